@@ -5,12 +5,10 @@ is wrong with the value, what to do), and the values that a program may want.
 """
 
 import errno
-import importlib
 import re
 import sys
 import warnings
 from collections.abc import Callable, Iterable
-from pathlib import Path
 from typing import Any, TypeVar
 
 _Found = TypeVar("_Found")
@@ -127,37 +125,6 @@ def refusal(error: Exception) -> str:
     """Describe in words why the system refused a file."""
     words = getattr(error, "strerror", None) or str(error).strip().rstrip(".")
     return _REFUSALS.get(getattr(error, "errno", None) or 0, f"cannot be read ({words})")
-
-
-def installing(extra: str) -> str:
-    """Return the command that installs an extra, from a checkout too."""
-    root = Path(__file__).parents[1]
-    what = f"-e '{root}[{extra}]'" if (root / "pyproject.toml").is_file() else f"'pcfix[{extra}]'"
-    return f"{sys.executable} -m pip install {what}"
-
-
-def optional_library(name: str, extra: str, who: str) -> Any:
-    """Import a library of an extra.
-
-    Raises
-    ------
-    InputError
-        ``library.missing``, with the command that installs the extra.
-    """
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise InputError(
-            "library.missing",
-            f"{who} needs {name}, which is not installed. Run: {installing(extra)}",
-            library=name,
-            extra=extra,
-        ) from error
-
-
-def photo_library(name: str) -> Any:
-    """Import a library of the extra ``photos``."""
-    return optional_library(name, "photos", "Work on photographs")
 
 
 def shown_once(read: Callable[[], _Found], notes: Callable[[_Found], Iterable[object]]) -> _Found:

@@ -22,6 +22,7 @@ HOUSE = Path(__file__).parents[1] / "pcfix"
 # lower floors and from its own room. "pcfix" is the front door, pcfix/__init__.py.
 FLOORS = (
     ("version", "errors", "blocks", "qgis"),
+    ("libraries",),
     ("kernels",),
     ("options",),
     ("model", "sums"),

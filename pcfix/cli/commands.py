@@ -194,7 +194,7 @@ def photos(
 ) -> None:
     """Take the water out of photographs, and with --rebuild make the cloud anew from them."""
     check_needed(options)
-    from pcfix.report.photos import photos_text, rounds_text
+    from pcfix.report.text import photos_text, rounds_text
 
     with progress_bar("Mapping", quiet, unit="photographs") as progress:
         if options.rebuild is None:
@@ -219,7 +219,7 @@ def ortho(
 ) -> None:
     """Lay photographs on the corrected DSM: the orthophoto of land and bed."""
     check_needed(options)
-    from pcfix.report.photos import ortho_text
+    from pcfix.report.text import ortho_text
 
     with progress_bar("Laying out", quiet, unit="cells") as progress:
         result = pcfix.ortho_photo(images, output, options=options, progress=progress)

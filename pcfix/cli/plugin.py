@@ -1,4 +1,4 @@
-"""The plugin of QGIS as a ZIP: its files, and a table of the commands that it offers."""
+"""The QGIS plugin as a ZIP: its files, and a table of the commands that it offers."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ _PLACES = {
     "output": "written", "out_dir": "folder written", "images": "folder", "reference": "file",
     "spec": "text",
 }  # fmt: skip
-"""What the places of commands are; the others are clouds."""
+"""Kinds of the positional arguments; the others are clouds."""
 _WRITTEN = ("summary", "shoreline", "save_regression", "plot")
-"""Options that name a file to write; `out_dir` a folder."""
+"""Options with a file to write; `out_dir` is a folder."""
 
 
 def plugin_zip(commands: Iterable[Callable[..., None]]) -> bytes:
-    """Return the plugin with those of the commands that it offers."""
+    """Return the plugin, with the commands among those given that it offers."""
     by_name = {command.__name__: command for command in commands}
     table = {"version": __version__, "commands": [_command(by_name[name]) for name in OFFERED]}
     return packed(json.dumps(table, indent=1) + "\n", __version__)
@@ -36,7 +36,14 @@ def _command(command: Callable[..., None]) -> dict[str, Any]:
         "name": command.__name__,
         "help": inspect.getdoc(command),
         "places": [
-            _place(name, _help_of(hints[name]))
+            {
+                "name": name,
+                "kind": _PLACES.get(name, "cloud"),
+                "help": next(one.help for one in get_args(hints[name])[1:] if hasattr(one, "help")),
+                "unit": "",
+                "default": None,
+                "needed": True,
+            }
             for name, one in inspect.signature(command).parameters.items()
             if one.kind is inspect.Parameter.POSITIONAL_ONLY
         ],
@@ -48,21 +55,11 @@ def _command(command: Callable[..., None]) -> dict[str, Any]:
     }
 
 
-def _help_of(hint: Any) -> str:
-    """Return the help that is written beside the type of a place."""
-    return next(one.help for one in get_args(hint)[1:] if hasattr(one, "help"))
-
-
-def _place(name: str, words: str) -> dict[str, Any]:
-    kind = _PLACES.get(name, "cloud")
-    return {"name": name, "kind": kind, "help": words, "unit": "", "default": None, "needed": True}
-
-
 def _option(one: Option, *, instead: bool) -> dict[str, Any]:
-    """Return an option as a form needs it; `instead` tells whether another may stand for it."""
+    """Return an option for a form; with `instead`, another option can replace it."""
     kind, default = _kind(one), one.default
     if kind not in ("bool", "int", "float", "choice"):
-        default = None  # the text stays empty where pcfix shall take its own
+        default = None  # an empty text is pcfix's own default
     default_words = f" Default: {one.default_text}." if one.default_text else ""
     return {
         "name": one.name,

@@ -13,7 +13,8 @@ import numpy as np
 
 from pcfix.clean.neighbours import SLACK, Neighbours, Tiles, make_tiles
 from pcfix.compare.statistics import Statistics, statistics_of
-from pcfix.errors import GeometryError, optional_library
+from pcfix.errors import GeometryError
+from pcfix.libraries import optional_library
 from pcfix.model import FloatArray, IntArray
 
 MAX_CORE_POINTS = 100_000

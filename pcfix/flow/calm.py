@@ -1,13 +1,10 @@
-"""A sequence of one place to the image through calm water, and to the water of each frame."""
+"""Combine frames of one place into the image through calm water, with the water of each frame."""
 
 from __future__ import annotations
 
-import json
 import tempfile
 import time
-import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -16,16 +13,15 @@ import numpy.typing as npt
 
 from pcfix.blocks import let_go
 from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError
-from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.inputs import Inputs
-from pcfix.flow.photos import lens_of
+from pcfix.flow.photos import lens_of, plain, read_heights, warn_all
 from pcfix.flow.runner import Progress, check_summary, write_summary
 from pcfix.grid.lattice import Lattice
 from pcfix.io.crs import parse_crs
 from pcfix.io.drafts import folder_when_whole, replaced_when_whole
 from pcfix.io.files import scratch_arrays
-from pcfix.io.frames import Frames, check_calm, read_frames, write_calm, write_spread
-from pcfix.io.rasters import filled_heights, new_raster, open_raster, write_part
+from pcfix.io.photographs import Frames, check_calm, read_frames, write_calm, write_spread
+from pcfix.io.rasters import new_raster, write_part
 from pcfix.kernels import threads
 from pcfix.model import FloatArray, Lens, WaterRaster
 from pcfix.options.declare import File, taken
@@ -48,7 +44,6 @@ from pcfix.photos.waves import (
     Nodes,
     Slopes,
     View,
-    Waves,
     fit_waves,
     nodes_of,
     slopes_of,
@@ -59,11 +54,11 @@ from pcfix.water.surface import surface_above
 
 DOWN = np.diag([1.0, -1.0, -1.0])
 FAR_PX = 1e5
-"""Focal length of the camera that stands for parallel rays, pixels per pixel of the image."""
+"""Focal length of a camera with nearly parallel rays, in pixels per pixel of the image."""
 PASSES = 2
-"""Over the surface: the height at which the rays meet it follows from the first."""
+"""Over the surface: the height of the piercing points follows from the first."""
 LEAST_EXPLAINED = 0.5
-"""Of the slopes; waves that explain less are worth a warning."""
+"""Share of the slopes; if waves explain less, there is a warning."""
 
 
 def calm_frames(
@@ -74,28 +69,19 @@ def calm_frames(
     progress: Progress | None = None,
     **keywords: Any,
 ) -> CalmSummary:
-    """Write the median of a sequence through waves; what ``pcfix calm`` runs.
+    """Write the median of frames taken through waves; what ``pcfix calm`` runs.
 
     Parameters
     ----------
     frames : path
         Folder of photographs of one size, in the order of their names, or a video.
     out : path
-        Image of the frames' format, with the metadata of the first; PNG of a video. The spread is
-        written beside it, and with `surface` a folder of rasters of the water.
+        Image in the format of the frames, with the metadata of the first; PNG for a video. The
+        spread is written beside it, and with `surface` a folder of rasters of the water.
     options : CalmOptions, optional
         Or its attributes as keywords.
     progress : callable, optional
-        Called with (frames done, frames in all); each is gone through twice, with `surface` thrice.
-
-    Returns
-    -------
-    CalmSummary
-
-    Raises
-    ------
-    PcfixError
-        With one sentence on what to mend.
+        Called with (frames done, frames in all); each is read twice, with `surface` three times.
     """
     given = taken(CalmOptions, options, keywords, "calm_frames")
     check_summary(given)
@@ -104,13 +90,15 @@ def calm_frames(
     target, beside = check_calm(out, found, overwrite=given.overwrite)
     folder = target.with_name(f"{target.stem}_water")
     if given.surface and folder.exists() and not given.overwrite:
-        raise SettingError(f"{folder}: the output exists; add --overwrite to replace it.")
+        raise SettingError(
+            "output.exists", f"{folder}: exists. Add --overwrite to replace it.", path=folder
+        )
     count = _Counted(progress, len(found.names) * (1 + given.surface + (not given.still)))
     with threads(given.jobs), scratch_arrays(target) as empty:
         view, crs = _view(given, found) if given.surface else (None, None)
-        way = _standing(len(found.names)) if given.still else _registered(found, count)
+        way = _registered(found, count, still=given.still)
         median, spread, stack = _median(found, way, empty, count)
-        notes: list[str] = []
+        notes: tuple[PcfixWarning, ...] = ()
         water = None
         if view is not None:
             waters, nodes, water = _water(given, found, view, count, median=median, stack=stack)
@@ -122,17 +110,16 @@ def calm_frames(
     write_spread(beside, spread)
     middle = np.array([0.5 * found.columns, 0.5 * found.rows, 1.0])
     moved = way.homography @ middle
-    for note in notes:
-        warnings.warn(note, PcfixWarning, stacklevel=2)
+    warn_all(notes)
     summary = CalmSummary(
         input=str(frames), output=str(out), spread_file=str(beside), frames=len(found.names),
         columns=found.columns, rows=found.rows, corners=len(way.scatter_px),
         scatter_px=round(float(np.median(way.scatter_px)) if len(way.scatter_px) else 0.0, 3),
         moved_px=round(float(np.hypot(*(moved[:, :2] / moved[:, 2:] - middle[:2]).T).max()), 2),
         spread=round(float(np.nanmedian(spread)), 2),
-        seconds=round(time.perf_counter() - started, 3), water=water, notes=tuple(notes),
+        seconds=round(time.perf_counter() - started, 3), water=water, notes=notes,
     )  # fmt: skip
-    write_summary(given, asdict(summary) | {"water": None if water is None else water._asdict()})
+    write_summary(given, plain(summary) | {"water": water and water._asdict()})
     return summary
 
 
@@ -150,11 +137,10 @@ class _Counted:
                 self._progress(self._done, self._total)
 
 
-def _standing(frames: int) -> Registration:
-    return Registration(np.tile(np.eye(3), (frames, 1, 1)), np.empty(0))
-
-
-def _registered(frames: Frames, count: _Counted) -> Registration:
+def _registered(frames: Frames, count: _Counted, *, still: bool) -> Registration:
+    """Register all frames to the first, unless the camera stood still."""
+    if still:
+        return Registration(np.tile(np.eye(3), (len(frames.names), 1, 1)), np.empty(0))
     follower: Follower | None = None
     places: list[FloatArray] = []
     for frame in count(frames):
@@ -164,9 +150,10 @@ def _registered(frames: Frames, count: _Counted) -> Registration:
     lost = np.flatnonzero(~np.isfinite(way.homography).all(axis=(1, 2)))
     if len(lost):
         raise InputError(
-            f"{frames.path}: {len(lost)} frames cannot be laid onto the first, with which they"
-            f" share fewer than {LEAST_CORNERS} corners: {frames.names[lost[0]]}; leave them"
-            " out, or begin with another."
+            "frames.no_overlap",
+            f"{frames.path}: {len(lost)} frames share fewer than {LEAST_CORNERS} corners with the"
+            f" first, such as {frames.names[lost[0]]}. Leave them out, or begin with another.",
+            frames=[frames.names[row] for row in lost],
         )
     return way
 
@@ -174,15 +161,18 @@ def _registered(frames: Frames, count: _Counted) -> Registration:
 def _median(
     frames: Frames, way: Registration, empty: Callable[..., Any], count: _Counted
 ) -> tuple[npt.NDArray[Any], FloatArray, Any]:
-    """Return the median, its spread, and the frames as they lie on the first, in a file."""
+    """Return the median, its spread, and the registered frames, which are on disk."""
     stack: Any = None
     for number, frame in enumerate(count(frames)):
         if stack is None:
             stack = empty((len(frames.names), *frame.shape), frame.dtype)
         if frame.shape != stack.shape[1:] or frame.dtype != stack.dtype:
             raise InputError(
-                f"{frames.names[number]}: has {frame.shape[2]} bands of {frame.dtype}, and the"
-                f" first frame {stack.shape[3]} of {stack.dtype}; a sequence is of one kind."
+                "photos.kind",
+                f"{frames.names[number]}: has {frame.shape[2]} bands of {frame.dtype}, but the"
+                f" first frame {stack.shape[3]} of {stack.dtype}. Give frames of one kind.",
+                frame=frames.names[number],
+                bands=frame.shape[2],
             )
         same = np.array_equal(way.homography[number], np.eye(3))
         stack[number] = frame if same else laid(frame, way.homography[number])
@@ -200,7 +190,7 @@ def _median(
 
 
 def _view(given: CalmOptions, frames: Frames) -> tuple[View, str | None]:
-    """Return what the frames are of, as the options have it, and the CRS."""
+    """Return camera, water and bed as given, and the CRS."""
     bed, crs = _bed(given)
     index, level = index_of(given.index, given.index_formula)[0], given.level
     size = frames.columns, frames.rows
@@ -218,8 +208,11 @@ def _view(given: CalmOptions, frames: Frames) -> tuple[View, str | None]:
     rows = [0] if len(cameras.labels) == 1 else rows
     if len(rows) != 1 or cameras.rotations is None or cameras.lenses is None:
         raise InputError(
-            f"{given.cameras}: has no one pose with angles and a lens for {first}; give one row of"
-            " that name."
+            "photos.no_pose",
+            f"{given.cameras}: has no single pose with angles and a lens for {first}. Give one row"
+            " of that name.",
+            path=given.cameras,
+            photograph=first,
         )
     row = rows[0]
     lens = lens_of(frames.path, cameras, row, size)
@@ -229,48 +222,44 @@ def _view(given: CalmOptions, frames: Frames) -> tuple[View, str | None]:
 
 def _bed(given: CalmOptions) -> tuple[Callable[[FloatArray], FloatArray], str | None]:
     """Return the height of the true bed by place, and the CRS of its raster."""
-    level, crs = given.level, None
+    level = given.level
     try:
         depth = float(given.depth)
     except ValueError:
         depth = np.nan
     if np.isfinite(depth):
         if not depth > 0.0:
-            raise SettingError(f"depth {depth:g} is not positive; give metres under the level.")
+            raise SettingError(
+                "option.range",
+                f"depth {depth:g} is not positive. Give metres below the level.",
+                option="depth",
+                value=depth,
+            )
         return lambda xy: np.full(len(xy), level - depth), None
-    path = Path(given.depth)
     with tempfile.TemporaryDirectory() as scratch:
-        if path.suffix.lower() in (".las", ".laz"):
-            grid_dsm(path, Path(scratch) / "bed.tif", resolution=given.resolution)
-            path = Path(scratch) / "bed.tif"
-        with open_raster(path) as source:
-            t, tags = source.transform, source.tags()
-            crs = None if source.crs is None else source.crs.to_wkt()
-            height = filled_heights(source, fill=True)
-    if not (t.a > 0.0 > t.e and t.b == t.d == 0.0):
-        raise InputError(f"{given.depth}: is not north up; warp it first.")
-    if not json.loads(tags.get("PCFIX", "{}")).get("corrected"):
+        height, (left, top, cell), crs, corrected = read_heights(
+            given.depth, given.resolution, Path(scratch), fill=True
+        )
+    if not corrected:
         index = index_of(given.index, given.index_formula)[0]
         height = np.where(height < level, level - index * (level - height), height)
-    raster = WaterRaster(height, t.c, t.f, (t.a, -t.e), "bed")
+    raster = WaterRaster(height, left, top, (cell, cell), "bed")
     return lambda xy: surface_above(raster, xy).height_m, crs
 
 
 def _water(
     given: CalmOptions, frames: Frames, view: View, count: _Counted, *, median: Any, stack: Any
 ) -> tuple[list[tuple[FloatArray, FloatArray]], Nodes, WaterFound]:
-    """Return heights and standard errors of the water in each frame."""
+    """Fit the water of each frame; return heights and standard errors, cells, and a summary."""
     nodes = nodes_of(view, given.resolution)
     measure = Displacements(median, view, nodes)
     interval = given.interval * given.every if given.interval else frames.interval_s
     times = np.arange(len(stack), dtype=np.float64) * (interval or 0.0)
-    shifts, weights = (
-        np.zeros((len(stack), len(nodes.xy), 2)),
-        np.zeros((len(stack), len(nodes.xy))),
-    )
-    for number, frame in enumerate(count(stack)):
-        shifts[number], weights[number] = measure.of(frame)
+    measured = []
+    for frame in count(stack):
+        measured.append(measure.of(frame))
         let_go()
+    shifts, weights = (np.stack(one) for one in zip(*measured, strict=True))
     weights[:, still(shifts, weights)] = 0.0
     middle = nodes.xy.mean(axis=0)
     depth = float(np.nanmedian(view.level_m - view.bed(nodes.xy[nodes.seen])))
@@ -282,12 +271,23 @@ def _water(
         )
         known = np.isfinite(slope.sum(axis=2))
         if not (known & (weights > 0.0)).any():
-            raise GeometryError("no part of the image shows a bed under moving water; check depth.")
+            raise GeometryError(
+                "frames.no_water",
+                "No part of the image shows a bed under moving water. Check depth and level.",
+                depth_m=depth,
+            )
         data = Slopes(
             np.nan_to_num(slope), np.where(known, weights, 0.0), times,
             nodes.xy - middle, nodes.shape, nodes.cell_m,
         )  # fmt: skip
-        waves = _waves(data, depth, tied=interval is not None)
+        if interval is not None:  # time ties the frames together
+            waves = [fit_waves(data, depth)] * len(times)
+        else:
+            each = zip(data.slope, data.weight, strict=True)
+            waves = [
+                fit_waves(data._replace(slope=s[None], weight=w[None], time_s=np.zeros(1)), depth)
+                for s, w in each
+            ]
         found = [w.at(nodes.xy - middle, t) for w, t in zip(waves, times, strict=True)]
         heights = view.level_m + np.stack([height for height, _ in found])
     seen = nodes.seen
@@ -301,16 +301,6 @@ def _water(
         explained=round(float(np.mean([one.explained for one in waves])), 3),
     )  # fmt: skip
     return found, nodes, summary
-
-
-def _waves(data: Slopes, depth_m: float, *, tied: bool) -> list[Waves]:
-    """Return the waves of each frame: the same ones where time ties the frames together."""
-    if tied:
-        return [fit_waves(data, depth_m)] * len(data.time_s)
-    return [
-        fit_waves(data._replace(slope=s[None], weight=w[None], time_s=np.zeros(1)), depth_m)
-        for s, w in zip(data.slope, data.weight, strict=True)
-    ]
 
 
 def _write_waters(
@@ -335,16 +325,17 @@ def _write_waters(
                 write_part(target, values.reshape(nodes.shape), lattice.window, 1)
 
 
-def _notes_of(water: WaterFound, *, tied: bool) -> list[str]:
+def _notes_of(water: WaterFound, *, tied: bool) -> tuple[PcfixWarning, ...]:
     notes = []
     if not tied:
-        notes.append(
-            "the time between frames is not known, so that each frame's water is found alone; give"
-            " interval."
+        words = (
+            "The time between frames is not known, so each frame is fitted alone. Give --interval."
         )
+        notes.append(PcfixWarning("frames.no_interval", words))
     if water.explained < LEAST_EXPLAINED:
-        notes.append(
-            f"waves explain {100 * water.explained:.0f} % of the slopes alone: a current, glints, a"
-            " wrong interval or depth; do not rely on the surfaces."
+        words = (
+            f"Waves explain only {100 * water.explained:.0f} % of the slopes (a current, glints, a"
+            " wrong interval or depth). Do not rely on the surfaces."
         )
-    return notes
+        notes.append(PcfixWarning("waves.explained", words, explained=water.explained))
+    return tuple(notes)

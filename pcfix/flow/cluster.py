@@ -15,8 +15,9 @@ from types import ModuleType
 from typing import Any, TypeVar
 
 from pcfix import version
-from pcfix.errors import InputError, optional_library
+from pcfix.errors import InputError
 from pcfix.kernels import cores
+from pcfix.libraries import optional_library
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")

@@ -166,7 +166,7 @@ def _write(result: Comparison, given: CompareOptions) -> None:
             for name, content in files.items():
                 write_text(folder / name, content, overwrite=given.overwrite)
         if given.plot is not None:
-            from pcfix.report.c2c import c2c_figure
+            from pcfix.report.comparison import c2c_figure
             from pcfix.report.page import png_of
 
             picture = png_of(c2c_figure(result.as_dict()))

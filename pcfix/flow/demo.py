@@ -1,4 +1,4 @@
-"""Simulate, correct, and hold the result against the truth: what ``pcfix demo`` runs."""
+"""Simulate two scenes, correct them, and compare the results with the truth: ``pcfix demo``."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ REPORT = "run"
 def run_demo(
     out_dir: File, *, points: int = 50_000, overwrite: bool = False, bar: Bar = no_bar
 ) -> str:
-    """Make both blocks of scenes in a folder, run all steps on them, return the table."""
+    """Simulate both blocks in a folder, run all steps on them, and return a table of errors."""
     sections = []
     for kind in BLOCKS:
         folder = Path(out_dir) / kind
@@ -49,10 +49,10 @@ def _table(scene: Scene, corrected: FloatArray) -> str:
         scene.apparent_xyz, scene.cameras, scene.water, index=scene.refractive_index
     )
     rows = [
-        ("as it came", scene.apparent_xyz),
+        ("uncorrected", scene.apparent_xyz),
         (f"depth times {scene.refractive_index:g}", times_n),
-        ("without any option", by_default.xyz),
-        ("consistent, own cameras", corrected),
+        ("default options", by_default.xyz),
+        ("with the view list", corrected),
     ]
     head = f"error of {deep.sum():,} bed points"
     lines = [f"{head:<30}{'mean Z':>20}{'RMSE Z':>20}{'RMSE XY':>20}"]

@@ -1,4 +1,4 @@
-"""The vectors that a run leaves for a GIS, as layers of ``map.gpkg``."""
+"""The vector layers of ``map.gpkg``, which a run writes for a GIS."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ from pcfix.options.declare import File
 from pcfix.water.surface import surface_above
 
 MOST_CELLS = 4_000_000
-"""Of the rasters that contours and footprint are drawn of."""
+"""Of the rasters for contours and outline."""
 SECTIONS = 3
 DARK, RED, GREY = (8, 48, 107), (203, 24, 29), (120, 120, 120)
 ORANGE, GREEN = (253, 141, 60), (35, 139, 69)
 
 
 class Drawn(NamedTuple):
-    """What a run knows that goes into the map.
+    """The parts of a run that the map shows.
 
-    sigma_level_m : standard error of the water's height, None where it was not known.
-    sections : lines of the comparison, as its figures have them.
-    check_points : x, y, reference height and cloud minus reference, shape (n, 4).
+    `sigma_level_m` is the standard error of the water level, None where unknown; `sections` are the
+    lines of the comparison; `check_points`, shape (n, 4), are x, y, reference height, and cloud
+    minus reference.
     """
 
     cloud: Path | Tiles
@@ -75,7 +75,7 @@ def _area(folder: Path) -> Layer:
 
 
 def contours_layer(folder: Path, interval: float | None = None) -> Layer:
-    """Return the lines of equal depth; without an interval no closer than the depth is known."""
+    """Return the depth contours; the default interval follows from the uncertainty."""
     depth, bounds = rasters.preview(folder / DEPTH, MOST_CELLS)
     if interval is None:
         path = folder / UNCERTAINTY
@@ -127,7 +127,7 @@ def _sections(drawn: Drawn) -> Layer:
 
 
 def _cameras(cameras: Cameras, unused: list[str]) -> Layer:
-    """Return the projection centres, and whether each made a corrected point."""
+    """Return the projection centres, and whether each was used."""
     use = ["not used" if label in set(unused) else "used" for label in cameras.labels]
     symbols = {"used": Symbol("marker", GREEN, 2.0), "not used": Symbol("marker", GREY, 1.6)}
     values = {"label": np.array(cameras.labels, object), "use": np.array(use, object)}
@@ -136,7 +136,7 @@ def _cameras(cameras: Cameras, unused: list[str]) -> Layer:
 
 
 def _check_points(drawn: Drawn) -> list[Layer]:
-    """Return surveyed points with what the cloud, or the map of depths, says more than they."""
+    """Return surveyed points with the differences of the cloud, or of the map of depths."""
     symbol = {"point": Symbol("marker", ORANGE, 2.2, "diamond")}
     style = vector_style(symbol, label="""format_number("residual_m", 2)""")
     layers = []

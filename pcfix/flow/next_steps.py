@@ -1,6 +1,6 @@
-"""The commands that a user is told to run next: lines that work as they are printed.
+"""Commands that the user is told to run next, ready to paste.
 
-What was not given and is needed has a name in capitals, and the sentence before the line says why.
+A file that was not given has a name in capitals.
 """
 
 from __future__ import annotations
@@ -21,76 +21,56 @@ if TYPE_CHECKING:
     from pcfix.adjust.result import Adjusted
 
 MODELS = ("colmap", "opensfm/reconstruction.json", "cameras.csv")
-"""What an adjustment leaves, in the order in which a next step takes it."""
-
+"""The models that an adjustment writes, the preferred one first."""
 WATER = "water.tif"
-"""The water of an adjustment, where it is no plane and something of it was free."""
-
+"""The water of an adjustment, where it is not a plane and was adjusted."""
 READ_ALIKE = (
     "sensor", "angles", "cameras_crs", "cameras_offset", "views", "views_are", "water_model",
     "water_crs",
 )  # fmt: skip
-"""Options that `pcfix correct` and `pcfix adjust` read alike."""
-
-NO_DATUM = (
-    " (nothing given says where the block is: GNSS.csv stands for the positions of the images,"
-    " --gcps takes control points instead)"
-)
+"""Options that `pcfix correct` and `pcfix adjust` have in common."""
+NO_DATUM = " (GNSS.csv has the positions of the images; control points, --gcps, serve as well)"
 
 
 def adjust_words(
     inputs: Inputs, cloud: str, *, has_datum: bool, **more: File | float | None
 ) -> tuple[str, str]:
-    """Return the command that mends the poses, and why it has what was not given.
+    """Return the command that corrects the poses, and a remark on it.
 
-    Without a datum it has GNSS positions to fill in; `more` are options of an adjustment alone.
+    Without a datum it asks for GNSS positions; `more` are options of an adjustment only.
     """
     model = "MODEL" if isinstance(inputs.cameras, Cameras) else str(inputs.cameras)
     words = ["pcfix", "adjust", model, "OUT", "--water", _water(inputs.water), "--cloud", cloud]
     words += _flags(inputs)
     if inputs.water_mask is not None:
         words += ["--water-mask", str(inputs.water_mask)]
-    because = "" if has_datum or more.get("gcps") or more.get("gnss") else NO_DATUM
-    if because:
+    remark = "" if has_datum or more.get("gcps") or more.get("gnss") else NO_DATUM
+    if remark:
         more["gnss"] = "GNSS.csv"
     for name, value in more.items():
-        if value is not None:
-            words += [f"--{name}", str(value)]
-    return shlex.join(words), because
-
-
-def _water(given: Any) -> str:
-    """Return a water as it was given; one that an adjustment does not take is left open."""
-    known = isinstance(given, str | PathLike | float | int)
-    return f"{given}" if known and not str(given).startswith("dim:") else "SPEC"
-
-
-def _flags(given: Any) -> list[str]:
-    """Return the options that were given, of those that are read alike."""
-    words = []
-    for one in options_of(type(given)):
-        value = getattr(given, one.name)
-        if one.name in READ_ALIKE and value not in (None, one.default):
-            is_offset = one.name == "cameras_offset"
-            words += [one.flag, ",".join(f"{v:.12g}" for v in value) if is_offset else str(value)]
-    return words
+        words += [] if value is None else [f"--{name}", str(value)]
+    return shlex.join(words), remark
 
 
 def correct_words(found: Adjusted, model: File, out_dir: File, options: AdjustOptions) -> str:
-    """Return the command that takes the cloud over to adjusted cameras, and corrects it."""
-    cameras = next((one for one in MODELS if (Path(out_dir) / one).exists()), MODELS[0])
-    words = ["pcfix", "correct", str(options.cloud or "CLOUD.laz"), "corrected.laz"]
-    words += ["--cameras", str(Path(out_dir) / cameras)]
-    if options.port is not None:  # nothing is carried before a port: the cloud is made anew
+    """Return the command that transfers the cloud to the adjusted poses, and corrects it."""
+    out = Path(out_dir)
+    cameras = next((one for one in MODELS if (out / one).exists()), MODELS[0])
+    head = ["pcfix", "correct", str(options.cloud or "CLOUD.laz"), "corrected.laz"]
+    words = [*head, "--cameras", str(out / cameras)]
+    if options.port is not None:  # before a port no cloud is transferred: it is reconstructed
         moved = found.port if {"distance", "centre"} & set(options.free) else None
-        port = str(options.port) if moved is None else spec_of(moved)
-        return shlex.join([*words[:2], "CLOUD.laz", *words[3:], "--port", port])
-    words += ["--adjusted-from", str(model)]
-    raster, water = Path(out_dir) / WATER, _water(options.water)
-    if isinstance(found.water, WaterPlane) or raster.exists():
-        water = _plane(found.water) if isinstance(found.water, WaterPlane) else str(raster)
+        words[2] = "CLOUD.laz"
+        return shlex.join([*words, "--port", spec_of(moved) if moved else str(options.port)])
+    water = _water(options.water)
+    if isinstance(found.water, WaterPlane) or (out / WATER).exists():
+        water, plane = str(out / WATER), found.water
+        if isinstance(plane, WaterPlane):
+            is_level = plane.b == plane.c == 0.0
+            tilted = f"plane:{plane.a:.15g},{plane.b:.15g},{plane.c:.15g}"
+            water = f"{plane.a:.3f}" if is_level else tilted
         options = replace(options, water_model="auto", water_crs=None)
-    words += ["--water", water]
+    words += ["--adjusted-from", str(model), "--water", water]
     if options.water_mask is not None:
         words += ["--water-mask", str(options.water_mask)]
     if "index" in options.free or options.sigma_index is not None:
@@ -100,8 +80,18 @@ def correct_words(found: Adjusted, model: File, out_dir: File, options: AdjustOp
     return shlex.join([*words, *_flags(options)])
 
 
-def _plane(water: WaterPlane) -> str:
-    """Return a plane as ``--water`` takes it."""
-    if water.b == water.c == 0.0:
-        return f"{water.a:.3f}"
-    return f"plane:{water.a:.15g},{water.b:.15g},{water.c:.15g}"
+def _water(given: Any) -> str:
+    """Return a water as it was given, or SPEC where an adjustment does not take it."""
+    known = isinstance(given, str | PathLike | float | int)
+    return f"{given}" if known and not str(given).startswith("dim:") else "SPEC"
+
+
+def _flags(given: Any) -> list[str]:
+    """Return the common options that were given."""
+    words = []
+    for one in options_of(type(given)):
+        value = getattr(given, one.name)
+        if one.name in READ_ALIKE and value not in (None, one.default):
+            is_offset = one.name == "cameras_offset"
+            words += [one.flag, ",".join(f"{v:.12g}" for v in value) if is_offset else str(value)]
+    return words

@@ -1,19 +1,17 @@
-"""Photographs to an orthophoto of land and bed, tile by tile."""
+"""Write an orthophoto of land and bed, tile by tile."""
 
 from __future__ import annotations
 
 import time
-import warnings
-from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pcfix.errors import GeometryError, InputError, PcfixWarning
+from pcfix.errors import GeometryError, InputError
 from pcfix.flow.inputs import paths_in
-from pcfix.flow.photos import Block, block_of
+from pcfix.flow.photos import CLOUDS, PhotoBlock, block_of, plain, warn_all
 from pcfix.flow.runner import Progress, check_summary, write_summary
 from pcfix.grid.lattice import Lattice, Window, lattice_over, refuse_size
 from pcfix.io import rasters
@@ -27,7 +25,7 @@ from pcfix.photos.ortho import OrthoSummary, Picture, mosaic, picture_of
 
 TILE_CELLS = 512
 CACHE_BYTES = 400_000_000
-"""Of photographs that are kept for the next tile."""
+"""Of photographs cached for the next tile."""
 NO_WATER = WaterPlane(-100_000.0)
 """Below all ground, so that every ray is straight."""
 COLOURS = {1: ("gray",), 3: ("red", "green", "blue")}
@@ -41,10 +39,10 @@ def ortho_photo(
     progress: Progress | None = None,
     **keywords: Any,
 ) -> OrthoSummary:
-    """Lay photographs on a DSM of land and bed; what ``pcfix ortho`` runs.
+    """Write an orthophoto of land and bed on a DSM; what ``pcfix ortho`` runs.
 
     The file is a cloud optimised GeoTIFF in the CRS of the DSM, with the bands of the photographs
-    and alpha: 0 where no photograph sees the cell. See `pcfix.photos.ortho`.
+    and alpha, 0 where no photograph sees the cell. See `pcfix.photos.ortho`.
 
     Parameters
     ----------
@@ -53,19 +51,9 @@ def ortho_photo(
     output : path
         The name ends in ``.tif`` or ``.tiff``.
     options : OrthoOptions, optional
-        Or its attributes as keywords: cameras, dsm and, for photographs as they were taken, water
-        among them.
+        Or its attributes as keywords, such as cameras, dsm and, for original photographs, water.
     progress : callable, optional
         Called with (cells done, cells in all).
-
-    Returns
-    -------
-    OrthoSummary
-
-    Raises
-    ------
-    PcfixError
-        With one sentence on what to mend; no output is left behind.
     """
     started = time.perf_counter()
     given = taken(OrthoOptions, options, keywords, "ortho_photo")
@@ -73,36 +61,38 @@ def ortho_photo(
     known = [*paths_in(given), *([given.dsm] if given.dsm else []), *paths]
     target = rasters.check_tif(output, overwrite=given.overwrite, inputs=known)
     check_summary(given, [*known, target])
-    rasters.check_cog()
     with threads(given.jobs), replaced_when_whole(target) as draft, draft_folder(target) as folder:
         block = block_of(_as_photos(given), paths, folder)
-        for note in block.notes:
-            warnings.warn(note, PcfixWarning, stacklevel=2)
+        warn_all(block.notes)
         lattice = _lattice(block, given)
         covered, ground = _write(block, lattice, given, folder / "plain.tif", progress)
         if not covered:
-            raise GeometryError(f"{given.dsm}: no photograph sees it; check the CRS of both.")
+            raise GeometryError(
+                "cameras.no_overlap",
+                f"{given.dsm}: no photograph sees it. Check the CRS of the DSM and the cameras.",
+                path=given.dsm,
+            )
         rasters.copy_as_cog(folder / "plain.tif", draft)
     summary = OrthoSummary(
         str(target), len(block.photos), lattice.width, lattice.height, lattice.resolution_m,
         lattice.bounds_m, round(covered / ground, 5), round(time.perf_counter() - started, 3),
         str(given.dsm), None if given.water is None else str(given.water), block.notes,
     )  # fmt: skip
-    write_summary(given, asdict(summary))
+    write_summary(given, plain(summary))
     return summary
 
 
 def _as_photos(given: OrthoOptions) -> PhotosOptions:
-    """Return what `block_of` needs: photographs without water have it below all ground."""
+    """Return the options for `block_of`; without water, its level is below all ground."""
     same = {one.name: getattr(given, one.name) for one in options_of(OrthoOptions)}
     same["water"] = NO_WATER if given.water is None else given.water
-    is_cloud = Path(given.dsm).suffix.lower() in (".las", ".laz")
+    is_cloud = Path(given.dsm).suffix.lower() in CLOUDS
     same["resolution"] = 2.0 * given.resolution if is_cloud and given.resolution else None
     return PhotosOptions(**same)
 
 
-def _lattice(block: Block, given: OrthoOptions) -> Lattice:
-    """Return the cells over the DSM; by default two digits of the ground pixel are their side."""
+def _lattice(block: PhotoBlock, given: OrthoOptions) -> Lattice:
+    """Return the cells over the DSM; their side is the ground pixel, rounded to two digits."""
     ground = block.scene.ground
     rows, columns = ground.height_m.shape
     low = np.array([ground.left_m, ground.top_m - rows * ground.cell_m])
@@ -113,9 +103,9 @@ def _lattice(block: Block, given: OrthoOptions) -> Lattice:
 
 
 def _write(
-    block: Block, lattice: Lattice, given: OrthoOptions, path: Path, progress: Progress | None
+    block: PhotoBlock, lattice: Lattice, given: OrthoOptions, path: Path, progress: Progress | None
 ) -> tuple[int, int]:
-    """Write the raster, and return how many cells have a colour, and how many a height."""
+    """Write the raster, and return the number of cells with a colour and with a height."""
     first = read_colours(block.paths[0])
     bands, dtype = first.shape[2], first.dtype
     shrunk = max(1, int(lattice.resolution_m / block.gsd_m))
@@ -126,21 +116,20 @@ def _write(
         pixels = read_colours(block.paths[row])
         if pixels.shape[2] != bands or pixels.dtype != dtype:
             raise InputError(
-                f"{block.paths[row]}: has {pixels.shape[2]} bands of {pixels.dtype}, and"
-                f" {block.paths[0].name} {bands} of {dtype}; give photographs of one kind."
+                "photos.kind",
+                f"{block.paths[row]}: has {pixels.shape[2]} bands of {pixels.dtype}, but"
+                f" {block.paths[0].name} {bands} of {dtype}. Give photographs of one kind.",
+                path=block.paths[row],
+                bands=pixels.shape[2],
             )
         return picture_of(pixels, shrunk, blanks=given.water is None)
 
     names = COLOURS.get(bands, tuple(f"band {b + 1}" for b in range(bands)))
     covered = ground = done = 0
+    layers = dict.fromkeys((*names, "alpha"), "")
     with rasters.new_raster(
-        path,
-        lattice,
-        block.crs,
-        dict.fromkeys((*names, "alpha"), ""),
-        dtype=str(dtype),
-        nodata=None,
-    ) as target:
+        path, lattice, block.crs, layers, dtype=str(dtype), nodata=None
+    ) as target:  # fmt: skip
         for window in lattice.windows(TILE_CELLS):
             xyz, known = _cells(block, lattice, window)
             found = mosaic(xyz, block.photos, block.scene, picture) if len(xyz) else None
@@ -160,7 +149,7 @@ def _write(
     return covered, ground
 
 
-def _cells(block: Block, lattice: Lattice, window: Window) -> tuple[FloatArray, Any]:
+def _cells(block: PhotoBlock, lattice: Lattice, window: Window) -> tuple[FloatArray, Any]:
     """Return the centres of the cells that have a height, shape (n, 3), and which they are."""
     side = lattice.resolution_m
     x = lattice.left_m + (np.arange(window.column, window.column_stop) + 0.5) * side

@@ -1,7 +1,7 @@
-"""Work out the effect of refraction and the tables of papers, and write them into a folder.
+"""Write the effect of refraction, and the tables of papers, into a folder.
 
 What ``pcfix simulate --refraction-effect`` runs. One table is that of Hsu & Wang's experiment,
-simulated: error by depth, method by method.
+simulated: error by depth and method.
 """
 
 from __future__ import annotations
@@ -42,29 +42,13 @@ from pcfix.version import __version__
 from pcfix.water.index import index_of
 
 HEIGHTS_M = (50.0, 100.0, 200.0)
-"""Above the water, of a camera of one's own."""
-PUBLISHED = (
-    "published (Skarlatos & Agrafiotis 2018) for the SwingletCAM from 100 m, 80 %, 15 m: centre"
-    " -5.15 m, corner -8.23 m; the largest error at any height, with any lens: 1/3 of the true"
-    " depth or half the apparent one"
-)
+"""Flying heights of a camera that the user gives."""
 
 
 def write_refraction_effect(out_dir: File, options: SimulateOptions) -> str:
-    """Write tables, settings and pictures, and return a short text about them.
+    """Write tables, settings and figures, and return a summary.
 
-    Parameters
-    ----------
-    out_dir : path
-    options : SimulateOptions
-        Those called effect_..., index and seed. Without a camera of one's own the two of
-        Skarlatos & Agrafiotis (2018) are taken.
-
-    Raises
-    ------
-    SettingError
-        If an argument is outside its rule, or a file exists and `overwrite` is not set; then
-        none is written.
+    Without a camera of the user's, those of Skarlatos & Agrafiotis (2018) are used.
     """
     camera, apparent_depths_m = _camera(options), options.effect_depths or APPARENT_DEPTHS_M
     index, seed = index_of(options.index, options.index_formula)[0], options.seed
@@ -102,24 +86,25 @@ def write_refraction_effect(out_dir: File, options: SimulateOptions) -> str:
         "bowl_depth_bins.csv": papers.csv_text(papers.depth_bins_rows(bins)).encode(),
         "refraction_effect.json": json_text(settings).encode(),
     }
-    _write(Path(out_dir), files, options.overwrite)
-    shan_lines = papers.shan_text(pairs[0], shan[pairs[0]], deepest)
-    parts = [papers.effect_text(found), shan_lines, papers.depth_bins_text(bins)]
-    if camera is None:
-        parts[0] += f"\n{PUBLISHED}"
-    return "\n\n".join([*parts, f"{out_dir}: {', '.join(sorted(files))}"])
+    folder = Path(out_dir)
+    with made_folder(folder), all_or_none():
+        for name in files:
+            check_output(folder / name, overwrite=options.overwrite)
+        for name, data in files.items():
+            write_bytes(folder / name, data, overwrite=options.overwrite)
+    return f"{papers.effect_text(found)}\n{out_dir}: {', '.join(sorted(files))}"
 
 
 def _camera(options: SimulateOptions) -> AerialCamera | None:
-    """Return the camera of one's own, where one is given."""
+    """Return the camera of the user, if one is given."""
     focal, frame = options.effect_focal_mm, options.effect_frame_px
     pixel = options.effect_pixel_um
     if focal is None and frame is None and pixel is None:
         return None
     if focal is None or frame is None or pixel is None:
         raise SettingError(
-            "a camera needs --effect-focal-mm, --effect-frame-px and --effect-pixel-um; give all"
-            " three."
+            "option.missing",
+            "A camera needs --effect-focal-mm, --effect-frame-px and --effect-pixel-um. Give all.",
         )
     return AerialCamera("camera", focal, *frame, pixel)
 
@@ -137,16 +122,8 @@ def _pictures(found: list[Effect], bins: DepthBins, deepest: float) -> dict[str,
     return {name: png_of(figure) for name, figure in figures.items()}
 
 
-def _write(folder: Path, files: dict[str, bytes], overwrite: bool) -> None:
-    with made_folder(folder), all_or_none():
-        for name in files:
-            check_output(folder / name, overwrite=overwrite)
-        for name, data in files.items():
-            write_bytes(folder / name, data, overwrite=overwrite)
-
-
 def bowl_bins(bowl: Bowl) -> DepthBins:
-    """Correct the bowl's cloud by every method and return the errors by depth."""
+    """Correct the bowl by every method, and return the errors by depth."""
     corrected = {
         name: correct_points(
             bowl.apparent_xyz, bowl.cameras, WATER_LEVEL_M, index=bowl.refractive_index,

@@ -1,4 +1,4 @@
-"""Photographs to photographs without water, several at a time, resumed where it stopped."""
+"""Remove refraction from photographs, several at a time; an interrupted call is resumed."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 import tempfile
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -25,26 +25,24 @@ from pcfix.io.rasters import filled_heights, open_raster
 from pcfix.io.water_rasters import rasters_of_images, read_water_raster
 from pcfix.kernels import cores, threads
 from pcfix.lens.imaging import unproject
-from pcfix.model import Cameras, FloatArray, Lens, WaterDimension, WaterSurface
+from pcfix.model import Cameras, FloatArray, Lens, WaterDimension
 from pcfix.options.declare import File, taken
 from pcfix.options.photos import PhotosOptions
 from pcfix.photos.ground import Ground, ground_of
-from pcfix.photos.mapping import Photo, Scene, exact, nodes_of, paper
-from pcfix.photos.model import PhotosSummary
-from pcfix.photos.resample import resample
+from pcfix.photos.mapping import Photo, PhotosSummary, Scene, exact, nodes_of, paper, resample
 from pcfix.version import __version__
+from pcfix.water.checks import check_above_water
 from pcfix.water.index import index_of
-from pcfix.water.surface import surface_above
 
 RECORD = "pcfix-photos.json"
 LEAST_STEP_PX = 8
-GROUND_PIXELS_A_CELL = 2.0
 COARSE_STEP_PX = 100
-"""Between the rays that tell whether a photograph sees anything of the ground."""
+"""Between the rays that test whether an image sees any of the ground."""
 MOST_BLACK = 0.2
-"""Of a photograph; more is worth a warning."""
+"""Share of an image; more gives a warning."""
 LENS_TOLERANCE = 0.005
-"""Of the shape of a frame in millimetres against that of the photograph."""
+"""Of the shape of a frame in millimetres against that of the image."""
+CLOUDS = (".las", ".laz")
 
 
 def map_photos(
@@ -60,294 +58,314 @@ def map_photos(
     Parameters
     ----------
     images : path
-        Folder of JPEG, TIFF or PNG files; names or stems are those of the camera file.
+        Folder of JPEG, TIFF or PNG files, named as in the camera file.
     out : path
-        Folder, made where it is missing. Files keep their names, sizes, bands and metadata, so
-        that the camera file needs no change. Photographs that an equal call has written already
-        are left as they are.
+        Folder, created if needed. Files keep their names, sizes, bands and metadata, so the camera
+        file needs no change. Images that an equal call has written are not written again.
     options : PhotosOptions, optional
-        Or its attributes as keywords: cameras, dsm and water among them; see
-        `pcfix.photos.mapping`.
+        Or its attributes as keywords, such as cameras, dsm and water.
     progress : callable, optional
-        Called with (photographs done, photographs in all).
-
-    Returns
-    -------
-    PhotosSummary
+        Called with (images done, images in all).
 
     Raises
     ------
     PcfixError
-        With one sentence on what to mend; photographs that were finished stay.
+        Images that are finished are kept.
     """
     given = taken(PhotosOptions, options, keywords, "map_photos")
     folder, target = Path(images), Path(out)
     if target.resolve() == folder.resolve():
-        raise SettingError(f"{target}: is the folder of the photographs; give another one.")
+        raise SettingError(
+            "output.is_input",
+            f"{target}: is the folder of the photographs. Give another one.",
+            path=target,
+        )
     check_summary(given)
     started, paths = time.perf_counter(), photographs_in(folder)
     with threads(given.jobs), tempfile.TemporaryDirectory() as scratch:
         block = block_of(given, paths, Path(scratch))
-        old = _begin(target, given, block, overwrite=given.overwrite)
+        old = _begin(target, given, block)
         found = _all(block, target, old, given.mapping, progress)
     pixels = sum(one.pixels for one in found)
-    black = sum(one.black for one in found) / max(pixels, 1)
-    notes = (*block.notes, *_notes(found, given))
-    for note in notes:
-        warnings.warn(note, PcfixWarning, stacklevel=2)
+    notes = (*block.notes, *_black_notes(found, given))
+    warn_all(notes)
     summary = PhotosSummary(
         images=len(block.photos), done_before=len(old), megapixels=round(1e-6 * pixels, 1),
         seconds=round(time.perf_counter() - started, 3),
         largest_shift_px=round(max((one.shift_px for one in found), default=0.0), 2),
-        black_share=round(black, 5), mapping=given.mapping, dsm=str(given.dsm),
-        water=str(block.scene.water), refractive_index=block.scene.refractive_index,
-        spacing_px=block.step_px, notes=notes,
+        black_share=round(sum(one.black for one in found) / max(pixels, 1), 5),
+        mapping=given.mapping, dsm=str(given.dsm), water=str(block.scene.water),
+        refractive_index=block.scene.refractive_index, spacing_px=block.step_px, notes=notes,
     )  # fmt: skip
-    write_summary(given, asdict(summary))
+    write_summary(given, plain(summary))
     return summary
 
 
+def warn_all(notes: Iterable[PcfixWarning]) -> None:
+    """Show notes as warnings of the function that the user called."""
+    for note in notes:
+        warnings.warn(note, stacklevel=3)
+
+
+def plain(summary: Any) -> dict[str, Any]:
+    """Return a summary of a step over photographs as plain values, ready for JSON."""
+    return asdict(summary) | {"notes": [note.as_dict() for note in summary.notes]}
+
+
 @dataclass(frozen=True, eq=False)
-class Block:
+class PhotoBlock:
     """Photographs with their poses, and what they see.
 
     Attributes
     ----------
-    paths : tuple of path
-    photos : tuple of Photo
-        One for each path.
-    scene : Scene
     step_px : int
         Between the nodes of the grid.
-    notes : tuple of str
     crs : CRS, str or None
-        Of the DSM, which all is in.
+        Of the DSM and of all coordinates.
     gsd_m : float
-        A pixel on the lowest ground, median of the photographs.
+        A pixel on the lowest ground, median of the images.
     waters : dict
-        Rasters of the water of some photographs, by their stems.
+        Water rasters of single images, by their stems.
     """
 
     paths: tuple[Path, ...]
     photos: tuple[Photo, ...]
     scene: Scene
     step_px: int
-    notes: tuple[str, ...]
+    notes: tuple[PcfixWarning, ...]
     crs: Any
     gsd_m: float
     waters: dict[str, Path]
 
     def scene_of(self, path: Path) -> Scene:
-        """Return what a photograph sees, through its own water where that is known."""
+        """Return the scene of an image, with its own water where that is known."""
         if path.stem not in self.waters:
             return self.scene
         return replace(self.scene, water=read_water_raster(self.waters[path.stem], self.crs))
 
 
-def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> Block:
-    """Return what the options and a folder of photographs say together.
-
-    Raises
-    ------
-    PcfixError
-        If cameras and photographs, or cameras and ground, do not belong together.
-    """
-    inputs = given.part(Inputs)
+def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> PhotoBlock:
+    """Read cameras, ground and water for a folder of photographs, and check that they match."""
+    name, inputs = str(given.cameras), given.part(Inputs)
     read = inputs.read()
     if read.rotations is None or read.lenses is None:
-        raise InputError(f"{given.cameras}: photographs are mapped with angles and a lens of each.")
-    heights, origin, crs, notes = _heights(given, read, scratch)
+        raise InputError(
+            "cameras.incomplete",
+            f"{name}: has no angles or no lenses. Photographs need both for each image.",
+            path=name,
+        )
+    heights, origin, crs, corrected = read_heights(
+        given.dsm, given.resolution, scratch, fill=given.holes == "fill"
+    )
+    if Path(given.dsm).suffix.lower() not in CLOUDS and given.resolution is not None:
+        raise SettingError(
+            "option.no_use",
+            "--resolution is for a cloud; the DSM has its own.",
+            option="resolution",
+        )
+    notes = [*_provenance_notes(corrected, given), *_transformed_notes(given, read, crs)]
     cameras, _ = inputs.block(crs, read)
-    mine, theirs, more = _matched(paths, cameras, str(given.cameras))
+    rows, lost = _matched(paths, cameras, name)
+    notes += lost
     surface = inputs.surface().surface
     if isinstance(surface, WaterDimension):
         raise SettingError(
-            "water dim:NAME belongs to a cloud; give a level, plane, mesh or raster."
+            "water.dimension",
+            "--water dim:NAME is for clouds. Give a level, plane, mesh or raster.",
+            water=str(given.water),
         )
-    check_above(cameras.centres[theirs], surface, str(given.cameras))
+    check_above_water(cameras, surface)
     ground = ground_of(heights, *origin)
-    index = index_of(given.index, given.index_formula)[0]
+    mine = tuple(path for path, row in zip(paths, rows, strict=True) if row >= 0)
     rotations: Any = cameras.rotations
     photos = tuple(
         Photo(
-            cameras.labels[row],
-            cameras.centres[row],
-            rotations[row],
+            cameras.labels[row], cameras.centres[row], rotations[row],
             lens_of(path, cameras, row, size_of(path)),
         )
-        for path, row in zip(mine, theirs, strict=True)
-    )
-    gsd = _ground_pixel_m(photos, ground)
-    step = given.spacing or max(LEAST_STEP_PX, int(np.ceil(ground.cell_m / gsd)))
-    scene, (waters, few) = Scene(ground, surface, index), _waters(given, mine)
+        for path, row in zip(paths, rows, strict=True) if row >= 0
+    )  # fmt: skip
+    waters: dict[str, Path] = {}
+    if given.water_per_image is not None:
+        found, few = rasters_of_images(given.water_per_image, [path.name for path in mine])
+        waters = {mine[row].stem: path for row, path in found.items()}
+        notes += [PcfixWarning("water.images_missing", note) for note in few]
+    low = float(np.nanmin(ground.height_m))
+    sizes = [(photo.centre[2] - low) / photo.lens.focal for photo in photos]
+    if not min(sizes) > 0.0:
+        raise GeometryError(
+            "cameras.below_ground",
+            f"{name}: cameras are below the DSM, whose lowest height is {low:.1f} m. Check its CRS"
+            " and vertical datum.",
+            path=name,
+            lowest_m=low,
+        )
     _check_seen(photos, ground, given)
-    notes = (*_brought(given, read, crs), *notes, *more, *few)
-    return Block(tuple(mine), photos, scene, step, notes, crs, gsd, waters)
+    gsd = float(np.median(sizes))
+    step = given.spacing or max(LEAST_STEP_PX, int(np.ceil(ground.cell_m / gsd)))
+    scene = Scene(ground, surface, index_of(given.index, given.index_formula)[0])
+    return PhotoBlock(mine, photos, scene, step, tuple(notes), crs, gsd, waters)
 
 
-def _brought(given: PhotosOptions, read: Cameras, crs: str | None) -> tuple[str, ...]:
-    """Return a note where the cameras were in another CRS than the ground."""
+def read_heights(
+    dsm: File, resolution: float | None, scratch: Path, *, fill: bool
+) -> tuple[FloatArray, tuple[float, float, float], str | None, bool]:
+    """Read a DSM, or grid a cloud in a folder for temporary files.
+
+    Returns
+    -------
+    heights : array, shape (rows, columns)
+    origin : tuple of float
+        Left, top and size of the cells.
+    crs : str or None
+    corrected : bool
+        Whether pcfix made it of a corrected cloud.
+    """
+    path = Path(dsm)
+    if path.suffix.lower() in CLOUDS:
+        grid_dsm(path, scratch / "dsm.tif", resolution=resolution)
+        path = scratch / "dsm.tif"
+    with open_raster(path) as source:
+        t, tags = source.transform, source.tags()
+        crs = None if source.crs is None else source.crs.to_wkt()
+        heights = filled_heights(source, fill=fill)
+    if abs(t.a + t.e) >= 1e-6 * t.a or t.b or t.d:
+        raise InputError(
+            "raster.rotated",
+            f"{dsm}: its cells are rotated or not square. Warp it to north up first.",
+            path=dsm,
+        )
+    corrected = bool(json.loads(tags.get("PCFIX", "{}")).get("corrected"))
+    return heights, (t.c, t.f, t.a), crs, corrected
+
+
+def _transformed_notes(given: PhotosOptions, read: Cameras, crs: str | None) -> list[PcfixWarning]:
+    """Return a note if the cameras have another CRS than the ground."""
     theirs = given.cameras_crs or read.crs
     if theirs is None or crs is None:
-        return ()
+        return []
     own, other = parse_crs(theirs, str(given.cameras)), parse_crs(crs, str(given.dsm))
     if is_same(own, other):
-        return ()
-    return (f"{given.cameras}: its cameras were brought from {own.name} to {other.name}.",)
+        return []
+    words = f"{given.cameras}: its cameras were transformed from {own.name} to {other.name}."
+    return [PcfixWarning("cameras.transformed", words, source=own.name, target=other.name)]
+
+
+def _provenance_notes(corrected: bool, given: PhotosOptions) -> list[PcfixWarning]:
+    """Refuse the DSM of a corrected cloud for the mapping of the paper; note what is unknown."""
+    is_exact = given.mapping == "exact"
+    if corrected and is_exact:
+        return []
+    if corrected:
+        raise SettingError(
+            "dsm.corrected",
+            f"{given.dsm}: is of a corrected cloud, but --mapping paper needs the apparent bed."
+            " Give the DSM of the uncorrected cloud, or --mapping exact.",
+            path=given.dsm,
+        )
+    bed = "the true bed, as from 'pcfix correct'" if is_exact else "the apparent bed"
+    words = f"{given.dsm}: does not state whether it was corrected; it is used as {bed}."
+    return [PcfixWarning("dsm.origin_unknown", words, path=given.dsm)]
+
+
+def _matched(
+    paths: list[Path], cameras: Cameras, name: str
+) -> tuple[list[int], list[PcfixWarning]]:
+    """Return the row of the pose of each photograph, -1 for none, and a note on those without."""
+    by_name: dict[str, int] = {}
+    for row, label in enumerate(cameras.labels):
+        for key in (Path(label).name.lower(), Path(label).stem.lower()):
+            by_name.setdefault(key, row)
+    rows = [by_name.get(p.name.lower(), by_name.get(p.stem.lower(), -1)) for p in paths]
+    lost = [path.name for path, row in zip(paths, rows, strict=True) if row < 0]
+    if len(lost) == len(paths):
+        raise InputError(
+            "photos.no_pose",
+            f"{name}: has no pose of the photographs ({lost[0]} against {cameras.labels[0]})."
+            " Give the folder whose files have the names in the camera file.",
+            path=name,
+            photograph=lost[0],
+        )
+    if not lost:
+        return rows, []
+    words = f"{name}: {len(lost)} photographs have no pose and are ignored, such as {lost[0]}."
+    return rows, [PcfixWarning("photos.no_pose", words, count=len(lost))]
+
+
+def lens_of(path: Path, cameras: Cameras, row: int, size: tuple[int, int]) -> Lens:
+    """Return the lens in pixels of an image of some columns and rows; both must match."""
+    columns, rows = size
+    lenses: Any = cameras.lenses
+    lens: Lens = lenses[row]
+    if lens.unit == "px":
+        matches, scale = size == (round(lens.width), round(lens.height)), 1.0
+    else:
+        scale = columns / lens.width
+        matches = abs(rows / lens.height / scale - 1.0) <= LENS_TOLERANCE
+    if not matches:
+        raise InputError(
+            "photos.size",
+            f"{path}: has {columns} x {rows} pixels, but the camera file says {lens.width:g} x"
+            f" {lens.height:g} {lens.unit}. Give the photographs that were aligned.",
+            path=path,
+            size=size,
+        )
+    if lens.unit == "px":
+        return lens
+    lengths = ("focal", "principal_x", "principal_y", "b1", "b2", "b3")
+    scaled = {one: getattr(lens, one) * scale for one in lengths}
+    return replace(lens, width=columns, height=rows, unit="px", **scaled)
 
 
 def _check_seen(photos: tuple[Photo, ...], ground: Ground, given: PhotosOptions) -> None:
-    """Refuse a ground that no photograph sees anything of."""
+    """Refuse a ground that no image sees."""
     for photo in photos:
         nodes, _ = nodes_of(photo.lens, COARSE_STEP_PX)
         rays = unproject(photo.lens, nodes) @ photo.rotation
         if np.isfinite(ground.hit(photo.centre, rays[np.isfinite(rays).all(axis=1)])).any():
             return
     raise GeometryError(
-        f"{given.dsm}: none of the {len(photos)} photographs sees anything of it; check its CRS"
-        f" against that of {given.cameras} (--cameras-crs, --cameras-offset)."
+        "cameras.no_overlap",
+        f"{given.dsm}: none of the {len(photos)} photographs sees it. Check its CRS and that of"
+        f" {given.cameras} (--cameras-crs, --cameras-offset).",
+        path=given.dsm,
     )
 
 
-def check_above(centres: FloatArray, water: WaterSurface, name: str) -> None:
-    """Refuse cameras that do not stand above the water, where that is known."""
-    under = surface_above(water, centres).height_m >= centres[:, 2]
-    if under.any():
-        raise GeometryError(
-            f"{name}: {int(under.sum())} of {len(centres)} cameras do not stand above the water,"
-            f" the lowest at {centres[:, 2].min():.1f} m; check the CRS and vertical datum of both."
-        )
-
-
-def _waters(given: PhotosOptions, paths: list[Path]) -> tuple[dict[str, Path], tuple[str, ...]]:
-    """Return the rasters of the water that belong to photographs, and a note on the others."""
-    if given.water_per_image is None:
-        return {}, ()
-    found, notes = rasters_of_images(given.water_per_image, [path.name for path in paths])
-    return {paths[row].stem: path for row, path in found.items()}, notes
-
-
-def _heights(
-    given: PhotosOptions, read: Cameras, scratch: Path
-) -> tuple[FloatArray, tuple[float, float, float], Any, tuple[str, ...]]:
-    """Return the raster of heights, its left, top and cell, its CRS, and notes."""
-    path = Path(given.dsm)
-    if path.suffix.lower() in (".las", ".laz"):
-        raster = scratch / "dsm.tif"
-        grid_dsm(path, raster, resolution=given.resolution)
-        path = raster
-    elif given.resolution is not None:
-        raise SettingError("resolution is of a cloud that is gridded; the DSM has its own.")
-    with open_raster(path) as source:
-        transform, tags = source.transform, source.tags()
-        crs = None if source.crs is None else source.crs.to_wkt()
-        height = filled_heights(source, fill=given.holes == "fill")
-    square = abs(transform.a + transform.e) < 1e-6 * transform.a
-    if not (square and transform.b == transform.d == 0.0):
-        raise InputError(f"{path}: its cells are turned or not square; warp it to north up first.")
-    origin = (transform.c, transform.f, transform.a)
-    return height, origin, crs, _provenance(tags, given)
-
-
-def _provenance(tags: dict[str, str], given: PhotosOptions) -> tuple[str, ...]:
-    """Refuse a ground that is known to be the wrong one; say so where it is not known."""
-    corrected = json.loads(tags.get("PCFIX", "{}")).get("corrected")
-    exactly = given.mapping == "exact"
-    if corrected and exactly:
-        return ()
-    if corrected:
-        raise SettingError(
-            f"{given.dsm}: is of a corrected cloud, and --mapping paper needs the bed as it"
-            " appears; give the DSM of the cloud as it came, or --mapping exact."
-        )
-    kind = "the true bed, as 'pcfix correct' gives it" if exactly else "the bed as it appears"
-    return (
-        f"{given.dsm} does not say that it is of a cloud that pcfix corrected; --mapping"
-        f" {given.mapping} takes it for {kind}.",
-    )
-
-
-def _matched(
-    paths: list[Path], cameras: Cameras, name: str
-) -> tuple[list[Path], list[int], tuple[str, ...]]:
-    """Return the photographs that have a pose, its row for each, and notes on the others."""
-    by_name: dict[str, int] = {}
-    for row, label in enumerate(cameras.labels):
-        for key in (Path(label).name.lower(), Path(label).stem.lower()):
-            by_name.setdefault(key, row)
-    rows = [by_name.get(p.name.lower(), by_name.get(p.stem.lower(), -1)) for p in paths]
-    mine = [path for path, row in zip(paths, rows, strict=True) if row >= 0]
-    lost = [path.name for path, row in zip(paths, rows, strict=True) if row < 0]
-    if not mine:
-        raise InputError(
-            f"{name}: knows none of the photographs ({paths[0].name} ... against"
-            f" {cameras.labels[0]} ...); give the folder whose files bear the names of the cameras."
-        )
-    notes = []
-    if lost:
-        notes.append(f"{len(lost)} photographs have no pose in {name} and are left out: {lost[0]}.")
-    return mine, [row for row in rows if row >= 0], tuple(notes)
-
-
-def lens_of(path: Path, cameras: Cameras, row: int, size: tuple[int, int]) -> Lens:
-    """Return the lens in pixels of a photograph of so many columns and rows, which it must have."""
-    columns, rows = size
-    lenses: Any = cameras.lenses
-    lens: Lens = lenses[row]
-    if lens.unit == "px":
-        if (columns, rows) != (round(lens.width), round(lens.height)):
-            raise InputError(
-                f"{path}: has {columns} x {rows} pixels, and the camera file says"
-                f" {lens.width:g} x {lens.height:g}; give the photographs that were aligned."
-            )
-        return lens
-    scale = columns / lens.width
-    if abs(rows / lens.height / scale - 1.0) > LENS_TOLERANCE:
-        raise InputError(
-            f"{path}: has {columns} x {rows} pixels, and the frame of the camera file is"
-            f" {lens.width:g} x {lens.height:g} mm, of another shape."
-        )
-    lengths = ("focal", "principal_x", "principal_y", "b1", "b2", "b3")
-    scaled = {one: getattr(lens, one) * scale for one in lengths}
-    return replace(lens, width=columns, height=rows, unit="px", **scaled)
-
-
-def _ground_pixel_m(photos: tuple[Photo, ...], ground: Ground) -> float:
-    low = float(np.nanmin(ground.height_m))
-    sizes = [(photo.centre[2] - low) / photo.lens.focal for photo in photos]
-    if not min(sizes) > 0.0:
-        raise GeometryError(
-            f"the cameras do not stand above the DSM, whose lowest height is {low:.1f} m; check"
-            " its CRS and vertical datum."
-        )
-    return float(np.median(sizes))
-
-
-def _begin(target: Path, given: PhotosOptions, block: Block, *, overwrite: bool) -> set[str]:
-    """Return the names that an equal call has written, once its record stands in the folder."""
+def _begin(target: Path, given: PhotosOptions, block: PhotoBlock) -> set[str]:
+    """Return the names that an equal call has written, and record this call in the folder."""
     target.mkdir(parents=True, exist_ok=True)
     asked = given.as_dict()
     for name in ("overwrite", "jobs", "summary"):
         asked.pop(name)
-    files = [given.cameras, given.dsm, given.sensor, given.water]
-    files += block.waters.values()
-    states = [file_state(Path(f)) for f in files if f is not None and Path(str(f)).exists()]
-    record = {"pcfix": __version__, "asked": asked, "files": states}
+    record = {
+        "pcfix": __version__,
+        "asked": asked,
+        "files": input_states(given) + [file_state(path) for path in block.waters.values()],
+    }
     place = target / RECORD
     there = {path.name for path in block.paths if (target / path.name).exists()}
-    if there and not overwrite:
+    if there and not given.overwrite:
         if not place.exists() or read_json(place) != json.loads(json.dumps(record)):
             raise SettingError(
-                f"{target / min(there)}: exists, and was not written by an equal call; add"
-                " --overwrite to replace it, or give another folder."
+                "output.exists",
+                f"{target / min(there)}: exists, and was not written by an equal call. Add"
+                " --overwrite to replace it, or give another folder.",
+                path=target / min(there),
             )
         return there
     write_text(place, json_text(record), overwrite=True)
     return set()
 
 
+def input_states(given: PhotosOptions) -> list[dict[str, Any]]:
+    """Return size and time of the input files, to recognise an equal call."""
+    files = [given.cameras, given.dsm, given.sensor, given.water]
+    return [file_state(Path(f)) for f in files if f is not None and Path(str(f)).exists()]
+
+
 @dataclass(frozen=True)
-class _Done:
+class _Written:
     """One photograph that was written."""
 
     name: str
@@ -357,15 +375,22 @@ class _Done:
 
 
 def _all(
-    block: Block, target: Path, old: set[str], mapping: str, progress: Progress | None
-) -> list[_Done]:
-    """Map the photographs that are not there yet, as many at a time as there are threads."""
+    block: PhotoBlock, target: Path, old: set[str], mapping: str, progress: Progress | None
+) -> list[_Written]:
+    """Map the photographs that are not written yet, as many at a time as there are threads."""
     todo = [pair for pair in zip(block.paths, block.photos, strict=True) if pair[0].name not in old]
-    way = exact if mapping == "exact" else paper
-    done: list[_Done] = []
-    workers = max(1, min(cores(), len(todo)))
-    with threads(1), ThreadPoolExecutor(workers) as pool:
-        jobs = [pool.submit(_one, *pair, block, way, target) for pair in todo]
+    mapped: Callable[..., Any] = exact if mapping == "exact" else paper
+
+    def write(path: Path, photo: Photo) -> _Written:
+        shifts = mapped(photo, block.scene_of(path), block.step_px)
+        found = resample(read_photograph(path), shifts)
+        write_photograph(path, target / path.name, found.image, found.touched)
+        pixels, shift = found.touched.size, float(np.abs(shifts.shift_px).max())
+        return _Written(path.name, pixels, round(found.black_share * pixels), shift)
+
+    done: list[_Written] = []
+    with threads(1), ThreadPoolExecutor(max(1, min(cores(), len(todo)))) as pool:
+        jobs = [pool.submit(write, *pair) for pair in todo]
         try:
             for job in jobs:
                 done.append(job.result())
@@ -377,23 +402,15 @@ def _all(
     return done
 
 
-def _one(path: Path, photo: Photo, block: Block, way: Callable[..., Any], target: Path) -> _Done:
-    shifts = way(photo, block.scene_of(path), block.step_px)
-    found = resample(read_photograph(path), shifts)
-    write_photograph(path, target / path.name, found.image, found.touched)
-    pixels = found.touched.size
-    shift = float(np.abs(shifts.shift_px).max())
-    return _Done(path.name, pixels, round(found.black_share * pixels), shift)
-
-
-def _notes(found: list[_Done], given: PhotosOptions) -> list[str]:
-    """Return what is worth a warning of the photographs written."""
+def _black_notes(found: list[_Written], given: PhotosOptions) -> list[PcfixWarning]:
+    """Return a note on photographs that are black over a large part."""
     poor = [one for one in found if one.black > MOST_BLACK * one.pixels]
     if not poor:
         return []
     worst = max(poor, key=lambda one: one.black / one.pixels)
-    return [
-        f"{len(poor)} photographs are black over more than {100 * MOST_BLACK:.0f} %, as"
-        f" {given.dsm} does not cover what they see; {worst.name} over"
-        f" {100 * worst.black / worst.pixels:.0f} %."
-    ]
+    words = (
+        f"{given.dsm}: does not cover all that {len(poor)} photographs see; more than"
+        f" {100 * MOST_BLACK:.0f} % of them is black ({worst.name}:"
+        f" {100 * worst.black / worst.pixels:.0f} %)."
+    )
+    return [PcfixWarning("dsm.too_small", words, photographs=len(poor))]

@@ -1,4 +1,4 @@
-"""The PDAL pipeline that does what a call of `correct_file` does."""
+"""Write the PDAL pipeline that equals a call of `correct_file`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ def stage_for(input: Path, options: CorrectOptions) -> dict[str, Any]:
     """Return the pipeline's stage that corrects, ready for JSON; see `pipeline_for`."""
     if options.uncorrected == "drop":
         raise SettingError(
-            "uncorrected 'drop' takes another stage to drop points; print the whole pipeline."
+            "pipeline.drop",
+            "--uncorrected drop needs a stage that drops points. Print the whole pipeline.",
         )
     job_for(input, options)
     return _stage(options)
@@ -31,18 +32,8 @@ def stage_for(input: Path, options: CorrectOptions) -> dict[str, Any]:
 def pipeline_for(input: Path, output: Path, options: CorrectOptions) -> dict[str, Any]:
     """Return the pipeline, ready for JSON.
 
-    Parameters
-    ----------
-    input, output : Path
-        As of `pcfix.correct_file`. PDAL replaces an output that exists.
-    options : CorrectOptions
-        Those that are not the default become the stage's.
-
-    Raises
-    ------
-    PcfixError
-        If `pcfix.correct_file` would refuse them at its start, or PDAL cannot write the point
-        format.
+    Options that differ from their defaults become those of the stage. PDAL replaces an output that
+    exists. What `pcfix.correct_file` refuses at its start is refused here too.
     """
     check_suffix(output)
     job_for(input, options)
@@ -50,8 +41,11 @@ def pipeline_for(input: Path, output: Path, options: CorrectOptions) -> dict[str
         point_format = source.header.point_format
     if UPGRADE[point_format.id] in (9, 10):
         raise InputError(
-            f"{input}: has waveforms (point format {point_format.id}), which PDAL does not write;"
-            " use 'pcfix correct'."
+            "cloud.waveforms",
+            f"{input}: has waveforms (point format {point_format.id}), which PDAL does not write."
+            " Use 'pcfix correct'.",
+            path=input,
+            point_format=point_format.id,
         )
     drop = options.uncorrected == "drop"
     dropping = {"type": "filters.range", "limits": f"{OUTCOME}[0:1]"}
@@ -72,8 +66,9 @@ def pipeline_for(input: Path, output: Path, options: CorrectOptions) -> dict[str
 def _stage(options: CorrectOptions) -> dict[str, Any]:
     if options.part(PartOptions) != PartOptions():
         raise SettingError(
-            "bounds and read-resolution are the reader's in a pipeline: leave them out, and give"
-            " readers.copc its bounds and resolution."
+            "option.no_use",
+            "--bounds and --read-resolution have no use in a pipeline. Give readers.copc its own.",
+            option="bounds",
         )
     drop, plain = options.uncorrected == "drop", options.plain()
     columns = columns_for(options.dimensions, options.unsure)

@@ -1,10 +1,9 @@
-"""What a flight will bring: the standard errors of its bed, by the kernels that correct clouds.
+"""Predict the accuracy of a planned flight: ``pcfix plan``.
 
-The planned block is flown by the simulator over flat beds, without noise. What its images show is
-intersected as software does that knows of no water, and `pcfix.correct_points` says how uncertain
-the corrected points are, of each part of the error budget alone. Poses are adjusted twice: through
-the water, whose covariance is what adjusted poses add, and by straight rays, which shows how much
-of the refraction poses and focal length take up.
+The block is simulated over flat beds without noise, the apparent points are intersected with
+straight rays, and `pcfix.correct_points` gives the standard errors of the corrected points for each
+part of the error budget. Poses are adjusted twice: through the water, whose covariance is what
+adjusted poses add, and by straight rays, which shows how much of the refraction is absorbed.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ from pcfix.options.handover import PlanOptions
 from pcfix.refract.batch import Survey
 from pcfix.report.page import png_of
 from pcfix.report.plan import Alternative, DepthPlan, Plan, plan_figure
-from pcfix.simulate.block import fly_block
+from pcfix.simulate.block import Block, fly_block
 from pcfix.simulate.scene import Streams, lay_out, points_on
 from pcfix.simulate.settings import SceneSettings
 from pcfix.simulate.sight import see
@@ -45,7 +44,7 @@ from pcfix.water.index import index_of
 POINTS = 400
 """Of each bed; they are also the tie points of the adjustments."""
 MOST_BASES, MOST_SPACINGS = 8, 4
-"""The block that is computed is no larger: farther inside, it is the same again."""
+"""Limits of the simulated block: farther inside, the geometry repeats."""
 FEWEST_SEEN, NOTHING_PX = 50, 1e-6
 PARTS = {
     "image": ("sigma_image",), "level": ("sigma_level", "sigma_tilt"), "waves": ("sigma_waves",),
@@ -54,7 +53,7 @@ PARTS = {
 
 
 class _Bed(NamedTuple):
-    """The points of a flat bed that three images show, and where they show them, pixels."""
+    """The points of a flat bed in three or more images, and their pixels there."""
 
     truth: FloatArray
     apparent: FloatArray
@@ -73,12 +72,12 @@ def plan_flight(
     progress: Callable[[int, int], None] | None = None,
     **keywords: Any,
 ) -> Plan:
-    """Predict what a flight over water will measure, and what would make it better.
+    """Predict the accuracy of a planned flight, and what would improve it.
 
     Parameters
     ----------
     options : PlanOptions, optional
-        Or its attributes as keywords, as of ``pcfix plan``: height, overlap, sidelap, obliques,
+        Or its attributes as keywords, as for ``pcfix plan``: height, overlap, sidelap, obliques,
         lens, area, depth, gnss_sigma, index, and the standard deviations of ``pcfix correct``.
     progress : callable, optional
         Called with (steps done, steps in all).
@@ -86,11 +85,6 @@ def plan_flight(
     Returns
     -------
     Plan
-
-    Raises
-    ------
-    SettingError
-        If an option is outside its rule, or the images do not overlap enough.
 
     Examples
     --------
@@ -105,45 +99,41 @@ def plan_flight(
         check_output(given.plot, overwrite=given.overwrite)
     deepest = max(given.depth)
     others = _alternatives(given)
-    steps, done = len(given.depth) + len(others), 0
+    steps = len(given.depth) + len(others)
+    beds: list[DepthPlan] = []
+    tried: list[Alternative] = []
 
     def step() -> None:
-        nonlocal done
-        done += 1
         if progress is not None:
-            progress(done, steps)
+            progress(len(beds) + len(tried), steps)
 
-    beds, tried = [], []
-    with threads(1):  # so few points are not worth sharing out
+    with threads(1):  # for so few points, threads do not pay
         for depth in given.depth:
             beds.append(_depth_plan(given, depth))
             step()
         for words, other in others:
             sigma_m = _sigma(other, _bed(other, deepest))[1]
-            tried.append(Alternative(words, _images(other), sigma_m))
+            images = len(_flown(other).cameras)
+            tried.append(Alternative(words, images, sigma_m))
             step()
-    plan = _plan(given, tuple(beds), tuple(tried))
+    scene = _scene(given, deepest)
+    off_nadir = float(np.degrees(np.arctan(scene.optics.reach))) + (given.obliques or 0.0)
+    plan = Plan(
+        cameras=_flown(given).cameras, area_m=given.area, height_m=given.height,
+        gsd_m=scene.gsd_m, base_m=scene.base_and_spacing_m[0],
+        spacing_m=scene.base_and_spacing_m[1], obliques_deg=given.obliques,
+        overlap=given.overlap, sidelap=given.sidelap, flattest_deg=off_nadir,
+        index=scene.refractive_index, gnss_sigma_m=given.gnss_sigma,
+        budget=given.part(BudgetOptions).as_dict(), depths=tuple(beds), alternatives=tuple(tried),
+    )  # fmt: skip
     if given.plot is not None:
         write_bytes(given.plot, png_of(plan_figure(plan)), overwrite=given.overwrite)
     write_summary(given, plan.as_dict())
     return plan
 
 
-def _plan(given: PlanOptions, beds: tuple[DepthPlan, ...], tried: tuple[Alternative, ...]) -> Plan:
-    scene = _scene(given, max(given.depth))
-    flown = fly_block(given.area, scene, Streams.of(scene.seed).main).cameras
-    off_nadir = float(np.degrees(np.arctan(scene.optics.reach))) + (given.obliques or 0.0)
-    return Plan(
-        cameras=flown, area_m=given.area, height_m=given.height, gsd_m=scene.gsd_m,
-        base_m=scene.base_and_spacing_m[0], spacing_m=scene.base_and_spacing_m[1],
-        obliques_deg=given.obliques, overlap=given.overlap, sidelap=given.sidelap,
-        flattest_deg=off_nadir, index=scene.refractive_index, gnss_sigma_m=given.gnss_sigma,
-        budget=given.part(BudgetOptions).as_dict(), depths=beds, alternatives=tried,
-    )  # fmt: skip
-
-
 def _alternatives(given: PlanOptions) -> list[tuple[str, PlanOptions]]:
-    """Return other flights, each with what is different about it."""
+    """Return other flights, each with its changed option."""
     overlap, height = 0.5 + 0.5 * given.overlap, round(0.7 * given.height, 1)
     found = [(f"--height {height:g}", replace(given, height=height))]
     if overlap <= 0.95:
@@ -166,13 +156,14 @@ def _scene(given: PlanOptions, depth_m: float) -> SceneSettings:
     )  # fmt: skip
 
 
-def _images(given: PlanOptions) -> int:
+def _flown(given: PlanOptions) -> Block:
+    """Return the whole block of the flight."""
     scene = _scene(given, max(given.depth))
-    return len(fly_block(given.area, scene, Streams.of(scene.seed).main).cameras)
+    return fly_block(given.area, scene, Streams.of(scene.seed).main)
 
 
 def _bed(given: PlanOptions, depth_m: float) -> _Bed:
-    """Return what the images show of a flat bed, and where straight rays put it."""
+    """Return the image points of a flat bed, and its apparent points by straight rays."""
     scene = _scene(given, depth_m)
     most = (MOST_BASES, MOST_SPACINGS) * np.array(scene.base_and_spacing_m)
     scene = replace(scene, area_m=tuple(np.minimum(scene.area_m, most).tolist()))
@@ -182,9 +173,12 @@ def _bed(given: PlanOptions, depth_m: float) -> _Bed:
     seen = np.flatnonzero(sight.paired)
     if len(seen) < FEWEST_SEEN:
         raise SettingError(
-            f"overlap {given.overlap:g} and sidelap {given.sidelap:g}: only"
-            f" {100 * len(seen) / POINTS:.0f} % of a bed {depth_m:g} m deep is seen by three"
-            " images; give more overlap."
+            "plan.overlap",
+            f"Overlap {given.overlap:g} and sidelap {given.sidelap:g}: three images see only"
+            f" {100 * len(seen) / POINTS:.0f} % of a bed {depth_m:g} m deep. Give more overlap.",
+            overlap=given.overlap,
+            sidelap=given.sidelap,
+            share=len(seen) / POINTS,
         )
     views = Views(sight.start, sight.camera).take(seen)
     apparent = sight.intersected(sight.ideal)[seen]
@@ -195,7 +189,7 @@ def _bed(given: PlanOptions, depth_m: float) -> _Bed:
 
 
 def _budget(given: PlanOptions, bed: _Bed, part: str = "") -> Correction:
-    """Return the bed corrected, its standard errors of the whole budget, or one part of it."""
+    """Correct the bed, with standard errors of the whole budget or of one part."""
     options = _refraction(given)
     if part:
         off: dict[str, Any] = {
@@ -235,9 +229,9 @@ def _depth_plan(given: PlanOptions, depth_m: float) -> DepthPlan:
 
 
 def _sigma(given: PlanOptions, bed: _Bed) -> tuple[Correction, float, float]:
-    """Return a bed corrected, its standard error, and what of that adjusted poses add.
+    """Return a corrected bed, its standard error, and the part from adjusted poses.
 
-    Where nothing is said of the poses they are those of an adjustment through the water.
+    If no precision of the poses is given, they are those of an adjustment through the water.
     """
     whole, adjusted = _budget(given, bed), 0.0
     if given.sigma_centre == given.sigma_attitude == 0.0:
@@ -259,10 +253,10 @@ def _of_adjusted_poses(given: PlanOptions, bed: _Bed) -> float:
 
 
 def _absorbed(given: PlanOptions, bed: _Bed) -> tuple[float, float]:
-    """Return the share of the misfit that straight rays hide, and by how much the bed is off then.
+    """Return the absorbed share of the refraction, and the bias of the bed with such poses.
 
-    The misfit is that of straight rays in the images at the true poses; the bed is corrected with
-    the poses that have taken their share of it, true minus corrected height, metres.
+    The share is of the misfit of straight rays at the true poses; the bias, true minus corrected
+    height, is of the bed corrected with the adjusted poses.
     """
     problem, start = _prepared(given, bed, through_water=False)
     found = solve(problem, start)

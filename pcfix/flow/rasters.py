@@ -1,4 +1,4 @@
-"""The rasters that a run leaves for a GIS: surface, bed, depth, uncertainty, shaded picture."""
+"""The rasters that a run writes for a GIS: surface, bed, depth, uncertainty, shaded relief."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from pcfix.options.steps import DsmOptions, DsmRules
 SURFACE, BED, DEPTH, UNCERTAINTY = "surface.tif", "bed.tif", "depth.tif", "uncertainty.tif"
 COUNTS, SHADED = "surface_counts.tif", "shaded.tif"
 HOLE_CELLS = 3.0
-"""Holes up to so wide are filled: where points lie at random one cell in twenty has none."""
+"""Width of holes that are filled: of cells with random points, one in twenty is empty."""
 SUN_DEG = 315.0, 45.0
 
 
 def raster_files(folder: Path, *, errors: bool) -> list[Path]:
-    """Return what `write_rasters` leaves: the uncertainty where the cloud has standard errors."""
+    """Return the files of `write_rasters`; `errors` is whether the cloud has standard errors."""
     maps = [SURFACE, BED, DEPTH, *([UNCERTAINTY] if errors else [])]
     files = [folder / name for name in (*maps, COUNTS, SHADED)]
     return [*files, *((folder / name).with_suffix(".qml") for name in maps)]
@@ -43,8 +43,8 @@ def write_rasters(
 ) -> dict[str, Any]:  # fmt: skip
     """Write all rasters of a corrected cloud as cloud optimised GeoTIFF, with styles for QGIS.
 
-    Without a resolution the cells have 2 to 4 points, and are no smaller than a pixel on the
-    ground. Returns what ``run.json`` keeps.
+    By default the cells have 2 to 4 points, and are no smaller than a pixel on the ground. Returns
+    the facts for ``run.json``.
     """
     gsd_m = _gsd_m(cloud, cameras)
     spacing_m = point_spacing_m(cloud, DsmRules())
@@ -72,17 +72,16 @@ def write_rasters(
 
 
 def resolution_sentence(made: dict[str, Any], *, given: bool) -> str:
-    """Say how large the cells of the rasters are, and why."""
-    parts = (
-        [] if made["points_per_cell"] is None else [f"{made['points_per_cell']:.1f} points each"]
-    )
-    parts += [] if made["gsd_m"] is None else [f"GSD {made['gsd_m']:.2g} m"]
+    """Return the size of the cells of the rasters, and its reason."""
+    density, gsd_m = made["points_per_cell"], made["gsd_m"]
+    parts = [] if density is None else [f"{density:.1f} points each"]
+    parts += [] if gsd_m is None else [f"GSD {gsd_m:.2g} m"]
     more = f" ({', '.join(parts)})" if parts else ""
     return f", cells of {made['resolution_m']:g} m{', as given' if given else ''}{more}"
 
 
 def _gsd_m(cloud: Path | Tiles, cameras: Cameras) -> float | None:
-    """Return the size of a pixel on the ground, straight down, median; None without lenses."""
+    """Return the size of a pixel on the ground at nadir, median; None without lenses."""
     if not cameras.lenses:
         return None
     with open_cloud(cloud) as source:

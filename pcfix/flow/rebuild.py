@@ -1,8 +1,7 @@
-"""Rounds: photographs without water, a cloud from them, its DSM, and again until the bed stays.
+"""Rebuild a cloud in rounds: photographs without water, a cloud from them, its DSM, and again.
 
-The workflow of Fig 10 of Skarlatos & Agrafiotis 2018. Each round starts from the photographs as
-they were taken, and from the DSM of the round before. With the mapping ``exact`` and the true bed
-the first round ends it: the rebuilt cloud is free of refraction, and lies where the DSM does.
+The workflow of Fig 10 of Skarlatos & Agrafiotis 2018. Each round starts from the original images
+and the DSM of the round before. With the mapping ``exact`` and the true bed, one round is enough.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ import numpy as np
 from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError
 from pcfix.flow.compare import compare_clouds
 from pcfix.flow.dsm import grid_dsm
-from pcfix.flow.photos import Block, block_of, map_photos
+from pcfix.flow.photos import CLOUDS, PhotoBlock, block_of, input_states, map_photos, plain
 from pcfix.flow.runner import Progress, check_summary, json_text, write_summary
 from pcfix.io.files import check_input, file_state, read_json, run_logged, write_text
 from pcfix.io.las.writing import write_points
@@ -44,9 +43,7 @@ STEREO_CELL_PIXELS = 2.0
 STEREO_STEP_M = 0.001
 CACHED_PHOTOGRAPHS = 16
 COMMAND_ONLY = ("overwrite", "jobs", "summary", "rebuild", "until_gsd", "most_rounds", "reference")
-"""Options that a later call may change and still go on from the rounds that are there."""
-NOT_SAID = ".*does not say that it is of a cloud.*"
-"""Said of the DSM given; those of later rounds are pcfix's own."""
+"""Options that a later call may change and still resume."""
 
 
 def rebuild_rounds(
@@ -63,11 +60,11 @@ def rebuild_rounds(
     Parameters
     ----------
     images : path
-        Folder of photographs, as of `pcfix.flow.photos.map_photos`.
+        Folder of photographs, as for `pcfix.flow.photos.map_photos`.
     out : path
-        Folder, made where it is missing. Each round leaves ``images``, ``cloud.laz``, ``dsm.tif``
-        and ``difference.tif`` (from the DSM before) in a folder ``round1``, ``round2`` ...; rounds
-        that an equal call has finished are not repeated.
+        Folder, created if needed. Each round writes ``images``, ``cloud.laz``, ``dsm.tif`` and
+        ``difference.tif`` (from the DSM before) in a folder ``round1``, ``round2`` ... Rounds that
+        an equal call has finished are skipped.
     options : PhotosOptions, optional
         Or its attributes as keywords, rebuild among them.
     progress : callable, optional
@@ -75,93 +72,88 @@ def rebuild_rounds(
     say : callable, optional
         Called with a line for each round.
 
-    Returns
-    -------
-    RebuildSummary
-
     Raises
     ------
     PcfixError
-        With one sentence on what to mend; rounds that were finished stay.
+        Rounds that are finished are kept.
     """
     started = time.perf_counter()
     given = taken(PhotosOptions, options, keywords, "rebuild_rounds")
     if given.rebuild is None:
-        raise SettingError("rebuild is missing: give stereo, or a command.")
+        raise SettingError(
+            "option.missing", "--rebuild is missing. Give stereo, or a command.", option="rebuild"
+        )
     paths, target = photographs_in(Path(images)), Path(out)
     check_summary(given)
     if given.reference is not None:
         check_input(given.reference)
     target.mkdir(parents=True, exist_ok=True)
-    record = _Record.opened(target, given)
+    record = _opened(target, given)
+    finished = sum("mean_m" in one for one in record["rounds"])
+    start = str(given.dsm) if Path(given.dsm).suffix.lower() in CLOUDS else None
     given = _with_raster(given, target)
     with threads(given.jobs), TemporaryDirectory() as scratch:
         block = block_of(given, paths, Path(scratch))
-    run = _Run(Path(images), target, given, block, progress)
-    rounds, notes, settled = run.all(record, say or (lambda text: None))
-    compare = _compare_words(rounds, record.start_cloud, given, target)
-    compared = _compared(rounds, record.start_cloud, given, target)
+    run = _Run(Path(images), target, given, block, progress, record)
+    rounds: list[Round] = []
+    notes: list[PcfixWarning] = []
+    settled = False
+    while len(rounds) < given.most_rounds and not settled:
+        number = len(rounds) + 1
+        one = run.round(number, Path(rounds[-1].dsm) if rounds else Path(given.dsm))
+        rounds.append(one)
+        if say is not None:
+            say(
+                f"Round {number}: the bed moved by {one.mean_m:+.3f} m (standard deviation"
+                f" {one.sd_m:.3f} m), {100 * one.within_gsd:.0f} % of it by at most one pixel"
+            )
+        if number == PAPER_ROUNDS and given.mapping == "paper":
+            notes.append(_paper_note(block.scene.refractive_index))
+            warnings.warn(notes[-1], stacklevel=2)
+        settled = abs(one.mean_m) < run.threshold_m
+    compare = _compare_words(rounds, start, given, target)
+    compared = _compared(rounds, start, given, target)
     summary = RebuildSummary(
-        tuple(rounds), record.finished, settled, round(block.gsd_m, 5), run.threshold_m,
+        tuple(rounds), min(finished, run.first_new - 1), settled, round(block.gsd_m, 5),
+        run.threshold_m,
         round(time.perf_counter() - started, 3), given.mapping, given.rebuild or "",
         shlex.join(compare), compared, tuple(notes),
     )  # fmt: skip
-    write_summary(given, asdict(summary))
+    write_summary(given, plain(summary))
     return summary
 
 
-@dataclass
-class _Record:
-    """What is kept of the rounds: what was asked, and what each has left."""
-
-    path: Path
-    content: dict[str, Any]
-    finished: int
-    start_cloud: str | None
-
-    @classmethod
-    def opened(cls, target: Path, given: PhotosOptions) -> _Record:
-        """Return the record of a folder, a new one where there is none or it is replaced."""
-        path = target / RECORD
-        asked = {k: str(v) for k, v in given.as_dict().items() if k not in COMMAND_ONLY}
-        files = [given.cameras, given.dsm, given.sensor, given.water]
-        known = [Path(str(f)) for f in files if f is not None and Path(str(f)).exists()]
-        states = [file_state(one) for one in known]
-        new = {"pcfix": __version__, "asked": asked, "files": states}
-        is_cloud = Path(given.dsm).suffix.lower() in (".las", ".laz")
-        start = str(given.dsm) if is_cloud else None
-        old = read_json(path) if path.exists() and not given.overwrite else None
-        if old is None:
-            for folder in target.glob("round[0-9]*"):
-                if not given.overwrite:
-                    raise SettingError(
-                        f"{folder}: exists; add --overwrite, or give another folder."
-                    )
-                shutil.rmtree(folder)
-            write_text(path, json_text(new | {"rounds": []}), overwrite=True)
-            return cls(path, new | {"rounds": []}, 0, start)
-        if {k: old.get(k) for k in new} != json.loads(json.dumps(new)):
+def _opened(target: Path, given: PhotosOptions) -> dict[str, Any]:
+    """Return the record of a folder: the options and inputs, and the rounds that it has."""
+    path = target / RECORD
+    asked = {k: str(v) for k, v in given.as_dict().items() if k not in COMMAND_ONLY}
+    new: dict[str, Any] = {"pcfix": __version__, "asked": asked, "files": input_states(given)}
+    if path.exists() and not given.overwrite:
+        old: dict[str, Any] = read_json(path)
+        if {name: old.get(name) for name in new} != json.loads(json.dumps(new)):
             raise SettingError(
-                f"{target}: holds the rounds of another call; add --overwrite to replace them, or"
-                " give another folder."
+                "output.exists",
+                f"{target}: has the rounds of another call. Add --overwrite to replace them,"
+                " or give another folder.",
+                path=target,
             )
-        whole = [one for one in old["rounds"] if "mean_m" in one]
-        return cls(path, old, len(whole), start)
-
-    def of(self, number: int) -> dict[str, Any]:
-        """Return what a round has left so far."""
-        rounds = self.content["rounds"]
-        return dict(rounds[number - 1]) if number <= len(rounds) else {}
-
-    def keep(self, number: int, left: dict[str, Any]) -> None:
-        """Keep what a round has left."""
-        self.content["rounds"][number - 1 :] = [left]
-        write_text(self.path, json_text(self.content), overwrite=True)
+        return old
+    for folder in target.glob("round[0-9]*"):
+        if not given.overwrite:
+            raise SettingError(
+                "output.exists",
+                f"{folder}: exists. Add --overwrite, or give another folder.",
+                path=folder,
+            )
+        shutil.rmtree(folder)
+    new["rounds"] = []
+    write_text(path, json_text(new), overwrite=True)
+    return new
 
 
 def _with_raster(given: PhotosOptions, target: Path) -> PhotosOptions:
-    """Return options whose DSM is a raster: that of a cloud stays in the folder."""
-    if Path(given.dsm).suffix.lower() not in (".las", ".laz"):
+    """Return options whose DSM is a raster; a cloud is gridded to the folder."""
+    if Path(given.dsm).suffix.lower() not in CLOUDS:
         return given
     raster = target / "dsm.tif"
     fresh = raster.exists() and raster.stat().st_mtime_ns > Path(given.dsm).stat().st_mtime_ns
@@ -170,70 +162,56 @@ def _with_raster(given: PhotosOptions, target: Path) -> PhotosOptions:
     return replace(given, dsm=raster, resolution=None)
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Run:
-    """Photographs, where their rounds go, and how."""
+    """The rounds of one call, and what they share."""
 
     images: Path
     target: Path
     given: PhotosOptions
-    block: Block
+    block: PhotoBlock
     progress: Progress | None
+    record: dict[str, Any]
+    first_new: int = 1_000_000
+    """Number of the first round that was not finished before."""
 
     @property
     def threshold_m(self) -> float:
-        """How little the bed may move for the last time."""
+        """The rounds end when the bed moves by less than this."""
         return round(self.given.until_gsd * self.block.gsd_m, 5)
 
-    def all(
-        self, record: _Record, say: Callable[[str], None]
-    ) -> tuple[list[Round], list[str], bool]:
-        """Return the rounds, notes on them, and whether the last one settled it."""
-        rounds: list[Round] = []
-        notes: list[str] = []
-        before = Path(self.given.dsm)
-        while len(rounds) < self.given.most_rounds:
-            number = len(rounds) + 1
-            one = self.round(number, before, record)
-            rounds.append(one)
-            before = Path(one.dsm)
-            say(
-                f"round {number}: the bed moved by {one.mean_m:+.3f} m (sd {one.sd_m:.3f} m),"
-                f" {100 * one.within_gsd:.0f} % of it by less than a ground pixel"
-            )
-            if number == PAPER_ROUNDS and self.given.mapping == "paper":
-                notes.append(self._paper_note())
-                warnings.warn(notes[-1], PcfixWarning, stacklevel=3)
-            if abs(one.mean_m) < self.threshold_m:
-                return rounds, notes, True
-        return rounds, notes, False
-
-    def round(self, number: int, before: Path, record: _Record) -> Round:
-        """Return a round, made anew where it was not finished."""
+    def round(self, number: int, before: Path) -> Round:
+        """Return a round; its parts that are finished are skipped."""
         folder = self.target / f"round{number}"
         cloud, dsm = folder / "cloud.laz", folder / "dsm.tif"
-        left = record.of(number)
+        rounds = self.record["rounds"]
+        left = rounds[number - 1] if number <= len(rounds) else {}
         made = cloud.exists() and left.get("state") == file_state(cloud)
         if made and "mean_m" in left and dsm.exists():
             return Round(**{name: left[name] for name in Round.__dataclass_fields__})
-        record.finished = min(record.finished, number - 1)
+        self.first_new = min(self.first_new, number)
         with warnings.catch_warnings():
-            if number > 1:
-                warnings.filterwarnings("ignore", NOT_SAID, PcfixWarning)
+            if number > 1:  # the DSM is pcfix's own
+                warnings.filterwarnings("ignore", ".*does not state whether", PcfixWarning)
             if not made:
-                self._photographs(folder / "images", before)
+                how = replace(
+                    self.given, dsm=before, resolution=None, summary=None,
+                    **RebuildOptions().as_dict(),
+                )  # fmt: skip
+                map_photos(self.images, folder / "images", options=how, progress=self.progress)
                 self._cloud(number, folder / "images", cloud)
-                record.keep(number, {"command": self.given.rebuild, "state": file_state(cloud)})
+                left = {"command": self.given.rebuild, "state": file_state(cloud)}
+                self._keep(number, left)
             cell = self.block.scene.ground.cell_m
             grid_dsm(cloud, dsm, resolution=cell, overwrite=True)
         one = self._difference(cloud, dsm, before)
-        record.keep(number, {**record.of(number), **asdict(one)})
+        self._keep(number, {**left, **asdict(one)})
         return one
 
-    def _photographs(self, folder: Path, before: Path) -> None:
-        plain = RebuildOptions().as_dict()
-        how = replace(self.given, dsm=before, resolution=None, summary=None, **plain)
-        map_photos(self.images, folder, options=how, progress=self.progress)
+    def _keep(self, number: int, left: dict[str, Any]) -> None:
+        """Record a round, for a later call to resume."""
+        self.record["rounds"][number - 1 :] = [left]
+        write_text(self.target / RECORD, json_text(self.record), overwrite=True)
 
     def _cloud(self, number: int, images: Path, cloud: Path) -> None:
         """Make the cloud, by a program of the user's or by stereo pairs."""
@@ -249,10 +227,14 @@ class _Run:
         code, last = run_logged(words, log)
         if code == 0 and cloud.exists():
             return None
-        wrong = f"ended with code {code}" if code else f"left no {cloud}"
+        wrong = f"ended with code {code}" if code else f"wrote no {cloud}"
         raise InputError(
-            f"--rebuild {wrong} in round {number}, and said: {' / '.join(last) or 'nothing'} (all"
-            f" of it in {log}); mend it and call again, which goes on from {images}."
+            "rebuild.failed",
+            f"--rebuild {wrong} in round {number}: {' / '.join(last) or 'no message'} (see {log})."
+            " Correct it and call again, which resumes here.",
+            exit_code=code,
+            round=number,
+            log=log,
         )
 
     def _stereo(self, images: Path, cloud: Path) -> None:
@@ -261,13 +243,12 @@ class _Run:
         @lru_cache(maxsize=CACHED_PHOTOGRAPHS)
         def picture(row: int) -> Grey:
             pixels = read_colours(images / self.block.paths[row].name)
-            blank = blank_in(pixels)
-            grey = pixels[..., 0] if pixels.shape[2] < 3 else None
-            if grey is None:
+            grey = pixels[..., 0]
+            if pixels.shape[2] >= 3:
                 grey = cv2.cvtColor(np.ascontiguousarray(pixels[..., :3]), cv2.COLOR_RGB2GRAY)
             if grey.dtype == np.uint16:
                 grey = (grey >> 8).astype(np.uint8)
-            return Grey(np.ascontiguousarray(grey), blank)
+            return Grey(np.ascontiguousarray(grey), blank_in(pixels))
 
         ground = self.block.scene.ground
         side = STEREO_CELL_PIXELS * self.block.gsd_m
@@ -288,13 +269,15 @@ class _Run:
         wet[row, column] = np.nan_to_num(water - xyz[:, 2], nan=0.0) > 0.0
         return round_of((str(cloud), str(dsm)), moved, wet, self.block.gsd_m)
 
-    def _paper_note(self) -> str:
-        index = self.block.scene.refractive_index
-        return (
-            "--mapping paper tends to the apparent depth over 2 - n, not to n times it: with n ="
-            f" {index:g} the bed ends up to {100 * paper_excess(index):.0f} % of its depth too"
-            " deep; correct the cloud and take --mapping exact for the true one."
-        )
+
+def _paper_note(index: float) -> PcfixWarning:
+    excess = paper_excess(index)
+    return PcfixWarning(
+        "photos.paper_limit",
+        "--mapping paper tends to the apparent depth over 2 - n, here up to"
+        f" {100 * excess:.0f} % too deep. Correct the cloud and use --mapping exact.",
+        excess=excess,
+    )
 
 
 def _others(rounds: list[Round], start: str | None) -> dict[str, str]:
@@ -306,10 +289,9 @@ def _others(rounds: list[Round], start: str | None) -> dict[str, str]:
 def _compare_words(
     rounds: list[Round], start: str | None, given: PhotosOptions, target: Path
 ) -> list[str]:
-    """Return the command that gives Figs 16, 18 and 20; the first cloud as reference 15 and 17."""
-    reference = "REFERENCE" if given.reference is None else str(given.reference)
-    words = ["pcfix", "compare", rounds[-1].cloud, reference, "--water", str(given.water)]
-    words += ["--submerged", "--out-dir", str(target / "compare")]
+    """Return the command that gives Figs 16, 18 and 20; with the first cloud 15 and 17."""
+    words = ["pcfix", "compare", rounds[-1].cloud, str(given.reference or "REFERENCE")]
+    words += ["--water", str(given.water), "--submerged", "--out-dir", str(target / "compare")]
     for name, cloud in _others(rounds, start).items():
         words += ["--also", f"{name}={cloud}"]
     return words
@@ -318,7 +300,7 @@ def _compare_words(
 def _compared(
     rounds: list[Round], start: str | None, given: PhotosOptions, target: Path
 ) -> str | None:
-    """Compare the clouds with a reference, where one was named; a failure loses no round."""
+    """Compare the clouds with a reference, if one was given; a failure loses no round."""
     if given.reference is None:
         return None
     folder = target / "compare"
@@ -328,6 +310,7 @@ def _compared(
             also=_others(rounds, start), overwrite=True,
         )  # fmt: skip
     except PcfixError as error:
-        warnings.warn(f"the rounds are done, but {error}", PcfixWarning, stacklevel=3)
+        words = f"The rounds are finished, but not compared: {error}"
+        warnings.warn(PcfixWarning("rebuild.not_compared", words, cause=error.code), stacklevel=3)
         return None
     return str(folder)

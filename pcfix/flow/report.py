@@ -1,11 +1,10 @@
-"""The report on a corrected cloud: read it once, and write its page and pictures."""
+"""Read a corrected cloud once, and write its report page and figures."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -25,13 +24,13 @@ from pcfix.report.run import NOTHING_LATER, Corrected, Later, run_report
 NEEDED = (*SHIFTS, "WaterDepth", "RayCount")
 SIGMA_Z = "SigmaZ"
 SAMPLE_POINTS = 200_000
-"""Points whose numbers go into histogram and picture, evenly spread over the file."""
+"""Points in histogram and uncertainty figure, evenly spread over the file."""
 NO_SURVEY = Survey()
 PAGE = "report.html"
 ENDINGS = (".laz", ".las", ".tif", ".gpkg", ".csv", ".html", ".json")
 RESULTS = {
-    "corrected.laz": "all points, the bed where it is",
-    "cleaned.laz": "the same, outliers flagged as noise",
+    "corrected.laz": "all points, the bed corrected",
+    "cleaned.laz": "the same, with outliers flagged as noise",
     "depth.tif": "depth below the water",
     "bed.tif": "heights of the bed",
     "surface.tif": "heights of land and bed",
@@ -39,7 +38,7 @@ RESULTS = {
     "surface_counts.tif": "points of each cell, and their spread",
     "shaded.tif": "coloured, shaded relief",
     "map.gpkg": "contours, waterline and other lines and places, for a GIS",
-    "run.json": "what was asked for, and what came out",
+    "run.json": "options and results of the run",
     "compare/compare.json": "all figures of the comparison",
     "compare/depth_bins.csv": "errors by depth",
     "compare/shore_bins.csv": "errors by distance from the shore",
@@ -47,7 +46,7 @@ RESULTS = {
     "compare/reference_dsm.tif": "heights of the reference",
     "adjusted/report.html": "the adjustment of the cameras",
 }
-"""By name; those that are not there are not listed."""
+"""The results of a run by name; only existing ones are listed."""
 
 
 def write_report(
@@ -67,41 +66,24 @@ def write_report(
     Parameters
     ----------
     corrected : Path or Tiles
-        A cloud that `correct_file` wrote with all dimensions, cleaned or not.
+        A cloud from `correct_file` with all dimensions, cleaned or not.
     out_dir : Path
         A folder that exists.
-    summary : Summary
-        What `correct_file` returned.
-    cameras, water
-        What it was given.
+    summary, cameras, water
+        The result and the inputs of `correct_file`.
     inputs : sequence of Path
         Files whose size and checksum the page lists.
     survey : Survey
-        Name of the project and date of the images, where they are known.
+        Name of the project and date of the images.
     later : Later
-        What other steps of a run add.
-    overwrite : bool
-        Replace a report that is there.
-
-    Returns
-    -------
-    Report
-        What the page says.
-
-    Raises
-    ------
-    InputError
-        If the cloud lacks the dimensions.
+        The results of other steps of a run.
     """
-    told = _read(corrected, later.resolution_m)
     rows = [[path.name, f"{path.stat().st_size:,}", sha256(path)] for path in inputs]
-    found = Corrected(
-        summary, replace(survey, crs=told.crs, heights=told.heights), cameras, water, told.maps,
-        told.depth_m, told.sample,
-    )  # fmt: skip
-    report = run_report(
-        found, Table("Input files", ["file", "bytes", "SHA-256"], rows), _beside(out_dir), later
-    )
+    maps, depth_m, sample, crs, heights = _read(corrected, later.resolution_m)
+    survey = replace(survey, crs=crs, heights=heights)
+    found = Corrected(summary, survey, cameras, water, maps, depth_m, sample)
+    table = Table("Input files", ["file", "bytes", "SHA-256"], rows)
+    report = run_report(found, table, _beside(out_dir), later)
     figures = out_dir / "figures"
     figures.mkdir(exist_ok=True)
     for picture in report.pictures:
@@ -111,7 +93,7 @@ def write_report(
 
 
 def _beside(folder: Path) -> list[tuple[str, str]]:
-    """Return the results that lie beside the page, and what they are."""
+    """Return the files beside the page, and their contents."""
     found = [path for pattern in ("*", "*/*") for path in sorted(folder.glob(pattern))]
     names = [path.relative_to(folder).as_posix() for path in found if path.is_file()]
     tiled = {f"{name[:-4]}/": words for name, words in RESULTS.items() if name.endswith(".laz")}
@@ -123,44 +105,41 @@ def _beside(folder: Path) -> list[tuple[str, str]]:
     ]
 
 
-class _Told(NamedTuple):
-    """What a corrected cloud says."""
+def _read(
+    path: Path | Tiles, resolution_m: float | None
+) -> tuple[Maps, dict[str, float], FloatArray, str, str]:
+    """Return maps, depths, a sample, CRS and vertical datum of a cloud, without noise.
 
-    maps: Maps
-    sample: FloatArray
-    depth_m: dict[str, float]
-    crs: str
-    heights: str
-
-
-def _read(path: Path | Tiles, resolution_m: float | None) -> _Told:
-    """Read a corrected cloud, without noise and what is withheld."""
+    The sample, shape (m, 3), has shift in Z, depth and standard error of Z of corrected points.
+    """
     with open_cloud(path) as source:
-        missing = set(NEEDED).difference(source.header.point_format.dimension_names)
-        if missing:
+        dimensions = set(source.header.point_format.dimension_names)
+        if missing := set(NEEDED) - dimensions:
             raise InputError(
-                f"{path}: has no dimensions {', '.join(sorted(missing))}; correct it with"
-                " --dimensions all."
+                "cloud.dimension_missing",
+                f"{path}: has no dimensions {', '.join(sorted(missing))}. Correct it with"
+                " --dimensions all.",
+                path=path,
+                dimensions=sorted(missing),
             )
         builder = MapsBuilder(
             source.header.mins[:2], source.header.maxs[:2], len(source), resolution_m
         )
         every = max(1, len(source) // SAMPLE_POINTS)
         sample, low, high, total, count = [], np.inf, -np.inf, 0.0, 0
-        has_sigma = SIGMA_Z in source.header.point_format.dimension_names
         for points in source.chunks():
             kept = ~np.isin(np.asarray(points["classification"]), NOISE_CLASSES)
             points = points[kept & ~np.asarray(points["withheld"]).astype(bool)]
             moved = np.asarray(points["RayCount"]) > 0
-            columns = ["WaterDepth", "ShiftZ", "RayCount", *([SIGMA_Z] if has_sigma else [])]
-            told = np.zeros((int(moved.sum()), 4))
+            columns = ["WaterDepth", "ShiftZ", "RayCount"] + [SIGMA_Z] * (SIGMA_Z in dimensions)
+            values = np.zeros((int(moved.sum()), 4))
             for i, name in enumerate(columns):
-                told[:, i] = np.asarray(points[name])[moved]
-            builder.add(coordinates(points), moved, told)
-            sample.append(told[-count % every :: every, [1, 0, 3]])
-            depth = told[:, 0]
+                values[:, i] = np.asarray(points[name])[moved]
+            builder.add(coordinates(points), moved, values)
+            sample.append(values[-count % every :: every, [1, 0, 3]])
+            depth = values[:, 0]
             low, high = depth.min(initial=low), depth.max(initial=high)
             total, count = total + float(depth.sum()), count + len(depth)
         crs, heights = crs_words(stated_crs(source))
     depth_m = {"min": float(low), "mean": total / max(count, 1), "max": float(high)}
-    return _Told(builder.maps(), np.vstack(sample), depth_m, crs, heights)
+    return builder.maps(), depth_m, np.vstack(sample), crs, heights

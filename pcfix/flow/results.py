@@ -24,8 +24,7 @@ from pcfix.options.steps import METRES
 from pcfix.options.survey import RunOptions
 from pcfix.refract.tally import Summary
 from pcfix.report.comparison import signed_statistics
-from pcfix.report.notebook import overview, run_html
-from pcfix.report.page import Tile
+from pcfix.report.page import Tile, overview, run_html
 
 if TYPE_CHECKING:
     from geopandas import GeoDataFrame

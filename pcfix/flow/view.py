@@ -1,8 +1,7 @@
-"""Clouds before and after a correction, a reference, cameras and water, in one view."""
+"""Show clouds before and after a correction, a reference, cameras and water in one view."""
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,34 +12,39 @@ import numpy as np
 from pcfix.compare.match import near_in_plan
 from pcfix.compare.nearest import mean_spacing_m
 from pcfix.compare.vertical import heights_at
-from pcfix.errors import InputError, PcfixWarning, SettingError
+from pcfix.errors import InputError, SettingError
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.surfaces import find_surface, view_of
 from pcfix.io.clouds import check_same_crs, read_reference
 from pcfix.io.files import check_input, check_output, write_bytes
 from pcfix.io.las.columns import SHIFTS
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
-from pcfix.io.viewer import Scene3d, render, show
 from pcfix.lens.imaging import unproject
 from pcfix.model import Cameras, FloatArray, IntArray, WaterDimension, WaterSurface
 from pcfix.options.declare import File, taken
 from pcfix.options.handover import ViewerOptions
 from pcfix.refract.tally import COVERAGE_95
 from pcfix.report.page import png_of
-from pcfix.report.view import Scale, view_figure
+from pcfix.report.view import Scale, Scene3d, show, view_figure
 from pcfix.water.surface import surface_above
 
 NEIGHBOURS, GAP_SPACINGS, LEAST_GAP_M = 8, 5.0, 1.0
-"""As a comparison takes them, by default."""
+"""The defaults of a comparison."""
 FRUSTUM_SHARE = 0.06
 """Length of a frustum, as a share of the height of its camera above the clouds."""
 WATER_CELLS = 40
-WIDTH_PX, HEIGHT_PX = 1000, 750
-SEEN = ("WaterDepth", "SigmaZ", *SHIFTS)
+SHOWN = ("WaterDepth", "SigmaZ", *SHIFTS)
+_REMEDY = {
+    "depth": "Give --water, or a cloud from 'pcfix correct'.",
+    "shift": "Give a cloud from 'pcfix correct'.",
+    "uncertainty": "Give a cloud from 'pcfix correct --dimensions all'.",
+    "error": "Cloud and reference do not overlap.",
+    "height": "Its heights are not numbers.",
+}
 
 
 class _Layer(NamedTuple):
-    """Some points of a cloud, world frame, and what is known of each by name."""
+    """Some points of a cloud, world frame, and the values of its dimensions by name."""
 
     name: str
     xyz: FloatArray
@@ -52,7 +56,7 @@ def view_clouds(
 ) -> str:
     """Show clouds in space, in open3d's viewer or as a picture; ``pcfix view``.
 
-    A cloud that `correct_file` wrote with all its dimensions is shown as it was before, too.
+    A corrected cloud with all its dimensions is also shown as it was before the correction.
 
     Parameters
     ----------
@@ -64,29 +68,26 @@ def view_clouds(
     Returns
     -------
     str
-        What was drawn, and by what, where it is a picture; empty after a window.
-
-    Raises
-    ------
-    PcfixError
-        With one sentence on what to mend.
+        The clouds in the picture; empty after a window.
     """
     given = taken(ViewerOptions, options, keywords, "view_clouds")
     if not clouds:
-        raise SettingError("there is no cloud to show; give one or more.")
+        raise SettingError("cloud.missing", "There is no cloud to show. Give one or more.")
     if given.image is not None:
         check_output(given.image, overwrite=given.overwrite, inputs=clouds)
     if given.colour == "error" and given.reference is None:
-        raise SettingError("colour error is the height above a reference; give --reference too.")
+        raise SettingError(
+            "option.missing",
+            "--colour error is the height above a reference. Give --reference too.",
+            option="reference",
+        )
     paths = [check_input(cloud) for cloud in clouds]
     first = view_of(paths[0])
     surface = None if given.water is None else find_surface(given.water, given, first).surface
     layers = [layer for path in paths for layer in _read(path, given.points)]
-    with LasSource(paths[0]) as source:
-        crs = metric_crs(source)
+    crs = _crs(paths[0])
     for path in paths[1:]:
-        with LasSource(path) as source:
-            check_same_crs(str(paths[0]), crs, str(path), metric_crs(source))
+        check_same_crs(str(paths[0]), crs, str(path), _crs(path))
     if given.reference is not None:
         target = read_reference(given.reference)
         check_same_crs(str(paths[0]), crs, target.name, target.crs)
@@ -102,25 +103,21 @@ def view_clouds(
     if given.image is None:
         show(scene, f"pcfix view: {given.colour}")
         return ""
-    images, why = render(scene, WIDTH_PX, HEIGHT_PX)
-    if not images:
-        warnings.warn(
-            f"open3d cannot draw without a screen here ({why}), so that thinned clouds are drawn"
-            " by matplotlib; on Debian and Ubuntu: apt-get install libvulkan1"
-            " mesa-vulkan-drivers libegl1.",
-            PcfixWarning,
-            stacklevel=2,
-        )
-    picture = png_of(view_figure(scene, images, scale))
+    picture = png_of(view_figure(scene, scale))
     write_bytes(given.image, picture, overwrite=given.overwrite)
     return f"{given.image}: {', '.join(scene.names)} by {given.colour}"
 
 
+def _crs(path: Path) -> Any:
+    with LasSource(path) as source:
+        return metric_crs(source)
+
+
 def _read(path: Path, most: int) -> list[_Layer]:
-    """Return a cloud, and before it what it was before its correction, where it says so."""
+    """Return a cloud, and before it the cloud before its correction, where that is known."""
     xyz, known = [], dict[str, list[FloatArray]]()
     with LasSource(path) as source:
-        names = [n for n in SEEN if n in source.header.point_format.extra_dimension_names]
+        names = [n for n in SHOWN if n in source.header.point_format.extra_dimension_names]
         step, row = 1 + (len(source) - 1) // most, 0
         for points in source.chunks():
             rows = np.arange(-row % step, len(points), step)
@@ -129,7 +126,7 @@ def _read(path: Path, most: int) -> list[_Layer]:
                 known.setdefault(name, []).append(source.dimension(points, name)[rows])
             row += len(points)
     if not xyz:
-        raise InputError(f"{path}: has no points to show.")
+        raise InputError("cloud.empty", f"{path}: has no points to show.", path=path)
     after = _Layer(path.name, np.vstack(xyz), {n: np.concatenate(v) for n, v in known.items()})
     if not known.keys() >= {*SHIFTS, "WaterDepth"}:
         return [after]
@@ -141,7 +138,7 @@ def _read(path: Path, most: int) -> list[_Layer]:
 
 
 def _values(colour: str, layers: list[_Layer], surface: WaterSurface | None) -> list[FloatArray]:
-    """Return what the colours of each layer are, NaN where that is not known."""
+    """Return the values for the colours of each layer, NaN where unknown."""
     if colour == "error":
         *clouds, target = layers
         values = [_error(one.xyz, target.xyz) for one in clouds]
@@ -149,31 +146,29 @@ def _values(colour: str, layers: list[_Layer], surface: WaterSurface | None) -> 
     else:
         values = [_own(colour, one, surface) for one in layers]
     if not any(np.isfinite(one).any() for one in values):
-        raise SettingError(f"colour {colour}: no cloud has it; {_REMEDY[colour]}.")
+        raise SettingError(
+            "view.no_values",
+            f"No cloud has values for --colour {colour}. {_REMEDY[colour]}",
+            colour=colour,
+        )
     return values
 
 
-_REMEDY = {
-    "depth": "give --water, or a cloud that 'pcfix correct' wrote",
-    "shift": "give a cloud that 'pcfix correct' wrote",
-    "uncertainty": "give a cloud that 'pcfix correct' wrote with --dimensions all",
-    "error": "cloud and reference do not overlap",
-    "height": "its heights are no numbers",
-}
-
-
 def _own(colour: str, layer: _Layer, surface: WaterSurface | None) -> FloatArray:
-    nothing = np.full(len(layer.xyz), np.nan)
     if colour == "height":
         return np.asarray(layer.xyz[:, 2])
     if colour == "depth":
-        depth = layer.known.get("WaterDepth")
-        if depth is None and surface is not None and not isinstance(surface, WaterDimension):
-            depth = surface_above(surface, layer.xyz).height_m - layer.xyz[:, 2]
-        return nothing if depth is None else np.where(depth > 0.0, depth, np.nan)
-    name, sign = {"shift": ("ShiftZ", -1.0), "uncertainty": ("SigmaZ", COVERAGE_95)}[colour]
-    found = layer.known.get(name)
-    return nothing if found is None else np.where(found != 0.0, sign * found, np.nan)
+        found, sign = layer.known.get("WaterDepth"), 1.0
+        if found is None and surface is not None and not isinstance(surface, WaterDimension):
+            found = surface_above(surface, layer.xyz).height_m - layer.xyz[:, 2]
+        known = None if found is None else found > 0.0
+    else:
+        name, sign = {"shift": ("ShiftZ", -1.0), "uncertainty": ("SigmaZ", COVERAGE_95)}[colour]
+        found = layer.known.get(name)
+        known = None if found is None else found != 0.0
+    if found is None or known is None:
+        return np.full(len(layer.xyz), np.nan)
+    return np.where(known, sign * found, np.nan)
 
 
 def _error(xyz: FloatArray, reference: FloatArray) -> FloatArray:
@@ -192,7 +187,7 @@ def _scene(
     cameras: Cameras | None,
     surface: WaterSurface | None,
 ) -> Scene3d:
-    """Return all of it about the middle of the clouds."""
+    """Return clouds, cameras and water about the centre of all."""
     low = np.min([one.xyz.min(axis=0) for one in layers], axis=0)
     high = np.max([one.xyz.max(axis=0) for one in layers], axis=0)
     lines = np.zeros((0, 2, 3)) if cameras is None else _frusta(cameras, float(high[2]))
@@ -206,7 +201,7 @@ def _scene(
 
 
 def _frusta(cameras: Cameras, ground_m: float) -> FloatArray:
-    """Return the edges of each camera's frustum, or a stroke down where it has no frame."""
+    """Return the edges of each camera's frustum, or a line down where it has no frame."""
     length = FRUSTUM_SHARE * max(float(np.median(cameras.centres[:, 2])) - ground_m, 1.0)
     lines = []
     for row, centre in enumerate(cameras.centres):
@@ -226,10 +221,7 @@ def _frusta(cameras: Cameras, ground_m: float) -> FloatArray:
 def _sheet(
     surface: WaterSurface | None, low: FloatArray, high: FloatArray
 ) -> tuple[FloatArray, IntArray]:
-    """Return the water over the clouds as a mesh; nothing where it is not known everywhere about.
-
-    A dimension has no surface away from its points.
-    """
+    """Return the water over the clouds as a mesh; a dimension has no surface beside its points."""
     if surface is None or isinstance(surface, WaterDimension):
         return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
     sides = [np.linspace(low[axis], high[axis], WATER_CELLS + 1) for axis in (0, 1)]

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pcfix.errors import optional_library
 from pcfix.io.files import check_input
+from pcfix.libraries import optional_library
 
 if TYPE_CHECKING:
     from geopandas import GeoDataFrame

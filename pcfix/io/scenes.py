@@ -1,4 +1,4 @@
-"""Write a simulated scene as the files that a surveyor would have, and its truth."""
+"""Write a simulated scene as the files of a survey, and its truth."""
 
 from __future__ import annotations
 
@@ -21,32 +21,29 @@ if TYPE_CHECKING:
 
 GROUND = 2
 FILES = {
-    "cloud.laz": "the cloud as SfM software that knows nothing of water makes it",
+    "cloud.laz": "the apparent cloud, as from SfM software",
     "truth.laz": "the true position of each of its points, row by row",
-    "lidar.laz": "a reference cloud with noise, as bathymetric LiDAR gives; 2 land, 40 bed",
+    "lidar.laz": "a reference cloud with noise, as from bathymetric LiDAR; 2 land, 40 bed",
     "cameras.csv": "label, x, y, z, yaw, pitch, roll of each image",
     "sensor.csv": "focal length and sensor size, mm; of a distorted lens pixels and OpenCV's k, p",
     "scene.json": "water, refractive index, GSD, and the arguments that made the scene",
 }
-"""Files that every scene has."""
+"""Files of every scene."""
 
 OTHERS = {
     "fused.ply.vis": "the cameras of each point of the cloud, row by row, in COLMAP's layout",
     "dense.ply": "the cloud with the cameras of each point and their weights, in OpenMVS's layout",
-    "true_cameras.csv": "the poses that the images were made with",
+    "true_cameras.csv": "the true poses of the images",
     "neighbours.csv": "label of each image and of those it was matched with, best first",
     "pairs.npz": "start and pairs: point i has the stereo pairs start[i] to start[i + 1]",
 }
-"""Files that some scenes have; the view list is one of the first two, of depth maps the second."""
+"""Files of some scenes; the view list is one of the first two, for depth maps the second."""
 
 _FINE_GSD_M = 0.005  # clouds of finer images get steps of 0.1 mm
 
 
 def write_scene(scene: Scene, out_dir: File, *, overwrite: bool) -> None:
-    """Write `FILES`, and those of `OTHERS` that the scene has, into a folder, made if need be.
-
-    A `SettingError` if one of them exists and `overwrite` is not set; then none is written.
-    """
+    """Write `FILES`, and those of `OTHERS` that the scene has, into a folder."""
     folder, contents = Path(out_dir), _contents(scene)
     files = FILES | {name: text for name, text in OTHERS.items() if name in contents}
     contents["scene.json"] = _facts(scene, files)
@@ -94,10 +91,8 @@ def colmap_vis(views: Views) -> bytes:
 def openmvs_ply(xyz: FloatArray, views: Views) -> bytes:
     """Return a cloud in the layout of OpenMVS's dense PLY, positions in double precision.
 
-    OpenMVS counts the entries of a list in a byte; here it is four where a byte is too small.
+    Lists longer than 255 have a count of four bytes. The views must have weights.
     """
-    if views.weight is None:
-        raise ValueError("OpenMVS's layout needs weights")
     counts = np.diff(views.start)
     name, size = ("uchar", 1) if counts.max(initial=0) < 256 else ("uint", 4)
     place = 2 * size + 24 + 8 * counts
@@ -111,7 +106,9 @@ def openmvs_ply(xyz: FloatArray, views: Views) -> bytes:
     _put(data, first + 24, counts.astype(f"<u{size}"))
     _put(data, entry + 24 + size, views.camera.astype("<u4"))
     _put(data, second, counts.astype(f"<u{size}"))
-    _put(data, entry + 24 + 2 * size + 4 * np.repeat(counts, counts), views.weight.astype("<f4"))
+    _put(
+        data, entry + 24 + 2 * size + 4 * np.repeat(counts, counts), np.asarray(views.weight, "<f4")
+    )
     head = [
         "ply",
         "format binary_little_endian 1.0",

@@ -1,7 +1,7 @@
-"""Styles for QGIS (QML) with the colours of the report: of rasters, and of layers of a GeoPackage.
+"""Styles for QGIS (QML) with the colours of the report, of rasters and of layers of a GeoPackage.
 
-QGIS reads that of a raster from the file of its name that ends in ``.qml``, and those of a
-GeoPackage from its table ``layer_styles``.
+QGIS reads the style of a raster from the ``.qml`` file of its name, and those of a GeoPackage from
+its table ``layer_styles``.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from pcfix.io.rasters import preview
 from pcfix.model import FloatArray
 
 RAMPS = {"depth": DEPTH, "height": HEIGHT, "uncertainty": UNCERTAINTY, "RayCount": RAYS}
-"""By what a raster holds; for anything else that of heights."""
+"""By the contents of a raster; anything else has that of heights."""
 FROM_ZERO = ("depth", "uncertainty", "RayCount")
 CUT = 0.5
-"""So many percent of the cells at either end share the last colour: one cell shall not rule."""
+"""Percent of the cells at either end that share the last colour, so that outliers do not count."""
 
 _PAGE = """<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>
 <qgis version="3.22" styleCategories="{categories}">
@@ -35,7 +35,7 @@ def hex_colour(colour: tuple[int, ...]) -> str:
 
 
 def limits_of(values: FloatArray, what: str) -> tuple[float, float]:
-    """Return which values get the first and the last colour of a map; NaN does not count."""
+    """Return the values for the first and the last colour of a map; NaN does not count."""
     known = values[np.isfinite(values)]
     if not known.size:
         return 0.0, 1.0
@@ -91,10 +91,9 @@ _LAYERS = {
 
 
 def vector_style(symbols: dict[str, Symbol], attribute: str = "", label: str = "") -> str:
-    """Return the style of a layer.
+    """Return the style of a layer: one symbol, or one for each value of an attribute.
 
-    The symbols are those of each value of an attribute; without one the only symbol is that of all
-    features. The label is an expression that is written beside each.
+    The label is an expression of QGIS.
     """
     drawn = "\n".join(_symbol(str(row), one) for row, one in enumerate(symbols.values()))
     head, rows = 'type="singleSymbol"', ""

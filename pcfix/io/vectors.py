@@ -13,11 +13,12 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from pcfix.errors import PcfixWarning, bad_file, optional_library
+from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.crs import parse_crs
 from pcfix.io.files import check_input
 from pcfix.io.tables import check_columns, read_lines, split_header, table_below
 from pcfix.io.transformations import LOCAL, way_to_cloud
+from pcfix.libraries import optional_library
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
 

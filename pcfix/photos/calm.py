@@ -1,48 +1,48 @@
-"""The image through calm water, from many through waves: registration, and the pixel-wise median.
+"""The image through calm water from frames taken through waves: registration and median.
 
-Mulsow 2024, "strategies for wavy water", the simple method: a wave moves what a pixel sees of the
-bed to and fro about where calm water would have it, so that the median over a sequence is about the
-image taken through flat water. First the camera, which hovers but does not stand, is held still:
-each frame is laid onto the first by a homography.
+Mulsow 2024, "strategies for wavy water", the simple method: a wave moves the part of the bed that a
+pixel sees to and fro about its place under calm water, so the median over a sequence is about the
+image through flat water. Before that, the movement of the hovering camera is removed: a homography
+maps each frame to the first.
 
-What the homographies go by is what does not move. Corners of the first frame are followed through
-all the others; how far one scatters, once the frames lie on each other, is how much waves move it,
-and it counts by the inverse of its variance. So land decides where there is some, and elsewhere
-many corners, each about its own mean over the frames, of which the first is only one.
+The homographies rest on what does not move. Corners of the first frame are tracked through all
+others, and each is weighted by the inverse variance of its scatter in the registered frames. So
+land decides where there is some, and elsewhere many corners, each about its mean over the frames.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import photo_library
+from pcfix.errors import PcfixWarning
+from pcfix.libraries import photo_library
 from pcfix.model import BoolArray, FloatArray
 
 FOLLOWED_PX = 2048
-"""Longer sides of images in which corners are followed; larger ones are reduced."""
+"""Longer side of the images in which corners are tracked; larger ones are reduced."""
 COARSE_PX = 1024
-"""And in which features are matched, which says where to begin."""
+"""Longer side of the images in which features are matched, for a first homography."""
 CORNERS = 2000
 LEAST_CORNERS = 12
 RETURN_PX = 0.7
-"""A corner that is followed there and back comes home so nearly."""
+"""A corner that is tracked there and back must return to within this distance."""
 OUTLIER_PX = 5.0
-"""Waves move corners about; what lies farther off, of an image as it was reduced, is a mismatch."""
+"""Waves move corners; what lies farther off in the reduced image is a mismatch."""
 ROUNDS = 20
 STILL_PX = 0.1
-"""Scatter below which corners do not count more: what following a corner is good for."""
+"""Least scatter of a corner for its weight: the precision of tracking."""
 SORTED_BYTES = 200_000_000
 """Of the frames of a strip at once, in single precision."""
 
 
 def grey8(image: npt.NDArray[Any], longest_px: int | None = None) -> npt.NDArray[np.uint8]:
-    """Return an image, shape (rows, columns, bands), as grey of 8 bits, reduced where larger.
+    """Return an image, shape (rows, columns, bands), as 8-bit grey, reduced where larger.
 
-    The bands count alike; of images of more bits the darkest and brightest percent are cut off.
+    Bands have equal weight; images of more bits are stretched between the 1st and 99th percentile.
     """
     cv2 = photo_library("cv2")
     grey = image[..., :3].mean(axis=2, dtype=np.float32)
@@ -56,32 +56,20 @@ def grey8(image: npt.NDArray[Any], longest_px: int | None = None) -> npt.NDArray
     return np.asarray(np.clip(np.rint(grey), 0, 255).astype(np.uint8))
 
 
-@dataclass(eq=False)
 class Follower:
-    """The corners of a first frame, which are found again in others.
+    """Track the corners of a first frame, shape (rows, columns, bands), in other frames."""
 
-    Attributes
-    ----------
-    first : array, shape (rows, columns, bands)
-        The frame.
-    """
-
-    first: npt.NDArray[Any]
-    at: FloatArray = field(init=False)
-    _grey: Any = field(init=False)
-    _features: Any = field(init=False)
-
-    def __post_init__(self) -> None:
+    def __init__(self, first: npt.NDArray[Any]) -> None:
         cv2 = photo_library("cv2")
-        self._grey = grey8(self.first, FOLLOWED_PX)
-        self.scale = self.first.shape[1] / self._grey.shape[1]
+        self._grey = grey8(first, FOLLOWED_PX)
+        self._scale = first.shape[1] / self._grey.shape[1]
         apart = max(self._grey.shape) / 80.0
         found = cv2.goodFeaturesToTrack(self._grey, CORNERS, 0.01, apart)
         self.at = np.empty((0, 2)) if found is None else found[:, 0].astype(np.float64)
         self._features = _features(self._grey)
 
     def follow(self, frame: npt.NDArray[Any]) -> FloatArray:
-        """Return where the corners lie in another frame, in pixels of it, shape (k, 2), or NaN."""
+        """Return the corners in another frame, in its pixels, shape (k, 2); NaN where lost."""
         cv2 = photo_library("cv2")
         lost = np.full(self.at.shape, np.nan)
         grey = grey8(frame, FOLLOWED_PX)
@@ -90,23 +78,18 @@ class Follower:
             return lost
         start = self.at.astype(np.float32)[:, None]
         guess = cv2.perspectiveTransform(start, coarse)
-        there, back = self._flow(grey, start, guess)
-        away = np.hypot(*(back - start)[:, 0].T)
-        return np.where((away < RETURN_PX)[:, None], self.full(there[:, 0]), lost)
-
-    def _flow(self, grey: Any, start: Any, guess: Any) -> tuple[Any, Any]:
-        cv2 = photo_library("cv2")
         how: dict[str, Any] = {
             "winSize": (21, 21), "maxLevel": 2, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
         }  # fmt: skip
-        there, found, _ = cv2.calcOpticalFlowPyrLK(self._grey, grey, start, guess.copy(), **how)
+        there, found, _ = cv2.calcOpticalFlowPyrLK(self._grey, grey, start, guess, **how)
         back, again, _ = cv2.calcOpticalFlowPyrLK(grey, self._grey, there, start.copy(), **how)
         back[(found & again).ravel() == 0] = np.inf
-        return there, back
+        away = np.hypot(*(back - start)[:, 0].T)
+        return np.where((away < RETURN_PX)[:, None], self.full(there[:, 0]), lost)
 
     def full(self, places: FloatArray) -> FloatArray:
-        """Return places in the reduced image as those in the whole one; centres are whole."""
-        return np.asarray((places + 0.5) * self.scale - 0.5, np.float64)
+        """Convert pixels of the reduced image to those of the whole one; centres are integers."""
+        return np.asarray((places + 0.5) * self._scale - 0.5, np.float64)
 
 
 def _features(grey: Any) -> tuple[FloatArray, Any]:
@@ -134,15 +117,14 @@ def _coarse(one: tuple[FloatArray, Any], other: tuple[FloatArray, Any]) -> Any:
 
 
 class Registration(NamedTuple):
-    """How frames lie on the first.
+    """The homographies from frames to the first, and the scatter of the corners.
 
     Attributes
     ----------
     homography : array, shape (f, 3, 3)
-        From pixels of a frame to pixels of the first, the centre of the first pixel at (0, 0); NaN
-        where a frame could not be laid on it.
+        In pixels, the centre of the first pixel at (0, 0); NaN where a frame has none.
     scatter_px : array, shape (k,)
-        Of each corner that counted, an axis.
+        Standard deviation of each corner along an axis.
     """
 
     homography: FloatArray
@@ -150,13 +132,7 @@ class Registration(NamedTuple):
 
 
 def register(places: FloatArray) -> Registration:
-    """Lay frames onto the first by corners, the still ones before the others.
-
-    Parameters
-    ----------
-    places : array, shape (f, k, 2)
-        Where corners lie in each frame, pixels; NaN where one was not found.
-    """
+    """Register frames to the first by the pixels of corners, shape (f, k, 2); NaN where lost."""
     cv2 = photo_library("cv2")
     found = np.isfinite(places[..., 0])
     often = found & (found.sum(axis=0) >= max(2, len(places) // 2))
@@ -206,7 +182,7 @@ def _fitted(one: FloatArray, other: FloatArray, weight: FloatArray) -> FloatArra
 
 
 def laid(frame: npt.NDArray[Any], way: FloatArray) -> npt.NDArray[Any]:
-    """Return a frame, shape (rows, columns, bands), as the first lies; bicubic."""
+    """Resample a frame, shape (rows, columns, bands), by a homography; bicubic."""
     cv2 = photo_library("cv2")
     rows, columns, bands = frame.shape
     out = np.empty_like(frame)
@@ -220,7 +196,7 @@ def laid(frame: npt.NDArray[Any], way: FloatArray) -> npt.NDArray[Any]:
 
 
 def covered(way: FloatArray, shape: tuple[int, int], top: int, bottom: int) -> BoolArray:
-    """Return where a frame, laid, covers rows from `top` to `bottom` of the first."""
+    """Return which pixels of rows `top` to `bottom` of the first frame another one covers."""
     rows, columns = shape
     edge = np.array([[0.0, 0.0], [columns, 0.0], [columns, rows], [0.0, rows]]) - 0.5
     corners = _moved(way, edge) - [0.0, top]
@@ -239,22 +215,20 @@ def strip_rows(frames: int, columns: int, bands: int) -> int:
 def median_of(
     frames: npt.NDArray[Any], known: BoolArray
 ) -> tuple[npt.NDArray[Any], npt.NDArray[np.float32]]:
-    """Return the median over frames and how far they spread about it.
+    """Return the median over registered frames and their spread about it.
 
     Parameters
     ----------
     frames : array, shape (f, rows, columns, bands)
-        Laid on each other; of one type.
     known : array of bool, shape (f, rows, columns)
-        Where each has pixels; somewhere for every pixel, or the median is 0.
+        Where each has pixels; the median is 0 where none has.
 
     Returns
     -------
     median : array, shape (rows, columns, bands)
         Of the frames' type.
     spread : array, shape (rows, columns)
-        1.4826 times the median of the absolute deviations, the standard deviation of normal
-        noise; mean over the bands, NaN where fewer than three frames are known.
+        NMAD, mean over the bands; NaN where fewer than three frames are known.
     """
     count = known.sum(axis=0)[..., None, None]
     values = frames.astype(np.float32)
@@ -268,7 +242,7 @@ def median_of(
 
 
 def _middle(values: npt.NDArray[np.float32], count: Any) -> npt.NDArray[np.float32]:
-    """Return the medians of the first so many along the last axis once they are sorted."""
+    """Return the medians of the `count` smallest values along the last axis."""
     ordered = np.sort(values, axis=-1)
     low = np.take_along_axis(ordered, np.maximum(count - 1, 0) // 2, axis=-1)
     high = np.take_along_axis(ordered, np.minimum(count // 2, values.shape[-1] - 1), axis=-1)
@@ -277,7 +251,7 @@ def _middle(values: npt.NDArray[np.float32], count: Any) -> npt.NDArray[np.float
 
 
 class WaterFound(NamedTuple):
-    """What is known of the water of a sequence: how many waves, rms values, and where it is."""
+    """The water of a sequence: number of waves, rms values, share of the slopes explained."""
 
     folder: str
     waves: int
@@ -289,21 +263,16 @@ class WaterFound(NamedTuple):
 
 @dataclass(frozen=True)
 class CalmSummary:
-    """What `calm_frames` did.
+    """The result of `calm_frames`.
 
     Attributes
     ----------
-    input, output, spread_file : str
-    frames, columns, rows : int
     corners : int
-        By which the frames were laid on each other.
+        By which the frames were registered.
     scatter_px, moved_px : float
-        Median scatter of a corner, an axis; how far at most the camera moved the frame's middle.
+        Median scatter of a corner along an axis; largest movement of the frame's centre.
     spread : float
-        Median over the image of how much the frames differ, grey values.
-    seconds : float
-    water : WaterFound or None
-    notes : tuple of str
+        Median over the image of the spread of the frames, grey values.
     """
 
     input: str
@@ -318,4 +287,4 @@ class CalmSummary:
     spread: float
     seconds: float
     water: WaterFound | None
-    notes: tuple[str, ...] = ()
+    notes: tuple[PcfixWarning, ...] = ()

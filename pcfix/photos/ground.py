@@ -1,4 +1,4 @@
-"""The ground under the photographs: a raster of heights, and where rays meet it."""
+"""The ground under the images: a raster of heights, and where rays meet it."""
 
 from __future__ import annotations
 
@@ -8,94 +8,80 @@ from typing import Any
 import numpy as np
 
 from pcfix.errors import SettingError
+from pcfix.libraries import load_open3d
 from pcfix.model import FloatArray
 
 MOST_CELLS = 6_000_000
-"""Of the surface that rays are sent at; a raster with more is thinned. Memory is 200 bytes each."""
+"""Of the surface for ray casting (200 bytes each); a raster with more is averaged."""
 
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """A surface of land and bed, its heights at the centres of cells.
+    """A surface of land and bed, with heights at the centres of cells.
 
     Attributes
     ----------
     height_m : array, shape (rows, columns)
-        World frame, NaN where there is none; the first row is the northern one.
+        World frame, NaN where unknown; the first row is the northern one.
     left_m, top_m : float
         Upper left corner of the upper left cell.
-    cell_m : float
+    middle : array, shape (3,)
+        Origin of the coordinates for ray casting, so that single precision is enough.
     """
 
     height_m: FloatArray
     left_m: float
     top_m: float
     cell_m: float
+    middle: FloatArray = field(init=False, repr=False)
     _scene: Any = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Build the surface of triangles; its coordinates are from the raster's middle."""
+        """Build the surface of triangles."""
         rows, columns = self.height_m.shape
-        if min(rows, columns) < 2 or not np.isfinite(self.height_m).any():
-            raise SettingError("a ground needs two rows and columns, and heights.")
-        object.__setattr__(self, "_scene", self._built())
-
-    @property
-    def middle(self) -> FloatArray:
-        """What the coordinates of rays are taken from, so that single precision is enough."""
-        rows, columns = self.height_m.shape
-        return np.array(
-            [
-                self.left_m + 0.5 * columns * self.cell_m,
-                self.top_m - 0.5 * rows * self.cell_m,
-                float(np.nanmean(self.height_m)),
-            ]
+        known = np.isfinite(self.height_m)
+        if min(rows, columns) < 2 or not known.any():
+            raise SettingError("dsm.empty", "The DSM has fewer than two rows or no heights.")
+        x = self.left_m + (np.arange(columns) + 0.5) * self.cell_m
+        y = self.top_m - (np.arange(rows) + 0.5) * self.cell_m
+        right, low = (
+            self.left_m + 0.5 * columns * self.cell_m,
+            self.top_m - 0.5 * rows * self.cell_m,
         )
-
-    def _built(self) -> Any:
-        from open3d.core import Tensor
-        from open3d.t.geometry import RaycastingScene
-
-        rows, columns = self.height_m.shape
-        x = self.left_m + (np.arange(columns) + 0.5) * self.cell_m - self.middle[0]
-        y = self.top_m - (np.arange(rows) + 0.5) * self.cell_m - self.middle[1]
-        z = self.height_m - self.middle[2]
-        known = np.isfinite(z)
+        middle = np.array([right, low, float(np.nanmean(self.height_m))])
+        z = np.where(known, self.height_m - middle[2], 0.0)
         corners = np.column_stack(
-            [np.tile(x, rows), np.repeat(y, columns), np.where(known, z, 0.0).ravel()]
+            [np.tile(x - middle[0], rows), np.repeat(y - middle[1], columns), z.ravel()]
         ).astype(np.float32)
-        one = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
-        whole = (known[:-1, :-1] & known[:-1, 1:] & known[1:, :-1] & known[1:, 1:]).ravel()
-        one = one[whole]
-        below, right = one + columns, one + 1
+        # two triangles for each square of four known heights
+        whole = known[:-1, :-1] & known[:-1, 1:] & known[1:, :-1] & known[1:, 1:]
+        one = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1))[whole]
+        below, beside = one + columns, one + 1
         faces = np.vstack(
-            [np.column_stack([one, below, right]), np.column_stack([right, below, below + 1])]
+            [np.column_stack([one, below, beside]), np.column_stack([beside, below, below + 1])]
         ).astype(np.uint32)
-        scene: Any = RaycastingScene()
-        scene.add_triangles(Tensor.from_numpy(corners), Tensor.from_numpy(faces))
-        return scene
+        tensor = load_open3d("open3d.core").Tensor.from_numpy
+        scene = load_open3d("open3d.t.geometry").RaycastingScene()
+        scene.add_triangles(tensor(corners), tensor(faces))
+        object.__setattr__(self, "middle", middle)
+        object.__setattr__(self, "_scene", scene)
 
     def hit(self, origin: FloatArray, direction: FloatArray) -> FloatArray:
-        """Return how far along rays the ground is first met.
+        """Return the distance along rays to the ground, metres; infinite where they miss it.
 
         Parameters
         ----------
         origin : array, shape (n, 3) or (3,)
             Metres, world frame.
         direction : array, shape (n, 3)
-            Unit vectors.
-
-        Returns
-        -------
-        array, shape (n,)
-            Metres, good to 1e-7 of the distance; infinite where a ray meets nothing.
+            Unit vectors. Distances are good to 1e-7 of themselves.
         """
         rays = np.empty((len(direction), 6), np.float32)
         rays[:, :3], rays[:, 3:] = origin - self.middle, direction
         return self._scene.cast_rays(rays)["t_hit"].numpy().astype(np.float64)
 
     def heights_at(self, xy: FloatArray) -> FloatArray:
-        """Return heights between the centres of cells, shape (n,); NaN where there is none."""
+        """Interpolate heights between the centres of cells, shape (n,); NaN where unknown."""
         from scipy.ndimage import map_coordinates
 
         row = (self.top_m - xy[:, 1]) / self.cell_m - 0.5
@@ -106,7 +92,7 @@ class Ground:
 
 
 def ground_of(height_m: FloatArray, left_m: float, top_m: float, cell_m: float) -> Ground:
-    """Return a ground of no more than `MOST_CELLS` cells, means of the raster's own."""
+    """Return a ground of at most `MOST_CELLS` cells, each the mean of cells of the raster."""
     step = int(np.ceil(np.sqrt(height_m.size / MOST_CELLS)))
     if step > 1:
         rows, columns = (side // step * step for side in height_m.shape)

@@ -1,45 +1,76 @@
-"""Where the colour of each pixel of a photograph without water comes from in the photograph taken.
+"""Photographs without water: the pixel that each pixel takes its colour from, and the resampling.
 
-Both mappings work on the nodes of a grid over the photograph, as section 2.3 of Skarlatos &
-Agrafiotis 2018 has it, and what they give is a shift for each node: its colour lies in the
-photograph taken at node plus shift.
+Both mappings give a shift at the nodes of a grid over the image, as in section 2.3 of Skarlatos &
+Agrafiotis 2018: the colour of a node lies in the original image at node plus shift.
 
-*Exact*: the straight ray of a node, the lens undone, meets the true bed at P. The light from P
-reached the camera through the surface: backward tracing gives its path, the lens its pixel.
-Nothing is approximate, and nothing is iterated, if the bed is the true one; it is what the
-paper's iterations are on their way to.
+*Exact*: the straight ray of a node meets the true bed at P. Backward ray tracing gives the path of
+the light from P through the surface to the camera, and the lens gives its pixel. There is no
+approximation and no iteration if the bed is the true one.
 
-*Paper*: their eq 12 and Fig 9 on the apparent bed. A ray of which the share P_w runs in water is
-given the focal length c' = (P_air + P_w n) c, and its pixel a is put where c/c' of its way from
-the principal point ends. The fixed point of the iteration is not the true depth: near nadir, h
-looking like h0 through water, a round makes of the depth h(k) the depth h0 + (n - 1) h(k), which
-tends to h0 / (2 - n), 1.515 h0 for n = 1.34, where n h0 would be right. Each step is n - 1 = 0.34
-of the one before, as the steps of their Figs 15 and 17 are (0.30, 0.32, 0.34; 0.33, 0.35, 0.35).
+*Paper*: their eq 12 and Fig 9 on the apparent bed. A ray with the share P_w in water gets the focal
+length c' = (P_air + P_w n) c, so its pixel moves to c/c' of the distance from the principal point.
+The fixed point of the iteration is not the true depth: near nadir, with apparent depth h0, a round
+makes of the depth h the depth h0 + (n - 1) h, which tends to h0 / (2 - n) and not to n h0 (1.515
+against 1.34 for n = 1.34). Each step is n - 1 = 0.34 of the one before, as in their Figs 15 and 17
+(0.30 to 0.35).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from pcfix.errors import photo_library
+from pcfix.errors import PcfixWarning
 from pcfix.lens.imaging import project, unproject
+from pcfix.libraries import photo_library
 from pcfix.model import BoolArray, FloatArray, Lens, WaterMesh, WaterPlane, WaterRaster
 from pcfix.photos.ground import Ground
 from pcfix.refract.tracing import trace
 from pcfix.water.surface import surface_above
 
 OCCLUSION_CELLS = 1.5
-"""Light that meets the ground nearer to the water than its point by more cells is hidden."""
+"""A ray that meets the ground more cells before its point than this is occluded."""
 INVERSION_STEPS = 6
-"""Of the paper's mapping, which goes from the photograph taken to the one without water; each
-leaves a tenth of the error, and fewer than 0.01 px are left of 50."""
+"""Of the mapping of the paper; each leaves a tenth of the error, 0.01 px of 50 in the end."""
+STRIP_ROWS = 512
+"""Rows resampled at once, so that the places stay in the processor's cache."""
+CHANNELS_AT_ONCE = 4
+"""OpenCV's limit."""
+
+
+@dataclass(frozen=True)
+class PhotosSummary:
+    """The result of `map_photos`.
+
+    Attributes
+    ----------
+    images, done_before : int
+        Images written, and those among them that an earlier call wrote.
+    black_share : float
+        Share of pixels without ground, occluded, or outside the original image.
+    spacing_px : int
+        Between the nodes of the grid.
+    """
+
+    images: int
+    done_before: int
+    megapixels: float
+    seconds: float
+    largest_shift_px: float
+    black_share: float
+    mapping: str
+    dsm: str
+    water: str
+    refractive_index: float
+    spacing_px: int
+    notes: tuple[PcfixWarning, ...]
 
 
 class Photo(NamedTuple):
-    """One image: where it was taken, and with what lens (in pixels)."""
+    """One image: its exterior orientation, and its lens in pixels."""
 
     label: str
     centre: FloatArray
@@ -49,7 +80,7 @@ class Photo(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What the images see: ground, water surface and refractive index."""
+    """Ground, water surface and refractive index."""
 
     ground: Ground
     water: WaterPlane | WaterMesh | WaterRaster
@@ -57,7 +88,7 @@ class Scene:
 
 
 class Shifts(NamedTuple):
-    """What a mapping found at the nodes of a grid.
+    """The mapping at the nodes of a grid.
 
     Attributes
     ----------
@@ -65,9 +96,9 @@ class Shifts(NamedTuple):
         Between nodes. The first node is half a step outside the upper left corner of the image,
         so that the nodes surround it.
     shift_px : array of float32, shape (rows, columns, 2)
-        From the pixel to where its colour comes from, in u and v; exactly 0 on land.
+        From the pixel to the source of its colour, in u and v; exactly 0 on land.
     known : array of bool, shape (rows, columns)
-        Whether there is ground under the node, and it is in sight.
+        Whether there is ground under the node, not occluded.
     """
 
     step_px: int
@@ -85,70 +116,44 @@ def nodes_of(lens: Lens, step_px: int) -> tuple[FloatArray, tuple[int, int]]:
 
 
 def exact(photo: Photo, scene: Scene, step_px: int) -> Shifts:
-    """Map by the true bed: straight out through the lens, back as the light came.
-
-    Parameters
-    ----------
-    photo : Photo
-    scene : Scene
-        With the true ground: bed where it is, not where it appears.
-    step_px : int
-    """
+    """Map by the true bed in `scene`: straight out through the lens, back as the light came."""
     nodes, shape = nodes_of(photo.lens, step_px)
-    seen = _ground_seen(photo, scene, nodes)
+    xyz, depth, known = _ground_seen(photo, scene, nodes)
     shift = np.zeros((len(nodes), 2))
-    known = seen.known.copy()
-    wet = np.flatnonzero(seen.wet)
-    path = trace(photo.centre, seen.xyz[wet], scene.water, refractive_index=scene.refractive_index)
-    camera = (path.piercing_xyz - photo.centre) @ photo.rotation.T
-    place = project(photo.lens, camera)
+    wet = np.flatnonzero(depth > 0.0)
+    path = trace(photo.centre, xyz[wet], scene.water, refractive_index=scene.refractive_index)
+    place = project(photo.lens, (path.piercing_xyz - photo.centre) @ photo.rotation.T)
     free = path.converged & np.isfinite(place).all(axis=1)
-    free[free] = ~hidden(scene.ground, path.piercing_xyz[free], seen.xyz[wet[free]])
+    free[free] = ~hidden(scene.ground, path.piercing_xyz[free], xyz[wet[free]])
     shift[wet[free]] = place[free] - nodes[wet[free]]
     known[wet[~free]] = False
     return _as_grid(step_px, shift, known, shape)
 
 
 def paper(photo: Photo, scene: Scene, step_px: int) -> Shifts:
-    """Map by eq 12 of Skarlatos & Agrafiotis 2018, their Fig 9, on the ground as it appears.
+    """Map by eq 12 of Skarlatos & Agrafiotis 2018 on the apparent ground, or that of a round.
 
-    Parameters
-    ----------
-    photo : Photo
-    scene : Scene
-        With the apparent ground, or that of the round before.
-    step_px : int
-
-    Notes
-    -----
-    The paper moves the pixel of the photograph taken; what is wanted here is the other way round,
-    and found by repeated substitution.
+    The paper moves pixels of the original image; the inverse, which is needed here, is found by
+    repeated substitution.
     """
     nodes, shape = nodes_of(photo.lens, step_px)
-    seen = _ground_seen(photo, scene, nodes)
+    xyz, depth, known = _ground_seen(photo, scene, nodes)
     shift = np.zeros((len(nodes), 2))
-    wet = np.flatnonzero(seen.wet)
-    share = seen.depth_m[wet] / (photo.centre[2] - seen.xyz[wet, 2])  # P_w of a straight path
-    mixed = (1.0 - share) + share * scene.refractive_index  # c' / c
-    camera = (seen.xyz[wet] - photo.centre) @ photo.rotation.T
-    camera[:, :2] /= mixed[:, None]
+    wet = np.flatnonzero(depth > 0.0)
+    share = depth[wet] / (photo.centre[2] - xyz[wet, 2])  # P_w of a straight path
+    camera = (xyz[wet] - photo.centre) @ photo.rotation.T
+    camera[:, :2] /= ((1.0 - share) + share * scene.refractive_index)[:, None]  # c' / c
     shift[wet] = project(photo.lens, camera) - nodes[wet]
-    known = seen.known & np.isfinite(shift).all(axis=1)
+    known &= np.isfinite(shift).all(axis=1)
     shift[~known] = 0.0
     forward = _as_grid(step_px, shift, known, shape)
     return forward._replace(shift_px=_inverse(forward))
 
 
-class _Seen(NamedTuple):
-    """What straight rays meet: places, depth under water, whether anything, whether wet."""
-
-    xyz: FloatArray
-    depth_m: FloatArray
-    known: BoolArray
-    wet: BoolArray
-
-
-def _ground_seen(photo: Photo, scene: Scene, nodes: FloatArray) -> _Seen:
+def _ground_seen(
+    photo: Photo, scene: Scene, nodes: FloatArray
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Return where straight rays meet the ground, its depth (0 on land), and whether they do."""
     direction = unproject(photo.lens, nodes) @ photo.rotation
     usable = np.isfinite(direction).all(axis=1)
     direction[~usable] = 0.0, 0.0, 1.0
@@ -157,12 +162,11 @@ def _ground_seen(photo: Photo, scene: Scene, nodes: FloatArray) -> _Seen:
     xyz = np.where(known[:, None], photo.centre + np.where(known, far, 0.0)[:, None] * direction, 0)
     depth = np.zeros(len(nodes))
     depth[known] = surface_above(scene.water, xyz[known]).height_m - xyz[known, 2]
-    depth = np.nan_to_num(depth, nan=0.0)  # no water over it
-    return _Seen(xyz, depth, known, known & (depth > 0.0))
+    return xyz, np.maximum(np.nan_to_num(depth, nan=0.0), 0.0), known  # NaN: no water above
 
 
 def hidden(ground: Ground, start: FloatArray, end: FloatArray) -> BoolArray:
-    """Return whether the ground stands between places, shapes (n, 3), and others beyond."""
+    """Return whether the ground stands between start and end, both of shape (n, 3)."""
     way = end - start
     length = np.linalg.norm(way, axis=1)
     apart = length > 0.0
@@ -177,7 +181,7 @@ def _as_grid(step_px: int, shift: FloatArray, known: BoolArray, shape: tuple[int
 
 
 def _inverse(forward: Shifts) -> FloatArray:
-    """Return for each node q the p - q with p + shift(p) = q."""
+    """Return p - q for each node q, where p + shift(p) = q."""
     cv2 = photo_library("cv2")
 
     rows, columns = forward.known.shape
@@ -190,3 +194,63 @@ def _inverse(forward: Shifts) -> FloatArray:
             borderMode=cv2.BORDER_REPLICATE,
         )  # fmt: skip
     return back
+
+
+class Resampled(NamedTuple):
+    """An image without water, shape (rows, columns, bands), and the pixels that changed."""
+
+    image: npt.NDArray[Any]
+    touched: BoolArray
+    black_share: float
+
+
+def resample(image: npt.NDArray[Any], shifts: Shifts) -> Resampled:
+    """Resample an image, shape (rows, columns, bands), by bicubic interpolation.
+
+    Pixels without a shift are copied bit by bit; pixels whose source is not known become black.
+    """
+    cv2 = photo_library("cv2")
+    rows, columns, bands = image.shape
+    groups = [slice(k, min(k + CHANNELS_AT_ONCE, bands)) for k in range(0, bands, CHANNELS_AT_ONCE)]
+    sources = [np.ascontiguousarray(image[..., some]) for some in groups]
+    out = np.empty_like(image)
+    touched = np.empty((rows, columns), bool)
+    black = 0
+    for top in range(0, rows, STRIP_ROWS):
+        bottom = min(top + STRIP_ROWS, rows)
+        shift, lost = _strip(shifts, top, bottom, columns)
+        moved = (shift[..., 0] != 0.0) | (shift[..., 1] != 0.0)
+        part = out[top:bottom]
+        if not moved.all():
+            part[...] = image[top:bottom]
+        if moved.any():
+            u = np.arange(columns, dtype=np.float32)[None, :] + shift[..., 0]
+            v = np.arange(top, bottom, dtype=np.float32)[:, None] + shift[..., 1]
+            for some, source in zip(groups, sources, strict=True):
+                found = cv2.remap(
+                    source, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+                )  # fmt: skip
+                # many times as fast as a mask of numpy
+                mask, target = moved.view(np.uint8), np.ascontiguousarray(part[..., some])
+                part[..., some] = cv2.copyTo(found, mask, target).reshape(target.shape)
+            lost |= (u < -0.5) | (u > columns - 0.5) | (v < -0.5) | (v > rows - 0.5)
+        if lost.any():
+            part[lost] = 0
+        touched[top:bottom] = moved | lost
+        black += int(np.count_nonzero(lost))
+    return Resampled(out, touched, black / (rows * columns))
+
+
+def _strip(shifts: Shifts, top: int, bottom: int, columns: int) -> tuple[Any, BoolArray]:
+    """Interpolate the shifts of some rows, and whether they are unknown, from the nodes."""
+    cv2 = photo_library("cv2")
+    step = shifts.step_px
+    first, last = top // step, -(-bottom // step) + 2  # nodes half a step above and below
+    size = ((shifts.known.shape[1]) * step, (last - first) * step)
+    # nodes are the centres of the cells that a resize makes of them, one step further up and left
+    window = np.s_[top - first * step + step : bottom - first * step + step, step : step + columns]
+    wide = cv2.resize(shifts.shift_px[first:last], size, interpolation=cv2.INTER_LINEAR)[window]
+    lost = (~shifts.known[first:last]).astype(np.float32)
+    if not lost.any():
+        return wide, np.zeros(wide.shape[:2], bool)
+    return wide, cv2.resize(lost, size, interpolation=cv2.INTER_LINEAR)[window] > 0.0

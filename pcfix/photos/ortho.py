@@ -1,12 +1,11 @@
-"""The orthophoto of the bed: each cell in the colour of the photograph that sees it most steeply.
+"""The orthophoto of the bed: each cell takes the colour of the images closest to nadir.
 
-A cell of the bed is looked for in the photographs themselves: where there is water over it, the
-light is traced from the bed through the surface to the projection centre, and the lens says where
-it ends. So photographs as they were taken serve as well as those without water, are resampled once
-only, and nothing is lost to the frames of photographs that have become smaller.
+Each cell of the DSM is located in the images themselves: under water, the light is traced from the
+bed through the surface to the projection centre. So original images serve as well as those without
+water, and they are resampled only once.
 
-Of the photographs that see a cell, those count of which the ray is nearly as steep as the steepest
-one, less the flatter they look, so that colours run into each other at the seams.
+Images whose rays are nearly as steep as the steepest are mixed, weighted by the difference, so that
+seams do not show.
 """
 
 from __future__ import annotations
@@ -18,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from pcfix.errors import PcfixWarning
 from pcfix.lens.imaging import project
 from pcfix.model import BoolArray, FloatArray
 from pcfix.photos.mapping import Photo, Scene, hidden
@@ -25,34 +25,18 @@ from pcfix.refract.tracing import trace
 from pcfix.water.surface import surface_above
 
 FEATHER = 0.01
-"""Tangents off the vertical within which photographs are mixed: 15 pixels of a lens of 1500."""
+"""Images are mixed within this difference of tangents from nadir (15 px at f = 1500 px)."""
 SPARE_SHARE = 0.15
-"""Of the frame: so far outside a straight ray may end, and the bent one inside."""
+"""Of the frame: a straight ray may end so far outside it while the refracted ray ends inside."""
 BLACK = 3
-"""Of 255: what is as dark as this over `BLACK_PX`, as JPEG leaves it, is no picture."""
+"""Pixels up to this value (of 255) over an area of `BLACK_PX` squared have no picture."""
 BLACK_PX = 7
 REMAP_COLUMNS = 1024
 
 
 @dataclass(frozen=True)
 class OrthoSummary:
-    """What `pcfix.ortho_photo` did.
-
-    Attributes
-    ----------
-    output : str
-    images, width, height : int
-        Photographs, and cells.
-    resolution_m : float
-    bounds_m : tuple of float
-        Left, bottom, right, top.
-    covered_share : float
-        Of the cells over the DSM.
-    seconds : float
-    dsm : str
-    water : str or None
-    notes : tuple of str
-    """
+    """The result of `pcfix.ortho_photo`; `covered_share` is that of the cells over the DSM."""
 
     output: str
     images: int
@@ -64,19 +48,13 @@ class OrthoSummary:
     seconds: float
     dsm: str
     water: str | None
-    notes: tuple[str, ...]
+    notes: tuple[PcfixWarning, ...]
 
 
 class Picture(NamedTuple):
-    """The pixels of a photograph.
+    """The pixels of an image, shape (rows, columns, bands), reduced by a whole factor.
 
-    Attributes
-    ----------
-    pixels : array, shape (rows, columns, bands)
-    shrunk : int
-        So many pixels of the photograph taken, each way, are one of these.
-    blank : array of bool, shape (rows, columns), or None
-        Where there is no picture.
+    `blank`, shape (rows, columns), is where there is no picture, if that was asked for.
     """
 
     pixels: npt.NDArray[Any]
@@ -85,7 +63,7 @@ class Picture(NamedTuple):
 
 
 def picture_of(pixels: npt.NDArray[Any], shrunk: int = 1, *, blanks: bool = False) -> Picture:
-    """Return a photograph, made smaller for coarse rasters, and without what is left black."""
+    """Return an image, reduced for coarse rasters; with `blanks`, black areas have no picture."""
     import cv2
 
     blank = blank_in(pixels) if blanks else None
@@ -101,7 +79,7 @@ def picture_of(pixels: npt.NDArray[Any], shrunk: int = 1, *, blanks: bool = Fals
 
 
 def blank_in(pixels: npt.NDArray[Any]) -> BoolArray:
-    """Return where a photograph without water was left black, and what lies next to that."""
+    """Return the black areas of an image without water, and the pixels beside them."""
     import cv2
 
     limit = BLACK * (257 if pixels.dtype == np.uint16 else 1)
@@ -114,7 +92,7 @@ def blank_in(pixels: npt.NDArray[Any]) -> BoolArray:
 
 
 class Mosaic(NamedTuple):
-    """Colours of cells, shape (n, bands), and which of them any photograph sees."""
+    """Colours of cells, shape (n, bands), and whether any image sees them."""
 
     colour: FloatArray
     covered: BoolArray
@@ -123,17 +101,9 @@ class Mosaic(NamedTuple):
 def mosaic(
     xyz: FloatArray, photos: Sequence[Photo], scene: Scene, picture: Callable[[int], Picture]
 ) -> Mosaic | None:
-    """Return the colours of places on the ground, None where no photograph sees one.
+    """Return the colours of places on the ground, shape (n, 3); None where no image sees any.
 
-    Parameters
-    ----------
-    xyz : array, shape (n, 3)
-        Metres, world frame.
-    photos : sequence of Photo
-    scene : Scene
-        Ground, and the water over it.
-    picture : callable
-        From the place of a photograph in the sequence to its pixels.
+    `picture` returns the pixels of an image by its place in `photos`.
     """
     slopes = [slope_of(photo, xyz) for photo in photos]
     near = [k for k, one in enumerate(slopes) if np.isfinite(one).any()]
@@ -169,7 +139,7 @@ def mosaic(
 
 
 def slope_of(photo: Photo, xyz: FloatArray) -> npt.NDArray[np.float32]:
-    """Return the tangent off the vertical of straight rays; infinite well outside the frame."""
+    """Return the tangent of straight rays from nadir; infinite far outside the frame."""
     away = xyz - photo.centre
     lens = photo.lens
     place = project(lens, away @ photo.rotation.T) / [lens.width, lens.height]
@@ -180,22 +150,9 @@ def slope_of(photo: Photo, xyz: FloatArray) -> npt.NDArray[np.float32]:
 
 
 def seen_at(photo: Photo, xyz: FloatArray, scene: Scene) -> tuple[FloatArray, BoolArray]:
-    """Return where places on the ground are in a photograph, and whether they are in sight.
+    """Return the pixels of places on the ground, shape (n, 3), and whether the image sees them.
 
-    Parameters
-    ----------
-    photo : Photo
-    xyz : array, shape (n, 3)
-        Metres, world frame.
-    scene : Scene
-
-    Returns
-    -------
-    place : array, shape (n, 2)
-        u and v in pixels.
-    seen : array of bool, shape (n,)
-        Whether the place is in the frame, and neither the way through the air nor that through
-        the water meets the ground before.
+    A place is seen if it lies in the frame and the ground does not occlude its ray in air or water.
     """
     depth = np.nan_to_num(surface_above(scene.water, xyz).height_m - xyz[:, 2], nan=0.0)
     wet = np.flatnonzero(depth > 0.0)

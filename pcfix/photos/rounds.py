@@ -1,8 +1,7 @@
-"""The rounds of Fig 10 of Skarlatos & Agrafiotis 2018: what each changed, and when to stop.
+"""The rounds of Fig 10 of Skarlatos & Agrafiotis 2018: how far the bed moved, and when to stop.
 
-Their rule is that the differences of a DSM from the one before are "below a certain threshold
-(i.e., ground pixel size)". Here it is the mean difference under water that counts: single cells
-differ by what the matcher scatters, however often it is asked.
+Their rule is that a DSM differs from the one before by less than a threshold (a ground pixel). Here
+the mean difference under water counts: single cells scatter by the noise of the matcher.
 """
 
 from __future__ import annotations
@@ -11,27 +10,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pcfix.errors import GeometryError
+from pcfix.errors import GeometryError, PcfixWarning
 from pcfix.model import BoolArray, FloatArray
 
 PAPER_ROUNDS = 3
-"""After so many the mapping by eq 12 has come near to where it goes, not to the bed."""
+"""After so many, the mapping by eq 12 is close to its fixed point, which is not the bed."""
 
 
 @dataclass(frozen=True)
 class Round:
-    """What a round changed.
+    """The change in a round: DSM minus the one before, over submerged cells (all if none are).
 
-    Attributes
-    ----------
-    cloud, dsm : str
-        Its files.
-    cells : int
-        Under water, or all where none are, with a height before and after.
-    mean_m, sd_m : float
-        Of the DSM minus that before.
-    within_gsd : float
-        Share of the cells that moved by no more than a ground pixel.
+    `within_gsd` is the share of the cells that moved by at most a ground pixel.
     """
 
     cloud: str
@@ -44,22 +34,18 @@ class Round:
 
 @dataclass(frozen=True)
 class RebuildSummary:
-    """What `pcfix.rebuild_rounds` did.
+    """The result of `pcfix.rebuild_rounds`.
 
     Attributes
     ----------
-    rounds : tuple of Round
     done_before : int
-        Rounds that an earlier call had finished.
+        Rounds that an earlier call finished.
     settled : bool
-        Whether the last one moved the bed by less than asked for.
-    gsd_m, threshold_m, seconds : float
-    mapping, rebuild : str
+        Whether the last round moved the bed by less than the threshold.
     compare : str
         The command that compares all clouds with a reference.
     compared : str or None
-        The folder with what it gave, where a reference was named.
-    notes : tuple of str
+        The folder with its results, where a reference was given.
     """
 
     rounds: tuple[Round, ...]
@@ -72,40 +58,40 @@ class RebuildSummary:
     rebuild: str
     compare: str
     compared: str | None
-    notes: tuple[str, ...]
+    notes: tuple[PcfixWarning, ...]
 
 
 def round_of(
     files: tuple[str, str], difference_m: FloatArray, wet: BoolArray, gsd_m: float
 ) -> Round:
-    """Return what a round changed.
+    """Return the change in a round.
 
     Parameters
     ----------
     files : tuple of str
         Its cloud and its DSM.
     difference_m : array, shape (rows, columns)
-        The DSM minus that before, NaN where either has no height.
+        DSM minus the one before, NaN where either has no height.
     wet : array of bool, shape (rows, columns)
-    gsd_m : float
 
     Raises
     ------
     GeometryError
-        If no cell has both heights.
+        ``cloud.no_overlap``.
     """
     known = np.isfinite(difference_m)
     moved = difference_m[known & wet] if (known & wet).any() else difference_m[known]
     if not len(moved):
-        raise GeometryError(f"{files[0]}: lies beside the DSM before; check its CRS.")
+        raise GeometryError(
+            "cloud.no_overlap",
+            f"{files[0]}: does not overlap the DSM of the round before. Check its CRS.",
+            path=files[0],
+        )
     within = float((np.abs(moved) <= gsd_m).mean())
     mean, sd = float(moved.mean()), float(moved.std())
     return Round(*files, len(moved), round(mean, 5), round(sd, 5), round(within, 5))
 
 
 def paper_excess(refractive_index: float) -> float:
-    """Return by which share of the depth eq 12 comes out too deep, near nadir, in the end.
-
-    A round makes h0 + (n - 1) h of a depth h, which tends to h0 / (2 - n) instead of n h0.
-    """
+    """Return the share of the depth by which eq 12 ends too deep near nadir: h0 / (2 - n)."""
     return 1.0 / (refractive_index * (2.0 - refractive_index)) - 1.0

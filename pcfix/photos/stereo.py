@@ -1,11 +1,10 @@
-"""A dense cloud by stereo pairs, for rounds without another program.
+"""A simple dense matcher by stereo pairs, for rounds without another program.
 
 As on the slide "Processing of stereo images" of Mulsow 2024: pairs, matching, intersection of
-straight rays, fusion of the clouds, filtering. Each photograph is paired with a few neighbours,
-both are turned so that rows correspond, OpenCV's semi-global matcher (Hirschmueller 2008) finds
-disparities from left to right and back, and of the heights that the pairs give a cell the median is
-taken. It is modest: no weights, no visibility, heights of all pairs in memory (a few hundred
-photographs), and good for land and bed that are seen from above.
+straight rays, fusion, filtering. Each image is paired with a few neighbours and rectified, OpenCV's
+semi-global matcher (Hirschmueller 2008) finds disparities in both directions, and each cell takes
+the median of the heights from the pairs. There are no weights and no visibility, and the heights of
+all pairs are in memory (a few hundred images). It suits land and bed seen from above.
 """
 
 from __future__ import annotations
@@ -24,39 +23,31 @@ from pcfix.photos.mapping import Photo
 
 PARTNERS = 4
 BASE_SHARES = (0.1, 0.3, 0.55)
-"""Of the shorter side of the photograph: shortest base, best, longest."""
+"""Shortest, best and longest base, as shares of the shorter side of the image."""
 MOST_ANGLE_DEG = 30.0
 """Between the axes of a pair."""
 SPARE_PX = 4
 SPARE_RELIEF = 0.5
-"""Of the range of heights: so much lower the bed is looked for than the ground before."""
+"""The bed is searched this share of the range of heights below the ground."""
 BLOCK_PX = 5
 FEWEST_PAIRS = 2
-"""Of a cell, and half of all there, whose heights are within a pixel of parallax of the median."""
-
+"""A cell needs so many pairs, and half of its own, within a pixel of parallax of the median."""
 HALF = 1 << 31
-"""Added to columns, so that those west of x = 0 share a number with their rows."""
+"""Added to columns, so that those west of x = 0 do not run into the row of their number."""
 
 
 class Grey(NamedTuple):
-    """A photograph for matching: uint8, shape (rows, columns), and where it has no picture."""
+    """An image for matching: uint8, shape (rows, columns), and where it has no picture."""
 
     pixels: npt.NDArray[np.uint8]
     blank: BoolArray
 
 
 class Rectified(NamedTuple):
-    """The common frame of a pair, x along the base: rotation from the world, and its window.
+    """The common frame of a pair, x along the base: its rotation from the world, and its window.
 
-    Attributes
-    ----------
-    rotation : array, shape (3, 3)
-    base_m, focal_px : float
-    left_px, top_px : float
-        Where the window begins in the left photograph, from the foot of the axis.
-    width, height : int
-    least_px, disparities : int
-        Smallest disparity, and how many.
+    `left_px` and `top_px` are the corner of the window in the left image, from the foot of the
+    axis; disparities begin at `least_px`.
     """
 
     rotation: FloatArray
@@ -77,28 +68,15 @@ def stereo_cloud(
     picture: Callable[[int], Grey],
     progress: Callable[[int, int], None] | None = None,
 ) -> FloatArray:
-    """Return a point for each cell of land and bed that two pairs of photographs see.
+    """Return a point, shape (n, 3), for each cell of land and bed in two or more pairs of images.
 
-    Parameters
-    ----------
-    photos : sequence of Photo
-    ground : Ground
-        Roughly: from it are the range of depths and the flying height.
-    cell_m : float
-    picture : callable
-        From the place of a photograph in the sequence to its pixels.
-    progress : callable, optional
-        Called with (pairs done, pairs in all).
-
-    Returns
-    -------
-    array, shape (n, 3)
-        Metres, world frame.
+    The ground, which need only be approximate, gives the range of depths and the flying height;
+    `picture` returns the pixels of an image by its place in `photos`.
 
     Raises
     ------
     GeometryError
-        If there are no pairs, or none gives heights.
+        ``photos.no_pairs``.
     """
     low, high = np.nanquantile(ground.height_m, [0.001, 0.999])
     heights = float(low - SPARE_RELIEF * (high - low) - 1.0), float(high + 1.0)
@@ -113,8 +91,10 @@ def stereo_cloud(
             progress(done, len(pairs))
     if not sum(map(len, z)):
         raise GeometryError(
-            "stereo found no pairs of photographs that overlap and match; rebuild with a command of"
-            " a photogrammetry package."
+            "photos.no_pairs",
+            "Stereo found no pairs of images that overlap and match. Rebuild with the command of a"
+            " photogrammetry package.",
+            pairs=len(pairs),
         )
     middle = float(np.nanmedian(ground.height_m))
     parallax = [
@@ -125,7 +105,7 @@ def stereo_cloud(
 
 
 def pairs_of(photos: Sequence[Photo], ground_m: float) -> list[tuple[int, int]]:
-    """Return pairs, each photograph with the neighbours whose bases are nearest to the best."""
+    """Pair each image with the neighbours whose bases are nearest to the best."""
     shortest, best, longest = BASE_SHARES
     centres = np.array([photo.centre for photo in photos])
     axes = np.array([photo.rotation[2] for photo in photos])
@@ -143,7 +123,7 @@ def pairs_of(photos: Sequence[Photo], ground_m: float) -> list[tuple[int, int]]:
 
 
 def rectified(left: Photo, right: Photo, heights: tuple[float, float]) -> Rectified | None:
-    """Return the common frame of a pair, None where they have no ground in common."""
+    """Return the common frame of a pair; None where they have no ground in common."""
     way = right.centre - left.centre
     base = float(np.linalg.norm(way))
     x = way / base
@@ -151,7 +131,11 @@ def rectified(left: Photo, right: Photo, heights: tuple[float, float]) -> Rectif
     z = z - (z @ x) * x
     z /= np.linalg.norm(z)
     rotation = np.stack([x, np.cross(z, x), z])
-    corners = [_corners(photo) for photo in (left, right)]
+    corners = []  # directions of the corners of both images, world frame
+    for photo in (left, right):
+        w, h = photo.lens.width, photo.lens.height
+        places = np.array([[0.0, 0.0], [w, 0.0], [0.0, h], [w, h]])
+        corners.append(np.asarray(unproject(photo.lens, places) @ photo.rotation))
     ahead = [one @ rotation.T for one in corners]
     if min((one[:, 2] / np.linalg.norm(one, axis=1)).min() for one in ahead) < 0.3:
         return None
@@ -179,17 +163,10 @@ def rectified(left: Photo, right: Photo, heights: tuple[float, float]) -> Rectif
     )
 
 
-def _corners(photo: Photo) -> FloatArray:
-    """Return where the corners of a photograph look to, shape (4, 3), world frame."""
-    w, h = photo.lens.width, photo.lens.height
-    places = np.array([[0.0, 0.0], [w, 0.0], [0.0, h], [w, h]])
-    return np.asarray(unproject(photo.lens, places) @ photo.rotation)
-
-
 def pair_points(
     left: Photo, right: Photo, one: Grey, other: Grey, heights: tuple[float, float]
 ) -> FloatArray:
-    """Return what two photographs see both, shape (n, 3), metres, world frame."""
+    """Intersect what both images of a pair see, shape (n, 3), metres, world frame."""
     import cv2
 
     frame = rectified(left, right, heights)
@@ -217,7 +194,7 @@ def pair_points(
 
 
 def _turned(photo: Photo, grey: Grey, frame: Rectified, least_px: int) -> tuple[Any, BoolArray]:
-    """Return a photograph in the frame of a pair, and where it has no picture there."""
+    """Rectify an image to the frame of a pair, and return where it has no picture there."""
     import cv2
 
     u = np.arange(frame.width) + 0.5 + frame.left_px - least_px
@@ -236,7 +213,7 @@ def _turned(photo: Photo, grey: Grey, frame: Rectified, least_px: int) -> tuple[
 
 
 def _means(xyz: FloatArray, cell_m: float) -> tuple[IntArray, FloatArray]:
-    """Return the cells that have points, as one number each, and the mean heights there."""
+    """Return the cells with points, as one number each, and their mean heights."""
     column, row = np.floor(xyz[:, :2] / cell_m).astype(np.int64).T
     cells, inverse, counts = np.unique(
         (row << 32) + column + HALF, return_inverse=True, return_counts=True
@@ -245,7 +222,7 @@ def _means(xyz: FloatArray, cell_m: float) -> tuple[IntArray, FloatArray]:
 
 
 def _fused(cells: IntArray, z: FloatArray, cell_m: float, parallax_m: float) -> FloatArray:
-    """Return the medians of the heights of each cell, over its centre, where most pairs agree."""
+    """Return the median height of each cell, at its centre, where most pairs agree."""
     order = np.lexsort((z, cells))
     z = z[order]
     own, first, counts = np.unique(cells[order], return_index=True, return_counts=True)

@@ -1,41 +1,36 @@
-"""The water surface above a bed, from how far waves displace the bed in the frames of a sequence.
+"""The water surface above a bed, from the displacement of the bed in the frames of a sequence.
 
 Mulsow 2024, "strategies for wavy water", the complex method: a spatio-temporal model of the
 surface.
 
-*From displacement to slope.* A camera ray s that looks straight down meets the surface where its
-normal is N = (-z_x, -z_y, 1), nearly. Snell's law in vector form (eq 10 of Skarlatos & Agrafiotis
-2018), t = r s + (r c - sqrt(1 - r^2 (1 - c^2))) N with r = 1/n and c = -N.s = 1, is to the first
-order t = r s - (1 - r) N = ((1 - r) z_x, (1 - r) z_y, -1): at the depth h the ray meets the bed
-displaced by
+*From displacement to slope.* A nadir ray s meets the surface where its normal is about
+N = (-z_x, -z_y, 1). Snell's law in vector form (eq 10 of Skarlatos & Agrafiotis 2018) with r = 1/n
+gives, to the first order, t = ((1 - r) z_x, (1 - r) z_y, -1): at the depth h the ray meets the bed
 
     h (1 - 1/n) grad z
 
-from where it met it under calm water, a quarter of depth times slope. No need for the first
-order: the law says that n t - s is along the normal. Of a pixel p of a frame, s is known by the
-camera and the piercing point A by s and the level; the median image shows at p + d what the frame
-shows at p, and calm water puts that at the place Q of the bed. So t = (Q - A) / |Q - A|, N is
-along s - n t, and the slope is -N_xy / N_z: exact, for any angle of view. A needs the height of
-the water itself, which is zero at first and that of the first solution then.
+from its place under calm water, a quarter of depth times slope. The exact form, for any angle of
+view: n t - s is along the normal. For a pixel p of a frame, s follows from the camera, and the
+piercing point A from s and the level. The median image shows at p + d what the frame shows at p,
+and through calm water that is the place Q of the bed. So t = (Q - A) / |Q - A|, N is along s - n t,
+and the slope is -N_xy / N_z. A needs the height of the water, which is zero at first and then that
+of the first solution.
 
 *From slopes to heights.* The surface is a sum of plane waves,
 
     z(x, t) = sum a cos(k.x - w t) + b sin(k.x - w t),    w^2 = g k tanh(k h),
 
-which has no curl, needs no border, and ties the frames together: each wave runs as fast as water
-lets it (the dispersion relation; no current, no surface tension, the mean depth). The waves are
-chosen where the slopes have most energy on the dispersion shell of their spectrum, some at a
-time, and fitted by least squares to the slopes of all frames at once, weighted by the texture of
-the bed, with a prior of the slopes' own variance. Where the time between frames is not known,
-each frame is fitted alone.
+which has no curl, needs no border condition, and ties the frames together by the dispersion
+relation (no current, no surface tension, mean depth). The waves with most energy on the dispersion
+shell of the spectrum are chosen, some at a time, and fitted by least squares to the slopes of all
+frames, weighted by the texture of the bed, with a prior of the slopes' own variance. Where the time
+between frames is not known, each frame is fitted alone.
 
-The median over few frames is not calm water: it keeps about the mean of each wave over them, and
-the slopes lack it. So what is fitted is each wave less its mean over the frames; of one that hardly
-turns meanwhile little is left, and its standard error says so.
+The median over few frames keeps about the mean of each wave over them, and the slopes lack it. So
+each wave is fitted less its mean over the frames.
 
-What it cannot know: the mean level; waves longer than twice the image, or shorter than three
-cells; and, where there is no land that holds the frames still, the part of the waves that looks
-like a move of the camera.
+Not observable are the mean level, waves longer than twice the image or shorter than three cells,
+and, without land, the part of the waves that looks like a movement of the camera.
 """
 
 from __future__ import annotations
@@ -47,32 +42,33 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import GeometryError, photo_library
+from pcfix.errors import GeometryError
 from pcfix.lens.imaging import project, unproject
+from pcfix.libraries import photo_library
 from pcfix.model import BoolArray, FloatArray
 from pcfix.photos.calm import grey8
 from pcfix.photos.mapping import Photo
 
 GRAVITY = 9.81
 CELLS = 2000
-"""Of the rasters by default: more make more short waves, at a price of time."""
+"""Of the rasters by default; more cells give more short waves, and take more time."""
 MARGIN = 0.4
-"""Of the depth, by which the rasters go beyond what the camera sees of the level."""
+"""Of the depth, by which the rasters exceed what the camera sees of the level."""
 SHORTEST_CELLS = 3.0
 WAVES_AT_ONCE = 40
 ROUNDS = 6
 LEAST_GAIN = 0.003
-"""Of the slopes' energy that a further round must explain."""
+"""Share of the slopes' energy that a further round must explain."""
 OVER_NOISE = 8.0
-"""Of the mean energy of the shell that a wave must have to be one."""
+"""A wave needs so many times the mean energy of the shell."""
 STILL = 0.15
-"""Of the usual displacement; what moves less, over the whole sequence, is land."""
+"""Share of the usual displacement below which a node is land."""
 
 
 class View(NamedTuple):
-    """What the frames are of: the first one's camera, calm water, and the true bed's height.
+    """The first frame's camera, calm water, and the true bed.
 
-    `bed` takes places in plan, shape (n, 2), and gives heights, shape (n,); NaN where not known.
+    `bed` takes places in plan, shape (n, 2), and gives heights, shape (n,); NaN where unknown.
     """
 
     photo: Photo
@@ -83,17 +79,9 @@ class View(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Nodes:
-    """The cells of the rasters: their centres, and what of them the first frame sees.
+    """The cells of the rasters, row by row from the north, and whether the first frame sees them.
 
-    Attributes
-    ----------
-    left_m, top_m, cell_m : float
-    shape : tuple of 2 int
-        Rows and columns.
-    xy : array, shape (n, 2)
-        Centres, world frame, row by row from the north.
-    seen : array of bool, shape (n,)
-        In the image and over water.
+    `shape` has rows and columns, `xy` the centres in the world frame, shape (n, 2).
     """
 
     left_m: float
@@ -133,8 +121,9 @@ def nodes_of(view: View, cell_m: float | None) -> Nodes:
     outline = on_level(view, edge)[:, :2]
     if not np.isfinite(outline).all():
         raise GeometryError(
-            "the camera does not look down onto the water with its whole image; check the pose, and"
-            " level."
+            "cameras.pose",
+            "The camera does not see the water with its whole image. Check pose and level.",
+            level=view.level_m,
         )
     cell = cell_m or float(np.sqrt(np.ptp(outline, axis=0).prod() / CELLS))
     depth = float(np.nanmedian(view.level_m - view.bed(outline)))
@@ -155,7 +144,7 @@ def _pixels(view: View, xyz: FloatArray) -> FloatArray:
 
 
 class Displacements:
-    """How far each frame shows the bed from where the median has it, at the nodes."""
+    """Measure the displacement of the bed in each frame from the median image, at the nodes."""
 
     def __init__(self, median: npt.NDArray[Any], view: View, nodes: Nodes) -> None:
         cv2 = photo_library("cv2")
@@ -187,22 +176,19 @@ class Displacements:
 
 
 def slopes_of(view: View, xy: FloatArray, height_m: FloatArray, shift_px: FloatArray) -> FloatArray:
-    """Return the slopes that displace the bed so, by Snell's law in vector form.
+    """Return the slopes of the surface that displace the bed, by Snell's law in vector form.
 
     Parameters
     ----------
-    view : View
-    xy : array, shape (n, 2)
-        Where the surface is met, world frame.
-    height_m : array, shape (n,)
-        Of the surface there.
+    xy, height_m : array, shape (n, 2) and (n,)
+        Piercing points, world frame.
     shift_px : array, shape (n, 2)
-        From the pixel of a frame to where the median shows the same.
+        From the pixel of a frame to the pixel of the median that shows the same.
 
     Returns
     -------
     array, shape (n, 2)
-        dz/dx and dz/dy; NaN where the bed is not known, or not under water.
+        dz/dx and dz/dy; NaN where the bed is unknown or not under water.
     """
     pierced = np.column_stack([xy, height_m])
     seen = pierced - view.photo.centre
@@ -216,7 +202,7 @@ def slopes_of(view: View, xy: FloatArray, height_m: FloatArray, shift_px: FloatA
 
 @dataclass(frozen=True, eq=False)
 class Waves:
-    """Plane waves, and how well they are known.
+    """Plane waves and their precision.
 
     Attributes
     ----------
@@ -224,14 +210,12 @@ class Waves:
         Wave numbers k, rad/m.
     frequency : array, shape (m,)
         w, rad/s.
-    slope : array, shape (2 m,)
-        Of the cosines, then the sines: amplitude of the slope, k times that of the height.
-    covariance : array, shape (2 m, 2 m)
-        Of `slope`.
+    slope, covariance : array, shape (2 m,) and (2 m, 2 m)
+        Amplitudes of the slope (k times that of the height), cosines then sines.
     left_over_m : float
-        Heights, rms, that the slopes left over would make.
+        Heights, rms, that correspond to the residual slopes.
     explained : float
-        Of the energy of the slopes.
+        Share of the energy of the slopes.
     """
 
     number: FloatArray
@@ -253,7 +237,7 @@ class Waves:
 
 
 class Slopes(NamedTuple):
-    """What waves are fitted to: slopes of all frames, shape (f, n, 2), weights and times.
+    """Slopes of all frames, shape (f, n, 2), their weights, shape (f, n), and times.
 
     `xy`, shape (n, 2), is the lattice of `shape` and `cell_m`, relative to any point.
     """
@@ -267,7 +251,7 @@ class Slopes(NamedTuple):
 
 
 def fit_waves(given: Slopes, depth_m: float) -> Waves:
-    """Return the plane waves that slopes show; of one frame alone, where the time tells nothing."""
+    """Fit plane waves to slopes; with one frame, time has no effect."""
     spectrum = _Spectrum(given, depth_m)
     chosen = np.empty(0, np.int64)
     total = float((given.weight[..., None] * given.slope**2).sum())
@@ -298,9 +282,9 @@ class _Fit(NamedTuple):
 
 
 def _bases(given: Slopes, number: FloatArray, frequency: FloatArray) -> Iterator[FloatArray]:
-    """Yield what unit slopes of cosines and sines of height give along their waves, (n, 2 m).
+    """Yield the slopes along unit waves, cosines then sines, shape (n, 2 m), of each frame.
 
-    One for each frame, less the mean over the frames, which the median has kept.
+    The mean over the frames is subtracted, as the median image keeps it.
     """
     place = np.exp(1j * (given.xy @ number.T))
     turn = np.exp(-1j * given.time_s[:, None] * frequency)
@@ -327,7 +311,7 @@ def _solved(given: Slopes, number: FloatArray, frequency: FloatArray) -> _Fit:
     count = max(float(given.weight.sum()), 1e-30)
     prior = float((given.weight[..., None] * given.slope**2).sum()) / count
     residual, noise = given.slope.copy(), 0.1 * prior
-    for _ in range(2):  # the noise first guessed, then that of the residuals
+    for _ in range(2):  # first with a guess of the noise, then with that of the residuals
         covariance = np.linalg.inv(gram + (noise / prior) * np.eye(size))
         found = covariance @ right
         bases = _bases(part, number, frequency)
@@ -338,7 +322,7 @@ def _solved(given: Slopes, number: FloatArray, frequency: FloatArray) -> _Fit:
 
 
 class _Spectrum:
-    """The wave numbers that may be, and the energy of slopes at each of them on the shell."""
+    """The possible wave numbers, and the energy of slopes at each of them on the shell."""
 
     def __init__(self, given: Slopes, depth_m: float) -> None:
         self._given = given
@@ -375,7 +359,7 @@ class _Spectrum:
         return np.abs(total) ** 2
 
     def strongest(self, slope: FloatArray, chosen: npt.NDArray[np.int64]) -> Any:
-        """Return the rows of the next waves, those with most energy of what is not chosen."""
+        """Return the rows of the next waves: those with most energy that are not chosen."""
         energy = self.energy(slope)
         least = OVER_NOISE * float(self._white(slope))
         energy[chosen] = 0.0
@@ -383,17 +367,17 @@ class _Spectrum:
         return first[energy[first] > least]
 
     def _white(self, slope: FloatArray) -> float:
-        """Return the energy that slopes would have everywhere, were they white noise."""
+        """Return the energy at each wave number if the slopes were white noise."""
         weight = self._given.weight[..., None]
         return float(((weight * slope) ** 2).sum()) / 2.0
 
     def redness(self, residual: FloatArray, chosen: npt.NDArray[np.int64]) -> float:
-        """Return how much more of the residuals is on the shell than of white noise."""
+        """Return the energy of the residuals on the shell, relative to white noise."""
         energy = np.delete(self.energy(residual), chosen)
         return max(1.0, float(energy.mean()) / max(self._white(residual), 1e-30))
 
     def height_rms(self, residual: FloatArray) -> float:
-        """Return the heights that slopes would make, rms, as Frankot & Chellappa integrate."""
+        """Integrate residual slopes to heights, rms, by the method of Frankot & Chellappa."""
         given, total, count = self._given, 0.0, 0.0
         half = 2.0 if len(given.time_s) == 1 else 1.0
         for one, weight in zip(residual, given.weight, strict=True):
@@ -404,7 +388,7 @@ class _Spectrum:
 
 
 def still(shifts_px: FloatArray, weight: FloatArray) -> BoolArray:
-    """Return which nodes hardly ever move: land, by displacements of shape (f, n, 2)."""
+    """Return which nodes hardly move, and so are land, by displacements of shape (f, n, 2)."""
     moved = np.sqrt((shifts_px**2).sum(axis=2).mean(axis=0))
     known = weight.mean(axis=0) > 0.0
     return np.asarray(known & (moved < STILL * np.median(moved[known])) if known.any() else ~known)

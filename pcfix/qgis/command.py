@@ -1,4 +1,4 @@
-"""A command of pcfix, from the values of a form: its words, its process, what it says."""
+"""Run a command of pcfix from the values of a form: command line, process, messages."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import os
 import queue
 import shutil
 import signal
-import struct
 import subprocess
 import threading
 from collections.abc import Callable, Iterator
@@ -14,35 +13,32 @@ from pathlib import Path
 from typing import IO, Any
 
 HELP = (
-    "install pcfix into an environment of its own (pip install pcfix), and name that environment,"
-    " or its program pcfix, under Settings > Options > Processing > Providers > pcfix."
+    "Install pcfix into an environment (pip install pcfix), and give that environment, or its"
+    " program pcfix, under Settings > Options > Processing > Providers > pcfix."
 )
 PROGRESS = "progress "
-"""How a line of progress begins: percent follows."""
+"""The beginning of a line of progress; percent follow."""
 _WAIT_S, _PATIENCE_S = 0.2, 10.0
 
 
 class CommandError(Exception):
-    """What went wrong, in a sentence for the user."""
+    """A mistake that the user can correct."""
 
 
 def program_of(setting: str) -> str:
-    """Return the program of an environment, or of the search path where none is named.
-
-    A `CommandError` if there is none.
-    """
+    """Return the program of an environment, or of the search path if none is given."""
     named = setting.strip() or "pcfix"
     tries = [named]
     if Path(named).is_dir():
         tries = [str(Path(named, *way)) for way in (("bin", "pcfix"), ("Scripts", "pcfix.exe"))]
     found = next(filter(None, map(shutil.which, tries)), None)
     if found is None:
-        raise CommandError(f"pcfix is not at '{named}': {HELP}")
+        raise CommandError(f"There is no pcfix at '{named}'. {HELP}")
     return found
 
 
 def words_of(command: dict[str, Any], values: dict[str, Any]) -> list[str]:
-    """Return the command line: places first, then the options that are not as by default."""
+    """Return the command line: arguments, then the options that differ from their defaults."""
     words = [command["name"]]
     words += [str(values[one["name"]]) for one in command["places"]]
     for one in command["options"]:
@@ -57,52 +53,6 @@ def words_of(command: dict[str, Any], values: dict[str, Any]) -> list[str]:
     return words
 
 
-def check_cloud(path: str) -> str:
-    """Return a note on a cloud that says nothing of where it lies; empty where it does.
-
-    A `CommandError` if it is none that pcfix reads.
-    """
-    suffix = Path(path).suffix.lower()
-    if suffix not in (".las", ".laz"):
-        raise CommandError(
-            f"{path}: pcfix reads LAS and LAZ; export the cloud as LAZ, or convert it"
-            " with 'pdal translate IN OUT.laz' or CloudCompare."
-        )
-    try:
-        named = _names_crs(path)
-    except (OSError, struct.error) as error:
-        raise CommandError(f"{path}: cannot be read ({error}).") from error
-    if named:
-        return ""
-    return (
-        f"{path} names no CRS: it is taken to be in metres and in that of the cameras, and what"
-        " is loaded has no CRS either; set it in the layer's properties, or write it into the"
-        " cloud with 'pdal translate --writers.las.a_srs=EPSG:CODE'."
-    )
-
-
-def _names_crs(path: str) -> bool:
-    """Return whether a LAS file has a record of a projection, before its points or behind."""
-    with open(path, "rb") as file:  # noqa: PTH123
-        head = file.read(375)
-        if head[:4] != b"LASF":
-            raise OSError("it is not a LAS file")
-        start, count = struct.unpack_from("<H4xI", head, 94)
-        size, behind = 54, (0, 0)
-        if head[25] >= 4:
-            behind = struct.unpack_from("<QI", head, 235)
-        for at, records, head_size, layout in (
-            (start, count, size, "<2x16s2xH"), (*behind, 60, "<2x16s2xQ")
-        ):  # fmt: skip
-            file.seek(at)
-            for _ in range(records):
-                user, length = struct.unpack_from(layout, file.read(head_size))
-                if user.rstrip(b"\0") == b"LASF_Projection":
-                    return True
-                file.seek(length, os.SEEK_CUR)
-    return False
-
-
 def run(
     program: str,
     words: list[str],
@@ -110,9 +60,12 @@ def run(
     percent: Callable[[float], None],
     say: Callable[[str], None],
 ) -> None:
-    """Run pcfix to its end, and pass on what it says.
+    """Run pcfix to its end and pass on what it prints.
 
-    A `CommandError` with its own last sentence if it fails, or if it was cancelled.
+    Raises
+    ------
+    CommandError
+        With the last line that it printed if it fails, or if it was cancelled.
     """
     kept = {k: v for k, v in os.environ.items() if k not in ("PYTHONHOME", "PYTHONPATH")}
     try:
@@ -122,7 +75,7 @@ def run(
             env={**kept, "PCFIX_PROGRESS": "lines", "PYTHONIOENCODING": "utf-8"},
         )  # fmt: skip
     except OSError as error:
-        raise CommandError(f"{program} cannot be run ({error.strerror}): {HELP}") from error
+        raise CommandError(f"{program} cannot be run ({error.strerror}). {HELP}") from error
     last = ""
     for line in _lines(process, is_cancelled):
         if line.startswith(PROGRESS):
@@ -131,15 +84,15 @@ def run(
             last = line
             say(line)
     if is_cancelled():
-        raise CommandError("cancelled; what was half written is gone.")
+        raise CommandError("Cancelled; unfinished output was removed.")
     if process.returncode:
         raise CommandError(
-            last.removeprefix("pcfix: ") or f"exit code {process.returncode}: {HELP}"
+            last.removeprefix("pcfix: ") or f"Exit code {process.returncode}. {HELP}"
         )
 
 
 def _lines(process: subprocess.Popen[str], is_cancelled: Callable[[], bool]) -> Iterator[str]:
-    """Yield the lines of a process as they come; a cancelled one is asked to stop, then made to."""
+    """Yield the lines of a process; if cancelled it is interrupted and, after a while, killed."""
     lines: queue.Queue[str | None] = queue.Queue()
 
     def read(stream: IO[str]) -> None:

@@ -1,4 +1,4 @@
-"""pcfix in QGIS's toolbox: the provider, its setting, and an algorithm for each command."""
+"""The Processing provider of pcfix in QGIS: its setting, and an algorithm for each command."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from qgis.core import (
     QgsVectorLayer,
 )
 
-from .command import CommandError, check_cloud, program_of, run, words_of
+from .command import CommandError, program_of, run, words_of
 
 PROGRAM = "PCFIX_PROGRAM"
 SAID = "said"
@@ -36,13 +36,13 @@ CLOUDS = "Point clouds (*.las *.laz);;All files (*.*)"
 
 
 class Plugin:
-    """What QGIS loads."""
+    """The plugin."""
 
     def __init__(self) -> None:
         self.provider: Any = None
 
     def initProcessing(self) -> None:  # noqa: N802
-        """Add the algorithms; all that ``qgis_process`` asks for."""
+        """Add the algorithms; ``qgis_process`` calls only this."""
         self.provider = Provider()
         QgsApplication.processingRegistry().addProvider(self.provider)
 
@@ -51,16 +51,16 @@ class Plugin:
         self.initProcessing()
 
     def unload(self) -> None:
-        """Take them away again."""
+        """Remove the algorithms."""
         if self.provider is not None:
             QgsApplication.processingRegistry().removeProvider(self.provider)
 
 
 class Provider(QgsProcessingProvider):
-    """All commands that `pcfix qgis-plugin` put into ``commands.json``."""
+    """The commands in ``commands.json``."""
 
     def id(self) -> str:
-        """Return what stands before the colon."""
+        """Return the prefix of the names of the algorithms."""
         return "pcfix"
 
     def name(self) -> str:
@@ -69,7 +69,7 @@ class Provider(QgsProcessingProvider):
 
     def load(self) -> bool:
         """Add the setting that names pcfix's environment."""
-        words = "Environment that pcfix is installed in, or its program (empty: on the PATH)"
+        words = "Environment with pcfix, or its program (empty: on the PATH)"
         ProcessingConfig.settingIcons["pcfix"] = self.icon()
         ProcessingConfig.addSetting(Setting("pcfix", PROGRAM, words, ""))
         ProcessingConfig.readSettings()
@@ -77,7 +77,7 @@ class Provider(QgsProcessingProvider):
         return True
 
     def unload(self) -> None:
-        """Take the setting away."""
+        """Remove the setting."""
         ProcessingConfig.removeSetting(PROGRAM)
 
     def loadAlgorithms(self) -> None:  # noqa: N802
@@ -95,11 +95,11 @@ class Algorithm(QgsProcessingAlgorithm):
         self.command = command
 
     def createInstance(self) -> Algorithm:  # noqa: N802
-        """Return another one."""
+        """Return a copy."""
         return Algorithm(self.command)
 
     def name(self) -> str:
-        """Return what stands behind the colon."""
+        """Return the name after the prefix."""
         return str(self.command["name"])
 
     def displayName(self) -> str:  # noqa: N802
@@ -111,7 +111,7 @@ class Algorithm(QgsProcessingAlgorithm):
         return str(self.command["help"])
 
     def initAlgorithm(self, configuration: dict[str, Any] | None = None) -> None:  # noqa: N802
-        """Declare places and options."""
+        """Declare arguments and options."""
         for one in (*self.command["places"], *self.command["options"]):
             parameter = _parameter(one)
             parameter.setHelp(one["help"])
@@ -119,12 +119,12 @@ class Algorithm(QgsProcessingAlgorithm):
                 flag = QgsProcessingParameterDefinition.FlagAdvanced
                 parameter.setFlags(parameter.flags() | flag)
             self.addParameter(parameter, createOutput=True)
-        self.addOutput(QgsProcessingOutputString(SAID, "What pcfix said"))
+        self.addOutput(QgsProcessingOutputString(SAID, "Messages of pcfix"))
 
     def processAlgorithm(  # noqa: N802
         self, parameters: dict[str, Any], context: Any, feedback: Any
     ) -> dict[str, Any]:
-        """Run pcfix, and load what it wrote."""
+        """Run pcfix and load its output."""
         values = {
             one["name"]: self._value(one, parameters, context)
             for one in (*self.command["places"], *self.command["options"])
@@ -136,9 +136,6 @@ class Algorithm(QgsProcessingAlgorithm):
             (feedback.pushWarning if "warning:" in line else feedback.pushInfo)(line)
 
         try:
-            for one in self.command["places"]:
-                if one["kind"] == "cloud" and (note := check_cloud(values[one["name"]])):
-                    feedback.pushWarning(note)
             program = program_of(ProcessingConfig.getSetting(PROGRAM) or "")
             words = words_of(self.command, values)
             feedback.pushCommandInfo(" ".join(["pcfix", *words]))
@@ -158,41 +155,36 @@ class Algorithm(QgsProcessingAlgorithm):
         name, kind = one["name"], one["kind"]
         if parameters.get(name) is None and not one["needed"]:
             return None
-        if kind == "bool":
-            return self.parameterAsBool(parameters, name, context)
-        if kind == "int":
-            return self.parameterAsInt(parameters, name, context)
-        if kind == "float":
-            return self.parameterAsDouble(parameters, name, context)
-        if kind == "choice":
-            return self.parameterAsEnumString(parameters, name, context)
-        if kind.endswith("written"):
-            return self.parameterAsFileOutput(parameters, name, context)
-        return self.parameterAsString(parameters, name, context)
+        read: Any = {
+            "bool": self.parameterAsBool,
+            "int": self.parameterAsInt,
+            "float": self.parameterAsDouble,
+            "choice": self.parameterAsEnumString,
+            "written": self.parameterAsFileOutput,
+            "folder written": self.parameterAsFileOutput,
+        }
+        return read.get(kind, self.parameterAsString)(parameters, name, context)
 
 
 def _parameter(one: dict[str, Any]) -> Any:
-    """Return the field of a form for a place or an option; all but the needed may stay empty."""
+    """Return the field of a form for an argument or an option; only needed ones are required."""
     name, kind, default = one["name"], one["kind"], one["default"]
     label = name.replace("_", " ").capitalize() + (f" [{one['unit']}]" if one["unit"] else "")
     optional = not one["needed"]
-    file = QgsProcessingParameterFile
+    file, number = QgsProcessingParameterFile, QgsProcessingParameterNumber
     if kind == "bool":
         return QgsProcessingParameterBoolean(name, label, default, optional)
     if kind in ("int", "float"):
-        number = QgsProcessingParameterNumber
-        return number(name, label, number.Integer if kind == "int" else number.Double, default,
-                      optional)  # fmt: skip
+        type_ = number.Integer if kind == "int" else number.Double
+        return number(name, label, type_, default, optional)
     if kind == "choice":
         return QgsProcessingParameterEnum(
             name, label, one["choices"], False, default, optional, usesStaticStrings=True
         )
-    if kind == "folder":
-        return file(name, label, file.Folder, optional=optional)
-    if kind == "cloud":
-        return file(name, label, file.File, optional=optional, fileFilter=CLOUDS)
-    if kind == "file":
-        return file(name, label, file.File, optional=optional)
+    if kind in ("file", "cloud", "folder"):
+        behaviour = file.Folder if kind == "folder" else file.File
+        clouds = {"fileFilter": CLOUDS} if kind == "cloud" else {}
+        return file(name, label, behaviour, optional=optional, **clouds)
     if kind == "folder written":
         return QgsProcessingParameterFolderDestination(name, label, None, optional, not optional)
     if kind == "written":
@@ -204,7 +196,7 @@ def _parameter(one: dict[str, Any]) -> Any:
 
 
 def _load(path: Path, context: Any) -> None:
-    """Load what was written, a folder's rasters and vectors; a .qml beside one is its style."""
+    """Load an output, or the rasters and vectors of a folder, with the style beside them."""
     paths = sorted(path.iterdir()) if path.is_dir() else [path]
     for one in paths:
         for layer in _layers(one):

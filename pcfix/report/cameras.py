@@ -1,4 +1,4 @@
-"""What ``pcfix cameras`` says of a block of cameras: the figures, in words and as a picture."""
+"""The report of ``pcfix cameras`` on a block of cameras: its data, its summary, and a picture."""
 
 from __future__ import annotations
 
@@ -12,21 +12,28 @@ from pcfix.adjust.evidence import export_of
 from pcfix.lens.frames import footprint
 from pcfix.model import Cameras, FloatArray
 from pcfix.report.page import AFTER, WATER, draw_cloud, label_plan, label_side, new_figure
+from pcfix.report.text import aligned
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-
 MOST_FOOTPRINTS = 400
+SHORT_CRS, SHOWN_NAMES = 60, 5
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """The images of one interior orientation, or of several alike; None where the file is silent.
+    """The images of one interior orientation, or of several alike; None where not stated.
 
-    `focal` is the least and `focal_most` the greatest of its `lenses`, which have so many `frames`;
-    `folded` is the share of the frame beyond the fold of the distortion. A `nominal` one was not
-    calibrated, though others of the block were.
+    Attributes
+    ----------
+    lenses, frames : int
+        How many lenses and frame sizes differ; `focal` and `focal_most` are the limits.
+    folded : float
+        Share of the frame beyond the fold of the distortion.
+    nominal : bool
+        Whether it is not calibrated, though others of the block are.
     """
 
     name: str
@@ -61,7 +68,7 @@ class GnssResiduals:
 
 @dataclass(frozen=True)
 class Fit:
-    """How cameras and cloud lie to each other.
+    """How well cameras and cloud match.
 
     Attributes
     ----------
@@ -72,9 +79,9 @@ class Fit:
     below_ground : int
         Cameras lower than the cloud's highest point within their reach in plan.
     verdict : str
-        What is likely wrong; empty where they fit.
+        What is likely wrong; empty where they match.
     tested : str
-        What they were tested with, and what not.
+        What was tested, and what was not.
     """
 
     cloud: str
@@ -93,32 +100,28 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class CamerasReport:
-    """What ``pcfix cameras`` says.
+    """The report of ``pcfix cameras``.
 
     Attributes
     ----------
-    path : str
     cameras : Cameras
         In the cloud's CRS, where there is a cloud.
     crs_read : str or None
-        Of the file.
-    sensors : tuple of Sensor
+        CRS of the file.
     height_above_water_m : tuple of 3 float, or None
-        Least, mean, most; above the water where it is known, else None.
+        Least, mean and largest; None where the water is not known.
     tilt_deg : tuple of 2 float, or None
         Median and largest angle of the optical axes from nadir.
-    gnss : GnssResiduals or None
-    fit : Fit or None
     sample_xyz : array, shape (m, 3)
         Points of the cloud, for a picture; none without a cloud.
     level_m : float or None
         Mean height of the water.
     problem : str
-        Why `cameras` are not in a map and so have no heights; empty where they are.
+        Why `cameras` are not in a map and have no heights; empty where they are.
     diagnosis : Diagnosis or None
         Whether the poses have absorbed the refraction; None without a cloud or water.
     remedy : tuple of 2 str
-        The command that mends them, and why it has what was not given.
+        The command that corrects the poses, and a remark on it.
     """
 
     path: str
@@ -152,140 +155,135 @@ class CamerasReport:
             "gnss": self.gnss and asdict(self.gnss),
             "fit": fit and {**asdict(fit), "fits": fit.fits},
             "refraction": self.diagnosis and self.diagnosis.as_dict(),
-            "notes": list(cameras.notes),
+            "notes": list(map(str, cameras.notes)),
         }
 
 
-def cameras_text(report: CamerasReport) -> str:
-    """Return what a person wants to know of a camera file."""
-    r, cameras = report, report.cameras
-    unposed = len(cameras.unposed)
-    names = ", ".join(cameras.unposed[:5]) + (", ..." if unposed > 5 else "")
-    lines = [
-        f"{r.path}: {cameras.source or 'cameras'}",
-        f"images       {len(cameras):,} with a pose"
-        + (f", {unposed:,} without: {names}" if unposed else ""),
-        *(_sensor(sensor) for sensor in r.sensors),
-    ]
+def cameras_text(r: CamerasReport) -> str:
+    """Return the summary of a camera file."""
+    cameras, missing = r.cameras, r.cameras.unposed
+    images = f"{len(cameras):,} with a pose"
+    if missing:
+        more = ", ..." if len(missing) > SHOWN_NAMES else ""
+        images += f", {len(missing):,} without: {', '.join(missing[:SHOWN_NAMES])}{more}"
+    rows = [("Images", images), *(row for one in r.sensors for row in sensor_rows(one))]
     if not r.sensors:
-        lines.append("sensor       none: frames are not known")
+        rows.append(("Sensor", "none: the frames are not known"))
     if cameras.rotations is None:
-        lines.append("angles       none: every camera counts as seeing every point")
-    lines.append(f"CRS          {_short(r.crs_read) or 'the file states none'}")
+        rows.append(("Angles", "none: every camera counts as visible from every point"))
+    rows.append(("CRS", _short(r.crs_read) or "not stated"))
     if cameras.crs != r.crs_read:
-        lines.append(f"  now        {_short(cameras.crs) or 'the cloud states none'}")
+        rows.append(("CRS of cloud", _short(cameras.crs) or "not stated"))
     if r.problem:
-        lines.append(f"  problem    {r.problem}")
+        rows.append(("Problem", r.problem))
     else:
         z = cameras.centres[:, 2]
-        lines.append(f"heights      {z.min():.2f} to {z.max():.2f} m, mean {z.mean():.2f} m")
+        rows.append(("Heights", f"{z.min():.2f} to {z.max():.2f} m, mean {z.mean():.2f} m"))
     if r.height_above_water_m is not None:
         low, mean, high = r.height_above_water_m
-        lines.append(f"over water   {low:.1f} to {high:.1f} m, mean {mean:.1f} m")
+        rows.append(("Above water", f"{low:.1f} to {high:.1f} m, mean {mean:.1f} m"))
     if r.tilt_deg is not None:
-        median, largest = r.tilt_deg
-        lines.append(f"tilt         median {median:.1f}, largest {largest:.1f} degrees")
-    if r.gnss is not None:
-        lines += _gnss(r.gnss)
-    lines += [f"note         {note}" for note in cameras.notes]
-    return "\n".join([*lines, *_fit(r), *_refraction(r)])
+        rows.append(("Tilt", "median {:.1f} deg, largest {:.1f} deg".format(*r.tilt_deg)))
+    rows += [*_gnss_rows(r.gnss), *_fit_rows(r.fit), *_refraction_rows(r)]
+    return aligned(f"{r.path}: {cameras.source or 'cameras'}", rows, cameras.notes)
 
 
-def _sensor(s: Sensor) -> str:
-    kind = s.projection + (", distorted" if s.distorted else "")
+def sensor_rows(s: Sensor) -> list[tuple[str, str]]:
+    """Return frame, focal length and pixel size of a sensor, and what is wrong with its lens."""
     low, high = f"{s.focal:.6g}", f"{s.focal_most or s.focal:.6g}"
-    focal = f"{low} {s.unit}" if low == high else f"{low} to {high} {s.unit}"
     size = f"{s.width:g} x {s.height:g} {s.unit}"
-    if s.frames > 1:
-        size = f"{s.frames} sizes as {size}"
-    size += f", focal length {focal}"
+    parts = [
+        f"{s.images:,} images" + (f" with {s.lenses:,} different lenses" if s.lenses > 1 else ""),
+        f"{s.frames} sizes as {size}" if s.frames > 1 else size,
+        f"focal length {low if low == high else f'{low} to {high}'} {s.unit}",
+    ]
     if s.pixel_size_um is not None and s.focal_mm is not None:
-        mm = "" if s.lenses > 1 else f" = {s.focal_mm:.3f} mm"
-        size += f"{mm}, pixel {s.pixel_size_um:.2f} um"
-    gsd = "" if s.gsd_m is None else f", GSD {100.0 * s.gsd_m:.2f} cm at the water"
-    lenses = f" with {s.lenses:,} lenses that differ" if s.lenses > 1 else ""
-    line = f"sensor       {s.name or 'unnamed'}: {s.images:,} images{lenses}, {size}, {kind}{gsd}"
+        parts[-1] += "" if s.lenses > 1 else f" = {s.focal_mm:.3f} mm"
+        parts.append(f"pixel {s.pixel_size_um:.2f} um")
+    parts += [s.projection, *(["distorted"] if s.distorted else [])]
+    parts += [] if s.gsd_m is None else [f"GSD {100.0 * s.gsd_m:.2f} cm at the water"]
+    rows = [("Sensor", f"{s.name or 'unnamed'}: {', '.join(parts)}")]
     if s.folded:
-        line += (
-            f"\n  note       its distortion folds within the frame: {100.0 * s.folded:.2g} % of it"
-            " has no direction, and points there count as not seen; see its radial coefficients"
-        )
+        rows.append(("", f"the distortion folds within the frame: {100.0 * s.folded:.2g} % of it is"
+                     " not used; check the radial coefficients"))  # fmt: skip
     if s.nominal:
-        line += (
-            "\n  note       not calibrated, unlike the others: no distortion, the principal point"
-            " in the middle; its images likely had no tie points, so do not trust their poses"
-        )
-    return line
+        rows.append(("", "not calibrated, unlike the others; its images likely had no tie points,"
+                     " so do not trust their poses"))  # fmt: skip
+    return rows
 
 
 def _short(crs: str | None) -> str:
     """Return the name of a CRS, whose text may be pages long."""
-    if crs is None or len(crs) < 60:
+    if crs is None or len(crs) < SHORT_CRS:
         return crs or ""
-    return crs.split('"')[1] if '"' in crs else crs[:60] + " ..."
+    return crs.split('"')[1] if '"' in crs else crs[:SHORT_CRS] + " ..."
 
 
-def _gnss(g: GnssResiduals) -> list[str]:
-    if g.images == 0:
-        return [f"GNSS         {g.reason}"]
-
-    def three(values: tuple[float | None, ...]) -> str:
-        return ", ".join("-" if v is None else f"{v:+.3f}" for v in values)
-
-    lines = [
-        f"GNSS         {g.images:,} images; adjusted minus GNSS east, north, up: mean"
-        f" {three(g.mean_m)} m, sd {three(g.sd_m).replace('+', '')} m; largest {g.largest_m:.3f} m"
-        f" ({g.largest_image})"
-    ]
-    return [*lines, f"  note       {g.reason}"] if g.reason else lines
+def _gnss_rows(g: GnssResiduals | None) -> list[tuple[str, str]]:
+    if g is None or g.images == 0:
+        return [] if g is None else [("GNSS", g.reason)]
+    mean = ", ".join("-" if v is None else f"{v:+.3f}" for v in g.mean_m)
+    sd = ", ".join("-" if v is None else f"{v:.3f}" for v in g.sd_m)
+    words = (
+        f"{g.images:,} images; adjusted minus GNSS east, north, up: mean {mean} m, sd {sd} m;"
+        f" largest {g.largest_m:.3f} m ({g.largest_image})"
+    )
+    return [("GNSS", words), *([("", g.reason)] if g.reason else [])]
 
 
-def _fit(report: CamerasReport) -> list[str]:
-    fit = report.fit
+def _fit_rows(fit: Fit | None) -> list[tuple[str, str]]:
     if fit is None:
         return []
     seen = ", ".join(f"{name}: {100.0 * part:.1f} %" for name, part in fit.seen_by.items())
-    lines = ["", f"{fit.cloud} ({fit.points_sampled:,} points looked at)", f"seen by      {seen}"]
+    rows = [("Cloud", f"{fit.cloud} ({fit.points_sampled:,} points sampled)")]
+    rows.append(("Visible", f"share of points by number of cameras: {seen}"))
     if fit.distance_m > 0.0:
-        lines.append(f"apart        {fit.distance_m:,.1f} m in plan between block and cloud")
+        rows.append(("Distance", f"{fit.distance_m:,.1f} m in plan between block and cloud"))
     if fit.below_ground:
-        lines.append(f"below ground {fit.below_ground} cameras")
-    return [*lines, f"fit          {fit.verdict or fit.tested}"]
+        rows.append(("Below ground", f"{fit.below_ground} cameras"))
+    return [*rows, ("Check", fit.verdict or fit.tested)]
 
 
-def _refraction(report: CamerasReport) -> list[str]:
-    """Say what each sign tells of absorbed refraction, and what they come to."""
+def _refraction_rows(report: CamerasReport) -> list[tuple[str, str]]:
+    """Return each sign of absorbed refraction, and what they come to."""
     found = report.diagnosis
     if found is None:
         return []
     says = {True: "absorbed", False: "not absorbed", None: "open"}
-    lines = ["", "Have the poses absorbed the refraction?"]
-    lines += [f"{sign.name:<14} {says[sign.speaks] + ':':<13} {sign.words}" for sign in found.signs]
     if found.absorbed:
-        return [*lines, f"{'verdict':<14} {found.sentence(*report.remedy)}"]
-    if found.absorbed is False and found.decided_by is not None:
-        return [*lines, f"{'verdict':<14} no, by {found.decided_by.name}"]
-    needs = f"control points (--gcps) or a reference would tell, else {export_of(report.cameras)}"
-    return [*lines, f"{'verdict':<14} not known; {needs}"]
+        verdict = found.sentence(*report.remedy)
+    elif found.absorbed is False and found.decided_by is not None:
+        verdict = f"the poses have not absorbed the refraction, by {found.decided_by.name}"
+    else:
+        verdict = f"not known; give control points (--gcps), or {export_of(report.cameras)}"
+    rows = [("", f"{s.name}: {says[s.speaks]}. {s.words}") for s in found.signs]
+    return [("Refraction", verdict), *rows]
+
+
+def draw_footprints(plan: Axes, cameras: Cameras, level_m: float, **look: Any) -> bool:
+    """Draw footprints on a level, of at most `MOST_FOOTPRINTS` images; return whether any exist."""
+    is_drawn = False
+    for row in range(0, len(cameras), max(1, len(cameras) // MOST_FOOTPRINTS)):
+        border = footprint(cameras, row, level_m)
+        if len(border) and np.isfinite(border).all():
+            plan.plot(*np.vstack([border, border[:1]]).T, color=WATER, **look)
+            is_drawn = True
+    return is_drawn
 
 
 def block_figure(report: CamerasReport) -> Figure:
     """Draw the block in plan, with the footprints of its frames, and from the south."""
     cameras, xyz = report.cameras, report.sample_xyz
     figure, (plan, side) = new_figure(8.0, 8.5, nrows=2, height_ratios=[5, 2])
-    level = report.level_m  # where to draw footprints: at the water, else amid the cloud
+    level = report.level_m  # of the footprints: the water, or else the middle of the cloud
     if level is None:
         level = float(np.median(xyz[:, 2])) if len(xyz) else np.nan
     shown = draw_cloud(figure, plan, xyz, report.level_m, label="cloud")
     if len(shown):
         side.plot(shown[:, 0], shown[:, 2], ".", color="0.6", markersize=1, label="cloud")
-    rows = range(0, len(cameras), max(1, len(cameras) // MOST_FOOTPRINTS))
-    borders = [footprint(cameras, row, level) for row in rows]
-    borders = [border for border in borders if len(border) and np.isfinite(border).all()]
-    for border in borders:
-        plan.plot(*np.vstack([border, border[:1]]).T, color=WATER, linewidth=0.6, alpha=0.6)
+    has_footprints = draw_footprints(plan, cameras, level, linewidth=0.6, alpha=0.6)
     plan.plot(*cameras.centres[:, :2].T, "^", color=AFTER, markersize=4, label="cameras")
-    if borders:
+    if has_footprints:
         plan.plot([], [], color=WATER, label=f"footprints at {level:.1f} m")
     side.plot(cameras.centres[:, 0], cameras.centres[:, 2], "^", color=AFTER, markersize=4)
     if report.level_m is not None:

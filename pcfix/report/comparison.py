@@ -1,7 +1,7 @@
-"""A comparison with a reference: its text, and the pictures and tables that it adds to a page.
+"""A comparison with a reference: its summary, and the pictures and tables for the report page.
 
-Pictures and tables work on the plain values of `Comparison.as_dict`, so that a run that resumes
-can draw what an earlier one measured.
+Everything works on the plain values of `Comparison.as_dict`, so that a resumed run can draw what an
+earlier one measured.
 """
 
 from __future__ import annotations
@@ -13,16 +13,6 @@ import numpy as np
 from pcfix.grid.colours import DIFFERENCE
 from pcfix.model import FloatArray
 from pcfix.options.steps import LAYERS
-from pcfix.report.c2c import (
-    TIMES,
-    Plain,
-    bell,
-    c2c_figure,
-    c2c_lines,
-    c2c_rows,
-    c2c_table,
-    further_colour,
-)
 from pcfix.report.page import (
     AFTER,
     BEFORE,
@@ -34,84 +24,79 @@ from pcfix.report.page import (
     new_figure,
     new_map,
 )
-from pcfix.report.text import share
+from pcfix.report.text import aligned, share
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from pcfix.compare.figures import Comparison
-    from pcfix.compare.statistics import Bin
 
+Plain = dict[str, Any]
+TIMES = (("before", "uncorrected", BEFORE), ("after", "corrected", AFTER))
+SIGNED = (
+    ("dZ", "Vertical error", "vertical"),
+    ("dZ bed", "Bed, vertical error", "bed"),
+    ("dZ land", "Land, vertical error", "land"),
+    ("M3C2", "M3C2 distance", "m3c2"),
+)
+"""What has a sign: its name in tables of the terminal and of the page, and its key."""
+MOMENTS = ("mean_m", "sd_m", "rmse_m", "nmad_m", "median_m")
 _HEAD = ("mean", "sd", "rmse", "nmad", "median", "5 %", "95 %", "max")
+_SHOWN = 0.995
+"""The share of the distances of each histogram up to which the axis reaches at least."""
 
 
-def comparison_text(comparison: Comparison) -> str:
-    """Return what a person wants to know of a comparison; metres throughout."""
-    c, n = comparison, comparison.counts
-    kind = "check points" if c.measured_at == "reference" else "points"
-    whole = n.reference - n.reference_left_out if kind == "check points" else n.cloud
-    lines = [
-        f"{c.cloud} against {c.reference}, {c.seconds:.1f} s",
-        f"compared     {n.compared:,} {kind} ({share(n.compared, whole)})",
-    ]
-    left = {
+def comparison_text(c: Comparison) -> str:
+    """Return the summary of a comparison; metres throughout."""
+    plain, n = c.as_dict(), c.counts
+    checks = c.measured_at == "reference"
+    in_reference = n.reference - n.reference_left_out
+    compared = share(n.compared, in_reference if checks else n.cloud)
+    rows = [("Compared", f"{n.compared:,} {'check points' if checks else 'points'} ({compared})")]
+    ignored = {
         "withheld or noise": n.cloud_left_out,
         "not submerged": n.not_submerged,
         "outside the overlap": n.outside_overlap,
     }
-    lines += [f"  not        {count:,}: {reason}" for reason, count in left.items() if count]
+    rows += [("", f"{count:,} ignored: {why}") for why, count in ignored.items() if count]
     if n.by_nearest:
-        lines.append(f"  no plane   {n.by_nearest:,}: the nearest point's height was taken")
+        rows.append(("No plane", f"{n.by_nearest:,} points were compared with the nearest height"))
     if n.reference_compared:
-        whole = n.reference - n.reference_left_out
-        lines.append(
-            f"  C2C from   {n.reference_compared:,} points of the reference"
-            f" ({share(n.reference_compared, whole)}): those about the cloud"
-            f"{' and under water' if c.settings.submerged else ''}"
-        )
-    plain = c.as_dict()
-    distances = [(f"C2C {way}, {name}", of["statistics"]) for way, name, _, of in c2c_rows(plain)]
-    for table in (
-        [*_table(signed_statistics(plain)), *_normal(c)],
-        _table(distances) + c2c_lines(plain),
-    ):
-        lines += ["", *table] if table else []
+        of = share(n.reference_compared, in_reference)
+        rows.append(("C2C from", f"{n.reference_compared:,} points of the reference ({of})"))
     if c.own is not None:
-        lines += ["", *_own(plain)]
-    if c.depth is not None:
-        lines += [
-            "",
-            *(
-                f"depth fit {when:<7} depth = {line.intercept_m:+.3f} m + {line.slope:.4f} x"
-                f" reference depth, r2 {line.r2:.4f}"
-                for when, line in (("before", c.depth.before), ("after", c.depth.after))
-                if line is not None
-            ),
-        ]
-    for title, bins in (("depth", c.depth_bins), ("from shore", c.shore_bins)):
-        lines += _bin_lines(title, bins)
+        rows.append(_own_row(plain))
+    for when, line in () if c.depth is None else (
+        ("before", c.depth.before), ("after", c.depth.after),
+    ):  # fmt: skip
+        if line is not None:
+            words = f"{line.intercept_m:+.3f} m + {line.slope:.4f} x reference depth"
+            rows.append((f"Depth {when}", f"{words}, r2 {line.r2:.4f}"))
     if c.m3c2 is not None:
         m = c.m3c2.after
-        lines += [
-            "",
-            f"M3C2: {m.statistics.count:,} of {m.core_points:,} core points, normals"
-            f" {m.normal_radius_m:.2f} m, cylinder {m.cylinder_radius_m:.2f} m; mean level of"
-            f" detection {m.mean_level_of_detection_m:.3f} m,"
-            f" {100 * m.significant_share:.0f} % of the distances beyond it",
-        ]
-    return "\n".join([*lines, *(f"note: {note}" for note in c.notes)])
-
-
-def _own(plain: Plain) -> list[str]:
-    """Return the cloud's own errors, and what was taken out for them."""
-    own, title = plain["own"], "bed" if plain["own"]["of"] == "bed" else "cloud"
-    raw = raw_of(plain)["after"]
-    if own["rmse_m"] is None:
-        return [f"of the {title} alone: {noise_sentence(own, raw)}"]
-    return [
-        f"of the {title} alone: RMSE {own['rmse_m']:.3f} m, 95 % {own['within_95_m']:.3f} m,"
-        f" {noise_sentence(own, raw)}"
+        rows.append(("M3C2", f"{m.statistics.count:,} of {m.core_points:,} core points, normals"
+                     f" {m.normal_radius_m:.2f} m, cylinder {m.cylinder_radius_m:.2f} m; mean level"
+                     f" of detection {m.mean_level_of_detection_m:.3f} m,"
+                     f" {100 * m.significant_share:.0f} % of the distances beyond it"))  # fmt: skip
+    rows += c2c_lines(plain)
+    distances = [(f"C2C {way}, {name}", of["statistics"]) for way, name, _, of in c2c_rows(plain)]
+    text = [
+        aligned(f"Compared {c.cloud} with {c.reference} in {c.seconds:.1f} s", rows),
+        *_table(signed_statistics(plain) + distances),
+        *_bin_lines("depth", plain["depth_bins"]),
+        *_bin_lines("from shore", plain["shore_bins"]),
+        *(f"Note: {note}" for note in c.notes),
     ]
+    return "\n".join(text)
+
+
+def _own_row(plain: Plain) -> tuple[str, str]:
+    """Return the cloud's own errors, without the noise of the reference."""
+    own, raw = plain["own"], raw_of(plain)["after"]
+    noise = noise_sentence(own, raw)
+    if own["rmse_m"] is not None:
+        noise = f"RMSE {own['rmse_m']:.3f} m, 95 % {own['within_95_m']:.3f} m, {noise}"
+    return ("Bed" if own["of"] == "bed" else "Cloud"), noise
 
 
 def raw_of(compared: Plain) -> Plain:
@@ -122,19 +107,18 @@ def raw_of(compared: Plain) -> Plain:
 
 
 def noise_sentence(own: Plain, raw: Plain) -> str:
-    """Say what the noise of the reference has to do with the errors of the cloud."""
+    """Return how the noise of the reference changes the errors of the cloud."""
     source = "assumed" if own["is_assumed"] else "stated"
     noise = f"the reference's noise ({own['sigma_reference_m']:.3f} m, {source})"
     if own["rmse_m"] is None:
-        return f"the differences scatter no more than {noise}, so its own part is not known."
+        return f"the differences scatter no more than {noise}, so the cloud's error is not known."
     return f"without {noise}; with it RMSE {raw['rmse_m']:.3f} m, 95 % {raw['within_95_m']:.3f} m."
 
 
 def signed_statistics(plain: Plain) -> list[tuple[str, Plain]]:
     """Return the statistics of all that has a sign, by title."""
     rows = []
-    kinds = (("dZ", "vertical"), ("dZ bed", "bed"), ("dZ land", "land"), ("M3C2", "m3c2"))
-    for title, key in kinds:
+    for title, _, key in SIGNED:
         pair = plain[key] or {"before": None, "after": None}
         if pair["before"] is not None:
             rows.append((f"{title} before", pair["before"].get("statistics", pair["before"])))
@@ -149,43 +133,123 @@ def _table(rows: list[tuple[str, Plain]]) -> list[str]:
     if not rows:
         return []
     width = max(20, *(len(title) + 1 for title, _ in rows))
-    head = f"{'m':<{width}}" + "".join(f"{name:>9}" for name in _HEAD)
-    return [head, *(f"{title:<{width}}{_figures(of)}" for title, of in rows)]
+    lines = [f"{'m':<{width}}" + "".join(f"{name:>9}" for name in _HEAD)]
+    for title, s in rows:
+        marks = s["percentiles_m"]
+        values = (*(s[name] for name in MOMENTS), marks["p5"], marks["p95"], s["max_m"])
+        lines.append(f"{title:<{width}}" + "".join(f"{value:9.3f}" for value in values))
+    return lines
 
 
-def _figures(s: Plain) -> str:
-    names = ("mean_m", "sd_m", "rmse_m", "nmad_m", "median_m")
-    marks = s["percentiles_m"]
-    values = (*(s[name] for name in names), marks["p5"], marks["p95"], s["max_m"])
-    return "".join(f"{value:9.3f}" for value in values)
+def _bin_lines(title: str, bins: list[Plain] | tuple[Plain, ...]) -> list[str]:
+    """Return lines with the errors of each class of depth or distance."""
+    lines = [f"{title + ', m':<20}{'count':>9}" + "".join(f"{n:>9}" for n in _HEAD[:4])] * bool(
+        bins
+    )
+    for one in bins:
+        s, name = one["after"], f"{one['from_m']:g} to {one['to_m']:g}"
+        values = "".join(f"{s[key]:9.3f}" for key in MOMENTS[:4])
+        before = one["before"]
+        more = "" if before is None else f"   before {before['mean_m']:.3f}, {before['rmse_m']:.3f}"
+        lines.append(f"{name:<20}{s['count']:>9,}{values}{more}")
+    return lines
 
 
-def _normal(c: Comparison) -> list[str]:
-    if c.vertical is None:
-        return []
-    normal = c.vertical.after.normal
-    if normal.histogram_mu_m is None:
-        return [f"note: dZ: {normal.note}"]
+def c2c_rows(compared: Plain) -> list[tuple[str, str, str, Plain]]:
+    """Return direction, cloud, colour and distribution of all C2C, a direction after the other."""
+    rows = []
+    for key, way in (("c2c", "to reference"), ("c2c_from_reference", "from reference")):
+        pair = compared.get(key) or {}
+        if key == "c2c" and compared["measured_at"] == "reference":
+            way = "from check points"
+        for when, name, colour in TIMES:
+            if pair.get(when) is not None:
+                rows.append((way, "cloud" if pair["before"] is None else name, colour, pair[when]))
+        for number, one in enumerate(compared.get("also", ())):
+            if one[key] is not None:
+                rows.append((way, one["name"], further_colour(number), one[key]))
+    return rows
+
+
+def further_colour(number: int) -> str:
+    """Return the colour of a further cloud, by its number from 0."""
+    return ("#6a3d9a", "#33804d", "#c51b7d", "#8c6d1f", "#5f6b73")[number % 5]
+
+
+def gauss(of: Plain) -> str:
+    """Return the normal distribution fitted to distances, in CloudCompare's words."""
+    normal, classes = of["normal"], len(of["histogram"]["counts"])
+    return (
+        f"Gauss: mean = {normal['mu_m']:.6f} / std.dev. = {normal['sigma_m']:.6f}"
+        f" [{classes} classes]"
+    )
+
+
+def _shares(of: Plain) -> list[tuple[str, str]]:
+    """Return each band with the share of distances in it."""
     return [
-        f"normal fit to the histogram of dZ: mu {normal.histogram_mu_m:.3f},"
-        f" sigma {normal.histogram_sigma_m:.3f}"
+        (f"{one['low_m']:g} to {one['high_m']:g} m", f"{100 * one['share']:.1f} %")
+        for one in of.get("shares", ())
     ]
 
 
-def _bin_lines(title: str, bins: tuple[Bin, ...]) -> list[str]:
-    if not bins:
-        return []
-    both = bins[0].before is not None
-    head = f"{title + ', m':<20}{'count':>9}{'bias':>9}{'sd':>9}{'rmse':>9}{'nmad':>9}"
-    lines = ["", head + (f"{'bias':>11}{'rmse':>9}  before" if both else "")]
-    for one in bins:
-        s, b = one.after, one.before
-        lines.append(
-            f"{f'{one.from_m:g} to {one.to_m:g}':<20}{s.count:>9,}"
-            + "".join(f"{value:9.3f}" for value in (s.mean_m, s.sd_m, s.rmse_m, s.nmad_m))
-            + (f"{b.mean_m:11.3f}{b.rmse_m:9.3f}" if b is not None else "")
-        )
-    return lines
+def c2c_lines(compared: Plain) -> list[tuple[str, str]]:
+    """Return Gauss and shares of all distances as rows of a summary."""
+    rows = []
+    for way, name, _, of in c2c_rows(compared):
+        rows.append(("C2C", f"{way}, {name}: {gauss(of)}"))
+        shares = ", ".join(f"{part} are {band} away" for band, part in _shares(of))
+        rows += [("", f"of {of['statistics']['count']:,} points {shares}")] if shares else []
+    return rows
+
+
+def c2c_table(compared: Plain) -> Table:
+    """Return Gauss and shares of all distances as a table."""
+    rows = c2c_rows(compared)
+    header = ["", "mean (m)", "std.dev. (m)", "classes", *(b for b, _ in _shares(rows[0][-1]))]
+    cells = [
+        [
+            f"{way}, {name}", f"{of['normal']['mu_m']:.6f}", f"{of['normal']['sigma_m']:.6f}",
+            str(len(of["histogram"]["counts"])), *(share for _, share in _shares(of)),
+        ]
+        for way, name, _, of in rows
+    ]  # fmt: skip
+    return Table("C2C: Gauss as CloudCompare fits it", header, cells)
+
+
+def c2c_figure(compared: Plain) -> Figure:
+    """Draw all histograms with their Gauss: a column a direction, a row a cloud, one axis."""
+    from scipy.stats import norm
+
+    rows = c2c_rows(compared)
+    ways = list(dict.fromkeys(way for way, *_ in rows))
+    count = len(rows) // len(ways)  # each direction has the same clouds
+    figure, panels = new_figure(
+        7.5 * len(ways) + 0.5, 2.4 * count + 0.4, nrows=count, ncols=len(ways), sharex=True,
+        squeeze=False,
+    )  # fmt: skip
+    for axes, (way, name, colour, of) in zip(panels.T.flat, rows, strict=True):
+        histogram, normal = of["histogram"], of["normal"]
+        edges, counts = np.array(histogram["edges_m"]), np.array(histogram["counts"])
+        label = f"{name}, {way}; largest {of['statistics']['max_m']:.3f} m"
+        axes.stairs(counts, edges, fill=True, color=colour, alpha=0.55, label=label)
+        if normal["sigma_m"] > 0.0:
+            x = np.linspace(0.0, edges[-1], 2000)
+            area = counts.sum() * (edges[1] - edges[0])
+            axes.plot(x, area * norm.pdf(x, normal["mu_m"], normal["sigma_m"]), color="0.15")
+        axes.set_title(gauss(of), fontsize="medium")
+        axes.set_ylabel("Count")
+        axes.legend(loc="upper right")
+    panels[0, 0].set_xlim(0.0, max(_reach(of["histogram"]) for *_, of in rows))
+    for axes in panels[-1]:
+        axes.set_xlabel("Distance to the nearest point (m)")
+    return figure
+
+
+def _reach(histogram: Plain) -> float:
+    """Return the upper edge of the class in which the last of the distances shown lies."""
+    up_to = np.cumsum(histogram["counts"])
+    return float(histogram["edges_m"][1 + int(np.searchsorted(up_to, _SHOWN * up_to[-1]))])
 
 
 def evaluation(
@@ -224,38 +288,32 @@ def _difference(values: FloatArray, extent_m: tuple[float, float, float, float])
 
 
 def in_a_sentence(compared: Plain) -> str:
-    """Return what the correction came to against the reference; empty where it is not known."""
+    """Return what the correction changed against the reference; empty where it is not known."""
     pair = compared["vertical"]
     if pair is None or pair["before"] is None:
         return ""
-    is_of_bed = compared.get("bed") is not None
-    if is_of_bed:
-        pair = compared["bed"]
-    before, after = (pair[when].get("statistics", pair[when]) for when, _, _ in TIMES)
-    name = name_of(compared["reference"])
+    bed, land = compared.get("bed"), compared.get("land")
+    before, after = ((bed or pair)[when] for when, _, _ in TIMES)
+    before, after = (one.get("statistics", one) for one in (before, after))
     way = "fell" if after["rmse_m"] <= before["rmse_m"] else "grew"
     twice = "".join(
         f" {n['message']}" for n in compared["notes"] if n["code"] == "cloud.corrected_twice"
     )
+    of_land = "" if not bed or land is None else (
+        f" Land: {land['before']['rmse_m']:.3f} to {land['after']['rmse_m']:.3f} m."
+    )  # fmt: skip
     return (
-        f" Against {name} the vertical error{' of the bed' if is_of_bed else ''} {way} from"
-        f" {before['rmse_m']:.3f} to {after['rmse_m']:.3f} m (RMSE of {after['count']:,} points,"
-        f" the reference's noise included); what is left has a bias of"
-        f" {signed(after['mean_m'])}.{_of_land(compared)}{twice}"
+        f" Against {name_of(compared['reference'])} the vertical error"
+        f"{' of the bed' if bed else ''} {way} from {before['rmse_m']:.3f} to"
+        f" {after['rmse_m']:.3f} m (RMSE of {after['count']:,}"
+        f" points, the reference's noise included). The remaining bias is"
+        f" {signed(after['mean_m'])}.{of_land}{twice}"
     )
 
 
 def signed(value_m: float) -> str:
     """Return metres with their sign, which is plus for what rounds to zero."""
     return f"{round(value_m, 3) + 0.0:+.3f} m"
-
-
-def _of_land(compared: Plain) -> str:
-    """Return how land changed, where there is a bed too."""
-    land = compared.get("land")
-    if land is None or compared["bed"] is None:
-        return ""
-    return f" Land: {land['before']['rmse_m']:.3f} to {land['after']['rmse_m']:.3f} m."
 
 
 def _histograms(compared: Plain) -> list[Picture]:
@@ -282,6 +340,8 @@ def _moments(rows: list[tuple[str, Plain | None]]) -> str:
 
 
 def _histogram(pair: Plain, label: str) -> Figure:
+    from scipy.stats import norm
+
     known = [(when, name, colour) for when, name, colour in TIMES if pair[when] is not None]
     figure, panels = new_figure(8.0, 2.4 * len(known) + 0.4, nrows=len(known), squeeze=False)
     for axes, (when, name, colour) in zip(panels[:, 0], known, strict=True):
@@ -292,7 +352,7 @@ def _histogram(pair: Plain, label: str) -> Figure:
         axes.stairs(density, edges, fill=True, color=colour, alpha=0.55, label=text)
         if s["sd_m"] > 0.0:
             x = np.linspace(edges[0], edges[-1], 200)
-            axes.plot(x, bell(x, s["mean_m"], s["sd_m"]), color=colour)
+            axes.plot(x, norm.pdf(x, s["mean_m"], s["sd_m"]), color=colour)
         axes.set_ylabel("Density")
         axes.legend(loc="upper right")
     panels[-1, 0].set_xlabel(label)
@@ -335,7 +395,7 @@ def _sections(sections: list[Plain]) -> list[Picture]:
         Picture(
             f"section_{number}", f"Cross-section {number}",
             f"Heights along a line of {section['distance_m'][-1]:.0f} m: water surface, the cloud"
-            f" as it came, corrected, the reference{''.join(f', {n}' for n in _further(section))}.",
+            f" before and after, reference{''.join(f', {n}' for n in _further(section))}.",
             _section(section),
         )
         for number, section in enumerate(sections, start=1)
@@ -354,7 +414,7 @@ def _section(section: Plain) -> Figure:
         "apparent": {"color": BEFORE, "linestyle": "--"},
         "corrected": {"color": AFTER},
     }
-    names = {"apparent": "as it came"}
+    names = {"apparent": "uncorrected"}
     for number, name in enumerate(_further(section)):
         looks[name] = {"color": further_colour(number), "linewidth": 1.0}
     for key, look in looks.items():
@@ -368,29 +428,18 @@ def _section(section: Plain) -> Figure:
 
 def _statistics(compared: Plain) -> Table:
     header = ["", "points", "mean", "sd", "RMSE", "NMAD", "median", "95 %", "max"]
-    rows = []
-    kinds = (
-        ("vertical", "Vertical error"), ("bed", "Bed, vertical error"),
-        ("land", "Land, vertical error"), ("m3c2", "M3C2 distance"),
-    )  # fmt: skip
-    for key, kind in kinds:
-        for when, name, _ in TIMES:
-            # comparisons from before there were bed and land do without
-            if (pair := compared.get(key)) is not None and pair[when] is not None:
-                s = pair[when].get("statistics", pair[when])
-                rows.append([f"{kind}, {name}", *_cells(s)])
-    rows += [
-        [f"C2C {way}, {name}", *_cells(of["statistics"])] for way, name, _, of in c2c_rows(compared)
+    found = [
+        (f"{kind}, {name}", pair[when].get("statistics", pair[when]))
+        for _, kind, key in SIGNED
+        for when, name, _ in TIMES
+        if (pair := compared.get(key)) is not None and pair[when] is not None
     ]
-    title = f"Against {compared['reference'].rsplit('/', 1)[-1]} (m)"
-    return Table(title, header, rows)
-
-
-def _cells(s: Plain) -> list[str]:
-    """Return the cells of a sample under the header of `_statistics`."""
-    values = [s[n] for n in ("mean_m", "sd_m", "rmse_m", "nmad_m", "median_m")]
-    values += [s["percentiles_m"]["p95"], s["max_m"]]
-    return [f"{s['count']:,}", *(f"{value:.3f}" for value in values)]
+    found += [(f"C2C {way}, {name}", of["statistics"]) for way, name, _, of in c2c_rows(compared)]
+    rows = []
+    for title, s in found:
+        values = [*(s[name] for name in MOMENTS), s["percentiles_m"]["p95"], s["max_m"]]
+        rows.append([title, f"{s['count']:,}", *(f"{value:.3f}" for value in values)])
+    return Table(f"Against {name_of(compared['reference'])} (m)", header, rows)
 
 
 def _bins(compared: Plain) -> list[Table]:
@@ -404,18 +453,14 @@ def _bins(compared: Plain) -> list[Table]:
         header = ["", "slope", "intercept (m)", "r²"]
         tables.append(Table("Depth against reference depth", header, rows))
     if compared["depth_bins"]:
+        figures = ("bias", "mean_m"), ("RMSE", "rmse_m"), ("NMAD", "nmad_m")
         header = ["Depth (m)", "points"]
-        header += [
-            f"{n}, {w}" for w in ("as it came", "corrected") for n in ("bias", "RMSE", "NMAD")
-        ]
-        rows = [
-            [f"{b['from_m']:g} to {b['to_m']:g}", f"{b['after']['count']:,}"]
-            + [
-                "" if b[when] is None else f"{b[when][key]:.3f}"
-                for when, _, _ in TIMES
-                for key in ("mean_m", "rmse_m", "nmad_m")
-            ]
-            for b in compared["depth_bins"]
-        ]
+        header += [f"{figure}, {name}" for _, name, _ in TIMES for figure, _ in figures]
+        rows = []
+        for b in compared["depth_bins"]:
+            both = [b[when] for when, _, _ in TIMES]
+            cells = ["" if s is None else f"{s[key]:.3f}" for s in both for _, key in figures]
+            name = f"{b['from_m']:g} to {b['to_m']:g}"
+            rows.append([name, f"{b['after']['count']:,}", *cells])
         tables.append(Table("By depth (m)", header, rows))
     return tables

@@ -1,6 +1,6 @@
-"""What the page of a run says first: of what, by which water, how deep, how well, and what not.
+"""The first screen of the report page: project, depth, accuracy, and what to check.
 
-Measured figures come before formal ones, those of the bed before all others.
+Measured figures come before predicted ones, those of the bed before all others.
 """
 
 from __future__ import annotations
@@ -18,22 +18,14 @@ from pcfix.report.text import FEWEST, share
 Plain = dict[str, Any]
 
 CONTRADICTS = 1.5
-"""Times by which measured and predicted errors may differ, where there are enough."""
+"""Measured and predicted errors that differ by a larger factor contradict each other."""
 SHOWN_NOTES = 3
+UNKNOWN_DATUM = "vertical datum not known"
 
 
 @dataclass(frozen=True)
 class Survey:
-    """What the page says of the project that is not of the correction.
-
-    Attributes
-    ----------
-    project : str
-    date : str
-        When the images were taken; empty where that is not known.
-    crs, heights : str
-        Name of the system in plan, and what heights are above; empty where the cloud says none.
-    """
+    """Project, date of the images, CRS, and vertical datum; empty where not known."""
 
     project: str = ""
     date: str = ""
@@ -42,11 +34,8 @@ class Survey:
 
     @property
     def place(self) -> str:
-        """Of the coordinates of the map."""
+        """CRS and vertical datum of the map."""
         return f"{self.crs or 'CRS not stated'}; heights: {self.heights or UNKNOWN_DATUM}."
-
-
-UNKNOWN_DATUM = "vertical datum not known"
 
 
 def head_of(s: Summary, survey: Survey) -> Table:
@@ -70,34 +59,33 @@ def is_found(s: Summary) -> bool:
 def water_words(s: Summary) -> str:
     """Return the level with its standard error, and where they come from."""
     fit, stated = s.water_fit, s.settings.get("sigma_level")
-    if fit is None:
-        origin, sigma, of = "as given", LEVEL_M, "assumed"
-    else:
+    water, origin, sigma, of = s.water, "as given", LEVEL_M, "assumed"
+    if fit is not None:
         known = f" to {fit['accepted']} of {fit['points']} points" if "points" in fit else ""
         origin = "found in the cloud" if is_found(s) else f"fitted{known}"
         sigma, of = fit["sigma_level_m"], "of the fit"
+        if not fit.get("tilt_percent", 1.0):
+            water = f"level {fit['level_m']:.3f} m"
     if stated is not None:
         sigma, of = stated, "as stated"
-    is_level = fit is not None and not fit.get("tilt_percent", 1.0)
-    water = f"level {fit['level_m']:.3f} m" if fit and is_level else s.water
     index = s.settings["index"]
     return f"{water}, {origin}; standard error {sigma:.3f} m ({of}); index {index:g}"
 
 
 def tiles_of(s: Summary, survey: Survey, compared: Plain, depth_m: Plain) -> list[Tile]:
-    """Return the three tiles: depth (`depth_m` with min, mean and max), accuracy, watch out."""
-    notes = notes_of(s, survey, compared)
+    """Return the three tiles: depth (`depth_m` with min, mean and max), accuracy, notes."""
+    mean = s.shift_z_m["mean"]
+    way = "up" if mean > 0.0 else "down"
+    depths = [
+        ("range", f"{depth_m['min']:.2f} to {depth_m['max']:.2f} m"),
+        ("mean", f"{depth_m['mean']:.2f} m"),
+    ]
+    moved = f"{s.corrected:,} points of the bed moved {way} by {abs(mean):.2f} m on average."
+    notes = notes_of(s, survey, compared)[:SHOWN_NOTES] or ["Nothing stood out."]
     return [
-        Tile(
-            "Depth",
-            figures=[
-                ("range", f"{depth_m['min']:.2f} to {depth_m['max']:.2f} m"),
-                ("mean", f"{depth_m['mean']:.2f} m"),
-            ],
-            notes=[_moved(s)],
-        ),
+        Tile("Depth", figures=depths, notes=[moved]),
         accuracy_tile(s, compared),
-        Tile("What to watch out for", notes=notes[:SHOWN_NOTES] or ["Nothing stood out."]),
+        Tile("What to watch out for", notes=notes),
     ]
 
 
@@ -112,41 +100,32 @@ def in_short(tiles: Sequence[Tile]) -> str:
     return "; ".join(parts)
 
 
-def _moved(s: Summary) -> str:
-    mean = s.shift_z_m["mean"]
-    way = "up" if mean > 0.0 else "down"
-    return f"{s.corrected:,} points of the bed moved {way} by {abs(mean):.2f} m on average."
-
-
 def accuracy_tile(s: Summary, compared: Plain) -> Tile:
-    """Return how good the bed is: as measured where there is a reference, else as predicted."""
+    """Return the accuracy of the bed: measured where there is a reference, else predicted."""
     if compared.get("own"):
         return _measured(compared)
+    title, unknown = "Accuracy of the bed", "not known"
     if s.uncertainty is None:
-        return Tile(
-            "Accuracy of the bed", "predicted", [("RMSE", "not known")],
-            ["No reference, and no standard errors of the points."],
-        )  # fmt: skip
+        why = "There is no reference, and the points have no standard errors."
+        return Tile(title, "predicted", [("RMSE", unknown)], [why])
     sigma, tvu = s.uncertainty["sigma_z_m"]["mean"], s.uncertainty["tvu_95_m"]["mean"]
-    return Tile(
-        "Accuracy of the bed",
-        "predicted",
-        [("standard error", f"{sigma:.3f} m"), ("95 %", f"{tvu:.3f} m"), ("bias", "not known")],
-        ["No reference was given: predicted from the errors assumed, which hold no common bias."],
+    figures = [("standard error", f"{sigma:.3f} m"), ("95 %", f"{tvu:.3f} m"), ("bias", unknown)]
+    why = (
+        "No reference was given. The prediction follows from assumed errors without a common bias."
     )
+    return Tile(title, "predicted", figures, [why])
 
 
 def _measured(compared: Plain) -> Tile:
     own, pair = compared["own"], raw_of(compared)
-    raw, came = pair["after"], pair["before"]
+    raw, before = pair["after"], pair["before"]
     name = name_of(compared["reference"])
-    of = "bed" if own["of"] == "bed" else "cloud (bed and land are not told apart)"
-    is_known = own["rmse_m"] is not None
-    rmse, within = (own if is_known else raw)["rmse_m"], (own if is_known else raw)["within_95_m"]
+    of = "bed" if own["of"] == "bed" else "cloud (bed and land are not separated)"
+    known = raw if own["rmse_m"] is None else own
     noise = noise_sentence(own, raw)
     notes = [
         f"At {raw['count']:,} points against {name}"
-        + (f"; as it came, RMSE {came['rmse_m']:.3f} m." if came else "."),
+        + (f"; before the correction, RMSE {before['rmse_m']:.3f} m." if before else "."),
         noise[:1].upper() + noise[1:],
     ]
     if own["of"] == "bed" and compared["land"]:
@@ -154,67 +133,59 @@ def _measured(compared: Plain) -> Tile:
         notes.append(
             f"Land: bias {signed(land['mean_m'])}, RMSE {land['rmse_m']:.3f} m, reference included."
         )
-    figures = [("bias", signed(own["mean_m"])), ("RMSE", f"{rmse:.3f} m")]
-    return Tile(f"Accuracy of the {of}", "measured", [*figures, ("95 %", f"{within:.3f} m")], notes)
+    figures = [
+        ("bias", signed(own["mean_m"])),
+        ("RMSE", f"{known['rmse_m']:.3f} m"),
+        ("95 %", f"{known['within_95_m']:.3f} m"),
+    ]
+    return Tile(f"Accuracy of the {of}", "measured", figures, notes)
 
 
 def notes_of(s: Summary, survey: Survey, compared: Plain) -> list[str]:
-    """Return what to watch out for, what was measured first."""
-    notes = [*_contradiction(s, compared), *_biased(compared)]
+    """Return what to check, the most important first."""
+    notes = [] if not compared.get("own") else _contradictions(s, compared)
     if not compared.get("own"):
         notes.append("No reference: the accuracy is predicted. Check points on the bed measure it.")
     if s.poses is not None and s.poses["absorbed"] is None and s.cameras:
         notes.append(f"Poses: {s.poses['words']}.")
     if not survey.heights:
         notes.append(
-            "The vertical datum is not known: the water level, the cloud and any reference must"
-            " count from one."
+            "The vertical datum is not known: water level, cloud and reference must have the same."
         )
-    notes += [*_uncorrected(s), *s.warnings, *compared.get("notes", ())]
+    fate = {"withhold": "withheld", "keep": "kept", "drop": "dropped"}[s.settings["uncorrected"]]
+    notes += [
+        f"{count:,} points under water could not be corrected ({reason}). They were not moved and"
+        f" are {fate}."
+        for reason, count in s.uncorrected.items()
+        if count
+    ]
+    if s.water_unknown:
+        notes.append(f"{s.water_unknown:,} points have no known water surface above them.")
+    notes += [*map(str, s.warnings), *map(str, compared.get("notes", ()))]
     return [note[:1].upper() + note[1:] for note in notes]
 
 
-def _contradiction(s: Summary, compared: Plain) -> list[str]:
-    """Say where measured errors are not those that were predicted."""
-    own, bed = compared.get("own"), compared.get("bed")
-    if not own or not bed or s.uncertainty is None or bed["after"]["count"] < FEWEST:
+def _contradictions(s: Summary, compared: Plain) -> list[str]:
+    """Return notes where measured errors are not the predicted ones, or the bed has a bias."""
+    own, bed = compared["own"], compared.get("bed")
+    if not bed:
         return []
-    sigma, measured = s.uncertainty["sigma_z_m"]["mean"], bed["after"]["rmse_m"]
-    expected = (sigma**2 + own["sigma_reference_m"] ** 2) ** 0.5
-    if 1.0 / CONTRADICTS <= measured / expected <= CONTRADICTS:
-        return []
-    way = "larger" if measured > expected else "smaller"
-    rely = "take the measured ones" if measured > expected else "these are cautious here"
-    return [
-        f"The measured errors of the bed are {way} than the predicted ones (RMSE {measured:.3f} m,"
-        f" predicted {expected:.3f} m with the reference's noise; 95 % predicted"
-        f" {COVERAGE_95 * sigma:.3f} m without): {rely}."
-    ]
-
-
-def _biased(compared: Plain) -> list[str]:
-    own, bed = compared.get("own"), compared.get("bed")
-    if not own or not bed:
-        return []
-    bias, scatter = bed["after"]["mean_m"], bed["after"]["sd_m"]
-    if abs(bias) <= max(scatter, own["sigma_reference_m"]):
-        return []
-    way = "high" if bias > 0.0 else "low"
-    return [
-        f"The bed is too {way} as a whole by {abs(bias):.3f} m, more than it scatters: check water"
-        " level, refractive index, vertical datum and poses."
-    ]
-
-
-def _uncorrected(s: Summary) -> list[str]:
-    notes = []
-    fate = {"withhold": "flagged as withheld", "keep": "left as they were", "drop": "left out"}
-    for reason, count in s.uncorrected.items():
-        if count:
+    notes, after, noise = [], bed["after"], own["sigma_reference_m"]
+    if s.uncertainty is not None and after["count"] >= FEWEST:
+        sigma, measured = s.uncertainty["sigma_z_m"]["mean"], after["rmse_m"]
+        expected = (sigma**2 + noise**2) ** 0.5
+        if not 1.0 / CONTRADICTS <= measured / expected <= CONTRADICTS:
+            is_larger = measured > expected
             notes.append(
-                f"{count:,} points under water could not be corrected ({reason}); they were not"
-                f" moved and are {fate[s.settings['uncorrected']]}."
+                f"The measured errors of the bed are {'larger' if is_larger else 'smaller'} than"
+                f" the predicted ones (RMSE {measured:.3f} m, predicted {expected:.3f} m with the"
+                f" reference's noise; 95 % predicted {COVERAGE_95 * sigma:.3f} m without): "
+                f"{'use the measured ones' if is_larger else 'the predicted ones are cautious'}."
             )
-    if s.water_unknown:
-        notes.append(f"{s.water_unknown:,} points have no known water surface above them.")
+    bias = after["mean_m"]
+    if abs(bias) > max(after["sd_m"], noise):
+        notes.append(
+            f"The bed is too {'high' if bias > 0.0 else 'low'} by {abs(bias):.3f} m on average,"
+            " more than it scatters. Check water level, refractive index, vertical datum and poses."
+        )
     return notes

@@ -1,4 +1,4 @@
-"""The data of the map of a page: layers, shade and contours, packed as its script reads them."""
+"""The data of the map on the page: layers, shade and contours, packed for its script."""
 
 from __future__ import annotations
 
@@ -30,20 +30,16 @@ SMOOTH_CELLS = 1.5
 
 @dataclass(frozen=True)
 class Layer:
-    """One choice of the map: values per cell, shape (rows, columns), NaN where there are none.
+    """One choice of the map: values of cells, shape (rows, columns), NaN where unknown.
 
     Attributes
     ----------
-    name, unit : str
-    values : array
     ramp : str
-        Of `pcfix.grid.colours`.
+        A ramp of `pcfix.grid.colours`.
     plus_minus : str
-        Name of the layer that tells how well this one is known, at 95 %.
+        Name of the layer with the uncertainty of this one at 95 %.
     is_centred : bool
         Whether its colours are centred on zero.
-    has_contours : bool
-        Whether it is the one that contours are drawn of.
     """
 
     name: str
@@ -56,10 +52,9 @@ class Layer:
 
 
 def map_json(maps: Maps, layers: list[Layer]) -> str:
-    """Return the data as JSON that nothing in it can end early, as "<" is written in another way.
+    """Return the data as JSON without "<", so that no text in it can end the script element.
 
-    The layers are whole numbers of 16 bits, each less the one before, compressed by zlib, in
-    base 64.
+    Layers are differences of 16-bit integers, compressed by zlib, in base 64.
     """
     west, _, _, north = maps.extent_m
     rows, columns = maps.height_m.shape

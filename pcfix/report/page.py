@@ -1,6 +1,6 @@
-"""The page that a surveyor hands to a client: one HTML file with everything inside.
+"""The report page for a client, one HTML file with everything inside, and what its figures share.
 
-And what all its pictures share; matplotlib is loaded when one is drawn.
+Matplotlib is imported when a figure is drawn.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from pcfix.grid.colours import DEPTH, HEIGHT
 from pcfix.grid.maps import Maps
@@ -30,10 +31,10 @@ if TYPE_CHECKING:
 
 MOST_POINTS = 8000
 FIGURES = 4
-"""So many are shown at once."""
+"""Shown; the others are folded."""
 
 BEFORE, AFTER, WATER, REFERENCE = "#b3541e", "#0b5e8a", "#4aa3c7", "#222222"
-"""Colours that differ in lightness too, for those who cannot tell the hues apart."""
+"""Colours of different lightness, for readers with colour blindness."""
 
 
 def new_figure(width_in: float = 8.0, height_in: float = 4.5, **grid: Any) -> tuple[Figure, Any]:
@@ -136,10 +137,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Tile:
-    """What one must know at once: figures by name, and what they rest on.
-
-    `tag` says what kind of figures they are, as "measured".
-    """
+    """Figures by name with a tag, such as "measured", and notes on them."""
 
     title: str
     tag: str = ""
@@ -149,26 +147,20 @@ class Tile:
 
 @dataclass(frozen=True)
 class Report:
-    """All that the page says, in its order.
+    """The contents of the page, in its order.
 
     Attributes
     ----------
-    title, lead : str
     head : Table
-        Beside the map, in a line each.
-    tiles : sequence of Tile
-    warnings : list of str
-    maps : Maps
-    layers : list of Layer
+        Beside the map.
     place : str
-        What the map's coordinates and heights are.
+        CRS and vertical datum of the map.
     pictures : list of Picture
         The first `FIGURES` are shown, the others folded.
     tables : list of Table
         The first is shown, the others folded.
-    provenance : list of Table
     files : list of pair
-        Path from the page, and what lies there.
+        Path from the page, and its contents.
     """
 
     title: str
@@ -186,7 +178,7 @@ class Report:
 
 
 _FOLDERS = re.compile(r"(?<![\w.:/~-])(?:[A-Za-z]:)?[/\\](?:[^/\\\s:*?\"<>|]+[/\\])+")
-"""Of an absolute path, which is of no use to a reader elsewhere."""
+"""The folders of an absolute path, which mean nothing to a reader elsewhere."""
 
 
 def name_of(path: str) -> str:
@@ -203,7 +195,7 @@ def _as_read(value: Any) -> Any:
 
 
 def environment() -> Environment:
-    """Return how templates are filled: what is put in is escaped."""
+    """Return the templates; values are escaped."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     return Environment(
@@ -217,15 +209,33 @@ def environment() -> Environment:
 
 
 def render(report: Report) -> str:
-    """Return the page: no address outside it is used, and it works without scripts too."""
+    """Return the page; it uses no address outside itself, and works without scripts."""
     from markupsafe import Markup
 
     from pcfix.report.map_data import map_json  # not quick to load, and texts do without
 
-    return (
-        environment()
-        .get_template("page.html.j2")
-        .render(
-            report=report, figures=FIGURES, map_data=Markup(map_json(report.maps, report.layers))
-        )
-    )
+    data = Markup(map_json(report.maps, report.layers))
+    template = environment().get_template("page.html.j2")
+    return template.render(report=report, figures=FIGURES, map_data=data)
+
+
+def run_html(title: str, tiles: Sequence[Tile], place: str, picture: Picture) -> str:
+    """Return what a notebook shows of a run, HTML without scripts: tiles and a small map."""
+    template = environment().get_template("notebook.html.j2")
+    return template.render(title=title, tiles=tiles, place=place, picture=picture)
+
+
+def overview(
+    colours: npt.NDArray[np.uint8], extent_m: tuple[float, float, float, float], deepest_m: float
+) -> Picture:
+    """Return a map of the shaded bed, from colours of shape (rows, columns, 4) with alpha."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    figure, axes = new_map(extent_m)
+    axes.imshow(colours, extent=extent_m)
+    ramp = ScalarMappable(Normalize(0.0, deepest_m), DEPTH)
+    bar = figure.colorbar(ramp, ax=axes, label="Depth (m)", shrink=0.8, extend="max")
+    bar.ax.invert_yaxis()
+    alt = f"Map of the bed, shaded and in the colours of its depth, 0 to {deepest_m:.1f} m."
+    return Picture("overview", "Depth", alt, figure)

@@ -1,7 +1,4 @@
-"""Papers, remade: the effect of refraction on a pair of vertical images, Shan's iteration, a bowl.
-
-Each as text, as rows for a CSV file, and as pictures.
-"""
+"""Tables and figures of three papers: refraction in a stereo pair, Shan's iteration, and a bowl."""
 
 from __future__ import annotations
 
@@ -16,21 +13,13 @@ import numpy as np
 from pcfix.grid.colours import DEPTH, HEIGHT
 from pcfix.model import FloatArray
 from pcfix.report.page import AFTER, BEFORE, REFERENCE, WATER, new_figure
-from pcfix.simulate.hsu_wang import EDGES_M, METHODS, PRINTED_RMSE_MM, DepthBins
+from pcfix.simulate.hsu_wang import EDGES_M, METHODS, DepthBins
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from pcfix.simulate.refraction_effect import AerialCamera, Effect, Iteration, StereoPair
+    from pcfix.simulate.refraction_effect import Effect, Iteration, StereoPair
 
-COLUMNS = (
-    "camera", "focal_mm", "flying_height_m", "overlap", "base_m", "refractive_index",
-    "apparent_depth_m", "error_centre_m", "error_corner_m", "error_mean_m",
-    "true_depth_centre_m", "true_depth_corner_m", "factor_centre", "factor_corner",
-    "largest_shift_xy_m",
-)  # fmt: skip
-"""Of the table; errors are apparent minus true depth, factors true depth over apparent depth."""
 LINES = ":", "-", "--", "-."
 _COLOURS = {
     "uncorrected": REFERENCE, "I": BEFORE, "II": WATER, "III": "#8a8a8a", "pcfix": AFTER,
@@ -38,43 +27,55 @@ _COLOURS = {
 
 
 def effect_text(effects: list[Effect]) -> str:
-    """Return the errors at the largest depth, a line per camera, overlap and flying height."""
+    """Return the errors at the largest depth, a line for each pair."""
     deepest = max(one.apparent_depth_m for one in effects)
-    heads = "base", "centre", "corner", "mean", "/ true", "/ apparent"
     lines = [
-        f"apparent minus true depth of a bed that looks {deepest:g} m deep, refractive index"
-        f" {effects[0].refractive_index:g}; the corner's as a share of the two depths too",
-        f"{'camera':<12}{'overlap':>9}{'flying height':>15}"
-        + "".join(f"{head:>11}" for head in heads),
+        f"Apparent minus true depth at an apparent depth of {deepest:g} m, refractive index"
+        f" {effects[0].refractive_index:g}",
+        f"{'camera':<12}{'overlap':>9}{'flying height':>15}{'base':>11}{'centre':>11}{'corner':>11}"
+        f"{'mean':>11}",
     ]
     for one in effects:
         if one.apparent_depth_m == deepest:
-            pair, corner = one.pair, -one.corner_m
+            pair = one.pair
             lines.append(
                 f"{pair.camera.name:<12}{100.0 * pair.overlap:>7g} %{pair.flying_height_m:>13g} m"
                 f"{pair.base_m:>9.2f} m{one.centre_m:>9.3f} m{one.corner_m:>9.3f} m"
-                f"{one.mean_m:>9.3f} m{corner / (corner + deepest):>11.3f}{corner / deepest:>11.3f}"
+                f"{one.mean_m:>9.3f} m"
             )
     return "\n".join(lines)
 
 
 def effect_rows(effects: list[Effect]) -> list[dict[str, Any]]:
-    """Return a row of `COLUMNS` per pair and depth; a depth of 0 has no factors."""
+    """Return a row per pair and depth; a depth of 0 has no factors.
+
+    Errors are apparent minus true depth, factors true over apparent depth.
+    """
     rows = []
     for one in effects:
         pair, depth = one.pair, one.apparent_depth_m
         centre, corner = depth - one.centre_m, depth - one.corner_m
-        metres = (
-            one.centre_m, one.corner_m, one.mean_m, centre, corner,
-            *((centre / depth, corner / depth) if depth else (math.nan, math.nan)),
-            float(one.shift_m.max()),
-        )  # fmt: skip
-        facts = (
-            pair.camera.name, pair.camera.focal_mm, pair.flying_height_m, pair.overlap,
-            round(pair.base_m, 4), one.refractive_index, depth,
-        )  # fmt: skip
-        numbers = ("" if math.isnan(m) else round(m, 5) + 0.0 for m in metres)
-        rows.append(dict(zip(COLUMNS, [*facts, *numbers], strict=True)))
+        metres = {
+            "error_centre_m": one.centre_m,
+            "error_corner_m": one.corner_m,
+            "error_mean_m": one.mean_m,
+            "true_depth_centre_m": centre,
+            "true_depth_corner_m": corner,
+            "factor_centre": centre / depth if depth else math.nan,
+            "factor_corner": corner / depth if depth else math.nan,
+            "largest_shift_xy_m": float(one.shift_m.max()),
+        }
+        facts = {
+            "camera": pair.camera.name,
+            "focal_mm": pair.camera.focal_mm,
+            "flying_height_m": pair.flying_height_m,
+            "overlap": pair.overlap,
+            "base_m": round(pair.base_m, 4),
+            "refractive_index": one.refractive_index,
+            "apparent_depth_m": depth,
+        }
+        numbers = {k: "" if math.isnan(v) else round(v, 5) + 0.0 for k, v in metres.items()}
+        rows.append(facts | numbers)
     return rows
 
 
@@ -89,14 +90,28 @@ def csv_text(rows: list[dict[str, Any]]) -> str:
 
 def error_map_figure(effects: list[Effect]) -> Figure:
     """Draw the error over the model of one camera at one depth, a map per pair."""
+    from matplotlib.patheffects import withStroke
+
+    box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.5}
+    look: dict[str, Any] = {
+        "textcoords": "offset points", "fontsize": 9, "bbox": box, "zorder": 20,
+    }  # fmt: skip
     low = min(float(one.error_m.min()) for one in effects)
     high = max(float(one.error_m.max()) for one in effects)
     levels = _levels(low, high)
     figure, panels = _panels(effects, 2.9, 4.6)
     for axes, (one,) in panels:
         filled = axes.contourf(one.x_m, one.y_m, one.error_m, levels, cmap=HEIGHT)
-        _draw_contours(axes, one, levels)
-        _mark_places(axes, one)
+        lines = axes.contour(
+            one.x_m, one.y_m, one.error_m, levels, colors="white", linewidths=0.7,
+            linestyles="solid",
+        )  # fmt: skip
+        for text in axes.clabel(lines, fontsize=8, fmt="%g"):  # a dark rim, for light colours
+            text.set_path_effects([withStroke(linewidth=2.0, foreground=REFERENCE)])
+        axes.plot(0.0, 0.0, "+", color=REFERENCE)
+        centre, corner = (0.0, 0.0), (one.x_m[-1], one.y_m[-1])
+        axes.annotate(f"{one.centre_m:.2f} m", centre, (0, 6), ha="center", **look)
+        axes.annotate(f"{one.corner_m:.2f} m", corner, (-3, -3), ha="right", va="top", **look)
         axes.set_aspect("equal")
     figure.colorbar(
         filled, ax=[axes for axes, _ in panels], label="Apparent minus true depth (m)", shrink=0.9
@@ -105,18 +120,13 @@ def error_map_figure(effects: list[Effect]) -> Figure:
 
 
 def bed_figure(effects: list[Effect]) -> Figure:
-    """Draw the apparent bed of one depth, the true one and their difference, after Fig 4.
-
-    The true bed and the difference stand where the apparent one does in plan.
-    """
+    """Draw the apparent bed of one depth, the true one and their difference, after Fig 4."""
     figure, panels = _panels(effects, 4.2, 4.2, subplot_kw={"projection": "3d"})
-    surfaces = {"True bed": "tab:blue", "Apparent bed": "tab:green", "Difference": "tab:red"}
     for axes, (one,) in panels:
         bed = np.full_like(one.error_m, -one.apparent_depth_m)
-        for z, (name, colour) in zip(
-            (bed + one.error_m, bed, one.error_m), surfaces.items(), strict=True
-        ):
-            _draw_surface(axes, one, z, color=colour, label=name)
+        _draw_surface(axes, one, bed + one.error_m, color="tab:blue", label="True bed")
+        _draw_surface(axes, one, bed, color="tab:green", label="Apparent bed")
+        _draw_surface(axes, one, one.error_m, color="tab:red", label="Difference")
         _label_surfaces(axes, one, "Height (m)")
     figure.legend(*panels[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure
@@ -185,19 +195,6 @@ def _panels(
     return figure, list(zip(panels.flat, own, strict=True))
 
 
-def _draw_contours(axes: Axes, one: Effect, levels: Any) -> None:
-    """Draw white lines with numbers; a dark rim keeps these readable on light colours too."""
-    from matplotlib.patheffects import withStroke
-
-    lines = axes.contour(
-        one.x_m, one.y_m, one.error_m, levels, colors="white", linewidths=0.7, linestyles="solid"
-    )
-    for text in axes.clabel(
-        lines, fontsize=8, fmt=lambda level: f"{level:g}".replace("-", "\N{MINUS SIGN}")
-    ):
-        text.set_path_effects([withStroke(linewidth=2.0, foreground=REFERENCE)])
-
-
 def _levels(low: float, high: float) -> Any:
     """Return round values, about ten, from below `low` to above `high`."""
     rough = max(high - low, 1e-6) / 9.0
@@ -207,30 +204,28 @@ def _levels(low: float, high: float) -> Any:
     return step * np.arange(first, max(np.ceil(high / step), first + 1.0) + 1.0)
 
 
-def _mark_places(axes: Axes, one: Effect) -> None:
-    """Name the values of centre and corner, and the axes."""
-    box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.5}
-    axes.plot(0.0, 0.0, "+", color=REFERENCE)
-    axes.annotate(
-        f"{one.centre_m:.2f} m", (0.0, 0.0), xytext=(0, 6), textcoords="offset points",
-        ha="center", fontsize=9, bbox=box, zorder=20,
-    )  # fmt: skip
-    axes.annotate(
-        f"{one.corner_m:.2f} m", (one.x_m[-1], one.y_m[-1]), xytext=(-3, -3),
-        textcoords="offset points", ha="right", va="top", fontsize=9, bbox=box, zorder=20,
-    )  # fmt: skip
-
-
 def depth_figure(effects: list[Effect]) -> Figure:
     """Draw error and correction factor against the apparent depth, centre and corner."""
     figure, panels = new_figure(10.5, 6.0, nrows=1, ncols=2)
     cameras = list(dict.fromkeys(one.pair.camera for one in effects))
-    colours = (BEFORE, AFTER, REFERENCE)
-    for camera, colour in zip(cameras, colours, strict=False):
-        _draw_camera(panels, camera, effects, colour)
-    for axes, label in zip(
-        panels, ("Apparent minus true depth (m)", "True over apparent depth"), strict=True
-    ):
+    for camera, colour in zip(cameras, (BEFORE, AFTER, REFERENCE), strict=False):
+        own = [one for one in effects if one.pair.camera == camera]
+        for i, pair in enumerate(dict.fromkeys(one.pair for one in own)):
+            line = [one for one in own if one.pair == pair]
+            line.sort(key=lambda one: one.apparent_depth_m)
+            depth = np.array([one.apparent_depth_m for one in line])
+            wet = depth > 0.0
+            flight = f"{camera.name} {pair.flying_height_m:g} m, {100.0 * pair.overlap:g} %"
+            for place, mark, fill in (("centre", "o", "white"), ("corner", "s", colour)):
+                error = np.array([getattr(one, f"{place}_m") for one in line])
+                style = {
+                    "linestyle": LINES[i % len(LINES)], "marker": mark, "color": colour,
+                    "markersize": 4, "markerfacecolor": fill, "label": f"{flight}, {place}",
+                }  # fmt: skip
+                panels[0].plot(depth, error, **style)
+                panels[1].plot(depth[wet], 1.0 - error[wet] / depth[wet], **style)
+    labels = "Apparent minus true depth (m)", "True over apparent depth"
+    for axes, label in zip(panels, labels, strict=True):
         axes.set(xlabel="Apparent depth (m)", ylabel=label)
         axes.grid(color="0.9")
     index = effects[0].refractive_index
@@ -239,42 +234,9 @@ def depth_figure(effects: list[Effect]) -> Figure:
         f"n = {index:g}", (1.0, index), xycoords=("axes fraction", "data"), xytext=(-4, -3),
         textcoords="offset points", ha="right", va="top", fontsize=9,
     )  # fmt: skip
-    handles, labels = panels[1].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(cameras))
+    handles, names = panels[1].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside lower center", ncols=len(cameras))
     return figure
-
-
-def _draw_camera(panels: Any, camera: AerialCamera, effects: list[Effect], colour: str) -> None:
-    own = [one for one in effects if one.pair.camera == camera]
-    for i, pair in enumerate(dict.fromkeys(one.pair for one in own)):
-        line = sorted(
-            (one for one in own if one.pair == pair), key=lambda one: one.apparent_depth_m
-        )
-        depth = np.array([one.apparent_depth_m for one in line])
-        wet = depth > 0.0
-        for place, mark in (("centre", "o"), ("corner", "s")):
-            error = np.array([getattr(one, f"{place}_m") for one in line])
-            style = {
-                "linestyle": LINES[i % len(LINES)], "marker": mark, "color": colour,
-                "markersize": 4, "markerfacecolor": "white" if place == "centre" else colour,
-                "label": f"{camera.name} {pair.flying_height_m:g} m, {100.0 * pair.overlap:g} %,"
-                f" {place}",
-            }  # fmt: skip
-            panels[0].plot(depth, error, **style)
-            panels[1].plot(depth[wet], 1.0 - error[wet] / depth[wet], **style)
-
-
-def shan_text(pair: StereoPair, table: list[Iteration], depth_m: float) -> str:
-    """Return the residuals of Shan's iteration over a bed, a line each."""
-    lines = [
-        f"Shan's iteration, {pair.camera.name} from {pair.flying_height_m:g} m, bed"
-        f" {depth_m:g} m deep: residual of the depth",
-        f"{'iteration':>9}{'mean':>16}{'largest':>16}{'change of tan a':>18}",
-    ]
-    for one in table:
-        change = "" if np.isnan(one.change) else f"{one.change:.1e}"
-        lines.append(f"{one.number:>9}{one.mean_m:>14.3g} m{one.max_m:>14.3g} m{change:>18}")
-    return "\n".join(lines)
 
 
 def shan_rows(pair: StereoPair, table: list[Iteration]) -> list[dict[str, Any]]:
@@ -293,36 +255,14 @@ def shan_rows(pair: StereoPair, table: list[Iteration]) -> list[dict[str, Any]]:
     ]
 
 
-def depth_bins_text(bins: DepthBins) -> str:
-    """Return the RMSE of the heights by depth, a column per method, and what the paper prints."""
-    lines = [
-        "RMSE of heights in the simulated bowl of Hsu & Wang, mm, by true depth; III: D ="
-        f" {1000 * bins.offset_m:+.2f} mm {bins.slope:+.3f} d, r2 {bins.r2:.4f}",
-        f"{'depth, mm':<11}{'points':>7}" + "".join(f"{name:>13}" for name in METHODS),
-    ]
-    for name, points, row in zip(_bin_names(), bins.points, bins.rmse_m, strict=True):
-        lines.append(f"{name:<11}{points:>7}" + "".join(f"{1e3 * v:>13.3f}" for v in row))
-    lines.append(
-        "as printed; refraction does not explain it, as the uncorrected error falls with depth"
-    )
-    for name, row in zip(_bin_names(), zip(*PRINTED_RMSE_MM.values(), strict=True), strict=True):
-        lines.append(f"{name:<18}" + "".join(f"{v:>13.3f}" for v in row))
-    return "\n".join(lines)
-
-
 def depth_bins_rows(bins: DepthBins) -> list[dict[str, Any]]:
     """Return RMSE and mean error of each bin and method as rows."""
+    figures = bins.points.tolist(), bins.rmse_m.tolist(), bins.mean_m.tolist()
     return [
         {"depth_mm": name, "points": points}
         | {f"rmse_{m}_mm": round(1e3 * v, 3) for m, v in zip(METHODS, rmse, strict=True)}
         | {f"mean_{m}_mm": round(1e3 * v, 3) for m, v in zip(METHODS, mean, strict=True)}
-        for name, points, rmse, mean in zip(
-            _bin_names(),
-            bins.points.tolist(),
-            bins.rmse_m.tolist(),
-            bins.mean_m.tolist(),
-            strict=True,
-        )
+        for name, points, rmse, mean in zip(_bin_names(), *figures, strict=True)
     ]
 
 

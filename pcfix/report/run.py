@@ -1,12 +1,9 @@
-"""The page of a run: what a correction came to, in words, pictures and tables.
-
-And what it says of the adjustment that the run began with.
-"""
+"""The report page of a run: words, pictures and tables on the correction and the adjustment."""
 
 from __future__ import annotations
 
 import platform
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -36,7 +33,7 @@ from pcfix.report.page import (
     new_figure,
     new_map,
 )
-from pcfix.report.text import formal_words, share, uncertainty_sentence
+from pcfix.report.text import formal_words, summary_rows, uncertainty_sentence
 from pcfix.version import __version__
 
 if TYPE_CHECKING:
@@ -53,15 +50,10 @@ class Corrected:
 
     Attributes
     ----------
-    summary : Summary
-    survey : Survey
-    cameras : Cameras
-    water : WaterSurface
-    maps : Maps
     depth_m : dict
-        Least (min), mean and greatest (max) of the bed's points that are not noise.
+        Least (min), mean and greatest (max) depth of the bed's points that are not noise.
     sample : array, shape (m, 3)
-        Shift in Z, depth and standard error of Z of corrected points, metres; zero where none is.
+        Z shift, depth and standard error of Z of corrected points, metres; zero where unknown.
     """
 
     summary: Summary
@@ -80,15 +72,15 @@ class Later:
     Attributes
     ----------
     pictures, tables : sequence
-        Those that matter most first.
+        The most important first.
     verdict : str
-        A sentence that they come to.
+        One sentence that they come to.
     compared : dict
-        `Comparison.as_dict`; what it measured replaces what was predicted.
+        `Comparison.as_dict`; measured figures replace predicted ones.
     difference : pair, optional
-        From the reference, shape (rows, columns), metres, and its extent.
+        Cloud minus reference, shape (rows, columns), metres, and its extent.
     resolution_m : float, optional
-        Of the rasters, which is that of the map too.
+        Of the rasters and of the map.
     """
 
     pictures: Sequence[Picture] = ()
@@ -178,46 +170,26 @@ def _worded(value: Any) -> str:
 
 def _lead(s: Summary) -> str:
     mean = s.shift_z_m["mean"]
-    way = "higher" if mean > 0.0 else "deeper"
-    land = ""
+    transferred = ""
     if s.carried is not None:
-        land = (
-            f" First the whole cloud, land too, was taken from the cameras that made it to the"
-            f" adjusted ones, which moved it by {s.carried['shift_m']['rms']:.2f} m (rms)."
+        transferred = (
+            " Before that, the whole cloud was transferred to the adjusted poses, which moved it by"
+            f" {s.carried['shift_m']['rms']:.2f} m (rms)."
         )
     return (
         f"Correction for refraction of {name_of(s.input)}: {s.corrected:,} of {s.points:,} points"
-        f" lay under water and were moved to where the bed is, {abs(mean):.2f} m {way} on"
-        f" average.{land}"
+        f" are under water and were moved, {abs(mean):.2f} m"
+        f" {'higher' if mean > 0.0 else 'deeper'} on average.{transferred}"
     )
 
 
 def _facts(s: Summary, measured: Plain | None) -> Table:
-    shift, depth = s.shift_z_m, s.depth_m
-    rows = [
-        ["Cloud", name_of(s.input)],
-        ["Water", f"{s.water}; refractive index {s.settings['index']:g}"],
-        ["Points", f"{s.points:,}"],
-        ["Under water", f"{s.submerged:,} ({share(s.submerged, s.points)} of the points)"],
-        ["Corrected", f"{s.corrected:,} ({share(s.corrected, s.submerged)} of these)"],
-        ["Depth", f"{depth['min']:.2f} to {depth['max']:.2f} m, mean {depth['mean']:.2f} m"],
-        ["Shift in Z", f"mean {shift['mean']:.3f} m; 90 % of the points lie between"
-         f" {shift['p5']:.3f} and {shift['p95']:.3f} m"],
-        ["Cameras", f"{s.cameras_used} of {s.cameras} see corrected points;"
-         f" {s.rays / max(s.corrected, 1):.1f} rays a point" if s.cameras else "none"],
-    ]  # fmt: skip
-    if s.unsure is not None:
-        rows.append(["Unsure", f"{s.unsure:,} ({share(s.unsure, s.corrected)} of the corrected) are"
-                     " seen by flat obliques alone, and withheld"])  # fmt: skip
-    if s.made is not None:
-        rows.insert(2, ["Method", f"{s.made['method']}. {s.made['because']}"])
-    if uncertainty := uncertainty_sentence(s, measured):
-        rows.append(["Uncertainty", uncertainty])
-    if s.fit is not None and s.cameras:
-        rows.append(["Fit", s.fit["words"]])
-    if s.poses is not None:
-        rows.append(["Poses", s.poses["words"]])
-    return Table("In short", [], rows)
+    """Return the rows of the terminal, with the detected reconstruction type in words."""
+    words = dict(summary_rows(s))
+    words |= {"Method": f"{s.made['method']}. {s.made['because']}"} if s.made else {}
+    words |= {"Uncertainty": uncertainty_sentence(s, measured)}
+    rows = [[label, text] for label, text in words.items() if label and text]
+    return Table("In short", [], [["Cloud", name_of(s.input)], ["Points", f"{s.points:,}"], *rows])
 
 
 def _pictures(corrected: Corrected) -> list[Picture]:
@@ -321,15 +293,13 @@ def _uncertainty_picture(sample: FloatArray, s: Summary, later: Later) -> list[P
     if s.uncertainty is None or not known.any():
         return []
     bins = later.compared["depth_bins"] if later.tvu else []
+    dots = (
+        " Dots: the limit that 95 % of the differences to the reference keep, its noise included."
+    )
     text = (
-        "Total vertical uncertainty at 95 % (1.96 standard errors of Z) over depth, and the"
-        f" largest that the orders of IHO S-44 allow. It is formal: {formal_words(s)}."
-        + (
-            " Dots: within which 95 % of the differences to the reference lie, its noise included."
-            if bins
-            else ""
-        )
-        + " S-44 asks for more than the TVU: position, features and coverage."
+        "Total vertical uncertainty at 95 % (1.96 standard errors of Z) over depth, and the limits"
+        f" of the orders of IHO S-44. {formal_words(s)}.{dots if bins else ''}"
+        " S-44 has requirements other than the TVU: position, features and coverage."
     )
     figure = tvu_figure(sample[known, 1], sample[known, 2], bins)
     return [Picture("uncertainty", "Vertical uncertainty", text, figure)]
@@ -338,18 +308,18 @@ def _uncertainty_picture(sample: FloatArray, s: Summary, later: Later) -> list[P
 def tvu_figure(
     depth_m: FloatArray, sigma_z_m: FloatArray, measured: Sequence[Plain] = ()
 ) -> Figure:
-    """Draw TVU at 95 % over depth, and the largest of the orders of IHO S-44 up to one above it.
+    """Draw TVU at 95 % over depth, and the limits of the orders of IHO S-44 up to one above it.
 
     `measured` are the `Comparison.depth_bins` of a reference, in plain values.
     """
     figure, axes = new_figure()
-    tvu = COVERAGE_95 * sigma_z_m
     deepest = float(max(depth_m.max(), 1e-3))
     edges = np.linspace(0.0, deepest * (1.0 + 1e-9), 31)
     slot = np.clip(np.digitize(depth_m, edges) - 1, 0, 29)
-    filled = [i for i in range(30) if (slot == i).any()]
-    low, middle, high = np.array([np.percentile(tvu[slot == i], [5, 50, 95]) for i in filled]).T
-    centres = 0.5 * (edges[:-1] + edges[1:])[filled]
+    used = np.unique(slot)
+    tvu = COVERAGE_95 * sigma_z_m
+    low, middle, high = np.array([np.percentile(tvu[slot == i], [5, 50, 95]) for i in used]).T
+    centres = 0.5 * (edges[:-1] + edges[1:])[used]
     axes.fill_between(
         centres, low, high, color=WATER, alpha=0.6, linewidth=0.0, label="predicted, 90 %"
     )
@@ -364,7 +334,7 @@ def tvu_figure(
         name = order.name if order.name[0].isalpha() else f"order {order.name}"
         axes.plot(depths, largest, style, color=BEFORE, label=f"IHO S-44 {name}")
         if largest[0] > max(high.max(), *within, 0.0):
-            break  # the laxer ones would only press the points down
+            break  # laxer limits would only press the points down
     axes.set(xlim=(0.0, deepest), ylim=(0.0, None), xlabel="Depth (m)", ylabel="TVU at 95 % (m)")
     axes.legend(loc="best")
     return figure
@@ -387,79 +357,61 @@ def _orders(s: Summary, measured: Plain | None) -> list[Table]:
 
 def adjustment_sentence(d: Plain) -> str:
     """Return an adjustment in half a line, of the values of `adjustment_dict`."""
-    unit = d["image_unit"]
-    parts = [
-        f"focal length {short(row['before'], row['sigma'])} -> {short(row['after'], row['sigma'])}"
-        f" {unit}"
-        for row in d["lens"][:1]
-        if row["name"] == "f"
-    ]
+    unit, parts = d["image_unit"], []
+    if d["lens"] and d["lens"][0]["name"] == "f":
+        row = d["lens"][0]
+        before, after = (short(row[when], row["sigma"]) for when in ("before", "after"))
+        parts.append(f"focal length {before} -> {after} {unit}")
     parts.append(f"centres moved {fixed(d['poses']['moved_rms_m'], 3)} m (rms)")
     residuals = [
         f"{fixed(d['residuals'][key]['rms_px'], 2)} {unit} {where}"
         for key, where in WHERE
         if d["residuals"][key]["rms_px"] is not None
     ]
-    if residuals:
-        parts.append(f"residuals {' and '.join(residuals)}")
-    return ", ".join(parts)
+    return ", ".join([*parts, *([f"residuals {' and '.join(residuals)}"] if residuals else [])])
+
+
+def reason_sentence(adjusted: bool, why: str) -> str:
+    """Return why a run adjusted the cameras, or why not."""
+    if adjusted:
+        return f" The cameras were adjusted first, as {why}."
+    return f" The cameras were not adjusted: {why}."
 
 
 def adjustment_table(d: Plain, page: str) -> Table:
     """Return what the adjustment changed, of `adjustment_dict`, with a link to its own page."""
     from markupsafe import Markup
 
-    link = Markup('<a href="{0}">{0}</a>').format(page)
-    rows = [*_lens(d), *_residuals(d), *_poses(d), *_surveyed(d)]
-    rows += [*(["Note", "", note] for note in all_notes(d)), ["All of it", "", link]]
-    return Table("Refractive bundle adjustment", ["", "before", "after"], rows)
-
-
-def reason_sentence(adjusted: bool, why: str) -> str:
-    """Return why a run adjusted or did not, for the head of its page."""
-    if adjusted:
-        return f" The cameras were adjusted first, as {why}."
-    return f" The cameras were not adjusted: {why}."
-
-
-def _lens(d: Plain) -> Iterator[list[str]]:
-    many = len({row["sensor"] for row in d["lens"]}) > 1
-    for row in d["lens"]:
-        of = f" of {row['sensor']}" if many else ""
-        unit = f" {d['image_unit']}" if row["name"] in ("f", "cx", "cy", "b1", "b2") else ""
-        name = lens_label(row) + of
-        plus_minus = "" if row["sigma"] is None else f" ± {row['sigma']:.2g}"
-        yield [
-            name[:1].upper() + name[1:] if len(name) > 2 else name,
-            short(row["before"], row["sigma"]) + unit,
-            short(row["after"], row["sigma"]) + plus_minus + unit,
-        ]
-
-
-def _residuals(d: Plain) -> Iterator[list[str]]:
     unit = d["image_unit"]
+    rows = [_lens_row(row, d) for row in d["lens"]]
     for key, where in WHERE:
         r = d["residuals"][key]
         if r["points"]:
-            yield [
-                f"Residuals {where} (rms)",
-                f"{fixed(r['rms_before_px'], 3)} {unit}",
-                f"{fixed(r['rms_px'], 3)} {unit}, {fixed(r['rms_m'], 4)} m",
-            ]
-
-
-def _poses(d: Plain) -> Iterator[list[str]]:
-    yield ["Projection centres moved (rms)", "", f"{fixed(d['poses']['moved_rms_m'], 3)} m"]
+            after = f"{fixed(r['rms_px'], 3)} {unit}, {fixed(r['rms_m'], 4)} m"
+            before = f"{fixed(r['rms_before_px'], 3)} {unit}"
+            rows.append([f"Residuals {where} (rms)", before, after])
+    moved = fixed(d["poses"]["moved_rms_m"], 3)
+    rows.append(["Projection centres moved (rms)", "", f"{moved} m"])
     if d["gnss"] is not None:
         before, after = (listed(d["gnss"].get(key)) for key in ("rms_before_m", "rms_m"))
-        yield ["Centres minus GNSS, east, north, up (rms)", f"{before} m", f"{after} m"]
-
-
-def _surveyed(d: Plain) -> Iterator[list[str]]:
+        rows.append(["Centres minus GNSS, east, north, up (rms)", f"{before} m", f"{after} m"])
     for role in ("control", "check"):
-        if d[role] is not None:
-            one = d[role]
-            yield [
-                f"{role.capitalize()} points, X, Y, Z ({len(one['points'])}, rms)", "",
-                f"{listed(one['rms_m'])} m, {fixed(one['rms_px'], 2)} {d['image_unit']}",
-            ]  # fmt: skip
+        if (one := d[role]) is not None:
+            name = f"{role.capitalize()} points, X, Y, Z ({len(one['points'])}, rms)"
+            rows.append([name, "", f"{listed(one['rms_m'])} m, {fixed(one['rms_px'], 2)} {unit}"])
+    rows += [["Note", "", note] for note in all_notes(d)]
+    rows.append(["All of it", "", Markup('<a href="{0}">{0}</a>').format(page)])
+    return Table("Refractive bundle adjustment", ["", "before", "after"], rows)
+
+
+def _lens_row(row: Plain, d: Plain) -> list[str]:
+    """Return a parameter of the lens before and after, with its standard error."""
+    several = len({one["sensor"] for one in d["lens"]}) > 1
+    name = lens_label(row) + (f" of {row['sensor']}" if several else "")
+    unit = f" {d['image_unit']}" if row["name"] in ("f", "cx", "cy", "b1", "b2") else ""
+    plus_minus = "" if row["sigma"] is None else f" ± {row['sigma']:.2g}"
+    return [
+        name[:1].upper() + name[1:] if len(name) > 2 else name,
+        short(row["before"], row["sigma"]) + unit,
+        short(row["after"], row["sigma"]) + plus_minus + unit,
+    ]

@@ -1,7 +1,12 @@
-"""What a command did, in a dozen lines: of correct, label, clean and dsm."""
+"""The summaries of the commands, as tables of rows.
+
+A row is (label, format, needs): the format takes values by name, and the row is left out where the
+value that it needs is missing or zero. Terminal and report page use the same rows.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,233 +20,262 @@ if TYPE_CHECKING:
     from pcfix.grid.model import DsmSummary
     from pcfix.label.labelling import LabelSummary
     from pcfix.photos.calm import CalmSummary
+    from pcfix.photos.mapping import PhotosSummary
+    from pcfix.photos.ortho import OrthoSummary
+    from pcfix.photos.rounds import RebuildSummary
 
-BELOW = "\n" + 13 * " "
+Plain = dict[str, Any]
+Rows = list[tuple[str, str]]
+RowTable = tuple[tuple[str, str, str], ...]
+
 FEWEST = 59
 """Differences of which all keep an order before 95 % of all are likely to: 0.95^59 is 0.05."""
-BED_PER_LEVEL = 0.44
-"""How far a bed moves with the level, measured over whole blocks; straight down it is n - 1."""
+SHOWN_NAMES = 5
+
+_DEPTH = (
+    "Depth",
+    "{depth_m[min]:.2f} to {depth_m[max]:.2f} m, mean {depth_m[mean]:.2f} m",
+    "depth_m",
+)
+_PART = ("Read", "{part_words}", "part_words")
+_NO_SURFACE = (
+    "No surface",
+    "{water_unknown:,} points have no known water surface",
+    "water_unknown",
+)
+_SHORELINE: RowTable = (
+    ("Shoreline", "{lines} lines, {length_m:.1f} m, standard error in plan {sigma_m:.2f} m: {path}",
+     "lines"),
+    ("Shoreline", "none: the water does not meet the cloud; {path} is empty", "is_empty"),
+)  # fmt: skip
+_LABELLING: RowTable = (
+    ("Mask", "{outside_mask:,} points below the surface lie outside and stay land", "water_mask"),
+    ("Kept class", "{respected:,} points below the surface keep their class", "respected"),
+    ("Pools", "{pools[points]:,} points in {pools[pools]:,} separate pools stay land; the largest,"
+     " {pools[largest][area_m2]:,.1f} m2 with {pools[largest][points]:,} points, is at"
+     " {pools[largest][x]:.1f}, {pools[largest][y]:.1f}", "pools"),
+)  # fmt: skip
+_CORRECTED: RowTable = (
+    _PART,
+    ("Transferred", "{carried[points]:,} points ({carried[land]:,} on land) to the adjusted poses:"
+     " {carried[shift_m][rms]:.3f} m rms, at most {carried[shift_m][max]:.3f} m, mean Z"
+     " {carried[shift_m][mean_z]:+.3f} m", "carried"),
+    ("", "{carried_not:,} not: {carried[not_carried_reason]} ({fate})", "carried_not"),
+    ("Submerged", "{submerged:,} points ({submerged_share}), {corrected_words}", "points"),
+    _NO_SURFACE,
+    ("Withheld", "{unsure:,} corrected points ({unsure_share}) are seen at large incidence angles"
+     " only", "unsure"),
+    _DEPTH,
+    ("Z shift", "mean {shift_z_m[mean]:.3f} m (5th to 95th percentile {shift_z_m[p5]:.3f} to"
+     " {shift_z_m[p95]:.3f} m)", "shift_z_m"),
+    ("Method", "{method}", "method"),
+    ("Cameras", "{cameras_used} of {cameras} used, {rays_per_point:.1f} rays per point, incidence"
+     " angles up to {incidence_deg:.0f} deg", "cameras"),
+    ("Cameras", "none; ray counts of 1 and incidence angles of 0 are placeholders", "no_cameras"),
+    ("Unused", "{unused}", "unused"),
+    ("Water", "{water}, refractive index {settings[index]:.6g}", "water"),
+    ("", "fitted: {water_fit[model]}{fit_points}, standard error {water_fit[sigma_level_m]:.3f} m",
+     "water_fit"),
+    ("", "index from {settings[index_from]}: the bed is {deeper_cm:+.1f} cm deeper than with"
+     f" {DEFAULT_REFRACTIVE_INDEX:g}, on average", "deeper_cm"),
+)  # fmt: skip
+_UNCERTAINTY: RowTable = (
+    ("Uncertainty", "{uncertainty[tvu_95_m][mean]:.3f} m at 95 % (predicted)", "uncertainty"),
+    ("Uncertainty", "not known: without cameras there are no rays", "no_uncertainty"),
+    ("IHO S-44", "{order}", "uncertainty"),
+    ("Check", "{check}", "check"),
+    ("Poses", "{poses[words]}", "poses"),
+)  # fmt: skip
+_LABELLED: RowTable = (
+    _PART,
+    ("Class 40", "{submerged:,} points ({submerged_share})", "points"),
+    ("Class 41", "{water_surface:,} points within {settings[band]:g} m of the surface", "has_band"),
+    ("Reclassified", "{stale:,} points of class 40 or 41 are neither now: {stale_fate}", "stale"),
+    _NO_SURFACE,
+)  # fmt: skip
+_CLEANED: RowTable = (
+    ("Noise", "{noise:,} points ({noise_share}), {fate}", "points"),
+    ("Ignored", "{set_aside:,} points were withheld or noise before", "set_aside"),
+    ("Bed", "{submerged:,} submerged points tested against it", "submerged"),
+    ("Neighbours", "mean distance {near[mean]:.3f} m, standard deviation {near[sd]:.3f} m, limit"
+     " {near[limit]:.3f} m", "near"),
+)  # fmt: skip
+_GRIDDED: RowTable = (
+    _PART,
+    ("Raster", "{width:,} x {height:,} cells of {settings[resolution]:g} m{chosen},"
+     " {settings[method]}", "width"),
+    ("Values", "{what} {low:.4g} to {high:.4g}, mean {mean:.4g}{unit}", "what"),
+    ("Bounds", "x {bounds_m[0]:.10g} to {bounds_m[2]:.10g}, y {bounds_m[1]:.10g} to"
+     " {bounds_m[3]:.10g} m", "width"),
+    ("CRS", "{crs_name}; heights: {heights_name}", "width"),
+    ("Cells", "{cells:,} with points ({cells_share}), {points_per_cell:.1f} points each", "width"),
+    ("", "{filled:,} interpolated ({filled_share}), across holes up to {hole_m:.3g} m", "hole_m"),
+    ("", "{empty:,} empty ({empty_share})", "width"),
+    ("Hillshade", "{hillshade}", "hillshade"),
+    ("Counts", "{counts}", "counts"),
+)  # fmt: skip
+_CALMED: RowTable = (
+    ("Registered", "by {corners:,} corners with a median scatter of {scatter_px:.2f} px; the camera"
+     " moved by up to {moved_px:.1f} px", "corners"),
+    ("Registered", "no: the camera stood still", "is_still"),
+    ("Spread", "median {spread:.1f} grey values: {spread_file}", "frames"),
+    ("Water", "{found.waves} waves; slopes {found.slope_deg:.2f} deg rms, {percent:.0f} % of them"
+     " explained", "found"),
+    ("", "heights {height_cm:.1f} cm rms, standard error {sigma_cm:.1f} cm: {found.folder}",
+     "found"),
+)  # fmt: skip
+_MAPPED: RowTable = (
+    ("Mapping", "{mapping}, nodes every {spacing_px} px, largest shift {largest_shift_px:.1f} px",
+     "images"),
+    ("Black", "{black_percent:.1f} % of the pixels: no ground, occluded, or outside the image",
+     "images"),
+    ("Kept", "{done_before:,} images of an earlier call", "done_before"),
+    ("Ground", "{dsm}", "dsm"),
+    ("Water", "{water}, refractive index {refractive_index:g}", "water"),
+)  # fmt: skip
+_REBUILT: RowTable = (
+    ("Result", "{verdict}: the last round moved the bed by {less} than {threshold_m:.3f} m on"
+     " average", "rebuild"),
+    ("Cloud", "{cloud}", "cloud"),
+    ("Compared", "{compared}", "compared"),
+    ("Next", "{compare}", "not_compared"),
+)  # fmt: skip
+_ORTHO: RowTable = (
+    ("Raster", "{width:,} x {height:,} cells of {resolution_m:g} m", "width"),
+    ("Covered", "{covered:.1f} % of the DSM {dsm}", "width"),
+    ("Images", "{images}, {traced}", "images"),
+)  # fmt: skip
+_FATE = {"withhold": "not moved, withheld", "keep": "not moved", "drop": "dropped"}
+
+
+def aligned(head: str, rows: Iterable[tuple[str, str]], notes: Iterable[object] = ()) -> str:
+    """Return a summary: a line that says what was done, labelled rows, and notes."""
+    lines = [head, *(f"  {label:<13} {text}" for label, text in rows)]
+    return "\n".join([*lines, *(f"Note: {note}" for note in notes)])
+
+
+def filled(table: RowTable, values: Mapping[str, Any]) -> Rows:
+    """Return labels and texts of the rows of a table whose values are known."""
+    return [
+        (label, text.format_map(values))
+        for label, text, needs in table
+        if values.get(needs) not in (None, 0, "", {}, ())
+    ]
 
 
 def summary_text(summary: Summary) -> str:
-    """Return what a person wants to know of a run."""
-    s = summary
-    lines = [
-        *_head(s),
-        f"submerged    {s.submerged:,} ({share(s.submerged, s.points)} of the points)",
-        f"corrected    {s.corrected:,} ({share(s.corrected, s.submerged)} of the submerged)",
+    """Return the summary of a correction."""
+    return aligned(_head("Corrected", summary), summary_rows(summary), summary.told)
+
+
+def summary_rows(s: Summary) -> Rows:
+    """Return the facts of a correction, for the terminal and the report page."""
+    values = vars(s) | {
+        "part_words": _part_words(s.part),
+        "fate": _FATE[s.settings["uncorrected"]],
+        "carried_not": (s.carried or {}).get("not_carried"),
+        "submerged_share": share(s.submerged, s.points),
+        "corrected_words": "all corrected" if s.corrected == s.submerged
+        else f"{s.corrected:,} corrected ({share(s.corrected, s.submerged)})",
+        "unsure_share": share(s.unsure or 0, s.corrected),
+        "method": _method(s),
+        "rays_per_point": s.rays / max(s.corrected, 1),
+        "no_cameras": not s.cameras,
+        "unused": _unused(s),
+        "fit_points": _fit_points(s.water_fit),
+        "deeper_cm": _deeper_cm(s),
+        "no_uncertainty": s.uncertainty is None and s.settings["dimensions"] == "all"
+        and not s.cameras,
+        "order": order_sentence(s),
+        "check": _check(s),
+    }  # fmt: skip
+    rows = filled(_CORRECTED, values)
+    place = 1 + next((i for i, (label, _) in enumerate(rows) if label == "Submerged"), 0)
+    rows[place:place] = [
+        ("", f"{count:,} not corrected: {reason} ({values['fate']})")
+        for reason, count in s.uncorrected.items()
+        if count
     ]
-    lines[2:2] = _carried(s)
-    if 2 * s.corrected < s.submerged:
-        lines[:0] = [
-            f"WARNING      only {s.corrected:,} of {s.submerged:,} submerged points were corrected"
-            f" ({share(s.corrected, s.submerged)}): see below why"
-        ]
-    for reason, count in s.uncorrected.items():
-        if count:
-            lines.append(f"  not        {count:,}: {reason} ({_FATE[s.settings['uncorrected']]})")
-    if s.unsure is not None:
-        lines.append(
-            f"unsure       {s.unsure:,} ({share(s.unsure, s.corrected)} of the corrected): seen by"
-            " flat obliques alone, withheld"
-        )
-    lines += _no_surface(s)
-    if s.depth_m:
-        depth = s.depth_m
-        lines.append(
-            f"depth        {depth['min']:.2f} to {depth['max']:.2f} m, mean {depth['mean']:.2f} m"
-        )
-    if s.shift_z_m:
-        shift = s.shift_z_m
-        lines.append(
-            f"shift in Z   mean {shift['mean']:.3f} m, 5 % {shift['p5']:.3f} m,"
-            f" 95 % {shift['p95']:.3f} m"
-        )
-    if s.made:
-        lines.append(f"method       {s.made['method']}. {s.made['because']}")
-    elif s.told:
-        lines.append(f"method       {s.settings['method']}")
-    lines += [f"  note       {note}" for note in s.told]
-    lines += [
-        *_cameras(s),
-        f"water        {s.water}, refractive index {s.settings['index']:.6g}",
-        *_index(s),
-        *_water_fit(s),
-        *shoreline_lines(s.shoreline),
-        *([] if s.fit is None or not s.cameras else [f"fit          {s.fit['words']}"]),
-        *([] if s.poses is None else [f"poses        {s.poses['words']}"]),
-        *_uncertainty(s),
-    ]
-    return "\n".join([*lines, *left_out_lines(s.labelling)])
+    rows += shoreline_rows(s.shoreline)
+    return [*rows, *filled(_UNCERTAINTY, values), *_labelling_rows(s.labelling)]
 
 
-def _cameras(s: Summary) -> list[str]:
-    if not s.cameras:
-        return [
-            "cameras      none: a corrected point has a ray count of 1 and an incidence of 0, and"
-            " which images made it, or were hidden, is not known"
-        ]
-    left_out = [name for names in s.cameras_left_out.values() for name in names]
-    blind = [name for name in s.cameras_unused if name not in left_out]
-    unused = {f"see the bed {why}": names for why, names in s.cameras_left_out.items()}
-    unused |= {"see no corrected point": blind} if blind else {}
-    return [
-        f"cameras      {s.cameras_used} of {s.cameras} used"
-        + "".join(
-            f"; {len(names)} {why}: {', '.join(names[:5])}{', ...' if len(names) > 5 else ''}"
-            for why, names in unused.items()
-        ),
-        f"rays         {s.rays:,} ({s.rays / max(s.corrected, 1):.1f} a point, incidence up to"
-        f" {s.incidence_deg:.0f} degrees)",
-    ]
+def _head(verb: str, s: Any, points: str = "") -> str:
+    points = points or f"{s.points:,}"
+    return f"{verb} {s.input} -> {s.output}      {points} points in {s.seconds:.1f} s"
 
 
-def _head(s: Summary | LabelSummary | CleanSummary) -> list[str]:
-    rate = s.points / max(s.seconds, 1e-9)
-    return [
-        f"{s.input} -> {s.output}",
-        f"points       {s.points:,}{_of_whole(getattr(s, 'part', None))} in {s.seconds:.1f} s"
-        f" ({rate:,.0f} points/s)",
-    ]
-
-
-def _of_whole(part: dict[str, Any] | None) -> str:
-    """Say of how many points a part was read, and which."""
+def _part_words(part: Plain | None) -> str:
+    """Return which part of the points was read, and by which bounds."""
     if part is None:
         return ""
     box, step = part["bounds"], part["read_resolution"]
-    words = [] if box is None else ["within " + ",".join(f"{one:.12g}" for one in box)]
-    words += [] if step is None else [f"at a resolution of {step:g} m"]
-    return f" of {part['of']:,}, those {' '.join(words)},"
+    words = "" if box is None else " within " + ",".join(f"{one:.12g}" for one in box)
+    words += "" if step is None else f" at a resolution of {step:g} m"
+    return f"a part of {part['of']:,} points,{words}"
 
 
-def shoreline_lines(found: dict[str, Any] | None) -> list[str]:
-    """Say how long and how well known a shoreline is, where one was written."""
-    if found is None:
-        return []
-    if not found["lines"]:
-        return [f"shoreline    nowhere does the water meet the cloud: {found['path']} is empty"]
-    return [
-        f"shoreline    {found['lines']} lines, {found['length_m']:.1f} m, standard error in plan"
-        f" {found['sigma_m']:.2f} m: {found['path']}"
-    ]
+def _method(s: Summary) -> str:
+    made = s.made
+    if made is None:
+        return str(s.settings["method"])
+    if "made_of" not in made:
+        return f"{made['method']}. {made['because']}"
+    sure = "detected" if made["sure"] else "detected, not certain"
+    return f"{made['method']}, {made['made_of']} ({sure})"
 
 
-def _no_surface(s: Summary | LabelSummary) -> list[str]:
-    if not s.water_unknown:
-        return []
-    return [f"no surface   {s.water_unknown:,} points have no known water above them"]
-
-
-_FATE = {"withhold": "unmoved, withheld", "keep": "unmoved", "drop": "dropped"}
-
-
-def _carried(s: Summary) -> list[str]:
-    """Say that land moved too, and how far."""
-    found = s.carried
-    if found is None:
-        return []
-    shift = found["shift_m"]
-    lines = [
-        f"carried      {found['points']:,} ({share(found['points'], s.points)} of the points),"
-        f" {found['land']:,} of them land, from the old cameras to the adjusted ones: by"
-        f" {shift['rms']:.3f} m rms, {shift['max']:.3f} m at most, mean in Z"
-        f" {shift['mean_z']:+.3f} m; shifts below count from before it"
-    ]
-    if found["not_carried"]:
-        lines.append(
-            f"  not        {found['not_carried']:,}: {found['not_carried_reason']}"
-            f" ({_FATE[s.settings['uncorrected']]})"
-        )
-    return lines
-
-
-def _index(s: Summary) -> list[str]:
-    """Say what a water's own index changes: straight down, depth is in proportion to it."""
-    settings = s.settings
-    if not settings["index_from"] or not s.depth_m:
-        return []
-    change = 1.0 - DEFAULT_REFRACTIVE_INDEX / settings["index"]
-    mean, most = (100.0 * change * s.depth_m[name] for name in ("mean", "max"))
-    way = "deeper" if change > 0.0 else "shallower"
-    return [
-        f"  index      of {settings['index_from']}; against"
-        f" {DEFAULT_REFRACTIVE_INDEX:g} the bed is {abs(mean):.1f} cm {way} on average,"
-        f" {abs(most):.1f} cm at most"
-    ]
-
-
-def _water_fit(s: Summary) -> list[str]:
-    """Say how well a fitted water level is known, and what that does to the bed."""
-    fit = s.water_fit
-    if fit is None:
-        return []
-    sigma = fit["sigma_level_m"]
-    used = f", {fit['accepted']} of {fit['points']} points" if "points" in fit else ""
-    return [
-        f"  fitted     {fit['model']}{used}; standard error of the level {sigma:.3f} m, of the bed"
-        f" by it {BED_PER_LEVEL * sigma:.3f} m"
-    ]
-
-
-def _uncertainty(s: Summary) -> list[str]:
-    """Say how good the heights are, if the budget is right and nothing else is wrong."""
-    found = s.uncertainty
-    if found is None and s.settings["dimensions"] == "all" and not s.cameras:
-        return ["uncertainty  not known: no rays to propagate errors along; SigmaZ is 0"]
-    if found is None:
-        return []
-    sigma, tvu = found["sigma_z_m"], found["tvu_95_m"]
-    return [
-        f"uncertainty  predicted standard error of Z mean {sigma['mean']:.3f} m, 95 % of the points"
-        f" below {sigma['p95']:.3f} m; TVU at 95 % mean {tvu['mean']:.3f} m",
-        f"  IHO S-44   {order_sentence(s)}",
-        f"  formal     {formal_words(s, BELOW)}; S-44 asks for more than the TVU",
-    ]
-
-
-def formal_words(s: Summary, apart: str = " ") -> str:
-    """Return what the standard errors of a run rest on; `apart` stands between its two parts."""
-    if s.settings["method"] == "regression":
-        return "it is how far the line misses check depths that it was not fitted to"
-    fitted = None if s.water_fit is None else s.water_fit["sigma_level_m"]
-    errors = budget_words(s.settings, fitted)
-    return f"it assumes {errors} (standard deviations),{apart}and {of_cloud(s)}"
-
-
-def of_cloud(s: Summary) -> str:
-    """Return what the standard errors have beyond the budget, in words."""
-    known = s.uncertainty or {}
-    found, poses_m = known.get("of_cloud"), known.get("poses_m")
-    poses = "" if poses_m is None else f"; poses as adjusted: {poses_m:.3f} m"
-    if found is None:
-        return f"no mismatches{poses}"
-    return (
-        f"has from the cloud itself {found['scatter_m']:.3f} m of scatter and"
-        f" {100.0 * found['per_depth']:.1f} % of the depth{poses}"
+def _unused(s: Summary) -> str:
+    """Return which cameras were not used, by the reason."""
+    excluded = [name for names in s.cameras_left_out.values() for name in names]
+    groups = {f"see the bed {why}": names for why, names in s.cameras_left_out.items()}
+    groups["see no corrected point"] = [n for n in s.cameras_unused if n not in excluded]
+    return "; ".join(
+        f"{len(names)} {why}: {', '.join(names[:SHOWN_NAMES])}"
+        + (", ..." if len(names) > SHOWN_NAMES else "")
+        for why, names in groups.items()
+        if names
     )
 
 
-def left_out_lines(labelling: dict[str, Any] | None) -> list[str]:
-    """Return what was left as land although it lies below the surface."""
+def _fit_points(fit: Plain | None) -> str:
+    return f", {fit['accepted']} of {fit['points']} points" if fit and "points" in fit else ""
+
+
+def _deeper_cm(s: Summary) -> float | None:
+    """Return what a water's own index changes: straight down, depth is in proportion to it."""
+    if not s.settings["index_from"] or not s.depth_m:
+        return None
+    return 100.0 * (1.0 - DEFAULT_REFRACTIVE_INDEX / s.settings["index"]) * s.depth_m["mean"]
+
+
+def _check(s: Summary) -> str:
+    """Return what the test of cameras against cloud came to."""
+    if s.fit is None or not s.cameras:
+        return ""
+    if s.fit["doubts"]:
+        return "cameras may not match the cloud; see the warnings"
+    if not s.fit["fits"]:
+        return "cameras and cloud could not be tested"
+    more = f" (not tested: {'; '.join(s.fit['unchecked'])})" if s.fit["unchecked"] else ""
+    return f"cameras match the cloud{more}"
+
+
+def shoreline_rows(found: Plain | None) -> Rows:
+    """Return the length and the standard error of a shoreline, where one was written."""
+    return [] if found is None else filled(_SHORELINE, found | {"is_empty": not found["lines"]})
+
+
+def _labelling_rows(labelling: Plain | None) -> Rows:
+    """Return what stays land although it lies below the surface."""
     if labelling is None:
         return []
-    lines = []
-    if labelling["water_mask"] is not None:
-        lines.append(f"mask         {labelling['outside_mask']:,} points below lie outside: land")
-    if labelling["respected"]:
-        lines.append(f"respected    {labelling['respected']:,} points below keep their class")
-    apart = labelling["separate"]
-    if apart is not None and apart["pools"]:
-        most = apart["largest"]
-        lines.append(
-            f"separate     {apart['points']:,} points in {apart['pools']:,} pools apart from the"
-            f" water were left as land; the largest, {most['area_m2']:,.1f} m2 with"
-            f" {most['points']:,} points, is at {most['x']:.1f}, {most['y']:.1f}"
-        )
-    elif apart is not None:
-        lines.append("separate     no pools apart from the water")
-    return lines
+    pools = labelling["separate"]
+    values = labelling | {"pools": pools if pools and pools["pools"] else None}
+    rows = filled(_LABELLING, values)
+    return (
+        [*rows, ("Pools", "none separate from the water")] if pools and not pools["pools"] else rows
+    )
 
 
 def share(part: int, whole: int) -> str:
@@ -252,15 +286,22 @@ def share(part: int, whole: int) -> str:
     return f"{percent:.0f} %" if percent >= 10 or percent == 0 else f"{percent:.1f} %"
 
 
-def strictest_order(uncertainty: dict[str, Any]) -> str | None:
-    """Return the strictest order whose TVU 95 % of the points keep, if any."""
-    for order in ORDERS:
-        if uncertainty["s44"][order.name] >= 0.95:
-            return order.name
-    return None
+def formal_words(s: Summary) -> str:
+    """Return what the standard errors of a run rest on."""
+    if s.settings["method"] == "regression":
+        return "the scatter of check depths about the line, where it was not fitted to them"
+    fitted = None if s.water_fit is None else s.water_fit["sigma_level_m"]
+    known = s.uncertainty or {}
+    found, poses_m = known.get("of_cloud"), known.get("poses_m")
+    cloud = "" if found is None else (
+        f". Estimated from the cloud: matching noise {found['scatter_m']:.3f} m, model uncertainty"
+        f" {100.0 * found['per_depth']:.1f} % of depth"
+    )  # fmt: skip
+    poses = "" if poses_m is None else f". Adjusted poses: {poses_m:.3f} m"
+    return f"Assumed standard deviations: {budget_words(s.settings, fitted)}{cloud}{poses}"
 
 
-def budget_words(errors: dict[str, Any], level_from_fit: float | None = None) -> str:
+def budget_words(errors: Plain, level_from_fit: float | None = None) -> str:
     """Return the standard deviations that were assumed, as ``image 0.5 px, level 0.020 m``.
 
     Parameters
@@ -270,8 +311,7 @@ def budget_words(errors: dict[str, Any], level_from_fit: float | None = None) ->
     level_from_fit : float, optional
         Standard error of the level that a fit gave, where the user stated none.
     """
-    level = errors["sigma_level"]
-    source = ""
+    level, source = errors["sigma_level"], ""
     if level is None:
         level, source = LEVEL_M, " (assumed)"
         if level_from_fit is not None and np.isfinite(level_from_fit):
@@ -288,6 +328,11 @@ def budget_words(errors: dict[str, Any], level_from_fit: float | None = None) ->
     return ", ".join(parts)
 
 
+def strictest_order(uncertainty: Plain) -> str | None:
+    """Return the strictest order whose TVU 95 % of the points keep, if any."""
+    return next((o.name for o in ORDERS if uncertainty["s44"][o.name] >= 0.95), None)
+
+
 def order_sentence(s: Summary) -> str:
     """Return which order of S-44 the standard errors allow, or why none is claimed."""
     if s.uncertainty is None or s.why_no_order:
@@ -295,26 +340,25 @@ def order_sentence(s: Summary) -> str:
     return tvu_sentence(s.uncertainty)
 
 
-def tvu_sentence(uncertainty: dict[str, Any]) -> str:
+def tvu_sentence(uncertainty: Plain) -> str:
     """Return which order of S-44 the standard errors would allow, in words."""
     order = strictest_order(uncertainty)
     if order is None:
         within = uncertainty["s44"][ORDERS[-1].name]
         return f"fewer than 95 % of the points keep any order of IHO S-44 ({within:.0%} order 2)"
+    name = f"order {order}" if order[0].isdigit() else f"{order} Order"
     within = uncertainty["s44"][order]
-    number = "order" if order[0].isdigit() else ""
-    name = f"{number} {order}".strip() + ("" if number else " Order")
     return f"{100.0 * within:.4g} % of the points are within the TVU of IHO S-44 {name}"
 
 
-def uncertainty_sentence(s: Summary, measured: dict[str, Any] | None = None) -> str:
+def uncertainty_sentence(s: Summary, measured: Plain | None = None) -> str:
     """Return TVU and order of S-44 of a run: as `measured` against a reference, else as predicted.
 
     `measured` is `Comparison.tvu` in plain values. Empty where neither is known.
     """
     mean = "" if s.uncertainty is None else f"{s.uncertainty['tvu_95_m']['mean']:.3f} m on average"
     if measured is None:
-        return f"TVU at 95 % {mean}, formal; {order_sentence(s)}" if mean else ""
+        return f"TVU at 95 % {mean}, predicted; {order_sentence(s)}" if mean else ""
     few = f"fewer than {FEWEST} points claim no order of IHO S-44"
     return (
         f"TVU at 95 %{f' predicted {mean},' if mean else ''} measured"
@@ -323,96 +367,85 @@ def uncertainty_sentence(s: Summary, measured: dict[str, Any] | None = None) -> 
     )
 
 
-def labelling_text(summary: LabelSummary) -> str:
-    """Return what a person wants to know of a labelling."""
-    s = summary
-    lines = [
-        *_head(s),
-        f"class 40     {s.submerged:,} ({share(s.submerged, s.points)} of the points)",
-    ]
-    if s.settings["band"]:
-        lines.append(f"class 41     {s.water_surface:,} within {s.settings['band']:g} m")
-    if s.stale:
-        fate = "now class 1" if s.settings["reset"] else "left so; --reset makes them class 1"
-        lines.append(f"class before {s.stale:,} came as class 40 or 41 and are neither: {fate}")
-    lines += _no_surface(s)
-    return "\n".join([*lines, *left_out_lines(s.labelling), f"water        {s.water}"])
+def labelling_text(s: LabelSummary) -> str:
+    """Return the summary of a labelling."""
+    values = vars(s) | {
+        "part_words": _part_words(s.part),
+        "submerged_share": share(s.submerged, s.points),
+        "has_band": s.settings["band"] > 0.0,
+        "stale_fate": "class 1" if s.settings["reset"] else "kept; --reset makes them class 1",
+    }
+    rows = [*filled(_LABELLED, values), *_labelling_rows(s.labelling), ("Water", s.water)]
+    return aligned(_head("Labelled", s), rows)
 
 
-def cleaning_text(summary: CleanSummary) -> str:
-    """Return what a person wants to know of a cleaning."""
-    s = summary
-    fate = "dropped" if s.dropped else "class 7, withheld"
-    lines = [
-        *_head(s),
-        f"set aside    {s.set_aside:,} withheld or noise already",
-        f"noise        {s.noise:,} ({share(s.noise, s.points)} of the points; {fate})",
-    ]
-    for reason, count in s.reasons.items():
-        if count:
-            lines.append(f"  {reason.replace('_', ' '):<13}{count:,}")
-    lines += [f"not run      {test}" for test in s.not_run]
-    if s.submerged:
-        lines.append(f"bed          {s.submerged:,} submerged points tested against it")
-    if s.neighbour_distance_m:
-        near = s.neighbour_distance_m
-        lines.append(
-            f"neighbours   mean distance {near['mean']:.3f} m, sd {near['sd']:.3f} m,"
-            f" limit {near['limit']:.3f} m"
-        )
-    return "\n".join(lines)
+def cleaning_text(s: CleanSummary) -> str:
+    """Return the summary of a cleaning."""
+    values = vars(s) | {
+        "noise_share": share(s.noise, s.points),
+        "fate": "dropped" if s.dropped else "class 7, withheld",
+        "near": s.neighbour_distance_m,
+    }
+    rows = filled(_CLEANED, values)
+    reasons = {name.replace("_", " "): n for name, n in s.reasons.items() if n}
+    rows[1:1] = [("", f"{count:,} {reason}") for reason, count in reasons.items()]
+    return aligned(_head("Cleaned", s), [*rows, *(("Not run", test) for test in s.not_run)])
 
 
-def dsm_text(summary: DsmSummary) -> str:
-    """Return what a person wants to know of a DSM."""
-    s = summary
-    left, bottom, right, top = s.bounds_m
+def dsm_text(s: DsmSummary) -> str:
+    """Return the summary of a DSM."""
     total = s.width * s.height
-    wanted = {"all": "land and bed", "bed": "bed, class 40"}[s.settings["surface"]]
     low, mean, high = (s.values.get(name, np.nan) for name in ("min", "mean", "max"))
-    chosen = ", chosen for 2 to 4 points each" if s.resolution_is == "chosen" else ""
-    lines = [
-        f"{s.input} -> {s.output}",
-        f"points       {s.points_used:,} of {s.points:,}{_of_whole(s.part)} ({wanted}) in"
-        f" {s.seconds:.1f} s",
-        f"raster       {s.width:,} x {s.height:,} cells of {s.settings['resolution']:g} m{chosen},"
-        f" {s.settings['method']}",
-        f"{s.what:<12} {low:.4g} to {high:.4g}, mean {mean:.4g}"
-        f"{' m at 95 %, formal' if s.what == 'uncertainty' else ''}",
-        f"bounds       x {left:.10g} to {right:.10g}, y {bottom:.10g} to {top:.10g} m",
-        f"CRS          {s.crs or 'the cloud states none'}; heights:"
-        f" {s.heights or 'the cloud states no vertical datum'}",
-        f"with points  {s.cells:,} cells ({share(s.cells, total)}),"
-        f" {s.points_per_cell:.1f} points each",
-    ]
-    if s.hole_m is not None:
-        lines.append(
-            f"bridged      {s.filled:,} cells ({share(s.filled, total)}),"
-            f" across holes up to {s.hole_m:.3g} m"
-        )
-    lines.append(f"empty        {s.empty:,} cells ({share(s.empty, total)})")
-    also = {"hillshade": s.hillshade, "counts": s.counts}
-    lines += [f"{name:<12} {path}" for name, path in also.items() if path is not None]
-    return "\n".join(lines)
+    values = vars(s) | {
+        "part_words": _part_words(s.part),
+        "low": low, "mean": mean, "high": high,
+        "chosen": ", chosen for 2 to 4 points each" if s.resolution_is == "chosen" else "",
+        "unit": " m at 95 % (predicted)" if s.what == "uncertainty" else "",
+        "crs_name": s.crs or "the cloud states none",
+        "heights_name": s.heights or "the cloud states no vertical datum",
+        "cells_share": share(s.cells, total),
+        "filled_share": share(s.filled, total),
+        "empty_share": share(s.empty, total),
+    }  # fmt: skip
+    surface = {"all": "land and bed", "bed": "bed, class 40"}[s.settings["surface"]]
+    points = f"{s.points_used:,} of {s.points:,} ({surface})"
+    return aligned(_head("Gridded", s, points), filled(_GRIDDED, values))
 
 
-def calm_text(summary: CalmSummary) -> str:
-    """Return what a person wants to know of an image through calm water."""
-    s = summary
-    lines = [
-        f"{s.input} -> {s.output}",
-        f"frames       {s.frames} of {s.columns:,} x {s.rows:,} pixels in {s.seconds:.1f} s",
-        f"registered   by {s.corners:,} corners, of which half scatter by less than"
-        f" {s.scatter_px:.2f} px; the camera moved by up to {s.moved_px:.1f} px"
-        if s.corners
-        else "registered   not at all: the camera stood still",
-        f"spread       median {s.spread:.1f} grey values: {s.spread_file}",
-    ]
+def calm_text(s: CalmSummary) -> str:
+    """Return the summary of an image through calm water."""
+    values = vars(s) | {"is_still": not s.corners, "found": s.water}
     if s.water is not None:
-        w = s.water
-        lines.append(
-            f"water        {w.waves} waves, slopes of {w.slope_deg:.2f} deg rms, heights of"
-            f" {100 * w.height_m:.1f} cm rms with a standard error of {100 * w.sigma_m:.1f} cm,"
-            f" {100 * w.explained:.0f} % of the slopes explained: {w.folder}"
-        )
-    return "\n".join(lines)
+        values |= {"percent": 100 * s.water.explained, "height_cm": 100 * s.water.height_m,
+                   "sigma_cm": 100 * s.water.sigma_m}  # fmt: skip
+    head = (
+        f"Combined {s.input} -> {s.output}      {s.frames} frames of {s.columns:,} x {s.rows:,}"
+        f" pixels in {s.seconds:.1f} s"
+    )
+    return aligned(head, filled(_CALMED, values))
+
+
+def photos_text(s: PhotosSummary) -> str:
+    """Return the summary of photographs without water."""
+    head = f"Mapped {s.images - s.done_before:,} images in {s.seconds:.1f} s"
+    if s.seconds and s.images > s.done_before:
+        head += f" ({s.megapixels / s.seconds:.1f} Mpx/s)"
+    return aligned(head, filled(_MAPPED, vars(s) | {"black_percent": 100.0 * s.black_share}))
+
+
+def rounds_text(s: RebuildSummary) -> str:
+    """Return why the rounds ended, and where their clouds and the comparison are."""
+    values = vars(s) | {
+        "verdict": "settled" if s.settled else "not settled",
+        "less": "less" if s.settled else "more",
+        "cloud": s.rounds[-1].cloud,
+        "not_compared": s.compared is None,
+    }
+    return aligned(f"Rebuilt in {len(s.rounds)} rounds", filled(_REBUILT, values))
+
+
+def ortho_text(s: OrthoSummary) -> str:
+    """Return the summary of an orthophoto."""
+    traced = "without refraction" if s.water is None else f"traced through water {s.water}"
+    values = vars(s) | {"covered": 100 * s.covered_share, "traced": traced}
+    return aligned(f"Orthophoto {s.output} in {s.seconds:.1f} s", filled(_ORTHO, values))

@@ -1,21 +1,31 @@
-"""The picture of clouds in space: one panel a cloud, drawn by open3d or, without it, by dots."""
+"""Clouds in space, in open3d's window or as a picture with one panel for each cloud."""
 
 from __future__ import annotations
 
+import os
+import sys
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from pcfix.errors import SettingError
 from pcfix.grid import colours
-from pcfix.io.viewer import CAMERA_COLOUR, FROM, WATER_COLOUR, Scene3d
-from pcfix.model import FloatArray
-from pcfix.report.page import MOST_POINTS, new_figure
+from pcfix.libraries import load_open3d
+from pcfix.model import FloatArray, IntArray
+from pcfix.report.page import new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+WATER_COLOUR = (0.29, 0.64, 0.78, 0.25)
+CAMERA_COLOUR = (0.04, 0.37, 0.54)
+AZIMUTH_DEG, ELEVATION_DEG = -119.0, 29.0
+"""The view is from the south-west, from above."""
+MOST_DOTS = 30_000
 GREY = 0.72
-"""Of points without a value: land, where depths are shown."""
+"""Of points without a value, such as land where depths are shown."""
+MOST_PERCENT = 98.0
 RAMPS = {
     "depth": (colours.DEPTH, "Depth below the water (m)"),
     "shift": (colours.HEIGHT, "Lowered by the correction (m)"),
@@ -23,11 +33,25 @@ RAMPS = {
     "uncertainty": (colours.UNCERTAINTY, "Uncertainty of Z at 95 % (m)"),
     "height": (colours.HEIGHT, "Height (m)"),
 }
-MOST_PERCENT = 98.0
+
+
+@dataclass(frozen=True, eq=False)
+class Scene3d:
+    """Named clouds with their colours, frusta of cameras, and the water, metres from an origin.
+
+    `lines` has the shape (m, 2, 3); `triangles` are rows of `water`.
+    """
+
+    names: list[str]
+    xyz: list[FloatArray]
+    rgb: list[FloatArray]
+    lines: FloatArray
+    water: FloatArray
+    triangles: IntArray
 
 
 class Scale(NamedTuple):
-    """The values at both ends of a ramp, and what they are."""
+    """A quantity and its values at both ends of the colour ramp."""
 
     what: str
     low: float
@@ -35,7 +59,7 @@ class Scale(NamedTuple):
 
     @classmethod
     def of(cls, what: str, values: FloatArray) -> Scale:
-        """Return the scale of values, NaN where there are none; few of them lie beyond it."""
+        """Return the scale of values, NaN where unknown; it leaves out 2 % at the ends."""
         known = values[np.isfinite(values)]
         if what == "error":
             most = max(float(np.percentile(np.abs(known), MOST_PERCENT)), 1e-3)
@@ -54,40 +78,63 @@ class Scale(NamedTuple):
         return np.asarray(rgb)
 
 
-def view_figure(scene: Scene3d, images: list[FloatArray], scale: Scale) -> Figure:
-    """Draw each cloud with its name, side by side, and the scale of the colours.
+def show(scene: Scene3d, title: str) -> None:
+    """Open open3d's viewer with a switch for each cloud, and return when it is closed."""
+    on_x = sys.platform.startswith("linux")
+    if on_x and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise SettingError(
+            "view.no_screen", "There is no screen to open a window on. Give --image FILE.png."
+        )
+    o3d = load_open3d()
+    points, record = o3d.utility.Vector3dVector, o3d.visualization.rendering.MaterialRecord
+    things = []
 
-    `images` are those of the clouds; without any, thinned clouds are drawn as dots.
-    """
+    def add(name: str, geometry: Any, shader: str, **look: Any) -> None:
+        material = record()
+        for key, value in {"shader": shader, **look}.items():
+            setattr(material, key, value)
+        things.append({"name": name, "geometry": geometry, "material": material})
+
+    for name, xyz, rgb in zip(scene.names, scene.xyz, scene.rgb, strict=True):
+        cloud = o3d.geometry.PointCloud(points(xyz))
+        cloud.colors = points(rgb)
+        add(name, cloud, "defaultUnlit", point_size=2.5)
+    if len(scene.lines):
+        ends = np.arange(2 * len(scene.lines)).reshape(-1, 2)
+        pairs = o3d.utility.Vector2iVector(ends)
+        lines = o3d.geometry.LineSet(points(scene.lines.reshape(-1, 3)), pairs)
+        lines.paint_uniform_color(CAMERA_COLOUR)
+        add("cameras", lines, "unlitLine", line_width=1.0)
+    if len(scene.triangles):
+        triangles = o3d.utility.Vector3iVector(scene.triangles)
+        mesh = o3d.geometry.TriangleMesh(points(scene.water), triangles)
+        mesh.compute_vertex_normals()  # without them, and with other shaders, open3d 0.20 crashes
+        add("water", mesh, "defaultLitTransparency", base_color=WATER_COLOUR)
+    o3d.visualization.draw(things, title=title, show_ui=True, bg_color=(1.0, 1.0, 1.0, 1.0))
+
+
+def view_figure(scene: Scene3d, scale: Scale) -> Figure:
+    """Draw each cloud as dots with its name, side by side, and the scale of the colours."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
     count = len(scene.names)
-    more: dict[str, Any] = {} if images else {"subplot_kw": {"projection": "3d"}}
-    figure, axes = new_figure(0.8 + 6.4 * count, 5.2, ncols=count, squeeze=False, **more)
-    for i, panel in enumerate(axes[0]):
-        panel.set_title(scene.names[i])
-        if images:
-            panel.imshow(images[i])
-            panel.set_axis_off()
-        else:
-            _draw_dots(panel, scene, i)
+    figure, axes = new_figure(
+        0.8 + 6.4 * count, 5.2, ncols=count, squeeze=False, subplot_kw={"projection": "3d"}
+    )
+    for panel, name, xyz, rgb in zip(axes[0], scene.names, scene.xyz, scene.rgb, strict=True):
+        step = max(1, len(xyz) // MOST_DOTS)
+        panel.set_title(name)
+        panel.scatter(*xyz[::step].T, c=rgb[::step], s=1, depthshade=False)
+        for line in scene.lines:
+            panel.plot(*line.T, color=CAMERA_COLOUR, linewidth=0.5)
+        if len(scene.triangles):
+            x, y, z = scene.water.T
+            panel.plot_trisurf(x, y, scene.triangles, z, color=WATER_COLOUR, linewidth=0)
+        panel.view_init(ELEVATION_DEG, AZIMUTH_DEG)
+        panel.set_aspect("equal")
+        panel.set(xlabel="East (m)", ylabel="North (m)", zlabel="Height (m)")
     ramp, label = RAMPS[scale.what]
     colour = ScalarMappable(Normalize(scale.low, scale.high), ramp)
     figure.colorbar(colour, ax=list(axes[0]), label=label, shrink=0.8, extend="both")
     return figure
-
-
-def _draw_dots(axes: Any, scene: Scene3d, i: int) -> None:
-    step = max(1, len(scene.xyz[i]) // MOST_POINTS)
-    xyz = scene.xyz[i][::step]
-    axes.scatter(*xyz.T, c=scene.rgb[i][::step], s=1, depthshade=False)
-    for line in scene.lines:
-        axes.plot(*line.T, color=CAMERA_COLOUR, linewidth=0.5)
-    if len(scene.triangles):
-        x, y, z = scene.water.T
-        axes.plot_trisurf(x, y, scene.triangles, z, color=WATER_COLOUR, linewidth=0)
-    elevation = float(np.degrees(np.arcsin(FROM[2])))
-    axes.view_init(elevation, float(np.degrees(np.arctan2(FROM[1], FROM[0]))))
-    axes.set_aspect("equal")
-    axes.set(xlabel="East (m)", ylabel="North (m)", zlabel="Height (m)")

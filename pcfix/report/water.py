@@ -1,4 +1,4 @@
-"""What ``pcfix water`` says of a water surface: in words, and as a picture of its evidence."""
+"""The report of ``pcfix water`` on a water surface: its summary, and a picture of its evidence."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.grid.colours import DIFFERENCE
-from pcfix.model import BoolArray, FloatArray
+from pcfix.model import FloatArray
 from pcfix.report.page import AFTER, BEFORE, WATER, Picture, draw_cloud, label_plan, new_figure
-from pcfix.report.text import shoreline_lines
+from pcfix.report.text import aligned, shoreline_rows
 from pcfix.water.auto import WaterProposal
 from pcfix.water.fit import WaterFit
 from pcfix.water.river import RiverFit
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 MOST_LISTED = 10
 WITNESSES = ("brightness", "noise")
-"""Cues that do not fix the level are drawn thinly."""
+"""Evidence that does not fix the level; it is drawn with thin lines."""
 SHOWN_CELLS = 40_000
 LEAST_REACH_M, REACH_SIGMAS = 1.5, 8.0
 LINES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)))
@@ -32,19 +32,16 @@ COLOURS = (BEFORE, AFTER, "#5b3a8c", "#2f7d4f", "#222222", "#a07c00")
 
 @dataclass(frozen=True, eq=False)
 class WaterReport:
-    """What ``pcfix water`` says.
+    """The report of ``pcfix water``.
 
     Attributes
     ----------
-    spec : str
-    found : FoundSurface
-    cloud : str or None
     below, unknown : float or None
         Share of the cloud's points below the surface, and of those without a surface above them.
     sample_xyz : array, shape (m, 3)
         Points of the cloud, evenly spread, for a picture.
     shoreline : dict or None
-        What was written of it.
+        File, lines and length of the shoreline that was written.
     """
 
     spec: str
@@ -61,104 +58,92 @@ class WaterReport:
             "water": self.spec,
             "surface": str(self.found.surface),
             "fit": self.found.as_dict(),
-            "points": self._points(),
+            "points": _residuals(self.found),
             "cloud": self.cloud,
             "share_below": self.below,
             "share_unknown": self.unknown,
             "shoreline": self.shoreline,
-            "notes": list(self.found.notes),
+            "notes": list(map(str, self.found.notes)),
         }
 
-    def _points(self) -> list[dict[str, Any]] | None:
-        """Return each fitted point with its residual, None where it has no height."""
-        found = self.found
-        if found.points is None or not isinstance(found.evidence, WaterFit | RiverFit):
-            return None
-        fit = found.evidence
-        rows = zip(found.points, fit.residual_m, fit.accepted, strict=True)
-        return [
-            {
-                "xyz": [float(v) if np.isfinite(v) else None for v in xyz],
-                "residual_m": float(residual) if np.isfinite(residual) else None,
-                "accepted": bool(accepted),
-            }
-            for xyz, residual, accepted in rows
-        ]
+
+def _residuals(found: FoundSurface) -> list[dict[str, Any]] | None:
+    """Return each fitted point with its residual, None where it has no height."""
+    fit = found.evidence
+    if found.points is None or not isinstance(fit, WaterFit | RiverFit):
+        return None
+    rows = zip(found.points, fit.residual_m, fit.accepted, strict=True)
+    return [
+        {
+            "xyz": [float(v) if np.isfinite(v) else None for v in xyz],
+            "residual_m": float(residual) if np.isfinite(residual) else None,
+            "accepted": bool(accepted),
+        }
+        for xyz, residual, accepted in rows
+    ]
 
 
 def water_text(report: WaterReport) -> str:
-    """Return what a person wants to know of a water surface."""
-    found = report.found
-    lines = [f"{report.spec}: {found.surface}"]
+    """Return the summary of a water surface."""
+    found, rows = report.found, list[tuple[str, str]]()
     match found.evidence:
         case WaterFit() as fit:
-            lines += _fit(fit, found.points)
-        case RiverFit() as river:
-            lines += _river(river, found.points)
-        case WaterProposal() as proposal:
-            lines += [
-                f"level        {proposal.level_m:.3f} m, standard error"
-                f" {proposal.sigma_level_m:.3f} m, confidence {proposal.confidence:.2f}",
-                *(f"evidence     {reason}" for reason in proposal.reasons),
+            x, y = fit.centre_xy
+            level = f"{fit.level_m:.3f} m at {x:.1f}, {y:.1f}"
+            rows = [
+                _model_row(fit.model, fit),
+                ("Level", f"{level}; standard error {fit.sigma_level_m:.3f} m"),
             ]
+            if fit.tilt.any():
+                rows.append(("Tilt", f"{fit.tilt_percent:.3f} %, standard error"
+                             f" {fit.sigma_tilt_percent:.3f} %, falls towards"
+                             f" {fit.downhill_deg:.0f} deg"))  # fmt: skip
+            rows += _residual_rows(fit, found.points)
+        case RiverFit() as river:
+            sigma = river.profile.sigma_height_m.mean()
+            rows = [
+                _model_row("river", river),
+                ("Length", f"{river.length_m:.1f} m, falls {river.drop_m:.3f} m; standard error of"
+                 f" the level {sigma:.3f} m"),
+                *_residual_rows(river, found.points),
+            ]  # fmt: skip
+        case WaterProposal() as proposal:
+            rows = [
+                ("Level", f"{proposal.level_m:.3f} m, standard error {proposal.sigma_level_m:.3f}"
+                 f" m, confidence {proposal.confidence:.2f}"),
+                *(("Evidence", reason) for reason in proposal.reasons),
+            ]  # fmt: skip
     if report.below is not None and report.unknown is not None:
-        lines.append(
-            f"cloud        {100.0 * report.below:.1f} % of {report.cloud} lie below it,"
-            f" {100.0 * report.unknown:.1f} % have no surface above them"
-        )
-    lines += shoreline_lines(report.shoreline)
-    return "\n".join([*lines, *(f"note         {note}" for note in found.notes)])
+        rows.append(("Cloud", f"{100.0 * report.below:.1f} % of {report.cloud} are below the"
+                     f" surface, {100.0 * report.unknown:.1f} % have none above them"))  # fmt: skip
+    rows += shoreline_rows(report.shoreline)
+    return aligned(f"{report.spec}: {found.surface}", rows, found.notes)
 
 
-def _fit(fit: WaterFit, points: FloatArray | None) -> list[str]:
-    x, y = fit.centre_xy
-    lines = [
-        f"model        {fit.model}, of {int(fit.accepted.sum())} of {len(fit.accepted)} points;"
-        f" scatter {fit.sigma_m:.3f} m",
-        f"level        {fit.level_m:.3f} m at {x:.1f}, {y:.1f}; standard error"
-        f" {fit.sigma_level_m:.3f} m",
-    ]
-    if fit.tilt.any():
-        lines.append(
-            f"tilt         {fit.tilt_percent:.3f} %, standard error {fit.sigma_tilt_percent:.3f} %,"
-            f" falls towards {fit.downhill_deg:.0f} degrees"
-        )
-    return [*lines, *_rejected(fit.residual_m, fit.accepted, points)]
+def _model_row(name: str, fit: WaterFit | RiverFit) -> tuple[str, str]:
+    used = f"{int(fit.accepted.sum())} of {len(fit.accepted)} points"
+    return "Model", f"{name}, {used}; scatter {fit.sigma_m:.3f} m"
 
 
-def _river(river: RiverFit, points: FloatArray | None) -> list[str]:
-    known = int(river.accepted.sum())
-    return [
-        f"model        river, of {known} of {len(river.accepted)} points; scatter"
-        f" {river.sigma_m:.3f} m",
-        f"length       {river.length_m:.1f} m, falls {river.drop_m:.3f} m; standard error of the"
-        f" level {river.profile.sigma_height_m.mean():.3f} m",
-        *_rejected(river.residual_m, river.accepted, points),
-    ]
-
-
-def _rejected(residual_m: FloatArray, accepted: BoolArray, points: FloatArray | None) -> list[str]:
-    """Sum up the residuals, and list the points that were not believed, worst first."""
-    good = np.abs(residual_m[accepted])
-    lines = [
-        f"residuals    of the accepted points: rms {np.sqrt(np.mean(good**2)):.3f} m, median"
-        f" {np.median(good):.3f} m, largest {good.max():.3f} m"
-    ]
-    rows = np.flatnonzero(~accepted & np.isfinite(residual_m))
-    rows = rows[np.argsort(-np.abs(residual_m[rows]), kind="stable")]
-    if points is None or len(rows) == 0:
-        return lines
-    lines += [
-        f"rejected     {points[i, 0]:.2f}, {points[i, 1]:.2f}, {points[i, 2]:.2f}:"
-        f" {residual_m[i]:+.3f} m"
-        for i in rows[:MOST_LISTED]
-    ]
-    more = len(rows) - MOST_LISTED
-    return [*lines, f"             and {more} more"] if more > 0 else lines
+def _residual_rows(fit: WaterFit | RiverFit, points: FloatArray | None) -> list[tuple[str, str]]:
+    """Return the size of the residuals, and the rejected points, the largest residual first."""
+    residual = fit.residual_m
+    good = np.abs(residual[fit.accepted])
+    rows = [("Residuals", f"of the accepted points: rms {np.sqrt(np.mean(good**2)):.3f} m, median"
+             f" {np.median(good):.3f} m, largest {good.max():.3f} m")]  # fmt: skip
+    if points is None:
+        return rows
+    rejected = np.flatnonzero(~fit.accepted & np.isfinite(residual))
+    rejected = rejected[np.argsort(-np.abs(residual[rejected]), kind="stable")]
+    for i in rejected[:MOST_LISTED]:
+        x, y, z = points[i]
+        rows.append(("Rejected", f"{x:.2f}, {y:.2f}, {z:.2f}: {residual[i]:+.3f} m"))
+    more = len(rejected) - MOST_LISTED
+    return [*rows, ("", f"and {more} more")] if more > 0 else rows
 
 
 def water_figure(report: WaterReport) -> Figure:
-    """Draw the shoreline points in plan and their residuals, or what was found in the cloud."""
+    """Draw the shoreline points in plan and their residuals, or the evidence found in the cloud."""
     found = report.found
     if isinstance(found.evidence, WaterProposal):
         return shoreline_figure(found.evidence)
@@ -193,7 +178,7 @@ def _points(plan: Axes, side: Axes, points: FloatArray, fit: WaterFit | RiverFit
 
 
 def _station(points: FloatArray, fit: WaterFit | RiverFit) -> FloatArray:
-    """Return how far down the river or the tilt, or along their longest extent, points lie."""
+    """Return the distance of points along the river, the tilt, or their longest extent."""
     if isinstance(fit, RiverFit):
         return np.asarray(fit.axis.locate(points[:, :2])[0])
     centred = points[:, :2] - points[:, :2].mean(axis=0)
@@ -206,8 +191,8 @@ def _station(points: FloatArray, fit: WaterFit | RiverFit) -> FloatArray:
 
 
 def found_picture(found: FoundSurface) -> Picture:
-    """Return what a level that was found in the cloud rests on, for a page."""
-    alt = "How the water was found: the shoreline in plan, the heights, and what speaks for which."
+    """Return the evidence for a level that was found in the cloud, for the page."""
+    alt = "How the water was found: shoreline in plan, heights, and the evidence for each height."
     reasons = found.evidence.reasons if isinstance(found.evidence, WaterProposal) else ()
     alt += "".join(f" {reason[:1].upper()}{reason[1:].rstrip('.')}." for reason in reasons)
     figure = water_figure(WaterReport("auto", found, None, None, None, np.zeros((0, 3))))
@@ -222,10 +207,15 @@ def shoreline_figure(found: WaterProposal) -> Figure:
     grid = axes[0, 0].get_gridspec()
     for unused in axes[:, 0]:
         unused.remove()
-    plan = figure.add_subplot(grid[:, 0])
-    _plan(plan, figure, found)
-    _histogram(axes[0, 1], found)
-    _evidence(axes[1, 1], found)
+    _plan(figure.add_subplot(grid[:, 0]), figure, found)
+    # heights to show: the ground, but no more than is needed to see the level
+    heights = _above(found, found.ground)
+    low, high = np.percentile(heights, [1.0, 99.0])
+    most = 4.0 * max(LEAST_REACH_M, REACH_SIGMAS * found.sigma_level_m)
+    low = found.level_m + min(max(float(low), -most), -0.2)
+    high = found.level_m + max(min(float(high), most), 0.2)
+    _histogram(axes[0, 1], found, heights, (low, high))
+    _evidence(axes[1, 1], found, (low, high))
     tilt = 100.0 * float(np.hypot(*found.tilt))
     kind = f", tilt {tilt:.2f} %" if tilt > 0.0 else ""
     figure.suptitle(
@@ -261,22 +251,13 @@ def _plan(axes: Axes, figure: Figure, found: WaterProposal) -> None:
     axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), frameon=False, borderaxespad=0.0)
 
 
-def _histogram(axes: Axes, found: WaterProposal) -> None:
-    low, high = _limits(found)
-    heights = _above(found, found.ground) + found.level_m
-    axes.hist(heights, bins=90, range=(low, high), color="0.65")
+def _histogram(
+    axes: Axes, found: WaterProposal, above_m: FloatArray, limits: tuple[float, float]
+) -> None:
+    axes.hist(above_m + found.level_m, bins=90, range=limits, color="0.65")
     _level(axes, found)
-    axes.set(xlim=(low, high), xlabel="Apparent height (m)", ylabel="Cells")
+    axes.set(xlim=limits, xlabel="Apparent height (m)", ylabel="Cells")
     axes.legend(loc="best")
-
-
-def _limits(found: WaterProposal) -> tuple[float, float]:
-    """Return the heights to show: the ground, but no more than is needed to see the level."""
-    heights = _above(found, found.ground)
-    low, high = np.percentile(heights, [1.0, 99.0])
-    reach = max(LEAST_REACH_M, REACH_SIGMAS * found.sigma_level_m)
-    lowest, highest = max(float(low), -4.0 * reach), min(float(high), 4.0 * reach)
-    return found.level_m + min(lowest, -0.2), found.level_m + max(highest, 0.2)
 
 
 def _level(axes: Axes, found: WaterProposal) -> None:
@@ -285,8 +266,8 @@ def _level(axes: Axes, found: WaterProposal) -> None:
     axes.axvspan(found.level_m - reach, found.level_m + reach, color=WATER, alpha=0.3, linewidth=0)
 
 
-def _evidence(axes: Axes, found: WaterProposal) -> None:
-    low, high = _limits(found)
+def _evidence(axes: Axes, found: WaterProposal, limits: tuple[float, float]) -> None:
+    low, high = limits
     shown = (found.curve_height_m >= low) & (found.curve_height_m <= high)
     height = found.curve_height_m[shown]
     for (name, gain), colour, line in zip(found.curves.items(), COLOURS, LINES, strict=False):
@@ -294,10 +275,8 @@ def _evidence(axes: Axes, found: WaterProposal) -> None:
         values = np.maximum(gain[shown], 0.0)
         axes.plot(height, values, color=colour, linestyle=line, linewidth=width, label=name)
     _level(axes, found)
-    axes.set_xlim(low, high)
-    axes.set_ylim(bottom=0.0)
-    axes.set_xlabel("Height of the water, if there (m)")
-    axes.set_ylabel("Evidence (log likelihood ratio)")
+    axes.set(xlim=limits, xlabel="Height of the water, if there (m)")
+    axes.set(ylim=(0.0, None), ylabel="Evidence (log likelihood ratio)")
     axes.legend(
         loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=3, fontsize="small", frameon=False
     )

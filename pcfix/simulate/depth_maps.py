@@ -1,33 +1,28 @@
 """A cloud of fused depth maps, as OpenMVS makes it.
 
-Every image is a reference. Along a ray of its own it has the depth at which the two best of its
-partners agree best: each shows what the reference sees there at a place of its image, with noise,
-and its cost of a depth is the squared distance from that place, pixels^2. A depth is scored by the
-mean of its two lowest costs, so that the best depth is that of the pair of partners whose least
-squares are smallest. Each depth is then averaged with those of up to eight neighbouring maps that
-see the same place, where they agree within 1.2 %.
+Every image is a reference. Along its ray the depth is where the two best of its partners agree
+best: each partner shows at a place, with noise, what the reference sees, and its cost of a depth is
+the squared distance from that place, pixels^2. A depth is scored by the mean of its two lowest
+costs, so the best depth is that of the pair of partners with the least sum of squares. Each depth
+is then averaged with those of up to eight neighbouring maps that see the same place within 1.2 %.
 
-Then depth maps are fused. Images are taken in the order of how many others they have tie points in
-common with. An image whose depth is not used up is a seed: with it are fused those of its up to
-twelve neighbours that agree within 1 % and are not used up, and if there are three they are used
-up, with the neighbours' depths that lie behind the seed. So a place can make several points, of
-different images; one of them, picked by chance, is returned: the mean of points on each image's
-own ray, with the weights 1 / depth^2.
+Fusion takes images in the order of how many others they share tie points with. An unused depth is a
+seed: it is fused with those of up to twelve neighbours that agree within 1 % and are unused. If
+there are three, they are used up, with the neighbours' depths behind the seed. So a place can make
+several points; one of them, by chance, is returned: the mean of points on each image's own ray,
+with the weights 1 / depth^2.
 
-What a reference sees is on the bed, which near a point is taken as the tangent plane of the true
-surface: refraction lets the rays of different images through one apparent place meet different
-places of the bed. The true point is the mean of the places that all depths in the mean belong to,
-with the shares that they have, so it lies on the tangent plane.
+The reference sees the bed, here the tangent plane of the true surface; the rays of different images
+through one apparent place meet different places of it. The true point is the mean of these places,
+with the weights of their depths in the mean.
 
-Costs have a noise of their own, since a patch of texture does not match quite as well as its
-distance says; so of two pairs with nearly the same squares either may be taken. It is one of
-`COST_NOISE` times the variance of the image noise: 0.1 pixels^2 of a pair at half a pixel.
+A patch of texture matches a little worse than its distance says, so costs have noise of their own:
+`COST_NOISE` times the variance of the image noise, 0.1 pixels^2 of a pair at half a pixel.
 
-Departures from the program: costs are squares of distances, not correlations of patches, which are
-squares to first order; rays are not rounded to pixels; all confidences are alike, as in the
-program they nearly are in the end; the map that a neighbour has near a place is a plane, parallel
-to the bed; and the local water plane of each image (see `pcfix.simulate.tracing`) is that at the
-point for which the picture was begun.
+Differences from OpenMVS: costs are squares of distances, not correlations of patches (the same to
+first order); rays are not rounded to pixels; all confidences are alike; a neighbour's map near a
+place is a plane parallel to the bed; and the local water plane of each image (see
+`pcfix.simulate.tracing`) is that at the first estimate of the point.
 """
 
 from __future__ import annotations
@@ -56,10 +51,9 @@ _CONVERGED_M = 1e-9
 class Matching(NamedTuple):
     """What the depths of all m references, the rows of `sight`, are found with.
 
-    `water` has an anchor and a normal for each row of `sight`; `normals` has that of the bed for
-    each point. Partners and neighbours are rows of `sight` too, -1 for none, shape (m, c), (m, 8)
-    and (m, 12). Partner j of row i shows a place with the error ``noise_px[i, j]`` and counts with
-    ``cost_px2[i, j]`` more.
+    `water` has an anchor and a normal for each row of `sight`, `normals` the bed's for each point.
+    Partners and neighbours are rows of `sight`, -1 for none, shape (m, c), (m, 8) and (m, 12).
+    Partner j of row i has the image noise ``noise_px[i, j]`` and the extra cost ``cost_px2[i, j]``.
     """
 
     sight: Sight
@@ -74,9 +68,9 @@ class Matching(NamedTuple):
 
 
 class Sightings(NamedTuple):
-    """Of which rays other images show a place, and where: e measured ideal pixels.
+    """Places of rays in other images: e measured ideal pixels.
 
-    `owner` is the ray, shape (e,). In the frame of the other camera the ray is
+    `owner` is the row of the ray, shape (e,). In the frame of the other camera the ray is
     ``start + depth * way``, both of shape (3, e).
     """
 
@@ -93,10 +87,10 @@ class Sightings(NamedTuple):
 
 
 class Maps(NamedTuple):
-    """Of m references: their rays, the depth along each before and after averaging, and the bed.
+    """Rays of m references, their depths before and after averaging, and the bed.
 
-    Depths are along the optical axis, NaN where there is none; rays have the component 1 there.
-    `seen` is the place of the bed, `shown` the mean of those of all depths in the averaged one.
+    Depths are along the optical axis, NaN for none; rays have the component 1 there. `seen` is the
+    place of the bed, `shown` the mean over all depths in the averaged one.
     """
 
     origin: FloatArray
@@ -114,11 +108,10 @@ class Maps(NamedTuple):
 def fuse_depth_maps(
     sight: Sight, normals: FloatArray, partners: Partners, rng: np.random.Generator
 ) -> Part:
-    """Return a fused point of each place of the bed.
+    """Return a fused point for each place of the bed.
 
-    A place of which fewer than three depth maps agree stays where it is and has no cameras.
-    `normals`, shape (n, 3), are unit normals of the true surface; `rng` makes the noise, and says
-    which point of a place is taken.
+    A place with fewer than three matching depth maps is not moved and has no cameras. `normals`,
+    shape (n, 3), are unit normals of the true surface; `rng` makes noise and selects points.
     """
     matching = _matching(sight, normals, partners, rng)
     luck = rng.uniform(0.0, 1.0, len(sight.point))

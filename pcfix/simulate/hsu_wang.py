@@ -1,30 +1,26 @@
 """The experiment of Hsu & Wang, simulated: a bowl in a box of water under a hand-held camera.
 
 Their section 2: a box of 20 x 30 x 40 cm, in it a bowl of sand 15 cm wide and 3 cm high, a Nikon
-D200 with a lens of 60 mm (3872 x 2592 pixels of 6.1 um, points measured to 0.2 px), 24 images taken
-almost vertically, a surface model every 0.5 mm, 16 depths measured with a probe. What they do not
-give is chosen: the camera 1 m above the water, six by four images, tilts of a degree, the rim of
-the bowl 1 mm under water, and the probe good for 0.1 mm.
+D200 with a lens of 60 mm (3872 x 2592 pixels of 6.1 um, points measured to 0.2 px), 24 nearly nadir
+images, a surface model every 0.5 mm, 16 depths measured with a probe. Not given, and chosen here:
+the camera 1 m above the water, six by four images, tilts of a degree, the rim of the bowl 1 mm
+under water, and a probe good for 0.1 mm.
 
 =========== ===================================================================================
-uncorrected the cloud as it came
+uncorrected the apparent cloud
 I           `pcfix.refract.literature.butler`, their eq 1: the mean over a point's images
 II          `pcfix.refract.literature.murase`, their eqs 2 to 4: the X-parallax of its stereo pairs
 III         D = a + b d, fitted by least squares to the probe's depths
-pcfix       `pcfix.correct_points` with the cameras that made each point
+pcfix       `pcfix.correct_points` with the cameras of each point
 =========== ===================================================================================
 
-The error is that of the surface model (eq 5): the height of each point against the bed above or
-below its place in plan.
+The error is that of the surface model (eq 5): the height of each point minus that of the bed at its
+place in plan.
 
-The table that they print (`PRINTED_RMSE_MM`) cannot come from refraction, and nothing here is set
-to reach it. A bed that looks d deep is d (n - 1), a third of d, too high where rays are steep:
-that grows with the depth, from 3 mm at 10-15 mm to 7 mm at 25-30 mm, but the printed error of the
-uncorrected model falls from 8.3 to 5.9 mm. Their line, h = 0.9895 h_A - 8.3428 mm with heights from
-an origin 190 mm off and an r2 of 0.79, says the same: next to no scale, which refraction is, and a
-shift of 6 to 8 mm, which refraction is not. A shift between the two surface models, or another
-water level, would explain both, and would make methods I and II miss by what is left of it. So
-would noise of millimetres, where 0.2 px in 24 images comes to 0.08 mm.
+Their printed table (8.3 mm uncorrected at 10-15 mm of depth, 5.9 mm at 25-30 mm) cannot come from
+refraction alone: a bed of apparent depth d is d (n - 1), a third of d, too high, which grows with
+depth, from 3 to 7 mm. A shift between the two surface models or another water level would explain
+it.
 """
 
 from __future__ import annotations
@@ -52,28 +48,11 @@ PROBES, PROBE_SD_M = 16, 1e-4
 METHODS = {"uncorrected": "", "I": "butler", "II": "murase", "III": "", "pcfix": "auto"}
 """The columns of the table, and by which method of pcfix."""
 EDGES_M = np.arange(0.010, 0.031, 0.005)
-PRINTED_RMSE_MM = {
-    "uncorrected": (8.32, 8.1221, 7.2805, 5.8844, 8.145),
-    "I": (7.5109, 5.2108, 3.0802, 3.2645, 6.9539),
-    "II": (6.1878, 4.2094, 2.3091, 2.569, 5.7084),
-    "III": (2.0803, 1.9761, 1.1521, 1.3702, 2.0063),
-}
-"""Their Fig 11: 10-15, 15-20, 20-25, 25-30 mm, and overall."""
 
 
 @dataclass(frozen=True, eq=False)
 class Bowl:
-    """What `simulate_bowl` made; metres.
-
-    Attributes
-    ----------
-    apparent_xyz, true_xyz : array, shape (n, 3)
-        The points as SfM software would place them, and the truth, row by row; all submerged.
-    cameras : Cameras
-    views : Views
-        The cameras that made each point.
-    refractive_index : float
-    """
+    """The bowl: apparent and true points row by row, all submerged, with the cameras of each."""
 
     apparent_xyz: FloatArray
     true_xyz: FloatArray
@@ -92,18 +71,19 @@ def simulate_bowl(
     """Make the bowl and the cloud of its surface.
 
     Every point is traced through the water into every image that shows it, gets noise there, and
-    is triangulated with straight rays from all of them.
-
-    Raises
-    ------
-    SettingError
-        If an argument is outside its rule.
+    is triangulated with straight rays.
     """
     ScienceOptions(index=refractive_index)
     if not 0.0 < spacing_m < BOWL_WIDTH_M / 4.0:
-        raise SettingError(f"spacing {spacing_m:g} m is not between 0 and a quarter of the bowl.")
+        raise SettingError(
+            "option.range",
+            f"Spacing {spacing_m:g} m is not between 0 and a quarter of the bowl.",
+            value=spacing_m,
+        )
     if image_noise_px < 0.0:
-        raise SettingError(f"image noise {image_noise_px:g} px is negative.")
+        raise SettingError(
+            "option.range", f"Image noise {image_noise_px:g} px is negative.", value=image_noise_px
+        )
     rng = np.random.default_rng(seed)
     side = np.arange(-BOWL_WIDTH_M / 2.0, BOWL_WIDTH_M / 2.0, spacing_m) + spacing_m / 2.0
     plan = np.array([axis.ravel() for axis in np.meshgrid(side, side)]).T
@@ -137,16 +117,10 @@ def _cameras(rng: np.random.Generator) -> Cameras:
 
 @dataclass(frozen=True, eq=False)
 class DepthBins:
-    """The errors of the methods, bin by bin of true depth.
+    """The errors of the methods by bins of true depth (`EDGES_M`); the last row is for all points.
 
-    Attributes
-    ----------
-    points : array, shape (b + 1,)
-        Points of each bin of `EDGES_M`, and of the whole bowl.
-    rmse_m, mean_m : array, shape (b + 1, len(METHODS))
-        Of the heights; the last row is for all points.
-    offset_m, slope, r2 : float
-        The line of method III, and its coefficient of determination.
+    RMSE and mean have a column for each of `METHODS`; `offset_m`, `slope` and `r2` are the line of
+    method III.
     """
 
     points: IntArray
@@ -160,13 +134,7 @@ class DepthBins:
 def depth_bins(bowl: Bowl, corrected: dict[str, FloatArray], seed: int = 1) -> DepthBins:
     """Return the errors of every method by depth.
 
-    Parameters
-    ----------
-    bowl : Bowl
-    corrected : dict of str to array, shape (n, 3)
-        The cloud as the methods of `METHODS` with a name of pcfix correct it.
-    seed : int
-        Of the probe's errors.
+    `corrected` has the clouds by the methods of pcfix in `METHODS`; `seed` is for the probe.
     """
     apparent, true_m = bowl.apparent_xyz, WATER_LEVEL_M - bowl.true_xyz[:, 2]
     offset, slope, r2 = probe_line(WATER_LEVEL_M - apparent[:, 2], true_m, seed)

@@ -1,7 +1,6 @@
 """The simulated lens, by numpy alone: Brown's distortion and its inverse.
 
-*Ideal* pixels are those of a pinhole with the lens's focal length and principal point; *image*
-pixels are those that the real lens makes. The formula is that of `pcfix.model.Lens`.
+*Ideal* pixels are those of a pinhole camera, *image* pixels those of the real lens.
 """
 
 from __future__ import annotations
@@ -20,11 +19,7 @@ _MARGIN = 1.02  # of the radius up to which a lens must not fold
 
 @dataclass(frozen=True, slots=True)
 class Optics:
-    """A lens, and how far from the axis its frame reaches.
-
-    lens : pixels, perspective, `radial` of k1, k2, k3 and `tangential` of p1, p2, or neither.
-    reach : tangent of the angle from the axis to the farthest corner of the frame.
-    """
+    """A lens, and the tangent of the angle from its axis to the farthest corner of the frame."""
 
     lens: Lens
     reach: float
@@ -65,12 +60,12 @@ def make_optics(
     sensor_px: tuple[int, int],
     distortion: tuple[float, ...],
 ) -> Optics:
-    """Return the optics of a camera, of the width and height of its sensor and k1, k2, k3, p1, p2.
+    """Return the optics of a camera; `distortion` is k1, k2, k3, p1, p2.
 
     Raises
     ------
     SettingError
-        If the distortion is so strong that the image folds inside the frame.
+        ``scene.distortion``, if the image folds inside the frame.
     """
     width, height = sensor_px
     focal = focal_mm / sensor_mm[0] * width
@@ -97,9 +92,12 @@ def _reach_of(lens: Lens) -> float:
         there = np.abs(_brown(ideal, lens)[0] - border).max() < 1e-9
         known = bool(there and (xx > 0.0).all() and (xx * yy - xy * xy > 0.0).all())
     if not known:
+        terms = (*lens.radial, *lens.tangential)
         raise SettingError(
-            f"the distortion {', '.join(f'{v:g}' for v in (*lens.radial, *lens.tangential))} folds"
-            " the image inside the frame; give smaller k1, k2, k3, p1, p2."
+            "scene.distortion",
+            f"The distortion {', '.join(f'{v:g}' for v in terms)} folds the image inside the frame."
+            " Give smaller values.",
+            distortion=terms,
         )
     return reach
 

@@ -1,38 +1,33 @@
-"""How far refraction puts a point wrong in a pair of vertical images, before any correction.
+"""The effect of refraction in a pair of vertical images, before any correction.
 
 Remakes Figures 4 to 6 of Skarlatos & Agrafiotis (2018), "A Novel Iterative Water Refraction
-Correction Algorithm for Use in Structure from Motion Photogrammetric Pipeline", JMSE 6(3) 77:
-the error of the apparent depth over the model of two vertical images. Nothing here is shared
-with the correction; that the two agree is for a test to say.
+Correction Algorithm for Use in Structure from Motion Photogrammetric Pipeline", JMSE 6(3) 77: the
+error of the apparent depth over the model of two vertical images. Nothing is shared with the
+correction; a test compares the two.
 
-What the paper gives to check against is one pair of numbers: with the SwingletCAM from 100 m, 80 %
-overlap and an apparent depth of 15 m, -8.23 m in the corners of the model and -5.15 m in its
-centre. The reading that gives both (-8.232 m and -5.147 m):
+The paper gives one pair of numbers: SwingletCAM from 100 m, 80 % overlap, apparent depth 15 m:
+-8.23 m in the corners of the model and -5.15 m in its centre. This reading gives both (-8.232,
+-5.147):
 
-- The flying height is above the water, where the footprint is that which is printed, 144 m x 108 m,
-  pixels of 0.036 m. The lens and the 1.55 um printed make it 144.19 m x 108.14 m, which gives both
-  numbers for no index; so the pixel is taken as 1.548 um, which rounds to that.
-- The base is the free part of the short side at the water: 21.6 m. The model is the overlap of the
-  two footprints there, and its apparent bed is level: x and y of a corner are 43.2 m and 72 m from
-  the centre, and z is -15 m there.
-- n = 1.3405. It is not printed but fitted to the two: they come out from 1.3404 to 1.3406. So that
-  they agree says that one n explains both, not that it was the authors'.
-- The true point is that of eqs 8 to 11: the least squares of eq 11 for two rays are the midpoint of
-  the shortest line between them.
-- The error is the apparent depth minus the true depth, so a minus says: too shallow.
+- The flying height is above the water, where the printed footprint is 144 m x 108 m with pixels of
+  0.036 m. The printed 1.55 um would give 144.19 m x 108.14 m, which fits both numbers for no index;
+  so the pixel is 1.548 um, which rounds to that.
+- The base is the free part of the short side at the water, 21.6 m. The model is the overlap of the
+  footprints there, and its apparent bed is level.
+- n = 1.3405, which is not printed but fitted; both numbers come out from 1.3404 to 1.3406.
+- The true point is that of eqs 8 to 11: for two rays, the midpoint of the shortest line between
+  them.
+- The error is the apparent minus the true depth; negative means too shallow.
 
-How fast the iteration of Shan (1994), "Relief reconstruction using two-media photogrammetry", finds
-the depth is reckoned as the same paper gives it (eqs 1 to 7): the true point A and its image do
-not fit the collinearity equations, but the point on the vertical through A does that lies 1/s as
-deep, where
+Shan's iteration (1994), "Relief reconstruction using two-media photogrammetry", follows eqs 1 to 7
+of the same paper: the collinearity equations hold for the point on the vertical through the true
+point that lies 1/s as deep, where
 
     s = tan a / tan b = sqrt(n^2 + (n^2 - 1) tan^2 a),    tan a = R / (Z_o - Z / s),
 
-a the angle in air, b that in water, R the distance in plan. Each image has its own s, so a pair
-gives the 4 equations of eq 3 for X, Y, depth and two s; with s known they are linear. The iteration
-starts with s = 1, the point that software makes that knows nothing of water, takes tan a from the
-point found, and solves again, until tan a no longer changes. (Where that departs from the print:
-`pcfix.refract.shan`.)
+with a the angle in air, b in water, R the distance in plan. Each image has its own s, so a pair
+gives the 4 equations of eq 3 for X, Y, depth and two s; with s known they are linear. It starts
+with s = 1 and repeats until tan a no longer changes. (`pcfix.refract.shan` notes a misprint.)
 """
 
 from __future__ import annotations
@@ -49,19 +44,23 @@ from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
 from pcfix.simulate.tracing import piercing_points
 
 NODES = 61
-"""Nodes of a model along its flight and across it; odd, so that the centre is one."""
+"""Nodes of a model along the flight and across; odd, so that the centre is one."""
 OVERLAP = 0.8
 APPARENT_DEPTHS_M = tuple(float(depth) for depth in range(16))
 PAPER_INDEX = 1.3405
 """Not printed: fitted to the two errors that are."""
+TOLERANCE, _MOST_ITERATIONS = 1e-9, 50
+"""Of tan a, between two of Shan's iterations, and their number."""
+
+
+def _check_positive(what: str, value: float) -> None:
+    if not (np.isfinite(value) and value > 0):
+        raise SettingError("option.range", f"{what} {value:g} is not above 0.", value=value)
 
 
 @dataclass(frozen=True)
 class AerialCamera:
-    """A frame camera that looks straight down, the short side of its frame along the flight.
-
-    Its columns are the pixels across the flight, its rows those along it.
-    """
+    """A nadir frame camera; its rows are the pixels along the flight, the short side."""
 
     name: str
     focal_mm: float
@@ -71,11 +70,8 @@ class AerialCamera:
 
     def __post_init__(self) -> None:
         """Check that the camera can take an image."""
-        names = "focal length", "number of columns", "number of rows", "pixel size"
-        values = self.focal_mm, self.columns, self.rows, self.pixel_um
-        for what, value in zip(names, values, strict=True):
-            if not (np.isfinite(value) and value > 0):
-                raise SettingError(f"{what} {value:g} of the camera is not above 0.")
+        for what in ("focal_mm", "columns", "rows", "pixel_um"):
+            _check_positive(f"The camera's {what}", getattr(self, what))
 
     def footprint_m(self, flying_height_m: float) -> tuple[float, float]:
         """Return the sides of an image on the water, along the flight and across it."""
@@ -97,10 +93,7 @@ OVERLAPS: dict[AerialCamera, tuple[float, ...]] = {SWINGLETCAM: (0.8,), ULTRACAM
 
 @dataclass(frozen=True)
 class StereoPair:
-    """Two vertical images of one strip, level with each other; x runs along the flight.
-
-    The origin lies on the water surface, midway between the two.
-    """
+    """Two nadir images of one strip; x is along the flight, 0 on the water between them."""
 
     camera: AerialCamera
     flying_height_m: float
@@ -108,11 +101,12 @@ class StereoPair:
 
     def __post_init__(self) -> None:
         """Check that the two images overlap."""
-        if not (np.isfinite(self.flying_height_m) and self.flying_height_m > 0.0):
-            raise SettingError(f"flying height {self.flying_height_m:g} m is not above 0.")
+        _check_positive("Flying height", self.flying_height_m)
         if not 0.0 < self.overlap < 1.0:
             raise SettingError(
-                f"overlap {self.overlap:g} is not between 0 and 1; give a share, as 0.8."
+                "option.range",
+                f"Overlap {self.overlap:g} is not between 0 and 1. Give a share, such as 0.8.",
+                value=self.overlap,
             )
 
     @property
@@ -137,9 +131,8 @@ class StereoPair:
 class Effect:
     """The effect of refraction over one model.
 
-    x_m, y_m : shape (nodes,), along the flight and across it, from the centre of the model.
-    error_m : shape (nodes, nodes), apparent depth minus true depth; a row has one y.
-    shift_m : shape (nodes, nodes), how far in plan the apparent point lies from the true one.
+    `x_m` and `y_m` are the nodes along the flight and across; `error_m`, apparent minus true depth,
+    and `shift_m`, the distance in plan, have a row for each y.
     """
 
     pair: StereoPair
@@ -173,51 +166,41 @@ def effect(
     refractive_index: float = DEFAULT_REFRACTIVE_INDEX,
     nodes: int = NODES,
 ) -> Effect:
-    """Return the error of a level apparent bed over the whole model of a pair.
-
-    Raises
-    ------
-    SettingError
-        If the depth is not above 0 and finite, or the refractive index is outside its rule.
-    """
-    _check_depths((apparent_depth_m,))
-    return _over_model(pair, apparent_depth_m, refractive_index, nodes)
-
-
-def _check_depths(apparent_depths_m: tuple[float, ...]) -> None:
-    """Refuse depths that are none, and the water's surface alone."""
-    wrong = [depth for depth in apparent_depths_m if not 0.0 <= depth < np.inf]
-    if wrong or not any(apparent_depths_m):
+    """Return the error of a level apparent bed over the whole model of a pair."""
+    if not 0.0 <= apparent_depth_m < np.inf:
         raise SettingError(
-            f"apparent depth {[*wrong, 0.0][0]:g} m is not finite and above 0: give metres under"
-            " the water, and 0 only beside others."
+            "option.range",
+            f"Apparent depth {apparent_depth_m:g} m is negative or infinite.",
+            value=apparent_depth_m,
         )
-
-
-def _over_model(pair: StereoPair, apparent_depth_m: float, index: float, nodes: int) -> Effect:
-    ScienceOptions(index=index)
+    ScienceOptions(index=refractive_index)
     along, across = pair.model_m
     x = np.linspace(-along / 2.0, along / 2.0, nodes | 1)
     y = np.linspace(-across / 2.0, across / 2.0, nodes | 1)
     plan = np.stack(np.meshgrid(x, y), axis=-1)
     apparent = np.dstack([plan, np.full(plan.shape[:2], -apparent_depth_m)])
-    true = true_points(apparent, pair.centres, index)
-    return Effect(
-        pair=pair,
-        apparent_depth_m=apparent_depth_m,
-        refractive_index=index,
-        x_m=x,
-        y_m=y,
-        error_m=apparent_depth_m + true[..., 2],
-        shift_m=np.hypot(*np.moveaxis(true[..., :2] - plan, -1, 0)),
-    )
+    true = true_points(apparent, pair.centres, refractive_index)
+    error = apparent_depth_m + true[..., 2]
+    shift = np.hypot(*np.moveaxis(true[..., :2] - plan, -1, 0))
+    return Effect(pair, apparent_depth_m, refractive_index, x, y, error, shift)
+
+
+def effects(
+    pairs: list[StereoPair],
+    apparent_depths_m: tuple[float, ...],
+    refractive_index: float = DEFAULT_REFRACTIVE_INDEX,
+) -> list[Effect]:
+    """Return the effect for every pair and apparent depth, of which one must be above 0."""
+    if not any(apparent_depths_m):
+        raise SettingError("option.range", "Give an apparent depth above 0.", value=0.0)
+    return [effect(pair, depth, refractive_index) for pair in pairs for depth in apparent_depths_m]
 
 
 def true_points(apparent: FloatArray, centres: FloatArray, refractive_index: float) -> FloatArray:
-    """Return the true points of apparent ones that two images gave.
+    """Return the true points of apparent ones, shape (..., 3), metres, z negative.
 
-    The lines of sight to the apparent point are broken at the water, z = 0; the true point is the
-    midpoint of the shortest line between the two in the water. Shape (..., 3), metres, z negative.
+    The straight rays to the apparent point are refracted at the water, z = 0; the true point is the
+    midpoint of the shortest line between the two in the water.
     """
     (first, a), (second, b) = (_in_water(apparent, c, refractive_index) for c in centres)
     gap = second - first
@@ -229,9 +212,9 @@ def true_points(apparent: FloatArray, centres: FloatArray, refractive_index: flo
 
 
 def _in_water(apparent: FloatArray, centre: FloatArray, n: float) -> tuple[FloatArray, FloatArray]:
-    """Return where a line of sight meets the water and its unit direction below it.
+    """Return the piercing point of a ray and its unit direction in the water.
 
-    At a level surface the horizontal part of the direction shrinks by n: that is Snell's law.
+    At a level surface the horizontal part of the direction shrinks by n (Snell's law).
     """
     sight = apparent - centre
     surface = centre + sight * (centre[2] / -sight[..., 2])[..., None]
@@ -240,40 +223,17 @@ def _in_water(apparent: FloatArray, centre: FloatArray, n: float) -> tuple[Float
     return surface, down
 
 
-def effects(
-    pairs: list[StereoPair],
-    apparent_depths_m: tuple[float, ...],
-    refractive_index: float = DEFAULT_REFRACTIVE_INDEX,
-) -> list[Effect]:
-    """Return the effect of every pair and apparent depth; 0 among several is the water's surface.
-
-    Raises
-    ------
-    SettingError
-        As `effect`.
-    """
-    _check_depths(apparent_depths_m)
-    return [
-        _over_model(pair, depth, refractive_index, NODES)
-        for pair in pairs
-        for depth in apparent_depths_m
-    ]
-
-
-TOLERANCE = 1e-9
-"""Of tan a, between two iterations."""
-_MOST_ITERATIONS = 50
-
-
 class Iteration(NamedTuple):
-    """Residuals of the depth, estimate minus truth, over the model after one iteration."""
+    """Residuals of the depth, estimate minus truth, over the model after one iteration.
+
+    `max_m` is the largest, with its sign; `change` is the largest change of tan a since the
+    iteration before, NaN for the first two.
+    """
 
     number: int
     mean_m: float
     max_m: float
-    """The largest, with its sign."""
     change: float
-    """The largest change of tan a since the iteration before; NaN for the first two."""
 
 
 def shan_iterations(
@@ -284,10 +244,11 @@ def shan_iterations(
 ) -> list[Iteration]:
     """Return the residuals of every iteration over a level bed of known depth.
 
-    The images have no noise and are traced through the water from the true bed, `nodes` along
-    the model and as many across it.
+    The images are traced through the water without noise, from `nodes` squared places.
     """
-    bed = _bed(pair.model_m, true_depth_m, nodes)
+    share = (np.arange(nodes) - (nodes - 1) / 2.0) / max(nodes - 1, 1)
+    x, y = (side.ravel() for side in np.meshgrid(*(side * share for side in pair.model_m)))
+    bed = np.column_stack([x, y, np.full(len(x), -true_depth_m)])
     slopes = np.stack([_slopes(bed, c, refractive_index) for c in pair.centres], axis=1)
     s, tangent, table = np.ones(slopes.shape[:2]), None, []
     for number in range(_MOST_ITERATIONS):
@@ -302,13 +263,6 @@ def shan_iterations(
         tangent = following
         s = np.sqrt(refractive_index**2 + (refractive_index**2 - 1.0) * tangent**2)
     return table
-
-
-def _bed(model_m: tuple[float, float], depth_m: float, nodes: int) -> FloatArray:
-    """Return the nodes of a level bed, shape (nodes squared, 3); a single one is in the centre."""
-    share = (np.arange(nodes) - (nodes - 1) / 2.0) / max(nodes - 1, 1)
-    x, y = (side.ravel() for side in np.meshgrid(model_m[0] * share, model_m[1] * share))
-    return np.column_stack([x, y, np.full(len(x), -depth_m)])
 
 
 def _slopes(bed: FloatArray, centre: FloatArray, n: float) -> FloatArray:

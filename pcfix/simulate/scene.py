@@ -35,43 +35,30 @@ _TRACK_PAIRS_AT_ONCE, _DENSE_PAIRS_AT_ONCE = 2_000_000, 50_000
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What `simulate_scene` made; metres, UTM.
+    """A simulated scene; metres, UTM.
 
     Attributes
     ----------
     apparent_xyz, true_xyz : array, shape (n, 3)
-        The cloud as SfM software would place it, and the truth, row by row. A point that fewer
-        than three images show, or for which fewer than three depth maps agree, has no views and is
-        not moved.
+        The cloud of the SfM software, and the truth, row by row. A point in fewer than three images
+        or depth maps has no views and is not moved.
     views : Views
-        The cameras that made each point; of depth maps with what each counted for.
-    cameras : Cameras
-        Those that the user is given; the cloud is intersected with them.
-    yaw_pitch_roll_deg : array, shape (k, 3)
-        Of `cameras`.
+        The cameras of each point, for depth maps with weights.
+    cameras, true_cameras : Cameras
+        The given ones, with which the cloud is intersected, and those of the images; the same
+        object without pose noise.
     lidar_xyz : array, shape (m, 3)
         A reference cloud of the true surface with noise.
     water_level_m : float
-        Of the mean water plane in the middle of the area.
-    refractive_index, gsd_m : float
+        Of the mean water plane `water` in the middle of the area.
     sensor_mm : tuple of float
         Focal length, sensor width and height.
-    epsg : int
     settings : dict
         The arguments that made it.
-    water : WaterPlane
-        The mean water plane.
-    true_cameras : Cameras
-        Those that the images were made with; the same object as `cameras` where there is no
-        pose noise.
-    true_yaw_pitch_roll_deg : array, shape (k, 3)
-        Of `true_cameras`.
     neighbours : array, shape (k, c), or None
         The images that each was matched with, -1 for none; None for a cloud of tracks.
-    pairs : array, shape (p, 2), or None
-        The cameras of each stereo pair, point by point, of a cloud of pairs.
-    pairs_start : array, shape (n + 1,), or None
-        Point i has the pairs from ``pairs_start[i]`` to ``pairs_start[i + 1]``.
+    pairs, pairs_start : array, shape (p, 2) and (n + 1,), or None
+        The cameras of each stereo pair of a cloud of pairs, point by point.
     """
 
     apparent_xyz: FloatArray
@@ -122,7 +109,7 @@ class Scene:
 
 
 class Streams(NamedTuple):
-    """Random numbers: `main` as they always came, and others for what can be switched on."""
+    """Random numbers: `main`, and independent streams for what can be switched on."""
 
     main: np.random.Generator
     poses: np.random.Generator
@@ -146,28 +133,18 @@ def simulate_scene(
 ) -> Scene:
     """Make a scene with known truth: ground and water under a block of images.
 
-    Every point is traced through the water surface into every image that shows it; the image
-    points get noise; straight rays through them are intersected, as software that knows nothing
-    of water does. By default: a shore from land to 12 m deep, level water, nadir images, true
-    poses and a true lens, and each point from all its images with the least reprojection error.
+    Every point is traced through the water surface into every image that shows it; the image points
+    get noise and are intersected with straight rays. By default: a shore from land to 12 m of
+    depth, level water, nadir images, true poses, and each point from all its images.
 
     Parameters
     ----------
     points : int, optional
         Points of the cloud; default 100,000.
     options : SceneOptions, optional
-        Or its attributes as keywords, as of ``pcfix simulate``.
+        Or its attributes as keywords, as for ``pcfix simulate``.
     progress : callable, optional
         Called with (points done, points in all).
-
-    Returns
-    -------
-    Scene
-
-    Raises
-    ------
-    SettingError
-        If an argument is outside its rule.
 
     Examples
     --------
@@ -212,7 +189,7 @@ def simulate_scene(
 
 
 class Site(NamedTuple):
-    """What stands before a point is seen: ground, block, what images are made with, randomness."""
+    """Ground, flown and given block, rig, and random numbers of a scene."""
 
     terrain: Terrain
     flown: Block
@@ -264,7 +241,7 @@ def points_on(terrain: Terrain, count: int, rng: np.random.Generator) -> FloatAr
 
 
 def _partners(chosen: SceneSettings, truth: FloatArray, site: Site) -> Partners | IntArray | None:
-    """Return what the kind of cloud needs of which images are matched with which."""
+    """Return the images that each is matched with, as the kind of cloud needs them."""
     if chosen.cloud == "tracks":
         return None
     rig, rng = site.rig, np.random.default_rng(0)
@@ -283,7 +260,7 @@ def _parts(
     partners: Partners | IntArray | None,
     progress: Callable[[int, int], None] | None,
 ) -> list[Part]:
-    """Return the cloud in parts that fit into the memory."""
+    """Return the cloud in parts of bounded memory."""
     pairs = _TRACK_PAIRS_AT_ONCE if partners is None else _DENSE_PAIRS_AT_ONCE
     at_once = max(1, pairs // len(site.rig.true))
     parts: list[Part] = []
@@ -296,7 +273,7 @@ def _parts(
 
 
 def _observe(truth: FloatArray, site: Site, partners: Partners | IntArray | None) -> Part:
-    """Return the cloud that is made of the images of some points."""
+    """Return the cloud of some points."""
     rig, streams = site.rig, site.streams
     sight = see(truth, rig, streams.detection)
     if partners is None:

@@ -1,4 +1,4 @@
-"""What a simulated scene can be asked for, and the rules of every value."""
+"""The settings of a simulated scene, checked together."""
 
 from __future__ import annotations
 
@@ -23,9 +23,8 @@ _NEIGHBOURS = {"tracks": 0, "pairs": 4, "depth-maps": 5}
 class SceneSettings(SceneOptions):
     """The options of a scene, and what follows from them.
 
-    The images are made with the true poses, the cloud is intersected with the given ones, which
-    have the noise of positions and attitude. The water level is that of the mean plane in the
-    middle of the area.
+    The images have the true poses; the cloud is intersected with the given ones, which have noise.
+    The water level is that of the mean plane in the middle of the area.
     """
 
     def check(self) -> None:
@@ -33,35 +32,42 @@ class SceneSettings(SceneOptions):
         super().check()
         object.__setattr__(self, "index", index_of(self.index, self.index_formula)[0])
         pitch = [mm / px for mm, px in zip(self.sensor_mm, self.sensor_px, strict=True)]
+        rise = self.water_tilt * float(np.hypot(*self.area_m))
         if not 0.98 < pitch[0] / pitch[1] < 1.02:
             raise SettingError(
+                "scene.pixels",
                 f"sensor_mm {self.sensor_mm} and sensor_px {self.sensor_px} make pixels of"
-                f" {1000 * pitch[0]:.3g} x {1000 * pitch[1]:.3g} um: give one with square pixels."
+                f" {1000 * pitch[0]:.3g} x {1000 * pitch[1]:.3g} um. Give square pixels.",
+                pixel_um=[1000 * side for side in pitch],
             )
-        self._check_together()
-
-    def _check_together(self) -> None:
         if self.flying_height_m <= 0.5 * self.depth_m:
             raise SettingError(
-                f"flying height {self.flying_height_m:g} m is not more than half the greatest"
-                f" depth {self.depth_m:g} m: the land would come too near; fly higher or give a"
-                " smaller greatest depth."
+                "scene.too_low",
+                f"Flying height {self.flying_height_m:g} m is not more than half the greatest depth"
+                f" {self.depth_m:g} m. Fly higher or give a smaller greatest depth.",
+                flying_height_m=self.flying_height_m,
+                depth_m=self.depth_m,
             )
-        rise = self.water_tilt * float(np.hypot(*self.area_m))
         if rise > 0.25 * self.flying_height_m:
             raise SettingError(
-                f"tilt {100 * self.water_tilt:g} % makes the water fall {rise:.3g} m over the area,"
-                f" too much below a flight at {self.flying_height_m:g} m: give a smaller one."
+                "scene.tilt",
+                f"Tilt {100 * self.water_tilt:g} % makes the water fall {rise:.3g} m over the area,"
+                f" too much for a flight at {self.flying_height_m:g} m. Give a smaller one.",
+                tilt_percent=100 * self.water_tilt,
             )
         if self.neighbours is not None and self.cloud == "tracks":
             raise SettingError(
-                "neighbours belong to the clouds of pairs and depth maps: give one of those, or"
-                " leave them out."
+                "option.no_use",
+                "neighbours is for clouds of pairs and depth maps. Give one of those, or leave it"
+                " out.",
+                option="neighbours",
             )
         if self.oblique_share is not None and not self.has_obliques:
             raise SettingError(
-                f"oblique share {self.oblique_share:g} needs obliques: give the block oblique, or"
-                " their angle."
+                "option.no_use",
+                f"oblique share {self.oblique_share:g} needs obliques. Give the block oblique, or"
+                " their angle.",
+                option="oblique_share",
             )
 
     @property

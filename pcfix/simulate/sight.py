@@ -1,9 +1,8 @@
-"""Which images show which points and are matched with one another; clouds of tracks and pairs.
+"""Which images show which points and are matched with each other; clouds of tracks and pairs.
 
-A point of a cloud of *tracks* is made of all images that show it at once. One of *pairs* is what
-semi-global matching and fusion by the median make: each image is matched with its neighbours, every
-pair that shows a point measures it in both images anew, two straight rays give a place (least
-residuals in the images), and the point is the median of these places in x, y and z one by one.
+A point of a cloud of *tracks* is intersected from all images that show it. *Pairs* are semi-global
+matching with a median: each image is matched with its neighbours, every pair that shows a point
+measures it anew in both images, and the point is the median of the intersections, axis by axis.
 """
 
 from __future__ import annotations
@@ -27,10 +26,10 @@ def starts_of(point: IntArray, count: int) -> IntArray:
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """All that the images are made with and the software is given.
+    """True and given poses, optics, water and noise of the images.
 
-    `true` are the poses of the images, `given` those that the cloud is intersected with. Nothing is
-    below `lowest_m`.
+    `true` are the poses of the images, `given` those for the intersection. Nothing is below
+    `lowest_m`.
     """
 
     true: Cameras
@@ -54,10 +53,8 @@ class Rig:
 class Sight:
     """The m pairs of one of n points and an image that shows it, sorted by point, then camera.
 
-    truth : shape (n, 3), the points.
-    start : shape (n + 1,), point i has the pairs from ``start[i]`` to ``start[i + 1]``.
-    point, camera : shape (m,).
-    ideal : shape (m, 2), where the image shows the point, ideal pixels without noise.
+    Point i of `truth`, shape (n, 3), has the pairs from ``start[i]`` to ``start[i + 1]``; `ideal`,
+    shape (m, 2), are ideal pixels without noise.
     """
 
     rig: Rig
@@ -151,10 +148,10 @@ LEAST_SCORE = 0.03
 
 
 class Part(NamedTuple):
-    """Some points of a cloud, shape (n, 3), what they are points of, and the images of each.
+    """Some points of a cloud, shape (n, 3), the true points, and the images of each.
 
-    In a cloud of pairs point i has those from ``pairs_start[i]`` to ``pairs_start[i + 1]``: rows
-    of `pairs`, shape (p, 2), the lower camera first.
+    In a cloud of pairs, point i has the rows ``pairs_start[i]`` to ``pairs_start[i + 1]`` of
+    `pairs`, shape (p, 2), the lower camera first.
     """
 
     xyz: FloatArray
@@ -165,13 +162,10 @@ class Part(NamedTuple):
 
 
 class Partners(NamedTuple):
-    """What OpenMVS would use of the other images, for each of k; best first, -1 for none.
+    """The partners that OpenMVS would select for each of k images; best first, -1 for none.
 
-    matched : shape (k, c), those that the depth map is matched with.
-    averaged : shape (k, 8), those whose depth maps are averaged into it.
-    fused : shape (k, 12), those whose depth maps may be fused with it.
-    known : shape (k,), how many images have tie points in common with it; the fusion begins with
-        the most.
+    `matched`, shape (k, c), are for the depth map, `averaged`, (k, 8), for averaging maps and
+    `fused`, (k, 12), for fusion; `known`, (k,), counts images with common tie points.
     """
 
     matched: IntArray
@@ -183,8 +177,8 @@ class Partners(NamedTuple):
 def neighbour_table(sight: Sight, count: int) -> IntArray:
     """Return the best neighbours of each image, shape (k, count), best first, -1 for none.
 
-    An image scores for every point that both show, the more the nearer the angle between their
-    rays is to 10 degrees (a bell, wider above): the manner of OpenMVS's choice, not its formula.
+    An image scores for every common point, by a bell about an angle of 10 degrees between the rays,
+    wider above: in the manner of OpenMVS.
     """
     centres = sight.rig.true.centres
     k = len(centres)
@@ -208,13 +202,10 @@ def openmvs_partners(
 ) -> Partners:
     """Return the partners that OpenMVS 2.3 would choose (`Scene::SelectNeighborViews`).
 
-    Each tie point is a feature of one image, found again in others with a probability that falls
-    with the angle to it, so that nadir and oblique images have few in common. Left out is the
-    weight of the region of interest, and the least score, as it counts tie points.
-
-    `ties`, shape (p, 3), are tie points where the software has them, and `sight` the images that
-    show them; `count` is how many partners a depth map is matched with; `rng` says which features
-    are found again.
+    Each tie point is a feature of one image, found in others with a probability that falls with the
+    angle, so nadir and oblique images have few in common. The weight of the region of interest and
+    the least score are not modelled. `ties`, shape (p, 3), are the reconstructed tie points,
+    `count` the partners of a depth map; `rng` selects which features are found.
     """
     cameras = sight.rig.given
     k = len(cameras)

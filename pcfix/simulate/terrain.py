@@ -24,13 +24,9 @@ _WALL = 10.0  # a slope steeper than this is the wall of a step, beside which th
 
 @dataclass(frozen=True)
 class Terrain:
-    """A surface z(x, y) over a rectangle from the origin.
+    """A surface z(x, y) over a rectangle from the origin, below a mean water plane.
 
-    kind : see `BEDS`.
-    length_m, width_m : extent in x and y.
-    water : mean surface, in the same frame.
-    greatest_depth_m : vertically below the water.
-    rocks : shape (r, 4), plan position, height and radius of each rock, metres; of a shore.
+    `rocks`, shape (r, 4), are plan position, height and radius, metres, of a shore.
     """
 
     kind: BedKind
@@ -122,5 +118,5 @@ BEDS: dict[BedKind, Bed] = {
     "steps": Bed(6.0, _steps),
     "river": Bed(2.5, _river),
 }
-"""Flat: one depth everywhere; slope: an even one from the waterline at x = 0 to the greatest depth
-at x = length; the others as their functions say. A kind more is an entry here and in `BedKind`."""
+"""Flat: one depth everywhere; slope: from the waterline at x = 0 to the greatest depth at the end.
+A new kind is an entry here and in `BedKind`."""

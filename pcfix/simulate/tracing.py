@@ -1,18 +1,17 @@
-"""From a true point through a plane water surface into images, and what SfM makes of it.
+"""Rays from true points through the water surface into images, and their straight intersection.
 
-The piercing point of the ray from object to camera is where Fermat's principle puts it: the
-root of Snell's law along the line between their feet, found by a safeguarded Newton iteration.
-Nothing here is shared with the correction; it goes the other way and uses other mathematics.
+The piercing point follows from Fermat's principle: it is the root of Snell's law along the line
+between the feet of object and camera, found by a safeguarded Newton iteration. Nothing here is
+shared with the correction, which traces in the other direction by other mathematics.
 
-The surface is a plane, level or tilted, with waves that each image sees anew. Waves are normals, no
-heights. At the moment of an image the surface near the place where its light would pass the mean
-plane is the plane through that place whose normal is tilted by the slope of a random field; the
-light takes the least optical path through this tangent plane. So Snell's law holds exactly with the
-tilted normal. Left out are the height of the waves and their curvature within the few centimetres
-by which they move the crossing, so that no caustics arise.
+The surface is a plane, level or tilted, with waves that differ from image to image. A wave is a
+tilt of the tangent plane where the light would pass the mean plane; the light takes the least
+optical path through the tangent plane, so Snell's law holds exactly there. The height of the waves
+and their curvature within the few centimetres of this shift are neglected, so there are no
+caustics.
 
-All arrays are flat over the m (point, camera) pairs, sorted by point: metres, shape (m, 3), where
-nothing else is said.
+Arrays are flat over the m (point, camera) pairs, sorted by point: metres, shape (m, 3), unless
+stated otherwise.
 """
 
 from __future__ import annotations
@@ -30,26 +29,13 @@ _CONVERGED_M = 1e-11
 def piercing_points(
     points: FloatArray, centres: FloatArray, water_level_m: float, refractive_index: float
 ) -> FloatArray:
-    """Return where the light from each point to its camera passes the level surface, (m, 3).
-
-    A point above the water is its own "piercing point": its light goes straight.
-
-    Raises
-    ------
-    ArithmeticError
-        If the iteration does not converge.
-    """
-    depth = water_level_m - points[:, 2]
-    wet = depth > 0.0
-    foot = points[wet, :2] - centres[wet, :2]
-    reach = np.hypot(*foot.T)
-    height, depth = centres[wet, 2] - water_level_m, depth[wet]
-    along = _root_of_snell(reach, height, depth, refractive_index)
-    surface = points.copy()
-    share = np.divide(along, reach, out=np.zeros_like(along), where=reach > 0.0)
-    surface[wet, :2] = centres[wet, :2] + foot * share[:, None]
-    surface[wet, 2] = water_level_m
-    return surface
+    """Return where the light from each point to its camera passes a level surface, (m, 3)."""
+    anchor, normal = np.array([0.0, 0.0, water_level_m]), np.array([0.0, 0.0, 1.0])
+    shape = points.shape
+    return piercing_points_of_planes(
+        points, centres, np.broadcast_to(anchor, shape), np.broadcast_to(normal, shape),
+        refractive_index,
+    )  # fmt: skip
 
 
 def piercing_points_of_planes(
@@ -59,11 +45,15 @@ def piercing_points_of_planes(
     normals: FloatArray,
     refractive_index: float,
 ) -> FloatArray:
-    """Return where the light from each point to its camera passes a plane of any attitude, (m, 3).
+    """Return where the light from each point to its camera passes a plane, (m, 3).
 
-    The picture is that of `piercing_points` with the plane's normal for the plumb line: the feet
-    of both on the plane, and the root of Snell's law between them. `anchors` and `normals` are a
-    point of each pair's plane and its unit normal, away from the water.
+    `anchors` and `normals` are a point of each pair's plane and its unit normal, away from the
+    water. A point above the water is its own piercing point.
+
+    Raises
+    ------
+    ArithmeticError
+        If the iteration does not converge.
     """
     depth = np.einsum("mi,mi->m", anchors - points, normals)
     wet = depth > 0.0
@@ -86,10 +76,10 @@ def bed_points(
     bed: tuple[FloatArray, FloatArray],
     refractive_index: float,
 ) -> FloatArray:
-    """Return what each camera sees along a ray: where it meets the bed, bent at the water, (m, 3).
+    """Return where the ray of each camera meets the bed, refracted at the water, (m, 3).
 
-    Directions are of any length; `water` and `bed` are a point of each ray's water plane and of its
-    bed plane, and their unit normals. A ray that meets the bed above the water is straight.
+    Directions have any length; `water` and `bed` are points and unit normals of the planes of each
+    ray. A ray that meets the bed above the water is straight.
     """
     (anchors, normals), (places, bed_normals) = water, bed
     straight = _on_plane(centres, directions, places, bed_normals)
@@ -160,11 +150,10 @@ def triangulate(
     lens: Lens,
     guess: FloatArray,
 ) -> FloatArray:
-    """Return what software that knows nothing of water makes of image points.
+    """Intersect straight rays through image points: least squared reprojection errors.
 
-    The points, shape (n, 3), with the least squared reprojection errors over straight rays, by
-    Gauss-Newton from a guess. Point i has the pairs from ``start[i]`` to ``start[i + 1]``, two at
-    least.
+    Gauss-Newton from a guess, shape (n, 3). Point i has the pairs from ``start[i]`` to
+    ``start[i + 1]``, at least two.
     """
     rows = rotations_of(cameras)[camera]
     owner = np.repeat(np.arange(len(start) - 1), np.diff(start))
@@ -195,11 +184,10 @@ _COMPONENTS = 8
 
 @dataclass(frozen=True, eq=False)
 class Waves:
-    """A field of slopes for each of k images, as a sum of c sinusoids of one wavelength.
+    """A field of slopes for each of k images, the sum of c sinusoids of one wavelength.
 
-    wave_numbers : shape (k, c, 2), radians per metre along the two axes of the mean plane.
-    phases : shape (k, c).
-    steepness : amplitude of the slope of each sinusoid.
+    `wave_numbers`, shape (k, c, 2), are in radians per metre along the axes of the mean plane;
+    `steepness` is the amplitude of the slope of each sinusoid.
     """
 
     wave_numbers: FloatArray
@@ -210,10 +198,10 @@ class Waves:
     def random(
         cls, cameras: int, slope_deg: float, wavelength_m: float, rng: np.random.Generator
     ) -> Waves:
-        """Draw fields whose slope along any axis has the standard deviation asked for.
+        """Draw fields whose slope along any axis has the given standard deviation.
 
-        Directions are spread evenly over the half circle, beginning anywhere: then the variance
-        along either axis is ``components * steepness^2 / 4``.
+        Directions are evenly spread over the half circle, so the variance along either axis is
+        ``components * steepness^2 / 4``.
         """
         first = rng.uniform(0.0, 1.0, (cameras, 1))
         angle = np.pi * (first + np.arange(_COMPONENTS)) / _COMPONENTS
@@ -251,21 +239,16 @@ class Water:
     def piercing_points(
         self, points: FloatArray, centres: FloatArray, camera: IntArray
     ) -> FloatArray:
-        """Return where the light from each point to its camera passes the surface, (m, 3).
-
-        A point above the mean plane is its own "piercing point".
-        """
-        if self.waves is None and self.plane.b == self.plane.c == 0.0:
-            return piercing_points(points, centres, self.plane.a, self.refractive_index)
+        """Return where the light from each point to its camera passes the surface, (m, 3)."""
         anchors, normals = self.tangent_planes(points, centres, camera)
         return piercing_points_of_planes(points, centres, anchors, normals, self.refractive_index)
 
     def tangent_planes(
         self, points: FloatArray, centres: FloatArray, camera: IntArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the plane that the light of each pair passes: a point of it and the unit normal.
+        """Return a point and the unit normal of the plane that the light of each pair passes.
 
-        All are of shape (m, 3); `camera`, shape (m,), says whose waves there are.
+        Both have the shape (m, 3); `camera`, shape (m,), selects the waves.
         """
         shape = points.shape
         anchor = np.array([0.0, 0.0, self.plane.a])

@@ -28,8 +28,7 @@ from pcfix.flow.photos import block_of
 from pcfix.io.photographs import photographs_in, read_photograph
 from pcfix.kernels import threads
 from pcfix.options.photos import PhotosOptions
-from pcfix.photos.mapping import exact
-from pcfix.photos.resample import resample
+from pcfix.photos.mapping import exact, resample
 from tests.utils.renderer import Relief, Texture, rendered
 from tests.utils.shared import SHARED
 

@@ -20,8 +20,7 @@ import pcfix
 from pcfix.io.water_rasters import read_water_raster
 from pcfix.model import Lens, WaterPlane
 from pcfix.photos.ground import Ground
-from pcfix.photos.mapping import Photo, Scene, exact
-from pcfix.photos.resample import resample
+from pcfix.photos.mapping import Photo, Scene, exact, resample
 from pcfix.water.surface import surface_above
 from tests.utils.renderer import Relief, Texture, rendered
 from tests.utils.waves import Sea, frame, rays_of

@@ -8,7 +8,7 @@ import pytest
 from pcfix.clean import neighbours
 from pcfix.clean.neighbours import Neighbours, height_quartiles, make_tiles
 from pcfix.clean.points import Reason, clean_points
-from pcfix.io.viewer import load_open3d
+from pcfix.libraries import load_open3d
 from pcfix.options.steps import CleanRules
 from tests.clean.scenes import spoilt_scene
 from tests.utils.nightly import mostly_nightly

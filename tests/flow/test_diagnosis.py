@@ -76,7 +76,7 @@ def test_every_sign_speaks_of_bent_poses():
     # the README of the data: the land is 0.96 m too low
     assert report.as_dict()["refraction"]["likely_error_m"] == pytest.approx(0.96, abs=0.05)
     text = cameras_text(report)
-    assert "verdict        The poses have absorbed the refraction" in text
+    assert "The poses have absorbed the refraction" in text
     assert "--gcps" in text
 
 
@@ -131,7 +131,7 @@ def test_the_command_names_what_was_given():
     assert (command, because) == (f"{head} {tail} --gnss gnss.csv", "")
     command, because = adjust_words(inputs, "cloud.laz", has_datum=False)
     assert command == f"{head} {tail} --gnss GNSS.csv"
-    assert "nothing given says where the block is" in because
+    assert "--gcps" in because
 
 
 @bent
@@ -141,5 +141,5 @@ def test_the_command_line_says_so():
         "--gnss", BENT / "gnss.csv",
     )  # fmt: skip
     assert done.returncode == 0
-    assert "GNSS           absorbed:" in done.stdout
+    assert "GNSS: absorbed" in done.stdout
     assert "pcfix adjust" in done.stdout

@@ -52,7 +52,7 @@ def test_command_line_and_python_give_the_same_file(scene, tmp_path):
     )
     assert (tmp_path / "a.las").read_bytes() == (tmp_path / "b.las").read_bytes()
     report = json.loads((tmp_path / "run.json").read_text())
-    assert f"{report['submerged']:,} (" in done.stdout
+    assert f"{report['submerged']:,} points (" in done.stdout
     assert report["points"] == 3000
     assert report["submerged"] == report["corrected"] + sum(report["uncorrected"].values())
     assert report["cameras"] == report["cameras_used"] + len(report["cameras_unused"])
@@ -141,7 +141,7 @@ def test_demo_prints_errors_before_and_after(tmp_path):
     assert done.returncode == 0, done.stderr
     rows = {}
     for line in done.stdout.splitlines():
-        for name in ("as it came", "depth times 1.34", "without any option", "consistent"):
+        for name in ("uncorrected", "depth times 1.34", "default options", "with the view list"):
             if line.startswith(name):
                 rows.setdefault(name, []).append(float(line[30:].split()[6]))
     before, factor, snell, consistent = (np.array(r) for r in rows.values())

@@ -192,15 +192,14 @@ def test_summary_says_what_was_left_out(tmp_path, mask):
     path = write_cloud(tmp_path / "in.las", 7)
     words = ["--water", WATER_M, "--water-mask", mask, "--connected", "--respect-classes", "9, 2"]
     done = invoke("label", path, tmp_path / "out.las", *words)
-    assert "points below lie outside: land" in done.stdout
-    assert "points below keep their class" in done.stdout
-    assert "came as class 40 or 41 and are neither: left so; --reset makes" in done.stdout
+    for label in ("Mask", "Kept class", "Reclassified"):
+        assert f"  {label} " in done.stdout
     cameras = cameras_csv(tmp_path / "cameras.csv", block())
     done = invoke("correct", path, tmp_path / "c.las", "--cameras", cameras, *words)
-    assert "points below lie outside: land" in done.stdout
+    assert "  Mask " in done.stdout
     plain = invoke("label", path, tmp_path / "p.las", "--water", WATER_M)
-    assert "outside" not in plain.stdout
-    assert "class 41 " not in plain.stdout
+    assert "Mask" not in plain.stdout
+    assert "Class 41" not in plain.stdout
 
 
 def test_pools_left_out_are_told(tmp_path):
@@ -212,14 +211,14 @@ def test_pools_left_out_are_told(tmp_path):
     las.x, las.y, las.z = EAST_M + x, NORTH_M + y, np.where((x < 30) | pit, -1.0, 1.0)
     las.write(tmp_path / "in.las")
     done = invoke("label", tmp_path / "in.las", tmp_path / "out.las", "--water", 0, "--connected")
-    told = f"{pit.sum()} points in 1 pools apart from the water were left as land; the largest, "
+    told = f"{pit.sum()} points in 1 separate pools stay land; the largest, "
     assert told in done.stdout
     place = done.stdout.split("is at ")[1].split("\n")[0].split(", ")
     assert np.hypot(float(place[0]) - EAST_M - 50, float(place[1]) - NORTH_M - 20) < 3.5
     wet = np.asarray(laspy.read(tmp_path / "out.las").classification) == 40
     np.testing.assert_array_equal(wet, x < 30)
     every = invoke("label", tmp_path / "in.las", tmp_path / "all.las", "--water", 0)
-    assert "separate" not in every.stdout
+    assert "Pools" not in every.stdout
     assert (np.asarray(laspy.read(tmp_path / "all.las").classification) == 40).sum() == (
         (x < 30) | pit
     ).sum()

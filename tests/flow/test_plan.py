@@ -39,7 +39,7 @@ def block(noise_px):
     )  # fmt: skip
 
 
-def test_the_parts_add_up(plan):
+def test_parts(plan):
     for one in plan.depths:
         total = np.sqrt(sum(part**2 for part in one.parts_m.values()))
         assert one.sigma_m == pytest.approx(total, rel=1e-6)
@@ -51,7 +51,7 @@ def test_the_parts_add_up(plan):
 
 
 @pytest.mark.parametrize(("noise_px", "most"), [(0.0, 1.01), (0.5, 1.1)])
-def test_predicted_is_what_a_correction_says(plan, noise_px, most):
+def test_correction_agrees(plan, noise_px, most):
     """Of other points; a noisy cloud itself tells of up to 10 % more."""
     scene = block(noise_px)
     found = pcfix.correct_points(
@@ -61,7 +61,7 @@ def test_predicted_is_what_a_correction_says(plan, noise_px, most):
     assert 0.99 < said / plan.deepest.sigma_m < most
 
 
-def test_predicted_noise_is_the_noise(plan):
+def test_noise(plan):
     """Of 3,000 points with true level, index, poses: 1.3 % for one sigma."""
     scene = block(0.5)
     found = pcfix.correct_points(scene.apparent_xyz, scene.cameras, 0.0, views=scene.views)
@@ -69,7 +69,7 @@ def test_predicted_noise_is_the_noise(plan):
     assert plan.deepest.parts_m["image"] == pytest.approx(np.sqrt(np.mean(off**2)), rel=0.05)
 
 
-def test_adjusted_poses_are_as_good_as_what_holds_them():
+def test_adjusted_poses():
     given = PlanOptions(**FLIGHT, gnss_sigma=0.02)
     bed = flight._bed(given, DEPTH_M)
     fine, coarse = (
@@ -79,33 +79,34 @@ def test_adjusted_poses_are_as_good_as_what_holds_them():
     assert 4.0 * fine < coarse < 12.0 * fine
 
 
-def test_without_refraction_there_is_nothing_to_absorb():
+def test_index_of_one():
     given = PlanOptions(**FLIGHT, index=1.0)
     share, left_m = flight._absorbed(given, flight._bed(given, DEPTH_M))
     assert share == 0.0
     assert abs(left_m) < 1e-6
 
 
-def test_the_command_and_its_files(monkeypatch, folder, plan):
+def test_command(monkeypatch, folder, plan):
     monkeypatch.setattr(pcfix, "plan_flight", lambda *, options, progress: plan, raising=False)
     done = run_pcfix("plan", "--area", 60, 40, "--lens", "8.8,13.2,8.8,5472")
     assert done.returncode == 0, done.stderr
     assert done.stdout == plan_text(plan) + "\n"
-    assert "50 m above the water over 60 x 40 m: 28 images" in done.stdout
+    assert len(plan.cameras) == 28
     assert (folder / "plan.png").read_bytes()[:4] == b"\x89PNG"
     found = json.loads((folder / "plan.json").read_text("utf-8"))
     assert found["depths"][1]["sigma_m"] == plan.deepest.sigma_m
 
 
 @pytest.mark.parametrize(
-    ("given", "sentence"),
+    ("given", "code"),
     [
-        ({"lens": "8.8,13.2"}, "is not FOCAL,WIDTH,HEIGHT,PIXELS"),
-        ({"depth": "0"}, "must be above 0: give metres below the water"),
-        ({"sidelap": 0.0, "overlap": 0.3}, "is seen by three images; give more overlap"),
-        ({"height": 3.0, "depth": (8.0,)}, "fly higher or give a smaller greatest depth"),
+        ({"lens": "8.8,13.2"}, None),
+        ({"depth": "0"}, None),
+        ({"sidelap": 0.0, "overlap": 0.3}, "plan.overlap"),
+        ({"height": 3.0, "depth": (8.0,)}, "scene.too_low"),
     ],
 )
-def test_refused(given, sentence):
-    with pytest.raises(SettingError, match=sentence):
+def test_refused(given, code):
+    with pytest.raises(SettingError) as caught:
         pcfix.plan_flight(**given)
+    assert code in (None, caught.value.code)

@@ -1,4 +1,4 @@
-"""What `pcfix view` shows: points in the colours of their values, cameras and water in place."""
+"""`pcfix view`: points in the colours of their values, cameras and water in place."""
 
 from __future__ import annotations
 
@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.errors import PcfixWarning, SettingError
 from pcfix.flow import view
 from pcfix.io.scenes import write_scene
-from pcfix.io.viewer import Scene3d, render
-from pcfix.report.view import GREY, Scale
+from pcfix.report.view import GREY, Scale, view_figure
+from tests.utils.codes import refused
 
 
 @pytest.fixture(scope="module")
@@ -24,23 +23,15 @@ def folder(tmp_path_factory):
     return folder
 
 
-@pytest.fixture
-def shown(monkeypatch):
-    """Catch what would be drawn, as on a machine where open3d cannot draw."""
-    caught = []
-    monkeypatch.setattr(view, "render", lambda scene, *size: (caught.append(scene), ([], "no"))[1])
-    return caught
-
-
-def test_clouds_cameras_and_water(folder, tmp_path, shown):
-    with pytest.warns(PcfixWarning, match=r"cannot draw without a screen here \(no\).*apt-get"):
-        said = pcfix.view_clouds(
-            [folder / "corrected.laz"], cameras=folder / "cameras.csv", water=0.37,
-            reference=folder / "lidar.laz", image=tmp_path / "view.png",
-        )  # fmt: skip
+def test_scene(folder, tmp_path, monkeypatch):
+    shown = []
+    monkeypatch.setattr(view, "view_figure", lambda *a: (shown.append(a[0]), view_figure(*a))[1])
+    pcfix.view_clouds(
+        [folder / "corrected.laz"], cameras=folder / "cameras.csv", water=0.37,
+        reference=folder / "lidar.laz", image=tmp_path / "view.png",
+    )  # fmt: skip
     (scene,) = shown
     assert scene.names == ["corrected.laz before", "corrected.laz", "reference lidar.laz"]
-    assert said.endswith("by depth")
     assert (tmp_path / "view.png").stat().st_size > 20_000
     before, after, _ = scene.xyz
     grey = (scene.rgb[1] == GREY).all(axis=1)
@@ -55,8 +46,7 @@ def test_clouds_cameras_and_water(folder, tmp_path, shown):
     assert (scene.lines[:, 1, 2] < tops.max()).all()  # they look down
 
 
-@pytest.mark.filterwarnings("ignore:open3d cannot draw")
-def test_errors_shrink(folder, tmp_path, shown, monkeypatch):
+def test_errors(folder, tmp_path, monkeypatch):
     values = []
     monkeypatch.setattr(
         Scale, "colours", lambda self, one: (values.append(one), np.ones((len(one), 3)))[1]
@@ -74,32 +64,17 @@ def test_errors_shrink(folder, tmp_path, shown, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("name", "given", "sentence"),
+    ("name", "given", "code"),
     [
-        ("cloud.laz", {}, "colour depth: no cloud has it; give --water, or a cloud that 'pcfix"),
-        ("cloud.laz", {"colour": "uncertainty"}, "no cloud has it; give a cloud that 'pcfix corr"),
-        ("cloud.laz", {"colour": "error"}, "is the height above a reference; give --reference too"),
-        ("corrected.laz", {}, "there is no screen to open a viewer on; give --image"),
+        ("cloud.laz", {}, "view.no_values"),
+        ("cloud.laz", {"colour": "uncertainty"}, "view.no_values"),
+        ("cloud.laz", {"colour": "error"}, "option.missing"),
+        ("corrected.laz", {}, "view.no_screen"),
     ],
 )
-def test_refused(folder, monkeypatch, name, given, sentence):
+def test_refused(folder, monkeypatch, name, given, code):
     monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    with pytest.raises(SettingError, match=sentence):
+    with refused(code):
         pcfix.view_clouds([folder / name], **given)
-
-
-def test_open3d_draws_off_the_screen():
-    """A red cloud about the origin; skipped where open3d has nothing to draw with."""
-    xyz = np.random.default_rng(0).uniform(-1.0, 1.0, (20_000, 3))
-    red = np.tile([1.0, 0.0, 0.0], (len(xyz), 1))
-    nothing = np.zeros((0, 3))
-    scene = Scene3d(["a"], [xyz], [red], np.zeros((0, 2, 3)), nothing, nothing.astype(int))
-    images, why = render(scene, 80, 60)
-    if not images:
-        pytest.skip(why)
-    (image,) = images
-    assert image.shape == (60, 80, 3)
-    assert image[30, 40].tolist() == [255, 0, 0]
-    assert image[0, 0].tolist() == [255, 255, 255]

@@ -8,8 +8,7 @@ pytest.importorskip("cv2", reason="photographs need the extra 'photos'")
 from pcfix.lens.rotations import from_yaw_pitch_roll
 from pcfix.model import Lens, WaterPlane
 from pcfix.photos.ground import Ground
-from pcfix.photos.mapping import Photo, Scene, exact, nodes_of, paper
-from pcfix.photos.resample import resample
+from pcfix.photos.mapping import Photo, Scene, exact, nodes_of, paper, resample
 from tests.utils.renderer import Relief, Texture, rendered
 
 LENS = Lens(600.0, 480, 360, 243.0, 178.0)
@@ -59,7 +58,7 @@ def displacement_px(one, other, every=6):
     return (moved - at)[found.ravel() == 1]
 
 
-def test_the_photograph_is_that_without_water(scene, views):
+def test_exact(scene, views):
     wet, _, dry, place = views
     found = resample(wet[..., None], exact(photo(), scene, 4))
     lost = found.touched & (found.image[..., 0] == 0)
@@ -76,7 +75,7 @@ def test_the_photograph_is_that_without_water(scene, views):
 
 
 @pytest.mark.parametrize("step_px", [1, 4, 8])
-def test_every_pixel_comes_from_where_its_ground_was_seen(scene, views, step_px):
+def test_exact_places(scene, views, step_px):
     _, seen, _, straight = views
     mapped = resample(seen[..., :2].astype(np.float32), exact(photo(), scene, step_px)).image
     known = (np.abs(mapped).max(axis=2) > 0.0)[10:-10, 10:-10]
@@ -86,7 +85,7 @@ def test_every_pixel_comes_from_where_its_ground_was_seen(scene, views, step_px)
     assert known.mean() > 0.9
 
 
-def test_depth_by_the_paper_tends_to_h0_over_two_minus_n():
+def test_paper_limit():
     """Near nadir a round makes h0 + (n - 1) h of a depth h; the steps have the ratio n - 1."""
     n, true, height = 1.34, 3.0, 60.0
     level = photo(tilt=(0.0, 0.0))

@@ -4,7 +4,6 @@ import json
 import sys
 import warnings
 
-import laspy
 import numpy as np
 import pytest
 
@@ -13,12 +12,13 @@ pytest.importorskip("cv2", reason="photographs need the extra 'photos'")
 import cv2
 
 import pcfix
-from pcfix.errors import InputError, PcfixWarning, SettingError
+from pcfix.errors import InputError, SettingError
 from pcfix.io.las.writing import write_points
 from pcfix.photos.ground import Ground
 from pcfix.photos.rounds import paper_excess, round_of
 from pcfix.photos.stereo import Grey, pairs_of, stereo_cloud
 from tests.photos.test_mapping import GSD_M, photo, relief
+from tests.utils.codes import refused, warned
 from tests.utils.renderer import Texture, rendered
 
 DEPTHS_M = (2.5, 2.66, 2.71, 2.73)
@@ -74,7 +74,7 @@ def calls(block):
     return (block[1].parent / "calls").read_text()
 
 
-def test_rounds_stop_when_the_bed_stays(block):
+def test_rounds_stop(block):
     # the ground pixel is 0.62 m: 62 m over 100 px
     found = rounds(block, until_gsd=0.04)
     assert found.gsd_m == pytest.approx(0.62, abs=0.01)
@@ -89,25 +89,20 @@ def test_rounds_stop_when_the_bed_stays(block):
         assert name in found.compare
 
 
-def test_paper_warns_of_where_it_tends_to(block):
+def test_paper_limit(block):
     images, out, how = block
-    with (
-        pytest.warns(PcfixWarning, match=r"apparent depth over 2 - n.* 13 % of its depth too"),
-        pytest.warns(PcfixWarning, match="does not say that it is of a cloud"),
-    ):
+    with warned("photos.paper_limit"):
         found = pcfix.rebuild_rounds(images, out, **how, until_gsd=0.001, most_rounds=3)
-    assert len(found.notes) == 1
+    assert [note.code for note in found.notes] == ["photos.paper_limit"]
     assert paper_excess(1.34) == pytest.approx(0.131, abs=0.001)
 
 
-def test_a_command_that_fails_loses_nothing(block):
+def test_failed_command(block):
     out = block[1]
     broken = out.parent / "broken"
     first = rounds(block, most_rounds=1)
     broken.touch()
-    with pytest.raises(
-        InputError, match="ended with code 3 in round 2, and said: reading images / no licence left"
-    ):
+    with refused("rebuild.failed", exit_code=3, round=2):
         rounds(block, until_gsd=0.05, most_rounds=2)
     mapped = {one: one.stat().st_mtime_ns for one in (out / "round2" / "images").iterdir()}
     broken.unlink()
@@ -119,7 +114,7 @@ def test_a_command_that_fails_loses_nothing(block):
     assert not list(out.parent.glob("*.part*"))
 
 
-def test_interrupted_between_cloud_and_dsm(block):
+def test_resumed(block):
     rounds(block, most_rounds=1)
     out = block[1]
     record = json.loads((out / "pcfix-rebuild.json").read_text())
@@ -130,35 +125,35 @@ def test_interrupted_between_cloud_and_dsm(block):
     assert calls(block) == "x"
 
 
-def test_other_calls_do_not_go_on_from_these(block):
+def test_other_call(block):
     rounds(block, most_rounds=1)
-    with pytest.raises(SettingError, match="holds the rounds of another call"):
+    with refused("output.exists"):
         rounds(block, water=0.1)
     assert rounds(block, water=0.1, overwrite=True, most_rounds=1).done_before == 0
 
 
 @pytest.mark.parametrize(
-    ("more", "sentence"),
+    "more",
     [
-        ({"rebuild": "odm {images}"}, "rebuild 'odm {images}' lacks {cloud}; name the folder"),
-        ({"rebuild": None, "reference": "lidar.laz"}, "reference is of no use without rebuild"),
-        ({"until_gsd": 0}, "until-gsd 0 is not positive"),
-        ({"most_rounds": 0}, "most-rounds 0"),
+        {"rebuild": "odm {images}"},
+        {"rebuild": None, "reference": "lidar.laz"},
+        {"until_gsd": 0},
+        {"most_rounds": 0},
     ],
 )
-def test_what_cannot_be_is_refused(block, more, sentence):
-    with pytest.raises(SettingError, match=sentence):
+def test_bad_options(block, more):
+    with pytest.raises(SettingError):
         rounds(block, **more)
 
 
-def test_programs_that_are_not_there_or_leave_nothing(block):
-    with pytest.raises(InputError, match="no-such-program: cannot be run"):
+def test_bad_programs(block):
+    with pytest.raises(InputError):
         rounds(block, rebuild="no-such-program {images} {cloud}")
-    with pytest.raises(InputError, match=r"left no .*cloud.laz in round 1, and said: nothing"):
+    with refused("rebuild.failed", exit_code=0):
         rounds(block, rebuild=f'"{sys.executable}" -c pass {{images}} {{cloud}}')
 
 
-def test_only_the_bed_counts():
+def test_round_of_bed():
     difference = np.array([[0.0, 0.0, -0.2], [0.0, np.nan, -0.4]])
     wet = np.array([[False, False, True], [False, True, True]])
     found = round_of(("c", "d"), difference, wet, 0.25)
@@ -167,7 +162,7 @@ def test_only_the_bed_counts():
 
 
 @pytest.mark.nightly
-def test_stereo_finds_a_ground_without_water():
+def test_stereo():
     photos = [photo(x, tilt) for x, tilt in ((-8, (2, 1)), (0, (-1, 2)), (8, (1, -2)))]
     assert pairs_of(photos, 0.0) == [(0, 1), (0, 2), (1, 2)]
     texture = Texture(3.0 * GSD_M, 3.0)
@@ -180,8 +175,3 @@ def test_stereo_finds_a_ground_without_water():
     # m: a pixel of parallax is 0.5 m at the best base; ledge and boulders are steeper than cells
     assert abs(np.median(off)) < 0.02
     assert np.quantile(np.abs(off), [0.5, 0.95]) == pytest.approx([0.0, 0.0], abs=0.25)
-
-
-def test_clouds_are_las_in_the_crs_of_the_dsm(tmp_path):
-    write_points(tmp_path / "cloud.laz", np.ones((3, 3)), (None, 0.001))
-    assert laspy.read(tmp_path / "cloud.laz").header.parse_crs() is None

@@ -19,7 +19,7 @@ from pcfix.cli.plugin import OFFERED, plugin_zip
 from pcfix.io.scenes import write_scene
 from pcfix.options.declare import options_of
 from pcfix.options.survey import RunOptions
-from pcfix.qgis.command import CommandError, check_cloud, program_of, run, words_of
+from pcfix.qgis.command import CommandError, program_of, run, words_of
 from tests.utils.program import run_pcfix
 
 QGIS = shutil.which("qgis_process.bin") or shutil.which("qgis_process")
@@ -44,7 +44,7 @@ def scene(tmp_path_factory):
     return folder
 
 
-def test_every_option_is_offered(commands):
+def test_options(commands):
     assert tuple(commands) == OFFERED
     assert [one["kind"] for one in commands["run"]["places"]] == ["cloud", "folder written"]
     shown = [one.name for one in options_of(RunOptions) if not one.hidden]
@@ -58,7 +58,7 @@ def test_every_option_is_offered(commands):
     }  # fmt: skip
 
 
-def test_words_are_those_of_the_command_line(commands):
+def test_command_line(commands):
     values = {
         "input": "a b.laz", "output": "o.laz", "water": "-0.37", "sigma_image": 0.5, "exact": True,
         "sigma_index": 0.01, "method": "auto", "overwrite": False, "views": "", "max_angle": None,
@@ -71,9 +71,9 @@ def test_words_are_those_of_the_command_line(commands):
     assert words_of(commands["compare"], sections) == expected
 
 
-def test_an_environment_without_pcfix(tmp_path):
+def test_no_pcfix(tmp_path):
     for setting in (str(tmp_path), str(tmp_path / "none")):
-        with pytest.raises(CommandError, match=r"pcfix is not at '.*': install pcfix into an env"):
+        with pytest.raises(CommandError, match="There is no pcfix at"):
             program_of(setting)
     program = tmp_path / "bin" / "pcfix"
     program.parent.mkdir()
@@ -82,22 +82,7 @@ def test_an_environment_without_pcfix(tmp_path):
     assert program_of(str(tmp_path)) == program_of(str(program)) == str(program)
 
 
-def test_clouds(scene, tmp_path):
-    import laspy
-
-    assert check_cloud(str(scene / "cloud.laz")) == ""
-    cloud = laspy.create(point_format=6, file_version="1.4")
-    cloud.write(tmp_path / "bare.las")
-    assert "bare.las names no CRS: it is taken to be in metres" in check_cloud(
-        str(tmp_path / "bare.las")
-    )
-    (tmp_path / "text.las").write_text("no cloud")
-    for name, sentence in (("a.ply", "reads LAS and LAZ; export"), ("text.las", "not a LAS file")):
-        with pytest.raises(CommandError, match=sentence):
-            check_cloud(str(tmp_path / name))
-
-
-def test_progress_and_what_is_said(scene, tmp_path, monkeypatch, commands):
+def test_progress(scene, tmp_path, monkeypatch, commands):
     monkeypatch.setenv("PCFIX_PROGRESS", "lines")
     done = run_pcfix("label", scene / "cloud.laz", tmp_path / "l.laz", "--water", 0.37)
     assert done.stderr.splitlines()[-1] == "progress 100"
@@ -115,7 +100,7 @@ def test_cancelled():
     """It is asked to stop, as by Ctrl-C, and does so long before its end."""
     program = "import time; print('here', flush=True); time.sleep(60)"
     said, started = [], time.monotonic()
-    with pytest.raises(CommandError, match="cancelled"):
+    with pytest.raises(CommandError, match="Cancelled"):
         run(sys.executable, ["-c", program], lambda: bool(said), float, said.append)
     assert time.monotonic() - started < 30.0
 
@@ -150,19 +135,19 @@ def qgis(packed, tmp_path_factory):
     return call
 
 
-def test_qgis_writes_the_same_bytes(qgis, scene, tmp_path):
+def test_same_bytes(qgis, scene, tmp_path):
     given = {"cameras": scene / "cameras.csv", "water": 0.37, "method": "snell"}
     done = qgis("correct", input=scene / "cloud.laz", output=tmp_path / "qgis.laz", **given)
     assert done.returncode == 0, done.stderr
-    assert "corrected" in done.stdout
+    assert "Corrected" in done.stdout
     pcfix.correct_file(scene / "cloud.laz", tmp_path / "python.laz", **given)
     assert (tmp_path / "qgis.laz").read_bytes() == (tmp_path / "python.laz").read_bytes()
 
 
-def test_qgis_says_what_to_install(qgis, scene, tmp_path):
+def test_qgis_no_pcfix(qgis, scene, tmp_path):
     done = qgis(
         "label", "/no/pcfix", input=scene / "cloud.laz", output=tmp_path / "l.laz", water=0.37
     )
     assert done.returncode != 0
-    assert "pcfix is not at '/no/pcfix': install pcfix into an environment" in done.stderr
+    assert "There is no pcfix at '/no/pcfix'" in done.stderr
     assert not (tmp_path / "l.laz").exists()

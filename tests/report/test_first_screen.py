@@ -1,4 +1,4 @@
-"""What a page says first: of a bed that was measured, or predicted, and what contradicts what."""
+"""The first screen of a page: measured or predicted accuracy, and contradictions."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from pcfix.compare.statistics import own_of, statistics_of
 from pcfix.report.first_screen import Survey, accuracy_tile, notes_of, water_words
 
 KNOWN = Survey("", "", "a CRS", "a datum")
+FIT = {"model": "level", "level_m": 0.3694, "sigma_level_m": 0.012, "tilt_percent": 0.0}
 
 
 def summary(sigma=0.05, **more):
@@ -33,23 +34,24 @@ def compared(bias, scatter, count=100):
 
 
 @pytest.mark.parametrize(
-    ("scatter", "said"), [(0.05, ""), (0.07, ""), (0.1, "larger"), (0.02, "smaller")]
+    ("sigma", "bias", "scatter", "count", "words"),
+    [
+        (0.05, 0.0, 0.05, 100, []),
+        (0.05, 0.0, 0.07, 100, []),
+        (0.05, 0.0, 0.1, 100, ["larger"]),
+        (0.05, 0.0, 0.02, 100, ["smaller"]),
+        (0.05, 0.0, 0.1, 50, []),  # too few
+        (0.08, 0.04, 0.05, 100, []),
+        (0.1, -0.09, 0.05, 100, ["too low by 0.090 m"]),
+    ],
 )
-def test_a_measured_error_that_contradicts_the_predicted_one_is_said_to(scatter, said):
-    notes = " ".join(notes_of(summary(), KNOWN, compared(0.0, scatter)))
-    assert ("are larger than the predicted" in notes) == (said == "larger")
-    assert ("are smaller than the predicted" in notes) == (said == "smaller")
-    few = notes_of(summary(), KNOWN, compared(0.0, scatter, 50))
-    assert few == []  # too few to say
+def test_contradictions(sigma, bias, scatter, count, words):
+    notes = notes_of(summary(sigma), KNOWN, compared(bias, scatter, count))
+    assert len(notes) == len(words)
+    assert all(word in note for word, note in zip(words, notes, strict=True))
 
 
-def test_a_bias_beyond_the_scatter_is_said():
-    assert notes_of(summary(0.08), KNOWN, compared(0.04, 0.05)) == []
-    notes = notes_of(summary(0.1), KNOWN, compared(-0.09, 0.05))
-    assert len(notes) == 1 and "too low as a whole by 0.090 m" in notes[0]
-
-
-def test_measured_and_predicted_are_called_so():
+def test_tags():
     measured, predicted = (accuracy_tile(summary(), of) for of in (compared(0.01, 0.05), {}))
     assert (measured.tag, predicted.tag) == ("measured", "predicted")
     assert measured.figures[:2] == [("bias", "+0.010 m"), ("RMSE", "0.051 m")]
@@ -57,23 +59,19 @@ def test_measured_and_predicted_are_called_so():
     assert "lidar.laz" in measured.notes[0] and "/far" not in measured.notes[0]
     nothing = accuracy_tile(summary(uncertainty=None), {})
     assert (nothing.tag, nothing.figures) == ("predicted", [("RMSE", "not known")])
+    assert len(notes_of(summary(), Survey(), {})) == 2  # no reference, no vertical datum
 
 
-def test_what_is_not_known_is_said():
-    notes = notes_of(summary(), Survey(), {})
-    assert [note.split(":")[0] for note in notes] == [
-        "No reference", "The vertical datum is not known",
-    ]  # fmt: skip
-    assert "vertical datum not known" in Survey().place
-
-
-def test_the_origin_of_the_water_is_said():
-    fit = {"model": "level", "level_m": 0.3694, "sigma_level_m": 0.012, "tilt_percent": 0.0}
-    points = {"accepted": 30, "points": 32}
-    assert "as given; standard error 0.020 m (assumed)" in water_words(summary())
-    fitted = water_words(summary(water_fit={**fit, **points}))
-    assert fitted.startswith("level 0.369 m, fitted to 30 of 32 points; standard error 0.012 m")
-    found = water_words(summary(water_fit={**fit, "model": "auto"}))
-    assert "found in the cloud" in found
-    stated = {**summary().settings, "sigma_level": 0.05}
-    assert "0.050 m (as stated)" in water_words(summary(water_fit=fit, settings=stated))
+@pytest.mark.parametrize(
+    ("fit", "sigma_level", "words"),
+    [
+        (None, None, ("level 0.37 m, as given", "0.020 m (assumed)")),
+        (FIT | {"accepted": 30, "points": 32}, None, ("0.369 m, fitted to 30 of 32", "0.012 m")),
+        (FIT | {"model": "auto"}, None, ("found in the cloud",)),
+        (FIT, 0.05, ("0.050 m (as stated)",)),
+    ],
+)
+def test_origin_of_water(fit, sigma_level, words):
+    settings = {**summary().settings, "sigma_level": sigma_level}
+    found = water_words(summary(water_fit=fit, settings=settings))
+    assert all(word in found for word in words)

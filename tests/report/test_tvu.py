@@ -1,4 +1,4 @@
-"""Standard errors in the terms of IHO S-44: shares by hand, words that say what was assumed."""
+"""Standard errors in the terms of IHO S-44."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import json
 from dataclasses import asdict, replace
 from pathlib import Path
 
-import laspy
 import numpy as np
 import pytest
 
@@ -19,7 +18,9 @@ from pcfix.report.run import tvu_figure
 from pcfix.report.text import (
     FEWEST,
     budget_words,
+    formal_words,
     strictest_order,
+    summary_rows,
     summary_text,
     tvu_sentence,
     uncertainty_sentence,
@@ -35,7 +36,7 @@ BY_HAND = {
 
 
 @pytest.mark.parametrize("order", ORDERS, ids=lambda order: order.name)
-def test_largest_tvu_is_that_of_the_standard(order):
+def test_largest_tvu(order):
     found = largest_tvu_m(order, np.array([0.0, 40.0]))
     np.testing.assert_allclose(found, BY_HAND[order.name], atol=5e-5)  # as it is printed there
 
@@ -54,47 +55,45 @@ def test_shares_and_percentiles():
     assert found["sigma_z_m"] == {"mean": 0.24, "p5": 0.05, "p50": 0.15, "p95": 0.6, "max": 0.6}
     assert found["tvu_95_m"]["mean"] == pytest.approx(1.96 * 0.24, abs=5e-5)
     json.dumps(found)
+    deep = tally_of(np.full(2, 0.1), np.array([0.0, 20.0]))  # TVU 0.196 m; 0.2121 m at 20 m
+    assert deep["s44"]["Exclusive"] == 0.5
 
 
-def test_depth_allows_more():
-    found = tally_of(np.full(2, 0.1), np.array([0.0, 20.0]))  # TVU 0.196 m; 0.2121 m at 20 m
-    assert found["s44"]["Exclusive"] == 0.5
-
-
-def test_chunks_do_not_matter():
+def test_chunks():
     rng = np.random.default_rng(0)
     sigma, depth = rng.gamma(2.0, 0.05, 10_000), rng.uniform(0.0, 10.0, 10_000)
     assert tally_of(sigma, depth) == tally_of(sigma, depth, parts=7)
     p95 = tally_of(sigma, depth)["sigma_z_m"]["p95"]
     assert p95 == pytest.approx(np.percentile(sigma, 95), abs=0.001)  # a bin
+    assert tally_of(np.zeros(3), np.ones(3)) is UncertaintyTally().as_dict() is None
 
 
-def test_nothing_is_said_without_standard_errors():
-    assert UncertaintyTally().as_dict() is None
-    assert tally_of(np.zeros(3), np.ones(3)) is None
+@pytest.mark.parametrize(
+    ("shares", "order"),
+    [((0.5, 0.9499, 0.95, 1.0), "1a/1b"), ((0.95, 1.0, 1.0, 1.0), "Exclusive"), ((0.0,) * 4, None)],
+)
+def test_strictest_order(shares, order):
+    found = {"s44": dict(zip(BY_HAND, shares, strict=True))}
+    assert strictest_order(found) == order
+    assert (order or "fewer than 95 %") in tvu_sentence(found)
 
 
-def test_the_strictest_order_holds_95_percent():
-    shares = {"Exclusive": 0.5, "Special": 0.9499, "1a/1b": 0.95, "2": 1.0}
-    assert strictest_order({"s44": shares}) == "1a/1b"
-    assert "95 % of the points" in tvu_sentence({"s44": shares})
-    assert "order 1a/1b" in tvu_sentence({"s44": shares})
-    none = {"s44": dict.fromkeys(shares, 0.0)}
-    assert strictest_order(none) is None
-    assert "fewer than 95 %" in tvu_sentence(none)
+@pytest.mark.parametrize(
+    ("changes", "fitted", "words"),
+    [
+        ({}, None, "level 0.020 m (assumed)"),
+        ({}, 0.007, "level 0.007 m (fitted)"),
+        ({}, float("nan"), "level 0.020 m (assumed)"),
+        ({"sigma_level": 0.1}, 0.007, "level 0.100 m,"),
+        ({"sigma_waves": 2.0}, None, "waves 2 deg"),
+    ],
+)
+def test_budget_words(changes, fitted, words):
+    assert words in budget_words(asdict(replace(BudgetOptions(), **changes)), fitted)
+    assert "waves" not in budget_words(asdict(BudgetOptions()))
 
 
-def test_words_name_what_was_assumed():
-    errors = BudgetOptions()
-    assert "level 0.020 m (assumed)" in budget_words(asdict(errors))
-    assert "level 0.007 m (fitted)" in budget_words(asdict(errors), 0.007)
-    assert "level 0.020 m (assumed)" in budget_words(asdict(errors), float("nan"))
-    assert "level 0.100 m," in budget_words(asdict(replace(errors, sigma_level=0.1)), 0.007)
-    assert "waves" not in budget_words(asdict(errors))
-    assert "waves 2 deg" in budget_words(asdict(replace(errors, sigma_waves=2.0)))
-
-
-def test_the_picture_can_be_drawn():
+def test_figure():
     rng = np.random.default_rng(0)
     for points in (1, 500):
         depth, sigma = rng.uniform(0.0, 8.0, points), rng.uniform(0.01, 0.2, points)
@@ -103,7 +102,7 @@ def test_the_picture_can_be_drawn():
     assert png_of(tvu_figure(depth, sigma, bins)).startswith(b"\x89PNG")
 
 
-def test_measured_tvu_is_that_of_differences_of_either_sign():
+def test_measured_tvu():
     # 21 from 0 to 0.20 m at the surface, of which 16 are within 0.15 m, and 0.20 m at 20 m
     error, depth = np.append(np.arange(21) * 0.01, -0.2), np.append(np.zeros(21), 20.0)
     found = tvu_of(error, depth)
@@ -119,43 +118,36 @@ def summary(tmp_path_factory):
     return pcfix.correct_file(scene / "cloud.laz", out, cameras=scene / "cameras.csv", water=0.37)
 
 
-def test_what_was_measured_is_said_instead_of_what_was_predicted(summary):
-    assert "no order is claimed: the poses were not checked" in uncertainty_sentence(summary)
+def test_measured_replaces_predicted(summary):
+    assert summary.why_no_order in uncertainty_sentence(summary)
     predicted = uncertainty_sentence(replace(summary, poses={"absorbed": False}))
-    assert "formal" in predicted and "Exclusive Order" in predicted
+    assert "predicted" in predicted and "Exclusive Order" in predicted
     far = asdict(tvu_of(np.full(100, 0.3), np.full(100, 2.0)))
-    said = uncertainty_sentence(summary, far)
+    found = uncertainty_sentence(summary, far)
     mean = summary.uncertainty["tvu_95_m"]["mean"]
-    assert f"predicted {mean:.3f} m on average, measured 0.300 m at 100 points" in said
-    assert "order 1a/1b" in said and "Exclusive" not in said
+    assert f"predicted {mean:.3f} m on average, measured 0.300 m at 100 points" in found
+    assert "order 1a/1b" in found and "Exclusive" not in found
     assert "predicted" not in uncertainty_sentence(replace(summary, uncertainty=None), far)
     few = asdict(tvu_of(np.full(FEWEST - 1, 0.01), np.full(FEWEST - 1, 2.0)))
     assert f"fewer than {FEWEST} points claim no order" in uncertainty_sentence(summary, few)
 
 
-def test_what_the_cloud_adds_is_said(summary):
+def test_model_uncertainty(summary):
     made = summary.made
-    doubt = {"scatter_m": made["scatter_m"], "per_depth": made["doubt_per_depth"]}
-    assert summary.uncertainty["of_cloud"] == doubt
-    percent = 100.0 * doubt["per_depth"]
-    assert percent > 0.0
-    text = summary_text(summary)
-    assert f"m of scatter and {percent:.1f} % of the depth; S-44 asks" in text
-    assert "no mismatches" not in text
+    found = {"scatter_m": made["scatter_m"], "per_depth": made["doubt_per_depth"]}
+    assert summary.uncertainty["of_cloud"] == found
+    assert found["per_depth"] > 0.0
+    assert f"model uncertainty {100.0 * found['per_depth']:.1f} % of depth" in formal_words(summary)
     assert Tally(1).uncertainty(made) is None
 
 
-def test_a_run_says_what_it_assumed(tmp_path):
-    scene = Path(__file__).parents[2] / "samples" / "scene"
-    cloud, cameras = scene / "cloud.laz", scene / "cameras.csv"
-    summary = pcfix.correct_file(
-        cloud, tmp_path / "c.laz", cameras=cameras, water=0.37, dimensions="all"
+def test_summary_rows(summary):
+    rows = dict(summary_rows(summary))
+    assert rows["Submerged"] == "14,736 points (74 %), all corrected"
+    assert (
+        rows["Uncertainty"]
+        == f"{summary.uncertainty['tvu_95_m']['mean']:.3f} m at 95 % (predicted)"
     )
-    tally = UncertaintyTally()
-    written = laspy.read(tmp_path / "c.laz")
-    moved = np.asarray(written["RayCount"]) > 0
-    tally.add(np.asarray(written["SigmaZ"])[moved], np.asarray(written["WaterDepth"])[moved])
-    text = summary_text(replace(summary, uncertainty=tally.as_dict()))
-    assert "predicted standard error of Z" in text and "and no mismatches" in text
-    assert "TVU at 95 %" in text and "it assumes image 0.5 px, level 0.020 m (assumed)" in text
-    assert "uncertainty" not in summary_text(replace(summary, uncertainty=None))
+    assert "Uncertainty" not in dict(summary_rows(replace(summary, uncertainty=None)))
+    lines = summary_text(summary).splitlines()
+    assert lines[0].startswith("Corrected ") and all(len(line) < 160 for line in lines[1:-3])

@@ -27,7 +27,7 @@ MICROMETRE = 1e-6
         {"bed": "steps", "area_m": (4, 2), "flying_height_m": 2.0, "greatest_depth_m": 0.3},
     ],
 )
-def test_without_refraction_and_noise_the_truth_comes_home(kind, more):
+def test_truth_without_refraction(kind, more):
     scene = pcfix.simulate_scene(
         150, cloud=kind, index=1.0, image_noise=0.0, lidar_per_m2=0.1, **more
     )
@@ -82,7 +82,7 @@ def views_of(scene, i):
     return scene.views.camera[scene.views.start[i] : scene.views.start[i + 1]]
 
 
-def test_tracks_agree_with_a_slow_twin():
+def test_tracks_twin():
     scene = pcfix.simulate_scene(60, image_noise=0.0, tilt_percent=1.0, detection=0.7, **POSES)
     twin = Twin(scene)
     for i in range(0, 60, 10):
@@ -90,7 +90,7 @@ def test_tracks_agree_with_a_slow_twin():
         assert twin.xyz[i] == pytest.approx(slow, abs=1e-5)  # scipy stops at 1e-8 of a focal length
 
 
-def test_pairs_agree_with_a_slow_twin():
+def test_pairs_twin():
     scene = pcfix.simulate_scene(60, cloud="pairs", image_noise=0.0, tilt_percent=1.0, **POSES)
     twin = Twin(scene)
     for i in (5, 33, 59):
@@ -106,7 +106,7 @@ def test_pairs_agree_with_a_slow_twin():
         assert twin.xyz[i] == pytest.approx(np.median(slow, axis=0), abs=1e-4)
 
 
-def test_depth_maps_agree_with_a_slow_twin(monkeypatch):
+def test_depth_maps_twin(monkeypatch):
     """Fermat and scipy, loops over images, and groups as sets."""
     settings = {"bed": "flat", "image_noise": 0.0, "tilt_percent": 1.0, **POSES}
     kept = []
@@ -230,7 +230,7 @@ def depth_of(twin, scene, k, fused, bed, shown):
     return place, depth, origin + depth * ray
 
 
-def test_depth_maps_see_every_bed_at_about_the_same_place():
+def test_depth_maps():
     scene = pcfix.simulate_scene(400, cloud="depth-maps", image_noise=0.3, obliques_deg=25.0)
     made = np.diff(scene.views.start) > 0
     assert made.mean() > 0.95
@@ -245,7 +245,7 @@ def test_depth_maps_see_every_bed_at_about_the_same_place():
     assert 0.3 < ratio.min() < np.median(ratio) < 1 / 1.34
 
 
-def test_neighbours_look_at_about_ten_degrees():
+def test_neighbours():
     scene = pcfix.simulate_scene(300, cloud="depth-maps", forward_overlap=0.9)
     best = scene.neighbours[:, 0]
     assert (best >= 0).all()
@@ -259,7 +259,7 @@ def test_neighbours_look_at_about_ten_degrees():
         assert len(set(known)) == len(known)
 
 
-def test_pose_noise_is_as_asked():
+def test_pose_noise():
     scene = pcfix.simulate_scene(
         20, block="oblique", position_noise_m=0.2, attitude_noise_deg=0.3, lidar_per_m2=0
     )
@@ -275,7 +275,7 @@ def test_pose_noise_is_as_asked():
     assert np.array_equal(calm.views.camera, scene.views.camera)
 
 
-def test_detection_is_as_asked_and_leaves_three():
+def test_detection():
     every = pcfix.simulate_scene(800, lidar_per_m2=0)
     some = pcfix.simulate_scene(800, lidar_per_m2=0, detection=0.6)
     share = len(some.views.camera) / len(every.views.camera)

@@ -19,28 +19,25 @@ KINDS = ("tracks", "pairs", "depth-maps")
 def written(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene")
     scene = pcfix.simulate_scene(
-        300,
-        cloud=request.param,
-        tilt_percent=0.7,
+        300, cloud=request.param, tilt_percent=0.7, position_noise_m=0.02, lidar_per_m2=0.2,
         distortion=(-0.05, 0.02, -0.003, 0.0006, -0.0004),
-        position_noise_m=0.02,
-        lidar_per_m2=0.2,
-    )
+    )  # fmt: skip
     write_scene(scene, folder, overwrite=False)
     return scene, folder
 
 
-def test_files_are_those_that_are_listed(written):
+def test_files(written):
     scene, folder = written
     facts = json.loads((folder / "scene.json").read_text())
     assert {path.name for path in folder.iterdir()} == facts["files"].keys() >= FILES.keys()
     assert facts["files"].items() <= (FILES | OTHERS).items()
     assert facts["arguments"]["tilt_percent"] == 0.7
-    with pytest.raises(pcfix.SettingError, match="exists"):
+    assert pcfix.read_water(facts["water"]) == scene.water
+    with pytest.raises(pcfix.SettingError):
         write_scene(scene, folder, overwrite=False)
 
 
-def test_cameras_come_back(written):
+def test_cameras(written):
     scene, folder = written
     for name, cameras in (("cameras", scene.cameras), ("true_cameras", scene.true_cameras)):
         read = pcfix.read_cameras(folder / f"{name}.csv")
@@ -52,7 +49,7 @@ def test_cameras_come_back(written):
         assert read.lenses[0].focal == cameras.lenses[0].focal
 
 
-def test_view_list_comes_back(written):
+def test_views(written):
     scene, folder = written
     name = "fused.ply.vis" if scene.views.weight is None else "dense.ply"
     raw = read_views(folder / name, pcfix.read_cameras(folder / "cameras.csv")).raw
@@ -63,7 +60,7 @@ def test_view_list_comes_back(written):
         assert np.array_equal(raw.xyz, scene.xyz)
 
 
-def test_clouds_come_back_in_the_world_frame(written):
+def test_clouds(written):
     scene, folder = written
     for name, xyz in (("cloud", scene.xyz), ("truth", scene.true_xyz), ("lidar", scene.lidar_xyz)):
         read = laspy.read(folder / f"{name}.laz")
@@ -71,13 +68,7 @@ def test_clouds_come_back_in_the_world_frame(written):
     assert np.array_equal(read.classification == 40, scene.depth_m(scene.lidar_xyz) > 0.0)
 
 
-def test_water_of_the_facts_is_what_the_reader_takes(written):
-    scene, folder = written
-    facts = json.loads((folder / "scene.json").read_text())
-    assert pcfix.read_water(facts["water"]) == scene.water
-
-
-def test_pairs_and_neighbours_come_back(written):
+def test_pairs(written):
     scene, folder = written
     if scene.neighbours is not None:
         rows = (folder / "neighbours.csv").read_text().splitlines()
@@ -91,7 +82,7 @@ def test_pairs_and_neighbours_come_back(written):
 
 
 @pytest.mark.parametrize("longest", [3, 300])
-def test_lists_of_any_length_and_none(tmp_path, longest):
+def test_view_lists(tmp_path, longest):
     counts = np.array([0, longest, 2, 0])
     camera = np.concatenate([np.arange(longest), [4, 1]])
     weight = np.linspace(0.1, 1, longest + 2).astype(np.float32)
@@ -106,7 +97,7 @@ def test_lists_of_any_length_and_none(tmp_path, longest):
         assert np.array_equal(raw.image, camera)
 
 
-def test_a_flume_keeps_a_tenth_of_a_millimetre(tmp_path):
+def test_flume_step(tmp_path):
     scene = pcfix.simulate_scene(
         100, bed="steps", area_m=(4, 2), flying_height_m=2.0, greatest_depth_m=0.3, lidar_per_m2=9
     )
@@ -114,22 +105,16 @@ def test_a_flume_keeps_a_tenth_of_a_millimetre(tmp_path):
     assert np.abs(laspy.read(tmp_path / "cloud.laz").xyz - scene.xyz).max() < 0.000051
 
 
-def test_the_command_says_what_python_says(tmp_path):
+def test_command(tmp_path):
     words = "--points 150 --obliques-deg 35 --area-m 60 40 --bed river --cloud pairs"
     words += " --wave-slope-deg 1.5 --distortion -0.03 0 0 0 0 --lidar-per-m2 0.5 --quiet"
     done = run_pcfix("simulate", tmp_path, *words.split())
     assert done.returncode == 0, done.stderr
     facts = json.loads((tmp_path / "scene.json").read_text())
     scene = pcfix.simulate_scene(
-        150,
-        obliques_deg=35.0,
-        area_m=(60, 40),
-        bed="river",
-        cloud="pairs",
-        wave_slope_deg=1.5,
-        distortion=(-0.03, 0, 0, 0, 0),
-        lidar_per_m2=0.5,
-    )
+        150, obliques_deg=35.0, area_m=(60, 40), bed="river", cloud="pairs", wave_slope_deg=1.5,
+        distortion=(-0.03, 0, 0, 0, 0), lidar_per_m2=0.5,
+    )  # fmt: skip
     assert facts["arguments"] == scene.settings
     cloud = laspy.read(tmp_path / "cloud.laz")
     assert np.abs(cloud.xyz - scene.xyz).max() < 0.00051

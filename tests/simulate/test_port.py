@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pcfix.port.shapes import DomePort, FlatPort
-from tests.utils.port_scenes import fermat_directions, simulate_port
+from tests.utils.port_scenes import fermat_directions
 
 
 def test_flat_port_obeys_snell():
@@ -29,22 +29,3 @@ def test_thin_dome_obeys_snell():
     port = DomePort(0.05, 0.0, 1.49, tuple(centre))
     (w,) = fermat_directions((at + towards)[None], port, 1.34)
     assert w == pytest.approx([1.0, 0.0, 0.0], abs=1e-10)
-
-
-def test_scene_is_repeatable_and_complete():
-    port = FlatPort(0.02, 0.008)
-    one, two = (simulate_port(port, points=200, noise_px=0.5, seed=4) for _ in range(2))
-    assert one.image_xy.tobytes() == two.image_xy.tobytes()
-    assert np.diff(one.views.start).min() >= 2
-    assert len(one.image_xy) == len(one.views.camera) == one.views.start[-1]
-    assert len(one.truth) == len(one.apparent) == len(one.views.start) - 1
-    clean = simulate_port(port, points=200, seed=4)
-    assert (one.image_xy - clean.image_xy).std() == pytest.approx(0.5, rel=0.05)
-
-
-def test_flat_port_brings_the_bed_nearer():
-    # about by n, seen from straight above
-    scene = simulate_port(FlatPort(0.02), points=500)
-    height = scene.cameras.centres[:, 2].mean()
-    ratio = (height - scene.truth[:, 2]) / (height - scene.apparent[:, 2])
-    assert 1.2 < np.median(ratio) < 1.5

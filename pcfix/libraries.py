@@ -1,0 +1,68 @@
+"""Import libraries that may be missing: those of extras, and open3d with its libusb."""
+
+import ctypes
+import importlib
+import sys
+from pathlib import Path
+from typing import Any
+
+from pcfix.errors import InputError
+
+
+def installing(extra: str) -> str:
+    """Return the command that installs an extra, from a checkout too."""
+    root = Path(__file__).parents[1]
+    what = f"-e '{root}[{extra}]'" if (root / "pyproject.toml").is_file() else f"'pcfix[{extra}]'"
+    return f"{sys.executable} -m pip install {what}"
+
+
+def optional_library(name: str, extra: str, who: str) -> Any:
+    """Import a library of an extra.
+
+    Raises
+    ------
+    InputError
+        ``library.missing``, with the command that installs the extra.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise InputError(
+            "library.missing",
+            f"{who} needs {name}, which is not installed. Run: {installing(extra)}",
+            library=name,
+            extra=extra,
+        ) from error
+
+
+def photo_library(name: str) -> Any:
+    """Import a library of the extra ``photos``."""
+    return optional_library(name, "photos", "Work on photographs")
+
+
+def load_open3d(part: str = "open3d") -> Any:
+    """Import open3d, or a part of it, with libusb-1.0.
+
+    The camera drivers in open3d link to libusb-1.0 of the system, which servers often lack; the
+    one in the package libusb-package serves as well.
+
+    Raises
+    ------
+    InputError
+        ``library.missing``, with what to install.
+    """
+    try:
+        try:
+            import libusb_package
+
+            ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
+        except (ImportError, OSError):
+            pass  # the libusb of the system may do
+        return importlib.import_module(part)
+    except (ImportError, OSError) as error:
+        raise InputError(
+            "library.missing",
+            f"open3d cannot be loaded ({error}). On Debian and Ubuntu: apt-get install"
+            " libusb-1.0-0 libgl1 libegl1 libgomp1 libx11-6.",
+            library="open3d",
+        ) from error
