@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.adjust.diagnosis import Diagnosis
-from pcfix.adjust.evidence import Evidence
+from pcfix.adjust.diagnosis import Diagnosis, Evidence
 from pcfix.errors import InputError, SettingError, shown_once
 from pcfix.flow.diagnosis import (
     diagnose,
