@@ -241,16 +241,13 @@ def check_datum(block: Block, unknowns: Unknowns, reason: str = "") -> None:
     fixed = len(set(unknowns.fixed_images) & set(block.cameras.labels))
     if gnss + control >= 3 or fixed >= 2:
         return
-    raise GeometryError(
-        "adjust.no_datum",
+    words = (
         f"Position, orientation and scale of the block are undetermined: {gnss} GNSS positions,"
         f" {control} control points in two or more images, {fixed} fixed images. Give --gnss or"
         " --gcps with three points or more, or --datum free to keep the mean of the original"
-        " projection centres." + (f" {reason}" if reason else ""),
-        gnss=gnss,
-        control=control,
-        fixed=fixed,
+        " projection centres." + (f" {reason}" if reason else "")
     )
+    raise GeometryError("adjust.no_datum", words, gnss=gnss, control=control, fixed=fixed)
 
 
 # Lens parameters
@@ -436,12 +433,11 @@ def block_of(material: Material, ties: TiePoints, sigma_px: float) -> Block:
         xyz = np.where(bare[:, None], true_start(places, water, n, under_water), xyz)
         if np.isnan(xyz).any():
             name = control.names[int(np.argmax(np.isnan(xyz).any(axis=1)))]
-            raise GeometryError(
-                "gcps.no_coordinates",
+            words = (
                 f"Point {name} has no coordinates and its image rays do not intersect."
-                " Mark it in at least two images from different directions.",
-                point=name,
+                " Mark it in at least two images from different directions."
             )
+            raise GeometryError("gcps.no_coordinates", words, point=name)
     return replace(
         block,
         xyz=np.vstack([block.xyz, xyz]),
@@ -527,14 +523,12 @@ def gnss_with_sigma(
     typical = float(np.median(sigma[np.isfinite(sigma)]))
     if np.abs(mean).max() > max(MOST_OFFSET_M, MOST_OFFSET_SIGMAS * typical):
         x, y, z = (-mean).tolist()
-        raise GeometryError(
-            "gnss.offset",
+        words = (
             f"{name}: the GNSS positions lie on average {x:.2f}, {y:.2f}, {z:.2f} m (x, y, z) from"
             " the projection centres, so they have another datum or CRS (ellipsoidal heights?)."
-            " Name it with --gnss-crs, or transform the positions or the model.",
-            path=name,
-            offset_m=[x, y, z],
+            " Name it with --gnss-crs, or transform the positions or the model."
         )
+        raise GeometryError("gnss.offset", words, path=name, offset_m=[x, y, z])
     return GnssPositions(found.xyz, sigma, None), notes
 
 

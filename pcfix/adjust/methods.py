@@ -157,12 +157,11 @@ def by_cloud(
             original = some_cameras(material.original, kept)
             candidates.append(Candidate(name, restricted(block, kept), original, apparent))
     if not candidates:
-        raise GeometryError(
-            "cameras.no_overlap",
+        words = (
             f"{material.name}: the images do not see the cloud. Check the poses with 'pcfix cameras"
-            " --cloud'.",
-            path=material.name,
+            " --cloud'."
         )
+        raise GeometryError("cameras.no_overlap", words, path=material.name)
     _check_wet(material.water, candidates[0].block.xyz)
     sets = [_lens_of(material, rules)]
     if rules.lens_unknowns is None and material.calibrated is None:
@@ -181,26 +180,22 @@ def _check_wet(water: WaterSurface | None, xyz: FloatArray) -> None:
         return
     below = int((surface_above(water, xyz).height_m > xyz[:, 2]).sum())
     if below < SMALL_WATER:
-        raise GeometryError(
-            "water.below_points",
+        words = (
             f"Only {below} of {len(xyz):,} points lie below the water, so there is no refraction to"
-            " adjust. Check the water level, or use an ordinary bundle adjustment.",
-            wet=below,
-            points=len(xyz),
+            " adjust. Check the water level, or use an ordinary bundle adjustment."
         )
+        raise GeometryError("water.below_points", words, wet=below, points=len(xyz))
 
 
 def _well_seen(name: str, block: Block) -> tuple[IntArray, list[PcfixWarning]]:
     """Return the rows of the images that can be adjusted, and a warning about others."""
     kept, count = well_seen(block), len(block.cameras)
     if len(kept) < 2:
-        raise GeometryError(
-            "ties.few_images",
+        words = (
             f"{name}: only {len(kept)} of {count} images have enough observations for a pose. Give"
-            " a model with more tie points.",
-            path=name,
-            images=len(kept),
+            " a model with more tie points."
         )
+        raise GeometryError("ties.few_images", words, path=name, images=len(kept))
     lost = np.setdiff1d(np.arange(count), kept)
     if not len(lost):
         return kept, []
@@ -217,12 +212,11 @@ def check_images(
     """Check that the fixed images exist, and that the cameras are above the water."""
     missing = [label for label in fixed_images if label not in cameras.labels]
     if missing:
-        raise SettingError(
-            "adjust.fixed_image",
+        words = (
             f"Fixed image {missing[0]} is not in the model, which has {len(cameras)} images (first"
-            f" {cameras.labels[0]}).",
-            image=missing[0],
+            f" {cameras.labels[0]})."
         )
+        raise SettingError("adjust.fixed_image", words, image=missing[0])
     if water is None:
         return
     level = surface_above(water, cameras.centres).height_m
@@ -271,14 +265,12 @@ def check_marks(
     height = float(np.median(cameras.centres[:, 2]) - np.nanmedian(control.xyz[:, 2]))
     if is_placed and np.abs(middle).max() > ELSEWHERE * height > 0.0:
         x, y, z = (-middle).tolist()
-        raise GeometryError(
-            "gcps.offset",
+        words = (
             f"{name}: the control points lie {x:.1f}, {y:.1f}, {z:.1f} m (x, y, z; median) from the"
             " intersections of their marks, while the GNSS positions fit. One of the two has"
-            " another CRS or height datum; name it with --gcps-crs or --gnss-crs.",
-            path=name,
-            offset_m=[x, y, z],
+            " another CRS or height datum; name it with --gcps-crs or --gnss-crs."
         )
+        raise GeometryError("gcps.offset", words, path=name, offset_m=[x, y, z])
     worst = int(np.argmax(np.where(met, apart, 0.0)))
     if apart[worst] > ELSEWHERE * height > 0.0:
         raise GeometryError(
@@ -303,13 +295,11 @@ def _check_dry(water: WaterSurface | None, found: Adjusted) -> list[PcfixWarning
         return []
     few = f"Only {above} of {count:,} points lie above the water"
     if any(found.unknowns.water_sigma):
-        raise GeometryError(
-            "water.no_land",
+        words = (
             f"{few}, so level, tilt and index cannot be separated from the height of the block."
-            " Fix the water.",
-            land=above,
-            points=count,
+            " Fix the water."
         )
+        raise GeometryError("water.no_land", words, land=above, points=count)
     words = f"{few}, so only GNSS and control points determine the heights of the bed."
     return [PcfixWarning("water.no_land", words, land=above, points=count)]
 
@@ -334,15 +324,12 @@ def check_control(found: Adjusted, name: str) -> None:
     worst = int(np.argmax(np.where(gross, px, 0.0)))
     others = int(gross.sum()) - 1
     point = block.control_names[rows[worst] - block.tie_points]
-    raise GeometryError(
-        "gcps.gross_error",
+    words = (
         f"{name}: control point {point} does not fit: its error is {px[worst]:.0f} px or"
         f" {sigmas[worst]:.0f} standard deviations{f' ({others} more do not)' if others else ''}."
-        f" {_REMEDY}",
-        path=name,
-        point=point,
-        off_px=float(px[worst]),
+        f" {_REMEDY}"
     )
+    raise GeometryError("gcps.gross_error", words, path=name, point=point, off_px=float(px[worst]))
 
 
 def _error_of(found: Adjusted, point: int) -> tuple[float, float]:

@@ -23,7 +23,6 @@ from scipy.special import chdtri
 from pcfix.adjust.block import (
     CODES,
     INDEX,
-    MOTIONS,
     PORT,
     SHAPE,
     WATER_NAMES,
@@ -56,12 +55,6 @@ wait for one another for a third of a second."""
 SINGULAR = 1e-13
 """Reciprocal condition of the scaled matrix below which its inverse is meaningless."""
 
-BLOCK_MOTIONS = (
-    "the mean height of the projection centres",
-    "the mean tilt of the projection centres along x",
-    "the mean tilt of the projection centres along y",
-)
-
 
 class SharedUnknown(NamedTuple):
     """A shared unknown: its name, the correction to its start value, and its standard error.
@@ -89,8 +82,6 @@ class Precision:
     shared : tuple of SharedUnknown, length g
     correlation : array, shape (g, g)
         Of the shared unknowns.
-    block_correlation : array, shape (g, 3)
-        Of the shared unknowns with `BLOCK_MOTIONS`; zero if these are fixed.
     point_covariance_m2 : array, shape (m, 6), or None
         xx, xy, xz, yy, yz, zz, world frame; NaN for points that their observations do not fix.
         None for very large blocks.
@@ -103,7 +94,6 @@ class Precision:
     pose_covariance: FloatArray
     shared: tuple[SharedUnknown, ...]
     correlation: FloatArray
-    block_correlation: FloatArray
     point_covariance_m2: FloatArray | None
     notes: tuple[PcfixWarning, ...] = ()
     members: Members | None = None
@@ -154,7 +144,6 @@ def precision_of(
     active, k, g = reduced.active, len(state.centres), given.shared
     times = np.ones(6 + g) if factor is None else factor
     each = np.concatenate([np.tile(times[:6], k), times[6:]])[active]
-    wanted = _wanted(problem, solution)[active] * each[:, None]
     variance = sigma0 * sigma0
     notes: list[PcfixWarning] = []
     points: FloatArray | None = None
@@ -171,17 +160,18 @@ def precision_of(
         inverse = _inverse(reduced)
         if inverse is None:
             raise singular(problem, solution)
-        of_wanted = wanted.T @ inverse @ wanted
         inverse *= each
         inverse *= each[:, None]
+        of_shared = inverse[len(active) - g :, len(active) - g :]
         poses = _pose_blocks(problem, solution, active, inverse)
         points = variance * point_covariances(state, given, active, inverse)
         members = members_of(problem, solution, active, sigma0 * drawn(inverse))
     else:
-        found = _by_parts(reduced, k, wanted)
+        found = _by_parts(reduced, k, g)
         if found is None:
             raise singular(problem, solution)
-        of_wanted, poses = found
+        of_shared, poses = found
+        of_shared *= times[6:] * times[6:, None]
         poses *= times[:6] * times[:6, None]
         notes.append(
             PcfixWarning(
@@ -191,31 +181,13 @@ def precision_of(
                 unknowns=len(active),
             )
         )
-    deviation = np.sqrt(np.maximum(np.diag(of_wanted), 0.0))
-    scale = np.divide(1.0, deviation, out=np.zeros_like(deviation), where=deviation > 0.0)
-    correlation = np.asarray(of_wanted * scale * scale[:, None])
-    sigma = np.sqrt(np.diag(of_wanted)[:g]) * sigma0
-    rows = zip(problem.names, solution.shared.tolist(), sigma.tolist(), strict=True)
+    sigma = np.sqrt(np.diag(of_shared))
+    correlation = of_shared / sigma / sigma[:, None]
+    rows = zip(problem.names, solution.shared.tolist(), (sigma * sigma0).tolist(), strict=True)
     return Precision(
         sigma0, variance * poses.reshape(k, 6, 6), tuple(SharedUnknown(*row) for row in rows),
-        correlation[:g, :g], correlation[:g, g:], points, tuple(notes), members,
+        correlation, points, tuple(notes), members,
     )  # fmt: skip
-
-
-def _wanted(problem: Problem, solution: Solution) -> FloatArray:
-    """Return shared unknowns and block motions as sums of all unknowns, shape (u, g + 3)."""
-    k, g, state = len(solution.state.centres), problem.given.shared, solution.state
-    rows = np.zeros((6 * k + g, g + 3))
-    rows[6 * k :, :g] = np.eye(g)
-    away = state.centres - state.centres.mean(axis=0)
-    fit = np.linalg.pinv(np.column_stack([np.ones(k), away[:, :2]]), rcond=1e-6)
-    if problem.given.similarity < 0:
-        rows[5 : 6 * k : 6, g:] = fit.T
-        return rows
-    at = 6 * k + problem.given.similarity
-    upward = pose_gradients(state, problem.given.pivot)[:, 5]
-    rows[at : at + 7, g:] = np.einsum("ak,kb->ba", fit, upward)
-    return rows
 
 
 def _inverse(reduced: Reduced) -> FloatArray | None:
@@ -265,21 +237,22 @@ def _pose_blocks(
     return poses
 
 
-def _by_parts(reduced: Reduced, k: int, wanted: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-    """Return covariances of what is wanted and of each pose, without the whole inverse."""
+def _by_parts(reduced: Reduced, k: int, g: int) -> tuple[FloatArray, FloatArray] | None:
+    """Return covariances of the shared unknowns and of each pose, without the whole inverse."""
     active, solve_for = reduced.active, solver(reduced)
     if solve_for is None:
         return None
-    of_wanted, poses = wanted.T @ solve_for(wanted), np.zeros((k, 6, 6))
+    u, poses = len(active), np.zeros((k, 6, 6))
+    of_shared = solve_for(np.eye(u, g, g - u))[u - g :]  # the last g unknowns
     first = np.flatnonzero(np.isin(active, 6 * np.arange(k)))
     for part in np.array_split(first, max(1, len(first) // 32)):
         rows = part[:, None] + np.arange(6)
-        unit = np.zeros((len(active), rows.size))
+        unit = np.zeros((u, rows.size))
         unit[rows.ravel(), np.arange(rows.size)] = 1.0
-        found = solve_for(unit).reshape(len(active), len(part), 6)
+        found = solve_for(unit).reshape(u, len(part), 6)
         poses[active[part] // 6] = found[rows, np.arange(len(part))[:, None]]
-    variances = np.concatenate([np.diag(of_wanted), np.einsum("kii->ki", poses).ravel()])
-    return (np.asarray(of_wanted), poses) if (variances >= 0.0).all() else None
+    variances = np.concatenate([np.diag(of_shared), np.einsum("kii->ki", poses).ravel()])
+    return (of_shared, poses) if (variances >= 0.0).all() else None
 
 
 # What is known poorly
@@ -312,11 +285,6 @@ def correlated(precision: Precision) -> list[PcfixWarning]:
                 beds = (names[j] in BED) + (name in BED)
                 remedy = ", or give control points at several heights" if beds == 1 else ""
                 pairs.append((r, words_of(names[j]), words_of(name), remedy))
-        for words, r in zip(BLOCK_MOTIONS, precision.block_correlation[i].tolist(), strict=True):
-            # a similarity has the shift of all poses as an unknown of its own
-            if abs(r) > STRONG and name not in MOTIONS:
-                how = "on land" if name in BED else "at several heights"
-                pairs.append((r, words_of(name), words, f", or give control points {how}"))
     return [
         PcfixWarning(
             "adjust.correlated",

@@ -163,12 +163,11 @@ def prepare(
     codes = [usable_codes(cameras.lenses[images[0]], unknowns.lens) for images in groups]
     if (unknowns.tilt_sigma or unknowns.shape_sigma) and isinstance(water, WaterMesh | WaterRaster):
         what = "tilt" if unknowns.tilt_sigma else "shape"
-        raise GeometryError(
-            "adjust.fixed_surface",
+        words = (
             f"The {what} of the water can be free for a level or plane only, not for a mesh or"
-            " raster.",
-            unknown=what,
+            " raster."
         )
+        raise GeometryError("adjust.fixed_surface", words, unknown=what)
     numbers = _surface_numbers(block, origin)
     planes, plane_names, axis, alike = _planes(block, origin, numbers)
     # columns of the shared unknowns: lenses, then surface and planes, then a similarity

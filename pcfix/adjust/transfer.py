@@ -198,13 +198,12 @@ def _in_unit_of(adjusted: Lens, original: Lens, label: str) -> Lens:
     """Return an original lens in the unit of the adjusted one."""
     factor = adjusted.width / original.width
     if not abs(factor * original.height / adjusted.height - 1.0) <= SAME_SHAPE:
-        raise GeometryError(
-            "adjusted_from.shape",
+        words = (
             f"--adjusted-from: image {label} has {original.width:g} x {original.height:g}"
             f" {original.unit}, but {adjusted.width:g} x {adjusted.height:g} {adjusted.unit} in the"
-            " cameras (undistorted?). Give the model from which the cameras were adjusted.",
-            image=label,
+            " cameras (undistorted?). Give the model from which the cameras were adjusted."
         )
+        raise GeometryError("adjusted_from.shape", words, image=label)
     if factor == 1.0:
         return original
     lengths = ("focal", "width", "height", "principal_x", "principal_y", "b1", "b2", "b3")
@@ -324,14 +323,12 @@ class CloudTransfer(Sums):
         if height <= 0.0 or apart.max() <= most:
             return
         if middle > most:
-            raise GeometryError(
-                "adjusted_from.apart",
+            words = (
                 f"--adjusted-from: its cameras are {middle:,.0f} m from the adjusted ones (median;"
                 f" flying height {height:,.0f} m). Check both files, --cameras-crs and"
-                " --cameras-offset, which count for the file that has no CRS.",
-                apart_m=middle,
-                height_m=height,
+                " --cameras-offset, which count for the file that has no CRS."
             )
+            raise GeometryError("adjusted_from.apart", words, apart_m=middle, height_m=height)
         worst = int(np.argmax(apart))
         warnings.warn(
             PcfixWarning(
@@ -370,12 +367,11 @@ class CloudTransfer(Sums):
             If no point was transferred.
         """
         if self._points == 0 and self._not_moved:
-            raise GeometryError(
-                "adjusted_from.no_overlap",
+            words = (
                 f"{name}: no point could be transferred to the adjusted cameras, because {REASON}."
-                " Check that --adjusted-from is the model that made the cloud, in its CRS.",
-                path=name,
+                " Check that --adjusted-from is the model that made the cloud, in its CRS."
             )
+            raise GeometryError("adjusted_from.no_overlap", words, path=name)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the statistics as plain values, metres."""

@@ -156,14 +156,11 @@ def adjust_into(
         found = by_ties(material, ties, rules, progress)
     elif view is None or rules.ties == "measured":
         cloud_too = "" if rules.ties == "measured" else ", and there is no --cloud"
-        raise InputError(
-            "cameras.no_ties",
+        words = (
             f"{material.name}: has {count} usable tie points ({LEAST_TIES} are"
-            f" needed){cloud_too}. {_EXPORTS}",
-            path=material.name,
-            ties=count,
-            least=LEAST_TIES,
+            f" needed){cloud_too}. {_EXPORTS}"
         )
+        raise InputError("cameras.no_ties", words, path=material.name, ties=count, least=LEAST_TIES)
     else:
         xyz, listed = _sample(view, views, material.original)
         guesses = {"all images in frame": views_in_frame(xyz, material.original)}
@@ -198,20 +195,18 @@ def _read(
         crs = found.crs if parse_crs(found.crs, "cameras").is_projected else None
     original, views = inputs.block(crs, found)
     if original.rotations is None or original.lenses is None:
-        raise InputError(
-            "cameras.no_angles",
+        words = (
             f"{name}: an adjustment needs angles and a lens of every image. Give the project or"
-            " model of the software, or --sensor.",
-            path=name,
+            " model of the software, or --sensor."
         )
+        raise InputError("cameras.no_angles", words, path=name)
     water = None if inputs.water is None else inputs.surface(view).surface
     if isinstance(water, WaterDimension):
-        raise SettingError(
-            "water.dimension",
+        words = (
             f"The water {water} is known at points of the cloud only. For an adjustment, give it as"
-            " a level, plane, raster, mesh or shoreline.",
-            value=str(water),
+            " a level, plane, raster, mesh or shoreline."
         )
+        raise SettingError("water.dimension", words, value=str(water))
     check_images(name, original, water, rules.fixed_images)
     _check_free(rules, inputs.port)
     gnss, reason, notes = _gnss(original, name, survey, rules.gnss_sigma)
@@ -270,13 +265,11 @@ def _check_surfaces(
     known = list(dict.fromkeys(one for one in on if one and one != WATER))
     known += [WATER] if isinstance(water, WaterPlane) else []
     if parallel and (len(parallel) < 2 or not set(parallel) <= set(known)):
-        raise SettingError(
-            "adjust.parallel",
+        words = (
             f"--parallel {','.join(parallel)}: give at least two of the planes"
-            f" {', '.join(known) or '(none)'}. Mark points of --gcps with the role on:NAME.",
-            value=list(parallel),
-            planes=known,
+            f" {', '.join(known) or '(none)'}. Mark points of --gcps with the role on:NAME."
         )
+        raise SettingError("adjust.parallel", words, value=list(parallel), planes=known)
 
 
 def _gnss(
@@ -306,13 +299,12 @@ def _calibration(path: File, cameras: Cameras) -> Lens:
     one = read_sensor(check_input(path))
     for lens in set(cameras.lenses or ()):
         if (lens.width, lens.height, lens.unit) != (one.width, one.height, one.unit):
-            raise InputError(
-                "sensor.size",
+            words = (
                 f"{path}: the calibration is of images of {one.width:g} x {one.height:g}"
                 f" {one.unit}, the model has {lens.width:g} x {lens.height:g} {lens.unit}. Give the"
-                " one of these images.",
-                path=path,
+                " one of these images."
             )
+            raise InputError("sensor.size", words, path=path)
     return one
 
 

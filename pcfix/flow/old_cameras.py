@@ -41,12 +41,11 @@ def paired(original: Cameras, adjusted: Cameras) -> Pair:
     for cameras, which in ((original, "adjusted-from"), (adjusted, "cameras")):
         if cameras.rotations is None or cameras.lenses is None:
             missing = "angles" if cameras.rotations is None else "lens"
-            raise SettingError(
-                f"cameras.no_{missing}",
+            words = (
                 f"--{which}: has no {missing}, without which points have no image. Give the model"
-                " itself, or --sensor.",
-                option=which,
+                " itself, or --sensor."
             )
+            raise SettingError(f"cameras.no_{missing}", words, option=which)
     return pair_of(original, adjusted, _rows(original.labels, adjusted.labels))
 
 
@@ -57,22 +56,19 @@ def _rows(original: tuple[str, ...], adjusted: tuple[str, ...]) -> IntArray:
     row, unclear = match_labels(adjusted, original)
     repeated = [label for label, count in Counter(adjusted).items() if count > 1]
     if ambiguous := [*repeated, *unclear]:
-        raise GeometryError(
-            "adjusted_from.ambiguous",
+        words = (
             f"--adjusted-from: image name {ambiguous[0]} is ambiguous. Give every image its own"
-            " name.",
-            image=ambiguous[0],
+            " name."
         )
+        raise GeometryError("adjusted_from.ambiguous", words, image=ambiguous[0])
     if (row < 0).any():
         unknown = [label for label, at in zip(adjusted, row, strict=True) if at < 0]
-        raise GeometryError(
-            "adjusted_from.no_image",
+        words = (
             f"--adjusted-from: has no image {unknown[0]} ({len(unknown)} of {len(adjusted)} images"
             f" of the cameras are missing; its first is {original[0]}). Give the model from which"
-            " the cameras were adjusted.",
-            image=unknown[0],
-            missing=len(unknown),
+            " the cameras were adjusted."
         )
+        raise GeometryError("adjusted_from.no_image", words, image=unknown[0], missing=len(unknown))
     return row
 
 
@@ -119,12 +115,11 @@ def _refuse_apart(original: Cameras, adjusted: Cameras) -> None:
     centres = original.centres[_rows(original.labels, adjusted.labels)]
     apart = float(np.median(np.linalg.norm(adjusted.centres - centres, axis=1)))
     if apart > np.ptp(np.vstack([centres, adjusted.centres]), axis=0).max() / 2.0:
-        raise GeometryError(
-            "adjusted_from.apart",
+        words = (
             f"--adjusted-from: its cameras are {apart:,.0f} m from the adjusted ones. Give the"
-            " offset of the shifted one: --cameras-offset counts for the file that has no CRS.",
-            apart_m=apart,
+            " offset of the shifted one: --cameras-offset counts for the file that has no CRS."
         )
+        raise GeometryError("adjusted_from.apart", words, apart_m=apart)
 
 
 def told_apart(inputs: Inputs) -> tuple[Inputs, Inputs]:
@@ -177,12 +172,11 @@ def _refuse_adjusted_tracks(inputs: Inputs) -> None:
     if views is None or cameras is None or Path(views) != Path(cameras):
         return
     if original is None or Path(original) != Path(cameras):
-        raise SettingError(
-            "views.adjusted",
+        words = (
             f"--views: the tie points of {cameras} are adjusted ones, not those of the cloud. Give"
-            " the model of --adjusted-from, or the view list of the cloud.",
-            path=cameras,
+            " the model of --adjusted-from, or the view list of the cloud."
         )
+        raise SettingError("views.adjusted", words, path=cameras)
 
 
 def old_tie_points(

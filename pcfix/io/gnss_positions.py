@@ -68,12 +68,11 @@ def read_gnss(path: File, cameras: Cameras, *, crs: str | None = None) -> Camera
     known = int(np.isfinite(found.xyz).all(axis=1).sum())
     if not known:
         first = f"first {cameras.labels[0]}{f', in the file {unknown[0]}' if unknown else ''}"
-        raise InputError(
-            "gnss.no_image",
+        words = (
             f"{source}: no position belongs to one of the {len(cameras)} images ({first}). Give the"
-            " positions of this block.",
-            path=source,
+            " positions of this block."
         )
+        raise InputError("gnss.no_image", words, path=source)
     if crs is not None:
         found = replace(found, crs=crs)
     _check_near(source, replace(cameras, gnss=found))
@@ -107,12 +106,11 @@ def _listed(path: Path) -> tuple[list[str], GnssPositions]:
         columns = replace(columns, place=place)
         labels, listed = columns.labels, gnss_positions(columns)
     if listed is None:
-        raise InputError(
-            "gnss.none",
+        words = (
             f"{path}: has no measured positions. Give a table with the columns image, x, y, z or"
-            " image, longitude, latitude, height.",
-            path=path,
+            " image, longitude, latitude, height."
         )
+        raise InputError("gnss.none", words, path=path)
     return labels, listed
 
 
@@ -123,34 +121,28 @@ def _by_camera(
     bad = (listed.sigma_m <= 0.0).any(axis=1)
     if bad.any():
         i = int(np.argmax(bad))
-        raise InputError(
-            "gnss.sigma",
+        words = (
             f"{path}: image {names[i]}: the standard deviation {np.nanmin(listed.sigma_m[i]):g} m"
-            " must be positive. Leave it empty if it is unknown.",
-            path=path,
-            image=names[i],
+            " must be positive. Leave it empty if it is unknown."
         )
+        raise InputError("gnss.sigma", words, path=path, image=names[i])
     row_of: dict[str, int] = {}
     for i, label in enumerate(names):
         first = row_of.setdefault(label, i)
         if not np.array_equal(listed.xyz[i], listed.xyz[first], equal_nan=True):
-            raise InputError(
-                "gnss.two_positions",
+            words = (
                 f"{path}: image {label} has two positions. Give one for every image, and use names"
-                " with folders if names are repeated.",
-                path=path,
-                image=label,
+                " with folders if names are repeated."
             )
+            raise InputError("gnss.two_positions", words, path=path, image=label)
     labels = list(row_of)
     matched = match_labels(labels, cameras.labels)
     if matched.ambiguous:
-        raise InputError(
-            "images.ambiguous",
+        words = (
             f"{path}: image {matched.ambiguous[0]} could be several of the {len(cameras)} images of"
-            " the model. Use its names, with their folders.",
-            path=path,
-            image=matched.ambiguous[0],
+            " the model. Use its names, with their folders."
         )
+        raise InputError("images.ambiguous", words, path=path, image=matched.ambiguous[0])
     there = matched.row >= 0
     rows = np.array([row_of[label] for label in labels])[there]
     xyz, sigma = np.full((2, len(cameras), 3), np.nan)
@@ -165,13 +157,11 @@ def _check_near(path: Path, cameras: Cameras) -> None:
         return
     apart_m = np.hypot(*adjusted_minus_gnss(cameras, str(path)).enu_m[:, :2].T)
     if np.isfinite(apart_m).any() and np.nanmedian(apart_m) > FARTHEST_M:
-        raise InputError(
-            "gnss.far",
+        words = (
             f"{path}: its positions are {np.nanmedian(apart_m) / 1e3:,.0f} km from the block. Check"
-            " their CRS, and that x is east and y north.",
-            path=path,
-            apart_m=float(np.nanmedian(apart_m)),
+            " their CRS, and that x is east and y north."
         )
+        raise InputError("gnss.far", words, path=path, apart_m=float(np.nanmedian(apart_m)))
 
 
 def gnss_in_frame_of(cameras: Cameras, name: str = "cameras") -> tuple[GnssPositions, str]:

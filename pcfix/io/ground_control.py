@@ -284,22 +284,18 @@ def _to_cameras(
     xyz = marks.xyz[rows]
     if target is not None and target.strip().lower() == LOCAL:
         if source is not None and source.strip().lower() != LOCAL:
-            raise InputError(
-                "crs.local",
+            words = (
                 f"{name}: is in {source}, the cameras are in a local frame. Transform the cameras,"
-                " or give the CRS of the points as 'local' to use their numbers unchanged.",
-                path=marks.path,
-                crs=source,
+                " or give the CRS of the points as 'local' to use their numbers unchanged."
             )
+            raise InputError("crs.local", words, path=marks.path, crs=source)
         return xyz, ()
     if target is not None and is_topocentric(target):
-        raise InputError(
-            "crs.topocentric",
+        words = (
             f"{name}: the cameras have axes east, north, up ({target}). Transform them to the"
-            " cloud's CRS first.",
-            path=marks.path,
-            crs=target,
+            " cloud's CRS first."
         )
+        raise InputError("crs.topocentric", words, path=marks.path, crs=target)
     forward, notes = way_to_cloud(source, target, xyz, name, heights=True)
     if forward is None:
         return xyz, notes
@@ -340,13 +336,12 @@ def read_marks(path: Path) -> Marks:
     if rows is not None:
         return _from_odm(path, rows)
     if not any(is_header(header.names) for header in headers(lines)):
-        raise InputError(
-            "gcps.format",
+        words = (
             f"{path}: is neither a table of marks nor OpenDroneMap's gcp_list.txt. Line 1 must name"
             " the columns name, x, y, z, image, u, v, or be a CRS above rows of x, y, z, u, v,"
-            " image.",
-            path=path,
+            " image."
         )
+        raise InputError("gcps.format", words, path=path)
     return _from_table(path)
 
 
@@ -386,12 +381,11 @@ def _from_table(path: Path) -> Marks:
     xyz = centres(columns, needed=not any(on))
     bare = [i for i in np.flatnonzero(np.isnan(xyz).any(axis=1)) if not on[i]]
     if bare:
-        raise InputError(
-            "gcps.no_coordinates",
+        words = (
             f"{columns.where(int(bare[0]))}: the point has no x, y, z, which only points with the"
-            " role waterline or on:NAME may omit.",
-            path=path,
+            " role waterline or on:NAME may omit."
         )
+        raise InputError("gcps.no_coordinates", words, path=path)
     return Marks(
         path=path,
         point=names,
@@ -419,35 +413,29 @@ def _with_roles(columns: Columns) -> Columns:
             place[role] = there[0]
     missing = [_PLAIN.get(role, role) for role in ("point", "label", "u", "v") if role not in place]
     if missing:
-        raise InputError(
-            "table.column_missing",
+        words = (
             f"{path}: the columns {', '.join(missing)} are missing (header: {', '.join(header)})."
-            " Give name, x, y, z, image, u, v.",
-            path=path,
-            columns=missing,
+            " Give name, x, y, z, image, u, v."
         )
+        raise InputError("table.column_missing", words, path=path, columns=missing)
     for role in "uv":
         unit = columns.unit[place[role]]
         if unit not in PIXELS:
-            raise InputError(
-                "table.unit",
+            words = (
                 f"{path}: column {header[place[role]]} is in '{unit}'. Give pixels from the upper"
-                " left corner.",
-                path=path,
-                unit=unit,
+                " left corner."
             )
+            raise InputError("table.unit", words, path=path, unit=unit)
     found = replace(columns, place=place)
     if "crs" not in place:
         return found
     stated = sorted({row[place["crs"]] for row in columns.table.rows} - {""})
     if len(stated) > 1:
-        raise InputError(
-            "gcps.several_crs",
+        words = (
             f"{path}: has points in {len(stated)} CRS ({', '.join(stated[:3])}). Transform all to"
-            " one.",
-            path=path,
-            crs=stated,
+            " one."
         )
+        raise InputError("gcps.several_crs", words, path=path, crs=stated)
     return replace(found, crs=stated[0] if stated else columns.crs)
 
 
@@ -487,13 +475,11 @@ def _odm_rows(path: Path, lines: list[str]) -> list[tuple[int, list[str]]] | Non
         return None
     for i, fields in rows:
         if len(fields) < _LEAST_ODM:
-            raise InputError(
-                "gcps.fields",
+            words = (
                 f"{path}: line {i} has {len(fields)} fields. Give x, y, z, u, v, image and"
-                " optionally the name of the point.",
-                path=path,
-                line=i,
+                " optionally the name of the point."
             )
+            raise InputError("gcps.fields", words, path=path, line=i)
     return rows
 
 
@@ -542,12 +528,11 @@ def _from_metashape(path: Path) -> Marks:
     }
     marks = [mark for mark in _locations(chunk) if mark[0] in surveyed]
     if not marks:
-        raise InputError(
-            "gcps.none",
+        words = (
             f"{path}: has no marker with surveyed coordinates and a mark in an image. Give the"
-            " project, or export the markers.",
-            path=path,
+            " project, or export the markers."
         )
+        raise InputError("gcps.none", words, path=path)
     of = [surveyed[marker] for marker, _, _ in marks]
     references = [_reference(marker) for marker in of]
     cameras = chunk.element.iterfind("cameras//camera")
