@@ -109,7 +109,7 @@ def correct_points(
     adjusted_from : Cameras, optional
         Those that the points were made with, in the same frame, where `cameras` are the same
         images (matched by their labels) adjusted since. All points, land too, are first taken
-        from those to these; see `pcfix.adjust.carry`.
+        from those to these; see `pcfix.adjust.transfer`.
     regression : DepthRegression or path, optional
         With the method regression: see `pcfix.refract.regression`, or the file of a line.
 

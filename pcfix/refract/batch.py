@@ -164,7 +164,7 @@ class Batch:
         that give it a ray. None where no list says it.
     made_with : MadeWith or None
         The points as they came and the cameras they came from, where `xyz` are the same points
-        carried to others (`pcfix.adjust.carry`). What undoes dense matching goes by it; the matcher
+        carried to others (`pcfix.adjust.transfer`). What undoes dense matching goes by it; the matcher
         learned is one of those cameras then.
     level_sigma_m : array, shape (m,), or None
         Standard deviation of the height of the surface above each point, as its fit has it.
