@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from pyproj import CRS, Transformer
 
-from pcfix.errors import InputError
+from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.cameras import read_cameras
 from pcfix.io.gnss_positions import gnss_in_frame_of, read_gnss
 from pcfix.model import Cameras, GnssPositions
-from tests.utils.codes import refused, warned
+from tests.utils.codes import refused
 from tests.utils.reprojection import bring_to
 from tests.utils.shared import needs
 
@@ -138,10 +138,12 @@ def test_images_without_position(tmp_path):
     path = write(
         tmp_path, "image,x,y,z\nb.jpg,500001,4000002,3\na.jpg,,,\nq.jpg,4,5,6\nu.jpg,7,8,9\n"
     )
-    with warned("gnss.images_without", images=1), warned("gnss.unknown_images", images=["q.jpg"]):
+    with pytest.warns(PcfixWarning) as given:
         cameras = read_gnss(path, block(unposed=("u",)))
     assert np.isnan(cameras.gnss.xyz[0]).all()
     assert cameras.gnss.xyz[1].tolist() == [500001.0, 4000002.0, 3.0]
+    assert [one.message.code for one in given] == ["gnss.images_without", "gnss.unknown_images"]
+    assert given[1].message.values["images"] == ["q.jpg"]
     assert len(cameras.notes) == 2
     assert np.isnan(gnss_in_frame_of(cameras)[0].xyz).tolist() == [[True] * 3, [False] * 3]
 

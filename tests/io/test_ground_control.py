@@ -263,8 +263,10 @@ def test_unknown_images(tmp_path):
 
 def test_images_without_pose(tmp_path):
     rows = [*ROWS, "G3,500030,4000020,-1,z.jpg,5,6", "G1,500010,4000010,2.5,Z,5,6"]
-    with warned("gcps.unposed"), warned("gcps.unseen", points=["G3"]):
+    with pytest.warns(PcfixWarning) as given:
         found = read(tmp_path, *rows, cameras=block(unposed=("z.jpg",)))
+    assert [one.message.code for one in given] == ["gcps.unposed", "gcps.unseen"]
+    assert given[1].message.values["points"] == ["G3"]
     assert found.names == ("G1", "G2")
     assert len(found.point) == 3
 
