@@ -1,200 +1,94 @@
-"""A block of images as it goes into an adjustment, what may move in it, and both as flat arrays.
+"""A block of images: what was measured, what may move, and the parameters of its lenses.
 
-`Block` and `Unknowns` are what the doors give; the named tuples are what the kernels take. Their
-coordinates are relative to an origin of the block, so that nothing is lost at large coordinates.
-The water's numbers are its plane z = a + b x + c y in these coordinates, and what bends it,
-d x^2 + e x y + f y^2; over a mesh or raster `a` is by how much it stands higher than given, and the
-others are unused.
+`Material` is what the doors read; `block_of` makes a `Block` of it with tie points or points of the
+cloud. Everything is in one frame, metres, Z up.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 
-from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Lens, TiePoints, WaterSurface
+from pcfix.errors import GeometryError, PcfixWarning
+from pcfix.lens.imaging import project, unproject
+from pcfix.model import (
+    BoolArray,
+    Cameras,
+    FloatArray,
+    GnssPositions,
+    GroundControl,
+    IntArray,
+    Lens,
+    TiePoints,
+    Views,
+    WaterSurface,
+)
 from pcfix.port.shapes import Port
-
-if TYPE_CHECKING:
-    from pcfix.water.surface import Field, Tin
-
-
-class State(NamedTuple):
-    """What is estimated.
-
-    centres : shape (k, 3); rotations : shape (k, 3, 3), world to camera.
-    lenses : shape (l, ...), coefficients of `pcfix.lens.imaging.lens_table`.
-    xyz : shape (m, 3), true points.
-    water : shape (11 + 3 p,), the numbers of `WATER_NAMES`: a, b, c, the refractive index, d, e, f,
-    and of a port its distance or its centre; then height and slopes of each plane of `Conditions`.
-    """
-
-    centres: FloatArray
-    rotations: FloatArray
-    lenses: FloatArray
-    xyz: FloatArray
-    water: FloatArray
-
-
-class Seen(NamedTuple):
-    """What was measured, gathered by point.
-
-    start : shape (m + 1,); camera, image_xy, weight : o rows.
-    weight : 1 / standard deviation of u and v; zero where the observation is left out.
-    wet : shape (m,), whether the point may be under water; it is where it lies below it.
-    lens_row, group : shape (k,), row of the lens table and group of lenses of each camera.
-    """
-
-    start: IntArray
-    camera: IntArray
-    image_xy: FloatArray
-    weight: FloatArray
-    wet: BoolArray
-    lens_row: IntArray
-    group: IntArray
-
-
-class Surface(NamedTuple):
-    """What bends the light besides the plane of `State.water`.
-
-    there : whether there is water at all.
-    tin, field : a mesh or raster instead of the plane.
-    origin : shape (3,), the block's origin in the world frame.
-    port : coefficients of a housing port, of length 0 where there is none.
-    curved : whether the water is more than a plane: d, e, f count.
-    """
-
-    there: bool
-    tin: Tin | None
-    field: Field | None
-    origin: FloatArray
-    port: FloatArray
-    curved: bool = False
-
-
-FOCAL, CX, CY, B1, B2, P1, P2, K1 = range(8)
-"""Codes of the lens parameters; k1, k2, ... follow from `K1` on."""
-
-CODES = {"f": FOCAL, "cx": CX, "cy": CY, "b1": B1, "b2": B2, "p1": P1, "p2": P2}
-CODES |= {f"k{i + 1}": K1 + i for i in range(8)}
-NAMES = {code: name for name, code in CODES.items()}
+from pcfix.water.surface import surface_above
 
 WATER_NAMES = (
     *("level", "tilt_x", "tilt_y", "index", "shape_xx", "shape_xy", "shape_yy"),
     *("distance", "centre_x", "centre_y", "centre_z"),
 )
-"""What bends the light: numbers of the water, then of a port."""
+"""Parameters of the refracting surface: of the water, then of a housing port.
+
+The water is z = a + b x + c y + d x^2 + e x y + f y^2 about the origin of the block; over a mesh or
+raster, level is a height added to it and the others are unused.
+"""
 INDEX, SHAPE, PORT, PLANES = 3, 4, 7, 11
-"""Where the index, d, e, f, the numbers of a port and those of planes stand."""
+"""Positions of the index, of d, e, f, of the port's parameters, and of planes (`Conditions`)."""
 
 MOTIONS = ("shift x", "shift y", "shift z", "turn x", "turn y", "turn z", "scale")
-"""What a similarity does."""
-
-
-class Columns(NamedTuple):
-    """Where the unknowns that many points share stand, counted from the first of them.
-
-    lens : shape (groups + 1,), where the parameters of each group begin.
-    code : shape (lens[-1],), which parameter each one is.
-    water : for each number of `State.water`, -1 where fixed; parallel planes share theirs.
-    similarity : the first of seven, -1 where the poses move on their own.
-    total : how many there are.
-    pivot : shape (3,), about which a similarity turns and scales.
-    """
-
-    lens: IntArray
-    code: IntArray
-    water: IntArray
-    similarity: int
-    total: int
-    pivot: FloatArray
-
-
-class Loss(NamedTuple):
-    """How residuals count: the kind, and where it begins to bend, in standard deviations."""
-
-    kind: int = 0
-    scale: float = 1.0
-
-
-SQUARES, HUBER, CAUCHY = range(3)
-"""Kinds of `Loss`."""
-
-LEAST_SQUARES = Loss()
-
-
-class PointPriors(NamedTuple):
-    """Surveyed points: where, and the inverse variances along x, y, z; zero for the others."""
-
-    xyz: FloatArray
-    weight: FloatArray
-
-
-class OnSurfaces(NamedTuple):
-    """Points that lie on a surface; arrays of length 0 where there are none.
-
-    on : shape (m,), 0 on the water, 1, 2, ... on a plane, -1 on none.
-    weight : shape (m,), 1 / standard deviation of the distance, along `axis`.
-    axis : shape (1 + p,), that along which each surface has its height: 2 is up.
-    """
-
-    on: IntArray
-    weight: FloatArray
-    axis: IntArray
-
-
-ON_NOTHING = OnSurfaces(np.zeros(0, np.int64), np.zeros(0), np.zeros(0, np.int64))
-
-
-class Given(NamedTuple):
-    """What stays as it is while a block is adjusted."""
-
-    seen: Seen
-    surface: Surface
-    columns: Columns
-    priors: PointPriors
-    on_surfaces: OnSurfaces = ON_NOTHING
-
-
-def columns_of(
-    codes: list[tuple[int, ...]], water: list[bool], similarity: bool, pivot: FloatArray,
-    alike: dict[int, int] | None = None,
-) -> Columns:  # fmt: skip
-    """Return the columns of the free parameters of each group, the water's and a similarity's.
-
-    `alike` says of numbers of the water, not free themselves, with which others they go.
-    """
-    lens = np.concatenate([[0], np.cumsum([len(one) for one in codes])]).astype(np.int64)
-    place = np.full(len(water), -1, np.int64)
-    free = np.flatnonzero(water)
-    place[free] = lens[-1] + np.arange(len(free))
-    for number, other in (alike or {}).items():
-        place[number] = place[other]
-    first = int(lens[-1]) + len(free)
-    flat = np.array([code for of_sensor in codes for code in of_sensor], np.int64)
-    return Columns(lens, flat, place, first if similarity else -1, first + 7 * similarity, pivot)
-
+"""Parameters of a similarity transformation of all poses."""
 
 Poses = Literal["free", "fixed", "similarity"]
 Robust = Literal["squares", "huber", "cauchy"]
 
+WATER = "water"
+"""The name of the water among planes."""
+
+LEAST_VIEWS = 2
+LEAST_POINTS_IN_IMAGE = 4
+"""A pose has up to four solutions with three points."""
+
+LEAST_ANGLE_DEG = 2.0
+"""Between the rays of a tie point; the depth of points with smaller angles is hardly determined."""
+
+LEAST_DETERMINANT = 1e-5
+"""Of the normal matrix of unit rays: two at a third of a degree."""
+
+TIE_POINTS = 150_000
+"""At most; more reduce only the noise, which is no longer the largest error then."""
+
+FIRST_SIGMA_PX = 1.0
+"""Of measured tie points, until the adjustment has estimated it."""
+
+LEAST_GNSS_SIGMA_M = 0.02
+MOST_OFFSET_M, MOST_OFFSET_SIGMAS = 1.0, 10.0
+"""Mean offset between GNSS and projection centres that indicates another datum, if it exceeds
+both."""
+
+FEW_IMAGES = 5.0
+"""Images per lens, on average, below which the lenses of one sensor share their corrections."""
+
 
 @dataclass(frozen=True, eq=False)
 class Conditions:
-    """Which points lie on the water or on a plane, and which of these are parallel.
+    """Points that lie on the water or on planes, and which planes are parallel.
 
     Attributes
     ----------
     names : tuple of str
-        Of the planes.
+        Names of the planes.
     on : array of int, shape (m,)
-        0 on the water, i + 1 on the plane i, -1 on none.
+        0 on the water, i + 1 on plane i, -1 on no surface.
     sigma_m : array, shape (m,)
-        Standard deviation of the distance from it.
+        Standard deviation of the distance from the surface.
     parallel : tuple of str
-        Names of planes that are parallel, `WATER` among them or not.
+        Names of parallel planes, `WATER` possibly among them.
     """
 
     names: tuple[str, ...]
@@ -203,13 +97,9 @@ class Conditions:
     parallel: tuple[str, ...] = ()
 
 
-WATER = "water"
-"""The name of the water among planes."""
-
-
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Images, points and what was measured; all in one frame, metres, Z up.
+    """Images, points and measurements.
 
     Attributes
     ----------
@@ -222,26 +112,26 @@ class Block:
     camera : array of int, shape (o,)
         Row of the cameras.
     image_xy : array, shape (o, 2)
-        Where the image shows the point, unit of the lens, from the upper left corner.
+        Image coordinates in the unit of the lens, from the upper left corner.
     sigma_px : array, shape (o,)
-        Standard deviation of u and v; infinite where an observation does not count.
+        Standard deviation of u and v; infinite for observations without weight.
     water : WaterPlane, WaterMesh, WaterRaster or None
-        None on a block without water.
+        None for a block without water.
     refractive_index : float
     wet : array of bool, shape (m,)
-        Which points may be under water; they are while they lie below it.
+        Points that may be under water; they are refracted while they lie below the surface.
     surveyed_xyz, surveyed_sigma_m : array, shape (m, 3)
-        Of control points, from the survey; NaN and infinite for the others.
+        Surveyed coordinates of control points; NaN and infinite for other points.
     gnss_xyz, gnss_sigma_m : array, shape (k, 3)
-        Of the projection centres; NaN and infinite where there is none.
+        GNSS positions of the projection centres; NaN and infinite where there is none.
     port : Port or None
         A housing port as the refracting surface, instead of water.
     control_names : tuple of str
-        Of the surveyed points, which are the last ones of `xyz`.
+        Names of the surveyed points, which are the last points of `xyz`.
     is_check : array of bool, shape (len(control_names),)
-        Which of them are held out, to check the result.
+        Check points: surveyed points that are withheld from the adjustment.
     conditions : Conditions or None
-        Which points lie on a surface.
+        Points that lie on a surface.
     """
 
     cameras: Cameras
@@ -268,49 +158,48 @@ class Block:
         return np.repeat(np.arange(len(self.xyz)), np.diff(self.start))
 
     @property
+    def tie_points(self) -> int:
+        """Number of tie points; they come before the surveyed points."""
+        return len(self.xyz) - len(self.control_names)
+
+    @property
     def is_surveyed(self) -> BoolArray:
-        """Which points are control points."""
+        """Points that count as control points."""
         return np.asarray(np.isfinite(self.surveyed_sigma_m).any(axis=1))
 
+    @property
+    def gnss_weights(self) -> FloatArray:
+        """Inverse variances of the GNSS positions, shape (k, 3); zero where there is none."""
+        return inverse_variances(self.gnss_xyz, self.gnss_sigma_m)
 
-def plain_block(
-    cameras: Cameras,
-    ties: TiePoints,
-    water: WaterSurface | None = None,
-    refractive_index: float = 1.0,
-    wet: BoolArray | None = None,
-) -> Block:
-    """Return a block of tie points alone, all observations of 1 px; dry unless `wet` says where."""
-    k, m, o = len(cameras), len(ties.xyz), len(ties.views.camera)
-    nowhere, unknown = np.full((max(k, m), 3), np.nan), np.full((max(k, m), 3), np.inf)
-    return Block(
-        cameras, ties.xyz, ties.views.start, ties.views.camera, ties.image_xy, np.ones(o),
-        water, refractive_index, np.zeros(m, np.bool_) if wet is None else wet,
-        nowhere[:m], unknown[:m], nowhere[:k], unknown[:k],
-    )  # fmt: skip
+
+def inverse_variances(values: FloatArray, sigma: FloatArray) -> FloatArray:
+    """Return inverse variances; zero where the value or its standard deviation is unknown."""
+    known = np.isfinite(values) & np.isfinite(sigma)
+    return np.where(known, 1.0 / np.where(known, sigma, 1.0) ** 2, 0.0)
 
 
 @dataclass(frozen=True)
 class Unknowns:
-    """What may move: zero fixes a number, infinity frees it, else it is a standard deviation.
+    """What may move: a standard deviation of zero fixes a parameter, infinity frees it.
 
     Attributes
     ----------
     poses : {"free", "fixed", "similarity"}
-        `similarity` moves, turns and scales them all together.
+        `similarity` shifts, turns and scales all poses together.
     fixed_images : tuple of str
-        Labels of images that keep their pose.
+        Labels of images whose pose is fixed.
     lens : tuple of str
-        Parameters of each sensor that are free: f, cx, cy, b1, b2, k1 ... k8, p1, p2.
+        Free parameters of each sensor: f, cx, cy, b1, b2, k1 ... k8, p1, p2.
     lens_sigma : dict
         Standard deviations of some of them about their start values, in their unit.
     level_sigma_m, tilt_sigma, index_sigma, shape_sigma : float
-        Of the water level, its slopes, the refractive index, and what is more than a plane (1/m).
+        Of the water level, its slopes, the refractive index, and its curvature terms (1/m).
     distance_sigma_m, centre_sigma_m : float
         Of the distance of a flat port, and of the centre of a dome.
     free_network : bool
-        The datum is that of the start values: the projection centres keep mean place, mean
-        direction and mean scale.
+        Take the datum from the start values: mean position, direction and scale of the projection
+        centres stay.
     """
 
     poses: Poses = "free"
@@ -327,7 +216,7 @@ class Unknowns:
 
     @property
     def water_sigma(self) -> tuple[float, ...]:
-        """Of the numbers of `WATER_NAMES`."""
+        """Standard deviations in the order of `WATER_NAMES`."""
         return (
             *(self.level_sigma_m, self.tilt_sigma, self.tilt_sigma, self.index_sigma),
             *(self.shape_sigma,) * 3,
@@ -335,14 +224,52 @@ class Unknowns:
         )
 
 
-def sensor_groups(lenses: tuple[Lens, ...]) -> tuple[IntArray, list[list[int]]]:
-    """Return which sensor each of k lenses is of, and the rows of each sensor.
+def check_datum(block: Block, unknowns: Unknowns, reason: str = "") -> None:
+    """Check that GNSS, control points, fixed images or a free network give a datum.
 
-    Images with a calibration each of one sensor and frame share what is added to it.
+    `reason` is why GNSS positions are not used.
+
+    Raises
+    ------
+    GeometryError
+        If none of them does.
+    """
+    if unknowns.free_network or unknowns.poses == "fixed":
+        return
+    gnss = int((block.gnss_weights > 0.0).all(axis=1).sum())
+    control = int((block.is_surveyed & (np.diff(block.start) >= LEAST_VIEWS)).sum())
+    fixed = len(set(unknowns.fixed_images) & set(block.cameras.labels))
+    if gnss + control >= 3 or fixed >= 2:
+        return
+    words = (
+        f"Position, orientation and scale of the block are undetermined: {gnss} GNSS positions,"
+        f" {control} control points in two or more images, {fixed} fixed images. Give --gnss or"
+        " --gcps with three points or more, or --datum free to keep the mean of the original"
+        " projection centres." + (f" {reason}" if reason else "")
+    )
+    raise GeometryError("adjust.no_datum", words, gnss=gnss, control=control, fixed=fixed)
+
+
+# Lens parameters
+
+
+FOCAL, CX, CY, B1, B2, P1, P2, K1 = range(8)
+"""Codes of the lens parameters; k1, k2, ... follow from `K1` on."""
+
+CODES = {"f": FOCAL, "cx": CX, "cy": CY, "b1": B1, "b2": B2, "p1": P1, "p2": P2}
+CODES |= {f"k{i + 1}": K1 + i for i in range(8)}
+NAMES = {code: name for name, code in CODES.items()}
+_FIELDS = {FOCAL: "focal", CX: "principal_x", CY: "principal_y", B1: "b1", B2: "b2"}
+
+
+def sensor_groups(lenses: tuple[Lens, ...]) -> tuple[IntArray, list[list[int]]]:
+    """Return the sensor of each of k lenses, and the rows of each sensor.
+
+    Images that have a calibration each, but one sensor and frame, share the corrections.
     """
     sensors = [(one.sensor, one.width, one.height, one.projection, one.inverse) for one in lenses]
     distinct = len(set(lenses))
-    # several lenses of one sensor, each with images enough for its own
+    # several lenses of one sensor, each with enough images for corrections of its own
     is_own = distinct > len(set(sensors)) and len(lenses) / distinct >= FEW_IMAGES
     rows: dict[object, list[int]] = {}
     for i, key in enumerate(lenses if is_own else sensors):
@@ -353,21 +280,14 @@ def sensor_groups(lenses: tuple[Lens, ...]) -> tuple[IntArray, list[list[int]]]:
     return group, list(rows.values())
 
 
-FEW_IMAGES = 5.0
-"""Images a lens, in the mean, below which lenses of one sensor share what is added to them."""
-
-
 def usable_codes(lens: Lens, names: tuple[str, ...]) -> tuple[int, ...]:
-    """Return the codes of those parameters that the formula of a lens has."""
+    """Return the codes of those parameters that the model of a lens has."""
     codes = tuple(CODES[name] for name in names)
     return tuple(code for code in codes if code < P1) if lens.in_turn else codes
 
 
-_FIELDS = {FOCAL: "focal", CX: "principal_x", CY: "principal_y", B1: "b1", B2: "b2"}
-
-
 def lens_parameter(lens: Lens, code: int) -> float:
-    """Return a parameter of a lens; zero of a polynomial that ends before it."""
+    """Return a parameter of a lens; zero for terms that its polynomial does not have."""
     if code in _FIELDS:
         return float(getattr(lens, _FIELDS[code]))
     values, place = (lens.radial, code - K1) if code >= K1 else (lens.tangential, code - P1)
@@ -375,15 +295,399 @@ def lens_parameter(lens: Lens, code: int) -> float:
 
 
 def moved_lens(lens: Lens, codes: tuple[int, ...], by: FloatArray) -> Lens:
-    """Return a lens with something added to some of its parameters."""
-    changes: dict[str, Any] = {"radial": lens.radial, "tangential": lens.tangential}
+    """Return a lens with corrections added to some of its parameters."""
+    changes: dict[str, Any] = {}
+    radial, tangential = [*lens.radial], [*lens.tangential]
     for code, step in zip(codes, by.tolist(), strict=True):
-        value = lens_parameter(lens, code) + step
         if code in _FIELDS:
-            changes[_FIELDS[code]] = value
+            changes[_FIELDS[code]] = getattr(lens, _FIELDS[code]) + step
             continue
-        name, first, least = ("radial", K1, 0) if code >= K1 else ("tangential", P1, 2)
-        values = [*changes[name], *[0.0] * (max(code - first + 1, least) - len(changes[name]))]
-        values[code - first] = value
-        changes[name] = tuple(values)
-    return replace(lens, **changes)
+        terms, at, least = (radial, code - K1, 0) if code >= K1 else (tangential, code - P1, 2)
+        terms += [0.0] * (max(at + 1, least) - len(terms))
+        terms[at] += step
+    return replace(lens, radial=tuple(radial), tangential=tuple(tangential), **changes)
+
+
+def effect_at_corner(lens: Lens, code: int) -> float:
+    """Return the image movement at the corner of the frame per unit of a lens parameter."""
+    r = 0.5 * np.hypot(lens.width, lens.height) / lens.focal
+    if code in (CX, CY):
+        return 1.0
+    if code >= K1:
+        return float(lens.focal * r ** (2 * (code - K1) + 3))
+    return float(3.0 * lens.focal * r * r if code in (P1, P2) else r)
+
+
+# Blocks from what was read
+
+
+def plain_block(
+    cameras: Cameras,
+    ties: TiePoints,
+    water: WaterSurface | None = None,
+    refractive_index: float = 1.0,
+    wet: BoolArray | None = None,
+) -> Block:
+    """Return a block of tie points only, with a standard deviation of 1 px; dry without `wet`."""
+    k, m, o = len(cameras), len(ties.xyz), len(ties.views.camera)
+    nowhere, unknown = np.full((max(k, m), 3), np.nan), np.full((max(k, m), 3), np.inf)
+    return Block(
+        cameras, ties.xyz, ties.views.start, ties.views.camera, ties.image_xy, np.ones(o),
+        water, refractive_index, np.zeros(m, np.bool_) if wet is None else wet,
+        nowhere[:m], unknown[:m], nowhere[:k], unknown[:k],
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """Everything a block is made of, besides its tie points.
+
+    Attributes
+    ----------
+    name : str
+        Camera file, for messages.
+    original : Cameras
+        As they were read, with angles and lenses.
+    water, refractive_index, port
+        See `Block`.
+    gnss : GnssPositions or None
+        In the frame of the block, with standard deviations.
+    control : GroundControl or None
+        Check points among them get no weight.
+    calibrated : Lens or None
+        Replaces the lenses of the cameras.
+    inside : callable or None
+        Whether points, given x and y, may be under water; everywhere without it.
+    level_sigma_m : float
+        Standard deviation of the water level; infinite if it is free.
+    no_gnss : str
+        Why GNSS positions of the camera file are not used.
+    parallel : tuple of str
+        Parallel planes on which control points lie, possibly with the water.
+    """
+
+    name: str
+    original: Cameras
+    water: WaterSurface | None
+    refractive_index: float
+    gnss: GnssPositions | None = None
+    control: GroundControl | None = None
+    port: Port | None = None
+    calibrated: Lens | None = None
+    inside: Callable[[FloatArray, FloatArray], BoolArray] | None = None
+    level_sigma_m: float = 0.0
+    no_gnss: str = ""
+    parallel: tuple[str, ...] = ()
+
+
+def block_of(material: Material, ties: TiePoints, sigma_px: float) -> Block:
+    """Return the block of tie points and surveyed points.
+
+    Parameters
+    ----------
+    material : Material
+    ties : TiePoints
+        Apparent points, in the frame of the cameras.
+    sigma_px : float
+        Standard deviation of their image coordinates.
+
+    Raises
+    ------
+    GeometryError
+        If a control point lies below the water but is not marked as under water.
+    """
+    water, n, cameras = material.water, material.refractive_index, material.original
+    if material.calibrated is not None:
+        cameras = replace(cameras, lenses=(material.calibrated,) * len(cameras))
+    inside = material.inside
+    wet = np.ones(len(ties.xyz), np.bool_) if inside is None else inside(*ties.xyz[:, :2].T)
+    ties = replace(ties, xyz=true_start(ties.xyz, water, n, wet))
+    block = replace(
+        plain_block(cameras, ties, water, n, wet),
+        sigma_px=np.full(len(ties.views.camera), sigma_px),
+        port=material.port,
+    )
+    if material.gnss is not None:
+        known = material.gnss
+        block = replace(block, gnss_xyz=known.xyz, gnss_sigma_m=known.sigma_m)
+    control = material.control
+    if control is None:
+        return block
+    _check_under_water(control, water, material.level_sigma_m)
+    marks, sigma = marks_of(control)
+    conditions, under_water, xyz = None, control.under_water.copy(), control.xyz
+    if any(control.on):
+        on = np.array(control.on)
+        names = tuple(dict.fromkeys(name for name in control.on if name and name != WATER))
+        number = {"": -1, WATER: 0} | {name: i for i, name in enumerate(names, start=1)}
+        conditions = Conditions(
+            names,
+            np.array([-1] * len(block.xyz) + [number[name] for name in control.on]),
+            np.concatenate([np.ones(len(block.xyz)), control.on_sigma_m]),
+            material.parallel,
+        )
+        # points without coordinates start where their rays meet
+        bare = np.asarray(np.isnan(xyz).any(axis=1))
+        under_water[bare] = on[bare] != WATER
+        places = with_places(marks, material.original).xyz
+        xyz = np.where(bare[:, None], true_start(places, water, n, under_water), xyz)
+        if np.isnan(xyz).any():
+            name = control.names[int(np.argmax(np.isnan(xyz).any(axis=1)))]
+            words = (
+                f"Point {name} has no coordinates and its image rays do not intersect."
+                " Mark it in at least two images from different directions."
+            )
+            raise GeometryError("gcps.no_coordinates", words, point=name)
+    return replace(
+        block,
+        xyz=np.vstack([block.xyz, xyz]),
+        conditions=conditions,
+        start=np.concatenate([block.start, marks.views.start[1:] + block.start[-1]]),
+        camera=np.concatenate([block.camera, marks.views.camera]),
+        image_xy=np.vstack([block.image_xy, marks.image_xy]),
+        sigma_px=np.concatenate([block.sigma_px, sigma]),
+        wet=np.concatenate([block.wet, under_water]),
+        surveyed_xyz=np.vstack([block.surveyed_xyz, control.xyz]),
+        surveyed_sigma_m=np.vstack(
+            [block.surveyed_sigma_m, np.where(control.is_check[:, None], np.inf, control.sigma_m)]
+        ),
+        control_names=control.names,
+        is_check=control.is_check,
+    )
+
+
+def _check_under_water(
+    control: GroundControl, water: WaterSurface | None, level_sigma_m: float
+) -> None:
+    """Refuse points far below the water surface that are not marked as under water."""
+    if water is None:
+        return
+    level = surface_above(water, control.xyz).height_m
+    least = level - 3.0 * np.hypot(control.sigma_m[:, 2], level_sigma_m)
+    deep = (control.xyz[:, 2] < least) & ~control.under_water
+    if deep.any():
+        i = int(np.argmax(deep))
+        raise GeometryError(
+            "gcps.under_water",
+            f"Control point {control.names[i]} (height {control.xyz[i, 2]:.3f} m) lies below the"
+            f" water surface ({level[i]:.3f} m), but is not marked as under water. Put yes into the"
+            " column under_water, or check the height datum and the water level.",
+            point=control.names[i],
+            height_m=float(control.xyz[i, 2]),
+            level_m=float(level[i]),
+        )
+
+
+def gnss_with_sigma(
+    centres: FloatArray, found: GnssPositions, name: str, sigma_m: float | None
+) -> tuple[GnssPositions | None, list[PcfixWarning]]:
+    """Return GNSS positions with standard deviations (infinite for unknown ones), and warnings.
+
+    Parameters
+    ----------
+    centres : array, shape (k, 3)
+        Projection centres, metres.
+    found : GnssPositions
+        In the same frame, as read: NaN where unknown.
+    name : str
+        Their file, for messages.
+    sigma_m : float or None
+        For positions without one; None estimates it from their scatter about the centres.
+
+    Raises
+    ------
+    GeometryError
+        If all positions are offset, which indicates another datum or CRS.
+    """
+    known = np.isfinite(found.xyz)
+    if not known.any():
+        return None, []
+    sigma = np.where(known, found.sigma_m, np.inf)
+    silent = known & ~np.isfinite(found.sigma_m)
+    off = np.where(known, centres - found.xyz, np.nan)
+    notes = []
+    if silent.any() and sigma_m is None:
+        rest = off - np.nanmedian(off, axis=0)
+        sigma_m = max(1.4826 * float(np.nanmedian(np.abs(rest))), LEAST_GNSS_SIGMA_M)
+        notes.append(
+            PcfixWarning(
+                "gnss.no_sigma",
+                f"The GNSS positions have no standard deviations; {sigma_m:.2f} m is assumed, from"
+                " their scatter about the projection centres. Give --gnss-sigma if you know it.",
+                sigma_m=sigma_m,
+            )
+        )
+    if silent.any():
+        sigma[silent] = sigma_m
+    mean = np.nan_to_num(np.nanmean(off, axis=0))
+    typical = float(np.median(sigma[np.isfinite(sigma)]))
+    if np.abs(mean).max() > max(MOST_OFFSET_M, MOST_OFFSET_SIGMAS * typical):
+        x, y, z = (-mean).tolist()
+        words = (
+            f"{name}: the GNSS positions lie on average {x:.2f}, {y:.2f}, {z:.2f} m (x, y, z) from"
+            " the projection centres, so they have another datum or CRS (ellipsoidal heights?)."
+            " Name it with --gnss-crs, or transform the positions or the model."
+        )
+        raise GeometryError("gnss.offset", words, path=name, offset_m=[x, y, z])
+    return GnssPositions(found.xyz, sigma, None), notes
+
+
+def marks_of(control: GroundControl) -> tuple[TiePoints, FloatArray]:
+    """Return surveyed points and their marks as tie points, and the marks' standard deviations.
+
+    Those of check points are infinite.
+    """
+    order = np.argsort(control.point, kind="stable")
+    counts = np.bincount(control.point, minlength=len(control.names))
+    views = Views(np.concatenate([[0], np.cumsum(counts)]), control.camera[order])
+    sigma = np.where(control.is_check[control.point[order]], np.inf, control.sigma_px[order])
+    return TiePoints(control.xyz, views, control.image_xy[order]), sigma
+
+
+def true_start(
+    xyz: FloatArray, water: WaterSurface | None, n: float, allowed: BoolArray | None = None
+) -> FloatArray:
+    """Return apparent points with their depths times n, as start values of the true points."""
+    if water is None:
+        return xyz.copy()
+    level = surface_above(water, xyz).height_m
+    below = level > xyz[:, 2]
+    return deeper(xyz, level, below if allowed is None else below & allowed, n)
+
+
+def deeper(
+    apparent: FloatArray, level_m: FloatArray, wet: BoolArray, refractive_index: float
+) -> FloatArray:
+    """Return approximate true points: seen vertically, the depth grows by the index."""
+    true = apparent.copy()
+    true[wet, 2] = level_m[wet] - refractive_index * (level_m - apparent[:, 2])[wet]
+    return true
+
+
+# Tie points
+
+
+def taken(ties: TiePoints, rows: IntArray) -> TiePoints:
+    """Return some of the tie points, in the given order."""
+    first, counts = ties.views.start[rows], np.diff(ties.views.start)[rows]
+    begin = np.cumsum(counts) - counts
+    where = np.repeat(first - begin, counts) + np.arange(counts.sum())
+    return TiePoints(ties.xyz[rows], ties.views.take(rows), ties.image_xy[where])
+
+
+def usable_ties(ties: TiePoints, cameras: Cameras, most: int = TIE_POINTS) -> TiePoints:
+    """Return the tie points that can be adjusted; a random part of them if there are very many.
+
+    They have coordinates, two images or more, and a sufficient angle between their rays.
+    """
+    seen = np.diff(ties.views.start) >= LEAST_VIEWS
+    rows = np.flatnonzero(np.isfinite(ties.xyz).all(axis=1) & seen)
+    rows = rows[_ray_angle_deg(taken(ties, rows), cameras) >= LEAST_ANGLE_DEG]
+    if len(rows) > most:
+        rows = np.sort(np.random.default_rng(0).choice(rows, most, replace=False))
+    return taken(ties, rows)
+
+
+def _ray_angle_deg(ties: TiePoints, cameras: Cameras) -> FloatArray:
+    """Return twice the largest angle between a ray and the mean ray of its point."""
+    owner = np.repeat(np.arange(len(ties.xyz)), np.diff(ties.views.start))
+    ray = cameras.centres[ties.views.camera] - ties.xyz[owner]
+    ray /= np.linalg.norm(ray, axis=1)[:, None]
+    mean = np.zeros((len(ties.xyz), 3))
+    np.add.at(mean, owner, ray)
+    mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-12)[:, None]
+    cosine = np.full(len(mean), 1.0)
+    np.minimum.at(cosine, owner, np.einsum("oi,oi->o", ray, mean[owner]))
+    return 2.0 * np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def with_places(ties: TiePoints, cameras: Cameras) -> TiePoints:
+    """Return tie points in which those without coordinates are intersected by straight rays.
+
+    The sum of squared distances from the rays is minimised, which is good enough as a start.
+    """
+    lost = np.flatnonzero(~np.isfinite(ties.xyz).all(axis=1) & (np.diff(ties.views.start) >= 2))
+    if len(lost) == 0 or cameras.lenses is None or cameras.rotations is None:
+        return ties
+    some = taken(ties, lost)
+    owner = np.repeat(np.arange(len(lost)), np.diff(some.views.start))
+    ray = np.full((len(owner), 3), np.nan)
+    for c in np.unique(some.views.camera):
+        entries = some.views.camera == c
+        ray[entries] = unproject(cameras.lenses[c], some.image_xy[entries]) @ cameras.rotations[c]
+    across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
+    middle = cameras.centres.mean(axis=0)
+    centre = cameras.centres[some.views.camera] - middle
+    normal, right = np.zeros((len(lost), 3, 3)), np.zeros((len(lost), 3))
+    np.add.at(normal, owner, across)
+    np.add.at(right, owner, np.einsum("oij,oj->oi", across, centre))
+    finite = np.flatnonzero(np.isfinite(normal).all(axis=(1, 2)))
+    known = finite[np.linalg.det(normal[finite]) > LEAST_DETERMINANT]
+    xyz = ties.xyz.copy()
+    meet = np.linalg.solve(normal[known], right[known][:, :, None])[:, :, 0]
+    xyz[lost[known]] = meet + middle
+    return replace(ties, xyz=xyz)
+
+
+def ties_of_cloud(xyz: FloatArray, views: Views, cameras: Cameras) -> TiePoints:
+    """Return apparent points, shape (m, 3), as tie points, imaged by straight rays.
+
+    The views say which cameras contributed to them, or have them in their frame.
+    """
+    owner = np.repeat(np.arange(len(xyz)), np.diff(views.start))
+    image = straight_images(xyz[owner], np.asarray(views.camera), cameras)
+    seen = np.isfinite(image).all(axis=1)
+    counts = np.bincount(owner[seen], minlength=len(xyz))
+    start = np.concatenate([[0], np.cumsum(counts)])
+    tracks = Views(start, np.asarray(views.camera)[seen])
+    rows = np.flatnonzero(counts >= LEAST_VIEWS)
+    return taken(TiePoints(xyz, tracks, image[seen]), rows)
+
+
+def straight_images(xyz: FloatArray, camera: IntArray, cameras: Cameras) -> FloatArray:
+    """Return the images of points by straight rays, one camera for each point, shape (o, 2)."""
+    rotations, lenses = np.asarray(cameras.rotations), cameras.lenses or ()
+    local = np.einsum("oij,oj->oi", rotations[camera], xyz - cameras.centres[camera])
+    image_xy = np.empty((len(local), 2))
+    for c in np.unique(camera):
+        image_xy[camera == c] = project(lenses[c], local[camera == c])
+    return image_xy
+
+
+# Parts of a block
+
+
+def well_seen(block: Block) -> IntArray:
+    """Return the rows of the images with enough observations for a pose."""
+    counts = np.bincount(block.camera[np.isfinite(block.sigma_px)], minlength=len(block.cameras))
+    return np.flatnonzero(counts >= LEAST_POINTS_IN_IMAGE)
+
+
+def restricted(block: Block, rows: IntArray) -> Block:
+    """Return a block with some of its images, in the given order."""
+    place = np.full(len(block.cameras), -1)
+    place[rows] = np.arange(len(rows))
+    kept = place[block.camera] >= 0
+    counts = np.bincount(block.owner[kept], minlength=len(block.xyz))
+    return replace(
+        block,
+        cameras=some_cameras(block.cameras, rows),
+        start=np.concatenate([[0], np.cumsum(counts)]),
+        camera=place[block.camera[kept]],
+        image_xy=block.image_xy[kept],
+        sigma_px=block.sigma_px[kept],
+        gnss_xyz=block.gnss_xyz[rows],
+        gnss_sigma_m=block.gnss_sigma_m[rows],
+    )
+
+
+def some_cameras(cameras: Cameras, rows: IntArray) -> Cameras:
+    """Return some of the cameras, in the given order, without their GNSS positions."""
+    return replace(
+        cameras,
+        labels=tuple(cameras.labels[i] for i in rows),
+        centres=cameras.centres[rows],
+        rotations=None if cameras.rotations is None else cameras.rotations[rows],
+        lenses=None if cameras.lenses is None else tuple(cameras.lenses[i] for i in rows),
+        gnss=None,
+    )

@@ -1,52 +1,66 @@
-"""How well an adjustment determines its unknowns: covariances, standard errors, correlations.
+"""The precision of an adjustment: covariances, standard errors, correlations, an ensemble.
 
 The inverse of the reduced normal matrix S is the covariance of poses and shared unknowns for
-observations of unit weight, as the points were eliminated and not left out (Triggs et al. 2000,
-section 6). All is scaled by the a-posteriori variance of unit weight, and by what groups of
-observations disagree beyond it. The datum is that of the
-priors; in a free network that of the start values.
+observations of unit weight, because the points were eliminated and not ignored (Triggs et al. 2000,
+section 6). It is scaled by the a-posteriori variance of unit weight, and by factors for errors that
+observations share (`pcfix.adjust.shared_errors`). The datum is that of the prior knowledge; in a
+free network that of the start values.
+
+Standard errors do not tell that errors of a block are correlated: a focal length that is too long
+is compensated by cameras that are too high. So members of an ensemble are drawn from the joint
+covariance. Whatever is computed with each of them in turn scatters by all errors at once.
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
-from pcfix.adjust.block import MOTIONS, WATER_NAMES, Unknowns
-from pcfix.adjust.equations import Reduced, Undamped, point_covariances, solver, undamped
-from pcfix.adjust.members import Members, drawn, members_of
-from pcfix.adjust.problem import Problem, Solution, pose_gradients
-from pcfix.adjust.solve import BED, LIMITS, weakest, words_of
-from pcfix.errors import GeometryError
-from pcfix.model import FloatArray
+from pcfix.adjust.block import (
+    CODES,
+    INDEX,
+    PORT,
+    SHAPE,
+    WATER_NAMES,
+    Unknowns,
+    lens_parameter,
+    moved_lens,
+)
+from pcfix.adjust.normal import fixed_points, point_covariances
+from pcfix.adjust.problem import Problem, Solution, polynomial, pose_gradients
+from pcfix.adjust.solve import (
+    BED,
+    LIMITS,
+    Reduced,
+    moved_by,
+    reduced_at,
+    singular,
+    solver,
+    words_of,
+)
+from pcfix.errors import PcfixWarning
+from pcfix.model import Cameras, FloatArray, IntArray, WaterPlane, WaterRaster, WaterSurface
 
 DENSE_UP_TO = 12_000
 """Unknowns up to which the whole inverse is computed (1.2 GB)."""
 
 QUICK = 1000
-"""Unknowns up to which memory does not matter and LAPACK's dpotri costs more than a plain inverse:
-on busy cores its threads wait for one another for a third of a second."""
+"""Unknowns up to which LAPACK's dpotri takes longer than a plain inverse: on busy cores its threads
+wait for one another for a third of a second."""
 
 SINGULAR = 1e-13
-"""Reciprocal condition of the scaled matrix below which nothing in the inverse can be trusted."""
-
-BLOCK_MOTIONS = (
-    "the mean height of the projection centres",
-    "the mean tilt of the projection centres along x",
-    "the mean tilt of the projection centres along y",
-)
+"""Reciprocal condition of the scaled matrix below which its inverse is meaningless."""
 
 
 class SharedUnknown(NamedTuple):
-    """One of the unknowns that all points share.
+    """A shared unknown: its name, the correction to its start value, and its standard error.
 
-    name : see `Problem.names`; the level is that at the origin of the block, below the middle of
-    the projection centres. added : to its start value.
-    sigma : standard error, in its unit: pixels, metres, slopes without unit, radians.
+    Units are pixels, metres, slopes, radians. The level is that at the origin of the block, below
+    the mean of the projection centres.
     """
 
     name: str
@@ -56,36 +70,32 @@ class SharedUnknown(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Precision:
-    """What the observations say about how well everything is known.
+    """The precision of an adjustment with k cameras, m points and g shared unknowns.
 
     Attributes
     ----------
     sigma0 : float
-        By whose square the covariances are scaled, apart from the factors of `precision_of`.
+        A-posteriori standard deviation of unit weight by which the covariances are scaled.
     pose_covariance : array, shape (k, 6, 6)
-        Of the small turn of each camera about the axes of its own frame (radians), and of its
-        centre in the world frame (metres). Zero where a pose is fixed.
+        Of a small rotation about the axes of the camera's frame (radians) and of the projection
+        centre in the world frame (metres). Zero if the pose is fixed.
     shared : tuple of SharedUnknown, length g
     correlation : array, shape (g, g)
         Of the shared unknowns.
-    block_correlation : array, shape (g, 3)
-        Of the shared unknowns with `BLOCK_MOTIONS`; zero where these are fixed.
     point_covariance_m2 : array, shape (m, 6), or None
-        xx, xy, xz, yy, yz, zz, world frame; NaN of points that their observations do not fix.
-        None where there are too many unknowns.
-    notes : tuple of str
-        What was left out.
+        xx, xy, xz, yy, yz, zz, world frame; NaN for points that their observations do not fix.
+        None for very large blocks.
+    notes : tuple of PcfixWarning
     members : Members or None
-        Drawn from the joint covariance of poses, lens and water; None as for the points.
+        Drawn from the joint covariance of poses, lens and water; None for very large blocks.
     """
 
     sigma0: float
     pose_covariance: FloatArray
     shared: tuple[SharedUnknown, ...]
     correlation: FloatArray
-    block_correlation: FloatArray
     point_covariance_m2: FloatArray | None
-    notes: tuple[str, ...] = ()
+    notes: tuple[PcfixWarning, ...] = ()
     members: Members | None = None
 
     @property
@@ -95,7 +105,7 @@ class Precision:
 
     @property
     def angle_sigma_deg(self) -> FloatArray:
-        """Standard errors of turns about the axes of each camera's frame, shape (k, 3)."""
+        """Standard errors of rotations about the axes of the cameras, shape (k, 3)."""
         return np.asarray(np.degrees(np.sqrt(np.einsum("kii->ki", self.pose_covariance)[:, :3])))
 
     @property
@@ -105,7 +115,7 @@ class Precision:
         return None if covariance is None else np.sqrt(covariance[:, [0, 3, 5]])
 
     def sigma_of(self, name: str) -> float | None:
-        """Return the standard error of a shared unknown; None where it is fixed."""
+        """Return the standard error of a shared unknown; None if it is fixed."""
         return next((row.sigma for row in self.shared if row.name == name), None)
 
 
@@ -117,227 +127,212 @@ def precision_of(
     Parameters
     ----------
     problem : Problem
-        Outliers without weight.
+        Outliers have no weight.
     solution : Solution
     sigma0 : float
-        A-posteriori standard deviation of unit weight; 1 for what the given ones say.
+        A-posteriori standard deviation of unit weight; 1 for the given standard deviations.
     factor : array, shape (6 + g,), optional
-        By which standard errors grow besides: of the angles and centres of all poses, and of the
-        shared unknowns; see `pcfix.adjust.disagreement`.
+        Further factors of standard errors: of angles and centres of all poses, and of the shared
+        unknowns; see `pcfix.adjust.shared_errors`.
 
     Raises
     ------
     GeometryError
-        If the block does not determine its unknowns; says which.
+        If unknowns are undetermined.
     """
-    equations = undamped(problem, solution)
-    size, k = len(equations.reduced.active), len(solution.state.centres)
-    g = problem.columns.total
+    reduced, state, given = reduced_at(problem, solution), solution.state, problem.given
+    active, k, g = reduced.active, len(state.centres), given.shared
     times = np.ones(6 + g) if factor is None else factor
-    each = np.concatenate([np.tile(times[:6], k), times[6:]])[equations.reduced.active]
-    asked = _asked(problem, solution)[equations.reduced.active] * each[:, None]
+    each = np.concatenate([np.tile(times[:6], k), times[6:]])[active]
     variance = sigma0 * sigma0
-    notes: list[str] = []
+    notes: list[PcfixWarning] = []
     points: FloatArray | None = None
     members: Members | None = None
-    if loose := int((~equations.is_fixed).sum()):
-        notes.append(f"{loose:,} points that their images do not fix have no covariance.")
-    if size <= DENSE_UP_TO:
-        inverse = _inverse(equations, solution)
-        of_asked = asked.T @ inverse @ asked
+    if loose := int((~fixed_points(state, given)).sum()):
+        notes.append(
+            PcfixWarning(
+                "adjust.loose_points",
+                f"{loose:,} points are not determined by their images and have no covariance.",
+                points=loose,
+            )
+        )
+    if len(active) <= DENSE_UP_TO:
+        inverse = _inverse(reduced)
+        if inverse is None:
+            raise singular(problem, solution)
         inverse *= each
         inverse *= each[:, None]
-        poses = _pose_blocks(problem, solution, equations.reduced, inverse)
-        points = variance * point_covariances(equations, solution, inverse)
-        active = equations.reduced.active
+        of_shared = inverse[len(active) - g :, len(active) - g :]
+        poses = _pose_blocks(problem, solution, active, inverse)
+        points = variance * point_covariances(state, given, active, inverse)
         members = members_of(problem, solution, active, sigma0 * drawn(inverse))
     else:
-        of_asked, poses = _by_parts(equations, solution, asked)
+        found = _by_parts(reduced, k, g)
+        if found is None:
+            raise singular(problem, solution)
+        of_shared, poses = found
+        of_shared *= times[6:] * times[6:, None]
         poses *= times[:6] * times[:6, None]
         notes.append(
-            f"The covariances of the points were left out, and the ensemble: {size:,} unknowns of"
-            f" poses, lens and water are more than {DENSE_UP_TO:,}."
+            PcfixWarning(
+                "adjust.too_large",
+                f"The block has {len(active):,} unknowns (limit {DENSE_UP_TO:,}), so its points"
+                " have no covariances, and the correction cannot use the errors of the poses.",
+                unknowns=len(active),
+            )
         )
-    correlation = _correlations(of_asked)
-    sigma = np.sqrt(np.diag(of_asked)[:g]) * sigma0
-    rows = zip(problem.names, solution.shared.tolist(), sigma.tolist(), strict=True)
+    sigma = np.sqrt(np.diag(of_shared))
+    correlation = of_shared / sigma / sigma[:, None]
+    rows = zip(problem.names, solution.shared.tolist(), (sigma * sigma0).tolist(), strict=True)
     return Precision(
         sigma0, variance * poses.reshape(k, 6, 6), tuple(SharedUnknown(*row) for row in rows),
-        correlation[:g, :g], correlation[:g, g:], points, tuple(notes), members,
+        correlation, points, tuple(notes), members,
     )  # fmt: skip
 
 
-def _asked(problem: Problem, solution: Solution) -> FloatArray:
-    """Return what shared unknowns and block motions are of all unknowns, shape (u, g + 3)."""
-    k, g = len(solution.state.centres), problem.columns.total
-    rows = np.zeros((6 * k + g, g + 3))
-    rows[6 * k :, :g] = np.eye(g)
-    away = solution.state.centres - solution.state.centres.mean(axis=0)
-    fit = np.linalg.pinv(np.column_stack([np.ones(k), away[:, :2]]), rcond=1e-6)
-    if problem.columns.similarity < 0:
-        rows[5 : 6 * k : 6, g:] = fit.T
-        return rows
-    at = 6 * k + problem.columns.similarity
-    upward = pose_gradients(solution.state, problem.columns.pivot)[:, 5]
-    rows[at : at + 7, g:] = np.einsum("ak,kb->ba", fit, upward)
-    return rows
-
-
-def _inverse(equations: Undamped, solution: Solution) -> FloatArray:
-    """Return the whole inverse, by Cholesky's method with a unit diagonal."""
+def _inverse(reduced: Reduced) -> FloatArray | None:
+    """Return the whole inverse, by Cholesky's method with a unit diagonal; None if singular."""
     from scipy.linalg import lapack
 
-    matrix = equations.reduced.matrix
+    matrix = reduced.matrix
     if matrix.shape[0] == 0:
         return np.zeros((0, 0))
     a = np.array(matrix if isinstance(matrix, np.ndarray) else matrix.toarray(), order="F")
     diagonal = a.diagonal()
     if not (diagonal > 0.0).all():
-        raise _singular(equations, solution)
+        return None
     scale = 1.0 / np.sqrt(diagonal)
     a *= scale
     a *= scale[:, None]
     norm = lapack.dlange("1", a)  # type: ignore[call-arg]
     factor, failed = lapack.dpotrf(a, lower=1, overwrite_a=len(a) > QUICK)
     if failed:
-        raise _singular(equations, solution)
-    a = _inverted(a, factor)
+        return None
+    if len(a) <= QUICK:
+        a = np.linalg.inv(a)
+        a = 0.5 * (a + a.T)
+    else:  # in place of the factor, as memory matters
+        a, _ = lapack.dpotri(factor, lower=1, overwrite_c=1)
+        for i in range(1, len(a)):
+            a[:i, i] = a[i, :i]
     if not norm * lapack.dlange("1", a) * SINGULAR < 1.0:  # type: ignore[call-arg]
-        raise _singular(equations, solution)
+        return None
     a *= scale
     a *= scale[:, None]
     return np.asarray(a)
 
 
-def _inverted(a: FloatArray, factor: FloatArray) -> FloatArray:
-    """Return the inverse, of a large matrix in the place of its factor."""
-    from scipy.linalg import lapack
-
-    if len(a) <= QUICK:
-        inverse = np.linalg.inv(a)
-        return np.asarray(0.5 * (inverse + inverse.T))
-    found, _ = lapack.dpotri(factor, lower=1, overwrite_c=1)
-    for i in range(1, len(found)):
-        found[:i, i] = found[i, :i]
-    return np.asarray(found)
-
-
-def _singular(equations: Undamped, solution: Solution) -> GeometryError:
-    return GeometryError(
-        "the normal equations are singular: " + weakest(equations.problem, solution)
-    )
-
-
 def _pose_blocks(
-    problem: Problem, solution: Solution, reduced: Reduced, inverse: FloatArray
+    problem: Problem, solution: Solution, active: IntArray, inverse: FloatArray
 ) -> FloatArray:
     """Return the covariance of each pose, shape (k, 6, 6)."""
-    k = len(solution.state.centres)
-    poses = np.zeros((k, 6, 6))
-    if problem.columns.similarity >= 0:
-        at = problem.columns.similarity
-        by = pose_gradients(solution.state, problem.columns.pivot)
+    k, at = len(solution.state.centres), problem.given.similarity
+    if at >= 0:
+        by = pose_gradients(solution.state, problem.given.pivot)
         return np.asarray(by @ inverse[at : at + 7, at : at + 7] @ by.transpose(0, 2, 1))
-    place = np.full(len(problem.moves), -1)
-    place[reduced.active] = np.arange(len(reduced.active))
-    first = place[: 6 * k : 6]
-    rows = first[first >= 0][:, None] + np.arange(6)
-    poses[first >= 0] = inverse[rows[:, :, None], rows[:, None, :]]
+    poses = np.zeros((k, 6, 6))
+    first = np.flatnonzero(np.isin(active, 6 * np.arange(k)))  # six in a row belong to a pose
+    rows = first[:, None] + np.arange(6)
+    poses[active[first] // 6] = inverse[rows[:, :, None], rows[:, None, :]]
     return poses
 
 
-def _by_parts(
-    equations: Undamped, solution: Solution, asked: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return covariances of what is asked for and of each pose, without the whole inverse."""
-    reduced, k = equations.reduced, len(solution.state.centres)
-    solve_for = solver(reduced)
+def _by_parts(reduced: Reduced, k: int, g: int) -> tuple[FloatArray, FloatArray] | None:
+    """Return covariances of the shared unknowns and of each pose, without the whole inverse."""
+    active, solve_for = reduced.active, solver(reduced)
     if solve_for is None:
-        raise _singular(equations, solution)
-    of_asked = asked.T @ solve_for(asked)
-    poses = np.zeros((k, 6, 6))
-    first = np.searchsorted(reduced.active, 6 * np.arange(k))
-    moves = np.flatnonzero(reduced.active[np.minimum(first, len(asked) - 1)] == 6 * np.arange(k))
-    for part in np.array_split(moves, max(1, len(moves) // 32)):
-        rows = first[part][:, None] + np.arange(6)
-        unit = np.zeros((len(asked), rows.size))
+        return None
+    u, poses = len(active), np.zeros((k, 6, 6))
+    of_shared = solve_for(np.eye(u, g, g - u))[u - g :]  # the last g unknowns
+    first = np.flatnonzero(np.isin(active, 6 * np.arange(k)))
+    for part in np.array_split(first, max(1, len(first) // 32)):
+        rows = part[:, None] + np.arange(6)
+        unit = np.zeros((u, rows.size))
         unit[rows.ravel(), np.arange(rows.size)] = 1.0
-        found = solve_for(unit).reshape(len(asked), len(part), 6)
-        poses[part] = found[rows, np.arange(len(part))[:, None]]
-    if not (np.diag(of_asked) >= 0.0).all() or not (np.einsum("kii->ki", poses) >= 0.0).all():
-        raise _singular(equations, solution)
-    return np.asarray(of_asked), poses
+        found = solve_for(unit).reshape(u, len(part), 6)
+        poses[active[part] // 6] = found[rows, np.arange(len(part))[:, None]]
+    variances = np.concatenate([np.diag(of_shared), np.einsum("kii->ki", poses).ravel()])
+    return (of_shared, poses) if (variances >= 0.0).all() else None
 
 
-def _correlations(covariance: FloatArray) -> FloatArray:
-    """Return correlations; zero with what is fixed, whose variance is zero."""
-    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    known = sigma > 0.0
-    scale = np.where(known, 1.0 / np.where(known, sigma, 1.0), 0.0)
-    return np.asarray(covariance * scale * scale[:, None])
+# What is known poorly
 
 
 STRONG = 0.95
-
+"""Correlation of two unknowns that are hardly separated."""
 
 NO_NEWS = 0.9
-"""Share of a given standard deviation above which the images told nothing beyond it."""
+"""Share of a given standard deviation above which the images did not improve an unknown."""
+
+LEAST_BEND_M = 0.02
+"""Standard error of the curvature of the water from which it is undetermined, as the level's."""
+
+SURE = 0.01
+"""Probability that flat water appears to be curved by chance."""
 
 
-def strong_correlations(precision: Precision) -> list[str]:
-    """Return a sentence for each two unknowns that are hardly told apart, the strongest first.
+def correlated(precision: Precision) -> list[PcfixWarning]:
+    """Return a warning for each two unknowns that are hardly separated, the strongest first.
 
-    Pairs of k1, k2, ... are left out: they always are, and it harms nothing.
+    Pairs of k1, k2, ... are always correlated, which does no harm.
     """
     names = [row.name for row in precision.shared]
-    found: list[tuple[float, str]] = []
+    pairs: list[tuple[float, str, str, str]] = []
     for i, name in enumerate(names):
         for j in range(i):
             r = float(precision.correlation[i, j])
             if abs(r) > STRONG and not (name[0] == names[j][0] == "k"):
-                found.append((r, _pair(names[j], name, r)))
-        for words, r in zip(BLOCK_MOTIONS, precision.block_correlation[i].tolist(), strict=True):
-            # where poses move together, their shift is a shared unknown of its own
-            if abs(r) > STRONG and name not in MOTIONS:
-                found.append((r, _with_block(name, words, r)))
-    return [words for _, words in sorted(found, key=lambda row: -abs(row[0]))]
-
-
-def _pair(a: str, b: str, r: float) -> str:
-    beds, words = (a in BED) + (b in BED), f"{words_of(a)} and {words_of(b)}"
-    if beds == 2:
-        return f"{words} move the bed alike: r = {r:.3f}; fix one of them."
-    if beds == 1:
-        return (
-            f"{words} are hardly told apart: r = {r:.3f}; fix one of them, or give control points"
-            " at several heights."
+                beds = (names[j] in BED) + (name in BED)
+                remedy = ", or give control points at several heights" if beds == 1 else ""
+                pairs.append((r, words_of(names[j]), words_of(name), remedy))
+    return [
+        PcfixWarning(
+            "adjust.correlated",
+            f"{a} and {b} are strongly correlated (r = {r:.3f}). Fix one of them{remedy}.",
+            unknowns=[a, b],
+            correlation=r,
         )
-    return f"{words} do the same to the images: r = {r:.3f}; fix one of them."
+        for r, a, b, remedy in sorted(pairs, key=lambda row: -abs(row[0]))
+    ]
 
 
-def _with_block(name: str, motion: str, r: float) -> str:
-    remedy = "on land or better GNSS positions" if name in BED else "at several heights or obliques"
-    return (
-        f"{words_of(name)} and {motion} are hardly told apart: r = {r:.3f}; fix it, or give control"
-        f" points {remedy}."
-    )
+def undetermined(precision: Precision, unknowns: Unknowns) -> list[PcfixWarning]:
+    """Return a warning for each unknown whose standard error is too large to be useful."""
+    given = dict(zip(WATER_NAMES, unknowns.water_sigma, strict=True)) | unknowns.lens_sigma
+    notes = []
+    for row in precision.shared:
+        limit, unit, _ = LIMITS.get(row.name, (np.inf, "", ""))
+        prior = given.get(row.name.partition(" of sensor ")[0], np.inf)
+        values = {"unknown": row.name, "sigma": row.sigma}
+        if row.sigma > limit:
+            notes.append(
+                PcfixWarning(
+                    "adjust.undetermined",
+                    f"{words_of(row.name)} is undetermined: standard error {row.sigma:.2g}{unit}"
+                    f" (limit {limit:g}{unit}). Fix it to a measured value.",
+                    **values,
+                )
+            )
+        elif prior < np.inf and row.sigma > NO_NEWS * prior:
+            notes.append(
+                PcfixWarning(
+                    "adjust.not_improved",
+                    f"{words_of(row.name)} was not improved: the images tell no more than its"
+                    f" standard deviation of {prior:g}{unit}.",
+                    **values,
+                )
+            )
+    return notes
 
 
-LEAST_BEND_M = 0.02
-"""Standard error of the bend of the water, from where it counts as undetermined, as the level."""
-
-SURE = 0.01
-"""Probability that flat water seems to be bent, by chance."""
-
-
-def shape_doubts(precision: Precision, wet_xy: FloatArray) -> list[str]:
-    """Return a sentence if the block cannot tell the shape of the water, where it was free.
+def shape_notes(precision: Precision, wet_xy: FloatArray) -> list[PcfixWarning]:
+    """Return a warning if a free shape of the water is undetermined, or a plane.
 
     Parameters
     ----------
     wet_xy : array, shape (m, 2)
-        Points under water, about the origin of the block, metres. What bends the water over them
-        is what a plane does not take up.
+        Points under water, about the origin of the block, metres. The curvature over them is what
+        a plane cannot represent.
     """
     rows = [i for i, row in enumerate(precision.shared) if row.name.startswith("shape_")]
     if not rows or len(wet_xy) < 6:
@@ -350,34 +345,176 @@ def shape_doubts(precision: Precision, wet_xy: FloatArray) -> list[str]:
     chi2 = float(by @ np.linalg.solve(covariance, by))
     bend = float(np.sqrt(np.mean((terms @ by) ** 2)))
     error = float(np.sqrt(np.mean(np.einsum("mi,ij,mj->m", terms, covariance, terms))))
-    if error <= LEAST_BEND_M and chi2 > chdtri(len(rows), SURE):
-        return []
     figures = (
-        f"its shape bends it by {1000.0 * bend:.2g} mm (rms over the bed), with a standard error of"
-        f" {1000.0 * error:.2g} mm; leave shape out of --free"
+        f"curvature {1000.0 * bend:.2g} mm (RMS over the bed), standard error"
+        f" {1000.0 * error:.2g} mm. Remove shape from --free"
     )
+    values = {"bend_m": bend, "sigma_m": error}
     if error > LEAST_BEND_M:
-        more = "mark waterline points, or give more tie points under water"
-        return [f"the block does not tell the shape of the water: {figures}, or {more}."]
-    return [f"the water is a plane as far as the block tells: {figures}."]
+        return [
+            PcfixWarning(
+                "adjust.shape_undetermined",
+                f"the shape of the water is undetermined: {figures}, or mark waterline points.",
+                **values,
+            )
+        ]
+    if chi2 > chdtri(len(rows), SURE):
+        return []
+    return [PcfixWarning("adjust.flat", f"the water is not curved: {figures}.", **values)]
 
 
-def undetermined(precision: Precision, unknowns: Unknowns) -> list[str]:
-    """Return a sentence for each unknown whose standard error is too large to be of use."""
-    given = dict(zip(WATER_NAMES, unknowns.water_sigma, strict=True)) | unknowns.lens_sigma
-    notes = []
-    for row in precision.shared:
-        limit, unit, _ = LIMITS.get(row.name, (math.inf, "", ""))
-        prior = given.get(row.name.partition(" of sensor ")[0], math.inf)
-        space = f" {unit}" if unit else ""
-        if row.sigma > limit:
-            notes.append(
-                f"{words_of(row.name)} is undetermined: its standard error of"
-                f" {row.sigma:.2g}{space} exceeds {limit:g}{space}; fix it to a measured value."
-            )
-        elif prior < math.inf and row.sigma > NO_NEWS * prior:
-            notes.append(
-                f"{words_of(row.name)} is what was given: the images tell no more than its standard"
-                f" deviation of {prior:g}{space}."
-            )
-    return notes
+# The ensemble
+
+
+MEMBERS, AXES = 32, 16
+"""So many members leave an eighth of a standard deviation to chance, but nothing along the axes."""
+
+TINY = 1e-10
+"""Added to the diagonal of correlations, which rounding may leave indefinite."""
+
+SAME_M, SAME_FOCAL = 1e-3, 1e-6
+"""Differences of distances between centres, and relative ones of focal lengths, in one block."""
+
+
+@dataclass(frozen=True, eq=False)
+class Members:
+    """Corrections of m members of an ensemble to the k cameras of a block and to its water.
+
+    Attributes
+    ----------
+    labels : tuple of str, length k
+    centres : array, shape (k, 3)
+    focal : array, shape (k,)
+        Of the adjusted block, to recognise it.
+    turn : array, shape (m, k, 3)
+        About the axes of each camera's frame, rotation vectors, radians.
+    shift_m : array, shape (m, k, 3)
+        Of the centres, along the same axes.
+    lens_names : tuple of str, length p
+    lens : array, shape (m, k, p)
+        Added to these parameters.
+    water : array, shape (m, 7), or (m, 4) for a plane
+        Added to the height of the water below the mean of the centres, to its slopes along x and
+        y, to the refractive index, and to d, e, f of d x^2 + e x y + f y^2 about there; zero for
+        what was fixed.
+    """
+
+    labels: tuple[str, ...]
+    centres: FloatArray
+    focal: FloatArray
+    turn: FloatArray
+    shift_m: FloatArray
+    lens_names: tuple[str, ...]
+    lens: FloatArray
+    water: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.turn)
+
+    def rows_of(self, cameras: Cameras) -> IntArray | None:
+        """Return the row of each of some cameras, in any CRS; None for another block."""
+        row = {label: i for i, label in enumerate(self.labels)}
+        if len(row) < len(self.labels) or sorted(cameras.labels) != sorted(self.labels):
+            return None
+        rows = np.array([row[label] for label in cameras.labels])
+        if cameras.rotations is None or cameras.lenses is None:
+            return None
+        focal = np.array([lens.focal for lens in cameras.lenses])
+        here, there = (
+            np.linalg.norm(c - c.mean(axis=0), axis=1)
+            for c in (self.centres[rows], cameras.centres)
+        )
+        # maps differ in scale
+        there = there * (here.mean() / max(float(there.mean()), SAME_M))
+        is_same = np.abs(focal / self.focal[rows] - 1.0).max() < SAME_FOCAL
+        return rows if is_same and np.abs(there - here).max() < SAME_M else None
+
+    def cameras(self, member: int, nominal: Cameras, rows: IntArray) -> Cameras:
+        """Return the cameras of a member; `rows` is `rows_of` the nominal ones."""
+        rotations = np.asarray(nominal.rotations)
+        turn, shift = self.turn[member, rows], self.shift_m[member, rows]
+        codes, by = tuple(CODES[name] for name in self.lens_names), self.lens[member, rows]
+        lenses = zip(nominal.lenses or (), by, strict=True)
+        return replace(
+            nominal,
+            centres=nominal.centres + np.einsum("kji,kj->ki", rotations, shift),
+            rotations=Rotation.from_rotvec(turn).as_matrix() @ rotations,
+            lenses=tuple(moved_lens(lens, codes, add) for lens, add in lenses),
+        )
+
+    def surface(self, member: int, water: WaterSurface, cameras: Cameras) -> WaterSurface:
+        """Return the water of a member; a mesh or a dimension of the cloud stays the same."""
+        level, b, c, _ = self.water[member, :4].tolist()
+        if not np.delete(self.water[member], INDEX).any():
+            return water
+        x, y, _ = cameras.centres.mean(axis=0).tolist()
+        if isinstance(water, WaterRaster):
+            rows, columns = (np.arange(n) + 0.5 for n in water.height_m.shape)
+            dx = (water.left_m + water.cell_m[0] * columns - x)[None, :]
+            dy = (water.top_m - water.cell_m[1] * rows - y)[:, None]
+            return replace(water, height_m=water.height_m + polynomial(self.water[member], dx, dy))
+        if not isinstance(water, WaterPlane):
+            return water
+        return WaterPlane(water.a + level - b * x - c * y, water.b + b, water.c + c)
+
+
+def drawn(covariance: FloatArray, count: int = MEMBERS) -> FloatArray:
+    """Return random draws from a covariance, shape (a, a), as rows; always the same.
+
+    Along the largest axes of its correlations, on which most unknowns move together, they scatter
+    by exactly the variance; along all others by chance.
+    """
+    from scipy.linalg import cholesky
+    from scipy.sparse.linalg import eigsh
+
+    sigma, rng = np.sqrt(covariance.diagonal()), np.random.default_rng(0)
+    correlation = np.array(covariance / sigma, order="F")
+    correlation /= sigma[:, None]
+    correlation[np.diag_indices(len(sigma))] += TINY
+    few = min(AXES, count, len(sigma) - 1)
+    found = eigsh(correlation, few, v0=np.ones(len(sigma))) if few > 0 else None
+    factor = cholesky(correlation, lower=True, overwrite_a=True)
+    draws = rng.standard_normal((count, len(sigma))) @ factor.T
+    if found is not None:
+        values, axes = found
+        even = np.linalg.qr(draws @ axes)[0] * np.sqrt(count * values)
+        draws += (even - draws @ axes) @ axes.T
+    return np.asarray(draws * sigma)
+
+
+def members_of(problem: Problem, found: Solution, active: IntArray, steps: FloatArray) -> Members:
+    """Return the members that differ from a solution by steps, shape (m, a), of active unknowns.
+
+    Steps that take a lens or an index out of its range are skipped.
+    """
+    state, names = found.state, problem.unknowns.lens
+    codes = [CODES[name] for name in names]
+    before = [[lens_parameter(lens, code) for code in codes] for lens in found.lenses]
+    turn, shift, lens, water = [], [], [], []
+    for one in steps:
+        step = np.zeros(len(problem.moves))
+        step[active] = one
+        moved = moved_by(problem, found, step, np.zeros_like(state.xyz))
+        if moved is None:
+            continue
+        r, by = state.rotations, moved.state.water - state.water
+        turn.append(Rotation.from_matrix(moved.state.rotations @ r.transpose(0, 2, 1)).as_rotvec())
+        shift.append(np.einsum("kij,kj->ki", r, moved.state.centres - state.centres))
+        after = [[lens_parameter(lens, code) for code in codes] for lens in moved.lenses]
+        lens.append(np.array(after) - np.array(before))
+        # level and slopes below the mean of the cameras, not at the origin of the block
+        x, y, _ = state.centres.mean(axis=0)
+        d, e, f = by[SHAPE:PORT]
+        slopes = by[1] + 2.0 * d * x + e * y, by[2] + e * x + 2.0 * f * y
+        water.append([float(polynomial(by, x, y)), *slopes, by[INDEX], d, e, f])
+    k, m = len(state.centres), len(turn)
+    return Members(
+        problem.block.cameras.labels,
+        state.centres + problem.origin,
+        np.array([lens.focal for lens in found.lenses]),
+        np.reshape(turn, (m, k, 3)),
+        np.reshape(shift, (m, k, 3)),
+        names,
+        np.reshape(lens, (m, k, len(names))),
+        np.reshape(water, (m, 7)),
+    )

@@ -1,4 +1,4 @@
-"""A block as a problem to solve: what is measured, what moves, what is known beforehand.
+"""An adjustment as a least squares problem: observations, unknowns and prior knowledge.
 
 The datum and all other prior knowledge enter as observations of the unknowns: GNSS positions,
 surveyed points, standard deviations of lens, water and index.
@@ -15,29 +15,23 @@ import numpy as np
 from pcfix.adjust.block import (
     CODES,
     INDEX,
-    LEAST_SQUARES,
     MOTIONS,
     NAMES,
+    PLANES,
     PORT,
     SHAPE,
+    WATER,
     WATER_NAMES,
     Block,
-    Columns,
-    Given,
-    Loss,
-    OnSurfaces,
-    PointPriors,
-    Seen,
-    State,
-    Surface,
     Unknowns,
-    columns_of,
+    inverse_variances,
     sensor_groups,
     usable_codes,
 )
-from pcfix.adjust.conditions import distances, planes_of
-from pcfix.adjust.normal import cost_of, pair_slots, point_steps, residuals
+from pcfix.adjust.collinearity import Given, State, Workspace, condition
+from pcfix.adjust.normal import PLAIN, Rule, cost_of, in_parts, pair_slots, point_steps, residuals
 from pcfix.errors import GeometryError
+from pcfix.kernels import Span, kernel
 from pcfix.lens.imaging import lens_table
 from pcfix.model import (
     BoolArray,
@@ -55,11 +49,16 @@ from pcfix.port.shapes import DomePort, FlatPort, Port
 from pcfix.water.surface import build_field, build_tin
 
 NETWORK_SIGMA_M = 1e-4
-"""How tightly the mean of the projection centres is held in a free network."""
+"""Standard deviation of the mean of the projection centres in a free network."""
+
+CELLS = 400
+"""Of a raster of curved water, along its longer side: a bend of 10 cm is kept within 1 um."""
+MARGIN = 0.2
+"""By which that raster exceeds the block, as a share of its extent."""
 
 
 class LogRow(NamedTuple):
-    """One step: which round, what it came to, and the damping."""
+    """One step of an adjustment."""
 
     round: int
     step: int
@@ -76,52 +75,65 @@ class LogRow(NamedTuple):
 
 
 Progress = Callable[[LogRow], None]
-"""What is called after each step."""
+"""Is called after each step."""
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class Problem:
-    """A block with everything that stays as it is while it is solved."""
+    """A block prepared for the solver.
+
+    Attributes
+    ----------
+    block : Block
+    unknowns : Unknowns
+    origin : array, shape (3,)
+        Of the coordinates in `given` and in states.
+    given : Given
+        What the kernels need.
+    groups : list of list of int
+        Rows of the cameras of each sensor.
+    codes : list of tuple of int
+        Free lens parameters of each sensor.
+    slots : tuple of arrays
+        See `pcfix.adjust.normal.pair_slots`.
+    moves : array of bool, shape (6 k + g,)
+        Which of the poses and shared unknowns are free.
+    names : list of str
+        Names of the shared unknowns.
+    """
 
     block: Block
     unknowns: Unknowns
     origin: FloatArray
-    seen: Seen
-    surface: Surface
-    columns: Columns
+    given: Given
     groups: list[list[int]]
     codes: list[tuple[int, ...]]
     slots: tuple[IntArray, IntArray]
-    priors: PointPriors
     moves: BoolArray
-    on_surfaces: OnSurfaces
-    numbers: tuple[str, ...]
+    names: list[str]
 
     @property
-    def given(self) -> Given:
-        """What the kernels take of it."""
-        return Given(self.seen, self.surface, self.columns, self.priors, self.on_surfaces)
+    def used(self) -> BoolArray:
+        """Observations that count, shape (o,)."""
+        return np.asarray(self.given.weight > 0.0)
 
     @property
-    def names(self) -> list[str]:
-        """What each of the shared unknowns is."""
-        names = [
-            NAMES[code] if len(self.groups) == 1 else f"{NAMES[code]} of sensor {i}"
-            for i, codes in enumerate(self.codes, start=1)
-            for code in codes
-        ]
-        by_column = dict(zip(self.columns.water[::-1].tolist(), self.numbers[::-1], strict=True))
-        names += [by_column[at] for at in sorted(by_column) if at >= 0]
-        return names + list(MOTIONS if self.columns.similarity >= 0 else ())
+    def of_ties(self) -> BoolArray:
+        """Observations of tie points, shape (o,)."""
+        return np.asarray(self.block.owner < self.block.tie_points)
+
+    def weighted(self, weight: FloatArray) -> Problem:
+        """Return the problem with other weights of its observations."""
+        return replace(self, given=self.given._replace(weight=weight))
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Where a problem came to rest.
+    """State of a problem after some steps.
 
-    state : relative to `Problem.origin`; lenses : k of them.
-    shared : shape (g,), what was added to the shared unknowns.
-    cost : sum of weighted squares, priors included.
+    state : relative to `Problem.origin`; lenses : of the k cameras.
+    shared : shape (g,), corrections of the shared unknowns.
+    cost : sum of weighted squares, including prior knowledge.
     """
 
     state: State
@@ -134,55 +146,98 @@ class Solution:
 def prepare(
     block: Block, unknowns: Unknowns, origin: FloatArray | None = None
 ) -> tuple[Problem, Solution]:
-    """Return a problem and its start; the origin of its frame is the middle of the cameras.
+    """Return a problem and its start; the origin is the rounded mean of the cameras by default.
 
     Raises
     ------
     GeometryError
-        If cameras lack angles or lenses, or the water's tilt is to move over a mesh or raster.
+        If cameras lack angles or lenses, or tilt or shape of a mesh or raster are free.
     """
-    cameras = block.cameras
+    cameras, water = block.cameras, block.water
     if cameras.rotations is None or cameras.lenses is None:
-        raise GeometryError("an adjustment needs cameras with angles and lenses.")
+        raise GeometryError(
+            "cameras.no_angles", "An adjustment needs the angles and a lens of every image."
+        )
     origin = np.round(cameras.centres.mean(axis=0)) if origin is None else origin
     group, groups = sensor_groups(cameras.lenses)
     codes = [usable_codes(cameras.lenses[images[0]], unknowns.lens) for images in groups]
-    plane = isinstance(block.water, WaterPlane) or block.water is None
-    if (unknowns.tilt_sigma or unknowns.shape_sigma) and not plane:
+    if (unknowns.tilt_sigma or unknowns.shape_sigma) and isinstance(water, WaterMesh | WaterRaster):
         what = "tilt" if unknowns.tilt_sigma else "shape"
-        raise GeometryError(f"the {what} of the water can be free for a level or plane only.")
-    water = _water_numbers(block, origin)
-    planes = planes_of(block, origin, water)
+        words = (
+            f"The {what} of the water can be free for a level or plane only, not for a mesh or"
+            " raster."
+        )
+        raise GeometryError("adjust.fixed_surface", words, unknown=what)
+    numbers = _surface_numbers(block, origin)
+    planes, plane_names, axis, alike = _planes(block, origin, numbers)
+    # columns of the shared unknowns: lenses, then surface and planes, then a similarity
+    first_lens = np.concatenate([[0], np.cumsum([len(one) for one in codes])]).astype(np.int64)
     free = [sigma != 0.0 for sigma in unknowns.water_sigma]
-    free += [len(WATER_NAMES) + i not in planes.alike for i in range(len(planes.numbers))]
-    centres = cameras.centres - origin
-    columns = columns_of(
-        codes, free, unknowns.poses == "similarity", centres.mean(axis=0), planes.alike
-    )
+    free += [len(WATER_NAMES) + i not in alike for i in range(len(planes))]
+    column = np.full(len(free), -1, np.int64)
+    column[free] = first_lens[-1] + np.arange(sum(free))
+    for number, other in alike.items():
+        column[number] = column[other]
+    names = [
+        NAMES[code] if len(groups) == 1 else f"{NAMES[code]} of sensor {i}"
+        for i, of_sensor in enumerate(codes, start=1)
+        for code in of_sensor
+    ]
+    names += [
+        name for name, is_free in zip((*WATER_NAMES, *plane_names), free, strict=True) if is_free
+    ]
+    is_similarity = unknowns.poses == "similarity"
+    similarity = len(names) if is_similarity else -1
+    names += list(MOTIONS) if is_similarity else []
     row, table = lens_table(cameras.lenses)
-    seen = Seen(
-        np.ascontiguousarray(block.start, np.int64),
-        np.ascontiguousarray(block.camera, np.int64),
-        np.ascontiguousarray(block.image_xy, np.float64),
-        1.0 / np.asarray(block.sigma_px, np.float64),
-        np.ascontiguousarray(block.wet, np.bool_),
-        row.astype(np.int64),
-        group,
+    centres = cameras.centres - origin
+    weight = inverse_variances(block.surveyed_xyz, block.surveyed_sigma_m)
+    conditions = block.conditions
+    given = Given(
+        start=np.ascontiguousarray(block.start, np.int64),
+        camera=np.ascontiguousarray(block.camera, np.int64),
+        image_xy=np.ascontiguousarray(block.image_xy, np.float64),
+        weight=1.0 / np.asarray(block.sigma_px, np.float64),
+        wet=np.ascontiguousarray(block.wet, np.bool_),
+        lens_row=row.astype(np.int64),
+        group=group,
+        has_water=water is not None,
+        tin=build_tin(water) if isinstance(water, WaterMesh) else None,
+        field=build_field(water) if isinstance(water, WaterRaster) else None,
+        origin=origin,
+        port=np.zeros(0) if block.port is None else port_coefficients(block.port),
+        curved=unknowns.shape_sigma != 0.0,
+        first_lens=first_lens,
+        code=np.array([code for of_sensor in codes for code in of_sensor], np.int64),
+        column=column,
+        similarity=similarity,
+        shared=len(names),
+        pivot=centres.mean(axis=0),
+        surveyed_xyz=np.where(weight > 0.0, block.surveyed_xyz - origin, 0.0),
+        surveyed_weight=weight,
+        on=np.asarray([] if conditions is None else conditions.on, np.int64),
+        on_weight=np.zeros(0)
+        if conditions is None
+        else np.where(conditions.on >= 0, 1.0 / conditions.sigma_m, 0.0),
+        axis=axis,
     )
-    state = State(
-        centres, np.ascontiguousarray(cameras.rotations, np.float64), table,
-        block.xyz - origin, np.concatenate([water, planes.numbers]),
-    )  # fmt: skip
+    poses = [
+        unknowns.poses == "free" and label not in unknowns.fixed_images for label in cameras.labels
+    ]
     problem = Problem(
-        block, unknowns, origin, seen, _surface(block, origin, unknowns), columns, groups, codes,
-        pair_slots(seen, len(cameras)), _point_priors(block, origin),
-        _moves(block, unknowns, columns), planes.rows, (*WATER_NAMES, *planes.names),
+        block, unknowns, origin, given, groups, codes,
+        pair_slots(given.start, given.camera, len(cameras)),
+        np.concatenate([np.repeat(poses, 6), np.ones(len(names), bool)]), names,
     )  # fmt: skip
-    start = Solution(state, cameras.lenses, np.zeros(columns.total), np.inf, [])
-    return problem, start
+    state = State(
+        centres, np.ascontiguousarray(cameras.rotations, np.float64), table, block.xyz - origin,
+        np.concatenate([numbers, planes]),
+    )  # fmt: skip
+    return problem, Solution(state, cameras.lenses, np.zeros(len(names)), np.inf, [])
 
 
-def _water_numbers(block: Block, origin: FloatArray) -> FloatArray:
+def _surface_numbers(block: Block, origin: FloatArray) -> FloatArray:
+    """Return the start values of `WATER_NAMES`, shape (11,)."""
     water, numbers = block.water, np.zeros(len(WATER_NAMES))
     numbers[INDEX] = block.refractive_index
     if isinstance(water, WaterPlane):
@@ -196,8 +251,83 @@ def _water_numbers(block: Block, origin: FloatArray) -> FloatArray:
     return numbers
 
 
+def _planes(
+    block: Block, origin: FloatArray, water: FloatArray
+) -> tuple[list[float], list[str], IntArray, dict[int, int]]:
+    """Fit the planes of a block to the start values of their points.
+
+    Parallel planes share two slopes, those of the water if that is one of them.
+
+    Returns
+    -------
+    numbers : list of float
+        Height and two slopes of each plane.
+    names : list of str
+        Of these numbers.
+    axis : array of int
+        Along which the water and each plane have their heights: that nearest to the normal.
+    alike : dict
+        Numbers that are the same unknown as another one, counted from the first of `WATER_NAMES`.
+
+    Raises
+    ------
+    GeometryError
+        If a plane, or a bundle of parallel planes, has too few points.
+    """
+    given = block.conditions
+    if given is None:
+        return [], [], np.zeros(0, np.int64), {}
+    xyz, counts = block.xyz - origin, np.diff(block.start) > 0
+    bundles = [tuple(given.parallel)] if given.parallel else []
+    bundles += [(name,) for name in given.names if name not in given.parallel]
+    numbers = np.zeros((len(given.names), 3))
+    axis, alike = np.full(1 + len(given.names), 2), dict[int, int]()
+    for bundle in bundles:
+        rows = [given.names.index(name) for name in bundle if name != WATER]
+        on = [xyz[(given.on == row + 1) & counts] for row in rows]
+        normal = np.array([-water[1], -water[2], 1.0])
+        if WATER not in bundle:
+            # any three points lie on a plane: one more is needed to say anything
+            count, least = sum(map(len, on)), len(bundle) + 3
+            if count < least:
+                raise GeometryError(
+                    "gcps.few_on_plane",
+                    f"Plane {', '.join(bundle)}: {count} points lie on it, at least {least} are"
+                    " needed. Mark more points.",
+                    plane=", ".join(bundle),
+                    points=count,
+                    least=least,
+                )
+            apart = np.vstack([points - points.mean(axis=0) for points in on])
+            normal = np.linalg.svd(apart, full_matrices=False)[2][-1]
+        up = int(np.abs(normal).argmax())
+        x, y = (up + 1) % 3, (up + 2) % 3
+        slopes = -normal[[x, y]] / normal[up]
+        first = 0 if WATER in bundle else PLANES + 3 * rows[0]
+        for row, points in zip(rows, on, strict=True):
+            middle = points.mean(axis=0) if len(points) else np.zeros(3)
+            numbers[row], axis[1 + row] = [middle[up] - slopes @ middle[[x, y]], *slopes], up
+            if PLANES + 3 * row != first:
+                alike |= {PLANES + 3 * row + i: first + i for i in (1, 2)}
+    names = [f"{word} of {name}" for name in given.names for word in WATER_NAMES[:3]]
+    return numbers.ravel().tolist(), names, axis.astype(np.int64), alike
+
+
+# What was found
+
+
+def solved_cameras(problem: Problem, found: Solution) -> Cameras:
+    """Return the cameras of a solution, world frame."""
+    return replace(
+        problem.block.cameras,
+        centres=found.state.centres + problem.origin,
+        rotations=found.state.rotations,
+        lenses=found.lenses,
+    )
+
+
 def port_of(block: Block, numbers: FloatArray) -> Port | None:
-    """Return the port of a block with the numbers of a state."""
+    """Return the port of a block with the parameters of a state."""
     match block.port:
         case FlatPort():
             return replace(block.port, distance_m=float(numbers[PORT]))
@@ -208,11 +338,11 @@ def port_of(block: Block, numbers: FloatArray) -> Port | None:
 
 
 def water_of(problem: Problem, state: State) -> WaterSurface | None:
-    """Return the water surface as it was found, world frame."""
+    """Return the water surface of a state, world frame."""
     water, origin = problem.block.water, problem.origin
     level, b, c = (float(value) for value in state.water[:3])
     match water:
-        case WaterPlane() if problem.surface.curved:
+        case WaterPlane() if problem.given.curved:
             return _curved_raster(problem, state)
         case WaterPlane():
             return WaterPlane(level + origin[2] - (b * origin[0] + c * origin[1]), b, c)
@@ -222,12 +352,6 @@ def water_of(problem: Problem, state: State) -> WaterSurface | None:
             return replace(water, vertices=water.vertices + np.array([0.0, 0.0, level]))
         case _:
             return water
-
-
-CELLS = 400
-"""Along the longer side of a raster of curved water: a bend of 10 cm in all is met within 1 um."""
-MARGIN = 0.2
-"""Of the block's extent, by which the raster goes beyond it."""
 
 
 def _curved_raster(problem: Problem, state: State) -> WaterRaster:
@@ -245,82 +369,61 @@ def _curved_raster(problem: Problem, state: State) -> WaterRaster:
 
 
 def polynomial(water: FloatArray, x: FloatArray | float, y: FloatArray | float) -> FloatArray:
-    """Return the height of the water's numbers at places, block frame."""
+    """Return the height of the water at x, y, block frame."""
     (a, b, c), (d, e, f) = water[:3], water[SHAPE:PORT] if len(water) > SHAPE else (0.0, 0.0, 0.0)
     return np.asarray(a + b * x + c * y + d * x * x + e * x * y + f * y * y)
 
 
-def _surface(block: Block, origin: FloatArray, unknowns: Unknowns) -> Surface:
-    water = block.water
-    return Surface(
-        water is not None,
-        build_tin(water) if isinstance(water, WaterMesh) else None,
-        build_field(water) if isinstance(water, WaterRaster) else None,
-        origin,
-        np.zeros(0) if block.port is None else port_coefficients(block.port),
-        unknowns.shape_sigma != 0.0,
+# Prior knowledge
+
+
+def priors_at(problem: Problem, found: Solution) -> tuple[float, FloatArray, FloatArray]:
+    """Return what prior knowledge of poses, lens and water adds to the equations of a state.
+
+    Returns
+    -------
+    cost : float
+    matrix : array, shape (u,) or (u, u)
+        Its diagonal, if it has no other entries.
+    right : array, shape (u,)
+    """
+    given, block = problem.given, problem.block
+    k, g = len(block.cameras), given.shared
+    diagonal, right = np.zeros(6 * k + g), np.zeros(6 * k + g)
+    weight = block.gnss_weights
+    off = np.where(weight > 0.0, block.gnss_xyz - problem.origin - found.state.centres, 0.0)
+    shared = inverse_variances(found.shared, _shared_sigma(problem))
+    cost = float((weight * off * off).sum() + (shared * found.shared**2).sum())
+    diagonal[6 * k :], right[6 * k :] = shared, -shared * found.shared
+    if given.similarity >= 0:
+        matrix, at = np.diag(diagonal), 6 * k + given.similarity
+        by = similarity_gradients(found.state.centres - given.pivot)
+        matrix[at:, at:] += np.einsum("kia,ki,kib->ab", by, weight, by)
+        right[at:] += np.einsum("kia,ki->a", by, weight * off)
+        return cost, matrix, right
+    diagonal[: 6 * k].reshape(k, 6)[:, 3:] = weight
+    right[: 6 * k].reshape(k, 6)[:, 3:] = weight * off
+    if not problem.unknowns.free_network:
+        return cost, diagonal, right
+    # a free network: seven more observations hold mean, direction and scale of the centres
+    start = block.cameras.centres - problem.origin
+    d = start - start.mean(axis=0)
+    by = similarity_gradients(d) / np.array([1.0] * 3 + [np.sqrt((d * d).sum() / k)] * 4)
+    rows = np.zeros((7, len(right)))
+    rows[:, : 6 * k].reshape(7, k, 6)[:, :, 3:] = by.transpose(2, 0, 1) / k
+    rows = rows[_undetermined_motions(problem)]
+    of_centres = rows[:, : 6 * k].reshape(len(rows), k, 6)[:, :, 3:]
+    moved = np.einsum("akj,kj->a", of_centres, found.state.centres - start)
+    tight = 1.0 / NETWORK_SIGMA_M**2
+    return (
+        cost + tight * float((moved * moved).sum()),
+        np.diag(diagonal) + tight * rows.T @ rows,
+        right - tight * rows.T @ moved,
     )
 
 
-def _point_priors(block: Block, origin: FloatArray) -> PointPriors:
-    weight = _weights(block.surveyed_xyz, block.surveyed_sigma_m)
-    return PointPriors(np.where(weight > 0.0, block.surveyed_xyz - origin, 0.0), weight)
-
-
-def _moves(block: Block, unknowns: Unknowns, columns: Columns) -> BoolArray:
-    labels, fixed = block.cameras.labels, set(unknowns.fixed_images)
-    poses = [unknowns.poses == "free" and label not in fixed for label in labels]
-    return np.concatenate([np.repeat(poses, 6), np.ones(columns.total, bool)])
-
-
-class Priors(NamedTuple):
-    """What priors add: cost, to the matrix or its diagonal, and to the right side."""
-
-    cost: float
-    matrix: FloatArray
-    right: FloatArray
-
-
-def gnss_weights(block: Block) -> FloatArray:
-    """Return inverse variances of the GNSS positions, shape (k, 3); zero where there is none."""
-    return _weights(block.gnss_xyz, block.gnss_sigma_m)
-
-
-def _weights(values: FloatArray, sigma: FloatArray) -> FloatArray:
-    """Return inverse variances; zero where value or standard deviation is not known."""
-    known = np.isfinite(values) & np.isfinite(sigma)
-    return np.where(known, 1.0 / np.where(known, sigma, 1.0) ** 2, 0.0)
-
-
-def priors_at(problem: Problem, found: Solution) -> Priors:
-    """Return what the priors of poses, lens and water say at a state."""
-    block, columns, unknowns = problem.block, problem.columns, problem.unknowns
-    k, g = len(block.cameras), columns.total
-    diagonal, right = np.zeros(6 * k + g), np.zeros(6 * k + g)
-    weight = gnss_weights(block)
-    off = np.where(weight > 0.0, block.gnss_xyz - problem.origin - found.state.centres, 0.0)
-    cost = float((weight * off * off).sum())
-    tight = _weights(found.shared, _shared_sigma(problem))
-    cost += float((tight * found.shared**2).sum())
-    diagonal[6 * k :] = tight
-    right[6 * k :] = -tight * found.shared
-    poses = np.column_stack([np.zeros((k, 3)), weight])
-    if columns.similarity < 0:
-        diagonal[: 6 * k] = poses.ravel()
-        right[: 6 * k] = np.column_stack([np.zeros((k, 3)), weight * off]).ravel()
-        if unknowns.free_network:
-            return _with_network(problem, found, Priors(cost, diagonal, right))
-        return Priors(cost, diagonal, right)
-    matrix = np.diag(diagonal)
-    by = similarity_gradients(found.state.centres - columns.pivot)
-    at = 6 * k + columns.similarity
-    matrix[at:, at:] += np.einsum("kia,ki,kib->ab", by, weight, by)
-    right[at:] += np.einsum("kia,ki->a", by, weight * off)
-    return Priors(cost, matrix, right)
-
-
 def similarity_gradients(d: FloatArray) -> FloatArray:
-    """Return how places move with a shift, a turn and a scale about the pivot, shape (k, 3, 7)."""
+    """Return how places d from the pivot move with shift, turn and scale, shape (k, 3, 7)."""
     by = np.zeros((len(d), 3, 7))
     by[:, [0, 1, 2], [0, 1, 2]] = 1.0
     x, y, z = d.T
@@ -339,33 +442,14 @@ def pose_gradients(state: State, pivot: FloatArray) -> FloatArray:
     return by
 
 
-def _with_network(problem: Problem, found: Solution, extra: Priors) -> Priors:
-    """Hold mean place, direction and scale of the projection centres."""
-    start = problem.block.cameras.centres - problem.origin
-    k = len(start)
-    d = start - start.mean(axis=0)
-    by = similarity_gradients(d) / np.array([1.0] * 3 + [np.sqrt((d * d).sum() / k)] * 4)
-    rows = np.zeros((7, len(extra.right)))
-    rows[:, : 6 * k].reshape(7, k, 6)[:, :, 3:] = by.transpose(2, 0, 1) / k
-    rows = rows[_undetermined(problem)]
-    off = rows[:, : 6 * k].reshape(len(rows), k, 6)[:, :, 3:]
-    miss = np.einsum("akj,kj->a", off, found.state.centres - start)
-    weight = 1.0 / NETWORK_SIGMA_M**2
-    return Priors(
-        extra.cost + weight * float((miss * miss).sum()),
-        np.diag(extra.matrix) + weight * rows.T @ rows,
-        extra.right - weight * rows.T @ miss,
-    )
+def _undetermined_motions(problem: Problem) -> list[int]:
+    """Return which of shift, turn and scale the images do not determine.
 
-
-def _undetermined(problem: Problem) -> list[int]:
-    """Return which of shift, turn and scale nothing in the images tells.
-
-    A water surface whose level or tilt does not move freely tells the height or tilt of the block.
+    A water surface whose level or tilt is not free determines height or tilt of the block.
     """
     unknowns = problem.unknowns
-    bends = problem.block.refractive_index != 1.0 or unknowns.index_sigma > 0.0
-    if not (problem.surface.there and bends and problem.block.wet.any()):
+    refracts = problem.block.refractive_index != 1.0 or unknowns.index_sigma > 0.0
+    if not (problem.given.has_water and refracts and problem.block.wet.any()):
         return list(range(7))
     level = [2] if np.isinf(unknowns.level_sigma_m) else []
     tilt = [3, 4] if np.isinf(unknowns.tilt_sigma) else []
@@ -376,46 +460,53 @@ def _shared_sigma(problem: Problem) -> FloatArray:
     """Return the standard deviations of the shared unknowns about their start."""
     unknowns = problem.unknowns
     given = {CODES[name]: value for name, value in unknowns.lens_sigma.items()}
-    lens = [given.get(int(code), np.inf) for code in problem.columns.code]
+    lens = [given.get(int(code), np.inf) for code in problem.given.code]
     water = [sigma for sigma in unknowns.water_sigma if sigma]
-    rest = problem.columns.total - len(lens) - len(water)
+    rest = problem.given.shared - len(lens) - len(water)
     return np.array([*lens, *water, *([np.inf] * rest)], np.float64)
 
 
-def cost_at(problem: Problem, found: Solution, loss: Loss) -> float:
-    """Return what a solution costs: images, surveyed points and all priors."""
-    counts = problem.seen.weight > 0.0
-    r = residuals(found.state, problem.seen, problem.surface)[counts]
-    images = cost_of((r**2).sum(axis=1) * problem.seen.weight[counts] ** 2, loss)
-    return images + survey_cost(problem, found) + priors_at(problem, found).cost
+def cost_at(problem: Problem, found: Solution, rule: Rule) -> float:
+    """Return the cost of a solution: images, surveyed points and all prior knowledge."""
+    used, weight = problem.used, problem.given.weight
+    r = residuals(found.state, problem.given)[used]
+    images = cost_of((r**2).sum(axis=1) * weight[used] ** 2, rule)
+    return images + survey_cost(problem, found) + priors_at(problem, found)[0]
 
 
 def survey_cost(problem: Problem, found: Solution) -> float:
-    """Return the weighted squares by which surveyed points were moved, or lie off their surface."""
-    priors, rows = problem.priors, problem.on_surfaces
-    cost = float((priors.weight * (priors.xyz - found.state.xyz) ** 2).sum())
-    if not len(rows.on):
+    """Return the weighted squared residuals of surveyed points and of points on surfaces."""
+    given = problem.given
+    off = given.surveyed_weight * (given.surveyed_xyz - found.state.xyz) ** 2
+    cost = float(off.sum())
+    if not len(given.on):
         return cost
-    off = distances(found.state, problem.given)
-    return cost + float(np.nansum((rows.weight * off) ** 2))
+    return cost + float(np.nansum((given.on_weight * surface_distances(problem, found)) ** 2))
+
+
+def surface_distances(problem: Problem, found: Solution) -> FloatArray:
+    """Return surface minus point, shape (m,), metres along its axis; NaN for points on none."""
+    off, given, state = np.full(len(found.state.xyz), np.nan), problem.given, found.state
+    in_parts(lambda span, _, work: _surface_distances(span, state, given, off, work), given)
+    return off
+
+
+@kernel
+def _surface_distances(
+    span: Span, state: State, given: Given, off: FloatArray, work: Workspace
+) -> None:
+    for p in range(*span):
+        if condition(state, given, p, work, 0):
+            off[p] = work.r[0, 0] / given.on_weight[p]
 
 
 def counts_of(problem: Problem, found: Solution) -> tuple[int, float]:
-    """Return how many observations count, and the root mean square of their residuals."""
-    counts = problem.seen.weight > 0.0
-    r = residuals(found.state, problem.seen, problem.surface)[counts]
-    n = int(counts.sum())
-    return n, float(np.sqrt(np.nansum(r * r) / max(2 * n, 1)))
+    """Return the number of observations that count, and the RMS of their residuals."""
+    r = residuals(found.state, problem.given)[problem.used]
+    return len(r), float(np.sqrt(np.nansum(r * r) / max(2 * len(r), 1)))
 
 
-def solved_cameras(problem: Problem, found: Solution) -> Cameras:
-    """Return the cameras of a solution, world frame."""
-    return replace(
-        problem.block.cameras,
-        centres=found.state.centres + problem.origin,
-        rotations=found.state.rotations,
-        lenses=found.lenses,
-    )
+# Intersection with fixed poses
 
 
 STEPS = 10
@@ -426,7 +517,7 @@ class Intersected(NamedTuple):
     """Points and how well they fit their images.
 
     xyz : shape (m, 3), metres, world frame.
-    residual_px : shape (o, 2), measured minus computed; NaN where the intersection failed.
+    residual_px : shape (o, 2), measured minus computed; NaN if the intersection failed.
     start : shape (m + 1,), the residuals of point i are ``start[i]:start[i + 1]``.
     """
 
@@ -451,19 +542,19 @@ class Intersected(NamedTuple):
 
 
 def intersect_fixed(block: Block) -> Intersected:
-    """Return the points of a block by least squares, poses, lens and water as they are.
+    """Intersect the points of a block by least squares, with fixed poses, lens and water.
 
-    A point that takes more than `STEPS` steps of Gauss and Newton has failed.
+    It fails for a point that needs more than `STEPS` Gauss-Newton steps.
     """
     problem, now = prepare(replace(block, conditions=None), Unknowns(poses="fixed", lens=()))
     nothing = np.zeros(len(problem.moves))
     state, step = now.state, np.full((len(block.xyz), 3), np.inf)
     for _ in range(STEPS):
-        step = point_steps(state, problem.given, LEAST_SQUARES, 0.0, nothing)
+        step = point_steps(state, problem.given, PLAIN, nothing)
         state = state._replace(xyz=state.xyz + step)
         if np.nanmax(np.abs(step), initial=0.0) < CLOSE_M:
             break
-    r = residuals(state, problem.seen, problem.surface)
+    r = residuals(state, problem.given)
     settled = (np.abs(step) < CLOSE_M).all(axis=1)
     r[~settled[block.owner]] = np.nan
     return Intersected(state.xyz + problem.origin, r, np.asarray(block.start))

@@ -1,4 +1,4 @@
-"""Refractive bundle adjustment from files into a folder: one call for all doors."""
+"""Refractive bundle adjustment from files into a folder, for all doors."""
 
 from __future__ import annotations
 
@@ -6,33 +6,88 @@ import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pcfix.adjust.gather import LEAST_VIEWS
-from pcfix.adjust.gather import taken as taken_ties
+from pcfix.adjust.block import (
+    LEAST_VIEWS,
+    WATER,
+    Material,
+    gnss_with_sigma,
+    usable_ties,
+    with_places,
+)
+from pcfix.adjust.block import taken as taken_ties
+from pcfix.adjust.methods import (
+    LEAST_TIES,
+    by_cloud,
+    by_ties,
+    check_control,
+    check_images,
+    check_marks,
+    unknowns_of,
+)
 from pcfix.adjust.problem import Progress
 from pcfix.adjust.result import Adjusted
-from pcfix.adjust.ways import unknowns_of
-from pcfix.errors import InputError, SettingError
-from pcfix.flow.adjust_job import Survey, adjusted, read_job
-from pcfix.flow.inputs import Inputs
-from pcfix.flow.next_steps import WATER
-from pcfix.flow.surfaces import view_of
+from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError
+from pcfix.flow.inputs import Inputs, mask_of
+from pcfix.flow.next_steps import WATER as WATER_FILE
+from pcfix.flow.surfaces import CloudView, view_of
 from pcfix.io.cameras.colmap.writing import write_colmap
 from pcfix.io.cameras.opensfm.models import write_opensfm
-from pcfix.io.cameras.table.sensor import write_table
+from pcfix.io.cameras.table.sensor import read_sensor, write_table
+from pcfix.io.crs import is_topocentric, parse_crs
 from pcfix.io.drafts import folder_when_whole
-from pcfix.io.files import write_text
+from pcfix.io.files import check_input, write_text
+from pcfix.io.gnss_positions import gnss_in_frame_of, read_gnss
+from pcfix.io.ground_control import read_ground_control
 from pcfix.io.members import write_members
 from pcfix.io.tiles import Clouds, cloud_of
+from pcfix.io.views import ViewList, ViewMatch
 from pcfix.io.water_rasters import write_water_raster
-from pcfix.model import Cameras, TiePoints, Views, WaterRaster
+from pcfix.model import (
+    Cameras,
+    FloatArray,
+    GnssPositions,
+    GroundControl,
+    Lens,
+    TiePoints,
+    Views,
+    WaterDimension,
+    WaterPlane,
+    WaterRaster,
+    WaterSurface,
+)
 from pcfix.options.declare import File, taken
-from pcfix.options.survey import AdjustOptions, AdjustRules
+from pcfix.options.survey import WATER_UNKNOWNS, AdjustOptions, AdjustRules
+from pcfix.port.shapes import FlatPort, Port
+from pcfix.refract.choice import views_in_frame
+from pcfix.water.index import index_of
+
+if TYPE_CHECKING:
+    from pyproj import CRS
 
 SUMMARY = "adjustment.json"
+
+CLOUD_POINTS = 6000
+"""Points of the cloud that stand for tie points."""
+
+_EXPORTS = (
+    "Tie points are in COLMAP's model with points3D, OpenSfM's reconstruction with tracks.csv, a"
+    " Metashape project (.psx, .psz) or its BlocksExchange export, Pix4D's params folder with its"
+    " tp_ file, and Bundler's .out."
+)
+
+
+class Survey(NamedTuple):
+    """Measurements besides the images; see `adjust_cameras`."""
+
+    gcps: File | GroundControl | None = None
+    gnss: File | None = None
+    lens: File | None = None
+    gcps_crs: str | None = None
+    gnss_crs: str | None = None
 
 
 def adjust_cameras(
@@ -43,21 +98,21 @@ def adjust_cameras(
     progress: Progress | None = None,
     **keywords: Any,
 ) -> Adjusted:
-    """Adjust the poses of a block with the water in the light's way; ``pcfix adjust``.
+    """Adjust the poses and lens of a block with refraction; ``pcfix adjust``.
 
     Parameters
     ----------
     model : path or Cameras
         See `pcfix.read_cameras`; with tie points, or together with the cloud that it made.
     out_dir : path, optional
-        A new folder: the adjusted model as ``colmap/`` and ``opensfm/``, where one lens will do
-        as ``cameras.csv``, ``ensemble.npz`` (see `pcfix.adjust.members`), ``adjustment.json`` and
-        ``report.html``; water that is no plane and was free as ``water.tif``. Nothing is written
-        without.
+        A new folder for the adjusted model as ``colmap/`` and ``opensfm/``, for blocks with one
+        simple lens as ``cameras.csv``, ``ensemble.npz`` (see `pcfix.adjust.precision.Members`),
+        ``adjustment.json`` and ``report.html``, and for free water that is no plane ``water.tif``.
+        Nothing is written without it.
     options : AdjustOptions, optional
         Or its attributes as keywords, as of ``pcfix adjust``: water (or port), cloud (apparent;
-        some of its points stand for tie points where there are none), gcps, gnss, lens (held
-        fixed unless lens_unknowns say otherwise) and others.
+        some of its points replace missing tie points), gcps, gnss, lens (fixed unless
+        lens_unknowns are given) and others.
     progress : callable, optional
         Called with the `LogRow` of each step.
 
@@ -68,10 +123,10 @@ def adjust_cameras(
     Raises
     ------
     PcfixError
-        If an input cannot be read or does not fit, the block has no datum, or the unknowns cannot
-        be told apart. Nothing is written then.
+        If an input cannot be read or does not fit, the block has no datum, or unknowns cannot be
+        separated. Nothing is written then.
     """
-    if "free_network" in keywords:  # what was true or false is one of two words now
+    if "free_network" in keywords:  # an older, logical name of the datum
         keywords["free_network"] = "free" if keywords["free_network"] else "observed"
     given = taken(AdjustOptions, options, keywords, "adjust_cameras")
     inputs = replace(given.part(Inputs), cameras=model)
@@ -87,41 +142,215 @@ def adjust_into(
     folder: Path | None, inputs: Inputs, survey: Survey, rules: AdjustRules,
     cloud: Clouds | None = None, *, overwrite: bool = False, progress: Progress | None = None,
 ) -> Adjusted:  # fmt: skip
-    """Adjust cameras with what was read of the options; see `adjust_cameras`."""
+    """Adjust cameras with options that were read; see `adjust_cameras`."""
     unknowns_of(rules, ())
-    target = None if folder is None else checked_folder(folder, overwrite, inputs.paths())
+    if folder is not None:
+        _check_folder(folder, overwrite, inputs.paths())
     view = None if cloud is None else view_of(cloud_of(cloud))
-    found = adjusted(read_job(inputs, rules, view, survey), progress)
-    if target is not None:
-        write_adjustment(target, found, str(inputs.cameras))
+    material, views, crs, notes = _read(inputs, rules, view, survey)
+    ties = None if rules.ties == "cloud" else inputs.tie_points(crs, placed=False)
+    if ties is not None:
+        ties = usable_ties(with_places(ties, material.original), material.original)
+    count = 0 if ties is None else len(ties.xyz)
+    if ties is not None and count >= LEAST_TIES:
+        found = by_ties(material, ties, rules, progress)
+    elif view is None or rules.ties == "measured":
+        cloud_too = "" if rules.ties == "measured" else ", and there is no --cloud"
+        words = (
+            f"{material.name}: has {count} usable tie points ({LEAST_TIES} are"
+            f" needed){cloud_too}. {_EXPORTS}"
+        )
+        raise InputError("cameras.no_ties", words, path=material.name, ties=count, least=LEAST_TIES)
+    else:
+        xyz, listed = _sample(view, views, material.original)
+        guesses = {"all images in frame": views_in_frame(xyz, material.original)}
+        if listed is not None:
+            guesses["the images of the view list"] = listed
+        found = by_cloud(material, xyz, guesses, rules, progress)
+    if material.control is not None:
+        check_control(found, _gcps_name(survey))
+    found = replace(found, notes=[*notes, *found.notes])
+    if folder is not None:
+        _write(folder, found, str(inputs.cameras))
     return found
 
 
-def checked_folder(folder: Path, overwrite: bool, inputs: list[Any]) -> Path:
-    """Return a folder that may be written.
+# Reading
+
+
+def _read(
+    inputs: Inputs, rules: AdjustRules, view: CloudView | None, survey: Survey
+) -> tuple[Material, ViewList | None, str | CRS | None, list[PcfixWarning]]:
+    """Read and check everything but tie points; return the view list, the CRS and warnings too.
 
     Raises
     ------
-    SettingError
-        If it exists and is not an earlier adjustment that may be replaced.
+    PcfixError
+        If a file cannot be read, or does not fit.
     """
-    if any(folder.exists() and Path(one).exists() and folder.samefile(one) for one in inputs):
-        raise SettingError(f"{folder}: output and model are the same; give another folder.")
-    if folder.exists() and not folder.is_dir():
-        raise SettingError(f"{folder}: is a file; give a folder.")
-    if folder.is_dir() and any(folder.iterdir()):
-        if not overwrite:
-            raise SettingError(f"{folder}: the output exists; add --overwrite to replace it.")
-        if not (folder / SUMMARY).is_file():
+    name = str(inputs.cameras) if isinstance(inputs.cameras, str | Path) else "cameras"
+    found = inputs.read()
+    crs: str | CRS | None = None if view is None else view.crs
+    if view is None and found.crs is not None and not is_topocentric(found.crs):
+        crs = found.crs if parse_crs(found.crs, "cameras").is_projected else None
+    original, views = inputs.block(crs, found)
+    if original.rotations is None or original.lenses is None:
+        words = (
+            f"{name}: an adjustment needs angles and a lens of every image. Give the project or"
+            " model of the software, or --sensor."
+        )
+        raise InputError("cameras.no_angles", words, path=name)
+    water = None if inputs.water is None else inputs.surface(view).surface
+    if isinstance(water, WaterDimension):
+        words = (
+            f"The water {water} is known at points of the cloud only. For an adjustment, give it as"
+            " a level, plane, raster, mesh or shoreline."
+        )
+        raise SettingError("water.dimension", words, value=str(water))
+    check_images(name, original, water, rules.fixed_images)
+    _check_free(rules, inputs.port)
+    gnss, reason, notes = _gnss(original, name, survey, rules.gnss_sigma)
+    control = survey.gcps
+    if control is not None and not isinstance(control, GroundControl):
+        control = read_ground_control(control, original, crs=survey.gcps_crs)
+    if control is not None and water is not None:
+        check_marks(control, original, _gcps_name(survey), is_placed=gnss is not None)
+    _check_surfaces(rules.parallel, control, water, _gcps_name(survey))
+    low, high = original.centres.min(axis=0), original.centres.max(axis=0)
+    if view is not None:
+        low, high = view.low, view.high
+    mask = mask_of(inputs.water_mask, crs or original.crs, low[:2], high[:2])
+    material = Material(
+        name, original, water, index_of(rules.index, rules.index_formula)[0], gnss, control,
+        inputs.port, None if survey.lens is None else _calibration(survey.lens, original),
+        None if mask is None else mask.inside, unknowns_of(rules, ()).level_sigma_m, reason,
+        rules.parallel,
+    )  # fmt: skip
+    return material, views, crs, notes
+
+
+def _gcps_name(survey: Survey) -> str:
+    return "gcps" if isinstance(survey.gcps, GroundControl) else str(survey.gcps)
+
+
+def _check_free(rules: AdjustRules, port: Port | None) -> None:
+    """Refuse unknowns that water or port do not have."""
+    what, known = "the water", [*WATER_UNKNOWNS[:4]]
+    if port is not None:
+        is_flat = isinstance(port, FlatPort)
+        what = "a flat port" if is_flat else "a dome"
+        known = ["index", "distance" if is_flat else "centre"]
+    given = {"level": rules.sigma_level, "tilt": rules.sigma_tilt}
+    for name in (*rules.free, *(name for name, sigma in given.items() if sigma)):
+        if name not in known:
             raise SettingError(
-                f"{folder}: holds other files than an adjustment's; give an empty or new folder."
+                "option.choice",
+                f"--free {name}: {what} has no {name}. Use {', '.join(known)}.",
+                option="free",
+                value=name,
             )
-    if not folder.resolve().parent.is_dir():
-        raise SettingError(f"{folder}: the folder {folder.parent} does not exist; make it first.")
-    return folder
 
 
-def write_adjustment(folder: Path, found: Adjusted, model: str) -> None:
+def _check_surfaces(
+    parallel: tuple[str, ...], control: GroundControl | None, water: WaterSurface | None, name: str
+) -> None:
+    """Refuse points on water that does not exist, and unknown planes."""
+    on = () if control is None else control.on
+    if WATER in on and water is None:
+        raise InputError(
+            "gcps.no_water",
+            f"{name}: points have the role waterline, but there is no --water.",
+            path=name,
+        )
+    known = list(dict.fromkeys(one for one in on if one and one != WATER))
+    known += [WATER] if isinstance(water, WaterPlane) else []
+    if parallel and (len(parallel) < 2 or not set(parallel) <= set(known)):
+        words = (
+            f"--parallel {','.join(parallel)}: give at least two of the planes"
+            f" {', '.join(known) or '(none)'}. Mark points of --gcps with the role on:NAME."
+        )
+        raise SettingError("adjust.parallel", words, value=list(parallel), planes=known)
+
+
+def _gnss(
+    original: Cameras, name: str, survey: Survey, sigma_m: float | None
+) -> tuple[GnssPositions | None, str, list[PcfixWarning]]:
+    """Return GNSS positions in the block's frame, why they are not used, and warnings."""
+    cameras = original
+    if survey.gnss is not None:
+        cameras, name = read_gnss(survey.gnss, original, crs=survey.gnss_crs), str(survey.gnss)
+    if cameras.gnss is None:
+        return None, "", []
+    try:
+        found, reason = gnss_in_frame_of(cameras, name)
+    except PcfixError as error:
+        if survey.gnss is not None:
+            raise
+        words = f"{error} The GNSS positions of the camera file are not used."
+        return None, "", [PcfixWarning(error.code or "gnss.not_used", words, **error.values)]
+    gnss, notes = gnss_with_sigma(original.centres, found, name, sigma_m)
+    if reason:
+        notes = [PcfixWarning("gnss.not_used", reason, path=name), *notes]
+    return gnss, reason, notes
+
+
+def _calibration(path: File, cameras: Cameras) -> Lens:
+    """Return a calibration of images of this size."""
+    one = read_sensor(check_input(path))
+    for lens in set(cameras.lenses or ()):
+        if (lens.width, lens.height, lens.unit) != (one.width, one.height, one.unit):
+            words = (
+                f"{path}: the calibration is of images of {one.width:g} x {one.height:g}"
+                f" {one.unit}, the model has {lens.width:g} x {lens.height:g} {lens.unit}. Give the"
+                " one of these images."
+            )
+            raise InputError("sensor.size", words, path=path)
+    return one
+
+
+def _sample(
+    view: CloudView, views: ViewList | None, cameras: Cameras
+) -> tuple[FloatArray, Views | None]:
+    """Return random points of the cloud, and their part of the view list."""
+    count = min(CLOUD_POINTS, view.points)
+    rows = np.sort(np.random.default_rng(0).choice(view.points, count, replace=False))
+    match = None if views is None else ViewMatch(views, cameras, points=view.points)
+    parts: list[Views] = []
+    xyz, first = [], 0
+    for seen in view.chunks():
+        inside = rows[(rows >= first) & (rows < first + len(seen.xyz))] - first
+        xyz.append(seen.xyz[inside])
+        if match is not None:
+            parts.append(match.for_chunk(seen.xyz, first).take(inside))
+        first += len(seen.xyz)
+    if match is None:
+        return np.vstack(xyz), None
+    start = np.cumsum(np.concatenate([[0], *(np.diff(part.start) for part in parts)]))
+    return np.vstack(xyz), Views(start, np.concatenate([part.camera for part in parts]))
+
+
+# Writing
+
+
+def _check_folder(folder: Path, overwrite: bool, inputs: list[Any]) -> None:
+    """Refuse a folder that is an input, or holds anything but an earlier adjustment."""
+    code, wrong = "output.exists", ""
+    if any(folder.exists() and Path(one).exists() and folder.samefile(one) for one in inputs):
+        code, wrong = "output.is_input", "is an input. Give another folder"
+    elif folder.exists() and not folder.is_dir():
+        wrong = "is a file. Give a folder"
+    elif folder.is_dir() and any(folder.iterdir()):
+        if not overwrite:
+            wrong = "exists. Add --overwrite to replace it"
+        elif not (folder / SUMMARY).is_file():
+            wrong = "holds other files than an adjustment. Give an empty or new folder"
+    elif not folder.resolve().parent.is_dir():
+        code, wrong = "output.no_folder", f"its folder {folder.parent} does not exist. Create it"
+    if wrong:
+        raise SettingError(code, f"{folder}: {wrong}.", path=folder)
+
+
+def _write(folder: Path, found: Adjusted, model: str) -> None:
     """Write an adjusted block: model, camera files, summary, report; all or nothing."""
     from pcfix.report.adjustment import adjustment_dict, adjustment_page, before_of
 
@@ -130,7 +359,7 @@ def write_adjustment(folder: Path, found: Adjusted, model: str) -> None:
         _write_models(draft, found)
         moved = found.unknowns.level_sigma_m or found.unknowns.shape_sigma
         if moved and isinstance(found.water, WaterRaster):
-            write_water_raster(draft / WATER, found.water, found.cameras.crs)
+            write_water_raster(draft / WATER_FILE, found.water, found.cameras.crs)
         if found.precision is not None and found.precision.members is not None:
             write_members(draft, found.precision.members)
         summary = {"model": model, **adjustment_dict(found, before)}
@@ -140,7 +369,7 @@ def write_adjustment(folder: Path, found: Adjusted, model: str) -> None:
 
 
 def _write_models(folder: Path, found: Adjusted) -> None:
-    """Write the model in each form that holds its lenses exactly."""
+    """Write the model in each format that holds its lenses exactly."""
     ties, cameras, opensfm = adjusted_ties(found), found.cameras, folder / "opensfm"
     writers = {
         "colmap": partial(write_colmap, folder / "colmap", cameras, ties, crs=cameras.crs),
@@ -154,23 +383,24 @@ def _write_models(folder: Path, found: Adjusted) -> None:
             write()
         except InputError as error:
             failed.append(str(error).replace(f"{folder}/", ""))
-            if name != "cameras.csv":  # a table is a convenience for blocks of one plain lens
-                found.notes.append(f"{name} is not written: {failed[-1]}")
+            if name != "cameras.csv":  # which is for blocks with one simple lens
+                words = f"{name} was not written: {failed[-1]}"
+                found.notes.append(PcfixWarning("output.format", words, name=name))
     if not any(opensfm.iterdir()):
         opensfm.rmdir()
     if len(failed) == len(writers):
-        raise InputError("no form of camera file holds these lenses: " + " ".join(failed))
+        raise InputError(
+            "output.format", "No camera format can hold these lenses: " + " ".join(failed)
+        )
 
 
 def adjusted_ties(found: Adjusted) -> TiePoints | None:
-    """Return the adjusted tie points without outliers; None where points of the cloud stood in."""
+    """Return the adjusted tie points without outliers; None if the cloud replaced them."""
     if found.source == "cloud":
         return None
-    block = found.block
-    m = len(block.xyz) - len(block.control_names)
-    owner = block.owner
-    kept = found.used & (owner < m)
-    counts = np.bincount(owner[kept], minlength=m)[:m]
+    block, m = found.block, found.block.tie_points
+    kept = found.used & (block.owner < m)
+    counts = np.bincount(block.owner[kept], minlength=m)[:m]
     start = np.concatenate([[0], np.cumsum(counts)])
     ties = TiePoints(found.xyz[:m], Views(start, block.camera[kept]), block.image_xy[kept])
     return taken_ties(ties, np.flatnonzero(counts >= LEAST_VIEWS))

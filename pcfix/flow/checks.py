@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.adjust.evidence import Evidence
+from pcfix.adjust.diagnosis import Evidence
 from pcfix.errors import InputError, SettingError, shown_once
 from pcfix.flow.diagnosis import (
     diagnose,

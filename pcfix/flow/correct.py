@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.adjust.carry import Carrying
+from pcfix.adjust.transfer import CloudTransfer
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.inputs import paths_in
 from pcfix.flow.job import Job
@@ -109,7 +109,7 @@ def correct_points(
     adjusted_from : Cameras, optional
         Those that the points were made with, in the same frame, where `cameras` are the same
         images (matched by their labels) adjusted since. All points, land too, are first taken
-        from those to these; see `pcfix.adjust.carry`.
+        from those to these; see `pcfix.adjust.transfer`.
     regression : DepthRegression or path, optional
         With the method regression: see `pcfix.refract.regression`, or the file of a line.
 
@@ -166,8 +166,8 @@ def correct_points(
     step, made_with = None, None
     if adjusted_from is not None:
         pair = paired(adjusted_from, cameras)
-        step = Carrying(pair).step(points, views)
-        made_with = MadeWith(points, pair.old)
+        step = CloudTransfer(pair).step(points, views)
+        made_with = MadeWith(points, pair.original)
         points, views, label = step.xyz, step.views, step.rule(label)
     above = surface_above(surface, points, dimension)
     place = None, *corners(points[:, 0], points[:, 1])

@@ -1,4 +1,4 @@
-"""Whether the poses of a job have absorbed the refraction: what is read to tell."""
+"""Did the poses of a correction absorb the refraction? What is read to find out."""
 
 from __future__ import annotations
 
@@ -9,9 +9,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.adjust.diagnosis import MOST_STATED_M, Diagnosis, neighbours_sign
-from pcfix.adjust.evidence import Evidence, diagnosed, export_of
-from pcfix.adjust.gather import Datum
+from pcfix.adjust.diagnosis import (
+    MOST_STATED_M,
+    Diagnosis,
+    Evidence,
+    diagnosed,
+    export_of,
+    neighbours_sign,
+)
 from pcfix.errors import InputError, PcfixError, PcfixWarning
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.next_steps import adjust_words
@@ -25,14 +30,14 @@ from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
 from pcfix.refract.hypotheses import Verdict
 
 LEAST_POSITIONS = 3
-"""Of the GNSS, that say where a block is, how it is turned, and its scale."""
+"""GNSS positions that determine position, orientation and scale of a block."""
 
 QUICK_BYTES = 25_000_000
-"""Of a model, in passing, where nobody asked: it takes no more than a second or two."""
+"""Size of a model that is read within a second or two, even if nobody asked."""
 
 
 def diagnose(evidence: Evidence) -> Diagnosis:
-    """Look for every sign that the evidence allows, the GNSS positions of the cameras included.
+    """Look for every sign that the evidence allows, with the GNSS positions of the cameras.
 
     Raises
     ------
@@ -41,9 +46,9 @@ def diagnose(evidence: Evidence) -> Diagnosis:
     """
     if evidence.has_rays and evidence.cameras.gnss is not None:
         try:
-            found = gnss_in_frame_of(evidence.cameras, evidence.name)
-            evidence = replace(evidence, gnss=Datum(found.xyz, found.sigma_m))
-        except InputError:  # then nothing can be said of them
+            gnss = gnss_in_frame_of(evidence.cameras, evidence.name)[0]
+            evidence = replace(evidence, gnss=gnss)
+        except InputError:  # positions that cannot be compared say nothing
             pass
     return diagnosed(evidence)
 
@@ -51,9 +56,8 @@ def diagnose(evidence: Evidence) -> Diagnosis:
 class Poses(NamedTuple):
     """What is known of the poses of a correction.
 
-    absorbed : whether they have absorbed the refraction, None where nothing tells; words : that as
-    a line of a summary; warning : empty where there is nothing to mend; signs : each in plain
-    values.
+    absorbed : whether they absorbed the refraction, None if unknown; words : that as a line of a
+    summary; warning : empty if there is none; signs : each in plain values.
     """
 
     absorbed: bool | None
@@ -66,16 +70,16 @@ class Poses(NamedTuple):
         return {"absorbed": self.absorbed, "words": self.words, "signs": list(self.signs)}
 
 
-ADJUSTED = Poses(False, "adjusted with the light bent at the water (--adjusted-from)")
+ADJUSTED = Poses(False, "adjusted with refraction (--adjusted-from)")
 
 
 def diagnose_in_passing(
     inputs: Inputs, evidence: Evidence, view: CloudView, verdicts: tuple[Verdict, ...] = ()
 ) -> Poses:
-    """Say what a correction is made with anyway tells of its poses; warn once if they are bent.
+    """Check the poses with what a correction has read anyway; warn once if they are bent.
 
-    The cameras and `quick_ties` of the evidence are in the cloud's CRS; the verdicts are what the
-    cloud was taken for.
+    The evidence has the cameras in the cloud's CRS and `quick_ties`; the verdicts are on the
+    reconstruction types of the cloud.
     """
     if inputs.adjusted_from is not None:
         return ADJUSTED
@@ -85,12 +89,12 @@ def diagnose_in_passing(
     evidence, why = replace(evidence, view=view, neighbours=sign, in_passing=True), ""
     try:
         if path is not None and _size_of(Path(path)) > QUICK_BYTES:
-            why = f"a file of more than {QUICK_BYTES / 1e6:g} MB is looked at by 'pcfix cameras'"
+            why = f"the file is larger than {QUICK_BYTES / 1e6:g} MB; use 'pcfix cameras'"
         elif path is not None:
             ties = evidence.ties if evidence.has_rays else None
             evidence = replace(evidence, ties=ties, calibrated=given_focal_lengths(path))
         found = diagnose(evidence)
-    except (PcfixError, OSError) as error:  # a look in passing stops no correction
+    except (PcfixError, OSError) as error:  # this check stops no correction
         return Poses(None, f"not checked for absorbed refraction: {error}")
     n = evidence.refractive_index
     command, because = adjust_words(
@@ -98,44 +102,41 @@ def diagnose_in_passing(
         index=None if n == DEFAULT_REFRACTIVE_INDEX else n,
     )  # fmt: skip
     sentence = found.sentence(command, because)
+    decided = found.decided_by
+    if decided is not None:
+        did = "absorbed" if found.absorbed else "did not absorb"
+        words = f"{did} the refraction, by {decided.name}{'; see the warning' * bool(sentence)}"
+    else:
+        silent = [one.name for one in found.signs if one.name in ("tie points", "GNSS")]
+        if not why and silent:
+            why = f"{' and '.join(silent)} of the file tell too little (see 'pcfix cameras')"
+        none = f"the file has neither tie points nor GNSS; {export_of(evidence.cameras)}"
+        words = f"not checked for absorbed refraction: {why or none}"
     if sentence:
-        warnings.warn(sentence, PcfixWarning, stacklevel=3)
-    signs = tuple(found.as_dict()["signs"])
-    return Poses(found.absorbed, _in_short(found, evidence.cameras, why), sentence, signs)
-
-
-def _in_short(found: Diagnosis, cameras: Cameras, why: str) -> str:
-    """Return the line of a summary; `why` says why a file was not looked at."""
-    if found.decided_by is not None:
-        name = found.decided_by.name
-        if found.absorbed:
-            return f"absorbed the refraction, by {name}; see the warning"
-        return f"did not absorb the refraction, by {name}"
-    open_ones = [sign.name for sign in found.signs if sign.name in ("tie points", "GNSS")]
-    if not why and open_ones:
-        why = f"{' and '.join(open_ones)} of the file tell too little (see 'pcfix cameras')"
-    none = "the file has neither tie points nor GNSS; "
-    return f"not checked for absorbed refraction: {why or none + export_of(cameras)}"
+        values = {} if found.size is None else {"likely_error_m": found.size[0]}
+        warning = PcfixWarning("poses.absorbed", sentence, command=command, **values)
+        warnings.warn(warning, stacklevel=3)
+    return Poses(found.absorbed, words, sentence, tuple(found.as_dict()["signs"]))
 
 
 def ties_of(inputs: Inputs, crs: Any) -> TiePoints | None:
-    """Return the tie points of the camera file in the cloud's CRS, where it has any."""
+    """Return the tie points of the camera file in the cloud's CRS, if it has any."""
     with warnings.catch_warnings():  # they were shown when the cameras were read
         warnings.simplefilter("ignore", PcfixWarning)
         return inputs.tie_points(crs)
 
 
 def quick_ties(inputs: Inputs, crs: Any) -> TiePoints | None:
-    """Return the tie points of `ties_of` where reading them takes a second or two at most."""
+    """Return the tie points of `ties_of` if reading them takes no more than a second or two."""
     path = None if isinstance(inputs.cameras, Cameras) else Path(inputs.cameras)
     try:
         return None if path is None or _size_of(path) > QUICK_BYTES else ties_of(inputs, crs)
-    except (PcfixError, OSError):  # a look in passing stops no correction
+    except (PcfixError, OSError):  # this check stops no correction
         return None
 
 
 def _size_of(path: Path) -> int:
-    """Return how many bytes a camera file and what lies with it have."""
+    """Return the size of a camera file with the files that belong to it."""
     folder = path.with_suffix(".files") if path.suffix == ".psx" else path
     if folder.is_dir():
         return sum(one.stat().st_size for one in folder.rglob("*") if one.is_file())
@@ -143,11 +144,11 @@ def _size_of(path: Path) -> int:
 
 
 def has_datum(cameras: Cameras, name: str) -> bool:
-    """Whether the camera file has positions of the GNSS good enough to hold a block."""
+    """Return whether the camera file has GNSS positions that are good enough as a datum."""
     if cameras.gnss is None:
         return False
     try:
-        found = gnss_in_frame_of(cameras, name)
+        found = gnss_in_frame_of(cameras, name)[0]
     except InputError:
         return False
     known = np.isfinite(found.xyz).all(axis=1)

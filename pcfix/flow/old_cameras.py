@@ -1,16 +1,17 @@
-"""Two models of one block: the cameras that a cloud was made with, and the adjusted ones."""
+"""Two models of one block: the original cameras, which made a cloud, and the adjusted ones."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pcfix.adjust.carry import Pair, pair_of, renumbered
+from pcfix.adjust.transfer import Pair, pair_of, renumbered
 from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError
 from pcfix.io.cameras import takes_sensor
 from pcfix.io.labels import match_labels
@@ -26,58 +27,57 @@ if TYPE_CHECKING:
 LOCAL = "local"
 
 
-def paired(old: Cameras, new: Cameras) -> Pair:
+def paired(original: Cameras, adjusted: Cameras) -> Pair:
     """Match the images of two models in the cloud's CRS by their names.
 
     Raises
     ------
     GeometryError
-        If `new` has images that `old` does not have, one name could be several, or the images
-        have not the same shape.
+        If adjusted images are missing in the original model, a name is ambiguous, or the images
+        differ in shape.
     SettingError
-        If one has no angles or no lenses.
+        If one model has no angles or no lenses.
     """
-    for cameras, which in ((old, "adjusted-from"), (new, "cameras")):
+    for cameras, which in ((original, "adjusted-from"), (adjusted, "cameras")):
         if cameras.rotations is None or cameras.lenses is None:
-            raise SettingError(
-                f"{which}: has no {'angles' if cameras.rotations is None else 'lens'}, without"
-                " which a point has no place in the image; give the model itself, or --sensor."
+            missing = "angles" if cameras.rotations is None else "lens"
+            words = (
+                f"--{which}: has no {missing}, without which points have no image. Give the model"
+                " itself, or --sensor."
             )
-    return pair_of(old, new, _rows(old.labels, new.labels))
+            raise SettingError(f"cameras.no_{missing}", words, option=which)
+    return pair_of(original, adjusted, _rows(original.labels, adjusted.labels))
 
 
-def _rows(old: tuple[str, ...], new: tuple[str, ...]) -> IntArray:
-    """Return the row in the old labels of each new one."""
-    if old == new:  # then even repeated names are clear
-        return np.arange(len(new))
-    if len(set(new)) < len(new):
-        twice = next(label for label in new if new.count(label) > 1)
-        raise GeometryError(
-            f"cameras: there are several images {twice}, and adjusted-from has not the same images"
-            " in the same order; give every image a name of its own."
+def _rows(original: tuple[str, ...], adjusted: tuple[str, ...]) -> IntArray:
+    """Return the row in the original labels of each adjusted one."""
+    if original == adjusted:  # then even repeated names are unambiguous
+        return np.arange(len(adjusted))
+    row, unclear = match_labels(adjusted, original)
+    repeated = [label for label, count in Counter(adjusted).items() if count > 1]
+    if ambiguous := [*repeated, *unclear]:
+        words = (
+            f"--adjusted-from: image name {ambiguous[0]} is ambiguous. Give every image its own"
+            " name."
         )
-    row, unclear = match_labels(new, old)
-    if unclear:
-        raise GeometryError(
-            f"adjusted-from: image {unclear[0]} could be several there; give every image a name of"
-            " its own."
-        )
+        raise GeometryError("adjusted_from.ambiguous", words, image=ambiguous[0])
     if (row < 0).any():
-        unknown = [label for label, at in zip(new, row, strict=True) if at < 0]
-        raise GeometryError(
-            f"adjusted-from: has no image {unknown[0]}, which the cameras have"
-            f" ({len(unknown)} of {len(new)} are unknown there; its first is {old[0]}); give the"
-            " model that these cameras were adjusted from."
+        unknown = [label for label, at in zip(adjusted, row, strict=True) if at < 0]
+        words = (
+            f"--adjusted-from: has no image {unknown[0]} ({len(unknown)} of {len(adjusted)} images"
+            f" of the cameras are missing; its first is {original[0]}). Give the model from which"
+            " the cameras were adjusted."
         )
+        raise GeometryError("adjusted_from.no_image", words, image=unknown[0], missing=len(unknown))
     return row
 
 
 class Blocks(NamedTuple):
-    """What a correction has of cameras.
+    """The cameras of a correction.
 
-    cameras : the ones to correct with, `NO_CAMERAS` where none are given; views : the list of the
-    cloud, where there is one; listed : the cameras that it counts, which made the cloud; pair :
-    where the two are not the same.
+    cameras : to correct with, `NO_CAMERAS` without any; views : the view list of the cloud, if
+    there is one; listed : the cameras that it counts, which made the cloud; pair : both, if they
+    differ.
     """
 
     cameras: Cameras
@@ -87,7 +87,7 @@ class Blocks(NamedTuple):
 
 
 def read_blocks(inputs: Inputs, cloud_crs: str | CRS | None) -> Blocks:
-    """Return cameras in the cloud's CRS, and the view list, confirmed by those that made the cloud.
+    """Return cameras in the cloud's CRS, and the view list, checked with the original cameras.
 
     Raises
     ------
@@ -99,35 +99,34 @@ def read_blocks(inputs: Inputs, cloud_crs: str | CRS | None) -> Blocks:
     if inputs.adjusted_from is None:
         cameras, views = inputs.block(cloud_crs)
         return Blocks(cameras, views, cameras, None)
-    old, new = told_apart(inputs)
-    cameras, _ = new.block(cloud_crs)
+    original, adjusted = told_apart(inputs)
+    cameras, _ = adjusted.block(cloud_crs)
     try:
-        listed, views = old.block(cloud_crs)
-    except InputError:
-        _refuse_apart(replace(old, views=None).block(cloud_crs)[0], cameras)
+        listed, views = original.block(cloud_crs)
+    except InputError:  # a view list does not fit cameras in another place
+        _refuse_apart(replace(original, views=None).block(cloud_crs)[0], cameras)
         raise
     _refuse_apart(listed, cameras)
     return Blocks(cameras, views, listed, paired(listed, cameras))
 
 
-def _refuse_apart(old: Cameras, new: Cameras) -> None:
-    """Refuse two models that are apart, before the list of the cloud is blamed."""
-    place = _rows(old.labels, new.labels)
-    apart = float(np.median(np.linalg.norm(new.centres - old.centres[place], axis=1)))
-    if apart > np.ptp(np.vstack([old.centres[place], new.centres]), axis=0).max() / 2.0:
-        raise GeometryError(
-            f"adjusted-from: its cameras stand {apart:,.0f} m from where the adjusted ones do;"
-            " give the offset of the one that is shifted to the origin: --cameras-offset"
-            " counts for the file that does not say where it lies."
+def _refuse_apart(original: Cameras, adjusted: Cameras) -> None:
+    """Refuse two models in different places."""
+    centres = original.centres[_rows(original.labels, adjusted.labels)]
+    apart = float(np.median(np.linalg.norm(adjusted.centres - centres, axis=1)))
+    if apart > np.ptp(np.vstack([centres, adjusted.centres]), axis=0).max() / 2.0:
+        words = (
+            f"--adjusted-from: its cameras are {apart:,.0f} m from the adjusted ones. Give the"
+            " offset of the shifted one: --cameras-offset counts for the file that has no CRS."
         )
+        raise GeometryError("adjusted_from.apart", words, apart_m=apart)
 
 
 def told_apart(inputs: Inputs) -> tuple[Inputs, Inputs]:
-    """Return the inputs with the old cameras and those with the new ones.
+    """Return the inputs with the original cameras and those with the adjusted ones.
 
-    A CRS and an offset of the cameras are of those of the two files that do not say where they
-    lie themselves, or of both if both do. Where neither does, the offset is of those with which
-    the two agree best.
+    CRS and offset of the cameras are for the file that does not have its own place, or for both if
+    both have one. If neither has, the offset is for that with which the two agree best.
 
     Raises
     ------
@@ -135,76 +134,68 @@ def told_apart(inputs: Inputs) -> tuple[Inputs, Inputs]:
         If a file cannot be read, or the views are tracks of the adjusted model.
     """
     _refuse_adjusted_tracks(inputs)
-    made_with = inputs.cameras if inputs.adjusted_from is None else inputs.adjusted_from
-    old = replace(inputs, cameras=made_with, adjusted_from=None)
-    new = replace(inputs, views=None, adjusted_from=None)
-    tables = [_takes_sensor(one) for one in (old, new)]
-    if inputs.sensor is not None and any(tables):  # a model has the lens itself
-        old, new = (
-            one if takes else replace(one, sensor=None)
-            for one, takes in zip((old, new), tables, strict=True)
-        )
+    source = inputs.cameras if inputs.adjusted_from is None else inputs.adjusted_from
+    both = [
+        replace(inputs, cameras=source, adjusted_from=None),
+        replace(inputs, views=None, adjusted_from=None),
+    ]
+    tables = [not isinstance(one.cameras, Cameras) and takes_sensor(one.cameras) for one in both]
+    if inputs.sensor is not None and any(tables):  # a model has its own lens
+        both = _without(both, tables, sensor=None)
     if inputs.cameras_crs is None and inputs.cameras_offset is None:
-        return old, new
-    read = old.read(), new.read()
-    tied = tuple(
+        return both[0], both[1]
+    original, adjusted = read = [one.read() for one in both]
+    tied = [
         isinstance(given.cameras, Cameras) or cameras.crs not in (None, LOCAL)
-        for given, cameras in zip((old, new), read, strict=True)
-    )
+        for given, cameras in zip(both, read, strict=True)
+    ]
     if any(tied) and not all(tied):
-        plain = replace(old if tied[0] else new, cameras_crs=None, cameras_offset=None)
-        return (plain, new) if tied[0] else (old, plain)
-    if inputs.cameras_offset is not None and not any(tied):
-        moves = _who_moves(*read, np.array(inputs.cameras_offset))
-        old, new = (
-            one if moved else replace(one, cameras_offset=None)
-            for one, moved in zip((old, new), moves, strict=True)
-        )
-    return old, new
+        both = _without(both, [not one for one in tied], cameras_crs=None, cameras_offset=None)
+    elif inputs.cameras_offset is not None and not any(tied):
+        apart = adjusted.centres - original.centres[_rows(original.labels, adjusted.labels)]
+        offset = np.array(inputs.cameras_offset)
+        moves = {(True, True): apart, (True, False): apart - offset, (False, True): apart + offset}
+        best = min(moves, key=lambda way: np.median(np.linalg.norm(moves[way], axis=1)))
+        both = _without(both, best, cameras_offset=None)
+    return both[0], both[1]
 
 
-def _takes_sensor(inputs: Inputs) -> bool:
-    return not isinstance(inputs.cameras, Cameras) and takes_sensor(inputs.cameras)
+def _without(both: list[Inputs], kept: Sequence[bool], **changes: Any) -> list[Inputs]:
+    """Return the inputs, changed where they are not kept."""
+    return [one if keep else replace(one, **changes) for one, keep in zip(both, kept, strict=True)]
 
 
 def _refuse_adjusted_tracks(inputs: Inputs) -> None:
     """Refuse the tracks of the adjusted model as views of the cloud."""
     given = (inputs.views, inputs.cameras, inputs.adjusted_from)
-    views, cameras, old = (None if isinstance(one, Cameras) else one for one in given)
+    views, cameras, original = (None if isinstance(one, Cameras) else one for one in given)
     if views is None or cameras is None or Path(views) != Path(cameras):
         return
-    if old is None or Path(old) != Path(cameras):
-        raise SettingError(
-            f"views: the tie points of {cameras} are where the adjustment put them, not where the"
-            " cloud has its points; give the model of adjusted-from, or the list of the cloud."
+    if original is None or Path(original) != Path(cameras):
+        words = (
+            f"--views: the tie points of {cameras} are adjusted ones, not those of the cloud. Give"
+            " the model of --adjusted-from, or the view list of the cloud."
         )
-
-
-def _who_moves(old: Cameras, new: Cameras, offset_m: FloatArray) -> tuple[bool, bool]:
-    """Return whether an offset is for the old centres and for the new ones, shapes (k, 3)."""
-    apart = new.centres - old.centres[_rows(old.labels, new.labels)]
-    ways = {(True, True): apart, (True, False): apart - offset_m, (False, True): apart + offset_m}
-    return min(ways, key=lambda way: float(np.median(np.linalg.norm(ways[way], axis=1))))
+        raise SettingError("views.adjusted", words, path=cameras)
 
 
 def old_tie_points(
     inputs: Inputs, pair: Pair, cloud_crs: str | CRS | None
 ) -> tuple[TiePoints | None, bool]:
-    """Return tie points that count the rows of a pair, and whether they are the old model's.
+    """Return tie points with the rows of a pair, and whether they are the original model's.
 
-    Those of the old model, where the old cameras have them, tell best which images the cloud was
-    made with; else those of the new one.
+    Those of the original model show best which images made the cloud; the others are second best.
     """
-    old, new = told_apart(inputs)
-    ties = old.tie_points(cloud_crs)
+    original, adjusted = told_apart(inputs)
+    ties = original.tie_points(cloud_crs)
     if ties is None:
-        return new.tie_points(cloud_crs), False
+        return adjusted.tie_points(cloud_crs), False
     views, entry = renumbered(ties.views, pair.row)
     return replace(ties, views=views, image_xy=ties.image_xy[entry]), True
 
 
 class ListedViews(Sums):
-    """The view list of a cloud, given to its points chunk by chunk; empty without a list."""
+    """The view list of a cloud, matched to its points chunk by chunk; empty without a list."""
 
     added = ("report",)
 
@@ -224,7 +215,7 @@ class ListedViews(Sums):
         self._match = self._anew()
 
     def all_anew(self) -> Callable[[FloatArray, int], Views | None]:
-        """Return the views of the whole cloud from its first row on, apart from the count here."""
+        """Return the views of the whole cloud from its first row, without changing the report."""
         match = self._anew()
         return lambda xyz, row: None if match is None else match.for_chunk(xyz, row)
 
@@ -234,14 +225,14 @@ class ListedViews(Sums):
 
     @property
     def are_all(self) -> bool:
-        """Whether every point of the cloud can have a list."""
+        """Whether every point of the cloud can have views."""
         return self.list is None or (
             len(self.list) >= self._points and bool((np.diff(self.list.raw.start) > 0).all())
         )
 
     @property
     def report(self) -> ViewReport | None:
-        """How the list fits so far."""
+        """How the list has fitted so far."""
         return None if self._match is None else self._match.report
 
     @property
@@ -250,7 +241,7 @@ class ListedViews(Sums):
         return None if self.list is None else str(self.list.raw.path)
 
     def check(self) -> None:
-        """Refuse a list that does not belong to the cloud, and warn of one that hardly does."""
+        """Refuse a list of another cloud, and warn of one that hardly fits."""
         if self.report is None:
             return
         self.report.check()

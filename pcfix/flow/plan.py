@@ -15,8 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.adjust.block import Unknowns, plain_block
-from pcfix.adjust.gather import restricted, well_seen
+from pcfix.adjust.block import Unknowns, plain_block, restricted, well_seen
 from pcfix.adjust.normal import residuals
 from pcfix.adjust.precision import precision_of
 from pcfix.adjust.problem import prepare, solved_cameras
@@ -260,9 +259,7 @@ def _absorbed(given: PlanOptions, bed: _Bed) -> tuple[float, float]:
     """
     problem, start = _prepared(given, bed, through_water=False)
     found = solve(problem, start)
-    before, after = (
-        _rms(residuals(one.state, problem.seen, problem.surface)) for one in (start, found)
-    )
+    before, after = (_rms(residuals(one.state, problem.given)) for one in (start, found))
     apparent, cameras = found.state.xyz + problem.origin, solved_cameras(problem, found)
     moved = _budget(given, bed._replace(apparent=apparent, cameras=cameras))
     known = moved.corrected

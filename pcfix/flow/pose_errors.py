@@ -1,7 +1,7 @@
-"""What the errors of an adjustment do to a corrected bed: a sample corrected with its members.
+"""Errors of a corrected bed by the errors of an adjustment: a sample is corrected with each member.
 
-What stays is what the images showed: each member's cameras intersect the image places of the
-points anew, whether the cloud came from cameras before the adjustment or from the adjusted ones.
+The images do not change: the cameras of each member intersect the images of the points again,
+whether the cloud came from the original cameras or from the adjusted ones.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from pcfix.adjust.carry import Carrying, Pair
+from pcfix.adjust.transfer import CloudTransfer, Pair
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.flow.old_cameras import ListedViews
 from pcfix.flow.surfaces import Points
@@ -26,21 +26,21 @@ from pcfix.refract.pose_errors import PoseErrors, pose_errors_of
 from pcfix.water.surface import is_submerged, surface_above
 
 if TYPE_CHECKING:
-    from pcfix.adjust.members import Members
+    from pcfix.adjust.precision import Members
 
 SAMPLE_POINTS, BED_POINTS = 20_000, 1000
-"""Of the cloud, and at most about so many of those under water: the errors are smooth."""
+"""Of the cloud, and of its points under water; a thousand is enough, as the errors are smooth."""
 
 
 class Adjustment(NamedTuple):
-    """The members of an adjustment, and the row in them of each camera."""
+    """The members of an adjustment, and the row of each camera in them."""
 
     members: Members
     row: IntArray
 
 
 def adjustment_of(path: File | Cameras, cameras: Cameras) -> tuple[Adjustment | None, str]:
-    """Return the adjustment that cameras came from, where it stands beside them, and a note."""
+    """Return the adjustment of cameras, if its file is beside them, and a note."""
     if isinstance(path, Cameras):
         return None, ""
     try:
@@ -53,14 +53,14 @@ def adjustment_of(path: File | Cameras, cameras: Cameras) -> tuple[Adjustment | 
     row = members.rows_of(cameras)
     if row is None:
         return None, (
-            f"{where}: is of other cameras than these, so SigmaZ goes without the errors of an"
-            " adjustment; take the cameras that the adjustment wrote, or take the file away."
+            f"{where}: belongs to other cameras, so SigmaZ does not include errors of the poses."
+            " Use the cameras that the adjustment wrote, or remove the file."
         )
     return Adjustment(members, row), ""
 
 
 class Sample(NamedTuple):
-    """Points as they came, and their views as they were listed."""
+    """Apparent points, and their view list."""
 
     points: Points
     listed: Views | None
@@ -72,7 +72,7 @@ class Sample(NamedTuple):
 
 
 def sample_of(chunks: Iterable[Points], views: ListedViews, step: int) -> Sample:
-    """Return every so manieth point of a cloud, without noise."""
+    """Return every `step`-th point of a cloud, without noise."""
     listed, row, parts = views.all_anew(), 0, list[Sample]()
     for points in chunks:
         seen = listed(points.xyz, row)
@@ -84,7 +84,7 @@ def sample_of(chunks: Iterable[Points], views: ListedViews, step: int) -> Sample
 
 
 def _joined(parts: list[Sample]) -> Sample:
-    """Return samples that follow each other as one; the weights of views do not count here."""
+    """Return consecutive samples as one, without the weights of their views."""
     points, listed = [part.points for part in parts], [part.listed for part in parts]
     heights = [one.heights for one in points if one.heights is not None]
     sources = [one.sources for one in points if one.sources is not None]
@@ -110,42 +110,44 @@ def _joined(parts: list[Sample]) -> Sample:
 def pose_errors(
     sample: Sample, survey: Survey, adjustment: Adjustment, pair: Pair | None
 ) -> PoseErrors | None:
-    """Return what the errors of the poses come to; None where nothing of the sample is corrected.
+    """Return the errors of the bed by those of the poses; None if no point is corrected.
 
     Parameters
     ----------
     sample : Sample
     survey : Survey
-        With all that was learned.
+        With everything that was estimated.
     adjustment : Adjustment
     pair : Pair or None
-        The cameras that the cloud was made with, where these are not those of the survey.
+        The original cameras, if those of the survey were adjusted since.
     """
-    made = pair or Pair(survey.cameras, survey.cameras, np.arange(len(survey.cameras)), ())
-    step = Carrying(made).step(sample.points.xyz, sample.listed)
+    pair = pair or Pair(survey.cameras, survey.cameras, np.arange(len(survey.cameras)), ())
+    step = CloudTransfer(pair).step(sample.points.xyz, sample.listed)
     above = surface_above(survey.water, step.xyz, sample.points.heights)
-    wet = np.flatnonzero(is_submerged(step.xyz[:, 2], above) & step.carried)
+    wet = np.flatnonzero(is_submerged(step.xyz[:, 2], above) & step.moved)
     wet = wet[:: 1 + len(wet) // BED_POINTS]
-    variance_m2 = variances(sample.take(wet), survey, adjustment, made)
+    variance_m2 = variances(sample.take(wet), survey, adjustment, pair)
     known = np.flatnonzero(np.isfinite(variance_m2))
     if not len(known):
         return None
     return pose_errors_of(step.xyz[wet[known], :2], variance_m2[known])
 
 
-def variances(sample: Sample, survey: Survey, adjustment: Adjustment, made: Pair) -> FloatArray:
+def variances(sample: Sample, survey: Survey, adjustment: Adjustment, pair: Pair) -> FloatArray:
     """Return the variance of the heights of a sample by the poses, shape (n,); NaN if unknown."""
-    members, row = adjustment
-    with warnings.catch_warnings():  # the correction itself says it
+    with warnings.catch_warnings():  # the correction shows them
         warnings.simplefilter("ignore", PcfixWarning)
-        nominal = _heights(sample, survey, made)
-        others = (_survey_of(survey, members, i, row) for i in range(len(members)))
-        off = [_heights(sample, one, made) - nominal for one in others]
+        nominal = _heights(sample, survey, pair)
+        off = [
+            _heights(sample, _survey_of(survey, adjustment, member), pair) - nominal
+            for member in range(len(adjustment.members))
+        ]
     return np.asarray(np.square(off).mean(axis=0))
 
 
-def _survey_of(survey: Survey, members: Members, member: int, row: IntArray) -> Survey:
+def _survey_of(survey: Survey, adjustment: Adjustment, member: int) -> Survey:
     """Return a survey with cameras and water of a member."""
+    members, row = adjustment
     cameras = members.cameras(member, survey.cameras, row)
     water = members.surface(member, survey.water, survey.cameras)
     index = survey.settings.refractive_index + float(members.water[member, 3])
@@ -157,19 +159,19 @@ def _survey_of(survey: Survey, members: Members, member: int, row: IntArray) -> 
     return replace(moved(survey), parts={key: moved(one) for key, one in survey.parts.items()})
 
 
-def _heights(sample: Sample, survey: Survey, made: Pair) -> FloatArray:
-    """Return the true heights of a sample, shape (n,), NaN where it cannot be told."""
+def _heights(sample: Sample, survey: Survey, pair: Pair) -> FloatArray:
+    """Return the corrected heights of a sample, shape (n,), NaN for uncorrected points."""
     (xyz, heights, _, sources, _), listed = sample
-    step = Carrying(replace(made, new=survey.cameras)).step(xyz, listed)
+    step = CloudTransfer(replace(pair, adjusted=survey.cameras)).step(xyz, listed)
     above = surface_above(survey.water, step.xyz, heights)
     found = correct(
-        Batch(step.xyz, above, survey, step.views, MadeWith(xyz, made.old), source=sources)
+        Batch(step.xyz, above, survey, step.views, MadeWith(xyz, pair.original), source=sources)
     )
-    known = step.carried & (found.outcome == Outcome.CORRECTED)
+    known = step.moved & (found.outcome == Outcome.CORRECTED)
     return np.where(known, step.xyz[:, 2] + found.shift_m[:, 2], np.nan)
 
 
 def with_poses(survey: Survey, poses: PoseErrors | None) -> Survey:
-    """Return a survey that knows of the errors of its poses, in all its parts."""
+    """Return a survey with the errors of its poses, in all its parts."""
     parts = {key: with_poses(one, poses) for key, one in survey.parts.items()}
     return replace(survey, learned=survey.learned._replace(poses=poses), parts=parts)

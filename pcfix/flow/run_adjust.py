@@ -1,42 +1,30 @@
-"""The first step of a run: poses that have absorbed the refraction are adjusted before all else."""
+"""The first step of a run: poses that have absorbed the refraction are adjusted."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, get_args
 
-from pcfix.adjust.diagnosis import MOST_STATED_M, Diagnosis
-from pcfix.adjust.evidence import Evidence
+from pcfix.adjust.diagnosis import MOST_STATED_M, Evidence
 from pcfix.errors import PcfixError, PcfixWarning, SettingError
-from pcfix.flow.adjust import SUMMARY, adjust_into
-from pcfix.flow.adjust_job import Survey
+from pcfix.flow.adjust import SUMMARY, Survey, adjust_into
 from pcfix.flow.diagnosis import diagnose, focal_length_of, given_focal_lengths, has_datum, ties_of
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.next_steps import MODELS
-from pcfix.flow.surfaces import CloudView, view_of
+from pcfix.flow.surfaces import view_of
 from pcfix.io.files import read_json
 from pcfix.io.gnss_positions import read_gnss
 from pcfix.io.ground_control import read_ground_control
 from pcfix.io.members import FILE as MEMBERS
 from pcfix.io.tiles import Clouds, cloud_of
 from pcfix.kernels import threads
-from pcfix.model import Cameras, WaterDimension, WaterSurface
+from pcfix.model import WaterDimension
 from pcfix.options.declare import File
 from pcfix.options.survey import AdjustRules, AdjustWhen
 
 FOLDER = "adjusted"
-
-
-class Decision(NamedTuple):
-    """Whether a run adjusts, why, whether that is worth a line, and whether the poses are right."""
-
-    adjust: bool
-    why: str
-    is_said: bool = True
-    is_fine: bool = False
 
 
 def outputs_of(folder: Path) -> list[Path]:
@@ -46,12 +34,17 @@ def outputs_of(folder: Path) -> list[Path]:
     return [folder / FOLDER / name for name in names]
 
 
+def figures_of(folder: Path) -> dict[str, Any]:
+    """Return the summary of the adjustment of a run, as of `pcfix.adjust.result`."""
+    return dict(read_json(folder / FOLDER / SUMMARY))
+
+
 @dataclass(frozen=True)
 class AdjustStep:
-    """What a run is asked of its first step.
+    """Settings of the first step of a run.
 
-    cloud, inputs, index : of the run. gcps, gnss, lens : files that are of use to an adjustment
-    only, see `pcfix.adjust_cameras`.
+    cloud, inputs, index : of the run. gcps, gnss, lens : files that only an adjustment uses, see
+    `pcfix.adjust_cameras`.
     """
 
     cloud: Clouds
@@ -63,43 +56,40 @@ class AdjustStep:
     lens: File | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what does not go with each other."""
+        """Refuse settings that exclude each other."""
+        wrong, code = "", "option.conflict"
         if self.when not in get_args(AdjustWhen):
-            names = ", ".join(get_args(AdjustWhen))
-            raise SettingError(f"adjust '{self.when}' must be among {names}.")
-        if self.when == "no" and self.survey:
+            code, wrong = "option.choice", f"use {', '.join(get_args(AdjustWhen))}"
+        elif self.when == "no" and self.survey:
+            wrong = f"{self.survey[0]} is for an adjustment only. Remove it, or use auto or yes"
+        elif self.when == "yes" and self.unfit:
+            wrong = f"{self.unfit}. Remove one of the two options"
+        if wrong:
             raise SettingError(
-                f"{self.survey[0]} is of use to an adjustment only; leave it out, or let --adjust"
-                " be auto or yes."
+                code, f"--adjust {self.when}: {wrong}.", option="adjust", value=self.when
             )
-        if self.when == "yes" and self.inputs.cameras is None:
-            raise SettingError(
-                "adjust yes: there are no cameras to adjust; give them, or leave it."
-            )
-        if self.when == "yes" and self.unfit:
-            raise SettingError(f"adjust yes: {self.unfit}; leave one of the two out.")
 
     @property
     def survey(self) -> list[str]:
-        """The names of the files that were given for an adjustment alone."""
+        """Names of the files that were given for an adjustment only."""
         return [name for name in ("gcps", "gnss", "lens") if getattr(self, name) is not None]
 
     @property
     def unfit(self) -> str:
-        """Why an adjustment does not go with the other options; empty where it does."""
+        """Why an adjustment is impossible with the other options; empty if it is possible."""
         if self.inputs.cameras is None:
             return "there are no cameras to adjust"
         if self.inputs.adjusted_from is not None:
             return "with adjusted-from the cameras are adjusted already"
         if self.inputs.tide is not None:
-            return "a tide gives each image its own water level, and an adjustment takes one"
+            return "a tide gives each image its own water level, and an adjustment has one"
         return ""
 
 
 def adjust_first(
     step: AdjustStep, folder: Path, files: list[Path], jobs: int | None = None
 ) -> dict[str, Any]:
-    """Adjust the cameras of a run into its folder where that is asked for, or called for.
+    """Adjust the cameras of a run into its folder if asked, or if they need it.
 
     The files are inputs of the run, which the adjustment must not replace.
 
@@ -112,106 +102,88 @@ def adjust_first(
     Raises
     ------
     PcfixError
-        If an adjustment was asked for, or files were given for it, and it cannot be done. Else
-        the run goes on with the cameras as they are.
+        If an adjustment was asked for, or files were given for it, and it is impossible. Otherwise
+        the run continues with the original cameras.
     """
-    adjusts, why, is_said, is_fine, model = False, "", False, False, None
+    found = {"adjusted": False, "model": None, "why": "", "is_said": False, "is_fine": False}
     try:
-        adjusts, why, is_said, is_fine = _decide(step)
-        if adjusts:
-            model = _adjust(step, folder / FOLDER, files, jobs)
+        found |= _decide(step)
+        if found["adjusted"]:
+            found["model"] = _adjust(step, folder / FOLDER, files, jobs)
     except PcfixError as error:
         if step.when == "yes" or step.survey:
             raise
-        # what cannot be read stops the correction, with the same sentence
-        adjusts, why, is_said = False, str(error), adjusts
-    return {"adjusted": adjusts, "model": model, "why": why, "is_said": is_said, "is_fine": is_fine}
+        # a file that cannot be read will stop the correction, with the same message
+        found |= {"adjusted": False, "why": str(error), "is_said": found["adjusted"]}
+    return found
 
 
 def is_worth_saying(step: dict[str, Any], absorbed: bool) -> bool:
-    """Whether it matters that a run did not adjust: if asked, or if the poses turn out to be bent.
+    """Return whether to report that a run did not adjust: if asked, or if the poses are bent.
 
-    The step is what `adjust_first` returned; `absorbed` stands in the summary of the correction.
+    The step is what `adjust_first` returned; `absorbed` is in the summary of the correction.
     """
     return step["is_said"] or bool(step["why"] and absorbed)
 
 
-def _decide(step: AdjustStep) -> Decision:
-    """Return whether to adjust: on request, or where the poses are bent and there is a datum."""
+def _decide(step: AdjustStep) -> dict[str, Any]:
+    """Decide whether to adjust: on request, or if the poses are bent and there is a datum.
+
+    Signs of absorbed refraction do not include the survey with which the result is compared: the
+    cloud must not depend on it.
+    """
+    inputs, lens, model = step.inputs, step.lens, str(step.inputs.cameras)
     if step.when == "yes":
-        return Decision(True, "that was asked for")
+        return {"adjusted": True, "why": "that was asked for", "is_said": True}
     if step.when == "no":
-        return Decision(False, "", is_said=False)
-    inputs, is_said = step.inputs, bool(step.survey)
+        return {}
+    is_said = bool(step.survey)
     if step.unfit:
-        return Decision(False, step.unfit, is_said)
+        return {"why": step.unfit, "is_said": is_said}
     view = view_of(cloud_of(step.cloud))
     with warnings.catch_warnings():  # the correction shows them
         warnings.simplefilter("ignore", PcfixWarning)
         cameras = inputs.block(view.crs)[0]
         if step.gnss is not None:
             cameras = read_gnss(step.gnss, cameras)
-        elif step.gcps is None and not has_datum(cameras, str(inputs.cameras)):
-            return Decision(False, _NO_DATUM, is_said)
+        elif step.gcps is None and not has_datum(cameras, model):
+            why = (
+                "there is no datum: no --gcps, no --gnss, and no GNSS positions better than"
+                f" {MOST_STATED_M:g} m in the camera file"
+            )
+            return {"why": why, "is_said": is_said}
         water = inputs.surface(view).surface
         if isinstance(water, WaterDimension):
-            return Decision(False, f"{water} is known at the points of the cloud alone")
-        return _verdict(_diagnosed(step, cameras, water, view))
-
-
-_NO_DATUM = (
-    "nothing says where the block is: no --gcps, no --gnss, and no positions of the GNSS to"
-    f" {MOST_STATED_M:g} m in the camera file"
-)
-
-
-def _diagnosed(
-    step: AdjustStep, cameras: Cameras, water: WaterSurface, view: CloudView
-) -> Diagnosis:
-    """Look for signs of absorbed refraction.
-
-    What the result is compared with is none of them: the cloud must not depend on it.
-    """
-    lens, model = step.lens, str(step.inputs.cameras)
-    evidence = Evidence(
-        cameras, model, water, step.index, view=view,
-        control=None if step.gcps is None else read_ground_control(step.gcps, cameras).surveyed,
-        calibrated=given_focal_lengths(model) if lens is None else focal_length_of(lens),
-        in_passing=not step.survey,
-    )  # fmt: skip
-    if evidence.has_rays:
-        evidence = replace(evidence, ties=ties_of(step.inputs, view.crs))
-    return diagnose(evidence)
-
-
-def _verdict(found: Diagnosis) -> Decision:
+            why = f"the water {water} is known at points of the cloud only"
+            return {"why": why, "is_said": True}
+        evidence = Evidence(
+            cameras, model, water, step.index, view=view,
+            control=None if step.gcps is None else read_ground_control(step.gcps, cameras).surveyed,
+            calibrated=given_focal_lengths(model) if lens is None else focal_length_of(lens),
+            in_passing=not step.survey,
+        )  # fmt: skip
+        if evidence.has_rays:
+            evidence = replace(evidence, ties=ties_of(inputs, view.crs))
+        found = diagnose(evidence)
     sign = found.decided_by
     if sign is None:
-        why = (
-            "nothing tells whether the poses have absorbed the refraction; --adjust yes does it"
-            " all the same"
-        )
-        return Decision(False, why)
-    if not sign.speaks:
-        shown = sign.plainly if sign.name == "tie points" else sign.words
-        why = f"the poses have not absorbed the refraction: {shown}"
-        return Decision(False, why, is_fine=True)
-    return Decision(True, f"the poses had absorbed the refraction: {sign.plainly or sign.words}")
+        why = "nothing shows whether the poses absorbed the refraction; --adjust yes adjusts anyway"
+        return {"why": why, "is_said": True}
+    did = "absorbed" if sign.speaks else "did not absorb"
+    why = f"the poses {did} the refraction: {sign.words}"
+    return {"adjusted": sign.speaks, "why": why, "is_said": True, "is_fine": not sign.speaks}
 
 
-def _adjust(step: AdjustStep, target: Path, files: Sequence[Path], jobs: int | None) -> str:
+def _adjust(step: AdjustStep, target: Path, files: list[Path], jobs: int | None) -> str:
     """Adjust, and return which of `MODELS` has the cameras."""
     for path in files:
         if target.resolve() in path.resolve().parents:
             raise SettingError(
-                f"{path}: lies in {target}, which the adjustment replaces; give another OUT_DIR."
+                "output.is_input",
+                f"{path}: lies in {target}, which the adjustment replaces. Give another OUT_DIR.",
+                path=path,
             )
     survey, rules = Survey(step.gcps, step.gnss, step.lens), AdjustRules(index=step.index)
     with threads(jobs):
         adjust_into(target, step.inputs, survey, rules, step.cloud, overwrite=True)
     return next(name for name in MODELS if (target / name).exists())
-
-
-def figures_of(folder: Path) -> dict[str, Any]:
-    """Return what the adjustment of a run came to, as of `pcfix.report.adjustment`."""
-    return dict(read_json(folder / FOLDER / SUMMARY))

@@ -9,8 +9,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from pcfix.adjust.carry import Carrying
-from pcfix.adjust.evidence import Evidence
+from pcfix.adjust.diagnosis import Evidence
+from pcfix.adjust.transfer import CloudTransfer
 from pcfix.flow.diagnosis import Poses, diagnose_in_passing, quick_ties
 from pcfix.flow.inputs import Inputs, paths_in
 from pcfix.flow.learning import Learning
@@ -75,7 +75,7 @@ class ThroughWater(Sums):
         self.settings = {} if inputs.regression is None else {"regression": str(inputs.regression)}
         self._options, self._inputs, self._view = options, inputs, view
         self._cameras = blocks.cameras
-        self.carrying = None if blocks.pair is None else Carrying(blocks.pair)
+        self.carrying = None if blocks.pair is None else CloudTransfer(blocks.pair)
         self.found = inputs.surface(view)
         self.water = self.found.surface
         self.level_offset_m = inputs.level_offset_m(self._cameras)
@@ -148,7 +148,7 @@ class ThroughWater(Sums):
 
     @staticmethod
     def _carried(
-        chunks: Callable[[], Iterable[Points]], carrying: Carrying, views: ListedViews
+        chunks: Callable[[], Iterable[Points]], carrying: CloudTransfer, views: ListedViews
     ) -> Iterator[Points]:
         """Yield the whole cloud as it lies with the adjusted cameras."""
         listed, row = views.all_anew(), 0
@@ -158,17 +158,19 @@ class ThroughWater(Sums):
             row += len(xyz)
 
     @staticmethod
-    def _makers(chunks: Callable[[], Iterable[Points]], carrying: Carrying) -> Iterator[MadeWith]:
+    def _makers(
+        chunks: Callable[[], Iterable[Points]], carrying: CloudTransfer
+    ) -> Iterator[MadeWith]:
         """Yield what made the points of the whole cloud."""
         for points in chunks():
-            yield MadeWith(points.xyz, carrying.pair.old)
+            yield MadeWith(points.xyz, carrying.pair.original)
 
     def _old_ties(self) -> TiePoints | None:
         """Return the tie points of the old model, else those of the adjusted one taken back."""
         if self.carrying is None:
             return None
         ties, are_old = old_tie_points(self._inputs, self.carrying.pair, self._view.crs)
-        return ties if ties is None or are_old else self.carrying.of_new_ties(ties)
+        return ties if ties is None or are_old else self.carrying.back(ties)
 
     def correct(self, points: Points, views: Views | None, labelling: Labelling) -> Correction:
         """Correct one chunk; see `pcfix.flow.job.Job.correct`."""
@@ -176,7 +178,10 @@ class ThroughWater(Sums):
         label: Label = partial(labelling.submerged, classes=classes)
         step, made_with = None, None
         if self.carrying is not None:
-            step, made_with = self.carrying.step(xyz, views), MadeWith(xyz, self.carrying.pair.old)
+            step, made_with = (
+                self.carrying.step(xyz, views),
+                MadeWith(xyz, self.carrying.pair.original),
+            )
             xyz, views, label = step.xyz, step.views, step.rule(label)
         above = surface_above(self.water, xyz, points.heights)
         batch = Batch(xyz, above, self.survey, views, made_with, source=points.sources)

@@ -1,4 +1,4 @@
-"""The file beside an adjusted model that has the members of its joint covariance."""
+"""The file beside an adjusted model with the members of its ensemble."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pcfix.errors import InputError
 from pcfix.options.declare import File
 
 if TYPE_CHECKING:
-    from pcfix.adjust.members import Members
+    from pcfix.adjust.precision import Members
 
 FILE = "ensemble.npz"
 _NOT_READ = (OSError, ValueError, TypeError, KeyError, EOFError, BadZipFile, zlib.error)
@@ -28,20 +28,20 @@ def write_members(folder: Path, members: Members) -> None:
 
 
 def find_members(cameras: File) -> tuple[Path, Members] | None:
-    """Return the members beside a camera file and where they stand; None where there are none.
+    """Return the members beside a camera file, and their file; None if there is none.
 
-    They stand in the folder of the adjustment: a model's own folder, or one of the two above it.
+    It is in the folder of the adjustment: a model's own folder, or one of the two above it.
 
     Raises
     ------
     InputError
-        If the file is none of an adjustment.
+        If the file is not one of an adjustment.
     """
     path = Path(cameras).resolve()
     found = next((at / FILE for at in (path, *path.parents[:2]) if (at / FILE).is_file()), None)
     if found is None:
         return None
-    from pcfix.adjust.members import Members  # not quick to load
+    from pcfix.adjust.precision import Members  # not quick to load
 
     try:
         with np.load(found) as arrays:
@@ -50,7 +50,9 @@ def find_members(cameras: File) -> tuple[Path, Members] | None:
         _check(labels, lens_names, values)
     except (*_NOT_READ, MemoryError) as error:
         raise InputError(
-            f"{found}: is no ensemble of an adjustment; adjust anew, or take the file away."
+            "ensemble.damaged",
+            f"{found}: is not an ensemble of an adjustment. Adjust again, or remove the file.",
+            path=found,
         ) from error
     return found, Members(
         labels=tuple(labels.tolist()), lens_names=tuple(lens_names.tolist()), **values
@@ -58,7 +60,7 @@ def find_members(cameras: File) -> tuple[Path, Members] | None:
 
 
 def _check(labels: Any, lens_names: Any, values: dict[str, Any]) -> None:
-    """Raise a ValueError where arrays are not those of `Members`."""
+    """Raise a ValueError if arrays are not those of `Members`."""
     m, k, p = len(values["turn"]), len(labels), len(lens_names)
     shapes = {
         **{"centres": (k, 3), "focal": (k,), "turn": (m, k, 3), "shift_m": (m, k, 3)},

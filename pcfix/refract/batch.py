@@ -163,9 +163,8 @@ class Batch:
         The cameras of each point: those of a list, to choose from; or, once they are chosen, those
         that give it a ray. None where no list says it.
     made_with : MadeWith or None
-        The points as they came and the cameras they came from, where `xyz` are the same points
-        carried to others (`pcfix.adjust.carry`). What undoes dense matching goes by it; the matcher
-        learned is one of those cameras then.
+        The points and cameras as the SfM software left them, where `xyz` are the points transferred
+        to adjusted cameras (`pcfix.adjust.transfer`). Inverting the dense matching uses these.
     level_sigma_m : array, shape (m,), or None
         Standard deviation of the height of the surface above each point, as its fit has it.
     source : array of int, shape (m,), or None

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pcfix.adjust.block import sensor_groups
-from pcfix.adjust.result import Adjusted
-from pcfix.adjust.values import Before, Plain, carried_by, nice_step, rms
+from pcfix.adjust.result import Adjusted, Before, Plain, nice_step, rms
 from pcfix.grid.colours import DIFFERENCE
 from pcfix.model import BoolArray, FloatArray
 from pcfix.report.page import AFTER, BEFORE, WATER, Picture, label_plan, new_figure
@@ -24,13 +23,13 @@ COLUMNS = 14
 
 LEAST_IN_CELL = 4
 ARROW = 0.07
-"""Of the longer side of the block: how long a large arrow is drawn."""
+"""Length of a large arrow, as a share of the longer side of the block."""
 
 ARROW_LOOK: Plain = {"angles": "xy", "scale_units": "xy", "zorder": 3}
 
 
 def pictures_of(d: Plain, adjusted: Adjusted, before: Before | None) -> list[Picture]:
-    """Return all pictures that an adjustment has, of its values and itself."""
+    """Return the pictures of an adjustment."""
     return [
         *_block(d, adjusted),
         *_by_depth(d, before),
@@ -58,8 +57,8 @@ def _block(d: Plain, a: Adjusted) -> list[Picture]:
         _arrows(figure, axes, a, vectors, rows)
         axes.set_title(title, loc="left", pad=12.0)
     alt = (
-        "The block in plan. Arrows show, enlarged, in plan how far each projection centre moved"
-        " and by how much it misses its GNSS position; their colour tells the part in height."
+        "The block in plan. Enlarged arrows show how far each projection centre moved, and its"
+        " difference from the GNSS position; their colour shows the vertical part."
         f" The centres moved by {d['poses']['moved_rms_m']:.3f} m (rms)."
     )
     return [Picture("block", "Projection centres", alt, figure)]
@@ -67,7 +66,7 @@ def _block(d: Plain, a: Adjusted) -> list[Picture]:
 
 def _arrows(figure: Figure, axes: Axes, a: Adjusted, vectors: FloatArray, rows: BoolArray) -> None:
     """Draw vectors at the projection centres: in plan as arrows, in height as colour."""
-    xyz = a.xyz[carried_by(a)]
+    xyz = a.xyz[a.is_observed]
     xyz = xyz[:: max(1, len(xyz) // MOST_POINTS)]
     axes.plot(*xyz[:, :2].T, ".", color="0.85", markersize=1.5, zorder=1)
     at, by = a.cameras.centres[rows], np.nan_to_num(vectors[rows])
@@ -92,7 +91,7 @@ def _arrows(figure: Figure, axes: Axes, a: Adjusted, vectors: FloatArray, rows: 
 
 
 def _by_depth(d: Plain, before: Before | None) -> list[Picture]:
-    """Return the residuals by depth, land first."""
+    """Return residuals by depth, land first."""
     land = d["residuals"]["land"]
     bins = [("land", land)] if land["observations"] else []
     bins += [(f"{b['from_m']:g} to {b['to_m']:g}", b) for b in d["depth_bins"]]
@@ -119,7 +118,7 @@ def _by_depth(d: Plain, before: Before | None) -> list[Picture]:
         " by depth below the water."
     )
     if before is not None:
-        alt += " Before: the poses and lens as they came, the points intersected with refraction."
+        alt += " Before: original poses and lens, points intersected with refraction."
     return [Picture("residuals_by_depth", "Residuals by depth", alt, figure)]
 
 
@@ -158,7 +157,7 @@ def _vectors(d: Plain, a: Adjusted, before: Before | None) -> list[Picture]:
     rest = {name: rms(np.concatenate(m[2:])) for name, m, _ in cells}
     alt = (
         f"Mean residuals (measured minus computed) by place in the image, enlarged alike; sensor"
-        f" {lens.sensor or main + 1}. What remains here is what lens and poses did not take up: "
+        f" {lens.sensor or main + 1}. Lens and poses did not absorb these: "
         + ", ".join(f"{name} {value:.3f} {lens.unit} rms" for name, value in rest.items() if value)
         + "."
     )
@@ -187,10 +186,10 @@ def _cell_means(
 
 
 def _section(a: Adjusted, before: Before | None) -> list[Picture]:
-    """Return the points of a strip along the block, with the water."""
+    """Return the points in a strip along the block, with the water."""
     station, across, line = _strip(a.xyz)
     inside = np.abs(across - np.median(across)) < 0.15 * float(np.ptp(across)) + 1e-9
-    rows = np.flatnonzero(inside & carried_by(a))
+    rows = np.flatnonzero(inside & a.is_observed)
     rows = rows[:: max(1, len(rows) // MOST_POINTS)]
     if len(rows) < 2:
         return []
@@ -216,15 +215,15 @@ def _section(a: Adjusted, before: Before | None) -> list[Picture]:
     alt = (
         f"Points of a strip along the middle of the block, {len(rows):,} of them, in section,"
         " and the water."
-        + (" Before: intersected with the poses and lens as they came." if before else "")
+        + (" Before: intersected with the original poses and lens." if before else "")
     )
     return [Picture("section", "Section", alt, figure)]
 
 
 def _strip(xyz: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return where points lie along the longest extent of the block and across, and its middle.
+    """Return the positions of points along and across the longest extent of the block.
 
-    The third are places along the middle, shape (200, 3), that the water is drawn over; metres.
+    The third result are places along its middle, shape (200, 3), for the water; metres.
     """
     middle = xyz.mean(axis=0)
     plan = xyz[:, :2] - middle[:2]
@@ -264,8 +263,7 @@ def _rounds(d: Plain, a: Adjusted) -> list[Picture]:
     lower.set_xlabel("Step")
     lower.xaxis.get_major_locator().set_params(integer=True)
     alt = (
-        "Cost (sum of weighted squares) and root mean square residual after each step; dashed"
-        " lines part the rounds, between which outliers are left out, so that"
-        " their costs cannot be compared."
+        "Cost (sum of weighted squares) and RMS residual after each step. Dashed lines separate"
+        " the rounds, whose costs cannot be compared, as outliers are excluded between them."
     )
     return [Picture("rounds", "Convergence", alt, figure)]

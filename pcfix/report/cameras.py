@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.adjust.diagnosis import Diagnosis
-from pcfix.adjust.evidence import export_of
+from pcfix.adjust.diagnosis import Diagnosis, export_of
 from pcfix.lens.frames import footprint
 from pcfix.model import Cameras, FloatArray
 from pcfix.report.page import AFTER, WATER, draw_cloud, label_plan, label_side, new_figure

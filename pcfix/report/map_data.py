@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.adjust.values import nice_step
+from pcfix.adjust.result import nice_step
 from pcfix.grid.colours import HEIGHT, stops_of
 from pcfix.grid.contours import contours, depth_interval
 from pcfix.grid.maps import Maps, smoothed

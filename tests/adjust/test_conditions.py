@@ -8,16 +8,15 @@ import numpy as np
 import pytest
 
 from pcfix.adjust.block import PLANES, Conditions, Unknowns
-from pcfix.adjust.disagreement import pulls_of
-from pcfix.adjust.equations import undamped
 from pcfix.adjust.precision import precision_of
 from pcfix.adjust.problem import prepare
 from pcfix.adjust.result import adjusted_of, redundancy_of
-from pcfix.adjust.solve import solve
-from pcfix.errors import GeometryError
-from pcfix.kernels import threads
+from pcfix.adjust.shared_errors import pulls_of
+from pcfix.adjust.solve import reduced_at
 from pcfix.model import WaterMesh, WaterPlane, WaterRaster
+from tests.utils import tie_blocks
 from tests.utils.adjust_twin import Twin
+from tests.utils.codes import refused
 from tests.utils.curved_water import under_bent_water
 from tests.utils.nightly import mostly_nightly
 from tests.utils.tie_blocks import block_of
@@ -27,13 +26,6 @@ FREE = np.inf
 LEVEL = Unknowns(lens=(), level_sigma_m=FREE)
 HOME_M = 1e-6
 SIGMA_M = 0.01
-
-
-@pytest.fixture(autouse=True)
-def _one_thread():
-    """Small blocks spend more on waking a second thread than it does."""
-    with threads(1):
-        yield
 
 
 def scene(points, **settings):
@@ -76,12 +68,11 @@ def block_with(made, conditions, **how):
 
 
 def adjusted(block, unknowns):
-    problem, start = prepare(block, unknowns)
-    found = solve(problem, start)
+    problem, found = tie_blocks.adjusted(block, unknowns)
     return problem, found, precision_of(problem, found)
 
 
-def test_points_on_the_water_and_on_a_floor_come_home():
+def test_come_home():
     made = scene(90)
     made, conditions = put(made, {
         "water": (np.arange(8), at_level(made)),
@@ -97,19 +88,19 @@ def test_points_on_the_water_and_on_a_floor_come_home():
     assert found.state.water[0] == pytest.approx(made.water.a - problem.origin[2], abs=HOME_M)
 
 
-def test_a_steep_wall_has_its_height_along_another_axis():
+def test_wall():
     made = scene(60)
     middle = np.round(made.true_cameras.centres.mean(axis=0))
     rows = np.flatnonzero(~made.is_wet)[:9]
     east = lambda q: np.column_stack([middle[0] + 0.1 * (q[:, 2] - made.water.a), q[:, 1:]])  # noqa: E731
     made, conditions = put(made, {"wall": (rows, east)})
     problem, found, _ = adjusted(block_with(made, conditions, exact=True), Unknowns(lens=()))
-    assert problem.on_surfaces.axis.tolist() == [2, 0]
+    assert problem.given.axis.tolist() == [2, 0]
     np.testing.assert_allclose(found.state.water[PLANES + 1 :], [0.0, 0.1], atol=1e-7)
     np.testing.assert_allclose(found.state.xyz + problem.origin, made.truth, atol=HOME_M)
 
 
-def test_waterline_points_tell_the_level_better():
+def test_waterline():
     made = scene(200)
     rows = np.arange(10)
     made, conditions = put(made, {"water": (rows, at_level(made))})
@@ -125,7 +116,7 @@ def test_waterline_points_tell_the_level_better():
 
 
 @pytest.mark.parametrize("parallel", [("floor", "deck"), ("water", "floor", "deck")])
-def test_parallel_planes_have_the_same_slopes(parallel):
+def test_parallel(parallel):
     made = scene(120, tilt_percent=1.0)
     b, c = made.water.b, made.water.c
     made, conditions = put(made, {
@@ -183,7 +174,7 @@ def test_same_as_scipy():
 
 
 @pytest.mark.parametrize("kind", mostly_nightly(["raster", "mesh"], "mesh"))
-def test_points_on_a_level_raster_or_mesh(kind):
+def test_level_surface(kind):
     made = scene(90)
     made, conditions = put(made, {"water": (np.arange(8), at_level(made))})
     (x, y, _), level = np.round(made.cameras.centres.mean(axis=0)), made.water.a + 0.2
@@ -199,7 +190,7 @@ def test_points_on_a_level_raster_or_mesh(kind):
     assert precision.sigma_of("level") == pytest.approx(as_plane.sigma_of("level"), rel=1e-6)
 
 
-def test_what_groups_pull_adds_up_with_conditions():
+def test_pulls_of_groups():
     made = scene(60)
     made, conditions = put(made, {
         "water": (np.arange(6), at_level(made)),
@@ -207,13 +198,12 @@ def test_what_groups_pull_adds_up_with_conditions():
     })  # fmt: skip
     block = block_with(made, conditions, gnss=False, start_xyz=made.truth + 0.01)
     problem, start = prepare(block, Unknowns(poses="fixed", lens=("f",), level_sigma_m=FREE))
-    equations = undamped(problem, start)
-    pulls = pulls_of(equations.problem, start, block.owner % 5, np.zeros((0, 2)))
-    right, active = equations.reduced.right, equations.reduced.active
-    np.testing.assert_allclose(pulls.sum(axis=0)[active], right, rtol=1e-7)
+    reduced = reduced_at(problem, start)
+    pulls = pulls_of(problem, start, block.owner % 5, np.zeros((0, 2)))
+    np.testing.assert_allclose(pulls.sum(axis=0)[reduced.active], reduced.right, rtol=1e-7)
 
 
-def test_how_the_points_lie_is_told():
+def test_distances():
     made = scene(60)
     made, conditions = put(made, {"water": (np.arange(6), at_level(made))})
     problem, found, precision = adjusted(block_with(made, conditions), LEVEL)
@@ -224,8 +214,8 @@ def test_how_the_points_lie_is_told():
     assert row.largest_point == f"P{np.argmax(np.abs(off))}"
 
 
-def test_three_points_of_a_plane_say_nothing():
+def test_few_points():
     made = scene(60)
     made, conditions = put(made, {"floor": (np.arange(3), at_level(made, depth=1.0))})
-    with pytest.raises(GeometryError, match=r"plane floor: 3 points lie there.*mark 4 at least"):
+    with refused("gcps.few_on_plane", plane="floor", points=3, least=4):
         prepare(block_with(made, conditions), Unknowns(lens=()))

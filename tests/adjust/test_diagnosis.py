@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pcfix.adjust.block import deeper
 from pcfix.adjust.diagnosis import (
     Sign,
     bed_sign,
@@ -16,8 +17,7 @@ from pcfix.adjust.diagnosis import (
     land_sign,
     tie_point_sign,
 )
-from pcfix.adjust.gather import deeper
-from pcfix.adjust.mend import mended
+from pcfix.adjust.from_cloud import mended
 from pcfix.adjust.problem import intersect_fixed
 from pcfix.model import WaterPlane
 from tests.utils.bent_blocks import GNSS_M, LEVEL_M, N, TrueBlock
@@ -46,10 +46,9 @@ def gnss_signs(cameras, apparent):
     )
 
 
-@pytest.mark.parametrize("seed", [1])
 @pytest.mark.parametrize("poses", ["true", "adjusted with water"])
-def test_right_poses_are_called_right(seed, poses):
-    true = TrueBlock(seed)
+def test_right_poses(poses):
+    true = TrueBlock(1)
     cameras = true.cameras if poses == "true" else true.adjusted(WATER)
     sign, apparent = tie_sign(true, cameras)
     assert sign.speaks is False
@@ -61,9 +60,8 @@ def test_right_poses_are_called_right(seed, poses):
     assert abs(by_gnss.figures["share"]) < 4.0 * by_gnss.figures["sigma_share"]
 
 
-@pytest.mark.parametrize("seed", [1])
-def test_poses_of_an_ordinary_adjustment_are_found_out(seed):
-    true = TrueBlock(seed)
+def test_absorbed():
+    true = TrueBlock(1)
     bent = true.adjusted()
     sign, apparent = tie_sign(true, bent)
     assert sign.speaks is True
@@ -80,13 +78,18 @@ def test_poses_of_an_ordinary_adjustment_are_found_out(seed):
     assert by_gnss.size_m == pytest.approx(np.sqrt(np.mean(found.land_m**2)))
 
 
-def test_without_refraction_nothing_is_said():
-    true = TrueBlock(3, n=1.0)
-    sign, _ = tie_sign(true, true.cameras, n=1.0)
-    assert sign.speaks is None
+@pytest.mark.parametrize(
+    ("block", "n"),
+    [({"seed": 3, "n": 1.0}, 1.0), ({"seed": 5, "points": 30, "strips": (3, 3)}, N)],
+    ids=["no refraction", "few points"],
+)  # fmt: skip
+def test_silent(block, n):
+    true = TrueBlock(**block)
+    sign, _ = tie_sign(true, true.cameras, n=n)
+    assert sign.speaks is None and sign.why == sign.words
 
 
-def test_a_random_error_of_the_poses_is_not_taken_for_refraction():
+def test_random_errors():
     true = TrueBlock(4)
     rng = np.random.default_rng(4)
     centres = true.cameras.centres + rng.normal(0.0, 0.1, true.cameras.centres.shape)
@@ -96,13 +99,7 @@ def test_a_random_error_of_the_poses_is_not_taken_for_refraction():
     assert gnss_signs(moved, apparent)[1].speaks is not True
 
 
-def test_few_points_under_water_say_nothing():
-    true = TrueBlock(5, points=30, strips=(3, 3))
-    sign, _ = tie_sign(true, true.cameras)
-    assert sign.speaks is None
-
-
-def test_land_counts_beyond_chance_and_two_gsd():
+def test_land():
     rng = np.random.default_rng(0)
     low = land_sign(rng.normal(-0.96, 0.1, 200), 0.05, "a survey")
     assert low.speaks is True
@@ -111,14 +108,14 @@ def test_land_counts_beyond_chance_and_two_gsd():
     assert land_sign(np.array([-1.0, np.nan]), 0.05, "a survey").speaks is None
 
 
-def test_a_bed_of_nearly_its_true_depth_was_not_refracted():
+def test_bed():
     true = np.linspace(2.0, 8.0, 40)
     assert bed_sign(true / 1.4, true, N).speaks is False
     assert bed_sign(0.97 * true, true, N).speaks is True
     assert bed_sign(0.97 * true[:2], true[:2], N).speaks is None
 
 
-def test_control_points_and_focal_length():
+def test_control_and_focal_length():
     rng = np.random.default_rng(0)
     assert control_sign(rng.normal(0, 0.5, (30, 2)), np.full(30, 0.5), 0.05).speaks is None
     off = control_sign(rng.normal(0, 12.0, (30, 2)), np.full(30, 0.5), 0.05)
@@ -130,9 +127,9 @@ def test_control_points_and_focal_length():
     assert focal_sign(np.array([1501.0]), np.array([1500.0]), 75.0).speaks is None
 
 
-def test_the_sign_that_tells_most_decides():
+def test_order():
     land = land_sign(np.full(9, -1.0), 0.05, "a survey")
-    ties = Sign("tie points", "they fit", {}, speaks=False)
+    ties = Sign("tie points", {}, speaks=False, why="they fit")
     assert diagnosis_of([land]).absorbed is True
     assert diagnosis_of([land, ties]).absorbed is False
     assert diagnosis_of([land, ties]).sentence("x") == ""

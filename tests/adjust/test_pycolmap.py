@@ -150,6 +150,6 @@ def test_it_is_an_ordinary_adjustment_without_refraction(model, water):
     block = scene.block(water, n=1.0 if water else 1.34)
     problem, start = prepare(block, Unknowns(lens=free, free_network=True))
     found = solve(problem, start)
-    r = residuals(found.state, problem.seen, problem.surface)
+    r = residuals(found.state, problem.given)
     assert 0.3 < expected.std() < 0.6  # px; the noise, less what the unknowns took
     assert np.abs(r - expected).max() < SAME_PX

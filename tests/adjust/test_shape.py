@@ -9,14 +9,11 @@ import numpy as np
 import pytest
 
 from pcfix.adjust.block import Unknowns
-from pcfix.adjust.members import members_of
-from pcfix.adjust.precision import precision_of, shape_doubts
-from pcfix.adjust.problem import prepare, water_of
-from pcfix.adjust.solve import solve
-from pcfix.errors import GeometryError
-from pcfix.kernels import threads
+from pcfix.adjust.precision import members_of, precision_of, shape_notes
+from pcfix.adjust.problem import water_of
 from pcfix.model import WaterPlane, WaterRaster
 from pcfix.water.surface import surface_above
+from tests.utils import tie_blocks
 from tests.utils.adjust_twin import Twin
 from tests.utils.curved_water import under_bent_water
 from tests.utils.tie_blocks import block_of, clear_of_the_waterline
@@ -32,13 +29,6 @@ SCENE = {
 }  # fmt: skip
 
 
-@pytest.fixture(autouse=True)
-def _one_thread():
-    """Small blocks spend more on waking a second thread than it does."""
-    with threads(1):
-        yield
-
-
 @cache
 def scene(points, bend=tuple(BEND), **settings):
     made = simulate_tie_points(points, **(SCENE | settings))
@@ -47,12 +37,16 @@ def scene(points, bend=tuple(BEND), **settings):
 
 
 def adjusted(block, unknowns=SHAPED):
-    problem, start = prepare(block, unknowns)
-    found = solve(problem, start)
+    problem, found = tie_blocks.adjusted(block, unknowns)
     return problem, found, precision_of(problem, found)
 
 
-def test_exact_images_through_bent_water_come_home():
+def notes_of(made, found, precision):
+    wet = made.is_wet
+    return [one.code for one in shape_notes(precision, found.state.xyz[: len(wet)][wet, :2])]
+
+
+def test_comes_home():
     made = scene(150)
     start = WaterPlane(made.water.a + 0.1)
     block = block_of(made, exact=True, control=True, water=start)
@@ -68,7 +62,7 @@ def test_exact_images_through_bent_water_come_home():
     np.testing.assert_allclose(surface_above(water, made.truth).height_m, wanted, atol=2e-5)
 
 
-def test_noisy_images_tell_it_within_the_standard_errors():
+def test_noise():
     """Level, tilt and shape with their correlations, over draws of all noise."""
     made, rng, chi2, repeats = scene(300), np.random.default_rng(5), [], 16
     for _ in range(repeats):
@@ -76,38 +70,23 @@ def test_noisy_images_tell_it_within_the_standard_errors():
         sigma = np.array([row.sigma for row in precision.shared])
         off = (found.shared - [0.0, 0.0, 0.0, *BEND]) / sigma
         chi2.append(off @ np.linalg.solve(precision.correlation, off))
-        wet = made.is_wet
-        assert not shape_doubts(precision, found.state.xyz[: len(wet)][wet, :2])
+        assert notes_of(made, found, precision) == []
     assert (np.abs(BEND) > 2.5 * sigma[3:]).all()  # so that there is something to find
     # chi-square of six numbers has a variance of twelve
     assert np.mean(chi2) == pytest.approx(6.0, abs=3.0 * np.sqrt(12.0 / repeats))
 
 
-def test_water_that_is_flat_is_said_to_be_so():
-    made = scene(600, (0.0, 0.0, 0.0))
-    _, found, precision = adjusted(block_of(made, control=True))
-    wet = made.is_wet
-    (note,) = shape_doubts(precision, found.state.xyz[: len(wet)][wet, :2])
-    assert "as far as the block tells" in note and "leave shape out" in note
+@pytest.mark.parametrize(
+    ("points", "bend", "sigma_px", "code"),
+    [(600, (0.0, 0.0, 0.0), None, "adjust.flat"), (60, BEND, 8.0, "adjust.shape_undetermined")],
+)
+def test_notes(points, bend, sigma_px, code):
+    made = scene(points, tuple(bend))
+    _, found, precision = adjusted(block_of(made, control=True, sigma_px=sigma_px))
+    assert notes_of(made, found, precision) == [code]
 
 
-def test_a_block_that_hardly_has_water_does_not_tell_its_shape():
-    made = scene(60)
-    _, found, precision = adjusted(block_of(made, control=True, sigma_px=8.0))
-    wet = made.is_wet
-    (note,) = shape_doubts(precision, found.state.xyz[: len(wet)][wet, :2])
-    assert "does not tell the shape" in note
-
-
-def test_without_a_point_under_water_it_is_refused():
-    made = scene(60)
-    block = block_of(made, control=True)
-    dry = replace(block, wet=np.zeros(len(block.wet), bool))
-    with pytest.raises(GeometryError, match=r"the water's shape xx.*no point lies under water"):
-        adjusted(dry)
-
-
-def test_same_as_scipy_with_fermats_principle():
+def test_same_as_scipy():
     made = simulate_tie_points(
         14, seed=2, area_m=(25, 20), greatest_depth_m=6, position_noise_m=0.05,
         attitude_noise_deg=0.05, forward_overlap=0.6, side_overlap=0.5, obliques_deg=25,
@@ -130,7 +109,7 @@ def test_same_as_scipy_with_fermats_principle():
     assert np.abs(off / sigma).max() < 1e-3
 
 
-def test_members_bend_the_water_as_they_do():
+def test_members():
     made = scene(60)
     problem, found, precision = adjusted(block_of(made, control=True))
     step = np.zeros((1, len(problem.moves)))

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import pcfix
+from pcfix.adjust.block import usable_ties
 from pcfix.flow.adjust import adjust_cameras
-from pcfix.flow.adjust_job import usable_ties
 from tests.flow.test_carrying import FREE, TRUE, errors_gsd, free, true
 from tests.utils.nightly import mostly_nightly
 
@@ -27,9 +27,9 @@ TIES = 3000
     ("ties", "bed_gsd", "land_gsd"),
     mostly_nightly([("measured", 1.00, 0.80), ("cloud", 0.98, 0.80)], ("measured", 1.00, 0.80)),
 )
-def test_bed_and_land_come_home(tmp_path, monkeypatch, ties, bed_gsd, land_gsd):
+def test_rendered_block(tmp_path, monkeypatch, ties, bed_gsd, land_gsd):
     """Before, land lies 19 GSD (of 5 cm) too low; the matcher's own noise is 0.9 and 0.7."""
-    monkeypatch.setattr("pcfix.flow.adjust_job.usable_ties", partial(usable_ties, most=TIES))
+    monkeypatch.setattr("pcfix.flow.adjust.usable_ties", partial(usable_ties, most=TIES))
     offset = tuple(np.loadtxt(FREE / "offset.txt"))
     found = adjust_cameras(
         FREE / "sparse", water=WATER_M, cameras_offset=offset, cloud=FREE / "cloud.las",

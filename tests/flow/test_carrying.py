@@ -1,4 +1,4 @@
-"""A cloud of old cameras, corrected with adjusted ones, through every door."""
+"""A cloud of the original cameras, corrected with adjusted ones, through every door."""
 
 import json
 from dataclasses import replace
@@ -10,9 +10,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import pcfix
-from pcfix.errors import GeometryError, PcfixWarning, SettingError
+from pcfix.errors import SettingError
 from pcfix.flow.inputs import Inputs
-from pcfix.flow.old_cameras import paired, told_apart
+from pcfix.flow.old_cameras import told_apart
 from pcfix.flow.request import Request, request_of
 from pcfix.model import Cameras, Outcome, Views
 from pcfix.report.text import summary_text
@@ -29,6 +29,7 @@ from tests.utils.clouds import (
     read_raw,
     write_cloud,
 )
+from tests.utils.codes import refused, warned
 from tests.utils.nightly import mostly_nightly
 from tests.utils.program import run_pcfix
 from tests.utils.shared import ROOT, needs
@@ -75,7 +76,7 @@ def shift_of(las):
     return np.column_stack([np.array(las.points.array[f"Shift{a}"]) for a in "XYZ"]).astype(int)
 
 
-def test_cameras_that_did_not_move_change_nothing(cloud, old):
+def test_same_cameras(cloud, old):
     told, _, carried = correct(cloud, cameras=old, adjusted_from=old)
     _, before, plain = correct(cloud, cameras=old)
     # the last step of the intersection may be 1e-6 m: a thousandth of one of the file's
@@ -88,7 +89,7 @@ def test_cameras_that_did_not_move_change_nothing(cloud, old):
     assert told.carried["points"] + seen + sum(told.uncorrected.values()) == len(before)
 
 
-def test_land_and_bed_follow_the_cameras(cloud, old):
+def test_land_and_bed(cloud, old):
     new = adjusted(old)
     told, before, after = correct(cloud, cameras=new, adjusted_from=old)
     came = np.array(before.xyz)
@@ -117,7 +118,7 @@ def test_land_and_bed_follow_the_cameras(cloud, old):
     assert f"({told.carried['land']:,} on land)" in summary_text(told)
 
 
-def test_points_that_no_two_old_cameras_see_stay_and_are_withheld(cloud, old):
+def test_unseen_points(cloud, old):
     told, before, after = correct(cloud, cameras=adjusted(old), adjusted_from=old)
     result = snell(before.xyz, adjusted(old), WATER_M, adjusted_from=old)
     behind = result.outcome == Outcome.NOT_CARRIED
@@ -127,7 +128,6 @@ def test_points_that_no_two_old_cameras_see_stay_and_are_withheld(cloud, old):
     assert np.array_equal(
         np.array(after.classification)[behind], np.array(before.classification)[behind]
     )
-    assert told.carried["not_carried_reason"] in summary_text(told)
     told, _, after = correct(cloud, cameras=adjusted(old), adjusted_from=old, uncorrected="drop")
     assert len(after) == len(before) - told.dropped
     assert told.dropped == behind.sum() + sum(told.uncorrected.values())
@@ -137,7 +137,7 @@ def test_points_that_no_two_old_cameras_see_stay_and_are_withheld(cloud, old):
 
 
 @pytest.mark.parametrize("number", [1, 7])
-def test_restored_to_the_bit(tmp_path, old, number):
+def test_restored(tmp_path, old, number):
     cloud = write_cloud(tmp_path / "cloud.las", number)
     correct(cloud, cameras=adjusted(old), adjusted_from=old)
     pcfix.restore_file(tmp_path / "out.las", tmp_path / "back.las")
@@ -145,7 +145,7 @@ def test_restored_to_the_bit(tmp_path, old, number):
     assert np.array_equal(before.points, back.points)
 
 
-def test_the_doors_agree(cloud, old, tmp_path):
+def test_doors_agree(cloud, old, tmp_path):
     """The program, files, arrays, and the stage of PDAL as a function of arrays."""
     from tests.pdal_stage.test_arrays import arrays_of, metadata_of, run
 
@@ -191,16 +191,16 @@ def test_the_doors_agree(cloud, old, tmp_path):
     assert stage["pdalargs"]["adjusted_from"] == paths["adjusted_from"]
 
 
-def test_chunks_leave_no_trace(cloud, old, tmp_path, monkeypatch):
+def test_chunks(cloud, old, tmp_path, monkeypatch):
     correct(cloud, cameras=adjusted(old), adjusted_from=old)
     whole = (tmp_path / "out.las").read_bytes()
     monkeypatch.setattr("pcfix.io.las.source.CHUNK_POINTS", 333)
-    monkeypatch.setattr("pcfix.adjust.carry.POINTS_AT_ONCE", 100)
+    monkeypatch.setattr("pcfix.adjust.transfer.POINTS_AT_ONCE", 100)
     correct(cloud, cameras=adjusted(old), adjusted_from=old, jobs=1)
     assert (tmp_path / "out.las").read_bytes() == whole
 
 
-def test_views_count_the_old_cameras(old):
+def test_views(old):
     """They come in another order there, and under whole paths; one was not adjusted."""
     rng = np.random.default_rng(3)
     xyz = rng.uniform((EAST_M, NORTH_M, 5.0), (EAST_M + SIDE_M, NORTH_M + SIDE_M, 11.0), (200, 3))
@@ -235,7 +235,7 @@ def test_views_count_the_old_cameras(old):
     assert np.array_equal(found.ray_count[has], straight.ray_count[has] - 1)
 
 
-def test_a_lens_in_millimetres_fits_one_in_pixels(cloud, old):
+def test_millimetres(cloud, old):
     px = tuple(
         replace(lens, focal=6000.0, width=6000.0, height=2400.0, principal_x=3000.0,
                 principal_y=1200.0, unit="px")
@@ -247,52 +247,50 @@ def test_a_lens_in_millimetres_fits_one_in_pixels(cloud, old):
 
 
 @pytest.mark.parametrize(
-    ("change", "kind", "words"),
+    ("change", "code"),
     [
-        ({"labels": tuple("abcdefghi")}, GeometryError, "has no image c0"),
-        ({"rotations": None, "lenses": None}, SettingError, "adjusted-from: has no angles"),
-        ({"lenses": None}, SettingError, "adjusted-from: has no lens"),
-        ({"centres": 40.0}, GeometryError, "40.00 m from where the adjusted ones do"),
-        ({"labels": ("a/c0.jpg", "b/c0.jpg", *(f"c{i}" for i in range(2, 9)))},
-         GeometryError, "could be several"),
+        ({"labels": tuple("abcdefghi")}, "adjusted_from.no_image"),
+        ({"rotations": None, "lenses": None}, "cameras.no_angles"),
+        ({"lenses": None}, "cameras.no_lens"),
+        ({"centres": 40.0}, "adjusted_from.apart"),
+        (
+            {"labels": ("a/c0.jpg", "b/c0.jpg", *(f"c{i}" for i in range(2, 9)))},
+            "adjusted_from.ambiguous",
+        ),
+        ({"lenses": 9.5}, "adjusted_from.shape"),
     ],
-)  # fmt: skip
-def test_models_that_are_not_of_one_block_are_refused(cloud, old, change, kind, words):
+)
+def test_other_block(cloud, old, change, code):
     if "centres" in change:
         change = {"centres": old.centres + np.array([change["centres"], 0.0, 0.0])}
-    with pytest.raises(kind) as raised:
+    if change.get("lenses"):
+        change = {"lenses": tuple(replace(lens, height=9.5) for lens in old.lenses)}
+    with refused(code):
         correct(cloud, cameras=old, adjusted_from=replace(old, **change))
-    assert words in str(raised.value)
     assert not cloud.with_name("out.las").exists()
 
 
-def test_undistorted_images_are_refused(old):
-    cut = tuple(replace(lens, height=9.5) for lens in old.lenses)
-    with pytest.raises(GeometryError, match="not the same images"):
-        paired(replace(old, lenses=cut), old)
-
-
 @DEEP
-def test_one_image_far_off_is_warned_of(cloud, old):
+def test_one_image_far_off(cloud, old):
     centres = old.centres.copy()
     centres[4] += [0.2 * CAMERA_HEIGHT_M, 0.0, 0.0]
-    with pytest.warns(PcfixWarning, match="1 of 9 images were moved by more than a tenth"):
+    with warned("adjusted_from.images_apart", image=old.labels[4]):
         correct(cloud, cameras=old, adjusted_from=replace(old, centres=centres), deep=True)
 
 
-def test_a_port_and_the_tracks_of_the_adjusted_model_are_refused(cloud, old, tmp_path):
-    with pytest.raises(SettingError, match="adjusted-from is of no use with a port"):
+def test_port_and_adjusted_tracks(cloud, old, tmp_path):
+    with pytest.raises(SettingError):
         pcfix.correct_file(
             cloud, tmp_path / "o.las", cameras=old, adjusted_from=old, port="flat:distance=0.02"
         )
     given = Inputs(cameras="new", water=WATER_M, views="new", adjusted_from="old")
-    with pytest.raises(SettingError, match="not where the cloud has its points"):
+    with refused("views.adjusted"):
         told_apart(given)
 
 
 @pytest.mark.parametrize("local", ["old", "new", "both", "neither"])
 @pytest.mark.parametrize("said", [False, True])
-def test_an_offset_is_for_the_file_that_does_not_say_where_it_lies(tmp_path, old, local, said):
+def test_offset(tmp_path, old, local, said):
     offset = np.array([EAST_M, NORTH_M, 0.0])
     (tmp_path / "sensor.csv").write_text("focal,sensor_x,sensor_y\n24,24,9.6\n")
     for name, moved in (("old", 0.0), ("new", 0.5)):
@@ -315,7 +313,7 @@ def test_an_offset_is_for_the_file_that_does_not_say_where_it_lies(tmp_path, old
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_a_run_keeps_it(tmp_path):
+def test_run(tmp_path):
     scene = ROOT / "samples" / "scene"
     done = run_pcfix(
         "run", "-q", scene / "cloud.laz", tmp_path / "a", "--water", "0.37",
@@ -334,7 +332,7 @@ def test_a_run_keeps_it(tmp_path):
 @free
 @true
 @pytest.mark.parametrize("views", mostly_nightly([None, "dense.vis"], "dense.vis"))
-def test_a_block_that_had_swallowed_the_water(tmp_path, views):
+def test_rendered_block(tmp_path, views):
     """With true poses; before, land lies 19 GSD (of 5 cm) too low and the bed is 27 off."""
     told = pcfix.correct_file(
         FREE / "cloud.las", tmp_path / "out.las", cameras=TRUE / "colmap", water=0.37,

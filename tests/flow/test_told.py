@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.adjust.diagnosis import diagnosis_of, focal_sign, neighbours_sign
-from pcfix.adjust.evidence import EXPORTS, export_of
-from pcfix.flow.adjust_job import usable_ties
+from pcfix.adjust.block import usable_ties
+from pcfix.adjust.diagnosis import EXPORTS, diagnosis_of, export_of, focal_sign, neighbours_sign
 from pcfix.model import Cameras, Lens, Outcome
 from pcfix.report.text import share
 from tests.utils.crops import middle_of
@@ -53,7 +52,7 @@ def run_line(line, **instead):
 @pytest.mark.usefixtures("undrawn")
 def test_each_line_leads_to_the_next(bent_middle, tmp_path, monkeypatch):
     """From the warning by `pcfix adjust` to the corrected cloud, as printed."""
-    monkeypatch.setattr("pcfix.flow.adjust_job.usable_ties", partial(usable_ties, most=TIES))
+    monkeypatch.setattr("pcfix.flow.adjust.usable_ties", partial(usable_ties, most=TIES))
     cloud, listed = bent_middle / "cloud.las", bent_middle / "dense.vis"
     done = run_pcfix(
         "correct", cloud, tmp_path / "bent.laz", "--cameras", BENT / "sparse", "--water", LEVEL_M,

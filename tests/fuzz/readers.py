@@ -194,7 +194,7 @@ READERS: dict[str, Reader] = {
          "odm": seeds.text("gcp_list.txt", "EPSG:32636\n500010 4000010 2.5 100 200 a.jpg G1\n"
                                      "500030 4000020 -1.75 0.5 1199 b.jpg G2\n"),
          "markers": seeds.markers},
-        ("pcfix.io.control_marks", "pcfix.io.ground_control"),
+        ("pcfix.io.ground_control",),
     ),
     "gnss": Reader(
         read_positions,

@@ -13,15 +13,10 @@ import pytest
 from pcfix.adjust.block import Block, Unknowns
 from pcfix.adjust.precision import Precision, SharedUnknown
 from pcfix.adjust.problem import LogRow
-from pcfix.adjust.result import Adjusted, ControlRow
+from pcfix.adjust.result import Adjusted, Before, ControlRow, adjustment_dict, before_of
+from pcfix.errors import PcfixWarning
 from pcfix.model import Cameras, Lens, WaterPlane, WaterRaster
-from pcfix.report.adjustment import (
-    Before,
-    adjustment_dict,
-    adjustment_page,
-    adjustment_text,
-    before_of,
-)
+from pcfix.report.adjustment import adjustment_page, adjustment_text
 from pcfix.report.adjustment_figures import pictures_of
 from tests.utils.browser import needs_browser, open_page
 
@@ -99,7 +94,8 @@ def adjusted():
     return Adjusted(
         make_block(xyz, pinhole(xyz, before), before), Unknowns(level_sigma_m=0.1), after,
         WaterPlane(LEVEL + 0.02), 1.34, xyz, residual, used, is_wet, 1.234, 60, rounds,
-        "tie points", "direct", make_precision(len(xyz)), gnss, control, ["something <decided>"],
+        "tie points", "direct", make_precision(len(xyz)), gnss, control,
+        [PcfixWarning("adjust.lens", "something <decided>")],
     )  # fmt: skip
 
 
@@ -111,7 +107,7 @@ def make_precision(m):
     # of every point: 1, 2 and 3 cm
     covariance = np.tile([1e-4, 0.0, 0.0, 4e-4, 0.0, 9e-4], (m, 1))
     correlation = np.array([[1.0, -0.6], [-0.6, 1.0]])
-    return Precision(1.234, pose, shared, correlation, np.zeros((2, 3)), covariance)
+    return Precision(1.234, pose, shared, correlation, covariance)
 
 
 def before_px(adjusted):
@@ -120,28 +116,31 @@ def before_px(adjusted):
     return Before(adjusted.xyz - [0.0, 0.0, 1.0], size * np.array([1.0, 1.0]))
 
 
-def test_text_says_what_was_calculated_by_hand(adjusted):
+def test_text(adjusted):
     text = adjustment_text(adjusted, before_px(adjusted))
     land, wet = (re.search(rf"  {name} .*", text)[0].split() for name in ("on land", "under water"))
-    # the rms of a coordinate: every one is 0.3 px on land, 0.4 px under water
+    # the RMS of a coordinate: every one is 0.3 px on land, 0.4 px under water
     assert land[2:6] == ["8", "23", "1.200", "0.300"]
     assert wet[2:6] == ["16", "47", "2.400", "0.400"]
-    assert "70 used, 2 left out (2.8 %)" in text
-    assert "sigma0       1.234, redundancy 60; 2 rounds, 3 steps" in text
-    assert "focal length 1000.00 -> 1002.00 px (+2.00, standard error 0.25)" in text
-    assert "water level  0.500 -> 0.520 m (+0.020, standard error 0.004)" in text
-    assert "index        1.34, fixed" in text
-    assert "0.0100, 0.0200, 0.0300" in text  # standard errors of the points
-    # rms of (0.01, 0.05), (0.02, 0.02), (0.03, 0.09); the longest is that of b.jpg
-    assert "rms 0.036, 0.020, 0.067 m; largest 0.105 m (b.jpg)" in text
-    # rms of (0.03, 0.05) in height: sqrt(0.0017) = 0.0412
-    assert "rms 0.010, 0.020, 0.041 m, 0.61 px" in text
-    assert "C1            -0.040   +0.000   +0.060 m    0.80 px, 3 images" in text
-    assert "note         Something <decided>" in text
+    for words in (
+        "70 measured tie points used, 2 left out (2.8 %)",
+        "sigma0         1.234, redundancy 60, 2 rounds, 3 steps",
+        "focal length   1000.00 -> 1002.00 px (+2.00, standard error 0.25)",
+        "water level    0.500 -> 0.520 m (+0.020, standard error 0.004)",
+        "index          1.34, fixed",
+        "0.0100       0.0200       0.0300",  # standard errors of the points
+        # RMS of (0.01, 0.05), (0.02, 0.02), (0.03, 0.09); the longest is that of b.jpg
+        "RMS 0.036, 0.020, 0.067 m, largest 0.105 m (b.jpg)",
+        # RMS of (0.03, 0.05) in height: sqrt(0.0017) = 0.0412
+        "RMS 0.010, 0.020, 0.041 m, 0.61 px",
+        "C1           -0.040, +0.000, +0.060 m, 0.80 px, 3 images",
+        "Note: Something <decided>",
+    ):
+        assert words in text, text
     assert "nan" not in text.lower() and "none" not in text.lower()
 
 
-def test_residuals_of_x_and_y_stand_apart(adjusted):
+def test_residuals_of_x_and_y(adjusted):
     adjusted.residual_px[:, 1] *= 2.0
     told = adjustment_dict(adjusted)["residuals"]
     assert told["land"]["rms_xy_px"] == pytest.approx([0.3, 0.6])
@@ -150,7 +149,7 @@ def test_residuals_of_x_and_y_stand_apart(adjusted):
     assert "0.300 / 0.600" in adjustment_page(adjusted)
 
 
-def test_residuals_on_the_ground_are_those_of_similar_triangles(adjusted):
+def test_residuals_on_the_ground(adjusted):
     found = adjustment_dict(adjusted)["residuals"]["land"]["rms_m"]
     total = count = 0.0
     for p in np.flatnonzero(~adjusted.is_wet):
@@ -162,7 +161,7 @@ def test_residuals_on_the_ground_are_those_of_similar_triangles(adjusted):
     assert found == pytest.approx(np.sqrt(total / count), rel=1e-12)
 
 
-def test_values_are_plain_and_documented(adjusted):
+def test_values(adjusted):
     values = adjustment_dict(adjusted, before_px(adjusted))
     json.dumps(values, allow_nan=False)
     documented = re.findall(r"^ {8}([a-z_0-9, ]+) : ", adjustment_dict.__doc__, re.M)
@@ -179,7 +178,7 @@ def test_values_are_plain_and_documented(adjusted):
     assert values["poses"]["turned_largest_deg"] == 0.0
 
 
-def test_classes_of_depth_hold_every_observation_under_water(adjusted):
+def test_depth_bins(adjusted):
     bins = adjustment_dict(adjusted)["depth_bins"]
     assert sum(b["observations"] for b in bins) == 47
     assert bins[0]["from_m"] == 0.0
@@ -221,7 +220,7 @@ def bare(adjusted):
 
 
 @pytest.mark.parametrize("kind", ["whole", "bare"])
-def test_page_is_whole_and_says_nothing_unknown(adjusted, kind):
+def test_page(adjusted, kind):
     before = before_px(adjusted) if kind == "whole" else None
     it = adjusted if kind == "whole" else bare(adjusted)
     pictures = pictures_of(adjustment_dict(it, before), it, before)
@@ -238,13 +237,15 @@ def test_page_is_whole_and_says_nothing_unknown(adjusted, kind):
         assert "Something <decided>" in said
 
 
-def test_text_without_anything_beside_the_images(adjusted):
+def test_bare_text(adjusted):
     text = adjustment_text(bare(adjusted))
-    assert "poses fixed" in text and "lens         fixed" in text and "water        none" in text
+    assert (
+        "poses fixed" in text and "lens           fixed" in text and "water          none" in text
+    )
     assert not re.search(r"GNSS|control|check|under water {2}|nan", text)
 
 
-def test_what_was_held_out_does_not_count_as_left_out(adjusted):
+def test_check_points(adjusted):
     """The last point is a check point: none of its three images is used."""
     used = adjusted.used.copy()
     used[-3:] = False
@@ -260,27 +261,26 @@ def test_what_was_held_out_does_not_count_as_left_out(adjusted):
     assert sum(values["residuals"][key]["points"] for key in ("land", "water")) == 22
 
 
-def test_level_of_a_raster_is_its_mean_over_the_points(adjusted):
+def test_level_of_raster(adjusted):
     def raster(height):
         return WaterRaster(np.full((3, 3), height), EAST - 50.0, NORTH + 50.0, (50.0, 50.0))
 
     it = replace(adjusted, block=replace(adjusted.block, water=raster(0.5)), water=raster(0.53))
     text = adjustment_text(it)
-    assert "water level  0.500 -> 0.530 m (+0.030, standard error 0.004)" in text
+    assert "water level    0.500 -> 0.530 m (+0.030, standard error 0.004)" in text
     assert "tilt" not in text
 
 
-def test_similarity_tells_shift_turn_and_scale(adjusted):
+def test_similarity(adjusted):
     shared = (*adjusted.precision.shared, SharedUnknown("shift z", 0.31, 0.02))
-    precision = replace(adjusted.precision, shared=shared, correlation=np.eye(3),
-                        block_correlation=np.zeros((3, 3)))  # fmt: skip
+    precision = replace(adjusted.precision, shared=shared, correlation=np.eye(3))
     free = Unknowns(poses="similarity", level_sigma_m=0.1)
     page = adjustment_page(replace(adjusted, precision=precision, unknowns=free))
     row = re.search(r">shift z</th>(.*?)</tr>", page)[1]
     assert re.findall(r"<td>(.*?)</td>", row) == ["", "", "+0.31", "0.02", "m"]
 
 
-def test_before_intersects_what_the_images_show(adjusted):
+def test_before(adjusted):
     """n = 1: straight rays meet at the truth, whatever the survey says of a control point."""
     truth = points()
     start = truth + np.array([0.3, -0.2, 0.4])
@@ -296,7 +296,7 @@ def test_before_intersects_what_the_images_show(adjusted):
 
 
 @needs_browser
-def test_page_opens_without_an_error(adjusted, tmp_path):
+def test_page_opens(adjusted, tmp_path):
     page = tmp_path / "adjustment.html"
     page.write_text(adjustment_page(adjusted, before_px(adjusted)))
     opened = open_page(page, tmp_path / "profile")

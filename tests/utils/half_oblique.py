@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import laspy
 import numpy as np
 
-from pcfix.adjust.carry import renumbered
+from pcfix.adjust.transfer import renumbered
 from pcfix.io.scenes import write_scene
 from pcfix.model import Cameras
 from pcfix.simulate.scene import simulate_scene

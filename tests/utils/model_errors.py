@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pcfix.adjust.gather import Datum, Material, usable_ties
+from pcfix.adjust.block import Material, usable_ties
+from pcfix.adjust.methods import by_ties
 from pcfix.adjust.problem import intersect_fixed
-from pcfix.adjust.ways import by_ties
 from pcfix.model import TiePoints, WaterPlane
 from pcfix.options.survey import AdjustRules
 from tests.utils.tie_blocks import block_of
@@ -65,9 +65,7 @@ def run(kind: str, seed: int, **settings: object) -> Run:
     water = WaterPlane(scene.water.a + off_m, scene.water.b, scene.water.c)
     made = unaware(scene, robust="cauchy" if kind == "mismatches" else "squares")
     gnss = scene.cameras.gnss
-    material = Material(
-        "block", made.cameras, water, scene.refractive_index, Datum(gnss.xyz, gnss.sigma_m)
-    )
+    material = Material("block", made.cameras, water, scene.refractive_index, gnss)
     rules = AdjustRules(sigma_level=SIGMA_LEVEL_M if kind == "level" else None)
     found = by_ties(material, usable_ties(made.ties, made.cameras), rules)
     bed = tuple(

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pcfix.adjust.block import Block
+from pcfix.adjust.problem import prepare
+from pcfix.adjust.solve import solve
 from pcfix.model import TiePoints
 
 if TYPE_CHECKING:
@@ -59,6 +61,12 @@ def block_of(
         gnss_xyz=place if gnss else np.full((k, 3), np.nan),
         gnss_sigma_m=positions.sigma_m if gnss else np.full((k, 3), np.inf),
     )
+
+
+def adjusted(block: Block, unknowns):
+    """Return a block as a problem and its solution."""
+    problem, start = prepare(block, unknowns)
+    return problem, solve(problem, start)
 
 
 def clear_of_the_waterline(scene: TieScene, by_m: float) -> TieScene:

@@ -10,24 +10,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pcfix.adjust.block import Unknowns
-from pcfix.adjust.disagreement import disagreement_of
 from pcfix.adjust.precision import precision_of
-from pcfix.adjust.problem import prepare
 from pcfix.adjust.result import sigma0_of
-from pcfix.adjust.solve import solve
-from pcfix.kernels import threads
-from tests.utils.tie_blocks import block_of
+from pcfix.adjust.shared_errors import disagreement_of
+from tests.utils.tie_blocks import adjusted, block_of
 from tests.utils.tie_points import simulate_tie_points
 
 NOISE_PX = 0.2
 DRAWS = 2
-
-
-@pytest.fixture(autouse=True)
-def _one_thread():
-    """So small a block spends more on waking a second thread than it does."""
-    with threads(1):
-        yield
 
 
 @cache
@@ -63,42 +53,32 @@ def draws(kind, count=DRAWS):
     """Return errors over standard errors of each kind of unknown, formal ones and larger ones."""
     rng, made, both = np.random.default_rng(8), scene(), []
     for _ in range(count):
-        problem, start = prepare(with_errors(rng, kind), Unknowns(lens=("f",)))
-        found = solve(problem, start)
+        problem, found = adjusted(with_errors(rng, kind), Unknowns(lens=("f",)))
         formal = precision_of(problem, found, sigma0_of(problem, found))
-        by = disagreement_of(problem, found, formal)
+        factor, _ = disagreement_of(problem, found, formal)
         off = found.state.centres + problem.origin - made.true_cameras.centres
         turn = found.state.rotations @ made.true_cameras.rotations.transpose(0, 2, 1)
         angles = np.degrees(Rotation.from_matrix(turn).as_rotvec())
         rows = []
-        for precision in (formal, precision_of(problem, found, formal.sigma0, by.factor)):
+        for precision in (formal, precision_of(problem, found, formal.sigma0, factor)):
             z = np.hstack([angles / precision.angle_sigma_deg, off / precision.centre_sigma_m])
             rows.append(np.sqrt([(z[:, :3] ** 2).mean(), (z[:, 3:] ** 2).mean()]))
         both.append(rows)
     return np.sqrt((np.array(both) ** 2).mean(axis=0))
 
 
-def test_what_shares_nothing_is_left():
+def test_independent_errors():
     formal, larger = draws("none")
     assert (formal > 0.7).all() and (formal < 1.4).all()
     assert (larger > 0.85 * formal).all()
 
 
-def test_errors_that_neighbours_share():
-    """Of patches of 10 m as one image shows them; over 12 draws it is 2.4 and 2.8, then 1 and 1.1.
+@pytest.mark.parametrize(("kind", "count", "least"), [("shared", DRAWS, 1.7), ("lens", 4, 2.0)])
+def test_shared_errors(kind, count, least):
+    """Errors of patches of 10 m in one image, and of a bent lens, most of which poses absorb.
 
-    Two draws of some thirty images that hang together leave a third of it to chance.
+    Over 12 draws patches give 2.4 and 2.8, then 1 and 1.1. So few draws leave a third to chance.
     """
-    formal, larger = draws("shared")
-    assert (formal > 1.7).all()
-    assert (larger > 0.7).all() and (larger < 1.4).all()
-
-
-def test_a_lens_that_is_bent():
-    """Most of a smooth field hides in angles and centres; the rest says how large it was.
-
-    Four draws, whose centres hang together, leave a third of it to chance.
-    """
-    formal, larger = draws("lens", 4)
-    assert (formal > 2.0).all()
+    formal, larger = draws(kind, count)
+    assert (formal > least).all()
     assert (larger > 0.7).all() and (larger < 1.4).all()

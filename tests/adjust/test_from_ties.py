@@ -1,33 +1,22 @@
-"""Noise, outliers, datum, check points and weak lens parameters of an adjustment by tie points."""
+"""Adjustment by tie points: noise, outliers, datum, check points and lens parameters."""
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
-from pcfix.adjust.block import Unknowns
-from pcfix.adjust.gather import Datum, Material, block_of, no_datum
-from pcfix.adjust.lens_choice import default_lens
+from pcfix.adjust.block import Material, Unknowns, block_of, check_datum
+from pcfix.adjust.from_ties import adjust_ties, default_lens, noise_px
 from pcfix.adjust.problem import prepare
-from pcfix.adjust.rounds import adjust_ties, check_datum, noise_px
 from pcfix.adjust.solve import solve
-from pcfix.errors import GeometryError
-from pcfix.kernels import threads
+from tests.utils.codes import refused
 from tests.utils.tie_blocks import block_of as simple_block
 from tests.utils.tie_points import simulate_tie_points
 
 FOCAL = Unknowns(lens=("f",))
-
-
-@pytest.fixture(autouse=True)
-def _one_thread():
-    """So small a block spends more on waking a second thread than it does."""
-    with threads(1):
-        yield
 
 
 @cache
@@ -39,14 +28,15 @@ def scene(image_px=0.5, **settings):
 
 
 def block(made, ties=None, gnss=True, control=None):
-    datum = no_datum(len(made.cameras))
-    if gnss:
-        datum = Datum(made.cameras.gnss.xyz, made.cameras.gnss.sigma_m)
-    ties = made.ties if ties is None else ties
     material = Material(
-        "model", made.cameras, made.water, made.refractive_index, datum, control
+        "model", made.cameras, made.water, made.refractive_index,
+        made.cameras.gnss if gnss else None, control,
     )  # fmt: skip
-    return block_of(material, ties, 1.0)
+    return block_of(material, made.ties if ties is None else ties, 1.0)
+
+
+def codes(found):
+    return [note.code for note in found.notes]
 
 
 def with_gross_errors(made, share=0.05):
@@ -60,7 +50,7 @@ def with_gross_errors(made, share=0.05):
 
 @pytest.mark.parametrize("image_px", [0.15, 1.5])
 @pytest.mark.parametrize("gross", [False, True])
-def test_the_noise_is_found(image_px, gross):
+def test_noise(image_px, gross):
     """In 8000 coordinates, the median's own error is 1 %, and unit weight's the same."""
     made = scene(image_px)
     ties = with_gross_errors(made)[0] if gross else made.ties
@@ -73,7 +63,7 @@ def test_the_noise_is_found(image_px, gross):
     assert np.sqrt(np.mean(r * r) / share) == pytest.approx(image_px, rel=0.1)
 
 
-def test_the_median_hardly_sees_outliers():
+def test_robust_noise():
     made = scene()
     problem, start = prepare(block(made), FOCAL)
     assert noise_px(problem, solve(problem, start)) == pytest.approx(0.5, rel=0.05)
@@ -82,7 +72,7 @@ def test_the_median_hardly_sees_outliers():
     assert noise_px(problem, solve(problem, start, "huber")) == pytest.approx(0.5, rel=0.3)
 
 
-def test_gross_errors_are_left_out_and_good_ones_are_not():
+def test_outliers():
     made = scene()
     ties, bad = with_gross_errors(made)
     found = adjust_ties(block(made, ties), FOCAL)
@@ -98,14 +88,14 @@ def test_gross_errors_are_left_out_and_good_ones_are_not():
     assert kept.used.all()
 
 
-def test_a_given_noise_is_not_estimated():
+def test_given_noise():
     made = scene()
     weighed = replace(block(made), sigma_px=np.full(len(made.views.camera), 0.25))
     found = adjust_ties(weighed, FOCAL, sigma_px=0.25, outliers=False)
     assert found.sigma0 == pytest.approx(2.0, rel=0.1)
 
 
-def test_check_points_tell_and_do_not_count():
+def test_check_points():
     made = scene()
     control = made.control
     first = int(np.argmax(control.is_check))
@@ -129,7 +119,7 @@ def test_check_points_tell_and_do_not_count():
     assert shifted.dx_m < rows[control.names[first]].dx_m - 5.0
 
 
-def test_marks_of_control_points_are_never_outliers():
+def test_marks_are_no_outliers():
     made = scene()
     control = made.control
     mine = np.flatnonzero(control.point == 0)
@@ -148,16 +138,15 @@ def test_marks_of_control_points_are_never_outliers():
     ("gnss", "unknowns"),
     [(0, FOCAL), (2, FOCAL), (0, replace(FOCAL, fixed_images=("IMG_0001.JPG",)))],
 )
-def test_without_a_datum_it_says_what_is_undetermined(gnss, unknowns):
-    made = scene()
-    whole = block(made)
+def test_no_datum(gnss, unknowns):
+    whole = block(scene())
     few = whole.gnss_xyz.copy()
     few[gnss:] = np.nan
-    with pytest.raises(GeometryError, match="shift in plan, turn and scale stay undetermined"):
+    with refused("adjust.no_datum", gnss=gnss, control=0):
         adjust_ties(replace(whole, gnss_xyz=few), unknowns)
 
 
-def test_three_points_two_images_or_the_wish_are_a_datum():
+def test_datum():
     made = scene()
     labels = made.cameras.labels
     nothing = block(made, gnss=False)
@@ -165,19 +154,19 @@ def test_three_points_two_images_or_the_wish_are_a_datum():
     check_datum(nothing, replace(FOCAL, fixed_images=labels[:2]))
     check_datum(nothing, replace(FOCAL, poses="fixed"))
     check_datum(block(made, gnss=False, control=made.control), FOCAL)
-    with pytest.raises(GeometryError, match="0 control points"):
+    with refused("adjust.no_datum", control=0):
         checks = replace(made.control, is_check=np.ones(len(made.control.names), bool))
         check_datum(block(made, gnss=False, control=checks), FOCAL)
 
 
-def test_lens_parameters_that_the_block_does_not_tell_are_left():
+def test_weak_lens():
     made = scene()
     lens = ("f", "cx", "cy", "k1", "k2", "p2")
     found = adjust_ties(block(made), replace(FOCAL, lens=lens))
-    note = next(note for note in found.notes if "does not determine" in note)
+    note = next(note for note in found.notes if note.code == "adjust.weak_lens")
     weak = set(lens) - set(found.unknowns.lens)
     assert {"cx", "cy"} <= weak  # nadir images over an even bed: a shift of all centres does it
-    assert all(name in note for name in weak)
+    assert set(note.values["fixed"]) == weak
     before, after = made.cameras.lenses[0], found.cameras.lenses[0]
     assert (after.principal_x, after.principal_y) == (before.principal_x, before.principal_y)
     assert after.focal != before.focal
@@ -186,14 +175,14 @@ def test_lens_parameters_that_the_block_does_not_tell_are_left():
     assert not named.notes
 
 
-def test_lens_parameters_that_may_move_are_those_of_the_lens():
+def test_default_lens():
     plain = scene().cameras.lenses[0]
     assert default_lens((plain,)) == ("f", "cx", "cy")
     bent = replace(plain, radial=(-0.1, 0.0, 0.01), tangential=(0.0, 1e-4))
     assert default_lens((bent,)) == ("f", "cx", "cy", "k1", "k3", "p2")
 
 
-def test_it_is_the_least_squares_of_what_it_kept():
+def test_least_squares():
     made = scene()
     whole = simple_block(made)
     found = adjust_ties(whole, FOCAL, sigma_px=0.5, outliers=False)
@@ -204,19 +193,78 @@ def test_it_is_the_least_squares_of_what_it_kept():
     np.testing.assert_allclose(centres, once.state.centres, atol=1e-6)
 
 
-def test_sides_of_the_water_that_differ_count_by_their_own_noise():
+def test_noise_differs():
     """Noise of 0.3 px and of 0.9 px under water, each found to a tenth; a given one is kept."""
     made = scene(0.3)
     wet = np.repeat(made.is_wet, np.diff(made.views.start))
     more = np.random.default_rng(5).normal(0.0, np.sqrt(0.9**2 - 0.3**2), (len(wet), 2))
     ties = replace(made.ties, image_xy=made.ties.image_xy + np.where(wet[:, None], more, 0.0))
     found = adjust_ties(block(made, ties), FOCAL)
-    (note,) = [words for words in found.notes if "the noise of tie points differs" in words]
-    land, under = re.match(
-        r".*: ([\d.]+) px on land and ([\d.]+) px under water; each", note
-    ).groups()
-    assert float(land) == pytest.approx(0.3, rel=0.1)
-    assert float(under) == pytest.approx(0.9, rel=0.1)
+    note = next(one for one in found.notes if one.code == "adjust.noise_differs")
+    wanted = {"on land": pytest.approx(0.3, rel=0.1), "under water": pytest.approx(0.9, rel=0.1)}
+    assert note.values["noise_px"] == wanted
     equal = adjust_ties(block(made, ties), FOCAL, sigma_px=0.7)
-    assert not any("differs" in words for words in equal.notes)
-    assert not any("differs" in words for words in adjust_ties(block(made), FOCAL).notes)
+    assert "adjust.noise_differs" not in codes(equal)
+    assert "adjust.noise_differs" not in codes(adjust_ties(block(made), FOCAL))
+
+
+# px: what distortion may hide in the noise, and what a block of so few points sees of it
+NOISE_PX = 0.3
+
+
+@cache
+def oblique_scene():
+    return simulate_tie_points(
+        150, area_m=(35, 30), greatest_depth_m=5, position_noise_m=0.3, attitude_noise_deg=0.2,
+        obliques_deg=30, oblique_directions=4, image_noise=NOISE_PX, seed=3,
+    )  # fmt: skip
+
+
+def with_lens(b1=0.0, k1=0.0, p1=0.0, start_b1=0.0):
+    """Return a block whose images were made by a lens with these terms, and their start values.
+
+    A term is added to the places of a lens without any: to the first order they are the same.
+    """
+    block = simple_block(oblique_scene(), sigma_px=NOISE_PX)
+    lens = block.cameras.lenses[0]
+    middle = [lens.principal_x, lens.principal_y]
+    x, y = ((block.image_xy - middle) / lens.focal).T
+    r2 = x * x + y * y
+    along_x = b1 * x + lens.focal * (k1 * x * r2 + p1 * (r2 + 2.0 * x * x))
+    along_y = lens.focal * (k1 * y * r2 + p1 * 2.0 * x * y)
+    start = (replace(lens, b1=start_b1),) * len(block.cameras)
+    return replace(
+        block,
+        image_xy=block.image_xy + np.column_stack([along_x, along_y]),
+        cameras=replace(block.cameras, lenses=start),
+    )
+
+
+def adjusted(block):
+    return adjust_ties(block, Unknowns(lens=default_lens(block.cameras.lenses)))
+
+
+def test_nothing_missing():
+    found = adjusted(with_lens())
+    assert found.unknowns.lens == ("f", "cx", "cy")
+    assert [one.values["free"] for one in found.notes] == [["f", "cx", "cy"]]
+
+
+@pytest.mark.parametrize("term", [{"b1": 0.6}, {"k1": 2e-3}, {"p1": 2e-4}], ids=["b1", "k1", "p1"])
+def test_missing_term(term):
+    """Each moves the edge of the frame by half a pixel or so."""
+    ((name, value),) = term.items()
+    found = adjusted(with_lens(**term))
+    assert found.unknowns.lens == ("f", "cx", "cy", name)
+    assert found.notes[0].values == {"free": ["f", "cx", "cy", name], "found": [name]}
+    row = next(row for row in found.precision.shared if row.name == name)
+    assert abs(row.added - value) < 4.0 * row.sigma
+    assert found.sigma0 == pytest.approx(1.0, abs=0.1)
+
+
+def test_absorbed_term():
+    """Square pixels came with an aspect of 0.2 px, too little to be missed among the residuals."""
+    found = adjusted(with_lens(start_b1=0.2))
+    assert found.unknowns.lens == ("f", "cx", "cy", "b1")
+    sigma = found.precision.sigma_of("b1")
+    assert abs(found.cameras.lenses[0].b1) < 4.0 * sigma

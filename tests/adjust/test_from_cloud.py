@@ -8,15 +8,14 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pcfix.adjust.block import Unknowns
-from pcfix.adjust.gather import Datum, Material, block_of, no_datum, ties_of_cloud
-from pcfix.adjust.mend import Candidate, mend
-from pcfix.adjust.problem import prepare, solved_cameras
-from pcfix.adjust.rounds import adjust_ties
-from pcfix.adjust.solve import solve
-from pcfix.errors import GeometryError
-from pcfix.kernels import threads
+from pcfix.adjust.block import Material, Unknowns, block_of, ties_of_cloud
+from pcfix.adjust.from_cloud import Candidate, adjust_cloud
+from pcfix.adjust.from_ties import adjust_ties
+from pcfix.adjust.problem import solved_cameras
+from pcfix.model import GnssPositions
 from pcfix.simulate.tracing import piercing_points, project
+from tests.utils.codes import refused
+from tests.utils.tie_blocks import adjusted
 from tests.utils.tie_points import simulate_tie_points
 from tests.utils.unaware_blocks import unaware
 
@@ -31,13 +30,6 @@ AT_REST = 1e-7
 """Of |J||r|: differences of the simulator's projection are good to about 1e-9 of it."""
 
 
-@pytest.fixture(autouse=True)
-def _one_thread():
-    """So small a block spends more on waking a second thread than it does."""
-    with threads(1):
-        yield
-
-
 @cache
 def block(points=150, exact=True, **settings):
     return unaware(simulate_tie_points(points, **(SMALL | settings)), exact=exact)
@@ -47,10 +39,10 @@ def candidate(made, *, gnss=True, control=None, exact=True):
     """Return the apparent points as the only thing that is known of the images."""
     scene, old = made.scene, made.cameras
     ties = ties_of_cloud(made.ties.xyz, made.ties.views, old)
-    datum = no_datum(len(old))
+    datum = None
     if gnss:
         place = scene.true_cameras.centres if exact else scene.cameras.gnss.xyz
-        datum = Datum(place, scene.cameras.gnss.sigma_m)
+        datum = GnssPositions(place, scene.cameras.gnss.sigma_m, None)
     material = Material("model", old, scene.water, scene.refractive_index, datum, control)
     whole = block_of(material, ties, 1.0)
     apparent = ties.xyz if control is None else np.vstack([ties.xyz, control.xyz])
@@ -61,7 +53,7 @@ def centre_error_m(made, cameras):
     return np.abs(cameras.centres - made.scene.true_cameras.centres).max()
 
 
-def test_the_old_adjustment_is_at_rest():
+def test_original_adjustment():
     """Its residuals pull at nothing, as the simulator's straight rays see it; nor are they zero."""
     pull, size = block(40).normal_vector()
     assert np.abs(pull / size).max() < AT_REST
@@ -73,10 +65,10 @@ def test_the_old_adjustment_is_at_rest():
     [{}, {"tilt_percent": 2.0}, {"obliques_deg": 30, "oblique_directions": 2}],
     ids=["nadir", "tilted water", "obliques"],
 )
-def test_poses_come_home_from_the_points_alone(settings):
+def test_comes_home(settings):
     made = block(**settings)
     assert centre_error_m(made, made.cameras) > 0.1
-    found = mend([candidate(made)], Unknowns(), FOCAL)
+    found = adjust_cloud([candidate(made)], Unknowns(), FOCAL)
     assert centre_error_m(made, found.cameras) < HOME_M
     # px; a micrometre of 50 m is that of 3648 px in the focal length
     assert abs(found.cameras.lenses[0].focal - made.scene.true_cameras.lenses[0].focal) < 1e-4
@@ -84,12 +76,12 @@ def test_poses_come_home_from_the_points_alone(settings):
     assert found.source == "cloud"
 
 
-def test_control_points_are_datum_enough():
+def test_control_points():
     made = block()
     control = replace(
         made.scene.control, xyz=made.scene.control_truth, image_xy=made.scene.control_exact_xy
     )
-    found = mend([candidate(made, gnss=False, control=control)], Unknowns(), FOCAL)
+    found = adjust_cloud([candidate(made, gnss=False, control=control)], Unknowns(), FOCAL)
     assert centre_error_m(made, found.cameras) < 10 * HOME_M  # four points hold six strips
     assert {row.role for row in found.control} == {"control", "check"}
     for row in found.control:
@@ -98,23 +90,22 @@ def test_control_points_are_datum_enough():
 
 
 @pytest.mark.parametrize("sigma_px", [0.03, 0.3, 1.0])
-def test_least_squares_on_the_projected_points_do_not(sigma_px):
+def test_least_squares_does_not(sigma_px):
     """Their residuals are those of the old adjustment taken away, which pulls back to it."""
     made = block()
     one = candidate(made).block
     one = replace(one, sigma_px=np.full(len(one.camera), sigma_px))
-    problem, start = prepare(one, Unknowns(lens=("f",)))
-    found = solved_cameras(problem, solve(problem, start))
+    found = solved_cameras(*adjusted(one, Unknowns(lens=("f",))))
     # exact GNSS positions hold the centres, so that the focal length takes it
     assert abs(found.lenses[0].focal - made.scene.true_cameras.lenses[0].focal) > 10.0  # px
     assert centre_error_m(made, found) > 1e4 * HOME_M
 
 
-def test_residuals_are_orthogonal_to_the_old_columns():
+def test_orthogonal_residuals():
     """Those of light through the water, by the simulator, at what was found."""
     made = block(40)
     scene = made.scene
-    found = mend([candidate(made)], Unknowns(), FOCAL)
+    found = adjust_cloud([candidate(made)], Unknowns(), FOCAL)
     owner = np.repeat(np.arange(len(scene.truth)), np.diff(scene.views.start))
     camera, new, old = scene.views.camera, found.cameras, made.cameras
     surface = piercing_points(
@@ -127,13 +118,13 @@ def test_residuals_are_orthogonal_to_the_old_columns():
     assert np.abs(wet - straight).max() > 0.5  # px: what straight rays could not fit
 
 
-def test_noise_in_the_images_goes_where_it_goes_with_tie_points():
+def test_noise():
     """As the old columns are nearly those of light through the water, so are the estimates."""
     made = block(400, exact=False)
     scene = made.scene
-    mended = mend([candidate(made, exact=False)], Unknowns(), FOCAL)
-    datum = Datum(scene.cameras.gnss.xyz, scene.cameras.gnss.sigma_m)
-    material = Material("model", scene.cameras, scene.water, scene.refractive_index, datum)
+    mended = adjust_cloud([candidate(made, exact=False)], Unknowns(), FOCAL)
+    gnss = scene.cameras.gnss
+    material = Material("model", scene.cameras, scene.water, scene.refractive_index, gnss)
     whole = block_of(material, scene.ties, scene.noise.image_px)
     aware = adjust_ties(whole, Unknowns(lens=("f",)))
     sigma_m = aware.precision.centre_sigma_m
@@ -145,15 +136,15 @@ def test_noise_in_the_images_goes_where_it_goes_with_tie_points():
 
 
 @pytest.mark.parametrize(
-    ("unknowns", "words"),
+    ("unknowns", "code"),
     [
-        (Unknowns(free_network=True), "give --gnss or --gcps"),
-        (Unknowns(poses="similarity"), "give --gnss or --gcps"),
-        (Unknowns(level_sigma_m=np.inf), "from measured tie points only"),
-        (Unknowns(), "nothing says where the block is"),
+        (Unknowns(free_network=True), "adjust.cloud_needs_datum"),
+        (Unknowns(poses="similarity"), "adjust.cloud_needs_datum"),
+        (Unknowns(level_sigma_m=np.inf), "adjust.cloud_needs_water"),
+        (Unknowns(), "adjust.no_datum"),
     ],
 )
-def test_what_points_alone_cannot_tell_is_refused(unknowns, words):
+def test_refused(unknowns, code):
     one = candidate(block(40), gnss=unknowns.poses == "similarity" or bool(unknowns.level_sigma_m))
-    with pytest.raises(GeometryError, match=words):
-        mend([one], unknowns, FOCAL)
+    with refused(code):
+        adjust_cloud([one], unknowns, FOCAL)

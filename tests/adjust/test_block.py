@@ -6,14 +6,10 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
-import pytest
 
-from pcfix.adjust.gather import (
-    Datum,
+from pcfix.adjust.block import (
     Material,
     block_of,
-    check_surface,
-    no_datum,
     restricted,
     taken,
     ties_of_cloud,
@@ -22,9 +18,9 @@ from pcfix.adjust.gather import (
     well_seen,
     with_places,
 )
-from pcfix.errors import GeometryError, SettingError
-from pcfix.model import TiePoints, Views, WaterDimension, WaterPlane
+from pcfix.model import TiePoints, Views, WaterPlane
 from pcfix.simulate.tracing import project
+from tests.utils.codes import refused
 from tests.utils.tie_points import simulate_tie_points
 
 
@@ -36,9 +32,9 @@ def scene():
 def gathered(**changes):
     made = scene()
     given = {
-        "name": "model", "old": made.cameras, "water": made.water,
-        "refractive_index": made.refractive_index,
-        "gnss": Datum(made.cameras.gnss.xyz, made.cameras.gnss.sigma_m), "control": made.control,
+        "name": "model", "original": made.cameras, "water": made.water,
+        "refractive_index": made.refractive_index, "gnss": made.cameras.gnss,
+        "control": made.control,
     }  # fmt: skip
     return block_of(Material(**(given | changes)), made.ties, 0.7)
 
@@ -49,7 +45,7 @@ def observations(block):
     return {tuple(map(float, row)) for row in rows}
 
 
-def test_every_observation_keeps_its_point_and_image():
+def test_observations():
     made, block = scene(), gathered()
     m, control = len(made.truth), made.control
     owner = np.repeat(np.arange(m), np.diff(made.views.start))
@@ -59,7 +55,7 @@ def test_every_observation_keeps_its_point_and_image():
     assert len(block.owner) == len(made.views.camera) + len(control.point)
 
 
-def test_marks_in_any_order_are_sorted_by_point():
+def test_unsorted_marks():
     control = scene().control
     order = np.random.default_rng(2).permutation(len(control.point))
     mixed = replace(
@@ -69,7 +65,7 @@ def test_marks_in_any_order_are_sorted_by_point():
     assert observations(gathered(control=mixed)) == observations(gathered())
 
 
-def test_control_points_count_and_check_points_do_not():
+def test_check_points():
     made, block = scene(), gathered()
     m, control = len(made.truth), made.control
     assert control.is_check.any()
@@ -84,7 +80,7 @@ def test_control_points_count_and_check_points_do_not():
     assert block.control_names == control.names
 
 
-def test_true_points_are_looked_for_deeper_by_n():
+def test_true_start():
     water = WaterPlane(2.0, 0.01, 0.0)
     xyz = np.array([[0.0, 0.0, 1.0], [100.0, 0.0, 1.0], [0.0, 0.0, 2.5]])
     found = true_start(xyz, water, 1.34)
@@ -95,7 +91,7 @@ def test_true_points_are_looked_for_deeper_by_n():
     np.testing.assert_array_equal(true_start(xyz, None, 1.34), xyz)
 
 
-def test_the_image_of_the_cloud_is_that_of_its_cameras():
+def test_ties_of_cloud():
     made = scene()
     views = made.views
     ties = ties_of_cloud(made.truth, views, made.cameras)
@@ -106,7 +102,7 @@ def test_the_image_of_the_cloud_is_that_of_its_cameras():
     np.testing.assert_array_equal(ties.views.camera, views.camera)
 
 
-def test_points_behind_their_cameras_have_no_image_there():
+def test_points_behind_cameras():
     made = scene()
     xyz = np.vstack([made.truth[:1], made.cameras.centres[:1] + np.array([0.0, 0.0, 50.0])])
     views = Views(np.array([0, 2, 5]), np.array([0, 1, 0, 1, 2]))
@@ -114,7 +110,7 @@ def test_points_behind_their_cameras_have_no_image_there():
     np.testing.assert_array_equal(ties.xyz, xyz[:1])
 
 
-def test_only_points_that_two_rays_fix_are_used():
+def test_usable_ties():
     made = scene()
     first = made.ties.views.start[1]
     lone = Views(np.array([0, 1, 1 + first, 1 + 2 * first]), np.zeros(1 + 2 * first, int))
@@ -129,7 +125,7 @@ def test_only_points_that_two_rays_fix_are_used():
     assert len(usable_ties(far, made.cameras).xyz) == 0
 
 
-def test_of_very_many_a_part_is_drawn_always_the_same():
+def test_many_ties():
     made = scene()
     one, two = (usable_ties(made.ties, made.cameras, most=20) for _ in range(2))
     assert len(one.xyz) == 20
@@ -140,7 +136,7 @@ def test_of_very_many_a_part_is_drawn_always_the_same():
     np.testing.assert_array_equal(one.views.camera, same.views.camera)
 
 
-def test_images_that_hardly_see_anything_leave_the_block():
+def test_poor_image():
     made = scene()
     block = gathered(control=None)
     seen = np.flatnonzero(block.camera == 3)
@@ -161,28 +157,17 @@ def test_images_that_hardly_see_anything_leave_the_block():
     np.testing.assert_array_equal(less.gnss_xyz, made.cameras.gnss.xyz[rows])
 
 
-def test_control_under_water_has_to_say_so():
+def test_control_under_water():
     control = scene().control
     assert control.under_water.any()
     silent = replace(control, under_water=np.zeros(len(control.names), bool))
     name = control.names[int(np.argmax(control.under_water))]
-    with pytest.raises(GeometryError, match=f"control point {name}: .* under_water"):
+    with refused("gcps.under_water", point=name):
         gathered(control=silent)
     assert gathered(control=silent, water=None).control_names == control.names
 
 
-def test_water_that_only_the_cloud_knows_is_refused():
-    with pytest.raises(SettingError, match="level, plane, raster, mesh or shoreline"):
-        check_surface(WaterDimension("w"))
-
-
-def test_no_datum_is_no_position():
-    none = no_datum(3)
-    assert np.isnan(none.xyz).all()
-    assert np.isinf(none.sigma_m).all()
-
-
-def test_points_without_a_place_get_one_where_their_rays_meet():
+def test_with_places():
     """As of Pix4D, whose files have image places only; straight, so the apparent points."""
     made = scene()
     lost = TiePoints(np.full_like(made.ties.xyz, np.nan), made.ties.views, made.ties.image_xy)

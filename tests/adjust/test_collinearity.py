@@ -6,31 +6,20 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pcfix.adjust.block import (
-    CODES,
-    PORT,
-    SHAPE,
-    WATER_NAMES,
-    Given,
-    Loss,
-    PointPriors,
-    Seen,
-    State,
-    Surface,
-    columns_of,
-    moved_lens,
-)
-from pcfix.adjust.normal import linearise
-from pcfix.adjust.observe import (
-    WATER,
+from pcfix.adjust.block import CODES, PORT, SHAPE, Unknowns, moved_lens, plain_block
+from pcfix.adjust.collinearity import (
+    SURFACE,
     WIDTH,
+    State,
     image,
     image_and_all_gradients,
     lens_gradients,
-    scratch,
+    workspace,
 )
-from pcfix.lens.imaging import coefficients, lens_table
-from pcfix.model import Lens, WaterRaster
+from pcfix.adjust.normal import Rule, linearise
+from pcfix.adjust.problem import prepare
+from pcfix.lens.imaging import coefficients
+from pcfix.model import Cameras, Lens, TiePoints, Views, WaterPlane, WaterRaster
 from pcfix.port.light import coefficients as port_coefficients
 from pcfix.port.shapes import DomePort, FlatPort
 from pcfix.water.surface import build_field
@@ -65,17 +54,20 @@ NEAR = 2e-6
 """Relative to the largest of a row: central differences of 0.1 mm steps are good to 1e-7 or so."""
 
 
-def no_surface() -> Surface:
-    return Surface(True, None, None, np.zeros(3), np.zeros(0))
+def given_of(**changes):
+    """Return one camera and one point, under water where it lies below it."""
+    cameras = Cameras(("a",), np.zeros((1, 3)), DOWN[None], (PLAIN,))
+    ties = TiePoints(np.zeros((1, 3)), Views(np.array([0, 1]), np.array([0])), np.zeros((1, 2)))
+    block = plain_block(cameras, ties, WaterPlane(-60.0), 1.34, np.array([True]))
+    return prepare(block, Unknowns(lens=()), np.zeros(3))[0].given._replace(**changes)
 
 
-def planar_raster(b: float, c: float) -> Surface:
-    """Return a raster that is the plane z = b x + c y, so that it has one slope everywhere."""
-    rows, columns = 80, 80
-    x = -200.0 + 5.0 * (np.arange(columns) + 0.5)
-    y = 200.0 - 5.0 * (np.arange(rows) + 0.5)
+def planar_raster(b: float, c: float):
+    """Return a raster that is the plane z = b x + c y - 60, with one slope everywhere."""
+    x = -200.0 + 5.0 * (np.arange(80) + 0.5)
+    y = 200.0 - 5.0 * (np.arange(80) + 0.5)
     raster = WaterRaster(b * x[None, :] + c * y[:, None] - 60.0, -200.0, 200.0, (5.0, 5.0))
-    return Surface(True, None, build_field(raster), np.zeros(3), np.zeros(0))
+    return given_of(field=build_field(raster))
 
 
 def pose(seed: int):
@@ -84,33 +76,29 @@ def pose(seed: int):
     return rng.uniform(-5.0, 5.0, 3), DOWN @ turn.as_matrix()
 
 
-def one(q, centre, rotation, lens, water):
-    """Return the state and the observation of one point, under water where it lies below it."""
-    state = State(centre[None], rotation[None], lens[None], q[None], np.asarray(water, float))
-    return state, Seen(
-        np.array([0, 1]), np.array([0]), np.zeros((1, 2)), np.ones(1), np.array([True]),
-        np.zeros(1, np.int64), np.zeros(1, np.int64),
-    )  # fmt: skip
+def state_of(q, centre, rotation, lens, water):
+    return State(centre[None], rotation[None], lens[None], q[None], np.asarray(water, float))
 
 
-def at(q, centre, rotation, lens, water, surface):
-    return np.array(image(*one(q, centre, rotation, lens, water), surface, 0, 0, scratch()))
+def at(q, centre, rotation, lens, water, given):
+    state = state_of(q, centre, rotation, lens, water)
+    return np.array(image(state, given, 0, 0, workspace(given)))
 
 
-def gradients(q, centre, rotation, lens, water, surface):
-    room, out = scratch(), np.zeros((2, WIDTH))
-    seen = one(q, centre, rotation, lens, water)
-    uv = image_and_all_gradients(*seen, surface, 0, 0, room, out)
-    return np.array(uv), out[:, : WATER + len(water)], room.ahead
+def gradients(q, centre, rotation, lens, water, given):
+    work, out = workspace(given), np.zeros((2, WIDTH))
+    state = state_of(q, centre, rotation, lens, water)
+    uv = image_and_all_gradients(state, given, 0, 0, work, out)
+    return np.array(uv), out[:, : SURFACE + len(water)], work.ahead
 
 
 def differences(q, centre, rotation, lens, water, surface):
     """Return the derivatives by omega, C, Q and the water's numbers, by central differences."""
     columns = []
-    for i in range(WATER + len(water)):
+    for i in range(SURFACE + len(water)):
         ends = []
         # metres; 1/m; radians, slopes, index and metres of a port
-        step = 1e-4 if 3 <= i <= WATER else 1e-8 if SHAPE <= i - WATER < PORT else 1e-6
+        step = 1e-4 if 3 <= i <= SURFACE else 1e-8 if SHAPE <= i - SURFACE < PORT else 1e-6
         for sign in (1.0, -1.0):
             moved = [q.copy(), centre.copy(), rotation, np.array(water, float)]
             if i < 3:
@@ -119,10 +107,10 @@ def differences(q, centre, rotation, lens, water, surface):
                 moved[2] = Rotation.from_rotvec(omega).as_matrix() @ rotation
             elif i < 6:
                 moved[1][i - 3] += sign * step
-            elif i < WATER:
+            elif i < SURFACE:
                 moved[0][i - 6] += sign * step
             else:
-                moved[3][i - WATER] += sign * step
+                moved[3][i - SURFACE] += sign * step
             ends.append(at(moved[0], moved[1], moved[2], lens, moved[3], surface))
         columns.append((ends[0] - ends[1]) / (2.0 * step))
     return np.column_stack(columns)
@@ -136,57 +124,56 @@ def close(found, wanted):
 @pytest.mark.parametrize("name", LENSES)
 @pytest.mark.parametrize("water", WATERS)
 @pytest.mark.parametrize("z", [-68.0, -60.9, -55.0])
-def test_all_gradients_of_an_observation(name, water, z):
-    lens = coefficients(LENSES[name])
+def test_gradients(name, water, z):
+    lens, given = coefficients(LENSES[name]), given_of()
     for seed in range(3):
         centre, rotation = pose(seed)
         q = np.array([*np.random.default_rng(seed + 50).uniform(-12.0, 12.0, 2), z])
-        uv, out, _ = gradients(q, centre, rotation, lens, WATERS[water], no_surface())
-        same = at(q, centre, rotation, lens, WATERS[water], no_surface())
+        uv, out, _ = gradients(q, centre, rotation, lens, WATERS[water], given)
+        same = at(q, centre, rotation, lens, WATERS[water], given)
         np.testing.assert_allclose(uv, same, atol=1e-9)  # px: one formula, written twice
-        close(out, differences(q, centre, rotation, lens, WATERS[water], no_surface()))
+        close(out, differences(q, centre, rotation, lens, WATERS[water], given))
     if z == -55.0:
-        assert not out[:, WATER:].any()  # above the water nothing depends on it
+        assert not out[:, SURFACE:].any()  # above the water nothing depends on it
 
 
-def test_straight_below_the_camera():
-    q, centre = np.array([0.0, 0.0, -66.0]), np.zeros(3)
-    _, out, _ = gradients(q, centre, DOWN, coefficients(PLAIN), WATERS["level"], no_surface())
-    close(out, differences(q, centre, DOWN, coefficients(PLAIN), WATERS["level"], no_surface()))
+def test_nadir():
+    q, centre, given = np.array([0.0, 0.0, -66.0]), np.zeros(3), given_of()
+    _, out, _ = gradients(q, centre, DOWN, coefficients(PLAIN), WATERS["level"], given)
+    close(out, differences(q, centre, DOWN, coefficients(PLAIN), WATERS["level"], given))
 
 
 @pytest.mark.parametrize("bend", [(0.0, 0.0, 0.0), (4e-4, -3e-4, 6e-4)], ids=["flat", "bent"])
-def test_gradients_through_water_of_second_order(bend):
-    """A bend of 4e-4 / m is 4 cm in 10 m, which no water has."""
-    surface = no_surface()._replace(curved=True)
-    water = (-60.0, 0.01, -0.02, 1.34, *bend)
+def test_curved_water(bend):
+    """A curvature of 4e-4 / m is 4 cm in 10 m, which no water has."""
+    given, water = given_of(curved=True), (-60.0, 0.01, -0.02, 1.34, *bend)
     for seed in range(3):
         centre, rotation = pose(seed)
         q = np.array([*np.random.default_rng(seed + 50).uniform(-12.0, 12.0, 2), -68.0])
-        _, out, _ = gradients(q, centre, rotation, coefficients(BROWN), water, surface)
-        close(out, differences(q, centre, rotation, coefficients(BROWN), water, surface))
+        _, out, _ = gradients(q, centre, rotation, coefficients(BROWN), water, given)
+        close(out, differences(q, centre, rotation, coefficients(BROWN), water, given))
 
 
 @pytest.mark.parametrize("port", [
     FlatPort(0.02, 0.008), FlatPort(0.02, 0.0, 1.49, (0.05, -0.03, 1.0)),
     DomePort(0.05, 0.004, 1.49, (0.003, -0.002, 0.006)),
 ])  # fmt: skip
-def test_gradients_by_the_port(port):
-    surface = no_surface()._replace(port=port_coefficients(port))
+def test_port(port):
+    surface = given_of(port=port_coefficients(port), has_water=False)
     is_flat = isinstance(port, FlatPort)
     of_port = (port.distance_m, 0.0, 0.0, 0.0) if is_flat else (0.0, *port.centre_m)
     water = (0.0, 0.0, 0.0, 1.34, 0.0, 0.0, 0.0, *of_port)
-    known = WATER + (np.array([PORT]) if is_flat else np.arange(PORT + 1, len(water)))
+    known = SURFACE + (np.array([PORT]) if is_flat else np.arange(PORT + 1, len(water)))
     centre, rotation = pose(5)
     q, lens = centre + rotation.T @ [0.9, -0.7, 3.0], coefficients(PLAIN)
     _, out, _ = gradients(q, centre, rotation, lens, water, surface)
     wanted = differences(q, centre, rotation, lens, water, surface)
     close(out[:, known], wanted[:, known])
-    close(out[:, WATER + 3], wanted[:, WATER + 3])
+    close(out[:, SURFACE + 3], wanted[:, SURFACE + 3])
 
 
 @pytest.mark.parametrize("slope", [(0.0, 0.0), (0.02, -0.03)])
-def test_gradients_through_a_raster(slope):
+def test_raster(slope):
     """Of a raster that is a plane: its slope does not change with the place."""
     surface, water, lens = planar_raster(*slope), (0.2, 0.0, 0.0, 1.34), coefficients(BROWN)
     centre, rotation = pose(4)
@@ -197,11 +184,11 @@ def test_gradients_through_a_raster(slope):
     close(out[:, known], wanted[:, known])
     plane = (-60.0 + water[0], *slope, 1.34)
     # px: the raster's corners are the plane's to rounding
-    np.testing.assert_allclose(uv, at(q, centre, rotation, lens, plane, no_surface()), atol=1e-6)
+    np.testing.assert_allclose(uv, at(q, centre, rotation, lens, plane, given_of()), atol=1e-6)
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_gradients_by_the_lens(name):
+def test_lens(name):
     lens = LENSES[name]
     names = ["f", "cx", "cy", "b1", "b2", "k1", "k2", "k3"]
     if lens.tangential:
@@ -209,7 +196,7 @@ def test_gradients_by_the_lens(name):
     codes = np.array([CODES[n] for n in names])
     centre, rotation = pose(7)
     q, out = np.array([9.0, -8.0, -66.0]), np.empty((2, len(codes)))
-    _, _, ahead = gradients(q, centre, rotation, coefficients(lens), WATERS["tilted"], no_surface())
+    _, _, ahead = gradients(q, centre, rotation, coefficients(lens), WATERS["tilted"], given_of())
     lens_gradients(coefficients(lens), ahead, codes, out)
     wanted = []
     for i, code in enumerate(codes):
@@ -218,7 +205,7 @@ def test_gradients_by_the_lens(name):
             at(
                 q, centre, rotation,
                 coefficients(moved_lens(lens, (int(code),), np.array([sign * step]))),
-                WATERS["tilted"], no_surface(),
+                WATERS["tilted"], given_of(),
             )
             for sign in (1.0, -1.0)
         ]  # fmt: skip
@@ -228,18 +215,15 @@ def test_gradients_by_the_lens(name):
     np.testing.assert_allclose(out, wanted, rtol=1e-6, atol=2e-5)
 
 
-def test_columns_of_a_similarity():
+def test_similarity():
     """A shift, turn and scale of all poses together, about a pivot."""
     centre, rotation = pose(9)
     lens, water, q = coefficients(BROWN), np.array(WATERS["tilted"]), np.array([6.0, 5.0, -65.0])
     pivot = np.array([3.0, -14.0, 2.0])
-    state, seen = one(q, centre, rotation, lens_table((BROWN,))[1][0], water)
-    nothing = PointPriors(np.zeros((1, 3)), np.zeros((1, 3)))
-    columns = columns_of([()], [False] * len(WATER_NAMES), True, pivot)
-    own, shared = np.empty((2, WIDTH)), np.zeros((2, 7))
-    given = Given(seen, no_surface(), columns, nothing)
-    assert linearise(state, given, Loss(), 0, 0, scratch(), own, shared, np.empty(2))
-    assert not own[:, :6].any()  # the poses do not move on their own
+    given = given_of(similarity=0, shared=7, pivot=pivot)
+    work = workspace(given)
+    assert linearise(state_of(q, centre, rotation, lens, water), given, Rule(), 0, 0, work, 0)
+    assert not work.own[0, :, :6].any()  # the poses do not move on their own
     wanted = []
     for i in range(7):
         ends = []
@@ -249,6 +233,6 @@ def test_columns_of_a_similarity():
             by[i] = sign * step
             turn = Rotation.from_rotvec(by[3:6]).as_matrix()
             moved = pivot + by[:3] + (1.0 + by[6]) * turn @ (centre - pivot)
-            ends.append(at(q, moved, rotation @ turn.T, lens, water, no_surface()))
+            ends.append(at(q, moved, rotation @ turn.T, lens, water, given))
         wanted.append((ends[0] - ends[1]) / (2.0 * step))
-    close(shared, np.column_stack(wanted))
+    close(work.shared[0], np.column_stack(wanted))

@@ -1,0 +1,482 @@
+r"""The refractive collinearity: the image of a point through the water, and its derivatives.
+
+Object point, piercing point and image (Mulsow 2024). The direction w of the light at the projection
+centre comes from `pcfix.refract.tracing.gradients` with its derivatives; in the camera frame it is
+x = R w. A rotation changes as exp(omega) R with a small vector omega in the camera frame, for which
+d x = omega x x. So an image gradient g with respect to x becomes x x g with respect to omega.
+
+Water of the second order, z = a + b x + c y + d x^2 + e x y + f y^2, refracts at the piercing point
+P as its tangent plane does. As anything changes, P moves along the surface and the tangent plane
+turns with it. With w the direction at the projection centre C, H the height of C above the plane,
+m = (-z_x, -z_y, 1), K the 2 x 2 matrix of second derivatives and G the 3 x 2 derivatives of w by
+the slopes of a plane about P:
+
+    dw = L + G K dp,    dp = H E dw + E dC + w_xy dz / (m.w),    E = (I - w m' / (m.w))_xy
+
+L is dw for a plane that does not turn, dp the horizontal movement of P, and dz the rise of the
+surface at P. Substituted into each other these are two equations for dp.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from pcfix.adjust.block import B1, B2, CX, CY, FOCAL, INDEX, K1, P1, PLANES, PORT, SHAPE
+from pcfix.kernels import device
+from pcfix.lens import formulas
+from pcfix.lens.algebra import (
+    Vector,
+    beyond,
+    column_of,
+    cross,
+    dot,
+    minus,
+    normal_of,
+    plus,
+    scaled,
+    times,
+    transposed_times,
+    vector,
+)
+from pcfix.lens.formulas import distorted, jacobian, undistorted
+from pcfix.lens.imaging import image_and_gradients, image_of, in_plane
+from pcfix.model import BoolArray, FloatArray, IntArray
+from pcfix.port.light import BY_PORT, FLAT, KIND, SIZE, X, through_port
+from pcfix.refract.rays import direction, lay, light_path, plane_at, settle
+from pcfix.refract.tracing.gradients import light_and_gradients
+
+if TYPE_CHECKING:
+    from pcfix.water.surface import Field, Tin
+
+
+class State(NamedTuple):
+    """What is estimated, relative to the origin of the block.
+
+    centres : shape (k, 3); rotations : shape (k, 3, 3), world to camera.
+    lenses : shape (l, ...), coefficients of `pcfix.lens.imaging.lens_table`.
+    xyz : shape (m, 3), true points.
+    water : shape (11 + 3 p,), the parameters of `WATER_NAMES`, then height and two slopes of each
+    of p planes.
+    """
+
+    centres: FloatArray
+    rotations: FloatArray
+    lenses: FloatArray
+    xyz: FloatArray
+    water: FloatArray
+
+
+class Given(NamedTuple):
+    """What stays fixed during an adjustment: observations, surface, unknowns, prior knowledge.
+
+    Observations, sorted by point
+        start : shape (m + 1,); camera, image_xy, weight : o rows, with weight = 1 / standard
+        deviation, zero for observations that do not count; wet : shape (m,), whether a point may
+        be under water; lens_row, group : shape (k,), row of the lens table and sensor of cameras.
+    Refracting surface
+        has_water; tin, field : a mesh or raster instead of the plane in `State.water`;
+        origin : shape (3,), of the block; port : coefficients of a housing port, empty without
+        one; curved : whether d, e, f count.
+    Unknowns that many points share, counted from the first of them
+        first_lens : shape (groups + 1,), where the parameters of each sensor begin;
+        code : shape (first_lens[-1],), which parameters these are; column : for each number of
+        `State.water`, -1 if it is fixed (parallel planes share theirs); similarity : the first of
+        seven, -1 without; shared : how many there are; pivot : shape (3,), of a similarity.
+    Prior knowledge
+        surveyed_xyz, surveyed_weight : shape (m, 3), with inverse variances, zero for other
+        points; on, on_weight, axis : points on surfaces: 0 water, 1, 2, ... planes, -1 none (on has
+        length 0 if there is no such point), 1 / standard deviation of the distance, and for each
+        surface the axis along which it has its height: 2 is up.
+    """
+
+    start: IntArray
+    camera: IntArray
+    image_xy: FloatArray
+    weight: FloatArray
+    wet: BoolArray
+    lens_row: IntArray
+    group: IntArray
+    has_water: bool
+    tin: Tin | None
+    field: Field | None
+    origin: FloatArray
+    port: FloatArray
+    curved: bool
+    first_lens: IntArray
+    code: IntArray
+    column: IntArray
+    similarity: int
+    shared: int
+    pivot: FloatArray
+    surveyed_xyz: FloatArray
+    surveyed_weight: FloatArray
+    on: IntArray
+    on_weight: FloatArray
+    axis: IntArray
+
+
+POSE, POINT, SURFACE = 0, 6, 9
+WIDTH = SURFACE + PLANES
+"""Columns of derivatives: omega and C, Q, and the parameters of `pcfix.adjust.block.WATER_NAMES`.
+"""
+
+
+class Workspace(NamedTuple):
+    """Arrays that one thread reuses for all points; g unknowns are shared, `most` rows in a point.
+
+    light, plane : shapes (3, 12) and (4,), refracted light with its derivatives, and its plane.
+    ahead : shape (3,), the direction that the lens images, camera frame.
+    behind_port : shape (3, 8), that direction behind a port, with its derivatives.
+    origin : shape (3,), the block's origin, seen from the water level.
+    by_shape : shape (3, 3), derivatives of the light by d, e, f.
+    port : shape (7,), the port with its estimated parameters.
+    own, shared, r : shapes (most, 2, `WIDTH`), (most, 2, g) and (most, 2): weighted derivatives
+    and residuals of the observations of a point.
+    row : shape (most,), which observation each of them is.
+    v, rhs : shapes (3, 3) and (3,), normal equations of the point.
+    w, w_shared, y : shapes (most, 6, 3), (g, 3) and (6, 3), W = J'B, W_g and W V^-1.
+    """
+
+    light: FloatArray
+    plane: FloatArray
+    ahead: FloatArray
+    behind_port: FloatArray
+    origin: FloatArray
+    by_shape: FloatArray
+    port: FloatArray
+    own: FloatArray
+    shared: FloatArray
+    r: FloatArray
+    row: IntArray
+    v: FloatArray
+    rhs: FloatArray
+    w: FloatArray
+    w_shared: FloatArray
+    y: FloatArray
+
+
+def workspace(given: Given) -> Workspace:
+    """Return a new workspace."""
+    most = int(np.diff(given.start).max(initial=0)) + 1  # one more for a `condition`
+    g = given.shared
+    light, plane, ahead, behind, origin, by_shape, port = (
+        np.empty(shape) for shape in ((3, 12), 4, 3, (3, 8), 3, (3, 3), 7)
+    )
+    own, shared, r, v, rhs, w, w_shared, y = (
+        np.zeros(shape)
+        for shape in (
+            (most, 2, WIDTH),
+            (most, 2, g),
+            (most, 2),
+            (3, 3),
+            3,
+            (most, 6, 3),
+            (g, 3),
+            (6, 3),
+        )
+    )
+    row = np.empty(most, np.int64)
+    return Workspace(
+        light, plane, ahead, behind, origin, by_shape, port,
+        own, shared, r, row, v, rhs, w, w_shared, y,
+    )  # fmt: skip
+
+
+# The water
+
+
+STEPS, CLOSE_M = 30, 1e-12
+"""Iterations for the piercing point; each leaves curvature times depth of the last error."""
+
+
+@device
+def height_of(water: FloatArray, x: float, y: float) -> Vector:
+    """Return height, dz/dx and dz/dy of the water at x, y."""
+    d, e, f = water[SHAPE], water[SHAPE + 1], water[SHAPE + 2]
+    z = water[0] + (water[1] + d * x + e * y) * x + (water[2] + f * y) * y
+    return z, water[1] + 2.0 * d * x + e * y, water[2] + e * x + 2.0 * f * y
+
+
+@device
+def _curved_plane(plane: FloatArray, water: FloatArray, q: Vector, centre: Vector) -> bool:
+    """Set the plane (N, h) tangent to the water at the piercing point; return if Q is below it."""
+    z, b, c = height_of(water, q[0], q[1])
+    if not z > q[2]:
+        return False
+    lay(plane, q[0], q[1], z, b, c)
+    for _ in range(STEPS):
+        # refract at the tangent plane, then move the plane to where the light pierces it
+        normal = vector(plane)
+        path = light_path(q, centre, normal, plane[3], water[INDEX])
+        x, y, z_plane = beyond(centre, path[2], direction(path, normal))
+        z, b_there, c_there = height_of(water, x, y)
+        change = abs(z - z_plane) + abs(path[3]) * (abs(b_there - b) + abs(c_there - c))
+        lay(plane, x, y, z, b_there, c_there)
+        if not change > CLOSE_M:
+            break
+        b, c = b_there, c_there
+    return True
+
+
+@device
+def _curved_gradients(
+    plane: FloatArray, water: FloatArray, centre: Vector, light: FloatArray, shape: FloatArray
+) -> None:
+    """Turn derivatives of light through the tangent plane into those through the curved water.
+
+    `light` is as of `light_and_gradients`; `shape`, (3, 3), is filled with those by d, e, f.
+    """
+    w = column_of(light, 0)
+    up = dot(vector(plane), centre) - plane[3]
+    x, y = centre[0] + up * w[0], centre[1] + up * w[1]  # the piercing point P
+    m = plane[0] / plane[2], plane[1] / plane[2], 1.0
+    steep = dot(m, w)
+    # G: slopes of a plane about P instead of about the origin
+    by_height = column_of(light, 7)
+    by_x = beyond(column_of(light, 8), -x, by_height)
+    by_y = beyond(column_of(light, 9), -y, by_height)
+    for i in range(3):
+        shape[i, 0] = x * x * by_height[i] + 2.0 * x * by_x[i]
+        shape[i, 1] = x * y * by_height[i] + y * by_x[i] + x * by_y[i]
+        shape[i, 2] = y * y * by_height[i] + 2.0 * y * by_y[i]
+    d, e, f = water[SHAPE], water[SHAPE + 1], water[SHAPE + 2]
+    turn_x = plus(scaled(2.0 * d, by_x), scaled(e, by_y))  # G K
+    turn_y = plus(scaled(e, by_x), scaled(2.0 * f, by_y))
+    along_x = beyond((1.0, 0.0, 0.0), -w[0] / steep, m)  # E
+    along_y = beyond((0.0, 1.0, 0.0), -w[1] / steep, m)
+    xx, xy = 1.0 - up * dot(along_x, turn_x), -up * dot(along_x, turn_y)
+    yx, yy = -up * dot(along_y, turn_x), 1.0 - up * dot(along_y, turn_y)
+    det = xx * yy - xy * yx
+    rises = (1.0, x, y, 0.0, x * x, x * y, y * y)  # dz at P, by a, b, c, n, d, e, f
+    for column in range(13):
+        block, at = (light, column + 1) if column < 10 else (shape, column - 10)
+        plain = column_of(block, at)
+        rise = 0.0 if column < 6 else rises[column - 6] / steep
+        px, py = up * dot(along_x, plain) + w[0] * rise, up * dot(along_y, plain) + w[1] * rise
+        if 3 <= column < 6:
+            px, py = px + along_x[column - 3], py + along_y[column - 3]
+        dx, dy = (yy * px - xy * py) / det, (xx * py - yx * px) / det
+        for i in range(3):
+            block[i, at] += turn_x[i] * dx + turn_y[i] * dy
+
+
+@device
+def _set_plane(work: Workspace, water: FloatArray, given: Given, q: Vector, centre: Vector) -> bool:
+    """Set the refracting plane (N, h) for light from Q to C; return if Q is below the water."""
+    plane, origin = work.plane, work.origin
+    if given.field is None and given.tin is None:
+        if given.curved:
+            return _curved_plane(plane, water, q, centre)
+        plane[0], plane[1], plane[2] = normal_of(water[1], water[2])
+        plane[3] = plane[2] * water[0]
+        return bool(water[0] + water[1] * q[0] + water[2] * q[1] > q[2])
+    # a level added to a mesh or raster is an origin that lies lower
+    origin[0], origin[1], origin[2] = vector(given.origin)
+    origin[2] -= water[0]
+    z, b, c = plane_at(given.tin, given.field, q[0], q[1], origin)
+    if not z > q[2]:
+        return False
+    lay(plane, q[0], q[1], z, b, c)
+    settle(plane, given.tin, given.field, origin, q, centre, water[INDEX])
+    return True
+
+
+@device
+def _set_port(port: FloatArray, water: FloatArray, given: Given) -> None:
+    """Set the port with its estimated distance or centre."""
+    for i in range(port.size):
+        port[i] = given.port[i]
+    if port[KIND] == FLAT:
+        port[SIZE] = water[PORT]
+    else:
+        for i in range(3):
+            port[X + i] = water[PORT + 1 + i]
+
+
+# Images
+
+
+@device
+def image(state: State, given: Given, p: int, c: int, work: Workspace) -> tuple[float, float]:
+    """Return the image of point p in camera c; NaN if there is none."""
+    q, centre, water = vector(state.xyz[p]), vector(state.centres[c]), state.water
+    w = minus(q, centre)
+    may_refract = given.port.size == 0 and given.wet[p] and given.has_water
+    if may_refract and _set_plane(work, water, given, q, centre):
+        normal = vector(work.plane)
+        w = direction(light_path(q, centre, normal, work.plane[3], water[INDEX]), normal)
+    x = times(state.rotations[c], w)
+    if given.port.size:
+        _set_port(work.port, water, given)
+        through_port(work.port, water[INDEX], *x, work.light)
+        x = column_of(work.light, 0)
+    return image_of(state.lenses[given.lens_row[c]], *x)
+
+
+@device
+def image_and_all_gradients(
+    state: State, given: Given, p: int, c: int, work: Workspace, out: FloatArray
+) -> tuple[float, float]:
+    """Return the image of point p in camera c, and fill in its derivatives.
+
+    `out`, shape (2, `WIDTH`), has the derivatives of u and v by omega, C, Q, and a, b, c, n; by
+    d, e, f if the water is curved, and by the parameters of a port if there is one.
+    """
+    q, centre = vector(state.xyz[p]), vector(state.centres[c])
+    r, water = state.rotations[c], state.water
+    light, plane, ahead = work.light, work.plane, work.ahead
+    refracted = given.port.size == 0 and given.wet[p] and given.has_water
+    if refracted:
+        refracted = _set_plane(work, water, given, q, centre)
+    if refracted:
+        light_and_gradients(q, centre, vector(plane), plane[3], water[INDEX], light)
+        if given.curved:
+            _curved_gradients(plane, water, centre, light, work.by_shape)
+    else:
+        light[:], work.by_shape[:] = 0.0, 0.0
+        for i in range(3):
+            light[i, 0] = q[i] - centre[i]
+            light[i, 1 + i], light[i, 4 + i] = 1.0, -1.0
+    x = times(r, column_of(light, 0))
+    ahead[0], ahead[1], ahead[2] = x
+    behind = work.behind_port
+    if given.port.size:
+        _set_port(work.port, water, given)
+        through_port(work.port, water[INDEX], *x, behind)
+        ahead[0], ahead[1], ahead[2] = column_of(behind, 0)
+    u, v, both = image_and_gradients(state.lenses[given.lens_row[c]], ahead[0], ahead[1], ahead[2])
+    for row in range(2):
+        g = both[3 * row], both[3 * row + 1], both[3 * row + 2]
+        by_index = 0.0
+        if given.port.size:
+            # chain rule through the port: its own parameters first, then g by the direction before
+            by_index = dot(g, column_of(behind, 4))
+            out[row, SURFACE + PORT] = dot(g, column_of(behind, BY_PORT))
+            for i in range(3):
+                out[row, SURFACE + PORT + 1 + i] = dot(g, column_of(behind, BY_PORT + i))
+            g = (
+                dot(g, column_of(behind, 1)),
+                dot(g, column_of(behind, 2)),
+                dot(g, column_of(behind, 3)),
+            )
+        out[row, 0], out[row, 1], out[row, 2] = cross(x, g)
+        w = transposed_times(r, g)
+        for i in range(3):
+            out[row, POINT + i] = dot(w, column_of(light, 1 + i))
+            out[row, 3 + i] = dot(w, column_of(light, 4 + i))
+        for i in range(4):
+            out[row, SURFACE + i] = dot(w, column_of(light, 7 + i))
+        out[row, SURFACE + INDEX] += by_index
+        if given.curved:
+            for i in range(3):
+                out[row, SURFACE + SHAPE + i] = dot(w, column_of(work.by_shape, i))
+    return u, v
+
+
+_CENTRE_X, _CENTRE_Y, _INVERSE = formulas.CENTRE_X, formulas.CENTRE_Y, formulas.INVERSE
+_FOCAL_X, _FOCAL_Y, _B2, _B3 = formulas.FOCAL_X, formulas.FOCAL_Y, formulas.B2, formulas.B3
+_RADIALS, _DENOMINATORS, _TAIL = formulas.RADIALS, formulas.DENOMINATORS, formulas.TAIL
+_TANGENTIAL = formulas.TANGENTIAL
+
+
+@device
+def lens_gradients(c: FloatArray, ahead: FloatArray, codes: IntArray, out: FloatArray) -> None:
+    """Fill in the derivatives of the image of a direction, camera frame, by lens parameters.
+
+    c are the coefficients of the lens, codes, shape (p,), the parameters; `out` has shape (2, p).
+    For a lens whose formula goes from the image to the plane (`inverse`), x' solves B(x') = x, so
+    that d x' = -J^-1 d B.
+    """
+    px, py = in_plane(c, ahead[0], ahead[1], ahead[2])
+    px, py = px - c[_CENTRE_X], py - c[_CENTRE_Y]
+    inverse = c[_INVERSE] != 0.0
+    if inverse:
+        ax, ay = undistorted(c, px, py)
+        dx, dy = ax, ay
+        xx, xy, yx, yy = jacobian(c, ax, ay)
+        det = xx * yy - xy * yx
+    else:
+        ax, ay = px, py
+        dx, dy = distorted(c, px, py)
+    fx, fy, b2, b3 = c[_FOCAL_X], c[_FOCAL_Y], c[_B2], c[_B3]
+    for i in range(codes.size):
+        code = codes[i]
+        if code == FOCAL:
+            out[0, i], out[1, i] = dx + c[_CENTRE_X], dy + c[_CENTRE_Y]
+        elif code == CX:
+            out[0, i], out[1, i] = 1.0, 0.0
+        elif code == CY:
+            out[0, i], out[1, i] = 0.0, 1.0
+        elif code == B1:
+            out[0, i], out[1, i] = dx + c[_CENTRE_X], 0.0
+        elif code == B2:
+            out[0, i], out[1, i] = dy + c[_CENTRE_Y], 0.0
+        else:
+            bx, by = _brown_gradient(c, ax, ay, code)
+            if inverse:
+                bx, by = -(yy * bx - xy * by) / det, -(xx * by - yx * bx) / det
+            out[0, i], out[1, i] = fx * bx + b2 * by, fy * by + b3 * bx
+
+
+@device
+def _brown_gradient(c: FloatArray, x: float, y: float, code: int) -> tuple[float, float]:
+    """Return the derivative of Brown's formula at x, y by one of its parameters."""
+    r2 = x * x + y * y
+    if code >= K1:
+        # radial terms are divided by a polynomial in rational models
+        below, power = 1.0, 1.0
+        first = _TAIL + int(c[_RADIALS])
+        for i in range(int(c[_DENOMINATORS])):
+            power *= r2
+            below += c[first + i] * power
+        power = r2 ** (code - K1 + 1) / below
+        return x * power, y * power
+    more = 1.0 + (c[_TANGENTIAL + 2] + c[_TANGENTIAL + 3] * r2) * r2
+    if code == P1:
+        return (r2 + 2.0 * x * x) * more, 2.0 * x * y * more
+    return 2.0 * x * y * more, (r2 + 2.0 * y * y) * more
+
+
+# Points on surfaces
+
+
+@device
+def condition(state: State, given: Given, p: int, work: Workspace, at: int) -> bool:
+    """Fill a row of the workspace with the condition that a point lies on a surface, if it does.
+
+    Membership of a surface (Mulsow 2024) is one more observation: the distance from the surface,
+    along the axis nearest to its normal, is zero within a standard deviation. The second of the two
+    coordinates stays zero.
+    """
+    if given.on.size == 0 or given.on[p] < 0:
+        return False
+    own, shared, r = work.own[at], work.shared[at], work.r[at]
+    q, numbers, number, weight = state.xyz[p], state.water, given.on[p], given.on_weight[p]
+    up = given.axis[number]
+    x, y = q[(up + 1) % 3], q[(up + 2) % 3]
+    first = 0 if number == 0 else PLANES + 3 * (number - 1)
+    if number > 0:
+        b, c = numbers[first + 1], numbers[first + 2]
+        z = numbers[first] + b * x + c * y
+    elif given.field is None and given.tin is None:
+        z, b, c = height_of(numbers, x, y)
+    else:
+        z, b, c = plane_at(given.tin, given.field, x, y, given.origin)
+        z += numbers[0]
+    if np.isnan(z):
+        return False
+    own[:], shared[:], r[1] = 0.0, 0.0, 0.0
+    r[0] = weight * (z - q[up])
+    own[0, POINT + up] = weight
+    own[0, POINT + (up + 1) % 3], own[0, POINT + (up + 2) % 3] = -weight * b, -weight * c
+    columns, by = given.column, (1.0, x, y)
+    for i in range(3):
+        if columns[first + i] >= 0:
+            shared[0, columns[first + i]] -= weight * by[i]
+    by = (x * x, x * y, y * y)
+    for i in range(3):
+        if number == 0 and columns[SHAPE + i] >= 0:
+            shared[0, columns[SHAPE + i]] -= weight * by[i]
+    return True

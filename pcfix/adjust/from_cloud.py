@@ -1,0 +1,536 @@
+r"""Adjustment without tie points: an adjustment without water is undone from its cloud only.
+
+An ordinary bundle adjustment that did not know of the water stopped where its residuals r were
+orthogonal to all its unknowns:
+
+    sum J'r = 0 for every image,   sum G'r = 0 for the lens,   sum B'r = 0 for every point
+
+with the Jacobians J, G and B of its own straight collinearity at its own solution. Without tie
+points the residuals are unknown, but not that they are orthogonal to these columns. So those true
+poses and points are found whose images through the water, pi(Q), give r = pi(Q) - pi_original(P)
+with
+
+    J_original' r = 0,   G_original' r = 0,   B_original' r = 0
+
+These are as many equations as unknowns (a Petrov-Galerkin method: the columns that test the
+residual are not those that change it). Shift, turn and scale of the block are left to GNSS
+positions or control points. Taking pi_original(P) as measurements and minimising r would pull the
+solution back to the original one instead.
+
+Points of the apparent cloud stand for the tie points of that adjustment, which were spread in much
+the same way. They have no noise; their weight is how well they stand for the tie points. It is the
+largest with which GNSS positions and control points fit within their standard deviations, and of
+several choices the one under which these fit best is taken.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import chdtri
+
+from pcfix.adjust.block import (
+    Block,
+    Unknowns,
+    check_datum,
+    deeper,
+    plain_block,
+    some_cameras,
+    straight_images,
+)
+from pcfix.adjust.collinearity import POINT, SURFACE, Given, State, Workspace
+from pcfix.adjust.normal import (
+    PARTS,
+    PLAIN,
+    change_of,
+    in_parts,
+    linearise,
+    linearise_point,
+    residuals,
+    step_of_point,
+)
+from pcfix.adjust.precision import precision_of
+from pcfix.adjust.problem import (
+    LogRow,
+    Problem,
+    Progress,
+    Solution,
+    counts_of,
+    intersect_fixed,
+    prepare,
+    priors_at,
+    solved_cameras,
+    survey_cost,
+)
+from pcfix.adjust.result import Adjusted, adjusted_of
+from pcfix.adjust.solve import moved_by
+from pcfix.errors import GeometryError, PcfixWarning
+from pcfix.kernels import Span, device, kernel
+from pcfix.lens.algebra import inverted
+from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, TiePoints, WaterSurface
+from pcfix.refract.choice import views_in_frame
+from pcfix.water.surface import is_submerged, surface_above
+
+SIGMAS_PX = (0.01, 0.03, 0.1, 0.3, 1.0, 2.0, 3.0, 5.0, 10.0)
+"""Standard deviations of points of the cloud as tie points, tried in this order."""
+
+POOR_PX = 5.0
+"""Of `SIGMAS_PX`, from which the result deserves a warning."""
+
+FITS = 1.15
+"""Mean squared residual of GNSS and control points, in variances, with which they fit."""
+
+SURE = 1e-3
+"""Probability that further lens parameters lower the misfit as much by chance."""
+
+MAX_STEPS = 25
+CLOSE_M = 1e-7
+LARGE_STEP_M = 1e4
+
+
+class Trial(NamedTuple):
+    """One choice, and how GNSS and control points fit it."""
+
+    name: str
+    problem: Problem
+    found: Solution
+    sigma_px: float
+    misfit: float
+    observations: int
+
+    @property
+    def mean(self) -> float:
+        """Misfit per redundant observation."""
+        return self.misfit / max(self.observations - 7, 1)
+
+
+class Candidate(NamedTuple):
+    """A block whose tie points are points of the cloud.
+
+    `original` are the cameras that made the cloud; those of the block are the start. `apparent_xyz`
+    has a row per point of the block, control points included.
+    """
+
+    name: str
+    block: Block
+    original: Cameras
+    apparent_xyz: FloatArray
+
+
+def adjust_cloud(
+    candidates: list[Candidate],
+    unknowns: Unknowns,
+    lens_sets: list[tuple[str, ...]],
+    progress: Progress | None = None,
+) -> Adjusted:
+    """Adjust a block by the cloud that its original poses made.
+
+    Parameters
+    ----------
+    candidates : list of Candidate
+        The same cloud with different guesses which images contributed to each point.
+    unknowns : Unknowns
+        Its lens parameters are replaced by one of `lens_sets`.
+    lens_sets : list of tuple of str
+        Each contains the one before it.
+
+    Raises
+    ------
+    GeometryError
+        If there is no datum, or no choice converges.
+    """
+    first = candidates[0].block
+    check_datum(first, unknowns)
+    has_gnss = bool((first.gnss_weights > 0.0).any())
+    if (unknowns.free_network and not has_gnss) or unknowns.poses != "free":
+        raise GeometryError(
+            "adjust.cloud_needs_datum",
+            "Without tie points the poses must be free, and need GNSS positions or control points."
+            " Give --gnss or --gcps, or a model with tie points.",
+        )
+    if any(unknowns.water_sigma):
+        raise GeometryError(
+            "adjust.cloud_needs_water",
+            "Level, tilt and refractive index can be free with measured tie points only. Give a"
+            " model with tie points, or fix the water.",
+        )
+    if first.conditions is not None:
+        raise GeometryError(
+            "adjust.cloud_has_conditions",
+            "Points on the water or on a plane need measured tie points. Give a model with tie"
+            " points, or remove the roles waterline and on:NAME from --gcps.",
+        )
+    best = min(
+        (_fitting(one, replace(unknowns, lens=lens_sets[0]), progress) for one in candidates),
+        key=lambda trial: (trial.sigma_px, trial.misfit),
+    )
+    chosen = best
+    one = next(c for c in candidates if c.name == best.name)
+    for names in lens_sets[1:]:
+        try:
+            more = _trial(one, replace(unknowns, lens=names), best.sigma_px, progress)
+        except GeometryError:
+            continue
+        extra = len(names) - len(chosen.problem.unknowns.lens)
+        gain = (chosen.misfit - more.misfit) / max(chosen.mean, 1.0)
+        if gain > chdtri(extra * len(chosen.problem.groups), SURE):
+            chosen = more
+    notes = _notes(chosen, lens_sets)
+    # only GNSS and control points have noise
+    free, sigma0 = max(chosen.observations - 7, 1), float(np.sqrt(chosen.mean))
+    try:  # about as precise as with tie points of this standard deviation
+        known = precision_of(chosen.problem, chosen.found, max(sigma0, 1.0))
+    except GeometryError as error:
+        known = None
+        notes.append(
+            PcfixWarning(
+                "adjust.no_precision",
+                f"The precision of the poses is unknown, and SigmaZ will not include it: {error}",
+                reason=error.code,
+            )
+        )
+    found = adjusted_of(chosen.problem, chosen.found, known, notes, "cloud", "unaware")
+    return replace(found, sigma0=sigma0, redundancy=free)
+
+
+def _notes(chosen: Trial, lens_sets: list[tuple[str, ...]]) -> list[PcfixWarning]:
+    """Return what was decided, and a warning if the points stand poorly for tie points."""
+    count, free = int(chosen.problem.block.start[-1]), chosen.problem.unknowns.lens
+    fixed = dict.fromkeys(name for names in lens_sets for name in names if name not in free)
+    words = (
+        f"No tie points: {count:,} images of points of the cloud ({chosen.name}) were used with a"
+        f" standard deviation of {chosen.sigma_px:g} px. Lens parameters free:"
+        f" {', '.join(free) or 'none'}"
+        + (f" (undetermined and fixed: {', '.join(fixed)})." if fixed else ".")
+    )
+    values = {"sigma_px": chosen.sigma_px, "images": chosen.name}
+    notes = [PcfixWarning("adjust.by_cloud", words, free=list(free), fixed=list(fixed), **values)]
+    if chosen.sigma_px >= POOR_PX:
+        words = (
+            f"Points of the cloud fit GNSS and control points only with {chosen.sigma_px:g} px, so"
+            " bed and focal length may be wrong by more than all figures say. Give tie points,"
+            " control points or a calibrated lens."
+        )
+        notes.append(PcfixWarning("adjust.poor_cloud", words, **values))
+    return notes
+
+
+def _fitting(one: Candidate, unknowns: Unknowns, progress: Progress | None) -> Trial:
+    """Return the trial with the smallest standard deviation that fits GNSS and control points."""
+    trials: list[Trial] = []
+    for sigma in SIGMAS_PX:
+        try:
+            trials.append(_trial(one, unknowns, sigma, progress))
+        except GeometryError:
+            if not trials and sigma == SIGMAS_PX[-1]:
+                raise
+        else:
+            if trials[-1].mean <= FITS:
+                break
+    return trials[-1]
+
+
+def _trial(one: Candidate, unknowns: Unknowns, sigma_px: float, progress: Progress | None) -> Trial:
+    m, owner = one.block.tie_points, one.block.owner
+    block = replace(one.block, sigma_px=np.where(owner < m, sigma_px, one.block.sigma_px))
+    problem, start = prepare(block, unknowns)
+    before, at_rest = prepare(replace(block, cameras=one.original), unknowns)
+    tests = straight_columns(before, at_rest, one.apparent_xyz - before.origin)
+    is_tested = np.arange(len(block.xyz)) < m
+    found = solve_unaware(problem, start, tests, is_tested, progress)
+    marks, weight = problem.used & ~is_tested[owner], problem.given.weight
+    r = residuals(found.state, problem.given)[marks]
+    in_images = float((r * r * weight[marks][:, None] ** 2).sum())
+    surveyed = problem.given.surveyed_weight > 0.0
+    count = int((block.gnss_weights > 0.0).sum()) + 2 * int(marks.sum()) + int(surveyed.sum())
+    count -= 3 * int(surveyed.any(axis=1).sum())
+    return Trial(one.name, problem, found, sigma_px, found.cost + in_images, count)
+
+
+# The equations
+
+
+def straight_columns(problem: Problem, start: Solution, apparent_xyz: FloatArray) -> FloatArray:
+    """Return the Jacobians of the straight collinearity at the original solution.
+
+    Parameters
+    ----------
+    apparent_xyz : array, shape (m, 3)
+        The points of the original adjustment, block frame.
+
+    Returns
+    -------
+    array, shape (o, 2, 9 + g)
+        By pose, point and shared unknowns; the residuals are orthogonal to these columns.
+    """
+    o = len(problem.given.camera)
+    tests = np.zeros((o, 2, SURFACE + problem.given.shared))
+    dry = problem.given._replace(wet=np.zeros(len(problem.given.wet), np.bool_), weight=np.ones(o))
+    state = start.state._replace(xyz=np.ascontiguousarray(apparent_xyz))
+    in_parts(lambda span, _, work: _columns(span, state, dry, tests, work), dry)
+    return tests
+
+
+@kernel
+def _columns(span: Span, state: State, given: Given, tests: FloatArray, work: Workspace) -> None:
+    for p in range(*span):
+        for o in range(given.start[p], given.start[p + 1]):
+            if linearise(state, given, PLAIN, p, o, work, 0):
+                tests[o, :, :SURFACE] = work.own[0, :, :SURFACE]
+                tests[o, :, SURFACE:] = work.shared[0]
+
+
+def solve_unaware(
+    problem: Problem,
+    start: Solution,
+    tests: FloatArray,
+    is_tested: BoolArray,
+    progress: Progress | None = None,
+) -> Solution:
+    """Find poses, lens and points whose residuals are orthogonal to the original columns.
+
+    Parameters
+    ----------
+    problem, start : Problem, Solution
+        Of `pcfix.adjust.problem.prepare`; points of the cloud were observed where the original
+        cameras image them.
+    tests : array, shape (o, 2, 9 + g)
+        Of `straight_columns`.
+    is_tested : array of bool, shape (m,)
+        Points of the cloud. The others, control points, are adjusted by least squares.
+
+    Raises
+    ------
+    GeometryError
+        If the equations are singular or Newton's steps do not shrink.
+    """
+    now, log, size = start, list(start.log), np.inf
+    for number in range(1, MAX_STEPS + 1):
+        step, points = _newton(problem, now, tests, is_tested)
+        moved = moved_by(problem, now, step, points)
+        size = float(np.abs(points).max(initial=0.0)) if np.isfinite(points).all() else np.inf
+        if moved is None or not size < LARGE_STEP_M:
+            break
+        now = moved
+        cost = survey_cost(problem, now) + priors_at(problem, now)[0]
+        row = LogRow(1, number, cost, 0.0, *counts_of(problem, now))
+        log.append(row)
+        if progress is not None:
+            progress(row)
+        if size < CLOSE_M:
+            return replace(now, cost=cost, log=log)
+    raise _unsolved(f"the steps do not converge (last step {size:.2g} m)")
+
+
+def _unsolved(why: str) -> GeometryError:
+    return GeometryError(
+        "adjust.cloud_unsolved",
+        f"The poses cannot be adjusted by the cloud: {why}. Give tie points, GNSS positions of more"
+        " images, or control points.",
+    )
+
+
+def _newton(
+    problem: Problem, now: Solution, tests: FloatArray, is_tested: BoolArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the steps of poses and shared unknowns, shape (6 k + g,), and of the points."""
+    from scipy.linalg import solve as solve_full
+
+    size, given, state = len(problem.moves), problem.given, now.state
+    parts = PARTS if size <= 3000 else 2  # of memory
+    matrix, right = np.zeros((parts, size, size)), np.zeros((parts, size))
+    in_parts(
+        lambda span, part, work: _sum_tested(
+            span, state, given, tests, is_tested, matrix[part], right[part], work
+        ),
+        given,
+        parts,
+    )
+    total, side = matrix.sum(axis=0), right.sum(axis=0)
+    _, extra, extra_right = priors_at(problem, now)
+    total += extra if extra.ndim == 2 else np.diag(extra)
+    side += extra_right
+    step, active = np.zeros(size), np.flatnonzero(problem.moves)
+    scale = 1.0 / np.sqrt(np.maximum(np.abs(total.diagonal()[active]), 1e-300))
+    part = total[np.ix_(active, active)] * scale * scale[:, None]
+    try:
+        step[active] = scale * solve_full(part, scale * side[active])
+    except np.linalg.LinAlgError:
+        raise _unsolved("the equations are singular") from None
+    points = np.zeros((len(state.xyz), 3))
+    in_parts(
+        lambda span, _, work: _tested_points(
+            span, state, given, tests, is_tested, step, points, work
+        ),
+        given,
+    )
+    return step, points
+
+
+@device
+def _test_point(
+    state: State, given: Given, tests: FloatArray, is_tested: bool, p: int, work: Workspace,
+    left: FloatArray,
+) -> int:  # fmt: skip
+    """Linearise a point and fill in the columns that test it; return how many rows count.
+
+    `left`, shape (most, 2, 9 + g), has the original columns if the point is tested, else those of
+    the point itself. The workspace has V = B_left' B, inverted, and B_left' r.
+    """
+    count, _ = linearise_point(state, given, PLAIN, p, work)
+    v, rhs = work.v, work.rhs
+    if not is_tested:
+        for a in range(count):
+            left[a, :, :SURFACE] = work.own[a, :, :SURFACE]
+            left[a, :, SURFACE:] = work.shared[a]
+        return count
+    v[:], rhs[:] = 0.0, 0.0
+    for a in range(count):
+        left[a] = given.weight[work.row[a]] * tests[work.row[a]]
+        for k in range(2):
+            for i in range(3):
+                rhs[i] += left[a, k, POINT + i] * work.r[a, k]
+                for j in range(3):
+                    v[i, j] += left[a, k, POINT + i] * work.own[a, k, POINT + j]
+    return count if count and inverted(v, 1e-12) else 0
+
+
+@kernel(allocates=True)
+def _sum_tested(
+    span: Span, state: State, given: Given, tests: FloatArray, is_tested: BoolArray,
+    matrix: FloatArray, side: FloatArray, work: Workspace,
+) -> None:  # fmt: skip
+    """Add up left'(pose, shared) times right, with the points eliminated: W_left V^-1 W_right."""
+    g, k, most, v, rhs = given.shared, len(state.centres), len(work.own), work.v, work.rhs
+    size = 6 * most + g
+    left, column = np.empty((most, 2, SURFACE + g)), np.empty(size, np.int64)
+    w_right, w_left, y = np.empty((3, size)), np.empty((size, 3)), np.empty(3)
+    for p in range(*span):
+        count = _test_point(state, given, tests, is_tested[p], p, work, left)
+        if count == 0:
+            continue
+        used = 6 * count + g
+        w_right[:, :used], w_left[:used] = 0.0, 0.0
+        for i in range(g):
+            column[6 * count + i] = 6 * k + i
+        for a in range(count):
+            own, shared, camera = work.own[a], work.shared[a], 6 * given.camera[work.row[a]]
+            for i in range(6):
+                column[6 * a + i] = camera + i
+            for axis in range(2):
+                for i in range(6 + g):
+                    # row i: a pose column, or a shared one at the border of the matrix
+                    of_pose = i < 6
+                    row = camera + i if of_pose else 6 * k + i - 6
+                    place = 6 * a + i if of_pose else 6 * count + i - 6
+                    by_left = left[a, axis, i] if of_pose else left[a, axis, SURFACE + i - 6]
+                    by_right = own[axis, i] if of_pose else shared[axis, i - 6]
+                    side[row] += by_left * work.r[a, axis]
+                    for j in range(6):
+                        matrix[row, camera + j] += by_left * own[axis, j]
+                    for j in range(g):
+                        matrix[row, 6 * k + j] += by_left * shared[axis, j]
+                    for j in range(3):
+                        w_left[place, j] += by_left * own[axis, POINT + j]
+                        w_right[j, place] += left[a, axis, POINT + j] * by_right
+        for i in range(used):
+            for j in range(3):
+                y[j] = w_left[i, 0] * v[0, j] + w_left[i, 1] * v[1, j] + w_left[i, 2] * v[2, j]
+            side[column[i]] -= y[0] * rhs[0] + y[1] * rhs[1] + y[2] * rhs[2]
+            line = matrix[column[i]]
+            for j in range(used):
+                line[column[j]] -= (
+                    y[0] * w_right[0, j] + y[1] * w_right[1, j] + y[2] * w_right[2, j]
+                )
+
+
+@kernel(allocates=True)
+def _tested_points(
+    span: Span, state: State, given: Given, tests: FloatArray, is_tested: BoolArray,
+    moved: FloatArray, steps: FloatArray, work: Workspace,
+) -> None:  # fmt: skip
+    left = np.empty((len(work.own), 2, SURFACE + given.shared))
+    for p in range(*span):
+        count = _test_point(state, given, tests, is_tested[p], p, work, left)
+        for a in range(count):
+            change = change_of(given, work, a, moved)
+            for i in range(3):
+                for axis in range(2):
+                    work.rhs[i] -= left[a, axis, POINT + i] * change[axis]
+        if count:
+            step_of_point(work, steps[p])
+
+
+# What absorbed refraction has done to a block
+
+
+SIGMA_PX = 0.25
+"""Of an image; small, so that the centres only hold the block as a whole."""
+OWN_SIGMA_M = 1.0
+"""Of a projection centre, which holds the block where it is."""
+LEAST_IMAGES_OF_POINT, LEAST_POINTS, LEAST_IMAGES = 3, 10, 5
+
+
+class Mended(NamedTuple):
+    """The poses if they had absorbed the refraction, and the errors that this implies.
+
+    cameras : those with enough points; row : shape (k,), their rows among all cameras.
+    land_m, bed_m : shape (m,) and (w,), by how much land and bed are too low now, the bed after
+    its correction with the present poses.
+    """
+
+    cameras: Cameras
+    row: IntArray
+    land_m: FloatArray
+    bed_m: FloatArray
+
+
+def images_of(xyz: FloatArray, cameras: Cameras) -> TiePoints:
+    """Return the points, shape (m, 3), in three or more frames, with straight images there."""
+    views = views_in_frame(xyz, cameras)
+    rows = np.flatnonzero(np.diff(views.start) >= LEAST_IMAGES_OF_POINT)
+    views = views.take(rows)
+    owner = np.repeat(rows, np.diff(views.start))
+    return TiePoints(xyz[rows], views, straight_images(xyz[owner], views.camera, cameras))
+
+
+def mended(
+    xyz: FloatArray, cameras: Cameras, water: WaterSurface, refractive_index: float
+) -> Mended:
+    """Return the poses that an adjustment with water would have found; the block stays in place.
+
+    Parameters
+    ----------
+    xyz : array, shape (m, 3)
+        Points of the apparent cloud, or tie points, spread over it; a thousand or two.
+
+    Raises
+    ------
+    GeometryError
+        If the cloud does not determine the poses.
+    """
+    counts = np.bincount(images_of(xyz, cameras).views.camera, minlength=len(cameras))
+    row = np.flatnonzero(counts >= LEAST_POINTS)
+    if len(row) < LEAST_IMAGES:
+        raise _unsolved(f"only {len(row)} images have {LEAST_POINTS} points of the cloud")
+    cameras = some_cameras(cameras, row)
+    ties = images_of(xyz, cameras)
+    above = surface_above(water, ties.xyz)
+    wet = is_submerged(ties.xyz[:, 2], above)
+    if not wet.any():
+        raise _unsolved("no point under water lies in three images")
+    true = deeper(ties.xyz, above.height_m, wet, refractive_index)
+    block = replace(
+        plain_block(cameras, replace(ties, xyz=true), water, refractive_index, wet),
+        sigma_px=np.full(len(ties.image_xy), SIGMA_PX),
+        gnss_xyz=cameras.centres,
+        gnss_sigma_m=np.full((len(cameras), 3), OWN_SIGMA_M),
+    )
+    problem, begin = prepare(block, Unknowns(lens=("f",)))
+    tests = straight_columns(problem, begin, ties.xyz - problem.origin)
+    found = solve_unaware(problem, begin, tests, np.ones(len(wet), np.bool_))
+    higher = found.state.xyz[:, 2] + problem.origin[2] - intersect_fixed(block).xyz[:, 2]
+    known = np.isfinite(higher)
+    return Mended(solved_cameras(problem, found), row, higher[~wet & known], higher[wet & known])

@@ -1,0 +1,370 @@
+"""Adjustment by tie points: noise, outliers, and which lens parameters are free.
+
+An adjustment without water bends its lens to absorb refraction: square pixels get an aspect, a lens
+without distortion some of it. What it left must be free to go back, and missing terms must be
+found. So the block is adjusted with the parameters that its lenses have, and each other parameter
+is tested: by how much would it lower the weighted squares?
+
+That needs no further adjustment. With the normal equations [[A, B], [B', C]] of all unknowns and of
+the candidates, at a solution with right sides 0 and c, freed candidates take R^-1 c with
+R = C - B' A^-1 B, and lower the squares by c' R^-1 c.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.special import chdtri
+
+from pcfix.adjust.block import (
+    CODES,
+    LEAST_VIEWS,
+    NAMES,
+    Block,
+    Robust,
+    Unknowns,
+    check_datum,
+    effect_at_corner,
+    usable_codes,
+)
+from pcfix.adjust.normal import residuals
+from pcfix.adjust.precision import Precision, precision_of
+from pcfix.adjust.problem import Problem, Progress, Solution, prepare
+from pcfix.adjust.result import Adjusted, adjusted_of, sigma0_of
+from pcfix.adjust.shared_errors import common_errors, disagreement_of, weighed
+from pcfix.adjust.solve import reduced_at, solve, solver
+from pcfix.errors import GeometryError, PcfixWarning
+from pcfix.model import BoolArray, FloatArray, IntArray, Lens
+
+ROUGHLY = 1e-4
+"""Relative gain of a step that ends the first, robust rounds."""
+
+OUTLIER_SIGMAS = 4.0
+"""Longer residuals are outliers: three good ones in 10,000."""
+
+LEAST_SHARE = 0.5
+"""Share of the observations that must fit."""
+
+MAD_TO_SIGMA = 1.4826
+OUTLIER_ROUNDS = 3
+LAST_ROUND = 2 + OUTLIER_ROUNDS
+MANY_OUT = 0.05
+"""Share of outliers that is worth a warning."""
+
+
+def adjust_ties(
+    block: Block,
+    unknowns: Unknowns,
+    progress: Progress | None = None,
+    *,
+    sigma_px: float | None = None,
+    outliers: bool = True,
+    choose_lens: bool = True,
+) -> Adjusted:
+    """Adjust a block of measured tie points.
+
+    Parameters
+    ----------
+    sigma_px : float, optional
+        Standard deviation of the tie points; it is estimated by default.
+    outliers : bool
+        Whether to exclude outliers.
+    choose_lens : bool
+        Whether lens parameters that the block does not determine are fixed, and those that lower
+        the residuals freed; else exactly those of the unknowns are free.
+
+    Raises
+    ------
+    GeometryError
+        If the block lacks a datum, does not converge, or has undetermined unknowns.
+    """
+    check_datum(block, unknowns)
+    problem, now = prepare(block, unknowns)
+    in_front = np.asarray(np.isfinite(residuals(now.state, problem.given)).all(axis=1))
+    _check_most(
+        problem, in_front, "adjust.behind",
+        "tie point observations are in front of their cameras at the start. Check that poses and"
+        " tie points belong to one model, and the camera axes.",
+    )  # fmt: skip
+    clean, now = _cleaned(problem, now, sigma_px, outliers, progress)
+    estimate, notes = sigma_px is None, list[PcfixWarning]()
+    problem, now, precision = _settled(clean, now, LAST_ROUND, estimate, progress)
+    if choose_lens:
+        weak = weak_lens_parameters(problem, now, precision)
+        kept = [name for name in unknowns.lens if name not in weak]
+        more = missing_lens_parameters(problem, now, sigma0_of(problem, now))
+        notes = _lens_notes([*kept, *more], weak, more)
+        if weak or more:
+            clean, now = _with_lens(clean, now, (*kept, *more), outliers, progress)
+            problem, now, precision = _settled(clean, now, LAST_ROUND + 2, estimate, progress)
+    factor, shared = disagreement_of(problem, now, precision)
+    factor = factor * common_errors(problem, precision)
+    precision = precision_of(problem, now, precision.sigma0, factor)
+    quality = weighed(clean, now, clean.of_ties)[1] if estimate else []
+    notes += [*quality, *shared]
+    counted = np.isfinite(block.sigma_px) & problem.of_ties
+    share = 1.0 - float(problem.used[counted].mean())
+    if share >= MANY_OUT:
+        notes.append(
+            PcfixWarning(
+                "adjust.many_outliers",
+                f"{100.0 * share:.0f} % of the tie point observations are outliers (more than"
+                f" {OUTLIER_SIGMAS:g} standard deviations): mismatches, waves, moving objects, or"
+                " another lens or water surface than assumed. Check that the matching is the cause;"
+                " otherwise the standard errors are too small.",
+                share=share,
+            )
+        )
+    return adjusted_of(problem, now, precision, notes, "tie points", "direct")
+
+
+def _cleaned(
+    problem: Problem, now: Solution, sigma_px: float | None, outliers: bool,
+    progress: Progress | None,
+) -> tuple[Problem, Solution]:  # fmt: skip
+    """Return the problem with the noise of its tie points estimated and outliers excluded."""
+    estimate = sigma_px is None
+    if outliers or estimate:
+        now = solve(problem, now, "huber", number=1, progress=progress, close=ROUGHLY)
+    if estimate:
+        problem = with_sigma(problem, noise_px(problem, now))
+    if not outliers:
+        return problem, now
+    for number in range(OUTLIER_ROUNDS):
+        robust: Robust = "cauchy" if number == 0 else "squares"
+        now = solve(problem, now, robust, number=2 + number, progress=progress, close=ROUGHLY)
+        before = problem.used
+        problem = without_outliers(problem, now)
+        _check_most(
+            problem, problem.used, "adjust.not_converged",
+            "tie point observations fit any poses near the given ones. Check that tie points and"
+            " poses belong to one model, and the water level; or align the images again.",
+        )  # fmt: skip
+        if estimate:
+            problem = with_sigma(problem, noise_px(problem, now))
+        if number and (problem.used == before).all():
+            break
+    return problem, now
+
+
+def _check_most(problem: Problem, good: BoolArray, code: str, what: str) -> None:
+    """Refuse a block in which too few observations of tie points are good."""
+    counts = np.isfinite(problem.block.sigma_px) & problem.of_ties
+    n, total = int((counts & good).sum()), int(counts.sum())
+    if n < LEAST_SHARE * total:
+        raise GeometryError(code, f"Only {n:,} of {total:,} {what}", good=n, observations=total)
+
+
+def _settled(
+    problem: Problem, now: Solution, number: int, estimate: bool, progress: Progress | None
+) -> tuple[Problem, Solution, Precision]:
+    """Return the least squares solution without outliers, and its precision.
+
+    The noise is now estimated from all residuals, long tails included, so that GNSS and control
+    points, whose standard deviations are given, get the right weight beside the images.
+    """
+    if estimate:
+        problem = with_sigma(problem, noise_px(problem, now, robust=False))
+        problem = weighed(problem, now, problem.of_ties)[0]
+    now = solve(problem, now, "squares", number=number, progress=progress)
+    return problem, now, precision_of(problem, now, sigma0_of(problem, now))
+
+
+def noise_px(problem: Problem, now: Solution, *, robust: bool = True) -> float:
+    """Return the standard deviation of the tie points' image coordinates, from their residuals.
+
+    Robust is by the median, which outliers do not move, else by the mean square. The share of the
+    redundancy corrects for what the points absorb.
+    """
+    rows = problem.of_ties & problem.used
+    r = residuals(now.state, problem.given)[rows]
+    r = r[np.isfinite(r).all(axis=1)]
+    points = len(np.unique(problem.block.owner[rows]))
+    share = max(1.0 - 3.0 * points / max(2.0 * len(r), 1.0), 0.05)
+    typical = MAD_TO_SIGMA * np.median(np.abs(r)) if robust else np.sqrt(np.mean(r * r))
+    return float(max(typical / np.sqrt(share), 1e-6))
+
+
+def with_sigma(problem: Problem, sigma_px: float) -> Problem:
+    """Return the problem with another standard deviation of the tie points."""
+    rows = problem.of_ties & problem.used
+    return problem.weighted(np.where(rows, 1.0 / sigma_px, problem.given.weight))
+
+
+def without_outliers(problem: Problem, now: Solution) -> Problem:
+    """Return the problem without observations whose residuals are too long.
+
+    A point with fewer than two observations is excluded altogether. Marks of control points stay:
+    the surveyor should see them.
+    """
+    given, owner, ties = problem.given, problem.block.owner, problem.of_ties
+    length = np.linalg.norm(residuals(now.state, given), axis=1) * given.weight
+    weight = np.where(ties & problem.used & ~(length <= OUTLIER_SIGMAS), 0.0, given.weight)
+    left = np.bincount(owner, weight > 0.0, minlength=len(problem.block.xyz))
+    weight[ties & (left[owner] < LEAST_VIEWS)] = 0.0
+    return problem.weighted(weight)
+
+
+def _with_lens(
+    problem: Problem, now: Solution, lens: tuple[str, ...], outliers: bool,
+    progress: Progress | None,
+) -> tuple[Problem, Solution]:  # fmt: skip
+    """Return the problem with other lens parameters, and its outliers chosen again."""
+    wide, start = prepare(problem.block, replace(problem.unknowns, lens=lens))
+    wide = wide.weighted(problem.given.weight)
+    start = replace(start, state=start.state._replace(xyz=now.state.xyz), log=now.log)
+    start = solve(wide, start, "squares", number=LAST_ROUND + 1, progress=progress, close=ROUGHLY)
+    if not outliers:
+        return wide, start
+    used = problem.given.weight[problem.of_ties].max(initial=0.0)
+    ties = problem.of_ties & np.isfinite(problem.block.sigma_px)
+    wide = wide.weighted(np.where(ties, used, wide.given.weight))
+    return without_outliers(wide, start), start
+
+
+# Which lens parameters are free
+
+
+SURE = 1e-3
+"""Probability that a further lens parameter lowers the squares as much by chance."""
+
+WEAK_PX = 2.0
+"""Standard error of the image at the corner of the frame above which a lens parameter is fixed, if
+the residuals permit; the focal length is always free."""
+
+BENT = 0.05
+"""Probability that weak parameters move as far by chance. An adjustment without water bends them
+too: fixing them there bends the block instead, which no standard error shows."""
+
+TRIED = ("b1", "k1", "k2", "k3", "p1", "p2")
+"""Terms that a lens may lack. Sensors have no skew b2, nor do COLMAP's lenses."""
+
+
+def default_lens(lenses: tuple[Lens, ...]) -> tuple[str, ...]:
+    """Return the lens parameters that are free by default: those that the lenses have."""
+    names = ["f", "cx", "cy"]
+    for lens in lenses:
+        names += [name for name in ("b1", "b2") if getattr(lens, name)]
+        names += [f"k{i}" for i, value in enumerate(lens.radial[:4], start=1) if value]
+        names += [f"p{i}" for i, value in enumerate(lens.tangential[:2], start=1) if value]
+    return tuple(
+        name for name in dict.fromkeys(names) if any(usable_codes(lens, (name,)) for lens in lenses)
+    )
+
+
+def _lens_notes(free: list[str], weak: list[str], more: list[str]) -> list[PcfixWarning]:
+    """Return notes on which lens parameters are free, and what the tests found."""
+    tests = f" ({', '.join(more)} found by tests of the residuals)" if more else ""
+    words = f"Lens parameters free: {', '.join(free)}{tests}."
+    notes = [PcfixWarning("adjust.lens", words, free=free, found=more)]
+    if weak:
+        words = f"The block does not determine {', '.join(weak)} of the lens; they were fixed."
+        notes.append(PcfixWarning("adjust.weak_lens", words, fixed=weak))
+    return notes
+
+
+def weak_lens_parameters(problem: Problem, found: Solution, precision: Precision) -> list[str]:
+    """Return lens parameters, except the focal length, that the block hardly determines.
+
+    None are returned if all of them moved further together than chance allows.
+    """
+    lenses = problem.block.cameras.lenses or ()
+    names, effects = [], []
+    for images, codes in zip(problem.groups, problem.codes, strict=True):
+        names += [NAMES[code] for code in codes]
+        effects += [effect_at_corner(lenses[images[0]], code) for code in codes]
+    sigma = np.array([row.sigma for row in precision.shared[: len(names)]])
+    by_px = zip(names, sigma * effects, strict=True)
+    weak = list(dict.fromkeys(name for name, by in by_px if name != "f" and by > WEAK_PX))
+    rows = np.flatnonzero(np.isin(names, weak))
+    went = found.shared[rows] / sigma[rows]
+    squares = went @ np.linalg.pinv(precision.correlation[np.ix_(rows, rows)]) @ went
+    return [] if squares > chdtri(max(len(rows), 1), BENT) else weak
+
+
+class _Candidates(NamedTuple):
+    """Lens parameters to test: codes, effects at the corner of the frame, R and c."""
+
+    code: IntArray
+    effect: FloatArray
+    matrix: FloatArray
+    pull: FloatArray
+
+
+def missing_lens_parameters(problem: Problem, now: Solution, sigma0: float) -> list[str]:
+    """Return lens parameters that lower the squares by more than chance does, the best first.
+
+    Parameters
+    ----------
+    problem, now : Problem, Solution
+        Adjusted with the parameters that the lenses have.
+    sigma0 : float
+        A-posteriori standard deviation of unit weight.
+    """
+    tried = _candidates(problem, now)
+    chosen: list[int] = []
+    while tried is not None:
+        gains = {
+            int(code): gain
+            for code in np.unique(tried.code)
+            if code not in chosen and (gain := _gain(tried, [*chosen, int(code)], sigma0))
+        }
+        if not gains:
+            break
+        chosen.append(max(gains, key=gains.__getitem__))
+    return [NAMES[code] for code in chosen]
+
+
+def _gain(tried: _Candidates, codes: list[int], sigma0: float) -> float:
+    """Return by how much the last parameter lowers the squares; zero if not significantly."""
+    rows = np.isin(tried.code, codes)
+    before = np.isin(tried.code, codes[:-1])
+    covariance = np.linalg.inv(tried.matrix[np.ix_(rows, rows)])
+    if (sigma0 * np.sqrt(covariance.diagonal()) * tried.effect[rows] > WEAK_PX).any():
+        return 0.0
+    gain = float(tried.pull[rows] @ covariance @ tried.pull[rows])
+    if before.any():
+        kept = np.linalg.solve(tried.matrix[np.ix_(before, before)], tried.pull[before])
+        gain -= float(tried.pull[before] @ kept)
+    gain /= max(sigma0, 1.0) ** 2
+    return gain if gain > chdtri(int(rows.sum() - before.sum()), SURE) else 0.0
+
+
+def _candidates(problem: Problem, now: Solution) -> _Candidates | None:
+    """Return the candidates; None if there are none, or the equations are singular."""
+    lenses = problem.block.cameras.lenses or ()
+    names = problem.unknowns.lens
+    if any(lens.projection != "perspective" for lens in lenses):
+        return None  # other projections have terms of their own with the same effect
+    more = tuple(name for name in TRIED if name not in names)
+    wide, start = prepare(problem.block, replace(problem.unknowns, lens=names + more))
+    wide, given = wide.weighted(problem.given.weight), wide.given
+    codes = [CODES[name] for name in more]
+    is_tried = np.concatenate([
+        np.isin(given.code, codes), np.zeros(given.shared - len(given.code), np.bool_),
+    ])  # fmt: skip
+    shared = np.zeros(given.shared)
+    shared[~is_tried] = now.shared
+    reduced = reduced_at(wide, replace(start, state=now.state, lenses=now.lenses, shared=shared))
+    matrix: Any = reduced.matrix
+    poses = np.zeros(len(wide.moves) - len(shared), np.bool_)
+    mine = np.concatenate([poses, is_tried])[reduced.active]
+    solve_for = solver(reduced._replace(matrix=matrix[~mine][:, ~mine]))
+    if not mine.any() or solve_for is None:
+        return None
+    border, own = matrix[~mine][:, mine], matrix[mine][:, mine]
+    if not isinstance(matrix, np.ndarray):
+        border, own = border.toarray(), own.toarray()
+    taken = solve_for(np.column_stack([border, reduced.right[~mine]]))
+    rows = np.flatnonzero(is_tried)
+    group = np.searchsorted(given.first_lens, rows, side="right") - 1
+    effect = [
+        effect_at_corner(lenses[wide.groups[i][0]], int(given.code[row]))
+        for i, row in zip(group.tolist(), rows, strict=True)
+    ]
+    return _Candidates(
+        given.code[rows], np.array(effect), own - border.T @ taken[:, :-1],
+        reduced.right[mine] - border.T @ taken[:, -1],
+    )  # fmt: skip

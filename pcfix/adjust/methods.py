@@ -1,0 +1,511 @@
+"""The two ways to adjust a block, by tie points or by the cloud, and the checks of their results.
+
+An antenna's lever arm, another height datum or a wrong water level offset all GNSS positions from
+the projection centres alike. The block follows them, focal length and heights absorb the offset,
+and residuals hardly show it. The water level, control points and strips flown in both directions
+reveal it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from pcfix.adjust.block import (
+    CODES,
+    FIRST_SIGMA_PX,
+    Block,
+    Material,
+    Unknowns,
+    block_of,
+    check_datum,
+    marks_of,
+    plain_block,
+    restricted,
+    some_cameras,
+    ties_of_cloud,
+    well_seen,
+)
+from pcfix.adjust.from_cloud import Candidate, adjust_cloud
+from pcfix.adjust.from_ties import adjust_ties, default_lens, noise_px, with_sigma
+from pcfix.adjust.precision import correlated, shape_notes, undetermined
+from pcfix.adjust.problem import Progress, intersect_fixed, prepare
+from pcfix.adjust.result import Adjusted
+from pcfix.adjust.solve import reduced_at, solver
+from pcfix.errors import GeometryError, PcfixWarning, SettingError
+from pcfix.model import Cameras, FloatArray, GroundControl, IntArray, TiePoints, Views, WaterSurface
+from pcfix.options.survey import AdjustRules
+from pcfix.water.surface import surface_above
+
+LEAST_TIES = 100
+SMALL_WATER = 10
+"""Tie points on one side of the surface that are needed for it to count as observed."""
+
+GROSS_SIGMAS, GROSS_PX = 20.0, 10.0
+"""A control point with larger errors than both is a mistake, not noise."""
+
+ELSEWHERE = 0.1
+"""Share of the flying height; no absorbed refraction puts control points that far off."""
+
+_REMEDY = (
+    "Check its name, coordinates and marks (swapped names?). A point with the role check has no"
+    " weight."
+)
+
+
+def unknowns_of(rules: AdjustRules, lens: tuple[str, ...]) -> Unknowns:
+    """Return what is free, with these lens parameters.
+
+    Raises
+    ------
+    SettingError
+        If the user names an unknown lens parameter.
+    """
+    for name in rules.lens_unknowns or ():
+        if name not in CODES:
+            raise SettingError(
+                "option.choice",
+                f"Lens parameter '{name}' is unknown. Use {', '.join(CODES)} or none.",
+                option="lens_unknowns",
+                value=name,
+            )
+    tilt = None if rules.sigma_tilt is None else float(np.tan(np.radians(rules.sigma_tilt)))
+    sigma = {"level": rules.sigma_level, "tilt": tilt, "index": rules.sigma_index}
+    water = {
+        name: (np.inf if value is None else value) if name in rules.free or value else 0.0
+        for name, value in sigma.items()
+    }
+    return Unknowns(
+        poses=rules.poses,
+        fixed_images=rules.fixed_images,
+        lens=lens,
+        level_sigma_m=water["level"],
+        tilt_sigma=water["tilt"],
+        index_sigma=water["index"],
+        shape_sigma=np.inf if "shape" in rules.free else 0.0,
+        distance_sigma_m=np.inf if "distance" in rules.free else 0.0,
+        centre_sigma_m=np.inf if "centre" in rules.free else 0.0,
+        free_network=rules.datum == "free",
+    )
+
+
+def _lens_of(material: Material, rules: AdjustRules) -> tuple[str, ...]:
+    """Return the free lens parameters: those named, none of a calibration, or the default."""
+    if rules.lens_unknowns is not None:
+        return rules.lens_unknowns
+    return () if material.calibrated is not None else default_lens(material.original.lenses or ())
+
+
+def by_ties(
+    material: Material, ties: TiePoints, rules: AdjustRules, progress: Progress | None = None
+) -> Adjusted:
+    """Adjust a block by measured tie points.
+
+    Raises
+    ------
+    GeometryError
+        If it has no datum, no water below it, or images without points.
+    """
+    block = block_of(material, ties, rules.sigma_image or FIRST_SIGMA_PX)
+    unknowns = unknowns_of(rules, _lens_of(material, rules))
+    check_datum(block, unknowns, material.no_gnss)
+    _check_wet(material.water, block.xyz[: len(ties.xyz)])
+    kept, left_out = _well_seen(material.name, block)
+    found = adjust_ties(
+        restricted(block, kept), unknowns, progress, sigma_px=rules.sigma_image,
+        outliers=rules.outliers,
+        choose_lens=rules.lens_unknowns is None and material.calibrated is None,
+    )  # fmt: skip
+    notes = [*left_out, *_check_dry(material.water, found), *found.notes]
+    if found.precision is not None:
+        notes += undetermined(found.precision, unknowns)
+        notes += correlated(found.precision)
+        if found.origin is not None:
+            wet = found.is_wet & np.isfinite(found.xyz).all(axis=1)
+            notes += shape_notes(found.precision, (found.xyz - found.origin)[wet, :2])
+    return replace(found, notes=[*notes, *datum_notes(found), *bed_notes(found)])
+
+
+def by_cloud(
+    material: Material, xyz: FloatArray, guesses: dict[str, Views], rules: AdjustRules,
+    progress: Progress | None = None,
+) -> Adjusted:  # fmt: skip
+    """Adjust a block by points, shape (m, 3), of the apparent cloud that it made.
+
+    The guesses say which images contributed to them, each with its name.
+
+    Raises
+    ------
+    GeometryError
+        If the images do not see the cloud, or as of `by_ties`.
+    """
+    candidates: list[Candidate] = []
+    notes: list[PcfixWarning] = []
+    for name, views in guesses.items():
+        ties = ties_of_cloud(xyz, views, material.original)
+        if len(ties.xyz) < LEAST_TIES:
+            continue
+        block = block_of(material, ties, FIRST_SIGMA_PX)
+        check_datum(block, unknowns_of(rules, ()), material.no_gnss)
+        surveyed = [] if material.control is None else [material.control.xyz]
+        apparent = np.vstack([ties.xyz, *surveyed])
+        kept = well_seen(block)
+        if len(guesses) == 1:
+            kept, notes = _well_seen(material.name, block)
+        if len(kept) >= 2:
+            original = some_cameras(material.original, kept)
+            candidates.append(Candidate(name, restricted(block, kept), original, apparent))
+    if not candidates:
+        words = (
+            f"{material.name}: the images do not see the cloud. Check the poses with 'pcfix cameras"
+            " --cloud'."
+        )
+        raise GeometryError("cameras.no_overlap", words, path=material.name)
+    _check_wet(material.water, candidates[0].block.xyz)
+    sets = [_lens_of(material, rules)]
+    if rules.lens_unknowns is None and material.calibrated is None:
+        sets = list(dict.fromkeys([("f",), ("f", "cx", "cy"), *sets]))
+    found = adjust_cloud(candidates, unknowns_of(rules, sets[0]), sets, progress)
+    notes += [*_check_dry(material.water, found), *found.notes]
+    return replace(found, notes=[*notes, *datum_notes(found), *bed_notes(found)])
+
+
+# Checks of what goes in
+
+
+def _check_wet(water: WaterSurface | None, xyz: FloatArray) -> None:
+    """Check that some points lie below the water."""
+    if water is None:
+        return
+    below = int((surface_above(water, xyz).height_m > xyz[:, 2]).sum())
+    if below < SMALL_WATER:
+        words = (
+            f"Only {below} of {len(xyz):,} points lie below the water, so there is no refraction to"
+            " adjust. Check the water level, or use an ordinary bundle adjustment."
+        )
+        raise GeometryError("water.below_points", words, wet=below, points=len(xyz))
+
+
+def _well_seen(name: str, block: Block) -> tuple[IntArray, list[PcfixWarning]]:
+    """Return the rows of the images that can be adjusted, and a warning about others."""
+    kept, count = well_seen(block), len(block.cameras)
+    if len(kept) < 2:
+        words = (
+            f"{name}: only {len(kept)} of {count} images have enough observations for a pose. Give"
+            " a model with more tie points."
+        )
+        raise GeometryError("ties.few_images", words, path=name, images=len(kept))
+    lost = np.setdiff1d(np.arange(count), kept)
+    if not len(lost):
+        return kept, []
+    words = (
+        f"{len(lost)} of {count} images (first {block.cameras.labels[lost[0]]}) have too few"
+        " observations for a pose and were excluded."
+    )
+    return kept, [PcfixWarning("ties.few_in_image", words, images=len(lost))]
+
+
+def check_images(
+    name: str, cameras: Cameras, water: WaterSurface | None, fixed_images: tuple[str, ...]
+) -> None:
+    """Check that the fixed images exist, and that the cameras are above the water."""
+    missing = [label for label in fixed_images if label not in cameras.labels]
+    if missing:
+        words = (
+            f"Fixed image {missing[0]} is not in the model, which has {len(cameras)} images (first"
+            f" {cameras.labels[0]})."
+        )
+        raise SettingError("adjust.fixed_image", words, image=missing[0])
+    if water is None:
+        return
+    level = surface_above(water, cameras.centres).height_m
+    wet = np.flatnonzero(level > cameras.centres[:, 2])
+    if len(wet):
+        i = int(wet[0])
+        raise GeometryError(
+            "cameras.under_water",
+            f"{name}: {len(wet)} of {len(cameras)} cameras are below the water (first"
+            f" {cameras.labels[i]}, {cameras.centres[i, 2]:.2f} m). Check the water level and the"
+            " CRS of both; for underwater images give --port.",
+            path=name,
+            images=len(wet),
+            image=cameras.labels[i],
+        )
+
+
+def check_marks(
+    control: GroundControl, cameras: Cameras, name: str, *, is_placed: bool = False
+) -> None:
+    """Refuse control points whose marks are somewhere else altogether, before any adjustment.
+
+    Each point is intersected from the original cameras by straight rays. All may be offset alike,
+    as the block may be if nothing else places it; one that is offset differently is a mistake.
+
+    Parameters
+    ----------
+    name : str
+        Of the file.
+    is_placed : bool
+        Whether GNSS positions have placed the block already.
+
+    Raises
+    ------
+    GeometryError
+        Naming the point that is farthest off.
+    """
+    marks, _ = marks_of(control)
+    found = intersect_fixed(plain_block(cameras, marks))
+    met = np.isfinite(found.squares) & (np.diff(found.start) >= 2) & ~control.is_check
+    if met.sum() < 3:
+        return
+    off = found.xyz - control.xyz
+    middle = np.median(off[met], axis=0)
+    apart = np.linalg.norm(off - middle, axis=1)
+    height = float(np.median(cameras.centres[:, 2]) - np.nanmedian(control.xyz[:, 2]))
+    if is_placed and np.abs(middle).max() > ELSEWHERE * height > 0.0:
+        x, y, z = (-middle).tolist()
+        words = (
+            f"{name}: the control points lie {x:.1f}, {y:.1f}, {z:.1f} m (x, y, z; median) from the"
+            " intersections of their marks, while the GNSS positions fit. One of the two has"
+            " another CRS or height datum; name it with --gcps-crs or --gnss-crs."
+        )
+        raise GeometryError("gcps.offset", words, path=name, offset_m=[x, y, z])
+    worst = int(np.argmax(np.where(met, apart, 0.0)))
+    if apart[worst] > ELSEWHERE * height > 0.0:
+        raise GeometryError(
+            "gcps.gross_error",
+            f"{name}: control point {control.names[worst]} does not fit: its marks intersect"
+            f" {apart[worst]:.1f} m from its coordinates, relative to the other points. {_REMEDY}",
+            path=name,
+            point=control.names[worst],
+            off_m=float(apart[worst]),
+        )
+
+
+# Checks of what comes out
+
+
+def _check_dry(water: WaterSurface | None, found: Adjusted) -> list[PcfixWarning]:
+    """Check that there is land, which a free water surface needs."""
+    if water is None:
+        return []
+    above, count = int((found.is_observed & ~found.is_wet).sum()), int(found.is_observed.sum())
+    if above >= SMALL_WATER:
+        return []
+    few = f"Only {above} of {count:,} points lie above the water"
+    if any(found.unknowns.water_sigma):
+        words = (
+            f"{few}, so level, tilt and index cannot be separated from the height of the block."
+            " Fix the water."
+        )
+        raise GeometryError("water.no_land", words, land=above, points=count)
+    words = f"{few}, so only GNSS and control points determine the heights of the bed."
+    return [PcfixWarning("water.no_land", words, land=above, points=count)]
+
+
+def check_control(found: Adjusted, name: str) -> None:
+    """Refuse control points with gross errors.
+
+    The adjustment distributes a gross error over the coordinates of the point and its marks, so
+    both count: the coordinates as they appear in the images.
+
+    Raises
+    ------
+    GeometryError
+        Naming the point that is farthest off.
+    """
+    block = found.block
+    rows = block.tie_points + np.flatnonzero(block.is_surveyed[block.tie_points :])
+    px, sigmas = np.array([_error_of(found, int(i)) for i in rows]).reshape(-1, 2).T
+    gross = (px > GROSS_PX) & (sigmas > GROSS_SIGMAS)
+    if not gross.any():
+        return
+    worst = int(np.argmax(np.where(gross, px, 0.0)))
+    others = int(gross.sum()) - 1
+    point = block.control_names[rows[worst] - block.tie_points]
+    words = (
+        f"{name}: control point {point} does not fit: its error is {px[worst]:.0f} px or"
+        f" {sigmas[worst]:.0f} standard deviations{f' ({others} more do not)' if others else ''}."
+        f" {_REMEDY}"
+    )
+    raise GeometryError("gcps.gross_error", words, path=name, point=point, off_px=float(px[worst]))
+
+
+def _error_of(found: Adjusted, point: int) -> tuple[float, float]:
+    """Return the error of a control point in the images, and in standard deviations."""
+    block = found.block
+    marks = slice(block.start[point], block.start[point + 1])
+    sigma_px, residual = block.sigma_px[marks], found.residual_px[marks]
+    seen = np.isfinite(residual).all(axis=1) & np.isfinite(sigma_px)
+    if not seen.any():
+        return 0.0, 0.0
+    off = np.linalg.norm(residual[seen], axis=1)
+    known = np.isfinite(block.surveyed_sigma_m[point])
+    place = np.where(known, found.xyz[point] - block.surveyed_xyz[point], 0.0)
+    camera = block.camera[marks][seen]
+    away = np.linalg.norm(found.cameras.centres[camera] - found.xyz[point], axis=1)
+    focal = np.array([lens.focal for lens in found.cameras.lenses or ()])[camera]
+    px = float(off.max() + np.linalg.norm(place) * float(np.median(focal / away)))
+    of_place = np.abs(place[known] / block.surveyed_sigma_m[point][known]).max(initial=0.0)
+    return px, float(max((off / sigma_px[seen]).max(), of_place))
+
+
+# Datum and heights of the bed
+
+
+UNKNOWN_M = 10.0
+"""Prior standard deviation of an offset; one that keeps it is not determined."""
+
+SIGMAS, OF_GNSS = 3.0, 2.0
+"""An offset is reported if it exceeds so many of its standard errors, and so many standard
+deviations of a position: smaller ones come from fixed lens parameters, and move the bed by less."""
+
+WEAK, FEW = 3.0, 6
+"""A datum is weak if the standard error of a centre exceeds so many of a position, or (adjusted by
+the cloud) if there are fewer positions and control points."""
+
+IN_LINE = 0.1
+"""Spread of positions across a line, over that along it, below which they lie on it."""
+
+BED_GSD = 1.5
+"""Standard error of the heights of the bed, in ground pixels, that is worth a warning."""
+
+SIDES = (("to the right of", "to the left of"), ("ahead of", "behind"), ("above", "below"))
+"""Relative to the projection centres, with the top of the image ahead."""
+
+
+def offset_of(found: Adjusted) -> tuple[FloatArray, FloatArray] | None:
+    """Return the offset of the GNSS with which a block would fit best, and its standard errors.
+
+    Both are to the right, ahead and up, shape (3,), metres. It is one more unknown of all
+    positions, estimated by one step from the solution. None if nothing is free.
+    """
+    block = replace(
+        found.block, cameras=found.cameras, xyz=found.xyz,
+        sigma_px=np.where(found.used, found.block.sigma_px, np.inf),
+    )  # fmt: skip
+    problem, now = prepare(block, found.unknowns, found.origin)
+    if found.numbers is not None:
+        now = replace(now, state=now.state._replace(water=found.numbers))
+    problem = with_sigma(problem, noise_px(problem, now))
+    weight = block.gnss_weights
+    # axes of each image in the world: right, ahead, up
+    right = np.asarray(found.cameras.rotations)[:, 0] * [1.0, 1.0, 0.0]
+    right /= np.maximum(np.linalg.norm(right, axis=1), 1e-9)[:, None]
+    up = np.broadcast_to([0.0, 0.0, 1.0], right.shape)
+    axes = np.stack([right, np.cross(up, right), up], axis=1)
+    with_centres = np.zeros((len(weight), 6, 3))
+    with_centres[:, 3:] = weight[:, :, None] * axes.transpose(0, 2, 1)
+    shared = np.zeros((problem.given.shared, 3))
+    reduced = reduced_at(problem, now)
+    taken_up = np.vstack([with_centres.reshape(-1, 3), shared])[reduced.active]
+    solve_for = solver(reduced)
+    if solve_for is None or not taken_up.any():
+        return None
+    own = np.einsum("kij,kj,klj->il", axes, weight, axes) + np.eye(3) / UNKNOWN_M**2
+    covariance = np.linalg.inv(own - taken_up.T @ solve_for(taken_up))
+    side = -np.einsum("kij,kj->i", axes, weight * np.nan_to_num(found.gnss_residual_m))
+    step = covariance @ (side - taken_up.T @ solve_for(reduced.right))
+    return step, max(found.sigma0, 1.0) * np.sqrt(np.diag(covariance))
+
+
+def datum_notes(found: Adjusted) -> list[PcfixWarning]:
+    """Return a warning if GNSS positions are a weak datum, and one if they have an offset."""
+    known = np.isfinite(found.gnss_residual_m)
+    if not known.any() or found.unknowns.poses != "free" or found.unknowns.free_network:
+        return []
+    stated_m = float(np.median(found.block.gnss_sigma_m[known]))
+    places, line = _line(found)
+    control = sum(row.role == "control" for row in found.control)
+    notes, values = [], {"gnss": len(places), "control": control}
+    what = f"{len(places)} GNSS positions{', on a line,' if line is not None else ''} and {control}"
+    remedy = "Give positions of more images, spread over the block, or control points."
+    if found.source == "cloud" and len(places) + control < FEW:
+        words = f"Only {what} control points determine the weight of the cloud. {remedy}"
+        notes.append(PcfixWarning("gnss.few", words, **values))
+    if found.precision is None or found.source == "cloud":
+        return notes
+    sigma = found.precision.centre_sigma_m.max(axis=1)
+    if sigma.max() > WEAK * stated_m:
+        image = found.cameras.labels[int(sigma.argmax())]
+        words = (
+            f"{what} control points are a weak datum: the largest standard error of a projection"
+            f" centre is {sigma.max():.2f} m ({image}), that of a position {stated_m:.2f} m."
+            f" {remedy}"
+        )
+        more = {"sigma_m": float(sigma.max()), "image": image, "in_line": line is not None}
+        notes.append(PcfixWarning("gnss.weak", words, **values, **more))
+    offset = offset_of(found)
+    return notes if offset is None else [*notes, *_offset_notes(found, *offset, stated_m)]
+
+
+def _offset_notes(
+    found: Adjusted, offset_m: FloatArray, sigma_m: FloatArray, stated_m: float
+) -> list[PcfixWarning]:
+    """Return a warning if GNSS positions have a significant offset."""
+    least = np.maximum(SIGMAS * sigma_m, OF_GNSS * stated_m)
+    is_off = np.abs(offset_m) > least
+    if not is_off.any():
+        return []
+    parts = [
+        f"{abs(m):.2f} m {side[m < 0.0]} the projection centres (standard error {sigma:.2f} m)"
+        for m, sigma, side, off in zip(offset_m, sigma_m, SIDES, is_off, strict=True)
+        if off
+    ]
+    level = ""
+    if is_off[2] and found.water is not None:
+        level = f", or a water level that is too {'low' if offset_m[2] > 0.0 else 'high'}"
+    words = (
+        f"The GNSS positions lie {' and '.join(parts)}: an antenna lever arm, another datum{level}."
+        " The block followed them. Correct them, or omit them if there are control points."
+    )
+    return [
+        PcfixWarning(
+            "gnss.offset_found", words, offset_m=offset_m.tolist(), sigma_m=sigma_m.tolist()
+        )
+    ]
+
+
+def _line(found: Adjusted) -> tuple[FloatArray, FloatArray | None]:
+    """Return the GNSS positions that were used, and the direction of the line they lie on."""
+    places = found.block.gnss_xyz[np.isfinite(found.gnss_residual_m[:, :2]).all(axis=1)]
+    if len(places) < 2:
+        return places, None
+    off = places[:, :2] - places[:, :2].mean(axis=0)
+    _, spread, axes = np.linalg.svd(off, full_matrices=False)
+    return places, np.append(axes[0], 0.0) if spread[1] < IN_LINE * spread[0] else None
+
+
+def bed_notes(found: Adjusted) -> list[PcfixWarning]:
+    """Return a warning if the heights of the bed are imprecise, with the cause."""
+    precision, bed = found.precision, found.is_wet & found.is_observed
+    if precision is None or precision.point_sigma_m is None or not bed.any():
+        return []
+    sigma_m = float(np.nanmedian(precision.point_sigma_m[bed, 2]))
+    focal = float(np.median([lens.focal for lens in found.cameras.lenses or ()]))
+    away_m = float(np.median(found.cameras.centres[:, 2]) - np.median(found.xyz[bed, 2]))
+    gsd = sigma_m / (away_m / focal)
+    if gsd < BED_GSD:
+        return []
+    why, (places, line), values = "", _line(found), {"sigma_m": sigma_m, "gsd": gsd}
+    of_focal = precision.sigma_of("f")
+    if line is not None and not any(row.role == "control" for row in found.control):
+        about = np.asarray(found.cameras.rotations) @ line
+        turn = np.einsum("ki,kij,kj->k", about, precision.pose_covariance[:, :3, :3], about)
+        values["tilt_deg"] = float(np.degrees(np.sqrt(np.median(turn))))
+        why = (
+            f" The {len(places)} GNSS positions lie on a line, so the tilt across it has a standard"
+            f" error of {values['tilt_deg']:.2f} deg. Give control points beside it, or fly another"
+            " strip."
+        )
+    elif of_focal is not None and of_focal / focal * away_m > 0.5 * sigma_m:
+        why = (
+            f" Most of it comes from the focal length (standard error {of_focal:.2g}). Give a"
+            " calibrated lens or control points."
+        )
+    words = (
+        f"The heights of the bed have a standard error of {sigma_m:.2f} m ({gsd:.1f} ground"
+        f" pixels).{why}"
+    )
+    return [PcfixWarning("adjust.imprecise_bed", words, **values)]

@@ -1,0 +1,424 @@
+"""Errors that observations share, and observations of different quality.
+
+Standard errors from the inverse normal matrix hold for independent errors. Errors of matching and
+of the lens model are shared: by neighbouring points, by one image, by one place in the frame. A
+group of observations contributes a part h of the right side; all parts together are zero. Without
+the other parts it would move the unknowns by S^-1 h, and the sum of the squares over the groups is
+a variance that allows for errors shared within a group (sandwich estimator: White 1980, Liang &
+Zeger 1986; to first order a delete-a-group jackknife). Random groups of points give that variance
+without shared errors, and random residuals that of observations of equal quality. The excess, if an
+F-test confirms it, is added to the variances.
+
+Places in the frame are too few for that, and lens, angles and centres absorb most of what they
+share. There a smooth field of image shifts is estimated, as of terms that the lens model lacks: a
+random field with standard deviation s in pixels, smooth over some part of the frame. With shifts e
+of tiles of the frame as candidates besides the unknowns, R = C - B' A^-1 B and their right sides c
+(see `pcfix.adjust.from_ties`), c has the covariance sigma0^2 R + s^2 R K R, where K is the
+covariance of the tiles. That gives the likelihood of s. The mean over all s and ranges is used, so
+that fields too small to be found count too. The unknowns move by A^-1 B e.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import fdtri
+
+from pcfix.adjust.block import CX, CY, FOCAL, effect_at_corner
+from pcfix.adjust.collinearity import POINT, Given, State, Workspace
+from pcfix.adjust.normal import UNDAMPED, in_parts, linearise_point, residuals
+from pcfix.adjust.precision import Precision
+from pcfix.adjust.problem import Problem, Solution, water_of
+from pcfix.adjust.solve import Reduced, reduced_at, solver
+from pcfix.errors import PcfixWarning
+from pcfix.kernels import Span, device, kernel
+from pcfix.model import BoolArray, FloatArray, IntArray
+from pcfix.water.surface import surface_above
+
+SURE = 0.99
+"""Probability with which equal groups would not differ by as much."""
+
+# Errors in common
+
+
+MOST_TILES, POINTS_PER_TILE, FRAME_TILES = 400, 25, 48
+ALONE, FRAME = "observations of different quality", "places in the frame"
+NOTED = 0.44
+"""Variance by the frame, over the formal one, that is worth a note: standard errors 1.2 times."""
+
+LEAST_GROUPS = 10
+"""Fewer groups do not give a variance."""
+
+COMMON_SHARE = 0.5
+"""Error in common to all images at the corner of the frame, as a share of the image noise: matching
+shifts features with their slope, and outliers of the original adjustment are missing on one side.
+Focal length and principal point absorb it, so that poses and bed are right, and residuals do not
+show it. Rendered blocks, whose lens is known, had up to 1.5 times this."""
+
+POSE = ("angle about x", "angle about y", "angle about z", "centre x", "centre y", "centre z")
+
+
+def disagreement_of(
+    problem: Problem, found: Solution, formal: Precision
+) -> tuple[FloatArray, list[PcfixWarning]]:
+    """Return by which factors standard errors must grow for shared errors, and a warning.
+
+    Parameters
+    ----------
+    formal : Precision
+        From the normal matrix.
+
+    Returns
+    -------
+    factor : array, shape (6 + g,)
+        For the parameters of `POSE` and the shared unknowns.
+    notes : list of PcfixWarning
+    """
+    groups, added = _groups_by_sharing(problem, found), np.zeros(6 + problem.given.shared)
+    counts = {words: len(np.unique(group)) for words, group in groups.items()}
+    if counts[ALONE] < LEAST_GROUPS:
+        return 1.0 + added, []
+    reduced = reduced_at(problem, found)
+    solve_for = solver(reduced)
+    if solve_for is None:
+        return 1.0 + added, []
+    drawn = np.random.default_rng(1).normal(0.0, formal.sigma0, problem.given.image_xy.shape)
+    nothing, shared = np.zeros((0, 2)), []
+
+    def share_of(pulls: FloatArray) -> FloatArray:
+        moved = solve_for(pulls[:, reduced.active].T)
+        return _share_of(formal, reduced.active, (moved**2).sum(axis=1))
+
+    by_chance = share_of(pulls_of(problem, found, groups[ALONE], drawn))
+    for words, count in counts.items():
+        if count < LEAST_GROUPS:
+            continue
+        if words == FRAME:
+            field = _pulls_of_field(
+                problem, found, groups[words], formal.sigma0, reduced, solve_for
+            )
+            more = share_of(field)
+            is_more = more > NOTED
+        else:
+            together = share_of(pulls_of(problem, found, groups[words], nothing))
+            is_more = together > fdtri(count - 1, counts[ALONE] - 1, SURE) * by_chance
+            more = np.where(is_more, together - by_chance, 0.0)
+        added += more
+        if is_more.any():
+            shared.append(words)
+        if words == ALONE:
+            by_chance = by_chance + more
+    factor = np.sqrt(1.0 + added)
+    if not shared:
+        return factor, []
+    worst = (*POSE, *problem.names)[int(np.argmax(factor))]
+    note = PcfixWarning(
+        "adjust.shared_errors",
+        f"Errors are shared by {', '.join(shared)}. Standard errors include them; they grow up to"
+        f" {factor.max():.1f} times ({worst}).",
+        groups=shared,
+        factor=float(factor.max()),
+        worst=worst,
+    )
+    return factor, [note]
+
+
+def common_errors(problem: Problem, formal: Precision) -> FloatArray:
+    """Return factors of the standard errors for an error that all images share, (6 + g,)."""
+    factor = np.ones(6 + len(formal.shared))
+    noise_px = formal.sigma0 / float(np.median(problem.given.weight[problem.used]))
+    at = 6
+    for rows, codes in zip(problem.groups, problem.codes, strict=True):
+        lens = (problem.block.cameras.lenses or ())[rows[0]]
+        for code in codes:
+            if code in (FOCAL, CX, CY):
+                common = COMMON_SHARE * noise_px / effect_at_corner(lens, code)
+                factor[at] = np.hypot(1.0, common / formal.shared[at - 6].sigma)
+            at += 1
+    return factor
+
+
+def _groups_by_sharing(problem: Problem, found: Solution) -> dict[str, IntArray]:
+    """Return the groups of the observations by what they share; `ALONE` are random groups."""
+    given, block = problem.given, problem.block
+    m = len(block.xyz)
+    tiles = min(MOST_TILES, m // POINTS_PER_TILE)
+    size = np.array([(lens.width, lens.height) for lens in block.cameras.lenses or ()])
+    alone = np.random.default_rng(0).integers(0, max(tiles, 1), m)
+    place = _tiles(given.image_xy / size[given.camera], FRAME_TILES)
+    place += given.group[given.camera] * (place.max(initial=0) + 1)
+    return {
+        ALONE: alone[block.owner],
+        "neighbouring points": _tiles(found.state.xyz[:, :2], tiles)[block.owner],
+        "points of an image": given.camera,
+        FRAME: np.unique(place, return_inverse=True)[1],
+    }
+
+
+def _tiles(xy: FloatArray, count: int) -> IntArray:
+    """Return the tile of each place, of about `count` square ones that cover nearly all places."""
+    low, high = np.nanpercentile(xy, [1.0, 99.0], axis=0)
+    side = max(float(np.sqrt(np.prod(high - low) / max(count, 1))), 1e-9)
+    last = np.maximum(np.ceil((high - low) / side) - 1.0, 0.0)
+    place = np.clip(np.floor((np.nan_to_num(xy) - low) / side), 0.0, last).astype(np.int64)
+    return np.asarray(place[:, 0] * int(last[1] + 1.0) + place[:, 1])
+
+
+def _share_of(formal: Precision, active: IntArray, moved2: FloatArray) -> FloatArray:
+    """Return variances over the formal ones, (6 + g,), for poses their mean."""
+    k, poses = len(formal.pose_covariance), np.einsum("kii->ki", formal.pose_covariance)
+    variance = np.concatenate([poses.ravel(), [row.sigma**2 for row in formal.shared]])
+    share = np.zeros(len(variance))
+    share[active] = moved2
+    share = np.divide(share, variance, out=np.zeros(len(variance)), where=variance > 0.0)
+    free = max(int((poses > 0.0).any(axis=1).sum()), 1)
+    return np.concatenate([share[: 6 * k].reshape(k, 6).sum(axis=0) / free, share[6 * k :]])
+
+
+def pulls_of(problem: Problem, found: Solution, group: IntArray, drawn: FloatArray) -> FloatArray:
+    """Return the right side of the reduced equations by groups, shape (groups, 6 k + g).
+
+    Parameters
+    ----------
+    group : array of int, shape (o,)
+        Of each observation, from zero.
+    drawn : array, shape (o, 2) or (0, 2)
+        Weighted residuals to use instead.
+    """
+    pulls, given = np.zeros((int(group.max(initial=0)) + 1, len(problem.moves))), problem.given
+    rows, state = np.ascontiguousarray(group, np.int64), found.state
+    in_parts(
+        lambda span, _, work: _sum_pulls(span, state, given, rows, drawn, pulls, work), given, 1
+    )
+    return pulls
+
+
+@kernel(allocates=True)
+def _sum_pulls(
+    span: Span, state: State, given: Given, group: IntArray, drawn: FloatArray, pulls: FloatArray,
+    work: Workspace,
+) -> None:  # fmt: skip
+    left = np.empty((len(work.own), 2))
+    for p in range(*span):
+        count, images = linearise_point(state, given, UNDAMPED, p, work)
+        for a in range(count):
+            r = drawn[work.row[a]] if len(drawn) and a < images else work.r[a]
+            _add_pull(given, work, count, a, r[0], r[1], left, pulls[group[work.row[a]]])
+
+
+@device
+def _add_pull(
+    given: Given, work: Workspace, count: int, a: int, by_u: float, by_v: float, left: FloatArray,
+    sums: FloatArray,
+) -> None:  # fmt: skip
+    """Add J'(e - B V^-1 B'e) of a point's rows to sums, for a change e of row a only.
+
+    It is the right side of a change of one observation, with the point eliminated. `left`, shape
+    (count, 2), is filled with what is left of the change in each row.
+    """
+    v, own = work.v, work.own
+    first = len(sums) - given.shared
+    for b in range(count):
+        left[b, 0], left[b, 1] = (by_u, by_v) if a == b else (0.0, 0.0)
+    for i in range(3):
+        # movement of the point along axis i
+        moved = 0.0
+        for j in range(3):
+            moved += v[i, j] * (own[a, 0, POINT + j] * by_u + own[a, 1, POINT + j] * by_v)
+        for b in range(count):
+            left[b, 0] -= own[b, 0, POINT + i] * moved
+            left[b, 1] -= own[b, 1, POINT + i] * moved
+    for b in range(count):
+        camera = 6 * given.camera[work.row[b]]
+        for i in range(6):
+            sums[camera + i] += own[b, 0, i] * left[b, 0] + own[b, 1, i] * left[b, 1]
+        for i in range(given.shared):
+            sums[first + i] += work.shared[b, 0, i] * left[b, 0] + work.shared[b, 1, i] * left[b, 1]
+
+
+# A smooth field over the frame
+
+
+RANGES = (0.2, 0.4, 0.8)
+"""Ranges of smoothness, over half the diagonal: from waves of the sensor to whole frames."""
+
+LARGEST_PX, STEPS = 2.0, np.linspace(0.0, 1.0, 200)
+"""Range of s; a lens with larger errors is another lens."""
+
+NO_FIELD = 1e-9
+"""Share of the largest eigenvalue below which a field leaves nothing in the residuals."""
+
+
+class _Tiles(NamedTuple):
+    """Shifts along u and v of each tile of the frame, 2 t candidates.
+
+    pulls : B', shape (2 t, u); matrix : C, shape (2 t, 2 t); right : shape (2 t,).
+    """
+
+    pulls: FloatArray
+    matrix: FloatArray
+    right: FloatArray
+
+
+def _pulls_of_field(
+    problem: Problem, found: Solution, tile: IntArray, sigma0: float, reduced: Reduced,
+    solve_for: Callable[[FloatArray], FloatArray],
+) -> FloatArray:  # fmt: skip
+    """Return right sides of likely fields, shape (2 t, u).
+
+    The sum of the squares of the movements that they cause is the variance by the field.
+
+    Parameters
+    ----------
+    tile : array of int, shape (o,)
+        Of the frame, from zero, none without observations; each sensor has its own.
+    sigma0 : float
+        A-posteriori standard deviation of unit weight.
+    """
+    given, state = problem.given, found.state
+    size, count = len(problem.moves), int(tile.max()) + 1
+    tiles = _Tiles(np.zeros((2 * count, size)), np.zeros((2 * count,) * 2), np.zeros(2 * count))
+    rows = np.ascontiguousarray(tile, np.int64)
+    in_parts(lambda span, _, work: _sum_tiles(span, state, given, rows, tiles, work), given, 1)
+    taken_up = solve_for(np.column_stack([tiles.pulls[:, reduced.active].T, reduced.right]))
+    rest = np.column_stack([tiles.matrix, tiles.right])
+    rest -= tiles.pulls[:, reduced.active] @ taken_up
+    # in the eigenvectors of K R K' the pulls are independent, so that the likelihood is a product
+    likely, halves = np.zeros((len(RANGES), len(STEPS))), []
+    square = (LARGEST_PX * STEPS**3) ** 2  # dense where s is small
+    for i, common in enumerate(_covariances_of_tiles(problem, tile)):
+        half = np.linalg.cholesky(common + 1e-9 * np.eye(2 * count))
+        halves.append(half)
+        value, vector = np.linalg.eigh(half.T @ rest[:, :-1] @ half)
+        shows = value > NO_FIELD * value[-1]
+        pull2 = (vector[:, shows].T @ half.T @ rest[:, -1]) ** 2 / value[shows]
+        variance = sigma0**2 + square[:, None] * value[shows]
+        likely[i] = -0.5 * (np.log(variance) + pull2 / variance).sum(axis=1)
+    weight = np.exp(likely - likely.max()) * STEPS**2  # a uniform prior of s
+    s2_of = (weight * square).sum(axis=1) / weight.sum()
+    of_all = np.sum([s2 * half @ half.T for s2, half in zip(s2_of, halves, strict=True)], axis=0)
+    whole = np.linalg.cholesky(of_all + 1e-12 * np.eye(2 * count))
+    return np.asarray(whole.T @ tiles.pulls)
+
+
+def _covariances_of_tiles(problem: Problem, tile: IntArray) -> list[FloatArray]:
+    """Return K for each range, shape (2 t, 2 t)."""
+    given, lenses = problem.given, problem.block.cameras.lenses or ()
+    half = 0.5 * np.array([np.hypot(lens.width, lens.height) for lens in lenses])[given.camera]
+    count = np.bincount(tile)
+    middle = [np.bincount(tile, given.image_xy[:, i] / half) / count for i in range(2)]
+    sensor = np.bincount(tile, given.group[given.camera]) / count
+    apart = np.sum([(axis - axis[:, None]) ** 2 for axis in middle], axis=0)
+    alike = sensor == sensor[:, None]
+    return [
+        np.asarray(np.kron(np.where(alike, np.exp(-0.5 * apart / length**2), 0.0), np.eye(2)))
+        for length in RANGES
+    ]
+
+
+@kernel(allocates=True)
+def _sum_tiles(
+    span: Span, state: State, given: Given, tile: IntArray, sums: _Tiles, work: Workspace
+) -> None:
+    """Add up B, C and right sides of a shift by one pixel, with the points eliminated."""
+    left, v = np.empty((len(work.own), 2)), work.v
+    for p in range(*span):
+        count, images = linearise_point(state, given, UNDAMPED, p, work)
+        for a in range(images):
+            weight = given.weight[work.row[a]]
+            for axis in range(2):
+                at, rest, own = 2 * tile[work.row[a]] + axis, work.r[a, axis], work.own[a, axis]
+                for i in range(3):
+                    for j in range(3):
+                        rest -= v[i, j] * own[POINT + j] * work.rhs[i]
+                sums.right[at] += weight * rest
+                by_u, by_v = (weight, 0.0) if axis == 0 else (0.0, weight)
+                _add_pull(given, work, count, a, by_u, by_v, left, sums.pulls[at])
+                for b in range(images):
+                    row = work.row[b]
+                    for k in range(2):
+                        sums.matrix[at, 2 * tile[row] + k] += given.weight[row] * left[b, k]
+
+
+# Observations of different quality
+
+
+LEAST_POINTS = 30
+"""Points of a group; its degrees of freedom, as residuals of one point are correlated."""
+
+LEAST_RATIO = 1.2
+"""Of standard deviations; below it other weights would gain a fiftieth of a standard error."""
+
+OBLIQUE_DEG = 15.0
+"""From nadir."""
+
+LEAST_GAP = 0.2
+"""Between two flying heights, as a share of the lower."""
+
+
+def weighed(problem: Problem, now: Solution, ties: BoolArray) -> tuple[Problem, list[PcfixWarning]]:
+    """Weight observations by the noise of their group, and return a warning if groups differ.
+
+    Each side of the water and each kind of image has its own variance of unit weight: weighted
+    squares over its share of the redundancy, of which each point takes three. Groups whose
+    variances differ (F-test), and by enough to matter, are weighted by their own (Foerstner 1979,
+    one step).
+
+    Parameters
+    ----------
+    ties : array of bool, shape (o,)
+        Observations of tie points; others keep their weights.
+    """
+    weight, owner, noise = problem.given.weight, problem.block.owner, dict[str, float]()
+    used = ties & (weight > 0.0)
+    r = residuals(now.state, problem.given)
+    used &= np.isfinite(r).all(axis=1)
+    square = (np.where(used[:, None], r, 0.0) ** 2).sum(axis=1)
+    redundancy = 2.0 - 3.0 / np.maximum(np.bincount(owner, used)[owner], 2.0)
+    for names, group in _groups_by_quality(problem, now):
+        rows = [used & (group == i) for i in range(len(names))]
+        points = np.array([len(np.unique(owner[row])) for row in rows])
+        if len(names) < 2 or points.min() < LEAST_POINTS:
+            continue
+        free = np.array([redundancy[row].sum() for row in rows])
+        each = [(square[row] * weight[row] ** 2).sum() for row in rows] / free
+        worst, best = int(np.argmax(each)), int(np.argmin(each))
+        ratio = each[worst] / each[best]
+        if ratio < max(fdtri(points[worst], points[best], SURE), LEAST_RATIO**2):
+            continue
+        weight = weight.copy()
+        for row, variance in zip(rows, each, strict=True):
+            weight[row] /= np.sqrt(variance)
+        px = np.sqrt([square[row].sum() for row in rows] / free).tolist()
+        noise |= dict(zip(names, px, strict=True))
+    if not noise:
+        return problem, []
+    words = ", ".join(f"{px:.2f} px {name}" for name, px in noise.items())
+    note = PcfixWarning(
+        "adjust.noise_differs",
+        f"The noise of tie points differs: {words}. Each group is weighted by its own.",
+        noise_px=noise,
+    )
+    return problem.weighted(weight), [note]
+
+
+def _groups_by_quality(problem: Problem, now: Solution) -> Iterator[tuple[list[str], IntArray]]:
+    """Yield groupings of the observations: names, and the group of each observation."""
+    block, given, state = problem.block, problem.given, now.state
+    water = water_of(problem, state)
+    if water is not None:
+        xyz = state.xyz + problem.origin
+        wet = block.wet & (surface_above(water, xyz).height_m > xyz[:, 2])
+        yield ["on land", "under water"], wet[block.owner].astype(np.int64)
+    sensors = int(given.group.max()) + 1
+    yield [f"of sensor {i}" for i in range(1, sensors + 1)], given.group[given.camera]
+    oblique = -state.rotations[:, 2, 2] < np.cos(np.radians(OBLIQUE_DEG))
+    yield ["in nadir images", "in oblique images"], oblique[given.camera].astype(np.int64)
+    height = state.centres[:, 2] - np.median(state.xyz[:, 2])
+    order = np.sort(height)
+    gap = np.diff(order, prepend=order[:1])
+    if gap.max() > LEAST_GAP * np.median(height):
+        high = height >= order[int(np.argmax(gap))]
+        yield ["of the lower flight", "of the higher flight"], high[given.camera].astype(np.int64)

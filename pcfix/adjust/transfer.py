@@ -1,0 +1,398 @@
+r"""Transfer of a dense cloud from the original to the adjusted cameras.
+
+An apparent point P is the intersection of rays of the original cameras. The images have not
+changed, so it moves to P', where the same image coordinates intersect now:
+
+    sum J'(pi_adjusted(P') - pi_original(P)) = 0
+
+with straight rays, as ordinary software intersects them, land and bed alike. The cloud is then the
+one that the same software would have made with the adjusted cameras, and can be corrected with them
+by any method. Points are classified as submerged afterwards, because an adjustment without water
+may sink or lift whole beaches.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+
+from pcfix.adjust.block import some_cameras
+from pcfix.errors import GeometryError, PcfixWarning
+from pcfix.kernels import Span, device, in_tiles, kernel, most_between
+from pcfix.lens.algebra import dot, minus, plus, plus_square, row_of, scaled, solved, times, vector
+from pcfix.lens.imaging import image_in_world, image_of, lens_table
+from pcfix.model import (
+    BoolArray,
+    Cameras,
+    Correction,
+    FloatArray,
+    IntArray,
+    Lens,
+    Outcome,
+    TiePoints,
+    Views,
+)
+from pcfix.refract.choice import views_in_frame
+from pcfix.refract.tiling import spatial_order
+from pcfix.sums import Sums
+from pcfix.water.surface import SurfaceAbove, is_submerged
+
+Label: TypeAlias = Callable[[FloatArray, SurfaceAbove], BoolArray]
+
+MAX_STEPS = 12
+CLOSE_M = 1e-6
+LEAST_CONDITION = 1e-6
+"""Determinant of the normal matrix over the product of its diagonal."""
+
+SAME_SHAPE = 0.002
+"""Relative difference of the aspect ratios of one image. Undistorted images differ by more from
+their originals, unless they have the same size; sides in millimetres are rounded by less."""
+
+POINTS_AT_ONCE = 100_000
+"""Points whose cameras are listed at a time, which limits the memory."""
+
+MOST_APART = 0.1
+"""Share of the flying height between two centres of one image; refraction moves a block, with its
+datum and scale, by a few hundredths."""
+
+REASON = "fewer than two original cameras image them"
+
+
+# Points
+
+
+class _Side(NamedTuple):
+    """Cameras for the kernels: poses, the row of each in the lens table, and the table."""
+
+    centres: FloatArray
+    rotations: FloatArray
+    row: IntArray
+    lenses: FloatArray
+
+
+def transfer(
+    xyz: FloatArray, views: Views, original: Cameras, adjusted: Cameras
+) -> tuple[FloatArray, BoolArray]:
+    """Intersect the images of points again, with adjusted cameras.
+
+    Parameters
+    ----------
+    xyz : array, shape (n, 3)
+        Apparent points, metres, world frame.
+    views : Views
+        Cameras that intersect each point; weights do not count.
+    original, adjusted : Cameras
+        The same images, in the same order, with angles and lenses.
+
+    Returns
+    -------
+    shift_m : array, shape (n, 3)
+        Zero for points that stay.
+    moved : array of bool, shape (n,)
+        Points that two cameras or more image, before and after.
+    """
+    shift, moved = np.zeros((len(xyz), 3)), np.zeros(len(xyz), np.bool_)
+    start, camera = np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)
+    sides = (
+        _Side(
+            np.ascontiguousarray(cameras.centres),
+            np.ascontiguousarray(cameras.rotations, np.float64),
+            *lens_table(cameras.lenses or ()),
+        )
+        for cameras in (original, adjusted)
+    )
+    in_tiles(_transfer, len(xyz), np.ascontiguousarray(xyz), start, camera, *sides, shift, moved)
+    return shift, moved
+
+
+@kernel(allocates=True)
+def _transfer(
+    span: Span, xyz: FloatArray, start: IntArray, camera: IntArray, original: _Side,
+    adjusted: _Side, shift: FloatArray, moved: BoolArray,
+) -> None:  # fmt: skip
+    most = most_between(span, start)
+    image, who = np.empty((most, 2)), np.empty(most, np.int64)
+    for i in range(*span):
+        count = 0
+        for j in range(start[i], start[i + 1]):
+            c = camera[j]
+            ahead = times(original.rotations[c], minus(row_of(xyz, i), row_of(original.centres, c)))
+            u, v = image_of(original.lenses[original.row[c]], *ahead)
+            if u == u and v == v:  # not NaN
+                image[count, 0], image[count, 1], who[count] = u, v, c
+                count += 1
+        if count >= 2:
+            moved[i] = _intersect(shift[i], xyz[i], image[:count], who[:count], adjusted)
+
+
+@device
+def _intersect(
+    shift: FloatArray, xyz: FloatArray, image: FloatArray, who: IntArray, cameras: _Side
+) -> bool:
+    """Find the shift of a point that minimises its residuals; return whether that converges."""
+    moved, point = (0.0, 0.0, 0.0), vector(xyz)
+    for _ in range(MAX_STEPS):
+        # Gauss-Newton: m = sum J'J (upper triangle), b = sum J'r
+        m, b = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+        for j in range(who.size):
+            c = who[j]
+            ahead = minus(plus(point, moved), row_of(cameras.centres, c))
+            lens = cameras.lenses[cameras.row[c]]
+            u, v, by_u, by_v = image_in_world(lens, cameras.rotations[c], ahead)
+            m, b = plus_square(m, by_u), plus(b, scaled(image[j, 0] - u, by_u))
+            m, b = plus_square(m, by_v), plus(b, scaled(image[j, 1] - v, by_v))
+        det, step = solved(m, b)
+        if not det > LEAST_CONDITION * m[0] * m[3] * m[5]:
+            return False
+        moved = plus(moved, step)
+        if dot(step, step) <= CLOSE_M * CLOSE_M:
+            shift[0], shift[1], shift[2] = moved
+            return True
+    return False
+
+
+# Pairs of models
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Original and adjusted cameras of the same k images, row by row.
+
+    Attributes
+    ----------
+    original, adjusted : Cameras
+        In the cloud's CRS, with angles and lenses; both lenses of an image in one unit.
+    row : array, shape (o,)
+        The row here of each of the original cameras as read, -1 if it was not adjusted.
+    left_out : tuple of str
+        Images of the original model that were not adjusted.
+    """
+
+    original: Cameras
+    adjusted: Cameras
+    row: IntArray
+    left_out: tuple[str, ...]
+
+
+def pair_of(original: Cameras, adjusted: Cameras, place: IntArray) -> Pair:
+    """Return the pair of two models, given the original row of each adjusted image.
+
+    Raises
+    ------
+    GeometryError
+        If the images differ in shape.
+    """
+    row = np.full(len(original), -1)
+    row[place] = np.arange(len(adjusted))
+    left_out = tuple(label for label, at in zip(original.labels, row, strict=True) if at < 0)
+    original = some_cameras(original, place)
+    lenses = map(_in_unit_of, adjusted.lenses or (), original.lenses or (), original.labels)
+    return Pair(replace(original, lenses=tuple(lenses)), adjusted, row, left_out)
+
+
+def _in_unit_of(adjusted: Lens, original: Lens, label: str) -> Lens:
+    """Return an original lens in the unit of the adjusted one."""
+    factor = adjusted.width / original.width
+    if not abs(factor * original.height / adjusted.height - 1.0) <= SAME_SHAPE:
+        words = (
+            f"--adjusted-from: image {label} has {original.width:g} x {original.height:g}"
+            f" {original.unit}, but {adjusted.width:g} x {adjusted.height:g} {adjusted.unit} in the"
+            " cameras (undistorted?). Give the model from which the cameras were adjusted."
+        )
+        raise GeometryError("adjusted_from.shape", words, image=label)
+    if factor == 1.0:
+        return original
+    lengths = ("focal", "width", "height", "principal_x", "principal_y", "b1", "b2", "b3")
+    changed = {name: factor * getattr(original, name) for name in lengths}
+    return replace(original, unit=adjusted.unit, **changed)
+
+
+def renumbered(views: Views, row: IntArray) -> tuple[Views, IntArray]:
+    """Return views with other camera numbers, without negative ones, and the entries that stay."""
+    camera = row[np.asarray(views.camera)]
+    stays = camera >= 0
+    if views.kind == "pairs":
+        stays = np.repeat(stays[::2] & stays[1::2], 2)
+    entry = np.flatnonzero(stays)
+    start = np.concatenate([[0], np.cumsum(stays)])[views.start]
+    weight = None if views.weight is None else views.weight[entry]
+    return Views(start, camera[entry], weight, views.kind), entry
+
+
+# Clouds
+
+
+class Transferred(NamedTuple):
+    """Points after their transfer.
+
+    original_xyz, xyz : shape (n, 3), metres, with the original and the adjusted cameras.
+    moved : shape (n,), whether a point could be transferred.
+    views : their view list with the adjusted cameras, if there is one.
+    """
+
+    original_xyz: FloatArray
+    xyz: FloatArray
+    moved: BoolArray
+    views: Views | None
+
+    def rule(self, label: Label | None) -> Label:
+        """Return a rule of what is submerged that excludes points that were not transferred."""
+
+        def submerged(xyz: FloatArray, surface: SurfaceAbove) -> BoolArray:
+            below = is_submerged(xyz[:, 2], surface) if label is None else label(xyz, surface)
+            return below & self.moved
+
+        return submerged
+
+    def whole(self, correction: Correction) -> Correction:
+        """Return the correction of `xyz` as one of the original points.
+
+        Points that were not transferred or not corrected stay at their original place.
+        """
+        outcome = np.where(self.moved, correction.outcome, np.uint8(Outcome.NOT_CARRIED))
+        found = replace(correction, outcome=outcome)
+        shift = self.xyz - self.original_xyz + correction.shift_m
+        shift = np.where(found.uncorrected[:, None], 0.0, shift)
+        return replace(found, apparent_xyz=self.original_xyz, shift_m=shift)
+
+
+class CloudTransfer(Sums):
+    """The transfer of a cloud, chunk by chunk, and its statistics."""
+
+    added, most = ("_points", "_not_moved", "_land", "_sum_m"), ("_most_m",)
+
+    def __init__(self, pair: Pair) -> None:
+        self.pair = pair
+        self._is_checked = False
+        self.restart()
+
+    def restart(self) -> None:
+        """Reset the statistics."""
+        self._points = self._not_moved = self._land = 0
+        self._sum_m, self._most_m = np.zeros(4), 0.0
+
+    def step(self, xyz: FloatArray, listed: Views | None) -> Transferred:
+        """Transfer points.
+
+        Parameters
+        ----------
+        xyz : array, shape (n, 3)
+            Metres, world frame.
+        listed : Views or None
+            Of the original cameras, as read.
+
+        Raises
+        ------
+        GeometryError
+            If the two models are in different places.
+        """
+        self._check(xyz)
+        original, adjusted = self.pair.original, self.pair.adjusted
+        shift, moved = np.zeros((len(xyz), 3)), np.zeros(len(xyz), np.bool_)
+        views = None if listed is None else renumbered(listed, self.pair.row)[0]
+        if views is not None:
+            # whatever kind of list it is for the correction, these images show the point
+            shift, moved = transfer(xyz, replace(views, kind="tracks"), original, adjusted)
+        left = np.flatnonzero(~moved)
+        left = left[spatial_order(np.ascontiguousarray(xyz[left]))]
+        for first in range(0, len(left), POINTS_AT_ONCE):
+            rows = left[first : first + POINTS_AT_ONCE]
+            in_frame = views_in_frame(xyz[rows], original)
+            shift[rows], moved[rows] = transfer(xyz[rows], in_frame, original, adjusted)
+        return Transferred(xyz, xyz + shift, moved, views)
+
+    def back(self, ties: TiePoints) -> TiePoints:
+        """Return tie points of the adjusted block, transferred to the original cameras."""
+        known = np.flatnonzero(np.isfinite(ties.xyz).all(axis=1))
+        xyz, views = ties.xyz.copy(), ties.views.take(known)
+        xyz[known] += transfer(xyz[known], views, self.pair.adjusted, self.pair.original)[0]
+        return replace(ties, xyz=xyz)
+
+    def _check(self, xyz: FloatArray) -> None:
+        """Refuse models in different places, at the first points, and warn of single images."""
+        if self._is_checked or not len(xyz):
+            return
+        self._is_checked = True
+        original, apart = self.pair.original, self._apart_m()
+        height = float(np.median(original.centres[:, 2]) - np.median(xyz[:, 2]))
+        middle, most = float(np.median(apart)), MOST_APART * height
+        if height <= 0.0 or apart.max() <= most:
+            return
+        if middle > most:
+            words = (
+                f"--adjusted-from: its cameras are {middle:,.0f} m from the adjusted ones (median;"
+                f" flying height {height:,.0f} m). Check both files, --cameras-crs and"
+                " --cameras-offset, which count for the file that has no CRS."
+            )
+            raise GeometryError("adjusted_from.apart", words, apart_m=middle, height_m=height)
+        worst = int(np.argmax(apart))
+        warnings.warn(
+            PcfixWarning(
+                "adjusted_from.images_apart",
+                f"{int((apart > most).sum())} of {len(apart)} images moved by more than a tenth of"
+                f" the flying height in the adjustment (most: {original.labels[worst]},"
+                f" {apart[worst]:,.0f} m). Check their poses.",
+                image=original.labels[worst],
+                moved_m=float(apart[worst]),
+            ),
+            stacklevel=3,
+        )
+
+    def _apart_m(self) -> FloatArray:
+        """Return the distances between original and adjusted centres, shape (k,)."""
+        apart = self.pair.adjusted.centres - self.pair.original.centres
+        return np.asarray(np.linalg.norm(apart, axis=1))
+
+    def add(self, step: Transferred, correction: Correction) -> None:
+        """Count a chunk, with the correction that `Transferred.whole` returned."""
+        followed = step.moved & ~correction.uncorrected
+        shift = (step.xyz - step.original_xyz)[followed]
+        length2 = (shift**2).sum(axis=1)
+        self._points += len(shift)
+        self._land += int((correction.outcome[followed] == Outcome.LAND).sum())
+        self._not_moved += int((~step.moved).sum())
+        self._sum_m += [*shift.sum(axis=0), length2.sum()]
+        self._most_m = max(self._most_m, float(np.sqrt(length2.max(initial=0.0))))
+
+    def check(self, name: str) -> None:
+        """Refuse a cloud that the original cameras do not see.
+
+        Raises
+        ------
+        GeometryError
+            If no point was transferred.
+        """
+        if self._points == 0 and self._not_moved:
+            words = (
+                f"{name}: no point could be transferred to the adjusted cameras, because {REASON}."
+                " Check that --adjusted-from is the model that made the cloud, in its CRS."
+            )
+            raise GeometryError("adjusted_from.no_overlap", words, path=name)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the statistics as plain values, metres."""
+        apart, mean = self._apart_m(), self._sum_m / max(self._points, 1)
+        shift = {
+            "mean_x": mean[0], "mean_y": mean[1], "mean_z": mean[2], "rms": np.sqrt(mean[3]),
+            "max": self._most_m,
+        }  # fmt: skip
+        centres = {"rms": np.sqrt((apart**2).mean()), "max": apart.max()}
+        return {
+            "points": self._points,
+            "land": self._land,
+            "not_carried": self._not_moved,
+            "not_carried_reason": REASON,
+            "shift_m": {name: round(float(value), 4) for name, value in shift.items()},
+            "cameras": len(apart),
+            "cameras_left_out": list(self.pair.left_out),
+            "centres_m": {name: round(float(value), 4) for name, value in centres.items()},
+        }
+
+    def provenance(self) -> dict[str, Any]:
+        """Return what the output file says about the transfer."""
+        source = self.pair.original.source
+        return {"adjusted_from": {"cameras": len(self.pair.row), "source": source}}
