@@ -40,7 +40,7 @@ from pcfix.io.cameras.checks import numbers
 from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.metashape import SPREADS, documents
 from pcfix.io.cameras.metashape.documents import Chunk
-from pcfix.io.cameras.odm.project import named_crs
+from pcfix.io.cameras.odm import named_crs
 from pcfix.io.cameras.table import centres, crs
 from pcfix.io.cameras.table.columns import Columns, headers, is_header, read_columns
 from pcfix.io.crs import is_local, parse_crs

@@ -14,7 +14,7 @@ from pcfix.io.cameras import read_cameras, table
 from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.frames import is_tied
 from pcfix.io.cameras.georeference import adjusted_minus_gnss
-from pcfix.io.cameras.odm.project import read_images
+from pcfix.io.cameras.odm import read_images
 from pcfix.io.cameras.table import gnss_positions, open_table
 from pcfix.io.cameras.table.columns import Columns
 from pcfix.io.crs import METRES, is_topocentric, parse_crs
@@ -88,9 +88,10 @@ def read_gnss(path: File, cameras: Cameras, *, crs: str | None = None) -> Camera
         found = replace(found, crs=crs)
     _check_near(source, replace(cameras, gnss=found))
     notes = _notes(source, cameras, int(known.sum()), unknown)
-    for note in notes:
+    said = [PcfixWarning("gnss.positions", note) for note in notes]
+    for note in said:
         warnings.warn(note, PcfixWarning, stacklevel=2)
-    return replace(cameras, gnss=found, notes=(*cameras.notes, *notes))
+    return replace(cameras, gnss=found, notes=(*cameras.notes, *said))
 
 
 def _listed(path: Path) -> tuple[list[str], GnssPositions]:

@@ -1,4 +1,4 @@
-"""What every module of a camera format gets and gives, and its entry in the table of formats."""
+"""The input of every module of a camera format, and its entry in the table of formats."""
 
 from __future__ import annotations
 
@@ -54,12 +54,12 @@ class Source:
 class Reader(Protocol):
     """A module of this folder.
 
-    What is wrong with a file is an `InputError` with the file, the image or the line, the value,
-    and what to do; no reader raises another error.
+    `read_cameras` turns what damaged contents raise into an `InputError`, and checks the rotations
+    and lenses. A reader itself raises an `InputError` where it can say more than "damaged".
     """
 
     def recognises(self, source: Source) -> bool:
-        """Whether the content is of this format; cheap, and never an error."""
+        """Whether the content is of this format; cheap."""
         ...
 
     def read(self, source: Source) -> Cameras:

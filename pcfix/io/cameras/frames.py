@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from pcfix.errors import InputError
+from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.crs import (
     GEOCENTRIC_WGS84,
     GEOGRAPHIC_WGS84,
@@ -58,7 +58,7 @@ class Frame(NamedTuple):
         return np.column_stack([1.0 / (along_parallel * size), 1.0 / (along_meridian * size), up])
 
     def check(self, xyz: FloatArray, labels: Sequence[str], name: str) -> None:
-        """Refuse numbers that are no place on the earth."""
+        """Raise InputError for numbers that are no place on the earth."""
         if self.topocentric or self.crs.is_projected:
             return
         if self.direct:
@@ -70,9 +70,14 @@ class Frame(NamedTuple):
         if wrong.any():
             i = int(np.argmax(wrong))
             kind = "longitude and latitude" if self.direct else "geocentric coordinates"
+            numbers = ", ".join(f"{number:.10g}" for number in xyz[i])
             raise InputError(
-                f"{name}: image {labels[i]}: {', '.join(f'{number:.10g}' for number in xyz[i])}"
-                f" are not {kind} ({self.crs.name}); say what they are with --cameras-crs."
+                "cameras.degrees" if self.direct else "cameras.geocentric",
+                f"{name}: image {labels[i]}: {numbers} are not {kind} ({self.crs.name}). Give the"
+                " CRS of the cameras with --cameras-crs.",
+                path=name,
+                image=labels[i],
+                crs=self.crs.name,
             )
 
 
@@ -99,7 +104,12 @@ def frame_of(text: str, name: str) -> Frame:
         geographic = geographic_3d(crs)
         return Frame(geographic, _from_geocentric(crs, geographic))
     if not (crs.is_projected or crs.is_geographic):
-        raise InputError(f"{name}: {crs.name} is not a CRS in which cameras can stand.")
+        raise InputError(
+            "cameras.crs",
+            f"{name}: {crs.name} is not a CRS for cameras. Give another with --cameras-crs.",
+            path=name,
+            crs=crs.name,
+        )
     return Frame(crs, lambda xyz: xyz, direct=True)
 
 
@@ -115,10 +125,10 @@ LOCAL = "local"
 
 
 class Statement(NamedTuple):
-    """What file and user say of the frame of cameras.
+    """The frame of cameras by their file and by ``--cameras-crs``.
 
     `crs` is as in `Cameras`, `project` that in which the software delivers its clouds. It is
-    `chosen` where the user says so, and `trusted` where heights not stated are the cloud's.
+    `chosen` if the user gave it, and `trusted` if heights of an unknown system are the cloud's.
     """
 
     crs: str | None
@@ -128,7 +138,7 @@ class Statement(NamedTuple):
 
 
 def statement(cameras: Cameras, cameras_crs: str | None, name: str) -> Statement:
-    """Return what holds of what the file says and the user's ``--cameras-crs``."""
+    """Combine the CRS of the file with the user's ``--cameras-crs``, which has priority."""
     project = _on_earth(cameras.project_crs, name)
     given = (cameras_crs or "").strip()
     if not given:
@@ -171,27 +181,29 @@ def agree(frame: Frame, target: CRS, stated: Statement) -> bool:
     return (stated.trusted and not frame.direct) or heights_agree(frame.crs, target)
 
 
-def height_notes(frame: Frame, target: CRS, stated: Statement, name: str) -> tuple[str, ...]:
-    """Return what is guessed about heights."""
+def height_notes(
+    frame: Frame, target: CRS, stated: Statement, name: str
+) -> tuple[PcfixWarning, ...]:
+    """Return a note on what is assumed about heights, if anything."""
     own, cloud = heights_of(frame.crs), heights_of(target)
     unit, size = plan_unit(frame.crs)
-    if own == "unstated" and frame.crs.is_projected and size != 1.0:
-        return (f"{name}: heights are taken to be in {unit}, as x and y are.",)
-    if stated.trusted:
-        return ()
-    if own == "unstated" and cloud != "unstated":
-        return (
-            f"{name}: does not say what its heights are; taken to be the cloud's ({target.name}).",
-        )
     axes = [e.semi_major_metre for e in (frame.crs.ellipsoid, target.ellipsoid) if e is not None]
     other_datum = bool(axes) and max(axes) - min(axes) > 1.0
     is_guess = other_datum or (stated.project is None and not frame.topocentric)
-    if own == "ellipsoidal" and cloud == "unstated" and is_guess:
-        return (
-            f"{name}: the cloud's CRS ({target.name}) does not say what its heights are; taken to"
-            f" be ellipsoidal, of {frame.crs.name}.",
+    if own == "unstated" and frame.crs.is_projected and size != 1.0:
+        what = f"heights are taken to be in {unit}, as x and y are"
+    elif stated.trusted:
+        return ()
+    elif own == "unstated" and cloud != "unstated":
+        what = f"does not say what its heights are; taken to be the cloud's ({target.name})"
+    elif own == "ellipsoidal" and cloud == "unstated" and is_guess:
+        what = (
+            f"the cloud's CRS ({target.name}) does not say what its heights are; taken to be"
+            f" ellipsoidal, of {frame.crs.name}"
         )
-    return ()
+    else:
+        return ()
+    return (PcfixWarning("cameras.heights_assumed", f"{name}: {what}.", path=name),)
 
 
 def without_grid(frame: Frame, target: CRS) -> str:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pcfix.errors import InputError
+from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.cameras import frames
 from pcfix.io.cameras.frames import Frame, Statement
 from pcfix.io.cameras.mistakes import UNDULATION_M
@@ -50,17 +50,17 @@ STEP_M = 10.0
 
 @dataclass(frozen=True, eq=False)
 class Georeference:
-    """The way from the frame of a camera file into another.
+    """The transformation from the frame of a camera file into another CRS.
 
-    `frame` is where the numbers come from, None where they are taken as they are; `offset`, shape
-    (3,), is added before all else; `crs` is where they end, as `Cameras.crs` says it.
+    `frame` is that of the file, None where its numbers are taken as they are; `offset`, shape (3,),
+    is added first; `crs` is the result's, as in `Cameras.crs`.
     """
 
     frame: Frame | None
     transformation: Transformation | None
     offset: FloatArray
     crs: str | None
-    notes: tuple[str, ...]
+    notes: tuple[PcfixWarning, ...]
     name: str
 
     def cameras(self, cameras: Cameras) -> Cameras:
@@ -93,8 +93,11 @@ class Georeference:
         vectors = (ahead - behind).reshape(-1, 3, 3).transpose(0, 2, 1) / (2.0 * STEP_M)
         if (np.linalg.det(vectors) < 0.0).any():
             raise InputError(
-                f"{self.name}: the axes of {self.frame.crs.name} are left-handed, so rotations"
-                " have no meaning in it; export the cameras in another CRS."
+                "cameras.left_handed",
+                f"{self.name}: the axes of {self.frame.crs.name} are left-handed, so rotations have"
+                " no meaning in it. Export the cameras in another CRS.",
+                path=self.name,
+                crs=self.frame.crs.name,
             )
         u, _, v = np.linalg.svd(vectors)
         return np.asarray(u @ v)
@@ -111,9 +114,11 @@ class Georeference:
             i = int(np.argmax(lost))
             x, y, z = cameras.centres[i] + self.offset
             raise InputError(
-                f"{self.name}: image {cameras.labels[i]}: its position {x:.10g}, {y:.10g},"
-                f" {z:.6g} cannot be brought to {shortened(self.crs or '')}; check the CRS of the"
-                " cameras (--cameras-crs)."
+                "cameras.not_transformed",
+                f"{self.name}: image {cameras.labels[i]}: its position {x:.10g}, {y:.10g}, {z:.6g}"
+                f" cannot be transformed to {shortened(self.crs or '')}. Check --cameras-crs.",
+                path=self.name,
+                image=cameras.labels[i],
             )
         return centres
 
@@ -152,7 +157,12 @@ def georeference(
     """
     offset = np.zeros(3) if offset_m is None else np.asarray(offset_m, np.float64)
     if offset.shape != (3,) or not np.isfinite(offset).all():
-        raise InputError(f"{name}: the offset {offset_m} is not three numbers x, y, z.")
+        raise InputError(
+            "cameras.offset",
+            f"{name}: the offset {offset_m} is not three numbers. Give x, y, z.",
+            path=name,
+            value=offset_m,
+        )
     cloud = None if cloud_crs is None else parse_crs(cloud_crs, "the cloud")
     stated = frames.statement(cameras, cameras_crs, name)
     if frames.is_tied(stated.crs, name):
@@ -161,9 +171,11 @@ def georeference(
         return Georeference(None, None, offset, stated.crs, (), name)
     if stated.crs is not None and not stated.chosen and not is_local(cloud):
         raise InputError(
-            f"{name}: is in a local frame, not tied to the earth, but the cloud is in"
-            f" {cloud.name}; export the cameras in that CRS, or, if their numbers are in it up to"
-            " a shift, give --cameras-crs local (and --cameras-offset)."
+            "cameras.local",
+            f"{name}: is in a local frame, but the cloud is in {cloud.name}. Export the cameras in"
+            " that CRS, or give --cameras-crs local if their numbers differ by a shift at most.",
+            path=name,
+            cloud_crs=cloud.name,
         )
     return Georeference(None, None, offset, crs_text(cloud), (), name)
 
@@ -179,8 +191,12 @@ def _from_earth(
     crs = stated.crs or ""
     if cloud is not None and is_local(cloud):
         raise InputError(
-            f"{name}: is in {shortened(crs)}, but the cloud is in a local frame ({cloud.name}); set"
-            " the cloud's CRS, or give --cameras-crs local to take the numbers as they are."
+            "cloud.local",
+            f"{name}: is in {shortened(crs)}, but the cloud is in a local frame ({cloud.name}). Set"
+            " the cloud's CRS, or give --cameras-crs local to take the numbers as they are.",
+            path=name,
+            crs=crs,
+            cloud_crs=cloud.name,
         )
     frame = frames.frame_of(crs, name)
     if cloud is not None:
@@ -194,13 +210,17 @@ def _from_earth(
     elif frame.direct or stated.project is None or not stated.project.is_projected:
         kind = "degrees" if frame.direct else "geocentric coordinates"
         raise InputError(
-            f"{name}: is in {kind} ({frame.crs.name}) and no cloud names a CRS; give"
-            " the cloud, or set its CRS."
+            "cloud.no_crs",
+            f"{name}: is in {kind} ({frame.crs.name}) and no cloud names a CRS. Give the cloud, or"
+            " set its CRS.",
+            path=name,
+            crs=frame.crs.name,
         )
     else:
         words = stated.project.name
         found = _into(stated.project, frame, stated, cameras, offset, name)
-    note = f"{name}: no cloud names a CRS; taken to be in {words} as the cameras are."
+    sentence = f"{name}: no cloud names a CRS; it is taken to be in {words} as the cameras are."
+    note = PcfixWarning("cloud.crs_assumed", sentence, path=name)
     return replace(found, notes=(note, *found.notes))
 
 
@@ -211,7 +231,11 @@ def _into(
     check_projected_metres(cloud, "the cloud")
     if frame.direct and frame.crs.is_geographic and offset.any():
         raise InputError(
-            f"{name}: an offset in metres cannot be added to degrees ({frame.crs.name})."
+            "cameras.offset",
+            f"{name}: an offset in metres cannot be added to degrees ({frame.crs.name}). Leave it"
+            " out, or export the cameras in a projected CRS.",
+            path=name,
+            value=offset.tolist(),
         )
     at = cameras.centres + offset
     frame.check(at, cameras.labels, name)
@@ -224,16 +248,19 @@ def _into(
     step = transformation(
         frame.crs, target, frame.enter(at), name, heights=heights, instead=instead
     )
-    found = Georeference(frame, step, offset, crs, (*step.notes, *notes), name)
+    of_step = (PcfixWarning("crs.transformation", str(note), path=name) for note in step.notes)
+    found = Georeference(frame, step, offset, crs, (*of_step, *notes), name)
     if stated.trusted and not (frame.direct or frame.topocentric):
         return replace(found, notes=found.notes + _on_trust(found, cameras, frame, target))
     return found
 
 
-def _on_trust(found: Georeference, cameras: Cameras, frame: Frame, target: CRS) -> tuple[str, ...]:
-    """Return a note where heights that are the cloud's by --cameras-crs are not those of the GNSS.
+def _on_trust(
+    found: Georeference, cameras: Cameras, frame: Frame, target: CRS
+) -> tuple[PcfixWarning, ...]:
+    """Return a note where heights that --cameras-crs declares contradict the GNSS positions.
 
-    Only a GNSS that the file states in heights like the cloud's can tell.
+    This can be tested only if the GNSS heights are above the geoid, as those of the cloud.
     """
     if heights_of(target) != "gravity" or cameras.gnss is None or cameras.gnss.crs is None:
         return ()
@@ -241,12 +268,12 @@ def _on_trust(found: Georeference, cameras: Cameras, frame: Frame, target: CRS) 
     off = float(np.median(up[np.isfinite(up)])) if np.isfinite(up).any() else 0.0
     if abs(off) < UNDULATION_M[0]:
         return ()
-    return (
-        f"{found.name}: its heights are above the ellipsoid ({frame.crs.name}); --cameras-crs takes"
-        f" them for the cloud's ({target.name}), but then the cameras are {abs(off):.1f} m"
-        f" {'above' if off > 0.0 else 'below'} the heights that their GNSS states: the two do not"
-        " agree, so install the grid instead.",
+    sentence = (
+        f"{found.name}: with the heights of --cameras-crs ({target.name}) the cameras are"
+        f" {abs(off):.1f} m {'above' if off > 0.0 else 'below'} their GNSS positions. Install the"
+        f" grid instead; the file has heights above the ellipsoid ({frame.crs.name})."
     )
+    return (PcfixWarning("cameras.heights_differ", sentence, path=found.name, metres=off),)
 
 
 @dataclass(frozen=True, eq=False)
@@ -356,7 +383,7 @@ def _common(cameras: Cameras, name: str) -> CRS:
         return frame.crs
     base = parts(unbound(frame.crs))[0].geodetic_crs
     if base is None:
-        raise InputError(f"{name}: {frame.crs.name} has no datum.")
+        raise InputError("cameras.crs", f"{name}: {frame.crs.name} has no datum.", path=name)
     to_degrees = Transformer.from_crs(parts(frame.crs)[0], "EPSG:4326", always_xy=True)
     middle = np.median(frame.enter(cameras.centres), axis=0)
     longitude, latitude = to_degrees.transform(middle[0], middle[1])

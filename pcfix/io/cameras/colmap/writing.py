@@ -14,8 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.errors import InputError
-from pcfix.io.cameras.checks import is_same_lens, write_new
+from pcfix.io.cameras.checks import bad_label, is_same_lens, lens_not_held, needs_lenses, write_new
 from pcfix.io.cameras.colmap import FILE, place_text
 from pcfix.io.cameras.colmap.files import BY_NAME, MODELS, OBSERVATION, SHAPES, Camera, lens
 from pcfix.io.cameras.tracks import NO_TIE_POINTS, are_seen
@@ -91,7 +90,7 @@ def write_colmap(
     block = _block(target, cameras, tie_points or NO_TIE_POINTS, offset)
     for label in cameras.labels:  # a file would cut it off
         if not label.strip() or "\0" in label or "\n" in label or label != label.strip():
-            raise InputError(f"{target}: the image name {label!r} has no place in COLMAP's files.")
+            raise bad_label(target, label)
     contents = {
         "cameras.bin": _cameras(block),
         "images.bin": _images(block),
@@ -105,7 +104,7 @@ def _block(target: Path, cameras: Cameras, tie_points: TiePoints, offset: FloatA
     from scipy.spatial.transform import Rotation
 
     if cameras.rotations is None or cameras.lenses is None:
-        raise InputError(f"{target}: a COLMAP model needs rotations and lenses of all images.")
+        raise needs_lenses(target)
     distinct = list(dict.fromkeys(cameras.lenses))
     number = {each: i for i, each in enumerate(distinct)}
     turns = Rotation.from_matrix(cameras.rotations).as_quat(canonical=True)
@@ -140,10 +139,7 @@ def colmap_camera(path: Path, given: Lens) -> Camera:
             camera = Camera(model, given.width, given.height, numbers)
             if is_same_lens(lens(path, 1, camera), given):
                 return camera
-    raise InputError(
-        f"{path}: COLMAP has no camera model that holds the lens {given.sensor or 'of the images'}"
-        f" ({_what(given)}) exactly, so no COLMAP model is written; take another form."
-    )
+    raise lens_not_held(path, given)
 
 
 def _values(given: Lens) -> dict[str, float]:
@@ -158,20 +154,6 @@ def _values(given: Lens) -> dict[str, float]:
     ):
         values |= dict(zip(names, numbers, strict=False))
     return values | dict(zip(SHAPES.get(given.projection, ()), given.shape, strict=False))
-
-
-def _what(given: Lens) -> str:
-    """Return in words what a lens has."""
-    parts = {
-        f"{given.projection} in {given.unit}": True,
-        f"{len(given.radial)} radial": given.radial,
-        f"{len(given.denominator)} rational": given.denominator,
-        f"{len(given.tangential)} tangential": given.tangential,
-        "thin prism": any(given.thin_prism),
-        "skew": given.b2 or given.b3,
-        "inverse": given.inverse,
-    }
-    return ", ".join(text for text, there in parts.items() if there)
 
 
 def _cameras(block: Block) -> bytes:

@@ -10,9 +10,9 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from pcfix.errors import InputError
+from pcfix.errors import PcfixWarning
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import ROUNDING, number, numbers
+from pcfix.io.cameras.checks import damaged, number, numbers
 from pcfix.io.cameras.metashape import sensors
 from pcfix.io.cameras.metashape.documents import Chunk
 from pcfix.io.crs import METRES, crs_text, is_local, parse_crs, shortened, unbound
@@ -55,17 +55,13 @@ def _similarity(path: Path, element: Element | None) -> Similarity | None:
             rotation = numbers(path, where, given["rotation"], 9).reshape(3, 3)
         if given["translation"] is not None:
             translation = numbers(path, where, given["translation"], 3)
-    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if not (scale > 0.0 and off <= ROUNDING and np.linalg.det(rotation) > 0.0):
-        raise InputError(
-            f"{path}: the transform of the chunk is not a rotation with one positive scale (scale"
-            f" {scale:g}); export the cameras again."
-        )
-    u, _, v = np.linalg.svd(rotation)
-    return Similarity(scale, u @ v, translation)
+    rotation = checks.rotations(path, [where], rotation)[0]
+    if not scale > 0.0:
+        raise damaged(path, f"{where}: the scale {scale:g} is not positive")
+    return Similarity(scale, rotation, translation)
 
 
-def _world(path: Path, chunk: Element) -> tuple[str, str | None, tuple[str, ...]]:
+def _world(path: Path, chunk: Element) -> tuple[str, str | None, tuple[PcfixWarning, ...]]:
     """Return the frame that a chunk's transforms lead to, its CRS if another, and notes on them."""
     text = (chunk.findtext("reference") or "").strip()
     if not text or text.upper() == "LOCAL":
@@ -73,17 +69,16 @@ def _world(path: Path, chunk: Element) -> tuple[str, str | None, tuple[str, ...]
     crs = parse_crs(text, str(path))
     if is_local(crs):
         unit = crs.axis_info[0].unit_name
-        note = (
-            f"{path}: the local coordinates of the chunk are in {unit}; its transform is in metres,"
-            " so that a cloud exported in that unit has to be scaled."
+        sentence = (
+            f"{path}: the local coordinates of the chunk are in {unit}, its transform in metres."
+            " Scale a cloud that was exported in that unit."
         )
+        note = PcfixWarning("cameras.local_unit", sentence, unit=unit)
         return "local", None, () if unit in METRES else (note,)
     base = None if crs.geodetic_crs is None else unbound(crs.geodetic_crs)
     if base is None:
-        raise InputError(
-            f"{path}: the CRS of the chunk, {shortened(text)}, has no datum; set it again in"
-            " Metashape's reference settings."
-        )
+        remedy = "Set it again in Metashape's reference settings"
+        raise checks.unsupported(path, f"the CRS {shortened(text)}, which has no datum,", remedy)
     frame = crs_text(type(crs).from_json_dict(_geocentric(base.to_json_dict())))
     return frame, frame if crs.is_geocentric else text, ()
 
@@ -134,13 +129,9 @@ def read_block(chunk: Chunk) -> Block:
     poses = _poses(path, images)
     kept, places, why = _select(path, element, [image for image in images if image.id in poses])
     if not kept:
-        rest = [f"{len(images) - len(poses)} are not aligned", *why]
-        no_pose = "no image is aligned; align the photos, or choose the chunk that is."
-        raise InputError(
-            f"{path}: none of the {len(images)} images of the chunk"
-            f" {element.get('label') or 'without a name'} can be used:"
-            f" {', '.join(rest) + '.' if poses else no_pose}"
-        )
+        chunk_name = element.get("label") or "without a name"
+        rest = ", ".join([f"{len(images) - len(poses)} are not aligned", *why])
+        raise checks.no_pose(path, f"of the {len(images)} images of chunk {chunk_name} {rest}")
     local = IDENTITY in places
     crs, project_crs, of_world = ("local", None, ()) if local else _world(path, element)
     centres, rotations = _in_world([poses[image.id] for image in kept], places)
@@ -154,7 +145,11 @@ def read_block(chunk: Chunk) -> Block:
         crs=crs,
         project_crs=project_crs,
         unposed=tuple(image.label for image in images if image.id not in chosen),
-        notes=(*(f"{path}: {reason}; left out." for reason in why), *of_lenses, *of_world),
+        notes=(
+            *(PcfixWarning("cameras.left_out", f"{path}: {one}; left out.") for one in why),
+            *of_lenses,
+            *of_world,
+        ),
         source=chunk.software,
     )
     return Block(kept, places, cameras)
@@ -205,15 +200,8 @@ def _matrices(path: Path, images: list[Image]) -> FloatArray:
         for image in images
     ]
     matrices = np.array(rows).reshape(-1, 4, 4)
-    tilted = np.abs(matrices[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) > ROUNDING
-    if tilted.any():
-        raise InputError(
-            f"{path}: image {images[int(np.argmax(tilted))].label}: the last row of its transform"
-            " is not 0 0 0 1; export the cameras again."
-        )
     turns = matrices[:, :3, :3]
-    for image, turn in zip(images, turns, strict=True):
-        checks.rotation(path, image.label, turn)
+    checks.rotations(path, [image.label for image in images], turns)
     u, _, v = np.linalg.svd(turns)
     matrices[:, :3, :3] = u @ v
     return matrices
@@ -272,16 +260,13 @@ def _in_world(poses: list[FloatArray], places: list[Similarity]) -> tuple[FloatA
     return centres, np.ascontiguousarray((turn @ to_chunk[:, :3, :3]).transpose(0, 2, 1))
 
 
-def _lenses(path: Path, images: list[Image]) -> tuple[tuple[Lens, ...], list[str]]:
+def _lenses(path: Path, images: list[Image]) -> tuple[tuple[Lens, ...], list[PcfixWarning]]:
     """Return the lens of each image, one object per sensor, and notes."""
     found: dict[Element | None, Lens] = {}
-    notes: list[str] = []
+    notes: list[PcfixWarning] = []
     for image in images:
         if image.sensor is None:
-            raise InputError(
-                f"{path}: image {image.label}: its sensor {image.element.get('sensor_id')} is not"
-                " in the file; export the cameras again."
-            )
+            raise damaged(path, f"sensor {image.element.get('sensor_id')} is missing")
         if image.sensor not in found:
             found[image.sensor] = sensors.lens_of(path, image.sensor, image.label)
             notes.extend(sensors.notes_on(path, image.sensor))

@@ -46,8 +46,6 @@ _OWN_NAMES = (
     *("f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2"),
     *(f"{role}_est" for role in POSE),
 )
-POSE = ("x", "y", "z", "longitude", "latitude", "yaw", "pitch", "roll", "omega", "phi", "kappa")
-
 SPELLINGS |= {name: (name,) for name in _OWN_NAMES}
 POSITION = {"label", "x", "y", "z", "longitude", "latitude", "tx", "ty", "tz"}
 POSITION |= {"x_est", "y_est", "z_est"}
@@ -128,9 +126,23 @@ def refuse_two_of_a_kind(path: Path, line: int, names: list[str]) -> None:
         there = [name for name in names if name in spellings]
         if len(there) > 1 and role not in MANY and (role not in there or there.count(role) > 1):
             raise InputError(
-                f"{path}: line {line}: the columns {', '.join(there)} may all be {role}; take"
-                " out all but one."
+                "table.columns_alike",
+                f"{path}: line {line}: the columns {', '.join(there)} may all be {role}. Take out"
+                " all but one.",
+                path=path,
+                columns=there,
             )
+
+
+def column_missing(path: Path, missing: Sequence[str], header: Sequence[str]) -> InputError:
+    """Return the error for a table that lacks columns."""
+    return InputError(
+        "table.column_missing",
+        f"{path}: the columns {', '.join(missing)} are missing. Its header has"
+        f" {', '.join(header)}.",
+        path=path,
+        columns=list(missing),
+    )
 
 
 def require_position(path: Path, line: int, names: list[str]) -> None:
@@ -140,15 +152,13 @@ def require_position(path: Path, line: int, names: list[str]) -> None:
         return
     if {"tx", "ty", "tz"} <= place.keys() and axes(place) is None:
         raise InputError(
-            f"{path}: line {line} has tx, ty, tz, which may be a translation or a projection"
-            " centre; give the projection centres as x, y, z."
+            "table.translations",
+            f"{path}: line {line} has tx, ty, tz, which may be translations or projection centres."
+            " Give the projection centres as x, y, z.",
+            path=path,
         )
     needed = ("label", "longitude", "latitude", "z") if "longitude" in place else ("label", *"xyz")
-    missing = [role for role in needed if role not in place]
-    raise InputError(
-        f"{path}: line {line} must name the columns {', '.join(needed)}; {', '.join(missing)}"
-        f" missing (it has: {', '.join(names)})."
-    )
+    raise column_missing(path, [role for role in needed if role not in place], names)
 
 
 DEGREES = {
@@ -226,8 +236,12 @@ class Columns:
         for i in np.flatnonzero(~np.isfinite(values)):
             if needed or texts[i]:
                 raise InputError(
-                    f"{self.where(int(i))}, column {self.name(role)}: '{texts[i]}' is not a"
-                    " finite number."
+                    "table.number",
+                    f"{self.where(int(i))}, column {self.name(role)}: '{texts[i]}' is not a finite"
+                    " number.",
+                    path=self.path,
+                    line=self.table.line[i],
+                    value=texts[i],
                 )
         return values * self._factor(role)
 
@@ -239,7 +253,10 @@ class Columns:
         known, wanted = (METRES, "metres") if base in LENGTHS else (DEGREES, "degrees")
         if unit not in known:
             raise InputError(
-                f"{self.path}: column {self.name(role)} is in '{unit}'; give {wanted}."
+                "table.unit",
+                f"{self.path}: column {self.name(role)} is in '{unit}'. Give {wanted}.",
+                path=self.path,
+                value=unit,
             )
         return known[unit]
 
@@ -250,8 +267,10 @@ def read_columns(path: Path) -> Columns:
     found = [header for header in headers(lines) if is_header(header.names)]
     if not found:
         raise InputError(
-            f"{path}: line 1 must name the columns; put a header above the rows, for example"
-            " label,x,y,z,omega,phi,kappa."
+            "table.no_header",
+            f"{path}: no line names the columns. Put a header above the rows, for example"
+            " label,x,y,z,omega,phi,kappa.",
+            path=path,
         )
     at, names, unit, comment = found[-1]
     refuse_two_of_a_kind(path, at + 1, names)

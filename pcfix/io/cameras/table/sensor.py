@@ -55,12 +55,18 @@ def read_sensor(path: Path) -> Lens:
         return _from_pixels(read_table(path, PIXELS))
     table = read_table(path, MILLIMETRES)
     focal, width, height = (table.numbers(name)[0] for name in MILLIMETRES)
-    if len(table.rows) != 1 or min(focal, width, height) <= 0.0:
+    _one_row(table)
+    return checks.lens(path, "of the sensor", _centred_mm(focal, width, height))
+
+
+def _one_row(table: Table) -> None:
+    if len(table.rows) != 1:
         raise InputError(
-            f"{path}: give one row of positive focal, sensor_x and sensor_y in mm, not"
-            f" {len(table.rows)} row(s) beginning {focal:g}, {width:g}, {height:g}."
+            "cameras.sensor_rows",
+            f"{table.path}: has {len(table.rows)} rows. Give one row for all images.",
+            path=table.path,
+            rows=len(table.rows),
         )
-    return _centred_mm(focal, width, height)
 
 
 def _centred_mm(focal: float, width: float, height: float) -> Lens:
@@ -72,12 +78,13 @@ def read_lenses(columns: Columns, sensor: Path | None) -> tuple[Lens, ...]:
     own = columns.has("f", "px", "py")
     path = sensor or columns.path.with_name("sensor.csv")
     if sensor is None and not path.is_file():
+        needed = "width_px,height_px" if own else "focal,sensor_x,sensor_y (mm)"
         raise InputError(
-            f"{columns.path}: has the shape of no image: give --sensor a table with the columns"
-            " width_px,height_px."
-            if own
-            else f"{columns.path}: has angles, but there is no sensor: give --sensor, put"
-            " sensor.csv (focal,sensor_x,sensor_y in mm) beside it, or leave the angles out."
+            "cameras.sensor_missing",
+            f"{columns.path}: has angles, but there is no sensor. Give --sensor a table with the"
+            f" columns {needed}, or put it beside as sensor.csv.",
+            path=columns.path,
+            columns=needed,
         )
     return _own_lenses(columns, path) if own else (read_sensor(path),) * len(columns.labels)
 
@@ -90,17 +97,16 @@ def _own_lenses(columns: Columns, sensor: Path) -> tuple[Lens, ...]:
     brown = np.nan_to_num(columns.where_there(DISTORTION))
     seen: dict[bytes, Lens] = {}
     lenses = []
-    for label, row in zip(columns.labels, np.hstack([rows, brown]), strict=True):
+    for row in np.hstack([rows, brown]):
         key = row.tobytes()
         if key not in seen:
             focal, x, y, *k = row.tolist()
-            lens = Lens(
+            seen[key] = Lens(
                 *(focal * largest / FILM_MM, width, height),
                 *(width / 2.0 + x * largest, height / 2.0 + y * largest),
                 radial=tuple(k[:4]),
                 tangential=tuple(k[4:]),
             )
-            seen[key] = checks.lens(columns.path, label, lens)
         lenses.append(seen[key])
     return tuple(lenses)
 
@@ -109,10 +115,6 @@ def _frame(path: Path) -> tuple[float, float]:
     """Return width and height of the images, pixels or millimetres."""
     if not _is_xml(check_input(path)) and _names(path) >= set(FRAME):
         width, height = (read_table(path, FRAME).numbers(name)[0] for name in FRAME)
-        if min(width, height) <= 0.0:
-            raise InputError(
-                f"{path}: width_px {width:g} and height_px {height:g} must be positive."
-            )
         return width, height
     lens = read_sensor(path)
     return lens.width, lens.height
@@ -120,8 +122,7 @@ def _frame(path: Path) -> tuple[float, float]:
 
 def _from_pixels(table: Table) -> Lens:
     """Return the lens of a row in pixels, with OpenCV's names."""
-    if len(table.rows) != 1:
-        raise InputError(f"{table.path}: give one row for all images, not {len(table.rows)}.")
+    _one_row(table)
 
     def value(name: str, default: float = 0.0) -> float:
         return table.numbers(name)[0] if name in table.header else default
@@ -138,8 +139,10 @@ def _from_pixels(table: Table) -> Lens:
     checks.lens(table.path, table.path.stem, lens)
     if not (0.25 < cx / width < 0.75 and 0.25 < cy / height < 0.75):
         raise InputError(
-            f"{table.path}: cx {cx:g}, cy {cy:g} is far from the centre; count them"
-            " in pixels from its upper left corner."
+            "cameras.principal_point",
+            f"{table.path}: cx {cx:g}, cy {cy:g} is far from the centre of the image. Give pixels"
+            " from its upper left corner.",
+            path=table.path,
         )
     return lens
 
@@ -177,11 +180,14 @@ def write_table(folder: File, cameras: Cameras) -> None:
     """
     target = Path(folder)
     if cameras.rotations is None or cameras.lenses is None:
-        raise InputError(f"{target}: a table of poses needs rotations and lenses of all images.")
+        raise checks.needs_lenses(target)
     if cameras.crs is not None and is_topocentric(cameras.crs):
         raise InputError(
-            f"{target}: a table cannot say that its axes are {cameras.crs}; bring the cameras to a"
-            " projected CRS first."
+            "output.crs",
+            f"{target}: a table cannot hold the axes {cameras.crs}. Bring the cameras to a"
+            " projected CRS first.",
+            path=target,
+            crs=cameras.crs,
         )
     distinct = list(dict.fromkeys(cameras.lenses))
     if len(distinct) == 1:
@@ -190,8 +196,10 @@ def write_table(folder: File, cameras: Cameras) -> None:
         frames = {(lens.width, lens.height, lens.unit) for lens in distinct}
         if len(frames) > 1 or distinct[0].unit != "px":
             raise InputError(
-                f"{target}: a table of poses holds several lenses only in pixels and of one frame;"
-                " take another form."
+                "output.lens",
+                f"{target}: a table holds several lenses only in pixels and of one frame size. Take"
+                " another format.",
+                path=target,
             )
         sensor = _row({"width_px": distinct[0].width, "height_px": distinct[0].height})
         poses = _poses(cameras, [_own(target, lens) for lens in cameras.lenses])
@@ -249,11 +257,7 @@ def _brown(target: Path, lens: Lens, counts: Sequence[int]) -> list[tuple[float,
 
 def _check_held(target: Path, lens: Lens, held: Lens) -> None:
     if not is_same_lens(lens, held):
-        raise InputError(
-            f"{target}: a table of poses cannot hold the lens {lens.sensor or 'of the images'}"
-            f" ({lens.projection}) exactly: it knows one focal length, the principal point and"
-            " OpenCV's k and p; take another form."
-        )
+        raise checks.lens_not_held(target, lens)
 
 
 def _row(values: dict[str, float]) -> str:
