@@ -12,6 +12,8 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from pcfix.errors import InputError, SettingError
 from pcfix.io.cameras import (
     blocksexchange,
@@ -246,7 +248,7 @@ def _format_of(source: Source) -> CameraFormat | None:
 
 def _knows(form: CameraFormat, source: Source) -> bool:
     """Whether a file is of a format; not where it is too damaged to tell."""
-    with suppress(InputError, *DAMAGES):
+    with suppress(InputError, *DAMAGES), np.errstate(all="ignore"):
         return form.reader.recognises(source)
     return False
 

@@ -28,7 +28,6 @@ POSES = "Give the file or folder with the camera poses"
 UNPACK = "Unpack it, then give the file or folder with the camera poses"
 OPK = "Write a table with the header label,x,y,z,omega,phi,kappa and give its lens by --sensor"
 COLMAP = "Export a COLMAP model (cameras, images, points3D)"
-METASHAPE = "In Metashape, use File > Export > Export Cameras, Agisoft XML"
 
 IMAGE = Refusal("an image", POSES)
 PIX4D = Refusal("a project of Pix4D", "Give its folder 1_initial/params")
@@ -58,14 +57,7 @@ CONTENTS = (
     (rb"\A\x1f\x8b", Refusal("an archive (gzip)", UNPACK)),
     (rb"\APK[\x03\x05]", Refusal("an archive (ZIP)", UNPACK)),
     (rb"\AMVS[I\0]", Refusal("a scene of OpenMVS", f"{COLMAP} from what OpenMVS was run on")),
-    (rb"<pix4uav|<!DOCTYPE Pix4D", PIX4D),
-    (
-        rb"\A\s*(<\?xml[^>]*>\s*)?<document[^>]*\bpath=",
-        Refusal(
-            "a project of Metashape without its poses",
-            f"Keep the folder .files beside it. Or, {METASHAPE[0].lower()}{METASHAPE[1:]}",
-        ),
-    ),
+    (rb"<!DOCTYPE Pix4D", PIX4D),
     (
         rb"<Reality(Capture|Scan)",
         Refusal(

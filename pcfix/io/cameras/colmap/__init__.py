@@ -89,7 +89,7 @@ def read(source: Source) -> Cameras:
         rotations=rotations,
         lenses=tuple(lenses[image.camera] for image in posed),
         crs=None if place is None else place.crs,
-        notes=(*((several,) if model.others else ()), *incomplete_notes(model), *notes),
+        notes=(several, *notes) if model.others else notes,
         gnss=gnss,
         unposed=tuple(image.name for image in images if not image.posed),
         source="COLMAP",
@@ -161,24 +161,6 @@ def _in_folder(folder: Path, *suffixes: str) -> Model | None:
             if _CAMERA_LINE.search(stream.read(4096)):
                 return model
     return None
-
-
-def incomplete_notes(model: Model) -> tuple[PcfixWarning, ...]:
-    """Return a note on each incomplete model beside the one that is read."""
-    folder, notes = model.folder, []
-    beside = folder.parent.iterdir() if folder.name.isdecimal() else ()
-    for other in (folder, *sorted(p for p in beside if p.name.isdecimal() and p.is_dir())):
-        names = {path.name for path in other.iterdir()}
-        for suffix in ("bin", "txt"):
-            parts = [f"{part}.{suffix}" for part in ("cameras", "images", "points3D")]
-            lacks = [part for part in parts if part not in names]
-            if 0 < len(lacks) < len(parts) and (other, suffix) != (folder, model.suffix):
-                sentence = (
-                    f"{other}: a model beside the one that is read lacks {' and '.join(lacks)} and"
-                    " is left out. Export it again if it belongs to the block."
-                )
-                notes.append(PcfixWarning("cameras.incomplete_model", sentence, missing=lacks))
-    return tuple(notes)
 
 
 FILE = "georeference.json"
