@@ -12,8 +12,7 @@ import numpy as np
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.cameras import read_cameras, table
 from pcfix.io.cameras.formats import Source
-from pcfix.io.cameras.frames import is_tied
-from pcfix.io.cameras.georeference import adjusted_minus_gnss
+from pcfix.io.cameras.georeference import adjusted_minus_gnss, is_tied
 from pcfix.io.cameras.odm import read_images
 from pcfix.io.cameras.table import gnss_positions, open_table
 from pcfix.io.cameras.table.columns import Columns

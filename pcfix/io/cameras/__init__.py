@@ -39,6 +39,7 @@ from pcfix.io.cameras.checks import (
     no_pose,
     reading,
     sensor_unused,
+    wrong,
 )
 from pcfix.io.cameras.formats import Angles, CameraFormat, Source, SparseReader
 from pcfix.io.cameras.table.sensor import read_sensor
@@ -208,20 +209,15 @@ def _recognised(
     inside = _camera_files(where)
     if inside:
         listed = " and ".join(f"{name} ({software})" for name, software in inside)
-        raise InputError(
-            "cameras.folder",
-            f"{where}: is a folder that holds {listed}. Give {where / inside[0][0]} itself.",
-            path=where,
-            files=[name for name, _ in inside],
-        )
+        sentence = f"is a folder that holds {listed}. Give {where / inside[0][0]} itself."
+        raise wrong(where, "cameras.folder", sentence, files=[name for name, _ in inside])
     if known is not None:
         return source, known
-    raise InputError(
-        "cameras.unknown",
-        f"{where}: is not a camera file that pcfix knows. Give a CSV table with the columns label,"
-        " x, y, z and, if you have them, yaw, pitch, roll.",
-        path=where,
+    sentence = (
+        "is not a camera file that pcfix knows. Give a CSV table with the columns label, x, y, z"
+        " and, if you have them, yaw, pitch, roll."
     )
+    raise wrong(where, "cameras.unknown", sentence)
 
 
 def takes_sensor(path: File) -> bool:

@@ -42,7 +42,7 @@ import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.cameras import checks, tracks
-from pcfix.io.cameras.checks import damaged, number, read_xml
+from pcfix.io.cameras.checks import damaged, number, read_xml, wrong
 from pcfix.io.cameras.formats import Source
 from pcfix.lens.rotations import from_omega_phi_kappa, from_photogrammetric
 from pcfix.model import BoolArray, Cameras, FloatArray, GnssPositions, IntArray, Lens, TiePoints
@@ -219,11 +219,8 @@ def _of_one_frame(
     twice = [p.label for p in kept if block_of.setdefault(p.label, p.key[0]) != p.key[0]]
     if twice or len(systems) > 1:
         why = f"image {twice[0]} is in several blocks" if twice else "it has several SRS"
-        raise InputError(
-            "cameras.several_blocks",
-            f"{path}: {why}. Export the one block that the cloud was made from, in one SRS.",
-            path=path,
-        )
+        sentence = f"{why}. Export the one block that the cloud was made from, in one SRS."
+        raise wrong(path, "cameras.several_blocks", sentence)
     return kept, tuple(notes)
 
 

@@ -35,6 +35,11 @@ DAMAGES = (
 """What readers run into where a file is cut off, or holds something else than it should."""
 
 
+def wrong(path: object, code: str, sentence: str, **values: Any) -> InputError:
+    """Return the error for a file: its path, what is wrong, and what to do."""
+    return InputError(code, f"{path}: {sentence}", **{"path": path, **values})
+
+
 def damaged(path: object, why: object, **values: Any) -> InputError:
     """Return the error for contents that no software writes."""
     sentence = f"{path}: is damaged or cut off ({why}). Export it again."
@@ -55,7 +60,7 @@ def unsupported(path: Path, what: str, remedy: str, **values: Any) -> InputError
 
 def missing(path: Path, remedy: str = "Keep all files of the project together") -> InputError:
     """Return the error for a file of a project that is not there."""
-    return InputError("cameras.missing_file", f"{path}: is missing. {remedy}.", path=path)
+    return wrong(path, "cameras.missing_file", f"is missing. {remedy}.")
 
 
 def several(path: Path, count: int, images: int) -> PcfixWarning:
@@ -103,16 +108,14 @@ def rotations(path: Path, labels: Sequence[str], matrices: FloatArray) -> FloatA
     """Return the proper rotations closest to matrices, shape (k, 3, 3), rounded in their file."""
     matrices = np.asarray(matrices, np.float64).reshape(-1, 3, 3)
     off = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    wrong = ~((off <= ROUNDING) & (np.linalg.det(np.nan_to_num(matrices, posinf=0.0)) > 0.0))
-    if wrong.any():
-        label = labels[int(np.argmax(wrong))]
-        raise InputError(
-            "cameras.rotation",
-            f"{path}: the rotation of {label} is mirrored, or its axes are not at right angles."
-            " Export the poses again.",
-            path=path,
-            image=label,
+    bad = ~((off <= ROUNDING) & (np.linalg.det(np.nan_to_num(matrices, posinf=0.0)) > 0.0))
+    if bad.any():
+        label = labels[int(np.argmax(bad))]
+        sentence = (
+            f"the rotation of {label} is mirrored, or its axes are not at right angles. Export the"
+            " poses again."
         )
+        raise wrong(path, "cameras.rotation", sentence, image=label)
     for _ in range(2):  # Newton's iteration to the polar factor squares the rounding each time
         matrices = 1.5 * matrices - 0.5 * matrices @ matrices.transpose(0, 2, 1) @ matrices
     return matrices
@@ -122,15 +125,11 @@ def quaternions(path: Path, labels: Sequence[str], wxyz: FloatArray) -> FloatArr
     """Return the rotations, shape (k, 3, 3), of unit quaternions (k, 4), the scalar first."""
     from scipy.spatial.transform import Rotation
 
-    wrong = ~(np.abs(np.linalg.norm(wxyz, axis=1) - 1.0) <= ROUNDING)
-    if wrong.any():
-        label = labels[int(np.argmax(wrong))]
-        raise InputError(
-            "cameras.rotation",
-            f"{path}: the quaternion of {label} has not the length 1. Export the poses again.",
-            path=path,
-            image=label,
-        )
+    bad = ~(np.abs(np.linalg.norm(wxyz, axis=1) - 1.0) <= ROUNDING)
+    if bad.any():
+        label = labels[int(np.argmax(bad))]
+        sentence = f"the quaternion of {label} has not the length 1. Export the poses again."
+        raise wrong(path, "cameras.rotation", sentence, image=label)
     return np.asarray(Rotation.from_quat(np.roll(wxyz, -1, axis=1)).as_matrix())
 
 
@@ -140,14 +139,11 @@ def lens(path: Path, name: str, given: Lens) -> Lens:
     numbers = (*_lengths(given), *itertools.chain(*lists), *given.distortion_centre)
     positive = min(given.focal, given.focal + given.b1, given.width, given.height) > 0.0
     if not (positive and np.isfinite(numbers).all()):
-        raise InputError(
-            "cameras.lens",
-            f"{path}: the lens {name} has the focal length {given.focal:g} and the frame"
-            f" {given.width:g} x {given.height:g}, or a number that is not finite. Export the"
-            " calibration again.",
-            path=path,
-            lens=name,
+        sentence = (
+            f"the lens {name} has the focal length {given.focal:g} and the frame {given.width:g} x"
+            f" {given.height:g}, or a number that is not finite. Export the calibration again."
         )
+        raise wrong(path, "cameras.lens", sentence, lens=name)
     return given
 
 
@@ -177,13 +173,11 @@ def crs(path: Path, definition: str) -> str:
     if text.lower() == "local" or text.upper().startswith(("LOCAL_CS", "ENGCRS", "ENGINEERINGCRS")):
         return "local"
     if not names_crs(text):
-        raise InputError(
-            "cameras.crs",
-            f"{path}: PROJ does not know the CRS '{text[:80]}'. Export the poses in a CRS with an"
-            " EPSG code.",
-            path=path,
-            crs=text,
+        sentence = (
+            f"PROJ does not know the CRS '{text[:80]}'. Export the poses in a CRS with an EPSG"
+            " code."
         )
+        raise wrong(path, "cameras.crs", sentence, crs=text)
     return text
 
 
@@ -269,13 +263,8 @@ def number(path: Path, where: str, text: str | None) -> float:
         value = np.nan
     if not np.isfinite(value):
         shown = (text or "").strip()
-        raise InputError(
-            "cameras.number",
-            f"{path}: {where}: '{shown}' is not a number. Export it again.",
-            path=path,
-            where=where,
-            value=shown,
-        )
+        sentence = f"{where}: '{shown}' is not a number. Export it again."
+        raise wrong(path, "cameras.number", sentence, where=where, value=shown)
     return value
 
 

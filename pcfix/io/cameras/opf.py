@@ -30,9 +30,9 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from pcfix.errors import InputError, PcfixWarning
+from pcfix.errors import PcfixWarning
 from pcfix.io.cameras import checks, tracks
-from pcfix.io.cameras.checks import load_json, triple
+from pcfix.io.cameras.checks import load_json, triple, wrong
 from pcfix.io.cameras.formats import Source
 from pcfix.io.crs import crs_text, parse_crs, plan_unit
 from pcfix.lens.rotations import from_omega_phi_kappa
@@ -126,13 +126,11 @@ def _open_project(path: Path) -> Project:
         above = path.resolve().parent
         found = [*sorted(above.glob("*.opf")), *sorted(above.parent.glob("*.opf"))]
     if len(found) != 1 or found[0] == path:
-        raise InputError(
-            "cameras.several_projects",
-            f"{path}: belongs to an OPF project, of which {len(found)} are there. Give the project"
-            " file (.opf) that goes with the cloud.",
-            path=path,
-            projects=len(found),
+        sentence = (
+            f"belongs to an OPF project, of which {len(found)} are there. Give the project file"
+            " (.opf) that goes with the cloud."
         )
+        raise wrong(path, "cameras.several_projects", sentence, projects=len(found))
     return _open_project(found[0])
 
 

@@ -728,7 +728,7 @@ def test_other_archives_are_not_recognised(tmp_path):
             chunk(cameras=camera(0, "<transform>-1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1</transform>")),
             "cameras.rotation",
         ),
-        (chunk(rest=transform(rotation="1 0 0 0 1 0 0 0 -1")), "cameras.rotation"),
+        (chunk(rest=transform(rotation="1 0 0 0 1 0 0 0 2")), "cameras.rotation"),
         (chunk(rest=transform(scale="-1")), "cameras.damaged"),
         (chunk(rest=transform("x 1 2")), "cameras.number"),
         (chunk(cameras=camera(0, reference('x="1" y="2" z="3" sxy="1 2 3"'))), "cameras.damaged"),

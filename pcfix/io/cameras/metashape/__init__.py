@@ -222,9 +222,9 @@ def _component(
 ) -> Seen:
     """Return the points of one component and where the images in `rows` saw them."""
     vertices = _vertices(archive, points, POINTS)
-    xyz = block.places[rows[0]].points(
-        np.column_stack([vertices[axis] for axis in "xyz"]).astype(np.float64)
-    )
+    place = block.places[rows[0]]
+    xyz = np.column_stack([vertices[axis] for axis in "xyz"]).astype(np.float64)
+    xyz = xyz @ place[:3, :3].T + place[:3, 3]
     order = np.argsort(vertices["id"], kind="stable")
     ids = vertices["id"][order].astype(np.int64)
     point, camera, uv = [], [], []

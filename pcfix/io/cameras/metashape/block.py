@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree.ElementTree import Element
@@ -18,54 +17,38 @@ from pcfix.io.cameras.metashape.documents import Chunk
 from pcfix.io.crs import METRES, crs_text, is_local, parse_crs, shortened, unbound
 from pcfix.model import Cameras, FloatArray, Lens
 
-
-@dataclass(frozen=True, eq=False)
-class Similarity:
-    """world = scale rotation X + translation."""
-
-    scale: float
-    rotation: FloatArray
-    translation: FloatArray
-
-    def points(self, xyz: FloatArray) -> FloatArray:
-        """Return points of the chunk, shape (n, 3), in the world."""
-        return np.asarray(self.scale * xyz @ self.rotation.T + self.translation)
+LOCAL = "local"
+CHUNK = np.eye(4)
+"""Where the chunk has no place in the world, its own frame is taken."""
 
 
-IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
-
-
-def _similarity(path: Path, element: Element | None) -> Similarity | None:
-    """Return a transform of three parts, or of one 4x4 matrix that holds the scale too."""
+def _similarity(path: Path, element: Element | None) -> FloatArray | None:
+    """Return the 4x4 matrix of a transform that is one matrix, or has up to three parts."""
     if element is None:
         return None
-    where = "transform of the chunk"
-    scale, rotation, translation = 1.0, np.eye(3), np.zeros(3)
+    where, matrix = "transform of the chunk", np.eye(4)
+    scale, rotation, translation = map(element.findtext, ("scale", "rotation", "translation"))
     if (element.text or "").strip():
         matrix = numbers(path, where, element.text, 16).reshape(4, 4)
-        scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-        rotation, translation = matrix[:3, :3] / (scale or 1.0), matrix[:3, 3]
-    else:
-        given = {tag: element.findtext(tag) for tag in ("scale", "rotation", "translation")}
-        if not any(text is not None for text in given.values()):
-            return None
-        if given["scale"] is not None:
-            scale = number(path, where, given["scale"])
-        if given["rotation"] is not None:
-            rotation = numbers(path, where, given["rotation"], 9).reshape(3, 3)
-        if given["translation"] is not None:
-            translation = numbers(path, where, given["translation"], 3)
-    rotation = checks.rotations(path, [where], rotation)[0]
-    if not scale > 0.0:
-        raise damaged(path, f"{where}: the scale {scale:g} is not positive")
-    return Similarity(scale, rotation, translation)
+    elif scale is None and rotation is None and translation is None:
+        return None
+    if rotation is not None:
+        matrix[:3, :3] = numbers(path, where, rotation, 9).reshape(3, 3)
+    if translation is not None:
+        matrix[:3, 3] = numbers(path, where, translation, 3)
+    inside = float(np.cbrt(np.linalg.det(matrix[:3, :3]))) if scale is None else 1.0
+    size = inside if scale is None else number(path, where, scale)
+    if not size > 0.0:
+        raise damaged(path, f"{where}: the scale {size:g} is not positive")
+    matrix[:3, :3] = size * checks.rotations(path, [where], matrix[:3, :3] / inside)[0]
+    return matrix
 
 
 def _world(path: Path, chunk: Element) -> tuple[str, str | None, tuple[PcfixWarning, ...]]:
     """Return the frame that a chunk's transforms lead to, its CRS if another, and notes on them."""
     text = (chunk.findtext("reference") or "").strip()
     if not text or text.upper() == "LOCAL":
-        return "local", None, ()
+        return LOCAL, None, ()
     crs = parse_crs(text, str(path))
     if is_local(crs):
         unit = crs.axis_info[0].unit_name
@@ -74,7 +57,7 @@ def _world(path: Path, chunk: Element) -> tuple[str, str | None, tuple[PcfixWarn
             " Scale a cloud that was exported in that unit."
         )
         note = PcfixWarning("cameras.local_unit", sentence, unit=unit)
-        return "local", None, () if unit in METRES else (note,)
+        return LOCAL, None, () if unit in METRES else (note,)
     base = None if crs.geodetic_crs is None else unbound(crs.geodetic_crs)
     if base is None:
         remedy = "Set it again in Metashape's reference settings"
@@ -111,10 +94,10 @@ class Image(NamedTuple):
 
 
 class Block(NamedTuple):
-    """The images with a pose, in the order of the file, and how the chunk lies in the world."""
+    """The images with a pose, in the order of the file, and their matrices from chunk to world."""
 
     images: list[Image]
-    places: list[Similarity]
+    places: list[FloatArray]
     cameras: Cameras
 
 
@@ -132,15 +115,18 @@ def read_block(chunk: Chunk) -> Block:
         chunk_name = element.get("label") or "without a name"
         rest = ", ".join([f"{len(images) - len(poses)} are not aligned", *why])
         raise checks.no_pose(path, f"of the {len(images)} images of chunk {chunk_name} {rest}")
-    local = IDENTITY in places
-    crs, project_crs, of_world = ("local", None, ()) if local else _world(path, element)
-    centres, rotations = _in_world([poses[image.id] for image in kept], places)
+    if any(place is CHUNK for place in places):
+        crs, project_crs, of_world = LOCAL, None, ()
+    else:
+        crs, project_crs, of_world = _world(path, element)
+    in_world = np.array(places) @ np.array([poses[image.id] for image in kept])
+    scales = np.cbrt(np.linalg.det(in_world[:, :3, :3]))[:, None, None]
     lenses, of_lenses = _lenses(path, kept)
     chosen = {image.id for image in kept}
     cameras = Cameras(
         labels=tuple(image.label for image in kept),
-        centres=centres,
-        rotations=rotations,
+        centres=in_world[:, :3, 3],
+        rotations=np.ascontiguousarray((in_world[:, :3, :3] / scales).transpose(0, 2, 1)),
         lenses=lenses,
         crs=crs,
         project_crs=project_crs,
@@ -209,7 +195,7 @@ def _matrices(path: Path, images: list[Image]) -> FloatArray:
 
 def _select(
     path: Path, chunk: Element, posed: list[Image]
-) -> tuple[list[Image], list[Similarity], list[str]]:
+) -> tuple[list[Image], list[FloatArray], list[str]]:
     """Return the images to use, the way of each to the world, and what the others are."""
     kept, places = [], []
     why: Counter[str] = Counter()
@@ -227,7 +213,7 @@ def _select(
     return kept, places, [f"{count} images are {reason}" for reason, count in why.items()]
 
 
-def _places(path: Path, chunk: Element, posed: list[Image]) -> list[Similarity | None]:
+def _places(path: Path, chunk: Element, posed: list[Image]) -> list[FloatArray | None]:
     """Return the way of each image to the world, None where its component has no place in it.
 
     Every component has a frame of its own. One with a transform has a place in the world; one
@@ -240,24 +226,14 @@ def _places(path: Path, chunk: Element, posed: list[Image]) -> list[Similarity |
     parent = chunk.find("components")
     active = None if parent is None else parent.get("active_id")
     main = active if active in own else next(iter(own), None)
-    in_chunk = [i.component in (None, main) or i.component not in own for i in posed]
-    places = [
-        own.get(image.component) or (of_chunk if is_main else None)
-        for image, is_main in zip(posed, in_chunk, strict=True)
-    ]
-    if any(places):
-        return places
-    return [IDENTITY if is_main else None for is_main in in_chunk]
-
-
-def _in_world(poses: list[FloatArray], places: list[Similarity]) -> tuple[FloatArray, FloatArray]:
-    """Return centres, shape (k, 3), and rotations world to camera, (k, 3, 3)."""
-    to_chunk = np.array(poses)
-    turn = np.array([place.rotation for place in places])
-    scale = np.array([place.scale for place in places])
-    shift = np.array([place.translation for place in places])
-    centres = scale[:, None] * np.einsum("kij,kj->ki", turn, to_chunk[:, :3, 3]) + shift
-    return centres, np.ascontiguousarray((turn @ to_chunk[:, :3, :3]).transpose(0, 2, 1))
+    of_main: list[FloatArray | None] = []
+    places: list[FloatArray | None] = []
+    for image in posed:
+        is_main = image.component in (None, main) or image.component not in own
+        component = own.get(image.component)
+        of_main.append(CHUNK if is_main else None)
+        places.append(of_chunk if component is None and is_main else component)
+    return places if any(place is not None for place in places) else of_main
 
 
 def _lenses(path: Path, images: list[Image]) -> tuple[tuple[Lens, ...], list[PcfixWarning]]:

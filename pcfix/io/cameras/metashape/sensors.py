@@ -21,9 +21,9 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from pcfix.errors import InputError, PcfixWarning
+from pcfix.errors import PcfixWarning
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import damaged, number, numbers, read_xml, without_zeros
+from pcfix.io.cameras.checks import damaged, number, numbers, read_xml, without_zeros, wrong
 from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.metashape import documents
 from pcfix.model import FloatArray, Lens, Projection
@@ -45,12 +45,11 @@ def read_calibration(path: Path) -> Lens:
     """Read a calibration that Metashape saved on its own (root element ``calibration``), pixels."""
     root = read_xml(path)
     if root.tag != "calibration":
-        raise InputError(
-            "cameras.no_calibration",
-            f"{path}: is not a calibration of Metashape ({root.tag}). Save it from Tools, Camera"
-            " Calibration.",
-            path=path,
+        sentence = (
+            f"is not a calibration of Metashape ({root.tag}). Save it from Tools, Camera"
+            " Calibration."
         )
+        raise wrong(path, "cameras.no_calibration", sentence)
     kind = (root.findtext("projection") or "frame").strip()
     if kind not in PROJECTIONS:
         remedy = f"Use a lens of type {', '.join(PROJECTIONS)}"
@@ -117,13 +116,11 @@ def lens_of(path: Path, sensor: Element, image: str) -> Lens:
         return replace(lens, pixel_size_mm=pixel_mm)
     focal_mm = _property(path, sensor, "focal_length")
     if found is not None or size is None or focal_mm is None or pixel_mm is None:
-        raise InputError(
-            "cameras.no_calibration",
-            f"{path}: the sensor {label} of image {image} has no calibration, or no size. Align the"
-            " images in Metashape and export the cameras again.",
-            path=path,
-            sensor=label,
+        sentence = (
+            f"the sensor {label} of image {image} has no calibration, or no size. Align the images"
+            " in Metashape and export the cameras again."
         )
+        raise wrong(path, "cameras.no_calibration", sentence, sensor=label)
     width, height = size
     return Lens(  # what Metashape itself starts from: the data sheet, no distortion
         *(focal_mm / pixel_mm, width, height, width / 2.0, height / 2.0),

@@ -25,7 +25,6 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.errors import InputError
 from pcfix.io.cameras.checks import (
     bad_label,
     damaged,
@@ -34,9 +33,9 @@ from pcfix.io.cameras.checks import (
     needs_lenses,
     unsupported,
     write_new,
+    wrong,
 )
-from pcfix.io.cameras.frames import frame_of, is_tied
-from pcfix.io.cameras.georeference import georeference
+from pcfix.io.cameras.georeference import frame_of, georeference, is_tied
 from pcfix.io.cameras.tracks import NO_TIE_POINTS, are_seen
 from pcfix.io.crs import (
     GEOCENTRIC_WGS84,
@@ -224,12 +223,8 @@ def _world(
     if is_topocentric(cameras.crs):
         return cameras, points, Topocentric.from_text(cameras.crs, name)
     if not parse_crs(cameras.crs, name).is_projected:
-        raise InputError(
-            "output.crs",
-            f"{name}: the cameras are in {shortened(cameras.crs)}. Bring them to a projected CRS.",
-            path=name,
-            crs=cameras.crs,
-        )
+        sentence = f"the cameras are in {shortened(cameras.crs)}. Bring them to a projected CRS."
+        raise wrong(name, "output.crs", sentence, crs=cameras.crs)
     source, geographic = frame_of(cameras.crs, name).crs, parse_crs(GEOGRAPHIC_WGS84, name)
     stated = heights_of(source) != "unstated"
     way = transformation_in_space if stated else transformation_in_plan

@@ -29,9 +29,9 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from pcfix.errors import InputError, PcfixWarning
+from pcfix.errors import PcfixWarning
 from pcfix.io.cameras import checks, tracks
-from pcfix.io.cameras.checks import damaged, number, read_xml
+from pcfix.io.cameras.checks import damaged, number, read_xml, wrong
 from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.pix4d import tables
 from pcfix.io.cameras.pix4d.tables import read_text
@@ -128,13 +128,11 @@ def _in_folders(root: Path) -> Files:
     for folder in _folders(root):
         prefixes = _prefixes(folder)
         if len(prefixes) > 1:
-            raise InputError(
-                "cameras.several_projects",
-                f"{folder}: holds the tables of several projects ({', '.join(sorted(prefixes))})."
-                " Give one of the files instead.",
-                path=folder,
-                projects=len(prefixes),
+            sentence = (
+                f"holds the tables of several projects ({', '.join(sorted(prefixes))}). Give one of"
+                " the files instead."
             )
+            raise wrong(folder, "cameras.several_projects", sentence, projects=len(prefixes))
         if prefixes:
             return _named(folder, prefixes.pop())
     return {}

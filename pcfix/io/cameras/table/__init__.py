@@ -44,6 +44,7 @@ import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.cameras import checks
+from pcfix.io.cameras.checks import wrong
 from pcfix.io.cameras.formats import Angles, Source
 from pcfix.io.cameras.table.columns import (
     EXIF,
@@ -164,15 +165,14 @@ def centres(columns: Columns, suffix: str = "", *, needed: bool = False) -> Floa
             beyond = [text[:1].upper() in ("S", "W") for text in texts]
             xyz[beyond, i] = -np.abs(xyz[beyond, i])
     if three[0].startswith("longitude") or _is_geographic(crs(columns)[0]):
-        wrong = (np.abs(xyz[:, :2]) > [360.0, 90.0]).any(axis=1)
-        if wrong.any():
-            i = int(np.argmax(wrong))
-            raise InputError(
-                "cameras.degrees",
-                f"{columns.where(i)}: longitude {xyz[i, 0]:g}, latitude {xyz[i, 1]:g} is no place"
-                " on earth. Are the columns swapped, or metres?",
-                path=columns.path,
+        bad = (np.abs(xyz[:, :2]) > [360.0, 90.0]).any(axis=1)
+        if bad.any():
+            i = int(np.argmax(bad))
+            sentence = (
+                f"longitude {xyz[i, 0]:g}, latitude {xyz[i, 1]:g} is no place on earth. Are the"
+                " columns swapped, or metres?"
             )
+            raise wrong(columns.where(i), "cameras.degrees", sentence, path=columns.path)
     xyz[np.isnan(xyz).any(axis=1)] = np.nan
     return xyz
 
@@ -307,10 +307,14 @@ def _from_omega_phi_kappa(columns: Columns, opk: Sequence[str]) -> FloatArray:
         apart_deg = np.degrees(2.0 * np.arcsin(np.minimum(half_chord, 1.0)))
         worst = int(np.argmax(apart_deg))
         if apart_deg[worst] > AGREEMENT_DEG:
-            raise InputError(
+            sentence = (
+                f"omega, phi, kappa and r11 to r33 are {apart_deg[worst]:.3g} degrees apart. Export"
+                " the table again."
+            )
+            raise wrong(
+                columns.where(worst),
                 "cameras.angles_differ",
-                f"{columns.where(worst)}: omega, phi, kappa and r11 to r33 are"
-                f" {apart_deg[worst]:.3g} degrees apart. Export the table again.",
+                sentence,
                 path=columns.path,
                 degrees=float(apart_deg[worst]),
             )

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.errors import InputError
+from pcfix.io.cameras.checks import wrong
 from pcfix.io.tables import Table, delimiter_of, number, read_lines, split_header, table_below
 from pcfix.model import FloatArray, IntArray
 
@@ -125,24 +126,17 @@ def refuse_two_of_a_kind(path: Path, line: int, names: list[str]) -> None:
     for role, spellings in SPELLINGS.items():
         there = [name for name in names if name in spellings]
         if len(there) > 1 and role not in MANY and (role not in there or there.count(role) > 1):
-            raise InputError(
-                "table.columns_alike",
-                f"{path}: line {line}: the columns {', '.join(there)} may all be {role}. Take out"
-                " all but one.",
-                path=path,
-                columns=there,
+            sentence = (
+                f"line {line}: the columns {', '.join(there)} may all be {role}. Take out all but"
+                " one."
             )
+            raise wrong(path, "table.columns_alike", sentence, columns=there)
 
 
 def column_missing(path: Path, missing: Sequence[str], header: Sequence[str]) -> InputError:
     """Return the error for a table that lacks columns."""
-    return InputError(
-        "table.column_missing",
-        f"{path}: the columns {', '.join(missing)} are missing. Its header has"
-        f" {', '.join(header)}.",
-        path=path,
-        columns=list(missing),
-    )
+    sentence = f"the columns {', '.join(missing)} are missing. Its header has {', '.join(header)}."
+    return wrong(path, "table.column_missing", sentence, columns=list(missing))
 
 
 def require_position(path: Path, line: int, names: list[str]) -> None:
@@ -151,12 +145,11 @@ def require_position(path: Path, line: int, names: list[str]) -> None:
     if "label" in place and (axes(place) or axes(place, "_est")):
         return
     if {"tx", "ty", "tz"} <= place.keys() and axes(place) is None:
-        raise InputError(
-            "table.translations",
-            f"{path}: line {line} has tx, ty, tz, which may be translations or projection centres."
-            " Give the projection centres as x, y, z.",
-            path=path,
+        sentence = (
+            f"line {line} has tx, ty, tz, which may be translations or projection centres. Give the"
+            " projection centres as x, y, z."
         )
+        raise wrong(path, "table.translations", sentence)
     needed = ("label", "longitude", "latitude", "z") if "longitude" in place else ("label", *"xyz")
     raise column_missing(path, [role for role in needed if role not in place], names)
 
@@ -252,12 +245,8 @@ class Columns:
             return 1.0
         known, wanted = (METRES, "metres") if base in LENGTHS else (DEGREES, "degrees")
         if unit not in known:
-            raise InputError(
-                "table.unit",
-                f"{self.path}: column {self.name(role)} is in '{unit}'. Give {wanted}.",
-                path=self.path,
-                value=unit,
-            )
+            sentence = f"column {self.name(role)} is in '{unit}'. Give {wanted}."
+            raise wrong(self.path, "table.unit", sentence, value=unit)
         return known[unit]
 
 
@@ -266,12 +255,11 @@ def read_columns(path: Path) -> Columns:
     lines = read_lines(path)
     found = [header for header in headers(lines) if is_header(header.names)]
     if not found:
-        raise InputError(
-            "table.no_header",
-            f"{path}: no line names the columns. Put a header above the rows, for example"
-            " label,x,y,z,omega,phi,kappa.",
-            path=path,
+        sentence = (
+            "no line names the columns. Put a header above the rows, for example"
+            " label,x,y,z,omega,phi,kappa."
         )
+        raise wrong(path, "table.no_header", sentence)
     at, names, unit, comment = found[-1]
     refuse_two_of_a_kind(path, at + 1, names)
     require_position(path, at + 1, names)

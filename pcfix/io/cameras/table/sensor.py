@@ -17,9 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pcfix.errors import InputError
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import is_same_lens, write_new
+from pcfix.io.cameras.checks import is_same_lens, write_new, wrong
 from pcfix.io.cameras.table.columns import Columns
 from pcfix.io.crs import is_topocentric
 from pcfix.io.files import check_input
@@ -61,12 +60,8 @@ def read_sensor(path: Path) -> Lens:
 
 def _one_row(table: Table) -> None:
     if len(table.rows) != 1:
-        raise InputError(
-            "cameras.sensor_rows",
-            f"{table.path}: has {len(table.rows)} rows. Give one row for all images.",
-            path=table.path,
-            rows=len(table.rows),
-        )
+        sentence = f"has {len(table.rows)} rows. Give one row for all images."
+        raise wrong(table.path, "cameras.sensor_rows", sentence, rows=len(table.rows))
 
 
 def _centred_mm(focal: float, width: float, height: float) -> Lens:
@@ -79,13 +74,11 @@ def read_lenses(columns: Columns, sensor: Path | None) -> tuple[Lens, ...]:
     path = sensor or columns.path.with_name("sensor.csv")
     if sensor is None and not path.is_file():
         needed = "width_px,height_px" if own else "focal,sensor_x,sensor_y (mm)"
-        raise InputError(
-            "cameras.sensor_missing",
-            f"{columns.path}: has angles, but there is no sensor. Give --sensor a table with the"
-            f" columns {needed}, or put it beside as sensor.csv.",
-            path=columns.path,
-            columns=needed,
+        sentence = (
+            f"has angles, but there is no sensor. Give --sensor a table with the columns {needed},"
+            " or put it beside as sensor.csv."
         )
+        raise wrong(columns.path, "cameras.sensor_missing", sentence, columns=needed)
     return _own_lenses(columns, path) if own else (read_sensor(path),) * len(columns.labels)
 
 
@@ -138,12 +131,11 @@ def _from_pixels(table: Table) -> Lens:
     )
     checks.lens(table.path, table.path.stem, lens)
     if not (0.25 < cx / width < 0.75 and 0.25 < cy / height < 0.75):
-        raise InputError(
-            "cameras.principal_point",
-            f"{table.path}: cx {cx:g}, cy {cy:g} is far from the centre of the image. Give pixels"
-            " from its upper left corner.",
-            path=table.path,
+        sentence = (
+            f"cx {cx:g}, cy {cy:g} is far from the centre of the image. Give pixels from its upper"
+            " left corner."
         )
+        raise wrong(table.path, "cameras.principal_point", sentence)
     return lens
 
 
@@ -182,25 +174,22 @@ def write_table(folder: File, cameras: Cameras) -> None:
     if cameras.rotations is None or cameras.lenses is None:
         raise checks.needs_lenses(target)
     if cameras.crs is not None and is_topocentric(cameras.crs):
-        raise InputError(
-            "output.crs",
-            f"{target}: a table cannot hold the axes {cameras.crs}. Bring the cameras to a"
-            " projected CRS first.",
-            path=target,
-            crs=cameras.crs,
+        sentence = (
+            f"a table cannot hold the axes {cameras.crs}. Bring the cameras to a projected CRS"
+            " first."
         )
+        raise wrong(target, "output.crs", sentence, crs=cameras.crs)
     distinct = list(dict.fromkeys(cameras.lenses))
     if len(distinct) == 1:
         sensor, poses = _sensor(target, distinct[0]), _poses(cameras, None)
     else:
         frames = {(lens.width, lens.height, lens.unit) for lens in distinct}
         if len(frames) > 1 or distinct[0].unit != "px":
-            raise InputError(
-                "output.lens",
-                f"{target}: a table holds several lenses only in pixels and of one frame size. Take"
-                " another format.",
-                path=target,
+            sentence = (
+                "a table holds several lenses only in pixels and of one frame size. Take another"
+                " format."
             )
+            raise wrong(target, "output.lens", sentence)
         sensor = _row({"width_px": distinct[0].width, "height_px": distinct[0].height})
         poses = _poses(cameras, [_own(target, lens) for lens in cameras.lenses])
     write_new(target, {"cameras.csv": poses.encode(), "sensor.csv": sensor.encode()})
