@@ -1,8 +1,10 @@
 """Read camera poses of any software: one module per format behind one `read_cameras`.
 
-A format module has ``recognises(source)``, ``read(source)`` and, where the format has tie points,
-``tie_points(source, cameras)``; see `formats.Reader`. To add a format, write its module and an
-entry of `FORMATS`, from which its line in README.md of this folder follows.
+A format module has ``recognises(source)``, which is cheap, ``read(source)`` and, where the format
+has tie points, ``tie_points(source, cameras)``. `read_cameras` turns what damaged contents raise
+into an `InputError`, and checks rotations and lenses; a module raises an `InputError` itself where
+it can say more than "damaged". To add a format, write its module and an entry of `FORMATS`, from
+which its line in README.md of this folder follows.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ import warnings
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -41,7 +44,7 @@ from pcfix.io.cameras.checks import (
     sensor_unused,
     wrong,
 )
-from pcfix.io.cameras.formats import Angles, CameraFormat, Source, SparseReader
+from pcfix.io.cameras.formats import Angles, Source
 from pcfix.io.cameras.table.sensor import read_sensor
 from pcfix.io.cameras.tracks import no_tie_points
 from pcfix.io.files import check_input
@@ -52,6 +55,16 @@ LISTS = (
     *(".xml", ".csv", ".txt", ".json", ".geojson", ".psx", ".psz", ".xmlz", ".opf", ".out", ".nvm"),
 )
 """Endings of files that may hold cameras."""
+
+
+class CameraFormat(NamedTuple):
+    """A format: its software, what to give ``--cameras`` (for the documentation), its module."""
+
+    software: str
+    give: str
+    reader: Any
+
+
 FORMATS = (
     CameraFormat(
         "Agisoft Metashape, PhotoScan",
@@ -185,7 +198,7 @@ def read_tie_points(path: File, cameras: Cameras) -> TiePoints:
         left out.
     """
     source, form = _recognised(path, None, None)
-    if not isinstance(form.reader, SparseReader):
+    if not hasattr(form.reader, "tie_points"):
         raise no_tie_points(source.path, f"the format ({form.software}) has none")
     with reading(path):
         ties, note = tracks.finite(source.path, form.reader.tie_points(source, cameras))
@@ -245,7 +258,7 @@ def _format_of(source: Source) -> CameraFormat | None:
 def _knows(form: CameraFormat, source: Source) -> bool:
     """Whether a file is of a format; not where it is too damaged to tell."""
     with suppress(InputError, *DAMAGES), np.errstate(all="ignore"):
-        return form.reader.recognises(source)
+        return bool(form.reader.recognises(source))
     return False
 
 

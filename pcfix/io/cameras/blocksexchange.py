@@ -32,7 +32,7 @@ import io
 import math
 import re
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path, PureWindowsPath
 from typing import NamedTuple
@@ -45,7 +45,7 @@ from pcfix.io.cameras import checks, tracks
 from pcfix.io.cameras.checks import damaged, number, read_xml, wrong
 from pcfix.io.cameras.formats import Source
 from pcfix.lens.rotations import from_omega_phi_kappa, from_photogrammetric
-from pcfix.model import BoolArray, Cameras, FloatArray, GnssPositions, IntArray, Lens, TiePoints
+from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, TiePoints
 
 ZIP_MAGIC = b"PK\x03\x04"
 COMMENT = re.compile(rb"<!--.*?-->", re.DOTALL)
@@ -383,12 +383,10 @@ class Photogroup:
         x, y = self.number("PrincipalPoint/x"), self.number("PrincipalPoint/y")
         if x is not None and y is not None:
             return x + FIRST_PIXEL, y + FIRST_PIXEL
-        pixel = self.pixel_size_mm()
-        offset = np.zeros(2)
-        if pixel is not None:
+        u, v = np.array(self.size()) / 2.0
+        if (pixel := self.pixel_size_mm()) is not None:
             mm = np.array(self.numbers("PrincipalPoint", ("xmm", "ymm")))
-            offset = self.axes()[:2, :2] @ mm / pixel
-        u, v = np.array(self.size()) / 2.0 + offset
+            u, v = (u, v) + self.axes()[:2, :2] @ mm / pixel
         return float(u), float(v)
 
     def _matrix(self, kind: str) -> list[float] | None:
@@ -396,8 +394,7 @@ class Photogroup:
         if kind == "Fisheye" and self.element.find("FisheyeFocalMatrix") is not None:
             return self.numbers("FisheyeFocalMatrix", ("M_00", "M_01", "M_10", "M_11"))
         focal, focal_mm = self.number("FocalLengthPixels"), self.number("FocalLength")
-        pixel = self.pixel_size_mm()
-        if focal is None and focal_mm is not None and pixel is not None:
+        if focal is None and focal_mm is not None and (pixel := self.pixel_size_mm()) is not None:
             focal = focal_mm / pixel
         if focal is None:
             return None
@@ -407,41 +404,9 @@ class Photogroup:
         return [focal, self.number("Skew") or 0.0, 0.0, focal if aspect is None else focal * aspect]
 
 
-BEGINS = ("TiePoint", "Position", "Measurement")
-NAMES = (*BEGINS, "x", "y", "z", "xmm", "ymm", "PhotoId", "SRSId")
-CODES = {name: code for code, name in enumerate(NAMES)}
-TOKEN = re.compile(f"<({'|'.join(NAMES)})>\\s*([^<]*)")
 EXTERNAL = re.compile(rb"<Path>\s*([^<]*?)\s*</Path>")
-
-
-class Tokens:
-    """The tags of a text that count, with the number of the point and measurement each is in."""
-
-    def __init__(self, text: str) -> None:
-        found = TOKEN.findall(text)
-        self.texts = [word for _, word in found]
-        self.code = np.array([CODES[name] for name, _ in found], dtype=np.int8)
-        self.point = np.cumsum(self.code == CODES["TiePoint"]) - 1
-        self.measurement = np.cumsum(self.code == CODES["Measurement"]) - 1
-        begun = np.where(self.code < len(BEGINS), np.arange(len(self.code)), 0)
-        self.inside = self.code[np.maximum.accumulate(begun)] if len(begun) else self.code
-
-    def numbers(self, names: tuple[str, ...], within: str) -> FloatArray:
-        """Return one row per point (within Position) or measurement; NaN where there is none."""
-        number = self.point if within == "Position" else self.measurement
-        values = np.full((int(number[-1]) + 1 if len(number) else 0, len(names)), np.nan)
-        inside = self.inside == CODES[within]
-        for column, name in enumerate(names):
-            rows = np.flatnonzero((self.code == CODES[name]) & inside)
-            values[number[rows], column] = np.array([self.texts[row] for row in rows], float)
-        return values
-
-    def owned(self, name: str, number: IntArray, count: int) -> list[str]:
-        """Return the text of a tag in each point or measurement, empty where there is none."""
-        texts = [""] * count
-        for row in np.flatnonzero((self.code == CODES[name]) & (number >= 0)):
-            texts[number[row]] = self.texts[row].strip()
-        return texts
+DECLARATION = re.compile(rb"<\?xml.*?\?>")
+SRS_OF_ALL = re.compile(rb"<SRSId>\s*([^<]*?)\s*</SRSId>")
 
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
@@ -449,66 +414,61 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     path = source.path
     root, texts = _read_document(path)
     rows = _read_photos(path, root)[1]
-    xyz, point, camera, uv = [np.empty((0, 3))], [], [], [np.empty((0, 2))]
+    xyz: list[list[float]] = []
+    point, camera, uv = [], [], []
     for block, text in texts:
         where, inside = _inside(path, text)
+        head = SRS_OF_ALL.search(inside[: inside.find(b"<TiePoint>")])
+        srs_of_all = rows.srs_of_blocks[block] if head is None else head[1].decode()
         with checks.reading(where):
-            tokens = Tokens(inside)
-            positions = _positions(tokens, rows.srs_of_blocks[block], rows.srs)
-            point.append(
-                len(np.concatenate(xyz)) + tokens.point[tokens.code == CODES["Measurement"]]
-            )
-            xyz.append(positions)
-            ids = tokens.owned("PhotoId", tokens.measurement, len(point[-1]))
-            camera.append(np.array([rows.of.get((block, name), -1) for name in ids], np.int64))
-            groups = [rows.groups.get((block, name)) for name in ids]
-            uv.append(_places(where, tokens, camera[-1], groups))
-    cameras_of_all = np.concatenate([np.empty(0, np.int64), *camera])
-    if not (cameras_of_all >= 0).any():
+            for element in _elements(inside):
+                keys = [(block, _text(m, "PhotoId")) for m in element.iterfind("Measurement")]
+                pairs = zip(keys, element.iterfind("Measurement"), strict=True)
+                seen = [(key, mark) for key, mark in pairs if key in rows.of]
+                for key, mark in seen:
+                    point.append(len(xyz))
+                    camera.append(rows.of[key])
+                    uv.append(_place(mark, rows.groups[key]))
+                place = element.find("Position")
+                is_here = (_text(element, "SRSId") or srs_of_all) == rows.srs
+                if seen and place is not None and is_here:
+                    xyz.append([float(_text(place, axis)) for axis in "xyz"])
+                elif seen:
+                    xyz.append([math.nan] * 3)
+    if not xyz:
         raise tracks.no_tie_points(path, f"none was seen by one of its {len(cameras)} photos")
-    points = np.concatenate(point)
-    seen, points[cameras_of_all >= 0] = np.unique(points[cameras_of_all >= 0], return_inverse=True)
-    return tracks.tie_points(np.concatenate(xyz)[seen], points, cameras_of_all, np.concatenate(uv))
+    return tracks.tie_points(np.array(xyz), np.array(point), np.array(camera), np.array(uv))
 
 
-def _inside(path: Path, text: bytes) -> tuple[Path, str]:
+def _inside(path: Path, text: bytes) -> tuple[Path, bytes]:
     """Return the text itself, or that of the file beside the document that it names."""
     other = EXTERNAL.search(text)
     if other is None:
-        return path, text.decode(errors="replace")
+        return path, text
     plain = other[1].decode(errors="replace").replace("\\", "/")
     for place in (path.parent / plain, path.parent / PureWindowsPath(plain).name):
         if place.is_file():
-            data = _read_bytes(place)
-            if not data.rstrip().endswith((b"</TiePoint>", b"</TiePoints>")):
-                raise damaged(place, "its last tie point is not whole")
-            return place, data.decode(errors="replace")
+            return place, DECLARATION.sub(b"", _read_bytes(place))
     raise checks.missing(path.parent / plain, "Keep the file of the tie points beside the block")
 
 
-def _positions(tokens: Tokens, srs_of_block: str, srs: str) -> FloatArray:
-    """Return the points, NaN without a position or with one in another reference system."""
-    xyz = tokens.numbers(("x", "y", "z"), "Position")
-    before = (tokens.code == CODES["SRSId"]) & (tokens.point < 0)
-    default = next((tokens.texts[row].strip() for row in np.flatnonzero(before)), srs_of_block)
-    own = tokens.owned("SRSId", tokens.point, len(xyz))
-    other = np.array([(name or default) != srs for name in own], dtype=bool)
-    xyz[other] = np.nan
-    return xyz
+def _elements(text: bytes) -> Iterator[Element]:
+    """Yield the tie points of a text one by one, so that no tree holds millions of them."""
+    from defusedxml.ElementTree import iterparse
+
+    for _, element in iterparse(io.BytesIO(b"<All>" + text + b"</All>")):
+        if element.tag == "TiePoint":
+            yield element
+            element.clear()
 
 
-def _places(
-    path: Path, tokens: Tokens, camera: IntArray, groups: list[Photogroup | None]
-) -> FloatArray:
-    """Return u, v in pixels from the corner, of places in pixels or in mm."""
-    uv = tokens.numbers(("x", "y"), "Measurement") + FIRST_PIXEL
-    missing: BoolArray = ~np.isfinite(uv).all(axis=1) & (camera >= 0)
-    mm = tokens.numbers(("xmm", "ymm"), "Measurement") if missing.any() else uv
-    for row in np.flatnonzero(missing):
-        group = groups[row]
-        pixel = None if group is None else group.pixel_size_mm()
-        if group is not None and pixel is not None:
-            uv[row] = group.principal_point() + group.axes()[:2, :2] @ mm[row] / pixel
-        if not np.isfinite(uv[row]).all():
-            raise damaged(path, "a measurement has no x and y, or is in mm without a pixel size")
-    return uv
+def _place(mark: Element, group: Photogroup) -> tuple[float, float]:
+    """Return u, v in pixels from the corner, of a place in pixels or in mm."""
+    if mark.find("x") is not None and mark.find("y") is not None:
+        return float(_text(mark, "x")) + FIRST_PIXEL, float(_text(mark, "y")) + FIRST_PIXEL
+    pixel = group.pixel_size_mm()
+    if pixel is None:
+        raise ValueError("a measurement is in mm, but its photogroup has no pixel size")
+    mm = np.array([float(_text(mark, name)) for name in ("xmm", "ymm")])
+    u, v = group.principal_point() + group.axes()[:2, :2] @ mm / pixel
+    return float(u), float(v)

@@ -35,7 +35,7 @@ DAMAGES = (
 """What readers run into where a file is cut off, or holds something else than it should."""
 
 
-def wrong(path: object, code: str, sentence: str, **values: Any) -> InputError:
+def wrong(path: object, code: str, sentence: str, /, **values: Any) -> InputError:
     """Return the error for a file: its path, what is wrong, and what to do."""
     return InputError(code, f"{path}: {sentence}", **{"path": path, **values})
 

@@ -22,7 +22,7 @@ from pcfix.io.cameras.checks import is_same_lens, write_new, wrong
 from pcfix.io.cameras.table.columns import Columns
 from pcfix.io.crs import is_topocentric
 from pcfix.io.files import check_input
-from pcfix.io.tables import Table, read_lines, read_table, split_header
+from pcfix.io.tables import read_lines, read_table, split_header
 from pcfix.model import Cameras, Lens
 from pcfix.options.declare import File
 
@@ -48,20 +48,33 @@ def read_sensor(path: Path) -> Lens:
     if _is_xml(check_input(path)):
         from pcfix.io.cameras.metashape import read_calibration
 
-        lens: Lens = read_calibration(path)
-        return lens
-    if _names(path) >= set(PIXELS):
-        return _from_pixels(read_table(path, PIXELS))
-    table = read_table(path, MILLIMETRES)
-    focal, width, height = (table.numbers(name)[0] for name in MILLIMETRES)
-    _one_row(table)
-    return checks.lens(path, "of the sensor", _centred_mm(focal, width, height))
-
-
-def _one_row(table: Table) -> None:
+        return read_calibration(path)
+    columns = PIXELS if _names(path) >= set(PIXELS) else MILLIMETRES
+    table = read_table(path, columns)
     if len(table.rows) != 1:
         sentence = f"has {len(table.rows)} rows. Give one row for all images."
-        raise wrong(table.path, "cameras.sensor_rows", sentence, rows=len(table.rows))
+        raise wrong(path, "cameras.sensor_rows", sentence, rows=len(table.rows))
+
+    def value(name: str, default: float = 0.0) -> float:
+        return table.numbers(name)[0] if name in table.header else default
+
+    focal, width, height = map(value, columns)
+    lens = _centred_mm(focal, width, height)
+    if columns == PIXELS:
+        cx, cy = value("cx", width / 2.0), value("cy", height / 2.0)
+        k = [value(f"k{i}") for i in range(1, 7)]
+        lens = Lens(
+            *(focal, width, height, cx, cy),
+            radial=tuple(k[:3]),
+            denominator=tuple(k[3:]) if any(k[3:]) else (),
+            tangential=(value("p2"), value("p1")),
+        )
+    checks.lens(path, path.stem, lens)
+    shares = lens.principal_x / width, lens.principal_y / height
+    if not all(0.25 < share < 0.75 for share in shares):
+        sentence = "cx, cy is far from the centre. Give pixels from the upper left corner."
+        raise wrong(path, "cameras.principal_point", sentence)
+    return lens
 
 
 def _centred_mm(focal: float, width: float, height: float) -> Lens:
@@ -69,74 +82,33 @@ def _centred_mm(focal: float, width: float, height: float) -> Lens:
 
 
 def read_lenses(columns: Columns, sensor: Path | None) -> tuple[Lens, ...]:
-    """Return the lens of each row."""
+    """Return the lens of each row: that of the sensor, or RealityCapture's own columns."""
     own = columns.has("f", "px", "py")
     path = sensor or columns.path.with_name("sensor.csv")
     if sensor is None and not path.is_file():
         needed = "width_px,height_px" if own else "focal,sensor_x,sensor_y (mm)"
-        sentence = (
-            f"has angles, but there is no sensor. Give --sensor a table with the columns {needed},"
-            " or put it beside as sensor.csv."
-        )
+        sentence = f"has angles but no sensor. Give --sensor a table with the columns {needed}."
         raise wrong(columns.path, "cameras.sensor_missing", sentence, columns=needed)
-    return _own_lenses(columns, path) if own else (read_sensor(path),) * len(columns.labels)
-
-
-def _own_lenses(columns: Columns, sensor: Path) -> tuple[Lens, ...]:
-    """Return the lenses of RealityCapture's table, whose sensor says only the shape."""
-    width, height = _frame(sensor)
-    largest = max(width, height)
-    rows = columns.of(("f", "px", "py"))
-    brown = np.nan_to_num(columns.where_there(DISTORTION))
-    seen: dict[bytes, Lens] = {}
-    lenses = []
-    for row in np.hstack([rows, brown]):
-        key = row.tobytes()
-        if key not in seen:
-            focal, x, y, *k = row.tolist()
-            seen[key] = Lens(
-                *(focal * largest / FILM_MM, width, height),
-                *(width / 2.0 + x * largest, height / 2.0 + y * largest),
-                radial=tuple(k[:4]),
-                tangential=tuple(k[4:]),
-            )
-        lenses.append(seen[key])
-    return tuple(lenses)
-
-
-def _frame(path: Path) -> tuple[float, float]:
-    """Return width and height of the images, pixels or millimetres."""
+    if not own:
+        return (read_sensor(path),) * len(columns.labels)
     if not _is_xml(check_input(path)) and _names(path) >= set(FRAME):
         width, height = (read_table(path, FRAME).numbers(name)[0] for name in FRAME)
-        return width, height
-    lens = read_sensor(path)
-    return lens.width, lens.height
-
-
-def _from_pixels(table: Table) -> Lens:
-    """Return the lens of a row in pixels, with OpenCV's names."""
-    _one_row(table)
-
-    def value(name: str, default: float = 0.0) -> float:
-        return table.numbers(name)[0] if name in table.header else default
-
-    focal, width, height = (value(name) for name in PIXELS)
-    cx, cy = value("cx", width / 2.0), value("cy", height / 2.0)
-    k = [value(f"k{i}") for i in range(1, 7)]
-    lens = Lens(
-        *(focal, width, height, cx, cy),
-        radial=tuple(k[:3]),
-        denominator=tuple(k[3:]) if any(k[3:]) else (),
-        tangential=(value("p2"), value("p1")),
-    )
-    checks.lens(table.path, table.path.stem, lens)
-    if not (0.25 < cx / width < 0.75 and 0.25 < cy / height < 0.75):
-        sentence = (
-            f"cx {cx:g}, cy {cy:g} is far from the centre of the image. Give pixels from its upper"
-            " left corner."
+    else:
+        lens = read_sensor(path)
+        width, height = lens.width, lens.height
+    largest = max(width, height)
+    brown = np.nan_to_num(columns.where_there(DISTORTION))
+    rows = [tuple(row) for row in np.hstack([columns.of(("f", "px", "py")), brown]).tolist()]
+    lenses = {
+        (focal, x, y, *k): Lens(
+            *(focal * largest / FILM_MM, width, height),
+            *(width / 2.0 + x * largest, height / 2.0 + y * largest),
+            radial=tuple(k[:4]),
+            tangential=tuple(k[4:]),
         )
-        raise wrong(table.path, "cameras.principal_point", sentence)
-    return lens
+        for focal, x, y, *k in dict.fromkeys(rows)
+    }
+    return tuple(lenses[row] for row in rows)
 
 
 def _is_xml(path: Path) -> bool:
