@@ -49,7 +49,6 @@ TOPOCENTRIC = "reconstruction.topocentric.json"
 ALIGNED_M = 0.1
 
 _FOLDERS = ("", "opensfm", "odm_georeferencing", "odm_georeferencing_25d", "odm_report")
-_LINK_BYTES = 400
 _OF_CRS = ("proj.txt", "coords.txt", "odm_georeferencing_model_geo.txt")
 _SHOTS_HEAD = re.compile(
     r'\s*\{.*"features"\s*:\s*\[.*"(translation|rotation|filename)"', re.DOTALL
@@ -61,19 +60,21 @@ def recognises(source: Source) -> bool:
     project = _locate(source.path)
     if project.poses is None:
         return False
-    if not source.path.is_dir() and _SHOTS_HEAD.match(source.text):
-        return True
-    poses = _poses_of(project)
-    found = source if poses == source.path else Source(poses)
+    found = Source(project.poses)
     if _SHOTS_HEAD.match(found.text):
         return True
-    return opensfm.recognises(found) and _is_odm(project, poses)
+    if not opensfm.recognises(found):
+        return False
+    if any(project.find(name) for name in (*_OF_CRS, SHOTS, TOPOCENTRIC)):
+        return True
+    reference = _reference_of(project.poses)
+    return reference is not None and _whole_metres(*reference, None) is not None
 
 
 def read(source: Source) -> Cameras:
     """Read the poses, of a folder rather from the reconstruction than from shots.geojson."""
     project = _locate(source.path)
-    path = _poses_of(project)
+    path = project.poses or project.root / RECONSTRUCTION
     if not opensfm.recognises(Source(path)):
         return _read_shots(project, path)
     found = opensfm.read_reconstruction(path)
@@ -95,7 +96,7 @@ def read(source: Source) -> Cameras:
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """Read points and tracks, in the frame of the poses."""
     project = _locate(source.path)
-    found = opensfm.read_reconstruction(_poses_of(project))
+    found = opensfm.read_reconstruction(project.poses or project.root / RECONSTRUCTION)
     points = opensfm.read_tie_points(found)
     return replace(points, xyz=_frame(project, found).points(points.xyz))
 
@@ -112,7 +113,7 @@ class Project(NamedTuple):
         folders += [self.root / folder for folder in _FOLDERS]
         for folder in folders:
             if (folder / name).is_file():
-                return _followed(folder / name, self.root)
+                return folder / name
         return None
 
     def crs(self) -> str | None:
@@ -137,44 +138,6 @@ def _locate(path: Path) -> Project:
     places = [folder / RECONSTRUCTION, root / "opensfm" / RECONSTRUCTION]
     places += [folder / SHOTS, root / "odm_report" / SHOTS]
     return Project(root, next((place for place in places if place.is_file()), None))
-
-
-def _poses_of(project: Project) -> Path:
-    """Return the file with the poses, followed where it is a link kept as text."""
-    if project.poses is None:
-        raise checks.missing(project.root / RECONSTRUCTION)
-    found = _followed(project.poses, project.root)
-    if found is None:
-        raise checks.missing(project.poses, "It is only a link; give the file itself")
-    return found
-
-
-def _followed(path: Path, root: Path) -> Path | None:
-    """Return the file that a link kept as text (git does so) leads to, inside the project."""
-    link = _link(path)
-    if link is None:
-        return path
-    target = (path.parent / link).resolve()
-    if not target.is_file() or not target.is_relative_to(root.resolve()):
-        return None
-    return None if _link(target) else target
-
-
-def _link(path: Path) -> str | None:
-    """Return the path that a file consists of; None for any other file."""
-    if path.stat().st_size > _LINK_BYTES:
-        return None
-    text = path.read_bytes().decode("utf-8", errors="replace").strip()
-    is_path = "/" in text and text.rsplit(".", 1)[-1] == path.suffix[1:]
-    return text if is_path and not set(text) & set('{}[]"\n\0') else None
-
-
-def _is_odm(project: Project, poses: Path) -> bool:
-    """Whether ODM's own files lie around a reconstruction, or its reference is ODM's choice."""
-    if any(project.find(name) for name in (*_OF_CRS, SHOTS, TOPOCENTRIC)):
-        return True
-    reference = _reference_of(poses)
-    return reference is not None and _whole_metres(*reference, None) is not None
 
 
 def _compared(project: Project, cameras: Cameras) -> Cameras:

@@ -256,19 +256,6 @@ def test_images_without_pose_and_their_gnss(tmp_path):
     assert np.isnan(cameras.gnss.xyz[[0, 2, 3]]).all()
 
 
-def test_link_kept_as_text(tmp_path):
-    folder = project(tmp_path, reconstruction=reconstruction(PLACES))
-    (folder / "real").mkdir()
-    (folder / "opensfm/reconstruction.json").rename(folder / "real/reconstruction.json")
-    link = folder / "opensfm/reconstruction.json"
-    link.write_text("../real/reconstruction.json")
-    assert len(read(link)) == 4
-    for target in ("../../away/reconstruction.json", "../nothing/reconstruction.json"):
-        link.write_text(target)
-        with refused("cameras.unknown"):
-            read(link)
-
-
 def test_opensfm_alone_is_not_claimed(tmp_path):
     (tmp_path / "reconstruction.json").write_text(json.dumps(reconstruction(PLACES, LON + 1e-4)))
     assert is_of(tmp_path, opensfm)

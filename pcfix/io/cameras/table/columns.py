@@ -121,37 +121,10 @@ def _split_unit(name: str) -> tuple[str, str]:
 _PLAIN = {spelling for spellings in SPELLINGS.values() for spelling in spellings}
 
 
-def refuse_two_of_a_kind(path: Path, line: int, names: list[str]) -> None:
-    """Refuse easting beside east; a column that is called by the role's own name counts."""
-    for role, spellings in SPELLINGS.items():
-        there = [name for name in names if name in spellings]
-        if len(there) > 1 and role not in MANY and (role not in there or there.count(role) > 1):
-            sentence = (
-                f"line {line}: the columns {', '.join(there)} may all be {role}. Take out all but"
-                " one."
-            )
-            raise wrong(path, "table.columns_alike", sentence, columns=there)
-
-
 def column_missing(path: Path, missing: Sequence[str], header: Sequence[str]) -> InputError:
     """Return the error for a table that lacks columns."""
     sentence = f"the columns {', '.join(missing)} are missing. Its header has {', '.join(header)}."
     return wrong(path, "table.column_missing", sentence, columns=list(missing))
-
-
-def require_position(path: Path, line: int, names: list[str]) -> None:
-    """Refuse a header without the name of the image or its position."""
-    place = known(names)
-    if "label" in place and (axes(place) or axes(place, "_est")):
-        return
-    if {"tx", "ty", "tz"} <= place.keys() and axes(place) is None:
-        sentence = (
-            f"line {line} has tx, ty, tz, which may be translations or projection centres. Give the"
-            " projection centres as x, y, z."
-        )
-        raise wrong(path, "table.translations", sentence)
-    needed = ("label", "longitude", "latitude", "z") if "longitude" in place else ("label", *"xyz")
-    raise column_missing(path, [role for role in needed if role not in place], names)
 
 
 DEGREES = {
@@ -189,7 +162,8 @@ class Columns:
         labels = [row[self.place["label"]] for row in self.table.rows]
         if "" in labels:
             line = self.table.line[labels.index("")]
-            raise InputError(f"{self.path}: line {line}: the image has no name.")
+            sentence = f"line {line}: the image has no name. Give it one."
+            raise wrong(self.path, "table.no_label", sentence, line=line)
         if self.name("label") == "sourcefile":
             return [re.split(r"[\\/]", label)[-1] for label in labels]
         return labels
@@ -228,26 +202,18 @@ class Columns:
         values = np.array([read(text) for text in texts])
         for i in np.flatnonzero(~np.isfinite(values)):
             if needed or texts[i]:
-                raise InputError(
-                    "table.number",
-                    f"{self.where(int(i))}, column {self.name(role)}: '{texts[i]}' is not a finite"
-                    " number.",
-                    path=self.path,
-                    line=self.table.line[i],
-                    value=texts[i],
-                )
-        return values * self._factor(role)
-
-    def _factor(self, role: str) -> float:
-        """Return what the unit of a column is in metres or degrees."""
+                name, line = self.name(role), self.table.line[i]
+                sentence = f"column {name}: '{texts[i]}' is not a finite number. Correct it."
+                where = {"path": self.path, "line": line, "value": texts[i]}
+                raise wrong(self.where(int(i)), "table.number", sentence, **where)
         base, unit = role.removesuffix("_est"), self.unit[self.place[role]]
         if base not in (*LENGTHS, *POSE):
-            return 1.0
+            return values
         known, wanted = (METRES, "metres") if base in LENGTHS else (DEGREES, "degrees")
         if unit not in known:
             sentence = f"column {self.name(role)} is in '{unit}'. Give {wanted}."
             raise wrong(self.path, "table.unit", sentence, value=unit)
-        return known[unit]
+        return values * known[unit]
 
 
 def read_columns(path: Path) -> Columns:
@@ -261,8 +227,19 @@ def read_columns(path: Path) -> Columns:
         )
         raise wrong(path, "table.no_header", sentence)
     at, names, unit, comment = found[-1]
-    refuse_two_of_a_kind(path, at + 1, names)
-    require_position(path, at + 1, names)
+    place = known(names)
+    for role, spellings in SPELLINGS.items():  # a column with the role's own name counts
+        alike = [name for name in names if name in spellings]
+        if len(alike) > 1 and role not in MANY and (role not in alike or alike.count(role) > 1):
+            sentence = f"the columns {', '.join(alike)} may all be {role}. Take out all but one."
+            raise wrong(path, "table.columns_alike", sentence, columns=alike)
+    if {"tx", "ty", "tz"} <= place.keys() and axes(place) is None:
+        sentence = "tx, ty, tz may be translations. Give the projection centres as x, y, z."
+        raise wrong(path, "table.translations", sentence)
+    if "label" not in place or not (axes(place) or axes(place, "_est")):
+        position = ("longitude", "latitude", "z") if "longitude" in place else ("x", "y", "z")
+        lacking = [role for role in ("label", *position) if role not in place]
+        raise column_missing(path, lacking, names)
     comments = comment or any(line.startswith("#") for line in lines[:at])
     below = next((line for line in lines[at + 1 :] if line.strip() and line[0] != "#"), "")
     delimiter = delimiter_of(below.strip()) if comment else split_header(lines[at].strip())[1]
@@ -270,7 +247,7 @@ def read_columns(path: Path) -> Columns:
     crs = next(
         (match[1].strip() for line in lines[:at] if (match := CRS_COMMENT.match(line))), None
     )
-    return Columns(table, known(names), unit, comment, crs)
+    return Columns(table, place, unit, comment, crs)
 
 
 def exif_number(text: str) -> float:
