@@ -66,18 +66,6 @@ def write(tmp_path, text, name="block.xml"):
     return path
 
 
-@paris
-def test_angles_of_the_example_are_its_matrix(tmp_path):
-    text = PARIS.read_text()
-    start, end = text.index("<M_00>"), text.index("</M_22>") + len("</M_22>")
-    angles = (
-        "<Omega>179.6523471469934</Omega><Phi>0.04985630236313049</Phi>"
-        "<Kappa>179.9065465708369</Kappa>"
-    )
-    cameras = read(write(tmp_path, text[:start] + angles + text[end:]))
-    assert cameras.rotations == pytest.approx(read(PARIS).rotations, abs=1e-12)
-
-
 @enu
 def test_local_frame_at_a_place_and_gnss():
     cameras = read(ENU)

@@ -119,15 +119,6 @@ def test_places_of_a_model(tmp_path, make, given):
     assert len(read(tmp_path / given)) == 3
 
 
-@pytest.mark.parametrize(
-    ("make", "suffix"), [(folder, "txt"), (binary_folder, "bin")], ids=["txt", "bin"]
-)
-@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
-def test_each_file_stands_for_the_model(tmp_path, make, suffix, name):
-    make(tmp_path)
-    assert len(read(tmp_path / f"{name}.{suffix}")) == 3
-
-
 def test_the_file_named_is_the_form_that_is_read(tmp_path):
     binary_folder(tmp_path)
     folder(tmp_path, images="1 1 0 0 0 0 0 0 3 only.jpg\n\n")
@@ -160,109 +151,6 @@ def test_other_files_are_not_recognised(tmp_path):
     (tmp_path / "frames.txt").write_text("1\n")
     assert not is_of(tmp_path, colmap)
     assert not is_of(tmp_path / "frames.txt", colmap)
-
-
-def test_images_without_a_pose(tmp_path):
-    images = IMAGES + "5 nan nan nan nan nan nan nan 3 lost.jpg\n\n"
-    path = folder(tmp_path, images=images)
-    assert read(path).unposed == ("lost.jpg",)
-    assert "lost.jpg" not in read(path).labels
-
-
-def brown(x, y, k=(), below=(), p=(0, 0), s=(0, 0, 0, 0)):
-    """Return Brown's distortion with p1 and p2 in OpenCV's order."""
-    r2 = x * x + y * y
-    radial = 1 + sum(c * r2 ** (i + 1) for i, c in enumerate(k))
-    radial = radial / (1 + sum(c * r2 ** (i + 1) for i, c in enumerate(below)))
-    return (
-        x * radial + 2 * p[0] * x * y + p[1] * (r2 + 2 * x * x) + s[0] * r2 + s[1] * r2 * r2,
-        y * radial + p[0] * (r2 + 2 * y * y) + 2 * p[1] * x * y + s[2] * r2 + s[3] * r2 * r2,
-    )
-
-
-def fisheye(x, y):
-    theta = np.arctan(np.hypot(x, y)) / np.hypot(x, y)
-    return x * theta, y * theta
-
-
-def fov(x, y, w):
-    r = np.hypot(x, y)
-    return np.array([x, y]) * np.arctan(r * 2 * np.tan(w / 2)) / (r * w)
-
-
-def division(x, y, k):
-    return np.array([x, y]) * 2 / (1 + np.sqrt(1 - 4 * k * (x * x + y * y)))
-
-
-def eucm(x, y, a, b):
-    return np.array([x, y]) / (a * np.sqrt(b * (x * x + y * y) + 1) + 1 - a)
-
-
-def aria(x, y, k, p, s):
-    return brown(*brown(*fisheye(x, y), k), p=(p[1], p[0]), s=s)
-
-
-@pytest.mark.parametrize(
-    ("name", "extra", "plane"),
-    [
-        ("SIMPLE_PINHOLE", [], lambda x, y: (x, y)),
-        ("PINHOLE", [], lambda x, y: (x, y)),
-        ("SIMPLE_RADIAL", [0.1], lambda x, y: brown(x, y, (0.1,))),
-        ("RADIAL", [0.1, -0.02], lambda x, y: brown(x, y, (0.1, -0.02))),
-        (
-            "OPENCV",
-            [0.1, -0.02, 0.003, -0.004],
-            lambda x, y: brown(x, y, (0.1, -0.02), p=(0.003, -0.004)),
-        ),
-        (
-            "OPENCV_FISHEYE",
-            [0.1, -0.02, 0.03, 0.01],
-            lambda x, y: brown(*fisheye(x, y), (0.1, -0.02, 0.03, 0.01)),
-        ),
-        (
-            "FULL_OPENCV",
-            [0.1, 0.02, 0.003, -0.004, 0.01, 0.2, 0.03, 0.004],
-            lambda x, y: brown(x, y, (0.1, 0.02, 0.01), (0.2, 0.03, 0.004), (0.003, -0.004)),
-        ),
-        ("FOV", [0.8], lambda x, y: fov(x, y, 0.8)),
-        ("FOV", [0.0], lambda x, y: (x, y)),
-        ("SIMPLE_RADIAL_FISHEYE", [0.1], lambda x, y: brown(*fisheye(x, y), (0.1,))),
-        ("RADIAL_FISHEYE", [0.1, 0.02], lambda x, y: brown(*fisheye(x, y), (0.1, 0.02))),
-        (
-            "THIN_PRISM_FISHEYE",
-            [0.1, 0.02, 0.003, -0.004, 0.01, 0.02, 0.005, -0.006],
-            lambda x, y: brown(
-                *fisheye(x, y), (0.1, 0.02, 0.01, 0.02), p=(0.003, -0.004), s=(0.005, 0, -0.006, 0)
-            ),
-        ),
-        (
-            "RAD_TAN_THIN_PRISM_FISHEYE",
-            [0.1, 0.02, 0.01, 0.02, 0.01, 0.03, 0.003, -0.004, 0.005, 0.006, 0.007, 0.008],
-            lambda x, y: aria(
-                x,
-                y,
-                (0.1, 0.02, 0.01, 0.02, 0.01, 0.03),
-                (0.003, -0.004),
-                (0.005, 0.006, 0.007, 0.008),
-            ),
-        ),
-        ("SIMPLE_DIVISION", [-0.1], lambda x, y: division(x, y, -0.1)),
-        ("DIVISION", [0.1], lambda x, y: division(x, y, 0.1)),
-        ("SIMPLE_FISHEYE", [], fisheye),
-        ("FISHEYE", [], fisheye),
-        ("EUCM", [0.6, 1.1], lambda x, y: eucm(x, y, 0.6, 1.1)),
-    ],
-)
-def test_every_model(tmp_path, name, extra, plane):
-    model = next(m for m in MODELS if m.name == name)
-    fx, fy = (500, 510) if "fx" in model.parameters else (500, 500)
-    focals = [fx, fy] if "fx" in model.parameters else [fx]
-    line = " ".join(map(str, (1, name, 800, 600, *focals, 410, 290, *extra)))
-    path = folder(tmp_path, cameras=line, images="1 1 0 0 0 0 0 0 1 a.jpg\n\n")
-    x, y = np.random.default_rng(5).uniform(-0.4, 0.4, (2, 50))
-    px, py = plane(x, y)
-    seen = project(read(path).lenses[0], np.column_stack([x, y, np.ones(50)]) * 3)
-    assert seen == pytest.approx(np.column_stack([fx * px + 410, fy * py + 290]), abs=1e-9)
 
 
 @pytest.mark.parametrize("number", range(len(MODELS)))

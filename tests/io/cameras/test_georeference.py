@@ -1,7 +1,5 @@
 """Cameras from the frame of their file into the cloud's CRS."""
 
-import csv
-import json
 import subprocess
 import sys
 from dataclasses import replace
@@ -84,51 +82,6 @@ def test_geocentric_positions_of_metashape_on_a_map():
     assert (found.crs, found.project_crs, found.notes) == (UTM30, None, ())
 
 
-@uclm
-def test_survey_points_in_four_crs_are_the_same_points():
-    def table(name):
-        rows = csv.reader((UCLM / name).read_text().split(), delimiter=";")
-        return np.array([row[1:4] for row in rows], float)
-
-    texts = (UCLM / "gcp_ecef.csv").read_text().splitlines()
-    ecef = np.array([t.replace(" ", "").split(";")[1:4] for t in texts if t.strip()], float)
-    utm, degrees = table("gcp_25830.csv"), table("gcp_4258.csv")
-    assert bring_to(cameras(degrees, "EPSG:4258"), UTM30).centres == pytest.approx(utm, abs=2e-3)
-    there = georeference(cameras(ecef, "EPSG:4936", project_crs=UTM30), UTM30)
-    assert there.points(ecef) == pytest.approx(utm, abs=2e-3)
-
-
-@wheat
-def test_a_geographic_chunk_goes_to_utm():
-    truth = check_file(WHEAT)["projection_centres"]
-    degrees = np.array([[t["X"], t["Y"], t["Z"]] for t in truth])
-    read = cameras([t["ECEF"] for t in truth], "EPSG:4978", project_crs="EPSG:4326")
-    found = bring_to(read, "EPSG:32654")
-    east, north = Transformer.from_crs("EPSG:4326", "EPSG:32654", always_xy=True).transform(
-        degrees[:, 0], degrees[:, 1]
-    )
-    assert found.centres == pytest.approx(np.column_stack([east, north, degrees[:, 2]]), abs=2e-3)
-    assert found.notes == ()
-
-
-@duluth
-def test_a_topocentric_block_of_odm_goes_where_its_cloud_is():
-    truth = check_file(DULUTH)["projection_centres"]
-    block = json.loads((DULUTH / "opensfm/reconstruction.json").read_text())[0]["shots"]
-    turns = [Rotation.from_rotvec(block[t["image"]]["rotation"]).as_matrix() for t in truth]
-    shifts = [block[t["image"]]["translation"] for t in truth]
-    centres = [-r.T @ t for r, t in zip(turns, shifts, strict=True)]
-    lla = json.loads((DULUTH / "opensfm/reference_lla.json").read_text())
-    crs = f"ENU:{lla['latitude']!r},{lla['longitude']!r},{lla['altitude']!r}"
-    found = bring_to(cameras(centres, crs, np.array(turns)), "EPSG:32615")
-    expected = np.array([[t["X"], t["Y"], t["Z"]] for t in truth])
-    assert found.centres == pytest.approx(expected, abs=5e-3)
-    for i, t in enumerate(truth):
-        assert found.rotations[i][2] == pytest.approx(t["view_dir"], abs=2e-5)
-        top = np.array(t["up_dir_minus_cam_y"])  # through a matrix with the scale of the map
-        assert -found.rotations[i][1] == pytest.approx(top / np.linalg.norm(top), abs=2e-5)
-
-
 @berlin
 def test_a_topocentric_block_of_opensfm_by_closed_formulas():
     report = check_file(BERLIN)
@@ -140,20 +93,6 @@ def test_a_topocentric_block_of_opensfm_by_closed_formulas():
     to_map = Transformer.from_crs("EPSG:4978", CRS("EPSG:32633").to_3d(), always_xy=True)
     found = bring_to(cameras(enu, f"ENU:{lat},{lon},{h}"), "EPSG:32633")
     assert found.centres == pytest.approx(np.column_stack(to_map.transform(*ecef.T)), abs=1e-5)
-
-
-@bangkok
-def test_longitude_and_latitude_of_pix4d_agree_with_its_map():
-    folder = BANGKOK / "params"
-    stem = "CA502_ReDateTime_reprocess_calibrated_external_camera_parameters"
-    degrees, utm = (
-        np.array(
-            [line.split()[1:7] for line in (folder / name).read_text().splitlines()[1:]], float
-        )
-        for name in (f"{stem}_wgs84.txt", f"{stem}.txt")
-    )
-    found = bring_to(cameras(degrees[:, :3], "EPSG:4326"), "EPSG:32647")
-    assert found.centres == pytest.approx(utm[:, :3], abs=2e-3)  # eight decimals of a degree
 
 
 def test_feet_become_metres_heights_too():
@@ -341,19 +280,6 @@ def test_pixels_are_kept_between_two_maps():
     assert angle == pytest.approx(turn, abs=2e-5)
 
 
-def test_a_thousand_cameras_turn_at_once_as_one_by_one():
-    rng = np.random.default_rng(4)
-    degrees = np.column_stack(
-        [rng.uniform(-1, 0, 1000), rng.uniform(39, 40, 1000), rng.uniform(50, 500, 1000)]
-    )
-    turns = Rotation.from_quat(np.random.default_rng(7).normal(size=(1000, 4))).as_matrix()
-    block = bring_to(cameras(degrees, "EPSG:4258", turns), UTM30)
-    for i in (0, 499, 999):
-        one = bring_to(cameras(degrees[i], "EPSG:4258", turns[i][None]), UTM30)
-        assert block.rotations[i] == pytest.approx(one.rotations[0], abs=1e-12)
-        assert block.centres[i] == pytest.approx(one.centres[0], abs=1e-9)
-
-
 def test_left_handed_axes_are_refused():
     crs = CRS("EPSG:5513")  # south, west
     x, y = Transformer.from_crs("EPSG:4156", crs, always_xy=True).transform(15.0, 50.0)
@@ -406,15 +332,6 @@ def test_heights_that_were_vouched_for_are_compared_with_the_gnss(undulation_m, 
     else:
         assert found.notes[0].code == "cameras.heights_differ"
         assert found.notes[0].values["metres"] == pytest.approx(51.5, abs=1e-3)
-
-
-def test_a_crs_without_a_code_of_its_own_is_named_by_one_that_can_be_typed():
-    """The WKT of a cloud may have no code; the remedy prints no page of it."""
-    bare = CRS.from_epsg(25830).to_json_dict()
-    del bare["id"]
-    read = cameras(geocentric(*VALENCIA_LON_LAT), "EPSG:4936", project_crs=UTM30_ALICANTE)
-    with pytest.raises(InputError):
-        bring_to(read, CRS.from_json_dict(bare), name="a.xml")
 
 
 GEOID = """

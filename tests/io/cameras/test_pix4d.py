@@ -1,7 +1,5 @@
 """Pix4D params folders."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from pyproj import CRS
@@ -12,7 +10,6 @@ from pcfix.io.cameras.formats import Source
 from pcfix.lens.imaging import project, unproject
 from tests.utils.camera_files import notes, read, read_ties
 from tests.utils.codes import refused
-from tests.utils.reprojection import check_file, residuals_px
 from tests.utils.shared import needs
 
 CA502, ca502 = needs("cameras", "pix4d", "ca502_oblique5")
@@ -99,27 +96,6 @@ def misses_px(cameras, ties):
             i = camera[row]
             ray = cameras.rotations[i] @ (point - cameras.centres[i])
             yield np.hypot(*(project(cameras.lenses[i], ray[None]) - ties.image_xy[row]).T)
-
-
-@easyidp
-def test_virtual_points_of_the_projection_matrices():
-    cameras = read(EASYIDP)
-    assert cameras.crs is None
-    assert len(cameras) == 168
-    ideal = [replace(lens, radial=(), tangential=()) for lens in cameras.lenses]
-    cameras = replace(cameras, lenses=tuple(ideal))
-    listed = residuals_px(cameras, check_file(EASYIDP)["observations"])
-    assert listed.max() < 0.02  # the points are given to 0.1 mm, and are 15 m away
-    offset = np.array([368109.0, 3956043.0, 96.0])
-    misses = []
-    for line in (EASYIDP / "pix4d.origin_pmatrix.txt").read_text().splitlines():
-        label, *numbers = line.split()
-        i = cameras.labels.index(label)
-        point = cameras.centres[i] + cameras.rotations[i].T @ [2.0, -3.0, 15.0]
-        u, v, w = np.array(numbers, float).reshape(3, 4) @ [*(point - offset), 1.0]
-        ray = cameras.rotations[i] @ (point - cameras.centres[i])
-        misses.append(project(ideal[i], ray[None])[0] - (u / w, v / w))
-    assert np.sqrt(np.mean(np.square(misses))) < 0.001  # the matrices have six decimals
 
 
 @lod3
@@ -271,12 +247,6 @@ def test_any_way_into_a_project(tmp_path, where):
     cameras = read(path)
     assert cameras.centres.tolist() == [[11, 22, 33]]
     assert cameras.lenses[0].focal == 4000.0
-
-
-def test_a_table_of_another_name_is_known_by_its_content(tmp_path):
-    path = tmp_path / "poses of june.dat"
-    path.write_text(external(("a.jpg", 11, 22, 33, 0, 0, 90)))
-    assert read(path).rotations[0][0] == pytest.approx([0, 1, 0], abs=1e-12)
 
 
 def test_offsets_of_groups(tmp_path):
