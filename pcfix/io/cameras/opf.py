@@ -300,7 +300,10 @@ def _nodes(path: Path, row_of: dict[int, int]) -> Iterator[Matches]:
                     at, point, camera = _matched(path, model, matches, row_of)
                     if len(point) and point.max() >= len(xyz):
                         raise checks.damaged(path, "its matches are of points that are not there")
-                    yield Matches(_z_up(node, xyz), point, camera, uv[at].astype(np.float64))
+                    matrix = np.array(node.get("matrix", np.eye(4).ravel()), float).reshape(4, 4).T
+                    x, y, z = (xyz.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]).T
+                    z_up = np.column_stack([x, -z, y])  # the model itself has y up
+                    yield Matches(z_up, point, camera, uv[at].astype(np.float64))
 
 
 def _matched(
@@ -318,13 +321,6 @@ def _matched(
     point = np.repeat(np.arange(len(count)), count)
     at = np.arange(len(point)) + np.repeat(first - (np.cumsum(count) - count), count)
     return at, point, rows[index[at]]
-
-
-def _z_up(node: Part, xyz: FloatArray) -> FloatArray:
-    """Return points of a node in the processing CRS; the model itself has y up."""
-    matrix = np.array(node.get("matrix", np.eye(4).ravel()), np.float64).reshape(4, 4).T
-    x, y, z = (xyz.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]).T
-    return np.column_stack([x, -z, y])
 
 
 def _accessor(path: Path, model: Part, index: int, width: int) -> Any:

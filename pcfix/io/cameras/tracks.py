@@ -148,7 +148,13 @@ def frame_sizes(
     why = f"the size of {missing.sum()} images is not in the file, nor are the images beside it"
     if not smallest_px.any():
         return None, (without_lens(path, why),)
-    sizes[missing] = _bounds(focal_px, smallest_px)[missing]
+    order = np.argsort(focal_px)
+    steps = focal_px[order][1:] > _SAME_CAMERA * focal_px[order][:-1]
+    bounds = np.empty_like(smallest_px)
+    for members in np.split(order, np.flatnonzero(steps) + 1):  # images of about one focal length
+        bound = smallest_px[members].max(axis=0)
+        bounds[members] = bound if bound.all() else smallest_px.max(axis=0)
+    sizes[missing] = bounds[missing]
     first = sizes[missing][0].tolist()
     note = PcfixWarning(
         "cameras.frames_estimated",
@@ -158,17 +164,6 @@ def frame_sizes(
         size_px=first,
     )
     return sizes, (note,)
-
-
-def _bounds(focal_px: FloatArray, smallest_px: FloatArray) -> FloatArray:
-    """Return for each image the bound of all images of about its focal length."""
-    order = np.argsort(focal_px)
-    steps = focal_px[order][1:] > _SAME_CAMERA * focal_px[order][:-1]
-    bounds = np.empty_like(smallest_px)
-    for members in np.split(order, np.flatnonzero(steps) + 1):
-        bound = smallest_px[members].max(axis=0)
-        bounds[members] = bound if bound.all() else smallest_px.max(axis=0)
-    return bounds
 
 
 def image_size(folder: Path, name: str) -> tuple[int, int] | None:

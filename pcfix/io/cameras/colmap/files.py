@@ -90,12 +90,14 @@ def lens(path: Path, identifier: int, camera: Camera) -> Lens:
         raise _no_model(path, identifier, model.name)
     given = dict(zip(model.parameters, camera.values, strict=True))
     focal_x, focal = given.get("fx", given.get("f", 0.0)), given.get("fy", given.get("f", 0.0))
-    projection, shape = _projection(model.projection, given)
+    projection, shape = model.projection, SHAPES.get(model.projection, ())
+    if projection == "fov" and abs(given["omega"]) < _SMALLEST_OMEGA:
+        projection, shape = "perspective", ()
     return Lens(
         *(focal, camera.width, camera.height, given["cx"], given["cy"]),
         b1=focal_x - focal,
         projection=projection,
-        shape=shape,
+        shape=tuple(given[name] for name in shape),
         radial=_coefficients(given, "k1", "k2", "k3", "k4", "k5", "k6"),
         denominator=_coefficients(given, "d1", "d2", "d3"),
         tangential=_coefficients(given, "p2", "p1"),
@@ -114,15 +116,6 @@ def _coefficients(given: dict[str, float], *names: str) -> tuple[float, ...]:
     """Return the values up to the last name that the model has, 0 for those between."""
     there = [i for i, name in enumerate(names) if name in given]
     return tuple(given.get(name, 0.0) for name in names[: there[-1] + 1]) if there else ()
-
-
-def _projection(
-    projection: Projection, given: dict[str, float]
-) -> tuple[Projection, tuple[float, ...]]:
-    """Return the projection and its parameters."""
-    if projection == "fov" and abs(given["omega"]) < _SMALLEST_OMEGA:
-        return "perspective", ()
-    return projection, tuple(given[name] for name in SHAPES.get(projection, ()))
 
 
 class Image(NamedTuple):

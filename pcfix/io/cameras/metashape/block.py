@@ -115,10 +115,8 @@ def read_block(chunk: Chunk) -> Block:
         chunk_name = element.get("label") or "without a name"
         rest = ", ".join([f"{len(images) - len(poses)} are not aligned", *why])
         raise checks.no_pose(path, f"of the {len(images)} images of chunk {chunk_name} {rest}")
-    if any(place is CHUNK for place in places):
-        crs, project_crs, of_world = LOCAL, None, ()
-    else:
-        crs, project_crs, of_world = _world(path, element)
+    local = any(place is CHUNK for place in places)
+    crs, project_crs, of_world = (LOCAL, None, ()) if local else _world(path, element)
     in_world = np.array(places) @ np.array([poses[image.id] for image in kept])
     scales = np.cbrt(np.linalg.det(in_world[:, :3, :3]))[:, None, None]
     lenses, of_lenses = _lenses(path, kept)
@@ -166,7 +164,14 @@ def _images(chunk: Element) -> list[Image]:
 def _poses(path: Path, images: list[Image]) -> dict[str, FloatArray]:
     """Return camera to chunk, 4x4, of each image that is aligned or whose master is."""
     aligned = [image for image in images if (image.element.findtext("transform") or "").strip()]
-    masters = dict(zip((image.id for image in aligned), _matrices(path, aligned), strict=True))
+    texts = [image.element.findtext("transform") for image in aligned]
+    named = zip(aligned, texts, strict=True)
+    rows = [numbers(path, f"image {one.label}, transform", text, 16) for one, text in named]
+    matrices = np.array(rows).reshape(-1, 4, 4)
+    checks.rotations(path, [image.label for image in aligned], matrices[:, :3, :3])
+    u, _, v = np.linalg.svd(matrices[:, :3, :3])
+    matrices[:, :3, :3] = u @ v
+    masters = dict(zip((image.id for image in aligned), matrices, strict=True))
     offsets: dict[Element, FloatArray] = {}
     poses = dict(masters)
     for image in images:
@@ -177,20 +182,6 @@ def _poses(path: Path, images: list[Image]) -> dict[str, FloatArray]:
             offsets[image.sensor] = sensors.offset_of(path, image.sensor)
         poses[image.id] = master @ offsets[image.sensor]
     return poses
-
-
-def _matrices(path: Path, images: list[Image]) -> FloatArray:
-    """Return the transforms of images, shape (k, 4, 4), with proper rotations."""
-    rows = [
-        numbers(path, f"image {image.label}, transform", image.element.findtext("transform"), 16)
-        for image in images
-    ]
-    matrices = np.array(rows).reshape(-1, 4, 4)
-    turns = matrices[:, :3, :3]
-    checks.rotations(path, [image.label for image in images], turns)
-    u, _, v = np.linalg.svd(turns)
-    matrices[:, :3, :3] = u @ v
-    return matrices
 
 
 def _select(

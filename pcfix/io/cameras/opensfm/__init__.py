@@ -113,6 +113,9 @@ def _reconstruction(path: Path, data: Any) -> Reconstruction:
     reference = _reference(path, chosen)
     crs = "local" if reference is None else "ENU:" + ",".join(map(repr, reference))
     has_gnss = reference is not None and np.isfinite(xyz).any()
+    listed = path.with_name("image_list.txt")  # the images that the project was given
+    lines = listed.read_text("utf-8", errors="replace").split("\n") if listed.is_file() else []
+    given = [PurePath(line.strip().replace("\\", "/")).name for line in lines if line.strip()]
     cameras = Cameras(
         labels=tuple(shots),
         centres=centres,
@@ -121,7 +124,7 @@ def _reconstruction(path: Path, data: Any) -> Reconstruction:
         crs=crs,
         notes=tuple(notes),
         gnss=GnssPositions(xyz, sigma, crs) if has_gnss else None,
-        unposed=left_out(shots, [*others, *panoramas, *_listed(path)]),
+        unposed=left_out(shots, [*others, *panoramas, *given]),
         source="OpenSfM",
     )
     return Reconstruction(path, cameras, reference, chosen.get("points", {}))
@@ -184,15 +187,6 @@ def _reference(path: Path, chosen: Any) -> tuple[float, float, float] | None:
         if not (abs(lat) <= 90.0 and abs(lon) <= 360.0 and abs(alt) < np.inf):
             raise damaged(path, f"reference_lla {lat:g}, {lon:g} is no latitude and longitude")
     return None if lat == lon == 0.0 else (lat, lon, alt)
-
-
-def _listed(path: Path) -> list[str]:
-    """Return the images that the project was given, where it has kept the list."""
-    listed = path.with_name("image_list.txt")
-    if not listed.is_file():
-        return []
-    lines = listed.read_text("utf-8", errors="replace").splitlines()
-    return [PurePath(line.strip().replace("\\", "/")).name for line in lines if line.strip()]
 
 
 HEADER = b"OPENSFM_TRACKS_VERSION"

@@ -135,8 +135,12 @@ def write_opensfm(path: File, cameras: Cameras, tie_points: TiePoints | None = N
         If a file exists.
     """
     target = Path(path)
-    _check_whole(target, cameras)
-    models = {each: opensfm_camera(target, each) for each in dict.fromkeys(cameras.lenses or ())}
+    if cameras.rotations is None or cameras.lenses is None:
+        raise needs_lenses(target)
+    for label, count in Counter(cameras.labels).items():  # they are keys in the file
+        if count > 1 or "\t" in label or "\n" in label:
+            raise bad_label(target, label)
+    models = {each: opensfm_camera(target, each) for each in dict.fromkeys(cameras.lenses)}
     names = {each: f"pcfix {i}" for i, each in enumerate(models, start=1)}
     ties = tie_points or NO_TIE_POINTS
     kept = np.flatnonzero(are_seen(ties))
@@ -158,15 +162,6 @@ def write_opensfm(path: File, cameras: Cameras, tie_points: TiePoints | None = N
         texts["tracks.csv"] = "\n".join(_tracks(cameras, tie_points, kept)) + "\n"
     texts[target.name] = json.dumps([chosen]) + "\n"
     write_new(target.parent, {name: text.encode() for name, text in texts.items()})
-
-
-def _check_whole(target: Path, cameras: Cameras) -> None:
-    """Refuse a block without rotations or lenses, and names that are no keys."""
-    if cameras.rotations is None or cameras.lenses is None:
-        raise needs_lenses(target)
-    for label, count in Counter(cameras.labels).items():
-        if count > 1 or "\t" in label or "\n" in label:
-            raise bad_label(target, label)
 
 
 def opensfm_camera(path: Path, given: Lens) -> dict[str, Any]:

@@ -35,7 +35,7 @@ from pcfix.io.cameras.checks import damaged, number, read_xml, wrong
 from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.pix4d import tables
 from pcfix.io.cameras.pix4d.tables import read_text
-from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, TiePoints
+from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, TiePoints
 
 PARAMETERS = "calibrated_camera_parameters.txt"
 EXTERNAL = "calibrated_external_camera_parameters.txt"
@@ -356,10 +356,17 @@ def _observations(
     xy = np.array([row[2:4] for row in measured], dtype=float)
     if path == files.get("bingo"):
         sensor = np.array([row[4:] for row in measured], dtype=float)
-        xy = _from_centre_mm(path, xy, sensor, camera, lenses)
+        if not (sensor[posed] > 0.0).all():
+            raise damaged(path, "the line of an image lacks its sensor size H_width_height")
+        frame = np.array([(lens.width, lens.height) for lens in lenses])[camera]
+        # from mm from the image centre, y up, to the unit of the lens from the upper left
+        xy = frame / 2.0 + xy * np.array([1.0, -1.0]) * frame / sensor
     points = np.array([name for name, *_ in measured])
     names, point = np.unique(points[posed], return_inverse=True)
-    known = _estimated(files["gcps"]) if "gcps" in files else {}
+    known = {}  # where the adjustment placed the control points
+    if "gcps" in files:
+        lines = [line.split(",") for line in read_text(files["gcps"]).splitlines()[1:]]
+        known = {row[0].strip(): checks.triple(row[4:7]) for row in lines if len(row) > 1}
     unknown = np.full(3, np.nan)
     xyz = np.array([known.get(name.partition("_")[2], unknown) for name in names.tolist()])
     return tracks.tie_points(xyz, point, camera[posed], xy[posed])
@@ -387,20 +394,3 @@ def _measured(path: Path, rows: dict[str, int]) -> list[tuple[str, int, str, str
         else:
             raise damaged(path, f"'{line.strip()[:60]}' is not a point and its x and y")
     return found
-
-
-def _from_centre_mm(
-    path: Path, xy: FloatArray, sensor: FloatArray, camera: IntArray, lenses: tuple[Lens, ...]
-) -> FloatArray:
-    """Turn mm from the image centre, y up, into the unit of the lens from the upper left."""
-    frame = np.array([(lens.width, lens.height) for lens in lenses])[camera]
-    if not (sensor[camera >= 0] > 0.0).all():
-        raise damaged(path, "the line of an image lacks its sensor size H_width_height")
-    return np.asarray(frame / 2.0 + xy * np.array([1.0, -1.0]) * frame / sensor)
-
-
-def _estimated(path: Path) -> dict[str, FloatArray]:
-    """Read where the adjustment placed the control points, by their labels."""
-    with checks.reading(path):
-        lines = [line.split(",") for line in read_text(path).splitlines()[1:] if line.strip()]
-        return {row[0].strip(): checks.triple(row[4:7]) for row in lines}

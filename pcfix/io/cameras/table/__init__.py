@@ -59,7 +59,7 @@ from pcfix.io.cameras.table.sensor import read_lenses, read_sensor
 from pcfix.io.crs import shortened
 from pcfix.io.tables import Table, number, read_lines
 from pcfix.lens import rotations
-from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray
+from pcfix.model import Cameras, FloatArray, GnssPositions
 
 __all__ = ["read", "read_sensor", "recognises"]
 
@@ -79,13 +79,23 @@ def read(source: Source) -> Cameras:
     """Read a table; see `pcfix.read_cameras`."""
     everything = open_table(source.path)
     suffix = "_est" if axes(everything.place, "_est") else ""
-    columns, unposed = _with_a_pose(everything, suffix)
+    columns, unposed = everything, tuple[str, ...]()
+    if suffix or are_by_gnss(everything):  # else a position that is not there is a mistake
+        lost = np.isnan(centres(everything, suffix)).any(axis=1)
+        if lost.all():
+            raise checks.no_pose(source.path, "no image has a position")
+        unposed = tuple(everything.labels[i] for i in np.flatnonzero(lost))
+        columns = everything.take(np.flatnonzero(~lost))
     xyz = centres(columns, suffix, needed=True)
     turns = _rotations(columns, source.angles, suffix)
     if turns is None and source.sensor is not None:
         raise checks.sensor_unused(source, "no angles")
     lenses = None if turns is None else read_lenses(columns, source.sensor)
-    keep, notes = _without_copies(columns, xyz)
+    first: dict[tuple[str, bytes], int] = {}  # labels are no key, but an exact copy counts once
+    for i, label in enumerate(columns.labels):
+        first.setdefault((label, xyz[i].tobytes()), i)
+    keep = np.array(list(first.values()))
+    notes = checks.repeated(columns.path, columns.labels, len(columns.labels) - len(keep))
     gnss = gnss_positions(columns) if suffix else None
     system, doubt = crs(columns)
     if are_by_gnss(columns):
@@ -102,31 +112,6 @@ def read(source: Source) -> Cameras:
         unposed=unposed,
         source="CSV table",
     )
-
-
-def _with_a_pose(columns: Columns, suffix: str) -> tuple[Columns, tuple[str, ...]]:
-    """Return the rows with a position, and the images of the others.
-
-    In a table of poses a position that is not there is a mistake; in one of measurements, or of
-    adjusted beside measured values, it is an image that has none.
-    """
-    if not suffix and not are_by_gnss(columns):
-        return columns, ()
-    lost = np.isnan(centres(columns, suffix)).any(axis=1)
-    if lost.all():
-        raise checks.no_pose(columns.path, "no image has a position")
-    unposed = tuple(columns.labels[i] for i in np.flatnonzero(lost))
-    return columns.take(np.flatnonzero(~lost)), unposed
-
-
-def _without_copies(columns: Columns, xyz: FloatArray) -> tuple[IntArray, tuple[PcfixWarning, ...]]:
-    """Return the rows to keep and what to tell: labels are no key, but a copy counts once."""
-    labels = columns.labels
-    first: dict[tuple[str, bytes], int] = {}
-    for i, label in enumerate(labels):
-        first.setdefault((label, xyz[i].tobytes()), i)
-    keep = np.array(list(first.values()))
-    return keep, checks.repeated(columns.path, labels, len(labels) - len(keep))
 
 
 WGS84, WGS84_ELLIPSOIDAL = "EPSG:4326", "EPSG:4979"
@@ -155,6 +140,8 @@ def gnss_positions(columns: Columns) -> GnssPositions | None:
 
 def centres(columns: Columns, suffix: str = "", *, needed: bool = False) -> FloatArray:
     """Return positions, shape (k, 3), NaN for rows without when they are not `needed`."""
+    from pyproj import CRS
+
     three = axes(columns.place, suffix)
     if three is None:
         return np.full((len(columns.labels), 3), np.nan)
@@ -164,7 +151,8 @@ def centres(columns: Columns, suffix: str = "", *, needed: bool = False) -> Floa
             texts = columns.table.column(columns.name(side))
             beyond = [text[:1].upper() in ("S", "W") for text in texts]
             xyz[beyond, i] = -np.abs(xyz[beyond, i])
-    if three[0].startswith("longitude") or _is_geographic(crs(columns)[0]):
+    system = crs(columns)[0] or "local"
+    if three[0].startswith("longitude") or (system != "local" and CRS(system).is_geographic):
         bad = (np.abs(xyz[:, :2]) > [360.0, 90.0]).any(axis=1)
         if bad.any():
             i = int(np.argmax(bad))
@@ -184,7 +172,9 @@ def crs(columns: Columns) -> tuple[str | None, tuple[PcfixWarning, ...]]:
     if the header calls them so; else the CRS has no heights. A ``.prj`` of the table's name beside
     it counts where the table itself says nothing.
     """
-    said = columns.crs or _beside(columns.path)
+    said, beside = columns.crs, columns.path.with_suffix(".prj")
+    if not said and beside != columns.path and beside.is_file():
+        said = beside.read_bytes().decode("utf-8-sig", errors="replace").strip() or None
     if said is None:
         if axes(columns.place) != ("longitude", "latitude", "z"):
             return None, ()
@@ -199,14 +189,6 @@ def crs(columns: Columns) -> tuple[str | None, tuple[PcfixWarning, ...]]:
         )
         return None, (PcfixWarning("cameras.crs_unknown", sentence, crs=said),)
     return said, ()
-
-
-def _beside(path: Path) -> str | None:
-    """Return the CRS in the .prj of a table, None where there is none."""
-    projection = path.with_suffix(".prj")
-    if projection == path or not projection.is_file():
-        return None
-    return projection.read_bytes().decode("utf-8-sig", errors="replace").strip() or None
 
 
 def are_by_gnss(columns: Columns) -> bool:
@@ -236,14 +218,6 @@ def _read_geo(path: Path, lines: list[str]) -> Columns:
     return Columns(
         table, place, [""] * len(GEO), after_hash=False, crs=checks.utm_as_code(lines[0].strip())
     )
-
-
-def _is_geographic(name: str | None) -> bool:
-    if name is None or name == "local":
-        return False
-    from pyproj import CRS
-
-    return bool(CRS(name).is_geographic)
 
 
 OMEGA_PHI_KAPPA = ("omega", "phi", "kappa")

@@ -163,7 +163,14 @@ def write_table(folder: File, cameras: Cameras) -> None:
             )
             raise wrong(target, "output.lens", sentence)
         sensor = _row({"width_px": distinct[0].width, "height_px": distinct[0].height})
-        poses = _poses(cameras, [_own(target, lens) for lens in cameras.lenses])
+        side = max(distinct[0].width, distinct[0].height)
+        own = []
+        for lens in cameras.lenses:  # f, px, py, k1 ... k4, t1, t2 as RealityCapture has them
+            radial, _, tangential = _brown(target, lens, (4, 0, 2))
+            x, y = lens.principal_x - lens.width / 2.0, lens.principal_y - lens.height / 2.0
+            row = [lens.focal * FILM_MM / side, x / side, y / side, *radial, *tangential]
+            own.append(row)
+        poses = _poses(cameras, own)
     write_new(target, {"cameras.csv": poses.encode(), "sensor.csv": sensor.encode()})
 
 
@@ -195,14 +202,6 @@ def _sensor(target: Path, lens: Lens) -> str:
     values |= {f"k{i}": value for i, value in enumerate((*radial, *denominator), start=1)}
     values |= {"p1": tangential[1], "p2": tangential[0]}  # OpenCV counts them the other way round
     return _row(values)
-
-
-def _own(target: Path, lens: Lens) -> list[float]:
-    """Return f, px, py, k1 ... k4, t1, t2 of one image, as RealityCapture's tables have them."""
-    radial, _, tangential = _brown(target, lens, (4, 0, 2))
-    largest = max(lens.width, lens.height)
-    x, y = lens.principal_x - lens.width / 2.0, lens.principal_y - lens.height / 2.0
-    return [lens.focal * FILM_MM / largest, x / largest, y / largest, *radial, *tangential]
 
 
 def _brown(target: Path, lens: Lens, counts: Sequence[int]) -> list[tuple[float, ...]]:
