@@ -276,7 +276,7 @@ def test_correct_recipe_on_the_river(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     (line,) = done.stderr.splitlines()
     assert line.startswith("pcfix: warning: ")
-    with pytest.warns(pcfix.PcfixWarning, match="7 labels occur more than once"):
+    with pytest.warns(pcfix.PcfixWarning, match="7 labels repeat"):
         pcfix.correct_file(
             RIVER / "points.las", tmp_path / "cli.las", cameras=cameras, water="dim:w_surf",
             index=1.337, method="snell", max_angle=35.0,

@@ -123,7 +123,9 @@ _PLAIN = {spelling for spellings in SPELLINGS.values() for spelling in spellings
 
 def column_missing(path: Path, missing: Sequence[str], header: Sequence[str]) -> InputError:
     """Return the error for a table that lacks columns."""
-    sentence = f"the columns {', '.join(missing)} are missing. Its header has {', '.join(header)}."
+    sentence = (
+        f"the header lacks {', '.join(missing)}; it has {', '.join(header)}. Add the columns."
+    )
     return wrong(path, "table.column_missing", sentence, columns=list(missing))
 
 
