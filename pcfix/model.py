@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import SettingError
+from pcfix.errors import PcfixWarning, SettingError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -179,7 +179,7 @@ class Cameras:
     gnss : GnssPositions or None
     unposed : tuple of str
         Images without a pose, which are left out.
-    notes : tuple of str
+    notes : tuple of PcfixWarning
         What was done on reading, for the summary.
     source : str
         The software and its version.
@@ -190,7 +190,7 @@ class Cameras:
     rotations: FloatArray | None = None
     lenses: tuple[Lens, ...] | None = None
     crs: str | None = None
-    notes: tuple[str, ...] = ()
+    notes: tuple[PcfixWarning, ...] = ()
     project_crs: str | None = None
     gnss: GnssPositions | None = None
     unposed: tuple[str, ...] = ()

@@ -358,7 +358,7 @@ def test_a_folder_that_holds_cameras(refuse: Refuse, folder: Path) -> None:
     (folder / "images" / "cameras.csv").write_bytes((folder / "cameras.csv").read_bytes())
     (folder / "images" / "notes.txt").write_text("flown on a Tuesday")
     said = refuse(*job("--cameras", "images"))
-    assert "is a folder that holds cameras.csv (CSV table); give images/cameras.csv itself" in said
+    assert "is a folder that holds cameras.csv (CSV table). Give images/cameras.csv itself" in said
 
 
 @pytest.mark.parametrize("angles", [False, True])
@@ -376,8 +376,8 @@ ROWS = "a,456010,5432010,90\nb,456060,5432010,90\nc,456010,5432060,90\n"
 TABLES = {
     "too many fields": ("label,x,y,z\n" + ROWS + "d,1,456060,5432060,90\n", ["line 5", "shifted"]),
     "too few fields": ("label,x,y,z\n" + ROWS + "d,5432060,90\n", ["line 5", "shifted"]),
-    "no column z": ("label,x,y\na,1,2\n", ["z missing", "line 1"]),
-    "no column label": ("who,x,y,z\n" + ROWS, ["label missing"]),
+    "no column z": ("label,x,y\na,1,2\n", ["lacks z"]),
+    "no column label": ("who,x,y,z\n" + ROWS, ["lacks label"]),
     "a word": ("label,x,y,z\na,456010,5432010,90\nb,east,5432010,90\n", ["line 3", "column x"]),
     "an empty field": ("label,x,y,z\n" + ROWS + "d,456060,,90\n", ["line 5", "column y"]),
     "nan": ("label,x,y,z\n" + ROWS + "d,456060,5432060,nan\n", ["line 5", "column z", "'nan'"]),
@@ -412,7 +412,7 @@ def test_angles_without_a_sensor(refuse: Refuse, folder: Path) -> None:
 
 def test_a_sensor_without_angles(refuse: Refuse, folder: Path) -> None:
     (folder / "lens.csv").write_text(SENSOR)
-    assert "yaw" in refuse(*job("--sensor", "lens.csv"))
+    assert "angles" in refuse(*job("--sensor", "lens.csv"))
 
 
 @pytest.mark.parametrize(

@@ -161,7 +161,7 @@ class Job(Sums):
             seconds=round(seconds, 3),
             views=None if report is None else report.as_dict(),
             warnings=[
-                *self.cameras.notes,
+                *map(str, self.cameras.notes),
                 *([] if report is None else map(str, report.warnings())),
                 *self.labelling.notes,
                 *self.medium.notes(tally),

@@ -11,9 +11,8 @@ import numpy as np
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.cameras import read_cameras, table
 from pcfix.io.cameras.formats import Source
-from pcfix.io.cameras.frames import is_tied
-from pcfix.io.cameras.georeference import adjusted_minus_gnss
-from pcfix.io.cameras.odm.project import read_images
+from pcfix.io.cameras.georeference import adjusted_minus_gnss, is_tied
+from pcfix.io.cameras.odm import read_images
 from pcfix.io.cameras.table import gnss_positions, open_table
 from pcfix.io.crs import METRES, is_topocentric, parse_crs
 from pcfix.io.files import check_input
@@ -88,7 +87,7 @@ def read_gnss(path: File, cameras: Cameras, *, crs: str | None = None) -> Camera
         notes.append(PcfixWarning("gnss.unknown_images", words, path=source, images=list(others)))
     for note in notes:
         warnings.warn(note, stacklevel=2)
-    return replace(cameras, gnss=found, notes=(*cameras.notes, *map(str, notes)))
+    return replace(cameras, gnss=found, notes=(*cameras.notes, *notes))
 
 
 def _listed(path: Path) -> tuple[list[str], GnssPositions]:

@@ -154,7 +154,7 @@ class CamerasReport:
             "gnss": self.gnss and asdict(self.gnss),
             "fit": fit and {**asdict(fit), "fits": fit.fits},
             "refraction": self.diagnosis and self.diagnosis.as_dict(),
-            "notes": list(map(str, cameras.notes)),
+            "notes": [str(note) for note in cameras.notes],
         }
 
 

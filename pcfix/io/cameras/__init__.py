@@ -1,17 +1,23 @@
-"""Camera poses, whatever wrote them: one module per format behind one `read_cameras`.
+"""Read camera poses of any software: one module per format behind one `read_cameras`.
 
-A format module has ``recognises(source)``, ``read(source)`` and, where the format has tie points,
-``tie_points(source, cameras)``; see `formats.Reader`. To add a format, write its module and an
-entry of `FORMATS`, from which its line in README.md of this folder follows.
+A format module has ``recognises(source)``, which is cheap, ``read(source)`` and, where the format
+has tie points, ``tie_points(source, cameras)``. `read_cameras` turns what damaged contents raise
+into an `InputError`, and checks rotations and lenses; a module raises an `InputError` itself where
+it can say more than "damaged". To add a format, write its module and an entry of `FORMATS`, from
+which its line in README.md of this folder follows.
 """
 
 from __future__ import annotations
 
 import warnings
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, NamedTuple
 
-from pcfix.errors import InputError, NoTiePointsError, PcfixWarning, SettingError
+import numpy as np
+
+from pcfix.errors import InputError, SettingError
 from pcfix.io.cameras import (
     blocksexchange,
     bundler,
@@ -28,26 +34,37 @@ from pcfix.io.cameras import (
     tracks,
     unsupported,
 )
-from pcfix.io.cameras.formats import Angles, CameraFormat, Source, SparseReader
+from pcfix.io.cameras.checks import (
+    DAMAGES,
+    NO_LENS,
+    checked,
+    damaged,
+    no_pose,
+    reading,
+    sensor_unused,
+    wrong,
+)
+from pcfix.io.cameras.formats import Angles, Source
 from pcfix.io.cameras.table.sensor import read_sensor
+from pcfix.io.cameras.tracks import no_tie_points
 from pcfix.io.files import check_input
 from pcfix.model import Cameras, TiePoints
 from pcfix.options.declare import File
 
 LISTS = (
-    ".xml",
-    ".csv",
-    ".txt",
-    ".json",
-    ".geojson",
-    ".psx",
-    ".psz",
-    ".xmlz",
-    ".opf",
-    ".out",
-    ".nvm",
+    *(".xml", ".csv", ".txt", ".json", ".geojson", ".psx", ".psz", ".xmlz", ".opf", ".out", ".nvm"),
 )
-"""How files are named that cameras may be in."""
+"""Endings of files that may hold cameras."""
+
+
+class CameraFormat(NamedTuple):
+    """A format: its software, what to give ``--cameras`` (for the documentation), its module."""
+
+    software: str
+    give: str
+    reader: Any
+
+
 FORMATS = (
     CameraFormat(
         "Agisoft Metashape, PhotoScan",
@@ -86,8 +103,6 @@ FORMATS = (
 table says least of all."""
 TAKE_SENSOR = (table, realitycapture)
 """Readers that look for the sensor themselves."""
-BOUNDLESS = "frames are taken as boundless."
-"""What notes of readers end with where they find no lens."""
 
 
 def read_cameras(
@@ -114,8 +129,8 @@ def read_cameras(
         ``focal, sensor_x, sensor_y`` in millimetres or ``focal_px, width_px, height_px, ...``, or a
         calibration of Metashape. Default: a ``sensor.csv`` beside the cameras.
     angles : {"omega-phi-kappa", "yaw-pitch-roll", "aircraft"}, optional
-        What the angles of a table are, where its header cannot say. Of an aircraft's or a
-        gimbal's, pitch -90 looks straight down.
+        The kind of angles in a table whose header does not say it. For the angles of an aircraft
+        or a gimbal, pitch -90 looks straight down.
 
     Returns
     -------
@@ -131,8 +146,8 @@ def read_cameras(
     Raises
     ------
     InputError
-        If a file is missing, or a row or column is not what it should be; the message names it.
-        Or if there is a `sensor` for a file that has its own lenses.
+        If a file is missing or damaged, is not a camera file, or has its own lenses beside a
+        `sensor`.
 
     Examples
     --------
@@ -143,13 +158,15 @@ def read_cameras(
     """
     source, form = _recognised(path, sensor, angles)
     try:
-        cameras = _with_sensor(source, form.reader.read(source), form)
+        with reading(path):
+            cameras = _with_sensor(source, form.reader.read(source), form)
+            cameras = checked(source.path, cameras)
     except SettingError as error:  # numbers that are finite in the file and not in the world
-        raise InputError(f"{source.path}: {error}") from error
+        raise damaged(path, str(error).rstrip(".")) from error
     if not len(cameras):
-        raise InputError(f"{path}: has no image with a pose.")
+        raise no_pose(source.path)
     for note in cameras.notes:
-        warnings.warn(note, PcfixWarning, stacklevel=2)
+        warnings.warn(note, stacklevel=2)
     return cameras
 
 
@@ -159,7 +176,7 @@ def read_tie_points(path: File, cameras: Cameras) -> TiePoints:
     Parameters
     ----------
     path : path
-        What `cameras` was read from.
+        The file or folder that `cameras` was read from.
     cameras : Cameras
         As `read_cameras` gave them.
 
@@ -177,16 +194,16 @@ def read_tie_points(path: File, cameras: Cameras) -> TiePoints:
     Warns
     -----
     PcfixWarning
-        When numbers are not finite: such image places, and points with such a coordinate, are
+        When numbers are not finite: such observations, and points with such a coordinate, are
         left out.
     """
     source, form = _recognised(path, None, None)
-    if not isinstance(form.reader, SparseReader):
-        raise NoTiePointsError(f"{source.path}: the format ({form.software}) has no tie points.")
-    found = form.reader.tie_points(source, cameras)
-    ties, note = tracks.finite(found)
-    if note:
-        warnings.warn(f"{source.path}: {note}", PcfixWarning, stacklevel=2)
+    if not hasattr(form.reader, "tie_points"):
+        raise no_tie_points(source.path, f"the format ({form.software}) has none")
+    with reading(path):
+        ties, note = tracks.finite(source.path, form.reader.tie_points(source, cameras))
+    if note is not None:
+        warnings.warn(note, stacklevel=2)
     return ties
 
 
@@ -205,19 +222,19 @@ def _recognised(
     inside = _camera_files(where)
     if inside:
         listed = " and ".join(f"{name} ({software})" for name, software in inside)
-        raise InputError(
-            f"{where}: is a folder that holds {listed}; give {where / inside[0][0]} itself."
-        )
+        sentence = f"is a folder that holds {listed}. Give {where / inside[0][0]} itself."
+        raise wrong(where, "cameras.folder", sentence, files=[name for name, _ in inside])
     if known is not None:
         return source, known
-    raise InputError(
-        f"{where}: is not a camera file that pcfix knows; give a CSV table with the columns"
-        " label, x, y, z and, if you have them, yaw, pitch, roll."
+    sentence = (
+        "is not a camera file that pcfix knows. Give a CSV table with the columns label, x, y, z"
+        " and, if you have them, yaw, pitch, roll."
     )
+    raise wrong(where, "cameras.unknown", sentence)
 
 
 def takes_sensor(path: File) -> bool:
-    """Whether a file is of a format whose lens stands in a file of its own."""
+    """Whether the format of a file keeps the lens in a file of its own."""
     return _recognised(path, None, None)[1].reader in TAKE_SENSOR
 
 
@@ -225,29 +242,28 @@ def _with_sensor(source: Source, cameras: Cameras, form: CameraFormat) -> Camera
     """Return cameras with the lens of ``--sensor`` where their file has none."""
     if source.sensor is None or form.reader in TAKE_SENSOR or not len(cameras):
         return cameras
-    if cameras.lenses is not None:
-        raise InputError(
-            f"{source.path}: has the lenses of its images ({form.software}), so --sensor"
-            f" {source.sensor} would say them twice; leave it out."
-        )
-    if cameras.rotations is None:
-        raise InputError(
-            f"{source.path}: has no angles, so the sensor {source.sensor} says nothing; leave it"
-            " out, or export the angles."
-        )
+    if cameras.lenses is not None or cameras.rotations is None:
+        raise sensor_unused(source, "no angles" if cameras.lenses is None else "its own lenses")
     lenses = (read_sensor(source.sensor),) * len(cameras)
-    notes = tuple(note for note in cameras.notes if not note.endswith(BOUNDLESS))
+    notes = tuple(note for note in cameras.notes if note.code != NO_LENS)
     return replace(cameras, lenses=lenses, notes=notes)
 
 
 def _format_of(source: Source) -> CameraFormat | None:
     """Return the first format that knows the content; standard errors look like poses."""
     asked = FORMATS[-1:] if unsupported.is_part(source) else FORMATS
-    return next((form for form in asked if form.reader.recognises(source)), None)
+    return next((form for form in asked if _knows(form, source)), None)
+
+
+def _knows(form: CameraFormat, source: Source) -> bool:
+    """Whether a file is of a format; not where it is too damaged to tell."""
+    with suppress(InputError, *DAMAGES), np.errstate(all="ignore"):
+        return bool(form.reader.recognises(source))
+    return False
 
 
 def _camera_files(folder: Path) -> list[tuple[str, str]]:
-    """Return the names of camera files in a folder and whose they are, three at most."""
+    """Return the names of camera files in a folder and their software, three at most."""
     found = []
     for path in sorted(p for p in folder.glob("*") if p.suffix.lower() in LISTS and p.is_file()):
         form = _format_of(Source(path))

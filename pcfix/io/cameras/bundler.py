@@ -13,7 +13,7 @@ MVE ("drews 1.0", https://github.com/simonfuhrmann/mve/wiki/MVE-File-Format) has
 in units of the longer side of the frame, and views (image, feature, nothing).
 
 Neither has names or sizes of the images. Names are in ``list.txt``, a line for each camera. Sizes
-are taken as `pcfix.io.cameras.tracks` says. The CRS is not told.
+are taken as `pcfix.io.cameras.tracks` says. The files name no CRS.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.errors import InputError, NoTiePointsError
+from pcfix.errors import PcfixWarning
 from pcfix.io.cameras import checks, tracks
 from pcfix.io.cameras.formats import Source
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
@@ -57,19 +57,18 @@ def recognises(source: Source) -> bool:
 
 def read(source: Source) -> Cameras:
     """Read the poses of images with a focal length, and their lenses where sizes are known."""
-    bundle = _read(source)
+    bundle = _read(source.path)
     names, notes = _names(bundle)
-    posed = bundle.posed.tolist()
-    if not posed:
-        raise InputError(f"{bundle.path}: no image has a pose (all focal lengths are 0).")
-    poses = [_pose(bundle, names[i], bundle.cameras[i]) for i in posed]
-    rotations, centres = zip(*poses, strict=True)
-    labels, rows = tuple(names[i] for i in posed), set(posed)
+    rows = bundle.posed.tolist()
+    if not rows:
+        raise checks.no_pose(bundle.path, "no image has a pose (all focal lengths are 0)")
+    labels, posed = tuple(names[i] for i in rows), bundle.cameras[rows]
+    rotations = checks.rotations(bundle.path, labels, posed[:, 3:12])
     lenses, more = _lenses(bundle, labels)
     return Cameras(
         labels=labels,
-        centres=np.array(centres),
-        rotations=np.array(rotations),
+        centres=-np.einsum("kji,kj->ki", rotations, posed[:, 12:]),
+        rotations=rotations if bundle.mve else _UP_BACK_TO_DOWN_FORWARD @ rotations,
         lenses=lenses,
         notes=(*notes, *more),
         unposed=tuple(name for i, name in enumerate(names) if i not in rows),
@@ -79,55 +78,33 @@ def read(source: Source) -> Cameras:
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """Read the points and where the images saw them."""
-    bundle = _read(source)
+    bundle = _read(source.path)
     points = bundle.points
     if bundle.mve:
-        raise NoTiePointsError(f"{bundle.path}: MVE writes no image coordinates; no tie points.")
+        raise tracks.no_tie_points(bundle.path, "MVE writes no image coordinates")
     if not len(points.xyz) or cameras.lenses is None:
-        raise NoTiePointsError(f"{bundle.path}: has no points; no tie points.")
+        raise tracks.no_tie_points(bundle.path, "it lists no points")
     places = points.rest[:, 1:] * (1.0, -1.0)
     return tracks.from_principal_point(points, bundle.posed, cameras, places)
 
 
-def _read(source: Source) -> Bundle:
-    path = source.path
+def _read(path: Path) -> Bundle:
     head, _, body = path.read_bytes().decode("utf-8-sig", "replace").partition("\n")
     version = _BUNDLER.match(head)
     if version and version[1] != _VERSION:
-        raise InputError(
-            f"{path}: is of Bundler's format v{version[1]}, which pcfix does not read; export"
-            f" v{_VERSION}."
-        )
-    values = tracks.numbers(path, body)
-    counts = values[:2]
-    whole = np.isfinite(counts) & (counts >= 0) & (counts == np.floor(counts))
-    if len(counts) < 2 or not whole.all():
-        raise InputError(f"{path}: line 2 must give the numbers of cameras and points.")
-    cameras, points = (int(count) for count in counts)
+        what = f"Bundler's format v{version[1]}"
+        raise checks.unsupported(path, what, f"Export v{_VERSION}", version=version[1])
+    values = tracks.numbers(body)
+    cameras, points = int(values[0]), int(values[1])
     end = 2 + _CAMERA_NUMBERS * cameras
-    if end > len(values) or cameras == 0:
-        raise InputError(
-            f"{path}: is cut off: it announces {cameras} cameras, but there are"
-            f" {(len(values) - 2) // _CAMERA_NUMBERS}; export it again."
-        )
-    width = 4 if version else 3
-    listed = tracks.point_list(path, values[end:], points, cameras, width)
+    listed = tracks.point_list(path, values[end:], points, cameras, 4 if version else 3)
     rows = values[2:end].reshape(cameras, _CAMERA_NUMBERS)
     return Bundle(path, version is None, rows, listed)
 
 
-def _pose(bundle: Bundle, name: str, numbers: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return rotation, in OpenCV's axes, and projection centre."""
-    matrix = checks.rotation(bundle.path, name, numbers[3:12].reshape(3, 3))
-    centre = -matrix.T @ numbers[12:]
-    if not np.isfinite(centre).all():
-        raise InputError(f"{bundle.path}: image {name}: its position is not finite.")
-    return (matrix if bundle.mve else _UP_BACK_TO_DOWN_FORWARD @ matrix), centre
-
-
 def _lenses(
     bundle: Bundle, labels: tuple[str, ...]
-) -> tuple[tuple[Lens, ...] | None, tuple[str, ...]]:
+) -> tuple[tuple[Lens, ...] | None, tuple[PcfixWarning, ...]]:
     focal, k1, k2 = bundle.cameras[bundle.posed, :3].T
     bounds = np.zeros((len(bundle.cameras), 2))
     if not bundle.mve:
@@ -137,15 +114,11 @@ def _lenses(
         return None, notes
     if bundle.mve:
         focal = focal * frames.max(axis=1)
-    lenses = []
     rows = np.column_stack([focal, frames, k1, k2]).tolist()
-    for label, (f, w, h, *radial) in zip(labels, rows, strict=True):
-        lens = Lens(f, w, h, w / 2.0, h / 2.0, radial=tuple(radial))
-        lenses.append(checks.lens(bundle.path, f"of image {label}", lens))
-    return tuple(lenses), notes
+    return tuple(Lens(f, w, h, w / 2.0, h / 2.0, radial=tuple(k)) for f, w, h, *k in rows), notes
 
 
-def _names(bundle: Bundle) -> tuple[list[str], tuple[str, ...]]:
+def _names(bundle: Bundle) -> tuple[list[str], tuple[PcfixWarning, ...]]:
     """Return the names of all images, from the list beside the file if it fits."""
     path, count = bundle.path, len(bundle.cameras)
     stem = path.name.removesuffix(".out")
@@ -157,9 +130,12 @@ def _names(bundle: Bundle) -> tuple[list[str], tuple[str, ...]]:
         return numbered, ()
     lines = found.read_bytes().decode("utf-8-sig", "replace").splitlines()
     names = [_FOCAL_OF_LIST.sub("", line.strip()) for line in lines if line.strip()]
-    if len(names) != count:
-        return numbered, (
-            f"{found}: lists {len(names)} images, but {path.name} has {count} cameras; the images"
-            " are numbered instead.",
-        )
-    return names, ()
+    if len(names) == count:
+        return names, ()
+    note = PcfixWarning(
+        "cameras.list_unused",
+        f"{found}: lists {len(names)} images, but {path.name} has {count} cameras. The images are"
+        " numbered instead.",
+        path=found,
+    )
+    return numbered, (note,)

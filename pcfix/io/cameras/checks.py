@@ -3,84 +3,168 @@
 from __future__ import annotations
 
 import itertools
+import lzma
 import re
+import sqlite3
+import struct
+import zipfile
+import zlib
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
-from xml.etree.ElementTree import Element, ParseError
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from pcfix.errors import InputError
+from pcfix.errors import InputError, PcfixError, PcfixWarning
+from pcfix.io.cameras.formats import Source
 from pcfix.io.files import check_output, parse_json, write_bytes
-from pcfix.model import FloatArray, Lens
+from pcfix.model import Cameras, FloatArray, Lens
 
 ROUNDING = 1e-3
 """Of a rotation's elements: files with four decimals pass, a mirrored or scaled one does not."""
 
-
-def rotation(path: Path, label: str, matrix: FloatArray) -> FloatArray:
-    """Return the proper rotation next to a 3x3 matrix that is one but for its rounding."""
-    if not (np.abs(matrix) < 2.0).all() or np.abs(matrix @ matrix.T - np.eye(3)).max() > ROUNDING:
-        raise InputError(
-            f"{path}: image {label}: the rotation matrix is not orthonormal; export it again."
-        )
-    if np.linalg.det(matrix) < 0.0:
-        raise InputError(
-            f"{path}: image {label}: the rotation matrix mirrors (determinant -1); its axes are"
-            " left-handed, export it again."
-        )
-    for _ in range(2):  # Newton's iteration to the polar factor; the rounding is squared each time
-        matrix = 1.5 * matrix - 0.5 * matrix @ matrix.T @ matrix
-    return matrix
+DAMAGES = (
+    *(ArithmeticError, AttributeError, EOFError, LookupError, MemoryError, OSError, RuntimeError),
+    *(SyntaxError, TypeError, ValueError, lzma.LZMAError, sqlite3.Error, struct.error),
+    *(zipfile.BadZipFile, zlib.error),
+)
+"""What readers run into where a file is cut off, or holds something else than it should."""
 
 
-def rotations(path: Path, labels: Sequence[str], matrices: Iterable[FloatArray]) -> FloatArray:
-    """Return the proper rotations next to those of images, shape (k, 3, 3)."""
-    pairs = zip(labels, matrices, strict=True)
-    return np.array([rotation(path, label, matrix) for label, matrix in pairs])
+def wrong(path: object, code: str, sentence: str, /, **values: Any) -> InputError:
+    """Return the error for a file: its path, what is wrong, and what to do."""
+    return InputError(code, f"{path}: {sentence}", **{"path": path, **values})
 
 
-def repeated(path: Path, labels: Sequence[str], dropped: int = 0) -> tuple[str, ...]:
-    """Return a note where labels repeat: they are no key, and their images are kept apart."""
-    names = [label for label, count in Counter(labels).items() if count > 1]
-    if not names:
-        return ()
-    copies = f"; {dropped} exact copies are dropped" if dropped else ""
-    listed = ", ".join(names[:10]) + (", ..." if len(names) > 10 else "")
-    return (
-        f"{path}: {len(names)} labels occur more than once ({listed}); cameras at different"
-        f" positions are kept as different images{copies}.",
+def damaged(path: object, why: object, **values: Any) -> InputError:
+    """Return the error for contents that no software writes."""
+    sentence = f"{path}: is damaged or cut off ({why}). Export it again."
+    return InputError("cameras.damaged", sentence, path=path, **values)
+
+
+def no_pose(path: Path, why: str = "no image has a pose") -> InputError:
+    """Return the error for a file without poses."""
+    sentence = f"{path}: {why}. Align the images first, then export their poses."
+    return InputError("cameras.no_pose", sentence, path=path)
+
+
+def unsupported(path: Path, what: str, remedy: str, **values: Any) -> InputError:
+    """Return the error for a lens, rotation or frame that pcfix has no model for."""
+    sentence = f"{path}: {what} is not supported. {remedy}."
+    return InputError("cameras.unsupported", sentence, path=path, **values)
+
+
+def missing(path: Path, remedy: str = "Keep all files of the project together") -> InputError:
+    """Return the error for a file of a project that is not there."""
+    return wrong(path, "cameras.missing_file", f"is missing. {remedy}.")
+
+
+def several(path: Path, count: int, images: int) -> PcfixWarning:
+    """Return a note on models that are not connected, of which the largest is read."""
+    return PcfixWarning(
+        "cameras.several_models",
+        f"{path}: has {count} models that are not connected. The largest is read, with {images}"
+        " images; those of the others are left out.",
+        models=count,
+        images=images,
     )
 
 
-def quaternion(path: Path, label: str, wxyz: FloatArray) -> FloatArray:
-    """Return the rotation matrix of a unit quaternion, the scalar first."""
+def sensor_unused(source: Source, why: str) -> InputError:
+    """Return the error for a sensor that the cameras have no use for."""
+    sentence = f"{source.path}: has {why}, so --sensor {source.sensor} has no use. Leave it out."
+    return InputError("cameras.sensor_unused", sentence, path=source.path, sensor=source.sensor)
+
+
+NO_LENS = "cameras.no_lens"
+
+
+def without_lens(path: Path, why: str) -> PcfixWarning:
+    """Return a note on images without a frame."""
+    return PcfixWarning(
+        NO_LENS, f"{path}: {why}, so every point in front of a camera counts as inside its frame."
+    )
+
+
+@contextmanager
+def reading(path: object) -> Iterator[None]:
+    """Raise `InputError` for whatever damaged contents make the block run into."""
+    try:
+        with np.errstate(all="ignore"):
+            yield
+    except PcfixError:
+        raise
+    except KeyError as error:
+        raise damaged(path, f"{error} is missing") from error
+    except DAMAGES as error:
+        raise damaged(path, error or type(error).__name__) from error
+
+
+def rotations(path: Path, labels: Sequence[str], matrices: FloatArray) -> FloatArray:
+    """Return the proper rotations closest to matrices, shape (k, 3, 3), rounded in their file."""
+    matrices = np.asarray(matrices, np.float64).reshape(-1, 3, 3)
+    off = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    bad = ~((off <= ROUNDING) & (np.linalg.det(np.nan_to_num(matrices, posinf=0.0)) > 0.0))
+    if bad.any():
+        label = labels[int(np.argmax(bad))]
+        sentence = (
+            f"the rotation of {label} is mirrored, or its axes are not at right angles. Export the"
+            " poses again."
+        )
+        raise wrong(path, "cameras.rotation", sentence, image=label)
+    for _ in range(2):  # Newton's iteration to the polar factor squares the rounding each time
+        matrices = 1.5 * matrices - 0.5 * matrices @ matrices.transpose(0, 2, 1) @ matrices
+    return matrices
+
+
+def quaternions(path: Path, labels: Sequence[str], wxyz: FloatArray) -> FloatArray:
+    """Return the rotations, shape (k, 3, 3), of unit quaternions (k, 4), the scalar first."""
     from scipy.spatial.transform import Rotation
 
-    with np.errstate(over="ignore"):
-        length = float(np.linalg.norm(wxyz))
-    if not abs(length - 1.0) <= ROUNDING:
-        raise InputError(
-            f"{path}: image {label}: the quaternion has length {length:g} instead of 1; export"
-            " the poses again."
-        )
-    return np.asarray(Rotation.from_quat(np.roll(wxyz, -1)).as_matrix())
+    bad = ~(np.abs(np.linalg.norm(wxyz, axis=1) - 1.0) <= ROUNDING)
+    if bad.any():
+        label = labels[int(np.argmax(bad))]
+        sentence = f"the quaternion of {label} has not the length 1. Export the poses again."
+        raise wrong(path, "cameras.rotation", sentence, image=label)
+    return np.asarray(Rotation.from_quat(np.roll(wxyz, -1, axis=1)).as_matrix())
 
 
 def lens(path: Path, name: str, given: Lens) -> Lens:
     """Return the lens when its numbers can be those of a camera."""
     lists = (given.shape, given.radial, given.denominator, given.tangential, given.thin_prism)
     numbers = (*_lengths(given), *itertools.chain(*lists), *given.distortion_centre)
-    if not np.isfinite(numbers).all():
-        raise InputError(f"{path}: camera {name}: its calibration has a number that is not finite.")
-    if not min(given.focal, given.width, given.height) > 0.0:
-        raise InputError(
-            f"{path}: camera {name}: focal length {given.focal:g} and frame {given.width:g} x"
-            f" {given.height:g} must be positive; export the calibration again."
+    positive = min(given.focal, given.focal + given.b1, given.width, given.height) > 0.0
+    if not (positive and np.isfinite(numbers).all()):
+        sentence = (
+            f"the lens {name} has the focal length {given.focal:g} and the frame {given.width:g} x"
+            f" {given.height:g}, or a number that is not finite. Export the calibration again."
         )
+        raise wrong(path, "cameras.lens", sentence, lens=name)
     return given
+
+
+def checked(path: Path, cameras: Cameras) -> Cameras:
+    """Return cameras with proper rotations, after a look at their lenses too."""
+    for given, label in dict(zip(cameras.lenses or (), cameras.labels, strict=False)).items():
+        lens(path, given.sensor or f"of {label}", given)
+    if cameras.rotations is not None:
+        return replace(cameras, rotations=rotations(path, cameras.labels, cameras.rotations))
+    return cameras
+
+
+def repeated(path: Path, labels: Sequence[str], dropped: int = 0) -> tuple[PcfixWarning, ...]:
+    """Return a note where labels repeat: they are no key, and their images are kept apart."""
+    names = [label for label, count in Counter(labels).items() if count > 1]
+    if not names:
+        return ()
+    copies = f"; {dropped} exact copies are dropped" if dropped else ""
+    listed = ", ".join(names[:10]) + (", ..." if len(names) > 10 else "")
+    sentence = f"{path}: {len(names)} labels repeat ({listed}). Different positions stay{copies}."
+    return (PcfixWarning("cameras.repeated", sentence, labels=names, dropped=dropped),)
 
 
 def crs(path: Path, definition: str) -> str:
@@ -89,10 +173,11 @@ def crs(path: Path, definition: str) -> str:
     if text.lower() == "local" or text.upper().startswith(("LOCAL_CS", "ENGCRS", "ENGINEERINGCRS")):
         return "local"
     if not names_crs(text):
-        raise InputError(
-            f"{path}: the CRS '{text[:80]}' is not one that PROJ knows; export the poses in a CRS"
-            " with an EPSG code."
+        sentence = (
+            f"PROJ does not know the CRS '{text[:80]}'. Export the poses in a CRS with an EPSG"
+            " code."
         )
+        raise wrong(path, "cameras.crs", sentence, crs=text)
     return text
 
 
@@ -121,7 +206,7 @@ TOLERANCE = 1e-12
 def is_same_lens(one: Lens, other: Lens) -> bool:
     """Whether two lenses take every direction to the same place, but for rounding.
 
-    Zeros at the end of a list of coefficients count for nothing, nor does what the lens is called.
+    Zeros at the end of a list of coefficients do not count, nor does the name of the lens.
     """
     (kind, lists), (other_kind, other_lists) = _coefficients(one), _coefficients(other)
     off = np.abs(np.subtract(_lengths(one), _lengths(other))).max()
@@ -156,29 +241,18 @@ def without_zeros(values: Sequence[float]) -> tuple[float, ...]:
 
 
 def read_xml(path: Path, stream: IO[bytes] | None = None) -> Element:
-    """Return the root of a document.
-
-    Parameters
-    ----------
-    path : Path
-        The file; only for messages when `stream` is given.
-    stream : binary file, optional
-        Read this instead, for documents inside an archive.
-    """
-    from defusedxml.common import DefusedXmlException
+    """Return the root of a document, from `stream` where it lies in an archive."""
     from defusedxml.ElementTree import parse
 
-    try:
+    with reading(path):
         root: Element = parse(stream if stream is not None else path, forbid_dtd=False).getroot()
-    except DefusedXmlException as error:
-        raise InputError(
-            f"{path}: the XML declares entities, which no camera file needs; it is not read."
-        ) from error
-    except (ParseError, LookupError, ValueError) as error:
-        raise InputError(
-            f"{path}: the XML is damaged or cut off ({error}); export it again."
-        ) from error
     return root
+
+
+def load_json(path: Path) -> Any:
+    """Return what a JSON file holds."""
+    with reading(path):
+        return parse_json(path.read_bytes())
 
 
 def number(path: Path, where: str, text: str | None) -> float:
@@ -188,28 +262,23 @@ def number(path: Path, where: str, text: str | None) -> float:
     except ValueError:
         value = np.nan
     if not np.isfinite(value):
-        raise InputError(f"{path}: {where}: '{(text or '').strip()}' is not a number.")
+        shown = (text or "").strip()
+        sentence = f"{where}: '{shown}' is not a number. Export it again."
+        raise wrong(path, "cameras.number", sentence, where=where, value=shown)
     return value
 
 
 def numbers(path: Path, where: str, text: str | None, count: int) -> FloatArray:
     """Return `count` numbers separated by white space or commas."""
-    words: list[Any] = (text or "").replace(",", " ").split()
+    words = (text or "").replace(",", " ").split()
     if len(words) != count:
-        raise InputError(f"{path}: {where}: has {len(words)} numbers instead of {count}.")
+        raise damaged(path, f"{where}: {len(words)} numbers instead of {count}")
     return np.array([number(path, where, word) for word in words])
 
 
-def load_json(path: Path) -> Any:
-    """Return what a JSON file holds."""
-    try:
-        return parse_json(path.read_bytes())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}).") from error
-    except ValueError as error:
-        raise InputError(
-            f"{path}: the JSON is damaged or cut off ({error}); copy it again from the project."
-        ) from error
+def triple(value: Any) -> FloatArray:
+    """Return the three numbers of a list in a JSON file."""
+    return np.array(value, np.float64).reshape(3)
 
 
 def write_new(folder: Path, contents: Mapping[str, bytes]) -> None:
@@ -221,43 +290,22 @@ def write_new(folder: Path, contents: Mapping[str, bytes]) -> None:
         write_bytes(folder / name, data, overwrite=False)
 
 
-def mapping(path: Path, where: str, value: Any) -> dict[str, Any]:
-    """Return a value that is a JSON object."""
-    if not isinstance(value, dict):
-        raise InputError(f"{path}: {where} is not an object with names but {_shown(value)}.")
-    return value
+def needs_lenses(path: Path) -> InputError:
+    """Return the error for cameras that cannot be written without rotations and lenses."""
+    sentence = f"{path}: the cameras have no rotations or no lenses, so they cannot be written."
+    return InputError("output.no_lenses", sentence, path=path)
 
 
-def json_number(path: Path, where: str, value: Any) -> float:
-    """Return a finite number."""
-    return float(vector(path, where, [value], 1)[0])
-
-
-def vector(path: Path, where: str, value: Any, count: int) -> FloatArray:
-    """Return `count` finite numbers."""
-    return np.asarray(rows(path, where, [value], count)[0])
-
-
-def rows(path: Path, where: str, values: Collection[Any], count: int) -> FloatArray:
-    """Return rows of `count` finite numbers each, shape (len(values), count)."""
-    try:
-        found = np.array(list(values), dtype=np.float64).reshape(len(values), -1)
-    except (TypeError, ValueError, OverflowError):
-        found = np.empty((len(values), 0))
-    if len(values) and (found.shape[1] != count or not np.isfinite(found).all()):
-        shown = next((v for v in values if not _is_row(v, count)), values)
-        raise InputError(f"{path}: {where}: {_shown(shown)} is not {count} finite number(s).")
-    return found.reshape(len(values), count)
-
-
-def _is_row(value: Any, count: int) -> bool:
-    return (
-        isinstance(value, list)
-        and len(value) == count
-        and all(isinstance(v, int | float) and abs(v) < np.inf for v in value)
+def lens_not_held(path: Path, given: Lens) -> InputError:
+    """Return the error for a lens that a format cannot hold exactly."""
+    sentence = (
+        f"{path}: the format cannot hold the lens {given.sensor or 'of the images'}"
+        f" ({given.projection} in {given.unit}) exactly. Take another format."
     )
+    return InputError("output.lens", sentence, path=path, lens=given.sensor)
 
 
-def _shown(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+def bad_label(path: Path, label: str) -> InputError:
+    """Return the error for an image whose name cannot stand in a file."""
+    sentence = f"{path}: the format cannot hold the image name {label!r}. Take another format."
+    return InputError("output.label", sentence, path=path, image=label)

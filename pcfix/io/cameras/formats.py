@@ -1,14 +1,13 @@
-"""What every module of a camera format gets and gives, and its entry in the table of formats."""
+"""The input of every module of a camera format."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, NamedTuple, Protocol, runtime_checkable
+from typing import Literal
 
 from pcfix.io.files import check_input
-from pcfix.model import Cameras, TiePoints
 
 Angles = Literal["omega-phi-kappa", "yaw-pitch-roll", "aircraft"]
 
@@ -19,13 +18,8 @@ _HEAD_BYTES = 4096
 class Source:
     """A file or folder that may hold cameras, and what the user said about it.
 
-    Attributes
-    ----------
-    path : Path
-    sensor : Path or None
-        The ``--sensor`` file.
-    angles : Angles or None
-        Which angles a table has, where its header cannot say.
+    `sensor` is the ``--sensor`` file, `angles` the kind of angles of a table whose header does not
+    say it.
     """
 
     path: Path
@@ -49,43 +43,3 @@ class Source:
     def names(self) -> frozenset[str]:
         """Names of what lies in a folder; nothing for a file."""
         return frozenset(p.name for p in self.path.iterdir()) if self.path.is_dir() else frozenset()
-
-
-class Reader(Protocol):
-    """A module of this folder.
-
-    What is wrong with a file is an `InputError` with the file, the image or the line, the value,
-    and what to do; no reader raises another error.
-    """
-
-    def recognises(self, source: Source) -> bool:
-        """Whether the content is of this format; cheap, and never an error."""
-        ...
-
-    def read(self, source: Source) -> Cameras:
-        """Read poses and lenses, in the frame of the file."""
-        ...
-
-
-@runtime_checkable
-class SparseReader(Reader, Protocol):
-    """One whose format has tie points too."""
-
-    def tie_points(self, source: Source, cameras: Cameras) -> TiePoints:
-        """Read points and observations; `cameras` is what `read` gave for the same source."""
-        ...
-
-
-class CameraFormat(NamedTuple):
-    """An entry of the table of formats.
-
-    software : str
-        Whose it is, for messages and the documentation.
-    give : str
-        What to give ``--cameras``, for the documentation; empty where it says nothing.
-    reader : Reader
-    """
-
-    software: str
-    give: str
-    reader: Reader

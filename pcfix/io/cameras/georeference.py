@@ -14,34 +14,173 @@ ellipsoidal ones remain ellipsoidal, whatever the cloud's datum is.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from pcfix.errors import InputError
-from pcfix.io.cameras import frames
-from pcfix.io.cameras.frames import Frame, Statement
+from pcfix.errors import PcfixWarning
+from pcfix.io.cameras.checks import wrong
 from pcfix.io.cameras.mistakes import UNDULATION_M
 from pcfix.io.crs import (
+    GEOCENTRIC_WGS84,
+    GEOGRAPHIC_WGS84,
     METRES,
+    Topocentric,
     check_projected_metres,
     crs_text,
+    geographic_3d,
     heights_of,
     is_local,
     is_topocentric,
+    metres_up,
     parse_crs,
     parts,
     plan_unit,
     shortened,
+    typed,
     unbound,
     with_heights,
 )
-from pcfix.io.transformations import HeightsError, Transformation, is_same_numbers, transformation
+from pcfix.io.transformations import (
+    HeightsError,
+    Transformation,
+    heights_agree,
+    is_same_numbers,
+    transformation,
+)
 from pcfix.model import Cameras, FloatArray, GnssPositions
 
 if TYPE_CHECKING:
     from pyproj import CRS
+
+
+EARTH_RADII_M = (6.2e6, 7.0e6)
+"""Cameras are at no other distance from the centre of the earth."""
+
+
+class Frame(NamedTuple):
+    """A frame that is tied to the earth.
+
+    `enter` takes points (n, 3) of it to `crs`, which is not geocentric, and is the frame itself
+    where it is `direct`. A `topocentric` one has axes east, north, up at a place.
+    """
+
+    crs: CRS
+    enter: Callable[[FloatArray], FloatArray]
+    direct: bool = False
+    topocentric: bool = False
+
+    def per_metre(self, xyz: FloatArray) -> FloatArray:
+        """Return how much each number changes per metre along its axis, at points (n, 3)."""
+        if not self.direct:
+            return np.ones_like(xyz)
+        size = plan_unit(self.crs)[1]
+        up = np.full(len(xyz), 1.0 / abs(metres_up(self.crs)))
+        if self.crs.is_projected:
+            return np.column_stack([np.full((len(xyz), 2), 1.0 / size), up])
+        ellipsoid, latitude, height_m = self.crs.ellipsoid, xyz[:, 1] * size, xyz[:, 2] / up
+        a = ellipsoid.semi_major_metre if ellipsoid is not None else 6378137.0
+        b = ellipsoid.semi_minor_metre if ellipsoid is not None else a
+        e2 = 1.0 - (b / a) ** 2
+        w = np.sqrt(1.0 - e2 * np.sin(latitude) ** 2)
+        parallel_m = (a / w + height_m) * np.maximum(np.cos(latitude), 1e-9)
+        meridian_m = a * (1.0 - e2) / w**3 + height_m
+        return np.column_stack([1.0 / (parallel_m * size), 1.0 / (meridian_m * size), up])
+
+    def check(self, xyz: FloatArray, labels: Sequence[str], name: str) -> None:
+        """Raise InputError for numbers that are no place on the earth."""
+        if self.topocentric or self.crs.is_projected:
+            return
+        if self.direct:
+            turn = 2.0 * np.pi / plan_unit(self.crs)[1] * (1.0 + 1e-9)
+            bad = (np.abs(xyz[:, :2]) > [turn, turn / 4.0]).any(axis=1)
+        else:
+            radius = np.linalg.norm(xyz, axis=1)
+            bad = ~((radius > EARTH_RADII_M[0]) & (radius < EARTH_RADII_M[1]))
+        if bad.any():
+            i = int(np.argmax(bad))
+            kind = "longitude and latitude" if self.direct else "geocentric coordinates"
+            numbers = ", ".join(f"{number:.10g}" for number in xyz[i])
+            code = "cameras.degrees" if self.direct else "cameras.geocentric"
+            sentence = (
+                f"image {labels[i]}: {numbers} are not {kind} ({self.crs.name}). Give the CRS of"
+                " the cameras with --cameras-crs."
+            )
+            raise wrong(name, code, sentence, image=labels[i], crs=self.crs.name)
+
+
+def frame_of(text: str, name: str) -> Frame:
+    """Return the frame that a text names: a CRS, or ``ENU:latitude,longitude,height``."""
+    if is_topocentric(text):
+        place = Topocentric.from_text(text, name)
+        crs = parse_crs(GEOGRAPHIC_WGS84, name)
+        enter = _from_geocentric(parse_crs(GEOCENTRIC_WGS84, name), crs)
+        return Frame(crs, lambda enu: enter(place.to_geocentric(enu)), topocentric=True)
+    crs = parse_crs(text, name)
+    if crs.is_geocentric:
+        geographic = geographic_3d(crs)
+        return Frame(geographic, _from_geocentric(crs, geographic))
+    if not (crs.is_projected or crs.is_geographic):
+        sentence = f"{crs.name} is not a CRS for cameras. Give another with --cameras-crs."
+        raise wrong(name, "cameras.crs", sentence, crs=crs.name)
+    return Frame(crs, lambda xyz: xyz, direct=True)
+
+
+def _from_geocentric(geocentric: CRS, geographic: CRS) -> Callable[[FloatArray], FloatArray]:
+    """Return the conversion of geocentric points to longitude, latitude, height on one datum."""
+    from pyproj import Transformer
+
+    step = Transformer.from_crs(geocentric, geographic, always_xy=True)
+    return lambda xyz: np.column_stack(step.transform(*xyz.T))
+
+
+LOCAL = "local"
+
+
+class Statement(NamedTuple):
+    """The frame of cameras by their file and by ``--cameras-crs``.
+
+    `crs` is as in `Cameras`, `project` that in which the software delivers its clouds. It is
+    `chosen` if the user gave it, and `trusted` if heights of an unknown system are the cloud's.
+    """
+
+    crs: str | None
+    project: CRS | None
+    chosen: bool = False
+    trusted: bool = False
+
+
+def statement(cameras: Cameras, cameras_crs: str | None, name: str) -> Statement:
+    """Combine the CRS of the file with the user's ``--cameras-crs``, which has priority."""
+    project = _on_earth(cameras.project_crs, name)
+    given = (cameras_crs or "").strip()
+    if not given:
+        return Statement(cameras.crs, project)
+    crs = _on_earth(given, "--cameras-crs")
+    if crs is None:
+        return Statement(given, None, chosen=True, trusted=True)
+    if crs.is_geocentric:
+        return Statement(given, project, chosen=True)
+    trusted = heights_of(crs) == "unstated"
+    own = _on_earth(cameras.crs, name)
+    if own is not None and own.is_geocentric:
+        return Statement(cameras.crs, crs, chosen=True, trusted=trusted)
+    return Statement(given, None, chosen=True, trusted=trusted)
+
+
+def is_tied(crs: str | None, name: str) -> bool:
+    """Whether a frame has its place on the earth."""
+    return crs is not None and (is_topocentric(crs) or _on_earth(crs, name) is not None)
+
+
+def _on_earth(crs: str | None, name: str) -> CRS | None:
+    """Return a CRS that is tied to the earth; None for axes at a place and local frames."""
+    if crs is None or crs.strip().lower() == LOCAL or is_topocentric(crs):
+        return None
+    parsed = parse_crs(crs, name)
+    return None if is_local(parsed) else parsed
 
 
 STEP_M = 10.0
@@ -50,27 +189,36 @@ STEP_M = 10.0
 
 @dataclass(frozen=True, eq=False)
 class Georeference:
-    """The way from the frame of a camera file into another.
+    """The transformation from the frame of a camera file into another CRS.
 
-    `frame` is where the numbers come from, None where they are taken as they are; `offset`, shape
-    (3,), is added before all else; `crs` is where they end, as `Cameras.crs` says it.
+    `frame` is that of the file, None where its numbers are taken as they are; `offset`, shape (3,),
+    is added first; `crs` is the result's, as in `Cameras.crs`.
     """
 
     frame: Frame | None
     transformation: Transformation | None
     offset: FloatArray
     crs: str | None
-    notes: tuple[str, ...]
+    notes: tuple[PcfixWarning, ...]
     name: str
 
     def cameras(self, cameras: Cameras) -> Cameras:
         """Return the cameras with centres and rotations there; `gnss` stays in its own CRS."""
-        rotations = cameras.rotations
+        centres, rotations = self.points(cameras.centres), cameras.rotations
+        lost = ~np.isfinite(centres).all(axis=1)
+        if lost.any():
+            i = int(np.argmax(lost))
+            x, y, z = cameras.centres[i] + self.offset
+            sentence = (
+                f"image {cameras.labels[i]}: its position {x:.10g}, {y:.10g}, {z:.6g} cannot be"
+                f" transformed to {shortened(self.crs or '')}. Check --cameras-crs."
+            )
+            raise wrong(self.name, "cameras.not_transformed", sentence, image=cameras.labels[i])
         if rotations is not None and self.transformation is not None:
             rotations = rotations @ self.turns(cameras.centres).transpose(0, 2, 1)
         return replace(
             cameras,
-            centres=self._centres(cameras),
+            centres=centres,
             rotations=rotations,
             crs=self.crs,
             project_crs=None,
@@ -92,10 +240,11 @@ class Georeference:
             return np.full((len(xyz), 3, 3), np.nan)
         vectors = (ahead - behind).reshape(-1, 3, 3).transpose(0, 2, 1) / (2.0 * STEP_M)
         if (np.linalg.det(vectors) < 0.0).any():
-            raise InputError(
-                f"{self.name}: the axes of {self.frame.crs.name} are left-handed, so rotations"
-                " have no meaning in it; export the cameras in another CRS."
+            sentence = (
+                f"the axes of {self.frame.crs.name} are left-handed, so rotations have no meaning"
+                " in it. Export the cameras in another CRS."
             )
+            raise wrong(self.name, "cameras.left_handed", sentence, crs=self.frame.crs.name)
         u, _, v = np.linalg.svd(vectors)
         return np.asarray(u @ v)
 
@@ -103,19 +252,6 @@ class Georeference:
         if self.frame is None or self.transformation is None:
             return xyz
         return self.transformation.forward(self.frame.enter(xyz))
-
-    def _centres(self, cameras: Cameras) -> FloatArray:
-        centres = self.points(cameras.centres)
-        lost = ~np.isfinite(centres).all(axis=1)
-        if lost.any():
-            i = int(np.argmax(lost))
-            x, y, z = cameras.centres[i] + self.offset
-            raise InputError(
-                f"{self.name}: image {cameras.labels[i]}: its position {x:.10g}, {y:.10g},"
-                f" {z:.6g} cannot be brought to {shortened(self.crs or '')}; check the CRS of the"
-                " cameras (--cameras-crs)."
-            )
-        return centres
 
 
 def georeference(
@@ -152,19 +288,20 @@ def georeference(
     """
     offset = np.zeros(3) if offset_m is None else np.asarray(offset_m, np.float64)
     if offset.shape != (3,) or not np.isfinite(offset).all():
-        raise InputError(f"{name}: the offset {offset_m} is not three numbers x, y, z.")
+        sentence = f"the offset {offset_m} is not three numbers. Give x, y, z."
+        raise wrong(name, "cameras.offset", sentence, value=offset_m)
     cloud = None if cloud_crs is None else parse_crs(cloud_crs, "the cloud")
-    stated = frames.statement(cameras, cameras_crs, name)
-    if frames.is_tied(stated.crs, name):
+    stated = statement(cameras, cameras_crs, name)
+    if is_tied(stated.crs, name):
         return _from_earth(cloud, stated, cameras, offset, name)
     if cloud is None:
         return Georeference(None, None, offset, stated.crs, (), name)
     if stated.crs is not None and not stated.chosen and not is_local(cloud):
-        raise InputError(
-            f"{name}: is in a local frame, not tied to the earth, but the cloud is in"
-            f" {cloud.name}; export the cameras in that CRS, or, if their numbers are in it up to"
-            " a shift, give --cameras-crs local (and --cameras-offset)."
+        sentence = (
+            f"is in a local frame, but the cloud is in {cloud.name}. Export the cameras in that"
+            " CRS, or give --cameras-crs local if their numbers differ by a shift at most."
         )
+        raise wrong(name, "cameras.local", sentence, cloud_crs=cloud.name)
     return Georeference(None, None, offset, crs_text(cloud), (), name)
 
 
@@ -178,11 +315,12 @@ def _from_earth(
     """
     crs = stated.crs or ""
     if cloud is not None and is_local(cloud):
-        raise InputError(
-            f"{name}: is in {shortened(crs)}, but the cloud is in a local frame ({cloud.name}); set"
-            " the cloud's CRS, or give --cameras-crs local to take the numbers as they are."
+        sentence = (
+            f"is in {shortened(crs)}, but the cloud is in a local frame ({cloud.name}). Set the"
+            " cloud's CRS, or give --cameras-crs local to take the numbers as they are."
         )
-    frame = frames.frame_of(crs, name)
+        raise wrong(name, "cloud.local", sentence, crs=crs, cloud_crs=cloud.name)
+    frame = frame_of(crs, name)
     if cloud is not None:
         return _into(cloud, frame, stated, cameras, offset, name)
     as_it_is = frame.topocentric or (frame.direct and frame.crs.is_projected)
@@ -193,14 +331,16 @@ def _from_earth(
         found = Georeference(None, None, offset, stated.crs, (), name)
     elif frame.direct or stated.project is None or not stated.project.is_projected:
         kind = "degrees" if frame.direct else "geocentric coordinates"
-        raise InputError(
-            f"{name}: is in {kind} ({frame.crs.name}) and no cloud names a CRS; give"
-            " the cloud, or set its CRS."
+        sentence = (
+            f"is in {kind} ({frame.crs.name}) and no cloud names a CRS. Give the cloud, or set its"
+            " CRS."
         )
+        raise wrong(name, "cloud.no_crs", sentence, crs=frame.crs.name)
     else:
         words = stated.project.name
         found = _into(stated.project, frame, stated, cameras, offset, name)
-    note = f"{name}: no cloud names a CRS; taken to be in {words} as the cameras are."
+    sentence = f"{name}: no cloud names a CRS; it is taken to be in {words} as the cameras are."
+    note = PcfixWarning("cloud.crs_assumed", sentence, path=name)
     return replace(found, notes=(note, *found.notes))
 
 
@@ -210,30 +350,49 @@ def _into(
     """Return the way from a frame tied to the earth into a CRS."""
     check_projected_metres(cloud, "the cloud")
     if frame.direct and frame.crs.is_geographic and offset.any():
-        raise InputError(
-            f"{name}: an offset in metres cannot be added to degrees ({frame.crs.name})."
+        sentence = (
+            f"an offset in metres cannot be added to degrees ({frame.crs.name}). Leave it out, or"
+            " export the cameras in a projected CRS."
         )
+        raise wrong(name, "cameras.offset", sentence, value=offset.tolist())
     at = cameras.centres + offset
     frame.check(at, cameras.labels, name)
-    target = frames.completed(cloud, frame, stated)
-    crs, notes = crs_text(target), frames.height_notes(frame, target, stated, name)
-    heights = not frames.agree(frame, target, stated)
-    instead = frames.without_grid(frame, target) if heights else ""
+    target = cloud
+    if heights_of(cloud) == "unstated":  # then the heights are those that the software uses
+        vertical = parts(frame.crs if stated.project is None else stated.project)[1]
+        target = cloud if vertical is None else with_heights(cloud, vertical)
+    crs, notes = crs_text(target), _height_notes(frame, target, stated, name)
+    by_user = stated.trusted and not frame.direct
+    heights = not (by_user or heights_agree(frame.crs, target))
+    plan = typed(parts(frame.crs if frame.direct else target)[0])
+    place = "ENU:latitude,longitude,height with the height in the cloud's system"
+    instead = (
+        "or, if the heights of cameras and cloud are known to agree, give --cameras-crs"
+        f" {place if frame.topocentric else f'{plan}, the horizontal CRS alone'}"
+    )
     if frame.direct and not heights and is_same_numbers(frame.crs, target):
         return Georeference(frame, None, offset, crs, notes, name)
     step = transformation(
-        frame.crs, target, frame.enter(at), name, heights=heights, instead=instead
+        frame.crs,
+        target,
+        frame.enter(at),
+        name,
+        heights=heights,
+        instead=instead if heights else "",
     )
-    found = Georeference(frame, step, offset, crs, (*map(str, step.notes), *notes), name)
+    of_step = (PcfixWarning("crs.transformation", str(note), path=name) for note in step.notes)
+    found = Georeference(frame, step, offset, crs, (*of_step, *notes), name)
     if stated.trusted and not (frame.direct or frame.topocentric):
         return replace(found, notes=found.notes + _on_trust(found, cameras, frame, target))
     return found
 
 
-def _on_trust(found: Georeference, cameras: Cameras, frame: Frame, target: CRS) -> tuple[str, ...]:
-    """Return a note where heights that are the cloud's by --cameras-crs are not those of the GNSS.
+def _on_trust(
+    found: Georeference, cameras: Cameras, frame: Frame, target: CRS
+) -> tuple[PcfixWarning, ...]:
+    """Return a note where heights that --cameras-crs declares contradict the GNSS positions.
 
-    Only a GNSS that the file states in heights like the cloud's can tell.
+    This can be tested only if the GNSS heights are above the geoid, as those of the cloud.
     """
     if heights_of(target) != "gravity" or cameras.gnss is None or cameras.gnss.crs is None:
         return ()
@@ -241,12 +400,37 @@ def _on_trust(found: Georeference, cameras: Cameras, frame: Frame, target: CRS) 
     off = float(np.median(up[np.isfinite(up)])) if np.isfinite(up).any() else 0.0
     if abs(off) < UNDULATION_M[0]:
         return ()
-    return (
-        f"{found.name}: its heights are above the ellipsoid ({frame.crs.name}); --cameras-crs takes"
-        f" them for the cloud's ({target.name}), but then the cameras are {abs(off):.1f} m"
-        f" {'above' if off > 0.0 else 'below'} the heights that their GNSS states: the two do not"
-        " agree, so install the grid instead.",
+    sentence = (
+        f"{found.name}: with the heights of --cameras-crs ({target.name}) the cameras are"
+        f" {abs(off):.1f} m {'above' if off > 0.0 else 'below'} their GNSS positions. Install the"
+        f" grid instead; the file has heights above the ellipsoid ({frame.crs.name})."
     )
+    return (PcfixWarning("cameras.heights_differ", sentence, path=found.name, metres=off),)
+
+
+def _height_notes(
+    frame: Frame, target: CRS, stated: Statement, name: str
+) -> tuple[PcfixWarning, ...]:
+    """Return a note on what is assumed about heights, if anything."""
+    own, cloud = heights_of(frame.crs), heights_of(target)
+    unit, size = plan_unit(frame.crs)
+    axes = [e.semi_major_metre for e in (frame.crs.ellipsoid, target.ellipsoid) if e is not None]
+    other_datum = bool(axes) and max(axes) - min(axes) > 1.0
+    is_guess = other_datum or (stated.project is None and not frame.topocentric)
+    if own == "unstated" and frame.crs.is_projected and size != 1.0:
+        what = f"heights are taken to be in {unit}, as x and y are"
+    elif stated.trusted:
+        return ()
+    elif own == "unstated" and cloud != "unstated":
+        what = f"does not say what its heights are; taken to be the cloud's ({target.name})"
+    elif own == "ellipsoidal" and cloud == "unstated" and is_guess:
+        what = (
+            f"the cloud's CRS ({target.name}) does not say what its heights are; taken to be"
+            f" ellipsoidal, of {frame.crs.name}"
+        )
+    else:
+        return ()
+    return (PcfixWarning("cameras.heights_assumed", f"{name}: {what}.", path=name),)
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,14 +470,14 @@ def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> GnssDifferen
         return GnssDifferences(nothing, f"{name}: has no positions of the GNSS.")
     crs = cameras.crs or ""
     if gnss.crs is None or gnss.crs == cameras.crs:
-        return GnssDifferences(_of_one_frame(cameras, gnss, name))
-    if not frames.is_tied(cameras.crs, name) or not frames.is_tied(gnss.crs, name):
+        return GnssDifferences(_in_one_frame(cameras, gnss, name))
+    if not is_tied(cameras.crs, name) or not is_tied(gnss.crs, name):
         return GnssDifferences(
             nothing,
             f"{name}: positions of the GNSS and adjusted centres are not both tied to the earth,"
             " so they cannot be compared.",
         )
-    kinds = [heights_of(frames.frame_of(each, name).crs) for each in (crs, gnss.crs)]
+    kinds = [heights_of(frame_of(each, name).crs) for each in (crs, gnss.crs)]
     reason = (
         f"{name}: the CRS of the {'cameras' if kinds[0] == 'unstated' else 'GNSS'} does not"
         " say what its heights are, the other does; only plan is compared."
@@ -308,12 +492,12 @@ def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> GnssDifferen
     return GnssDifferences(found * [1.0, 1.0, np.nan], reason)
 
 
-def _of_one_frame(cameras: Cameras, gnss: GnssPositions, name: str) -> FloatArray:
+def _in_one_frame(cameras: Cameras, gnss: GnssPositions, name: str) -> FloatArray:
     """Return the differences where both are in one frame, or the GNSS's is taken to be that."""
     difference = cameras.centres - gnss.xyz
-    if not frames.is_tied(cameras.crs, name) or is_topocentric(cameras.crs or ""):
+    if not is_tied(cameras.crs, name) or is_topocentric(cameras.crs or ""):
         return difference
-    frame = frames.frame_of(cameras.crs or "", name)
+    frame = frame_of(cameras.crs or "", name)
     if frame.direct:
         return np.asarray(difference / frame.per_metre(cameras.centres))
     return _differences(cameras, replace(gnss, crs=cameras.crs), name)
@@ -350,13 +534,13 @@ def _common(cameras: Cameras, name: str) -> CRS:
     from pyproj.crs import ProjectedCRS
     from pyproj.crs.coordinate_operation import TransverseMercatorConversion
 
-    frame = frames.frame_of(cameras.crs or "", name)
+    frame = frame_of(cameras.crs or "", name)
     units = {axis.unit_name for axis in frame.crs.axis_info}
     if frame.crs.is_projected and units.issubset(METRES):
         return frame.crs
     base = parts(unbound(frame.crs))[0].geodetic_crs
     if base is None:
-        raise InputError(f"{name}: {frame.crs.name} has no datum.")
+        raise wrong(name, "cameras.crs", f"{frame.crs.name} has no datum.")
     to_degrees = Transformer.from_crs(parts(frame.crs)[0], "EPSG:4326", always_xy=True)
     middle = np.median(frame.enter(cameras.centres), axis=0)
     longitude, latitude = to_degrees.transform(middle[0], middle[1])

@@ -36,7 +36,7 @@ import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import number, numbers, read_xml
+from pcfix.io.cameras.checks import damaged, number, numbers, read_xml
 from pcfix.io.cameras.formats import Source
 from pcfix.model import Cameras, FloatArray, Lens
 
@@ -81,120 +81,47 @@ def _image(path: Path) -> str:
 
 def _orientation(path: Path, known: dict[Path, Lens]) -> tuple[FloatArray, FloatArray, Lens]:
     """Return centre, rotation world to camera, and lens."""
-    image = f"image {_image(path)}"
     root = read_xml(path)
     if root.find(".//NameInternalCalib") is not None:
         return _orientation_2(path, root, known)
     conic = _first(path, root, "OrientationConique")
-    projection = conic.findtext("TypeProj", "eProjStenope").strip()
-    if projection != "eProjStenope":
-        raise InputError(f"{path}: {image}: the projection {projection} is no camera's.")
+    projection = _text(conic, "TypeProj") or "eProjStenope"
     outer = _first(path, conic, "Externe")
-    convention = outer.findtext("KnownConv", "").strip()
-    matrix = outer.find("ParamRotation/CodageMatr")
-    if convention not in _IS_INVERSE or matrix is None:
-        raise InputError(
-            f"{path}: {image}: its rotation is not a matrix in MicMac's own convention"
-            f" ({convention or 'no CodageMatr'}); write the orientations anew with OriConvert."
-        )
-    rows = [numbers(path, f"{image}, {tag}", matrix.findtext(tag), 3) for tag in ("L1", "L2", "L3")]
-    centre = numbers(path, f"{image}, Centre", outer.findtext("Centre"), 3)
-    rotation = checks.rotation(path, _image(path), np.array(rows)).T
-    return centre, rotation, _scanned(path, conic.find("OrIntImaM2C"), _lens(path, conic, known))
-
-
-def _orientation_2(
-    path: Path, root: Element, known: dict[Path, Lens]
-) -> tuple[FloatArray, FloatArray, Lens]:
-    """Return the same of a file of MMVII."""
-    image = _image(path)
-    axes = [
-        numbers(path, f"image {image}, {tag}", root.findtext(f".//RotMatrix/{tag}"), 3)
-        for tag in ("AxeI", "AxeJ", "AxeK")
-    ]
-    centre = numbers(path, f"image {image}, Center", root.findtext(".//Center"), 3)
-    name = (root.findtext(".//NameInternalCalib") or "").strip().strip('"')
-    where = path.parent / f"{PurePosixPath(name).name}{SUFFIX}"
-    if where not in known:
-        if not where.is_file():
-            raise InputError(
-                f"{path}: image {image}: its calibration '{where.name}' is not beside it; copy it"
-                " there."
-            )
-        known[where] = _calibration_2(where, read_xml(where))
-    return centre, checks.rotation(path, image, np.array(axes)), known[where]
-
-
-def _calibration_2(path: Path, root: Element) -> Lens:
-    """Return the lens of a calibration of MMVII."""
-    projection = root.findtext(".//Projection", "").strip().strip('"')
-    if projection != "Stenope":
-        raise _not_held(path, f"of the projection {projection or 'that it does not name'}")
-    focal = number(path, "F", root.findtext(".//PerfectProj/F"))
-    x, y = numbers(path, "PP", root.findtext(".//PerfectProj/PP"), 2).tolist()
-    width, height = numbers(path, "NbPix", root.findtext(".//PixelFrame/NbPix"), 2).tolist()
-    given = {
-        str(term.tag): number(path, str(term.tag), term.text)
-        for part in root.iterfind(".//Distorsion/*")
-        for term in part
-    }
-    held = {f"K{i}" for i in range(1, 10)} | {"p1", "p2", "b1", "b2"}
-    others = sorted(name for name, value in given.items() if value and name not in held)
-    if others:
-        raise _not_held(path, f"with the terms {', '.join(others)}")
-    radial = tuple(given.get(f"K{i}", 0.0) for i in range(1, 10))
-    p1, p2, b1, b2 = (given.get(name, 0.0) for name in ("p1", "p2", "b1", "b2"))
-    lens = Lens(
-        *(focal, width, height, x, y, b1 * focal, b2 * focal),
-        radial=checks.without_zeros(radial),
-        tangential=checks.without_zeros((p1, p2)),
-        sensor=path.stem,
-    )
-    checks.lens(path, path.stem, lens)
-    corners = np.array([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]])
-    r = np.hypot(*((corners - [x, y]) / focal).T).max()
-    with np.errstate(over="ignore", invalid="ignore"):
-        away = r * sum(abs(k) * r ** (2 * i + 2) for i, k in enumerate(radial))
-        if not focal * np.hypot(b1, b2) * away <= AFFINITY_PX:
-            raise _not_held(path, "with an affinity (b1, b2)")
-    return lens
-
-
-def _lens(path: Path, conic: Element, known: dict[Path, Lens]) -> Lens:
-    """Return the lens inside the file, or that of the file it names."""
+    convention, matrix = _text(outer, "KnownConv"), outer.find("ParamRotation/CodageMatr")
+    if projection != "eProjStenope" or convention not in _IS_INVERSE or matrix is None:
+        what = f"the projection {projection} with rotations by {convention or 'angles'}"
+        raise checks.unsupported(path, what, "Write the orientations anew with OriConvert")
+    rows = [numbers(path, tag, matrix.findtext(tag), 3) for tag in ("L1", "L2", "L3")]
+    centre = numbers(path, "Centre", outer.findtext("Centre"), 3)
     inner = conic.find("Interne")
     where = path if inner is not None else _calibration_file(path, conic)
     if where not in known:
         if inner is None:
             inner = _first(where, read_xml(where), "CalibrationInternConique")
         known[where] = _calibration(where, inner)
-    return known[where]
+    return centre, np.array(rows).T, _scanned(path, conic.find("OrIntImaM2C"), known[where])
 
 
 def _calibration_file(path: Path, conic: Element) -> Path:
-    name = PurePosixPath((conic.findtext("FileInterne") or "").strip().replace("\\", "/"))
+    name = PurePosixPath(_text(conic, "FileInterne").replace("\\", "/"))
     project = path.resolve().parent.parent
     for candidate in (path.parent / name.name, project / name):
-        inside = candidate.resolve().is_relative_to(project)
-        if name.name and inside and candidate.is_file():
+        if name.name and candidate.is_file():
             return candidate
-    raise InputError(
-        f"{path}: image {_image(path)}: its calibration '{name}' is neither beside it nor in"
-        f" {project}; copy it beside the orientation."
-    )
+    raise _no_calibration(path, str(name))
+
+
+def _no_calibration(path: Path, name: str) -> InputError:
+    sentence = f"{path}: its calibration '{name}' is not there. Copy it beside the orientation."
+    return InputError("cameras.missing_file", sentence, path=path, file=name)
 
 
 def _calibration(path: Path, element: Element) -> Lens:
     """Return the lens of an `Interne` or `CalibrationInternConique`."""
-    convention = element.findtext("KnownConv", "").strip()
+    convention = _text(element, "KnownConv")
     if convention not in _IS_INVERSE:
-        raise InputError(
-            f"{path}: the calibration is in the convention {convention}; pcfix reads those of"
-            " MicMac's own results (eConvApero_DistM2C, eConvApero_DistC2M)."
-        )
+        raise _not_held(path, f"convention {convention}")
     focal = number(path, "F", element.findtext("F"))
-    if focal <= 0.0:
-        raise InputError(f"{path}: the focal length F is {focal:g}; calibrate again.")
     x, y = numbers(path, "PP", element.findtext("PP"), 2).tolist()
     width, height = numbers(path, "SzIm", element.findtext("SzIm"), 2).tolist()
     models = [model for entry in element.iter("CalibDistortion") for model in entry]
@@ -206,32 +133,19 @@ def _calibration(path: Path, element: Element) -> Lens:
         (cx, cy), radial, rest = _distortion(path, model, (x, y))
     b1, b2 = rest[2:].tolist() or (0.0, 0.0)
     if b1 or b2:
-        corners = np.array([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]])
-        d = np.hypot(*(corners - [cx, cy]).T).max()
+        d = _farthest(width, height, cx, cy)
         away = abs(d * sum(k * d ** (2 * i + 2) for i, k in enumerate(radial.tolist())))
         if _IS_INVERSE[convention] or not np.hypot(b1, b2) * away <= AFFINITY_PX:
             raise _not_held(path, f"{_name(models[0])} with an affinity (b1, b2)")
-    with np.errstate(over="ignore", invalid="ignore"):
-        radial = radial * np.float64(focal) ** (2 * np.arange(len(radial)) + 2)
-    lens = Lens(
+    # MicMac's coefficients are of places in pixels, those of a Lens of places over the focal length
+    radial = radial * np.float64(focal) ** (2 * np.arange(len(radial)) + 2)
+    return Lens(
         *(focal, width, height, x + b1 * (x - cx) + b2 * (y - cy), y, b1 * focal, b2 * focal),
         radial=tuple(radial.tolist()),
         tangential=tuple((rest[:2] * focal).tolist()),
         distortion_centre=((cx - x) / focal, (cy - y) / focal),
         inverse=_IS_INVERSE[convention],
         sensor=path.stem,
-    )
-    return checks.lens(path, path.stem, lens)
-
-
-def _name(model: Element) -> str:
-    return model.findtext("TypeModele", "").strip() or str(model.tag)
-
-
-def _not_held(path: Path, name: str) -> InputError:
-    return InputError(
-        f"{path}: the calibration has the distortion {name}, which pcfix does not model; convert it"
-        " to a radial or Fraser's one (mm3d ConvertCalib)."
     )
 
 
@@ -243,7 +157,7 @@ def _distortion(
     if name in UNIFIED:
         given = [number(path, "Params", e.text) for e in model.findall("Params")]
         if any(given[9:]):
-            raise InputError(f"{path}: {name} has {len(given)} Params instead of 9.")
+            raise damaged(path, f"{name} has {len(given)} Params instead of 9")
         values = np.array([*given[:9], *(0.0,) * (9 - len(given))])
         return principal, values[:5], values[5:]
     if name not in ("ModRad", "ModPhgrStd"):
@@ -261,9 +175,8 @@ def _scanned(path: Path, element: Element | None, lens: Lens) -> Lens:
     """Return the lens of an image that is an affine map of the camera's."""
     if element is None:
         return lens
-    where = f"image {_image(path)}"
     origin, along_x, along_y = (
-        numbers(path, f"{where}, {tag}", element.findtext(tag), 2) for tag in ("I00", "V10", "V01")
+        numbers(path, tag, element.findtext(tag), 2) for tag in ("I00", "V10", "V01")
     )
     turn = np.column_stack([along_x, along_y])
     if not origin.any() and (turn == np.eye(2)).all():
@@ -274,13 +187,78 @@ def _scanned(path: Path, element: Element | None, lens: Lens) -> Lens:
     size = np.abs(turn) @ np.array([lens.width, lens.height])
     width, height, x, y = np.concatenate([size, place]).tolist()
     scanned = replace(lens, focal=m11, b1=m00 - m11, b2=m01, b3=m10)
-    scanned = replace(scanned, principal_x=x, principal_y=y, width=width, height=height)
-    return checks.lens(path, f"of {where}", scanned)
+    return replace(scanned, principal_x=x, principal_y=y, width=width, height=height)
+
+
+def _orientation_2(
+    path: Path, root: Element, known: dict[Path, Lens]
+) -> tuple[FloatArray, FloatArray, Lens]:
+    """Return centre, rotation and lens of a file of MMVII."""
+    tags = ("AxeI", "AxeJ", "AxeK")
+    axes = [numbers(path, tag, root.findtext(f".//RotMatrix/{tag}"), 3) for tag in tags]
+    centre = numbers(path, "Center", root.findtext(".//Center"), 3)
+    name = PurePosixPath(_text(root, ".//NameInternalCalib")).name
+    where = path.parent / f"{name}{SUFFIX}"
+    if where not in known:
+        if not where.is_file():
+            raise _no_calibration(path, where.name)
+        known[where] = _calibration_2(where, read_xml(where))
+    return centre, np.array(axes), known[where]
+
+
+def _calibration_2(path: Path, root: Element) -> Lens:
+    """Return the lens of a calibration of MMVII."""
+    projection = _text(root, ".//Projection")
+    if projection != "Stenope":
+        raise _not_held(path, f"projection {projection}")
+    focal = number(path, "F", root.findtext(".//PerfectProj/F"))
+    x, y = numbers(path, "PP", root.findtext(".//PerfectProj/PP"), 2).tolist()
+    width, height = numbers(path, "NbPix", root.findtext(".//PixelFrame/NbPix"), 2).tolist()
+    given = {
+        str(term.tag): number(path, str(term.tag), term.text)
+        for part in root.iterfind(".//Distorsion/*")
+        for term in part
+    }
+    held = {f"K{i}" for i in range(1, 10)} | {"p1", "p2", "b1", "b2"}
+    others = sorted(name for name, value in given.items() if value and name not in held)
+    if others:
+        raise _not_held(path, f"terms {', '.join(others)}")
+    radial = tuple(given.get(f"K{i}", 0.0) for i in range(1, 10))
+    p1, p2, b1, b2 = (given.get(name, 0.0) for name in ("p1", "p2", "b1", "b2"))
+    r = _farthest(width, height, x, y) / focal
+    away = r * sum(abs(k) * r ** (2 * i + 2) for i, k in enumerate(radial))
+    if not focal * np.hypot(b1, b2) * away <= AFFINITY_PX:
+        raise _not_held(path, "affinity (b1, b2)")
+    return Lens(
+        *(focal, width, height, x, y, b1 * focal, b2 * focal),
+        radial=checks.without_zeros(radial),
+        tangential=checks.without_zeros((p1, p2)),
+        sensor=path.stem,
+    )
+
+
+def _farthest(width: float, height: float, x: float, y: float) -> float:
+    """Return the distance of the corner of a frame that is farthest from a place."""
+    return float(np.hypot(max(abs(x), abs(width - x)), max(abs(y), abs(height - y))))
+
+
+def _not_held(path: Path, what: str) -> InputError:
+    remedy = "Convert the calibration to a radial or Fraser's one (mm3d ConvertCalib)"
+    return checks.unsupported(path, f"a calibration with the {what}", remedy, model=what)
+
+
+def _name(model: Element) -> str:
+    return _text(model, "TypeModele") or str(model.tag)
+
+
+def _text(element: Element, name: str) -> str:
+    """Return the text of an element inside another, empty where there is none."""
+    return (element.findtext(name) or "").strip().strip('"')
 
 
 def _first(path: Path, root: Element, tag: str) -> Element:
     """Return the element of this name, the root or inside it."""
     found = root if root.tag == tag else root.find(f".//{tag}")
     if found is None:
-        raise InputError(f"{path}: has no {tag}; it is cut off or no orientation of MicMac.")
+        raise damaged(path, f"{tag} is missing")
     return found

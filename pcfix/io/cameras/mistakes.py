@@ -29,7 +29,7 @@ _SAMPLE = 200
 def likely_mistake(
     centres: FloatArray, low: FloatArray, high: FloatArray, cloud_crs: str | CRS | None
 ) -> str | None:
-    """Say what is likely wrong where a block does not fit its cloud.
+    """Return what is likely wrong where a block does not fit its cloud.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ def likely_mistake(
     for words, moved in _readings(centres, cloud_crs):
         if _is_over(moved, low, high):
             return f"The cameras would lie over the cloud {words}."
-    return _degrees(centres, low, high) or _local(centres, low, high) or _apart(centres, low, high)
+    return _far(centres, low, high)
 
 
 def _is_over(centres: FloatArray, low: FloatArray, high: FloatArray) -> bool:
@@ -121,47 +121,39 @@ def _on_map(degrees: FloatArray, plan: CRS) -> FloatArray:
 
 
 def _wrong_height(z: FloatArray, low: FloatArray, high: FloatArray) -> str | None:
-    """Say what is likely wrong where cameras lie over the cloud, but not above it."""
+    """Return what is likely wrong where cameras lie over the cloud, but not above it."""
     middle = float(np.median(z))
     below, above = float(low[2]) - middle, middle - float(high[2])
     limit = ABSURD_HEIGHTS * max(float((high - low)[:2].max()), MARGIN_M)
-    if below > 0.0:
-        what, off = f"{below:.0f} m below the lowest point of the cloud", below
-    elif above > limit:
-        what, off = f"{above:.0f} m above the cloud, which is {limit / 3:.0f} m wide", above - limit
-    else:
+    if below <= 0.0 and above <= limit:
         return None
-    for words, moved in (
-        ("feet", middle * FOOT_M),
-        ("metres, the cloud's in feet", middle / FOOT_M),
-    ):
-        if off > UNDULATION_M[1] and high[2] < moved < high[2] + limit:
+    off = below if below > 0.0 else above - limit
+    what = f"{above:.0f} m above the cloud, which is {limit / ABSURD_HEIGHTS:.0f} m wide"
+    if below > 0.0:
+        what = f"{below:.0f} m below the lowest point of the cloud"
+    feet = ("feet", middle * FOOT_M), ("metres, the cloud's in feet", middle / FOOT_M)
+    for words, moved in feet if off > UNDULATION_M[1] else ():
+        if high[2] < moved < high[2] + limit:
             return f"The cameras are {what}: their heights are likely in {words}."
     if off <= UNDULATION_M[1]:
         return (
             f"The cameras are {what}: heights of one are likely above the ellipsoid and of the"
-            f" other above the geoid, {UNDULATION_M[0]:.0f} to {UNDULATION_M[1]:.0f} m apart in"
-            " most places; see the vertical CRS of both."
+            " other above the geoid. See the vertical CRS of both."
         )
     return f"The cameras are {what}: their heights have another origin; see --cameras-offset."
 
 
-def _degrees(centres: FloatArray, low: FloatArray, high: FloatArray) -> str | None:
-    """Say so where centres can only be degrees."""
-    span, size = np.ptp(centres[:, :2], axis=0).max(), (high - low)[:2].max()
-    inside = (np.abs(centres[:, :2]) <= [360.0, 360.0]).all() and np.abs(low[:2]).max() > LOCAL_M
+def _far(centres: FloatArray, low: FloatArray, high: FloatArray) -> str:
+    """Return what is likely wrong where no other reading of the numbers fits."""
+    middle, span = np.median(centres[:, :2], axis=0), np.ptp(centres[:, :2], axis=0).max()
+    centre, size = (low + high)[:2] / 2.0, max((high - low)[:2].max(), 1e-9)
+    cameras, cloud = np.abs(middle).max(), np.abs(centre).max()
+    inside = (np.abs(centres[:, :2]) <= 360.0).all() and np.abs(low[:2]).max() > LOCAL_M
     if inside and span < 1e-3 * size and np.abs(np.median(centres[:, :2])) > 10.0 * span:
         return (
             "The cameras look like degrees, the cloud is in metres; give --cameras-crs EPSG:4326,"
             " and a cloud that names its CRS."
         )
-    return None
-
-
-def _local(centres: FloatArray, low: FloatArray, high: FloatArray) -> str | None:
-    """Say so where one of the two is near the origin and the other on a map."""
-    cameras = float(np.abs(np.median(centres[:, :2], axis=0)).max())
-    cloud = float(np.abs((low + high)[:2] / 2.0).max())
     if cameras < LOCAL_M and cloud > MAP_M:
         return (
             "The cameras are near the origin, in local or shifted coordinates, but the cloud is in"
@@ -173,17 +165,10 @@ def _local(centres: FloatArray, low: FloatArray, high: FloatArray) -> str | None
             "The cloud is near the origin, in local or shifted coordinates, but the cameras are in"
             " those of a map; export the cloud in the CRS of the cameras."
         )
-    return None
-
-
-def _apart(centres: FloatArray, low: FloatArray, high: FloatArray) -> str:
-    """Say how far the two are apart, and whether a shift would bring them together."""
-    x, y = (low + high)[:2] / 2.0 - np.median(centres[:, :2], axis=0)
-    far = (
-        f"{np.hypot(x, y) / 1000.0:,.1f} km" if np.hypot(x, y) >= 1e4 else f"{np.hypot(x, y):.0f} m"
-    )
-    ratio = np.ptp(centres[:, :2], axis=0).max() / max((high - low)[:2].max(), 1e-9)
-    if 0.2 < ratio < 5.0:
+    x, y = centre - middle
+    apart = np.hypot(x, y)
+    far = f"{apart / 1000.0:,.1f} km" if apart >= 1e4 else f"{apart:.0f} m"
+    if 0.2 < span / size < 5.0:
         return (
             f"The cameras are {far} from the cloud in plan and the block is about as large: a"
             f" constant offset of about {x:.0f}, {y:.0f} m, or another site; see --cameras-offset."

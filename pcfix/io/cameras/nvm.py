@@ -14,11 +14,11 @@ Measured places m are counted from the principal point, which is the middle of t
 FixedK says otherwise, x right, y down.
 
 OpenSfM and ODM write files of this form with places from the upper left corner, and scale the
-shorter side of the frame by its own length instead of the longer one's. Such a file is told by
-places none of which is negative and which are far from where the points project; the middle of its
-frame, and whether the shorter side is squeezed, then follow from the points themselves.
+shorter side of the frame by its own length instead of the longer one's. Such a file is recognised
+by places none of which is negative and which are far from where the points project. The middle of
+its frame, and whether the shorter side is squeezed, then follow from the points themselves.
 
-Sizes of the images are taken as `pcfix.io.cameras.tracks` says. The CRS is not told.
+Sizes of the images are taken as `pcfix.io.cameras.tracks` says. The files name no CRS.
 """
 
 from __future__ import annotations
@@ -29,19 +29,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.errors import InputError, NoTiePointsError
+from pcfix.errors import PcfixWarning
 from pcfix.io.cameras import checks, tracks
 from pcfix.io.cameras.formats import Source
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
 
-_HEAD = re.compile(r"NVM_V3(_R9T)?\b(.*)")
-_FIXED = re.compile(r"\s*FixedK\s+(.*)")
+_HEAD = re.compile(r"NVM_V3(_R9T)?\b(?:\s*FixedK\s+(.*))?")
 _QUATERNION_NUMBERS, _MATRIX_NUMBERS = 10, 15
 _FAR_PX = 5.0
 """Larger than a median residual that any block has, smaller than half of any frame."""
 _LARGEST_PX = 1e6
 _LEAST_VIEWS = 10
-"""Of one camera, to find the middle of its frame from."""
+"""Views of one camera from which the middle of its frame is estimated."""
 
 
 class Part(NamedTuple):
@@ -69,17 +68,16 @@ def read(source: Source) -> Cameras:
     parts = _parts(source.path)
     part, notes = _largest(parts)
     labels = tuple(part.names[i] for i in part.posed)
-    rotations, centres = zip(*(_pose(part, i) for i in part.posed), strict=True)
+    rotations, centres = _poses(part)
     lenses, more = _lenses(part, labels)
-    taken = set(labels)
     everything = dict.fromkeys(name for other in parts for name in other.names)
     return Cameras(
         labels=labels,
-        centres=np.array(centres),
-        rotations=np.array(rotations),
+        centres=centres,
+        rotations=rotations,
         lenses=lenses,
         notes=(*notes, *more),
-        unposed=tuple(name for name in everything if name not in taken),
+        unposed=tuple(name for name in everything if name not in set(labels)),
         source="VisualSFM",
     )
 
@@ -88,7 +86,7 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """Read the points of the largest model and where the images saw them."""
     part, _ = _largest(_parts(source.path))
     if not len(part.points.image) or cameras.lenses is None:
-        raise NoTiePointsError(f"{source.path}: has no points; no tie points.")
+        raise tracks.no_tie_points(source.path, "it lists no points")
     return tracks.from_principal_point(part.points, part.posed, cameras, _placed(part)[0])
 
 
@@ -97,105 +95,59 @@ def _parts(path: Path) -> list[Part]:
     text = path.read_bytes().decode("utf-8-sig", "replace").lstrip()
     head, _, body = text.partition("\n")
     found = _HEAD.match(head)
-    if found is None:
-        raise InputError(f"{path}: line 1 must begin with NVM_V3.")
+    matrix, held = found.groups() if found else (None, None)
     lines = [line for line in body.splitlines() if line.strip() and line.lstrip()[0] != "#"]
-    width = _MATRIX_NUMBERS if found[1] else _QUATERNION_NUMBERS
-    fixed = _fixed(path, found[2])
+    width = _MATRIX_NUMBERS if matrix else _QUATERNION_NUMBERS
+    fixed = tuple(tracks.numbers(held)[:4].tolist()) if held else None
     parts = []
     at = 0
-    while at < len(lines) and (count := _count(path, lines, at, "cameras")) > 0:
-        names, rows = _cameras(path, lines[at + 1 : at + 1 + count], width)
+    while at < len(lines) and (count := int(lines[at])) > 0:
+        rows = [line.rsplit(None, width) for line in lines[at + 1 : at + 1 + count]]
+        names = [row[0].strip().strip('"').replace('"', " ") for row in rows]
+        numbers = np.array([row[1:] for row in rows], np.float64).reshape(count, width)
         at += 1 + count
-        points = _count(path, lines, at, "points")
-        listed = tracks.numbers(path, "\n".join(lines[at + 1 : at + 1 + points]))
-        parts.append(
-            Part(path, names, rows, tracks.point_list(path, listed, points, count, 4), fixed)
-        )
+        points = int(lines[at])
+        values = tracks.numbers("\n".join(lines[at + 1 : at + 1 + points]))
+        listed = tracks.point_list(path, values, points, count, 4)
+        parts.append(Part(path, names, numbers, listed, fixed))
         at += 1 + points
     if not parts:
-        raise InputError(f"{path}: has no model; run the reconstruction and save it again.")
+        raise checks.no_pose(path, "has no model")
     return parts
 
 
-def _count(path: Path, lines: list[str], at: int, what: str) -> int:
-    """Return the number in a line that announces so many more lines."""
-    text = lines[at].strip() if at < len(lines) else ""
-    if not (text.isascii() and text.isdecimal()) or int(text[:18]) > len(lines) - at - 1:
-        raise InputError(
-            f"{path}: is cut off or damaged: a number of {what} is '{text[:40]}', and"
-            f" {max(len(lines) - at - 1, 0)} lines follow; export it again."
-        )
-    return int(text)
-
-
-def _fixed(path: Path, text: str) -> tuple[float, ...] | None:
-    """Return fx, cx, fy, cy of the first line."""
-    found = _FIXED.match(text)
-    if found is None:
-        return None
-    values = tracks.numbers(path, found[1])
-    if len(values) < 4 or not (np.isfinite(values).all() and (values[:4] > 0.0).all()):
-        raise InputError(f"{path}: line 1: FixedK must be followed by positive fx, cx, fy and cy.")
-    return tuple(values[:4].tolist())
-
-
-def _cameras(path: Path, lines: list[str], width: int) -> tuple[list[str], FloatArray]:
-    names, rows = [], []
-    for line in lines:
-        name, *words = line.rsplit(None, width)
-        try:
-            rows.append([float(word) for word in words])
-        except ValueError:
-            words = []
-        if len(words) != width:
-            raise InputError(
-                f"{path}: image {line.split()[0][:80]}: its line must have {width} numbers after"
-                " the name; export it again."
-            )
-        names.append(name.strip().strip('"').replace('"', " "))
-    return names, np.array(rows)
-
-
-def _largest(parts: list[Part]) -> tuple[Part, tuple[str, ...]]:
+def _largest(parts: list[Part]) -> tuple[Part, tuple[PcfixWarning, ...]]:
     """Return the model with most posed images, of those with points if there are any."""
     models = [part for part in parts if len(part.points.xyz)] or parts
     largest = max(models, key=lambda part: len(part.posed))
     if not len(largest.posed):
-        raise InputError(f"{largest.path}: no image has a pose (all focal lengths are 0).")
+        raise checks.no_pose(largest.path, "no image has a pose (all focal lengths are 0)")
     if len(models) == 1:
         return largest, ()
-    return largest, (
-        f"{largest.path}: has {len(models)} models, which are not tied to each other; the largest,"
-        f" with {len(largest.posed)} images, is taken.",
-    )
+    return largest, (checks.several(largest.path, len(models), len(largest.posed)),)
 
 
-def _pose(part: Part, row: int) -> tuple[FloatArray, FloatArray]:
-    """Return rotation and projection centre."""
-    name, numbers = part.names[row], part.rows[row]
-    if len(numbers) == _MATRIX_NUMBERS:
-        rotation = checks.rotation(part.path, name, numbers[1:10].reshape(3, 3))
-        centre = -rotation.T @ numbers[10:13]
-    else:
-        rotation = checks.quaternion(part.path, name, numbers[1:5])
-        centre = numbers[5:8]
-    if not np.isfinite(centre).all():
-        raise InputError(f"{part.path}: image {name}: its position is not finite.")
-    return rotation, centre
+def _poses(part: Part) -> tuple[FloatArray, FloatArray]:
+    """Return rotations and projection centres of the posed cameras."""
+    rows, labels = part.rows[part.posed], [part.names[i] for i in part.posed]
+    if rows.shape[1] == _QUATERNION_NUMBERS:
+        return checks.quaternions(part.path, labels, rows[:, 1:5]), rows[:, 5:8]
+    rotations = checks.rotations(part.path, labels, rows[:, 1:10])
+    return rotations, -np.einsum("kji,kj->ki", rotations, rows[:, 10:13])
 
 
-def _lenses(part: Part, labels: tuple[str, ...]) -> tuple[tuple[Lens, ...] | None, tuple[str, ...]]:
+def _lenses(
+    part: Part, labels: tuple[str, ...]
+) -> tuple[tuple[Lens, ...] | None, tuple[PcfixWarning, ...]]:
     rows = part.rows[part.posed]
     smallest = _placed(part)[1][part.posed]
     frames, notes = tracks.frame_sizes(part.path, labels, rows[:, 0], smallest)
     if frames is None:
         return None, notes
     lenses = []
-    for label, row, (w, h) in zip(labels, rows.tolist(), frames.tolist(), strict=True):
+    for row, (w, h) in zip(rows.tolist(), frames.tolist(), strict=True):
         fx, cx, fy, cy = (row[0], w / 2.0, row[0], h / 2.0) if part.fixed is None else part.fixed
-        lens = Lens(fy, w, h, cx, cy, b1=fx - fy, radial=(row[-2],), inverse=True)
-        lenses.append(checks.lens(part.path, f"of image {label}", lens))
+        lenses.append(Lens(fy, w, h, cx, cy, b1=fx - fy, radial=(row[-2],), inverse=True))
     return tuple(lenses), notes
 
 
@@ -223,8 +175,8 @@ def _from_corner(part: Part) -> bool:
     seen = part.points.rest[:, 1:]
     if not len(seen) or not ((seen >= 0.0) & (seen < _LARGEST_PX)).all():
         return False
-    miss = np.abs(seen - _expected(part))
-    return bool(np.median(miss[np.isfinite(miss)] if np.isfinite(miss).any() else 0.0) > _FAR_PX)
+    apart = np.abs(seen - _expected(part))
+    return bool(np.isfinite(apart).any() and np.nanmedian(apart) > _FAR_PX)
 
 
 def _expected(part: Part) -> FloatArray:
@@ -233,13 +185,11 @@ def _expected(part: Part) -> FloatArray:
     expected = np.full((len(points.image), 2), np.nan)
     order = np.argsort(points.image, kind="stable")
     bounds = np.searchsorted(points.image[order], np.arange(len(part.rows) + 1))
-    for row in part.posed:
-        rotation, centre = _pose(part, row)
+    for row, rotation, centre in zip(part.posed, *_poses(part), strict=True):
         rows = order[bounds[row] : bounds[row + 1]]
-        with np.errstate(over="ignore", invalid="ignore"):
-            x, y, z = rotation @ (points.xyz[points.point[rows]] - centre).T
-            z = np.where(z > 0.0, z, np.nan)
-            places = part.rows[row, 0] * np.column_stack([x / z, y / z])
+        x, y, z = rotation @ (points.xyz[points.point[rows]] - centre).T
+        z = np.where(z > 0.0, z, np.nan)
+        places = part.rows[row, 0] * np.column_stack([x / z, y / z])
         expected[rows] = np.where(np.abs(places) < _LARGEST_PX, places, np.nan)
     return expected
 
@@ -256,8 +206,8 @@ def _squeeze_and_frame(expected: FloatArray, seen: FloatArray) -> tuple[FloatArr
         good = np.full(len(e), True)
         for _ in range(2):
             offsets[axis], slopes[axis] = np.polynomial.polynomial.polyfit(e[good], s[good], 1)
-            miss = np.abs(s - slopes[axis] * e - offsets[axis])
-            good = miss <= 3.0 * np.median(miss)
+            apart = np.abs(s - slopes[axis] * e - offsets[axis])
+            good = apart <= 3.0 * np.median(apart)
     frame = np.round(2.0 * offsets)
     squeeze = frame / frame.max()
     nearer = np.abs(slopes - squeeze) < np.abs(slopes - 1.0)

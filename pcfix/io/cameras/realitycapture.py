@@ -35,7 +35,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.errors import InputError
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import number, numbers, read_xml
 from pcfix.io.cameras.formats import Source
@@ -66,11 +65,6 @@ class Image(NamedTuple):
     label: str
     fields: dict[str, str]
 
-    @property
-    def posed(self) -> bool:
-        """Whether it has a pose."""
-        return {"Rotation", "Position"} <= self.fields.keys()
-
     def numbers(self, name: str, count: int) -> FloatArray:
         """Return so many numbers of a field."""
         return numbers(self.path, f"image {self.label}, xcr:{name}", self.fields.get(name), count)
@@ -91,31 +85,27 @@ def recognises(source: Source) -> bool:
 def read(source: Source) -> Cameras:
     """Read the poses, and the lenses where the size of the images is known."""
     path = source.path
-    images = _images(path)
-    posed = [image for image in images if image.posed]
-    if not posed:
-        raise InputError(
-            f"{path}: has no xcr:Rotation and xcr:Position; export the XMP after the alignment,"
-            " with poses."
-        )
-    frames = _frames(source, posed)
-    lenses = None if frames is None else tuple(map(_lens, posed, frames))
-    note = (
-        f"{path}: XMP files do not tell the size of the images, and those are not beside them; put"
-        " them there or give --sensor. Frames are taken as boundless."
-    )
-    relative = any(image.fields.get("Coordinates", "absolute") != "absolute" for image in posed)
-    turns = [
-        checks.rotation(i.path, i.label, i.numbers("Rotation", 9).reshape(3, 3)) for i in posed
+    folder = path if path.is_dir() else path.parent
+    beside = {p.stem: p.name for p in folder.iterdir() if p.suffix.lower() in IMAGES}
+    images = [
+        Image(file, beside.get(file.stem, file.stem), _fields(file))
+        for file in _files(path)
+        if _is_ours(file) and file.stem != "_common"  # which speaks of no image
     ]
+    posed = [image for image in images if {"Rotation", "Position"} <= image.fields.keys()]
+    if not posed:
+        raise checks.no_pose(path, "has no xcr:Rotation and xcr:Position")
+    frames = _frames(source, folder, posed)
+    why = "the size of the images is not in XMP files; put the images beside them or give --sensor"
+    relative = any(image.fields.get("Coordinates", "absolute") != "absolute" for image in posed)
     return Cameras(
         labels=tuple(image.label for image in posed),
         centres=np.array([image.numbers("Position", 3) for image in posed]),
-        rotations=np.array(turns),
-        lenses=lenses,
+        rotations=np.array([image.numbers("Rotation", 9).reshape(3, 3) for image in posed]),
+        lenses=None if frames is None else tuple(map(_lens, posed, frames)),
         crs="local" if relative else None,
-        notes=() if lenses else (note,),
-        unposed=tuple(image.label for image in images if not image.posed),
+        notes=() if frames else (checks.without_lens(path, why),),
+        unposed=tuple(image.label for image in images if image not in posed),
         source="RealityCapture",
     )
 
@@ -128,23 +118,8 @@ def _files(path: Path) -> list[Path]:
 
 
 def _is_ours(path: Path) -> bool:
-    try:
-        with path.open("rb") as stream:
-            return NAMESPACE.encode() in stream.read(HEAD_BYTES)
-    except OSError:
-        return False
-
-
-def _images(path: Path) -> list[Image]:
-    """Read the files; ``_common.xmp`` speaks of no image."""
-    files = _files(path)
-    folder = path if path.is_dir() else path.parent
-    beside = {p.stem: p.name for p in folder.iterdir() if p.suffix.lower() in IMAGES}
-    return [
-        Image(file, beside.get(file.stem, file.stem), _fields(file))
-        for file in files
-        if _is_ours(file) and file.stem != "_common"
-    ]
+    with path.open("rb") as stream:
+        return NAMESPACE.encode() in stream.read(HEAD_BYTES)
 
 
 def _fields(path: Path) -> dict[str, str]:
@@ -158,9 +133,10 @@ def _fields(path: Path) -> dict[str, str]:
     return fields
 
 
-def _frames(source: Source, images: list[Image]) -> Sequence[tuple[float, float]] | None:
+def _frames(
+    source: Source, folder: Path, images: list[Image]
+) -> Sequence[tuple[float, float]] | None:
     """Return width and height of each image; None when one of them is not known."""
-    folder = source.path if source.path.is_dir() else source.path.parent
     beside = folder / "sensor.csv"
     sensor = source.sensor or (beside if beside.is_file() else None)
     lens = None if sensor is None else read_sensor(sensor)
@@ -177,41 +153,31 @@ def _lens(image: Image, frame: tuple[float, float]) -> Lens:
     across = image.number("FocalLength35mm", "") / FILM_MM * scale
     u, v = (image.number(f"PrincipalPoint{axis}") * scale for axis in "UV")
     focal = across * image.number("AspectRatio", "1")
-    model, radial, tangential = _distortion(image)
-    lens = Lens(
-        *(focal, width, height, width / 2.0 + u, height / 2.0 + v),
-        b1=across - focal,
-        b2=image.number("Skew") * scale,
-        radial=radial,
-        tangential=tangential,
-    )
-    checks.lens(image.path, f"of image {image.label}", lens)
-    return _with_division(lens, scale) if model == "division" else lens
-
-
-def _distortion(image: Image) -> tuple[str, tuple[float, ...], tuple[float, ...]]:
-    """Return the model and its radial and tangential coefficients."""
     model = image.fields.get("DistortionModel", "perspective")
     if model not in MODELS:
-        raise InputError(
-            f"{image.path}: image {image.label}: the distortion model '{model}' is not supported;"
-            f" export with one of {', '.join(MODELS)}."
-        )
-    name = "DistortionCoeficients"
+        remedy = f"Export with one of {', '.join(MODELS)}"
+        what = f"the distortion model '{model}' of {image.label}"
+        raise checks.unsupported(image.path, what, remedy, model=model, image=image.label)
+    radial, tangential = MODELS[model]
+    name = "DistortionCoeficients"  # misspelt in the files too
     given = image.numbers(name, len(image.fields.get(name, "").split())).tolist()
     k = [*given, *(0.0,) * 6][:6]
-    radial, tangential = MODELS[model]
-    return model, tuple(k[:radial]), tuple(k[4 : 4 + tangential])
-
-
-def _with_division(lens: Lens, scale: float) -> Lens:
-    """Return the lens with its radial coefficient taken as that of the division model.
-
-    In plane coordinates the centre of the image is at minus the principal point over the focal
-    length, and a length there is a share of the image divided by that of the focal length.
-    """
-    across = lens.focal + lens.b1
-    x = (lens.width / 2.0 - lens.principal_x) / across
-    y = (lens.height / 2.0 - lens.principal_y) / lens.focal
-    k = lens.radial[0] * (across / scale) ** 2
-    return replace(lens, radial=(), denominator=(k,), distortion_centre=(x, y), inverse=True)
+    x, y = width / 2.0 + u, height / 2.0 + v
+    lens = Lens(
+        *(focal, width, height, x, y),
+        b1=across - focal,
+        b2=image.number("Skew") * scale,
+        radial=tuple(k[:radial]),
+        tangential=tuple(k[4 : 4 + tangential]),
+    )
+    if model != "division":
+        return lens
+    # In plane coordinates the centre of the image is at minus the principal point over the focal
+    # length, and a length there is a share of the image divided by that of the focal length.
+    return replace(
+        lens,
+        radial=(),
+        denominator=(k[0] * (across / scale) ** 2,),
+        distortion_centre=((width / 2.0 - x) / across, (height / 2.0 - y) / focal),
+        inverse=True,
+    )

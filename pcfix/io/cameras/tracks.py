@@ -1,19 +1,25 @@
-"""Points, the images that saw them, and the sizes of those: what readers of sparse models share."""
+"""Gather tie points and estimate frame sizes: shared by the readers of sparse models."""
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from pathlib import Path, PureWindowsPath
 from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.errors import InputError
+from pcfix.errors import NoTiePointsError, PcfixWarning
+from pcfix.io.cameras.checks import damaged, without_lens
 from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, TiePoints, Views
 
 _BEFORE_VIEWS = 7
 """Numbers of a point before its views: x, y, z, red, green, blue, count of views."""
+
+
+def no_tie_points(path: Path, why: str) -> NoTiePointsError:
+    """Return the error for a file without tie points."""
+    sentence = f"{path}: has no tie points, as {why}."
+    return NoTiePointsError("cameras.no_tie_points", sentence, path=path)
 
 
 class PointList(NamedTuple):
@@ -29,17 +35,9 @@ class PointList(NamedTuple):
     rest: FloatArray
 
 
-def numbers(path: Path, text: str) -> FloatArray:
+def numbers(text: str) -> FloatArray:
     """Return all numbers of a text that holds nothing else but white space."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", DeprecationWarning)
-        try:
-            return np.fromstring(text, sep=" ") if text.strip() else np.empty(0)
-        except (DeprecationWarning, ValueError) as error:
-            raise InputError(
-                f"{path}: among the numbers is a word that is none; the file is damaged, export it"
-                " again."
-            ) from error
+    return np.array(text.split(), np.float64)
 
 
 def point_list(path: Path, body: FloatArray, count: int, images: int, width: int) -> PointList:
@@ -48,37 +46,25 @@ def point_list(path: Path, body: FloatArray, count: int, images: int, width: int
     `count` is the number of points that the file announces, `images` that of its images, which the
     first number of a view counts from 0.
     """
-    first, views = _starts(path, body, count, width)
-    point = np.repeat(np.arange(count), views)
-    within = np.arange(len(point)) - np.repeat(np.cumsum(views) - views, views)
-    at = np.repeat(first + _BEFORE_VIEWS, views) + width * within
-    image = body[at]
-    bad = ~((image >= 0) & (image < images) & (image == np.floor(image)))
-    if bad.any():
-        i = int(np.argmax(bad))
-        raise InputError(
-            f"{path}: point {point[i]} was seen by image {image[i]:g}, but there are {images}"
-            " images; the file is damaged, export it again."
-        )
-    xyz = body[first[:, None] + np.arange(3)]
-    rest = body[at[:, None] + np.arange(1, width)]
-    return PointList(xyz, point, image.astype(np.int64), rest)
-
-
-def _starts(path: Path, body: FloatArray, count: int, width: int) -> tuple[IntArray, IntArray]:
-    """Return where each point begins, and how many views it has."""
-    found: list[tuple[int, int]] = []  # grows with the file, not with what that announces
+    starts: list[tuple[int, int]] = []  # where a point begins, and its number of views
     at = 0
     for i in range(count):
-        n = float(body[at + _BEFORE_VIEWS - 1]) if at + _BEFORE_VIEWS <= len(body) else 0.5
-        if n < 0 or not n.is_integer() or at + _BEFORE_VIEWS + width * n > len(body):
-            raise InputError(
-                f"{path}: is cut off or damaged at point {i} of {count}; export it again."
-            )
-        found.append((at, int(n)))
-        at += _BEFORE_VIEWS + width * int(n)
-    first, views = np.array(found, np.int64).reshape(-1, 2).T
-    return first, views
+        n = int(body[at + _BEFORE_VIEWS - 1]) if at + _BEFORE_VIEWS <= len(body) else -1
+        if n < 0 or at + _BEFORE_VIEWS + width * n > len(body):
+            raise damaged(path, f"it ends at point {i} of {count}")
+        starts.append((at, n))
+        at += _BEFORE_VIEWS + width * n
+    first, views = np.array(starts, np.int64).reshape(-1, 2).T
+    point = np.repeat(np.arange(count), views)
+    within = np.arange(len(point)) - np.repeat(np.cumsum(views) - views, views)
+    at_view = np.repeat(first + _BEFORE_VIEWS, views) + width * within
+    image = body[at_view]
+    bad = ~((image >= 0) & (image < images))
+    if bad.any():
+        raise damaged(path, f"point {point[np.argmax(bad)]} is in image {image[np.argmax(bad)]:g}")
+    xyz = body[first[:, None] + np.arange(3)]
+    rest = body[at_view[:, None] + np.arange(1, width)]
+    return PointList(xyz, point, image.astype(np.int64), rest)
 
 
 def tie_points(xyz: FloatArray, point: IntArray, camera: IntArray, uv: FloatArray) -> TiePoints:
@@ -90,8 +76,8 @@ def tie_points(xyz: FloatArray, point: IntArray, camera: IntArray, uv: FloatArra
     return TiePoints(xyz, Views(start, camera[kept]), uv[kept])
 
 
-def finite(ties: TiePoints) -> tuple[TiePoints, str]:
-    """Return tie points without those that are not finite, and in words how many these were.
+def finite(path: Path, ties: TiePoints) -> tuple[TiePoints, PcfixWarning | None]:
+    """Return tie points without those that are not finite, and a note on how many these were.
 
     A point without any coordinate is one that the source has not placed, and stays.
     """
@@ -100,15 +86,19 @@ def finite(ties: TiePoints) -> tuple[TiePoints, str]:
     point = np.repeat(np.arange(len(ties.xyz)), np.diff(ties.views.start))
     seen = np.isfinite(ties.image_xy).all(axis=1)
     if kept.all() and seen.all():
-        return ties, ""
+        return ties, None
     rows = np.flatnonzero(seen & kept[point])
     number = np.cumsum(kept) - 1
     left = tie_points(
         ties.xyz[kept], number[point[rows]], ties.views.camera[rows], ties.image_xy[rows]
     )
-    return left, (
-        f"{int((~kept).sum()):,} tie points and {int((~seen).sum()):,} image places have a number"
-        " that is not finite; they are left out."
+    points, observations = int((~kept).sum()), int((~seen).sum())
+    return left, PcfixWarning(
+        "cameras.tie_points_not_finite",
+        f"{path}: {points:,} tie points and {observations:,} observations have a number that is not"
+        " finite. They are left out.",
+        points=points,
+        observations=observations,
     )
 
 
@@ -141,7 +131,7 @@ _SAME_CAMERA = 1.1
 
 def frame_sizes(
     path: Path, names: Sequence[str], focal_px: FloatArray, smallest_px: FloatArray
-) -> tuple[FloatArray | None, tuple[str, ...]]:
+) -> tuple[FloatArray | None, tuple[PcfixWarning, ...]]:
     """Return width and height of images, from the images themselves or from their tie points.
 
     Where an image cannot be opened, its frame is the smallest that holds all tie points that
@@ -149,35 +139,31 @@ def frame_sizes(
 
     Images are looked for where the camera file lies, one folder up, and in ``images``.
     `smallest_px`, shape (k, 2), is the smallest width and height that hold the tie points of an
-    image, 0 where it has none. None where nothing tells the frames; the texts are for the user.
+    image, 0 where it has none. None where nothing tells the frames.
     """
     sizes = np.array([image_size(path.parent, name) or (0, 0) for name in names], float)
     missing = sizes[:, 0] == 0
     if not missing.any():
         return sizes, ()
+    why = f"the size of {missing.sum()} images is not in the file, nor are the images beside it"
     if not smallest_px.any():
-        return None, (
-            f"{path}: tells no size of {missing.sum()} images, and the images are not beside it;"
-            " every point is taken as inside their frames. Put the images beside the file.",
-        )
-    sizes[missing] = _bounds(focal_px, smallest_px)[missing]
-    return sizes, (
-        f"{path}: tells no size of {missing.sum()} images, and the images are not beside it; their"
-        f" frames are estimated from the tie points, that of {names[missing.argmax()]} as"
-        f" {sizes[missing][0, 0]:.0f} x {sizes[missing][0, 1]:.0f} px. Put the images beside the"
-        " file.",
-    )
-
-
-def _bounds(focal_px: FloatArray, smallest_px: FloatArray) -> FloatArray:
-    """Return for each image the bound of all images of about its focal length."""
+        return None, (without_lens(path, why),)
     order = np.argsort(focal_px)
     steps = focal_px[order][1:] > _SAME_CAMERA * focal_px[order][:-1]
     bounds = np.empty_like(smallest_px)
-    for members in np.split(order, np.flatnonzero(steps) + 1):
+    for members in np.split(order, np.flatnonzero(steps) + 1):  # images of about one focal length
         bound = smallest_px[members].max(axis=0)
         bounds[members] = bound if bound.all() else smallest_px.max(axis=0)
-    return bounds
+    sizes[missing] = bounds[missing]
+    first = sizes[missing][0].tolist()
+    note = PcfixWarning(
+        "cameras.frames_estimated",
+        f"{path}: {why}. Their frames are estimated from the tie points, the first as"
+        f" {first[0]:.0f} x {first[1]:.0f} px; put the images beside the file.",
+        images=int(missing.sum()),
+        size_px=first,
+    )
+    return sizes, (note,)
 
 
 def image_size(folder: Path, name: str) -> tuple[int, int] | None:

@@ -1,7 +1,8 @@
-"""Files that are known but not read: each is refused with its name and a way round.
+"""Files that are known but not read: each is refused with its name and a remedy.
 
-Only what no reader has claimed comes here. Recognised are signatures, keywords in the first bytes,
-the names of files that are one part of an export and, of folders, the names inside.
+Only files that no reader has claimed come here. They are recognised by signatures and keywords in
+the first bytes, by the names of files that are one part of an export and, in folders, by the names
+inside.
 """
 
 from __future__ import annotations
@@ -15,112 +16,93 @@ from pcfix.errors import InputError
 from pcfix.io.cameras.formats import Source
 from pcfix.io.tables import number
 
-ANY_CAMERAS = "give the file or folder with the camera poses"
-OMEGA_PHI_KAPPA = (
-    "write a table with the header label,x,y,z,omega,phi,kappa and give its lens by --sensor"
-)
-COLMAP = "export a COLMAP model (cameras, images, points3D)"
-METASHAPE = "in Metashape, File > Export > Export Cameras, Agisoft XML"
-
 
 class Refusal(NamedTuple):
-    """A format: what it is, what its content matches, and what to do instead."""
+    """A kind of file that is not read, and what to do instead."""
 
     what: str
-    pattern: bytes
     remedy: str
 
 
-OPENMVG = Refusal("a scene of OpenMVG", rb'"sfm_data_version"', f"{COLMAP} (openMVG2Colmap)")
-ALICEVISION = Refusal(
-    "a scene of AliceVision (Meshroom)",
-    rb'"viewId"|"featuresFolders"|"pipelineVersion"',
-    f"{COLMAP} (aliceVision_exportColmap)",
-)
-NERFSTUDIO = Refusal(
-    "a scene of nerfstudio or instant-ngp",
-    rb'"transform_matrix"|"camera_angle_x"|"fl_x"',
-    "give the model from which it was converted; its axes and scale are no longer the cloud's",
-)
-IMAGES = Refusal("an image", rb"\A(\xff\xd8\xff|II[*+]\0|MM\0[*+]|\x89PNG)", ANY_CAMERAS)
-PIX4D = Refusal(
-    "a project of Pix4D", rb"<pix4uav|<!DOCTYPE Pix4D", "give its folder 1_initial/params"
-)
+POSES = "Give the file or folder with the camera poses"
+UNPACK = "Unpack it, then give the file or folder with the camera poses"
+OPK = "Write a table with the header label,x,y,z,omega,phi,kappa and give its lens by --sensor"
+COLMAP = "Export a COLMAP model (cameras, images, points3D)"
+
+IMAGE = Refusal("an image", POSES)
+PIX4D = Refusal("a project of Pix4D", "Give its folder 1_initial/params")
 MICMAC = Refusal(
     "a calibration of MicMac",
-    rb"<(CalibrationInternConique|InternalCalibration)>",
-    "give the folder that holds the orientations, Orientation-*.xml or Ori-PerspCentral-*.xml",
+    "Give the folder that holds the orientations, Orientation-*.xml or Ori-PerspCentral-*.xml",
 )
 ODM = Refusal(
     "a list of lenses of OpenDroneMap or OpenSfM, without poses",
-    rb'"projection_type"',
-    "give reconstruction.json or shots.geojson of the same project, or its folder",
+    "Give reconstruction.json or shots.geojson of the same project, or its folder",
+)
+OPENMVG = Refusal("a scene of OpenMVG", f"{COLMAP} with openMVG2Colmap")
+ALICEVISION = Refusal(
+    "a scene of AliceVision (Meshroom)", f"{COLMAP} with aliceVision_exportColmap"
+)
+NERFSTUDIO = Refusal(
+    "a scene of nerfstudio or instant-ngp",
+    "Give the model from which it was converted; its axes and scale are no longer the cloud's",
 )
 
-FILES = (
-    IMAGES,
-    Refusal("a point cloud (LAS, LAZ)", rb"\ALASF", ANY_CAMERAS),
-    Refusal("a point cloud or mesh (PLY)", rb"\Aply\r?\n", ANY_CAMERAS),
-    Refusal("a GeoPackage or other SQLite database", rb"\ASQLite format 3\0", ANY_CAMERAS),
-    Refusal("a shapefile", rb"\A\0\0\x27\x0a", ANY_CAMERAS),
-    Refusal("an archive (gzip)", rb"\A\x1f\x8b", f"unpack it, then {ANY_CAMERAS}"),
-    Refusal("an archive (ZIP)", rb"\APK[\x03\x05]", f"unpack it, then {ANY_CAMERAS}"),
-    Refusal("a scene of OpenMVS", rb"\AMVS[I\0]", f"{COLMAP} from what OpenMVS was run on"),
-    PIX4D,
-    Refusal(
-        "a project of Metashape without its poses",
-        rb"\A\s*(<\?xml[^>]*>\s*)?<document[^>]*\bpath=",
-        f"keep the folder .files beside it, or {METASHAPE}",
-    ),
-    Refusal(
-        "a project of RealityCapture",
+CONTENTS = (
+    (rb"\A(\xff\xd8\xff|II[*+]\0|MM\0[*+]|\x89PNG)", IMAGE),
+    (rb"\ALASF", Refusal("a point cloud (LAS, LAZ)", POSES)),
+    (rb"\Aply\r?\n", Refusal("a point cloud or mesh (PLY)", POSES)),
+    (rb"\ASQLite format 3\0", Refusal("a GeoPackage or other SQLite database", POSES)),
+    (rb"\A\0\0\x27\x0a", Refusal("a shapefile", POSES)),
+    (rb"\A\x1f\x8b", Refusal("an archive (gzip)", UNPACK)),
+    (rb"\APK[\x03\x05]", Refusal("an archive (ZIP)", UNPACK)),
+    (rb"\AMVS[I\0]", Refusal("a scene of OpenMVS", f"{COLMAP} from what OpenMVS was run on")),
+    (rb"<!DOCTYPE Pix4D", PIX4D),
+    (
         rb"<Reality(Capture|Scan)",
-        "export Internal/External camera parameters (CSV) or XMP files",
+        Refusal(
+            "a project of RealityCapture",
+            "Export Internal/External camera parameters (CSV) or XMP files",
+        ),
     ),
-    Refusal("a map of Google Earth (KML)", rb"<kml[\s>]", ANY_CAMERAS),
-    Refusal("a survey job (Trimble, Leica)", rb"<(JOBFile|HeXML|LandXML)[\s>]", ANY_CAMERAS),
-    Refusal(
-        "a list of ground control points (ODM)",
+    (rb"<kml[\s>]", Refusal("a map of Google Earth (KML)", POSES)),
+    (rb"<(JOBFile|HeXML|LandXML)[\s>]", Refusal("a survey job (Trimble, Leica)", POSES)),
+    (
         rb"\A(EPSG:\d|\+proj=|WGS84 UTM )[^\n]*\n\s*[-+.\d]+[ \t]+[-+.\d]+[ \t]",
-        ANY_CAMERAS,
+        Refusal("a list of ground control points (ODM)", POSES),
     ),
-    Refusal("a table of the sensor", rb"\A(\xef\xbb\xbf)?focal", "give it by --sensor"),
-    Refusal(
-        "a project of Inpho (Trimble)",
+    (rb"\A(\xef\xbb\xbf)?focal", Refusal("a table of the sensor", "Give it by --sensor")),
+    (
         rb"\A\s*\$PROJECT\b|^\s*\$(PHOTO_NUM|EXT_ORI)\b",
-        OMEGA_PHI_KAPPA,
+        Refusal("a project of Inpho (Trimble)", OPK),
     ),
-    Refusal(
-        "a support file of SOCET SET",
+    (
         rb"^\s*(SENSOR_TYPE|IMAGE_SUPPORT|SENSOR_SERIAL_NUMBER|TRIANGULATION_TYPE)\s",
-        OMEGA_PHI_KAPPA,
+        Refusal("a support file of SOCET SET", OPK),
     ),
-    Refusal("a file of BINGO", rb"^\s*(ORI[AE]|PRO[JI]|GEOI|BILD)\s+\S+\s+\S", OMEGA_PHI_KAPPA),
-    MICMAC,
-    ODM,
-    OPENMVG,
-    ALICEVISION,
-    NERFSTUDIO,
+    (rb"^\s*(ORI[AE]|PRO[JI]|GEOI|BILD)\s+\S+\s+\S", Refusal("a file of BINGO", OPK)),
+    (rb"<(CalibrationInternConique|InternalCalibration)>", MICMAC),
+    (rb'"projection_type"', ODM),
+    (rb'"sfm_data_version"', OPENMVG),
+    (rb'"viewId"|"featuresFolders"|"pipelineVersion"', ALICEVISION),
+    (rb'"transform_matrix"|"camera_angle_x"|"fl_x"', NERFSTUDIO),
 )
-"""The first that matches counts."""
+"""What the first bytes of a file match; the first counts."""
 
 PIX4D_TABLES = (
-    "give calibrated_camera_parameters.txt of the same export, or the params folder that holds it"
+    "Give calibrated_camera_parameters.txt of the same export, or the params folder that holds it"
 )
 PARTS = tuple(
-    (rf"(?i)(.*_)?{name}", Refusal(what, b"", PIX4D_TABLES))
+    (rf"(?i)(.*_)?{name}", Refusal(f"{what} of Pix4D", PIX4D_TABLES))
     for name, what in (
-        (r"calibrated_images_position\.txt", "a list of positions by Pix4D, without angles"),
-        (r"pmatrix\.txt", "a list of projection matrices by Pix4D, without the distortion"),
-        (r"offset\.xyz", "the offset of a project of Pix4D"),
-        (r"internal_camera_parameters\.cam", "a calibration of Pix4D, without poses"),
-        (
-            r"camera_parameters(_wgs84)?_error\.txt",
-            "a table of standard errors by Pix4D, without poses",
-        ),
+        (r"calibrated_images_position\.txt", "a list of positions without angles"),
+        (r"pmatrix\.txt", "a list of projection matrices without the distortion"),
+        (r"offset\.xyz", "the offset of a project"),
+        (r"internal_camera_parameters\.cam", "a calibration without poses"),
+        (r"camera_parameters(_wgs84)?_error\.txt", "a table of standard errors without poses"),
     )
 )
-"""What the name of a file says that is one part of an export."""
+"""Names of files that are one part of an export."""
 FOLDERS = (
     *PARTS,
     (r"AutoCal.*\.xml|Calib-PerspCentral-.*\.xml", MICMAC),
@@ -129,14 +111,12 @@ FOLDERS = (
     (r".*\.(sfm|mg)", ALICEVISION),
     (r"transforms\.json", NERFSTUDIO),
     (r"1_initial", PIX4D),
-    (r"(?i).*\.(jpe?g|tiff?|png|dng)", IMAGES._replace(what="a folder of images")),
+    (r"(?i).*\.(jpe?g|tiff?|png|dng)", Refusal("a folder of images", POSES)),
 )
-"""What the name of a file inside says of a folder."""
-PATB = Refusal("a text like PATB's .ori, with rotation matrices", b"", OMEGA_PHI_KAPPA)
+"""Names of files inside a folder, and what the folder is then."""
+PATB = Refusal("a text like PATB's .ori, with rotation matrices", OPK)
 BARE = Refusal(
-    "a table without a header",
-    b"",
-    "put one above the rows, for example label,x,y,z,omega,phi,kappa",
+    "a table without a header", "Put one above the rows, for example label,x,y,z,omega,phi,kappa"
 )
 
 
@@ -152,9 +132,12 @@ def is_part(source: Source) -> bool:
 
 def read(source: Source) -> NoReturn:
     """Refuse the file."""
-    found = _refusal(source) or Refusal("a format that pcfix does not read", b"", ANY_CAMERAS)
+    found = _refusal(source) or Refusal("a format that pcfix does not read", POSES)
     raise InputError(
-        f"{source.path}: is {found.what}, which pcfix does not read as cameras; {found.remedy}."
+        "cameras.not_read",
+        f"{source.path}: is {found.what}, which pcfix does not read as cameras. {found.remedy}.",
+        path=source.path,
+        what=found.what,
     )
 
 
@@ -166,12 +149,12 @@ def _refusal(source: Source) -> Refusal | None:
                 if re.fullmatch(pattern, name):
                     return found._replace(what=f"a folder with {name}: {found.what}")
         return None
-    part = next((f for name, f in PARTS if re.fullmatch(name, source.path.name)), None)
-    if part is not None:
-        return part
-    for each in FILES:
-        if re.search(each.pattern, source.head, re.MULTILINE):
-            return each
+    for name, found in PARTS:
+        if re.fullmatch(name, source.path.name):
+            return found
+    for content, found in CONTENTS:
+        if re.search(content, source.head, re.MULTILINE):
+            return found
     return None if b"\0" in source.head else _bare_numbers(source.text)
 
 

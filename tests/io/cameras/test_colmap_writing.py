@@ -6,12 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pcfix.errors import InputError, SettingError
+from pcfix.errors import SettingError
 from pcfix.io.cameras import read_cameras, read_tie_points
 from pcfix.io.cameras.colmap.writing import colmap_camera, write_colmap
 from pcfix.lens.imaging import project
 from pcfix.model import Lens, TiePoints, Views
 from tests.utils.blocks import PLAIN, small_block, some_ties
+from tests.utils.codes import refused
 from tests.utils.reprojection import bring_to
 from tests.utils.shared import needs
 
@@ -146,7 +147,7 @@ def test_the_simplest_model_that_is_the_lens(tmp_path, name):
     ],
 )
 def test_a_lens_that_no_model_holds(tmp_path, lens):
-    with pytest.raises(InputError, match="COLMAP has no camera model that holds the lens"):
+    with refused("output.lens"):
         write_colmap(tmp_path / "m", small_block((lens,)))
     assert not (tmp_path / "m").exists()
 
@@ -169,23 +170,23 @@ def test_a_block_without_tie_points(tmp_path):
     cameras = small_block()
     write_colmap(tmp_path, cameras)
     same_block(read_cameras(tmp_path), cameras)
-    with pytest.raises(InputError, match="no tie points"):
+    with refused("cameras.no_tie_points"):
         read_tie_points(tmp_path, cameras)
 
 
 def test_nothing_is_replaced_unasked(tmp_path):
     (tmp_path / "points3D.bin").write_text("mine")
-    with pytest.raises(SettingError, match=r"points3D.bin: the output exists"):
+    with pytest.raises(SettingError):
         write_colmap(tmp_path, small_block())
     assert [path.name for path in tmp_path.iterdir()] == ["points3D.bin"]
 
 
 def test_cameras_that_are_not_whole(tmp_path):
     bare = replace(small_block(), lenses=None, rotations=None)
-    with pytest.raises(InputError, match="needs rotations and lenses"):
+    with refused("output.no_lenses"):
         write_colmap(tmp_path, bare)
     odd = replace(small_block(), labels=("a\nb", *small_block().labels[1:]))
-    with pytest.raises(InputError, match="has no place in COLMAP's files"):
+    with refused("output.label"):
         write_colmap(tmp_path, odd)
     spaced = replace(small_block(), labels=("a b.jpg", *small_block().labels[1:]))
     write_colmap(tmp_path, spaced)
@@ -195,19 +196,18 @@ def test_cameras_that_are_not_whole(tmp_path):
 @pytest.mark.parametrize(
     ("text", "word"),
     [
-        ("{", "is damaged"),
-        ('{"written_by": "pcfix"}', "is damaged"),
-        ('{"written_by": "pcfix", "crs": null, "offset_m": [1, 2]}', "three numbers"),
-        ('{"written_by": "pcfix", "crs": 7, "offset_m": [1, 2, 3]}', "three numbers"),
-        ('{"written_by": "pcfix", "crs": "EPSG:1", "offset_m": [1, 2, 3]}', "EPSG:1"),
+        ("{", "cameras.damaged"),
+        ('{"written_by": "pcfix"}', "cameras.damaged"),
+        ('{"written_by": "pcfix", "crs": null, "offset_m": [1, 2]}', "cameras.damaged"),
+        ('{"written_by": "pcfix", "crs": 7, "offset_m": [1, 2, 3]}', "cameras.damaged"),
+        ('{"written_by": "pcfix", "crs": "EPSG:1", "offset_m": [1, 2, 3]}', "cameras.crs"),
     ],
 )
 def test_a_damaged_georeference(tmp_path, text, word):
     write_colmap(tmp_path, small_block())
     (tmp_path / "georeference.json").write_text(text)
-    with pytest.raises(InputError, match=word) as error:
+    with refused(word):
         read_cameras(tmp_path)
-    assert "georeference.json" in str(error.value)
 
 
 def test_a_georeference_of_others_says_nothing(tmp_path):

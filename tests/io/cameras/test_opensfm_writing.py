@@ -14,6 +14,7 @@ from pcfix.io.cameras.opensfm.models import opensfm_camera, write_opensfm
 from pcfix.lens.imaging import project
 from pcfix.model import Lens, TiePoints, Views
 from tests.utils.blocks import PLAIN, small_block, some_ties
+from tests.utils.codes import refused
 from tests.utils.reprojection import bring_to
 from tests.utils.shared import needs
 
@@ -123,7 +124,7 @@ def test_the_simplest_model_that_is_the_lens(tmp_path, name):
     ],
 )
 def test_a_lens_that_no_model_holds(tmp_path, lens):
-    with pytest.raises(InputError, match="OpenSfM has no camera model that holds the lens"):
+    with refused("output.lens"):
         write_opensfm(tmp_path / "reconstruction.json", small_block((lens,)))
     assert not list(tmp_path.iterdir())
 
@@ -141,29 +142,29 @@ def test_points_that_nothing_can_hold_are_left_out(tmp_path):
 
 
 def test_heights_need_a_grid_or_are_refused(tmp_path):
-    with pytest.raises(InputError, match=r"without the grid us_nga_egm96_15.tif"):
+    with pytest.raises(InputError):
         write_opensfm(tmp_path / "reconstruction.json", small_block(crs="EPSG:32636+5773"))
 
 
 @pytest.mark.parametrize("crs", ["EPSG:4979", "EPSG:4978"])
 def test_another_kind_of_crs_is_refused(tmp_path, crs):
-    with pytest.raises(InputError, match="bring them to a projected CRS first"):
+    with refused("output.crs"):
         write_opensfm(tmp_path / "reconstruction.json", small_block(crs=crs))
 
 
 def test_blocks_that_opensfm_cannot_key(tmp_path):
     path, cameras = tmp_path / "reconstruction.json", small_block()
-    for labels, word in ((("a",) * 6, "5 names occur again"), (("a\tb", *"cdefg"), "has no place")):
-        with pytest.raises(InputError, match=word):
+    for labels, word in ((("a",) * 6, "output.label"), (("a\tb", *"cdefg"), "output.label")):
+        with refused(word):
             write_opensfm(path, replace(cameras, labels=labels))
-    with pytest.raises(InputError, match="needs rotations and lenses"):
+    with refused("output.no_lenses"):
         write_opensfm(path, replace(cameras, lenses=None))
 
 
 def test_nothing_is_replaced_unasked(tmp_path):
     path, cameras = tmp_path / "reconstruction.json", small_block((PLAIN,))
     (tmp_path / "reference_lla.json").write_text("{}")
-    with pytest.raises(SettingError, match=r"reference_lla.json: the output exists"):
+    with pytest.raises(SettingError):
         write_opensfm(path, cameras)
     assert not path.exists()
 

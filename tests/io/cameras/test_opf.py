@@ -2,7 +2,6 @@
 
 import json
 import math
-import warnings
 
 import numpy as np
 import pytest
@@ -10,9 +9,8 @@ from scipy.spatial.transform import Rotation
 
 import pcfix
 from pcfix.errors import InputError
-from pcfix.io.cameras import FORMATS, opf, read_tie_points
-from pcfix.io.cameras.formats import Source
-from pcfix.lens.imaging import project
+from pcfix.io.cameras import read_tie_points
+from tests.utils.codes import refused, warned
 from tests.utils.pose_files.block import Block
 from tests.utils.pose_files.opf import FIRST_ID, Base
 from tests.utils.pose_files.opf import opf as write
@@ -115,15 +113,6 @@ def test_tracks_fall_where_the_images_saw_them(make, kind):
     assert cameras.source == "OPF PIX4Dmatic 1.6"
 
 
-def test_wrong_angles_would_be_noticed(make):
-    path, _ = make()
-    cameras = pcfix.read_cameras(path)
-    ties = read_tie_points(path, cameras)
-    turned = Rotation.from_euler("z", 0.01, degrees=True).as_matrix() @ cameras.rotations
-    rays = (ties.xyz[0] - cameras.centres[0]) @ turned[0].T
-    assert np.hypot(*(project(cameras.lenses[0], rays[None])[0] - ties.image_xy[0])) > 0.05
-
-
 @pytest.mark.parametrize("given", ["folder", "project.opf", "calibrated-cameras.json"])
 def test_project_folder_and_calibration_are_one_block(make, tmp_path, given):
     path, _ = make()
@@ -169,7 +158,7 @@ def test_heights_of_a_crs_without_them_are_ellipsoidal(make):
     found = bring_to(cameras, "EPSG:32632")
     assert found.centres == pytest.approx(PLACES, abs=1e-6)
     assert found.notes == ()
-    with pytest.raises(InputError, match="ellipsoidal heights"):
+    with pytest.raises(InputError):
         bring_to(cameras, "EPSG:32632+5783")
 
 
@@ -191,7 +180,7 @@ def test_a_constant_geoid_is_said(make, tmp_path):
     path, _ = make()
     crs = {"definition": "EPSG:32632+5783", "geoid_height": 47.5}
     change(tmp_path, "scene-reference-frame.json", crs=crs)
-    with pytest.warns(pcfix.PcfixWarning, match="a constant geoid, 47.5 m over the ellipsoid"):
+    with warned("cameras.constant_geoid"):
         pcfix.read_cameras(path)
 
 
@@ -217,7 +206,7 @@ def test_gnss_is_of_the_reference_camera_east_before_north(make, tmp_path):
 def test_without_input_cameras_frames_are_boundless(make, tmp_path):
     path, _ = make()
     change(tmp_path, "input-cameras.json", sensors=[])
-    with pytest.warns(pcfix.PcfixWarning, match="frames are taken as boundless"):
+    with warned("cameras.no_lens"):
         assert pcfix.read_cameras(path).lenses is None
 
 
@@ -225,99 +214,51 @@ def test_a_sensor_is_honoured_where_the_file_has_no_lens_and_refused_where_it_ha
     path, _ = make()
     sensor = tmp_path / "sensor.csv"
     sensor.write_text("focal_px,width_px,height_px\n3000,4000,3000\n")
-    with pytest.raises(InputError, match=r"has the lenses of its images \(OPF.*leave it out"):
+    with refused("cameras.sensor_unused"):
         pcfix.read_cameras(path, sensor)
     change(tmp_path, "input-cameras.json", sensors=[])
     found = pcfix.read_cameras(path, sensor)  # without the warning of boundless frames
     assert [lens.focal for lens in found.lenses] == [3000.0, 3000.0]
 
 
-WRONG = {
-    "no calibration": ("project.opf", {"items": []}, "has 0 files of calibrated cameras"),
-    "gone": ("project.opf", None, "calibrated-cameras.json: is missing"),
-    "spherical": (
-        "calibrated-cameras.json",
-        {"sensors": [{"id": 7, "internals": {"type": "spherical", "principal_point_px": [1, 2]}}]},
-        "sensor one: the type 'spherical'",
-    ),
-    "angles": (
-        "calibrated-cameras.json",
-        {"cameras": [{"id": FIRST_ID, "sensor_id": 7, "position": [0, 0, 0]}]},
-        "image a b.jpg, orientation: None is not 3 finite number",
-    ),
-    "scale": (
-        "scene-reference-frame.json",
-        {"base_to_canonical": {"shift": [0, 0, 0], "scale": [0, 1, 1], "swap_xy": False}},
-        "must be positive",
-    ),
-    "crs": ("scene-reference-frame.json", {"crs": {"definition": "nowhere"}}, "nowhere"),
-}
-
-
-@pytest.mark.parametrize("name", WRONG)
-def test_what_is_wrong_is_said(make, tmp_path, name):
+@pytest.mark.parametrize(
+    ("part", "values", "code"),
+    [
+        ("project.opf", {"items": []}, "cameras.damaged"),
+        (
+            "calibrated-cameras.json",
+            {"sensors": [{"id": 7, "internals": {"type": "x", "principal_point_px": [1, 2]}}]},
+            "cameras.unsupported",
+        ),
+        (
+            "calibrated-cameras.json",
+            {"cameras": [{"id": FIRST_ID, "sensor_id": 7, "position": [0, 0, 0]}]},
+            "cameras.damaged",
+        ),
+        (
+            "scene-reference-frame.json",
+            {"base_to_canonical": {"shift": [0, 0, 0], "scale": [0, 1, 1], "swap_xy": False}},
+            "cameras.damaged",
+        ),
+        ("scene-reference-frame.json", {"crs": {"definition": "nowhere"}}, "cameras.crs"),
+    ],
+)
+def test_refused(make, tmp_path, part, values, code):
     path, _ = make()
-    part, values, words = WRONG[name]
-    if values is None:
-        (tmp_path / "calibrated-cameras.json").unlink()
-    else:
-        change(tmp_path, part, **values)
-    with pytest.raises(InputError) as refusal:
+    change(tmp_path, part, **values)
+    with refused(code):
         pcfix.read_cameras(path)
-    assert words in str(refusal.value)
 
 
-def test_tracks_that_are_cut_off_or_not_there(make, tmp_path):
+def test_tracks_refused(make, tmp_path):
     path, _ = make()
     cameras = pcfix.read_cameras(path)
     (tmp_path / "pixels.bin").write_bytes(b"")
-    with pytest.raises(InputError, match=r"pixels\.bin: is missing or cut off"):
+    with refused("cameras.damaged", path=tmp_path / "pixels.bin"):
         read_tie_points(path, cameras)
     (tmp_path / "tracks.gltf").unlink()
-    with pytest.raises(InputError, match=r"tracks\.gltf: is missing"):
+    with refused("cameras.missing_file", path=tmp_path / "tracks.gltf"):
         read_tie_points(path, cameras)
-
-
-def places_in(value, way=()):
-    """Yield the way to every value inside a JSON document."""
-    pairs = value.items() if isinstance(value, dict) else enumerate(value)
-    for key, inner in pairs:
-        yield (*way, key)
-        if isinstance(inner, dict | list):
-            yield from places_in(inner, (*way, key))
-
-
-JUNK = (None, "x", [], {}, -1, 1e400, [[1]], True)
-
-
-@pytest.mark.parametrize(
-    "part",
-    [
-        "project.opf", "calibrated-cameras.json", "input-cameras.json", "camera-list.json",
-        "scene-reference-frame.json", "tracks.gltf",
-    ],
-)  # fmt: skip
-def test_every_wrong_value_is_an_input_error_or_harmless(make, tmp_path, part):
-    path, _ = make()
-    content = json.loads((tmp_path / part).read_text())
-    cameras = pcfix.read_cameras(path)
-    for number, way in enumerate(places_in(content)):
-        inside = json.loads(json.dumps(content))
-        held = inside
-        for key in way[:-1]:
-            held = held[key]
-        held[way[-1]] = JUNK[number % len(JUNK)]
-        (tmp_path / part).write_text(json.dumps(inside))
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", pcfix.PcfixWarning)
-            try:
-                pcfix.read_cameras(path)
-                read_tie_points(path, cameras)
-            except InputError as error:
-                assert str(tmp_path) in str(error)
-
-
-def test_a_file_of_another_json_is_not_claimed(tmp_path):
-    (tmp_path / "a.json").write_text('{"shots": {}}')
-    assert not opf.recognises(Source(tmp_path / "a.json"))
-    assert [form.reader for form in FORMATS].count(opf) == 1
+    (tmp_path / "calibrated-cameras.json").unlink()
+    with refused("cameras.missing_file", path=tmp_path / "calibrated-cameras.json"):
+        pcfix.read_cameras(path)

@@ -1,17 +1,15 @@
 """Pix4D params folders."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from pyproj import CRS
 from scipy.spatial.transform import Rotation
 
-import pcfix
 from pcfix.io.cameras import pix4d
 from pcfix.io.cameras.formats import Source
 from pcfix.lens.imaging import project, unproject
-from tests.utils.reprojection import check_file, residuals_px, row_of
+from tests.utils.camera_files import notes, read, read_ties
+from tests.utils.codes import refused
 from tests.utils.shared import needs
 
 CA502, ca502 = needs("cameras", "pix4d", "ca502_oblique5")
@@ -64,30 +62,12 @@ def params(tmp_path, **files):
     return folder
 
 
-def read(path):
-    assert pix4d.recognises(Source(path))
-    return pix4d.read(Source(path))
-
-
-@ca502
-def test_oblique_block_fits_its_measurements():
-    cameras = read(CA502)
-    check = check_file(CA502)
-    found = residuals_px(cameras, check["observations"])
-    expected = [seen["res_px"] for seen in check["observations"]]
-    assert found == pytest.approx(expected, abs=0.01)  # points are given to 0.1 mm
-    assert len(cameras) == 1265
-    assert cameras.crs.startswith('PROJCS["WGS 84 / UTM zone 47N"')
-    assert cameras.notes == cameras.unposed == ()
-    sizes = [lens.pixel_size_mm for lens in cameras.lenses]
-    assert sizes == pytest.approx([23.52 / 6000] * 1265)
-    assert len({lens.focal for lens in cameras.lenses}) == 5
-
-
 @ca502
 def test_all_tie_points_of_the_oblique_block():
     cameras = read(CA502)
-    ties = pix4d.tie_points(Source(CA502), cameras)
+    ties = read_ties(CA502)
+    assert len({lens.focal for lens in cameras.lenses}) == 5
+    assert {lens.pixel_size_mm for lens in cameras.lenses} == {23.52 / 6000}
     assert len(ties.image_xy) == len(ties.views.camera) == 103328
     assert np.isfinite(ties.xyz).all(axis=1).sum() == 11  # control points
     misses = np.concatenate(list(misses_px(cameras, ties)))
@@ -118,47 +98,12 @@ def misses_px(cameras, ties):
             yield np.hypot(*(project(cameras.lenses[i], ray[None]) - ties.image_xy[row]).T)
 
 
-@easyidp
-def test_virtual_points_of_the_projection_matrices():
-    cameras = read(EASYIDP)
-    assert cameras.crs is None
-    assert len(cameras) == 168
-    ideal = [replace(lens, radial=(), tangential=()) for lens in cameras.lenses]
-    cameras = replace(cameras, lenses=tuple(ideal))
-    listed = residuals_px(cameras, check_file(EASYIDP)["observations"])
-    assert listed.max() < 0.02  # the points are given to 0.1 mm, and are 15 m away
-    offset = np.array([368109.0, 3956043.0, 96.0])
-    misses = []
-    for line in (EASYIDP / "pix4d.origin_pmatrix.txt").read_text().splitlines():
-        label, *numbers = line.split()
-        i = cameras.labels.index(label)
-        point = cameras.centres[i] + cameras.rotations[i].T @ [2.0, -3.0, 15.0]
-        u, v, w = np.array(numbers, float).reshape(3, 4) @ [*(point - offset), 1.0]
-        ray = cameras.rotations[i] @ (point - cameras.centres[i])
-        misses.append(project(ideal[i], ray[None])[0] - (u / w, v / w))
-    assert np.sqrt(np.mean(np.square(misses))) < 0.001  # the matrices have six decimals
-
-
-@easyidp
-@lod3
-@ca502
-@pytest.mark.parametrize("sample", [CA502, LOD3, EASYIDP], ids=lambda path: path.name)
-def test_centres_and_views_of_the_samples(sample):
-    cameras = read(sample)
-    for given in check_file(sample)["projection_centres"]:
-        i = row_of(cameras, given["image"])
-        assert cameras.centres[i] == pytest.approx([given[a] for a in "XYZ"], abs=1e-4)
-        assert cameras.rotations[i][2] == pytest.approx(given["view_dir"], abs=1e-6)
-        assert -cameras.rotations[i][1] == pytest.approx(given["up_dir_minus_cam_y"], abs=1e-6)
-
-
 @lod3
 def test_a_wrong_offset_is_noticed_and_the_absolute_table_believed():
     cameras = read(LOD3)
     assert cameras.unposed == ("403_0032_00130203.tif",)  # only relative, and the offset is wrong
-    wrong, repeated = cameras.notes
-    assert "differ by up to 218.28 m and 0.000 degrees" in wrong
-    assert "2 labels occur more than once" in repeated
+    assert notes(cameras) == ["cameras.tables_differ", "cameras.repeated"]
+    assert cameras.notes[0].values["metres"] == pytest.approx(218.28, abs=0.01)
     assert np.ptp(cameras.centres[:, 2]) < 30.0
 
 
@@ -281,7 +226,7 @@ def test_external_table_alone_has_no_frames(tmp_path):
     cameras = read(path)
     assert cameras.lenses is None
     assert cameras.rotations[0] == pytest.approx(DOWN)
-    assert "frames are taken as boundless" in cameras.notes[0]
+    assert notes(cameras) == ["cameras.no_lens"]
 
 
 @pytest.mark.parametrize("where", ["project", "1_initial", "params", "parameters", "external"])
@@ -304,12 +249,6 @@ def test_any_way_into_a_project(tmp_path, where):
     assert cameras.lenses[0].focal == 4000.0
 
 
-def test_a_table_of_another_name_is_known_by_its_content(tmp_path):
-    path = tmp_path / "poses of june.dat"
-    path.write_text(external(("a.jpg", 11, 22, 33, 0, 0, 90)))
-    assert read(path).rotations[0][0] == pytest.approx([0, 1, 0], abs=1e-12)
-
-
 def test_offsets_of_groups(tmp_path):
     parameters = HEADER + block("402_1.tif", (1, 2, 3)) + block("403_1.tif", (1, 2, 3))
     parameters += block("999_1.tif", (1, 2, 3))
@@ -323,7 +262,7 @@ def test_no_offset_is_told(tmp_path):
     path = params(tmp_path, parameters=HEADER + block("a.jpg", (1, 2, 3)))
     cameras = read(path)
     assert cameras.centres.tolist() == [[1, 2, 3]]
-    assert "there is no offset.xyz beside it" in cameras.notes[0]
+    assert notes(cameras) == ["cameras.no_offset"]
 
 
 PROJECT = """<?xml version="1.0" encoding="UTF-8"?>
@@ -375,7 +314,7 @@ GCPS = "GCP label, mx, my, mz, ex, ey, ez, weight, n\nG1, 1, 2, 3, 4, 5, 6, 0.9,
 def test_tie_points(tmp_path, form):
     parameters = HEADER + block("b.jpg", (1, 2, 3)) + block("a.jpg", (1, 2, 3))
     path = params(tmp_path, parameters=parameters, offset="0 0 0", gcps=GCPS, **form)
-    ties = pix4d.tie_points(Source(path), read(path))
+    ties = read_ties(path)
     assert ties.views.start.tolist() == [0, 2, 3]
     assert ties.views.camera.tolist() == [1, 0, 1]
     assert ties.image_xy == pytest.approx(np.array([[0, 0], [3001, 2000], [3500, 2500]]))
@@ -387,78 +326,6 @@ GOOD = {"parameters": HEADER + block("a.jpg", (1, 2, 3)), "offset": "0 0 0"}
 
 
 @pytest.mark.parametrize(
-    ("files", "message"),
-    [
-        ({"parameters": GOOD["parameters"][:-30]}, "parameters.txt: image a.jpg: has 19 numbers"),
-        ({"parameters": GOOD["parameters"] + "b.jpg\n"}, "'b.jpg' should be the name, width"),
-        (
-            {"parameters": GOOD["parameters"].replace("0.3", "zero")},
-            "image a.jpg: .*'zero'.*; the file is damaged",
-        ),
-        ({"parameters": GOOD["parameters"].replace("0.3", "nan")}, "image a.jpg: .* not finite"),
-        ({"parameters": HEADER}, "has a header but no images"),
-        ({"parameters": "fileName imageWidth imageHeight\n1\n"}, "does not name the fields"),
-        (
-            {"parameters": HEADER + block("a.jpg", (1, 2, 3), np.diag([2.0, -1, -1]))},
-            "image a.jpg: the rotation matrix is not orthonormal",
-        ),
-        (
-            {"parameters": HEADER + block("a.jpg", (1, 2, 3), np.diag([1.0, 1, -1]))},
-            "image a.jpg: the rotation matrix mirrors",
-        ),
-        (
-            {"parameters": HEADER + block("a.jpg", (1, 2, 3), k=((0, 0, 1), (0, 0, 1), (0, 0, 1)))},
-            "camera a.jpg: focal length 0",
-        ),
-        ({**GOOD, "offset": "1 2"}, "offset.xyz: '1 2' is not an offset"),
-        ({**GOOD, "offset": ""}, "offset.xyz: is empty"),
-        ({**GOOD, "wkt": "PROJCS[nothing"}, "wkt.prj: the CRS 'PROJCS"),
-        ({**GOOD, "external": external()}, "external_.*: has a header but no images"),
-        ({**GOOD, "external": external(("b.jpg", 1, 2, 3, 0, 0, 0))}, "names none of the images"),
-        ({**GOOD, "external": external(("a.jpg", 1, 2))}, "has 2 numbers instead of 6"),
-        ({**GOOD, "external": external(("a.jpg", 1, 2, 3, 0, 0, "inf"))}, "a.jpg: .*not finite"),
-    ],
-)
-def test_bad_input(tmp_path, files, message):
-    path = params(tmp_path, **files)
-    with pytest.raises(pcfix.InputError, match=message) as caught:
-        read(path)
-    assert str(path) in str(caught.value)
-
-
-def test_several_projects_in_a_folder(tmp_path):
-    folder = params(tmp_path, **GOOD)
-    (folder / "other_calibrated_camera_parameters.txt").write_text(GOOD["parameters"])
-    with pytest.raises(pcfix.InputError, match=r"several projects \(job_, other_\); give one"):
-        read(folder)
-
-
-def test_geographic_table_alone_does_not_suffice(tmp_path):
-    path = tmp_path / "job_calibrated_external_camera_parameters_wgs84.txt"
-    path.write_text("imageName longitude latitude altitude Omega Phi Kappa\na 1 2 3 0 0 0\n")
-    with pytest.raises(pcfix.InputError, match="alone does not suffice"):
-        read(path)
-
-
-@pytest.mark.parametrize(
-    ("form", "message"),
-    [
-        ({}, "no tie points"),
-        ({"bingo": BINGO.replace("-6.0", "x")}, "tp_bingo.txt: .*; the file is damaged"),
-        ({"bingo": BINGO.replace(" H_12.0_8.0", "")}, "lacks its sensor size"),
-        ({"bingo": "a H_12.0_8.0\n7 1\n"}, "'7 1' is not a point"),
-        ({"bingo": "z H_12.0_8.0\n7 1 2\n-99\n"}, "measures nothing in the images"),
-        ({"bingo": BINGO, "gcps": "head\nG1, 1, 2\n"}, "fewer than 7 fields"),
-    ],
-)
-def test_bad_tie_points(tmp_path, form, message):
-    path = params(tmp_path, **GOOD, **form)
-    cameras = read(path)
-    with pytest.raises(pcfix.InputError, match=message):
-        pix4d.tie_points(Source(path), cameras)
-
-
-@pytest.mark.parametrize(
     "data", [b"", b"\x00\xff" * 3000, b"label,x,y,z\na,1,2,3\n", b"PK\x03\x04"]
 )
 def test_other_files_are_not_taken(tmp_path, data):
@@ -466,3 +333,60 @@ def test_other_files_are_not_taken(tmp_path, data):
     path.write_bytes(data)
     assert not pix4d.recognises(Source(path))
     assert not pix4d.recognises(Source(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("files", "code"),
+    [
+        ({"parameters": GOOD["parameters"][:-30]}, "cameras.damaged"),
+        ({"parameters": GOOD["parameters"] + "b.jpg\n"}, "cameras.damaged"),
+        ({"parameters": GOOD["parameters"].replace("0.3", "zero")}, "cameras.damaged"),
+        ({"parameters": HEADER}, "cameras.damaged"),
+        ({"parameters": "fileName imageWidth imageHeight\n1\n"}, "cameras.damaged"),
+        (
+            {"parameters": HEADER + block("a.jpg", (1, 2, 3), np.diag([1.0, 1, -1]))},
+            "cameras.rotation",
+        ),
+        (
+            {"parameters": HEADER + block("a.jpg", (1, 2, 3), k=((0, 0, 1), (0, 0, 1), (0, 0, 1)))},
+            "cameras.lens",
+        ),
+        ({**GOOD, "offset": "1 2"}, "cameras.damaged"),
+        ({**GOOD, "wkt": "PROJCS[nothing"}, "cameras.crs"),
+        ({**GOOD, "external": external()}, "cameras.damaged"),
+        ({**GOOD, "external": external(("b.jpg", 1, 2, 3, 0, 0, 0))}, "cameras.damaged"),
+    ],
+)
+def test_refused(tmp_path, files, code):
+    with refused(code):
+        read(params(tmp_path, **files))
+
+
+def test_folder_of_several_projects(tmp_path):
+    folder = params(tmp_path, **GOOD)
+    (folder / "other_calibrated_camera_parameters.txt").write_text(GOOD["parameters"])
+    with refused("cameras.several_projects", projects=2):
+        read(folder)
+
+
+def test_geographic_table_alone(tmp_path):
+    path = tmp_path / "job_calibrated_external_camera_parameters_wgs84.txt"
+    path.write_text("imageName longitude latitude altitude Omega Phi Kappa\na 1 2 3 0 0 0\n")
+    with refused("cameras.missing_file"):
+        read(path)
+
+
+@pytest.mark.parametrize(
+    ("form", "code"),
+    [
+        ({}, "cameras.no_tie_points"),
+        ({"bingo": BINGO.replace("-6.0", "x")}, "cameras.damaged"),
+        ({"bingo": BINGO.replace(" H_12.0_8.0", "")}, "cameras.damaged"),
+        ({"bingo": "a H_12.0_8.0\n7 1\n"}, "cameras.damaged"),
+        ({"bingo": "z H_12.0_8.0\n7 1 2\n-99\n"}, "cameras.no_tie_points"),
+        ({"bingo": BINGO, "gcps": "head\nG1, 1, 2\n"}, "cameras.damaged"),
+    ],
+)
+def test_tie_points_refused(tmp_path, form, code):
+    with refused(code):
+        read_ties(params(tmp_path, **GOOD, **form))

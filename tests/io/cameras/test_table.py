@@ -1,7 +1,6 @@
 """Poses from CSV tables."""
 
 import csv
-import re
 
 import numpy as np
 import pytest
@@ -10,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 import pcfix
 from pcfix.io.cameras import table
-from pcfix.io.cameras.formats import Source
-from tests.utils.reprojection import check_file, row_of
+from tests.utils.camera_files import notes, read
+from tests.utils.codes import refused, warned
 from tests.utils.shared import needs
 
 RENDERED, rendered = needs("rendered_a")
@@ -52,62 +51,6 @@ def test_yaw_pitch_roll(tmp_path, angles, forward, top, right):
         assert vector == pytest.approx(expected, abs=1e-12)
 
 
-@rendered
-def test_yaw_pitch_roll_agree_with_quaternions_of_the_same_block():
-    cameras = pcfix.read_cameras(RENDERED / "cameras.csv")
-    lines = [
-        line.split()
-        for line in (RENDERED / "colmap/images.txt").read_text().splitlines()
-        if not line.startswith("#")
-    ][::2]
-    offset = np.loadtxt(RENDERED / "offset.txt", comments="#")
-    for fields in lines:
-        i = cameras.labels.index(fields[9])
-        w, *xyz = (float(f) for f in fields[1:5])
-        rotation = Rotation.from_quat([*xyz, w]).as_matrix()
-        centre = -rotation.T @ np.array(fields[5:8], float) + offset
-        assert cameras.centres[i] == pytest.approx(centre, abs=1e-4)  # the CSV has 0.1 mm
-        turn = Rotation.from_matrix(cameras.rotations[i] @ rotation.T).magnitude()
-        assert np.degrees(turn) < 1e-5  # the CSV has 1e-6 degrees
-
-
-@rendered
-def test_tie_points_project_where_they_were_measured():
-    # f and the sensor come from millimetres, the principal point as the centre (it is 6 and 5
-    # px off): 10 px tell a right reading of the angles from a wrong one, which is hundreds off
-    cameras = pcfix.read_cameras(RENDERED / "cameras.csv")
-    text = (RENDERED / "colmap/images.txt").read_text().splitlines()
-    rows = [line for line in text if not line.startswith("#")]
-    offset = np.loadtxt(RENDERED / "offset.txt", comments="#")
-    points = {}
-    for line in (RENDERED / "colmap/points3D.txt").read_text().splitlines():
-        if not line.startswith("#"):
-            fields = line.split()
-            points[int(fields[0])] = np.array(fields[1:4], float) + offset
-    lens = cameras.lenses[0]
-    misses = []
-    for head, tail in zip(rows[::2], rows[1::2], strict=True):
-        i = cameras.labels.index(head.split()[9])
-        seen = np.array(tail.split(), float).reshape(-1, 3)
-        seen = seen[np.isin(seen[:, 2], list(points))]
-        world = np.array([points[int(p)] for p in seen[:, 2]])
-        x, y, z = cameras.rotations[i] @ (world - cameras.centres[i]).T
-        uv = np.column_stack(
-            [lens.focal * x / z + lens.principal_x, lens.focal * y / z + lens.principal_y]
-        )
-        misses.append(np.hypot(*(uv * 1600 / lens.width - seen[:, :2]).T))
-    assert len(np.concatenate(misses)) > 10_000
-    assert np.median(np.concatenate(misses)) < 10.0
-
-
-def test_plain_table_has_no_frames(tmp_path):
-    cameras = pcfix.read_cameras(write(tmp_path, "Label,X,Y,Z\na,1,2,3\nb,4,5,6\n", sensor=None))
-    assert cameras.labels == ("a", "b")
-    assert cameras.centres.tolist() == [[1, 2, 3], [4, 5, 6]]
-    assert cameras.rotations is None
-    assert cameras.lenses is None
-
-
 @pytest.mark.parametrize(
     "text",
     [
@@ -125,7 +68,7 @@ def test_dialects(tmp_path, text):
 
 @river
 def test_river_keeps_cameras_that_share_a_label():
-    with pytest.warns(pcfix.PcfixWarning, match="7 labels occur more than once") as caught:
+    with warned("cameras.repeated") as caught:
         cameras = pcfix.read_cameras(RIVER / "cameras.csv")
     assert len(caught) == 1
     assert len(cameras) == 31
@@ -136,18 +79,10 @@ def test_river_keeps_cameras_that_share_a_label():
 
 def test_exact_copies_count_once(tmp_path):
     text = "label,x,y,z\na,1,2,3\na,1,2,3\na,1,2,4\nb,1,2,3\n"
-    with pytest.warns(pcfix.PcfixWarning, match="1 exact copies are dropped"):
+    with warned("cameras.repeated"):
         cameras = pcfix.read_cameras(write(tmp_path, text, sensor=None))
     assert cameras.labels == ("a", "a", "b")
     assert cameras.centres[:, 2].tolist() == [3, 4, 3]
-
-
-def test_sensor_elsewhere(tmp_path):
-    path = write(tmp_path, "label,x,y,z,yaw,pitch,roll\na,1,2,3,0,0,0\n", sensor=None)
-    sensor = tmp_path / "p4p.csv"
-    sensor.write_text("focal,sensor_x,sensor_y\n8.8,13.2,8.8\n")
-    lens = pcfix.read_cameras(path, sensor).lenses[0]
-    assert lens == pcfix.Lens(8.8, 13.2, 8.8, 6.6, 4.4, unit="mm")
 
 
 # Columns
@@ -155,9 +90,7 @@ def test_sensor_elsewhere(tmp_path):
 
 def plain(tmp_path, text, **options):
     """Return the cameras of a table as this module reads it, with the usual sensor beside it."""
-    path = write(tmp_path, text)
-    assert table.recognises(Source(path))
-    return table.read(Source(path, **options))
+    return read(write(tmp_path, text), **options)
 
 
 @pytest.mark.parametrize(
@@ -181,29 +114,6 @@ def test_spellings(tmp_path, header):
     assert cameras.notes == ()
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "label x y z\na 1 2 3\n",
-        "label   x  y z\n a   1 2    3 \n",
-        "# made by hand\nlabel\tx\ty\tz\n# not this\na\t1\t2\t3\n",
-        "# label, x, y, z\na\t1\t2\t3\n",
-        "#cameras 1\n#name,x,y,z\na,1,2,3\n",
-        "#\n\n# \nlabel,x,y,z\na,1,2,3\n",
-        "'label' 'x' 'y' 'z'\n'a' 1 2 3\n",
-    ],
-)
-def test_more_dialects(tmp_path, text):
-    cameras = plain(tmp_path, text)
-    assert cameras.labels == ("a",)
-    assert cameras.centres.tolist() == [[1, 2, 3]]
-
-
-def test_names_with_spaces_in_a_table_of_spaces(tmp_path):
-    cameras = plain(tmp_path, 'label x y z\n"a b.jpg" 1 2 3\n')
-    assert cameras.labels == ("a b.jpg",)
-
-
 def test_the_column_of_the_plain_name_counts(tmp_path):
     cameras = plain(tmp_path, "label,filename,x,y,z,height,longitude,latitude\na,b,1,2,3,9,7,8\n")
     assert cameras.labels == ("a",)
@@ -224,11 +134,6 @@ def test_degrees(tmp_path, header, crs):
     assert cameras.crs == crs
 
 
-def test_latitude_first(tmp_path):
-    cameras = plain(tmp_path, "image,lat,lon,alt\na,55.25,12.5,90\n")
-    assert cameras.centres.tolist() == [[12.5, 55.25, 90]]
-
-
 @pytest.mark.parametrize(
     ("said", "crs"),
     [
@@ -244,7 +149,7 @@ def test_the_crs_of_a_comment(tmp_path, said, crs):
 def test_a_crs_that_is_not_understood(tmp_path):
     cameras = plain(tmp_path, '# CoordinateSystem: PROJCS["WGS 84" GEOGCS\n#Label,X,Y,Z\na,1,2,3\n')
     assert cameras.crs is None
-    assert "not understood" in cameras.notes[0]
+    assert notes(cameras) == ["cameras.crs_unknown"]
 
 
 # Angles
@@ -313,7 +218,7 @@ GIMBAL = "label,x,y,z,{}\na,1,2,3,10,-90,0\nb,1,2,3,20,-60,0\n"
 
 def test_angles_of_a_gimbal_do_not_pass_as_others(tmp_path):
     text = GIMBAL.format("yaw,pitch,roll")
-    with pytest.raises(pcfix.InputError, match=r"cameras\.csv: .*--angles aircraft"):
+    with refused("cameras.angles"):
         plain(tmp_path, text)
     assert nadir(plain(tmp_path, text, angles="aircraft")) == pytest.approx([0, 30])
     assert nadir(plain(tmp_path, text, angles="yaw-pitch-roll")) == pytest.approx([90, 60])
@@ -336,13 +241,6 @@ def test_the_option_chooses_between_angles_that_are_both_there(tmp_path):
     assert nadir(plain(tmp_path, text, angles="yaw-pitch-roll")) == pytest.approx([20])
 
 
-def test_quaternions_turn_world_to_camera(tmp_path):
-    turn = Rotation.from_euler("XYZ", [170.0, 12.0, 40.0], degrees=True)
-    x, y, z, w = turn.as_quat()
-    cameras = plain(tmp_path, f"label,x,y,z,qw,qx,qy,qz\na,1,2,3,{w},{x},{y},{z}\n")
-    assert cameras.rotations[0] == pytest.approx(turn.as_matrix(), abs=1e-12)
-
-
 @pytest.mark.parametrize("flip", [np.eye(3), np.diag([1.0, -1.0, -1.0])])
 def test_matrices_alone_look_down(tmp_path, flip):
     turn = photogrammetric(0.1, -0.2, 2.0)
@@ -353,33 +251,6 @@ def test_matrices_alone_look_down(tmp_path, flip):
 
 
 # Software
-
-
-@metashape
-def test_metashape_omega_phi_kappa():
-    source = Source(METASHAPE / "trajectory.txt", METASHAPE / "io" / "ioP4P.xml")
-    cameras = table.read(source)
-    expected = check_file(METASHAPE)["projection_centres"]
-    assert len(cameras) == 89
-    assert cameras.notes == ()
-    for truth in expected:
-        i = row_of(cameras, truth["image"])
-        assert cameras.centres[i] == pytest.approx([truth[a] for a in "XYZ"], abs=1e-4)
-        assert cameras.rotations[i][2] == pytest.approx(truth["view_dir"], abs=1e-6)
-        assert -cameras.rotations[i][1] == pytest.approx(truth["up_dir_minus_cam_y"], abs=1e-6)
-    lens = cameras.lenses[0]
-    assert (lens.width, lens.height) == (5472, 3648)
-    assert lens.focal == pytest.approx(3734.78562573314)
-    assert lens.principal_x == pytest.approx(2736 - 18.7767676938948)
-
-
-@metashape
-def test_matrix_and_angles_of_a_flight_agree():
-    path = METASHAPE / "trajectory.txt"
-    both = table.read(Source(path, METASHAPE / "io" / "ioP4P.xml"))
-    matrices = np.loadtxt(path, usecols=range(7, 16)).reshape(-1, 3, 3)
-    flipped = np.diag([1.0, -1.0, -1.0]) @ matrices
-    assert turn_deg(both.rotations, flipped).max() < 1e-9
 
 
 METASHAPE_TABLE = """\
@@ -415,44 +286,7 @@ def test_metashape_sources_alone_are_not_adjusted(tmp_path):
     cameras = plain(tmp_path, text + "a,9.5,50.5,90,0.02,0.04\nb,,,,,\n")
     assert cameras.labels == ("a",)
     assert cameras.unposed == ("b",)
-    assert "not adjusted" in cameras.notes[0]
-
-
-@odm
-def test_odm_omega_phi_kappa(tmp_path):
-    sensor = tmp_path / "sensor.csv"
-    sensor.write_text("focal_px,width_px,height_px\n3648,5472,3648\n")
-    cameras = table.read(Source(ODM / "odm_xyz_opk.csv", sensor))
-    for truth in check_file(ODM)["projection_centres"]:
-        i = row_of(cameras, truth["image"])
-        assert cameras.centres[i] == pytest.approx([truth[a] for a in "XYZ"], abs=1e-3)
-        assert cameras.rotations[i][2] == pytest.approx(truth["view_dir"], abs=2e-5)
-        assert -cameras.rotations[i][1] == pytest.approx(truth["up_dir_minus_cam_y"], abs=2e-5)
-
-
-@odm
-def test_odm_roll_pitch_yaw_is_zero_straight_down(tmp_path):
-    # navigation, not adjusted: 4 degrees tell the two conventions apart, which are 60 off
-    sensor = tmp_path / "sensor.csv"
-    sensor.write_text("focal_px,width_px,height_px\n3648,5472,3648\n")
-    cameras = table.read(Source(ODM / "odm_lla_rpy.csv", sensor))
-    assert cameras.crs == "EPSG:4326"
-    for truth in check_file(ODM)["projection_centres"]:
-        i = row_of(cameras, truth["image"])
-        apart = np.arccos(cameras.rotations[i][2] @ truth["view_dir"])
-        assert np.degrees(apart) < 4.0
-
-
-@pix4d
-def test_pix4d_external_parameters_can_be_read_as_a_table(tmp_path):
-    path = next(PIX4D.glob("*external_camera_parameters.txt"))
-    sensor = tmp_path / "sensor.csv"
-    sensor.write_text("focal,sensor_x,sensor_y\n35,36,24\n")
-    cameras = table.read(Source(path, sensor))
-    for truth in check_file(PIX4D.parent)["projection_centres"]:
-        i = row_of(cameras, truth["image"])
-        assert cameras.centres[i] == pytest.approx([truth[a] for a in "XYZ"], abs=1e-3)
-        assert cameras.rotations[i][2] == pytest.approx(truth["view_dir"], abs=1e-5)
+    assert notes(cameras) == ["cameras.not_adjusted"]
 
 
 RC = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n"
@@ -489,12 +323,6 @@ def test_realitycapture_lens(tmp_path):
     assert cameras.lenses[2].focal == pytest.approx(2880.0)
 
 
-def test_realitycapture_takes_the_shape_from_any_sensor(tmp_path):
-    cameras = plain(tmp_path, RC + "a,1,2,3,0,0,0,24,0,0,0,0,0,0,0,0\n")
-    lens = cameras.lenses[0]
-    assert (lens.focal, lens.width, lens.height) == pytest.approx((8.8, 13.2, 8.8))
-
-
 # Sensors
 
 
@@ -506,31 +334,6 @@ def test_a_sensor_in_pixels_has_the_order_of_opencv(tmp_path):
     assert table.read_sensor(sensor) == pcfix.Lens(
         3000, 4000, 3000, 2010, 1490, radial=(0.1, 0.2, 0.5), tangential=(0.4, 0.3)
     )
-
-
-def test_a_sensor_in_pixels_without_the_rest(tmp_path):
-    sensor = tmp_path / "sensor.csv"
-    sensor.write_text("focal_px,width_px,height_px\n3000,4000,3000\n")
-    lens = table.read_sensor(sensor)
-    assert (lens.principal_x, lens.principal_y) == (2000, 1500)
-    assert lens.denominator == ()
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("focal_px,width_px,height_px,cx,cy\n3000,4000,3000,10,-5\n", "upper left corner"),
-        ("focal_px,width_px,height_px\n0,4000,3000\n", "must be positive"),
-        ("focal_px,width_px,height_px\n3000,4000,3000\n3000,4000,3000\n", "one row"),
-        ("focal_px,width_px,height_px,k1\n3000,4000,3000,x\n", "column k1"),
-    ],
-)
-def test_sensors_in_pixels_that_are_not_right(tmp_path, text, message):
-    sensor = tmp_path / "lens.csv"
-    sensor.write_text(text)
-    with pytest.raises(pcfix.InputError, match=message) as refusal:
-        table.read_sensor(sensor)
-    assert "lens.csv" in str(refusal.value)
 
 
 # GNSS
@@ -559,13 +362,12 @@ def test_geo_txt(tmp_path):
 def test_geo_txt_as_cameras(tmp_path):
     path = tmp_path / "geo.txt"
     path.write_text("EPSG:4326\na.jpg -91.99 46.84 198.6 0 0 0\nb.jpg -91.98 46.84\n")
-    assert table.recognises(Source(path))
-    cameras = table.read(Source(path))
+    cameras = read(path)
     assert cameras.centres.tolist() == [[-91.99, 46.84, 198.6]]
     assert cameras.unposed == ("b.jpg",)
     assert cameras.rotations is None
     assert cameras.crs == "EPSG:4326"
-    assert "not adjusted" in cameras.notes[0]
+    assert notes(cameras) == ["cameras.not_adjusted"]
 
 
 EXIFTOOL = (
@@ -586,29 +388,6 @@ def test_exiftool(tmp_path):
     assert np.isnan(gnss.xyz[2]).all()
 
 
-def test_exiftool_with_the_hemisphere_apart(tmp_path):
-    text = (
-        "SourceFile,GPSLatitude,GPSLatitudeRef,GPSLongitude,GPSLongitudeRef,GPSAltitude\n"
-        "C:\\day\\a.JPG,41.5,South,2.5,W,12\n"
-    )
-    labels, gnss = gnss_of(write(tmp_path, text))
-    assert labels == ("a.JPG",)
-    assert gnss.xyz.tolist() == [[-2.5, -41.5, 12]]
-
-
-def test_exiftool_as_cameras(tmp_path):
-    cameras = plain(tmp_path, EXIFTOOL)
-    assert len(cameras) == 2
-    assert cameras.unposed == ("c.JPG",)
-    assert "not adjusted" in cameras.notes[0]
-
-
-def test_gnss_of_a_metashape_reference(tmp_path):
-    labels, gnss = gnss_of(write(tmp_path, METASHAPE_TABLE))
-    assert labels == ("a", "b", "c", "d")
-    assert gnss.xyz[[0, 2], 0].tolist() == [500001, 500021]
-
-
 @pytest.mark.parametrize("text", ["#Label,X_est,Y_est,Z_est\na,1,2,3\n", "EPSG:4326\na.jpg 1 2\n"])
 def test_no_gnss_at_all(tmp_path, text):
     _, gnss = gnss_of(write(tmp_path, text))
@@ -620,56 +399,48 @@ def test_no_gnss_at_all(tmp_path, text):
 ANGLED = "label,x,y,z,omega,phi,kappa\n"
 MATRIX = "label,x,y,z," + ",".join(f"r{i}{j}" for i in "123" for j in "123")
 REFUSED = {
-    "two names for one thing": ("label,easting,east,y,z\na,1,1,2,3\n", r"line 1: .*easting, east"),
-    "one name twice": ("label,x,x,y,z\na,1,1,2,3\n", r"line 1: .*x, x"),
-    "feet": ("label,x[ft],y[ft],z[ft]\na,1,2,3\n", r"column x is in 'ft'"),
-    "mils": ("label,x,y,z,omega[mil],phi,kappa\na,1,2,3,0,0,0\n", r"column omega is in 'mil'"),
-    "no label": ("longitude,latitude,altitude\n1,2,3\n", r"label missing"),
-    "no height": ("label,lon,lat\na,1,2\n", r"line 1 .*z missing"),
-    "an empty label": ("label,x,y,z\na,1,2,3\n,1,2,3\n", r"line 3: the image has no name"),
-    "no number": ("label,x,y,z\na.jpg,1,two,3\n", r"line 2 \(image a.jpg\), column y: 'two'"),
-    "nan": (ANGLED + "a.jpg,1,2,3,0,nan,0\n", r"line 2 \(image a.jpg\), column phi: 'nan'"),
-    "latitude": ("label,lon,lat,alt\na,1,2,3\nb,55,512,3\n", r"line 3 \(image b\): .*latitude 512"),
+    "two names for one thing": ("label,easting,east,y,z\na,1,1,2,3\n", "table.columns_alike"),
+    "one name twice": ("label,x,x,y,z\na,1,1,2,3\n", "table.columns_alike"),
+    "feet": ("label,x[ft],y[ft],z[ft]\na,1,2,3\n", "table.unit"),
+    "mils": ("label,x,y,z,omega[mil],phi,kappa\na,1,2,3,0,0,0\n", "table.unit"),
+    "no label": ("longitude,latitude,altitude\n1,2,3\n", "table.column_missing"),
+    "no height": ("label,lon,lat\na,1,2\n", "table.column_missing"),
+    "no number": ("label,x,y,z\na.jpg,1,two,3\n", "table.number"),
+    "nan": (ANGLED + "a.jpg,1,2,3,0,nan,0\n", "table.number"),
+    "latitude": ("label,lon,lat,alt\na,1,2,3\nb,55,512,3\n", "cameras.degrees"),
     "metres as degrees": (
         "# crs: EPSG:4326\n#Label,X,Y,Z\na,500000,5600000,3\n",
-        r"line 3 \(image a\): longitude 500000",
+        "cameras.degrees",
     ),
-    "two angles": ("label,x,y,z,omega,phi\na,1,2,3,0,0\n", r"has omega, phi but lacks kappa"),
-    "alpha, nu": ("label,x,y,z,alpha,nu,kappa\na,1,2,3,0,0,0\n", r"lacks omega, phi|alpha, nu"),
-    "phi first": ("label,x,y,z,phi,omega,kappa\na,1,2,3,0,0,0\n", r"--angles omega-phi-kappa"),
-    "RealityCapture's omega": ("#name,x,y,z,omega,phi,kappa\na,1,2,3,0,0,0\n", r"RealityCapture"),
-    "a translation": ("label,qw,qx,qy,qz,tx,ty,tz\na,1,0,0,0,1,2,3\n", r"tx, ty, tz.*x, y, z"),
-    "a quaternion": (
-        "label,x,y,z,qw,qx,qy,qz\na.jpg,1,2,3,1,1,0,0\n",
-        r"image a.jpg: .*length 1.41",
-    ),
-    "a mirror": (MATRIX + "\na.jpg,1,2,3,1,0,0,0,1,0,0,0,-1\n", r"image a.jpg: .*mirrors"),
-    "a stretch": (MATRIX + "\na.jpg,1,2,3,2,0,0,0,1,0,0,0,1\n", r"image a.jpg: .*orthonormal"),
+    "two angles": ("label,x,y,z,omega,phi\na,1,2,3,0,0\n", "table.column_missing"),
+    "alpha, nu": ("label,x,y,z,alpha,nu,kappa\na,1,2,3,0,0,0\n", "table.column_missing"),
+    "phi first": ("label,x,y,z,phi,omega,kappa\na,1,2,3,0,0,0\n", "cameras.angles"),
+    "RealityCapture's omega": ("#name,x,y,z,omega,phi,kappa\na,1,2,3,0,0,0\n", "cameras.angles"),
+    "a translation": ("label,qw,qx,qy,qz,tx,ty,tz\na,1,0,0,0,1,2,3\n", "table.translations"),
+    "a quaternion": ("label,x,y,z,qw,qx,qy,qz\na.jpg,1,2,3,1,1,0,0\n", "cameras.rotation"),
+    "a mirror": (MATRIX + "\na.jpg,1,2,3,1,0,0,0,1,0,0,0,-1\n", "cameras.rotation"),
+    "a stretch": (MATRIX + "\na.jpg,1,2,3,2,0,0,0,1,0,0,0,1\n", "cameras.rotation"),
     "two sorts of axes": (
         MATRIX + "\na,1,2,3,1,0,0,0,-1,0,0,0,-1\nb,1,2,3,1,0,0,0,1,0,0,0,1\n",
-        r"line 3 \(image b\): r33",
+        "cameras.angles",
     ),
     "matrix against angles": (
         MATRIX + ",omega,phi,kappa\na.jpg,1,2,3,1,0,0,0,1,0,0,0,1,0,1,0\n",
-        r"line 2 \(image a.jpg\): .*1 degrees apart",
+        "cameras.angles_differ",
     ),
-    "nothing adjusted": (
-        "#Label,X,Y,Z,X_est,Y_est,Z_est\na,1,2,3,,,\n",
-        r"no image has a position",
-    ),
+    "nothing adjusted": ("#Label,X,Y,Z,X_est,Y_est,Z_est\na,1,2,3,,,\n", "cameras.no_pose"),
 }
 
 
 @pytest.mark.parametrize("case", REFUSED)
 def test_tables_that_are_not_right(tmp_path, case):
     text, message = REFUSED[case]
-    with pytest.raises(pcfix.InputError, match=message) as refusal:
+    with refused(message):
         plain(tmp_path, text)
-    assert "cameras.csv" in str(refusal.value)
 
 
 def test_an_option_that_the_table_cannot_fill(tmp_path):
-    with pytest.raises(pcfix.InputError, match=re.escape("--angles aircraft needs")):
+    with refused("table.column_missing"):
         plain(tmp_path, ANGLED + "a,1,2,3,0,0,0\n", angles="aircraft")
 
 
@@ -681,29 +452,8 @@ def test_the_option_settles_the_order_of_the_turns(tmp_path):
 @pytest.mark.parametrize("text", [ANGLED, RC])
 def test_angles_need_a_sensor(tmp_path, text):
     row = "a,1,2,3" + ",0" * (text.count(",") - 3)
-    with pytest.raises(pcfix.InputError, match=r"cameras\.csv: .*--sensor"):
-        table.read(Source(write(tmp_path, text + row, sensor=None)))
-
-
-def test_geo_txt_with_a_short_row(tmp_path):
-    (tmp_path / "geo.txt").write_text("EPSG:4326\na.jpg 1 2 3\nb.jpg 1\n")
-    with pytest.raises(pcfix.InputError, match=r"geo\.txt: line 3 has 2 fields"):
-        gnss_of(tmp_path / "geo.txt")
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_damage_is_refused_or_read_but_never_an_error_of_python(tmp_path, seed):
-    random = np.random.default_rng(seed)
-    data = bytearray(METASHAPE_TABLE.encode())
-    for _ in range(1 + seed):
-        data[random.integers(len(data))] = random.integers(256)
-    path = write(tmp_path, bytes(data[: random.integers(len(data))]))
-    try:
-        cameras = table.read(Source(path))
-    except pcfix.InputError as refusal:
-        assert "cameras.csv" in str(refusal)
-    else:
-        assert np.isfinite(cameras.centres).all()
+    with refused("cameras.sensor_missing"):
+        read(write(tmp_path, text + row, sensor=None))
 
 
 @pytest.mark.parametrize("flavour", ["WKT1_ESRI", "WKT1_GDAL", "WKT2_2019"])
@@ -722,5 +472,5 @@ def test_a_projection_that_is_none_is_noted(tmp_path):
     path = tmp_path / "cameras.csv"
     path.write_text("label,x,y,z\na,500000,5200000,90\n")
     path.with_suffix(".prj").write_bytes(b"$PROJECT 6.0.0\n\xff")
-    with pytest.warns(pcfix.PcfixWarning, match="is not understood"):
+    with warned("cameras.crs_unknown"):
         assert pcfix.read_cameras(path).crs is None

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from pyproj import CRS
 
-from pcfix.errors import InputError, SettingError
+from pcfix.errors import SettingError
 from pcfix.io.cameras import read_cameras
 from pcfix.io.cameras.table.sensor import write_table
 from pcfix.lens.imaging import project
 from pcfix.model import Lens
 from tests.utils.blocks import PLAIN, small_block
+from tests.utils.codes import refused
 
 FRAME = (1600.0, 1200.0, 810.0, 590.0)
 OPENCV = Lens(
@@ -43,30 +44,30 @@ def test_there_and_back(tmp_path, lenses, crs):
 @pytest.mark.parametrize(
     ("lenses", "word"),
     [
-        ((FOUR,), "a table of poses cannot hold the lens"),
-        ((replace(PLAIN, b1=0.1),), "one focal length"),
-        ((replace(PLAIN, projection="equidistant"),), r"\(equidistant\)"),
-        ((replace(FILM, radial=(0.1,)),), "cannot hold"),
-        ((PLAIN, OPENCV), "cannot hold"),
-        ((PLAIN, replace(PLAIN, width=1700.0)), "several lenses only in pixels and of one frame"),
-        ((FILM, replace(FILM, focal=3.7)), "several lenses only in pixels"),
+        ((FOUR,), "output.lens"),
+        ((replace(PLAIN, b1=0.1),), "output.lens"),
+        ((replace(PLAIN, projection="equidistant"),), "output.lens"),
+        ((replace(FILM, radial=(0.1,)),), "output.lens"),
+        ((PLAIN, OPENCV), "output.lens"),
+        ((PLAIN, replace(PLAIN, width=1700.0)), "output.lens"),
+        ((FILM, replace(FILM, focal=3.7)), "output.lens"),
     ],
 )
 def test_lenses_that_a_table_cannot_hold(tmp_path, lenses, word):
-    with pytest.raises(InputError, match=word):
+    with refused(word):
         write_table(tmp_path / "new", small_block(lenses))
     assert not (tmp_path / "new").exists()
 
 
 def test_blocks_that_a_table_cannot_hold(tmp_path):
-    with pytest.raises(InputError, match="needs rotations and lenses"):
+    with refused("output.no_lenses"):
         write_table(tmp_path, replace(small_block(), lenses=None))
-    with pytest.raises(InputError, match="bring the cameras to a projected CRS"):
+    with refused("output.crs"):
         write_table(tmp_path, small_block(crs="ENU:1,2,3"))
 
 
 def test_nothing_is_replaced_unasked(tmp_path):
     (tmp_path / "sensor.csv").write_text("mine")
-    with pytest.raises(SettingError, match=r"sensor.csv: the output exists"):
+    with pytest.raises(SettingError):
         write_table(tmp_path, small_block())
     assert not (tmp_path / "cameras.csv").exists()

@@ -7,7 +7,7 @@ pose of every image in rigs also. Definition: https://colmap.github.io/format.ht
 A pose is a unit quaternion, scalar first, and a translation, both world to camera, in OpenCV
 axes: ``x_cam = R x + t``, so the projection centre is ``-R' t``. Pixels start at the upper left
 corner of the upper left pixel. The world is that of the alignment, if there was one, often minus an
-offset; the files do not tell, so the CRS is None, unless ``georeference.json`` of pcfix lies beside
+offset; the files name no CRS, so it is None, unless ``georeference.json`` of pcfix lies beside
 them (``crs``, text or null, ``offset_m``, three numbers, ``written_by``): its offset is then added
 to centres and tie points, and its CRS is theirs. `files` has the lenses, `writing` writes models.
 
@@ -28,19 +28,19 @@ import json
 import re
 import sqlite3
 from collections.abc import Sequence
-from contextlib import closing, suppress
+from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.errors import InputError, NoTiePointsError
+from pcfix.errors import PcfixWarning
 from pcfix.io.cameras import checks, tracks
 from pcfix.io.cameras.colmap import files
 from pcfix.io.cameras.formats import Source
 from pcfix.io.crs import is_topocentric
 from pcfix.io.files import read_json
-from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, TiePoints
+from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, TiePoints
 
 _PART = re.compile(r"(cameras|images|points3D|rigs|frames)\.(bin|txt)")
 _CAMERA_LINE = re.compile(r"^\s*\d+\s+[A-Z][A-Z_0-9]+(\s+\S+){2}", re.MULTILINE)
@@ -60,40 +60,36 @@ class Model(NamedTuple):
 
 def recognises(source: Source) -> bool:
     """Whether it is a model, one of its files, or a folder above that has one."""
-    with suppress(OSError):
-        return _find(source.path) is not None
-    return False
+    return _find(source.path) is not None
 
 
 def read(source: Source) -> Cameras:
     """Read the poses of registered images and their lenses."""
     model = _model(source)
-    cameras = files.read_cameras(model.part("cameras"))
-    images: list[files.Image] = files.read_images(model.part("images"), points=False)
+    listed, path = model.part("cameras"), model.part("images")
+    cameras = files.read_cameras(listed)
+    images = files.read_images(path, points=False)
     posed = [image for image in images if image.posed]
-    path = model.part("images")
     if not posed:
-        raise InputError(f"{path}: has no image with a pose; give the model of another folder.")
+        raise checks.no_pose(path)
     poses = np.array([image.pose for image in posed])
-    rotations = np.array([checks.quaternion(path, i.name, np.array(i.pose[:4])) for i in posed])
     labels = tuple(image.name for image in posed)
+    rotations = checks.quaternions(path, labels, poses[:, :4])
+    used = dict.fromkeys(image.camera for image in posed)
+    lenses = {number: files.lens(listed, number, cameras[number]) for number in used}
     gnss, notes = read_priors(model.folder, labels)
     place = read_place(model.folder)
     if place is not None and gnss is not None and gnss.crs is None:
         gnss = None  # of the model that the database found, which this one may not be
     centres = -np.einsum("kji,kj->ki", rotations, poses[:, 4:])
-    others = (
-        f"{model.folder}: is the largest of {model.others + 1} models of the block, which are not"
-        " tied to each other; the images of the others are left out."
-    )
-    notes = (*incomplete_notes(model), *notes)
+    several = checks.several(model.folder, model.others + 1, len(posed))
     return Cameras(
         labels=labels,
         centres=centres if place is None else centres + place.offset_m,
         rotations=rotations,
-        lenses=_lenses(model, cameras, posed),
+        lenses=tuple(lenses[image.camera] for image in posed),
         crs=None if place is None else place.crs,
-        notes=(others, *notes) if model.others else notes,
+        notes=(several, *notes) if model.others else notes,
         gnss=gnss,
         unposed=tuple(image.name for image in images if not image.posed),
         source="COLMAP",
@@ -105,13 +101,11 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     model = _model(source)
     path = model.part("points3D")
     if not path.is_file():
-        raise NoTiePointsError(f"{path}: there is no such file, so there are no tie points.")
+        raise tracks.no_tie_points(path, "there is no such file")
     points = files.read_points(path)
     images = [i for i in files.read_images(model.part("images"), points=True) if i.posed]
     if not len(points.identifiers) or not any(len(image.points) for image in images):
-        raise NoTiePointsError(
-            f"{path}: the model has no points that its images saw; no tie points."
-        )
+        raise tracks.no_tie_points(path, "the model has no points that its images saw")
     seen = np.concatenate([image.points for image in images])
     camera = np.repeat(np.arange(len(cameras)), [len(image.points) for image in images])
     row = _rows_of(points.identifiers, seen)
@@ -132,25 +126,10 @@ def _rows_of(identifiers: IntArray, wanted: IntArray) -> IntArray:
     return np.where(identifiers[row] == wanted, row, -1)
 
 
-def _lenses(
-    model: Model, cameras: dict[int, files.Camera], images: list[files.Image]
-) -> tuple[Lens, ...]:
-    for image in images:
-        if image.camera not in cameras:
-            raise InputError(
-                f"{model.part('images')}: image {image.name}: its camera {image.camera} is not in"
-                f" {model.part('cameras').name}; export the model again."
-            )
-    path = model.part("cameras")
-    used = dict.fromkeys(image.camera for image in images)
-    found = {number: files.lens(path, number, cameras[number]) for number in used}
-    return tuple(found[image.camera] for image in images)
-
-
 def _model(source: Source) -> Model:
     found = _find(source.path)
     if found is None:
-        raise InputError(f"{source.path}: has no COLMAP model.")
+        raise checks.missing(source.path / "cameras.bin")
     return found
 
 
@@ -184,23 +163,6 @@ def _in_folder(folder: Path, *suffixes: str) -> Model | None:
     return None
 
 
-def incomplete_notes(model: Model) -> tuple[str, ...]:
-    """Return a sentence on each model beside the one that is read of which files are missing."""
-    folder, notes = model.folder, []
-    beside = folder.parent.iterdir() if folder.name.isdecimal() else ()
-    for other in (folder, *sorted(p for p in beside if p.name.isdecimal() and p.is_dir())):
-        names = {path.name for path in other.iterdir()}
-        for suffix in ("bin", "txt"):
-            parts = [f"{part}.{suffix}" for part in ("cameras", "images", "points3D")]
-            missing = [part for part in parts if part not in names]
-            if 0 < len(missing) < len(parts) and (other, suffix) != (folder, model.suffix):
-                notes.append(
-                    f"{other}: a model beside the one that is read lacks {' and '.join(missing)}:"
-                    " it is left out; export it again if it belongs to the block."
-                )
-    return tuple(notes)
-
-
 FILE = "georeference.json"
 WRITER = "pcfix"
 
@@ -217,19 +179,13 @@ def read_place(folder: Path) -> Place | None:
     path = folder / FILE
     if not path.is_file():
         return None
-    try:
+    with checks.reading(path):
         found = read_json(path)
         if not isinstance(found, dict) or found.get("written_by") != WRITER:
             return None
-        offset = np.array(found["offset_m"], np.float64)
-        crs = found["crs"]
-    except (OSError, ValueError, TypeError, LookupError) as error:
-        raise InputError(f"{path}: is damaged ({error}); write the model again.") from error
-    if offset.shape != (3,) or not np.isfinite(offset).all() or not isinstance(crs, str | None):
-        raise InputError(
-            f"{path}: needs offset_m, three numbers, and crs, a text or null; write the model"
-            " again."
-        )
+        offset, crs = checks.triple(found["offset_m"]), found["crs"]
+        if not np.isfinite(offset).all() or not isinstance(crs, str | None):
+            raise checks.damaged(path, "it needs offset_m, three numbers, and crs")
     return Place(offset, crs if crs is None or is_topocentric(crs) else checks.crs(path, crs))
 
 
@@ -245,21 +201,24 @@ _WGS84 = 0
 _WGS84_CRS = "EPSG:4979"
 
 
-def read_priors(model: Path, labels: Sequence[str]) -> tuple[GnssPositions | None, tuple[str, ...]]:
+def read_priors(
+    model: Path, labels: Sequence[str]
+) -> tuple[GnssPositions | None, tuple[PcfixWarning, ...]]:
     """Return the priors of images from the database beside or above a model, and notes on it."""
     places = (model, *model.resolve().parents[:_FOLDERS_ABOVE])
     path = next((p / _DATABASE for p in places if (p / _DATABASE).is_file()), None)
     if path is None:
         return None, ()
     try:
-        rows = _rows(path)
+        rows, why = _rows(path), ""
     except sqlite3.Error as error:
-        return None, (f"{path}: the pose priors cannot be read ({error}); they are left out.",)
+        rows, why = [], f"cannot be read ({error})"
     row_of = {label: i for i, label in enumerate(labels)}
     found = [(row_of[name], *row) for name, *row in rows if name in row_of]
     systems = {system for *_, system in found}
-    if len(systems) > 1:
-        return None, (f"{path}: the pose priors are in several systems; they are left out.",)
+    if why or len(systems) > 1:
+        sentence = f"{path}: its pose priors {why or 'are in several systems'}. They are left out."
+        return None, (PcfixWarning("cameras.priors_left_out", sentence, path=path),)
     xyz, sigma = np.full((2, len(labels), 3), np.nan)
     for i, position, covariance, _ in found:
         xyz[i] = np.frombuffer(position, "<f8")

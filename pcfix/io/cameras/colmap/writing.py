@@ -10,12 +10,10 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.errors import InputError
-from pcfix.io.cameras.checks import is_same_lens, write_new
+from pcfix.io.cameras.checks import bad_label, is_same_lens, lens_not_held, needs_lenses, write_new
 from pcfix.io.cameras.colmap import FILE, place_text
 from pcfix.io.cameras.colmap.files import BY_NAME, MODELS, OBSERVATION, SHAPES, Camera, lens
 from pcfix.io.cameras.tracks import NO_TIE_POINTS, are_seen
@@ -30,28 +28,6 @@ PREFERRED = (
 """The simplest first; those that only new versions of COLMAP know come last."""
 GREY = (128, 128, 128)
 ROUND_M = 100.0
-
-
-class Block(NamedTuple):
-    """What is written: all that the files have, in their order.
-
-    camera_of : row of `cameras` of each image.
-    quaternions : array, shape (k, 4), the scalar first.
-    translations : array, shape (k, 3).
-    points : array, shape (m, 3), minus the offset.
-    xy, point : of the image points, (o, 2) and (o,), image by image.
-    image_start : array, shape (k + 1,), where each image's begin.
-    """
-
-    labels: tuple[str, ...]
-    cameras: list[Camera]
-    camera_of: IntArray
-    quaternions: FloatArray
-    translations: FloatArray
-    points: FloatArray
-    xy: FloatArray
-    point: IntArray
-    image_start: IntArray
 
 
 def write_colmap(
@@ -85,46 +61,32 @@ def write_colmap(
         If a file exists.
     """
     target = Path(folder)
+    if cameras.rotations is None or cameras.lenses is None:
+        raise needs_lenses(target)
+    for label in cameras.labels:  # a file would cut it off
+        if not label.strip() or "\0" in label or "\n" in label or label != label.strip():
+            raise bad_label(target, label)
     middle = np.median(cameras.centres, axis=0)
     middle[2] = 0.0  # heights are small, and easier to read as they are
     offset = np.asarray(np.round(middle / ROUND_M) * ROUND_M if offset_m is None else offset_m)
-    block = _block(target, cameras, tie_points or NO_TIE_POINTS, offset)
-    for label in cameras.labels:  # a file would cut it off
-        if not label.strip() or "\0" in label or "\n" in label or label != label.strip():
-            raise InputError(f"{target}: the image name {label!r} has no place in COLMAP's files.")
+    distinct = list(dict.fromkeys(cameras.lenses))
+    number = {lens: i for i, lens in enumerate(distinct, start=1)}
+    ties = tie_points or NO_TIE_POINTS
+    kept, counts = are_seen(ties), np.diff(ties.views.start)
+    of_kept = np.repeat(kept, counts)
+    camera = ties.views.camera[of_kept]
+    order = np.argsort(camera, kind="stable")  # COLMAP lists the image points image by image
+    seen = np.empty(len(camera), OBSERVATION)
+    seen["xy"] = ties.image_xy[of_kept][order]
+    seen["point"] = np.repeat(np.cumsum(kept), counts)[of_kept][order]
+    start = np.concatenate([[0], np.cumsum(np.bincount(camera, minlength=len(cameras)))])
     contents = {
-        "cameras.bin": _cameras(block),
-        "images.bin": _images(block),
-        "points3D.bin": _points(block),
+        "cameras.bin": _cameras([colmap_camera(target, lens) for lens in distinct]),
+        "images.bin": _images(cameras, offset, [number[k] for k in cameras.lenses], seen, start),
+        "points3D.bin": _points(ties.xyz[kept] - offset, seen["point"], start),
         FILE: place_text(offset, crs or cameras.crs).encode(),
     }
     write_new(target, contents)
-
-
-def _block(target: Path, cameras: Cameras, tie_points: TiePoints, offset: FloatArray) -> Block:
-    from scipy.spatial.transform import Rotation
-
-    if cameras.rotations is None or cameras.lenses is None:
-        raise InputError(f"{target}: a COLMAP model needs rotations and lenses of all images.")
-    distinct = list(dict.fromkeys(cameras.lenses))
-    number = {each: i for i, each in enumerate(distinct)}
-    turns = Rotation.from_matrix(cameras.rotations).as_quat(canonical=True)
-    kept, counts = are_seen(tie_points), np.diff(tie_points.views.start)
-    seen = np.repeat(kept, counts)
-    camera = tie_points.views.camera[seen]
-    order = np.argsort(camera, kind="stable")
-    image_counts = np.bincount(camera, minlength=len(cameras))
-    return Block(
-        labels=cameras.labels,
-        cameras=[colmap_camera(target, each) for each in distinct],
-        camera_of=np.array([number[each] for each in cameras.lenses]),
-        quaternions=np.roll(turns, 1, axis=1),
-        translations=-np.einsum("kij,kj->ki", cameras.rotations, cameras.centres - offset),
-        points=tie_points.xyz[kept] - offset,
-        xy=tie_points.image_xy[seen][order],
-        point=np.repeat(np.cumsum(kept) - 1, counts)[seen][order],
-        image_start=np.concatenate([[0], np.cumsum(image_counts)]),
-    )
 
 
 def colmap_camera(path: Path, given: Lens) -> Camera:
@@ -140,10 +102,7 @@ def colmap_camera(path: Path, given: Lens) -> Camera:
             camera = Camera(model, given.width, given.height, numbers)
             if is_same_lens(lens(path, 1, camera), given):
                 return camera
-    raise InputError(
-        f"{path}: COLMAP has no camera model that holds the lens {given.sensor or 'of the images'}"
-        f" ({_what(given)}) exactly, so no COLMAP model is written; take another form."
-    )
+    raise lens_not_held(path, given)
 
 
 def _values(given: Lens) -> dict[str, float]:
@@ -160,53 +119,43 @@ def _values(given: Lens) -> dict[str, float]:
     return values | dict(zip(SHAPES.get(given.projection, ()), given.shape, strict=False))
 
 
-def _what(given: Lens) -> str:
-    """Return in words what a lens has."""
-    parts = {
-        f"{given.projection} in {given.unit}": True,
-        f"{len(given.radial)} radial": given.radial,
-        f"{len(given.denominator)} rational": given.denominator,
-        f"{len(given.tangential)} tangential": given.tangential,
-        "thin prism": any(given.thin_prism),
-        "skew": given.b2 or given.b3,
-        "inverse": given.inverse,
-    }
-    return ", ".join(text for text, there in parts.items() if there)
-
-
-def _cameras(block: Block) -> bytes:
-    parts = [struct.pack("<Q", len(block.cameras))]
-    for i, camera in enumerate(block.cameras, start=1):
+def _cameras(cameras: list[Camera]) -> bytes:
+    parts = [struct.pack("<Q", len(cameras))]
+    for i, camera in enumerate(cameras, start=1):
         number = MODELS.index(camera.model)
         parts.append(struct.pack("<IiQQ", i, number, int(camera.width), int(camera.height)))
         parts.append(np.array(camera.values, "<f8").tobytes())
     return b"".join(parts)
 
 
-def _images(block: Block) -> bytes:
-    seen = np.empty(len(block.point), OBSERVATION)
-    seen["xy"], seen["point"] = block.xy, block.point + 1
-    parts = [struct.pack("<Q", len(block.labels))]
-    for i, label in enumerate(block.labels):
-        first, last = block.image_start[i : i + 2]
-        pose = (*block.quaternions[i], *block.translations[i])
-        parts.append(struct.pack("<I7dI", i + 1, *pose, block.camera_of[i] + 1))
+def _images(
+    cameras: Cameras, offset: FloatArray, numbers: list[int], seen: np.ndarray, start: IntArray
+) -> bytes:
+    """Return the poses, and the image points `seen` that begin at `start` for each image."""
+    from scipy.spatial.transform import Rotation
+
+    rotations = np.asarray(cameras.rotations)
+    turns = np.roll(Rotation.from_matrix(rotations).as_quat(canonical=True), 1, axis=1)
+    shifts = -np.einsum("kij,kj->ki", rotations, cameras.centres - offset)
+    parts = [struct.pack("<Q", len(cameras))]
+    for i, (label, number) in enumerate(zip(cameras.labels, numbers, strict=True)):
+        first, last = start[i : i + 2]
+        parts.append(struct.pack("<I7dI", i + 1, *turns[i], *shifts[i], number))
         parts.append(label.encode() + b"\0" + struct.pack("<Q", last - first))
         parts.append(seen[first:last].tobytes())
     return b"".join(parts)
 
 
-def _points(block: Block) -> bytes:
+def _points(xyz: FloatArray, point: IntArray, image_start: IntArray) -> bytes:
     """Return the points, each with image number and number in the image of its views; no errors."""
-    image = np.repeat(np.arange(len(block.labels)), np.diff(block.image_start))
-    within = np.arange(len(image)) - block.image_start[image]
-    order = np.argsort(block.point, kind="stable")
+    image = np.repeat(np.arange(len(image_start) - 1), np.diff(image_start))
+    within = np.arange(len(image)) - image_start[image]
+    order = np.argsort(point, kind="stable")
     views = np.column_stack([image + 1, within])[order].astype("<u4")
-    counts = np.bincount(block.point, minlength=len(block.points))
-    start = np.concatenate([[0], np.cumsum(counts)])
-    parts = [struct.pack("<Q", len(block.points))]
-    for i, xyz in enumerate(block.points):
+    start = np.cumsum(np.bincount(point, minlength=len(xyz) + 1))
+    parts = [struct.pack("<Q", len(xyz))]
+    for i, place in enumerate(xyz):
         first, last = start[i : i + 2]
-        parts.append(struct.pack("<Q3d3BdQ", i + 1, *xyz, *GREY, 0.0, last - first))
+        parts.append(struct.pack("<Q3d3BdQ", i + 1, *place, *GREY, 0.0, last - first))
         parts.append(views[first:last].tobytes())
     return b"".join(parts)

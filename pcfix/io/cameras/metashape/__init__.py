@@ -36,13 +36,14 @@ from zipfile import ZipFile
 
 import numpy as np
 
-from pcfix.errors import InputError, NoTiePointsError
-from pcfix.io.cameras.checks import number, numbers
+from pcfix.errors import PcfixWarning
+from pcfix.io.cameras.checks import damaged, number, numbers, reading
 from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.metashape import documents
 from pcfix.io.cameras.metashape.block import Block, read_block
-from pcfix.io.cameras.metashape.documents import Chunk, Document, opened, read_entry, recognises
+from pcfix.io.cameras.metashape.documents import Chunk, Document, open_archive, recognises, unpacked
 from pcfix.io.cameras.metashape.sensors import read_calibration
+from pcfix.io.cameras.tracks import no_tie_points
 from pcfix.io.cameras.tracks import tie_points as gathered
 from pcfix.io.crs import is_local, parse_crs
 from pcfix.io.ply import parse_header
@@ -68,18 +69,13 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     chunk = documents.open_chunk(source.path)
     block = read_block(chunk)
     if len(block.images) != len(cameras):
-        raise InputError(
-            f"{chunk.path}: has {len(block.images)} aligned images, but the cameras are"
-            f" {len(cameras)}; read the cameras from the same file."
-        )
+        raise damaged(chunk.path, f"{len(block.images)} aligned images, {len(cameras)} cameras")
     first = chunk.element.find("frames/frame")
     frame = None if first is None else chunk.document.follow(first)
     seen = [] if frame is None else [*_tie_points(frame, block), _markers(frame, block)]
     if not any(len(part.point) for part in seen):
-        raise NoTiePointsError(
-            f"{chunk.path}: has neither tie points nor markers that were measured in aligned"
-            " images; give the project (.psx with its .files folder), or export the markers."
-        )
+        why = "only a project (.psx with its .files folder) or exported markers have them"
+        raise no_tie_points(chunk.path, why)
     before = np.cumsum([0, *(len(part.xyz) for part in seen)])
     return gathered(
         np.vstack([part.xyz for part in seen]),
@@ -104,7 +100,9 @@ DEFAULTS: Spreads = (
 LOCAL = "LOCAL"
 
 
-def gnss_positions(chunk: Chunk, block: Block) -> tuple[GnssPositions | None, tuple[str, ...]]:
+def gnss_positions(
+    chunk: Chunk, block: Block
+) -> tuple[GnssPositions | None, tuple[PcfixWarning, ...]]:
     """Return the reference positions of the images of a block, and notes on them.
 
     Positions that the user unticked are no measurement and left out, unless all are, as is usual
@@ -148,7 +146,7 @@ def _sigma(
     return sigma
 
 
-def _crs(path: Path, chunk: Element, xyz: FloatArray) -> tuple[str, tuple[str, ...]]:
+def _crs(path: Path, chunk: Element, xyz: FloatArray) -> tuple[str, tuple[PcfixWarning, ...]]:
     """Return the CRS of the positions; that of the cameras may differ from that of the chunk."""
     own = (chunk.findtext("camera_reference") or "").strip()
     text = own or (chunk.findtext("reference") or "").strip() or LOCAL
@@ -156,14 +154,15 @@ def _crs(path: Path, chunk: Element, xyz: FloatArray) -> tuple[str, tuple[str, .
         return "local", ()
     are_degrees = (np.nanmax(np.abs(xyz[:, :2]), axis=0) <= [180.0, 90.0]).all()
     if not own and not crs.is_geographic and are_degrees:
-        return "EPSG:4979", (
+        sentence = (
             f"{path}: the reference positions of the cameras are degrees, although the CRS of the"
-            " chunk is in metres; taken as WGS 84.",
+            " chunk is in metres. They are taken as WGS 84."
         )
+        return "EPSG:4979", (PcfixWarning("cameras.gnss_in_degrees", sentence),)
     return text, ()
 
 
-def _antenna_notes(path: Path, block: Block) -> tuple[str, ...]:
+def _antenna_notes(path: Path, block: Block) -> tuple[PcfixWarning, ...]:
     notes = []
     for sensor in dict.fromkeys(image.sensor for image in block.images):
         antenna = None if sensor is None else sensor.find("antenna")
@@ -174,10 +173,12 @@ def _antenna_notes(path: Path, block: Block) -> tuple[str, ...]:
             words += [reference.get(axis) or "0" for axis in "xyz"]
             words += (reference.get("location") or "").split()
         if any(number(path, "GNSS antenna", word) != 0.0 for word in words):
-            notes.append(
-                f"{path}: sensor {sensor.get('label')}: its GNSS antenna has an offset from the"
-                " camera; the GNSS positions are those of the antenna."
+            label = sensor.get("label")
+            sentence = (
+                f"{path}: the GNSS antenna of sensor {label} has an offset from the camera. The"
+                " GNSS positions are those of the antenna."
             )
+            notes.append(PcfixWarning("cameras.antenna_offset", sentence, sensor=label))
     return tuple(notes)
 
 
@@ -203,7 +204,7 @@ def _tie_points(frame: Document, block: Block) -> Iterator[Seen]:
         return
     listed = document.root.iterfind("projections")
     files = {entry.get("camera_id") or "": entry.get("path") or "" for entry in listed}
-    with opened(document.path) as archive:
+    with open_archive(document.path) as archive:
         for points in document.root.iterfind("points"):
             component = points.get("component_id")
             rows = [
@@ -221,9 +222,9 @@ def _component(
 ) -> Seen:
     """Return the points of one component and where the images in `rows` saw them."""
     vertices = _vertices(archive, points, POINTS)
-    xyz = block.places[rows[0]].points(
-        np.column_stack([vertices[axis] for axis in "xyz"]).astype(np.float64)
-    )
+    place = block.places[rows[0]]
+    xyz = np.column_stack([vertices[axis] for axis in "xyz"]).astype(np.float64)
+    xyz = xyz @ place[:3, :3].T + place[:3, 3]
     order = np.argsort(vertices["id"], kind="stable")
     ids = vertices["id"][order].astype(np.int64)
     point, camera, uv = [], [], []
@@ -239,24 +240,15 @@ def _component(
 
 def _vertices(archive: ZipFile, name: str, needed: tuple[str, ...]) -> np.ndarray:
     """Return the vertices of a binary PLY in an archive, with the properties that are needed."""
-    where, data = f"{archive.filename}: {name}", read_entry(archive, name)
+    where, data = f"{archive.filename}: {name}", unpacked(archive, name)
     header = parse_header(where, data)
     kinds = [(p.name, header.order + p.item) for p in header.properties if not p.length]
-    if not header.order or header.skipped or len({*kinds}) < len(header.properties):
-        raise InputError(f"{where}: is not a binary PLY of vertices; save the project again.")
-    missing = [field for field in needed if field not in dict(kinds)]
-    if missing:
-        raise InputError(f"{where}: has no property {', '.join(missing)}; save the project again.")
-    kind = np.dtype(kinds)
-    whole = (len(data) - header.end) // kind.itemsize
-    if header.records > whole:
-        raise InputError(
-            f"{where}: says {header.records} vertices but is cut off after {whole}; save the"
-            " project again."
-        )
-    vertices = np.frombuffer(data, kind, header.records, header.end)
-    if vertices["id"].dtype.kind not in "iu":
-        raise InputError(f"{archive.filename}: the id of {name} is not a whole number.")
+    if not header.order or header.skipped or not {*needed} <= dict(kinds).keys():
+        raise damaged(where, f"it is not a binary PLY of vertices with {', '.join(needed)}")
+    with reading(where):
+        vertices = np.frombuffer(data, np.dtype(kinds), header.records, header.end)
+        if vertices["id"].dtype.kind not in "iu":
+            raise damaged(where, "the id is not a whole number")
     return vertices
 
 

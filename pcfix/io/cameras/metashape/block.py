@@ -3,87 +3,65 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from pcfix.errors import InputError
+from pcfix.errors import PcfixWarning
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import ROUNDING, number, numbers
+from pcfix.io.cameras.checks import damaged, number, numbers
 from pcfix.io.cameras.metashape import sensors
 from pcfix.io.cameras.metashape.documents import Chunk
 from pcfix.io.crs import METRES, crs_text, is_local, parse_crs, shortened, unbound
 from pcfix.model import Cameras, FloatArray, Lens
 
-
-@dataclass(frozen=True, eq=False)
-class Similarity:
-    """world = scale rotation X + translation."""
-
-    scale: float
-    rotation: FloatArray
-    translation: FloatArray
-
-    def points(self, xyz: FloatArray) -> FloatArray:
-        """Return points of the chunk, shape (n, 3), in the world."""
-        return np.asarray(self.scale * xyz @ self.rotation.T + self.translation)
+LOCAL = "local"
+CHUNK = np.eye(4)
+"""Where the chunk has no place in the world, its own frame is taken."""
 
 
-IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
-
-
-def _similarity(path: Path, element: Element | None) -> Similarity | None:
-    """Return a transform of three parts, or of one 4x4 matrix that holds the scale too."""
+def _similarity(path: Path, element: Element | None) -> FloatArray | None:
+    """Return the 4x4 matrix of a transform that is one matrix, or has up to three parts."""
     if element is None:
         return None
-    where = "transform of the chunk"
-    scale, rotation, translation = 1.0, np.eye(3), np.zeros(3)
+    where, matrix = "transform of the chunk", np.eye(4)
+    scale, rotation, translation = map(element.findtext, ("scale", "rotation", "translation"))
     if (element.text or "").strip():
         matrix = numbers(path, where, element.text, 16).reshape(4, 4)
-        scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-        rotation, translation = matrix[:3, :3] / (scale or 1.0), matrix[:3, 3]
-    else:
-        given = {tag: element.findtext(tag) for tag in ("scale", "rotation", "translation")}
-        if not any(text is not None for text in given.values()):
-            return None
-        if given["scale"] is not None:
-            scale = number(path, where, given["scale"])
-        if given["rotation"] is not None:
-            rotation = numbers(path, where, given["rotation"], 9).reshape(3, 3)
-        if given["translation"] is not None:
-            translation = numbers(path, where, given["translation"], 3)
-    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if not (scale > 0.0 and off <= ROUNDING and np.linalg.det(rotation) > 0.0):
-        raise InputError(
-            f"{path}: the transform of the chunk is not a rotation with one positive scale (scale"
-            f" {scale:g}); export the cameras again."
-        )
-    u, _, v = np.linalg.svd(rotation)
-    return Similarity(scale, u @ v, translation)
+    elif scale is None and rotation is None and translation is None:
+        return None
+    if rotation is not None:
+        matrix[:3, :3] = numbers(path, where, rotation, 9).reshape(3, 3)
+    if translation is not None:
+        matrix[:3, 3] = numbers(path, where, translation, 3)
+    inside = float(np.cbrt(np.linalg.det(matrix[:3, :3]))) if scale is None else 1.0
+    size = inside if scale is None else number(path, where, scale)
+    if not size > 0.0:
+        raise damaged(path, f"{where}: the scale {size:g} is not positive")
+    matrix[:3, :3] = size * checks.rotations(path, [where], matrix[:3, :3] / inside)[0]
+    return matrix
 
 
-def _world(path: Path, chunk: Element) -> tuple[str, str | None, tuple[str, ...]]:
+def _world(path: Path, chunk: Element) -> tuple[str, str | None, tuple[PcfixWarning, ...]]:
     """Return the frame that a chunk's transforms lead to, its CRS if another, and notes on them."""
     text = (chunk.findtext("reference") or "").strip()
     if not text or text.upper() == "LOCAL":
-        return "local", None, ()
+        return LOCAL, None, ()
     crs = parse_crs(text, str(path))
     if is_local(crs):
         unit = crs.axis_info[0].unit_name
-        note = (
-            f"{path}: the local coordinates of the chunk are in {unit}; its transform is in metres,"
-            " so that a cloud exported in that unit has to be scaled."
+        sentence = (
+            f"{path}: the local coordinates of the chunk are in {unit}, its transform in metres."
+            " Scale a cloud that was exported in that unit."
         )
-        return "local", None, () if unit in METRES else (note,)
+        note = PcfixWarning("cameras.local_unit", sentence, unit=unit)
+        return LOCAL, None, () if unit in METRES else (note,)
     base = None if crs.geodetic_crs is None else unbound(crs.geodetic_crs)
     if base is None:
-        raise InputError(
-            f"{path}: the CRS of the chunk, {shortened(text)}, has no datum; set it again in"
-            " Metashape's reference settings."
-        )
+        remedy = "Set it again in Metashape's reference settings"
+        raise checks.unsupported(path, f"the CRS {shortened(text)}, which has no datum,", remedy)
     frame = crs_text(type(crs).from_json_dict(_geocentric(base.to_json_dict())))
     return frame, frame if crs.is_geocentric else text, ()
 
@@ -116,10 +94,10 @@ class Image(NamedTuple):
 
 
 class Block(NamedTuple):
-    """The images with a pose, in the order of the file, and how the chunk lies in the world."""
+    """The images with a pose, in the order of the file, and their matrices from chunk to world."""
 
     images: list[Image]
-    places: list[Similarity]
+    places: list[FloatArray]
     cameras: Cameras
 
 
@@ -134,27 +112,28 @@ def read_block(chunk: Chunk) -> Block:
     poses = _poses(path, images)
     kept, places, why = _select(path, element, [image for image in images if image.id in poses])
     if not kept:
-        rest = [f"{len(images) - len(poses)} are not aligned", *why]
-        no_pose = "no image is aligned; align the photos, or choose the chunk that is."
-        raise InputError(
-            f"{path}: none of the {len(images)} images of the chunk"
-            f" {element.get('label') or 'without a name'} can be used:"
-            f" {', '.join(rest) + '.' if poses else no_pose}"
-        )
-    local = IDENTITY in places
-    crs, project_crs, of_world = ("local", None, ()) if local else _world(path, element)
-    centres, rotations = _in_world([poses[image.id] for image in kept], places)
+        chunk_name = element.get("label") or "without a name"
+        rest = ", ".join([f"{len(images) - len(poses)} are not aligned", *why])
+        raise checks.no_pose(path, f"of the {len(images)} images of chunk {chunk_name} {rest}")
+    local = any(place is CHUNK for place in places)
+    crs, project_crs, of_world = (LOCAL, None, ()) if local else _world(path, element)
+    in_world = np.array(places) @ np.array([poses[image.id] for image in kept])
+    scales = np.cbrt(np.linalg.det(in_world[:, :3, :3]))[:, None, None]
     lenses, of_lenses = _lenses(path, kept)
     chosen = {image.id for image in kept}
     cameras = Cameras(
         labels=tuple(image.label for image in kept),
-        centres=centres,
-        rotations=rotations,
+        centres=in_world[:, :3, 3],
+        rotations=np.ascontiguousarray((in_world[:, :3, :3] / scales).transpose(0, 2, 1)),
         lenses=lenses,
         crs=crs,
         project_crs=project_crs,
         unposed=tuple(image.label for image in images if image.id not in chosen),
-        notes=(*(f"{path}: {reason}; left out." for reason in why), *of_lenses, *of_world),
+        notes=(
+            *(PcfixWarning("cameras.left_out", f"{path}: {one}; left out.") for one in why),
+            *of_lenses,
+            *of_world,
+        ),
         source=chunk.software,
     )
     return Block(kept, places, cameras)
@@ -185,7 +164,14 @@ def _images(chunk: Element) -> list[Image]:
 def _poses(path: Path, images: list[Image]) -> dict[str, FloatArray]:
     """Return camera to chunk, 4x4, of each image that is aligned or whose master is."""
     aligned = [image for image in images if (image.element.findtext("transform") or "").strip()]
-    masters = dict(zip((image.id for image in aligned), _matrices(path, aligned), strict=True))
+    texts = [image.element.findtext("transform") for image in aligned]
+    named = zip(aligned, texts, strict=True)
+    rows = [numbers(path, f"image {one.label}, transform", text, 16) for one, text in named]
+    matrices = np.array(rows).reshape(-1, 4, 4)
+    checks.rotations(path, [image.label for image in aligned], matrices[:, :3, :3])
+    u, _, v = np.linalg.svd(matrices[:, :3, :3])
+    matrices[:, :3, :3] = u @ v
+    masters = dict(zip((image.id for image in aligned), matrices, strict=True))
     offsets: dict[Element, FloatArray] = {}
     poses = dict(masters)
     for image in images:
@@ -198,30 +184,9 @@ def _poses(path: Path, images: list[Image]) -> dict[str, FloatArray]:
     return poses
 
 
-def _matrices(path: Path, images: list[Image]) -> FloatArray:
-    """Return the transforms of images, shape (k, 4, 4), with proper rotations."""
-    rows = [
-        numbers(path, f"image {image.label}, transform", image.element.findtext("transform"), 16)
-        for image in images
-    ]
-    matrices = np.array(rows).reshape(-1, 4, 4)
-    tilted = np.abs(matrices[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) > ROUNDING
-    if tilted.any():
-        raise InputError(
-            f"{path}: image {images[int(np.argmax(tilted))].label}: the last row of its transform"
-            " is not 0 0 0 1; export the cameras again."
-        )
-    turns = matrices[:, :3, :3]
-    for image, turn in zip(images, turns, strict=True):
-        checks.rotation(path, image.label, turn)
-    u, _, v = np.linalg.svd(turns)
-    matrices[:, :3, :3] = u @ v
-    return matrices
-
-
 def _select(
     path: Path, chunk: Element, posed: list[Image]
-) -> tuple[list[Image], list[Similarity], list[str]]:
+) -> tuple[list[Image], list[FloatArray], list[str]]:
     """Return the images to use, the way of each to the world, and what the others are."""
     kept, places = [], []
     why: Counter[str] = Counter()
@@ -239,7 +204,7 @@ def _select(
     return kept, places, [f"{count} images are {reason}" for reason, count in why.items()]
 
 
-def _places(path: Path, chunk: Element, posed: list[Image]) -> list[Similarity | None]:
+def _places(path: Path, chunk: Element, posed: list[Image]) -> list[FloatArray | None]:
     """Return the way of each image to the world, None where its component has no place in it.
 
     Every component has a frame of its own. One with a transform has a place in the world; one
@@ -252,36 +217,23 @@ def _places(path: Path, chunk: Element, posed: list[Image]) -> list[Similarity |
     parent = chunk.find("components")
     active = None if parent is None else parent.get("active_id")
     main = active if active in own else next(iter(own), None)
-    in_chunk = [i.component in (None, main) or i.component not in own for i in posed]
-    places = [
-        own.get(image.component) or (of_chunk if is_main else None)
-        for image, is_main in zip(posed, in_chunk, strict=True)
-    ]
-    if any(places):
-        return places
-    return [IDENTITY if is_main else None for is_main in in_chunk]
+    of_main: list[FloatArray | None] = []
+    places: list[FloatArray | None] = []
+    for image in posed:
+        is_main = image.component in (None, main) or image.component not in own
+        component = own.get(image.component)
+        of_main.append(CHUNK if is_main else None)
+        places.append(of_chunk if component is None and is_main else component)
+    return places if any(place is not None for place in places) else of_main
 
 
-def _in_world(poses: list[FloatArray], places: list[Similarity]) -> tuple[FloatArray, FloatArray]:
-    """Return centres, shape (k, 3), and rotations world to camera, (k, 3, 3)."""
-    to_chunk = np.array(poses)
-    turn = np.array([place.rotation for place in places])
-    scale = np.array([place.scale for place in places])
-    shift = np.array([place.translation for place in places])
-    centres = scale[:, None] * np.einsum("kij,kj->ki", turn, to_chunk[:, :3, 3]) + shift
-    return centres, np.ascontiguousarray((turn @ to_chunk[:, :3, :3]).transpose(0, 2, 1))
-
-
-def _lenses(path: Path, images: list[Image]) -> tuple[tuple[Lens, ...], list[str]]:
+def _lenses(path: Path, images: list[Image]) -> tuple[tuple[Lens, ...], list[PcfixWarning]]:
     """Return the lens of each image, one object per sensor, and notes."""
     found: dict[Element | None, Lens] = {}
-    notes: list[str] = []
+    notes: list[PcfixWarning] = []
     for image in images:
         if image.sensor is None:
-            raise InputError(
-                f"{path}: image {image.label}: its sensor {image.element.get('sensor_id')} is not"
-                " in the file; export the cameras again."
-            )
+            raise damaged(path, f"sensor {image.element.get('sensor_id')} is missing")
         if image.sensor not in found:
             found[image.sensor] = sensors.lens_of(path, image.sensor, image.label)
             notes.extend(sensors.notes_on(path, image.sensor))

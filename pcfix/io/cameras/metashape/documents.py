@@ -1,25 +1,17 @@
-"""From what the user named to the one chunk that is read.
-
-The zip archives of a project are read without trusting what their directories say.
-"""
+"""Find the chunk to read in a project or an exported document."""
 
 from __future__ import annotations
 
 import io
-import lzma
 import re
-import struct
 import zipfile
-import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
-from pcfix.errors import InputError
-from pcfix.io.cameras.checks import read_xml
+from pcfix.errors import InputError, PcfixWarning
+from pcfix.io.cameras.checks import DAMAGES, damaged, missing, no_pose, read_xml, reading
 from pcfix.io.cameras.formats import Source
 
 ZIP_MAGIC = b"PK\x03\x04"
@@ -44,7 +36,7 @@ class Document:
         relative = element.get("path")
         if relative is None:
             return Document(element, self.path)
-        return _from_archive(self._file(relative))
+        return read_entry(self._file(relative))
 
     def leads_to_a_file(self, element: Element) -> bool:
         """Whether what an element stands for is there: in the same document, or as a file."""
@@ -61,7 +53,7 @@ class Chunk(NamedTuple):
     path: Path
     document: Document
     software: str
-    notes: tuple[str, ...]
+    notes: tuple[PcfixWarning, ...]
 
     @property
     def element(self) -> Element:
@@ -78,7 +70,7 @@ def recognises(source: Source) -> bool:
         try:
             with zipfile.ZipFile(source.path) as archive, archive.open("doc.xml") as stream:
                 text = stream.read(len(source.head)).decode("utf-8", errors="replace")
-        except (*DAMAGES, KeyError):
+        except DAMAGES:
             return False
     root = ROOT.match(text)
     inside = INSIDE.get(root[1]) if root else None
@@ -92,57 +84,52 @@ def open_chunk(path: Path) -> Chunk:
         return Chunk(path, top, _software(top.root, top.root), ())
     candidates = top.root.findall("chunk") or top.root.findall("chunks/chunk")
     if not candidates:
-        raise InputError(f"{path}: has no chunk; save the project again with its chunks.")
+        raise no_pose(path, "has no chunk")
     chunks = top.root.find("chunks")
     active = None if chunks is None else chunks.get("active_id")
     candidates.sort(key=lambda chunk: chunk.get("id") != active)
     chosen, *others = _with_poses(top, candidates)
     name, *names = (each.root.get("label") or "without a name" for each in (chosen, *others))
-    note = (
+    sentence = (
         f"{path}: {len(others) + 1} chunks have aligned images; read is {name}, not"
-        f" {', '.join(names[:10])}{', ...' if len(names) > 10 else ''}: make another chunk the"
-        " active one, or export its cameras, to read that."
+        f" {', '.join(names[:10])}. Make another chunk the active one to read that."
     )
+    note = PcfixWarning("cameras.several_chunks", sentence, chunk=name, others=names)
     return Chunk(path, chosen, _software(chosen.root, top.root), (note,) if others else ())
 
 
 def _top(path: Path) -> Document:
     """Return the outermost document; that of a .psx lies in the folder beside it."""
     if path.is_dir():
-        return _from_archive(path / "project.zip")
+        return read_entry(path / "project.zip")
     with path.open("rb") as stream:
         if stream.read(len(ZIP_MAGIC)) == ZIP_MAGIC:
-            return _from_archive(path)
+            return read_entry(path)
     root = read_xml(path)
     inside = root.get("path")
     if root.tag == "document" and inside is not None:
         archive = Path(inside.replace("{projectname}", path.stem))
         if archive.is_absolute():
-            raise InputError(f"{path}: its path '{inside}' leads out of its folder; mend it.")
-        return _from_archive(path.parent / archive)
+            raise damaged(path, f"its path '{inside}' leads out of its folder")
+        return read_entry(path.parent / archive)
     return Document(root, path)
-
-
-def _from_archive(path: Path) -> Document:
-    with opened(path) as archive:
-        return Document(read_xml(path, io.BytesIO(read_entry(archive, "doc.xml"))), path)
 
 
 def _with_poses(top: Document, candidates: list[Element]) -> list[Document]:
     """Return the chunks with poses, or the first where none has some."""
     posed: list[Document] = []
     empty: list[Document] = []
-    missing: list[InputError] = []
+    lost: list[InputError] = []
     for candidate in candidates:
         try:
             chunk = top.follow(candidate)
         except InputError as error:
-            missing.append(error)
+            lost.append(error)
             continue
         cameras = chunk.root.iterfind("cameras//camera")
         (posed if any(c.find("transform") is not None for c in cameras) else empty).append(chunk)
-    if not posed and missing:
-        raise missing[0]
+    if not posed and lost:
+        raise lost[0]
     return posed or empty[:1]
 
 
@@ -159,50 +146,26 @@ def _software(chunk: Element, top: Element) -> str:
 
 
 MOST_BYTES = 2**30
-MOST_RATIO = 200
-"""Documents shrink to a tenth, points hardly; an archive made to burst a thousandfold."""
-FREE_BYTES = 2**24
-"""Below this the ratio is not asked for."""
-
-DAMAGES = (
-    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error),
-    *(EOFError, OSError, RuntimeError, ValueError),
-)
+"""Largest document or table of points that is unpacked from an archive."""
 
 
-@contextmanager
-def opened(path: Path) -> Iterator[zipfile.ZipFile]:
+def read_entry(path: Path) -> Document:
+    """Return the document in an archive."""
+    with open_archive(path) as archive:
+        return Document(read_xml(path, io.BytesIO(unpacked(archive, "doc.xml"))), path)
+
+
+def open_archive(path: Path) -> zipfile.ZipFile:
     """Open an archive."""
-    with _damage(path):  # a name may be longer than the system allows
-        is_there = path.is_file()
-    if not is_there:
-        raise InputError(f"{path}: is missing; keep all files of the project together.")
-    with _damage(path):
-        archive = zipfile.ZipFile(path)
-    with archive:
-        yield archive
+    with reading(path):
+        if not path.is_file():
+            raise missing(path)
+        return zipfile.ZipFile(path)
 
 
-def read_entry(archive: zipfile.ZipFile, name: str) -> bytes:
-    """Return the content of an entry, unless it is made to burst."""
-    path = archive.filename
-    if name not in archive.NameToInfo:
-        raise InputError(f"{path}: has no {name}; the project is incomplete, save it again.")
-    entry = archive.getinfo(name)
-    if entry.file_size > min(MOST_BYTES, FREE_BYTES + MOST_RATIO * entry.compress_size):
-        raise InputError(
-            f"{path}: {name} would unpack to {entry.file_size / 1e6:.0f} MB from"
-            f" {entry.compress_size / 1e6:.3f} MB, which no project does; it is not read."
-        )
-    with _damage(path):
+def unpacked(archive: zipfile.ZipFile, name: str) -> bytes:
+    """Return the content of an entry."""
+    with reading(archive.filename):
+        if archive.getinfo(name).file_size > MOST_BYTES:
+            raise damaged(archive.filename, f"{name} unpacks to more than 1 GB")
         return archive.read(name)
-
-
-@contextmanager
-def _damage(path: Path | str | None) -> Iterator[None]:
-    try:
-        yield
-    except DAMAGES as error:
-        raise InputError(
-            f"{path}: the archive is damaged or cut off ({error}); save the project again."
-        ) from error

@@ -21,9 +21,9 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from pcfix.errors import InputError
+from pcfix.errors import PcfixWarning
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import number, numbers, read_xml, without_zeros
+from pcfix.io.cameras.checks import damaged, number, numbers, read_xml, without_zeros, wrong
 from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.metashape import documents
 from pcfix.model import FloatArray, Lens, Projection
@@ -45,18 +45,18 @@ def read_calibration(path: Path) -> Lens:
     """Read a calibration that Metashape saved on its own (root element ``calibration``), pixels."""
     root = read_xml(path)
     if root.tag != "calibration":
-        raise InputError(
-            f"{path}: is not a Metashape calibration (its root is {root.tag}, not calibration);"
-            " save it from Tools, Camera Calibration."
+        sentence = (
+            f"is not a calibration of Metashape ({root.tag}). Save it from Tools, Camera"
+            " Calibration."
         )
+        raise wrong(path, "cameras.no_calibration", sentence)
     kind = (root.findtext("projection") or "frame").strip()
     if kind not in PROJECTIONS:
-        raise InputError(
-            f"{path}: the projection '{kind}' has no lens in pcfix; it knows"
-            f" {', '.join(PROJECTIONS)}."
-        )
+        remedy = f"Use a lens of type {', '.join(PROJECTIONS)}"
+        raise checks.unsupported(path, f"the projection '{kind}'", remedy, model=kind)
     width, height = (number(path, side, root.findtext(side)) for side in ("width", "height"))
-    return _lens_of_calibration(path, path.stem, kind, root, (width, height))
+    lens = _lens_of_calibration(path, path.stem, kind, root, (width, height))
+    return checks.lens(path, path.stem, lens)
 
 
 def _lens_of_calibration(
@@ -69,9 +69,7 @@ def _lens_of_calibration(
         if entry.tag in PARAMETERS
     }
     if not given.keys() & {"f", "fx", "fy"}:
-        raise InputError(
-            f"{path}: sensor {sensor}: its calibration has no focal length (f); export it again."
-        )
+        raise damaged(path, f"the calibration of sensor {sensor} has no focal length")
     value = defaultdict(float, given)
     width, height = size
     if "f" in given:
@@ -81,14 +79,13 @@ def _lens_of_calibration(
         focal = given.get("fy", value["fx"])
         x, y = given.get("cx", width / 2.0), given.get("cy", height / 2.0)
         b1, b2, p1, p2 = given.get("fx", focal) - focal, value["skew"], value["p2"], value["p1"]
-    lens = Lens(
+    return Lens(
         *(focal, width, height, x, y, b1, b2),
         projection=PROJECTIONS[kind],
         radial=without_zeros([value[name] for name in RADIAL]),
         tangential=without_zeros([p1, p2, value["p3"], value["p4"]]),
         sensor=sensor,
     )
-    return checks.lens(path, sensor, lens)
 
 
 def name_of(sensor: Element) -> str:
@@ -114,28 +111,23 @@ def lens_of(path: Path, sensor: Element, image: str) -> Lens:
     size = None if found is None else _resolution(path, label, found)
     size = size or _resolution(path, label, sensor)
     pixel_mm = _property(path, sensor, "pixel_width")
-    if found is not None:
-        if size is None:
-            raise InputError(
-                f"{path}: image {image}: its sensor {label} has no resolution; export the cameras"
-                " again."
-            )
+    if found is not None and size is not None:
         lens = _lens_of_calibration(path, label, kind, found, size)
         return replace(lens, pixel_size_mm=pixel_mm)
     focal_mm = _property(path, sensor, "focal_length")
-    if size is None or focal_mm is None or pixel_mm is None:
-        raise InputError(
-            f"{path}: image {image}: its sensor {label} has no calibration; align or optimise the"
-            " cameras in Metashape and export them again."
+    if found is not None or size is None or focal_mm is None or pixel_mm is None:
+        sentence = (
+            f"the sensor {label} of image {image} has no calibration, or no size. Align the images"
+            " in Metashape and export the cameras again."
         )
+        raise wrong(path, "cameras.no_calibration", sentence, sensor=label)
     width, height = size
-    lens = Lens(  # what Metashape itself starts from: the data sheet, no distortion
+    return Lens(  # what Metashape itself starts from: the data sheet, no distortion
         *(focal_mm / pixel_mm, width, height, width / 2.0, height / 2.0),
         projection=PROJECTIONS[kind],
         pixel_size_mm=pixel_mm,
         sensor=label,
     )
-    return checks.lens(path, label, lens)
 
 
 def offset_of(path: Path, sensor: Element) -> FloatArray:
@@ -144,40 +136,40 @@ def offset_of(path: Path, sensor: Element) -> FloatArray:
     offset = np.eye(4)
     if rotation := (sensor.findtext("rotation") or "").strip():
         matrix = numbers(path, f"sensor {label}, rotation", rotation, 9).reshape(3, 3)
-        offset[:3, :3] = checks.rotation(path, f"of the sensor {label}", matrix)
+        offset[:3, :3] = checks.rotations(path, [f"sensor {label}"], matrix)[0]
     if location := (sensor.findtext("location") or "").strip():
         offset[:3, 3] = numbers(path, f"sensor {label}, location", location, 3)
     return offset
 
 
-def notes_on(path: Path, sensor: Element) -> tuple[str, ...]:
-    """Return what a sensor has and its lens has not."""
+def notes_on(path: Path, sensor: Element) -> tuple[PcfixWarning, ...]:
+    """Return notes on what the lens of a sensor does not have."""
     label = name_of(sensor)
     found = _calibration(sensor)
     notes = []
     if found is None:
-        notes.append(
-            f"{path}: sensor {label} has no calibration: its focal length is that of the data"
+        sentence = (
+            f"{path}: sensor {label} has no calibration. Its focal length is that of the data"
             " sheet, without distortion."
         )
+        notes.append(PcfixWarning("cameras.data_sheet_lens", sentence, sensor=label))
     elif coefficients := found.findtext("corrections/coeffs"):
         where = f"sensor {label}, corrections"
         values = numbers(path, where, coefficients, len(coefficients.split()))
-        notes.append(
-            f"{path}: sensor {label}: its additional corrections,"
-            f" {np.sqrt((values**2).sum() / 2.0):.2f} px rms, are left out."
-        )
+        rms_px = float(np.sqrt((values**2).sum() / 2.0))
+        sentence = f"{path}: the additional corrections of sensor {label} are ignored"
+        sentence += f" ({rms_px:.2f} px rms)."
+        notes.append(PcfixWarning("cameras.corrections", sentence, sensor=label, rms_px=rms_px))
     if any(
         entry.get("name") == "rolling_shutter"  # rolling_shutter_flags say which model
         and (entry.get("value") or "").lower() not in _OFF
         for entry in sensor.iterfind("property")
     ):
-        notes.append(
-            f"{path}: sensor {label}: its rolling shutter compensation is left out; each image"
-            " has one pose, though the camera flew on while the rows were read out: 0.15 m at 5 m/s"
-            " and 30 ms, half of it at either edge. Where that matters fly slower, or give images"
-            " of a global or mechanical shutter."
+        sentence = (
+            f"{path}: the rolling shutter compensation of sensor {label} is ignored, each image has"
+            " one pose. At 5 m/s and 30 ms that is 0.15 m; fly slower where it matters."
         )
+        notes.append(PcfixWarning("cameras.rolling_shutter", sentence, sensor=label))
     return tuple(notes)
 
 
@@ -223,5 +215,6 @@ def given_lenses(path: Path) -> dict[str, Lens]:
         label = name_of(sensor)
         size = _resolution(path, label, given[-1])
         if size and any((given[-1].findtext(k) or "0").strip(" 0.-") for k in DISTORTION):
-            found[label] = _lens_of_calibration(path, label, kind_of(sensor), given[-1], size)
+            lens = _lens_of_calibration(path, label, kind_of(sensor), given[-1], size)
+            found[label] = checks.lens(path, label, lens)
     return found

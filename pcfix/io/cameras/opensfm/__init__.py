@@ -27,9 +27,9 @@ from typing import IO, Any, NamedTuple
 
 import numpy as np
 
-from pcfix.errors import InputError, NoTiePointsError
+from pcfix.errors import PcfixWarning
 from pcfix.io.cameras import tracks
-from pcfix.io.cameras.checks import json_number, load_json, mapping, rows, vector
+from pcfix.io.cameras.checks import damaged, load_json, no_pose, reading, several, triple
 from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.opensfm.models import is_panorama, lens
 from pcfix.lens.rotations import from_rotation_vectors
@@ -84,21 +84,38 @@ class Reconstruction(NamedTuple):
 
 def read_reconstruction(path: Path) -> Reconstruction:
     """Read the reconstruction with the most images."""
-    chosen, others, notes = _largest(path, load_json(path))
-    entries = mapping(path, "cameras", chosen.get("cameras"))
-    shots, panoramas = _usable(path, chosen["shots"], entries)
+    with reading(path):
+        return _reconstruction(path, load_json(path))
+
+
+def _reconstruction(path: Path, data: Any) -> Reconstruction:
+    """Return the reconstruction with the most images of a file."""
+    sets = [entry.get("shots", {}) for entry in data]
+    counts = [len(shots) for shots in sets]
+    if not any(counts):
+        raise no_pose(path)
+    best = counts.index(max(counts))
+    chosen, notes = data[best], []
+    others = [name for i, shots in enumerate(sets) if i != best for name in shots]
+    if others:
+        notes.append(several(path, len(data), counts[best]))
+    entries = chosen["cameras"]
+    panoramas = [k for k, shot in sets[best].items() if is_panorama(entries[shot["camera"]])]
+    shots = {k: shot for k, shot in sets[best].items() if k not in set(panoramas)}
     if panoramas:
-        notes.append(
-            f"{path}: {len(panoramas)} images of all-round cameras (spherical) are left out; pcfix"
-            " needs images with a frame."
-        )
-    names = {shot["camera"] for shot in shots.values()}
-    lenses = {name: lens(path, name, entries[name]) for name in names}
-    rotations, centres = _poses(path, chosen, shots)
-    xyz, sigma = _gnss(path, shots)
+        sentence = f"{path}: {len(panoramas)} images of all-round cameras are left out."
+        notes.append(PcfixWarning("cameras.panoramas", sentence, images=panoramas))
+    if not shots:
+        raise no_pose(path, "all images are of all-round cameras (spherical)")
+    lenses = {k: lens(path, k, entries[k]) for k in {shot["camera"] for shot in shots.values()}}
+    rotations, centres = _poses(chosen, shots)
+    xyz, sigma = _gnss(shots)
     reference = _reference(path, chosen)
     crs = "local" if reference is None else "ENU:" + ",".join(map(repr, reference))
     has_gnss = reference is not None and np.isfinite(xyz).any()
+    listed = path.with_name("image_list.txt")  # the images that the project was given
+    lines = listed.read_text("utf-8", errors="replace").split("\n") if listed.is_file() else []
+    given = [PurePath(line.strip().replace("\\", "/")).name for line in lines if line.strip()]
     cameras = Cameras(
         labels=tuple(shots),
         centres=centres,
@@ -107,12 +124,10 @@ def read_reconstruction(path: Path) -> Reconstruction:
         crs=crs,
         notes=tuple(notes),
         gnss=GnssPositions(xyz, sigma, crs) if has_gnss else None,
-        unposed=left_out(shots, [*others, *panoramas, *_listed(path)]),
+        unposed=left_out(shots, [*others, *panoramas, *given]),
         source="OpenSfM",
     )
-    return Reconstruction(
-        path, cameras, reference, mapping(path, "points", chosen.get("points", {}))
-    )
+    return Reconstruction(path, cameras, reference, chosen.get("points", {}))
 
 
 def left_out(labels: Iterable[str], others: Iterable[str]) -> tuple[str, ...]:
@@ -122,109 +137,44 @@ def left_out(labels: Iterable[str], others: Iterable[str]) -> tuple[str, ...]:
     return tuple(n for n in names if n not in known and PurePath(n).stem not in known)
 
 
-def _largest(path: Path, data: Any) -> tuple[dict[str, Any], list[str], list[str]]:
-    """Return the largest reconstruction, the images of the others, and what to say of them."""
-    if not isinstance(data, list) or not all(isinstance(entry, dict) for entry in data):
-        raise InputError(f"{path}: is not a list of reconstructions as OpenSfM writes it.")
-    sets = [mapping(path, "shots", entry.get("shots", {})) for entry in data]
-    counts = [len(shots) for shots in sets]
-    if not any(counts):
-        raise InputError(f"{path}: has no images with a pose; run the reconstruction first.")
-    best = counts.index(max(counts))
-    others = [name for i, shots in enumerate(sets) if i != best for name in shots]
-    if not others:
-        return data[best], [], []
-    note = (
-        f"{path}: holds {len(data)} reconstructions that are not connected; the largest, with"
-        f" {counts[best]} images, is read, {len(others)} images of the others are left out."
-    )
-    return data[best], others, [note]
+def _poses(chosen: Any, shots: dict[str, Any]) -> tuple[FloatArray, FloatArray]:
+    """Return rotations and centres; x_camera = R x + t.
 
-
-def _usable(
-    path: Path, shots: dict[str, Any], cameras: dict[str, Any]
-) -> tuple[dict[str, dict[str, Any]], list[str]]:
-    """Return the shots whose camera pcfix can use, and the names of those that see all around."""
-    usable, panoramas = {}, []
-    for label, value in shots.items():
-        shot = mapping(path, f"image {label}", value)
-        name = shot.get("camera")
-        if not isinstance(name, str) or name not in cameras:
-            raise InputError(
-                f"{path}: image {label}: its camera '{name}' is not among the cameras."
-            )
-        if is_panorama(mapping(path, f"camera {name}", cameras[name])):
-            panoramas.append(label)
-        else:
-            usable[label] = shot
-    if not usable:
-        raise InputError(
-            f"{path}: all images are of all-round cameras (spherical), which pcfix cannot use;"
-            " cut them into perspective images before the reconstruction."
-        )
-    return usable, panoramas
-
-
-def _poses(
-    path: Path, chosen: dict[str, Any], shots: dict[str, dict[str, Any]]
-) -> tuple[FloatArray, FloatArray]:
-    """Return rotations and centres; x_camera = R x + t."""
-    riders = _riders(path, chosen)
-    pairs = [
-        _pose(path, f"image {label}", shot)
-        if "rotation" in shot or label not in riders
-        else _on_rig(path, label, chosen, *riders[label])
-        for label, shot in shots.items()
-    ]
+    An image on a rig has the pose of the rig in the world, then that of its camera on the rig.
+    """
+    riders = {
+        label: (instance, chosen.get("rig_cameras", {}).get(str(camera)))
+        for instance in chosen.get("rig_instances", {}).values()
+        for label, camera in instance.get("rig_camera_ids", {}).items()
+    }
+    pairs = []
+    for label, shot in shots.items():
+        if "rotation" in shot or label not in riders:
+            pairs.append(_pose(shot))
+            continue
+        (rig_r, rig_t), (turn, shift) = map(_pose, riders[label])
+        pairs.append((turn @ rig_r, turn @ rig_t + shift))
     rotations, shifts = (np.array(each) for each in zip(*pairs, strict=True))
     return rotations, -np.einsum("kji,kj->ki", rotations, shifts)
 
 
-def _pose(path: Path, where: str, value: Any) -> tuple[FloatArray, FloatArray]:
+def _pose(entry: Any) -> tuple[FloatArray, FloatArray]:
     """Return R and t of an entry with an axis-angle rotation."""
-    entry = mapping(path, where, value)
-    turn = vector(path, f"{where}, rotation", entry.get("rotation"), 3)
-    shift = vector(path, f"{where}, translation", entry.get("translation"), 3)
-    return from_rotation_vectors(turn), shift
+    return from_rotation_vectors(triple(entry["rotation"])), triple(entry["translation"])
 
 
-def _riders(path: Path, chosen: dict[str, Any]) -> dict[str, tuple[str, str]]:
-    """Return rig instance and rig camera of every image that rides on a rig."""
-    riders = {}
-    for name, value in mapping(path, "rig_instances", chosen.get("rig_instances", {})).items():
-        where = f"rig instance {name}"
-        ids = mapping(path, where, value).get("rig_camera_ids", {})
-        for label, camera in mapping(path, f"{where}, rig_camera_ids", ids).items():
-            riders[label] = (name, str(camera))
-    return riders
-
-
-def _on_rig(
-    path: Path, label: str, chosen: dict[str, Any], instance: str, camera: str
-) -> tuple[FloatArray, FloatArray]:
-    """Return the pose of an image from those of its rig in the world and its camera on the rig."""
-    on = mapping(path, "rig_cameras", chosen.get("rig_cameras", {}))
-    if camera not in on:
-        raise InputError(f"{path}: image {label}: its rig camera '{camera}' is not in the file.")
-    rig_r, rig_t = _pose(path, f"rig instance {instance}", chosen["rig_instances"][instance])
-    turn, shift = _pose(path, f"rig camera {camera}", on[camera])
-    return turn @ rig_r, turn @ rig_t + shift
-
-
-def _gnss(path: Path, shots: dict[str, dict[str, Any]]) -> tuple[FloatArray, FloatArray]:
+def _gnss(shots: dict[str, Any]) -> tuple[FloatArray, FloatArray]:
     """Return positions and their standard deviation, NaN where an image has none."""
     xyz, sigma = np.full((2, len(shots), 3), np.nan)
-    for i, (label, shot) in enumerate(shots.items()):
+    for i, shot in enumerate(shots.values()):
         dop = shot.get("gps_dop")
-        if shot.get("gps_position") is None or dop == NO_GNSS:
-            continue
-        xyz[i] = vector(path, f"image {label}, gps_position", shot["gps_position"], 3)
-        if dop is not None:
-            sigma[i] = json_number(path, f"image {label}, gps_dop", dop)
+        if shot.get("gps_position") is not None and dop != NO_GNSS:
+            xyz[i] = triple(shot["gps_position"])
+            sigma[i] = np.nan if dop is None else dop
     return xyz, sigma
 
 
-def _reference(path: Path, chosen: dict[str, Any]) -> tuple[float, float, float] | None:
+def _reference(path: Path, chosen: Any) -> tuple[float, float, float] | None:
     """Return latitude, longitude, height of the origin, from the file or the one beside it."""
     entry = chosen.get("reference_lla")
     beside = path.with_name("reference_lla.json")
@@ -232,21 +182,11 @@ def _reference(path: Path, chosen: dict[str, Any]) -> tuple[float, float, float]
         path, entry = beside, load_json(beside)
     if entry is None:
         return None
-    entry = mapping(path, "reference_lla", entry)
-    keys = ("latitude", "longitude", "altitude")
-    lat, lon, alt = rows(path, "reference_lla", [[entry.get(k) for k in keys]], 3)[0]
-    if abs(lat) > 90.0 or abs(lon) > 360.0:
-        raise InputError(f"{path}: reference_lla: {lat:g}, {lon:g} is no latitude and longitude.")
-    return None if lat == lon == 0.0 else (float(lat), float(lon), float(alt))
-
-
-def _listed(path: Path) -> list[str]:
-    """Return the images that the project was given, where it has kept the list."""
-    listed = path.with_name("image_list.txt")
-    if not listed.is_file():
-        return []
-    lines = listed.read_text("utf-8", errors="replace").splitlines()
-    return [PurePath(line.strip().replace("\\", "/")).name for line in lines if line.strip()]
+    with reading(path):
+        lat, lon, alt = (float(entry[key]) for key in ("latitude", "longitude", "altitude"))
+        if not (abs(lat) <= 90.0 and abs(lon) <= 360.0 and abs(alt) < np.inf):
+            raise damaged(path, f"reference_lla {lat:g}, {lon:g} is no latitude and longitude")
+    return None if lat == lon == 0.0 else (lat, lon, alt)
 
 
 HEADER = b"OPENSFM_TRACKS_VERSION"
@@ -256,16 +196,13 @@ CHUNK_BYTES = 1 << 24
 def read_tie_points(reconstruction: Reconstruction) -> TiePoints:
     """Return the points in the frame of the file, and where its images saw them."""
     path, cameras, _, points = reconstruction
-    if not points:
-        raise NoTiePointsError(f"{path}: has no tie points.")
     beside = path.with_name("tracks.csv")
-    if not beside.is_file():
-        raise NoTiePointsError(
-            f"{path}: there is no tracks.csv beside it, so its tie points have no rays."
-        )
-    entries = [mapping(path, f"point {k}", v).get("coordinates") for k, v in points.items()]
-    xyz = rows(path, "coordinates of a point", entries, 3)
-    point, camera, xy = _observations(beside, list(points), cameras.labels)
+    if not points or not beside.is_file():
+        why = "it has no points" if not points else "tracks.csv is not beside it"
+        raise tracks.no_tie_points(path, why)
+    xyz = np.array([point["coordinates"] for point in points.values()], float).reshape(-1, 3)
+    with reading(beside):
+        point, camera, xy = _observations(beside, list(points), cameras.labels)
     order = np.lexsort((camera, point))
     size = np.array([(lens.width, lens.height) for lens in cameras.lenses or ()])[camera]
     uv = xy * size.max(axis=1, initial=0.0)[:, None] + size / 2.0
@@ -284,26 +221,13 @@ def _observations(
     with path.open("rb") as stream:
         for block in _blocks(stream):
             lines = [line.split(b"\t", 5) for line in block.split(b"\n") if line.strip()]
-            short = next((fields for fields in lines if len(fields) < 5), None)
-            if short is not None:
-                raise InputError(
-                    f"{path}: the line beginning '{short[0][:40].decode(errors='replace')}' is cut"
-                    " off; copy the file again."
-                )
             point = np.array([point_of.get(fields[1], -1) for fields in lines], dtype=np.int64)
             camera = np.array([camera_of.get(fields[0], -1) for fields in lines], dtype=np.int64)
-            try:
-                values = [float(value) for fields in lines for value in fields[3:5]]
-            except ValueError as error:
-                raise InputError(
-                    f"{path}: x or y of an observation is not a number ({error})."
-                ) from error
-            if not np.isfinite(values).all():
-                raise InputError(f"{path}: x or y of an observation is not finite.")
+            values = np.array([fields[3:5] for fields in lines], dtype=float).reshape(-1, 2)
             keep = (point >= 0) & (camera >= 0)
-            parts.append((point[keep], camera[keep], np.array(values).reshape(-1, 2)[keep]))
+            parts.append((point[keep], camera[keep], values[keep]))
     if not parts:
-        raise InputError(f"{path}: is empty.")
+        raise damaged(path, "it is empty")
     point, camera, xy = (np.concatenate(column) for column in zip(*parts, strict=True))
     return point, camera, xy
 

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import astuple, replace
 from pathlib import Path
@@ -24,11 +25,17 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.errors import InputError
-from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import is_same_lens, json_number, write_new
-from pcfix.io.cameras.frames import frame_of, is_tied
-from pcfix.io.cameras.georeference import georeference
+from pcfix.io.cameras.checks import (
+    bad_label,
+    damaged,
+    is_same_lens,
+    lens_not_held,
+    needs_lenses,
+    unsupported,
+    write_new,
+    wrong,
+)
+from pcfix.io.cameras.georeference import frame_of, georeference, is_tied
 from pcfix.io.cameras.tracks import NO_TIE_POINTS, are_seen
 from pcfix.io.crs import (
     GEOCENTRIC_WGS84,
@@ -69,33 +76,26 @@ def lens(path: Path, name: str, camera: dict[str, Any]) -> Lens:
     """Return the lens of an entry of `cameras`."""
     model = str(camera.get("projection_type", "perspective"))
     if model not in _MODELS:
-        raise InputError(
-            f"{path}: camera {name}: the projection_type '{model}' is none that pcfix knows"
-            f" ({', '.join(_MODELS)})."
-        )
+        remedy = f"Use one of {', '.join(_MODELS)}"
+        what = f"the projection_type '{model}' of camera {name}"
+        raise unsupported(path, what, remedy, model=model, camera=name)
 
-    def value(key: str, default: float | None = 0.0) -> float:
-        found = camera.get(key, default)
-        if found is None:
-            raise InputError(f"{path}: camera {name} lacks {key}.")
-        return json_number(path, f"camera {name}, {key}", found)
+    def value(key: str, default: float = 0.0) -> float:
+        return float(camera.get(key, default))
 
     width, height = value("width"), value("height")
     named = _SIZE.search(name)  # the size, in old files
     if not (width and height) and named:
         width, height = float(named[1]), float(named[2])
     if not (width and height):
-        raise InputError(
-            f"{path}: camera {name}: the size of its images is missing; write their width and"
-            " height in pixels into this camera's entry."
-        )
+        raise damaged(path, f"the width and height of camera {name} are missing")
     scale = max(width, height)
-    fx = value("focal_x") if "focal_x" in camera else value("focal", None)
+    fx = float(camera["focal_x" if "focal_x" in camera else "focal"])
     fy = value("focal_y", fx) if "focal_x" in camera else fx
     keys = ("c_x", "c_y", "p1", "p2", "s0", "s1", "s2", "s3")
     cx, cy, p1, p2, *prism = (value(key) for key in keys)
     projection, radial = _MODELS[model]
-    found = Lens(
+    return Lens(
         *(fy * scale, width, height, width / 2.0 + cx * scale, height / 2.0 + cy * scale),
         b1=(fx - fy) * scale,
         projection=projection,
@@ -105,7 +105,6 @@ def lens(path: Path, name: str, camera: dict[str, Any]) -> Lens:
         thin_prism=tuple(prism) if model == "fisheye624" else (),
         sensor=name,
     )
-    return checks.lens(path, name, found)
 
 
 TRACKS_HEADER = "OPENSFM_TRACKS_VERSION_v2"
@@ -136,8 +135,12 @@ def write_opensfm(path: File, cameras: Cameras, tie_points: TiePoints | None = N
         If a file exists.
     """
     target = Path(path)
-    _check_whole(target, cameras)
-    models = {each: opensfm_camera(target, each) for each in dict.fromkeys(cameras.lenses or ())}
+    if cameras.rotations is None or cameras.lenses is None:
+        raise needs_lenses(target)
+    for label, count in Counter(cameras.labels).items():  # they are keys in the file
+        if count > 1 or "\t" in label or "\n" in label:
+            raise bad_label(target, label)
+    models = {each: opensfm_camera(target, each) for each in dict.fromkeys(cameras.lenses)}
     names = {each: f"pcfix {i}" for i, each in enumerate(models, start=1)}
     ties = tie_points or NO_TIE_POINTS
     kept = np.flatnonzero(are_seen(ties))
@@ -161,31 +164,13 @@ def write_opensfm(path: File, cameras: Cameras, tie_points: TiePoints | None = N
     write_new(target.parent, {name: text.encode() for name, text in texts.items()})
 
 
-def _check_whole(target: Path, cameras: Cameras) -> None:
-    """Refuse a block without rotations or lenses, and names that are no keys."""
-    if cameras.rotations is None or cameras.lenses is None:
-        raise InputError(f"{target}: a reconstruction needs rotations and lenses of all images.")
-    if len(set(cameras.labels)) < len(cameras):
-        raise InputError(
-            f"{target}: images are keys in OpenSfM's files, and"
-            f" {len(cameras) - len(set(cameras.labels))} names occur again; take another form."
-        )
-    for label in cameras.labels:
-        if "\t" in label or "\n" in label:
-            raise InputError(f"{target}: the image name {label!r} has no place in OpenSfM's files.")
-
-
 def opensfm_camera(path: Path, given: Lens) -> dict[str, Any]:
     """Return the simplest entry of `cameras` that is exactly this lens."""
     if given.unit == "px":
         for camera in _candidates(given):
             if is_same_lens(lens(path, "1", camera), given):
                 return camera
-    raise InputError(
-        f"{path}: OpenSfM has no camera model that holds the lens {given.sensor or 'of the images'}"
-        f" ({given.projection} in {given.unit}) exactly, so no reconstruction is written; take"
-        " another form."
-    )
+    raise lens_not_held(path, given)
 
 
 def _candidates(given: Lens) -> Iterator[dict[str, Any]]:
@@ -233,10 +218,8 @@ def _world(
     if is_topocentric(cameras.crs):
         return cameras, points, Topocentric.from_text(cameras.crs, name)
     if not parse_crs(cameras.crs, name).is_projected:
-        raise InputError(
-            f"{name}: the cameras are in {shortened(cameras.crs)}; bring them to a projected CRS"
-            " first."
-        )
+        sentence = f"the cameras are in {shortened(cameras.crs)}. Bring them to a projected CRS."
+        raise wrong(name, "output.crs", sentence, crs=cameras.crs)
     source, geographic = frame_of(cameras.crs, name).crs, parse_crs(GEOGRAPHIC_WGS84, name)
     stated = heights_of(source) != "unstated"
     to_degrees = transformation(source, geographic, cameras.centres, name, heights=stated).forward

@@ -11,9 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.errors import InputError
-from pcfix.io.cameras import checks
-from pcfix.io.cameras.pix4d.files import read_text
+from pcfix.io.cameras.checks import damaged
 from pcfix.lens.rotations import from_omega_phi_kappa
 from pcfix.model import FloatArray, Lens
 
@@ -27,7 +25,6 @@ FIELDS = {
     "position": "centre",
     "rotation": "rotation",
 }
-MOST_NUMBERS = 100
 SHAPE = re.compile(r"^(.*?)\s*\[\s*(\d{1,2})\s*x\s*(\d{1,2})\s*\]\s*$")
 SENSOR = re.compile(r"sensor width of\s*([-+.\deE]+)\s*x\s*([-+.\deE]+)")
 
@@ -48,6 +45,15 @@ class Calibration(NamedTuple):
     values: dict[str, list[float]]
 
 
+def read_text(path: Path) -> str:
+    """Return the text of a file; bytes that are not UTF-8 can only be in names."""
+    data = path.read_bytes()
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("latin-1")
+
+
 def read_parameters(path: Path) -> list[Image]:
     """Read the camera parameters; their layout is what the header names with sizes."""
     lines = [line for line in read_text(path).splitlines() if line.strip()]
@@ -63,7 +69,7 @@ def read_parameters(path: Path) -> list[Image]:
         image, row = _image(path, lines, row, layout)
         images.append(image)
     if not images:
-        raise InputError(f"{path}: has a header but no images.")
+        raise damaged(path, "has a header but no images")
     return images
 
 
@@ -74,12 +80,8 @@ def _layout(path: Path, header: list[str]) -> list[tuple[str, int]]:
         words = match[1].lower()
         name = next((name for word, name in FIELDS.items() if word in words), "")
         layout.append((name, int(match[2]) * int(match[3])))
-    total = sum(count for _, count in layout)
-    if not {("centre", 3), ("rotation", 9)} <= set(layout) or total > MOST_NUMBERS:
-        raise InputError(
-            f"{path}: the header does not name the fields 'camera position t [3x1]' and 'camera"
-            " rotation R [3x3]'; give calibrated_external_camera_parameters.txt instead."
-        )
+    if not {("centre", 3), ("rotation", 9)} <= set(layout):
+        raise damaged(path, "its header has no 'camera position t [3x1]' or 'rotation R [3x3]'")
     return layout
 
 
@@ -87,14 +89,7 @@ def _image(
     path: Path, lines: list[str], row: int, layout: list[tuple[str, int]]
 ) -> tuple[Image, int]:
     """Return the image that begins in a row, and the row after it."""
-    head = lines[row].rsplit(None, 2)
-    if len(head) != 3:
-        raise InputError(
-            f"{path}: '{lines[row].strip()[:60]}' should be the name, width and height of an"
-            " image; the file is cut off or damaged, export it again."
-        )
-    label = head[0].strip()
-    width, height = _numbers(path, f"image {head[0]}", head[1:]).tolist()
+    label, *size = lines[row].rsplit(None, 2)
     ends = np.cumsum([count for _, count in layout])
     words: list[str] = []
     row += 1
@@ -102,22 +97,20 @@ def _image(
         words += lines[row].split()
         row += 1
     if len(words) != ends[-1]:
-        raise InputError(
-            f"{path}: image {label}: has {len(words)} numbers instead of {ends[-1]}; the file is"
-            " cut off or damaged, export it again."
-        )
+        raise damaged(path, f"image {label}: {len(words)} numbers instead of {ends[-1]}")
+    width, height = _numbers(path, f"image {label}", size)
     parts = np.split(_numbers(path, f"image {label}", words), ends[:-1])
     fields = {name: part for (name, _), part in zip(layout, parts, strict=True) if name}
-    return Image(label, width, height, fields), row
+    return Image(label.strip(), float(width), float(height), fields), row
 
 
 def _numbers(path: Path, where: str, words: list[str]) -> FloatArray:
     try:
         values = np.array(words, dtype=float)
     except ValueError as error:
-        raise InputError(f"{path}: {where}: {error}; the file is damaged.") from error
+        raise damaged(path, f"{where}: {error}") from error
     if not np.isfinite(values).all():
-        raise InputError(f"{path}: {where}: has a number that is not finite.")
+        raise damaged(path, f"{where}: a number is not finite")
     return values
 
 
@@ -125,13 +118,7 @@ def read_external(path: Path) -> tuple[list[str], FloatArray, FloatArray]:
     """Read the absolute table: labels, centres (k, 3) and rotations (k, 3, 3)."""
     rows = [line.rsplit(None, 6) for line in read_text(path).splitlines()[1:] if line.strip()]
     if not rows:
-        raise InputError(f"{path}: has a header but no images.")
-    for row in rows:
-        if len(row) != 7:
-            raise InputError(
-                f"{path}: image {row[0]}: has {len(row) - 1} numbers instead of 6; the file is cut"
-                " off or damaged, export it again."
-            )
+        raise damaged(path, "has a header but no images")
     values = np.array([_numbers(path, f"image {row[0]}", row[1:]) for row in rows])
     rotations = from_omega_phi_kappa(*values[:, 3:].T)
     return [row[0].strip() for row in rows], values[:, :3], rotations
@@ -139,16 +126,12 @@ def read_external(path: Path) -> tuple[list[str], FloatArray, FloatArray]:
 
 def read_offsets(path: Path) -> list[tuple[str, FloatArray]]:
     """Read the offset: one line, or one for each group of images whose names begin alike."""
-    offsets = []
-    for line in read_text(path).replace(",", " ").splitlines():
-        words = line.split()
-        if words:
-            if len(words) < 3:
-                raise InputError(f"{path}: '{line.strip()[:60]}' is not an offset x y z.")
-            label = " ".join(words[:-3])
-            offsets.append((label, _numbers(path, "the offset", words[-3:])))
-    if not offsets:
-        raise InputError(f"{path}: is empty; it should have the offset x y z.")
+    lines = [line.split() for line in read_text(path).replace(",", " ").splitlines()]
+    offsets = [
+        (" ".join(words[:-3]), _numbers(path, "the offset", words[-3:])) for words in lines if words
+    ]
+    if not offsets or any(len(values) != 3 for _, values in offsets):
+        raise damaged(path, "it should have the offset x y z")
     return offsets
 
 
@@ -174,7 +157,7 @@ POWERS = ("p0", "p1", "p2", "p3", "p4")
 
 
 def lenses_of_images(
-    path: Path, images: list[Image], calibrations: list[Calibration]
+    images: list[Image], calibrations: list[Calibration]
 ) -> tuple[Lens, ...] | None:
     """Return the lens of each image; None when an image has none."""
     known: dict[object, Lens | None] = {}
@@ -183,7 +166,7 @@ def lenses_of_images(
         own = [(k, v.tobytes()) for k, v in image.fields.items() if k not in ("centre", "rotation")]
         key = (image.width, image.height, *own)
         if key not in known:
-            known[key] = _lens(path, image, calibrations)
+            known[key] = _lens(image, calibrations)
         lens = known[key]
         if lens is None:
             return None
@@ -191,7 +174,7 @@ def lenses_of_images(
     return tuple(lenses)
 
 
-def _lens(path: Path, image: Image, calibrations: list[Calibration]) -> Lens | None:
+def _lens(image: Image, calibrations: list[Calibration]) -> Lens | None:
     """Return the lens in pixels, from the block of the image or the only calibration."""
     fields: dict[str, list[float]] = {k: v.tolist() for k, v in image.fields.items()}
     matrix = fields.get("matrix", [])
@@ -207,10 +190,9 @@ def _lens(path: Path, image: Image, calibrations: list[Calibration]) -> Lens | N
             tangential=(t2, t1),
         )
     elif len(calibrations) == 1:
-        return lens_of_calibration(path, calibrations[0], image)
+        return lens_of_calibration(calibrations[0], image)
     else:
         return None
-    checks.lens(path, image.label, lens)
     return replace(lens, pixel_size_mm=_pixel_size_mm(lens, calibrations))
 
 
@@ -229,9 +211,7 @@ def _fisheye(
     )
 
 
-def lens_of_calibration(
-    path: Path, calibration: Calibration, image: Image | None = None
-) -> Lens | None:
+def lens_of_calibration(calibration: Calibration, image: Image | None = None) -> Lens | None:
     """Return the lens of a calibration: in pixels where an image tells how many, else in mm.
 
     A fisheye needs the image, as its matrix is in pixels and its principal point in mm. None
@@ -249,13 +229,12 @@ def lens_of_calibration(
         principal = (values["px"] * scale, values["py"] * scale)
         affine, polynomial = ([value[name] for name in names] for names in ("cdef", POWERS))
         lens = _fisheye(image, principal, affine, polynomial)
-        return replace(checks.lens(path, image.label, lens), pixel_size_mm=1.0 / scale)
-    lens = Lens(
+        return replace(lens, pixel_size_mm=1.0 / scale)
+    return Lens(
         *(values["f"], width_mm, height_mm, values["px"], values["py"]),
         radial=(value["k1"], value["k2"], value["k3"]),
         tangential=(value["t2"], value["t1"]),
     )
-    return checks.lens(path, "calibration", lens)
 
 
 def _pixel_size_mm(lens: Lens, calibrations: list[Calibration]) -> float | None:

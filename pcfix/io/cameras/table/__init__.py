@@ -37,19 +37,29 @@ its f, px, py and the order of t1, t2 are those of AliceVision's reader of the s
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from pcfix.errors import InputError
+from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.formats import Source
-from pcfix.io.cameras.table.attitude import read_rotations
-from pcfix.io.cameras.table.columns import EXIF, Columns, axes, headers, is_header, read_columns
+from pcfix.io.cameras.checks import wrong
+from pcfix.io.cameras.formats import Angles, Source
+from pcfix.io.cameras.table.columns import (
+    EXIF,
+    Columns,
+    axes,
+    column_missing,
+    headers,
+    is_header,
+    read_columns,
+)
 from pcfix.io.cameras.table.sensor import read_lenses, read_sensor
 from pcfix.io.crs import shortened
 from pcfix.io.tables import Table, number, read_lines
-from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray
+from pcfix.lens import rotations
+from pcfix.model import Cameras, FloatArray, GnssPositions
 
 __all__ = ["read", "read_sensor", "recognises"]
 
@@ -69,58 +79,39 @@ def read(source: Source) -> Cameras:
     """Read a table; see `pcfix.read_cameras`."""
     everything = open_table(source.path)
     suffix = "_est" if axes(everything.place, "_est") else ""
-    columns, unposed = _with_a_pose(everything, suffix)
+    columns, unposed = everything, tuple[str, ...]()
+    if suffix or are_by_gnss(everything):  # else a position that is not there is a mistake
+        lost = np.isnan(centres(everything, suffix)).any(axis=1)
+        if lost.all():
+            raise checks.no_pose(source.path, "no image has a position")
+        unposed = tuple(everything.labels[i] for i in np.flatnonzero(lost))
+        columns = everything.take(np.flatnonzero(~lost))
     xyz = centres(columns, suffix, needed=True)
-    rotations = read_rotations(columns, source.angles, suffix)
-    if rotations is None and source.sensor is not None:
-        raise InputError(
-            f"{columns.path}: has no yaw, pitch and roll or other angles, so the sensor"
-            f" {source.sensor} says nothing; add the angles or leave the sensor out."
-        )
-    lenses = None if rotations is None else read_lenses(columns, source.sensor)
-    keep, notes = _without_copies(columns, xyz)
+    turns = _rotations(columns, source.angles, suffix)
+    if turns is None and source.sensor is not None:
+        raise checks.sensor_unused(source, "no angles")
+    lenses = None if turns is None else read_lenses(columns, source.sensor)
+    first: dict[tuple[str, bytes], int] = {}  # labels are no key, but an exact copy counts once
+    for i, label in enumerate(columns.labels):
+        first.setdefault((label, xyz[i].tobytes()), i)
+    keep = np.array(list(first.values()))
+    notes = checks.repeated(columns.path, columns.labels, len(columns.labels) - len(keep))
     gnss = gnss_positions(columns) if suffix else None
     system, doubt = crs(columns)
-    not_adjusted = (
-        f"{columns.path}: its positions are those of the GNSS, not adjusted ones; export the poses"
-        " from the photogrammetry software if you can."
-    )
+    if are_by_gnss(columns):
+        sentence = f"{columns.path}: its positions are those of the GNSS, not adjusted ones."
+        doubt += (PcfixWarning("cameras.not_adjusted", sentence, path=columns.path),)
     return Cameras(
         labels=tuple(columns.labels[i] for i in keep),
         centres=xyz[keep],
-        rotations=None if rotations is None else rotations[keep],
+        rotations=None if turns is None else turns[keep],
         lenses=None if lenses is None else tuple(lenses[i] for i in keep),
         crs=system,
-        notes=(*notes, *doubt, *((not_adjusted,) if are_by_gnss(columns) else ())),
+        notes=(*notes, *doubt),
         gnss=gnss and GnssPositions(gnss.xyz[keep], gnss.sigma_m[keep], gnss.crs),
         unposed=unposed,
         source="CSV table",
     )
-
-
-def _with_a_pose(columns: Columns, suffix: str) -> tuple[Columns, tuple[str, ...]]:
-    """Return the rows with a position, and the images of the others.
-
-    In a table of poses a position that is not there is a mistake; in one of measurements, or of
-    adjusted beside measured values, it is an image that has none.
-    """
-    if not suffix and not are_by_gnss(columns):
-        return columns, ()
-    lost = np.isnan(centres(columns, suffix)).any(axis=1)
-    if lost.all():
-        raise InputError(f"{columns.path}: no image has a position; align the images first.")
-    unposed = tuple(columns.labels[i] for i in np.flatnonzero(lost))
-    return columns.take(np.flatnonzero(~lost)), unposed
-
-
-def _without_copies(columns: Columns, xyz: FloatArray) -> tuple[IntArray, tuple[str, ...]]:
-    """Return the rows to keep and what to tell: labels are no key, but a copy counts once."""
-    labels = columns.labels
-    first: dict[tuple[str, bytes], int] = {}
-    for i, label in enumerate(labels):
-        first.setdefault((label, xyz[i].tobytes()), i)
-    keep = np.array(list(first.values()))
-    return keep, checks.repeated(columns.path, labels, len(labels) - len(keep))
 
 
 WGS84, WGS84_ELLIPSOIDAL = "EPSG:4326", "EPSG:4979"
@@ -149,6 +140,8 @@ def gnss_positions(columns: Columns) -> GnssPositions | None:
 
 def centres(columns: Columns, suffix: str = "", *, needed: bool = False) -> FloatArray:
     """Return positions, shape (k, 3), NaN for rows without when they are not `needed`."""
+    from pyproj import CRS
+
     three = axes(columns.place, suffix)
     if three is None:
         return np.full((len(columns.labels), 3), np.nan)
@@ -158,25 +151,30 @@ def centres(columns: Columns, suffix: str = "", *, needed: bool = False) -> Floa
             texts = columns.table.column(columns.name(side))
             beyond = [text[:1].upper() in ("S", "W") for text in texts]
             xyz[beyond, i] = -np.abs(xyz[beyond, i])
-    if three[0].startswith("longitude") or _is_geographic(crs(columns)[0]):
-        for i, (longitude, latitude) in enumerate(xyz[:, :2]):
-            if abs(latitude) > 90.0 or abs(longitude) > 360.0:
-                raise InputError(
-                    f"{columns.where(i)}: longitude {longitude:g}, latitude {latitude:g} is no"
-                    " place on earth; are the columns swapped, or metres?"
-                )
+    system = crs(columns)[0] or "local"
+    if three[0].startswith("longitude") or (system != "local" and CRS(system).is_geographic):
+        bad = (np.abs(xyz[:, :2]) > [360.0, 90.0]).any(axis=1)
+        if bad.any():
+            i = int(np.argmax(bad))
+            sentence = (
+                f"longitude {xyz[i, 0]:g}, latitude {xyz[i, 1]:g} is no place on earth. Are the"
+                " columns swapped, or metres?"
+            )
+            raise wrong(columns.where(i), "cameras.degrees", sentence, path=columns.path)
     xyz[np.isnan(xyz).any(axis=1)] = np.nan
     return xyz
 
 
-def crs(columns: Columns) -> tuple[str | None, tuple[str, ...]]:
+def crs(columns: Columns) -> tuple[str | None, tuple[PcfixWarning, ...]]:
     """Return the CRS that a table says or shows, and what to tell about it.
 
     Longitude and latitude without more are those of WGS 84. Heights then are ellipsoidal only
     if the header calls them so; else the CRS has no heights. A ``.prj`` of the table's name beside
     it counts where the table itself says nothing.
     """
-    said = columns.crs or _beside(columns.path)
+    said, beside = columns.crs, columns.path.with_suffix(".prj")
+    if not said and beside != columns.path and beside.is_file():
+        said = beside.read_bytes().decode("utf-8-sig", errors="replace").strip() or None
     if said is None:
         if axes(columns.place) != ("longitude", "latitude", "z"):
             return None, ()
@@ -185,20 +183,12 @@ def crs(columns: Columns) -> tuple[str | None, tuple[str, ...]]:
     if said.startswith("LOCAL_CS"):
         return "local", ()
     if not checks.names_crs(said):
-        note = (
-            f"{columns.path}: its coordinate system '{shortened(said)}' is not understood; the"
-            " cloud's is assumed."
+        sentence = (
+            f"{columns.path}: PROJ does not know its CRS '{shortened(said)}'. The cloud's is"
+            " assumed."
         )
-        return None, (note,)
+        return None, (PcfixWarning("cameras.crs_unknown", sentence, crs=said),)
     return said, ()
-
-
-def _beside(path: Path) -> str | None:
-    """Return the CRS in the .prj of a table, None where there is none."""
-    projection = path.with_suffix(".prj")
-    if projection == path or not projection.is_file():
-        return None
-    return projection.read_bytes().decode("utf-8-sig", errors="replace").strip() or None
 
 
 def are_by_gnss(columns: Columns) -> bool:
@@ -219,8 +209,6 @@ def _read_geo(path: Path, lines: list[str]) -> Columns:
     rows, numbers = [], []
     for i, line in enumerate(lines[1:], start=2):
         fields = line.split()
-        if fields and len(fields) < 3:
-            raise InputError(f"{path}: line {i} has {len(fields)} fields; give image, x, y, z.")
         if fields:
             rows.append([*fields, *[""] * len(GEO)][: len(GEO)])
             numbers.append(i)
@@ -232,9 +220,124 @@ def _read_geo(path: Path, lines: list[str]) -> Columns:
     )
 
 
-def _is_geographic(name: str | None) -> bool:
-    if name is None or name == "local":
-        return False
-    from pyproj import CRS
+OMEGA_PHI_KAPPA = ("omega", "phi", "kappa")
+YAW_PITCH_ROLL = ("yaw", "pitch", "roll")
+QUATERNION = ("qw", "qx", "qy", "qz")
+MATRIX = tuple(f"r{i}{j}" for i in "123" for j in "123")
+AGREEMENT_DEG = 0.05
+"""Of angles with the matrix beside them; angles with two decimals pass."""
+LOOKS_DOWN_DEG = 80.0
+"""Largest tilt from the vertical of a camera that looks at the ground."""
 
-    return bool(CRS(name).is_geographic)
+
+def _rotations(columns: Columns, angles: Angles | None, suffix: str = "") -> FloatArray | None:
+    """Return world to camera rotations, or None where the table has nothing that turns.
+
+    `angles` is what the user says that they are, `suffix` is ``_est`` for adjusted values.
+    """
+    opk, ypr = (tuple(a + suffix for a in kind) for kind in (OMEGA_PHI_KAPPA, YAW_PITCH_ROLL))
+    for kind in (opk, ypr, QUATERNION, MATRIX):
+        there = [role for role in kind if columns.has(role)]
+        missing = [role for role in kind if not columns.has(role)]
+        if there and missing:
+            raise column_missing(columns.path, missing, columns.table.header)
+    if columns.has("alpha") or columns.has("nu"):
+        what = "a table with the angles alpha, nu, kappa"
+        raise checks.unsupported(columns.path, what, "Export omega, phi, kappa")
+    if angles is not None:
+        roles = opk if angles == "omega-phi-kappa" else ypr
+        if not columns.has(*roles):
+            raise column_missing(columns.path, roles, columns.table.header)
+        return FROM_ANGLES[angles](*columns.of(roles).T)
+    if columns.has(*opk):
+        return _from_omega_phi_kappa(columns, opk)
+    if columns.has(*QUATERNION):
+        return checks.quaternions(columns.path, columns.labels, columns.of(QUATERNION))
+    if columns.has(*MATRIX):
+        return _from_matrix(columns)
+    return _from_yaw_pitch_roll(columns, ypr) if columns.has(*ypr) else None
+
+
+FROM_ANGLES = {
+    "omega-phi-kappa": rotations.from_omega_phi_kappa,
+    "yaw-pitch-roll": rotations.from_yaw_pitch_roll,
+    "aircraft": rotations.from_aircraft,
+}
+
+
+def _from_omega_phi_kappa(columns: Columns, opk: Sequence[str]) -> FloatArray:
+    """Return rotations from the angles; a matrix beside them must be the same turn."""
+    place = columns.place
+    reality_capture = columns.after_hash and columns.name("label") == "name"
+    if place[opk[1]] < place[opk[0]] or reality_capture:
+        raise _ambiguous(
+            columns,
+            "omega, phi, kappa may be turns in another order here",
+            "Export heading, pitch, roll, or give --angles omega-phi-kappa",
+        )
+    found = rotations.from_omega_phi_kappa(*columns.of(opk).T)
+    if columns.has(*MATRIX) and opk == OMEGA_PHI_KAPPA:
+        half_chord = np.linalg.norm(found - _from_matrix(columns), axis=(1, 2)) / np.sqrt(8.0)
+        apart_deg = np.degrees(2.0 * np.arcsin(np.minimum(half_chord, 1.0)))
+        worst = int(np.argmax(apart_deg))
+        if apart_deg[worst] > AGREEMENT_DEG:
+            sentence = (
+                f"omega, phi, kappa and r11 to r33 are {apart_deg[worst]:.3g} degrees apart. Export"
+                " the table again."
+            )
+            raise wrong(
+                columns.where(worst),
+                "cameras.angles_differ",
+                sentence,
+                path=columns.path,
+                degrees=float(apart_deg[worst]),
+            )
+    return found
+
+
+def _from_matrix(columns: Columns) -> FloatArray:
+    """Return rotations from r11 ... r33, to axes either y up, z back or y down, z forward.
+
+    Both turn world to camera. Which one it is shows where the cameras look: at the ground.
+    """
+    matrices = columns.of(MATRIX).reshape(-1, 3, 3)
+    found = checks.rotations(columns.path, columns.labels, matrices)
+    back_is_up = found[:, 2, 2] > 0.0
+    if back_is_up.all():
+        return rotations.from_photogrammetric(found)
+    if back_is_up.any():
+        what = "r33 has both signs, so the axes of the camera are not clear"
+        raise _ambiguous(columns, what, "Give omega, phi, kappa")
+    return found
+
+
+def _from_yaw_pitch_roll(columns: Columns, ypr: Sequence[str]) -> FloatArray:
+    """Return rotations from angles of the view; what the header cannot say, the view must.
+
+    Refused are angles that are more likely those of a gimbal, which are -90 straight down.
+    """
+    values = columns.of(ypr).T
+    aircraft = rotations.from_aircraft(*values)
+    if columns.name(ypr[0]).startswith("gimbal"):
+        return aircraft
+    found = rotations.from_yaw_pitch_roll(*values)
+    if columns.after_hash and columns.name(ypr[0]) == "heading":  # RealityCapture's
+        return found
+    tilt, other = (  # the angles between the views and straight down
+        np.degrees(np.arctan2(np.hypot(each[:, 2, 0], each[:, 2, 1]), -each[:, 2, 2]))
+        for each in (found, aircraft)
+    )
+    if other.max() < LOOKS_DOWN_DEG and np.median(other) < np.median(tilt):
+        raise _ambiguous(
+            columns,
+            f"with yaw, pitch, roll that are 0 straight down the cameras look {np.median(tilt):.0f}"
+            f" degrees off the vertical, with those of a gimbal {np.median(other):.0f}",
+            "Give --angles yaw-pitch-roll or --angles aircraft",
+        )
+    return found
+
+
+def _ambiguous(columns: Columns, what: str, remedy: str) -> InputError:
+    """Return the error for angles that the table does not define."""
+    sentence = f"{columns.path}: {what}. {remedy}."
+    return InputError("cameras.angles", sentence, path=columns.path)

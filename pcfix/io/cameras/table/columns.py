@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.errors import InputError
+from pcfix.io.cameras.checks import wrong
 from pcfix.io.tables import Table, delimiter_of, number, read_lines, split_header, table_below
 from pcfix.model import FloatArray, IntArray
 
@@ -46,8 +47,6 @@ _OWN_NAMES = (
     *("f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2"),
     *(f"{role}_est" for role in POSE),
 )
-POSE = ("x", "y", "z", "longitude", "latitude", "yaw", "pitch", "roll", "omega", "phi", "kappa")
-
 SPELLINGS |= {name: (name,) for name in _OWN_NAMES}
 POSITION = {"label", "x", "y", "z", "longitude", "latitude", "tx", "ty", "tz"}
 POSITION |= {"x_est", "y_est", "z_est"}
@@ -122,33 +121,12 @@ def _split_unit(name: str) -> tuple[str, str]:
 _PLAIN = {spelling for spellings in SPELLINGS.values() for spelling in spellings}
 
 
-def refuse_two_of_a_kind(path: Path, line: int, names: list[str]) -> None:
-    """Refuse easting beside east; a column that is called by the role's own name counts."""
-    for role, spellings in SPELLINGS.items():
-        there = [name for name in names if name in spellings]
-        if len(there) > 1 and role not in MANY and (role not in there or there.count(role) > 1):
-            raise InputError(
-                f"{path}: line {line}: the columns {', '.join(there)} may all be {role}; take"
-                " out all but one."
-            )
-
-
-def require_position(path: Path, line: int, names: list[str]) -> None:
-    """Refuse a header without the name of the image or its position."""
-    place = known(names)
-    if "label" in place and (axes(place) or axes(place, "_est")):
-        return
-    if {"tx", "ty", "tz"} <= place.keys() and axes(place) is None:
-        raise InputError(
-            f"{path}: line {line} has tx, ty, tz, which may be a translation or a projection"
-            " centre; give the projection centres as x, y, z."
-        )
-    needed = ("label", "longitude", "latitude", "z") if "longitude" in place else ("label", *"xyz")
-    missing = [role for role in needed if role not in place]
-    raise InputError(
-        f"{path}: line {line} must name the columns {', '.join(needed)}; {', '.join(missing)}"
-        f" missing (it has: {', '.join(names)})."
+def column_missing(path: Path, missing: Sequence[str], header: Sequence[str]) -> InputError:
+    """Return the error for a table that lacks columns."""
+    sentence = (
+        f"the header lacks {', '.join(missing)}; it has {', '.join(header)}. Add the columns."
     )
+    return wrong(path, "table.column_missing", sentence, columns=list(missing))
 
 
 DEGREES = {
@@ -186,7 +164,8 @@ class Columns:
         labels = [row[self.place["label"]] for row in self.table.rows]
         if "" in labels:
             line = self.table.line[labels.index("")]
-            raise InputError(f"{self.path}: line {line}: the image has no name.")
+            sentence = f"line {line}: the image has no name. Give it one."
+            raise wrong(self.path, "table.no_label", sentence, line=line)
         if self.name("label") == "sourcefile":
             return [re.split(r"[\\/]", label)[-1] for label in labels]
         return labels
@@ -225,23 +204,18 @@ class Columns:
         values = np.array([read(text) for text in texts])
         for i in np.flatnonzero(~np.isfinite(values)):
             if needed or texts[i]:
-                raise InputError(
-                    f"{self.where(int(i))}, column {self.name(role)}: '{texts[i]}' is not a"
-                    " finite number."
-                )
-        return values * self._factor(role)
-
-    def _factor(self, role: str) -> float:
-        """Return what the unit of a column is in metres or degrees."""
+                name, line = self.name(role), self.table.line[i]
+                sentence = f"column {name}: '{texts[i]}' is not a finite number. Correct it."
+                where = {"path": self.path, "line": line, "value": texts[i]}
+                raise wrong(self.where(int(i)), "table.number", sentence, **where)
         base, unit = role.removesuffix("_est"), self.unit[self.place[role]]
         if base not in (*LENGTHS, *POSE):
-            return 1.0
+            return values
         known, wanted = (METRES, "metres") if base in LENGTHS else (DEGREES, "degrees")
         if unit not in known:
-            raise InputError(
-                f"{self.path}: column {self.name(role)} is in '{unit}'; give {wanted}."
-            )
-        return known[unit]
+            sentence = f"column {self.name(role)} is in '{unit}'. Give {wanted}."
+            raise wrong(self.path, "table.unit", sentence, value=unit)
+        return values * known[unit]
 
 
 def read_columns(path: Path) -> Columns:
@@ -249,13 +223,25 @@ def read_columns(path: Path) -> Columns:
     lines = read_lines(path)
     found = [header for header in headers(lines) if is_header(header.names)]
     if not found:
-        raise InputError(
-            f"{path}: line 1 must name the columns; put a header above the rows, for example"
+        sentence = (
+            "no line names the columns. Put a header above the rows, for example"
             " label,x,y,z,omega,phi,kappa."
         )
+        raise wrong(path, "table.no_header", sentence)
     at, names, unit, comment = found[-1]
-    refuse_two_of_a_kind(path, at + 1, names)
-    require_position(path, at + 1, names)
+    place = known(names)
+    for role, spellings in SPELLINGS.items():  # a column with the role's own name counts
+        alike = [name for name in names if name in spellings]
+        if len(alike) > 1 and role not in MANY and (role not in alike or alike.count(role) > 1):
+            sentence = f"the columns {', '.join(alike)} may all be {role}. Take out all but one."
+            raise wrong(path, "table.columns_alike", sentence, columns=alike)
+    if {"tx", "ty", "tz"} <= place.keys() and axes(place) is None:
+        sentence = "tx, ty, tz may be translations. Give the projection centres as x, y, z."
+        raise wrong(path, "table.translations", sentence)
+    if "label" not in place or not (axes(place) or axes(place, "_est")):
+        position = ("longitude", "latitude", "z") if "longitude" in place else ("x", "y", "z")
+        lacking = [role for role in ("label", *position) if role not in place]
+        raise column_missing(path, lacking, names)
     comments = comment or any(line.startswith("#") for line in lines[:at])
     below = next((line for line in lines[at + 1 :] if line.strip() and line[0] != "#"), "")
     delimiter = delimiter_of(below.strip()) if comment else split_header(lines[at].strip())[1]
@@ -263,7 +249,7 @@ def read_columns(path: Path) -> Columns:
     crs = next(
         (match[1].strip() for line in lines[:at] if (match := CRS_COMMENT.match(line))), None
     )
-    return Columns(table, known(names), unit, comment, crs)
+    return Columns(table, place, unit, comment, crs)
 
 
 def exif_number(text: str) -> float:

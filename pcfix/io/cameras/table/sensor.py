@@ -17,13 +17,12 @@ from pathlib import Path
 
 import numpy as np
 
-from pcfix.errors import InputError
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import is_same_lens, write_new
+from pcfix.io.cameras.checks import is_same_lens, write_new, wrong
 from pcfix.io.cameras.table.columns import Columns
 from pcfix.io.crs import is_topocentric
 from pcfix.io.files import check_input
-from pcfix.io.tables import Table, read_lines, read_table, split_header
+from pcfix.io.tables import read_lines, read_table, split_header
 from pcfix.model import Cameras, Lens
 from pcfix.options.declare import File
 
@@ -49,18 +48,33 @@ def read_sensor(path: Path) -> Lens:
     if _is_xml(check_input(path)):
         from pcfix.io.cameras.metashape import read_calibration
 
-        lens: Lens = read_calibration(path)
-        return lens
-    if _names(path) >= set(PIXELS):
-        return _from_pixels(read_table(path, PIXELS))
-    table = read_table(path, MILLIMETRES)
-    focal, width, height = (table.numbers(name)[0] for name in MILLIMETRES)
-    if len(table.rows) != 1 or min(focal, width, height) <= 0.0:
-        raise InputError(
-            f"{path}: give one row of positive focal, sensor_x and sensor_y in mm, not"
-            f" {len(table.rows)} row(s) beginning {focal:g}, {width:g}, {height:g}."
+        return read_calibration(path)
+    columns = PIXELS if _names(path) >= set(PIXELS) else MILLIMETRES
+    table = read_table(path, columns)
+    if len(table.rows) != 1:
+        sentence = f"has {len(table.rows)} rows. Give one row for all images."
+        raise wrong(path, "cameras.sensor_rows", sentence, rows=len(table.rows))
+
+    def value(name: str, default: float = 0.0) -> float:
+        return table.numbers(name)[0] if name in table.header else default
+
+    focal, width, height = map(value, columns)
+    lens = _centred_mm(focal, width, height)
+    if columns == PIXELS:
+        cx, cy = value("cx", width / 2.0), value("cy", height / 2.0)
+        k = [value(f"k{i}") for i in range(1, 7)]
+        lens = Lens(
+            *(focal, width, height, cx, cy),
+            radial=tuple(k[:3]),
+            denominator=tuple(k[3:]) if any(k[3:]) else (),
+            tangential=(value("p2"), value("p1")),
         )
-    return _centred_mm(focal, width, height)
+    checks.lens(path, path.stem, lens)
+    shares = lens.principal_x / width, lens.principal_y / height
+    if not all(0.25 < share < 0.75 for share in shares):
+        sentence = "cx, cy is far from the centre. Give pixels from the upper left corner."
+        raise wrong(path, "cameras.principal_point", sentence)
+    return lens
 
 
 def _centred_mm(focal: float, width: float, height: float) -> Lens:
@@ -68,80 +82,33 @@ def _centred_mm(focal: float, width: float, height: float) -> Lens:
 
 
 def read_lenses(columns: Columns, sensor: Path | None) -> tuple[Lens, ...]:
-    """Return the lens of each row."""
+    """Return the lens of each row: that of the sensor, or RealityCapture's own columns."""
     own = columns.has("f", "px", "py")
     path = sensor or columns.path.with_name("sensor.csv")
     if sensor is None and not path.is_file():
-        raise InputError(
-            f"{columns.path}: has the shape of no image: give --sensor a table with the columns"
-            " width_px,height_px."
-            if own
-            else f"{columns.path}: has angles, but there is no sensor: give --sensor, put"
-            " sensor.csv (focal,sensor_x,sensor_y in mm) beside it, or leave the angles out."
-        )
-    return _own_lenses(columns, path) if own else (read_sensor(path),) * len(columns.labels)
-
-
-def _own_lenses(columns: Columns, sensor: Path) -> tuple[Lens, ...]:
-    """Return the lenses of RealityCapture's table, whose sensor says only the shape."""
-    width, height = _frame(sensor)
-    largest = max(width, height)
-    rows = columns.of(("f", "px", "py"))
-    brown = np.nan_to_num(columns.where_there(DISTORTION))
-    seen: dict[bytes, Lens] = {}
-    lenses = []
-    for label, row in zip(columns.labels, np.hstack([rows, brown]), strict=True):
-        key = row.tobytes()
-        if key not in seen:
-            focal, x, y, *k = row.tolist()
-            lens = Lens(
-                *(focal * largest / FILM_MM, width, height),
-                *(width / 2.0 + x * largest, height / 2.0 + y * largest),
-                radial=tuple(k[:4]),
-                tangential=tuple(k[4:]),
-            )
-            seen[key] = checks.lens(columns.path, label, lens)
-        lenses.append(seen[key])
-    return tuple(lenses)
-
-
-def _frame(path: Path) -> tuple[float, float]:
-    """Return width and height of the images, pixels or millimetres."""
+        needed = "width_px,height_px" if own else "focal,sensor_x,sensor_y (mm)"
+        sentence = f"has angles but no sensor. Give --sensor a table with the columns {needed}."
+        raise wrong(columns.path, "cameras.sensor_missing", sentence, columns=needed)
+    if not own:
+        return (read_sensor(path),) * len(columns.labels)
     if not _is_xml(check_input(path)) and _names(path) >= set(FRAME):
         width, height = (read_table(path, FRAME).numbers(name)[0] for name in FRAME)
-        if min(width, height) <= 0.0:
-            raise InputError(
-                f"{path}: width_px {width:g} and height_px {height:g} must be positive."
-            )
-        return width, height
-    lens = read_sensor(path)
-    return lens.width, lens.height
-
-
-def _from_pixels(table: Table) -> Lens:
-    """Return the lens of a row in pixels, with OpenCV's names."""
-    if len(table.rows) != 1:
-        raise InputError(f"{table.path}: give one row for all images, not {len(table.rows)}.")
-
-    def value(name: str, default: float = 0.0) -> float:
-        return table.numbers(name)[0] if name in table.header else default
-
-    focal, width, height = (value(name) for name in PIXELS)
-    cx, cy = value("cx", width / 2.0), value("cy", height / 2.0)
-    k = [value(f"k{i}") for i in range(1, 7)]
-    lens = Lens(
-        *(focal, width, height, cx, cy),
-        radial=tuple(k[:3]),
-        denominator=tuple(k[3:]) if any(k[3:]) else (),
-        tangential=(value("p2"), value("p1")),
-    )
-    checks.lens(table.path, table.path.stem, lens)
-    if not (0.25 < cx / width < 0.75 and 0.25 < cy / height < 0.75):
-        raise InputError(
-            f"{table.path}: cx {cx:g}, cy {cy:g} is far from the centre; count them"
-            " in pixels from its upper left corner."
+    else:
+        lens = read_sensor(path)
+        width, height = lens.width, lens.height
+    largest = max(width, height)
+    brown = np.nan_to_num(columns.where_there(DISTORTION))
+    rows = [tuple(row) for row in np.hstack([columns.of(("f", "px", "py")), brown]).tolist()]
+    lenses = {
+        (focal, x, y, *k): Lens(
+            *(focal * largest / FILM_MM, width, height),
+            *(width / 2.0 + x * largest, height / 2.0 + y * largest),
+            radial=tuple(k[:4]),
+            tangential=tuple(k[4:]),
         )
-    return lens
+        for focal, x, y, *k in dict.fromkeys(rows)
+    }
+    return tuple(lenses[row] for row in rows)
 
 
 def _is_xml(path: Path) -> bool:
@@ -177,24 +144,33 @@ def write_table(folder: File, cameras: Cameras) -> None:
     """
     target = Path(folder)
     if cameras.rotations is None or cameras.lenses is None:
-        raise InputError(f"{target}: a table of poses needs rotations and lenses of all images.")
+        raise checks.needs_lenses(target)
     if cameras.crs is not None and is_topocentric(cameras.crs):
-        raise InputError(
-            f"{target}: a table cannot say that its axes are {cameras.crs}; bring the cameras to a"
-            " projected CRS first."
+        sentence = (
+            f"a table cannot hold the axes {cameras.crs}. Bring the cameras to a projected CRS"
+            " first."
         )
+        raise wrong(target, "output.crs", sentence, crs=cameras.crs)
     distinct = list(dict.fromkeys(cameras.lenses))
     if len(distinct) == 1:
         sensor, poses = _sensor(target, distinct[0]), _poses(cameras, None)
     else:
         frames = {(lens.width, lens.height, lens.unit) for lens in distinct}
         if len(frames) > 1 or distinct[0].unit != "px":
-            raise InputError(
-                f"{target}: a table of poses holds several lenses only in pixels and of one frame;"
-                " take another form."
+            sentence = (
+                "a table holds several lenses only in pixels and of one frame size. Take another"
+                " format."
             )
+            raise wrong(target, "output.lens", sentence)
         sensor = _row({"width_px": distinct[0].width, "height_px": distinct[0].height})
-        poses = _poses(cameras, [_own(target, lens) for lens in cameras.lenses])
+        side = max(distinct[0].width, distinct[0].height)
+        own = []
+        for lens in cameras.lenses:  # f, px, py, k1 ... k4, t1, t2 as RealityCapture has them
+            radial, _, tangential = _brown(target, lens, (4, 0, 2))
+            x, y = lens.principal_x - lens.width / 2.0, lens.principal_y - lens.height / 2.0
+            row = [lens.focal * FILM_MM / side, x / side, y / side, *radial, *tangential]
+            own.append(row)
+        poses = _poses(cameras, own)
     write_new(target, {"cameras.csv": poses.encode(), "sensor.csv": sensor.encode()})
 
 
@@ -228,14 +204,6 @@ def _sensor(target: Path, lens: Lens) -> str:
     return _row(values)
 
 
-def _own(target: Path, lens: Lens) -> list[float]:
-    """Return f, px, py, k1 ... k4, t1, t2 of one image, as RealityCapture's tables have them."""
-    radial, _, tangential = _brown(target, lens, (4, 0, 2))
-    largest = max(lens.width, lens.height)
-    x, y = lens.principal_x - lens.width / 2.0, lens.principal_y - lens.height / 2.0
-    return [lens.focal * FILM_MM / largest, x / largest, y / largest, *radial, *tangential]
-
-
 def _brown(target: Path, lens: Lens, counts: Sequence[int]) -> list[tuple[float, ...]]:
     """Return radial, denominator and tangential coefficients, so many, if they are the lens."""
     given = (lens.radial, lens.denominator, lens.tangential)
@@ -249,11 +217,7 @@ def _brown(target: Path, lens: Lens, counts: Sequence[int]) -> list[tuple[float,
 
 def _check_held(target: Path, lens: Lens, held: Lens) -> None:
     if not is_same_lens(lens, held):
-        raise InputError(
-            f"{target}: a table of poses cannot hold the lens {lens.sensor or 'of the images'}"
-            f" ({lens.projection}) exactly: it knows one focal length, the principal point and"
-            " OpenCV's k and p; take another form."
-        )
+        raise checks.lens_not_held(target, lens)
 
 
 def _row(values: dict[str, float]) -> str:

@@ -1,0 +1,442 @@
+"""OpenDroneMap: a project folder, its reconstruction.json or its shots.geojson.
+
+ODM reconstructs with OpenSfM and delivers its cloud in a projected CRS, named in proj.txt or in
+the first line of coords.txt. Its reconstruction has been in three frames:
+
+- up to 2020 topocentric as OpenSfM writes it, with geocoords_transformation.txt, an affine map
+  (turn by the meridian convergence, scale, shift) that makes projected coordinates of it, and so
+  of the cloud;
+- then with the axes of the projected CRS, less its coordinates of the reference; the reference is
+  at whole metres, which tells this frame from a true topocentric one;
+- topocentric again in versions that project the finished cloud point by point, and in
+  reconstruction.topocentric.json, which the second kind keeps.
+
+Where the reference is at whole metres, shots.geojson decides between the last two, or the GNSS
+positions (always topocentric). Poses come out in the projected CRS in the first two frames,
+topocentric in the third.
+
+shots.geojson has per image `translation`, the projection centre in the projected CRS, `rotation`,
+axis times angle from the axes of that CRS to the camera (x right, y down, z forward), and size and
+focal length, by which its lens is found in cameras.json (OpenSfM's models).
+
+References: "Outputs" in the ODM manual, https://docs.opendronemap.org/outputs; the stages
+`opensfm` and `odm_report` of https://github.com/OpenDroneMap/ODM.
+"""
+
+from __future__ import annotations
+
+import mmap
+import re
+from dataclasses import replace
+from pathlib import Path, PurePath
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pcfix.errors import PcfixWarning
+from pcfix.io.cameras import checks, opensfm
+from pcfix.io.cameras.checks import damaged, load_json, triple, wrong
+from pcfix.io.cameras.formats import Source
+from pcfix.io.cameras.opensfm.models import is_panorama, lens
+from pcfix.io.crs import GEOCENTRIC_WGS84, GEOGRAPHIC_WGS84, Topocentric
+from pcfix.lens.rotations import from_rotation_vectors
+from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, TiePoints
+
+SHOTS = "shots.geojson"
+RECONSTRUCTION = "reconstruction.json"
+TRANSFORMATION = "geocoords_transformation.txt"
+TOPOCENTRIC = "reconstruction.topocentric.json"
+ALIGNED_M = 0.1
+
+_FOLDERS = ("", "opensfm", "odm_georeferencing", "odm_georeferencing_25d", "odm_report")
+_OF_CRS = ("proj.txt", "coords.txt", "odm_georeferencing_model_geo.txt")
+_SHOTS_HEAD = re.compile(
+    r'\s*\{.*"features"\s*:\s*\[.*"(translation|rotation|filename)"', re.DOTALL
+)
+
+
+def recognises(source: Source) -> bool:
+    """Whether it is shots.geojson, or a reconstruction in a project of ODM."""
+    project = _locate(source.path)
+    if project.poses is None:
+        return False
+    found = Source(project.poses)
+    if _SHOTS_HEAD.match(found.text):
+        return True
+    if not opensfm.recognises(found):
+        return False
+    if any(project.find(name) for name in (*_OF_CRS, SHOTS, TOPOCENTRIC)):
+        return True
+    reference = _reference_of(project.poses)
+    return reference is not None and _whole_metres(*reference, None) is not None
+
+
+def read(source: Source) -> Cameras:
+    """Read the poses, of a folder rather from the reconstruction than from shots.geojson."""
+    project = _locate(source.path)
+    path = project.poses or project.root / RECONSTRUCTION
+    if not opensfm.recognises(Source(path)):
+        return _read_shots(project, path)
+    found = opensfm.read_reconstruction(path)
+    own, placed = found.cameras, _frame(project, found)
+    gnss, listed = read_images(project.find("images.json"), own.labels)
+    cameras = replace(
+        own,
+        centres=placed.points(own.centres),
+        rotations=placed.rotations(np.asarray(own.rotations)),
+        crs=placed.crs,
+        project_crs=placed.project_crs,
+        gnss=gnss or own.gnss,
+        unposed=opensfm.left_out(own.labels, [*own.unposed, *listed]),
+        source="OpenDroneMap",
+    )
+    return cameras if placed.project_crs else _compared(project, cameras)
+
+
+def tie_points(source: Source, cameras: Cameras) -> TiePoints:
+    """Read points and tracks, in the frame of the poses."""
+    project = _locate(source.path)
+    found = opensfm.read_reconstruction(project.poses or project.root / RECONSTRUCTION)
+    points = opensfm.read_tie_points(found)
+    return replace(points, xyz=_frame(project, found).points(points.xyz))
+
+
+class Project(NamedTuple):
+    """A project folder and the file in it that has the poses, shots.geojson or a reconstruction."""
+
+    root: Path
+    poses: Path | None
+
+    def find(self, name: str) -> Path | None:
+        """Return a file of this name beside the poses or in the project's own folders."""
+        folders = [self.poses.parent] if self.poses else []
+        folders += [self.root / folder for folder in _FOLDERS]
+        for folder in folders:
+            if (folder / name).is_file():
+                return folder / name
+        return None
+
+    def crs(self) -> str | None:
+        """Return the projected CRS that the project names."""
+        path = next(filter(None, map(self.find, _OF_CRS)), None)
+        return None if path is None else named_crs(path)
+
+
+def _locate(path: Path) -> Project:
+    """Return the project that a file or folder belongs to.
+
+    A file is taken as it is; of a folder its reconstruction, or else its shots.geojson.
+    """
+    folder = path if path.is_dir() else path.parent
+    root = folder
+    if root.name == "undistorted":
+        root = root.parent
+    if root.name in _FOLDERS[1:]:
+        root = root.parent
+    if not path.is_dir():
+        return Project(root, path)
+    places = [folder / RECONSTRUCTION, root / "opensfm" / RECONSTRUCTION]
+    places += [folder / SHOTS, root / "odm_report" / SHOTS]
+    return Project(root, next((place for place in places if place.is_file()), None))
+
+
+def _compared(project: Project, cameras: Cameras) -> Cameras:
+    """Return the cameras with a note where the project was moved after the reconstruction."""
+    truth, own = _in_shots(project, cameras)
+    apart = float(np.median(np.hypot(*(own - truth)[:, :2].T))) if len(own) else 0.0
+    if apart < ALIGNED_M:
+        return cameras
+    sentence = (
+        f"{project.poses}: its cameras are {apart:.2f} m from those of {project.find(SHOTS)}. If"
+        " the project was aligned to a reference, give shots.geojson, which fits its cloud."
+    )
+    note = PcfixWarning("cameras.shots_differ", sentence, metres=apart)
+    return replace(cameras, notes=(*cameras.notes, note))
+
+
+SCALE_TOLERANCE = 0.1
+"""Of the squared scale of a map projection; feet, or a matrix of nonsense, are outside."""
+
+_REFERENCE = re.compile(rb'"(latitude|longitude)"\s*:\s*(-?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)')
+
+
+class Frame(NamedTuple):
+    """The affine map from a reconstruction to `crs`: p -> matrix p + shift, metres."""
+
+    matrix: FloatArray
+    shift: FloatArray
+    crs: str
+    project_crs: str | None = None
+
+    def points(self, xyz: FloatArray) -> FloatArray:
+        """Return points in `crs`."""
+        return np.asarray(xyz @ self.matrix.T + self.shift)
+
+    def rotations(self, rotations: FloatArray) -> FloatArray:
+        """Return world to camera rotations in `crs`: the nearest ones, as the map scales a bit."""
+        u, _, v = np.linalg.svd(rotations @ np.linalg.inv(self.matrix))
+        return np.asarray(u @ v)
+
+
+def _frame(project: Project, found: opensfm.Reconstruction) -> Frame:
+    """Decide the frame; see the top of this module for the rules."""
+    crs = project.crs()
+    unmoved = Frame(np.eye(3), np.zeros(3), found.cameras.crs or "", crs)
+    if found.reference is None or found.path.name == TOPOCENTRIC:
+        return unmoved
+    transformation = project.find(TRANSFORMATION)
+    turned = _transformed(transformation, found.reference, crs) if transformation else None
+    if turned is not None:
+        return turned
+    whole = _whole_metres(*found.reference[:2], crs)
+    if whole is None:
+        return unmoved
+    crs, east, north = whole
+    moved = Frame(np.eye(3), np.array([east, north, 0.0]), crs)
+    if _is_topocentric(project, found.cameras, found.reference, moved):
+        return unmoved._replace(project_crs=crs)
+    return moved
+
+
+def _reference_of(path: Path) -> tuple[float, float] | None:
+    """Return latitude and longitude of a reconstruction's origin without reading all of it."""
+    with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as view:
+        at = view.find(b'"reference_lla"')
+        text = view[at : at + 400] if at >= 0 else b""
+    values = {key: float(value) for key, value in _REFERENCE.findall(text)[:2]}
+    return (values[b"latitude"], values[b"longitude"]) if len(values) == 2 else None
+
+
+def _in_shots(project: Project, cameras: Cameras) -> tuple[FloatArray, FloatArray]:
+    """Return the centres in shots.geojson and ours of the images that are in both."""
+    path = project.find(SHOTS)
+    there = _positions(path) if path is not None else {}
+    shared = [i for i, label in enumerate(cameras.labels) if label in there]
+    truth = np.array([there[cameras.labels[i]] for i in shared]).reshape(-1, 3)
+    return truth, cameras.centres[shared]
+
+
+def _transformed(
+    path: Path, reference: tuple[float, float, float], crs: str | None
+) -> Frame | None:
+    """Return the frame after geocoords_transformation.txt; None where it is of another origin."""
+    with checks.reading(path):
+        text = path.read_bytes()[:4096].decode("utf-8", errors="replace")
+        rows = [line.split()[:4] for line in text.splitlines() if line.strip()]
+        matrix = np.array(rows, float).reshape(4, 4)
+    turn, shift = matrix[:3, :3], matrix[:3, 3]
+    if not (np.abs(turn.T @ turn - np.eye(3)).max() <= SCALE_TOLERANCE):
+        raise damaged(path, "it does not turn and shift the reconstruction")
+    lat, lon, _ = reference
+    named = _crs_of_place(lon, lat, shift[0], shift[1], [crs] if crs else None)
+    return Frame(turn, shift, named) if named else None
+
+
+def _is_topocentric(
+    project: Project, cameras: Cameras, reference: tuple[float, float, float], moved: Frame
+) -> bool:
+    """Whether a reconstruction with its origin at whole metres was left as OpenSfM made it.
+
+    The centres of shots.geojson tell, or else the GNSS positions, which stay topocentric in any
+    case: the two readings differ by the meridian convergence and the scale.
+    """
+    truth, own = _in_shots(project, cameras)
+    if len(own) < 3 and cameras.gnss is not None:
+        known = np.isfinite(cameras.gnss.xyz).all(axis=1)
+        truth = _from_topocentric(cameras.gnss.xyz[known], reference, moved.crs)
+        own = cameras.centres[known]
+    if len(own) < 3:
+        return False
+    rmse = [
+        np.sqrt(np.mean((guess - truth)[:, :2] ** 2))
+        for guess in (_from_topocentric(own, reference, moved.crs), moved.points(own))
+    ]
+    return bool(rmse[0] < 0.5 * rmse[1])
+
+
+WHOLE_M = 2e-3
+"""Newer ODM puts the origin at whole metres; reference_lla is rounded a little."""
+
+
+def named_crs(path: Path) -> str:
+    """Return the CRS in the first line of a file: a PROJ string, EPSG:n or WGS84 UTM 16N."""
+    text = path.read_bytes()[:4096].decode("utf-8-sig", errors="replace").strip()
+    line = text.splitlines()[0].strip() if text else ""
+    crs = checks.utm_as_code(line)
+    if not checks.names_crs(crs):
+        raise wrong(
+            path, "cameras.crs", f"'{line[:80]}' names no CRS. Put its EPSG code there.", crs=line
+        )
+    return crs
+
+
+def _whole_metres(lat: float, lon: float, crs: str | None) -> tuple[str, float, float] | None:
+    """Return CRS, easting and northing where a reference is at whole metres of both.
+
+    The CRS is the one named, or else UTM, the zone of the reference or one beside it.
+    """
+    for candidate in [crs] if crs else _zones(lat, lon):
+        east, north = _projected(candidate, lon, lat)
+        if np.hypot(east - np.round(east), north - np.round(north)) < WHOLE_M:
+            return candidate, float(np.round(east)), float(np.round(north))
+    return None
+
+
+def _crs_of_place(
+    lon: float, lat: float, east: float, north: float, candidates: list[str] | None = None
+) -> str | None:
+    """Return the CRS (by default a UTM zone) in which a place has these coordinates, to a metre."""
+    for candidate in candidates or _zones(lat, lon):
+        if np.hypot(*(_projected(candidate, lon, lat) - np.array([east, north]))) < 1.0:
+            return candidate
+    return None
+
+
+def _from_topocentric(
+    xyz: FloatArray, reference: tuple[float, float, float], crs: str
+) -> FloatArray:
+    """Return topocentric points in a projected CRS, heights on the ellipsoid, shape (n, 3)."""
+    from pyproj import Transformer
+
+    to_degrees = Transformer.from_crs(GEOCENTRIC_WGS84, GEOGRAPHIC_WGS84, always_xy=True)
+    geographic = np.column_stack(
+        to_degrees.transform(*Topocentric(*reference).to_geocentric(xyz).T)
+    )
+    return np.column_stack([_projected(crs, *geographic[:, :2].T).T, geographic[:, 2]])
+
+
+def _zones(lat: float, lon: float) -> list[str]:
+    zone = int((lon + 180.0) // 6.0) if np.isfinite(lon) else 0
+    first = 32601 if lat >= 0.0 else 32701
+    return [f"EPSG:{first + (zone + step) % 60}" for step in (0, -1, 1)]
+
+
+def _projected(crs: str, lon: float | FloatArray, lat: float | FloatArray) -> FloatArray:
+    from pyproj import Transformer
+
+    return np.array(Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(lon, lat))
+
+
+SAME_FOCAL = 1e-6
+GNSS_KEYS = ("longitude", "latitude", "altitude", "gps_xy_stddev", "gps_z_stddev")
+
+
+def _read_shots(project: Project, path: Path) -> Cameras:
+    """Read the cameras of shots.geojson, in the projected CRS."""
+    with checks.reading(path):
+        shots = _shots(path)
+        turns = np.array([triple(shot["rotation"]) for shot in shots.values()])
+        centres = np.array(list(_positions(path).values()))
+    labels = tuple(shots)
+    lenses, notes = _lenses(project, path, shots)
+    gnss, listed = read_images(project.find("images.json"), labels)
+    return Cameras(
+        labels=labels,
+        centres=centres,
+        rotations=from_rotation_vectors(turns),
+        lenses=lenses,
+        crs=project.crs() or _crs_of_geometry(shots),
+        notes=notes,
+        gnss=gnss,
+        unposed=opensfm.left_out(labels, listed),
+        source="OpenDroneMap",
+    )
+
+
+def _positions(path: Path) -> dict[str, FloatArray]:
+    """Return the projection centre of every image of shots.geojson, metres."""
+    return {label: triple(shot["translation"]) for label, shot in _shots(path).items()}
+
+
+def read_images(
+    path: Path | None, labels: tuple[str, ...]
+) -> tuple[GnssPositions | None, list[str]]:
+    """Return the GNSS positions of images.json per label, and the names of all its images.
+
+    Longitude, latitude, and the altitude as the image states it.
+    """
+    if path is None:
+        return None, []
+    images = load_json(path)
+    with checks.reading(path):
+        names = [str(image.get("filename")) for image in images]
+        by_name = dict(zip(names, images, strict=True))
+        values = np.full((len(labels), len(GNSS_KEYS)), np.nan)
+        for i, label in enumerate(labels):
+            image = by_name.get(label) or by_name.get(PurePath(label).stem)
+            if image is not None and image.get("latitude") is not None:
+                values[i] = [np.nan if image.get(k) is None else image[k] for k in GNSS_KEYS]
+    values[~np.isfinite(values)] = np.nan
+    if np.isnan(values[:, :3]).all():
+        return None, names
+    return GnssPositions(values[:, :3], values[:, [3, 3, 4]], "EPSG:4326"), names
+
+
+def _shots(path: Path) -> dict[str, dict[str, Any]]:
+    """Return the properties of every feature by file name, with its `geometry`."""
+    features = load_json(path)["features"]
+    shots = {
+        str(feature["properties"]["filename"]): {
+            **feature["properties"],
+            "geometry": feature.get("geometry"),
+        }
+        for feature in features
+    }
+    if not shots or len(shots) < len(features):
+        raise damaged(path, f"{len(features)} features have {len(shots)} different filenames")
+    return shots
+
+
+def _lenses(
+    project: Project, path: Path, shots: dict[str, dict[str, Any]]
+) -> tuple[tuple[Lens, ...], tuple[PcfixWarning, ...]]:
+    """Return the lens of each shot, and a note where cameras.json does not have it."""
+    beside = project.find("cameras.json")
+    known = {}
+    if beside is not None:
+        with checks.reading(beside):
+            entries = load_json(beside).items()
+            known = {k: lens(beside, k, entry) for k, entry in entries if not is_panorama(entry)}
+    lenses, plain = [], 0
+    for shot in shots.values():
+        width, height, focal = (float(shot[key]) for key in ("width", "height", "focal"))
+        found = _match(known, str(shot.get("camera")), width, height, focal)
+        if found is None:
+            plain += 1
+            focal_px = focal * max(width, height)
+            found = Lens(focal_px, width, height, width / 2.0, height / 2.0)
+        lenses.append(found)
+    sentence = (
+        f"{path}: cameras.json has no camera of the size and focal length of {plain} images. Their"
+        " lens is taken as free of distortion."
+    )
+    note = PcfixWarning("cameras.no_distortion", sentence, images=plain)
+    return tuple(lenses), (note,) if plain else ()
+
+
+def _match(
+    known: dict[str, Lens], name: str, width: float, height: float, focal: float
+) -> Lens | None:
+    """Return the lens of the camera a shot names, or else of the only one that is alike."""
+    if name in known:
+        return known[name]
+    fits = [
+        found
+        for found in known.values()
+        if (found.width, found.height) == (width, height)
+        and abs((found.focal + found.b1) / max(width, height) - focal) < SAME_FOCAL
+    ]
+    return fits[0] if len(fits) == 1 else None
+
+
+def _crs_of_geometry(shots: dict[str, dict[str, Any]]) -> str:
+    """Return the UTM zone that takes a shot's longitude and latitude to its translation.
+
+    A project without GNSS has made-up coordinates, which fit no zone.
+    """
+    shot = next(iter(shots.values()))
+    place = (shot["geometry"] or {}).get("coordinates")
+    if place is None:
+        return "local"
+    (lon, lat, _), (east, north, _) = triple(place), triple(shot["translation"])
+    return _crs_of_place(lon, lat, east, north) or "local"

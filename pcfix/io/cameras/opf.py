@@ -1,0 +1,337 @@
+"""OPF, the Open Photogrammetry Format of PIX4Dmatic and PIX4Dcatch: a project and its parts.
+
+The project (``.opf``, JSON) names files by item and format. Of the item `calibration` come the
+calibrated cameras and the tracks; `input_cameras` has frames, pixel sizes and what the GNSS said;
+`camera_list` the names of the images; `scene_reference_frame` the CRS.
+
+Poses are in the processing CRS, which is right-handed and isometric: coordinates of the project's
+CRS times `scale`, with x and y exchanged where that is left-handed (`swap_xy`), plus `shift`. So
+its axes are east, north, up, as `Cameras` has them of a CRS with northing before easting too. A CRS
+without heights has ellipsoidal ones, in the unit of its plan. Omega, phi, kappa: Rx Ry Rz turns
+image axes x right, y up, z back to the processing CRS.
+
+Pixels start at the corner of the image; T1 and T2 are in OpenCV's order. A fisheye has an affine
+matrix [c d; e f] and a polynomial of 2 theta / pi, as in `pcfix.io.cameras.pix4d`.
+
+Tracks are a glTF model with its buffers beside it: positions in the axes of each node, whose matrix
+leads to y up (so processing x, y, z are its x, -z, y), and for each point 40 bits that say where
+its matches begin and 24 how many they are.
+
+Reference: Pix4D, "Open Photogrammetry Format Specification" 1.0, https://pix4d.github.io/opf-spec.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+from urllib.parse import unquote
+
+import numpy as np
+
+from pcfix.errors import PcfixWarning
+from pcfix.io.cameras import checks, tracks
+from pcfix.io.cameras.checks import load_json, triple, wrong
+from pcfix.io.cameras.formats import Source
+from pcfix.io.crs import crs_text, parse_crs, plan_unit
+from pcfix.lens.rotations import from_omega_phi_kappa
+from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, TiePoints
+
+FORMAT = "application/opf-{}+json"
+PROJECT = FORMAT.format("project")
+Part = dict[str, Any]
+"""An object of a JSON file."""
+
+
+def recognises(source: Source) -> bool:
+    """Whether a file is a project or calibrated cameras, or a folder holds a project."""
+    if source.path.is_dir():
+        return any(name.endswith(".opf") for name in source.names)
+    return '"application/opf-' in source.text or (
+        '"orientation_deg"' in source.text and '"sensor_id"' in source.text
+    )
+
+
+def read(source: Source) -> Cameras:
+    """Read calibrated poses and lenses, in the CRS of the project."""
+    project = _open_project(source.path)
+    path, calibrated = project.part("calibration", "calibrated-cameras")
+    _, given = project.part("input_cameras", "input-cameras", needed=False)
+    frame, names = _frame_of(project), _image_names(project)
+    shots = {shot["id"]: shot for shot in calibrated["cameras"]}
+    labels = tuple(names.get(i, f"camera {i}") for i in shots)
+    xyz = np.array([triple(shot["position"]) for shot in shots.values()]).reshape(-1, 3)
+    angles = np.array([triple(s["orientation_deg"]) for s in shots.values()]).reshape(-1, 3)
+    lenses, notes = _lenses(path, calibrated, given)
+    captured = [
+        shot["id"] for capture in given.get("captures", []) for shot in capture.get("cameras", [])
+    ]
+    if any(shot.get("rolling_shutter") for shot in shots.values()):
+        sentence = f"{path}: its rolling shutter is ignored, each image has one pose."
+        notes += (PcfixWarning("cameras.rolling_shutter", sentence, path=path),)
+    return Cameras(
+        labels=labels,
+        centres=frame.enter(xyz),
+        rotations=from_omega_phi_kappa(*angles.T) if len(shots) else None,
+        lenses=lenses,
+        crs=frame.crs,
+        project_crs=frame.project_crs,
+        notes=(*frame.notes, *notes, *checks.repeated(path, labels)),
+        gnss=_gnss(path, given, list(shots)),
+        unposed=tuple(names.get(i, f"camera {i}") for i in captured if i not in shots),
+        source=" ".join(["OPF", *project.generator]),
+    )
+
+
+class Project(NamedTuple):
+    """The list of items of a project, and what wrote it."""
+
+    path: Path
+    items: list[Part]
+    generator: tuple[str, ...]
+
+    def files(self, kind: str, form: str) -> list[Path]:
+        """Return the files of a format that items of a kind have."""
+        return [
+            self.path.parent / unquote(resource["uri"])
+            for item in self.items
+            if item.get("type") == kind
+            for resource in item.get("resources", [])
+            if resource.get("format") == form
+        ]
+
+    def part(self, kind: str, form: str, *, needed: bool = True) -> tuple[Path, Part]:
+        """Return the one file of a format and what it holds; nothing where it is not needed."""
+        found = self.files(kind, FORMAT.format(form))
+        if not found and not needed:
+            return self.path, {}
+        if len(found) != 1:
+            raise checks.damaged(self.path, f"{len(found)} files of {form} instead of one")
+        if not found[0].is_file():
+            raise checks.missing(found[0])
+        return found[0], load_json(found[0])
+
+
+def _open_project(path: Path) -> Project:
+    """Read the project that a path is, that lies in a folder, or that a part belongs to."""
+    if path.is_dir():
+        found = sorted(path.glob("*.opf"))
+    else:
+        content = load_json(path)
+        if content.get("format") == PROJECT:
+            generator = content.get("generator", {})
+            said = tuple(str(generator[name]) for name in ("name", "version") if name in generator)
+            return Project(path, content["items"], said)
+        above = path.resolve().parent
+        found = [*sorted(above.glob("*.opf")), *sorted(above.parent.glob("*.opf"))]
+    if len(found) != 1 or found[0] == path:
+        sentence = (
+            f"belongs to an OPF project, of which {len(found)} are there. Give the project file"
+            " (.opf) that goes with the cloud."
+        )
+        raise wrong(path, "cameras.several_projects", sentence, projects=len(found))
+    return _open_project(found[0])
+
+
+def _image_names(project: Project) -> dict[int, str]:
+    """Return the names of the images by their ids; of a page of a file with its number."""
+    names = {}
+    for path in project.files("camera_list", FORMAT.format("camera-list")):
+        for camera in load_json(path)["cameras"] if path.is_file() else []:
+            name = camera["uri"].replace("\\", "/").rpartition("/")[2]
+            names[camera["id"]] = unquote(name.removesuffix("#page=0"))
+    return names
+
+
+class Frame(NamedTuple):
+    """The way from the processing CRS to coordinates east, north, up of the project's."""
+
+    crs: str
+    project_crs: str | None
+    shift: FloatArray
+    scale: FloatArray
+    notes: tuple[PcfixWarning, ...] = ()
+
+    def enter(self, xyz: FloatArray) -> FloatArray:
+        """Return points (n, 3) in the CRS of the project."""
+        return np.asarray((xyz - self.shift) / self.scale)
+
+
+def _frame_of(project: Project) -> Frame:
+    """Read the scene reference frame."""
+    path, scene = project.part("scene_reference_frame", "scene-reference-frame", needed=False)
+    if not scene:  # the frame of the processing is arbitrary
+        return Frame("local", None, np.zeros(3), np.ones(3))
+    way = scene["base_to_canonical"]
+    shift, scale = triple(way["shift"]), triple(way["scale"])
+    if not (scale > 0.0).all():
+        raise checks.damaged(path, f"the scale {scale.tolist()} is not positive")
+    if way.get("swap_xy"):
+        scale = scale[[1, 0, 2]]  # positions are east, north already, scales in the CRS's order
+    said = checks.crs(path, scene["crs"]["definition"])
+    crs, unit = (said, 1.0) if said == "local" else _with_heights(said, str(path))
+    geoid_m = float(scene["crs"].get("geoid_height") or 0.0)
+    notes: tuple[PcfixWarning, ...] = ()
+    if geoid_m:
+        sentence = (
+            f"{path}: its heights are above a constant geoid, {geoid_m:g} m over the ellipsoid, and"
+            " taken for those that its CRS names."
+        )
+        notes = (PcfixWarning("cameras.constant_geoid", sentence, geoid_m=geoid_m),)
+    project_crs = None if crs == said else said
+    return Frame(crs, project_crs, shift, scale / [1.0, 1.0, unit], notes)
+
+
+def _with_heights(text: str, name: str) -> tuple[str, float]:
+    """Return a CRS, ellipsoidal heights in metres added if need be, and metres in what was one."""
+    crs = parse_crs(text, name)
+    if len(crs.axis_info) != 2:
+        return text, 1.0
+    return crs_text(crs.to_3d()), 1.0 if crs.is_geographic else plan_unit(crs)[1]
+
+
+def _lenses(
+    path: Path, calibrated: Part, given: Part
+) -> tuple[tuple[Lens, ...] | None, tuple[PcfixWarning, ...]]:
+    """Return the lens of each image, or None and a note where one has no frame."""
+    sensors = {sensor["id"]: sensor for sensor in given.get("sensors", [])}
+    known = {
+        sensor["id"]: _lens(path, sensor, sensors[sensor["id"]])
+        for sensor in calibrated["sensors"]
+        if "image_size_px" in sensors.get(sensor["id"], {})
+    }
+    used = [shot["sensor_id"] for shot in calibrated["cameras"]]
+    lost = next((i for i in used if i not in known), None)
+    if lost is None:
+        return tuple(known[i] for i in used) or None, ()
+    return None, (checks.without_lens(path, f"the input cameras have no frame of sensor {lost}"),)
+
+
+def _lens(path: Path, sensor: Part, given: Part) -> Lens:
+    """Return the calibrated lens of a sensor, with the frame of the input cameras."""
+    width, height = map(float, given["image_size_px"])
+    inner, name = sensor["internals"], str(given.get("name") or f"sensor {sensor['id']}")
+    x, y = map(float, inner["principal_point_px"])
+    if inner.get("type") == "perspective":
+        t1, t2 = map(float, inner["tangential_distortion"])
+        radial = tuple(triple(inner["radial_distortion"]).tolist())
+        focal = float(inner["focal_length_px"])
+        lens = Lens(focal, width, height, x, y, radial=radial, tangential=(t2, t1))
+    elif inner.get("type") == "fisheye":
+        c, d, e, f = map(float, inner["affine"])
+        shape = tuple(map(float, inner["polynomial"]))
+        lens = Lens(f, width, height, x, y, c - f, d, e, projection="polynomial", shape=shape)
+    else:
+        what = f"the type {inner.get('type')!r:.40} of sensor {name}"
+        remedy = "Leave its images out and calibrate again"
+        raise checks.unsupported(path, what, remedy, sensor=name)
+    pixel_um = float(given.get("pixel_size_um", 0))
+    return replace(lens, sensor=name, pixel_size_mm=pixel_um / 1000.0 if pixel_um > 0.0 else None)
+
+
+def _gnss(path: Path, given: Part, ids: list[int]) -> GnssPositions | None:
+    """Return where captures were taken, at their reference cameras, in the CRS of the first."""
+    found = {
+        ids.index(capture["reference_camera_id"]): capture["geolocation"]
+        for capture in given.get("captures", [])
+        if capture.get("geolocation") and capture.get("reference_camera_id") in ids
+    }
+    text = next((place["crs"]["definition"] for place in found.values()), "local")
+    if checks.crs(path, text) == "local":
+        return None
+    crs = parse_crs(text, str(path))
+    order = [1, 0, 2] if crs.axis_info[0].direction.lower() == "north" else [0, 1, 2]
+    said, up_m = _with_heights(text, str(path))
+    unit_m = 1.0 if crs.is_geographic else plan_unit(crs)[1]
+    xyz, sigma_m = np.full((2, len(ids), 3), np.nan)
+    for row, place in found.items():
+        if place["crs"]["definition"] == text:
+            xyz[row] = triple(place["coordinates"])[order] * [1.0, 1.0, up_m]
+            sigma_m[row] = triple(place["sigmas"])[order] * unit_m
+    return GnssPositions(xyz, sigma_m, said)
+
+
+COMPONENTS = {"5121": "u1", "5123": "<u2", "5125": "<u4", "5126": "<f4"}
+MATCHES = "OPF_mesh_primitive_matches"
+OFFSET_BITS = 40
+
+
+class Matches(NamedTuple):
+    """Points of a node, and of each match its point, its camera (-1: not posed) and its place."""
+
+    xyz: FloatArray
+    point: IntArray
+    camera: IntArray
+    uv: FloatArray
+
+
+def tie_points(source: Source, cameras: Cameras) -> TiePoints:
+    """Read the tracks of the calibration."""
+    project = _open_project(source.path)
+    _, calibrated = project.part("calibration", "calibrated-cameras")
+    row_of = {shot["id"]: i for i, shot in enumerate(calibrated["cameras"])}
+    models = project.files("calibration", "model/gltf+json")
+    found = [node for model in models for node in _nodes(model, row_of)]
+    if not any((node.camera >= 0).any() for node in found):
+        raise tracks.no_tie_points(project.path, "its calibration has no tracks in its images")
+    before = np.cumsum([0, *(len(node.xyz) for node in found)])
+    return tracks.tie_points(
+        _frame_of(project).enter(np.concatenate([node.xyz for node in found])),
+        np.concatenate([node.point + n for node, n in zip(found, before, strict=False)]),
+        np.concatenate([node.camera for node in found]),
+        np.concatenate([node.uv for node in found]),
+    )
+
+
+def _nodes(path: Path, row_of: dict[int, int]) -> Iterator[Matches]:
+    """Yield the points and matches of the nodes of a model."""
+    if not path.is_file():
+        raise checks.missing(path)
+    with checks.reading(path):
+        model = load_json(path)
+        for node in model.get("nodes", []):
+            for primitive in model["meshes"][node["mesh"]]["primitives"]:
+                matches = primitive.get("extensions", {}).get(MATCHES, {})
+                images = matches.get("imagePoints", {})
+                if "pixelCoordinates" in images:
+                    xyz = _accessor(path, model, primitive["attributes"]["POSITION"], 3)
+                    uv = _accessor(path, model, images["pixelCoordinates"], 2)
+                    at, point, camera = _matched(path, model, matches, row_of)
+                    if len(point) and point.max() >= len(xyz):
+                        raise checks.damaged(path, "its matches are of points that are not there")
+                    matrix = np.array(node.get("matrix", np.eye(4).ravel()), float).reshape(4, 4).T
+                    x, y, z = (xyz.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]).T
+                    z_up = np.column_stack([x, -z, y])  # the model itself has y up
+                    yield Matches(z_up, point, camera, uv[at].astype(np.float64))
+
+
+def _matched(
+    path: Path, model: Part, matches: Part, row_of: dict[int, int]
+) -> tuple[IntArray, IntArray, IntArray]:
+    """Return the rows of matches that points have, which point each is of, and its camera."""
+    ranges = _accessor(path, model, matches["pointIndexRanges"], 2).astype(np.uint64)
+    packed = ranges[:, 0] | ranges[:, 1] << np.uint64(32)
+    first = (packed & np.uint64(2**OFFSET_BITS - 1)).astype(np.int64)
+    count = (packed >> np.uint64(OFFSET_BITS)).astype(np.int64)
+    index = _accessor(path, model, matches["cameraIds"], 1)[:, 0].astype(np.int64)
+    rows = np.array([row_of.get(i, -1) for i in matches["cameraUids"]], np.int64)
+    if (first + count > len(index)).any():  # before so many are asked for
+        raise checks.damaged(path, "its points have more matches than there are")
+    point = np.repeat(np.arange(len(count)), count)
+    at = np.arange(len(point)) + np.repeat(first - (np.cumsum(count) - count), count)
+    return at, point, rows[index[at]]
+
+
+def _accessor(path: Path, model: Part, index: int, width: int) -> Any:
+    """Return the rows of an accessor, from the file of its buffer."""
+    accessor = model["accessors"][index]
+    view = model["bufferViews"][accessor["bufferView"]]
+    where = path.parent / unquote(model["buffers"][view["buffer"]]["uri"])
+    if not where.is_file():
+        raise checks.missing(where)
+    with checks.reading(where):
+        kind, count = COMPONENTS[str(accessor["componentType"])], accessor["count"]
+        start = view.get("byteOffset", 0)
+        values = np.frombuffer(where.read_bytes(), kind, count * width, start)
+        return values.reshape(count, width)
