@@ -81,10 +81,6 @@ def test_measured_tie_points_that_are_not_there(refuse):
     has(refuse("bare", more=["--ties=measured", "--cloud=cloud.las"]), "0 usable tie points")
 
 
-def test_the_engine_that_is_gone(refuse):
-    has(refuse(more=["--engine=colmap"]), "0.1.0", "COLMAP's engine", "--engine")
-
-
 def test_no_datum_at_all(refuse):
     message = refuse(gnss=False)
     has(message, "shift in plan, turn and scale stay undetermined", "--gnss", "--gcps",

@@ -132,7 +132,7 @@ def test_the_input_is_not_changed() -> None:
 @pytest.mark.parametrize(
     ("choice", "message"),
     [
-        ({"neighbours": 5}, "neighbours 5 must be a whole number at least 6"),
+        ({"neighbours": 5}, "neighbours 5 must be at least 6"),
         ({"neighbours": 20.5}, "neighbours 20.5"),
         ({"deviations": 0.0}, "deviations 0.0 must be above 0"),
         ({"deviations": np.nan}, "deviations nan"),
@@ -143,7 +143,7 @@ def test_the_input_is_not_changed() -> None:
         ({"max_incidence": 91.0}, "max-incidence 91.0 must be above 0 and at most 90"),
         ({"bed_neighbours": 501}, "bed-neighbours 501"),
         ({"fences": 0.0}, "fences 0.0"),
-        ({"below": "deep"}, "below deep"),
+        ({"below": "deep"}, "below 'deep'"),
         ({"floating": -0.1}, "floating -0.1"),
         (
             {
@@ -154,7 +154,7 @@ def test_the_input_is_not_changed() -> None:
                 "below": None,
                 "floating": None,
             },
-            "No test is left",
+            "All tests are off",
         ),
     ],
 )

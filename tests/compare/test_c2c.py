@@ -291,4 +291,4 @@ def test_the_command_leaves_figures_picture_and_sections(tmp_path, both, correct
         assert next(csv.reader(stream))[-1] == "Dietrich_m"
     done = run_pcfix("compare", corrected, LIDAR, "--share", "-1,2")
     assert done.returncode == 1
-    assert done.stderr.startswith("pcfix: share '-1,2' must be two distances LOW,HIGH")
+    assert done.stderr.startswith("pcfix: share '-1,2' must be LOW,HIGH")

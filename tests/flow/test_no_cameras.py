@@ -89,14 +89,14 @@ def test_every_door_gives_the_same(folder, method):
 
 REFUSED = {
     "another method": ({"method": "snell"}, "cameras are missing: method snell goes along"),
-    "no method": ({}, "cameras are missing: method auto goes along their rays"),
+    "no method": ({}, "cameras are missing: method auto needs them"),
     "a factor of theirs": (
         {"method": "factor", "depth_factor": "auto"}, "cameras are missing: depth-factor auto",
     ),
-    "views": ({"method": "factor", "views": "list.ply"}, "views is about cameras, and there are"),
-    "occlusion": ({"method": "factor", "occlusion": "on"}, "occlusion is about cameras"),
-    "a limit": ({"method": "factor", "max_angle": 30.0}, "max-angle is about cameras"),
-    "a tide": ({"method": "factor", "tide": "tide.csv"}, "tide is about cameras"),
+    "views": ({"method": "factor", "views": "list.ply"}, "views has no effect without cameras"),
+    "occlusion": ({"method": "factor", "occlusion": "on"}, "occlusion has no effect"),
+    "a limit": ({"method": "factor", "max_angle": 30.0}, "max-angle has no effect"),
+    "a tide": ({"method": "factor", "tide": "tide.csv"}, "tide has no effect"),
 }  # fmt: skip
 
 

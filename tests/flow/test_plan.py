@@ -100,8 +100,8 @@ def test_the_command_and_its_files(monkeypatch, folder, plan):
 @pytest.mark.parametrize(
     ("given", "sentence"),
     [
-        ({"lens": "8.8,13.2"}, "is not FOCAL,WIDTH,HEIGHT,PIXELS"),
-        ({"depth": "0"}, "must be above 0: give metres below the water"),
+        ({"lens": "8.8,13.2"}, "must be 4 values, F,W,H,N"),
+        ({"depth": "0"}, "must be above 0"),
         ({"sidelap": 0.0, "overlap": 0.3}, "is seen by three images; give more overlap"),
         ({"height": 3.0, "depth": (8.0,)}, "fly higher or give a smaller greatest depth"),
     ],

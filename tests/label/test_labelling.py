@@ -238,14 +238,14 @@ def test_a_line_of_points_and_a_stray_one():
 @pytest.mark.parametrize(
     ("choices", "sentence"),
     [
-        ({"band": -0.1}, r"band -0.1 must not be negative: give metres"),
-        ({"dead_band": -1}, r"dead-band -1 must not be negative"),
-        ({"band": float("nan")}, r"band nan must not be negative"),
-        ({"band": 0.2, "dead_band": 0.1}, r"dead-band 0.1 does not reach beyond band 0.2"),
-        ({"respect_classes": (2, 256)}, r"respect-classes: 256 is no class of LAS; .* 0 to 255"),
-        ({"respect_classes": (-1,)}, r"respect-classes: -1 is no class"),
-        ({"least_pool": 5.0}, r"least-pool is of no use without connected"),
-        ({"least_pool": -5.0, "connected": True}, r"least-pool -5 must not be negative"),
+        ({"band": -0.1}, r"band -0.1 must be at least 0"),
+        ({"dead_band": -1}, r"dead-band -1 must be at least 0"),
+        ({"band": float("nan")}, r"band nan must be at least 0"),
+        ({"band": 0.2, "dead_band": 0.1}, r"dead-band 0.1 must be more than band 0.2"),
+        ({"respect_classes": (2, 256)}, r"respect-classes 256 must be at least 0 and at most 255"),
+        ({"respect_classes": (-1,)}, r"respect-classes -1 must"),
+        ({"least_pool": 5.0}, r"least-pool has no effect without --connected"),
+        ({"least_pool": -5.0, "connected": True}, r"least-pool -5.0 must be at least 0"),
     ],
 )
 def test_settings_that_make_no_sense(choices, sentence):

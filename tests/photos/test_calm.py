@@ -195,9 +195,9 @@ def test_a_video_is_a_sequence_too(tmp_path, folder):
 @pytest.mark.parametrize(
     ("keywords", "sentence"),
     [
-        ({"surface": True, "gsd": 0.1}, "surface needs depth, which says how far"),
+        ({"surface": True, "gsd": 0.1}, "surface needs depth"),
         ({"surface": True, "depth": 2.0}, "surface needs either cameras, .* or gsd"),
-        ({"gsd": 0.1}, "gsd is of no use without surface"),
+        ({"gsd": 0.1}, "gsd has no effect without --surface"),
         ({"surface": True, "gsd": 0.1, "depth": -2.0}, "depth -2 is not positive"),
         ({"every": 7}, "has 2 frames, and a median needs 3 at least"),
     ],

@@ -140,9 +140,9 @@ def test_other_calls_do_not_go_on_from_these(block):
 @pytest.mark.parametrize(
     ("more", "sentence"),
     [
-        ({"rebuild": "odm {images}"}, "rebuild 'odm {images}' lacks {cloud}; name the folder"),
-        ({"rebuild": None, "reference": "lidar.laz"}, "reference is of no use without rebuild"),
-        ({"until_gsd": 0}, "until-gsd 0 is not positive"),
+        ({"rebuild": "odm {images}"}, "rebuild 'odm {images}' has no {cloud}"),
+        ({"rebuild": None, "reference": "lidar.laz"}, "reference has no effect without --rebuild"),
+        ({"until_gsd": 0}, "until-gsd 0 must be above 0"),
         ({"most_rounds": 0}, "most-rounds 0"),
     ],
 )

@@ -16,20 +16,20 @@ FEW = {"points": 200, "lidar_per_m2": 0.2}
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"flying_height_m": 0.1}, "flying height 0.1 m is outside"),
-        ({"flying_height_m": float("nan")}, "flying height nan"),
+        ({"flying_height_m": 0.1}, "flying-height-m 0.1 must be"),
+        ({"flying_height_m": float("nan")}, "flying-height-m nan"),
         ({"flying_height_m": 5.0}, "half the greatest depth"),
-        ({"focal_mm": 0.0}, "focal length"),
+        ({"focal_mm": 0.0}, "focal-mm"),
         ({"sensor_mm": (13.2, 4.4)}, "square"),
-        ({"sensor_px": (0, 3)}, "positive"),
-        ({"area_m": (10.0,)}, "2 finite numbers"),
-        ({"distortion": (0.1, 0.2)}, "5 finite numbers"),
+        ({"sensor_px": (0, 3)}, "sensor-px 0 must be above 0"),
+        ({"area_m": (10.0,)}, "must be 2 values"),
+        ({"distortion": (0.1, 0.2)}, "must be 5 values"),
         ({"distortion": (-0.9, 0, 0, 0, 0)}, "folds"),
-        ({"forward_overlap": 1.2}, "forward overlap 1.2 is outside 0.3 to 0.95"),
-        ({"obliques_deg": 80.0}, "obliques 80 deg"),
+        ({"forward_overlap": 1.2}, "forward-overlap 1.2 must be at least 0.3 and at most 0.95"),
+        ({"obliques_deg": 80.0}, "obliques-deg 80"),
         ({"oblique_share": 0.5}, "needs obliques"),
-        ({"position_noise_m": -0.1}, "position noise -0.1 m is negative"),
-        ({"wave_slope_deg": 30.0}, "wave slope"),
+        ({"position_noise_m": -0.1}, "position-noise-m -0.1"),
+        ({"wave_slope_deg": 30.0}, "wave-slope-deg"),
         ({"tilt_percent": 19.0, "area_m": (500, 80)}, "tilt 19 %"),
         ({"bed": "lake"}, "bed 'lake'"),
         ({"cloud": "mesh"}, "cloud 'mesh'"),
@@ -44,7 +44,7 @@ def test_bad_settings_are_refused(arguments, words):
 
 
 def test_an_unknown_setting_names_the_nearest():
-    with pytest.raises(pcfix.SettingError, match="'wavelength'; did you mean wave_length"):
+    with pytest.raises(pcfix.SettingError, match="'wavelength'. Did you mean wave_length"):
         pcfix.simulate_scene(10, wavelength=3)
 
 
