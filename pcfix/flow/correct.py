@@ -266,7 +266,7 @@ def correct_file(
     tiles = tiles_of(input)
     if tiles is not None:
         run = TiledRun("correct", tiles, local_path(output), given, progress)
-        return run.run(partial(_step_over, given), partial(_summary_over, run), Summary)
+        return run.run(partial(_step_over, given), partial(_summary_over, run))
     task = file_task(single(input), output, given, reads=paths_in(given), progress=progress)
     step = Correcting(job_for(task.source, given))
     with threads(given.jobs):

@@ -94,7 +94,7 @@ def run_all(
     inputs = [path for some in read.values() for path in some]
     files = Files(out_dir, request.source)
     _check(request, files)
-    record = _begun(request, out_dir, overwrite, say)
+    record = _opened(request, out_dir, overwrite)
     check_shoreline(request.shoreline, overwrite=overwrite or record.resumes, inputs=inputs)
     shore = [] if request.shoreline is None else [Path(request.shoreline)]
 
@@ -160,22 +160,25 @@ def _check(request: Request, files: Files) -> None:
         TiledRun("correct", request.source, files.corrected, request).check_folder()
 
 
-def _begun(request: Request, out_dir: Path, overwrite: bool, say: Callable[[str], None]) -> Record:
+def _opened(request: Request, out_dir: Path, overwrite: bool) -> Record:
     """Return the record of a folder, made where it is missing; refuse one of another run."""
     if not out_dir.parent.is_dir():
-        raise SettingError(f"{out_dir}: the folder {out_dir.parent} does not exist; make it first.")
+        raise SettingError(
+            "output.no_folder",
+            f"{out_dir}: the folder {out_dir.parent} does not exist. Make it first.",
+            path=out_dir,
+        )
     out_dir.mkdir(exist_ok=True)
     record = Record(out_dir / RECORD, request.record(), request.watched(out_dir), since)
-    changed = ", ".join(record.changed)
     if not (overwrite or record.resumes) and any(out_dir.iterdir()):
-        other = f"a run with another {changed}" if changed else "other files"
+        changed = ", ".join(record.changed) or "input file, or other files"
         raise SettingError(
-            f"{out_dir}: holds {other}; add --overwrite to replace what it has, or give another"
-            " folder."
+            "run.other",
+            f"{out_dir}: holds a run with another {changed}. Add --overwrite to replace it, or give"
+            " another folder.",
+            path=out_dir,
+            changed=record.changed,
         )
-    if changed:
-        say(f"{'changed':<9} {changed}: {record.first} and what follows is done"
-            " anew, what comes before is kept")  # fmt: skip
     return record
 
 
