@@ -142,7 +142,7 @@ class ThroughWater(Sums):
         self.restart()
 
     def _original_ties(self) -> TiePoints | None:
-        """Return the tie points of the original model, else those of the adjusted one moved back."""
+        """Return the tie points of the original model, else the adjusted ones moved back."""
         if self.carrying is None:
             return None
         ties, are_original = old_tie_points(self._inputs, self.carrying.pair, self._view.crs)
@@ -219,18 +219,17 @@ class ThroughWater(Sums):
 
     def provenance(self) -> dict[str, Any]:
         """Return the record of the water for the output file."""
+        plane = list(astuple(self.water)) if isinstance(self.water, WaterPlane) else None
         return {
             "water": str(self.water),
-            "water_plane": list(astuple(self.water))
-            if isinstance(self.water, WaterPlane)
-            else None,
+            "water_plane": plane,
             **self.settings,
             **({} if self.made is None else {"made": self.made}),
             **({} if self.carrying is None else self.carrying.provenance()),
         }
 
     def check(self, name: str, tally: Tally, labelling: Labelling) -> None:
-        """Refuse a cloud that could not be transferred, and water that is not where the cloud is."""
+        """Refuse a cloud that could not be transferred, and water apart from the cloud."""
         if self.carrying is not None:
             self.carrying.check(name)
         labelling.check(name)
@@ -387,8 +386,9 @@ def correct_checked(
     if heights_only:
         found = found._replace(covariance_m2=None)
     # depth below the water after the correction, negative above it
-    rise = (wet.surface.slope * found.shift_m[:, :2]).sum(axis=1)
-    below = np.asarray(wet.surface.height_m + rise - (wet.xyz[:, 2] + found.shift_m[:, 2]))
+    slope, (shift_x, shift_y, shift_z) = wet.surface.slope, found.shift_m.T
+    rise = slope[:, 0] * shift_x + slope[:, 1] * shift_y
+    below = np.asarray(wet.surface.height_m + rise - (wet.xyz[:, 2] + shift_z))
     if batch.made_with is not None:
         # points whose own images place them above the water after the transfer are land
         bed = (below >= 0.0) | (found.outcome != Outcome.CORRECTED)

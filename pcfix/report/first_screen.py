@@ -170,7 +170,7 @@ def notes_of(s: Summary, survey: Survey, compared: Plain) -> list[str]:
             "The vertical datum is not known: the water level, the cloud and any reference must"
             " count from one."
         )
-    notes += [*_uncorrected(s), *s.warnings, *compared.get("notes", ())]
+    notes += [*_uncorrected(s), *(one["message"] for one in s.warnings), *compared.get("notes", ())]
     return [note[:1].upper() + note[1:] for note in notes]
 
 

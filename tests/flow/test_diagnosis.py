@@ -41,7 +41,7 @@ def test_a_correction_with_bent_poses_warns_once(tmp_path):
     assert f"pcfix adjust {model} OUT --water 0.37 --cloud {cloud}" in found[0]
     # the land lies 0.96 m too low; the block's own centres tell most of it
     assert 0.6 < float(found[0].split("likely error is ")[1].split(" m")[0]) < 1.3
-    assert found[0] in summary.warnings
+    assert found[0] in [one["message"] for one in summary.warnings]
 
 
 @rendered

@@ -370,9 +370,9 @@ def test_what_a_raster_does_not_cover_is_said_and_left(scene, tmp_path):
     with pytest.warns(pcfix.PcfixWarning, match=r"does not cover \d+\.\d % of the points") as said:
         summary = corrected(scene, tmp_path / "a.las", path)
     assert 0 < summary.water_unknown < summary.points
-    assert summary.warnings[-1] in [str(one.message) for one in said]
+    assert summary.warnings[-1]["message"] in [str(one.message) for one in said]
     share = 100.0 * summary.water_unknown / summary.points
-    assert f"cover {share:.1f} %" in summary.warnings[-1]
+    assert f"cover {share:.1f} %" in summary.warnings[-1]["message"]
 
 
 def test_a_tilt_above_five_percent_is_refused(scene, tmp_path):

@@ -64,7 +64,7 @@ def test_forward_intersection_says_what_it_leaves_out(scene, cloud, tmp_path):
     told = pcfix.correct_file(
         cloud, tmp_path / "out.las", cameras=scene.cameras, port=scene.port, method="snell"
     )
-    (note,) = [line for line in told.warnings if "miss each other" in line]
+    (note,) = [one["message"] for one in told.warnings if one["code"] == "port.ray_distance"]
     assert "--method consistent" in note
 
 
@@ -82,11 +82,11 @@ def test_restored_to_the_bit(scene, cloud, tmp_path):
         ({}, "water is missing"),
         ({"port": SPEC, "water": 0.0}, "water and port exclude each other"),
         ({"port": "flat"}, "distance is missing"),
-        ({"port": SPEC, "method": "murase"}, "method murase is about a water surface"),
-        ({"port": SPEC, "camera_set": "mvs"}, "camera-set mvs is of no use with a port"),
-        ({"port": SPEC, "unsure": "withhold"}, "unsure withhold is of no use with a port"),
-        ({"port": SPEC, "connected": True}, "connected is of no use with a port"),
-        ({"port": SPEC, "tide": "tide.csv"}, "tide is of no use with a port"),
+        ({"port": SPEC, "method": "murase"}, "method murase has no effect with a port"),
+        ({"port": SPEC, "camera_set": "mvs"}, "camera-set mvs has no effect with a port"),
+        ({"port": SPEC, "unsure": "withhold"}, "unsure withhold has no effect with a port"),
+        ({"port": SPEC, "connected": True}, "connected True has no effect with a port"),
+        ({"port": SPEC, "tide": "tide.csv"}, "tide tide.csv has no effect with a port"),
     ],
 )
 def test_what_does_not_go_together_is_refused(scene, cloud, tmp_path, given, words):
