@@ -443,5 +443,5 @@ def test_without_a_word_the_noise_is_that_of_the_kind_of_reference(tmp_path):
     assert told.own.rmse_m == pytest.approx(np.sqrt(raw.rmse_m**2 - 0.05**2))
     assert f"RMSE {told.own.rmse_m:.3f} m" in comparison_text(told)
     assert "the reference's noise (0.050 m, stated)" in comparison_text(told)
-    with pytest.raises(pcfix.SettingError, match="sigma-reference -0.1 must be at least 0"):
+    with pytest.raises(pcfix.SettingError, match=r"sigma-reference -0\.1 must be at least 0"):
         compare_clouds(cloud, lidar, sigma_reference=-0.1)

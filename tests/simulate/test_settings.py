@@ -44,7 +44,7 @@ def test_bad_settings_are_refused(arguments, words):
 
 
 def test_an_unknown_setting_names_the_nearest():
-    with pytest.raises(pcfix.SettingError, match="'wavelength'. Did you mean wave_length"):
+    with pytest.raises(pcfix.SettingError, match=r"'wavelength'\. Did you mean wave_length"):
         pcfix.simulate_scene(10, wavelength=3)
 
 
