@@ -41,8 +41,11 @@ def main(tokens: Sequence[str] | None = None) -> None:
     """Run the command line; a user's mistake is one line on stderr and exit code 1."""
     arguments = list(sys.argv[1:] if tokens is None else tokens)
     try:
-        _end_cleanly()
-        _seldom_collect()
+        _end_by_signals()
+        # Modules and kernels are hundreds of thousands of objects that stay: searching them for
+        # garbage, often and at the end, took a fifth of a start.
+        gc.set_threshold(50_000, 20, 50)
+        atexit.register(gc.freeze)
         _run(arguments)
     except CycloptsError as error:
         if isinstance(error.__cause__, PcfixError):
@@ -55,7 +58,7 @@ def main(tokens: Sequence[str] | None = None) -> None:
     except UnicodeEncodeError as error:
         if error.encoding != "utf-8" or "\n" in error.object:
             raise
-        _stop(f"{error.object}: the name is not in UTF-8; rename the file.", 1)
+        _stop(f"{error.object}: the name is not in UTF-8. Rename the file.", 1)
     except _EndedError as end:
         _stop("stopped.", 128 + end.args[0])
     except KeyboardInterrupt as stop:
@@ -68,14 +71,8 @@ def main(tokens: Sequence[str] | None = None) -> None:
         _stop(f"{error.filename}: {refusal(error)}.", 1)
 
 
-REMOVED = {"warm-up": "it compiled the kernels ahead; 'pcfix demo' does that, as any first command"}
-"""Commands that there were, and what to do instead."""
-
-
 def _run(arguments: list[str]) -> None:
     warnings.showwarning = show_warning
-    if arguments and arguments[0] in REMOVED:
-        raise UsageError(f"'{arguments[0]}' is no longer a command: {REMOVED[arguments[0]]}.")
     for command, _ in EXAMPLES:
         if name_of(command) in arguments[:1]:
             prepare(command)
@@ -85,22 +82,12 @@ def _run(arguments: list[str]) -> None:
     app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
 
 
-def _seldom_collect() -> None:
-    """Look for garbage seldom, and not at the end: that took a fifth of a start.
-
-    Modules and kernels are hundreds of thousands of objects, which stay; what is large is freed
-    without a search.
-    """
-    gc.set_threshold(50_000, 20, 50)
-    atexit.register(gc.freeze)
-
-
 class _EndedError(KeyboardInterrupt):
-    """Another process ends this one, which tidies up as after Ctrl-C."""
+    """Another process ends this one, which cleans up as after Ctrl-C."""
 
 
-def _end_cleanly() -> None:
-    """Let signals that end a process do so as Ctrl-C does, but where they are ignored."""
+def _end_by_signals() -> None:
+    """Let SIGTERM and SIGHUP end the process as Ctrl-C does, unless they are ignored."""
 
     def end(number: int, frame: Any) -> None:
         raise _EndedError(number)

@@ -1,4 +1,4 @@
-"""The commands, each of which turns its flags into one call, no more."""
+"""The commands: each turns its flags into one call of the Python interface."""
 
 from __future__ import annotations
 
@@ -7,14 +7,13 @@ import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 
 import pcfix
 from pcfix.cli.flags import FLAGS, Quiet, UsageError, check_needed, progress_bar, say, status_line
 from pcfix.options.correct import CorrectOptions, LabelOptions
-from pcfix.options.declare import options_of
 from pcfix.options.handover import PlanOptions, PluginOptions, ViewerOptions
 from pcfix.options.photos import CalmOptions, OrthoOptions, PhotosOptions
 from pcfix.options.scenes import DemoOptions, SimulateOptions
@@ -34,36 +33,31 @@ def run(
     /,
     *,
     options: Annotated[RunOptions, FLAGS] = RunOptions(),
-    config: Annotated[
-        Path | None, Parameter(help="run.json of an earlier run, to repeat it.")
-    ] = None,
+    config: Annotated[Path | None, Parameter(help="Repeat the run of this run.json.")] = None,
     quiet: Quiet = False,
 ) -> None:
     """Adjust, correct, clean, grid, compare and report; resumes where it stopped.
 
     With --config give only the folder: pcfix run OUT_DIR --config run.json.
     """
-    from pcfix.flow.request import Request, request_of
-    from pcfix.flow.run import run_all
-
-    if config is not None:
-        folder = out_dir or input
-        if folder is None or options.cameras is not None or options.water is not None:
-            raise UsageError("with --config give OUT_DIR alone")
-        request = request_of(config)
-    else:
+    shown: dict[str, Any] = {
+        "say": partial(say, quiet=quiet),
+        "bar": partial(progress_bar, quiet=quiet),
+    }
+    if config is None:
         if input is None or out_dir is None:
             raise UsageError("INPUT and OUT_DIR are needed")
         check_needed(options)
-        values = {one.name: getattr(options, one.name) for one in options_of(RunOptions)}
-        request, folder = Request(input=input, **values), out_dir
+        pcfix.run(input, out_dir, options=options, **shown)
+        return
+    from pcfix.flow.request import request_of
+    from pcfix.flow.run import run_all
+
+    folder = out_dir or input
+    if folder is None or options.cameras is not None or options.water is not None:
+        raise UsageError("with --config give OUT_DIR alone")
     run_all(
-        request,
-        Path(str(folder)),
-        overwrite=options.overwrite,
-        jobs=options.jobs,
-        say=lambda text: say(text, quiet),
-        bar=partial(progress_bar, quiet=quiet),
+        request_of(config), Path(folder), overwrite=options.overwrite, jobs=options.jobs, **shown
     )
 
 
@@ -75,7 +69,7 @@ def correct(
     options: Annotated[CorrectOptions, FLAGS] = CorrectOptions(),
     quiet: Quiet = False,
 ) -> None:
-    """Move the points below the water surface to where they are."""
+    """Correct a point cloud for refraction at the water surface."""
     check_needed(options, water=False)
     if options.water is None and options.port is None:
         raise UsageError("--water is needed, or --port for a cloud taken under water")
@@ -93,22 +87,20 @@ def pipeline(
     *,
     options: Annotated[CorrectOptions, FLAGS] = CorrectOptions(),
     stage: Annotated[
-        bool,
-        Parameter(
-            negative=(), help="Print its stage alone, for a pipeline of one's own.", group="Output"
-        ),
+        bool, Parameter(negative=(), help="Only the stage, for your own pipeline.", group="Output")
     ] = False,
 ) -> None:
     """Print the PDAL pipeline of the same 'pcfix correct', as JSON."""
     from pcfix.flow.pipeline import pipeline_for, stage_for
 
     check_needed(options)
-    if output is None and not stage:
+    if stage:
+        content = stage_for(input, options)
+    elif output is None:
         raise UsageError("OUTPUT is needed, or --stage for the stage alone")
-    job = (
-        pipeline_for(input, output, options) if output and not stage else stage_for(input, options)
-    )
-    say(json.dumps(job, indent=2))
+    else:
+        content = pipeline_for(input, output, options)
+    say(json.dumps(content, indent=2))
 
 
 def adjust(
@@ -120,7 +112,7 @@ def adjust(
     quiet: Quiet = False,
     jobs: Annotated[int | None, Parameter(help="Threads.", group="Output")] = None,
 ) -> None:
-    """Adjust poses, lens and points with the light bent at the water."""
+    """Refine camera poses and lens by a refractive bundle adjustment."""
     if (options.water is None) == (options.port is None):
         raise UsageError("give --water, or --port for images taken under water")
     from pcfix.flow.next_steps import correct_words
@@ -130,7 +122,7 @@ def adjust(
     with threads(jobs), status_line("Adjusting", quiet) as progress:
         found = pcfix.adjust_cameras(model, out, options=options, progress=progress)
     say(adjustment_text(found, before_of(found)), quiet)
-    cloud = "" if options.cloud else " (CLOUD.laz is the cloud that the old cameras made)"
+    cloud = "" if options.cloud else " (CLOUD.laz is the cloud of the original cameras)"
     say(f"Next{cloud}: {correct_words(found, model, out, options)}", quiet)
 
 
@@ -142,7 +134,7 @@ def label(
     options: Annotated[LabelOptions, FLAGS] = LabelOptions(),
     quiet: Quiet = False,
 ) -> None:
-    """Give the points below the water surface class 40, and change nothing else."""
+    """Classify points below the water surface (class 40)."""
     check_needed(options)
     from pcfix.report.text import labelling_text
 
@@ -159,7 +151,7 @@ def clean(
     options: Annotated[CleanOptions, FLAGS] = CleanOptions(),
     quiet: Quiet = False,
 ) -> None:
-    """Flag the noise of a cloud: outliers, weak intersections, points off the bed."""
+    """Flag noise: outliers, weak intersections, points far from the bed."""
     from pcfix.report.text import cleaning_text
 
     with progress_bar("Cleaning", quiet) as progress:
@@ -186,26 +178,23 @@ def dsm(
 
 def photos(
     images: Annotated[Path, Parameter(help="Folder of photographs.")],
-    out_dir: Annotated[Path, Parameter(help="Folder for them without water, or for the rounds.")],
+    out_dir: Annotated[Path, Parameter(help="Folder for the results, or for the rounds.")],
     /,
     *,
     options: Annotated[PhotosOptions, FLAGS] = PhotosOptions(),
     quiet: Quiet = False,
 ) -> None:
-    """Take the water out of photographs, and with --rebuild make the cloud anew from them."""
+    """Remove refraction from photographs, for use in any SfM software."""
     check_needed(options)
     from pcfix.report.text import photos_text, rounds_text
 
     with progress_bar("Mapping", quiet, unit="photographs") as progress:
+        given: dict[str, Any] = {"options": options, "progress": progress}
         if options.rebuild is None:
-            text = photos_text(
-                pcfix.map_photos(images, out_dir, options=options, progress=progress)
-            )
+            text = photos_text(pcfix.map_photos(images, out_dir, **given))
         else:
-            found = pcfix.rebuild_rounds(
-                images, out_dir, options=options, progress=progress, say=lambda t: say(t, quiet)
-            )
-            text = rounds_text(found)
+            shown = partial(say, quiet=quiet)
+            text = rounds_text(pcfix.rebuild_rounds(images, out_dir, **given, say=shown))
     say(text, quiet)
 
 
@@ -217,7 +206,7 @@ def ortho(
     options: Annotated[OrthoOptions, FLAGS] = OrthoOptions(),
     quiet: Quiet = False,
 ) -> None:
-    """Lay photographs on the corrected DSM: the orthophoto of land and bed."""
+    """Make an orthophoto of land and bed from photographs and the corrected DSM."""
     check_needed(options)
     from pcfix.report.text import ortho_text
 
@@ -237,7 +226,7 @@ def compare(
     options: Annotated[CompareOptions, FLAGS] = CompareOptions(),
     quiet: Quiet = False,
 ) -> None:
-    """Measure how far a cloud is from a reference, before and after correction."""
+    """Compare a cloud with a reference, before and after correction."""
     from pcfix.report.comparison import comparison_text
 
     result = pcfix.compare_clouds(cloud, reference, options=options)
@@ -252,7 +241,7 @@ def calm(
     options: Annotated[CalmOptions, FLAGS] = CalmOptions(),
     quiet: Quiet = False,
 ) -> None:
-    """Make of a sequence of one place through waves the image through calm water."""
+    """Combine a burst of frames into one image as seen through calm water."""
     from pcfix.report.text import calm_text
 
     with progress_bar("Calming", quiet) as progress:
@@ -266,7 +255,7 @@ def cameras(
     *,
     options: Annotated[CamerasCheckOptions, FLAGS] = CamerasCheckOptions(),
 ) -> None:
-    """Say what a camera file holds, whether it fits a cloud, and whether it absorbed refraction."""
+    """Inspect a camera file: contents, fit to the cloud, absorbed refraction."""
     from pcfix.flow.checks import check_cameras
     from pcfix.report.cameras import cameras_text
 
@@ -279,7 +268,7 @@ def water(
     *,
     options: Annotated[WaterCheckOptions, FLAGS] = WaterCheckOptions(),
 ) -> None:
-    """Read, fit or find a water surface, and say how well it is known."""
+    """Read, fit or detect a water surface, with its standard error."""
     from pcfix.flow.checks import check_water
     from pcfix.report.water import water_text
 
@@ -294,10 +283,10 @@ def restore(
     options: Annotated[TileOptions, FLAGS] = TileOptions(),
     quiet: Quiet = False,
 ) -> None:
-    """Give back the cloud as it was before 'pcfix correct', bit for bit."""
+    """Undo a correction exactly."""
     with progress_bar("Restoring", quiet) as progress:
         points = pcfix.restore_file(input, output, options=options, progress=progress)
-    say(f"{input} -> {output}: {points:,} points as they were", quiet)
+    say(f"{input} -> {output}: {points:,} points restored", quiet)
 
 
 def simulate(
@@ -307,7 +296,7 @@ def simulate(
     options: Annotated[SimulateOptions, FLAGS] = SimulateOptions(),
     quiet: Quiet = False,
 ) -> None:
-    """Make a scene with known truth: cloud, cameras, truth, LiDAR."""
+    """Simulate a scene with known truth: cloud, cameras, truth, LiDAR."""
     if options.refraction_effect:
         from pcfix.flow.papers import write_refraction_effect
 
@@ -322,7 +311,7 @@ def simulate(
 
 
 def plan(*, options: Annotated[PlanOptions, FLAGS] = PlanOptions(), quiet: Quiet = False) -> None:
-    """Predict what a flight over water will measure, and say what would make it better."""
+    """Predict the accuracy of a planned flight."""
     from pcfix.report.plan import plan_text
 
     with progress_bar("Planning", quiet, unit="beds") as progress:
@@ -335,7 +324,7 @@ def view(
     options: Annotated[ViewerOptions, FLAGS] = ViewerOptions(),
     quiet: Quiet = False,
 ) -> None:
-    """Show clouds in space, before and after, with reference, cameras and water."""
+    """Show clouds in 3D, before and after, with reference, cameras and water."""
     found = pcfix.view_clouds(clouds, options=options)
     if found:
         say(found, quiet)
@@ -348,7 +337,7 @@ def qgis_plugin(
     options: Annotated[PluginOptions, FLAGS] = PluginOptions(),
     quiet: Quiet = False,
 ) -> None:
-    """Pack the plugin of QGIS: pcfix's commands as algorithms of its toolbox.
+    """Write the QGIS plugin: the commands of pcfix as algorithms of its toolbox.
 
     In QGIS: Plugins > Manage and Install Plugins > Install from ZIP.
     """
@@ -356,9 +345,10 @@ def qgis_plugin(
     from pcfix.io.files import write_bytes
 
     write_bytes(out, plugin_zip(one for one, _ in EXAMPLES), overwrite=options.overwrite)
-    say(f"{out}: install it in QGIS by Plugins > Manage and Install Plugins > Install from ZIP;"
-        f" its environment of pcfix (Settings > Options > Processing > Providers > pcfix) is"
-        f" {Path(sys.prefix)}", quiet)  # fmt: skip
+    say(
+        f"{out}: install it in QGIS, then set its environment to {Path(sys.prefix)} in"
+        " Settings > Options > Processing > Providers > pcfix.", quiet,
+    )  # fmt: skip
 
 
 def demo(
@@ -368,7 +358,7 @@ def demo(
     options: Annotated[DemoOptions, FLAGS] = DemoOptions(),
     quiet: Quiet = False,
 ) -> None:
-    """Simulate, correct, and show how far the cloud is from the truth."""
+    """Simulate scenes, correct them, and compare with the truth."""
     from pcfix.flow.demo import run_demo
 
     bar = partial(progress_bar, quiet=quiet)
@@ -396,4 +386,4 @@ EXAMPLES: tuple[tuple[Callable[..., None], str], ...] = (
     (qgis_plugin, "pcfix qgis-plugin pcfix.zip"),
     (demo, "pcfix demo"),
 )
-"""The commands in the order of the help, each with a line that shows it at work."""
+"""The commands in the order of the help, each with an example."""

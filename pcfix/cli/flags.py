@@ -1,4 +1,4 @@
-"""Options as flags of the command line, a bar that shows progress, and what is said at the end."""
+"""Options as flags of the command line, progress, and what is printed at the end."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, get_args, get_type_hints
 
@@ -25,19 +24,23 @@ _GROUPS: dict[str, Group] = {
 
 
 class UsageError(Exception):
-    """Flags that say nothing together; exit code 2."""
+    """Flags that do not go together; exit code 2."""
 
 
 def name_of(command: Callable[..., None]) -> str:
-    """Return what a command is called on the command line."""
+    """Return the name of a command on the command line."""
     return command.__name__.replace("_", "-")
 
 
+def kind_of(command: Callable[..., None]) -> Any:
+    """Return the class of the options of a command."""
+    return get_args(get_type_hints(command, include_extras=True)["options"])[0]
+
+
 def prepare(command: Callable[..., None]) -> None:
-    """Tell cyclopts of the options of a command: their types as text, panels and help."""
-    kind = get_args(get_type_hints(command, include_extras=True)["options"])[0]
-    by_name = {one.name: one for one in options_of(kind)}
-    hints = {name: Annotated[_type(one), _parameter(one)] for name, one in by_name.items()}
+    """Give cyclopts the options of a command: their types, panels and help."""
+    kind = kind_of(command)
+    hints = {one.name: Annotated[_type(one), _parameter(one)] for one in options_of(kind)}
     hints["index_from"] = Annotated[str, Parameter(parse=False)]
     for base in kind.__mro__:
         own = vars(base).get("__annotations__", {})
@@ -55,7 +58,7 @@ def check_needed(options: OptionSet, *, water: bool = True) -> None:
 
 
 def _type(one: Option) -> Any:
-    """Return what the text of the command line becomes; what has a parser stays text."""
+    """Return the type that cyclopts makes of the text; for an option with a parser it is text."""
     if one.metavar == "PATH" or os.PathLike[str] in one.kinds:
         return Path | None
     if one.parse is not None or one.type is Any:
@@ -76,7 +79,6 @@ def _parameter(one: Option) -> Parameter:
         negative_iterable=(),
         allow_repeating=True,  # the last one counts
         allow_leading_hyphen=one.metavar in ("X,Y,Z", "X,Y,X,Y", "LOW,HIGH"),  # below zero
-        show=not one.hidden,
         show_default=(lambda value: default) if default else False,
     )
 
@@ -94,9 +96,8 @@ Quiet = Annotated[
 ]
 
 
-@cache
 def _announce_compiling() -> None:
-    """Say on a terminal, once, that the first command compiles the kernels."""
+    """Print on a terminal that the first command compiles the kernels."""
     from pcfix.kernels import cache_folder
 
     folder = cache_folder()
@@ -108,12 +109,22 @@ def _announce_compiling() -> None:
 def progress_bar(
     title: str, quiet: bool, unit: str = "points"
 ) -> Iterator[Callable[[int, int], None] | None]:
-    """Show a bar with units/s and the time left on a terminal; nothing when piped.
+    """Show a bar with units/s and the remaining time on a terminal; nothing if piped.
 
     With ``PCFIX_PROGRESS=lines`` it is a line for each percent, for programs that call this one.
     """
     if os.environ.get("PCFIX_PROGRESS") == "lines":
-        yield _percent_lines()
+        shown = -1
+
+        def print_percent(done: int, total: int) -> None:
+            nonlocal shown
+            percent = 100 * done // max(total, 1)
+            if percent != shown:
+                shown = percent
+                sys.stderr.write(f"progress {percent}\n")
+                sys.stderr.flush()
+
+        yield print_percent
         return
     if quiet or not sys.stderr.isatty():
         yield None
@@ -141,23 +152,9 @@ def progress_bar(
         yield update
 
 
-def _percent_lines() -> Callable[[int, int], None]:
-    last = -1
-
-    def update(done: int, total: int) -> None:
-        nonlocal last
-        percent = 100 * done // max(total, 1)
-        if percent != last:
-            last = percent
-            sys.stderr.write(f"progress {percent}\n")
-            sys.stderr.flush()
-
-    return update
-
-
 @contextmanager
 def status_line(title: str, quiet: bool) -> Iterator[Callable[[Any], None] | None]:
-    """Show on a terminal what happens, a line that changes; nothing when piped."""
+    """Show on a terminal one line that changes; nothing if piped."""
     if quiet or not sys.stderr.isatty():
         yield None
         return
@@ -169,6 +166,6 @@ def status_line(title: str, quiet: bool) -> Iterator[Callable[[Any], None] | Non
 
 
 def say(text: str, quiet: bool = False) -> None:
-    """Print a summary, unless it is not wanted."""
+    """Print a summary, unless `quiet`."""
     if not quiet:
         sys.stdout.write(text + "\n")

@@ -47,11 +47,7 @@ def _command(command: Callable[..., None]) -> dict[str, Any]:
             for name, one in inspect.signature(command).parameters.items()
             if one.kind is inspect.Parameter.POSITIONAL_ONLY
         ],
-        "options": [
-            _option(one, instead=has_port and one.name == "water")
-            for one in options
-            if not one.hidden
-        ],
+        "options": [_option(one, instead=has_port and one.name == "water") for one in options],
     }
 
 

@@ -91,7 +91,6 @@ def clean_file(
         return run.run(
             lambda part: _Cleaning(part, given, there / folder.name, how, progress),
             lambda step: step.summary(str(tiles), str(output), run.seconds),
-            CleanSummary,
         )
     task = file_task(single(input), output, given, reads=[given.water], progress=last)
     with threads(given.jobs):

@@ -14,7 +14,6 @@ from multiprocessing import get_context
 from types import ModuleType
 from typing import Any, TypeVar
 
-from pcfix import version
 from pcfix.errors import InputError
 from pcfix.kernels import cores
 from pcfix.libraries import optional_library
@@ -31,10 +30,10 @@ WAIT_S = 10
 def in_processes(
     jobs: int | None, most: int, work: Work[Task, Result], shared: bytes, tasks: Sequence[Task]
 ) -> Iterator[tuple[Task, Result | str]]:
-    """Yield tasks with their results, or why they failed, as they are done.
+    """Yield tasks with their results as they are done, with the same `shared` for all.
 
-    So many processes at most share so many jobs, all cores by default. A single one is this
-    process. What is shared goes to all tasks.
+    At most `most` processes share `jobs` threads, all cores by default. A single one is this
+    process.
     """
     count = min(most, jobs or cores(), len(tasks))
     if count <= 1:
@@ -53,8 +52,9 @@ def in_processes(
                 yield futures[future], future.result()
         except BrokenProcessPool as error:
             raise InputError(
-                "A process came to a sudden end, for want of memory perhaps; the same command goes"
-                " on, with fewer --jobs it needs less memory."
+                "tiles.process_ended",
+                "A process ended suddenly, probably for lack of memory. Run the same command with"
+                " fewer --jobs; it continues.",
             ) from error
         except BaseException:
             for process in list((pool._processes or {}).values()):
@@ -79,18 +79,13 @@ def _interruptible(work: Callable[..., Result], *given: Any) -> Result:
 
 @contextmanager
 def _without_main() -> Iterator[None]:
-    """Let processes begin without the user's script, which each would run again."""
+    """Let processes start without the user's script, which each would run again."""
     main = sys.modules["__main__"]
     sys.modules["__main__"] = ModuleType("__main__")
     try:
         yield
     finally:
         sys.modules["__main__"] = main
-
-
-def version_here() -> str:
-    """Return the version of pcfix, of whatever worker is asked."""
-    return version.__version__
 
 
 @contextmanager
@@ -100,25 +95,34 @@ def on_cluster(address: str) -> Iterator[Run]:
     Raises
     ------
     InputError
-        If the scheduler does not answer, has no workers, or one has another pcfix.
+        If the scheduler does not answer, or has no workers.
     """
     distributed = optional_library("distributed", "cluster", f"--scheduler {address}")
     try:
         client = distributed.Client(address, timeout=WAIT_S, set_as_default=False)
     except (OSError, ValueError) as error:  # TimeoutError is an OSError
         raise InputError(
-            f"scheduler {address}: does not answer within {WAIT_S} s ({error}); check the address,"
-            " and that 'dask scheduler' runs there."
+            "cluster.no_answer",
+            f"scheduler {address}: does not answer within {WAIT_S} s ({error}). Check the address,"
+            " and that 'dask scheduler' runs there.",
+            address=address,
         ) from error
     with client:
-        _check_workers(client, address)
+        try:
+            client.wait_for_workers(1, timeout=WAIT_S)
+        except TimeoutError as error:
+            raise InputError(
+                "cluster.no_workers",
+                f"scheduler {address}: has no workers. Start some with 'dask worker {address}'.",
+                address=address,
+            ) from error
         yield partial(_on_workers, client, distributed.as_completed)
 
 
 def _on_workers(
     client: Any, as_completed: Any, work: Work[Task, Result], shared: bytes, tasks: Sequence[Task]
 ) -> Iterator[tuple[Task, Result | str]]:
-    everywhere = client.scatter(shared, broadcast=True)  # a worker that is lost takes its own
+    everywhere = client.scatter(shared, broadcast=True)  # a lost worker loses only its own copy
     futures = {client.submit(work, everywhere, one, 1, pure=False): one for one in tasks}
     try:
         done = as_completed(list(futures), loop=client.loop)
@@ -126,33 +130,10 @@ def _on_workers(
             task = futures[future]
             if future.status == "finished":
                 yield task, future.result()
-            elif future.status in ("lost", "pending"):  # its result went with a worker: once more
+            elif future.status in ("lost", "pending"):  # its result was lost with a worker: again
                 done.add(future)
             else:
                 why = future.exception() if future.status == "error" else future.status
-                yield task, f"{task}: was given up by the cluster ({why})."
+                yield task, f"{task}: the cluster gave up ({why})."
     finally:
         client.cancel(list(futures))
-
-
-def _check_workers(client: Any, address: str) -> None:
-    """Refuse a cluster without workers, or with other versions of pcfix."""
-    try:
-        client.wait_for_workers(1, timeout=WAIT_S)
-    except TimeoutError as error:
-        raise InputError(
-            f"scheduler {address}: has no workers; start some with 'dask worker {address}'."
-        ) from error
-    try:
-        found: dict[str, str] = client.run(version_here)
-    except Exception as error:  # of the worker, whatever it is
-        raise InputError(
-            f"scheduler {address}: its workers cannot run pcfix ({error}); install pcfix"
-            f" {version.__version__} there."
-        ) from error
-    for worker, other in found.items():
-        if other != version.__version__:
-            raise InputError(
-                f"scheduler {address}: worker {worker} has pcfix {other}, here it is"
-                f" {version.__version__}; install one version everywhere."
-            )

@@ -1,4 +1,4 @@
-"""The correction of a LAS or LAZ file, and of arrays: two doors to one calculation."""
+"""Correct a LAS or LAZ cloud, or arrays, for refraction: two doors to one calculation."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,6 @@ from pcfix.model import (
     Cameras,
     Correction,
     FloatArray,
-    IntArray,
     Views,
     WaterSurface,
 )
@@ -149,8 +149,10 @@ def correct_points(
         given.check_no_cameras()
         if not (views is None and level_offset_m is None and adjusted_from is None):
             raise SettingError(
-                "views, level_offset_m and adjusted_from are about cameras, and there are none:"
-                " leave them out, or give cameras too."
+                "option.needs",
+                "views, level_offset_m and adjusted_from have no effect without cameras. Give both,"
+                " or neither.",
+                needs="cameras",
             )
     cameras = cameras or NO_CAMERAS
     if given.water_per_image is not None:
@@ -160,11 +162,10 @@ def correct_points(
     offset = None if level_offset_m is None else _offsets(level_offset_m, len(cameras))
     check_above_water(cameras, surface, offset)
     if views is not None:
-        _check_views(views, len(points), len(adjusted_from or cameras))
-        _warn_of_beside(beside_frames(points, views, adjusted_from or cameras))
-    label = None if may_be_submerged is None else _only(may_be_submerged, len(points))
+        _check_views(views, points, adjusted_from or cameras)
+    label = None if may_be_submerged is None else _label_of(may_be_submerged, len(points))
     step, made_with = None, None
-    if adjusted_from is not None:
+    if adjusted_from is not None:  # transfer the points to the adjusted poses
         pair = paired(adjusted_from, cameras)
         step = CloudTransfer(pair).step(points, views)
         made_with = MadeWith(points, pair.original)
@@ -174,10 +175,9 @@ def correct_points(
     own, notes = own_water_of(given.water_per_image, cameras, surface, place, offset)
     survey = Survey(surface, cameras, settings, offset, own_water=own)
     batch = Batch(points, above, survey, views, made_with)
-    line = regression
-    if line is not None and not isinstance(line, DepthRegression):
-        line = read_regression(line)
+    line = read_regression(regression) if isinstance(regression, str | PathLike) else regression
     found = correct_checked(learn_of_points(batch, line), label)
+    # refuse or warn of what does not fit together, as for a file
     meeting, sample = WaterMeeting(surface, deep=settings.deep), CloudSample(len(points))
     meeting.add(points, found)
     meeting.check_reach("xyz")
@@ -197,35 +197,43 @@ def _offsets(level_offset_m: npt.ArrayLike, k: int) -> FloatArray:
     offset = np.ascontiguousarray(level_offset_m, dtype=np.float64)
     if offset.shape != (k,) or not np.isfinite(offset).all():
         raise SettingError(
+            "array.shape",
             f"level_offset_m must be {k} finite numbers, one per camera, not of shape"
-            f" {offset.shape}."
+            f" {offset.shape}.",
         )
     return offset
 
 
-def _only(may_be_submerged: npt.ArrayLike, n: int) -> Label:
-    """Return the rule that of the points below the surface some are land."""
+def _label_of(may_be_submerged: npt.ArrayLike, n: int) -> Label:
+    """Return the rule that only some of the points below the surface are submerged."""
     allowed = np.asarray(may_be_submerged)
     if allowed.shape != (n,) or allowed.dtype != np.bool_:
         raise SettingError(
-            f"may_be_submerged must be {n} booleans, not {allowed.dtype} of shape {allowed.shape}."
+            "array.shape",
+            f"may_be_submerged must be {n} booleans, not {allowed.dtype} of shape {allowed.shape}.",
         )
     return lambda xyz, surface: is_submerged(xyz[:, 2], surface) & allowed
 
 
-def _check_views(views: Views, n: int, k: int) -> None:
-    if len(views.start) != n + 1 or views.start[0] != 0 or views.start[-1] != len(views.camera):
-        raise SettingError(f"views must have {n + 1} starts, from 0 to the number of entries.")
-    if (np.diff(views.start) < 0).any():
-        raise SettingError("views: the starts must not decrease.")
-    if len(views.camera) and not 0 <= views.camera.min() <= views.camera.max() < k:
-        raise SettingError(f"views name camera {views.camera.max()}, but there are {k}.")
-
-
-def _warn_of_beside(counts: IntArray) -> None:
+def _check_views(views: Views, points: FloatArray, cameras: Cameras) -> None:
+    """Refuse views that are no table of these points, and warn of points outside their images."""
+    n, start, camera = len(points), views.start, views.camera
+    is_table = len(start) == n + 1 and start[0] == 0 and start[-1] == len(camera)
+    if not is_table or (np.diff(start) < 0).any():
+        raise SettingError(
+            "views.table",
+            f"views must have {n + 1} starts that do not decrease, from 0 to the number of"
+            " entries.",
+        )
+    if len(camera) and not 0 <= camera.min() <= camera.max() < len(cameras):
+        raise SettingError(
+            "views.camera", f"views name camera {camera.max()}, but there are {len(cameras)}."
+        )
+    counts = beside_frames(points, views, cameras)
     if counts.any():
-        entries, points = int(counts.sum()), int(np.count_nonzero(counts))
-        warnings.warn(f"views: {beside(entries, points)}", PcfixWarning, stacklevel=3)
+        entries, outside = int(counts.sum()), int(np.count_nonzero(counts))
+        note = PcfixWarning("views.outside", f"views: {beside(entries, outside)}", entries=entries)
+        warnings.warn(note, stacklevel=3)
 
 
 def correct_file(
@@ -266,42 +274,37 @@ def correct_file(
     tiles = tiles_of(input)
     if tiles is not None:
         run = TiledRun("correct", tiles, path_of(output), given, progress)
-        return run.run(partial(_step_over, given), partial(_summary_over, run), Summary)
-    task = file_task(single(input), output, given, reads=paths_in(given), progress=progress)
-    step = Correcting(job_for(task.source, given))
-    with threads(given.jobs):
-        step.job.look_around(
-            partial(file_points, task.source, step.job.water, given.jobs, task.kept)
+        return run.run(
+            partial(_step_for, options=given),
+            lambda step: step.result(str(tiles), str(output), run.seconds),
         )
-        with all_or_none():
-            step.run(task)
-            step.job.save_regression()
-            result = step.job.summary(str(task.source), str(task.target), task.seconds)
-            result = replace(result, part=part_report(task.source))
-            task.tell(result.as_dict())
+    task = file_task(single(input), output, given, reads=paths_in(given), progress=progress)
+    with threads(given.jobs), all_or_none():
+        step = _step_for(task.source, given, task.kept)
+        step.run(task)
+        result = step.result(str(task.source), str(task.target), task.seconds)
+        result = replace(result, part=part_report(task.source))
+        task.tell(result.as_dict())
     return result
 
 
-def _step_over(options: CorrectOptions, tiles: Tiles) -> Correcting:
-    """Return the step for many files, with what is learned of the cloud that they are."""
-    job = job_for(tiles, options)
-    job.look_around(partial(file_points, tiles, job.water, options.jobs))
-    if job.views.list is not None:  # the first chunk tells what it lists
-        job.correct(first_points(file_points(tiles, job.water, options.jobs)))
+def _step_for(
+    cloud: Path | Tiles, options: CorrectOptions, kept: list[Chunk] | None = None
+) -> Correcting:
+    """Return the step, with what is estimated from the whole cloud."""
+    job = job_for(cloud, options)
+    chunks = partial(file_points, cloud, job.water, options.jobs, kept)
+    job.look_around(chunks)
+    if isinstance(cloud, Tiles) and job.views.list is not None:
+        job.correct(first_points(chunks()))  # it shows of which type the view list is
     return Correcting(job)
-
-
-def _summary_over(run: TiledRun, step: Correcting) -> Summary:
-    step.job.save_regression()
-    return step.job.summary(str(run.tiles), str(run.folder), run.seconds)
 
 
 def job_for(cloud: Path | Tiles, options: CorrectOptions) -> Job:
     """Return the job of correcting a LAS or LAZ file, or many as one cloud."""
-    view = view_of(cloud)
     with open_cloud(cloud) as source:
         step_m = float(max(source.header.scales))
-    return Job(str(cloud), options, view, step_m)
+    return Job(str(cloud), options, view_of(cloud), step_m)
 
 
 class Correcting(Sums, Step):
@@ -315,13 +318,13 @@ class Correcting(Sums, Step):
         self.begin(0)
 
     def begin(self, first_row: int) -> None:
-        """Forget the chunks so far; the next one begins at a row of the whole cloud."""
+        """Forget the chunks so far; the next one starts at a row of the whole cloud."""
         self.wide = False
         self.steps: tuple[int, ...] = (0, 0, 0)
         self.job.restart(first_row)
 
     def run(self, task: FileTask) -> None:
-        """Write with narrow types and the input's offsets, and again where they do not do."""
+        """Write with narrow types and the input's offsets, and again if the values do not fit."""
         while True:
             try:
                 return task.run(self)
@@ -331,8 +334,10 @@ class Correcting(Sums, Step):
                 old, self.steps = self.steps, centring_steps(task.source, task.jobs)
                 if self.steps == old:
                     raise InputError(
-                        f"{task.source}: the scale of {axis} is too fine to hold the result in 32"
-                        " bits; write the cloud with a coarser scale first."
+                        "cloud.scale",
+                        f"{task.source}: the scale of {axis} is too fine for the result in 32 bits."
+                        " Write the cloud with a coarser scale first.",
+                        path=task.source,
                     ) from axis
             self.job.restart(self.job.first_row)
 
@@ -348,25 +353,28 @@ class Correcting(Sums, Step):
         return partial(self._written, points, header, correction)
 
     def _written(self, points: Chunk, header: Header, correction: Correction) -> Chunk:
+        """Move points, and write their new dimensions, classes and flags."""
         new = columns.convert(points, header.point_format)
         new.offsets = header.offsets
+        withhold = self.job.options.uncorrected == "withhold"
         for rows, part in correction.parts():
-            self._fill(new[rows], part)
+            some = new[rows]
+            moved = columns.shift_steps(part, some.scales)
+            columns.move(some, moved + np.array(self.steps))
+            withheld = np.asarray(some["withheld"]).astype(bool)
+            part = columns.unsure_anew(part, withheld)
+            changed = columns.changed_rows(part, withheld, withhold=withhold)
+            columns.fill(some, self._columns, part, moved, changed)
+            some.array["classification"][part.corrected] = BATHYMETRIC_POINT
+            flagged = withheld | columns.to_withhold(part, withhold=withhold)
+            some["withheld"][:] = flagged.astype(np.uint8)
         return new[~correction.uncorrected] if self.job.options.uncorrected == "drop" else new
 
-    def _fill(self, new: Chunk, correction: Correction) -> None:
-        """Move points, and write their new dimensions, classes and flags."""
-        moved = columns.shift_steps(correction, new.scales)
-        columns.move(new, moved + np.array(self.steps))
-        withheld = np.asarray(new["withheld"]).astype(bool)
-        withhold = self.job.options.uncorrected == "withhold"
-        correction = columns.unsure_anew(correction, withheld)
-        changed = columns.changed_rows(correction, withheld, withhold=withhold)
-        columns.fill(new, self._columns, correction, moved, changed)
-        new.array["classification"][correction.corrected] = BATHYMETRIC_POINT
-        flagged = withheld | columns.to_withhold(correction, withhold=withhold)
-        new["withheld"][:] = flagged.astype(np.uint8)
-
     def finish(self) -> None:
-        """Refuse a result in which cloud, water and cameras did not meet."""
+        """Refuse a result in which cloud, water and cameras do not fit together."""
         self.job.check_fit()
+
+    def result(self, input: str, output: str, seconds: float) -> Summary:
+        """Write the line of a regression, if asked, and return the summary of all chunks."""
+        self.job.save_regression()
+        return self.job.summary(input, output, seconds)

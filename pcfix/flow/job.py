@@ -1,4 +1,4 @@
-"""One correction, whichever door it came through: what was asked for, and what was done so far."""
+"""One correction, whichever door it came through: its options, inputs and statistics so far."""
 
 from __future__ import annotations
 
@@ -8,18 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.errors import GeometryError
+from pcfix.errors import GeometryError, PcfixWarning
 from pcfix.flow.inputs import Inputs, mask_of
 from pcfix.flow.old_cameras import ListedViews, read_blocks
 from pcfix.flow.surfaces import CloudView, Points
-from pcfix.flow.through_port import ThroughPort
+from pcfix.flow.through_port import ThroughPort, check_port_options
 from pcfix.flow.through_water import ThroughWater
 from pcfix.io.cameras.mistakes import likely_mistake
 from pcfix.io.regressions import write_regression
 from pcfix.label.labelling import Labelling
-from pcfix.model import Correction, Outcome, WaterSurface
+from pcfix.model import Correction, Outcome
 from pcfix.options.correct import CorrectOptions, LabelRules, ScienceOptions
-from pcfix.refract.choice import views_in_frame
 from pcfix.refract.tally import Summary, Tally
 from pcfix.sums import Sums
 from pcfix.version import __version__
@@ -32,7 +31,7 @@ class Job(Sums):
     Parameters
     ----------
     name : str
-        What is being corrected, for messages.
+        Of the cloud, for messages.
     options : CorrectOptions
     view : CloudView
         Of the whole cloud.
@@ -52,31 +51,30 @@ class Job(Sums):
     ) -> None:
         self.name, self.options, self._view = name, with_index(options), view
         inputs = options.part(Inputs)
-        medium = ThroughPort if inputs.port is not None else ThroughWater
-        medium.check(self.options)
+        if inputs.port is not None:
+            check_port_options(self.options)
+        elif not options.cameras:
+            self.options.check_no_cameras()
         blocks = read_blocks(inputs, view.crs)
         self.cameras = blocks.cameras
         self.views = ListedViews(blocks.views, blocks.listed, view.points, step_m)
+        medium = ThroughWater if inputs.port is None else ThroughPort
         self.medium: ThroughWater | ThroughPort = medium(self.options, inputs, blocks, view)
+        self.water = self.medium.water
         mask = mask_of(self.options.water_mask, view.crs, view.low, view.high)
         self.labelling = Labelling(self.options.part(LabelRules), mask)
         self.restart()
 
-    @property
-    def water(self) -> WaterSurface:
-        """The water surface; infinitely high behind a port."""
-        return self.medium.water
-
     def restart(self, first_row: int = 0) -> None:
-        """Forget the chunks so far; the next one begins at a row of the whole cloud."""
+        """Forget the chunks so far; the next one starts at a row of the whole cloud."""
         self.first_row = first_row
         self.tally = Tally(len(self.cameras), self._view.points, first_row)
-        self.labelling.restart()
+        for one in (self.labelling, self.views):
+            one.restart()
         self.medium.restart(first_row)
-        self.views.restart()
 
     def look_around(self, chunks: Callable[[], Iterable[Points]]) -> None:
-        """Learn what must be known of the whole cloud, before the first chunk is corrected."""
+        """Estimate everything that a correction must know about the whole cloud."""
         self.medium.look_around(chunks, self.labelling, self.views)
 
     def correct(self, points: Points) -> Correction:
@@ -87,7 +85,7 @@ class Job(Sums):
         return correction
 
     def provenance(self) -> dict[str, Any]:
-        """Return what a file shall say of its correction."""
+        """Return the record of the correction for the output file."""
         labelling = self.labelling
         mask = None if labelling.mask is None else labelling.mask.name
         rules = {"labelling": {**labelling.settings.as_dict(), "water_mask": mask}}
@@ -102,44 +100,55 @@ class Job(Sums):
         }
 
     def check_fit(self) -> None:
-        """Refuse a result in which cloud, water and cameras did not meet.
+        """Refuse a result in which cloud, water and cameras do not fit together.
 
         Raises
         ------
         GeometryError
-            If no point is to be corrected, or no camera sees one that is.
+            If no point was corrected, and why: none is submerged, or no image shows one.
         """
-        tally = self.tally
+        name, tally = self.name, self.tally
         self.views.check()
-        self.medium.check_carried(self.name)
-        self.labelling.check(self.name)
-        self.medium.check_meeting(self.name, tally)
+        self.medium.check(name, tally, self.labelling)
         flat = int(tally.outcomes[Outcome.FLAT_RAYS])
         if tally.outcomes[Outcome.NO_CAMERA] + flat == tally.submerged:
             block = self.cameras.centres, tally.low, tally.high, self._view.crs
-            found = None if flat else likely_mistake(*block)
-            mistake = f" {found}" if found else ""
-            raise GeometryError(f"{self.name}: {self.medium.out_of_sight(tally)}{mistake}")
-        if not tally.corrected and tally.submerged:
-            reasons = [f"{n:,}: {why}" for why, n in tally.uncorrected().items() if n]
+            mistake = (None if flat else likely_mistake(*block)) or ""
             raise GeometryError(
-                f"{self.name}: none of {tally.submerged:,} submerged points can be corrected"
-                f" ({'; '.join(reasons)}); check that cameras and cloud belong together."
+                "cameras.max_angle" if flat else "cameras.no_overlap",
+                f"{name}: {self.medium.out_of_sight(tally)} {mistake}".strip(),
+                submerged=tally.submerged,
+                flat=flat,
             )
-        self.medium.look_back()
+        if not tally.corrected and tally.submerged:
+            reasons = {why: n for why, n in tally.uncorrected().items() if n}
+            listed = "; ".join(f"{n:,}: {why}" for why, n in reasons.items())
+            raise GeometryError(
+                "cameras.none_corrected",
+                f"{name}: none of {tally.submerged:,} submerged points can be corrected ({listed})."
+                " Check that cameras and cloud belong together.",
+                reasons=reasons,
+            )
+        self.medium.finish()
 
     def save_regression(self) -> None:
-        """Write the line that was fitted, where a file was named for it."""
+        """Write the line that was fitted, if a file was named for it."""
         path, line = self.options.save_regression, self.medium.regression
         if path is not None and line is not None:
             write_regression(path, line, overwrite=self.options.overwrite)
 
     def summary(self, input: str, output: str, seconds: float) -> Summary:
-        """Return the numbers of all chunks."""
+        """Return the figures of all chunks."""
         tally, report = self.tally, self.views.report
         unused = list(compress(self.cameras.labels, np.logical_not(tally.camera_used)))
         uncorrected = tally.uncorrected()
-        stuck = sum(uncorrected.values()) + int(tally.outcomes[Outcome.NOT_CARRIED])
+        not_moved = sum(uncorrected.values()) + int(tally.outcomes[Outcome.NOT_CARRIED])
+        notes = [
+            *self.cameras.notes,
+            *([] if report is None else report.warnings()),
+            *self.labelling.notes,
+            *self.medium.notes(tally),
+        ]
         return Summary(
             input=input,
             output=output,
@@ -148,7 +157,7 @@ class Job(Sums):
             submerged=tally.submerged,
             corrected=tally.corrected,
             uncorrected=uncorrected,
-            dropped=stuck if self.options.uncorrected == "drop" else 0,
+            dropped=not_moved if self.options.uncorrected == "drop" else 0,
             water_unknown=tally.water_unknown,
             unsure=tally.unsure if self.options.unsure == "withhold" else None,
             shift_z_m=tally.shift_z_m(),
@@ -157,35 +166,13 @@ class Job(Sums):
             cameras=len(self.cameras),
             cameras_used=len(self.cameras) - len(unused),
             cameras_unused=unused,
-            cameras_left_out=self._left_out(),
             seconds=round(seconds, 3),
             views=None if report is None else report.as_dict(),
             warnings=[
-                *map(str, self.cameras.notes),
-                *([] if report is None else map(str, report.warnings())),
-                *self.labelling.notes,
-                *self.medium.notes(tally),
+                (one if isinstance(one, PcfixWarning) else PcfixWarning(one)).as_dict()
+                for one in notes
             ],
             labelling=self.labelling.report(),
             settings={**self.options.part(ScienceOptions).as_dict(), **self.medium.settings},
             **self.medium.figures(tally),
         )
-
-    def _left_out(self) -> dict[str, list[str]]:
-        """Return the unused cameras in whose frame corrected points lie, by what left them out."""
-        unused = ~self.tally.camera_used
-        if isinstance(self.medium, ThroughPort) or not self.tally.moved or not unused.any():
-            return {}
-        xyz, limit = np.vstack(self.tally.moved), self.medium.survey.settings.limit_deg or 90.0
-        seen = views_in_frame(xyz, self.cameras)
-        points = np.repeat(np.arange(len(xyz)), np.diff(seen.start))
-        across, along, up = (self.cameras.centres[seen.camera] - xyz[points]).T
-        steepest = np.full(len(unused), np.inf)
-        np.minimum.at(steepest, seen.camera, np.degrees(np.arctan2(np.hypot(across, along), up)))
-        beyond, within = unused & np.isfinite(steepest) & (steepest > limit), steepest <= limit
-        reasons = {f"beyond {limit:g} degrees alone": beyond, "but are not chosen": unused & within}
-        return {
-            why: list(compress(self.cameras.labels, rows))
-            for why, rows in reasons.items()
-            if rows.any()
-        }

@@ -152,7 +152,6 @@ def label_file(
         return run.run(
             lambda part: _step_for(part, given),
             lambda step: _summary(step, str(tiles), str(output), run.seconds),
-            LabelSummary,
         )
     task = file_task(single(input), output, given, reads=paths_in(given), progress=progress)
     with threads(given.jobs), all_or_none():

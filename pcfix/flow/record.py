@@ -1,16 +1,18 @@
-"""What a run was asked for and which of its steps are done, in a file, so that it can go on."""
+"""The file run.json: what a run was asked for, and which of its steps are done."""
 
 from __future__ import annotations
 
+import glob
 import json
 from collections.abc import Callable, Mapping, Sequence
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 from pcfix.errors import InputError
 from pcfix.flow.runner import json_text
-from pcfix.io.files import file_state, read_json, write_text
-from pcfix.io.opened import files_opened, of_inputs
+from pcfix.io.files import file_state, files_around, read_json, write_text
+from pcfix.options.declare import File
 
 VERSION = "pcfix"
 """Of a request: which version of pcfix did it."""
@@ -21,10 +23,9 @@ STEPS = ("adjust", "correct", "clean", "dsm", "compare", "map", "report")
 class Record:
     """What was asked for, from which files, and which steps are done.
 
-    A step counts as done while the request and the input files are those of the record, but for
-    what matters to later steps only, every step before it was found done, and its own files are as
-    it left them; files that it opened beside the inputs count as these do. The JSON file at `path`
-    is written after each step.
+    Each step has a key: a hash of its options, its input files and the key of the step before it.
+    A step is done if the record has it with the same key, its outputs are as it left them, and no
+    step before it had to be done. The JSON file at `path` is written after each step.
 
     Parameters
     ----------
@@ -44,40 +45,29 @@ class Record:
         inputs: Mapping[str, Sequence[Path]],
         since: Callable[[str], str],
     ) -> None:
-        self._path, self._since = path, since
-        states = [{**file_state(p), "step": step} for step, some in inputs.items() for p in some]
-        self._content: dict[str, Any] = {"request": request, "inputs": states, "steps": {}}
-        self._earlier: dict[str, Any] = {}
-        self.changed: list[str] = []
-        """What an earlier run was asked otherwise: options, or else files."""
-        self.first: str | None = None
-        """The first step of an earlier run that is not kept for that."""
-        self.resumes = path.exists() and self._kept(read_record(path))
+        self._path = path
+        states = {step: [file_state(one) for one in some] for step, some in inputs.items()}
+        self._content: dict[str, Any] = {
+            "request": request,
+            "inputs": [{**one, "step": step} for step, some in states.items() for one in some],
+            "steps": {},
+        }
+        self._keys: dict[str, str] = {}
+        key = ""
+        for step in STEPS:
+            options = {name: value for name, value in request.items() if since(name) == step}
+            depends = json.dumps([key, options, states.get(step)], sort_keys=True)
+            key = self._keys[step] = sha256(depends.encode()).hexdigest()
+        earlier = read_record(path) if path.exists() else {"request": request, "steps": {}}
+        self._earlier: dict[str, Any] = earlier["steps"]
+        self.resumes = self._has("correct" if "correct" in self._earlier else "adjust")
         """Whether there is an earlier run whose corrected cloud is not replaced."""
+        plain = json.loads(json.dumps(request))
+        self.changed = [one for one in plain if plain[one] != earlier["request"].get(one)]
+        """The options that the earlier run had otherwise."""
 
-    def _kept(self, earlier: dict[str, Any]) -> bool:
-        """Keep the steps of an earlier run that nothing changed for."""
-        plain = json.loads(json.dumps(self._content))
-        now, then = plain["request"], earlier["request"]
-        names = [one for one in {**now, **then} if now.get(one) != then.get(one)]
-        both = [*plain["inputs"], *earlier["inputs"]]
-        files = [one for one in both if both.count(one) == 1]
-        files += [
-            {**one, "step": step}
-            for step, done in earlier["steps"].items()
-            for one in done.get("read", ())
-            if file_state(Path(one["path"])) != one
-        ]
-        self.changed = [
-            "version of pcfix" if name == VERSION else f"--{name.replace('_', '-')}"
-            for name in names
-        ]
-        self.changed = self.changed or list(dict.fromkeys(Path(one["path"]).name for one in files))
-        firsts = [*map(self._since, names), *(one.get("step", STEPS[0]) for one in files)]
-        self.first = min(firsts, key=STEPS.index, default=None)
-        kept = STEPS[: STEPS.index(self.first)] if self.first else STEPS
-        self._earlier = {step: done for step, done in earlier["steps"].items() if step in kept}
-        return "correct" in kept and bool(self._earlier)
+    def _has(self, step: str) -> bool:
+        return bool(self._earlier.get(step, {}).get("key") == self._keys[step])
 
     def step(self, name: str, outputs: Sequence[Path], work: Callable[[], Any]) -> tuple[Any, bool]:
         """Do a step unless it is done; return its result and whether it was done.
@@ -85,26 +75,22 @@ class Record:
         `outputs` are all files that `work` leaves; it returns what later steps need, as JSON can
         hold it.
         """
-        earlier = self._earlier.get(name)
-        if earlier is not None and earlier["outputs"] == [file_state(p) for p in outputs]:
-            self._note(name, earlier)
-            return earlier["result"], True
-        self._earlier = {}  # what follows was made from other files
-        with files_opened() as opened:
-            result = work()
-        inputs = [Path(one["path"]) for one in self._content["inputs"]]
-        known = {path.resolve() for path in inputs}
-        read = of_inputs(opened, inputs, self._path.parent)
-        self._note(name, {
-            "outputs": [file_state(p) for p in outputs],
-            "read": [file_state(p) for p in read if p.resolve() not in known],
-            "result": result,
-        })  # fmt: skip
-        return json.loads(json.dumps(result)), False
-
-    def _note(self, name: str, step: dict[str, Any]) -> None:
-        self._content["steps"][name] = step
+        was_done = self._has(name) and self._earlier[name]["outputs"] == list(
+            map(file_state, outputs)
+        )
+        if was_done:
+            done = self._earlier[name]
+        else:
+            self._earlier = {}  # what follows was made from other files
+            result = json.loads(json.dumps(work()))
+            done = {
+                "key": self._keys[name],
+                "outputs": [file_state(one) for one in outputs],
+                "result": result,
+            }
+        self._content["steps"][name] = done
         write_text(self._path, json_text(self._content), overwrite=True)
+        return done["result"], was_done
 
 
 def read_record(path: Path) -> dict[str, Any]:
@@ -120,7 +106,21 @@ def read_record(path: Path) -> dict[str, Any]:
         _ = content["request"], content["inputs"], content["steps"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(
-            f"{path}: is not the record of a run ({error}); give the run.json of an earlier run,"
-            " or remove it."
+            "run.record",
+            f"{path}: is not the record of a run ({error}). Give the run.json of an earlier run, or"
+            " remove it.",
+            path=path,
         ) from error
     return content
+
+
+def belonging(path: File) -> list[Path]:
+    """Return a file or folder with what may be read with it: files of the same stem, and others.
+
+    The others are a sensor.csv beside it, all files of a folder, and the folder of a project.
+    """
+    found = files_around(path)
+    alike = (
+        [] if Path(path).is_dir() else Path(path).parent.glob(f"{glob.escape(Path(path).stem)}.*")
+    )
+    return sorted({*found, *(one for one in alike if one.is_file())})

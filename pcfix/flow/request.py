@@ -1,4 +1,4 @@
-"""What a run is asked for, what it reads, and where it leaves what it makes."""
+"""What a run is asked for, the files that it reads, and those that it writes."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from typing import Any
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.inputs import Inputs, paths_in
 from pcfix.flow.rasters import SURFACE
-from pcfix.flow.record import VERSION, read_record
+from pcfix.flow.record import VERSION, belonging, read_record
 from pcfix.flow.run_adjust import FOLDER, AdjustStep
 from pcfix.flow.tiles import HOW, RECORDS
 from pcfix.io.clouds import reference_of
-from pcfix.io.files import files_around, files_in
+from pcfix.io.files import files_in
 from pcfix.io.tiles import Tiles, cloud_of, inputs_of, tiles_from, tiles_of
 from pcfix.options.correct import CorrectOptions
 from pcfix.options.declare import named, options_of
@@ -57,7 +57,7 @@ class Request(RunOptions):
         )
 
     def with_adjusted(self, folder: Path, step: dict[str, Any]) -> Request:
-        """Return the request of the steps that follow: with the adjusted cameras where they are."""
+        """Return the request of the next steps: with the adjusted cameras, if there are any."""
         if not step["adjusted"]:
             return self
         return replace(
@@ -83,13 +83,12 @@ class Request(RunOptions):
         return {"adjust": found, "compare": compared}
 
     def watched(self, results: Path) -> dict[str, list[Path]]:
-        """Return all files that the results may go by; those in the folder of results are none."""
+        """Return the input files with those that belong to them, but none in the results."""
         read = self.files()
-        names = paths_in(self, but=("water",))
-        around = {path for name in names for path in files_around(name)}
         own = results.resolve()
-        more = sorted(one for one in around if own not in one.resolve().parents)
-        return {**read, "adjust": list(dict.fromkeys([*read["adjust"], *more]))}
+        more = {one for name in paths_in(self, but=("water",)) for one in belonging(name)}
+        more = {one for one in more if own not in one.resolve().parents}
+        return {**read, "adjust": list(dict.fromkeys([*read["adjust"], *sorted(more)]))}
 
 
 def _files_of(cloud: Path | Tiles) -> list[Path]:
@@ -114,22 +113,21 @@ def since(name: str) -> str:
 
 def request_of(record: Path) -> Request:
     """Return what an earlier run was asked for, from its ``run.json``."""
-    # runs before there were adjustments did without
-    kept = {"adjust": "no", **read_record(record)["request"]}
-    input = kept.pop("input", "")
-    input = tuple(input) if isinstance(input, list) else input
+    asked = dict(read_record(record)["request"])
+    input = asked.pop("input", "")
     for name in ("index_from", VERSION):
-        kept.pop(name, None)
+        asked.pop(name, None)
     try:
-        with warnings.catch_warnings():  # a record of old may have old names
-            warnings.simplefilter("ignore", PcfixWarning)
-            return Request(input=input, **named(kept, options_of(RunOptions), str(record)))
+        values = named(asked, options_of(RunOptions), str(record))
+        return Request(input=tuple(input) if isinstance(input, list) else input, **values)
     except (SettingError, TypeError) as error:
-        raise InputError(f"{record}: is not the record of a run ({error}).") from error
+        raise InputError(
+            "run.record", f"{record}: is not the record of a run ({error}).", path=record
+        ) from error
 
 
 class Files:
-    """Where a run leaves what it makes: of many files a folder of them."""
+    """The files that a run writes; of a cloud of many files a folder."""
 
     def __init__(self, folder: Path, source: Path | Tiles | None = None) -> None:
         self.folder = folder
@@ -155,12 +153,12 @@ class Files:
         return self._cloud(self.cleaned)
 
     def _cloud(self, target: Path) -> Path | Tiles:
-        with warnings.catch_warnings():  # what is said of the tiles was said of the inputs
+        with warnings.catch_warnings():  # they were shown for the inputs
             warnings.simplefilter("ignore", PcfixWarning)
             return target if self._many is None else tiles_from(str(target), self.parts(target))
 
     def remove_others(self) -> None:
-        """Remove the clouds that an earlier run made of other files; they would pass for these."""
+        """Remove the clouds that an earlier run made of other files."""
         kept = {*self.parts(self.corrected), *self.parts(self.cleaned)}
         for one in CLOUDS:
             records = (self.folder / one / RECORDS).glob("*.la[sz].npz")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from pcfix.errors import InputError
-from pcfix.flow.runner import Chunk, FileTask, Header, Step, file_task
+from pcfix.flow.runner import Chunk, Header, Step, file_task
 from pcfix.flow.tiles import TiledRun
 from pcfix.io.files import path_of
 from pcfix.io.las.columns import (
@@ -87,10 +87,6 @@ class Restoring(Sums, Step):
         """Count from nothing, wherever the next point is."""
         del first_row
         self.points = 0
-
-    def run(self, task: FileTask) -> None:
-        """Take a file through."""
-        task.run(self)
 
     def header(self, source: LasSource) -> Header:
         """Return the header as it was before the correction."""

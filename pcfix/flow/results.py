@@ -20,7 +20,6 @@ from pcfix.flow.runner import Bar, no_bar
 from pcfix.io import analysis, rasters
 from pcfix.io.styles import limits_of
 from pcfix.options.declare import File, options_of, taken
-from pcfix.options.steps import METRES
 from pcfix.options.survey import RunOptions
 from pcfix.refract.tally import Summary
 from pcfix.report.comparison import signed_statistics
@@ -109,8 +108,11 @@ class RunResults:
         """
         if interval is None:
             return self.layer("depth_contours")
-        if wrong := METRES("interval", interval):
-            raise SettingError(wrong)
+        if not interval > 0.0:
+            raise SettingError(
+                "option.range", f"interval {interval:g} must be above 0.",
+                option="interval", value=interval, above=0,
+            )  # fmt: skip
         crs = analysis.open_array(self._file(DEPTH)).rio.crs
         return analysis.frame_of(contours_layer(self.folder, interval), crs)
 

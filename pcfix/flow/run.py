@@ -1,14 +1,14 @@
-"""The whole way in one call: adjust, correct, clean, grid, compare, report."""
+"""All steps in one call: adjust, correct, clean, grid, compare, report."""
 
 from __future__ import annotations
 
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -49,9 +49,9 @@ from pcfix.report.text import uncertainty_sentence
 from pcfix.report.water import found_picture
 
 RECORD = "run.json"
-CLEAN = CleanOptions(overwrite=True)
 SECTIONS = 3
 DOD, REFERENCE_DSM = "dod.tif", "reference_dsm.tif"
+Work: TypeAlias = Callable[[Progress | None], Any]
 
 
 def run_all(
@@ -69,8 +69,8 @@ def run_all(
     ----------
     request : Request
     out_dir : Path
-        Made where its parent exists. A run with the same request resumes there; with other
-        options of later steps alone, such as a reference, only these are done anew.
+        Made where its parent exists. A run with the same request resumes there; if only options
+        of later steps changed, such as the reference, only these steps are done again.
     overwrite : bool
         Replace a cloud that was corrected in another way, and what else lies there.
     jobs : int, optional
@@ -88,54 +88,60 @@ def run_all(
     Raises
     ------
     PcfixError
-        With one sentence on what to mend; the steps before it stay done.
+        With one sentence on what to do; the steps before it stay done.
     """
     read = request.files()
     inputs = [path for some in read.values() for path in some]
     files = Files(out_dir, request.source)
-    _check(request, files)
-    record = _begun(request, out_dir, overwrite, say)
+    if request.m3c2:
+        load_py4dgeo()
+    check_one_file(request.source, request)
+    if isinstance(request.source, Tiles):
+        TiledRun("correct", request.source, files.corrected, request).check_folder()
+    record = _opened(request, out_dir, overwrite)
     check_shoreline(request.shoreline, overwrite=overwrite or record.resumes, inputs=inputs)
     shore = [] if request.shoreline is None else [Path(request.shoreline)]
 
-    step = _Steps(record, say, bar)
+    def do(name: str, outputs: list[Path], work: Work) -> tuple[Any, bool]:
+        """Return the result of a step, and whether it was done before."""
+
+        def with_bar() -> Any:
+            with bar(_TITLES[name]) as progress:
+                return work(progress)
+
+        return record.step(name, outputs, with_bar)
+
+    def step(name: str, outputs: list[Path], work: Work, more: Any = None) -> Any:
+        """Do a step that is not done yet, and print a line on it."""
+        result, was_done = do(name, outputs, work)
+        shown = {"correct": files.corrected, "clean": files.cleaned}.get(name, outputs[0])
+        done = "done before" if was_done else "done"
+        say(f"{name:<9} {done}: {shown}{more(result) if more else ''}")
+        return result
+
     asked = replace(request.adjust_step(), cloud=request.source)
-    first, was_done = step.done(
+    first, was_done = do(
         "adjust", outputs_of(out_dir), lambda _: adjust_first(asked, out_dir, inputs, jobs)
     )
     _say_adjusted(first, out_dir, was_done, say)
     request = request.with_adjusted(out_dir, first)
     line = [] if request.check_depths is None else [files.regression]
-    corrected = step(
-        "correct",
-        [*files.parts(files.corrected), *line, *shore],
-        partial(_correct, request, files, jobs),
-        shown=files.corrected,
-    )
+    outputs = [*files.parts(files.corrected), *line, *shore]
+    corrected = step("correct", outputs, partial(_correct, request, files, jobs))
     corrected = _with_checked(corrected, first)
-    if not first["is_said"] and is_worth_saying(first, _is_bent(corrected)):
+    absorbed = bool((corrected["poses"] or {}).get("absorbed"))
+    if not first["is_said"] and is_worth_saying(first, absorbed):
         first = {**first, "is_said": True}
         _say_adjusted(first, out_dir, was_done, say)
-    # the surface of a dimension is still in the cloud, and what was corrected is known anyway
-    clean = replace(CLEAN, jobs=jobs, scheduler=request.scheduler)
-    step(
-        "clean",
-        files.parts(files.cleaned),
-        lambda progress: clean_file(
-            files.corrected_cloud, files.cleaned, options=clean, progress=progress
-        ).as_dict(),
-        shown=files.cleaned,
-    )
+    step("clean", files.parts(files.cleaned), partial(_clean, request, files, jobs))
     errors = corrected["uncertainty"] is not None
-    outputs = raster_files(out_dir, errors=errors)
     cells = partial(resolution_sentence, given=request.resolution is not None)
+    outputs = raster_files(out_dir, errors=errors)
     step("dsm", outputs, partial(_grid, request, files, errors), cells)
-    compared = None
+    done = {"adjust": first, "correct": corrected, "compare": None}
     if request.reference is not None:
-        compared = step(
-            "compare", [files.compare / "compare.json"], lambda _: _compare(request, files)
-        )
-    done = {"adjust": first, "correct": corrected, "compare": compared}
+        outputs = [files.compare / "compare.json"]
+        done["compare"] = step("compare", outputs, lambda _: _compare(request, files))
     try:
         check_layers(files.map)
     except SettingError as error:
@@ -151,31 +157,25 @@ def run_all(
     return files.report
 
 
-def _check(request: Request, files: Files) -> None:
-    """Refuse what cannot be done, before anything is made."""
-    if request.m3c2:
-        load_py4dgeo()
-    check_one_file(request.source, request)
-    if isinstance(request.source, Tiles):
-        TiledRun("correct", request.source, files.corrected, request).check_folder()
-
-
-def _begun(request: Request, out_dir: Path, overwrite: bool, say: Callable[[str], None]) -> Record:
+def _opened(request: Request, out_dir: Path, overwrite: bool) -> Record:
     """Return the record of a folder, made where it is missing; refuse one of another run."""
     if not out_dir.parent.is_dir():
-        raise SettingError(f"{out_dir}: the folder {out_dir.parent} does not exist; make it first.")
+        raise SettingError(
+            "output.no_folder",
+            f"{out_dir}: the folder {out_dir.parent} does not exist. Make it first.",
+            path=out_dir,
+        )
     out_dir.mkdir(exist_ok=True)
     record = Record(out_dir / RECORD, request.record(), request.watched(out_dir), since)
-    changed = ", ".join(record.changed)
     if not (overwrite or record.resumes) and any(out_dir.iterdir()):
-        other = f"a run with another {changed}" if changed else "other files"
+        changed = ", ".join(record.changed) or "input file, or other files"
         raise SettingError(
-            f"{out_dir}: holds {other}; add --overwrite to replace what it has, or give another"
-            " folder."
+            "run.other",
+            f"{out_dir}: holds a run with another {changed}. Add --overwrite to replace it, or give"
+            " another folder.",
+            path=out_dir,
+            changed=record.changed,
         )
-    if changed:
-        say(f"{'changed':<9} {changed}: {record.first} and what follows is done"
-            " anew, what comes before is kept")  # fmt: skip
     return record
 
 
@@ -185,43 +185,10 @@ _TITLES = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class _Steps:
-    """Does steps that are not done yet, with a bar, and says a line on each."""
-
-    record: Record
-    say: Callable[[str], None]
-    bar: Bar
-
-    def __call__(
-        self,
-        name: str,
-        outputs: list[Path],
-        work: Callable[[Progress | None], Any],
-        more: Callable[[Any], str] = lambda result: "",
-        shown: Path | None = None,
-    ) -> Any:
-        result, was_done = self.done(name, outputs, work)
-        done = "done before" if was_done else "done"
-        self.say(f"{name:<9} {done}: {shown or outputs[0]}{more(result)}")
-        return result
-
-    def done(
-        self, name: str, outputs: list[Path], work: Callable[[Progress | None], Any]
-    ) -> tuple[Any, bool]:
-        """Return what a step comes to, and whether it was done before; nothing is said."""
-
-        def with_bar() -> Any:
-            with self.bar(_TITLES[name]) as progress:
-                return work(progress)
-
-        return self.record.step(name, outputs, with_bar)
-
-
 def _say_adjusted(
     first: dict[str, Any], out_dir: Path, was_done: bool, say: Callable[[str], None]
 ) -> None:
-    """Say what came of the adjustment; nothing where there was no question of one."""
+    """Print the result of the adjustment; nothing if there was no question of one."""
     if first["adjusted"]:
         say(f"{'adjust':<9} {'done before' if was_done else 'done'}: {outputs_of(out_dir)[0]}")
         figures = figures_of(out_dir)
@@ -251,9 +218,13 @@ def _with_checked(corrected: dict[str, Any], first: dict[str, Any]) -> dict[str,
     return {**corrected, "poses": {**poses, "absorbed": False, "words": words}}
 
 
-def _is_bent(corrected: dict[str, Any]) -> bool:
-    """Whether the correction found that the poses have absorbed the refraction."""
-    return bool((corrected["poses"] or {}).get("absorbed"))
+def _clean(
+    request: Request, files: Files, jobs: int | None, progress: Progress | None
+) -> dict[str, Any]:
+    # no water is given: the corrected cloud has a surface of a dimension, and marks what is below
+    options = CleanOptions(overwrite=True, jobs=jobs, scheduler=request.scheduler)
+    cloud = files.corrected_cloud
+    return clean_file(cloud, files.cleaned, options=options, progress=progress).as_dict()
 
 
 def _grid(
@@ -265,12 +236,16 @@ def _grid(
     )  # fmt: skip
 
 
+def _inputs(request: Request) -> Inputs:
+    """Return the inputs of the correction, without the view list."""
+    return replace(request, views=None).part(Inputs)
+
+
 def _cameras(request: Request, files: Files) -> Cameras:
     """Return the cameras in the CRS of the cloud; notes were shown when it was corrected."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PcfixWarning)
-        inputs = replace(request, views=None).part(Inputs)
-        return read_blocks(inputs, view_of(files.corrected_cloud).crs).cameras
+        return read_blocks(_inputs(request), view_of(files.corrected_cloud).crs).cameras
 
 
 def _compare(request: Request, files: Files) -> dict[str, Any]:
@@ -284,7 +259,7 @@ def _compare(request: Request, files: Files) -> dict[str, Any]:
         overwrite=True,
         **asked,
     )
-    if _rasters(request):
+    if _has_dod(request):
         heights = Path(str(reference))
         if is_cloud(reference):
             heights = files.compare / REFERENCE_DSM
@@ -309,7 +284,7 @@ def _compare(request: Request, files: Files) -> dict[str, Any]:
 
 
 def _map(request: Request, files: Files, done: dict[str, Any]) -> dict[str, int]:
-    """Write the vectors; of the water's height only its standard error as a whole is known."""
+    """Write the vector layers; the water's height has one standard error for all places."""
     summary, compared = done["correct"], done["compare"] or {}
     fitted = (summary["water_fit"] or {}).get("sigma_level_m")
     drawn = Drawn(
@@ -332,15 +307,13 @@ def _water(request: Request, files: Files) -> WaterSurface:
         warnings.simplefilter("ignore", PcfixWarning)
         with open_cloud(files.corrected_cloud) as source:
             stated = own_water(source)
-        inputs = replace(request, views=None).part(Inputs)
-        return stated or inputs.surface(view_of(files.corrected_cloud)).surface
+        return stated or _inputs(request).surface(view_of(files.corrected_cloud)).surface
 
 
-def _rasters(request: Request) -> list[str]:
-    """Return the rasters that a comparison leaves: none with check points."""
-    if is_cloud(request.surveyed):
-        return [DOD, REFERENCE_DSM]
-    return [DOD] if Path(str(request.reference)).suffix.lower() in (".tif", ".tiff") else []
+def _has_dod(request: Request) -> bool:
+    """Whether the comparison makes a raster of differences: not with check points."""
+    suffix = Path(str(request.reference)).suffix.lower()
+    return is_cloud(request.surveyed) or suffix in (".tif", ".tiff")
 
 
 def _report(
@@ -352,13 +325,13 @@ def _report(
     first, compared = done["adjust"], done["compare"]
     verdict = reason_sentence(first["adjusted"], first["why"]) if first["is_said"] else ""
     if compared is not None:
-        dod = preview(files.compare / DOD, MOST_CELLS) if _rasters(request) else None
+        dod = preview(files.compare / DOD, MOST_CELLS) if _has_dod(request) else None
         pictures, tables = evaluation(compared["figures"], compared["sections"], dod)
         verdict += in_a_sentence(compared["figures"])
     if first["adjusted"]:
         tables.append(adjustment_table(figures_of(files.folder), f"{FOLDER}/report.html"))
     summary = Summary(**done["correct"])
-    again = replace(request, views=None).part(Inputs)
+    again = _inputs(request)
     cameras = _cameras(request, files)
     if is_found(summary):
         pictures.append(found_picture(again.surface(view_of(request.source))))

@@ -59,6 +59,10 @@ class Step(Protocol):
         """Refuse a result that cannot be right; nothing is left behind then."""
         return
 
+    def run(self, task: FileTask) -> None:
+        """Process a file."""
+        task.run(self)
+
 
 @dataclass(frozen=True)
 class FileTask:

@@ -1,8 +1,8 @@
 """A correction through the port of a housing, for a cloud that was taken under water.
 
-All points are under water, whatever their height, but those outside the mask or of classes to
-respect. Without a water surface there is no depth: it is 0, and in a file the least that marks a
-submerged point, 1 mm.
+All points are under water, whatever their height, except those outside the mask or of classes to
+respect. Without a water surface there is no depth: it is 0, and in a file 1 mm, the least that
+marks a submerged point.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.errors import GeometryError, SettingError
+from pcfix.errors import GeometryError, PcfixWarning, SettingError
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.old_cameras import Blocks, ListedViews
 from pcfix.flow.surfaces import CloudView, Points
@@ -26,9 +26,31 @@ from pcfix.refract.tally import Tally
 from pcfix.sums import Sums
 from pcfix.water.surface import SurfaceAbove
 
+_ABOUT_WATER = (
+    "tide", "water_per_image", "image_times", "check_depths", "regression", "water_crs",
+    "water_model", "connected", "adjusted_from", "unsure", "shoreline",
+)  # fmt: skip
+_DEFAULTS = CorrectOptions()
+
+
+def check_port_options(options: CorrectOptions) -> None:
+    """Refuse options that need a water surface."""
+    excluded = {name: getattr(options, name) != getattr(_DEFAULTS, name) for name in _ABOUT_WATER}
+    excluded["camera_set"] = options.camera_set == "mvs"
+    excluded["occlusion"] = options.occlusion == "on"
+    excluded["method"] = options.method not in ("auto", "snell", "consistent")
+    for name, is_given in excluded.items():
+        if is_given:
+            raise SettingError(
+                "port.excludes",
+                f"{name.replace('_', '-')} {getattr(options, name)} has no effect with a port."
+                " Leave it out; the methods are snell and consistent.",
+                option=name,
+            )
+
 
 class ThroughPort(Sums):
-    """The light bends at a port that is fixed to the camera.
+    """The light is refracted at a port that is fixed to the camera.
 
     Raises
     ------
@@ -37,6 +59,7 @@ class ThroughPort(Sums):
     """
 
     added = ("_miss_sum_m",)
+    regression = None
 
     def __init__(
         self, options: CorrectOptions, inputs: Inputs, blocks: Blocks, view: CloudView
@@ -44,59 +67,31 @@ class ThroughPort(Sums):
         self._options, self._cameras, self._port = options, blocks.cameras, inputs.port
         if self._cameras.rotations is None:
             raise SettingError(
-                "port: it is fixed to the camera, and these cameras have no angles; give a camera"
-                " file that has them."
+                "cameras.no_angles",
+                "port: it is fixed to the camera, and these cameras have no angles. Give a camera"
+                " file with angles.",
             )
         if options.method == "auto":
             known = self._cameras.lenses is not None
             self._options = replace(options, method="consistent" if known else "snell")
         self.water = WaterPlane(np.inf)
-        self.settings, self.regression = {"port": asdict(self._port)}, None
+        self.settings = {"port": asdict(self._port)}
         self.restart()
-
-    @staticmethod
-    def check(options: CorrectOptions) -> None:
-        """Refuse what needs a water surface, or a model of what happens above one."""
-        given = {
-            "tide": options.tide is not None,
-            "water-per-image": options.water_per_image is not None,
-            "image-times": options.image_times is not None,
-            "check-depths": options.check_depths is not None,
-            "regression": options.regression is not None,
-            "water-crs": options.water_crs is not None,
-            "water-model": options.water_model != "auto",
-            "connected": options.connected,
-            "camera-set mvs": options.camera_set == "mvs",
-            "occlusion on": options.occlusion == "on",
-            "adjusted-from": options.adjusted_from is not None,
-            "unsure withhold": options.unsure == "withhold",
-            "shoreline": options.shoreline is not None,
-        }
-        for name, is_given in given.items():
-            if is_given:
-                raise SettingError(f"{name} is of no use with a port; leave it out.")
-        if options.method not in ("auto", "snell", "consistent"):
-            raise SettingError(
-                f"method {options.method} is about a water surface; with a port give snell or"
-                " consistent."
-            )
 
     def restart(self, first_row: int = 0) -> None:
         """Forget the chunks so far."""
-        del first_row
         self._miss_sum_m = 0.0
 
     def look_around(
         self, chunks: Callable[[], Iterable[Points]], labelling: Labelling, views: ListedViews
     ) -> None:
-        """Learn nothing: no point depends on others."""
+        """Do nothing: no point depends on others."""
 
     def correct(self, points: Points, views: Views | None, labelling: Labelling) -> Correction:
         """Correct one chunk; see `pcfix.flow.job.Job.correct`."""
-        xyz, classes = points.xyz, points.classes
-        n = len(xyz)
+        xyz, n = points.xyz, len(points.xyz)
         above = SurfaceAbove(np.full(n, np.inf), np.zeros((n, 2)))
-        rows = np.flatnonzero(labelling.submerged(xyz, above, classes))
+        rows = np.flatnonzero(labelling.submerged(xyz, above, points.classes))
         listed = None if views is None else views.take(rows)
         found = correct_through_port(xyz[rows], self._cameras, self._port, self._options, listed)
         self._miss_sum_m += float(found.ray_miss_m.sum())
@@ -110,41 +105,44 @@ class ThroughPort(Sums):
         )
 
     def provenance(self) -> dict[str, Any]:
-        """Return what a file shall say of the port."""
+        """Return the record of the port for the output file."""
         return dict(self.settings)
 
-    def check_carried(self, name: str) -> None:
-        """Nothing is carried through a port."""
-
-    def check_meeting(self, name: str, tally: Tally) -> None:
-        """Refuse a cloud of which nothing is left to correct."""
+    def check(self, name: str, tally: Tally, labelling: Labelling) -> None:
+        """Refuse a cloud that has no point to correct."""
+        labelling.check(name)
         if tally.submerged == 0:
-            raise GeometryError(f"{name}: no point is left to correct; check the mask.")
+            raise GeometryError(
+                "cloud.none_submerged", f"{name}: no point is left to correct. Check the mask."
+            )
 
     def out_of_sight(self, tally: Tally) -> str:
-        """Return what to say where no camera has a point in sight."""
-        return "no camera has a point in sight; check that cameras and cloud have the same CRS."
+        """Return the sentence for a cloud that no image shows."""
+        return "no camera has a point in sight. Check that cameras and cloud have the same CRS."
 
-    def look_back(self) -> None:
-        """Nothing is known of poses bent by a port, and there is no shoreline."""
+    def finish(self) -> None:
+        """Do nothing: absorbed refraction cannot be tested, and there is no shoreline."""
 
-    def notes(self, tally: Tally) -> list[str]:
-        """Say what forward intersection leaves out, where that was used."""
+    def notes(self, tally: Tally) -> list[PcfixWarning]:
+        """Return what forward intersection leaves out, if it was used."""
         if self._options.method != "snell" or not tally.corrected:
             return []
         mean = self._miss_sum_m / tally.corrected
-        return [
-            f"The rays through the apparent points miss each other behind the port by"
-            f" {mean:.3f} m on average; --method consistent takes into account that the straight"
-            " ones did, best with the views of each point."
-        ]
+        note = PcfixWarning(
+            "port.ray_distance",
+            "The refracted rays of the apparent points miss each other behind the port by"
+            f" {mean:.3f} m on average. --method consistent takes this into account, best with"
+            " --views.",
+            mean_m=mean,
+        )
+        return [note]
 
     def figures(self, tally: Tally) -> dict[str, Any]:
-        """Return what the summary says: no depths, and no orders of survey by depth."""
+        """Return the part of the summary about the port: no depths, and no orders by depth."""
         return {
             "depth_m": {},
             "water": f"all around, seen through a {self._port}",
             "water_fit": None,
             "uncertainty": None,
-            "told": self.notes(tally),
+            "told": list(map(str, self.notes(tally))),
         }

@@ -1,10 +1,11 @@
-"""A correction through a water surface: what it learns first, what it does, what it checks."""
+"""A correction through a water surface: the estimates before, the correction, the checks after."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import astuple, replace
 from functools import partial
+from itertools import compress
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -36,6 +37,7 @@ from pcfix.model import (
 )
 from pcfix.options.correct import CorrectOptions, ScienceOptions
 from pcfix.refract.batch import Batch, Intersection, MadeWith, Survey
+from pcfix.refract.choice import views_in_frame
 from pcfix.refract.hypotheses import CAUSES, Verdict
 from pcfix.refract.learning import as_told, for_own_water, weigh_lists
 from pcfix.refract.methods import correct, shift_of_land
@@ -45,12 +47,12 @@ from pcfix.sums import Sums
 from pcfix.water.checks import WaterMeeting, check_above_water, check_tilt, refuse_under_water
 from pcfix.water.surface import SurfaceAbove, is_submerged, surface_above
 
-OWN_WATER = "Images have water of their own, which snell and consistent alone allow for."
+OWN_WATER = "Each image has its own water surface; only snell and consistent can use them."
 Label: TypeAlias = Callable[[FloatArray, SurfaceAbove], BoolArray]
 
 
 class ThroughWater(Sums):
-    """The light bends at a water surface, and the cloud may come from other cameras.
+    """The light is refracted at a water surface; the cloud may come from other camera poses.
 
     Raises
     ------
@@ -60,19 +62,11 @@ class ThroughWater(Sums):
     """
 
     added = ("_meeting", "_sample", "_beyond", "_shore", "carrying")
-    settings: dict[str, Any]
-
-    @staticmethod
-    def check(options: CorrectOptions) -> None:
-        """Refuse what needs cameras, where there are none."""
-        if not options.cameras:
-            options.check_no_cameras()
 
     def __init__(
         self, options: CorrectOptions, inputs: Inputs, blocks: Blocks, view: CloudView
     ) -> None:
         check_shoreline(options.shoreline, overwrite=options.overwrite, inputs=paths_in(options))
-        self.settings = {} if inputs.regression is None else {"regression": str(inputs.regression)}
         self._options, self._inputs, self._view = options, inputs, view
         self._cameras = blocks.cameras
         self.carrying = None if blocks.pair is None else CloudTransfer(blocks.pair)
@@ -81,6 +75,9 @@ class ThroughWater(Sums):
         self.level_offset_m = inputs.level_offset_m(self._cameras)
         check_above_water(self._cameras, self.water, self.level_offset_m)
         check_tilt(self.water)
+        self.settings: dict[str, Any] = {}
+        if inputs.regression is not None:
+            self.settings["regression"] = str(inputs.regression)
         self._listed = None if blocks.views is None else blocks.views.kind
         settings: ScienceOptions = options
         folder, place = options.water_per_image, (view.crs, view.low, view.high)
@@ -93,7 +90,7 @@ class ThroughWater(Sums):
         self._learning = Learning(
             Survey(self.water, self._cameras, settings, self.level_offset_m, own_water=own),
             inputs, view, self._listed,
-            None if blocks.pair is None else self._old_ties,
+            None if blocks.pair is None else self._original_ties,
         )  # fmt: skip
         self.survey = self._learning.survey
         self._kind: ViewKind | None = None
@@ -101,8 +98,8 @@ class ThroughWater(Sums):
         self._poses: Poses | None = None
         self._shoreline: dict[str, Any] | None = None
         self._adjustment, self._no_poses = None, ""
-        told = options.dimensions == "all" and self.survey.settings.method != "regression"
-        if told and len(self._cameras):
+        wanted = options.dimensions == "all" and self.survey.settings.method != "regression"
+        if wanted and len(self._cameras):
             self._adjustment, self._no_poses = adjustment_of(inputs.cameras, self._cameras)
         self.restart()
 
@@ -121,11 +118,14 @@ class ThroughWater(Sums):
     def look_around(
         self, chunks: Callable[[], Iterable[Points]], labelling: Labelling, views: ListedViews
     ) -> None:
-        """Learn what must be known of the whole cloud, before the first chunk is corrected."""
-        around, makers = chunks, None
-        if self.carrying is not None:
-            around = partial(self._carried, chunks, self.carrying, views)
-            makers = partial(self._makers, chunks, self.carrying)
+        """Estimate everything that a correction must know about the whole cloud."""
+        around, makers, carrying = chunks, None, self.carrying
+        if carrying is not None:
+            around = partial(_transferred, chunks, carrying, views)
+
+            def makers() -> Iterator[MadeWith]:
+                return (MadeWith(points.xyz, carrying.pair.original) for points in chunks())
+
         if labelling.looks_around:
             labelling.look_around(
                 lambda: parts_of(around(), self.water), self._view.low, self._view.high
@@ -134,43 +134,19 @@ class ThroughWater(Sums):
         if self._options.depth_factor == "auto":
             self.settings["depth_factor"] = self.survey.settings.depth_factor
         self.verdicts = self._learning.verdicts
-        self._learn_poses(chunks, views)
+        if self._adjustment is not None:
+            sample = sample_of(chunks(), views, 1 + self._view.points // SAMPLE_POINTS)
+            pair = None if carrying is None else carrying.pair
+            poses = pose_errors(sample, self.survey, self._adjustment, pair)
+            self.survey = with_poses(self.survey, poses)
         self.restart()
 
-    def _learn_poses(self, chunks: Callable[[], Iterable[Points]], views: ListedViews) -> None:
-        """Find what the errors of the adjustment come to in the heights of the bed."""
-        if self._adjustment is None:
-            return
-        sample = sample_of(chunks(), views, 1 + self._view.points // SAMPLE_POINTS)
-        pair = None if self.carrying is None else self.carrying.pair
-        poses = pose_errors(sample, self.survey, self._adjustment, pair)
-        self.survey = with_poses(self.survey, poses)
-
-    @staticmethod
-    def _carried(
-        chunks: Callable[[], Iterable[Points]], carrying: CloudTransfer, views: ListedViews
-    ) -> Iterator[Points]:
-        """Yield the whole cloud as it lies with the adjusted cameras."""
-        listed, row = views.all_anew(), 0
-        for points in chunks():
-            xyz = points.xyz
-            yield points._replace(xyz=carrying.step(xyz, listed(xyz, row)).xyz)
-            row += len(xyz)
-
-    @staticmethod
-    def _makers(
-        chunks: Callable[[], Iterable[Points]], carrying: CloudTransfer
-    ) -> Iterator[MadeWith]:
-        """Yield what made the points of the whole cloud."""
-        for points in chunks():
-            yield MadeWith(points.xyz, carrying.pair.original)
-
-    def _old_ties(self) -> TiePoints | None:
-        """Return the tie points of the old model, else those of the adjusted one taken back."""
+    def _original_ties(self) -> TiePoints | None:
+        """Return the tie points of the original model, else the adjusted ones moved back."""
         if self.carrying is None:
             return None
-        ties, are_old = old_tie_points(self._inputs, self.carrying.pair, self._view.crs)
-        return ties if ties is None or are_old else self.carrying.back(ties)
+        ties, are_original = old_tie_points(self._inputs, self.carrying.pair, self._view.crs)
+        return ties if ties is None or are_original else self.carrying.back(ties)
 
     def correct(self, points: Points, views: Views | None, labelling: Labelling) -> Correction:
         """Correct one chunk; see `pcfix.flow.job.Job.correct`."""
@@ -206,7 +182,7 @@ class ThroughWater(Sums):
         return self.survey.learned.regression
 
     def _of_kind(self, batch: Batch) -> Batch:
-        """Return a chunk with its views as what they are; the first one tells what they list."""
+        """Return a chunk with the type of its view list, which is detected from the first one."""
         if batch.views is None:
             return batch
         if self._kind is None:
@@ -220,21 +196,9 @@ class ThroughWater(Sums):
                 self.survey = as_told(self.survey, verdict)
         return replace(batch, survey=self.survey, views=replace(batch.views, kind=self._kind))
 
-    def _write_shoreline(self) -> None:
-        """Write where the water meets the corrected cloud, where that is wanted."""
-        options, stated = self._options, self._options.sigma_level
-
-        def sigma(xy: FloatArray) -> FloatArray | None:
-            return self.found.sigma_level_m(xy) if stated is None else np.full(len(xy), stated)
-
-        if self._shore is not None and options.shoreline is not None:
-            self._shoreline = write_shoreline(
-                options.shoreline, self._shore, sigma, self._view.crs, overwrite=options.overwrite
-            )
-
     @property
     def made(self) -> dict[str, Any] | None:
-        """What the cloud was taken for, and why, where the options leave it open."""
+        """The reconstruction type, and why, if the options leave it open."""
         settings, views = self.survey.settings, self._listed
         own = [] if self.survey.own_water is None else [OWN_WATER]
         if self.verdicts or own:
@@ -244,9 +208,9 @@ class ThroughWater(Sums):
         elif settings.method == "snell":
             because = "The cameras have no lenses or no angles: corrected by snell."
         elif views is not None:
-            because = f"The list is one of {views}: corrected as such."
+            because = f"The view list is one of {views}: corrected as such."
         else:
-            because = "Too few points to tell how the cloud was made: taken for intersected rays."
+            because = "Too few points to detect the reconstruction type: tracks assumed."
         return {
             "method": settings.method,
             "camera_set": settings.camera_set,
@@ -257,48 +221,46 @@ class ThroughWater(Sums):
         }
 
     def provenance(self) -> dict[str, Any]:
-        """Return what a file shall say of the water."""
+        """Return the record of the water for the output file."""
         plane = list(astuple(self.water)) if isinstance(self.water, WaterPlane) else None
-        carried = {} if self.carrying is None else self.carrying.provenance()
-        made = {} if self.made is None else {"made": self.made}
         return {
-            "water": str(self.water), "water_plane": plane, **self.settings, **made, **carried
-        }  # fmt: skip
+            "water": str(self.water),
+            "water_plane": plane,
+            **self.settings,
+            **({} if self.made is None else {"made": self.made}),
+            **({} if self.carrying is None else self.carrying.provenance()),
+        }
 
-    def check_carried(self, name: str) -> None:
-        """Refuse a cloud that could not be taken to the adjusted cameras."""
+    def check(self, name: str, tally: Tally, labelling: Labelling) -> None:
+        """Refuse a cloud that could not be transferred, and water apart from the cloud."""
         if self.carrying is not None:
             self.carrying.check(name)
-
-    def check_meeting(self, name: str, tally: Tally) -> None:
-        """Refuse water that does not lie where the cloud is."""
+        labelling.check(name)
         self._meeting.check_submerged(name)
         if isinstance(self.water, WaterDimension):
             refuse_under_water(self._cameras, tally.lowest_water_m, str(self.water))
         self._meeting.check_reach(name)
 
     def out_of_sight(self, tally: Tally) -> str:
-        """Return what to say where no camera has a submerged point in sight."""
-        limit = self.survey.settings.limit_deg
-        if tally.outcomes[Outcome.FLAT_RAYS]:
+        """Return the sentence for a cloud of which no camera sees a submerged point."""
+        limit, flat = self.survey.settings.limit_deg, tally.outcomes[Outcome.FLAT_RAYS]
+        if flat:
             return (
-                f"no submerged point has two rays within {limit or 90.0:g} degrees of the surface"
-                f" normal, {tally.outcomes[Outcome.FLAT_RAYS]:,} have them beyond; give a larger"
-                " --max-angle, or none."
+                f"no submerged point has two rays within {limit or 90.0:g} deg of the surface"
+                f" normal; {flat:,} points have rays at larger angles. Increase --max-angle."
             )
         middle = (tally.low + tally.high) / 2.0
         distance = float(np.hypot(*(self._cameras.centres - middle)[:, :2].T).min())
         away = f"{distance / 1000.0:,.1f} km" if distance >= 10_000.0 else f"{distance:,.1f} m"
+        within = f" within {limit:g} degrees" if limit else ""
         return (
-            "no camera has a submerged point in sight"
-            + (f" within {limit:g} degrees" if limit else "")
-            + f"; the nearest stands {away} in plan from the middle of the"
-            f" {tally.submerged:,} submerged points; check that cameras and cloud have the"
-            " same CRS, and that pitch 0 means straight down."
+            f"no camera has a submerged point in sight{within}; the nearest is {away} in plan from"
+            f" the middle of the {tally.submerged:,} submerged points. Check that cameras and cloud"
+            " have the same CRS, and that pitch 0 is straight down."
         )
 
-    def look_back(self) -> None:
-        """Warn if the poses are bent by what the correction was made with; write the shoreline."""
+    def finish(self) -> None:
+        """Check cameras, cloud and water against each other; write the shoreline."""
         given = self._inputs.cameras
         ties = quick_ties(self._inputs, self._view.crs) if len(self._cameras) else None
         sought = (self.found.as_dict() or {}).get("model") == "auto"
@@ -308,7 +270,7 @@ class ThroughWater(Sums):
             self._listed is not None, self._sample.every,
         )  # fmt: skip
         tested = plausible(self._cameras, self._sample.xyz, ties, doubts, flight)
-        self._plausible = tested._replace(noted=CAUSES in self._told())
+        self._plausible = tested._replace(noted=CAUSES in map(str, self._detected()))
         self._plausible.warn()
         if not len(self._cameras):
             self._poses = Poses(None, "not applicable: no cameras were given")
@@ -317,35 +279,38 @@ class ThroughWater(Sums):
         n = self._options.refractive_index
         evidence = Evidence(self._cameras, name, self.water, n, ties=ties)
         self._poses = diagnose_in_passing(self._inputs, evidence, self._view, self.verdicts)
-        self._write_shoreline()
+        if self._shore is not None:
+            self._shoreline = self._written_shoreline(self._shore)
 
-    def _told(self) -> list[str]:
-        """Return what the cloud told beside the sentence on how it was made."""
-        verdicts = dict.fromkeys(note for one in self.verdicts for note in one.warnings())
+    def _written_shoreline(self, near: NearWater) -> dict[str, Any] | None:
+        """Write where the water meets the corrected cloud."""
+        path, stated = self._options.shoreline or "", self._options.sigma_level
+
+        def sigma(xy: FloatArray) -> FloatArray | None:
+            return self.found.sigma_level_m(xy) if stated is None else np.full(len(xy), stated)
+
+        return write_shoreline(path, near, sigma, self._view.crs, overwrite=self._options.overwrite)
+
+    def _detected(self) -> list[Any]:
+        """Return the notes on what was detected from the cloud."""
+        verdicts = {str(note): note for one in self.verdicts for note in one.warnings()}
         beyond = [] if self._beyond is None else self._beyond.notes()
-        return [*self._learning.notes, *beyond, *verdicts, *self._learning.of_unlisted_notes()]
+        unlisted = self._learning.of_unlisted_notes()
+        return [*self._learning.notes, *beyond, *verdicts.values(), *unlisted]
 
-    def notes(self, tally: Tally) -> list[str]:
-        """Return what was done on the user's behalf."""
-        bent = self._poses.warning if self._poses else ""
-        said = [one for one in (bent, self._no_poses) if one]
-        doubts, own = self._plausible.doubts, self._own_notes
-        return [
-            *map(str, doubts),
-            *self._told(),
-            *self.found.notes,
-            *own,
-            *self._meeting.notes,
-            *said,
-        ]
+    def notes(self, tally: Tally) -> list[Any]:
+        """Return what the user should know of the result."""
+        of_poses = [self._poses.warning if self._poses else "", self._no_poses]
+        notes = [*self._plausible.doubts, *self._detected(), *self.found.notes, *self._own_notes]
+        return [*notes, *self._meeting.notes, *(one for one in of_poses if one)]
 
     def figures(self, tally: Tally) -> dict[str, Any]:
-        """Return what the summary says of depths and water."""
+        """Return the part of the summary about depths, water and cameras."""
         moved, water, made = self.level_offset_m, str(self.water), self.made
-        uncertainty, poses = tally.uncertainty(self.made), self.survey.learned.poses
+        uncertainty, poses = tally.uncertainty(made), self.survey.learned.poses
         if uncertainty is not None and poses is not None:
             uncertainty["poses_m"] = round(poses.middle_m, 4)
-        notes = [s for s in self._told() if made is None or s not in made["because"]]
+        detected = map(str, self._detected())
         if moved is not None:
             times = f"{moved.min():+.3f} to {moved.max():+.3f} m at the times of the images"
             water = f"{water}, {times}"
@@ -356,11 +321,42 @@ class ThroughWater(Sums):
             "uncertainty": uncertainty,
             "carried": None if self.carrying is None else self.carrying.as_dict(),
             "made": made,
-            "told": notes,
+            "told": [one for one in detected if made is None or one not in made["because"]],
             "poses": None if self._poses is None else self._poses.as_dict(),
             "shoreline": self._shoreline,
             "fit": self._plausible.as_dict(),
+            "cameras_left_out": self._left_out(tally),
         }
+
+    def _left_out(self, tally: Tally) -> dict[str, list[str]]:
+        """Return the unused cameras whose frames hold corrected points, by the reason."""
+        unused = ~tally.camera_used
+        if not tally.moved or not unused.any():
+            return {}
+        xyz, limit = np.vstack(tally.moved), self.survey.settings.limit_deg or 90.0
+        seen = views_in_frame(xyz, self._cameras)
+        points = np.repeat(np.arange(len(xyz)), np.diff(seen.start))
+        across, along, up = (self._cameras.centres[seen.camera] - xyz[points]).T
+        steepest = np.full(len(unused), np.inf)
+        np.minimum.at(steepest, seen.camera, np.degrees(np.arctan2(np.hypot(across, along), up)))
+        beyond, within = unused & np.isfinite(steepest) & (steepest > limit), steepest <= limit
+        reasons = {f"beyond {limit:g} degrees alone": beyond, "but are not chosen": unused & within}
+        return {
+            why: list(compress(self._cameras.labels, rows))
+            for why, rows in reasons.items()
+            if rows.any()
+        }
+
+
+def _transferred(
+    chunks: Callable[[], Iterable[Points]], carrying: CloudTransfer, views: ListedViews
+) -> Iterator[Points]:
+    """Yield the whole cloud, transferred to the adjusted poses."""
+    listed, row = views.all_anew(), 0
+    for points in chunks():
+        xyz = points.xyz
+        yield points._replace(xyz=carrying.step(xyz, listed(xyz, row)).xyz)
+        row += len(xyz)
 
 
 def correct_checked(
@@ -370,7 +366,7 @@ def correct_checked(
     *,
     heights_only: bool = False,
 ) -> Correction:
-    """Label, refract, and spread the result over all rows: what every door runs.
+    """Label and correct points, and spread the result over all rows: what every door runs.
 
     Parameters
     ----------
@@ -381,7 +377,7 @@ def correct_checked(
     level_sigma_m : callable, optional
         Returns the standard deviation of the water's height at places, shape (m, 2).
     heights_only : bool
-        Leave the covariances out, of which files have the standard error of Z alone.
+        Leave the covariances out; files have only the standard error of Z.
     """
     xyz, surface = batch.xyz, batch.surface
     submerged = is_submerged(xyz[:, 2], surface) if label is None else label(xyz, surface)
@@ -392,9 +388,12 @@ def correct_checked(
     found = correct(wet)
     if heights_only:
         found = found._replace(covariance_m2=None)
-    below = _below_m(wet, found)
+    # depth below the water after the correction, negative above it
+    slope, (shift_x, shift_y, shift_z) = wet.surface.slope, found.shift_m.T
+    rise = slope[:, 0] * shift_x + slope[:, 1] * shift_y
+    below = np.asarray(wet.surface.height_m + rise - (wet.xyz[:, 2] + shift_z))
     if batch.made_with is not None:
-        # their own images put them lower than all images together, by which they were carried
+        # points whose own images place them above the water after the transfer are land
         bed = (below >= 0.0) | (found.outcome != Outcome.CORRECTED)
         submerged = submerged.copy()
         submerged[rows[~bed]] = False
@@ -403,7 +402,9 @@ def correct_checked(
     depth[rows] = below
     values = spread_over(found, rows, len(xyz))
     if batch.made_with is not None:
-        values["shift_m"] = values["shift_m"] + _land_shift(batch, submerged)
+        land = np.flatnonzero(~submerged)
+        values["shift_m"] = values["shift_m"].copy()
+        values["shift_m"][land] += shift_of_land(batch.take(land))
     known = np.isfinite(surface.height_m)
     return Correction(
         apparent_xyz=xyz,
@@ -415,13 +416,6 @@ def correct_checked(
     )
 
 
-def _below_m(wet: Batch, found: Intersection) -> FloatArray:
-    """Return how deep points lie after their correction, shape (m,); above the water negative."""
-    shift_x, shift_y, shift_z = found.shift_m.T
-    rise = wet.surface.slope[:, 0] * shift_x + wet.surface.slope[:, 1] * shift_y
-    return np.asarray(wet.surface.height_m + rise - (wet.xyz[:, 2] + shift_z))
-
-
 _PER_POINT = (
     "shift_m", "outcome", "ray_count", "ray_miss_m", "incidence_deg", "sigma_z_m", "covariance_m2",
     "unsure",
@@ -429,7 +423,7 @@ _PER_POINT = (
 
 
 def spread_over(found: Intersection, rows: IntArray, n: int) -> dict[str, Any]:
-    """Return the values of corrected rows as those of n points, zero elsewhere."""
+    """Return the values of some rows as those of n points, zero elsewhere."""
     full: dict[str, Any] = dict.fromkeys(_PER_POINT)
     if len(rows) == n:
         return {name: getattr(found, name) for name in _PER_POINT}
@@ -439,11 +433,3 @@ def spread_over(found: Intersection, rows: IntArray, n: int) -> dict[str, Any]:
             full[name] = np.zeros((n, *values.shape[1:]), values.dtype)
             full[name][rows] = values
     return full
-
-
-def _land_shift(batch: Batch, submerged: BoolArray) -> FloatArray:
-    """Return the shift of points made with other cameras, shape (n, 3), zero where submerged."""
-    shift = np.zeros((len(batch), 3))
-    rows = np.flatnonzero(~submerged)
-    shift[rows] = shift_of_land(batch.take(rows))
-    return shift

@@ -42,7 +42,7 @@ from pcfix.io.cameras.checks import numbers
 from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.metashape import SPREADS, documents
 from pcfix.io.cameras.metashape.documents import Chunk
-from pcfix.io.cameras.odm.project import named_crs
+from pcfix.io.cameras.odm import named_crs
 from pcfix.io.cameras.table import centres
 from pcfix.io.cameras.table import crs as table_crs
 from pcfix.io.cameras.table.columns import Columns, headers, is_header, read_columns

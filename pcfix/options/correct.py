@@ -6,15 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from pcfix.errors import SettingError
-from pcfix.options.declare import (
-    File,
-    OptionSet,
-    at_least,
-    not_negative,
-    option,
-    options_of,
-    within,
-)
+from pcfix.options.declare import File, OptionSet, number_or, option, options_of
 from pcfix.options.shared import (
     IndexOptions,
     InputOptions,
@@ -26,7 +18,6 @@ from pcfix.options.shared import (
     SubmergedOptions,
     SummaryOption,
     TileOptions,
-    WaterOptions,
     WaterPerImageOption,
 )
 
@@ -41,7 +32,7 @@ Occlusion = Literal["auto", "on", "off"]
 MatcherKind = Literal["depth-maps", "pairs"]
 
 WITHOUT_CAMERAS = ("factor", "regression")
-"""Methods that look at the apparent depth alone."""
+"""Methods that use the apparent depth only."""
 _ABOUT_CAMERAS = (
     "sensor", "angles", "cameras_crs", "cameras_offset", "views", "views_are", "adjusted_from",
     "tide", "image_times", "camera_set", "matcher", "max_angle", "max_cameras", "occlusion",
@@ -49,193 +40,172 @@ _ABOUT_CAMERAS = (
 )  # fmt: skip
 
 LEVEL_M = 0.02
-"""Standard deviation of a water level that nothing else is known of."""
-
-_SIGMA = not_negative("give a standard deviation")
-
-
-def _factor(name: str, text: str) -> float | str:
-    try:
-        return "auto" if text == "auto" else float(text)
-    except ValueError:
-        raise SettingError(f"{name} '{text}' is neither true by apparent depth nor auto.") from None
-
-
-def _angle_limit(name: str, text: str) -> float | str | None:
-    if text in ("auto", "none"):
-        return text if text == "auto" else None
-    try:
-        return float(text)
-    except ValueError:
-        raise SettingError(f"{name} '{text}' is neither degrees nor none or auto.") from None
+"""Assumed standard deviation of a water level."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MethodOptions(IndexOptions):
-    """Which rays count, and how the true point follows from the apparent one."""
+    """The rays that are used, and how the true point follows from the apparent one."""
 
     panel = Panel.METHOD
-    old_units = True
 
     method: Method = option(
         "auto",
-        "How the true point follows from the apparent one; auto: consistent, as the cloud itself"
-        " tells that it was made, or snell where the cameras have no lenses or angles.",
+        "Correction method. auto: consistent if the cameras have angles and lenses, else snell.",
     )
     camera_set: CameraSet = option(
         "auto",
-        "Without --views: every camera whose frame holds the point, or a model of dense matching;"
-        " auto: the model with --method consistent, else all.",
+        "Cameras used when there is no view list: every visible camera (all), or those that a"
+        " dense matcher would use (mvs); auto: mvs with --method consistent, else all.",
     )
     matcher: MatcherKind = option(
         "depth-maps",
-        "What that model makes a point of: fused depth maps (OpenMVS, COLMAP), or the median of"
+        "Dense matcher of --camera-set mvs: fused depth maps (OpenMVS, COLMAP), or the median of"
         " stereo pairs (MicMac, SURE).",
     )
     max_angle: float | str | None = option(
         "auto",
-        "Use rays up to this incidence angle in air, from the surface normal, or none: all; auto:"
-        " with a method that weighs all rays alike, as the cloud tells which rays made it.",
+        "Maximum incidence angle of a ray, from the surface normal; none for no limit. With auto"
+        " it is estimated from the cloud, for methods that weigh all rays alike.",
         unit="deg",
-        rule=within(0.0, 90.0, "give degrees from the surface normal", above=True),
-        parse=_angle_limit,
+        above=0,
+        most=90,
+        parse=number_or("auto", "none"),
         metavar="DEG",
         default_is="auto; 80 without angles",
     )
     max_cameras: int | None = option(
         None,
-        "Use so many rays a point at most, the steepest.",
-        rule=at_least(1, "give one ray or more"),
+        "Maximum number of rays per point; those closest to nadir are used.",
+        least=1,
         default_is="no limit",
     )
     occlusion: Occlusion = option(
         "auto",
-        "Leave out cameras to which the cloud itself hides the point; auto: where there are"
-        " obliques.",
+        "Skip cameras from which the cloud occludes the point; auto: if there are oblique images.",
     )
     exact: bool = option(
         False,
-        "Solve every point by itself; else --method consistent has that within 0.05 ground pixels,"
-        " but where a choice of images is all but open, from polynomials where these are enough.",
+        "Solve every point exactly. Otherwise --method consistent interpolates where that is"
+        " within 0.05 ground pixels.",
     )
     depth_factor: float | str | None = option(
         None,
-        "With --method factor: true by apparent depth; auto: as stereo pairs with the flying"
-        " height, focal length and base of the cameras have it on average.",
-        rule=within(1.0, 3.0, "give true by apparent depth"),
-        parse=_factor,
+        "Ratio of true to apparent depth; auto: from the height, focal length and base of the"
+        " cameras.",
+        least=1,
+        most=3,
+        needs="method factor",
+        parse=number_or("auto"),
         metavar="N",
         default_is="the refractive index",
     )
     least_r2: float = option(
-        0.5, "With --method regression: a fit with a lower r2 is refused.", rule=within(0, 1, "")
+        0.5, "With --method regression: refuse a fit with a lower r2.", least=0, most=1
     )
     index_from: str = ""
-    """Which water the index is of, where it was not given as a number; not an option."""
+    """Which water the index is of, if it was not given as a number; not an option."""
 
     def check(self) -> None:
-        """Check what options say together."""
+        """Check that one ray is enough for the method."""
         super().check()
-        if self.depth_factor is not None and self.method != "factor":
-            raise SettingError("depth-factor is of no use without --method factor; give both.")
         if self.max_cameras == 1 and self.method not in ("butler", "dietrich"):
             raise SettingError(
-                "max-cameras 1 is less than 2: an intersection needs two rays; one is enough for"
-                " --method butler and dietrich alone."
+                "option.range",
+                "max-cameras 1 is not enough: an intersection needs two rays. Only --method butler"
+                " and dietrich can use one.",
+                option="max_cameras",
+                value=1,
             )
 
     @property
     def needs_cameras(self) -> bool:
-        """Whether the correction looks at cameras."""
+        """Whether the correction uses cameras."""
         return self.method not in WITHOUT_CAMERAS or self.depth_factor == "auto"
 
     def check_no_cameras(self) -> None:
-        """Refuse what cannot be done, or says nothing, where there are no cameras.
+        """Refuse what cannot be done, or has no effect, without cameras.
 
         Raises
         ------
         SettingError
             With the first option that is about cameras.
         """
-        if self.depth_factor == "auto":
-            raise SettingError(
-                "cameras are missing: depth-factor auto goes by their height, focal length and"
-                " base; give them, or a number."
-            )
         if self.needs_cameras:
+            factor = self.method in WITHOUT_CAMERAS
+            wanted = "depth-factor auto" if factor else f"method {self.method}"
+            other = "a number" if factor else f"a method without: {' or '.join(WITHOUT_CAMERAS)}"
             raise SettingError(
-                f"cameras are missing: method {self.method} goes along their rays; give the poses"
-                f" of the images, or a method that needs none: {' or '.join(WITHOUT_CAMERAS)}."
+                "cameras.missing",
+                f"cameras are missing: {wanted} needs them. Give them, or {other}.",
             )
         for one in options_of(type(self)):
             if one.name in _ABOUT_CAMERAS and getattr(self, one.name) not in (one.default, "off"):
                 raise SettingError(
-                    f"{one.flag[2:]} is about cameras, and there are none: leave it out, or give"
-                    " cameras too."
+                    "option.needs",
+                    f"{one.flag[2:]} has no effect without cameras. Give both, or neither.",
+                    option=one.name,
+                    needs="cameras",
                 )
 
     @property
     def limit_deg(self) -> float | None:
-        """The largest incidence angle; None where there is none, or it is still open."""
+        """The maximum incidence angle; None for no limit, or if it is not known yet."""
         return None if self.max_angle in (None, "auto") else float(self.max_angle)
 
     @property
     def models_matcher(self) -> bool:
-        """Whether a model of dense matching stands in for a list of views."""
+        """Whether a model of dense matching replaces a view list."""
         automatic = self.camera_set == "auto" and self.method in ("auto", "consistent")
         return automatic or self.camera_set == "mvs"
 
 
 @dataclass(frozen=True, kw_only=True)
 class BudgetOptions(OptionSet):
-    """Standard deviations of what goes into a correction; see `pcfix.refract.uncertainty`."""
+    """Standard deviations of the inputs of a correction; see `pcfix.refract.uncertainty`."""
 
     panel = Panel.BUDGET
 
     sigma_image: float = option(
-        0.5, "Standard deviation of an image coordinate.", unit="px", rule=_SIGMA
+        0.5, "Standard deviation of an image coordinate.", unit="px", least=0
     )
     sigma_level: float | None = option(
         None,
-        "Of the water level.",
+        "Standard deviation of the water level.",
         unit="m",
-        rule=_SIGMA,
-        default_is=f"what its fit says, else {LEVEL_M:g}",
+        least=0,
+        default_is=f"that of its fit, else {LEVEL_M:g}",
     )
     sigma_tilt: float = option(
-        0.0, "Of the slope of the water surface, about each axis.", unit="deg", rule=_SIGMA
+        0.0, "Standard deviation of the slope of the water, about each axis.", unit="deg", least=0
     )
-    sigma_index: float = option(0.002, "Of the refractive index.", rule=_SIGMA)
+    sigma_index: float = option(0.002, "Standard deviation of the refractive index.", least=0)
     sigma_waves: float = option(
-        0.0, "Of the slope of the waves, from ray to ray.", unit="deg", rule=_SIGMA
+        0.0, "Standard deviation of the slope of waves, from ray to ray.", unit="deg", least=0
     )
-    sigma_centre: float = option(0.0, "Of a projection centre, each axis.", unit="m", rule=_SIGMA)
+    sigma_centre: float = option(
+        0.0, "Standard deviation of a projection centre, each axis.", unit="m", least=0
+    )
     sigma_attitude: float = option(
-        0.0, "Of the attitude of an image, about each axis.", unit="deg", rule=_SIGMA
+        0.0, "Standard deviation of the attitude, about each axis.", unit="deg", least=0
     )
 
 
 @dataclass(frozen=True, kw_only=True)
-class UnsureOption(OptionSet):
-    """What becomes of points that were corrected by flat rays alone."""
+class RefractionOptions(BudgetOptions, MethodOptions):
+    """Everything that the correction of points depends on."""
 
     panel = Panel.OUTPUT
 
     unsure: Unsure = option(
         "keep",
-        "Corrected points that only flat obliques see, every ray beyond 35 degrees, where no list"
-        " says which images made them: as others, or flagged withheld.",
+        "Corrected points seen only by oblique images, all rays beyond 35 degrees, without a view"
+        " list: kept as others, or flagged withheld.",
     )
-
-
-@dataclass(frozen=True, kw_only=True)
-class RefractionOptions(BudgetOptions, MethodOptions, UnsureOption):
-    """What the correction of points goes by."""
-
-    panel = Panel.WATER
-
     deep: bool = option(
-        False, "Accept depths of more than 60 m, which else are taken for a wrong water level."
+        False,
+        "Accept depths of more than 60 m, which usually mean a wrong water level.",
+        panel=Panel.WATER,
     )
 
 
@@ -245,20 +215,15 @@ class PointsOptions(RefractionOptions, WaterPerImageOption):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ResultOptions(OptionSet):
-    """What is written of a correction."""
+class ScienceOptions(RefractionOptions):
+    """Everything that a corrected file depends on, besides its inputs; the file records it."""
 
     panel = Panel.OUTPUT
 
     uncorrected: Uncorrected = option(
-        "withhold", "Submerged points with fewer than two usable rays: flagged, kept or left out."
+        "withhold", "Submerged points with fewer than two usable rays: flag, keep or drop them."
     )
     dimensions: Dimensions = option("all", "Extra dimensions; 'pcfix restore' needs all.")
-
-
-@dataclass(frozen=True, kw_only=True)
-class ScienceOptions(RefractionOptions, ResultOptions):
-    """What the values of a corrected file depend on, beside its inputs; the file records it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -277,53 +242,48 @@ class CorrectOptions(
     panel = Panel.OUTPUT
 
     save_regression: File | None = option(
-        None, "Write the line fitted to --check-depths there, as JSON."
+        None, "JSON file for the line fitted to --check-depths.", needs="check_depths"
     )
-
-    def check(self) -> None:
-        """Check what options say together."""
-        super().check()
-        if self.save_regression is not None and self.check_depths is None:
-            raise SettingError(
-                "save-regression is of no use without check-depths; give both, or neither."
-            )
 
 
 @dataclass(frozen=True, kw_only=True)
 class LabelRules(LandRules):
-    """Which points count as submerged, beyond lying below the surface; see `pcfix.label`."""
+    """Which points count as submerged, besides those below the surface; see `pcfix.label`."""
 
     panel = Panel.WATER
-    old_units = True
 
     band: float = option(
         0.0,
-        "Points at most so far from the surface, above or below, become class 41.",
+        "Points up to this distance from the surface, above or below, become class 41.",
         unit="m",
-        rule=not_negative("give metres from the water surface, or 0 for none"),
+        least=0,
         default_is="no class 41",
     )
     dead_band: float = option(
         0.0,
-        "Points at most so far from the surface take the label of their surroundings.",
+        "Points up to this distance from the surface get the label of their surroundings.",
         unit="m",
-        rule=not_negative("give metres from the water surface, or 0 for none"),
+        least=0,
         default_is="none",
     )
-    reset: bool = option(False, "Points that come as class 40 or 41 and are neither become 1.")
+    reset: bool = option(False, "Set points of class 40 or 41 that are neither to class 1.")
 
     def check(self) -> None:
-        """Check what options say together."""
+        """Check that the dead band is wider."""
         super().check()
         if 0.0 < self.dead_band <= self.band:
             raise SettingError(
-                f"dead-band {self.dead_band:g} does not reach beyond band {self.band:g}, in"
-                " which all points are class 41: give a wider dead band, or 0 for none."
+                "option.range",
+                f"dead-band {self.dead_band:g} must be more than band {self.band:g}, where all"
+                " points are class 41. Give a wider one, or 0 for none.",
+                option="dead_band",
+                value=self.dead_band,
+                above=self.band,
             )
 
 
 @dataclass(frozen=True, kw_only=True)
-class StageLabelOptions(LabelRules, SubmergedOptions, WaterOptions, NeededOptions):
+class StageLabelOptions(LabelRules, SubmergedOptions, NeededOptions):
     """The options of the stage ``label`` of PDAL, which writes no files."""
 
 

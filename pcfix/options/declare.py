@@ -12,10 +12,8 @@ import math
 import os
 import sys
 import types
-import warnings
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
-from dataclasses import Field, asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from inspect import get_annotations
 from typing import (
     Any,
@@ -25,17 +23,13 @@ from typing import (
     TypeAlias,
     TypeVar,
     Union,
-    cast,
     get_args,
     get_origin,
 )
 
-from pcfix.errors import PcfixWarning, SettingError
+from pcfix.errors import SettingError
 
 File: TypeAlias = str | os.PathLike[str]
-Rule: TypeAlias = Callable[[str, Any], str | None]
-"""Takes an option's name and value; returns what is wrong as a sentence, or None."""
-
 Set = TypeVar("Set", bound="OptionSet")
 
 
@@ -48,32 +42,35 @@ class Option(NamedTuple):
         One sentence, for the help and the tables.
     unit : str
         Of the value, as it is written after a number: m, deg, px.
-    rule : Rule or None
+    least, above, most : float or None
+        Limits of a number, or of each number of several; `above` itself is not allowed.
     default_is : str
         The default in words, where it is not the value.
     needed : bool
         Whether the command line and PDAL ask for it; `default_is` says where not.
+    needs : str
+        Another option of the class without which this one has no effect, or one and the value
+        that it must have: ``"method factor"``.
     parse : callable or None
-        From the text of the command line or of JSON to the value.
+        From the option's name and the text of the command line or of JSON to the value.
     metavar : str
-        What stands for the value in the help.
-    old : tuple of str
-        Names that it had; they work, with a warning.
-    hidden : bool
-        Left out of help and documents: it says nothing any more.
-    name, type, default, panel
-        From its field and its class; see `options_of`.
+        Stands for the value in the help.
+    panel : str
+        Of the help, where it is not that of its class.
+    name, type, default
+        From its field; see `options_of`.
     """
 
     help: str
     unit: str = ""
-    rule: Rule | None = None
+    least: float | None = None
+    above: float | None = None
+    most: float | None = None
     default_is: str = ""
     needed: bool = False
+    needs: str = ""
     parse: Callable[[str, str], Any] | None = None
     metavar: str = ""
-    old: tuple[str, ...] = ()
-    hidden: bool = False
     name: str = ""
     type: Any = None
     default: Any = None
@@ -107,7 +104,7 @@ class Option(NamedTuple):
         if self.default_is or self.default in (None, ()) or self.default is False:
             return self.default_is
         if isinstance(self.default, tuple):
-            return " ".join(f"{value:g}" for value in self.default)
+            return ("," if self.parse else " ").join(f"{value:g}" for value in self.default)
         return f"{self.default:g}" if isinstance(self.default, float) else str(self.default)
 
     @property
@@ -137,56 +134,99 @@ class Option(NamedTuple):
         Raises
         ------
         SettingError
-            If it is another type, not among the choices, or outside the rule.
+            If it is another type, not among the choices, or outside the limits.
         """
         if isinstance(value, str) and self.parse is not None:
             value = self.parse(self.flag[2:], value)
         if value is None and (self.default is None or type(None) in get_args(self.type)):
             return None
-        value = tuple(value) if isinstance(value, list) else value
-        wrong = None
-        with suppress(TypeError):  # of what is no number at all
-            wrong = None if self.rule is None else self.rule(self.flag[2:], value)
-        if wrong is None and self.choices and value not in self.choices:
-            wrong = f"{self.flag[2:]} '{value}' is not one of {', '.join(self.choices)}."
-        if wrong is not None:
-            raise SettingError(wrong)
-        return _converted(self, value)
+        several = next((get_args(kind) for kind in self.kinds if get_origin(kind) is tuple), None)
+        if several is None:
+            return self._checked_one(value, self.kinds)
+        if several[0] is Any:  # the class takes it apart
+            return tuple(value) if isinstance(value, list) else value
+        count = None if several[-1] is Ellipsis else len(several)
+        if isinstance(value, str) or not isinstance(value, Iterable):
+            raise self._wrong("type", value, "must be several values, as a list")
+        values = tuple(self._checked_one(one, several[:1]) for one in value)
+        if count is not None and len(values) != count:
+            form = f", {self.metavar}" if self.metavar else ""
+            raise self._wrong("count", value, f"must be {count} values{form}")
+        return values
 
-
-def _converted(one: Option, value: Any) -> Any:
-    """Return numbers as Python's."""
-    kinds = one.kinds
-    if bool in kinds or isinstance(value, str | tuple | os.PathLike):
-        if isinstance(value, str) and kinds in ((float,), (int,)):
-            raise SettingError(f"{one.flag[2:]} {value!r} must be a number.")
-        return value
-    if kinds == (int,):
-        if value != value or float(value) != math.floor(value):
-            raise SettingError(f"{one.flag[2:]} {value} must be a whole number.")
+    def _checked_one(self, value: Any, kinds: tuple[Any, ...]) -> Any:
+        """Return a single value as one of some types."""
+        if get_origin(kinds[0]) is Literal:
+            choices = get_args(kinds[0])
+            if value not in choices:
+                raise self._wrong("choice", value, f"is not one of {', '.join(choices)}")
+            return value
+        if not {int, float} & {*kinds} or (str in kinds and isinstance(value, str)):
+            return value
+        if isinstance(value, str) or not hasattr(value, "__float__"):
+            raise self._wrong("type", value, "must be a number")
+        number = float(value)
+        if not self._is_within(number):
+            limits = {"at least": self.least, "above": self.above, "at most": self.most}
+            words = [f"{word} {x:g}" for word, x in limits.items() if x is not None]
+            raise self._wrong(
+                "range", value, f"must be {' and '.join(words) or 'a finite number'}",
+                least=self.least if self.above is None else self.above, most=self.most,
+            )  # fmt: skip
+        if float in kinds:
+            return number
+        if number != math.floor(number):
+            raise self._wrong("type", value, "must be a whole number")
         return int(value)
-    return float(value) if float in kinds and hasattr(value, "__float__") else value
+
+    def _is_within(self, number: float) -> bool:
+        return (
+            math.isfinite(number)
+            and (self.least is None or number >= self.least)
+            and (self.above is None or number > self.above)
+            and (self.most is None or number <= self.most)
+        )
+
+    def _wrong(self, code: str, value: Any, words: str, **values: Any) -> SettingError:
+        """Return the error of a value that is not as it must be."""
+        shown = f"'{value}'" if isinstance(value, str) else value
+        return SettingError(
+            f"option.{code}", f"{self.flag[2:]} {shown} {words}.",
+            option=self.name, value=value, **values,
+        )  # fmt: skip
 
 
 def option(default: Any, help: str, **more: Any) -> Any:
     """Declare an option; for the names of `more` see `Option`."""
-    return field(default=default, metadata={"help": help, "option": Option(help, **more)})
+    return field(default=default, metadata={"option": Option(help, **more)})
 
 
 @dataclass(frozen=True, kw_only=True)
 class OptionSet:
-    """The base of all classes of options: every value is checked against its rule.
+    """The base of all classes of options: every value is checked against its declaration.
 
-    A class says in which `panel` of the help its own options stand, and whether they, where they
-    have a unit, once had it in their names (`old_units`: ``radius_m`` is `radius` now).
+    A class says in which `panel` of the help its own options stand.
     """
 
     panel: ClassVar[str] = ""
-    old_units: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        for one in options_of(type(self)):
-            object.__setattr__(self, one.name, one.checked(getattr(self, one.name)))
+        """Check every option, then what they say together."""
+        options = {one.name: one for one in options_of(type(self))}
+        for name, one in options.items():
+            object.__setattr__(self, name, one.checked(getattr(self, name)))
+        for name, one in options.items():
+            other, _, wanted = one.needs.partition(" ")
+            if other in options and getattr(self, name) != one.default:
+                value = getattr(self, other)
+                if value != wanted if wanted else value == options[other].default:
+                    flag = f"{options[other].flag} {wanted}".strip()
+                    raise SettingError(
+                        "option.needs",
+                        f"{one.flag[2:]} has no effect without {flag}. Give both, or neither.",
+                        option=name,
+                        needs=one.needs,
+                    )
         self.check()
 
     def check(self) -> None:
@@ -200,7 +240,7 @@ class OptionSet:
     def plain(self) -> dict[str, Any]:
         """Return what was given, other than the defaults, as a stage of PDAL takes it."""
         return {
-            one.name: _worded(one, getattr(self, one.name))
+            one.name: _as_text(one, getattr(self, one.name))
             for one in options_of(type(self))
             if getattr(self, one.name) != one.default
         }
@@ -210,7 +250,7 @@ class OptionSet:
         return {name: _plain(value) for name, value in asdict(self).items()}
 
 
-def _worded(one: Option, value: Any) -> Any:
+def _as_text(one: Option, value: Any) -> Any:
     """Return numbers and words as text with commas between, where text is parsed, and no limit."""
     if value is None:
         return "none"  # null would be the default
@@ -230,32 +270,24 @@ _KNOWN: dict[type, tuple[Option, ...]] = {}
 
 def options_of(kind: type) -> tuple[Option, ...]:
     """Return the options of a class, in the order of its help."""
-    if kind not in _KNOWN:
-        _KNOWN[kind] = _options_of(kind)
-    return _KNOWN[kind]
-
-
-def _options_of(kind: type) -> tuple[Option, ...]:
+    if kind in _KNOWN:
+        return _KNOWN[kind]
     homes = {name: base for base in reversed(kind.__mro__) for name in get_annotations(base)}
-    return tuple(_option(one, homes[one.name]) for one in fields(kind) if "option" in one.metadata)
-
-
-def _option(one: Field[Any], home: type) -> Option:
-    """Return the option of a field, with what the class that declares it says of all of its own."""
-    own, declared = vars(home), cast(Option, one.metadata["option"])
-    if own.get("old_units") and declared.unit:
-        declared = declared._replace(old=(f"{one.name}_{declared.unit}",))
-    kind = eval(str(one.type), vars(sys.modules[home.__module__]))
-    panel = own.get("panel", "")
-    return declared._replace(name=one.name, type=kind, default=one.default, panel=panel)
+    found = []
+    for one in (one for one in fields(kind) if "option" in one.metadata):
+        home = homes[one.name]
+        hint = eval(str(one.type), vars(sys.modules[home.__module__]))
+        declared: Option = one.metadata["option"]
+        panel = declared.panel or vars(home).get("panel", "")
+        found.append(declared._replace(name=one.name, type=hint, default=one.default, panel=panel))
+    _KNOWN[kind] = tuple(found)
+    return _KNOWN[kind]
 
 
 def table_of(kind: type) -> str:
     """Return the options of a class as a table of a document."""
     rows = ["| option | meaning | default |", "|---|---|---|"]
     for one in options_of(kind):
-        if one.hidden:
-            continue
         value = "\\|".join(one.choices) or one.metavar or one.placeholder
         flag = f"{one.flag} {value}".strip()
         rows.append(f"| `{flag}` | {one.help_text} | {one.needed_text} |")
@@ -272,7 +304,7 @@ def taken(kind: type[Set], given: OptionSet | None, keywords: Mapping[str, Any],
     given : OptionSet or None
         The argument ``options``.
     keywords : mapping
-        The others, by name; names of old work with a warning.
+        The others, by name.
     where : str
         Whose options they are, for messages.
 
@@ -281,120 +313,73 @@ def taken(kind: type[Set], given: OptionSet | None, keywords: Mapping[str, Any],
     SettingError
         If a name is unknown, or options are given both ways.
     """
-    if given is not None and keywords:
+    if given is None:
+        return kind(**named(keywords, options_of(kind), where))
+    if keywords:
+        name = next(iter(keywords))
         raise SettingError(
-            f"{where}: give options=... or {next(iter(keywords))}=..., not both;"
-            " dataclasses.replace changes single options."
+            "option.twice",
+            f"{where}: give options=... or {name}=..., not both. dataclasses.replace changes"
+            " single options.",
+            option=name,
         )
-    if given is not None:
-        return given if isinstance(given, kind) else given.part(kind)
-    return kind(**named(keywords, options_of(kind), where))
+    return given if isinstance(given, kind) else given.part(kind)
 
 
 def named(given: Mapping[str, Any], known: Iterable[Option], where: str) -> dict[str, Any]:
-    """Return values under the names of today, and warn of older ones.
+    """Return values whose names are all known.
 
     Raises
     ------
     SettingError
         If a name is unknown; the message names the nearest known one.
     """
-    options = list(known)
-    names = [one.name for one in options]
-    renamed = {old: one.name for one in options for old in one.old}
-    found: dict[str, Any] = {}
-    for name, value in _without_budget(given, names).items():
-        if name in renamed:
-            warnings.warn(
-                f"{where}: {name} is called {renamed[name]} now; the old name goes with the next"
-                " version.",
-                PcfixWarning,
-                stacklevel=4,
-            )
-        elif name not in names:
+    names = [one.name for one in known]
+    for name in given:
+        if name not in names:
             near = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
-            mean = f" did you mean {near[0]}?" if near else ""
+            hint = f"Did you mean {near[0]}?" if near else f"The options are {', '.join(names)}."
             raise SettingError(
-                f"{where}: there is no option '{name}';{mean} the options are {', '.join(names)}."
+                "option.unknown",
+                f"{where}: there is no option '{name}'. {hint}",
+                option=name,
+                near=next(iter(near), None),
             )
-        found[renamed.get(name, name)] = value
-    return found
+    return dict(given)
 
 
-def _without_budget(given: Mapping[str, Any], known: list[str]) -> dict[str, Any]:
-    """Return options with those of an old record's ``errors`` by their own names."""
-    if "errors" not in given or "sigma_image" not in known:
-        return dict(given)
-    rest = {name: value for name, value in given.items() if name != "errors"}
-    budget: dict[str, Any] = given["errors"] or {}
-    return {**rest, **{f"sigma_{name.rpartition('_')[0] or name}": budget[name] for name in budget}}
+def words(option: str, text: str) -> tuple[str, ...]:
+    """Parse words with commas between."""
+    return tuple(word.strip() for word in text.split(",") if word.strip())
 
 
-def rule(holds: Callable[[Any], bool], sentence: str) -> Rule:
-    """Return the rule that something holds; else a sentence with {option} and {value} in it."""
-
-    def check(option: str, value: Any) -> str | None:
-        return None if holds(value) else sentence.format(option=option, value=value)
-
-    return check
-
-
-def within(low: float, high: float, remedy: str, *, name: str = "", above: bool = False) -> Rule:
-    """Return the rule of a range, without its lower end where `above`."""
-    ends = f"{low:.1f} to {high:.1f}" if name else f"{low:g} to {high:g}"
-    return rule(
-        lambda value: (
-            isinstance(value, str) or ((low < value if above else low <= value) and value <= high)
-        ),
-        f"{name or '{option}'} {{value:g}} is outside {ends}{remedy and ': ' + remedy}.",
-    )
+def numbers(option: str, text: str) -> tuple[float, ...]:
+    """Parse numbers with commas between."""
+    try:
+        return tuple(float(word) for word in words(option, text))
+    except ValueError:
+        raise SettingError(
+            "option.type",
+            f"{option} '{text}' must be numbers with commas between.",
+            option=option.replace("-", "_"),
+            value=text,
+        ) from None
 
 
-def not_negative(remedy: str) -> Rule:
-    """Return the rule of what is finite and at least 0."""
-    return rule(
-        lambda value: math.isfinite(value) and value >= 0.0,
-        f"{{option}} {{value:g}} must not be negative: {remedy}.",
-    )
+def number_or(*names: str) -> Callable[[str, str], float | str | None]:
+    """Return the parser of a number or one of some words, any if none are named; none is None."""
 
-
-def at_least(low: float, remedy: str) -> Rule:
-    """Return the rule of a lower end."""
-    return rule(
-        lambda value: not value < low, f"{{option}} {{value:g}} is less than {low:g}: {remedy}."
-    )
-
-
-def must_be(low: float, high: float, remedy: str, *, whole: bool = False) -> Rule:
-    """Return the rule of finite numbers from low to high; a low of zero is itself not allowed."""
-    least = "above 0" if low == 0.0 else f"at least {low:g}"
-    most = f" and at most {high:g}" if math.isfinite(high) else ""
-
-    def holds(value: Any) -> bool:
-        number = math.nan if isinstance(value, str) else float(value)
-        if not math.isfinite(number) or (whole and number != math.floor(number)):
-            return False
-        return (number > low if low == 0.0 else number >= low) and number <= high
-
-    words = f"{'a whole number ' if whole else ''}{least}{most}"
-    return rule(holds, f"{{option}} {{value}} must be {words}: {remedy}.")
-
-
-def positive(sentence: str) -> Rule:
-    """Return the rule of what is above zero and finite."""
-    return rule(lambda value: 0.0 < value < math.inf, sentence)
-
-
-def one_or_more(kind: type, example: str) -> Callable[[str, str], tuple[Any, ...]]:
-    """Return the parser of words or numbers with commas between."""
-    kinds = {int: "whole numbers", float: "numbers", str: "words"}
-
-    def parse(option: str, text: str) -> tuple[Any, ...]:
+    def parse(option: str, text: str) -> float | str | None:
         try:
-            return tuple(kind(word.strip()) for word in text.split(",") if word.strip())
+            return float(text)
         except ValueError:
-            raise SettingError(
-                f"{option} '{text}' must be {kinds[kind]} with commas between, as {example}."
-            ) from None
+            if names and text not in names:
+                raise SettingError(
+                    "option.type",
+                    f"{option} '{text}' is neither a number nor {' nor '.join(names)}.",
+                    option=option.replace("-", "_"),
+                    value=text,
+                ) from None
+        return None if text == "none" else text
 
     return parse

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from pcfix.errors import SettingError
-from pcfix.options.declare import File, OptionSet, at_least, must_be, option, positive
+from pcfix.options.declare import File, OptionSet, option
 from pcfix.options.shared import (
     CameraFileOptions,
     CamerasOptions,
@@ -18,10 +18,33 @@ from pcfix.options.shared import (
     WaterOptions,
     WaterPerImageOption,
 )
-from pcfix.options.steps import METRES
 
 Mapping = Literal["exact", "paper"]
 Holes = Literal["fill", "black"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class OrthoOptions(JobOptions, SummaryOption, IndexOptions, WaterOptions, CamerasOptions):
+    """The options of ``pcfix ortho``."""
+
+    panel = Panel.NEED
+
+    dsm: Any = option(
+        None,
+        "True heights of land and bed: a GeoTIFF, or a corrected cloud (.las, .laz), which is"
+        " gridded to cells twice as wide as those of the orthophoto.",
+        metavar="PATH",
+        needed=True,
+    )
+    resolution: float | None = option(
+        None, "Cell size.", unit="m", above=0, default_is="a ground pixel"
+    )
+    water: Any = option(
+        None,
+        "Water surface, as for 'pcfix photos', for photographs as taken; without it refraction"
+        " must have been removed from them.",
+        metavar="SPEC",
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,115 +55,56 @@ class MappingRules(OptionSet):
 
     mapping: Mapping = option(
         "exact",
-        "exact: light is traced back from the true bed; paper: eq 12 of Skarlatos & Agrafiotis"
-        " 2018 on the apparent bed, a round of their iteration.",
+        "exact: trace the light back from the true bed; paper: eq 12 of Skarlatos & Agrafiotis"
+        " 2018 on the apparent bed, one round of their iteration.",
     )
     spacing: int | None = option(
         None,
-        "Between the nodes of the grid over the photograph.",
+        "Spacing of the grid nodes over the photograph.",
         unit="px",
-        rule=must_be(1, 512, "give pixels from 1 to 512", whole=True),
-        default_is="a cell of the DSM, and 8 px at least",
+        least=1,
+        most=512,
+        default_is="a cell of the DSM, at least 8 px",
     )
-    holes: Holes = option(
-        "fill", "Holes of the DSM: interpolated from around them, or black in the photographs."
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class GroundOptions(OptionSet):
-    """The ground under the photographs."""
-
-    panel = Panel.NEED
-
-    dsm: Any = option(
-        None,
-        "Heights of land and bed: a GeoTIFF, or a cloud (.las, .laz), which is gridded; corrected"
-        " for the mapping exact, as it came for paper.",
-        metavar="PATH",
-        needed=True,
-    )
-    resolution: float | None = option(
-        None,
-        "Of the raster that a cloud is gridded to.",
-        unit="m",
-        rule=METRES,
-        default_is="2 to 4 points a cell",
-    )
+    holes: Holes = option("fill", "Interpolate holes of the DSM, or make them black.")
 
 
 @dataclass(frozen=True, kw_only=True)
 class RebuildOptions(OptionSet):
-    """Rounds of photographs without water and clouds from them."""
+    """Rounds of photographs without refraction and clouds from them."""
 
     panel = Panel.ROUNDS
 
     rebuild: str | None = option(
         None,
-        "After the photographs the cloud is made again, and so on in rounds: stereo, pairs matched"
-        " by pcfix itself, or a command of another program, in which {images}, {cameras} and"
-        " {cloud} stand for the folder of the photographs, --cameras and the LAZ file to write.",
+        "Reconstruct the cloud from the photographs, in rounds: stereo, matching by pcfix, or the"
+        " command of another program, with {images}, {cameras} and {cloud} for the folder of the"
+        " photographs, --cameras and the LAZ file to write.",
         metavar="COMMAND",
     )
     until_gsd: float = option(
-        1.0,
-        "Stop when the bed moves by less than so many ground pixels, on average.",
-        rule=positive("{option} {value:g} is not positive; 1 is usual."),
+        1.0, "Stop if the mean change of the bed is less than this many ground pixels.", above=0
     )
-    most_rounds: int = option(4, "Stop after so many rounds.", rule=at_least(1, "4 are usual"))
+    most_rounds: int = option(4, "Maximum number of rounds.", least=1)
     reference: File | None = option(
-        None, "With --rebuild: 'pcfix compare' the clouds of all rounds with it, in OUT/compare."
+        None,
+        "Compare the clouds of all rounds with it, in OUT/compare; see 'pcfix compare'.",
+        needs="rebuild",
     )
 
     def check(self) -> None:
-        """Check what options say together."""
+        """Check that the command names what it reads and writes."""
         super().check()
-        if self.rebuild is None and self.reference is not None:
-            raise SettingError("reference is of no use without rebuild; give both, or neither.")
         command = self.rebuild or "stereo"
-        lacking = [one for one in ("{images}", "{cloud}") if one not in command]
-        if command != "stereo" and lacking:
+        missing = [one for one in ("{images}", "{cloud}") if one not in command]
+        if command != "stereo" and missing:
             raise SettingError(
-                f"rebuild '{command}' lacks {' and '.join(lacking)}; name the folder that the"
-                " command reads and the cloud that it writes so, or give stereo."
+                "option.command",
+                f"rebuild '{command}' has no {' and '.join(missing)}. Use them for the folder that"
+                " the command reads and the cloud that it writes, or give stereo.",
+                option="rebuild",
+                missing=missing,
             )
-
-
-@dataclass(frozen=True, kw_only=True)
-class OrthoRules(OptionSet):
-    """What an orthophoto is made of."""
-
-    panel = Panel.NEED
-
-    dsm: Any = option(
-        None,
-        "Heights of land and bed where they are: a GeoTIFF, or a cloud (.las, .laz) that was"
-        " corrected, which is gridded to cells twice as wide as those of the orthophoto.",
-        metavar="PATH",
-        needed=True,
-    )
-    resolution: float | None = option(
-        None, "Side of a cell.", unit="m", rule=METRES, default_is="a ground pixel"
-    )
-    water: Any = option(
-        None,
-        "For photographs as they were taken: the water surface, as of 'pcfix photos'; without it"
-        " they are photographs without water.",
-        metavar="SPEC",
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class OrthoOptions(
-    JobOptions,
-    SummaryOption,
-    CameraFileOptions,
-    IndexOptions,
-    WaterOptions,
-    OrthoRules,
-    CamerasOptions,
-):
-    """The options of ``pcfix ortho``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,96 +114,99 @@ class PhotosOptions(
     SummaryOption,
     RebuildOptions,
     MappingRules,
-    CameraFileOptions,
     IndexOptions,
-    WaterOptions,
-    GroundOptions,
     NeededOptions,
     CamerasOptions,
 ):
     """The options of ``pcfix photos``."""
 
+    panel = Panel.NEED
+
+    dsm: Any = option(
+        None,
+        "Heights of land and bed: a GeoTIFF, or a cloud (.las, .laz), which is gridded; corrected"
+        " for --mapping exact, apparent for paper.",
+        metavar="PATH",
+        needed=True,
+    )
+    resolution: float | None = option(
+        None,
+        "Cell size to which a cloud is gridded.",
+        unit="m",
+        above=0,
+        default_is="2 to 4 points a cell",
+    )
+
 
 @dataclass(frozen=True, kw_only=True)
-class WavesOptions(OptionSet):
-    """The water surface from what waves do to the frames."""
+class CalmOptions(JobOptions, SummaryOption, CameraFileOptions, IndexOptions):
+    """The options of ``pcfix calm``."""
 
     panel = Panel.WATER
 
     surface: bool = option(
         False,
-        "Also the water surface of each frame, from how far the bed is displaced in it: rasters in"
-        " OUT_water, which --water-per-image of 'pcfix correct' and 'photos' takes.",
+        "Also estimate the water surface of each frame from the displacement of the bed: rasters in"
+        " OUT_water, for --water-per-image of 'pcfix correct' and 'photos'.",
     )
     depth: Any = option(
         None,
-        "With --surface: the true depth in metres, or heights of the bed: a GeoTIFF or cloud, taken"
-        " as it appears through the water where pcfix did not correct it.",
+        "With --surface: true depth in metres, or heights of the bed: a GeoTIFF or cloud, which is"
+        " apparent unless pcfix corrected it.",
         metavar="SPEC",
+        needs="surface",
     )
     level: float = option(0.0, "With --surface: height of the calm water.", unit="m")
     cameras: Any = option(
         None,
-        "With --surface: the pose of the hovering camera, that of the first frame by its name, or"
-        " the only one in the file.",
+        "With --surface: pose of the hovering camera, by the name of the first frame, or the only"
+        " one in the file.",
         metavar="PATH",
+        needs="surface",
     )
     gsd: float | None = option(
         None,
-        "With --surface, instead of --cameras, for a view straight down: the size of a pixel at the"
-        " bed.",
+        "With --surface, instead of --cameras, for a nadir view: pixel size at the bed.",
         unit="m",
-        rule=METRES,
+        above=0,
+        needs="surface",
     )
     interval: float | None = option(
         None,
-        "With --surface: time between frames, before --every; without it each stands alone.",
+        "With --surface: time between frames, before --every; without it frames are independent.",
         unit="s",
-        rule=positive("{option} {value:g} is not positive; give seconds."),
+        above=0,
+        needs="surface",
         default_is="what the video says",
     )
     resolution: float | None = option(
         None,
-        "Of the rasters of the water.",
+        "Cell size of the rasters of the water.",
         unit="m",
-        rule=METRES,
-        default_is="so that it has 2,000 cells",
+        above=0,
+        default_is="that of 2,000 cells",
     )
-
-
-@dataclass(frozen=True, kw_only=True)
-class CalmOptions(JobOptions, SummaryOption, CameraFileOptions, IndexOptions, WavesOptions):
-    """The options of ``pcfix calm``."""
-
-    panel = Panel.METHOD
-
-    every: int = option(
-        1,
-        "Take every so many frames.",
-        rule=must_be(1, 100_000, "give 2 for every other one", whole=True),
-    )
-
+    every: int = option(1, "Use every Nth frame.", least=1, most=100_000, panel=Panel.METHOD)
     still: bool = option(
         False,
-        "The camera stood still, as on a mast: frames are taken as they are. Else they are laid on"
-        " the first by what moves least; without land the waves of the first move the image a bit.",
+        "The camera did not move, as on a mast: frames are used as they are. Otherwise they are"
+        " aligned to the first by what moves least.",
+        panel=Panel.METHOD,
     )
 
     def check(self) -> None:
-        """Check what options say together."""
+        """Check that the depth and the scale of the images are known."""
         super().check()
-        if not self.surface:
-            for name in ("depth", "cameras", "gsd", "interval"):
-                if getattr(self, name) is not None:
-                    raise SettingError(f"{name} is of no use without surface; add it, or leave it.")
-            return
-        if self.depth is None:
+        if self.surface and self.depth is None:
             raise SettingError(
-                "surface needs depth, which says how far a slope displaces the bed; give metres, or"
-                " heights of the bed."
+                "option.missing",
+                "surface needs depth. Give metres, or heights of the bed.",
+                option="depth",
             )
-        if (self.cameras is None) == (self.gsd is None):
+        if self.surface and (self.cameras is None) == (self.gsd is None):
             raise SettingError(
-                "surface needs either cameras, the pose of the hovering camera, or gsd, the size of"
-                " a pixel at the bed in metres."
+                "option.missing",
+                "surface needs either cameras or gsd. Give the pose of the camera, or the pixel"
+                " size at the bed in metres.",
+                option="cameras",
             )

@@ -2,23 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal
 
-from pcfix.errors import SettingError
-from pcfix.options.declare import (
-    File,
-    OptionSet,
-    at_least,
-    not_negative,
-    one_or_more,
-    option,
-    positive,
-    rule,
-    within,
-)
+from pcfix.options.declare import File, OptionSet, number_or, numbers, option
 
 ViewsAre = Literal["auto", "tracks", "depth-maps", "pairs"]
 Angles = Literal["omega-phi-kappa", "yaw-pitch-roll", "aircraft"]
@@ -49,42 +37,6 @@ class Panel(StrEnum):
     OUTPUT = "Output"
 
 
-_INDEX = within(
-    1.0, 1.5, "give the index of water relative to air, about 1.333 for fresh and 1.34 for sea"
-    " water", name="refractive index",
-)  # fmt: skip
-
-
-def index_or_name(option: str, text: str) -> float | str:
-    """Return a number as one, and the name of a water as it is."""
-    try:
-        return float(text)
-    except ValueError:
-        return text
-
-
-def _three_numbers(option: str, text: str) -> tuple[float, ...]:
-    try:
-        x, y, z = (float(word) for word in text.split(","))
-    except ValueError:
-        x = y = z = math.nan
-    if not math.isfinite(x + y + z):
-        raise SettingError(
-            f"{option} '{text}' must be three numbers X,Y,Z in metres, as 500000,4650000,0."
-        )
-    return x, y, z
-
-
-def _classes(option: str, numbers: Any) -> str | None:
-    for number in numbers:
-        if not 0 <= number <= 255:
-            return f"{option}: {number} is no class of LAS; give numbers from 0 to 255."
-    return None
-
-
-Offset: TypeAlias = tuple[float, float, float]
-
-
 @dataclass(frozen=True, kw_only=True)
 class IndexOptions(OptionSet):
     """The refractive index of the water."""
@@ -94,15 +46,15 @@ class IndexOptions(OptionSet):
     index: float | str | None = option(
         None,
         "Refractive index of the water relative to air: a number, fresh or sea.",
-        rule=_INDEX,
-        parse=index_or_name,
+        least=1.0,
+        most=1.5,
+        parse=number_or(),
         default_is=f"{DEFAULT_REFRACTIVE_INDEX:g}",
         metavar="N",
-        old=("refractive_index",),
     )
     index_formula: IndexFormula = option(
         "skarlatos",
-        "How the index follows from salinity, temperature and wavelength: Skarlatos & Agrafiotis"
+        "Formula of the index from salinity, temperature and wavelength: Skarlatos & Agrafiotis"
         " 2018, eq 13, or Quan & Fry 1995.",
     )
 
@@ -120,8 +72,8 @@ class WaterOptions(OptionSet):
 
     water_model: WaterModel = option(
         "auto",
-        "What is fitted to shoreline points: a level, a plane, one tilted along the points and"
-        " level across, or a river; auto chooses among the first three.",
+        "Surface fitted to shoreline points: level, plane, plane tilted along the points only, or"
+        " river; auto chooses among the first three.",
     )
     water_crs: str | None = option(
         None, "CRS of the shoreline points.", default_is="what their file says", metavar="CRS"
@@ -129,15 +81,30 @@ class WaterOptions(OptionSet):
 
 
 @dataclass(frozen=True, kw_only=True)
+class NeededOptions(WaterOptions):
+    """The water surface."""
+
+    panel = Panel.NEED
+
+    water: Any = option(
+        None,
+        "Water surface: a level (0.37), plane:a,b,c, dim:NAME, a mesh (.obj, .ply), a raster"
+        " (.tif), shoreline points (.csv, .gpkg, .shp, .geojson, .wkt), or auto.",
+        metavar="SPEC",
+        needed=True,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class WaterPerImageOption(OptionSet):
-    """Water that is another for each photograph."""
+    """A water surface of its own for each image."""
 
     panel = Panel.WATER
 
     water_per_image: File | None = option(
         None,
-        "Folder of rasters of the water, each of the name of a photograph, as 'pcfix calm"
-        " --surface' writes them; the others go by --water.",
+        "Folder of rasters of the water, named as the images; see 'pcfix calm --surface'. --water"
+        " is used for the other images.",
     )
 
 
@@ -146,34 +113,32 @@ class LandRules(OptionSet):
     """Which points below the surface are land all the same."""
 
     panel = Panel.WATER
-    old_units = True
 
     connected: bool = option(
-        False, "Leave out pools that are apart from the water; what was left out is reported."
+        False, "Correct only the main water body and its connected parts; ignore separate pools."
     )
     least_pool: float | None = option(
         None,
-        "With --connected: pools of at least this area stay in.",
+        "Pools of at least this area are not ignored.",
         unit="m2",
-        rule=not_negative("give square metres"),
+        least=0.0,
+        needs="connected",
         default_is="a tenth of the largest water",
     )
     respect_classes: tuple[int, ...] = option(
         (),
-        "Points of these classes are never submerged, as 2,5,6 for ground, trees and buildings.",
-        rule=_classes,
-        parse=one_or_more(int, "2,5,6"),
+        "Points of these classes are never submerged; 2,5,6 are ground, trees and buildings.",
+        least=0,
+        most=255,
+        parse=numbers,
         default_is="none",
         metavar="N,N",
     )
 
     def check(self) -> None:
-        """Check what options say together."""
+        """Sort the classes."""
         super().check()
-        if self.least_pool is not None and not self.connected:
-            raise SettingError("least-pool is of no use without connected; give both, or neither.")
-        numbers = tuple(sorted({int(number) for number in self.respect_classes}))
-        object.__setattr__(self, "respect_classes", numbers)
+        object.__setattr__(self, "respect_classes", tuple(sorted({*self.respect_classes})))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -190,54 +155,158 @@ class SubmergedOptions(LandRules):
 
 
 @dataclass(frozen=True, kw_only=True)
+class PortOptions(OptionSet):
+    """A housing under water."""
+
+    panel = Panel.WATER
+
+    port: Any = option(
+        None,
+        "Housing port, for a cloud taken under water, instead of --water:"
+        " flat:distance=M[,thickness=M,glass=N,nx=,ny=] or"
+        " dome:radius=M[,thickness=M,glass=N,x=M,y=M,z=M], seen from the projection centre.",
+        metavar="SPEC",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class CameraFileOptions(OptionSet):
     """How a camera file is read."""
 
     panel = Panel.CAMERAS
-    old_units = True
 
     sensor: File | None = option(
         None,
-        "Interior orientation where the cameras have none: CSV focal,sensor_x,sensor_y in mm, or"
-        " a Metashape calibration.",
+        "Interior orientation, if the cameras have none: CSV focal,sensor_x,sensor_y in mm, or a"
+        " Metashape calibration.",
         default_is="sensor.csv beside the cameras",
     )
     angles: Angles | None = option(
         None,
-        "Which angles a table has, where its header cannot say: aircraft means pitch -90 straight"
+        "Angles of a table whose header does not name them; in aircraft, pitch -90 is straight"
         " down.",
         default_is="yaw-pitch-roll",
     )
     cameras_crs: str | None = option(
         None,
-        "CRS of the cameras, as EPSG:25830; 'local' takes the numbers as they are.",
+        "CRS of the cameras, such as EPSG:25830; 'local' uses the numbers as they are.",
         default_is="what their file says, else the cloud's",
         metavar="CRS",
     )
-    cameras_offset: Offset | None = option(
+    cameras_offset: tuple[float, float, float] | None = option(
         None,
         "Added to the projection centres, for models shifted to the origin.",
         unit="m",
-        parse=_three_numbers,
+        parse=numbers,
         metavar="X,Y,Z",
     )
 
 
+CAMERAS: dict[str, Any] = {
+    "help": "File or folder of camera poses: Metashape, Pix4D, OPF, ODM, OpenSfM, COLMAP, MicMac,"
+    " Bundler, VisualSFM, BlocksExchange, RealityCapture, or a CSV table.",
+    "metavar": "PATH",
+    "needed": True,
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class CamerasOptions(CameraFileOptions):
+    """The exterior orientation."""
+
+    panel = Panel.NEED
+
+    cameras: Any = option(None, **CAMERAS)
+
+
 @dataclass(frozen=True, kw_only=True)
 class ViewOptions(OptionSet):
-    """Which cameras made each point."""
+    """Which images contributed to each point."""
 
     panel = Panel.CAMERAS
 
     views: File | None = option(
         None,
-        "Which cameras made each point: COLMAP's fused.ply.vis, the dense PLY of OpenMVS, or the"
-        " camera file itself for the tracks of its tie points.",
+        "View list: the images that contributed to each point. COLMAP's fused.ply.vis, the dense"
+        " PLY of OpenMVS, or the camera file itself for the tracks of its tie points.",
     )
     views_are: ViewsAre = option(
         "auto",
-        "Whether --views lists the images whose rays were intersected, whose depth maps were"
-        " averaged, or of whose stereo pairs the median was taken; auto: told by the cloud.",
+        "Images in the view list: those of a track, of depth maps that were averaged, or of"
+        " stereo pairs; auto detects it from the cloud.",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurveyOptions(ViewOptions, CamerasOptions, NeededOptions):
+    """Inputs of a correction through a water surface, as the user names them."""
+
+    panel = Panel.CAMERAS
+
+    cameras: Any = option(
+        None, default_is="not with --method factor or regression", panel=Panel.NEED, **CAMERAS
+    )
+    adjusted_from: Any = option(
+        None,
+        "Original camera file, if --cameras is the output of 'pcfix adjust'. The cloud is first"
+        " transferred to the adjusted poses.",
+        metavar="PATH",
+    )
+    check_depths: File | None = option(
+        None, "With --method regression: CSV x,y,depth of measured depths, m."
+    )
+    regression: File | None = option(
+        None, "Line that --save-regression wrote for another cloud, instead of --check-depths."
+    )
+    tide: File | None = option(
+        None, "CSV time,level_m: each image gets the water level of its time.", panel=Panel.WATER
+    )
+    image_times: File | None = option(
+        None,
+        "With --tide: CSV label,time, or the folder of the images.",
+        default_is="what the camera file says",
+        panel=Panel.WATER,
+    )
+    salinity: float | None = option(
+        None,
+        "Salinity of the water, to compute the refractive index.",
+        unit="PSU",
+        default_is="35",
+        panel=Panel.WATER,
+    )
+    temperature: float | None = option(
+        None, "Temperature of the water.", unit="deg C", default_is="15", panel=Panel.WATER
+    )
+    wavelength: float | None = option(
+        None, "Wavelength of the light.", unit="um", default_is="0.53", panel=Panel.WATER
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class InputOptions(SurveyOptions, PortOptions):
+    """Inputs of any correction: through a water surface, or the port of a housing."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PartOptions(OptionSet):
+    """Which points of a cloud are read; see `pcfix.io.las.part`."""
+
+    panel = Panel.INPUT
+
+    bounds: tuple[float, float, float, float] | None = option(
+        None,
+        "Read only the points in this box (west, south, east, north).",
+        unit="m",
+        parse=numbers,
+        metavar="X,Y,X,Y",
+        default_is="all",
+    )
+    read_resolution: float | None = option(
+        None,
+        "Read only the coarse levels of a COPC file, about one point in each square of this side.",
+        unit="m",
+        above=0,
+        default_is="all levels",
     )
 
 
@@ -257,44 +326,10 @@ class JobOptions(OverwriteOption):
     panel = Panel.OUTPUT
 
     jobs: int | None = option(
-        None, "Threads.", rule=at_least(1, "give a number of threads"), default_is="all cores"
-    )
-
-
-def _four_numbers(option: str, text: str) -> tuple[float, ...]:
-    try:
-        west, south, east, north = (float(word) for word in text.split(","))
-    except ValueError:
-        west = south = east = north = math.nan
-    return west, south, east, north
-
-
-@dataclass(frozen=True, kw_only=True)
-class PartOptions(OptionSet):
-    """Which points of a cloud are read; see `pcfix.io.las.part`."""
-
-    panel = Panel.INPUT
-
-    bounds: tuple[float, float, float, float] | None = option(
         None,
-        "Read the points within them alone: west, south, east, north. Of COPC no others are"
-        " unpacked.",
-        unit="m",
-        rule=rule(
-            lambda box: len(box) == 4 and box[0] <= box[2] and box[1] <= box[3],
-            "{option} must be four numbers X0,Y0,X1,Y1 in metres, west and south first, as"
-            " 500000,4650000,500100,4650100.",
-        ),
-        parse=_four_numbers,
-        metavar="X,Y,X,Y",
-        default_is="all",
-    )
-    read_resolution: float | None = option(
-        None,
-        "Of COPC: read its coarse levels alone, with a point in about each square of this side.",
-        unit="m",
-        rule=positive("read-resolution {value:g} must be above 0: give metres."),
-        default_is="all levels",
+        "Number of threads; with many files, of files processed at the same time.",
+        least=1,
+        default_is="all cores",
     )
 
 
@@ -304,149 +339,28 @@ class TileOptions(JobOptions):
 
     panel = Panel.OUTPUT
 
-    jobs: int | None = option(
-        None,
-        "Threads; of many files so many are worked on at once, each in a process of its own.",
-        rule=at_least(1, "give a number of threads"),
-        default_is="all cores",
-    )
     scheduler: str | None = option(
         None,
-        "With many files: work on them on a cluster, by the address of its Dask scheduler, as"
-        " tcp://host:8786.",
+        "With many files: process them on the cluster of this Dask scheduler, tcp://host:8786.",
         metavar="ADDRESS",
     )
 
 
 @dataclass(frozen=True, kw_only=True)
 class SummaryOption(OptionSet):
-    """What is told of the work."""
+    """The summary as a file."""
 
     panel = Panel.OUTPUT
 
-    summary: File | None = option(None, "Write the summary there, as JSON.")
+    summary: File | None = option(None, "JSON file for the summary.")
 
 
 @dataclass(frozen=True, kw_only=True)
 class ShorelineOption(OptionSet):
-    """Where the line goes at which the water meets the cloud."""
+    """The line at which the water meets the cloud."""
 
     panel = Panel.OUTPUT
 
     shoreline: File | None = option(
-        None,
-        "Write the line where the water meets the cloud there (.gpkg), with its standard error.",
+        None, "GeoPackage (.gpkg) for the shoreline of the cloud, with its standard error."
     )
-
-
-@dataclass(frozen=True, kw_only=True)
-class NeededOptions(OptionSet):
-    """Where the light bends."""
-
-    panel = Panel.NEED
-
-    water: Any = option(
-        None,
-        "A level (0.37), plane:a,b,c, dim:NAME, a mesh (.obj, .ply), a raster (.tif), shoreline"
-        " points (.csv, .gpkg, .shp, .geojson, .wkt), or auto.",
-        metavar="SPEC",
-        needed=True,
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class PortOptions(OptionSet):
-    """A housing under water."""
-
-    panel = Panel.WATER
-
-    port: Any = option(
-        None,
-        "Instead of --water, for a cloud taken under water: the port of the cameras' housing,"
-        " flat:distance=M[,thickness=M,glass=N,nx=,ny=] or"
-        " dome:radius=M[,thickness=M,glass=N,x=M,y=M,z=M], seen from the projection centre.",
-        metavar="SPEC",
-    )
-
-
-_CAMERAS: dict[str, Any] = {
-    "help": "File or folder of camera poses: Metashape, Pix4D, OPF, ODM, OpenSfM, COLMAP, MicMac,"
-    " Bundler, VisualSFM, BlocksExchange, RealityCapture, or a CSV table.",
-    "metavar": "PATH",
-    "needed": True,
-}
-
-
-@dataclass(frozen=True, kw_only=True)
-class CamerasOptions(OptionSet):
-    """The exterior orientation."""
-
-    panel = Panel.NEED
-
-    cameras: Any = option(None, **_CAMERAS)
-
-
-@dataclass(frozen=True, kw_only=True)
-class CamerasOrNoneOptions(OptionSet):
-    """The exterior orientation, where the method looks at it."""
-
-    panel = Panel.NEED
-
-    cameras: Any = option(None, default_is="but with --method factor or regression", **_CAMERAS)
-
-
-@dataclass(frozen=True, kw_only=True)
-class TideOptions(OptionSet):
-    """Water that moves, and what water it is."""
-
-    panel = Panel.WATER
-
-    tide: File | None = option(
-        None, "CSV time,level_m: each image gets the water level of its time."
-    )
-    image_times: File | None = option(
-        None,
-        "With --tide: CSV label,time, or the folder of the images.",
-        default_is="what the camera file says",
-    )
-    salinity: float | None = option(None, "Instead of --index.", unit="PSU", default_is="35")
-    temperature: float | None = option(None, "Of the water.", unit="deg C", default_is="15")
-    wavelength: float | None = option(None, "Of the light.", unit="um", default_is="0.53")
-
-
-@dataclass(frozen=True, kw_only=True)
-class HistoryOptions(OptionSet):
-    """What came before the correction."""
-
-    panel = Panel.CAMERAS
-
-    adjusted_from: Any = option(
-        None,
-        "The cameras that the cloud was made with, where --cameras are the same images adjusted"
-        " since: first the whole cloud, land too, is taken from those to these.",
-        metavar="PATH",
-    )
-    check_depths: File | None = option(
-        None, "With --method regression: CSV x,y,depth of measured depths, m."
-    )
-    regression: File | None = option(
-        None, "Instead of --check-depths: the line that --save-regression wrote of another cloud."
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class SurveyOptions(
-    HistoryOptions,
-    ViewOptions,
-    CameraFileOptions,
-    TideOptions,
-    WaterOptions,
-    NeededOptions,
-    CamerasOrNoneOptions,
-):
-    """What a correction through a water surface is made with, as the user names it."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class InputOptions(SurveyOptions, PortOptions):
-    """What any correction is made with: through a water surface, or the port of a housing."""

@@ -262,7 +262,7 @@ class Summary:
     seconds: float
     views: dict[str, Any] | None = None
     water_fit: dict[str, Any] | None = None
-    warnings: list[str] = field(default_factory=list)
+    warnings: list[dict[str, Any]] = field(default_factory=list)
     labelling: dict[str, Any] | None = None
     uncertainty: dict[str, Any] | None = None
     carried: dict[str, Any] | None = None

@@ -161,7 +161,8 @@ def notes_of(s: Summary, survey: Survey, compared: Plain) -> list[str]:
     ]
     if s.water_unknown:
         notes.append(f"{s.water_unknown:,} points have no known water surface above them.")
-    notes += [*map(str, s.warnings), *map(str, compared.get("notes", ()))]
+    notes += [one["message"] for one in s.warnings]
+    notes += [one["message"] for one in compared.get("notes", ())]
     return [note[:1].upper() + note[1:] for note in notes]
 
 

@@ -300,7 +300,7 @@ def test_nothing_is_replaced_unasked(tmp_path, mask):
         (["--respect-classes", "2;5"], "respect-classes '2;5' must be whole numbers with commas"),
         (["--respect-classes", "300"], "300 is no class of LAS"),
         (["--band", "-1"], "band -1 must not be negative"),
-        (["--least-pool", "5"], "least-pool is of no use without connected"),
+        (["--least-pool", "5"], "least-pool has no effect without connected"),
         (["--water-mask", "no.gpkg"], "no.gpkg: there is no such file"),
     ],
 )
@@ -363,5 +363,5 @@ def test_run_keeps_them_in_its_record(tmp_path, mask):
     assert request.respect_classes == (9,) and not request.connected
     moved = np.asarray(laspy.read(tmp_path / "out" / "corrected.laz").RayCount) > 0
     np.testing.assert_array_equal(moved, (las.z < 0.37) & (las.x <= middle))
-    with pytest.raises(SettingError, match="least-pool is of no use"):
+    with pytest.raises(SettingError, match="least-pool has no effect"):
         Request(input="a.las", cameras="b.csv", water="0", least_pool=4.0)

@@ -35,33 +35,21 @@ def same(one, other):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
-# --- whether -------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("tilts_deg", "wanted"),
     [((0.0, 3.0, -14.0), False), ((0.0, 16.0), True), ((0.0, -30.0), True), ((90.0,), True)],
 )
-def test_auto_goes_by_the_axes(tilts_deg, wanted):
+def test_wanted(tilts_deg, wanted):
+    """With auto if there are oblique images; cameras without angles count as nadir."""
     assert wants_occlusion(cameras(*tilts_deg), ScienceOptions()) is wanted
+    no_angles = Cameras(("a",), np.zeros((1, 3)))
+    assert wants_occlusion(no_angles, ScienceOptions()) is False
+    for block in (cameras(*tilts_deg), no_angles):
+        assert wants_occlusion(block, ScienceOptions(occlusion="on")) is True
+        assert wants_occlusion(block, ScienceOptions(occlusion="off")) is False
 
 
-@pytest.mark.parametrize("tilt_deg", [0.0, 40.0])
-def test_on_and_off_are_as_told(tilt_deg):
-    assert wants_occlusion(cameras(tilt_deg), ScienceOptions(occlusion="on")) is True
-    assert wants_occlusion(cameras(tilt_deg), ScienceOptions(occlusion="off")) is False
-
-
-def test_cameras_without_angles_count_as_nadir():
-    block = Cameras(("a",), np.zeros((1, 3)))
-    assert wants_occlusion(block, ScienceOptions()) is False
-    assert wants_occlusion(block, ScienceOptions(occlusion="on")) is True
-
-
-# --- the surface ---------------------------------------------------------------------------------
-
-
-def test_height_is_that_of_the_second_highest_point_of_a_cell():
+def test_second_highest():
     xyz = hills()
     occluder = occluder_of(xyz)
     column = np.floor((xyz[:, 0] - occluder.left_m) / occluder.cell_m).astype(int)
@@ -82,7 +70,7 @@ def test_height_is_that_of_the_second_highest_point_of_a_cell():
     np.testing.assert_array_equal(occluder.height[1:-1, 1:-1], expected.astype(np.float32))
 
 
-def test_cells_are_two_to_four_point_spacings_wide_where_there_are_points():
+def test_cell_size():
     spacing = np.sqrt(60.0 * 40.0 / 50_000)
     assert 2.0 <= occluder_of(hills()).cell_m / spacing <= 4.0
     xyz = hills()
@@ -90,7 +78,7 @@ def test_cells_are_two_to_four_point_spacings_wide_where_there_are_points():
     assert 2.0 <= occluder_of(strip).cell_m / spacing <= 4.0
 
 
-def test_blocks_have_the_height_of_their_highest_cell():
+def test_blocks():
     occluder = occluder_of(hills())
     for tops, side in ((occluder.block_top, 8), (occluder.large_block_top, 64)):
         for (r, c), top in np.ndenumerate(tops):
@@ -99,7 +87,7 @@ def test_blocks_have_the_height_of_their_highest_cell():
     assert occluder.highest_m == np.nanmax(occluder.height)
 
 
-def test_chunks_their_order_and_what_is_known_of_the_corners_do_not_matter():
+def test_chunks():
     xyz = hills()
     whole = occluder_of(xyz)
     shuffled = xyz[np.random.default_rng(2).permutation(len(xyz))]
@@ -113,7 +101,7 @@ def test_chunks_their_order_and_what_is_known_of_the_corners_do_not_matter():
         same(builder.build(), whole)
 
 
-def test_noise_builds_no_surface():
+def test_noise():
     xyz = hills()
     wrong = np.column_stack([xyz[:20_000, :2], np.full(20_000, 100.0)])
     classes = np.concatenate([np.ones(len(xyz)), np.tile([7, 18], 10_000)]).astype(np.uint8)
@@ -122,7 +110,7 @@ def test_noise_builds_no_surface():
     assert occluder_of(both).highest_m == 100.0
 
 
-def test_memory_is_bounded_over_a_wide_extent(monkeypatch):
+def test_memory(monkeypatch):
     monkeypatch.setattr(top_surface, "MOST_CELLS", 10_000)
     rng = np.random.default_rng(3)
     wide = np.column_stack([rng.uniform(0.0, 1e5, (20_000, 2)), rng.normal(0.0, 1.0, 20_000)])
@@ -134,12 +122,12 @@ def test_memory_is_bounded_over_a_wide_extent(monkeypatch):
 
 
 @pytest.mark.parametrize("n", [1, 2, 50])
-def test_points_all_in_one_place(n):
+def test_one_place(n):
     occluder = occluder_of(np.repeat(UTM[None], n, axis=0))
     assert np.isnan(occluder.height).all()  # no cell beside it
     assert occluder.highest_m == -np.inf and (occluder.margin == 0.0).all()
 
 
-def test_nothing_makes_no_surface():
+def test_no_points():
     assert occluder_of(np.zeros((0, 3))) is None
     assert occluder_of(UTM[None], np.array([7], np.uint8)) is None

@@ -1,4 +1,4 @@
-"""What a user is told: lines that work as printed, right reasons, poses that are doubted."""
+"""Printed commands work, errors have the right reason, absorbed refraction is detected."""
 
 import json
 import shlex
@@ -14,7 +14,6 @@ import pcfix
 from pcfix.adjust.block import usable_ties
 from pcfix.adjust.diagnosis import EXPORTS, diagnosis_of, export_of, focal_sign, neighbours_sign
 from pcfix.model import Cameras, Lens, Outcome
-from pcfix.report.text import share
 from tests.utils.crops import middle_of
 from tests.utils.nightly import mostly_nightly
 from tests.utils.program import run_pcfix
@@ -50,7 +49,7 @@ def run_line(line, **instead):
 
 @bent
 @pytest.mark.usefixtures("undrawn")
-def test_each_line_leads_to_the_next(bent_middle, tmp_path, monkeypatch):
+def test_next_commands(bent_middle, tmp_path, monkeypatch):
     """From the warning by `pcfix adjust` to the corrected cloud, as printed."""
     monkeypatch.setattr("pcfix.flow.adjust.usable_ties", partial(usable_ties, most=TIES))
     cloud, listed = bent_middle / "cloud.las", bent_middle / "dense.vis"
@@ -75,12 +74,10 @@ def test_each_line_leads_to_the_next(bent_middle, tmp_path, monkeypatch):
     words[2] = str(tmp_path / "none.laz")
     done = run_pcfix(*words)
     assert done.returncode == 1
-    assert "adjusted-from: its cameras stand" in done.stderr
-    assert "--cameras-offset" in done.stderr
 
 
 @bent
-def test_a_local_ply_beside_the_list_is_left_out(bent_middle, tmp_path):
+def test_local_ply(bent_middle, tmp_path):
     """As of a dense workspace, shifted to the origin, where the cameras are on the map."""
     shutil.copy(bent_middle / "dense.vis", tmp_path)
     las = laspy.read(bent_middle / "cloud.las")
@@ -94,26 +91,9 @@ def test_a_local_ply_beside_the_list_is_left_out(bent_middle, tmp_path):
         "--views", tmp_path / "dense.vis", "--summary", tmp_path / "it.json",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert "the PLY file beside it is in another frame" in done.stderr
     found = json.loads((tmp_path / "it.json").read_text())["views"]
     assert found["share_seen"] > 0.95
     assert found["by_row"] == len(local)
-
-
-@bent
-def test_without_a_cloud_none_is_spoken_of(tmp_path):
-    done = run_pcfix("adjust", BENT / "cameras.xml", tmp_path / "out", "--water", "0.37")
-    assert done.returncode == 1
-    assert "the cloud names no CRS" not in done.stderr
-    assert "reproject the cloud" not in done.stderr
-    assert "give --cloud" in done.stderr
-
-
-def test_all_is_said_of_all_only():
-    assert share(100_000, 100_000) == "100 %"
-    assert share(99_897, 100_000) == "all but 103"
-    assert share(99_000, 100_000) == "99 %"
-    assert share(0, 0) == "0 %"
 
 
 def nadir():
@@ -123,7 +103,7 @@ def nadir():
     return Cameras(("a", "b"), centres, np.tile(np.diag([1.0, -1.0, -1.0]), (2, 1, 1)), (lens,) * 2)
 
 
-def test_rays_beyond_the_limit_have_a_reason_of_their_own():
+def test_flat_rays():
     """Straight below one of two cameras, between them, and out of all frames."""
     xyz = [[30.0, 0.0, -2.0], [0.0, 0.0, -2.0], [0.0, 500.0, -2.0]]
     with warnings.catch_warnings():
@@ -132,15 +112,13 @@ def test_rays_beyond_the_limit_have_a_reason_of_their_own():
     assert found.outcome.tolist() == [Outcome.FLAT_RAYS, Outcome.CORRECTED, Outcome.NO_CAMERA]
 
 
-def test_a_limit_that_leaves_no_ray_is_named(tmp_path):
+def test_limit_without_rays(tmp_path):
     done = run_pcfix(
         "correct", SCENE / "cloud.laz", tmp_path / "out.laz", "--cameras",
         SCENE / "cameras.csv", "--water", "0.37", "--method", "snell", "--max-angle", "0.01",
     )  # fmt: skip
-    assert done.returncode == 1
-    assert "within 0.01 degrees of the surface normal" in done.stderr
-    assert "give a larger --max-angle" in done.stderr
-    assert "same CRS" not in done.stderr
+    assert done.code == "cameras.max_angle"
+    assert done.error.values["flat"] > 0
 
 
 @pytest.mark.parametrize(
@@ -154,11 +132,11 @@ def test_a_limit_that_leaves_no_ray_is_named(tmp_path):
         (0.6, 0.05, True, None),
     ],
 )
-def test_neighbours_tell_of_the_poses(share, sigma, is_fused, absorbed):
+def test_neighbours_sign(share, sigma, is_fused, absorbed):
     assert neighbours_sign(share, sigma, is_fused=is_fused).speaks is absorbed
 
 
-def test_neighbours_are_heard_before_a_calibration():
+def test_neighbours_first():
     off = focal_sign(np.array([1.01]), np.array([1.0]), 80.0)
     found = diagnosis_of([off, neighbours_sign(0.1, 0.01, is_fused=True)])
     assert found.absorbed is False
@@ -178,7 +156,7 @@ def told_of(cloud, cameras, tmp_path, *more):
 
 @bent
 @pytest.mark.parametrize("listed", mostly_nightly((False, True), True))
-def test_bent_poses_without_ties_or_gnss_are_noticed(bent_middle, tmp_path, listed):
+def test_absorbed(bent_middle, tmp_path, listed):
     more = ["--views", bent_middle / "dense.vis"] if listed else []
     done, found = told_of(bent_middle / "cloud.las", BENT / "cameras.xml", tmp_path, *more)
     assert "The poses seem to have absorbed the refraction" in done.stderr
@@ -190,13 +168,14 @@ def test_bent_poses_without_ties_or_gnss_are_noticed(bent_middle, tmp_path, list
 
 
 @rendered
-def test_true_poses_are_said_to_be_right(true_middle, tmp_path):
+def test_not_absorbed(true_middle, tmp_path):
     done, found = told_of(true_middle / "cloud.las", TRUE / "cameras.xml", tmp_path)
     assert "absorbed" not in done.stderr
     assert found["poses"]["absorbed"] is False
 
 
-def test_where_nothing_was_checked_that_is_said(tmp_path):
+def test_readme_summary(tmp_path):
+    """The README shows what is printed where nothing was checked."""
     done = run_pcfix(
         "correct", SCENE / "cloud.laz", tmp_path / "out.laz", "--cameras", SCENE / "cameras.csv",
         "--water", "0.37",
@@ -204,7 +183,7 @@ def test_where_nothing_was_checked_that_is_said(tmp_path):
     assert "not checked" in done.stdout
 
 
-def test_each_package_has_its_export():
+def test_exports():
     for name, words in EXPORTS.items():
         cameras = Cameras(("a",), np.zeros((1, 3)), source=f"{name.capitalize()} 2.1")
         assert words in export_of(cameras)

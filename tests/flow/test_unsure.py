@@ -1,4 +1,4 @@
-"""Points that flat obliques alone see: found, told from those that came withheld, given back."""
+"""Points seen only by oblique images: found, withheld, restored."""
 
 from __future__ import annotations
 
@@ -14,8 +14,6 @@ import pcfix
 from pcfix.io.las.columns import COLUMNS
 from pcfix.io.scenes import colmap_vis
 from pcfix.model import Views
-from pcfix.options.correct import CorrectOptions
-from pcfix.options.survey import RunOptions
 from pcfix.refract.matcher import without_border
 from pcfix.report.text import summary_text
 from tests.utils.half_oblique import half_oblique, seen_flat, write_half_oblique
@@ -74,24 +72,20 @@ def points_of(way, unsure):
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_they_are_those_whose_steepest_ray_is_flat(way):
+def test_found(way):
+    """They are those whose ray closest to nadir is oblique, and are corrected as others."""
     scene = half_oblique()
-    found = points_of(way, "withhold")
+    keep, found = points_of(way, "keep"), points_of(way, "withhold")
     cameras = without_border(scene.cameras) if way == "depth maps" else scene.cameras
     expected = found.corrected & seen_flat(scene.xyz, cameras, scene.water)
     np.testing.assert_array_equal(found.unsure, expected)
     assert 0.2 < expected.sum() / found.corrected.sum() < 0.8
-
-
-@pytest.mark.parametrize("way", WAYS)
-def test_they_are_corrected_as_always(way):
-    keep, withhold = points_of(way, "keep"), points_of(way, "withhold")
     assert keep.unsure is None
     for name in {field.name for field in fields(keep)} - {"unsure"}:
-        np.testing.assert_array_equal(getattr(keep, name), getattr(withhold, name), name)
+        np.testing.assert_array_equal(getattr(keep, name), getattr(found, name), name)
 
 
-def test_with_a_list_nothing_is_unsure(folder, corrected):
+def test_view_list(folder, corrected):
     scene = half_oblique()
     found = pcfix.correct_points(
         scene.xyz, scene.cameras, scene.water, views=scene.views, unsure="withhold", **SNELL
@@ -101,7 +95,7 @@ def test_with_a_list_nothing_is_unsure(folder, corrected):
     assert told.corrected and told.unsure == 0
 
 
-def test_of_a_list_of_some_points_the_others_may_be_unsure(corrected, tmp_path):
+def test_list_of_some(corrected, tmp_path):
     views, listed = half_oblique().views, np.arange(3000) % 2 == 0
     start = np.concatenate([[0], np.cumsum(np.where(listed, np.diff(views.start), 0))])
     camera = views.camera[np.repeat(listed, np.diff(views.start))]
@@ -111,7 +105,7 @@ def test_of_a_list_of_some_points_the_others_may_be_unsure(corrected, tmp_path):
     np.testing.assert_array_equal(some.Unsure, np.where(listed, 0, whole.Unsure))
 
 
-def test_a_file_has_them_withheld_and_marked(folder, corrected):
+def test_withheld(folder, corrected):
     told, marked = corrected()
     kept = corrected(unsure="keep")[1]
     before, keep, withhold = (laspy.read(path) for path in (folder / "cloud.las", kept, marked))
@@ -125,6 +119,8 @@ def test_a_file_has_them_withheld_and_marked(folder, corrected):
     for name in ("X", "Y", "Z", "classification", *(column.name for column in COLUMNS)):
         np.testing.assert_array_equal(np.array(keep[name]), np.array(withhold[name]), name)
     assert "Unsure" not in keep.point_format.dimension_names
+    quiet = corrected(unsure="keep")[0]
+    assert quiet.unsure is None and "unsure" not in quiet.as_dict()
     assert told.unsure == told.as_dict()["unsure"] == unsure.sum() > (unsure & ~came).sum() > 0
 
 
@@ -136,7 +132,7 @@ def test_without_the_option_a_summary_does_not_speak_of_them(corrected):
 
 @pytest.mark.parametrize("uncorrected", ["withhold", "keep"])
 @pytest.mark.parametrize("max_angle", [None, 38.0])
-def test_restore_gives_the_file_back(folder, corrected, tmp_path, uncorrected, max_angle):
+def test_restored(folder, corrected, tmp_path, uncorrected, max_angle):
     told, out = corrected(uncorrected=uncorrected, max_angle=max_angle)
     assert told.unsure and (max_angle is None or sum(told.uncorrected.values()))
     pcfix.restore_file(out, tmp_path / "back.las")
@@ -144,7 +140,7 @@ def test_restore_gives_the_file_back(folder, corrected, tmp_path, uncorrected, m
 
 
 @pytest.mark.parametrize(("dimensions", "count"), [("minimal", 3), ("none", 0)])
-def test_fewer_dimensions_have_the_same_flags(corrected, dimensions, count):
+def test_fewer_dimensions(corrected, dimensions, count):
     given = ({}, {"dimensions": dimensions})
     whole, few = (laspy.read(corrected(**more)[1]) for more in given)
     np.testing.assert_array_equal(whole.withheld, few.withheld)
@@ -152,33 +148,20 @@ def test_fewer_dimensions_have_the_same_flags(corrected, dimensions, count):
     assert len(names) == count and ("Unsure" in names) == (count > 0)
 
 
-@pytest.mark.parametrize("unsure", ["keep", "withhold"])
-def test_the_note_on_them_advises_the_option(folder, needed, by_default, tmp_path, unsure):
-    told, source = by_default[0], folder / "cloud.las"
-    if unsure == "keep":
-        told = pcfix.correct_file(source, tmp_path / "a.las", **needed, unsure=unsure)
-    (note,) = (one for one in told.warnings if "seen by flat obliques alone, every ray" in one)
-    assert note.endswith(", --unsure withhold flags them.") == (unsure == "keep")
-
-
-def test_command_line_and_python_give_the_same_file(folder, needed, by_default, tmp_path):
-    told, source = by_default[0], folder / "cloud.las"
+def test_command_line(folder, needed, by_default, tmp_path):
     words = [word for name, value in needed.items() for word in ("--" + name, value)]
-    done = run_pcfix("correct", source, tmp_path / "b.las", *words, "--unsure", "withhold")
+    done = run_pcfix(
+        "correct", folder / "cloud.las", tmp_path / "b.las", *words, "--unsure", "withhold"
+    )
     assert done.returncode == 0, done.stderr
-    assert f"{told.unsure:,} corrected points (27 %)" in done.stdout
     assert by_default[1].read_bytes() == (tmp_path / "b.las").read_bytes()
-
-
-def test_a_whole_run_has_the_option():
-    assert RunOptions(unsure="withhold").part(CorrectOptions).unsure == "withhold"
 
 
 @pytest.mark.parametrize(
     ("more", "why"),
     [({"max_angle": 15}, "beyond 15 degrees alone"), ({"max_cameras": 2}, "but are not chosen")],
 )
-def test_what_left_a_camera_out_is_said(tmp_path, more, why):
+def test_cameras_left_out(tmp_path, more, why):
     scene = Path(__file__).parents[2] / "samples" / "scene"
     cloud, cameras = laspy.read(scene / "cloud.laz"), pcfix.read_cameras(scene / "cameras.csv")
     found = pcfix.correct_file(

@@ -47,7 +47,7 @@ def scene(tmp_path_factory):
 def test_options(commands):
     assert tuple(commands) == OFFERED
     assert [one["kind"] for one in commands["run"]["places"]] == ["cloud", "folder written"]
-    shown = [one.name for one in options_of(RunOptions) if not one.hidden]
+    shown = [one.name for one in options_of(RunOptions)]
     found = {one["name"]: one for one in commands["run"]["options"]}
     assert list(found) == shown
     assert found["water"]["needed"]

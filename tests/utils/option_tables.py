@@ -1,15 +1,15 @@
 """The tables of options in pcfix/cli/README.md, made from their declarations.
 
-python -m tests.utils.option_tables     writes them anew
+python -m tests.utils.option_tables     writes them again
 """
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import get_args, get_type_hints
 
 from pcfix.cli.commands import EXAMPLES
+from pcfix.cli.flags import kind_of
 from pcfix.options.declare import table_of
 
 DOCUMENT = Path(__file__).parents[2] / "pcfix" / "cli" / "README.md"
@@ -17,10 +17,7 @@ DOCUMENT = Path(__file__).parents[2] / "pcfix" / "cli" / "README.md"
 
 def with_tables(text: str) -> str:
     """Return a document with a current table between the marks of each command."""
-    kinds = {
-        command.__name__: get_args(get_type_hints(command, include_extras=True)["options"])[0]
-        for command, _ in EXAMPLES
-    }
+    kinds = {command.__name__: kind_of(command) for command, _ in EXAMPLES}
 
     def between(found: re.Match[str]) -> str:
         name = found.group(1)
