@@ -53,7 +53,7 @@ from pcfix.model import (
 )
 from pcfix.options.correct import CorrectOptions, PointsOptions, RefractionOptions, ScienceOptions
 from pcfix.options.declare import File, taken
-from pcfix.refract.batch import Batch, MadeWith, Survey
+from pcfix.refract.batch import Batch, OriginalModel, Survey
 from pcfix.refract.learning import for_own_water, learn_of_points
 from pcfix.refract.regression import BeyondRange, DepthRegression
 from pcfix.refract.tally import Summary
@@ -163,17 +163,17 @@ def correct_points(
         _check_views(views, len(points), len(adjusted_from or cameras))
         _warn_of_beside(beside_frames(points, views, adjusted_from or cameras))
     label = None if may_be_submerged is None else _only(may_be_submerged, len(points))
-    step, made_with = None, None
+    step, original_model = None, None
     if adjusted_from is not None:
         pair = paired(adjusted_from, cameras)
         step = Carrying(pair).step(points, views)
-        made_with = MadeWith(points, pair.old)
+        original_model = OriginalModel(points, pair.old)
         points, views, label = step.xyz, step.views, step.rule(label)
     above = surface_above(surface, points, dimension)
     place = None, *corners(points[:, 0], points[:, 1])
     own, notes = own_water_of(given.water_per_image, cameras, surface, place, offset)
     survey = Survey(surface, cameras, settings, offset, own_water=own)
-    batch = Batch(points, above, survey, views, made_with)
+    batch = Batch(points, above, survey, views, original_model)
     line = regression
     if line is not None and not isinstance(line, DepthRegression):
         line = read_regression(line)

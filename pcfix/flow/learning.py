@@ -22,7 +22,7 @@ from pcfix.label.labelling import Part
 from pcfix.model import NOISE_CLASSES, BoolArray, FloatArray, IntArray, TiePoints, ViewKind
 from pcfix.options.correct import ScienceOptions
 from pcfix.options.declare import File
-from pcfix.refract.batch import FLAT_DEG, UNLISTED, Batch, Learned, MadeWith, Survey, stacked
+from pcfix.refract.batch import FLAT_DEG, UNLISTED, Batch, Learned, OriginalModel, Survey, stacked
 from pcfix.refract.hypotheses import Verdict, hint_of
 from pcfix.refract.learning import (
     CORRECTED_RATIO,
@@ -96,7 +96,7 @@ class Learning:
     def of_cloud(
         self,
         chunks: Callable[[], Iterable[Points]],
-        makers: Callable[[], Iterable[MadeWith]] | None = None,
+        makers: Callable[[], Iterable[OriginalModel]] | None = None,
         *,
         all_listed: bool = True,
     ) -> Survey:
@@ -201,7 +201,7 @@ class Learning:
     def _sample(
         self,
         chunks: Callable[[], Iterable[Points]],
-        makers: Callable[[], Iterable[MadeWith]] | None,
+        makers: Callable[[], Iterable[OriginalModel]] | None,
     ) -> tuple[Batch, Near | None]:
         """Return points of the whole cloud, evenly spread over its order, and without noise.
 
@@ -219,10 +219,10 @@ class Learning:
         Thread(target=import_module, args=("scipy.spatial",), daemon=True).start()
         done = 0
         of_chunks = repeat(None) if makers is None else makers()
-        for points, made_with in zip(chunks(), of_chunks, strict=False):
-            taken.append(_every(step, done, points, survey, made_with))
+        for points, original_model in zip(chunks(), of_chunks, strict=False):
+            taken.append(_every(step, done, points, survey, original_model))
             if squares is not None:
-                squares.add(submerged_of(_every(near_step, done, points, survey, made_with)))
+                squares.add(submerged_of(_every(near_step, done, points, survey, original_model)))
             done += len(points.xyz)
         return stacked(taken), None if squares is None else Near(squares.all(), near_step)
 
@@ -236,7 +236,7 @@ class Learning:
 
 
 def _every(
-    step: int, done: int, points: Points, survey: Survey, made_with: MadeWith | None
+    step: int, done: int, points: Points, survey: Survey, original_model: OriginalModel | None
 ) -> Batch:
     """Return every so manieth point of a cloud, of a chunk before which so many were."""
     rows = np.arange(-done % step, len(points.xyz), step)
@@ -247,7 +247,7 @@ def _every(
         xyz,
         surface_above(survey.water, xyz, heights),
         survey,
-        made_with=None if made_with is None else made_with.take(rows),
+        original_model=None if original_model is None else original_model.take(rows),
         source=None if points.sources is None else points.sources[rows],
     )
 

@@ -20,7 +20,7 @@ from pcfix.flow.surfaces import Points
 from pcfix.io.members import find_members
 from pcfix.model import NOISE_CLASSES, Cameras, FloatArray, IntArray, Outcome, Views
 from pcfix.options.declare import File
-from pcfix.refract.batch import Batch, MadeWith, Survey
+from pcfix.refract.batch import Batch, OriginalModel, Survey
 from pcfix.refract.methods import correct
 from pcfix.refract.pose_errors import PoseErrors, pose_errors_of
 from pcfix.water.surface import is_submerged, surface_above
@@ -163,7 +163,7 @@ def _heights(sample: Sample, survey: Survey, made: Pair) -> FloatArray:
     step = Carrying(replace(made, new=survey.cameras)).step(xyz, listed)
     above = surface_above(survey.water, step.xyz, heights)
     found = correct(
-        Batch(step.xyz, above, survey, step.views, MadeWith(xyz, made.old), source=sources)
+        Batch(step.xyz, above, survey, step.views, OriginalModel(xyz, made.old), source=sources)
     )
     known = step.carried & (found.outcome == Outcome.CORRECTED)
     return np.where(known, step.xyz[:, 2] + found.shift_m[:, 2], np.nan)

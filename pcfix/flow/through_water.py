@@ -35,7 +35,7 @@ from pcfix.model import (
     WaterPlane,
 )
 from pcfix.options.correct import CorrectOptions, ScienceOptions
-from pcfix.refract.batch import Batch, Intersection, MadeWith, Survey
+from pcfix.refract.batch import Batch, Intersection, OriginalModel, Survey
 from pcfix.refract.hypotheses import CAUSES, Verdict
 from pcfix.refract.learning import as_told, for_own_water, weigh_lists
 from pcfix.refract.methods import correct, shift_of_land
@@ -158,10 +158,12 @@ class ThroughWater(Sums):
             row += len(xyz)
 
     @staticmethod
-    def _makers(chunks: Callable[[], Iterable[Points]], carrying: Carrying) -> Iterator[MadeWith]:
+    def _makers(
+        chunks: Callable[[], Iterable[Points]], carrying: Carrying
+    ) -> Iterator[OriginalModel]:
         """Yield what made the points of the whole cloud."""
         for points in chunks():
-            yield MadeWith(points.xyz, carrying.pair.old)
+            yield OriginalModel(points.xyz, carrying.pair.old)
 
     def _old_ties(self) -> TiePoints | None:
         """Return the tie points of the old model, else those of the adjusted one taken back."""
@@ -174,12 +176,15 @@ class ThroughWater(Sums):
         """Correct one chunk; see `pcfix.flow.job.Job.correct`."""
         xyz, classes = points.xyz, points.classes
         label: Label = partial(labelling.submerged, classes=classes)
-        step, made_with = None, None
+        step, original_model = None, None
         if self.carrying is not None:
-            step, made_with = self.carrying.step(xyz, views), MadeWith(xyz, self.carrying.pair.old)
+            step, original_model = (
+                self.carrying.step(xyz, views),
+                OriginalModel(xyz, self.carrying.pair.old),
+            )
             xyz, views, label = step.xyz, step.views, step.rule(label)
         above = surface_above(self.water, xyz, points.heights)
-        batch = Batch(xyz, above, self.survey, views, made_with, source=points.sources)
+        batch = Batch(xyz, above, self.survey, views, original_model, source=points.sources)
         batch = self._of_kind(batch)
         correction = correct_checked(batch, label, self.found.sigma_level_m, heights_only=True)
         if self._beyond is not None:
@@ -381,7 +386,7 @@ def correct_checked(
     if heights_only:
         found = found._replace(covariance_m2=None)
     below = _below_m(wet, found)
-    if batch.made_with is not None:
+    if batch.original_model is not None:
         # their own images put them lower than all images together, by which they were carried
         bed = (below >= 0.0) | (found.outcome != Outcome.CORRECTED)
         submerged = submerged.copy()
@@ -390,7 +395,7 @@ def correct_checked(
     depth = np.zeros(len(xyz))
     depth[rows] = below
     values = spread_over(found, rows, len(xyz))
-    if batch.made_with is not None:
+    if batch.original_model is not None:
         values["shift_m"] = values["shift_m"] + _land_shift(batch, submerged)
     known = np.isfinite(surface.height_m)
     return Correction(

@@ -6,7 +6,7 @@ cameras chosen.
 
 A dense matcher compared images in the geometry of its own cameras, right or wrong; the light went
 in that of the true ones. What both have in common is the place in the image: a direction in the
-one geometry is a direction in the other, through the lens of either (`MadeWith`, `Images`).
+one geometry is a direction in the other, through the lens of either (`OriginalModel`, `Images`).
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class Doubt(NamedTuple):
     formal_m: float = 0.0
 
 
-class MadeWith(NamedTuple):
+class OriginalModel(NamedTuple):
     """What made m points, where that are other cameras than those they are corrected with.
 
     Attributes
@@ -105,9 +105,9 @@ class MadeWith(NamedTuple):
     xyz: FloatArray
     cameras: Cameras
 
-    def take(self, rows: IntArray) -> MadeWith:
+    def take(self, rows: IntArray) -> OriginalModel:
         """Return what made some of the points."""
-        return MadeWith(self.xyz[rows], self.cameras)
+        return OriginalModel(self.xyz[rows], self.cameras)
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +162,7 @@ class Batch:
     views : Views or None
         The cameras of each point: those of a list, to choose from; or, once they are chosen, those
         that give it a ray. None where no list says it.
-    made_with : MadeWith or None
+    original_model : OriginalModel or None
         The points as they came and the cameras they came from, where `xyz` are the same points
         carried to others (`pcfix.adjust.carry`). What undoes dense matching goes by it; the matcher
         learned is one of those cameras then.
@@ -176,7 +176,7 @@ class Batch:
     surface: SurfaceAbove
     survey: Survey
     views: Views | None = None
-    made_with: MadeWith | None = None
+    original_model: OriginalModel | None = None
     level_sigma_m: FloatArray | None = None
     source: IntArray | None = None
 
@@ -190,7 +190,7 @@ class Batch:
                 self.surface.height_m[rows], self.surface.slope.take(rows, axis=0)
             ),
             views=None if self.views is None else self.views.take(rows),
-            made_with=None if self.made_with is None else self.made_with.take(rows),
+            original_model=None if self.original_model is None else self.original_model.take(rows),
             level_sigma_m=None if sigma is None else sigma[rows],
             source=None if self.source is None else self.source[rows],
         )
@@ -231,10 +231,10 @@ class Batch:
     def chosen(self) -> Chosen:
         """Return the points and their cameras for kernels."""
         survey = self.survey
-        made_xyz = self.xyz if self.made_with is None else self.made_with.xyz
+        original_xyz = self.xyz if self.original_model is None else self.original_model.xyz
         return Chosen(
             np.ascontiguousarray(self.xyz),
-            np.ascontiguousarray(made_xyz),
+            np.ascontiguousarray(original_xyz),
             np.ascontiguousarray(self.surface.height_m),
             np.ascontiguousarray(self.surface.slope),
             self.normals(),
@@ -316,7 +316,7 @@ class Batch:
 
 def stacked(batches: list[Batch]) -> Batch:
     """Return batches of one survey, without views, as one; at least one of them."""
-    made = [batch.made_with for batch in batches if batch.made_with is not None]
+    made = [batch.original_model for batch in batches if batch.original_model is not None]
     source = [batch.source for batch in batches if batch.source is not None]
     return replace(
         batches[0],
@@ -325,7 +325,9 @@ def stacked(batches: list[Batch]) -> Batch:
             np.concatenate([batch.surface.height_m for batch in batches]),
             np.vstack([batch.surface.slope for batch in batches]),
         ),
-        made_with=MadeWith(np.vstack([one.xyz for one in made]), made[0].cameras) if made else None,
+        original_model=OriginalModel(np.vstack([one.xyz for one in made]), made[0].cameras)
+        if made
+        else None,
         source=np.concatenate(source) if source else None,
     )
 
@@ -399,7 +401,7 @@ class Chosen(NamedTuple):
 
     Attributes
     ----------
-    xyz, made_xyz : array, shape (m, 3)
+    xyz, original_xyz : array, shape (m, 3)
         Apparent points, as they are corrected and as the matcher had them.
     height : array, shape (m,)
     slope : array, shape (m, 2)
@@ -414,7 +416,7 @@ class Chosen(NamedTuple):
     """
 
     xyz: FloatArray
-    made_xyz: FloatArray
+    original_xyz: FloatArray
     height: FloatArray
     slope: FloatArray
     normals: FloatArray
@@ -470,7 +472,7 @@ class Images(NamedTuple):
     lenses_now: FloatArray
 
 
-def images_of(made_with: MadeWith | None, now: Cameras) -> Images:
+def images_of(original_model: OriginalModel | None, now: Cameras) -> Images:
     """Return the images for kernels.
 
     Raises
@@ -479,10 +481,10 @@ def images_of(made_with: MadeWith | None, now: Cameras) -> Images:
         If there are two sets of cameras, and one has no angles or no lenses, or they are not of
         the same number.
     """
-    if made_with is None or _are_equal(made_with.cameras, now):
+    if original_model is None or _are_equal(original_model.cameras, now):
         none, no_row = np.zeros((0, 3, 3)), np.zeros(0, np.int64)
         return Images(np.zeros((0, 3)), none, no_row, np.zeros((0, 1)), none, no_row, none[:, 0])
-    made = made_with.cameras
+    made = original_model.cameras
     if made.lenses is None or now.lenses is None or len(made) != len(now):
         raise ValueError("the same images are needed twice, with angles and lenses")
     return Images(np.ascontiguousarray(made.centres, np.float64), *optics_of(made), *optics_of(now))
@@ -500,7 +502,7 @@ def _are_equal(made: Cameras, now: Cameras) -> bool:
 
 
 @device
-def as_made(images: Images, c: int, a: Vector) -> Vector:
+def to_original(images: Images, c: int, a: Vector) -> Vector:
     """Return where the matcher had what camera c sees in a direction, both in the world frame.
 
     NaN where there is no image; of any length.
@@ -514,7 +516,7 @@ def as_made(images: Images, c: int, a: Vector) -> Vector:
 
 
 @device
-def as_now(images: Images, c: int, a: Vector) -> Vector:
+def to_adjusted(images: Images, c: int, a: Vector) -> Vector:
     """Return in which direction camera c sees what the matcher had in a direction."""
     return _through(
         images.rotations[c], images.lenses[images.row[c]],

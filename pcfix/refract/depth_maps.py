@@ -39,8 +39,8 @@ from pcfix.refract.batch import (
     Batch,
     Chosen,
     Intersection,
-    as_made,
-    as_now,
+    to_adjusted,
+    to_original,
 )
 from pcfix.refract.cells import CUBIC
 from pcfix.refract.map_table import USUAL, Block, Table, has_terms, meet, read_table
@@ -135,7 +135,7 @@ def sight_of(points: Chosen, i: int) -> Sight:
     """Return point i."""
     normal = row_of(points.normals, i)
     above = normal[2] * (points.height[i] - points.xyz[i, 2])
-    return Sight(row_of(points.xyz, i), row_of(points.made_xyz, i), above, normal)
+    return Sight(row_of(points.xyz, i), row_of(points.original_xyz, i), above, normal)
 
 
 @device
@@ -348,7 +348,7 @@ def _ray(c: int, sight: Sight, block: Block) -> tuple[Vector, Vector, float]:
     up, above = _up(sight, block.points, c), _above(sight, block.points, c)
     if len(block.images.centres) == 0:
         return (0.0, 0.0, 0.0), up, above
-    d = as_now(block.images, c, scaled(-1.0, made_up(sight, block, c)))
+    d = to_adjusted(block.images, c, scaled(-1.0, made_up(sight, block, c)))
     e = scaled(dot(up, d) / dot(d, d), d)
     a = minus(up, e)
     return a, e, above - dot(sight.normal, a)
@@ -371,7 +371,7 @@ def _compare(
             break
         up, above = _up(sight, points, j), _above(sight, points, j)
         path = light_path(q, up, sight.normal, above, points.n)
-        a = as_made(block.images, j, direction(path, sight.normal))
+        a = to_original(block.images, j, direction(path, sight.normal))
         if not (path[0] == path[0] and holds(matcher.inner, j, scaled(-1.0, a))):
             continue
         base = minus(made, made_up(sight, block, j))

@@ -215,7 +215,7 @@ def learn_of_sample(
     near = near or Near(sample, points / max(len(batch), 1))
     survey, verdicts = _weighed(replace(near.batch, survey=survey), near.step, hint)
     settings, learned = survey.settings, survey.learned._replace(land=None)
-    if batch.made_with is not None:
+    if batch.original_model is not None:
         learned = learned._replace(land=_land_of(survey, verdicts))
     if not settings.models_matcher:
         learned = learned._replace(matcher=None)
@@ -307,7 +307,7 @@ def as_told(survey: Survey, verdict: Verdict | None, else_as: Hypothesis | None 
 def with_matcher(batch: Batch, ties: TiePoints | None) -> Survey:
     """Return the survey with how the images were matched."""
     survey = batch.survey
-    places, matched = batch.made_with or (batch.xyz, survey.cameras)
+    places, matched = batch.original_model or (batch.xyz, survey.cameras)
     if ties is not None:
         matcher = matcher_of_ties(matched, ties)
     else:

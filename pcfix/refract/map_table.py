@@ -16,7 +16,7 @@ from pcfix.kernels import device
 from pcfix.lens.algebra import Vector, cross, dot, minus, normal_of, row_of, scaled, unit
 from pcfix.lens.frames import holds
 from pcfix.model import BoolArray, FloatArray, IntArray
-from pcfix.refract.batch import Batch, Chosen, Images, as_made, images_of
+from pcfix.refract.batch import Batch, Chosen, Images, images_of, to_original
 from pcfix.refract.cells import (
     BASIS,
     CUBIC,
@@ -97,7 +97,7 @@ def block_of(batch: Batch) -> Block:
     matcher = batch.survey.learned.matcher
     if matcher is None:
         raise ValueError("a model of the matcher is needed")
-    return Block(batch.chosen(), images_of(batch.made_with, batch.survey.cameras), matcher)
+    return Block(batch.chosen(), images_of(batch.original_model, batch.survey.cameras), matcher)
 
 
 @device(allocates=True)
@@ -158,7 +158,7 @@ def _see(view: FloatArray, c: int, box: Box, block: Block) -> None:
         above = normal[2] * (points.offset[c] - under)
         path = light_path((0.0, 0.0, 0.0), e, normal, above, points.n)
         w = direction(path, normal)
-        view[k, 0], view[k, 1], view[k, 2] = as_made(block.images, c, w)
+        view[k, 0], view[k, 1], view[k, 2] = to_original(block.images, c, w)
         view[k, 3] = np.sqrt(dot(w, w)) * (path[2] + USUAL * path[3])
 
 

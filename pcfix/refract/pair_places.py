@@ -13,7 +13,7 @@ from pcfix.lens.algebra import Vector, beyond, dot, minus, plus, row_of, scaled,
 from pcfix.lens.formulas import KIND, PERSPECTIVE
 from pcfix.lens.imaging import image_in_world
 from pcfix.model import FloatArray
-from pcfix.refract.batch import Chosen, Images, Optics, as_made
+from pcfix.refract.batch import Chosen, Images, Optics, to_original
 from pcfix.refract.rays import direction, light_path
 
 # Columns of a ray: e, the height of its water over P, e as the matcher had it, how its scale
@@ -40,7 +40,7 @@ def begin(ray: FloatArray, points: Chosen, i: int, c: int, images: PairImages) -
     ray[ABOVE] = points.normals[i, 2] * (points.height[i] - points.xyz[i, 2] + points.offset[c])
     made, optics = e, images.optics
     if len(images.both.centres):
-        made = minus(row_of(images.both.centres, c), row_of(points.made_xyz, i))
+        made = minus(row_of(images.both.centres, c), row_of(points.original_xyz, i))
     axis, size2 = row_of(optics.rotations[c], 2), dot(made, made)
     ahead = -dot(axis, made)
     flat = optics.lenses[optics.row[c], KIND] == PERSPECTIVE and ahead > 0.0
@@ -56,7 +56,7 @@ def see(ray: FloatArray, q: Vector, c: int, normal: Vector, images: PairImages) 
     w, as the matcher had it, is scaled to be as far away as P, so that G is that of there.
     """
     path = light_path(q, vector(ray), normal, ray[ABOVE], images.n)
-    w = as_made(images.both, c, direction(path, normal))
+    w = to_original(images.both, c, direction(path, normal))
     w = scaled(1.0 / dot(w, vector(ray, _BY_PLACE)), w)
     optics, e = images.optics, vector(ray, _MADE)
     _, _, by_u, by_v = image_in_world(optics.lenses[optics.row[c]], optics.rotations[c], w)

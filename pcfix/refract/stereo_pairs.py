@@ -131,16 +131,16 @@ def invert_pairs(batch: Batch, pairs: Views | None = None) -> Intersection:
     cameras, matcher = batch.survey.cameras, batch.survey.learned.matcher
     if pairs is None and matcher is None:
         raise ValueError("pairs or a model of the matcher are needed")
-    made = cameras if batch.made_with is None else batch.made_with.cameras
+    made = cameras if batch.original_model is None else batch.original_model.cameras
     none = np.zeros(0, np.int64)
     listed = (none, none)
     if pairs is not None:
         listed = np.asarray(pairs.start, np.int64), np.asarray(pairs.camera, np.int64)
     matched = np.zeros((0, 0), np.int64) if matcher is None else matcher.matched
     used, result = np.zeros(len(batch.rays.camera), np.bool_), np.zeros((len(batch), _WIDTH))
-    both = images_of(batch.made_with, cameras)
+    both = images_of(batch.original_model, cameras)
     images = PairImages(optics_of(made), both, batch.survey.settings.refractive_index)
-    quick = is_quick(batch) and matcher is not None and batch.made_with is None
+    quick = is_quick(batch) and matcher is not None and batch.original_model is None
     focal_px = np.zeros(0) if matcher is None or not quick else matcher.focal_px
     order, first = cells_of(batch)
     in_tiles(

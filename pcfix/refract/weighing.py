@@ -108,7 +108,7 @@ def _straight(part: Batch, beds: _Beds, way: int) -> tuple[float, float] | None:
 
     None where too few points tell, or where they were made with other poses.
     """
-    if not beds.patches or part.made_with is not None:
+    if not beds.patches or part.original_model is not None:
         return None
     share, sigma = shares(part, beds.place, np.array([beds.z[way], part.xyz[:, 2]]))
     return float(share[0, 1]), float(sigma[0, 1])
