@@ -22,7 +22,7 @@ from pcfix.io.gnss_positions import gnss_in_frame_of
 from pcfix.model import Cameras, TiePoints
 from pcfix.options.declare import File
 from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
-from pcfix.refract.hypotheses import Verdict
+from pcfix.refract.reconstructions import Verdict
 
 LEAST_POSITIONS = 3
 """Of the GNSS, that say where a block is, how it is turned, and its scale."""

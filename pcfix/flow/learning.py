@@ -23,7 +23,7 @@ from pcfix.model import NOISE_CLASSES, BoolArray, FloatArray, IntArray, TiePoint
 from pcfix.options.correct import ScienceOptions
 from pcfix.options.declare import File
 from pcfix.refract.batch import FLAT_DEG, UNLISTED, Batch, Learned, OriginalModel, Survey, stacked
-from pcfix.refract.hypotheses import Verdict, hint_of
+from pcfix.refract.reconstructions import Verdict, hint_of
 from pcfix.refract.learning import (
     CORRECTED_RATIO,
     Near,

@@ -36,7 +36,7 @@ PARALLEL, CORRECTED = int(Outcome.PARALLEL_RAYS), int(Outcome.CORRECTED)
 """Of `Outcome`, for kernels."""
 
 FLAT_DEG = 35.0
-"""Rays beyond this are those by which methods differ most; see `hypotheses.LIMITS`."""
+"""Rays beyond this are those by which methods differ most; see `reconstructions.LIMITS`."""
 
 
 UNLISTED, MAIN = -1, -2
@@ -56,7 +56,7 @@ class Learned(NamedTuple):
         Which images were matched with which.
     bed : Bed or None
         What fused points of one place have in common.
-    doubt : Doubt or None
+    model_uncertainty : ModelUncertainty or None
         Of how the cloud was made.
     land : Survey or None
         What land is corrected with that was carried to adjusted cameras, if not with the same.
@@ -68,12 +68,12 @@ class Learned(NamedTuple):
     occluder: Occluder | None = None
     matcher: Matcher | None = None
     bed: Bed | None = None
-    doubt: Doubt | None = None
+    model_uncertainty: ModelUncertainty | None = None
     land: Survey | None = None
     poses: PoseErrors | None = None
 
 
-class Doubt(NamedTuple):
+class ModelUncertainty(NamedTuple):
     """What the standard error of Z has beyond the error budget, as the cloud itself tells it.
 
     Attributes

@@ -13,15 +13,15 @@ from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import UNLISTED, Batch, Learned, Survey
 from pcfix.refract.consistent import check_consistent
 from pcfix.refract.fusion import likely_beds
-from pcfix.refract.hypotheses import (
+from pcfix.refract.reconstructions import (
     ALIKE,
     BARE,
     IN_FRAME,
     LIMITS,
     Hint,
-    Hypothesis,
+    Reconstruction,
     Verdict,
-    hypotheses_of,
+    reconstructions_of,
     told_by,
 )
 from pcfix.refract.matcher import Bed, bed_of, matcher_of, matcher_of_ties, places_for
@@ -275,15 +275,15 @@ def learn_of_unlisted(
 
 
 def _weighed(sample: Batch, step: float, hint: Hint | None) -> tuple[Survey, tuple[Verdict, ...]]:
-    """Return the survey without ``auto``, and with the doubt of submerged points without lists."""
+    """Return the survey without ``auto``, and with the model uncertainty of submerged points without lists."""
     survey = sample.survey
-    hypotheses = hypotheses_of(sample)
-    if survey.settings.method == "auto" and len(hypotheses) > 1:
-        verdict = weigh(sample, hypotheses, step, hint=hint)
-        survey = as_told(survey, verdict, hypotheses[0])
+    reconstructions = reconstructions_of(sample)
+    if survey.settings.method == "auto" and len(reconstructions) > 1:
+        verdict = weigh(sample, reconstructions, step, hint=hint)
+        survey = as_told(survey, verdict, reconstructions[0])
         return survey, () if verdict is None else (verdict,)
     if survey.settings.method == "auto":
-        survey = as_told(survey, None, hypotheses[0])
+        survey = as_told(survey, None, reconstructions[0])
     verdicts = list[Verdict | None]()
     if _wants_limit(survey.settings, None):
         verdicts.append(weigh(replace(sample, survey=survey), LIMITS, step))
@@ -295,12 +295,14 @@ def _weighed(sample: Batch, step: float, hint: Hint | None) -> tuple[Survey, tup
     return survey, tuple(one for one in verdicts if one is not None)
 
 
-def as_told(survey: Survey, verdict: Verdict | None, else_as: Hypothesis | None = None) -> Survey:
-    """Return a survey with the options, and the doubt, of what the cloud was taken for."""
+def as_told(
+    survey: Survey, verdict: Verdict | None, else_as: Reconstruction | None = None
+) -> Survey:
+    """Return a survey with the options, and the model uncertainty, of what the cloud was taken for."""
     if verdict is None:
         given = survey.settings
         return survey if else_as is None else replace(survey, settings=else_as.settings(given))
-    learned = survey.learned._replace(doubt=verdict.doubt)
+    learned = survey.learned._replace(model_uncertainty=verdict.model_uncertainty)
     return replace(survey, settings=verdict.chosen.settings(survey.settings), learned=learned)
 
 
@@ -383,7 +385,7 @@ def weigh_lists(batch: Batch, *, is_open: bool) -> Verdict | None:
     None where there are too few points, or nothing is to be told.
     """
     if is_open and batch.survey.settings.method == "consistent":
-        return weigh(batch, hypotheses_of(batch), 1.0)
+        return weigh(batch, reconstructions_of(batch), 1.0)
     if not _wants_comparison(batch.survey):
         return None
-    return weigh(batch, hypotheses_of(batch), 1.0, told=told_by(batch))
+    return weigh(batch, reconstructions_of(batch), 1.0, told=told_by(batch))

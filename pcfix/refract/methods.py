@@ -22,12 +22,12 @@ from pcfix.refract.fusion import invert_fusion
 from pcfix.refract.intersect import intersect, intersect_in_frame
 from pcfix.refract.listed_maps import invert_depth_maps
 from pcfix.refract.matcher import steepest_and_partners, without_border
-from pcfix.refract.occlusion import in_sight
+from pcfix.refract.occlusion import visible_cameras
 from pcfix.refract.shan import shan
 from pcfix.refract.smooth import consistent_in_cells
 from pcfix.refract.stereo_pairs import invert_pairs
 from pcfix.refract.tiling import spatial_order
-from pcfix.refract.uncertainty import with_doubt, with_uncertainty
+from pcfix.refract.uncertainty import with_model_uncertainty, with_uncertainty
 from pcfix.water.surface import SurfaceAbove
 
 Method: TypeAlias = Callable[[Batch], Intersection]
@@ -99,7 +99,7 @@ def _corrected(batch: Batch) -> Intersection:
     if views is not None and views.kind == "pairs":
         pairs, batch = views, replace(batch, views=cameras_of_pairs(views))
     if method in _IN_FRAME and _takes_all_in_frame(batch):
-        return with_doubt(_IN_FRAME[method](batch), batch)
+        return with_model_uncertainty(_IN_FRAME[method](batch), batch)
     order = spatial_order(batch.xyz)
     parts = []
     for rows in batches(order):
@@ -112,7 +112,7 @@ def _corrected(batch: Batch) -> Intersection:
         if method in (invert_fusion, invert_depth_maps):
             known = _with_model_error(known, found, part)
         parts.append(_with_unsure(known, part, batch.views))
-    return with_doubt(joined(parts, order, len(survey.cameras)), batch)
+    return with_model_uncertainty(joined(parts, order, len(survey.cameras)), batch)
 
 
 def _takes_all_in_frame(batch: Batch) -> bool:
@@ -214,11 +214,11 @@ def with_rays(batch: Batch) -> Batch:
     """
     survey, matcher = batch.survey, batch.survey.learned.matcher
     if batch.views is not None or matcher is None:
-        return replace(batch, views=_in_sight(batch))
+        return replace(batch, views=_visible_cameras(batch))
     inner = replace(survey, cameras=without_border(survey.cameras))
     if survey.settings.method == "consistent":
-        return replace(batch, views=_in_sight(replace(batch, survey=inner)))
-    seeing = _in_sight(replace(batch, survey=_with_any_number(inner)))
+        return replace(batch, views=_visible_cameras(replace(batch, survey=inner)))
+    seeing = _visible_cameras(replace(batch, survey=_with_any_number(inner)))
     partners = steepest_and_partners(batch.xyz, survey.cameras.centres, seeing, matcher)
     return replace(batch, views=chosen_views(replace(batch, views=partners)))
 
@@ -227,13 +227,13 @@ def _with_any_number(survey: Survey) -> Survey:
     return replace(survey, settings=replace(survey.settings, max_cameras=None))
 
 
-def _in_sight(batch: Batch) -> Views:
+def _visible_cameras(batch: Batch) -> Views:
     """Return the chosen cameras, without those that the cloud hides; the steepest of the rest."""
     survey, occluder = batch.survey, batch.survey.learned.occluder
     if occluder is None:
         return chosen_views(batch)
     chosen = chosen_views(replace(batch, survey=_with_any_number(survey)))
-    seeing = in_sight(batch.xyz, survey.cameras.centres, chosen, occluder)
+    seeing = visible_cameras(batch.xyz, survey.cameras.centres, chosen, occluder)
     if survey.settings.max_cameras is None:
         return seeing
     return chosen_views(replace(batch, views=seeing))

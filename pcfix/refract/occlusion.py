@@ -92,7 +92,9 @@ def hidden(xyz: FloatArray, centres: FloatArray, views: Views, occluder: Occlude
     return found
 
 
-def in_sight(xyz: FloatArray, centres: FloatArray, views: Views, occluder: Occluder) -> Views:
+def visible_cameras(
+    xyz: FloatArray, centres: FloatArray, views: Views, occluder: Occluder
+) -> Views:
     """Return the views without the hidden cameras.
 
     A point that would keep fewer than two cameras keeps them all: it is in the cloud, so two saw

@@ -105,19 +105,19 @@ def with_errors(found: Intersection, covariance: FloatArray | None) -> Intersect
     return found._replace(sigma_z_m=np.sqrt(covariance[:, _ZZ]), covariance_m2=covariance)
 
 
-def with_doubt(found: Intersection, batch: Batch) -> Intersection:
+def with_model_uncertainty(found: Intersection, batch: Batch) -> Intersection:
     """Return a result whose standard errors of Z have what cloud and poses tell of them.
 
     They are added to its covariances where these stand.
     """
-    doubt, poses = batch.survey.learned.doubt, batch.survey.learned.poses
-    if (doubt is None and poses is None) or found.covariance_m2 is None:
+    model, poses = batch.survey.learned.model_uncertainty, batch.survey.learned.poses
+    if (model is None and poses is None) or found.covariance_m2 is None:
         return found
     moved = found.outcome == Outcome.CORRECTED
     covariance = found.covariance_m2
-    if doubt is not None:
+    if model is not None:
         depth = batch.surface.height_m - (batch.xyz[:, 2] + found.shift_m[:, 2])
-        more = doubt.scatter_m**2 + (doubt.per_depth * depth) ** 2
+        more = model.scatter_m**2 + (model.per_depth * depth) ** 2
         covariance[:, _ZZ] += np.where(moved, more, 0.0)
     if poses is not None:
         covariance[moved, _ZZ] += poses.at(batch.xyz[moved, :2]) ** 2

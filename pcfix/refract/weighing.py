@@ -10,9 +10,9 @@ import numpy as np
 
 from pcfix.model import FloatArray, IntArray, Outcome
 from pcfix.options.correct import Dimensions
-from pcfix.refract.batch import Batch, Doubt
+from pcfix.refract.batch import Batch, ModelUncertainty
 from pcfix.refract.fusion import likely_beds
-from pcfix.refract.hypotheses import SURE, Hint, Hypothesis, Verdict
+from pcfix.refract.reconstructions import SURE, Hint, Reconstruction, Verdict
 from pcfix.refract.matcher import bed_of
 from pcfix.refract.methods import correct, with_rays
 from pcfix.refract.patches import (
@@ -27,16 +27,16 @@ from pcfix.refract.patches import (
 )
 
 LEAST_PATCHES = 100
-"""Patches with all their points corrected under each hypothesis, below which nothing is told."""
+"""Patches with all their points corrected under each reconstruction, below which nothing is told."""
 
 COVERED = 0.95
-"""Of the points that most hypotheses correct, what a hypothesis must correct to be one."""
+"""Of the points that most reconstructions correct, what a reconstruction must correct to be one."""
 
 
 class _Beds(NamedTuple):
     """What each way makes of the points of patches; see `pcfix.refract.patches.shares`."""
 
-    ways: tuple[Hypothesis, ...]
+    ways: tuple[Reconstruction, ...]
     z: FloatArray
     place: IntArray
     patches: int
@@ -52,32 +52,32 @@ class _Beds(NamedTuple):
 
 def weigh(
     batch: Batch,
-    hypotheses: tuple[Hypothesis, ...],
+    reconstructions: tuple[Reconstruction, ...],
     step: float,
     *,
-    told: Hypothesis | None = None,
+    told: Reconstruction | None = None,
     hint: Hint | None = None,
 ) -> Verdict | None:
-    """Tell which of the hypotheses made the points, or how far the way that was told is off.
+    """Tell which of the reconstructions made the points, or how far the way that was told is off.
 
     Parameters
     ----------
     batch : Batch
         Submerged points, evenly spread over the cloud; `batch.survey.learned` has the matcher.
-    hypotheses : tuple of Hypothesis
+    reconstructions : tuple of Reconstruction
     step : float
         Points of the whole cloud for each of these.
-    told : Hypothesis, optional
+    told : Reconstruction, optional
         What the user wants, which is not decided then.
     hint : Hint, optional
-        What decides between hypotheses that the points leave open.
+        What decides between reconstructions that the points leave open.
 
     Returns
     -------
     Verdict or None
         None where there is one way alone, or too few points to form patches of.
     """
-    ways = hypotheses if told is None or told in hypotheses else (*hypotheses, told)
+    ways = reconstructions if told is None or told in reconstructions else (*reconstructions, told)
     patches = patches_of(batch) if len(ways) > 1 else None
     if patches is None:
         return None
@@ -91,14 +91,14 @@ def weigh(
         best, other, by = _decided(part, beds, patches, step, hint, weak=bool(remarks))
     else:
         best, by = beds.ways.index(told), ""
-        among = [i for i in among if beds.ways[i] in hypotheses]
+        among = [i for i in among if beds.ways[i] in reconstructions]
         first, second = beds.rank(among)
         other = second if first == best else first
     deeper_m = float(np.nanmean((beds.z[best] - beds.z[other])[beds.place]))
     return Verdict(
         beds.ways[best], beds.ways[other], float(beds.share[best, other]),
         float(beds.share[other, best]), float(beds.sigma[best, other]), deeper_m, beds.patches,
-        _doubt(part, beds, best, among), by, told is not None, remarks,
+        _model_uncertainty(part, beds, best, among), by, told is not None, remarks,
         straight=None if remarks else _straight(part, beds, best),
     )  # fmt: skip
 
@@ -115,7 +115,7 @@ def _straight(part: Batch, beds: _Beds, way: int) -> tuple[float, float] | None:
 
 
 def _beds(
-    part: Batch, batch: Batch, patches: Patches, ways: tuple[Hypothesis, ...]
+    part: Batch, batch: Batch, patches: Patches, ways: tuple[Reconstruction, ...]
 ) -> _Beds | None:
     """Correct the points of the patches in each way; None where fewer than two can."""
     around = others_around(batch, patches.rows)
@@ -180,7 +180,7 @@ def _remarks(part: Batch, place: IntArray) -> tuple[str, ...]:
     return ()
 
 
-def _doubt(part: Batch, beds: _Beds, way: int, among: list[int]) -> Doubt:
+def _model_uncertainty(part: Batch, beds: _Beds, way: int, among: list[int]) -> ModelUncertainty:
     """Return what a way leaves open, told or decided, among ways that may be right.
 
     That is of the one that fits best, for each other one, the share of the difference to it that
@@ -202,7 +202,7 @@ def _doubt(part: Batch, beds: _Beds, way: int, among: list[int]) -> Doubt:
     scatter = scatter_m(part, beds.place, beds.z[way])
     budget = correct(_as(part, beds.ways[way], "all"))
     formal = float(np.median(budget.sigma_z_m))
-    return Doubt(math.sqrt(max(scatter**2 - formal**2, 0.0)), open_m, formal)
+    return ModelUncertainty(math.sqrt(max(scatter**2 - formal**2, 0.0)), open_m, formal)
 
 
 LEAST_DEPTH_M = 0.1
@@ -217,7 +217,7 @@ def _spread(apart: FloatArray) -> float:
     return max(rms, float(np.nanquantile(apart, 0.95)) / 1.96)
 
 
-def _as(part: Batch, way: Hypothesis, dimensions: Dimensions = "none") -> Batch:
+def _as(part: Batch, way: Reconstruction, dimensions: Dimensions = "none") -> Batch:
     """Return the points as those of a way."""
     survey = part.survey
     settings = replace(way.settings(survey.settings), dimensions=dimensions)
@@ -229,7 +229,7 @@ def _as(part: Batch, way: Hypothesis, dimensions: Dimensions = "none") -> Batch:
     return replace(part, views=views, survey=replace(survey, settings=settings, learned=learned))
 
 
-def _heights(part: Batch, around: Batch, way: Hypothesis) -> FloatArray:
+def _heights(part: Batch, around: Batch, way: Reconstruction) -> FloatArray:
     """Return the heights in one way, NaN where a point is not corrected."""
     part = _as(part, way)
     settings = part.survey.settings

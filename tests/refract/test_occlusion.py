@@ -12,7 +12,7 @@ from pcfix.model import Views, WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Learned
 from pcfix.refract.methods import correct
-from pcfix.refract.occlusion import hidden, in_sight
+from pcfix.refract.occlusion import hidden, visible_cameras
 from pcfix.refract.top_surface import occluder_of
 from pcfix.simulate.tracing import piercing_points, project, triangulate
 from pcfix.water.surface import SurfaceAbove
@@ -230,7 +230,7 @@ def test_views_lose_hidden_cameras_but_a_point_keeps_all_rather_than_one(walled)
     xyz = np.array([[-2.0, 0.0, 0.0], [-2.0, 1.0, 0.0], [-9.0, 0.0, 0.0]]) + UTM
     camera = np.array([0, 1, 2, 1, 0, 2, 0])
     views = Views(np.array([0, 3, 5, 7]), camera, np.arange(7, dtype=np.float32), "depth-maps")
-    found = in_sight(xyz, centres, views, occluder)
+    found = visible_cameras(xyz, centres, views, occluder)
     # the first camera is in the shadow of the wall for the first two points (8 m at 63 degrees)
     assert found.start.tolist() == [0, 2, 4, 6]
     assert found.camera.tolist() == [1, 2, 1, 0, 2, 0]

@@ -9,7 +9,7 @@ import pcfix
 from pcfix.model import Cameras, WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Batch, Survey
-from pcfix.refract.hypotheses import IN_FRAME, hypotheses_of
+from pcfix.refract.reconstructions import IN_FRAME, reconstructions_of
 from pcfix.refract.learning import learn_of_sample
 from pcfix.refract.patches import FEWEST_WITHOUT_LIST
 from pcfix.water.surface import surface_above
@@ -83,7 +83,7 @@ def test_a_camera_set_limits_what_is_asked():
         surface_above(scene.water, scene.apparent_xyz),
         Survey(scene.water, scene.cameras, replace(AUTO, camera_set="mvs")),
     )
-    assert hypotheses_of(batch) == IN_FRAME[1:]
+    assert reconstructions_of(batch) == IN_FRAME[1:]
     settings, verdict = told(
         scene.apparent_xyz, scene.cameras, scene.water, replace(AUTO, camera_set="mvs")
     )

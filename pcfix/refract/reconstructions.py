@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 
 from pcfix.model import ViewKind
 from pcfix.options.correct import ScienceOptions
-from pcfix.refract.batch import Batch, Doubt
+from pcfix.refract.batch import Batch, ModelUncertainty
 
 SURE = 3.0
 """Standard errors by which a share must differ from one half to tell."""
 
 
-class Hypothesis(NamedTuple):
+class Reconstruction(NamedTuple):
     """A way in which a cloud may have been made.
 
     words : str
@@ -41,22 +41,22 @@ class Hypothesis(NamedTuple):
 
 _TRACKS, _MAPS, _PAIRS = "intersected rays", "fused depth maps", "stereo pairs"
 IN_FRAME = (
-    Hypothesis(_TRACKS, {"method": "consistent", "camera_set": "all"}),
-    Hypothesis(_MAPS, {"method": "consistent", "camera_set": "mvs", "matcher": "depth-maps"}),
-    Hypothesis(_PAIRS, {"method": "consistent", "camera_set": "mvs", "matcher": "pairs"}),
+    Reconstruction(_TRACKS, {"method": "consistent", "camera_set": "all"}),
+    Reconstruction(_MAPS, {"method": "consistent", "camera_set": "mvs", "matcher": "depth-maps"}),
+    Reconstruction(_PAIRS, {"method": "consistent", "camera_set": "mvs", "matcher": "pairs"}),
 )
 LISTED = (
-    Hypothesis(_TRACKS, {"method": "consistent"}, "tracks"),
-    Hypothesis(_MAPS, {"method": "consistent"}, "depth-maps"),
-    Hypothesis(_PAIRS, {"method": "consistent"}, "pair-images"),
+    Reconstruction(_TRACKS, {"method": "consistent"}, "tracks"),
+    Reconstruction(_MAPS, {"method": "consistent"}, "depth-maps"),
+    Reconstruction(_PAIRS, {"method": "consistent"}, "pair-images"),
 )
-BARE = Hypothesis(_TRACKS, {"method": "snell", "camera_set": "all"})
+BARE = Reconstruction(_TRACKS, {"method": "snell", "camera_set": "all"})
 """Without lenses or angles no other method is possible."""
 
 LIMITS = (
-    Hypothesis("all rays", {"max_angle": None}),
+    Reconstruction("all rays", {"max_angle": None}),
     *(
-        Hypothesis(f"rays within {limit:g} degrees of the surface normal", {"max_angle": limit})
+        Reconstruction(f"rays within {limit:g} degrees of the surface normal", {"max_angle": limit})
         for limit in (60.0, 50.0, 40.0, 35.0)
     ),
 )
@@ -91,7 +91,7 @@ class Hint(NamedTuple):
     """What files say of how a dense cloud was made.
 
     words : str
-        Of the hypothesis that they speak for.
+        Of the reconstruction that they speak for.
     source : str
         What says it.
     """
@@ -114,7 +114,7 @@ class Verdict(NamedTuple):
 
     Attributes
     ----------
-    chosen, runner_up : Hypothesis
+    chosen, runner_up : Reconstruction
         What it was taken for, and what comes next; where the user told the way, what fits best of
         all others.
     share, runner_up_share : float
@@ -125,7 +125,7 @@ class Verdict(NamedTuple):
         By how much the other would have the bed deeper, on the average of the patches.
     patches : int
         How many told it; 0 if they told nothing.
-    doubt : Doubt
+    model_uncertainty : ModelUncertainty
         What it leaves open.
     by : str
         What else decided than the steps, in words; empty where they did.
@@ -140,14 +140,14 @@ class Verdict(NamedTuple):
         What makes the evidence weak, a sentence each.
     """
 
-    chosen: Hypothesis
-    runner_up: Hypothesis
+    chosen: Reconstruction
+    runner_up: Reconstruction
     share: float
     runner_up_share: float
     sigma: float
     deeper_m: float
     patches: int
-    doubt: Doubt
+    model_uncertainty: ModelUncertainty
     by: str = ""
     is_told: bool = False
     remarks: tuple[str, ...] = ()
@@ -171,7 +171,7 @@ class Verdict(NamedTuple):
 
     def warnings(self) -> tuple[str, ...]:
         """Return what the user must know of it, a sentence each."""
-        apart = self.is_against and abs(self.deeper_m) > self.doubt.formal_m
+        apart = self.is_against and abs(self.deeper_m) > self.model_uncertainty.formal_m
         unsure = apart if self.is_told else not self.is_sure
         is_way = "method" in self.chosen.changes and not self.is_told
         open_ = not self.is_sure and self.share > FITS
@@ -192,8 +192,8 @@ class Verdict(NamedTuple):
             "runner_up_deeper_m": round(self.deeper_m, 4),
             "patches": self.patches,
             "by": self.by,
-            "scatter_m": round(self.doubt.scatter_m, 4),
-            "doubt_per_depth": round(self.doubt.per_depth, 4),
+            "scatter_m": round(self.model_uncertainty.scatter_m, 4),
+            "doubt_per_depth": round(self.model_uncertainty.per_depth, 4),
         }
 
     def __str__(self) -> str:
@@ -215,16 +215,16 @@ class Verdict(NamedTuple):
         if self.is_told:
             fit = f"; the cloud fits {self.runner_up.words} better" if self.is_against else ""
             return f"{taken}: {steps}{fit}{other}."
-        doubt = "" if self.is_sure else ", which is not sure"
+        unsure = "" if self.is_sure else ", which is not sure"
         by = f" (by {self.by})" if self.by else ""
-        return f"{taken}{doubt}{by}: {steps}{other}."
+        return f"{taken}{unsure}{by}: {steps}{other}."
 
 
 def _percent(share: float) -> str:
     return f"{100.0 * min(max(share, 0.0), 1.0):.0f} %"
 
 
-def hypotheses_of(batch: Batch) -> tuple[Hypothesis, ...]:
+def reconstructions_of(batch: Batch) -> tuple[Reconstruction, ...]:
     """Return what may have made the points; the kind of a list is only asked if it may be any."""
     cameras, views = batch.survey.cameras, batch.views
     if cameras.lenses is None or cameras.rotations is None:
@@ -239,7 +239,7 @@ def hypotheses_of(batch: Batch) -> tuple[Hypothesis, ...]:
     return LISTED if batch.survey.learned.matcher is not None else LISTED[:1]
 
 
-def told_by(batch: Batch) -> Hypothesis:
+def told_by(batch: Batch) -> Reconstruction:
     """Return the way in which the options say to correct points, limits of angles resolved."""
     settings, views = batch.survey.settings, batch.views
     changes: dict[str, Any] = {"method": settings.method, "max_angle": settings.max_angle}
@@ -247,7 +247,7 @@ def told_by(batch: Batch) -> Hypothesis:
         changes["camera_set"] = "mvs" if settings.models_matcher else "all"
         changes["matcher"] = settings.matcher
     kind = None if views is None else views.kind
-    for one in hypotheses_of(batch) if views is not None else IN_FRAME:
+    for one in reconstructions_of(batch) if views is not None else IN_FRAME:
         if one.kind == kind and all(changes[name] == one.changes[name] for name in one.changes):
             return one
-    return Hypothesis(settings.method, changes, kind)
+    return Reconstruction(settings.method, changes, kind)
