@@ -23,7 +23,6 @@ from pcfix.model import NOISE_CLASSES, BoolArray, FloatArray, IntArray, TiePoint
 from pcfix.options.correct import ScienceOptions
 from pcfix.options.declare import File
 from pcfix.refract.batch import FLAT_DEG, UNLISTED, Batch, Learned, OriginalModel, Survey, stacked
-from pcfix.refract.reconstructions import Verdict, hint_of
 from pcfix.refract.learning import (
     CORRECTED_RATIO,
     Near,
@@ -40,6 +39,7 @@ from pcfix.refract.learning import (
 )
 from pcfix.refract.occlusion import Occluder
 from pcfix.refract.patches import PATCH_WIDTH, Squares
+from pcfix.refract.reconstructions import Verdict, hint_of
 from pcfix.refract.regression import (
     LEAST_COUNT,
     LEAST_NEIGHBOURS,

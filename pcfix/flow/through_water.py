@@ -36,9 +36,9 @@ from pcfix.model import (
 )
 from pcfix.options.correct import CorrectOptions, ScienceOptions
 from pcfix.refract.batch import Batch, Intersection, OriginalModel, Survey
-from pcfix.refract.reconstructions import CAUSES, Verdict
 from pcfix.refract.learning import as_told, for_own_water, weigh_lists
 from pcfix.refract.methods import correct, shift_of_land
+from pcfix.refract.reconstructions import CAUSES, Verdict
 from pcfix.refract.regression import LEAST_BEYOND, BeyondRange, DepthRegression
 from pcfix.refract.tally import Tally
 from pcfix.sums import Sums

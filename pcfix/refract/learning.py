@@ -13,6 +13,9 @@ from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import UNLISTED, Batch, Learned, Survey
 from pcfix.refract.consistent import check_consistent
 from pcfix.refract.fusion import likely_beds
+from pcfix.refract.matcher import Bed, bed_of, matcher_of, matcher_of_ties, places_for
+from pcfix.refract.methods import batches, on_land, with_rays
+from pcfix.refract.patches import FEWEST_WITHOUT_LIST
 from pcfix.refract.reconstructions import (
     ALIKE,
     BARE,
@@ -24,9 +27,6 @@ from pcfix.refract.reconstructions import (
     reconstructions_of,
     told_by,
 )
-from pcfix.refract.matcher import Bed, bed_of, matcher_of, matcher_of_ties, places_for
-from pcfix.refract.methods import batches, on_land, with_rays
-from pcfix.refract.patches import FEWEST_WITHOUT_LIST
 from pcfix.refract.regression import DepthRegression
 from pcfix.refract.stereo_factor import StereoFactor, check_stereo, stereo_factor
 from pcfix.refract.tiling import spatial_order

@@ -12,7 +12,6 @@ from pcfix.model import FloatArray, IntArray, Outcome
 from pcfix.options.correct import Dimensions
 from pcfix.refract.batch import Batch, ModelUncertainty
 from pcfix.refract.fusion import likely_beds
-from pcfix.refract.reconstructions import SURE, Hint, Reconstruction, Verdict
 from pcfix.refract.matcher import bed_of
 from pcfix.refract.methods import correct, with_rays
 from pcfix.refract.patches import (
@@ -25,6 +24,7 @@ from pcfix.refract.patches import (
     scatter_m,
     shares,
 )
+from pcfix.refract.reconstructions import SURE, Hint, Reconstruction, Verdict
 
 LEAST_PATCHES = 100
 """Patches with all their points corrected under each reconstruction, below which nothing is told."""

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from reconstruction import assume, given
-from reconstruction import strategies as st
+from hypothesis import assume, given
+from hypothesis import strategies as st
 
 import pcfix
 from pcfix.refract.stereo_pairs import CLOSE_M

@@ -5,8 +5,8 @@ import math
 
 import numpy as np
 import pytest
-from reconstruction import given
-from reconstruction import strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 
 import pcfix
 from pcfix.errors import SettingError

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 import pytest
-from reconstruction import given
-from reconstruction import strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 
 import pcfix
 from tests.utils.beyond_frames import BEYOND_FRAMES, DEEP

@@ -9,9 +9,9 @@ import pcfix
 from pcfix.model import Cameras, WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Batch, Survey
-from pcfix.refract.reconstructions import IN_FRAME, reconstructions_of
 from pcfix.refract.learning import learn_of_sample
 from pcfix.refract.patches import FEWEST_WITHOUT_LIST
+from pcfix.refract.reconstructions import IN_FRAME, reconstructions_of
 from pcfix.water.surface import surface_above
 from tests.utils.nightly import mostly_nightly
 from tests.utils.shared import needs
