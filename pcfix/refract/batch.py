@@ -229,20 +229,20 @@ class Batch:
         return np.diff(self.rays.start)
 
     def chosen(self) -> Chosen:
-        """Return the points and their cameras for kernels."""
-        survey = self.survey
-        original_xyz = self.xyz if self.original_model is None else self.original_model.xyz
+        """Return the points and their cameras, if these are known, for kernels."""
+        survey, views, none = self.survey, self.views, np.zeros(0, np.int64)
+        original = self.xyz if self.original_model is None else self.original_model.xyz
         return Chosen(
-            np.ascontiguousarray(self.xyz),
-            np.ascontiguousarray(original_xyz),
-            np.ascontiguousarray(self.surface.height_m),
-            np.ascontiguousarray(self.surface.slope),
-            self.normals(),
-            np.ascontiguousarray(survey.cameras.centres),
-            survey.offset_m,
-            np.ascontiguousarray(self.rays.start, np.int64),
-            np.ascontiguousarray(self.rays.camera, np.int64),
-            survey.settings.refractive_index,
+            xyz=np.ascontiguousarray(self.xyz),
+            original_xyz=np.ascontiguousarray(original),
+            height=np.ascontiguousarray(self.surface.height_m),
+            slope=np.ascontiguousarray(self.surface.slope),
+            normals=self.normals(),
+            centres=np.ascontiguousarray(survey.cameras.centres),
+            offset=survey.offset_m,
+            start=none if views is None else np.ascontiguousarray(views.start, np.int64),
+            camera=none if views is None else np.ascontiguousarray(views.camera, np.int64),
+            n=survey.settings.refractive_index,
         )
 
     def normals(self) -> FloatArray:

@@ -80,7 +80,7 @@ CLOSE_M = 1e-7
 
 
 # Columns of the result.
-MISS, RAYS, INCIDENCE, OUTCOME, FOUND = 3, 4, 5, 6, 7
+DISTANCE, RAYS, INCIDENCE, OUTCOME, FOUND = 3, 4, 5, 6, 7
 COLUMNS = 8
 
 # Columns of a ray: e, its plane (N, h), the gradients of its image by P, that image, its origin.
@@ -152,7 +152,7 @@ def intersection_of(result: FloatArray, used: BoolArray) -> Intersection:
         shift_m=result[:, :3],
         outcome=outcome,
         ray_count=result[:, RAYS].astype(np.int32),
-        ray_miss_m=result[:, MISS],
+        ray_miss_m=result[:, DISTANCE],
         sigma_z_m=np.zeros(len(result)),
         incidence_deg=result[:, INCIDENCE],
         camera_used=used,
@@ -259,20 +259,20 @@ def _solve(
         out[OUTCOME] = PARALLEL
         return
     found, q = _search(q, (g, inverse), rays, cameras, optics, n, tin, fields)
-    write_row(out, q, miss(k, sums, q), k, sums[9])
+    write_row(out, q, ray_distance(k, sums, q), k, sums[9])
     out[FOUND] = 1.0 if found else 0.0
 
 
 @device
-def write_row(out: FloatArray, q: Vector, miss_m: float, k: float, cosine2: float) -> None:
+def write_row(out: FloatArray, q: Vector, distance: float, k: float, cosine2: float) -> None:
     """Write the row of a point with a solution."""
     out[0], out[1], out[2] = q
-    out[MISS], out[RAYS], out[OUTCOME], out[FOUND] = miss_m, k, CORRECTED, 1.0
+    out[DISTANCE], out[RAYS], out[OUTCOME], out[FOUND] = distance, k, CORRECTED, 1.0
     out[INCIDENCE] = np.degrees(np.arccos(np.sqrt(min(cosine2, 1.0))))
 
 
 @device
-def miss(k: float, s: FloatArray | Nine, q: Vector) -> float:
+def ray_distance(k: float, s: FloatArray | Nine, q: Vector) -> float:
     """Return the rms distance of Q from the lines of the sums, Q'MQ - 2 b'Q + s over k."""
     x, y, z = q
     along = s[0] * x * x + s[3] * y * y + (k - s[0] - s[3]) * z * z

@@ -25,14 +25,15 @@ from typing import TypeAlias
 import numpy as np
 
 from pcfix.kernels import Span, device, in_tiles, kernel
-from pcfix.lens.algebra import Nine, Symmetric, Vector
+from pcfix.lens.algebra import Nine, Symmetric, Vector, plus, scaled
 from pcfix.model import FloatArray, IntArray, Outcome, SingleArray
 from pcfix.options.correct import LEVEL_M
 from pcfix.refract import sensitivity as s
+from pcfix.refract import tiling
 from pcfix.refract.batch import Batch, Intersection, Survey
 from pcfix.refract.choice import Rig, Rule, rig_of, rule_of
 from pcfix.refract.sensitivity import Budget
-from pcfix.refract.tiling import TILE, Points, gather, marks_of_lists, points_of, tiles_of
+from pcfix.refract.tiling import TILE, Points, nine, points_of, three
 from pcfix.water.surface import Field, height_at
 
 Four: TypeAlias = tuple[float, float, float, float]
@@ -76,7 +77,7 @@ def covariances(batch: Batch, shift_m: FloatArray) -> FloatArray:
     # the rays are chosen: a mesh may have let through one that its plane above the point would not
     every_ray = rule_of(survey)._replace(least_cosine2=0.0)
     in_tiles(
-        _of_lists, tiles_of(batch), points_of(batch), np.ascontiguousarray(shift_m), rig_of(survey),
+        _of_lists, tiling.tiles_of(batch), points_of(batch), np.ascontiguousarray(shift_m), rig_of(survey),
         (np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)),
         every_ray, budget_of(survey), level_sigma_of(batch), result,
     )  # fmt: skip
@@ -197,9 +198,9 @@ def _of_lists(
     for t in range(*span):
         rows = points.order[t * TILE : (t + 1) * TILE]
         tile = np.empty(7 * TILE)
-        gather(tile, rows, points)
+        tiling.gather(tile, rows, points)
         room = s.room_of(tile, shift, rows)
-        named, marks = marks_of_lists(start, camera, rows, len(rig.centres))
+        named, marks = tiling.marks_of_lists(start, camera, rows, len(rig.centres))
         for at in range(named.size):
             add_errors(room, tile, marks[at], rig, named[at], rule, budget)
         finish_tile(result, rows, room, tile, level_sigma, budget)
@@ -262,7 +263,7 @@ def _solved_in_images(sums: FloatArray, j: int) -> tuple[bool, Nine]:
 
     Q moves by that times the right side of the normal equations of P, and times sum S delta.
     """
-    m = _nine(sums, s.BY_Q * TILE + j)
+    m = nine(sums, s.BY_Q * TILE + j)
     det, inverse = inverse_of(m)
     half = 0.5 * (m[0] + m[4] + m[8])
     return (sums[j] >= 2.0) & (det >= MIN_DETERMINANT * half * half * half), inverse
@@ -278,7 +279,7 @@ def _solved_in_space(sums: FloatArray, j: int) -> tuple[bool, Nine, Nine]:
     k = sums[j]
     det, by_delta = inverse_of(_full(_six(sums, s.BY_Q * TILE + j)))
     full, by_sight = inverse_of(_full(_six(sums, s.SIGHT * TILE + j)))
-    by_p = _product(by_delta, _nine(sums, s.BY_P * TILE + j))
+    by_p = _product(by_delta, nine(sums, s.BY_P * TILE + j))
     solved = (k >= 2.0) & (det >= MIN_DETERMINANT * k * k * k) & (full > 0.0)
     return solved, by_delta, _product(by_p, by_sight)
 
@@ -323,24 +324,19 @@ def _columns(
     nx, ny, nz = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
     scale = 1.0 / np.sqrt(nx * nx + nz * nz)
     ux, uz = nz * scale, -nx * scale
-    by_tilt = _nine(sums, s.BY_TILT * TILE + j)
-    by_level, by_n = _three(sums, s.BY_LEVEL * TILE + j), _three(sums, s.BY_N * TILE + j)
-    level = _scaled(nz, by_level)
+    by_tilt = nine(sums, s.BY_TILT * TILE + j)
+    by_level, by_n = three(sums, s.BY_LEVEL * TILE + j), three(sums, s.BY_N * TILE + j)
+    level = scaled(nz, by_level)
     away_u, away_v = tile[j] - budget.pivot_x, tile[TILE + j] - budget.pivot_y
     # the normal leans away from where the slope rises
-    u = _plus(product_of(by_tilt, (-ux, 0.0, -uz)), _scaled(away_u, level))
-    v = _plus(product_of(by_tilt, (-ny * uz, nx * uz - nz * ux, ny * ux)), _scaled(away_v, level))
+    u = plus(product_of(by_tilt, (-ux, 0.0, -uz)), scaled(away_u, level))
+    v = plus(product_of(by_tilt, (-ny * uz, nx * uz - nz * ux, ny * ux)), scaled(away_v, level))
     return (
-        _scaled(level_sigma, product_of(by_delta, level)),
-        _scaled(budget.refractive_index, product_of(by_delta, by_n)),
-        _scaled(budget.tilt, product_of(by_delta, u)),
-        _scaled(budget.tilt, product_of(by_delta, v)),
+        scaled(level_sigma, product_of(by_delta, level)),
+        scaled(budget.refractive_index, product_of(by_delta, by_n)),
+        scaled(budget.tilt, product_of(by_delta, u)),
+        scaled(budget.tilt, product_of(by_delta, v)),
     )
-
-
-@device
-def _three(sums: FloatArray, at: int) -> Vector:
-    return sums[at], sums[at + TILE], sums[at + 2 * TILE]
 
 
 @device
@@ -352,27 +348,8 @@ def _six(sums: FloatArray, at: int) -> Symmetric:
 
 
 @device
-def _nine(sums: FloatArray, at: int) -> Nine:
-    return (
-        sums[at], sums[at + TILE], sums[at + 2 * TILE],
-        sums[at + 3 * TILE], sums[at + 4 * TILE], sums[at + 5 * TILE],
-        sums[at + 6 * TILE], sums[at + 7 * TILE], sums[at + 8 * TILE],
-    )  # fmt: skip
-
-
-@device
 def _full(m: Symmetric) -> Nine:
     return m[0], m[1], m[2], m[1], m[3], m[4], m[2], m[4], m[5]
-
-
-@device
-def _scaled(c: float, x: Vector) -> Vector:
-    return c * x[0], c * x[1], c * x[2]
-
-
-@device
-def _plus(x: Vector, y: Vector) -> Vector:
-    return x[0] + y[0], x[1] + y[1], x[2] + y[2]
 
 
 @device
