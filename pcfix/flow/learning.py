@@ -37,7 +37,7 @@ from pcfix.refract.learning import (
     with_factor,
     with_matcher,
 )
-from pcfix.refract.occlusion import Occluder
+from pcfix.refract.occlusion import Occluder, OccluderBuilder, wants_occlusion
 from pcfix.refract.patches import PATCH_WIDTH, Squares
 from pcfix.refract.reconstructions import Verdict, hint_of
 from pcfix.refract.regression import (
@@ -48,7 +48,6 @@ from pcfix.refract.regression import (
     DepthRegression,
     fit_depths,
 )
-from pcfix.refract.top_surface import OccluderBuilder, wants_occlusion
 from pcfix.water.surface import SurfaceAbove, is_submerged, surface_above
 
 

@@ -15,6 +15,7 @@ from pcfix.refract.consistent import check_consistent
 from pcfix.refract.fusion import likely_beds
 from pcfix.refract.matcher import Bed, bed_of, matcher_of, matcher_of_ties, places_for
 from pcfix.refract.methods import batches, on_land, with_rays
+from pcfix.refract.occlusion import occluder_of, wants_occlusion
 from pcfix.refract.patches import FEWEST_WITHOUT_LIST
 from pcfix.refract.reconstructions import (
     ALIKE,
@@ -30,7 +31,6 @@ from pcfix.refract.reconstructions import (
 from pcfix.refract.regression import DepthRegression
 from pcfix.refract.stereo_factor import StereoFactor, check_stereo, stereo_factor
 from pcfix.refract.tiling import spatial_order
-from pcfix.refract.top_surface import occluder_of, wants_occlusion
 from pcfix.refract.weighing import weigh
 from pcfix.water.surface import is_submerged
 

@@ -18,9 +18,8 @@ from pcfix.refract.batch import Batch, Intersection, Survey
 from pcfix.refract.cells import is_bent, is_quick
 from pcfix.refract.choice import cameras_of_pairs, chosen_views
 from pcfix.refract.consistent import consistent
-from pcfix.refract.fusion import invert_fusion
+from pcfix.refract.fusion import invert_depth_maps, invert_fusion
 from pcfix.refract.intersect import intersect, intersect_in_frame
-from pcfix.refract.listed_maps import invert_depth_maps
 from pcfix.refract.matcher import steepest_and_partners, without_border
 from pcfix.refract.occlusion import visible_cameras
 from pcfix.refract.shan import shan

@@ -12,8 +12,7 @@ from pcfix.model import Views, WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Learned
 from pcfix.refract.methods import correct
-from pcfix.refract.occlusion import hidden, visible_cameras
-from pcfix.refract.top_surface import occluder_of
+from pcfix.refract.occlusion import occluded, occluder_of, visible_cameras
 from pcfix.simulate.tracing import piercing_points, project, triangulate
 from pcfix.water.surface import SurfaceAbove
 from tests.utils.batches import batch_of
@@ -32,7 +31,7 @@ def to_all(n, k):
 def hidden_of(xyz, centres, occluder):
     """Return whether each camera is hidden from each point, shape (n, k)."""
     n, k = len(xyz), len(centres)
-    return hidden(xyz, centres, to_all(n, k), occluder).reshape(n, k)
+    return occluded(xyz, centres, to_all(n, k), occluder).reshape(n, k)
 
 
 def ring(incidence_deg, away_m=100.0, k=8):
@@ -255,7 +254,7 @@ def test_cameras_that_made_a_real_cloud_are_not_called_hidden():
     xyz = np.column_stack([las.x, las.y, las.z])
     views = read_views(RENDERED / "dense.vis", cameras)
     match = ViewMatch(views, cameras, points=len(xyz))
-    found = hidden(xyz, cameras.centres, match.for_chunk(xyz, 0), occluder_of(xyz))
+    found = occluded(xyz, cameras.centres, match.for_chunk(xyz, 0), occluder_of(xyz))
     assert found.mean() < 0.01  # of entries, all of which are of images that saw the point
 
 
