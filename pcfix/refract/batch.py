@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import PcfixWarning
+from pcfix.errors import PcfixWarning, SettingError
 from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import Vector, times, transposed_times
 from pcfix.lens.imaging import direction_of, image_of, lens_table
@@ -385,13 +385,30 @@ class Intersection(NamedTuple):
         return self._replace(**{name: value[rows] for name, value in known.items()})
 
 
+def require_orientation(cameras: Cameras, who: str, instead: str = "") -> None:
+    """Raise SettingError if cameras have no angles or no lenses."""
+    named = (("angles", cameras.rotations), ("lenses", cameras.lenses))
+    missing = [name for name, value in named if value is None]
+    if missing:
+        raise SettingError(
+            "cameras.no_orientation",
+            f"{who} needs the angles and the lens of each image, and the cameras have no"
+            f" {' and no '.join(missing)}. Give a camera file that has them, or --sensor for the"
+            f" lens{f', or {instead}' if instead else ''}.",
+            missing=missing,
+        )
+
+
 def warn_of_unsolved(beginning: str, found: BoolArray) -> None:
     """Warn of the points that are moved without a solution; `found` has one entry for each."""
     if not found.all():
         unsolved = int((~found).sum())
         warnings.warn(
-            f"{beginning} for {unsolved:,} of {len(found):,} points; they have that of snell.",
-            PcfixWarning,
+            PcfixWarning(
+                "points.unsolved",
+                f"{beginning} for {unsolved:,} of {len(found):,} points; they have that of snell.",
+                points=unsolved,
+            ),
             stacklevel=3,
         )
 

@@ -52,6 +52,10 @@ def _basis_of(x: FloatArray) -> FloatArray:
     )  # fmt: skip
 
 
+def _fit_at(basis: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.pinv(basis), np.float64)
+
+
 QUADRATIC, CUBIC = 10, 19
 """Terms of polynomials; the cubic one has no w^3, as the height varies least."""
 
@@ -61,10 +65,10 @@ _CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
 NODES = np.vstack([np.array(list(product(_FOUR, _FOUR, _THREE))), _CORNERS])
 INSIDE, AT_CORNERS = len(NODES) - len(_CORNERS), len(_CORNERS)
 BASIS = _basis_of(NODES)
-FIT_CUBIC = np.linalg.pinv(BASIS[:INSIDE])
-FIT_QUADRATIC = np.linalg.pinv(BASIS[:INSIDE, :QUADRATIC])
+FIT_CUBIC = _fit_at(BASIS[:INSIDE])
+FIT_QUADRATIC = _fit_at(BASIS[:INSIDE, :QUADRATIC])
 SOME = np.concatenate([np.arange(0, INSIDE, 5), np.arange(INSIDE, len(NODES))])
-FIT_SOME = np.linalg.pinv(BASIS[SOME, :QUADRATIC])
+FIT_SOME = _fit_at(BASIS[SOME, :QUADRATIC])
 
 
 def is_bent(survey: Survey) -> bool:

@@ -29,7 +29,6 @@ from typing import TypeAlias
 
 import numpy as np
 
-from pcfix.errors import SettingError
 from pcfix.kernels import Span, device, in_tiles, kernel, most_between
 from pcfix.lens.algebra import (
     Nine,
@@ -58,6 +57,7 @@ from pcfix.refract.batch import (
     Intersection,
     Optics,
     optics_of,
+    require_orientation,
     warn_of_unsolved,
 )
 from pcfix.refract.choice import shapes_of
@@ -88,24 +88,8 @@ _PLANE, _GRADIENTS, _IMAGE, _ORIGIN, RAY_WIDTH = 3, 7, 13, 15, 18
 
 
 def check_consistent(cameras: Cameras) -> None:
-    """Check that the method consistent can be done with cameras.
-
-    Raises
-    ------
-    SettingError
-        If they have no angles or no lenses.
-    """
-    missing = [
-        name
-        for name, value in (("angles", cameras.rotations), ("lenses", cameras.lenses))
-        if value is None
-    ]
-    if missing:
-        raise SettingError(
-            f"method consistent goes through the images, and the cameras have no"
-            f" {' and no '.join(missing)}: give cameras with interior and exterior orientation,"
-            " or use --method snell."
-        )
+    """Raise SettingError if cameras have no angles or no lenses."""
+    require_orientation(cameras, "Method consistent", "use method snell")
 
 
 def consistent(batch: Batch) -> Intersection:

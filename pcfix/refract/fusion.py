@@ -19,9 +19,10 @@ of all. So the height that most points around can have come from, the bed of the
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import dot
@@ -59,8 +60,8 @@ def invert_fusion(batch: Batch) -> Intersection:
     """
     bed = batch.survey.learned.bed
     around = np.full(len(batch.xyz), np.nan) if bed is None else bed.height_at(batch.xyz[:, :2])
-    result, likely = np.zeros((len(batch.xyz), depth_maps.COLUMNS)), np.zeros((0, 0), np.float32)
-    _in_cells(batch, _fuse_cells, around, result, likely)
+    result = np.zeros((len(batch.xyz), depth_maps.COLUMNS))
+    _in_cells(batch, _fuse_cells, around, result, np.zeros((0, 0), np.float32))
     return depth_maps.intersection_of(batch, result)
 
 
@@ -96,7 +97,7 @@ def invert_depth_maps(batch: Batch) -> Intersection:
     return depth_maps.intersection_of(batch, result)
 
 
-def _in_cells(batch: Batch, run: Callable[..., None], *given: FloatArray) -> None:
+def _in_cells(batch: Batch, run: Callable[..., None], *given: npt.NDArray[Any]) -> None:
     order, first = cells_of(batch)
     in_tiles(
         run, len(first) - 1, (order, first), block_of(batch), is_quick(batch), *given,

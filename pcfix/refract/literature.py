@@ -20,12 +20,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from pcfix.errors import SettingError
 from pcfix.kernels import device, kernel
 from pcfix.lens.algebra import minus, row_of
 from pcfix.model import BoolArray, FloatArray, IntArray, Outcome
 from pcfix.refract.batch import Batch, Chosen, Intersection
 from pcfix.refract.rays import MIN_DETERMINANT
+from pcfix.refract.regression import raise_no_regression
 
 
 def apparent_depth(batch: Batch) -> FloatArray:
@@ -133,7 +133,7 @@ def regression(batch: Batch) -> Intersection:
     """
     learned = batch.survey.learned.regression
     if learned is None:
-        raise SettingError("method regression needs a regression; fit one of check depths first.")
+        raise_no_regression()
     apparent = apparent_depth(batch)
     return without_rays(batch, learned.depth_m(apparent) - apparent)
 

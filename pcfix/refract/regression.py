@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
-from pcfix.errors import GeometryError
+from pcfix.errors import GeometryError, SettingError
 from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.sums import Sums
 from pcfix.water.surface import SurfaceAbove, is_submerged
@@ -97,6 +97,14 @@ class DepthRegression:
         )
 
 
+def raise_no_regression() -> NoReturn:
+    """Raise SettingError because the method regression has no line."""
+    raise SettingError(
+        "regression.missing",
+        "Method regression needs a fitted line. Give check depths or the line of another cloud.",
+    )
+
+
 def fit_depths(apparent_m: FloatArray, true_m: FloatArray) -> DepthRegression:
     """Fit the line by least squares, all check depths with equal weight and none left out.
 
@@ -115,19 +123,25 @@ def fit_depths(apparent_m: FloatArray, true_m: FloatArray) -> DepthRegression:
     x, y = np.asarray(apparent_m, np.float64), np.asarray(true_m, np.float64)
     if len(x) < LEAST_COUNT:
         raise GeometryError(
-            f"{len(x)} check depths are too few for a regression: give {LEAST_COUNT} at least,"
-            f" better {FEW} or more."
+            "check_depths.few",
+            f"{len(x)} check depths are too few for a regression. Give at least {LEAST_COUNT},"
+            f" better {FEW} or more.",
+            count=len(x),
         )
     if np.ptp(x) < _SAME_M:
         raise GeometryError(
-            f"all {len(x)} check depths lie at one apparent depth, {x.mean():.3f} m, which leaves"
-            " the slope open: give check depths from shallow to deep."
+            "check_depths.one_depth",
+            f"All {len(x)} check depths have the apparent depth {x.mean():.3f} m, which leaves the"
+            " slope open. Give check depths from shallow to deep.",
+            apparent_m=float(x.mean()),
         )
     line = linregress(x, y)
     if not line.slope > 0.0:
         raise GeometryError(
-            f"the check depths do not grow with the depths of the cloud (slope {line.slope:.3f}):"
-            " check that they are positive down and lie in the cloud's CRS."
+            "check_depths.falling",
+            f"The check depths do not grow with the depths of the cloud (slope {line.slope:.3f})."
+            " Check that they are positive down and in the cloud's CRS.",
+            slope=float(line.slope),
         )
     residual = y - (line.intercept + line.slope * x)
     leverage = 1.0 / len(x) + (x - x.mean()) ** 2 / ((x - x.mean()) ** 2).sum()

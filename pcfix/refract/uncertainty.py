@@ -77,8 +77,8 @@ def covariances(batch: Batch, shift_m: FloatArray) -> FloatArray:
     # the rays are chosen: a mesh may have let through one that its plane above the point would not
     every_ray = rule_of(survey)._replace(least_cosine2=0.0)
     in_tiles(
-        _of_lists, tiling.tiles_of(batch), points_of(batch), np.ascontiguousarray(shift_m), rig_of(survey),
-        (np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)),
+        _of_lists, tiling.tiles_of(batch), points_of(batch), np.ascontiguousarray(shift_m),
+        rig_of(survey), (np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)),
         every_ray, budget_of(survey), level_sigma_of(batch), result,
     )  # fmt: skip
     return result

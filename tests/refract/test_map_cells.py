@@ -10,8 +10,8 @@ from pcfix.kernels import threads
 from pcfix.model import WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import FLAT_DEG, Batch, Survey
-from pcfix.refract.learning import learn_of_sample, seen_flat
-from pcfix.refract.methods import correct
+from pcfix.refract.learning import learn_of_sample
+from pcfix.refract.methods import correct, with_rays
 from pcfix.water.surface import is_submerged, surface_above
 from tests.utils.batches import batch_of
 from tests.utils.depth_map_twin import looking
@@ -73,6 +73,6 @@ def test_points_seen_by_flat_obliques_alone_are_known():
     xyz = np.array([[5.0, 0.0, -2.0], [80.0, 0.0, -2.0], [900.0, 0.0, -2.0]])
     above = surface_above(WaterPlane(0.0), xyz)
     settings = ScienceOptions(method="consistent", camera_set="all")
-    flat = seen_flat(batch_of(xyz, above, WaterPlane(0.0), cameras, settings))
+    flat = with_rays(batch_of(xyz, above, WaterPlane(0.0), cameras, settings)).seen_flat()
     assert flat.tolist() == [False, True, False]  # from above; at 48 degrees; not at all
     assert FLAT_DEG < 48.0
