@@ -116,7 +116,7 @@ def chosen_views(batch: Batch) -> Views:
         begin, entries = np.empty(len(batch), np.int64), (first[:0], first[:0])
         place = np.empty(np.cumsum(first, out=first)[-1], np.int32)
     else:
-        entries = (np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64))
+        entries = batch.listed
         begin = entries[0][:-1].copy()
         place = np.empty(len(views.camera), np.int32)
     rule, (tin, fields), found = rule_of(survey), shapes_of(survey), (first, begin, count, place)

@@ -27,7 +27,7 @@ import numpy.typing as npt
 from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import dot
 from pcfix.lens.frames import holds
-from pcfix.model import BoolArray, FloatArray, IntArray
+from pcfix.model import FloatArray, IntArray
 from pcfix.refract import depth_maps
 from pcfix.refract.batch import Batch, Intersection
 from pcfix.refract.cells import are_same, cameras_of, cells_of, counts_of, is_quick
@@ -366,24 +366,19 @@ def _invert_listed(
         rows = order[first[cell] : first[cell + 1]]
         fitted = none
         if quick and rows.size >= LEAST_POINTS:
-            fitted = table_of(rows, _may_count(rows, block), block)
+            # the listed images, and those whose maps were averaged into theirs
+            listed = counts_of(rows, points) > 0
+            seeing = listed.copy()
+            for c in range(listed.size):
+                for a in block.matcher.averaged[c]:
+                    if listed[c] and a >= 0:
+                        seeing[a] = True
+            fitted = table_of(rows, seeing, block)
         for i in rows:
             begin, end = points.start[i], points.start[i + 1]
             given = weight[begin:end] if weight.size else weight
             table = fitted if reads(fitted, points, i) else none
             _invert_listed_one(result[i], i, points.camera[begin:end], given, block, table, room)
-
-
-@device(allocates=True)
-def _may_count(rows: IntArray, block: Block) -> BoolArray:
-    """Return which images, or their neighbours, are listed for some points."""
-    listed = counts_of(rows, block.points) > 0
-    with_neighbours = listed.copy()
-    for c in np.flatnonzero(listed):
-        for a in block.matcher.averaged[c]:
-            if a >= 0:
-                with_neighbours[a] = True
-    return with_neighbours
 
 
 @device

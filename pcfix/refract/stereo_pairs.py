@@ -258,20 +258,15 @@ def _matched_pairs(pairs: IntArray, cameras: IntArray, matched: IntArray, place:
             if partner < 0:
                 break
             b = place[partner]
-            # a pair that each has in its list counts once
-            if b < 0 or (b < a and _contains(matched[partner], cameras[a])):
+            # a pair that each image has in its list counts once
+            both = False
+            for one in matched[partner]:
+                both = both or one == cameras[a]
+            if b < 0 or (b < a and both):
                 continue
             pairs[count, 0], pairs[count, 1], pairs[count, 2] = a, b, cameras[a] * partners + p
             count += 1
     return count
-
-
-@device
-def _contains(row: IntArray, value: int) -> bool:
-    found = False
-    for one in row:
-        found = found or one == value
-    return found
 
 
 @device

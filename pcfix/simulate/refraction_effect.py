@@ -32,7 +32,7 @@ a the angle in air, b that in water, R the distance in plan. Each image has its 
 gives the 4 equations of eq 3 for X, Y, depth and two s; with s known they are linear. The iteration
 starts with s = 1, the point that software makes that knows nothing of water, takes tan a from the
 point found, and solves again, until tan a no longer changes. (Where that departs from the print:
-`pcfix.refract.shan`.)
+`pcfix.refract.literature.shan`.)
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""From the camera forwards: a ray through any water surface, and by how much it misses the point.
+"""Trace rays forward from the camera through any water surface.
 
 The object point is the local origin. A ray is named by its aim: the place where it would cross the
 level of the water above the point. It pierces the surface at A, bends there, and comes down to the
-height of the point at the place (mx, my): its miss.
+height of the point at the place (mx, my): its offset.
 
 The surface is a plane, or the bilinear raster or the facets of `pcfix.water.surface`. Where there
 is none, and where it faces away from the camera, all is NaN. Water that hides water behind it is
@@ -62,7 +62,7 @@ def height_of(water: Water, x: float, y: float) -> tuple[float, float, float]:
 def _height_of(
     plane: FloatArray, tin: Tin | None, field: Field | None, origin: FloatArray, x: float, y: float
 ) -> tuple[float, float, float]:
-    """Do it; numba drops the branch of what is None only where it is an argument of its own."""
+    # numba drops the branch of what is None only where that is an argument of its own
     if tin is None and field is None:
         return plane[0] + plane[1] * x + plane[2] * y, plane[1], plane[2]
     return plane_at(tin, field, x, y, origin)
