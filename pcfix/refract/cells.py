@@ -164,6 +164,7 @@ def box_of(rows: IntArray, points: Chosen) -> Box:
     b, c = points.slope[i, 0], points.slope[i, 1]
     a = points.height[i] - b * points.xyz[i, 0] - c * points.xyz[i, 1]
     for j in rows:
+        # the third axis is the height over the water
         x, y, z = row_of(points.xyz, j)
         at = x, y, z - (a + b * x + c * y)
         for axis in range(3):
@@ -181,6 +182,7 @@ def water_at(box: Box, x: float, y: float) -> float:
 @device(allocates=True)
 def nodes_of(box: Box, points: Chosen) -> Chosen:
     """Return the nodes of a box as points."""
+    # from coordinates of -1 to 1 to the world
     xyz, height = box.middle + box.half * NODES, np.empty(len(NODES))
     slope, normals = np.empty((len(NODES), 2)), np.empty((len(NODES), 3))
     for k in range(len(NODES)):

@@ -181,6 +181,7 @@ def _choose_all(
         tile = np.empty(7 * TILE)
         low, high = tiling.gather(tile, rows, points)
         near = tiling.near_cameras(around, frames, rig.centres, low, high)
+        # the tile has its own stretch of entries
         free = first[t]
         for j in range(rows.size):
             i = rows[j]
@@ -218,7 +219,18 @@ def _choose_in_frame(
         seeing = near.size
         # first camera by camera, over all points; then point by point, over all cameras
         for at in range(seeing):
-            _set_steepness(cosine2[at], tile, rig, near[at], rule)
+            # marks become squared cosines of incidence angles, negative for rays that do not count
+            centre, offset = row_of(rig.centres, near[at]), rig.offset[near[at]]
+            marks = cosine2[at]
+            for j in range(marks.size):
+                z = tile[2 * TILE + j]
+                e = minus(centre, (tile[j], tile[TILE + j], z))
+                height = dot((tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]), e)
+                h = tile[6 * TILE + j] * (tile[3 * TILE + j] - (z - offset))
+                length2 = dot(e, e)
+                # the camera is above the water, and its ray within the largest incidence angle
+                use = (height > h) & (height * height >= rule.least_cosine2 * length2)
+                marks[j] = height * height / length2 if use & (marks[j] > 0.0) else -1.0
         free, steep = first[t], np.empty(seeing)
         for j in range(rows.size):
             k = 0
@@ -226,24 +238,10 @@ def _choose_in_frame(
                 if cosine2[at, j] >= 0.0:
                     place[free + k], steep[k] = near[at], cosine2[at, j]
                     k += 1
+            # then drop what exceeds the largest number of rays
             k = _keep_steepest(place[free:], steep, k, rule.most)
             begin[rows[j]], count[rows[j] + 1] = free, k
             free += k
-
-
-@device
-def _set_steepness(marks: FloatArray, tile: FloatArray, rig: Rig, c: int, rule: Rule) -> None:
-    """Turn marks into squared cosines of incidence angles, negative where a ray does not count."""
-    centre, offset = row_of(rig.centres, c), rig.offset[c]
-    for j in range(marks.size):
-        z = tile[2 * TILE + j]
-        e = minus(centre, (tile[j], tile[TILE + j], z))
-        height = dot((tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]), e)
-        h = tile[6 * TILE + j] * (tile[3 * TILE + j] - (z - offset))
-        length2 = dot(e, e)
-        # the camera is above the water, and its ray within the largest incidence angle
-        use = (height > h) & (height * height >= rule.least_cosine2 * length2)
-        marks[j] = height * height / length2 if use & (marks[j] > 0.0) else -1.0
 
 
 @device
@@ -281,10 +279,12 @@ def _choose(
         e, lowered = minus(row_of(rig.centres, c), (x, y, z)), (x, y, z - rig.offset[c])
         h = upward[2] * (tile[3 * TILE + j] - lowered[2])
         height, length2 = dot(upward, e), dot(e, e)
+        # above the water, and in the frame
         if not (height > h and holds(frames, c, e)):
             continue
         if h > 0.0 and is_limited and (tin is not None or fields is not None):
             _, normal = pierce_of(c, tin, fields, lowered, e, h, upward, facet)
+            # the incidence angle at the piercing point
             height = max(dot(normal, e), 0.0)
         if height * height >= rule.least_cosine2 * length2:
             chosen[k], cosine2[k] = at, height * height / length2

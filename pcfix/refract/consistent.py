@@ -62,28 +62,13 @@ def check_consistent(cameras: Cameras) -> None:
 def consistent(batch: Batch) -> Intersection:
     """Find the true points whose images give the apparent points, by straight rays.
 
-    Parameters
-    ----------
-    batch : Batch
-        Its cameras need angles and lenses. Weights of its views are not used, as software
-        triangulates with equal weights.
+    The cameras need angles and lenses. Weights of the views are not used, as software triangulates
+    with equal weights. Light is refracted for a camera whose water stood above the true point; for
+    `snell` it is the apparent point.
 
-    Returns
-    -------
-    Intersection
-        `ray_miss_m` is the distance from the refracted rays of the apparent point, as for `snell`.
-        Light is refracted for a camera whose water stood above the true point; for `snell` it is
-        the apparent point.
-
-    Raises
-    ------
-    SettingError
-        If the cameras have no angles or no lenses.
-
-    Warns
-    -----
-    PcfixWarning
-        Of points without a solution, under waves that focus the light; they get that of `snell`.
+    `ray_miss_m` is the distance from the refracted rays of the apparent point, as for `snell`. A
+    point whose views are all one camera is `ONE_CAMERA`. Points without a solution, under waves
+    that focus the light, get that of `snell`, with a warning.
     """
     check_consistent(batch.survey.cameras)
     survey, result = batch.survey, np.zeros((len(batch), COLUMNS))
@@ -144,6 +129,7 @@ def correct_one(
     if one:
         out[OUTCOME] = types.ONE_CAMERA if cameras.size else types.NO_CAMERA
         return
+    # the facet above the point, where piercing starts
     facet = -1 if tin is None else locate(tin, points.xyz[i, 0], points.xyz[i, 1])
     sums[:9], sums[9] = 0.0, 1.0
     for j in range(cameras.size):
@@ -169,10 +155,12 @@ def begin(
     Its plane is that of the water where the line from P to the camera pierces it.
     """
     x, y, z = row_of(points.xyz, i)
+    # water that stood higher for this image: lower the point instead
     lowered = x, y, z - points.offset[c]
     e = minus(row_of(points.centres, c), (x, y, z))
     normal = normal_of(points.slope[i, 0], points.slope[i, 1])
     h, height, length2 = normal[2] * (points.height[i] - lowered[2]), dot(normal, e), dot(e, e)
+    # a point above its water has a straight ray
     f, bend = 0.0, 1.0
     if h > 0.0:
         bend = 1.0 / points.n
@@ -191,6 +179,7 @@ def begin(
 @device
 def add_image(ray: FloatArray, optics: Optics, c: int) -> None:
     """Fill in the image of P and its gradients by P in the world frame."""
+    # P is seen in the direction -e
     lens, down = optics.lenses[optics.row[c]], scaled(-1.0, vector(ray))
     u, v, by_u, by_v = image_in_world(lens, optics.rotations[c], down)
     for axis in range(3):
@@ -209,6 +198,7 @@ def write_row(out: FloatArray, q: Vector, distance: float, k: float, cosine2: fl
 @device
 def ray_distance(k: float, s: FloatArray | Nine, q: Vector) -> float:
     """Return the rms distance of Q from the lines of the sums, Q'MQ - 2 b'Q + s over k."""
+    # t t' summed over the rays, with zz from the trace
     x, y, z = q
     along = s[0] * x * x + s[3] * y * y + (k - s[0] - s[3]) * z * z
     along += 2.0 * (s[1] * x * y + s[2] * x * z + s[4] * y * z)
@@ -237,14 +227,17 @@ def _search(
             add_residual(g, slope, q, rays[j], cameras[j], optics, n, tin, fields)
         if step == 0 and not algebra.inverted(inverse, 0.0):
             return False, start
+        # the quasi-Newton step -B g
         t = scaled(-1.0, algebra.times(inverse, vector(g)))
         if step > 0:
+            # good Broyden update; the step then follows without another product
             share, along = 1.0 / (before - dot(s, t)), algebra.transposed_times(inverse, s)
             for i in range(3):
                 for j in range(3):
                     inverse[i, j] += share * t[i] * along[j]
             t = scaled(share * before, t)
         q, size2 = algebra.plus(q, t), dot(t, t)
+        # NaN: some camera has no image of Q
         if not size2 < np.inf:
             return False, start
         # steps shrink at least as fast as the last one did: the rest is about size^2 / before
@@ -261,12 +254,15 @@ def add_residual(
 ) -> None:  # fmt: skip
     """Add the residual of one ray to g(Q), and its part of d g / d Q if `slope` has rows."""
     e, plane = vector(ray), ray[_PLANE:_GRADIENTS]
+    # under waves the plane of the ray moves with Q
     if tin is not None or fields is not None:
         water_rays.settle_of(c, plane, tin, fields, ray[_ORIGIN:], q, e, n)
     normal = vector(plane)
     path = light_path(q, e, normal, plane[3], n)
+    # the direction of the light in the frame of the camera
     w = algebra.times(optics.rotations[c], direction(path, normal))
     u, v = image_of(optics.lenses[optics.row[c]], *w)
+    # the residual in pixels
     du, dv = u - ray[_IMAGE], v - ray[_IMAGE + 1]
     for i in range(3):
         g[i] += ray[_GRADIENTS + i] * du + ray[_GRADIENTS + 3 + i] * dv
@@ -282,6 +278,7 @@ def _add_slope(slope: FloatArray, ray: FloatArray, path: Path, by_q: Vector) -> 
     for image in range(2):
         at = _GRADIENTS + 3 * image
         j = vector(ray, at)
+        # k (I - N N') J + (J.s) grad k
         across = minus(j, scaled(dot(j, normal), normal))
         d = scaled(height, beyond(scaled(k, across), dot(j, s), by_q))
         for i in range(3):

@@ -227,6 +227,7 @@ def likely_bed(sight: Sight, block: Block) -> float:
     points, above = block.points, 0.0
     for c in range(len(points.offset)):
         above += points.offset[c]
+    # the mean water level of all images
     above = sight.above + sight.normal[2] * above / len(points.offset)
     return -LIKELY * max(above, LEAST_DEPTH_M) / sight.normal[2] * (points.n - 1.0)
 
@@ -257,6 +258,7 @@ def settle_bed(
         c = maps[0]
         near = max(near, NEAR_PX * _length(sight, block, c) / block.matcher.focal_px[c])
     for _ in range(MAX_LOOKS):
+        # no image with a weight sees the bed
         if not np.isfinite(step):
             return
         if abs(step) <= near:
@@ -291,6 +293,7 @@ def _look(
     """
     n, normal = block.points.n, sight.normal
     a, e, above = _ray(c, sight, block)
+    # H and L^2; f leads to the piercing point, as in `rays`
     across, length2 = dot(normal, e), dot(e, e)
     per_across, length = 1.0 / across, np.sqrt(length2)
     f, bend = (above * per_across, 1.0 / n) if above > 0.0 else (0.0, 1.0)
@@ -304,6 +307,7 @@ def _look(
     away, per_depth = length, length * per_across
     if len(block.images.centres):
         length = _length(sight, block, c)
+    # from the polynomials, or exactly where these do not reach
     if has_terms(table, c):
         usual = away - under + USUAL * depth * per_depth - length
         count = read_table(room.partners, room.powers, table, c, plus(sight.now, q), usual, block)
@@ -338,6 +342,7 @@ def _ray(c: int, sight: Sight, block: Block) -> tuple[Vector, Vector, float]:
     above = sight.above + sight.normal[2] * block.points.offset[c]
     if len(block.images.centres) == 0:
         return (0.0, 0.0, 0.0), up, above
+    # the ray of the original image, in the adjusted camera
     d = to_adjusted(block.images, c, scaled(-1.0, original_up(sight, block, c)))
     e = scaled(dot(up, d) / dot(d, d), d)
     a = minus(up, e)
@@ -366,6 +371,7 @@ def _compare(
         if not (path[0] == path[0] and holds(matcher.inner, j, scaled(-1.0, a))):
             continue
         base = minus(original, original_up(sight, block, j))
+        # where the ray of j, as the original model has it, is nearest to that of c
         away, residual, partners[count, 2] = meet(u, unit(a), base, matcher.focal_px[j])
         partners[count, 0], partners[count, 1] = away - length, residual * residual
         count += 1
@@ -392,6 +398,7 @@ def best_pairs(partners: FloatArray, pairs: FloatArray, tolerance: float) -> flo
             least, count = min(least, cost), count + 1
     total, sum_t = 0.0, 0.0
     for p in range(count):
+        # the weights fall off by e for each `tolerance` of squared residuals
         worse = (pairs[p, 0] - least) / tolerance
         if worse < NOTHING:
             w = np.exp(-worse)

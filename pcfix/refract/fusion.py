@@ -137,17 +137,6 @@ class Groups(NamedTuple):
     own: FloatArray
 
 
-@device(allocates=True)
-def _no_groups(block: Block) -> Groups:
-    k, matcher = len(block.points.centres), block.matcher
-    return Groups(
-        np.full((k, matcher.averaged.shape[1] + 1), ABSENT),
-        np.full((k, matcher.fused.shape[1] + 1), ABSENT),
-        np.full(k, ABSENT), np.empty(k), np.empty(k), np.empty(k), np.empty(k), np.empty(k),
-        np.empty(k),
-    )  # fmt: skip
-
-
 @device
 def _group(groups: Groups, maps: IntArray, matcher: Matcher) -> None:
     """Find the places of the depth maps of a point."""
@@ -162,6 +151,7 @@ def _group(groups: Groups, maps: IntArray, matcher: Matcher) -> None:
 @device
 def _place(members: IntArray, q: int, others: IntArray, place: IntArray) -> None:
     """Write a place and those of other images that have one."""
+    # the map itself comes first
     members[0], count = q, 1
     for c in others:
         if c >= 0 and place[c] >= 0:
@@ -177,7 +167,13 @@ def _fuse_cells(
     """Invert the fusion of the points of each cell or, where `likely` has rows, fill these in."""
     points, (order, first) = block.points, cells
     room, none = depth_maps.room_for(len(points.centres)), no_table()
-    groups = _no_groups(block)
+    k, matcher = len(points.centres), block.matcher
+    groups = Groups(
+        np.full((k, matcher.averaged.shape[1] + 1), ABSENT),
+        np.full((k, matcher.fused.shape[1] + 1), ABSENT),
+        np.full(k, ABSENT), np.empty(k), np.empty(k), np.empty(k), np.empty(k), np.empty(k),
+        np.empty(k),
+    )  # fmt: skip
     for cell in range(*span):
         rows = order[first[cell] : first[cell + 1]]
         fitted = none
@@ -185,6 +181,7 @@ def _fuse_cells(
             fitted = table_of(rows, counts_of(rows, points) > 0, block)
         for at in range(rows.size):
             i, maps = rows[at], cameras_of(points, rows[at])
+            # points with the same cameras share their groups
             if at == 0 or not are_same(maps, cameras_of(points, rows[at - 1])):
                 _group(groups, maps, block.matcher)
             table = fitted if reads(fitted, points, i) else none
@@ -253,15 +250,18 @@ def _best_seed(groups: Groups, depths: Lines, wanted: float) -> tuple[int, float
     best, at_best, least, known = -1, 0.0, np.inf, wanted == wanted
     total, first, second = 0.0, 0.0, 0.0  # sum, and moments, of what is likely
     for seed in range(depths.t.size):
+        # the seed has no depth of this bed
         if depths.slope[seed] != depths.slope[seed]:
             continue
         rise = groups.rise[seed]
+        # distance from the wanted bed, or else the larger group first
         misfit = abs(rise - wanted) if known else -groups.size[seed]
         if misfit < least:
             best, at_best, least = seed, rise, misfit
         likely = np.exp(-0.5 * (misfit / WIDTH_M) ** 2) if known else 1.0
         total += likely
         first, second = first + likely * rise, second + likely * rise * rise
+    # all groups are far from the wanted bed
     if not total > 0.0:
         return best, at_best, abs(least) if best >= 0 else 0.0
     mean = first / total
@@ -347,6 +347,7 @@ def _weigh(weight: FloatArray, seed: int, rise: float, groups: Groups, depths: L
             break
         if not abs(groups.depth[q] - groups.depth[seed]) < AGREE:
             continue
+        # its partners that agree at this bed
         own, count = t[q] + slope[q] * rise, 0.0
         for a in groups.averaged[q]:
             count += a >= 0 and abs(t[a] + slope[a] * rise - own) < AVERAGED_WITHIN
@@ -436,6 +437,7 @@ def _with_neighbours(
         for a in matcher.averaged[c]:
             if a < 0:
                 break
+            # a partner that was not looked at yet
             if place[a] == ABSENT:
                 place[a] = _OUTSIDE
                 if holds(matcher.inner, a, depth_maps.original_up(sight, block, a)):
@@ -455,6 +457,7 @@ def _share(
         at, members = place[listed[k]], 1.0
         for a in averaged[listed[k]]:
             members += _averages(at, a, now, place)
+        # the map and its partners share its weight evenly
         counts[at] += own[k] / members
         for a in averaged[listed[k]]:
             if _averages(at, a, now, place):

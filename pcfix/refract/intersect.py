@@ -120,6 +120,7 @@ def add_camera(
     rays = 0
     for j in range(marks.size):
         z = tile[2 * TILE + j]
+        # from the point to the centre; N, H = N.e; h, the height of the water over P
         e = minus(centre, (tile[j], tile[TILE + j], z))
         normal = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
         height = dot(normal, e)
@@ -132,6 +133,7 @@ def add_camera(
         # one division for two; a ray that is not used adds zeros, as a branch would not vectorise
         q = 1.0 / (length2 * height)
         f = h * length2 * q if use and h > 0.0 else 0.0
+        # 1 / L^2
         inv = height * q if use else 0.0
         bend = r if h > 0.0 else 1.0
         d = refracted(e, length2, normal, height, bend)
@@ -163,6 +165,7 @@ def _all_in_frame(
     low, high = tiling.corners_of(points.order[span[0] * TILE : span[1] * TILE], points.xyz)
     around = tiling.cameras_around(frames, centres, low, high)
     for t in range(*span):
+        # a tile of neighbours, its sums, and the cameras near it
         rows = points.order[t * TILE : (t + 1) * TILE]
         tile, sums = np.empty(7 * TILE), np.zeros(11 * TILE)
         low, high = tiling.gather(tile, rows, points)
@@ -214,6 +217,7 @@ def _chosen(
         tiling.gather(tile, rows, points)
         for j in range(rows.size):
             i = rows[j]
+            # the facet above the point, where piercing starts
             facet = -1 if tin is None else locate(tin, tile[j], tile[TILE + j])
             cameras = camera[start[i] : start[i + 1]]
             for c in cameras:
@@ -234,6 +238,7 @@ def _intersect_one(
         e = minus(row_of(rig.centres, c), (x, y, z))
         length2, lowered = dot(e, e), (x, y, z - rig.offset[c])
         h = upward[2] * (tile[3 * TILE + j] - lowered[2])
+        # a point above its water has a straight ray
         f, bend, normal = 0.0, 1.0, upward
         if h > 0.0:
             bend = r

@@ -179,25 +179,13 @@ def learn_of_sample(
 ) -> tuple[Survey, tuple[Verdict, ...]]:
     """Resolve ``auto`` and estimate the partners of the images and the bed, as needed.
 
-    Parameters
-    ----------
-    batch : Batch
-        Points of the whole cloud, evenly spread, with land; their view lists have a kind.
-    points : int
-        Number of points of the cloud.
-    ties : TiePoints, optional
-        Tie points of the original model; default: the points show which images overlap.
-    hint : Hint, optional
-        The type that the software is known for.
-    near : Near, optional
-        Points for the detection of the type, if those of the batch are too far apart.
+    The batch are points of the whole cloud of `points` points, evenly spread, with land; their view
+    lists have a kind. `ties` are tie points of the original model; by default the points show which
+    images overlap. `hint` is the type that the software is known for, `near` are points for the
+    detection of the type, if those of the batch are too far apart.
 
-    Returns
-    -------
-    survey : Survey
-        Without ``auto``.
-    verdicts : tuple of Verdict
-        Empty where nothing was to be decided, or could be.
+    Returns the survey without ``auto`` and the verdicts, if something was to be decided, and could
+    be.
     """
     if batch.views is None and batch.survey.settings.method == "auto":
         found = _learn_of_sources(batch, points, ties, hint, near)
@@ -215,7 +203,15 @@ def learn_of_sample(
     survey, verdicts = _weighed(replace(near.batch, survey=survey), near.step, hint)
     settings, learned = survey.settings, survey.learned._replace(land=None)
     if batch.original_model is not None:
-        learned = learned._replace(land=_land_of(survey, verdicts))
+        # land has the reconstruction type of the cloud, also where a formula corrects the bed
+        made = survey
+        for one in verdicts:
+            if one.is_told and one.is_against:
+                made = replace(made, settings=one.runner_up.settings(made.settings))
+        land = on_land(made)
+        if not made.settings.models_matcher:
+            land = replace(land, learned=land.learned._replace(matcher=None))
+        learned = learned._replace(land=land)
     if not settings.models_matcher:
         learned = learned._replace(matcher=None)
     elif settings.method == "consistent" and settings.matcher == "depth-maps" and len(sample):
@@ -327,20 +323,6 @@ def _learn_bed(batch: Batch) -> Bed | None:
     ]
     table = np.concatenate(wide)
     return bed_of(batch.xyz[order], table) if np.isfinite(table).any() else None
-
-
-def _land_of(survey: Survey, verdicts: tuple[Verdict, ...]) -> Survey:
-    """Return the survey for land that was transferred to adjusted cameras.
-
-    It has the reconstruction type of the cloud, also where a formula corrects the bed.
-    """
-    for verdict in verdicts:
-        if verdict.is_told and verdict.is_against:
-            survey = replace(survey, settings=verdict.runner_up.settings(survey.settings))
-    dry = on_land(survey)
-    if survey.settings.models_matcher:
-        return dry
-    return replace(dry, learned=dry.learned._replace(matcher=None))
 
 
 LEAST_TIES, LEAST_DEPTH_M = 50, 0.3

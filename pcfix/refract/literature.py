@@ -80,6 +80,7 @@ def _crossing(points: Chosen, i: int, c: int) -> tuple[float, float]:
     ex, ey, ez = minus(row_of(points.centres, c), row_of(points.xyz, i))
     plan2 = ex * ex + ey * ey
     cosine2 = ez * ez / (plan2 + ez * ez)
+    # below the water of this camera; 0 above it
     depth = points.height[i] - points.xyz[i, 2] + points.offset[c]
     return max(depth, 0.0) * (depth_ratio(plan2 / (ez * ez), points.n) - 1.0), cosine2
 
@@ -217,6 +218,7 @@ def _equal_x(points: Chosen) -> tuple[FloatArray, FloatArray, BoolArray]:
         rays = points.camera[points.start[i] : points.start[i + 1]]
         if rays.size < 2:
             continue
+        # weighted mean over all pairs
         products = squares = 0.0
         for a in range(rays.size):
             for b in range(a + 1, rays.size):
@@ -236,6 +238,7 @@ def _equal_x(points: Chosen) -> tuple[FloatArray, FloatArray, BoolArray]:
 def _pair(points: Chosen, i: int, first: int, second: int) -> tuple[float, float]:
     """Return the X-parallax of two refracted rays per metre of depth, and at the apparent point."""
     x, y, _ = minus(row_of(points.centres, second), row_of(points.centres, first))
+    # X is along the base of the pair
     base = np.hypot(x, y)
     if base == 0.0:
         return 0.0, 0.0
@@ -244,6 +247,7 @@ def _pair(points: Chosen, i: int, first: int, second: int) -> tuple[float, float
         ex, ey, ez = minus(row_of(points.centres, c), row_of(points.xyz, i))
         depth = points.height[i] - points.xyz[i, 2] + points.offset[c]
         s = depth_ratio((ex * ex + ey * ey) / (ez * ez), points.n) if depth > 0.0 else 1.0
+        # slope of the straight ray along X, and that under water
         straight = -(ex * x + ey * y) / (base * ez)
         parallax += sign * straight / s
         shift += sign * (straight - straight / s) * max(depth, 0.0)
@@ -306,6 +310,7 @@ def _solve_all(span: Span, points: Chosen, found: FloatArray, failed: BoolArray)
             for axis in range(3):
                 e[j, axis] = points.centres[rays[j], axis] - points.xyz[i, axis]
             depth = points.height[i] - points.xyz[i, 2]
+            # the depth under the water of this camera; 0 above it
             d[j] = max(depth + points.offset[rays[j]], 0.0)
         solved, x, y, sunk = _iterate(e, d, points.n)
         failed[i] = not solved
@@ -330,6 +335,7 @@ def _iterate(e: FloatArray, d: FloatArray, n: float) -> tuple[bool, float, float
             return False, 0.0, 0.0, 0.0
         change = 0.0
         for j in range(d.size):
+            # height of the camera over the point at the depth D / s
             rise = e[j, 2] - d[j] + (d[j] + sunk) / s[j]
             following = np.hypot(x - e[j, 0], y - e[j, 1]) / rise
             change = max(change, abs(following - tangent[j]))
@@ -361,6 +367,7 @@ def _intersected(e: FloatArray, d: FloatArray, s: FloatArray) -> tuple[bool, flo
             r[j, axis] = -(u - v[j, axis]) * d[j]
     mean_v = np.array([v[:, 0].mean(), v[:, 1].mean()])
     mean_r = np.array([r[:, 0].mean(), r[:, 1].mean()])
+    # least squares of a line through the places (v, r)
     spread = product = 0.0
     for j in range(k):
         for axis in range(2):
@@ -386,6 +393,7 @@ def _shan_distance(
         v0, v1 = u / s, w / s
         aside0 = x - v0 * sunk + (u - v0) * d[j]
         aside1 = y - v1 * sunk + (w - v1) * d[j]
+        # the part of the offset along the ray does not count
         along = aside0 * v0 + aside1 * v1
         square = aside0 * aside0 + aside1 * aside1 - along * along / (1.0 + v0 * v0 + v1 * v1)
         squares += max(square, 0.0)

@@ -100,11 +100,13 @@ def no_table() -> Table:
 def table_of(rows: IntArray, seeing: BoolArray, block: Block) -> Table:
     """Fit the polynomials of some points, for the images that may see them."""
     matched, first = block.matcher.matched, np.flatnonzero(seeing)
+    # the partners of these images are needed too
     involved = seeing.copy()
     for c in first:
         for j in matched[c]:
             if j >= 0:
                 involved[j] = True
+    # images that see points first, as only these get depths
     order = np.concatenate((first, np.flatnonzero(involved & ~seeing)))
     place, box = np.full(seeing.size, -1), bed_under(cells.box_of(rows, block.points))
     views = np.empty((order.size, len(NODES), 4))
@@ -124,6 +126,7 @@ def table_of(rows: IntArray, seeing: BoolArray, block: Block) -> Table:
 @device(allocates=True)
 def bed_under(box: Box) -> Box:
     """Return the box in which the bed of the points of a box lies."""
+    # depths of the deepest and shallowest apparent point of the cell
     deep, shallow = box.half[2] - box.middle[2], -box.half[2] - box.middle[2]
     low, high = -DEEPEST * deep, -max(shallow, LEAST_LENGTH_M)
     middle, half = box.middle.copy(), box.half + ASIDE * deep
@@ -184,6 +187,7 @@ def meet(u: Vector, a: Vector, base: Vector, focal_px: float) -> tuple[float, fl
     curvature of its square, px^2/m^2. `base` leads from the centre of a to that of u.
     """
     across = cross(u, a)
+    # squared sine and cosine of the angle between the rays
     sine2, along = dot(across, across), dot(u, a)
     away = (dot(base, a) * along - dot(base, u)) / sine2
     # pixels per metre at that place, as the image of a sees it

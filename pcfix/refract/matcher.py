@@ -192,6 +192,7 @@ def _find_partners(
     for i in range(*span):
         for one in range(seen.start[i], seen.start[i + 1]):
             p = seen.place[one]
+            # all other images that see this place
             for at in range(seen.first[p], seen.first[p + 1]):
                 other = seen.of_place[at]
                 j = seen.image[other]
@@ -202,7 +203,9 @@ def _find_partners(
                     angle = np.degrees(np.arccos(min(1.0, cosine)))
                     scale = seen.depth[other] / seen.depth[one]
                     found = 1.0 if tracked else np.exp(-((angle / REPEATED_DEG) ** 2))
-                    sums[j, TOTAL] += found * _angle_weight(angle) * _scale_weight(scale)
+                    # full weight for images that are as near or up to FINER times farther away
+                    weight = (FINER / scale) ** 2 if scale > FINER else min(scale * scale, 1.0)
+                    sums[j, TOTAL] += found * _angle_weight(angle) * weight
                     sums[j, ANGLES] += found * angle
                     sums[j, SCALES] += found * scale
                     sums[j, COMMON] += found
@@ -226,6 +229,7 @@ def _find_partners(
 def _score(sums: FloatArray, covered: int) -> float:
     """Return the score of a partner from its sums and the cells that common places cover."""
     area, common = covered / (CELLS * CELLS), sums[COMMON]
+    # too few common places, or mean angle or scale out of range
     if covered < LEAST_COMMON or area < LEAST_AREA:
         return 0.0
     if not LEAST_ANGLE_DEG <= sums[ANGLES] / common <= LARGEST_ANGLE_DEG:
@@ -238,30 +242,17 @@ def _score(sums: FloatArray, covered: int) -> float:
 @device
 def _angle_weight(angle_deg: float) -> float:
     wide = NARROW_DEG if angle_deg < BEST_ANGLE_DEG else WIDE_DEG
+    # a Gaussian around the best angle, wider towards large ones
     off = (angle_deg - BEST_ANGLE_DEG) / wide
     return max(np.exp(-0.5 * off * off), LEAST_ANGLE_WEIGHT)
-
-
-@device
-def _scale_weight(scale: float) -> float:
-    if scale > FINER:
-        return (FINER / scale) ** 2
-    return 1.0 if scale >= 1.0 else scale * scale
 
 
 def steepest_and_partners(
     xyz: FloatArray, centres: FloatArray, views: Views, matcher: Matcher
 ) -> Views:
-    """Return for each point the steepest image, and those that it was matched with.
+    """Return the steepest of the images that see each point, and those that it was matched with.
 
-    Parameters
-    ----------
-    xyz : array, shape (m, 3)
-    centres : array, shape (k, 3)
-        World frame.
-    views : Views
-        The images that see each point.
-    matcher : Matcher
+    Points, shape (m, 3), and centres, shape (k, 3), in the world frame.
     """
     owner = np.repeat(np.arange(len(xyz)), np.diff(views.start))
     up = centres[views.camera] - xyz[owner]
@@ -396,6 +387,7 @@ def _vote(
     """Find the height with most votes in each cell; a point votes for all its likely beds."""
     for c in range(*span):
         rows = order[start[c] : start[c + 1]]
+        # the range of likely beds in the cell
         low, high = np.inf, -np.inf
         for i in rows:
             for h in range(likely.shape[1]):
@@ -421,6 +413,7 @@ def _vote(
 @device
 def _add_vote(vote: FloatArray, at: float) -> None:
     """Vote for the heights around one likely bed; several likely beds of a point count once."""
+    # three standard deviations to both sides
     reach = int(3.0 * _STEPS)
     for k in range(max(0, int(at) - reach), min(vote.size, int(at) + reach + 2)):
         off = (k - at) / _STEPS

@@ -102,13 +102,9 @@ def occluded(xyz: FloatArray, centres: FloatArray, views: Views, occluder: Occlu
     """Return for each entry of ``views.camera`` whether the cloud occludes its point.
 
     Apparent points, shape (n, 3), and projection centres, shape (k, 3), in metres, world frame.
-    Cameras below their point, and points beside the grid, are never occluded.
-
-    Notes
-    -----
-    The cells on the way are found as by Amanatides & Woo 1987, "A fast voxel traversal algorithm
-    for ray tracing", in blocks of three sizes. The ray's height as it leaves a cell is compared,
-    so that on an even slope, which the ray climbs away from, no cell stands above it.
+    Cameras below their point, and points beside the grid, are never occluded. The cells on the way
+    are found as by Amanatides & Woo 1987, "A fast voxel traversal algorithm for ray tracing", in
+    blocks of three sizes.
     """
     found = np.zeros(len(views.camera), np.bool_)
     in_tiles(
@@ -145,7 +141,9 @@ def _occlude(
         u, v, z = (xyz[i, 0] - o.left_m) / o.cell_m, (xyz[i, 1] - o.bottom_m) / o.cell_m, xyz[i, 2]
         if not _inside(o.height, u, v):
             continue
+        # the noise of the points here
         slack = float(o.margin[int(v) // MARGIN_BLOCK, int(u) // MARGIN_BLOCK])
+        # nothing in the cloud is higher
         if z + slack >= o.highest_m:
             continue
         roofed = _is_roofed(o.height, int(v), int(u), z + ROOF_MARGINS * slack)
@@ -155,6 +153,7 @@ def _occlude(
             up, run = centres[c, 2] - z, np.sqrt(du * du + dv * dv)
             if up <= 0.0:
                 continue
+            # straight above: only a roof can occlude it
             if run < _ONWARD:
                 found[entry] = roofed
                 continue
@@ -176,6 +175,7 @@ def _is_roofed(height: Heights, row: int, column: int, z: float) -> bool:
     """Whether all cells within `NEAR_CELLS` are higher than z."""
     if not height[row, column] > z:
         return False
+    # roofs are not looked for at the edge of the grid
     reach = int(NEAR_CELLS)
     if not (reach <= row < height.shape[0] - reach and reach <= column < height.shape[1] - reach):
         return False
@@ -213,6 +213,7 @@ def _meets(
             side = LARGE_BLOCK
         elif low >= o.block_top[row // BLOCK, column // BLOCK]:
             side = BLOCK
+        # on to the edge of the cell or block
         t = min(t + min(_to_edge(x, du, side), _to_edge(y, dv, side)), run)
         if side == 1 and z + t * rise < o.height[row, column]:
             return True
@@ -235,6 +236,7 @@ def _through_roof(
         x, y, low = u + t * du, v + t * dv, z + t * rise
         if not _inside(o.height, x, y):
             break
+        # the roof over this cell
         top = o.height[int(y), int(x)]
         if top <= low:
             return t, low - top < slack
@@ -307,7 +309,10 @@ class OccluderBuilder:
         cells, self._cells = self._cells, None
         if cells is None or not self._points:
             return None
-        while _is_thin(cells, self._points):
+        # until the cells with points have enough of them on average
+        while max(cells.highest.shape) > 2 and (
+            self._points < POINTS_A_CELL * np.isfinite(cells.highest).sum()
+        ):
             cells = _halved(cells)
         height = _without_spikes(cells.second)
         return Occluder(
@@ -345,12 +350,6 @@ def _over(low: FloatArray, high: FloatArray, most: int, old: _Cells | None) -> _
         for target, source in zip(new[3:], old[3:], strict=True):
             target[row : row + rows, column : column + columns] = source
     return new
-
-
-def _is_thin(cells: _Cells, points: int) -> bool:
-    """Whether the cells with points have too few on average."""
-    taken = np.count_nonzero(np.isfinite(cells.highest))
-    return max(cells.highest.shape) > 2 and bool(points < POINTS_A_CELL * taken)
 
 
 def _halved(cells: _Cells) -> _Cells:
@@ -438,13 +437,7 @@ def wants_occlusion(cameras: Cameras, settings: ScienceOptions) -> bool:
 
 
 def occluder_of(xyz: FloatArray, classes: npt.NDArray[np.uint8] | None = None) -> Occluder | None:
-    """Return the surface of points that are the whole cloud.
-
-    Parameters
-    ----------
-    xyz, classes
-        As of `OccluderBuilder.add`.
-    """
+    """Return the surface of points that are the whole cloud; see `OccluderBuilder.add`."""
     if not len(xyz):
         return None
     builder = OccluderBuilder(xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0), len(xyz))

@@ -51,6 +51,7 @@ def begin(ray: FloatArray, points: Chosen, i: int, c: int, images: PairImages) -
         original = minus(row_of(images.both.centres, c), row_of(points.original_xyz, i))
     axis, size2 = row_of(optics.rotations[c], 2), dot(original, original)
     ahead = -dot(axis, original)
+    # behind a perspective camera the depth along the axis has no meaning
     flat = optics.lenses[optics.row[c], KIND] == PERSPECTIVE and ahead > 0.0
     for j in range(3):
         ray[j], ray[_ORIGINAL + j] = e[j], original[j]
@@ -65,12 +66,14 @@ def see(ray: FloatArray, q: Vector, c: int, normal: Vector, images: PairImages) 
     """
     path = light_path(q, vector(ray), normal, ray[ABOVE], images.n)
     w = to_original(images.both, c, direction(path, normal))
+    # g.w is the distance of w in terms of P
     w = scaled(1.0 / dot(w, vector(ray, _BY_PLACE)), w)
     optics, e = images.optics, vector(ray, _ORIGINAL)
     _, _, by_u, by_v = image_in_world(optics.lenses[optics.row[c]], optics.rotations[c], w)
     ray[_SQUARE:] = 0.0
     for g in (by_u, by_v):
         (x, y, z), off = g, dot(g, e)
+        # one row g of G: g g', (g.e) g and (g.e)^2
         terms = (x * x, x * y, x * z, y * y, y * z, z * z, off * x, off * y, off * z, off * off)
         for i in range(10):
             ray[_SQUARE + i] += terms[i]
@@ -87,6 +90,7 @@ def meet(a: FloatArray, b: FloatArray) -> Vector:
 
     That matters for narrow pairs whose rays pass each other.
     """
+    # first t = 1, then with the t and r^2 of that place
     place = _solve_two(a, b, 1.0, 1.0, 0.0, 0.0)
     t, r2 = _residual(place, a)
     t_b, r2_b = _residual(place, b)
@@ -98,6 +102,7 @@ def _residual(place: Vector, ray: FloatArray) -> tuple[float, float]:
     """Return t and r^2 of a place."""
     (x, y, z), s = place, ray[_SQUARE:]
     t = 1.0 + x * ray[_BY_PLACE] + y * ray[_BY_PLACE + 1] + z * ray[_BY_PLACE + 2]
+    # |G (X - e)|^2 from the sums
     twice = x * (s[1] * y + s[2] * z) + s[4] * y * z - (s[6] * x + s[7] * y + s[8] * z)
     return t, s[0] * x * x + s[3] * y * y + s[5] * z * z + 2.0 * twice + s[9]
 
@@ -194,6 +199,7 @@ def _is_near(terms: FloatArray, values: FloatArray, rays: FloatArray, focal_px: 
     near = True
     for k in range(INSIDE, len(NODES)):
         lack = minus(values_of(terms, BASIS[k]), row_of(values, k))
+        # a pixel of the image on the ground, squared
         pixel2 = dot(vector(rays[k]), vector(rays[k])) / (focal_px * focal_px)
         near = near and dot(lack, lack) <= TOLERANCE_PX * TOLERANCE_PX * pixel2
     return near

@@ -74,24 +74,12 @@ def refracted(e: Vector, length2: float, normal: Vector, height: float, r: float
     """Return the refracted ray's direction (downward), with the length L of e.
 
     Snell's law in vector form, Skarlatos & Agrafiotis 2018, eq 10, multiplied by L: with the
-    unit ray s = -e/L and c = -N.s = H/L,
+    unit ray s = -e/L, c = -N.s = H/L, H = N.e (`height`) and r = 1 / n,
 
         L t = r L s + (r L c - sqrt(L^2 - r^2 (L^2 - L^2 c^2))) N
             = -r e + (r H - sqrt(L^2 - r^2 (L^2 - H^2))) N
-
-    Parameters
-    ----------
-    e : Vector
-        From the apparent point to the projection centre, metres.
-    length2 : float
-        L^2 = e.e
-    normal : Vector
-        Unit normal N of the surface, upward.
-    height : float
-        H = N.e
-    r : float
-        1 / n
     """
+    # L t = -r e + k N
     k = r * height - np.sqrt(length2 - r * r * (length2 - height * height))
     return minus(scaled(k, normal), scaled(r, e))
 
@@ -104,17 +92,13 @@ def line_terms(
 
     The line runs through A along t = d / L. Its squared distance from Q is Q'MQ - 2 b'Q + s
     with M = I - t t', b = M A and s = A'M A (Skarlatos & Agrafiotis 2018, eq 11, for any
-    number of rays). The diagonal of t t' sums to 1, so that zz need not be returned.
-
-    Returns
-    -------
-    xx, xy, xz, yy, yz : float
-        Elements of t t'.
-    bx, by, bz, s : float
-        b (metres) and s (metres squared).
+    number of rays). Returned are xx, xy, xz, yy and yz of t t' (its diagonal sums to 1, so that zz
+    is not needed), b (metres) and s (metres squared).
     """
+    # d has the length L, so that t t' = d d' / L^2
     t, along = scaled(inv_length2, d), dot(d, a)
     bx, by, bz = minus(a, scaled(along, t))
+    # A'M A: squared distance of the line from the origin
     s = dot(a, a) - along * along * inv_length2
     return d[0] * t[0], d[0] * t[1], d[0] * t[2], d[1] * t[1], d[1] * t[2], bx, by, bz, s
 
@@ -136,31 +120,20 @@ degree, far below any usable base, and keeps rounding below 1e-9 m."""
 def nearest_point(k: float, sums: FloatArray) -> tuple[bool, Vector, float, float]:
     """Solve M Q = b for the point nearest to k lines, all with equal weight.
 
-    Parameters
-    ----------
-    k : float
-    sums : array
-        The first nine are the sums of `line_terms`.
-
-    Returns
-    -------
-    solved : bool
-        False if the lines are nearly parallel; then the rest is meaningless.
-    q : Vector
-        Q relative to the apparent point, metres.
-    distance : float
-        Root mean square distance of Q from the lines, metres.
-    sigma_z : float
-        Standard error of Q_z from the scatter of the lines, metres: the a-posteriori variance
-        s_min / (2k - 3) times (M^-1)_zz.
+    The first nine `sums` are those of `line_terms`. Returns whether it is solved (else the lines
+    are nearly parallel, and the rest is meaningless); Q relative to the apparent point; its root
+    mean square distance from the lines; and the standard error of Q_z from the scatter of the
+    lines: the a-posteriori variance s_min / (2k - 3) times (M^-1)_zz. Metres.
     """
     m00, m11 = k - sums[0], k - sums[3]
+    # M = k I - sum t t', with the last diagonal element from the trace
     det, c = cofactors((m00, -sums[1], -sums[2], m11, -sums[4], 2.0 * k - m00 - m11))
     b = sums[5], sums[6], sums[7]
     x, y, z = product(c, b)
     q = x / det, y / det, z / det
     # the sum of squared distances at the minimum
     rest = max(sums[8] - dot(b, q), 0.0)
+    # 2 k equations for 3 unknowns
     sigma_z = np.sqrt(rest / (2.0 * k - 3.0) * c[5] / det)
     return det >= MIN_DETERMINANT * k * k * k, q, np.sqrt(rest / k), sigma_z
 
@@ -175,25 +148,11 @@ CLOSE_M = 1e-9
 def pierce(
     tin: Tin | None, field: Field | None, p: Vector, e: Vector, h: float, normal: Vector, facet: int
 ) -> tuple[float, Vector]:
-    """Return the fraction of e from P to the surface, and the unit normal there.
+    """Return the fraction f of e from P to the surface, and the unit normal there.
 
-    Parameters
-    ----------
-    tin, field
-        The mesh or raster; a plane where both are None.
-    p : Vector
-        Apparent point, world frame, under water.
-    e : Vector
-        From it to the projection centre.
-    h, normal : float, Vector
-        Distance of the point from the tangent plane above it, and that plane's normal.
-    facet : int
-        The facet above the point, on a mesh.
-
-    Returns
-    -------
-    f, normal : float, Vector
-        The piercing point is P + f e.
+    P (world frame) lies under the mesh or raster, or under a plane where both are None; e leads to
+    the projection centre. h is the distance of P from the tangent plane above it, `normal` that
+    plane's normal, and `facet` the facet above P on a mesh. The piercing point is P + f e.
     """
     if tin is not None:
         return _pierce_mesh(tin, p, e, facet)
@@ -220,8 +179,10 @@ def _pierce_mesh(tin: Tin, p: Vector, e: Vector, facet: int) -> tuple[float, Vec
     f, b, c = 0.0, 0.0, 0.0
     for _ in range(PIERCING_STEPS):
         a, b, c = tin.planes[facet, 0], tin.planes[facet, 1], tin.planes[facet, 2]
+        # height of the plane of the facet over P
         above = a + b * (p[0] - tin.origin_x) + c * (p[1] - tin.origin_y) - p[2]
         f = above / (e[2] - b * e[0] - c * e[1])
+        # the facet at the piercing point
         following = locate(tin, p[0] + f * e[0], p[1] + f * e[1])
         if following == facet or following < 0:
             break
@@ -238,6 +199,7 @@ def _pierce_raster(
     f = h / dot(normal, e)
     for _ in range(MAX_HALVINGS):
         z, b, c = height_at(field, p[0] + f * e[0], p[1] + f * e[1])
+        # positive while the line is below the surface
         gap = z - (p[2] + f * e[2])
         if np.isnan(gap):
             break
@@ -248,6 +210,7 @@ def _pierce_raster(
             low = f
         else:
             high = f
+        # Newton step on the tangent plane; else bisect
         f += gap / (e[2] - b * e[0] - c * e[1])
         if not low < f < high:
             f = 0.5 * (low + high)
@@ -264,26 +227,15 @@ CLOSE = 1e-8
 
 @device
 def light_path(q: Vector, e: Vector, normal: Vector, h: float, n: float) -> Path:
-    """Return how light goes from Q to a camera through a plane.
+    """Return the light path from Q to a camera through a plane.
 
-    Parameters
-    ----------
-    q : Vector
-        Q relative to the apparent point, metres.
-    e : Vector
-        From the apparent point to the projection centre, metres.
-    normal, h : Vector, float
-        The plane: unit normal, upward, and height over the apparent point along it, metres.
-    n : float
-        Refractive index.
-
-    Returns
-    -------
-    Path
-        k NaN where the camera is not above the plane and the point.
+    Q and the projection centre e are relative to the apparent point, metres; the plane is given by
+    its unit normal, upward, and its height h over the apparent point along it; n is the refractive
+    index. k is NaN if the camera is not above the plane and the point.
     """
     height = dot(normal, e) - h
     depth = h - dot(normal, q)
+    # H + D, and the sideways vector s from the foot of C to Q
     all_down = height + depth
     s = beyond(minus(q, e), all_down, normal)
     if not (height > 0.0 and all_down > 0.0):
@@ -291,11 +243,13 @@ def light_path(q: Vector, e: Vector, normal: Vector, h: float, n: float) -> Path
     if depth <= 0.0:  # above the water: straight
         return 1.0 / all_down, 1.0, height, depth, s
     n2 = n * n
+    # S^2 = n^2 + (n^2 - 1) k^2 s.s
     a = (n2 - 1.0) * dot(s, s)
     k, root = 1.0 / (height + depth / n), n
     for _ in range(NEWTON_STEPS):
         root = np.sqrt(n2 + a * k * k)
         rest = 1.0 - k * (height + depth / root)
+        # -G / G_k, with G_k = H + D n^2 / S^3
         step = rest / (height + depth * n2 / (root * root * root))
         k += step
         if abs(step) <= CLOSE * k:
@@ -322,6 +276,7 @@ def slope_of_path(path: Path, normal: Vector, n: float) -> Vector:
     k, root, height, depth, s = path
     n2 = n * n if depth > 0.0 else 1.0
     cube = root * root * root
+    # 1 / G_k
     below = 1.0 / (height + depth * n2 / cube)
     aside = below * depth * k * k * k * (n2 - 1.0) / cube
     return beyond(scaled(below * k / root, normal), aside, s)
@@ -343,6 +298,7 @@ def plane_at(
     if field is not None:
         z, b, c = height_at(field, origin[0] + x, origin[1] + y)
         return z - origin[2], b, c
+    # on a mesh: the plane of the facet there
     if tin is not None:
         px, py = origin[0] + x, origin[1] + y
         facet = locate(tin, px, py)
@@ -364,15 +320,18 @@ def settle(
     crease: the plane gets a slope between the two, where the path is shortest (Fermat) and changes
     without a jump. Beyond the edge, and over gaps, the last plane is continued.
     """
+    # slopes of the plane (N, h)
     b, c = -plane[0] / plane[2], -plane[1] / plane[2]
     before = b, c
     for _ in range(SETTLING_STEPS):
         (x, y, z_plane), depth = _way_out(plane, q, e, n)
         z, b_there, c_there = plane_at(tin, field, x, y, origin)
+        # the path changes by the height, and by the slope times the depth
         change = abs(z - z_plane) + abs(depth) * (abs(b_there - b) + abs(c_there - c))
         if not change > CLOSE_M:
             return
         lay(plane, x, y, z, b_there, c_there)
+        # keep both slopes: on a crease the steps alternate
         before, b, c = (b, c), b_there, c_there
     _settle_on_crease(plane, tin, field, origin, before, (b, c), q, e, n)
 
@@ -406,10 +365,12 @@ def _settle_on_crease(
         z, b, c = plane_at(tin, field, x, y, origin)
         if np.isnan(z):
             return
+        # a slope between the two sides
         share = 0.5 * (low + high)
         lay(plane, x, y, z, b1 + share * (b2 - b1), c1 + share * (c2 - c1))
         (x, y, _), _ = _way_out(plane, q, e, n)
         _, b, c = plane_at(tin, field, x, y, origin)
+        # on which side does the light leave now?
         if (b - b1) ** 2 + (c - c1) ** 2 > (b - b2) ** 2 + (c - c2) ** 2:
             low, b2, c2 = share, b, c
         else:

@@ -284,22 +284,9 @@ def weigh(
 ) -> Verdict | None:
     """Choose the reconstruction that best explains the points, or test the one set by the user.
 
-    Parameters
-    ----------
-    batch : Batch
-        Submerged points, evenly spread over the cloud; `batch.survey.learned` has the matcher.
-    reconstructions : tuple of Reconstruction
-    step : float
-        Points of the whole cloud for each of these.
-    told : Reconstruction, optional
-        Set by the user.
-    hint : Hint, optional
-        Decides if the points do not.
-
-    Returns
-    -------
-    Verdict or None
-        None with a single way, or too few points for patches.
+    The submerged points are evenly spread over the cloud, and each represents `step` of its points;
+    `batch.survey.learned` has the matcher. `told` is set by the user, `hint` decides if the points
+    do not. None with a single way, or too few points for patches.
     """
     ways = reconstructions if told is None or told in reconstructions else (*reconstructions, told)
     sample = patches.patches_of(batch) if len(ways) > 1 else None
@@ -415,7 +402,12 @@ def _model_uncertainty(part: Batch, beds: _Beds, way: int, among: list[int]) -> 
     def left(a: int, b: int, most: float) -> float:
         apart = np.abs((beds.z[a] - beds.z[b])[beds.place]) / depth
         share = min(max(float(beds.share[a, b]), 0.0) + float(beds.sigma[a, b]), 1.0)
-        return (share if share <= most else 1.0) * _spread(apart[deep])
+        if not np.isfinite(apart[deep]).any():
+            return 0.0
+        # its 95 % interval covers 95 % of the differences
+        rms = float(np.sqrt(np.nanmean(apart[deep] ** 2)))
+        spread = max(rms, float(np.nanquantile(apart[deep], 0.95)) / 1.96)
+        return (share if share <= most else 1.0) * spread
 
     best, _ = beds.rank(among)
     open_m = max((left(best, i, 1.0) for i in among if i != best), default=0.0)
@@ -425,14 +417,6 @@ def _model_uncertainty(part: Batch, beds: _Beds, way: int, among: list[int]) -> 
     budget = correct(_as(part, beds.ways[way], "all"))
     formal = float(np.median(budget.sigma_z_m))
     return ModelUncertainty(math.sqrt(max(scatter**2 - formal**2, 0.0)), open_m, formal)
-
-
-def _spread(apart: FloatArray) -> float:
-    """Return a standard deviation whose 95 % interval covers 95 % of absolute differences."""
-    if not np.isfinite(apart).any():
-        return 0.0
-    rms = float(np.sqrt(np.nanmean(apart**2)))
-    return max(rms, float(np.nanquantile(apart, 0.95)) / 1.96)
 
 
 def _as(part: Batch, way: Reconstruction, dimensions: Dimensions = "none") -> Batch:

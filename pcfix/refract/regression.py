@@ -196,8 +196,8 @@ def notes_of(count: int, slope: float) -> tuple[str, ...]:
         )
     if not 1.0 <= slope <= 2.0:
         notes.append(
-            f"The slope {slope:.3f} of the regression is not that of refraction (1.33 to 1.6). Check"
-            " the water level and the check depths."
+            f"The slope {slope:.3f} of the regression is not that of refraction (1.33 to 1.6)."
+            " Check the water level and the check depths."
         )
     return tuple(notes)
 
@@ -276,15 +276,7 @@ class ApparentDepths:
         self._xy = np.full((*shape, 2), np.nan)
 
     def add(self, xyz: FloatArray, surface: SurfaceAbove) -> None:
-        """Look through n more points.
-
-        Parameters
-        ----------
-        xyz : array, shape (n, 3)
-            Metres, world frame.
-        surface : SurfaceAbove
-            The water above each of them.
-        """
+        """Add n points, shape (n, 3), metres, world frame, with the water above them."""
         from scipy.spatial import cKDTree
 
         rows = np.flatnonzero(is_submerged(xyz[:, 2], surface))
@@ -325,20 +317,10 @@ class ApparentDepths:
         return float(np.median(known)) if len(known) else 0.0
 
     def medians(self, radius_m: float) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Return what the points within a radius say of each place.
+        """Return the apparent depth and the water level of each place from points within a radius.
 
-        Parameters
-        ----------
-        radius_m : float
-
-        Returns
-        -------
-        depth_m : array, shape (p,)
-            Median apparent depth of the nearest submerged points, at most `NEIGHBOURS`.
-        level_m : array, shape (p,)
-            Height of the water over the place.
-        covered : array of bool, shape (p,)
-            Whether there are `LEAST_NEIGHBOURS` points. Where not, the others are NaN.
+        Medians of the nearest submerged points, at most `NEIGHBOURS`; then whether each place has
+        `LEAST_NEIGHBOURS` points. If not, the others are NaN.
         """
         near = self.distance_m <= radius_m
         covered = near.sum(axis=1) >= LEAST_NEIGHBOURS

@@ -155,21 +155,11 @@ def _bases(centres: FloatArray, rotations: FloatArray) -> tuple[FloatArray, Floa
 
 
 def ratios(relative_base: float, along: float, across: float, n: float) -> FloatArray:
-    """Return true by apparent depth over the overlap of a pair.
+    """Return the ratio of true to apparent depth over the overlap of a pair.
 
-    Parameters
-    ----------
-    relative_base : float
-        Base by flying height.
-    along, across : float
-        Half the sides of the frame by the focal length, along the base and across it.
-    n : float
-        Refractive index.
-
-    Returns
-    -------
-    array, shape (NODES, NODES)
-        In the middles of the cells; see the top of the file.
+    `relative_base` is the base by the flying height; `along` and `across` are half the sides of the
+    frame by the focal length. The result, shape (NODES, NODES), is for the middles of cells; see
+    the top of the file.
     """
     middles = (np.arange(NODES) + 0.5) / NODES * 2.0 - 1.0
     x, y = np.meshgrid(middles * (along - relative_base / 2.0), middles * across)

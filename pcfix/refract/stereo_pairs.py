@@ -101,31 +101,18 @@ def invert_pairs(batch: Batch, pairs: Views | None = None) -> Intersection:
     ----------
     batch : Batch
         Its cameras need angles and lenses. Its views are pairs, or the cameras that may be in one.
+        The surface above each point is taken as a plane.
     pairs : Views, optional
-        Of the kind pairs; one is left out where either camera is not among the batch's views.
-        Without them the pairs are those of the images that the matcher learned matched, each
-        pair once.
+        Of the kind pairs; a pair counts if both cameras are among the batch's views. Default: the
+        pairs of images that the matcher matched, each once.
 
     Returns
     -------
     Intersection
         `ray_count` and `incidence_deg` are of the cameras that are in a pair; `ray_miss_m` is the
-        distance from their refracted rays through the apparent point, as of `snell`. A point with
+        distance from their refracted rays through the apparent point, as for `snell`. A point with
         cameras but without a pair is `ONE_CAMERA`, one with narrow pairs only `PARALLEL_RAYS`.
-
-    Raises
-    ------
-    SettingError
-        If the cameras have no angles or no lenses.
-
-    Warns
-    -----
-    PcfixWarning
-        Of points for which no true point was found; they get the solution of `snell`.
-
-    Notes
-    -----
-    The surface above each point is taken as a plane.
+        Points without a solution get that of `snell`, with a warning.
     """
     check_consistent(batch.survey.cameras)
     if batch.rays.kind == "pairs":
@@ -193,6 +180,7 @@ def _invert(
         for i in inside:
             cameras = points.camera[start[i] : start[i + 1]]
             flags, normal = used[start[i] : start[i + 1]], row_of(points.normals, i)
+            # `place` maps a camera to its ray of this point
             for j in range(cameras.size):
                 place[cameras[j]] = j
                 pair_table.begin(rays[j], points, i, cameras[j], images)
@@ -210,10 +198,16 @@ def _invert(
                 continue
             for p in range(wide):
                 flags[pairs[p, 0]], flags[pairs[p, 1]] = True, True
+            # the result row first holds the start of the search, NaN without one
             near = result[i, :3]
             near[:] = np.nan
             if before >= 0 and are_same(cameras, cameras_of(points, before)):
-                _start(near, points, i, before, result[before])
+                depth = points.height[i] - points.xyz[i, 2]
+                there = points.height[before] - points.xyz[before, 2]
+                # the shift grows with the depth, unless the depths differ much
+                if there > 0.0 and ALIKE * there < depth < there / ALIKE:
+                    for axis in range(3):
+                        near[axis] = result[before, axis] * (depth / there)
             xyz = row_of(points.xyz, i)
             point = _Point(xyz, normal, rays, cameras, flags, pairs[:wide], places[:, :wide])
             quick = False
@@ -221,16 +215,6 @@ def _invert(
                 quick = pair_table.has_pairs(table, points, i, point.pairs)
             _solve(result[i], point, images, room, quick, table)
             before = i if result[i, _FOUND] > 0.0 else -1
-
-
-@device
-def _start(near: FloatArray, points: Chosen, i: int, before: int, found: FloatArray) -> None:
-    """Write the shift of the point before, scaled by the depth, unless the depths differ much."""
-    depth = points.height[i] - points.xyz[i, 2]
-    there = points.height[before] - points.xyz[before, 2]
-    if there > 0.0 and ALIKE * there < depth < there / ALIKE:
-        for axis in range(3):
-            near[axis] = found[axis] * (depth / there)
 
 
 @device
@@ -280,6 +264,7 @@ def _wide_pairs(pairs: IntArray, rays: FloatArray, normal: Vector) -> int:
     for p in range(len(pairs)):
         first, second = rays[pairs[p, 0]], rays[pairs[p, 1]]
         a, b = vector(first), vector(second)
+        # sin^2 of the angle between the rays against that of parallel ones
         across = cross(a, b)
         above = dot(normal, a) > max(first[ABOVE], 0.0)
         above = above and dot(normal, b) > max(second[ABOVE], 0.0)
@@ -378,13 +363,20 @@ def _search(
             pair_table.read_pairs(point.places, q, point.xyz, point.pairs, table)
         else:
             _place_pairs(q, point, images)
+        # the median is relative to P, so that it is F itself
         f = _median(point.places[0]), _median(point.places[1]), _median(point.places[2])
         size = np.sqrt(dot(f, f))
         if size <= CLOSE_M:
             return True, q
         if size < best:
             if best < np.inf:
-                _update(inverse, minus(q, nearest), minus(f, at_nearest))
+                step, change = minus(q, nearest), minus(f, at_nearest)
+                missing = minus(step, algebra.times(inverse, change))
+                left = algebra.transposed_times(inverse, step)
+                along = dot(left, change)
+                for i in range(3 if along != 0.0 else 0):
+                    for j in range(3):
+                        inverse[i, j] += missing[i] * left[j] / along
             best, nearest, at_nearest = size, q, f
         elif best < np.inf:
             share *= 0.5
@@ -402,19 +394,6 @@ def _as_from_above(inverse: FloatArray, share: float, n: float) -> None:
     """Set B to a share of the inverse derivative for light from straight above."""
     inverse[:] = 0.0
     inverse[0, 0], inverse[1, 1], inverse[2, 2] = share, share, share * n
-
-
-@device
-def _update(inverse: FloatArray, step: Vector, change: Vector) -> None:
-    """Update B so that it maps the last change of F to the last step (Broyden)."""
-    missing = minus(step, algebra.times(inverse, change))
-    left = algebra.transposed_times(inverse, step)
-    scale = dot(left, change)
-    if scale == 0.0:
-        return
-    for i in range(3):
-        for j in range(3):
-            inverse[i, j] += missing[i] * left[j] / scale
 
 
 @device

@@ -118,6 +118,7 @@ def cameras_around(
     around = np.empty(len(centres), np.int64)
     count = 0
     for c in range(len(centres)):
+        # the box is not wholly beyond one plane of the pyramid
         if may_hold(frames.planes[c], centres[c], low, high):
             around[count] = c
             count += 1
@@ -182,6 +183,7 @@ def marks_of_lists(
     Of k cameras; the marks have a row for each camera returned and a column for each point.
     """
     place, named, count = np.zeros(k, np.int64), np.empty(k, np.int64), 0
+    # mark the cameras that are named at all, then number them in order
     for i in rows:
         for at in range(start[i], start[i + 1]):
             place[camera[at]] = 1

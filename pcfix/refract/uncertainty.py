@@ -43,27 +43,16 @@ MIN_DETERMINANT = 1e-6
 
 
 def covariances(batch: Batch, shift_m: FloatArray) -> FloatArray:
-    """Return the covariance of each corrected point.
+    """Return the covariance of each corrected point, shape (m, 6), to first order.
 
-    Parameters
-    ----------
-    batch : Batch
-        With the cameras that gave rays; the standard deviations are those of the settings. That of
-        the level is `level_sigma_m`, or else `LEVEL_M`, if the settings have none.
-    shift_m : array, shape (m, 3)
-        True minus apparent, by any method.
+    xx, xy, xz, yy, yz, zz in metres squared, world frame; zeros if fewer than two rays meet, or
+    nearly parallel ones. `shift_m`, shape (m, 3), is true minus apparent, by any method. The
+    standard deviations are those of the settings; that of the level is `level_sigma_m`, or else
+    `LEVEL_M`, if the settings have none.
 
-    Returns
-    -------
-    array, shape (m, 6)
-        xx, xy, xz, yy, yz, zz in metres squared, world frame; zeros where fewer than two rays
-        meet, or nearly parallel ones.
-
-    Notes
-    -----
-    First order. A mesh or raster is taken as its plane above the point. All rays of a point are
-    assumed to have made it, by an adjustment in image residuals, with noise of the size of a pixel
-    in the middle of the image. A tilt turns the water about the middle of the projection centres.
+    A mesh or raster is taken as its plane above the point. All rays of a point are assumed to have
+    made it, by an adjustment in image residuals, with noise of the size of a pixel in the middle of
+    the image. A tilt turns the water about the middle of the projection centres.
 
     It is an approximation for methods that move points along the vertical only (they get that of
     `snell`), and where `consistent` inverts a dense matcher, which gets that of one adjustment of
@@ -194,6 +183,7 @@ def _of_lists(
     for t in range(*span):
         rows = points.order[t * TILE : (t + 1) * TILE]
         tile = np.empty(7 * TILE)
+        # the runs of the tile, then those of its rays, then one camera after the other
         tiling.gather(tile, rows, points)
         room = s.room_of(tile, shift, rows)
         named, marks = tiling.marks_of_lists(start, camera, rows, len(rig.centres))
@@ -216,6 +206,7 @@ def add_errors(
     """Add the rays of one camera to the points of a tile that have a mark."""
     count, sight = marks.size, s.lens_of(rig, c, rule)
     s.add_rays(room, tile, marks, rig, c, rule)
+    # the derivative of consistent, or that of snell
     if budget.in_images:
         s.add_in_images(room, count, sight)
     else:
@@ -236,6 +227,7 @@ def finish_tile(
     LLVM inlines what it calls; otherwise the loops over the points would not be vectorised.
     """
     out, sigma, sums = np.empty(6 * TILE), level_sigma[rows], room.astype(np.float64)
+    # R = sigma^2 K if all rays have the same image noise
     if not differ_by_ray(budget):
         for at in range(6 * TILE):
             sums[s.NOISE * TILE + at] = budget.image_px**2 * sums[s.SIGHT * TILE + at]
@@ -260,6 +252,7 @@ def _solved_in_images(sums: FloatArray, j: int) -> tuple[bool, Nine]:
     """
     m = nine(sums, s.BY_Q * TILE + j)
     det, inverse = inverse_of(m)
+    # in units of the trace, as M has the trace 2 k
     half = 0.5 * (m[0] + m[4] + m[8])
     return (sums[j] >= 2.0) & (det >= MIN_DETERMINANT * half * half * half), inverse
 
@@ -274,6 +267,7 @@ def _solved_in_space(sums: FloatArray, j: int) -> tuple[bool, Nine, Nine]:
     k = sums[j]
     det, by_delta = inverse_of(_full(_six(sums, s.BY_Q * TILE + j)))
     full, by_sight = inverse_of(_full(_six(sums, s.SIGHT * TILE + j)))
+    # (sum M)^-1 (sum M D) moves Q with P, (sum W)^-1 moves P with the images
     by_p = _product(by_delta, nine(sums, s.BY_P * TILE + j))
     solved = (k >= 2.0) & (det >= MIN_DETERMINANT * k * k * k) & (full > 0.0)
     return solved, by_delta, _product(by_p, by_sight)
@@ -290,6 +284,7 @@ def _write(
     noise = _product(_product(b, _full(_six(sums, s.NOISE * TILE + j))), (
         b[0], b[3], b[6], b[1], b[4], b[7], b[2], b[5], b[8]
     ))  # fmt: skip
+    # each common error is one standard deviation times a column
     level, index, u, v = _columns(by_delta, sums, tile, j, level_sigma, budget)
     x = level[0], index[0], u[0], v[0]
     y = level[1], index[1], u[1], v[1]
@@ -316,10 +311,12 @@ def _columns(
     A tilt also raises the water above the point, in proportion to its distance from the pivot.
     """
     nx, ny, nz = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
+    # two horizontal directions of slope: u towards x, v across it
     scale = 1.0 / np.sqrt(nx * nx + nz * nz)
     ux, uz = nz * scale, -nx * scale
     by_tilt = nine(sums, s.BY_TILT * TILE + j)
     by_level, by_n = three(sums, s.BY_LEVEL * TILE + j), three(sums, s.BY_N * TILE + j)
+    # the level rises along the vertical, h is along N
     level = scaled(nz, by_level)
     away_u, away_v = tile[j] - budget.pivot_x, tile[TILE + j] - budget.pivot_y
     # the normal leans away from where the slope rises
@@ -369,6 +366,7 @@ def _product(a: Nine, b: Nine) -> Nine:
 def inverse_of(m: Nine) -> tuple[float, Nine]:
     """Return the determinant of a matrix and its inverse, meaningless if that is 0."""
     a, b, c, d, e, f, g, h, i = m
+    # cofactors of the first row
     x, y, z = e * i - f * h, f * g - d * i, d * h - e * g
     det = a * x + b * y + c * z
     inv = 1.0 / det

@@ -7,7 +7,6 @@ import pytest
 import pcfix
 from pcfix import Cameras, Lens
 from pcfix.io.views import ViewMatch, read_views
-from pcfix.kernels import threads
 from pcfix.model import Views, WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Learned
@@ -234,17 +233,6 @@ def test_views_lose_hidden_cameras_but_a_point_keeps_all_rather_than_one(walled)
     assert found.start.tolist() == [0, 2, 4, 6]
     assert found.camera.tolist() == [1, 2, 1, 0, 2, 0]
     assert found.weight.tolist() == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0] and found.kind == "depth-maps"
-
-
-def test_result_does_not_depend_on_threads_or_company(walled):
-    bed, _, occluder = walled
-    xyz, centres = bed[:5_000] + UTM, ring(50.0) + UTM
-    whole = hidden_of(xyz, centres, occluder)
-    for count in (1, 3):
-        with threads(count):
-            assert (hidden_of(xyz, centres, occluder) == whole).all()
-    parts = [hidden_of(part, centres, occluder) for part in np.array_split(xyz, 7)]
-    assert (np.concatenate(parts) == whole).all() and whole.any()
 
 
 @rendered

@@ -135,7 +135,15 @@ def trace(
     >>> found.piercing_xyz.round(3).tolist()
     [[0.292, 0.0, 0.0]]
     """
-    xyz, seen_from = _pairs(target, origin)
+    xyz, seen_from = np.atleast_2d(target), np.atleast_2d(origin)
+    fit = xyz.ndim == seen_from.ndim == 2 and xyz.shape[1] == seen_from.shape[1] == 3
+    if not (fit and (len(xyz) == len(seen_from) or 1 in (len(xyz), len(seen_from)))):
+        raise SettingError(
+            "trace.shapes",
+            f"An origin of shape {np.shape(origin)} and a target of shape {np.shape(target)} do not"
+            " form pairs. Give both as (n, 3), or one of them as (3,).",
+        )
+    xyz, seen_from = (np.ascontiguousarray(a, float) for a in np.broadcast_arrays(xyz, seen_from))
     n = float(refractive_index)
     if method not in METHODS:
         raise SettingError(
@@ -163,20 +171,6 @@ def trace(
         converged=result[:, _STATE] != _LOST,
         on_crease=result[:, _STATE] == _CREASE,
     )
-
-
-def _pairs(target: npt.ArrayLike, origin: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Return targets and origins as two arrays of the same shape (n, 3)."""
-    xyz, seen_from = np.atleast_2d(target), np.atleast_2d(origin)
-    fit = xyz.ndim == seen_from.ndim == 2 and xyz.shape[1] == seen_from.shape[1] == 3
-    if not (fit and (len(xyz) == len(seen_from) or 1 in (len(xyz), len(seen_from)))):
-        raise SettingError(
-            "trace.shapes",
-            f"An origin of shape {np.shape(origin)} and a target of shape {np.shape(target)} do not"
-            " form pairs. Give both as (n, 3), or one of them as (3,).",
-        )
-    both = np.broadcast_arrays(xyz, seen_from)
-    return np.ascontiguousarray(both[0], float), np.ascontiguousarray(both[1], float)
 
 
 def _as_kernels_take(
@@ -228,13 +222,16 @@ def _path(out: FloatArray, water: Water, e: Vector, n: float, method: int, narro
     out[:] = np.nan
     out[_STEPS], out[_STATE] = 0.0, _LOST
     level, over = height_of(water, 0.0, 0.0)[0], height_of(water, e[0], e[1])[0]
+    # the camera is under the water, or somewhere infinite
     if e[2] <= over or not abs(e[0]) + abs(e[1]) + abs(e[2]) < np.inf:
         return
+    # the point is above the water: straight
     if not level > 0.0:
         out[:_STEPS], out[_STATE] = 0.0, _HIT
         return
     if not e[2] > 0.0:
         return
+    # the height at which rays are aimed
     aim = min(level, HIGHEST_AIM * e[2])
     if method == _KOTOWSKI:
         x, y, steps, found = kotowski(water, aim, e, n)
@@ -250,23 +247,15 @@ def _path(out: FloatArray, water: Water, e: Vector, n: float, method: int, narro
         x, y, more, found = narrowed(water, e, x, y, NEAR * level, n)
         steps += more
     out[_STEPS] = steps
-    if found:
-        _write(out, water, e, x, y, n)
-
-
-@device
-def _write(out: FloatArray, water: Water, e: Vector, x: float, y: float, n: float) -> None:
-    """Fill in place and slope of the surface where the light leaves the water.
-
-    Of a crease, where no facet's plane bends the light so, Snell's law gives the normal: it is
-    parallel to u - n v, with the unit vectors u to A and v from there.
-    """
+    if not found:
+        return
     z, b, c = height_of(water, x, y)
     out[0], out[1], out[2], out[_SLOPE], out[_SLOPE + 1] = x, y, z, b, c
     out[_STATE] = _HIT
     mx, my = miss_through(water, e, x, y, n)
     if mx * mx + my * my <= CREASE_M * CREASE_M:
         return
+    # on a crease Snell's law gives the normal: u - n v, with the unit vectors u to A and v from A
     a = x, y, z
     u = minus(a, e)
     air, wet = 1.0 / np.sqrt(dot(u, u)), n / np.sqrt(dot(a, a))

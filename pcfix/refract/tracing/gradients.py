@@ -69,8 +69,10 @@ def light_and_gradients(
     if np.isnan(k):
         out[:] = np.nan
         return
+    # light of a point above the plane does not depend on n
     m = n if depth > 0.0 else 1.0
     cube = root * root * root
+    # 1 / G_k
     below = 1.0 / (height + depth * m * m / cube)
     along, aside = below * k / root, below * depth * k * k * k * (m * m - 1.0) / cube
     by_n = 0.0
@@ -208,6 +210,7 @@ def _differentiate(
             h = 0.0  # straight: of a point in the plane itself
         e = minus(row_of(centres, i), vector(p))
         light_and_gradients((0.0, 0.0, 0.0), e, normal, h, n, out)
+        # from w to the unit direction
         w = out[:, DIRECTION]
         size = np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
         for row in range(3):
