@@ -476,7 +476,7 @@ class Correction:
     sigma_z_m : array, shape (n,)
         Standard error of Z: what the options ``sigma_...`` come to by the law of propagation, and
         what the cloud itself tells, where it has enough points: mismatches, and by how much other
-        ways to make such a cloud would have the bed elsewhere (see `pcfix.refract.weighing`).
+        ways to make such a cloud would have the bed elsewhere (`pcfix.refract.reconstructions`).
     camera_used : array of bool, shape (k,)
         Which cameras gave at least one ray.
     water_known : array of bool, shape (n,)

@@ -451,7 +451,7 @@ def neighbours_sign(share: float, sigma: float, *, is_fused: bool) -> Sign:
     Parameters
     ----------
     share, sigma : float
-        See `pcfix.refract.hypotheses.Verdict.straight`. On four rendered blocks it is 0.02 to 0.25
+        See `Verdict.straight` of `pcfix.refract`. On four rendered blocks it is 0.02 to 0.25
         with true poses, and 0.76 to 0.96 with those of an ordinary adjustment.
     is_fused : bool
         Whether the cloud is of fused depth maps; others can have discontinuities all the same.

@@ -53,7 +53,7 @@ from pcfix.model import (
 )
 from pcfix.options.correct import CorrectOptions, PointsOptions, RefractionOptions, ScienceOptions
 from pcfix.options.declare import File, taken
-from pcfix.refract.batch import Batch, MadeWith, Survey
+from pcfix.refract.batch import Batch, OriginalModel, Survey
 from pcfix.refract.learning import for_own_water, learn_of_points
 from pcfix.refract.regression import BeyondRange, DepthRegression
 from pcfix.refract.tally import Summary
@@ -164,17 +164,17 @@ def correct_points(
     if views is not None:
         _check_views(views, points, adjusted_from or cameras)
     label = None if may_be_submerged is None else _label_of(may_be_submerged, len(points))
-    step, made_with = None, None
+    step, original_model = None, None
     if adjusted_from is not None:  # transfer the points to the adjusted poses
         pair = paired(adjusted_from, cameras)
         step = CloudTransfer(pair).step(points, views)
-        made_with = MadeWith(points, pair.original)
+        original_model = OriginalModel(points, pair.original)
         points, views, label = step.xyz, step.views, step.rule(label)
     above = surface_above(surface, points, dimension)
     place = None, *corners(points[:, 0], points[:, 1])
     own, notes = own_water_of(given.water_per_image, cameras, surface, place, offset)
     survey = Survey(surface, cameras, settings, offset, own_water=own)
-    batch = Batch(points, above, survey, views, made_with)
+    batch = Batch(points, above, survey, views, original_model)
     line = read_regression(regression) if isinstance(regression, str | PathLike) else regression
     found = correct_checked(learn_of_points(batch, line), label)
     # refuse or warn of what does not fit together, as for a file

@@ -27,7 +27,7 @@ from pcfix.io.gnss_positions import gnss_in_frame_of
 from pcfix.model import Cameras, TiePoints
 from pcfix.options.declare import File
 from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
-from pcfix.refract.hypotheses import Verdict
+from pcfix.refract.reconstructions import Verdict
 
 LEAST_POSITIONS = 3
 """GNSS positions that determine position, orientation and scale of a block."""

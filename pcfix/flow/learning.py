@@ -1,4 +1,4 @@
-"""What a correction learns of the block and the whole cloud before it moves the first point."""
+"""Estimate everything that a correction needs to know about the whole cloud of a file."""
 
 from __future__ import annotations
 
@@ -22,8 +22,7 @@ from pcfix.label.labelling import Part
 from pcfix.model import NOISE_CLASSES, BoolArray, FloatArray, IntArray, TiePoints, ViewKind
 from pcfix.options.correct import ScienceOptions
 from pcfix.options.declare import File
-from pcfix.refract.batch import FLAT_DEG, UNLISTED, Batch, Learned, MadeWith, Survey, stacked
-from pcfix.refract.hypotheses import Verdict, hint_of
+from pcfix.refract.batch import FLAT_DEG, UNLISTED, Batch, Learned, OriginalModel, Survey, stacked
 from pcfix.refract.learning import (
     CORRECTED_RATIO,
     Near,
@@ -32,14 +31,15 @@ from pcfix.refract.learning import (
     learn_of_sample,
     learn_of_unlisted,
     resolved,
-    seen_flat,
     submerged_of,
     wants_sample,
     with_factor,
     with_matcher,
 )
-from pcfix.refract.occlusion import Occluder
+from pcfix.refract.methods import with_rays
+from pcfix.refract.occlusion import Occluder, OccluderBuilder, wants_occlusion
 from pcfix.refract.patches import PATCH_WIDTH, Squares
+from pcfix.refract.reconstructions import Verdict, hint_of
 from pcfix.refract.regression import (
     LEAST_COUNT,
     LEAST_NEIGHBOURS,
@@ -48,30 +48,28 @@ from pcfix.refract.regression import (
     DepthRegression,
     fit_depths,
 )
-from pcfix.refract.top_surface import OccluderBuilder, wants_occlusion
 from pcfix.water.surface import SurfaceAbove, is_submerged, surface_above
 
 
 class Learning:
-    """The lessons of one job.
+    """Everything that is learned for one job.
 
     Parameters
     ----------
     survey : Survey
-        Nothing learned yet.
+        With nothing learned.
     inputs : Inputs
     view : CloudView
         Of the whole cloud.
     views : {"tracks", "depth-maps"} or None
-        Of which kind the view list is, if there is one.
+        Kind of the view list, if there is one.
     ties : callable, optional
-        Returns the tie points of the block, of the cameras that made the cloud. Default: those of
-        the camera file.
+        Returns the tie points of the original model; default: those of the camera file.
 
     Raises
     ------
     SettingError
-        If the method lacks something that it cannot do without.
+        If the method lacks something that it needs.
     """
 
     def __init__(
@@ -96,14 +94,14 @@ class Learning:
     def of_cloud(
         self,
         chunks: Callable[[], Iterable[Points]],
-        makers: Callable[[], Iterable[MadeWith]] | None = None,
+        makers: Callable[[], Iterable[OriginalModel]] | None = None,
         *,
         all_listed: bool = True,
     ) -> Survey:
-        """Return the survey with what is learned of the whole cloud; its chunks may be asked again.
+        """Return the survey with what is learned from the whole cloud.
 
-        And, chunk by chunk, what made the points, where that are not these cameras. Where not
-        all points are listed, the others are corrected as without a list.
+        Its chunks are read several times, with the original model of each if the cameras were
+        adjusted. Unless all points are listed, the others are corrected without a list.
         """
         occluder = self._occluder(chunks, listed=self._views is not None)
         learned = Learned(regression=self._regression(chunks), occluder=occluder)
@@ -134,46 +132,46 @@ class Learning:
         return self.survey
 
     def _note_corrected(self, sample: Batch, ties: TiePoints | None) -> None:
-        """Say so where the cloud is deeper than tie points of the same cameras."""
+        """Note a cloud that is deeper than the tie points of its cameras."""
         wet = sample.take(np.flatnonzero(is_submerged(sample.xyz[:, 2], sample.surface)))
         ratio = None if ties is None else depth_ratio(wet, ties)
         if ratio is not None and ratio > CORRECTED_RATIO:
             self.notes.append(
-                f"The cloud lies {ratio:.2f} times as deep as the tie points of its cameras: it"
-                " looks as if it had been corrected before; give the cloud as the matcher wrote it."
+                f"The cloud is {ratio:.2f} times as deep as the tie points of its cameras, as if it"
+                " had been corrected before. Give the cloud as the matcher wrote it."
             )
 
     def _note_flat(self, sample: Batch) -> None:
-        """Say how many points are seen by flat obliques alone, and where."""
+        """Note how many points only obliques see, and where."""
         rows = np.flatnonzero(is_submerged(sample.xyz[:, 2], sample.surface))
         wet = replace(sample.take(rows[:: 1 + len(rows) // FLAT_SAMPLE]), survey=self.survey)
-        flat = seen_flat(wet) if len(wet) else np.zeros(0, np.bool_)
+        flat = with_rays(wet).seen_flat() if len(wet) else np.zeros(0, np.bool_)
         if flat.sum() <= FLAT_SHARE * len(flat):
             return
         low, high = np.percentile(wet.xyz[flat, :2], (2.0, 98.0), axis=0)
+        unsure = self.survey.settings.unsure
         self.notes.append(
-            f"About {100.0 * flat.mean():.0f} % of the submerged points are seen by flat obliques"
-            f" alone, every ray beyond {FLAT_DEG:g} degrees: nearly all of them between"
-            f" {low[0]:.0f}, {low[1]:.0f} and {high[0]:.0f}, {high[1]:.0f}. Their depths are the"
-            " least certain; images from above would tell more of them"
-            + (", --unsure withhold flags them." if self.survey.settings.unsure == "keep" else ".")
+            f"About {100.0 * flat.mean():.0f} % of the submerged points have only rays beyond"
+            f" {FLAT_DEG:g} degrees, nearly all between {low[0]:.0f}, {low[1]:.0f} and"
+            f" {high[0]:.0f}, {high[1]:.0f}. Their depths are the least certain; add nadir images"
+            + (", or flag them with --unsure withhold." if unsure == "keep" else ".")
         )
 
     def of_unlisted_notes(self) -> list[str]:
-        """Return what is said of points in no list."""
+        """Return the note on points that are in no view list."""
         if UNLISTED not in self.survey.parts:
             return []
         so = " ".join(str(one) for one in self.of_unlisted)
-        return [f"The list is of a part of the cloud: the rest is corrected as without one. {so}"]
+        return [f"Points in no view list are corrected as without a list. {so}"]
 
     def _regression(self, chunks: Callable[[], Iterable[Points]]) -> DepthRegression | None:
         path, water, where = self._inputs.check_depths, self.survey.water, ""
         if self._inputs.regression is not None:
             found = read_regression(self._inputs.regression)
+            fitted = f", fitted to {found.source}" if found.source else ""
             where = (
-                f" It is that of {self._inputs.regression}"
-                + (f", fitted to {found.source}" if found.source else "")
-                + "; that it holds for this cloud too is not checked."
+                f" It comes from {self._inputs.regression}{fitted}; whether it holds for this cloud"
+                " is not checked."
             )
         elif path is not None:
             found = learn_regression(path, parts_of(chunks(), water), self.survey.settings)
@@ -192,7 +190,7 @@ class Learning:
     def _occluder(self, chunks: Callable[[], Iterable[Points]], *, listed: bool) -> Occluder | None:
         listed = listed and self.survey.settings.occlusion == "auto"
         if listed or not wants_occlusion(self.survey.cameras, self.survey.settings):
-            return None  # listed cameras did see their points
+            return None  # listed cameras saw their points
         builder = OccluderBuilder(self._view.low, self._view.high, self._view.points)
         for points in chunks():
             builder.add(points.xyz, points.classes)
@@ -201,33 +199,34 @@ class Learning:
     def _sample(
         self,
         chunks: Callable[[], Iterable[Points]],
-        makers: Callable[[], Iterable[MadeWith]] | None,
+        makers: Callable[[], Iterable[OriginalModel]] | None,
     ) -> tuple[Batch, Near | None]:
-        """Return points of the whole cloud, evenly spread over its order, and without noise.
+        """Return points of the whole cloud, evenly spread over its order, without noise.
 
-        And, where these may be too far apart to tell how it was made, submerged ones in squares.
+        If these may be too far apart to detect the reconstruction type, submerged points in squares
+        too.
         """
         area_m2 = np.prod(np.maximum(np.subtract(self._view.high, self._view.low)[:2], 1.0))
         dense = BED_POINTS_A_M2 * float(area_m2)
-        dense = dense if np.isfinite(dense) else MOST_BED_POINTS  # bounds that are none
+        dense = dense if np.isfinite(dense) else MOST_BED_POINTS  # unknown bounds
         wanted = np.clip(dense, FEWEST_BED_POINTS, MOST_BED_POINTS)
         step = max(1, self._view.points // int(wanted))
         near_step = max(1, self._view.points // int(max(dense, FEWEST_BED_POINTS)))
         squares = Squares(PATCH_WIDTH * self._flying_height_m()) if near_step < step else None
         survey, taken = self.survey, list[Batch]()
-        # what looks for neighbours is loaded while the cloud is read
+        # import it while the cloud is read
         Thread(target=import_module, args=("scipy.spatial",), daemon=True).start()
         done = 0
         of_chunks = repeat(None) if makers is None else makers()
-        for points, made_with in zip(chunks(), of_chunks, strict=False):
-            taken.append(_every(step, done, points, survey, made_with))
+        for points, original_model in zip(chunks(), of_chunks, strict=False):
+            taken.append(_every(step, done, points, survey, original_model))
             if squares is not None:
-                squares.add(submerged_of(_every(near_step, done, points, survey, made_with)))
+                squares.add(submerged_of(_every(near_step, done, points, survey, original_model)))
             done += len(points.xyz)
         return stacked(taken), None if squares is None else Near(squares.all(), near_step)
 
     def _flying_height_m(self) -> float:
-        """Return the height of the cameras above the water that is known below them."""
+        """Return the median height of the cameras above the water below them."""
         centres = self.survey.cameras.centres
         unknown = np.full(len(centres), np.nan)
         above = centres[:, 2] - surface_above(self.survey.water, centres, unknown).height_m
@@ -236,9 +235,9 @@ class Learning:
 
 
 def _every(
-    step: int, done: int, points: Points, survey: Survey, made_with: MadeWith | None
+    step: int, done: int, points: Points, survey: Survey, original_model: OriginalModel | None
 ) -> Batch:
-    """Return every so manieth point of a cloud, of a chunk before which so many were."""
+    """Return every n-th point of a cloud (n = `step`) from a chunk after `done` points."""
     rows = np.arange(-done % step, len(points.xyz), step)
     rows = rows[~np.isin(points.classes[rows], NOISE_CLASSES)]
     heights = None if points.heights is None else points.heights[rows]
@@ -247,42 +246,47 @@ def _every(
         xyz,
         surface_above(survey.water, xyz, heights),
         survey,
-        made_with=None if made_with is None else made_with.take(rows),
+        original_model=None if original_model is None else original_model.take(rows),
         source=None if points.sources is None else points.sources[rows],
     )
 
 
 def _check_regression(method: str, inputs: Inputs) -> None:
-    """Refuse check depths, or a line, without the method; the method without either; both."""
+    """Raise SettingError unless the method regression has check depths or a line, and no other."""
     given = [n for n in ("check_depths", "regression") if getattr(inputs, n) is not None]
     if len(given) == 2:
         raise SettingError(
-            "check-depths and regression exclude each other: a line is fitted, or taken from a"
-            " file; give one of the two."
+            "option.exclusive",
+            "check-depths and regression exclude each other: a line is fitted, or read from a file."
+            " Give one of the two.",
+            options=given,
         )
     if (method == "regression") != bool(given):
         raise SettingError(
-            "method regression needs check-depths, a CSV of measured depths, or regression, the"
-            " line of another cloud, and these are of no use without it; give both, or neither."
+            "option.together",
+            "Method regression needs check-depths (a CSV of measured depths) or regression (the"
+            " line of another cloud), and only it uses them. Give both, or neither.",
+            method=method,
+            options=given,
         )
 
 
 def _ties_of(inputs: Inputs, view: CloudView) -> TiePoints | None:
-    """Return the tie points of the camera file; what it warns of was said with its cameras."""
+    """Return the tie points of the camera file; its warnings came with the cameras."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PcfixWarning)
         return inputs.tie_points(view.crs)
 
 
 FLAT_SHARE, FLAT_SAMPLE = 0.01, 20_000
-"""Of the submerged points, from which flat obliques alone are worth a word; of so many at most."""
+"""Share of the submerged points above which it is noted, and size of the sample for it."""
 
 FLYING_HEIGHT_M = 100.0
-"""Where no height of the water is known below the cameras, for the width of squares."""
+"""If the water below the cameras is unknown, for the width of squares."""
 
 BED_POINTS_A_M2 = 5.0
 FEWEST_BED_POINTS, MOST_BED_POINTS = 125_000, 1_000_000
-"""Of the cloud, evenly spread over its order, tell the bed of the surroundings."""
+"""Size of the sample of the cloud that the bed of the surroundings is estimated from."""
 
 
 def learn_regression(
@@ -290,8 +294,8 @@ def learn_regression(
 ) -> DepthRegression:
     """Fit true depth = a + b * apparent depth to the check depths of a file.
 
-    The parts are the whole cloud as it came, each point with the water above it; they are gone
-    through once, in bounded memory. Points of noise (classes 7 and 18) do not count.
+    The parts are the whole apparent cloud, each point with the water above it; they are read once,
+    in bounded memory. Points of noise (classes 7 and 18) do not count.
 
     Raises
     ------
@@ -305,7 +309,7 @@ def learn_regression(
     -----
     The apparent depth at a check depth is the median of the nearest submerged points, 3 to 16,
     within four times the distance between neighbouring points there. Check depths with fewer are
-    left out, and a note says how many; an outlier is noted too, but stays in.
+    excluded, with a note; an outlier is noted too, but used.
     """
     checks = read_check_depths(path)
     around = ApparentDepths(checks.xy)
@@ -317,18 +321,21 @@ def learn_regression(
     apparent, level, covered = around.medians(radius)
     left_out = _left_out(checks, around.distance_m[:, 0], covered, radius)
     if left_out and covered.sum() < LEAST_COUNT:
-        raise GeometryError(left_out)
+        raise GeometryError("check_depths.no_bed", left_out, covered=int(covered.sum()))
     rows = np.flatnonzero(covered)
     true = _true_depths(checks, level, rows)
     try:
         found = fit_depths(apparent[rows], true)
     except GeometryError as error:
-        raise GeometryError(f"{checks.name}: {error}") from error
+        raise GeometryError(error.code, f"{checks.name}: {error}", **error.values) from error
     if found.r2 < settings.least_r2:
         raise GeometryError(
-            f"{checks.name}: the regression explains too little: r2 {found.r2:.3f} of"
-            f" {found.count} check depths is below {settings.least_r2:g}; check their CRS and the"
-            " water's height, or accept it with a lower --least-r2."
+            "check_depths.low_r2",
+            f"{checks.name}: r2 {found.r2:.3f} of the regression over {found.count} check depths is"
+            f" below {settings.least_r2:g}. Check their CRS and the water level, or lower"
+            " --least-r2.",
+            r2=found.r2,
+            least=settings.least_r2,
         )
     notes = (left_out,) if left_out else ()
     return replace(found, notes=(*notes, *found.notes, *_outlier_notes(checks, found, rows)))
@@ -337,28 +344,24 @@ def learn_regression(
 def _left_out(
     checks: CheckDepths, nearest_m: FloatArray, covered: BoolArray, radius_m: float
 ) -> str:
-    """Return how many check depths lie where the cloud has no bed, in words; empty if none."""
+    """Describe the check depths where the cloud has no bed; empty if there are none."""
     if covered.all():
         return ""
     first = int(np.argmin(covered))
-    away = nearest_m[first]
-    there = (
-        f"{away:,.2f} m from the nearest submerged point; {LEAST_NEIGHBOURS} are wanted within"
-        f" {radius_m:.2f} m"
-        if np.isfinite(away)
-        else "and the cloud has no submerged point"
-    )
-    enough = int(covered.sum()) >= LEAST_COUNT
+    there = "the cloud has no submerged point"
+    if np.isfinite(nearest_m[first]):
+        there = (
+            f"the nearest submerged point is {nearest_m[first]:,.2f} m away, and {LEAST_NEIGHBOURS}"
+            f" are needed within {radius_m:.2f} m"
+        )
     return (
-        f"{checks.where(first)}: the check depth is {there}"
-        f" ({int((~covered).sum())} of {len(checks)} are like that and"
-        + (" are left out)." if enough else f" cannot be used; a regression needs {LEAST_COUNT}).")
-        + " Check that they have the cloud's CRS and lie in the water."
+        f"{checks.where(first)}: {int((~covered).sum())} of {len(checks)} check depths have no bed"
+        f" around them: {there}. Check that they have the cloud's CRS and lie in the water."
     )
 
 
 def _true_depths(checks: CheckDepths, level_m: FloatArray, rows: IntArray) -> FloatArray:
-    """Return the true depths, metres; a height is turned over at the water above its place."""
+    """Return the true depths, metres; heights are subtracted from the water above them."""
     if not checks.are_heights:
         return checks.value_m[rows]
     depth = level_m[rows] - checks.value_m[rows]
@@ -366,21 +369,23 @@ def _true_depths(checks: CheckDepths, level_m: FloatArray, rows: IntArray) -> Fl
     if len(above):
         first = int(rows[above[0]])
         raise GeometryError(
+            "check_depths.above_water",
             f"{checks.where(first)}: the height {checks.value_m[first]:.2f} m is above the water,"
-            f" {level_m[first]:.2f} m there ({len(above)} of {len(rows)} are); give heights of"
-            " the bed with the cloud's vertical datum, or depths in a column depth."
+            f" {level_m[first]:.2f} m there ({len(above)} of {len(rows)} are). Give heights of the"
+            " bed in the cloud's vertical datum, or depths in a column depth.",
+            height_m=float(checks.value_m[first]),
+            count=len(above),
         )
     return np.asarray(depth)
 
 
 def _outlier_notes(checks: CheckDepths, found: DepthRegression, rows: IntArray) -> tuple[str, ...]:
-    """Return a sentence on check depths far off the line, if any."""
+    """Return a note on check depths far off the line, if there are any."""
     if not found.outliers:
         return ()
     first = int(rows[found.outliers[0]])
     lines = ", ".join(str(checks.line[rows[i]]) for i in found.outliers[:5])
     return (
-        f"{checks.where(first)}: the check depth lies too far off the line to be of one set with"
-        f" the rest (lines {lines}; {len(found.outliers)} in all); it was kept: mend it or take it"
-        " out.",
+        f"{checks.where(first)}: {len(found.outliers)} check depths are outliers (lines {lines})"
+        " and were used. Correct or remove them.",
     )

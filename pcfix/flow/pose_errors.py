@@ -20,7 +20,7 @@ from pcfix.flow.surfaces import Points
 from pcfix.io.members import find_members
 from pcfix.model import NOISE_CLASSES, Cameras, FloatArray, IntArray, Outcome, Views
 from pcfix.options.declare import File
-from pcfix.refract.batch import Batch, MadeWith, Survey
+from pcfix.refract.batch import Batch, OriginalModel, Survey
 from pcfix.refract.methods import correct
 from pcfix.refract.pose_errors import PoseErrors, pose_errors_of
 from pcfix.water.surface import is_submerged, surface_above
@@ -165,7 +165,9 @@ def _heights(sample: Sample, survey: Survey, pair: Pair) -> FloatArray:
     step = CloudTransfer(replace(pair, adjusted=survey.cameras)).step(xyz, listed)
     above = surface_above(survey.water, step.xyz, heights)
     found = correct(
-        Batch(step.xyz, above, survey, step.views, MadeWith(xyz, pair.original), source=sources)
+        Batch(
+            step.xyz, above, survey, step.views, OriginalModel(xyz, pair.original), source=sources
+        )
     )
     known = step.moved & (found.outcome == Outcome.CORRECTED)
     return np.where(known, step.xyz[:, 2] + found.shift_m[:, 2], np.nan)

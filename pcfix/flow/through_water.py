@@ -36,11 +36,11 @@ from pcfix.model import (
     WaterPlane,
 )
 from pcfix.options.correct import CorrectOptions, ScienceOptions
-from pcfix.refract.batch import Batch, Intersection, MadeWith, Survey
+from pcfix.refract.batch import Batch, Intersection, OriginalModel, Survey
 from pcfix.refract.choice import views_in_frame
-from pcfix.refract.hypotheses import CAUSES, Verdict
 from pcfix.refract.learning import as_told, for_own_water, weigh_lists
 from pcfix.refract.methods import correct, shift_of_land
+from pcfix.refract.reconstructions import CAUSES, Verdict
 from pcfix.refract.regression import LEAST_BEYOND, BeyondRange, DepthRegression
 from pcfix.refract.tally import Tally
 from pcfix.sums import Sums
@@ -123,8 +123,8 @@ class ThroughWater(Sums):
         if carrying is not None:
             around = partial(_transferred, chunks, carrying, views)
 
-            def makers() -> Iterator[MadeWith]:
-                return (MadeWith(points.xyz, carrying.pair.original) for points in chunks())
+            def makers() -> Iterator[OriginalModel]:
+                return (OriginalModel(points.xyz, carrying.pair.original) for points in chunks())
 
         if labelling.looks_around:
             labelling.look_around(
@@ -152,15 +152,15 @@ class ThroughWater(Sums):
         """Correct one chunk; see `pcfix.flow.job.Job.correct`."""
         xyz, classes = points.xyz, points.classes
         label: Label = partial(labelling.submerged, classes=classes)
-        step, made_with = None, None
+        step, original_model = None, None
         if self.carrying is not None:
-            step, made_with = (
+            step, original_model = (
                 self.carrying.step(xyz, views),
-                MadeWith(xyz, self.carrying.pair.original),
+                OriginalModel(xyz, self.carrying.pair.original),
             )
             xyz, views, label = step.xyz, step.views, step.rule(label)
         above = surface_above(self.water, xyz, points.heights)
-        batch = Batch(xyz, above, self.survey, views, made_with, source=points.sources)
+        batch = Batch(xyz, above, self.survey, views, original_model, source=points.sources)
         batch = self._of_kind(batch)
         correction = correct_checked(batch, label, self.found.sigma_level_m, heights_only=True)
         if self._beyond is not None:
@@ -392,7 +392,7 @@ def correct_checked(
     slope, (shift_x, shift_y, shift_z) = wet.surface.slope, found.shift_m.T
     rise = slope[:, 0] * shift_x + slope[:, 1] * shift_y
     below = np.asarray(wet.surface.height_m + rise - (wet.xyz[:, 2] + shift_z))
-    if batch.made_with is not None:
+    if batch.original_model is not None:
         # points whose own images place them above the water after the transfer are land
         bed = (below >= 0.0) | (found.outcome != Outcome.CORRECTED)
         submerged = submerged.copy()
@@ -401,7 +401,7 @@ def correct_checked(
     depth = np.zeros(len(xyz))
     depth[rows] = below
     values = spread_over(found, rows, len(xyz))
-    if batch.made_with is not None:
+    if batch.original_model is not None:
         land = np.flatnonzero(~submerged)
         values["shift_m"] = values["shift_m"].copy()
         values["shift_m"][land] += shift_of_land(batch.take(land))

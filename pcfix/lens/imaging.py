@@ -79,7 +79,6 @@ def coefficients(lens: Lens) -> FloatArray:
     c[places.LARGEST_ANGLE] = largest_angle(lens)
     c[places.LARGEST_RADIUS] = largest_radius(c)
     c[places.DISC] = largest_disc(lens, c)
-    c.setflags(write=False)
     return c
 
 

@@ -1,12 +1,11 @@
-"""What goes into a correction and what comes out: one batch of points, one result.
+"""Input and output types of the correction methods.
 
-`Survey` is what all points have in common, `Batch` adds what each of them has of its own. The door
-of the room, `pcfix.refract.methods.correct`, takes a batch whole; so does each method, with the
-cameras chosen.
+`Survey` is what all points have in common, `Batch` adds what each point has. Methods take a batch
+whose cameras are chosen; `pcfix.refract.methods.correct` chooses them.
 
 A dense matcher compared images in the geometry of its own cameras, right or wrong; the light went
-in that of the true ones. What both have in common is the place in the image: a direction in the
-one geometry is a direction in the other, through the lens of either (`MadeWith`, `Images`).
+in that of the true ones. What both have in common is the place in the image: a direction in one
+geometry becomes one in the other through the lens of either (`OriginalModel`, `Images`).
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import PcfixWarning
+from pcfix.errors import PcfixWarning, SettingError
 from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import Vector, times, transposed_times
 from pcfix.lens.imaging import direction_of, image_of, lens_table
@@ -36,54 +35,52 @@ PARALLEL, CORRECTED = int(Outcome.PARALLEL_RAYS), int(Outcome.CORRECTED)
 """Of `Outcome`, for kernels."""
 
 FLAT_DEG = 35.0
-"""Rays beyond this are those by which methods differ most; see `hypotheses.LIMITS`."""
-
+"""Incidence angle beyond which methods differ most; see `reconstructions.LIMITS`."""
 
 UNLISTED, MAIN = -1, -2
-"""Points in no list, and those of no source of their own; see `Survey.parts`."""
+"""Points in no view list, and points of all other sources; see `Survey.parts`."""
 
 
 class Learned(NamedTuple):
-    """What methods may need beyond the points themselves; None where it was not learned.
+    """What was learned from the whole cloud; None where it was not.
 
     Attributes
     ----------
     regression : DepthRegression or None
         From check depths, for the method of that name.
     occluder : Occluder or None
-        The cloud's own surface, which hides points from cameras.
+        The surface of the cloud.
     matcher : Matcher or None
-        Which images were matched with which.
+        Which images were matched with each other.
     bed : Bed or None
-        What fused points of one place have in common.
-    doubt : Doubt or None
-        Of how the cloud was made.
+        The bed that agrees with most fused points.
+    model_uncertainty : ModelUncertainty or None
     land : Survey or None
-        What land is corrected with that was carried to adjusted cameras, if not with the same.
+        For land that was transferred to adjusted cameras, if it differs.
     poses : PoseErrors or None
-        What the errors of adjusted poses come to.
+        Errors of Z from the adjusted poses.
     """
 
     regression: DepthRegression | None = None
     occluder: Occluder | None = None
     matcher: Matcher | None = None
     bed: Bed | None = None
-    doubt: Doubt | None = None
+    model_uncertainty: ModelUncertainty | None = None
     land: Survey | None = None
     poses: PoseErrors | None = None
 
 
-class Doubt(NamedTuple):
-    """What the standard error of Z has beyond the error budget, as the cloud itself tells it.
+class ModelUncertainty(NamedTuple):
+    """Errors of Z beyond the error budget, estimated from the cloud.
 
     Attributes
     ----------
     scatter_m : float
-        Of neighbours about a smooth bed, beyond what the budget explains: mismatches.
+        Of neighbours about a smooth bed, beyond the budget: mismatches.
     per_depth : float
-        Standard deviation, relative to the depth, by what is not known of how the cloud was made.
+        Standard deviation relative to the depth, from the unknown reconstruction type.
     formal_m : float
-        What the budget itself comes to, in the median, metres.
+        Median standard error of the budget itself, metres.
     """
 
     scatter_m: float
@@ -91,28 +88,28 @@ class Doubt(NamedTuple):
     formal_m: float = 0.0
 
 
-class MadeWith(NamedTuple):
-    """What made m points, where that are other cameras than those they are corrected with.
+class OriginalModel(NamedTuple):
+    """The model from which m points came, if the cameras were adjusted since.
 
     Attributes
     ----------
     xyz : array, shape (m, 3)
-        Apparent points as the software had them, metres, world frame.
+        Original apparent points, metres, world frame.
     cameras : Cameras
-        Those it had, in the order of the adjusted ones, with angles and lenses.
+        Original cameras, in the order of the adjusted ones, with angles and lenses.
     """
 
     xyz: FloatArray
     cameras: Cameras
 
-    def take(self, rows: IntArray) -> MadeWith:
-        """Return what made some of the points."""
-        return MadeWith(self.xyz[rows], self.cameras)
+    def take(self, rows: IntArray) -> OriginalModel:
+        """Return some of the points."""
+        return OriginalModel(self.xyz[rows], self.cameras)
 
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """What all points of a cloud are corrected with.
+    """What all points of a cloud have in common.
 
     Attributes
     ----------
@@ -122,14 +119,14 @@ class Survey:
         Projection centres and frames, world frame.
     settings : ScienceOptions
     level_offset_m : array, shape (k,), or None
-        How much higher the water stood when each camera took its image. None: nowhere.
+        How much higher the water stood when each image was taken. None: it did not move.
     learned : Learned
     parts : mapping
-        Surveys of points that were made in another way than most: by their source, and of those in
-        no list, where there is one, by `UNLISTED`.
+        Surveys of points with another reconstruction type than most, by their source; `UNLISTED`
+        for those without a view list.
     own_water : OwnWater or None
-        Rasters of the water as single images saw it, in which all rays of ``snell`` and
-        ``consistent`` bend; at `water` where they do not reach.
+        The water of single images as rasters, for ``snell`` and ``consistent``; beyond their edges
+        the rays are refracted at `water`.
     """
 
     water: WaterSurface
@@ -160,22 +157,22 @@ class Batch:
         The water above each of them.
     survey : Survey
     views : Views or None
-        The cameras of each point: those of a list, to choose from; or, once they are chosen, those
-        that give it a ray. None where no list says it.
-    made_with : MadeWith or None
-        The points and cameras as the SfM software left them, where `xyz` are the points transferred
-        to adjusted cameras (`pcfix.adjust.transfer`). Inverting the dense matching uses these.
+        The cameras of each point: its view list or, once they are chosen, those that give it a
+        ray. None without a list.
+    original_model : OriginalModel or None
+        If `xyz` were transferred to adjusted cameras (`pcfix.adjust.transfer`). Dense matching is
+        inverted in the original model; the matcher then has its cameras.
     level_sigma_m : array, shape (m,), or None
-        Standard deviation of the height of the surface above each point, as its fit has it.
+        Standard deviation of the height of the surface above each point, from its fit.
     source : array of int, shape (m,), or None
-        Which of several clouds each point came from.
+        Point source IDs.
     """
 
     xyz: FloatArray
     surface: SurfaceAbove
     survey: Survey
     views: Views | None = None
-    made_with: MadeWith | None = None
+    original_model: OriginalModel | None = None
     level_sigma_m: FloatArray | None = None
     source: IntArray | None = None
 
@@ -189,7 +186,7 @@ class Batch:
                 self.surface.height_m[rows], self.surface.slope.take(rows, axis=0)
             ),
             views=None if self.views is None else self.views.take(rows),
-            made_with=None if self.made_with is None else self.made_with.take(rows),
+            original_model=None if self.original_model is None else self.original_model.take(rows),
             level_sigma_m=None if sigma is None else sigma[rows],
             source=None if self.source is None else self.source[rows],
         )
@@ -198,7 +195,7 @@ class Batch:
         return len(self.xyz)
 
     def parts(self) -> list[tuple[IntArray, Batch]]:
-        """Return the rows that were made in one way, and the batch of them, way by way."""
+        """Return the rows and the batch of each of the `Survey.parts`."""
         surveys = self.survey.parts
         if not surveys:
             return [(np.arange(len(self)), self)]
@@ -223,25 +220,30 @@ class Batch:
         return self.views
 
     @property
+    def listed(self) -> tuple[IntArray, IntArray]:
+        """The cameras that were chosen, for kernels: first entry of each point, and the cameras."""
+        return np.asarray(self.rays.start, np.int64), np.asarray(self.rays.camera, np.int64)
+
+    @property
     def counts(self) -> IntArray:
         """Rays of each point, shape (m,)."""
         return np.diff(self.rays.start)
 
     def chosen(self) -> Chosen:
-        """Return the points and their cameras for kernels."""
-        survey = self.survey
-        made_xyz = self.xyz if self.made_with is None else self.made_with.xyz
+        """Return the points and their cameras, if these are known, for kernels."""
+        survey, views, none = self.survey, self.views, np.zeros(0, np.int64)
+        original = self.xyz if self.original_model is None else self.original_model.xyz
         return Chosen(
-            np.ascontiguousarray(self.xyz),
-            np.ascontiguousarray(made_xyz),
-            np.ascontiguousarray(self.surface.height_m),
-            np.ascontiguousarray(self.surface.slope),
-            self.normals(),
-            np.ascontiguousarray(survey.cameras.centres),
-            survey.offset_m,
-            np.ascontiguousarray(self.rays.start, np.int64),
-            np.ascontiguousarray(self.rays.camera, np.int64),
-            survey.settings.refractive_index,
+            xyz=np.ascontiguousarray(self.xyz),
+            original_xyz=np.ascontiguousarray(original),
+            height=np.ascontiguousarray(self.surface.height_m),
+            slope=np.ascontiguousarray(self.surface.slope),
+            normals=self.normals(),
+            centres=np.ascontiguousarray(survey.cameras.centres),
+            offset=survey.offset_m,
+            start=none if views is None else np.ascontiguousarray(views.start, np.int64),
+            camera=none if views is None else np.ascontiguousarray(views.camera, np.int64),
+            n=survey.settings.refractive_index,
         )
 
     def normals(self) -> FloatArray:
@@ -251,41 +253,31 @@ class Batch:
         return np.column_stack([-slope * up[:, None], up])
 
     def outcome(self) -> npt.NDArray[np.uint8]:
-        """Return what becomes of points with so many rays, shape (m,)."""
+        """Return the outcome of each point by its number of rays, shape (m,)."""
         counts = self.counts
         few = np.where(counts == 1, Outcome.ONE_CAMERA, Outcome.NO_CAMERA)
         return np.where(counts >= 2, Outcome.CORRECTED, few).astype(np.uint8)
 
-    def incidence_deg(self) -> FloatArray:
-        """Return the largest incidence angle in air of each point's rays, shape (m,)."""
-        return self._angles_deg()[:, 1]
-
-    def steepest_deg(self) -> FloatArray:
-        """Return the smallest one; 90 where there is no ray."""
-        return self._angles_deg()[:, 0]
-
-    def seen_flat(self) -> BoolArray:
-        """Return which points have rays, and those beyond `FLAT_DEG` from the normal alone."""
-        return np.asarray((self.counts > 0) & (self.steepest_deg() > FLAT_DEG))
-
-    def _angles_deg(self) -> FloatArray:
+    def angles_deg(self) -> FloatArray:
         """Return the smallest and the largest incidence angle of each point's rays, shape (m, 2).
 
-        90 and 0 where there is no ray.
+        In air; 90 and 0 where there is no ray.
         """
-        cosine, views = np.empty((len(self), 2)), self.rays
+        cosine = np.empty((len(self), 2))
         in_tiles(
             _incidence, len(self), np.ascontiguousarray(self.xyz), self.normals(),
-            np.ascontiguousarray(self.survey.cameras.centres),
-            np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64), cosine,
+            np.ascontiguousarray(self.survey.cameras.centres), *self.listed, cosine,
         )  # fmt: skip
         return np.degrees(np.arccos(np.clip(cosine, 0.0, 1.0)))
 
+    def seen_flat(self) -> BoolArray:
+        """Return which points have rays beyond `FLAT_DEG` from the normal only."""
+        return np.asarray((self.counts > 0) & (self.angles_deg()[:, 0] > FLAT_DEG))
+
     def camera_used(self, moved: BoolArray) -> BoolArray:
         """Return which cameras give a ray to a point that is moved, shape (k,)."""
-        used, views = np.zeros(len(self.survey.cameras), np.bool_), self.rays
-        start, camera = np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)
-        in_tiles(_mark_used, len(self), start, camera, moved, used)
+        used = np.zeros(len(self.survey.cameras), np.bool_)
+        used[self.rays.camera[np.repeat(moved, self.counts)]] = True
         return used
 
     def result(
@@ -297,7 +289,7 @@ class Batch:
     ) -> Intersection:
         """Return the result of a method that gives shifts, shape (m, 3).
 
-        Points that are not moved get a shift of zero, and zeros beside it.
+        Points that are not moved get zeros.
         """
         outcome = self.outcome() if outcome is None else outcome
         moved = outcome == Outcome.CORRECTED
@@ -308,15 +300,18 @@ class Batch:
             ray_count=np.where(moved, self.counts, 0).astype(np.int32),
             ray_miss_m=zero if ray_miss_m is None else np.where(moved, ray_miss_m, 0.0),
             sigma_z_m=zero,
-            incidence_deg=np.where(moved, self.incidence_deg(), 0.0),
+            incidence_deg=np.where(moved, self.angles_deg()[:, 1], 0.0),
             camera_used=self.camera_used(moved),
         )
 
 
 def stacked(batches: list[Batch]) -> Batch:
-    """Return batches of one survey, without views, as one; at least one of them."""
-    made = [batch.made_with for batch in batches if batch.made_with is not None]
+    """Join batches of one survey, without views; at least one."""
+    models = [batch.original_model for batch in batches if batch.original_model is not None]
     source = [batch.source for batch in batches if batch.source is not None]
+    model = None
+    if models:
+        model = OriginalModel(np.vstack([one.xyz for one in models]), models[0].cameras)
     return replace(
         batches[0],
         xyz=np.vstack([batch.xyz for batch in batches]),
@@ -324,7 +319,7 @@ def stacked(batches: list[Batch]) -> Batch:
             np.concatenate([batch.surface.height_m for batch in batches]),
             np.vstack([batch.surface.slope for batch in batches]),
         ),
-        made_with=MadeWith(np.vstack([one.xyz for one in made]), made[0].cameras) if made else None,
+        original_model=model,
         source=np.concatenate(source) if source else None,
     )
 
@@ -347,22 +342,11 @@ def _incidence(
         cosine[i, 0], cosine[i, 1] = most, least
 
 
-@kernel
-def _mark_used(
-    span: Span, start: IntArray, camera: IntArray, moved: BoolArray, used: BoolArray
-) -> None:
-    """Mark the cameras of the points that are moved; threads write the same value."""
-    for i in range(*span):
-        if moved[i]:
-            for at in range(start[i], start[i + 1]):
-                used[camera[at]] = True
-
-
 class Intersection(NamedTuple):
     """The result for m submerged points; see `pcfix.Correction` for the meaning of each.
 
-    The methods themselves leave `sigma_z_m`, `covariance_m2` and `unsure` open, but for some that
-    know a scatter; `pcfix.refract.methods.correct` fills them.
+    Methods leave `sigma_z_m`, `covariance_m2` and `unsure` to `pcfix.refract.methods.correct`,
+    except for some that know a scatter.
     """
 
     shift_m: FloatArray
@@ -382,13 +366,30 @@ class Intersection(NamedTuple):
         return self._replace(**{name: value[rows] for name, value in known.items()})
 
 
+def require_orientation(cameras: Cameras, who: str, instead: str = "") -> None:
+    """Raise SettingError if cameras have no angles or no lenses."""
+    named = (("angles", cameras.rotations), ("lenses", cameras.lenses))
+    missing = [name for name, value in named if value is None]
+    if missing:
+        raise SettingError(
+            "cameras.no_orientation",
+            f"{who} needs the angles and the lens of each image, and the cameras have no"
+            f" {' and no '.join(missing)}. Give a camera file that has them, or --sensor for the"
+            f" lens{f', or {instead}' if instead else ''}.",
+            missing=missing,
+        )
+
+
 def warn_of_unsolved(beginning: str, found: BoolArray) -> None:
-    """Warn of the points that are moved without a solution; `found` has one entry for each."""
+    """Warn of points that were moved without a solution; `found` has an entry for each."""
     if not found.all():
         unsolved = int((~found).sum())
         warnings.warn(
-            f"{beginning} for {unsolved:,} of {len(found):,} points; they have that of snell.",
-            PcfixWarning,
+            PcfixWarning(
+                "points.unsolved",
+                f"{beginning} for {unsolved:,} of {len(found):,} points; they have that of snell.",
+                points=unsolved,
+            ),
             stacklevel=3,
         )
 
@@ -398,8 +399,8 @@ class Chosen(NamedTuple):
 
     Attributes
     ----------
-    xyz, made_xyz : array, shape (m, 3)
-        Apparent points, as they are corrected and as the matcher had them.
+    xyz, original_xyz : array, shape (m, 3)
+        Apparent points, now and in the original model.
     height : array, shape (m,)
     slope : array, shape (m, 2)
     normals : array, shape (m, 3)
@@ -413,7 +414,7 @@ class Chosen(NamedTuple):
     """
 
     xyz: FloatArray
-    made_xyz: FloatArray
+    original_xyz: FloatArray
     height: FloatArray
     slope: FloatArray
     normals: FloatArray
@@ -425,9 +426,9 @@ class Chosen(NamedTuple):
 
 
 class Optics(NamedTuple):
-    """The k cameras as they image, for kernels.
+    """The angles and lenses of k cameras, for kernels.
 
-    Rotations from the world, shape (k, 3, 3); the lens of each as a row of the table `lenses`, see
+    Rotations from the world, shape (k, 3, 3); the row of each lens in the table `lenses`, see
     `pcfix.lens.imaging.lens_table`.
     """
 
@@ -444,32 +445,23 @@ def optics_of(cameras: Cameras) -> Optics:
 
 
 class Images(NamedTuple):
-    """The k images in the cameras that made the points and in those of now, for kernels.
+    """The k images in the original and in the adjusted cameras, for kernels.
 
-    Without rows where they are the same: then no light goes through a lens, and nothing is rounded.
+    Without rows where both are the same: then no direction is rounded by two lenses.
 
     Attributes
     ----------
     centres : array, shape (k, 3)
-        Of those that made the points, metres, world frame.
-    rotations, rotations_now : array, shape (k, 3, 3)
-        World to camera.
-    row, row_now : array, shape (k,)
-        The lens of each image in the tables.
-    lenses, lenses_now : array, shape (l, ...)
-        See `pcfix.lens.imaging.lens_table`.
+        Of the original cameras, metres, world frame.
+    original, adjusted : Optics
     """
 
     centres: FloatArray
-    rotations: FloatArray
-    row: IntArray
-    lenses: FloatArray
-    rotations_now: FloatArray
-    row_now: IntArray
-    lenses_now: FloatArray
+    original: Optics
+    adjusted: Optics
 
 
-def images_of(made_with: MadeWith | None, now: Cameras) -> Images:
+def images_of(original_model: OriginalModel | None, now: Cameras) -> Images:
     """Return the images for kernels.
 
     Raises
@@ -478,53 +470,47 @@ def images_of(made_with: MadeWith | None, now: Cameras) -> Images:
         If there are two sets of cameras, and one has no angles or no lenses, or they are not of
         the same number.
     """
-    if made_with is None or _are_equal(made_with.cameras, now):
-        none, no_row = np.zeros((0, 3, 3)), np.zeros(0, np.int64)
-        return Images(np.zeros((0, 3)), none, no_row, np.zeros((0, 1)), none, no_row, none[:, 0])
-    made = made_with.cameras
-    if made.lenses is None or now.lenses is None or len(made) != len(now):
+    if original_model is None or _are_equal(original_model.cameras, now):
+        none = Optics(np.zeros((0, 3, 3)), np.zeros(0, np.int64), np.zeros((0, 1)))
+        return Images(np.zeros((0, 3)), none, none)
+    original = original_model.cameras
+    if original.lenses is None or now.lenses is None or len(original) != len(now):
         raise ValueError("the same images are needed twice, with angles and lenses")
-    return Images(np.ascontiguousarray(made.centres, np.float64), *optics_of(made), *optics_of(now))
+    centres = np.ascontiguousarray(original.centres, np.float64)
+    return Images(centres, optics_of(original), optics_of(now))
 
 
-def _are_equal(made: Cameras, now: Cameras) -> bool:
-    """Whether two sets of cameras show the same everywhere."""
-    return made is now or (
-        np.array_equal(made.centres, now.centres)
-        and made.lenses == now.lenses
-        and made.rotations is not None
-        and now.rotations is not None
-        and np.array_equal(made.rotations, now.rotations)
+def _are_equal(one: Cameras, other: Cameras) -> bool:
+    """Whether two sets of cameras are the same."""
+    return one is other or (
+        np.array_equal(one.centres, other.centres)
+        and one.lenses == other.lenses
+        and one.rotations is not None
+        and other.rotations is not None
+        and np.array_equal(one.rotations, other.rotations)
     )
 
 
 @device
-def as_made(images: Images, c: int, a: Vector) -> Vector:
-    """Return where the matcher had what camera c sees in a direction, both in the world frame.
+def to_original(images: Images, c: int, a: Vector) -> Vector:
+    """Convert a direction in which adjusted camera c sees something to the original camera.
 
-    NaN where there is no image; of any length.
+    Both in the world frame, of any length; NaN where there is no image.
     """
     if len(images.centres) == 0:
         return a
-    return _through(
-        images.rotations_now[c], images.lenses_now[images.row_now[c]],
-        images.rotations[c], images.lenses[images.row[c]], a,
-    )  # fmt: skip
+    return _between(images.adjusted, images.original, c, a)
 
 
 @device
-def as_now(images: Images, c: int, a: Vector) -> Vector:
-    """Return in which direction camera c sees what the matcher had in a direction."""
-    return _through(
-        images.rotations[c], images.lenses[images.row[c]],
-        images.rotations_now[c], images.lenses_now[images.row_now[c]], a,
-    )  # fmt: skip
+def to_adjusted(images: Images, c: int, a: Vector) -> Vector:
+    """Convert a direction of original camera c to the adjusted camera."""
+    return _between(images.original, images.adjusted, c, a)
 
 
 @device
-def _through(
-    r: FloatArray, lens: FloatArray, to_r: FloatArray, to_lens: FloatArray, a: Vector
-) -> Vector:
+def _between(one: Optics, other: Optics, c: int, a: Vector) -> Vector:
     """Return the direction of the same place in the image for another pose and lens."""
-    u, v = image_of(lens, *times(r, a))
-    return transposed_times(to_r, direction_of(to_lens, u, v))
+    u, v = image_of(one.lenses[one.row[c]], *times(one.rotations[c], a))
+    seen = direction_of(other.lenses[other.row[c]], u, v)
+    return transposed_times(other.rotations[c], seen)

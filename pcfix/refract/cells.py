@@ -1,7 +1,7 @@
-"""Cells of neighbouring points, in which what is smooth becomes polynomials.
+"""Cells of neighbouring points, in which smooth functions are replaced by polynomials.
 
-Each has a box: in x and y, and in the height over the water, that is a plane above the cell. Its
-coordinates go from -1 to 1.
+Each cell has a box in x, y and the height over the water, which is a plane above the cell. The
+coordinates in the box go from -1 to 1.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.kernels import Span, device, in_tiles, kernel
+from pcfix.kernels import device
 from pcfix.lens.algebra import Vector, normal_of, row_of
 from pcfix.model import FloatArray, IntArray, WaterMesh, WaterRaster
 from pcfix.refract.batch import Batch, Chosen, Survey
@@ -43,6 +43,7 @@ class Box(NamedTuple):
 
 
 def _basis_of(x: FloatArray) -> FloatArray:
+    """Return the powers of coordinates, shape (n, 3), one column for each term."""
     u, v, w = x.T
     uu, uv, vv, ww = u * u, u * v, v * v, w * w
     return np.column_stack(
@@ -56,9 +57,9 @@ def _fit_at(basis: FloatArray) -> FloatArray:
 
 
 QUADRATIC, CUBIC = 10, 19
-"""Terms of polynomials; the cubic one has no power of three of the height, that spreads least."""
+"""Terms of polynomials; the cubic one has no w^3, as the height varies least."""
 
-# Polynomials through these nodes are off most at the corners, where it is asked how much.
+# Chebyshev nodes: polynomials through these are off most at the corners, where this is tested.
 _FOUR, _THREE = np.cos(np.pi / 8.0 * np.arange(1, 8, 2)), np.sqrt(0.75) * np.arange(-1.0, 2.0)
 _CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
 NODES = np.vstack([np.array(list(product(_FOUR, _FOUR, _THREE))), _CORNERS])
@@ -71,30 +72,29 @@ FIT_SOME = _fit_at(BASIS[SOME, :QUADRATIC])
 
 
 def is_bent(survey: Survey) -> bool:
-    """Whether rays of one point may pierce the water under different slopes."""
+    """Whether the rays of a point may pierce the water under different slopes."""
     return isinstance(survey.water, WaterMesh | WaterRaster) or survey.own_water is not None
 
 
 def is_quick(batch: Batch) -> bool:
-    """Whether polynomials may stand for what each point would have to be asked."""
+    """Whether polynomials may replace the exact functions."""
     return not (batch.survey.settings.exact or is_bent(batch.survey))
 
 
 def cells_of(batch: Batch) -> tuple[IntArray, IntArray]:
     """Return the order of the points cell by cell, and the first of each cell.
 
-    Those of a cell with the same cameras come one after the other.
+    Within a cell, points with the same cameras follow each other.
     """
     if not len(batch):
         return np.zeros(0, np.int64), np.zeros(1, np.int64)
     cell = np.floor(batch.xyz[:, :2] / _size_of(batch)).astype(np.int64)
     cell -= cell.min(axis=0)
     key = cell[:, 1] * (cell[:, 0].max() + 1) + cell[:, 0]
+    # a random number stands for each camera, so that a sum stands for a list of cameras
     names = np.random.default_rng(0).integers(2**40, size=len(batch.survey.cameras))
-    views, sums = batch.rays, np.zeros(len(batch), np.int64)
-    start, camera = np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)
-    in_tiles(_sum_names, len(batch), start, camera, names, sums)
-    order = np.lexsort((sums, key))
+    total = np.concatenate([[0], np.cumsum(names[batch.rays.camera])])
+    order = np.lexsort((np.diff(total[batch.rays.start]), key))
     new = np.flatnonzero(np.diff(key[order])) + 1
     return order, np.concatenate([[0], new, [len(order)]])
 
@@ -108,69 +108,21 @@ def _size_of(batch: Batch) -> float:
 def neighbours_in_cells(batch: Batch) -> tuple[IntArray, IntArray]:
     """Return the order of the points cell by cell, and the first of each cell.
 
-    Those of a cell come a quarter of its side after the other, to and fro.
+    Within a cell the points come quarter by quarter of its side, to and fro.
     """
     if not len(batch):
         return np.zeros(0, np.int64), np.zeros(1, np.int64)
-    size, xyz = _size_of(batch), np.ascontiguousarray(batch.xyz)
-    west, east, south = (int(np.floor(at / size)) for at in (
-        xyz[:, 0].min(), xyz[:, 0].max(), xyz[:, 1].min()
-    ))  # fmt: skip
-    key = np.empty(len(xyz), np.int64)
-    in_tiles(_set_keys, len(xyz), xyz, _QUARTERS / size, west, south, east - west + 1, key)
-    order = _sorted(key)
-    new = np.flatnonzero(np.diff(key[order] // _QUARTERS**2)) + 1
+    x, y = np.floor(batch.xyz[:, :2].T * (_QUARTERS / _size_of(batch))).astype(np.int64)
+    x, y = (quarter - quarter.min() // _QUARTERS * _QUARTERS for quarter in (x, y))
+    column, row = x % _QUARTERS, y % _QUARTERS
+    within = _QUARTERS * row + np.where(row & 1, _QUARTERS - 1 - column, column)
+    cell = y // _QUARTERS * (x.max() // _QUARTERS + 1) + x // _QUARTERS
+    order = np.argsort(cell * _QUARTERS**2 + within, kind="stable")
+    new = np.flatnonzero(np.diff(cell[order])) + 1
     return order, np.concatenate([[0], new, [len(order)]])
 
 
-_QUARTERS, _DIGIT_BITS = 4, 11
-
-
-@kernel
-def _set_keys(
-    span: Span,
-    xyz: FloatArray,
-    quarters_a_m: float,
-    west: int,
-    south: int,
-    columns: int,
-    key: IntArray,
-) -> None:
-    """Set the number of each point's quarter, row after row of cells and to and fro in each."""
-    for i in range(*span):
-        x = int(np.floor(xyz[i, 0] * quarters_a_m)) - _QUARTERS * west
-        y = int(np.floor(xyz[i, 1] * quarters_a_m)) - _QUARTERS * south
-        column, row = x % _QUARTERS, y % _QUARTERS
-        within = _QUARTERS * row + (_QUARTERS - 1 - column if row & 1 else column)
-        cell = y // _QUARTERS * columns + x // _QUARTERS
-        key[i] = cell * _QUARTERS**2 + within
-
-
-@kernel(allocates=True)
-def _sorted(key: IntArray) -> IntArray:
-    """Return the order of keys from zero up, digit by digit: for points a few passes."""
-    order, other, shift, most = np.arange(key.size), np.empty(key.size, np.int64), 0, key.max()
-    while most >> shift > 0:
-        place = np.zeros(2**_DIGIT_BITS + 1, np.int64)
-        for i in order:
-            place[(key[i] >> shift) % 2**_DIGIT_BITS + 1] += 1
-        place = np.cumsum(place)
-        for i in order:
-            digit = (key[i] >> shift) % 2**_DIGIT_BITS
-            other[place[digit]] = i
-            place[digit] += 1
-        order, other, shift = other, order, shift + _DIGIT_BITS
-    return order
-
-
-@kernel
-def _sum_names(
-    span: Span, start: IntArray, camera: IntArray, names: IntArray, sums: IntArray
-) -> None:
-    """Sum up the numbers that stand for the cameras of each point."""
-    for i in range(*span):
-        for at in range(start[i], start[i + 1]):
-            sums[i] += names[camera[at]]
+_QUARTERS = 4
 
 
 @device(allocates=True)
@@ -181,7 +133,7 @@ def cameras_of(points: Chosen, i: int) -> IntArray:
 
 @device
 def are_same(a: IntArray, b: IntArray) -> bool:
-    """Whether two lists of cameras are one."""
+    """Whether two lists of cameras are the same."""
     same = a.size == b.size
     for j in range(min(a.size, b.size)):
         same = same and a[j] == b[j]
@@ -190,7 +142,7 @@ def are_same(a: IntArray, b: IntArray) -> bool:
 
 @device(allocates=True)
 def counts_of(rows: IntArray, points: Chosen) -> IntArray:
-    """Return how many of some points each camera sees."""
+    """Return how many of some points each camera sees, by their lists."""
     seen = np.zeros(len(points.centres), np.int64)
     for i in rows:
         for c in cameras_of(points, i):
@@ -208,9 +160,11 @@ def no_box() -> Box:
 def box_of(rows: IntArray, points: Chosen) -> Box:
     """Return the box of some points; the water is that of the first of them."""
     i, low, high = rows[0], np.full(3, np.inf), np.full(3, -np.inf)
+    # the plane of the water is a + b x + c y
     b, c = points.slope[i, 0], points.slope[i, 1]
     a = points.height[i] - b * points.xyz[i, 0] - c * points.xyz[i, 1]
     for j in rows:
+        # the third axis is the height over the water
         x, y, z = row_of(points.xyz, j)
         at = x, y, z - (a + b * x + c * y)
         for axis in range(3):
@@ -228,6 +182,7 @@ def water_at(box: Box, x: float, y: float) -> float:
 @device(allocates=True)
 def nodes_of(box: Box, points: Chosen) -> Chosen:
     """Return the nodes of a box as points."""
+    # from coordinates of -1 to 1 to the world
     xyz, height = box.middle + box.half * NODES, np.empty(len(NODES))
     slope, normals = np.empty((len(NODES), 2)), np.empty((len(NODES), 3))
     for k in range(len(NODES)):
@@ -262,7 +217,7 @@ def in_box(box: Box, place: Vector) -> Vector:
 
 @device
 def set_powers(basis: FloatArray, at: Vector) -> None:
-    """Write the powers of coordinates, one for each term."""
+    """Write the powers of coordinates, one for each term, in the order of `BASIS`."""
     u, v, w = at
     uu, uv, vv, ww = u * u, u * v, v * v, w * w
     powers = (
@@ -275,11 +230,12 @@ def set_powers(basis: FloatArray, at: Vector) -> None:
 
 @device
 def fit(terms: FloatArray, by: FloatArray, values: FloatArray) -> None:
-    """Write the polynomials through values at the nodes, shape (nodes, values).
+    """Fit polynomials by least squares to values at the nodes, shape (nodes, values).
 
-    Term by term: those of all values for the first power, and so on.
+    Writes them term by term: those of all values for the first power, and so on.
     """
     many = values.shape[1]
+    # `by` is the pseudo-inverse of the basis, so that the fit is one product
     for j in range(len(by)):
         for f in range(many):
             terms[j * many + f] = 0.0
@@ -294,6 +250,7 @@ def add_cubic(room: FloatArray, at: int, c: FloatArray, marks: FloatArray) -> No
 
     The first three runs are the coordinates in the box; the powers are those of `BASIS`.
     """
+    # as plain numbers the coefficients stay in registers, and the loop is vectorised
     one, u1, v1, w1, uu, uv, uw, vv, vw, ww = (
         c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8], c[9]
     )  # fmt: skip
@@ -302,6 +259,7 @@ def add_cubic(room: FloatArray, at: int, c: FloatArray, marks: FloatArray) -> No
     )  # fmt: skip
     for j in range(marks.size):
         u, v, w = room[j], room[TILE + j], room[2 * TILE + j]
+        # Horner's scheme
         value = one + w * (w1 + ww * w)
         value += u * (u1 + w * (uw + uww * w) + u * (uu + uuu * u + uuv * v + uuw * w))
         value += v * (v1 + w * (vw + vww * w) + v * (vv + vvv * v + vvw * w))

@@ -1,11 +1,8 @@
-"""Which cameras give a ray to each point: all in whose frame it lies, or those of a list.
-
-Points are worked on in tiles of neighbours, so that a tile needs to look at few cameras only.
-"""
+"""Choose the cameras that give a ray to each point: all in whose frame it lies, or a view list."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -15,26 +12,21 @@ from pcfix.lens.algebra import dot, minus, row_of
 from pcfix.lens.frames import Frames, frames_of, holds, listed_frames_of
 from pcfix.model import Cameras, FloatArray, IntArray, Views, WaterMesh, WaterPlane, WaterRaster
 from pcfix.options.correct import ScienceOptions
+from pcfix.refract import tiling
 from pcfix.refract.batch import Batch, Survey
 from pcfix.refract.rays import pierce_of
-from pcfix.refract.tiling import (
-    TILE,
-    Points,
-    cameras_around,
-    corners_of,
-    gather,
-    marks_in_frame,
-    near_cameras,
-    points_of,
-    tiles_of,
-)
+from pcfix.refract.tiling import TILE, Points
 from pcfix.water.surface import Field, SurfaceAbove, Tin, build_fields, build_tin, locate
 
 NOMINAL_FOCAL_PX = 3700.0
 """Of cameras without a lens: a survey drone's of 20 megapixels, 0.27 mrad a pixel."""
 
+MAX_ANGLE_WITHOUT_FRAMES_DEG = 80.0
+"""Cameras without a lens have no frame to leave; nobody matches images as flat as this, and a
+block in another CRS is recognised by it."""
+
 ANY_NUMBER = 2**31
-"""A list may name a camera twice, so that there can be more entries than cameras."""
+"""More rays than a point can have; a view list may name a camera twice."""
 
 
 class Rig(NamedTuple):
@@ -61,7 +53,7 @@ class Rig(NamedTuple):
 class Rule(NamedTuple):
     """Which rays count, and how they bend.
 
-    The square of the cosine of the largest incidence angle, the most rays of a point, 1 / n.
+    Squared cosine of the largest incidence angle, most rays per point, 1 / n.
     """
 
     least_cosine2: float
@@ -91,7 +83,7 @@ def rule_of(survey: Survey) -> Rule:
 
 
 def shapes_of(survey: Survey) -> tuple[Tin | None, Field | None]:
-    """Return a mesh, or the rasters of the images, for kernels; of another surface neither."""
+    """Return a mesh, or the rasters of the images, for kernels; neither for a plane."""
     water, k = survey.water, len(survey.cameras)
     if survey.own_water is not None:
         return None, survey.own_water.heights
@@ -115,16 +107,16 @@ def chosen_views(batch: Batch) -> Views:
     survey, views = batch.survey, batch.views
     if not len(survey.cameras):
         return Views(np.zeros(len(batch) + 1, np.int64), np.zeros(0, np.int64))
-    points, rig = points_of(batch), rig_of(survey)
+    points, rig = tiling.points_of(batch), rig_of(survey)
     frames = frames_of(survey.cameras) if views is None else listed_frames_of(survey.cameras)
-    tiles = tiles_of(batch)
+    tiles = tiling.tiles_of(batch)
     first, count = np.zeros(tiles + 1, np.int64), np.zeros(len(batch) + 1, np.int64)
     if views is None:
         in_tiles(_make_room, tiles, points, rig, frames, first)
         begin, entries = np.empty(len(batch), np.int64), (first[:0], first[:0])
         place = np.empty(np.cumsum(first, out=first)[-1], np.int32)
     else:
-        entries = (np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64))
+        entries = batch.listed
         begin = entries[0][:-1].copy()
         place = np.empty(len(views.camera), np.int32)
     rule, (tin, fields), found = rule_of(survey), shapes_of(survey), (first, begin, count, place)
@@ -133,8 +125,8 @@ def chosen_views(batch: Batch) -> Views:
     else:
         in_tiles(_choose_all, tiles, points, rig, frames, rule, tin, fields, entries, found)
     start = np.cumsum(count)
-    chosen = np.empty(start[-1], np.int64)
-    in_tiles(_gather_chosen, len(begin), begin, start, place, chosen)
+    # tiles left gaps between the entries of their points
+    chosen = place[np.repeat(begin - start[:-1], count[1:]) + np.arange(start[-1])].astype(np.int64)
     if views is None:
         return Views(start, chosen)
     weight = None if views.weight is None else views.weight[chosen]
@@ -152,34 +144,22 @@ def views_in_frame(xyz: FloatArray, cameras: Cameras) -> Views:
 
 def cameras_of_pairs(pairs: Views) -> Views:
     """Return the cameras in each point's pairs, each once, in the order of the list."""
-    start = np.zeros(len(pairs.start), np.int64)
     camera = np.asarray(pairs.camera, np.int64)
-    distinct = np.empty(len(camera), np.int64)
-    _distinct(np.asarray(pairs.start, np.int64), camera, start, distinct)
-    return Views(start, distinct[: start[-1]])
-
-
-@kernel(allocates=True)
-def _distinct(start: IntArray, camera: IntArray, first: IntArray, distinct: IntArray) -> None:
-    owner = np.full(camera.max() + 1 if camera.size else 0, -1)
-    count = 0
-    for i in range(len(start) - 1):
-        for c in camera[start[i] : start[i + 1]]:
-            if owner[c] != i:
-                owner[c], distinct[count] = i, c
-                count += 1
-        first[i + 1] = count
+    owner = np.repeat(np.arange(len(pairs.start) - 1), np.diff(pairs.start))
+    _, first = np.unique(owner * (camera.max(initial=0) + 1) + camera, return_index=True)
+    kept = np.sort(first)
+    return Views(np.searchsorted(owner[kept], np.arange(len(pairs.start))), camera[kept])
 
 
 @kernel(allocates=True)
 def _make_room(span: Span, points: Points, rig: Rig, frames: Frames, first: IntArray) -> None:
-    """Set for each tile, one place on, how many entries it may get."""
-    low, high = corners_of(points.order[span[0] * TILE : span[1] * TILE], points.xyz)
-    around = cameras_around(frames, rig.centres, low, high)
+    """Set how many entries each tile may get at most, one place on."""
+    low, high = tiling.corners_of(points.order[span[0] * TILE : span[1] * TILE], points.xyz)
+    around = tiling.cameras_around(frames, rig.centres, low, high)
     for t in range(*span):
         rows = points.order[t * TILE : (t + 1) * TILE]
-        low, high = gather(np.empty(7 * TILE), rows, points)
-        first[t + 1] = rows.size * near_cameras(around, frames, rig.centres, low, high).size
+        low, high = tiling.gather(np.empty(7 * TILE), rows, points)
+        first[t + 1] = rows.size * tiling.near_cameras(around, frames, rig.centres, low, high).size
 
 
 @kernel(allocates=True)
@@ -188,18 +168,20 @@ def _choose_all(
     fields: Field | None, views: tuple[IntArray, IntArray],
     found: tuple[IntArray, IntArray, IntArray, npt.NDArray[np.int32]],
 ) -> None:  # fmt: skip
-    """Fill in where the entries of point i begin, how many they are (at i + 1), and the entries.
+    """Choose point by point: from view lists, or under a mesh or raster.
 
-    An entry is the number of a camera, or, where there are views, that of one of their entries.
+    Fills in where the entries of point i begin, how many they are (at i + 1), and the entries. An
+    entry is the number of a camera or, with view lists, that of one of their entries.
     """
     (first, begin, count, place), listed = found, views[0].size > 0
-    low, high = corners_of(points.order[span[0] * TILE : span[1] * TILE], points.xyz)
-    around = views[1][:0] if listed else cameras_around(frames, rig.centres, low, high)
+    low, high = tiling.corners_of(points.order[span[0] * TILE : span[1] * TILE], points.xyz)
+    around = views[1][:0] if listed else tiling.cameras_around(frames, rig.centres, low, high)
     for t in range(*span):
         rows = points.order[t * TILE : (t + 1) * TILE]
         tile = np.empty(7 * TILE)
-        low, high = gather(tile, rows, points)
-        near = near_cameras(around, frames, rig.centres, low, high)
+        low, high = tiling.gather(tile, rows, points)
+        near = tiling.near_cameras(around, frames, rig.centres, low, high)
+        # the tile has its own stretch of entries
         free = first[t]
         for j in range(rows.size):
             i = rows[j]
@@ -209,7 +191,8 @@ def _choose_all(
                 candidates = views[1][begin[i] : views[0][i + 1]]
             else:
                 begin[i] = free
-            kept = choose(candidates, tile, j, rig, frames, rule, tin, fields, facet)
+            # of view lists the entries of a point stay where they are in the list
+            kept = _choose(candidates, tile, j, rig, frames, rule, tin, fields, facet)
             for k in range(kept.size):
                 at = kept[k]
                 place[begin[i] + k] = begin[i] + at if listed else candidates[at]
@@ -222,18 +205,32 @@ def _choose_in_frame(
     span: Span, points: Points, rig: Rig, frames: Frames, rule: Rule,
     found: tuple[IntArray, IntArray, IntArray, npt.NDArray[np.int32]],
 ) -> None:  # fmt: skip
-    """Do what `_choose_all` does without lists and under planes, to whole tiles at once."""
+    """Do as `_choose_all` without view lists and under planes, a tile of points at a time."""
     first, begin, count, place = found
-    low, high = corners_of(points.order[span[0] * TILE : span[1] * TILE], points.xyz)
-    around = cameras_around(frames, rig.centres, low, high)
+    low, high = tiling.corners_of(points.order[span[0] * TILE : span[1] * TILE], points.xyz)
+    around = tiling.cameras_around(frames, rig.centres, low, high)
     for t in range(*span):
         rows = points.order[t * TILE : (t + 1) * TILE]
         tile = np.empty(7 * TILE)
-        low, high = gather(tile, rows, points)
-        near, cosine2 = marks_in_frame(around, tile, frames, rig.centres, low, high, rows.size)
+        low, high = tiling.gather(tile, rows, points)
+        near, cosine2 = tiling.marks_in_frame(
+            around, tile, frames, rig.centres, low, high, rows.size
+        )
         seeing = near.size
+        # first camera by camera, over all points; then point by point, over all cameras
         for at in range(seeing):
-            _set_steepness(cosine2[at], tile, rig, near[at], rule)
+            # marks become squared cosines of incidence angles, negative for rays that do not count
+            centre, offset = row_of(rig.centres, near[at]), rig.offset[near[at]]
+            marks = cosine2[at]
+            for j in range(marks.size):
+                z = tile[2 * TILE + j]
+                e = minus(centre, (tile[j], tile[TILE + j], z))
+                height = dot((tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]), e)
+                h = tile[6 * TILE + j] * (tile[3 * TILE + j] - (z - offset))
+                length2 = dot(e, e)
+                # the camera is above the water, and its ray within the largest incidence angle
+                use = (height > h) & (height * height >= rule.least_cosine2 * length2)
+                marks[j] = height * height / length2 if use & (marks[j] > 0.0) else -1.0
         free, steep = first[t], np.empty(seeing)
         for j in range(rows.size):
             k = 0
@@ -241,80 +238,53 @@ def _choose_in_frame(
                 if cosine2[at, j] >= 0.0:
                     place[free + k], steep[k] = near[at], cosine2[at, j]
                     k += 1
+            # then drop what exceeds the largest number of rays
             k = _keep_steepest(place[free:], steep, k, rule.most)
             begin[rows[j]], count[rows[j] + 1] = free, k
             free += k
 
 
 @device
-def _set_steepness(marks: FloatArray, tile: FloatArray, rig: Rig, c: int, rule: Rule) -> None:
-    """Turn marks into squared cosines of incidence angles, negative where a ray does not count."""
-    centre, offset = row_of(rig.centres, c), rig.offset[c]
-    for j in range(marks.size):
-        z = tile[2 * TILE + j]
-        e = minus(centre, (tile[j], tile[TILE + j], z))
-        height = dot((tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]), e)
-        h = tile[6 * TILE + j] * (tile[3 * TILE + j] - (z - offset))
-        length2 = dot(e, e)
-        use = (height > h) & (height * height >= rule.least_cosine2 * length2)
-        marks[j] = height * height / length2 if use & (marks[j] > 0.0) else -1.0
-
-
-@kernel
-def _gather_chosen(
-    span: Span, begin: IntArray, start: IntArray, place: npt.NDArray[np.int32], chosen: IntArray
-) -> None:
-    """Set the entries of all points one after the other."""
-    for i in range(*span):
-        for k in range(start[i + 1] - start[i]):
-            chosen[start[i] + k] = place[begin[i] + k]
-
-
-MAX_ANGLE_WITHOUT_FRAMES_DEG = 80.0
-"""Cameras without a lens have no frame to leave; nobody matches images as flat as this, and a
-block in another CRS is told apart."""
-
-
-@device(allocates=True)
-def _keep_steepest(
-    chosen: npt.NDArray[np.integer[Any]], cosine2: FloatArray, k: int, most: int
-) -> int:
+def _keep_steepest(chosen: npt.NDArray[np.int32], cosine2: FloatArray, k: int, most: int) -> int:
     """Bring the `most` steepest of k cameras to the front, in the order of the cameras."""
-    if k <= most:
-        return k
-    ranked = np.argsort(-cosine2[:k], kind="mergesort")[:most]
-    ranked.sort()
-    for j in range(most):
-        chosen[j] = chosen[ranked[j]]
-    return most
+    for j in range(most, k):
+        flattest = 0
+        for i in range(1, most):
+            if cosine2[i] <= cosine2[flattest]:  # of equals the later one goes
+                flattest = i
+        if cosine2[j] > cosine2[flattest]:
+            for i in range(flattest, most - 1):
+                chosen[i], cosine2[i] = chosen[i + 1], cosine2[i + 1]
+            chosen[most - 1], cosine2[most - 1] = chosen[j], cosine2[j]
+    return min(k, most)
 
 
 @device(allocates=True)
-def choose(
+def _choose(
     candidates: IntArray, tile: FloatArray, j: int, rig: Rig, frames: Frames, rule: Rule,
     tin: Tin | None, fields: Field | None, facet: int,
-) -> IntArray:  # fmt: skip
-    """Return which of the candidates give a ray to a point of the tile, in their order.
+) -> npt.NDArray[np.int32]:  # fmt: skip
+    """Return the candidates that give a ray to point j of the tile, by their places, in order.
 
-    On a mesh or raster the incidence angle is that where the ray pierces it.
+    On a mesh or raster the incidence angle is that at the piercing point.
     """
-    chosen, cosine2 = np.empty(candidates.size, np.int64), np.empty(candidates.size)
+    chosen, cosine2 = np.empty(candidates.size, np.int32), np.empty(candidates.size)
     is_limited = rule.least_cosine2 > 0.0 or rule.most < candidates.size
     x, y, z = tile[j], tile[TILE + j], tile[2 * TILE + j]
     upward = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
     k = 0
     for at in range(candidates.size):
         c = candidates[at]
+        # water that stood higher for this image: the point is lowered instead
         e, lowered = minus(row_of(rig.centres, c), (x, y, z)), (x, y, z - rig.offset[c])
-        h, height, length2 = (
-            upward[2] * (tile[3 * TILE + j] - lowered[2]),
-            dot(upward, e),
-            dot(e, e),
-        )
+        h = upward[2] * (tile[3 * TILE + j] - lowered[2])
+        height, length2 = dot(upward, e), dot(e, e)
+        # above the water, and in the frame
         if not (height > h and holds(frames, c, e)):
             continue
         if h > 0.0 and is_limited and (tin is not None or fields is not None):
             _, normal = pierce_of(c, tin, fields, lowered, e, h, upward, facet)
+            # the incidence angle at the piercing point
             height = max(dot(normal, e), 0.0)
         if height * height >= rule.least_cosine2 * length2:
             chosen[k], cosine2[k] = at, height * height / length2

@@ -1,26 +1,26 @@
 r"""Find the true point from which SfM software would have made the apparent one.
 
-Software that knows nothing of water makes of the image points x_i of a true point Q the point P
-with the least squared residuals in the images, over straight rays:
+Software that ignores water intersects straight rays: from the image points x_i of a true point Q it
+computes the point P with the least squared residuals in the images,
 
     F(Q) = argmin_P  sum_i \|x_i(Q) - pi_i(P)\|^2
 
 with pi_i the projection of camera i, distortion included, and x_i(Q) = pi_i(A_i) the image of the
 point where the light from Q to that camera leaves the water (`pcfix.refract.rays`). P is known
-and Q is looked for, so that nothing need be triangulated: at the least the derivative is zero,
+and Q is unknown, so that nothing is triangulated: at the minimum the derivative is zero,
 
     g(Q) = sum_i J_i' (x_i(Q) - pi_i(P)) = 0,    J_i = d pi_i / d P
 
-three equations for the three unknowns of Q. In `snell` the refracted rays of P are met in space,
-with equal weight; here the residuals are those that made P.
+three equations for the three unknowns of Q. `snell` intersects the refracted rays of P in space,
+with equal weights; here the residuals are those that made P.
 
-At the solution the light w_i comes from where P is seen, but for the residuals, some pixels of
+At the solution the direction w_i of the light is that of P but for the residuals, some pixels of
 thousands. P is seen in the direction -e_i, and w_i is scaled to one along the normal N, so that
 
     d x_i / d Q = (N.e_i) J_i d w_i / d Q
 
 is known to about a thousandth. From `snell`'s solution each quasi-Newton step gains about three
-digits, and two or three do; Broyden's update of the inverse mends what is missing.
+digits, and two or three are enough; Broyden's update corrects the inverse.
 """
 
 from __future__ import annotations
@@ -29,58 +29,25 @@ from typing import TypeAlias
 
 import numpy as np
 
-from pcfix.errors import SettingError
 from pcfix.kernels import Span, device, in_tiles, kernel, most_between
-from pcfix.lens.algebra import (
-    Nine,
-    Vector,
-    beyond,
-    dot,
-    inverted,
-    minus,
-    normal_of,
-    plus,
-    row_of,
-    scaled,
-    times,
-    transposed_times,
-    vector,
-)
+from pcfix.lens import algebra
+from pcfix.lens.algebra import Nine, Vector, beyond, dot, minus, normal_of, row_of, scaled, vector
 from pcfix.lens.imaging import image_in_world, image_of
 from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Outcome
-from pcfix.refract.batch import (
-    CORRECTED,
-    NO_CAMERA,
-    ONE_CAMERA,
-    PARALLEL,
-    Batch,
-    Chosen,
-    Intersection,
-    Optics,
-    optics_of,
-    warn_of_unsolved,
-)
+from pcfix.refract import batch as types
+from pcfix.refract import rays as water_rays
+from pcfix.refract.batch import Batch, Chosen, Intersection, Optics, optics_of
 from pcfix.refract.choice import shapes_of
-from pcfix.refract.rays import (
-    Path,
-    add_line,
-    direction,
-    light_path,
-    nearest_point,
-    pierce_of,
-    refracted,
-    settle_of,
-    slope_of_path,
-)
+from pcfix.refract.rays import Path, add_line, direction, light_path, nearest_point
 from pcfix.water.surface import Field, Tin, locate
 
 MAX_STEPS = 30
 CLOSE_M = 1e-7
-"""What is left of the way to the solution, judged from the last two steps."""
+"""Estimated distance from the solution, from the last two steps."""
 
 
 # Columns of the result.
-MISS, RAYS, INCIDENCE, OUTCOME, FOUND = 3, 4, 5, 6, 7
+DISTANCE, RAYS, INCIDENCE, OUTCOME, FOUND = 3, 4, 5, 6, 7
 COLUMNS = 8
 
 # Columns of a ray: e, its plane (N, h), the gradients of its image by P, that image, its origin.
@@ -88,53 +55,20 @@ _PLANE, _GRADIENTS, _IMAGE, _ORIGIN, RAY_WIDTH = 3, 7, 13, 15, 18
 
 
 def check_consistent(cameras: Cameras) -> None:
-    """Check that the method consistent can be done with cameras.
-
-    Raises
-    ------
-    SettingError
-        If they have no angles or no lenses.
-    """
-    missing = [
-        name
-        for name, value in (("angles", cameras.rotations), ("lenses", cameras.lenses))
-        if value is None
-    ]
-    if missing:
-        raise SettingError(
-            f"method consistent goes through the images, and the cameras have no"
-            f" {' and no '.join(missing)}: give cameras with interior and exterior orientation,"
-            " or use --method snell."
-        )
+    """Raise SettingError if cameras have no angles or no lenses."""
+    types.require_orientation(cameras, "Method consistent", "use method snell")
 
 
 def consistent(batch: Batch) -> Intersection:
-    """Correct points so that straight rays to the true ones' images meet in the apparent ones.
+    """Find the true points whose images give the apparent points, by straight rays.
 
-    Parameters
-    ----------
-    batch : Batch
-        Its cameras need angles and lenses. Weights of its views are not used: software
-        triangulates with all residuals alike.
+    The cameras need angles and lenses. Weights of the views are not used, as software triangulates
+    with equal weights. Light is refracted for a camera whose water stood above the true point; for
+    `snell` it is the apparent point.
 
-    Returns
-    -------
-    Intersection
-        `ray_miss_m` is the distance from the refracted rays of the apparent point, as of `snell`.
-        A point whose views are all one camera is `ONE_CAMERA`.
-        Light bends for a camera whose water stood above the true point; `snell` asks the
-        apparent one.
-
-    Raises
-    ------
-    SettingError
-        If the cameras have no angles or no lenses.
-
-    Warns
-    -----
-    PcfixWarning
-        Of points for which no true point was found; they get the solution of `snell`. That
-        happens under waves that focus the light.
+    `ray_miss_m` is the distance from the refracted rays of the apparent point, as for `snell`. A
+    point whose views are all one camera is `ONE_CAMERA`. Points without a solution, under waves
+    that focus the light, get that of `snell`, with a warning.
     """
     check_consistent(batch.survey.cameras)
     survey, result = batch.survey, np.zeros((len(batch), COLUMNS))
@@ -144,15 +78,15 @@ def consistent(batch: Batch) -> Intersection:
 
 
 def intersection_of(result: FloatArray, used: BoolArray) -> Intersection:
-    """Return the rows that kernels wrote as a result, and warn of points without a solution."""
+    """Return the rows of kernels as a result, and warn of points without a solution."""
     outcome = result[:, OUTCOME].astype(np.uint8)
     moved = outcome == Outcome.CORRECTED
-    warn_of_unsolved("method consistent found no solution", result[moved, FOUND] > 0.0)
+    types.warn_of_unsolved("method consistent found no solution", result[moved, FOUND] > 0.0)
     return Intersection(
         shift_m=result[:, :3],
         outcome=outcome,
         ray_count=result[:, RAYS].astype(np.int32),
-        ray_miss_m=result[:, MISS],
+        ray_miss_m=result[:, DISTANCE],
         sigma_z_m=np.zeros(len(result)),
         incidence_deg=result[:, INCIDENCE],
         camera_used=used,
@@ -173,12 +107,12 @@ def _correct(
 
 
 Room: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
-"""Of one point: its rays, their sums, g and the inverse of its derivative."""
+"""Temporary arrays of one point: its rays, their sums, g and the inverse of its derivative."""
 
 
 @device(allocates=True)
 def room_for(rays: int) -> Room:
-    """Return room for a point with at most so many rays."""
+    """Return temporary arrays for a point with at most `rays` rays."""
     return np.empty((rays, RAY_WIDTH)), np.empty(10), np.empty(3), np.empty((3, 3))
 
 
@@ -189,24 +123,26 @@ def correct_one(
 ) -> None:  # fmt: skip
     """Correct one point with some cameras and write its row."""
     rays, sums, g, inverse = room
-    if _are_one(cameras):
-        out[OUTCOME] = ONE_CAMERA if cameras.size else NO_CAMERA
+    one = True  # or none; a list may name a camera several times
+    for c in cameras:
+        one = one and c == cameras[0]
+    if one:
+        out[OUTCOME] = types.ONE_CAMERA if cameras.size else types.NO_CAMERA
         return
+    # the facet above the point, where piercing starts
     facet = -1 if tin is None else locate(tin, points.xyz[i, 0], points.xyz[i, 1])
     sums[:9], sums[9] = 0.0, 1.0
     for j in range(cameras.size):
         begin(rays[j], sums, points, i, cameras[j], tin, fields, facet)
         add_image(rays[j], optics, cameras[j])
-    _solve(out, rays, (sums, g, inverse), cameras, optics, points.n, tin, fields)
-
-
-@device
-def _are_one(cameras: IntArray) -> bool:
-    """Whether there is one camera at most, perhaps several times."""
-    one = True
-    for c in cameras:
-        one = one and c == cameras[0]
-    return one
+    k = float(cameras.size)
+    solved, q, _, _ = nearest_point(k, sums)
+    if not solved:
+        out[OUTCOME] = types.PARALLEL
+        return
+    found, q = _search(q, (g, inverse), rays, cameras, optics, points.n, tin, fields)
+    write_row(out, q, ray_distance(k, sums, q), k, sums[9])
+    out[FOUND] = 1.0 if found else 0.0
 
 
 @device
@@ -214,22 +150,25 @@ def begin(
     ray: FloatArray, sums: FloatArray, points: Chosen, i: int, c: int,
     tin: Tin | None, fields: Field | None, facet: int,
 ) -> None:  # fmt: skip
-    """Fill in where a ray comes from, and add its refracted line to the sums of `snell`.
+    """Fill in the geometry of a ray, and add its refracted line to the sums of `snell`.
 
-    The ray's plane is that of the water where the line from P to the camera pierces it.
+    Its plane is that of the water where the line from P to the camera pierces it.
     """
     x, y, z = row_of(points.xyz, i)
+    # water that stood higher for this image: lower the point instead
     lowered = x, y, z - points.offset[c]
     e = minus(row_of(points.centres, c), (x, y, z))
     normal = normal_of(points.slope[i, 0], points.slope[i, 1])
     h, height, length2 = normal[2] * (points.height[i] - lowered[2]), dot(normal, e), dot(e, e)
+    # a point above its water has a straight ray
     f, bend = 0.0, 1.0
     if h > 0.0:
         bend = 1.0 / points.n
-        f, normal = pierce_of(c, tin, fields, lowered, e, h, normal, facet)
+        f, normal = water_rays.pierce_of(c, tin, fields, lowered, e, h, normal, facet)
         height = dot(normal, e)
         h = f * height
-    add_line(sums, scaled(f, e), refracted(e, length2, normal, height, bend), 1.0 / length2)
+    d = water_rays.refracted(e, length2, normal, height, bend)
+    add_line(sums, scaled(f, e), d, 1.0 / length2)
     sums[9] = min(sums[9], height * height / length2)
     ray[0], ray[1], ray[2] = e
     ray[_PLANE], ray[_PLANE + 1], ray[_PLANE + 2] = normal
@@ -239,7 +178,8 @@ def begin(
 
 @device
 def add_image(ray: FloatArray, optics: Optics, c: int) -> None:
-    """Fill in where the camera images P, and how that moves with P in the world frame."""
+    """Fill in the image of P and its gradients by P in the world frame."""
+    # P is seen in the direction -e
     lens, down = optics.lenses[optics.row[c]], scaled(-1.0, vector(ray))
     u, v, by_u, by_v = image_in_world(lens, optics.rotations[c], down)
     for axis in range(3):
@@ -248,32 +188,17 @@ def add_image(ray: FloatArray, optics: Optics, c: int) -> None:
 
 
 @device
-def _solve(
-    out: FloatArray, rays: FloatArray, room: tuple[FloatArray, FloatArray, FloatArray],
-    cameras: IntArray, optics: Optics, n: float, tin: Tin | None, fields: Field | None,
-) -> None:  # fmt: skip
-    """Solve one point and write its row; the room is its sums, and that of the search."""
-    (sums, g, inverse), k = room, float(cameras.size)
-    solved, q, _, _ = nearest_point(k, sums)
-    if not solved:
-        out[OUTCOME] = PARALLEL
-        return
-    found, q = _search(q, (g, inverse), rays, cameras, optics, n, tin, fields)
-    write_row(out, q, miss(k, sums, q), k, sums[9])
-    out[FOUND] = 1.0 if found else 0.0
-
-
-@device
-def write_row(out: FloatArray, q: Vector, miss_m: float, k: float, cosine2: float) -> None:
+def write_row(out: FloatArray, q: Vector, distance: float, k: float, cosine2: float) -> None:
     """Write the row of a point with a solution."""
     out[0], out[1], out[2] = q
-    out[MISS], out[RAYS], out[OUTCOME], out[FOUND] = miss_m, k, CORRECTED, 1.0
+    out[DISTANCE], out[RAYS], out[OUTCOME], out[FOUND] = distance, k, types.CORRECTED, 1.0
     out[INCIDENCE] = np.degrees(np.arccos(np.sqrt(min(cosine2, 1.0))))
 
 
 @device
-def miss(k: float, s: FloatArray | Nine, q: Vector) -> float:
+def ray_distance(k: float, s: FloatArray | Nine, q: Vector) -> float:
     """Return the rms distance of Q from the lines of the sums, Q'MQ - 2 b'Q + s over k."""
+    # t t' summed over the rays, with zz from the trace
     x, y, z = q
     along = s[0] * x * x + s[3] * y * y + (k - s[0] - s[3]) * z * z
     along += 2.0 * (s[1] * x * y + s[2] * x * z + s[4] * y * z)
@@ -287,7 +212,7 @@ def _search(
     start: Vector, room: tuple[FloatArray, FloatArray], rays: FloatArray, cameras: IntArray,
     optics: Optics, n: float, tin: Tin | None, fields: Field | None,
 ) -> tuple[bool, Vector]:  # fmt: skip
-    """Return whether a Q was found where g is zero, and it, else the start.
+    """Return whether a Q was found where g is zero, and that Q, else the start.
 
     After a full step s = -B g the good Broyden update of the inverse B of d g / d Q is
     B + t (s'B) / (s'(s - t)), with t = -B g of the new g.
@@ -296,20 +221,26 @@ def _search(
     g, inverse = room
     inverse[:] = 0.0
     for step in range(MAX_STEPS):
-        _gradient(g, inverse[: 0 if step else 3], q, rays, cameras, optics, n, tin, fields)
-        if step == 0 and not inverted(inverse, 0.0):
+        g[:] = 0.0
+        for j in range(cameras.size):  # the derivative only in the first step
+            slope = inverse[: 0 if step else 3]
+            add_residual(g, slope, q, rays[j], cameras[j], optics, n, tin, fields)
+        if step == 0 and not algebra.inverted(inverse, 0.0):
             return False, start
-        t = scaled(-1.0, times(inverse, vector(g)))
+        # the quasi-Newton step -B g
+        t = scaled(-1.0, algebra.times(inverse, vector(g)))
         if step > 0:
-            share, along = 1.0 / (before - dot(s, t)), transposed_times(inverse, s)
+            # good Broyden update; the step then follows without another product
+            share, along = 1.0 / (before - dot(s, t)), algebra.transposed_times(inverse, s)
             for i in range(3):
                 for j in range(3):
                     inverse[i, j] += share * t[i] * along[j]
             t = scaled(share * before, t)
-        q, size2 = plus(q, t), dot(t, t)
+        q, size2 = algebra.plus(q, t), dot(t, t)
+        # NaN: some camera has no image of Q
         if not size2 < np.inf:
             return False, start
-        # the steps shrink at least as fast as the last did: what is left is about size^2 / before
+        # steps shrink at least as fast as the last one did: the rest is about size^2 / before
         if size2 <= CLOSE_M * max(CLOSE_M, np.sqrt(before)):
             return True, q
         s, before = t, size2
@@ -317,34 +248,26 @@ def _search(
 
 
 @device
-def _gradient(
-    g: FloatArray, slope: FloatArray, q: Vector, rays: FloatArray, cameras: IntArray,
-    optics: Optics, n: float, tin: Tin | None, fields: Field | None,
-) -> None:  # fmt: skip
-    """Sum up g(Q), and d g / d Q where it has rows."""
-    g[:] = 0.0
-    for j in range(cameras.size):
-        add_residual(g, slope, q, rays[j], cameras[j], optics, n, tin, fields)
-
-
-@device
 def add_residual(
     g: FloatArray, slope: FloatArray, q: Vector, ray: FloatArray, c: int, optics: Optics, n: float,
     tin: Tin | None, fields: Field | None,
 ) -> None:  # fmt: skip
-    """Add what one ray says to g(Q), and to d g / d Q where it has rows."""
+    """Add the residual of one ray to g(Q), and its part of d g / d Q if `slope` has rows."""
     e, plane = vector(ray), ray[_PLANE:_GRADIENTS]
+    # under waves the plane of the ray moves with Q
     if tin is not None or fields is not None:
-        settle_of(c, plane, tin, fields, ray[_ORIGIN:], q, e, n)
+        water_rays.settle_of(c, plane, tin, fields, ray[_ORIGIN:], q, e, n)
     normal = vector(plane)
     path = light_path(q, e, normal, plane[3], n)
-    w = times(optics.rotations[c], direction(path, normal))
+    # the direction of the light in the frame of the camera
+    w = algebra.times(optics.rotations[c], direction(path, normal))
     u, v = image_of(optics.lenses[optics.row[c]], *w)
+    # the residual in pixels
     du, dv = u - ray[_IMAGE], v - ray[_IMAGE + 1]
     for i in range(3):
         g[i] += ray[_GRADIENTS + i] * du + ray[_GRADIENTS + 3 + i] * dv
     if len(slope):
-        _add_slope(slope, ray, path, slope_of_path(path, normal, n))
+        _add_slope(slope, ray, path, water_rays.slope_of_path(path, normal, n))
 
 
 @device
@@ -355,6 +278,7 @@ def _add_slope(slope: FloatArray, ray: FloatArray, path: Path, by_q: Vector) -> 
     for image in range(2):
         at = _GRADIENTS + 3 * image
         j = vector(ray, at)
+        # k (I - N N') J + (J.s) grad k
         across = minus(j, scaled(dot(j, normal), normal))
         d = scaled(height, beyond(scaled(k, across), dot(j, s), by_q))
         for i in range(3):

@@ -1,14 +1,14 @@
-r"""Where dense matching puts a point under water, and how to undo exactly that.
+r"""Compute where dense matching puts a point under water, and invert that.
 
-A dense cloud is not triangulated from tracks. For one image after the other the matcher finds how
-deep each pixel lies along its own ray, so that the images it is compared with agree best: a depth
-map. Then each depth is averaged with those of neighbouring maps that see the same place, and the
-maps are fused: a point is the weighted mean of the depths of several images, each along its own
-ray. Under water these depths differ, as each depends on where the compared images stand.
+A dense cloud is not triangulated from tracks. For each image the matcher finds the depth of every
+pixel along its own ray at which the compared images agree best: a depth map. Then each depth is
+averaged with those of neighbouring maps that see the same place, and the maps are fused: a point
+is the weighted mean of the depths of several images, each along its own ray. Under water these
+depths differ, as each depends on the positions of the compared images.
 
-The model, for an apparent point P, a bed at the height z, level around P, and one image i:
+The model, for an apparent point P, a level bed at the height z, and one image i:
 
-1. The ray from the projection centre i through P bends into the water and meets the bed in Q_i.
+1. The ray from the projection centre i through P is refracted and meets the bed in Q_i.
 2. From Q_i the light goes back to the images j that i was matched with; each sees Q_i in the
    direction a_ij.
 3. The depth map has P + t u_i on the ray u_i, where the two images that agree best agree: for
@@ -17,9 +17,8 @@ The model, for an apparent point P, a bed at the height z, level around P, and o
    images; which these are changes from pixel to pixel.
 
 The fused point is P where sum_i W_i t_i u_i = 0 along the vertical: one equation for z. The true
-point is the mean of the Q_i with the same weights.
-
-A level bed will do: a slope of it moves the Q_i and the directions a_ij nearly alike.
+point is the mean of the Q_i with the same weights. The bed may be taken as level, because a slope
+moves the Q_i and the directions a_ij nearly alike.
 """
 
 from __future__ import annotations
@@ -39,8 +38,8 @@ from pcfix.refract.batch import (
     Batch,
     Chosen,
     Intersection,
-    as_made,
-    as_now,
+    to_adjusted,
+    to_original,
 )
 from pcfix.refract.cells import CUBIC
 from pcfix.refract.map_table import USUAL, Block, Table, has_terms, meet, read_table
@@ -49,30 +48,30 @@ from pcfix.refract.rays import direction, light_path, refracted
 
 MAX_LOOKS = 5
 CLOSE_M = 0.002
-"""Between two looks; what is left is mended in a straight line."""
+"""Step of the bed below which the rest is linear."""
 
 NEAR_PX = 2.0
-"""Beside a table, which has how the depths change with the bed, in pixels on the ground."""
+"""The same with polynomials, which have the change of the depths, in ground pixels."""
 
 LIKELY, LEAST_DEPTH_M = 1.1, 0.005
-"""Below the apparent point, in terms of what the index alone would have; depths near nothing."""
+"""Likely height of the bed, in terms of (n - 1) times the depth; the least depth."""
 
 RISE, STEEP = 0.1, 0.3
-"""How far away from a bed, relative, the second look goes; by how much more or less than usual a
-depth may change on the way there, before it is taken to be of other images."""
+"""Relative height of the second look; the largest relative change of a depth on the way there
+beyond the usual one. A larger change comes from other images."""
 
 LEAST_CHANGE, MOST_CHANGE = 0.35, 1.5
-"""Between these is how much the apparent depth grows with that of the bed along a ray."""
+"""Range of the change of the apparent depth with that of the bed along a ray."""
 
 NOTHING = 20.0
-"""exp(-this) is not worth the time that it takes."""
+"""exp(-NOTHING) is neglected."""
 
 AVERAGED_WITHIN = 0.012
 """Depths of neighbouring maps that differ by less, relative, are averaged before the fusion."""
 
-_MISS, AMBIGUITY, OUTCOME, _COUNT = 3, 4, 5, 6
+_DISTANCE, AMBIGUITY, OUTCOME, _COUNT = 3, 4, 5, 6
 COLUMNS = 7
-"""Of what the kernels write: the shift, and these."""
+"""Columns that the kernels write: the shift, and these."""
 
 
 class Sight(NamedTuple):
@@ -80,8 +79,8 @@ class Sight(NamedTuple):
 
     Attributes
     ----------
-    now, made : Vector
-        Where it is, and where the matcher had it, world frame.
+    now, original : Vector
+        Its place now and in the original model, world frame.
     above : float
         Height of the water over it, along the normal, metres.
     normal : Vector
@@ -89,22 +88,22 @@ class Sight(NamedTuple):
     """
 
     now: Vector
-    made: Vector
+    original: Vector
     above: float
     normal: Vector
 
 
 class Room(NamedTuple):
-    """Room for one point and the k images, so that no kernel makes arrays.
+    """Temporary arrays for one point and the k images.
 
     t, slope : shape (k,), of `Lines`.
-    weight, own, now : shape (k,), what each map counts for, all in all and by itself, and its depth
-    as it is now.
+    weight, own, now : shape (k,), the weight of each map with what is averaged into it and without,
+    and its depth.
     looks : shape (k, 6), of `_look`.
     partners : shape (partners, 3), of `_compare`.
     pairs : shape (pairs of partners, 2), of `best_pairs`.
     powers : of the polynomials of a cell.
-    place, found : shape (k,), where each image is among those found, and these.
+    place, found : shape (k,), the place of each image among those found, and these images.
     """
 
     t: FloatArray
@@ -122,7 +121,7 @@ class Room(NamedTuple):
 
 @device(allocates=True)
 def room_for(k: int) -> Room:
-    """Return new room, in which no image has a place."""
+    """Return temporary arrays in which no image has a place."""
     return Room(
         np.empty(k), np.empty(k), np.empty(k), np.empty(k), np.empty(k), np.empty((k, 6)),
         np.empty((MATCHED, 3)), np.empty((MATCHED * MATCHED, 2)), np.empty(CUBIC),
@@ -135,36 +134,24 @@ def sight_of(points: Chosen, i: int) -> Sight:
     """Return point i."""
     normal = row_of(points.normals, i)
     above = normal[2] * (points.height[i] - points.xyz[i, 2])
-    return Sight(row_of(points.xyz, i), row_of(points.made_xyz, i), above, normal)
+    return Sight(row_of(points.xyz, i), row_of(points.original_xyz, i), above, normal)
 
 
 @device
-def _up(sight: Sight, points: Chosen, c: int) -> Vector:
-    """Return the way from the point to the projection centre."""
-    return minus(row_of(points.centres, c), sight.now)
-
-
-@device
-def made_up(sight: Sight, block: Block, c: int) -> Vector:
-    """Return the way from the point to the projection centre as the matcher had both."""
+def original_up(sight: Sight, block: Block, c: int) -> Vector:
+    """Return the vector from the point to the projection centre, both of the original model."""
     if len(block.images.centres) == 0:
-        return _up(sight, block.points, c)
-    return minus(row_of(block.images.centres, c), sight.made)
-
-
-@device
-def _above(sight: Sight, points: Chosen, c: int) -> float:
-    """Return how high the water of an image is over the point."""
-    return sight.above + sight.normal[2] * points.offset[c]
+        return minus(row_of(block.points.centres, c), sight.now)
+    return minus(row_of(block.images.centres, c), sight.original)
 
 
 def intersection_of(batch: Batch, result: FloatArray) -> Intersection:
     """Return the rows that the kernels wrote as a result; its `sigma_z_m` is the ambiguity.
 
-    The rays are those of the depth maps that count, averaged ones included.
+    The rays are those of the depth maps with a weight, averaged ones included.
     """
     found = batch.result(
-        result[:, :3], outcome=result[:, OUTCOME].astype(np.uint8), ray_miss_m=result[:, _MISS]
+        result[:, :3], outcome=result[:, OUTCOME].astype(np.uint8), ray_miss_m=result[:, _DISTANCE]
     )
     moved = found.outcome == CORRECTED
     return found._replace(
@@ -177,15 +164,15 @@ ABSENT = -1
 
 
 class Lines(NamedTuple):
-    """How the depth of each map changes with the height of the bed, nearly in a line.
+    """The depth of each map as a linear function of the height of the bed.
 
     Attributes
     ----------
     bed : float
         A height of the bed, relative to the apparent point, metres.
     t, slope : array, shape (maps,)
-        How far beyond the apparent point the map has that bed, relative to the distance from the
-        camera, and the change of it with the height, 1/m. NaN where it has none.
+        The depth of that bed in the map beyond the apparent point, relative to the distance from
+        the camera, and its change with the height, 1/m. NaN where it has none.
     """
 
     bed: float
@@ -198,7 +185,7 @@ def look(
     maps: IntArray, weight: FloatArray, bed: float, sight: Sight, block: Block, table: Table,
     room: Room,
 ) -> None:  # fmt: skip
-    """Look at a bed with the depth maps of those images that have a weight; see `_look`."""
+    """Compute the depths of a bed in the maps of those images that have a weight; see `_look`."""
     for q in range(maps.size):
         if weight[q] > 0.0:
             _look(room.looks[q], maps[q], bed, sight, block, table, room)
@@ -210,8 +197,8 @@ def find_lines(
 ) -> None:
     """Fill in the lines of the depth maps of some images.
 
-    How a depth changes with the bed is known from a second look; in a cell with polynomials the
-    first of its points has that for all.
+    The slope of a line comes from a second bed; in a cell with polynomials the first point
+    provides the slopes for all.
     """
     again, rise = room.now[: maps.size], min(RISE * lines.bed, -LEAST_DEPTH_M)
     for q in range(maps.size):
@@ -226,7 +213,8 @@ def find_lines(
         usual, lines.t[q] = room.looks[q, 5], room.looks[q, 0]
         if again[q] > 0.0:
             steep = (lines.slope[q] - lines.t[q]) / (rise * usual)
-            steep = steep if abs(steep - 1.0) < STEEP else 1.0  # other images are the best there
+            # beyond that range other images agree best at the second bed
+            steep = steep if abs(steep - 1.0) < STEEP else 1.0
             room.looks[q, 5] *= steep
             if has_terms(table, maps[q]):
                 table.steep[maps[q]] = steep
@@ -239,13 +227,14 @@ def likely_bed(sight: Sight, block: Block) -> float:
     points, above = block.points, 0.0
     for c in range(len(points.offset)):
         above += points.offset[c]
+    # the mean water level of all images
     above = sight.above + sight.normal[2] * above / len(points.offset)
     return -LIKELY * max(above, LEAST_DEPTH_M) / sight.normal[2] * (points.n - 1.0)
 
 
 @device
 def balance(t: FloatArray, slope: FloatArray, weight: FloatArray) -> float:
-    """Return how far up the bed must go so that the weighted mean of the depths is zero."""
+    """Return how far up the bed is at which the weighted mean of the depths is zero."""
     total, change = 0.0, 0.0
     for q in range(t.size):
         if weight[q] > 0.0 and slope[q] == slope[q]:
@@ -258,10 +247,9 @@ def settle_bed(
     row: FloatArray, maps: IntArray, weight: FloatArray, depths: Lines, sight: Sight,
     block: Block, table: Table, room: Room,
 ) -> None:  # fmt: skip
-    """Find the height of the bed at which the fused depths give the apparent point, and write it.
+    """Find the height of the bed at which the fused depths give the apparent point; write the row.
 
-    From where the lines, which were looked at last, say, and looked at again until they need not be
-    mended.
+    Starts from the lines that were computed last and repeats until the steps are small.
     """
     row[OUTCOME] = NO_CAMERA if maps.size == 0 else ONE_CAMERA
     bed, looks, near = depths.bed, room.looks[: maps.size], CLOSE_M
@@ -270,6 +258,7 @@ def settle_bed(
         c = maps[0]
         near = max(near, NEAR_PX * _length(sight, block, c) / block.matcher.focal_px[c])
     for _ in range(MAX_LOOKS):
+        # no image with a weight sees the bed
         if not np.isfinite(step):
             return
         if abs(step) <= near:
@@ -277,6 +266,7 @@ def settle_bed(
         bed += step
         look(maps, weight, bed, sight, block, table, room)
         step = balance(looks[:, 0], looks[:, 5], weight)
+    # the true point is the weighted mean of the Q_i, moved by the rest of the step
     total, x, y, squares, count = 0.0, 0.0, 0.0, 0.0, 0.0
     for q in range(maps.size):
         if weight[q] > 0.0 and looks[q, 5] == looks[q, 5]:
@@ -287,7 +277,7 @@ def settle_bed(
     if not (np.isfinite(step) and np.isfinite(squares)):
         return
     row[0], row[1], row[2] = x / total, y / total, bed + step
-    row[_MISS] = np.sqrt(max(squares / total - row[0] ** 2 - row[1] ** 2, 0.0))
+    row[_DISTANCE] = np.sqrt(max(squares / total - row[0] ** 2 - row[1] ** 2, 0.0))
     row[OUTCOME], row[_COUNT] = CORRECTED, count
 
 
@@ -295,20 +285,21 @@ def settle_bed(
 def _look(
     out: FloatArray, c: int, bed: float, sight: Sight, block: Block, table: Table, room: Room
 ) -> None:
-    """Say where the depth map of image c has a bed at a height relative to the apparent point.
+    """Compute the depth of a bed, at a height relative to the apparent point P, in one depth map.
 
-    Writes how far beyond P, relative to the distance from the camera, the place on the bed, how
-    that moves with the height, and how the first does, nearly. NaN where none of the images that
-    it was matched with sees the bed there.
+    Writes the depth beyond P, relative to the distance from the camera; the place Q on the bed
+    (x, y); its change with the height (x, y); and approximately that of the depth. NaN where no
+    partner of image c sees the bed there.
     """
     n, normal = block.points.n, sight.normal
     a, e, above = _ray(c, sight, block)
+    # H and L^2; f leads to the piercing point, as in `rays`
     across, length2 = dot(normal, e), dot(e, e)
     per_across, length = 1.0 / across, np.sqrt(length2)
     f, bend = (above * per_across, 1.0 / n) if above > 0.0 else (0.0, 1.0)
     d = refracted(e, length2, normal, across, bend)
     a, down = beyond(a, f, e), 1.0 / d[2]
-    s = (bed - a[2]) * down
+    s = (bed - a[2]) * down  # along the refracted ray from the water to the bed
     q = a[0] + s * d[0], a[1] + s * d[1], bed
     out[1], out[2] = q[0], q[1]
     out[3], out[4] = d[0] * down, d[1] * down
@@ -316,6 +307,7 @@ def _look(
     away, per_depth = length, length * per_across
     if len(block.images.centres):
         length = _length(sight, block, c)
+    # from the polynomials, or exactly where these do not reach
     if has_terms(table, c):
         usual = away - under + USUAL * depth * per_depth - length
         count = read_table(room.partners, room.powers, table, c, plus(sight.now, q), usual, block)
@@ -323,6 +315,7 @@ def _look(
         count = _compare(room.partners, c, q, length, sight, block)
     t = best_pairs(room.partners[:count], room.pairs, block.matcher.tolerance_px2)
     out[0] = t / length
+    # the change of the depth with the bed is nearly that of the whole water column
     change = (t + under) / depth if depth > LEAST_DEPTH_M else per_depth / n
     change = min(max(change, LEAST_CHANGE * per_depth), MOST_CHANGE * per_depth)
     steep = 1.0
@@ -333,22 +326,24 @@ def _look(
 
 @device
 def _length(sight: Sight, block: Block, c: int) -> float:
-    """Return how far the point is from the projection centre, as the matcher had both, metres."""
-    made = made_up(sight, block, c)
-    return np.sqrt(dot(made, made))
+    """Return the distance of the point from the projection centre in the original model, metres."""
+    up = original_up(sight, block, c)
+    return np.sqrt(dot(up, up))
 
 
 @device
 def _ray(c: int, sight: Sight, block: Block) -> tuple[Vector, Vector, float]:
     """Return the ray on which image c shows the point.
 
-    Where it passes the point, relative to it, the way from there to the projection centre, and how
-    high the water is over there.
+    Its nearest place to the point, relative to the point; the vector from there to the projection
+    centre; and the height of the water over that place, metres.
     """
-    up, above = _up(sight, block.points, c), _above(sight, block.points, c)
+    up = minus(row_of(block.points.centres, c), sight.now)
+    above = sight.above + sight.normal[2] * block.points.offset[c]
     if len(block.images.centres) == 0:
         return (0.0, 0.0, 0.0), up, above
-    d = as_now(block.images, c, scaled(-1.0, made_up(sight, block, c)))
+    # the ray of the original image, in the adjusted camera
+    d = to_adjusted(block.images, c, scaled(-1.0, original_up(sight, block, c)))
     e = scaled(dot(up, d) / dot(d, d), d)
     a = minus(up, e)
     return a, e, above - dot(sight.normal, a)
@@ -358,35 +353,37 @@ def _ray(c: int, sight: Sight, block: Block) -> tuple[Vector, Vector, float]:
 def _compare(
     partners: FloatArray, c: int, q: Vector, length: float, sight: Sight, block: Block
 ) -> int:
-    """Write what the images that image c was matched with say of a bed at Q; return how many do.
+    """Write what the partners of image c see of a bed at Q; return how many see it.
 
-    How far beyond P, m along its ray, each has it, its squared residual, px^2, and half of how that
-    curves, px^2/m^2. The light goes as it does; where it seems to come from, and P and its ray, are
-    as the matcher had them.
+    The depth beyond P along the ray of c (m), its squared residual (px^2) and half the curvature of
+    that (px^2/m^2). The light path is the true one; its direction in the image, P and the ray are
+    those of the original model.
     """
-    points, matcher, made = block.points, block.matcher, made_up(sight, block, c)
-    u, count = scaled(-1.0 / length, made), 0
+    points, matcher, original = block.points, block.matcher, original_up(sight, block, c)
+    u, count = scaled(-1.0 / length, original), 0
     for j in matcher.matched[c]:
         if j < 0:
             break
-        up, above = _up(sight, points, j), _above(sight, points, j)
+        up = minus(row_of(points.centres, j), sight.now)
+        above = sight.above + sight.normal[2] * points.offset[j]
         path = light_path(q, up, sight.normal, above, points.n)
-        a = as_made(block.images, j, direction(path, sight.normal))
+        a = to_original(block.images, j, direction(path, sight.normal))
         if not (path[0] == path[0] and holds(matcher.inner, j, scaled(-1.0, a))):
             continue
-        base = minus(made, made_up(sight, block, j))
-        away, miss, partners[count, 2] = meet(u, unit(a), base, matcher.focal_px[j])
-        partners[count, 0], partners[count, 1] = away - length, miss * miss
+        base = minus(original, original_up(sight, block, j))
+        # where the ray of j, as the original model has it, is nearest to that of c
+        away, residual, partners[count, 2] = meet(u, unit(a), base, matcher.focal_px[j])
+        partners[count, 0], partners[count, 1] = away - length, residual * residual
         count += 1
     return count
 
 
 @device
 def best_pairs(partners: FloatArray, pairs: FloatArray, tolerance: float) -> float:
-    """Return the depth at which two images agree best: a mean over the pairs, the best most.
+    """Return the depth at which two images agree best, as a weighted mean over the pairs.
 
-    See `_compare`; NaN without a partner, and that of a single one where it has its least. `pairs`
-    is room for the squared residuals of two images at the depth that they have together, and it.
+    See `_compare`. NaN without a partner; of a single partner its own depth. `pairs` gets the
+    squared residuals of two images at their common depth, and that depth.
     """
     count, least = 0, np.inf
     if len(partners) < 2:
@@ -394,12 +391,14 @@ def best_pairs(partners: FloatArray, pairs: FloatArray, tolerance: float) -> flo
     for p in range(len(partners)):
         for q in range(p + 1, len(partners)):
             a, b = partners[p, 2], partners[q, 2]
+            # the minimum of the sum of two parabolas
             off, share = partners[q, 0] - partners[p, 0], b / (a + b)
             cost = partners[p, 1] + partners[q, 1] + a * share * off * off
             pairs[count, 0], pairs[count, 1] = cost, partners[p, 0] + share * off
             least, count = min(least, cost), count + 1
     total, sum_t = 0.0, 0.0
     for p in range(count):
+        # the weights fall off by e for each `tolerance` of squared residuals
         worse = (pairs[p, 0] - least) / tolerance
         if worse < NOTHING:
             w = np.exp(-worse)

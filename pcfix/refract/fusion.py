@@ -1,45 +1,37 @@
-"""Which depth maps were fused into a point, where no list says it.
+"""Undo the fusion of depth maps into points.
 
 The software takes one image's pixel, the seed, and fuses with it the depth maps of its neighbours
-that agree; what they showed is used up, and later seeds fuse what is left. So the points of a place
-come from a few groups of images, and each group has the bed at another apparent height: where
-there are obliques, a metre apart under deep water.
+that agree. What they showed is used up, and later seeds fuse what is left. So the points of a place
+come from a few groups of images, and each group has the bed at another apparent height: a metre
+apart under deep water, where there are obliques.
 
-For each image that sees the point the model fuses what would agree with it as the seed, and says
-at which height the bed would lie if that group had made the point: the likely beds. Neighbouring
-points are of different groups, and only the true bed is among the likely ones of all; so the
-height that most points around can have come from, the bed of the surroundings
-(`pcfix.refract.matcher`), tells which group made each of them.
+*With a view list* the fused maps are known. Each counts by its weight, that of the list or one by
+its squared distance. The maps that were averaged into it before (`pcfix.refract.depth_maps`) share
+that weight.
+
+*Without a list* the model fuses, for each image that sees the point, the maps that would agree with
+it as the seed, and computes the height of the bed if that group had made the point: the likely
+beds. Neighbouring points come from different groups, and only the true bed is among the likely ones
+of all. So the height that most points around can have come from, the bed of the surroundings
+(`pcfix.refract.matcher`), identifies the group of each point.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import dot
+from pcfix.lens.frames import holds
 from pcfix.model import FloatArray, IntArray
+from pcfix.refract import depth_maps
 from pcfix.refract.batch import Batch, Intersection
 from pcfix.refract.cells import are_same, cameras_of, cells_of, counts_of, is_quick
-from pcfix.refract.depth_maps import (
-    ABSENT,
-    AMBIGUITY,
-    AVERAGED_WITHIN,
-    COLUMNS,
-    Lines,
-    Room,
-    Sight,
-    find_lines,
-    intersection_of,
-    likely_bed,
-    made_up,
-    room_for,
-    settle_bed,
-    sight_of,
-)
+from pcfix.refract.depth_maps import ABSENT, AVERAGED_WITHIN, Lines, Room, Sight
 from pcfix.refract.map_table import LEAST_POINTS, Block, Table, block_of, no_table, reads, table_of
 from pcfix.refract.matcher import WIDTH_M, Matcher
 
@@ -47,8 +39,14 @@ AGREE = 0.01
 """Depths that differ by less, relative, are fused."""
 
 SHALLOW, DEEP = 0.3, 3.5
-"""Where the bed of the surroundings is looked for at first, in likely heights: outliers have it
-elsewhere."""
+"""Range of the bed of the surroundings, in likely heights; outliers have it elsewhere."""
+
+_ROUNDS, _BEDS = 4, 3
+FAR = 0.1
+"""Of the way to the bed: farther off, it is decided anew which depths were averaged."""
+
+LEAST_LIKELY, MOST_LIKELY = 0.7, 2.0
+_OUTSIDE = -2
 
 
 def invert_fusion(batch: Batch) -> Intersection:
@@ -62,13 +60,13 @@ def invert_fusion(batch: Batch) -> Intersection:
     """
     bed = batch.survey.learned.bed
     around = np.full(len(batch.xyz), np.nan) if bed is None else bed.height_at(batch.xyz[:, :2])
-    result = np.zeros((len(batch.xyz), COLUMNS))
-    _in_cells(batch, _invert, around, result)
-    return intersection_of(batch, result)
+    result = np.zeros((len(batch.xyz), depth_maps.COLUMNS))
+    _in_cells(batch, _fuse_cells, around, result, np.zeros((0, 0), np.float32))
+    return depth_maps.intersection_of(batch, result)
 
 
 def likely_beds(batch: Batch) -> FloatArray:
-    """Return the heights of the bed that different groups of images would have made points of.
+    """Return the heights of the bed from which different groups of images would have made points.
 
     Returns
     -------
@@ -76,11 +74,30 @@ def likely_beds(batch: Batch) -> FloatArray:
         Relative to each apparent point, metres; NaN where there is none.
     """
     likely = np.full((len(batch.xyz), max(1, batch.counts.max(initial=0))), np.nan, np.float32)
-    _in_cells(batch, _likely, likely)
+    _in_cells(batch, _fuse_cells, np.zeros(0), np.zeros((0, 0)), likely)
     return likely
 
 
-def _in_cells(batch: Batch, run: Callable[..., None], *given: FloatArray) -> None:
+def invert_depth_maps(batch: Batch) -> Intersection:
+    """Return the true points from which dense matching would have made the apparent ones.
+
+    Parameters
+    ----------
+    batch : Batch
+        Its views are the images whose depth maps were fused, with their weights;
+        `batch.survey.learned.matcher` has how they were matched.
+
+    Notes
+    -----
+    The surface above each point is taken as a plane.
+    """
+    weights, result = batch.rays.weight, np.zeros((len(batch.xyz), depth_maps.COLUMNS))
+    given = np.zeros(0) if weights is None else weights.astype(np.float64)
+    _in_cells(batch, _invert_listed, given, result)
+    return depth_maps.intersection_of(batch, result)
+
+
+def _in_cells(batch: Batch, run: Callable[..., None], *given: npt.NDArray[Any]) -> None:
     order, first = cells_of(batch)
     in_tiles(
         run, len(first) - 1, (order, first), block_of(batch), is_quick(batch), *given,
@@ -89,24 +106,24 @@ def _in_cells(batch: Batch, run: Callable[..., None], *given: FloatArray) -> Non
 
 
 class Groups(NamedTuple):
-    """Which of a point's depth maps were averaged and fused with which, for kernels.
+    """Which of the k depth maps of a point were averaged and fused with which, for kernels.
 
     Attributes
     ----------
     averaged, fused : array, shape (k, 9) and (k, 13)
-        For each map itself and the others, by their places among those of the point; -1 after the
-        last.
+        For each map itself and its partners, by their places among those of the point; -1 after
+        the last.
     place : array, shape (k,)
-        Of each image among those of the point, or -1.
+        The place of each image among those of the point, or -1.
     share : array, shape (k,)
-        What each map counts for.
+        The weight of each map.
     depth, change : array, shape (k,)
-        Of each map as it is averaged, relative, and how that changes with the height of the bed.
+        The averaged depth of each map, relative, and its change with the height of the bed, 1/m.
     rise, size : array, shape (k,)
-        How far up the bed is if the group of each seed made the point, metres, and how many maps
-        are in it.
+        How far up the bed is if the group of each seed made the point, metres, and the number of
+        maps in the group.
     own : array, shape (k,)
-        Depth of each map by itself.
+        The depth of each map before it is averaged.
     """
 
     averaged: IntArray
@@ -118,17 +135,6 @@ class Groups(NamedTuple):
     rise: FloatArray
     size: FloatArray
     own: FloatArray
-
-
-@device(allocates=True)
-def _no_groups(block: Block) -> Groups:
-    k, matcher = len(block.points.centres), block.matcher
-    return Groups(
-        np.full((k, matcher.averaged.shape[1] + 1), ABSENT),
-        np.full((k, matcher.fused.shape[1] + 1), ABSENT),
-        np.full(k, ABSENT), np.empty(k), np.empty(k), np.empty(k), np.empty(k), np.empty(k),
-        np.empty(k),
-    )  # fmt: skip
 
 
 @device
@@ -145,6 +151,7 @@ def _group(groups: Groups, maps: IntArray, matcher: Matcher) -> None:
 @device
 def _place(members: IntArray, q: int, others: IntArray, place: IntArray) -> None:
     """Write a place and those of other images that have one."""
+    # the map itself comes first
     members[0], count = q, 1
     for c in others:
         if c >= 0 and place[c] >= 0:
@@ -153,11 +160,20 @@ def _place(members: IntArray, q: int, others: IntArray, place: IntArray) -> None
 
 
 @kernel(allocates=True)
-def _likely(
-    span: Span, cells: tuple[IntArray, IntArray], block: Block, quick: bool, likely: FloatArray
-) -> None:
+def _fuse_cells(
+    span: Span, cells: tuple[IntArray, IntArray], block: Block, quick: bool, around: FloatArray,
+    result: FloatArray, likely: FloatArray,
+) -> None:  # fmt: skip
+    """Invert the fusion of the points of each cell or, where `likely` has rows, fill these in."""
     points, (order, first) = block.points, cells
-    room, none, groups = room_for(len(points.centres)), no_table(), _no_groups(block)
+    room, none = depth_maps.room_for(len(points.centres)), no_table()
+    k, matcher = len(points.centres), block.matcher
+    groups = Groups(
+        np.full((k, matcher.averaged.shape[1] + 1), ABSENT),
+        np.full((k, matcher.fused.shape[1] + 1), ABSENT),
+        np.full(k, ABSENT), np.empty(k), np.empty(k), np.empty(k), np.empty(k), np.empty(k),
+        np.empty(k),
+    )  # fmt: skip
     for cell in range(*span):
         rows = order[first[cell] : first[cell + 1]]
         fitted = none
@@ -165,46 +181,28 @@ def _likely(
             fitted = table_of(rows, counts_of(rows, points) > 0, block)
         for at in range(rows.size):
             i, maps = rows[at], cameras_of(points, rows[at])
+            # points with the same cameras share their groups
             if at == 0 or not are_same(maps, cameras_of(points, rows[at - 1])):
                 _group(groups, maps, block.matcher)
             table = fitted if reads(fitted, points, i) else none
-            _likely_of(likely[i], i, maps, groups, block, table, room)
+            if len(likely):
+                _set_likely(likely[i], i, maps, groups, block, table, room)
+            else:
+                _invert_one(result[i], i, maps, around[i], groups, block, table, room)
 
 
 @device
-def _likely_of(
+def _set_likely(
     likely: FloatArray, i: int, maps: IntArray, groups: Groups, block: Block, table: Table,
     room: Room,
 ) -> None:  # fmt: skip
-    sight = sight_of(block.points, i)
-    t, slope = room.t[: maps.size], room.slope[: maps.size]
-    depths = Lines(likely_bed(sight, block), t, slope)
-    find_lines(depths, maps, sight, block, table, room)
-    _set_shares(groups.share, maps, sight, block)
-    _set_rises(groups, depths)
+    """Write the height of the bed if the group of each seed had made the point."""
+    sight = depth_maps.sight_of(block.points, i)
+    bed = depth_maps.likely_bed(sight, block)
+    depths = _rises_of(bed, maps, groups, sight, block, table, room)
     for seed in range(maps.size):
         if depths.slope[seed] == depths.slope[seed]:
             likely[seed] = depths.bed + groups.rise[seed]
-
-
-@kernel(allocates=True)
-def _invert(
-    span: Span, cells: tuple[IntArray, IntArray], block: Block, quick: bool, around: FloatArray,
-    result: FloatArray,
-) -> None:  # fmt: skip
-    points, (order, first) = block.points, cells
-    room, none, groups = room_for(len(points.centres)), no_table(), _no_groups(block)
-    for cell in range(*span):
-        rows = order[first[cell] : first[cell + 1]]
-        fitted = none
-        if quick and rows.size >= LEAST_POINTS:
-            fitted = table_of(rows, counts_of(rows, points) > 0, block)
-        for at in range(rows.size):
-            i, maps = rows[at], cameras_of(points, rows[at])
-            if at == 0 or not are_same(maps, cameras_of(points, rows[at - 1])):
-                _group(groups, maps, block.matcher)
-            table = fitted if reads(fitted, points, i) else none
-            _invert_one(result[i], i, maps, around[i], groups, block, table, room)
 
 
 @device
@@ -212,48 +210,58 @@ def _invert_one(
     row: FloatArray, i: int, maps: IntArray, around: float, groups: Groups, block: Block,
     table: Table, room: Room,
 ) -> None:  # fmt: skip
-    sight = sight_of(block.points, i)
-    wanted, bed = around - sight.now[2], likely_bed(sight, block)
-    if wanted == wanted:
+    """Find the group that made a point, and invert the fusion of its maps."""
+    sight = depth_maps.sight_of(block.points, i)
+    wanted, bed = around - sight.now[2], depth_maps.likely_bed(sight, block)
+    if wanted == wanted:  # the bed of the surroundings is known
         bed = max(min(wanted, SHALLOW * bed), DEEP * bed)
-    depths = Lines(bed, room.t[: maps.size], room.slope[: maps.size])
-    find_lines(depths, maps, sight, block, table, room)
-    _set_shares(groups.share, maps, sight, block)
-    seed, rise, row[AMBIGUITY] = _best_seed(groups, depths, wanted - bed)
+    depths = _rises_of(bed, maps, groups, sight, block, table, room)
+    seed, rise, row[depth_maps.AMBIGUITY] = _best_seed(groups, depths, wanted - bed)
     weight = room.weight[: maps.size]
     weight[:] = 0.0
     if seed >= 0:
         _weigh(weight, seed, rise, groups, depths)
-    settle_bed(row, maps, weight, depths, sight, block, table, room)
+    depth_maps.settle_bed(row, maps, weight, depths, sight, block, table, room)
 
 
 @device
-def _set_shares(share: FloatArray, maps: IntArray, sight: Sight, block: Block) -> None:
+def _rises_of(
+    bed: float, maps: IntArray, groups: Groups, sight: Sight, block: Block, table: Table,
+    room: Room,
+) -> Lines:  # fmt: skip
+    """Set the weights of the depth maps and the rises of their groups; return their lines."""
+    depths = Lines(bed, room.t[: maps.size], room.slope[: maps.size])
+    depth_maps.find_lines(depths, maps, sight, block, table, room)
     for q in range(maps.size):
-        made = made_up(sight, block, maps[q])
-        share[q] = 1.0 / dot(made, made)
+        # the pixel on the ground grows with the distance
+        up = depth_maps.original_up(sight, block, maps[q])
+        groups.share[q] = 1.0 / dot(up, up)
+    _set_rises(groups, depths)
+    return depths
 
 
 @device
 def _best_seed(groups: Groups, depths: Lines, wanted: float) -> tuple[int, float, float]:
-    """Return the seed whose group has the bed nearest to the wanted height, or the largest one.
+    """Return the seed of the group that made the point, its rise, and the ambiguity.
 
-    And that bed, and how far apart (m, standard deviation) the beds are of the groups that it can
-    have been.
+    That is the group whose bed is nearest to the wanted height or, where this is NaN, the largest.
+    The ambiguity is the standard deviation (m) of the beds of all groups that are likely.
     """
     best, at_best, least, known = -1, 0.0, np.inf, wanted == wanted
-    total, first, second = 0.0, 0.0, 0.0
-    _set_rises(groups, depths)
+    total, first, second = 0.0, 0.0, 0.0  # sum, and moments, of what is likely
     for seed in range(depths.t.size):
+        # the seed has no depth of this bed
         if depths.slope[seed] != depths.slope[seed]:
             continue
         rise = groups.rise[seed]
+        # distance from the wanted bed, or else the larger group first
         misfit = abs(rise - wanted) if known else -groups.size[seed]
         if misfit < least:
             best, at_best, least = seed, rise, misfit
         likely = np.exp(-0.5 * (misfit / WIDTH_M) ** 2) if known else 1.0
         total += likely
         first, second = first + likely * rise, second + likely * rise * rise
+    # all groups are far from the wanted bed
     if not total > 0.0:
         return best, at_best, abs(least) if best >= 0 else 0.0
     mean = first / total
@@ -262,9 +270,9 @@ def _best_seed(groups: Groups, depths: Lines, wanted: float) -> tuple[int, float
 
 @device
 def _set_rises(groups: Groups, depths: Lines) -> None:
-    """Find how far up the bed is if the group of each seed made the point, and its size.
+    """Find the rise and the size of the group of each seed.
 
-    Which maps agree is asked for the bed that the lines are of, and again for that of each group.
+    Which maps agree is decided for the bed of the lines, and again for that of each group.
     """
     k = depths.t.size
     _set_depths(groups, depths, 0.0)
@@ -280,7 +288,7 @@ def _set_rises(groups: Groups, depths: Lines) -> None:
 
 @device
 def _average_around(seed: int, groups: Groups, depths: Lines, rise: float) -> None:
-    """Average the depths that may be fused with that of a seed, for a bed so much higher."""
+    """Average the depths that may be fused with that of a seed, for a bed higher by `rise`."""
     _set_depths(groups, depths, rise)
     for q in groups.fused[seed]:
         if q < 0:
@@ -290,21 +298,19 @@ def _average_around(seed: int, groups: Groups, depths: Lines, rise: float) -> No
 
 @device
 def _set_depths(groups: Groups, depths: Lines, rise: float) -> None:
-    """Set the depth of each map for a bed so much higher."""
+    """Set the depth of each map for a bed higher by `rise`."""
     for q in range(depths.t.size):
         groups.own[q] = depths.t[q] + depths.slope[q] * rise
 
 
 @device
 def _average(q: int, groups: Groups, depths: Lines) -> None:
-    """Average a depth with those of the maps around that agree.
-
-    Without a branch, as no processor guesses which do.
-    """
+    """Average a depth with those of its partners that agree."""
     own, total, change, count = groups.own[q], 0.0, 0.0, 0.0
     for a in groups.averaged[q]:
         if a < 0:
             break
+        # no branch, which the processor would predict wrongly half the time
         agrees = abs(groups.own[a] - own) < AVERAGED_WITHIN
         total += groups.own[a] if agrees else 0.0
         change += depths.slope[a] if agrees else 0.0
@@ -315,7 +321,7 @@ def _average(q: int, groups: Groups, depths: Lines) -> None:
 
 @device
 def _fuse(seed: int, groups: Groups) -> tuple[float, float]:
-    """Return how far up the bed must go for the group of a seed, and how many maps it has."""
+    """Return how far up the bed is for the group of a seed, and how many maps the group has."""
     total, change, members = 0.0, 0.0, 0.0
     for q in groups.fused[seed]:
         if q < 0:
@@ -324,14 +330,15 @@ def _fuse(seed: int, groups: Groups) -> tuple[float, float]:
         total += groups.share[q] * groups.depth[q] if agrees else 0.0
         change += groups.share[q] * groups.change[q] if agrees else 0.0
         members += 1.0 if agrees else 0.0
+    # the weighted mean of depth + change * rise is zero
     return -total / change, members
 
 
 @device
 def _weigh(weight: FloatArray, seed: int, rise: float, groups: Groups, depths: Lines) -> None:
-    """Write what each depth map counts for in the group of a seed.
+    """Write the weight of each depth map in the group of a seed.
 
-    The weight of one that agrees goes evenly to the maps it was averaged with.
+    The weight of a map that agrees goes evenly to the maps it was averaged with.
     """
     t, slope = depths.t, depths.slope
     _average_around(seed, groups, depths, rise)
@@ -340,9 +347,126 @@ def _weigh(weight: FloatArray, seed: int, rise: float, groups: Groups, depths: L
             break
         if not abs(groups.depth[q] - groups.depth[seed]) < AGREE:
             continue
+        # its partners that agree at this bed
         own, count = t[q] + slope[q] * rise, 0.0
         for a in groups.averaged[q]:
             count += a >= 0 and abs(t[a] + slope[a] * rise - own) < AVERAGED_WITHIN
         for a in groups.averaged[q]:
             if a >= 0 and abs(t[a] + slope[a] * rise - own) < AVERAGED_WITHIN:
                 weight[a] += groups.share[q] / count
+
+
+@kernel(allocates=True)
+def _invert_listed(
+    span: Span, cells: tuple[IntArray, IntArray], block: Block, quick: bool, weight: FloatArray,
+    result: FloatArray,
+) -> None:  # fmt: skip
+    points, (order, first) = block.points, cells
+    room, none = depth_maps.room_for(len(points.centres)), no_table()
+    for cell in range(*span):
+        rows = order[first[cell] : first[cell + 1]]
+        fitted = none
+        if quick and rows.size >= LEAST_POINTS:
+            # the listed images, and those whose maps were averaged into theirs
+            listed = counts_of(rows, points) > 0
+            seeing = listed.copy()
+            for c in range(listed.size):
+                for a in block.matcher.averaged[c]:
+                    if listed[c] and a >= 0:
+                        seeing[a] = True
+            fitted = table_of(rows, seeing, block)
+        for i in rows:
+            begin, end = points.start[i], points.start[i + 1]
+            given = weight[begin:end] if weight.size else weight
+            table = fitted if reads(fitted, points, i) else none
+            _invert_listed_one(result[i], i, points.camera[begin:end], given, block, table, room)
+
+
+@device
+def _invert_listed_one(
+    row: FloatArray, i: int, listed: IntArray, given: FloatArray, block: Block, table: Table,
+    room: Room,
+) -> None:  # fmt: skip
+    """Invert the fusion of the maps in the list of a point, with their weights."""
+    sight, averaged = depth_maps.sight_of(block.points, i), block.matcher.averaged
+    maps = room.found[: _with_neighbours(room.found, room.place, listed, sight, block)]
+    t, slope = room.t[: maps.size], room.slope[: maps.size]
+    counts, own = room.weight[: maps.size], room.own[: listed.size]
+    for k in range(listed.size):
+        made = depth_maps.original_up(sight, block, listed[k])
+        own[k] = given[k] if given.size else 1.0 / dot(made, made)
+    likely, step = depth_maps.likely_bed(sight, block), 0.0
+    bed = likely * table.likely[0]
+    for _ in range(_BEDS):
+        bed += step
+        # which depths agree depends on the bed, and the bed on which agree
+        depth_maps.find_lines(Lines(bed, t, slope), maps, sight, block, table, room)
+        step = 0.0
+        for _ in range(_ROUNDS):
+            for q in range(maps.size):
+                room.now[q] = t[q] + slope[q] * step
+            _share(counts, listed, own, room.now, averaged, room.place)
+            step = depth_maps.balance(t, slope, counts)
+        if not abs(step) > FAR * abs(bed):
+            break
+    depth_maps.settle_bed(row, maps, counts, Lines(bed, t, slope), sight, block, table, room)
+    # the next point of the cell starts from the depth ratio of this one
+    if table.place.size:
+        table.likely[0] = min(max(row[2] / likely, LEAST_LIKELY), MOST_LIKELY)
+    for q in maps:
+        room.place[q] = ABSENT
+    for c in listed:
+        for a in averaged[c]:
+            if a >= 0:
+                room.place[a] = ABSENT
+
+
+@device
+def _with_neighbours(
+    found: IntArray, place: IntArray, listed: IntArray, sight: Sight, block: Block
+) -> int:
+    """Gather the listed images, and their partners whose frames hold the point.
+
+    Returns how many they are; `place` gets the place of each image among them.
+    """
+    count, matcher = 0, block.matcher
+    for c in listed:
+        if place[c] < 0:
+            place[c], found[count] = count, c
+            count += 1
+        for a in matcher.averaged[c]:
+            if a < 0:
+                break
+            # a partner that was not looked at yet
+            if place[a] == ABSENT:
+                place[a] = _OUTSIDE
+                if holds(matcher.inner, a, depth_maps.original_up(sight, block, a)):
+                    place[a], found[count] = count, a
+                    count += 1
+    return count
+
+
+@device
+def _share(
+    counts: FloatArray, listed: IntArray, own: FloatArray, now: FloatArray, averaged: IntArray,
+    place: IntArray,
+) -> None:  # fmt: skip
+    """Set the weight of each depth map in the point, by the depths `now`."""
+    counts[:] = 0.0
+    for k in range(listed.size):
+        at, members = place[listed[k]], 1.0
+        for a in averaged[listed[k]]:
+            members += _averages(at, a, now, place)
+        # the map and its partners share its weight evenly
+        counts[at] += own[k] / members
+        for a in averaged[listed[k]]:
+            if _averages(at, a, now, place):
+                counts[place[a]] += own[k] / members
+
+
+@device
+def _averages(own: int, a: int, now: FloatArray, place: IntArray) -> bool:
+    """Whether a depth is averaged with that of image a: both see the place, at nearly one depth."""
+    if a < 0 or place[a] < 0:
+        return False
+    return bool(abs(now[place[a]] - now[own]) < AVERAGED_WITHIN)

@@ -1,4 +1,4 @@
-"""What is learned of a block and the whole cloud before the first point is corrected."""
+"""Estimate everything that a correction needs to know about the block and the whole cloud."""
 
 from __future__ import annotations
 
@@ -8,48 +8,45 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.errors import SettingError
-from pcfix.model import BoolArray, Cameras, TiePoints, ViewKind
+from pcfix.model import Cameras, TiePoints, ViewKind
 from pcfix.options.correct import ScienceOptions
-from pcfix.refract.batch import UNLISTED, Batch, Learned, Survey
+from pcfix.refract.batch import UNLISTED, Batch, Learned, Survey, require_orientation
 from pcfix.refract.consistent import check_consistent
 from pcfix.refract.fusion import likely_beds
-from pcfix.refract.hypotheses import (
+from pcfix.refract.matcher import Bed, bed_of, matcher_of, matcher_of_ties, places_for
+from pcfix.refract.methods import batches, on_land, with_rays
+from pcfix.refract.occlusion import occluder_of, wants_occlusion
+from pcfix.refract.patches import FEWEST_WITHOUT_LIST
+from pcfix.refract.reconstructions import (
     ALIKE,
     BARE,
     IN_FRAME,
     LIMITS,
     Hint,
-    Hypothesis,
+    Reconstruction,
     Verdict,
-    hypotheses_of,
+    reconstructions_of,
     told_by,
+    weigh,
 )
-from pcfix.refract.matcher import Bed, bed_of, matcher_of, matcher_of_ties, places_for
-from pcfix.refract.methods import batches, on_land, with_rays
-from pcfix.refract.patches import FEWEST_WITHOUT_LIST
-from pcfix.refract.regression import DepthRegression
-from pcfix.refract.stereo_factor import StereoFactor, check_stereo, stereo_factor
+from pcfix.refract.regression import DepthRegression, raise_no_regression
+from pcfix.refract.stereo_factor import StereoFactor, stereo_factor
 from pcfix.refract.tiling import spatial_order
-from pcfix.refract.top_surface import occluder_of, wants_occlusion
-from pcfix.refract.weighing import weigh
 from pcfix.water.surface import is_submerged
 
 
 def check_method(settings: ScienceOptions, cameras: Cameras) -> None:
-    """Refuse a method that these cameras are not enough for."""
-    if settings.camera_set == "mvs" and (cameras.lenses is None or cameras.rotations is None):
-        raise SettingError(
-            "camera-set mvs needs the angles and the lens of each image: give --sensor, or a"
-            " camera file that has them, or use --camera-set all."
-        )
+    """Raise SettingError if the method needs an orientation that the cameras lack."""
+    if settings.camera_set == "mvs":
+        require_orientation(cameras, "camera-set mvs")
     if settings.method == "consistent":
         check_consistent(cameras)
     if settings.depth_factor == "auto":
-        check_stereo(cameras)
+        require_orientation(cameras, "depth-factor auto")
 
 
 def resolved(settings: ScienceOptions, cameras: Cameras, views: ViewKind | None) -> ScienceOptions:
-    """Return options without ``auto`` where no points are needed to tell what it stands for."""
+    """Replace the method ``auto`` if that needs no points."""
     if settings.method != "auto":
         return settings
     if cameras.lenses is None or cameras.rotations is None:
@@ -60,12 +57,12 @@ def resolved(settings: ScienceOptions, cameras: Cameras, views: ViewKind | None)
 def for_own_water(
     settings: ScienceOptions, cameras: Cameras, views: ViewKind | None
 ) -> ScienceOptions:
-    """Return options without ``auto`` where images have water of their own.
+    """Replace ``auto`` for images with their own water surfaces.
 
     Raises
     ------
     SettingError
-        If the method takes the water to be one for all images.
+        If the method needs one water surface for all images.
     """
     bare = cameras.lenses is None or cameras.rotations is None
     dense = settings.camera_set == "mvs" or views not in (None, "tracks")
@@ -73,29 +70,31 @@ def for_own_water(
     if method == "auto":
         method = "snell" if bare or dense else "consistent"
     if method not in ("snell", "consistent") or (method == "consistent" and dense):
-        of = ", as it inverts a dense matcher," if method == "consistent" else ""
         raise SettingError(
-            f"method {method}{of} takes the water to be one for all images; with water-per-image"
-            " give snell, or leave one of the two out."
+            "method.own_water",
+            f"Method {method} needs one water surface for all images"
+            f"{' if the cloud is dense' if dense else ''}. Use method snell, or leave out"
+            " water-per-image.",
+            method=method,
         )
     camera_set = "all" if settings.camera_set == "auto" else settings.camera_set
     return replace(settings, method=method, camera_set=camera_set)
 
 
 def wants_sample(survey: Survey, views: ViewKind | None) -> bool:
-    """Return whether points of the whole cloud tell something of the correction."""
+    """Return whether a sample of the whole cloud is needed."""
     known = survey.settings.depth_factor != "auto"
     return wants_matcher(survey, views) or _wants_limit(survey.settings, views) or not known
 
 
 def with_factor(batch: Batch) -> tuple[Batch, StereoFactor | None]:
-    """Return a batch with a number for the factor of depths, and whence, where that is auto."""
+    """Replace the depth factor ``auto`` by a number; return the batch and the factor found."""
     survey = batch.survey
     if survey.settings.depth_factor != "auto":
         return batch, None
     known = batch.surface.height_m[np.isfinite(batch.surface.height_m)]
     found = None
-    if len(known):  # else no point lies below the water, which is said elsewhere
+    if len(known):  # else no point is submerged, which is an error elsewhere
         n = survey.settings.refractive_index
         found = stereo_factor(survey.cameras, float(np.median(known)), n)
     settings = replace(survey.settings, depth_factor=None if found is None else found.factor)
@@ -103,14 +102,14 @@ def with_factor(batch: Batch) -> tuple[Batch, StereoFactor | None]:
 
 
 def _wants_limit(settings: ScienceOptions, views: ViewKind | None) -> bool:
-    """Whether the largest incidence angle is to be told by the cloud."""
+    """Whether the largest incidence angle is to be estimated from the cloud."""
     return views is None and settings.max_angle == "auto" and settings.method in ALIKE
 
 
 def _wants_comparison(survey: Survey) -> bool:
-    """Whether SigmaZ shall have how far the method is from the way that fits the cloud best.
+    """Whether SigmaZ includes the difference to the reconstruction that fits the cloud best.
 
-    That takes the water to be one.
+    That needs one water surface.
     """
     settings, cameras = survey.settings, survey.cameras
     told = settings.dimensions == "all" and settings.method != "regression"
@@ -119,7 +118,7 @@ def _wants_comparison(survey: Survey) -> bool:
 
 
 def wants_matcher(survey: Survey, views: ViewKind | None) -> bool:
-    """Return whether the images' partners must be known, with views of a kind or without any."""
+    """Return whether the partners of the images are needed, for a kind of view list or none."""
     settings, compared = survey.settings, _wants_comparison(survey)
     if views is None:
         return settings.models_matcher or settings.method == "auto" or compared
@@ -128,12 +127,12 @@ def wants_matcher(survey: Survey, views: ViewKind | None) -> bool:
 
 
 def learn_of_points(batch: Batch, regression: DepthRegression | None) -> Batch:
-    """Return a batch, whose points, land too, are the whole cloud, with what is learned of it.
+    """Return a batch that is the whole cloud, with land, with what is learned from it.
 
     Raises
     ------
     SettingError
-        If the method lacks something that it cannot do without.
+        If the method lacks something that it needs.
     """
     cameras, views = batch.survey.cameras, batch.views
     kind = None if views is None else views.kind
@@ -142,7 +141,7 @@ def learn_of_points(batch: Batch, regression: DepthRegression | None) -> Batch:
     given = batch.survey.settings
     settings = resolved(given, cameras, kind)
     if settings.method == "regression" and regression is None:
-        raise SettingError("method regression needs a regression; fit one of check depths first.")
+        raise_no_regression()
     hides = wants_occlusion(cameras, settings)
     listed = settings.occlusion == "auto" and views is not None
     occluder = occluder_of(batch.xyz) if hides and not listed else None
@@ -160,7 +159,7 @@ def learn_of_points(batch: Batch, regression: DepthRegression | None) -> Batch:
 
 
 class Near(NamedTuple):
-    """Submerged points with their neighbours, and how many of the cloud each stands for."""
+    """Submerged points with their neighbours, and how many points of the cloud each represents."""
 
     batch: Batch
     step: float
@@ -178,27 +177,15 @@ def learn_of_sample(
     hint: Hint | None = None,
     near: Near | None = None,
 ) -> tuple[Survey, tuple[Verdict, ...]]:
-    """Learn what ``auto`` stands for, how the images were matched, and the bed, as needed.
+    """Resolve ``auto`` and estimate the partners of the images and the bed, as needed.
 
-    Parameters
-    ----------
-    batch : Batch
-        Points of the whole cloud, evenly spread, land too; the kind of their lists is what is said.
-    points : int
-        How many the cloud has.
-    ties : TiePoints, optional
-        Of the block that made the points; else the points tell what the images have in common.
-    hint : Hint, optional
-        What files say of how the cloud was made.
-    near : Near, optional
-        Which points tell how it was made, where those of the batch are too far apart.
+    The batch are points of the whole cloud of `points` points, evenly spread, with land; their view
+    lists have a kind. `ties` are tie points of the original model; by default the points show which
+    images overlap. `hint` is the type that the software is known for, `near` are points for the
+    detection of the type, if those of the batch are too far apart.
 
-    Returns
-    -------
-    survey : Survey
-        Without ``auto``.
-    verdicts : tuple of Verdict
-        Why, as far as something was to be told, and could be.
+    Returns the survey without ``auto`` and the verdicts, if something was to be decided, and could
+    be.
     """
     if batch.views is None and batch.survey.settings.method == "auto":
         found = _learn_of_sources(batch, points, ties, hint, near)
@@ -215,8 +202,16 @@ def learn_of_sample(
     near = near or Near(sample, points / max(len(batch), 1))
     survey, verdicts = _weighed(replace(near.batch, survey=survey), near.step, hint)
     settings, learned = survey.settings, survey.learned._replace(land=None)
-    if batch.made_with is not None:
-        learned = learned._replace(land=_land_of(survey, verdicts))
+    if batch.original_model is not None:
+        # land has the reconstruction type of the cloud, also where a formula corrects the bed
+        made = survey
+        for one in verdicts:
+            if one.is_told and one.is_against:
+                made = replace(made, settings=one.runner_up.settings(made.settings))
+        land = on_land(made)
+        if not made.settings.models_matcher:
+            land = replace(land, learned=land.learned._replace(matcher=None))
+        learned = learned._replace(land=land)
     if not settings.models_matcher:
         learned = learned._replace(matcher=None)
     elif settings.method == "consistent" and settings.matcher == "depth-maps" and len(sample):
@@ -230,13 +225,13 @@ def submerged_of(batch: Batch) -> Batch:
 
 
 MOST_SOURCES = 8
-"""More point sources than these are strips or images, and not clouds that were merged."""
+"""More point sources are strips or images, and not clouds that were merged."""
 
 
 def _learn_of_sources(
     batch: Batch, points: int, ties: TiePoints | None, hint: Hint | None, near: Near | None
 ) -> tuple[Survey, tuple[Verdict, ...]] | None:
-    """Learn of each source by itself; None where all of them were made in one way."""
+    """Learn from each point source separately; None if all have one reconstruction type."""
     if batch.source is None:
         return None
     submerged = is_submerged(batch.xyz[:, 2], batch.surface)
@@ -265,9 +260,9 @@ def learn_of_unlisted(
     hint: Hint | None = None,
     near: Near | None = None,
 ) -> tuple[Survey, tuple[Verdict, ...]]:
-    """Learn of points as without their list, for those that are in none; see `learn_of_sample`.
+    """Do as `learn_of_sample` without view lists, for points that have none.
 
-    `batch.survey.settings` are those that were given, ``auto`` included.
+    `batch.survey.settings` are the original ones, with ``auto``.
     """
     settings = resolved(batch.survey.settings, batch.survey.cameras, None)
     bare = replace(batch, views=None, survey=replace(batch.survey, settings=settings))
@@ -275,15 +270,15 @@ def learn_of_unlisted(
 
 
 def _weighed(sample: Batch, step: float, hint: Hint | None) -> tuple[Survey, tuple[Verdict, ...]]:
-    """Return the survey without ``auto``, and with the doubt of submerged points without lists."""
+    """Resolve ``auto`` and set the model uncertainty, for submerged points without lists."""
     survey = sample.survey
-    hypotheses = hypotheses_of(sample)
-    if survey.settings.method == "auto" and len(hypotheses) > 1:
-        verdict = weigh(sample, hypotheses, step, hint=hint)
-        survey = as_told(survey, verdict, hypotheses[0])
+    reconstructions = reconstructions_of(sample)
+    if survey.settings.method == "auto" and len(reconstructions) > 1:
+        verdict = weigh(sample, reconstructions, step, hint=hint)
+        survey = as_told(survey, verdict, reconstructions[0])
         return survey, () if verdict is None else (verdict,)
     if survey.settings.method == "auto":
-        survey = as_told(survey, None, hypotheses[0])
+        survey = as_told(survey, None, reconstructions[0])
     verdicts = list[Verdict | None]()
     if _wants_limit(survey.settings, None):
         verdicts.append(weigh(replace(sample, survey=survey), LIMITS, step))
@@ -295,19 +290,21 @@ def _weighed(sample: Batch, step: float, hint: Hint | None) -> tuple[Survey, tup
     return survey, tuple(one for one in verdicts if one is not None)
 
 
-def as_told(survey: Survey, verdict: Verdict | None, else_as: Hypothesis | None = None) -> Survey:
-    """Return a survey with the options, and the doubt, of what the cloud was taken for."""
+def as_told(
+    survey: Survey, verdict: Verdict | None, else_as: Reconstruction | None = None
+) -> Survey:
+    """Return a survey with the options and the model uncertainty of a verdict."""
     if verdict is None:
         given = survey.settings
         return survey if else_as is None else replace(survey, settings=else_as.settings(given))
-    learned = survey.learned._replace(doubt=verdict.doubt)
+    learned = survey.learned._replace(model_uncertainty=verdict.model_uncertainty)
     return replace(survey, settings=verdict.chosen.settings(survey.settings), learned=learned)
 
 
 def with_matcher(batch: Batch, ties: TiePoints | None) -> Survey:
-    """Return the survey with how the images were matched."""
+    """Return the survey with the predicted partners of the images."""
     survey = batch.survey
-    places, matched = batch.made_with or (batch.xyz, survey.cameras)
+    places, matched = batch.original_model or (batch.xyz, survey.cameras)
     if ties is not None:
         matcher = matcher_of_ties(matched, ties)
     else:
@@ -317,45 +314,27 @@ def with_matcher(batch: Batch, ties: TiePoints | None) -> Survey:
 
 
 def _learn_bed(batch: Batch) -> Bed | None:
-    """Return the bed that fused points of a whole cloud have in common, of a sample of them.
-
-    None where no image sees a point.
-    """
+    """Return the bed that agrees with a sample of fused points; None if no image sees a point."""
     order = spatial_order(batch.xyz)
     likely = [likely_beds(with_rays(batch.take(rows))) for rows in batches(order)]
     most = max(part.shape[1] for part in likely)
-    table = np.full((len(batch), most), np.nan, np.float32)
-    done = 0
-    for part in likely:
-        table[done : done + len(part), : part.shape[1]] = part
-        done += len(part)
+    wide = [
+        np.pad(one, ((0, 0), (0, most - one.shape[1])), constant_values=np.nan) for one in likely
+    ]
+    table = np.concatenate(wide)
     return bed_of(batch.xyz[order], table) if np.isfinite(table).any() else None
-
-
-def _land_of(survey: Survey, verdicts: tuple[Verdict, ...]) -> Survey:
-    """Return what land is corrected with that was carried to adjusted cameras.
-
-    It goes by how the cloud was made, also where a formula corrects the bed.
-    """
-    for verdict in verdicts:
-        if verdict.is_told and verdict.is_against:
-            survey = replace(survey, settings=verdict.runner_up.settings(survey.settings))
-    dry = on_land(survey)
-    if survey.settings.models_matcher:
-        return dry
-    return replace(dry, learned=dry.learned._replace(matcher=None))
 
 
 LEAST_TIES, LEAST_DEPTH_M = 50, 0.3
 CORRECTED_RATIO = 1.2
-"""Depth of a cloud by that of its tie points, beyond which it was likely corrected before: as it
-came it is near 1, corrected 1.34 and more."""
+"""Ratio of the depth of a cloud to that of its tie points, above which the cloud was probably
+corrected before: uncorrected it is near 1, corrected 1.34 and more."""
 
 
 def depth_ratio(batch: Batch, ties: TiePoints) -> float | None:
-    """Return how much deeper submerged points, shape (m, 3), lie than tie points of their block.
+    """Return the median ratio of the depth of submerged points to that of tie points near them.
 
-    The median over the tie points of the ratio to the nearest point's depth; None for few of them.
+    None for few tie points.
     """
     from scipy.spatial import cKDTree
 
@@ -372,18 +351,13 @@ def depth_ratio(batch: Batch, ties: TiePoints) -> float | None:
     return float(np.median(depth[deep] / tie_depth[deep])) if deep.sum() >= LEAST_TIES else None
 
 
-def seen_flat(batch: Batch) -> BoolArray:
-    """Return which points are seen by flat obliques alone; see `Batch.seen_flat`."""
-    return with_rays(batch).seen_flat()
-
-
 def weigh_lists(batch: Batch, *, is_open: bool) -> Verdict | None:
-    """Tell what the lists of submerged points list, or what the given way leaves open.
+    """Decide what the view lists of submerged points contain, or test the type set by the user.
 
-    None where there are too few points, or nothing is to be told.
+    None if there are too few points, or nothing is to be decided.
     """
     if is_open and batch.survey.settings.method == "consistent":
-        return weigh(batch, hypotheses_of(batch), 1.0)
+        return weigh(batch, reconstructions_of(batch), 1.0)
     if not _wants_comparison(batch.survey):
         return None
-    return weigh(batch, hypotheses_of(batch), 1.0, told=told_by(batch))
+    return weigh(batch, reconstructions_of(batch), 1.0, told=told_by(batch))

@@ -1,9 +1,9 @@
-"""What the depth maps of a cell have, as polynomials.
+"""Polynomials for the depth maps of a cell.
 
-Where two lines of sight come nearest to each other, how far they pass each other by and the angle
-between them depend on the place on the bed alone, and smoothly. So they become polynomials, for
-each image and each of its partners (`pcfix.refract.cells`). Where the border of a partner's frame
-goes through the cell, so does the direction in which the partner sees the bed.
+For two images that see a place on the bed, the depth at which their rays are nearest, the residual
+there and its curvature are smooth functions of that place. They are replaced by polynomials
+(`pcfix.refract.cells`), for each image and each of its partners. So is the direction in which a
+partner sees the bed, which decides whether its frame holds the place.
 """
 
 from __future__ import annotations
@@ -16,45 +16,31 @@ from pcfix.kernels import device
 from pcfix.lens.algebra import Vector, cross, dot, minus, normal_of, row_of, scaled, unit
 from pcfix.lens.frames import holds
 from pcfix.model import BoolArray, FloatArray, IntArray
-from pcfix.refract.batch import Batch, Chosen, Images, as_made, images_of
-from pcfix.refract.cells import (
-    BASIS,
-    CUBIC,
-    FIT_CUBIC,
-    INSIDE,
-    LEAST_LENGTH_M,
-    NODES,
-    Box,
-    box_of,
-    fit,
-    in_box,
-    is_under,
-    no_box,
-    set_powers,
-    water_at,
-)
+from pcfix.refract import cells
+from pcfix.refract.batch import Batch, Chosen, Images, images_of, to_original
+from pcfix.refract.cells import BASIS, CUBIC, FIT_CUBIC, INSIDE, LEAST_LENGTH_M, NODES, Box
 from pcfix.refract.matcher import MATCHED, Matcher
 from pcfix.refract.rays import direction, light_path
 
 LEAST_POINTS = 60
-"""Of a cell: its polynomials cost as much as so many points."""
+"""Least points of a cell: its polynomials cost as much as so many points."""
 
 TOLERANCE_PX = 0.02
-"""What polynomials may lack at the corners of a cell, in pixels of the image."""
+"""Largest error of polynomials at the corners of a cell, in pixels of the image."""
 
 USUAL = 0.7
-"""Apparent to true depth along a ray, nearly: the polynomials have the rest."""
+"""Approximate ratio of apparent to true depth along a ray; the polynomials have the rest."""
 
 DEEPEST = 1.9
 ASIDE = 0.5
-"""The bed is at most so many apparent depths deep, and so many aside of the apparent point."""
+"""Largest depth of the bed, and distance from the apparent point in plan, in apparent depths."""
 
-AWAY, MISS, CURVED, EACH = 0, 1, 2, 3
+AWAY, RESIDUAL, CURVED, EACH = 0, 1, 2, 3
 ALWAYS, NEVER, SOMETIMES = 1, 0, 2
 
 
 class Block(NamedTuple):
-    """What the kernels have of all points: they and the cameras now, the images, the matcher."""
+    """All points and cameras, the images of the original model, and the matcher, for kernels."""
 
     points: Chosen
     images: Images
@@ -69,18 +55,18 @@ class Table(NamedTuple):
     box : Box
         Of the bed.
     place : array, shape (k,)
-        The row of each image in `ways`, or -1; none at all where there are no polynomials.
+        The row of each image in `ways`, or -1; empty without polynomials.
     terms : array, shape (images, 5 x 19 x 3)
-        Of the first images of `ways`, for each partner: how much farther than usual the bed seems
-        (m), and the other two of `meet`.
+        Of the first images of `ways`, for each partner: the depth less the usual one (m), and the
+        other two results of `meet`.
     in_frame : array, shape (images, 5)
-        Whether each partner has the whole cell in its frame, or nothing, or a part.
+        Whether the frame of each partner holds the whole cell, nothing, or a part of it.
     ways : array, shape (images and partners, 19 x 3)
         The direction in which each sees the bed.
     steep : array, shape (k,)
-        How much more than on average the apparent depth in an image changes with the bed.
+        Ratio of the change of the apparent depth in an image with the bed to the usual one.
     likely : array, shape (1,)
-        How deep the bed is beside what is likely, by the last point.
+        Ratio of the depth of the last point to the likely one.
     """
 
     box: Box
@@ -97,7 +83,7 @@ def block_of(batch: Batch) -> Block:
     matcher = batch.survey.learned.matcher
     if matcher is None:
         raise ValueError("a model of the matcher is needed")
-    return Block(batch.chosen(), images_of(batch.made_with, batch.survey.cameras), matcher)
+    return Block(batch.chosen(), images_of(batch.original_model, batch.survey.cameras), matcher)
 
 
 @device(allocates=True)
@@ -105,7 +91,7 @@ def no_table() -> Table:
     """Return a table without polynomials."""
     none = np.empty((0, 0))
     return Table(
-        no_box(), np.empty(0, np.int64), none, np.empty((0, 0), np.int64), none, np.ones(1),
+        cells.no_box(), np.empty(0, np.int64), none, np.empty((0, 0), np.int64), none, np.ones(1),
         np.ones(1),
     )  # fmt: skip
 
@@ -114,19 +100,21 @@ def no_table() -> Table:
 def table_of(rows: IntArray, seeing: BoolArray, block: Block) -> Table:
     """Fit the polynomials of some points, for the images that may see them."""
     matched, first = block.matcher.matched, np.flatnonzero(seeing)
+    # the partners of these images are needed too
     involved = seeing.copy()
     for c in first:
         for j in matched[c]:
             if j >= 0:
                 involved[j] = True
+    # images that see points first, as only these get depths
     order = np.concatenate((first, np.flatnonzero(involved & ~seeing)))
-    place, box = np.full(seeing.size, -1), bed_under(box_of(rows, block.points))
+    place, box = np.full(seeing.size, -1), bed_under(cells.box_of(rows, block.points))
     views = np.empty((order.size, len(NODES), 4))
     ways = np.empty((order.size, CUBIC * 3))
     for at in range(order.size):
         place[order[at]] = at
         _see(views[at], order[at], box, block)
-        fit(ways[at], FIT_CUBIC, views[at, :, :3])
+        cells.fit(ways[at], FIT_CUBIC, views[at, :, :3])
     terms, values = np.empty((first.size, EACH * CUBIC * MATCHED)), np.empty((len(NODES), EACH))
     in_frame = np.zeros((first.size, MATCHED), np.int64)
     for at in range(first.size):
@@ -138,6 +126,7 @@ def table_of(rows: IntArray, seeing: BoolArray, block: Block) -> Table:
 @device(allocates=True)
 def bed_under(box: Box) -> Box:
     """Return the box in which the bed of the points of a box lies."""
+    # depths of the deepest and shallowest apparent point of the cell
     deep, shallow = box.half[2] - box.middle[2], -box.half[2] - box.middle[2]
     low, high = -DEEPEST * deep, -max(shallow, LEAST_LENGTH_M)
     middle, half = box.middle.copy(), box.half + ASIDE * deep
@@ -147,26 +136,20 @@ def bed_under(box: Box) -> Box:
 
 @device
 def _see(view: FloatArray, c: int, box: Box, block: Block) -> None:
-    """Write where an image sees the nodes, as the matcher had it, and how far away they seem."""
+    """Write the directions of the nodes in an image of the original model, and the usual depths."""
     points = block.points
     normal = normal_of(box.water[1], box.water[2])
     for k in range(len(NODES)):
         x = box.middle[0] + box.half[0] * NODES[k, 0]
         y = box.middle[1] + box.half[1] * NODES[k, 1]
         under = box.middle[2] + box.half[2] * NODES[k, 2]
-        e = minus(row_of(points.centres, c), (x, y, water_at(box, x, y) + under))
+        e = minus(row_of(points.centres, c), (x, y, cells.water_at(box, x, y) + under))
         above = normal[2] * (points.offset[c] - under)
         path = light_path((0.0, 0.0, 0.0), e, normal, above, points.n)
         w = direction(path, normal)
-        view[k, 0], view[k, 1], view[k, 2] = as_made(block.images, c, w)
+        view[k, 0], view[k, 1], view[k, 2] = to_original(block.images, c, w)
+        # the length of the ray in air, and the usual part of that in water
         view[k, 3] = np.sqrt(dot(w, w)) * (path[2] + USUAL * path[3])
-
-
-@device
-def _made_centre(block: Block, c: int) -> Vector:
-    if len(block.images.centres) == 0:
-        return row_of(block.points.centres, c)
-    return row_of(block.images.centres, c)
 
 
 @device
@@ -174,21 +157,23 @@ def _fit_image(
     terms: FloatArray, in_frame: IntArray, values: FloatArray, views: FloatArray, c: int,
     place: IntArray, block: Block,
 ) -> bool:  # fmt: skip
-    """Write the polynomials of an image; False where they are not near enough."""
+    """Write the polynomials of an image; return whether they are accurate enough."""
     partners, own, near = block.matcher.matched[c], views[place[c]], True
+    images = block.images
+    centres = images.centres if len(images.centres) else block.points.centres
     for p in range(MATCHED):
         j = partners[p]
         if j < 0:
             continue
         view = views[place[j]]
         in_frame[p] = _has(view, j, block)
-        base = minus(_made_centre(block, c), _made_centre(block, j))
+        base = minus(row_of(centres, c), row_of(centres, j))
         for k in range(len(NODES)):
             u, a = unit(row_of(own, k)), unit(row_of(view, k))
-            away, miss, values[k, CURVED] = meet(u, a, base, block.matcher.focal_px[j])
-            values[k, AWAY], values[k, MISS] = away - own[k, 3], miss
+            away, residual, values[k, CURVED] = meet(u, a, base, block.matcher.focal_px[j])
+            values[k, AWAY], values[k, RESIDUAL] = away - own[k, 3], residual
         of_pair = terms[EACH * CUBIC * p : EACH * CUBIC * (p + 1)]
-        fit(of_pair, FIT_CUBIC, values)
+        cells.fit(of_pair, FIT_CUBIC, values)
         if in_frame[p] != NEVER:
             near = near and _is_near(of_pair, values, own, block.matcher.focal_px[c])
     return near
@@ -196,53 +181,51 @@ def _fit_image(
 
 @device
 def meet(u: Vector, a: Vector, base: Vector, focal_px: float) -> tuple[float, float, float]:
-    """Return where the ray u comes nearest to the ray a, and what an image on a says of that.
+    """Return where the ray u is nearest to the ray a, and the residual in the image of a.
 
-    How far from its centre, metres; its residual there, px, with a sign; half of how the square of
-    the residual curves, px^2/m^2. `base` is from the centre of a to that of u.
+    The distance from the centre of u, metres; the residual there, px, with a sign; half the
+    curvature of its square, px^2/m^2. `base` leads from the centre of a to that of u.
     """
     across = cross(u, a)
+    # squared sine and cosine of the angle between the rays
     sine2, along = dot(across, across), dot(u, a)
     away = (dot(base, a) * along - dot(base, u)) / sine2
+    # pixels per metre at that place, as the image of a sees it
     scale = focal_px / (dot(base, a) + away * along)
     return away, scale * dot(base, across) / np.sqrt(sine2), scale * scale * sine2
 
 
 @device
 def _has(view: FloatArray, j: int, block: Block) -> int:
-    """Return whether a frame holds all nodes, or none, beyond one of its sides."""
-    planes, all_in = block.matcher.inner.planes[j], True
-    beyond = 0, 0, 0, 0
+    """Return whether a frame holds all nodes, or none as they lie beyond one of its sides."""
+    planes, all_in, none_in = block.matcher.inner.planes[j], True, False
     for k in range(len(NODES)):
-        e = scaled(-1.0, row_of(view, k))
-        all_in = all_in and holds(block.matcher.inner, j, e)
-        beyond = (
-            beyond[0] + (dot(row_of(planes, 0), e) > 0.0),
-            beyond[1] + (dot(row_of(planes, 1), e) > 0.0),
-            beyond[2] + (dot(row_of(planes, 2), e) > 0.0),
-            beyond[3] + (dot(row_of(planes, 3), e) > 0.0),
-        )
+        all_in = all_in and holds(block.matcher.inner, j, scaled(-1.0, row_of(view, k)))
+    for side in range(4):
+        beyond = 0
+        for k in range(len(NODES)):
+            beyond += dot(row_of(planes, side), row_of(view, k)) < 0.0
+        none_in = none_in or beyond == len(NODES)
     if all_in:
         return ALWAYS
-    most = max(max(beyond[0], beyond[1]), max(beyond[2], beyond[3]))
-    return NEVER if most == len(NODES) else SOMETIMES
+    return NEVER if none_in else SOMETIMES
 
 
 @device
 def _is_near(terms: FloatArray, values: FloatArray, view: FloatArray, focal_px: float) -> bool:
-    """Whether polynomials are what they should be at the corners."""
+    """Whether polynomials are accurate at the corners, which were not fitted."""
     near = True
     for k in range(INSIDE, len(NODES)):
-        away, miss, curved = values_of(terms, BASIS[k])
+        away, residual, curved = values_of(terms, BASIS[k])
         off_px = abs(away - values[k, AWAY]) * focal_px / view[k, 3]
-        near = near and max(off_px, abs(miss - values[k, MISS])) <= TOLERANCE_PX
+        near = near and max(off_px, abs(residual - values[k, RESIDUAL])) <= TOLERANCE_PX
         near = near and abs(curved - values[k, CURVED]) <= TOLERANCE_PX * values[k, CURVED]
     return near
 
 
 @device
 def has_terms(table: Table, c: int) -> bool:
-    """Whether a table has the polynomials of an image."""
+    """Whether a table has the polynomials of an image; inaccurate ones are NaN."""
     at = table.place[c] if table.place.size else -1
     return bool(0 <= at < len(table.terms) and table.terms[at, 0] == table.terms[at, 0])
 
@@ -252,27 +235,27 @@ def read_table(
     partners: FloatArray, powers: FloatArray, table: Table, c: int, place: Vector,
     usual_m: float, block: Block,
 ) -> int:  # fmt: skip
-    """Write what the partners of an image say of a place on the bed; return how many see it.
+    """Write what the partners of an image see of a place on the bed; return how many see it.
 
-    How far away along its ray each has it (m), its squared residual (px^2) and half of how that
-    curves (px^2/m^2); -1 where the table does not reach. `usual_m` is how far it is usually.
+    The depth beyond P (m), given the usual one, its squared residual (px^2) and half the curvature
+    of that (px^2/m^2); see `depth_maps._compare`. Returns -1 for places outside the box.
     """
-    u, v, w = in_box(table.box, place)
+    u, v, w = cells.in_box(table.box, place)
     if not (abs(u) <= 1.0 and abs(v) <= 1.0 and abs(w) <= 1.0):
         return -1
-    set_powers(powers, (u, v, w))
+    cells.set_powers(powers, (u, v, w))
     at, count = table.place[c], 0
     for p in range(MATCHED):
         state = table.in_frame[at, p]
         if state == NEVER:
             continue
         j = block.matcher.matched[c, p]
-        if state == SOMETIMES:
+        if state == SOMETIMES:  # the border of the frame goes through the cell
             way = values_of(table.ways[table.place[j]], powers)
             if not holds(block.matcher.inner, j, scaled(-1.0, way)):
                 continue
-        away, miss, partners[count, 2] = values_of(table.terms[at, EACH * CUBIC * p :], powers)
-        partners[count, 0], partners[count, 1] = usual_m + away, miss * miss
+        away, residual, partners[count, 2] = values_of(table.terms[at, EACH * CUBIC * p :], powers)
+        partners[count, 0], partners[count, 1] = usual_m + away, residual * residual
         count += 1
     return count
 
@@ -290,5 +273,5 @@ def values_of(terms: FloatArray, powers: FloatArray) -> Vector:
 
 @device
 def reads(table: Table, points: Chosen, i: int) -> bool:
-    """Whether the water over a point is that of the table."""
-    return table.place.size > 0 and is_under(points, i, table.box)
+    """Whether the water above a point is that of the table."""
+    return table.place.size > 0 and cells.is_under(points, i, table.box)

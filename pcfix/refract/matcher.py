@@ -1,11 +1,10 @@
-"""Which images a dense matcher compares with which, from what they see of the scene.
+"""Predict which images a dense matcher compares with each other.
 
 For each image the others are scored by the places that both see: by the angle between the two
-rays, best at some 12 degrees, by their distances, as a finer image is compared badly with a
-coarser one, and by how much of the image the common places cover. This is the rule of
-OpenMVS (`Scene::SelectNeighborViews`); COLMAP's and those of other patch matchers differ in the
-constants. On a real block it finds 91 % of the partners from places of the dense cloud and 98 %
-from the tie points that the matcher itself went by.
+rays, best at some 12 degrees; by the ratio of their distances; and by how much of the image the
+common places cover. This is the rule of OpenMVS (`Scene::SelectNeighborViews`); COLMAP and other
+patch matchers differ in the constants. On a real block it finds 91 % of the partners from places
+of the dense cloud and 98 % from the tie points that the matcher used.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.kernels import Span, device, in_tiles, kernel
-from pcfix.lens.algebra import Vector, dot, minus, row_of
+from pcfix.lens.algebra import dot, minus, row_of
 from pcfix.lens.frames import Frames, frames_of, with_border
 from pcfix.lens.imaging import project
 from pcfix.model import Cameras, FloatArray, IntArray, TiePoints, Views
@@ -27,8 +26,8 @@ BEST_ANGLE_DEG, NARROW_DEG, WIDE_DEG = 12.0, 4.56, 8.4
 LEAST_ANGLE_DEG, LARGEST_ANGLE_DEG = 3.0, 65.0
 LEAST_ANGLE_WEIGHT = 0.1
 REPEATED_DEG = 45.0
-"""Features are found again in an image under another angle with the share exp(-(angle / this)^2),
-so that nadir and oblique images have few tie points in common."""
+"""Share of features found again in an image at another angle: exp(-(angle / REPEATED_DEG)^2).
+So nadir and oblique images have few tie points in common."""
 
 TOLERANCE_PX2 = 0.1
 CELLS = 16
@@ -37,7 +36,7 @@ LEAST_AREA = 0.05
 LEAST_COMMON = 3
 SCALE_RANGE = (0.2, 3.2)
 FINER = 1.6
-"""An image that is up to this much farther away than the reference is as good as one beside it."""
+"""Ratio of distances up to which an image is as good as one as far away as the reference."""
 
 
 class Matcher(NamedTuple):
@@ -46,7 +45,7 @@ class Matcher(NamedTuple):
     Attributes
     ----------
     matched : array, shape (k, 5)
-        The images that each one was compared with, best first; -1 after the last.
+        The images that each image was compared with, best first; -1 after the last.
     averaged : array, shape (k, 8)
         The images whose depth maps were averaged into its own.
     fused : array, shape (k, 12)
@@ -54,10 +53,10 @@ class Matcher(NamedTuple):
     focal_px : array, shape (k,)
         Pixels a radian.
     tolerance_px2 : float
-        Squared residuals of two images, px^2, that make a pair of images e times less likely to
-        be the one that a depth was found with.
+        Increase of the squared residuals of a pair of images, px^2, that makes it e times less
+        likely to determine a depth.
     inner : Frames
-        The frames without the border in which no patch has room.
+        The frames without a border, in which patches do not fit.
     """
 
     matched: IntArray
@@ -69,19 +68,19 @@ class Matcher(NamedTuple):
 
 
 class _Seen(NamedTuple):
-    """Which images see which of p places: e entries, image after image, places in order.
+    """Which images see which of p places: e entries, sorted by image and place.
 
     Attributes
     ----------
     start : array, shape (k + 1,)
         The first entry of each image.
     place, cell : array, shape (e,)
-        The place, and in which cell of the image it lies.
+        The place, and the cell of the image in which it lies.
     depth : array, shape (e,)
     of_place : array, shape (e,)
-        The entries, place after place, images in order.
+        The entries sorted by place and image.
     first : array, shape (p + 1,)
-        The first of them of each place.
+        The first of these of each place.
     image : array, shape (e,)
         The image of each entry.
     """
@@ -96,9 +95,9 @@ class _Seen(NamedTuple):
 
 
 def matcher_of(cameras: Cameras, places: FloatArray) -> Matcher:
-    """Return how images, with rotations and lenses, were likely matched.
+    """Predict the partners of images, with rotations and lenses, from places of the scene.
 
-    The places, shape (p, 3), are some thousand of the scene, as the software had them, metres.
+    The places, shape (p, 3), are some thousand apparent points, metres.
     """
     planes = frames_of(cameras).planes
     likely = (
@@ -109,7 +108,7 @@ def matcher_of(cameras: Cameras, places: FloatArray) -> Matcher:
 
 
 def matcher_of_ties(cameras: Cameras, ties: TiePoints) -> Matcher:
-    """Return how images were likely matched, by those that saw each tie point, world frame."""
+    """Predict the partners of images from the images that saw each tie point, world frame."""
     rows = np.flatnonzero(np.isfinite(ties.xyz).all(axis=1))
     views = ties.views.take(rows)
     places = np.ascontiguousarray(ties.xyz[rows])
@@ -122,7 +121,7 @@ def matcher_of_ties(cameras: Cameras, ties: TiePoints) -> Matcher:
 
 
 def places_for(cameras: Cameras) -> int:
-    """Return how many places of the scene tell enough of a block."""
+    """Return how many places of the scene are enough for a block."""
     return max(LEAST_PLACES, PLACES_AN_IMAGE * len(cameras))
 
 
@@ -139,11 +138,11 @@ def _matcher(cameras: Cameras, places: FloatArray, seen: _Seen, *, tracked: bool
 
 
 BORDER_PX = 8.0
-"""A patch of 9 pixels at half resolution reaches so far from its middle."""
+"""Half the width of a patch of 9 pixels at half resolution."""
 
 
 def without_border(cameras: Cameras) -> Cameras:
-    """Return cameras whose frames are narrower by the border in which no patch has room."""
+    """Return cameras whose frames are narrower by the border in which no patch fits."""
     if cameras.lenses is None:
         return cameras
     borders = [BORDER_PX * lens.pixel_size for lens in cameras.lenses]
@@ -151,7 +150,7 @@ def without_border(cameras: Cameras) -> Cameras:
 
 
 def _seen(cameras: Cameras, places: FloatArray, likely: Iterable[IntArray]) -> _Seen:
-    """Return which images see which places, of the rows of places that each image may see."""
+    """Return which images see which places; `likely` has the rows that each image may see."""
     if cameras.rotations is None or cameras.lenses is None:
         raise ValueError("a model of the matcher needs angles and lenses")
     found = list[tuple[IntArray, IntArray, FloatArray]]()
@@ -185,40 +184,52 @@ def _find_partners(
 ) -> None:  # fmt: skip
     """Set the best partners j of the reference i, best first.
 
-    Only images that see a place of the reference are looked at: their sums are kept in `sums`, and
-    are zero for all others.
+    `sums` and `covered` are zero for images that see no place of the reference.
     """
-    k = len(centres)
+    k, width = len(centres), table.shape[1]
     sums, covered = np.zeros((k, 4)), np.zeros((k, CELLS * CELLS), np.bool_)
+    best = np.empty(width)
     for i in range(*span):
         for one in range(seen.start[i], seen.start[i + 1]):
             p = seen.place[one]
-            for other in seen.of_place[seen.first[p] : seen.first[p + 1]]:
+            # all other images that see this place
+            for at in range(seen.first[p], seen.first[p + 1]):
+                other = seen.of_place[at]
                 j = seen.image[other]
                 if j != i:
-                    angle = _angle_deg(row_of(centres, i), row_of(centres, j), row_of(places, p))
+                    a = minus(row_of(centres, i), row_of(places, p))
+                    b = minus(row_of(centres, j), row_of(places, p))
+                    cosine = dot(a, b) / np.sqrt(dot(a, a) * dot(b, b))
+                    angle = np.degrees(np.arccos(min(1.0, cosine)))
                     scale = seen.depth[other] / seen.depth[one]
                     found = 1.0 if tracked else np.exp(-((angle / REPEATED_DEG) ** 2))
-                    sums[j, TOTAL] += found * _angle_weight(angle) * _scale_weight(scale)
+                    # full weight for images that are as near or up to FINER times farther away
+                    weight = (FINER / scale) ** 2 if scale > FINER else min(scale * scale, 1.0)
+                    sums[j, TOTAL] += found * _angle_weight(angle) * weight
                     sums[j, ANGLES] += found * angle
                     sums[j, SCALES] += found * scale
                     sums[j, COMMON] += found
                     covered[j, seen.cell[one]] = True
-        together = np.flatnonzero(sums[:, COMMON] > 0.0)
-        score = np.empty(len(together))
-        for at, j in enumerate(together):
-            score[at] = _score(sums[j], covered[j].sum())
+        best[:] = 0.0
+        for j in range(k):
+            if not sums[j, COMMON] > 0.0:
+                continue
+            # sort by insertion; of equal scores the first image stays ahead
+            score, at = _score(sums[j], covered[j].sum()), width
+            while at > 0 and score > best[at - 1]:
+                at -= 1
+                if at + 1 < width:
+                    best[at + 1], table[i, at + 1] = best[at], table[i, at]
+            if at < width:
+                best[at], table[i, at] = score, j
             sums[j], covered[j] = 0.0, False
-        best = np.argsort(-score, kind="mergesort")[: table.shape[1]]
-        for at, one in enumerate(best):
-            if score[one] > 0.0:
-                table[i, at] = together[one]
 
 
-@device(allocates=True)
+@device
 def _score(sums: FloatArray, covered: int) -> float:
-    """Return how good a partner is by its sums, and the cells that common places cover."""
+    """Return the score of a partner from its sums and the cells that common places cover."""
     area, common = covered / (CELLS * CELLS), sums[COMMON]
+    # too few common places, or mean angle or scale out of range
     if covered < LEAST_COMMON or area < LEAST_AREA:
         return 0.0
     if not LEAST_ANGLE_DEG <= sums[ANGLES] / common <= LARGEST_ANGLE_DEG:
@@ -229,40 +240,19 @@ def _score(sums: FloatArray, covered: int) -> float:
 
 
 @device
-def _angle_deg(one: Vector, other: Vector, place: Vector) -> float:
-    """Return the angle between the rays from a place to two centres."""
-    a, b = minus(one, place), minus(other, place)
-    cosine = dot(a, b) / np.sqrt(dot(a, a) * dot(b, b))
-    return float(np.degrees(np.arccos(min(1.0, cosine))))
-
-
-@device
 def _angle_weight(angle_deg: float) -> float:
     wide = NARROW_DEG if angle_deg < BEST_ANGLE_DEG else WIDE_DEG
+    # a Gaussian around the best angle, wider towards large ones
     off = (angle_deg - BEST_ANGLE_DEG) / wide
     return max(np.exp(-0.5 * off * off), LEAST_ANGLE_WEIGHT)
-
-
-@device
-def _scale_weight(scale: float) -> float:
-    if scale > FINER:
-        return (FINER / scale) ** 2
-    return 1.0 if scale >= 1.0 else scale * scale
 
 
 def steepest_and_partners(
     xyz: FloatArray, centres: FloatArray, views: Views, matcher: Matcher
 ) -> Views:
-    """Return for each point the image that looks down on it most, and those it was matched with.
+    """Return the steepest of the images that see each point, and those that it was matched with.
 
-    Parameters
-    ----------
-    xyz : array, shape (m, 3)
-    centres : array, shape (k, 3)
-        World frame.
-    views : Views
-        The images that see each point; the others are left out.
-    matcher : Matcher
+    Points, shape (m, 3), and centres, shape (k, 3), in the world frame.
     """
     owner = np.repeat(np.arange(len(xyz)), np.diff(views.start))
     up = centres[views.camera] - xyz[owner]
@@ -289,10 +279,10 @@ _STEPS = 2.0
 
 
 class Bed(NamedTuple):
-    """Heights on a grid; NaN where nothing is known.
+    """The bed of the surroundings as heights on a grid; NaN where nothing is known.
 
-    See `pcfix.refract.fusion`. It is a raster that only helps to choose among the likely beds of a
-    point; no point is put onto it.
+    It serves only to choose among the likely beds of a point (`pcfix.refract.fusion`); no point is
+    put onto it.
 
     Attributes
     ----------
@@ -300,7 +290,7 @@ class Bed(NamedTuple):
         World frame; the first row is the southern one.
     left_m, bottom_m, cell_m : float
     between : bool
-        Whether heights go from cell to cell in straight lines, or in steps.
+        Whether heights are interpolated between cells.
     """
 
     height_m: FloatArray
@@ -338,7 +328,7 @@ class Bed(NamedTuple):
 
 
 def bed_of(xyz: FloatArray, likely_m: FloatArray) -> Bed:
-    """Return the bed that most points can have come from, cell by cell.
+    """Return the bed that agrees with most points, cell by cell.
 
     Parameters
     ----------
@@ -363,37 +353,25 @@ def bed_of(xyz: FloatArray, likely_m: FloatArray) -> Bed:
     return Bed(grid, float(low[0]), float(low[1]), cell)
 
 
-@kernel(allocates=True)
 def _without_outliers(height: FloatArray) -> FloatArray:
-    """Return heights in which a cell far off the median of its 5 x 5 surroundings is that median.
+    """Replace a cell far from the median of its 5 x 5 surroundings by that median.
 
     Where only one group of images sees the bed, several heights have all votes.
     """
-    rows, columns = height.shape
-    smooth = height.copy()
-    around = np.empty((2 * REACH + 1) ** 2)
-    for r in range(rows):
-        for c in range(columns):
-            if height[r, c] != height[r, c]:
-                continue
-            count = 0
-            for i in range(max(0, r - REACH), min(rows, r + REACH + 1)):
-                for j in range(max(0, c - REACH), min(columns, c + REACH + 1)):
-                    if height[i, j] == height[i, j]:
-                        around[count] = height[i, j]
-                        count += 1
-            middle = np.median(around[:count])
-            if abs(height[r, c] - middle) > FAR_OFF_M:
-                smooth[r, c] = middle
+    row, column = np.nonzero(np.isfinite(height))
+    padded, smooth = np.pad(height, REACH, constant_values=np.nan), height.copy()
+    down, right = np.mgrid[: 2 * REACH + 1, : 2 * REACH + 1].reshape(2, -1)
+    middle = np.nanmedian(padded[row[:, None] + down, column[:, None] + right], axis=1)
+    far = np.abs(height[row, column] - middle) > FAR_OFF_M
+    smooth[row[far], column[far]] = middle[far]
     return smooth
 
 
 def _cell_m(xy: FloatArray, low: FloatArray, high: FloatArray) -> float:
-    """Return the side of cells that hold so many points on average where there are any."""
-    least = float(np.sqrt(np.prod(np.maximum(high - low, 1.0)) / MOST_CELLS))
-    side = max(
-        float(np.sqrt(np.prod(np.maximum(high - low, 1.0)) * POINTS_A_CELL / len(xy))), least
-    )
+    """Return the side of cells that hold `POINTS_A_CELL` points on average where there are any."""
+    area = np.prod(np.maximum(high - low, 1.0))
+    least = float(np.sqrt(area / MOST_CELLS))
+    side = max(float(np.sqrt(area * POINTS_A_CELL / len(xy))), least)
     for _ in range(3):
         at = np.floor((xy - low) / side).astype(np.int64)
         filled = len(np.unique(at[:, 1] * (at[:, 0].max() + 1) + at[:, 0]))
@@ -406,9 +384,10 @@ def _vote(
     span: Span, order: IntArray, start: IntArray, z: FloatArray, likely: FloatArray,
     found: FloatArray,
 ) -> None:  # fmt: skip
-    """Find in each cell the height with the most votes; a point votes for all its likely beds."""
+    """Find the height with most votes in each cell; a point votes for all its likely beds."""
     for c in range(*span):
         rows = order[start[c] : start[c + 1]]
+        # the range of likely beds in the cell
         low, high = np.inf, -np.inf
         for i in rows:
             for h in range(likely.shape[1]):
@@ -418,6 +397,7 @@ def _vote(
         found[c] = np.nan
         if not high >= low:
             continue
+        # a histogram with bins of half a standard deviation
         step = max(WIDTH_M / _STEPS, (high - low) / 2000.0)
         votes = np.zeros(int((high - low) / step) + 2)
         vote = np.empty(votes.size)
@@ -432,7 +412,8 @@ def _vote(
 
 @device
 def _add_vote(vote: FloatArray, at: float) -> None:
-    """Vote once for every height at which a point can be, however many groups say so."""
+    """Vote for the heights around one likely bed; several likely beds of a point count once."""
+    # three standard deviations to both sides
     reach = int(3.0 * _STEPS)
     for k in range(max(0, int(at) - reach), min(vote.size, int(at) + reach + 2)):
         off = (k - at) / _STEPS

@@ -1,7 +1,7 @@
-"""The methods of correction, each under its name, all through one seam.
+"""Correct points by the method of a name.
 
-``snell`` and ``consistent`` with every camera in frame choose cameras in their kernels as they go;
-the others get batches of points with the cameras chosen.
+``snell`` and ``consistent`` with all cameras in frame choose cameras in their kernels; the others
+get batches of points with chosen cameras.
 """
 
 from __future__ import annotations
@@ -18,47 +18,45 @@ from pcfix.refract.batch import Batch, Intersection, Survey
 from pcfix.refract.cells import is_bent, is_quick
 from pcfix.refract.choice import cameras_of_pairs, chosen_views
 from pcfix.refract.consistent import consistent
-from pcfix.refract.fusion import invert_fusion
+from pcfix.refract.fusion import invert_depth_maps, invert_fusion
 from pcfix.refract.intersect import intersect, intersect_in_frame
-from pcfix.refract.listed_maps import invert_depth_maps
 from pcfix.refract.matcher import steepest_and_partners, without_border
-from pcfix.refract.occlusion import in_sight
-from pcfix.refract.shan import shan
+from pcfix.refract.occlusion import visible_cameras
 from pcfix.refract.smooth import consistent_in_cells
 from pcfix.refract.stereo_pairs import invert_pairs
 from pcfix.refract.tiling import spatial_order
-from pcfix.refract.uncertainty import with_doubt, with_uncertainty
+from pcfix.refract.uncertainty import with_model_uncertainty, with_uncertainty
 from pcfix.water.surface import SurfaceAbove
 
 Method: TypeAlias = Callable[[Batch], Intersection]
 
 POINTS_AT_ONCE = 100_000
-"""Bounds the memory of the lists of cameras: some 50 MB at 40 rays a point."""
+"""Bounds the memory of the lists of cameras: some 50 MB at 40 rays per point."""
 
 METHODS: dict[str, Method] = {
     "snell": intersect,
     "consistent": consistent,
-    "shan": shan,
+    "shan": literature.shan,
     "butler": literature.butler,
     "murase": literature.murase,
-    "dietrich": literature.dietrich,
+    "dietrich": literature.butler,
     "factor": literature.factor,
     "regression": literature.regression,
 }
-"""What each name of `pcfix.options.Method` stands for: a new one is a function and an entry."""
+"""By the names of `pcfix.options.Method`: a new method is a function and an entry."""
 
 _OF_MATCHERS: dict[str, Method] = {
     "depth-maps": invert_depth_maps,
     "pairs": invert_pairs,
     "pair-images": invert_pairs,
 }
-"""What `consistent` is for the kinds of dense clouds."""
+"""`consistent` for the kinds of dense clouds."""
 
 _IN_FRAME: dict[Method, Method] = {
     intersect: intersect_in_frame,
     consistent_in_cells: consistent_in_cells,
 }
-"""Methods whose kernels choose among all cameras as they go, and what does so."""
+"""Methods whose kernels choose among all cameras, and the function that does so."""
 
 
 def correct(batch: Batch) -> Intersection:
@@ -77,7 +75,7 @@ def correct(batch: Batch) -> Intersection:
 
 
 def _named_by_limit(found: Intersection, batch: Batch) -> Intersection:
-    """Tell apart, of points with fewer than two rays, those that lack them by the largest angle."""
+    """Give points that lack rays only because of the largest angle an outcome of their own."""
     survey = batch.survey
     few = np.flatnonzero(np.isin(found.outcome, (Outcome.NO_CAMERA, Outcome.ONE_CAMERA)))
     if survey.settings.limit_deg is None or not len(few):
@@ -93,13 +91,13 @@ def _named_by_limit(found: Intersection, batch: Batch) -> Intersection:
 
 
 def _corrected(batch: Batch) -> Intersection:
-    """Correct points that were made in one way."""
+    """Correct points of one reconstruction type."""
     survey, views, pairs = batch.survey, batch.views, None
     method = _method(batch)
     if views is not None and views.kind == "pairs":
         pairs, batch = views, replace(batch, views=cameras_of_pairs(views))
     if method in _IN_FRAME and _takes_all_in_frame(batch):
-        return with_doubt(_IN_FRAME[method](batch), batch)
+        return with_model_uncertainty(_IN_FRAME[method](batch), batch)
     order = spatial_order(batch.xyz)
     parts = []
     for rows in batches(order):
@@ -111,15 +109,15 @@ def _corrected(batch: Batch) -> Intersection:
         known = with_uncertainty(found, part)
         if method in (invert_fusion, invert_depth_maps):
             known = _with_model_error(known, found, part)
-        parts.append(_with_unsure(known, part, batch.views))
-    return with_doubt(joined(parts, order, len(survey.cameras)), batch)
+        if survey.settings.unsure != "keep":
+            unsure = (found.outcome == Outcome.CORRECTED) & part.seen_flat() & (batch.views is None)
+            known = known._replace(unsure=unsure)
+        parts.append(known)
+    return with_model_uncertainty(joined(parts, order, len(survey.cameras)), batch)
 
 
 def _takes_all_in_frame(batch: Batch) -> bool:
-    """Whether every camera whose frame holds the point counts, under water that is a plane.
-
-    And nobody asks which these are, as the kernel for this makes no lists.
-    """
+    """Whether all cameras whose frames hold a point count, under a plane, and no list is needed."""
     survey = batch.survey
     return (
         batch.views is None
@@ -132,15 +130,15 @@ def _takes_all_in_frame(batch: Batch) -> bool:
 
 
 def shift_of_land(batch: Batch) -> FloatArray:
-    """Return how far points on land are from where a dense matcher would have had them.
+    """Return the shift of land points between a dense matcher and the intersection of all rays.
 
-    Carried by all their images alike, they lie where straight rays meet best; a dense matcher
-    would have made them of some images' depths. That is undone as on the bed, without water.
+    A transfer to adjusted cameras intersects the rays of all images; a dense matcher uses the
+    depths of some images. That is inverted as on the bed, without water.
 
     Returns
     -------
     array, shape (m, 3)
-        Metres; zero for clouds that no dense matcher made.
+        Metres; zero for clouds of tracks.
     """
     batch = replace(batch, survey=batch.survey.learned.land or on_land(batch.survey))
     if _method(batch) not in (invert_fusion, *_OF_MATCHERS.values()):
@@ -150,10 +148,9 @@ def shift_of_land(batch: Batch) -> FloatArray:
 
 
 def on_land(survey: Survey) -> Survey:
-    """Return what points are corrected with where there is no water.
+    """Return the survey for points without water.
 
-    The bed of the surroundings tells nothing there: groups of images are centimetres apart on land,
-    so that the largest made the point.
+    The bed of the surroundings is not used: on land the groups of images are centimetres apart.
     """
     return replace(
         survey,
@@ -167,12 +164,12 @@ def on_land(survey: Survey) -> Survey:
 
 
 MODEL_GSD = 0.8
-"""Standard error of the model of depth maps itself, which is common to a block: the bias of whole
-blocks with known truth was -0.6 to +1.4 ground pixels, most where image noise is large."""
+"""Standard error of the model of depth maps, common to a block: the bias of blocks with known truth
+was -0.6 to +1.4 ground pixels, largest with much image noise."""
 
 
 def _with_model_error(known: Intersection, found: Intersection, batch: Batch) -> Intersection:
-    """Add to the error of Z that of the model, and of not knowing which images made the point."""
+    """Add the errors of the model of depth maps, and of the ambiguous images, to that of Z."""
     if known.covariance_m2 is None:
         return known
     cameras, moved = batch.survey.cameras, found.outcome == Outcome.CORRECTED
@@ -183,16 +180,8 @@ def _with_model_error(known: Intersection, found: Intersection, batch: Batch) ->
     return known._replace(covariance_m2=covariance, sigma_z_m=np.sqrt(covariance[:, 5]))
 
 
-def _with_unsure(found: Intersection, part: Batch, listed: Views | None) -> Intersection:
-    """Add, where it is asked for, which points are corrected by flat obliques alone."""
-    if part.survey.settings.unsure == "keep":
-        return found
-    unsure = (found.outcome == Outcome.CORRECTED) & part.seen_flat() & (listed is None)
-    return found._replace(unsure=unsure)
-
-
 def _method(batch: Batch) -> Method:
-    """Return the function that corrects; what a dense matcher made is not triangulated at once."""
+    """Return the function that corrects; for `consistent` it depends on the reconstruction type."""
     settings, views = batch.survey.settings, batch.views
     modelled = "tracks" if batch.survey.learned.matcher is None else settings.matcher
     kind = modelled if views is None else views.kind
@@ -206,19 +195,19 @@ def _method(batch: Batch) -> Method:
 
 
 def with_rays(batch: Batch) -> Batch:
-    """Return the batch with its cameras chosen: none that the cloud hides.
+    """Return the batch with its cameras chosen, without occluded ones.
 
-    They are those of its list, of the model of a matcher, or all in frame. Of the model,
-    `consistent` takes all images that may have a depth of the point, as it weighs them by itself;
-    to the other methods go the steepest image and those it was matched with.
+    They are those of its view list, of the model of a matcher, or all in frame. With the model,
+    `consistent` takes all images that may have a depth of the point, and weights them; the other
+    methods get the steepest image and those it was matched with.
     """
     survey, matcher = batch.survey, batch.survey.learned.matcher
     if batch.views is not None or matcher is None:
-        return replace(batch, views=_in_sight(batch))
+        return replace(batch, views=_visible_cameras(batch))
     inner = replace(survey, cameras=without_border(survey.cameras))
     if survey.settings.method == "consistent":
-        return replace(batch, views=_in_sight(replace(batch, survey=inner)))
-    seeing = _in_sight(replace(batch, survey=_with_any_number(inner)))
+        return replace(batch, views=_visible_cameras(replace(batch, survey=inner)))
+    seeing = _visible_cameras(replace(batch, survey=_with_any_number(inner)))
     partners = steepest_and_partners(batch.xyz, survey.cameras.centres, seeing, matcher)
     return replace(batch, views=chosen_views(replace(batch, views=partners)))
 
@@ -227,26 +216,26 @@ def _with_any_number(survey: Survey) -> Survey:
     return replace(survey, settings=replace(survey.settings, max_cameras=None))
 
 
-def _in_sight(batch: Batch) -> Views:
-    """Return the chosen cameras, without those that the cloud hides; the steepest of the rest."""
+def _visible_cameras(batch: Batch) -> Views:
+    """Return the chosen cameras without occluded ones; the steepest of these if limited."""
     survey, occluder = batch.survey, batch.survey.learned.occluder
     if occluder is None:
         return chosen_views(batch)
     chosen = chosen_views(replace(batch, survey=_with_any_number(survey)))
-    seeing = in_sight(batch.xyz, survey.cameras.centres, chosen, occluder)
+    seeing = visible_cameras(batch.xyz, survey.cameras.centres, chosen, occluder)
     if survey.settings.max_cameras is None:
         return seeing
     return chosen_views(replace(batch, views=seeing))
 
 
 def batches(order: IntArray) -> Iterator[IntArray]:
-    """Yield the rows of points, so many at once as memory allows; at least once."""
+    """Yield the rows of points in batches, at least one."""
     for first in range(0, max(len(order), 1), POINTS_AT_ONCE):
         yield order[first : first + POINTS_AT_ONCE]
 
 
 def joined(parts: list[Intersection], order: IntArray, k: int) -> Intersection:
-    """Return the results of batches as one, back in the order of the points."""
+    """Join the results of batches, in the original order of the points."""
     place = np.empty_like(order)
     place[order] = np.arange(len(order))
 

@@ -1,20 +1,25 @@
-"""Which cameras a cloud hides from its own points.
+"""Find the cameras whose view of a point is occluded by the cloud itself.
 
-The cloud's own surface is a grid of heights. From the apparent point P the straight ray to the
+The surface of the cloud is a grid of heights. From the apparent point P the straight ray to the
 projection centre climbs over the cells on its way; where it is still below the surface as it
 leaves a cell, the camera did not see the point.
 
 The rays are straight and the surface is the apparent one, although light bends at the water. That
-is the same picture twice: the software that knew nothing of water put every submerged thing on
-the straight ray on which an image shows it, so that what hides P lies before it on its straight
-ray. It is an approximation where an apparent point was made of several images, as their straight
-rays miss each other: beside nadir images, that of a ray at 45 degrees by about a tenth of the
-depth. A thing and what it hides under water are off to the same side, so that the difference of
-their depths counts. Above the water nothing is approximate.
+is consistent: software that ignores water puts every submerged object on the straight ray on which
+an image shows it, so that what occludes P lies before it on its straight ray. It is an
+approximation for points of several images, as their straight rays pass each other: beside nadir
+images, a ray at 45 degrees by about a tenth of the depth. An object and what it occludes under
+water are displaced to the same side, so that only the difference of their depths matters. Above the
+water nothing is approximate.
 
-Nothing but the grid is known, so all below its surface counts as solid. Within `NEAR_CELLS` of P
-nothing is tested: a cell has one height, and on a cliff that is the upper edge, not P's. Only
-under a roof, where all cells around P stand over it, it matters whether the ray goes through it.
+Everything below the surface of the grid counts as solid. Within `NEAR_CELLS` of P nothing is
+tested: a cell has one height, which on a cliff is the upper edge. Only under a roof, where all
+cells around P are higher, it matters whether the ray goes through it.
+
+A cell has the height of its second highest point, and at most that of the highest of its eight
+neighbours, so that neither a single flying point nor a single cell counts. The sides of cells are
+powers of two, in metres, from the origin of the world frame: the surface does not depend on the
+order of the points.
 """
 
 from __future__ import annotations
@@ -25,29 +30,50 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.kernels import Span, device, in_tiles, kernel
-from pcfix.model import BoolArray, FloatArray, IntArray, Views
+from pcfix.model import NOISE_CLASSES, BoolArray, Cameras, FloatArray, IntArray, Views
+from pcfix.options.correct import ScienceOptions
 
 Heights = npt.NDArray[np.float32]
 
 NEAR_CELLS = 2.0
-"""So far from the point, in plan, its own surroundings do not hide it."""
+"""Distance from the point, in plan, within which nothing occludes it."""
 BLOCK, LARGE_BLOCK = 8, 64
-"""Cells along the side of the blocks whose highest cell is kept, to pass them at once."""
+"""Cells along the side of the blocks whose highest cell is known, to pass them at once."""
 MARGIN_BLOCK = 16
 ROOF_MARGINS = 2.0
-"""A roof stands over the point by so many margins; else it may be a low point of an even bed."""
+"""Least height of a roof over the point, in margins; else it may be a low point of an even bed."""
 _ONWARD = 1e-6
-"""Of a cell: past its edge, so that the next one is looked at."""
+"""Step past the edge of a cell into the next one, in cells."""
+
+MOST_CELLS = 2**24
+"""Bounds the memory, 8 bytes a cell; where a cloud needs more, its cells are larger."""
+CELLS_A_POINT = 16
+"""Most cells per point at first, so that a cloud may fill a sixteenth of its rectangle."""
+POINTS_A_CELL = 4.0
+"""Least points per cell with points, on average: cells are two to four point spacings wide."""
+FINEST_M = 2.0**-10
+WIDE_GAP = 0.75
+GAPS_TO_MARGIN = 4.5
+"""The margin is 4.5 times the upper quartile, over the cells of a block, of the gap between the
+highest two points of a cell. For noise and four to sixteen points that is about four standard
+deviations: the point may be low by three, and a cell high by one. The gap does not see the height
+of walls; the quartile stays that of a noisy bed where most of the block is smooth. In cells that
+are steep in themselves the gap grows with what they rise."""
+FEWEST_CELLS = 9
+"""With heights, in a block with a margin of its own."""
+OBLIQUE_DEG = 15.0
+"""An image whose axis is farther off the nadir is an oblique. The axes of stabilised nadir blocks
+stay within a few degrees; obliques are flown at 20 and more."""
 
 
 class Occluder(NamedTuple):
-    """The surface of a cloud, which hides points from cameras.
+    """The surface of a cloud, which occludes points.
 
     Attributes
     ----------
     height : array of float32, shape (rows, columns)
-        Metres, world frame; the first row is the southern one. NaN where it is not known; there
-        it hides nothing.
+        Metres, world frame; the first row is the southern one. NaN where it is not known, which
+        occludes nothing.
     left_m, bottom_m : float
         South-west corner of the grid, world frame.
     cell_m : float
@@ -55,8 +81,8 @@ class Occluder(NamedTuple):
     highest_m : float
         Of all heights; minus infinity where none is known.
     margin : array of float32, shape (rows / 16, columns / 16), rounded up
-        By how much a ray must pass below the surface, metres: the noise of the points in each
-        block of `MARGIN_BLOCK` cells.
+        Least distance by which a ray must pass below the surface, metres: the noise of the points
+        in each block of `MARGIN_BLOCK` cells.
     block_top, large_block_top : array of float32
         The highest of each block of `BLOCK` and `LARGE_BLOCK` cells; minus infinity where none
         is known.
@@ -72,33 +98,31 @@ class Occluder(NamedTuple):
     large_block_top: Heights
 
 
-def hidden(xyz: FloatArray, centres: FloatArray, views: Views, occluder: Occluder) -> BoolArray:
-    """Return for each entry of ``views.camera`` whether the cloud hides the camera from its point.
+def occluded(xyz: FloatArray, centres: FloatArray, views: Views, occluder: Occluder) -> BoolArray:
+    """Return for each entry of ``views.camera`` whether the cloud occludes its point.
 
-    Points, shape (n, 3), apparent, and projection centres, shape (k, 3), in metres, world frame.
-    No camera is hidden that is not above its point, nor from a point beside the grid.
-
-    Notes
-    -----
-    The cells on the way are found as by Amanatides & Woo 1987, "A fast voxel traversal algorithm
-    for ray tracing", in blocks of three sizes. The ray's height as it leaves a cell is compared,
-    so that on an even slope, which the ray climbs away from, no cell stands above it.
+    Apparent points, shape (n, 3), and projection centres, shape (k, 3), in metres, world frame.
+    Cameras below their point, and points beside the grid, are never occluded. The cells on the way
+    are found as by Amanatides & Woo 1987, "A fast voxel traversal algorithm for ray tracing", in
+    blocks of three sizes.
     """
     found = np.zeros(len(views.camera), np.bool_)
     in_tiles(
-        _hidden, len(xyz), np.ascontiguousarray(xyz), np.ascontiguousarray(centres),
+        _occlude, len(xyz), np.ascontiguousarray(xyz), np.ascontiguousarray(centres),
         views.start, views.camera, occluder, found,
     )  # fmt: skip
     return found
 
 
-def in_sight(xyz: FloatArray, centres: FloatArray, views: Views, occluder: Occluder) -> Views:
-    """Return the views without the hidden cameras.
+def visible_cameras(
+    xyz: FloatArray, centres: FloatArray, views: Views, occluder: Occluder
+) -> Views:
+    """Return the views without occluded ones; see `occluded`.
 
-    A point that would keep fewer than two cameras keeps them all: it is in the cloud, so two saw
-    it, and it is the grid that does not show how. Parameters are those of `hidden`.
+    A point that would keep fewer than two cameras keeps them all: as it is in the cloud, two
+    cameras saw it, and the grid is too coarse to show how.
     """
-    stays = ~hidden(xyz, centres, views, occluder)
+    stays = ~occluded(xyz, centres, views, occluder)
     owner = np.repeat(np.arange(len(xyz)), np.diff(views.start))
     left = np.bincount(owner[stays], minlength=len(xyz))
     stays |= (left < 2)[owner]
@@ -108,16 +132,18 @@ def in_sight(xyz: FloatArray, centres: FloatArray, views: Views, occluder: Occlu
 
 
 @kernel
-def _hidden(
+def _occlude(
     span: Span, xyz: FloatArray, centres: FloatArray, start: IntArray, camera: IntArray,
     o: Occluder, found: BoolArray,
 ) -> None:  # fmt: skip
-    """Test every ray; distances in plan are in cells from here on."""
+    """Test every ray; distances in plan are in cells."""
     for i in range(*span):
         u, v, z = (xyz[i, 0] - o.left_m) / o.cell_m, (xyz[i, 1] - o.bottom_m) / o.cell_m, xyz[i, 2]
         if not _inside(o.height, u, v):
             continue
+        # the noise of the points here
         slack = float(o.margin[int(v) // MARGIN_BLOCK, int(u) // MARGIN_BLOCK])
+        # nothing in the cloud is higher
         if z + slack >= o.highest_m:
             continue
         roofed = _is_roofed(o.height, int(v), int(u), z + ROOF_MARGINS * slack)
@@ -127,9 +153,11 @@ def _hidden(
             up, run = centres[c, 2] - z, np.sqrt(du * du + dv * dv)
             if up <= 0.0:
                 continue
+            # straight above: only a roof can occlude it
             if run < _ONWARD:
                 found[entry] = roofed
                 continue
+            # unit steps in plan, and the rise of the ray for each
             du, dv, rise = du / run, dv / run, up / run
             first, pierces = NEAR_CELLS, False
             if roofed:
@@ -144,9 +172,10 @@ def _inside(height: Heights, u: float, v: float) -> bool:
 
 @device
 def _is_roofed(height: Heights, row: int, column: int, z: float) -> bool:
-    """Whether all cells as near as is not tested stand above z."""
+    """Whether all cells within `NEAR_CELLS` are higher than z."""
     if not height[row, column] > z:
         return False
+    # roofs are not looked for at the edge of the grid
     reach = int(NEAR_CELLS)
     if not (reach <= row < height.shape[0] - reach and reach <= column < height.shape[1] - reach):
         return False
@@ -159,7 +188,7 @@ def _is_roofed(height: Heights, row: int, column: int, z: float) -> bool:
 
 @device
 def _to_edge(x: float, dx: float, side: int) -> float:
-    """Return how far the ray goes until it leaves its block along one axis."""
+    """Return the distance at which the ray leaves its block along one axis."""
     if dx == 0.0:
         return np.inf
     edge = np.floor(x / side) * side + (side if dx > 0.0 else 0)
@@ -171,18 +200,20 @@ def _meets(
     o: Occluder, u: float, v: float, z: float, du: float, dv: float, rise: float, run: float,
     first: float,
 ) -> bool:  # fmt: skip
-    """Whether the ray leaves some cell below its height, from `first` cells on."""
+    """Whether the ray leaves a cell below the height of that cell, from `first` cells on."""
     t = first
     while t < run:
         x, y, low = u + t * du, v + t * dv, z + t * rise
         if low >= o.highest_m or not _inside(o.height, x, y):
             return False
         row, column = int(y), int(x)
+        # pass blocks whose highest cell is below the ray
         side = 1
         if low >= o.large_block_top[row // LARGE_BLOCK, column // LARGE_BLOCK]:
             side = LARGE_BLOCK
         elif low >= o.block_top[row // BLOCK, column // BLOCK]:
             side = BLOCK
+        # on to the edge of the cell or block
         t = min(t + min(_to_edge(x, du, side), _to_edge(y, dv, side)), run)
         if side == 1 and z + t * rise < o.height[row, column]:
             return True
@@ -195,16 +226,17 @@ def _through_roof(
     o: Occluder, u: float, v: float, z: float, du: float, dv: float, rise: float, run: float,
     slack: float,
 ) -> tuple[float, bool]:  # fmt: skip
-    """Return how far the ray goes below a roof, and whether it goes through it.
+    """Return how far the ray goes below a roof, and whether it pierces the roof.
 
-    It does where the surface is left behind in a cell, or falls below the ray from one cell to
-    the next by less than the margin; at the edge of the roof it falls by more.
+    It does where it rises above the surface within a cell, or where the surface falls below the ray
+    from one cell to the next by less than the margin; at the edge of the roof it falls by more.
     """
     t = 0.0
     while t < run:
         x, y, low = u + t * du, v + t * dv, z + t * rise
         if not _inside(o.height, x, y):
             break
+        # the roof over this cell
         top = o.height[int(y), int(x)]
         if top <= low:
             return t, low - top < slack
@@ -213,3 +245,201 @@ def _through_roof(
             return t, True
         t += _ONWARD
     return t, False
+
+
+class _Cells(NamedTuple):
+    """Cells from a first row and column on; heights are minus infinity where there is no point."""
+
+    side_m: float
+    first_row: int
+    first_column: int
+    highest: Heights
+    second: Heights
+
+
+class OccluderBuilder:
+    """Builds the surface of a cloud from its chunks, without noise.
+
+    Parameters
+    ----------
+    low, high : array, shape (2,)
+        South-west and north-east corner of the cloud, metres, if they are known; the grid grows
+        where points lie outside.
+    points : int
+        Of the whole cloud.
+    """
+
+    def __init__(self, low: FloatArray, high: FloatArray, points: int) -> None:
+        self._most = min(MOST_CELLS, CELLS_A_POINT * max(points, 1))
+        self._low, self._high = np.full(2, np.inf), np.full(2, -np.inf)
+        self._cells: _Cells | None = None
+        self._points = 0
+        if np.isfinite([low, high]).all() and (low <= high).all():
+            self._reach(low, high)
+
+    def add(self, xyz: FloatArray, classes: npt.NDArray[np.uint8] | None = None) -> None:
+        """Add a chunk.
+
+        Parameters
+        ----------
+        xyz : array, shape (n, 3)
+            Apparent points, metres, world frame.
+        classes : array, shape (n,), optional
+            Low and high noise (7 and 18) occlude nothing.
+        """
+        if classes is not None:
+            xyz = xyz[~np.isin(classes, NOISE_CLASSES)]
+        if not len(xyz):
+            return
+        self._points += len(xyz)
+        self._reach(xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0))
+        if self._cells is not None:
+            _add(self._cells, np.ascontiguousarray(xyz))
+
+    def _reach(self, low: FloatArray, high: FloatArray) -> None:
+        """Extend the grid to a rectangle."""
+        low, high = np.minimum(self._low, low), np.maximum(self._high, high)
+        if (low == self._low).all() and (high == self._high).all():
+            return
+        self._low, self._high = low, high
+        self._cells = _over(low, high, self._most, self._cells)
+
+    def build(self) -> Occluder | None:
+        """Return the surface; None without points. The builder is then empty."""
+        cells, self._cells = self._cells, None
+        if cells is None or not self._points:
+            return None
+        # until the cells with points have enough of them on average
+        while max(cells.highest.shape) > 2 and (
+            self._points < POINTS_A_CELL * np.isfinite(cells.highest).sum()
+        ):
+            cells = _halved(cells)
+        height = _without_spikes(cells.second)
+        return Occluder(
+            height=height,
+            left_m=cells.first_column * cells.side_m,
+            bottom_m=cells.first_row * cells.side_m,
+            cell_m=cells.side_m,
+            highest_m=float(np.nanmax(height, initial=-np.inf)),
+            margin=_margins(cells.highest, cells.second),
+            block_top=_tops(height, BLOCK),
+            large_block_top=_tops(height, LARGE_BLOCK),
+        )
+
+
+def _shape(low: FloatArray, high: FloatArray, side: float) -> tuple[FloatArray, FloatArray]:
+    """Return the first row and column, and how many there are."""
+    first, last = np.floor(low[::-1] / side), np.floor(high[::-1] / side)
+    return first, last - first + 1.0
+
+
+def _over(low: FloatArray, high: FloatArray, most: int, old: _Cells | None) -> _Cells:
+    """Return the finest cells over a rectangle, with what is in the old ones."""
+    side = FINEST_M if old is None else old.side_m
+    while _shape(low, high, side)[1].prod() > most:
+        side *= 2.0
+    while old is not None and old.side_m < side:
+        old = _halved(old)
+    first, shape = _shape(low, high, side)
+    rows, columns = int(shape[0]), int(shape[1])
+    values = [np.full((rows, columns), -np.inf, np.float32) for _ in range(2)]
+    new = _Cells(side, int(first[0]), int(first[1]), *values)
+    if old is not None:
+        row, column = old.first_row - new.first_row, old.first_column - new.first_column
+        rows, columns = old.highest.shape
+        for target, source in zip(new[3:], old[3:], strict=True):
+            target[row : row + rows, column : column + columns] = source
+    return new
+
+
+def _halved(cells: _Cells) -> _Cells:
+    """Return the same in cells of twice the side."""
+    (rows, columns), south, west = cells.highest.shape, cells.first_row % 2, cells.first_column % 2
+    pad = (south, (south + rows) % 2), (west, (west + columns) % 2)
+    highest, second = _quads(cells.highest, pad), _quads(cells.second, pad)
+    first, runner_up = highest[0], second[0]
+    for one, other in zip(highest[1:], second[1:], strict=True):
+        runner_up = np.maximum(np.minimum(first, one), np.maximum(runner_up, other))
+        first = np.maximum(first, one)
+    corner = cells.first_row // 2, cells.first_column // 2
+    return _Cells(cells.side_m * 2.0, *corner, first, runner_up)
+
+
+def _quads(cells: Heights, pad: tuple[tuple[int, int], ...]) -> list[Heights]:
+    """Return the four cells of each two by two, after adding empty rows and columns."""
+    full = np.pad(cells, pad, constant_values=-np.inf) if np.any(pad) else cells
+    return [full[::2, ::2], full[::2, 1::2], full[1::2, ::2], full[1::2, 1::2]]
+
+
+@kernel
+def _add(cells: _Cells, xyz: FloatArray) -> None:
+    for i in range(len(xyz)):
+        c = int(np.floor(xyz[i, 0] / cells.side_m)) - cells.first_column
+        r = int(np.floor(xyz[i, 1] / cells.side_m)) - cells.first_row
+        z = np.float32(xyz[i, 2])
+        if z > cells.highest[r, c]:
+            cells.second[r, c] = cells.highest[r, c]
+            cells.highest[r, c] = z
+        elif z > cells.second[r, c]:
+            cells.second[r, c] = z
+
+
+def _without_spikes(second: Heights) -> Heights:
+    """Lower every cell to the highest of its eight neighbours; NaN where there is no height."""
+    from scipy.ndimage import maximum_filter
+
+    around = np.ones((3, 3), np.bool_)
+    around[1, 1] = False
+    beside = maximum_filter(second, footprint=around, mode="constant", cval=-np.inf)
+    lower = np.minimum(second, beside)
+    return np.where(lower > -np.inf, lower, np.float32(np.nan))
+
+
+def _tops(height: Heights, side: int) -> Heights:
+    """Return the highest of each block, minus infinity where no height is known."""
+    known = np.where(np.isnan(height), np.float32(-np.inf), height)
+    rows, columns = (np.arange(0, n, side) for n in height.shape)
+    return np.maximum.reduceat(np.maximum.reduceat(known, rows, axis=0), columns, axis=1)
+
+
+def _margins(highest: Heights, second: Heights) -> Heights:
+    """Return the margin of each block, metres: `GAPS_TO_MARGIN` times its upper quartile of gaps.
+
+    Blocks with few gaps get the quartile of all.
+    """
+    known = np.isfinite(second)
+    everywhere = np.quantile(highest[known] - second[known], WIDE_GAP) if known.any() else 0.0
+    rows, columns = (-(-n // MARGIN_BLOCK) for n in second.shape)
+    gaps = np.full((rows * MARGIN_BLOCK, columns * MARGIN_BLOCK), np.inf, np.float32)
+    gaps[: len(second), : second.shape[1]][known] = highest[known] - second[known]
+    blocks = gaps.reshape(rows, MARGIN_BLOCK, columns, MARGIN_BLOCK).swapaxes(1, 2)
+    blocks = np.sort(blocks.reshape(rows, columns, -1), axis=2)
+    count = np.isfinite(blocks).sum(axis=2)
+    place = (WIDE_GAP * np.maximum(count - 1, 0)).astype(np.int64)
+    quartile = np.take_along_axis(blocks, place[..., None], axis=2)[..., 0]
+    margin = np.where(count >= FEWEST_CELLS, quartile, everywhere)
+    return margin.astype(np.float32) * np.float32(GAPS_TO_MARGIN)
+
+
+def wants_occlusion(cameras: Cameras, settings: ScienceOptions) -> bool:
+    """Return whether occluded cameras are to be excluded.
+
+    With auto, if the axis of a camera is more than `OBLIQUE_DEG` off the nadir. Cameras without
+    angles count as nadir.
+    """
+    if settings.occlusion != "auto":
+        return settings.occlusion == "on"
+    if cameras.rotations is None:
+        return False
+    # the third row of a rotation is the axis in the world frame; straight down it is (0, 0, -1)
+    down = -cameras.rotations[:, 2, 2]
+    return bool((down < np.cos(np.radians(OBLIQUE_DEG))).any())
+
+
+def occluder_of(xyz: FloatArray, classes: npt.NDArray[np.uint8] | None = None) -> Occluder | None:
+    """Return the surface of points that are the whole cloud; see `OccluderBuilder.add`."""
+    if not len(xyz):
+        return None
+    builder = OccluderBuilder(xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0), len(xyz))
+    builder.add(xyz, classes)
+    return builder.build()

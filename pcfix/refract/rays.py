@@ -1,30 +1,28 @@
-r"""One ray at the water surface, forwards and backwards.
+r"""Refract rays at the water surface, forwards and backwards.
 
-Picture a camera C looking down at the apparent point P. The line from C to P meets the water
-surface at A and there bends towards the vertical; the true point lies somewhere on the bent ray
-that leaves A. Two or more such rays fix it.
+The line from the camera C to the apparent point P meets the water surface at A and is refracted
+there; the true point lies on the refracted ray that leaves A. Two or more such rays determine it.
 
-Everything is relative to P, which is the local origin: e = C - P points up to the camera, and
-A and the solution are small vectors, so nothing is lost at large coordinates. Directions keep
-the length L = \|e\| instead of being made unit vectors; that saves two square roots a ray, and
-the kernels live from that.
+Everything is relative to P, the local origin: e = C - P points up to the camera, and A and the
+solution are small vectors, so that nothing is lost at large coordinates. Directions have the length
+L = \|e\| instead of 1, which saves two square roots per ray.
 
-The functions hold arithmetic only: scalars in, scalars out, no reordering of sums
-(``fastmath`` stays off), so that the bits do not depend on tiles, chunks or threads.
+The functions contain arithmetic only, without reordering of sums (``fastmath`` is off), so that
+results do not depend on tiles, chunks or threads to the bit.
 
-**Piercing a mesh or raster.** Starting from the plane above the point, meet it; take the plane of
-the surface there, meet that one, and so on. Water is nearly flat, so this is over in one to three
-steps.
+**Piercing a mesh or raster.** From the plane above the point on: intersect it, take the plane of
+the surface there, intersect that one, and so on. Water is nearly flat, so that one to three steps
+are enough.
 
-On a mesh the planes are the facets'; on a crease between two, where it would go to and fro, the
-last of `PIERCING_STEPS` stands. On a raster they are the tangent planes of the bilinear surface;
-each step keeps to the bracket in which the line passes the surface, and halves it where a tangent
-plane leads out of it, until the line is within `CLOSE_M` of the surface. Beyond the edge of either,
-and over its gaps, the last plane goes on.
+On a mesh the planes are the facets'; on a crease, where the steps would alternate, the last of
+`PIERCING_STEPS` counts. On a raster they are the tangent planes of the bilinear surface; a step
+that leaves the bracket in which the line passes the surface halves it instead, until the line is
+within `CLOSE_M` of the surface. Beyond the edge of either, and over its gaps, the last plane is
+continued.
 
-**Backwards, from a true point to a camera.** Picture a point Q below a plane with the unit normal
-N, and a camera C at the height H above it. Seen from the foot of C the point lies at the sideways
-vector s, at the depth D. In air the light comes from the direction
+**Backwards, from a true point to a camera.** The point Q lies at the depth D below a plane with the
+unit normal N, and the camera C at the height H above it. From the foot of C the point is at the
+sideways vector s. In air the light comes from the direction
 
     w = -N + k s
 
@@ -38,13 +36,13 @@ or, divided by \|s\|, with S = sqrt(n^2 + (n^2 - 1) k^2 s.s)
 
     G(k) = k (H + D / S) - 1 = 0
 
-G rises and bends down, so that Newton's method started at k = 1 / (H + D / n), where G <= 0, comes
-to the only root from the left and needs no bracket. Nothing is divided by \|s\|: straight below
-the camera is no special case. A point above the plane sends its light straight, k = 1 / (H + D);
-the two meet at D = 0.
+G rises and bends down, so that Newton's method from k = 1 / (H + D / n), where G <= 0, converges to
+the only root from the left and needs no bracket. Nothing is divided by \|s\|: straight below the
+camera is no special case. The light of a point above the plane goes straight, k = 1 / (H + D); the
+two agree at D = 0.
 
 On a mesh or raster the plane is the tangent plane where the light leaves the water, found by
-going there, taking the plane there, and so on.
+iteration.
 
 The plane is N.x = h.
 """
@@ -76,24 +74,12 @@ def refracted(e: Vector, length2: float, normal: Vector, height: float, r: float
     """Return the refracted ray's direction (downward), with the length L of e.
 
     Snell's law in vector form, Skarlatos & Agrafiotis 2018, eq 10, multiplied by L: with the
-    unit ray s = -e/L and c = -N.s = H/L,
+    unit ray s = -e/L, c = -N.s = H/L, H = N.e (`height`) and r = 1 / n,
 
         L t = r L s + (r L c - sqrt(L^2 - r^2 (L^2 - L^2 c^2))) N
             = -r e + (r H - sqrt(L^2 - r^2 (L^2 - H^2))) N
-
-    Parameters
-    ----------
-    e : Vector
-        From the apparent point to the projection centre, metres.
-    length2 : float
-        L^2 = e.e
-    normal : Vector
-        Unit normal N of the surface, upward.
-    height : float
-        H = N.e
-    r : float
-        1 / n
     """
+    # L t = -r e + k N
     k = r * height - np.sqrt(length2 - r * r * (length2 - height * height))
     return minus(scaled(k, normal), scaled(r, e))
 
@@ -106,17 +92,13 @@ def line_terms(
 
     The line runs through A along t = d / L. Its squared distance from Q is Q'MQ - 2 b'Q + s
     with M = I - t t', b = M A and s = A'M A (Skarlatos & Agrafiotis 2018, eq 11, for any
-    number of rays). The diagonal of t t' sums to 1, so that zz need not be returned.
-
-    Returns
-    -------
-    xx, xy, xz, yy, yz : float
-        Elements of t t'.
-    bx, by, bz, s : float
-        b (metres) and s (metres squared).
+    number of rays). Returned are xx, xy, xz, yy and yz of t t' (its diagonal sums to 1, so that zz
+    is not needed), b (metres) and s (metres squared).
     """
+    # d has the length L, so that t t' = d d' / L^2
     t, along = scaled(inv_length2, d), dot(d, a)
     bx, by, bz = minus(a, scaled(along, t))
+    # A'M A: squared distance of the line from the origin
     s = dot(a, a) - along * along * inv_length2
     return d[0] * t[0], d[0] * t[1], d[0] * t[2], d[1] * t[1], d[1] * t[2], bx, by, bz, s
 
@@ -130,38 +112,28 @@ def add_line(sums: FloatArray, a: Vector, d: Vector, inv_length2: float) -> None
 
 
 MIN_DETERMINANT = 1e-6
-"""Of M / k. Two rays at an angle of alpha give alpha^2 / 4: 1e-6 is a tenth of a degree, far
-below any usable base, and keeps rounding below 1e-9 m."""
+"""Least determinant of M / k. Two rays at an angle alpha have alpha^2 / 4: 1e-6 is a tenth of a
+degree, far below any usable base, and keeps rounding below 1e-9 m."""
 
 
 @device
 def nearest_point(k: float, sums: FloatArray) -> tuple[bool, Vector, float, float]:
     """Solve M Q = b for the point nearest to k lines, all with equal weight.
 
-    Parameters
-    ----------
-    k : float
-    sums : array
-        The first nine are the sums of `line_terms`.
-
-    Returns
-    -------
-    solved : bool
-        False when the lines are too nearly parallel; then the rest is meaningless.
-    q : Vector
-        Q relative to the apparent point, metres.
-    miss : float
-        Root mean square distance of Q from the lines, metres.
-    sigma_z : float
-        Standard error of Q_z from the scatter of the lines, metres: the a-posteriori variance
-        s_min / (2k - 3) times (M^-1)_zz.
+    The first nine `sums` are those of `line_terms`. Returns whether it is solved (else the lines
+    are nearly parallel, and the rest is meaningless); Q relative to the apparent point; its root
+    mean square distance from the lines; and the standard error of Q_z from the scatter of the
+    lines: the a-posteriori variance s_min / (2k - 3) times (M^-1)_zz. Metres.
     """
     m00, m11 = k - sums[0], k - sums[3]
+    # M = k I - sum t t', with the last diagonal element from the trace
     det, c = cofactors((m00, -sums[1], -sums[2], m11, -sums[4], 2.0 * k - m00 - m11))
     b = sums[5], sums[6], sums[7]
     x, y, z = product(c, b)
     q = x / det, y / det, z / det
+    # the sum of squared distances at the minimum
     rest = max(sums[8] - dot(b, q), 0.0)
+    # 2 k equations for 3 unknowns
     sigma_z = np.sqrt(rest / (2.0 * k - 3.0) * c[5] / det)
     return det >= MIN_DETERMINANT * k * k * k, q, np.sqrt(rest / k), sigma_z
 
@@ -169,33 +141,18 @@ def nearest_point(k: float, sums: FloatArray) -> tuple[bool, Vector, float, floa
 PIERCING_STEPS = 16
 MAX_HALVINGS = 64
 CLOSE_M = 1e-9
-"""Along the vertical: a thousand times finer than any use, and no finer than a height in doubles
-allows (1e-12 m at 5000 m)."""
+"""Along the vertical: a thousandth of any use, and above the rounding of heights (1e-12 m)."""
 
 
 @device
 def pierce(
     tin: Tin | None, field: Field | None, p: Vector, e: Vector, h: float, normal: Vector, facet: int
 ) -> tuple[float, Vector]:
-    """Return the fraction of e from P to the surface, and the unit normal there.
+    """Return the fraction f of e from P to the surface, and the unit normal there.
 
-    Parameters
-    ----------
-    tin, field
-        The mesh or raster; a plane where both are None.
-    p : Vector
-        Apparent point, world frame, under water.
-    e : Vector
-        From it to the projection centre.
-    h, normal : float, Vector
-        Distance of the point from the tangent plane above it, and that plane's normal.
-    facet : int
-        The facet above the point, on a mesh.
-
-    Returns
-    -------
-    f, normal : float, Vector
-        The piercing point is P + f e.
+    P (world frame) lies under the mesh or raster, or under a plane where both are None; e leads to
+    the projection centre. h is the distance of P from the tangent plane above it, `normal` that
+    plane's normal, and `facet` the facet above P on a mesh. The piercing point is P + f e.
     """
     if tin is not None:
         return _pierce_mesh(tin, p, e, facet)
@@ -209,7 +166,7 @@ def pierce_of(
     c: int, tin: Tin | None, fields: Field | None, p: Vector, e: Vector, h: float, normal: Vector,
     facet: int,
 ) -> tuple[float, Vector]:  # fmt: skip
-    """Return `pierce` in the raster of camera c, where there are rasters."""
+    """Do as `pierce`, with the raster of camera c if there are rasters."""
     if fields is None:
         return pierce(tin, None, p, e, h, normal, facet)
     field = Field(fields.heights, fields.shape, fields.frame, c)
@@ -218,11 +175,14 @@ def pierce_of(
 
 @device
 def _pierce_mesh(tin: Tin, p: Vector, e: Vector, facet: int) -> tuple[float, Vector]:
+    """Walk from facet to facet until the line pierces the plane of a facet within it."""
     f, b, c = 0.0, 0.0, 0.0
     for _ in range(PIERCING_STEPS):
         a, b, c = tin.planes[facet, 0], tin.planes[facet, 1], tin.planes[facet, 2]
+        # height of the plane of the facet over P
         above = a + b * (p[0] - tin.origin_x) + c * (p[1] - tin.origin_y) - p[2]
         f = above / (e[2] - b * e[0] - c * e[1])
+        # the facet at the piercing point
         following = locate(tin, p[0] + f * e[0], p[1] + f * e[1])
         if following == facet or following < 0:
             break
@@ -234,10 +194,12 @@ def _pierce_mesh(tin: Tin, p: Vector, e: Vector, facet: int) -> tuple[float, Vec
 def _pierce_raster(
     field: Field, p: Vector, e: Vector, h: float, normal: Vector
 ) -> tuple[float, Vector]:
+    """Apply Newton's method to the tangent planes, inside a bracket."""
     low, high = 0.0, 1.0
     f = h / dot(normal, e)
     for _ in range(MAX_HALVINGS):
         z, b, c = height_at(field, p[0] + f * e[0], p[1] + f * e[1])
+        # positive while the line is below the surface
         gap = z - (p[2] + f * e[2])
         if np.isnan(gap):
             break
@@ -248,6 +210,7 @@ def _pierce_raster(
             low = f
         else:
             high = f
+        # Newton step on the tangent plane; else bisect
         f += gap / (e[2] - b * e[0] - c * e[1])
         if not low < f < high:
             f = 0.5 * (low + high)
@@ -259,44 +222,35 @@ Path: TypeAlias = tuple[float, float, float, float, Vector]
 
 NEWTON_STEPS = 40
 CLOSE = 1e-8
-"""Of a step of k, relative; as each step squares the error, the next would be below rounding."""
+"""Relative step of k: each step squares the error, so that the next is below rounding."""
 
 
 @device
 def light_path(q: Vector, e: Vector, normal: Vector, h: float, n: float) -> Path:
-    """Return how light goes from Q to a camera through a plane.
+    """Return the light path from Q to a camera through a plane.
 
-    Parameters
-    ----------
-    q : Vector
-        Q relative to the apparent point, metres.
-    e : Vector
-        From the apparent point to the projection centre, metres.
-    normal, h : Vector, float
-        The plane: unit normal, upward, and height over the apparent point along it, metres.
-    n : float
-        Refractive index.
-
-    Returns
-    -------
-    Path
-        k NaN where the camera is not above the plane and the point.
+    Q and the projection centre e are relative to the apparent point, metres; the plane is given by
+    its unit normal, upward, and its height h over the apparent point along it; n is the refractive
+    index. k is NaN if the camera is not above the plane and the point.
     """
     height = dot(normal, e) - h
     depth = h - dot(normal, q)
+    # H + D, and the sideways vector s from the foot of C to Q
     all_down = height + depth
     s = beyond(minus(q, e), all_down, normal)
     if not (height > 0.0 and all_down > 0.0):
         return np.nan, 1.0, height, depth, s
-    if depth <= 0.0:
+    if depth <= 0.0:  # above the water: straight
         return 1.0 / all_down, 1.0, height, depth, s
     n2 = n * n
+    # S^2 = n^2 + (n^2 - 1) k^2 s.s
     a = (n2 - 1.0) * dot(s, s)
     k, root = 1.0 / (height + depth / n), n
     for _ in range(NEWTON_STEPS):
         root = np.sqrt(n2 + a * k * k)
-        miss = 1.0 - k * (height + depth / root)
-        step = miss / (height + depth * n2 / (root * root * root))
+        rest = 1.0 - k * (height + depth / root)
+        # -G / G_k, with G_k = H + D n^2 / S^3
+        step = rest / (height + depth * n2 / (root * root * root))
         k += step
         if abs(step) <= CLOSE * k:
             break
@@ -322,6 +276,7 @@ def slope_of_path(path: Path, normal: Vector, n: float) -> Vector:
     k, root, height, depth, s = path
     n2 = n * n if depth > 0.0 else 1.0
     cube = root * root * root
+    # 1 / G_k
     below = 1.0 / (height + depth * n2 / cube)
     aside = below * depth * k * k * k * (n2 - 1.0) / cube
     return beyond(scaled(below * k / root, normal), aside, s)
@@ -329,7 +284,7 @@ def slope_of_path(path: Path, normal: Vector, n: float) -> Vector:
 
 SETTLING_STEPS = 12
 HALVINGS = 36
-"""Change of the path between two steps over a mesh or raster, as of `pcfix.refract.rays`."""
+"""Most steps to the plane where the light leaves a mesh or raster, and on a crease."""
 
 
 @device
@@ -338,12 +293,12 @@ def plane_at(
 ) -> tuple[float, float, float]:
     """Return height, dz/dx and dz/dy of the water at a place; NaN where there is none.
 
-    All three are relative to the apparent point `origin` (world frame, lowered by what the water
-    stood higher), the place as well.
+    Relative to the apparent point `origin` (world frame, lowered if the water stood higher).
     """
     if field is not None:
         z, b, c = height_at(field, origin[0] + x, origin[1] + y)
         return z - origin[2], b, c
+    # on a mesh: the plane of the facet there
     if tin is not None:
         px, py = origin[0] + x, origin[1] + y
         facet = locate(tin, px, py)
@@ -359,22 +314,24 @@ def settle(
     plane: FloatArray, tin: Tin | None, field: Field | None, origin: FloatArray,
     q: Vector, e: Vector, n: float,
 ) -> None:  # fmt: skip
-    """Bring the plane of a ray, (N, h), to where the light from Q leaves a mesh or raster.
+    """Move the plane of a ray, (N, h), to where the light from Q leaves a mesh or raster.
 
-    Light that leaves through a crease, from either side of which the path leads to the other,
-    gets a slope between the two: the path is shortest there (Fermat), and it goes over into the
-    paths through either side without a jump. Beyond the edge, and over gaps, the last plane goes
-    on.
+    If the path through either side of a crease leads to the other side, the light leaves on the
+    crease: the plane gets a slope between the two, where the path is shortest (Fermat) and changes
+    without a jump. Beyond the edge, and over gaps, the last plane is continued.
     """
+    # slopes of the plane (N, h)
     b, c = -plane[0] / plane[2], -plane[1] / plane[2]
     before = b, c
     for _ in range(SETTLING_STEPS):
         (x, y, z_plane), depth = _way_out(plane, q, e, n)
         z, b_there, c_there = plane_at(tin, field, x, y, origin)
+        # the path changes by the height, and by the slope times the depth
         change = abs(z - z_plane) + abs(depth) * (abs(b_there - b) + abs(c_there - c))
         if not change > CLOSE_M:
             return
         lay(plane, x, y, z, b_there, c_there)
+        # keep both slopes: on a crease the steps alternate
         before, b, c = (b, c), b_there, c_there
     _settle_on_crease(plane, tin, field, origin, before, (b, c), q, e, n)
 
@@ -384,7 +341,7 @@ def settle_of(
     c: int, plane: FloatArray, tin: Tin | None, fields: Field | None, origin: FloatArray,
     q: Vector, e: Vector, n: float,
 ) -> None:  # fmt: skip
-    """Do as `settle` with the raster of camera c, where there are rasters."""
+    """Do as `settle`, with the raster of camera c if there are rasters."""
     if fields is None:
         settle(plane, tin, None, origin, q, e, n)
     else:
@@ -397,10 +354,10 @@ def _settle_on_crease(
     plane: FloatArray, tin: Tin | None, field: Field | None, origin: FloatArray,
     one: tuple[float, float], other: tuple[float, float], q: Vector, e: Vector, n: float,
 ) -> None:  # fmt: skip
-    """Halve the share of the second slope until the light leaves on the crease itself.
+    """Bisect the share of the second slope until the light leaves on the crease itself.
 
-    The first slope leads to the side that has the second, and the other way round; the two are
-    taken anew as the crease comes nearer.
+    The first slope leads to the side that has the second, and vice versa; both are updated as the
+    crease comes nearer.
     """
     (b1, c1), (b2, c2), low, high = one, other, 0.0, 1.0
     for _ in range(HALVINGS):
@@ -408,10 +365,12 @@ def _settle_on_crease(
         z, b, c = plane_at(tin, field, x, y, origin)
         if np.isnan(z):
             return
+        # a slope between the two sides
         share = 0.5 * (low + high)
         lay(plane, x, y, z, b1 + share * (b2 - b1), c1 + share * (c2 - c1))
         (x, y, _), _ = _way_out(plane, q, e, n)
         _, b, c = plane_at(tin, field, x, y, origin)
+        # on which side does the light leave now?
         if (b - b1) ** 2 + (c - c1) ** 2 > (b - b2) ** 2 + (c - c2) ** 2:
             low, b2, c2 = share, b, c
         else:

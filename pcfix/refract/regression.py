@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
-from pcfix.errors import GeometryError
+from pcfix.errors import GeometryError, SettingError
 from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.sums import Sums
 from pcfix.water.surface import SurfaceAbove, is_submerged
@@ -97,6 +97,14 @@ class DepthRegression:
         )
 
 
+def raise_no_regression() -> NoReturn:
+    """Raise SettingError because the method regression has no line."""
+    raise SettingError(
+        "regression.missing",
+        "Method regression needs a fitted line. Give check depths or the line of another cloud.",
+    )
+
+
 def fit_depths(apparent_m: FloatArray, true_m: FloatArray) -> DepthRegression:
     """Fit the line by least squares, all check depths with equal weight and none left out.
 
@@ -115,22 +123,33 @@ def fit_depths(apparent_m: FloatArray, true_m: FloatArray) -> DepthRegression:
     x, y = np.asarray(apparent_m, np.float64), np.asarray(true_m, np.float64)
     if len(x) < LEAST_COUNT:
         raise GeometryError(
-            f"{len(x)} check depths are too few for a regression: give {LEAST_COUNT} at least,"
-            f" better {FEW} or more."
+            "check_depths.few",
+            f"{len(x)} check depths are too few for a regression. Give at least {LEAST_COUNT},"
+            f" better {FEW} or more.",
+            count=len(x),
         )
     if np.ptp(x) < _SAME_M:
         raise GeometryError(
-            f"all {len(x)} check depths lie at one apparent depth, {x.mean():.3f} m, which leaves"
-            " the slope open: give check depths from shallow to deep."
+            "check_depths.one_depth",
+            f"All {len(x)} check depths have the apparent depth {x.mean():.3f} m, which leaves the"
+            " slope open. Give check depths from shallow to deep.",
+            apparent_m=float(x.mean()),
         )
     line = linregress(x, y)
     if not line.slope > 0.0:
         raise GeometryError(
-            f"the check depths do not grow with the depths of the cloud (slope {line.slope:.3f}):"
-            " check that they are positive down and lie in the cloud's CRS."
+            "check_depths.falling",
+            f"The check depths do not grow with the depths of the cloud (slope {line.slope:.3f})."
+            " Check that they are positive down and in the cloud's CRS.",
+            slope=float(line.slope),
         )
     residual = y - (line.intercept + line.slope * x)
     leverage = 1.0 / len(x) + (x - x.mean()) ** 2 / ((x - x.mean()) ** 2).sum()
+    # without value i the line is off it by residual_i / (1 - h_i), with the diagonal h of the hat
+    # matrix; where h_i is 1 the others all have one depth
+    cross_validated = None
+    if not (leverage > 1.0 - 1e-9).any():
+        cross_validated = float(np.sqrt(np.mean((residual / (1.0 - leverage)) ** 2)))
     return DepthRegression(
         intercept_m=float(line.intercept),
         slope=float(line.slope),
@@ -138,7 +157,7 @@ def fit_depths(apparent_m: FloatArray, true_m: FloatArray) -> DepthRegression:
         slope_se=float(line.stderr),
         r2=float(line.rvalue**2),
         rmse_m=float(np.sqrt(np.mean(residual**2))),
-        cv_rmse_m=_cross_validated(residual, leverage),
+        cv_rmse_m=cross_validated,
         count=len(x),
         shallowest_m=float(x.min()),
         deepest_m=float(x.max()),
@@ -146,17 +165,6 @@ def fit_depths(apparent_m: FloatArray, true_m: FloatArray) -> DepthRegression:
         outliers=tuple(int(i) for i in outliers(residual, leverage)),
         notes=notes_of(len(x), float(line.slope)),
     )
-
-
-def _cross_validated(residual: FloatArray, leverage: FloatArray) -> float | None:
-    """Return the root mean square of the errors of predicting each value from all others.
-
-    Without value i the line misses it by residual_i / (1 - h_i), h the diagonal of the hat
-    matrix; no fit needs to be repeated. Where h_i is 1 the others all have one depth.
-    """
-    if (leverage > 1.0 - 1e-9).any():
-        return None
-    return float(np.sqrt(np.mean((residual / (1.0 - leverage)) ** 2)))
 
 
 def outliers(residual: FloatArray, leverage: FloatArray) -> IntArray:
@@ -183,13 +191,13 @@ def notes_of(count: int, slope: float) -> tuple[str, ...]:
     notes = []
     if count < FEW:
         notes.append(
-            f"the regression rests on {count} check depths; with fewer than {FEW} its errors are"
-            " little more than a guess."
+            f"The regression has only {count} check depths; with fewer than {FEW} its standard"
+            " errors are hardly known."
         )
     if not 1.0 <= slope <= 2.0:
         notes.append(
-            f"the regression's slope {slope:.3f} is not what refraction does (1.33 to 1.6); check"
-            " the water's height and the check depths."
+            f"The slope {slope:.3f} of the regression is not that of refraction (1.33 to 1.6)."
+            " Check the water level and the check depths."
         )
     return tuple(notes)
 
@@ -228,11 +236,11 @@ class BeyondRange(Sums):
             return []
         of = 100.0 / self._count
         return [
-            f"{of * (self._shallower + self._deeper):.1f} % of the submerged points lie beyond the"
-            f" apparent depths of {self._line.shallowest_m:.2f} to {self._line.deepest_m:.2f} m"
-            f" that the line was fitted on ({of * self._shallower:.1f} % shallower,"
-            f" {of * self._deeper:.1f} % deeper, down to {self._deepest_m:.2f} m): it is"
-            " extrapolated there, and SigmaZ grows."
+            f"The regression was fitted to apparent depths of {self._line.shallowest_m:.2f} to"
+            f" {self._line.deepest_m:.2f} m and is extrapolated for"
+            f" {of * (self._shallower + self._deeper):.1f} % of the submerged points"
+            f" ({of * self._shallower:.1f} % shallower, {of * self._deeper:.1f} % deeper, down to"
+            f" {self._deepest_m:.2f} m), where SigmaZ grows."
         ]
 
 
@@ -268,40 +276,28 @@ class ApparentDepths:
         self._xy = np.full((*shape, 2), np.nan)
 
     def add(self, xyz: FloatArray, surface: SurfaceAbove) -> None:
-        """Look through n more points.
-
-        Parameters
-        ----------
-        xyz : array, shape (n, 3)
-            Metres, world frame.
-        surface : SurfaceAbove
-            The water above each of them.
-        """
+        """Add n points, shape (n, 3), metres, world frame, with the water above them."""
         from scipy.spatial import cKDTree
 
         rows = np.flatnonzero(is_submerged(xyz[:, 2], surface))
         if not (len(rows) and len(self._places)):
             return
-        xy = xyz[rows, :2]
-        tree = cKDTree(xy, balanced_tree=False, compact_nodes=False)  # built faster, asked little
+        # built faster, as it has few queries
+        tree = cKDTree(xyz[rows, :2], balanced_tree=False, compact_nodes=False)
         distance, near = tree.query(self._places, k=range(1, NEIGHBOURS + 1))
         near = rows[np.where(np.isfinite(distance), near, 0)]
         aside = self._places[:, None, :] - xyz[near, :2]
         # the height of the water over the place itself, where the surface is tilted
         level = surface.height_m[near] + np.einsum("pka,pka->pk", surface.slope[near], aside)
         depth = surface.height_m[near] - xyz[near, 2]
-        self._keep_nearest(np.asarray(distance), depth, level, xyz[near, :2])
-
-    def _keep_nearest(
-        self, distance: FloatArray, depth: FloatArray, level: FloatArray, xy: FloatArray
-    ) -> None:
-        distance = np.hstack([self.distance_m, distance])
-        depth, level = np.hstack([self._depth_m, depth]), np.hstack([self._level_m, level])
-        xy = np.hstack([self._xy, xy])
+        distance = np.hstack([self.distance_m, np.asarray(distance)])
+        depth = np.hstack([self._depth_m, depth])
         order = np.lexsort((depth, distance), axis=-1)[:, :NEIGHBOURS]
         self.distance_m = np.take_along_axis(distance, order, axis=1)
         self._depth_m = np.take_along_axis(depth, order, axis=1)
+        level = np.hstack([self._level_m, level])
         self._level_m = np.take_along_axis(level, order, axis=1)
+        xy = np.hstack([self._xy, xyz[near, :2]])
         self._xy = np.take_along_axis(xy, order[:, :, None], axis=1)
 
     @property
@@ -321,20 +317,10 @@ class ApparentDepths:
         return float(np.median(known)) if len(known) else 0.0
 
     def medians(self, radius_m: float) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Return what the points within a radius say of each place.
+        """Return the apparent depth and the water level of each place from points within a radius.
 
-        Parameters
-        ----------
-        radius_m : float
-
-        Returns
-        -------
-        depth_m : array, shape (p,)
-            Median apparent depth of the nearest submerged points, at most `NEIGHBOURS`.
-        level_m : array, shape (p,)
-            Height of the water over the place.
-        covered : array of bool, shape (p,)
-            Whether there are `LEAST_NEIGHBOURS` points. Where not, the others are NaN.
+        Medians of the nearest submerged points, at most `NEIGHBOURS`; then whether each place has
+        `LEAST_NEIGHBOURS` points. If not, the others are NaN.
         """
         near = self.distance_m <= radius_m
         covered = near.sum(axis=1) >= LEAST_NEIGHBOURS

@@ -103,6 +103,7 @@ def room_of(tile: FloatArray, shift: FloatArray, rows: IntArray) -> SingleArray:
     standard error is off by 5e-6 of it where the cameras are 0.4 heights apart, by 5e-5 at 0.1 and
     by 4 % at 0.003, below which rays are parallel.
     """
+    # the sums start at zero; the runs of the rays are filled in by `add_rays`
     room = np.zeros(ROOM * TILE, np.float32)
     for j in range(rows.size):
         normal = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
@@ -129,6 +130,7 @@ def add_rays(
         normal = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
         height = dot(normal, e)
         h = normal[2] * (tile[3 * TILE + j] - (z - offset))
+        # the camera is above the water, the ray marked and within the limit of incidence
         use = (marks[j] > 0.0) & (height > h) & (height * height >= least_cosine2 * dot(e, e))
         room[_COUNT * TILE + j] = marks[j] if use else 0.0
         # straight up, where it is not used
@@ -154,7 +156,9 @@ def _seen(room: SingleArray, j: int, bend: float) -> Seen:
     at = _NORMAL * TILE + j
     normal = room[at], room[at + TILE], room[at + 2 * TILE]
     h = room[_HEIGHT * TILE + j]
+    # light of a point above the water goes straight
     bend = bend if h > _ZERO else _ONE
+    # y: depth of the true point below the surface
     y = h + room[_BELOW * TILE + j]
     return room[_COUNT * TILE + j], e, normal, dot(normal, e), dot(e, e), h, y, bend
 
@@ -167,6 +171,7 @@ def _bent(
     kappa = np.sqrt(length2 - bend * bend * (length2 - height * height))
     share = _ONE / (length2 * height * kappa)  # one division for three
     inv_k, inv_h, inv2 = share * length2 * height, share * length2 * kappa, share * height * kappa
+    # r / kappa, the tangent in water for each metre across in air
     lean = bend * inv_k
     fall = y * lean * inv_k * inv_k
     by_n = fall * bend * length2 if bend < _ONE else _ZERO
@@ -182,9 +187,12 @@ def _weight(one: float, e: Vector, length2: float, axis: Vector, square: float) 
     With the optical axis z and Z = -z.e it is (f / Z)^2 (I + x z' + z x'), x = e / Z +
     L^2 / (2 Z^2) z; without an axis (zeros), of angles, (f / L)^2 (I - e e' / L^2).
     """
+    # cameras without an axis, such as fisheyes, have equal angles per pixel
     flat = axis[0] != _ZERO or axis[1] != _ZERO or axis[2] != _ZERO
+    # depth along the axis, or the squared distance
     deep = -dot(axis, e) if flat else length2
     inv = _ONE / deep if one > _ZERO else _ZERO
+    # (f / Z)^2 or (f / L)^2; 0 for rays that do not count
     w = one * square * (inv * inv if flat else inv)
     a = inv if flat else -_HALF * inv
     b = _HALF * length2 * inv * inv if flat else _ZERO
@@ -237,8 +245,10 @@ def _in_space(
     dx, dy, dz = refracted(e, length2, normal, height, bend)
     one = one * inv2
     tx, ty, tz = one * dx, one * dy, one * dz
+    # E = (kappa^2 d - r kappa rho^2 N) / L^2, with d = e - H N
     along = kappa * kappa * one
     up = along * height + bend * kappa * (length2 - height * height) * one
+    # M = I - t t', with the diagonal from t.t = 1
     xx, yy, zz = dx * tx, dy * ty, dz * tz
     m = yy + zz, -dx * ty, -dx * tz, zz + xx, -dy * tz, xx + yy  # t.t is one
     return m, minus(scaled(along, e), scaled(up, normal))
@@ -254,6 +264,7 @@ def add_in_space(room: SingleArray, count: int, sight: Sight) -> None:
         m, g = _in_space(one, e, normal, height, length2, bend, kappa, inv2)
         # M D (p - (N.p) e / H), where M e = (1 - r H / kappa) E
         up = (away * (lean * height - _ONE) - beta * length2) * inv_h
+        # sums of M, M D, M delta by level and by n, and W
         room[RAYS * TILE + j] += one
         _add_six(room, BY_Q * TILE + j, m)
         q = plus(scaled(up, normal), scaled(beta, e))
@@ -276,12 +287,14 @@ def add_in_images(room: SingleArray, count: int, sight: Sight) -> None:
         _, inv_h, _, lean, away, beta, by_n = _bent(height, length2, h, y, bend)
         w = _weight(one, e, length2, axis, square)
         g = product(w, normal)
+        # D^-1 across d and along it; see the docstring for u and v
         inner, outer = _inverse(height, length2, away, beta)
         v = height * beta * inner * outer
         u = lean * height * outer - inner - height * v
         q = plus(scaled(u, normal), scaled(v, e))
         room[RAYS * TILE + j] += one
         _add_nine(room, BY_Q * TILE + j, inner, w, g, q)
+        # S d = -H W N / c
         scale = -height * outer
         _add_three(room, BY_LEVEL * TILE + j, scale * (inv_h - lean), g)
         _add_three(room, BY_N * TILE + j, scale * by_n, g)
@@ -291,37 +304,32 @@ def add_in_images(room: SingleArray, count: int, sight: Sight) -> None:
 @device
 def _inverse(height: float, length2: float, away: float, beta: float) -> tuple[float, float]:
     """Return what D^-1 does to p across d, and along it."""
+    # 1 - m + beta rho^2
     outer = away + beta * (length2 - height * height)
     share = _ONE / (away * outer)
     return share * outer, share * away
 
 
 @device
-def _turned(
-    height: float, inv_h: float, h: float, y: float, bend: float, inv_k: float, lean: float
-) -> tuple[float, float]:
-    """Return delta by the slope as a (tau) + b (d.tau) d: a and b."""
-    along = y * bend * bend * lean * height * inv_k * inv_k
-    along += (h * inv_h - y * lean) * lean - h * inv_h * inv_h
-    return -y * (_ONE - height * lean), along
-
-
-@device
 def add_tilt(room: SingleArray, count: int, sight: Sight, in_images: bool) -> None:
     """Add how the slope of the water moves each of one camera's rays, M delta or S delta.
 
-    S delta = (a W + (a beta - (1 - m) b) H / c W N d') / (1 - m) tau, c as above, with the a and b
-    of `_turned`; d.tau = e.tau.
+    S delta = (a W + (a beta - (1 - m) b) H / c W N d') / (1 - m) tau, c as above, for delta =
+    a tau + b (d.tau) d; d.tau = e.tau.
     """
     axis, square, bend_of = sight
     for j in range(count):
         one, e, normal, height, length2, h, y, bend = _seen(room, j, bend_of)
         kappa, inv_h, inv2, lean, away, beta, _ = _bent(height, length2, h, y, bend)
-        turn, along = _turned(height, inv_h, h, y, bend, _ONE / kappa, lean)
+        # delta by the slope is turn (tau) + along (d.tau) d, along = gamma + m r / kappa
+        inv_k, turn = _ONE / kappa, -y * (_ONE - height * lean)
+        along = y * bend * bend * lean * height * inv_k * inv_k
+        along += (h * inv_h - y * lean) * lean - h * inv_h * inv_h
         if in_images:
             w = _weight(one, e, length2, axis, square)
             g = product(w, normal)
             inner, outer = _inverse(height, length2, away, beta)
+            # both parts through D^-1
             along = (turn * beta * inner - along) * height * outer
             turn *= inner
         else:
@@ -348,14 +356,18 @@ def add_noise(room: SingleArray, count: int, sight: Sight, budget: Budget) -> No
         w = _weight(one, e, length2, axis, square)
         g = product(w, normal)
         inner, outer = _inverse(height, length2, away, beta)
+        # a slope of the wave moves the refracted ray by this across d
         across = waves * y * (_ONE - height * lean)
+        # and by the factor 1 + bow rho^2 along d
         bow = bend * bend / (kappa * kappa)
         c_t = across * inner
         c_r = across * outer * (_ONE + bow * (length2 - height * height))
         # (c_r^2 - c_t^2) / rho^2, also straight down; W d = -H W N
         more = across * outer * (bow - beta * inner) * (c_r + c_t)
+        # variance of the place of P from attitude, centre and waves, with C isotropic
         by_place = attitude * attitude * length2 + centre_m * centre_m + c_t * c_t
         by_normal = more * height * height - c_t * c_t
+        # W C W for an isotropic C is a multiple of W^2
         ww = _squared(w)
         noise = (
             image_px * image_px * w[0] + by_place * ww[0] + by_normal * g[0] * g[0],

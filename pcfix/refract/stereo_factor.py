@@ -1,4 +1,4 @@
-"""The factor of depths that a stereo pair has by its flying height, focal length and base.
+"""Compute the depth factor of a stereo pair from flying height, focal length and base.
 
 Mulsow (2024), "Methods for geometric modelling of refraction in photo-bathymetry", names a
 "correction factor calculated from camera setup (flying height, focal length, base length)" as the
@@ -30,8 +30,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pcfix.errors import GeometryError, SettingError
+from pcfix.errors import GeometryError
 from pcfix.model import Cameras, FloatArray
+from pcfix.refract.batch import require_orientation
 
 NADIR_DEG = 15.0
 """An image that looks further to the side does not count: the formula is of vertical ones."""
@@ -41,19 +42,19 @@ NODES = 100
 
 @dataclass(frozen=True)
 class StereoFactor:
-    """A factor, and what it follows from.
+    """A depth factor and the figures it was computed from.
 
     Attributes
     ----------
     factor : float
-        True by apparent depth.
+        Ratio of true to apparent depth.
     height_m, base_m : float
         Flying height above the water, and distance between neighbouring images in plan: medians.
     frame : tuple of float
         Focal length, and the sides of the frame along the base and across it, in one unit.
     unit : str
     images, aside : int
-        Images that count, and those that look aside, which do not.
+        Nadir images, which count, and images that look aside, which do not.
     """
 
     factor: float
@@ -66,37 +67,22 @@ class StereoFactor:
 
     def __str__(self) -> str:
         focal, along, across = self.frame
-        others = (
-            f"; {self.aside} images look aside by more than {NADIR_DEG:g} degrees, and what these"
-            " made needs a larger one"
-            if self.aside
-            else ""
+        text = (
+            f"Depth factor {self.factor:.4f}, from a flying height of {self.height_m:.2f} m above"
+            f" the water, a focal length of {focal:.6g} {self.unit}, a frame of {along:g} (along"
+            f" the base) by {across:g} {self.unit}, and a base of {self.base_m:.2f} m (medians of"
+            f" {self.images} images)."
         )
-        return (
-            f"Depth factor {self.factor:.4f}, the mean over a stereo pair with the flying height"
-            f" {self.height_m:.2f} m above the water, the focal length {focal:.6g} {self.unit} for"
-            f" a frame of {along:g} along the base by {across:g}, and the base {self.base_m:.2f} m"
-            f" (medians of {self.images} images){others}."
-        )
-
-
-def check_stereo(cameras: Cameras) -> None:
-    """Refuse cameras that tell no factor.
-
-    Raises
-    ------
-    SettingError
-        If they have no angles or no lens.
-    """
-    if cameras.lenses is None or cameras.rotations is None:
-        raise SettingError(
-            "depth-factor auto goes by height, focal length and base of the cameras, and these have"
-            " no angles or no lens: give --sensor or a camera file that has them, or a number."
-        )
+        if self.aside:
+            text += (
+                f" {self.aside} images look aside by more than {NADIR_DEG:g} degrees; points from"
+                " these need a larger factor."
+            )
+        return text
 
 
 def stereo_factor(cameras: Cameras, level_m: float, n: float) -> StereoFactor:
-    """Return the factor of the stereo pairs of a block.
+    """Return the depth factor of the stereo pairs of a block.
 
     Parameters
     ----------
@@ -110,19 +96,20 @@ def stereo_factor(cameras: Cameras, level_m: float, n: float) -> StereoFactor:
     Raises
     ------
     SettingError
-        If the cameras tell no factor.
+        If the cameras have no angles or no lenses.
     GeometryError
         If fewer than two images look down, or neighbours do not overlap.
     """
-    check_stereo(cameras)
+    require_orientation(cameras, "depth-factor auto")
     rotations, lenses = np.asarray(cameras.rotations), cameras.lenses or ()
     flat = np.array([lens.projection == "perspective" for lens in lenses])
     rows = np.flatnonzero(flat & (-rotations[:, 2, 2] >= np.cos(np.radians(NADIR_DEG))))
     if len(rows) < 2:
         raise GeometryError(
-            f"depth-factor auto is of stereo pairs that look down, and {len(rows)} of"
-            f" {len(cameras)} images do, within {NADIR_DEG:g} degrees and by a lens that is no"
-            " fisheye's: give a number."
+            "cameras.no_stereo",
+            f"Only {len(rows)} of {len(cameras)} images are nadir images (within {NADIR_DEG:g}"
+            " degrees, no fisheye), and depth-factor auto needs two. Give a number.",
+            nadir=len(rows),
         )
     centres = cameras.centres[rows]
     length_m, base = _bases(centres, rotations[rows])
@@ -134,8 +121,11 @@ def stereo_factor(cameras: Cameras, level_m: float, n: float) -> StereoFactor:
     relative = base_m / height_m
     if not 0.0 < relative < 2.0 * along:
         raise GeometryError(
-            f"depth-factor auto: neighbouring images {base_m:.2f} m apart, {height_m:.2f} m above"
-            " the water, do not overlap: check cameras and water, or give a number."
+            "cameras.no_overlap",
+            f"Neighbouring images, {base_m:.2f} m apart and {height_m:.2f} m above the water, do"
+            " not overlap, as depth-factor auto needs. Check cameras and water, or give a number.",
+            base_m=base_m,
+            height_m=height_m,
         )
     factor = float(ratios(relative, along, across, n).mean())
     focal, width, height = np.median(frames, axis=0).tolist()
@@ -165,21 +155,11 @@ def _bases(centres: FloatArray, rotations: FloatArray) -> tuple[FloatArray, Floa
 
 
 def ratios(relative_base: float, along: float, across: float, n: float) -> FloatArray:
-    """Return true by apparent depth over the overlap of a pair.
+    """Return the ratio of true to apparent depth over the overlap of a pair.
 
-    Parameters
-    ----------
-    relative_base : float
-        Base by flying height.
-    along, across : float
-        Half the sides of the frame by the focal length, along the base and across it.
-    n : float
-        Refractive index.
-
-    Returns
-    -------
-    array, shape (NODES, NODES)
-        In the middles of the cells; see the top of the file.
+    `relative_base` is the base by the flying height; `along` and `across` are half the sides of the
+    frame by the focal length. The result, shape (NODES, NODES), is for the middles of cells; see
+    the top of the file.
     """
     middles = (np.arange(NODES) + 0.5) / NODES * 2.0 - 1.0
     x, y = np.meshgrid(middles * (along - relative_base / 2.0), middles * across)

@@ -226,8 +226,8 @@ class Tally(Sums):
         """
         found = self._uncertainty.as_dict()
         if found is not None and made is not None and "scatter_m" in made:
-            doubt = {"scatter_m": made["scatter_m"], "per_depth": made["doubt_per_depth"]}
-            found["of_cloud"] = doubt
+            of_cloud = {"scatter_m": made["scatter_m"], "per_depth": made["doubt_per_depth"]}
+            found["of_cloud"] = of_cloud
         return found
 
 

@@ -1,7 +1,7 @@
 """Tiles of neighbouring points, and the cameras whose frames may hold one of them.
 
-Points are worked on a tile at a time, so that few cameras need to be looked at, and the processor
-works on several points at once.
+Kernels process points tile by tile: a tile of neighbours needs few cameras, and inner loops over
+its points are vectorised.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.kernels import device, kernel
-from pcfix.lens.algebra import normal_of
+from pcfix.kernels import device
+from pcfix.lens.algebra import Nine, Vector, normal_of
 from pcfix.lens.frames import (
     ALL,
     NOT_DISTORTED,
@@ -70,33 +70,20 @@ def spatial_order(xyz: FloatArray) -> IntArray:
     cells = min(len(xyz) / TILE, 2.0**14)
     cell_m = max(np.sqrt(width * height / cells), max(width, height) / cells)
     columns, rows = int(width / cell_m) + 1, int(height / cell_m) + 1
-    return _cell_order(xyz, x.min(), y.min(), 1.0 / cell_m, columns, rows)
-
-
-@kernel(allocates=True)
-def _cell_order(
-    xyz: FloatArray, x0: float, y0: float, cells_per_m: float, columns: int, rows: int
-) -> IntArray:
-    """Sort by cells, row after row to and fro, with one count and one pass over the points."""
-    cell = np.empty(len(xyz), np.int64)
-    place = np.zeros(columns * rows + 1, np.int64)
-    for i in range(len(xyz)):
-        column = min(int((xyz[i, 0] - x0) * cells_per_m), columns - 1)
-        row = min(int((xyz[i, 1] - y0) * cells_per_m), rows - 1)
-        cell[i] = row * columns + (columns - 1 - column if row & 1 else column)
-        place[cell[i] + 1] += 1
-    for c in range(columns * rows):
-        place[c + 1] += place[c]
-    order = np.empty(len(xyz), np.int64)
-    for i in range(len(xyz)):
-        order[place[cell[i]]] = i
-        place[cell[i]] += 1
-    return order
+    column = np.minimum(((x - x.min()) * (1.0 / cell_m)).astype(np.int64), columns - 1)
+    row = np.minimum(((y - y.min()) * (1.0 / cell_m)).astype(np.int64), rows - 1)
+    # row after row to and fro, so that the next cell is always a neighbour
+    within = np.where(row & 1, columns - 1 - column, column)
+    return np.argsort(row * columns + within, kind="stable")
 
 
 @device(allocates=True)
 def gather(tile: FloatArray, rows: IntArray, points: Points) -> tuple[FloatArray, FloatArray]:
-    """Bring a tile together: runs of x, y, z, surface height and unit normal; return its box."""
+    """Fill a tile with runs of x, y, z, surface height and unit normal; return its box.
+
+    The runs, of `TILE` numbers each, lie in one array: with one base address and fixed distances
+    the compiler sees that they cannot overlap.
+    """
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for j in range(rows.size):
         i = rows[j]
@@ -110,14 +97,28 @@ def gather(tile: FloatArray, rows: IntArray, points: Points) -> tuple[FloatArray
     return low, high
 
 
+@device
+def three(runs: FloatArray, at: int) -> Vector:
+    """Return the numbers of a point from three runs that follow each other."""
+    return runs[at], runs[at + TILE], runs[at + 2 * TILE]
+
+
+@device
+def nine(runs: FloatArray, at: int) -> Nine:
+    """Return the numbers of a point from nine runs that follow each other."""
+    a, b, c = three(runs, at), three(runs, at + 3 * TILE), three(runs, at + 6 * TILE)
+    return a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]
+
+
 @device(allocates=True)
 def cameras_around(
     frames: Frames, centres: FloatArray, low: FloatArray, high: FloatArray
 ) -> IntArray:
-    """Return the cameras whose pyramids may hold a point of the box of many tiles."""
+    """Return the cameras whose pyramids may hold a point of a box around many tiles."""
     around = np.empty(len(centres), np.int64)
     count = 0
     for c in range(len(centres)):
+        # the box is not wholly beyond one plane of the pyramid
         if may_hold(frames.planes[c], centres[c], low, high):
             around[count] = c
             count += 1
@@ -146,6 +147,7 @@ def near_cameras(
     for c in around:
         if not may_hold(planes[c], centres[c], low, high):
             continue
+        # the pyramid around a distorted frame is wider than the frame
         if row[c] == NOT_DISTORTED or judge(frames, c, centres[c], low, high) != NOTHING:
             near[count] = c
             count += 1
@@ -158,14 +160,12 @@ def mark_camera(
     low: FloatArray, high: FloatArray,
 ) -> bool:  # fmt: skip
     """Mark the points of a tile that lie in the frame of camera c; return whether any may."""
-    x, y, z = (
-        tile[: marks.size],
-        tile[TILE : TILE + marks.size],
-        tile[2 * TILE : 2 * TILE + marks.size],
-    )
-    if frames.row[c] == NOT_DISTORTED:
+    m = marks.size
+    x, y, z = tile[:m], tile[TILE : TILE + m], tile[2 * TILE : 2 * TILE + m]
+    if frames.row[c] == NOT_DISTORTED:  # the frame is a pyramid of four planes
         mark_pyramid(marks, x, y, z, centre, pyramid(frames.planes[c]))
         return True
+    # many boxes lie within a distorted frame, or beside it, as a whole
     held = judge(frames, c, centre, low, high)
     if held == ALL:
         marks[:] = 1.0
@@ -178,18 +178,24 @@ def mark_camera(
 def marks_of_lists(
     start: IntArray, camera: IntArray, rows: IntArray, k: int
 ) -> tuple[IntArray, FloatArray]:
-    """Return which of k cameras lists name for some points, and how often for each, in order."""
-    place = np.zeros(k, np.int64)
+    """Return the cameras that view lists name for some points, in order, and how often for each.
+
+    Of k cameras; the marks have a row for each camera returned and a column for each point.
+    """
+    place, named, count = np.zeros(k, np.int64), np.empty(k, np.int64), 0
+    # mark the cameras that are named at all, then number them in order
     for i in rows:
         for at in range(start[i], start[i + 1]):
             place[camera[at]] = 1
-    named = np.flatnonzero(place)
-    place[named] = np.arange(named.size)
-    marks = np.zeros((named.size, rows.size))
+    for c in range(k):
+        if place[c]:
+            place[c], named[count] = count, c
+            count += 1
+    marks = np.zeros((count, rows.size))
     for j in range(rows.size):
         for at in range(start[rows[j]], start[rows[j] + 1]):
             marks[place[camera[at]], j] += 1.0
-    return named, marks
+    return named[:count], marks
 
 
 @device(allocates=True)
@@ -197,9 +203,9 @@ def marks_in_frame(
     around: IntArray, tile: FloatArray, frames: Frames, centres: FloatArray, low: FloatArray,
     high: FloatArray, count: int,
 ) -> tuple[IntArray, FloatArray]:  # fmt: skip
-    """Return which of some cameras hold points of a tile in their frames, and the marks of these.
+    """Return the cameras whose frames hold points of a tile, and which points these are.
 
-    The tile has so many points, within a box.
+    `low` and `high` are the box of its `count` points, `around` the cameras to choose from.
     """
     near = near_cameras(around, frames, centres, low, high)
     marks = np.empty((near.size, count))

@@ -1,20 +1,20 @@
-r"""The covariance of corrected points, from that of what they were made from.
+r"""Compute the covariance of corrected points.
 
 Errors that differ from ray to ray (of image coordinates, poses, waves) move the apparent point P
-first: the SfM software intersects straight rays by least squares in the images, so that
+first: SfM software intersects straight rays by least squares in the images, so that
 
     Cov P = K^-1 R K^-1,   K = sum J'J,   R = sum J' Cov(image) J.
 
-The correction then carries P to Q; its derivative dQ/dP is that of the method, see
-`pcfix.refract.sensitivity`. Errors common to all rays (level, index and tilt of the water) come in
-only there, each with a column of its own:
+The correction moves P to Q; its derivative dQ/dP depends on the method, see
+`pcfix.refract.sensitivity`. Errors common to all rays (level, index and tilt of the water) enter
+only there, each with a column g of its own:
 
     Cov Q = dQ/dP Cov P dQ/dP' + sum over the common ones of sigma^2 g g'.
 
-`consistent` undoes that adjustment, so that dQ/dP = (sum S T)^-1 K, and K cancels out: noise comes
-through as if the refracted rays had been adjusted in the images. The other methods have the
-derivative of `snell`, which weighs rays by their distance (m) from the point; the more the lengths
-of the rays differ, the more the two do.
+`consistent` inverts that adjustment: dQ/dP = (sum S T)^-1 K, and K cancels out, so that noise acts
+as if the refracted rays had been adjusted in the images. The other methods have the derivative of
+`snell`, which weights rays by their distance (m) from the point; the two differ more, the more the
+lengths of the rays differ.
 """
 
 from __future__ import annotations
@@ -25,14 +25,15 @@ from typing import TypeAlias
 import numpy as np
 
 from pcfix.kernels import Span, device, in_tiles, kernel
-from pcfix.lens.algebra import Nine, Symmetric, Vector
+from pcfix.lens.algebra import Nine, Symmetric, Vector, plus, scaled
 from pcfix.model import FloatArray, IntArray, Outcome, SingleArray
 from pcfix.options.correct import LEVEL_M
 from pcfix.refract import sensitivity as s
+from pcfix.refract import tiling
 from pcfix.refract.batch import Batch, Intersection, Survey
 from pcfix.refract.choice import Rig, Rule, rig_of, rule_of
 from pcfix.refract.sensitivity import Budget
-from pcfix.refract.tiling import TILE, Points, gather, marks_of_lists, points_of, tiles_of
+from pcfix.refract.tiling import TILE, Points, nine, points_of, three
 from pcfix.water.surface import Field, height_at
 
 Four: TypeAlias = tuple[float, float, float, float]
@@ -42,49 +43,36 @@ MIN_DETERMINANT = 1e-6
 
 
 def covariances(batch: Batch, shift_m: FloatArray) -> FloatArray:
-    """Return the covariance of each corrected point.
+    """Return the covariance of each corrected point, shape (m, 6), to first order.
 
-    Parameters
-    ----------
-    batch : Batch
-        With the cameras that gave rays; the standard deviations are those of the
-        settings and, where
-        these do not have it, that of the level is `level_sigma_m`, else `LEVEL_M`.
-    shift_m : array, shape (m, 3)
-        True minus apparent, by whichever method.
+    xx, xy, xz, yy, yz, zz in metres squared, world frame; zeros if fewer than two rays meet, or
+    nearly parallel ones. `shift_m`, shape (m, 3), is true minus apparent, by any method. The
+    standard deviations are those of the settings; that of the level is `level_sigma_m`, or else
+    `LEVEL_M`, if the settings have none.
 
-    Returns
-    -------
-    array, shape (m, 6)
-        xx, xy, xz, yy, yz, zz in metres squared, world frame; zeros where fewer than two rays
-        meet, or nearly parallel ones.
-
-    Notes
-    -----
-    First order. A mesh or raster is taken as its plane above the point. Every ray of a point is
-    taken to have made it, by an adjustment in image residuals; noise is of the size of a pixel in
-    the middle of the image, lens distortion aside. A tilt turns the water about the middle of the
-    projection centres.
+    A mesh or raster is taken as its plane above the point. All rays of a point are assumed to have
+    made it, by an adjustment in image residuals, with noise of the size of a pixel in the middle of
+    the image. A tilt turns the water about the middle of the projection centres.
 
     It is an approximation for methods that move points along the vertical only (they get that of
-    `snell`), and where `consistent` inverts a dense matcher (depth maps, stereo pairs, their
-    models), which gets that of one adjustment of all its images.
+    `snell`), and where `consistent` inverts a dense matcher, which gets that of one adjustment of
+    all its images.
     """
-    survey, views, result = batch.survey, batch.rays, np.zeros((len(batch), 6))
+    survey, result = batch.survey, np.zeros((len(batch), 6))
     if not len(survey.cameras):
         return result
-    # the rays are chosen: a mesh may have let through one that its plane above the point would not
+    # the rays are chosen: on a mesh some may be beyond the limit for the plane above the point
     every_ray = rule_of(survey)._replace(least_cosine2=0.0)
     in_tiles(
-        _of_lists, tiles_of(batch), points_of(batch), np.ascontiguousarray(shift_m), rig_of(survey),
-        (np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)),
+        _of_lists, tiling.tiles_of(batch), points_of(batch), np.ascontiguousarray(shift_m),
+        rig_of(survey), batch.listed,
         every_ray, budget_of(survey), level_sigma_of(batch), result,
     )  # fmt: skip
     return result
 
 
 def with_uncertainty(found: Intersection, batch: Batch) -> Intersection:
-    """Return a result with its covariances and standard errors of Z, where they are asked for."""
+    """Return a result with its covariances and standard errors of Z, if asked for."""
     survey = batch.survey
     if survey.settings.dimensions != "all":
         return with_errors(found, None)
@@ -96,7 +84,7 @@ def with_uncertainty(found: Intersection, batch: Batch) -> Intersection:
 
 
 def with_errors(found: Intersection, covariance: FloatArray | None) -> Intersection:
-    """Return a result with covariances, which it may change, and what follows from them."""
+    """Return a result with covariances (modified in place) and standard errors of Z."""
     if covariance is None:
         return found._replace(sigma_z_m=np.zeros(len(found.outcome)))
     moved = found.outcome == Outcome.CORRECTED
@@ -105,23 +93,20 @@ def with_errors(found: Intersection, covariance: FloatArray | None) -> Intersect
     return found._replace(sigma_z_m=np.sqrt(covariance[:, _ZZ]), covariance_m2=covariance)
 
 
-def with_doubt(found: Intersection, batch: Batch) -> Intersection:
-    """Return a result whose standard errors of Z have what cloud and poses tell of them.
-
-    They are added to its covariances where these stand.
-    """
-    doubt, poses = batch.survey.learned.doubt, batch.survey.learned.poses
-    if (doubt is None and poses is None) or found.covariance_m2 is None:
+def with_model_uncertainty(found: Intersection, batch: Batch) -> Intersection:
+    """Add the uncertainties of the model and the poses to the covariances, if there are any."""
+    model, poses = batch.survey.learned.model_uncertainty, batch.survey.learned.poses
+    if (model is None and poses is None) or found.covariance_m2 is None:
         return found
     moved = found.outcome == Outcome.CORRECTED
     covariance = found.covariance_m2
-    if doubt is not None:
+    if model is not None:
         depth = batch.surface.height_m - (batch.xyz[:, 2] + found.shift_m[:, 2])
-        more = doubt.scatter_m**2 + (doubt.per_depth * depth) ** 2
+        more = model.scatter_m**2 + (model.per_depth * depth) ** 2
         covariance[:, _ZZ] += np.where(moved, more, 0.0)
     if poses is not None:
         covariance[moved, _ZZ] += poses.at(batch.xyz[moved, :2]) ** 2
-    return found._replace(sigma_z_m=np.sqrt(covariance[:, _ZZ]), covariance_m2=covariance)
+    return with_errors(found, covariance)
 
 
 _XZ, _YZ, _ZZ = 2, 4, 5
@@ -130,8 +115,8 @@ _XZ, _YZ, _ZZ = 2, 4, 5
 def level_sigma_of(batch: Batch) -> FloatArray:
     """Return the standard deviation of the water above each point, metres, shape (m,).
 
-    That of the level is common to all rays; where images have water of their own, its errors, of
-    which each ray has another, are added as those of the mean over the rays.
+    The error of the level is common to all rays. Errors of the water of single images differ from
+    ray to ray, and are added as the error of the mean over the rays.
     """
     stated, fitted = batch.survey.settings.sigma_level, batch.level_sigma_m
     known = stated if stated is not None else LEVEL_M if fitted is None else fitted
@@ -143,7 +128,7 @@ def level_sigma_of(batch: Batch) -> FloatArray:
     of_own, points = np.zeros(len(batch)), points_of(batch)
     in_tiles(
         _own_sigma, len(batch), points, rig_of(batch.survey), own.sigma,
-        (np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)), of_own,
+        batch.listed, of_own,
     )  # fmt: skip
     return np.hypot(full, of_own)
 
@@ -153,9 +138,9 @@ def _own_sigma(
     span: Span, points: Points, rig: Rig, sigma: Field, views: tuple[IntArray, IntArray],
     found: FloatArray,
 ) -> None:  # fmt: skip
-    """Set what the errors of the images' own water come to in the mean over the rays of a point.
+    """Set the standard error of the mean of the images' own water over the rays of a point.
 
-    They are independent from image to image. The water is taken as level above the point.
+    Errors are independent from image to image. The water is taken as level above the point.
     """
     start, camera = views
     for i in range(*span):
@@ -163,6 +148,7 @@ def _own_sigma(
         for at in range(start[i], start[i + 1]):
             c, x, y = camera[at], points.xyz[i, 0], points.xyz[i, 1]
             up = rig.centres[c, 2] - points.xyz[i, 2]
+            # where the straight ray pierces it
             f = (points.height[i] + rig.offset[c] - points.xyz[i, 2]) / up
             x, y = x + f * (rig.centres[c, 0] - x), y + f * (rig.centres[c, 1] - y)
             error = height_at(Field(sigma.heights, sigma.shape, sigma.frame, c), x, y)[0]
@@ -192,17 +178,24 @@ def _of_lists(
     span: Span, points: Points, shift: FloatArray, rig: Rig, views: tuple[IntArray, IntArray],
     rule: Rule, budget: Budget, level_sigma: FloatArray, result: FloatArray,
 ) -> None:  # fmt: skip
-    """Take the cameras of lists; those of a tile come one after the other, as by their frames."""
+    """Compute the covariances of points with view lists, a tile at a time."""
     start, camera = views
     for t in range(*span):
         rows = points.order[t * TILE : (t + 1) * TILE]
         tile = np.empty(7 * TILE)
-        gather(tile, rows, points)
+        # the runs of the tile, then those of its rays, then one camera after the other
+        tiling.gather(tile, rows, points)
         room = s.room_of(tile, shift, rows)
-        named, marks = marks_of_lists(start, camera, rows, len(rig.centres))
+        named, marks = tiling.marks_of_lists(start, camera, rows, len(rig.centres))
         for at in range(named.size):
             add_errors(room, tile, marks[at], rig, named[at], rule, budget)
         finish_tile(result, rows, room, tile, level_sigma, budget)
+
+
+@device
+def differ_by_ray(budget: Budget) -> bool:
+    """Whether rays have errors other than the noise of image coordinates."""
+    return max(budget.waves, max(budget.centre_m, budget.attitude)) > 0.0
 
 
 @device
@@ -210,27 +203,18 @@ def add_errors(
     room: SingleArray, tile: FloatArray, marks: FloatArray, rig: Rig, c: int, rule: Rule,
     budget: Budget,
 ) -> None:  # fmt: skip
-    """Add one camera's rays to the points of a tile that have a mark."""
+    """Add the rays of one camera to the points of a tile that have a mark."""
     count, sight = marks.size, s.lens_of(rig, c, rule)
     s.add_rays(room, tile, marks, rig, c, rule)
+    # the derivative of consistent, or that of snell
     if budget.in_images:
         s.add_in_images(room, count, sight)
     else:
         s.add_in_space(room, count, sight)
     if budget.tilt > 0.0:
         s.add_tilt(room, count, sight, budget.in_images)
-    if _per_image(budget):
+    if differ_by_ray(budget):
         s.add_noise(room, count, sight, budget)
-
-
-@device
-def _per_image(budget: Budget) -> bool:
-    """Whether rays differ by more than the noise of image coordinates."""
-    return max(budget.waves, max(budget.centre_m, budget.attitude)) > 0.0
-
-
-# What follows `finish_tile` is inlined: with calls left in it the loop over the points of a tile
-# is not vectorised, and takes five times as long.
 
 
 @device(allocates=True)
@@ -238,9 +222,13 @@ def finish_tile(
     result: FloatArray, rows: IntArray, room: SingleArray, tile: FloatArray,
     level_sigma: FloatArray, budget: Budget,
 ) -> None:  # fmt: skip
-    """Turn the sums of a tile into covariances."""
+    """Turn the sums of a tile into covariances.
+
+    LLVM inlines what it calls; otherwise the loops over the points would not be vectorised.
+    """
     out, sigma, sums = np.empty(6 * TILE), level_sigma[rows], room.astype(np.float64)
-    if not _per_image(budget):
+    # R = sigma^2 K if all rays have the same image noise
+    if not differ_by_ray(budget):
         for at in range(6 * TILE):
             sums[s.NOISE * TILE + at] = budget.image_px**2 * sums[s.SIGHT * TILE + at]
     if budget.in_images:
@@ -258,27 +246,29 @@ def finish_tile(
 
 @device
 def _solved_in_images(sums: FloatArray, j: int) -> tuple[bool, Nine]:
-    """Return whether the rays fix a point, and the inverse of sum S T.
+    """Return whether the rays determine a point, and the inverse of sum S T.
 
     Q moves by that times the right side of the normal equations of P, and times sum S delta.
     """
-    m = _nine(sums, s.BY_Q * TILE + j)
+    m = nine(sums, s.BY_Q * TILE + j)
     det, inverse = inverse_of(m)
+    # in units of the trace, as M has the trace 2 k
     half = 0.5 * (m[0] + m[4] + m[8])
     return (sums[j] >= 2.0) & (det >= MIN_DETERMINANT * half * half * half), inverse
 
 
 @device
 def _solved_in_space(sums: FloatArray, j: int) -> tuple[bool, Nine, Nine]:
-    """Return whether the rays fix a point, and by what it moves.
+    """Return whether the rays determine a point, and two matrices.
 
-    That is (sum M)^-1 times sum M delta, and (sum M)^-1 (sum M D) (sum W)^-1 times the right side
-    of the normal equations of P.
+    Q moves by the first, (sum M)^-1, times sum M delta, and by the second, (sum M)^-1 (sum M D)
+    (sum W)^-1, times the right side of the normal equations of P.
     """
     k = sums[j]
     det, by_delta = inverse_of(_full(_six(sums, s.BY_Q * TILE + j)))
     full, by_sight = inverse_of(_full(_six(sums, s.SIGHT * TILE + j)))
-    by_p = _product(by_delta, _nine(sums, s.BY_P * TILE + j))
+    # (sum M)^-1 (sum M D) moves Q with P, (sum W)^-1 moves P with the images
+    by_p = _product(by_delta, nine(sums, s.BY_P * TILE + j))
     solved = (k >= 2.0) & (det >= MIN_DETERMINANT * k * k * k) & (full > 0.0)
     return solved, by_delta, _product(by_p, by_sight)
 
@@ -288,17 +278,17 @@ def _write(
     out: FloatArray, j: int, solved: bool, by_delta: Nine, by_noise: Nine, sums: FloatArray,
     tile: FloatArray, level_sigma: float, budget: Budget,
 ) -> None:  # fmt: skip
-    """Write the covariance of a point: of its noise, and of each common error a column squared."""
+    """Write the covariance of a point: of noise, and of each common error."""
     b = by_noise
+    # B R B'
     noise = _product(_product(b, _full(_six(sums, s.NOISE * TILE + j))), (
         b[0], b[3], b[6], b[1], b[4], b[7], b[2], b[5], b[8]
     ))  # fmt: skip
+    # each common error is one standard deviation times a column
     level, index, u, v = _columns(by_delta, sums, tile, j, level_sigma, budget)
-    x, y, z = (
-        (level[0], index[0], u[0], v[0]),
-        (level[1], index[1], u[1], v[1]),
-        (level[2], index[2], u[2], v[2]),
-    )
+    x = level[0], index[0], u[0], v[0]
+    y = level[1], index[1], u[1], v[1]
+    z = level[2], index[2], u[2], v[2]
     out[j] = noise[0] + _dot(x, x) if solved else 0.0
     out[TILE + j] = noise[1] + _dot(x, y) if solved else 0.0
     out[2 * TILE + j] = noise[2] + _dot(x, z) if solved else 0.0
@@ -318,29 +308,26 @@ def _columns(
 ) -> tuple[Vector, Vector, Vector, Vector]:
     """Return how a point moves by one standard deviation of level, index and both tilts.
 
-    A tilt also raises the water above the point, by its distance from the pivot.
+    A tilt also raises the water above the point, in proportion to its distance from the pivot.
     """
     nx, ny, nz = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
+    # two horizontal directions of slope: u towards x, v across it
     scale = 1.0 / np.sqrt(nx * nx + nz * nz)
     ux, uz = nz * scale, -nx * scale
-    by_tilt = _nine(sums, s.BY_TILT * TILE + j)
-    by_level, by_n = _three(sums, s.BY_LEVEL * TILE + j), _three(sums, s.BY_N * TILE + j)
-    level = _scaled(nz, by_level)
+    by_tilt = nine(sums, s.BY_TILT * TILE + j)
+    by_level, by_n = three(sums, s.BY_LEVEL * TILE + j), three(sums, s.BY_N * TILE + j)
+    # the level rises along the vertical, h is along N
+    level = scaled(nz, by_level)
     away_u, away_v = tile[j] - budget.pivot_x, tile[TILE + j] - budget.pivot_y
     # the normal leans away from where the slope rises
-    u = _plus(product_of(by_tilt, (-ux, 0.0, -uz)), _scaled(away_u, level))
-    v = _plus(product_of(by_tilt, (-ny * uz, nx * uz - nz * ux, ny * ux)), _scaled(away_v, level))
+    u = plus(product_of(by_tilt, (-ux, 0.0, -uz)), scaled(away_u, level))
+    v = plus(product_of(by_tilt, (-ny * uz, nx * uz - nz * ux, ny * ux)), scaled(away_v, level))
     return (
-        _scaled(level_sigma, product_of(by_delta, level)),
-        _scaled(budget.refractive_index, product_of(by_delta, by_n)),
-        _scaled(budget.tilt, product_of(by_delta, u)),
-        _scaled(budget.tilt, product_of(by_delta, v)),
+        scaled(level_sigma, product_of(by_delta, level)),
+        scaled(budget.refractive_index, product_of(by_delta, by_n)),
+        scaled(budget.tilt, product_of(by_delta, u)),
+        scaled(budget.tilt, product_of(by_delta, v)),
     )
-
-
-@device
-def _three(sums: FloatArray, at: int) -> Vector:
-    return sums[at], sums[at + TILE], sums[at + 2 * TILE]
 
 
 @device
@@ -352,27 +339,8 @@ def _six(sums: FloatArray, at: int) -> Symmetric:
 
 
 @device
-def _nine(sums: FloatArray, at: int) -> Nine:
-    return (
-        sums[at], sums[at + TILE], sums[at + 2 * TILE],
-        sums[at + 3 * TILE], sums[at + 4 * TILE], sums[at + 5 * TILE],
-        sums[at + 6 * TILE], sums[at + 7 * TILE], sums[at + 8 * TILE],
-    )  # fmt: skip
-
-
-@device
 def _full(m: Symmetric) -> Nine:
     return m[0], m[1], m[2], m[1], m[3], m[4], m[2], m[4], m[5]
-
-
-@device
-def _scaled(c: float, x: Vector) -> Vector:
-    return c * x[0], c * x[1], c * x[2]
-
-
-@device
-def _plus(x: Vector, y: Vector) -> Vector:
-    return x[0] + y[0], x[1] + y[1], x[2] + y[2]
 
 
 @device
@@ -396,8 +364,9 @@ def _product(a: Nine, b: Nine) -> Nine:
 
 @device
 def inverse_of(m: Nine) -> tuple[float, Nine]:
-    """Return the determinant of a matrix and its inverse, which without one is meaningless."""
+    """Return the determinant of a matrix and its inverse, meaningless if that is 0."""
     a, b, c, d, e, f, g, h, i = m
+    # cofactors of the first row
     x, y, z = e * i - f * h, f * g - d * i, d * h - e * g
     det = a * x + b * y + c * z
     inv = 1.0 / det

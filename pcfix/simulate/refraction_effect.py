@@ -27,7 +27,7 @@ point that lies 1/s as deep, where
 
 with a the angle in air, b in water, R the distance in plan. Each image has its own s, so a pair
 gives the 4 equations of eq 3 for X, Y, depth and two s; with s known they are linear. It starts
-with s = 1 and repeats until tan a no longer changes. (`pcfix.refract.shan` notes a misprint.)
+with s = 1 and repeats until tan a no longer changes. (`pcfix.refract.literature` notes a misprint.)
 """
 
 from __future__ import annotations

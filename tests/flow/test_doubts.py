@@ -14,9 +14,9 @@ from pcfix.model import Outcome, TiePoints, Views
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract import patches
 from pcfix.refract.batch import Batch, Survey
-from pcfix.refract.hypotheses import IN_FRAME, hint_of
 from pcfix.refract.learning import CORRECTED_RATIO, depth_ratio, learn_of_sample
 from pcfix.refract.patches import grid_m
+from pcfix.refract.reconstructions import IN_FRAME, hint_of
 from pcfix.simulate.scene import simulate_scene
 from pcfix.water.surface import surface_above
 from tests.io.test_views import write_ply, write_vis

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-import pcfix.refract.top_surface as top_surface
+import pcfix.refract.occlusion as top_surface
 from pcfix import Cameras
 from pcfix.options.correct import ScienceOptions
-from pcfix.refract.top_surface import OccluderBuilder, occluder_of, wants_occlusion
+from pcfix.refract.occlusion import OccluderBuilder, occluder_of, wants_occlusion
 
 UTM = np.array([512_345.678, 4_987_654.321, 0.0])
 NAMES = ("height", "margin", "block_top", "large_block_top")

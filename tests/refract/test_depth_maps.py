@@ -8,7 +8,6 @@ import pytest
 
 import pcfix
 from pcfix.io.views import ViewMatch, read_views
-from pcfix.kernels import threads
 from pcfix.lens.frames import frames_of
 from pcfix.model import Outcome, Views, WaterPlane
 from pcfix.options.correct import ScienceOptions
@@ -86,13 +85,6 @@ def test_the_best_pairs_of_parabolas_are_those_that_scipy_finds():
             costs = [lambda t, p=p: float(p[1] + p[2] * (t - p[0]) ** 2) for p in partners]
             # scipy knows the place of a least value to about the root of its precision
             assert best(partners, 0.1) == pytest.approx(slow_depth(costs, 0.1), abs=1e-6)
-
-
-def test_the_order_of_the_images_does_not_change_the_best_pairs():
-    partners = np.random.default_rng(2).uniform(0.5, 3.0, (5, 3))
-    partners[:, 1] *= 1000.0  # squares so large that the worse pairs vanish
-    assert best(partners[::-1].copy(), 0.1) == pytest.approx(best(partners, 0.1), rel=1e-12)
-    assert np.isfinite(best(partners, 1e-9))
 
 
 @pytest.mark.parametrize("c", [0, 2, 4, 5, 7])
@@ -237,27 +229,6 @@ def test_points_of_few_images_have_an_outcome(with_list):
     moved = result.outcome == Outcome.CORRECTED
     assert np.abs(result.shift_m[~moved]).max() == 0.0
     assert (result.ray_count[~moved] == 0).all()
-
-
-def test_no_points_at_all():
-    learned = Learned(matcher=matcher(fused=FUSED))
-    for views in (None, listed([[]]).take(np.zeros(0, int))):
-        assert len(run(np.zeros((0, 3)), WaterPlane(0.3), views, learned).shift_m) == 0
-
-
-def test_threads_do_not_change_a_bit():
-    rng = np.random.default_rng(5)
-    xyz = np.column_stack([rng.uniform(-15, 15, (300, 2)), rng.uniform(-6, 0.2, 300)])
-    learned = Learned(
-        matcher=matcher(fused=FUSED, averaged=FUSED[:, :8].copy()),
-        bed=Bed(np.full((1, 1), -5.0), -20.0, -20.0, 50.0),
-    )
-    found = []
-    for count in (1, 3):
-        with threads(count):
-            found += [run(xyz, WaterPlane(0.3), listed([MIXED] * 300), learned).shift_m]
-            found += [run(xyz, WaterPlane(0.3), None, learned).shift_m]
-    assert np.array_equal(found[0], found[2]) and np.array_equal(found[1], found[3])
 
 
 # simulated blocks

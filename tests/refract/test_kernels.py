@@ -1,8 +1,6 @@
 """Both kernels, any number of threads, tiles and orders: the same bits."""
 
-import os
-import subprocess
-import sys
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import numpy as np
@@ -10,6 +8,7 @@ import pytest
 
 import pcfix
 from pcfix.kernels import threads
+from pcfix.model import WaterRaster
 from pcfix.refract.tiling import TILE, spatial_order
 from tests.utils.beyond_frames import BEYOND_FRAMES
 
@@ -72,26 +71,46 @@ def test_frame_test_is_projection(points, cameras):
     same(result, snell(points, cameras, 0.0, views=views))
 
 
-def test_order_of_points_does_not_matter(points, cameras):
-    shuffled = RNG.permutation(N)
-    one = snell(points, cameras, 0.0)
-    other = snell(points[shuffled], cameras, 0.0)
-    assert np.array_equal(one.xyz[shuffled], other.xyz)
+WAVES = WaterRaster(
+    0.15 * np.sin(np.arange(-20.0, 120.0) / 4.0) * np.ones((140, 1)), -20.0, 120.0, (1.0, 1.0)
+)
+PAIRS = {"camera_set": "mvs", "matcher": "pairs"}
+WAYS = {
+    "snell": {"method": "snell"},
+    "snell, waves": {"method": "snell", "water": WAVES},
+    "consistent": {"method": "consistent", "camera_set": "all", "exact": True},
+    "consistent, waves": {"method": "consistent", "camera_set": "all", "water": WAVES},
+    **{name: {"method": name} for name in ("shan", "butler", "murase", "factor")},
+    "cells": {"method": "consistent", "camera_set": "all"},
+    "depth maps": {"method": "consistent", "camera_set": "mvs", "matcher": "depth-maps"},
+    "pairs": {"method": "consistent", **PAIRS},
+}
+OF_ALL = ("cells", "depth maps", "pairs")
+"""Polynomials and matchers depend on all points."""
 
 
-def test_points_alone_give_the_same_bits(points, cameras):
-    whole = snell(points, cameras, 0.0)
-    for i in range(0, N, 61):
-        alone = snell(points[i : i + 1], cameras, 0.0)
-        assert np.array_equal(alone.xyz[0], whole.xyz[i])
+def corrected(points, cameras, *, water=0.0, **how):
+    return pcfix.correct_points(points, cameras, water, **how)
 
 
-def test_number_of_threads_does_not_matter(points, cameras):
-    results = []
+@pytest.mark.parametrize("way", WAYS)
+def test_threads_and_company(points, cameras, way):
+    how, shuffled = WAYS[way], np.random.default_rng(1).permutation(N)
+    whole = corrected(points, cameras, **how)
+    assert whole.corrected.any()
     for count in (1, 3):
         with threads(count):
-            results.append(snell(points, cameras, 0.0))
-    same(*results)
+            same(whole, corrected(points, cameras, **how))
+    if way not in OF_ALL:
+        assert np.array_equal(whole.xyz[shuffled], corrected(points[shuffled], cameras, **how).xyz)
+        for i in range(0, N, 61):
+            alone = corrected(points[i : i + 1], cameras, **how)
+            assert np.array_equal(alone.xyz[0], whole.xyz[i])
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_no_points(cameras, way):
+    assert corrected(np.zeros((0, 3)), cameras, **WAYS[way]).xyz.shape == (0, 3)
 
 
 def test_point_by_point_kernel_agrees_to_the_bit(points, cameras):
@@ -148,45 +167,7 @@ def test_spatial_order_is_a_permutation(points):
     assert np.array_equal(np.sort(spatial_order(line)), np.arange(N))
 
 
-def test_compiled_and_interpreted_agree(tmp_path, points, cameras):
-    some = points[:40]
-    np.savez(tmp_path / "scene.npz", xyz=some, centres=cameras.centres, r=cameras.rotations)
-    script = f"""
-import numpy as np, pcfix
-scene = np.load({str(tmp_path / "scene.npz")!r})
-k = len(scene["centres"])
-cameras = pcfix.Cameras(tuple(map(str, range(k))), scene["centres"], scene["r"],
-                        (pcfix.Lens(3000.0, 4000.0, 3000.0, 2010.0, 1490.0),) * k)
-one = pcfix.correct_points(scene["xyz"], cameras, 0.0, method="snell")
-other = pcfix.correct_points(scene["xyz"], cameras, 0.0, method="snell", max_cameras=4)
-np.savez({str(tmp_path / "out.npz")!r}, one=one.xyz, other=other.xyz)
-"""
-    subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", script], check=True, env=interpreted_environment()
-    )
-    slow = np.load(tmp_path / "out.npz")
-    fast = snell(some, cameras, 0.0)
-    # the compiler may round a product and a sum at once: allow the last bits
-    assert slow["one"] == pytest.approx(fast.xyz, abs=1e-11)
-    assert slow["other"] == pytest.approx(snell(some, cameras, 0.0, max_cameras=4).xyz, abs=1e-11)
-
-
-def interpreted_environment():
-
-    return {**os.environ, "NUMBA_DISABLE_JIT": "1"}
-
-
-def test_threads_of_python_may_call_at_once():
-    """Under numba's own pool of threads, two callers at once would end the process."""
-    program = """
-import threading, numpy as np, pcfix
-cameras = pcfix.Cameras(("a", "b"), np.array([[-20.0, 0, 100], [20.0, 0, 100]]))
-xyz = np.random.default_rng(1).uniform((-50, -50, -9), (50, 50, 0), (200_000, 3))
-results = [None] * 4
-def work(i): results[i] = pcfix.correct_points(xyz, cameras, 0.0, method="snell").xyz
-threads = [threading.Thread(target=work, args=(i,)) for i in range(4)]
-for t in threads: t.start()
-for t in threads: t.join()
-assert all(np.array_equal(r, results[0]) for r in results)
-"""
-    subprocess.run([sys.executable, "-c", program], check=True)
+def test_threads_of_python_may_call_at_once(points, cameras):
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda _: snell(points, cameras, 0.0).xyz, range(8)))
+    assert all(np.array_equal(one, found[0]) for one in found)

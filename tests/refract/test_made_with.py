@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from pcfix.lens.frames import frames_of
 from pcfix.model import Cameras, Outcome, Views, WaterPlane
 from pcfix.options.correct import ScienceOptions
-from pcfix.refract.batch import Learned, MadeWith, as_made, as_now, images_of
+from pcfix.refract.batch import Learned, OriginalModel, images_of, to_adjusted, to_original
 from pcfix.refract.matcher import Bed, Matcher
 from pcfix.refract.methods import correct, on_land, shift_of_land
 from pcfix.water.surface import surface_above
@@ -17,8 +17,8 @@ from tests.utils.batches import batch_of
 from tests.utils.compiled import compiled
 from tests.utils.depth_map_twin import LENS, fused_slowly, looking
 
-as_made = compiled(as_made)
-as_now = compiled(as_now)
+to_original = compiled(to_original)
+to_adjusted = compiled(to_adjusted)
 
 N_WATER, TOLERANCE = 1.34, 0.1
 WATER = WaterPlane(0.3, 0.004, -0.003)
@@ -66,11 +66,20 @@ def matcher(cameras, averages=False):
     )  # fmt: skip
 
 
-def run(xyz, views, learned, made_with, kind="depth-maps"):
+def run(xyz, views, learned, original_model, kind="depth-maps"):
     settings = ScienceOptions(method="consistent", index=N_WATER, dimensions="none", matcher=kind)
     above = surface_above(WATER, xyz)
     return correct(
-        batch_of(xyz, above, WATER, CAMERAS, settings, views, learned=learned, made_with=made_with)
+        batch_of(
+            xyz,
+            above,
+            WATER,
+            CAMERAS,
+            settings,
+            views,
+            learned=learned,
+            original_model=original_model,
+        )
     )
 
 
@@ -103,7 +112,7 @@ def test_maps_of_other_cameras_come_home(maps, metric):
         came,
         came + np.array([0.3, -0.2, 0.4]),
     ):  # the place it is counted from does not matter
-        result = run(start[None], views, learned, MadeWith(came[None], made))
+        result = run(start[None], views, learned, OriginalModel(came[None], made))
         assert result.outcome.tolist() == [Outcome.CORRECTED]
         # ways are balanced as shares of the distances, and angles stand for pixels, so that other
         # pairs are the best ones: as of one set of cameras, with residuals of some pixels
@@ -139,7 +148,7 @@ def test_a_block_that_is_only_elsewhere_makes_the_same_cloud(kind):
     one = run(xyz, views, Learned(matcher=matcher(CAMERAS, True), bed=bed), None, matching)
     other = run(
         xyz, views, Learned(matcher=matcher(made, True), bed=bed),
-        MadeWith(elsewhere(xyz), made), matching,
+        OriginalModel(elsewhere(xyz), made), matching,
     )  # fmt: skip
     assert (one.outcome == Outcome.CORRECTED).all()
     assert np.array_equal(one.outcome, other.outcome)
@@ -156,7 +165,7 @@ def test_the_same_cameras_change_no_bit(kind):
     )
     learned = Learned(matcher=matcher(CAMERAS, True))
     same = Cameras(CAMERAS.labels, CAMERAS.centres.copy(), CAMERAS.rotations.copy(), CAMERAS.lenses)
-    one, other = run(xyz, views, learned, None), run(xyz, views, learned, MadeWith(xyz, same))
+    one, other = run(xyz, views, learned, None), run(xyz, views, learned, OriginalModel(xyz, same))
     assert np.array_equal(one.shift_m, other.shift_m)
 
 
@@ -175,7 +184,7 @@ def test_land_comes_home(with_list):
     views = listed([maps]) if with_list else None
     batch = batch_of(
         came[None], surface_above(WATER, came[None]), WATER, CAMERAS, settings, views,
-        learned=Learned(matcher=alone), made_with=MadeWith(came[None], made),
+        learned=Learned(matcher=alone), original_model=OriginalModel(came[None], made),
     )  # fmt: skip
     shift = shift_of_land(batch)
     if with_list:
@@ -195,11 +204,11 @@ def test_land_comes_home(with_list):
 def test_directions_go_through_the_lenses_and_back():
     bent = replace(LENS, radial=(-0.05, 0.01), tangential=(0.001, -0.0005))
     made = replace(absorbed(), lenses=(bent,) * 8)
-    images = images_of(MadeWith(np.zeros((0, 3)), made), CAMERAS)
+    images = images_of(OriginalModel(np.zeros((0, 3)), made), CAMERAS)
     for c in range(8):
         axis = CAMERAS.rotations[c][2] + [0.1, -0.05, 0.02]
-        there = as_made(images, c, tuple(axis))
-        back = np.array(as_now(images, c, there))
+        there = to_original(images, c, tuple(axis))
+        back = np.array(to_adjusted(images, c, there))
         assert np.linalg.norm(there - axis / np.linalg.norm(axis)) > 1e-3
         # the distortion is undone to 1e-12
         assert back / np.linalg.norm(back) == pytest.approx(axis / np.linalg.norm(axis), abs=1e-10)
@@ -208,4 +217,4 @@ def test_directions_go_through_the_lenses_and_back():
 
 def test_cameras_without_lenses_are_refused():
     with pytest.raises(ValueError, match="twice"):
-        images_of(MadeWith(np.zeros((0, 3)), replace(absorbed(), lenses=None)), CAMERAS)
+        images_of(OriginalModel(np.zeros((0, 3)), replace(absorbed(), lenses=None)), CAMERAS)

@@ -7,13 +7,11 @@ import pytest
 import pcfix
 from pcfix import Cameras, Lens
 from pcfix.io.views import ViewMatch, read_views
-from pcfix.kernels import threads
 from pcfix.model import Views, WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Learned
 from pcfix.refract.methods import correct
-from pcfix.refract.occlusion import hidden, in_sight
-from pcfix.refract.top_surface import occluder_of
+from pcfix.refract.occlusion import occluded, occluder_of, visible_cameras
 from pcfix.simulate.tracing import piercing_points, project, triangulate
 from pcfix.water.surface import SurfaceAbove
 from tests.utils.batches import batch_of
@@ -32,7 +30,7 @@ def to_all(n, k):
 def hidden_of(xyz, centres, occluder):
     """Return whether each camera is hidden from each point, shape (n, k)."""
     n, k = len(xyz), len(centres)
-    return hidden(xyz, centres, to_all(n, k), occluder).reshape(n, k)
+    return occluded(xyz, centres, to_all(n, k), occluder).reshape(n, k)
 
 
 def ring(incidence_deg, away_m=100.0, k=8):
@@ -230,22 +228,11 @@ def test_views_lose_hidden_cameras_but_a_point_keeps_all_rather_than_one(walled)
     xyz = np.array([[-2.0, 0.0, 0.0], [-2.0, 1.0, 0.0], [-9.0, 0.0, 0.0]]) + UTM
     camera = np.array([0, 1, 2, 1, 0, 2, 0])
     views = Views(np.array([0, 3, 5, 7]), camera, np.arange(7, dtype=np.float32), "depth-maps")
-    found = in_sight(xyz, centres, views, occluder)
+    found = visible_cameras(xyz, centres, views, occluder)
     # the first camera is in the shadow of the wall for the first two points (8 m at 63 degrees)
     assert found.start.tolist() == [0, 2, 4, 6]
     assert found.camera.tolist() == [1, 2, 1, 0, 2, 0]
     assert found.weight.tolist() == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0] and found.kind == "depth-maps"
-
-
-def test_result_does_not_depend_on_threads_or_company(walled):
-    bed, _, occluder = walled
-    xyz, centres = bed[:5_000] + UTM, ring(50.0) + UTM
-    whole = hidden_of(xyz, centres, occluder)
-    for count in (1, 3):
-        with threads(count):
-            assert (hidden_of(xyz, centres, occluder) == whole).all()
-    parts = [hidden_of(part, centres, occluder) for part in np.array_split(xyz, 7)]
-    assert (np.concatenate(parts) == whole).all() and whole.any()
 
 
 @rendered
@@ -255,7 +242,7 @@ def test_cameras_that_made_a_real_cloud_are_not_called_hidden():
     xyz = np.column_stack([las.x, las.y, las.z])
     views = read_views(RENDERED / "dense.vis", cameras)
     match = ViewMatch(views, cameras, points=len(xyz))
-    found = hidden(xyz, cameras.centres, match.for_chunk(xyz, 0), occluder_of(xyz))
+    found = occluded(xyz, cameras.centres, match.for_chunk(xyz, 0), occluder_of(xyz))
     assert found.mean() < 0.01  # of entries, all of which are of images that saw the point
 
 

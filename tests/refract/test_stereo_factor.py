@@ -9,6 +9,7 @@ import pcfix
 from pcfix.errors import GeometryError, SettingError
 from pcfix.refract.stereo_factor import NODES, ratios, stereo_factor
 from pcfix.simulate.refraction_effect import SWINGLETCAM, StereoPair, effect
+from tests.utils.codes import refused
 from tests.utils.twins import light_path
 
 N = 1.34
@@ -70,7 +71,7 @@ def test_a_simulated_block_has_it_within_a_percent(scene):
     assert found.factor == pytest.approx(measured(scene), rel=0.01)
     assert found.height_m == pytest.approx(80.0, abs=0.5)
     assert (found.images, found.aside) == (40, 0)
-    assert "base 15.77 m (medians of 40 images)." in str(found)
+    assert found.base_m == pytest.approx(15.77, abs=0.005)
 
 
 def test_auto_is_that_number_through_arrays(scene):
@@ -88,22 +89,21 @@ def test_images_that_look_aside_do_not_count():
     scene = pcfix.simulate_scene(500, seed=1, obliques_deg=35.0, **SCENE)
     found = stereo_factor(scene.cameras, scene.water.a, N)
     assert (found.images, found.aside) == (40, 72)
-    assert "72 images look aside" in str(found)
 
 
 def test_what_tells_no_factor_is_refused(scene):
     cameras, level = scene.cameras, scene.water.a
     bare = pcfix.Cameras(cameras.labels, cameras.centres)
-    with pytest.raises(SettingError, match="these have no angles or no lens: give --sensor"):
+    with refused("cameras.no_orientation", SettingError):
         pcfix.correct_points(
             scene.apparent_xyz, bare, scene.water, method="factor", depth_factor="auto"
         )
     far = replace(cameras, centres=cameras.centres * [20.0, 20.0, 1.0])
-    with pytest.raises(GeometryError, match="do not overlap"):
+    with refused("cameras.no_overlap", GeometryError):
         stereo_factor(far, level, N)
     aside = replace(cameras, rotations=np.broadcast_to(np.eye(3), (40, 3, 3)))
-    with pytest.raises(GeometryError, match="and 0 of 40 images do, within 15 degrees"):
+    with refused("cameras.no_stereo", GeometryError, nadir=0):
         stereo_factor(aside, level, N)
     one = replace(cameras, centres=np.broadcast_to(cameras.centres[0], (40, 3)))
-    with pytest.raises(GeometryError, match=r"images 0\.00 m apart"):
+    with refused("cameras.no_overlap", GeometryError, base_m=0.0):
         stereo_factor(one, level, N)

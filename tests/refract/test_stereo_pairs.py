@@ -6,11 +6,8 @@ from functools import lru_cache
 import numpy as np
 import pytest
 from scipy.optimize import root
-from scipy.spatial.transform import Rotation
 
-from pcfix.errors import PcfixWarning, SettingError
-from pcfix.kernels import threads
-from pcfix.model import Cameras, Lens, Outcome, Views, WaterPlane
+from pcfix.model import Outcome, Views, WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Learned
 from pcfix.refract.choice import cameras_of_pairs
@@ -21,14 +18,14 @@ from pcfix.refract.stereo_pairs import invert_pairs
 from pcfix.simulate.scene import simulate_scene
 from pcfix.water.surface import surface_above
 from tests.utils.batches import batch_of
+from tests.utils.codes import warned
 from tests.utils.consistent_twin import seen_through_water, triangulated_straight
+from tests.utils.depth_map_twin import LENS, looking
 from tests.utils.nightly import mostly_nightly
 
 N_WATER = 1.34
-LENS = Lens(3600.0, 5472.0, 3648.0, 2736.0, 1824.0)
 DISTORTED = replace(LENS, radial=(-0.12, 0.05, -0.01), tangential=(1e-3, -6e-4), b1=1.5)
 FISHEYE = replace(LENS, focal=2200.0, projection="equidistant", radial=(0.02, -0.004))
-DOWN = np.diag([1.0, -1.0, -1.0])
 
 SCENES = {
     "shore": {"bed": "shore"},
@@ -140,16 +137,6 @@ def test_a_matcher_with_the_true_partners_gives_the_known_pairs():
 # the twin
 
 
-def looking(centres, tilts_deg, headings_deg, lens):
-    """Return cameras tilted from nadir towards a heading (from east, counterclockwise)."""
-    rotations = []
-    for tilt, heading in zip(tilts_deg, headings_deg, strict=True):
-        axis = np.array([np.sin(np.radians(heading)), -np.cos(np.radians(heading)), 0.0])
-        rotations.append(DOWN @ Rotation.from_rotvec(np.radians(tilt) * axis).as_matrix().T)
-    names = tuple(map(str, range(len(centres))))
-    return Cameras(names, np.asarray(centres, float), np.array(rotations), (lens,) * len(names))
-
-
 CENTRES = [[-24.0, 3, 70], [-8, -2, 71], [9, 14, 69], [25, -9, 70], [-50, 5, 66], [3, 52, 68]]
 TILTS, HEADINGS = [0.0, 2.0, 3.0, 1.0, 35.0, 35.0], [0.0, 40.0, 100.0, 250.0, 0.0, 270.0]
 PAIRS = np.array([[0, 1], [1, 2], [2, 3], [0, 2], [4, 0], [5, 2], [4, 1], [3, 5]])
@@ -250,12 +237,6 @@ def test_what_becomes_of_points_without_pairs():
     assert result.ray_count.tolist() == [2, 0, 0, 0, 0, 2]
 
 
-def test_no_points_at_all():
-    cameras = looking(CENTRES, TILTS, HEADINGS, LENS)
-    empty = Views(np.zeros(1, int), np.zeros(0, int), None, "pairs")
-    assert run(np.zeros((0, 3)), cameras, WaterPlane(0.0), empty).shift_m.shape == (0, 3)
-
-
 def test_points_without_a_solution_keep_that_of_snell():
     # the second camera looks away: it has no image of the point, and no list gives it a ray
     cameras = looking([[-20.0, 0, 70], [20.0, 0, 70]], [15.0, 170.0], [0.0, 0.0], LENS)
@@ -263,16 +244,10 @@ def test_points_without_a_solution_keep_that_of_snell():
     assert run(points, cameras, water, pairs).outcome.tolist() == [Outcome.ONE_CAMERA]
     settings = ScienceOptions(method="snell", index=N_WATER)
     batch = batch_of(points, surface_above(water, points), water, cameras, settings, pairs)
-    with pytest.warns(PcfixWarning, match="no solution for 1 of 1 points"):
+    with warned("points.unsolved", points=1):
         result = invert_pairs(batch)
     plain = intersect(replace(batch, views=cameras_of_pairs(pairs)))
     assert result.shift_m == pytest.approx(plain.shift_m, abs=1e-9)
-
-
-def test_cameras_without_lenses_are_refused():
-    cameras = replace(looking(CENTRES, TILTS, HEADINGS, LENS), lenses=None)
-    with pytest.raises(SettingError, match="no lenses"):
-        run(np.array([[1.0, 2, -5]]), cameras, WaterPlane(0.0), listed([PAIRS]))
 
 
 def test_snell_takes_each_camera_of_the_pairs_once():
@@ -287,13 +262,3 @@ def test_cameras_of_pairs():
     views = cameras_of_pairs(listed([[[3, 1], [1, 0]], [], [[0, 3], [0, 3]]]))
     assert views.start.tolist() == [0, 3, 3, 5]
     assert views.camera.tolist() == [3, 1, 0, 0, 3]
-
-
-def test_the_number_of_threads_does_not_matter():
-    scene = scene_of("obliques", 0.5)
-    rows = under_water(scene)
-    shifts = []
-    for count in (1, 3):
-        with threads(count):
-            shifts.append(corrected(scene, rows, pairs_in(scene, rows)).shift_m)
-    assert (shifts[0] == shifts[1]).all()

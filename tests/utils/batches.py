@@ -5,7 +5,7 @@ from pcfix.refract.batch import Batch, Learned, Survey
 
 def batch_of(
     xyz, above, water, cameras, settings, views=None, offset=None, *,
-    learned=None, level_sigma_m=None, made_with=None,
+    learned=None, level_sigma_m=None, original_model=None,
 ):  # fmt: skip
     survey = Survey(water, cameras, settings, offset, learned or Learned())
-    return Batch(xyz, above, survey, views, made_with, level_sigma_m)
+    return Batch(xyz, above, survey, views, original_model, level_sigma_m)

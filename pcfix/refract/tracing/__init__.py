@@ -1,7 +1,7 @@
-"""Where light from object points leaves the water towards the projection centres.
+"""Find where the light of object points leaves the water towards the projection centres.
 
-This is the refractive collinearity of Mulsow's multimedia bundle: the image of a point is that of
-its piercing point. Four methods find it, `kotowski`, `afrt`, `mdfrt` and `scattershot`
+In the refractive collinearity of Mulsow's multimedia bundle the image of a point is that of its
+piercing point. Four methods find it, `kotowski`, `afrt`, `mdfrt` and `scattershot`
 (`pcfix.refract.tracing.tracers`); they agree where all of them arrive.
 
 The first three look for a refracted ray that hits the point. On facets, and on the bilinear
@@ -135,11 +135,31 @@ def trace(
     >>> found.piercing_xyz.round(3).tolist()
     [[0.292, 0.0, 0.0]]
     """
-    xyz, seen_from = _pairs(target, origin)
-    code, n = _checked(refractive_index, method)
+    xyz, seen_from = np.atleast_2d(target), np.atleast_2d(origin)
+    fit = xyz.ndim == seen_from.ndim == 2 and xyz.shape[1] == seen_from.shape[1] == 3
+    if not (fit and (len(xyz) == len(seen_from) or 1 in (len(xyz), len(seen_from)))):
+        raise SettingError(
+            "trace.shapes",
+            f"An origin of shape {np.shape(origin)} and a target of shape {np.shape(target)} do not"
+            " form pairs. Give both as (n, 3), or one of them as (3,).",
+        )
+    xyz, seen_from = (np.ascontiguousarray(a, float) for a in np.broadcast_arrays(xyz, seen_from))
+    n = float(refractive_index)
+    if method not in METHODS:
+        raise SettingError(
+            "option.choice",
+            f"Method {method!r} is not known. Give one of {', '.join(METHODS)}.",
+            value=method,
+        )
+    if not 1.0 <= n < np.inf:
+        raise SettingError(
+            "option.range",
+            f"The refractive index {n:g} is below 1. Give that of the water, about 1.34.",
+            value=n,
+        )
     plane, tin, field = _as_kernels_take(surfaces)
     result = np.empty((len(xyz), _WIDTH))
-    how = n, code, narrow
+    how = n, METHODS.index(method), narrow
     in_tiles(_trace, len(xyz), xyz, seen_from, plane, tin, field, how, result)
     piercing = xyz + result[:, :_SLOPE]
     way = (xyz - seen_from) + result[:, :_SLOPE]
@@ -153,29 +173,6 @@ def trace(
     )
 
 
-def _pairs(target: npt.ArrayLike, origin: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Return targets and origins as two arrays of the same shape (n, 3)."""
-    xyz, seen_from = np.atleast_2d(target), np.atleast_2d(origin)
-    fit = xyz.ndim == seen_from.ndim == 2 and xyz.shape[1] == seen_from.shape[1] == 3
-    if not (fit and (len(xyz) == len(seen_from) or 1 in (len(xyz), len(seen_from)))):
-        raise SettingError(
-            f"an origin of shape {np.shape(origin)} and a target of shape {np.shape(target)} do"
-            " not make pairs: give both as (n, 3), or one of them as (3,)."
-        )
-    both = np.broadcast_arrays(xyz, seen_from)
-    return np.ascontiguousarray(both[0], float), np.ascontiguousarray(both[1], float)
-
-
-def _checked(refractive_index: float, method: str) -> tuple[int, float]:
-    """Return method and index as the kernel takes them."""
-    if method not in METHODS:
-        raise SettingError(f"method {method!r} is none of {', '.join(METHODS)}.")
-    n = float(refractive_index)
-    if not 1.0 <= n < np.inf:
-        raise SettingError(f"refractive index {n:g} is below 1: water's is about 1.34.")
-    return METHODS.index(method), n
-
-
 def _as_kernels_take(
     surfaces: Surface | float | Sequence[Surface | float],
 ) -> tuple[FloatArray, Tin | None, Field | None]:
@@ -183,8 +180,9 @@ def _as_kernels_take(
     if isinstance(surfaces, list | tuple):
         if len(surfaces) != 1:
             raise SettingError(
-                f"light is traced through one surface, not {len(surfaces)}: layers of several"
-                " media are not known."
+                "trace.surfaces",
+                f"Light is traced through one surface, not {len(surfaces)}. Give the water's.",
+                count=len(surfaces),
             )
         surfaces = surfaces[0]
     surface = WaterPlane(float(surfaces)) if isinstance(surfaces, int | float) else surfaces
@@ -196,7 +194,9 @@ def _as_kernels_take(
         return plane, build_tin(surface), None
     if isinstance(surface, WaterRaster):
         return plane, None, build_field(surface)
-    raise SettingError(f"Light is traced through a plane, raster or mesh, not {surface}.")
+    raise SettingError(
+        "trace.surface", f"Light cannot be traced through {surface}. Give a plane, raster or mesh."
+    )
 
 
 @kernel(allocates=True)
@@ -217,60 +217,45 @@ def _trace(
 
 
 @device
-def _path(
-    out: FloatArray, water: Water, e: Vector, n: float, method: int,
-    narrow: bool,
-) -> None:  # fmt: skip
+def _path(out: FloatArray, water: Water, e: Vector, n: float, method: int, narrow: bool) -> None:
     """Trace one pair and write its row."""
     out[:] = np.nan
     out[_STEPS], out[_STATE] = 0.0, _LOST
     level, over = height_of(water, 0.0, 0.0)[0], height_of(water, e[0], e[1])[0]
+    # the camera is under the water, or somewhere infinite
     if e[2] <= over or not abs(e[0]) + abs(e[1]) + abs(e[2]) < np.inf:
         return
+    # the point is above the water: straight
     if not level > 0.0:
         out[:_STEPS], out[_STATE] = 0.0, _HIT
         return
     if not e[2] > 0.0:
         return
+    # the height at which rays are aimed
     aim = min(level, HIGHEST_AIM * e[2])
-    x, y, steps, found = _search(water, aim, e, n, method)
+    if method == _KOTOWSKI:
+        x, y, steps, found = kotowski(water, aim, e, n)
+    elif method == _AFRT:
+        x, y, steps, found = afrt(water, aim, e, n)
+    elif method == _MDFRT:
+        x, y, steps, found = mdfrt(water, aim, e, n)
+    else:
+        x, y, steps, found = scattershot(water, aim, e, n)
     if not found and narrow and method != _SCATTERSHOT:
         if np.isnan(height_of(water, x, y)[0]):
             x, y = aim / e[2] * e[0], aim / e[2] * e[1]
         x, y, more, found = narrowed(water, e, x, y, NEAR * level, n)
         steps += more
     out[_STEPS] = steps
-    if found:
-        _write(out, water, e, x, y, n)
-
-
-@device
-def _search(
-    water: Water, level: float, e: Vector, n: float, method: int
-) -> tuple[float, float, int, bool]:
-    """Return what the method finds."""
-    if method == _KOTOWSKI:
-        return kotowski(water, level, e, n)
-    if method == _AFRT:
-        return afrt(water, level, e, n)
-    if method == _MDFRT:
-        return mdfrt(water, level, e, n)
-    return scattershot(water, level, e, n)
-
-
-@device
-def _write(out: FloatArray, water: Water, e: Vector, x: float, y: float, n: float) -> None:
-    """Fill in place and slope of the surface where the light leaves the water.
-
-    Of a crease, where no facet's plane bends the light so, Snell's law gives the normal: it is
-    parallel to u - n v, with the unit vectors u to A and v from there.
-    """
+    if not found:
+        return
     z, b, c = height_of(water, x, y)
     out[0], out[1], out[2], out[_SLOPE], out[_SLOPE + 1] = x, y, z, b, c
     out[_STATE] = _HIT
     mx, my = miss_through(water, e, x, y, n)
     if mx * mx + my * my <= CREASE_M * CREASE_M:
         return
+    # on a crease Snell's law gives the normal: u - n v, with the unit vectors u to A and v from A
     a = x, y, z
     u = minus(a, e)
     air, wet = 1.0 / np.sqrt(dot(u, u)), n / np.sqrt(dot(a, a))

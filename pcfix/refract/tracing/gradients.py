@@ -1,4 +1,4 @@
-r"""How the direction of light moves with all that it depends on: point, camera, plane and index.
+r"""Differentiate the direction of light by point, camera, plane and index.
 
 As in `pcfix.refract.rays` light from a point Q reaches the projection centre C through the
 plane N.x = h along
@@ -69,52 +69,38 @@ def light_and_gradients(
     if np.isnan(k):
         out[:] = np.nan
         return
+    # light of a point above the plane does not depend on n
     m = n if depth > 0.0 else 1.0
     cube = root * root * root
+    # 1 / G_k
     below = 1.0 / (height + depth * m * m / cube)
     along, aside = below * k / root, below * depth * k * k * k * (m * m - 1.0) / cube
     by_n = 0.0
     if depth > 0.0:
         by_n = below * k * depth * n * (1.0 + k * k * dot(s, s)) / cube
-    _by_places(out, k, below * k, along, aside, s, normal)
-    all_down, up = height + depth, normal[2]
-    for axis in range(2):
-        dk = (
-            up * below * k * (e[axis] - normal[axis] * height)
-            - up * along * (q[axis] + normal[axis] * depth)
-            - up * aside * all_down * s[axis]
-        )
-        _by_slope(out, axis, k, 1.0 - k * all_down, s, normal, dk)
-    by_level = up * (below * k - along)
-    for i in range(3):
-        out[i, BY_LEVEL], out[i, BY_INDEX], out[i, 11] = s[i] * by_level, s[i] * by_n, 0.0
-
-
-@device
-def _by_places(
-    out: FloatArray, k: float, up: float, along: float, aside: float, s: Vector, normal: Vector
-) -> None:
-    """Fill in w and its derivatives by Q and C.
-
-    With dk / dQ = along N + aside s and dk / dC = -(up N + aside s).
-    """
+    # dk / dQ = along N + aside s and dk / dC = -(below k N + aside s)
     for i in range(3):
         out[i, DIRECTION] = k * s[i] - normal[i]
         for j in range(3):
             flat = (k if i == j else 0.0) - k * normal[i] * normal[j]
             aside_j = aside * s[j]
             out[i, BY_POINT + j] = flat + s[i] * (along * normal[j] + aside_j)
-            out[i, BY_CENTRE + j] = -flat - s[i] * (up * normal[j] + aside_j)
-
-
-@device
-def _by_slope(
-    out: FloatArray, j: int, k: float, rest: float, s: Vector, normal: Vector, dk: float
-) -> None:
-    """Fill in dw by a slope: u (1 - k (H + D)) (e_j - N_j N) + k u s_j N + s dk, u = N_z."""
+            out[i, BY_CENTRE + j] = -flat - s[i] * (below * k * normal[j] + aside_j)
+    all_down, up = height + depth, normal[2]
+    for j in range(2):
+        dk = (
+            up * below * k * (e[j] - normal[j] * height)
+            - up * along * (q[j] + normal[j] * depth)
+            - up * aside * all_down * s[j]
+        )
+        # dw = u (1 - k (H + D)) (e_j - N_j N) + k u s_j N + s dk
+        rest = 1.0 - k * all_down
+        for i in range(3):
+            flat = (1.0 if i == j else 0.0) - normal[i] * normal[j]
+            out[i, BY_SLOPES + j] = up * (rest * flat + k * s[j] * normal[i]) + s[i] * dk
+    by_level = up * (below * k - along)
     for i in range(3):
-        flat = (1.0 if i == j else 0.0) - normal[i] * normal[j]
-        out[i, BY_SLOPES + j] = normal[2] * (rest * flat + k * s[j] * normal[i]) + s[i] * dk
+        out[i, BY_LEVEL], out[i, BY_INDEX], out[i, 11] = s[i] * by_level, s[i] * by_n, 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,8 +169,10 @@ def gradients(
         seen_from = np.ascontiguousarray(np.broadcast_to(np.asarray(centres, float), shape))
     except ValueError:
         raise SettingError(
-            f"points of shape {np.shape(points)} and centres of shape {np.shape(centres)} are not"
-            f" those of a tracing of {shape[0]} paths."
+            "trace.shapes",
+            f"Points of shape {np.shape(points)} and centres of shape {np.shape(centres)} do not"
+            f" fit a tracing of {shape[0]} paths. Give those that were traced.",
+            paths=shape[0],
         ) from None
     result = np.empty((len(xyz), 3, COLUMNS))
     in_tiles(
@@ -222,19 +210,14 @@ def _differentiate(
             h = 0.0  # straight: of a point in the plane itself
         e = minus(row_of(centres, i), vector(p))
         light_and_gradients((0.0, 0.0, 0.0), e, normal, h, n, out)
-        _of_unit_direction(out)
-
-
-@device
-def _of_unit_direction(out: FloatArray) -> None:
-    """Scale the direction to one, and its derivatives with it."""
-    w = out[:, DIRECTION]
-    size = np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
-    for row in range(3):
-        out[row, DIRECTION] /= size
-    for column in range(1, COLUMNS):
-        along = 0.0
+        # from w to the unit direction
+        w = out[:, DIRECTION]
+        size = np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
         for row in range(3):
-            along += out[row, DIRECTION] * out[row, column]
-        for row in range(3):
-            out[row, column] = (out[row, column] - along * out[row, DIRECTION]) / size
+            out[row, DIRECTION] /= size
+        for column in range(1, COLUMNS):
+            along = 0.0
+            for row in range(3):
+                along += out[row, DIRECTION] * out[row, column]
+            for row in range(3):
+                out[row, column] = (out[row, column] - along * out[row, DIRECTION]) / size

@@ -1,8 +1,8 @@
-"""From the camera forwards: a ray through any water surface, and by how much it misses the point.
+"""Trace rays forward from the camera through any water surface.
 
 The object point is the local origin. A ray is named by its aim: the place where it would cross the
 level of the water above the point. It pierces the surface at A, bends there, and comes down to the
-height of the point at the place (mx, my): its miss.
+height of the point at the place (mx, my): its offset.
 
 The surface is a plane, or the bilinear raster or the facets of `pcfix.water.surface`. Where there
 is none, and where it faces away from the camera, all is NaN. Water that hides water behind it is
@@ -62,7 +62,7 @@ def height_of(water: Water, x: float, y: float) -> tuple[float, float, float]:
 def _height_of(
     plane: FloatArray, tin: Tin | None, field: Field | None, origin: FloatArray, x: float, y: float
 ) -> tuple[float, float, float]:
-    """Do it; numba drops the branch of what is None only where it is an argument of its own."""
+    # numba drops the branch of what is None only where that is an argument of its own
     if tin is None and field is None:
         return plane[0] + plane[1] * x + plane[2] * y, plane[1], plane[2]
     return plane_at(tin, field, x, y, origin)
@@ -80,6 +80,7 @@ def pierce(water: Water, e: Vector, d: Vector) -> tuple[float, float]:
     for _ in range(PIERCING_STEPS):
         x, y = e[0] + f * d[0], e[1] + f * d[1]
         z, b, c = height_of(water, x, y)
+        # positive once the ray is below the water
         gap = z - (e[2] + f * d[2])
         if not abs(gap) > 0.1 * CLOSE_M:
             break
@@ -87,6 +88,7 @@ def pierce(water: Water, e: Vector, d: Vector) -> tuple[float, float]:
             high = f
         else:
             low = f
+        # Newton step on the tangent plane; out of the bracket, bisect or double
         f += gap / (d[2] - b * d[0] - c * d[1])
         if not low < f < high:
             f = 2.0 * low if high == np.inf else 0.5 * (low + high)
@@ -104,6 +106,7 @@ def bent(water: Water, e: Vector, x: float, y: float, n: float) -> tuple[Vector,
     z, b, c = height_of(water, x, y)
     a = x, y, z
     normal, u = normal_of(b, c), minus(e, a)
+    # light reaches only faces that look towards the camera
     facing = dot(normal, u)
     if facing > 0.0:
         t = refracted(u, dot(u, u), normal, facing, 1.0 / n)
@@ -135,6 +138,7 @@ def travel(water: Water, e: Vector, x: float, y: float, n: float) -> float:
     z, b, c = height_of(water, x, y)
     a = x, y, z
     u = minus(e, a)
+    # the surface faces away from the camera
     if not u[2] - b * u[0] - c * u[1] > 0.0:
         return np.inf
     air, wet = np.sqrt(dot(u, u)), np.sqrt(dot(a, a))
@@ -168,10 +172,12 @@ def kotowski(water: Water, level: float, e: Vector, n: float) -> Found:
     f = level / e[2]
     x, y = f * e[0], f * e[1]
     gx, gy, hxx, hxy, hyy = _snell_at(water, e, x, y, n)
+    # beyond the edge of the water: start above the point
     if np.isnan(gx):
         x, y = 0.0, 0.0
         gx, gy, hxx, hxy, hyy = _snell_at(water, e, x, y, n)
     for step in range(1, KOTOWSKI_STEPS + 1):
+        # Newton step -H^-1 g
         det = hxx * hyy - hxy * hxy
         dx, dy = (hxy * gy - hyy * gx) / det, (hxy * gx - hxx * gy) / det
         before, size, share = gx * gx + gy * gy, np.sqrt(dx * dx + dy * dy), 1.0
@@ -204,6 +210,7 @@ def _snell_at(
     along_ux, along_uy = ux + b * uz, uy + c * uz
     along_vx, along_vy = vx + b * vz, vy + c * vz
     up = uz - n * vz
+    # second derivatives of the optical length on the tangent plane
     both = air + n * wet
     return (
         along_ux - n * along_vx,
@@ -248,6 +255,7 @@ def afrt(water: Water, level: float, e: Vector, n: float) -> Found:
     x, y = f * e[0], f * e[1]
     longest = max(level, np.sqrt(x * x + y * y))
     for step in range(1, AFRT_STEPS + 1):
+        # trace the ray aimed at P
         ax, ay, mx, my = shoot(water, level, e, px + f * (e[0] - px), py + f * (e[1] - py), n)
         if np.isnan(mx):
             return x, y, step, False
@@ -256,6 +264,7 @@ def afrt(water: Water, level: float, e: Vector, n: float) -> Found:
             return x, y, step, True
         tx, ty = -bxx * mx - bxy * my, -byx * mx - byy * my
         if step > 1:
+            # good Broyden update, 2 x 2
             share = 1.0 / (sx * (sx - tx) + sy * (sy - ty))
             along_x, along_y = sx * bxx + sy * byx, sx * bxy + sy * byy
             bxx, bxy = bxx + share * tx * along_x, bxy + share * tx * along_y
@@ -264,6 +273,7 @@ def afrt(water: Water, level: float, e: Vector, n: float) -> Found:
         size = np.sqrt(tx * tx + ty * ty)
         if not size < np.inf:
             return x, y, step, False
+        # limit the step
         if size > longest:
             tx, ty = tx * longest / size, ty * longest / size
         px, py, sx, sy = px + tx, py + ty, tx, ty
@@ -316,9 +326,11 @@ def mdfrt(water: Water, level: float, e: Vector, n: float) -> Found:
         before = dot(d, d)
         if not before > CLOSE_M * CLOSE_M:
             return ax, ay, step, not np.isnan(before)
+        # distance of the two neighbouring aims
         apart = min(max(0.01 * np.sqrt(before), NARROW_M), 0.05 * level)
         by_x = minus(_distance(water, level, e, x + apart, y, n)[2], d)
         by_y = minus(_distance(water, level, e, x, y + apart, n)[2], d)
+        # solve for the aim across the ray (Cramer)
         det = dot(t, cross(by_x, by_y)) / apart
         dx, dy = dot(t, cross(by_y, d)) / det, dot(t, cross(d, by_x)) / det
         size, share = np.sqrt(dx * dx + dy * dy), 1.0
@@ -368,6 +380,7 @@ def scattershot(water: Water, level: float, e: Vector, n: float) -> Found:
     for i in range(KNOTS):
         for j in range(KNOTS):
             knot_x, knot_y = middle_x - half + i * apart, middle_y - half + j * apart
+            # Fermat: the shortest optical path
             length = travel(water, e, knot_x, knot_y, n)
             if length < best:
                 best, x, y = length, knot_x, knot_y
@@ -386,7 +399,13 @@ def narrowed(water: Water, e: Vector, x: float, y: float, half: float, n: float)
     px, py, second, miss = _draw_together(water, e, x, y, NEIGHBOUR_M, 0.1 * CLOSE_M, n, True)
     if miss <= CLOSE_M:
         return px, py, first + second, True
-    return x, y, first + second, _inside(water, x, y)
+    # at an edge of the water the shortest path means nothing
+    inside = True
+    for i in (-1.0, 1.0):
+        for j in (-1.0, 1.0):
+            z = height_of(water, x + i * NEIGHBOUR_M, y + j * NEIGHBOUR_M)[0]
+            inside = inside and not np.isnan(z)
+    return x, y, first + second, inside
 
 
 @device
@@ -408,6 +427,7 @@ def _draw_together(
                 if bad < best:
                     best, best_i, best_j = bad, i, j
         x, y = x + 0.5 * half * best_i, y + 0.5 * half * best_j
+        # the best knot is inside: halve the grid
         if max(abs(best_i), abs(best_j)) < 2:
             half *= 0.5
     return x, y, shots, best
@@ -420,13 +440,3 @@ def _badness(water: Water, e: Vector, x: float, y: float, n: float, by_miss: boo
         mx, my = miss_through(water, e, x, y, n)
         return np.inf if np.isnan(mx) else float(np.sqrt(mx * mx + my * my))
     return travel(water, e, x, y, n)
-
-
-@device
-def _inside(water: Water, x: float, y: float) -> bool:
-    """Whether there is water on all sides: at an edge the shortest path means nothing."""
-    for i in (-1.0, 1.0):
-        for j in (-1.0, 1.0):
-            if np.isnan(height_of(water, x + i * NEIGHBOUR_M, y + j * NEIGHBOUR_M)[0]):
-                return False
-    return True

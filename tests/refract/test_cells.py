@@ -1,6 +1,7 @@
 """Neighbours corrected by polynomials: as each by itself, within 0.05 ground pixels."""
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 import pytest
@@ -8,10 +9,13 @@ import pytest
 from pcfix.kernels import threads
 from pcfix.model import Outcome, Views, WaterPlane
 from pcfix.options.correct import ScienceOptions
+from pcfix.refract.batch import FLAT_DEG, Batch, Survey
 from pcfix.refract.cells import neighbours_in_cells
 from pcfix.refract.choice import chosen_views
-from pcfix.refract.methods import correct
-from pcfix.water.surface import surface_above
+from pcfix.refract.learning import learn_of_sample
+from pcfix.refract.methods import correct, with_rays
+from pcfix.refract.pair_table import LEAST_POINTS
+from pcfix.water.surface import is_submerged, surface_above
 from tests.refract.test_consistent import (
     DISTORTED,
     FISHEYE,
@@ -21,6 +25,9 @@ from tests.refract.test_consistent import (
     oblique_block,
 )
 from tests.utils.batches import batch_of
+from tests.utils.depth_map_twin import looking
+from tests.utils.nightly import mostly_nightly
+from tests.utils.simulated import simulated
 
 TOLERANCE_PX = 0.05
 LEVEL, RIVER = WaterPlane(0.0), WaterPlane(0.0, 0.004, -0.002)
@@ -114,16 +121,84 @@ def test_cells_hold_their_points_and_neighbours_are_near():
     assert np.median(steps) < 2.0
 
 
-def test_threads_do_not_matter_and_parts_hardly():
+def test_parts_are_nearly_the_whole():
     rng = np.random.default_rng(4)
     xyz, cameras = bed(rng), oblique_block(rng)
-    with threads(1):
-        one, _ = both(xyz, cameras)
-    with threads(3):
-        three, _ = both(xyz, cameras)
-    np.testing.assert_array_equal(one.shift_m, three.shift_m)
+    one, _ = both(xyz, cameras)
     some = np.sort(rng.choice(len(xyz), 2500, replace=False))
     part, _ = both(xyz[some], cameras)
     apart_m = np.linalg.norm(part.shift_m - one.shift_m[some], axis=1)
     assert apart_m.max() < TOLERANCE_PX * GSD_M
     assert (one.outcome == Outcome.CORRECTED).all()
+
+
+# dense matching
+
+BLOCKS = {"nadir": {}, "half oblique": {"obliques_deg": 30.0}}
+
+
+@lru_cache(maxsize=4)
+def dense(block, cloud, area_m=(70.0, 50.0)):
+    """Return the submerged points of a simulated cloud, their views, and the GSD."""
+    how = BLOCKS[block] | {"cloud": cloud} | ({"area_m": area_m} if block != "nadir" else {})
+    scene = simulated(12_000, seed=1, lidar_per_m2=0.0, **how)
+    settings = ScienceOptions(
+        method="consistent", matcher=cloud, camera_set="mvs", dimensions="none"
+    )
+    xyz = scene.apparent_xyz
+    whole = Batch(
+        xyz, surface_above(scene.water, xyz), Survey(scene.water, scene.cameras, settings)
+    )
+    survey, _ = learn_of_sample(whole, len(whole))
+    rows = np.flatnonzero(is_submerged(xyz[:, 2], whole.surface))
+    return replace(whole, survey=survey).take(rows), scene.views.take(rows), scene.gsd_m
+
+
+def quick_and_exact(part):
+    settings = replace(part.survey.settings, exact=True)
+    return correct(part), correct(replace(part, survey=replace(part.survey, settings=settings)))
+
+
+@pytest.mark.parametrize("with_list", [True, False], ids=["list", "no list"])
+@pytest.mark.parametrize("block", mostly_nightly(BLOCKS, "nadir"))
+def test_depth_maps_in_cells(block, with_list):
+    part, views, gsd_m = dense(block, "depth-maps")
+    if with_list:  # which is slow alone: a sixth of the area
+        rows = np.flatnonzero(part.xyz[:, 0] < np.quantile(part.xyz[:, 0], 0.17))
+        part = replace(part.take(rows), views=replace(views.take(rows), kind="depth-maps"))
+    quick, alone = quick_and_exact(part)
+    apart_px = np.linalg.norm(quick.shift_m - alone.shift_m, axis=1) / gsd_m
+    assert np.median(apart_px) < 0.005
+    # whether two maps agree, or which group is nearer, is nearly open for some: 0.1 to 1.7 %
+    assert (apart_px > 0.05).mean() < 0.02
+    np.testing.assert_array_equal(quick.outcome, alone.outcome)
+    assert (quick.shift_m != alone.shift_m).any(axis=1).mean() > 0.5  # polynomials were used
+
+
+@pytest.mark.parametrize("block", mostly_nightly(BLOCKS, "half oblique"))
+def test_pairs_in_cells(block):
+    part, _, gsd_m = dense(block, "pairs", (60.0, 40.0))
+    quick, each = quick_and_exact(part)
+    apart_px = np.linalg.norm(quick.shift_m - each.shift_m, axis=1) / gsd_m
+    # twice what polynomials may lack at the corners of a cell, as depths grow by 1.3 to 2
+    assert apart_px.max() < 0.05
+    np.testing.assert_array_equal(quick.outcome, each.outcome)
+    np.testing.assert_array_equal(quick.ray_count, each.ray_count)
+    assert (quick.shift_m != each.shift_m).any(axis=1).mean() > 0.3  # polynomials were used
+    few, exact = quick_and_exact(part.take(np.arange(LEAST_POINTS - 1)))
+    np.testing.assert_array_equal(few.shift_m, exact.shift_m)  # cells of few points have none
+    # the table is the same for any number of threads
+    with threads(3):
+        np.testing.assert_array_equal(correct(part).shift_m, quick.shift_m)
+
+
+def test_seen_flat():
+    cameras = looking(
+        [[0, 0, 70], [10, 0, 70], [160, 0, 70], [165, 5, 70]], [0, 0, 50, 50], [0, 0, 180, 180]
+    )
+    xyz = np.array([[5.0, 0.0, -2.0], [80.0, 0.0, -2.0], [900.0, 0.0, -2.0]])
+    above = surface_above(WaterPlane(0.0), xyz)
+    settings = ScienceOptions(method="consistent", camera_set="all")
+    flat = with_rays(batch_of(xyz, above, WaterPlane(0.0), cameras, settings)).seen_flat()
+    assert flat.tolist() == [False, True, False]  # from above; at 48 degrees; not at all
+    assert FLAT_DEG < 48.0

@@ -1,0 +1,453 @@
+"""Detect the reconstruction type: the one whose correction leaves the smoothest bed.
+
+``auto`` corrects a sample of points as each type would require and looks for discontinuities where
+the images that see the points change (`pcfix.refract.patches`).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pcfix.model import FloatArray, IntArray, Outcome, ViewKind
+from pcfix.options.correct import Dimensions, ScienceOptions
+from pcfix.refract import patches
+from pcfix.refract.batch import Batch, ModelUncertainty
+from pcfix.refract.fusion import likely_beds
+from pcfix.refract.matcher import bed_of
+from pcfix.refract.methods import correct, with_rays
+from pcfix.refract.patches import Patches, shares
+
+SURE = 3.0
+"""Standard errors by which a share must differ from one half to be significant."""
+LEAST_PATCHES = 100
+"""Patches with all their points corrected in each way, below which nothing is decided."""
+COVERED = 0.95
+"""Least share of the points that a way must correct, of those that most ways correct."""
+LEAST_DEPTH_M = 0.1
+"""Of water, under which the ratio of two depths means little."""
+FITS = 0.3
+"""Largest share of the discontinuities that the right type leaves; for stereo pairs it may be more.
+With moved cameras, and for smoothed clouds, the best type has 0.35 to 0.48. A wrong water level
+does not change the share."""
+MOST_BEYOND = -0.5
+"""A share below this means discontinuities that were never there: of good blocks nothing lies three
+standard errors beyond."""
+CAUSES = (
+    "No reconstruction type fits this cloud well. Check that the cameras belong to it, that the"
+    " poses have not absorbed refraction (pcfix cameras), and that the cloud was not filtered or"
+    " meshed."
+)
+
+
+class Reconstruction(NamedTuple):
+    """A way in which a cloud may have been made.
+
+    words : str
+        Its name.
+    changes : dict
+        The options that correct such a cloud.
+    kind : ViewKind or None
+        The kind of a view list; None without one.
+    """
+
+    words: str
+    changes: dict[str, Any]
+    kind: ViewKind | None = None
+
+    def settings(self, given: ScienceOptions) -> ScienceOptions:
+        """Return the options that correct such a cloud."""
+        of_factor = self.changes.get("method", given.method) == "factor"
+        gone: dict[str, Any] = {} if of_factor else {"depth_factor": None}
+        return replace(given, **gone, **self.changes)
+
+
+_TRACKS, _MAPS, _PAIRS = "intersected rays", "fused depth maps", "stereo pairs"
+IN_FRAME = (
+    Reconstruction(_TRACKS, {"method": "consistent", "camera_set": "all"}),
+    Reconstruction(_MAPS, {"method": "consistent", "camera_set": "mvs", "matcher": "depth-maps"}),
+    Reconstruction(_PAIRS, {"method": "consistent", "camera_set": "mvs", "matcher": "pairs"}),
+)
+LISTED = (
+    Reconstruction(_TRACKS, {"method": "consistent"}, "tracks"),
+    Reconstruction(_MAPS, {"method": "consistent"}, "depth-maps"),
+    Reconstruction(_PAIRS, {"method": "consistent"}, "pair-images"),
+)
+BARE = Reconstruction(_TRACKS, {"method": "snell", "camera_set": "all"})
+"""The only type without lenses or angles."""
+
+LIMITS = (
+    Reconstruction("all rays", {"max_angle": None}),
+    *(
+        Reconstruction(f"rays within {limit:g} degrees of the surface normal", {"max_angle": limit})
+        for limit in (60.0, 50.0, 40.0, 35.0)
+    ),
+)
+"""Possible largest angles of the rays that made the points, for methods with equal weights."""
+
+ALIKE = ("snell", "shan", "butler", "murase", "dietrich")
+
+SOFTWARE = {
+    "metashape": _MAPS, "photoscan": _MAPS, "openmvs": _MAPS, "colmap": _MAPS, "odm": _MAPS,
+    "opendronemap": _MAPS, "opensfm": _MAPS, "realitycapture": _MAPS, "realityscan": _MAPS,
+    "micmac": _PAIRS, "sure": _PAIRS,
+}  # fmt: skip
+"""Types of dense clouds by a word in the name of the software; that of Pix4D is unknown."""
+
+
+class Hint(NamedTuple):
+    """The type of a dense cloud by its software.
+
+    words : str
+        Of the reconstruction.
+    source : str
+        The name of the software.
+    """
+
+    words: str
+    source: str
+
+
+def hint_of(names: tuple[str, ...]) -> Hint | None:
+    """Return the type that software is known for, by the first name that is known."""
+    for name in names:
+        for word in re.findall(r"[a-z]+", name.lower()):
+            if word in SOFTWARE:
+                return Hint(SOFTWARE[word], name.strip())
+    return None
+
+
+class Verdict(NamedTuple):
+    """The reconstruction type of a cloud, and the evidence.
+
+    Attributes
+    ----------
+    chosen, runner_up : Reconstruction
+        The type, and the next best one; if the user set the type, the best of all others.
+    share, runner_up_share : float
+        Share of the discontinuities by which the two differ that is left in the bed of each: 0
+        where right.
+    sigma : float
+        Standard error of both.
+    deeper_m : float
+        By how much the bed of the other one would be deeper, on average over the patches.
+    patches : int
+        Number of patches; 0 without evidence.
+    model_uncertainty : ModelUncertainty
+    by : str
+        Other evidence that decided; empty if the discontinuities did.
+    is_told : bool
+        Whether the user set the type.
+    remarks : tuple of str
+        What makes the evidence weak.
+    of : str
+        The points it is about; empty for all.
+    straight : tuple of 2 float, or None
+        Share of the discontinuities between the chosen type and straight rays that is left in its
+        bed, near 1 if the poses have absorbed the refraction; and its standard error.
+    """
+
+    chosen: Reconstruction
+    runner_up: Reconstruction
+    share: float
+    runner_up_share: float
+    sigma: float
+    deeper_m: float
+    patches: int
+    model_uncertainty: ModelUncertainty
+    by: str = ""
+    is_told: bool = False
+    remarks: tuple[str, ...] = ()
+    of: str = ""
+    straight: tuple[float, float] | None = None
+
+    @property
+    def is_fused(self) -> bool:
+        """Whether the type is fused depth maps, whose model is the closest."""
+        return self.chosen.words == _MAPS
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether the discontinuities are significantly fewer than with the other type."""
+        return self.patches > 0 and 0.5 - self.share > SURE * self.sigma
+
+    @property
+    def is_against(self) -> bool:
+        """Whether the other type fits significantly better."""
+        return self.patches > 0 and self.share - 0.5 > SURE * self.sigma
+
+    def warnings(self) -> tuple[str, ...]:
+        """Return what the user must know, a sentence each."""
+        differs = self.is_against and abs(self.deeper_m) > self.model_uncertainty.formal_m
+        unsure = differs if self.is_told else not self.is_sure
+        is_type = "method" in self.chosen.changes and not self.is_told
+        poor = not self.is_sure and self.share > FITS
+        absurd = self.share < MOST_BEYOND and self.share < -SURE * self.sigma
+        none_fits = is_type and self.patches > 0 and (poor or absurd)
+        said = ((str(self), unsure), (CAUSES, none_fits))
+        return (*self.remarks, *(sentence for sentence, holds in said if holds))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        return {
+            "made_of": self.chosen.words,
+            "sure": self.is_sure,
+            "share": round(self.share, 3),
+            "runner_up": self.runner_up.words,
+            "runner_up_share": round(self.runner_up_share, 3),
+            "sigma": round(self.sigma, 3),
+            "runner_up_deeper_m": round(self.deeper_m, 4),
+            "patches": self.patches,
+            "by": self.by,
+            "scatter_m": round(self.model_uncertainty.scatter_m, 4),
+            "doubt_per_depth": round(self.model_uncertainty.per_depth, 4),
+        }
+
+    def __str__(self) -> str:
+        way = "lower" if self.deeper_m >= 0.0 else "higher"
+        points = self.of[:1].upper() + self.of[1:] or "Cloud"
+        how = "set by the user"
+        if not self.is_told:
+            by = self.by or ("" if self.patches else "its density")
+            how = f"detected{f' by {by}' if by else ''}{'' if self.is_sure else ', not certain'}"
+        fit = ", which fits better" if self.is_told and self.is_against else ""
+        text = (
+            f"{points}: {self.chosen.words} ({how}). Next best: {self.runner_up.words}{fit}; the"
+            f" bed would be {abs(self.deeper_m):.3f} m {way}."
+        )
+        if not self.patches:
+            return text
+        left, other = (100.0 * min(max(x, 0.0), 1.0) for x in (self.share, self.runner_up_share))
+        return (
+            f"{text} Discontinuities between image footprints left in the bed: {left:.0f} %, with"
+            f" {self.runner_up.words} {other:.0f} % ({self.patches} patches)."
+        )
+
+
+def reconstructions_of(batch: Batch) -> tuple[Reconstruction, ...]:
+    """Return the possible types of the points, of every kind of view list if it may be any."""
+    cameras, views = batch.survey.cameras, batch.views
+    if cameras.lenses is None or cameras.rotations is None:
+        return (BARE,)
+    if views is None:
+        given, auto = batch.survey.settings.camera_set, batch.survey.settings.method == "auto"
+        return tuple(
+            one for one in IN_FRAME if not auto or given in ("auto", one.changes["camera_set"])
+        )
+    if views.kind == "pairs":
+        return (LISTED[2]._replace(kind="pairs"), LISTED[0])
+    return LISTED if batch.survey.learned.matcher is not None else LISTED[:1]
+
+
+def told_by(batch: Batch) -> Reconstruction:
+    """Return the way that the options set, with limits of angles resolved."""
+    settings, views = batch.survey.settings, batch.views
+    changes: dict[str, Any] = {"method": settings.method, "max_angle": settings.max_angle}
+    if views is None:
+        changes["camera_set"] = "mvs" if settings.models_matcher else "all"
+        changes["matcher"] = settings.matcher
+    kind = None if views is None else views.kind
+    for one in reconstructions_of(batch) if views is not None else IN_FRAME:
+        if one.kind == kind and all(changes[name] == one.changes[name] for name in one.changes):
+            return one
+    return Reconstruction(settings.method, changes, kind)
+
+
+class _Beds(NamedTuple):
+    """The points of patches as each way corrects them; see `pcfix.refract.patches.shares`."""
+
+    ways: tuple[Reconstruction, ...]
+    z: FloatArray
+    place: IntArray
+    patches: int
+    share: FloatArray
+    sigma: FloatArray
+
+    def rank(self, among: list[int]) -> tuple[int, int]:
+        """Return the best of some ways, and the runner-up."""
+        share = self.share[np.ix_(among, among)]
+        best = int(np.argmin(share.max(axis=1)))
+        return among[best], among[int(np.argmax(share[best]))]
+
+
+def weigh(
+    batch: Batch,
+    reconstructions: tuple[Reconstruction, ...],
+    step: float,
+    *,
+    told: Reconstruction | None = None,
+    hint: Hint | None = None,
+) -> Verdict | None:
+    """Choose the reconstruction that best explains the points, or test the one set by the user.
+
+    The submerged points are evenly spread over the cloud, and each represents `step` of its points;
+    `batch.survey.learned` has the matcher. `told` is set by the user, `hint` decides if the points
+    do not. None with a single way, or too few points for patches.
+    """
+    ways = reconstructions if told is None or told in reconstructions else (*reconstructions, told)
+    sample = patches.patches_of(batch) if len(ways) > 1 else None
+    if sample is None:
+        return None
+    part = batch.take(sample.rows)
+    part = replace(part, survey=replace(part.survey, level_offset_m=None), level_sigma_m=None)
+    beds = _beds(part, replace(batch, survey=part.survey), sample, ways)
+    if beds is None or (told is not None and told not in beds.ways):
+        return None
+    remarks, among = _remarks(part, sample.place), list(range(len(beds.ways)))
+    if told is None:
+        best, other, by = _decided(part, beds, sample, step, hint, weak=bool(remarks))
+    else:
+        best, by = beds.ways.index(told), ""
+        among = [i for i in among if beds.ways[i] in reconstructions]
+        first, second = beds.rank(among)
+        other = second if first == best else first
+    deeper_m = float(np.nanmean((beds.z[best] - beds.z[other])[beds.place]))
+    straight = None
+    if beds.patches and not remarks and part.original_model is None:
+        share, sigma = shares(part, beds.place, np.array([beds.z[best], part.xyz[:, 2]]))
+        straight = float(share[0, 1]), float(sigma[0, 1])
+    return Verdict(
+        chosen=beds.ways[best],
+        runner_up=beds.ways[other],
+        share=float(beds.share[best, other]),
+        runner_up_share=float(beds.share[other, best]),
+        sigma=float(beds.sigma[best, other]),
+        deeper_m=deeper_m,
+        patches=beds.patches,
+        model_uncertainty=_model_uncertainty(part, beds, best, among),
+        by=by,
+        is_told=told is not None,
+        remarks=remarks,
+        straight=straight,
+    )
+
+
+def _beds(
+    part: Batch, batch: Batch, sample: Patches, ways: tuple[Reconstruction, ...]
+) -> _Beds | None:
+    """Correct the points of the patches in each way; None if fewer than two ways can."""
+    around = patches.others_around(batch, sample.rows)
+    z = np.array([_heights(part, around, way) for way in ways])
+    covered = np.isfinite(z).sum(axis=1)
+    kept = np.flatnonzero(covered >= COVERED * covered.max())
+    if len(kept) < 2 or not covered.max():
+        return None
+    z = z[kept]
+    place = sample.place[np.isfinite(z[:, sample.place]).all(axis=(0, 2))]
+    if len(place) >= LEAST_PATCHES:
+        share, sigma = shares(part, place, z)
+        told = len(place)
+    else:
+        share, sigma = np.full((2, len(z), len(z)), 0.5)
+        place, told = sample.place, 0
+    np.fill_diagonal(share, -np.inf)
+    return _Beds(tuple(ways[i] for i in kept), z, place, told, share, sigma)
+
+
+def _decided(
+    part: Batch, beds: _Beds, sample: Patches, step: float, hint: Hint | None, *, weak: bool
+) -> tuple[int, int, str]:
+    """Return the chosen way, the runner-up, and other evidence that decided.
+
+    If the discontinuities are not significant, a dense cloud is what its software makes, and not
+    tracks; a sparse one is tracks.
+    """
+    best, other = beds.rank(list(range(len(beds.ways))))
+    errors = SURE if weak else 1.0
+    if 0.5 - beds.share[best, other] > errors * beds.sigma[best, other] or part.views is not None:
+        return best, other, ""
+    words = [one.words for one in beds.ways]
+    dense = patches.is_dense(part, sample.place, step * sample.step)
+    if dense and hint is not None and hint.words in words:
+        said = words.index(hint.words)
+        return said, other if said == best else best, f"its software, {hint.source}"
+    if words[best if dense else other] == "intersected rays":
+        return other, best, "its density"
+    return best, other, ""
+
+
+def _remarks(part: Batch, place: IntArray) -> tuple[str, ...]:
+    """Return what makes the discontinuities weak evidence."""
+    if part.views is not None:
+        return ()
+    step = patches.grid_m(part.xyz)
+    if step is not None:
+        return (
+            f"The points lie on a grid of {step:.3g} m, like the heights of a raster, which smooths"
+            " the evidence of the reconstruction type. Give the cloud as the matcher wrote it.",
+        )
+    if part.survey.cameras.lenses is not None and patches.is_smooth(part, place):
+        return (
+            "Neighbouring points scatter less than images allow, as in a mesh or a filtered cloud:"
+            " its reconstruction type is uncertain, and SigmaZ has no share of mismatches. Give the"
+            " cloud as the matcher wrote it.",
+        )
+    return ()
+
+
+def _model_uncertainty(part: Batch, beds: _Beds, way: int, among: list[int]) -> ModelUncertainty:
+    """Return the model uncertainty of a way, among ways that may be right.
+
+    Of the best way it is, for each other one, the share of the difference to it that is left in the
+    bed; of another way, the difference to the best in addition. Of a formula, which is no
+    reconstruction type, it is the whole difference: a bed can be smooth and too shallow.
+    """
+    depth = np.maximum(part.surface.height_m - beds.z[way], 1e-3)[beds.place]
+    deep = depth > LEAST_DEPTH_M
+
+    def left(a: int, b: int, most: float) -> float:
+        apart = np.abs((beds.z[a] - beds.z[b])[beds.place]) / depth
+        share = min(max(float(beds.share[a, b]), 0.0) + float(beds.sigma[a, b]), 1.0)
+        if not np.isfinite(apart[deep]).any():
+            return 0.0
+        # its 95 % interval covers 95 % of the differences
+        rms = float(np.sqrt(np.nanmean(apart[deep] ** 2)))
+        spread = max(rms, float(np.nanquantile(apart[deep], 0.95)) / 1.96)
+        return (share if share <= most else 1.0) * spread
+
+    best, _ = beds.rank(among)
+    open_m = max((left(best, i, 1.0) for i in among if i != best), default=0.0)
+    if way != best:
+        open_m = math.hypot(open_m, left(way, best, 0.5 if way in among else 0.0))
+    scatter = patches.scatter_m(part, beds.place, beds.z[way])
+    budget = correct(_as(part, beds.ways[way], "all"))
+    formal = float(np.median(budget.sigma_z_m))
+    return ModelUncertainty(math.sqrt(max(scatter**2 - formal**2, 0.0)), open_m, formal)
+
+
+def _as(part: Batch, way: Reconstruction, dimensions: Dimensions = "none") -> Batch:
+    """Return the points with the settings of a way."""
+    survey = part.survey
+    settings = replace(way.settings(survey.settings), dimensions=dimensions)
+    learned, views = survey.learned, part.views
+    if views is None and not settings.models_matcher:
+        learned = learned._replace(matcher=None)
+    if views is not None and way.kind is not None:
+        views = replace(views, kind=way.kind)
+    return replace(part, views=views, survey=replace(survey, settings=settings, learned=learned))
+
+
+def _heights(part: Batch, around: Batch, way: Reconstruction) -> FloatArray:
+    """Return the heights corrected in one way, NaN where a point is not corrected."""
+    part = _as(part, way)
+    settings = part.survey.settings
+    fuses = settings.method == "consistent" and settings.matcher == "depth-maps"
+    if part.views is not None or not fuses or part.survey.learned.matcher is None:
+        return _corrected_z(part)
+    # the bed identifies the images of a point: it must be that of other points
+    likely = likely_beds(with_rays(_as(around, way)))
+    bed = bed_of(around.xyz, likely) if np.isfinite(likely).any() else None
+    # not interpolated, as a smooth bed would make any choice look smooth
+    bed = None if bed is None else bed._replace(between=False)
+    learned = part.survey.learned._replace(bed=bed)
+    return _corrected_z(replace(part, survey=replace(part.survey, learned=learned)))
+
+
+def _corrected_z(part: Batch) -> FloatArray:
+    found = correct(part)
+    z = part.xyz[:, 2] + found.shift_m[:, 2]
+    return np.where(found.outcome == Outcome.CORRECTED, z, np.nan)
