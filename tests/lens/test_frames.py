@@ -1,5 +1,6 @@
 """Frames of distorted lenses: the slow implementation, tiles, and cameras without lenses."""
 
+import os
 import subprocess
 import sys
 from functools import partial
@@ -13,7 +14,7 @@ from pcfix.kernels import threads
 from pcfix.lens.frames import ALL, NOT_DISTORTED, NOTHING, frames_of, holds, judge, may_hold
 from pcfix.lens.imaging import project
 from pcfix.refract.intersect import TILE
-from tests.refract.test_kernels import interpreted_environment, same
+from tests.refract.test_kernels import same
 from tests.utils.beyond_frames import BEYOND_FRAMES
 from tests.utils.compiled import compiled
 from tests.utils.nightly import mostly_nightly
@@ -273,9 +274,8 @@ np.savez({str(tmp_path / "out.npz")!r}, **found)
 """
     some = points[np.abs(points[:, :2] - 50).max(axis=1) < 50][:40]
     np.save(tmp_path / "xyz.npy", some)
-    subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", script], check=True, env=interpreted_environment()
-    )
+    environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
+    subprocess.run([sys.executable, "-W", "ignore", "-c", script], check=True, env=environment)
     slow = np.load(tmp_path / "out.npz")
     for name in names:
         fast = snell(some, block(LENSES[name], k=6), 0.0)
