@@ -138,7 +138,9 @@ def threads(jobs: int | None) -> Iterator[None]:
     """Run with so many threads, all cores where None; the result does not depend on it."""
     global _most_threads
     if jobs is not None and jobs < 1:
-        raise SettingError(f"jobs {jobs} is less than 1: give a number of threads.")
+        raise SettingError(
+            "option.range", f"jobs {jobs} is less than 1.", option="jobs", value=jobs
+        )
     before = _most_threads
     _most_threads = jobs or before
     try:

@@ -200,19 +200,19 @@ class Cameras:
         """Check that the arrays belong together."""
         k = len(self.labels)
         if self.centres.shape != (k, 3):
-            raise SettingError(
-                f"Cameras need one label per centre: {k} labels, centres of shape"
-                f" {self.centres.shape}."
-            )
+            shape = self.centres.shape
+            raise SettingError("cameras.arrays", f"{k} labels need centres ({k}, 3), not {shape}.")
         if not np.isfinite(self.centres).all():
             bad = self.labels[int(np.argmin(np.isfinite(self.centres).all(axis=1)))]
-            raise SettingError(f"Camera {bad}: the projection centre is not finite.")
+            raise SettingError("cameras.not_finite", f"Camera {bad}: its centre is not finite.")
         if self.rotations is None and self.lenses is not None:
-            raise SettingError("Cameras with lenses need rotations.")
+            raise SettingError("cameras.arrays", "Cameras with lenses need rotations.")
         if self.rotations is not None and self.rotations.shape != (k, 3, 3):
-            raise SettingError(f"rotations must be ({k}, 3, 3), not {self.rotations.shape}.")
+            shape = self.rotations.shape
+            raise SettingError("cameras.arrays", f"rotations must be ({k}, 3, 3), not {shape}.")
         if self.lenses is not None and len(self.lenses) != k:
-            raise SettingError(f"lenses must be {k}, not {len(self.lenses)}.")
+            count = len(self.lenses)
+            raise SettingError("cameras.arrays", f"{k} cameras need {k} lenses, not {count}.")
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -300,17 +300,20 @@ class WaterRaster:
         """Check that it is a raster with some heights."""
         shape = self.height_m.shape
         if len(shape) != 2 or min(shape) < 2:
-            raise SettingError(f"A water raster needs two rows and columns at least, not {shape}.")
+            raise SettingError(
+                "water.raster_size", f"Give at least 2 rows and columns, not {shape}."
+            )
         place = (self.left_m, self.top_m, *self.cell_m)
         if not (np.isfinite(place).all() and min(self.cell_m) > 0.0):
             raise SettingError(
+                "water.raster_place",
                 f"Water raster {self.name}: the corner {self.left_m:g}, {self.top_m:g} must be"
-                f" finite and the cells {self.cell_m[0]:g} x {self.cell_m[1]:g} m positive."
+                f" finite and the cells {self.cell_m[0]:g} x {self.cell_m[1]:g} m positive.",
             )
         if np.isinf(self.height_m).any() or not np.isfinite(self.height_m).any():
             raise SettingError(
-                f"Water raster {self.name}: heights must be finite, or NaN where there are none,"
-                " but not all of them."
+                "water.raster_heights",
+                f"Water raster {self.name}: heights must be finite, or NaN in some cells.",
             )
 
     def __str__(self) -> str:
