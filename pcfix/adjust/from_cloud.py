@@ -273,13 +273,22 @@ def straight_columns(problem: Problem, start: Solution, apparent_xyz: FloatArray
     return tests
 
 
+@device
+def _copy_columns(work: Workspace, a: int, columns: FloatArray) -> None:
+    """Copy the derivatives of an observation by its own and the shared unknowns."""
+    for k in range(2):
+        for j in range(SURFACE):
+            columns[k, j] = work.own[a, k, j]
+        for j in range(work.shared.shape[2]):
+            columns[k, SURFACE + j] = work.shared[a, k, j]
+
+
 @kernel
 def _columns(span: Span, state: State, given: Given, tests: FloatArray, work: Workspace) -> None:
     for p in range(*span):
         for o in range(given.start[p], given.start[p + 1]):
             if linearise(state, given, PLAIN, p, o, work, 0):
-                tests[o, :, :SURFACE] = work.own[0, :, :SURFACE]
-                tests[o, :, SURFACE:] = work.shared[0]
+                _copy_columns(work, 0, tests[o])
 
 
 def solve_unaware(
@@ -369,7 +378,7 @@ def _newton(
     return step, points
 
 
-@device
+@device(allocates=True)
 def _test_point(
     state: State, given: Given, tests: FloatArray, is_tested: bool, p: int, work: Workspace,
     left: FloatArray,
@@ -383,8 +392,7 @@ def _test_point(
     v, rhs = work.v, work.rhs
     if not is_tested:
         for a in range(count):
-            left[a, :, :SURFACE] = work.own[a, :, :SURFACE]
-            left[a, :, SURFACE:] = work.shared[a]
+            _copy_columns(work, a, left[a])
         return count
     v[:], rhs[:] = 0.0, 0.0
     for a in range(count):
