@@ -488,7 +488,7 @@ def _from_odm(path: Path, rows: list[tuple[int, list[str]]]) -> Marks:
     if not np.isfinite(values).all():
         i, k = np.argwhere(~np.isfinite(values))[0]
         raise InputError(
-            "table.not_a_number",
+            "table.number",
             f"{path}: line {rows[i][0]}: {'xyzuv'[k]} '{rows[i][1][k]}' is not a finite number.",
             path=path,
             line=rows[i][0],

@@ -42,7 +42,7 @@ class Table(NamedTuple):
                 why = "too large" if math.isfinite(value) else "not a finite number"
                 sentence = f"line {line}, column {name}: '{text}' is {why}."
                 where = {"line": line, "column": name, "value": text}
-                raise bad_file(self.path, "table.not_a_number", sentence, **where)
+                raise bad_file(self.path, "table.number", sentence, **where)
         return values
 
 

@@ -236,7 +236,7 @@ def test_odm(tmp_path, first, named):
 @pytest.mark.parametrize(
     ("line", "code"),
     [
-        ("500010 4000010 nan 1 2 a.jpg", "table.not_a_number"),
+        ("500010 4000010 nan 1 2 a.jpg", "table.number"),
         ("500010 4000010 2 1 2", "gcps.fields"),
     ],
 )

@@ -96,7 +96,7 @@ def test_table_that_does_not_fit(tmp_path):
     ("text", "code", "values"),
     [
         ("time,level_ft\n2026-05-01T10:00:00Z,1\n", "table.column_missing", {}),
-        (TIDE.replace("1.30", "high"), "table.not_a_number", {"line": 3, "value": "high"}),
+        (TIDE.replace("1.30", "high"), "table.number", {"line": 3, "value": "high"}),
         (TIDE.replace("2026-05-01T10:30:00Z", "half ten"), "time.format", {"value": "half ten"}),
         (TIDE.replace("T10:30:00Z", ""), "time.format", {"value": "2026-05-01"}),
         (TIDE.replace("10:30:00Z", "10:30:00"), "time.zone", {"value": "2026-05-01T10:30:00"}),
