@@ -18,9 +18,7 @@ within 1.96 SigmaZ.
 noise of the same size, of 1000 points. Of depth maps the list has no partner images, and each is
 matched anew, so that there it is a scale rather than a limit.
 
-``--reliability PNG`` draws, of each scene, the share of the points whose error is within so many
-standard errors beside the share that a Gaussian has there. ``--sensitivity`` prints how wrong
-inputs come through instead, beside the predicted budget.
+``--sensitivity`` prints how wrong inputs come through instead, beside the predicted budget.
 """
 
 from __future__ import annotations
@@ -43,7 +41,6 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from pcfix.flow.learning import learn_regression
 from pcfix.label.labelling import Part
 from pcfix.water.surface import surface_above
-from tests.benchmarks.accuracy_reliability import BOUNDS, draw
 from tests.benchmarks.accuracy_scenes import NAMES, Case, make
 from tests.benchmarks.accuracy_sensitivity import COLUMNS as SENSITIVITY_COLUMNS
 from tests.benchmarks.accuracy_sensitivity import sensitivity
@@ -109,7 +106,6 @@ def row_of(
         "rays": rays,
         **errors(case, error),
         "covered": float(np.mean(within <= 1.96)),
-        "within": [float(np.mean(within <= bound)) for bound in BOUNDS],
         "done": len(rows) / int(case.measured.sum()),
         "points_per_s": int(found.submerged.sum()) / seconds,
     }
@@ -184,7 +180,6 @@ def main() -> None:
     ask.add_argument("--scenes", nargs="+", choices=NAMES, default=list(NAMES))
     ask.add_argument("--runs", type=int, default=1, help="the speed is the median of so many")
     ask.add_argument("--seed", type=int, default=1)
-    ask.add_argument("--reliability", type=Path, metavar="PNG", help="draw it there")
     ask.add_argument("--sensitivity", action="store_true", help="print the other table")
     ask.add_argument("--markdown", action="store_true")
     ask.add_argument("--json", type=Path, help="write the rows there as well")
@@ -194,8 +189,6 @@ def main() -> None:
         print(table(rows, SENSITIVITY_COLUMNS, markdown=given.markdown))
     else:
         rows = accuracy(given)
-        if given.reliability:
-            draw(rows, given.reliability)
     if given.json:
         asked = {"points": given.points, "seed": given.seed, "runs": given.runs}
         given.json.write_text(json.dumps({"pcfix": pcfix.__version__, **asked, "rows": rows}))
