@@ -449,7 +449,7 @@ def _offset_notes(
     if not is_off.any():
         return []
     parts = [
-        f"{abs(m):.2f} m {side[m < 0.0]} the projection centres (standard error {sigma:.2f} m)"
+        f"{abs(m):.2f} m {side[int(m < 0.0)]} the projection centres (standard error {sigma:.2f} m)"
         for m, sigma, side, off in zip(offset_m, sigma_m, SIDES, is_off, strict=True)
         if off
     ]
