@@ -10,7 +10,6 @@ import pytest
 import shapely
 
 import pcfix
-from pcfix.flow.checks import check_water
 from pcfix.grid import shoreline
 from pcfix.grid.shoreline import NearWater
 from pcfix.io.scenes import write_scene
@@ -78,13 +77,6 @@ def test_standard_error(beach, tmp_path, off_m):
         assert off_m == 0.0 or rms > 0.3 * sigma  # it is no larger than it need be
         assert level == pytest.approx(LEVEL_M + off_m, abs=1e-6)
         assert length == pytest.approx(line.length)
-
-
-def test_apparent_cloud(beach, tmp_path):
-    folder, ground = beach
-    report = check_water(LEVEL_M, cloud=folder / "cloud.laz", shoreline=tmp_path / "shore.gpkg")
-    xy = read_vectors(tmp_path / "shore.gpkg").coordinates[:, :2]
-    assert math.sqrt(np.mean(distance_m(ground, xy) ** 2)) < 2.0 * report.shoreline["sigma_m"]
 
 
 def island_and_pool(count=60_000, noise_m=0.02):
