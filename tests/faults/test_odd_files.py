@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pcfix.errors import InputError, brief
-from pcfix.io.drafts import cannot_write, disk_of
+from pcfix.io.atomic import cannot_write, disk_of
 from pcfix.io.files import check_input, check_output, is_same
 from tests.utils.clouds import WATER_M, write_cloud
 from tests.utils.codes import refused
