@@ -17,8 +17,8 @@ from pcfix.flow.inputs import Inputs
 from pcfix.flow.photos import lens_of, plain, read_heights, warn_all
 from pcfix.flow.runner import Progress, check_summary, write_summary
 from pcfix.grid.lattice import Lattice
+from pcfix.io.atomic import temporary_folder, temporary_output
 from pcfix.io.crs import parse_crs
-from pcfix.io.drafts import folder_when_whole, replaced_when_whole
 from pcfix.io.files import scratch_arrays
 from pcfix.io.photographs import Frames, check_calm, read_frames, write_calm, write_spread
 from pcfix.io.rasters import new_raster, write_part
@@ -102,7 +102,7 @@ def calm_frames(
         water = None
         if view is not None:
             waters, nodes, water = _water(given, found, view, count, median=median, stack=stack)
-            with folder_when_whole(folder) as draft:
+            with temporary_folder(folder) as draft:
                 _write_waters(draft, found.names, view.level_m, nodes, waters, crs)
             water = water._replace(folder=str(folder))
             notes = _notes_of(water, tied=bool(given.interval or found.interval_s))
@@ -319,7 +319,7 @@ def _write_waters(
             (folder / "sigma" / f"{name}.tif", "standard error", sigma),
         ):
             with (
-                replaced_when_whole(path) as draft,
+                temporary_output(path) as draft,
                 new_raster(draft, lattice, parsed, {band: "m"}) as target,
             ):
                 write_part(target, values.reshape(nodes.shape), lattice.window, 1)

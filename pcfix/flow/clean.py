@@ -24,7 +24,7 @@ from pcfix.errors import InputError
 from pcfix.flow.runner import Chunk, FileTask, Header, Progress, Step, file_task
 from pcfix.flow.surfaces import CloudView, Points, find_surface, points_of, view_of
 from pcfix.flow.tiles import TiledRun
-from pcfix.io.drafts import all_or_none
+from pcfix.io.atomic import all_or_none
 from pcfix.io.files import path_of, scratch_arrays
 from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource

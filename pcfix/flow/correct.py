@@ -31,7 +31,7 @@ from pcfix.flow.surfaces import (
 )
 from pcfix.flow.through_water import Label, correct_checked
 from pcfix.flow.tiles import TiledRun
-from pcfix.io.drafts import all_or_none
+from pcfix.io.atomic import all_or_none
 from pcfix.io.files import path_of
 from pcfix.io.las import columns
 from pcfix.io.las.part import part_report

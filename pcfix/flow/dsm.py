@@ -23,8 +23,8 @@ from pcfix.grid.heights import Gridding, as_uncertainty, grid_window
 from pcfix.grid.lattice import round_resolution
 from pcfix.grid.model import NO_LIGHT, DsmSummary, Tally, hillshade
 from pcfix.io import rasters
+from pcfix.io.atomic import scratch_folder, temporary_output
 from pcfix.io.crs import crs_words, parts
-from pcfix.io.drafts import draft_folder, replaced_when_whole
 from pcfix.io.files import check_output, write_text
 from pcfix.io.las.part import part_report
 from pcfix.io.las.source import metric_crs
@@ -117,10 +117,10 @@ def grid_dsm(
     run = _Run(task, cloud, rules, given.cog)
     with ExitStack() as stack:
         drafts = {
-            name: stack.enter_context(replaced_when_whole(path))
+            name: stack.enter_context(temporary_output(path))
             for name, path in {"dsm": task.target, **more}.items()
         }
-        run.write(stack.enter_context(draft_folder(task.target)), **drafts)
+        run.write(stack.enter_context(scratch_folder(task.target)), **drafts)
     if given.style:
         write_text(style, raster_style(task.target, rules.what), overwrite=given.overwrite)
     result = replace(

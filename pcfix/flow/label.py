@@ -26,7 +26,7 @@ from pcfix.flow.surfaces import (
     view_of,
 )
 from pcfix.flow.tiles import TiledRun
-from pcfix.io.drafts import all_or_none
+from pcfix.io.atomic import all_or_none
 from pcfix.io.files import path_of
 from pcfix.io.las.columns import convert
 from pcfix.io.las.part import part_report

@@ -15,7 +15,7 @@ from pcfix.flow.photos import CLOUDS, PhotoBlock, block_of, plain, warn_all
 from pcfix.flow.runner import Progress, check_summary, write_summary
 from pcfix.grid.lattice import Lattice, Window, lattice_over, refuse_size
 from pcfix.io import rasters
-from pcfix.io.drafts import draft_folder, replaced_when_whole
+from pcfix.io.atomic import scratch_folder, temporary_output
 from pcfix.io.photographs import photographs_in, read_colours
 from pcfix.kernels import threads
 from pcfix.model import FloatArray, WaterPlane
@@ -61,7 +61,7 @@ def ortho_photo(
     known = [*paths_in(given), *([given.dsm] if given.dsm else []), *paths]
     target = rasters.check_tif(output, overwrite=given.overwrite, inputs=known)
     check_summary(given, [*known, target])
-    with threads(given.jobs), replaced_when_whole(target) as draft, draft_folder(target) as folder:
+    with threads(given.jobs), temporary_output(target) as draft, scratch_folder(target) as folder:
         block = block_of(_as_photos(given), paths, folder)
         warn_all(block.notes)
         lattice = _lattice(block, given)

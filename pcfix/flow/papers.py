@@ -12,7 +12,7 @@ from pathlib import Path
 from pcfix.errors import SettingError
 from pcfix.flow.correct import correct_points
 from pcfix.flow.runner import json_text
-from pcfix.io.drafts import all_or_none, made_folder
+from pcfix.io.atomic import all_or_none, output_folder
 from pcfix.io.files import check_output, write_bytes
 from pcfix.options.declare import File
 from pcfix.options.scenes import SimulateOptions
@@ -87,7 +87,7 @@ def write_refraction_effect(out_dir: File, options: SimulateOptions) -> str:
         "refraction_effect.json": json_text(settings).encode(),
     }
     folder = Path(out_dir)
-    with made_folder(folder), all_or_none():
+    with output_folder(folder), all_or_none():
         for name in files:
             check_output(folder / name, overwrite=options.overwrite)
         for name, data in files.items():

@@ -27,7 +27,7 @@ import numpy.typing as npt
 from pcfix.blocks import Empty, on_disk
 from pcfix.errors import InputError, SettingError, refusal
 from pcfix.grid.lattice import Window
-from pcfix.io.drafts import disk_of, replaced_when_whole
+from pcfix.io.atomic import disk_of, temporary_output
 from pcfix.model import FloatArray, IntArray
 from pcfix.options.declare import File
 from pcfix.sums import Counted
@@ -177,7 +177,7 @@ def digest_of(path: Path) -> str:
 
 def write_counted(path: Path, note: dict[str, Any], counted: Counted) -> None:
     """Write arrays and a note into one file, whole or not at all."""
-    with replaced_when_whole(path) as draft, draft.open("wb") as stream:
+    with temporary_output(path) as draft, draft.open("wb") as stream:
         np.savez_compressed(stream, **{**counted, "note": np.array(json.dumps(note))})  # type: ignore
 
 
@@ -215,7 +215,7 @@ def read_json(path: Path) -> Any:
 def write_bytes(path: File, data: bytes, *, overwrite: bool) -> None:
     """Write a small file under the same rules."""
     target = check_output(path, overwrite=overwrite)
-    with replaced_when_whole(target) as draft:
+    with temporary_output(target) as draft:
         draft.write_bytes(data)
 
 
