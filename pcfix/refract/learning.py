@@ -57,13 +57,7 @@ def resolved(settings: ScienceOptions, cameras: Cameras, views: ViewKind | None)
 def for_own_water(
     settings: ScienceOptions, cameras: Cameras, views: ViewKind | None
 ) -> ScienceOptions:
-    """Replace ``auto`` for images with their own water surfaces.
-
-    Raises
-    ------
-    SettingError
-        If the method needs one water surface for all images.
-    """
+    """Replace ``auto`` for images with their own water surfaces, if the method allows these."""
     bare = cameras.lenses is None or cameras.rotations is None
     dense = settings.camera_set == "mvs" or views not in (None, "tracks")
     method = settings.method
@@ -127,13 +121,7 @@ def wants_matcher(survey: Survey, views: ViewKind | None) -> bool:
 
 
 def learn_of_points(batch: Batch, regression: DepthRegression | None) -> Batch:
-    """Return a batch that is the whole cloud, with land, with what is learned from it.
-
-    Raises
-    ------
-    SettingError
-        If the method lacks something that it needs.
-    """
+    """Return a batch that is the whole cloud, with land, with what is learned from it."""
     cameras, views = batch.survey.cameras, batch.views
     kind = None if views is None else views.kind
     check_method(resolved(batch.survey.settings, cameras, kind), cameras)
@@ -182,10 +170,8 @@ def learn_of_sample(
     The batch are points of the whole cloud of `points` points, evenly spread, with land; their view
     lists have a kind. `ties` are tie points of the original model; by default the points show which
     images overlap. `hint` is the type that the software is known for, `near` are points for the
-    detection of the type, if those of the batch are too far apart.
-
-    Returns the survey without ``auto`` and the verdicts, if something was to be decided, and could
-    be.
+    detection of the type, if those of the batch are too far apart. Returns the survey without
+    ``auto`` and the verdicts.
     """
     if batch.views is None and batch.survey.settings.method == "auto":
         found = _learn_of_sources(batch, points, ties, hint, near)
@@ -317,11 +303,9 @@ def _learn_bed(batch: Batch) -> Bed | None:
     """Return the bed that agrees with a sample of fused points; None if no image sees a point."""
     order = spatial_order(batch.xyz)
     likely = [likely_beds(with_rays(batch.take(rows))) for rows in batches(order)]
-    most = max(part.shape[1] for part in likely)
-    wide = [
-        np.pad(one, ((0, 0), (0, most - one.shape[1])), constant_values=np.nan) for one in likely
-    ]
-    table = np.concatenate(wide)
+    table = np.full((len(batch), max(part.shape[1] for part in likely)), np.nan, np.float32)
+    for rows, part in zip(batches(np.arange(len(batch))), likely, strict=True):
+        table[rows, : part.shape[1]] = part
     return bed_of(batch.xyz[order], table) if np.isfinite(table).any() else None
 
 

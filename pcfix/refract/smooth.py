@@ -30,8 +30,8 @@ from pcfix.refract.choice import Rig, Rule, rig_of, rule_of
 from pcfix.refract.consistent import Room
 from pcfix.refract.intersect import add_camera
 from pcfix.refract.rays import MIN_DETERMINANT
-from pcfix.refract.sensitivity import Budget, room_of
-from pcfix.refract.tiling import TILE, Points, nine, three
+from pcfix.refract.tiling import TILE, nine, three
+from pcfix.refract.uncertainty import Budget, room_of
 
 LACK_PX, STEP_PX = 0.02, 0.03
 """Largest errors of the polynomials and of the one Newton step, in ground pixels.
@@ -159,9 +159,10 @@ def _look(
 
     A camera that the view list of a point names twice counts once here.
     """
-    low, high = tiling.gather(tile, rows, Points(rows, points.xyz, points.height, points.slope))
+    low, high = tiling.gather(tile, rows, points)
     if points.start.size:
         near, marks = tiling.marks_of_lists(points.start, points.camera, rows, len(rig.centres))
+        marks = np.minimum(marks, 1.0)
     else:
         near, marks = tiling.marks_in_frame(
             around, tile, frames, rig.centres, low, high, rows.size
@@ -170,7 +171,7 @@ def _look(
     lines[: 10 * TILE], lines[10 * TILE :] = 0.0, 1.0
     seeing = 0
     for k in range(near.size):
-        if add_camera(lines, tile, marks[k], None, rig, near[k], rule):
+        if add_camera(lines, tile, marks[k], None, rig, near[k], rule, None, None, near):
             near[seeing], marks[seeing] = near[k], marks[k]
             seeing += 1
     return near[:seeing], marks[:seeing]

@@ -133,7 +133,7 @@ def invert_pairs(batch: Batch, pairs: Views | None = None) -> Intersection:
     focal_px = None
     if is_quick(batch) and matcher is not None and batch.original_model is None:
         # without a large cell the kernel is compiled without polynomials
-        large = np.diff(first).max() >= pair_table.LEAST_POINTS
+        large = np.diff(first).max(initial=0) >= pair_table.LEAST_POINTS
         focal_px = matcher.focal_px if large else None
     in_tiles(
         _invert, len(first) - 1, (order, first), batch.chosen(), images, (*listed, matched),

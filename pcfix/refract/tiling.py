@@ -6,12 +6,10 @@ its points are vectorised.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from pcfix.kernels import device
-from pcfix.lens.algebra import Nine, Vector, normal_of
+from pcfix.lens.algebra import Nine, Vector
 from pcfix.lens.frames import (
     ALL,
     NOT_DISTORTED,
@@ -25,32 +23,10 @@ from pcfix.lens.frames import (
     pyramid,
 )
 from pcfix.model import FloatArray, IntArray
-from pcfix.refract.batch import Batch
+from pcfix.refract.batch import Batch, Chosen
 
 TILE = 128
 """Points of a tile: its sums (11 numbers a point) stay in the processor's first cache."""
-
-
-class Points(NamedTuple):
-    """Points and the water above them, for kernels; see `Batch`.
-
-    `order` brings neighbours together.
-    """
-
-    order: IntArray
-    xyz: FloatArray
-    height: FloatArray
-    slope: FloatArray
-
-
-def points_of(batch: Batch) -> Points:
-    """Return the points of a batch for kernels."""
-    return Points(
-        spatial_order(batch.xyz),
-        np.ascontiguousarray(batch.xyz),
-        np.ascontiguousarray(batch.surface.height_m),
-        np.ascontiguousarray(batch.surface.slope),
-    )
 
 
 def tiles_of(batch: Batch) -> int:
@@ -78,7 +54,7 @@ def spatial_order(xyz: FloatArray) -> IntArray:
 
 
 @device(allocates=True)
-def gather(tile: FloatArray, rows: IntArray, points: Points) -> tuple[FloatArray, FloatArray]:
+def gather(tile: FloatArray, rows: IntArray, points: Chosen) -> tuple[FloatArray, FloatArray]:
     """Fill a tile with runs of x, y, z, surface height and unit normal; return its box.
 
     The runs, of `TILE` numbers each, lie in one array: with one base address and fixed distances
@@ -91,9 +67,8 @@ def gather(tile: FloatArray, rows: IntArray, points: Points) -> tuple[FloatArray
             value = points.xyz[i, axis]
             tile[axis * TILE + j] = value
             low[axis], high[axis] = min(low[axis], value), max(high[axis], value)
-        x, y, z = normal_of(points.slope[i, 0], points.slope[i, 1])
+            tile[(4 + axis) * TILE + j] = points.normals[i, axis]
         tile[3 * TILE + j] = points.height[i]
-        tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j] = x, y, z
     return low, high
 
 

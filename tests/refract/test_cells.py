@@ -69,14 +69,14 @@ def assert_as_alone(quick, alone):
 @pytest.mark.parametrize("lens", [PLAIN, DISTORTED, FISHEYE], ids=["plain", "distorted", "fisheye"])
 @pytest.mark.parametrize("water", [LEVEL, RIVER], ids=["level", "river"])
 @pytest.mark.parametrize("block", [nadir_block, oblique_block])
-def test_neighbours_are_as_alone(block, water, lens):
+def test_cells_as_exact(block, water, lens):
     rng = np.random.default_rng(1)
     xyz = bed(rng)
     apart_px = assert_as_alone(*both(xyz, block(rng, lens), water))
     assert np.mean(apart_px > 0.0) > 0.5  # else every point was solved by itself
 
 
-def test_so_are_points_with_lists_of_their_own():
+def test_cells_with_lists():
     rng = np.random.default_rng(2)
     xyz, cameras = bed(rng), oblique_block(rng)
     count = rng.integers(0, 25, len(xyz))
@@ -88,14 +88,14 @@ def test_so_are_points_with_lists_of_their_own():
     assert len(np.unique(quick.outcome)) == 3
 
 
-def test_so_they_are_where_the_water_fell_during_the_flight():
+def test_cells_with_offsets():
     rng = np.random.default_rng(3)
     xyz, cameras = bed(rng, 1.0), nadir_block(rng)
     apart_px = assert_as_alone(*both(xyz, cameras, offset=rng.uniform(-0.5, 0.0, len(cameras))))
     assert np.mean(apart_px > 0.0) > 0.1  # not where a ray stays dry beside those that do not
 
 
-def test_a_camera_that_a_list_names_twice_counts_twice():
+def test_camera_named_twice():
     rng = np.random.default_rng(6)
     xyz, cameras = bed(rng), nadir_block(rng)
     seen = chosen_views(levelled(xyz, cameras))
