@@ -67,6 +67,11 @@ def rule_of(survey: Survey) -> Rule:
     return Rule(least, settings.max_cameras or ANY_NUMBER, 1.0 / settings.refractive_index)
 
 
+def is_bent(survey: Survey) -> bool:
+    """Whether the rays of a point may pierce the water under different slopes."""
+    return isinstance(survey.water, WaterMesh | WaterRaster) or survey.own_water is not None
+
+
 def shapes_of(survey: Survey) -> tuple[Tin | None, Field | None]:
     """Return a mesh, or the rasters of the images, for kernels; neither for a plane."""
     water, k = survey.water, len(survey.cameras)

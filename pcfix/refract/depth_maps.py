@@ -28,7 +28,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.kernels import device
-from pcfix.lens.algebra import Vector, beyond, dot, minus, plus, row_of, scaled, unit
+from pcfix.lens.algebra import Vector, beyond, dot, minus, normal_of, plus, row_of, scaled, unit
 from pcfix.lens.frames import holds
 from pcfix.model import FloatArray, IntArray
 from pcfix.refract.batch import (
@@ -41,8 +41,18 @@ from pcfix.refract.batch import (
     to_adjusted,
     to_original,
 )
-from pcfix.refract.cells import CUBIC
-from pcfix.refract.map_table import USUAL, Block, Table, has_terms, meet, read_table
+from pcfix.refract.map_table import (
+    CUBIC,
+    LAYER,
+    SHALLOWEST_M,
+    USUAL,
+    Block,
+    Table,
+    has_terms,
+    meet,
+    read_table,
+    water_at,
+)
 from pcfix.refract.matcher import MATCHED
 from pcfix.refract.rays import direction, light_path, refracted
 
@@ -164,13 +174,12 @@ def find_lines(
 ) -> None:
     """Fill in the lines of the depth maps of some images.
 
-    The slope of a line comes from a second bed; in a cell with polynomials the first point
-    provides the slopes for all.
+    The slope of a line comes from a second bed, or from the middle of a cell with polynomials.
     """
     again, rise = room.again[: maps.size], min(RISE * lines.bed, -LEAST_DEPTH_M)
     for q in range(maps.size):
         fitted = has_terms(table, maps[q])
-        again[q] = 1.0 if not fitted or table.steep[maps[q]] == 0.0 else 0.0
+        again[q] = 1.0 if not fitted or len(block.images.centres) else 0.0
     look(maps, again, lines.bed + rise, sight, block, table, room)
     for q in range(maps.size):
         lines.slope[q] = room.looks[q, DEPTH]
@@ -183,9 +192,27 @@ def find_lines(
             # beyond that range other images agree best at the second bed
             steep = steep if abs(steep - 1.0) < STEEP else 1.0
             room.looks[q, BY_HEIGHT] *= steep
-            if has_terms(table, maps[q]):
-                table.steep[maps[q]] = steep
         lines.slope[q] = room.looks[q, BY_HEIGHT]
+
+
+@device
+def set_steep(table: Table, layer: int, block: Block, room: Room) -> None:
+    """Set how the depths in the maps of a cell change with the bed, from a point in its middle."""
+    if len(block.images.centres):  # the middle has no place in the original model
+        return
+    (x, y), (_, b, c) = (table.middle[0], table.middle[1]), block.water
+    normal, depth = normal_of(b, c), SHALLOWEST_M * LAYER ** (layer - 0.5)
+    now = x, y, water_at(block, x, y) - depth
+    sight, out = Sight(now, now, normal[2] * depth, normal), room.looks[0]
+    bed = likely_bed(sight, block)
+    rise = min(RISE * bed, -LEAST_DEPTH_M)
+    for image in range(table.place.size):
+        if has_terms(table, image):
+            _look(out, image, bed + rise, sight, block, table, room)
+            further = out[DEPTH]
+            _look(out, image, bed, sight, block, table, room)
+            steep = (further - out[DEPTH]) / (rise * out[BY_HEIGHT])
+            table.steep[image] = steep if abs(steep - 1.0) < STEEP else 1.0
 
 
 @device
@@ -221,7 +248,7 @@ def settle_bed(
     row[OUTCOME] = NO_CAMERA if maps.size == 0 else ONE_CAMERA
     bed, looks, near = depths.bed, room.looks[: maps.size], CLOSE_M
     step = balance(depths.t, depths.slope, weight)
-    if table.place.size and maps.size:
+    if table.place.size and maps.size and not len(block.images.centres):
         c = maps[0]
         near = max(near, NEAR_PX * _length(sight, block, c) / block.matcher.focal_px[c])
     for _ in range(MAX_LOOKS):
@@ -283,9 +310,7 @@ def _look(
     # the change of the depth with the bed is nearly that of the whole water column
     change = (t + under) / depth if depth > LEAST_DEPTH_M else per_depth / n
     change = min(max(change, LEAST_CHANGE * per_depth), MOST_CHANGE * per_depth)
-    steep = 1.0
-    if table.place.size and table.steep[c] != 0.0:
-        steep = table.steep[c]
+    steep = table.steep[c] if table.place.size else 1.0
     out[BY_HEIGHT] = -steep * change / length if t == t else np.nan
 
 

@@ -28,10 +28,19 @@ from pcfix.lens.frames import holds
 from pcfix.model import FloatArray, IntArray
 from pcfix.refract import depth_maps
 from pcfix.refract.batch import Batch, Intersection
-from pcfix.refract.cells import are_same, cameras_of, cells_of, counts_of, is_quick
 from pcfix.refract.depth_maps import ABSENT, AVERAGED_WITHIN, Lines, Room, Sight
-from pcfix.refract.map_table import LEAST_POINTS, Block, Table, block_of, no_table, reads, table_of
+from pcfix.refract.map_table import (
+    LEAST_POINTS,
+    Block,
+    Table,
+    block_of,
+    layers_of,
+    no_table,
+    reads,
+    table_of,
+)
 from pcfix.refract.matcher import WIDTH_M, Matcher
+from pcfix.refract.tiling import are_same, cameras_of, cells_of, counts_of
 
 AGREE = 0.01
 """Depths that differ by less, relative, are fused."""
@@ -43,7 +52,6 @@ _ROUNDS, _BEDS = 4, 3
 FAR = 0.1
 """Of the way to the bed: farther off, it is decided anew which depths were averaged."""
 
-LEAST_LIKELY, MOST_LIKELY = 0.7, 2.0
 _OUTSIDE = -2
 
 
@@ -86,9 +94,12 @@ def invert_depth_maps(batch: Batch) -> Intersection:
 def _in_cells(
     batch: Batch, listed: bool, given: FloatArray, result: FloatArray, likely: FloatArray
 ) -> None:
-    order, first = cells_of(batch)
+    layer, dense = layers_of(batch), batch.survey.learned.dense
+    order, first = cells_of(batch, layer)
+    # which cells have polynomials is one decision for the whole cloud
+    least = LEAST_POINTS if dense is None else 1 if dense else len(batch) + 1
     in_tiles(
-        _invert_cells, len(first) - 1, (order, first), block_of(batch), is_quick(batch), listed,
+        _invert_cells, len(first) - 1, (order, first, layer), block_of(batch), least, listed,
         given, result, likely, points=len(batch),
     )  # fmt: skip
 
@@ -132,7 +143,7 @@ def _place(members: IntArray, q: int, others: IntArray, place: IntArray) -> None
 
 @kernel(allocates=True)
 def _invert_cells(
-    span: Span, cells: tuple[IntArray, IntArray], block: Block, quick: bool, listed: bool,
+    span: Span, cells: tuple[IntArray, IntArray, IntArray], block: Block, least: int, listed: bool,
     given: FloatArray, result: FloatArray, likely: FloatArray,
 ) -> None:  # fmt: skip
     """Invert the fusion of the points of each cell or, where `likely` has rows, fill these in.
@@ -140,7 +151,7 @@ def _invert_cells(
     With lists `given` are the weights of their entries, if there are any; without, the heights of
     the bed of the surroundings.
     """
-    points, (order, first), matcher = block.points, cells, block.matcher
+    points, (order, first, layer), matcher = block.points, cells, block.matcher
     k, none = len(points.centres), no_table()
     room = depth_maps.room_for(k)
     groups = Groups(
@@ -152,15 +163,16 @@ def _invert_cells(
     for cell in range(*span):
         rows = order[first[cell] : first[cell + 1]]
         fitted = none
-        if quick and rows.size >= LEAST_POINTS:
+        if rows.size >= least and reads(block, rows[0]):
             seeing = counts_of(rows, points) > 0
             for c in np.flatnonzero(seeing) if listed else rows[:0]:
                 for a in matcher.averaged[c]:  # maps that were averaged into those of the lists
                     seeing[a] = seeing[a] or a >= 0
-            fitted = table_of(rows, seeing, block)
+            fitted = table_of(rows[0], layer[rows[0]], seeing, block)
+            depth_maps.set_steep(fitted, layer[rows[0]], block, room)
         for at in range(rows.size):
             i, cameras = rows[at], cameras_of(points, rows[at])
-            table = fitted if reads(fitted, points, i) else none
+            table = fitted if reads(block, i) else none
             sight = depth_maps.sight_of(points, i)
             if listed:
                 weight = given[points.start[i] : points.start[i + 1]] if given.size else given
@@ -337,8 +349,7 @@ def _invert_listed(
     maps = groups.found[: _with_neighbours(groups, listed, sight, block)]
     _group(groups, maps, block.matcher)
     t, slope, weight = room.t[: maps.size], room.slope[: maps.size], room.weight[: maps.size]
-    likely, step = depth_maps.likely_bed(sight, block), 0.0
-    bed = likely * table.likely[0]
+    bed, step = depth_maps.likely_bed(sight, block), 0.0
     for _ in range(_BEDS):
         bed += step
         # which depths agree depends on the bed, and the bed on which agree
@@ -355,9 +366,6 @@ def _invert_listed(
         if not abs(step) > FAR * abs(bed):
             break
     depth_maps.settle_bed(row, maps, weight, Lines(bed, t, slope), sight, block, table, room)
-    # the next point of the cell starts from the depth ratio of this one
-    if table.place.size:
-        table.likely[0] = min(max(row[2] / likely, LEAST_LIKELY), MOST_LIKELY)
 
 
 @device

@@ -1,4 +1,4 @@
-"""Intersect the refracted rays of each point (method ``snell``).
+"""Intersect the refracted rays of each point (``snell``), or search its tracks (``consistent``).
 
 Points are processed a tile of neighbours at a time and camera by camera, so that the inner loop
 runs over the points of the tile and is vectorised. The cameras are those whose frames hold the
@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 
 from pcfix.kernels import Span, device, in_tiles, kernel
-from pcfix.lens.algebra import dot, minus, row_of, scaled
+from pcfix.lens.algebra import Nine, Vector, dot, minus, row_of, scaled, vector
 from pcfix.lens.frames import (
     NOT_DISTORTED,
     Frames,
@@ -27,7 +27,7 @@ from pcfix.lens.frames import (
     no_frames,
     pyramid,
 )
-from pcfix.model import BoolArray, FloatArray, IntArray
+from pcfix.model import BoolArray, Cameras, FloatArray, IntArray
 from pcfix.refract import tiling, uncertainty
 from pcfix.refract.batch import (
     CORRECTED,
@@ -37,19 +37,24 @@ from pcfix.refract.batch import (
     Batch,
     Chosen,
     Intersection,
+    Optics,
+    optics_of,
+    require_orientation,
+    warn_of_unsolved,
 )
 from pcfix.refract.choice import Rig, Rule, rig_of, rule_of, shapes_of
 from pcfix.refract.rays import line_terms, nearest_point, pierce_of, refracted
-from pcfix.refract.tiling import TILE, spatial_order, tiles_of
+from pcfix.refract.tiling import TILE, nine, spatial_order, three, tiles_of
+from pcfix.refract.tracks import FOUND, LOST, POINT_RUNS, RAY_RUNS, SEARCHED, STATE, Q, search_tile
 from pcfix.refract.uncertainty import Budget, room_of
 from pcfix.water.surface import Field, Tin, locate
 
 # Columns of the result: a row is one cache line, as points are written in scattered order.
-_DISTANCE, _INCIDENCE, _COUNT, _OUTCOME, _WIDTH = 3, 4, 5, 6, 8
+_DISTANCE, _INCIDENCE, _COUNT, _OUTCOME, _FOUND, _WIDTH = 3, 4, 5, 6, 7, 8
 
 
 def intersect(batch: Batch) -> Intersection:
-    """Re-intersect the refracted rays of points.
+    """Re-intersect the refracted rays of points (``snell``).
 
     The cameras are those of the views or, without these, all whose frames hold the apparent point,
     as that is where the SfM software projected it. The covariances, where the settings ask for
@@ -59,6 +64,30 @@ def intersect(batch: Batch) -> Intersection:
     -----
     Skarlatos & Agrafiotis 2018, eqs 10 and 11, for any number of rays with equal weight.
     """
+    return _intersected(batch, None)
+
+
+def consistent(batch: Batch) -> Intersection:
+    """Find the true points whose images give the apparent points, by straight rays.
+
+    Cameras and covariances are as of `intersect`; see `pcfix.refract.tracks`. Weights of the views
+    are not used, as software triangulates with equal weights. Light is refracted for a camera whose
+    water stood above the true point; for ``snell`` it is the apparent point.
+
+    `ray_miss_m` is the distance from the refracted rays of the apparent point, as for ``snell``.
+    Points without a solution, under waves that focus the light, get that of ``snell``, with a
+    warning.
+    """
+    check_consistent(batch.survey.cameras)
+    return _intersected(batch, optics_of(batch.survey.cameras))
+
+
+def check_consistent(cameras: Cameras) -> None:
+    """Raise SettingError if cameras have no angles or no lenses."""
+    require_orientation(cameras, "Method consistent", "use method snell")
+
+
+def _intersected(batch: Batch, optics: Optics | None) -> Intersection:
     survey, views = batch.survey, batch.views
     result, used = np.zeros((len(batch), _WIDTH)), np.zeros(len(survey.cameras), np.bool_)
     rule, frames = rule_of(survey), frames_of(survey.cameras)
@@ -68,11 +97,15 @@ def intersect(batch: Batch) -> Intersection:
     errors = uncertainty.budget_of(survey), uncertainty.level_sigma_of(batch)
     in_tiles(
         _intersect, tiles_of(batch), spatial_order(batch.xyz), batch.chosen(), rig_of(survey),
-        frames, rule, *shapes_of(survey), *errors, (result, used, covariance), points=len(batch),
+        frames, rule, optics, *shapes_of(survey), *errors, (result, used, covariance),
+        points=len(batch),
     )  # fmt: skip
+    outcome = result[:, _OUTCOME].astype(np.uint8)
+    moved = outcome == CORRECTED
+    warn_of_unsolved("method consistent found no solution", result[moved, _FOUND] > 0.0)
     found = Intersection(
         shift_m=result[:, :3],
-        outcome=result[:, _OUTCOME].astype(np.uint8),
+        outcome=outcome,
         ray_count=result[:, _COUNT].astype(np.int32),
         ray_miss_m=result[:, _DISTANCE],
         sigma_z_m=np.zeros(len(batch)),
@@ -85,12 +118,14 @@ def intersect(batch: Batch) -> Intersection:
 @kernel(allocates=True)
 def _intersect(
     span: Span, order: IntArray, points: Chosen, rig: Rig, frames: Frames, rule: Rule,
-    tin: Tin | None, fields: Field | None, budget: Budget, level_sigma: FloatArray,
-    found: tuple[FloatArray, BoolArray, FloatArray],
+    optics: Optics | None, tin: Tin | None, fields: Field | None, budget: Budget,
+    level_sigma: FloatArray, found: tuple[FloatArray, BoolArray, FloatArray],
 ) -> None:  # fmt: skip
     """Intersect the rays of the points of each tile, of listed cameras or of those in frame."""
     centres, start, camera = rig.centres, points.start, points.camera
     result, used, covariance = found
+    if optics is not None:  # of all cameras; the system provides what is used
+        rays, search = np.empty((len(centres), RAY_RUNS * TILE)), np.empty(POINT_RUNS * TILE)
     low, high = tiling.corners_of(order[span[0] * TILE : span[1] * TILE], points.xyz)
     around = camera[:0] if start.size else tiling.cameras_around(frames, centres, low, high)
     facet = np.full(TILE, -1)
@@ -110,19 +145,18 @@ def _intersect(
             marks = np.empty((near.size, rows.size))
         seeing = 0
         for k in range(near.size):
-            c = near[k]
+            c, added, some = near[k], 0, True
             if start.size:
                 marks[seeing] = marks[k]
-                rays = add_camera(sums, tile, marks[seeing], None, rig, c, rule, tin, fields, facet)
-            # the marks of a pyramid serve only the errors: a pass for them takes 40 % longer
-            elif frames.row[c] == NOT_DISTORTED and not len(covariance):
-                g = pyramid(frames.planes[c])
-                rays = add_camera(sums, tile, marks[seeing], g, rig, c, rule, tin, fields, facet)
-            elif tiling.mark_camera(marks[seeing], tile, frames, c, centres[c], low, high):
-                rays = add_camera(sums, tile, marks[seeing], None, rig, c, rule, tin, fields, facet)
+            elif frames.row[c] == NOT_DISTORTED:  # the pyramid is tested on the way
+                g, some = pyramid(frames.planes[c]), False
+                added = add_camera(sums, tile, marks[seeing], g, rig, c, rule, tin, fields, facet)
             else:
-                rays = 0
-            if rays:
+                some = tiling.mark_camera(marks[seeing], tile, frames, c, centres[c], low, high)
+            if some:
+                on = marks[seeing]
+                added = add_camera(sums, tile, on, None, rig, c, rule, tin, fields, facet)
+            if added:
                 used[c] = True  # threads may write it at once: always the same value
                 near[seeing] = c
                 seeing += 1
@@ -130,7 +164,23 @@ def _intersect(
         for j in range(rows.size):
             for at in range(11):
                 of_point[at] = sums[at * TILE + j]
-            _solve(result[rows[j]], of_point[9], of_point)
+            _solve(result[rows[j]], of_point[9], of_point, marks[:seeing, j])
+        if optics is not None:
+            for j in range(rows.size):
+                row = result[rows[j]]
+                search[STATE * TILE + j] = SEARCHED if row[_OUTCOME] == CORRECTED else LOST
+                for i in range(3):
+                    search[(Q + i) * TILE + j] = row[i]
+            search_tile(
+                search, rays, tile, marks[:seeing], near[:seeing], rig, optics, points.n, tin,
+                fields,
+            )  # fmt: skip
+            for j in range(rows.size):
+                row = result[rows[j]]
+                row[_FOUND] = 1.0 if search[STATE * TILE + j] == FOUND else 0.0
+                if row[_FOUND] > 0.0:
+                    row[0], row[1], row[2] = three(search, Q * TILE + j)
+                    row[_DISTANCE] = _distance(sums[9 * TILE + j], nine(sums, j), vector(row))
         if len(covariance):
             room = room_of(tile, result, rows)
             for k in range(seeing):
@@ -206,16 +256,34 @@ def add_camera(
 
 
 @device
-def _solve(row: FloatArray, k: float, sums: FloatArray) -> None:
-    """Solve one point and write its row; a point without a solution keeps a shift of zero."""
+def _solve(row: FloatArray, k: float, sums: FloatArray, marks: FloatArray) -> None:
+    """Solve one point and write its row; a point without a solution keeps a shift of zero.
+
+    A list may name a camera several times, as its `marks` say.
+    """
     if k < 2.0:
         row[_OUTCOME] = ONE_CAMERA if k == 1.0 else NO_CAMERA
         return
     solved, q, distance, _ = nearest_point(k, sums)
     if not solved:
-        row[_OUTCOME] = PARALLEL
+        most = 0.0
+        for times in marks:
+            most = max(most, times)
+        row[_OUTCOME] = ONE_CAMERA if most == k else PARALLEL
         return
     row[0], row[1], row[2] = q
-    row[_DISTANCE] = distance
+    row[_DISTANCE], row[_FOUND] = distance, 1.0
     row[_INCIDENCE] = np.degrees(np.arccos(np.sqrt(min(sums[10], 1.0))))
     row[_COUNT], row[_OUTCOME] = k, CORRECTED
+
+
+@device
+def _distance(k: float, s: Nine, q: Vector) -> float:
+    """Return the rms distance of Q from the lines of the sums, Q'MQ - 2 b'Q + s over k."""
+    # t t' summed over the rays, with zz from the trace
+    x, y, z = q
+    along = s[0] * x * x + s[3] * y * y + (k - s[0] - s[3]) * z * z
+    along += 2.0 * (s[1] * x * y + s[2] * x * z + s[4] * y * z)
+    rest = k * (x * x + y * y + z * z) - along
+    rest += s[8] - 2.0 * (s[5] * x + s[6] * y + s[7] * z)
+    return np.sqrt(max(rest, 0.0) / k)

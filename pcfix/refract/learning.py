@@ -11,8 +11,9 @@ from pcfix.errors import SettingError
 from pcfix.model import Cameras, TiePoints, ViewKind
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import UNLISTED, Batch, Learned, Survey, require_orientation
-from pcfix.refract.consistent import check_consistent
 from pcfix.refract.fusion import likely_beds
+from pcfix.refract.intersect import check_consistent
+from pcfix.refract.map_table import LEAST_POINTS, layers_of
 from pcfix.refract.matcher import Bed, bed_of, matcher_of, matcher_of_ties, places_for
 from pcfix.refract.methods import batches, on_land, with_rays
 from pcfix.refract.occlusion import occluder_of, wants_occlusion
@@ -31,7 +32,7 @@ from pcfix.refract.reconstructions import (
 )
 from pcfix.refract.regression import DepthRegression, raise_no_regression
 from pcfix.refract.stereo_factor import StereoFactor, stereo_factor
-from pcfix.refract.tiling import spatial_order
+from pcfix.refract.tiling import cell_side, spatial_order
 from pcfix.water.surface import is_submerged
 
 
@@ -184,7 +185,9 @@ def learn_of_sample(
     sample = replace(submerged_of(batch), survey=survey)
     if batch.views is not None:
         verdict = weigh_lists(sample, is_open=False)
-        return as_told(survey, verdict), () if verdict is None else (verdict,)
+        learned = survey.learned._replace(dense=_is_dense(sample, points / max(len(batch), 1)))
+        survey = as_told(replace(survey, learned=learned), verdict)
+        return survey, () if verdict is None else (verdict,)
     near = near or Near(sample, points / max(len(batch), 1))
     survey, verdicts = _weighed(replace(near.batch, survey=survey), near.step, hint)
     settings, learned = survey.settings, survey.learned._replace(land=None)
@@ -202,7 +205,15 @@ def learn_of_sample(
         learned = learned._replace(matcher=None)
     elif settings.method == "consistent" and settings.matcher == "depth-maps" and len(sample):
         learned = learned._replace(bed=_learn_bed(replace(sample, survey=survey)))
+        learned = learned._replace(dense=_is_dense(sample, points / max(len(batch), 1)))
     return replace(survey, learned=learned), verdicts
+
+
+def _is_dense(sample: Batch, step: float) -> bool:
+    """Whether the cells of depth maps have enough points, `step` for each of the sample."""
+    cell = np.floor(sample.xyz[:, :2] / cell_side(sample))
+    cells = len(np.unique(np.column_stack([cell, layers_of(sample)]), axis=0))
+    return len(sample) * step >= LEAST_POINTS * max(cells, 1)
 
 
 def submerged_of(batch: Batch) -> Batch:

@@ -15,14 +15,11 @@ import numpy as np
 from pcfix.model import FloatArray, IntArray, Outcome, WaterPlane
 from pcfix.refract import literature
 from pcfix.refract.batch import Batch, Intersection, Survey
-from pcfix.refract.cells import is_bent, is_quick
-from pcfix.refract.choice import cameras_of_pairs, chosen_views
-from pcfix.refract.consistent import consistent
+from pcfix.refract.choice import cameras_of_pairs, chosen_views, is_bent
 from pcfix.refract.fusion import invert_depth_maps, invert_fusion
-from pcfix.refract.intersect import intersect
+from pcfix.refract.intersect import consistent, intersect
 from pcfix.refract.matcher import steepest_and_partners, without_border
 from pcfix.refract.occlusion import visible_cameras
-from pcfix.refract.smooth import consistent_in_cells
 from pcfix.refract.stereo_pairs import invert_pairs
 from pcfix.refract.tiling import spatial_order
 from pcfix.refract.uncertainty import with_model_uncertainty, with_uncertainty
@@ -45,7 +42,7 @@ METHODS: dict[str, Method] = {
 }
 """By the names of `pcfix.options.Method`: a new method is a function and an entry."""
 
-_IN_FRAME = (intersect, consistent_in_cells)
+_IN_FRAME = (intersect, consistent)
 """Methods whose kernels choose among all cameras."""
 
 
@@ -151,7 +148,7 @@ def _method(batch: Batch) -> Method:
         return invert_fusion if views is None else invert_depth_maps
     if kind in ("pairs", "pair-images"):
         return invert_pairs
-    return consistent_in_cells if is_quick(batch) else consistent
+    return consistent
 
 
 def with_rays(batch: Batch) -> Batch:

@@ -49,7 +49,6 @@ Neglected is the turn of M, and of J, times the residual, which is of second ord
 from __future__ import annotations
 
 import math
-from itertools import accumulate
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -74,7 +73,7 @@ from pcfix.refract import tiling
 from pcfix.refract.batch import Batch, Chosen, Intersection, Survey
 from pcfix.refract.choice import Rig, Rule, rig_of, rule_of
 from pcfix.refract.rays import refracted
-from pcfix.refract.tiling import TILE, nine, three
+from pcfix.refract.tiling import TILE, inverse_of, nine, product_of, slots, three
 from pcfix.water.surface import Field, height_at
 
 MIN_DETERMINANT = 1e-6
@@ -227,10 +226,6 @@ def budget_of(survey: Survey) -> Budget:
     )
 
 
-def _slots(*widths: int) -> list[int]:
-    return [0, *accumulate(widths)]
-
-
 # Runs of `TILE` numbers in the room of a tile, for the points: the number of rays; what level (3)
 # and n (3) add to M delta or S delta; W (6); S T (9) or M (6); M D (9); what slopes add, to be
 # multiplied by tau (9); noise (6). For the rays of one camera: N and y - h of the points (4), how
@@ -238,7 +233,7 @@ def _slots(*widths: int) -> list[int]:
 (
     RAYS, BY_LEVEL, BY_N, SIGHT, BY_Q, BY_P, BY_TILT, NOISE, _NORMAL, _BELOW, _COUNT, _AWAY,
     _HEIGHT, ROOM,
-) = _slots(1, 3, 3, 6, 9, 9, 9, 6, 3, 1, 1, 3, 1)  # fmt: skip
+) = slots(1, 3, 3, 6, 9, 9, 9, 6, 3, 1, 1, 3, 1)  # fmt: skip
 
 # A number of a program has double precision, and would make doubles of what it is added to.
 _ZERO, _HALF, _ONE, _TWO = np.array([0.0, 0.5, 1.0, 2.0], np.float32)
@@ -671,34 +666,9 @@ def _full(m: Symmetric) -> Nine:
 
 
 @device
-def product_of(m: Nine, x: Vector) -> Vector:
-    """Return a matrix times a vector."""
-    return (
-        m[0] * x[0] + m[1] * x[1] + m[2] * x[2],
-        m[3] * x[0] + m[4] * x[1] + m[5] * x[2],
-        m[6] * x[0] + m[7] * x[1] + m[8] * x[2],
-    )
-
-
-@device
 def _product(a: Nine, b: Nine) -> Nine:
     """Return a matrix times a matrix."""
     x = product_of(a, (b[0], b[3], b[6]))
     y = product_of(a, (b[1], b[4], b[7]))
     z = product_of(a, (b[2], b[5], b[8]))
     return x[0], y[0], z[0], x[1], y[1], z[1], x[2], y[2], z[2]
-
-
-@device
-def inverse_of(m: Nine) -> tuple[float, Nine]:
-    """Return the determinant of a matrix and its inverse, meaningless if that is 0."""
-    a, b, c, d, e, f, g, h, i = m
-    # cofactors of the first row
-    x, y, z = e * i - f * h, f * g - d * i, d * h - e * g
-    det = a * x + b * y + c * z
-    inv = 1.0 / det
-    return det, (
-        inv * x, inv * (c * h - b * i), inv * (b * f - c * e),
-        inv * y, inv * (a * i - c * g), inv * (c * d - a * f),
-        inv * z, inv * (b * g - a * h), inv * (a * e - b * d),
-    )  # fmt: skip

@@ -15,8 +15,7 @@ from pcfix.errors import SettingError
 from pcfix.lens.imaging import coefficients, image_and_gradients
 from pcfix.model import Cameras, Lens, Outcome, Views, WaterMesh, WaterPlane, WaterRaster
 from pcfix.options.correct import ScienceOptions
-from pcfix.refract.consistent import check_consistent, consistent
-from pcfix.refract.intersect import intersect
+from pcfix.refract.intersect import check_consistent, consistent, intersect
 from pcfix.refract.methods import correct
 from pcfix.simulate.tracing import triangulate
 from pcfix.water.surface import surface_above

@@ -104,7 +104,8 @@ def test_depth_as_twin(c):
         p[None], p[None], np.array([height]), np.zeros((1, 2)), normal[None], CAMERAS.centres,
         offset, nothing, nothing, N_WATER,
     )  # fmt: skip
-    block, partners = Block(points, images_of(None, CAMERAS), matcher()), np.empty((5, 3))
+    block = Block(points, images_of(None, CAMERAS), matcher(), (0.0, 0.0, 0.0), 8.0)
+    partners = np.empty((5, 3))
     length, sight = np.linalg.norm(p - CAMERAS.centres[c]), sight_of(points, 0)
     count = _compare(partners, c, tuple(q - p), length, sight, block)
     # 0.3 to 1 m; scipy's least values are flat within 1e-6 m

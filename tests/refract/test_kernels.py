@@ -84,15 +84,14 @@ PAIRS = {"camera_set": "mvs", "matcher": "pairs"}
 WAYS = {
     "snell": {"method": "snell"},
     "snell, waves": {"method": "snell", "water": WAVES},
-    "consistent": {"method": "consistent", "camera_set": "all", "exact": True},
+    "consistent": {"method": "consistent", "camera_set": "all"},
     "consistent, waves": {"method": "consistent", "camera_set": "all", "water": WAVES},
     **{name: {"method": name} for name in ("shan", "butler", "murase", "factor")},
-    "cells": {"method": "consistent", "camera_set": "all"},
     "depth maps": {"method": "consistent", "camera_set": "mvs", "matcher": "depth-maps"},
     "pairs": {"method": "consistent", **PAIRS},
 }
-OF_ALL = ("cells", "depth maps", "pairs")
-"""Polynomials and matchers depend on all points."""
+OF_ALL = ("depth maps", "pairs")
+"""Matchers depend on all points."""
 
 
 def corrected(points, cameras, *, water=0.0, **how):
