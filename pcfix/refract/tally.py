@@ -44,15 +44,9 @@ ORDERS = (
 
 
 def largest_tvu_m(order: Order, depth_m: FloatArray) -> FloatArray:
-    """Return the largest total vertical uncertainty at 95 % that an order allows.
+    """Return the largest total vertical uncertainty (95 %) that an order allows at depths d.
 
     IHO S-44, edition 6, section 3.2: sqrt(a^2 + (b d)^2).
-
-    Parameters
-    ----------
-    order : Order
-    depth_m : array
-        Depths d, positive down.
     """
     return np.asarray(np.sqrt(order.a_m**2 + (order.b * depth_m) ** 2))
 
@@ -107,10 +101,8 @@ class UncertaintyTally(Sums):
 
     def add(self, sigma_z_m: FloatArray, depth_m: FloatArray) -> None:
         """Add corrected points: standard errors of Z and depths, metres, shape (m,)."""
-        if not len(sigma_z_m):
-            return
         self._sigma.add(sigma_z_m)
-        self._most_m = max(self._most_m, float(sigma_z_m.max()))
+        self._most_m = max(self._most_m, float(sigma_z_m.max(initial=0.0)))
         self._within += within_orders(COVERAGE_95 * sigma_z_m, depth_m)
 
     def as_dict(self) -> dict[str, Any] | None:
@@ -221,13 +213,13 @@ class Tally(Sums):
     def uncertainty(self, made: dict[str, Any] | None = None) -> dict[str, Any] | None:
         """Return standard error of Z, TVU and orders; see `UncertaintyTally.as_dict`.
 
-        `of_cloud` is there where what the cloud was `made` of tells it: the scatter beyond the
-        error budget, and the standard deviation relative to the depth, that the cloud itself adds.
+        `of_cloud` is what the cloud itself adds, if the detection (`made`) has estimated it.
         """
         found = self._uncertainty.as_dict()
         if found is not None and made is not None and "scatter_m" in made:
-            of_cloud = {"scatter_m": made["scatter_m"], "per_depth": made["doubt_per_depth"]}
-            found["of_cloud"] = of_cloud
+            found["of_cloud"] = {
+                "scatter_m": made["scatter_m"], "per_depth": made["doubt_per_depth"]
+            }  # fmt: skip
         return found
 
 
@@ -251,12 +243,10 @@ class Summary:
     depth_m: dict[str, float]
     shift_z_m: dict[str, float]
     rays: int
-    incidence_deg: float
-    """The largest in air of a ray that was used."""
+    incidence_deg: float  # the largest of the rays used, in air
     cameras: int
     cameras_used: int
-    cameras_unused: list[str]
-    """Those that see no corrected point, and those of `cameras_left_out`."""
+    cameras_unused: list[str]  # without corrected points, or in `cameras_left_out`
     water: str
     settings: dict[str, Any]
     seconds: float
@@ -266,36 +256,23 @@ class Summary:
     labelling: dict[str, Any] | None = None
     uncertainty: dict[str, Any] | None = None
     carried: dict[str, Any] | None = None
-    made: dict[str, Any] | None = None
-    """What the cloud was taken for, and why, where the options leave it open."""
-    told: list[str] = field(default_factory=list)
-    """What the cloud told beside that; `warnings` has it too."""
-    poses: dict[str, Any] | None = None
-    """Whether they have absorbed the refraction, in a line and sign by sign, where that was asked.
-    """
-    cameras_left_out: dict[str, list[str]] = field(default_factory=dict)
-    """Cameras that see corrected points, by why no ray of theirs was used."""
-    unsure: int | None = None
-    """Corrected points that flat obliques alone see; None where these are not withheld."""
+    made: dict[str, Any] | None = None  # the reconstruction type, and why
+    told: list[str] = field(default_factory=list)  # other notes on the cloud, also in `warnings`
+    poses: dict[str, Any] | None = None  # whether they have absorbed the refraction
+    cameras_left_out: dict[str, list[str]] = field(default_factory=dict)  # by reason
+    unsure: int | None = None  # corrected points that only obliques see; None if not withheld
     shoreline: dict[str, Any] | None = None
-    """Where it was written, how many lines, how long, and their standard error."""
-    fit: dict[str, Any] | None = None
-    """What cameras, cloud and water were tested with; see `pcfix.flow.plausibility`."""
-    part: dict[str, Any] | None = None
-    """How many points were read, of how many, and by which bounds; None where all were."""
+    fit: dict[str, Any] | None = None  # see `pcfix.flow.plausibility`
+    part: dict[str, Any] | None = None  # what was read, if not all points were
 
     @property
     def absorbed(self) -> bool | None:
-        """Whether the poses have absorbed the refraction; None where nothing tells."""
+        """Whether the poses have absorbed the refraction; None if that is unknown."""
         return None if self.poses is None else self.poses["absorbed"]
 
     @property
     def why_no_order(self) -> str:
-        """Why no order of S-44 is claimed: the bed may be off as a whole; empty where one is.
-
-        It may be where nothing tells that the cloud was made as the method takes it, or that its
-        poses have not absorbed the refraction.
-        """
+        """Why no order of S-44 is claimed, as the whole bed may be off; empty if one is."""
         made = self.made or {}
         if self.settings["method"] == "regression":  # measured depths hold the bed
             return "the line is of another cloud" if "regression" in self.settings else ""
@@ -313,18 +290,13 @@ class Summary:
         return self.points / max(self.seconds, 1e-9)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return plain values, ready for JSON.
-
-        `labelling` is there where it had rules, `poses` where the light bends at a surface,
-        `carried` where the cloud was taken from old cameras to adjusted ones, `unsure` where such
-        points are withheld, `shoreline` where one was written, `part` where not all was read. Where
-        no order of S-44 is claimed it is said why.
-        """
-        some = ("labelling", "carried", "unsure", "poses", "shoreline", "fit", "part")
-        own = ("told",)
-        values = {name: vars(self)[name] for name in vars(self) if name not in (*some, *own)}
-        more = {name: getattr(self, name) for name in some if getattr(self, name) is not None}
+        """Return plain values, ready for JSON; optional parts only if there are any."""
+        optional = ("labelling", "carried", "unsure", "poses", "shoreline", "fit", "part")
+        values = {
+            name: value for name, value in vars(self).items()
+            if name != "told" and not (name in optional and value is None)
+        }  # fmt: skip
         if self.uncertainty is not None and self.why_no_order:
             no_order = {"s44": None, "why_no_order": self.why_no_order}
-            more["uncertainty"] = {**self.uncertainty, **no_order}
-        return {**values, **more, "points_per_s": round(self.points_per_s)}
+            values["uncertainty"] = {**self.uncertainty, **no_order}
+        return {**values, "points_per_s": round(self.points_per_s)}
