@@ -286,6 +286,6 @@ if __name__ == "__main__":
         if one.depth_m == DEPTHS_M[-1]:
             print(
                 f"{one.pair.camera.name:<12} {one.pair.flying_height_m:g} m,"
-                f" {one.pair.overlap:.0%}: apparent minus true depth {one.centre_m:.3f} m in the centre,"
+                f" {one.pair.overlap:.0%}: apparent minus true depth {one.centre_m:.3f} m,"
                 f" {one.corner_m:.3f} m in the corners"
             )
