@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -30,16 +30,14 @@ ARROW_LOOK: Plain = {"angles": "xy", "scale_units": "xy", "zorder": 3}
 
 def pictures_of(d: Plain, adjusted: Adjusted, before: Before | None) -> list[Picture]:
     """Return the pictures of an adjustment."""
-    return [
-        *_block(d, adjusted),
-        *_by_depth(d, before),
-        *_vectors(d, adjusted, before),
-        *_section(adjusted, before),
-        *_rounds(d, adjusted),
-    ]
+    drawn = (
+        _block(d, adjusted), _by_depth(d, before), _vectors(d, adjusted, before),
+        _section(adjusted, before), _rounds(d, adjusted),
+    )  # fmt: skip
+    return [picture for picture in drawn if picture is not None]
 
 
-def _block(d: Plain, a: Adjusted) -> list[Picture]:
+def _block(d: Plain, a: Adjusted) -> Picture | None:
     moved = a.cameras.centres - a.block.cameras.centres
     known = np.asarray(np.isfinite(a.gnss_residual_m).any(axis=1))
     shown: list[tuple[str, FloatArray, BoolArray]] = []
@@ -48,7 +46,7 @@ def _block(d: Plain, a: Adjusted) -> list[Picture]:
     if known.any():
         shown.append(("Adjusted minus GNSS", a.gnss_residual_m, known))
     if not shown:
-        return []
+        return None
     size = np.ptp(a.block.cameras.centres[:, :2], axis=0)
     share = float(np.clip(size[1] / max(size[0], 1e-9), 0.25, 1.2))
     n = len(shown)
@@ -61,7 +59,7 @@ def _block(d: Plain, a: Adjusted) -> list[Picture]:
         " difference from the GNSS position; their colour shows the vertical part."
         f" The centres moved by {d['poses']['moved_rms_m']:.3f} m (rms)."
     )
-    return [Picture("block", "Projection centres", alt, figure)]
+    return Picture("block", "Projection centres", alt, figure)
 
 
 def _arrows(figure: Figure, axes: Axes, a: Adjusted, vectors: FloatArray, rows: BoolArray) -> None:
@@ -83,20 +81,19 @@ def _arrows(figure: Figure, axes: Axes, a: Adjusted, vectors: FloatArray, rows: 
     figure.colorbar(arrows, ax=axes, label="Up (m)", shrink=0.8)
     axes.quiverkey(arrows, 0.85, 1.05, key, f"{key:g} m", labelpos="E")
     tips = at[:, :2] + by[:, :2] * (ARROW * side / key)
-    drawn = np.vstack([a.cameras.centres[:, :2], tips])
-    (west, south), (east, north) = drawn.min(axis=0), drawn.max(axis=0)
-    axes.set_xlim(west - 0.05 * side, east + 0.05 * side)
-    axes.set_ylim(south - 0.05 * side, north + 0.05 * side)
+    axes.update_datalim(tips)
+    axes.margins(0.05)
+    axes.autoscale_view()
     label_plan(axes)
 
 
-def _by_depth(d: Plain, before: Before | None) -> list[Picture]:
+def _by_depth(d: Plain, before: Before | None) -> Picture | None:
     """Return residuals by depth, land first."""
     land = d["residuals"]["land"]
     bins = [("land", land)] if land["observations"] else []
     bins += [(f"{b['from_m']:g} to {b['to_m']:g}", b) for b in d["depth_bins"]]
     if not bins:
-        return []
+        return None
     figure, axes = new_figure(8.0, 3.8)
     place = np.arange(len(bins))
     times = [("before", "rms_before_px", BEFORE)] if before is not None else []
@@ -119,10 +116,10 @@ def _by_depth(d: Plain, before: Before | None) -> list[Picture]:
     )
     if before is not None:
         alt += " Before: original poses and lens, points intersected with refraction."
-    return [Picture("residuals_by_depth", "Residuals by depth", alt, figure)]
+    return Picture("residuals_by_depth", "Residuals by depth", alt, figure)
 
 
-def _vectors(d: Plain, a: Adjusted, before: Before | None) -> list[Picture]:
+def _vectors(d: Plain, a: Adjusted, before: Before | None) -> Picture | None:
     """Return mean residual vectors over the image, of the sensor that sees most."""
     lenses = a.block.cameras.lenses or ()
     group, _ = sensor_groups(lenses)
@@ -135,7 +132,7 @@ def _vectors(d: Plain, a: Adjusted, before: Before | None) -> list[Picture]:
     cells = [(name, _cell_means(a, r, rows, lens.width, lens.height), c) for name, r, c in sets]
     largest = max((float(np.hypot(*m[2:]).max(initial=0.0)) for _, m, _ in cells), default=0.0)
     if not largest > 0.0:
-        return []
+        return None
     cell = lens.width / COLUMNS
     key = nice_step(largest / 2.0)
     figure, panels = new_figure(
@@ -161,38 +158,34 @@ def _vectors(d: Plain, a: Adjusted, before: Before | None) -> list[Picture]:
         + ", ".join(f"{name} {value:.3f} {lens.unit} rms" for name, value in rest.items() if value)
         + "."
     )
-    return [Picture("residual_vectors", "Residuals over the image", alt, figure)]
+    return Picture("residual_vectors", "Residuals over the image", alt, figure)
 
 
 def _cell_means(
     a: Adjusted, residual: FloatArray, rows: BoolArray, width: float, height: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return centres of cells of the image and mean residuals there."""
+    from scipy.stats import binned_statistic_2d
+
     rows = rows & np.asarray(np.isfinite(residual).all(axis=1))
-    side = width / COLUMNS
-    down = max(1, round(height / side))
-    u, v = a.block.image_xy[rows].T
-    column = np.clip((u / side).astype(np.int64), 0, COLUMNS - 1)
-    row = np.clip((v * down / height).astype(np.int64), 0, down - 1)
-    cell = row * COLUMNS + column
-    count = np.bincount(cell, minlength=COLUMNS * down)
-    full = np.flatnonzero(count >= LEAST_IN_CELL)
-    du, dv = (
-        np.bincount(cell, weights=values, minlength=len(count))[full] / count[full]
-        for values in residual[rows].T
-    )
-    u, v = (full % COLUMNS + 0.5) * side, (full // COLUMNS + 0.5) * height / down
-    return np.asarray(u), np.asarray(v), du, dv
+    bins = [COLUMNS, max(1, round(height * COLUMNS / width))]
+    (u, v), limits = a.block.image_xy[rows].T, [[0.0, width], [0.0, height]]
+    found: Any = binned_statistic_2d
+    count = found(u, v, u, "count", bins, limits).statistic
+    du, dv = found(u, v, residual[rows].T, "mean", bins, limits).statistic
+    column, row = np.nonzero(count >= LEAST_IN_CELL)
+    u, v = (column + 0.5) * width / bins[0], (row + 0.5) * height / bins[1]
+    return u, v, du[column, row], dv[column, row]
 
 
-def _section(a: Adjusted, before: Before | None) -> list[Picture]:
+def _section(a: Adjusted, before: Before | None) -> Picture | None:
     """Return the points in a strip along the block, with the water."""
     station, across, line = _strip(a.xyz)
     inside = np.abs(across - np.median(across)) < 0.15 * float(np.ptp(across)) + 1e-9
     rows = np.flatnonzero(inside & a.is_observed)
     rows = rows[:: max(1, len(rows) // MOST_POINTS)]
     if len(rows) < 2:
-        return []
+        return None
     figure, axes = new_figure(8.0, 4.0)
     if before is not None:
         axes.plot(
@@ -217,7 +210,7 @@ def _section(a: Adjusted, before: Before | None) -> list[Picture]:
         " and the water."
         + (" Before: intersected with the original poses and lens." if before else "")
     )
-    return [Picture("section", "Section", alt, figure)]
+    return Picture("section", "Section", alt, figure)
 
 
 def _strip(xyz: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -235,10 +228,10 @@ def _strip(xyz: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     return station - station.min(), across, np.column_stack([line, np.zeros(200)])
 
 
-def _rounds(d: Plain, a: Adjusted) -> list[Picture]:
+def _rounds(d: Plain, a: Adjusted) -> Picture | None:
     """Return cost and residuals step by step."""
     if len(a.rounds) < 2:
-        return []
+        return None
     figure, (upper, lower) = new_figure(8.0, 4.6, nrows=2, sharex=True)
     step = np.arange(1, len(a.rounds) + 1)
     number, _, cost, _, _, rms_px = np.array(a.rounds).T
@@ -266,4 +259,4 @@ def _rounds(d: Plain, a: Adjusted) -> list[Picture]:
         "Cost (sum of weighted squares) and RMS residual after each step. Dashed lines separate"
         " the rounds, whose costs cannot be compared, as outliers are excluded between them."
     )
-    return [Picture("rounds", "Convergence", alt, figure)]
+    return Picture("rounds", "Convergence", alt, figure)

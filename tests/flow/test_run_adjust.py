@@ -24,7 +24,7 @@ from pcfix.flow.run import run_all
 from pcfix.flow.run_adjust import adjust_first, figures_of
 from pcfix.io.cameras.colmap.writing import write_colmap
 from pcfix.model import TiePoints, Views
-from pcfix.report.run import adjustment_table
+from pcfix.report.adjustment import adjustment_tables
 from tests.utils.bent_blocks import GNSS_M, LEVEL_M, TrueBlock
 from tests.utils.codes import refused, warned
 from tests.utils.program import run_pcfix
@@ -163,7 +163,7 @@ def test_report_compares(finished):
 def test_notes(scene, finished, monkeypatch):
     note = {"code": "gnss.offset_found", "message": "the GNSS positions lie 0.3 m above"}
     figures = figures_of(finished[0]) | {"notes": [note]}
-    assert ["Note", "", "The GNSS positions lie 0.3 m above"] in adjustment_table(figures, "p").rows
+    assert ["Note", "The GNSS positions lie 0.3 m above"] in adjustment_tables(figures, "p")[0].rows
     monkeypatch.setattr("pcfix.flow.run.figures_of", lambda _: figures)
     said = []
     run_all(scene.whole(), finished[0], say=said.append)
