@@ -99,7 +99,7 @@ def see(truth: FloatArray, rig: Rig, rng: np.random.Generator) -> Sight:
     point, camera = np.nonzero(np.hypot(*across) < _reach_m(rig))
     surface = rig.water.piercing_points(truth[point], cameras.centres[camera], camera)
     ideal, z = project(surface, cameras, camera, rig.optics.lens)
-    inside = (z > 0) & rig.optics.frames(ideal, rig.optics.to_image(ideal))
+    inside = (z > 0) & rig.optics.frames(rig.optics.to_image(ideal))
     point, camera, ideal = point[inside], camera[inside], ideal[inside]
     taken = _detected(point, rig.detection, rng)
     taken &= np.bincount(point, minlength=len(truth))[point] >= LEAST_VIEWS
