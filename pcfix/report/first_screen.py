@@ -81,11 +81,11 @@ def tiles_of(s: Summary, survey: Survey, compared: Plain, depth_m: Plain) -> lis
         ("mean", f"{depth_m['mean']:.2f} m"),
     ]
     moved = f"{s.corrected:,} points of the bed moved {way} by {abs(mean):.2f} m on average."
-    notes = notes_of(s, survey, compared)[:SHOWN_NOTES] or ["Nothing stood out."]
+    notes = notes_of(s, survey, compared)[:SHOWN_NOTES] or ["None."]
     return [
         Tile("Depth", figures=depths, notes=[moved]),
         accuracy_tile(s, compared),
-        Tile("What to watch out for", notes=notes),
+        Tile("Warnings", notes=notes),
     ]
 
 
