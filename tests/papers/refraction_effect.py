@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.report.page import AFTER, BEFORE, REFERENCE, WATER, new_figure, png_of
+from pcfix.report.page import AFTER, BEFORE, WATER, new_figure, png_of
 from pcfix.simulate.tracing import piercing_points
 from tests.papers import hsu_wang
 
@@ -227,20 +227,6 @@ def surfaces_figure(effects, *, beds):
     return png_of(figure)
 
 
-def bins_figure(bins):
-    """Draw the RMSE of each method by depth (Fig 11 of Hsu & Wang), logarithmic."""
-    figure, axes = new_figure(8.5, 4.8)
-    colours = (REFERENCE, BEFORE, WATER, "0.6", AFTER)
-    for i, (method, colour) in enumerate(zip(hsu_wang.METHODS, colours, strict=True)):
-        axes.bar(np.arange(4) + 0.16 * i, 1e3 * bins.rmse_m[:-1, i], 0.16, color=colour,
-                 label=method)  # fmt: skip
-    axes.set_yscale("log")
-    axes.set_xticks(np.arange(4) + 0.32, hsu_wang.BIN_NAMES[:-1])
-    axes.set(xlabel="True depth (mm)", ylabel="RMSE of heights (mm)")
-    axes.legend(ncols=5)
-    return png_of(figure)
-
-
 def write_all(folder, heights=None, bowl=None):
     """Write the tables and figures of both papers, and return the effects."""
     pairs = [
@@ -273,7 +259,6 @@ def write_all(folder, heights=None, bowl=None):
         deep = [one for one in own if one.depth_m == deepest]
         (folder / f"{stem}_bed.png").write_bytes(surfaces_figure(deep, beds=True))
         (folder / f"{stem}_stack.png").write_bytes(surfaces_figure(own, beds=False))
-    (folder / "bowl_depth_bins.png").write_bytes(bins_figure(bins))
     return effects
 
 

@@ -20,7 +20,6 @@ from pcfix.report.text import (
     budget_words,
     formal_words,
     summary_rows,
-    summary_text,
     tvu_sentence,
     uncertainty_sentence,
 )
@@ -93,11 +92,10 @@ def test_budget_words(changes, fitted, words):
 
 def test_figure():
     rng = np.random.default_rng(0)
-    for points in (1, 500):
-        depth, sigma = rng.uniform(0.0, 8.0, points), rng.uniform(0.01, 0.2, points)
-        assert png_of(tvu_figure(depth, sigma)).startswith(b"\x89PNG")
+    depth, sigma = rng.uniform(0.0, 8.0, 500), rng.uniform(0.01, 0.2, 500)
     bins = [asdict(one) for one in binned(depth, rng.normal(0.0, 0.1, 500), None, 1.0)]
-    assert png_of(tvu_figure(depth, sigma, bins)).startswith(b"\x89PNG")
+    for some, measured in ((slice(1), []), (slice(None), bins)):
+        assert png_of(tvu_figure(depth[some], sigma[some], measured)).startswith(b"\x89PNG")
 
 
 def test_measured_tvu():
@@ -142,10 +140,4 @@ def test_model_uncertainty(summary):
 def test_summary_rows(summary):
     rows = dict(summary_rows(summary))
     assert rows["Submerged"] == "14,736 points (74 %), all corrected"
-    assert (
-        rows["Uncertainty"]
-        == f"{summary.uncertainty['tvu_95_m']['mean']:.3f} m at 95 % (predicted)"
-    )
     assert "Uncertainty" not in dict(summary_rows(replace(summary, uncertainty=None)))
-    lines = summary_text(summary).splitlines()
-    assert lines[0].startswith("Corrected ") and all(len(line) < 160 for line in lines[1:-3])
