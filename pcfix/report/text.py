@@ -19,10 +19,6 @@ if TYPE_CHECKING:
     from pcfix.clean.points import CleanSummary
     from pcfix.grid.model import DsmSummary
     from pcfix.label.labelling import LabelSummary
-    from pcfix.photos.calm import CalmSummary
-    from pcfix.photos.mapping import PhotosSummary
-    from pcfix.photos.ortho import OrthoSummary
-    from pcfix.photos.rounds import RebuildSummary
 
 Plain = dict[str, Any]
 Rows = list[tuple[str, str]]
@@ -407,7 +403,7 @@ def dsm_text(s: DsmSummary) -> str:
     return aligned(_head("Gridded", s, points), filled(_GRIDDED, values))
 
 
-def calm_text(s: CalmSummary) -> str:
+def calm_text(s: Any) -> str:
     """Return the summary of an image through calm water."""
     values = vars(s) | {"is_still": not s.corners, "found": s.water}
     if s.water is not None:
@@ -420,7 +416,7 @@ def calm_text(s: CalmSummary) -> str:
     return aligned(head, filled(_CALMED, values))
 
 
-def photos_text(s: PhotosSummary) -> str:
+def photos_text(s: Any) -> str:
     """Return the summary of photographs without water."""
     head = f"Mapped {s.images - s.done_before:,} images in {s.seconds:.1f} s"
     if s.seconds and s.images > s.done_before:
@@ -428,7 +424,7 @@ def photos_text(s: PhotosSummary) -> str:
     return aligned(head, filled(_MAPPED, vars(s) | {"black_percent": 100.0 * s.black_share}))
 
 
-def rounds_text(s: RebuildSummary) -> str:
+def rounds_text(s: Any) -> str:
     """Return why the rounds ended, and where their clouds and the comparison are."""
     values = vars(s) | {
         "verdict": "settled" if s.settled else "not settled",
@@ -439,7 +435,7 @@ def rounds_text(s: RebuildSummary) -> str:
     return aligned(f"Rebuilt in {len(s.rounds)} rounds", filled(_REBUILT, values))
 
 
-def ortho_text(s: OrthoSummary) -> str:
+def ortho_text(s: Any) -> str:
     """Return the summary of an orthophoto."""
     traced = "without refraction" if s.water is None else f"traced through water {s.water}"
     values = vars(s) | {"covered": 100 * s.covered_share, "traced": traced}

@@ -13,9 +13,9 @@ import cv2
 
 import pcfix
 from pcfix.errors import InputError, SettingError
+from pcfix.flow.rebuild import round_of
 from pcfix.io.las.writing import write_points
 from pcfix.photos.ground import Ground
-from pcfix.photos.rounds import paper_excess, round_of
 from pcfix.photos.stereo import Grey, pairs_of, stereo_cloud
 from tests.photos.test_mapping import GSD_M, photo, relief
 from tests.utils.codes import refused, warned
@@ -94,7 +94,7 @@ def test_paper_limit(block):
     with warned("photos.paper_limit"):
         found = pcfix.rebuild_rounds(images, out, **how, until_gsd=0.001, most_rounds=3)
     assert [note.code for note in found.notes] == ["photos.paper_limit"]
-    assert paper_excess(1.34) == pytest.approx(0.131, abs=0.001)
+    assert found.notes[0].values["excess"] == pytest.approx(0.131, abs=0.001)
 
 
 def test_resumed(block):
