@@ -5,8 +5,9 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -28,10 +29,8 @@ from pcfix.options.declare import File, taken
 from pcfix.options.photos import CalmOptions
 from pcfix.photos.calm import (
     LEAST_CORNERS,
-    CalmSummary,
     Follower,
     Registration,
-    WaterFound,
     covered,
     laid,
     median_of,
@@ -59,6 +58,46 @@ PASSES = 2
 """Over the surface: the height of the piercing points follows from the first."""
 LEAST_EXPLAINED = 0.5
 """Share of the slopes; if waves explain less, there is a warning."""
+
+
+class WaterFound(NamedTuple):
+    """The water of a sequence: number of waves, rms values, share of the slopes explained."""
+
+    folder: str
+    waves: int
+    slope_deg: float
+    height_m: float
+    sigma_m: float
+    explained: float
+
+
+@dataclass(frozen=True)
+class CalmSummary:
+    """The result of `calm_frames`.
+
+    Attributes
+    ----------
+    corners : int
+        By which the frames were registered.
+    scatter_px, moved_px : float
+        Median scatter of a corner along an axis; largest movement of the frame's centre.
+    spread : float
+        Median over the image of the spread of the frames, grey values.
+    """
+
+    input: str
+    output: str
+    spread_file: str
+    frames: int
+    columns: int
+    rows: int
+    corners: int
+    scatter_px: float
+    moved_px: float
+    spread: float
+    seconds: float
+    water: WaterFound | None
+    notes: tuple[PcfixWarning, ...] = ()
 
 
 def calm_frames(

@@ -40,11 +40,16 @@ from pcfix.options.correct import CorrectOptions
 from pcfix.options.declare import options_of
 from pcfix.options.steps import CleanOptions, DistanceOptions
 from pcfix.refract.tally import Summary
-from pcfix.report.adjustment_text import all_notes
+from pcfix.report.adjustment import (
+    adjustment_sentence,
+    adjustment_tables,
+    all_notes,
+    reason_sentence,
+)
 from pcfix.report.comparison import evaluation, in_a_sentence
 from pcfix.report.first_screen import Survey, in_short, is_found
 from pcfix.report.page import Picture, Table
-from pcfix.report.run import Later, adjustment_sentence, adjustment_table, reason_sentence
+from pcfix.report.run import Later
 from pcfix.report.text import uncertainty_sentence
 from pcfix.report.water import found_picture
 
@@ -329,7 +334,7 @@ def _report(
         pictures, tables = evaluation(compared["figures"], compared["sections"], dod)
         verdict += in_a_sentence(compared["figures"])
     if first["adjusted"]:
-        tables.append(adjustment_table(figures_of(files.folder), f"{FOLDER}/report.html"))
+        tables += adjustment_tables(figures_of(files.folder), f"{FOLDER}/report.html")
     summary = Summary(**done["correct"])
     again = _inputs(request)
     cameras = _cameras(request, files)

@@ -1,4 +1,4 @@
-"""The options of simulated scenes: simulate, demo, and refraction in a stereo pair."""
+"""The options of simulated scenes: simulate and demo."""
 
 from __future__ import annotations
 
@@ -167,68 +167,11 @@ def depth_series(option: str, text: str) -> tuple[float, ...]:
     return tuple(round(first + i * step, 9) for i in range(int(count)))
 
 
-def _frame(option: str, text: str) -> tuple[float, ...]:
-    return numbers(option, text.lower().replace("x", ","))
-
-
 @dataclass(frozen=True, kw_only=True)
-class EffectOptions(OptionSet):
-    """The effect of refraction on a pair of vertical images."""
-
-    panel = Panel.EFFECT
-
-    effect_focal_mm: float | None = option(
-        None,
-        "Focal length of your own camera, with --effect-frame-px and --effect-pixel-um.",
-        needs="refraction_effect",
-        default_is="the paper's two cameras",
-    )
-    effect_frame_px: tuple[int, int] | None = option(
-        None,
-        "Its image size, such as 4000x3000; the height is along the flight.",
-        needs="refraction_effect",
-        parse=_frame,
-        metavar="WIDTHxHEIGHT",
-    )
-    effect_pixel_um: float | None = option(None, "Its pixel size.", needs="refraction_effect")
-    effect_overlap: tuple[float, ...] | None = option(
-        None,
-        "Overlaps of the two images, 0 to 1.",
-        needs="refraction_effect",
-        parse=numbers,
-        default_is="0.8; UltraCamX 0.6,0.8",
-        metavar="N,N",
-    )
-    effect_heights: tuple[float, ...] | None = option(
-        None,
-        "Flying heights above the water, metres.",
-        needs="refraction_effect",
-        parse=numbers,
-        default_is="100,200; UltraCamX 1000,3000; your own 50,100,200",
-        metavar="M,M",
-    )
-    effect_depths: tuple[float, ...] | None = option(
-        None,
-        "Apparent depths, metres: a list, or FROM:TO:STEP; maps are of the largest.",
-        needs="refraction_effect",
-        parse=depth_series,
-        default_is="0:15:1",
-        metavar="M,M",
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class SimulateOptions(OverwriteOption, EffectOptions, SceneOptions):
+class SimulateOptions(OverwriteOption, SceneOptions):
     """The options of ``pcfix simulate``."""
 
     panel = Panel.OUTPUT
-
-    refraction_effect: bool = option(
-        False,
-        "Instead of a scene, compute the error that refraction causes in a pair of vertical images"
-        " (Skarlatos & Agrafiotis 2018, Figures 4 to 6): surfaces, maps, tables. The default index"
-        " is then 1.3405, which fits the paper's figures.",
-    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -33,7 +33,6 @@ class Panel(StrEnum):
     UNKNOWNS = "What moves, and how much counts"
     CLOUDS = "Clouds"
     ROUNDS = "Rounds"
-    EFFECT = "With --refraction-effect"
     OUTPUT = "Output"
 
 

@@ -24,8 +24,7 @@ import numpy as np
 
 import pcfix
 from pcfix.errors import PcfixError, PcfixWarning
-from pcfix.report.adjustment import adjustment_dict, before_of
-from pcfix.report.adjustment_text import all_notes
+from pcfix.report.adjustment import adjustment_dict, all_notes, before_of
 from tests.utils.block_kinds import GSD_M, KINDS, write_kind
 
 GOOD_GSD, COVERED = 1.5, 0.8

@@ -19,9 +19,7 @@ from pcfix.report.text import (
     FEWEST,
     budget_words,
     formal_words,
-    strictest_order,
     summary_rows,
-    summary_text,
     tvu_sentence,
     uncertainty_sentence,
 )
@@ -74,7 +72,6 @@ def test_chunks():
 )
 def test_strictest_order(shares, order):
     found = {"s44": dict(zip(BY_HAND, shares, strict=True))}
-    assert strictest_order(found) == order
     assert (order or "fewer than 95 %") in tvu_sentence(found)
 
 
@@ -95,11 +92,10 @@ def test_budget_words(changes, fitted, words):
 
 def test_figure():
     rng = np.random.default_rng(0)
-    for points in (1, 500):
-        depth, sigma = rng.uniform(0.0, 8.0, points), rng.uniform(0.01, 0.2, points)
-        assert png_of(tvu_figure(depth, sigma)).startswith(b"\x89PNG")
+    depth, sigma = rng.uniform(0.0, 8.0, 500), rng.uniform(0.01, 0.2, 500)
     bins = [asdict(one) for one in binned(depth, rng.normal(0.0, 0.1, 500), None, 1.0)]
-    assert png_of(tvu_figure(depth, sigma, bins)).startswith(b"\x89PNG")
+    for some, measured in ((slice(1), []), (slice(None), bins)):
+        assert png_of(tvu_figure(depth[some], sigma[some], measured)).startswith(b"\x89PNG")
 
 
 def test_measured_tvu():
@@ -144,10 +140,4 @@ def test_model_uncertainty(summary):
 def test_summary_rows(summary):
     rows = dict(summary_rows(summary))
     assert rows["Submerged"] == "14,736 points (74 %), all corrected"
-    assert (
-        rows["Uncertainty"]
-        == f"{summary.uncertainty['tvu_95_m']['mean']:.3f} m at 95 % (predicted)"
-    )
     assert "Uncertainty" not in dict(summary_rows(replace(summary, uncertainty=None)))
-    lines = summary_text(summary).splitlines()
-    assert lines[0].startswith("Corrected ") and all(len(line) < 160 for line in lines[1:-3])
