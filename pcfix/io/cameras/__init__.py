@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.errors import InputError, SettingError
+from pcfix.errors import InputError, SettingError, bad_file
 from pcfix.io.cameras import (
     blocksexchange,
     bundler,
@@ -42,7 +42,6 @@ from pcfix.io.cameras.checks import (
     no_pose,
     reading,
     sensor_unused,
-    wrong,
 )
 from pcfix.io.cameras.formats import Angles, Source
 from pcfix.io.cameras.table.sensor import read_sensor
@@ -223,14 +222,14 @@ def _recognised(
     if inside:
         listed = " and ".join(f"{name} ({software})" for name, software in inside)
         sentence = f"is a folder that holds {listed}. Give {where / inside[0][0]} itself."
-        raise wrong(where, "cameras.folder", sentence, files=[name for name, _ in inside])
+        raise bad_file(where, "cameras.folder", sentence, files=[name for name, _ in inside])
     if known is not None:
         return source, known
     sentence = (
         "is not a camera file that pcfix knows. Give a CSV table with the columns label, x, y, z"
         " and, if you have them, yaw, pitch, roll."
     )
-    raise wrong(where, "cameras.unknown", sentence)
+    raise bad_file(where, "cameras.unknown", sentence)
 
 
 def takes_sensor(path: File) -> bool:

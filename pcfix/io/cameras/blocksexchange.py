@@ -40,9 +40,9 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from pcfix.errors import InputError, PcfixWarning
+from pcfix.errors import InputError, PcfixWarning, bad_file
 from pcfix.io.cameras import checks, tracks
-from pcfix.io.cameras.checks import damaged, number, read_xml, wrong
+from pcfix.io.cameras.checks import damaged, number, read_xml
 from pcfix.io.cameras.formats import Source
 from pcfix.lens.rotations import from_omega_phi_kappa, from_photogrammetric
 from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, TiePoints
@@ -220,7 +220,7 @@ def _of_one_frame(
     if twice or len(systems) > 1:
         why = f"image {twice[0]} is in several blocks" if twice else "it has several SRS"
         sentence = f"{why}. Export the one block that the cloud was made from, in one SRS."
-        raise wrong(path, "cameras.several_blocks", sentence)
+        raise bad_file(path, "cameras.several_blocks", sentence)
     return kept, tuple(notes)
 
 
@@ -437,7 +437,9 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
                     xyz.append([math.nan] * 3)
     if not xyz:
         raise tracks.no_tie_points(path, f"none was seen by one of its {len(cameras)} photos")
-    return tracks.tie_points(np.array(xyz), np.array(point), np.array(camera), np.array(uv))
+    return tracks.tie_points(
+        tracks.Seen(np.array(xyz), np.array(point), np.array(camera), np.array(uv))
+    )
 
 
 def _inside(path: Path, text: bytes) -> tuple[Path, bytes]:

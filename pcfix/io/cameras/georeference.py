@@ -20,8 +20,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from pcfix.errors import PcfixWarning
-from pcfix.io.cameras.checks import wrong
+from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.cameras.mistakes import UNDULATION_M
 from pcfix.io.crs import (
     GEOCENTRIC_WGS84,
@@ -108,7 +107,7 @@ class Frame(NamedTuple):
                 f"image {labels[i]}: {numbers} are not {kind} ({self.crs.name}). Give the CRS of"
                 " the cameras with --cameras-crs."
             )
-            raise wrong(name, code, sentence, image=labels[i], crs=self.crs.name)
+            raise bad_file(name, code, sentence, image=labels[i], crs=self.crs.name)
 
 
 def frame_of(text: str, name: str) -> Frame:
@@ -124,7 +123,7 @@ def frame_of(text: str, name: str) -> Frame:
         return Frame(geographic, _from_geocentric(crs, geographic))
     if not (crs.is_projected or crs.is_geographic):
         sentence = f"{crs.name} is not a CRS for cameras. Give another with --cameras-crs."
-        raise wrong(name, "cameras.crs", sentence, crs=crs.name)
+        raise bad_file(name, "cameras.crs", sentence, crs=crs.name)
     return Frame(crs, lambda xyz: xyz, direct=True)
 
 
@@ -213,7 +212,7 @@ class Georeference:
                 f"image {cameras.labels[i]}: its position {x:.10g}, {y:.10g}, {z:.6g} cannot be"
                 f" transformed to {shortened(self.crs or '')}. Check --cameras-crs."
             )
-            raise wrong(self.name, "cameras.not_transformed", sentence, image=cameras.labels[i])
+            raise bad_file(self.name, "cameras.not_transformed", sentence, image=cameras.labels[i])
         if rotations is not None and self.transformation is not None:
             rotations = rotations @ self.turns(cameras.centres).transpose(0, 2, 1)
         return replace(
@@ -244,7 +243,7 @@ class Georeference:
                 f"the axes of {self.frame.crs.name} are left-handed, so rotations have no meaning"
                 " in it. Export the cameras in another CRS."
             )
-            raise wrong(self.name, "cameras.left_handed", sentence, crs=self.frame.crs.name)
+            raise bad_file(self.name, "cameras.left_handed", sentence, crs=self.frame.crs.name)
         u, _, v = np.linalg.svd(vectors)
         return np.asarray(u @ v)
 
@@ -289,7 +288,7 @@ def georeference(
     offset = np.zeros(3) if offset_m is None else np.asarray(offset_m, np.float64)
     if offset.shape != (3,) or not np.isfinite(offset).all():
         sentence = f"the offset {offset_m} is not three numbers. Give x, y, z."
-        raise wrong(name, "cameras.offset", sentence, value=offset_m)
+        raise bad_file(name, "cameras.offset", sentence, value=offset_m)
     cloud = None if cloud_crs is None else parse_crs(cloud_crs, "the cloud")
     stated = statement(cameras, cameras_crs, name)
     if is_tied(stated.crs, name):
@@ -301,7 +300,7 @@ def georeference(
             f"is in a local frame, but the cloud is in {cloud.name}. Export the cameras in that"
             " CRS, or give --cameras-crs local if their numbers differ by a shift at most."
         )
-        raise wrong(name, "cameras.local", sentence, cloud_crs=cloud.name)
+        raise bad_file(name, "cameras.local", sentence, cloud_crs=cloud.name)
     return Georeference(None, None, offset, crs_text(cloud), (), name)
 
 
@@ -319,7 +318,7 @@ def _from_earth(
             f"is in {shortened(crs)}, but the cloud is in a local frame ({cloud.name}). Set the"
             " cloud's CRS, or give --cameras-crs local to take the numbers as they are."
         )
-        raise wrong(name, "cloud.local", sentence, crs=crs, cloud_crs=cloud.name)
+        raise bad_file(name, "cloud.local", sentence, crs=crs, cloud_crs=cloud.name)
     frame = frame_of(crs, name)
     if cloud is not None:
         return _into(cloud, frame, stated, cameras, offset, name)
@@ -335,7 +334,7 @@ def _from_earth(
             f"is in {kind} ({frame.crs.name}) and no cloud names a CRS. Give the cloud, or set its"
             " CRS."
         )
-        raise wrong(name, "cloud.no_crs", sentence, crs=frame.crs.name)
+        raise bad_file(name, "cloud.no_crs", sentence, crs=frame.crs.name)
     else:
         words = stated.project.name
         found = _into(stated.project, frame, stated, cameras, offset, name)
@@ -354,7 +353,7 @@ def _into(
             f"an offset in metres cannot be added to degrees ({frame.crs.name}). Leave it out, or"
             " export the cameras in a projected CRS."
         )
-        raise wrong(name, "cameras.offset", sentence, value=offset.tolist())
+        raise bad_file(name, "cameras.offset", sentence, value=offset.tolist())
     at = cameras.centres + offset
     frame.check(at, cameras.labels, name)
     target = cloud
@@ -540,7 +539,7 @@ def _common(cameras: Cameras, name: str) -> CRS:
         return frame.crs
     base = parts(unbound(frame.crs))[0].geodetic_crs
     if base is None:
-        raise wrong(name, "cameras.crs", f"{frame.crs.name} has no datum.")
+        raise bad_file(name, "cameras.crs", f"{frame.crs.name} has no datum.")
     to_degrees = Transformer.from_crs(parts(frame.crs)[0], "EPSG:4326", always_xy=True)
     middle = np.median(frame.enter(cameras.centres), axis=0)
     longitude, latitude = to_degrees.transform(middle[0], middle[1])

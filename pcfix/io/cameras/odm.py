@@ -33,9 +33,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.errors import PcfixWarning
+from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.cameras import checks, opensfm
-from pcfix.io.cameras.checks import damaged, load_json, triple, wrong
+from pcfix.io.cameras.checks import damaged, load_json, triple
 from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.opensfm.models import is_panorama, lens
 from pcfix.io.crs import GEOCENTRIC_WGS84, GEOGRAPHIC_WGS84, Topocentric
@@ -264,7 +264,7 @@ def named_crs(path: Path) -> str:
     line = text.splitlines()[0].strip() if text else ""
     crs = checks.utm_as_code(line)
     if not checks.names_crs(crs):
-        raise wrong(
+        raise bad_file(
             path, "cameras.crs", f"'{line[:80]}' names no CRS. Put its EPSG code there.", crs=line
         )
     return crs

@@ -30,9 +30,9 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from pcfix.errors import PcfixWarning
+from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.cameras import checks, tracks
-from pcfix.io.cameras.checks import load_json, triple, wrong
+from pcfix.io.cameras.checks import load_json, triple
 from pcfix.io.cameras.formats import Source
 from pcfix.io.crs import crs_text, parse_crs, plan_unit
 from pcfix.lens.rotations import from_omega_phi_kappa
@@ -130,7 +130,7 @@ def _open_project(path: Path) -> Project:
             f"belongs to an OPF project, of which {len(found)} are there. Give the project file"
             " (.opf) that goes with the cloud."
         )
-        raise wrong(path, "cameras.several_projects", sentence, projects=len(found))
+        raise bad_file(path, "cameras.several_projects", sentence, projects=len(found))
     return _open_project(found[0])
 
 
@@ -257,15 +257,6 @@ MATCHES = "OPF_mesh_primitive_matches"
 OFFSET_BITS = 40
 
 
-class Matches(NamedTuple):
-    """Points of a node, and of each match its point, its camera (-1: not posed) and its place."""
-
-    xyz: FloatArray
-    point: IntArray
-    camera: IntArray
-    uv: FloatArray
-
-
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """Read the tracks of the calibration."""
     project = _open_project(source.path)
@@ -275,16 +266,11 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     found = [node for model in models for node in _nodes(model, row_of)]
     if not any((node.camera >= 0).any() for node in found):
         raise tracks.no_tie_points(project.path, "its calibration has no tracks in its images")
-    before = np.cumsum([0, *(len(node.xyz) for node in found)])
-    return tracks.tie_points(
-        _frame_of(project).enter(np.concatenate([node.xyz for node in found])),
-        np.concatenate([node.point + n for node, n in zip(found, before, strict=False)]),
-        np.concatenate([node.camera for node in found]),
-        np.concatenate([node.uv for node in found]),
-    )
+    frame = _frame_of(project)
+    return tracks.tie_points(*(node._replace(xyz=frame.enter(node.xyz)) for node in found))
 
 
-def _nodes(path: Path, row_of: dict[int, int]) -> Iterator[Matches]:
+def _nodes(path: Path, row_of: dict[int, int]) -> Iterator[tracks.Seen]:
     """Yield the points and matches of the nodes of a model."""
     if not path.is_file():
         raise checks.missing(path)
@@ -303,7 +289,7 @@ def _nodes(path: Path, row_of: dict[int, int]) -> Iterator[Matches]:
                     matrix = np.array(node.get("matrix", np.eye(4).ravel()), float).reshape(4, 4).T
                     x, y, z = (xyz.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]).T
                     z_up = np.column_stack([x, -z, y])  # the model itself has y up
-                    yield Matches(z_up, point, camera, uv[at].astype(np.float64))
+                    yield tracks.Seen(z_up, point, camera, uv[at].astype(np.float64))
 
 
 def _matched(

@@ -113,7 +113,7 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     xy = np.concatenate([image.xy for image in images])[known]
     place = read_place(model.folder)
     xyz = points.xyz if place is None else points.xyz + place.offset_m
-    return tracks.tie_points(xyz, row[known], camera[known], xy)
+    return tracks.tie_points(tracks.Seen(xyz, row[known], camera[known], xy))
 
 
 def _rows_of(identifiers: IntArray, wanted: IntArray) -> IntArray:

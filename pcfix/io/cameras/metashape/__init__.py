@@ -30,7 +30,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 from xml.etree.ElementTree import Element
 from zipfile import ZipFile
 
@@ -43,11 +43,11 @@ from pcfix.io.cameras.metashape import documents
 from pcfix.io.cameras.metashape.block import Block, read_block
 from pcfix.io.cameras.metashape.documents import Chunk, Document, open_archive, recognises, unpacked
 from pcfix.io.cameras.metashape.sensors import read_calibration
-from pcfix.io.cameras.tracks import no_tie_points
+from pcfix.io.cameras.tracks import Seen, no_tie_points
 from pcfix.io.cameras.tracks import tie_points as gathered
 from pcfix.io.crs import is_local, parse_crs
 from pcfix.io.ply import parse_header
-from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, TiePoints
+from pcfix.model import Cameras, FloatArray, GnssPositions, TiePoints
 
 __all__ = ["read", "read_calibration", "recognises", "tie_points"]
 
@@ -76,13 +76,7 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     if not any(len(part.point) for part in seen):
         why = "only a project (.psx with its .files folder) or exported markers have them"
         raise no_tie_points(chunk.path, why)
-    before = np.cumsum([0, *(len(part.xyz) for part in seen)])
-    return gathered(
-        np.vstack([part.xyz for part in seen]),
-        np.concatenate([part.point + n for part, n in zip(seen, before, strict=False)]),
-        np.concatenate([part.camera for part in seen]),
-        np.vstack([part.uv for part in seen]),
-    )
+    return gathered(*seen)
 
 
 Spreads: TypeAlias = tuple[tuple[str, tuple[int, ...]], ...]
@@ -184,15 +178,6 @@ def _antenna_notes(path: Path, block: Block) -> tuple[PcfixWarning, ...]:
 
 POINTS = ("x", "y", "z", "id")
 PROJECTIONS = ("x", "y", "id")
-
-
-class Seen(NamedTuple):
-    """Points, and observations of them, camera by camera: row of both, u and v."""
-
-    xyz: FloatArray
-    point: IntArray
-    camera: IntArray
-    uv: FloatArray
 
 
 def _tie_points(frame: Document, block: Block) -> Iterator[Seen]:

@@ -21,9 +21,9 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from pcfix.errors import PcfixWarning
+from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import damaged, number, numbers, read_xml, without_zeros, wrong
+from pcfix.io.cameras.checks import damaged, number, numbers, read_xml, without_zeros
 from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.metashape import documents
 from pcfix.model import FloatArray, Lens, Projection
@@ -49,7 +49,7 @@ def read_calibration(path: Path) -> Lens:
             f"is not a calibration of Metashape ({root.tag}). Save it from Tools, Camera"
             " Calibration."
         )
-        raise wrong(path, "cameras.no_calibration", sentence)
+        raise bad_file(path, "cameras.no_calibration", sentence)
     kind = (root.findtext("projection") or "frame").strip()
     if kind not in PROJECTIONS:
         remedy = f"Use a lens of type {', '.join(PROJECTIONS)}"
@@ -120,7 +120,7 @@ def lens_of(path: Path, sensor: Element, image: str) -> Lens:
             f"the sensor {label} of image {image} has no calibration, or no size. Align the images"
             " in Metashape and export the cameras again."
         )
-        raise wrong(path, "cameras.no_calibration", sentence, sensor=label)
+        raise bad_file(path, "cameras.no_calibration", sentence, sensor=label)
     width, height = size
     return Lens(  # what Metashape itself starts from: the data sheet, no distortion
         *(focal_mm / pixel_mm, width, height, width / 2.0, height / 2.0),

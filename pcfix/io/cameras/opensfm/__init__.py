@@ -206,7 +206,7 @@ def read_tie_points(reconstruction: Reconstruction) -> TiePoints:
     order = np.lexsort((camera, point))
     size = np.array([(lens.width, lens.height) for lens in cameras.lenses or ()])[camera]
     uv = xy * size.max(axis=1, initial=0.0)[:, None] + size / 2.0
-    return tracks.tie_points(xyz, point[order], camera[order], uv[order])
+    return tracks.tie_points(tracks.Seen(xyz, point[order], camera[order], uv[order]))
 
 
 def _observations(

@@ -25,15 +25,14 @@ from typing import Any
 
 import numpy as np
 
+from pcfix.errors import bad_file
 from pcfix.io.cameras.checks import (
-    bad_label,
+    block_to_write,
     damaged,
     is_same_lens,
     lens_not_held,
-    needs_lenses,
     unsupported,
     write_new,
-    wrong,
 )
 from pcfix.io.cameras.georeference import frame_of, georeference, is_tied
 from pcfix.io.cameras.tracks import NO_TIE_POINTS, are_seen
@@ -135,12 +134,11 @@ def write_opensfm(path: File, cameras: Cameras, tie_points: TiePoints | None = N
         If a file exists.
     """
     target = Path(path)
-    if cameras.rotations is None or cameras.lenses is None:
-        raise needs_lenses(target)
-    for label, count in Counter(cameras.labels).items():  # they are keys in the file
-        if count > 1 or "\t" in label or "\n" in label:
-            raise bad_label(target, label)
-    models = {each: opensfm_camera(target, each) for each in dict.fromkeys(cameras.lenses)}
+    times = Counter(cameras.labels)  # they are keys in the file
+    _, lenses = block_to_write(
+        target, cameras, lambda label: times[label] == 1 and not {"\t", "\n"} & {*label}
+    )
+    models = {each: opensfm_camera(target, each) for each in dict.fromkeys(lenses)}
     names = {each: f"pcfix {i}" for i, each in enumerate(models, start=1)}
     ties = tie_points or NO_TIE_POINTS
     kept = np.flatnonzero(are_seen(ties))
@@ -219,7 +217,7 @@ def _world(
         return cameras, points, Topocentric.from_text(cameras.crs, name)
     if not parse_crs(cameras.crs, name).is_projected:
         sentence = f"the cameras are in {shortened(cameras.crs)}. Bring them to a projected CRS."
-        raise wrong(name, "output.crs", sentence, crs=cameras.crs)
+        raise bad_file(name, "output.crs", sentence, crs=cameras.crs)
     source, geographic = frame_of(cameras.crs, name).crs, parse_crs(GEOGRAPHIC_WGS84, name)
     stated = heights_of(source) != "unstated"
     to_degrees = transformation(source, geographic, cameras.centres, name, heights=stated).forward

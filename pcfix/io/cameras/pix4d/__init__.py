@@ -29,9 +29,9 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from pcfix.errors import PcfixWarning
+from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.cameras import checks, tracks
-from pcfix.io.cameras.checks import damaged, number, read_xml, wrong
+from pcfix.io.cameras.checks import damaged, number, read_xml
 from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.pix4d import tables
 from pcfix.io.cameras.pix4d.tables import read_text
@@ -132,7 +132,7 @@ def _in_folders(root: Path) -> Files:
                 f"holds the tables of several projects ({', '.join(sorted(prefixes))}). Give one of"
                 " the files instead."
             )
-            raise wrong(folder, "cameras.several_projects", sentence, projects=len(prefixes))
+            raise bad_file(folder, "cameras.several_projects", sentence, projects=len(prefixes))
         if prefixes:
             return _named(folder, prefixes.pop())
     return {}
@@ -369,7 +369,7 @@ def _observations(
         known = {row[0].strip(): checks.triple(row[4:7]) for row in lines if len(row) > 1}
     unknown = np.full(3, np.nan)
     xyz = np.array([known.get(name.partition("_")[2], unknown) for name in names.tolist()])
-    return tracks.tie_points(xyz, point, camera[posed], xy[posed])
+    return tracks.tie_points(tracks.Seen(xyz, point, camera[posed], xy[posed]))
 
 
 def _measured(path: Path, rows: dict[str, int]) -> list[tuple[str, int, str, str, str, str]]:

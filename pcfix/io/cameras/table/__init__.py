@@ -44,7 +44,6 @@ import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import wrong
 from pcfix.io.cameras.formats import Angles, Source
 from pcfix.io.cameras.table.columns import (
     EXIF,
@@ -160,7 +159,7 @@ def centres(columns: Columns, suffix: str = "", *, needed: bool = False) -> Floa
                 f"longitude {xyz[i, 0]:g}, latitude {xyz[i, 1]:g} is no place on earth. Are the"
                 " columns swapped, or metres?"
             )
-            raise wrong(columns.where(i), "cameras.degrees", sentence, path=columns.path)
+            raise columns.error(i, "cameras.degrees", sentence)
     xyz[np.isnan(xyz).any(axis=1)] = np.nan
     return xyz
 
@@ -285,12 +284,8 @@ def _from_omega_phi_kappa(columns: Columns, opk: Sequence[str]) -> FloatArray:
                 f"omega, phi, kappa and r11 to r33 are {apart_deg[worst]:.3g} degrees apart. Export"
                 " the table again."
             )
-            raise wrong(
-                columns.where(worst),
-                "cameras.angles_differ",
-                sentence,
-                path=columns.path,
-                degrees=float(apart_deg[worst]),
+            raise columns.error(
+                worst, "cameras.angles_differ", sentence, degrees=float(apart_deg[worst])
             )
     return found
 

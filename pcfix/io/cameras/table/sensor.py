@@ -17,8 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
+from pcfix.errors import bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import is_same_lens, write_new, wrong
+from pcfix.io.cameras.checks import is_same_lens, write_new
 from pcfix.io.cameras.table.columns import Columns
 from pcfix.io.crs import is_topocentric
 from pcfix.io.files import check_input
@@ -53,7 +54,7 @@ def read_sensor(path: Path) -> Lens:
     table = read_table(path, columns)
     if len(table.rows) != 1:
         sentence = f"has {len(table.rows)} rows. Give one row for all images."
-        raise wrong(path, "cameras.sensor_rows", sentence, rows=len(table.rows))
+        raise bad_file(path, "cameras.sensor_rows", sentence, rows=len(table.rows))
 
     def value(name: str, default: float = 0.0) -> float:
         return table.numbers(name)[0] if name in table.header else default
@@ -73,7 +74,7 @@ def read_sensor(path: Path) -> Lens:
     shares = lens.principal_x / width, lens.principal_y / height
     if not all(0.25 < share < 0.75 for share in shares):
         sentence = "cx, cy is far from the centre. Give pixels from the upper left corner."
-        raise wrong(path, "cameras.principal_point", sentence)
+        raise bad_file(path, "cameras.principal_point", sentence)
     return lens
 
 
@@ -88,7 +89,7 @@ def read_lenses(columns: Columns, sensor: Path | None) -> tuple[Lens, ...]:
     if sensor is None and not path.is_file():
         needed = "width_px,height_px" if own else "focal,sensor_x,sensor_y (mm)"
         sentence = f"has angles but no sensor. Give --sensor a table with the columns {needed}."
-        raise wrong(columns.path, "cameras.sensor_missing", sentence, columns=needed)
+        raise bad_file(columns.path, "cameras.sensor_missing", sentence, columns=needed)
     if not own:
         return (read_sensor(path),) * len(columns.labels)
     if not _is_xml(check_input(path)) and _names(path) >= set(FRAME):
@@ -143,15 +144,14 @@ def write_table(folder: File, cameras: Cameras) -> None:
         If a file exists.
     """
     target = Path(folder)
-    if cameras.rotations is None or cameras.lenses is None:
-        raise checks.needs_lenses(target)
+    _, lenses = checks.block_to_write(target, cameras, lambda _: True)
     if cameras.crs is not None and is_topocentric(cameras.crs):
         sentence = (
             f"a table cannot hold the axes {cameras.crs}. Bring the cameras to a projected CRS"
             " first."
         )
-        raise wrong(target, "output.crs", sentence, crs=cameras.crs)
-    distinct = list(dict.fromkeys(cameras.lenses))
+        raise bad_file(target, "output.crs", sentence, crs=cameras.crs)
+    distinct = list(dict.fromkeys(lenses))
     if len(distinct) == 1:
         sensor, poses = _sensor(target, distinct[0]), _poses(cameras, None)
     else:
@@ -161,11 +161,11 @@ def write_table(folder: File, cameras: Cameras) -> None:
                 "a table holds several lenses only in pixels and of one frame size. Take another"
                 " format."
             )
-            raise wrong(target, "output.lens", sentence)
+            raise bad_file(target, "output.lens", sentence)
         sensor = _row({"width_px": distinct[0].width, "height_px": distinct[0].height})
         side = max(distinct[0].width, distinct[0].height)
         own = []
-        for lens in cameras.lenses:  # f, px, py, k1 ... k4, t1, t2 as RealityCapture has them
+        for lens in lenses:  # f, px, py, k1 ... k4, t1, t2 as RealityCapture has them
             radial, _, tangential = _brown(target, lens, (4, 0, 2))
             x, y = lens.principal_x - lens.width / 2.0, lens.principal_y - lens.height / 2.0
             row = [lens.focal * FILM_MM / side, x / side, y / side, *radial, *tangential]
