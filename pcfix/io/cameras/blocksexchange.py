@@ -78,7 +78,10 @@ def _read_bytes(path: Path) -> bytes:
     data = path.read_bytes()
     if data.startswith(ZIP_MAGIC):
         with checks.reading(path), zipfile.ZipFile(path) as archive:
-            entry = next(e for e in archive.infolist() if e.filename.lower().endswith(".xml"))
+            found = [e for e in archive.infolist() if e.filename.lower().endswith(".xml")]
+            if not found:
+                raise damaged(path, "the archive has no XML document")
+            entry = found[0]
             if entry.file_size > LARGEST_RATIO * (entry.compress_size + 1):
                 raise damaged(path, "the archive unpacks to far too much")
             data = archive.read(entry)
