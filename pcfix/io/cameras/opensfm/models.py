@@ -63,6 +63,8 @@ _MODELS: dict[str, tuple[Projection, int]] = {
     "dual": ("dual", 2),
 }
 _TANGENTIAL = frozenset({"brown", "fisheye62", "fisheye624"})
+_WRITTEN = ("perspective", "brown", "fisheye", "fisheye_opencv", "fisheye62", "fisheye624", "dual")
+"""The simplest first."""
 _SIZE = re.compile(r" (\d{2,6}) (\d{2,6}) [a-z_]+\d* ")
 
 
@@ -142,10 +144,20 @@ def write_opensfm(path: File, cameras: Cameras, tie_points: TiePoints | None = N
     names = {each: f"pcfix {i}" for i, each in enumerate(models, start=1)}
     ties = tie_points or NO_TIE_POINTS
     kept = np.flatnonzero(are_seen(ties))
+    from scipy.spatial.transform import Rotation
+
     there, points, place = _world(cameras, ties.xyz[kept], str(target))
+    rotations = np.asarray(there.rotations)
+    turns = Rotation.from_matrix(rotations).as_rotvec()
+    shifts = -np.einsum("kij,kj->ki", rotations, there.centres)
     chosen: dict[str, Any] = {
         "cameras": {names[each]: model for each, model in models.items()},
-        "shots": _shots(there, names),
+        "shots": {
+            label: {"rotation": turn, "translation": shift, "camera": names[one]}
+            for label, turn, shift, one in zip(
+                cameras.labels, turns.tolist(), shifts.tolist(), lenses, strict=True
+            )
+        },
         "points": {
             str(i): {"color": list(GREY), "coordinates": row}
             for i, row in enumerate(points.tolist())
@@ -164,44 +176,30 @@ def write_opensfm(path: File, cameras: Cameras, tie_points: TiePoints | None = N
 
 def opensfm_camera(path: Path, given: Lens) -> dict[str, Any]:
     """Return the simplest entry of `cameras` that is exactly this lens."""
-    if given.unit == "px":
-        for camera in _candidates(given):
-            if is_same_lens(lens(path, "1", camera), given):
-                return camera
-    raise lens_not_held(path, given)
-
-
-def _candidates(given: Lens) -> Iterator[dict[str, Any]]:
-    """Yield the entries that may be the lens, the simplest first."""
     scale = max(given.width, given.height)
-    radial = {f"k{i + 1}": value for i, value in enumerate((*given.radial, *(0.0,) * 6)[:6])}
-    p2, p1 = (*given.tangential, 0.0, 0.0)[:2]
+    size = {"width": int(given.width), "height": int(given.height)}
     one = {"focal": given.focal / scale}
-    two: dict[str, Any] = {
+    two = {
         "focal_x": (given.focal + given.b1) / scale,
         "focal_y": given.focal / scale,
         "c_x": (given.principal_x - given.width / 2.0) / scale,
         "c_y": (given.principal_y - given.height / 2.0) / scale,
     }
-    bent = {"p1": p1, "p2": p2}
+    p2, p1 = (*given.tangential, 0.0, 0.0)[:2]
     prism = {f"s{i}": value for i, value in enumerate((*given.thin_prism, *(0.0,) * 4)[:4])}
-    for projection, model, more, count in (
-        ("perspective", "perspective", one, 2),
-        ("perspective", "brown", two | bent, 3),
-        ("equidistant", "fisheye", one, 2),
-        ("equidistant", "fisheye_opencv", two, 4),
-        ("equidistant", "fisheye62", two | bent, 6),
-        ("equidistant", "fisheye624", two | bent | prism, 6),
-        ("dual", "dual", one | {"transition": given.shape[0] if given.shape else 0.5}, 2),
-    ):
+    radial = (*given.radial, *(0.0,) * 6)
+    for model in _WRITTEN if given.unit == "px" else ():
+        projection, count = _MODELS[model]
         if projection == given.projection:
-            yield {
-                "projection_type": model,
-                "width": int(given.width),
-                "height": int(given.height),
-                **more,
-                **dict(list(radial.items())[:count]),
-            }
+            camera: dict[str, Any] = {"projection_type": model, **size}
+            camera |= one if model in ("perspective", "fisheye", "dual") else two
+            camera |= {f"k{i + 1}": radial[i] for i in range(count)}
+            camera |= {"p1": p1, "p2": p2} if model in _TANGENTIAL else {}
+            camera |= prism if model == "fisheye624" else {}
+            camera |= {"transition": (*given.shape, 0.5)[0]} if model == "dual" else {}
+            if is_same_lens(lens(path, "1", camera), given):
+                return camera
+    raise lens_not_held(path, given)
 
 
 def _world(
@@ -240,20 +238,6 @@ def _topocentric(degrees: FloatArray, place: Topocentric) -> FloatArray:
         f" +lon_0={place.longitude_deg!r} +h_0={place.height_m!r}"
     )
     return np.column_stack(to_axes.transform(*to_geocentric.transform(*degrees.T)))
-
-
-def _shots(cameras: Cameras, names: dict[Lens, str]) -> dict[str, Any]:
-    from scipy.spatial.transform import Rotation
-
-    rotations = np.asarray(cameras.rotations)
-    turns = Rotation.from_matrix(rotations).as_rotvec().tolist()
-    shifts = -np.einsum("kij,kj->ki", rotations, cameras.centres)
-    return {
-        label: {"rotation": turn, "translation": shift, "camera": names[lens]}
-        for label, turn, shift, lens in zip(
-            cameras.labels, turns, shifts.tolist(), cameras.lenses or (), strict=True
-        )
-    }
 
 
 def _tracks(cameras: Cameras, tie_points: TiePoints, kept: IntArray) -> Iterator[str]:
