@@ -41,7 +41,7 @@ SPELLINGS: dict[str, tuple[str, ...]] = {
 """What a column is, and its names; where several are there, the first counts."""
 POSE = ("x", "y", "z", "longitude", "latitude", "yaw", "pitch", "roll", "omega", "phi", "kappa")
 _OWN_NAMES = (
-    *("omega", "phi", "kappa", "qw", "qx", "qy", "qz", "enable", "tx", "ty", "tz", "alpha", "nu"),
+    *("omega", "phi", "kappa", "qw", "qx", "qy", "qz", "enable", "tx", "ty", "tz"),
     *(f"r{i}{j}" for i in "123" for j in "123"),
     *("f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2"),
     *(f"{role}_est" for role in POSE),
@@ -160,7 +160,7 @@ class Columns:
     @cached_property
     def labels(self) -> list[str]:
         """The names of the images, none empty."""
-        labels = [row[self.place["label"]] for row in self.table.rows]
+        labels = self.table.column(self.name("label"))
         if "" in labels:
             line = self.table.line[labels.index("")]
             sentence = f"line {line}: the image has no name. Give it one."
