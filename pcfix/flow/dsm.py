@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.flow.runner import FileTask, Progress, file_task
+from pcfix.flow.runner import FileTask, Progress, file_task, write_summary
 from pcfix.flow.sorted_points import BLOCK_CELLS, DIMENSIONS, SortedPoints, point_spacing_m
 from pcfix.grid.delaunay import fill_holes, margin_cells
 from pcfix.grid.heights import Gridding, as_uncertainty, grid_window
@@ -129,7 +129,7 @@ def grid_dsm(
         counts=str(more["counts"]) if "counts" in more else None,
         resolution_is="given" if given.resolution else "chosen",
     )
-    task.tell(result.as_dict())
+    write_summary(task, result.as_dict())
     return result
 
 

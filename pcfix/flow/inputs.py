@@ -18,7 +18,9 @@ from pcfix.io.cameras.georeference import Georeference, georeference
 from pcfix.io.vectors import LAYER_MARK
 from pcfix.io.views import ViewList
 from pcfix.label.areas import WaterMask
+from pcfix.label.labelling import Labelling
 from pcfix.model import Cameras, FloatArray, TiePoints, ViewKind
+from pcfix.options.correct import LabelRules
 from pcfix.options.declare import File, options_of
 from pcfix.options.shared import InputOptions
 from pcfix.port.shapes import port_of
@@ -184,6 +186,12 @@ def mask_of(
     polygons = read_water_polygons(path, cloud_crs)
     _warn(polygons.notes)
     return WaterMask(polygons.area, polygons.name, low, high, tuple(map(str, polygons.notes)))
+
+
+def labelling_of(options: Any, view: CloudView) -> Labelling:
+    """Return the rules by which points count as submerged, with the mask in the cloud's CRS."""
+    mask = mask_of(options.water_mask, view.crs, view.low, view.high)
+    return Labelling(options.part(LabelRules), mask)
 
 
 def _warn(notes: Iterable[str | PcfixWarning]) -> None:

@@ -161,7 +161,7 @@ class Files:
         """Remove the clouds that an earlier run made of other files."""
         kept = {*self.parts(self.corrected), *self.parts(self.cleaned)}
         for one in CLOUDS:
-            records = (self.folder / one / RECORDS).glob("*.la[sz].npz")
+            records = (self.folder / one / RECORDS).glob("*.la[sz].tally")
             made = {self.folder / one / path.stem: path for path in records}
             for path in {self.folder / f"{one}.laz", *made} - kept:
                 path.unlink(missing_ok=True)

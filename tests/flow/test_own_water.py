@@ -3,10 +3,10 @@
 import laspy
 import numpy as np
 import pytest
+from pcfix.flow.through_water import OWN_WATER
 
 import pcfix
 from pcfix.errors import InputError, PcfixWarning, SettingError
-from pcfix.flow.through_water import OWN_WATER
 from pcfix.io.water_rasters import write_water_raster
 from pcfix.model import Lens, WaterRaster
 from tests.pdal_stage.test_arrays import arrays_of, metadata_of
