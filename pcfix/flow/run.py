@@ -119,9 +119,8 @@ def run_all(
         say(f"{name:<9} {done}: {shown}{more(result) if more else ''}")
         return result
 
-    asked = replace(request.adjust_step(), cloud=request.source)
     first, was_done = do(
-        "adjust", outputs_of(out_dir), lambda _: adjust_first(asked, out_dir, inputs, jobs)
+        "adjust", outputs_of(out_dir), lambda _: adjust_first(request, out_dir, inputs, jobs)
     )
     _say_adjusted(first, out_dir, was_done, say)
     request = request.with_adjusted(out_dir, first)

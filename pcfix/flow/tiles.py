@@ -10,10 +10,8 @@ from __future__ import annotations
 import json
 import pickle
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial, reduce
+from functools import reduce
 from hashlib import sha256
 from operator import add
 from pathlib import Path
@@ -22,7 +20,7 @@ from typing import Any
 
 from pcfix import version
 from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError
-from pcfix.flow.cluster import Run, in_processes, on_cluster
+from pcfix.flow.cluster import machines
 from pcfix.flow.record import belonging
 from pcfix.flow.runner import (
     Command,
@@ -42,8 +40,6 @@ from pcfix.options.declare import File, options_of
 RECORDS = ".pcfix"
 HOW = ("overwrite", "jobs", "scheduler", "summary")
 """Options on which no output depends."""
-POINTS_A_PROCESS = 500_000
-"""These take about as long as another process takes to start."""
 
 
 @dataclass(frozen=True)
@@ -127,8 +123,8 @@ def run_tiles(
     todo = [tile for tile in work.values() if tile not in done]
     for tile in todo if folder.exists() else ():
         check_cloud(tile.target, overwrite=options.overwrite, inputs=tiles.paths)
-    result = None
-    with threads(options.jobs), _machines(options, sum(one.points for one in todo)) as run:
+    result, points = None, sum(one.points for one in todo)
+    with threads(options.jobs), machines(options.scheduler, options.jobs, points) as run:
         plan, readable = _planned(command, tiles, folder)
         try:
             (folder / RECORDS).mkdir(parents=True, exist_ok=True)
@@ -221,14 +217,3 @@ def _planned(command: Command, tiles: Tiles, folder: Path) -> tuple[Any, Tiles]:
             return command.plan(tiles, folder, None), tiles
         except BrokenTileError as error:
             tiles = tiles.without(error.path, str(error))
-
-
-@contextmanager
-def _machines(options: Any, points: int) -> Iterator[Run]:
-    """Give the function that runs tasks with this number of points."""
-    if options.scheduler is None:
-        jobs = options.jobs
-        yield partial(in_processes, jobs, jobs or 1 + points // POINTS_A_PROCESS)
-    else:
-        with on_cluster(options.scheduler) as run:
-            yield run

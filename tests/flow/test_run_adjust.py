@@ -32,7 +32,7 @@ from tests.utils.program import run_pcfix
 
 def first_step(request, folder):
     inputs = [path for some in request.files().values() for path in some]
-    return adjust_first(request.adjust_step(), folder, inputs)
+    return adjust_first(request, folder, inputs)
 
 
 ORIGIN_M = (319900.0, 3842700.0, 0.0)
