@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,7 +34,6 @@ TIMED = (".json", ".geojson")
 """Camera files that may hold the time of each image."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class Inputs(InputOptions):
     """Cameras, view list and water as the user gives them.
 

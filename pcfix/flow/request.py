@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,6 @@ from pcfix.water.index import Water, with_index
 CLOUDS = ("corrected", "cleaned")
 
 
-@dataclass(frozen=True, kw_only=True)
 class Request(RunOptions):
     """Everything that the results of a run depend on; ``run.json`` keeps it."""
 

@@ -23,6 +23,7 @@ from typing import (
     TypeAlias,
     TypeVar,
     Union,
+    dataclass_transform,
     get_args,
     get_origin,
 )
@@ -201,14 +202,21 @@ def option(default: Any, help: str, **more: Any) -> Any:
     return field(default=default, metadata={"option": Option(help, **more)})
 
 
+@dataclass_transform(kw_only_default=True, frozen_default=True)
 @dataclass(frozen=True, kw_only=True)
 class OptionSet:
     """The base of all classes of options: every value is checked against its declaration.
 
-    A class says in which `panel` of the help its own options stand.
+    Its subclasses are frozen dataclasses. A class says in which `panel` of the help its own options
+    are.
     """
 
     panel: ClassVar[str] = ""
+
+    def __init_subclass__(cls, panel: str = "") -> None:
+        """Make a subclass a dataclass."""
+        cls.panel = panel
+        dataclass(frozen=True, kw_only=True)(cls)
 
     def __post_init__(self) -> None:
         """Check every option, then what they say together."""
