@@ -25,16 +25,14 @@ _GROUPS: dict[str, Group] = {
 
 MANY = 20
 """Of a command with more options `--help` shows the essential ones, and `--help-all` all."""
-_ESSENTIAL = frozenset(
-    (
-        "adjust", "adjusted_from", "also", "bed", "block", "cameras", "cameras_crs", "cloud",
-        "connected", "depth", "drop", "dsm", "floating", "free", "gcps", "gnss", "gsd", "index",
-        "jobs", "lens", "mapping", "max_angle", "max_incidence", "max_ray_miss", "method",
-        "min_rays", "out_dir", "overwrite", "plot", "points", "port", "project", "radius",
-        "rebuild", "reference", "resolution", "section", "seed", "shoreline", "submerged", "summary",
-        "surface", "uncorrected", "views", "water", "water_mask",
-    )
-)  # fmt: skip
+_ESSENTIAL = {
+    "adjust", "adjusted_from", "also", "bed", "block", "cameras", "cameras_crs", "cloud",
+    "connected", "depth", "drop", "dsm", "floating", "free", "gcps", "gnss", "gsd", "index",
+    "jobs", "lens", "mapping", "max_angle", "max_incidence", "max_ray_miss", "method",
+    "min_rays", "out_dir", "overwrite", "plot", "points", "port", "project", "radius",
+    "rebuild", "reference", "resolution", "section", "seed", "shoreline", "submerged",
+    "summary", "surface", "uncorrected", "views", "water", "water_mask",
+}  # fmt: skip
 """Options that most people need, by name."""
 
 
