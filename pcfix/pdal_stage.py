@@ -93,8 +93,9 @@ def _run(work: Work, namespace: dict[str, Any], ins: Dimensions, outs: Dimension
 
 
 def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
-    from pcfix.flow.correction import check, correct_chunk, plan_correction, read_inputs, summarize
+    from pcfix.flow.correction import correct_chunk, plan_correction, read_inputs
     from pcfix.flow.inputs import paths_in
+    from pcfix.flow.outcome import check, summarize
     from pcfix.flow.runner import Ends, check_summary, write_summary
     from pcfix.io.las.columns import columns_for
     from pcfix.kernels import threads

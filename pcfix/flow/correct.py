@@ -17,15 +17,14 @@ from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.correction import (
     CloudTally,
     Plan,
-    check,
     correct_chunk,
     plan_correction,
     read_inputs,
-    summarize,
     water_plan,
 )
 from pcfix.flow.inputs import Inputs, paths_in
 from pcfix.flow.old_cameras import paired
+from pcfix.flow.outcome import check, summarize
 from pcfix.flow.plausibility import Flight, plausible
 from pcfix.flow.runner import Check, Chunk, Command, FileTask, Progress, run_command, stream
 from pcfix.flow.surfaces import CloudView, Points, corners, points_of, view_of
