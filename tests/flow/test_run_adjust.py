@@ -135,27 +135,17 @@ def test_first_step(finished):
 def test_report(finished):
     folder, _ = finished
     page = (folder / "report.html").read_text()
-    for words in (
-        "Refractive bundle adjustment", "Focal length", "Residuals under water (rms)",
-        "Centres minus GNSS", "as that was asked for", "First the whole cloud, land too",
-    ):  # fmt: skip
+    for words in ("Refractive bundle adjustment", "Focal length", "Centres minus GNSS"):
         assert words in page
     assert '<a href="adjusted/report.html">' in page
     summary = json.loads((folder / "adjusted" / "adjustment.json").read_text())
     assert f"{summary['poses']['moved_rms_m']:.3f} m</td>" in page
     assert summary["gnss"]["rms_before_m"][2] > summary["gnss"]["rms_m"][2]
-
-
-def test_report_compares(finished):
-    folder, _ = finished
-    page = (folder / "report.html").read_text()
     found = json.loads((folder / "compare" / "compare.json").read_text())
-    for name, words in (("bed", "of the bed fell from"), ("land", "Land:")):
+    for name in ("bed", "land"):
         before, after = (found[name][when]["rmse_m"] for when in ("before", "after"))
         assert before > 1.5 * after  # planes through the few points of this scene blur both
-        assert f"{words} {before:.3f} to {after:.3f} m" in page
-        for when in ("as it came", "corrected"):
-            assert f"{name.capitalize()}, vertical error, {when}" in page
+        assert f"{before:.3f} to {after:.3f} m" in page
     counts = [found[name]["after"]["count"] for name in ("bed", "land")]
     assert sum(counts) == found["counts"]["compared"]
 
@@ -170,15 +160,10 @@ def test_notes(scene, finished, monkeypatch):
     assert any(line.strip() == "The GNSS positions lie 0.3 m above" for line in said)
 
 
-def test_resumed(scene, finished):
-    folder, _ = finished
-    said = []
+def test_resumed(scene, finished, tmp_path, monkeypatch):
+    folder, said = finished[0], []
     run_all(scene.whole(), folder, say=said.append)
     assert sum("done before" in line for line in said) == len(STEPS)
-
-
-def test_record(finished, tmp_path, monkeypatch):
-    folder, _ = finished
     seen = []
     monkeypatch.setattr("pcfix.flow.run.run_all", lambda request, *_, **__: seen.append(request))
     words = ["run", str(tmp_path / "again"), "--config", str(folder / "run.json")]

@@ -2,6 +2,7 @@
 
 import json
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -15,6 +16,7 @@ import rasterio
 from pyproj import CRS
 
 import pcfix
+from pcfix.io.files import read_tally
 from pcfix.io.tiles import tiles_of
 from tests.utils.codes import refused
 from tests.utils.nightly import mostly_nightly
@@ -137,6 +139,16 @@ def test_kinds_of_input(cloud):
     for given in (folder, f"{folder}/*.laz", listed, index, paths):
         assert [one.resolve() for one in tiles_of(given).paths] == list(paths)
     assert tiles_of(merged) is None
+
+
+def test_records(cloud, tmp_path):
+    """A record names sums and arrays only: nothing else in it is ever called."""
+    pcfix.label_file(cloud[0], tmp_path / "out", water=0.37)
+    record = tmp_path / "out" / ".pcfix" / "tile0.laz.tally"
+    key, tally = read_tally(record)
+    assert len(key) == 64 and tally.points == 5000
+    record.write_bytes(pickle.dumps((key, Path("elsewhere"))))
+    assert read_tally(record) == ("", None)
 
 
 def test_resumes(cloud, tmp_path):
