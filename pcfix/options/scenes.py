@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Literal
 
 from pcfix.errors import SettingError
@@ -17,11 +16,8 @@ CloudKind = Literal["tracks", "pairs", "depth-maps"]
 _MOST_DEPTHS = 100
 
 
-@dataclass(frozen=True, kw_only=True)
-class FlightOptions(OptionSet):
+class FlightOptions(OptionSet, panel=Panel.FLIGHT):
     """How the block is flown."""
-
-    panel = Panel.FLIGHT
 
     block: BlockKind = option("nadir", "Only nadir images, or oblique ones too.")
     cameras: int | None = option(
@@ -63,11 +59,8 @@ class FlightOptions(OptionSet):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class CameraOptions(OptionSet):
+class CameraOptions(OptionSet, panel=Panel.CAMERA):
     """The camera, and how well it measures."""
-
-    panel = Panel.CAMERA
 
     focal_mm: float = option(8.8, "Focal length.", least=0.5, most=2000)
     sensor_mm: tuple[float, float] = option(
@@ -83,11 +76,8 @@ class CameraOptions(OptionSet):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class SceneWaterOptions(IndexOptions):
+class SceneWaterOptions(IndexOptions, panel=Panel.WATER):
     """The water and the ground."""
-
-    panel = Panel.WATER
 
     water: float = option(0.37, "Water level in the middle of the area.", unit="m")
     wave_slope_deg: float = option(
@@ -110,11 +100,8 @@ class SceneWaterOptions(IndexOptions):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class SceneCloudOptions(OptionSet):
+class SceneCloudOptions(OptionSet, panel=Panel.CLOUDS):
     """The cloud that is reconstructed from the images, and the LiDAR."""
-
-    panel = Panel.CLOUDS
 
     points: int = option(100_000, "Points of the cloud.", least=1)
     cloud: CloudKind = option(
@@ -143,7 +130,6 @@ class SceneCloudOptions(OptionSet):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
 class SceneOptions(SceneCloudOptions, SceneWaterOptions, CameraOptions, FlightOptions):
     """The options of a simulated scene."""
 
@@ -167,17 +153,11 @@ def depth_series(option: str, text: str) -> tuple[float, ...]:
     return tuple(round(first + i * step, 9) for i in range(int(count)))
 
 
-@dataclass(frozen=True, kw_only=True)
-class SimulateOptions(OverwriteOption, SceneOptions):
+class SimulateOptions(OverwriteOption, SceneOptions, panel=Panel.OUTPUT):
     """The options of ``pcfix simulate``."""
 
-    panel = Panel.OUTPUT
 
-
-@dataclass(frozen=True, kw_only=True)
-class DemoOptions(OverwriteOption):
+class DemoOptions(OverwriteOption, panel=Panel.OUTPUT):
     """The options of ``pcfix demo``."""
-
-    panel = Panel.OUTPUT
 
     points: int = option(50_000, "Points of each scene.")

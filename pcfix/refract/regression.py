@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, NoReturn
 
 import numpy as np
 
 from pcfix.errors import GeometryError, SettingError
 from pcfix.model import BoolArray, FloatArray, IntArray
-from pcfix.sums import Sums
+from pcfix.sums import MOST, Sums
 from pcfix.water.surface import SurfaceAbove, is_submerged
 
 LEAST_COUNT, FEW = 3, 10
@@ -172,34 +172,33 @@ LEAST_BEYOND = 0.05
 """Share of the points beyond the depths of a line from which its own cloud is worth a note."""
 
 
+@dataclass(frozen=True)
 class BeyondRange(Sums):
-    """Counts apparent depths beyond those that a line was fitted to; noted above a share."""
+    """Counts of apparent depths beyond those that a line was fitted to."""
 
-    added, most = ("_count", "_shallower", "_deeper"), ("_deepest_m",)
+    count: int
+    shallower: int
+    deeper: int
+    deepest_m: float = field(metadata=MOST)
 
-    def __init__(self, line: DepthRegression, least: float = 0.0) -> None:
-        self._least = least
-        self._line, self._count, self._shallower, self._deeper = line, 0, 0, 0
-        self._deepest_m = 0.0
+    @classmethod
+    def of(cls, apparent_m: FloatArray, line: DepthRegression) -> BeyondRange:
+        """Return the counts of submerged points, shape (m,)."""
+        shallower = int((apparent_m < line.shallowest_m).sum())
+        deeper = int((apparent_m > line.deepest_m).sum())
+        return cls(len(apparent_m), shallower, deeper, float(apparent_m.max(initial=0.0)))
 
-    def add(self, apparent_m: FloatArray) -> None:
-        """Add submerged points, shape (m,)."""
-        self._count += len(apparent_m)
-        self._shallower += int((apparent_m < self._line.shallowest_m).sum())
-        self._deeper += int((apparent_m > self._line.deepest_m).sum())
-        self._deepest_m = max(self._deepest_m, float(apparent_m.max(initial=0.0)))
-
-    def notes(self) -> list[str]:
-        """Return a sentence on them, if there are any."""
-        if self._shallower + self._deeper <= self._least * self._count:
+    def notes(self, line: DepthRegression, least: float = 0.0) -> list[str]:
+        """Return a sentence on them if their share is above `least`."""
+        if self.shallower + self.deeper <= least * self.count:
             return []
-        of = 100.0 / self._count
+        of = 100.0 / self.count
         return [
-            f"The regression was fitted to apparent depths of {self._line.shallowest_m:.2f} to"
-            f" {self._line.deepest_m:.2f} m and is extrapolated for"
-            f" {of * (self._shallower + self._deeper):.1f} % of the submerged points"
-            f" ({of * self._shallower:.1f} % shallower, {of * self._deeper:.1f} % deeper, down to"
-            f" {self._deepest_m:.2f} m), where SigmaZ grows."
+            f"The regression was fitted to apparent depths of {line.shallowest_m:.2f} to"
+            f" {line.deepest_m:.2f} m and is extrapolated for"
+            f" {of * (self.shallower + self.deeper):.1f} % of the submerged points"
+            f" ({of * self.shallower:.1f} % shallower, {of * self.deeper:.1f} % deeper, down to"
+            f" {self.deepest_m:.2f} m), where SigmaZ grows."
         ]
 
 

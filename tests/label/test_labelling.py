@@ -1,6 +1,9 @@
 """Dead band, connectivity, class 41 and respected classes on shores with a known waterline."""
 
 from collections import defaultdict
+from functools import reduce
+from operator import add
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,8 +25,7 @@ def part_of(xyz, classes=None, level=WATER_M):
 
 
 def labelled(part, mask=None, pieces=1, corners=None, **choices):
-    """Label a cloud in pieces; return the classes and the labelling."""
-    labelling = Labelling(LabelRules(**choices), mask)
+    """Label a cloud in pieces; return the classes and what was counted."""
     rows = np.array_split(np.arange(len(part.xyz)), pieces)
 
     def parts():
@@ -31,10 +33,15 @@ def labelled(part, mask=None, pieces=1, corners=None, **choices):
             above = SurfaceAbove(part.surface.height_m[r], part.surface.slope[r])
             yield Part(part.xyz[r], above, part.classes[r])
 
-    if labelling.looks_around:
-        low, high = part.xyz[:, :2].min(axis=0), part.xyz[:, :2].max(axis=0)
-        labelling.look_around(parts, *(corners or (low, high)))
-    return np.concatenate([labelling.labels(p).classes for p in parts()]), labelling
+    low, high = part.xyz[:, :2].min(axis=0), part.xyz[:, :2].max(axis=0)
+    labelling = Labelling(LabelRules(**choices), mask).scanned(parts, *(corners or (low, high)))
+    labels = [labelling.labels(p) for p in parts()]
+    counts = reduce(add, [one.counts for one in labels])
+    counted = SimpleNamespace(
+        report=lambda: labelling.report(counts),
+        check=lambda name, submerged=None: labelling.check(name, counts, submerged),
+    )
+    return np.concatenate([one.classes for one in labels]), counted
 
 
 def beach(count=60_000, noise_m=0.03, seed=1):
