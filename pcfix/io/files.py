@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import mimetypes
 import mmap
 import os
 import pickle
@@ -156,23 +155,6 @@ def sha256(path: Path) -> str:
     """Return the checksum of a file, as hexadecimal digits."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
-def digest_of(path: Path) -> str:
-    """Return the checksum of the content of a file, or of a folder of a project.
-
-    There images, videos and whatever is large go by size and time.
-    """
-    if not path.is_dir():
-        return sha256(path)
-    parts = []
-    for one in sorted(path.rglob("*")):
-        kind = mimetypes.guess_type(one.name)[0] or ""
-        if one.is_file():
-            light = one.stat().st_size < LARGE_BYTES and not kind.startswith(("image", "video"))
-            parts.append(sha256(one) if light else str(file_state(one)))
-            parts.append(str(one.relative_to(path)))
-    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 
 def write_tally(path: Path, key: str, tally: Any) -> None:
