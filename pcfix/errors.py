@@ -26,9 +26,7 @@ class CodedError(Exception):
         What a program may want: the file, the offending value, its limit.
     """
 
-    def __init__(self, code: str, message: object = None, **values: Any) -> None:
-        if message is None:  # until every sentence has a code
-            code, message = "", code
+    def __init__(self, code: str, message: object, **values: Any) -> None:
         self.code, self.message, self.values = code, brief(str(message)), values
         super().__init__(code, self.message)
 
@@ -68,6 +66,11 @@ class GeometryError(PcfixError):
 
 class PcfixWarning(CodedError, UserWarning):  # noqa: N818
     """Something that affects the result and that the user can act on."""
+
+
+def coded(code: str, notes: Iterable[object]) -> list[PcfixWarning]:
+    """Return notes as warnings; those that are sentences only get a code."""
+    return [one if isinstance(one, PcfixWarning) else PcfixWarning(code, one) for one in notes]
 
 
 def _plain(value: Any) -> Any:

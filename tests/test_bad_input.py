@@ -276,7 +276,7 @@ OUTPUTS = {
 RESTORED = {
     "cloud.not_corrected": ["cloud.las back.las"],
     "cloud.vlr_damaged": [f"r_{name}.las back.las" for name in RECORDS],
-    "cloud.no_way_back": ["none.las back.las", "minimal.las back.las", "no_shift.las back.las"],
+    "cloud.cannot_restore": ["none.las back.las", "minimal.las back.las", "no_shift.las back.las"],
     "output.exists": ["cloud.las taken.las"],
     "output.is_input": ["all.las all.las"],
     "output.no_folder": ["all.las nowhere/back.las"],

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from pcfix.adjust.transfer import CloudTransfer, TransferCounts
-from pcfix.errors import SettingError
+from pcfix.errors import PcfixWarning, SettingError, coded
 from pcfix.flow.diagnosis import ties_of
 from pcfix.flow.inputs import Inputs, labelling_of, paths_in
 from pcfix.flow.learning import batch_of, check_regression, learn_of_cloud, regression_of
@@ -110,7 +110,7 @@ class Plan:
     settings: dict[str, Any] = field(default_factory=dict)
     verdicts: tuple[Verdict, ...] = ()
     of_unlisted: tuple[Verdict, ...] = ()
-    notes: tuple[str, ...] = ()
+    notes: tuple[PcfixWarning, ...] = ()
     own_notes: tuple[str, ...] = ()
     no_poses: str = ""
 
@@ -339,7 +339,7 @@ def plan_correction(plan: Plan, line: DepthRegression | None = None) -> Plan:
         survey = with_poses(survey, pose_errors(sample, survey, plan.adjustment, pair))
     plan = replace(plan, survey=survey, labelling=labelling, settings=settings,
                    verdicts=facts.verdicts, of_unlisted=facts.of_unlisted,
-                   notes=(*line_notes, *facts.notes))  # fmt: skip
+                   notes=(*coded("regression.fit", line_notes), *facts.notes))  # fmt: skip
     return plan if first is None else _with_type_of_list(plan, first)
 
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.errors import GeometryError, SettingError
+from pcfix.errors import GeometryError, PcfixWarning, SettingError, coded
 from pcfix.flow.surfaces import CloudView, Points, parts_of
 from pcfix.io.regressions import read_regression
 from pcfix.io.tables import CheckDepths, read_check_depths
@@ -63,7 +63,7 @@ class CloudFacts(NamedTuple):
     survey: Survey
     verdicts: tuple[Verdict, ...] = ()
     of_unlisted: tuple[Verdict, ...] = ()
-    notes: tuple[str, ...] = ()
+    notes: tuple[PcfixWarning, ...] = ()
 
 
 def learn_of_cloud(
@@ -110,7 +110,7 @@ def learn_of_cloud(
         return CloudFacts(survey)
     (sample, near), tie_points = _sample(survey, view, chunks, original), ties()
     sample, factor = with_factor(sample)
-    notes = [] if factor is None else [str(factor)]
+    notes = coded("cloud.depth_factor", [] if factor is None else [factor])
     if factor is not None:
         survey, given = sample.survey, replace(given, depth_factor=factor.factor)
     notes += _note_corrected(sample, tie_points)
@@ -126,18 +126,19 @@ def learn_of_cloud(
     return CloudFacts(survey, (), of_unlisted, tuple(notes))
 
 
-def _note_corrected(sample: Batch, ties: TiePoints | None) -> list[str]:
+def _note_corrected(sample: Batch, ties: TiePoints | None) -> list[PcfixWarning]:
     """Note a cloud that is deeper than the tie points of its cameras."""
     ratio = None if ties is None else depth_ratio(submerged_of(sample), ties)
     if ratio is None or ratio <= CORRECTED_RATIO:
         return []
-    return [
+    sentence = (
         f"The cloud is {ratio:.2f} times as deep as the tie points of its cameras, as if it"
         " had been corrected before. Give the cloud as the matcher wrote it."
-    ]
+    )
+    return [PcfixWarning("cloud.corrected_before", sentence, ratio=ratio)]
 
 
-def _note_flat(sample: Batch, survey: Survey) -> list[str]:
+def _note_flat(sample: Batch, survey: Survey) -> list[PcfixWarning]:
     """Note how many points only oblique images see, and where."""
     rows = np.flatnonzero(is_submerged(sample.xyz[:, 2], sample.surface))
     wet = replace(sample.take(rows[:: 1 + len(rows) // FLAT_SAMPLE]), survey=survey)
@@ -146,12 +147,13 @@ def _note_flat(sample: Batch, survey: Survey) -> list[str]:
         return []
     low, high = np.percentile(wet.xyz[flat, :2], (2.0, 98.0), axis=0)
     keeps = survey.settings.unsure == "keep"
-    return [
+    sentence = (
         f"About {100.0 * flat.mean():.0f} % of the submerged points have only rays beyond"
         f" {FLAT_DEG:g} degrees, nearly all between {low[0]:.0f}, {low[1]:.0f} and"
         f" {high[0]:.0f}, {high[1]:.0f}. Their depths are the least certain; add nadir images"
         + (", or flag them with --unsure withhold." if keeps else ".")
-    ]
+    )
+    return [PcfixWarning("cloud.obliques_only", sentence, share=float(flat.mean()))]
 
 
 def _occluder(

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pcfix.adjust.diagnosis import Evidence
-from pcfix.errors import GeometryError, PcfixWarning
+from pcfix.errors import GeometryError, PcfixWarning, coded
 from pcfix.flow.correction import CloudTally, Plan
 from pcfix.flow.diagnosis import Poses, diagnose_in_passing, quick_ties
 from pcfix.flow.plausibility import CloudSample, Flight, Plausible, plausible
@@ -157,7 +157,7 @@ def _check_block(plan: Plan, tally: CloudTally) -> Findings:
     return Findings(tested, poses, shoreline)
 
 
-def _detected(plan: Plan, tally: CloudTally) -> list[Any]:
+def _detected(plan: Plan, tally: CloudTally) -> list[PcfixWarning]:
     """Return the notes on what was detected from the cloud."""
     verdicts = {str(note): note for one in plan.verdicts for note in one.warnings()}
     beyond, line = list[str](), plan.regression
@@ -168,7 +168,12 @@ def _detected(plan: Plan, tally: CloudTally) -> list[Any]:
     if UNLISTED in plan.survey.parts:
         so = " ".join(map(str, plan.of_unlisted))
         unlisted = [f"Points in no view list are corrected as without a list. {so}"]
-    return [*plan.notes, *beyond, *verdicts.values(), *unlisted]
+    return [
+        *plan.notes,
+        *coded("regression.range", beyond),
+        *coded("cloud.reconstruction", verdicts.values()),
+        *coded("views.unlisted", unlisted),
+    ]
 
 
 def summarize(plan: Plan, tally: CloudTally, findings: Findings, ends: Ends) -> Summary:
@@ -185,7 +190,7 @@ def summarize(plan: Plan, tally: CloudTally, findings: Findings, ends: Ends) -> 
     notes = [
         *plan.cameras.notes,
         *([] if report is None else report.warnings()),
-        *plan.labelling.notes,
+        *coded("cloud.labels", plan.labelling.notes),
         *own_notes,
     ]
     return Summary(
@@ -207,10 +212,7 @@ def summarize(plan: Plan, tally: CloudTally, findings: Findings, ends: Ends) -> 
         cameras_unused=unused,
         seconds=round(ends.seconds, 3),
         views=None if report is None else report.as_dict(),
-        warnings=[
-            (one if isinstance(one, PcfixWarning) else PcfixWarning("", one)).as_dict()
-            for one in notes
-        ],
+        warnings=[one.as_dict() for one in notes],
         labelling=plan.labelling.report(tally.labels),
         settings={**options.part(ScienceOptions).as_dict(), **plan.settings},
         part=None if ends.source is None else part_report(ends.source),
@@ -248,8 +250,14 @@ def _figures_of_water(
         "cameras_left_out": _left_out(plan, tally.figures),
     }
     of_poses = [poses.warning if poses else "", plan.no_poses]
-    notes = [*tested.doubts, *detected, *plan.found.notes, *plan.own_notes, *findings.water_notes]
-    return figures, [*notes, *filter(None, of_poses)]
+    return figures, [
+        *tested.doubts,
+        *detected,
+        *coded("water.surface", plan.found.notes),
+        *coded("water.images", plan.own_notes),
+        *coded("water.extent", findings.water_notes),
+        *coded("cameras.poses", filter(None, of_poses)),
+    ]
 
 
 def _left_out(plan: Plan, figures: Tally) -> dict[str, list[str]]:
