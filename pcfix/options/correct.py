@@ -86,8 +86,8 @@ class MethodOptions(IndexOptions):
     )
     exact: bool = option(
         False,
-        "Solve every point exactly. Otherwise --method consistent interpolates where that is"
-        " within 0.05 ground pixels.",
+        "Solve every point exactly. Otherwise depth maps are interpolated where that is within"
+        " 0.05 ground pixels.",
     )
     depth_factor: float | str | None = option(
         None,
