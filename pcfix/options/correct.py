@@ -82,8 +82,8 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
     )
     exact: bool = option(
         False,
-        "Solve every point exactly. Otherwise --method consistent interpolates where that is"
-        " within 0.05 ground pixels.",
+        "Solve every point exactly. Otherwise depth maps are interpolated where that is within"
+        " 0.05 ground pixels.",
     )
     depth_factor: float | str | None = option(
         None,

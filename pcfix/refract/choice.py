@@ -14,7 +14,7 @@ from pcfix.model import Cameras, FloatArray, IntArray, Views, WaterMesh, WaterPl
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract import tiling
 from pcfix.refract.batch import Batch, Chosen, Survey
-from pcfix.refract.rays import pierce_of
+from pcfix.refract.rays import pierce
 from pcfix.refract.tiling import TILE
 from pcfix.water.surface import Field, SurfaceAbove, Tin, build_fields, build_tin, locate
 
@@ -214,7 +214,7 @@ def _choose(
         if not (inside and height > h):  # in the frame, and the camera above the water
             continue
         if h > 0.0 and is_limited and (tin is not None or fields is not None):
-            _, normal = pierce_of(c, tin, fields, lowered, e, h, upward, facet)
+            _, normal = pierce(c, tin, fields, lowered, e, h, upward, facet)
             height = max(dot(normal, e), 0.0)
         if height * height >= rule.least_cosine2 * length2:
             chosen[k], cosine2[k] = at, height * height / length2

@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 
 from pcfix.kernels import Span, device, in_tiles, kernel
-from pcfix.lens.algebra import Nine, Vector, dot, minus, row_of, scaled, vector
+from pcfix.lens.algebra import dot, minus, row_of, scaled, vector
 from pcfix.lens.frames import (
     NOT_DISTORTED,
     Frames,
@@ -43,7 +43,7 @@ from pcfix.refract.batch import (
     warn_of_unsolved,
 )
 from pcfix.refract.choice import Rig, Rule, rig_of, rule_of, shapes_of
-from pcfix.refract.rays import line_terms, nearest_point, pierce_of, refracted
+from pcfix.refract.rays import line_terms, nearest_point, pierce, ray_distance, refracted
 from pcfix.refract.tiling import TILE, nine, spatial_order, three, tiles_of
 from pcfix.refract.tracks import FOUND, LOST, POINT_RUNS, RAY_RUNS, SEARCHED, STATE, Q, search_tile
 from pcfix.refract.uncertainty import Budget, room_of
@@ -180,7 +180,7 @@ def _intersect(
                 row[_FOUND] = 1.0 if search[STATE * TILE + j] == FOUND else 0.0
                 if row[_FOUND] > 0.0:
                     row[0], row[1], row[2] = three(search, Q * TILE + j)
-                    row[_DISTANCE] = _distance(sums[9 * TILE + j], nine(sums, j), vector(row))
+                    row[_DISTANCE] = ray_distance(sums[9 * TILE + j], nine(sums, j), vector(row))
         if len(covariance):
             room = room_of(tile, result, rows)
             for k in range(seeing):
@@ -231,7 +231,7 @@ def add_camera(
         q = 1.0 / (length2 * height)
         f = h * length2 * q if use and h > 0.0 else 0.0
         if (tin is not None or fields is not None) and use and h > 0.0:
-            f, normal = pierce_of(c, tin, fields, (x, y, z - offset), e, h, normal, facet[j])
+            f, normal = pierce(c, tin, fields, (x, y, z - offset), e, h, normal, facet[j])
             height = dot(normal, e)
             q = 1.0 / (length2 * height)
         # 1 / L^2
@@ -275,15 +275,3 @@ def _solve(row: FloatArray, k: float, sums: FloatArray, marks: FloatArray) -> No
     row[_DISTANCE], row[_FOUND] = distance, 1.0
     row[_INCIDENCE] = np.degrees(np.arccos(np.sqrt(min(sums[10], 1.0))))
     row[_COUNT], row[_OUTCOME] = k, CORRECTED
-
-
-@device
-def _distance(k: float, s: Nine, q: Vector) -> float:
-    """Return the rms distance of Q from the lines of the sums, Q'MQ - 2 b'Q + s over k."""
-    # t t' summed over the rays, with zz from the trace
-    x, y, z = q
-    along = s[0] * x * x + s[3] * y * y + (k - s[0] - s[3]) * z * z
-    along += 2.0 * (s[1] * x * y + s[2] * x * z + s[4] * y * z)
-    rest = k * (x * x + y * y + z * z) - along
-    rest += s[8] - 2.0 * (s[5] * x + s[6] * y + s[7] * z)
-    return np.sqrt(max(rest, 0.0) / k)

@@ -10,15 +10,9 @@ L = \|e\| instead of 1, which saves two square roots per ray.
 The functions contain arithmetic only, without reordering of sums (``fastmath`` is off), so that
 results do not depend on tiles, chunks or threads to the bit.
 
-**Piercing a mesh or raster.** From the plane above the point on: intersect it, take the plane of
-the surface there, intersect that one, and so on. Water is nearly flat, so that one to three steps
-are enough.
-
-On a mesh the planes are the facets'; on a crease, where the steps would alternate, the last of
-`PIERCING_STEPS` counts. On a raster they are the tangent planes of the bilinear surface; a step
-that leaves the bracket in which the line passes the surface halves it instead, until the line is
-within `CLOSE_M` of the surface. Beyond the edge of either, and over its gaps, the last plane is
-continued.
+**Piercing a mesh or raster.** The line is intersected with the plane above the point, then with the
+plane of the surface there, and so on. Water is nearly flat, so that one to three steps are enough.
+Beyond the edge of the surface, and over its gaps, the last plane is continued.
 
 **Backwards, from a true point to a camera.** The point Q lies at the depth D below a plane with the
 unit normal N, and the camera C at the height H above it. From the foot of C the point is at the
@@ -55,6 +49,7 @@ import numpy as np
 
 from pcfix.kernels import device
 from pcfix.lens.algebra import (
+    Nine,
     Vector,
     beyond,
     cofactors,
@@ -138,6 +133,18 @@ def nearest_point(k: float, sums: FloatArray) -> tuple[bool, Vector, float, floa
     return det >= MIN_DETERMINANT * k * k * k, q, np.sqrt(rest / k), sigma_z
 
 
+@device
+def ray_distance(k: float, s: Nine, q: Vector) -> float:
+    """Return the rms distance of Q from the lines of the sums, Q'MQ - 2 b'Q + s over k."""
+    # t t' summed over the rays, with zz from the trace
+    x, y, z = q
+    along = s[0] * x * x + s[3] * y * y + (k - s[0] - s[3]) * z * z
+    along += 2.0 * (s[1] * x * y + s[2] * x * z + s[4] * y * z)
+    rest = k * (x * x + y * y + z * z) - along
+    rest += s[8] - 2.0 * (s[5] * x + s[6] * y + s[7] * z)
+    return np.sqrt(max(rest, 0.0) / k)
+
+
 PIERCING_STEPS = 16
 MAX_HALVINGS = 64
 CLOSE_M = 1e-9
@@ -146,36 +153,27 @@ CLOSE_M = 1e-9
 
 @device
 def pierce(
-    tin: Tin | None, field: Field | None, p: Vector, e: Vector, h: float, normal: Vector, facet: int
-) -> tuple[float, Vector]:
+    c: int, tin: Tin | None, fields: Field | None, p: Vector, e: Vector, h: float, normal: Vector,
+    facet: int,
+) -> tuple[float, Vector]:  # fmt: skip
     """Return the fraction f of e from P to the surface, and the unit normal there.
 
-    P (world frame) lies under the mesh or raster, or under a plane where both are None; e leads to
-    the projection centre. h is the distance of P from the tangent plane above it, `normal` that
-    plane's normal, and `facet` the facet above P on a mesh. The piercing point is P + f e.
+    P (world frame) lies under the mesh, or under the raster of camera c, or under a plane where
+    both are None; e leads to the projection centre. h is the distance of P from the tangent plane
+    above it, `normal` that plane's normal, and `facet` the facet above P on a mesh. The piercing
+    point is P + f e.
     """
     if tin is not None:
         return _pierce_mesh(tin, p, e, facet)
-    if field is not None:
+    if fields is not None:
+        field = Field(fields.heights, fields.shape, fields.frame, c)
         return _pierce_raster(field, p, e, h, normal)
     return h / dot(normal, e), normal
 
 
 @device
-def pierce_of(
-    c: int, tin: Tin | None, fields: Field | None, p: Vector, e: Vector, h: float, normal: Vector,
-    facet: int,
-) -> tuple[float, Vector]:  # fmt: skip
-    """Do as `pierce`, with the raster of camera c if there are rasters."""
-    if fields is None:
-        return pierce(tin, None, p, e, h, normal, facet)
-    field = Field(fields.heights, fields.shape, fields.frame, c)
-    return pierce(tin, field, p, e, h, normal, facet)
-
-
-@device
 def _pierce_mesh(tin: Tin, p: Vector, e: Vector, facet: int) -> tuple[float, Vector]:
-    """Walk from facet to facet until the line pierces the plane of a facet within it."""
+    """Walk from facet to facet until the line pierces one; on a crease the last step counts."""
     f, b, c = 0.0, 0.0, 0.0
     for _ in range(PIERCING_STEPS):
         a, b, c = tin.planes[facet, 0], tin.planes[facet, 1], tin.planes[facet, 2]
@@ -261,25 +259,6 @@ def light_path(q: Vector, e: Vector, normal: Vector, h: float, n: float) -> Path
 def direction(path: Path, normal: Vector) -> Vector:
     """Return w = k s - N, from the camera to where the light leaves the water."""
     return minus(scaled(path[0], path[4]), normal)
-
-
-@device
-def slope_of_path(path: Path, normal: Vector, n: float) -> Vector:
-    """Return the gradient of k by Q, on one plane.
-
-    Of G(k, D, s.s) = 0, implicitly, with grad D = -N and grad s.s = 2 s:
-
-        grad k = (k / S N + D k^3 (n^2 - 1) / S^3 s) / (H + D n^2 / S^3)
-
-    and with it d w / d Q = k (I - N N') + s (grad k)'.
-    """
-    k, root, height, depth, s = path
-    n2 = n * n if depth > 0.0 else 1.0
-    cube = root * root * root
-    # 1 / G_k
-    below = 1.0 / (height + depth * n2 / cube)
-    aside = below * depth * k * k * k * (n2 - 1.0) / cube
-    return beyond(scaled(below * k / root, normal), aside, s)
 
 
 COLUMNS = 12

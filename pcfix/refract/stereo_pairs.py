@@ -72,6 +72,7 @@ from pcfix.refract.rays import (
     direction,
     light_path,
     nearest_point,
+    ray_distance,
     refracted,
 )
 from pcfix.refract.tiling import are_same, cameras_of, cells_of
@@ -353,7 +354,7 @@ def _solve(
 ) -> None:
     """Solve one point and write its row, which has a start already or NaN."""
     (sums, inverse), n = room, images.n
-    fixed, start = _snell(sums, point, n)
+    fixed, start, k = _snell(sums, point, n)
     if not fixed:
         out[:3], out[_OUTCOME] = 0.0, PARALLEL
         return
@@ -364,45 +365,30 @@ def _solve(
         _as_from_above(inverse, 1.0, n)
         found, q = _search(start, inverse, point, images)
     out[0], out[1], out[2] = q
-    out[_DISTANCE] = _ray_distance(q, point, n)
+    s = vector(sums), vector(sums, 3), vector(sums, 6)
+    out[_DISTANCE] = ray_distance(k, (*s[0], *s[1], *s[2]), q)
     out[_OUTCOME], out[_FOUND] = CORRECTED, 1.0 if found else 0.0
 
 
 @device
-def _line(ray: FloatArray, normal: Vector, n: float) -> tuple[Vector, Vector, float]:
-    """Return where the ray through P enters the water, its direction, and its length squared."""
-    e = vector(ray)
-    length2, across = dot(e, e), dot(normal, e)
-    f, bend = (ray[_ABOVE] / across, 1.0 / n) if ray[_ABOVE] > 0.0 else (0.0, 1.0)
-    return scaled(f, e), refracted(e, length2, normal, across, bend), length2
+def _snell(sums: FloatArray, point: _Point, n: float) -> tuple[bool, Vector, float]:
+    """Return whether there is a point nearest to the refracted rays, that point, and their number.
 
-
-@device
-def _snell(sums: FloatArray, point: _Point, n: float) -> tuple[bool, Vector]:
-    """Return whether there is a point nearest to the refracted rays, and that point."""
+    `sums` gets those of `line_terms`.
+    """
     k = 0.0
     sums[:] = 0.0
     for j in range(point.used.size):
         if point.used[j]:
-            a, d, length2 = _line(point.rays[j], point.normal, n)
-            add_line(sums, a, d, 1.0 / length2)
+            e, above = vector(point.rays[j]), point.rays[j, _ABOVE]
+            # where the ray through P enters the water, and its direction there
+            length2, across = dot(e, e), dot(point.normal, e)
+            f, bend = (above / across, 1.0 / n) if above > 0.0 else (0.0, 1.0)
+            d = refracted(e, length2, point.normal, across, bend)
+            add_line(sums, scaled(f, e), d, 1.0 / length2)
             k += 1.0
     fixed, q, _, _ = nearest_point(k, sums)
-    return fixed, q
-
-
-@device
-def _ray_distance(q: Vector, point: _Point, n: float) -> float:
-    """Return the rms distance of Q from the refracted rays through P."""
-    k, total = 0.0, 0.0
-    for j in range(point.used.size):
-        if point.used[j]:
-            a, d, length2 = _line(point.rays[j], point.normal, n)
-            a = minus(q, a)
-            along = dot(a, d)
-            total += max(dot(a, a) - along * along / length2, 0.0)
-            k += 1.0
-    return np.sqrt(total / k)
+    return fixed, q, k
 
 
 @device

@@ -235,7 +235,8 @@ def _add(
         room[_G * TILE + j] += by_u[0] * du + by_v[0] * dv
         room[(_G + 1) * TILE + j] += by_u[1] * du + by_v[1] * dv
         room[(_G + 2) * TILE + j] += by_u[2] * du + by_v[2] * dv
-        # d w / d Q = k (I - N N') + s (grad k)'; grad k as in `rays.slope_of_path`
+        # d w / d Q = k (I - N N') + s (grad k)', with G(k, D, s.s) = 0 implicitly:
+        # grad k = (k / S N + D k^3 (n^2 - 1) / S^3 s) / (H + D n^2 / S^3)
         across = dot(normal, e)
         cube = root * root * root
         below = 1.0 / (across - h + depth * m2 / cube)

@@ -6,37 +6,23 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pcfix.lens.frames import frames_of
-from pcfix.model import Cameras, Outcome, Views, WaterPlane
+from pcfix.model import Cameras, Outcome, WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Learned, OriginalModel, images_of, to_adjusted, to_original
-from pcfix.refract.matcher import Bed, Matcher
+from pcfix.refract.matcher import Bed
 from pcfix.refract.methods import correct, on_land, shift_of_land
 from pcfix.water.surface import surface_above
+from tests.refract.test_depth_maps import CAMERAS, MATCHED, MIXED, N_WATER, NADIR, TOLERANCE, listed
+from tests.refract.test_depth_maps import FUSED as OTHERS
+from tests.refract.test_depth_maps import matcher as plain_matcher
 from tests.utils.batches import batch_of
 from tests.utils.compiled import compiled
-from tests.utils.depth_map_twin import LENS, fused_slowly, looking
+from tests.utils.depth_map_twin import LENS, fused_slowly
 
 to_original = compiled(to_original)
 to_adjusted = compiled(to_adjusted)
 
-N_WATER, TOLERANCE = 1.34, 0.1
 WATER = WaterPlane(0.3, 0.004, -0.003)
-CENTRES = [
-    [-24.0, 3, 70], [-8, -2, 71], [9, 14, 69], [25, -9, 70], [2, -20, 70],
-    [-46, 5, 70], [3, 48, 69], [44, -4, 71],
-]  # fmt: skip
-CAMERAS = looking(
-    CENTRES, [0.0, 2.0, 3.0, 1.0, 2.0, 35.0, 35.0, 35.0], [0, 40, 100, 250, 10, 0, 270, 180]
-)
-MATCHED = np.array(
-    [
-        [1, 4, 2, 5, 3], [0, 4, 2, 3, 5], [1, 3, 4, 6, 0], [2, 4, 1, 7, 0], [1, 3, 0, 2, -1],
-        [0, 1, 4, 6, 2], [2, 1, 0, 3, 5], [3, 2, 4, 1, 6],
-    ]
-)  # fmt: skip
-OTHERS = np.array([[j for j in range(8) if j != c] + [-1] * 5 for c in range(8)])
-NADIR, MIXED = (0, 1, 2, 3, 4), (0, 2, 4, 5, 7)
 
 
 def absorbed():
@@ -59,11 +45,9 @@ def absorbed():
 
 
 def matcher(cameras, averages=False):
-    none = np.full((8, 12), -1)
-    return Matcher(
-        MATCHED, OTHERS[:, :8].copy() if averages else none[:, :8].copy(), OTHERS,
-        np.array([lens.focal for lens in cameras.lenses]), frames_of(cameras), TOLERANCE,
-    )  # fmt: skip
+    averaged = OTHERS[:, :8].copy() if averages else None
+    focal = np.array([lens.focal for lens in cameras.lenses])
+    return plain_matcher(cameras, averaged=averaged, fused=OTHERS)._replace(focal_px=focal)
 
 
 def run(xyz, views, learned, original_model, kind="depth-maps"):
@@ -83,9 +67,11 @@ def run(xyz, views, learned, original_model, kind="depth-maps"):
     )
 
 
-def listed(lists, kind="depth-maps"):
-    start = np.concatenate([[0], np.cumsum([len(row) for row in lists])])
-    return Views(start, np.concatenate(lists).astype(np.int64), None, kind)
+def views_of(kind):
+    """Return maps of a list, pairs of a list, or no list for the points of `some_points`."""
+    if kind == "list":
+        return listed([MIXED] * 60)
+    return replace(listed([(0, 2, 4, 5, 2, 7)] * 60), kind="pairs") if kind == "pairs" else None
 
 
 def some_points():
@@ -140,9 +126,10 @@ def test_transformed_block(kind):
         CAMERAS, centres=elsewhere(CAMERAS.centres), rotations=CAMERAS.rotations @ turned.T
     )
     xyz = some_points()
-    views = {"list": listed([MIXED] * 60), "pairs": listed([(0, 2, 4, 5, 2, 7)] * 60, "pairs")}.get(
-        kind
-    )
+    views = {
+        "list": listed([MIXED] * 60),
+        "pairs": replace(listed([(0, 2, 4, 5, 2, 7)] * 60), kind="pairs"),
+    }.get(kind)
     matching = "pairs" if kind == "pairs of the matcher" else "depth-maps"
     bed = Bed(np.full((1, 1), -5.0), -20.0, -20.0, 50.0)
     one = run(xyz, views, Learned(matcher=matcher(CAMERAS, True), bed=bed), None, matching)
@@ -160,9 +147,10 @@ def test_transformed_block(kind):
 @pytest.mark.parametrize("kind", ["list", "no list", "pairs"])
 def test_same_cameras(kind):
     xyz = some_points()
-    views = {"list": listed([MIXED] * 60), "pairs": listed([(0, 2, 4, 5, 2, 7)] * 60, "pairs")}.get(
-        kind
-    )
+    views = {
+        "list": listed([MIXED] * 60),
+        "pairs": replace(listed([(0, 2, 4, 5, 2, 7)] * 60), kind="pairs"),
+    }.get(kind)
     learned = Learned(matcher=matcher(CAMERAS, True))
     same = Cameras(CAMERAS.labels, CAMERAS.centres.copy(), CAMERAS.rotations.copy(), CAMERAS.lenses)
     one, other = run(xyz, views, learned, None), run(xyz, views, learned, OriginalModel(xyz, same))

@@ -30,22 +30,6 @@ def bed(seed=1, n=200, deepest=10.0):
     return xyz + UTM
 
 
-def test_index_one():
-    result = pcfix.correct_points(bed(), block(), 0.0, index=1.0)
-    assert result.corrected.all()
-    assert np.abs(result.shift_m).max() < NANOMETRE
-
-
-@pytest.mark.parametrize("n", [1.333, 1.34, 1.42])
-def test_straight_down(n):
-    # two cameras almost overhead: in the paraxial limit depth is multiplied by n; the next
-    # term is about depth * tan^2(0.3 deg) / 2 = 0.1 mm at 5 m
-    cameras = pcfix.Cameras(("a", "b"), np.array([[-0.5, 0, 100.0], [0.5, 0, 100.0]]))
-    result = pcfix.correct_points([[0, 0, -5.0]], cameras, 0.0, index=n)
-    assert result.depth_m[0] == pytest.approx(5.0 * n, abs=1.5e-4)
-    assert np.abs(result.shift_m[0, :2]).max() < NANOMETRE
-
-
 @pytest.mark.parametrize("plane", [(0.0, 0.0, 0.0), (0.5, 0.003, -0.002), (-0.3, 0.05, 0.08)])
 def test_twin(plane):
     a, b, c = plane

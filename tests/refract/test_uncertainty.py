@@ -15,7 +15,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pcfix.model import NOMINAL_WIDTH_PX, Lens, Outcome, Views, WaterPlane
+from pcfix.model import Outcome, Views, WaterPlane
 from pcfix.options.correct import LEVEL_M, BudgetOptions, ScienceOptions
 from pcfix.refract import uncertainty
 from pcfix.refract.intersect import intersect
@@ -292,13 +292,6 @@ def test_not_asked():
         batch_of(bed, flat(3), LEVEL, cameras, ScienceOptions(method="snell", dimensions="minimal"))
     )
     assert found.covariance_m2 is None and (found.sigma_z_m == 0.0).all()
-
-
-def test_focal_px():
-    lens = Lens(8.8, 13.2, 8.8, 6.6, 4.4, unit="mm")
-    assert replace(lens, pixel_size_mm=0.0024).focal_px == pytest.approx(8.8 / 0.0024)
-    assert lens.focal_px == pytest.approx(8.8 / 13.2 * NOMINAL_WIDTH_PX)
-    assert lens.focal_px == pytest.approx(lens.focal / lens.pixel_size)
 
 
 @pytest.mark.parametrize("method", ["shan", "factor", "murase"])
