@@ -122,9 +122,5 @@ def test_heights_from_another_origin():
     assert "their heights have another origin" in found
 
 
-def test_a_large_block_is_judged_by_a_part_of_it():
-    assert likely_mistake(np.tile(FITS, (100, 1)), LOW, HIGH, UTM) is None
-
-
 def test_a_cloud_in_all_zones_at_once():
     assert "km from the cloud" in likely_mistake(FITS + 1e6, LOW, HIGH, "EPSG:32600")

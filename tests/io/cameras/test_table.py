@@ -5,7 +5,6 @@ import csv
 import numpy as np
 import pytest
 from pyproj import CRS
-from scipy.spatial.transform import Rotation
 
 import pcfix
 from pcfix.io.cameras import table
@@ -161,10 +160,6 @@ def nadir(cameras):
     return np.degrees(np.arctan2(np.hypot(forward[:, 0], forward[:, 1]), -forward[:, 2]))
 
 
-def turn_deg(one, other):
-    return np.degrees(Rotation.from_matrix(one @ other.transpose(0, 2, 1)).magnitude())
-
-
 def photogrammetric(omega, phi, kappa):
     """Return Kraus's matrix, camera to world, written out, as rotations of pcfix."""
     so, co, sp, cp = np.sin(omega), np.cos(omega), np.sin(phi), np.cos(phi)
@@ -222,11 +217,6 @@ def test_angles_of_a_gimbal_do_not_pass_as_others(tmp_path):
         plain(tmp_path, text)
     assert nadir(plain(tmp_path, text, angles="aircraft")) == pytest.approx([0, 30])
     assert nadir(plain(tmp_path, text, angles="yaw-pitch-roll")) == pytest.approx([90, 60])
-
-
-def test_a_header_can_say_gimbal(tmp_path):
-    text = GIMBAL.format("GimbalYawDegree,GimbalPitchDegree,GimbalRollDegree")
-    assert nadir(plain(tmp_path, text)) == pytest.approx([0, 30])
 
 
 def test_obliques_among_views_down_are_not_taken_for_a_gimbal(tmp_path):
@@ -388,12 +378,6 @@ def test_exiftool(tmp_path):
     assert np.isnan(gnss.xyz[2]).all()
 
 
-@pytest.mark.parametrize("text", ["#Label,X_est,Y_est,Z_est\na,1,2,3\n", "EPSG:4326\na.jpg 1 2\n"])
-def test_no_gnss_at_all(tmp_path, text):
-    _, gnss = gnss_of(write(tmp_path, text))
-    assert gnss is None or np.isnan(gnss.xyz).any(axis=1).all()
-
-
 # Tables that are not right
 
 ANGLED = "label,x,y,z,omega,phi,kappa\n"
@@ -437,11 +421,6 @@ def test_tables_that_are_not_right(tmp_path, case):
     text, message = REFUSED[case]
     with refused(message):
         plain(tmp_path, text)
-
-
-def test_an_option_that_the_table_cannot_fill(tmp_path):
-    with refused("table.column_missing"):
-        plain(tmp_path, ANGLED + "a,1,2,3,0,0,0\n", angles="aircraft")
 
 
 def test_the_option_settles_the_order_of_the_turns(tmp_path):
