@@ -50,14 +50,6 @@ def test_numbers_alone(centres, words, crs):
         ),
         (to("EPSG:4326")[:, [1, 0, 2]], "read as degrees, latitude before longitude"),
         (to("EPSG:3857"), "read as web Mercator"),
-        (
-            np.column_stack(
-                Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True).transform(
-                    *to("EPSG:4326").T
-                )
-            ),
-            "read as geocentric coordinates",
-        ),
     ],
 )
 def test_another_crs(centres, words):
