@@ -216,15 +216,6 @@ def test_external_table_with_the_only_calibration(tmp_path):
     assert uv * 500 == pytest.approx(expected)  # 6000 px are 12 mm
 
 
-def test_external_table_alone_has_no_frames(tmp_path):
-    two = CAMERA.format(0) + CAMERA.format(1)
-    path = params(tmp_path, external=external(("a.jpg", 1, 2, 3, 0, 0, 0)), cam=two)
-    cameras = read(path)
-    assert cameras.lenses is None
-    assert cameras.rotations[0] == pytest.approx(DOWN)
-    assert notes(cameras) == ["cameras.no_lens"]
-
-
 @pytest.mark.parametrize("where", ["project", "1_initial", "params", "parameters", "external"])
 def test_any_way_into_a_project(tmp_path, where):
     folder = params(
@@ -245,6 +236,27 @@ def test_any_way_into_a_project(tmp_path, where):
     assert cameras.lenses[0].focal == 4000.0
 
 
+@pytest.mark.parametrize(
+    ("files", "code"),
+    [
+        ({"parameters": HEADER + block("a.jpg", (1, 2, 3))}, "cameras.no_offset"),
+        ({"external": external(("a.jpg", 1, 2, 3, 0, 0, 0))}, "cameras.no_lens"),
+        (
+            {
+                "external": external(("a.jpg", 1, 2, 3, 0, 0, 0)),
+                "cam": CAMERA.format(0) + CAMERA.format(1),
+            },
+            "cameras.no_lens",
+        ),
+    ],
+)
+def test_what_is_missing_is_told(tmp_path, files, code):
+    cameras = read(params(tmp_path, **files))
+    assert cameras.centres.tolist() == [[1, 2, 3]]
+    assert cameras.rotations[0] == pytest.approx(DOWN)
+    assert notes(cameras) == [code]
+
+
 def test_offsets_of_groups(tmp_path):
     parameters = HEADER + block("402_1.tif", (1, 2, 3)) + block("403_1.tif", (1, 2, 3))
     parameters += block("999_1.tif", (1, 2, 3))
@@ -252,13 +264,6 @@ def test_offsets_of_groups(tmp_path):
     cameras = read(path)
     assert cameras.centres.tolist() == [[11, 22, 33], [101, 202, 303]]
     assert cameras.unposed == ("999_1.tif",)
-
-
-def test_no_offset_is_told(tmp_path):
-    path = params(tmp_path, parameters=HEADER + block("a.jpg", (1, 2, 3)))
-    cameras = read(path)
-    assert cameras.centres.tolist() == [[1, 2, 3]]
-    assert notes(cameras) == ["cameras.no_offset"]
 
 
 PROJECT = """<?xml version="1.0" encoding="UTF-8"?>
