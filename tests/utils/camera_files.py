@@ -41,3 +41,13 @@ def _knows(reader: Any, source: Source) -> bool:
         return bool(reader.recognises(source))
     except Exception:  # of a damaged file, which read_cameras passes on to the next reader
         return False
+
+
+def brown(x: float, y: float, k: Any, p: Any = (0.0, 0.0)) -> tuple[float, float]:
+    """Return a place after Brown's distortion, his order of p1 and p2, written out."""
+    r2 = x * x + y * y
+    radial = 1.0 + sum(value * r2 ** (i + 1) for i, value in enumerate(k))
+    return (
+        x * radial + p[0] * (r2 + 2 * x * x) + 2 * p[1] * x * y,
+        y * radial + p[1] * (r2 + 2 * y * y) + 2 * p[0] * x * y,
+    )

@@ -63,7 +63,7 @@ def likely_mistake(
 
 def _readings(centres: FloatArray, crs: str | CRS | None) -> Iterator[tuple[str, FloatArray]]:
     """Yield other ways to read the numbers, the simplest first; to the metre or so."""
-    from pyproj import Proj, Transformer
+    from pyproj import Proj
     from pyproj.exceptions import ProjError
 
     swapped = centres[:, [1, 0, 2]]
@@ -73,15 +73,10 @@ def _readings(centres: FloatArray, crs: str | CRS | None) -> Iterator[tuple[str,
     plan = None if crs is None else parts(parse_crs(crs, "the cloud"))[0]
     if plan is None or not plan.is_projected:
         return
-    to_degrees = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
     say = "; say so with --cameras-crs"
     others = [
         (f"longitude and latitude in degrees{say} EPSG:4326", centres[:, :2]),
         ("degrees, latitude before longitude; exchange the columns", swapped[:, :2]),
-        (
-            f"geocentric coordinates{say} EPSG:4978",
-            np.column_stack(to_degrees.transform(*centres.T))[:, :2],
-        ),
     ]
     maps = [("+proj=webmerc +datum=WGS84", f"web Mercator{say} EPSG:3857")]
     if plan.utm_zone is not None:  # the zones within two of the cloud's, and the other hemisphere

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pcfix.lens.imaging import project
-from tests.utils.camera_files import notes, read, read_ties
+from tests.utils.camera_files import brown, notes, read, read_ties
 from tests.utils.codes import refused
 from tests.utils.shared import needs
 
@@ -119,10 +119,7 @@ def test_perspective_lens(tmp_path, focal):
     head = GROUP.replace("<FocalLength>24</FocalLength><SensorSize>36</SensorSize>", focal)
     lens = read(write(tmp_path, simple(photo(), head=head + BROWN))).lenses[0]
     x, y = 0.2, -0.1
-    r2 = x * x + y * y
-    radial = 1 + 0.1 * r2 - 0.2 * r2**2 + 0.3 * r2**3
-    xd = x * radial + 0.01 * (r2 + 2 * x * x) + 2 * 0.02 * x * y
-    yd = y * radial + 0.02 * (r2 + 2 * y * y) + 2 * 0.01 * x * y
+    xd, yd = brown(x, y, (0.1, -0.2, 0.3), (0.01, 0.02))
     expected = (3010.5 + 4000 * xd + 5 * yd, 1990.5 + 4400 * yd)
     assert project(lens, np.array([[x, y, 1.0]]))[0] == pytest.approx(expected)
     assert (lens.pixel_size_mm is None) == ("Pixels" in focal)
@@ -248,25 +245,24 @@ TIE = (
 )
 
 
+@pytest.mark.parametrize("packed", [False, True])
 @pytest.mark.parametrize("external", [False, True])
-def test_tie_points(tmp_path, external):
+def test_tie_points(tmp_path, external, packed):
     inside = "<Path>TiePoints.xml</Path>" if external else TIE
     (tmp_path / "TiePoints.xml").write_text('<?xml version="1.0" encoding="utf-8"?>\n' + TIE)
     text = simple(photo(1), photo(2), tail=f"<TiePoints>{inside}</TiePoints>")
-    ties = read_ties(write(tmp_path, text))
+    path = write(tmp_path, text)
+    if packed:
+        with zipfile.ZipFile(tmp_path / "block.xmlz", "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.write(path, "block.xml")
+        path = tmp_path / "block.xmlz"
+    ties = read_ties(path)
     assert ties.views.start.tolist() == [0, 2, 3, 4]
     assert ties.views.camera.tolist() == [0, 1, 1, 1]
     expected = [[10.5, 20.5], [3110.5, 1890.5], [0.5, 0.5], [5.5, 6.5]]
     assert ties.image_xy == pytest.approx(np.array(expected))
     assert ties.xyz[0].tolist() == [1, 2, 3]
     assert np.isnan(ties.xyz[1:]).all()
-
-
-def test_archive(tmp_path):
-    path = tmp_path / "block.xmlz"
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("block.xml", simple(photo(1)))
-    assert read(path).labels == ("p1.jpg",)
 
 
 @pytest.mark.parametrize(

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pcfix.io.cameras import colmap, read_tie_points
+from pcfix.io.cameras import read_tie_points
 from pcfix.io.cameras.colmap.files import MODELS, Camera, lens
 from pcfix.lens.imaging import project
-from tests.utils.camera_files import is_of, notes, read, read_ties
+from tests.utils.camera_files import notes, read, read_ties
 from tests.utils.codes import refused, warned
 
 CAMERAS = """# Camera list with one line of data per camera:
@@ -70,18 +70,6 @@ def binary_folder(path):
         + struct.pack("<Q3d3BdQ", 8, 0, 0, 1, 0, 0, 0, -1, 0)
     )
     return path
-
-
-def all_residuals(path):
-    """Return the reprojection residual of every observation of a model, px."""
-    cameras, points = read(path), read_ties(path)
-    of_point = np.repeat(np.arange(len(points.xyz)), np.diff(points.views.start))
-    misses = []
-    for i in range(len(cameras)):
-        rows = points.views.camera == i
-        rays = (points.xyz[of_point[rows]] - cameras.centres[i]) @ cameras.rotations[i].T
-        misses.append(np.hypot(*(project(cameras.lenses[i], rays) - points.image_xy[rows]).T))
-    return np.concatenate(misses)
 
 
 @pytest.mark.parametrize("make", [folder, binary_folder])
@@ -145,14 +133,6 @@ def test_tie_points_that_are_not_finite(tmp_path):
     assert ties.views.start.tolist() == [0, 1, 1, 1]
 
 
-def test_other_files_are_not_recognised(tmp_path):
-    (tmp_path / "cameras.txt").write_text("a table\n")
-    (tmp_path / "images.txt").write_text("of something else\n")
-    (tmp_path / "frames.txt").write_text("1\n")
-    assert not is_of(tmp_path, colmap)
-    assert not is_of(tmp_path / "frames.txt", colmap)
-
-
 @pytest.mark.parametrize("number", range(len(MODELS)))
 def test_binary_knows_the_models_by_their_numbers(tmp_path, number):
     pycolmap = pytest.importorskip("pycolmap")
@@ -211,19 +191,6 @@ def test_cartesian_pose_priors(tmp_path):
     assert gnss.xyz[2].tolist() == [10, 20, 30]
     assert np.isnan(gnss.xyz[[0, 1]]).all()
     assert np.isnan(gnss.sigma_m).all()
-
-
-def test_databases_that_say_nothing(tmp_path):
-    path = folder(tmp_path)
-    database(tmp_path / "database.db", [(2, (1, 2, 3), None, 0)])
-    assert read(path).gnss is None
-    assert read(path).notes == ()
-    (tmp_path / "database.db").unlink()
-    with sqlite3.connect(tmp_path / "database.db") as sql:
-        sql.execute("CREATE TABLE images (image_id, name)")
-    sql.close()
-    assert read(path).gnss is None
-    assert read(path).notes == ()
 
 
 def test_databases_that_are_left_out(tmp_path):

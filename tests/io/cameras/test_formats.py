@@ -26,12 +26,6 @@ def test_what_is_known_but_not_read_comes_last():
     assert [bool(each.give) for each in FORMATS] == [True] * (len(FORMATS) - 1) + [False]
 
 
-def test_nothing_is_of_several_formats_by_accident(tmp_path):
-    (tmp_path / "a.txt").write_text("no cameras at all\n")
-    with refused("cameras.unknown"):
-        pcfix.read_cameras(tmp_path / "a.txt")
-
-
 @pytest.mark.parametrize("angles", [True, False])
 def test_a_sensor_of_positions_alone_is_refused(tmp_path, angles):
     """BlocksExchange without a lens: with rotations the sensor counts, without it says nothing."""

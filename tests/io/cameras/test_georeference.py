@@ -64,14 +64,6 @@ def image_px(rotation, centre, points):
 # ---- centres ----
 
 
-def test_feet_become_metres_heights_too():
-    to_feet = Transformer.from_crs("EPSG:26910", "EPSG:2992", always_xy=True)
-    x, y = to_feet.transform(500000.0, 4900000.0)
-    found = bring_to(cameras([x, y, 1000.0], "EPSG:2992"), "EPSG:26910", name="a.xml")
-    assert found.centres[0] == pytest.approx([500000.0, 4900000.0, 304.8], abs=1e-3)
-    assert [note.code for note in found.notes] == ["cameras.heights_assumed"]
-
-
 @pytest.mark.parametrize("code", ["EPSG:2193", "EPSG:31467", "EPSG:2180"])
 def test_a_map_with_north_first_is_read_east_first(code):
     crs = CRS(code)
@@ -281,16 +273,6 @@ def test_a_missing_geoid_is_refused_and_named():
         )
 
 
-@pytest.mark.parametrize("cloud", [UTM30, UTM30_ALICANTE])
-def test_the_user_may_vouch_for_heights(cloud):
-    ecef = geocentric(*VALENCIA_LON_LAT)
-    read = cameras(ecef, "EPSG:4936", project_crs=UTM30_ALICANTE)
-    found = bring_to(read, cloud, cameras_crs=UTM30)
-    assert found.centres[0, 2] == pytest.approx(142.48, abs=1e-6)
-    assert found.crs == cloud
-    assert found.notes == ()
-
-
 @pytest.mark.parametrize(("undulation_m", "agree"), [(51.5, False), (0.2, True)])
 def test_heights_that_were_vouched_for_are_compared_with_the_gnss(undulation_m, agree):
     """The GNSS is in the cloud's heights; those of the cameras are above it by the undulation."""
@@ -351,60 +333,88 @@ def test_with_the_geoid_installed_heights_are_brought_over(tmp_path):
         assert notes == "()"
 
 
-def test_ellipsoidal_heights_stay_where_nobody_says_more():
-    found = bring_to(cameras(VALENCIA_LON_LAT, "EPSG:4937"), UTM30, name="a.txt")
-    assert found.centres[0, 2] == 142.48
-    assert [note.code for note in found.notes] == ["cameras.heights_assumed"]
+ASSUMED = "cameras.heights_assumed"
+ALICANTE_ECEF = geocentric(*VALENCIA_LON_LAT)
+DUTCH_ECEF = geocentric(5.0, 52.0, 50.0, f=1 / 298.257223563)
+OREGON = [500000.0, 4900000.0, 1000.0]
+TO_FEET = Transformer.from_crs("EPSG:26910", "EPSG:2992", always_xy=True)
+OREGON_FEET = [*TO_FEET.transform(5e5, 4.9e6), 1000.0]
+ENU_FRAME = "ENU:39.44,-0.38,92.5"
 
 
-def test_another_ellipsoid_shifts_no_height_by_forty_metres():
-    read = cameras(geocentric(5.0, 52.0, 50.0, f=1 / 298.257223563), "EPSG:4978")
-    found = bring_to(replace(read, project_crs="EPSG:28992"), "EPSG:28992")
-    assert found.centres[0, 2] == pytest.approx(50.0, abs=1e-6)  # 6.4 m above Bessel's ellipsoid
-    assert found.notes[-1].code == "cameras.heights_assumed"
-
-
-@pytest.mark.parametrize(("at", "crs"), [(VALENCIA_LON_LAT, "EPSG:4326"), (VALENCIA, UTM30)])
-def test_heights_not_stated_are_the_clouds_and_it_says_so(at, crs):
-    found = bring_to(cameras(at, crs), UTM30_ALICANTE, name="a.txt")
-    assert found.centres[0, 2] == at[2]
-    assert found.notes[-1].code == "cameras.heights_assumed"
-    assert bring_to(cameras(at, crs), UTM30_ALICANTE, cameras_crs=crs).notes == ()
-
-
-def test_a_topocentric_frame_needs_the_grid_unless_the_user_gives_its_height():
-    frame = "ENU:39.44,-0.38,92.5"
-    with pytest.raises(InputError):
-        bring_to(cameras([0.0, 0, 50], frame), UTM30_ALICANTE)
-    found = bring_to(cameras([0.0, 0, 50], frame), UTM30_ALICANTE, cameras_crs=frame)
-    assert found.centres[0, 2] == pytest.approx(142.5, abs=1e-6)
-
-
-def test_heights_of_the_file_name_those_of_the_cloud():
-    assert bring_to(cameras(VALENCIA, UTM30_ALICANTE), UTM30).crs == UTM30_ALICANTE
-    found = bring_to(cameras([500000.0, 4900000.0, 1000.0], "EPSG:26910+6360"), "EPSG:26910")
-    assert found.centres[0, 2] == pytest.approx(1200000.0 / 3937.0)
+@pytest.mark.parametrize(
+    ("at", "crs", "project", "cloud", "given", "z", "codes"),
+    [
+        # heights in feet where the plan is in feet, or the CRS says so
+        (OREGON_FEET, "EPSG:2992", None, "EPSG:26910", None, 304.8, [ASSUMED]),
+        (OREGON, "EPSG:26910+6360", None, "EPSG:26910", None, 1200000.0 / 3937.0, []),
+        # the user vouches for the heights
+        (ALICANTE_ECEF, "EPSG:4936", UTM30_ALICANTE, UTM30, UTM30, 142.48, []),
+        (ALICANTE_ECEF, "EPSG:4936", UTM30_ALICANTE, UTM30_ALICANTE, UTM30, 142.48, []),
+        ([0.0, 0, 50], ENU_FRAME, None, UTM30_ALICANTE, ENU_FRAME, 142.5, []),
+        # ellipsoidal ones stay where the cloud says nothing, on another ellipsoid too (6.4 m)
+        (VALENCIA_LON_LAT, "EPSG:4937", None, UTM30, None, 142.48, [ASSUMED]),
+        (DUTCH_ECEF, "EPSG:4978", "EPSG:28992", "EPSG:28992", None, 50.0, [ASSUMED]),
+        # those not stated are the cloud's
+        (VALENCIA_LON_LAT, "EPSG:4326", None, UTM30_ALICANTE, None, 142.48, [ASSUMED]),
+        (VALENCIA_LON_LAT, "EPSG:4326", None, UTM30_ALICANTE, "EPSG:4326", 142.48, []),
+        (VALENCIA, UTM30, None, UTM30_ALICANTE, None, VALENCIA[2], [ASSUMED]),
+        (VALENCIA, UTM30, None, UTM30_ALICANTE, UTM30, VALENCIA[2], []),
+    ],
+)
+def test_heights(at, crs, project, cloud, given, z, codes):
+    found = bring_to(cameras(at, crs, project_crs=project), cloud, cameras_crs=given)
+    assert found.centres[0, 2] == pytest.approx(z, abs=1e-3)
+    assert [note.code for note in found.notes if note.code == ASSUMED] == codes
 
 
 # ---- who says what ----
 
 
 @pytest.mark.parametrize("crs", ["local", LOCAL_CS])
-def test_a_local_frame_is_refused_unless_told_so(crs):
-    with refused("cameras.local"):
-        bring_to(cameras(VALENCIA, crs), UTM30, name="a.xml")
-    found = bring_to(cameras(VALENCIA, crs), UTM30, cameras_crs="Local")
+@pytest.mark.parametrize("given", ["Local", UTM30])
+def test_local_frame_by_the_user(crs, given):
+    found = bring_to(cameras(VALENCIA, crs), UTM30, cameras_crs=given)
     assert (found.crs, found.centres[0].tolist()) == (UTM30, VALENCIA)
-    assert bring_to(cameras(VALENCIA, crs), UTM30, cameras_crs=UTM30).crs == UTM30
 
 
-def test_a_local_cloud_takes_local_cameras_and_no_others():
-    for crs in ("local", LOCAL_CS, None):
-        assert bring_to(cameras([1.0, 2, 3], crs), LOCAL_CS).centres.tolist() == [[1, 2, 3]]
-    for crs in (UTM30, "ENU:1,2,3", "EPSG:4978"):
-        with refused("cloud.local"):
-            bring_to(cameras(VALENCIA, crs), LOCAL_CS)
-    assert bring_to(cameras(VALENCIA, UTM30), LOCAL_CS, cameras_crs="local").crs
+@pytest.mark.parametrize(
+    ("crs", "given"), [("local", None), (LOCAL_CS, None), (None, None), (UTM30, "local")]
+)
+def test_local_cloud(crs, given):
+    found = bring_to(cameras([1.0, 2, 3], crs), LOCAL_CS, cameras_crs=given)
+    assert found.centres.tolist() == [[1, 2, 3]]
+
+
+@pytest.mark.parametrize(
+    ("at", "crs", "project", "cloud", "code"),
+    [
+        (VALENCIA, "local", None, UTM30, "cameras.local"),
+        (VALENCIA, LOCAL_CS, None, UTM30, "cameras.local"),
+        (VALENCIA, UTM30, None, LOCAL_CS, "cloud.local"),
+        (VALENCIA, "ENU:1,2,3", None, LOCAL_CS, "cloud.local"),
+        (VALENCIA, "EPSG:4978", None, LOCAL_CS, "cloud.local"),
+        (VALENCIA_LON_LAT, "EPSG:4326", None, None, "cloud.no_crs"),
+        (ALICANTE_ECEF, "EPSG:4936", None, None, "cloud.no_crs"),
+        (ALICANTE_ECEF, "EPSG:4936", "EPSG:4258", None, "cloud.no_crs"),
+        (ALICANTE_ECEF, "EPSG:4936", LOCAL_CS, None, "cloud.no_crs"),
+        (VALENCIA, "EPSG:4326", None, UTM30, "cameras.degrees"),
+        (VALENCIA, "EPSG:4978", None, UTM30, "cameras.geocentric"),
+        (VALENCIA, "EPSG:4326+5773", None, UTM30, "cameras.degrees"),
+        ([1e30, 1e30, 5.0], "EPSG:32631", None, UTM30, "cameras.not_transformed"),
+        (VALENCIA, "EPSG:32630+5773", None, UTM30_ALICANTE, "crs.heights"),
+        ([0.0, 0, 50], ENU_FRAME, None, UTM30_ALICANTE, "crs.heights"),
+        (VALENCIA, "nonsense", None, UTM30, "crs.unknown"),
+        (VALENCIA, UTM30, None, "nonsense", "crs.unknown"),
+        (VALENCIA, "EPSG:32630", None, "EPSG:4326", "crs.not_projected"),
+        (VALENCIA, "EPSG:32630", None, "EPSG:2992", "crs.unit"),
+        (VALENCIA, "ENU:39", None, UTM30, "crs.origin"),
+        (VALENCIA, "EPSG:5703", None, UTM30, "crs.vertical_only"),
+    ],
+)
+def test_refused(at, crs, project, cloud, code):
+    with refused(code):
+        bring_to(cameras(at, crs, NADIR[None], project_crs=project), cloud, name="a.xml")
 
 
 def test_without_the_clouds_crs():
@@ -419,51 +429,6 @@ def test_without_the_clouds_crs():
     for crs in ("local", None):
         found = bring_to(cameras([1.0, 2, 3], crs), None)
         assert (found.crs, found.centres.tolist(), found.notes) == (crs, [[1, 2, 3]], ())
-
-
-@pytest.mark.parametrize(
-    ("at", "crs", "more"),
-    [
-        (VALENCIA_LON_LAT, "EPSG:4326", {}),
-        (geocentric(*VALENCIA_LON_LAT), "EPSG:4936", {}),
-        (geocentric(*VALENCIA_LON_LAT), "EPSG:4936", {"project_crs": "EPSG:4258"}),
-        (geocentric(*VALENCIA_LON_LAT), "EPSG:4936", {"project_crs": LOCAL_CS}),
-    ],
-)
-def test_without_the_clouds_crs_no_map_is_chosen(at, crs, more):
-    with refused("cloud.no_crs"):
-        bring_to(cameras(at, crs, **more), None, name="a.xml")
-
-
-@pytest.mark.parametrize(
-    ("at", "crs", "cloud", "code"),
-    [
-        (VALENCIA, "EPSG:4326", UTM30, "cameras.degrees"),
-        (VALENCIA, "EPSG:4978", UTM30, "cameras.geocentric"),
-        (VALENCIA, "EPSG:4326+5773", UTM30, "cameras.degrees"),
-        ([1e30, 1e30, 5.0], "EPSG:32631", UTM30, "cameras.not_transformed"),
-        (VALENCIA, "EPSG:32630+5773", UTM30_ALICANTE, "crs.heights"),
-    ],
-)
-def test_refused(at, crs, cloud, code):
-    with refused(code):
-        bring_to(cameras(at, crs, NADIR[None]), cloud, name="a.xml")
-
-
-@pytest.mark.parametrize(
-    ("crs", "cloud"),
-    [
-        ("nonsense", UTM30),
-        (UTM30, "nonsense"),
-        ("EPSG:32630", "EPSG:4326"),
-        ("EPSG:32630", "EPSG:2992"),
-        ("ENU:39", UTM30),
-        ("EPSG:5703", UTM30),
-    ],
-)
-def test_no_crs_for_cameras(crs, cloud):
-    with pytest.raises(InputError):
-        bring_to(cameras(VALENCIA, crs, NADIR[None]), cloud, name="a.xml")
 
 
 @pytest.mark.parametrize(

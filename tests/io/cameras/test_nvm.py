@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pcfix.lens.imaging import project
 from tests.utils.camera_files import notes, read, read_ties
 from tests.utils.codes import refused
+from tests.utils.reprojection import tie_point_residuals_px
 
 TURN = Rotation.from_euler("xyz", [170, 12, 34], degrees=True)
 CENTRE = np.array([3.0, -2.0, 50.0])
@@ -47,15 +47,8 @@ def write(tmp_path, *models, head="NVM_V3 "):
     return path
 
 
-def all_residuals(path):
-    cameras = read(path)
-    points = read_ties(path)
-    of_point = np.repeat(np.arange(len(points.xyz)), np.diff(points.views.start))
-    misses = []
-    for camera, point, place in zip(points.views.camera, of_point, points.image_xy, strict=True):
-        ray = cameras.rotations[camera] @ (points.xyz[point] - cameras.centres[camera])
-        misses.append(np.hypot(*(project(cameras.lenses[camera], ray[None])[0] - place)))
-    return np.array(misses)
+def residuals(path):
+    return tie_point_residuals_px(read(path), read_ties(path))
 
 
 def test_pose_and_lens(tmp_path):
@@ -66,7 +59,7 @@ def test_pose_and_lens(tmp_path):
     lens = cameras.lenses[0]
     assert [lens.width, lens.height] == pytest.approx(2 * np.abs(measured()).max(axis=0))
     assert notes(cameras) == ["cameras.frames_estimated"]
-    assert all_residuals(path).max() < 1e-5
+    assert residuals(path).max() < 1e-5
 
 
 def test_frame_of_the_image(tmp_path):
@@ -95,7 +88,7 @@ def test_fixed_calibration(tmp_path):
     lens = read(path).lenses[0]
     assert (lens.focal, lens.b1, lens.principal_x, lens.principal_y) == (710, -10, 310, 245)
     assert (lens.width, lens.height) == (620, 490)
-    assert all_residuals(path).max() < 1e-6
+    assert residuals(path).max() < 1e-6
 
 
 def test_matrix_and_translation(tmp_path):
@@ -105,7 +98,7 @@ def test_matrix_and_translation(tmp_path):
     cameras = read(write(tmp_path, text, head="NVM_V3_R9T"))
     assert cameras.centres[0] == pytest.approx(CENTRE)
     assert cameras.rotations[0] == pytest.approx(matrix)
-    assert all_residuals(tmp_path / "x.nvm").max() < 1e-5
+    assert residuals(tmp_path / "x.nvm").max() < 1e-5
 
 
 @pytest.mark.parametrize(("width", "height"), [(600, 380), (380, 600), (500, 500)])
@@ -119,7 +112,7 @@ def test_places_from_the_corner(tmp_path, width, height, squeezed):
     path = write(tmp_path, model(camera_line("a.jpg", f=250, k=0.0), points=point_lines(seen)))
     lens = read(path).lenses[0]
     assert (lens.width, lens.height) == (width, height)
-    every = all_residuals(path)
+    every = residuals(path)
     assert np.delete(every, 7).max() < 1e-6
     assert every[7] > 30
 
@@ -146,7 +139,7 @@ def test_images_without_focal_length_have_no_pose(tmp_path):
     path = write(tmp_path, text)
     assert read(path).labels == ("a.jpg",)
     assert read(path).unposed == ("lost.jpg",)
-    assert all_residuals(path).max() < 1e-5
+    assert residuals(path).max() < 1e-5
 
 
 def test_poses_without_points(tmp_path):

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pcfix.io.cameras import opensfm
 from pcfix.lens.imaging import project
+from tests.utils.camera_files import brown, read_ties
 from tests.utils.camera_files import read as read_file
-from tests.utils.camera_files import read_ties
 from tests.utils.codes import refused
 
 CAMERA = {"projection_type": "perspective", "width": 4000, "height": 3000, "focal": 0.8}
@@ -65,9 +64,8 @@ def seen_by(model, camera, direction):
     k = [camera.get(f"k{i}", 0.0) for i in range(1, 7)]
     p1, p2 = camera.get("p1", 0.0), camera.get("p2", 0.0)
     s = [camera.get(f"s{i}", 0.0) for i in range(4)]
-    bent = 1.0 + sum(c * r2 ** (i + 1) for i, c in enumerate(k))
-    xd = x * bent + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + s[0] * r2 + s[1] * r2 * r2
-    yd = y * bent + 2 * p2 * x * y + p1 * (r2 + 2 * y * y) + s[2] * r2 + s[3] * r2 * r2
+    xd, yd = brown(x, y, k, (p2, p1))
+    xd, yd = xd + s[0] * r2 + s[1] * r2 * r2, yd + s[2] * r2 + s[3] * r2 * r2
     fx = camera.get("focal_x", camera.get("focal"))
     fy = camera.get("focal_y", camera.get("focal"))
     u = fx * xd + camera.get("c_x", 0.0)
@@ -242,16 +240,6 @@ def test_tracks_of_every_version(tmp_path, header, tail):
     assert found.views.start.tolist() == [0, 2, 3]
     assert found.views.camera.tolist() == [0, 1, 0]
     assert found.image_xy == pytest.approx(np.array([[0, 3000], [3000, 1000], [2000, 1504]]))
-
-
-def test_tracks_longer_than_a_block(tmp_path, monkeypatch):
-    monkeypatch.setattr(opensfm, "CHUNK_BYTES", 7)
-    lines = [f"a.jpg\t{i}\t0\t{i / 100}\t0\t1\t2\t3" for i in range(20)]
-    (tmp_path / "tracks.csv").write_text("\n".join(lines))
-    points = {str(i): {"coordinates": [i, 0, 0]} for i in range(20)}
-    path = write(tmp_path, scene(points=points))
-    found = read_ties(path)
-    assert found.image_xy[:, 0] == pytest.approx(2000 + 40.0 * np.arange(20))
 
 
 @pytest.mark.parametrize(

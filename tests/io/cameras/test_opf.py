@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 import pcfix
 from pcfix.errors import InputError
 from pcfix.io.cameras import read_tie_points
+from tests.utils.camera_files import brown
 from tests.utils.codes import refused, warned
 from tests.utils.pose_files.block import Block
 from tests.utils.pose_files.opf import FIRST_ID, Base
@@ -43,11 +44,7 @@ def seen(kind, angles_deg, centre, point):
         rho = sum(p * theta**i for i, p in enumerate(POLYNOMIAL)) / math.hypot(x, y)
         c, d, e, f = AFFINE
         return c * rho * x + d * rho * y + cx, e * rho * x + f * rho * y + cy
-    x, y = x / z, y / z
-    r = x * x + y * y
-    bent = 1.0 + RADIAL[0] * r + RADIAL[1] * r**2 + RADIAL[2] * r**3
-    u = x * bent + 2 * T1 * x * y + T2 * (r + 2 * x * x)
-    v = y * bent + 2 * T2 * x * y + T1 * (r + 2 * y * y)
+    u, v = brown(x / z, y / z, RADIAL, (T2, T1))
     return 3000.0 * u + cx, 3000.0 * v + cy
 
 
@@ -208,17 +205,6 @@ def test_without_input_cameras_frames_are_boundless(make, tmp_path):
     change(tmp_path, "input-cameras.json", sensors=[])
     with warned("cameras.no_lens"):
         assert pcfix.read_cameras(path).lenses is None
-
-
-def test_a_sensor_is_honoured_where_the_file_has_no_lens_and_refused_where_it_has(make, tmp_path):
-    path, _ = make()
-    sensor = tmp_path / "sensor.csv"
-    sensor.write_text("focal_px,width_px,height_px\n3000,4000,3000\n")
-    with refused("cameras.sensor_unused"):
-        pcfix.read_cameras(path, sensor)
-    change(tmp_path, "input-cameras.json", sensors=[])
-    found = pcfix.read_cameras(path, sensor)  # without the warning of boundless frames
-    assert [lens.focal for lens in found.lenses] == [3000.0, 3000.0]
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from pcfix.lens.imaging import project
-from tests.utils.camera_files import notes, read
+from tests.utils.camera_files import brown, notes, read
 from tests.utils.codes import refused
 from tests.utils.shared import needs
 
@@ -71,15 +71,6 @@ def test_fields_as_elements_or_attributes(tmp_path, elements):
     assert cameras.centres.tolist() == [[10, 20, 30]]
     assert cameras.rotations[0] == pytest.approx(TURN)
     assert cameras.notes == ()
-
-
-def brown(x, y, k, t):
-    r2 = x * x + y * y
-    radial = 1 + sum(value * r2 ** (i + 1) for i, value in enumerate(k))
-    return (
-        x * radial + t[0] * (r2 + 2 * x * x) + 2 * t[1] * x * y,
-        y * radial + t[1] * (r2 + 2 * y * y) + 2 * t[0] * x * y,
-    )
 
 
 @pytest.mark.parametrize(

@@ -60,8 +60,12 @@ def write_colmap(
     SettingError
         If a file exists.
     """
+    from scipy.spatial.transform import Rotation
+
     target = Path(folder)
-    _, lenses = block_to_write(target, cameras, _fits)
+    _, lenses = block_to_write(  # a file would cut off other names
+        target, cameras, lambda name: name == name.strip() != "" and not {"\0", "\n"} & {*name}
+    )
     middle = np.median(cameras.centres, axis=0)
     middle[2] = 0.0  # heights are small, and easier to read as they are
     offset = np.asarray(np.round(middle / ROUND_M) * ROUND_M if offset_m is None else offset_m)
@@ -76,18 +80,27 @@ def write_colmap(
     seen["xy"] = ties.image_xy[of_kept][order]
     seen["point"] = np.repeat(np.cumsum(kept), counts)[of_kept][order]
     start = np.concatenate([[0], np.cumsum(np.bincount(camera, minlength=len(cameras)))])
+    listed = [struct.pack("<Q", len(distinct))]
+    for i, camera_of in enumerate((colmap_camera(target, one) for one in distinct), start=1):
+        size = int(camera_of.width), int(camera_of.height)
+        listed.append(struct.pack("<IiQQ", i, MODELS.index(camera_of.model), *size))
+        listed.append(np.array(camera_of.values, "<f8").tobytes())
+    rotations = np.asarray(cameras.rotations)
+    turns = np.roll(Rotation.from_matrix(rotations).as_quat(canonical=True), 1, axis=1)
+    shifts = -np.einsum("kij,kj->ki", rotations, cameras.centres - offset)
+    images = [struct.pack("<Q", len(cameras))]
+    for i, (label, one) in enumerate(zip(cameras.labels, lenses, strict=True)):
+        first, last = start[i : i + 2]
+        images.append(struct.pack("<I7dI", i + 1, *turns[i], *shifts[i], number[one]))
+        images.append(label.encode() + b"\0" + struct.pack("<Q", last - first))
+        images.append(seen[first:last].tobytes())
     contents = {
-        "cameras.bin": _cameras([colmap_camera(target, lens) for lens in distinct]),
-        "images.bin": _images(cameras, offset, [number[k] for k in lenses], seen, start),
+        "cameras.bin": b"".join(listed),
+        "images.bin": b"".join(images),
         "points3D.bin": _points(ties.xyz[kept] - offset, seen["point"], start),
         FILE: place_text(offset, crs or cameras.crs).encode(),
     }
     write_new(target, contents)
-
-
-def _fits(label: str) -> bool:
-    """Whether COLMAP's files hold a name whole."""
-    return bool(label.strip()) and label == label.strip() and not {"\0", "\n"} & {*label}
 
 
 def colmap_camera(path: Path, given: Lens) -> Camera:
@@ -118,33 +131,6 @@ def _values(given: Lens) -> dict[str, float]:
     ):
         values |= dict(zip(names, numbers, strict=False))
     return values | dict(zip(SHAPES.get(given.projection, ()), given.shape, strict=False))
-
-
-def _cameras(cameras: list[Camera]) -> bytes:
-    parts = [struct.pack("<Q", len(cameras))]
-    for i, camera in enumerate(cameras, start=1):
-        number = MODELS.index(camera.model)
-        parts.append(struct.pack("<IiQQ", i, number, int(camera.width), int(camera.height)))
-        parts.append(np.array(camera.values, "<f8").tobytes())
-    return b"".join(parts)
-
-
-def _images(
-    cameras: Cameras, offset: FloatArray, numbers: list[int], seen: np.ndarray, start: IntArray
-) -> bytes:
-    """Return the poses, and the image points `seen` that begin at `start` for each image."""
-    from scipy.spatial.transform import Rotation
-
-    rotations = np.asarray(cameras.rotations)
-    turns = np.roll(Rotation.from_matrix(rotations).as_quat(canonical=True), 1, axis=1)
-    shifts = -np.einsum("kij,kj->ki", rotations, cameras.centres - offset)
-    parts = [struct.pack("<Q", len(cameras))]
-    for i, (label, number) in enumerate(zip(cameras.labels, numbers, strict=True)):
-        first, last = start[i : i + 2]
-        parts.append(struct.pack("<I7dI", i + 1, *turns[i], *shifts[i], number))
-        parts.append(label.encode() + b"\0" + struct.pack("<Q", last - first))
-        parts.append(seen[first:last].tobytes())
-    return b"".join(parts)
 
 
 def _points(xyz: FloatArray, point: IntArray, image_start: IntArray) -> bytes:

@@ -27,18 +27,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.io.cameras import tracks
-from pcfix.io.cameras.checks import (
-    centres,
-    damaged,
-    load_json,
-    no_pose,
-    note,
-    read_text,
-    reading,
-    several,
-    triple,
-)
+from pcfix.io.cameras import checks, tracks
 from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.opensfm.models import is_panorama, lens
 from pcfix.lens.rotations import from_rotation_vectors
@@ -93,42 +82,42 @@ class Reconstruction(NamedTuple):
 
 def read_reconstruction(path: Path) -> Reconstruction:
     """Read the reconstruction with the most images."""
-    data = load_json(path)
-    with reading(path):
+    data = checks.load_json(path)
+    with checks.reading(path):
         sets = [entry.get("shots", {}) for entry in data]
         counts = [len(shots) for shots in sets]
         if not any(counts):
-            raise no_pose(path)
+            raise checks.no_pose(path)
         best = counts.index(max(counts))
         chosen, notes = data[best], []
         others = [name for i, shots in enumerate(sets) if i != best for name in shots]
         if others:
-            notes.append(several(path, len(data), counts[best]))
+            notes.append(checks.several(path, len(data), counts[best]))
         entries = chosen["cameras"]
         panoramas = [k for k, shot in sets[best].items() if is_panorama(entries[shot["camera"]])]
         shots = {k: shot for k, shot in sets[best].items() if k not in set(panoramas)}
         if panoramas:
             sentence = f"{len(panoramas)} images of all-round cameras are left out."
-            notes.append(note(path, "cameras.panoramas", sentence, images=panoramas))
+            notes.append(checks.note(path, "cameras.panoramas", sentence, images=panoramas))
         if not shots:
-            raise no_pose(path, "all images are of all-round cameras (spherical)")
+            raise checks.no_pose(path, "all images are of all-round cameras (spherical)")
         lenses = {k: lens(path, k, entries[k]) for k in {shot["camera"] for shot in shots.values()}}
         rotations, shifts = _poses(chosen, shots)
         xyz, sigma = np.full((2, len(shots), 3), np.nan)
         for i, shot in enumerate(shots.values()):
             dop = shot.get("gps_dop")
             if shot.get("gps_position") is not None and dop != NO_GNSS:
-                xyz[i] = triple(shot["gps_position"])
+                xyz[i] = checks.triple(shot["gps_position"])
                 sigma[i] = np.nan if dop is None else dop
         reference = _reference(path, chosen)
         crs = "local" if reference is None else "ENU:" + ",".join(map(repr, reference))
         has_gnss = reference is not None and np.isfinite(xyz).any()
         listed = path.with_name("image_list.txt")  # the images that the project was given
-        lines = read_text(listed).splitlines() if listed.is_file() else []
+        lines = checks.read_text(listed).splitlines() if listed.is_file() else []
         given = [PurePath(line.strip().replace("\\", "/")).name for line in lines if line.strip()]
         cameras = Cameras(
             labels=tuple(shots),
-            centres=centres(rotations, shifts),
+            centres=checks.centres(rotations, shifts),
             rotations=rotations,
             lenses=tuple(lenses[shot["camera"]] for shot in shots.values()),
             crs=crs,
@@ -170,7 +159,9 @@ def _poses(chosen: Any, shots: dict[str, Any]) -> tuple[FloatArray, FloatArray]:
 
 def _pose(entry: Any) -> tuple[FloatArray, FloatArray]:
     """Return R and t of an entry with an axis-angle rotation."""
-    return from_rotation_vectors(triple(entry["rotation"])), triple(entry["translation"])
+    return from_rotation_vectors(checks.triple(entry["rotation"])), checks.triple(
+        entry["translation"]
+    )
 
 
 def _reference(path: Path, chosen: Any) -> tuple[float, float, float] | None:
@@ -178,13 +169,15 @@ def _reference(path: Path, chosen: Any) -> tuple[float, float, float] | None:
     entry = chosen.get("reference_lla")
     beside = path.with_name("reference_lla.json")
     if entry is None and beside.is_file() and beside.read_bytes()[:100].lstrip()[:1] == b"{":
-        path, entry = beside, load_json(beside)
+        path, entry = beside, checks.load_json(beside)
     if entry is None:
         return None
-    with reading(path):
+    with checks.reading(path):
         lat, lon, alt = (float(entry[key]) for key in ("latitude", "longitude", "altitude"))
         if not (abs(lat) <= 90.0 and abs(lon) <= 360.0 and abs(alt) < np.inf):
-            raise damaged(path, f"reference_lla {lat:g}, {lon:g} is no latitude and longitude")
+            raise checks.damaged(
+                path, f"reference_lla {lat:g}, {lon:g} is no latitude and longitude"
+            )
     return None if lat == lon == 0.0 else (lat, lon, alt)
 
 
@@ -200,7 +193,7 @@ def read_tie_points(reconstruction: Reconstruction) -> TiePoints:
         why = "it has no points" if not points else "tracks.csv is not beside it"
         raise tracks.no_tie_points(path, why)
     xyz = np.array([point["coordinates"] for point in points.values()], float).reshape(-1, 3)
-    with reading(beside):
+    with checks.reading(beside):
         point, camera, xy = _observations(beside, list(points), cameras.labels)
     order = np.lexsort((camera, point))
     size = np.array([(lens.width, lens.height) for lens in cameras.lenses or ()])[camera]
@@ -230,6 +223,6 @@ def _observations(
             keep = (point >= 0) & (camera >= 0)
             parts.append((point[keep], camera[keep], values[keep]))
     if not parts:
-        raise damaged(path, "it is empty")
+        raise checks.damaged(path, "it is empty")
     point, camera, xy = (np.concatenate(column) for column in zip(*parts, strict=True))
     return point, camera, xy

@@ -26,14 +26,7 @@ from typing import Any
 import numpy as np
 
 from pcfix.errors import bad_file
-from pcfix.io.cameras.checks import (
-    block_to_write,
-    damaged,
-    is_same_lens,
-    lens_not_held,
-    unsupported,
-    write_new,
-)
+from pcfix.io.cameras import checks
 from pcfix.io.cameras.georeference import frame_of, georeference, is_tied
 from pcfix.io.cameras.tracks import NO_TIE_POINTS, are_seen
 from pcfix.io.crs import (
@@ -79,7 +72,7 @@ def lens(path: Path, name: str, camera: dict[str, Any]) -> Lens:
     if model not in _MODELS:
         remedy = f"Use one of {', '.join(_MODELS)}"
         what = f"the projection_type '{model}' of camera {name}"
-        raise unsupported(path, what, remedy, model=model, camera=name)
+        raise checks.unsupported(path, what, remedy, model=model, camera=name)
 
     def value(key: str, default: float = 0.0) -> float:
         return float(camera.get(key, default))
@@ -89,7 +82,7 @@ def lens(path: Path, name: str, camera: dict[str, Any]) -> Lens:
     if not (width and height) and named:
         width, height = float(named[1]), float(named[2])
     if not (width and height):
-        raise damaged(path, f"the width and height of camera {name} are missing")
+        raise checks.damaged(path, f"the width and height of camera {name} are missing")
     scale = max(width, height)
     fx = float(camera["focal_x" if "focal_x" in camera else "focal"])
     fy = value("focal_y", fx) if "focal_x" in camera else fx
@@ -137,7 +130,7 @@ def write_opensfm(path: File, cameras: Cameras, tie_points: TiePoints | None = N
     """
     target = Path(path)
     times = Counter(cameras.labels)  # they are keys in the file
-    _, lenses = block_to_write(
+    _, lenses = checks.block_to_write(
         target, cameras, lambda label: times[label] == 1 and not {"\t", "\n"} & {*label}
     )
     models = {each: opensfm_camera(target, each) for each in dict.fromkeys(lenses)}
@@ -171,7 +164,7 @@ def write_opensfm(path: File, cameras: Cameras, tie_points: TiePoints | None = N
     if tie_points is not None:
         texts["tracks.csv"] = "\n".join(_tracks(cameras, tie_points, kept)) + "\n"
     texts[target.name] = json.dumps([chosen]) + "\n"
-    write_new(target.parent, {name: text.encode() for name, text in texts.items()})
+    checks.write_new(target.parent, {name: text.encode() for name, text in texts.items()})
 
 
 def opensfm_camera(path: Path, given: Lens) -> dict[str, Any]:
@@ -197,9 +190,9 @@ def opensfm_camera(path: Path, given: Lens) -> dict[str, Any]:
             camera |= {"p1": p1, "p2": p2} if model in _TANGENTIAL else {}
             camera |= prism if model == "fisheye624" else {}
             camera |= {"transition": (*given.shape, 0.5)[0]} if model == "dual" else {}
-            if is_same_lens(lens(path, "1", camera), given):
+            if checks.is_same_lens(lens(path, "1", camera), given):
                 return camera
-    raise lens_not_held(path, given)
+    raise checks.lens_not_held(path, given)
 
 
 def _world(

@@ -1,0 +1,337 @@
+"""Blocks that pcfix writes: COLMAP's, OpenSfM's, and tables; read by pcfix and by COLMAP itself."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pyproj import CRS, Transformer
+
+from pcfix.errors import InputError, SettingError
+from pcfix.io.cameras import read_cameras, read_tie_points
+from pcfix.io.cameras.colmap.writing import colmap_camera, write_colmap
+from pcfix.io.cameras.georeference import georeference
+from pcfix.io.cameras.opensfm.models import opensfm_camera, write_opensfm
+from pcfix.io.cameras.table.sensor import write_table
+from pcfix.lens.imaging import project
+from pcfix.model import Lens, TiePoints, Views
+from tests.utils.blocks import PLAIN, small_block, some_ties
+from tests.utils.codes import refused
+from tests.utils.reprojection import bring_to, tie_point_residuals_px
+from tests.utils.shared import needs
+
+FREE, free = needs("rendered_a_free")
+
+FRAME = (1600.0, 1200.0, 810.0, 590.0)
+CENTRED = (1600.0, 1200.0, 800.0, 600.0)
+RAYS = np.random.default_rng(1).uniform([-0.4, -0.4, 1], [0.4, 0.4, 1], (50, 3))
+BENT = {"radial": (-0.1, 0.02, -0.003), "tangential": (1e-3, -2e-3)}
+FISH = {"projection": "equidistant"}
+COLMAP_LENSES = {
+    "SIMPLE_PINHOLE": PLAIN,
+    "PINHOLE": Lens(1500.0, *FRAME, b1=0.25),
+    "SIMPLE_RADIAL": Lens(1500.0, *FRAME, radial=(-0.1, 0.0)),
+    "RADIAL": Lens(1500.0, *FRAME, radial=(-0.1, 0.02, 0.0)),
+    "OPENCV": Lens(1500.0, *FRAME, b1=-2.0, radial=(-0.1, 0.02), tangential=(1e-3, -2e-3)),
+    "FULL_OPENCV": Lens(1500.0, *FRAME, **BENT, denominator=(0.01, 0.002)),
+    "SIMPLE_RADIAL_FISHEYE": Lens(800.0, *FRAME, **FISH),
+    "RADIAL_FISHEYE": Lens(800.0, *FRAME, **FISH, radial=(0.01, 0.002)),
+    "OPENCV_FISHEYE": Lens(800.0, *FRAME, **FISH, radial=(0.01, 2e-3, 3e-4, 1e-5)),
+    "THIN_PRISM_FISHEYE": Lens(
+        *(800.0, *FRAME),
+        **FISH,
+        radial=(0.01, 2e-3),
+        tangential=(1e-3, 2e-3),
+        thin_prism=(1e-4, 0.0, 2e-4, 0.0),
+    ),
+    "RAD_TAN_THIN_PRISM_FISHEYE": Lens(
+        *(800.0, *FRAME),
+        **FISH,
+        radial=(0.01, 2e-3, 1e-4, 1e-5, 1e-6, 1e-7),
+        tangential=(1e-3, 2e-3),
+        thin_prism=(1e-4, 3e-5, 2e-4, -2e-5),
+        in_turn=True,
+    ),
+    "FOV": Lens(800.0, *FRAME, projection="fov", shape=(0.9,)),
+    "SIMPLE_DIVISION": Lens(1500.0, *FRAME, projection="division", shape=(-0.05,)),
+    "EUCM": Lens(1500.0, *FRAME, projection="eucm", shape=(0.6, 1.1)),
+}
+OPENSFM_LENSES = {
+    "perspective": Lens(1500.0, *CENTRED, radial=(-0.1, 0.02)),
+    "brown": Lens(1500.0, *FRAME, b1=-2.0, **BENT),
+    "fisheye": Lens(800.0, *CENTRED, **FISH, radial=(0.01,)),
+    "fisheye_opencv": Lens(800.0, *FRAME, **FISH, b1=0.5, radial=(0.01, 2e-3, 3e-4, 1e-5)),
+    "fisheye62": Lens(
+        800.0, *FRAME, **FISH, radial=(0.01, 0.0, 0.0, 0.0, 1e-5, 1e-6), tangential=(1e-3, 2e-3)
+    ),
+    "fisheye624": Lens(800.0, *FRAME, **FISH, thin_prism=(1e-4, 2e-4, 3e-4, 4e-4)),
+    "dual": Lens(800.0, *CENTRED, projection="dual", shape=(0.7,), radial=(0.01, 0.002)),
+}
+OPENCV = Lens(1500.0, *FRAME, **BENT, denominator=(0.01, 0.0, 0.002))
+FOUR = Lens(1400.0, *FRAME, radial=(-0.1, 0.02, -0.003, 1e-4), tangential=(1e-3, -2e-3))
+FILM = Lens(3.6, 3.8, 2.8, 1.9, 1.4, unit="mm")
+
+
+def write(form, folder, cameras, ties=None, **more):
+    """Write a block into a folder, and return what is read again."""
+    if form == "colmap":
+        write_colmap(folder, cameras, ties, **more)
+        return folder
+    if form == "opensfm":
+        write_opensfm(folder / "reconstruction.json", cameras, ties)
+        return folder
+    write_table(folder, cameras)
+    return folder / "cameras.csv"
+
+
+def check_block(found, given, centres_m=1e-9, turn=1e-12):
+    assert found.labels == given.labels
+    # map coordinates of 4e6 m have steps of 5e-10 m
+    assert found.centres == pytest.approx(given.centres, abs=centres_m, rel=0.0)
+    assert found.rotations == pytest.approx(given.rotations, abs=turn)
+    for read, wrote in zip(found.lenses, given.lenses, strict=True):
+        assert project(read, RAYS) == pytest.approx(project(wrote, RAYS), abs=1e-8)
+
+
+def check_ties(found, given, places_m=1e-9, px=0.0):
+    assert found.xyz == pytest.approx(given.xyz, abs=places_m, rel=0.0)
+    assert found.views.start.tolist() == given.views.start.tolist()
+    assert found.views.camera.tolist() == given.views.camera.tolist()
+    assert found.image_xy == pytest.approx(given.image_xy, abs=px, rel=0.0)
+
+
+@pytest.mark.parametrize("offset", [(320000.0, 3842800.0, 0.0), (0.0, 0.0, 0.0), None])
+def test_colmap_there_and_back(tmp_path, offset):
+    cameras = small_block(tuple(COLMAP_LENSES.values()), k=16)
+    ties = some_ties(cameras)
+    write_colmap(tmp_path / "m", cameras, ties, offset_m=offset)
+    place = json.loads((tmp_path / "m" / "georeference.json").read_text())
+    assert place["offset_m"] == list(offset or (320000.0, 3842800.0, 0.0))  # near the block
+    found = read_cameras(tmp_path / "m")
+    assert found.crs == cameras.crs
+    check_block(found, cameras, 1e-9 if offset != (0.0, 0.0, 0.0) else 3e-9)
+    check_ties(read_tie_points(tmp_path / "m", found), ties)
+    check_block(bring_to(found, "EPSG:32636"), cameras, 3e-9)
+    names = {path.name for path in (tmp_path / "m").iterdir()}
+    assert names == {"cameras.bin", "images.bin", "points3D.bin", "georeference.json"}
+
+
+@pytest.mark.parametrize(
+    ("crs", "origin"),
+    [
+        ("EPSG:32636", (319900.0, 3842700.0, 0.0)),
+        ("EPSG:25830", (725400.0, 4369900.0, 120.0)),
+        ("EPSG:2154", (652000.0, 6862000.0, 30.0)),
+        (CRS("EPSG:32636").to_3d().to_wkt(), (319900.0, 3842700.0, 0.0)),
+        ("ENU:34.7,31.2,12.5", (0.0, 0.0, 0.0)),
+        ("local", (0.0, 0.0, 0.0)),
+    ],
+)
+def test_opensfm_there_and_back(tmp_path, crs, origin):
+    cameras = small_block(tuple(OPENSFM_LENSES.values()), crs, origin, k=8)
+    ties = some_ties(cameras, origin)
+    found = read_cameras(write("opensfm", tmp_path, cameras, ties))
+    seen = read_tie_points(tmp_path, found)
+    assert (tmp_path / "reference_lla.json").exists() == (crs != "local")
+    if crs.startswith(("ENU", "local")):
+        assert found.crs == crs
+    else:
+        way = georeference(found, crs)
+        found, seen = way.cameras(found), replace(seen, xyz=way.points(seen.xyz))
+    check_block(found, cameras, 1e-4, 1e-7)
+    check_ties(seen, ties, 1e-4, 1e-4)
+
+
+@pytest.mark.parametrize("lenses", [(PLAIN,), (OPENCV,), (FILM,), (PLAIN, FOUR)])
+@pytest.mark.parametrize("crs", ["EPSG:32636", CRS("EPSG:32636").to_3d().to_wkt(), None])
+def test_table_there_and_back(tmp_path, lenses, crs):
+    cameras = small_block(lenses, crs)
+    cameras = replace(cameras, labels=('a, "b".jpg', "c d.jpg", *cameras.labels[2:]))
+    found = read_cameras(write("table", tmp_path / "new", cameras))
+    assert found.crs == crs
+    check_block(found, cameras, 0.0)
+
+
+@free
+@pytest.mark.parametrize(
+    ("form", "places_m", "px"), [("colmap", 1e-9, 0.0), ("opensfm", 1e-4, 1e-4)]
+)
+def test_real_block_there_and_back(tmp_path, form, places_m, px):
+    offset = (319900.0, 3842700.0, 0.0)
+    cameras = read_cameras(FREE / "sparse")
+    ties = read_tie_points(FREE / "sparse", cameras)
+    cameras = bring_to(cameras, "EPSG:32636", offset_m=offset)
+    ties = replace(ties, xyz=ties.xyz + offset)
+    read = read_cameras(write(form, tmp_path, cameras, ties))
+    way, seen = georeference(read, "EPSG:32636"), read_tie_points(tmp_path, read)
+    found, seen = way.cameras(read), replace(seen, xyz=way.points(seen.xyz))
+    check_block(found, cameras, max(places_m, 3e-9), 1e-7)
+    check_ties(seen, ties, max(places_m, 3e-9), px)
+    before, after = (tie_point_residuals_px(*each) for each in ((cameras, ties), (found, seen)))
+    assert after == pytest.approx(before, abs=2e-4)
+
+
+def test_colmap_reads_it(tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    cameras = small_block(tuple(COLMAP_LENSES.values()), k=16)
+    ties = some_ties(cameras)
+    offset = np.array([319900.0, 3842700.0, 0.0])
+    write_colmap(tmp_path, cameras, ties, offset_m=tuple(offset))
+    model = pycolmap.Reconstruction(str(tmp_path))
+    assert len(model.points3D) == len(ties.xyz)
+    for i, label in enumerate(cameras.labels):
+        image = model.images[i + 1]
+        assert image.name == label
+        assert image.projection_center() == pytest.approx(cameras.centres[i] - offset, abs=1e-9)
+        matrix = image.cam_from_world().rotation.matrix()
+        assert matrix == pytest.approx(cameras.rotations[i], abs=1e-12)
+        seen = np.array([model.cameras[image.camera_id].img_from_cam(ray) for ray in RAYS])
+        assert seen == pytest.approx(project(cameras.lenses[i], RAYS), abs=1e-7)
+    for i, xyz in enumerate(ties.xyz):
+        point = model.points3D[i + 1]
+        assert point.xyz == pytest.approx(xyz - offset, abs=1e-9)
+        views = [
+            (e.image_id - 1, model.images[e.image_id].points2D[e.point2D_idx].xy)
+            for e in point.track.elements
+        ]
+        rows = slice(*ties.views.start[i : i + 2])
+        assert [camera for camera, _ in views] == ties.views.camera[rows].tolist()
+        assert np.array([xy for _, xy in views]) == pytest.approx(ties.image_xy[rows], abs=0)
+
+
+def test_world_of_opensfm_is_topocentric(tmp_path):
+    cameras = small_block()
+    read = read_cameras(write("opensfm", tmp_path, cameras))
+    lla = json.loads((tmp_path / "reference_lla.json").read_text())
+    step = Transformer.from_pipeline(
+        f"+proj=topocentric +ellps=WGS84 +lat_0={lla['latitude']!r} +lon_0={lla['longitude']!r}"
+        f" +h_0={lla['altitude']!r}"
+    )
+    ecef = step.transform(*read.centres.T, direction="INVERSE")
+    to_map = Transformer.from_crs("EPSG:4978", CRS("EPSG:32636").to_3d(), always_xy=True)
+    assert np.column_stack(to_map.transform(*ecef)) == pytest.approx(cameras.centres, abs=1e-6)
+    # the axes at the origin, by differences over 100 m; those at a camera 100 m away differ by
+    # the curvature of the earth between the two, 100 m / 6400 km
+    steps = np.vstack([np.zeros(3), 100.0 * np.eye(3)])
+    there = np.column_stack(to_map.transform(*step.transform(*steps.T, direction="INVERSE")))
+    turn = (there[1:] - there[0]).T / 100.0
+    assert abs(turn[0, 1]) > 0.01  # the meridian convergence
+    u, _, v = np.linalg.svd(turn)
+    assert read.rotations == pytest.approx(cameras.rotations @ (u @ v), abs=3e-5)
+
+
+@pytest.mark.parametrize("name", [*COLMAP_LENSES, *OPENSFM_LENSES])
+def test_simplest_model_of_a_lens(tmp_path, name):
+    if name in COLMAP_LENSES:
+        assert colmap_camera(tmp_path, COLMAP_LENSES[name]).model.name == name
+    else:
+        assert opensfm_camera(tmp_path, OPENSFM_LENSES[name])["projection_type"] == name
+
+
+ODD = (
+    Lens(1500.0, *FRAME, b2=0.1),
+    Lens(1500.0, *FRAME, radial=(0.1, 0.01, 0.001, 1e-4)),
+    Lens(1500.0, *FRAME, radial=(0.1,), inverse=True),
+    FILM,
+)
+
+
+@pytest.mark.parametrize(
+    ("form", "lenses"),
+    [
+        *((form, (lens,)) for form in ("colmap", "opensfm") for lens in ODD),
+        ("colmap", (Lens(1500.0, *FRAME, tangential=(1e-3, 1e-3, 1e-4)),)),
+        ("colmap", (Lens(1500.0, *FRAME, radial=(0.1,), distortion_centre=(0.01, 0.0)),)),
+        ("colmap", (Lens(1500.0, *FRAME, projection="polynomial", shape=(0.0, 1.0)),)),
+        ("colmap", (Lens(1500.0, *FRAME, projection="fov", shape=(0.9,), radial=(0.1,)),)),
+        ("colmap", (Lens(1500.0, *FRAME, thin_prism=(1e-3,)),)),
+        ("opensfm", (Lens(1500.0, *FRAME, denominator=(0.1,)),)),
+        ("opensfm", (Lens(800.0, *FRAME, projection="dual", shape=(0.7,)),)),
+        ("opensfm", (Lens(800.0, *FRAME, projection="equisolid"),)),
+        ("opensfm", (Lens(800.0, *FRAME, **FISH, tangential=(1e-3, 1e-3), in_turn=True),)),
+        ("table", (FOUR,)),
+        ("table", (replace(PLAIN, b1=0.1),)),
+        ("table", (replace(PLAIN, **FISH),)),
+        ("table", (replace(FILM, radial=(0.1,)),)),
+        ("table", (PLAIN, OPENCV)),
+        ("table", (PLAIN, replace(PLAIN, width=1700.0))),
+        ("table", (FILM, replace(FILM, focal=3.7))),
+    ],
+)
+def test_lens_not_held(tmp_path, form, lenses):
+    with refused("output.lens"):
+        write(form, tmp_path / "new", small_block(lenses))
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("form", "changes", "code"),
+    [
+        *((form, {"lenses": None}, "output.no_lenses") for form in ("colmap", "opensfm", "table")),
+        ("colmap", {"labels": ("a\nb", *"cdefg")}, "output.label"),
+        ("opensfm", {"labels": ("a",) * 6}, "output.label"),
+        ("opensfm", {"labels": ("a\tb", *"cdefg")}, "output.label"),
+        ("opensfm", {"crs": "EPSG:4979"}, "output.crs"),
+        ("opensfm", {"crs": "EPSG:4978"}, "output.crs"),
+        ("opensfm", {"crs": "EPSG:32636+5773"}, "crs.heights"),
+        ("table", {"crs": "ENU:1,2,3"}, "output.crs"),
+    ],
+)
+def test_block_not_held(tmp_path, form, changes, code):
+    with refused(code, InputError):
+        write(form, tmp_path, replace(small_block(), **changes))
+
+
+@pytest.mark.parametrize("form", ["colmap", "opensfm"])
+def test_unseen_points_are_left_out(tmp_path, form):
+    xyz = np.array([[1.0, 2, 3], [np.nan] * 3, [4.0, 5, 6], [7.0, 8, 9]])
+    views = Views(np.array([0, 2, 4, 4, 6]), np.array([0, 1, 0, 1, 2, 0]))
+    ties = TiePoints(xyz, views, np.arange(12.0).reshape(6, 2))
+    write(form, tmp_path, small_block(crs=None, origin=(0, 0, 0)), ties)
+    found = read_tie_points(tmp_path, read_cameras(tmp_path))
+    assert found.xyz.tolist() == [[1.0, 2, 3], [7.0, 8, 9]]
+    assert found.views.start.tolist() == [0, 2, 4]
+    assert found.views.camera.tolist() == [0, 1, 0, 2]
+    assert found.image_xy[:, 0] == pytest.approx([0.0, 2.0, 10.0, 8.0], abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("form", "name"),
+    [("colmap", "points3D.bin"), ("opensfm", "reference_lla.json"), ("table", "sensor.csv")],
+)
+def test_nothing_is_replaced(tmp_path, form, name):
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(SettingError):
+        write(form, tmp_path, small_block())
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_model_without_tie_points(tmp_path):
+    cameras = replace(small_block(), labels=("a b.jpg", *small_block().labels[1:]))
+    check_block(read_cameras(write("colmap", tmp_path, cameras)), cameras)
+    with refused("cameras.no_tie_points"):
+        read_tie_points(tmp_path, cameras)
+
+
+@pytest.mark.parametrize(
+    ("text", "code"),
+    [
+        ("{", "cameras.damaged"),
+        ('{"written_by": "pcfix", "crs": null, "offset_m": [1, 2]}', "cameras.damaged"),
+        ('{"written_by": "pcfix", "crs": 7, "offset_m": [1, 2, 3]}', "cameras.damaged"),
+        ('{"written_by": "pcfix", "crs": "EPSG:1", "offset_m": [1, 2, 3]}', "cameras.crs"),
+    ],
+)
+def test_georeference_refused(tmp_path, text, code):
+    write_colmap(tmp_path, small_block())
+    (tmp_path / "georeference.json").write_text(text)
+    with refused(code):
+        read_cameras(tmp_path)
+
+
+def test_georeference_of_others_says_nothing(tmp_path):
+    write_colmap(tmp_path, small_block(), offset_m=(1.0, 2.0, 3.0))
+    (tmp_path / "georeference.json").write_text('{"offset_m": [1, 2, 3], "crs": "EPSG:32636"}')
+    found = read_cameras(tmp_path)
+    assert found.crs is None
+    assert found.centres == pytest.approx(small_block().centres - [1, 2, 3], abs=2e-9, rel=0.0)
