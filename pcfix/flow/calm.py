@@ -35,7 +35,6 @@ from pcfix.photos.calm import (
     laid,
     median_of,
     register,
-    strip_rows,
 )
 from pcfix.photos.mapping import Photo
 from pcfix.photos.waves import (
@@ -56,6 +55,8 @@ FAR_PX = 1e5
 """Focal length of a camera with nearly parallel rays, in pixels per pixel of the image."""
 PASSES = 2
 """Over the surface: the height of the piercing points follows from the first."""
+SORTED_BYTES = 200_000_000
+"""Of the frames of a strip of rows at once, in single precision."""
 LEAST_EXPLAINED = 0.5
 """Share of the slopes; if waves explain less, there is a warning."""
 
@@ -219,7 +220,7 @@ def _median(
     shape = stack.shape[1:3]
     median = np.empty(stack.shape[1:], stack.dtype)
     spread = np.empty(shape, np.float32)
-    at_once = strip_rows(len(stack), shape[1], stack.shape[3])
+    at_once = max(1, SORTED_BYTES // (4 * stack[:, 0].size))
     for top in range(0, shape[0], at_once):
         bottom = min(top + at_once, shape[0])
         known = np.stack([covered(one, shape, top, bottom) for one in way.homography])

@@ -18,7 +18,6 @@ from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.runner import Progress, check_summary, json_text, write_summary
-from pcfix.io.crs import is_same, parse_crs
 from pcfix.io.files import file_state, read_json, write_text
 from pcfix.io.photographs import photographs_in, read_photograph, size_of, write_photograph
 from pcfix.io.rasters import filled_heights, open_raster
@@ -191,7 +190,7 @@ def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> PhotoBlo
             "--resolution is for a cloud; the DSM has its own.",
             option="resolution",
         )
-    notes = [*_provenance_notes(corrected, given), *_transformed_notes(given, read, crs)]
+    notes = _provenance_notes(corrected, given)
     cameras, _ = inputs.block(crs, read)
     rows, lost = _matched(paths, cameras, name)
     notes += lost
@@ -265,18 +264,6 @@ def read_heights(
         )
     corrected = bool(json.loads(tags.get("PCFIX", "{}")).get("corrected"))
     return heights, (t.c, t.f, t.a), crs, corrected
-
-
-def _transformed_notes(given: PhotosOptions, read: Cameras, crs: str | None) -> list[PcfixWarning]:
-    """Return a note if the cameras have another CRS than the ground."""
-    theirs = given.cameras_crs or read.crs
-    if theirs is None or crs is None:
-        return []
-    own, other = parse_crs(theirs, str(given.cameras)), parse_crs(crs, str(given.dsm))
-    if is_same(own, other):
-        return []
-    words = f"{given.cameras}: its cameras were transformed from {own.name} to {other.name}."
-    return [PcfixWarning("cameras.transformed", words, source=own.name, target=other.name)]
 
 
 def _provenance_notes(corrected: bool, given: PhotosOptions) -> list[PcfixWarning]:

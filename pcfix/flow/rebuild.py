@@ -75,8 +75,6 @@ class RebuildSummary:
         Rounds that an earlier call finished.
     settled : bool
         Whether the last round moved the bed by less than the threshold.
-    compare : str
-        The command that compares all clouds with a reference.
     compared : str or None
         The folder with its results, where a reference was given.
     """
@@ -89,7 +87,6 @@ class RebuildSummary:
     seconds: float
     mapping: str
     rebuild: str
-    compare: str
     compared: str | None
     notes: tuple[PcfixWarning, ...]
 
@@ -143,10 +140,10 @@ def rebuild_rounds(
     with threads(given.jobs), TemporaryDirectory() as scratch:
         block = block_of(given, paths, Path(scratch))
     run = _Run(Path(images), target, given, block, progress, record)
+    threshold_m = round(given.until_gsd * block.gsd_m, 5)
     rounds: list[Round] = []
     notes: list[PcfixWarning] = []
-    settled = False
-    while len(rounds) < given.most_rounds and not settled:
+    while len(rounds) < given.most_rounds and not (rounds and abs(rounds[-1].mean_m) < threshold_m):
         number = len(rounds) + 1
         one = run.round(number, Path(rounds[-1].dsm) if rounds else Path(given.dsm))
         rounds.append(one)
@@ -158,14 +155,12 @@ def rebuild_rounds(
         if number == PAPER_ROUNDS and given.mapping == "paper":
             notes.append(_paper_note(block.scene.refractive_index))
             warnings.warn(notes[-1], stacklevel=2)
-        settled = abs(one.mean_m) < run.threshold_m
-    compare = _compare_words(rounds, start, given, target)
-    compared = _compared(rounds, start, given, target)
     summary = RebuildSummary(
-        tuple(rounds), min(finished, run.first_new - 1), settled, round(block.gsd_m, 5),
-        run.threshold_m,
-        round(time.perf_counter() - started, 3), given.mapping, given.rebuild or "",
-        shlex.join(compare), compared, tuple(notes),
+        rounds=tuple(rounds), done_before=min(finished, run.first_new - 1),
+        settled=abs(rounds[-1].mean_m) < threshold_m, gsd_m=round(block.gsd_m, 5),
+        threshold_m=threshold_m, seconds=round(time.perf_counter() - started, 3),
+        mapping=given.mapping, rebuild=str(given.rebuild),
+        compared=_compared(rounds, start, given, target), notes=tuple(notes),
     )  # fmt: skip
     write_summary(given, plain(summary))
     return summary
@@ -222,11 +217,6 @@ class _Run:
     record: dict[str, Any]
     first_new: int = 1_000_000
     """Number of the first round that was not finished before."""
-
-    @property
-    def threshold_m(self) -> float:
-        """The rounds end when the bed moves by less than this."""
-        return round(self.given.until_gsd * self.block.gsd_m, 5)
 
     def round(self, number: int, before: Path) -> Round:
         """Return a round; its parts that are finished are skipped."""
@@ -359,34 +349,22 @@ def _paper_note(index: float) -> PcfixWarning:
     )
 
 
-def _others(rounds: list[Round], start: str | None) -> dict[str, str]:
-    """Return the clouds but for the last, by names for tables and sections."""
-    named = {f"round{k}": one.cloud for k, one in enumerate(rounds[:-1], start=1)}
-    return ({} if start is None else {"round0": start}) | named
-
-
-def _compare_words(
-    rounds: list[Round], start: str | None, given: PhotosOptions, target: Path
-) -> list[str]:
-    """Return the command that gives Figs 16, 18 and 20; with the first cloud 15 and 17."""
-    words = ["pcfix", "compare", rounds[-1].cloud, str(given.reference or "REFERENCE")]
-    words += ["--water", str(given.water), "--submerged", "--out-dir", str(target / "compare")]
-    for name, cloud in _others(rounds, start).items():
-        words += ["--also", f"{name}={cloud}"]
-    return words
-
-
 def _compared(
     rounds: list[Round], start: str | None, given: PhotosOptions, target: Path
 ) -> str | None:
-    """Compare the clouds with a reference, if one was given; a failure loses no round."""
+    """Compare the clouds with a reference, if one was given; a failure loses no round.
+
+    This gives Figs 16, 18 and 20 of the paper; with the first cloud also 15 and 17.
+    """
     if given.reference is None:
         return None
+    also = {} if start is None else {"round0": start}
+    also |= {f"round{k}": one.cloud for k, one in enumerate(rounds[:-1], start=1)}
     folder = target / "compare"
     try:
         compare_clouds(
             rounds[-1].cloud, given.reference, water=given.water, submerged=True, out_dir=folder,
-            also=_others(rounds, start), overwrite=True,
+            also=also, overwrite=True,
         )  # fmt: skip
     except PcfixError as error:
         words = f"The rounds are finished, but not compared: {error}"

@@ -33,8 +33,6 @@ OUTLIER_PX = 5.0
 ROUNDS = 20
 STILL_PX = 0.1
 """Least scatter of a corner for its weight: the precision of tracking."""
-SORTED_BYTES = 200_000_000
-"""Of the frames of a strip at once, in single precision."""
 
 
 def grey8(image: npt.NDArray[Any], longest_px: int | None = None) -> npt.NDArray[np.uint8]:
@@ -203,11 +201,6 @@ def covered(way: FloatArray, shape: tuple[int, int], top: int, bottom: int) -> B
     for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         inside &= (x1 - x0) * (y - y0) - (y1 - y0) * (x - x0) >= -1e-6 * np.hypot(columns, rows)
     return inside
-
-
-def strip_rows(frames: int, columns: int, bands: int) -> int:
-    """Return how many rows of all frames are sorted at once."""
-    return max(1, SORTED_BYTES // (4 * frames * columns * bands))
 
 
 def median_of(

@@ -118,7 +118,16 @@ def paper(photo: Photo, scene: Scene, step_px: int) -> Shifts:
     known &= np.isfinite(shift).all(axis=1)
     shift[~known] = 0.0
     forward = _as_grid(step_px, shift, known, shape)
-    return forward._replace(shift_px=_inverse(forward))
+    # the inverse: p - q for each node q, where p + shift(p) = q
+    cv2 = photo_library("cv2")
+    rows, columns = shape
+    here = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=2).astype(np.float32)
+    back = np.zeros_like(forward.shift_px)
+    for _ in range(INVERSION_STEPS):
+        u, v = np.moveaxis(here + back / step_px, 2, 0)
+        look: dict[str, Any] = {"borderMode": cv2.BORDER_REPLICATE}
+        back = -cv2.remap(forward.shift_px, u, v, cv2.INTER_LINEAR, **look)
+    return forward._replace(shift_px=back)
 
 
 def _ground_seen(
@@ -149,22 +158,6 @@ def hidden(ground: Ground, start: FloatArray, end: FloatArray) -> BoolArray:
 
 def _as_grid(step_px: int, shift: FloatArray, known: BoolArray, shape: tuple[int, int]) -> Shifts:
     return Shifts(step_px, shift.reshape(*shape, 2).astype(np.float32), known.reshape(shape))
-
-
-def _inverse(forward: Shifts) -> FloatArray:
-    """Return p - q for each node q, where p + shift(p) = q."""
-    cv2 = photo_library("cv2")
-
-    rows, columns = forward.known.shape
-    here = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=2).astype(np.float32)
-    back = np.zeros_like(forward.shift_px)
-    for _ in range(INVERSION_STEPS):
-        place = here + back / forward.step_px
-        back = -cv2.remap(
-            forward.shift_px, place[..., 0], place[..., 1], cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_REPLICATE,
-        )  # fmt: skip
-    return back
 
 
 class Resampled(NamedTuple):

@@ -252,33 +252,33 @@ class Slopes(NamedTuple):
 
 def fit_waves(given: Slopes, depth_m: float) -> Waves:
     """Fit plane waves to slopes; with one frame, time has no effect."""
-    spectrum = _Spectrum(given, depth_m)
-    chosen = np.empty(0, np.int64)
-    total = float((given.weight[..., None] * given.slope**2).sum())
-    found = _Fit(np.empty(0), np.empty((0, 0)), given.slope)
-    left = total
+    spectrum, weight = _Spectrum(given, depth_m), given.weight[..., None]
+    chosen, residual = np.empty(0, np.int64), given.slope
+    slope, covariance = np.empty(0), np.empty((0, 0))
+    total = max(float((weight * given.slope**2).sum()), 1e-30)
+    left = float((weight * given.slope**2).sum())
     for _ in range(ROUNDS):
-        more = spectrum.strongest(found.residual, chosen)
+        # those with most energy that are not chosen, well above that of white noise
+        energy = spectrum.energy(residual)
+        energy[chosen] = 0.0
+        more = np.argsort(-energy, kind="stable")[:WAVES_AT_ONCE]
+        more = more[energy[more] > OVER_NOISE * spectrum.white(residual)]
         if not len(more):
             break
-        trial = np.concatenate([chosen, more])
-        new = _solved(given, spectrum.number[trial], spectrum.frequency[trial])
-        now = float((given.weight[..., None] * new.residual**2).sum())
-        chosen, found, gain, left = trial, new, (left - now) / max(total, 1e-30), now
-        if gain < LEAST_GAIN:
+        chosen = np.concatenate([chosen, more])
+        slope, covariance, residual = _solved(
+            given, spectrum.number[chosen], spectrum.frequency[chosen]
+        )
+        before, left = left, float((weight * residual**2).sum())
+        if before - left < LEAST_GAIN * total:
             break
-    inflated = spectrum.redness(found.residual, chosen)
+    # residuals that are not white make the covariance larger
+    energy = np.delete(spectrum.energy(residual), chosen)
+    redness = max(1.0, float(energy.mean()) / max(spectrum.white(residual), 1e-30))
     return Waves(
-        spectrum.number[chosen], spectrum.frequency[chosen], found.slope,
-        found.covariance * inflated, spectrum.height_rms(found.residual),
-        1.0 - left / max(total, 1e-30),
+        spectrum.number[chosen], spectrum.frequency[chosen], slope, covariance * redness,
+        spectrum.height_rms(residual), 1.0 - left / total,
     )  # fmt: skip
-
-
-class _Fit(NamedTuple):
-    slope: FloatArray
-    covariance: FloatArray
-    residual: FloatArray
 
 
 def _bases(given: Slopes, number: FloatArray, frequency: FloatArray) -> Iterator[FloatArray]:
@@ -295,8 +295,13 @@ def _bases(given: Slopes, number: FloatArray, frequency: FloatArray) -> Iterator
         yield np.hstack([-wave.imag, wave.real])
 
 
-def _solved(given: Slopes, number: FloatArray, frequency: FloatArray) -> _Fit:
-    """Fit waves to the slopes of all frames by least squares, with a prior of their variance."""
+def _solved(
+    given: Slopes, number: FloatArray, frequency: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Fit waves to the slopes of all frames by least squares, with a prior of their variance.
+
+    Returns the amplitudes of the slope, their covariance, and the residuals.
+    """
     along = np.tile(number / np.hypot(*number.T)[:, None], (2, 1))
     size = len(along)
     gram, right = np.zeros((size, size)), np.zeros(size)
@@ -318,7 +323,7 @@ def _solved(given: Slopes, number: FloatArray, frequency: FloatArray) -> _Fit:
         for basis, left, slope in zip(bases, residual, given.slope, strict=True):
             left[used] = slope[used] - basis @ (found[:, None] * along)
         noise = float((given.weight[..., None] * residual**2).sum()) / (2.0 * count)
-    return _Fit(found, np.asarray(covariance * noise, np.float64), residual)
+    return found, np.asarray(covariance * noise, np.float64), residual
 
 
 class _Spectrum:
@@ -358,23 +363,10 @@ class _Spectrum:
             total += self._transformed(one, weight) * np.exp(1j * self.frequency * time)
         return np.abs(total) ** 2
 
-    def strongest(self, slope: FloatArray, chosen: npt.NDArray[np.int64]) -> Any:
-        """Return the rows of the next waves: those with most energy that are not chosen."""
-        energy = self.energy(slope)
-        least = OVER_NOISE * float(self._white(slope))
-        energy[chosen] = 0.0
-        first = np.argsort(-energy, kind="stable")[:WAVES_AT_ONCE]
-        return first[energy[first] > least]
-
-    def _white(self, slope: FloatArray) -> float:
+    def white(self, slope: FloatArray) -> float:
         """Return the energy at each wave number if the slopes were white noise."""
         weight = self._given.weight[..., None]
         return float(((weight * slope) ** 2).sum()) / 2.0
-
-    def redness(self, residual: FloatArray, chosen: npt.NDArray[np.int64]) -> float:
-        """Return the energy of the residuals on the shell, relative to white noise."""
-        energy = np.delete(self.energy(residual), chosen)
-        return max(1.0, float(energy.mean()) / max(self._white(residual), 1e-30))
 
     def height_rms(self, residual: FloatArray) -> float:
         """Integrate residual slopes to heights, rms, by the method of Frankot & Chellappa."""

@@ -1,1 +1,1 @@
-"""What a run did, told to people."""
+"""Summaries, figures and the HTML page."""

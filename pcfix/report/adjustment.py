@@ -200,8 +200,9 @@ def _facts(d: Plain) -> Rows:
         "steps": sum(row["steps"] for row in rounds), "has_shape": has_shape,
         "undone": "; adjustment without water undone" if d["engine"] == "unaware" else "",
     })  # fmt: skip
-    rows += [(_lens_label(row), _lens_words(row, d)) for row in d["lens"]] or [("lens", "fixed")]
-    rows += _water_rows(d)
+    rows += [] if d["lens"] else [("lens", "fixed")]
+    rows += [(label, _change_words(row, unit)) for label, row, unit in _unknowns(d)]
+    rows += _fixed_water(d)
     rows += [(f"on {one['surface']}", _surface_words(one, d)) for one in d["on_surfaces"]]
     if d["poses_are"] != "fixed":
         errors = {
@@ -252,26 +253,25 @@ def _change_words(row: Plain, unit: str) -> str:
     return f"{before} -> {after}{f' {unit}' if unit else ''} ({change}{error})"
 
 
-def _lens_label(row: Plain) -> str:
-    """Return what a surveyor calls a lens parameter."""
-    return str(_LENS.get(row["name"], row["name"]))
+def _unknowns(d: Plain) -> list[tuple[str, Plain, str]]:
+    """Return label, values and unit of what was free of lens, water and port."""
+    several = len({row["sensor"] for row in d["lens"]}) > 1
+    rows = []
+    for row in d["lens"]:
+        label = str(_LENS.get(row["name"], row["name"]))
+        label += f", {row['sensor']}, {row['images']:,} images" if several else ""
+        label += f", first of {row['lenses']} lenses" if row["lenses"] > 1 else ""
+        in_pixels = row["name"] in ("f", "cx", "cy", "b1", "b2")
+        rows.append((label, row, str(d["image_unit"]) if in_pixels else ""))
+    found = d["water"] or d["port_found"] or {}
+    for key, (label, unit) in _WATER.items():
+        if (value := found.get(key)) is not None and value["free"]:
+            rows.append((label, value, unit))
+    return rows
 
 
-def _lens_unit(row: Plain, d: Plain) -> str:
-    return str(d["image_unit"]) if row["name"] in ("f", "cx", "cy", "b1", "b2") else ""
-
-
-def _has_many_sensors(d: Plain) -> bool:
-    return len({row["sensor"] for row in d["lens"]}) > 1
-
-
-def _lens_words(row: Plain, d: Plain) -> str:
-    sensor = f"; {row['sensor']}, {row['images']:,} images" if _has_many_sensors(d) else ""
-    several = f"; first of {row['lenses']} lenses" if row["lenses"] > 1 else ""
-    return _change_words(row, _lens_unit(row, d)) + sensor + several
-
-
-def _water_rows(d: Plain) -> Rows:
+def _fixed_water(d: Plain) -> Rows:
+    """Return what was not free of water and port; a level surface has no tilt to show."""
     water, port = d["water"], d["port_found"]
     rows = []
     if water is None:
@@ -280,10 +280,8 @@ def _water_rows(d: Plain) -> Rows:
             rows.append(("port", f"--port {port['port']}"))
     for key, (label, unit) in _WATER.items():
         v = (water or port or {}).get(key)
-        if v is None or (key.startswith("tilt") and not v["free"] and v["after"] == 0.0):
-            continue
-        value = f"{v['after']:.6g}{f' {unit}' if unit else ''}, fixed"
-        rows.append((label, _change_words(v, unit) if v["free"] else value))
+        if v is not None and not v["free"] and not (key.startswith("tilt") and v["after"] == 0.0):
+            rows.append((label, f"{v['after']:.6g}{f' {unit}' if unit else ''}, fixed"))
     return rows
 
 
@@ -382,14 +380,7 @@ def _residual_table(d: Plain) -> Table:
 
 def _unknown_rows(d: Plain) -> list[list[str]]:
     """Return lens and water before and after, as far as they were free."""
-    rows = []
-    for row in d["lens"]:
-        label = _lens_label(row) + (f", {row['sensor']}" if _has_many_sensors(d) else "")
-        rows.append([label, *_change(row), _lens_unit(row, d)])
-    for key, (label, unit) in _WATER.items():
-        value = (d["water"] or d["port_found"] or {}).get(key)
-        if value is not None and value["free"]:
-            rows.append([label, *_change(value), unit])
+    rows = [[label, *_change(row), unit] for label, row, unit in _unknowns(d)]
     if d["poses_are"] == "similarity" and d["precision"] is not None:
         units = {"shift": "m", "turn": "rad", "scale": ""}
         for row in d["precision"]["shared"]:

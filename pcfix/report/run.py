@@ -134,6 +134,7 @@ def run_report(
 
 
 def _layers(maps: Maps, later: Later) -> list[Layer]:
+    """Return the choices of the map, depth first."""
     known = np.isfinite(maps.uncertainty_m).any()
     by = "Uncertainty (95 %)" if known else ""
     layers = [Layer("Depth", "m", maps.depth_m, DEPTH, by, has_contours=True)]

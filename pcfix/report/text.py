@@ -134,7 +134,6 @@ _REBUILT: RowTable = (
      " average", "rebuild"),
     ("Cloud", "{cloud}", "cloud"),
     ("Compared", "{compared}", "compared"),
-    ("Next", "{compare}", "not_compared"),
 )  # fmt: skip
 _ORTHO: RowTable = (
     ("Raster", "{width:,} x {height:,} cells of {resolution_m:g} m", "width"),
@@ -430,7 +429,6 @@ def rounds_text(s: Any) -> str:
         "verdict": "settled" if s.settled else "not settled",
         "less": "less" if s.settled else "more",
         "cloud": s.rounds[-1].cloud,
-        "not_compared": s.compared is None,
     }
     return aligned(f"Rebuilt in {len(s.rounds)} rounds", filled(_REBUILT, values))
 

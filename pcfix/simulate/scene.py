@@ -160,16 +160,26 @@ def simulate_scene(
     terrain, flown, given, rng = site.terrain, site.flown, site.given, site.streams.main
     truth = points_on(terrain, chosen.points, rng)
     partners = _partners(chosen, truth, site)
-    parts = _parts(truth, site, partners, progress)
+    # parts of bounded memory
+    pairs = _TRACK_PAIRS_AT_ONCE if partners is None else _DENSE_PAIRS_AT_ONCE
+    at_once = max(1, pairs // len(flown.cameras))
+    parts: list[Part] = []
+    for first in range(0, len(truth), at_once):
+        parts.append(_observe(truth[first : first + at_once], site, partners))
+        if progress is not None:
+            progress(min(first + at_once, len(truth)), len(truth))
     area_m2 = terrain.length_m * terrain.width_m
     lidar = points_on(terrain, round(area_m2 * chosen.lidar_per_m2), rng)
     lidar[:, 2] += rng.normal(0.0, chosen.lidar_noise_m, len(lidar))
     cameras = cameras_in_world(given.cameras)
-    views, pairs, pairs_start = _joined(parts)
     return Scene(
         apparent_xyz=np.vstack([part.xyz for part in parts]) + ORIGIN_M,
         true_xyz=np.vstack([part.true_xyz for part in parts]) + ORIGIN_M,
-        views=views,
+        views=Views(
+            _starts([part.views.start for part in parts]),
+            _joined([part.views.camera for part in parts]),
+            _joined([part.views.weight for part in parts]),
+        ),
         cameras=cameras,
         yaw_pitch_roll_deg=given.yaw_pitch_roll_deg,
         lidar_xyz=lidar + ORIGIN_M,
@@ -183,9 +193,20 @@ def simulate_scene(
         true_cameras=cameras if given is flown else cameras_in_world(flown.cameras),
         true_yaw_pitch_roll_deg=flown.yaw_pitch_roll_deg,
         neighbours=partners.matched if isinstance(partners, Partners) else partners,
-        pairs=pairs,
-        pairs_start=pairs_start,
+        pairs=_joined([part.pairs for part in parts]),
+        pairs_start=_starts([part.pairs_start for part in parts]),
     )
+
+
+def _joined(arrays: list[Any]) -> Any:
+    """Return the arrays of all parts in one; None if they have none."""
+    return None if arrays[0] is None else np.concatenate(arrays)
+
+
+def _starts(arrays: list[Any]) -> Any:
+    """Return where the rows of each point of all parts begin."""
+    counts = _joined([None if one is None else np.diff(one) for one in arrays])
+    return None if counts is None else np.concatenate([[0], np.cumsum(counts)])
 
 
 class Site(NamedTuple):
@@ -210,15 +231,11 @@ def lay_out(chosen: SceneSettings) -> Site:
         count = len(flown.cameras)
         waves = Waves.random(count, chosen.wave_slope_deg, chosen.wave_length_m, streams.waves)
     fall_m = chosen.water_tilt * float(np.hypot(*extent)) / 2.0
+    water, lowest_m = Water(plane, chosen.refractive_index, waves), chosen.water - chosen.depth_m
     rig = Rig(
-        true=flown.cameras,
-        given=given.cameras,
-        optics=chosen.optics,
-        water=Water(plane, chosen.refractive_index, waves),
-        lowest_m=chosen.water - chosen.depth_m - fall_m,
-        image_noise_px=chosen.image_noise,
-        detection=chosen.detection,
-    )
+        flown.cameras, given.cameras, chosen.optics, water, lowest_m - fall_m, chosen.image_noise,
+        chosen.detection,
+    )  # fmt: skip
     return Site(terrain, flown, given, rig, streams)
 
 
@@ -254,24 +271,6 @@ def _partners(chosen: SceneSettings, truth: FloatArray, site: Site) -> Partners 
     return openmvs_partners(every.intersected(every.ideal), every, chosen.matched_with, rng)
 
 
-def _parts(
-    truth: FloatArray,
-    site: Site,
-    partners: Partners | IntArray | None,
-    progress: Callable[[int, int], None] | None,
-) -> list[Part]:
-    """Return the cloud in parts of bounded memory."""
-    pairs = _TRACK_PAIRS_AT_ONCE if partners is None else _DENSE_PAIRS_AT_ONCE
-    at_once = max(1, pairs // len(site.rig.true))
-    parts: list[Part] = []
-    for first in range(0, len(truth), at_once):
-        part = truth[first : first + at_once]
-        parts.append(_observe(part, site, partners))
-        if progress is not None:
-            progress(first + len(part), len(truth))
-    return parts
-
-
 def _observe(truth: FloatArray, site: Site, partners: Partners | IntArray | None) -> Part:
     """Return the cloud of some points."""
     rig, streams = site.rig, site.streams
@@ -283,25 +282,6 @@ def _observe(truth: FloatArray, site: Site, partners: Partners | IntArray | None
         normals = site.terrain.normals(*truth[:, :2].T)
         return fuse_depth_maps(sight, normals, partners, streams.matching)
     return match_pairs(sight, partners, streams.matching)
-
-
-def _joined(parts: list[Part]) -> tuple[Views, IntArray | None, IntArray | None]:
-    """Return the views of all parts, and the pairs and where those of each point begin."""
-
-    def joined(arrays: list[Any]) -> Any:
-        return None if arrays[0] is None else np.concatenate(arrays)
-
-    def starts(arrays: list[Any]) -> Any:
-        if arrays[0] is None:
-            return None
-        return np.concatenate([[0], np.cumsum(np.concatenate([np.diff(one) for one in arrays]))])
-
-    views = Views(
-        starts([part.views.start for part in parts]),
-        joined([part.views.camera for part in parts]),
-        joined([part.views.weight for part in parts]),
-    )
-    return views, joined([part.pairs for part in parts]), starts([p.pairs_start for p in parts])
 
 
 def cameras_in_world(cameras: Cameras) -> Cameras:

@@ -263,7 +263,14 @@ def match_pairs(sight: Sight, table: IntArray, rng: np.random.Generator) -> Part
     A point without a pair stays where it is and has no cameras. `table`, shape (k, c), has the
     neighbours of each camera, -1 for none; `rng` makes the noise, of two image points a pair.
     """
-    one, other = pair_rows(sight, table)
+    # the rows that are pairs, each once, sorted by point, then camera
+    k, rows = len(table), sight.rows()
+    match = np.zeros((k, k + 1), bool)
+    match[np.arange(k)[:, None], table] = True  # the column k, or -1, is for "none"
+    match = match[:, :k]
+    first, second = np.nonzero(np.triu(match | match.T, 1))
+    owner, pair = np.nonzero((rows[:, first] >= 0) & (rows[:, second] >= 0))
+    one, other = rows[owner, first[pair]], rows[owner, second[pair]]
     rig, truth, point = sight.rig, sight.truth, sight.point[one]
     both = np.column_stack([one, other]).ravel()
     places = triangulate(
@@ -285,15 +292,3 @@ def match_pairs(sight: Sight, table: IntArray, rng: np.random.Generator) -> Part
     views = Views(starts_of(sight.point[used], len(truth)), sight.camera[used])
     pairs = np.column_stack([sight.camera[one], sight.camera[other]])
     return Part(xyz, truth, views, pairs, start)
-
-
-def pair_rows(sight: Sight, table: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the rows of `sight` that are pairs, each once, sorted by point, then camera."""
-    k, rows = len(table), sight.rows()
-    match = np.zeros((k, k + 1), bool)
-    match[np.arange(k)[:, None], table] = True  # the column k, or -1, is for "none"
-    match = match[:, :k]
-    first, second = np.nonzero(np.triu(match | match.T, 1))
-    both = (rows[:, first] >= 0) & (rows[:, second] >= 0)
-    point, pair = np.nonzero(both)
-    return rows[point, first[pair]], rows[point, second[pair]]

@@ -163,14 +163,10 @@ def triangulate(
         offset = (seen - [lens.principal_x, lens.principal_y]) / lens.focal
         scale = (lens.focal / z)[:, None]
         u, v = (scale * (rows[:, i] - offset[:, i : i + 1] * rows[:, 2]) for i in (0, 1))
-        residual_u, residual_v = (pixels - seen).T
-        normal, right = np.empty((len(points), 3, 3)), np.empty((len(points), 3))
-        for i in range(3):
-            for j in range(i, 3):
-                product = u[:, i] * u[:, j] + v[:, i] * v[:, j]
-                normal[:, i, j] = normal[:, j, i] = np.add.reduceat(product, start[:-1])
-            product = u[:, i] * residual_u + v[:, i] * residual_v
-            right[:, i] = np.add.reduceat(product, start[:-1])
+        residual = pixels - seen
+        products = u[:, :, None] * u[:, None] + v[:, :, None] * v[:, None]
+        normal = np.add.reduceat(products, start[:-1])
+        right = np.add.reduceat(u * residual[:, :1] + v * residual[:, 1:], start[:-1])
         step = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
         points += step
         if np.abs(step).max(initial=0.0) < 1e-7:

@@ -85,8 +85,6 @@ def test_rounds_stop(block):
     assert len(rounds(block, until_gsd=0.5).rounds) == 2  # the same, and asked for less
     assert not rounds(block, until_gsd=0.001).settled
     assert calls(block) == "xxxx"
-    for name in ("round0=", "round1=", "round3=", "round4/cloud.laz REFERENCE"):
-        assert name in found.compare
 
 
 def test_paper_limit(block):
