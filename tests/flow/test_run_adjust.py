@@ -154,7 +154,7 @@ def test_notes(scene, finished, monkeypatch):
     note = {"code": "gnss.offset_found", "message": "the GNSS positions lie 0.3 m above"}
     figures = figures_of(finished[0]) | {"notes": [note]}
     assert ["Note", "", "The GNSS positions lie 0.3 m above"] in adjustment_table(figures, "p").rows
-    monkeypatch.setattr("pcfix.flow.run.figures_of", lambda _: figures)
+    monkeypatch.setattr("pcfix.flow.run_steps.figures_of", lambda _: figures)
     said = []
     run_all(scene.whole(), finished[0], say=said.append)
     assert any(line.strip() == "The GNSS positions lie 0.3 m above" for line in said)
