@@ -74,14 +74,6 @@ def adjust_first(
     return found
 
 
-def is_worth_saying(step: dict[str, Any], absorbed: bool) -> bool:
-    """Return whether to report that a run did not adjust: if asked, or if the poses are bent.
-
-    The step is what `adjust_first` returned; `absorbed` is in the summary of the correction.
-    """
-    return step["is_said"] or bool(step["why"] and absorbed)
-
-
 def _decide(request: Request) -> dict[str, Any]:
     """Decide whether to adjust: on request, or if the poses are bent and there is a datum.
 
