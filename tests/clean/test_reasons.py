@@ -141,9 +141,6 @@ def test_settings_refused(choice: dict) -> None:
         CleanRules(**choice)
 
 
-BED_10 = float(np.sort(spoilt_scene(20_000, 100).xyz[:100, 2])[10])
-
-
 @pytest.mark.parametrize(
     ("count", "given", "code", "values"),
     [
@@ -151,12 +148,15 @@ BED_10 = float(np.sort(spoilt_scene(20_000, 100).xyz[:100, 2])[10])
         (100, {"tile_m": -1.0}, "option.range", {"value": -1.0}),
         (20, {}, "cloud.too_few_points", {"points": 20, "least": 21}),
         (5, {"settings": CleanRules(neighbours=6)}, "cloud.too_few_points", {"least": 7}),
-        (100, {"water": BED_10}, "cloud.too_few_points", {"points": 10, "least": 33}),
+        (100, {"water": "above ten points"}, "cloud.too_few_points", {"points": 10, "least": 33}),
     ],
 )
 def test_arrays_refused(count: int, given: dict, code: str, values: dict) -> None:
+    xyz = spoilt_scene(20_000, 100).xyz[:count]
+    if "water" in given:
+        given = {"water": float(np.sort(xyz[:, 2])[10])}
     with refused(code, **values):
-        clean_points(spoilt_scene(20_000, 100).xyz[:count], **given)
+        clean_points(xyz, **given)
     with refused("cloud.not_finite", row=0):
         clean_points(np.full((100, 3), np.nan))
 

@@ -53,7 +53,7 @@ class Bench:
     """The files of a reader's seeds in a folder, one of which is damaged at a time."""
 
     def __init__(self, name: str, folder: Path) -> None:
-        self.reader, self.folder = READERS[name], folder
+        self.name, self.reader, self.folder = name, READERS[name], folder
         self._given: dict[str, Any] = {}
         self.parts: list[Part] = []
         for i, (seed, write) in enumerate(self.reader.seeds.items()):

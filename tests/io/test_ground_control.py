@@ -235,10 +235,7 @@ def test_odm(tmp_path, first, named):
 
 @pytest.mark.parametrize(
     ("line", "code"),
-    [
-        ("500010 4000010 nan 1 2 a.jpg", "table.number"),
-        ("500010 4000010 2 1 2", "gcps.fields"),
-    ],
+    [("500010 4000010 nan 1 2 a.jpg", "table.number"), ("500010 4000010 2 1 2", "gcps.fields")],
 )
 def test_bad_line_of_odm(tmp_path, line, code):
     rows = ["500010 4000010 2.5 1 2 b.jpg", line]
