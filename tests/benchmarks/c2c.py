@@ -60,14 +60,8 @@ def main():
     program = shutil.which("CloudCompare")
     if program:
         files = [word for name in names for word in ("-O", f"{name}.ply")]
-        commands["CloudCompare, PLY"] = [
-            program,
-            "-SILENT",
-            "-AUTO_SAVE",
-            "OFF",
-            *files,
-            "-C2C_DIST",
-        ]
+        words = [*["-SILENT", "-AUTO_SAVE", "OFF"], *files, "-C2C_DIST"]
+        commands["CloudCompare, PLY"] = [program, *words]
     report(commands, arguments.runs)
     said = json.loads((folder / "summary.json").read_text())["c2c"]["after"]["statistics"]
     print(f"pcfix: mean {said['mean_m']:.6f} m, sd {said['sd_m']:.6f} m")

@@ -395,6 +395,10 @@ GNSS = "label,x,y,z,sx,sy,sz\n" + "".join(
     f"{label},{x},{y},{z},0.1,0.1,0.2\n"
     for label, (x, y, z) in zip(block().labels, block().centres.tolist(), strict=True)
 )
+GEO = "EPSG:32632\n" + "\n".join(
+    f"{label} {x} {y} {z}"
+    for label, (x, y, z) in zip(block().labels, block().centres.tolist(), strict=True)
+)
 TIMES = "label,time\n" + "".join(
     f"{one},2026-05-01T10:0{i}:00Z\n" for i, one in enumerate(block().labels)
 )
