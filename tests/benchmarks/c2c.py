@@ -7,7 +7,7 @@ figures written. CloudCompare gets its points as binary PLY, the quickest to loa
 build of it reads; pcfix gets LAS, and in rows of their own LAZ. Prints the ratios, and mean and
 standard deviation of both.
 
-    python tests/benchmarks/c2c.py [--points 1000000] [--runs 5] [--folder DIR]
+    python -m tests.benchmarks.c2c [--points 1000000] [--runs 5] [--folder DIR]
 """
 
 import argparse
