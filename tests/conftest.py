@@ -36,10 +36,14 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ["NUMBA_CACHE_DIR"] = tempfile.mkdtemp(prefix="pcfix-no-kernels-")
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Bring the tests into the order above."""
+    """Mark the quick tests of files with `quick_but`, and bring all into the order above."""
     rooms: dict[str, list[pytest.Item]] = {}
     for item in items:
+        others = item.get_closest_marker("quick_but")
+        if others and getattr(item, "originalname", item.name) not in others.args:
+            item.add_marker("quick")
         room = item.path.relative_to(Path(__file__).parent).parts[0]
         rooms.setdefault(room, []).append(item)
     one, two = ([item for room in begin for item in rooms.pop(room, [])] for begin in BEGIN)
