@@ -93,9 +93,10 @@ def _run(work: Work, namespace: dict[str, Any], ins: Dimensions, outs: Dimension
 
 
 def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
+    from pcfix.flow.correction import correct_chunk, plan_correction, read_inputs
     from pcfix.flow.inputs import paths_in
-    from pcfix.flow.job import Job
-    from pcfix.flow.runner import check_summary, write_summary
+    from pcfix.flow.outcome import check, summarize
+    from pcfix.flow.runner import Ends, check_summary, write_summary
     from pcfix.io.las.columns import columns_for
     from pcfix.kernels import threads
     from pcfix.options.correct import CorrectOptions
@@ -114,36 +115,39 @@ def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> No
         )
     cloud = PdalCloud(ins, namespace.get("metadata"))
     results = Results(cloud, columns_for(options.dimensions, options.unsure))
-    step_m = 0.0 if cloud.scales is None else float(cloud.scales.max())
-    job = Job(NAME, options, _view(cloud), step_m)
+    plan = read_inputs(options, _view(cloud))
     check_summary(options, paths_in(options))
+    tally: Any = None
     with threads(options.jobs):
-        job.look_around(lambda: (points for _, points in _chunks(cloud, job.water)))
-        for rows, points in _chunks(cloud, job.water):
-            results.add(rows, job.correct(points), options.uncorrected == "withhold")
-    job.check_fit()
+        plan = plan_correction(plan)
+        for rows, points in _chunks(cloud, plan.found.surface):
+            correction, one = correct_chunk(plan, points, rows.start)
+            results.add(rows, correction, options.uncorrected == "withhold")
+            tally = one if tally is None else tally + one
+    findings = check(plan, tally)
     outs.update(results.dimensions)
-    summary = job.summary(NAME, NAME, time.perf_counter() - started)
-    job.save_regression()
+    summary = summarize(plan, tally, findings, Ends(NAME, NAME, time.perf_counter() - started))
     write_summary(options, summary.as_dict())
     namespace["out_metadata"] = metadata_of(summary.as_dict(), cloud.flags)
 
 
 def _label(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
-    from pcfix.flow.label import LabellingStep
+    from pcfix.flow.label import check, label_chunk, plan_labelling
     from pcfix.options.correct import StageLabelOptions
 
     options = _options(namespace, StageLabelOptions, needed=("water",))
     cloud = PdalCloud(ins, namespace.get("metadata"))
-    step = LabellingStep(NAME, options, _view(cloud))
-    step.look_around(lambda: (points for _, points in _chunks(cloud, step.water)))
-    classes = cloud.flags.classes.copy()
-    for rows, points in _chunks(cloud, step.water):
-        classes[rows] = step.classes(points)
-    step.finish()
+    plan = plan_labelling(options, _view(cloud))
+    classes, tally = cloud.flags.classes.copy(), None
+    for rows, points in _chunks(cloud, plan.water):
+        classes[rows], one = label_chunk(plan, points)
+        tally = one if tally is None else tally + one
+    if tally is None:
+        return
+    check(plan, tally)
     outs["Classification"] = classes
     outs.update(cloud.flags.dimensions())
-    found = {**step.counts, "labelling": step.labelling.report()}
+    found = {**tally.counts(), "labelling": plan.labelling.report(tally.excluded)}
     namespace["out_metadata"] = metadata_of(found, cloud.flags)
 
 
@@ -277,23 +281,20 @@ def _chunks(cloud: PdalCloud, water: WaterSurface | None) -> Iterator[tuple[slic
         sources = ins["PointSourceId"][rows] if "PointSourceId" in ins else None
         rgb = tuple(ins[name][rows] for name in COLOURS if name in ins)
         colours = rgb if len(rgb) == len(COLOURS) else None
-        yield rows, Points(xyz, heights, cloud.flags.classes[rows], sources, colours)
+        returns = ins["NumberOfReturns"][rows] if "NumberOfReturns" in ins else None
+        yield rows, Points(xyz, heights, cloud.flags.classes[rows], sources, colours, returns)
 
 
 def _view(cloud: PdalCloud) -> CloudView:
-    """Return the cloud as a water surface needs it."""
-    from pcfix.flow.surfaces import CloudView, Seen, corners
+    """Return what is known of the cloud, and all its points."""
+    from pcfix.flow.surfaces import CloudView, corners
 
-    ins = cloud.ins
+    def chunks(water: WaterSurface | None = None) -> Iterator[Points]:
+        return (points for _, points in _chunks(cloud, water))
 
-    def chunks() -> Iterator[Seen]:
-        for rows in _slices(len(cloud)):
-            has_colours = all(name in ins for name in COLOURS)
-            rgb = np.column_stack([ins[name][rows] for name in COLOURS]) if has_colours else None
-            returns = ins["NumberOfReturns"][rows] if "NumberOfReturns" in ins else None
-            yield Seen(cloud.xyz(rows), rgb, cloud.flags.classes[rows], returns)
-
-    return CloudView(NAME, cloud.crs, *corners(ins["X"], ins["Y"]), len(cloud), chunks)
+    low, high = corners(cloud.ins["X"], cloud.ins["Y"])
+    step_m = 0.0 if cloud.scales is None else float(cloud.scales.max())
+    return CloudView(NAME, cloud.crs, low, high, len(cloud), chunks, step_m=step_m)
 
 
 def _repair_process(error: BaseException) -> None:

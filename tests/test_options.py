@@ -69,6 +69,15 @@ def test_usage():
     assert "--max-angel" in done.stderr
 
 
+def test_help():
+    """The options that most people need, or all."""
+    short, every = (run_pcfix("correct", word).stdout for word in ("--help", "--help-all"))
+    names = [one.flag for one in options_of(CorrectOptions)]
+    assert all(f" {name} " in every for name in names)
+    assert 12 <= sum(f" {name} " in short for name in names) <= 18
+    assert "pcfix correct --help-all" in short
+
+
 def test_part():
     given = with_index(CorrectOptions(salinity=10.0))
     part = given.part(ScienceOptions)

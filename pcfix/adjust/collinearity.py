@@ -1,7 +1,7 @@
 r"""The refractive collinearity: the image of a point through the water, and its derivatives.
 
 Object point, piercing point and image (Mulsow 2024). The direction w of the light at the projection
-centre comes from `pcfix.refract.tracing.gradients` with its derivatives; in the camera frame it is
+centre comes from `pcfix.refract.rays` with its derivatives; in the camera frame it is
 x = R w. A rotation changes as exp(omega) R with a small vector omega in the camera frame, for which
 d x = omega x x. So an image gradient g with respect to x becomes x x g with respect to omega.
 
@@ -44,8 +44,7 @@ from pcfix.lens.formulas import distorted, jacobian, undistorted
 from pcfix.lens.imaging import image_and_gradients, image_of, in_plane
 from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.port.light import BY_PORT, FLAT, KIND, SIZE, X, through_port
-from pcfix.refract.rays import direction, lay, light_path, plane_at, settle
-from pcfix.refract.tracing.gradients import light_and_gradients
+from pcfix.refract.rays import direction, lay, light_and_gradients, light_path, plane_at, settle
 
 if TYPE_CHECKING:
     from pcfix.water.surface import Field, Tin

@@ -14,9 +14,8 @@ may sink or lift whole beaches.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, TypeAlias
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -38,10 +37,7 @@ from pcfix.model import (
 )
 from pcfix.refract.choice import views_in_frame
 from pcfix.refract.tiling import spatial_order
-from pcfix.sums import Sums
-from pcfix.water.surface import SurfaceAbove, is_submerged
-
-Label: TypeAlias = Callable[[FloatArray, SurfaceAbove], BoolArray]
+from pcfix.sums import MOST, Sums
 
 MAX_STEPS = 12
 CLOSE_M = 1e-6
@@ -239,15 +235,6 @@ class Transferred(NamedTuple):
     moved: BoolArray
     views: Views | None
 
-    def rule(self, label: Label | None) -> Label:
-        """Return a rule of what is submerged that excludes points that were not transferred."""
-
-        def submerged(xyz: FloatArray, surface: SurfaceAbove) -> BoolArray:
-            below = is_submerged(xyz[:, 2], surface) if label is None else label(xyz, surface)
-            return below & self.moved
-
-        return submerged
-
     def whole(self, correction: Correction) -> Correction:
         """Return the correction of `xyz` as one of the original points.
 
@@ -260,20 +247,36 @@ class Transferred(NamedTuple):
         return replace(found, apparent_xyz=self.original_xyz, shift_m=shift)
 
 
-class CloudTransfer(Sums):
-    """The transfer of a cloud, chunk by chunk, and its statistics."""
+@dataclass(frozen=True)
+class TransferCounts(Sums):
+    """Statistics of transferred points."""
 
-    added, most = ("_points", "_not_moved", "_land", "_sum_m"), ("_most_m",)
+    points: int
+    not_moved: int
+    land: int
+    sum_m: FloatArray  # shape (4,): of the shift along the axes, and of its square
+    most_m: float = field(metadata=MOST)
 
-    def __init__(self, pair: Pair) -> None:
-        self.pair = pair
-        self._is_checked = False
-        self.restart()
+    @classmethod
+    def of(cls, step: Transferred, correction: Correction) -> TransferCounts:
+        """Return those of a chunk, with the correction that `Transferred.whole` returned."""
+        followed = step.moved & ~correction.uncorrected
+        shift = (step.xyz - step.original_xyz)[followed]
+        length2 = (shift**2).sum(axis=1)
+        return cls(
+            points=len(shift),
+            not_moved=int((~step.moved).sum()),
+            land=int((correction.outcome[followed] == Outcome.LAND).sum()),
+            sum_m=np.array([*shift.sum(axis=0), length2.sum()]),
+            most_m=float(np.sqrt(length2.max(initial=0.0))),
+        )
 
-    def restart(self) -> None:
-        """Reset the statistics."""
-        self._points = self._not_moved = self._land = 0
-        self._sum_m, self._most_m = np.zeros(4), 0.0
+
+@dataclass(frozen=True, eq=False)
+class CloudTransfer:
+    """The transfer of a cloud from the original to the adjusted cameras."""
+
+    pair: Pair
 
     def step(self, xyz: FloatArray, listed: Views | None) -> Transferred:
         """Transfer points.
@@ -284,13 +287,7 @@ class CloudTransfer(Sums):
             Metres, world frame.
         listed : Views or None
             Of the original cameras, as read.
-
-        Raises
-        ------
-        GeometryError
-            If the two models are in different places.
         """
-        self._check(xyz)
         original, adjusted = self.pair.original, self.pair.adjusted
         shift, moved = np.zeros((len(xyz), 3)), np.zeros(len(xyz), np.bool_)
         views = None if listed is None else renumbered(listed, self.pair.row)[0]
@@ -312,11 +309,16 @@ class CloudTransfer(Sums):
         xyz[known] += transfer(xyz[known], views, self.pair.adjusted, self.pair.original)[0]
         return replace(ties, xyz=xyz)
 
-    def _check(self, xyz: FloatArray) -> None:
-        """Refuse models in different places, at the first points, and warn of single images."""
-        if self._is_checked or not len(xyz):
+    def check_models(self, xyz: FloatArray) -> None:
+        """Refuse models in different places, given points of the cloud; warn of single images.
+
+        Raises
+        ------
+        GeometryError
+            ``adjusted_from.apart``.
+        """
+        if not len(xyz):
             return
-        self._is_checked = True
         original, apart = self.pair.original, self._apart_m()
         height = float(np.median(original.centres[:, 2]) - np.median(xyz[:, 2]))
         middle, most = float(np.median(apart)), MOST_APART * height
@@ -347,18 +349,7 @@ class CloudTransfer(Sums):
         apart = self.pair.adjusted.centres - self.pair.original.centres
         return np.asarray(np.linalg.norm(apart, axis=1))
 
-    def add(self, step: Transferred, correction: Correction) -> None:
-        """Count a chunk, with the correction that `Transferred.whole` returned."""
-        followed = step.moved & ~correction.uncorrected
-        shift = (step.xyz - step.original_xyz)[followed]
-        length2 = (shift**2).sum(axis=1)
-        self._points += len(shift)
-        self._land += int((correction.outcome[followed] == Outcome.LAND).sum())
-        self._not_moved += int((~step.moved).sum())
-        self._sum_m += [*shift.sum(axis=0), length2.sum()]
-        self._most_m = max(self._most_m, float(np.sqrt(length2.max(initial=0.0))))
-
-    def check(self, name: str) -> None:
+    def check(self, name: str, counts: TransferCounts) -> None:
         """Refuse a cloud that the original cameras do not see.
 
         Raises
@@ -366,25 +357,25 @@ class CloudTransfer(Sums):
         GeometryError
             If no point was transferred.
         """
-        if self._points == 0 and self._not_moved:
+        if counts.points == 0 and counts.not_moved:
             words = (
                 f"{name}: no point could be transferred to the adjusted cameras, because {REASON}."
                 " Check that --adjusted-from is the model that made the cloud, in its CRS."
             )
             raise GeometryError("adjusted_from.no_overlap", words, path=name)
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self, counts: TransferCounts) -> dict[str, Any]:
         """Return the statistics as plain values, metres."""
-        apart, mean = self._apart_m(), self._sum_m / max(self._points, 1)
+        apart, mean = self._apart_m(), counts.sum_m / max(counts.points, 1)
         shift = {
             "mean_x": mean[0], "mean_y": mean[1], "mean_z": mean[2], "rms": np.sqrt(mean[3]),
-            "max": self._most_m,
+            "max": counts.most_m,
         }  # fmt: skip
         centres = {"rms": np.sqrt((apart**2).mean()), "max": apart.max()}
         return {
-            "points": self._points,
-            "land": self._land,
-            "not_carried": self._not_moved,
+            "points": counts.points,
+            "land": counts.land,
+            "not_carried": counts.not_moved,
             "not_carried_reason": REASON,
             "shift_m": {name: round(float(value), 4) for name, value in shift.items()},
             "cameras": len(apart),

@@ -13,7 +13,7 @@ from typing import Any
 from cyclopts import App, CycloptsError
 
 from pcfix.cli.commands import EXAMPLES
-from pcfix.cli.flags import UsageError, name_of, prepare
+from pcfix.cli.flags import UsageError, has_many, name_of, prepare
 from pcfix.errors import PcfixError, brief, refusal, show_warning
 from pcfix.version import __version__
 
@@ -73,9 +73,14 @@ def main(tokens: Sequence[str] | None = None) -> None:
 
 def _run(arguments: list[str]) -> None:
     warnings.showwarning = show_warning
+    everything = "--help-all" in arguments
+    arguments = ["--help" if one == "--help-all" else one for one in arguments]
     for command, _ in EXAMPLES:
-        if name_of(command) in arguments[:1]:
-            prepare(command)
+        name = name_of(command)
+        if name in arguments[:1]:
+            prepare(command, everything=everything)
+            if has_many(command) and not everything:
+                app[name].help += f"\nAll options: pcfix {name} --help-all"
     if arguments in ([], *([name] for name in app if name not in ("demo", "--version"))):
         app([*arguments, "--help"], result_action="return_value")
         sys.exit(0 if arguments in (["--help"], ["-h"]) else 2)

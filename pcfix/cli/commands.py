@@ -297,11 +297,6 @@ def simulate(
     quiet: Quiet = False,
 ) -> None:
     """Simulate a scene with known truth: cloud, cameras, truth, LiDAR."""
-    if options.refraction_effect:
-        from pcfix.flow.papers import write_refraction_effect
-
-        say(write_refraction_effect(out_dir, options), quiet)
-        return
     from pcfix.io.scenes import write_scene
 
     with progress_bar("Simulating", quiet) as progress:

@@ -23,6 +23,19 @@ _GROUPS: dict[str, Group] = {
 }
 
 
+MANY = 20
+"""Of a command with more options `--help` shows the essential ones, and `--help-all` all."""
+_ESSENTIAL = {
+    "adjust", "adjusted_from", "also", "bed", "block", "cameras", "cameras_crs", "cloud",
+    "connected", "depth", "drop", "dsm", "floating", "free", "gcps", "gnss", "gsd", "index",
+    "jobs", "lens", "mapping", "max_angle", "max_incidence", "max_ray_miss", "method",
+    "min_rays", "out_dir", "overwrite", "plot", "points", "port", "project", "radius",
+    "rebuild", "reference", "resolution", "section", "seed", "shoreline", "submerged",
+    "summary", "surface", "uncorrected", "views", "water", "water_mask",
+}  # fmt: skip
+"""Options that most people need, by name."""
+
+
 class UsageError(Exception):
     """Flags that do not go together; exit code 2."""
 
@@ -37,10 +50,18 @@ def kind_of(command: Callable[..., None]) -> Any:
     return get_args(get_type_hints(command, include_extras=True)["options"])[0]
 
 
-def prepare(command: Callable[..., None]) -> None:
+def has_many(command: Callable[..., None]) -> bool:
+    """Return whether a command has more options than `--help` shows."""
+    return len(options_of(kind_of(command))) > MANY
+
+
+def prepare(command: Callable[..., None], *, everything: bool) -> None:
     """Give cyclopts the options of a command: their types, panels and help."""
-    kind = kind_of(command)
-    hints = {one.name: Annotated[_type(one), _parameter(one)] for one in options_of(kind)}
+    kind, every = kind_of(command), everything or not has_many(command)
+    hints = {
+        one.name: Annotated[_type(one), _parameter(one, every or one.name in _ESSENTIAL)]
+        for one in options_of(kind)
+    }
     hints["index_from"] = Annotated[str, Parameter(parse=False)]
     for base in kind.__mro__:
         own = vars(base).get("__annotations__", {})
@@ -68,12 +89,13 @@ def _type(one: Option) -> Any:
     return one.type | None if one.default is None else one.type
 
 
-def _parameter(one: Option) -> Parameter:
+def _parameter(one: Option, is_shown: bool) -> Parameter:
     default = "" if one.needed else one.default_text
     has_opposite = one.type is bool and (one.default or one.name == "connected")
     return Parameter(
         help=f"{one.help_text}{f' ({one.needed_text})' if one.needed else ''}",
         group=_GROUPS[one.panel],
+        show=is_shown,
         negative_bool="no-" if has_opposite else (),
         negative_none="no-" if one.name in ("below", "floating") else (),
         negative_iterable=(),

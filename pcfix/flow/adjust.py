@@ -34,11 +34,11 @@ from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError
 from pcfix.flow.inputs import Inputs, mask_of
 from pcfix.flow.next_steps import WATER as WATER_FILE
 from pcfix.flow.surfaces import CloudView, view_of
+from pcfix.io.atomic import temporary_folder
 from pcfix.io.cameras.colmap.writing import write_colmap
 from pcfix.io.cameras.opensfm.models import write_opensfm
 from pcfix.io.cameras.table.sensor import read_sensor, write_table
 from pcfix.io.crs import is_topocentric, parse_crs
-from pcfix.io.drafts import folder_when_whole
 from pcfix.io.files import check_input, write_text
 from pcfix.io.gnss_positions import gnss_in_frame_of, read_gnss
 from pcfix.io.ground_control import read_ground_control
@@ -355,7 +355,7 @@ def _write(folder: Path, found: Adjusted, model: str) -> None:
     from pcfix.report.adjustment import adjustment_dict, adjustment_page, before_of
 
     before = before_of(found)
-    with folder_when_whole(folder) as draft:
+    with temporary_folder(folder) as draft:
         _write_models(draft, found)
         moved = found.unknowns.level_sigma_m or found.unknowns.shape_sigma
         if moved and isinstance(found.water, WaterRaster):

@@ -5,8 +5,9 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -17,8 +18,8 @@ from pcfix.flow.inputs import Inputs
 from pcfix.flow.photos import lens_of, plain, read_heights, warn_all
 from pcfix.flow.runner import Progress, check_summary, write_summary
 from pcfix.grid.lattice import Lattice
+from pcfix.io.atomic import temporary_folder, temporary_output
 from pcfix.io.crs import parse_crs
-from pcfix.io.drafts import folder_when_whole, replaced_when_whole
 from pcfix.io.files import scratch_arrays
 from pcfix.io.photographs import Frames, check_calm, read_frames, write_calm, write_spread
 from pcfix.io.rasters import new_raster, write_part
@@ -28,10 +29,8 @@ from pcfix.options.declare import File, taken
 from pcfix.options.photos import CalmOptions
 from pcfix.photos.calm import (
     LEAST_CORNERS,
-    CalmSummary,
     Follower,
     Registration,
-    WaterFound,
     covered,
     laid,
     median_of,
@@ -59,6 +58,46 @@ PASSES = 2
 """Over the surface: the height of the piercing points follows from the first."""
 LEAST_EXPLAINED = 0.5
 """Share of the slopes; if waves explain less, there is a warning."""
+
+
+class WaterFound(NamedTuple):
+    """The water of a sequence: number of waves, rms values, share of the slopes explained."""
+
+    folder: str
+    waves: int
+    slope_deg: float
+    height_m: float
+    sigma_m: float
+    explained: float
+
+
+@dataclass(frozen=True)
+class CalmSummary:
+    """The result of `calm_frames`.
+
+    Attributes
+    ----------
+    corners : int
+        By which the frames were registered.
+    scatter_px, moved_px : float
+        Median scatter of a corner along an axis; largest movement of the frame's centre.
+    spread : float
+        Median over the image of the spread of the frames, grey values.
+    """
+
+    input: str
+    output: str
+    spread_file: str
+    frames: int
+    columns: int
+    rows: int
+    corners: int
+    scatter_px: float
+    moved_px: float
+    spread: float
+    seconds: float
+    water: WaterFound | None
+    notes: tuple[PcfixWarning, ...] = ()
 
 
 def calm_frames(
@@ -102,7 +141,7 @@ def calm_frames(
         water = None
         if view is not None:
             waters, nodes, water = _water(given, found, view, count, median=median, stack=stack)
-            with folder_when_whole(folder) as draft:
+            with temporary_folder(folder) as draft:
                 _write_waters(draft, found.names, view.level_m, nodes, waters, crs)
             water = water._replace(folder=str(folder))
             notes = _notes_of(water, tied=bool(given.interval or found.interval_s))
@@ -319,7 +358,7 @@ def _write_waters(
             (folder / "sigma" / f"{name}.tif", "standard error", sigma),
         ):
             with (
-                replaced_when_whole(path) as draft,
+                temporary_output(path) as draft,
                 new_raster(draft, lattice, parsed, {band: "m"}) as target,
             ):
                 write_part(target, values.reshape(nodes.shape), lattice.window, 1)

@@ -172,7 +172,7 @@ def check_water(
         points = NearWater()
         for one in file_points(Path(view.name), found.surface):
             above = surface_above(found.surface, one.xyz, one.heights)
-            points.add(one.xyz, one.xyz[:, 2] - above.height_m)
+            points += NearWater.of(one.xyz, one.xyz[:, 2] - above.height_m)
         shoreline = write_shoreline(
             given.shoreline, points, found.sigma_level_m, view.crs, overwrite=given.overwrite
         )

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from pcfix.blocks import empty, let_go
 from pcfix.clean.points import (
@@ -21,21 +22,17 @@ from pcfix.clean.points import (
     flag_weak,
 )
 from pcfix.errors import InputError
-from pcfix.flow.runner import Chunk, FileTask, Header, Progress, Step, file_task
+from pcfix.flow.runner import Check, Chunk, Command, Ends, FileTask, Progress, run_command, stream
 from pcfix.flow.surfaces import CloudView, Points, find_surface, points_of, view_of
-from pcfix.flow.tiles import TiledRun
-from pcfix.io.drafts import all_or_none
-from pcfix.io.files import path_of, scratch_arrays
+from pcfix.io.files import scratch_arrays
 from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource
-from pcfix.io.las.writing import cleaning_vlr, noted_header, own_settings
-from pcfix.io.tiles import Clouds, Tiles, open_cloud, single, tiles_of
-from pcfix.kernels import threads
+from pcfix.io.las.writing import cleaning_vlr, corrected_identity, noted_header, own_settings
+from pcfix.io.tiles import Clouds, Tiles, open_cloud
 from pcfix.model import LOW_NOISE, NOISE_CLASSES, BoolArray, FloatArray, WaterSurface
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import WaterOptions
 from pcfix.options.steps import CleanOptions, CleanRules
-from pcfix.sums import Sums
 from pcfix.version import __version__
 from pcfix.water.checks import check_submerged
 from pcfix.water.surface import is_submerged, surface_above
@@ -82,31 +79,21 @@ def clean_file(
     """
     given = taken(CleanOptions, options, keywords, "clean_file")
     check_tile(tile_m)
-    how, last = Resources(tile_m, given.jobs), _last_pass(progress)
-    tiles = tiles_of(input)
-    if tiles is not None:
-        folder = path_of(output)
-        there = next(one for one in (folder, *folder.absolute().parents) if one.is_dir())
-        run = TiledRun("clean", tiles, folder, given, last)
-        return run.run(
-            lambda part: _Cleaning(part, given, there / folder.name, how, progress),
-            lambda step: step.summary(str(tiles), str(output), run.seconds),
-        )
-    task = file_task(single(input), output, given, reads=[given.water], progress=last)
-    with threads(given.jobs):
-        step = _Cleaning(task.source, given, task.target, how, progress)
-    with all_or_none():
-        task.run(step)
-        result = step.summary(str(task.source), str(task.target), task.seconds)
-        task.tell(result.as_dict())
+    how = Resources(tile_m, given.jobs)
+    command = Command(
+        "clean",
+        plan=partial(_plan_file, given, how, progress),
+        process=_clean_cloud,
+        check=lambda plan, tally: None,
+        summarize=_summarize,
+    )
+    last = None
+    if progress is not None:  # writing is the last of the passes
+        last = lambda done, total: progress(((_PASSES - 1) * total + done) // _PASSES, total)  # noqa: E731
+    result: CleanSummary = run_command(
+        command, input, output, given, reads=[given.water], progress=last
+    )
     return result
-
-
-def _last_pass(progress: Progress | None) -> Progress | None:
-    """Return the progress of writing, which is the last of the passes."""
-    if progress is None:
-        return None
-    return lambda done, total: progress(((_PASSES - 1) * total + done) // _PASSES, total)
 
 
 RAY_DIMENSIONS = ("RayCount", "RayMiss", "Incidence")
@@ -239,83 +226,88 @@ class NoiseSearch:
         )
 
 
-class _Cleaning(Sums, Step):
-    """Flag or drop the noise of each chunk, once it was found in the whole cloud.
+class CleanPlan(NamedTuple):
+    """The noise of a whole cloud, one bit per point, and what is said of it."""
 
-    The large arrays of the search lie on disk `beside` a file. One bit per point is kept.
-    """
+    noise: npt.NDArray[np.uint8]
+    drop: bool
+    content: dict[str, Any]
+    summary: CleanSummary
 
-    def __init__(
-        self,
-        cloud: Path | Tiles,
-        options: CleanOptions,
-        beside: Path,
-        how: Resources,
-        progress: Progress | None,
-    ) -> None:
-        with open_cloud(cloud) as source:
-            names = set(source.header.point_format.dimension_names)
-            points = len(source)
-            try:
-                ours = own_settings(source.vlrs)
-            except ValueError:  # a damaged record is reported where its content is needed
-                ours = None
-        has_rays = not (isinstance(ours, dict) and ours.get("cameras") == 0)
-        passed = 0
 
-        def count(some: int) -> None:
-            nonlocal passed
-            passed += some
-            if progress is not None:
-                progress(passed // _PASSES, points)
+def _plan_file(
+    options: CleanOptions, how: Resources, progress: Progress | None,
+    cloud: Path | Tiles, target: Path, kept: list[Chunk] | None = None,
+) -> CleanPlan:  # fmt: skip
+    """Find the noise of a whole cloud; large arrays are on the disk of the target."""
+    with open_cloud(cloud) as source:
+        names = set(source.header.point_format.dimension_names)
+        points = len(source)
+        try:
+            ours = own_settings(source.vlrs)
+        except ValueError:  # a damaged record is reported where its content is needed
+            ours = None
+    has_rays = not (isinstance(ours, dict) and ours.get("cameras") == 0)
+    passed = 0
 
-        search = NoiseSearch(str(cloud), options, lambda: view_of(cloud), names, has_rays=has_rays)
-        with scratch_arrays(beside):
-            tested = _tested(cloud, search.water, how.jobs)
-            noise = search.run(tested, points, how._replace(progress=count))
-        self._drop, self._noise = options.drop, np.packbits(noise)
-        self._content = {**search.content(), "drop": options.drop}
-        self._summary = search.summary("", "", drop=options.drop, seconds=0.0)
-        if self._drop and noise.all():
-            raise InputError(
-                "cloud.all_noise",
-                f"{cloud}: every point is noise by these thresholds. Use wider thresholds, or leave"
-                " out --drop.",
-                path=cloud, points=points,
-            )  # fmt: skip
-        self.begin(0)
+    def count(some: int) -> None:
+        nonlocal passed
+        passed += some
+        if progress is not None:
+            progress(passed // _PASSES, points)
 
-    def begin(self, first_row: int) -> None:
-        """Continue at a row of the whole cloud."""
-        self._row = first_row
+    search = NoiseSearch(str(cloud), options, lambda: view_of(cloud), names, has_rays=has_rays)
+    beside = target.absolute()
+    if not beside.parent.is_dir():  # the folder of many files is made later
+        beside = next(one for one in beside.parents if one.is_dir()) / target.name
+    with scratch_arrays(beside):
+        tested = _tested(cloud, search.water, how.jobs)
+        noise = search.run(tested, points, how._replace(progress=count))
+    if options.drop and noise.all():
+        raise InputError(
+            "cloud.all_noise",
+            f"{cloud}: every point is noise by these thresholds. Use wider thresholds, or leave"
+            " out --drop.",
+            path=cloud, points=points,
+        )  # fmt: skip
+    summary = search.summary("", "", drop=options.drop, seconds=0.0)
+    content = {**search.content(), "drop": options.drop}
+    return CleanPlan(np.packbits(noise), options.drop, content, summary)
 
-    def run(self, task: FileTask) -> None:
-        """Process a file."""
-        task.run(self)
 
-    def header(self, source: LasSource) -> Header:
-        """Return the header with the record of the cleaning."""
-        return noted_header(source, cleaning_vlr(self._content))
+def _clean_cloud(
+    plan: CleanPlan, task: FileTask, row: int = 0, check: Check | None = None
+) -> tuple[Any, Any]:
+    return stream(task, partial(_Cleaning, plan), row, check)
 
-    def chunk(self, points: Chunk, source: LasSource, header: Header) -> Callable[[], Chunk]:
-        """Return what flags or drops the noise among points."""
-        first, byte = self._row, self._row // 8
-        self._row += len(points)
-        bits = np.unpackbits(self._noise[byte : (self._row + 7) // 8])
-        noise = bits[first - 8 * byte : self._row - 8 * byte].astype(np.bool_)
-        return partial(self._cleaned, points, header, noise)
 
-    def _cleaned(self, points: Chunk, header: Header, noise: BoolArray) -> Chunk:
-        new = convert(points, header.point_format)
-        if self._drop:
+class _Cleaning:
+    """The cleaning of one file: its header with a record of it, and each chunk."""
+
+    def __init__(self, plan: CleanPlan, source: LasSource) -> None:
+        self._plan = plan
+        self.header = noted_header(source, cleaning_vlr(plan.content))
+        self.identity = corrected_identity(source)
+
+    def compute(self, points: Chunk, row: int) -> tuple[BoolArray, int]:
+        """Return which points of a chunk are noise, and their number."""
+        end, byte = row + len(points), row // 8
+        bits = np.unpackbits(self._plan.noise[byte : (end + 7) // 8])
+        return bits[row - 8 * byte : end - 8 * byte].astype(np.bool_), len(points)
+
+    def apply(self, points: Chunk, noise: BoolArray) -> Chunk:
+        """Flag or drop the noise."""
+        new = convert(points, self.header.point_format)
+        if self._plan.drop:
             return new[~noise]
         new.array["classification"][noise] = LOW_NOISE
         new["withheld"][:] = np.asarray(new["withheld"]) | noise
         return new
 
-    def summary(self, input: str, output: str, seconds: float) -> CleanSummary:
-        """Return the numbers of the cleaning."""
-        return replace(self._summary, input=input, output=output, seconds=round(seconds, 3))
+
+def _summarize(plan: CleanPlan, tally: int, findings: None, ends: Ends) -> CleanSummary:
+    seconds = round(ends.seconds, 3)
+    return replace(plan.summary, input=ends.input, output=ends.output, seconds=seconds)
 
 
 def _tested(cloud: Path | Tiles, water: WaterSurface | None, jobs: int | None) -> Iterator[Tested]:

@@ -1,36 +1,37 @@
-"""Where tasks run: in processes of this machine, or on the workers of a Dask cluster."""
+"""Where the tiles of a cloud are processed: here, in processes, or on a Dask cluster."""
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import partial
-from multiprocessing import get_context
 from types import ModuleType
-from typing import Any, TypeVar
+from typing import Any
 
 from pcfix.errors import InputError
 from pcfix.kernels import cores
 from pcfix.libraries import optional_library
 
-Task = TypeVar("Task")
-Result = TypeVar("Result")
-Work = Callable[[bytes, Task, int | None], Result]
-Run = Callable[..., Iterator[Any]]
-
 WAIT_S = 10
 """For a scheduler to answer, and for its first worker."""
 
+Work = Callable[..., str]
+Run = Callable[[Work, bytes, Sequence[Any]], Iterator[tuple[Any, str]]]
+
+POINTS_A_PROCESS = 500_000
+"""These take about as long as another process takes to start."""
+
 
 def in_processes(
-    jobs: int | None, most: int, work: Work[Task, Result], shared: bytes, tasks: Sequence[Task]
-) -> Iterator[tuple[Task, Result | str]]:
-    """Yield tasks with their results as they are done, with the same `shared` for all.
+    work: Work, shared: bytes, tasks: Sequence[Any], most: int, jobs: int | None
+) -> Iterator[tuple[Any, str]]:
+    """Yield tasks with their errors as they are done, with the same `shared` for all.
 
     At most `most` processes share `jobs` threads, all cores by default. A single one is this
     process.
@@ -40,13 +41,11 @@ def in_processes(
         for task in tasks:
             yield task, work(shared, task, jobs)
         return
-    each = max(1, (jobs or cores()) // count)
-    context = get_context("spawn")
+    context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(count, context, initializer=_ignore_interrupts) as pool:
         with _without_main():
-            futures: dict[Future[Result], Task] = {
-                pool.submit(_interruptible, work, shared, task, each): task for task in tasks
-            }
+            given = shared, max(1, (jobs or cores()) // count)
+            futures = {pool.submit(_interruptible, work, given, task): task for task in tasks}
         try:
             for future in as_completed(futures):
                 yield futures[future], future.result()
@@ -57,7 +56,7 @@ def in_processes(
                 " fewer --jobs; it continues.",
             ) from error
         except BaseException:
-            for process in list((pool._processes or {}).values()):
+            for process in multiprocessing.active_children():
                 if process.pid is not None:  # it is not started yet
                     os.kill(process.pid, signal.SIGINT)
             pool.shutdown(cancel_futures=True)
@@ -68,11 +67,11 @@ def _ignore_interrupts() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _interruptible(work: Callable[..., Result], *given: Any) -> Result:
+def _interruptible(work: Work, given: tuple[bytes, int], task: Any) -> str:
     """Do a task that Ctrl-C ends; between tasks a process waits for its parent to end it."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        return work(*given)
+        return work(given[0], task, given[1])
     finally:
         _ignore_interrupts()
 
@@ -88,14 +87,44 @@ def _without_main() -> Iterator[None]:
         sys.modules["__main__"] = main
 
 
+def on_cluster(
+    client: Any, work: Work, shared: bytes, tasks: Sequence[Any]
+) -> Iterator[tuple[Any, str]]:
+    """Yield tasks with their errors as they are done on the workers of a cluster."""
+    everywhere = client.scatter(shared, broadcast=True)  # a lost worker loses its own copy only
+    executor: Executor = client.get_executor(pure=False)
+    futures: dict[Future[str], Any] = {
+        executor.submit(work, everywhere, task, 1): task for task in tasks
+    }
+    try:
+        for future in as_completed(futures):
+            task = futures[future]
+            try:
+                yield task, future.result()
+            except Exception as error:  # of the cluster; those of pcfix are results
+                yield task, f"{task}: the cluster gave up ({error})."
+    finally:
+        executor.shutdown(wait=False)
+
+
 @contextmanager
-def on_cluster(address: str) -> Iterator[Run]:
-    """Give what runs tasks on the workers of a cluster; see `in_processes`.
+def machines(scheduler: str | None, jobs: int | None, points: int) -> Iterator[Run]:
+    """Give the function that runs a task for each file, with this number of points in all."""
+    if scheduler is None:
+        yield partial(in_processes, most=jobs or 1 + points // POINTS_A_PROCESS, jobs=jobs)
+        return
+    with _client_of(scheduler) as client:
+        yield partial(on_cluster, client)
+
+
+@contextmanager
+def _client_of(address: str) -> Iterator[Any]:
+    """Connect to a scheduler that has workers.
 
     Raises
     ------
     InputError
-        If the scheduler does not answer, or has no workers.
+        ``cluster.no_answer`` or ``cluster.no_workers``.
     """
     distributed = optional_library("distributed", "cluster", f"--scheduler {address}")
     try:
@@ -116,24 +145,4 @@ def on_cluster(address: str) -> Iterator[Run]:
                 f"scheduler {address}: has no workers. Start some with 'dask worker {address}'.",
                 address=address,
             ) from error
-        yield partial(_on_workers, client, distributed.as_completed)
-
-
-def _on_workers(
-    client: Any, as_completed: Any, work: Work[Task, Result], shared: bytes, tasks: Sequence[Task]
-) -> Iterator[tuple[Task, Result | str]]:
-    everywhere = client.scatter(shared, broadcast=True)  # a lost worker loses only its own copy
-    futures = {client.submit(work, everywhere, one, 1, pure=False): one for one in tasks}
-    try:
-        done = as_completed(list(futures), loop=client.loop)
-        for future in done:
-            task = futures[future]
-            if future.status == "finished":
-                yield task, future.result()
-            elif future.status in ("lost", "pending"):  # its result was lost with a worker: again
-                done.add(future)
-            else:
-                why = future.exception() if future.status == "error" else future.status
-                yield task, f"{task}: the cluster gave up ({why})."
-    finally:
-        client.cancel(list(futures))
+        yield client

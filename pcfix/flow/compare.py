@@ -19,8 +19,8 @@ from pcfix.compare.match import Match, SurveyCloud, match
 from pcfix.compare.sections import parse_line
 from pcfix.errors import SettingError
 from pcfix.flow.runner import check_summary, json_text, write_summary
+from pcfix.io.atomic import all_or_none, output_folder
 from pcfix.io.clouds import check_same_crs, read_cloud, read_reference, reference_of
-from pcfix.io.drafts import all_or_none, made_folder
 from pcfix.io.files import check_output, scratch_arrays, write_bytes, write_text
 from pcfix.io.tiles import Clouds, Tiles, cloud_of, inputs_of
 from pcfix.model import WaterSurface
@@ -156,7 +156,7 @@ def _check_outputs(given: CompareOptions, inputs: list[File]) -> None:
 def _write(result: Comparison, given: CompareOptions) -> None:
     files: dict[str, str] = {}
     folder = None if given.out_dir is None else Path(given.out_dir)
-    with nullcontext() if folder is None else made_folder(folder), all_or_none():
+    with nullcontext() if folder is None else output_folder(folder), all_or_none():
         if folder is not None:
             tables = {"depth_bins.csv": result.depth_bins, "shore_bins.csv": result.shore_bins}
             files = {"compare.json": json_text(result.as_dict())}

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from os import PathLike
 from pathlib import Path
@@ -15,32 +14,27 @@ import numpy.typing as npt
 
 from pcfix.adjust.transfer import CloudTransfer
 from pcfix.errors import InputError, PcfixWarning, SettingError
-from pcfix.flow.inputs import paths_in
-from pcfix.flow.job import Job
-from pcfix.flow.old_cameras import paired
-from pcfix.flow.plausibility import CloudSample, Flight, plausible
-from pcfix.flow.runner import Chunk, FileTask, Header, Progress, Step, file_task
-from pcfix.flow.surfaces import (
-    Points,
-    corners,
-    file_points,
-    first_points,
-    own_water_of,
-    points_of,
-    view_of,
+from pcfix.flow.correction import (
+    CloudTally,
+    Plan,
+    correct_chunk,
+    plan_correction,
+    read_inputs,
+    water_plan,
 )
-from pcfix.flow.through_water import Label, correct_checked
-from pcfix.flow.tiles import TiledRun
-from pcfix.io.drafts import all_or_none
-from pcfix.io.files import path_of
+from pcfix.flow.inputs import Inputs, paths_in
+from pcfix.flow.old_cameras import paired
+from pcfix.flow.outcome import check, summarize
+from pcfix.flow.plausibility import Flight, plausible
+from pcfix.flow.runner import Check, Chunk, Command, FileTask, Progress, run_command, stream
+from pcfix.flow.surfaces import CloudView, Points, corners, points_of, view_of
 from pcfix.io.las import columns
-from pcfix.io.las.part import part_report
 from pcfix.io.las.source import LasSource, centring_steps
-from pcfix.io.las.writing import corrected_header
+from pcfix.io.las.writing import corrected_header, corrected_identity
 from pcfix.io.regressions import read_regression
-from pcfix.io.tiles import Clouds, Tiles, open_cloud, single, tiles_of
+from pcfix.io.tiles import Clouds, Tiles
 from pcfix.io.views.matching import beside
-from pcfix.kernels import threads
+from pcfix.label.labelling import Labelling
 from pcfix.lens.frames import beside_frames
 from pcfix.model import (
     BATHYMETRIC_POINT,
@@ -51,16 +45,14 @@ from pcfix.model import (
     Views,
     WaterSurface,
 )
-from pcfix.options.correct import CorrectOptions, PointsOptions, RefractionOptions, ScienceOptions
+from pcfix.options.correct import CorrectOptions, LabelRules, PointsOptions, RefractionOptions
 from pcfix.options.declare import File, taken
-from pcfix.refract.batch import Batch, OriginalModel, Survey
-from pcfix.refract.learning import for_own_water, learn_of_points
-from pcfix.refract.regression import BeyondRange, DepthRegression
+from pcfix.refract.learning import check_method, resolved
+from pcfix.refract.regression import DepthRegression, raise_no_regression
 from pcfix.refract.tally import Summary
-from pcfix.sums import Sums
-from pcfix.water.checks import WaterMeeting, as_surface, check_above_water, checked_points
+from pcfix.water.checks import as_surface, checked_points
 from pcfix.water.index import with_index
-from pcfix.water.surface import is_submerged, surface_above
+from pcfix.water.surface import FoundSurface
 
 
 def correct_points(
@@ -144,9 +136,9 @@ def correct_points(
     [[0.0, 0.0, -2.703]]
     """
     given = taken(PointsOptions, options, keywords, "correct_points")
-    settings = with_index(given.part(ScienceOptions))
+    all_options = CorrectOptions(**{one.name: getattr(given, one.name) for one in fields(given)})
     if not cameras:
-        given.check_no_cameras()
+        all_options.check_no_cameras()
         if not (views is None and level_offset_m is None and adjusted_from is None):
             raise SettingError(
                 "option.needs",
@@ -155,42 +147,42 @@ def correct_points(
                 needs="cameras",
             )
     cameras = cameras or NO_CAMERAS
-    if given.water_per_image is not None:
-        settings = for_own_water(settings, cameras, None if views is None else views.kind)
-    points = checked_points(xyz)
-    surface, dimension = as_surface(water, len(points))
+    xyz = checked_points(xyz)
+    surface, heights = as_surface(water, len(xyz))
     offset = None if level_offset_m is None else _offsets(level_offset_m, len(cameras))
-    check_above_water(cameras, surface, offset)
     if views is not None:
-        _check_views(views, points, adjusted_from or cameras)
-    label = None if may_be_submerged is None else _label_of(may_be_submerged, len(points))
-    step, original_model = None, None
-    if adjusted_from is not None:  # transfer the points to the adjusted poses
-        pair = paired(adjusted_from, cameras)
-        step = CloudTransfer(pair).step(points, views)
-        original_model = OriginalModel(points, pair.original)
-        points, views, label = step.xyz, step.views, step.rule(label)
-    above = surface_above(surface, points, dimension)
-    place = None, *corners(points[:, 0], points[:, 1])
-    own, notes = own_water_of(given.water_per_image, cameras, surface, place, offset)
-    survey = Survey(surface, cameras, settings, offset, own_water=own)
-    batch = Batch(points, above, survey, views, original_model)
+        _check_views(views, xyz, adjusted_from or cameras)
+    points = Points(xyz, heights, _classes(may_be_submerged, len(xyz)))
+    low, high = corners(xyz[:, 0], xyz[:, 1])
+    view = CloudView("xyz", None, low, high, len(xyz), lambda water=None: iter([points]))
+    inputs = Inputs(cameras=cameras, water=surface)
+    found = FoundSurface(surface)
+    plan = water_plan(with_index(all_options), inputs, view, cameras, found, views, offset)
+    check_method(resolved(plan.survey.settings, cameras, plan.kind), cameras)
+    transfer = None if adjusted_from is None else CloudTransfer(paired(adjusted_from, cameras))
     line = read_regression(regression) if isinstance(regression, str | PathLike) else regression
-    found = correct_checked(learn_of_points(batch, line), label)
+    if plan.survey.settings.method == "regression" and line is None:
+        raise_no_regression()
+    only = LabelRules(respect_classes=(NOT_SUBMERGED,))
+    plan = replace(plan, transfer=transfer, labelling=Labelling(only))
+    plan = plan_correction(plan, line)
+    correction, tally = correct_chunk(plan, points, 0, covariances=True)
     # refuse or warn of what does not fit together, as for a file
-    meeting, sample = WaterMeeting(surface, deep=settings.deep), CloudSample(len(points))
-    meeting.add(points, found)
-    meeting.check_reach("xyz")
-    sample.add(Points(points, None, np.zeros(len(points), np.uint8)), above.height_m)
-    flight = Flight(water_m=sample.water_m, every=sample.every)
-    plausible(cameras, sample.xyz, None, sample.level_doubts(), flight).warn()
-    if line is not None and line is not regression:
-        beyond = BeyondRange(line)
-        beyond.add((above.height_m - points[:, 2])[found.submerged])
-        notes = (*notes, *line.notes, *beyond.notes())
+    if tally.water is not None and tally.sample is not None:
+        tally.water.check_reach("xyz", surface, deep=given.deep)
+        sample = tally.sample
+        flight = Flight(water_m=sample.water_m, every=sample.every)
+        plausible(cameras, sample.xyz, None, sample.level_doubts(), flight).warn()
+    notes: list[str] = [*plan.own_notes]
+    if line is not None and line is not regression and tally.beyond is not None:
+        notes += [*line.notes, *tally.beyond.notes(line)]
     for note in notes:
-        warnings.warn(note, PcfixWarning, stacklevel=2)
-    return found if step is None else step.whole(found)
+        warnings.warn(PcfixWarning("points.note", note), stacklevel=2)
+    return correction
+
+
+NOT_SUBMERGED = 255
+"""The class of points that may not be submerged, for the rules of a labelling."""
 
 
 def _offsets(level_offset_m: npt.ArrayLike, k: int) -> FloatArray:
@@ -204,15 +196,19 @@ def _offsets(level_offset_m: npt.ArrayLike, k: int) -> FloatArray:
     return offset
 
 
-def _label_of(may_be_submerged: npt.ArrayLike, n: int) -> Label:
-    """Return the rule that only some of the points below the surface are submerged."""
-    allowed = np.asarray(may_be_submerged)
-    if allowed.shape != (n,) or allowed.dtype != np.bool_:
-        raise SettingError(
-            "array.shape",
-            f"may_be_submerged must be {n} booleans, not {allowed.dtype} of shape {allowed.shape}.",
-        )
-    return lambda xyz, surface: is_submerged(xyz[:, 2], surface) & allowed
+def _classes(may_be_submerged: npt.ArrayLike | None, n: int) -> npt.NDArray[np.uint8]:
+    """Return the classes of points, of which some may not be submerged."""
+    classes = np.zeros(n, np.uint8)
+    if may_be_submerged is not None:
+        allowed = np.asarray(may_be_submerged)
+        if allowed.shape != (n,) or allowed.dtype != np.bool_:
+            raise SettingError(
+                "array.shape",
+                f"may_be_submerged must be {n} booleans, not {allowed.dtype} of shape"
+                f" {allowed.shape}.",
+            )
+        classes[~allowed] = NOT_SUBMERGED
+    return classes
 
 
 def _check_views(views: Views, points: FloatArray, cameras: Cameras) -> None:
@@ -271,96 +267,70 @@ def correct_file(
         With one sentence on what to mend; no output is left behind.
     """
     given = taken(CorrectOptions, options, keywords, "correct_file")
-    tiles = tiles_of(input)
-    if tiles is not None:
-        run = TiledRun("correct", tiles, path_of(output), given, progress)
-        return run.run(
-            partial(_step_for, options=given),
-            lambda step: step.result(str(tiles), str(output), run.seconds),
-        )
-    task = file_task(single(input), output, given, reads=paths_in(given), progress=progress)
-    with threads(given.jobs), all_or_none():
-        step = _step_for(task.source, given, task.kept)
-        step.run(task)
-        result = step.result(str(task.source), str(task.target), task.seconds)
-        result = replace(result, part=part_report(task.source))
-        task.tell(result.as_dict())
+    command = Command("correct", partial(plan_file, given), correct_cloud, check, summarize)
+    result: Summary = run_command(
+        command, input, output, given, reads=paths_in(given), progress=progress
+    )
     return result
 
 
-def _step_for(
-    cloud: Path | Tiles, options: CorrectOptions, kept: list[Chunk] | None = None
-) -> Correcting:
-    """Return the step, with what is estimated from the whole cloud."""
-    job = job_for(cloud, options)
-    chunks = partial(file_points, cloud, job.water, options.jobs, kept)
-    job.look_around(chunks)
-    if isinstance(cloud, Tiles) and job.views.list is not None:
-        job.correct(first_points(chunks()))  # it shows of which type the view list is
-    return Correcting(job)
+def plan_file(
+    options: CorrectOptions, cloud: Path | Tiles, target: Path, kept: list[Chunk] | None = None
+) -> Plan:
+    """Return the plan for a file, or for many as one cloud."""
+    return plan_correction(read_inputs(options, view_of(cloud, options.jobs, kept)))
 
 
-def job_for(cloud: Path | Tiles, options: CorrectOptions) -> Job:
-    """Return the job of correcting a LAS or LAZ file, or many as one cloud."""
-    with open_cloud(cloud) as source:
-        step_m = float(max(source.header.scales))
-    return Job(str(cloud), options, view_of(cloud), step_m)
+def correct_cloud(
+    plan: Plan, task: FileTask, row: int = 0, check: Check | None = None
+) -> tuple[Any, Any]:
+    """Correct a file from a row of the cloud on; return statistics, and what a check finds.
+
+    It is written with narrow integers and the offsets of the input, and again if a value does not
+    fit: with wide integers, or with offsets in the middle of the cloud.
+    """
+    wide, steps = False, tuple[int, ...]((0, 0, 0))
+    while True:
+        try:
+            begin = partial(Correcting, plan, wide=wide, steps=steps)
+            return stream(task, begin, row, check)
+        except columns.TooNarrowError:
+            wide = True
+        except columns.OutOfRangeError as axis:
+            old, steps = steps, centring_steps(task.source, task.jobs)
+            if steps == old:
+                raise InputError(
+                    "cloud.scale",
+                    f"{task.source}: the scale of {axis} is too fine for the result in 32 bits."
+                    " Write the cloud with a coarser scale first.",
+                    path=task.source,
+                ) from axis
 
 
-class Correcting(Sums, Step):
-    """The step that corrects points."""
+class Correcting:
+    """The correction of one file: its header, and each chunk."""
 
-    added = ("job",)
+    def __init__(self, plan: Plan, source: LasSource, wide: bool, steps: tuple[int, ...]) -> None:
+        self._plan, self._source, self._steps = plan, source, np.array(steps)
+        self._columns = columns.columns_for(plan.options.dimensions, plan.options.unsure)
+        record = plan.provenance()
+        self.header = corrected_header(source, self._columns, record, wide=wide, steps=steps)
+        self.identity = corrected_identity(source)
 
-    def __init__(self, job: Job) -> None:
-        self.job = job
-        self._columns = columns.columns_for(job.options.dimensions, job.options.unsure)
-        self.begin(0)
+    def compute(self, points: Chunk, row: int) -> tuple[Correction, CloudTally]:
+        """Correct the points of a chunk."""
+        some = points_of(points, self._source, self._plan.found.surface)
+        return correct_chunk(self._plan, some, row)
 
-    def begin(self, first_row: int) -> None:
-        """Forget the chunks so far; the next one starts at a row of the whole cloud."""
-        self.wide = False
-        self.steps: tuple[int, ...] = (0, 0, 0)
-        self.job.restart(first_row)
-
-    def run(self, task: FileTask) -> None:
-        """Write with narrow types and the input's offsets, and again if the values do not fit."""
-        while True:
-            try:
-                return task.run(self)
-            except columns.TooNarrowError:
-                self.wide = True
-            except columns.OutOfRangeError as axis:
-                old, self.steps = self.steps, centring_steps(task.source, task.jobs)
-                if self.steps == old:
-                    raise InputError(
-                        "cloud.scale",
-                        f"{task.source}: the scale of {axis} is too fine for the result in 32 bits."
-                        " Write the cloud with a coarser scale first.",
-                        path=task.source,
-                    ) from axis
-            self.job.restart(self.job.first_row)
-
-    def header(self, source: LasSource) -> Header:
-        """Return the header with the new dimensions and the record of what is done."""
-        return corrected_header(
-            source, self._columns, self.job.provenance(), wide=self.wide, steps=self.steps
-        )
-
-    def chunk(self, points: Chunk, source: LasSource, header: Header) -> Callable[[], Chunk]:
-        """Return what gives corrected points their new dimensions, classes and flags."""
-        correction = self.job.correct(points_of(points, source, self.job.water))
-        return partial(self._written, points, header, correction)
-
-    def _written(self, points: Chunk, header: Header, correction: Correction) -> Chunk:
+    def apply(self, points: Chunk, correction: Correction) -> Chunk:
         """Move points, and write their new dimensions, classes and flags."""
-        new = columns.convert(points, header.point_format)
-        new.offsets = header.offsets
-        withhold = self.job.options.uncorrected == "withhold"
+        new = columns.convert(points, self.header.point_format)
+        new.offsets = self.header.offsets
+        withhold = self._plan.options.uncorrected == "withhold"
         for rows, part in correction.parts():
             some = new[rows]
             moved = columns.shift_steps(part, some.scales)
-            columns.move(some, moved + np.array(self.steps))
+            columns.move(some, moved + self._steps)
             withheld = np.asarray(some["withheld"]).astype(bool)
             part = columns.unsure_anew(part, withheld)
             changed = columns.changed_rows(part, withheld, withhold=withhold)
@@ -368,13 +338,5 @@ class Correcting(Sums, Step):
             some.array["classification"][part.corrected] = BATHYMETRIC_POINT
             flagged = withheld | columns.to_withhold(part, withhold=withhold)
             some["withheld"][:] = flagged.astype(np.uint8)
-        return new[~correction.uncorrected] if self.job.options.uncorrected == "drop" else new
-
-    def finish(self) -> None:
-        """Refuse a result in which cloud, water and cameras do not fit together."""
-        self.job.check_fit()
-
-    def result(self, input: str, output: str, seconds: float) -> Summary:
-        """Write the line of a regression, if asked, and return the summary of all chunks."""
-        self.job.save_regression()
-        return self.job.summary(input, output, seconds)
+        drops = self._plan.options.uncorrected == "drop"
+        return new[~correction.uncorrected] if drops else new

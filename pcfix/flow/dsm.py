@@ -9,22 +9,22 @@ from __future__ import annotations
 
 import json
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.flow.runner import FileTask, Progress, file_task
+from pcfix.flow.runner import FileTask, Progress, file_task, write_summary
 from pcfix.flow.sorted_points import BLOCK_CELLS, DIMENSIONS, SortedPoints, point_spacing_m
 from pcfix.grid.delaunay import fill_holes, margin_cells
 from pcfix.grid.heights import Gridding, as_uncertainty, grid_window
 from pcfix.grid.lattice import round_resolution
 from pcfix.grid.model import NO_LIGHT, DsmSummary, Tally, hillshade
 from pcfix.io import rasters
+from pcfix.io.atomic import scratch_folder, temporary_output
 from pcfix.io.crs import crs_words, parts
-from pcfix.io.drafts import draft_folder, replaced_when_whole
 from pcfix.io.files import check_output, write_text
 from pcfix.io.las.part import part_report
 from pcfix.io.las.source import metric_crs
@@ -114,99 +114,93 @@ def grid_dsm(
     if given.resolution is None:
         spacing_m = point_spacing_m(cloud, rules)
         rules = replace(rules, resolution=round_resolution(spacing_m, 0.0))
-    run = _Run(task, cloud, rules, given.cog)
     with ExitStack() as stack:
+        targets = {"dsm": task.target, **more}
         drafts = {
-            name: stack.enter_context(replaced_when_whole(path))
-            for name, path in {"dsm": task.target, **more}.items()
+            name: stack.enter_context(temporary_output(path)) for name, path in targets.items()
         }
-        run.write(stack.enter_context(draft_folder(task.target)), **drafts)
+        folder = stack.enter_context(scratch_folder(task.target))
+        gridding = _Gridding(task, cloud, rules, given.cog, folder)
+        gridding.write(**drafts)
     if given.style:
         write_text(style, raster_style(task.target, rules.what), overwrite=given.overwrite)
     result = replace(
-        run.summary(),
+        gridding.summary(),
         hillshade=str(more["hillshade"]) if "hillshade" in more else None,
         counts=str(more["counts"]) if "counts" in more else None,
         resolution_is="given" if given.resolution else "chosen",
     )
-    task.tell(result.as_dict())
+    write_summary(task, result.as_dict())
     return result
 
 
-@dataclass
-class _Run:
-    """The gridding of one cloud."""
+class _Gridding:
+    """The gridding of one cloud: its sorted points, and the rasters that are made of them."""
 
-    task: FileTask
-    cloud: Path | Tiles
-    settings: DsmRules
-    cog: bool
-    tally: Tally = field(default_factory=Tally)
-
-    def write(
-        self, folder: Path, dsm: Path, hillshade: Path | None = None, counts: Path | None = None
+    def __init__(
+        self, task: FileTask, cloud: Path | Tiles, settings: DsmRules, cog: bool, folder: Path
     ) -> None:
-        """Write the raster, and its hillshade and its counts if paths are given."""
-        with open_cloud(self.cloud) as source:
+        """Sort the points into files of a temporary folder."""
+        self.task, self.settings, self.cog, self.folder = task, settings, cog, folder
+        self.tally = Tally()
+        with open_cloud(cloud) as source:
             self.crs, self.points = metric_crs(source), len(source)
-            self.plan = None if self.crs is None else parts(self.crs)[0]
-            corrected = any(is_ours(vlr) for vlr in source.vlrs)
+            self.corrected = any(is_ours(vlr) for vlr in source.vlrs)
             self.sorted = SortedPoints(
-                source, self.settings, folder, lambda done, total: self.report(0.5 * done / total),
-                lambda: open_cloud(self.cloud, places_only=True),
+                source, settings, folder, lambda done, total: self.report(0.5 * done / total),
+                lambda: open_cloud(cloud, places_only=True),
             )  # fmt: skip
+        self.plan = None if self.crs is None else parts(self.crs)[0]
         self.near, self.lattice = self.sorted.near, self.sorted.lattice
-        made = {"pcfix": __version__, "corrected": corrected, **asdict(self.settings)}
-        tags, what = {"PCFIX": json.dumps(made)}, self.settings.what
+        spacings = TIN_REACH_SPACINGS * self.near.spacing_m
+        cells = TIN_REACH_CELLS * settings.cell_m
+        self.reach_m = max(spacings, cells, settings.fill or 0.0)  # widest circle of the TIN
+
+    def write(self, dsm: Path, hillshade: Path | None = None, counts: Path | None = None) -> None:
+        """Write the raster, and its hillshade and its counts if paths are given."""
+        what, folder = self.settings.what, self.folder
+        made = {"pcfix": __version__, "corrected": self.corrected, **asdict(self.settings)}
         unit = METRE if what in ("height", *DIMENSIONS) else ""
         crs = self.crs if what == "height" else self.plan
         plain = folder / "dsm.tif" if self.cog else dsm
         numbers = folder / "counts.tif" if self.cog else counts
+        new = partial(rasters.new_raster, lattice=self.lattice, tags={"PCFIX": json.dumps(made)})
         with ExitStack() as stack:
-            new = partial(rasters.new_raster, lattice=self.lattice, tags=tags)
             out, both = stack.enter_context(new(plain, crs=crs, bands={what: unit})), None
-            if counts is not None and numbers is not None:
+            if numbers is not None and counts is not None:
                 bands = {"count": "", "spread": unit}
                 both = stack.enter_context(new(numbers, crs=self.plan, bands=bands))
             if self.settings.fill is None or self.settings.method == "tin":
                 self.grid(out, both)
             else:
-                self.grid_and_fill(out, both, folder / "unfilled.tif")
+                self.grid_and_fill(out, both)
         if hillshade is not None:
-            self.shade(plain, hillshade, folder)
+            self.shade(plain, hillshade)
         self.finish(plain, dsm)
-        if counts is not None and numbers is not None:
+        if numbers is not None and counts is not None:
             self.finish(numbers, counts)
 
     def grid(self, heights: DatasetWriter, counts: DatasetWriter | None) -> None:
         """Write values to one raster, numbers of points and their spread to another."""
         done, lattice = 0, self.lattice
         how = Gridding(lattice, self.settings.method, self.reach_m, self.near.spacing_m)
-        into = ((heights, 1), (counts, 1), (counts, 2))
         limit = TIN_BLOCK_POINTS if self.settings.method == "tin" else BLOCK_POINTS
         for window in self.sorted.windows(limit):
             points = self.sorted.points_in(window.grown(how.margin_cells))
             bands = grid_window(*points, window, how)
             if self.settings.what == "uncertainty":
                 bands = as_uncertainty(bands)
-            for (raster, band), values in zip(into, bands, strict=True):
-                if raster is not None:
-                    rasters.write_part(raster, values, window, band)
+            rasters.write_part(heights, bands[0], window, 1)
+            if counts is not None:
+                for band, values in enumerate(bands[1:], start=1):
+                    rasters.write_part(counts, values, window, band)
             self.tally.add(bands)
             done += window.height * window.width
             self.report(0.5 + 0.5 * done / (lattice.height * lattice.width))
 
-    @property
-    def reach_m(self) -> float:
-        """Diameter of the widest circle around a triangle of the TIN."""
-        spacings = TIN_REACH_SPACINGS * self.near.spacing_m
-        cells = TIN_REACH_CELLS * self.settings.cell_m
-        return max(spacings, cells, self.settings.fill or 0.0)
-
-    def grid_and_fill(
-        self, dsm: DatasetWriter, counts: DatasetWriter | None, unfilled: Path
-    ) -> None:
+    def grid_and_fill(self, dsm: DatasetWriter, counts: DatasetWriter | None) -> None:
         """Write values to a temporary raster, and from there, with holes filled, to the DSM."""
+        unfilled, tally = self.folder / "unfilled.tif", self.tally
         with rasters.new_raster(unfilled, self.lattice, None, {"height": METRE}) as heights:
             self.grid(heights, counts)
         widest = (self.settings.fill or 0.0) / self.settings.cell_m
@@ -215,20 +209,18 @@ class _Run:
                 around = window.grown(margin_cells(widest)).clipped(self.lattice.window)
                 height = fill_holes(rasters.read_heights(heights, around), window, around, widest)
                 rasters.write_part(dsm, height, window, 1)
-                self.tally.filled += int((~np.isnan(height)).sum())
-        self.tally.filled -= self.tally.known
-        self.tally.known += self.tally.filled
+                tally.filled += int((~np.isnan(height)).sum())
+        tally.filled -= tally.known
+        tally.known += tally.filled
 
-    def shade(self, dsm: Path, target: Path, folder: Path) -> None:
+    def shade(self, dsm: Path, target: Path) -> None:
         """Write the hillshade of a DSM."""
-        plain = folder / "hillshade.tif" if self.cog else target
-        band, s = {"hillshade": ""}, self.settings
-        with (
-            rasters.open_raster(dsm) as heights,
-            rasters.new_raster(
-                plain, self.lattice, self.plan, band, dtype="uint8", nodata=NO_LIGHT
-            ) as out,
-        ):
+        plain = self.folder / "hillshade.tif" if self.cog else target
+        s, bands = self.settings, {"hillshade": ""}
+        new = rasters.new_raster(
+            plain, self.lattice, self.plan, bands, dtype="uint8", nodata=NO_LIGHT
+        )
+        with rasters.open_raster(dsm) as heights, new as out:
             for window in self.lattice.windows(BLOCK_CELLS):
                 height = rasters.read_within(heights, window.grown(1), self.lattice.window)
                 light = hillshade(height, s.cell_m, s.azimuth, s.altitude)
@@ -248,7 +240,7 @@ class _Run:
             self.task.progress(round(share * self.points), self.points)
 
     def summary(self) -> DsmSummary:
-        """Return the numbers of the run."""
+        """Return the figures of the raster."""
         settings, lattice, tally = self.settings, self.lattice, self.tally
         return DsmSummary(
             input=str(self.task.source),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +18,9 @@ from pcfix.io.cameras.georeference import Georeference, georeference
 from pcfix.io.vectors import LAYER_MARK
 from pcfix.io.views import ViewList
 from pcfix.label.areas import WaterMask
+from pcfix.label.labelling import Labelling
 from pcfix.model import Cameras, FloatArray, TiePoints, ViewKind
+from pcfix.options.correct import LabelRules
 from pcfix.options.declare import File, options_of
 from pcfix.options.shared import InputOptions
 from pcfix.port.shapes import port_of
@@ -32,7 +34,6 @@ TIMED = (".json", ".geojson")
 """Camera files that may hold the time of each image."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class Inputs(InputOptions):
     """Cameras, view list and water as the user gives them.
 
@@ -184,6 +185,12 @@ def mask_of(
     polygons = read_water_polygons(path, cloud_crs)
     _warn(polygons.notes)
     return WaterMask(polygons.area, polygons.name, low, high, tuple(map(str, polygons.notes)))
+
+
+def labelling_of(options: Any, view: CloudView) -> Labelling:
+    """Return the rules by which points count as submerged, with the mask in the cloud's CRS."""
+    mask = mask_of(options.water_mask, view.crs, view.low, view.high)
+    return Labelling(options.part(LabelRules), mask)
 
 
 def _warn(notes: Iterable[str | PcfixWarning]) -> None:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import astuple, replace
+from dataclasses import astuple, dataclass
 from functools import partial
 from os import PathLike
 from pathlib import Path
@@ -13,29 +12,24 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import SettingError
-from pcfix.flow.inputs import mask_of, paths_in
-from pcfix.flow.runner import Chunk, FileTask, Header, Progress, Step, file_task
+from pcfix.flow.inputs import labelling_of, mask_of, paths_in
+from pcfix.flow.runner import Check, Chunk, Command, Ends, FileTask, Progress, run_command, stream
 from pcfix.flow.surfaces import (
     CloudView,
     Points,
     corners,
-    file_points,
     find_surface,
     parts_of,
     points_of,
     view_of,
 )
-from pcfix.flow.tiles import TiledRun
-from pcfix.io.drafts import all_or_none
-from pcfix.io.files import path_of
 from pcfix.io.las.columns import convert
 from pcfix.io.las.part import part_report
 from pcfix.io.las.source import LasSource
-from pcfix.io.las.writing import labelling_vlr, noted_header
-from pcfix.io.tiles import Clouds, Tiles, single, tiles_of
-from pcfix.kernels import threads
+from pcfix.io.las.writing import corrected_identity, labelling_vlr, noted_header
+from pcfix.io.tiles import Clouds, Tiles
 from pcfix.label.areas import WaterMask
-from pcfix.label.labelling import Labelling, LabelSummary, Part, sets_class
+from pcfix.label.labelling import LabelCounts, Labelling, LabelSummary, Part, sets_class
 from pcfix.model import WaterPlane, WaterSurface
 from pcfix.options.correct import LabelOptions, LabelRules, StageLabelOptions
 from pcfix.options.declare import File, taken
@@ -45,9 +39,6 @@ from pcfix.water.checks import as_surface, check_submerged, check_tilt, checked_
 from pcfix.water.surface import surface_above
 
 Classes = npt.NDArray[np.uint8]
-
-COUNTS = ("submerged", "water_surface", "stale", "water_unknown", "points")
-"""Counts of points, by the names of `LabelSummary`."""
 
 
 def label_points(
@@ -105,10 +96,8 @@ def label_points(
     surface, heights = as_surface(water, len(points))
     if water_mask is None or isinstance(water_mask, str | PathLike):
         water_mask = mask_of(water_mask, crs, *corners(*points[:, :2].T))
-    labelling = Labelling(rules, water_mask)
     part = Part(points, surface_above(surface, points, heights), given)
-    if labelling.looks_around:
-        labelling.look_around(lambda: [part], *corners(*points[:, :2].T))
+    labelling = Labelling(rules, water_mask).scanned(lambda: [part], *corners(*points[:, :2].T))
     return labelling.labels(part).classes
 
 
@@ -146,116 +135,121 @@ def label_file(
         If a file, an option or the water cannot be used; no output is left behind.
     """
     given = taken(LabelOptions, options, keywords, "label_file")
-    tiles = tiles_of(input)
-    if tiles is not None:
-        run = TiledRun("label", tiles, path_of(output), given, progress)
-        return run.run(
-            lambda part: _step_for(part, given),
-            lambda step: _summary(step, str(tiles), str(output), run.seconds),
-        )
-    task = file_task(single(input), output, given, reads=paths_in(given), progress=progress)
-    with threads(given.jobs), all_or_none():
-        step = _step_for(task.source, given)
-        task.run(step)
-        result = _summary(step, str(task.source), str(task.target), task.seconds)
-        result = replace(result, part=part_report(task.source))
-        task.tell(result.as_dict())
+    command = Command("label", partial(_plan_file, given), _label_cloud, check, _summarize)
+    result: LabelSummary = run_command(
+        command, input, output, given, reads=paths_in(given), progress=progress
+    )
     return result
 
 
-def _step_for(cloud: Path | Tiles, options: LabelOptions) -> LabellingStep:
-    """Return the step after it has scanned the whole cloud, if its rules need that."""
-    step = LabellingStep(str(cloud), options, view_of(cloud))
-    step.look_around(lambda: file_points(cloud, step.water, options.jobs))
-    return step
+@dataclass(frozen=True)
+class LabelPlan:
+    """What all points of a cloud have in common: its water, and the rules of the labelling."""
+
+    name: str
+    water: WaterSurface
+    labelling: Labelling
 
 
-def _summary(step: LabellingStep, input: str, output: str, seconds: float) -> LabelSummary:
-    return LabelSummary(
-        input=input,
-        output=output,
-        pcfix=__version__,
-        **step.counts,
-        water=str(step.water),
-        settings=step.labelling.settings.as_dict(),
-        labelling=step.labelling.report(),
-        seconds=round(seconds, 3),
-        warnings=list(step.labelling.notes),
+@dataclass(frozen=True)
+class LabelTally(Sums):
+    """Counts of points, by the names of `LabelSummary`."""
+
+    submerged: int
+    water_surface: int
+    stale: int
+    water_unknown: int
+    points: int
+    excluded: LabelCounts
+
+    def counts(self) -> dict[str, int]:
+        """Return the counts without those of the excluded points."""
+        return {name: value for name, value in vars(self).items() if name != "excluded"}
+
+
+def plan_labelling(options: StageLabelOptions, view: CloudView) -> LabelPlan:
+    """Read water and mask, and scan the surroundings of all points if the rules need them."""
+    water = find_surface(options.water, options, view).surface
+    check_tilt(water)
+    labelling = labelling_of(options, view).scanned(
+        lambda: parts_of(view.chunks(water), water), view.low, view.high
+    )
+    return LabelPlan(view.name, water, labelling)
+
+
+def label_chunk(plan: LabelPlan, points: Points) -> tuple[Classes, LabelTally]:
+    """Return the classes of some points, and their counts."""
+    (part,) = parts_of([points], plan.water)
+    labels = plan.labelling.labels(part)
+    stale = sets_class(part.classes) & ~(labels.submerged | labels.at_surface)
+    unknown = np.isnan(part.surface.height_m)
+    return labels.classes, LabelTally(
+        submerged=int(labels.submerged.sum()),
+        water_surface=int(labels.at_surface.sum()),
+        stale=int(stale.sum()),
+        water_unknown=int(unknown.sum()),
+        points=len(unknown),
+        excluded=labels.counts,
     )
 
 
-class LabellingStep(Sums, Step):
-    """Label the points of a file, or the arrays of a PDAL pipeline.
+def check(plan: LabelPlan, tally: LabelTally) -> None:
+    """Raise GeometryError if no point lies below the water, or inside the mask."""
+    below = tally.submerged + tally.water_surface
+    plan.labelling.check(plan.name, tally.excluded, below)
+    check_submerged(below, plan.name, plan.water)
 
-    The name is for messages; the view is that of the whole cloud. Raises PcfixError if the water or
-    the mask cannot be read or do not fit.
-    """
 
-    added = ("counts", "labelling")
+def _plan_file(
+    options: LabelOptions, cloud: Path | Tiles, target: Path, kept: list[Chunk] | None = None
+) -> LabelPlan:
+    return plan_labelling(options, view_of(cloud, options.jobs))
 
-    def __init__(self, name: str, options: StageLabelOptions, view: CloudView) -> None:
-        self._name, self._view = name, view
-        self.water = find_surface(options.water, options, view).surface
-        check_tilt(self.water)
-        mask = mask_of(options.water_mask, view.crs, view.low, view.high)
-        self.labelling = Labelling(options.part(LabelRules), mask)
-        self.begin(0)
 
-    def begin(self, first_row: int) -> None:
-        """Reset the counts; the result does not depend on the row of the next chunk."""
-        del first_row
-        self.counts: dict[str, Any] = dict.fromkeys(COUNTS, 0)
-        self.labelling.restart()
+def _label_cloud(
+    plan: LabelPlan, task: FileTask, row: int = 0, check: Check | None = None
+) -> tuple[Any, Any]:
+    return stream(task, partial(_Labelling, plan), row, check)
 
-    def run(self, task: FileTask) -> None:
-        """Process a file."""
-        task.run(self)
 
-    def look_around(self, chunks: Callable[[], Iterable[Points]]) -> None:
-        """Scan the surroundings of all points, if the rules need them."""
-        if self.labelling.looks_around:
-            self.labelling.look_around(
-                lambda: parts_of(chunks(), self.water), self._view.low, self._view.high
-            )
+class _Labelling:
+    """The labelling of one file: its header with a record of it, and each chunk."""
 
-    def header(self, source: LasSource) -> Header:
-        """Return the header of a labelled file, with the record of the labelling."""
-        water, mask = self.water, self.labelling.mask
+    def __init__(self, plan: LabelPlan, source: LasSource) -> None:
+        self._plan, self._source = plan, source
+        water, mask, part = plan.water, plan.labelling.mask, part_report(source.path)
         content = {
             "pcfix": __version__,
-            "settings": self.labelling.settings.as_dict(),
+            "settings": plan.labelling.settings.as_dict(),
             "water": str(water),
             "water_plane": list(astuple(water)) if isinstance(water, WaterPlane) else None,
             "water_mask": None if mask is None else mask.name,
+            **({} if part is None else {"part": part}),
         }
-        part = part_report(source.path)
-        content |= {} if part is None else {"part": part}
-        return noted_header(source, labelling_vlr(content))
+        self.header = noted_header(source, labelling_vlr(content))
+        self.identity = corrected_identity(source)
 
-    def classes(self, points: Points) -> Classes:
-        """Return the classes of some points, and count them."""
-        (part,) = parts_of([points], self.water)
-        labels = self.labelling.labels(part)
-        stale = sets_class(part.classes) & ~(labels.submerged | labels.at_surface)
-        unknown = np.isnan(part.surface.height_m)
-        found = labels.submerged, labels.at_surface, stale, unknown, np.ones(len(unknown), np.bool_)
-        for name, rows in zip(COUNTS, found, strict=True):
-            self.counts[name] += int(rows.sum())
-        return labels.classes
+    def compute(self, points: Chunk, row: int) -> tuple[Classes, LabelTally]:
+        """Return the classes of the points of a chunk."""
+        return label_chunk(self._plan, points_of(points, self._source, self._plan.water))
 
-    def chunk(self, points: Chunk, source: LasSource, header: Header) -> Callable[[], Chunk]:
-        """Return what writes the labels of points of a file."""
-        found = self.classes(points_of(points, source, self.water))
-        return partial(_labelled, points, header, found)
-
-    def finish(self) -> None:
-        """Raise GeometryError if no point lies below the water, or inside the mask."""
-        below = self.counts["submerged"] + self.counts["water_surface"]
-        self.labelling.check(self._name, below)
-        check_submerged(below, self._name, self.water)
+    def apply(self, points: Chunk, classes: Classes) -> Chunk:
+        """Write the classes."""
+        new = convert(points, self.header.point_format)
+        new.array["classification"] = classes
+        return new
 
 
-def _labelled(points: Chunk, header: Header, classes: Classes) -> Chunk:
-    new = convert(points, header.point_format)
-    new.array["classification"] = classes
-    return new
+def _summarize(plan: LabelPlan, tally: LabelTally, findings: None, ends: Ends) -> LabelSummary:
+    return LabelSummary(
+        input=ends.input,
+        output=ends.output,
+        pcfix=__version__,
+        **tally.counts(),
+        water=str(plan.water),
+        settings=plan.labelling.settings.as_dict(),
+        labelling=plan.labelling.report(tally.excluded),
+        seconds=round(ends.seconds, 3),
+        warnings=list(plan.labelling.notes),
+        part=None if ends.source is None else part_report(ends.source),
+    )

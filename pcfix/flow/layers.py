@@ -101,7 +101,7 @@ def _waterline(drawn: Drawn) -> Layer:
             bed = points.classes == BATHYMETRIC_POINT
             above[bed] = -source.dimension(chunk, "WaterDepth")[bed]
             above[np.isin(points.classes, NOISE_CLASSES) | (chunk["withheld"] == 1)] = np.nan
-            near.add(points.xyz, above, source.dimension(chunk, "SigmaZ"))
+            near += NearWater.of(points.xyz, above, source.dimension(chunk, "SigmaZ"))
     sigma = LEVEL_M if drawn.sigma_level_m is None else drawn.sigma_level_m
     lines = near.lines(lambda xy: np.full(len(xy), sigma))
     style = vector_style({"line": Symbol("line", RED, 0.5)})

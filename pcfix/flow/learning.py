@@ -1,32 +1,26 @@
-"""Estimate everything that a correction needs to know about the whole cloud of a file."""
+"""Estimate everything that a correction needs to know about a whole cloud."""
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from functools import partial
-from importlib import import_module
-from itertools import repeat
 from pathlib import Path
-from threading import Thread
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.errors import GeometryError, PcfixWarning, SettingError
-from pcfix.flow.inputs import Inputs
+from pcfix.errors import GeometryError, SettingError
 from pcfix.flow.surfaces import CloudView, Points, parts_of
 from pcfix.io.regressions import read_regression
 from pcfix.io.tables import CheckDepths, read_check_depths
 from pcfix.label.labelling import Part
-from pcfix.model import NOISE_CLASSES, BoolArray, FloatArray, IntArray, TiePoints, ViewKind
+from pcfix.model import NOISE_CLASSES, BoolArray, Cameras, FloatArray, IntArray, TiePoints, ViewKind
 from pcfix.options.correct import ScienceOptions
 from pcfix.options.declare import File
 from pcfix.refract.batch import FLAT_DEG, UNLISTED, Batch, Learned, OriginalModel, Survey, stacked
 from pcfix.refract.learning import (
     CORRECTED_RATIO,
     Near,
-    check_method,
     depth_ratio,
     learn_of_sample,
     learn_of_unlisted,
@@ -39,7 +33,7 @@ from pcfix.refract.learning import (
 from pcfix.refract.methods import with_rays
 from pcfix.refract.occlusion import Occluder, OccluderBuilder, wants_occlusion
 from pcfix.refract.patches import PATCH_WIDTH, Squares
-from pcfix.refract.reconstructions import Verdict, hint_of
+from pcfix.refract.reconstructions import Hint, Verdict
 from pcfix.refract.regression import (
     LEAST_COUNT,
     LEAST_NEIGHBOURS,
@@ -50,209 +44,210 @@ from pcfix.refract.regression import (
 )
 from pcfix.water.surface import SurfaceAbove, is_submerged, surface_above
 
+FLAT_SHARE, FLAT_SAMPLE = 0.01, 20_000
+"""Share of the submerged points above which it is noted, and size of the sample for it."""
+FLYING_HEIGHT_M = 100.0
+"""If the water below the cameras is unknown, for the width of squares."""
+BED_POINTS_A_M2 = 5.0
+FEWEST_BED_POINTS, MOST_BED_POINTS = 125_000, 1_000_000
+"""Size of the sample of the cloud that the bed of the surroundings is estimated from."""
 
-class Learning:
-    """Everything that is learned for one job.
+
+class CloudFacts(NamedTuple):
+    """What a whole cloud shows.
+
+    survey : everything that all its points have in common; verdicts : on its reconstruction type;
+    of_unlisted : the same for points in no view list; notes : for the user.
+    """
+
+    survey: Survey
+    verdicts: tuple[Verdict, ...] = ()
+    of_unlisted: tuple[Verdict, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+def learn_of_cloud(
+    survey: Survey,
+    view: CloudView,
+    chunks: Callable[[], Iterable[Points]],
+    *,
+    original: Cameras | None = None,
+    views: ViewKind | None = None,
+    all_listed: bool = True,
+    ties: Callable[[], TiePoints | None] = lambda: None,
+    hint: Hint | None = None,
+    regression: DepthRegression | None = None,
+) -> CloudFacts:
+    """Resolve every option that is ``auto``, and estimate what the points have in common.
 
     Parameters
     ----------
     survey : Survey
-        With nothing learned.
-    inputs : Inputs
+        With the options as given.
     view : CloudView
-        Of the whole cloud.
-    views : {"tracks", "depth-maps"} or None
-        Kind of the view list, if there is one.
+    chunks : callable
+        Returns the whole cloud, chunk by chunk, transferred to the adjusted cameras if there are
+        any; it is called once or twice.
+    original : Cameras, optional
+        The original cameras, if they were adjusted since.
+    views : {"tracks", "depth-maps", ...}, optional
+        Type of the view list, if there is one.
+    all_listed : bool
+        Whether every point can have views. If not, the others are corrected as without a list.
     ties : callable, optional
-        Returns the tie points of the original model; default: those of the camera file.
-
-    Raises
-    ------
-    SettingError
-        If the method lacks something that it needs.
+        Returns the tie points of the original cameras.
+    hint : Hint, optional
+        The reconstruction type that the software is known for.
+    regression : DepthRegression, optional
     """
-
-    def __init__(
-        self,
-        survey: Survey,
-        inputs: Inputs,
-        view: CloudView,
-        views: ViewKind | None,
-        ties: Callable[[], TiePoints | None] | None = None,
-    ) -> None:
-        self._ties = ties or partial(_ties_of, inputs, view)
-        self._inputs, self._view, self._views = inputs, view, views
-        self.notes: list[str] = []
-        self.verdicts: tuple[Verdict, ...] = ()
-        self.of_unlisted: tuple[Verdict, ...] = ()
-        self._given = survey.settings
-        settings = resolved(survey.settings, survey.cameras, views)
-        self.survey = replace(survey, settings=settings)
-        check_method(settings, survey.cameras)
-        _check_regression(settings.method, inputs)
-
-    def of_cloud(
-        self,
-        chunks: Callable[[], Iterable[Points]],
-        makers: Callable[[], Iterable[OriginalModel]] | None = None,
-        *,
-        all_listed: bool = True,
-    ) -> Survey:
-        """Return the survey with what is learned from the whole cloud.
-
-        Its chunks are read several times, with the original model of each if the cameras were
-        adjusted. Unless all points are listed, the others are corrected without a list.
-        """
-        occluder = self._occluder(chunks, listed=self._views is not None)
-        learned = Learned(regression=self._regression(chunks), occluder=occluder)
-        self.survey = replace(self.survey, learned=learned)
-        some_listed = self._views is not None and not all_listed
-        if not (some_listed or wants_sample(self.survey, self._views)):
-            return self.survey
-        (sample, near), ties = self._sample(chunks, makers), self._ties()
-        sample, factor = with_factor(sample)
-        if factor is not None:
-            self.notes.append(str(factor))
-            self.survey = sample.survey
-            self._given = replace(self._given, depth_factor=factor.factor)
-        self._note_corrected(sample, ties)
-        points, hint = self._view.points, hint_of((self._view.software, self.survey.cameras.source))
-        if self._views is None:
-            self.survey, self.verdicts = learn_of_sample(sample, points, ties, hint, near)
-            self._note_flat(sample)
-            return self.survey
-        self.survey = with_matcher(sample, ties)
-        if some_listed:
-            learned = learned._replace(occluder=self._occluder(chunks, listed=False))
-            bare = replace(self.survey, settings=self._given, learned=learned)
-            unlisted, self.of_unlisted = learn_of_unlisted(
-                replace(sample, survey=bare), points, ties, hint, near
-            )
-            self.survey = replace(self.survey, parts={UNLISTED: unlisted})
-        return self.survey
-
-    def _note_corrected(self, sample: Batch, ties: TiePoints | None) -> None:
-        """Note a cloud that is deeper than the tie points of its cameras."""
-        wet = sample.take(np.flatnonzero(is_submerged(sample.xyz[:, 2], sample.surface)))
-        ratio = None if ties is None else depth_ratio(wet, ties)
-        if ratio is not None and ratio > CORRECTED_RATIO:
-            self.notes.append(
-                f"The cloud is {ratio:.2f} times as deep as the tie points of its cameras, as if it"
-                " had been corrected before. Give the cloud as the matcher wrote it."
-            )
-
-    def _note_flat(self, sample: Batch) -> None:
-        """Note how many points only obliques see, and where."""
-        rows = np.flatnonzero(is_submerged(sample.xyz[:, 2], sample.surface))
-        wet = replace(sample.take(rows[:: 1 + len(rows) // FLAT_SAMPLE]), survey=self.survey)
-        flat = with_rays(wet).seen_flat() if len(wet) else np.zeros(0, np.bool_)
-        if flat.sum() <= FLAT_SHARE * len(flat):
-            return
-        low, high = np.percentile(wet.xyz[flat, :2], (2.0, 98.0), axis=0)
-        unsure = self.survey.settings.unsure
-        self.notes.append(
-            f"About {100.0 * flat.mean():.0f} % of the submerged points have only rays beyond"
-            f" {FLAT_DEG:g} degrees, nearly all between {low[0]:.0f}, {low[1]:.0f} and"
-            f" {high[0]:.0f}, {high[1]:.0f}. Their depths are the least certain; add nadir images"
-            + (", or flag them with --unsure withhold." if unsure == "keep" else ".")
-        )
-
-    def of_unlisted_notes(self) -> list[str]:
-        """Return the note on points that are in no view list."""
-        if UNLISTED not in self.survey.parts:
-            return []
-        so = " ".join(str(one) for one in self.of_unlisted)
-        return [f"Points in no view list are corrected as without a list. {so}"]
-
-    def _regression(self, chunks: Callable[[], Iterable[Points]]) -> DepthRegression | None:
-        path, water, where = self._inputs.check_depths, self.survey.water, ""
-        if self._inputs.regression is not None:
-            found = read_regression(self._inputs.regression)
-            fitted = f", fitted to {found.source}" if found.source else ""
-            where = (
-                f" It comes from {self._inputs.regression}{fitted}; whether it holds for this cloud"
-                " is not checked."
-            )
-        elif path is not None:
-            found = learn_regression(path, parts_of(chunks(), water), self.survey.settings)
-            source = f"{Path(path).name} on {Path(self._view.name).name}, water {water}"
-            found = replace(found, source=source)
-        else:
-            return None
-        again = "" if found.cv_rmse_m is None else f", cross-validated {found.cv_rmse_m:.3f} m"
-        self.notes += [
-            f"Regression: {found}; standard errors {found.intercept_se_m:.3f} m and"
-            f" {found.slope_se:.3f}, RMSE {found.rmse_m:.3f} m{again}.{where}",
-            *found.notes,
-        ]
-        return found
-
-    def _occluder(self, chunks: Callable[[], Iterable[Points]], *, listed: bool) -> Occluder | None:
-        listed = listed and self.survey.settings.occlusion == "auto"
-        if listed or not wants_occlusion(self.survey.cameras, self.survey.settings):
-            return None  # listed cameras saw their points
-        builder = OccluderBuilder(self._view.low, self._view.high, self._view.points)
-        for points in chunks():
-            builder.add(points.xyz, points.classes)
-        return builder.build()
-
-    def _sample(
-        self,
-        chunks: Callable[[], Iterable[Points]],
-        makers: Callable[[], Iterable[OriginalModel]] | None,
-    ) -> tuple[Batch, Near | None]:
-        """Return points of the whole cloud, evenly spread over its order, without noise.
-
-        If these may be too far apart to detect the reconstruction type, submerged points in squares
-        too.
-        """
-        area_m2 = np.prod(np.maximum(np.subtract(self._view.high, self._view.low)[:2], 1.0))
-        dense = BED_POINTS_A_M2 * float(area_m2)
-        dense = dense if np.isfinite(dense) else MOST_BED_POINTS  # unknown bounds
-        wanted = np.clip(dense, FEWEST_BED_POINTS, MOST_BED_POINTS)
-        step = max(1, self._view.points // int(wanted))
-        near_step = max(1, self._view.points // int(max(dense, FEWEST_BED_POINTS)))
-        squares = Squares(PATCH_WIDTH * self._flying_height_m()) if near_step < step else None
-        survey, taken = self.survey, list[Batch]()
-        # import it while the cloud is read
-        Thread(target=import_module, args=("scipy.spatial",), daemon=True).start()
-        done = 0
-        of_chunks = repeat(None) if makers is None else makers()
-        for points, original_model in zip(chunks(), of_chunks, strict=False):
-            taken.append(_every(step, done, points, survey, original_model))
-            if squares is not None:
-                squares.add(submerged_of(_every(near_step, done, points, survey, original_model)))
-            done += len(points.xyz)
-        return stacked(taken), None if squares is None else Near(squares.all(), near_step)
-
-    def _flying_height_m(self) -> float:
-        """Return the median height of the cameras above the water below them."""
-        centres = self.survey.cameras.centres
-        unknown = np.full(len(centres), np.nan)
-        above = centres[:, 2] - surface_above(self.survey.water, centres, unknown).height_m
-        above = above[above > 0.0]
-        return float(np.median(above)) if len(above) else FLYING_HEIGHT_M
+    given = survey.settings
+    survey = replace(survey, settings=resolved(given, survey.cameras, views))
+    occluder = _occluder(survey, view, chunks, listed=views is not None)
+    learned = Learned(regression=regression, occluder=occluder)
+    survey = replace(survey, learned=learned)
+    some_listed = views is not None and not all_listed
+    if not (some_listed or wants_sample(survey, views)):
+        return CloudFacts(survey)
+    (sample, near), tie_points = _sample(survey, view, chunks, original), ties()
+    sample, factor = with_factor(sample)
+    notes = [] if factor is None else [str(factor)]
+    if factor is not None:
+        survey, given = sample.survey, replace(given, depth_factor=factor.factor)
+    notes += _note_corrected(sample, tie_points)
+    if views is None:
+        survey, verdicts = learn_of_sample(sample, view.points, tie_points, hint, near)
+        return CloudFacts(survey, verdicts, notes=(*notes, *_note_flat(sample, survey)))
+    survey, of_unlisted = with_matcher(sample, tie_points), tuple[Verdict, ...]()
+    if some_listed:
+        learned = learned._replace(occluder=_occluder(survey, view, chunks, listed=False))
+        bare = replace(sample, survey=replace(survey, settings=given, learned=learned))
+        unlisted, of_unlisted = learn_of_unlisted(bare, view.points, tie_points, hint, near)
+        survey = replace(survey, parts={UNLISTED: unlisted})
+    return CloudFacts(survey, (), of_unlisted, tuple(notes))
 
 
-def _every(
-    step: int, done: int, points: Points, survey: Survey, original_model: OriginalModel | None
-) -> Batch:
-    """Return every n-th point of a cloud (n = `step`) from a chunk after `done` points."""
-    rows = np.arange(-done % step, len(points.xyz), step)
-    rows = rows[~np.isin(points.classes[rows], NOISE_CLASSES)]
-    heights = None if points.heights is None else points.heights[rows]
-    xyz = points.xyz[rows]
-    return Batch(
-        xyz,
-        surface_above(survey.water, xyz, heights),
-        survey,
-        original_model=None if original_model is None else original_model.take(rows),
-        source=None if points.sources is None else points.sources[rows],
+def _note_corrected(sample: Batch, ties: TiePoints | None) -> list[str]:
+    """Note a cloud that is deeper than the tie points of its cameras."""
+    ratio = None if ties is None else depth_ratio(submerged_of(sample), ties)
+    if ratio is None or ratio <= CORRECTED_RATIO:
+        return []
+    return [
+        f"The cloud is {ratio:.2f} times as deep as the tie points of its cameras, as if it"
+        " had been corrected before. Give the cloud as the matcher wrote it."
+    ]
+
+
+def _note_flat(sample: Batch, survey: Survey) -> list[str]:
+    """Note how many points only oblique images see, and where."""
+    rows = np.flatnonzero(is_submerged(sample.xyz[:, 2], sample.surface))
+    wet = replace(sample.take(rows[:: 1 + len(rows) // FLAT_SAMPLE]), survey=survey)
+    flat = with_rays(wet).seen_flat() if len(wet) else np.zeros(0, np.bool_)
+    if flat.sum() <= FLAT_SHARE * len(flat):
+        return []
+    low, high = np.percentile(wet.xyz[flat, :2], (2.0, 98.0), axis=0)
+    keeps = survey.settings.unsure == "keep"
+    return [
+        f"About {100.0 * flat.mean():.0f} % of the submerged points have only rays beyond"
+        f" {FLAT_DEG:g} degrees, nearly all between {low[0]:.0f}, {low[1]:.0f} and"
+        f" {high[0]:.0f}, {high[1]:.0f}. Their depths are the least certain; add nadir images"
+        + (", or flag them with --unsure withhold." if keeps else ".")
+    ]
+
+
+def _occluder(
+    survey: Survey, view: CloudView, chunks: Callable[[], Iterable[Points]], *, listed: bool
+) -> Occluder | None:
+    """Return the surface of the cloud, if it may hide points from cameras."""
+    if listed and survey.settings.occlusion == "auto":
+        return None  # listed cameras saw their points
+    if not (view.points and wants_occlusion(survey.cameras, survey.settings)):
+        return None
+    builder = OccluderBuilder(view.low, view.high, view.points)
+    for points in chunks():
+        builder.add(points.xyz, points.classes)
+    return builder.build()
+
+
+def _sample(
+    survey: Survey,
+    view: CloudView,
+    chunks: Callable[[], Iterable[Points]],
+    original: Cameras | None,
+) -> tuple[Batch, Near | None]:
+    """Return points of the whole cloud, evenly spread over its order, without noise.
+
+    If these may be too far apart to detect the reconstruction type, submerged points in squares
+    too.
+    """
+    area_m2 = np.prod(np.maximum(np.subtract(view.high, view.low)[:2], 1.0))
+    dense = BED_POINTS_A_M2 * float(area_m2)
+    dense = dense if np.isfinite(dense) else MOST_BED_POINTS  # unknown bounds
+    step = max(1, view.points // int(np.clip(dense, FEWEST_BED_POINTS, MOST_BED_POINTS)))
+    near_step = max(1, view.points // int(max(dense, FEWEST_BED_POINTS)))
+    squares = Squares(PATCH_WIDTH * _flying_height_m(survey)) if near_step < step else None
+    taken, row = list[Batch](), 0
+    for points in chunks():
+        taken.append(_every(step, row, points, survey, original))
+        if squares is not None:
+            squares.add(submerged_of(_every(near_step, row, points, survey, original)))
+        row += len(points.xyz)
+    return stacked(taken), None if squares is None else Near(squares.all(), near_step)
+
+
+def _flying_height_m(survey: Survey) -> float:
+    """Return the median height of the cameras above the water below them."""
+    centres = survey.cameras.centres
+    unknown = np.full(len(centres), np.nan)
+    above = centres[:, 2] - surface_above(survey.water, centres, unknown).height_m
+    above = above[above > 0.0]
+    return float(np.median(above)) if len(above) else FLYING_HEIGHT_M
+
+
+def _every(step: int, row: int, points: Points, survey: Survey, original: Cameras | None) -> Batch:
+    """Return every n-th point of a cloud (n = `step`) from a chunk that begins at a row."""
+    rows = np.arange(-row % step, len(points.xyz), step)
+    return batch_of(
+        points.take(rows[~np.isin(points.classes[rows], NOISE_CLASSES)]), survey, original
     )
 
 
-def _check_regression(method: str, inputs: Inputs) -> None:
-    """Raise SettingError unless the method regression has check depths or a line, and no other."""
+def batch_of(points: Points, survey: Survey, original: Cameras | None) -> Batch:
+    """Return points of a cloud, without views, as the methods of correction take them."""
+    model = None
+    if original is not None and points.original_xyz is not None:
+        model = OriginalModel(points.original_xyz, original)
+    above = surface_above(survey.water, points.xyz, points.heights)
+    return Batch(points.xyz, above, survey, original_model=model, source=points.sources)
+
+
+def regression_of(
+    inputs: Any, view: CloudView, chunks: Callable[[], Iterable[Points]], survey: Survey
+) -> tuple[DepthRegression | None, tuple[str, ...]]:
+    """Read the line of a regression, or fit it to check depths; return it with notes."""
+    path, where = inputs.check_depths, ""
+    if inputs.regression is not None:
+        found = read_regression(inputs.regression)
+        fitted = f", fitted to {found.source}" if found.source else ""
+        where = (
+            f" It comes from {inputs.regression}{fitted}; whether it holds for this cloud"
+            " is not checked."
+        )
+    elif path is not None:
+        found = learn_regression(path, parts_of(chunks(), survey.water), survey.settings)
+        source = f"{Path(path).name} on {Path(view.name).name}, water {survey.water}"
+        found = replace(found, source=source)
+    else:
+        return None, ()
+    again = "" if found.cv_rmse_m is None else f", cross-validated {found.cv_rmse_m:.3f} m"
+    return found, (
+        f"Regression: {found}; standard errors {found.intercept_se_m:.3f} m and"
+        f" {found.slope_se:.3f}, RMSE {found.rmse_m:.3f} m{again}.{where}",
+        *found.notes,
+    )
+
+
+def check_regression(method: str, inputs: Any) -> None:
+    """Raise SettingError unless the method regression, and no other, has check depths or a line."""
     given = [n for n in ("check_depths", "regression") if getattr(inputs, n) is not None]
     if len(given) == 2:
         raise SettingError(
@@ -269,24 +264,6 @@ def _check_regression(method: str, inputs: Inputs) -> None:
             method=method,
             options=given,
         )
-
-
-def _ties_of(inputs: Inputs, view: CloudView) -> TiePoints | None:
-    """Return the tie points of the camera file; its warnings came with the cameras."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", PcfixWarning)
-        return inputs.tie_points(view.crs)
-
-
-FLAT_SHARE, FLAT_SAMPLE = 0.01, 20_000
-"""Share of the submerged points above which it is noted, and size of the sample for it."""
-
-FLYING_HEIGHT_M = 100.0
-"""If the water below the cameras is unknown, for the width of squares."""
-
-BED_POINTS_A_M2 = 5.0
-FEWEST_BED_POINTS, MOST_BED_POINTS = 125_000, 1_000_000
-"""Size of the sample of the cloud that the bed of the surroundings is estimated from."""
 
 
 def learn_regression(

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import warnings
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -12,12 +11,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from pcfix.adjust.transfer import Pair, pair_of, renumbered
-from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError
+from pcfix.errors import GeometryError, InputError, SettingError
 from pcfix.io.cameras import takes_sensor
 from pcfix.io.labels import match_labels
-from pcfix.io.views import ViewList, ViewMatch, ViewReport
-from pcfix.model import NO_CAMERAS, Cameras, FloatArray, IntArray, TiePoints, Views
-from pcfix.sums import Sums
+from pcfix.io.views import ViewList
+from pcfix.model import NO_CAMERAS, Cameras, IntArray, TiePoints
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -192,58 +190,3 @@ def old_tie_points(
         return adjusted.tie_points(cloud_crs), False
     views, entry = renumbered(ties.views, pair.row)
     return replace(ties, views=views, image_xy=ties.image_xy[entry]), True
-
-
-class ListedViews(Sums):
-    """The view list of a cloud, matched to its points chunk by chunk; empty without a list."""
-
-    added = ("report",)
-
-    def __init__(
-        self, views: ViewList | None, cameras: Cameras, points: int, step_m: float
-    ) -> None:
-        self.list, self._cameras, self._points, self._step_m = views, cameras, points, step_m
-        self.restart()
-
-    def _anew(self) -> ViewMatch | None:
-        if self.list is None:
-            return None
-        return ViewMatch(self.list, self._cameras, points=self._points, step_m=self._step_m)
-
-    def restart(self) -> None:
-        """Go back to the first row of the cloud."""
-        self._match = self._anew()
-
-    def all_anew(self) -> Callable[[FloatArray, int], Views | None]:
-        """Return the views of the whole cloud from its first row, without changing the report."""
-        match = self._anew()
-        return lambda xyz, row: None if match is None else match.for_chunk(xyz, row)
-
-    def of(self, xyz: FloatArray, row: int) -> Views | None:
-        """Return the views of a chunk, shape (n, 3), that begins at a row."""
-        return None if self._match is None else self._match.for_chunk(xyz, row)
-
-    @property
-    def are_all(self) -> bool:
-        """Whether every point of the cloud can have views."""
-        return self.list is None or (
-            len(self.list) >= self._points and bool((np.diff(self.list.raw.start) > 0).all())
-        )
-
-    @property
-    def report(self) -> ViewReport | None:
-        """How the list has fitted so far."""
-        return None if self._match is None else self._match.report
-
-    @property
-    def path(self) -> str | None:
-        """The file of the list."""
-        return None if self.list is None else str(self.list.raw.path)
-
-    def check(self) -> None:
-        """Refuse a list of another cloud, and warn of one that hardly fits."""
-        if self.report is None:
-            return
-        self.report.check()
-        for sentence in self.report.warnings():
-            warnings.warn(sentence, PcfixWarning, stacklevel=3)

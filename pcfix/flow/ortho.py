@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pcfix.errors import GeometryError, InputError
+from pcfix.errors import GeometryError, InputError, PcfixWarning
 from pcfix.flow.inputs import paths_in
 from pcfix.flow.photos import CLOUDS, PhotoBlock, block_of, plain, warn_all
 from pcfix.flow.runner import Progress, check_summary, write_summary
 from pcfix.grid.lattice import Lattice, Window, lattice_over, refuse_size
 from pcfix.io import rasters
-from pcfix.io.drafts import draft_folder, replaced_when_whole
+from pcfix.io.atomic import scratch_folder, temporary_output
 from pcfix.io.photographs import photographs_in, read_colours
 from pcfix.kernels import threads
 from pcfix.model import FloatArray, WaterPlane
 from pcfix.options.declare import File, options_of, taken
 from pcfix.options.photos import OrthoOptions, PhotosOptions
-from pcfix.photos.ortho import OrthoSummary, Picture, mosaic, picture_of
+from pcfix.photos.ortho import Picture, mosaic, picture_of
 
 TILE_CELLS = 512
 CACHE_BYTES = 400_000_000
@@ -29,6 +30,23 @@ CACHE_BYTES = 400_000_000
 NO_WATER = WaterPlane(-100_000.0)
 """Below all ground, so that every ray is straight."""
 COLOURS = {1: ("gray",), 3: ("red", "green", "blue")}
+
+
+@dataclass(frozen=True)
+class OrthoSummary:
+    """The result of `pcfix.ortho_photo`; `covered_share` is that of the cells over the DSM."""
+
+    output: str
+    images: int
+    width: int
+    height: int
+    resolution_m: float
+    bounds_m: tuple[float, float, float, float]
+    covered_share: float
+    seconds: float
+    dsm: str
+    water: str | None
+    notes: tuple[PcfixWarning, ...]
 
 
 def ortho_photo(
@@ -61,7 +79,7 @@ def ortho_photo(
     known = [*paths_in(given), *([given.dsm] if given.dsm else []), *paths]
     target = rasters.check_tif(output, overwrite=given.overwrite, inputs=known)
     check_summary(given, [*known, target])
-    with threads(given.jobs), replaced_when_whole(target) as draft, draft_folder(target) as folder:
+    with threads(given.jobs), temporary_output(target) as draft, scratch_folder(target) as folder:
         block = block_of(_as_photos(given), paths, folder)
         warn_all(block.notes)
         lattice = _lattice(block, given)

@@ -29,7 +29,7 @@ from pcfix.model import Cameras, FloatArray, Lens, WaterDimension
 from pcfix.options.declare import File, taken
 from pcfix.options.photos import PhotosOptions
 from pcfix.photos.ground import Ground, ground_of
-from pcfix.photos.mapping import Photo, PhotosSummary, Scene, exact, nodes_of, paper, resample
+from pcfix.photos.mapping import Photo, Scene, exact, nodes_of, paper, resample
 from pcfix.version import __version__
 from pcfix.water.checks import check_above_water
 from pcfix.water.index import index_of
@@ -43,6 +43,34 @@ MOST_BLACK = 0.2
 LENS_TOLERANCE = 0.005
 """Of the shape of a frame in millimetres against that of the image."""
 CLOUDS = (".las", ".laz")
+
+
+@dataclass(frozen=True)
+class PhotosSummary:
+    """The result of `map_photos`.
+
+    Attributes
+    ----------
+    images, done_before : int
+        Images written, and those among them that an earlier call wrote.
+    black_share : float
+        Share of pixels without ground, occluded, or outside the original image.
+    spacing_px : int
+        Between the nodes of the grid.
+    """
+
+    images: int
+    done_before: int
+    megapixels: float
+    seconds: float
+    largest_shift_px: float
+    black_share: float
+    mapping: str
+    dsm: str
+    water: str
+    refractive_index: float
+    spacing_px: int
+    notes: tuple[PcfixWarning, ...]
 
 
 def map_photos(

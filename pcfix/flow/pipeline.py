@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pcfix.errors import InputError, SettingError
-from pcfix.flow.correct import job_for
+from pcfix.flow.correction import read_inputs
+from pcfix.flow.surfaces import view_of
 from pcfix.io.las.columns import UPGRADE, Column, columns_for
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import check_suffix
@@ -25,7 +26,7 @@ def stage_for(input: Path, options: CorrectOptions) -> dict[str, Any]:
             "pipeline.drop",
             "--uncorrected drop needs a stage that drops points. Print the whole pipeline.",
         )
-    job_for(input, options)
+    read_inputs(options, view_of(input))
     return _stage(options)
 
 
@@ -36,7 +37,7 @@ def pipeline_for(input: Path, output: Path, options: CorrectOptions) -> dict[str
     exists. What `pcfix.correct_file` refuses at its start is refused here too.
     """
     check_suffix(output)
-    job_for(input, options)
+    read_inputs(options, view_of(input))
     with LasSource(input) as source:
         point_format = source.header.point_format
     if UPGRADE[point_format.id] in (9, 10):

@@ -7,7 +7,7 @@ cloud; what cannot be tested is listed as not checked. None of it changes a resu
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -20,7 +20,7 @@ from pcfix.lens.frames import cameras_in_sight
 from pcfix.lens.imaging import project
 from pcfix.model import BoolArray, Cameras, FloatArray, TiePoints
 from pcfix.options.declare import File
-from pcfix.sums import Sums
+from pcfix.sums import SAME, Sums
 
 SAMPLE_POINTS, IN_FRAMES = 30_000, 4_000
 """Points of the sample, and those of it that are tested in the frames; evenly spread."""
@@ -69,52 +69,45 @@ class Plausible(NamedTuple):
         return {"words": str(self), **lists}
 
 
+@dataclass(frozen=True)
 class CloudSample(Sums):
-    """A sample of a cloud, collected chunk by chunk; the same for any size of chunks."""
+    """Points of a cloud, evenly spread over its order, with the water above them."""
 
-    added = ("_xyz", "_water", "_rgb")
+    parts: tuple[FloatArray, ...] = ()  # (n, 3) each
+    water: tuple[FloatArray, ...] = ()  # (n,)
+    rgb: tuple[FloatArray, ...] = ()  # (n, 3), if the cloud has colours
+    every: float = field(default=1.0, metadata=SAME)  # points of the cloud for each of the sample
 
-    def __init__(self, points: int, first_row: int = 0) -> None:
-        self._step, self._done = max(1, points // SAMPLE_POINTS), first_row
-        self._xyz: list[FloatArray] = []
-        self._water: list[FloatArray] = []
-        self._rgb: list[FloatArray] = []
-
-    def add(self, points: Points, water_m: FloatArray) -> None:
-        """Add a chunk, and the water above each of its points."""
-        rows = np.arange(-self._done % self._step, len(points.xyz), self._step)
-        self._done += len(points.xyz)
-        self._xyz.append(points.xyz[rows])
-        self._water.append(water_m[rows])
-        if points.colours is not None:
-            self._rgb.append(np.column_stack([colour[rows] for colour in points.colours]))
-
-    @property
-    def every(self) -> float:
-        """How many points of the cloud there are for each of the sample."""
-        return float(self._step)
+    @classmethod
+    def of(cls, points: Points, water_m: FloatArray, row: int, count: int) -> CloudSample:
+        """Return the sample of a chunk that begins at a row of a cloud of `count` points."""
+        step = max(1, count // SAMPLE_POINTS)
+        rows = np.arange(-row % step, len(points.xyz), step)
+        colours = points.colours
+        rgb = () if colours is None else (np.column_stack([one[rows] for one in colours]),)
+        return cls((points.xyz[rows],), (water_m[rows],), rgb, float(step))
 
     @property
     def water_m(self) -> float | None:
         """The median height of the water."""
-        water = np.concatenate([np.zeros(0), *self._water])
+        water = np.concatenate([np.zeros(0), *self.water])
         water = water[np.isfinite(water)]
         return float(np.median(water)) if len(water) else None
 
     @property
     def xyz(self) -> FloatArray:
         """The points, shape (n, 3)."""
-        return np.vstack(self._xyz) if self._xyz else np.zeros((0, 3))
+        return np.vstack([np.zeros((0, 3)), *self.parts])
 
     def level_doubts(self) -> tuple[PcfixWarning, ...]:
         """Return warnings if the shoreline in the cloud is at another height than the water."""
         from pcfix.water.auto import LEAST_POINTS, find_elsewhere
 
-        xyz, water = self.xyz, np.concatenate([np.zeros(0), *self._water])
+        xyz, water = self.xyz, np.concatenate([np.zeros(0), *self.water])
         known = np.isfinite(water)
         if known.sum() < LEAST_POINTS:
             return ()
-        rgb = np.vstack(self._rgb)[known] if self._rgb else None
+        rgb = np.vstack(self.rgb)[known] if self.rgb else None
         found, tilted = find_elsewhere(xyz[known], water[known], rgb)
         doubts = []
         if found is not None:

@@ -15,9 +15,9 @@ import numpy as np
 
 from pcfix.adjust.transfer import CloudTransfer, Pair
 from pcfix.errors import InputError, PcfixWarning
-from pcfix.flow.old_cameras import ListedViews
 from pcfix.flow.surfaces import Points
 from pcfix.io.members import find_members
+from pcfix.io.views import ViewMatch
 from pcfix.model import NOISE_CLASSES, Cameras, FloatArray, IntArray, Outcome, Views
 from pcfix.options.declare import File
 from pcfix.refract.batch import Batch, OriginalModel, Survey
@@ -71,11 +71,11 @@ class Sample(NamedTuple):
         return Sample(self.points.take(rows), listed)
 
 
-def sample_of(chunks: Iterable[Points], views: ListedViews, step: int) -> Sample:
+def sample_of(chunks: Iterable[Points], match: ViewMatch | None, step: int) -> Sample:
     """Return every `step`-th point of a cloud, without noise."""
-    listed, row, parts = views.all_anew(), 0, list[Sample]()
+    row, parts = 0, list[Sample]()
     for points in chunks:
-        seen = listed(points.xyz, row)
+        seen = None if match is None else match.counted(points.xyz, row)[0]
         rows = np.arange(-row % step, len(points.xyz), step)
         rows = rows[~np.isin(points.classes[rows], NOISE_CLASSES)]
         parts.append(Sample(points, seen).take(rows))
@@ -161,8 +161,8 @@ def _survey_of(survey: Survey, adjustment: Adjustment, member: int) -> Survey:
 
 def _heights(sample: Sample, survey: Survey, pair: Pair) -> FloatArray:
     """Return the corrected heights of a sample, shape (n,), NaN for uncorrected points."""
-    (xyz, heights, _, sources, _), listed = sample
-    step = CloudTransfer(replace(pair, adjusted=survey.cameras)).step(xyz, listed)
+    xyz, heights, sources = sample.points.xyz, sample.points.heights, sample.points.sources
+    step = CloudTransfer(replace(pair, adjusted=survey.cameras)).step(xyz, sample.listed)
     above = surface_above(survey.water, step.xyz, heights)
     found = correct(
         Batch(

@@ -17,7 +17,7 @@ from pcfix.grid.colours import relief_colours
 from pcfix.grid.lattice import Lattice, Window, round_resolution
 from pcfix.grid.model import hillshade
 from pcfix.io import rasters
-from pcfix.io.drafts import draft_folder, replaced_when_whole
+from pcfix.io.atomic import scratch_folder, temporary_output
 from pcfix.io.styles import limits_of
 from pcfix.io.tiles import Tiles, open_cloud
 from pcfix.model import Cameras, FloatArray
@@ -95,8 +95,8 @@ def _write_shaded(folder: Path) -> None:
     target = folder / SHADED
     high = limits_of(rasters.preview(folder / DEPTH)[0], "depth")[1]
     with ExitStack() as stack:
-        draft = stack.enter_context(replaced_when_whole(target))
-        plain = stack.enter_context(draft_folder(target)) / SHADED
+        draft = stack.enter_context(temporary_output(target))
+        plain = stack.enter_context(scratch_folder(target)) / SHADED
         surface = stack.enter_context(rasters.open_raster(folder / SURFACE))
         depth = stack.enter_context(rasters.open_raster(folder / DEPTH))
         lattice = rasters.lattice_of(surface)

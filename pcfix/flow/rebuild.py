@@ -1,6 +1,8 @@
 """Rebuild a cloud in rounds: photographs without water, a cloud from them, its DSM, and again.
 
-The workflow of Fig 10 of Skarlatos & Agrafiotis 2018. Each round starts from the original images
+The workflow of Fig 10 of Skarlatos & Agrafiotis 2018, until a DSM differs from the one before by
+less than a threshold (a ground pixel). Here the mean difference under water counts, as single cells
+scatter by the noise of the matcher. Each round starts from the original images
 and the DSM of the round before. With the mapping ``exact`` and the true bed, one round is enough.
 """
 
@@ -20,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError
+from pcfix.errors import GeometryError, InputError, PcfixError, PcfixWarning, SettingError
 from pcfix.flow.compare import compare_clouds
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.photos import CLOUDS, PhotoBlock, block_of, input_states, map_photos, plain
@@ -30,20 +32,66 @@ from pcfix.io.las.writing import write_points
 from pcfix.io.photographs import photographs_in, read_colours
 from pcfix.io.rasters import open_raster, place_of, read_masked, write_dod
 from pcfix.kernels import threads
+from pcfix.model import BoolArray, FloatArray
 from pcfix.options.declare import File, taken
 from pcfix.options.photos import PhotosOptions, RebuildOptions
 from pcfix.photos.ortho import blank_in
-from pcfix.photos.rounds import PAPER_ROUNDS, RebuildSummary, Round, paper_excess, round_of
 from pcfix.photos.stereo import Grey, stereo_cloud
 from pcfix.version import __version__
 from pcfix.water.surface import surface_above
 
 RECORD = "pcfix-rebuild.json"
+PAPER_ROUNDS = 3
+"""After so many, the mapping by eq 12 is close to its fixed point, which is not the bed."""
 STEREO_CELL_PIXELS = 2.0
 STEREO_STEP_M = 0.001
 CACHED_PHOTOGRAPHS = 16
 COMMAND_ONLY = ("overwrite", "jobs", "summary", "rebuild", "until_gsd", "most_rounds", "reference")
 """Options that a later call may change and still resume."""
+
+
+@dataclass(frozen=True)
+class Round:
+    """The change in a round: DSM minus the one before, over submerged cells (all if none are).
+
+    `within_gsd` is the share of the cells that moved by at most a ground pixel.
+    """
+
+    cloud: str
+    dsm: str
+    cells: int
+    mean_m: float
+    sd_m: float
+    within_gsd: float
+
+
+@dataclass(frozen=True)
+class RebuildSummary:
+    """The result of `pcfix.rebuild_rounds`.
+
+    Attributes
+    ----------
+    done_before : int
+        Rounds that an earlier call finished.
+    settled : bool
+        Whether the last round moved the bed by less than the threshold.
+    compare : str
+        The command that compares all clouds with a reference.
+    compared : str or None
+        The folder with its results, where a reference was given.
+    """
+
+    rounds: tuple[Round, ...]
+    done_before: int
+    settled: bool
+    gsd_m: float
+    threshold_m: float
+    seconds: float
+    mapping: str
+    rebuild: str
+    compare: str
+    compared: str | None
+    notes: tuple[PcfixWarning, ...]
 
 
 def rebuild_rounds(
@@ -270,8 +318,39 @@ class _Run:
         return round_of((str(cloud), str(dsm)), moved, wet, self.block.gsd_m)
 
 
+def round_of(
+    files: tuple[str, str], difference_m: FloatArray, wet: BoolArray, gsd_m: float
+) -> Round:
+    """Return the change in a round.
+
+    Parameters
+    ----------
+    files : tuple of str
+        Its cloud and its DSM.
+    difference_m : array, shape (rows, columns)
+        DSM minus the one before, NaN where either has no height.
+    wet : array of bool, shape (rows, columns)
+
+    Raises
+    ------
+    GeometryError
+        ``cloud.no_overlap``.
+    """
+    known = np.isfinite(difference_m)
+    moved = difference_m[known & wet] if (known & wet).any() else difference_m[known]
+    if not len(moved):
+        raise GeometryError(
+            "cloud.no_overlap",
+            f"{files[0]}: does not overlap the DSM of the round before. Check its CRS.",
+            path=files[0],
+        )
+    within = float((np.abs(moved) <= gsd_m).mean())
+    mean, sd = float(moved.mean()), float(moved.std())
+    return Round(*files, len(moved), round(mean, 5), round(sd, 5), round(within, 5))
+
+
 def _paper_note(index: float) -> PcfixWarning:
-    excess = paper_excess(index)
+    excess = 1.0 / (index * (2.0 - index)) - 1.0  # near nadir the depth tends to h0 / (2 - n)
     return PcfixWarning(
         "photos.paper_limit",
         "--mapping paper tends to the apparent depth over 2 - n, here up to"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.inputs import Inputs, paths_in
 from pcfix.flow.rasters import SURFACE
 from pcfix.flow.record import VERSION, belonging, read_record
-from pcfix.flow.run_adjust import FOLDER, AdjustStep
+from pcfix.flow.run_adjust import FOLDER
 from pcfix.flow.tiles import HOW, RECORDS
 from pcfix.io.clouds import reference_of
 from pcfix.io.files import files_in
@@ -27,7 +27,6 @@ from pcfix.water.index import Water, with_index
 CLOUDS = ("corrected", "cleaned")
 
 
-@dataclass(frozen=True, kw_only=True)
 class Request(RunOptions):
     """Everything that the results of a run depend on; ``run.json`` keeps it."""
 
@@ -45,16 +44,34 @@ class Request(RunOptions):
         return reference_of(self.reference or "")
 
     def check(self) -> None:
-        """Check what options say together."""
+        """Refuse options that exclude each other."""
         super().check()
-        self.adjust_step()
+        wrong = ""
+        if self.adjust == "no" and self.only_to_adjust:
+            wrong = f"{self.only_to_adjust[0]} is for an adjustment only. Remove it, or use auto"
+        elif self.adjust == "yes" and self.why_not_adjust:
+            wrong = f"{self.why_not_adjust}. Remove one of the two options"
+        if wrong:
+            sentence = f"--adjust {self.adjust}: {wrong}."
+            raise SettingError("option.conflict", sentence, option="adjust", value=self.adjust)
+        self.part(Inputs)
+        with_index(self.part(RunOptions))
 
-    def adjust_step(self) -> AdjustStep:
-        """Return what the first step is asked for."""
-        index = with_index(self.part(RunOptions)).refractive_index
-        return AdjustStep(
-            self.input, self.part(Inputs), index, self.adjust, self.gcps, self.gnss, self.lens
-        )
+    @property
+    def only_to_adjust(self) -> list[str]:
+        """Options that were given and are for an adjustment only."""
+        return [name for name in ("gcps", "gnss", "lens") if getattr(self, name) is not None]
+
+    @property
+    def why_not_adjust(self) -> str:
+        """Why an adjustment is impossible with the other options; empty if it is possible."""
+        if self.cameras is None:
+            return "there are no cameras to adjust"
+        if self.adjusted_from is not None:
+            return "with adjusted-from the cameras are adjusted already"
+        if self.tide is not None:
+            return "a tide gives each image its own water level, and an adjustment has one"
+        return ""
 
     def with_adjusted(self, folder: Path, step: dict[str, Any]) -> Request:
         """Return the request of the next steps: with the adjusted cameras, if there are any."""
@@ -161,7 +178,7 @@ class Files:
         """Remove the clouds that an earlier run made of other files."""
         kept = {*self.parts(self.corrected), *self.parts(self.cleaned)}
         for one in CLOUDS:
-            records = (self.folder / one / RECORDS).glob("*.la[sz].npz")
+            records = (self.folder / one / RECORDS).glob("*.la[sz].tally")
             made = {self.folder / one / path.stem: path for path in records}
             for path in {self.folder / f"{one}.laz", *made} - kept:
                 path.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""A whole run from Python, and what it left: rasters, lines and tables as analysts have them."""
+"""A whole run from Python, and its results as rasters, lines and tables."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _WHY = {
 
 @dataclass(frozen=True)
 class RunResults:
-    """What a run left in its folder; a notebook shows its tiles and a map.
+    """The results of a run in its folder; a notebook shows its tiles and a map.
 
     Rasters and lines are in the CRS of the cloud, metres. They need the extra ``analysis``, and are
     read from the files each time they are asked for.
@@ -54,12 +54,13 @@ class RunResults:
 
     @cached_property
     def _steps(self) -> dict[str, Plain]:
-        """What each step came to, of ``run.json``."""
+        """The result of each step, from ``run.json``."""
         steps = read_record(self._file(RECORD))["steps"]
         if "report" not in steps:
             raise InputError(
-                f"{self.folder}: holds a run that did not come to its end; run it again, it resumes"
-                " where it stopped."
+                "run.unfinished",
+                f"{self.folder}: the run did not finish. Run it again; it resumes.",
+                path=self.folder,
             )
         return {name: step["result"] for name, step in steps.items()}
 
@@ -70,7 +71,7 @@ class RunResults:
 
     @property
     def summary(self) -> Summary:
-        """What the correction came to."""
+        """The figures of the correction."""
         return Summary(**self._steps["correct"])
 
     @property
@@ -81,22 +82,25 @@ class RunResults:
     @property
     def depth(self) -> DataArray:
         """Depth of the bed, shape (y, x), metres below the water, positive down; NaN on land."""
-        return analysis.open_array(self._file(DEPTH))
+        return self._raster(DEPTH)
 
     @property
     def bed(self) -> DataArray:
         """Heights of the bed, shape (y, x), metres; NaN on land."""
-        return analysis.open_array(self._file(BED))
+        return self._raster(BED)
 
     @property
     def surface(self) -> DataArray:
         """Heights of land and bed, shape (y, x), metres."""
-        return analysis.open_array(self._file(SURFACE))
+        return self._raster(SURFACE)
 
     @property
     def uncertainty(self) -> DataArray:
         """Vertical uncertainty of the bed at 95 %, shape (y, x), metres, predicted."""
-        return analysis.open_array(self._file(UNCERTAINTY))
+        return self._raster(UNCERTAINTY)
+
+    def _raster(self, name: str) -> DataArray:
+        return analysis.open_array(self._file(name))
 
     def contours(self, interval: float | None = None) -> GeoDataFrame:
         """Return lines of equal depth, ``depth_m``.
@@ -113,8 +117,7 @@ class RunResults:
                 "option.range", f"interval {interval:g} must be above 0.",
                 option="interval", value=interval, above=0,
             )  # fmt: skip
-        crs = analysis.open_array(self._file(DEPTH)).rio.crs
-        return analysis.frame_of(contours_layer(self.folder, interval), crs)
+        return analysis.frame_of(contours_layer(self.folder, interval), self.depth.rio.crs)
 
     @property
     def waterline(self) -> GeoDataFrame:
@@ -140,7 +143,7 @@ class RunResults:
         return {"statistics": statistics, **{one.stem: analysis.table_of_csv(one) for one in files}}
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows."""
+        """Return the HTML that a notebook shows."""
         first = self._steps["report"]
         colours, bounds = rasters.picture(self._file(SHADED))
         deepest = limits_of(rasters.preview(self._file(DEPTH))[0], "depth")[1]
@@ -151,7 +154,7 @@ class RunResults:
         path = self.folder / name
         if not path.is_file():
             why = f": {_WHY[name]}" if name in _WHY else ""
-            raise InputError(f"{path}: the run has not left this file{why}.")
+            raise InputError("run.no_file", f"{path}: the run has not written it{why}.", path=path)
         return path
 
 
@@ -188,7 +191,7 @@ def run(
     Raises
     ------
     PcfixError
-        With one sentence on what to mend; the steps before it stay done.
+        With one sentence on what to do; the steps before it stay done.
 
     Examples
     --------
@@ -202,26 +205,22 @@ def run(
     for one in options_of(RunOptions):
         value = values[one.name]
         if one.type is Any and value is not None and not isinstance(value, tuple):
-            values[one.name] = _as_text(one.name, value)
-    cloud = input if isinstance(input, str | os.PathLike) else tuple(map(str, input))
-    request = Request(input=cloud if isinstance(cloud, tuple) else str(cloud), **values)
-    folder = Path(out_dir)
+            if not isinstance(value, str | os.PathLike | Real):
+                raise SettingError(
+                    "option.type",
+                    f"run: {one.name} is a {type(value).__name__}. Give a file or text, which"
+                    " run.json can keep, or use correct_file.",
+                    option=one.name,
+                )
+            values[one.name] = str(value)
+    cloud = str(input) if isinstance(input, str | os.PathLike) else tuple(map(str, input))
+    request, folder = Request(input=cloud, **values), Path(out_dir)
     run_all(request, folder, overwrite=given.overwrite, jobs=given.jobs, say=say, bar=bar)
     return RunResults(folder)
 
 
-def _as_text(name: str, value: Any) -> str:
-    """Return what names cameras or water as the record of a run keeps it."""
-    if isinstance(value, str | os.PathLike | Real):
-        return str(value)
-    raise SettingError(
-        f"run: {name} is a {type(value).__name__}; give a file or text, which run.json can keep,"
-        " or take correct_file."
-    )
-
-
 def open_run(folder: File) -> RunResults:
-    """Open what a finished run left.
+    """Open the results of a finished run.
 
     Parameters
     ----------
@@ -235,7 +234,7 @@ def open_run(folder: File) -> RunResults:
     Raises
     ------
     InputError
-        If the folder holds no run, or one that did not come to its end.
+        If the folder holds no run, or an unfinished one.
     """
     found = RunResults(Path(folder))
     _ = found.summary

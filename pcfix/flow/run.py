@@ -29,7 +29,7 @@ from pcfix.flow.run_adjust import FOLDER, adjust_first, figures_of, is_worth_say
 from pcfix.flow.runner import Bar, Progress, no_bar
 from pcfix.flow.shore import check_shoreline
 from pcfix.flow.surfaces import view_of
-from pcfix.flow.tiles import TiledRun
+from pcfix.flow.tiles import check_folder
 from pcfix.grid.maps import MOST_CELLS
 from pcfix.io.clouds import is_cloud, own_water
 from pcfix.io.geopackage import check_layers
@@ -40,11 +40,16 @@ from pcfix.options.correct import CorrectOptions
 from pcfix.options.declare import options_of
 from pcfix.options.steps import CleanOptions, DistanceOptions
 from pcfix.refract.tally import Summary
-from pcfix.report.adjustment_text import all_notes
+from pcfix.report.adjustment import (
+    adjustment_sentence,
+    adjustment_tables,
+    all_notes,
+    reason_sentence,
+)
 from pcfix.report.comparison import evaluation, in_a_sentence
 from pcfix.report.first_screen import Survey, in_short, is_found
 from pcfix.report.page import Picture, Table
-from pcfix.report.run import Later, adjustment_sentence, adjustment_table, reason_sentence
+from pcfix.report.run import Later
 from pcfix.report.text import uncertainty_sentence
 from pcfix.report.water import found_picture
 
@@ -97,7 +102,7 @@ def run_all(
         load_py4dgeo()
     check_one_file(request.source, request)
     if isinstance(request.source, Tiles):
-        TiledRun("correct", request.source, files.corrected, request).check_folder()
+        check_folder(files.corrected, request.source)
     record = _opened(request, out_dir, overwrite)
     check_shoreline(request.shoreline, overwrite=overwrite or record.resumes, inputs=inputs)
     shore = [] if request.shoreline is None else [Path(request.shoreline)]
@@ -119,9 +124,8 @@ def run_all(
         say(f"{name:<9} {done}: {shown}{more(result) if more else ''}")
         return result
 
-    asked = replace(request.adjust_step(), cloud=request.source)
     first, was_done = do(
-        "adjust", outputs_of(out_dir), lambda _: adjust_first(asked, out_dir, inputs, jobs)
+        "adjust", outputs_of(out_dir), lambda _: adjust_first(request, out_dir, inputs, jobs)
     )
     _say_adjusted(first, out_dir, was_done, say)
     request = request.with_adjusted(out_dir, first)
@@ -329,7 +333,7 @@ def _report(
         pictures, tables = evaluation(compared["figures"], compared["sections"], dod)
         verdict += in_a_sentence(compared["figures"])
     if first["adjusted"]:
-        tables.append(adjustment_table(figures_of(files.folder), f"{FOLDER}/report.html"))
+        tables += adjustment_tables(figures_of(files.folder), f"{FOLDER}/report.html")
     summary = Summary(**done["correct"])
     again = _inputs(request)
     cameras = _cameras(request, files)

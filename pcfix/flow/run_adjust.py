@@ -1,11 +1,11 @@
-"""The first step of a run: poses that have absorbed the refraction are adjusted."""
+"""The first step of a run: adjust poses that have absorbed refraction."""
 
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any
 
 from pcfix.adjust.diagnosis import MOST_STATED_M, Evidence
 from pcfix.errors import PcfixError, PcfixWarning, SettingError
@@ -18,17 +18,19 @@ from pcfix.io.files import read_json
 from pcfix.io.gnss_positions import read_gnss
 from pcfix.io.ground_control import read_ground_control
 from pcfix.io.members import FILE as MEMBERS
-from pcfix.io.tiles import Clouds, cloud_of
 from pcfix.kernels import threads
 from pcfix.model import WaterDimension
-from pcfix.options.declare import File
-from pcfix.options.survey import AdjustRules, AdjustWhen
+from pcfix.options.survey import AdjustRules
+from pcfix.water.index import with_index
+
+if TYPE_CHECKING:
+    from pcfix.flow.request import Request
 
 FOLDER = "adjusted"
 
 
 def outputs_of(folder: Path) -> list[Path]:
-    """Return what an adjustment may leave in the folder of a run, its report first."""
+    """Return the files that an adjustment may leave in the folder of a run, its report first."""
     colmap = [f"colmap/{name}.bin" for name in ("cameras", "images", "points3D")]
     names = ["report.html", SUMMARY, MEMBERS, *colmap, "colmap/georeference.json", *MODELS[1:]]
     return [folder / FOLDER / name for name in names]
@@ -39,55 +41,8 @@ def figures_of(folder: Path) -> dict[str, Any]:
     return dict(read_json(folder / FOLDER / SUMMARY))
 
 
-@dataclass(frozen=True)
-class AdjustStep:
-    """Settings of the first step of a run.
-
-    cloud, inputs, index : of the run. gcps, gnss, lens : files that only an adjustment uses, see
-    `pcfix.adjust_cameras`.
-    """
-
-    cloud: Clouds
-    inputs: Inputs
-    index: float
-    when: AdjustWhen = "auto"
-    gcps: File | None = None
-    gnss: File | None = None
-    lens: File | None = None
-
-    def __post_init__(self) -> None:
-        """Refuse settings that exclude each other."""
-        wrong, code = "", "option.conflict"
-        if self.when not in get_args(AdjustWhen):
-            code, wrong = "option.choice", f"use {', '.join(get_args(AdjustWhen))}"
-        elif self.when == "no" and self.survey:
-            wrong = f"{self.survey[0]} is for an adjustment only. Remove it, or use auto or yes"
-        elif self.when == "yes" and self.unfit:
-            wrong = f"{self.unfit}. Remove one of the two options"
-        if wrong:
-            raise SettingError(
-                code, f"--adjust {self.when}: {wrong}.", option="adjust", value=self.when
-            )
-
-    @property
-    def survey(self) -> list[str]:
-        """Names of the files that were given for an adjustment only."""
-        return [name for name in ("gcps", "gnss", "lens") if getattr(self, name) is not None]
-
-    @property
-    def unfit(self) -> str:
-        """Why an adjustment is impossible with the other options; empty if it is possible."""
-        if self.inputs.cameras is None:
-            return "there are no cameras to adjust"
-        if self.inputs.adjusted_from is not None:
-            return "with adjusted-from the cameras are adjusted already"
-        if self.inputs.tide is not None:
-            return "a tide gives each image its own water level, and an adjustment has one"
-        return ""
-
-
 def adjust_first(
-    step: AdjustStep, folder: Path, files: list[Path], jobs: int | None = None
+    request: Request, folder: Path, files: list[Path], jobs: int | None = None
 ) -> dict[str, Any]:
     """Adjust the cameras of a run into its folder if asked, or if they need it.
 
@@ -96,8 +51,9 @@ def adjust_first(
     Returns
     -------
     dict
-        `adjusted`, a bool; `model`, what of the folder of the adjustment has the cameras; `why`;
-        `is_said`, whether that is worth a line; `is_fine`, whether the poses are known to be right.
+        `adjusted`, a bool; `model`, the file or folder with the cameras in that of the adjustment;
+        `why`; `is_said`, whether that is worth a line; `is_fine`, whether the poses are known to be
+        right.
 
     Raises
     ------
@@ -107,11 +63,11 @@ def adjust_first(
     """
     found = {"adjusted": False, "model": None, "why": "", "is_said": False, "is_fine": False}
     try:
-        found |= _decide(step)
+        found |= _decide(request)
         if found["adjusted"]:
-            found["model"] = _adjust(step, folder / FOLDER, files, jobs)
+            found["model"] = _adjust(request, folder / FOLDER, files, jobs)
     except PcfixError as error:
-        if step.when == "yes" or step.survey:
+        if request.adjust == "yes" or request.only_to_adjust:
             raise
         # a file that cannot be read will stop the correction, with the same message
         found |= {"adjusted": False, "why": str(error), "is_said": found["adjusted"]}
@@ -126,27 +82,27 @@ def is_worth_saying(step: dict[str, Any], absorbed: bool) -> bool:
     return step["is_said"] or bool(step["why"] and absorbed)
 
 
-def _decide(step: AdjustStep) -> dict[str, Any]:
+def _decide(request: Request) -> dict[str, Any]:
     """Decide whether to adjust: on request, or if the poses are bent and there is a datum.
 
     Signs of absorbed refraction do not include the survey with which the result is compared: the
     cloud must not depend on it.
     """
-    inputs, lens, model = step.inputs, step.lens, str(step.inputs.cameras)
-    if step.when == "yes":
+    if request.adjust == "yes":
         return {"adjusted": True, "why": "that was asked for", "is_said": True}
-    if step.when == "no":
+    if request.adjust == "no":
         return {}
-    is_said = bool(step.survey)
-    if step.unfit:
-        return {"why": step.unfit, "is_said": is_said}
-    view = view_of(cloud_of(step.cloud))
+    inputs, lens, model = request.part(Inputs), request.lens, str(request.cameras)
+    is_said = bool(request.only_to_adjust)
+    if request.why_not_adjust:
+        return {"why": request.why_not_adjust, "is_said": is_said}
+    view = view_of(request.source)
     with warnings.catch_warnings():  # the correction shows them
         warnings.simplefilter("ignore", PcfixWarning)
         cameras = inputs.block(view.crs)[0]
-        if step.gnss is not None:
-            cameras = read_gnss(step.gnss, cameras)
-        elif step.gcps is None and not has_datum(cameras, model):
+        if request.gnss is not None:
+            cameras = read_gnss(request.gnss, cameras)
+        elif request.gcps is None and not has_datum(cameras, model):
             why = (
                 "there is no datum: no --gcps, no --gnss, and no GNSS positions better than"
                 f" {MOST_STATED_M:g} m in the camera file"
@@ -156,16 +112,16 @@ def _decide(step: AdjustStep) -> dict[str, Any]:
         if isinstance(water, WaterDimension):
             why = f"the water {water} is known at points of the cloud only"
             return {"why": why, "is_said": True}
+        gcps = None if request.gcps is None else read_ground_control(request.gcps, cameras)
         evidence = Evidence(
-            cameras, model, water, step.index, view=view,
-            control=None if step.gcps is None else read_ground_control(step.gcps, cameras).surveyed,
+            cameras, model, water, with_index(request).refractive_index, view=view,
+            control=None if gcps is None else gcps.surveyed,
             calibrated=given_focal_lengths(model) if lens is None else focal_length_of(lens),
-            in_passing=not step.survey,
+            in_passing=not is_said,
         )  # fmt: skip
         if evidence.has_rays:
             evidence = replace(evidence, ties=ties_of(inputs, view.crs))
-        found = diagnose(evidence)
-    sign = found.decided_by
+        sign = diagnose(evidence).decided_by
     if sign is None:
         why = "nothing shows whether the poses absorbed the refraction; --adjust yes adjusts anyway"
         return {"why": why, "is_said": True}
@@ -174,16 +130,18 @@ def _decide(step: AdjustStep) -> dict[str, Any]:
     return {"adjusted": sign.speaks, "why": why, "is_said": True, "is_fine": not sign.speaks}
 
 
-def _adjust(step: AdjustStep, target: Path, files: list[Path], jobs: int | None) -> str:
+def _adjust(request: Request, target: Path, files: list[Path], jobs: int | None) -> str:
     """Adjust, and return which of `MODELS` has the cameras."""
-    for path in files:
-        if target.resolve() in path.resolve().parents:
-            raise SettingError(
-                "output.is_input",
-                f"{path}: lies in {target}, which the adjustment replaces. Give another OUT_DIR.",
-                path=path,
-            )
-    survey, rules = Survey(step.gcps, step.gnss, step.lens), AdjustRules(index=step.index)
+    inside = next((path for path in files if target.resolve() in path.resolve().parents), None)
+    if inside is not None:
+        raise SettingError(
+            "output.is_input",
+            f"{inside}: is in {target}, which the adjustment replaces. Give another OUT_DIR.",
+            path=inside,
+        )
+    survey = Survey(request.gcps, request.gnss, request.lens)
+    rules = AdjustRules(index=with_index(request).refractive_index)
     with threads(jobs):
-        adjust_into(target, step.inputs, survey, rules, step.cloud, overwrite=True)
+        inputs = request.part(Inputs)
+        adjust_into(target, inputs, survey, rules, request.source, overwrite=True)
     return next(name for name in MODELS if (target / name).exists())

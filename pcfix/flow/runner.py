@@ -1,4 +1,9 @@
-"""One step over a file: open, check, read in chunks, write beside the target, rename."""
+"""The loop of every command that rewrites a cloud: read a chunk, compute, write, add up.
+
+A `Command` plans once for a whole cloud; then each file goes through `stream`, chunk by chunk, with
+the next chunk being read and the last one written meanwhile. `run_command` does that for one file,
+`pcfix.flow.tiles` for many.
+"""
 
 from __future__ import annotations
 
@@ -6,19 +11,20 @@ import json
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
+from pcfix.io.atomic import all_or_none
 from pcfix.io.files import check_input, check_output, write_text
 from pcfix.io.las.part import cloud_part
 from pcfix.io.las.source import LasSource
-from pcfix.io.las.writing import LasSink, check_suffix, corrected_identity, output_evlrs
-from pcfix.io.tiles import Tiles, check_one_file, inputs_of
-from pcfix.kernels import telling
+from pcfix.io.las.writing import LasSink, check_suffix, output_evlrs
+from pcfix.io.tiles import Clouds, Tiles, check_one_file, inputs_of, single, tiles_of
+from pcfix.kernels import telling, threads
 from pcfix.options.declare import File
 
 if TYPE_CHECKING:
@@ -28,7 +34,9 @@ Chunk: TypeAlias = "laspy.ScaleAwarePointRecord"
 Header: TypeAlias = "laspy.LasHeader"
 Progress: TypeAlias = Callable[[int, int], None]
 Bar: TypeAlias = Callable[[str], AbstractContextManager[Progress | None]]
-"""Of the name of a step: what shows, while it runs, how far it is."""
+"""Shows the progress of a step, given its title."""
+Check: TypeAlias = Callable[[Any], Any]
+"""Refuses the statistics of a whole cloud that cannot be right, else returns its findings."""
 
 
 def no_bar(title: str) -> AbstractContextManager[None]:
@@ -37,31 +45,60 @@ def no_bar(title: str) -> AbstractContextManager[None]:
 
 
 def part_of(progress: Progress | None, number: int, count: int) -> Progress | None:
-    """Return what a job tells that is one of several alike."""
+    """Return the progress of one of several equal jobs."""
     if progress is None:
         return None
     return lambda done, total: progress(number * total + done, count * total)
 
 
-class Step(Protocol):
-    """What happens to the points of a file."""
+class FileWork(Protocol):
+    """What a command does to one file."""
 
-    identity: bytes | None = None
-    """Of the output, by its first bytes; None for that of every corrected file."""
+    header: Header
+    identity: bytes
+    """The bytes of the header that name the software of the output."""
 
-    def header(self, source: LasSource) -> Header:
-        """Return the header of the output, and be ready for the first chunk."""
+    def compute(self, points: Chunk, row: int) -> tuple[Any, Any]:
+        """Return the result for a chunk that begins at a row of the cloud, and its statistics."""
 
-    def chunk(self, points: Chunk, source: LasSource, header: Header) -> Callable[[], Chunk]:
-        """Return what turns some points into those of the output; it may run beside the next."""
+    def apply(self, points: Chunk, result: Any) -> Chunk:
+        """Return the points of the output; runs while the next chunk is computed."""
 
-    def finish(self) -> None:
-        """Refuse a result that cannot be right; nothing is left behind then."""
-        return
 
-    def run(self, task: FileTask) -> None:
-        """Process a file."""
-        task.run(self)
+@dataclass(frozen=True)
+class Command:
+    """A command that rewrites clouds, as functions.
+
+    Attributes
+    ----------
+    name : str
+    plan : callable
+        Of a cloud, the path of the output, and chunks to keep in memory (`FileTask.kept`): returns
+        all that the points have in common, which can be pickled.
+    process : callable
+        Takes one file through a plan: (plan, task, first row of the cloud, check or None). Returns
+        the statistics, and the findings of the check.
+    check : callable
+        Of a plan and the statistics of the whole cloud: refuses what cannot be right.
+    summarize : callable
+        Of a plan, statistics, findings, and `Ends`: returns the result.
+    """
+
+    name: str
+    plan: Callable[[Any, Path, list[Chunk] | None], Any]
+    process: Callable[[Any, FileTask, int, Check | None], tuple[Any, Any]]
+    check: Callable[[Any, Any], Any]
+    summarize: Callable[[Any, Any, Any, Ends], Any]
+
+
+@dataclass(frozen=True)
+class Ends:
+    """The names of input and output for a summary, the part that was read, and the time so far."""
+
+    input: str
+    output: str
+    seconds: float
+    source: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -71,15 +108,13 @@ class FileTask:
     Attributes
     ----------
     summary : path or None
-        Where the summary goes, as JSON.
+        JSON file for the summary.
     progress : callable or None
-        Called with (points done, points in all), after each chunk and while it is corrected.
-    is_tile : bool
-        Whether it is a part of a cloud; `Step.finish` is about a whole one.
+        Called with (points done, points in all), after each chunk and while it is computed.
     started : float
         `time.perf_counter` then.
     kept : list
-        The chunks of a small cloud that is gone through more than once; see `LasSource`.
+        The chunks of a small cloud that is read several times; see `LasSource`.
     """
 
     source: Path
@@ -88,45 +123,76 @@ class FileTask:
     overwrite: bool = False
     jobs: int | None = None
     progress: Progress | None = None
-    is_tile: bool = False
     started: float = field(default_factory=time.perf_counter)
     kept: list[Chunk] = field(default_factory=list)
 
     @property
     def seconds(self) -> float:
-        """How long it has taken so far."""
+        """Time since the start."""
         return time.perf_counter() - self.started
 
-    def run(self, step: Step) -> None:
-        """Take every chunk through a step; the target appears when all went well."""
-        with LasSource(self.source, self.jobs, kept=self.kept or None) as source:
-            header = step.header(source)
-            identity = step.identity or corrected_identity(source)
-            last = output_evlrs(source), identity, self.jobs
-            with LasSink(self.target, header, *last) as sink:
-                done = 0
-                with written_behind(sink.write, self.jobs) as write:
-                    for points in read_ahead(source.chunks(), self.jobs):
-                        count = len(points)
-                        with telling(partial(self._tell, done, count, len(source))):
-                            write(step.chunk(points, source, header))
-                        done += count
-                        self._tell(done, 0, len(source))
-                if not self.is_tile:
-                    step.finish()
 
-    def _tell(self, done: int, chunk: int, total: int, of_chunk: int = 0) -> None:
-        """Show that so many points are done, and so many of a chunk, which may go twice."""
-        if self.progress is not None:
-            self.progress(done + min(of_chunk, chunk), total)
+def run_command(
+    command: Command,
+    input: Clouds,
+    output: File,
+    options: Any,
+    *,
+    reads: Iterable[Any] = (),
+    progress: Progress | None = None,
+) -> Any:
+    """Run a command over one file or many; `reads` are further inputs. Returns its result."""
+    tiles = tiles_of(input)
+    if tiles is not None:
+        from pcfix.flow.tiles import run_tiles
 
-    def tell(self, summary: dict[str, Any]) -> None:
-        """Write the summary, where one is wanted."""
-        write_summary(self, summary)
+        return run_tiles(command, tiles, output, options, progress)
+    task = file_task(single(input), output, options, reads=reads, progress=progress)
+    with threads(task.jobs), all_or_none():
+        plan = command.plan(task.source, task.target, task.kept)
+        tally, findings = command.process(plan, task, 0, partial(command.check, plan))
+        ends = Ends(str(task.source), str(task.target), task.seconds, task.source)
+        result = command.summarize(plan, tally, findings, ends)
+        if task.summary is not None:
+            write_summary(task, result.as_dict())
+    return result
+
+
+def stream(
+    task: FileTask, begin: Callable[[LasSource], FileWork], row: int = 0, check: Check | None = None
+) -> tuple[Any, Any]:
+    """Take every chunk of a file through a command; the target appears when all went well.
+
+    `begin` returns the work on the opened file, which starts at a row of the whole cloud. Returns
+    the statistics, and the findings of the check.
+    """
+    with LasSource(task.source, task.jobs, kept=task.kept or None) as source:
+        work, total = begin(source), len(source)
+        last = output_evlrs(source), work.identity, task.jobs
+        tally, findings, done = None, None, 0
+
+        def tell(chunk: int, of_chunk: int) -> None:
+            if task.progress is not None:
+                task.progress(done + min(of_chunk, chunk), total)
+
+        with LasSink(task.target, work.header, *last) as sink:
+            write = WriteBehind(lambda points, result: sink.write(work.apply(points, result)))
+            with write if task.jobs != 1 else nullcontext():
+                for points in read_ahead(source.chunks(), task.jobs):
+                    count = len(points)
+                    with telling(partial(tell, count)):
+                        result, one = work.compute(points, row + done)
+                    write(points, result)
+                    tally = one if tally is None else tally + one
+                    done += count
+                    tell(0, 0)
+            if check is not None:
+                findings = check(tally)
+    return tally, findings
 
 
 def read_ahead(chunks: Iterator[Any], jobs: int | None) -> Iterator[Any]:
-    """Yield chunks, of which the next is being read meanwhile, but with one job."""
+    """Yield chunks while the next one is read; with one job without a thread."""
     if jobs == 1:
         yield from chunks
         return
@@ -137,28 +203,31 @@ def read_ahead(chunks: Iterator[Any], jobs: int | None) -> Iterator[Any]:
             yield one
 
 
-@contextmanager
-def written_behind(write: Callable[[Any], None], jobs: int | None) -> Iterator[Callable[..., None]]:
-    """Give a function that makes and writes chunks in order, while others are computed."""
+class WriteBehind:
+    """Calls a function in order: at once or, in a ``with`` block, in another thread."""
 
-    def made(make: Callable[[], Any]) -> None:
-        write(make())
+    def __init__(self, write: Callable[..., None]) -> None:
+        self._write = write
+        self._pool: ThreadPoolExecutor | None = None
+        self._last: Future[None] | None = None
 
-    if jobs == 1:
-        yield made
-        return
-    with ThreadPoolExecutor(1) as writer:
-        last: Future[None] | None = None
+    def __enter__(self) -> None:
+        self._pool = ThreadPoolExecutor(1)
 
-        def later(make: Callable[[], Any]) -> None:
-            nonlocal last
-            if last is not None:
-                last.result()
-            last = writer.submit(made, make)
+    def __exit__(self, kind: Any, *error: object) -> None:
+        if self._pool is not None:
+            self._pool.shutdown()
+        if self._last is not None and kind is None:
+            self._last.result()
 
-        yield later
-        if last is not None:
-            last.result()
+    def __call__(self, *given: Any) -> None:
+        """Call, once the call before has returned."""
+        if self._pool is None:
+            return self._write(*given)
+        if self._last is not None:
+            self._last.result()
+        self._last = self._pool.submit(self._write, *given)
+        return None
 
 
 def json_text(content: dict[str, Any]) -> str:
@@ -167,7 +236,7 @@ def json_text(content: dict[str, Any]) -> str:
 
 
 def check_summary(options: Any, inputs: Iterable[File] = ()) -> None:
-    """Refuse a summary, or a line, that could not be written, before anything is computed."""
+    """Refuse a summary or a regression file that could not be written, before the work begins."""
     known = list(inputs)
     for name in ("summary", "save_regression"):
         path = getattr(options, name, None)
@@ -176,7 +245,7 @@ def check_summary(options: Any, inputs: Iterable[File] = ()) -> None:
 
 
 def write_summary(options: Any, summary: dict[str, Any]) -> None:
-    """Write a summary as JSON where the options, with overwrite, name a file for it."""
+    """Write a summary as JSON if the options, with overwrite, name a file for it."""
     if options.summary is not None:
         write_text(options.summary, json_text(summary), overwrite=options.overwrite)
 
@@ -198,18 +267,18 @@ def file_task(
     check: Callable[..., Path] = check_cloud,
     progress: Progress | None = None,
 ) -> FileTask:
-    """Return the task of a command, once its files may be read and written.
+    """Return the task of a command after checking that its files may be read and written.
 
     Parameters
     ----------
     input, output : path
         The input may be many files.
     options : OptionSet
-        With overwrite, and where the command has them summary and jobs.
+        With overwrite and, if the command has them, summary and jobs.
     reads : iterable
-        What else is read; values that are no paths do not count.
+        Further inputs; values that are no paths do not count.
     more : iterable of path
-        What else is written, by the rule of the output.
+        Further outputs, checked like the output.
     check : callable
         Returns the path of an output; see `check_cloud`.
     progress : callable, optional
@@ -227,6 +296,7 @@ def file_task(
     for path in (output, *more):
         known.append(check(path, overwrite=options.overwrite, inputs=known))
     check_summary(options, known)
-    target = Path(output)
     summary, jobs = (getattr(options, name, None) for name in ("summary", "jobs"))
-    return FileTask(source, target, summary, options.overwrite, jobs, progress, started=started)
+    return FileTask(
+        source, Path(output), summary, options.overwrite, jobs, progress, started=started
+    )

@@ -144,20 +144,24 @@ class SortedPoints:
 
 
 def _dimension_of(source: LasSource, what: str) -> str | None:
-    """Return the dimension that a raster is made of, None of heights; refuse what is not there."""
+    """Return the dimension that a raster is made of, None for heights."""
     name = None if what == "height" else DIMENSIONS.get(what, what)
     known = list(source.header.point_format.dimension_names)
     if name is None or name in known:
         return name
     if what in DIMENSIONS:
         raise InputError(
-            f"{source.path}: has no dimension {name}, of which the {what} is made; correct the"
-            " cloud first, with --dimensions all."
-        )
+            "cloud.no_dimension",
+            f"{source.path}: has no dimension {name}, which --what {what} needs. Correct the cloud"
+            " first, with --dimensions all.",
+            path=source.path, dimension=name,
+        )  # fmt: skip
     raise SettingError(
-        f"{source.path}: has no dimension {what}; --what is one of height, {', '.join(DIMENSIONS)},"
-        f" {', '.join(known)}."
-    )
+        "option.choice",
+        f"{source.path}: has no dimension {what}. --what is one of height, {', '.join(DIMENSIONS)},"
+        f" {', '.join(known)}.",
+        option="what", value=what,
+    )  # fmt: skip
 
 
 def _wanted(points: laspy.ScaleAwarePointRecord, surface: SurfaceChoice) -> BoolArray:
@@ -190,34 +194,35 @@ def _bulk_of(again: Callable[[], LasSource], count: int, resolution_m: float) ->
 
 def _warn_of_stray(path: Path, count: int, first: FloatArray) -> None:
     place = ", ".join(f"{value:,.2f}" for value in first)
-    are = "1 point lies" if count == 1 else f"{count:,} points lie"
-    warnings.warn(
-        f"{path}: {are} far from all others and left out of the raster, the first at {place};"
-        " remove them, or grid their part of the cloud by itself.",
-        PcfixWarning,
-        stacklevel=2,
+    sentence = (
+        f"{path}: {count:,} points far from all others are not gridded, the first at {place}."
+        " Remove them, or grid their part of the cloud separately."
     )
+    warnings.warn(PcfixWarning("dsm.stray", sentence, points=count), stacklevel=2)
 
 
 def _refuse_none(points: int, source: Path | Tiles, surface: SurfaceChoice) -> None:
-    if not points and surface == "bed":
+    if points:
+        return
+    if surface == "bed":
         raise InputError(
-            f"{source}: has no point of class {BATHYMETRIC_POINT} (bed) that is not withheld;"
-            " correct the cloud first, or grid the surface all."
+            "dsm.no_bed",
+            f"{source}: has no point of class {BATHYMETRIC_POINT} (bed) that is not withheld."
+            " Correct the cloud first, or use --surface all.",
+            path=source,
         )
-    if not points:
-        raise InputError(
-            f"{source}: all points are noise (classes 7 and 18) or withheld; classify it again."
-        )
+    raise InputError(
+        "cloud.all_withheld",
+        f"{source}: all points are noise (classes 7 and 18) or withheld. Classify it again.",
+        path=source,
+    )
 
 
 def _warn_of_fine_cells(spacing_m: float, resolution_m: float) -> None:
     if resolution_m**2 < FEWEST_A_CELL * spacing_m**2:
         density = (resolution_m / spacing_m) ** 2
-        warnings.warn(
-            f"the resolution {resolution_m:g} m is finer than the points allow: they lie"
-            f" {spacing_m:.2g} m apart, so there are {density:.2g} a cell on average; take a"
-            " resolution of at least their distance.",
-            PcfixWarning,
-            stacklevel=5,
+        sentence = (
+            f"The resolution {resolution_m:g} m is finer than the points allow: their spacing is"
+            f" {spacing_m:.2g} m, or {density:.2g} points a cell. Use at least that spacing."
         )
+        warnings.warn(PcfixWarning("dsm.fine", sentence, spacing_m=spacing_m), stacklevel=5)

@@ -41,20 +41,23 @@ if TYPE_CHECKING:
 
 
 class Points(NamedTuple):
-    """The points of a chunk."""
+    """Some points of a cloud; None where the cloud does not have an attribute."""
 
     xyz: FloatArray  # (n, 3), world frame, metres
     heights: FloatArray | None  # (n,), of the water above each, if a dimension has it
     classes: npt.NDArray[np.uint8]  # (n,)
     sources: IntArray | None = None  # (n,), point source IDs
     colours: tuple[npt.NDArray[Any], ...] | None = None  # red, green and blue, (n,) each
+    returns: npt.NDArray[Any] | None = None  # (n,), number of returns
+    original_xyz: FloatArray | None = None  # (n, 3), before the transfer to adjusted cameras
 
-    def take(self, rows: IntArray) -> Points:
+    def take(self, rows: IntArray | slice) -> Points:
         """Return some of the points."""
-        heights = None if self.heights is None else self.heights[rows]
-        sources = None if self.sources is None else self.sources[rows]
         colours = None if self.colours is None else tuple(one[rows] for one in self.colours)
-        return Points(self.xyz[rows], heights, self.classes[rows], sources, colours)
+        names = [name for name in self._fields if name != "colours"]
+        some = {name: getattr(self, name) for name in names}
+        some = {name: None if one is None else one[rows] for name, one in some.items()}
+        return Points(**some, colours=colours)
 
 
 RGB = ("red", "green", "blue")
@@ -66,26 +69,18 @@ SAMPLE_POINTS = 2_000_000
 CloudPlace: TypeAlias = "tuple[CRS | str | None, FloatArray, FloatArray]"
 
 
-class Seen(NamedTuple):
-    """Some points of a cloud with their attributes; None if the cloud does not have them."""
-
-    xyz: FloatArray
-    rgb: npt.NDArray[Any] | None
-    classes: npt.NDArray[Any] | None
-    returns: npt.NDArray[Any] | None
-
-
 @dataclass(frozen=True)
 class CloudView:
-    """A cloud as a water surface needs it."""
+    """A cloud in one file, in many, or in memory: what is known of it, and all its points."""
 
     name: str  # for messages
     crs: CRS | str | None
     low: FloatArray  # (2,), south-west and north-east corner, metres
     high: FloatArray
     points: int
-    chunks: Callable[[], Iterator[Seen]]
+    chunks: Callable[..., Iterator[Points]]  # of the water, whose heights a dimension may have
     software: str = ""  # generating software in the header
+    step_m: float = 0.0  # coordinates are rounded to it
 
 
 def corners(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -95,30 +90,26 @@ def corners(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
 
 
-def view_of(cloud: Path | Tiles, jobs: int | None = None) -> CloudView:
-    """Return the view of a LAS or LAZ file, or of many as one cloud."""
+def view_of(
+    cloud: Path | Tiles, jobs: int | None = None, kept: list[Chunk] | None = None
+) -> CloudView:
+    """Return the view of a LAS or LAZ file, or of many as one cloud; `kept` as of `LasSource`."""
     with open_cloud(cloud, jobs) as source:
-        crs, points = metric_crs(source), len(source)
-        low, high = np.array(source.header.mins[:2]), np.array(source.header.maxs[:2])
-        software = str(source.header.generating_software or "")
-    chunks = partial(_seen, cloud, jobs)
-    return CloudView(str(cloud), crs, low, high, points, chunks, software)
-
-
-def _seen(cloud: Path | Tiles, jobs: int | None) -> Iterator[Seen]:
-    with open_cloud(cloud, jobs) as source:
-        names = set(source.header.point_format.dimension_names)
-        for chunk in source.chunks():
-            rgb = None
-            if {"red", "green", "blue"} <= names:
-                rgb = np.column_stack([chunk["red"], chunk["green"], chunk["blue"]])
-            classes, returns = chunk["classification"], chunk["number_of_returns"]
-            yield Seen(coordinates(chunk), rgb, np.asarray(classes), np.asarray(returns))
+        return CloudView(
+            str(cloud),
+            metric_crs(source),
+            np.array(source.header.mins[:2]),
+            np.array(source.header.maxs[:2]),
+            len(source),
+            partial(file_points, cloud, jobs=jobs, kept=kept),
+            str(source.header.generating_software or ""),
+            float(max(source.header.scales)),
+        )
 
 
 def file_points(
     cloud: Path | Tiles,
-    water: WaterSurface | None,
+    water: WaterSurface | None = None,
     jobs: int | None = None,
     kept: list[Chunk] | None = None,
 ) -> Iterator[Points]:
@@ -133,12 +124,14 @@ def first_points(chunks: Iterable[Points]) -> Points:
     parts: list[Points] = []
     count = 0
     for one in chunks:
-        parts.append(one.take(np.arange(min(len(one.xyz), las.CHUNK_POINTS - count))))
-        count += len(parts[-1].xyz)
+        some = one.take(slice(0, las.CHUNK_POINTS - count))
+        parts.append(some._replace(colours=None))
+        count += len(some.xyz)
         if count >= las.CHUNK_POINTS:
             break
-    columns = list(zip(*parts, strict=True))[:-1]
-    joined: list[Any] = [None if c[0] is None else np.concatenate(c) for c in columns]
+    joined: list[Any] = [
+        None if column[0] is None else np.concatenate(column) for column in zip(*parts, strict=True)
+    ]
     return Points(*joined)
 
 
@@ -147,10 +140,15 @@ def points_of(chunk: Chunk, source: LasSource, water: WaterSurface | None) -> Po
     heights = None
     if isinstance(water, WaterDimension):
         heights = source.dimension(chunk, water.name)
-    classes, sources = np.asarray(chunk["classification"]), np.asarray(chunk["point_source_id"])
     has_colours = "red" in (chunk.array.dtype.names or ())
-    colours = tuple(chunk.array[one] for one in RGB) if has_colours else None
-    return Points(coordinates(chunk), heights, classes, sources, colours)
+    return Points(
+        coordinates(chunk),
+        heights,
+        np.asarray(chunk["classification"]),
+        np.asarray(chunk["point_source_id"]),
+        tuple(chunk.array[one] for one in RGB) if has_colours else None,
+        np.asarray(chunk["number_of_returns"]),
+    )
 
 
 def parts_of(chunks: Iterable[Points], water: WaterSurface) -> Iterable[Part]:
@@ -287,12 +285,13 @@ def _found(view: CloudView | None) -> FoundSurface:
     if view is None:
         text = "The water surface 'auto' is found in a cloud. Give the cloud too."
         raise SettingError("cloud.missing", text)
-    every = max(1, view.points // SAMPLE_POINTS)
-    chunks: Iterable[tuple[Any, ...]] = view.chunks()
-    parts, row = [], 0
-    for seen in chunks:
-        parts.append([a if a is None else a[-row % every :: every] for a in seen])
-        row += len(seen[0])
+    every, row = max(1, view.points // SAMPLE_POINTS), 0
+    parts = []
+    for some in view.chunks():
+        rgb = None if some.colours is None else np.column_stack(some.colours)
+        columns = (some.xyz, rgb, some.classes, some.returns)
+        parts.append([a if a is None else a[-row % every :: every] for a in columns])
+        row += len(some.xyz)
     whole: list[Any] = [
         None if any(a is None for a in arrays) else np.concatenate(arrays)
         for arrays in zip(*parts, strict=True)

@@ -1,8 +1,8 @@
-"""One step over many files as over one cloud: in processes here, or on a cluster.
+"""A command over many files as over one cloud: in processes of this machine, or on a cluster.
 
-What a step must know of the whole cloud it learns once, here; then each file is a task: it applies
-the step, writes its output, and records what it counted beside it, in the folder `RECORDS`. A
-second call skips the files that have a record of the same work.
+The plan is made once, for the whole cloud; then each file is a task that writes its output, and
+its statistics beside it, in the folder `RECORDS`. A file whose output exists with the same key (a
+hash of options and input files) is skipped.
 """
 
 from __future__ import annotations
@@ -10,65 +10,50 @@ from __future__ import annotations
 import json
 import pickle
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass
+from functools import reduce
 from hashlib import sha256
+from operator import add
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Protocol
+from typing import Any
 
 from pcfix import version
 from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError
-from pcfix.flow.cluster import Run, in_processes, on_cluster
+from pcfix.flow.cluster import machines
 from pcfix.flow.record import belonging
-from pcfix.flow.runner import FileTask, Progress, Step, check_cloud, check_summary, write_summary
-from pcfix.io.files import file_state, read_counted, write_counted
+from pcfix.flow.runner import (
+    Command,
+    Ends,
+    FileTask,
+    Progress,
+    check_cloud,
+    check_summary,
+    write_summary,
+)
+from pcfix.io.files import file_state, path_of, read_tally, write_tally
 from pcfix.io.tiles import BrokenTileError, Tiles, check_one_file
 from pcfix.io.vectors import LAYER_MARK
 from pcfix.kernels import threads
-from pcfix.options.declare import options_of
-from pcfix.sums import Counted
+from pcfix.options.declare import File, options_of
 
 RECORDS = ".pcfix"
 HOW = ("overwrite", "jobs", "scheduler", "summary")
 """Options on which no output depends."""
-POINTS_A_PROCESS = 500_000
-"""These take about as long as another process takes to start."""
-
-
-class TileStep(Step, Protocol):
-    """A step that can be sent to another process, which sends back what it counted."""
-
-    def begin(self, first_row: int) -> None:
-        """Forget what was counted; the next point is this row of the whole cloud."""
-
-    def counted(self) -> Counted:
-        """Return what was counted."""
-
-    def add_counted(self, counted: Counted) -> None:
-        """Add what another process counted."""
 
 
 @dataclass(frozen=True)
 class Tile:
     """A file to process, and its output.
 
-    Attributes
-    ----------
-    first_row : int
-        Of the whole cloud.
-    key : str
-        Checksum of everything that the output depends on.
-    pcfix : str
-        The version that must process it.
+    `row` is its first of the whole cloud, `key` a checksum of everything that the output depends
+    on, and `pcfix` the version that must process it.
     """
 
     source: Path
     target: Path
     points: int
-    first_row: int
+    row: int
     key: str
     pcfix: str
 
@@ -77,20 +62,17 @@ class Tile:
 
     @property
     def record(self) -> Path:
-        """The file with what was counted, written when the output is complete."""
-        return self.target.parent / RECORDS / f"{self.target.name}.npz"
+        """The file with its statistics, written when the output is complete."""
+        return self.target.parent / RECORDS / f"{self.target.name}.tally"
 
     @property
     def is_finished(self) -> bool:
-        """Whether the output is there, of the same work."""
-        return self.target.is_file() and read_counted(self.record)[0].get("key") == self.key
+        """Whether the output exists, with the same key."""
+        return self.target.is_file() and read_tally(self.record)[0] == self.key
 
 
 def do_tile(pickled: bytes, tile: Tile, jobs: int | None = None) -> str:
-    """Apply a step to one file, record what it counted, and return the error, if there was one.
-
-    This is what runs in a process here and on a worker of a cluster.
-    """
+    """Process one file, here or on a worker; return the error, if there was one."""
     try:
         if tile.pcfix != version.__version__:
             raise InputError(
@@ -100,176 +82,122 @@ def do_tile(pickled: bytes, tile: Tile, jobs: int | None = None) -> str:
             )
         if tile.is_finished:  # by a worker that was lost before it could say so
             return ""
-        step: TileStep = pickle.loads(pickled)
-        step.begin(tile.first_row)
+        process, plan = pickle.loads(pickled)
         with threads(jobs), warnings.catch_warnings():
-            warnings.simplefilter("ignore", PcfixWarning)  # shown where the step was made
-            step.run(FileTask(tile.source, tile.target, jobs=jobs, is_tile=True))
-        write_counted(tile.record, {"key": tile.key}, step.counted())
+            warnings.simplefilter("ignore", PcfixWarning)  # shown when the plan was made
+            tally, _ = process(plan, FileTask(tile.source, tile.target, jobs=jobs), tile.row, None)
+        write_tally(tile.record, tile.key, tally)
     except PcfixError as error:
         return str(error)
     return ""
 
 
-@dataclass
-class TiledRun:
-    """A command over many files.
+def run_tiles(
+    command: Command, tiles: Tiles, output: File, options: Any, progress: Progress | None = None
+) -> Any:
+    """Run a command over all files that are not finished yet, and return its result.
 
     Parameters
     ----------
-    name : str
-        Of the command.
+    command : Command
     tiles : Tiles
-    folder : path
-        Of the outputs, which have the names of the inputs.
+    output : path
+        Folder of the outputs, which have the names of the inputs.
     options : OptionSet
         With jobs, scheduler and overwrite.
     progress : callable, optional
         Called with (points done, points in all) after each file.
+
+    Raises
+    ------
+    PcfixError
+        With the list of the files that failed, once the others are finished, or if the plan
+        cannot be made, or the result is refused.
     """
-
-    name: str
-    tiles: Tiles
-    folder: Path
-    options: Any
-    progress: Progress | None = None
-    started: float = field(default_factory=perf_counter)
-
-    @property
-    def seconds(self) -> float:
-        """Time since the start."""
-        return perf_counter() - self.started
-
-    def run(self, make: Callable[[Tiles], Any], tell: Callable[[Any], Any]) -> Any:
-        """Process all files that are not finished yet.
-
-        Parameters
-        ----------
-        make : callable
-            Returns the step for some tiles, with all that it learns of the whole cloud.
-        tell : callable
-            Makes the result of the command from the step, which has counted all files.
-
-        Raises
-        ------
-        PcfixError
-            With the list of the files that failed, once the others are finished, or if the step
-            cannot be made or refuses the result.
-        """
-        check_one_file(self.tiles, self.options)
-        self.check_folder()
-        check_summary(self.options, self.tiles.paths)
-        work = self._work()
-        done = {tile for tile in work.values() if tile.is_finished}
-        todo = [tile for tile in work.values() if tile not in done]
-        for tile in todo if self.folder.exists() else ():
-            check_cloud(tile.target, overwrite=self.options.overwrite, inputs=self.tiles.paths)
-        with threads(self.options.jobs), self._machines(sum(one.points for one in todo)) as run:
-            step, tiles = self._made(make)
-            step.begin(0)
-            try:
-                (self.folder / RECORDS).mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise InputError(
-                    "output.folder", f"{self.folder}: cannot be made ({error.strerror})."
-                ) from error
-            todo = [work[path] for path in tiles.paths if work[path] not in done]
-            failed = list(tiles.broken.values())
-            for tile, why in run(do_tile, pickle.dumps(step), todo):
-                if why:
-                    failed.append(why)
-                else:
-                    done.add(tile)
-                if self.progress is not None:
-                    self.progress(sum(one.points for one in done), sum(self.tiles.points))
-            if done:
-                # in the order of the files, so that no sum depends on which was first
-                for tile in (tile for tile in work.values() if tile in done):
-                    step.add_counted(read_counted(tile.record)[1])
-                _finish(step, todo)
-                result = tell(step)
-                if hasattr(result, "as_dict"):
-                    write_summary(self.options, result.as_dict())
-        if failed:
-            count = len(work) + len(self.tiles.broken)
+    started, folder = perf_counter(), path_of(output)
+    check_one_file(tiles, options)
+    check_folder(folder, tiles)
+    check_summary(options, tiles.paths)
+    work = _work(command.name, tiles, folder, options)
+    done = {tile for tile in work.values() if tile.is_finished}
+    todo = [tile for tile in work.values() if tile not in done]
+    for tile in todo if folder.exists() else ():
+        check_cloud(tile.target, overwrite=options.overwrite, inputs=tiles.paths)
+    result, points = None, sum(one.points for one in todo)
+    with threads(options.jobs), machines(options.scheduler, options.jobs, points) as run:
+        plan, readable = _planned(command, tiles, folder)
+        try:
+            (folder / RECORDS).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
             raise InputError(
-                "tiles.failed",
-                f"{self.tiles}: {len(failed)} of {count} files failed. The same command continues"
-                " with them; if files have changed, add --overwrite.\n"
-                + "\n".join(f"  {one}" for one in failed),
-                failed=failed,
-            )
-        return result
-
-    def check_folder(self) -> None:
-        """Refuse a folder that has inputs, or lies in theirs."""
-        folder, named = self.folder.resolve(), Path(self.tiles.name)
-        for path in self.tiles.paths:
-            if path.parent.resolve() == folder:
-                raise SettingError(
-                    "output.is_input",
-                    f"{self.folder}: is the folder of the input {path.name}. Give another one.",
-                    path=self.folder,
-                )
-        if named.is_dir() and folder.is_relative_to(named.resolve()):
-            raise SettingError(
-                "output.is_input",
-                f"{self.folder}: is inside the folder of the inputs. Give one outside of it.",
-                path=self.folder,
-            )
-        if self.folder.exists() and not self.folder.is_dir():
-            raise SettingError(
-                "output.folder",
-                f"{self.folder}: is a file. Give a folder for the outputs.",
-                path=self.folder,
-            )
-
-    def _work(self) -> dict[Path, Tile]:
-        """Return a tile for each file, in their order."""
-        paths = [*self.tiles.paths, *self.tiles.broken]
-        asked = {
-            one.name: _plain(getattr(self.options, one.name))
-            for one in options_of(type(self.options))
-            if one.name not in HOW
-        }
-        depends = [version.__version__, self.name, asked, [file_state(path) for path in paths]]
-        key = sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()
-        work, row = {}, 0
-        for path, points in zip(self.tiles.paths, self.tiles.points, strict=True):
-            target = self.folder.resolve() / path.name
-            work[path] = Tile(path.resolve(), target, points, row, key, version.__version__)
-            row += points
-        return work
-
-    def _made(self, make: Callable[[Tiles], Any]) -> tuple[Any, Tiles]:
-        """Return the step, and the tiles that could be read for it."""
-        tiles = self.tiles
-        while True:
+                "output.folder", f"{folder}: cannot be made ({error.strerror})."
+            ) from error
+        todo = [work[path] for path in readable.paths if work[path] not in done]
+        failed = list(readable.broken.values())
+        for tile, why in run(do_tile, pickle.dumps((command.process, plan)), todo):
+            if why:
+                failed.append(why)
+            else:
+                done.add(tile)
+            if progress is not None:
+                progress(sum(one.points for one in done), sum(tiles.points))
+        if done:
+            # in the order of the files, so that no sum depends on which was first
+            tallies = [read_tally(tile.record)[1] for tile in work.values() if tile in done]
+            tally = reduce(add, tallies) if tallies[0] is not None else None
             try:
-                return make(tiles), tiles
-            except BrokenTileError as error:
-                tiles = tiles.without(error.path, str(error))
+                findings = command.check(plan, tally)
+            except PcfixError:
+                for tile in todo:
+                    tile.record.unlink(missing_ok=True)
+                    tile.target.unlink(missing_ok=True)
+                raise
+            ends = Ends(str(tiles), str(output), perf_counter() - started)
+            result = command.summarize(plan, tally, findings, ends)
+            if getattr(options, "summary", None) is not None:
+                write_summary(options, result.as_dict())
+    if failed:
+        count = len(work) + len(readable.broken)
+        raise InputError(
+            "tiles.failed",
+            f"{tiles}: {len(failed)} of {count} files failed. The same command continues with them;"
+            " if files have changed, add --overwrite.\n" + "\n".join(f"  {one}" for one in failed),
+            failed=failed,
+        )
+    return result
 
-    @contextmanager
-    def _machines(self, points: int) -> Iterator[Run]:
-        """Give the function that runs tasks with this number of points."""
-        if self.options.scheduler is None:
-            jobs = self.options.jobs
-            yield partial(in_processes, jobs, jobs or 1 + points // POINTS_A_PROCESS)
-        else:
-            with on_cluster(self.options.scheduler) as run:
-                yield run
+
+def check_folder(folder: Path, tiles: Tiles) -> None:
+    """Refuse a folder for outputs that has inputs, or is inside theirs."""
+    resolved, named = folder.resolve(), Path(tiles.name)
+    code, wrong = "output.is_input", ""
+    inside = next((one for one in tiles.paths if one.parent.resolve() == resolved), None)
+    if inside is not None:
+        wrong = f"is the folder of the input {inside.name}. Give another one"
+    elif named.is_dir() and resolved.is_relative_to(named.resolve()):
+        wrong = "is inside the folder of the inputs. Give one outside of it"
+    elif folder.exists() and not folder.is_dir():
+        code, wrong = "output.folder", "is a file. Give a folder for the outputs"
+    if wrong:
+        raise SettingError(code, f"{folder}: {wrong}.", path=folder)
 
 
-def _finish(step: TileStep, new: list[Tile]) -> None:
-    """Let a step check the result of all files; remove the new ones if it refuses them."""
-    try:
-        step.finish()
-    except PcfixError:
-        for tile in new:
-            tile.record.unlink(missing_ok=True)
-            tile.target.unlink(missing_ok=True)
-        raise
+def _work(name: str, tiles: Tiles, folder: Path, options: Any) -> dict[Path, Tile]:
+    """Return a tile for each file, in their order."""
+    asked = {
+        one.name: _plain(getattr(options, one.name))
+        for one in options_of(type(options))
+        if one.name not in HOW
+    }
+    states = [file_state(path) for path in (*tiles.paths, *tiles.broken)]
+    depends = [version.__version__, name, asked, states]
+    key = sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()
+    work, row = {}, 0
+    for path, points in zip(tiles.paths, tiles.points, strict=True):
+        target = folder.resolve() / path.name
+        work[path] = Tile(path.resolve(), target, points, row, key, version.__version__)
+        row += points
+    return work
 
 
 def _plain(value: Any) -> Any:
@@ -280,3 +208,12 @@ def _plain(value: Any) -> Any:
     if value is None or isinstance(value, int | float | tuple):
         return value
     return sha256(pickle.dumps(value)).hexdigest()
+
+
+def _planned(command: Command, tiles: Tiles, folder: Path) -> tuple[Any, Tiles]:
+    """Return the plan, and the tiles that could be read for it."""
+    while True:
+        try:
+            return command.plan(tiles, folder, None), tiles
+        except BrokenTileError as error:
+            tiles = tiles.without(error.path, str(error))

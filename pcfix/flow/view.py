@@ -25,7 +25,7 @@ from pcfix.options.declare import File, taken
 from pcfix.options.handover import ViewerOptions
 from pcfix.refract.tally import COVERAGE_95
 from pcfix.report.page import png_of
-from pcfix.report.view import Scale, Scene3d, show, view_figure
+from pcfix.report.view import Scene3d, scale_of, show, view_figure
 from pcfix.water.surface import surface_above
 
 NEIGHBOURS, GAP_SPACINGS, LEAST_GAP_M = 8, 5.0, 1.0
@@ -98,12 +98,13 @@ def view_clouds(
         inputs = replace(given, water=0.0 if given.water is None else given.water).part(Inputs)
         cameras, _ = inputs.block(first.crs)
     values = _values(given.colour, layers, surface)
-    scale = Scale.of(given.colour, np.concatenate(values))
-    scene = _scene(layers, [scale.colours(one) for one in values], cameras, surface)
+    scale = scale_of(given.colour, np.concatenate(values))
+    colours = [scale.to_rgba(np.ma.masked_invalid(one))[:, :3] for one in values]
+    scene = _scene(layers, colours, cameras, surface)
     if given.image is None:
         show(scene, f"pcfix view: {given.colour}")
         return ""
-    picture = png_of(view_figure(scene, scale))
+    picture = png_of(view_figure(scene, scale, given.colour))
     write_bytes(given.image, picture, overwrite=given.overwrite)
     return f"{given.image}: {', '.join(scene.names)} by {given.colour}"
 
@@ -139,12 +140,24 @@ def _read(path: Path, most: int) -> list[_Layer]:
 
 def _values(colour: str, layers: list[_Layer], surface: WaterSurface | None) -> list[FloatArray]:
     """Return the values for the colours of each layer, NaN where unknown."""
-    if colour == "error":
-        *clouds, target = layers
-        values = [_error(one.xyz, target.xyz) for one in clouds]
-        values.append(np.full(len(target.xyz), np.nan))
-    else:
-        values = [_own(colour, one, surface) for one in layers]
+    values = []
+    for one in layers:
+        found = None
+        if colour == "error":
+            target = layers[-1]
+            found = None if one is target else _error(one.xyz, target.xyz)
+        elif colour == "height":
+            found = one.xyz[:, 2]
+        elif colour == "depth":
+            found = one.known.get("WaterDepth")
+            if found is None and surface is not None and not isinstance(surface, WaterDimension):
+                found = surface_above(surface, one.xyz).height_m - one.xyz[:, 2]
+            found = None if found is None else np.where(found > 0.0, found, np.nan)
+        else:
+            name, sign = {"shift": ("ShiftZ", -1.0), "uncertainty": ("SigmaZ", COVERAGE_95)}[colour]
+            if name in one.known:
+                found = np.where(one.known[name] != 0.0, sign * one.known[name], np.nan)
+        values.append(np.full(len(one.xyz), np.nan) if found is None else found)
     if not any(np.isfinite(one).any() for one in values):
         raise SettingError(
             "view.no_values",
@@ -152,23 +165,6 @@ def _values(colour: str, layers: list[_Layer], surface: WaterSurface | None) -> 
             colour=colour,
         )
     return values
-
-
-def _own(colour: str, layer: _Layer, surface: WaterSurface | None) -> FloatArray:
-    if colour == "height":
-        return np.asarray(layer.xyz[:, 2])
-    if colour == "depth":
-        found, sign = layer.known.get("WaterDepth"), 1.0
-        if found is None and surface is not None and not isinstance(surface, WaterDimension):
-            found = surface_above(surface, layer.xyz).height_m - layer.xyz[:, 2]
-        known = None if found is None else found > 0.0
-    else:
-        name, sign = {"shift": ("ShiftZ", -1.0), "uncertainty": ("SigmaZ", COVERAGE_95)}[colour]
-        found = layer.known.get(name)
-        known = None if found is None else found != 0.0
-    if found is None or known is None:
-        return np.full(len(layer.xyz), np.nan)
-    return np.where(known, sign * found, np.nan)
 
 
 def _error(xyz: FloatArray, reference: FloatArray) -> FloatArray:

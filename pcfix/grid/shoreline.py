@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.model import FloatArray
-from pcfix.sums import Counted, Sums
+from pcfix.sums import Sums
 
 REACH_M = 2.0
 """Points farther above or below the water are not used."""
@@ -48,47 +48,33 @@ class Shoreline:
         return float(np.hypot(*np.diff(self.xy, axis=0).T).sum())
 
 
+@dataclass(frozen=True)
 class NearWater(Sums):
-    """The points of a cloud near the height of the water, gathered chunk by chunk."""
+    """Points of a cloud near the height of the water; those of two parts of it are added with +."""
 
-    def __init__(self) -> None:
-        self._parts: list[FloatArray] = []
-        self._every = 1
+    parts: tuple[FloatArray, ...] = ()  # (n, 5) each: x, y, z, height above the water, sigma
+    every: int = 1  # one of so many points is kept
 
-    def add(
-        self, xyz: FloatArray, above_m: FloatArray, sigma_z_m: FloatArray | None = None
-    ) -> None:
-        """Add a chunk of n points, shape (n, 3), world frame, metres.
+    @classmethod
+    def of(
+        cls, xyz: FloatArray, above_m: FloatArray, sigma_z_m: FloatArray | None = None
+    ) -> NearWater:
+        """Return those of n points, shape (n, 3), world frame, metres.
 
         `above_m` is the height above the water surface, NaN if unknown, and `sigma_z_m` the
         standard error of the heights, zero if unknown; both have the shape (n,).
         """
-        rows = np.flatnonzero(np.abs(above_m) <= REACH_M)[:: self._every]
+        rows = np.flatnonzero(np.abs(above_m) <= REACH_M)
         sigma = np.zeros(len(xyz)) if sigma_z_m is None else sigma_z_m
-        self._parts.append(np.column_stack([xyz, above_m, sigma])[rows])
-        self._thin()
+        return cls((np.column_stack([xyz, above_m, sigma])[rows],))
 
-    def counted(self) -> Counted:
-        """Return the points, and of how many each is one."""
-        return {
-            "points": np.concatenate([np.empty((0, 5)), *self._parts]),
-            "every": np.array(self._every),
-        }
-
-    def add_counted(self, counted: Counted) -> None:
-        """Add the points of another process."""
-        every = int(counted["every"])
-        most = max(every, self._every)
-        self._parts = [part[:: most // self._every] for part in self._parts]
-        self._parts.append(counted["points"][:: most // every])
-        self._every = most
-        self._thin()
-
-    def _thin(self) -> None:
-        """Drop every second point while there are too many."""
-        while sum(map(len, self._parts)) > MOST_POINTS:
-            self._parts = [part[::2] for part in self._parts]
-            self._every *= 2
+    def __add__(self, other: NearWater) -> NearWater:
+        """Return the points of both; every second is dropped while there are too many."""
+        every = max(self.every, other.every)
+        parts = [part[:: every // one.every] for one in (self, other) for part in one.parts]
+        while sum(map(len, parts)) > MOST_POINTS:
+            parts, every = [part[::2] for part in parts], 2 * every
+        return NearWater(tuple(parts), every)
 
     def lines(self, sigma_level_m: Callable[[FloatArray], FloatArray]) -> list[Shoreline]:
         """Return the lines, the longest first; several if there are islands or pools.
@@ -97,7 +83,7 @@ class NearWater(Sums):
         """
         from contourpy import contour_generator
 
-        points = np.concatenate([np.empty((0, 5)), *self._parts])
+        points = np.concatenate([np.empty((0, 5)), *self.parts])
         if not len(points) or not points[:, 3].min() < 0.0 < points[:, 3].max():
             return []
         field = _field_of(points, _cell_m(points[:, :2]))

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-import mimetypes
 import mmap
 import os
+import pickle
 import re
 import stat
 import subprocess
@@ -19,7 +19,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 import numpy.typing as npt
@@ -27,10 +26,10 @@ import numpy.typing as npt
 from pcfix.blocks import Empty, on_disk
 from pcfix.errors import InputError, SettingError, refusal
 from pcfix.grid.lattice import Window
-from pcfix.io.drafts import disk_of, replaced_when_whole
+from pcfix.io.atomic import disk_of, temporary_output
 from pcfix.model import FloatArray, IntArray
 from pcfix.options.declare import File
-from pcfix.sums import Counted
+from pcfix.sums import Sums
 
 LARGE_BYTES = 2**26
 LAST_LINES = 3
@@ -158,37 +157,34 @@ def sha256(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def digest_of(path: Path) -> str:
-    """Return the checksum of the content of a file, or of a folder of a project.
-
-    There images, videos and whatever is large go by size and time.
-    """
-    if not path.is_dir():
-        return sha256(path)
-    parts = []
-    for one in sorted(path.rglob("*")):
-        kind = mimetypes.guess_type(one.name)[0] or ""
-        if one.is_file():
-            light = one.stat().st_size < LARGE_BYTES and not kind.startswith(("image", "video"))
-            parts.append(sha256(one) if light else str(file_state(one)))
-            parts.append(str(one.relative_to(path)))
-    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+def write_tally(path: Path, key: str, tally: Any) -> None:
+    """Write the statistics of a file under a key, completely or not at all."""
+    with temporary_output(path) as draft:
+        draft.write_bytes(pickle.dumps((key, tally)))
 
 
-def write_counted(path: Path, note: dict[str, Any], counted: Counted) -> None:
-    """Write arrays and a note into one file, whole or not at all."""
-    with replaced_when_whole(path) as draft, draft.open("wb") as stream:
-        np.savez_compressed(stream, **{**counted, "note": np.array(json.dumps(note))})  # type: ignore
-
-
-def read_counted(path: Path) -> tuple[dict[str, Any], Counted]:
-    """Return the note and the arrays of a file; nothing where there is none that is whole."""
+def read_tally(path: Path) -> tuple[str, Any]:
+    """Return the key and the statistics of `write_tally`; an empty key if there are none."""
     try:
-        with np.load(path, allow_pickle=False) as held:
-            counted = {name: held[name] for name in held.files}
-        return json.loads(str(counted.pop("note"))), counted
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile):
-        return {}, {}
+        with path.open("rb") as stream:
+            key, tally = _Statistics(stream).load()
+        return str(key), tally
+    except (OSError, ValueError, TypeError, EOFError, pickle.UnpicklingError, AttributeError):
+        return "", None
+
+
+class _Statistics(pickle.Unpickler):
+    """Reads sums and arrays only, as a pickle may run any function that it names."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        found = super().find_class(module, name) if module.startswith(("pcfix.", "numpy")) else None
+        is_sums = isinstance(found, type) and issubclass(found, Sums)
+        if is_sums or (module.startswith("numpy") and name in _OF_ARRAYS):
+            return found
+        raise pickle.UnpicklingError(f"{module}.{name}")
+
+
+_OF_ARRAYS = ("_reconstruct", "_frombuffer", "ndarray", "dtype", "scalar")
 
 
 def file_state(path: Path) -> dict[str, Any]:
@@ -215,7 +211,7 @@ def read_json(path: Path) -> Any:
 def write_bytes(path: File, data: bytes, *, overwrite: bool) -> None:
     """Write a small file under the same rules."""
     target = check_output(path, overwrite=overwrite)
-    with replaced_when_whole(target) as draft:
+    with temporary_output(target) as draft:
         draft.write_bytes(data)
 
 

@@ -11,8 +11,8 @@ import numpy as np
 import shapely
 
 from pcfix.errors import SettingError
+from pcfix.io.atomic import cannot_write, temporary_output
 from pcfix.io.crs import parse_crs
-from pcfix.io.drafts import cannot_write, replaced_when_whole
 from pcfix.io.files import check_output
 from pcfix.io.vectors import load_pyogrio
 from pcfix.options.declare import File
@@ -56,7 +56,7 @@ def write_layers(
     """Write layers in a CRS as one GeoPackage."""
     target = check_output(path, overwrite=overwrite)
     wkt = None if crs is None else parse_crs(crs, "the cloud").to_wkt()
-    with replaced_when_whole(target) as draft, warnings.catch_warnings():
+    with temporary_output(target) as draft, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a cloud may have no CRS
         try:
             for number, one in enumerate(layers):

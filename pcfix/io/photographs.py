@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import InputError, PcfixError, SettingError
-from pcfix.io.drafts import replaced_when_whole
+from pcfix.io.atomic import temporary_output
 from pcfix.io.files import check_output
 from pcfix.libraries import photo_library
 from pcfix.model import BoolArray, FloatArray
@@ -132,7 +132,7 @@ def write_photograph(source: Path, target: Path, pixels: Pixels, touched: BoolAr
     """
     suffix = source.suffix.lower()
     write = _write_jpeg if suffix in JPEG else _write_tiff if suffix in TIFF else _write_png
-    with replaced_when_whole(target) as draft:
+    with temporary_output(target) as draft:
         if touched.any():
             write(source, draft, pixels, touched)
         else:
@@ -369,13 +369,13 @@ def write_calm(target: Path, frames: Frames, pixels: Pixels) -> None:
         everywhere = np.ones(pixels.shape[:2], bool)
         write_photograph(frames.photographs[0], target, pixels, everywhere)
         return
-    with replaced_when_whole(target) as draft:
+    with temporary_output(target) as draft:
         draft.write_bytes(photo_library("cv2").imencode(".png", pixels)[1].tobytes())
 
 
 def write_spread(target: Path, spread: FloatArray) -> None:
     """Write the spread of the frames, shape (rows, columns), as TIFF of float32."""
-    with replaced_when_whole(target) as draft:
+    with temporary_output(target) as draft:
         photo_library("tifffile").imwrite(
             draft, spread.astype(np.float32), compression="zlib", metadata=None
         )

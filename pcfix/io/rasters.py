@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from pcfix.errors import GeometryError, SettingError, bad_file
 from pcfix.grid.lattice import Lattice, Window
-from pcfix.io.drafts import is_full_disk, replaced_when_whole
+from pcfix.io.atomic import is_full_disk, temporary_output
 from pcfix.io.files import check_input, check_output
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
@@ -237,7 +237,7 @@ def write_dod(dsm: Path, reference: Path, output: Path, *, overwrite: bool = Fal
             height=one.height, resampling=Resampling.bilinear, dtype="float64", nodata=NO_HEIGHT,
         )  # fmt: skip
         profile = one.profile | {"count": 1, "driver": "GTiff"}
-        with replaced_when_whole(target) as draft:
+        with temporary_output(target) as draft:
             with same, _written(draft), rasterio.open(draft, "w", **profile) as sink:
                 sink.set_band_description(1, "difference")
                 for _, window in sink.block_windows(1):

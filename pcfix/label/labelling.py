@@ -11,7 +11,7 @@ negative number.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,9 +19,16 @@ import numpy.typing as npt
 
 from pcfix.errors import GeometryError
 from pcfix.label.areas import Grid, Surroundings, WaterMask
-from pcfix.model import BATHYMETRIC_POINT, UNCLASSIFIED, WATER_SURFACE, BoolArray, FloatArray
+from pcfix.model import (
+    BATHYMETRIC_POINT,
+    UNCLASSIFIED,
+    WATER_SURFACE,
+    BoolArray,
+    FloatArray,
+    IntArray,
+)
 from pcfix.options.correct import LabelRules
-from pcfix.sums import Sums
+from pcfix.sums import LEAST, MOST, Sums
 from pcfix.water.surface import SurfaceAbove, is_submerged
 
 Classes = npt.NDArray[np.uint8]
@@ -36,30 +43,33 @@ class Part(NamedTuple):
 
 
 class Labels(NamedTuple):
-    """The new classes of n points, and which of them were set to 40 and 41."""
+    """The new classes of n points, which of them were set to 40 and 41, and what was excluded."""
 
     classes: Classes
     submerged: BoolArray
     at_surface: BoolArray
+    counts: LabelCounts
 
 
-class Labelling(Sums):
-    """The rules of a labelling, the surroundings of its points, and counts of excluded points."""
+@dataclass(frozen=True)
+class LabelCounts(Sums):
+    """Counts of the points below the water that the rules exclude, and the corners of these."""
 
-    added = ("_below", "_outside_mask", "_respected", "_in_pool")
-    least, most = ("_low",), ("_high",)
+    below: int = 0
+    outside_mask: int = 0
+    respected: int = 0
+    low: FloatArray = field(default_factory=lambda: np.full(2, np.inf), metadata=LEAST)
+    high: FloatArray = field(default_factory=lambda: np.full(2, -np.inf), metadata=MOST)
+    in_pool: IntArray | None = None  # points of each separate pool
 
-    def __init__(self, settings: LabelRules, mask: WaterMask | None = None) -> None:
-        self.settings, self.mask = settings, mask
-        self._around: Surroundings | None = None
-        self.restart()
 
-    def restart(self) -> None:
-        """Reset the counts, but not the surroundings."""
-        self._below = self._outside_mask = self._respected = 0
-        self._low, self._high = np.full(2, np.inf), np.full(2, -np.inf)
-        pools = None if self._around is None else self._around.pools
-        self._in_pool = np.zeros(0 if pools is None else len(pools.stays), np.int64)
+@dataclass(frozen=True)
+class Labelling:
+    """The rules of a labelling, and the surroundings of its points."""
+
+    settings: LabelRules
+    mask: WaterMask | None = None
+    around: Surroundings | None = None
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -72,20 +82,17 @@ class Labelling(Sums):
         s = self.settings
         return self.mask is None and not (s.respect_classes or s.connected or s.dead_band)
 
-    @property
-    def looks_around(self) -> bool:
-        """Whether `look_around` must scan the whole cloud first."""
-        return self.settings.connected or self.settings.dead_band > 0.0
-
-    def look_around(
+    def scanned(
         self, parts: Callable[[], Iterable[Part]], low: FloatArray, high: FloatArray
-    ) -> None:
-        """Scan the surroundings of all points.
+    ) -> Labelling:
+        """Return the rules with the surroundings of all points, if they need them.
 
         `parts` returns the whole cloud in chunks, and is called again if its south-west and
         north-east corner, `low` and `high`, were wrong.
         """
         settings = self.settings
+        if not (settings.connected or settings.dead_band > 0.0):
+            return self
         if not (np.isfinite([low, high]).all() and (low <= high).all()):
             low = high = np.zeros(2)
         while True:
@@ -102,25 +109,25 @@ class Labelling(Sums):
             if grid.fits:
                 break
             low, high = grid.low, grid.high
-        self._around = grid.surroundings(
-            connected=settings.connected, least_pool_m2=settings.least_pool
-        )
-        self.restart()
+        around = grid.surroundings(connected=settings.connected, least_pool_m2=settings.least_pool)
+        return replace(self, around=around)
 
-    def submerged(self, xyz: FloatArray, surface: SurfaceAbove, classes: Classes) -> BoolArray:
-        """Return which of n points are submerged, and count those that are excluded below it."""
+    def submerged(
+        self, xyz: FloatArray, surface: SurfaceAbove, classes: Classes
+    ) -> tuple[BoolArray, LabelCounts]:
+        """Return which of n points are submerged, and the counts of those that are excluded."""
         below = is_submerged(xyz[:, 2], surface)
         if self.is_plain:
-            return below
+            return below, LabelCounts()
         height = xyz[:, 2] - surface.height_m
         wet = below | _within(height, self.settings.dead_band)
         rows = np.flatnonzero(wet)
-        wet[rows] = self._decided(xyz[rows], height[rows], classes[rows])
-        return wet
+        wet[rows], counts = self._decided(xyz[rows], height[rows], classes[rows])
+        return wet, counts
 
     def labels(self, part: Part) -> Labels:
         """Return the new classes of points; those of land do not change."""
-        wet = self.submerged(*part)
+        wet, counts = self.submerged(*part)
         new = part.classes.copy()
         if self.settings.reset:
             new[sets_class(part.classes) & ~self._is_respected(part.classes)] = UNCLASSIFIED
@@ -130,12 +137,12 @@ class Labelling(Sums):
             rows = np.flatnonzero(near & ~self._is_respected(part.classes))
             x, y = np.ascontiguousarray(part.xyz[rows, :2].T)
             keep = self._is_inside(x, y)
-            if self._around is not None and self._around.joined is not None:
-                keep &= self._around.joined[self._around.cells(x, y)]
+            if self.around is not None and self.around.joined is not None:
+                keep &= self.around.joined[self.around.cells(x, y)]
             at_surface[rows[keep]] = True
         wet &= ~at_surface
         new[wet], new[at_surface] = BATHYMETRIC_POINT, WATER_SURFACE
-        return Labels(new, wet, at_surface)
+        return Labels(new, wet, at_surface, counts)
 
     def _is_respected(self, classes: Classes) -> BoolArray:
         return np.isin(classes, self.settings.respect_classes)
@@ -143,30 +150,33 @@ class Labelling(Sums):
     def _is_inside(self, x: FloatArray, y: FloatArray) -> BoolArray:
         return np.ones(len(x), np.bool_) if self.mask is None else self.mask.inside(x, y)
 
-    def _decided(self, xyz: FloatArray, height: FloatArray, classes: Classes) -> BoolArray:
-        """Return which points that are below or within the dead band are submerged."""
+    def _decided(
+        self, xyz: FloatArray, height: FloatArray, classes: Classes
+    ) -> tuple[BoolArray, LabelCounts]:
+        """Decide on points that are below or within the dead band."""
         x, y, _ = np.ascontiguousarray(xyz.T)
         below, inside, respected = height < 0.0, self._is_inside(x, y), self._is_respected(classes)
-        self._below += int(below.sum())
-        self._outside_mask += int((below & ~inside).sum())
-        self._respected += int((below & inside & respected).sum())
-        self._low = np.minimum(self._low, xyz[below, :2].min(axis=0, initial=np.inf))
-        self._high = np.maximum(self._high, xyz[below, :2].max(axis=0, initial=-np.inf))
-        wet = inside & ~respected
-        if self._around is None:
-            return wet
-        row, column = self._around.cells(x, y)
-        unsure = _within(height, self.settings.dead_band)
-        if unsure.any():
-            wet = wet & (~unsure | self._around.is_wet[row, column])
-        if self._around.pools is not None:
-            number = self._around.pools.number[row, column]
-            stays = self._around.pools.stays[number]
-            self._in_pool += np.bincount(number[wet & ~stays], minlength=len(self._in_pool))
-            wet = wet & stays
-        return wet
+        wet, in_pool = inside & ~respected, None
+        if self.around is not None:
+            row, column = self.around.cells(x, y)
+            unsure = _within(height, self.settings.dead_band)
+            if unsure.any():
+                wet &= ~unsure | self.around.is_wet[row, column]
+            if self.around.pools is not None:
+                number = self.around.pools.number[row, column]
+                stays = self.around.pools.stays
+                in_pool = np.bincount(number[wet & ~stays[number]], minlength=len(stays))
+                wet &= stays[number]
+        return wet, LabelCounts(
+            int(below.sum()),
+            int((below & ~inside).sum()),
+            int((below & inside & respected).sum()),
+            xyz[below, :2].min(axis=0, initial=np.inf),
+            xyz[below, :2].max(axis=0, initial=-np.inf),
+            in_pool,
+        )
 
-    def check(self, name: str, submerged: int | None = None) -> None:
+    def check(self, name: str, counts: LabelCounts, submerged: int | None = None) -> None:
         """Check that mask, respected classes and dead band leave points below the water.
 
         Raises
@@ -175,7 +185,7 @@ class Labelling(Sums):
             ``option.dead_band`` (if the number of points that became `submerged` is given),
             ``option.respect_classes`` or ``mask.no_points``.
         """
-        left = self._below - self._outside_mask - self._respected
+        left = counts.below - counts.outside_mask - counts.respected
         if submerged == 0 and left and self.settings.dead_band:
             raise GeometryError(
                 "option.dead_band",
@@ -184,57 +194,58 @@ class Labelling(Sums):
                 " narrower --dead-band.",
                 path=name, points=left, value=self.settings.dead_band,
             )  # fmt: skip
-        if self._respected and not left:
+        if counts.respected and not left:
             respected = ", ".join(map(str, self.settings.respect_classes))
             raise GeometryError(
                 "option.respect_classes",
-                f"{name}: all {self._respected:,} points below the water are of the classes to"
+                f"{name}: all {counts.respected:,} points below the water are of the classes to"
                 f" respect ({respected}). Respect fewer classes.",
-                path=name, points=self._respected,
+                path=name, points=counts.respected,
             )  # fmt: skip
-        if self.mask is None or self._outside_mask < max(self._below, 1):
+        if self.mask is None or counts.outside_mask < max(counts.below, 1):
             return
         west, south, east, north = self.mask.bounds
-        (x0, y0), (x1, y1) = self._low, self._high
+        (x0, y0), (x1, y1) = counts.low, counts.high
         raise GeometryError(
             "mask.no_points",
             f"{self.mask.name} (x {west:.1f} to {east:.1f}, y {south:.1f} to {north:.1f}) contains"
             f" none of the points of {name} below the water (x {x0:.1f} to {x1:.1f}, y {y0:.1f} to"
             f" {y1:.1f}). Check the CRS of both, and that the polygons are of water.",
-            path=self.mask.name, points=self._below, bounds=self.mask.bounds,
+            path=self.mask.name, points=counts.below, bounds=self.mask.bounds,
         )  # fmt: skip
 
-    def report(self) -> dict[str, Any] | None:
+    def report(self, counts: LabelCounts) -> dict[str, Any] | None:
         """Return rules and counts of excluded points as plain values; None without rules."""
         if self.is_plain:
             return None
         return {
             "settings": asdict(self.settings),
             "water_mask": None if self.mask is None else self.mask.name,
-            "below": self._below,
-            "outside_mask": self._outside_mask,
-            "respected": self._respected,
-            "cell_m": None if self._around is None else self._around.lattice.side_m,
-            "separate": self._separate(),
+            "below": counts.below,
+            "outside_mask": counts.outside_mask,
+            "respected": counts.respected,
+            "cell_m": None if self.around is None else self.around.lattice.side_m,
+            "separate": self._separate(counts),
         }
 
-    def _separate(self) -> dict[str, Any] | None:
+    def _separate(self, counts: LabelCounts) -> dict[str, Any] | None:
         """Return the number of excluded pools and their points, and the largest of them."""
-        if self._around is None or self._around.pools is None:
+        if self.around is None or self.around.pools is None:
             return None
-        lattice, pools = self._around.lattice, self._around.pools
-        area, largest = np.where(self._in_pool > 0, pools.area_m2, 0.0), None
+        lattice, pools = self.around.lattice, self.around.pools
+        in_pool = np.zeros(len(pools.stays), np.int64) if counts.in_pool is None else counts.in_pool
+        area, largest = np.where(in_pool > 0, pools.area_m2, 0.0), None
         if area.any():
             pool = int(np.argmax(area))
             cells = np.argwhere(pools.number == pool)
             row, column = cells[len(cells) // 2]  # a place inside it
             largest = {
                 "area_m2": round(float(pools.area_m2[pool]), 2),
-                "points": int(self._in_pool[pool]),
+                "points": int(in_pool[pool]),
                 "x": float((lattice.first_column + column + 0.5) * lattice.side_m),
                 "y": float((lattice.first_row + row + 0.5) * lattice.side_m),
             }
-        count, points = int((area > 0.0).sum()), int(self._in_pool.sum())
+        count, points = int((area > 0.0).sum()), int(in_pool.sum())
         return {"pools": count, "points": points, "largest": largest}
 
 

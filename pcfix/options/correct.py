@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 from pcfix.errors import SettingError
@@ -43,11 +42,8 @@ LEVEL_M = 0.02
 """Assumed standard deviation of a water level."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class MethodOptions(IndexOptions):
+class MethodOptions(IndexOptions, panel=Panel.METHOD):
     """The rays that are used, and how the true point follows from the apparent one."""
-
-    panel = Panel.METHOD
 
     method: Method = option(
         "auto",
@@ -160,11 +156,8 @@ class MethodOptions(IndexOptions):
         return automatic or self.camera_set == "mvs"
 
 
-@dataclass(frozen=True, kw_only=True)
-class BudgetOptions(OptionSet):
+class BudgetOptions(OptionSet, panel=Panel.BUDGET):
     """Standard deviations of the inputs of a correction; see `pcfix.refract.uncertainty`."""
-
-    panel = Panel.BUDGET
 
     sigma_image: float = option(
         0.5, "Standard deviation of an image coordinate.", unit="px", least=0
@@ -191,11 +184,8 @@ class BudgetOptions(OptionSet):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class RefractionOptions(BudgetOptions, MethodOptions):
+class RefractionOptions(BudgetOptions, MethodOptions, panel=Panel.OUTPUT):
     """Everything that the correction of points depends on."""
-
-    panel = Panel.OUTPUT
 
     unsure: Unsure = option(
         "keep",
@@ -209,16 +199,12 @@ class RefractionOptions(BudgetOptions, MethodOptions):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
 class PointsOptions(RefractionOptions, WaterPerImageOption):
     """The options of `pcfix.correct_points`."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ScienceOptions(RefractionOptions):
+class ScienceOptions(RefractionOptions, panel=Panel.OUTPUT):
     """Everything that a corrected file depends on, besides its inputs; the file records it."""
-
-    panel = Panel.OUTPUT
 
     uncorrected: Uncorrected = option(
         "withhold", "Submerged points with fewer than two usable rays: flag, keep or drop them."
@@ -226,7 +212,6 @@ class ScienceOptions(RefractionOptions):
     dimensions: Dimensions = option("all", "Extra dimensions; 'pcfix restore' needs all.")
 
 
-@dataclass(frozen=True, kw_only=True)
 class CorrectOptions(
     PartOptions,
     ShorelineOption,
@@ -236,21 +221,17 @@ class CorrectOptions(
     WaterPerImageOption,
     SubmergedOptions,
     InputOptions,
+    panel=Panel.OUTPUT,
 ):
     """The options of ``pcfix correct``; in Python they are `pcfix.Options`."""
-
-    panel = Panel.OUTPUT
 
     save_regression: File | None = option(
         None, "JSON file for the line fitted to --check-depths.", needs="check_depths"
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class LabelRules(LandRules):
+class LabelRules(LandRules, panel=Panel.WATER):
     """Which points count as submerged, besides those below the surface; see `pcfix.label`."""
-
-    panel = Panel.WATER
 
     band: float = option(
         0.0,
@@ -282,12 +263,10 @@ class LabelRules(LandRules):
             )
 
 
-@dataclass(frozen=True, kw_only=True)
 class StageLabelOptions(LabelRules, SubmergedOptions, NeededOptions):
     """The options of the stage ``label`` of PDAL, which writes no files."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class LabelOptions(PartOptions, TileOptions, SummaryOption, StageLabelOptions):
     """The options of ``pcfix label``."""
 

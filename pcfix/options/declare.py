@@ -1,8 +1,8 @@
 """How an option is declared: one entry, from which every door and its documentation is made.
 
-An option is a field of a frozen dataclass, `option(default, help, ...)`; the classes are panels of
-the command line's help, and what a command takes is a class that inherits some of them. Names are
-the same everywhere: ``max_angle`` in Python and JSON is ``--max-angle`` on the command line.
+An option is a field of an `OptionSet`, ``name: type = option(default, help, ...)``. The classes are
+panels of the help; a command has a class that inherits some of them. Names are the same everywhere:
+``max_angle`` in Python and JSON is ``--max-angle`` on the command line.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from typing import (
     TypeAlias,
     TypeVar,
     Union,
+    dataclass_transform,
     get_args,
     get_origin,
 )
@@ -38,25 +39,21 @@ class Option(NamedTuple):
 
     Attributes
     ----------
-    help : str
-        One sentence, for the help and the tables.
-    unit : str
-        Of the value, as it is written after a number: m, deg, px.
+    help, unit : str
+        One sentence, and the unit of the value: m, deg, px.
     least, above, most : float or None
-        Limits of a number, or of each number of several; `above` itself is not allowed.
+        Limits of a number, or of each of several; `above` itself is not allowed.
     default_is : str
-        The default in words, where it is not the value.
+        The default in words, if it is not the value.
     needed : bool
-        Whether the command line and PDAL ask for it; `default_is` says where not.
+        Whether it must be given; `default_is` says when not.
     needs : str
-        Another option of the class without which this one has no effect, or one and the value
-        that it must have: ``"method factor"``.
+        Another option without which this one has no effect, or one and the value that it must have:
+        ``"method factor"``.
     parse : callable or None
-        From the option's name and the text of the command line or of JSON to the value.
-    metavar : str
-        Stands for the value in the help.
-    panel : str
-        Of the help, where it is not that of its class.
+        Returns the value, given the option's name and a text.
+    metavar, panel : str
+        Placeholder of the value, and panel of the help if it is not that of the class.
     name, type, default
         From its field; see `options_of`.
     """
@@ -82,16 +79,16 @@ class Option(NamedTuple):
         return "--" + self.name.replace("_", "-")
 
     @property
-    def choices(self) -> tuple[str, ...]:
-        """The words that it may be; empty where it is free."""
-        return next((get_args(kind) for kind in self.kinds if get_origin(kind) is Literal), ())
-
-    @property
     def kinds(self) -> tuple[Any, ...]:
         """The types that it may have, without None."""
         union = get_origin(self.type) in (Union, types.UnionType)
         kinds = get_args(self.type) if union else (self.type,)
         return tuple(kind for kind in kinds if kind is not type(None))
+
+    @property
+    def choices(self) -> tuple[str, ...]:
+        """The words that it may be; empty if it is free."""
+        return next((get_args(kind) for kind in self.kinds if get_origin(kind) is Literal), ())
 
     @property
     def help_text(self) -> str:
@@ -100,7 +97,7 @@ class Option(NamedTuple):
 
     @property
     def default_text(self) -> str:
-        """Its default, in words where they say more; empty where there is none."""
+        """Its default, in words if there are any; empty without a default."""
         if self.default_is or self.default in (None, ()) or self.default is False:
             return self.default_is
         if isinstance(self.default, tuple):
@@ -109,12 +106,12 @@ class Option(NamedTuple):
 
     @property
     def needed_text(self) -> str:
-        """Whether it is needed, and where not."""
+        """Whether it is needed, and when not."""
         return ", ".join(filter(None, ["needed" if self.needed else "", self.default_text]))
 
     @property
     def placeholder(self) -> str:
-        """What stands for its value: a path, a number, or nothing for a switch."""
+        """The kind of its value: a path, a number, a text, or nothing for a switch."""
         if os.PathLike[str] in self.kinds:
             return "PATH"
         return "" if bool in self.kinds else "N" if self.kinds != (str,) else "TEXT"
@@ -157,35 +154,28 @@ class Option(NamedTuple):
     def _checked_one(self, value: Any, kinds: tuple[Any, ...]) -> Any:
         """Return a single value as one of some types."""
         if get_origin(kinds[0]) is Literal:
-            choices = get_args(kinds[0])
-            if value not in choices:
-                raise self._wrong("choice", value, f"is not one of {', '.join(choices)}")
+            if value not in get_args(kinds[0]):
+                raise self._wrong("choice", value, f"is not one of {', '.join(get_args(kinds[0]))}")
             return value
         if not {int, float} & {*kinds} or (str in kinds and isinstance(value, str)):
             return value
         if isinstance(value, str) or not hasattr(value, "__float__"):
             raise self._wrong("type", value, "must be a number")
-        number = float(value)
-        if not self._is_within(number):
+        number, least = float(value), self.least if self.above is None else self.above
+        low, high = (
+            -math.inf if least is None else least,
+            math.inf if self.most is None else self.most,
+        )
+        if not (math.isfinite(number) and low <= number <= high) or number == self.above:
             limits = {"at least": self.least, "above": self.above, "at most": self.most}
             words = [f"{word} {x:g}" for word, x in limits.items() if x is not None]
-            raise self._wrong(
-                "range", value, f"must be {' and '.join(words) or 'a finite number'}",
-                least=self.least if self.above is None else self.above, most=self.most,
-            )  # fmt: skip
+            sentence = f"must be {' and '.join(words) or 'a finite number'}"
+            raise self._wrong("range", value, sentence, least=least, most=self.most)
         if float in kinds:
             return number
         if number != math.floor(number):
             raise self._wrong("type", value, "must be a whole number")
         return int(value)
-
-    def _is_within(self, number: float) -> bool:
-        return (
-            math.isfinite(number)
-            and (self.least is None or number >= self.least)
-            and (self.above is None or number > self.above)
-            and (self.most is None or number <= self.most)
-        )
 
     def _wrong(self, code: str, value: Any, words: str, **values: Any) -> SettingError:
         """Return the error of a value that is not as it must be."""
@@ -201,14 +191,21 @@ def option(default: Any, help: str, **more: Any) -> Any:
     return field(default=default, metadata={"option": Option(help, **more)})
 
 
+@dataclass_transform(kw_only_default=True, frozen_default=True)
 @dataclass(frozen=True, kw_only=True)
 class OptionSet:
     """The base of all classes of options: every value is checked against its declaration.
 
-    A class says in which `panel` of the help its own options stand.
+    Its subclasses are frozen dataclasses. A class says in which `panel` of the help its own options
+    are.
     """
 
     panel: ClassVar[str] = ""
+
+    def __init_subclass__(cls, panel: str = "") -> None:
+        """Make a subclass a dataclass."""
+        cls.panel = panel
+        dataclass(frozen=True, kw_only=True)(cls)
 
     def __post_init__(self) -> None:
         """Check every option, then what they say together."""
@@ -295,23 +292,10 @@ def table_of(kind: type) -> str:
 
 
 def taken(kind: type[Set], given: OptionSet | None, keywords: Mapping[str, Any], where: str) -> Set:
-    """Return the options that a Python function is called with.
+    """Return the options of a Python function: its argument ``options``, or its `keywords`.
 
-    Parameters
-    ----------
-    kind : type
-        The class of its options.
-    given : OptionSet or None
-        The argument ``options``.
-    keywords : mapping
-        The others, by name.
-    where : str
-        Whose options they are, for messages.
-
-    Raises
-    ------
-    SettingError
-        If a name is unknown, or options are given both ways.
+    `where` is the function, for messages. Raises SettingError ``option.unknown`` or
+    ``option.twice``.
     """
     if given is None:
         return kind(**named(keywords, options_of(kind), where))
@@ -327,12 +311,9 @@ def taken(kind: type[Set], given: OptionSet | None, keywords: Mapping[str, Any],
 
 
 def named(given: Mapping[str, Any], known: Iterable[Option], where: str) -> dict[str, Any]:
-    """Return values whose names are all known.
+    """Return values, all of whose names must be known.
 
-    Raises
-    ------
-    SettingError
-        If a name is unknown; the message names the nearest known one.
+    Raises SettingError ``option.unknown``, with the nearest known name.
     """
     names = [one.name for one in known]
     for name in given:

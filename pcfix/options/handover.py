@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, Literal
 
 from pcfix.options.correct import BudgetOptions
@@ -28,11 +27,8 @@ def _depths(name: str, text: str) -> tuple[float, ...]:
     return found
 
 
-@dataclass(frozen=True, kw_only=True)
-class PlannedFlightOptions(OptionSet):
+class PlannedFlightOptions(OptionSet, panel=Panel.FLIGHT):
     """A planned flight."""
-
-    panel = Panel.FLIGHT
 
     height: float = option(80.0, "Flying height above the water.", unit="m", least=0.5, most=10_000)
     overlap: float = option(
@@ -71,22 +67,21 @@ class PlannedFlightOptions(OptionSet):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
 class PlanOptions(
-    OverwriteOption, SummaryOption, BudgetOptions, IndexOptions, PlannedFlightOptions
+    OverwriteOption,
+    SummaryOption,
+    BudgetOptions,
+    IndexOptions,
+    PlannedFlightOptions,
+    panel=Panel.OUTPUT,
 ):
     """The options of ``pcfix plan``."""
-
-    panel = Panel.OUTPUT
 
     plot: File | None = option(None, "PNG of the block and of the errors by depth.")
 
 
-@dataclass(frozen=True, kw_only=True)
-class ViewerOptions(OverwriteOption, CameraFileOptions, WaterOptions):
+class ViewerOptions(OverwriteOption, CameraFileOptions, WaterOptions, panel=Panel.OUTPUT):
     """The options of ``pcfix view``."""
-
-    panel = Panel.OUTPUT
 
     colour: Colour = option(
         "depth", "Value shown by colour; error needs --reference, others need extra dimensions."
@@ -106,6 +101,5 @@ class ViewerOptions(OverwriteOption, CameraFileOptions, WaterOptions):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
 class PluginOptions(OverwriteOption):
     """The options of ``pcfix qgis-plugin``."""

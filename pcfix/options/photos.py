@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, Literal
 
 from pcfix.errors import SettingError
@@ -23,11 +22,10 @@ Mapping = Literal["exact", "paper"]
 Holes = Literal["fill", "black"]
 
 
-@dataclass(frozen=True, kw_only=True)
-class OrthoOptions(JobOptions, SummaryOption, IndexOptions, WaterOptions, CamerasOptions):
+class OrthoOptions(
+    JobOptions, SummaryOption, IndexOptions, WaterOptions, CamerasOptions, panel=Panel.NEED
+):
     """The options of ``pcfix ortho``."""
-
-    panel = Panel.NEED
 
     dsm: Any = option(
         None,
@@ -47,11 +45,8 @@ class OrthoOptions(JobOptions, SummaryOption, IndexOptions, WaterOptions, Camera
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class MappingRules(OptionSet):
+class MappingRules(OptionSet, panel=Panel.METHOD):
     """How a photograph is resampled."""
-
-    panel = Panel.METHOD
 
     mapping: Mapping = option(
         "exact",
@@ -69,11 +64,8 @@ class MappingRules(OptionSet):
     holes: Holes = option("fill", "Interpolate holes of the DSM, or make them black.")
 
 
-@dataclass(frozen=True, kw_only=True)
-class RebuildOptions(OptionSet):
+class RebuildOptions(OptionSet, panel=Panel.ROUNDS):
     """Rounds of photographs without refraction and clouds from them."""
-
-    panel = Panel.ROUNDS
 
     rebuild: str | None = option(
         None,
@@ -107,7 +99,6 @@ class RebuildOptions(OptionSet):
             )
 
 
-@dataclass(frozen=True, kw_only=True)
 class PhotosOptions(
     WaterPerImageOption,
     JobOptions,
@@ -117,10 +108,9 @@ class PhotosOptions(
     IndexOptions,
     NeededOptions,
     CamerasOptions,
+    panel=Panel.NEED,
 ):
     """The options of ``pcfix photos``."""
-
-    panel = Panel.NEED
 
     dsm: Any = option(
         None,
@@ -138,11 +128,8 @@ class PhotosOptions(
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class CalmOptions(JobOptions, SummaryOption, CameraFileOptions, IndexOptions):
+class CalmOptions(JobOptions, SummaryOption, CameraFileOptions, IndexOptions, panel=Panel.WATER):
     """The options of ``pcfix calm``."""
-
-    panel = Panel.WATER
 
     surface: bool = option(
         False,

@@ -1,9 +1,8 @@
-"""The options of simulated scenes: simulate, demo, and refraction in a stereo pair."""
+"""The options of simulated scenes: simulate and demo."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Literal
 
 from pcfix.errors import SettingError
@@ -17,11 +16,8 @@ CloudKind = Literal["tracks", "pairs", "depth-maps"]
 _MOST_DEPTHS = 100
 
 
-@dataclass(frozen=True, kw_only=True)
-class FlightOptions(OptionSet):
+class FlightOptions(OptionSet, panel=Panel.FLIGHT):
     """How the block is flown."""
-
-    panel = Panel.FLIGHT
 
     block: BlockKind = option("nadir", "Only nadir images, or oblique ones too.")
     cameras: int | None = option(
@@ -63,11 +59,8 @@ class FlightOptions(OptionSet):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class CameraOptions(OptionSet):
+class CameraOptions(OptionSet, panel=Panel.CAMERA):
     """The camera, and how well it measures."""
-
-    panel = Panel.CAMERA
 
     focal_mm: float = option(8.8, "Focal length.", least=0.5, most=2000)
     sensor_mm: tuple[float, float] = option(
@@ -83,11 +76,8 @@ class CameraOptions(OptionSet):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class SceneWaterOptions(IndexOptions):
+class SceneWaterOptions(IndexOptions, panel=Panel.WATER):
     """The water and the ground."""
-
-    panel = Panel.WATER
 
     water: float = option(0.37, "Water level in the middle of the area.", unit="m")
     wave_slope_deg: float = option(
@@ -110,11 +100,8 @@ class SceneWaterOptions(IndexOptions):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class SceneCloudOptions(OptionSet):
+class SceneCloudOptions(OptionSet, panel=Panel.CLOUDS):
     """The cloud that is reconstructed from the images, and the LiDAR."""
-
-    panel = Panel.CLOUDS
 
     points: int = option(100_000, "Points of the cloud.", least=1)
     cloud: CloudKind = option(
@@ -143,7 +130,6 @@ class SceneCloudOptions(OptionSet):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
 class SceneOptions(SceneCloudOptions, SceneWaterOptions, CameraOptions, FlightOptions):
     """The options of a simulated scene."""
 
@@ -167,74 +153,11 @@ def depth_series(option: str, text: str) -> tuple[float, ...]:
     return tuple(round(first + i * step, 9) for i in range(int(count)))
 
 
-def _frame(option: str, text: str) -> tuple[float, ...]:
-    return numbers(option, text.lower().replace("x", ","))
-
-
-@dataclass(frozen=True, kw_only=True)
-class EffectOptions(OptionSet):
-    """The effect of refraction on a pair of vertical images."""
-
-    panel = Panel.EFFECT
-
-    effect_focal_mm: float | None = option(
-        None,
-        "Focal length of your own camera, with --effect-frame-px and --effect-pixel-um.",
-        needs="refraction_effect",
-        default_is="the paper's two cameras",
-    )
-    effect_frame_px: tuple[int, int] | None = option(
-        None,
-        "Its image size, such as 4000x3000; the height is along the flight.",
-        needs="refraction_effect",
-        parse=_frame,
-        metavar="WIDTHxHEIGHT",
-    )
-    effect_pixel_um: float | None = option(None, "Its pixel size.", needs="refraction_effect")
-    effect_overlap: tuple[float, ...] | None = option(
-        None,
-        "Overlaps of the two images, 0 to 1.",
-        needs="refraction_effect",
-        parse=numbers,
-        default_is="0.8; UltraCamX 0.6,0.8",
-        metavar="N,N",
-    )
-    effect_heights: tuple[float, ...] | None = option(
-        None,
-        "Flying heights above the water, metres.",
-        needs="refraction_effect",
-        parse=numbers,
-        default_is="100,200; UltraCamX 1000,3000; your own 50,100,200",
-        metavar="M,M",
-    )
-    effect_depths: tuple[float, ...] | None = option(
-        None,
-        "Apparent depths, metres: a list, or FROM:TO:STEP; maps are of the largest.",
-        needs="refraction_effect",
-        parse=depth_series,
-        default_is="0:15:1",
-        metavar="M,M",
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class SimulateOptions(OverwriteOption, EffectOptions, SceneOptions):
+class SimulateOptions(OverwriteOption, SceneOptions, panel=Panel.OUTPUT):
     """The options of ``pcfix simulate``."""
 
-    panel = Panel.OUTPUT
 
-    refraction_effect: bool = option(
-        False,
-        "Instead of a scene, compute the error that refraction causes in a pair of vertical images"
-        " (Skarlatos & Agrafiotis 2018, Figures 4 to 6): surfaces, maps, tables. The default index"
-        " is then 1.3405, which fits the paper's figures.",
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class DemoOptions(OverwriteOption):
+class DemoOptions(OverwriteOption, panel=Panel.OUTPUT):
     """The options of ``pcfix demo``."""
-
-    panel = Panel.OUTPUT
 
     points: int = option(50_000, "Points of each scene.")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Literal
 
@@ -33,15 +32,11 @@ class Panel(StrEnum):
     UNKNOWNS = "What moves, and how much counts"
     CLOUDS = "Clouds"
     ROUNDS = "Rounds"
-    EFFECT = "With --refraction-effect"
     OUTPUT = "Output"
 
 
-@dataclass(frozen=True, kw_only=True)
-class IndexOptions(OptionSet):
+class IndexOptions(OptionSet, panel=Panel.WATER):
     """The refractive index of the water."""
-
-    panel = Panel.WATER
 
     index: float | str | None = option(
         None,
@@ -64,11 +59,8 @@ class IndexOptions(OptionSet):
         return DEFAULT_REFRACTIVE_INDEX if self.index is None else float(self.index)
 
 
-@dataclass(frozen=True, kw_only=True)
-class WaterOptions(OptionSet):
+class WaterOptions(OptionSet, panel=Panel.WATER):
     """How a water surface is fitted to shoreline points."""
-
-    panel = Panel.WATER
 
     water_model: WaterModel = option(
         "auto",
@@ -80,11 +72,8 @@ class WaterOptions(OptionSet):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class NeededOptions(WaterOptions):
+class NeededOptions(WaterOptions, panel=Panel.NEED):
     """The water surface."""
-
-    panel = Panel.NEED
 
     water: Any = option(
         None,
@@ -95,11 +84,8 @@ class NeededOptions(WaterOptions):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class WaterPerImageOption(OptionSet):
+class WaterPerImageOption(OptionSet, panel=Panel.WATER):
     """A water surface of its own for each image."""
-
-    panel = Panel.WATER
 
     water_per_image: File | None = option(
         None,
@@ -108,11 +94,8 @@ class WaterPerImageOption(OptionSet):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class LandRules(OptionSet):
+class LandRules(OptionSet, panel=Panel.WATER):
     """Which points below the surface are land all the same."""
-
-    panel = Panel.WATER
 
     connected: bool = option(
         False, "Correct only the main water body and its connected parts; ignore separate pools."
@@ -141,11 +124,8 @@ class LandRules(OptionSet):
         object.__setattr__(self, "respect_classes", tuple(sorted({*self.respect_classes})))
 
 
-@dataclass(frozen=True, kw_only=True)
-class SubmergedOptions(LandRules):
+class SubmergedOptions(LandRules, panel=Panel.WATER):
     """Where, and which, points may be submerged."""
-
-    panel = Panel.WATER
 
     water_mask: File | None = option(
         None,
@@ -154,11 +134,8 @@ class SubmergedOptions(LandRules):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class PortOptions(OptionSet):
+class PortOptions(OptionSet, panel=Panel.WATER):
     """A housing under water."""
-
-    panel = Panel.WATER
 
     port: Any = option(
         None,
@@ -169,11 +146,8 @@ class PortOptions(OptionSet):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class CameraFileOptions(OptionSet):
+class CameraFileOptions(OptionSet, panel=Panel.CAMERAS):
     """How a camera file is read."""
-
-    panel = Panel.CAMERAS
 
     sensor: File | None = option(
         None,
@@ -210,20 +184,14 @@ CAMERAS: dict[str, Any] = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class CamerasOptions(CameraFileOptions):
+class CamerasOptions(CameraFileOptions, panel=Panel.NEED):
     """The exterior orientation."""
-
-    panel = Panel.NEED
 
     cameras: Any = option(None, **CAMERAS)
 
 
-@dataclass(frozen=True, kw_only=True)
-class ViewOptions(OptionSet):
+class ViewOptions(OptionSet, panel=Panel.CAMERAS):
     """Which images contributed to each point."""
-
-    panel = Panel.CAMERAS
 
     views: File | None = option(
         None,
@@ -237,11 +205,8 @@ class ViewOptions(OptionSet):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class SurveyOptions(ViewOptions, CamerasOptions, NeededOptions):
+class SurveyOptions(ViewOptions, CamerasOptions, NeededOptions, panel=Panel.CAMERAS):
     """Inputs of a correction through a water surface, as the user names them."""
-
-    panel = Panel.CAMERAS
 
     cameras: Any = option(
         None, default_is="not with --method factor or regression", panel=Panel.NEED, **CAMERAS
@@ -282,16 +247,12 @@ class SurveyOptions(ViewOptions, CamerasOptions, NeededOptions):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
 class InputOptions(SurveyOptions, PortOptions):
     """Inputs of any correction: through a water surface, or the port of a housing."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class PartOptions(OptionSet):
+class PartOptions(OptionSet, panel=Panel.INPUT):
     """Which points of a cloud are read; see `pcfix.io.las.part`."""
-
-    panel = Panel.INPUT
 
     bounds: tuple[float, float, float, float] | None = option(
         None,
@@ -310,20 +271,14 @@ class PartOptions(OptionSet):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class OverwriteOption(OptionSet):
+class OverwriteOption(OptionSet, panel=Panel.OUTPUT):
     """What becomes of files that exist."""
-
-    panel = Panel.OUTPUT
 
     overwrite: bool = option(False, "Replace an output that exists.")
 
 
-@dataclass(frozen=True, kw_only=True)
-class JobOptions(OverwriteOption):
+class JobOptions(OverwriteOption, panel=Panel.OUTPUT):
     """How the work is done."""
-
-    panel = Panel.OUTPUT
 
     jobs: int | None = option(
         None,
@@ -333,11 +288,8 @@ class JobOptions(OverwriteOption):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class TileOptions(JobOptions):
+class TileOptions(JobOptions, panel=Panel.OUTPUT):
     """How the work is done where the input may be many files."""
-
-    panel = Panel.OUTPUT
 
     scheduler: str | None = option(
         None,
@@ -346,20 +298,14 @@ class TileOptions(JobOptions):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class SummaryOption(OptionSet):
+class SummaryOption(OptionSet, panel=Panel.OUTPUT):
     """The summary as a file."""
-
-    panel = Panel.OUTPUT
 
     summary: File | None = option(None, "JSON file for the summary.")
 
 
-@dataclass(frozen=True, kw_only=True)
-class ShorelineOption(OptionSet):
+class ShorelineOption(OptionSet, panel=Panel.OUTPUT):
     """The line at which the water meets the cloud."""
-
-    panel = Panel.OUTPUT
 
     shoreline: File | None = option(
         None, "GeoPackage (.gpkg) for the shoreline of the cloud, with its standard error."

@@ -7,7 +7,6 @@ import os
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Any, Literal
 
 from pcfix.errors import SettingError
@@ -25,8 +24,7 @@ SurfaceChoice = Literal["all", "bed"]
 Direction = Literal["to-reference", "from-reference", "both"]
 
 
-@dataclass(frozen=True, kw_only=True)
-class CleanRules(OptionSet):
+class CleanRules(OptionSet, panel=Panel.TESTS):
     """Thresholds of the tests; None switches a test off.
 
     The fences are those of Tukey (Exploratory Data Analysis, 1977): three ranges are 4.7 standard
@@ -35,8 +33,6 @@ class CleanRules(OptionSet):
     as large as the terrain is high, so that nothing is taken for noise there. The mean distance
     to the neighbours finds, in a cloud of even spacing, also its edges and corners.
     """
-
-    panel = Panel.TESTS
 
     statistical: bool = option(True, "Test the mean distance to the nearest points in space.")
     neighbours: int = option(
@@ -110,11 +106,8 @@ class CleanRules(OptionSet):
         return max(statistical, 0 if self.radius is None else self.radius_neighbours + 1)
 
 
-@dataclass(frozen=True, kw_only=True)
-class CleanOptions(TileOptions, SummaryOption, CleanRules):
+class CleanOptions(TileOptions, SummaryOption, CleanRules, panel=Panel.OUTPUT):
     """The options of ``pcfix clean``."""
-
-    panel = Panel.OUTPUT
 
     water: Any = option(
         None,
@@ -125,11 +118,8 @@ class CleanOptions(TileOptions, SummaryOption, CleanRules):
     drop: bool = option(False, "Drop noise. Otherwise it gets class 7 and the withheld flag.")
 
 
-@dataclass(frozen=True, kw_only=True)
-class DsmRules(OptionSet):
+class DsmRules(OptionSet, panel=Panel.RASTER):
     """How a cloud becomes a raster."""
-
-    panel = Panel.RASTER
 
     resolution: float | None = option(
         None, "Cell size.", unit="m", least=MIN_RESOLUTION_M, default_is="2 to 4 points a cell"
@@ -185,11 +175,8 @@ class DsmRules(OptionSet):
             )
 
 
-@dataclass(frozen=True, kw_only=True)
-class DsmOptions(PartOptions, OverwriteOption, SummaryOption, DsmRules):
+class DsmOptions(PartOptions, OverwriteOption, SummaryOption, DsmRules, panel=Panel.OUTPUT):
     """The options of ``pcfix dsm``."""
-
-    panel = Panel.OUTPUT
 
     hillshade: File | None = option(None, "GeoTIFF for a hillshade.")
     counts: File | None = option(
@@ -208,15 +195,12 @@ SIGMA_REFERENCE_M = {"cloud": 0.03, "raster": 0.03, "table of check points": 0.0
 """Assumed noise of a height by kind of reference: LiDAR over hard ground, RTK or levelling."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class DistanceOptions(OptionSet):
+class DistanceOptions(OptionSet, panel=Panel.FIGURES):
     """What a comparison, or that of a run, measures besides the vertical error.
 
     `share` and `also` hold pairs: of bounds in metres, and of a name and a path. They may be given
     as texts; `also` may be a dict too.
     """
-
-    panel = Panel.FIGURES
 
     m3c2: bool = option(
         False, "Also compare by M3C2, with py4dgeo: the extra m3c2.", needs="reference"
@@ -314,11 +298,8 @@ def _named_clouds(given: Any) -> Iterator[tuple[str, str]]:
         yield name, os.fspath(path)
 
 
-@dataclass(frozen=True, kw_only=True)
-class CompareRules(DistanceOptions):
+class CompareRules(DistanceOptions, panel=Panel.FIGURES):
     """What is measured of two clouds."""
-
-    panel = Panel.FIGURES
 
     submerged: bool = option(False, "Compare only points of class 40, or below --water.")
     c2c_only: bool = option(False, "Only distances to the nearest point; no signed differences.")
@@ -345,22 +326,16 @@ class CompareRules(DistanceOptions):
         return not self.c2c_only
 
 
-@dataclass(frozen=True, kw_only=True)
-class ReferenceOption(OptionSet):
+class ReferenceOption(OptionSet, panel=Panel.OUTPUT):
     """The reference of a cloud."""
-
-    panel = Panel.OUTPUT
 
     reference: File | None = option(
         None, "LiDAR cloud, CSV check points or GeoTIFF to compare with."
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class CompareOptions(OverwriteOption, SummaryOption, CompareRules):
+class CompareOptions(OverwriteOption, SummaryOption, CompareRules, panel=Panel.OUTPUT):
     """The options of ``pcfix compare``."""
-
-    panel = Panel.OUTPUT
 
     out_dir: File | None = option(None, "Folder for compare.json, depth tables and sections (CSV).")
     water: Any = option(
@@ -375,6 +350,5 @@ class CompareOptions(OverwriteOption, SummaryOption, CompareRules):
     plot: File | None = option(None, "PNG of the C2C histograms, with Gauss curves.")
 
 
-@dataclass(frozen=True, kw_only=True)
 class StageCompareOptions(ReferenceOption, CompareOptions):
     """The options of the stage ``compare`` of PDAL, whose cloud is in no file."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 from pcfix.options.correct import RefractionOptions
@@ -32,11 +31,8 @@ WaterUnknown = Literal["level", "tilt", "index", "shape", "distance", "centre"]
 WATER_UNKNOWNS: tuple[str, ...] = get_args(WaterUnknown)
 
 
-@dataclass(frozen=True, kw_only=True)
-class SurveyedOptions(OptionSet):
+class SurveyedOptions(OptionSet, panel=Panel.CAMERAS):
     """Survey data of the images."""
-
-    panel = Panel.CAMERAS
 
     gcps: Any = option(
         None,
@@ -55,13 +51,15 @@ class SurveyedOptions(OptionSet):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
 class CamerasCheckOptions(
-    OverwriteOption, SummaryOption, SurveyedOptions, CameraFileOptions, IndexOptions
+    OverwriteOption,
+    SummaryOption,
+    SurveyedOptions,
+    CameraFileOptions,
+    IndexOptions,
+    panel=Panel.CAMERAS,
 ):
     """The options of ``pcfix cameras``."""
-
-    panel = Panel.CAMERAS
 
     cloud: File | None = option(None, "LAS or LAZ cloud to check against the cameras.")
     water: Any = option(
@@ -76,11 +74,8 @@ class CamerasCheckOptions(
     plot: File | None = option(None, "PNG of the block in plan and from the side.")
 
 
-@dataclass(frozen=True, kw_only=True)
-class WaterCheckOptions(OverwriteOption, SummaryOption, WaterOptions):
+class WaterCheckOptions(OverwriteOption, SummaryOption, WaterOptions, panel=Panel.OUTPUT):
     """The options of ``pcfix water``."""
-
-    panel = Panel.OUTPUT
 
     cloud: File | None = option(None, "LAS or LAZ cloud under the water surface.")
     plot: File | None = option(None, "PNG of points and residuals, or of the evidence for auto.")
@@ -91,7 +86,6 @@ class WaterCheckOptions(OverwriteOption, SummaryOption, WaterOptions):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
 class RunOptions(
     ReferenceOption,
     ShorelineOption,
@@ -101,10 +95,9 @@ class RunOptions(
     RefractionOptions,
     SubmergedOptions,
     SurveyOptions,
+    panel=Panel.OUTPUT,
 ):
     """The options of ``pcfix run``: everything that its results depend on is in ``run.json``."""
-
-    panel = Panel.OUTPUT
 
     resolution: float | None = option(
         None,
@@ -131,11 +124,8 @@ def _lens_names(option: str, text: str) -> tuple[str, ...]:
     return () if names == ("none",) else names
 
 
-@dataclass(frozen=True, kw_only=True)
-class AdjustRules(IndexOptions):
+class AdjustRules(IndexOptions, panel=Panel.UNKNOWNS):
     """How a block is adjusted."""
-
-    panel = Panel.UNKNOWNS
 
     free: tuple[WaterUnknown, ...] = option(
         (),
@@ -196,7 +186,6 @@ class AdjustRules(IndexOptions):
     outliers: bool = option(True, "Search for outliers and exclude them.")
 
 
-@dataclass(frozen=True, kw_only=True)
 class AdjustOptions(
     OverwriteOption,
     AdjustRules,
@@ -205,10 +194,9 @@ class AdjustOptions(
     CameraFileOptions,
     PortOptions,
     NeededOptions,
+    panel=Panel.CAMERAS,
 ):
     """The options of ``pcfix adjust``."""
-
-    panel = Panel.CAMERAS
 
     cloud: File | None = option(
         None, "Cloud made with these poses; used if there are no tie points."

@@ -12,13 +12,11 @@ land decides where there is some, and elsewhere many corners, each about its mea
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import PcfixWarning
 from pcfix.libraries import photo_library
 from pcfix.model import BoolArray, FloatArray
 
@@ -248,43 +246,3 @@ def _middle(values: npt.NDArray[np.float32], count: Any) -> npt.NDArray[np.float
     high = np.take_along_axis(ordered, np.minimum(count // 2, values.shape[-1] - 1), axis=-1)
     middle = 0.5 * (low + high)[..., 0]
     return np.where(count[..., 0] > 0, middle, np.float32(0.0))
-
-
-class WaterFound(NamedTuple):
-    """The water of a sequence: number of waves, rms values, share of the slopes explained."""
-
-    folder: str
-    waves: int
-    slope_deg: float
-    height_m: float
-    sigma_m: float
-    explained: float
-
-
-@dataclass(frozen=True)
-class CalmSummary:
-    """The result of `calm_frames`.
-
-    Attributes
-    ----------
-    corners : int
-        By which the frames were registered.
-    scatter_px, moved_px : float
-        Median scatter of a corner along an axis; largest movement of the frame's centre.
-    spread : float
-        Median over the image of the spread of the frames, grey values.
-    """
-
-    input: str
-    output: str
-    spread_file: str
-    frames: int
-    columns: int
-    rows: int
-    corners: int
-    scatter_px: float
-    moved_px: float
-    spread: float
-    seconds: float
-    water: WaterFound | None
-    notes: tuple[PcfixWarning, ...] = ()

@@ -23,7 +23,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import PcfixWarning
 from pcfix.lens.imaging import project, unproject
 from pcfix.libraries import photo_library
 from pcfix.model import BoolArray, FloatArray, Lens, WaterMesh, WaterPlane, WaterRaster
@@ -39,34 +38,6 @@ STRIP_ROWS = 512
 """Rows resampled at once, so that the places stay in the processor's cache."""
 CHANNELS_AT_ONCE = 4
 """OpenCV's limit."""
-
-
-@dataclass(frozen=True)
-class PhotosSummary:
-    """The result of `map_photos`.
-
-    Attributes
-    ----------
-    images, done_before : int
-        Images written, and those among them that an earlier call wrote.
-    black_share : float
-        Share of pixels without ground, occluded, or outside the original image.
-    spacing_px : int
-        Between the nodes of the grid.
-    """
-
-    images: int
-    done_before: int
-    megapixels: float
-    seconds: float
-    largest_shift_px: float
-    black_share: float
-    mapping: str
-    dsm: str
-    water: str
-    refractive_index: float
-    spacing_px: int
-    notes: tuple[PcfixWarning, ...]
 
 
 class Photo(NamedTuple):

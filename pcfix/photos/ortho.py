@@ -11,13 +11,11 @@ seams do not show.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import PcfixWarning
 from pcfix.lens.imaging import project
 from pcfix.model import BoolArray, FloatArray
 from pcfix.photos.mapping import Photo, Scene, hidden
@@ -32,23 +30,6 @@ BLACK = 3
 """Pixels up to this value (of 255) over an area of `BLACK_PX` squared have no picture."""
 BLACK_PX = 7
 REMAP_COLUMNS = 1024
-
-
-@dataclass(frozen=True)
-class OrthoSummary:
-    """The result of `pcfix.ortho_photo`; `covered_share` is that of the cells over the DSM."""
-
-    output: str
-    images: int
-    width: int
-    height: int
-    resolution_m: float
-    bounds_m: tuple[float, float, float, float]
-    covered_share: float
-    seconds: float
-    dsm: str
-    water: str | None
-    notes: tuple[PcfixWarning, ...]
 
 
 class Picture(NamedTuple):

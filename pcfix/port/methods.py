@@ -2,7 +2,7 @@ r"""Correct a cloud taken through a housing port: choose cameras, intersect, inv
 
 The inversion finds the true point that straight rays would reconstruct at the apparent one.
 
-As `pcfix.refract.consistent` at a water surface: software without a port model reconstructs from
+As `pcfix.refract.tracks` at a water surface: software without a port model reconstructs from
 the image points x_i of a true point Q the point P with the least squared residuals in the images,
 over straight rays. There the derivative by P is zero,
 
@@ -44,7 +44,7 @@ from pcfix.port.intersection import Rig, intersect_rays, lenses_of, port_views, 
 from pcfix.port.light import through_port
 from pcfix.port.shapes import Port
 from pcfix.refract.batch import Intersection, warn_of_unsolved
-from pcfix.refract.consistent import check_consistent
+from pcfix.refract.intersect import check_consistent
 from pcfix.refract.methods import batches, joined
 from pcfix.refract.tiling import spatial_order
 

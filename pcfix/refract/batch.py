@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from pcfix.errors import PcfixWarning, SettingError
 from pcfix.kernels import Span, device, in_tiles, kernel
-from pcfix.lens.algebra import Vector, times, transposed_times
+from pcfix.lens.algebra import Vector, dot, minus, row_of, times, transposed_times
 from pcfix.lens.imaging import direction_of, image_of, lens_table
 from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Outcome, Views, WaterSurface
 from pcfix.options.correct import ScienceOptions
@@ -42,65 +42,31 @@ UNLISTED, MAIN = -1, -2
 
 
 class Learned(NamedTuple):
-    """What was learned from the whole cloud; None where it was not.
+    """What was learned from the whole cloud; None where it was not."""
 
-    Attributes
-    ----------
-    regression : DepthRegression or None
-        From check depths, for the method of that name.
-    occluder : Occluder or None
-        The surface of the cloud.
-    matcher : Matcher or None
-        Which images were matched with each other.
-    bed : Bed or None
-        The bed that agrees with most fused points.
-    model_uncertainty : ModelUncertainty or None
-    land : Survey or None
-        For land that was transferred to adjusted cameras, if it differs.
-    poses : PoseErrors or None
-        Errors of Z from the adjusted poses.
-    """
-
-    regression: DepthRegression | None = None
-    occluder: Occluder | None = None
-    matcher: Matcher | None = None
-    bed: Bed | None = None
+    regression: DepthRegression | None = None  # for the method of that name
+    occluder: Occluder | None = None  # the surface of the cloud
+    matcher: Matcher | None = None  # which images were matched with each other
+    bed: Bed | None = None  # the bed that agrees with most fused points
+    dense: bool | None = None  # whether the cells of the cloud have enough points for polynomials
     model_uncertainty: ModelUncertainty | None = None
-    land: Survey | None = None
-    poses: PoseErrors | None = None
+    land: Survey | None = None  # for land transferred to adjusted cameras, if it differs
+    poses: PoseErrors | None = None  # errors of Z from the adjusted poses
 
 
 class ModelUncertainty(NamedTuple):
-    """Errors of Z beyond the error budget, estimated from the cloud.
+    """Errors of Z beyond the error budget, estimated from the cloud."""
 
-    Attributes
-    ----------
-    scatter_m : float
-        Of neighbours about a smooth bed, beyond the budget: mismatches.
-    per_depth : float
-        Standard deviation relative to the depth, from the unknown reconstruction type.
-    formal_m : float
-        Median standard error of the budget itself, metres.
-    """
-
-    scatter_m: float
-    per_depth: float
-    formal_m: float = 0.0
+    scatter_m: float  # of neighbours about a smooth bed, beyond the budget: mismatches
+    per_depth: float  # standard deviation by depth, from the unknown reconstruction type
+    formal_m: float = 0.0  # median standard error of the budget itself
 
 
 class OriginalModel(NamedTuple):
-    """The model from which m points came, if the cameras were adjusted since.
+    """The model from which m points came, if the cameras were adjusted since."""
 
-    Attributes
-    ----------
-    xyz : array, shape (m, 3)
-        Original apparent points, metres, world frame.
-    cameras : Cameras
-        Original cameras, in the order of the adjusted ones, with angles and lenses.
-    """
-
-    xyz: FloatArray
-    cameras: Cameras
+    xyz: FloatArray  # (m, 3), original apparent points, metres, world frame
+    cameras: Cameras  # in the order of the adjusted ones, with angles and lenses
 
     def take(self, rows: IntArray) -> OriginalModel:
         """Return some of the points."""
@@ -111,28 +77,15 @@ class OriginalModel(NamedTuple):
 class Survey:
     """What all points of a cloud have in common.
 
-    Attributes
-    ----------
-    water : WaterSurface
-        Needed for its shape where it is a mesh or raster.
-    cameras : Cameras
-        Projection centres and frames, world frame.
-    settings : ScienceOptions
-    level_offset_m : array, shape (k,), or None
-        How much higher the water stood when each image was taken. None: it did not move.
-    learned : Learned
-    parts : mapping
-        Surveys of points with another reconstruction type than most, by their source; `UNLISTED`
-        for those without a view list.
-    own_water : OwnWater or None
-        The water of single images as rasters, for ``snell`` and ``consistent``; beyond their edges
-        the rays are refracted at `water`.
+    `parts` are surveys of points with another reconstruction type than most, by their source, and
+    `UNLISTED` for those without a view list. `own_water` is the water of single images as rasters,
+    for ``snell`` and ``consistent``; beyond their edges the rays are refracted at `water`.
     """
 
     water: WaterSurface
     cameras: Cameras
     settings: ScienceOptions
-    level_offset_m: FloatArray | None = None
+    level_offset_m: FloatArray | None = None  # (k,), how much higher the water stood per image
     learned: Learned = field(default_factory=Learned)
     parts: Mapping[int, Survey] = field(default_factory=dict)
     own_water: OwnWater | None = None
@@ -149,32 +102,18 @@ class Survey:
 class Batch:
     """Submerged points, the water above them and the cameras that see them.
 
-    Attributes
-    ----------
-    xyz : array, shape (m, 3)
-        Apparent points, metres, world frame.
-    surface : SurfaceAbove
-        The water above each of them.
-    survey : Survey
-    views : Views or None
-        The cameras of each point: its view list or, once they are chosen, those that give it a
-        ray. None without a list.
-    original_model : OriginalModel or None
-        If `xyz` were transferred to adjusted cameras (`pcfix.adjust.transfer`). Dense matching is
-        inverted in the original model; the matcher then has its cameras.
-    level_sigma_m : array, shape (m,), or None
-        Standard deviation of the height of the surface above each point, from its fit.
-    source : array of int, shape (m,), or None
-        Point source IDs.
+    `views` are the view lists or, once they are chosen, the cameras that give each point a ray.
+    `original_model` is there if `xyz` were transferred to adjusted cameras
+    (`pcfix.adjust.transfer`): dense matching is inverted in it, and the matcher has its cameras.
     """
 
-    xyz: FloatArray
+    xyz: FloatArray  # (m, 3), apparent points, metres, world frame
     surface: SurfaceAbove
     survey: Survey
     views: Views | None = None
     original_model: OriginalModel | None = None
-    level_sigma_m: FloatArray | None = None
-    source: IntArray | None = None
+    level_sigma_m: FloatArray | None = None  # (m,), of the surface above each point, from its fit
+    source: IntArray | None = None  # (m,), point source IDs
 
     def take(self, rows: IntArray) -> Batch:
         """Return some of the points, in the order of `rows`."""
@@ -264,10 +203,7 @@ class Batch:
         In air; 90 and 0 where there is no ray.
         """
         cosine = np.empty((len(self), 2))
-        in_tiles(
-            _incidence, len(self), np.ascontiguousarray(self.xyz), self.normals(),
-            np.ascontiguousarray(self.survey.cameras.centres), *self.listed, cosine,
-        )  # fmt: skip
+        in_tiles(_incidence, len(self), self.chosen(), cosine)
         return np.degrees(np.arccos(np.clip(cosine, 0.0, 1.0)))
 
     def seen_flat(self) -> BoolArray:
@@ -284,14 +220,10 @@ class Batch:
         self,
         shift_m: FloatArray,
         *,
-        outcome: npt.NDArray[np.uint8] | None = None,
+        outcome: npt.NDArray[np.uint8],
         ray_miss_m: FloatArray | None = None,
     ) -> Intersection:
-        """Return the result of a method that gives shifts, shape (m, 3).
-
-        Points that are not moved get zeros.
-        """
-        outcome = self.outcome() if outcome is None else outcome
+        """Return the result of a method that gives shifts; zeros for points that are not moved."""
         moved = outcome == Outcome.CORRECTED
         zero = np.zeros(len(self.xyz))
         return Intersection(
@@ -324,24 +256,6 @@ def stacked(batches: list[Batch]) -> Batch:
     )
 
 
-@kernel
-def _incidence(
-    span: Span, xyz: FloatArray, normals: FloatArray, centres: FloatArray, start: IntArray,
-    camera: IntArray, cosine: FloatArray,
-) -> None:  # fmt: skip
-    """Write the largest and the smallest cosine of the incidence angles of each point's rays."""
-    for i in range(*span):
-        most, least = 0.0, 1.0
-        for at in range(start[i], start[i + 1]):
-            c, across, square = camera[at], 0.0, 0.0
-            for k in range(3):
-                way = centres[c, k] - xyz[i, k]
-                across, square = across + normals[i, k] * way, square + way * way
-            along = across / np.sqrt(square)
-            most, least = max(most, along), min(least, along)
-        cosine[i, 0], cosine[i, 1] = most, least
-
-
 class Intersection(NamedTuple):
     """The result for m submerged points; see `pcfix.Correction` for the meaning of each.
 
@@ -358,12 +272,25 @@ class Intersection(NamedTuple):
     camera_used: BoolArray
     covariance_m2: FloatArray | None = None
     unsure: BoolArray | None = None
+    ambiguity_m: FloatArray | None = None  # of Z, by the choice among groups of depth maps
 
     def take(self, rows: IntArray | BoolArray) -> Intersection:
         """Return the results of some points."""
         known = {name: value for name, value in self._asdict().items() if value is not None}
         known.pop("camera_used")
         return self._replace(**{name: value[rows] for name, value in known.items()})
+
+
+@kernel
+def _incidence(span: Span, points: Chosen, cosine: FloatArray) -> None:
+    """Write the largest and the smallest cosine of the incidence angles of each point's rays."""
+    for i in range(*span):
+        most, least = 0.0, 1.0
+        for at in range(points.start[i], points.start[i + 1]):
+            e = minus(row_of(points.centres, points.camera[at]), row_of(points.xyz, i))
+            along = dot(row_of(points.normals, i), e) / np.sqrt(dot(e, e))
+            most, least = max(most, along), min(least, along)
+        cosine[i, 0], cosine[i, 1] = most, least
 
 
 def require_orientation(cameras: Cameras, who: str, instead: str = "") -> None:
@@ -395,46 +322,26 @@ def warn_of_unsolved(beginning: str, found: BoolArray) -> None:
 
 
 class Chosen(NamedTuple):
-    """Points, the water above them and the cameras chosen for each, for kernels; see `Batch`.
+    """Points, the water above them and the cameras chosen for each, for kernels; see `Batch`."""
 
-    Attributes
-    ----------
-    xyz, original_xyz : array, shape (m, 3)
-        Apparent points, now and in the original model.
-    height : array, shape (m,)
-    slope : array, shape (m, 2)
-    normals : array, shape (m, 3)
-        Of the water above each point.
-    centres, offset : array, shapes (k, 3) and (k,)
-        Projection centres, and how much higher the water stood for each.
-    start, camera : array
-        Those of point i are ``camera[start[i] : start[i + 1]]``.
-    n : float
-        Refractive index.
-    """
-
-    xyz: FloatArray
-    original_xyz: FloatArray
-    height: FloatArray
-    slope: FloatArray
-    normals: FloatArray
-    centres: FloatArray
-    offset: FloatArray
-    start: IntArray
+    xyz: FloatArray  # (m, 3), apparent points
+    original_xyz: FloatArray  # the same in the original model
+    height: FloatArray  # (m,), of the water above each point
+    slope: FloatArray  # (m, 2)
+    normals: FloatArray  # (m, 3)
+    centres: FloatArray  # (k, 3), projection centres
+    offset: FloatArray  # (k,), how much higher the water stood for each camera
+    start: IntArray  # the cameras of point i are camera[start[i] : start[i + 1]]
     camera: IntArray
     n: float
 
 
 class Optics(NamedTuple):
-    """The angles and lenses of k cameras, for kernels.
+    """The angles and lenses of k cameras, for kernels."""
 
-    Rotations from the world, shape (k, 3, 3); the row of each lens in the table `lenses`, see
-    `pcfix.lens.imaging.lens_table`.
-    """
-
-    rotations: FloatArray
-    row: IntArray
-    lenses: FloatArray
+    rotations: FloatArray  # (k, 3, 3), from the world
+    row: IntArray  # (k,), of each camera in `lenses`
+    lenses: FloatArray  # see `pcfix.lens.imaging.lens_table`
 
 
 def optics_of(cameras: Cameras) -> Optics:
@@ -448,47 +355,27 @@ class Images(NamedTuple):
     """The k images in the original and in the adjusted cameras, for kernels.
 
     Without rows where both are the same: then no direction is rounded by two lenses.
-
-    Attributes
-    ----------
-    centres : array, shape (k, 3)
-        Of the original cameras, metres, world frame.
-    original, adjusted : Optics
     """
 
-    centres: FloatArray
+    centres: FloatArray  # (k, 3), of the original cameras, metres, world frame
     original: Optics
     adjusted: Optics
 
 
 def images_of(original_model: OriginalModel | None, now: Cameras) -> Images:
-    """Return the images for kernels.
-
-    Raises
-    ------
-    ValueError
-        If there are two sets of cameras, and one has no angles or no lenses, or they are not of
-        the same number.
-    """
-    if original_model is None or _are_equal(original_model.cameras, now):
+    """Return the images for kernels."""
+    original = now if original_model is None else original_model.cameras
+    if original is now or (
+        np.array_equal(original.centres, now.centres)
+        and original.lenses == now.lenses
+        and np.array_equal(np.asarray(original.rotations), np.asarray(now.rotations))
+    ):
         none = Optics(np.zeros((0, 3, 3)), np.zeros(0, np.int64), np.zeros((0, 1)))
         return Images(np.zeros((0, 3)), none, none)
-    original = original_model.cameras
     if original.lenses is None or now.lenses is None or len(original) != len(now):
         raise ValueError("the same images are needed twice, with angles and lenses")
     centres = np.ascontiguousarray(original.centres, np.float64)
     return Images(centres, optics_of(original), optics_of(now))
-
-
-def _are_equal(one: Cameras, other: Cameras) -> bool:
-    """Whether two sets of cameras are the same."""
-    return one is other or (
-        np.array_equal(one.centres, other.centres)
-        and one.lenses == other.lenses
-        and one.rotations is not None
-        and other.rotations is not None
-        and np.array_equal(one.rotations, other.rotations)
-    )
 
 
 @device

@@ -13,9 +13,9 @@ from pcfix.lens.frames import Frames, frames_of, holds, listed_frames_of
 from pcfix.model import Cameras, FloatArray, IntArray, Views, WaterMesh, WaterPlane, WaterRaster
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract import tiling
-from pcfix.refract.batch import Batch, Survey
+from pcfix.refract.batch import Batch, Chosen, Survey
 from pcfix.refract.rays import pierce_of
-from pcfix.refract.tiling import TILE, Points
+from pcfix.refract.tiling import TILE
 from pcfix.water.surface import Field, SurfaceAbove, Tin, build_fields, build_tin, locate
 
 NOMINAL_FOCAL_PX = 3700.0
@@ -30,35 +30,20 @@ ANY_NUMBER = 2**31
 
 
 class Rig(NamedTuple):
-    """The k cameras, for kernels.
+    """The k cameras, for kernels; metres, world frame."""
 
-    Attributes
-    ----------
-    centres : array, shape (k, 3)
-        Projection centres, metres, world frame.
-    offset : array, shape (k,)
-        How much higher the water stood for each, metres.
-    axes : array, shape (k, 3)
-        Optical axes, world frame. Zeros stand for an image in which equal angles are equally long,
-        as in a fisheye's, nearly.
-    focal_px : array, shape (k,)
-    """
-
-    centres: FloatArray
-    offset: FloatArray
-    axes: FloatArray
-    focal_px: FloatArray
+    centres: FloatArray  # (k, 3), projection centres
+    offset: FloatArray  # (k,), how much higher the water stood for each
+    axes: FloatArray  # (k, 3), optical axes; zeros for images of nearly equal angles (fisheyes)
+    focal_px: FloatArray  # (k,)
 
 
 class Rule(NamedTuple):
-    """Which rays count, and how they bend.
+    """Which rays count, and how they are refracted."""
 
-    Squared cosine of the largest incidence angle, most rays per point, 1 / n.
-    """
-
-    least_cosine2: float
-    most: int
-    bend: float
+    least_cosine2: float  # squared cosine of the largest incidence angle
+    most: int  # rays per point
+    bend: float  # 1 / n
 
 
 def rig_of(survey: Survey) -> Rig:
@@ -82,6 +67,11 @@ def rule_of(survey: Survey) -> Rule:
     return Rule(least, settings.max_cameras or ANY_NUMBER, 1.0 / settings.refractive_index)
 
 
+def is_bent(survey: Survey) -> bool:
+    """Whether the rays of a point may pierce the water under different slopes."""
+    return isinstance(survey.water, WaterMesh | WaterRaster) or survey.own_water is not None
+
+
 def shapes_of(survey: Survey) -> tuple[Tin | None, Field | None]:
     """Return a mesh, or the rasters of the images, for kernels; neither for a plane."""
     water, k = survey.water, len(survey.cameras)
@@ -96,34 +86,27 @@ def shapes_of(survey: Survey) -> tuple[Tin | None, Field | None]:
 def chosen_views(batch: Batch) -> Views:
     """Return the cameras whose rays each point gets, as a list.
 
-    Those of the list of the batch that can have imaged it (`pcfix.lens.frames.BESIDE`), or,
-    without a list, all in whose frame the point lies.
-
-    Returns
-    -------
-    Views
-        In the order of the cameras, or of the list; its weights are kept.
+    Those of the list of the batch, in its order and with its weights, that can have imaged the
+    point (`pcfix.lens.frames.BESIDE`); or, without a list, all in whose frame the point lies.
     """
     survey, views = batch.survey, batch.views
     if not len(survey.cameras):
         return Views(np.zeros(len(batch) + 1, np.int64), np.zeros(0, np.int64))
-    points, rig = tiling.points_of(batch), rig_of(survey)
+    points, rig = (tiling.spatial_order(batch.xyz), batch.chosen()), rig_of(survey)
     frames = frames_of(survey.cameras) if views is None else listed_frames_of(survey.cameras)
     tiles = tiling.tiles_of(batch)
     first, count = np.zeros(tiles + 1, np.int64), np.zeros(len(batch) + 1, np.int64)
     if views is None:
         in_tiles(_make_room, tiles, points, rig, frames, first)
-        begin, entries = np.empty(len(batch), np.int64), (first[:0], first[:0])
+        begin = np.empty(len(batch), np.int64)
         place = np.empty(np.cumsum(first, out=first)[-1], np.int32)
     else:
-        entries = batch.listed
-        begin = entries[0][:-1].copy()
+        begin = np.asarray(views.start[:-1], np.int64).copy()
         place = np.empty(len(views.camera), np.int32)
-    rule, (tin, fields), found = rule_of(survey), shapes_of(survey), (first, begin, count, place)
-    if views is None and tin is None and fields is None:
-        in_tiles(_choose_in_frame, tiles, points, rig, frames, rule, found)
-    else:
-        in_tiles(_choose_all, tiles, points, rig, frames, rule, tin, fields, entries, found)
+    found = first, begin, count, place
+    in_tiles(
+        _choose_all, tiles, points, rig, frames, rule_of(survey), *shapes_of(survey), found
+    )  # fmt: skip
     start = np.cumsum(count)
     # tiles left gaps between the entries of their points
     chosen = place[np.repeat(begin - start[:-1], count[1:]) + np.arange(start[-1])].astype(np.int64)
@@ -152,96 +135,91 @@ def cameras_of_pairs(pairs: Views) -> Views:
 
 
 @kernel(allocates=True)
-def _make_room(span: Span, points: Points, rig: Rig, frames: Frames, first: IntArray) -> None:
+def _make_room(
+    span: Span, given: tuple[IntArray, Chosen], rig: Rig, frames: Frames, first: IntArray
+) -> None:
     """Set how many entries each tile may get at most, one place on."""
-    low, high = tiling.corners_of(points.order[span[0] * TILE : span[1] * TILE], points.xyz)
+    order, points = given
+    low, high = tiling.corners_of(order[span[0] * TILE : span[1] * TILE], points.xyz)
     around = tiling.cameras_around(frames, rig.centres, low, high)
     for t in range(*span):
-        rows = points.order[t * TILE : (t + 1) * TILE]
+        rows = order[t * TILE : (t + 1) * TILE]
         low, high = tiling.gather(np.empty(7 * TILE), rows, points)
         first[t + 1] = rows.size * tiling.near_cameras(around, frames, rig.centres, low, high).size
 
 
 @kernel(allocates=True)
 def _choose_all(
-    span: Span, points: Points, rig: Rig, frames: Frames, rule: Rule, tin: Tin | None,
-    fields: Field | None, views: tuple[IntArray, IntArray],
+    span: Span, given: tuple[IntArray, Chosen], rig: Rig, frames: Frames, rule: Rule,
+    tin: Tin | None, fields: Field | None,
     found: tuple[IntArray, IntArray, IntArray, npt.NDArray[np.int32]],
 ) -> None:  # fmt: skip
-    """Choose point by point: from view lists, or under a mesh or raster.
+    """Choose the cameras of each point, a tile at a time.
 
     Fills in where the entries of point i begin, how many they are (at i + 1), and the entries. An
     entry is the number of a camera or, with view lists, that of one of their entries.
     """
-    (first, begin, count, place), listed = found, views[0].size > 0
-    low, high = tiling.corners_of(points.order[span[0] * TILE : span[1] * TILE], points.xyz)
-    around = views[1][:0] if listed else tiling.cameras_around(frames, rig.centres, low, high)
+    (order, points), (first, begin, count, place) = given, found
+    start, camera = points.start, points.camera
+    low, high = tiling.corners_of(order[span[0] * TILE : span[1] * TILE], points.xyz)
+    around = camera[:0] if start.size else tiling.cameras_around(frames, rig.centres, low, high)
     for t in range(*span):
-        rows = points.order[t * TILE : (t + 1) * TILE]
+        rows = order[t * TILE : (t + 1) * TILE]
         tile = np.empty(7 * TILE)
         low, high = tiling.gather(tile, rows, points)
-        near = tiling.near_cameras(around, frames, rig.centres, low, high)
-        # the tile has its own stretch of entries
-        free = first[t]
+        # without lists `around` has the cameras; the frame test is vectorised over the points
+        near, marks = tiling.marks_in_frame(
+            around, tile, frames, rig.centres, low, high, rows.size
+        )  # fmt: skip
+        free = first[t]  # the tile has its own stretch of entries
         for j in range(rows.size):
             i = rows[j]
             facet = -1 if tin is None else locate(tin, tile[j], tile[TILE + j])
-            candidates = near
-            if listed:
-                candidates = views[1][begin[i] : views[0][i + 1]]
+            if start.size:  # the entries of a point stay where they are in the list
+                candidates = camera[start[i] : start[i + 1]]
+                kept = _choose(candidates, None, tile, j, rig, frames, rule, tin, fields, facet)
+                for k in range(kept.size):
+                    place[begin[i] + k] = start[i] + kept[k]
             else:
                 begin[i] = free
-            # of view lists the entries of a point stay where they are in the list
-            kept = _choose(candidates, tile, j, rig, frames, rule, tin, fields, facet)
-            for k in range(kept.size):
-                at = kept[k]
-                place[begin[i] + k] = begin[i] + at if listed else candidates[at]
+                kept = _choose(near, marks, tile, j, rig, frames, rule, tin, fields, facet)
+                for k in range(kept.size):
+                    place[free + k] = near[kept[k]]
+                free += kept.size
             count[i + 1] = kept.size
-            free += kept.size
 
 
-@kernel(allocates=True)
-def _choose_in_frame(
-    span: Span, points: Points, rig: Rig, frames: Frames, rule: Rule,
-    found: tuple[IntArray, IntArray, IntArray, npt.NDArray[np.int32]],
-) -> None:  # fmt: skip
-    """Do as `_choose_all` without view lists and under planes, a tile of points at a time."""
-    first, begin, count, place = found
-    low, high = tiling.corners_of(points.order[span[0] * TILE : span[1] * TILE], points.xyz)
-    around = tiling.cameras_around(frames, rig.centres, low, high)
-    for t in range(*span):
-        rows = points.order[t * TILE : (t + 1) * TILE]
-        tile = np.empty(7 * TILE)
-        low, high = tiling.gather(tile, rows, points)
-        near, cosine2 = tiling.marks_in_frame(
-            around, tile, frames, rig.centres, low, high, rows.size
-        )
-        seeing = near.size
-        # first camera by camera, over all points; then point by point, over all cameras
-        for at in range(seeing):
-            # marks become squared cosines of incidence angles, negative for rays that do not count
-            centre, offset = row_of(rig.centres, near[at]), rig.offset[near[at]]
-            marks = cosine2[at]
-            for j in range(marks.size):
-                z = tile[2 * TILE + j]
-                e = minus(centre, (tile[j], tile[TILE + j], z))
-                height = dot((tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]), e)
-                h = tile[6 * TILE + j] * (tile[3 * TILE + j] - (z - offset))
-                length2 = dot(e, e)
-                # the camera is above the water, and its ray within the largest incidence angle
-                use = (height > h) & (height * height >= rule.least_cosine2 * length2)
-                marks[j] = height * height / length2 if use & (marks[j] > 0.0) else -1.0
-        free, steep = first[t], np.empty(seeing)
-        for j in range(rows.size):
-            k = 0
-            for at in range(seeing):
-                if cosine2[at, j] >= 0.0:
-                    place[free + k], steep[k] = near[at], cosine2[at, j]
-                    k += 1
-            # then drop what exceeds the largest number of rays
-            k = _keep_steepest(place[free:], steep, k, rule.most)
-            begin[rows[j]], count[rows[j] + 1] = free, k
-            free += k
+@device(allocates=True)
+def _choose(
+    candidates: IntArray, marks: FloatArray | None, tile: FloatArray, j: int, rig: Rig,
+    frames: Frames, rule: Rule, tin: Tin | None, fields: Field | None, facet: int,
+) -> npt.NDArray[np.int32]:  # fmt: skip
+    """Return the candidates that give a ray to point j of the tile, by their places, in order.
+
+    Their frames were tested before if there are marks. On a mesh or raster the incidence angle is
+    that at the piercing point.
+    """
+    chosen, cosine2 = np.empty(candidates.size, np.int32), np.empty(candidates.size)
+    is_limited = rule.least_cosine2 > 0.0 or rule.most < candidates.size
+    x, y, z = tile[j], tile[TILE + j], tile[2 * TILE + j]
+    upward = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
+    k = 0
+    for at in range(candidates.size):
+        c = candidates[at]
+        # water that stood higher for this image: the point is lowered instead
+        e, lowered = minus(row_of(rig.centres, c), (x, y, z)), (x, y, z - rig.offset[c])
+        inside = holds(frames, c, e) if marks is None else marks[at, j] > 0.0
+        h = upward[2] * (tile[3 * TILE + j] - lowered[2])
+        height, length2 = dot(upward, e), dot(e, e)
+        if not (inside and height > h):  # in the frame, and the camera above the water
+            continue
+        if h > 0.0 and is_limited and (tin is not None or fields is not None):
+            _, normal = pierce_of(c, tin, fields, lowered, e, h, upward, facet)
+            height = max(dot(normal, e), 0.0)
+        if height * height >= rule.least_cosine2 * length2:
+            chosen[k], cosine2[k] = at, height * height / length2
+            k += 1
+    return chosen[: _keep_steepest(chosen, cosine2, k, rule.most)]
 
 
 @device
@@ -257,36 +235,3 @@ def _keep_steepest(chosen: npt.NDArray[np.int32], cosine2: FloatArray, k: int, m
                 chosen[i], cosine2[i] = chosen[i + 1], cosine2[i + 1]
             chosen[most - 1], cosine2[most - 1] = chosen[j], cosine2[j]
     return min(k, most)
-
-
-@device(allocates=True)
-def _choose(
-    candidates: IntArray, tile: FloatArray, j: int, rig: Rig, frames: Frames, rule: Rule,
-    tin: Tin | None, fields: Field | None, facet: int,
-) -> npt.NDArray[np.int32]:  # fmt: skip
-    """Return the candidates that give a ray to point j of the tile, by their places, in order.
-
-    On a mesh or raster the incidence angle is that at the piercing point.
-    """
-    chosen, cosine2 = np.empty(candidates.size, np.int32), np.empty(candidates.size)
-    is_limited = rule.least_cosine2 > 0.0 or rule.most < candidates.size
-    x, y, z = tile[j], tile[TILE + j], tile[2 * TILE + j]
-    upward = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
-    k = 0
-    for at in range(candidates.size):
-        c = candidates[at]
-        # water that stood higher for this image: the point is lowered instead
-        e, lowered = minus(row_of(rig.centres, c), (x, y, z)), (x, y, z - rig.offset[c])
-        h = upward[2] * (tile[3 * TILE + j] - lowered[2])
-        height, length2 = dot(upward, e), dot(e, e)
-        # above the water, and in the frame
-        if not (height > h and holds(frames, c, e)):
-            continue
-        if h > 0.0 and is_limited and (tin is not None or fields is not None):
-            _, normal = pierce_of(c, tin, fields, lowered, e, h, upward, facet)
-            # the incidence angle at the piercing point
-            height = max(dot(normal, e), 0.0)
-        if height * height >= rule.least_cosine2 * length2:
-            chosen[k], cosine2[k] = at, height * height / length2
-            k += 1
-    return chosen[: _keep_steepest(chosen, cosine2, k, rule.most)]

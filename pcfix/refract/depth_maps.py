@@ -28,7 +28,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.kernels import device
-from pcfix.lens.algebra import Vector, beyond, dot, minus, plus, row_of, scaled, unit
+from pcfix.lens.algebra import Vector, beyond, dot, minus, normal_of, plus, row_of, scaled, unit
 from pcfix.lens.frames import holds
 from pcfix.model import FloatArray, IntArray
 from pcfix.refract.batch import (
@@ -41,8 +41,18 @@ from pcfix.refract.batch import (
     to_adjusted,
     to_original,
 )
-from pcfix.refract.cells import CUBIC
-from pcfix.refract.map_table import USUAL, Block, Table, has_terms, meet, read_table
+from pcfix.refract.map_table import (
+    CUBIC,
+    LAYER,
+    SHALLOWEST_M,
+    USUAL,
+    Block,
+    Table,
+    has_terms,
+    meet,
+    read_table,
+    water_at,
+)
 from pcfix.refract.matcher import MATCHED
 from pcfix.refract.rays import direction, light_path, refracted
 
@@ -73,59 +83,41 @@ _DISTANCE, AMBIGUITY, OUTCOME, _COUNT = 3, 4, 5, 6
 COLUMNS = 7
 """Columns that the kernels write: the shift, and these."""
 
+DEPTH, BY_HEIGHT, _X, _Y, _X_BY_HEIGHT, _Y_BY_HEIGHT = range(6)
+"""Columns of `Room.looks`: the depth of a bed in a map beyond P, by the distance of P from the
+camera, and its change with the height of the bed (1/m); the place on the bed, and its change."""
+
+ABSENT = -1
+
 
 class Sight(NamedTuple):
-    """One apparent point, for kernels.
+    """One apparent point, for kernels."""
 
-    Attributes
-    ----------
-    now, original : Vector
-        Its place now and in the original model, world frame.
-    above : float
-        Height of the water over it, along the normal, metres.
-    normal : Vector
-        Of the water, upward.
-    """
-
-    now: Vector
-    original: Vector
-    above: float
-    normal: Vector
+    now: Vector  # its place, world frame
+    original: Vector  # the same in the original model
+    above: float  # height of the water over it, along the normal, metres
+    normal: Vector  # of the water, upward
 
 
 class Room(NamedTuple):
-    """Temporary arrays for one point and the k images.
+    """Temporary arrays for one point and the k images."""
 
-    t, slope : shape (k,), of `Lines`.
-    weight, own, now : shape (k,), the weight of each map with what is averaged into it and without,
-    and its depth.
-    looks : shape (k, 6), of `_look`.
-    partners : shape (partners, 3), of `_compare`.
-    pairs : shape (pairs of partners, 2), of `best_pairs`.
-    powers : of the polynomials of a cell.
-    place, found : shape (k,), the place of each image among those found, and these images.
-    """
-
-    t: FloatArray
+    t: FloatArray  # (k,), of `Lines`
     slope: FloatArray
-    weight: FloatArray
-    own: FloatArray
-    now: FloatArray
-    looks: FloatArray
-    partners: FloatArray
-    pairs: FloatArray
-    powers: FloatArray
-    place: IntArray
-    found: IntArray
+    weight: FloatArray  # (k,), of each map, with what is averaged into it
+    again: FloatArray  # (k,), whether a map is looked at twice
+    looks: FloatArray  # (k, 6), of `_look`
+    partners: FloatArray  # (partners, 3), of `_compare`
+    pairs: FloatArray  # (pairs of partners, 2), of `best_pairs`
+    powers: FloatArray  # of the polynomials of a cell
 
 
 @device(allocates=True)
 def room_for(k: int) -> Room:
-    """Return temporary arrays in which no image has a place."""
+    """Return temporary arrays."""
     return Room(
-        np.empty(k), np.empty(k), np.empty(k), np.empty(k), np.empty(k), np.empty((k, 6)),
+        np.empty(k), np.empty(k), np.empty(k), np.empty(k), np.empty((k, 6)),
         np.empty((MATCHED, 3)), np.empty((MATCHED * MATCHED, 2)), np.empty(CUBIC),
-        np.full(k, ABSENT), np.empty(k, np.int64),
     )  # fmt: skip
 
 
@@ -146,38 +138,23 @@ def original_up(sight: Sight, block: Block, c: int) -> Vector:
 
 
 def intersection_of(batch: Batch, result: FloatArray) -> Intersection:
-    """Return the rows that the kernels wrote as a result; its `sigma_z_m` is the ambiguity.
-
-    The rays are those of the depth maps with a weight, averaged ones included.
-    """
+    """Return the rows that the kernels wrote as a result; its rays are the maps with a weight."""
     found = batch.result(
         result[:, :3], outcome=result[:, OUTCOME].astype(np.uint8), ray_miss_m=result[:, _DISTANCE]
     )
     moved = found.outcome == CORRECTED
     return found._replace(
-        sigma_z_m=np.where(moved, result[:, AMBIGUITY], 0.0),
+        ambiguity_m=np.where(moved, result[:, AMBIGUITY], 0.0),
         ray_count=np.where(moved, result[:, _COUNT], 0).astype(np.int32),
     )
 
 
-ABSENT = -1
-
-
 class Lines(NamedTuple):
-    """The depth of each map as a linear function of the height of the bed.
+    """The depth of each map as a linear function of the height of the bed; NaN without one."""
 
-    Attributes
-    ----------
-    bed : float
-        A height of the bed, relative to the apparent point, metres.
-    t, slope : array, shape (maps,)
-        The depth of that bed in the map beyond the apparent point, relative to the distance from
-        the camera, and its change with the height, 1/m. NaN where it has none.
-    """
-
-    bed: float
-    t: FloatArray
-    slope: FloatArray
+    bed: float  # a height of the bed, relative to the apparent point, metres
+    t: FloatArray  # (maps,), the depth of that bed; see `DEPTH`
+    slope: FloatArray  # its change with the height, 1/m
 
 
 @device
@@ -197,28 +174,45 @@ def find_lines(
 ) -> None:
     """Fill in the lines of the depth maps of some images.
 
-    The slope of a line comes from a second bed; in a cell with polynomials the first point
-    provides the slopes for all.
+    The slope of a line comes from a second bed, or from the middle of a cell with polynomials.
     """
-    again, rise = room.now[: maps.size], min(RISE * lines.bed, -LEAST_DEPTH_M)
+    again, rise = room.again[: maps.size], min(RISE * lines.bed, -LEAST_DEPTH_M)
     for q in range(maps.size):
         fitted = has_terms(table, maps[q])
-        again[q] = 1.0 if not fitted or table.steep[maps[q]] == 0.0 else 0.0
+        again[q] = 1.0 if not fitted or len(block.images.centres) else 0.0
     look(maps, again, lines.bed + rise, sight, block, table, room)
     for q in range(maps.size):
-        lines.slope[q] = room.looks[q, 0]
+        lines.slope[q] = room.looks[q, DEPTH]
     room.weight[: maps.size] = 1.0
     look(maps, room.weight, lines.bed, sight, block, table, room)
     for q in range(maps.size):
-        usual, lines.t[q] = room.looks[q, 5], room.looks[q, 0]
+        usual, lines.t[q] = room.looks[q, BY_HEIGHT], room.looks[q, DEPTH]
         if again[q] > 0.0:
             steep = (lines.slope[q] - lines.t[q]) / (rise * usual)
             # beyond that range other images agree best at the second bed
             steep = steep if abs(steep - 1.0) < STEEP else 1.0
-            room.looks[q, 5] *= steep
-            if has_terms(table, maps[q]):
-                table.steep[maps[q]] = steep
-        lines.slope[q] = room.looks[q, 5]
+            room.looks[q, BY_HEIGHT] *= steep
+        lines.slope[q] = room.looks[q, BY_HEIGHT]
+
+
+@device
+def set_steep(table: Table, layer: int, block: Block, room: Room) -> None:
+    """Set how the depths in the maps of a cell change with the bed, from a point in its middle."""
+    if len(block.images.centres):  # the middle has no place in the original model
+        return
+    (x, y), (_, b, c) = (table.middle[0], table.middle[1]), block.water
+    normal, depth = normal_of(b, c), SHALLOWEST_M * LAYER ** (layer - 0.5)
+    now = x, y, water_at(block, x, y) - depth
+    sight, out = Sight(now, now, normal[2] * depth, normal), room.looks[0]
+    bed = likely_bed(sight, block)
+    rise = min(RISE * bed, -LEAST_DEPTH_M)
+    for image in range(table.place.size):
+        if has_terms(table, image):
+            _look(out, image, bed + rise, sight, block, table, room)
+            further = out[DEPTH]
+            _look(out, image, bed, sight, block, table, room)
+            steep = (further - out[DEPTH]) / (rise * out[BY_HEIGHT])
+            table.steep[image] = steep if abs(steep - 1.0) < STEEP else 1.0
 
 
 @device
@@ -254,7 +248,7 @@ def settle_bed(
     row[OUTCOME] = NO_CAMERA if maps.size == 0 else ONE_CAMERA
     bed, looks, near = depths.bed, room.looks[: maps.size], CLOSE_M
     step = balance(depths.t, depths.slope, weight)
-    if table.place.size and maps.size:
+    if table.place.size and maps.size and not len(block.images.centres):
         c = maps[0]
         near = max(near, NEAR_PX * _length(sight, block, c) / block.matcher.focal_px[c])
     for _ in range(MAX_LOOKS):
@@ -265,13 +259,13 @@ def settle_bed(
             break
         bed += step
         look(maps, weight, bed, sight, block, table, room)
-        step = balance(looks[:, 0], looks[:, 5], weight)
+        step = balance(looks[:, DEPTH], looks[:, BY_HEIGHT], weight)
     # the true point is the weighted mean of the Q_i, moved by the rest of the step
     total, x, y, squares, count = 0.0, 0.0, 0.0, 0.0, 0.0
     for q in range(maps.size):
-        if weight[q] > 0.0 and looks[q, 5] == looks[q, 5]:
-            w, px = weight[q], looks[q, 1] + step * looks[q, 3]
-            py = looks[q, 2] + step * looks[q, 4]
+        if weight[q] > 0.0 and looks[q, BY_HEIGHT] == looks[q, BY_HEIGHT]:
+            w, px = weight[q], looks[q, _X] + step * looks[q, _X_BY_HEIGHT]
+            py = looks[q, _Y] + step * looks[q, _Y_BY_HEIGHT]
             total, x, y = total + w, x + w * px, y + w * py
             squares, count = squares + w * (px * px + py * py), count + 1.0
     if not (np.isfinite(step) and np.isfinite(squares)):
@@ -287,9 +281,7 @@ def _look(
 ) -> None:
     """Compute the depth of a bed, at a height relative to the apparent point P, in one depth map.
 
-    Writes the depth beyond P, relative to the distance from the camera; the place Q on the bed
-    (x, y); its change with the height (x, y); and approximately that of the depth. NaN where no
-    partner of image c sees the bed there.
+    Its change with the height is approximate. NaN where no partner of image c sees the bed there.
     """
     n, normal = block.points.n, sight.normal
     a, e, above = _ray(c, sight, block)
@@ -301,8 +293,8 @@ def _look(
     a, down = beyond(a, f, e), 1.0 / d[2]
     s = (bed - a[2]) * down  # along the refracted ray from the water to the bed
     q = a[0] + s * d[0], a[1] + s * d[1], bed
-    out[1], out[2] = q[0], q[1]
-    out[3], out[4] = d[0] * down, d[1] * down
+    out[_X], out[_Y] = q[0], q[1]
+    out[_X_BY_HEIGHT], out[_Y_BY_HEIGHT] = d[0] * down, d[1] * down
     depth, under, count = dot(normal, minus(a, q)), f * length, -1
     away, per_depth = length, length * per_across
     if len(block.images.centres):
@@ -314,14 +306,12 @@ def _look(
     if count < 0:
         count = _compare(room.partners, c, q, length, sight, block)
     t = best_pairs(room.partners[:count], room.pairs, block.matcher.tolerance_px2)
-    out[0] = t / length
+    out[DEPTH] = t / length
     # the change of the depth with the bed is nearly that of the whole water column
     change = (t + under) / depth if depth > LEAST_DEPTH_M else per_depth / n
     change = min(max(change, LEAST_CHANGE * per_depth), MOST_CHANGE * per_depth)
-    steep = 1.0
-    if table.place.size and table.steep[c] != 0.0:
-        steep = table.steep[c]
-    out[5] = -steep * change / length if t == t else np.nan
+    steep = table.steep[c] if table.place.size else 1.0
+    out[BY_HEIGHT] = -steep * change / length if t == t else np.nan
 
 
 @device

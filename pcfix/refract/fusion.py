@@ -18,11 +18,9 @@ of all. So the height that most points around can have come from, the bed of the
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import dot
@@ -30,10 +28,19 @@ from pcfix.lens.frames import holds
 from pcfix.model import FloatArray, IntArray
 from pcfix.refract import depth_maps
 from pcfix.refract.batch import Batch, Intersection
-from pcfix.refract.cells import are_same, cameras_of, cells_of, counts_of, is_quick
 from pcfix.refract.depth_maps import ABSENT, AVERAGED_WITHIN, Lines, Room, Sight
-from pcfix.refract.map_table import LEAST_POINTS, Block, Table, block_of, no_table, reads, table_of
+from pcfix.refract.map_table import (
+    LEAST_POINTS,
+    Block,
+    Table,
+    block_of,
+    layers_of,
+    no_table,
+    reads,
+    table_of,
+)
 from pcfix.refract.matcher import WIDTH_M, Matcher
+from pcfix.refract.tiling import are_same, cameras_of, cells_of, counts_of
 
 AGREE = 0.01
 """Depths that differ by less, relative, are fused."""
@@ -45,96 +52,71 @@ _ROUNDS, _BEDS = 4, 3
 FAR = 0.1
 """Of the way to the bed: farther off, it is decided anew which depths were averaged."""
 
-LEAST_LIKELY, MOST_LIKELY = 0.7, 2.0
 _OUTSIDE = -2
 
 
 def invert_fusion(batch: Batch) -> Intersection:
     """Return the true points from which fused depth maps would have made the apparent ones.
 
-    Parameters
-    ----------
-    batch : Batch
-        Its views are all images that see each point. `batch.survey.learned` has the matcher and, if
-        it was learned, the bed of the surroundings; without it the largest group made the point.
+    The views of the batch are all images that see each point. `batch.survey.learned` has the
+    matcher and perhaps the bed of the surroundings; without it the largest group made the point.
     """
     bed = batch.survey.learned.bed
     around = np.full(len(batch.xyz), np.nan) if bed is None else bed.height_at(batch.xyz[:, :2])
     result = np.zeros((len(batch.xyz), depth_maps.COLUMNS))
-    _in_cells(batch, _fuse_cells, around, result, np.zeros((0, 0), np.float32))
+    _in_cells(batch, False, around, result, np.zeros((0, 0), np.float32))
     return depth_maps.intersection_of(batch, result)
 
 
 def likely_beds(batch: Batch) -> FloatArray:
     """Return the heights of the bed from which different groups of images would have made points.
 
-    Returns
-    -------
-    array of float32, shape (m, most views)
-        Relative to each apparent point, metres; NaN where there is none.
+    Relative to each apparent point, metres, float32, shape (m, most views); NaN if there is none.
     """
     likely = np.full((len(batch.xyz), max(1, batch.counts.max(initial=0))), np.nan, np.float32)
-    _in_cells(batch, _fuse_cells, np.zeros(0), np.zeros((0, 0)), likely)
+    _in_cells(batch, False, np.zeros(0), np.zeros((0, 0)), likely)
     return likely
 
 
 def invert_depth_maps(batch: Batch) -> Intersection:
     """Return the true points from which dense matching would have made the apparent ones.
 
-    Parameters
-    ----------
-    batch : Batch
-        Its views are the images whose depth maps were fused, with their weights;
-        `batch.survey.learned.matcher` has how they were matched.
-
-    Notes
-    -----
-    The surface above each point is taken as a plane.
+    The views of the batch are the images whose depth maps were fused, with their weights;
+    `batch.survey.learned.matcher` has how they were matched. The surface above each point is taken
+    as a plane.
     """
     weights, result = batch.rays.weight, np.zeros((len(batch.xyz), depth_maps.COLUMNS))
     given = np.zeros(0) if weights is None else weights.astype(np.float64)
-    _in_cells(batch, _invert_listed, given, result)
+    _in_cells(batch, True, given, result, np.zeros((0, 0), np.float32))
     return depth_maps.intersection_of(batch, result)
 
 
-def _in_cells(batch: Batch, run: Callable[..., None], *given: npt.NDArray[Any]) -> None:
-    order, first = cells_of(batch)
+def _in_cells(
+    batch: Batch, listed: bool, given: FloatArray, result: FloatArray, likely: FloatArray
+) -> None:
+    layer, dense = layers_of(batch), batch.survey.learned.dense
+    order, first = cells_of(batch, layer)
+    # which cells have polynomials is one decision for the whole cloud
+    least = LEAST_POINTS if dense is None else 1 if dense else len(batch) + 1
     in_tiles(
-        run, len(first) - 1, (order, first), block_of(batch), is_quick(batch), *given,
-        points=len(batch),
+        _invert_cells, len(first) - 1, (order, first, layer), block_of(batch), least, listed,
+        given, result, likely, points=len(batch),
     )  # fmt: skip
 
 
 class Groups(NamedTuple):
-    """Which of the k depth maps of a point were averaged and fused with which, for kernels.
+    """Which of the k depth maps of a point were averaged and fused with which, for kernels."""
 
-    Attributes
-    ----------
-    averaged, fused : array, shape (k, 9) and (k, 13)
-        For each map itself and its partners, by their places among those of the point; -1 after
-        the last.
-    place : array, shape (k,)
-        The place of each image among those of the point, or -1.
-    share : array, shape (k,)
-        The weight of each map.
-    depth, change : array, shape (k,)
-        The averaged depth of each map, relative, and its change with the height of the bed, 1/m.
-    rise, size : array, shape (k,)
-        How far up the bed is if the group of each seed made the point, metres, and the number of
-        maps in the group.
-    own : array, shape (k,)
-        The depth of each map before it is averaged.
-    """
-
-    averaged: IntArray
-    fused: IntArray
-    place: IntArray
-    share: FloatArray
-    depth: FloatArray
-    change: FloatArray
-    rise: FloatArray
-    size: FloatArray
-    own: FloatArray
+    averaged: IntArray  # (k, 9), each map and its partners by their places; -1 after the last
+    fused: IntArray  # (k, 13), likewise
+    place: IntArray  # (k,), of each image among those of the point, or `ABSENT`
+    found: IntArray  # (k,), the images of a point with a list
+    share: FloatArray  # (k,), the weight of each map
+    depth: FloatArray  # (k,), the averaged depth of each map, relative
+    change: FloatArray  # (k,), its change with the height of the bed, 1/m
+    rise: FloatArray  # (k,), how far up the bed is if the group of a seed made the point, metres
+    size: FloatArray  # (k,), the number of maps in the group
+    own: FloatArray  # (k,), the depth of each map before it is averaged
 
 
 @device
@@ -160,44 +142,57 @@ def _place(members: IntArray, q: int, others: IntArray, place: IntArray) -> None
 
 
 @kernel(allocates=True)
-def _fuse_cells(
-    span: Span, cells: tuple[IntArray, IntArray], block: Block, quick: bool, around: FloatArray,
-    result: FloatArray, likely: FloatArray,
+def _invert_cells(
+    span: Span, cells: tuple[IntArray, IntArray, IntArray], block: Block, least: int, listed: bool,
+    given: FloatArray, result: FloatArray, likely: FloatArray,
 ) -> None:  # fmt: skip
-    """Invert the fusion of the points of each cell or, where `likely` has rows, fill these in."""
-    points, (order, first) = block.points, cells
-    room, none = depth_maps.room_for(len(points.centres)), no_table()
-    k, matcher = len(points.centres), block.matcher
+    """Invert the fusion of the points of each cell or, where `likely` has rows, fill these in.
+
+    With lists `given` are the weights of their entries, if there are any; without, the heights of
+    the bed of the surroundings.
+    """
+    points, (order, first, layer), matcher = block.points, cells, block.matcher
+    k, none = len(points.centres), no_table()
+    room = depth_maps.room_for(k)
     groups = Groups(
         np.full((k, matcher.averaged.shape[1] + 1), ABSENT),
         np.full((k, matcher.fused.shape[1] + 1), ABSENT),
-        np.full(k, ABSENT), np.empty(k), np.empty(k), np.empty(k), np.empty(k), np.empty(k),
-        np.empty(k),
+        np.full(k, ABSENT), np.empty(k, np.int64), np.empty(k), np.empty(k), np.empty(k),
+        np.empty(k), np.empty(k), np.empty(k),
     )  # fmt: skip
     for cell in range(*span):
         rows = order[first[cell] : first[cell + 1]]
         fitted = none
-        if quick and rows.size >= LEAST_POINTS:
-            fitted = table_of(rows, counts_of(rows, points) > 0, block)
+        if rows.size >= least and reads(block, rows[0]):
+            seeing = counts_of(rows, points) > 0
+            for c in np.flatnonzero(seeing) if listed else rows[:0]:
+                for a in matcher.averaged[c]:  # maps that were averaged into those of the lists
+                    seeing[a] = seeing[a] or a >= 0
+            fitted = table_of(rows[0], layer[rows[0]], seeing, block)
+            depth_maps.set_steep(fitted, layer[rows[0]], block, room)
         for at in range(rows.size):
-            i, maps = rows[at], cameras_of(points, rows[at])
+            i, cameras = rows[at], cameras_of(points, rows[at])
+            table = fitted if reads(block, i) else none
+            sight = depth_maps.sight_of(points, i)
+            if listed:
+                weight = given[points.start[i] : points.start[i + 1]] if given.size else given
+                _invert_listed(result[i], cameras, weight, groups, sight, block, table, room)
+                continue
             # points with the same cameras share their groups
-            if at == 0 or not are_same(maps, cameras_of(points, rows[at - 1])):
-                _group(groups, maps, block.matcher)
-            table = fitted if reads(fitted, points, i) else none
+            if at == 0 or not are_same(cameras, cameras_of(points, rows[at - 1])):
+                _group(groups, cameras, matcher)
             if len(likely):
-                _set_likely(likely[i], i, maps, groups, block, table, room)
+                _set_likely(likely[i], cameras, groups, sight, block, table, room)
             else:
-                _invert_one(result[i], i, maps, around[i], groups, block, table, room)
+                _invert_one(result[i], cameras, given[i], groups, sight, block, table, room)
 
 
 @device
 def _set_likely(
-    likely: FloatArray, i: int, maps: IntArray, groups: Groups, block: Block, table: Table,
+    likely: FloatArray, maps: IntArray, groups: Groups, sight: Sight, block: Block, table: Table,
     room: Room,
 ) -> None:  # fmt: skip
     """Write the height of the bed if the group of each seed had made the point."""
-    sight = depth_maps.sight_of(block.points, i)
     bed = depth_maps.likely_bed(sight, block)
     depths = _rises_of(bed, maps, groups, sight, block, table, room)
     for seed in range(maps.size):
@@ -207,11 +202,10 @@ def _set_likely(
 
 @device
 def _invert_one(
-    row: FloatArray, i: int, maps: IntArray, around: float, groups: Groups, block: Block,
+    row: FloatArray, maps: IntArray, around: float, groups: Groups, sight: Sight, block: Block,
     table: Table, room: Room,
 ) -> None:  # fmt: skip
     """Find the group that made a point, and invert the fusion of its maps."""
-    sight = depth_maps.sight_of(block.points, i)
     wanted, bed = around - sight.now[2], depth_maps.likely_bed(sight, block)
     if wanted == wanted:  # the bed of the surroundings is known
         bed = max(min(wanted, SHALLOW * bed), DEEP * bed)
@@ -220,8 +214,25 @@ def _invert_one(
     weight = room.weight[: maps.size]
     weight[:] = 0.0
     if seed >= 0:
-        _weigh(weight, seed, rise, groups, depths)
+        # a map that agrees shares its weight with the maps it was averaged with
+        _average_around(seed, groups, depths, rise)
+        for q in groups.fused[seed]:
+            if q < 0:
+                break
+            if abs(groups.depth[q] - groups.depth[seed]) < AGREE:
+                _share(weight, q, groups.share[q], groups)
     depth_maps.settle_bed(row, maps, weight, depths, sight, block, table, room)
+
+
+@device
+def _share(weight: FloatArray, q: int, share: float, groups: Groups) -> None:
+    """Add the weight of a depth map evenly to the maps that were averaged into it."""
+    count = 0.0
+    for a in groups.averaged[q]:
+        count += a >= 0 and abs(groups.own[a] - groups.own[q]) < AVERAGED_WITHIN
+    for a in groups.averaged[q]:
+        if a >= 0 and abs(groups.own[a] - groups.own[q]) < AVERAGED_WITHIN:
+            weight[a] += share / count
 
 
 @device
@@ -275,7 +286,8 @@ def _set_rises(groups: Groups, depths: Lines) -> None:
     Which maps agree is decided for the bed of the lines, and again for that of each group.
     """
     k = depths.t.size
-    _set_depths(groups, depths, 0.0)
+    for q in range(k):
+        groups.own[q] = depths.t[q]
     for q in range(k):
         _average(q, groups, depths)
     for seed in range(k):
@@ -289,18 +301,12 @@ def _set_rises(groups: Groups, depths: Lines) -> None:
 @device
 def _average_around(seed: int, groups: Groups, depths: Lines, rise: float) -> None:
     """Average the depths that may be fused with that of a seed, for a bed higher by `rise`."""
-    _set_depths(groups, depths, rise)
+    for q in range(depths.t.size):
+        groups.own[q] = depths.t[q] + depths.slope[q] * rise
     for q in groups.fused[seed]:
         if q < 0:
             break
         _average(q, groups, depths)
-
-
-@device
-def _set_depths(groups: Groups, depths: Lines, rise: float) -> None:
-    """Set the depth of each map for a bed higher by `rise`."""
-    for q in range(depths.t.size):
-        groups.own[q] = depths.t[q] + depths.slope[q] * rise
 
 
 @device
@@ -335,68 +341,15 @@ def _fuse(seed: int, groups: Groups) -> tuple[float, float]:
 
 
 @device
-def _weigh(weight: FloatArray, seed: int, rise: float, groups: Groups, depths: Lines) -> None:
-    """Write the weight of each depth map in the group of a seed.
-
-    The weight of a map that agrees goes evenly to the maps it was averaged with.
-    """
-    t, slope = depths.t, depths.slope
-    _average_around(seed, groups, depths, rise)
-    for q in groups.fused[seed]:
-        if q < 0:
-            break
-        if not abs(groups.depth[q] - groups.depth[seed]) < AGREE:
-            continue
-        # its partners that agree at this bed
-        own, count = t[q] + slope[q] * rise, 0.0
-        for a in groups.averaged[q]:
-            count += a >= 0 and abs(t[a] + slope[a] * rise - own) < AVERAGED_WITHIN
-        for a in groups.averaged[q]:
-            if a >= 0 and abs(t[a] + slope[a] * rise - own) < AVERAGED_WITHIN:
-                weight[a] += groups.share[q] / count
-
-
-@kernel(allocates=True)
 def _invert_listed(
-    span: Span, cells: tuple[IntArray, IntArray], block: Block, quick: bool, weight: FloatArray,
-    result: FloatArray,
-) -> None:  # fmt: skip
-    points, (order, first) = block.points, cells
-    room, none = depth_maps.room_for(len(points.centres)), no_table()
-    for cell in range(*span):
-        rows = order[first[cell] : first[cell + 1]]
-        fitted = none
-        if quick and rows.size >= LEAST_POINTS:
-            # the listed images, and those whose maps were averaged into theirs
-            listed = counts_of(rows, points) > 0
-            seeing = listed.copy()
-            for c in range(listed.size):
-                for a in block.matcher.averaged[c]:
-                    if listed[c] and a >= 0:
-                        seeing[a] = True
-            fitted = table_of(rows, seeing, block)
-        for i in rows:
-            begin, end = points.start[i], points.start[i + 1]
-            given = weight[begin:end] if weight.size else weight
-            table = fitted if reads(fitted, points, i) else none
-            _invert_listed_one(result[i], i, points.camera[begin:end], given, block, table, room)
-
-
-@device
-def _invert_listed_one(
-    row: FloatArray, i: int, listed: IntArray, given: FloatArray, block: Block, table: Table,
-    room: Room,
+    row: FloatArray, listed: IntArray, given: FloatArray, groups: Groups, sight: Sight,
+    block: Block, table: Table, room: Room,
 ) -> None:  # fmt: skip
     """Invert the fusion of the maps in the list of a point, with their weights."""
-    sight, averaged = depth_maps.sight_of(block.points, i), block.matcher.averaged
-    maps = room.found[: _with_neighbours(room.found, room.place, listed, sight, block)]
-    t, slope = room.t[: maps.size], room.slope[: maps.size]
-    counts, own = room.weight[: maps.size], room.own[: listed.size]
-    for k in range(listed.size):
-        made = depth_maps.original_up(sight, block, listed[k])
-        own[k] = given[k] if given.size else 1.0 / dot(made, made)
-    likely, step = depth_maps.likely_bed(sight, block), 0.0
-    bed = likely * table.likely[0]
+    maps = groups.found[: _with_neighbours(groups, listed, sight, block)]
+    _group(groups, maps, block.matcher)
+    t, slope, weight = room.t[: maps.size], room.slope[: maps.size], room.weight[: maps.size]
+    bed, step = depth_maps.likely_bed(sight, block), 0.0
     for _ in range(_BEDS):
         bed += step
         # which depths agree depends on the bed, and the bed on which agree
@@ -404,35 +357,25 @@ def _invert_listed_one(
         step = 0.0
         for _ in range(_ROUNDS):
             for q in range(maps.size):
-                room.now[q] = t[q] + slope[q] * step
-            _share(counts, listed, own, room.now, averaged, room.place)
-            step = depth_maps.balance(t, slope, counts)
+                groups.own[q], weight[q] = t[q] + slope[q] * step, 0.0
+            for k in range(listed.size):
+                up = depth_maps.original_up(sight, block, listed[k])
+                share = given[k] if given.size else 1.0 / dot(up, up)
+                _share(weight, groups.place[listed[k]], share, groups)
+            step = depth_maps.balance(t, slope, weight)
         if not abs(step) > FAR * abs(bed):
             break
-    depth_maps.settle_bed(row, maps, counts, Lines(bed, t, slope), sight, block, table, room)
-    # the next point of the cell starts from the depth ratio of this one
-    if table.place.size:
-        table.likely[0] = min(max(row[2] / likely, LEAST_LIKELY), MOST_LIKELY)
-    for q in maps:
-        room.place[q] = ABSENT
-    for c in listed:
-        for a in averaged[c]:
-            if a >= 0:
-                room.place[a] = ABSENT
+    depth_maps.settle_bed(row, maps, weight, Lines(bed, t, slope), sight, block, table, room)
 
 
 @device
-def _with_neighbours(
-    found: IntArray, place: IntArray, listed: IntArray, sight: Sight, block: Block
-) -> int:
-    """Gather the listed images, and their partners whose frames hold the point.
-
-    Returns how many they are; `place` gets the place of each image among them.
-    """
-    count, matcher = 0, block.matcher
+def _with_neighbours(groups: Groups, listed: IntArray, sight: Sight, block: Block) -> int:
+    """Gather the listed images, and their partners whose frames hold the point; return how many."""
+    count, matcher, place = 0, block.matcher, groups.place
+    place[:] = ABSENT
     for c in listed:
         if place[c] < 0:
-            place[c], found[count] = count, c
+            place[c], groups.found[count] = count, c
             count += 1
         for a in matcher.averaged[c]:
             if a < 0:
@@ -441,32 +384,6 @@ def _with_neighbours(
             if place[a] == ABSENT:
                 place[a] = _OUTSIDE
                 if holds(matcher.inner, a, depth_maps.original_up(sight, block, a)):
-                    place[a], found[count] = count, a
+                    place[a], groups.found[count] = count, a
                     count += 1
     return count
-
-
-@device
-def _share(
-    counts: FloatArray, listed: IntArray, own: FloatArray, now: FloatArray, averaged: IntArray,
-    place: IntArray,
-) -> None:  # fmt: skip
-    """Set the weight of each depth map in the point, by the depths `now`."""
-    counts[:] = 0.0
-    for k in range(listed.size):
-        at, members = place[listed[k]], 1.0
-        for a in averaged[listed[k]]:
-            members += _averages(at, a, now, place)
-        # the map and its partners share its weight evenly
-        counts[at] += own[k] / members
-        for a in averaged[listed[k]]:
-            if _averages(at, a, now, place):
-                counts[place[a]] += own[k] / members
-
-
-@device
-def _averages(own: int, a: int, now: FloatArray, place: IntArray) -> bool:
-    """Whether a depth is averaged with that of image a: both see the place, at nearly one depth."""
-    if a < 0 or place[a] < 0:
-        return False
-    return bool(abs(now[place[a]] - now[own]) < AVERAGED_WITHIN)

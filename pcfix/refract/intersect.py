@@ -1,9 +1,9 @@
-"""Intersect the refracted rays of each point (method ``snell``).
+"""Intersect the refracted rays of each point (``snell``), or search its tracks (``consistent``).
 
-Two kernels form the same sums. `_all_in_frame` takes every camera whose frame holds the point; its
-inner loop runs over the points of a tile and is vectorised. `_chosen` takes a list of cameras per
-point (view lists, or the steepest few), or a mesh or raster, point by point. Both add the same
-terms in the order of the cameras, so that they agree to the bit wherever both apply.
+Points are processed a tile of neighbours at a time and camera by camera, so that the inner loop
+runs over the points of the tile and is vectorised. The cameras are those whose frames hold the
+points, or those of a list per point (view lists, or the steepest few); both add the same terms in
+the order of the cameras.
 
 Each camera may have its own water level, the surface shifted along the vertical. The point is
 lowered by the shift instead, where only its distance from the surface counts. A camera whose water
@@ -16,179 +16,147 @@ from __future__ import annotations
 import numpy as np
 
 from pcfix.kernels import Span, device, in_tiles, kernel
-from pcfix.lens.algebra import dot, minus, row_of, scaled
-from pcfix.lens.frames import NOT_DISTORTED, Frames, Pyramid, frames_of, in_frame, may_hold, pyramid
-from pcfix.model import BoolArray, FloatArray, IntArray
+from pcfix.lens.algebra import Nine, Vector, dot, minus, row_of, scaled, vector
+from pcfix.lens.frames import (
+    NOT_DISTORTED,
+    Frames,
+    Pyramid,
+    frames_of,
+    in_frame,
+    may_hold,
+    no_frames,
+    pyramid,
+)
+from pcfix.model import BoolArray, Cameras, FloatArray, IntArray
 from pcfix.refract import tiling, uncertainty
-from pcfix.refract.batch import CORRECTED, NO_CAMERA, ONE_CAMERA, PARALLEL, Batch, Intersection
+from pcfix.refract.batch import (
+    CORRECTED,
+    NO_CAMERA,
+    ONE_CAMERA,
+    PARALLEL,
+    Batch,
+    Chosen,
+    Intersection,
+    Optics,
+    optics_of,
+    require_orientation,
+    warn_of_unsolved,
+)
 from pcfix.refract.choice import Rig, Rule, rig_of, rule_of, shapes_of
-from pcfix.refract.rays import add_line, line_terms, nearest_point, pierce_of, refracted
-from pcfix.refract.sensitivity import Budget, room_of
-from pcfix.refract.tiling import TILE, Points, points_of, tiles_of
+from pcfix.refract.rays import line_terms, nearest_point, pierce_of, refracted
+from pcfix.refract.tiling import TILE, nine, spatial_order, three, tiles_of
+from pcfix.refract.tracks import FOUND, LOST, POINT_RUNS, RAY_RUNS, SEARCHED, STATE, Q, search_tile
+from pcfix.refract.uncertainty import Budget, room_of
 from pcfix.water.surface import Field, Tin, locate
+
+# Columns of the result: a row is one cache line, as points are written in scattered order.
+_DISTANCE, _INCIDENCE, _COUNT, _OUTCOME, _FOUND, _WIDTH = 3, 4, 5, 6, 7, 8
 
 
 def intersect(batch: Batch) -> Intersection:
-    """Re-intersect the refracted rays of points with chosen cameras.
+    """Re-intersect the refracted rays of points (``snell``).
 
-    Returns
-    -------
-    Intersection
-        `sigma_z_m` is that of the scatter of the rays.
+    The cameras are those of the views or, without these, all whose frames hold the apparent point,
+    as that is where the SfM software projected it. The covariances, where the settings ask for
+    them, are computed in the same pass.
 
     Notes
     -----
     Skarlatos & Agrafiotis 2018, eqs 10 and 11, for any number of rays with equal weight.
     """
-    survey = batch.survey
-    result, used = np.zeros((len(batch), 8)), np.zeros(len(survey.cameras), np.bool_)
+    return _intersected(batch, None)
+
+
+def consistent(batch: Batch) -> Intersection:
+    """Find the true points whose images give the apparent points, by straight rays.
+
+    Cameras and covariances are as of `intersect`; see `pcfix.refract.tracks`. Weights of the views
+    are not used, as software triangulates with equal weights. Light is refracted for a camera whose
+    water stood above the true point; for ``snell`` it is the apparent point.
+
+    `ray_miss_m` is the distance from the refracted rays of the apparent point, as for ``snell``.
+    Points without a solution, under waves that focus the light, get that of ``snell``, with a
+    warning.
+    """
+    check_consistent(batch.survey.cameras)
+    return _intersected(batch, optics_of(batch.survey.cameras))
+
+
+def check_consistent(cameras: Cameras) -> None:
+    """Raise SettingError if cameras have no angles or no lenses."""
+    require_orientation(cameras, "Method consistent", "use method snell")
+
+
+def _intersected(batch: Batch, optics: Optics | None) -> Intersection:
+    survey, views = batch.survey, batch.views
+    result, used = np.zeros((len(batch), _WIDTH)), np.zeros(len(survey.cameras), np.bool_)
+    rule, frames = rule_of(survey), frames_of(survey.cameras)
+    if views is not None:  # the rays are chosen
+        rule, frames = rule._replace(least_cosine2=0.0), no_frames(len(survey.cameras))
+    covariance = np.zeros((len(batch) if survey.settings.dimensions == "all" else 0, 6))
+    errors = uncertainty.budget_of(survey), uncertainty.level_sigma_of(batch)
     in_tiles(
-        _chosen, tiles_of(batch), points_of(batch), rig_of(survey), rule_of(survey),
-        *shapes_of(survey),
-        batch.listed, result, used,
+        _intersect, tiles_of(batch), spatial_order(batch.xyz), batch.chosen(), rig_of(survey),
+        frames, rule, optics, *shapes_of(survey), *errors, (result, used, covariance),
         points=len(batch),
     )  # fmt: skip
-    return _as_intersection(result, used)
-
-
-def intersect_in_frame(batch: Batch) -> Intersection:
-    """Re-intersect the refracted rays of every camera whose frame holds a point.
-
-    The surface is a plane above each point. The covariances are computed in the same pass, where
-    the settings ask for them, so that the frames are looked at once.
-
-    Notes
-    -----
-    The frame test is for the apparent point, as that is where the SfM software projected it.
-    """
-    survey = batch.survey
-    result, used = np.zeros((len(batch), 8)), np.zeros(len(survey.cameras), np.bool_)
-    covariance = np.zeros((len(batch) if survey.settings.dimensions == "all" else 0, 6))
-    in_tiles(
-        _all_in_frame, tiles_of(batch), points_of(batch), rig_of(survey), frames_of(survey.cameras),
-        rule_of(survey), uncertainty.budget_of(survey), uncertainty.level_sigma_of(batch),
-        (result, used, covariance), points=len(batch),
-    )  # fmt: skip
-    found = _as_intersection(result, used)
-    return uncertainty.with_errors(found, covariance if len(covariance) == len(batch) else None)
-
-
-def _as_intersection(result: FloatArray, used: BoolArray) -> Intersection:
-    return Intersection(
+    outcome = result[:, _OUTCOME].astype(np.uint8)
+    moved = outcome == CORRECTED
+    warn_of_unsolved("method consistent found no solution", result[moved, _FOUND] > 0.0)
+    found = Intersection(
         shift_m=result[:, :3],
-        outcome=result[:, _OUTCOME].astype(np.uint8),
+        outcome=outcome,
         ray_count=result[:, _COUNT].astype(np.int32),
         ray_miss_m=result[:, _DISTANCE],
-        sigma_z_m=result[:, _SIGMA_Z],
+        sigma_z_m=np.zeros(len(batch)),
         incidence_deg=result[:, _INCIDENCE],
         camera_used=used,
     )
-
-
-# Columns of the result: a row is one cache line, as points are written in scattered order.
-_DISTANCE, _SIGMA_Z, _INCIDENCE, _COUNT, _OUTCOME = 3, 4, 5, 6, 7
-
-
-@device
-def _solve(row: FloatArray, k: float, sums: FloatArray) -> None:
-    """Solve one point and write its row; a point without a solution keeps a shift of zero."""
-    if k < 2.0:
-        row[_OUTCOME] = ONE_CAMERA if k == 1.0 else NO_CAMERA
-        return
-    solved, q, distance, sigma_z = nearest_point(k, sums)
-    if not solved:
-        row[_OUTCOME] = PARALLEL
-        return
-    row[0], row[1], row[2] = q
-    row[_DISTANCE], row[_SIGMA_Z] = distance, sigma_z
-    row[_INCIDENCE] = np.degrees(np.arccos(np.sqrt(min(sums[10], 1.0))))
-    row[_COUNT], row[_OUTCOME] = k, CORRECTED
-
-
-@device
-def add_camera(
-    sums: FloatArray, tile: FloatArray, marks: FloatArray, g: Pyramid | None, rig: Rig, c: int,
-    rule: Rule,
-) -> int:  # fmt: skip
-    """Add one camera's rays to the sums of a tile; return how many.
-
-    The frame is the pyramid `g`, or its test left marks. Afterwards the marks are those of the rays
-    that count.
-    """
-    centre, offset = row_of(rig.centres, c), rig.offset[c]
-    least_cosine2, r = rule.least_cosine2, rule.bend
-    rays = 0
-    for j in range(marks.size):
-        z = tile[2 * TILE + j]
-        # from the point to the centre; N, H = N.e; h, the height of the water over P
-        e = minus(centre, (tile[j], tile[TILE + j], z))
-        normal = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
-        height = dot(normal, e)
-        h = normal[2] * (tile[3 * TILE + j] - (z - offset))
-        length2 = dot(e, e)
-        steep = (height > h) & (height * height >= least_cosine2 * length2)
-        held = marks[j] > 0.0 if g is None else in_frame(g, e)
-        use = held & steep
-        marks[j] = 1.0 if use else 0.0
-        # one division for two; a ray that is not used adds zeros, as a branch would not vectorise
-        q = 1.0 / (length2 * height)
-        f = h * length2 * q if use and h > 0.0 else 0.0
-        # 1 / L^2
-        inv = height * q if use else 0.0
-        bend = r if h > 0.0 else 1.0
-        d = refracted(e, length2, normal, height, bend)
-        xx, xy, xz, yy, yz, bx, by, bz, s = line_terms(scaled(f, e), d, inv)
-        sums[j] += xx
-        sums[TILE + j] += xy
-        sums[2 * TILE + j] += xz
-        sums[3 * TILE + j] += yy
-        sums[4 * TILE + j] += yz
-        sums[5 * TILE + j] += bx
-        sums[6 * TILE + j] += by
-        sums[7 * TILE + j] += bz
-        sums[8 * TILE + j] += s
-        sums[9 * TILE + j] += 1.0 if use else 0.0
-        cosine2 = height * height * inv
-        sums[10 * TILE + j] = min(sums[10 * TILE + j], cosine2 if use else 1.0)
-        rays += 1 if use else 0
-    return rays
+    return uncertainty.with_errors(found, covariance if len(covariance) == len(batch) else None)
 
 
 @kernel(allocates=True)
-def _all_in_frame(
-    span: Span, points: Points, rig: Rig, frames: Frames, rule: Rule, budget: Budget,
+def _intersect(
+    span: Span, order: IntArray, points: Chosen, rig: Rig, frames: Frames, rule: Rule,
+    optics: Optics | None, tin: Tin | None, fields: Field | None, budget: Budget,
     level_sigma: FloatArray, found: tuple[FloatArray, BoolArray, FloatArray],
 ) -> None:  # fmt: skip
-    """Take every camera whose frame holds the point, under a plane."""
-    centres = rig.centres
+    """Intersect the rays of the points of each tile, of listed cameras or of those in frame."""
+    centres, start, camera = rig.centres, points.start, points.camera
     result, used, covariance = found
-    low, high = tiling.corners_of(points.order[span[0] * TILE : span[1] * TILE], points.xyz)
-    around = tiling.cameras_around(frames, centres, low, high)
+    if optics is not None:  # of all cameras; the system provides what is used
+        rays, search = np.empty((len(centres), RAY_RUNS * TILE)), np.empty(POINT_RUNS * TILE)
+    low, high = tiling.corners_of(order[span[0] * TILE : span[1] * TILE], points.xyz)
+    around = camera[:0] if start.size else tiling.cameras_around(frames, centres, low, high)
+    facet = np.full(TILE, -1)
     for t in range(*span):
         # a tile of neighbours, its sums, and the cameras near it
-        rows = points.order[t * TILE : (t + 1) * TILE]
+        rows = order[t * TILE : (t + 1) * TILE]
         tile, sums = np.empty(7 * TILE), np.zeros(11 * TILE)
         low, high = tiling.gather(tile, rows, points)
         sums[10 * TILE :] = 1.0
-        near = np.empty(len(around), np.int64)
-        count = 0
-        for c in around:
-            if may_hold(frames.planes[c], centres[c], low, high):
-                near[count] = c
-                count += 1
-        marks = np.empty((count, rows.size))
+        if tin is not None:  # the facet above each point, where piercing starts
+            for j in range(rows.size):
+                facet[j] = locate(tin, tile[j], tile[TILE + j])
+        if start.size:
+            near, marks = tiling.marks_of_lists(start, camera, rows, len(centres))
+        else:
+            near = around[_may_hold(frames, around, centres, low, high)]
+            marks = np.empty((near.size, rows.size))
         seeing = 0
-        for k in range(count):
-            c = near[k]
-            # the marks of a pyramid serve only the errors: a pass for them takes 40 % longer
-            if frames.row[c] == NOT_DISTORTED and not len(covariance):
-                g = pyramid(frames.planes[c])
-                rays = add_camera(sums, tile, marks[seeing], g, rig, c, rule)
-            elif tiling.mark_camera(marks[seeing], tile, frames, c, centres[c], low, high):
-                rays = add_camera(sums, tile, marks[seeing], None, rig, c, rule)
+        for k in range(near.size):
+            c, added, some = near[k], 0, True
+            if start.size:
+                marks[seeing] = marks[k]
+            elif frames.row[c] == NOT_DISTORTED:  # the pyramid is tested on the way
+                g, some = pyramid(frames.planes[c]), False
+                added = add_camera(sums, tile, marks[seeing], g, rig, c, rule, tin, fields, facet)
             else:
-                rays = 0
-            if rays:
+                some = tiling.mark_camera(marks[seeing], tile, frames, c, centres[c], low, high)
+            if some:
+                on = marks[seeing]
+                added = add_camera(sums, tile, on, None, rig, c, rule, tin, fields, facet)
+            if added:
                 used[c] = True  # threads may write it at once: always the same value
                 near[seeing] = c
                 seeing += 1
@@ -196,7 +164,23 @@ def _all_in_frame(
         for j in range(rows.size):
             for at in range(11):
                 of_point[at] = sums[at * TILE + j]
-            _solve(result[rows[j]], of_point[9], of_point)
+            _solve(result[rows[j]], of_point[9], of_point, marks[:seeing, j])
+        if optics is not None:
+            for j in range(rows.size):
+                row = result[rows[j]]
+                search[STATE * TILE + j] = SEARCHED if row[_OUTCOME] == CORRECTED else LOST
+                for i in range(3):
+                    search[(Q + i) * TILE + j] = row[i]
+            search_tile(
+                search, rays, tile, marks[:seeing], near[:seeing], rig, optics, points.n, tin,
+                fields,
+            )  # fmt: skip
+            for j in range(rows.size):
+                row = result[rows[j]]
+                row[_FOUND] = 1.0 if search[STATE * TILE + j] == FOUND else 0.0
+                if row[_FOUND] > 0.0:
+                    row[0], row[1], row[2] = three(search, Q * TILE + j)
+                    row[_DISTANCE] = _distance(sums[9 * TILE + j], nine(sums, j), vector(row))
         if len(covariance):
             room = room_of(tile, result, rows)
             for k in range(seeing):
@@ -204,51 +188,102 @@ def _all_in_frame(
             uncertainty.finish_tile(covariance, rows, room, tile, level_sigma, budget)
 
 
-@kernel(allocates=True)
-def _chosen(
-    span: Span, points: Points, rig: Rig, rule: Rule, tin: Tin | None, fields: Field | None,
-    views: tuple[IntArray, IntArray], result: FloatArray, used: BoolArray,
-) -> None:  # fmt: skip
-    """Take the chosen cameras of each point, under any surface."""
-    start, camera = views
-    for t in range(*span):
-        rows = points.order[t * TILE : (t + 1) * TILE]
-        tile = np.empty(7 * TILE)
-        tiling.gather(tile, rows, points)
-        for j in range(rows.size):
-            i = rows[j]
-            # the facet above the point, where piercing starts
-            facet = -1 if tin is None else locate(tin, tile[j], tile[TILE + j])
-            cameras = camera[start[i] : start[i + 1]]
-            for c in cameras:
-                used[c] = True  # threads may write it at once: always the same value
-            _intersect_one(result[i], cameras, tile, j, rig, rule.bend, tin, fields, facet)
-
-
 @device(allocates=True)
-def _intersect_one(
-    row: FloatArray, cameras: IntArray, tile: FloatArray, j: int, rig: Rig, r: float,
-    tin: Tin | None, fields: Field | None, facet: int,
-) -> None:  # fmt: skip
-    """Intersect the rays of point j of a tile with its cameras."""
-    x, y, z = tile[j], tile[TILE + j], tile[2 * TILE + j]
-    upward = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
-    sums, least = np.zeros(11), 1.0
-    for c in cameras:
-        e = minus(row_of(rig.centres, c), (x, y, z))
-        length2, lowered = dot(e, e), (x, y, z - rig.offset[c])
-        h = upward[2] * (tile[3 * TILE + j] - lowered[2])
-        # a point above its water has a straight ray
-        f, bend, normal = 0.0, 1.0, upward
-        if h > 0.0:
-            bend = r
-            f, normal = pierce_of(c, tin, fields, lowered, e, h, upward, facet)
+def _may_hold(
+    frames: Frames, around: IntArray, centres: FloatArray, low: FloatArray, high: FloatArray
+) -> BoolArray:
+    """Return which cameras may hold a point of a box by their pyramids."""
+    near = np.empty(around.size, np.bool_)
+    for k in range(around.size):
+        near[k] = may_hold(frames.planes[around[k]], centres[around[k]], low, high)
+    return near
+
+
+@device
+def add_camera(
+    sums: FloatArray, tile: FloatArray, marks: FloatArray, g: Pyramid | None, rig: Rig, c: int,
+    rule: Rule, tin: Tin | None, fields: Field | None, facet: IntArray,
+) -> int:  # fmt: skip
+    """Add one camera's rays to the sums of a tile; return how many.
+
+    The frame is the pyramid `g`, or the marks say how often each ray counts. Afterwards the marks
+    are those of the rays that count. The sums are those of `line_terms`, the number of rays, and
+    the least squared cosine of the incidence angles.
+    """
+    centre, offset = row_of(rig.centres, c), rig.offset[c]
+    least_cosine2, r = rule.least_cosine2, rule.bend
+    rays = 0
+    for j in range(marks.size):
+        x, y, z = tile[j], tile[TILE + j], tile[2 * TILE + j]
+        # from the point to the centre; N, H = N.e; h, the height of the water over P
+        e = minus(centre, (x, y, z))
+        normal = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
         height = dot(normal, e)
+        h = normal[2] * (tile[3 * TILE + j] - (z - offset))
+        length2 = dot(e, e)
+        steep = (height > h) & (height * height >= least_cosine2 * length2)
+        held = marks[j] > 0.0 if g is None else in_frame(g, e)
+        use = held & steep
+        times = marks[j] if g is None else 1.0
+        times = times if use else 0.0
+        marks[j] = times
+        # one division for two; a ray that is not used adds zeros, as a branch would not vectorise
         q = 1.0 / (length2 * height)
-        if h > 0.0 and tin is None and fields is None:
-            f = h * length2 * q  # as in `add_camera`
-        inv = height * q
-        add_line(sums, scaled(f, e), refracted(e, length2, normal, height, bend), inv)
-        least = min(least, height * height * inv)
-    sums[10] = least
-    _solve(row, float(cameras.size), sums)
+        f = h * length2 * q if use and h > 0.0 else 0.0
+        if (tin is not None or fields is not None) and use and h > 0.0:
+            f, normal = pierce_of(c, tin, fields, (x, y, z - offset), e, h, normal, facet[j])
+            height = dot(normal, e)
+            q = 1.0 / (length2 * height)
+        # 1 / L^2
+        inv = height * q if use else 0.0
+        bend = r if h > 0.0 else 1.0
+        d = refracted(e, length2, normal, height, bend)
+        xx, xy, xz, yy, yz, bx, by, bz, s = line_terms(scaled(f, e), d, inv)
+        sums[j] += times * xx
+        sums[TILE + j] += times * xy
+        sums[2 * TILE + j] += times * xz
+        sums[3 * TILE + j] += times * yy
+        sums[4 * TILE + j] += times * yz
+        sums[5 * TILE + j] += times * bx
+        sums[6 * TILE + j] += times * by
+        sums[7 * TILE + j] += times * bz
+        sums[8 * TILE + j] += times * s
+        sums[9 * TILE + j] += times
+        cosine2 = height * height * inv
+        sums[10 * TILE + j] = min(sums[10 * TILE + j], cosine2 if use else 1.0)
+        rays += 1 if use else 0
+    return rays
+
+
+@device
+def _solve(row: FloatArray, k: float, sums: FloatArray, marks: FloatArray) -> None:
+    """Solve one point and write its row; a point without a solution keeps a shift of zero.
+
+    A list may name a camera several times, as its `marks` say.
+    """
+    if k < 2.0:
+        row[_OUTCOME] = ONE_CAMERA if k == 1.0 else NO_CAMERA
+        return
+    solved, q, distance, _ = nearest_point(k, sums)
+    if not solved:
+        most = 0.0
+        for times in marks:
+            most = max(most, times)
+        row[_OUTCOME] = ONE_CAMERA if most == k else PARALLEL
+        return
+    row[0], row[1], row[2] = q
+    row[_DISTANCE], row[_FOUND] = distance, 1.0
+    row[_INCIDENCE] = np.degrees(np.arccos(np.sqrt(min(sums[10], 1.0))))
+    row[_COUNT], row[_OUTCOME] = k, CORRECTED
+
+
+@device
+def _distance(k: float, s: Nine, q: Vector) -> float:
+    """Return the rms distance of Q from the lines of the sums, Q'MQ - 2 b'Q + s over k."""
+    # t t' summed over the rays, with zz from the trace
+    x, y, z = q
+    along = s[0] * x * x + s[3] * y * y + (k - s[0] - s[3]) * z * z
+    along += 2.0 * (s[1] * x * y + s[2] * x * z + s[4] * y * z)
+    rest = k * (x * x + y * y + z * z) - along
+    rest += s[8] - 2.0 * (s[5] * x + s[6] * y + s[7] * z)
+    return np.sqrt(max(rest, 0.0) / k)

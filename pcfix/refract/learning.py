@@ -10,12 +10,12 @@ import numpy as np
 from pcfix.errors import SettingError
 from pcfix.model import Cameras, TiePoints, ViewKind
 from pcfix.options.correct import ScienceOptions
-from pcfix.refract.batch import UNLISTED, Batch, Learned, Survey, require_orientation
-from pcfix.refract.consistent import check_consistent
+from pcfix.refract.batch import Batch, Survey, require_orientation
 from pcfix.refract.fusion import likely_beds
+from pcfix.refract.intersect import check_consistent
+from pcfix.refract.map_table import LEAST_POINTS, layers_of
 from pcfix.refract.matcher import Bed, bed_of, matcher_of, matcher_of_ties, places_for
 from pcfix.refract.methods import batches, on_land, with_rays
-from pcfix.refract.occlusion import occluder_of, wants_occlusion
 from pcfix.refract.patches import FEWEST_WITHOUT_LIST
 from pcfix.refract.reconstructions import (
     ALIKE,
@@ -29,9 +29,8 @@ from pcfix.refract.reconstructions import (
     told_by,
     weigh,
 )
-from pcfix.refract.regression import DepthRegression, raise_no_regression
 from pcfix.refract.stereo_factor import StereoFactor, stereo_factor
-from pcfix.refract.tiling import spatial_order
+from pcfix.refract.tiling import cell_side, spatial_order
 from pcfix.water.surface import is_submerged
 
 
@@ -57,13 +56,7 @@ def resolved(settings: ScienceOptions, cameras: Cameras, views: ViewKind | None)
 def for_own_water(
     settings: ScienceOptions, cameras: Cameras, views: ViewKind | None
 ) -> ScienceOptions:
-    """Replace ``auto`` for images with their own water surfaces.
-
-    Raises
-    ------
-    SettingError
-        If the method needs one water surface for all images.
-    """
+    """Replace ``auto`` for images with their own water surfaces, if the method allows these."""
     bare = cameras.lenses is None or cameras.rotations is None
     dense = settings.camera_set == "mvs" or views not in (None, "tracks")
     method = settings.method
@@ -126,38 +119,6 @@ def wants_matcher(survey: Survey, views: ViewKind | None) -> bool:
     return compared or (dense and settings.method == "consistent")
 
 
-def learn_of_points(batch: Batch, regression: DepthRegression | None) -> Batch:
-    """Return a batch that is the whole cloud, with land, with what is learned from it.
-
-    Raises
-    ------
-    SettingError
-        If the method lacks something that it needs.
-    """
-    cameras, views = batch.survey.cameras, batch.views
-    kind = None if views is None else views.kind
-    check_method(resolved(batch.survey.settings, cameras, kind), cameras)
-    batch, _ = with_factor(batch)
-    given = batch.survey.settings
-    settings = resolved(given, cameras, kind)
-    if settings.method == "regression" and regression is None:
-        raise_no_regression()
-    hides = wants_occlusion(cameras, settings)
-    listed = settings.occlusion == "auto" and views is not None
-    occluder = occluder_of(batch.xyz) if hides and not listed else None
-    learned = Learned(regression=regression, occluder=occluder)
-    batch = replace(batch, survey=replace(batch.survey, settings=settings, learned=learned))
-    if not wants_sample(batch.survey, kind):
-        return batch
-    survey, _ = learn_of_sample(batch, len(batch))
-    if views is not None and (np.diff(views.start) == 0).any():
-        hidden = occluder_of(batch.xyz) if hides else None
-        as_given = replace(batch.survey, settings=given, learned=Learned(occluder=hidden))
-        unlisted, _ = learn_of_unlisted(replace(batch, survey=as_given), len(batch))
-        survey = replace(survey, parts={UNLISTED: unlisted})
-    return replace(batch, survey=survey)
-
-
 class Near(NamedTuple):
     """Submerged points with their neighbours, and how many points of the cloud each represents."""
 
@@ -182,10 +143,8 @@ def learn_of_sample(
     The batch are points of the whole cloud of `points` points, evenly spread, with land; their view
     lists have a kind. `ties` are tie points of the original model; by default the points show which
     images overlap. `hint` is the type that the software is known for, `near` are points for the
-    detection of the type, if those of the batch are too far apart.
-
-    Returns the survey without ``auto`` and the verdicts, if something was to be decided, and could
-    be.
+    detection of the type, if those of the batch are too far apart. Returns the survey without
+    ``auto`` and the verdicts.
     """
     if batch.views is None and batch.survey.settings.method == "auto":
         found = _learn_of_sources(batch, points, ties, hint, near)
@@ -198,7 +157,9 @@ def learn_of_sample(
     sample = replace(submerged_of(batch), survey=survey)
     if batch.views is not None:
         verdict = weigh_lists(sample, is_open=False)
-        return as_told(survey, verdict), () if verdict is None else (verdict,)
+        learned = survey.learned._replace(dense=_is_dense(sample, points / max(len(batch), 1)))
+        survey = as_told(replace(survey, learned=learned), verdict)
+        return survey, () if verdict is None else (verdict,)
     near = near or Near(sample, points / max(len(batch), 1))
     survey, verdicts = _weighed(replace(near.batch, survey=survey), near.step, hint)
     settings, learned = survey.settings, survey.learned._replace(land=None)
@@ -216,7 +177,15 @@ def learn_of_sample(
         learned = learned._replace(matcher=None)
     elif settings.method == "consistent" and settings.matcher == "depth-maps" and len(sample):
         learned = learned._replace(bed=_learn_bed(replace(sample, survey=survey)))
+        learned = learned._replace(dense=_is_dense(sample, points / max(len(batch), 1)))
     return replace(survey, learned=learned), verdicts
+
+
+def _is_dense(sample: Batch, step: float) -> bool:
+    """Whether the cells of depth maps have enough points, `step` for each of the sample."""
+    cell = np.floor(sample.xyz[:, :2] / cell_side(sample))
+    cells = len(np.unique(np.column_stack([cell, layers_of(sample)]), axis=0))
+    return len(sample) * step >= LEAST_POINTS * max(cells, 1)
 
 
 def submerged_of(batch: Batch) -> Batch:
@@ -317,11 +286,9 @@ def _learn_bed(batch: Batch) -> Bed | None:
     """Return the bed that agrees with a sample of fused points; None if no image sees a point."""
     order = spatial_order(batch.xyz)
     likely = [likely_beds(with_rays(batch.take(rows))) for rows in batches(order)]
-    most = max(part.shape[1] for part in likely)
-    wide = [
-        np.pad(one, ((0, 0), (0, most - one.shape[1])), constant_values=np.nan) for one in likely
-    ]
-    table = np.concatenate(wide)
+    table = np.full((len(batch), max(part.shape[1] for part in likely)), np.nan, np.float32)
+    for rows, part in zip(batches(np.arange(len(batch))), likely, strict=True):
+        table[rows, : part.shape[1]] = part
     return bed_of(batch.xyz[order], table) if np.isfinite(table).any() else None
 
 

@@ -17,11 +17,14 @@ straight.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+import numpy.typing as npt
 
 from pcfix.kernels import Span, device, in_tiles, kernel
-from pcfix.lens.algebra import minus, row_of
-from pcfix.model import BoolArray, FloatArray, IntArray, Outcome
+from pcfix.lens.algebra import Vector, minus, row_of
+from pcfix.model import BoolArray, FloatArray, Outcome
 from pcfix.refract.batch import Batch, Chosen, Intersection
 from pcfix.refract.rays import MIN_DETERMINANT
 from pcfix.refract.regression import raise_no_regression
@@ -49,40 +52,46 @@ def depth_ratio(tan2: float, n: float) -> float:
 
 
 @kernel(allocates=True)
-def _mean_crossings(points: Chosen) -> tuple[FloatArray, FloatArray]:
-    """Return the mean depth below P at which the refracted rays of a point cross its plumb line.
-
-    And the root mean square distance of that place from the rays; metres, 0 without rays.
-    """
-    lowered, distance = np.zeros(len(points.xyz)), np.zeros(len(points.xyz))
+def _mean_crossings(points: Chosen) -> FloatArray:
+    """Return the mean depth below P at which the refracted rays of a point cross its plumb line."""
+    lowered = np.zeros(len(points.xyz))
     for i in range(len(points.xyz)):
         rays = points.camera[points.start[i] : points.start[i + 1]]
         for c in rays:
             lowered[i] += _crossing(points, i, c)[0] / rays.size
-        distance[i] = _distance(points, i, rays, lowered[i])
-    return lowered, distance
+    return lowered
 
 
-@device(allocates=True)
-def _distance(points: Chosen, i: int, rays: IntArray, lowered: float) -> float:
-    """Return the root mean square distance of a place on the plumb line from the rays."""
-    squares = 0.0
-    for c in rays:
-        below, cosine2 = _crossing(points, i, c)
-        # h above the crossing the ray is h sin b away
-        squares += (lowered - below) ** 2 * (1.0 - cosine2) / (points.n * points.n)
-    return np.sqrt(squares / max(rays.size, 1))
+@kernel(allocates=True)
+def _distances(points: Chosen, shift: FloatArray) -> FloatArray:
+    """Return the root mean square distance of the true points from their refracted rays, metres."""
+    distance = np.zeros(len(points.xyz))
+    for i in range(len(points.xyz)):
+        rays, squares = points.camera[points.start[i] : points.start[i + 1]], 0.0
+        for c in rays:
+            below, u, v = _crossing(points, i, c)
+            # how far aside of the ray the point is at its own depth
+            x = shift[i, 0] - u * (-shift[i, 2] - below)
+            y = shift[i, 1] - v * (-shift[i, 2] - below)
+            # the part of the offset along the ray does not count
+            along = x * u + y * v
+            square = x * x + y * y - along * along / (1.0 + u * u + v * v)
+            squares += max(square, 0.0)
+        distance[i] = np.sqrt(squares / max(rays.size, 1))
+    return distance
 
 
 @device
-def _crossing(points: Chosen, i: int, c: int) -> tuple[float, float]:
-    """Return how far below P a refracted ray crosses its plumb line, and cos^2 a."""
+def _crossing(points: Chosen, i: int, c: int) -> Vector:
+    """Return how far below P a refracted ray crosses its plumb line, and how it leans.
+
+    The latter is how far it goes aside per metre down, in x and y.
+    """
     ex, ey, ez = minus(row_of(points.centres, c), row_of(points.xyz, i))
-    plan2 = ex * ex + ey * ey
-    cosine2 = ez * ez / (plan2 + ez * ez)
-    # below the water of this camera; 0 above it
-    depth = points.height[i] - points.xyz[i, 2] + points.offset[c]
-    return max(depth, 0.0) * (depth_ratio(plan2 / (ez * ez), points.n) - 1.0), cosine2
+    tan2 = (ex * ex + ey * ey) / (ez * ez)
+    depth = max(points.height[i] - points.xyz[i, 2] + points.offset[c], 0.0)
+    s = depth_ratio(tan2, points.n) if depth > 0.0 else 1.0
+    return depth * (s - 1.0), -ex / (ez * s), -ey / (ez * s)
 
 
 def factor(batch: Batch) -> Intersection:
@@ -94,8 +103,8 @@ def factor(batch: Batch) -> Intersection:
     -----
     n is the limit for cameras straight above, long in use for rivers (Westaway et al. 2001, Woodget
     et al. 2015). At the angle a in air the true depth is larger by (n^2 - 1) tan^2 a / (2 n^2) of
-    it: 1.6 % at 15 degrees, 3.3 % at 21 degrees. A factor of one's own can include that, or that of
-    stereo pairs (`pcfix.refract.stereo_factor`), for which `depth_factor` auto stands.
+    it: 1.6 % at 15 degrees, 3.3 % at 21 degrees. The factor auto is that of stereo pairs
+    (`pcfix.refract.stereo_factor`).
     """
     settings = batch.survey.settings
     given = settings.depth_factor
@@ -106,12 +115,8 @@ def factor(batch: Batch) -> Intersection:
 def regression(batch: Batch) -> Intersection:
     """Apply the fitted regression to the apparent depths; only Z moves.
 
-    Every point is corrected, as no ray is needed; see `without_rays`.
-
-    Raises
-    ------
-    SettingError
-        If there is no regression.
+    Every point is corrected, as no ray is needed; see `without_rays`. Raises SettingError if there
+    is no regression.
 
     Notes
     -----
@@ -121,11 +126,11 @@ def regression(batch: Batch) -> Intersection:
     The slope that they print, 0.9895, is for negative values from an origin at 190 mm; here depths
     count from the water.
     """
-    learned = batch.survey.learned.regression
-    if learned is None:
+    line = batch.survey.learned.regression
+    if line is None:
         raise_no_regression()
     apparent = apparent_depth(batch)
-    return without_rays(batch, learned.depth_m(apparent) - apparent)
+    return without_rays(batch, line.depth_m(apparent) - apparent)
 
 
 def without_rays(batch: Batch, lowered_m: FloatArray) -> Intersection:
@@ -137,6 +142,11 @@ def without_rays(batch: Batch, lowered_m: FloatArray) -> Intersection:
     outcome = np.full(len(batch.xyz), Outcome.CORRECTED, np.uint8)
     found = batch.result(down(lowered_m), outcome=outcome)
     return found._replace(ray_count=np.maximum(found.ray_count, 1))
+
+
+def _with_distances(batch: Batch, shift: FloatArray, outcome: npt.NDArray[Any]) -> Intersection:
+    distance = _distances(batch.chosen(), shift)
+    return batch.result(shift, outcome=outcome.astype(np.uint8), ray_miss_m=distance)
 
 
 def butler(batch: Batch) -> Intersection:
@@ -168,9 +178,9 @@ def butler(batch: Batch) -> Intersection:
     Processes and Landforms 42, 355-364, over all cameras, as his program pyBathySfM computes it.
     The program excludes a camera exactly above the point, as tan i is 0 there.
     """
-    lowered, distance = _mean_crossings(batch.chosen())
-    outcome = np.where(batch.counts > 0, Outcome.CORRECTED, Outcome.NO_CAMERA).astype(np.uint8)
-    return batch.result(down(lowered), outcome=outcome, ray_miss_m=distance)
+    lowered = _mean_crossings(batch.chosen())
+    outcome = np.where(batch.counts > 0, Outcome.CORRECTED, Outcome.NO_CAMERA)
+    return _with_distances(batch, down(lowered), outcome)
 
 
 def murase(batch: Batch) -> Intersection:
@@ -198,22 +208,15 @@ def murase(batch: Batch) -> Intersection:
     Exact where both rays have the same incidence, and where cameras and point are in one vertical
     plane. Elsewhere the rays of a pair differ in Y too, which the formula ignores.
     """
-    lowered, distance, failed = _equal_x(batch.chosen())
-    outcome = np.where(failed, np.uint8(Outcome.PARALLEL_RAYS), batch.outcome())
-    return batch.result(down(lowered), outcome=outcome, ray_miss_m=distance)
+    lowered = _equal_x(batch.chosen())
+    outcome = np.where(lowered < 0.0, Outcome.PARALLEL_RAYS, batch.outcome())
+    return _with_distances(batch, down(np.maximum(lowered, 0.0)), outcome)
 
 
 @kernel(allocates=True)
-def _equal_x(points: Chosen) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Return how far each point sinks by its pairs, its distance from the rays, and failures.
-
-    With p the slope tan r cos t of a ray along the base and q = p / s that of the refracted one,
-    the ray is q z - (p - q) d from the plumb line, z below the apparent point. The two of a pair
-    are equal at z = ((p_1 - q_1) d_1 - (p_2 - q_2) d_2) / (q_1 - q_2), with the depth d of each
-    image under its own water level; for one level that is the formula of the paper.
-    """
-    lowered, distance = np.zeros(len(points.xyz)), np.zeros(len(points.xyz))
-    failed = np.zeros(len(points.xyz), np.bool_)
+def _equal_x(points: Chosen) -> FloatArray:
+    """Return how far each point sinks by its pairs; negative where these leave the depth open."""
+    lowered = np.zeros(len(points.xyz))
     for i in range(len(points.xyz)):
         rays = points.camera[points.start[i] : points.start[i + 1]]
         if rays.size < 2:
@@ -226,17 +229,17 @@ def _equal_x(points: Chosen) -> tuple[FloatArray, FloatArray, BoolArray]:
                 products += parallax * shift
                 squares += parallax * parallax
         pairs = rays.size * (rays.size - 1) // 2
-        # next to no parallax leaves the depth open
-        sunk = products / squares if squares > 4.0 * pairs * MIN_DETERMINANT else -np.inf
-        failed[i] = sunk < 0.0
-        if not failed[i]:
-            lowered[i], distance[i] = sunk, _distance(points, i, rays, sunk)
-    return lowered, distance, failed
+        lowered[i] = -products / squares if squares > 4.0 * pairs * MIN_DETERMINANT else -np.inf
+    return lowered
 
 
 @device
 def _pair(points: Chosen, i: int, first: int, second: int) -> tuple[float, float]:
-    """Return the X-parallax of two refracted rays per metre of depth, and at the apparent point."""
+    """Return the X-parallax of two refracted rays per metre of depth, and at the apparent point.
+
+    With the slope q of a ray along the base and its crossing `below` the apparent point, the ray is
+    q (z - below) from the plumb line at the depth z; both are equal at -shift / parallax.
+    """
     x, y, _ = minus(row_of(points.centres, second), row_of(points.centres, first))
     # X is along the base of the pair
     base = np.hypot(x, y)
@@ -244,13 +247,9 @@ def _pair(points: Chosen, i: int, first: int, second: int) -> tuple[float, float
         return 0.0, 0.0
     parallax = shift = 0.0
     for c, sign in ((first, 1.0), (second, -1.0)):
-        ex, ey, ez = minus(row_of(points.centres, c), row_of(points.xyz, i))
-        depth = points.height[i] - points.xyz[i, 2] + points.offset[c]
-        s = depth_ratio((ex * ex + ey * ey) / (ez * ez), points.n) if depth > 0.0 else 1.0
-        # slope of the straight ray along X, and that under water
-        straight = -(ex * x + ey * y) / (base * ez)
-        parallax += sign * straight / s
-        shift += sign * (straight - straight / s) * max(depth, 0.0)
+        below, u, v = _crossing(points, i, c)
+        q = sign * (u * x + v * y) / base
+        parallax, shift = parallax + q, shift - q * below
     return parallax, shift
 
 
@@ -290,59 +289,40 @@ def shan(batch: Batch) -> Intersection:
     or in one vertical plane with the point. The image ray determines s, so that the iteration only
     accounts for rays that pass each other; a few iterations are enough.
     """
-    found = np.zeros((len(batch.xyz), 4))
+    shift = np.zeros((len(batch.xyz), 3))
     failed = np.zeros(len(batch.xyz), np.bool_)
-    in_tiles(_solve_all, len(batch), batch.chosen(), found, failed, points=len(batch))
-    outcome = np.where(failed, np.uint8(Outcome.PARALLEL_RAYS), batch.outcome())
-    return batch.result(found[:, :3], outcome=outcome, ray_miss_m=found[:, 3])
+    in_tiles(_iterate, len(batch), batch.chosen(), shift, failed, points=len(batch))
+    outcome = np.where(failed, Outcome.PARALLEL_RAYS, batch.outcome())
+    return _with_distances(batch, shift, outcome)
 
 
 @kernel(allocates=True)
-def _solve_all(span: Span, points: Chosen, found: FloatArray, failed: BoolArray) -> None:
-    """Fill in shift and distance from the rays of each point with two rays or more."""
+def _iterate(span: Span, points: Chosen, shift: FloatArray, failed: BoolArray) -> None:
+    """Fill in the shift of each point with two rays or more, or that it has no solution."""
     for i in range(*span):
         rays = points.camera[points.start[i] : points.start[i + 1]]
         if rays.size < 2:
             continue
-        e = np.empty((rays.size, 3))
-        d = np.empty(rays.size)
+        e, d, s = np.empty((rays.size, 3)), np.empty(rays.size), np.ones(rays.size)
         for j in range(rays.size):
-            for axis in range(3):
-                e[j, axis] = points.centres[rays[j], axis] - points.xyz[i, axis]
-            depth = points.height[i] - points.xyz[i, 2]
+            e[j] = points.centres[rays[j]] - points.xyz[i]
             # the depth under the water of this camera; 0 above it
-            d[j] = max(depth + points.offset[rays[j]], 0.0)
-        solved, x, y, sunk = _iterate(e, d, points.n)
-        failed[i] = not solved
-        if solved:
-            found[i, 0], found[i, 1], found[i, 2] = x, y, -sunk
-            found[i, 3] = _shan_distance(e, d, points.n, x, y, sunk)
-
-
-@device(allocates=True)
-def _iterate(e: FloatArray, d: FloatArray, n: float) -> tuple[bool, float, float, float]:
-    """Solve for one point; e (k, 3) leads from it to the cameras, d (k,) is its depth for each.
-
-    Returns whether it was solved, and how far the true point is aside (x, y) and below, metres.
-    """
-    s, tangent = np.ones(d.size), np.hypot(e[:, 0], e[:, 1]) / e[:, 2]
-    x = y = sunk = 0.0
-    for _ in range(MOST_ITERATIONS):
-        for j in range(d.size):
-            s[j] = depth_ratio(tangent[j] ** 2, n) if d[j] > 0.0 else 1.0
-        solved, x, y, sunk = _intersected(e, d, s)
-        if not (solved and sunk + d.min() >= 0.0):
-            return False, 0.0, 0.0, 0.0
-        change = 0.0
-        for j in range(d.size):
-            # height of the camera over the point at the depth D / s
-            rise = e[j, 2] - d[j] + (d[j] + sunk) / s[j]
-            following = np.hypot(x - e[j, 0], y - e[j, 1]) / rise
-            change = max(change, abs(following - tangent[j]))
-            tangent[j] = following
-        if change <= TOLERANCE:
-            break
-    return True, x, y, sunk
+            d[j] = max(points.height[i] - points.xyz[i, 2] + points.offset[rays[j]], 0.0)
+        tangent = np.hypot(e[:, 0], e[:, 1]) / e[:, 2]
+        for _ in range(MOST_ITERATIONS):
+            for j in range(rays.size):
+                s[j] = depth_ratio(tangent[j] ** 2, points.n) if d[j] > 0.0 else 1.0
+            solved, x, y, sunk = _intersected(e, d, s)
+            failed[i] = not (solved and sunk + d.min() >= 0.0)
+            if failed[i]:
+                break
+            # tan a from the height of the camera over the point at the depth D / s
+            following = np.hypot(x - e[:, 0], y - e[:, 1]) / (e[:, 2] - d + (d + sunk) / s)
+            change, tangent = np.abs(following - tangent).max(), following
+            if change <= TOLERANCE:
+                break
+        if not failed[i]:
+            shift[i, 0], shift[i, 1], shift[i, 2] = x, y, -sunk
 
 
 @device(allocates=True)
@@ -358,43 +338,19 @@ def _intersected(e: FloatArray, d: FloatArray, s: FloatArray) -> tuple[bool, flo
     for each of the two axes: a straight line through the places (v, r), of which `sunk` is the
     slope with its sign changed.
     """
-    k = d.size
-    v, r = np.empty((k, 2)), np.empty((k, 2))
-    for j in range(k):
-        for axis in range(2):
-            u = -e[j, axis] / e[j, 2]
-            v[j, axis] = u / s[j]
-            r[j, axis] = -(u - v[j, axis]) * d[j]
-    mean_v = np.array([v[:, 0].mean(), v[:, 1].mean()])
-    mean_r = np.array([r[:, 0].mean(), r[:, 1].mean()])
-    # least squares of a line through the places (v, r)
+    k, means = float(d.size), np.zeros((2, 2))
     spread = product = 0.0
-    for j in range(k):
-        for axis in range(2):
-            away = v[j, axis] - mean_v[axis]
-            spread += away * away
-            product += away * (r[j, axis] - mean_r[axis])
+    for axis in range(2):
+        u = -e[:, axis] / e[:, 2]
+        v = u / s
+        r = -(u - v) * d
+        means[axis, 0], means[axis, 1] = v.mean(), r.mean()
+        # least squares of a line through the places (v, r)
+        away = v - means[axis, 0]
+        spread += (away * away).sum()
+        product += (away * (r - means[axis, 1])).sum()
     # of two rays at a small angle alpha the spread is alpha^2 / 2
     if not spread >= 2.0 * k * MIN_DETERMINANT:
         return False, 0.0, 0.0, 0.0
     sunk = -product / spread
-    return True, mean_r[0] + sunk * mean_v[0], mean_r[1] + sunk * mean_v[1], sunk
-
-
-@device
-def _shan_distance(
-    e: FloatArray, d: FloatArray, n: float, x: float, y: float, sunk: float
-) -> float:
-    """Return the root mean square distance of a point from the refracted rays."""
-    squares = 0.0
-    for j in range(d.size):
-        u, w = -e[j, 0] / e[j, 2], -e[j, 1] / e[j, 2]
-        s = depth_ratio(u * u + w * w, n) if d[j] > 0.0 else 1.0
-        v0, v1 = u / s, w / s
-        aside0 = x - v0 * sunk + (u - v0) * d[j]
-        aside1 = y - v1 * sunk + (w - v1) * d[j]
-        # the part of the offset along the ray does not count
-        along = aside0 * v0 + aside1 * v1
-        square = aside0 * aside0 + aside1 * aside1 - along * along / (1.0 + v0 * v0 + v1 * v1)
-        squares += max(square, 0.0)
-    return np.sqrt(squares / d.size)
+    return True, means[0, 1] + sunk * means[0, 0], means[1, 1] + sunk * means[1, 0], sunk

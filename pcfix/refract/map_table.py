@@ -1,13 +1,20 @@
 """Polynomials for the depth maps of a cell.
 
 For two images that see a place on the bed, the depth at which their rays are nearest, the residual
-there and its curvature are smooth functions of that place. They are replaced by polynomials
-(`pcfix.refract.cells`), for each image and each of its partners. So is the direction in which a
-partner sees the bed, which decides whether its frame holds the place.
+there and its curvature are smooth functions of that place. So is the direction in which a partner
+sees the bed, which decides whether its frame holds the place. In a cell they are replaced by cubic
+polynomials, for each image and each of its partners. A correction of many points takes less than
+half of the time.
+
+The cells are fixed in the world: squares in plan, whose side is a power of two, by layers of the
+apparent depth. So the polynomials of a point do not depend on the other points. They are fitted at
+Chebyshev nodes and are off most at the corners of the cell, where they are tested; an image with
+polynomials that are off too much is computed exactly. The water above the cell is a plane.
 """
 
 from __future__ import annotations
 
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -15,12 +22,11 @@ import numpy as np
 from pcfix.kernels import device
 from pcfix.lens.algebra import Vector, cross, dot, minus, normal_of, row_of, scaled, unit
 from pcfix.lens.frames import holds
-from pcfix.model import BoolArray, FloatArray, IntArray
-from pcfix.refract import cells
+from pcfix.model import BoolArray, FloatArray, IntArray, WaterPlane
 from pcfix.refract.batch import Batch, Chosen, Images, images_of, to_original
-from pcfix.refract.cells import BASIS, CUBIC, FIT_CUBIC, INSIDE, LEAST_LENGTH_M, NODES, Box
 from pcfix.refract.matcher import MATCHED, Matcher
 from pcfix.refract.rays import direction, light_path
+from pcfix.refract.tiling import cell_side
 
 LEAST_POINTS = 60
 """Least points of a cell: its polynomials cost as much as so many points."""
@@ -31,12 +37,37 @@ TOLERANCE_PX = 0.02
 USUAL = 0.7
 """Approximate ratio of apparent to true depth along a ray; the polynomials have the rest."""
 
-DEEPEST = 1.9
-ASIDE = 0.5
+DEEPEST, ASIDE = 1.9, 0.5
 """Largest depth of the bed, and distance from the apparent point in plan, in apparent depths."""
+
+LAYER = 1.25
+"""Ratio of the apparent depths of two layers."""
+SHALLOWEST_M, SAME_PLANE = 0.05, 1e-6
+"""Depth of the first layer's lower edge; metres of height, and of slope."""
+
+CUBIC = 19
+"""Terms of a polynomial; it has no w^3, as the height varies least."""
 
 AWAY, RESIDUAL, CURVED, EACH = 0, 1, 2, 3
 ALWAYS, NEVER, SOMETIMES = 1, 0, 2
+
+
+def _powers(x: FloatArray) -> FloatArray:
+    """Return the powers of coordinates, shape (n, 3), one column for each term."""
+    u, v, w = x.T
+    uu, uv, vv, ww = u * u, u * v, v * v, w * w
+    return np.column_stack(
+        [np.ones(len(x)), u, v, w, uu, uv, u * w, vv, v * w, ww,
+         uu * u, uu * v, uu * w, uv * v, uv * w, u * ww, vv * v, vv * w, v * ww]
+    )  # fmt: skip
+
+
+_FOUR, _THREE = np.cos(np.pi / 8.0 * np.arange(1, 8, 2)), np.sqrt(0.75) * np.arange(-1.0, 2.0)
+NODES = np.array([*product(_FOUR, _FOUR, _THREE), *product((-1.0, 1.0), repeat=3)])
+INSIDE = len(NODES) - 8
+POWERS = _powers(NODES)
+FIT = np.asarray(np.linalg.pinv(POWERS[:INSIDE]), np.float64)
+"""The corners, which come last, are not fitted."""
 
 
 class Block(NamedTuple):
@@ -45,45 +76,39 @@ class Block(NamedTuple):
     points: Chosen
     images: Images
     matcher: Matcher
+    water: Vector  # a, b, c of the plane of the water, NaN if it is none
+    cell_m: float
 
 
 class Table(NamedTuple):
-    """The polynomials of a cell.
+    """The polynomials of a cell; u, v, w go from -1 to 1 in its box."""
 
-    Attributes
-    ----------
-    box : Box
-        Of the bed.
-    place : array, shape (k,)
-        The row of each image in `ways`, or -1; empty without polynomials.
-    terms : array, shape (images, 5 x 19 x 3)
-        Of the first images of `ways`, for each partner: the depth less the usual one (m), and the
-        other two results of `meet`.
-    in_frame : array, shape (images, 5)
-        Whether the frame of each partner holds the whole cell, nothing, or a part of it.
-    ways : array, shape (images and partners, 19 x 3)
-        The direction in which each sees the bed.
-    steep : array, shape (k,)
-        Ratio of the change of the apparent depth in an image with the bed to the usual one.
-    likely : array, shape (1,)
-        Ratio of the depth of the last point to the likely one.
-    """
-
-    box: Box
-    place: IntArray
-    terms: FloatArray
-    in_frame: IntArray
-    ways: FloatArray
-    steep: FloatArray
-    likely: FloatArray
+    middle: FloatArray  # (3,), of the box of the bed in x, y and the height over the water
+    half: FloatArray  # (3,), metres
+    place: IntArray  # (k,), the row of each image in `ways`, or -1; empty without polynomials
+    terms: FloatArray  # (images, 5 x 19 x 3), for each partner: depth less the usual one, `meet`
+    in_frame: IntArray  # (images, 5), whether the frame of each partner holds all, nothing or some
+    ways: FloatArray  # (images and partners, 19 x 3), the direction in which each sees the bed
+    steep: FloatArray  # (k,), change of the apparent depth with the bed, by the usual one
 
 
 def block_of(batch: Batch) -> Block:
     """Return what the kernels take of a batch."""
-    matcher = batch.survey.learned.matcher
+    survey = batch.survey
+    matcher, water = survey.learned.matcher, survey.water
     if matcher is None:
         raise ValueError("a model of the matcher is needed")
-    return Block(batch.chosen(), images_of(batch.original_model, batch.survey.cameras), matcher)
+    plane = np.nan, np.nan, np.nan
+    if isinstance(water, WaterPlane) and survey.own_water is None and not survey.settings.exact:
+        plane = water.a, water.b, water.c
+    images = images_of(batch.original_model, survey.cameras)
+    return Block(batch.chosen(), images, matcher, plane, cell_side(batch))
+
+
+def layers_of(batch: Batch) -> IntArray:
+    """Return the layer of each point by its apparent depth, 0 for the shallowest."""
+    depth = np.maximum(batch.surface.height_m - batch.xyz[:, 2], SHALLOWEST_M)
+    return np.asarray(np.ceil(np.log(depth / SHALLOWEST_M) / np.log(LAYER))).astype(np.int64)
 
 
 @device(allocates=True)
@@ -91,14 +116,14 @@ def no_table() -> Table:
     """Return a table without polynomials."""
     none = np.empty((0, 0))
     return Table(
-        cells.no_box(), np.empty(0, np.int64), none, np.empty((0, 0), np.int64), none, np.ones(1),
+        np.zeros(3), np.ones(3), np.empty(0, np.int64), none, np.empty((0, 0), np.int64), none,
         np.ones(1),
     )  # fmt: skip
 
 
 @device(allocates=True)
-def table_of(rows: IntArray, seeing: BoolArray, block: Block) -> Table:
-    """Fit the polynomials of some points, for the images that may see them."""
+def table_of(i: int, layer: int, seeing: BoolArray, block: Block) -> Table:
+    """Fit the polynomials of the cell of point i for the images that may see its points."""
     matched, first = block.matcher.matched, np.flatnonzero(seeing)
     # the partners of these images are needed too
     involved = seeing.copy()
@@ -108,48 +133,67 @@ def table_of(rows: IntArray, seeing: BoolArray, block: Block) -> Table:
                 involved[j] = True
     # images that see points first, as only these get depths
     order = np.concatenate((first, np.flatnonzero(involved & ~seeing)))
-    place, box = np.full(seeing.size, -1), bed_under(cells.box_of(rows, block.points))
-    views = np.empty((order.size, len(NODES), 4))
-    ways = np.empty((order.size, CUBIC * 3))
+    # the bed lies below the points of the cell and around it
+    deep = SHALLOWEST_M * LAYER**layer
+    shallow = deep / LAYER if layer > 0 else 0.02 * deep
+    middle, half = np.empty(3), np.full(3, 0.5 * block.cell_m + ASIDE * deep)
+    for axis in range(2):
+        middle[axis] = (np.floor(block.points.xyz[i, axis] / block.cell_m) + 0.5) * block.cell_m
+    middle[2], half[2] = -0.5 * (DEEPEST * deep + shallow), 0.5 * (DEEPEST * deep - shallow)
+    place = np.full(seeing.size, -1)
+    views, ways = np.empty((order.size, len(NODES), 4)), np.empty((order.size, CUBIC * 3))
     for at in range(order.size):
         place[order[at]] = at
-        _see(views[at], order[at], box, block)
-        cells.fit(ways[at], FIT_CUBIC, views[at, :, :3])
+        _see(views[at], order[at], middle, half, block)
+        _fit(ways[at], views[at, :, :3])
     terms, values = np.empty((first.size, EACH * CUBIC * MATCHED)), np.empty((len(NODES), EACH))
     in_frame = np.zeros((first.size, MATCHED), np.int64)
     for at in range(first.size):
         if not _fit_image(terms[at], in_frame[at], values, views, first[at], place, block):
             terms[at, 0] = np.nan
-    return Table(box, place, terms, in_frame, ways, np.zeros(seeing.size), np.ones(1))
-
-
-@device(allocates=True)
-def bed_under(box: Box) -> Box:
-    """Return the box in which the bed of the points of a box lies."""
-    # depths of the deepest and shallowest apparent point of the cell
-    deep, shallow = box.half[2] - box.middle[2], -box.half[2] - box.middle[2]
-    low, high = -DEEPEST * deep, -max(shallow, LEAST_LENGTH_M)
-    middle, half = box.middle.copy(), box.half + ASIDE * deep
-    middle[2], half[2] = 0.5 * (low + high), max(0.5 * (high - low), LEAST_LENGTH_M)
-    return Box(middle, half, 1.0 / half, box.water)
+    return Table(middle, half, place, terms, in_frame, ways, np.ones(seeing.size))
 
 
 @device
-def _see(view: FloatArray, c: int, box: Box, block: Block) -> None:
+def water_at(block: Block, x: float, y: float) -> float:
+    """Return the height of the plane of the water at a place."""
+    return block.water[0] + block.water[1] * x + block.water[2] * y
+
+
+@device
+def reads(block: Block, i: int) -> bool:
+    """Whether the water above a point is that of the cells."""
+    points, (_, b, c) = block.points, block.water
+    off = points.height[i] - water_at(block, points.xyz[i, 0], points.xyz[i, 1])
+    b, c = points.slope[i, 0] - b, points.slope[i, 1] - c
+    return (abs(off) <= SAME_PLANE) & (abs(b) <= SAME_PLANE) & (abs(c) <= SAME_PLANE)
+
+
+@device
+def _see(view: FloatArray, c: int, middle: FloatArray, half: FloatArray, block: Block) -> None:
     """Write the directions of the nodes in an image of the original model, and the usual depths."""
-    points = block.points
-    normal = normal_of(box.water[1], box.water[2])
+    points, normal = block.points, normal_of(block.water[1], block.water[2])
     for k in range(len(NODES)):
-        x = box.middle[0] + box.half[0] * NODES[k, 0]
-        y = box.middle[1] + box.half[1] * NODES[k, 1]
-        under = box.middle[2] + box.half[2] * NODES[k, 2]
-        e = minus(row_of(points.centres, c), (x, y, cells.water_at(box, x, y) + under))
+        x, y = middle[0] + half[0] * NODES[k, 0], middle[1] + half[1] * NODES[k, 1]
+        under = middle[2] + half[2] * NODES[k, 2]
+        e = minus(row_of(points.centres, c), (x, y, water_at(block, x, y) + under))
         above = normal[2] * (points.offset[c] - under)
         path = light_path((0.0, 0.0, 0.0), e, normal, above, points.n)
         w = direction(path, normal)
         view[k, 0], view[k, 1], view[k, 2] = to_original(block.images, c, w)
         # the length of the ray in air, and the usual part of that in water
         view[k, 3] = np.sqrt(dot(w, w)) * (path[2] + USUAL * path[3])
+
+
+@device
+def _fit(terms: FloatArray, values: FloatArray) -> None:
+    """Fit polynomials by least squares to three values at the nodes; write them term by term."""
+    for j in range(CUBIC):
+        for f in range(3):
+            total = 0.0
+            for k in range(INSIDE):
+                total += FIT[j, k] * values[k, f]
+            terms[3 * j + f] = total
 
 
 @device
@@ -173,14 +217,14 @@ def _fit_image(
             away, residual, values[k, CURVED] = meet(u, a, base, block.matcher.focal_px[j])
             values[k, AWAY], values[k, RESIDUAL] = away - own[k, 3], residual
         of_pair = terms[EACH * CUBIC * p : EACH * CUBIC * (p + 1)]
-        cells.fit(of_pair, FIT_CUBIC, values)
+        _fit(of_pair, values)
         if in_frame[p] != NEVER:
             near = near and _is_near(of_pair, values, own, block.matcher.focal_px[c])
     return near
 
 
 @device
-def meet(u: Vector, a: Vector, base: Vector, focal_px: float) -> tuple[float, float, float]:
+def meet(u: Vector, a: Vector, base: Vector, focal_px: float) -> Vector:
     """Return where the ray u is nearest to the ray a, and the residual in the image of a.
 
     The distance from the centre of u, metres; the residual there, px, with a sign; half the
@@ -216,7 +260,7 @@ def _is_near(terms: FloatArray, values: FloatArray, view: FloatArray, focal_px: 
     """Whether polynomials are accurate at the corners, which were not fitted."""
     near = True
     for k in range(INSIDE, len(NODES)):
-        away, residual, curved = values_of(terms, BASIS[k])
+        away, residual, curved = values_of(terms, POWERS[k])
         off_px = abs(away - values[k, AWAY]) * focal_px / view[k, 3]
         near = near and max(off_px, abs(residual - values[k, RESIDUAL])) <= TOLERANCE_PX
         near = near and abs(curved - values[k, CURVED]) <= TOLERANCE_PX * values[k, CURVED]
@@ -240,10 +284,18 @@ def read_table(
     The depth beyond P (m), given the usual one, its squared residual (px^2) and half the curvature
     of that (px^2/m^2); see `depth_maps._compare`. Returns -1 for places outside the box.
     """
-    u, v, w = cells.in_box(table.box, place)
+    x, y, z = place
+    u, v = (x - table.middle[0]) / table.half[0], (y - table.middle[1]) / table.half[1]
+    w = (z - water_at(block, x, y) - table.middle[2]) / table.half[2]
     if not (abs(u) <= 1.0 and abs(v) <= 1.0 and abs(w) <= 1.0):
         return -1
-    cells.set_powers(powers, (u, v, w))
+    uu, uv, vv, ww = u * u, u * v, v * v, w * w
+    terms = (  # in the order of `POWERS`
+        1.0, u, v, w, uu, uv, u * w, vv, v * w, ww,
+        uu * u, uu * v, uu * w, uv * v, uv * w, u * ww, vv * v, vv * w, v * ww,
+    )  # fmt: skip
+    for j in range(CUBIC):
+        powers[j] = terms[j]
     at, count = table.place[c], 0
     for p in range(MATCHED):
         state = table.in_frame[at, p]
@@ -269,9 +321,3 @@ def values_of(terms: FloatArray, powers: FloatArray) -> Vector:
         y += powers[t] * terms[3 * t + 1]
         z += powers[t] * terms[3 * t + 2]
     return x, y, z
-
-
-@device
-def reads(table: Table, points: Chosen, i: int) -> bool:
-    """Whether the water above a point is that of the table."""
-    return table.place.size > 0 and cells.is_under(points, i, table.box)

@@ -40,65 +40,30 @@ FINER = 1.6
 
 
 class Matcher(NamedTuple):
-    """How the images of a block were matched.
+    """How the images of a block were matched; -1 after the last partner of an image."""
 
-    Attributes
-    ----------
-    matched : array, shape (k, 5)
-        The images that each image was compared with, best first; -1 after the last.
-    averaged : array, shape (k, 8)
-        The images whose depth maps were averaged into its own.
-    fused : array, shape (k, 12)
-        The images whose depth maps may be fused with its own.
-    focal_px : array, shape (k,)
-        Pixels a radian.
-    tolerance_px2 : float
-        Increase of the squared residuals of a pair of images, px^2, that makes it e times less
-        likely to determine a depth.
-    inner : Frames
-        The frames without a border, in which patches do not fit.
-    """
-
-    matched: IntArray
-    averaged: IntArray
-    fused: IntArray
-    focal_px: FloatArray
-    inner: Frames
-    tolerance_px2: float = TOLERANCE_PX2
+    matched: IntArray  # (k, 5), the images that each image was compared with, best first
+    averaged: IntArray  # (k, 8), the images whose depth maps were averaged into its own
+    fused: IntArray  # (k, 12), the images whose depth maps may be fused with its own
+    focal_px: FloatArray  # (k,), pixels per radian
+    inner: Frames  # the frames without a border, in which patches do not fit
+    tolerance_px2: float = TOLERANCE_PX2  # squared residuals of a pair: e times less likely
 
 
 class _Seen(NamedTuple):
-    """Which images see which of p places: e entries, sorted by image and place.
+    """Which images see which of p places: e entries, sorted by image and place."""
 
-    Attributes
-    ----------
-    start : array, shape (k + 1,)
-        The first entry of each image.
-    place, cell : array, shape (e,)
-        The place, and the cell of the image in which it lies.
-    depth : array, shape (e,)
-    of_place : array, shape (e,)
-        The entries sorted by place and image.
-    first : array, shape (p + 1,)
-        The first of these of each place.
-    image : array, shape (e,)
-        The image of each entry.
-    """
-
-    start: IntArray
-    place: IntArray
-    cell: IntArray
-    depth: FloatArray
-    of_place: IntArray
-    first: IntArray
-    image: IntArray
+    start: IntArray  # (k + 1,), the first entry of each image
+    place: IntArray  # (e,)
+    cell: IntArray  # (e,), the cell of the image in which the place lies
+    depth: FloatArray  # (e,)
+    of_place: IntArray  # (e,), the entries sorted by place and image
+    first: IntArray  # (p + 1,), the first of these of each place
+    image: IntArray  # (e,), the image of each entry
 
 
 def matcher_of(cameras: Cameras, places: FloatArray) -> Matcher:
-    """Predict the partners of images, with rotations and lenses, from places of the scene.
-
-    The places, shape (p, 3), are some thousand apparent points, metres.
-    """
+    """Predict the partners of images from places of the scene: some thousand apparent points."""
     planes = frames_of(cameras).planes
     likely = (
         np.flatnonzero((((centre - places) @ around.T) <= 0.0).all(axis=1))
@@ -162,7 +127,7 @@ def _seen(cameras: Cameras, places: FloatArray, likely: Iterable[IntArray]) -> _
         cell = row.astype(int) * CELLS + column.astype(int)
         found.append((rows[inside], cell, rays[inside, 2]))
     place, cell, depth = (np.concatenate(one) for one in zip(*found, strict=True))
-    counts = [len(rows) for rows, _, _ in found]
+    counts = [len(rows) for rows, *_ in found]
     return _Seen(
         start=np.concatenate([[0], np.cumsum(counts)]),
         place=place,
@@ -283,27 +248,16 @@ class Bed(NamedTuple):
 
     It serves only to choose among the likely beds of a point (`pcfix.refract.fusion`); no point is
     put onto it.
-
-    Attributes
-    ----------
-    height_m : array, shape (rows, columns)
-        World frame; the first row is the southern one.
-    left_m, bottom_m, cell_m : float
-    between : bool
-        Whether heights are interpolated between cells.
     """
 
-    height_m: FloatArray
+    height_m: FloatArray  # (rows, columns), world frame, southern row first
     left_m: float
     bottom_m: float
     cell_m: float
-    between: bool = True
+    between: bool = True  # whether heights are interpolated between cells
 
     def height_at(self, xy: FloatArray) -> FloatArray:
-        """Return the height at each place, shape (n,).
-
-        NaN where the cell has none; cells beside it without one do not count.
-        """
+        """Return the height at each place, NaN where the cell has none."""
         x, y = (xy[:, 0] - self.left_m) / self.cell_m, (xy[:, 1] - self.bottom_m) / self.cell_m
         own = self._at(np.floor(y).astype(int), np.floor(x).astype(int))
         if not self.between:
@@ -328,14 +282,9 @@ class Bed(NamedTuple):
 
 
 def bed_of(xyz: FloatArray, likely_m: FloatArray) -> Bed:
-    """Return the bed that agrees with most points, cell by cell.
+    """Return the bed that agrees with most apparent points, cell by cell.
 
-    Parameters
-    ----------
-    xyz : array, shape (m, 3)
-        Apparent points, world frame, metres.
-    likely_m : array, shape (m, h)
-        See `pcfix.refract.fusion.likely_beds`.
+    `likely_m`, shape (m, h), are the `pcfix.refract.fusion.likely_beds`.
     """
     low, high = xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0)
     cell = _cell_m(xyz[:, :2], low, high)
@@ -385,6 +334,7 @@ def _vote(
     found: FloatArray,
 ) -> None:  # fmt: skip
     """Find the height with most votes in each cell; a point votes for all its likely beds."""
+    reach = int(3.0 * _STEPS)  # three standard deviations to both sides
     for c in range(*span):
         rows = order[start[c] : start[c + 1]]
         # the range of likely beds in the cell
@@ -404,17 +354,11 @@ def _vote(
         for i in rows:
             vote[:] = 0.0
             for h in range(likely.shape[1]):
-                if likely[i, h] == likely[i, h]:
-                    _add_vote(vote, (likely[i, h] + z[i] - low) / step)
+                at = (likely[i, h] + z[i] - low) / step
+                if at == at:
+                    # several likely beds of a point count once
+                    for k in range(max(0, int(at) - reach), min(vote.size, int(at) + reach + 2)):
+                        off = (k - at) / _STEPS
+                        vote[k] = max(vote[k], np.exp(-0.5 * off * off))
             votes += vote
         found[c] = low + np.argmax(votes) * step
-
-
-@device
-def _add_vote(vote: FloatArray, at: float) -> None:
-    """Vote for the heights around one likely bed; several likely beds of a point count once."""
-    # three standard deviations to both sides
-    reach = int(3.0 * _STEPS)
-    for k in range(max(0, int(at) - reach), min(vote.size, int(at) + reach + 2)):
-        off = (k - at) / _STEPS
-        vote[k] = max(vote[k], np.exp(-0.5 * off * off))

@@ -1,7 +1,7 @@
 """Correct points by the method of a name.
 
-``snell`` and ``consistent`` with all cameras in frame choose cameras in their kernels; the others
-get batches of points with chosen cameras.
+``snell`` and tracks with all cameras in frame choose cameras in their kernels; the others get
+batches of points with chosen cameras.
 """
 
 from __future__ import annotations
@@ -12,17 +12,14 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from pcfix.model import FloatArray, IntArray, Outcome, Views, WaterPlane
+from pcfix.model import FloatArray, IntArray, Outcome, WaterPlane
 from pcfix.refract import literature
 from pcfix.refract.batch import Batch, Intersection, Survey
-from pcfix.refract.cells import is_bent, is_quick
-from pcfix.refract.choice import cameras_of_pairs, chosen_views
-from pcfix.refract.consistent import consistent
+from pcfix.refract.choice import cameras_of_pairs, chosen_views, is_bent
 from pcfix.refract.fusion import invert_depth_maps, invert_fusion
-from pcfix.refract.intersect import intersect, intersect_in_frame
+from pcfix.refract.intersect import consistent, intersect
 from pcfix.refract.matcher import steepest_and_partners, without_border
 from pcfix.refract.occlusion import visible_cameras
-from pcfix.refract.smooth import consistent_in_cells
 from pcfix.refract.stereo_pairs import invert_pairs
 from pcfix.refract.tiling import spatial_order
 from pcfix.refract.uncertainty import with_model_uncertainty, with_uncertainty
@@ -45,28 +42,12 @@ METHODS: dict[str, Method] = {
 }
 """By the names of `pcfix.options.Method`: a new method is a function and an entry."""
 
-_OF_MATCHERS: dict[str, Method] = {
-    "depth-maps": invert_depth_maps,
-    "pairs": invert_pairs,
-    "pair-images": invert_pairs,
-}
-"""`consistent` for the kinds of dense clouds."""
-
-_IN_FRAME: dict[Method, Method] = {
-    intersect: intersect_in_frame,
-    consistent_in_cells: consistent_in_cells,
-}
-"""Methods whose kernels choose among all cameras, and the function that does so."""
+_IN_FRAME = (intersect, consistent)
+"""Methods whose kernels choose among all cameras."""
 
 
 def correct(batch: Batch) -> Intersection:
-    """Correct submerged points by the method that the settings name.
-
-    Returns
-    -------
-    Intersection
-        One row per point of the batch, in its order.
-    """
+    """Correct submerged points by the method that the settings name; one row per point."""
     parts = batch.parts()
     found = [_named_by_limit(_corrected(part), part) for _, part in parts]
     if len(found) == 1:
@@ -97,7 +78,7 @@ def _corrected(batch: Batch) -> Intersection:
     if views is not None and views.kind == "pairs":
         pairs, batch = views, replace(batch, views=cameras_of_pairs(views))
     if method in _IN_FRAME and _takes_all_in_frame(batch):
-        return with_model_uncertainty(_IN_FRAME[method](batch), batch)
+        return with_model_uncertainty(method(batch), batch)
     order = spatial_order(batch.xyz)
     parts = []
     for rows in batches(order):
@@ -107,8 +88,6 @@ def _corrected(batch: Batch) -> Intersection:
         else:
             found = method(part)
         known = with_uncertainty(found, part)
-        if method in (invert_fusion, invert_depth_maps):
-            known = _with_model_error(known, found, part)
         if survey.settings.unsure != "keep":
             unsure = (found.outcome == Outcome.CORRECTED) & part.seen_flat() & (batch.views is None)
             known = known._replace(unsure=unsure)
@@ -133,15 +112,10 @@ def shift_of_land(batch: Batch) -> FloatArray:
     """Return the shift of land points between a dense matcher and the intersection of all rays.
 
     A transfer to adjusted cameras intersects the rays of all images; a dense matcher uses the
-    depths of some images. That is inverted as on the bed, without water.
-
-    Returns
-    -------
-    array, shape (m, 3)
-        Metres; zero for clouds of tracks.
+    depths of some images. That is inverted as on the bed, without water. Zero for tracks.
     """
     batch = replace(batch, survey=batch.survey.learned.land or on_land(batch.survey))
-    if _method(batch) not in (invert_fusion, *_OF_MATCHERS.values()):
+    if _method(batch) not in (invert_fusion, invert_depth_maps, invert_pairs):
         return np.zeros((len(batch), 3))
     at_themselves = SurfaceAbove(batch.xyz[:, 2].copy(), np.zeros((len(batch), 2)))
     return correct(replace(batch, surface=at_themselves)).shift_m
@@ -163,35 +137,18 @@ def on_land(survey: Survey) -> Survey:
     )
 
 
-MODEL_GSD = 0.8
-"""Standard error of the model of depth maps, common to a block: the bias of blocks with known truth
-was -0.6 to +1.4 ground pixels, largest with much image noise."""
-
-
-def _with_model_error(known: Intersection, found: Intersection, batch: Batch) -> Intersection:
-    """Add the errors of the model of depth maps, and of the ambiguous images, to that of Z."""
-    if known.covariance_m2 is None:
-        return known
-    cameras, moved = batch.survey.cameras, found.outcome == Outcome.CORRECTED
-    focal_px = float(np.median([lens.focal_px for lens in cameras.lenses or ()]))
-    gsd_m = (np.median(cameras.centres[:, 2]) - batch.surface.height_m) / focal_px
-    covariance = known.covariance_m2.copy()
-    covariance[:, 5] += np.where(moved, found.sigma_z_m**2 + (MODEL_GSD * gsd_m) ** 2, 0.0)
-    return known._replace(covariance_m2=covariance, sigma_z_m=np.sqrt(covariance[:, 5]))
-
-
 def _method(batch: Batch) -> Method:
     """Return the function that corrects; for `consistent` it depends on the reconstruction type."""
     settings, views = batch.survey.settings, batch.views
+    if settings.method != "consistent":
+        return METHODS[settings.method]
     modelled = "tracks" if batch.survey.learned.matcher is None else settings.matcher
     kind = modelled if views is None else views.kind
-    if settings.method == "consistent" and views is None and kind == "depth-maps":
-        return invert_fusion
-    if settings.method == "consistent" and kind in _OF_MATCHERS:
-        return _OF_MATCHERS[kind]
-    if settings.method == "consistent" and is_quick(batch):
-        return consistent_in_cells
-    return METHODS[settings.method]
+    if kind == "depth-maps":
+        return invert_fusion if views is None else invert_depth_maps
+    if kind in ("pairs", "pair-images"):
+        return invert_pairs
+    return consistent
 
 
 def with_rays(batch: Batch) -> Batch:
@@ -201,31 +158,23 @@ def with_rays(batch: Batch) -> Batch:
     `consistent` takes all images that may have a depth of the point, and weights them; the other
     methods get the steepest image and those it was matched with.
     """
-    survey, matcher = batch.survey, batch.survey.learned.matcher
-    if batch.views is not None or matcher is None:
-        return replace(batch, views=_visible_cameras(batch))
-    inner = replace(survey, cameras=without_border(survey.cameras))
-    if survey.settings.method == "consistent":
-        return replace(batch, views=_visible_cameras(replace(batch, survey=inner)))
-    seeing = _visible_cameras(replace(batch, survey=_with_any_number(inner)))
-    partners = steepest_and_partners(batch.xyz, survey.cameras.centres, seeing, matcher)
-    return replace(batch, views=chosen_views(replace(batch, views=partners)))
-
-
-def _with_any_number(survey: Survey) -> Survey:
-    return replace(survey, settings=replace(survey.settings, max_cameras=None))
-
-
-def _visible_cameras(batch: Batch) -> Views:
-    """Return the chosen cameras without occluded ones; the steepest of these if limited."""
-    survey, occluder = batch.survey, batch.survey.learned.occluder
-    if occluder is None:
-        return chosen_views(batch)
-    chosen = chosen_views(replace(batch, survey=_with_any_number(survey)))
-    seeing = visible_cameras(batch.xyz, survey.cameras.centres, chosen, occluder)
-    if survey.settings.max_cameras is None:
-        return seeing
-    return chosen_views(replace(batch, views=seeing))
+    survey, learned = batch.survey, batch.survey.learned
+    any_number = replace(survey, settings=replace(survey.settings, max_cameras=None))
+    whole, by_model = survey, batch.views is None and learned.matcher is not None
+    seeds = by_model and survey.settings.method != "consistent"
+    if seeds or learned.occluder is not None:  # the number is limited in the end
+        whole = any_number
+    if by_model:
+        whole = replace(whole, cameras=without_border(survey.cameras))
+    views, is_final = chosen_views(replace(batch, survey=whole)), whole.settings == survey.settings
+    if learned.occluder is not None:
+        views = visible_cameras(batch.xyz, survey.cameras.centres, views, learned.occluder)
+    if seeds and learned.matcher is not None:
+        centres = survey.cameras.centres
+        views = steepest_and_partners(batch.xyz, centres, views, learned.matcher)
+    if seeds or not is_final:
+        views = chosen_views(replace(batch, views=views))
+    return replace(batch, views=views)
 
 
 def batches(order: IntArray) -> Iterator[IntArray]:

@@ -1,20 +1,14 @@
 """Find the cameras whose view of a point is occluded by the cloud itself.
 
 The surface of the cloud is a grid of heights. From the apparent point P the straight ray to the
-projection centre climbs over the cells on its way; where it is still below the surface as it
-leaves a cell, the camera did not see the point.
+projection centre climbs over the cells; where it is still below the surface as it leaves a cell,
+the camera did not see the point. Straight rays and the apparent surface belong together: software
+that ignores water puts every submerged object on the straight ray on which an image shows it. For
+points of several images this is an approximation, as their straight rays pass each other.
 
-The rays are straight and the surface is the apparent one, although light bends at the water. That
-is consistent: software that ignores water puts every submerged object on the straight ray on which
-an image shows it, so that what occludes P lies before it on its straight ray. It is an
-approximation for points of several images, as their straight rays pass each other: beside nadir
-images, a ray at 45 degrees by about a tenth of the depth. An object and what it occludes under
-water are displaced to the same side, so that only the difference of their depths matters. Above the
-water nothing is approximate.
-
-Everything below the surface of the grid counts as solid. Within `NEAR_CELLS` of P nothing is
-tested: a cell has one height, which on a cliff is the upper edge. Only under a roof, where all
-cells around P are higher, it matters whether the ray goes through it.
+Everything below the surface counts as solid. Within `NEAR_CELLS` of P nothing is tested: a cell has
+one height, which on a cliff is the upper edge. Only under a roof, where all cells around P are
+higher, it matters whether the ray goes through it.
 
 A cell has the height of its second highest point, and at most that of the highest of its eight
 neighbours, so that neither a single flying point nor a single cell counts. The sides of cells are
@@ -55,10 +49,7 @@ FINEST_M = 2.0**-10
 WIDE_GAP = 0.75
 GAPS_TO_MARGIN = 4.5
 """The margin is 4.5 times the upper quartile, over the cells of a block, of the gap between the
-highest two points of a cell. For noise and four to sixteen points that is about four standard
-deviations: the point may be low by three, and a cell high by one. The gap does not see the height
-of walls; the quartile stays that of a noisy bed where most of the block is smooth. In cells that
-are steep in themselves the gap grows with what they rise."""
+highest two points of a cell: four standard deviations of noise, without walls."""
 FEWEST_CELLS = 9
 """With heights, in a block with a margin of its own."""
 OBLIQUE_DEG = 15.0
@@ -67,44 +58,23 @@ stay within a few degrees; obliques are flown at 20 and more."""
 
 
 class Occluder(NamedTuple):
-    """The surface of a cloud, which occludes points.
+    """The surface of a cloud, which occludes points; metres, world frame."""
 
-    Attributes
-    ----------
-    height : array of float32, shape (rows, columns)
-        Metres, world frame; the first row is the southern one. NaN where it is not known, which
-        occludes nothing.
-    left_m, bottom_m : float
-        South-west corner of the grid, world frame.
-    cell_m : float
-        Side of a cell.
-    highest_m : float
-        Of all heights; minus infinity where none is known.
-    margin : array of float32, shape (rows / 16, columns / 16), rounded up
-        Least distance by which a ray must pass below the surface, metres: the noise of the points
-        in each block of `MARGIN_BLOCK` cells.
-    block_top, large_block_top : array of float32
-        The highest of each block of `BLOCK` and `LARGE_BLOCK` cells; minus infinity where none
-        is known.
-    """
-
-    height: Heights
+    height: Heights  # southern row first; NaN where it is not known, which occludes nothing
     left_m: float
-    bottom_m: float
+    bottom_m: float  # south-west corner of the grid
     cell_m: float
-    highest_m: float
-    margin: Heights
-    block_top: Heights
+    highest_m: float  # of all heights; minus infinity where none is known
+    margin: Heights  # of each `MARGIN_BLOCK`: a ray must pass below the surface by more (noise)
+    block_top: Heights  # the highest of each `BLOCK`; minus infinity where none is known
     large_block_top: Heights
 
 
 def occluded(xyz: FloatArray, centres: FloatArray, views: Views, occluder: Occluder) -> BoolArray:
     """Return for each entry of ``views.camera`` whether the cloud occludes its point.
 
-    Apparent points, shape (n, 3), and projection centres, shape (k, 3), in metres, world frame.
-    Cameras below their point, and points beside the grid, are never occluded. The cells on the way
-    are found as by Amanatides & Woo 1987, "A fast voxel traversal algorithm for ray tracing", in
-    blocks of three sizes.
+    Points beside the grid, and cameras below their point, are never occluded. The cells on the way
+    are found as by Amanatides & Woo 1987, "A fast voxel traversal algorithm for ray tracing".
     """
     found = np.zeros(len(views.camera), np.bool_)
     in_tiles(
@@ -258,15 +228,10 @@ class _Cells(NamedTuple):
 
 
 class OccluderBuilder:
-    """Builds the surface of a cloud from its chunks, without noise.
+    """Builds the surface of a cloud of so many points from its chunks.
 
-    Parameters
-    ----------
-    low, high : array, shape (2,)
-        South-west and north-east corner of the cloud, metres, if they are known; the grid grows
-        where points lie outside.
-    points : int
-        Of the whole cloud.
+    `low` and `high`, shape (2,), are the corners of the cloud in metres, if they are known; the
+    grid grows where points lie outside.
     """
 
     def __init__(self, low: FloatArray, high: FloatArray, points: int) -> None:
@@ -278,15 +243,7 @@ class OccluderBuilder:
             self._reach(low, high)
 
     def add(self, xyz: FloatArray, classes: npt.NDArray[np.uint8] | None = None) -> None:
-        """Add a chunk.
-
-        Parameters
-        ----------
-        xyz : array, shape (n, 3)
-            Apparent points, metres, world frame.
-        classes : array, shape (n,), optional
-            Low and high noise (7 and 18) occlude nothing.
-        """
+        """Add a chunk of apparent points, shape (n, 3); noise (classes 7 and 18) is ignored."""
         if classes is not None:
             xyz = xyz[~np.isin(classes, NOISE_CLASSES)]
         if not len(xyz):
@@ -299,10 +256,9 @@ class OccluderBuilder:
     def _reach(self, low: FloatArray, high: FloatArray) -> None:
         """Extend the grid to a rectangle."""
         low, high = np.minimum(self._low, low), np.maximum(self._high, high)
-        if (low == self._low).all() and (high == self._high).all():
-            return
-        self._low, self._high = low, high
-        self._cells = _over(low, high, self._most, self._cells)
+        if (low < self._low).any() or (high > self._high).any():
+            self._low, self._high = low, high
+            self._cells = _over(low, high, self._most, self._cells)
 
     def build(self) -> Occluder | None:
         """Return the surface; None without points. The builder is then empty."""
@@ -356,19 +312,17 @@ def _halved(cells: _Cells) -> _Cells:
     """Return the same in cells of twice the side."""
     (rows, columns), south, west = cells.highest.shape, cells.first_row % 2, cells.first_column % 2
     pad = (south, (south + rows) % 2), (west, (west + columns) % 2)
-    highest, second = _quads(cells.highest, pad), _quads(cells.second, pad)
-    first, runner_up = highest[0], second[0]
-    for one, other in zip(highest[1:], second[1:], strict=True):
+    highest, second = (
+        np.pad(values, pad, constant_values=-np.inf) if np.any(pad) else values
+        for values in (cells.highest, cells.second)
+    )
+    first, runner_up = highest[::2, ::2], second[::2, ::2]
+    for r, c in ((0, 1), (1, 0), (1, 1)):  # the other three of each four cells
+        one, other = highest[r::2, c::2], second[r::2, c::2]
         runner_up = np.maximum(np.minimum(first, one), np.maximum(runner_up, other))
         first = np.maximum(first, one)
     corner = cells.first_row // 2, cells.first_column // 2
     return _Cells(cells.side_m * 2.0, *corner, first, runner_up)
-
-
-def _quads(cells: Heights, pad: tuple[tuple[int, int], ...]) -> list[Heights]:
-    """Return the four cells of each two by two, after adding empty rows and columns."""
-    full = np.pad(cells, pad, constant_values=-np.inf) if np.any(pad) else cells
-    return [full[::2, ::2], full[::2, 1::2], full[1::2, ::2], full[1::2, 1::2]]
 
 
 @kernel
@@ -403,15 +357,13 @@ def _tops(height: Heights, side: int) -> Heights:
 
 
 def _margins(highest: Heights, second: Heights) -> Heights:
-    """Return the margin of each block, metres: `GAPS_TO_MARGIN` times its upper quartile of gaps.
-
-    Blocks with few gaps get the quartile of all.
-    """
+    """Return the margin of each block, metres; blocks with few gaps have the quartile of all."""
     known = np.isfinite(second)
-    everywhere = np.quantile(highest[known] - second[known], WIDE_GAP) if known.any() else 0.0
+    gap = highest[known] - second[known]
+    everywhere = np.quantile(gap, WIDE_GAP) if known.any() else 0.0
     rows, columns = (-(-n // MARGIN_BLOCK) for n in second.shape)
     gaps = np.full((rows * MARGIN_BLOCK, columns * MARGIN_BLOCK), np.inf, np.float32)
-    gaps[: len(second), : second.shape[1]][known] = highest[known] - second[known]
+    gaps[: len(second), : second.shape[1]][known] = gap
     blocks = gaps.reshape(rows, MARGIN_BLOCK, columns, MARGIN_BLOCK).swapaxes(1, 2)
     blocks = np.sort(blocks.reshape(rows, columns, -1), axis=2)
     count = np.isfinite(blocks).sum(axis=2)
@@ -422,18 +374,11 @@ def _margins(highest: Heights, second: Heights) -> Heights:
 
 
 def wants_occlusion(cameras: Cameras, settings: ScienceOptions) -> bool:
-    """Return whether occluded cameras are to be excluded.
-
-    With auto, if the axis of a camera is more than `OBLIQUE_DEG` off the nadir. Cameras without
-    angles count as nadir.
-    """
-    if settings.occlusion != "auto":
+    """Return whether to exclude occluded cameras; with auto, if one is oblique."""
+    if settings.occlusion != "auto" or cameras.rotations is None:
         return settings.occlusion == "on"
-    if cameras.rotations is None:
-        return False
     # the third row of a rotation is the axis in the world frame; straight down it is (0, 0, -1)
-    down = -cameras.rotations[:, 2, 2]
-    return bool((down < np.cos(np.radians(OBLIQUE_DEG))).any())
+    return bool((-cameras.rotations[:, 2, 2] < np.cos(np.radians(OBLIQUE_DEG))).any())
 
 
 def occluder_of(xyz: FloatArray, classes: npt.NDArray[np.uint8] | None = None) -> Occluder | None:

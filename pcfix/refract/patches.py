@@ -1,18 +1,17 @@
-"""Patches of neighbours, and what is left of the steps between them in a bed.
+"""Measure the discontinuities between image footprints that a correction leaves in a bed.
 
-The same apparent points are corrected as different software would have made them. Where the images
-that see a point change, two such corrections differ by a step. Of the right one the bed has no step
-there; of the wrong one it has just the step by which the two differ.
+The same apparent points are corrected for two reconstruction types. Where the images that see a
+point change, the two corrections differ by a discontinuity. The bed of the right one is smooth
+there; that of the wrong one has the discontinuity by which the two differ.
 
-So from patches of neighbours, with r_a and r_b what is left of the heights of either correction
-after a smooth surface (a quadratic one) is taken out, and d = r_a - r_b, comes the share of d that
-is in r_a,
+With r_a and r_b the residuals of the two beds from a quadratic surface over a patch of neighbours,
+and d = r_a - r_b, the share of d that is in r_a is
 
     beta = sum(w r_a d) / sum(w d d),
 
 near 0 if a is right and near 1 if b is. The weights are one over the square of the scatter of the
 apparent patch. Noise of the points is in r_a and r_b by the factors by which either makes depths
-larger; that part of d is taken out first, as it tells nothing.
+larger; that part of d is subtracted first.
 """
 
 from __future__ import annotations
@@ -29,45 +28,34 @@ PATCHES, PATCH_POINTS, FEWEST_POINTS = 500, 16, 400
 FEWEST_WITHOUT_LIST = 2000
 """Fewer are tie points, and their patches overlap."""
 
-WIDEST_PATCH = 0.055
-PATCH_WIDTH = 0.04
-"""Of a patch, in flying heights: wide enough for borders of images to cross many of them. Where the
-points are so sparse that patches are wider than the widest, relief drowns the steps of images."""
+PATCH_WIDTH, WIDEST_PATCH = 0.04, 0.055
+"""In flying heights: so wide that image borders cross many patches. In wider ones relief hides the
+discontinuities."""
 
 DENSE_GSD = 8.0
 """Points of dense matching are nearer to each other than this, those of tracks are not."""
 
 GRID_SHARE = 0.9
-"""Of neighbours that lie whole steps of a grid apart, from which a cloud is a grid."""
+"""Share of neighbours whole steps apart from which a cloud is a grid."""
 
 SMOOTH_GSD = 0.02
-"""Scatter of neighbours below which a cloud was made smooth: image noise leaves ten times that."""
+"""Least scatter of neighbours: image noise leaves ten times that."""
 
 SQUARE_PATCHES, MOST_IN_SQUARES = 5.0, 1_000_000
-"""Width of a square, in patches; so many points are looked at."""
+"""Width of a square, in patches; most points in squares."""
 
 _MIX = (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0xD6E8FEB86659FD93)
-"""Odd numbers whose products look as if by chance."""
+"""Odd numbers of a hash."""
 
 _TERMS = 6
 
 
 class Patches(NamedTuple):
-    """Groups of neighbours among points of a cloud.
+    """Groups of neighbours among points of a cloud."""
 
-    Attributes
-    ----------
-    rows : array, shape (m,)
-        The points that are of a patch, rows of a batch.
-    place : array, shape (p, 16)
-        Rows of `rows`, patch by patch.
-    step : int
-        Every so many points of the batch were taken.
-    """
-
-    rows: IntArray
-    place: IntArray
-    step: int
+    rows: IntArray  # (m,), the rows of a batch that are in a patch
+    place: IntArray  # (p, 16), rows of `rows`, patch by patch
+    step: int  # one in so many points of the batch was taken
 
 
 def patches_of(batch: Batch) -> Patches | None:
@@ -81,8 +69,11 @@ def patches_of(batch: Batch) -> Patches | None:
         return None
     width_m = PATCH_WIDTH * flying_height_m(batch)
     # so dense that a patch is as wide as the images' borders are far apart
-    extent = np.maximum(np.ptp(batch.xyz[usable, :2], axis=0), width_m)
-    covered = min(float(extent.prod()) / width_m**2, len(_squares(batch.xyz[usable], width_m)))
+    xy = batch.xyz[usable, :2]
+    extent = np.maximum(np.ptp(xy, axis=0), width_m)
+    x, y = np.floor((xy - xy.min(axis=0)).T / width_m).astype(np.int64)
+    squares = len(np.unique(x * (int(y.max()) + 1) + y))
+    covered = min(float(extent.prod()) / width_m**2, squares)
     step = max(1, int(len(usable) / max(FEWEST_POINTS, PATCH_POINTS * covered)))
     usable = usable[::step]
     xy = batch.xyz[usable, :2]
@@ -98,15 +89,10 @@ def patches_of(batch: Batch) -> Patches | None:
 
 
 class Squares:
-    """Points of a large cloud that have neighbours among them: of squares, not of all the ground.
+    """Points of a large cloud with their neighbours: those of some squares for patches of a width.
 
-    Which squares goes by chance, by their place alone: of as many, in halves of halves, as the
-    points are not too many. So chunks and tiles of other sizes lead to the same points.
-
-    Parameters
-    ----------
-    width_m : float
-        Of a patch.
+    A square is taken by a hash of its place, and their share is halved while the points are too
+    many, so that chunks and tiles of other sizes lead to the same points.
     """
 
     def __init__(self, width_m: float) -> None:
@@ -115,8 +101,12 @@ class Squares:
         self._taken = list[tuple[Batch, FloatArray]]()
 
     def add(self, batch: Batch) -> None:
-        """Take what lies in the squares that are looked at."""
-        self._taken.append(self._inside(batch, self._rank(batch.xyz)))
+        """Take what lies in the squares."""
+        x, y = np.floor(batch.xyz[:, :2].T / self._width_m).astype(np.int64).view(np.uint64)
+        mixed = (x * np.uint64(_MIX[0])) ^ (y * np.uint64(_MIX[1]))
+        mixed = (mixed ^ (mixed >> np.uint64(32))) * np.uint64(_MIX[2])
+        # a number from 0 to 1 for each square
+        self._taken.append(self._inside(batch, np.asarray((mixed >> np.uint64(11)) / 2.0**53)))
         while sum(len(one) for one, _ in self._taken) > MOST_IN_SQUARES:
             self._share /= 2.0
             self._taken = [self._inside(*one) for one in self._taken]
@@ -124,13 +114,6 @@ class Squares:
     def _inside(self, batch: Batch, rank: FloatArray) -> tuple[Batch, FloatArray]:
         rows = np.flatnonzero(rank < self._share)
         return batch.take(rows), rank[rows]
-
-    def _rank(self, xyz: FloatArray) -> FloatArray:
-        """Return a number from 0 to 1 for the square of each point, as if by chance."""
-        x, y = np.floor(xyz[:, :2].T / self._width_m).astype(np.int64).view(np.uint64)
-        mixed = (x * np.uint64(_MIX[0])) ^ (y * np.uint64(_MIX[1]))
-        mixed = (mixed ^ (mixed >> np.uint64(32))) * np.uint64(_MIX[2])
-        return np.asarray((mixed >> np.uint64(11)) / 2.0**53)
 
     def all(self) -> Batch:
         """Return the points."""
@@ -149,12 +132,6 @@ def others_around(batch: Batch, rows: IntArray) -> Batch:
     return batch.take(others[np.unique(near)])
 
 
-def _squares(xyz: FloatArray, width_m: float) -> IntArray:
-    """Return the squares that points lie in, one number for each."""
-    x, y = np.floor((xyz[:, :2] - xyz[:, :2].min(axis=0)).T / width_m).astype(np.int64)
-    return np.unique(x * (int(y.max()) + 1) + y)
-
-
 def flying_height_m(batch: Batch) -> float:
     """Return the height of the cameras above the water, in the median."""
     return float(np.median(batch.survey.cameras.centres[:, 2]) - batch.surface.height_m.mean())
@@ -167,15 +144,9 @@ def gsd_m(batch: Batch) -> float:
 
 
 def shares(part: Batch, place: IntArray, z: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return beta of each way a against each b, and its standard error, shapes (h, h).
+    """Return beta of each correction a against each b, and its standard error, shapes (h, h).
 
-    Parameters
-    ----------
-    part : Batch
-        The m points of the patches.
-    place : array, shape (p, 16)
-    z : array, shape (h, m)
-        Heights as each way corrects them, metres.
+    `part` are the m points of the patches, and `z`, shape (h, m), their corrected heights.
     """
     h = len(z)
     beta, sigma = np.full((2, h, h), np.nan)

@@ -282,6 +282,72 @@ def slope_of_path(path: Path, normal: Vector, n: float) -> Vector:
     return beyond(scaled(below * k / root, normal), aside, s)
 
 
+COLUMNS = 12
+DIRECTION, BY_POINT, BY_CENTRE, BY_LEVEL, BY_SLOPES, BY_INDEX = 0, 1, 4, 7, 8, 10
+"""First columns of `light_and_gradients`."""
+
+
+@device
+def light_and_gradients(
+    q: Vector, e: Vector, normal: Vector, h: float, n: float, out: FloatArray
+) -> None:
+    r"""Fill in the direction w of the light from Q to a camera, and its derivatives.
+
+    `q` and `e`, the projection centre, are relative to the local origin, as is the plane N.x = h.
+    `out`, shape (3, 12), has w and its derivatives by Q, the projection centre, the plane's level a
+    and slopes b and c (z = a + b x + c y about the local origin) and n; the last column is zero.
+    All is NaN where `light_path` finds no path.
+
+    By the implicit function theorem any change of Q, C, plane or index moves the root k of G by
+
+        dk = -(k dH + k / S dD - D k^3 (n^2 - 1) / (2 S^3) d(s.s) - k D n (1 + k^2 s.s) / S^3 dn)
+             / G_k,    G_k = H + D n^2 / S^3
+
+    and w by dw = -dN + k ds + s dk. For the plane, with u = N_z,
+
+        N = u (-b, -c, 1),  h = u a:    dN / db = -u (e_x - N_x N),    dh / db = u N_x h
+
+    and H and D change with b by -u and u times the x of the feet of C and Q on the plane; with c
+    likewise by y.
+    """
+    k, root, height, depth, s = light_path(q, e, normal, h, n)
+    if np.isnan(k):
+        out[:] = np.nan
+        return
+    # light of a point above the plane does not depend on n
+    m = n if depth > 0.0 else 1.0
+    cube = root * root * root
+    # 1 / G_k
+    below = 1.0 / (height + depth * m * m / cube)
+    along, aside = below * k / root, below * depth * k * k * k * (m * m - 1.0) / cube
+    by_n = 0.0
+    if depth > 0.0:
+        by_n = below * k * depth * n * (1.0 + k * k * dot(s, s)) / cube
+    # dk / dQ = along N + aside s and dk / dC = -(below k N + aside s)
+    for i in range(3):
+        out[i, DIRECTION] = k * s[i] - normal[i]
+        for j in range(3):
+            flat = (k if i == j else 0.0) - k * normal[i] * normal[j]
+            aside_j = aside * s[j]
+            out[i, BY_POINT + j] = flat + s[i] * (along * normal[j] + aside_j)
+            out[i, BY_CENTRE + j] = -flat - s[i] * (below * k * normal[j] + aside_j)
+    all_down, up = height + depth, normal[2]
+    for j in range(2):
+        dk = (
+            up * below * k * (e[j] - normal[j] * height)
+            - up * along * (q[j] + normal[j] * depth)
+            - up * aside * all_down * s[j]
+        )
+        # dw = u (1 - k (H + D)) (e_j - N_j N) + k u s_j N + s dk
+        rest = 1.0 - k * all_down
+        for i in range(3):
+            flat = (1.0 if i == j else 0.0) - normal[i] * normal[j]
+            out[i, BY_SLOPES + j] = up * (rest * flat + k * s[j] * normal[i]) + s[i] * dk
+    by_level = up * (below * k - along)
+    for i in range(3):
+        out[i, BY_LEVEL], out[i, BY_INDEX], out[i, 11] = s[i] * by_level, s[i] * by_n, 0.0
+
+
 SETTLING_STEPS = 12
 HALVINGS = 36
 """Most steps to the plane where the light leaves a mesh or raster, and on a crease."""

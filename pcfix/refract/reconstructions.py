@@ -25,11 +25,11 @@ from pcfix.refract.patches import Patches, shares
 SURE = 3.0
 """Standard errors by which a share must differ from one half to be significant."""
 LEAST_PATCHES = 100
-"""Patches with all their points corrected in each way, below which nothing is decided."""
+"""With all their points corrected for each type; with fewer nothing is decided."""
 COVERED = 0.95
-"""Least share of the points that a way must correct, of those that most ways correct."""
+"""Least share of the points that must be corrected, of those that are for most types."""
 LEAST_DEPTH_M = 0.1
-"""Of water, under which the ratio of two depths means little."""
+"""In shallower water the ratio of two depths means little."""
 FITS = 0.3
 """Largest share of the discontinuities that the right type leaves; for stereo pairs it may be more.
 With moved cameras, and for smoothed clouds, the best type has 0.35 to 0.48. A wrong water level
@@ -45,19 +45,11 @@ CAUSES = (
 
 
 class Reconstruction(NamedTuple):
-    """A way in which a cloud may have been made.
+    """A reconstruction type."""
 
-    words : str
-        Its name.
-    changes : dict
-        The options that correct such a cloud.
-    kind : ViewKind or None
-        The kind of a view list; None without one.
-    """
-
-    words: str
-    changes: dict[str, Any]
-    kind: ViewKind | None = None
+    words: str  # its name
+    changes: dict[str, Any]  # the options that correct such a cloud
+    kind: ViewKind | None = None  # of its view list, if there is one
 
     def settings(self, given: ScienceOptions) -> ScienceOptions:
         """Return the options that correct such a cloud."""
@@ -100,13 +92,7 @@ SOFTWARE = {
 
 
 class Hint(NamedTuple):
-    """The type of a dense cloud by its software.
-
-    words : str
-        Of the reconstruction.
-    source : str
-        The name of the software.
-    """
+    """The type of a dense cloud, and the name of the software by which it is known."""
 
     words: str
     source: str
@@ -124,45 +110,24 @@ def hint_of(names: tuple[str, ...]) -> Hint | None:
 class Verdict(NamedTuple):
     """The reconstruction type of a cloud, and the evidence.
 
-    Attributes
-    ----------
-    chosen, runner_up : Reconstruction
-        The type, and the next best one; if the user set the type, the best of all others.
-    share, runner_up_share : float
-        Share of the discontinuities by which the two differ that is left in the bed of each: 0
-        where right.
-    sigma : float
-        Standard error of both.
-    deeper_m : float
-        By how much the bed of the other one would be deeper, on average over the patches.
-    patches : int
-        Number of patches; 0 without evidence.
-    model_uncertainty : ModelUncertainty
-    by : str
-        Other evidence that decided; empty if the discontinuities did.
-    is_told : bool
-        Whether the user set the type.
-    remarks : tuple of str
-        What makes the evidence weak.
-    of : str
-        The points it is about; empty for all.
-    straight : tuple of 2 float, or None
-        Share of the discontinuities between the chosen type and straight rays that is left in its
-        bed, near 1 if the poses have absorbed the refraction; and its standard error.
+    `share` and `runner_up_share` are the shares of the discontinuities, by which the two types
+    differ, that are left in the bed of each: 0 where right. `straight` is that share between the
+    chosen type and straight rays, near 1 if the poses have absorbed the refraction, and its
+    standard error.
     """
 
     chosen: Reconstruction
-    runner_up: Reconstruction
+    runner_up: Reconstruction  # the next best; if the user set the type, the best of all others
     share: float
     runner_up_share: float
-    sigma: float
-    deeper_m: float
-    patches: int
+    sigma: float  # standard error of both
+    deeper_m: float  # mean depth of the runner-up's bed below the chosen one
+    patches: int  # 0 without evidence
     model_uncertainty: ModelUncertainty
-    by: str = ""
-    is_told: bool = False
-    remarks: tuple[str, ...] = ()
-    of: str = ""
+    by: str = ""  # other evidence that decided; empty if the discontinuities did
+    is_told: bool = False  # whether the user set the type
+    remarks: tuple[str, ...] = ()  # what makes the evidence weak
+    of: str = ""  # the points it is about; empty for all
     straight: tuple[float, float] | None = None
 
     @property
@@ -186,10 +151,9 @@ class Verdict(NamedTuple):
         unsure = differs if self.is_told else not self.is_sure
         is_type = "method" in self.chosen.changes and not self.is_told
         poor = not self.is_sure and self.share > FITS
-        absurd = self.share < MOST_BEYOND and self.share < -SURE * self.sigma
+        absurd = self.share < min(MOST_BEYOND, -SURE * self.sigma)
         none_fits = is_type and self.patches > 0 and (poor or absurd)
-        said = ((str(self), unsure), (CAUSES, none_fits))
-        return (*self.remarks, *(sentence for sentence, holds in said if holds))
+        return (*self.remarks, *[str(self)] * unsure, *[CAUSES] * none_fits)
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
@@ -244,7 +208,7 @@ def reconstructions_of(batch: Batch) -> tuple[Reconstruction, ...]:
 
 
 def told_by(batch: Batch) -> Reconstruction:
-    """Return the way that the options set, with limits of angles resolved."""
+    """Return the type that the options set, with limits of angles resolved."""
     settings, views = batch.survey.settings, batch.views
     changes: dict[str, Any] = {"method": settings.method, "max_angle": settings.max_angle}
     if views is None:
@@ -258,7 +222,7 @@ def told_by(batch: Batch) -> Reconstruction:
 
 
 class _Beds(NamedTuple):
-    """The points of patches as each way corrects them; see `pcfix.refract.patches.shares`."""
+    """The points of patches as corrected for each type; see `pcfix.refract.patches.shares`."""
 
     ways: tuple[Reconstruction, ...]
     z: FloatArray
@@ -268,7 +232,7 @@ class _Beds(NamedTuple):
     sigma: FloatArray
 
     def rank(self, among: list[int]) -> tuple[int, int]:
-        """Return the best of some ways, and the runner-up."""
+        """Return the best of some types, and the runner-up."""
         share = self.share[np.ix_(among, among)]
         best = int(np.argmin(share.max(axis=1)))
         return among[best], among[int(np.argmax(share[best]))]
@@ -286,14 +250,16 @@ def weigh(
 
     The submerged points are evenly spread over the cloud, and each represents `step` of its points;
     `batch.survey.learned` has the matcher. `told` is set by the user, `hint` decides if the points
-    do not. None with a single way, or too few points for patches.
+    do not. None with a single type, or too few points for patches.
     """
     ways = reconstructions if told is None or told in reconstructions else (*reconstructions, told)
     sample = patches.patches_of(batch) if len(ways) > 1 else None
     if sample is None:
         return None
     part = batch.take(sample.rows)
-    part = replace(part, survey=replace(part.survey, level_offset_m=None), level_sigma_m=None)
+    learned = part.survey.learned._replace(dense=None)
+    survey = replace(part.survey, level_offset_m=None, learned=learned)
+    part = replace(part, survey=survey, level_sigma_m=None)
     beds = _beds(part, replace(batch, survey=part.survey), sample, ways)
     if beds is None or (told is not None and told not in beds.ways):
         return None
@@ -329,7 +295,7 @@ def weigh(
 def _beds(
     part: Batch, batch: Batch, sample: Patches, ways: tuple[Reconstruction, ...]
 ) -> _Beds | None:
-    """Correct the points of the patches in each way; None if fewer than two ways can."""
+    """Correct the points of the patches for each type; None if fewer than two can."""
     around = patches.others_around(batch, sample.rows)
     z = np.array([_heights(part, around, way) for way in ways])
     covered = np.isfinite(z).sum(axis=1)
@@ -351,7 +317,7 @@ def _beds(
 def _decided(
     part: Batch, beds: _Beds, sample: Patches, step: float, hint: Hint | None, *, weak: bool
 ) -> tuple[int, int, str]:
-    """Return the chosen way, the runner-up, and other evidence that decided.
+    """Return the chosen type, the runner-up, and other evidence that decided.
 
     If the discontinuities are not significant, a dense cloud is what its software makes, and not
     tracks; a sparse one is tracks.
@@ -363,9 +329,9 @@ def _decided(
     words = [one.words for one in beds.ways]
     dense = patches.is_dense(part, sample.place, step * sample.step)
     if dense and hint is not None and hint.words in words:
-        said = words.index(hint.words)
-        return said, other if said == best else best, f"its software, {hint.source}"
-    if words[best if dense else other] == "intersected rays":
+        known = words.index(hint.words)
+        return known, other if known == best else best, f"its software, {hint.source}"
+    if words[best if dense else other] == _TRACKS:
         return other, best, "its density"
     return best, other, ""
 
@@ -390,10 +356,10 @@ def _remarks(part: Batch, place: IntArray) -> tuple[str, ...]:
 
 
 def _model_uncertainty(part: Batch, beds: _Beds, way: int, among: list[int]) -> ModelUncertainty:
-    """Return the model uncertainty of a way, among ways that may be right.
+    """Return the model uncertainty of a type, among types that may be right.
 
-    Of the best way it is, for each other one, the share of the difference to it that is left in the
-    bed; of another way, the difference to the best in addition. Of a formula, which is no
+    Of the best type it is, for each other one, the share of the difference to it that is left in
+    the bed; of another type, the difference to the best in addition. Of a formula, which is no
     reconstruction type, it is the whole difference: a bed can be smooth and too shallow.
     """
     depth = np.maximum(part.surface.height_m - beds.z[way], 1e-3)[beds.place]
@@ -420,7 +386,7 @@ def _model_uncertainty(part: Batch, beds: _Beds, way: int, among: list[int]) -> 
 
 
 def _as(part: Batch, way: Reconstruction, dimensions: Dimensions = "none") -> Batch:
-    """Return the points with the settings of a way."""
+    """Return the points with the settings of a type."""
     survey = part.survey
     settings = replace(way.settings(survey.settings), dimensions=dimensions)
     learned, views = survey.learned, part.views
@@ -432,22 +398,17 @@ def _as(part: Batch, way: Reconstruction, dimensions: Dimensions = "none") -> Ba
 
 
 def _heights(part: Batch, around: Batch, way: Reconstruction) -> FloatArray:
-    """Return the heights corrected in one way, NaN where a point is not corrected."""
+    """Return the heights corrected for a type, NaN where a point is not corrected."""
     part = _as(part, way)
-    settings = part.survey.settings
+    settings, learned = part.survey.settings, part.survey.learned
     fuses = settings.method == "consistent" and settings.matcher == "depth-maps"
-    if part.views is not None or not fuses or part.survey.learned.matcher is None:
-        return _corrected_z(part)
-    # the bed identifies the images of a point: it must be that of other points
-    likely = likely_beds(with_rays(_as(around, way)))
-    bed = bed_of(around.xyz, likely) if np.isfinite(likely).any() else None
-    # not interpolated, as a smooth bed would make any choice look smooth
-    bed = None if bed is None else bed._replace(between=False)
-    learned = part.survey.learned._replace(bed=bed)
-    return _corrected_z(replace(part, survey=replace(part.survey, learned=learned)))
-
-
-def _corrected_z(part: Batch) -> FloatArray:
+    if part.views is None and fuses and learned.matcher is not None:
+        # the bed identifies the images of a point: it must be that of other points
+        likely = likely_beds(with_rays(_as(around, way)))
+        bed = bed_of(around.xyz, likely) if np.isfinite(likely).any() else None
+        # not interpolated, as a smooth bed would make any choice look smooth
+        bed = None if bed is None else bed._replace(between=False)
+        part = replace(part, survey=replace(part.survey, learned=learned._replace(bed=bed)))
     found = correct(part)
     z = part.xyz[:, 2] + found.shift_m[:, 2]
     return np.where(found.outcome == Outcome.CORRECTED, z, np.nan)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, NoReturn
 
 import numpy as np
 
 from pcfix.errors import GeometryError, SettingError
 from pcfix.model import BoolArray, FloatArray, IntArray
-from pcfix.sums import Sums
+from pcfix.sums import MOST, Sums
 from pcfix.water.surface import SurfaceAbove, is_submerged
 
 LEAST_COUNT, FEW = 3, 10
@@ -22,47 +22,21 @@ _SAME_M = 1e-3
 
 @dataclass(frozen=True)
 class DepthRegression:
-    """The line true depth = `intercept_m` + `slope` * apparent depth, and how well it fits.
-
-    Attributes
-    ----------
-    intercept_m, slope : float
-    intercept_se_m, slope_se : float
-        Their standard errors.
-    r2 : float
-        Coefficient of determination.
-    rmse_m : float
-        Root mean square of the residuals; too good, as the line was fitted to them.
-    cv_rmse_m : float or None
-        The same with each check depth predicted from all others (leave-one-out). None where a
-        depth cannot be left out without leaving the slope open.
-    count : int
-        Check depths that were fitted.
-    shallowest_m, deepest_m : float
-        Of their apparent depths; the line is extrapolated beyond.
-    covariance_m : float
-        Of intercept and slope.
-    source : str
-        What the line was fitted to, in words.
-    outliers : tuple of int
-        Which of them, from 0, lie too far off the line to be of one set with the rest.
-    notes : tuple of str
-        What a user should know.
-    """
+    """The line true depth = `intercept_m` + `slope` * apparent depth, and how well it fits."""
 
     intercept_m: float
     slope: float
-    intercept_se_m: float
+    intercept_se_m: float  # standard errors
     slope_se: float
     r2: float
-    rmse_m: float
-    cv_rmse_m: float | None
-    count: int
-    shallowest_m: float
+    rmse_m: float  # of the residuals
+    cv_rmse_m: float | None  # leave-one-out; None if the slope would be open without one
+    count: int  # check depths that were fitted
+    shallowest_m: float  # of their apparent depths; the line is extrapolated beyond
     deepest_m: float
-    covariance_m: float = 0.0
-    source: str = ""
-    outliers: tuple[int, ...] = ()
+    covariance_m: float = 0.0  # of intercept and slope
+    source: str = ""  # what the line was fitted to
+    outliers: tuple[int, ...] = ()  # which check depths, from 0, are too far off the line
     notes: tuple[str, ...] = ()
 
     def depth_m(self, apparent_m: FloatArray) -> FloatArray:
@@ -72,9 +46,8 @@ class DepthRegression:
     def sigma_m(self, apparent_m: FloatArray) -> FloatArray:
         """Return the standard errors of true depths, metres, shape (m,), from apparent ones.
 
-        That of predicting check depths left out of the fit (of its residuals, where none can be):
-        it holds whatever the poses and the water were. Beyond the fitted depths grows what
-        the standard errors of the line add.
+        The leave-one-out error holds whatever the poses and the water were. Beyond the fitted
+        depths the standard errors of the line are added.
         """
         inside = self.rmse_m if self.cv_rmse_m is None else self.cv_rmse_m
         nearest = np.clip(apparent_m, self.shallowest_m, self.deepest_m)
@@ -106,17 +79,10 @@ def raise_no_regression() -> NoReturn:
 
 
 def fit_depths(apparent_m: FloatArray, true_m: FloatArray) -> DepthRegression:
-    """Fit the line by least squares, all check depths with equal weight and none left out.
+    """Fit the line by least squares to depths, shape (m,), metres, positive down.
 
-    Parameters
-    ----------
-    apparent_m, true_m : array, shape (m,)
-        Metres, positive down.
-
-    Raises
-    ------
-    GeometryError
-        If there are fewer than three, all have one apparent depth, or the line falls.
+    Raises GeometryError if there are fewer than three, all have one apparent depth, or the line
+    falls.
     """
     from scipy.stats import linregress
 
@@ -206,41 +172,33 @@ LEAST_BEYOND = 0.05
 """Share of the points beyond the depths of a line from which its own cloud is worth a note."""
 
 
+@dataclass(frozen=True)
 class BeyondRange(Sums):
-    """Counts apparent depths beyond those that a line was fitted on.
+    """Counts of apparent depths beyond those that a line was fitted to."""
 
-    Parameters
-    ----------
-    line : DepthRegression
-    least : float
-        The share of the points above which it is noted.
-    """
+    count: int
+    shallower: int
+    deeper: int
+    deepest_m: float = field(metadata=MOST)
 
-    added, most = ("_count", "_shallower", "_deeper"), ("_deepest_m",)
+    @classmethod
+    def of(cls, apparent_m: FloatArray, line: DepthRegression) -> BeyondRange:
+        """Return the counts of submerged points, shape (m,)."""
+        shallower = int((apparent_m < line.shallowest_m).sum())
+        deeper = int((apparent_m > line.deepest_m).sum())
+        return cls(len(apparent_m), shallower, deeper, float(apparent_m.max(initial=0.0)))
 
-    def __init__(self, line: DepthRegression, least: float = 0.0) -> None:
-        self._least = least
-        self._line, self._count, self._shallower, self._deeper = line, 0, 0, 0
-        self._deepest_m = 0.0
-
-    def add(self, apparent_m: FloatArray) -> None:
-        """Add submerged points, shape (m,)."""
-        self._count += len(apparent_m)
-        self._shallower += int((apparent_m < self._line.shallowest_m).sum())
-        self._deeper += int((apparent_m > self._line.deepest_m).sum())
-        self._deepest_m = max(self._deepest_m, float(apparent_m.max(initial=0.0)))
-
-    def notes(self) -> list[str]:
-        """Return a sentence on them, if there are any."""
-        if self._shallower + self._deeper <= self._least * self._count:
+    def notes(self, line: DepthRegression, least: float = 0.0) -> list[str]:
+        """Return a sentence on them if their share is above `least`."""
+        if self.shallower + self.deeper <= least * self.count:
             return []
-        of = 100.0 / self._count
+        of = 100.0 / self.count
         return [
-            f"The regression was fitted to apparent depths of {self._line.shallowest_m:.2f} to"
-            f" {self._line.deepest_m:.2f} m and is extrapolated for"
-            f" {of * (self._shallower + self._deeper):.1f} % of the submerged points"
-            f" ({of * self._shallower:.1f} % shallower, {of * self._deeper:.1f} % deeper, down to"
-            f" {self._deepest_m:.2f} m), where SigmaZ grows."
+            f"The regression was fitted to apparent depths of {line.shallowest_m:.2f} to"
+            f" {line.deepest_m:.2f} m and is extrapolated for"
+            f" {of * (self.shallower + self.deeper):.1f} % of the submerged points"
+            f" ({of * self.shallower:.1f} % shallower, {of * self.deeper:.1f} % deeper, down to"
+            f" {self.deepest_m:.2f} m), where SigmaZ grows."
         ]
 
 
@@ -253,27 +211,15 @@ the nearest neighbour is closer than on a grid, 10."""
 
 
 class ApparentDepths:
-    """The nearest submerged points of some places, gathered from a cloud chunk by chunk.
+    """The nearest submerged points of some places, shape (p, 2), gathered chunk by chunk.
 
-    The memory is that of `NEIGHBOURS` points a place.
-
-    Parameters
-    ----------
-    places : array, shape (p, 2)
-        Metres, world frame.
-
-    Attributes
-    ----------
-    distance_m : array, shape (p, NEIGHBOURS)
-        In plan, rising; infinite where there are fewer points so far.
+    `distance_m`, shape (p, NEIGHBOURS), is in plan and rising; infinite for missing points.
     """
 
     def __init__(self, places: FloatArray) -> None:
         self._places = places
-        shape = (len(places), NEIGHBOURS)
-        self.distance_m = np.full(shape, np.inf)
-        self._depth_m, self._level_m = np.full(shape, np.nan), np.full(shape, np.nan)
-        self._xy = np.full((*shape, 2), np.nan)
+        self.distance_m = np.full((len(places), NEIGHBOURS), np.inf)
+        self._near = np.full((len(places), NEIGHBOURS, 4), np.nan)  # depth, level, x, y
 
     def add(self, xyz: FloatArray, surface: SurfaceAbove) -> None:
         """Add n points, shape (n, 3), metres, world frame, with the water above them."""
@@ -290,25 +236,18 @@ class ApparentDepths:
         # the height of the water over the place itself, where the surface is tilted
         level = surface.height_m[near] + np.einsum("pka,pka->pk", surface.slope[near], aside)
         depth = surface.height_m[near] - xyz[near, 2]
+        new = np.dstack([depth, level, xyz[near, 0], xyz[near, 1]])
+        both = np.concatenate([self._near, new], axis=1)
         distance = np.hstack([self.distance_m, np.asarray(distance)])
-        depth = np.hstack([self._depth_m, depth])
-        order = np.lexsort((depth, distance), axis=-1)[:, :NEIGHBOURS]
+        order = np.lexsort((both[..., 0], distance), axis=-1)[:, :NEIGHBOURS]
         self.distance_m = np.take_along_axis(distance, order, axis=1)
-        self._depth_m = np.take_along_axis(depth, order, axis=1)
-        level = np.hstack([self._level_m, level])
-        self._level_m = np.take_along_axis(level, order, axis=1)
-        xy = np.hstack([self._xy, xyz[near, :2]])
-        self._xy = np.take_along_axis(xy, order[:, :, None], axis=1)
+        self._near = np.take_along_axis(both, order[:, :, None], axis=1)
 
     @property
     def spacing_m(self) -> float:
-        """Distance of a point from its nearest neighbour; 0 if no place has two points.
-
-        The median over the points that were found, so that it is the cloud's also where places
-        lie outside the cloud.
-        """
-        some = slice(None, None, -(-len(self._xy) // MOST_PLACES) or 1)
-        found, xy = np.isfinite(self.distance_m[some]), self._xy[some]
+        """Median distance of a point from its nearest neighbour; 0 if no place has two points."""
+        some = slice(None, None, -(-len(self._near) // MOST_PLACES) or 1)
+        found, xy = np.isfinite(self.distance_m[some]), self._near[some, :, 2:]
         away = xy[:, :, None, :] - xy[:, None, :, :]
         apart = np.hypot(away[..., 0], away[..., 1])
         apart[~(found[:, :, None] & found[:, None, :]) | (apart == 0.0)] = np.inf
@@ -317,15 +256,13 @@ class ApparentDepths:
         return float(np.median(known)) if len(known) else 0.0
 
     def medians(self, radius_m: float) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Return the apparent depth and the water level of each place from points within a radius.
+        """Return the median apparent depth and water level of the points within a radius.
 
-        Medians of the nearest submerged points, at most `NEIGHBOURS`; then whether each place has
-        `LEAST_NEIGHBOURS` points. If not, the others are NaN.
+        Then whether each place has `LEAST_NEIGHBOURS` points. If not, the others are NaN.
         """
         near = self.distance_m <= radius_m
         covered = near.sum(axis=1) >= LEAST_NEIGHBOURS
-        depth, level = np.full(len(near), np.nan), np.full(len(near), np.nan)
+        medians = np.full((2, len(near)), np.nan)
         for place in np.flatnonzero(covered):
-            depth[place] = np.median(self._depth_m[place, near[place]])
-            level[place] = np.median(self._level_m[place, near[place]])
-        return depth, level, covered
+            medians[:, place] = np.median(self._near[place, near[place], :2], axis=0)
+        return medians[0], medians[1], covered

@@ -18,10 +18,8 @@ across the base tells nothing of depth: a true depth h becomes the apparent dept
 
 Midway between two cameras near each other that is n, as for cameras straight above. The factor is
 the mean of h / d over the overlap of both frames on the water, in which the focal length and the
-size of the frame say how far t reaches. (The mean of s_1 and s_2, each camera by itself, is less:
-1.41 instead of 1.44 for 80 % overlap of frames of 74 by 53 degrees; the cloud of such a block has
-1.43.) Depths count as small against H. Where the images are more than a pair, or look aside, the
-cloud has another ratio.
+size of the frame say how far t reaches. Depths count as small against H. Where the images are more
+than a pair, or look aside, the cloud has another ratio.
 """
 
 from __future__ import annotations
@@ -42,28 +40,15 @@ NODES = 100
 
 @dataclass(frozen=True)
 class StereoFactor:
-    """A depth factor and the figures it was computed from.
+    """A depth factor and the figures it was computed from."""
 
-    Attributes
-    ----------
-    factor : float
-        Ratio of true to apparent depth.
-    height_m, base_m : float
-        Flying height above the water, and distance between neighbouring images in plan: medians.
-    frame : tuple of float
-        Focal length, and the sides of the frame along the base and across it, in one unit.
-    unit : str
-    images, aside : int
-        Nadir images, which count, and images that look aside, which do not.
-    """
-
-    factor: float
-    height_m: float
-    base_m: float
-    frame: tuple[float, float, float]
+    factor: float  # ratio of true to apparent depth
+    height_m: float  # flying height above the water, median
+    base_m: float  # distance between neighbouring images in plan, median
+    frame: tuple[float, float, float]  # focal length, sides along the base and across it, in `unit`
     unit: str
-    images: int
-    aside: int
+    images: int  # nadir images
+    aside: int  # images that look aside, which do not count
 
     def __str__(self) -> str:
         focal, along, across = self.frame
@@ -82,23 +67,9 @@ class StereoFactor:
 
 
 def stereo_factor(cameras: Cameras, level_m: float, n: float) -> StereoFactor:
-    """Return the depth factor of the stereo pairs of a block.
+    """Return the depth factor of the stereo pairs of a block over water of a level.
 
-    Parameters
-    ----------
-    cameras : Cameras
-        With angles and lenses.
-    level_m : float
-        Height of the water, metres, world frame.
-    n : float
-        Refractive index.
-
-    Raises
-    ------
-    SettingError
-        If the cameras have no angles or no lenses.
-    GeometryError
-        If fewer than two images look down, or neighbours do not overlap.
+    Raises GeometryError if fewer than two images look down, or neighbours do not overlap.
     """
     require_orientation(cameras, "depth-factor auto")
     rotations, lenses = np.asarray(cameras.rotations), cameras.lenses or ()
@@ -135,13 +106,9 @@ def stereo_factor(cameras: Cameras, level_m: float, n: float) -> StereoFactor:
 
 
 def _bases(centres: FloatArray, rotations: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the way in plan from each of k images to the nearest other place.
+    """Return the base in plan from each of k images to the nearest other place.
 
-    Returns
-    -------
-    length_m : array, shape (k,)
-    base : array, shape (k, 3)
-        In the frame of each camera.
+    Its length, shape (k,), and the vector in the frame of each camera, shape (k, 3).
     """
     from scipy.spatial import cKDTree
 
@@ -158,8 +125,7 @@ def ratios(relative_base: float, along: float, across: float, n: float) -> Float
     """Return the ratio of true to apparent depth over the overlap of a pair.
 
     `relative_base` is the base by the flying height; `along` and `across` are half the sides of the
-    frame by the focal length. The result, shape (NODES, NODES), is for the middles of cells; see
-    the top of the file.
+    frame by the focal length. The result, shape (NODES, NODES), is for the middles of cells.
     """
     middles = (np.arange(NODES) + 0.5) / NODES * 2.0 - 1.0
     x, y = np.meshgrid(middles * (along - relative_base / 2.0), middles * across)

@@ -21,8 +21,8 @@ The model, for an apparent point P and its pairs (a, b), all of which show one t
 Q is found where that median is P: three equations for three unknowns. The median of smooth
 functions is continuous, with kinks where it changes from one pair to another. Broyden's method
 starts at `snell`'s solution with the derivative diag(1, 1, 1/n), as if all light came from straight
-above, and goes back to half such a step wherever it does not come nearer. In a cell with many
-points X_ab(Q) is a polynomial (`pcfix.refract.pair_table`).
+above, and goes back to half such a step wherever it does not come nearer. A point with the cameras
+of the one before it starts from its solution.
 """
 
 from __future__ import annotations
@@ -34,9 +34,21 @@ import numpy as np
 
 from pcfix.kernels import Span, device, in_tiles, kernel, most_between
 from pcfix.lens import algebra
-from pcfix.lens.algebra import Vector, cross, dot, minus, row_of, scaled, vector
+from pcfix.lens.algebra import (
+    Vector,
+    beyond,
+    cross,
+    dot,
+    minus,
+    plus,
+    row_of,
+    scaled,
+    solved,
+    vector,
+)
+from pcfix.lens.formulas import KIND, PERSPECTIVE
+from pcfix.lens.imaging import image_in_world
 from pcfix.model import BoolArray, FloatArray, IntArray, Outcome, Views
-from pcfix.refract import pair_table
 from pcfix.refract.batch import (
     CORRECTED,
     NO_CAMERA,
@@ -44,16 +56,25 @@ from pcfix.refract.batch import (
     PARALLEL,
     Batch,
     Chosen,
+    Images,
     Intersection,
+    Optics,
     images_of,
     optics_of,
+    to_original,
     warn_of_unsolved,
 )
-from pcfix.refract.cells import are_same, cameras_of, cells_of, is_quick
 from pcfix.refract.choice import cameras_of_pairs
-from pcfix.refract.consistent import check_consistent
-from pcfix.refract.pair_table import ABOVE, PairImages, PairTable
-from pcfix.refract.rays import MIN_DETERMINANT, add_line, nearest_point, refracted
+from pcfix.refract.intersect import check_consistent
+from pcfix.refract.rays import (
+    MIN_DETERMINANT,
+    add_line,
+    direction,
+    light_path,
+    nearest_point,
+    refracted,
+)
+from pcfix.refract.tiling import are_same, cameras_of, cells_of
 
 MAX_STEPS = 40
 ALIKE = 0.5
@@ -66,53 +87,41 @@ CLOSE_M = 1e-6
 # Columns of the result.
 _DISTANCE, _OUTCOME, _FOUND, _WIDTH = 3, 4, 5, 6
 
+# Columns of a ray: e, the height of its water over P, e of the original model, the gradient of its
+# scale (g of `_meet`), and of the image of Q G'G (xx, xy, xz, yy, yz, zz), G'G e, |G e|^2.
+_ABOVE, _ORIGINAL, _BY_PLACE, _SQUARE, _RIGHT, _RAY_WIDTH = 3, 4, 7, 10, 16, 20
+
+
+class PairImages(NamedTuple):
+    """The images of the original model; `both` relates them to the adjusted ones; n."""
+
+    optics: Optics
+    both: Images
+    n: float
+
 
 class _Point(NamedTuple):
-    """One apparent point with its rays and pairs.
+    """One apparent point with its rays and pairs; coordinates are relative to the point."""
 
-    Attributes
-    ----------
-    xyz, normal : Vector
-        World frame; the normal is that of the water above the point.
-    rays : array, shape (j, ...)
-        The ray of each of its cameras, see `pcfix.refract.pair_table`.
-    cameras : array, shape (j,)
-    used : array of bool, shape (j,)
-        Whether the camera is in a pair.
-    pairs : array, shape (p, 3)
-        The rays of each pair, and its row in a table.
-    places : array, shape (3, p)
-        Temporary: where the pairs place a true point.
-    """
-
-    xyz: Vector
-    normal: Vector
-    rays: FloatArray
-    cameras: IntArray
-    used: BoolArray
-    pairs: IntArray
-    places: FloatArray
+    normal: Vector  # of the water above the point
+    rays: FloatArray  # (j, ...), a row for each of its cameras
+    cameras: IntArray  # (j,)
+    used: BoolArray  # (j,), whether the camera is in a pair
+    pairs: IntArray  # (p, 2), the rays of each pair
+    places: FloatArray  # (3, p), temporary: where the pairs place a true point
 
 
 def invert_pairs(batch: Batch, pairs: Views | None = None) -> Intersection:
     """Return the true points from which the median of stereo pairs would be the apparent ones.
 
-    Parameters
-    ----------
-    batch : Batch
-        Its cameras need angles and lenses. Its views are pairs, or the cameras that may be in one.
-        The surface above each point is taken as a plane.
-    pairs : Views, optional
-        Of the kind pairs; a pair counts if both cameras are among the batch's views. Default: the
-        pairs of images that the matcher matched, each once.
+    The views of the batch are pairs, or the cameras that may be in one; then `pairs`, of the kind
+    pairs, count if both cameras are among the views. By default the pairs are those of images that
+    the matcher matched, each once. The surface above each point is taken as a plane.
 
-    Returns
-    -------
-    Intersection
-        `ray_count` and `incidence_deg` are of the cameras that are in a pair; `ray_miss_m` is the
-        distance from their refracted rays through the apparent point, as for `snell`. A point with
-        cameras but without a pair is `ONE_CAMERA`, one with narrow pairs only `PARALLEL_RAYS`.
-        Points without a solution get that of `snell`, with a warning.
+    `ray_count` and `incidence_deg` are of the cameras that are in a pair; `ray_miss_m` is the
+    distance from their refracted rays through the apparent point, as for `snell`. A point with
+    cameras but without a pair is `ONE_CAMERA`, one with narrow pairs only `PARALLEL_RAYS`. Points
+    without a solution get that of `snell`, with a warning.
     """
     check_consistent(batch.survey.cameras)
     if batch.rays.kind == "pairs":
@@ -130,14 +139,9 @@ def invert_pairs(batch: Batch, pairs: Views | None = None) -> Intersection:
     both = images_of(batch.original_model, cameras)
     images = PairImages(optics_of(original), both, batch.survey.settings.refractive_index)
     order, first = cells_of(batch)
-    focal_px = None
-    if is_quick(batch) and matcher is not None and batch.original_model is None:
-        # without a large cell the kernel is compiled without polynomials
-        large = np.diff(first).max() >= pair_table.LEAST_POINTS
-        focal_px = matcher.focal_px if large else None
     in_tiles(
-        _invert, len(first) - 1, (order, first), batch.chosen(), images, (*listed, matched),
-        focal_px, used, result, points=len(batch),
+        _invert, len(first) - 1, (order, first), batch.chosen(), images, (*listed, matched), used,
+        result, points=len(batch),
     )  # fmt: skip
     outcome = result[:, _OUTCOME].astype(np.uint8)
     moved = outcome == Outcome.CORRECTED
@@ -151,39 +155,27 @@ def invert_pairs(batch: Batch, pairs: Views | None = None) -> Intersection:
 @kernel(allocates=True)
 def _invert(
     span: Span, cells: tuple[IntArray, IntArray], points: Chosen, images: PairImages,
-    listed: tuple[IntArray, IntArray, IntArray], focal_px: FloatArray | None, used: BoolArray,
-    result: FloatArray,
+    listed: tuple[IntArray, IntArray, IntArray], used: BoolArray, result: FloatArray,
 ) -> None:  # fmt: skip
-    """Correct the points of each cell.
-
-    Without listed pairs, which are empty then, they are those of the images that were matched. With
-    focal lengths large cells have polynomials. A point starts from the one before it, if that has
-    the same cameras.
-    """
+    """Correct the points of each cell; without listed pairs they are those of the matcher."""
     (order, first), (listed_start, listed_camera, matched) = cells, listed
     start = points.start
     most = most_between((0, len(start) - 1), start)
     most_pairs = most * matched.shape[1]
     if listed_start.size:
         most_pairs = most_between((0, len(start) - 1), listed_start) // 2
-    rays, place = np.empty((most, pair_table.RAY_WIDTH)), np.full(len(points.centres), -1)
-    pairs, places = np.empty((most_pairs, 3), np.int64), np.empty((3, most_pairs))
+    rays, place = np.empty((most, _RAY_WIDTH)), np.full(len(points.centres), -1)
+    pairs, places = np.empty((most_pairs, 2), np.int64), np.empty((3, most_pairs))
     room = np.empty(9), np.empty((3, 3))
     for t in range(*span):
-        before, inside = -1, order[first[t] : first[t + 1]]
-        if focal_px is None:
-            table = None
-        else:
-            table = pair_table.no_pair_table()
-            if inside.size >= pair_table.LEAST_POINTS:
-                table = pair_table.pair_table_of(inside, points, images, matched, focal_px)
-        for i in inside:
+        before = -1
+        for i in order[first[t] : first[t + 1]]:
             cameras = points.camera[start[i] : start[i + 1]]
             flags, normal = used[start[i] : start[i + 1]], row_of(points.normals, i)
             # `place` maps a camera to its ray of this point
             for j in range(cameras.size):
                 place[cameras[j]] = j
-                pair_table.begin(rays[j], points, i, cameras[j], images)
+                _begin(rays[j], points, i, cameras[j], images)
             if listed_start.size:
                 entries = listed_camera[listed_start[i] : listed_start[i + 1]]
                 count = _listed_pairs(pairs, entries, place)
@@ -208,13 +200,97 @@ def _invert(
                 if there > 0.0 and ALIKE * there < depth < there / ALIKE:
                     for axis in range(3):
                         near[axis] = result[before, axis] * (depth / there)
-            xyz = row_of(points.xyz, i)
-            point = _Point(xyz, normal, rays, cameras, flags, pairs[:wide], places[:, :wide])
-            quick = False
-            if table is not None:
-                quick = pair_table.has_pairs(table, points, i, point.pairs)
-            _solve(result[i], point, images, room, quick, table)
+            point = _Point(normal, rays, cameras, flags, pairs[:wide], places[:, :wide])
+            _solve(result[i], point, images, room)
             before = i if result[i, _FOUND] > 0.0 else -1
+
+
+@device
+def _begin(ray: FloatArray, points: Chosen, i: int, c: int, images: PairImages) -> None:
+    """Fill in where a ray comes from, and how the scale of its image changes with the place.
+
+    The scale depends on the distance, relative to that of P: along the axis in a perspective
+    image, from the centre in other projections.
+    """
+    e = minus(row_of(points.centres, c), row_of(points.xyz, i))
+    ray[_ABOVE] = points.normals[i, 2] * (points.height[i] - points.xyz[i, 2] + points.offset[c])
+    original, optics = e, images.optics
+    if len(images.both.centres):
+        original = minus(row_of(images.both.centres, c), row_of(points.original_xyz, i))
+    axis, size2 = row_of(optics.rotations[c], 2), dot(original, original)
+    ahead = -dot(axis, original)
+    # behind a perspective camera the depth along the axis has no meaning
+    flat = optics.lenses[optics.row[c], KIND] == PERSPECTIVE and ahead > 0.0
+    for j in range(3):
+        ray[j], ray[_ORIGINAL + j] = e[j], original[j]
+        ray[_BY_PLACE + j] = axis[j] / ahead if flat else -original[j] / size2
+
+
+@device
+def _see(ray: FloatArray, q: Vector, c: int, normal: Vector, images: PairImages) -> None:
+    """Write the normal equations of the image of Q: G'G, G'G e and |G e|^2.
+
+    The direction w, in the original model, is scaled to the distance of P, so that G is that there.
+    """
+    path = light_path(q, vector(ray), normal, ray[_ABOVE], images.n)
+    w = to_original(images.both, c, direction(path, normal))
+    # g.w is the distance of w in terms of P
+    w = scaled(1.0 / dot(w, vector(ray, _BY_PLACE)), w)
+    optics, e = images.optics, vector(ray, _ORIGINAL)
+    _, _, by_u, by_v = image_in_world(optics.lenses[optics.row[c]], optics.rotations[c], w)
+    ray[_SQUARE:] = 0.0
+    for g in (by_u, by_v):
+        (x, y, z), off = g, dot(g, e)
+        # one row g of G: g g', (g.e) g and (g.e)^2
+        terms = (x * x, x * y, x * z, y * y, y * z, z * z, off * x, off * y, off * z, off * off)
+        for i in range(10):
+            ray[_SQUARE + i] += terms[i]
+
+
+@device
+def _meet(a: FloatArray, b: FloatArray) -> Vector:
+    """Return where two straight rays have the least squared residuals in their images.
+
+    At X the residual of a camera is G (X - e) / t, with t = 1 + g.X the distance of X relative to
+    that of P. The first round takes t = 1. The second has t, and its change with X: at the minimum
+
+        sum_c G'G (X - e) / t^2 - r^2 / t^3 g = 0,    r^2 = |G (X - e)|^2
+
+    That matters for narrow pairs whose rays pass each other.
+    """
+    # first t = 1, then with the t and r^2 of that place
+    place = _solve_two(a, b, 1.0, 1.0, 0.0, 0.0)
+    t, r2 = _residual(place, a)
+    t_b, r2_b = _residual(place, b)
+    return _solve_two(a, b, 1.0 / (t * t), 1.0 / (t_b * t_b), r2 / t**3, r2_b / t_b**3)
+
+
+@device
+def _residual(place: Vector, ray: FloatArray) -> tuple[float, float]:
+    """Return t and r^2 of a place."""
+    (x, y, z), s = place, ray[_SQUARE:]
+    t = 1.0 + x * ray[_BY_PLACE] + y * ray[_BY_PLACE + 1] + z * ray[_BY_PLACE + 2]
+    # |G (X - e)|^2 from the sums
+    twice = x * (s[1] * y + s[2] * z) + s[4] * y * z - (s[6] * x + s[7] * y + s[8] * z)
+    return t, s[0] * x * x + s[3] * y * y + s[5] * z * z + 2.0 * twice + s[9]
+
+
+@device
+def _solve_two(
+    a: FloatArray, b: FloatArray, of_a: float, of_b: float, g_a: float, g_b: float
+) -> Vector:
+    """Solve the normal equations of two rays, with the weights and gradients of each."""
+    right = beyond(_sum(a, b, of_a, of_b, _RIGHT), g_a, vector(a, _BY_PLACE))
+    right = beyond(right, g_b, vector(b, _BY_PLACE))
+    xx, xy, xz = _sum(a, b, of_a, of_b, _SQUARE)
+    yy, yz, zz = _sum(a, b, of_a, of_b, _SQUARE + 3)
+    return solved((xx, xy, xz, yy, yz, zz), right)[1]
+
+
+@device
+def _sum(a: FloatArray, b: FloatArray, of_a: float, of_b: float, at: int) -> Vector:
+    """Return a weighted sum of three columns of two rays."""
+    return plus(scaled(of_a, vector(a, at)), scaled(of_b, vector(b, at)))
 
 
 @device
@@ -224,21 +300,17 @@ def _listed_pairs(pairs: IntArray, entries: IntArray, place: IntArray) -> int:
     for p in range(entries.size // 2):
         a, b = place[entries[2 * p]], place[entries[2 * p + 1]]
         if a >= 0 and b >= 0 and a != b:
-            pairs[count, 0], pairs[count, 1], pairs[count, 2] = a, b, -1
+            pairs[count, 0], pairs[count, 1] = a, b
             count += 1
     return count
 
 
 @device
 def _matched_pairs(pairs: IntArray, cameras: IntArray, matched: IntArray, place: IntArray) -> int:
-    """Write the pairs of cameras of which either was matched with the other; return how many.
-
-    The third column is the entry of `matched` that makes the pair.
-    """
-    count, partners = 0, matched.shape[1]
+    """Write the pairs of cameras of which either was matched with the other; return how many."""
+    count = 0
     for a in range(cameras.size):
-        for p in range(partners):
-            partner = matched[cameras[a], p]
+        for partner in matched[cameras[a]]:
             if partner < 0:
                 break
             b = place[partner]
@@ -248,7 +320,7 @@ def _matched_pairs(pairs: IntArray, cameras: IntArray, matched: IntArray, place:
                 both = both or one == cameras[a]
             if b < 0 or (b < a and both):
                 continue
-            pairs[count, 0], pairs[count, 1], pairs[count, 2] = a, b, cameras[a] * partners + p
+            pairs[count, 0], pairs[count, 1] = a, b
             count += 1
     return count
 
@@ -266,42 +338,31 @@ def _wide_pairs(pairs: IntArray, rays: FloatArray, normal: Vector) -> int:
         a, b = vector(first), vector(second)
         # sin^2 of the angle between the rays against that of parallel ones
         across = cross(a, b)
-        above = dot(normal, a) > max(first[ABOVE], 0.0)
-        above = above and dot(normal, b) > max(second[ABOVE], 0.0)
+        above = dot(normal, a) > max(first[_ABOVE], 0.0)
+        above = above and dot(normal, b) > max(second[_ABOVE], 0.0)
         wide = dot(across, across) >= 4.0 * MIN_DETERMINANT * (dot(a, a) * dot(b, b))
         if above and wide:
             pairs[count, 0], pairs[count, 1] = pairs[p, 0], pairs[p, 1]
-            pairs[count, 2] = pairs[p, 2]
             count += 1
     return count
 
 
 @device
 def _solve(
-    out: FloatArray, point: _Point, images: PairImages, room: tuple[FloatArray, FloatArray],
-    quick: bool, table: PairTable | None,
-) -> None:  # fmt: skip
-    """Solve one point and write its row, which has a start already or NaN.
-
-    With `quick` the table of the cell has all pairs of the point.
-    """
+    out: FloatArray, point: _Point, images: PairImages, room: tuple[FloatArray, FloatArray]
+) -> None:
+    """Solve one point and write its row, which has a start already or NaN."""
     (sums, inverse), n = room, images.n
-    fixed, q = _snell(sums, point, n)
+    fixed, start = _snell(sums, point, n)
     if not fixed:
         out[:3], out[_OUTCOME] = 0.0, PARALLEL
         return
-    found, near = False, vector(out)
-    if near[0] == near[0]:  # B is still that of the point before
-        found, near = _search(near, inverse, point, images, quick, table)
-    if found:
-        q = near
-    else:
-        start = q
+    found, q = False, vector(out)
+    if q[0] == q[0]:  # B is still that of the point before
+        found, q = _search(q, inverse, point, images)
+    if not found:
         _as_from_above(inverse, 1.0, n)
-        found, q = _search(start, inverse, point, images, quick, table)
-        if quick and not found:  # the search left the box of the table
-            _as_from_above(inverse, 1.0, n)
-            found, q = _search(start, inverse, point, images, False, table)
+        found, q = _search(start, inverse, point, images)
     out[0], out[1], out[2] = q
     out[_DISTANCE] = _ray_distance(q, point, n)
     out[_OUTCOME], out[_FOUND] = CORRECTED, 1.0 if found else 0.0
@@ -312,7 +373,7 @@ def _line(ray: FloatArray, normal: Vector, n: float) -> tuple[Vector, Vector, fl
     """Return where the ray through P enters the water, its direction, and its length squared."""
     e = vector(ray)
     length2, across = dot(e, e), dot(normal, e)
-    f, bend = (ray[ABOVE] / across, 1.0 / n) if ray[ABOVE] > 0.0 else (0.0, 1.0)
+    f, bend = (ray[_ABOVE] / across, 1.0 / n) if ray[_ABOVE] > 0.0 else (0.0, 1.0)
     return scaled(f, e), refracted(e, length2, normal, across, bend), length2
 
 
@@ -346,9 +407,8 @@ def _ray_distance(q: Vector, point: _Point, n: float) -> float:
 
 @device
 def _search(
-    start: Vector, inverse: FloatArray, point: _Point, images: PairImages, quick: bool,
-    table: PairTable | None,
-) -> tuple[bool, Vector]:  # fmt: skip
+    start: Vector, inverse: FloatArray, point: _Point, images: PairImages
+) -> tuple[bool, Vector]:
     """Return whether a Q was found where the median F of the pairs' places is P, and that Q.
 
     From the nearest Q so far goes a step s = -B F, at first with the given B. Where F comes nearer,
@@ -357,12 +417,7 @@ def _search(
     """
     q, nearest, at_nearest, best, share = start, start, (0.0, 0.0, 0.0), np.inf, 1.0
     for _ in range(MAX_STEPS):
-        if table is None:  # a condition of its own, so that numba drops what follows
-            _place_pairs(q, point, images)
-        elif quick:
-            pair_table.read_pairs(point.places, q, point.xyz, point.pairs, table)
-        else:
-            _place_pairs(q, point, images)
+        _place_pairs(q, point, images)
         # the median is relative to P, so that it is F itself
         f = _median(point.places[0]), _median(point.places[1]), _median(point.places[2])
         size = np.sqrt(dot(f, f))
@@ -402,9 +457,9 @@ def _place_pairs(q: Vector, point: _Point, images: PairImages) -> None:
     rays, pairs, places = point.rays, point.pairs, point.places
     for j in range(point.used.size):
         if point.used[j]:
-            pair_table.see(rays[j], q, point.cameras[j], point.normal, images)
+            _see(rays[j], q, point.cameras[j], point.normal, images)
     for p in range(len(pairs)):
-        place = pair_table.meet(rays[pairs[p, 0]], rays[pairs[p, 1]])
+        place = _meet(rays[pairs[p, 0]], rays[pairs[p, 1]])
         places[0, p], places[1, p], places[2, p] = place
 
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pcfix.model import BoolArray, Correction, FloatArray, IntArray, Outcome
-from pcfix.sums import Sums
+from pcfix.sums import LEAST, MOST, SAME, Sums
 
 COVERAGE_95 = 1.96
 """Standard errors of a Gaussian quantity within which 95 % lie, as S-44 takes it in one dimension.
@@ -44,15 +44,9 @@ ORDERS = (
 
 
 def largest_tvu_m(order: Order, depth_m: FloatArray) -> FloatArray:
-    """Return the largest total vertical uncertainty at 95 % that an order allows.
+    """Return the largest total vertical uncertainty (95 %) that an order allows at depths d.
 
     IHO S-44, edition 6, section 3.2: sqrt(a^2 + (b d)^2).
-
-    Parameters
-    ----------
-    order : Order
-    depth_m : array
-        Depths d, positive down.
     """
     return np.asarray(np.sqrt(order.a_m**2 + (order.b * depth_m) ** 2))
 
@@ -67,51 +61,47 @@ def share_of_orders(within: IntArray, count: int) -> dict[str, float]:
     return {o.name: round(int(n) / count, 6) for o, n in zip(ORDERS, within, strict=True)}
 
 
+@dataclass(frozen=True)
 class _Histogram(Sums):
-    """Sum and percentiles, to a millimetre, of values that are added array by array.
+    """Sum and percentiles, to a millimetre, of values.
 
-    Values beyond `low_m` and `high_m` share the last bins, which only percentiles would notice.
+    Values beyond the limits share the last bins, which only percentiles would notice.
     """
 
-    added = ("count", "_sum_m", "_bins")
+    low_m: float = field(metadata=SAME)
+    bins: IntArray
+    count: int = 0
+    sum_m: float = 0.0
 
-    def __init__(self, low_m: float, high_m: float) -> None:
-        self.count = 0
-        self._low_m, self._high_m = low_m, high_m
-        self._sum_m = 0.0
-        self._bins = np.zeros(round((high_m - low_m) / _BIN_M) + 1, dtype=np.int64)
-
-    def add(self, values_m: FloatArray) -> None:
-        self.count += len(values_m)
-        self._sum_m += float(values_m.sum())
-        places = np.rint((np.clip(values_m, self._low_m, self._high_m) - self._low_m) / _BIN_M)
-        self._bins += np.bincount(places.astype(np.int64), minlength=len(self._bins))
+    @classmethod
+    def of(cls, values_m: FloatArray, low_m: float, high_m: float) -> _Histogram:
+        """Return the histogram of some values."""
+        places = np.rint((np.clip(values_m, low_m, high_m) - low_m) / _BIN_M).astype(np.int64)
+        bins = np.bincount(places, minlength=round((high_m - low_m) / _BIN_M) + 1)
+        return cls(low_m, bins, len(values_m), float(values_m.sum()))
 
     def mean_m(self) -> float:
-        return self._sum_m / self.count
+        return self.sum_m / self.count
 
     def percentile_m(self, percent: float) -> float:
-        place = int(np.searchsorted(np.cumsum(self._bins), percent / 100.0 * self.count))
-        return place * _BIN_M + self._low_m
+        place = int(np.searchsorted(np.cumsum(self.bins), percent / 100.0 * self.count))
+        return place * _BIN_M + self.low_m
 
 
+@dataclass(frozen=True)
 class UncertaintyTally(Sums):
-    """Adds up standard errors of Z."""
+    """Standard errors of Z of corrected points."""
 
-    added, most = ("_sigma", "_within"), ("_most_m",)
+    sigma: _Histogram
+    within: IntArray  # points within the TVU of each order
+    most_m: float = field(default=0.0, metadata=MOST)
 
-    def __init__(self) -> None:
-        self._sigma = _Histogram(0.0, 10.0)
-        self._most_m = 0.0
-        self._within = np.zeros(len(ORDERS), dtype=np.int64)
-
-    def add(self, sigma_z_m: FloatArray, depth_m: FloatArray) -> None:
-        """Add corrected points: standard errors of Z and depths, metres, shape (m,)."""
-        if not len(sigma_z_m):
-            return
-        self._sigma.add(sigma_z_m)
-        self._most_m = max(self._most_m, float(sigma_z_m.max()))
-        self._within += within_orders(COVERAGE_95 * sigma_z_m, depth_m)
+    @classmethod
+    def of(cls, sigma_z_m: FloatArray, depth_m: FloatArray) -> UncertaintyTally:
+        """Return the tally of standard errors of Z and depths, metres, shape (m,)."""
+        within = within_orders(COVERAGE_95 * sigma_z_m, depth_m)
+        largest = float(sigma_z_m.max(initial=0.0))
+        return cls(_Histogram.of(sigma_z_m, 0.0, 10.0), within, largest)
 
     def as_dict(self) -> dict[str, Any] | None:
         """Return the figures as plain values; None where no point has a standard error.
@@ -119,75 +109,75 @@ class UncertaintyTally(Sums):
         `sigma_z_m` holds mean, percentiles (to a millimetre) and largest; `tvu_95_m` is 1.96 times
         these; `s44` the share of the points, 0 to 1, within the TVU of each order.
         """
-        if self._most_m == 0.0:
+        if self.most_m == 0.0:
             return None
-        percentiles = {f"p{p}": self._sigma.percentile_m(p) for p in (5, 50, 95)}
-        sigma = {"mean": self._sigma.mean_m(), **percentiles, "max": self._most_m}
+        percentiles = {f"p{p}": self.sigma.percentile_m(p) for p in (5, 50, 95)}
+        sigma = {"mean": self.sigma.mean_m(), **percentiles, "max": self.most_m}
         return {
             "sigma_z_m": _rounded(**sigma),
             "tvu_95_m": _rounded(**{name: COVERAGE_95 * value for name, value in sigma.items()}),
-            "s44": share_of_orders(self._within, self._sigma.count),
+            "s44": share_of_orders(self.within, self.sigma.count),
         }
 
 
 SAMPLE_POINTS = 10_000
-"""Of a cloud, evenly spread, of which those corrected are looked for in the frames of cameras that
-no point used."""
+"""Corrected points, evenly spread over the cloud, that are looked for in the frames of unused
+cameras."""
 
 
+@dataclass(frozen=True)
 class Tally(Sums):
-    """Counts, extremes, and histograms of shift and standard error in Z, over all chunks so far."""
+    """Counts, extremes, and histograms of the shift and the standard error of Z."""
 
-    added = (
-        *("points", "water_unknown", "unsure", "rays", "outcomes"),
-        *("_depth_sum_m", "moved", "_shift", "_uncertainty"),
-    )
-    least = ("low", "lowest_water_m", "_depth_low_m")
-    most = ("camera_used", "high", "incidence_deg", "_depth_high_m")
+    outcomes: IntArray
+    camera_used: BoolArray = field(metadata=MOST)
+    low: FloatArray = field(
+        metadata=LEAST
+    )  # south-west, lowest corner of the submerged points, shape (3,)
+    high: FloatArray = field(metadata=MOST)
+    shift: _Histogram
+    errors: UncertaintyTally
+    points: int = 0
+    water_unknown: int = 0
+    unsure: int = 0
+    rays: int = 0
+    lowest_water_m: float = field(default=np.inf, metadata=LEAST)
+    incidence_deg: float = field(default=0.0, metadata=MOST)
+    depth_low_m: float = field(default=np.inf, metadata=LEAST)
+    depth_high_m: float = field(default=-np.inf, metadata=MOST)
+    depth_sum_m: float = 0.0
+    moved: tuple[FloatArray, ...] = ()  # apparent places of some corrected points
 
-    def __init__(self, cameras: int, points: int = 0, first_row: int = 0) -> None:
-        """Begin at a row of a cloud of so many points."""
-        self._first_row, self._step = first_row, max(1, points // SAMPLE_POINTS)
-        self.points = 0
-        self.water_unknown = self.unsure = 0
-        self.rays = 0
-        self.outcomes = np.zeros(len(Outcome), dtype=np.int64)
-        self.camera_used: BoolArray = np.zeros(cameras, dtype=np.bool_)
-        self.low: FloatArray = np.full(3, np.inf)
-        self.high: FloatArray = np.full(3, -np.inf)
-        self.lowest_water_m, self.incidence_deg = np.inf, 0.0
-        self._depth_low_m, self._depth_high_m, self._depth_sum_m = np.inf, -np.inf, 0.0
-        self.moved: list[FloatArray] = []
-        """Some of the apparent points that were corrected, whatever the chunks."""
-        self._shift = _Histogram(-100.0, 100.0)
-        self._uncertainty = UncertaintyTally()
-
-    def add(self, apparent: FloatArray, correction: Correction) -> None:
-        """Add one chunk: the apparent points, shape (n, 3), and their correction."""
-        rows = np.arange(-(self._first_row + self.points) % self._step, len(apparent), self._step)
-        rows = rows[correction.corrected[rows]]
-        self.moved += [apparent[rows]] if len(rows) else []
-        self.points += len(apparent)
-        self.water_unknown += int((~correction.water_known).sum())
-        self.rays += int(correction.ray_count.sum())
-        self.unsure += 0 if correction.unsure is None else int(correction.unsure.sum())
-        self.outcomes += np.bincount(correction.outcome, minlength=len(Outcome))
-        self.camera_used |= correction.camera_used
+    @classmethod
+    def of(cls, correction: Correction, row: int = 0, points: int = 0) -> Tally:
+        """Return the tally of a chunk that begins at a row of a cloud of so many points."""
+        apparent, moved = correction.apparent_xyz, correction.corrected
+        step = max(1, points // SAMPLE_POINTS)
+        rows = np.arange(-row % step, len(apparent), step)
+        rows = rows[moved[rows]]
         submerged = apparent[correction.submerged]
-        if len(submerged):
-            # axis by axis: numpy is slow along the short one
-            self.low = np.minimum(self.low, [values.min() for values in submerged.T])
-            self.high = np.maximum(self.high, [values.max() for values in submerged.T])
-        self.lowest_water_m = min(self.lowest_water_m, correction.lowest_water_m)
-        moved = correction.corrected
-        if moved.any():
-            self.incidence_deg = max(self.incidence_deg, float(correction.incidence_deg.max()))
-            depth = correction.depth_m[moved]
-            self._depth_low_m = min(self._depth_low_m, float(depth.min()))
-            self._depth_high_m = max(self._depth_high_m, float(depth.max()))
-            self._depth_sum_m += float(depth.sum())
-            self._shift.add(correction.shift_m[moved, 2])
-            self._uncertainty.add(correction.sigma_z_m[moved], depth)
+        # axis by axis: numpy is slow along the short one
+        low = np.array([values.min(initial=np.inf) for values in submerged.T])
+        high = np.array([values.max(initial=-np.inf) for values in submerged.T])
+        depth = correction.depth_m[moved]
+        return cls(
+            outcomes=np.bincount(correction.outcome, minlength=len(Outcome)),
+            camera_used=correction.camera_used,
+            low=low,
+            high=high,
+            shift=_Histogram.of(correction.shift_m[moved, 2], -100.0, 100.0),
+            errors=UncertaintyTally.of(correction.sigma_z_m[moved], depth),
+            points=len(apparent),
+            water_unknown=int((~correction.water_known).sum()),
+            unsure=0 if correction.unsure is None else int(correction.unsure.sum()),
+            rays=int(correction.ray_count.sum()),
+            lowest_water_m=correction.lowest_water_m,
+            incidence_deg=float(correction.incidence_deg.max(initial=0.0, where=moved)),
+            depth_low_m=float(depth.min(initial=np.inf)),
+            depth_high_m=float(depth.max(initial=-np.inf)),
+            depth_sum_m=float(depth.sum()),
+            moved=(apparent[rows],),
+        )
 
     @property
     def submerged(self) -> int:
@@ -208,26 +198,26 @@ class Tally(Sums):
         """Return the range and mean of the corrected depth."""
         if not self.corrected:
             return {}
-        mean = self._depth_sum_m / self.corrected
-        return _rounded(min=self._depth_low_m, mean=mean, max=self._depth_high_m)
+        mean = self.depth_sum_m / self.corrected
+        return _rounded(min=self.depth_low_m, mean=mean, max=self.depth_high_m)
 
     def shift_z_m(self) -> dict[str, float]:
         """Return mean and 5 and 95 % points of the shift in Z; percentiles to a millimetre."""
         if not self.corrected:
             return {}
-        p5, p95 = (self._shift.percentile_m(percent) for percent in (5, 95))
-        return _rounded(mean=self._shift.mean_m(), p5=p5, p95=p95)
+        p5, p95 = (self.shift.percentile_m(percent) for percent in (5, 95))
+        return _rounded(mean=self.shift.mean_m(), p5=p5, p95=p95)
 
     def uncertainty(self, made: dict[str, Any] | None = None) -> dict[str, Any] | None:
         """Return standard error of Z, TVU and orders; see `UncertaintyTally.as_dict`.
 
-        `of_cloud` is there where what the cloud was `made` of tells it: the scatter beyond the
-        error budget, and the standard deviation relative to the depth, that the cloud itself adds.
+        `of_cloud` is what the cloud itself adds, if the detection (`made`) has estimated it.
         """
-        found = self._uncertainty.as_dict()
+        found = self.errors.as_dict()
         if found is not None and made is not None and "scatter_m" in made:
-            of_cloud = {"scatter_m": made["scatter_m"], "per_depth": made["doubt_per_depth"]}
-            found["of_cloud"] = of_cloud
+            found["of_cloud"] = {
+                "scatter_m": made["scatter_m"], "per_depth": made["doubt_per_depth"]
+            }  # fmt: skip
         return found
 
 
@@ -251,12 +241,10 @@ class Summary:
     depth_m: dict[str, float]
     shift_z_m: dict[str, float]
     rays: int
-    incidence_deg: float
-    """The largest in air of a ray that was used."""
+    incidence_deg: float  # the largest of the rays used, in air
     cameras: int
     cameras_used: int
-    cameras_unused: list[str]
-    """Those that see no corrected point, and those of `cameras_left_out`."""
+    cameras_unused: list[str]  # without corrected points, or in `cameras_left_out`
     water: str
     settings: dict[str, Any]
     seconds: float
@@ -266,36 +254,23 @@ class Summary:
     labelling: dict[str, Any] | None = None
     uncertainty: dict[str, Any] | None = None
     carried: dict[str, Any] | None = None
-    made: dict[str, Any] | None = None
-    """What the cloud was taken for, and why, where the options leave it open."""
-    told: list[str] = field(default_factory=list)
-    """What the cloud told beside that; `warnings` has it too."""
-    poses: dict[str, Any] | None = None
-    """Whether they have absorbed the refraction, in a line and sign by sign, where that was asked.
-    """
-    cameras_left_out: dict[str, list[str]] = field(default_factory=dict)
-    """Cameras that see corrected points, by why no ray of theirs was used."""
-    unsure: int | None = None
-    """Corrected points that flat obliques alone see; None where these are not withheld."""
+    made: dict[str, Any] | None = None  # the reconstruction type, and why
+    told: list[str] = field(default_factory=list)  # other notes on the cloud, also in `warnings`
+    poses: dict[str, Any] | None = None  # whether they have absorbed the refraction
+    cameras_left_out: dict[str, list[str]] = field(default_factory=dict)  # by reason
+    unsure: int | None = None  # corrected points that only obliques see; None if not withheld
     shoreline: dict[str, Any] | None = None
-    """Where it was written, how many lines, how long, and their standard error."""
-    fit: dict[str, Any] | None = None
-    """What cameras, cloud and water were tested with; see `pcfix.flow.plausibility`."""
-    part: dict[str, Any] | None = None
-    """How many points were read, of how many, and by which bounds; None where all were."""
+    fit: dict[str, Any] | None = None  # see `pcfix.flow.plausibility`
+    part: dict[str, Any] | None = None  # what was read, if not all points were
 
     @property
     def absorbed(self) -> bool | None:
-        """Whether the poses have absorbed the refraction; None where nothing tells."""
+        """Whether the poses have absorbed the refraction; None if that is unknown."""
         return None if self.poses is None else self.poses["absorbed"]
 
     @property
     def why_no_order(self) -> str:
-        """Why no order of S-44 is claimed: the bed may be off as a whole; empty where one is.
-
-        It may be where nothing tells that the cloud was made as the method takes it, or that its
-        poses have not absorbed the refraction.
-        """
+        """Why no order of S-44 is claimed, as the whole bed may be off; empty if one is."""
         made = self.made or {}
         if self.settings["method"] == "regression":  # measured depths hold the bed
             return "the line is of another cloud" if "regression" in self.settings else ""
@@ -313,18 +288,13 @@ class Summary:
         return self.points / max(self.seconds, 1e-9)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return plain values, ready for JSON.
-
-        `labelling` is there where it had rules, `poses` where the light bends at a surface,
-        `carried` where the cloud was taken from old cameras to adjusted ones, `unsure` where such
-        points are withheld, `shoreline` where one was written, `part` where not all was read. Where
-        no order of S-44 is claimed it is said why.
-        """
-        some = ("labelling", "carried", "unsure", "poses", "shoreline", "fit", "part")
-        own = ("told",)
-        values = {name: vars(self)[name] for name in vars(self) if name not in (*some, *own)}
-        more = {name: getattr(self, name) for name in some if getattr(self, name) is not None}
+        """Return plain values, ready for JSON; optional parts only if there are any."""
+        optional = ("labelling", "carried", "unsure", "poses", "shoreline", "fit", "part")
+        values = {
+            name: value for name, value in vars(self).items()
+            if name != "told" and not (name in optional and value is None)
+        }  # fmt: skip
         if self.uncertainty is not None and self.why_no_order:
             no_order = {"s44": None, "why_no_order": self.why_no_order}
-            more["uncertainty"] = {**self.uncertainty, **no_order}
-        return {**values, **more, "points_per_s": round(self.points_per_s)}
+            values["uncertainty"] = {**self.uncertainty, **no_order}
+        return {**values, "points_per_s": round(self.points_per_s)}

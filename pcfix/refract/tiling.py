@@ -1,4 +1,4 @@
-"""Tiles of neighbouring points, and the cameras whose frames may hold one of them.
+"""Tiles and cells of neighbouring points, and the cameras whose frames may hold one of them.
 
 Kernels process points tile by tile: a tile of neighbours needs few cameras, and inner loops over
 its points are vectorised.
@@ -6,12 +6,12 @@ its points are vectorised.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from itertools import accumulate
 
 import numpy as np
 
 from pcfix.kernels import device
-from pcfix.lens.algebra import Nine, Vector, normal_of
+from pcfix.lens.algebra import Nine, Vector
 from pcfix.lens.frames import (
     ALL,
     NOT_DISTORTED,
@@ -24,33 +24,14 @@ from pcfix.lens.frames import (
     may_hold,
     pyramid,
 )
-from pcfix.model import FloatArray, IntArray
-from pcfix.refract.batch import Batch
+from pcfix.model import FloatArray, IntArray, WaterPlane
+from pcfix.refract.batch import Batch, Chosen
 
 TILE = 128
 """Points of a tile: its sums (11 numbers a point) stay in the processor's first cache."""
 
-
-class Points(NamedTuple):
-    """Points and the water above them, for kernels; see `Batch`.
-
-    `order` brings neighbours together.
-    """
-
-    order: IntArray
-    xyz: FloatArray
-    height: FloatArray
-    slope: FloatArray
-
-
-def points_of(batch: Batch) -> Points:
-    """Return the points of a batch for kernels."""
-    return Points(
-        spatial_order(batch.xyz),
-        np.ascontiguousarray(batch.xyz),
-        np.ascontiguousarray(batch.surface.height_m),
-        np.ascontiguousarray(batch.surface.slope),
-    )
+CELLS_A_HEIGHT = 8.0
+"""Flying height by the side of a cell."""
 
 
 def tiles_of(batch: Batch) -> int:
@@ -77,8 +58,65 @@ def spatial_order(xyz: FloatArray) -> IntArray:
     return np.argsort(row * columns + within, kind="stable")
 
 
+def cell_side(batch: Batch) -> float:
+    """Return the side of the cells, metres: a power of two."""
+    x, y, z = np.median(batch.survey.cameras.centres, axis=0)
+    water = batch.survey.water
+    if isinstance(water, WaterPlane):
+        level = water.a + water.b * x + water.c * y
+    else:
+        level = np.median(batch.surface.height_m)
+    return float(2.0 ** np.rint(np.log2(max(z - level, 0.01) / CELLS_A_HEIGHT)))
+
+
+def cells_of(batch: Batch, layer: IntArray | None = None) -> tuple[IntArray, IntArray]:
+    """Return the order of the points cell by cell, and the first of each cell.
+
+    Cells are squares fixed in the world, by layers if these are given. Within a cell, points with
+    the same cameras follow each other.
+    """
+    if not len(batch):
+        return np.zeros(0, np.int64), np.zeros(1, np.int64)
+    cell = np.floor(batch.xyz[:, :2] / cell_side(batch)).astype(np.int64)
+    cell -= cell.min(axis=0)
+    key = cell[:, 1] * (cell[:, 0].max() + 1) + cell[:, 0]
+    if layer is not None:
+        key = key * (layer.max() + 1) + layer
+    # a random number stands for each camera, so that a sum stands for a list of cameras
+    names = np.random.default_rng(0).integers(2**40, size=len(batch.survey.cameras))
+    total = np.concatenate([[0], np.cumsum(names[batch.rays.camera])])
+    order = np.lexsort((np.diff(total[batch.rays.start]), key))
+    new = np.flatnonzero(np.diff(key[order])) + 1
+    return order, np.concatenate([[0], new, [len(order)]])
+
+
 @device(allocates=True)
-def gather(tile: FloatArray, rows: IntArray, points: Points) -> tuple[FloatArray, FloatArray]:
+def cameras_of(points: Chosen, i: int) -> IntArray:
+    """Return the cameras of a point."""
+    return points.camera[points.start[i] : points.start[i + 1]]
+
+
+@device
+def are_same(a: IntArray, b: IntArray) -> bool:
+    """Whether two lists of cameras are the same."""
+    same = a.size == b.size
+    for j in range(min(a.size, b.size)):
+        same = same and a[j] == b[j]
+    return same
+
+
+@device(allocates=True)
+def counts_of(rows: IntArray, points: Chosen) -> IntArray:
+    """Return how many of some points each camera sees, by their lists."""
+    seen = np.zeros(len(points.centres), np.int64)
+    for i in rows:
+        for c in cameras_of(points, i):
+            seen[c] += 1
+    return seen
+
+
+@device(allocates=True)
+def gather(tile: FloatArray, rows: IntArray, points: Chosen) -> tuple[FloatArray, FloatArray]:
     """Fill a tile with runs of x, y, z, surface height and unit normal; return its box.
 
     The runs, of `TILE` numbers each, lie in one array: with one base address and fixed distances
@@ -91,10 +129,17 @@ def gather(tile: FloatArray, rows: IntArray, points: Points) -> tuple[FloatArray
             value = points.xyz[i, axis]
             tile[axis * TILE + j] = value
             low[axis], high[axis] = min(low[axis], value), max(high[axis], value)
-        x, y, z = normal_of(points.slope[i, 0], points.slope[i, 1])
+            tile[(4 + axis) * TILE + j] = points.normals[i, axis]
         tile[3 * TILE + j] = points.height[i]
-        tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j] = x, y, z
     return low, high
+
+
+def slots(*widths: int) -> tuple[int, ...]:
+    """Return the first run of each of several quantities of so many numbers, and how many in all.
+
+    Runs of `TILE` numbers in one array: the compiler sees that they cannot overlap.
+    """
+    return (0, *accumulate(widths))
 
 
 @device
@@ -215,3 +260,28 @@ def marks_in_frame(
             near[seeing] = c
             seeing += 1
     return near[:seeing], marks[:seeing]
+
+
+@device
+def product_of(m: Nine, x: Vector) -> Vector:
+    """Return a matrix times a vector."""
+    return (
+        m[0] * x[0] + m[1] * x[1] + m[2] * x[2],
+        m[3] * x[0] + m[4] * x[1] + m[5] * x[2],
+        m[6] * x[0] + m[7] * x[1] + m[8] * x[2],
+    )
+
+
+@device
+def inverse_of(m: Nine) -> tuple[float, Nine]:
+    """Return the determinant of a matrix and its inverse, meaningless if that is 0."""
+    a, b, c, d, e, f, g, h, i = m
+    # cofactors of the first row
+    x, y, z = e * i - f * h, f * g - d * i, d * h - e * g
+    det = a * x + b * y + c * z
+    inv = 1.0 / det
+    return det, (
+        inv * x, inv * (c * h - b * i), inv * (b * f - c * e),
+        inv * y, inv * (a * i - c * g), inv * (c * d - a * f),
+        inv * z, inv * (b * g - a * h), inv * (a * e - b * d),
+    )  # fmt: skip

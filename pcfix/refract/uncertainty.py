@@ -1,58 +1,114 @@
-r"""Compute the covariance of corrected points.
+r"""Compute the covariance of corrected points, to first order.
 
 Errors that differ from ray to ray (of image coordinates, poses, waves) move the apparent point P
 first: SfM software intersects straight rays by least squares in the images, so that
 
     Cov P = K^-1 R K^-1,   K = sum J'J,   R = sum J' Cov(image) J.
 
-The correction moves P to Q; its derivative dQ/dP depends on the method, see
-`pcfix.refract.sensitivity`. Errors common to all rays (level, index and tilt of the water) enter
+The correction moves P to Q. Errors common to all rays (level, index and tilt of the water) enter
 only there, each with a column g of its own:
 
     Cov Q = dQ/dP Cov P dQ/dP' + sum over the common ones of sigma^2 g g'.
 
-`consistent` inverts that adjustment: dQ/dP = (sum S T)^-1 K, and K cancels out, so that noise acts
-as if the refracted rays had been adjusted in the images. The other methods have the derivative of
-`snell`, which weights rays by their distance (m) from the point; the two differ more, the more the
-lengths of the rays differ.
+**One ray** in the frame of the surface above P: N is up, the other two axes lie in the surface.
+From P to the projection centre is e, of length L, with the height H above P and d = e - H N, of
+length rho, across. The surface is h above P; the true point Q lies y below it. With r = 1 / n and
+kappa = sqrt(L^2 - r^2 rho^2) the refracted ray is t = -(r d + kappa N) / L, and at depth y it is
+m d away from P, with m = h / H - y r / kappa. All errors move this place, at a fixed y, by some
+delta across:
+
+=====================  ========================================================================
+by                     delta
+=====================  ========================================================================
+P across, p            D p = (1 - m) p + beta (d.p) d,  beta = -y r (1 - r^2) / kappa^3
+P up                   -D d / H
+h                      (1 / H - r / kappa) d
+n                      y r^2 L^2 / kappa^3 d
+slope, N + tau         -y (1 - r H / kappa) tau + (gamma + m r / kappa) (d.tau) d,
+                       gamma = y r^3 H / kappa^3 - h / H^2 (about the place above P)
+=====================  ========================================================================
+
+What a delta of each ray does to Q depends on what Q is the least of.
+
+*In space* (`snell` and most others) that is the squared distances from the refracted rays, eq 11 of
+Skarlatos & Agrafiotis 2018. With M = I - t t'
+
+    dQ = (sum M)^-1 sum M delta,    M d = E = (kappa^2 d - r kappa rho^2 N) / L^2.
+
+*In images* (`consistent`) the residuals are those at P: sum J' (x(Q) - pi(P)) = 0. A Q that is off
+its ray, by T Q = Q - (N.Q) (N + (r / kappa) d) at its own depth, is seen where P would be after a
+move of D^-1 T Q. With W = J'J and S = W D^-1, D^-1 across as in the table,
+
+    dQ = (sum S T)^-1 sum S delta,    S d = -H W N / (1 - m + beta rho^2)
+
+as W e = 0. Q depends on P only through pi(P): dQ / dP = (sum S T)^-1 sum W, and K cancels out.
+
+Neglected is the turn of M, and of J, times the residual, which is of second order.
 """
 
 from __future__ import annotations
 
 import math
-from typing import TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 from pcfix.kernels import Span, device, in_tiles, kernel
-from pcfix.lens.algebra import Nine, Symmetric, Vector, plus, scaled
+from pcfix.lens.algebra import (
+    Nine,
+    Symmetric,
+    Vector,
+    beyond,
+    dot,
+    minus,
+    plus,
+    plus_square,
+    product,
+    row_of,
+    scaled,
+)
 from pcfix.model import FloatArray, IntArray, Outcome, SingleArray
 from pcfix.options.correct import LEVEL_M
-from pcfix.refract import sensitivity as s
 from pcfix.refract import tiling
-from pcfix.refract.batch import Batch, Intersection, Survey
+from pcfix.refract.batch import Batch, Chosen, Intersection, Survey
 from pcfix.refract.choice import Rig, Rule, rig_of, rule_of
-from pcfix.refract.sensitivity import Budget
-from pcfix.refract.tiling import TILE, Points, nine, points_of, three
+from pcfix.refract.rays import refracted
+from pcfix.refract.tiling import TILE, inverse_of, nine, product_of, slots, three
 from pcfix.water.surface import Field, height_at
-
-Four: TypeAlias = tuple[float, float, float, float]
 
 MIN_DETERMINANT = 1e-6
 """As of `pcfix.refract.rays.nearest_point`, of half the trace cubed: k^3 for k rays in space."""
 
+MODEL_GSD = 0.8
+"""Standard error of the model of depth maps, common to a block: the bias of blocks with known truth
+was -0.6 to +1.4 ground pixels, largest with much image noise."""
+
+_XZ, _YZ, _ZZ = 2, 4, 5
+
+
+class Budget(NamedTuple):
+    """Standard deviations, angles in radians; the place about which the water tilts.
+
+    `in_images` says which residuals the correction makes least.
+    """
+
+    image_px: float
+    refractive_index: float
+    tilt: float
+    waves: float
+    centre_m: float
+    attitude: float
+    pivot_x: float
+    pivot_y: float
+    in_images: bool
+
 
 def covariances(batch: Batch, shift_m: FloatArray) -> FloatArray:
-    """Return the covariance of each corrected point, shape (m, 6), to first order.
+    """Return the covariance of each corrected point: xx, xy, xz, yy, yz, zz, shape (m, 6), m^2.
 
-    xx, xy, xz, yy, yz, zz in metres squared, world frame; zeros if fewer than two rays meet, or
-    nearly parallel ones. `shift_m`, shape (m, 3), is true minus apparent, by any method. The
-    standard deviations are those of the settings; that of the level is `level_sigma_m`, or else
-    `LEVEL_M`, if the settings have none.
-
-    A mesh or raster is taken as its plane above the point. All rays of a point are assumed to have
-    made it, by an adjustment in image residuals, with noise of the size of a pixel in the middle of
-    the image. A tilt turns the water about the middle of the projection centres.
+    Zeros if fewer than two rays meet, or nearly parallel ones. `shift_m`, shape (m, 3), is true
+    minus apparent, by any method. A mesh or raster is taken as its plane above the point. A tilt
+    turns the water about the middle of the projection centres.
 
     It is an approximation for methods that move points along the vertical only (they get that of
     `snell`), and where `consistent` inverts a dense matcher, which gets that of one adjustment of
@@ -64,9 +120,9 @@ def covariances(batch: Batch, shift_m: FloatArray) -> FloatArray:
     # the rays are chosen: on a mesh some may be beyond the limit for the plane above the point
     every_ray = rule_of(survey)._replace(least_cosine2=0.0)
     in_tiles(
-        _of_lists, tiling.tiles_of(batch), points_of(batch), np.ascontiguousarray(shift_m),
-        rig_of(survey), batch.listed,
-        every_ray, budget_of(survey), level_sigma_of(batch), result,
+        _of_lists, tiling.tiles_of(batch), tiling.spatial_order(batch.xyz), batch.chosen(),
+        np.ascontiguousarray(shift_m), rig_of(survey), every_ray, budget_of(survey),
+        level_sigma_of(batch), result,
     )  # fmt: skip
     return result
 
@@ -74,17 +130,23 @@ def covariances(batch: Batch, shift_m: FloatArray) -> FloatArray:
 def with_uncertainty(found: Intersection, batch: Batch) -> Intersection:
     """Return a result with its covariances and standard errors of Z, if asked for."""
     survey = batch.survey
-    if survey.settings.dimensions != "all":
-        return with_errors(found, None)
+    if survey.settings.dimensions != "all" or found.covariance_m2 is not None:
+        return with_errors(found, found.covariance_m2)
     covariance, line = covariances(batch, found.shift_m), survey.learned.regression
     if survey.settings.method == "regression" and line is not None:
         covariance[:, [_XZ, _YZ]] = 0.0
         covariance[:, _ZZ] = line.sigma_m(batch.surface.height_m - batch.xyz[:, 2]) ** 2
+    if found.ambiguity_m is not None:  # of depth maps
+        cameras = survey.cameras
+        focal_px = float(np.median([lens.focal_px for lens in cameras.lenses or ()]))
+        gsd_m = (np.median(cameras.centres[:, 2]) - batch.surface.height_m) / focal_px
+        covariance[:, _ZZ] += found.ambiguity_m**2 + (MODEL_GSD * gsd_m) ** 2
     return with_errors(found, covariance)
 
 
 def with_errors(found: Intersection, covariance: FloatArray | None) -> Intersection:
     """Return a result with covariances (modified in place) and standard errors of Z."""
+    found = found._replace(ambiguity_m=None)
     if covariance is None:
         return found._replace(sigma_z_m=np.zeros(len(found.outcome)))
     moved = found.outcome == Outcome.CORRECTED
@@ -109,14 +171,11 @@ def with_model_uncertainty(found: Intersection, batch: Batch) -> Intersection:
     return with_errors(found, covariance)
 
 
-_XZ, _YZ, _ZZ = 2, 4, 5
-
-
 def level_sigma_of(batch: Batch) -> FloatArray:
     """Return the standard deviation of the water above each point, metres, shape (m,).
 
-    The error of the level is common to all rays. Errors of the water of single images differ from
-    ray to ray, and are added as the error of the mean over the rays.
+    That of the settings, else of the fit, else `LEVEL_M`. Errors of the water of single images
+    are added as the error of the mean over the rays.
     """
     stated, fitted = batch.survey.settings.sigma_level, batch.level_sigma_m
     known = stated if stated is not None else LEVEL_M if fitted is None else fitted
@@ -125,32 +184,26 @@ def level_sigma_of(batch: Batch) -> FloatArray:
     own, views = batch.survey.own_water, batch.views
     if own is None or views is None:
         return full
-    of_own, points = np.zeros(len(batch)), points_of(batch)
-    in_tiles(
-        _own_sigma, len(batch), points, rig_of(batch.survey), own.sigma,
-        batch.listed, of_own,
-    )  # fmt: skip
+    of_own = np.zeros(len(batch))
+    in_tiles(_own_sigma, len(batch), batch.chosen(), own.sigma, of_own)
     return np.hypot(full, of_own)
 
 
 @kernel
-def _own_sigma(
-    span: Span, points: Points, rig: Rig, sigma: Field, views: tuple[IntArray, IntArray],
-    found: FloatArray,
-) -> None:  # fmt: skip
+def _own_sigma(span: Span, points: Chosen, sigma: Field, found: FloatArray) -> None:
     """Set the standard error of the mean of the images' own water over the rays of a point.
 
     Errors are independent from image to image. The water is taken as level above the point.
     """
-    start, camera = views
+    start, camera = points.start, points.camera
     for i in range(*span):
         total = 0.0
         for at in range(start[i], start[i + 1]):
-            c, x, y = camera[at], points.xyz[i, 0], points.xyz[i, 1]
-            up = rig.centres[c, 2] - points.xyz[i, 2]
+            c = camera[at]
+            e = minus(row_of(points.centres, c), row_of(points.xyz, i))
             # where the straight ray pierces it
-            f = (points.height[i] + rig.offset[c] - points.xyz[i, 2]) / up
-            x, y = x + f * (rig.centres[c, 0] - x), y + f * (rig.centres[c, 1] - y)
+            f = (points.height[i] + points.offset[c] - points.xyz[i, 2]) / e[2]
+            x, y = points.xyz[i, 0] + f * e[0], points.xyz[i, 1] + f * e[1]
             error = height_at(Field(sigma.heights, sigma.shape, sigma.frame, c), x, y)[0]
             total += error * error if error > 0.0 else 0.0
         found[i] = np.sqrt(total) / max(start[i + 1] - start[i], 1)
@@ -173,19 +226,314 @@ def budget_of(survey: Survey) -> Budget:
     )
 
 
+# Runs of `TILE` numbers in the room of a tile, for the points: the number of rays; what level (3)
+# and n (3) add to M delta or S delta; W (6); S T (9) or M (6); M D (9); what slopes add, to be
+# multiplied by tau (9); noise (6). For the rays of one camera: N and y - h of the points (4), how
+# often each counts, e (3) and h.
+(
+    RAYS, BY_LEVEL, BY_N, SIGHT, BY_Q, BY_P, BY_TILT, NOISE, _NORMAL, _BELOW, _COUNT, _AWAY,
+    _HEIGHT, ROOM,
+) = slots(1, 3, 3, 6, 9, 9, 9, 6, 3, 1, 1, 3, 1)  # fmt: skip
+
+# A number of a program has double precision, and would make doubles of what it is added to.
+_ZERO, _HALF, _ONE, _TWO = np.array([0.0, 0.5, 1.0, 2.0], np.float32)
+_single: Any = np.float32
+
+Sight: TypeAlias = tuple[Vector, float, float]
+"""Optical axis, squared focal length (px), 1 / n: plain numbers, which stay in registers."""
+Seen: TypeAlias = tuple[float, Vector, Vector, float, float, float, float, float]
+
+
+@device(allocates=True)
+def room_of(tile: FloatArray, shift: FloatArray, rows: IntArray) -> SingleArray:
+    """Return room for the sums of a tile, and how far below P the true points lie, along N.
+
+    It is of single precision, in which the processor works on twice as many rays at once. A
+    standard error is off by 5e-6 of it where the cameras are 0.4 heights apart, by 5e-5 at 0.1 and
+    by 4 % at 0.003, below which rays are parallel.
+    """
+    # the sums start at zero; the runs of the rays are filled in by `add_rays`
+    room = np.zeros(ROOM * TILE, np.float32)
+    for j in range(rows.size):
+        normal = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
+        room[_NORMAL * TILE + j] = normal[0]
+        room[(_NORMAL + 1) * TILE + j] = normal[1]
+        room[(_NORMAL + 2) * TILE + j] = normal[2]
+        room[_BELOW * TILE + j] = -dot(normal, row_of(shift, rows[j]))
+    return room
+
+
+@device
+def add_rays(
+    room: SingleArray, tile: FloatArray, marks: FloatArray, rig: Rig, c: int, rule: Rule
+) -> None:
+    """Set what the rays of one camera have: how often they count, as their marks say, e and h.
+
+    Double precision makes this the same to the bit in any tile. A ray that is not used goes
+    straight up.
+    """
+    centre, offset, least_cosine2 = row_of(rig.centres, c), rig.offset[c], rule.least_cosine2
+    for j in range(marks.size):
+        z = tile[2 * TILE + j]
+        e = minus(centre, (tile[j], tile[TILE + j], z))
+        normal = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
+        height = dot(normal, e)
+        h = normal[2] * (tile[3 * TILE + j] - (z - offset))
+        # the camera is above the water, the ray marked and within the limit of incidence
+        use = (marks[j] > 0.0) & (height > h) & (height * height >= least_cosine2 * dot(e, e))
+        room[_COUNT * TILE + j] = marks[j] if use else 0.0
+        room[_AWAY * TILE + j] = e[0] if use else normal[0]
+        room[(_AWAY + 1) * TILE + j] = e[1] if use else normal[1]
+        room[(_AWAY + 2) * TILE + j] = e[2] if use else normal[2]
+        room[_HEIGHT * TILE + j] = h
+
+
+@device
+def _seen(room: SingleArray, j: int, bend: float) -> Seen:
+    """Return how often a ray counts; e, N, H, L^2, h, y and r where the light bends."""
+    at = _AWAY * TILE + j
+    e = room[at], room[at + TILE], room[at + 2 * TILE]
+    at = _NORMAL * TILE + j
+    normal = room[at], room[at + TILE], room[at + 2 * TILE]
+    h = room[_HEIGHT * TILE + j]
+    # light of a point above the water goes straight
+    bend = bend if h > _ZERO else _ONE
+    # y: depth of the true point below the surface
+    y = h + room[_BELOW * TILE + j]
+    return room[_COUNT * TILE + j], e, normal, dot(normal, e), dot(e, e), h, y, bend
+
+
+@device
+def _bent(
+    height: float, length2: float, h: float, y: float, bend: float
+) -> tuple[float, float, float, float, float, float, float]:
+    """Return kappa, 1 / H, 1 / L^2, r / kappa, 1 - m, beta, and delta by n over d."""
+    kappa = np.sqrt(length2 - bend * bend * (length2 - height * height))
+    share = _ONE / (length2 * height * kappa)  # one division for three
+    inv_k, inv_h, inv2 = share * length2 * height, share * length2 * kappa, share * height * kappa
+    # r / kappa, the tangent in water for each metre across in air
+    lean = bend * inv_k
+    fall = y * lean * inv_k * inv_k
+    by_n = fall * bend * length2 if bend < _ONE else _ZERO
+    return (
+        kappa, inv_h, inv2, lean, _ONE - h * inv_h + y * lean, fall * (bend * bend - _ONE), by_n
+    )  # fmt: skip
+
+
+@device
+def _weight(one: float, e: Vector, length2: float, axis: Vector, square: float) -> Symmetric:
+    """Return J'J of a camera whose squared focal length (px) is `square`, at P.
+
+    With the optical axis z and Z = -z.e it is (f / Z)^2 (I + x z' + z x'), x = e / Z +
+    L^2 / (2 Z^2) z; without an axis (zeros), of angles, (f / L)^2 (I - e e' / L^2).
+    """
+    # cameras without an axis, such as fisheyes, have equal angles per pixel
+    flat = axis[0] != _ZERO or axis[1] != _ZERO or axis[2] != _ZERO
+    # depth along the axis, or the squared distance
+    deep = -dot(axis, e) if flat else length2
+    inv = _ONE / deep if one > _ZERO else _ZERO
+    # (f / Z)^2 or (f / L)^2; 0 for rays that do not count
+    w = one * square * (inv * inv if flat else inv)
+    a = inv if flat else -_HALF * inv
+    b = _HALF * length2 * inv * inv if flat else _ZERO
+    zx, zy, zz = axis[0] if flat else e[0], axis[1] if flat else e[1], axis[2] if flat else e[2]
+    x, y, z = scaled(w, beyond(scaled(a, e), b, (zx, zy, zz)))
+    return (
+        w + _TWO * x * zx, x * zy + zx * y, x * zz + zx * z,
+        w + _TWO * y * zy, y * zz + zy * z, w + _TWO * z * zz,
+    )  # fmt: skip
+
+
+@device
+def _add_three(sums: FloatArray, at: int, c: float, a: Vector) -> None:
+    """Add c a."""
+    sums[at] += c * a[0]
+    sums[at + TILE] += c * a[1]
+    sums[at + 2 * TILE] += c * a[2]
+
+
+@device
+def _add_six(sums: FloatArray, at: int, m: Symmetric) -> None:
+    sums[at] += m[0]
+    sums[at + TILE] += m[1]
+    sums[at + 2 * TILE] += m[2]
+    sums[at + 3 * TILE] += m[3]
+    sums[at + 4 * TILE] += m[4]
+    sums[at + 5 * TILE] += m[5]
+
+
+@device
+def _add_nine(sums: FloatArray, at: int, c: float, m: Symmetric, g: Vector, q: Vector) -> None:
+    """Add c m + g q'."""
+    sums[at] += c * m[0] + g[0] * q[0]
+    sums[at + TILE] += c * m[1] + g[0] * q[1]
+    sums[at + 2 * TILE] += c * m[2] + g[0] * q[2]
+    sums[at + 3 * TILE] += c * m[1] + g[1] * q[0]
+    sums[at + 4 * TILE] += c * m[3] + g[1] * q[1]
+    sums[at + 5 * TILE] += c * m[4] + g[1] * q[2]
+    sums[at + 6 * TILE] += c * m[2] + g[2] * q[0]
+    sums[at + 7 * TILE] += c * m[4] + g[2] * q[1]
+    sums[at + 8 * TILE] += c * m[5] + g[2] * q[2]
+
+
+@device
+def _in_space(
+    one: float, e: Vector, normal: Vector, height: float, length2: float, bend: float,
+    kappa: float, inv2: float,
+) -> tuple[Symmetric, Vector]:  # fmt: skip
+    """Return M and E."""
+    dx, dy, dz = refracted(e, length2, normal, height, bend)
+    one = one * inv2
+    tx, ty, tz = one * dx, one * dy, one * dz
+    # E = (kappa^2 d - r kappa rho^2 N) / L^2, with d = e - H N
+    along = kappa * kappa * one
+    up = along * height + bend * kappa * (length2 - height * height) * one
+    # M = I - t t', with the diagonal from t.t = 1
+    xx, yy, zz = dx * tx, dy * ty, dz * tz
+    m = yy + zz, -dx * ty, -dx * tz, zz + xx, -dy * tz, xx + yy  # t.t is one
+    return m, minus(scaled(along, e), scaled(up, normal))
+
+
+@device
+def add_in_space(room: SingleArray, count: int, sight: Sight) -> None:
+    """Add one camera's rays to the sums of a tile's points, of so many."""
+    axis, square, bend_of = sight
+    for j in range(count):
+        one, e, normal, height, length2, h, y, bend = _seen(room, j, bend_of)
+        kappa, inv_h, inv2, lean, away, beta, by_n = _bent(height, length2, h, y, bend)
+        m, g = _in_space(one, e, normal, height, length2, bend, kappa, inv2)
+        # M D (p - (N.p) e / H), where M e = (1 - r H / kappa) E
+        up = (away * (lean * height - _ONE) - beta * length2) * inv_h
+        # sums of M, M D, M delta by level and by n, and W
+        room[RAYS * TILE + j] += one
+        _add_six(room, BY_Q * TILE + j, m)
+        q = plus(scaled(up, normal), scaled(beta, e))
+        _add_nine(room, BY_P * TILE + j, away, m, g, q)
+        _add_three(room, BY_LEVEL * TILE + j, inv_h - lean, g)
+        _add_three(room, BY_N * TILE + j, by_n, g)
+        _add_six(room, SIGHT * TILE + j, _weight(one, e, length2, axis, square))
+
+
+@device
+def add_in_images(room: SingleArray, count: int, sight: Sight) -> None:
+    """Add one camera's rays to the sums of a tile's points, of so many.
+
+    S T = W / (1 - m) + W N (u N + v e)', with c = 1 - m + beta rho^2, v = H beta / ((1 - m) c) and
+    u = (r H / kappa) / c - 1 / (1 - m) - H v.
+    """
+    axis, square, bend_of = sight
+    for j in range(count):
+        one, e, normal, height, length2, h, y, bend = _seen(room, j, bend_of)
+        _, inv_h, _, lean, away, beta, by_n = _bent(height, length2, h, y, bend)
+        w = _weight(one, e, length2, axis, square)
+        g = product(w, normal)
+        # D^-1 across d and along it; see the docstring for u and v
+        inner, outer = _inverse(height, length2, away, beta)
+        v = height * beta * inner * outer
+        u = lean * height * outer - inner - height * v
+        q = plus(scaled(u, normal), scaled(v, e))
+        room[RAYS * TILE + j] += one
+        _add_nine(room, BY_Q * TILE + j, inner, w, g, q)
+        # S d = -H W N / c
+        scale = -height * outer
+        _add_three(room, BY_LEVEL * TILE + j, scale * (inv_h - lean), g)
+        _add_three(room, BY_N * TILE + j, scale * by_n, g)
+        _add_six(room, SIGHT * TILE + j, w)
+
+
+@device
+def _inverse(height: float, length2: float, away: float, beta: float) -> tuple[float, float]:
+    """Return what D^-1 does to p across d, and along it."""
+    # 1 - m + beta rho^2
+    outer = away + beta * (length2 - height * height)
+    share = _ONE / (away * outer)
+    return share * outer, share * away
+
+
+@device
+def add_tilt(room: SingleArray, count: int, sight: Sight, in_images: bool) -> None:
+    """Add how the slope of the water moves each of one camera's rays, M delta or S delta.
+
+    S delta = (a W + (a beta - (1 - m) b) H / c W N d') / (1 - m) tau, c as above, for delta =
+    a tau + b (d.tau) d; d.tau = e.tau.
+    """
+    axis, square, bend_of = sight
+    for j in range(count):
+        one, e, normal, height, length2, h, y, bend = _seen(room, j, bend_of)
+        kappa, inv_h, inv2, lean, away, beta, _ = _bent(height, length2, h, y, bend)
+        # delta by the slope is turn (tau) + along (d.tau) d, along = gamma + m r / kappa
+        inv_k, turn = _ONE / kappa, -y * (_ONE - height * lean)
+        along = y * bend * bend * lean * height * inv_k * inv_k
+        along += (h * inv_h - y * lean) * lean - h * inv_h * inv_h
+        if in_images:
+            w = _weight(one, e, length2, axis, square)
+            g = product(w, normal)
+            inner, outer = _inverse(height, length2, away, beta)
+            # both parts through D^-1
+            along = (turn * beta * inner - along) * height * outer
+            turn *= inner
+        else:
+            w, g = _in_space(one, e, normal, height, length2, bend, kappa, inv2)
+        _add_nine(room, BY_TILT * TILE + j, turn, w, g, scaled(along, e))
+
+
+@device
+def add_noise(room: SingleArray, count: int, sight: Sight, budget: Budget) -> None:
+    """Add the noise of one camera's rays to the normal equations of the straight rays.
+
+    An error that moves the straight ray at P by z, of covariance C, moves its image by J z and
+    adds W C W. A turned camera has C = attitude^2 L^2 times what is across the ray, a moved one
+    centre_m^2. A wave of slope tau at the piercing point moves the refracted ray at depth y by
+    -y (1 - r H / kappa) (tau + r^2 / kappa^2 d (d.tau)); D^-1 of that is what moves P, by c_t
+    across d and c_r along.
+    """
+    axis, square, bend_of = sight
+    image_px, centre_m = _single(budget.image_px), _single(budget.centre_m)
+    attitude, waves = _single(budget.attitude), _single(budget.waves)
+    for j in range(count):
+        one, e, normal, height, length2, h, y, bend = _seen(room, j, bend_of)
+        kappa, _, _, lean, away, beta, _ = _bent(height, length2, h, y, bend)
+        w = _weight(one, e, length2, axis, square)
+        g = product(w, normal)
+        inner, outer = _inverse(height, length2, away, beta)
+        # a slope of the wave moves the refracted ray by this across d
+        across = waves * y * (_ONE - height * lean)
+        # and by the factor 1 + bow rho^2 along d
+        bow = bend * bend / (kappa * kappa)
+        c_t = across * inner
+        c_r = across * outer * (_ONE + bow * (length2 - height * height))
+        # (c_r^2 - c_t^2) / rho^2, also straight down; W d = -H W N
+        more = across * outer * (bow - beta * inner) * (c_r + c_t)
+        # variance of the place of P from attitude, centre and waves, with C isotropic
+        by_place = attitude * attitude * length2 + centre_m * centre_m + c_t * c_t
+        by_normal = more * height * height - c_t * c_t
+        # W C W for an isotropic C is a multiple of W^2, whose elements are products of its rows
+        by_image = image_px * image_px
+        row_x, row_y, row_z = (w[0], w[1], w[2]), (w[1], w[3], w[4]), (w[2], w[4], w[5])
+        noise = (
+            by_image * w[0] + by_place * dot(row_x, row_x) + by_normal * g[0] * g[0],
+            by_image * w[1] + by_place * dot(row_x, row_y) + by_normal * g[0] * g[1],
+            by_image * w[2] + by_place * dot(row_x, row_z) + by_normal * g[0] * g[2],
+            by_image * w[3] + by_place * dot(row_y, row_y) + by_normal * g[1] * g[1],
+            by_image * w[4] + by_place * dot(row_y, row_z) + by_normal * g[1] * g[2],
+            by_image * w[5] + by_place * dot(row_z, row_z) + by_normal * g[2] * g[2],
+        )
+        _add_six(room, NOISE * TILE + j, noise)
+
+
 @kernel(allocates=True)
 def _of_lists(
-    span: Span, points: Points, shift: FloatArray, rig: Rig, views: tuple[IntArray, IntArray],
-    rule: Rule, budget: Budget, level_sigma: FloatArray, result: FloatArray,
+    span: Span, order: IntArray, points: Chosen, shift: FloatArray, rig: Rig, rule: Rule,
+    budget: Budget, level_sigma: FloatArray, result: FloatArray,
 ) -> None:  # fmt: skip
     """Compute the covariances of points with view lists, a tile at a time."""
-    start, camera = views
+    start, camera = points.start, points.camera
     for t in range(*span):
-        rows = points.order[t * TILE : (t + 1) * TILE]
+        rows = order[t * TILE : (t + 1) * TILE]
         tile = np.empty(7 * TILE)
         # the runs of the tile, then those of its rays, then one camera after the other
         tiling.gather(tile, rows, points)
-        room = s.room_of(tile, shift, rows)
+        room = room_of(tile, shift, rows)
         named, marks = tiling.marks_of_lists(start, camera, rows, len(rig.centres))
         for at in range(named.size):
             add_errors(room, tile, marks[at], rig, named[at], rule, budget)
@@ -204,17 +552,20 @@ def add_errors(
     budget: Budget,
 ) -> None:  # fmt: skip
     """Add the rays of one camera to the points of a tile that have a mark."""
-    count, sight = marks.size, s.lens_of(rig, c, rule)
-    s.add_rays(room, tile, marks, rig, c, rule)
+    x, y, z = row_of(rig.axes, c)
+    square = _single(rig.focal_px[c] * rig.focal_px[c])
+    sight = (_single(x), _single(y), _single(z)), square, _single(rule.bend)
+    count = marks.size
+    add_rays(room, tile, marks, rig, c, rule)
     # the derivative of consistent, or that of snell
     if budget.in_images:
-        s.add_in_images(room, count, sight)
+        add_in_images(room, count, sight)
     else:
-        s.add_in_space(room, count, sight)
+        add_in_space(room, count, sight)
     if budget.tilt > 0.0:
-        s.add_tilt(room, count, sight, budget.in_images)
+        add_tilt(room, count, sight, budget.in_images)
     if differ_by_ray(budget):
-        s.add_noise(room, count, sight, budget)
+        add_noise(room, count, sight, budget)
 
 
 @device(allocates=True)
@@ -230,14 +581,23 @@ def finish_tile(
     # R = sigma^2 K if all rays have the same image noise
     if not differ_by_ray(budget):
         for at in range(6 * TILE):
-            sums[s.NOISE * TILE + at] = budget.image_px**2 * sums[s.SIGHT * TILE + at]
+            sums[NOISE * TILE + at] = budget.image_px**2 * sums[SIGHT * TILE + at]
     if budget.in_images:
         for j in range(rows.size):
-            solved, by_delta = _solved_in_images(sums, j)
+            # Q moves by (sum S T)^-1 times sum S delta, and times the noise of P
+            m, k = nine(sums, BY_Q * TILE + j), sums[j]
+            det, by_delta = inverse_of(m)
+            half = 0.5 * (m[0] + m[4] + m[8])  # in units of the trace, as M has the trace 2 k
+            solved = (k >= 2.0) & (det >= MIN_DETERMINANT * half * half * half)
             _write(out, j, solved, by_delta, by_delta, sums, tile, sigma[j], budget)
     else:
         for j in range(rows.size):
-            solved, by_delta, by_noise = _solved_in_space(sums, j)
+            # Q moves by (sum M)^-1 sum M delta, and with P by (sum M)^-1 (sum M D) (sum W)^-1
+            k = sums[j]
+            det, by_delta = inverse_of(_full(_six(sums, BY_Q * TILE + j)))
+            full, by_sight = inverse_of(_full(_six(sums, SIGHT * TILE + j)))
+            by_noise = _product(_product(by_delta, nine(sums, BY_P * TILE + j)), by_sight)
+            solved = (k >= 2.0) & (det >= MIN_DETERMINANT * k * k * k) & (full > 0.0)
             _write(out, j, solved, by_delta, by_noise, sums, tile, sigma[j], budget)
     for j in range(rows.size):
         for at in range(6):
@@ -245,61 +605,23 @@ def finish_tile(
 
 
 @device
-def _solved_in_images(sums: FloatArray, j: int) -> tuple[bool, Nine]:
-    """Return whether the rays determine a point, and the inverse of sum S T.
-
-    Q moves by that times the right side of the normal equations of P, and times sum S delta.
-    """
-    m = nine(sums, s.BY_Q * TILE + j)
-    det, inverse = inverse_of(m)
-    # in units of the trace, as M has the trace 2 k
-    half = 0.5 * (m[0] + m[4] + m[8])
-    return (sums[j] >= 2.0) & (det >= MIN_DETERMINANT * half * half * half), inverse
-
-
-@device
-def _solved_in_space(sums: FloatArray, j: int) -> tuple[bool, Nine, Nine]:
-    """Return whether the rays determine a point, and two matrices.
-
-    Q moves by the first, (sum M)^-1, times sum M delta, and by the second, (sum M)^-1 (sum M D)
-    (sum W)^-1, times the right side of the normal equations of P.
-    """
-    k = sums[j]
-    det, by_delta = inverse_of(_full(_six(sums, s.BY_Q * TILE + j)))
-    full, by_sight = inverse_of(_full(_six(sums, s.SIGHT * TILE + j)))
-    # (sum M)^-1 (sum M D) moves Q with P, (sum W)^-1 moves P with the images
-    by_p = _product(by_delta, nine(sums, s.BY_P * TILE + j))
-    solved = (k >= 2.0) & (det >= MIN_DETERMINANT * k * k * k) & (full > 0.0)
-    return solved, by_delta, _product(by_p, by_sight)
-
-
-@device
 def _write(
-    out: FloatArray, j: int, solved: bool, by_delta: Nine, by_noise: Nine, sums: FloatArray,
+    out: FloatArray, j: int, solved: bool, by_delta: Nine, b: Nine, sums: FloatArray,
     tile: FloatArray, level_sigma: float, budget: Budget,
 ) -> None:  # fmt: skip
-    """Write the covariance of a point: of noise, and of each common error."""
-    b = by_noise
-    # B R B'
-    noise = _product(_product(b, _full(_six(sums, s.NOISE * TILE + j))), (
-        b[0], b[3], b[6], b[1], b[4], b[7], b[2], b[5], b[8]
-    ))  # fmt: skip
+    """Write the covariance of a point: B R B' of the noise, and that of each common error."""
+    r = _full(_six(sums, NOISE * TILE + j))
+    n = _product(_product(b, r), (b[0], b[3], b[6], b[1], b[4], b[7], b[2], b[5], b[8]))
     # each common error is one standard deviation times a column
     level, index, u, v = _columns(by_delta, sums, tile, j, level_sigma, budget)
-    x = level[0], index[0], u[0], v[0]
-    y = level[1], index[1], u[1], v[1]
-    z = level[2], index[2], u[2], v[2]
-    out[j] = noise[0] + _dot(x, x) if solved else 0.0
-    out[TILE + j] = noise[1] + _dot(x, y) if solved else 0.0
-    out[2 * TILE + j] = noise[2] + _dot(x, z) if solved else 0.0
-    out[3 * TILE + j] = noise[4] + _dot(y, y) if solved else 0.0
-    out[4 * TILE + j] = noise[5] + _dot(y, z) if solved else 0.0
-    out[5 * TILE + j] = noise[8] + _dot(z, z) if solved else 0.0
-
-
-@device
-def _dot(x: Four, y: Four) -> float:
-    return x[0] * y[0] + x[1] * y[1] + x[2] * y[2] + x[3] * y[3]
+    cov = plus_square((n[0], n[1], n[2], n[4], n[5], n[8]), level)
+    cov = plus_square(plus_square(plus_square(cov, index), u), v)
+    out[j] = cov[0] if solved else 0.0
+    out[TILE + j] = cov[1] if solved else 0.0
+    out[2 * TILE + j] = cov[2] if solved else 0.0
+    out[3 * TILE + j] = cov[3] if solved else 0.0
+    out[4 * TILE + j] = cov[4] if solved else 0.0
+    out[5 * TILE + j] = cov[5] if solved else 0.0
 
 
 @device
@@ -314,8 +636,8 @@ def _columns(
     # two horizontal directions of slope: u towards x, v across it
     scale = 1.0 / np.sqrt(nx * nx + nz * nz)
     ux, uz = nz * scale, -nx * scale
-    by_tilt = nine(sums, s.BY_TILT * TILE + j)
-    by_level, by_n = three(sums, s.BY_LEVEL * TILE + j), three(sums, s.BY_N * TILE + j)
+    by_tilt = nine(sums, BY_TILT * TILE + j)
+    by_level, by_n = three(sums, BY_LEVEL * TILE + j), three(sums, BY_N * TILE + j)
     # the level rises along the vertical, h is along N
     level = scaled(nz, by_level)
     away_u, away_v = tile[j] - budget.pivot_x, tile[TILE + j] - budget.pivot_y
@@ -344,34 +666,9 @@ def _full(m: Symmetric) -> Nine:
 
 
 @device
-def product_of(m: Nine, x: Vector) -> Vector:
-    """Return a matrix times a vector."""
-    return (
-        m[0] * x[0] + m[1] * x[1] + m[2] * x[2],
-        m[3] * x[0] + m[4] * x[1] + m[5] * x[2],
-        m[6] * x[0] + m[7] * x[1] + m[8] * x[2],
-    )
-
-
-@device
 def _product(a: Nine, b: Nine) -> Nine:
     """Return a matrix times a matrix."""
     x = product_of(a, (b[0], b[3], b[6]))
     y = product_of(a, (b[1], b[4], b[7]))
     z = product_of(a, (b[2], b[5], b[8]))
     return x[0], y[0], z[0], x[1], y[1], z[1], x[2], y[2], z[2]
-
-
-@device
-def inverse_of(m: Nine) -> tuple[float, Nine]:
-    """Return the determinant of a matrix and its inverse, meaningless if that is 0."""
-    a, b, c, d, e, f, g, h, i = m
-    # cofactors of the first row
-    x, y, z = e * i - f * h, f * g - d * i, d * h - e * g
-    det = a * x + b * y + c * z
-    inv = 1.0 / det
-    return det, (
-        inv * x, inv * (c * h - b * i), inv * (b * f - c * e),
-        inv * y, inv * (a * i - c * g), inv * (c * d - a * f),
-        inv * z, inv * (b * g - a * h), inv * (a * e - b * d),
-    )  # fmt: skip

@@ -1,4 +1,7 @@
-"""The report of an adjustment: its summary as text, and its page with tables and pictures."""
+"""The report of an adjustment: its summary as text, and its page with tables and pictures.
+
+All words are made of the plain values of `adjustment_dict`, so that a resumed run has them too.
+"""
 
 from __future__ import annotations
 
@@ -12,31 +15,98 @@ from pcfix.grid.colours import DEPTH, DIFFERENCE, RAYS, UNCERTAINTY
 from pcfix.grid.maps import Maps, MapsBuilder
 from pcfix.model import FloatArray
 from pcfix.report.adjustment_figures import pictures_of
-from pcfix.report.adjustment_text import (
-    WHERE,
-    all_notes,
-    fixed,
-    has_many_sensors,
-    lens_label,
-    listed,
-    short,
-)
 from pcfix.report.map_data import Layer
 from pcfix.report.page import Report, Table, render
-from pcfix.report.text import share
+from pcfix.report.text import Rows, filled, share
 
 __all__ = ["Before", "adjustment_dict", "adjustment_page", "adjustment_text", "before_of"]
 
+WHERE = (("land", "on land"), ("water", "under water"))
 MOST_LISTED = 12
 """Surveyed points in the text; the page has all of them."""
-
-WATER_WORDS = {
+_LENS = {"f": "focal length", "cx": "principal x", "cy": "principal y"}
+_WATER = {
     "level": ("water level", "m"), "tilt_x": ("tilt east", ""), "tilt_y": ("tilt north", ""),
     "index": ("index", ""), "shape_xx": ("shape x^2", "/m"), "shape_xy": ("shape x y", "/m"),
     "shape_yy": ("shape y^2", "/m"), "distance": ("port distance", "m"),
     "centre_x": ("dome centre x", "m"), "centre_y": ("dome centre y", "m"),
     "centre_z": ("dome centre z", "m"),
 }  # fmt: skip
+_COUNTS = (
+    ("images", "{images:,}, {poses_words}", "images"),
+    ("points", "{points[all]:,}: {points[land]:,} on land, {points[water]:,} under water{counted}",
+     "points"),
+    ("observations", "{o[used]:,} {kind} used, {o[left_out]:,} left out ({o_share}){outside}", "o"),
+    ("sigma0", "{sigma0_words}, redundancy {redundancy:,}, {rounds_count} rounds, {steps}"
+     " steps{undone}", "rounds"),
+    ("water", "{water[surface]}", "has_shape"),
+)  # fmt: skip
+_POSES = (
+    ("poses", "centres moved {moved_rms_m:.3f} m (RMS), mean east, north, up {mean} m, largest"
+     " {moved_largest_m:.3f} m ({moved_largest_image}); turned {turned_rms_deg:.4f} deg (RMS)",
+     "moved_rms_m"),
+    ("precision", "standard errors of centres X, Y, Z: mean {centre_mean} m, largest"
+     " {centre_largest} m; of angles: mean {angle_mean} deg, largest {angle_largest} deg",
+     "centre_mean"),
+)  # fmt: skip
+
+
+# Numbers and words
+
+
+def fixed(value: float | None, digits: int, sign: str = "") -> str:
+    """Return a number with a fixed number of digits; a dash if it is unknown."""
+    if value is None:
+        return "-"
+    # a zero has no minus sign
+    return f"{value if abs(value) >= 0.5 * 10.0**-digits else 0.0:{sign}.{digits}f}"
+
+
+def listed(values: Sequence[float | None] | None, digits: int = 3, sign: str = "") -> str:
+    """Return numbers separated by commas; a dash if they are unknown."""
+    return "-" if values is None else ", ".join(fixed(value, digits, sign) for value in values)
+
+
+def short(value: float, sigma: float | None, sign: str = "") -> str:
+    """Return a number with the digits that its standard error justifies, two at least."""
+    if sigma is None or not sigma > 0.0:
+        return f"{value:{sign}.6g}"
+    digits = int(np.clip(np.ceil(np.log10(2.0 / sigma)), 2, 9))
+    return f"{value:{sign}.{digits}f}"
+
+
+def all_notes(d: Plain) -> list[str]:
+    """Return the messages of all warnings, each once."""
+    doubts = d["precision"]["doubts"] if d["precision"] is not None else []
+    notes = [one["message"] for one in [*d["notes"], *doubts]]
+    return list(dict.fromkeys(note[:1].upper() + note[1:] for note in notes))
+
+
+def reason_sentence(adjusted: bool, why: str) -> str:
+    """Return why a run adjusted the cameras, or why not."""
+    if adjusted:
+        return f" The cameras were adjusted first, as {why}."
+    return f" The cameras were not adjusted: {why}."
+
+
+def _residuals(d: Plain) -> str:
+    """Return the RMS residuals on land and under water; empty without any."""
+    known = [(where, d["residuals"][key]["rms_px"]) for key, where in WHERE]
+    unit = d["image_unit"]
+    return " and ".join(
+        f"{fixed(rms, 2)} {unit} {where}" for where, rms in known if rms is not None
+    )
+
+
+def adjustment_sentence(d: Plain) -> str:
+    """Return an adjustment in half a line."""
+    row = next((one for one in d["lens"][:1] if one["name"] == "f"), None)
+    parts = [f"centres moved {fixed(d['poses']['moved_rms_m'], 3)} m (rms)"]
+    if row is not None:
+        before, after, *_ = _change(row)
+        parts.insert(0, f"focal length {before} -> {after} {d['image_unit']}")
+    residuals = _residuals(d)
+    return ", ".join([*parts, *([f"residuals {residuals}"] if residuals else [])])
 
 
 def adjustment_text(adjusted: Adjusted, before: Before | None = None) -> str:
@@ -49,9 +119,7 @@ def adjustment_text(adjusted: Adjusted, before: Before | None = None) -> str:
         Of `before_of`, for the residuals before.
     """
     d = adjustment_dict(adjusted, before)
-    lines = [f"{label:<14} {words}" for label, words in _facts(d)]
-    residuals = _residual_table(d)
-    lines += _aligned([residuals.header, *residuals.rows])
+    lines = [f"{label:<14} {words}" for label, words in _facts(d)] + _residual_table(d).lines()
     for role in ("control", "check"):
         points = (d[role] or {"points": []})["points"]
         for row in points[:MOST_LISTED]:
@@ -61,15 +129,6 @@ def adjustment_text(adjusted: Adjusted, before: Before | None = None) -> str:
         more = len(points) - MOST_LISTED
         lines += [f"  and {more} more"] if more > 0 else []
     return "\n".join([*lines, *(f"Note: {note}" for note in all_notes(d))])
-
-
-def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return the lines of a table, with its columns aligned to the right."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return [
-        "  ".join([f"  {row[0]:<{widths[0]}}", *map(str.rjust, row[1:], widths[1:])])
-        for row in rows
-    ]
 
 
 def adjustment_page(adjusted: Adjusted, before: Before | None = None) -> str:
@@ -83,23 +142,17 @@ def adjustment_page(adjusted: Adjusted, before: Before | None = None) -> str:
     """
     d = adjustment_dict(adjusted, before)
     maps, layers = _map(adjusted, before)
-    unit, surface = d["image_unit"], "at the housing port" if d["port"] else "at the water"
-    rest = [
-        f"{fixed(d['residuals'][key]['rms_px'], 2)} {unit} {where}"
-        for key, where in WHERE
-        if d["residuals"][key]["rms_px"] is not None
-    ]
-    is_straight = d["water"] is None and not d["port"]
+    how = "without refraction" if d["water"] is None else "with refraction at the water"
     lead = (
         f"{d['images']:,} images and {d['points']['all']:,} points were adjusted"
-        f" {'without refraction' if is_straight else f'with refraction {surface}'};"
-        f" {d['observations']['used']:,} observations fit within {' and '.join(rest)} (RMS of a"
+        f" {'with refraction at the housing port' if d['port'] else how};"
+        f" {d['observations']['used']:,} observations fit within {_residuals(d)} (RMS of a"
         " coordinate)."
     )
     report = Report(
         title="Refractive bundle adjustment",
         lead=lead,
-        head=Table("In short", [], [[_capital(label), words] for label, words in _facts(d)]),
+        head=_fact_table(d),
         warnings=all_notes(d),
         maps=maps,
         layers=layers,
@@ -110,53 +163,60 @@ def adjustment_page(adjusted: Adjusted, before: Before | None = None) -> str:
     return render(report)
 
 
-def _capital(text: str) -> str:
-    return text if text[:1] in "bkp" and text[1:].isdigit() else text[:1].upper() + text[1:]
+def adjustment_tables(d: Plain, page: str) -> list[Table]:
+    """Return what an adjustment changed, for the page of a run, with a link to its own page."""
+    from markupsafe import Markup
+
+    facts = _fact_table(d)
+    rows: list[list[str]] = [["Note", note] for note in all_notes(d)]
+    rows.append(["All of it", Markup('<a href="{0}">{0}</a>').format(page)])
+    title = "Refractive bundle adjustment"
+    return [Table(title, [], [*facts.rows, *rows]), _residual_table(d)]
 
 
 # Facts
 
 
-def _facts(d: Plain) -> list[tuple[str, str]]:
-    """Return labels and values of the summary."""
-    n, o, kept, rounds = d["points"], d["observations"], d["images_fixed"], d["rounds"]
-    poses = {
-        "free": "poses free" + (f", {kept:,} of them fixed" if kept else ""),
-        "fixed": "poses fixed",
+def _poses_are(d: Plain) -> str:
+    held = f", {d['images_fixed']:,} of them fixed" if d["images_fixed"] else ""
+    return {
+        "free": f"poses free{held}", "fixed": "poses fixed",
         "similarity": "shifted, turned and scaled together",
-    }[d["poses_are"]]
-    kinds = {"tie points": "measured tie points", "cloud": "points of the cloud in original images"}
+    }[d["poses_are"]]  # fmt: skip
+
+
+def _facts(d: Plain) -> Rows:
+    """Return labels and values of the summary."""
+    n, o, rounds, precision = d["points"], d["observations"], d["rounds"], d["precision"]
     counts = [(n[key], key.replace("_", " ")) for key in ("left_out", "control", "check")]
-    counted = "".join(f", {count:,} {key}" for count, key in counts if count)
-    steps = sum(row["steps"] for row in rounds)
-    how = "; adjustment without water undone" if d["engine"] == "unaware" else ""
-    rows = [
-        ("images", f"{d['images']:,}, {poses}"),
-        ("points", f"{n['all']:,}: {n['land']:,} on land, {n['water']:,} under water{counted}"),
-        (
-            "observations",
-            f"{o['used']:,} {kinds[d['source']]} used, {o['left_out']:,} left out"
-            f" ({share(o['left_out'], o['used'] + o['left_out'])})"
-            + (f", {o['out_of_sight']:,} outside their image" if o["out_of_sight"] else ""),
-        ),
-        (
-            "sigma0",
-            f"{fixed(d['sigma0'], 3)}, redundancy {d['redundancy']:,}, {len(rounds)} rounds,"
-            f" {steps} steps{how}",
-        ),
-    ]
-    if d["water"] is not None and not d["water"]["surface"].startswith("level"):
-        rows.append(("water", d["water"]["surface"]))
-    rows += [(lens_label(row), _lens_words(row, d)) for row in d["lens"]] or [("lens", "fixed")]
+    kinds = {"tie points": "measured tie points", "cloud": "points of the cloud in original images"}
+    outside = f", {o['out_of_sight']:,} outside their image" if o["out_of_sight"] else ""
+    has_shape = d["water"] is not None and not d["water"]["surface"].startswith("level")
+    rows = filled(_COUNTS, d | {
+        "poses_words": _poses_are(d), "o": o, "kind": kinds[d["source"]], "outside": outside,
+        "counted": "".join(f", {count:,} {key}" for count, key in counts if count),
+        "o_share": share(o["left_out"], o["used"] + o["left_out"]),
+        "sigma0_words": fixed(d["sigma0"], 3), "rounds_count": len(rounds),
+        "steps": sum(row["steps"] for row in rounds), "has_shape": has_shape,
+        "undone": "; adjustment without water undone" if d["engine"] == "unaware" else "",
+    })  # fmt: skip
+    rows += [(_lens_label(row), _lens_words(row, d)) for row in d["lens"]] or [("lens", "fixed")]
     rows += _water_rows(d)
     rows += [(f"on {one['surface']}", _surface_words(one, d)) for one in d["on_surfaces"]]
-    rows += _pose_facts(d)
-    if d["gnss"] is not None:
-        g = d["gnss"]
+    if d["poses_are"] != "fixed":
+        errors = {
+            f"{what}_{which}": listed(precision[f"{what}_{which}_{unit}"], 4)
+            for what, unit in (("centre", "m"), ("angle", "deg"))
+            for which in ("mean", "largest")
+        } if precision is not None and precision["images"] else {}  # fmt: skip
+        mean = listed(d["poses"]["moved_mean_m"], 3, "+")
+        rows += filled(_POSES, d["poses"] | errors | {"mean": mean})
+    if (g := d["gnss"]) is not None:
         words = (
             f"{g['images']:,} images, adjusted minus GNSS east, north, up: mean"
             f" {listed(g['mean_m'], 3, '+')} m, RMS {listed(g['rms_m'])} m, largest"
-            f" {fixed(g['largest_m'], 3)} m ({g['largest_image']})"
+            f" {fixed(g['largest_m'], 3)} m ({g['largest_image']}); RMS before"
+            f" {listed(g.get('rms_before_m'))} m"
         )
         rows.append(("GNSS", words))
     for role in ("control", "check"):
@@ -170,15 +230,20 @@ def _facts(d: Plain) -> list[tuple[str, str]]:
     return rows
 
 
+def _fact_table(d: Plain) -> Table:
+    rows = [
+        # k1 and the other coefficients keep their small letters
+        [label if label[1:].isdigit() else label[:1].upper() + label[1:], words]
+        for label, words in _facts(d)
+    ]
+    return Table("In short", [], rows)
+
+
 def _change(row: Plain) -> list[str]:
     """Return a value before and after, the difference, and its standard error."""
     before, after, sigma = row["before"], row["after"], row["sigma"]
-    change = short(after - before, sigma, "+")
-    return [short(before, sigma), short(after, sigma), change, _error(sigma)]
-
-
-def _error(sigma: float | None) -> str:
-    return "-" if sigma is None else f"{sigma:.2g}"
+    error = "-" if sigma is None else f"{sigma:.2g}"
+    return [short(before, sigma), short(after, sigma), short(after - before, sigma, "+"), error]
 
 
 def _change_words(row: Plain, unit: str) -> str:
@@ -187,24 +252,33 @@ def _change_words(row: Plain, unit: str) -> str:
     return f"{before} -> {after}{f' {unit}' if unit else ''} ({change}{error})"
 
 
+def _lens_label(row: Plain) -> str:
+    """Return what a surveyor calls a lens parameter."""
+    return str(_LENS.get(row["name"], row["name"]))
+
+
 def _lens_unit(row: Plain, d: Plain) -> str:
     return str(d["image_unit"]) if row["name"] in ("f", "cx", "cy", "b1", "b2") else ""
 
 
+def _has_many_sensors(d: Plain) -> bool:
+    return len({row["sensor"] for row in d["lens"]}) > 1
+
+
 def _lens_words(row: Plain, d: Plain) -> str:
-    sensor = f"; {row['sensor']}, {row['images']:,} images" if has_many_sensors(d) else ""
+    sensor = f"; {row['sensor']}, {row['images']:,} images" if _has_many_sensors(d) else ""
     several = f"; first of {row['lenses']} lenses" if row["lenses"] > 1 else ""
     return _change_words(row, _lens_unit(row, d)) + sensor + several
 
 
-def _water_rows(d: Plain) -> list[tuple[str, str]]:
+def _water_rows(d: Plain) -> Rows:
     water, port = d["water"], d["port_found"]
     rows = []
     if water is None:
         rows = [("water", "none, a housing port refracts" if d["port"] else "none")]
         if port is not None and len(port) > 1:
             rows.append(("port", f"--port {port['port']}"))
-    for key, (label, unit) in WATER_WORDS.items():
+    for key, (label, unit) in _WATER.items():
         v = (water or port or {}).get(key)
         if v is None or (key.startswith("tilt") and not v["free"] and v["after"] == 0.0):
             continue
@@ -221,25 +295,6 @@ def _surface_words(one: Plain, d: Plain) -> str:
         f" {one['sigma_m']:g} m), largest {fixed(one['largest_m'], 4)} m ({one['largest_point']})"
         + (f"; parallel to {', '.join(others)}" if others else "")
     )
-
-
-def _pose_facts(d: Plain) -> list[tuple[str, str]]:
-    p, precision = d["poses"], d["precision"]
-    if d["poses_are"] == "fixed":
-        return []
-    moved = (
-        f"centres moved {fixed(p['moved_rms_m'], 3)} m (RMS), mean east, north, up"
-        f" {listed(p['moved_mean_m'], 3, '+')} m, largest {fixed(p['moved_largest_m'], 3)} m"
-        f" ({p['moved_largest_image']}); turned {fixed(p['turned_rms_deg'], 4)} deg (RMS)"
-    )
-    if precision is None or not precision["images"]:
-        return [("poses", moved)]
-    errors = (
-        f"standard errors of centres X, Y, Z: mean {listed(precision['centre_mean_m'], 4)} m,"
-        f" largest {listed(precision['centre_largest_m'], 4)} m; of angles: mean"
-        f" {listed(precision['angle_mean_deg'], 4)} deg"
-    )
-    return [("poses", moved), ("precision", errors)]
 
 
 # Maps
@@ -259,11 +314,10 @@ def _map(a: Adjusted, before: Before | None) -> tuple[Maps, list[Layer]]:
     # mean squared residual of a coordinate of each point
     rows = a.used & np.isfinite(a.residual_px).all(axis=1)
     owner, m = a.block.owner[rows], len(a.xyz)
-    count = np.bincount(owner, minlength=m).astype(np.float64)
-    squares = np.bincount(owner, (a.residual_px[rows] ** 2).mean(axis=1), m)
-    squares = np.where(count > 0, squares / np.maximum(count, 1), np.nan)
-    residual = np.sqrt(_means(a, np.asarray(squares, np.float64)).height_m)
-    layers.append(Layer("Residual", unit, residual, UNCERTAINTY))
+    count = np.bincount(owner, minlength=m)
+    total = np.bincount(owner, (a.residual_px[rows] ** 2).mean(axis=1), m)
+    squares: FloatArray = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    layers.append(Layer("Residual", unit, np.sqrt(_means(a, squares).height_m), UNCERTAINTY))
     images = np.bincount(a.block.owner[a.used], minlength=m).astype(np.float64)
     return heights, [*layers, Layer("Images", "", _means(a, images).height_m, RAYS)]
 
@@ -281,27 +335,17 @@ def _means(a: Adjusted, values: FloatArray) -> Maps:
 
 
 def _tables(d: Plain) -> list[Table]:
-    """Return the tables that have rows, and those of residuals and rounds."""
-    unit, p, g = d["image_unit"], d["precision"], d["gnss"]
+    """Return the tables that have rows, residuals first."""
+    unit, p = d["image_unit"], d["precision"]
     header = ["", "before", "after", "change", "standard error", "unit"]
-    tables = [Table("Lens and water", header, _unknown_rows(d))]
+    tables = [_residual_table(d), Table("Lens and water", header, _unknown_rows(d))]
     shared = [] if p is None else [row["name"].replace("_", " ") for row in p["shared"]]
     if len(shared) > 1:
-        rows = [_row(*row, 3, "+") for row in zip(shared, p["correlation"], strict=True)]
-        tables.append(Table("Correlations of the shared unknowns", ["", *shared], rows))
-    if p is not None and p["images"]:
-        kinds = (("centre", "m", "centre (m)"), ("angle", "deg", "angle, camera axes (deg)"))
         rows = [
-            _row(f"{label}, {which}", p[f"{name}_{which}_{unit}"], 4)
-            for name, unit, label in kinds
-            for which in ("mean", "largest")
+            [name, *(fixed(value, 3, "+") for value in row)]
+            for name, row in zip(shared, p["correlation"], strict=True)
         ]
-        title = f"Standard errors of {p['images']:,} poses"
-        tables.append(Table(title, ["", "X", "Y", "Z"], rows))
-    if g is not None:
-        rows = [_row("mean", g["mean_m"], 3, "+"), _row("RMS", g["rms_m"], 3)]
-        title = f"Adjusted minus GNSS, {g['images']:,} images"
-        tables.append(Table(title, ["", "east (m)", "north (m)", "up (m)"], rows))
+        tables.append(Table("Correlations of the shared unknowns", ["", *shared], rows))
     header = ["", "role", "dX (m)", "dY (m)", "dZ (m)", f"RMS ({unit})", "images"]
     title = "Control and check points, adjusted minus surveyed"
     tables.append(Table(title, header, _surveyed_rows(d)))
@@ -313,12 +357,7 @@ def _tables(d: Plain) -> list[Table]:
         for row in d["rounds"]
     ]  # fmt: skip
     header = ["round", "steps", "observations", "cost", f"RMS ({unit})"]
-    known = [table for table in tables if table.rows]
-    return [_residual_table(d), *known, Table("Rounds", header, rounds)]
-
-
-def _row(label: str, values: Sequence[float | None], digits: int, sign: str = "") -> list[str]:
-    return [label, *(fixed(value, digits, sign) for value in values)]
+    return [table for table in [*tables, Table("Rounds", header, rounds)] if table.rows]
 
 
 def _residual_table(d: Plain) -> Table:
@@ -345,18 +384,20 @@ def _unknown_rows(d: Plain) -> list[list[str]]:
     """Return lens and water before and after, as far as they were free."""
     rows = []
     for row in d["lens"]:
-        label = lens_label(row) + (f", {row['sensor']}" if has_many_sensors(d) else "")
+        label = _lens_label(row) + (f", {row['sensor']}" if _has_many_sensors(d) else "")
         rows.append([label, *_change(row), _lens_unit(row, d)])
-    for key, (label, unit) in WATER_WORDS.items():
+    for key, (label, unit) in _WATER.items():
         value = (d["water"] or d["port_found"] or {}).get(key)
         if value is not None and value["free"]:
             rows.append([label, *_change(value), unit])
     if d["poses_are"] == "similarity" and d["precision"] is not None:
         units = {"shift": "m", "turn": "rad", "scale": ""}
         for row in d["precision"]["shared"]:
-            name, by, sigma = row["name"], row["added"], row["sigma"]
-            if (kind := name.partition(" ")[0]) in units:
-                rows.append([name, "", "", short(by, sigma, "+"), _error(sigma), units[kind]])
+            if (kind := row["name"].partition(" ")[0]) in units:
+                sigma = row["sigma"]
+                error = "-" if sigma is None else f"{sigma:.2g}"
+                added = short(row["added"], sigma, "+")
+                rows.append([row["name"], "", "", added, error, units[kind]])
     return rows
 
 
@@ -387,7 +428,7 @@ def _what_was_free(d: Plain) -> Table:
     lens = ", ".join(u["lens"]) + (f" ({'; '.join(held)})" if held else "")
     datum = "free network" if u["free_network"] else "of GNSS, control points or fixed poses"
     rows: list[list[Any]] = [
-        ["poses", _facts(d)[0][1].partition(", ")[2].removeprefix("poses ")],
+        ["poses", _poses_are(d).removeprefix("poses ")],
         ["datum", datum],
         ["lens", lens or "fixed"],
         ["water level", how(u["level_sigma_m"], " m")],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,26 +20,23 @@ if TYPE_CHECKING:
 MOST_POINTS = 6000
 COLUMNS = 14
 """Cells over the width of an image, for mean residual vectors."""
-
 LEAST_IN_CELL = 4
 ARROW = 0.07
 """Length of a large arrow, as a share of the longer side of the block."""
-
 ARROW_LOOK: Plain = {"angles": "xy", "scale_units": "xy", "zorder": 3}
 
 
 def pictures_of(d: Plain, adjusted: Adjusted, before: Before | None) -> list[Picture]:
     """Return the pictures of an adjustment."""
-    return [
-        *_block(d, adjusted),
-        *_by_depth(d, before),
-        *_vectors(d, adjusted, before),
-        *_section(adjusted, before),
-        *_rounds(d, adjusted),
-    ]
+    drawn = (
+        _block(d, adjusted), _by_depth(d, before), _vectors(adjusted, before),
+        _section(adjusted, before), _rounds(d, adjusted),
+    )  # fmt: skip
+    return [picture for picture in drawn if picture is not None]
 
 
-def _block(d: Plain, a: Adjusted) -> list[Picture]:
+def _block(d: Plain, a: Adjusted) -> Picture | None:
+    """Draw how far the projection centres moved, and their differences from GNSS, as arrows."""
     moved = a.cameras.centres - a.block.cameras.centres
     known = np.asarray(np.isfinite(a.gnss_residual_m).any(axis=1))
     shown: list[tuple[str, FloatArray, BoolArray]] = []
@@ -48,7 +45,7 @@ def _block(d: Plain, a: Adjusted) -> list[Picture]:
     if known.any():
         shown.append(("Adjusted minus GNSS", a.gnss_residual_m, known))
     if not shown:
-        return []
+        return None
     size = np.ptp(a.block.cameras.centres[:, :2], axis=0)
     share = float(np.clip(size[1] / max(size[0], 1e-9), 0.25, 1.2))
     n = len(shown)
@@ -61,7 +58,7 @@ def _block(d: Plain, a: Adjusted) -> list[Picture]:
         " difference from the GNSS position; their colour shows the vertical part."
         f" The centres moved by {d['poses']['moved_rms_m']:.3f} m (rms)."
     )
-    return [Picture("block", "Projection centres", alt, figure)]
+    return Picture("block", "Projection centres", alt, figure)
 
 
 def _arrows(figure: Figure, axes: Axes, a: Adjusted, vectors: FloatArray, rows: BoolArray) -> None:
@@ -69,48 +66,46 @@ def _arrows(figure: Figure, axes: Axes, a: Adjusted, vectors: FloatArray, rows: 
     xyz = a.xyz[a.is_observed]
     xyz = xyz[:: max(1, len(xyz) // MOST_POINTS)]
     axes.plot(*xyz[:, :2].T, ".", color="0.85", markersize=1.5, zorder=1)
-    at, by = a.cameras.centres[rows], np.nan_to_num(vectors[rows])
+    (x, y, _), (dx, dy, up) = a.cameras.centres[rows].T, np.nan_to_num(vectors[rows]).T
     side = float(max(np.ptp(a.cameras.centres[:, :2], axis=0).max(), 1e-3))
-    length = np.hypot(by[:, 0], by[:, 1])
-    key = nice_step(max(float(np.percentile(length, 95.0)), 1e-6) / 2.0)
-    reach = max(float(np.abs(by[:, 2]).max()), 1e-6)
+    key = nice_step(max(float(np.percentile(np.hypot(dx, dy), 95.0)), 1e-6) / 2.0)
+    reach = max(float(np.abs(up).max()), 1e-6)
     arrows = axes.quiver(
-        at[:, 0], at[:, 1], by[:, 0], by[:, 1], by[:, 2], cmap=DIFFERENCE,
-        scale=key / (ARROW * side), clim=(-reach, reach), edgecolor="0.3", linewidth=0.5,
-        width=0.007, **ARROW_LOOK,
+        x, y, dx, dy, up, cmap=DIFFERENCE, scale=key / (ARROW * side), clim=(-reach, reach),
+        edgecolor="0.3", linewidth=0.5, width=0.007, **ARROW_LOOK,
     )  # fmt: skip
-    axes.plot(at[:, 0], at[:, 1], "o", color="0.2", markersize=1.5, zorder=2)
+    axes.plot(x, y, "o", color="0.2", markersize=1.5, zorder=2)
     figure.colorbar(arrows, ax=axes, label="Up (m)", shrink=0.8)
     axes.quiverkey(arrows, 0.85, 1.05, key, f"{key:g} m", labelpos="E")
-    tips = at[:, :2] + by[:, :2] * (ARROW * side / key)
-    drawn = np.vstack([a.cameras.centres[:, :2], tips])
-    (west, south), (east, north) = drawn.min(axis=0), drawn.max(axis=0)
-    axes.set_xlim(west - 0.05 * side, east + 0.05 * side)
-    axes.set_ylim(south - 0.05 * side, north + 0.05 * side)
+    longer = ARROW * side / key
+    axes.update_datalim(np.column_stack([x + longer * dx, y + longer * dy]))
+    axes.margins(0.05)
+    axes.autoscale_view()
     label_plan(axes)
 
 
-def _by_depth(d: Plain, before: Before | None) -> list[Picture]:
-    """Return residuals by depth, land first."""
+def _by_depth(d: Plain, before: Before | None) -> Picture | None:
+    """Draw residuals by depth, land first."""
     land = d["residuals"]["land"]
     bins = [("land", land)] if land["observations"] else []
     bins += [(f"{b['from_m']:g} to {b['to_m']:g}", b) for b in d["depth_bins"]]
     if not bins:
-        return []
+        return None
     figure, axes = new_figure(8.0, 3.8)
-    place = np.arange(len(bins))
     times = [("before", "rms_before_px", BEFORE)] if before is not None else []
     times.append(("after", "rms_px", AFTER))
+    names = [f"{name}\n{b['observations']:,}" for name, b in bins]
+    values = {
+        name: [np.nan if b[key] is None else b[key] for _, b in bins] for name, key, _ in times
+    }
     thick = 0.8 / len(times)
-    for i, (name, key, colour) in enumerate(times):
-        heights = [b[key] if b[key] is not None else np.nan for _, b in bins]
-        at = place + (i - (len(times) - 1) / 2.0) * thick
-        bars = axes.bar(at, heights, thick, color=colour, label=name)
-        labels = ["" if np.isnan(h) else f"{h:.2f}" for h in heights]
-        axes.bar_label(bars, labels, fontsize="small", padding=1)
-    axes.set_xticks(place, [f"{name}\n{b['observations']:,}" for name, b in bins])
-    axes.set_xlabel("Depth below the water (m), and how many observations")
-    axes.set_ylabel(f"Rms residual ({d['image_unit']})")
+    for i, (name, _, colour) in enumerate(times):
+        at = np.arange(len(bins)) + (i - (len(times) - 1) / 2.0) * thick
+        bars = axes.bar(at, values[name], thick, color=colour, label=name)
+        axes.bar_label(bars, fmt="%.2f", fontsize="small", padding=1)
+    axes.set_xticks(range(len(bins)), names)
+    axes.set_xlabel("Depth below the water (m), and number of observations")
+    axes.set_ylabel(f"RMS residual ({d['image_unit']})")
     axes.margins(y=0.12)
     axes.legend(loc="best")
     alt = (
@@ -119,11 +114,11 @@ def _by_depth(d: Plain, before: Before | None) -> list[Picture]:
     )
     if before is not None:
         alt += " Before: original poses and lens, points intersected with refraction."
-    return [Picture("residuals_by_depth", "Residuals by depth", alt, figure)]
+    return Picture("residuals_by_depth", "Residuals by depth", alt, figure)
 
 
-def _vectors(d: Plain, a: Adjusted, before: Before | None) -> list[Picture]:
-    """Return mean residual vectors over the image, of the sensor that sees most."""
+def _vectors(a: Adjusted, before: Before | None) -> Picture | None:
+    """Draw mean residual vectors over the image, of the sensor with most observations."""
     lenses = a.block.cameras.lenses or ()
     group, _ = sensor_groups(lenses)
     of_group = group[a.block.camera]
@@ -135,22 +130,14 @@ def _vectors(d: Plain, a: Adjusted, before: Before | None) -> list[Picture]:
     cells = [(name, _cell_means(a, r, rows, lens.width, lens.height), c) for name, r, c in sets]
     largest = max((float(np.hypot(*m[2:]).max(initial=0.0)) for _, m, _ in cells), default=0.0)
     if not largest > 0.0:
-        return []
-    cell = lens.width / COLUMNS
-    key = nice_step(largest / 2.0)
-    figure, panels = new_figure(
-        8.0, 8.0 / len(cells) * lens.height / lens.width + 0.7, ncols=len(cells), squeeze=False,
-        sharey=True,
-    )  # fmt: skip
-    for axes, (name, (u, v, du, dv), colour) in zip(panels.ravel(), cells, strict=True):
-        arrows = axes.quiver(
-            u, v, du, dv, color=colour, scale=largest / (1.6 * cell), width=0.004, **ARROW_LOOK
-        )
+        return None
+    key, scale = nice_step(largest / 2.0), largest * COLUMNS / (1.6 * lens.width)
+    height_in = 8.0 / len(cells) * lens.height / lens.width + 0.7
+    figure, panels = new_figure(8.0, height_in, ncols=len(cells), squeeze=False, sharey=True)
+    for axes, (name, means, colour) in zip(panels.ravel(), cells, strict=True):
+        arrows = axes.quiver(*means, color=colour, scale=scale, width=0.004, **ARROW_LOOK)
         axes.quiverkey(arrows, 0.85, 1.04, key, f"{key:g} {lens.unit}", labelpos="E")
-        axes.set_title(name)
-        axes.set_xlim(0.0, lens.width)
-        axes.set_ylim(lens.height, 0.0)
-        axes.set_aspect("equal")
+        axes.set(title=name, xlim=(0.0, lens.width), ylim=(lens.height, 0.0), aspect="equal")
         axes.locator_params(nbins=5)
         axes.set_xlabel(f"u ({lens.unit})")
     panels[0, 0].set_ylabel(f"v ({lens.unit})")
@@ -161,109 +148,86 @@ def _vectors(d: Plain, a: Adjusted, before: Before | None) -> list[Picture]:
         + ", ".join(f"{name} {value:.3f} {lens.unit} rms" for name, value in rest.items() if value)
         + "."
     )
-    return [Picture("residual_vectors", "Residuals over the image", alt, figure)]
+    return Picture("residual_vectors", "Residuals over the image", alt, figure)
 
 
 def _cell_means(
     a: Adjusted, residual: FloatArray, rows: BoolArray, width: float, height: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return centres of cells of the image and mean residuals there."""
+    from scipy.stats import binned_statistic_2d
+
     rows = rows & np.asarray(np.isfinite(residual).all(axis=1))
-    side = width / COLUMNS
-    down = max(1, round(height / side))
-    u, v = a.block.image_xy[rows].T
-    column = np.clip((u / side).astype(np.int64), 0, COLUMNS - 1)
-    row = np.clip((v * down / height).astype(np.int64), 0, down - 1)
-    cell = row * COLUMNS + column
-    count = np.bincount(cell, minlength=COLUMNS * down)
-    full = np.flatnonzero(count >= LEAST_IN_CELL)
-    du, dv = (
-        np.bincount(cell, weights=values, minlength=len(count))[full] / count[full]
-        for values in residual[rows].T
-    )
-    u, v = (full % COLUMNS + 0.5) * side, (full // COLUMNS + 0.5) * height / down
-    return np.asarray(u), np.asarray(v), du, dv
+    bins = [COLUMNS, max(1, round(height * COLUMNS / width))]
+    (u, v), limits = a.block.image_xy[rows].T, [[0.0, width], [0.0, height]]
+    found: Any = binned_statistic_2d
+    count = found(u, v, u, "count", bins, limits).statistic
+    du, dv = found(u, v, residual[rows].T, "mean", bins, limits).statistic
+    column, row = np.nonzero(count >= LEAST_IN_CELL)
+    u, v = (column + 0.5) * width / bins[0], (row + 0.5) * height / bins[1]
+    return u, v, du[column, row], dv[column, row]
 
 
-def _section(a: Adjusted, before: Before | None) -> list[Picture]:
-    """Return the points in a strip along the block, with the water."""
-    station, across, line = _strip(a.xyz)
+def _section(a: Adjusted, before: Before | None) -> Picture | None:
+    """Draw the points in a strip along the longest extent of the block, with the water."""
+    middle = a.xyz.mean(axis=0)
+    plan = a.xyz[:, :2] - middle[:2]
+    along, aside = np.linalg.svd(plan, full_matrices=False)[2]
+    along = along if along[0] >= 0.0 else -along
+    station, across = plan @ along, plan @ aside
     inside = np.abs(across - np.median(across)) < 0.15 * float(np.ptp(across)) + 1e-9
     rows = np.flatnonzero(inside & a.is_observed)
     rows = rows[:: max(1, len(rows) // MOST_POINTS)]
     if len(rows) < 2:
-        return []
+        return None
     figure, axes = new_figure(8.0, 4.0)
+    first, dots = station.min(), {"linestyle": "none", "marker": ".", "markersize": 2.5}
     if before is not None:
-        axes.plot(
-            station[rows], before.xyz[rows, 2], ".", color=BEFORE, markersize=2.5, label="before"
-        )
+        axes.plot(station[rows] - first, before.xyz[rows, 2], color=BEFORE, label="before", **dots)
     for wet, colour, name in ((False, "0.35", "after, land"), (True, AFTER, "after, under water")):
         some = rows[a.is_wet[rows] == wet]
         if len(some):
-            axes.plot(station[some], a.xyz[some, 2], ".", color=colour, markersize=2.5, label=name)
+            axes.plot(station[some] - first, a.xyz[some, 2], color=colour, label=name, **dots)
     if a.water is not None:
-        height = surface_above(a.water, line).height_m
-        axes.plot(np.linspace(0.0, station.max(), len(line)), height, color=WATER, label="water")
+        places = np.linspace(first, station.max(), 200)
+        line = middle[:2] + places[:, None] * along + np.median(across) * aside
+        height = surface_above(a.water, np.column_stack([line, np.zeros(200)])).height_m
+        axes.plot(places - first, height, color=WATER, label="water")
     low, high = np.percentile(a.xyz[rows, 2], [0.2, 99.8])
     margin = 0.15 * (high - low) + 0.05
-    axes.set_ylim(low - margin, high + margin)
+    axes.set(ylim=(low - margin, high + margin), xlabel="Along the block (m)", ylabel="Height (m)")
     axes.ticklabel_format(style="plain", useOffset=False)
-    axes.set_xlabel("Along the block (m)")
-    axes.set_ylabel("Height (m)")
     axes.legend(loc="best", markerscale=3.0)
     alt = (
         f"Points of a strip along the middle of the block, {len(rows):,} of them, in section,"
         " and the water."
         + (" Before: intersected with the original poses and lens." if before else "")
     )
-    return [Picture("section", "Section", alt, figure)]
+    return Picture("section", "Section", alt, figure)
 
 
-def _strip(xyz: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the positions of points along and across the longest extent of the block.
-
-    The third result are places along its middle, shape (200, 3), for the water; metres.
-    """
-    middle = xyz.mean(axis=0)
-    plan = xyz[:, :2] - middle[:2]
-    along, aside = np.linalg.svd(plan, full_matrices=False)[2]
-    along = along if along[0] >= 0.0 else -along
-    station, across = plan @ along, plan @ aside
-    places = np.linspace(station.min(), station.max(), 200)[:, None]
-    line = middle[:2] + places * along + np.median(across) * aside
-    return station - station.min(), across, np.column_stack([line, np.zeros(200)])
-
-
-def _rounds(d: Plain, a: Adjusted) -> list[Picture]:
-    """Return cost and residuals step by step."""
+def _rounds(d: Plain, a: Adjusted) -> Picture | None:
+    """Draw cost and residuals step by step."""
     if len(a.rounds) < 2:
-        return []
-    figure, (upper, lower) = new_figure(8.0, 4.6, nrows=2, sharex=True)
-    step = np.arange(1, len(a.rounds) + 1)
+        return None
+    figure, panels = new_figure(8.0, 4.6, nrows=2, sharex=True)
     number, _, cost, _, _, rms_px = np.array(a.rounds).T
-    for axes, values in ((upper, cost), (lower, rms_px)):
+    step = np.arange(1, len(number) + 1)
+    labels = "Cost", f"RMS residual ({d['image_unit']})"
+    for axes, values, label in zip(panels, (cost, rms_px), labels, strict=True):
         for one in np.unique(number):
-            of_round = number == one
-            axes.plot(step[of_round], values[of_round], "o-", color=AFTER, markersize=3)
+            axes.plot(step[number == one], values[number == one], "o-", color=AFTER, markersize=3)
         # over several powers of ten, as poor starts have
         if values.min() > 0.0 and values.max() > 20.0 * values.min():
             axes.set_yscale("log")
-    for axes in (upper, lower):
         for first in np.flatnonzero(np.diff(number)) + 1.5:
             axes.axvline(first, color="0.6", linewidth=0.8, linestyle="--")
         axes.grid(visible=True, axis="y", color="0.9", linewidth=0.6)
-    for one in np.unique(number):
-        upper.annotate(
-            f"round {one:g}", (step[number == one][0], 1.0), xycoords=("data", "axes fraction"),
-            xytext=(2, 3), textcoords="offset points", fontsize="small",
-        )  # fmt: skip
-    upper.set_ylabel("Cost")
-    lower.set_ylabel(f"Rms residual ({d['image_unit']})")
-    lower.set_xlabel("Step")
-    lower.xaxis.get_major_locator().set_params(integer=True)
+        axes.set_ylabel(label)
+    panels[1].set_xlabel("Step")
+    panels[1].xaxis.get_major_locator().set_params(integer=True)
     alt = (
         "Cost (sum of weighted squares) and RMS residual after each step. Dashed lines separate"
         " the rounds, whose costs cannot be compared, as outliers are excluded between them."
     )
-    return [Picture("rounds", "Convergence", alt, figure)]
+    return Picture("rounds", "Convergence", alt, figure)

@@ -1,11 +1,12 @@
 """A comparison with a reference: its summary, and the pictures and tables for the report page.
 
 Everything works on the plain values of `Comparison.as_dict`, so that a resumed run can draw what an
-earlier one measured.
+earlier one measured. The terminal and the page show the same tables.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,30 +21,85 @@ from pcfix.report.page import (
     WATER,
     Picture,
     Table,
+    map_figure,
     name_of,
     new_figure,
-    new_map,
 )
 from pcfix.report.text import aligned, share
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from pcfix.compare.figures import Comparison
 
 Plain = dict[str, Any]
 TIMES = (("before", "uncorrected", BEFORE), ("after", "corrected", AFTER))
-SIGNED = (
-    ("dZ", "Vertical error", "vertical"),
-    ("dZ bed", "Bed, vertical error", "bed"),
-    ("dZ land", "Land, vertical error", "land"),
-    ("M3C2", "M3C2 distance", "m3c2"),
-)
-"""What has a sign: its name in tables of the terminal and of the page, and its key."""
-MOMENTS = ("mean_m", "sd_m", "rmse_m", "nmad_m", "median_m")
-_HEAD = ("mean", "sd", "rmse", "nmad", "median", "5 %", "95 %", "max")
+SIGNED = {
+    "vertical": ("dZ", "Vertical error"),
+    "bed": ("dZ bed", "Bed, vertical error"),
+    "land": ("dZ land", "Land, vertical error"),
+    "m3c2": ("M3C2", "M3C2 distance"),
+}
+"""Errors with a sign: their names in the tables of Python and of the page."""
+MOMENTS = {
+    "mean": "mean_m", "sd": "sd_m", "RMSE": "rmse_m", "NMAD": "nmad_m", "median": "median_m",
+}  # fmt: skip
+BINS = {
+    "depth_bins": ("By depth (m)", "Error against depth", "Reference depth (m)"),
+    "shore_bins": (
+        "By distance from shore (m)", "Error against distance from shore",
+        "Distance from the shore (m)",
+    ),
+}  # fmt: skip
+"""Their titles as a table and as a picture, and the label of the axis."""
 _SHOWN = 0.995
 """The share of the distances of each histogram up to which the axis reaches at least."""
+
+
+# Numbers
+
+
+def _signed(compared: Plain) -> Iterator[tuple[str, str, Plain]]:
+    """Yield key, time and statistics of every error that has a sign."""
+    for key in SIGNED:
+        for when, _, _ in TIMES:
+            if (one := (compared.get(key) or {}).get(when)) is not None:
+                yield key, when, one.get("statistics", one)
+
+
+def signed_statistics(compared: Plain) -> list[tuple[str, Plain]]:
+    """Return title and statistics of every error that has a sign, for tables in Python."""
+    return [
+        (f"{SIGNED[key][0]} {when}" if compared[key]["before"] else SIGNED[key][0], statistics)
+        for key, when, statistics in _signed(compared)
+    ]
+
+
+def c2c_rows(compared: Plain) -> list[tuple[str, str, str, Plain]]:
+    """Return direction, cloud, colour and distribution of all C2C, a direction after the other."""
+    rows = []
+    for key, way in (("c2c", "to reference"), ("c2c_from_reference", "from reference")):
+        pair = compared.get(key) or {}
+        if key == "c2c" and compared["measured_at"] == "reference":
+            way = "from check points"
+        for when, name, colour in TIMES:
+            if pair.get(when) is not None:
+                rows.append((way, "cloud" if pair["before"] is None else name, colour, pair[when]))
+        for number, one in enumerate(compared.get("also", ())):
+            if one[key] is not None:
+                rows.append((way, one["name"], further_colour(number), one[key]))
+    return rows
+
+
+def raw_of(compared: Plain) -> Plain:
+    """Return the statistics that the cloud's own errors were taken from, before and after."""
+    if compared["own"]["of"] == "bed":
+        return dict(compared["bed"])
+    return {when: of and of["statistics"] for when, of in compared["vertical"].items()}
+
+
+# Words
 
 
 def comparison_text(c: Comparison) -> str:
@@ -65,45 +121,19 @@ def comparison_text(c: Comparison) -> str:
         of = share(n.reference_compared, in_reference)
         rows.append(("C2C from", f"{n.reference_compared:,} points of the reference ({of})"))
     if c.own is not None:
-        rows.append(_own_row(plain))
-    for when, line in () if c.depth is None else (
-        ("before", c.depth.before), ("after", c.depth.after),
-    ):  # fmt: skip
-        if line is not None:
-            words = f"{line.intercept_m:+.3f} m + {line.slope:.4f} x reference depth"
-            rows.append((f"Depth {when}", f"{words}, r2 {line.r2:.4f}"))
+        own, noise = plain["own"], noise_sentence(plain["own"], raw_of(plain)["after"])
+        if own["rmse_m"] is not None:
+            noise = f"RMSE {own['rmse_m']:.3f} m, 95 % {own['within_95_m']:.3f} m, {noise}"
+        rows.append(("Bed" if own["of"] == "bed" else "Cloud", noise))
     if c.m3c2 is not None:
         m = c.m3c2.after
         rows.append(("M3C2", f"{m.statistics.count:,} of {m.core_points:,} core points, normals"
                      f" {m.normal_radius_m:.2f} m, cylinder {m.cylinder_radius_m:.2f} m; mean level"
                      f" of detection {m.mean_level_of_detection_m:.3f} m,"
                      f" {100 * m.significant_share:.0f} % of the distances beyond it"))  # fmt: skip
-    rows += c2c_lines(plain)
-    distances = [(f"C2C {way}, {name}", of["statistics"]) for way, name, _, of in c2c_rows(plain)]
-    text = [
-        aligned(f"Compared {c.cloud} with {c.reference} in {c.seconds:.1f} s", rows),
-        *_table(signed_statistics(plain) + distances),
-        *_bin_lines("depth", plain["depth_bins"]),
-        *_bin_lines("from shore", plain["shore_bins"]),
-        *(f"Note: {note}" for note in c.notes),
-    ]
-    return "\n".join(text)
-
-
-def _own_row(plain: Plain) -> tuple[str, str]:
-    """Return the cloud's own errors, without the noise of the reference."""
-    own, raw = plain["own"], raw_of(plain)["after"]
-    noise = noise_sentence(own, raw)
-    if own["rmse_m"] is not None:
-        noise = f"RMSE {own['rmse_m']:.3f} m, 95 % {own['within_95_m']:.3f} m, {noise}"
-    return ("Bed" if own["of"] == "bed" else "Cloud"), noise
-
-
-def raw_of(compared: Plain) -> Plain:
-    """Return the statistics that the cloud's own errors were taken from, before and after."""
-    if compared["own"]["of"] == "bed":
-        return dict(compared["bed"])
-    return {when: of and of["statistics"] for when, of in compared["vertical"].items()}
+    head = f"Compared {c.cloud} with {c.reference} in {c.seconds:.1f} s"
+    tables = [line for table in _tables(plain) for line in table.lines()]
+    return "\n".join([aligned(head, rows), *tables, *(f"Note: {note}" for note in c.notes)])
 
 
 def noise_sentence(own: Plain, raw: Plain) -> str:
@@ -115,65 +145,35 @@ def noise_sentence(own: Plain, raw: Plain) -> str:
     return f"without {noise}; with it RMSE {raw['rmse_m']:.3f} m, 95 % {raw['within_95_m']:.3f} m."
 
 
-def signed_statistics(plain: Plain) -> list[tuple[str, Plain]]:
-    """Return the statistics of all that has a sign, by title."""
-    rows = []
-    for title, _, key in SIGNED:
-        pair = plain[key] or {"before": None, "after": None}
-        if pair["before"] is not None:
-            rows.append((f"{title} before", pair["before"].get("statistics", pair["before"])))
-            title += " after"
-        if pair["after"] is not None:
-            rows.append((title, pair["after"].get("statistics", pair["after"])))
-    return rows
-
-
-def _table(rows: list[tuple[str, Plain]]) -> list[str]:
-    """Return lines of statistics under a header; none where there are none."""
-    if not rows:
-        return []
-    width = max(20, *(len(title) + 1 for title, _ in rows))
-    lines = [f"{'m':<{width}}" + "".join(f"{name:>9}" for name in _HEAD)]
-    for title, s in rows:
-        marks = s["percentiles_m"]
-        values = (*(s[name] for name in MOMENTS), marks["p5"], marks["p95"], s["max_m"])
-        lines.append(f"{title:<{width}}" + "".join(f"{value:9.3f}" for value in values))
-    return lines
-
-
-def _bin_lines(title: str, bins: list[Plain] | tuple[Plain, ...]) -> list[str]:
-    """Return lines with the errors of each class of depth or distance."""
-    lines = [f"{title + ', m':<20}{'count':>9}" + "".join(f"{n:>9}" for n in _HEAD[:4])] * bool(
-        bins
+def in_a_sentence(compared: Plain) -> str:
+    """Return what the correction changed against the reference; empty where it is not known."""
+    pair = compared["vertical"]
+    if pair is None or pair["before"] is None:
+        return ""
+    bed, land = compared.get("bed"), compared.get("land")
+    before, after = ((bed or pair)[when] for when, _, _ in TIMES)
+    before, after = (one.get("statistics", one) for one in (before, after))
+    way = "fell" if after["rmse_m"] <= before["rmse_m"] else "grew"
+    of_land = "" if not bed or land is None else (
+        f" Land: {land['before']['rmse_m']:.3f} to {land['after']['rmse_m']:.3f} m."
+    )  # fmt: skip
+    return (
+        f" Against {name_of(compared['reference'])} the vertical error"
+        f"{' of the bed' if bed else ''} {way} from {before['rmse_m']:.3f} to"
+        f" {after['rmse_m']:.3f} m (RMSE of {after['count']:,}"
+        f" points, the reference's noise included). The remaining bias is"
+        f" {signed(after['mean_m'])}.{of_land}{_noted(compared, 'cloud.corrected_twice')}"
     )
-    for one in bins:
-        s, name = one["after"], f"{one['from_m']:g} to {one['to_m']:g}"
-        values = "".join(f"{s[key]:9.3f}" for key in MOMENTS[:4])
-        before = one["before"]
-        more = "" if before is None else f"   before {before['mean_m']:.3f}, {before['rmse_m']:.3f}"
-        lines.append(f"{name:<20}{s['count']:>9,}{values}{more}")
-    return lines
 
 
-def c2c_rows(compared: Plain) -> list[tuple[str, str, str, Plain]]:
-    """Return direction, cloud, colour and distribution of all C2C, a direction after the other."""
-    rows = []
-    for key, way in (("c2c", "to reference"), ("c2c_from_reference", "from reference")):
-        pair = compared.get(key) or {}
-        if key == "c2c" and compared["measured_at"] == "reference":
-            way = "from check points"
-        for when, name, colour in TIMES:
-            if pair.get(when) is not None:
-                rows.append((way, "cloud" if pair["before"] is None else name, colour, pair[when]))
-        for number, one in enumerate(compared.get("also", ())):
-            if one[key] is not None:
-                rows.append((way, one["name"], further_colour(number), one[key]))
-    return rows
+def _noted(compared: Plain, *codes: str) -> str:
+    """Return the messages of some warnings, each after a blank."""
+    return "".join(f" {one['message']}" for one in compared["notes"] if one["code"] in codes)
 
 
-def further_colour(number: int) -> str:
-    """Return the colour of a further cloud, by its number from 0."""
-    return ("#6a3d9a", "#33804d", "#c51b7d", "#8c6d1f", "#5f6b73")[number % 5]
+def signed(value_m: float) -> str:
+    """Return metres with their sign, which is plus for what rounds to zero."""
+    return f"{round(value_m, 3) + 0.0:+.3f} m"
 
 
 def gauss(of: Plain) -> str:
@@ -185,71 +185,69 @@ def gauss(of: Plain) -> str:
     )
 
 
-def _shares(of: Plain) -> list[tuple[str, str]]:
-    """Return each band with the share of distances in it."""
-    return [
-        (f"{one['low_m']:g} to {one['high_m']:g} m", f"{100 * one['share']:.1f} %")
-        for one in of.get("shares", ())
-    ]
+# Tables
 
 
-def c2c_lines(compared: Plain) -> list[tuple[str, str]]:
-    """Return Gauss and shares of all distances as rows of a summary."""
+def _tables(compared: Plain) -> list[Table]:
+    """Return the tables for terminal and page; those without rows are omitted."""
+    bins = [_bins(title, compared[key]) for key, (title, _, _) in BINS.items()]
+    tables = [_statistics(compared), _c2c(compared), _depth_lines(compared), *bins]
+    return [table for table in tables if table.rows]
+
+
+def _statistics(compared: Plain) -> Table:
+    names = {when: name for when, name, _ in TIMES}
+    found = [(f"{SIGNED[key][1]}, {names[when]}", s) for key, when, s in _signed(compared)]
+    found += [(f"C2C {way}, {name}", of["statistics"]) for way, name, _, of in c2c_rows(compared)]
     rows = []
-    for way, name, _, of in c2c_rows(compared):
-        rows.append(("C2C", f"{way}, {name}: {gauss(of)}"))
-        shares = ", ".join(f"{part} are {band} away" for band, part in _shares(of))
-        rows += [("", f"of {of['statistics']['count']:,} points {shares}")] if shares else []
-    return rows
+    for title, s in found:
+        marks = s["percentiles_m"]
+        values = [*(s[key] for key in MOMENTS.values()), marks["p5"], marks["p95"], s["max_m"]]
+        rows.append([title, f"{s['count']:,}", *(f"{value:.3f}" for value in values)])
+    title = f"Against {name_of(compared['reference'])} (m)"
+    return Table(title, ["", "points", *MOMENTS, "5 %", "95 %", "max"], rows)
 
 
-def c2c_table(compared: Plain) -> Table:
-    """Return Gauss and shares of all distances as a table."""
+def _c2c(compared: Plain) -> Table:
     rows = c2c_rows(compared)
-    header = ["", "mean (m)", "std.dev. (m)", "classes", *(b for b, _ in _shares(rows[0][-1]))]
+    bands = rows[0][-1].get("shares", ()) if rows else ()
+    header = ["", "mean (m)", "std.dev. (m)", "classes"]
+    header += [f"{one['low_m']:g} to {one['high_m']:g} m" for one in bands]
     cells = [
         [
             f"{way}, {name}", f"{of['normal']['mu_m']:.6f}", f"{of['normal']['sigma_m']:.6f}",
-            str(len(of["histogram"]["counts"])), *(share for _, share in _shares(of)),
+            str(len(of["histogram"]["counts"])),
+            *(f"{100 * one['share']:.1f} %" for one in of.get("shares", ())),
         ]
         for way, name, _, of in rows
     ]  # fmt: skip
     return Table("C2C: Gauss as CloudCompare fits it", header, cells)
 
 
-def c2c_figure(compared: Plain) -> Figure:
-    """Draw all histograms with their Gauss: a column a direction, a row a cloud, one axis."""
-    from scipy.stats import norm
-
-    rows = c2c_rows(compared)
-    ways = list(dict.fromkeys(way for way, *_ in rows))
-    count = len(rows) // len(ways)  # each direction has the same clouds
-    figure, panels = new_figure(
-        7.5 * len(ways) + 0.5, 2.4 * count + 0.4, nrows=count, ncols=len(ways), sharex=True,
-        squeeze=False,
-    )  # fmt: skip
-    for axes, (way, name, colour, of) in zip(panels.T.flat, rows, strict=True):
-        histogram, normal = of["histogram"], of["normal"]
-        edges, counts = np.array(histogram["edges_m"]), np.array(histogram["counts"])
-        label = f"{name}, {way}; largest {of['statistics']['max_m']:.3f} m"
-        axes.stairs(counts, edges, fill=True, color=colour, alpha=0.55, label=label)
-        if normal["sigma_m"] > 0.0:
-            x = np.linspace(0.0, edges[-1], 2000)
-            area = counts.sum() * (edges[1] - edges[0])
-            axes.plot(x, area * norm.pdf(x, normal["mu_m"], normal["sigma_m"]), color="0.15")
-        axes.set_title(gauss(of), fontsize="medium")
-        axes.set_ylabel("Count")
-        axes.legend(loc="upper right")
-    panels[0, 0].set_xlim(0.0, max(_reach(of["histogram"]) for *_, of in rows))
-    for axes in panels[-1]:
-        axes.set_xlabel("Distance to the nearest point (m)")
-    return figure
+def _depth_lines(compared: Plain) -> Table:
+    lines = [(name, (compared["depth"] or {}).get(when)) for when, name, _ in TIMES]
+    rows = [
+        [name, f"{fit['slope']:.4f}", f"{fit['intercept_m']:+.3f}", f"{fit['r2']:.4f}"]
+        for name, fit in lines
+        if fit is not None
+    ]
+    return Table("Depth against reference depth", ["", "slope", "intercept (m)", "r²"], rows)
 
 
-def _reach(histogram: Plain) -> float:
-    """Return the upper edge of the class in which the last of the distances shown lies."""
-    up_to = np.cumsum(histogram["counts"])
-    return float(histogram["edges_m"][1 + int(np.searchsorted(up_to, _SHOWN * up_to[-1]))])
+def _bins(title: str, bins: list[Plain]) -> Table:
+    """Return the errors of each class of depth or of distance from the shore."""
+    figures = {"bias": "mean_m", "sd": "sd_m", "RMSE": "rmse_m", "NMAD": "nmad_m"}
+    header = [f"{figure}, {name}" for _, name, _ in TIMES for figure in figures]
+    rows = []
+    for one in bins:
+        both = [one[when] for when, _, _ in TIMES]
+        cells = ["" if s is None else f"{s[key]:.3f}" for s in both for key in figures.values()]
+        name = f"{one['from_m']:g} to {one['to_m']:g}"
+        rows.append([name, f"{one['after']['count']:,}", *cells])
+    return Table(title, ["", "points", *header], rows)
+
+
+# Pictures
 
 
 def evaluation(
@@ -269,111 +267,94 @@ def evaluation(
         Difference of the surfaces, shape (rows, columns), metres, and its west, east, south and
         north.
     """
-    pictures = [*_histograms(compared), *_by_depth(compared), *_sections(sections)]
+    pictures = _histograms(compared)
     if dod is not None:
-        pictures.insert(2, _difference(*dod))
-    return pictures, [_statistics(compared), c2c_table(compared), *_bins(compared)]
-
-
-def _difference(values: FloatArray, extent_m: tuple[float, float, float, float]) -> Picture:
-    reach = float(np.nanpercentile(np.abs(values), 98.0))
-    alt = (
-        "Map of the corrected surface minus the reference surface; blue where the cloud is lower."
-        f" 98 % of the cells differ by less than {reach:.2f} m."
-    )
-    figure, axes = new_map(extent_m)
-    image = axes.imshow(values, extent=extent_m, cmap=DIFFERENCE, vmin=-reach, vmax=reach)
-    figure.colorbar(image, ax=axes, label="Cloud minus reference (m)", shrink=0.9)
-    return Picture("dod", "Difference of the surfaces (DoD)", alt, figure)
-
-
-def in_a_sentence(compared: Plain) -> str:
-    """Return what the correction changed against the reference; empty where it is not known."""
-    pair = compared["vertical"]
-    if pair is None or pair["before"] is None:
-        return ""
-    bed, land = compared.get("bed"), compared.get("land")
-    before, after = ((bed or pair)[when] for when, _, _ in TIMES)
-    before, after = (one.get("statistics", one) for one in (before, after))
-    way = "fell" if after["rmse_m"] <= before["rmse_m"] else "grew"
-    twice = "".join(
-        f" {n['message']}" for n in compared["notes"] if n["code"] == "cloud.corrected_twice"
-    )
-    of_land = "" if not bed or land is None else (
-        f" Land: {land['before']['rmse_m']:.3f} to {land['after']['rmse_m']:.3f} m."
-    )  # fmt: skip
-    return (
-        f" Against {name_of(compared['reference'])} the vertical error"
-        f"{' of the bed' if bed else ''} {way} from {before['rmse_m']:.3f} to"
-        f" {after['rmse_m']:.3f} m (RMSE of {after['count']:,}"
-        f" points, the reference's noise included). The remaining bias is"
-        f" {signed(after['mean_m'])}.{of_land}{twice}"
-    )
-
-
-def signed(value_m: float) -> str:
-    """Return metres with their sign, which is plus for what rounds to zero."""
-    return f"{round(value_m, 3) + 0.0:+.3f} m"
-
-
-def _histograms(compared: Plain) -> list[Picture]:
-    pictures = []
-    if compared["vertical"] is not None:
-        rows = [(name, compared["vertical"][when]) for when, name, _ in TIMES]
-        alt = f"Vertical error: histograms with fitted Gaussians. {_moments(rows)}"
-        figure = _histogram(compared["vertical"], "Cloud minus reference, Z (m)")
-        pictures.append(Picture("histogram_vertical", "Vertical error", alt, figure))
-    rows = [(f"{way}, {name}", of) for way, name, _, of in c2c_rows(compared)]
-    title = "Distance to the nearest point (C2C)"
-    alt = f"{title}: histograms with fitted Gaussians. {_moments(rows)}"
-    alt += "".join(f" {n['message']}" for n in compared["notes"] if n["code"].endswith(".sparse"))
-    return [*pictures, Picture("histogram_c2c", title, alt, c2c_figure(compared))]
-
-
-def _moments(rows: list[tuple[str, Plain | None]]) -> str:
-    return " ".join(
-        f"{name[:1].upper() + name[1:]}: mean {of['statistics']['mean_m']:.3f} m, standard"
-        f" deviation {of['statistics']['sd_m']:.3f} m."
-        for name, of in rows
-        if of is not None
-    )
-
-
-def _histogram(pair: Plain, label: str) -> Figure:
-    from scipy.stats import norm
-
-    known = [(when, name, colour) for when, name, colour in TIMES if pair[when] is not None]
-    figure, panels = new_figure(8.0, 2.4 * len(known) + 0.4, nrows=len(known), squeeze=False)
-    for axes, (when, name, colour) in zip(panels[:, 0], known, strict=True):
-        s, h = pair[when]["statistics"], pair[when]["histogram"]
-        edges, counts = np.array(h["edges_m"]), np.array(h["counts"], float)
-        density = counts / (s["count"] * np.diff(edges))
-        text = f"{name}: mean {s['mean_m']:.3f}, sd {s['sd_m']:.3f} m"
-        axes.stairs(density, edges, fill=True, color=colour, alpha=0.55, label=text)
-        if s["sd_m"] > 0.0:
-            x = np.linspace(edges[0], edges[-1], 200)
-            axes.plot(x, norm.pdf(x, s["mean_m"], s["sd_m"]), color=colour)
-        axes.set_ylabel("Density")
-        axes.legend(loc="upper right")
-    panels[-1, 0].set_xlabel(label)
-    return figure
-
-
-def _by_depth(compared: Plain) -> list[Picture]:
-    kinds = (
-        ("depth_bins", "Error against depth", "Reference depth (m)"),
-        ("shore_bins", "Error against distance from shore", "Distance from the shore (m)"),
-    )
-    return [
+        reach = float(np.nanpercentile(np.abs(dod[0]), 98.0))
+        alt = (
+            "Map of the corrected surface minus the reference surface; blue where the cloud is"
+            f" lower. 98 % of the cells differ by less than {reach:.2f} m."
+        )
+        figure = map_figure(*dod, "Cloud minus reference (m)", cmap=DIFFERENCE, vmin=-reach,
+                            vmax=reach)  # fmt: skip
+        pictures.append(Picture("dod", "Difference of the surfaces (DoD)", alt, figure))
+    pictures += [
         Picture(
             key, title,
             f"{title}: mean and standard deviation of the vertical error in {len(compared[key])}"
             " classes, before and after the correction.",
             _errors(compared[key], label),
         )
-        for key, title, label in kinds
-        if compared[key]
+        for key, (_, title, label) in BINS.items() if compared[key]
     ]  # fmt: skip
+    pictures += [_section(number, one) for number, one in enumerate(sections, start=1)]
+    return pictures, _tables(compared)
+
+
+def _histograms(compared: Plain) -> list[Picture]:
+    pictures, pair = [], compared["vertical"]
+    if pair is not None:
+        rows = [(name, colour, pair[when]) for when, name, colour in TIMES if pair[when]]
+        figure, panels = new_figure(8.0, 2.4 * len(rows) + 0.4, nrows=len(rows), squeeze=False)
+        for axes, (name, colour, of) in zip(panels[:, 0], rows, strict=True):
+            s = of["statistics"]
+            label = f"{name}: mean {s['mean_m']:.3f}, sd {s['sd_m']:.3f} m"
+            _histogram(axes, of, (s["mean_m"], s["sd_m"]), color=colour, label=label)
+        panels[-1, 0].set_xlabel("Cloud minus reference, Z (m)")
+        alt = f"Vertical error: histograms with fitted Gaussians. {_moments(rows)}"
+        pictures.append(Picture("histogram_vertical", "Vertical error", alt, figure))
+    title = "Distance to the nearest point (C2C)"
+    rows = [(f"{way}, {name}", colour, of) for way, name, colour, of in c2c_rows(compared)]
+    alt = f"{title}: histograms with fitted Gaussians. {_moments(rows)}"
+    alt += _noted(compared, "cloud.sparse", "reference.sparse")
+    return [*pictures, Picture("histogram_c2c", title, alt, c2c_figure(compared))]
+
+
+def _moments(rows: list[tuple[str, str, Plain]]) -> str:
+    return " ".join(
+        f"{name[:1].upper() + name[1:]}: mean {of['statistics']['mean_m']:.3f} m, standard"
+        f" deviation {of['statistics']['sd_m']:.3f} m."
+        for name, _, of in rows
+    )
+
+
+def c2c_figure(compared: Plain) -> Figure:
+    """Draw all histograms with their Gauss: a column a direction, a row a cloud, one axis."""
+    rows = c2c_rows(compared)
+    ways = list(dict.fromkeys(way for way, *_ in rows))
+    count = len(rows) // len(ways)  # each direction has the same clouds
+    figure, panels = new_figure(
+        7.5 * len(ways) + 0.5, 2.4 * count + 0.4, nrows=count, ncols=len(ways), sharex=True,
+        squeeze=False,
+    )  # fmt: skip
+    reach = 0.0
+    for axes, (way, name, colour, of) in zip(panels.T.flat, rows, strict=True):
+        label = f"{name}, {way}; largest {of['statistics']['max_m']:.3f} m"
+        normal = of["normal"]["mu_m"], of["normal"]["sigma_m"]
+        _histogram(axes, of, normal, color=colour, label=label)
+        axes.set_title(gauss(of), fontsize="medium")
+        # the upper edge of the class in which the last of the distances shown lies
+        up_to = np.cumsum(of["histogram"]["counts"])
+        last = int(np.searchsorted(up_to, _SHOWN * up_to[-1]))
+        reach = max(reach, of["histogram"]["edges_m"][1 + last])
+    panels[0, 0].set_xlim(0.0, reach)
+    for axes in panels[-1]:
+        axes.set_xlabel("Distance to the nearest point (m)")
+    return figure
+
+
+def _histogram(axes: Axes, of: Plain, normal: tuple[float, float], **look: Any) -> None:
+    """Draw a distribution and the normal distribution of a mean and a standard deviation."""
+    from scipy.stats import norm
+
+    edges, counts = (np.array(of["histogram"][key]) for key in ("edges_m", "counts"))
+    axes.stairs(counts, edges, fill=True, alpha=0.55, **look)
+    mean, sd = normal
+    if sd > 0.0:
+        x = np.linspace(edges[0], edges[-1], 2000)
+        area = of["statistics"]["count"] * (edges[1] - edges[0])
+        axes.plot(x, area * norm.pdf(x, mean, sd), color="0.15")
+    axes.set_ylabel("Count")
+    axes.legend(loc="upper right")
 
 
 def _errors(bins: list[Plain], label: str) -> Figure:
@@ -390,77 +371,31 @@ def _errors(bins: list[Plain], label: str) -> Figure:
     return figure
 
 
-def _sections(sections: list[Plain]) -> list[Picture]:
-    return [
-        Picture(
-            f"section_{number}", f"Cross-section {number}",
-            f"Heights along a line of {section['distance_m'][-1]:.0f} m: water surface, the cloud"
-            f" before and after, reference{''.join(f', {n}' for n in _further(section))}.",
-            _section(section),
-        )
-        for number, section in enumerate(sections, start=1)
-    ]  # fmt: skip
+def further_colour(number: int) -> str:
+    """Return the colour of a further cloud, by its number from 0."""
+    return ("#6a3d9a", "#33804d", "#c51b7d", "#8c6d1f", "#5f6b73")[number % 5]
 
 
-def _further(section: Plain) -> list[str]:
-    return [name for name in section["heights_m"] if name not in LAYERS]
-
-
-def _section(section: Plain) -> Figure:
+def _section(number: int, section: Plain) -> Picture:
     figure, axes = new_figure(8.0, 4.0)
+    further = [name for name in section["heights_m"] if name not in LAYERS]
     looks: dict[str, dict[str, Any]] = {
         "water": {"color": WATER, "linewidth": 1.2},
         "reference": {"color": REFERENCE, "linewidth": 2.5, "alpha": 0.45},
-        "apparent": {"color": BEFORE, "linestyle": "--"},
+        "apparent": {"color": BEFORE, "linestyle": "--", "label": "uncorrected"},
         "corrected": {"color": AFTER},
     }
-    names = {"apparent": "uncorrected"}
-    for number, name in enumerate(_further(section)):
-        looks[name] = {"color": further_colour(number), "linewidth": 1.0}
+    looks |= {
+        name: {"color": further_colour(i), "linewidth": 1.0} for i, name in enumerate(further)
+    }
     for key, look in looks.items():
         if key in section["heights_m"]:
             heights = np.array(section["heights_m"][key], float)
-            axes.plot(section["distance_m"], heights, label=names.get(key, key), **look)
+            axes.plot(section["distance_m"], heights, **{"label": key} | look)
     axes.set(xlabel="Distance along the line (m)", ylabel="Height (m)")
     axes.legend(loc="best")
-    return figure
-
-
-def _statistics(compared: Plain) -> Table:
-    header = ["", "points", "mean", "sd", "RMSE", "NMAD", "median", "95 %", "max"]
-    found = [
-        (f"{kind}, {name}", pair[when].get("statistics", pair[when]))
-        for _, kind, key in SIGNED
-        for when, name, _ in TIMES
-        if (pair := compared.get(key)) is not None and pair[when] is not None
-    ]
-    found += [(f"C2C {way}, {name}", of["statistics"]) for way, name, _, of in c2c_rows(compared)]
-    rows = []
-    for title, s in found:
-        values = [*(s[name] for name in MOMENTS), s["percentiles_m"]["p95"], s["max_m"]]
-        rows.append([title, f"{s['count']:,}", *(f"{value:.3f}" for value in values)])
-    return Table(f"Against {name_of(compared['reference'])} (m)", header, rows)
-
-
-def _bins(compared: Plain) -> list[Table]:
-    tables = []
-    if compared["depth"] is not None:
-        rows = [
-            [name, f"{fit['slope']:.4f}", f"{fit['intercept_m']:.3f}", f"{fit['r2']:.4f}"]
-            for when, name, _ in TIMES
-            if (fit := compared["depth"][when]) is not None
-        ]
-        header = ["", "slope", "intercept (m)", "r²"]
-        tables.append(Table("Depth against reference depth", header, rows))
-    if compared["depth_bins"]:
-        figures = ("bias", "mean_m"), ("RMSE", "rmse_m"), ("NMAD", "nmad_m")
-        header = ["Depth (m)", "points"]
-        header += [f"{figure}, {name}" for _, name, _ in TIMES for figure, _ in figures]
-        rows = []
-        for b in compared["depth_bins"]:
-            both = [b[when] for when, _, _ in TIMES]
-            cells = ["" if s is None else f"{s[key]:.3f}" for s in both for _, key in figures]
-            name = f"{b['from_m']:g} to {b['to_m']:g}"
-            rows.append([name, f"{b['after']['count']:,}", *cells])
-        tables.append(Table("By depth (m)", header, rows))
-    return tables
+    alt = (
+        f"Heights along a line of {section['distance_m'][-1]:.0f} m: water surface, the cloud"
+        f" before and after, reference{''.join(f', {name}' for name in further)}."
+    )
+    return Picture(f"section_{number}", f"Cross-section {number}", alt, figure)

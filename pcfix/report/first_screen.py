@@ -9,11 +9,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pcfix.options.correct import LEVEL_M
 from pcfix.refract.tally import COVERAGE_95, Summary
 from pcfix.report.comparison import noise_sentence, raw_of, signed
 from pcfix.report.page import Table, Tile, name_of
-from pcfix.report.text import FEWEST, share
+from pcfix.report.text import FEWEST, summary_rows
 
 Plain = dict[str, Any]
 
@@ -40,13 +39,13 @@ class Survey:
 
 def head_of(s: Summary, survey: Survey) -> Table:
     """Return the lines beside the map."""
+    shown = ("Submerged", "Cameras", "Water", "")
     rows = [
         ["Images", survey.date or "date not stated"],
         ["CRS", survey.crs or "not stated by the cloud"],
         ["Heights", survey.heights or f"{UNKNOWN_DATUM}: the cloud states none"],
-        ["Water", water_words(s)],
-        ["Points", f"{s.points:,}, {share(s.submerged, s.points)} under water"],
-        ["Cameras", f"{s.cameras_used} of {s.cameras} used" if s.cameras else "none"],
+        ["Points", f"{s.points:,}"],
+        *([label, text] for label, text in summary_rows(s) if label in shown),
     ]
     return Table("The project", [], rows)
 
@@ -54,22 +53,6 @@ def head_of(s: Summary, survey: Survey) -> Table:
 def is_found(s: Summary) -> bool:
     """Whether the water was sought in the cloud."""
     return s.water_fit is not None and s.water_fit["model"] == "auto"
-
-
-def water_words(s: Summary) -> str:
-    """Return the level with its standard error, and where they come from."""
-    fit, stated = s.water_fit, s.settings.get("sigma_level")
-    water, origin, sigma, of = s.water, "as given", LEVEL_M, "assumed"
-    if fit is not None:
-        known = f" to {fit['accepted']} of {fit['points']} points" if "points" in fit else ""
-        origin = "found in the cloud" if is_found(s) else f"fitted{known}"
-        sigma, of = fit["sigma_level_m"], "of the fit"
-        if not fit.get("tilt_percent", 1.0):
-            water = f"level {fit['level_m']:.3f} m"
-    if stated is not None:
-        sigma, of = stated, "as stated"
-    index = s.settings["index"]
-    return f"{water}, {origin}; standard error {sigma:.3f} m ({of}); index {index:g}"
 
 
 def tiles_of(s: Summary, survey: Survey, compared: Plain, depth_m: Plain) -> list[Tile]:
@@ -81,11 +64,11 @@ def tiles_of(s: Summary, survey: Survey, compared: Plain, depth_m: Plain) -> lis
         ("mean", f"{depth_m['mean']:.2f} m"),
     ]
     moved = f"{s.corrected:,} points of the bed moved {way} by {abs(mean):.2f} m on average."
-    notes = notes_of(s, survey, compared)[:SHOWN_NOTES] or ["Nothing stood out."]
+    notes = notes_of(s, survey, compared)[:SHOWN_NOTES] or ["None."]
     return [
         Tile("Depth", figures=depths, notes=[moved]),
         accuracy_tile(s, compared),
-        Tile("What to watch out for", notes=notes),
+        Tile("Warnings", notes=notes),
     ]
 
 

@@ -23,7 +23,7 @@ from pcfix.grid.maps import Maps
 from pcfix.model import FloatArray
 
 if TYPE_CHECKING:
-    from jinja2 import Environment
+    from jinja2 import Template
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -37,13 +37,17 @@ BEFORE, AFTER, WATER, REFERENCE = "#b3541e", "#0b5e8a", "#4aa3c7", "#222222"
 """Colours of different lightness, for readers with colour blindness."""
 
 
-def new_figure(width_in: float = 8.0, height_in: float = 4.5, **grid: Any) -> tuple[Figure, Any]:
-    """Return a figure and its axes, drawn without a screen."""
+def new_figure(
+    width_in: float = 8.0, height_in: float = 4.5, mosaic: Any = None, **grid: Any
+) -> tuple[Figure, Any]:
+    """Return a figure, drawn without a screen, and its axes: a grid, or a mosaic by name."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width_in, height_in), layout="constrained")
     FigureCanvasAgg(figure)
+    if mosaic is not None:
+        return figure, figure.subplot_mosaic(mosaic, **grid)
     return figure, figure.subplots(**grid)
 
 
@@ -58,13 +62,31 @@ def png_of(figure: Figure) -> bytes:
     return stream.getvalue()
 
 
-def new_map(extent_m: tuple[float, float, float, float]) -> tuple[Figure, Any]:
-    """Return a figure of the shape of an area: west, east, south and north, metres."""
+def map_figure(
+    values: npt.NDArray[Any],
+    extent_m: tuple[float, float, float, float],
+    label: str,
+    shade: FloatArray | None = None,
+    **look: Any,
+) -> Figure:
+    """Draw a map of values over west, east, south and north, metres; `shade` is its relief.
+
+    Values are numbers, shape (rows, columns), or colours of shape (rows, columns, 4); for those
+    `look` gives the colour ramp and its `norm`.
+    """
+    from matplotlib.cm import ScalarMappable
+
     west, east, south, north = extent_m
     height_in = float(np.clip(6.5 * (north - south) / (east - west) + 0.8, 2.8, 9.0))
     figure, axes = new_figure(8.0, height_in)
     label_plan(axes)
-    return figure, axes
+    if shade is not None:
+        axes.imshow(shade, extent=extent_m, cmap="gray", vmin=0.0, vmax=1.0)
+        look["alpha"] = 0.75
+    image = axes.imshow(values, extent=extent_m, **look)
+    ramp = image if values.ndim == 2 else ScalarMappable(look["norm"], look["cmap"])
+    figure.colorbar(ramp, ax=axes, label=label, shrink=0.9)
+    return figure
 
 
 def label_plan(axes: Axes, turned_deg: float = 30.0) -> None:
@@ -120,7 +142,7 @@ class Picture:
 
     @property
     def data(self) -> str:
-        """The picture for an HTML page."""
+        """The picture for an HTML page; its "/" are no folders (see `_as_read`)."""
         from markupsafe import Markup
 
         return Markup(base64.b64encode(self.png).decode())
@@ -133,6 +155,16 @@ class Table:
     title: str
     header: list[str]
     rows: list[list[str]]
+
+    def lines(self) -> list[str]:
+        """Return the table for the terminal, with its columns aligned to the right."""
+        rows = [[self.title if self.header[0] == "" else self.header[0], *self.header[1:]]]
+        rows += self.rows
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        return [
+            "  ".join([f"  {row[0]:<{widths[0]}}", *map(str.rjust, row[1:], widths[1:])]).rstrip()
+            for row in rows
+        ]
 
 
 @dataclass(frozen=True)
@@ -194,18 +226,14 @@ def _as_read(value: Any) -> Any:
     return "-" if value is None else value
 
 
-def environment() -> Environment:
-    """Return the templates; values are escaped."""
+def _template(name: str) -> Template:
+    """Return a template; values are escaped."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     return Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        finalize=_as_read,
-    )
+        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True, finalize=_as_read,
+    ).get_template(name)  # fmt: skip
 
 
 def render(report: Report) -> str:
@@ -215,13 +243,12 @@ def render(report: Report) -> str:
     from pcfix.report.map_data import map_json  # not quick to load, and texts do without
 
     data = Markup(map_json(report.maps, report.layers))
-    template = environment().get_template("page.html.j2")
-    return template.render(report=report, figures=FIGURES, map_data=data)
+    return _template("page.html.j2").render(report=report, figures=FIGURES, map_data=data)
 
 
 def run_html(title: str, tiles: Sequence[Tile], place: str, picture: Picture) -> str:
     """Return what a notebook shows of a run, HTML without scripts: tiles and a small map."""
-    template = environment().get_template("notebook.html.j2")
+    template = _template("notebook.html.j2")
     return template.render(title=title, tiles=tiles, place=place, picture=picture)
 
 
@@ -229,13 +256,9 @@ def overview(
     colours: npt.NDArray[np.uint8], extent_m: tuple[float, float, float, float], deepest_m: float
 ) -> Picture:
     """Return a map of the shaded bed, from colours of shape (rows, columns, 4) with alpha."""
-    from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
-    figure, axes = new_map(extent_m)
-    axes.imshow(colours, extent=extent_m)
-    ramp = ScalarMappable(Normalize(0.0, deepest_m), DEPTH)
-    bar = figure.colorbar(ramp, ax=axes, label="Depth (m)", shrink=0.8, extend="max")
-    bar.ax.invert_yaxis()
+    norm = Normalize(0.0, deepest_m)
+    figure = map_figure(colours, extent_m, "Depth (m)", norm=norm, cmap=DEPTH)
     alt = f"Map of the bed, shaded and in the colours of its depth, 0 to {deepest_m:.1f} m."
     return Picture("overview", "Depth", alt, figure)

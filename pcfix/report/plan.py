@@ -10,7 +10,7 @@ import numpy as np
 from pcfix.model import Cameras
 from pcfix.refract.tally import COVERAGE_95, ORDERS, largest_tvu_m
 from pcfix.report.cameras import draw_footprints
-from pcfix.report.page import AFTER, BEFORE, REFERENCE, WATER, label_plan, new_figure
+from pcfix.report.page import AFTER, BEFORE, REFERENCE, WATER, Table, label_plan, new_figure
 from pcfix.report.text import aligned
 
 if TYPE_CHECKING:
@@ -56,12 +56,8 @@ class DepthPlan:
     @property
     def order(self) -> str:
         """The strictest order of S-44 that the uncertainty at 95 % would keep, or a dash."""
-        depth = np.array([self.depth_m])
-        kept = (
-            one.name for one in ORDERS
-            if COVERAGE_95 * self.sigma_m <= float(largest_tvu_m(one, depth)[0])
-        )  # fmt: skip
-        return next(kept, "-")
+        depth, tvu = np.array([self.depth_m]), COVERAGE_95 * self.sigma_m
+        return next((one.name for one in ORDERS if tvu <= largest_tvu_m(one, depth)[0]), "-")
 
 
 @dataclass(frozen=True)
@@ -128,19 +124,19 @@ def plan_text(plan: Plan) -> str:
         ("GSD", f"{100.0 * plan.gsd_m:.2f} cm at the water"),
     ]  # fmt: skip
     head = "Planned {:g} m above the water over {:g} x {:g} m".format(plan.height_m, *plan.area_m)
-    parts = "".join(f"{part:>8}" for part in deepest.parts_m)
-    table = [
-        "",
-        f"Standard errors of the corrected bed in cm (refractive index {plan.index:g}):",
-        f" depth  apparent  rays {parts}   total     95 %  S-44 order  absorbed    bias",
-    ]
-    for one in plan.depths:
-        errors = "".join(f"{100.0 * part:>8.2f}" for part in one.parts_m.values())
-        table.append(
-            f"{one.depth_m:>4.4g} m{one.apparent_m:>8.2f} m{one.rays:>6.1f} {errors}"
-            f"{100.0 * one.sigma_m:>8.2f}{100.0 * COVERAGE_95 * one.sigma_m:>9.2f}"
-            f"  {one.order:<10}{one.absorbed:>10.0%}{100.0 * one.left_m:>+8.1f}"
-        )
+    header = ["depth", "apparent", "rays", *deepest.parts_m, "total", "95 %", "S-44 order",
+              "absorbed", "bias"]  # fmt: skip
+    errors = [
+        [
+            f"{one.depth_m:.4g} m", f"{one.apparent_m:.2f} m", f"{one.rays:.1f}",
+            *(f"{100.0 * part:.2f}" for part in one.parts_m.values()),
+            f"{100.0 * one.sigma_m:.2f}", f"{100.0 * COVERAGE_95 * one.sigma_m:.2f}", one.order,
+            f"{one.absorbed:.0%}", f"{100.0 * one.left_m:+.1f}",
+        ]
+        for one in plan.depths
+    ]  # fmt: skip
+    title = f"Standard errors of the corrected bed in cm (refractive index {plan.index:g}):"
+    table = ["", title, *Table(title, header, errors).lines()]
     rows = [
         ("poses", f"after 'pcfix adjust' with GNSS of {plan.gnss_sigma_m:g} m and a calibrated"
          " lens, unless --sigma-centre or --sigma-attitude are given"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -14,9 +15,8 @@ import numpy as np
 from pcfix.grid.colours import DEPTH, DIFFERENCE, HEIGHT, RAYS, UNCERTAINTY
 from pcfix.grid.contours import contours, depth_interval
 from pcfix.grid.maps import Extent, Maps
-from pcfix.model import BoolArray, Cameras, FloatArray, WaterPlane, WaterSurface
+from pcfix.model import Cameras, FloatArray, WaterPlane, WaterSurface
 from pcfix.refract.tally import COVERAGE_95, ORDERS, Summary, largest_tvu_m
-from pcfix.report.adjustment_text import WHERE, all_notes, fixed, lens_label, listed, short
 from pcfix.report.first_screen import Survey, head_of, notes_of, tiles_of
 from pcfix.report.map_data import Layer, relief
 from pcfix.report.page import (
@@ -29,9 +29,9 @@ from pcfix.report.page import (
     Table,
     label_plan,
     label_side,
+    map_figure,
     name_of,
     new_figure,
-    new_map,
 )
 from pcfix.report.text import formal_words, summary_rows, uncertainty_sentence
 from pcfix.version import __version__
@@ -97,6 +97,7 @@ class Later:
 
 
 NOTHING_LATER = Later()
+SHIFT = "True minus apparent Z (m)"
 FIRST_FIGURES = ("water", "section_1", "depth_bins", "uncertainty", "cameras", "shift")
 """Those that are shown where they are there, the first four of them."""
 
@@ -193,57 +194,45 @@ def _facts(s: Summary, measured: Plain | None) -> Table:
 
 
 def _pictures(corrected: Corrected) -> list[Picture]:
-    s, maps, water = corrected.summary, corrected.maps, corrected.water
-    cameras = corrected.cameras
-    used = ~np.isin(np.array(cameras.labels), s.cameras_unused)
-    flat = isinstance(water, WaterPlane) and water.b == water.c == 0.0
-    level = water.a if isinstance(water, WaterPlane) and flat else None
-    depth, shift = corrected.depth_m, s.shift_z_m
-    return [
+    s, maps, depth = corrected.summary, corrected.maps, corrected.depth_m
+    interval = depth_interval(maps.depth_m, maps.uncertainty_m)
+    shade = relief(maps.height_m, maps.cell_m)
+    depths = map_figure(maps.depth_m, maps.extent_m, "Depth (m)", shade, cmap=DEPTH)
+    for _, place in contours(maps.depth_m, interval):
+        x, y = (place + 0.5).T * maps.cell_m  # from the corner of the map
+        depths.axes[0].plot(maps.west_m + x, maps.north_m - y, color=REFERENCE, linewidth=0.5)
+    shifts = map_figure(maps.shift_z_m, maps.extent_m, SHIFT, shade, cmap=HEIGHT)
+    cause = "growing with depth and incidence angle" if s.carried is None else (
+        "including the change by the adjustment"
+    )  # fmt: skip
+    pictures = [
         Picture(
             "depth", "Depth",
             f"Map of the corrected depth over the shaded relief; {depth['min']:.2f} to"
-            f" {depth['max']:.2f} m, mean {depth['mean']:.2f} m; contours every"
-            f" {depth_interval(maps.depth_m, maps.uncertainty_m):g} m.",
-            map_figure(maps, maps.depth_m, "Depth (m)", DEPTH),
+            f" {depth['max']:.2f} m, mean {depth['mean']:.2f} m; contours every {interval:g} m.",
+            depths,
         ),
         Picture(
             "shift", "Shift in Z",
-            f"Map of how far the bed moved down; mean {shift['mean']:.2f} m,"
-            + (" growing with depth and towards flat rays." if s.carried is None else " with what"
-               " the adjustment changed."),
-            map_figure(maps, maps.shift_z_m, "True minus apparent Z (m)", HEIGHT),
+            f"Map of how far the bed moved; mean {s.shift_z_m['mean']:.2f} m, {cause}.", shifts,
         ),
         Picture(
             "shift_histogram", "How far the points moved",
             "Histogram of the shift in Z of the corrected points.",
-            histogram_figure(corrected.sample[:, 0], "shift in Z", "True minus apparent Z (m)"),
+            histogram_figure(corrected.sample[:, 0], "shift in Z", SHIFT),
         ),
-        *([] if not s.cameras else [Picture(
-            "cameras", "Cameras",
-            f"Projection centres over the cloud, in plan and seen from the south;"
-            f" {s.cameras_used} of {s.cameras} see corrected points.",
-            cameras_figure(maps, cameras.centres, used, level),
-        )]),
     ]  # fmt: skip
-
-
-def map_figure(maps: Maps, values: FloatArray, label: str, ramp: str) -> Figure:
-    """Draw a map of values over the shaded relief, with contours where they are depths."""
-    figure, axes = new_map(maps.extent_m)
-    shade = relief(maps.height_m, maps.cell_m)
-    axes.imshow(shade, extent=maps.extent_m, cmap="gray", vmin=0.0, vmax=1.0)
-    image = axes.imshow(values, extent=maps.extent_m, cmap=ramp, alpha=0.75)
-    if ramp == DEPTH:
-        for _, place in contours(values, depth_interval(values, maps.uncertainty_m)):
-            x, y = (place + 0.5).T * maps.cell_m  # from the corner of the map
-            axes.plot(maps.west_m + x, maps.north_m - y, color=REFERENCE, linewidth=0.5)
-    figure.colorbar(image, ax=axes, label=label, shrink=0.9)
-    return figure
+    if s.cameras:
+        alt = (
+            "Projection centres over the cloud, in plan and seen from the south;"
+            f" {s.cameras_used} of {s.cameras} see corrected points."
+        )
+        pictures.append(Picture("cameras", "Cameras", alt, cameras_figure(corrected)))
+    return pictures
 
 
 def histogram_figure(values: FloatArray, name: str, label: str) -> Figure:
-    """Draw the distribution of some values."""
+    """Draw the distribution of some values, without half a percent at each end."""
     figure, axes = new_figure()
     low, high = np.percentile(values, [0.5, 99.5])
     if high <= low:
@@ -256,32 +245,29 @@ def histogram_figure(values: FloatArray, name: str, label: str) -> Figure:
     return figure
 
 
-def cameras_figure(
-    maps: Maps, centres: FloatArray, used: BoolArray, water_m: float | None
-) -> Figure:
-    """Draw the projection centres in plan and in profile, shape (k, 3), over the cloud."""
+def cameras_figure(corrected: Corrected) -> Figure:
+    """Draw the projection centres in plan and in profile over the cloud."""
+    maps, cameras, water = corrected.maps, corrected.cameras, corrected.water
+    used = ~np.isin(np.array(cameras.labels), corrected.summary.cameras_unused)
     figure, (plan, profile) = new_figure(8.0, 7.0, nrows=2, height_ratios=[3, 2])
     plan.imshow(maps.height_m, extent=maps.extent_m, cmap="Greys_r", alpha=0.6)
     depth = plan.imshow(maps.depth_m, extent=maps.extent_m, cmap=DEPTH)
     figure.colorbar(depth, ax=plan, label="Depth (m)", shrink=0.8)
-    marks = (used, "o", AFTER, "used"), (~used, "x", BEFORE, "not used")
-    for chosen, mark, colour, name in marks:
+    for chosen, mark, colour, name in (used, "o", AFTER, "used"), (~used, "x", BEFORE, "not used"):
         if chosen.any():
-            x, y, z = centres[chosen].T
+            x, y, z = cameras.centres[chosen].T
             plan.plot(x, y, mark, color=colour, label=name, markersize=4)
             profile.plot(x, z, mark, color=colour, markersize=4)
     label_plan(plan)
-    plan.legend(loc="best")
-    west, east, _, _ = maps.extent_m
-    columns = np.linspace(west, east, maps.height_m.shape[1])
-    with np.errstate(all="ignore"):
-        low, high = (
-            np.nanpercentile(np.where(np.isnan(maps.height_m), np.nan, maps.height_m), q, axis=0)
-            for q in (5, 95)
-        )
+    # above the axes, where it covers no camera
+    plan.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, frameon=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # columns without heights
+        low, high = np.nanpercentile(maps.height_m, (5, 95), axis=0)
+    columns = np.linspace(*maps.extent_m[:2], len(low))
     profile.fill_between(columns, low, high, color="0.6", label="cloud, 5 to 95 %")
-    if water_m is not None:
-        profile.axhline(water_m, color=WATER, label="water")
+    if isinstance(water, WaterPlane) and water.b == water.c == 0.0:
+        profile.axhline(water.a, color=WATER, label="water")
     label_side(profile)
     profile.legend(loc="best")
     return figure
@@ -353,65 +339,3 @@ def _orders(s: Summary, measured: Plain | None) -> list[Table]:
     limit = "within sqrt(a^2 + (b depth)^2)"
     header = ["order", "a", "b", *(f"points with {name} {limit}" for name in known)]
     return [Table("Orders of IHO S-44, vertical", header, rows)] if known else []
-
-
-def adjustment_sentence(d: Plain) -> str:
-    """Return an adjustment in half a line, of the values of `adjustment_dict`."""
-    unit, parts = d["image_unit"], []
-    if d["lens"] and d["lens"][0]["name"] == "f":
-        row = d["lens"][0]
-        before, after = (short(row[when], row["sigma"]) for when in ("before", "after"))
-        parts.append(f"focal length {before} -> {after} {unit}")
-    parts.append(f"centres moved {fixed(d['poses']['moved_rms_m'], 3)} m (rms)")
-    residuals = [
-        f"{fixed(d['residuals'][key]['rms_px'], 2)} {unit} {where}"
-        for key, where in WHERE
-        if d["residuals"][key]["rms_px"] is not None
-    ]
-    return ", ".join([*parts, *([f"residuals {' and '.join(residuals)}"] if residuals else [])])
-
-
-def reason_sentence(adjusted: bool, why: str) -> str:
-    """Return why a run adjusted the cameras, or why not."""
-    if adjusted:
-        return f" The cameras were adjusted first, as {why}."
-    return f" The cameras were not adjusted: {why}."
-
-
-def adjustment_table(d: Plain, page: str) -> Table:
-    """Return what the adjustment changed, of `adjustment_dict`, with a link to its own page."""
-    from markupsafe import Markup
-
-    unit = d["image_unit"]
-    rows = [_lens_row(row, d) for row in d["lens"]]
-    for key, where in WHERE:
-        r = d["residuals"][key]
-        if r["points"]:
-            after = f"{fixed(r['rms_px'], 3)} {unit}, {fixed(r['rms_m'], 4)} m"
-            before = f"{fixed(r['rms_before_px'], 3)} {unit}"
-            rows.append([f"Residuals {where} (rms)", before, after])
-    moved = fixed(d["poses"]["moved_rms_m"], 3)
-    rows.append(["Projection centres moved (rms)", "", f"{moved} m"])
-    if d["gnss"] is not None:
-        before, after = (listed(d["gnss"].get(key)) for key in ("rms_before_m", "rms_m"))
-        rows.append(["Centres minus GNSS, east, north, up (rms)", f"{before} m", f"{after} m"])
-    for role in ("control", "check"):
-        if (one := d[role]) is not None:
-            name = f"{role.capitalize()} points, X, Y, Z ({len(one['points'])}, rms)"
-            rows.append([name, "", f"{listed(one['rms_m'])} m, {fixed(one['rms_px'], 2)} {unit}"])
-    rows += [["Note", "", note] for note in all_notes(d)]
-    rows.append(["All of it", "", Markup('<a href="{0}">{0}</a>').format(page)])
-    return Table("Refractive bundle adjustment", ["", "before", "after"], rows)
-
-
-def _lens_row(row: Plain, d: Plain) -> list[str]:
-    """Return a parameter of the lens before and after, with its standard error."""
-    several = len({one["sensor"] for one in d["lens"]}) > 1
-    name = lens_label(row) + (f" of {row['sensor']}" if several else "")
-    unit = f" {d['image_unit']}" if row["name"] in ("f", "cx", "cy", "b1", "b2") else ""
-    plus_minus = "" if row["sigma"] is None else f" ± {row['sigma']:.2g}"
-    return [
-        name[:1].upper() + name[1:] if len(name) > 2 else name,
-        short(row["before"], row["sigma"]) + unit,
-        short(row["after"], row["sigma"]) + plus_minus + unit,
-    ]

@@ -19,10 +19,6 @@ if TYPE_CHECKING:
     from pcfix.clean.points import CleanSummary
     from pcfix.grid.model import DsmSummary
     from pcfix.label.labelling import LabelSummary
-    from pcfix.photos.calm import CalmSummary
-    from pcfix.photos.mapping import PhotosSummary
-    from pcfix.photos.ortho import OrthoSummary
-    from pcfix.photos.rounds import RebuildSummary
 
 Plain = dict[str, Any]
 Rows = list[tuple[str, str]]
@@ -170,6 +166,7 @@ def summary_text(summary: Summary) -> str:
 
 def summary_rows(s: Summary) -> Rows:
     """Return the facts of a correction, for the terminal and the report page."""
+    fit = s.water_fit or {}
     values = vars(s) | {
         "part_words": _part_words(s.part),
         "fate": _FATE[s.settings["uncorrected"]],
@@ -182,7 +179,7 @@ def summary_rows(s: Summary) -> Rows:
         "rays_per_point": s.rays / max(s.corrected, 1),
         "no_cameras": not s.cameras,
         "unused": _unused(s),
-        "fit_points": _fit_points(s.water_fit),
+        "fit_points": ", {accepted} of {points} points".format(**fit) if "points" in fit else "",
         "deeper_cm": _deeper_cm(s),
         "no_uncertainty": s.uncertainty is None and s.settings["dimensions"] == "all"
         and not s.cameras,
@@ -236,10 +233,6 @@ def _unused(s: Summary) -> str:
         for why, names in groups.items()
         if names
     )
-
-
-def _fit_points(fit: Plain | None) -> str:
-    return f", {fit['accepted']} of {fit['points']} points" if fit and "points" in fit else ""
 
 
 def _deeper_cm(s: Summary) -> float | None:
@@ -301,6 +294,17 @@ def formal_words(s: Summary) -> str:
     return f"Assumed standard deviations: {budget_words(s.settings, fitted)}{cloud}{poses}"
 
 
+_BUDGET: RowTable = (
+    ("image", "{sigma_image:g} px", "settings"),
+    ("level", "{level:.3f} m{source}", "settings"),
+    ("index", "{sigma_index:g}", "settings"),
+    ("tilt", "{sigma_tilt:g} deg", "sigma_tilt"),
+    ("waves", "{sigma_waves:g} deg", "sigma_waves"),
+    ("camera positions", "{sigma_centre:g} m", "sigma_centre"),
+    ("attitude", "{sigma_attitude:g} deg", "sigma_attitude"),
+)  # fmt: skip
+
+
 def budget_words(errors: Plain, level_from_fit: float | None = None) -> str:
     """Return the standard deviations that were assumed, as ``image 0.5 px, level 0.020 m``.
 
@@ -316,21 +320,8 @@ def budget_words(errors: Plain, level_from_fit: float | None = None) -> str:
         level, source = LEVEL_M, " (assumed)"
         if level_from_fit is not None and np.isfinite(level_from_fit):
             level, source = level_from_fit, " (fitted)"
-    parts = [f"image {errors['sigma_image']:g} px", f"level {level:.3f} m{source}"]
-    parts.append(f"index {errors['sigma_index']:g}")
-    more = (
-        ("tilt", "sigma_tilt", "deg"),
-        ("waves", "sigma_waves", "deg"),
-        ("camera positions", "sigma_centre", "m"),
-        ("attitude", "sigma_attitude", "deg"),
-    )
-    parts += [f"{name} {errors[key]:g} {unit}" for name, key, unit in more if errors[key] > 0.0]
-    return ", ".join(parts)
-
-
-def strictest_order(uncertainty: Plain) -> str | None:
-    """Return the strictest order whose TVU 95 % of the points keep, if any."""
-    return next((o.name for o in ORDERS if uncertainty["s44"][o.name] >= 0.95), None)
+    values = errors | {"level": level, "source": source, "settings": True}
+    return ", ".join(f"{name} {text}" for name, text in filled(_BUDGET, values))
 
 
 def order_sentence(s: Summary) -> str:
@@ -341,14 +332,14 @@ def order_sentence(s: Summary) -> str:
 
 
 def tvu_sentence(uncertainty: Plain) -> str:
-    """Return which order of S-44 the standard errors would allow, in words."""
-    order = strictest_order(uncertainty)
+    """Return the strictest order of S-44 whose TVU 95 % of the points keep, in words."""
+    shares = uncertainty["s44"]
+    order = next((one.name for one in ORDERS if shares[one.name] >= 0.95), None)
     if order is None:
-        within = uncertainty["s44"][ORDERS[-1].name]
+        within = shares[ORDERS[-1].name]
         return f"fewer than 95 % of the points keep any order of IHO S-44 ({within:.0%} order 2)"
     name = f"order {order}" if order[0].isdigit() else f"{order} Order"
-    within = uncertainty["s44"][order]
-    return f"{100.0 * within:.4g} % of the points are within the TVU of IHO S-44 {name}"
+    return f"{100.0 * shares[order]:.4g} % of the points are within the TVU of IHO S-44 {name}"
 
 
 def uncertainty_sentence(s: Summary, measured: Plain | None = None) -> str:
@@ -412,7 +403,7 @@ def dsm_text(s: DsmSummary) -> str:
     return aligned(_head("Gridded", s, points), filled(_GRIDDED, values))
 
 
-def calm_text(s: CalmSummary) -> str:
+def calm_text(s: Any) -> str:
     """Return the summary of an image through calm water."""
     values = vars(s) | {"is_still": not s.corners, "found": s.water}
     if s.water is not None:
@@ -425,7 +416,7 @@ def calm_text(s: CalmSummary) -> str:
     return aligned(head, filled(_CALMED, values))
 
 
-def photos_text(s: PhotosSummary) -> str:
+def photos_text(s: Any) -> str:
     """Return the summary of photographs without water."""
     head = f"Mapped {s.images - s.done_before:,} images in {s.seconds:.1f} s"
     if s.seconds and s.images > s.done_before:
@@ -433,7 +424,7 @@ def photos_text(s: PhotosSummary) -> str:
     return aligned(head, filled(_MAPPED, vars(s) | {"black_percent": 100.0 * s.black_share}))
 
 
-def rounds_text(s: RebuildSummary) -> str:
+def rounds_text(s: Any) -> str:
     """Return why the rounds ended, and where their clouds and the comparison are."""
     values = vars(s) | {
         "verdict": "settled" if s.settled else "not settled",
@@ -444,7 +435,7 @@ def rounds_text(s: RebuildSummary) -> str:
     return aligned(f"Rebuilt in {len(s.rounds)} rounds", filled(_REBUILT, values))
 
 
-def ortho_text(s: OrthoSummary) -> str:
+def ortho_text(s: Any) -> str:
     """Return the summary of an orthophoto."""
     traced = "without refraction" if s.water is None else f"traced through water {s.water}"
     values = vars(s) | {"covered": 100 * s.covered_share, "traced": traced}

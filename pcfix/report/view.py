@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from pcfix.model import FloatArray, IntArray
 from pcfix.report.page import new_figure
 
 if TYPE_CHECKING:
+    from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
 
 WATER_COLOUR = (0.29, 0.64, 0.78, 0.25)
@@ -50,32 +51,24 @@ class Scene3d:
     triangles: IntArray
 
 
-class Scale(NamedTuple):
-    """A quantity and its values at both ends of the colour ramp."""
+def scale_of(what: str, values: FloatArray) -> ScalarMappable:
+    """Return the colour scale of values, NaN where unknown; it leaves out 2 % at the ends.
 
-    what: str
-    low: float
-    high: float
+    Its ``to_rgba`` gives colours; those of NaN are grey.
+    """
+    from matplotlib import colormaps
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
 
-    @classmethod
-    def of(cls, what: str, values: FloatArray) -> Scale:
-        """Return the scale of values, NaN where unknown; it leaves out 2 % at the ends."""
-        known = values[np.isfinite(values)]
-        if what == "error":
-            most = max(float(np.percentile(np.abs(known), MOST_PERCENT)), 1e-3)
-            return cls(what, -most, most)
+    known = values[np.isfinite(values)]
+    if what == "error":
+        high = max(float(np.percentile(np.abs(known), MOST_PERCENT)), 1e-3)
+        low = -high
+    else:
         low = float(np.percentile(known, 100.0 - MOST_PERCENT)) if what == "height" else 0.0
-        return cls(what, low, max(float(np.percentile(known, MOST_PERCENT)), low + 1e-3))
-
-    def colours(self, values: FloatArray) -> FloatArray:
-        """Return the colour of each value, shape (n, 3); grey where it is NaN."""
-        from matplotlib import colormaps
-
-        known = np.isfinite(values)
-        share = np.where(known, (values - self.low) / (self.high - self.low), 0.0)
-        rgb = colormaps[RAMPS[self.what][0]](np.clip(share, 0.0, 1.0))[:, :3]
-        rgb[~known] = GREY
-        return np.asarray(rgb)
+        high = max(float(np.percentile(known, MOST_PERCENT)), low + 1e-3)
+    ramp = colormaps[RAMPS[what][0]].with_extremes(bad=(GREY, GREY, GREY))
+    return ScalarMappable(Normalize(low, high), ramp)
 
 
 def show(scene: Scene3d, title: str) -> None:
@@ -113,11 +106,8 @@ def show(scene: Scene3d, title: str) -> None:
     o3d.visualization.draw(things, title=title, show_ui=True, bg_color=(1.0, 1.0, 1.0, 1.0))
 
 
-def view_figure(scene: Scene3d, scale: Scale) -> Figure:
+def view_figure(scene: Scene3d, scale: ScalarMappable, what: str) -> Figure:
     """Draw each cloud as dots with its name, side by side, and the scale of the colours."""
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
-
     count = len(scene.names)
     figure, axes = new_figure(
         0.8 + 6.4 * count, 5.2, ncols=count, squeeze=False, subplot_kw={"projection": "3d"}
@@ -134,7 +124,6 @@ def view_figure(scene: Scene3d, scale: Scale) -> Figure:
         panel.view_init(ELEVATION_DEG, AZIMUTH_DEG)
         panel.set_aspect("equal")
         panel.set(xlabel="East (m)", ylabel="North (m)", zlabel="Height (m)")
-    ramp, label = RAMPS[scale.what]
-    colour = ScalarMappable(Normalize(scale.low, scale.high), ramp)
-    figure.colorbar(colour, ax=list(axes[0]), label=label, shrink=0.8, extend="both")
+    label = RAMPS[what][1]
+    figure.colorbar(scale, ax=list(axes[0]), label=label, shrink=0.8, extend="both")
     return figure

@@ -10,7 +10,7 @@ import numpy as np
 from pcfix.grid.colours import DIFFERENCE
 from pcfix.model import FloatArray
 from pcfix.report.page import AFTER, BEFORE, WATER, Picture, draw_cloud, label_plan, new_figure
-from pcfix.report.text import aligned, shoreline_rows
+from pcfix.report.text import Rows, RowTable, aligned, filled, shoreline_rows
 from pcfix.water.auto import WaterProposal
 from pcfix.water.fit import WaterFit
 from pcfix.water.river import RiverFit
@@ -25,9 +25,19 @@ MOST_LISTED = 10
 WITNESSES = ("brightness", "noise")
 """Evidence that does not fix the level; it is drawn with thin lines."""
 SHOWN_CELLS = 40_000
-LEAST_REACH_M, REACH_SIGMAS = 1.5, 8.0
 LINES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)))
 COLOURS = (BEFORE, AFTER, "#5b3a8c", "#2f7d4f", "#222222", "#a07c00")
+_FIT: RowTable = (
+    ("Model", "{model}, {accepted} of {count} points; scatter {sigma_m:.3f} m", "count"),
+    ("Level", "{level_m:.3f} m at {x:.1f}, {y:.1f}; standard error {sigma_level_m:.3f} m",
+     "is_plane"),
+    ("Tilt", "{tilt_percent:.3f} %, standard error {sigma_tilt_percent:.3f} %, falls towards"
+     " {downhill_deg:.0f} deg", "is_tilted"),
+    ("Length", "{length_m:.1f} m, falls {drop_m:.3f} m; standard error of the level"
+     " {sigma_height_m:.3f} m", "is_river"),
+    ("Residuals", "of the accepted points: rms {rms:.3f} m, median {median:.3f} m, largest"
+     " {largest:.3f} m", "count"),
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,34 +95,15 @@ def _residuals(found: FoundSurface) -> list[dict[str, Any]] | None:
 
 def water_text(report: WaterReport) -> str:
     """Return the summary of a water surface."""
-    found, rows = report.found, list[tuple[str, str]]()
-    match found.evidence:
-        case WaterFit() as fit:
-            x, y = fit.centre_xy
-            level = f"{fit.level_m:.3f} m at {x:.1f}, {y:.1f}"
-            rows = [
-                _model_row(fit.model, fit),
-                ("Level", f"{level}; standard error {fit.sigma_level_m:.3f} m"),
-            ]
-            if fit.tilt.any():
-                rows.append(("Tilt", f"{fit.tilt_percent:.3f} %, standard error"
-                             f" {fit.sigma_tilt_percent:.3f} %, falls towards"
-                             f" {fit.downhill_deg:.0f} deg"))  # fmt: skip
-            rows += _residual_rows(fit, found.points)
-        case RiverFit() as river:
-            sigma = river.profile.sigma_height_m.mean()
-            rows = [
-                _model_row("river", river),
-                ("Length", f"{river.length_m:.1f} m, falls {river.drop_m:.3f} m; standard error of"
-                 f" the level {sigma:.3f} m"),
-                *_residual_rows(river, found.points),
-            ]  # fmt: skip
-        case WaterProposal() as proposal:
-            rows = [
-                ("Level", f"{proposal.level_m:.3f} m, standard error {proposal.sigma_level_m:.3f}"
-                 f" m, confidence {proposal.confidence:.2f}"),
-                *(("Evidence", reason) for reason in proposal.reasons),
-            ]  # fmt: skip
+    found, fit, rows = report.found, report.found.evidence, list[tuple[str, str]]()
+    if isinstance(fit, WaterFit | RiverFit):
+        rows = _fit_rows(fit, found.points)
+    elif isinstance(fit, WaterProposal):
+        rows = [
+            ("Level", f"{fit.level_m:.3f} m, standard error {fit.sigma_level_m:.3f} m, confidence"
+             f" {fit.confidence:.2f}"),
+            *(("Evidence", reason) for reason in fit.reasons),
+        ]  # fmt: skip
     if report.below is not None and report.unknown is not None:
         rows.append(("Cloud", f"{100.0 * report.below:.1f} % of {report.cloud} are below the"
                      f" surface, {100.0 * report.unknown:.1f} % have none above them"))  # fmt: skip
@@ -120,17 +111,25 @@ def water_text(report: WaterReport) -> str:
     return aligned(f"{report.spec}: {found.surface}", rows, found.notes)
 
 
-def _model_row(name: str, fit: WaterFit | RiverFit) -> tuple[str, str]:
-    used = f"{int(fit.accepted.sum())} of {len(fit.accepted)} points"
-    return "Model", f"{name}, {used}; scatter {fit.sigma_m:.3f} m"
-
-
-def _residual_rows(fit: WaterFit | RiverFit, points: FloatArray | None) -> list[tuple[str, str]]:
-    """Return the size of the residuals, and the rejected points, the largest residual first."""
+def _fit_rows(fit: WaterFit | RiverFit, points: FloatArray | None) -> Rows:
+    """Return the rows of a fit, and its rejected points, the largest residual first."""
     residual = fit.residual_m
     good = np.abs(residual[fit.accepted])
-    rows = [("Residuals", f"of the accepted points: rms {np.sqrt(np.mean(good**2)):.3f} m, median"
-             f" {np.median(good):.3f} m, largest {good.max():.3f} m")]  # fmt: skip
+    values: dict[str, Any] = {
+        "accepted": int(fit.accepted.sum()), "count": len(residual), "sigma_m": fit.sigma_m,
+        "rms": np.sqrt(np.mean(good**2)), "median": np.median(good), "largest": good.max(),
+    }  # fmt: skip
+    if isinstance(fit, RiverFit):
+        sigma = fit.profile.sigma_height_m.mean()
+        values |= {"model": "river", "is_river": True, "length_m": fit.length_m,
+                   "drop_m": fit.drop_m, "sigma_height_m": sigma}  # fmt: skip
+    else:
+        x, y = fit.centre_xy
+        names = ("model", "level_m", "sigma_level_m", "tilt_percent", "sigma_tilt_percent",
+                 "downhill_deg")  # fmt: skip
+        values |= {name: getattr(fit, name) for name in names}
+        values |= {"is_plane": True, "is_tilted": bool(fit.tilt.any()), "x": x, "y": y}
+    rows = filled(_FIT, values)
     if points is None:
         return rows
     rejected = np.flatnonzero(~fit.accepted & np.isfinite(residual))
@@ -144,26 +143,33 @@ def _residual_rows(fit: WaterFit | RiverFit, points: FloatArray | None) -> list[
 
 def water_figure(report: WaterReport) -> Figure:
     """Draw the shoreline points in plan and their residuals, or the evidence found in the cloud."""
-    found = report.found
-    if isinstance(found.evidence, WaterProposal):
-        return shoreline_figure(found.evidence)
+    found, fit = report.found, report.found.evidence
+    if isinstance(fit, WaterProposal):
+        return shoreline_figure(fit)
     figure, (plan, side) = new_figure(8.0, 7.5, nrows=2, height_ratios=[3, 2])
-    draw_cloud(figure, plan, report.sample_xyz, getattr(found.evidence, "level_m", None))
-    if found.evidence is not None and found.points is not None:
-        _points(plan, side, found.points, found.evidence)
+    draw_cloud(figure, plan, report.sample_xyz, getattr(fit, "level_m", None))
+    if fit is not None and found.points is not None:
+        _draw_fit(plan, side, found.points, fit)
     label_plan(plan, 20.0)
     plan.set_title(str(found.surface))
     return figure
 
 
-def _points(plan: Axes, side: Axes, points: FloatArray, fit: WaterFit | RiverFit) -> None:
-    station = _station(points, fit)
-    height = fit.height_at(points[:, :2])
+def _draw_fit(plan: Axes, side: Axes, points: FloatArray, fit: WaterFit | RiverFit) -> None:
+    """Draw the points of a fit in plan, and their heights along the river or the tilt."""
+    if isinstance(fit, RiverFit):
+        station, label = np.asarray(fit.axis.locate(points[:, :2])[0]), "Down the flow (m)"
+    else:
+        centred = points[:, :2] - points[:, :2].mean(axis=0)
+        axis = np.linalg.svd(centred, full_matrices=False)[2][0]  # of their longest extent
+        station = centred @ (-fit.tilt / np.hypot(*fit.tilt) if fit.tilt.any() else axis)
+        station, label = station - station.min(), "Along the points (m)"
     order = np.argsort(station)
-    side.plot(station[order], height[order], color=WATER, label="surface")
-    sigma = fit.sigma_at(points[:, :2])[order]
-    low, high = height[order] - 2.0 * sigma, height[order] + 2.0 * sigma
-    side.fill_between(station[order], low, high, color=WATER, alpha=0.3, label="95 %")
+    height = fit.height_at(points[order, :2])
+    reach = 2.0 * fit.sigma_at(points[order, :2])
+    side.plot(station[order], height, color=WATER, label="surface")
+    look: dict[str, Any] = {"color": WATER, "alpha": 0.3, "label": "95 %"}
+    side.fill_between(station[order], height - reach, height + reach, **look)
     for rows, mark, colour, name in (
         (fit.accepted, "o", AFTER, "accepted"),
         (~fit.accepted, "x", BEFORE, "rejected"),
@@ -171,23 +177,9 @@ def _points(plan: Axes, side: Axes, points: FloatArray, fit: WaterFit | RiverFit
         if rows.any():
             plan.plot(*points[rows, :2].T, mark, color=colour, markersize=5, label=name)
             side.plot(station[rows], points[rows, 2], mark, color=colour, markersize=5)
-    side.set_xlabel("Down the flow (m)" if isinstance(fit, RiverFit) else "Along the points (m)")
-    side.set_ylabel("Height (m)")
+    side.set(xlabel=label, ylabel="Height (m)")
     side.legend(loc="best")
     plan.legend(loc="upper right", bbox_to_anchor=(1.0, 1.0))
-
-
-def _station(points: FloatArray, fit: WaterFit | RiverFit) -> FloatArray:
-    """Return the distance of points along the river, the tilt, or their longest extent."""
-    if isinstance(fit, RiverFit):
-        return np.asarray(fit.axis.locate(points[:, :2])[0])
-    centred = points[:, :2] - points[:, :2].mean(axis=0)
-    if fit.tilt.any():
-        axis = -fit.tilt / np.hypot(*fit.tilt)
-    else:
-        axis = np.linalg.svd(centred, full_matrices=False)[2][0]
-    station = centred @ axis
-    return np.asarray(station - station.min())
 
 
 def found_picture(found: FoundSurface) -> Picture:
@@ -202,20 +194,41 @@ def found_picture(found: FoundSurface) -> Picture:
 def shoreline_figure(found: WaterProposal) -> Figure:
     """Draw the shoreline in plan, and heights and evidence beside it."""
     figure, axes = new_figure(
-        11.0, 6.5, nrows=2, ncols=2, width_ratios=[3, 2], height_ratios=[2, 3]
-    )
-    grid = axes[0, 0].get_gridspec()
-    for unused in axes[:, 0]:
-        unused.remove()
-    _plan(figure.add_subplot(grid[:, 0]), figure, found)
+        11.0, 6.5, mosaic=[["plan", "heights"], ["plan", "evidence"]], width_ratios=[3, 2],
+        height_ratios=[2, 3],
+    )  # fmt: skip
+    heights = found.ground[:, 2] - found.level_m
+    heights -= (found.ground[:, :2] - found.centre_xy) @ found.tilt
+    _draw_shoreline(axes["plan"], figure, found, heights)
     # heights to show: the ground, but no more than is needed to see the level
-    heights = _above(found, found.ground)
     low, high = np.percentile(heights, [1.0, 99.0])
-    most = 4.0 * max(LEAST_REACH_M, REACH_SIGMAS * found.sigma_level_m)
-    low = found.level_m + min(max(float(low), -most), -0.2)
-    high = found.level_m + max(min(float(high), most), 0.2)
-    _histogram(axes[0, 1], found, heights, (low, high))
-    _evidence(axes[1, 1], found, (low, high))
+    most = 4.0 * max(1.5, 8.0 * found.sigma_level_m)
+    limits = (
+        found.level_m + min(max(float(low), -most), -0.2),
+        found.level_m + max(min(float(high), most), 0.2),
+    )
+    axes["heights"].hist(heights + found.level_m, bins=90, range=limits, color="0.65")
+    axes["heights"].set(xlabel="Apparent height (m)", ylabel="Cells")
+    evidence = axes["evidence"]
+    shown = (found.curve_height_m >= limits[0]) & (found.curve_height_m <= limits[1])
+    for (name, gain), colour, line in zip(found.curves.items(), COLOURS, LINES, strict=False):
+        width = 0.9 if name in WITNESSES else 1.8
+        look: dict[str, Any] = {"color": colour, "linestyle": line, "linewidth": width}
+        gain = np.maximum(gain[shown], 0.0)
+        evidence.plot(found.curve_height_m[shown], gain, label=name, **look)
+    evidence.set(ylim=(0.0, None), ylabel="Evidence (log likelihood ratio)")
+    evidence.set(xlabel="Height of the water, if there (m)")
+    reach = 2.0 * found.sigma_level_m
+    for side in (axes["heights"], evidence):
+        side.axvline(found.level_m, color=WATER, label="water")
+        side.axvspan(
+            found.level_m - reach, found.level_m + reach, color=WATER, alpha=0.3, linewidth=0
+        )
+        side.set_xlim(limits)
+    axes["heights"].legend(loc="best")
+    evidence.legend(
+        loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=3, fontsize="small", frameon=False
+    )
     tilt = 100.0 * float(np.hypot(*found.tilt))
     kind = f", tilt {tilt:.2f} %" if tilt > 0.0 else ""
     figure.suptitle(
@@ -225,21 +238,16 @@ def shoreline_figure(found: WaterProposal) -> Figure:
     return figure
 
 
-def _above(found: WaterProposal, xyz: FloatArray) -> FloatArray:
-    """Return heights above the surface, metres."""
-    return np.asarray(xyz[:, 2] - found.level_m - (xyz[:, :2] - found.centre_xy) @ found.tilt)
-
-
-def _plan(axes: Axes, figure: Figure, found: WaterProposal) -> None:
-    ground = found.ground[:: len(found.ground) // SHOWN_CELLS + 1]
-    above_m = _above(found, ground)
+def _draw_shoreline(axes: Axes, figure: Figure, found: WaterProposal, above_m: FloatArray) -> None:
+    step = len(found.ground) // SHOWN_CELLS + 1
+    above_m, ground = above_m[::step], found.ground[::step]
     reach = max(float(np.percentile(np.abs(above_m), 95.0)), 0.2)
     corner = np.floor(found.ground[:, :2].min(axis=0))
     x, y = (ground[:, :2] - corner).T
-    size = 60.0 * np.sqrt(1_000.0 / len(ground))
     dots = axes.scatter(
-        x, y, c=above_m, s=size, cmap=DIFFERENCE, vmin=-reach, vmax=reach, linewidths=0, marker="s"
-    )
+        x, y, c=above_m, s=60.0 * np.sqrt(1_000.0 / len(ground)),
+        cmap=DIFFERENCE, vmin=-reach, vmax=reach, linewidths=0, marker="s",
+    )  # fmt: skip
     label = "Apparent height above the surface (m)"
     figure.colorbar(dots, ax=axes, label=label, location="bottom", shrink=0.7, aspect=30)
     shore_x, shore_y = (found.shoreline[:, :2] - corner).T
@@ -249,34 +257,3 @@ def _plan(axes: Axes, figure: Figure, found: WaterProposal) -> None:
     axes.set_xlabel(f"East (m) from {corner[0]:,.0f}")
     axes.set_ylabel(f"North (m) from {corner[1]:,.0f}")
     axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), frameon=False, borderaxespad=0.0)
-
-
-def _histogram(
-    axes: Axes, found: WaterProposal, above_m: FloatArray, limits: tuple[float, float]
-) -> None:
-    axes.hist(above_m + found.level_m, bins=90, range=limits, color="0.65")
-    _level(axes, found)
-    axes.set(xlim=limits, xlabel="Apparent height (m)", ylabel="Cells")
-    axes.legend(loc="best")
-
-
-def _level(axes: Axes, found: WaterProposal) -> None:
-    axes.axvline(found.level_m, color=WATER, label="water")
-    reach = 2.0 * found.sigma_level_m
-    axes.axvspan(found.level_m - reach, found.level_m + reach, color=WATER, alpha=0.3, linewidth=0)
-
-
-def _evidence(axes: Axes, found: WaterProposal, limits: tuple[float, float]) -> None:
-    low, high = limits
-    shown = (found.curve_height_m >= low) & (found.curve_height_m <= high)
-    height = found.curve_height_m[shown]
-    for (name, gain), colour, line in zip(found.curves.items(), COLOURS, LINES, strict=False):
-        width = 0.9 if name in WITNESSES else 1.8
-        values = np.maximum(gain[shown], 0.0)
-        axes.plot(height, values, color=colour, linestyle=line, linewidth=width, label=name)
-    _level(axes, found)
-    axes.set(xlim=limits, xlabel="Height of the water, if there (m)")
-    axes.set(ylim=(0.0, None), ylabel="Evidence (log likelihood ratio)")
-    axes.legend(
-        loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=3, fontsize="small", frameon=False
-    )

@@ -31,7 +31,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Lens, Views
+from pcfix.model import Cameras, FloatArray, IntArray, Lens, Views
 from pcfix.simulate.sight import Part, Partners, Sight, starts_of
 from pcfix.simulate.tracing import bed_points, piercing_points_of_planes, project, rotations_of
 
@@ -79,12 +79,6 @@ class Sightings(NamedTuple):
     start: FloatArray
     way: FloatArray
 
-    def take(self, kept: BoolArray) -> Sightings:
-        """Return some of them."""
-        return Sightings(
-            self.owner[kept], self.measured[kept], self.start[:, kept], self.way[:, kept]
-        )
-
 
 class Maps(NamedTuple):
     """Rays of m references, their depths before and after averaging, and the bed.
@@ -122,7 +116,10 @@ def fuse_depth_maps(
     place[seeded] = maps.points(seed[seeded], maps.averaged[seed[seeded]])
     maps = depth_maps(matching, place)
     rows = np.flatnonzero((group >= 0) & (group == seed[sight.point]))
-    rows = rows[_at(matching, maps, rows, place)]
+    # without those whose depth is not that of their point's place
+    rig = sight.rig
+    _, z = project(place[sight.point[rows]], rig.given, sight.camera[rows], rig.optics.lens)
+    rows = rows[np.abs(maps.averaged[rows] - z) < AGREE * z]
     count = np.bincount(sight.point[rows], minlength=len(seed))
     rows = rows[count[sight.point[rows]] >= LEAST_FUSED]
     point, weight = sight.point[rows], 1.0 / maps.averaged[rows] ** 2
@@ -199,33 +196,24 @@ def _depths(
         np.einsum("mij,mj->im", turn, origin[reference] - given.centres[camera]),
         np.einsum("mij,mj->im", turn, ray[reference]),
     )
-    depth = _plausible(_least_squares(first, sightings, lens), first)
+    depth = _least_squares(first, sightings, lens)
+    depth[~(np.abs(depth - first) < MOST_OFF * first)] = np.nan  # the images agree nowhere
     residual, slope = _residuals(depth, sightings, lens)
     shape = matching.partner.shape
     squares, right, curved = np.full(shape, np.inf), np.zeros(shape), np.ones(shape)
     squares[reference, slot] = (residual**2).sum(axis=1) + matching.cost_px2[reference, slot]
     right[reference, slot] = (slope * residual).sum(axis=1)
     curved[reference, slot] = (slope**2).sum(axis=1)
-    best = _best_pair(squares, right, curved)
-    taken = (best[reference] == slot[:, None]).any(axis=1)
-    return _plausible(_least_squares(depth, sightings.take(taken), lens), first)
-
-
-def _plausible(depth: FloatArray, first: FloatArray) -> FloatArray:
-    """Return depths without those that no search would go to: the images do not agree anywhere."""
-    return np.where(np.abs(depth - first) < MOST_OFF * first, depth, np.nan)
-
-
-def _best_pair(squares: FloatArray, right: FloatArray, curved: FloatArray) -> IntArray:
-    """Return the two slots of each row whose sum of squares can become least, shape (m, 2).
-
-    Squares are those at a depth close to all; `right` and `curved` say how they change with it:
-    the least of a pair is its sum - (sum of right)^2 / sum of curved.
-    """
-    one, other = np.triu_indices(squares.shape[1], 1)
+    # the pair whose sum of squares becomes least: sum - (sum of right)^2 / sum of curved
+    one, other = np.triu_indices(shape[1], 1)
     gain = (right[:, one] + right[:, other]) ** 2 / (curved[:, one] + curved[:, other])
     best = np.argmin(squares[:, one] + squares[:, other] - gain, axis=1)
-    return np.column_stack([one[best], other[best]])
+    taken = (one[best][reference] == slot) | (other[best][reference] == slot)
+    sightings = Sightings(
+        reference[taken], measured[taken], sightings.start[:, taken], sightings.way[:, taken]
+    )
+    depth = _least_squares(depth, sightings, lens)
+    return np.where(np.abs(depth - first) < MOST_OFF * first, depth, np.nan)
 
 
 def _measured(
@@ -337,13 +325,6 @@ def _beyond(matching: Matching, maps: Maps, seeds: IntArray, there: IntArray) ->
     normal = matching.normals[matching.sight.point[seeds]][:, None]
     reach = (maps.averaged[there][..., None] * maps.ray[there] * normal).sum(axis=2)
     return np.asarray(reach / ((at - maps.origin[there]) * normal).sum(axis=2) - 1.0)
-
-
-def _at(matching: Matching, maps: Maps, rows: IntArray, place: FloatArray) -> BoolArray:
-    """Return which rows have the depth of their point's place."""
-    rig, point = matching.sight.rig, matching.sight.point[rows]
-    _, z = project(place[point], rig.given, matching.sight.camera[rows], rig.optics.lens)
-    return np.asarray(np.abs(maps.averaged[rows] - z) < AGREE * z)
 
 
 def _means(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -19,7 +18,6 @@ RIVER_TILT_PERCENT = 0.3
 _NEIGHBOURS = {"tracks": 0, "pairs": 4, "depth-maps": 5}
 
 
-@dataclass(frozen=True, kw_only=True)
 class SceneSettings(SceneOptions):
     """The options of a scene, and what follows from them.
 

@@ -92,41 +92,28 @@ class Sight:
 def see(truth: FloatArray, rig: Rig, rng: np.random.Generator) -> Sight:
     """Trace every point, shape (n, 3), into every image; those in fewer than three have no pairs.
 
-    `rng` says what is detected.
+    `rng` says what is detected; the luckiest three images of a point always are.
     """
     cameras = rig.true
+    # how far from below each camera it can see anything: the most oblique ray of the frame's
+    # corner, prolonged as if there were no refraction
+    off_nadir = np.arccos(np.clip(-rotations_of(cameras)[:, 2, 2], -1.0, 1.0))
+    widest = np.minimum(np.arctan(rig.optics.reach) + off_nadir, np.radians(80.0))
+    reach = (cameras.centres[:, 2] - rig.lowest_m) * np.tan(widest)
     across = truth[:, None, 0] - cameras.centres[:, 0], truth[:, None, 1] - cameras.centres[:, 1]
-    point, camera = np.nonzero(np.hypot(*across) < _reach_m(rig))
+    point, camera = np.nonzero(np.hypot(*across) < reach)
     surface = rig.water.piercing_points(truth[point], cameras.centres[camera], camera)
     ideal, z = project(surface, cameras, camera, rig.optics.lens)
-    inside = (z > 0) & rig.optics.frames(ideal, rig.optics.to_image(ideal))
+    inside = (z > 0) & rig.optics.frames(rig.optics.to_image(ideal))
     point, camera, ideal = point[inside], camera[inside], ideal[inside]
-    taken = _detected(point, rig.detection, rng)
-    taken &= np.bincount(point, minlength=len(truth))[point] >= LEAST_VIEWS
+    taken = np.bincount(point, minlength=len(truth))[point] >= LEAST_VIEWS
+    if rig.detection < 1.0:
+        luck = rng.uniform(0.0, 1.0, len(point))
+        rank = np.empty(len(point), np.int64)
+        rank[np.lexsort((luck, point))] = np.arange(len(point)) - np.searchsorted(point, point)
+        taken &= (luck < rig.detection) | (rank < LEAST_VIEWS)
     point, camera, ideal = point[taken], camera[taken], ideal[taken]
     return Sight(rig, truth, starts_of(point, len(truth)), point, camera, ideal)
-
-
-def _reach_m(rig: Rig) -> FloatArray:
-    """Return how far from below each camera it can see anything, metres, shape (k,).
-
-    Generous: the flattest ray of the frame's corner, prolonged as if there were no refraction.
-    """
-    off_nadir = np.arccos(np.clip(-rotations_of(rig.true)[:, 2, 2], -1.0, 1.0))
-    flattest = np.minimum(np.arctan(rig.optics.reach) + off_nadir, np.radians(80.0))
-    return np.asarray((rig.true.centres[:, 2] - rig.lowest_m) * np.tan(flattest))
-
-
-def _detected(point: IntArray, probability: float, rng: np.random.Generator) -> np.ndarray:
-    """Return which pairs take part: by chance, but the luckiest three of a point always."""
-    if probability >= 1.0:
-        return np.ones(len(point), bool)
-    luck = rng.uniform(0.0, 1.0, len(point))
-    order = np.lexsort((luck, point))
-    first = np.searchsorted(point, point)  # the row at which each pair's point begins
-    rank = np.empty(len(point), np.int64)
-    rank[order] = np.arange(len(point)) - first
-    return np.asarray((luck < probability) | (rank < LEAST_VIEWS))
 
 
 SAMPLE = 1000
@@ -207,9 +194,13 @@ def openmvs_partners(
     the least score are not modelled. `ties`, shape (p, 3), are the reconstructed tie points,
     `count` the partners of a depth map; `rng` selects which features are found.
     """
-    cameras = sight.rig.given
+    cameras, optics = sight.rig.given, sight.rig.optics
     k = len(cameras)
-    cell = _cells(sight)
+    # the cell of each image in which each tie point is found, shape (k, p), -1 for none
+    cell = np.full((k, len(ties)), -1)
+    share = optics.to_image(sight.ideal) / [optics.lens.width, optics.lens.height]
+    column, row = np.clip((CELLS * share).astype(int), 0, CELLS - 1).T
+    cell[sight.camera, sight.point] = row * CELLS + column
     cell[_lost(ties, sight, cameras.centres, rng)] = -1
     axes = rotations_of(cameras)[:, 2]
     depth = np.einsum("ki,kpi->kp", axes, ties - cameras.centres[:, None])
@@ -219,38 +210,44 @@ def openmvs_partners(
         visible = np.flatnonzero(cell[i] >= 0)
         common = cell[:, visible] >= 0
         common[i] = False
-        angle = _angles_deg(cameras.centres, i, ties[visible])
+        counts = common.sum(axis=1)
+        rays = cameras.centres[:, None] - ties[visible]
+        rays /= np.linalg.norm(rays, axis=2)[:, :, None]
+        cosine = np.einsum("kmi,mi->km", rays, rays[i])
+        angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+        spread = np.where(angle < BEST_DEG, BELOW_DEG, ABOVE_DEG)
+        bell = np.exp(-0.5 * ((angle - BEST_DEG) / spread) ** 2)
         scale = depth[:, visible] / depth[i, visible]
-        area = _shares_of_cells(common, cell[i, visible])
-        score = (common * _weights(angle, scale)).sum(axis=1) * np.maximum(area, 0.01)
+        coarse = np.where(scale > FARTHER, (FARTHER / scale) ** 2, np.minimum(scale, 1.0) ** 2)
+        weight = np.maximum(bell, LEAST_WEIGHT) * coarse
+        # the share of the reference's cells that holds points in common with each image
+        holds = np.zeros((len(visible), CELLS * CELLS))
+        holds[np.arange(len(visible)), cell[i, visible]] = 1.0
+        area = (common.astype(float) @ holds > 0.0).sum(axis=1) / CELLS**2
+        score = (common * weight).sum(axis=1) * np.maximum(area, 0.01)
+        good = area >= LEAST_AREA
+        for values, (low, high) in ((scale, SCALES), (angle, ANGLES_DEG)):
+            mean = (common * values).sum(axis=1) / np.maximum(counts, 1)
+            good &= (mean >= low) & (mean <= high)
         order = np.argsort(-score, kind="stable")
-        order = order[common.sum(axis=1)[order] >= LEAST_COMMON]
-        good = (area >= LEAST_AREA) & _within(common, scale, SCALES)
-        good &= _within(common, angle, ANGLES_DEG)
-        kept = _filtered(order, good)[: table.shape[1]]
+        order = order[counts[order] >= LEAST_COMMON]
+        kept = list(order)
+        for candidate in order[::-1]:  # bad ones go, from the worst up, while more than nine remain
+            if len(kept) > LEAST_LEFT and not good[candidate]:
+                kept.remove(candidate)
+        kept = kept[: table.shape[1]]
         table[i, : len(kept)], known[i] = kept, len(order)
-        strong = kept[:count][score[kept[:count]] >= LEAST_SCORE * score[kept[:1]]]
+        strong = [one for one in kept[:count] if score[one] >= LEAST_SCORE * score[kept[0]]]
         matched[i, : len(strong)] = strong
     return Partners(matched, table[:, :AVERAGED], table[:, :MOST], known)
-
-
-def _cells(sight: Sight) -> IntArray:
-    """Return in which cell of each image each point lies, shape (k, p), -1 where it is not."""
-    optics = sight.rig.optics
-    cell = np.full((len(sight.rig.true), len(sight.truth)), -1)
-    share = optics.to_image(sight.ideal) / [optics.lens.width, optics.lens.height]
-    column, row = np.clip((CELLS * share).astype(int), 0, CELLS - 1).T
-    cell[sight.camera, sight.point] = row * CELLS + column
-    return cell
 
 
 def _lost(
     ties: FloatArray, sight: Sight, centres: FloatArray, rng: np.random.Generator
 ) -> tuple[IntArray, IntArray]:
     """Return cameras and points where a feature is not found again."""
-    count = np.diff(sight.start)
     luck = rng.uniform(0.0, 1.0, len(ties))
-    home = sight.start[:-1] + (luck * count).astype(int)
+    home = sight.start[:-1] + (luck * np.diff(sight.start)).astype(int)
     first = np.minimum(home, max(0, len(sight.camera) - 1))[sight.point]
     ray = centres[sight.camera] - ties[sight.point]
     ray /= np.linalg.norm(ray, axis=1)[:, None]
@@ -258,44 +255,6 @@ def _lost(
     angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
     gone = rng.uniform(0.0, 1.0, len(ray)) > np.exp(-((angle / FOUND_AGAIN_DEG) ** 2))
     return sight.camera[gone], sight.point[gone]
-
-
-def _angles_deg(centres: FloatArray, i: int, places: FloatArray) -> FloatArray:
-    """Return the angles at places between the rays to image i and to every other, (k, m)."""
-    rays = centres[:, None] - places
-    rays /= np.linalg.norm(rays, axis=2)[:, :, None]
-    cosine = np.einsum("kmi,mi->km", rays, rays[i])
-    return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
-
-
-def _weights(angle_deg: FloatArray, scale: FloatArray) -> FloatArray:
-    spread = np.where(angle_deg < BEST_DEG, BELOW_DEG, ABOVE_DEG)
-    bell = np.exp(-0.5 * ((angle_deg - BEST_DEG) / spread) ** 2)
-    coarse = np.where(scale > FARTHER, (FARTHER / scale) ** 2, np.minimum(scale, 1.0) ** 2)
-    return np.asarray(np.maximum(bell, LEAST_WEIGHT) * coarse)
-
-
-def _shares_of_cells(common: np.ndarray, cell: IntArray) -> FloatArray:
-    """Return what share of the reference's cells holds points in common with each image, (k,)."""
-    holds = np.zeros((len(cell), CELLS * CELLS))
-    holds[np.arange(len(cell)), cell] = 1.0
-    return np.asarray((common.astype(float) @ holds > 0.0).sum(axis=1) / CELLS**2)
-
-
-def _within(common: np.ndarray, values: FloatArray, limits: tuple[float, float]) -> np.ndarray:
-    mean = (common * values).sum(axis=1) / np.maximum(common.sum(axis=1), 1)
-    return np.asarray((mean >= limits[0]) & (mean <= limits[1]))
-
-
-def _filtered(order: IntArray, good: np.ndarray) -> IntArray:
-    """Drop bad candidates from the worst up, while more than nine remain."""
-    kept = list(order)
-    for candidate in order[::-1]:
-        if len(kept) <= LEAST_LEFT:
-            break
-        if not good[candidate]:
-            kept.remove(candidate)
-    return np.array(kept, int)
 
 
 def match_pairs(sight: Sight, table: IntArray, rng: np.random.Generator) -> Part:
@@ -317,8 +276,10 @@ def match_pairs(sight: Sight, table: IntArray, rng: np.random.Generator) -> Part
     )
     start = starts_of(point, len(truth))
     xyz, paired = truth.copy(), np.diff(start) > 0
+    low, high = (start[:-1] + (np.diff(start) + i) // 2 for i in (-1, 0))
     for axis in range(3):
-        xyz[paired, axis] = _medians(places[:, axis], point, start)[paired]
+        ordered = places[np.lexsort((places[:, axis], point)), axis]
+        xyz[paired, axis] = (ordered[low[paired]] + ordered[high[paired]]) / 2.0
     used = np.zeros(len(sight.point), bool)
     used[both] = True
     views = Views(starts_of(sight.point[used], len(truth)), sight.camera[used])
@@ -336,11 +297,3 @@ def pair_rows(sight: Sight, table: IntArray) -> tuple[IntArray, IntArray]:
     both = (rows[:, first] >= 0) & (rows[:, second] >= 0)
     point, pair = np.nonzero(both)
     return rows[point, first[pair]], rows[point, second[pair]]
-
-
-def _medians(values: FloatArray, point: IntArray, start: IntArray) -> FloatArray:
-    """Return the median of each point's values, shape (n,); any number where it has none."""
-    ordered = np.concatenate([values[np.lexsort((values, point))], [0.0]])
-    count = np.diff(start)
-    low, high = start[:-1] + (count - 1) // 2, start[:-1] + count // 2
-    return np.asarray((ordered[low] + ordered[high]) / 2.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from pcfix.model import (
     WaterRaster,
     WaterSurface,
 )
-from pcfix.sums import Sums
+from pcfix.sums import LEAST, MOST, Sums
 from pcfix.water.surface import surface_above
 
 MOST_TILT = 0.05
@@ -172,48 +173,49 @@ def overall_tilt(water: WaterSurface) -> float:
     return float(np.hypot(*slope))
 
 
+@dataclass(frozen=True)
 class WaterMeeting(Sums):
-    """Depths and coverage of a cloud below a water surface, accumulated over chunks."""
+    """Depths and coverage of a cloud below a water surface."""
 
-    added = (
-        *("_points", "_submerged", "_uncovered", "_uncovered_low"),
-        *("_doubtful", "_too_deep"),
-    )
-    least = ("_low_m", "_least_depth_m", "_lowest_water_m")
-    most = ("_high_m", "_most_depth_m")
+    points: int
+    submerged: int
+    uncovered: int
+    uncovered_low: int
+    doubtful: int
+    too_deep: int
+    low_m: float = field(metadata=LEAST)
+    high_m: float = field(metadata=MOST)
+    lowest_water_m: float = field(metadata=LEAST)
+    least_depth_m: float = field(metadata=LEAST)
+    most_depth_m: float = field(metadata=MOST)
 
-    def __init__(self, water: WaterSurface, *, deep: bool = False) -> None:
-        self._water, self._may_be_deep = water, deep
-        self._doubtful = self._too_deep = 0
-        self._most_depth_m = 0.0
-        self._highest_m = _highest(water)
-        self._points = self._submerged = self._uncovered = self._uncovered_low = 0
-        self._low_m, self._high_m = np.inf, -np.inf
-        self._least_depth_m = self._lowest_water_m = np.inf
-        self.notes: list[str] = []
-
-    def add(self, apparent: FloatArray, correction: Correction) -> None:
-        """Add one chunk: the apparent points, shape (n, 3), and their correction."""
+    @classmethod
+    def of(cls, apparent: FloatArray, correction: Correction, water: WaterSurface) -> WaterMeeting:
+        """Return the figures of the apparent points of a chunk, shape (n, 3)."""
         z, unknown = apparent[:, 2], ~correction.water_known
-        self._points += len(z)
-        self._low_m = min(self._low_m, float(z.min(initial=np.inf)))
-        self._high_m = max(self._high_m, float(z.max(initial=-np.inf)))
-        self._lowest_water_m = min(self._lowest_water_m, correction.lowest_water_m)
         depth = correction.depth_m[correction.submerged]
-        self._submerged += len(depth)
-        self._least_depth_m = min(self._least_depth_m, float(depth.min(initial=np.inf)))
-        self._doubtful += int((depth > DOUBTFUL_M).sum())
-        self._too_deep += int((depth > TOO_DEEP_M).sum())
-        self._most_depth_m = max(self._most_depth_m, float(depth.max(initial=0.0)))
-        self._uncovered += int(unknown.sum())
-        self._uncovered_low += int((z[unknown] < self._highest_m).sum())
+        return cls(
+            points=len(z),
+            submerged=len(depth),
+            uncovered=int(unknown.sum()),
+            uncovered_low=int((z[unknown] < _highest(water)).sum()),
+            doubtful=int((depth > DOUBTFUL_M).sum()),
+            too_deep=int((depth > TOO_DEEP_M).sum()),
+            low_m=float(z.min(initial=np.inf)),
+            high_m=float(z.max(initial=-np.inf)),
+            lowest_water_m=correction.lowest_water_m,
+            least_depth_m=float(depth.min(initial=np.inf)),
+            most_depth_m=float(depth.max(initial=0.0)),
+        )
 
-    def check_submerged(self, name: str) -> None:
+    def check_submerged(self, name: str, water: WaterSurface) -> None:
         """Raise GeometryError if no point lies below the water."""
-        check_submerged(self._submerged, name, self._water, self._heights())
+        check_submerged(self.submerged, name, water, self._heights())
 
-    def check_reach(self, name: str) -> None:
-        """Check for water far above the cloud, and warn of points that it does not cover.
+    def check_reach(self, name: str, water: WaterSurface, *, deep: bool = False) -> list[str]:
+        """Check for water far above the cloud; warn of points that it does not cover.
+
+        `deep` allows depths of more than `TOO_DEEP_M`. Returns the warnings as sentences.
 
         Raises
         ------
@@ -222,54 +224,54 @@ class WaterMeeting(Sums):
             many are deeper than `TOO_DEEP_M` and that was not allowed.
         """
         found = []
-        where = f"below the water ({self._water})"
-        if self._submerged == self._points and self._least_depth_m > DEEPEST_M:
+        where = f"below the water ({water})"
+        if self.submerged == self.points and self.least_depth_m > DEEPEST_M:
             raise GeometryError(
                 "water.above_cloud",
                 f"{name}: all points lie more than {DEEPEST_M:g} m {where}, the highest"
-                f" {self._least_depth_m:.0f} m{self._heights()}. Check the height of the water and"
+                f" {self.least_depth_m:.0f} m{self._heights()}. Check the height of the water and"
                 " its vertical datum.",
-                path=name, depth_m=self._least_depth_m,
+                path=name, depth_m=self.least_depth_m,
             )  # fmt: skip
-        least = DEEP_SHARE * self._submerged
-        land = "" if self._submerged < self._points else "; no point is left as land"
-        why = f"the deepest {self._most_depth_m:.0f} m {where}{land}{self._heights()}"
-        if self._too_deep > least and not self._may_be_deep:
+        few = DEEP_SHARE * self.submerged
+        land = "" if self.submerged < self.points else "; no point is left as land"
+        why = f"the deepest {self.most_depth_m:.0f} m {where}{land}{self._heights()}"
+        if self.too_deep > few and not deep:
             raise GeometryError(
                 "water.too_deep",
-                f"{name}: {self._too_deep:,} of {self._submerged:,} submerged points lie deeper"
+                f"{name}: {self.too_deep:,} of {self.submerged:,} submerged points lie deeper"
                 f" than {TOO_DEEP_M:g} m, {why}. Check the height of the water and its vertical"
                 " datum, or use --deep if the depths are right.",
-                path=name, points=self._too_deep, depth_m=self._most_depth_m,
+                path=name, points=self.too_deep, depth_m=self.most_depth_m,
             )  # fmt: skip
-        if self._doubtful > least:
+        if self.doubtful > few:
             found.append(
                 PcfixWarning(
                     "water.deep",
-                    f"{name}: {self._doubtful:,} of {self._submerged:,} submerged points lie deeper"
+                    f"{name}: {self.doubtful:,} of {self.submerged:,} submerged points lie deeper"
                     f" than {DOUBTFUL_M:g} m, {why}. Check the height of the water and its vertical"
                     " datum.",
-                    points=self._doubtful,
+                    points=self.doubtful,
                 )
             )
-        if self._uncovered_low:
+        if self.uncovered_low:
             found.append(
                 PcfixWarning(
                     "water.not_covered",
-                    f"{name}: the water surface ({self._water}) does not cover"
-                    f" {100.0 * self._uncovered / self._points:.1f} % of the points;"
-                    f" {self._uncovered_low:,} of them are lower than its highest place and may be"
+                    f"{name}: the water surface ({water}) does not cover"
+                    f" {100.0 * self.uncovered / self.points:.1f} % of the points;"
+                    f" {self.uncovered_low:,} of them are lower than its highest place and may be"
                     " under water. They are not corrected.",
-                    points=self._uncovered_low,
+                    points=self.uncovered_low,
                 )
             )
-        self.notes = [str(one) for one in found]
         for one in found:
             warnings.warn(one, stacklevel=2)
+        return [str(one) for one in found]
 
     def _heights(self) -> str:
         """Return the range of the cloud's heights, and whether cloud or water may be in feet."""
-        low, high, level = self._low_m, self._high_m, self._lowest_water_m
+        low, high, level = self.low_m, self.high_m, self.lowest_water_m
         if not np.isfinite([low, high]).all():
             return ""
         text = f"; the cloud's heights are {low:.2f} to {high:.2f} m"

@@ -16,7 +16,6 @@ from pcfix.adjust.block import (
     true_start,
     usable_ties,
     well_seen,
-    with_places,
 )
 from pcfix.model import TiePoints, Views, WaterPlane
 from pcfix.simulate.tracing import project
@@ -55,16 +54,6 @@ def test_observations():
     assert len(block.owner) == len(made.views.camera) + len(control.point)
 
 
-def test_unsorted_marks():
-    control = scene().control
-    order = np.random.default_rng(2).permutation(len(control.point))
-    mixed = replace(
-        control, point=control.point[order], camera=control.camera[order],
-        image_xy=control.image_xy[order], sigma_px=control.sigma_px[order],
-    )  # fmt: skip
-    assert observations(gathered(control=mixed)) == observations(gathered())
-
-
 def test_check_points():
     made, block = scene(), gathered()
     m, control = len(made.truth), made.control
@@ -100,14 +89,6 @@ def test_ties_of_cloud():
     np.testing.assert_allclose(ties.image_xy, expected, atol=1e-6)  # px: of thousands
     np.testing.assert_array_equal(ties.views.start, views.start)
     np.testing.assert_array_equal(ties.views.camera, views.camera)
-
-
-def test_points_behind_cameras():
-    made = scene()
-    xyz = np.vstack([made.truth[:1], made.cameras.centres[:1] + np.array([0.0, 0.0, 50.0])])
-    views = Views(np.array([0, 2, 5]), np.array([0, 1, 0, 1, 2]))
-    ties = ties_of_cloud(xyz, views, made.cameras)
-    np.testing.assert_array_equal(ties.xyz, xyz[:1])
 
 
 def test_usable_ties():
@@ -165,16 +146,3 @@ def test_control_under_water():
     with refused("gcps.under_water", point=name):
         gathered(control=silent)
     assert gathered(control=silent, water=None).control_names == control.names
-
-
-def test_with_places():
-    """As of Pix4D, whose files have image places only; straight, so the apparent points."""
-    made = scene()
-    lost = TiePoints(np.full_like(made.ties.xyz, np.nan), made.ties.views, made.ties.image_xy)
-    placed = with_places(lost, made.cameras)
-    dry = made.truth[:, 2] > made.water.a + 0.3
-    # m: image places have half a pixel of noise, at 80 m two centimetres in plan and more in height
-    np.testing.assert_allclose(placed.xyz[dry], made.truth[dry], atol=0.5)
-    wet = made.truth[:, 2] < made.water.a - 1.0
-    assert (placed.xyz[wet, 2] > made.truth[wet, 2]).mean() > 0.9
-    assert placed.views is lost.views

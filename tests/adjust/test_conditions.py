@@ -10,13 +10,10 @@ import pytest
 from pcfix.adjust.block import PLANES, Conditions, Unknowns
 from pcfix.adjust.precision import precision_of
 from pcfix.adjust.problem import prepare
-from pcfix.adjust.result import adjusted_of, redundancy_of
-from pcfix.adjust.shared_errors import pulls_of
-from pcfix.adjust.solve import reduced_at
+from pcfix.adjust.result import redundancy_of
 from pcfix.model import WaterMesh, WaterPlane, WaterRaster
 from tests.utils import tie_blocks
 from tests.utils.adjust_twin import Twin
-from tests.utils.codes import refused
 from tests.utils.curved_water import under_bent_water
 from tests.utils.nightly import mostly_nightly
 from tests.utils.tie_blocks import block_of
@@ -188,34 +185,3 @@ def test_level_surface(kind):
     _, wanted, as_plane = adjusted(plane, LEVEL)
     assert found.shared[0] == pytest.approx(wanted.shared[0], abs=1e-6)  # m
     assert precision.sigma_of("level") == pytest.approx(as_plane.sigma_of("level"), rel=1e-6)
-
-
-def test_pulls_of_groups():
-    made = scene(60)
-    made, conditions = put(made, {
-        "water": (np.arange(6), at_level(made)),
-        "floor": (np.arange(6, 12), at_level(made, depth=1.0)),
-    })  # fmt: skip
-    block = block_with(made, conditions, gnss=False, start_xyz=made.truth + 0.01)
-    problem, start = prepare(block, Unknowns(poses="fixed", lens=("f",), level_sigma_m=FREE))
-    reduced = reduced_at(problem, start)
-    pulls = pulls_of(problem, start, block.owner % 5, np.zeros((0, 2)))
-    np.testing.assert_allclose(pulls.sum(axis=0)[reduced.active], reduced.right, rtol=1e-7)
-
-
-def test_distances():
-    made = scene(60)
-    made, conditions = put(made, {"water": (np.arange(6), at_level(made))})
-    problem, found, precision = adjusted(block_with(made, conditions), LEVEL)
-    (row,) = adjusted_of(problem, found, precision, [], "tie points", "direct").on_surfaces
-    off = found.state.water[0] - found.state.xyz[:6, 2]
-    assert (row.surface, row.points, row.sigma_m) == ("water", 6, pytest.approx(SIGMA_M))
-    assert row.rms_m == pytest.approx(np.sqrt(np.mean(off**2)))
-    assert row.largest_point == f"P{np.argmax(np.abs(off))}"
-
-
-def test_few_points():
-    made = scene(60)
-    made, conditions = put(made, {"floor": (np.arange(3), at_level(made, depth=1.0))})
-    with refused("gcps.few_on_plane", plane="floor", points=3, least=4):
-        prepare(block_with(made, conditions), Unknowns(lens=()))

@@ -7,14 +7,11 @@ import pytest
 
 from pcfix.adjust.block import deeper
 from pcfix.adjust.diagnosis import (
-    Sign,
     bed_sign,
     control_sign,
-    diagnosis_of,
     focal_sign,
     gnss_is_suspicious,
     gnss_sign,
-    land_sign,
     tie_point_sign,
 )
 from pcfix.adjust.from_cloud import mended
@@ -78,17 +75,6 @@ def test_absorbed():
     assert by_gnss.size_m == pytest.approx(np.sqrt(np.mean(found.land_m**2)))
 
 
-@pytest.mark.parametrize(
-    ("block", "n"),
-    [({"seed": 3, "n": 1.0}, 1.0), ({"seed": 5, "points": 30, "strips": (3, 3)}, N)],
-    ids=["no refraction", "few points"],
-)  # fmt: skip
-def test_silent(block, n):
-    true = TrueBlock(**block)
-    sign, _ = tie_sign(true, true.cameras, n=n)
-    assert sign.speaks is None and sign.why == sign.words
-
-
 def test_random_errors():
     true = TrueBlock(4)
     rng = np.random.default_rng(4)
@@ -97,15 +83,6 @@ def test_random_errors():
     sign, apparent = tie_sign(true, moved)
     assert sign.speaks is not True
     assert gnss_signs(moved, apparent)[1].speaks is not True
-
-
-def test_land():
-    rng = np.random.default_rng(0)
-    low = land_sign(rng.normal(-0.96, 0.1, 200), 0.05, "a survey")
-    assert low.speaks is True
-    assert low.size_m == pytest.approx(0.96, abs=0.03)  # 4 standard errors of a median
-    assert land_sign(rng.normal(-0.05, 0.1, 200), 0.05, "a survey").speaks is None
-    assert land_sign(np.array([-1.0, np.nan]), 0.05, "a survey").speaks is None
 
 
 def test_bed():
@@ -125,16 +102,3 @@ def test_control_and_focal_length():
     assert short.speaks is True
     assert short.size_m == pytest.approx(75.0 * 3.5 / 1500.0)
     assert focal_sign(np.array([1501.0]), np.array([1500.0]), 75.0).speaks is None
-
-
-def test_order():
-    land = land_sign(np.full(9, -1.0), 0.05, "a survey")
-    ties = Sign("tie points", {}, speaks=False, why="they fit")
-    assert diagnosis_of([land]).absorbed is True
-    assert diagnosis_of([land, ties]).absorbed is False
-    assert diagnosis_of([land, ties]).sentence("x") == ""
-    unsure = replace(ties, speaks=None)
-    assert diagnosis_of([unsure, land]).decided_by is land
-    assert "1 m" in diagnosis_of([land]).sentence("pcfix adjust a b")
-    assert diagnosis_of([land]).sentence("pcfix adjust a b").endswith("pcfix adjust a b")
-    assert diagnosis_of([]).absorbed is None

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pcfix.adjust.block import Unknowns
-from pcfix.adjust.precision import correlated, drawn, members_of, precision_of, undetermined
+from pcfix.adjust.precision import correlated, members_of, precision_of, undetermined
 from pcfix.adjust.problem import solved_cameras, water_of
 from pcfix.adjust.solve import moved_by
 from tests.utils.adjust_twin import Twin
@@ -125,19 +125,6 @@ def test_normalised_error_of_unknown(kind):
     assert 0.82 < np.sqrt((repeats()[0][kind] ** 2).mean()) < 1.18
 
 
-def test_cost():
-    """The weighted squares add up to observations minus unknowns, so that sigma0 is one."""
-    errors, problem = repeats()
-    block = problem.block
-    observations = 2 * len(block.camera)
-    for sigma in (block.surveyed_sigma_m, block.gnss_sigma_m):
-        observations += np.isfinite(sigma).sum()
-    unknowns = problem.moves.sum() + 3 * len(block.xyz)
-    # its variance is twice the redundancy
-    allowed = 4.0 * np.sqrt(2.0 * (observations - unknowns) / REPEATS)
-    assert abs(errors["cost"].mean() - (observations - unknowns)) < allowed
-
-
 def test_similarity():
     made, rng = tiny(20), np.random.default_rng(3)
     errors = []
@@ -193,23 +180,6 @@ def test_undetermined(change, given, unknowns, wanted):
         precision_of(*adjusted(block, unknowns))
 
 
-def test_point_of_one_image():
-    made = tiny()
-    block = block_of(made)
-    sigma = block.sigma_px.copy()
-    sigma[block.start[4] + 1 : block.start[5]] = np.inf  # one image of point 4 is left
-    problem, found = adjusted(replace(block, sigma_px=sigma), Unknowns(lens=()))
-    precision = precision_of(problem, found)
-    sigma[block.start[4]] = np.inf
-    problem, found = adjusted(replace(block, sigma_px=sigma), Unknowns(lens=()))
-    without = precision_of(problem, found)
-    assert np.isnan(precision.point_covariance_m2[4]).all()
-    assert np.isnan(precision.point_covariance_m2).sum() == 6
-    assert precision.notes[0].code == "adjust.loose_points"
-    assert precision.notes[0].values["points"] == 1
-    np.testing.assert_allclose(precision.centre_sigma_m, without.centre_sigma_m, rtol=1e-6)
-
-
 def test_sloping_bed():
     """Over an evenly sloping bed, straight down, level, tilt and index move the bed alike.
 
@@ -252,17 +222,6 @@ def test_large_block(monkeypatch):
     np.testing.assert_allclose(parts.pose_covariance, whole.pose_covariance, rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(parts.correlation, whole.correlation, atol=1e-6)
     assert not whole.pose_covariance[1:3].any()
-
-
-def test_draws():
-    rng = np.random.default_rng(1)
-    sigma = 10.0 ** np.arange(-6, 2)
-    mix = rng.normal(size=(8, 8))
-    covariance = mix @ mix.T * sigma * sigma[:, None]
-    draws = drawn(covariance, 40_000)
-    found = draws.T @ draws / len(draws)
-    scale = np.sqrt(covariance.diagonal())
-    assert np.abs((found - covariance) / scale / scale[:, None]).max() < 0.03
 
 
 @pytest.mark.parametrize("poses", ["free", "similarity"])
@@ -309,21 +268,3 @@ def test_members_scatter():
     assert np.sqrt(squares.mean() / (wanted**2).mean()) == pytest.approx(1.0, abs=0.1)
     f = np.sqrt((members.lens[:, 0, 0] ** 2).mean())
     assert f == pytest.approx(precision.sigma_of("f"), rel=0.3)
-
-
-def test_members_of_another_block():
-    problem, found = adjusted(block_of(tiny()), Unknowns(lens=("f",)))
-    members, cameras = precision_of(problem, found).members, solved_cameras(problem, found)
-    turn = Rotation.from_rotvec([0.3, 0.2, 1.0]).as_matrix()
-    elsewhere = replace(cameras, centres=0.9996 * cameras.centres @ turn.T + 5e5)
-    assert members.rows_of(elsewhere) is not None
-    far = cameras.centres.copy()
-    far[0, 0] += 0.01
-    longer = tuple(replace(lens, focal=lens.focal + 0.1) for lens in cameras.lenses)
-    for other in (
-        replace(cameras, centres=far),
-        replace(cameras, lenses=longer),
-        replace(cameras, labels=("other", *cameras.labels[1:])),
-        replace(cameras, rotations=None, lenses=None),
-    ):
-        assert members.rows_of(other) is None

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from pcfix.adjust.block import Unknowns
 from pcfix.adjust.precision import precision_of, undetermined
 from pcfix.adjust.problem import solved_cameras, water_of
-from pcfix.kernels import threads
 from pcfix.model import WaterMesh, WaterPlane, WaterRaster
 from tests.utils.adjust_twin import Twin
 from tests.utils.nightly import mostly_nightly
@@ -142,18 +141,6 @@ def test_level():
     assert undetermined(precision, problem.unknowns) == []
 
 
-def test_tilt():
-    made = scene(1500, tilt_percent=1.0, **WIDE)
-    x, y = np.round(made.cameras.centres.mean(axis=0))[:2]
-    level = made.water.a + made.water.b * x + made.water.c * y
-    block = block_of(made, control=True, water=WaterPlane(level))
-    problem, found = adjusted(block, Unknowns(lens=(), level_sigma_m=FREE, tilt_sigma=FREE))
-    plane, precision = water_of(problem, found.state), precision_of(problem, found)
-    for name, miss in (("tilt_x", plane.b - made.water.b), ("tilt_y", plane.c - made.water.c)):
-        assert abs(miss) < 3.5 * precision.sigma_of(name) < 0.002  # m/m
-    assert abs(plane.a + plane.b * x + plane.c * y - level) < 0.02  # m
-
-
 @pytest.mark.parametrize("points", [100, 1500])
 def test_index(points):
     made = scene(points, **(WIDE if points > 100 else {}))
@@ -168,14 +155,6 @@ def test_index(points):
     else:
         assert precision.sigma_of("index") > 0.005
         assert (notes[0].code, notes[0].values["unknown"]) == ("adjust.undetermined", "index")
-
-
-def test_fixed_poses():
-    made = scene()
-    block = block_of(made, exact=True, cameras=made.true_cameras, start_xyz=disturbed(made))
-    problem, found = adjusted(block, Unknowns(poses="fixed", lens=()))
-    assert max(misses(made, problem, found)) < HOME_M
-    np.testing.assert_array_equal(found.state.centres + problem.origin, made.true_cameras.centres)
 
 
 def test_similarity():
@@ -207,19 +186,6 @@ def test_level_surface(kind):
     np.testing.assert_allclose(found.state.xyz, wanted.state.xyz, atol=1e-6)
     height = level + found.state.water[0]
     assert abs(height - water_of(problem, wanted.state).a) < 1e-6
-
-
-def test_threads():
-    made = scene()
-    unknowns = Unknowns(lens=("f",), level_sigma_m=FREE, index_sigma=FREE)
-    block, states = block_of(made, control=True), []
-    for count in (1, 3):
-        with threads(count):
-            problem, found = adjusted(block, unknowns)
-            points = precision_of(problem, found).point_covariance_m2
-            states.append((*found.state, found.shared, points))
-    for one, two in zip(*states, strict=True):
-        np.testing.assert_array_equal(one, two)
 
 
 @pytest.mark.parametrize("tilt", [None, 2.0], ids=["level", "tilted"])

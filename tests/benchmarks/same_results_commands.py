@@ -345,7 +345,6 @@ def table() -> dict[str, str]:
     kinds = {"tracks": "", "pairs": "--cloud pairs --bed river", "depth-maps": flight}
     kinds["waves"] = "--wave-slope-deg 1 --tilt-percent 0.2 --bed steps --seed 3 --lidar-per-m2 1"
     add("simulate", SIMULATE, kinds)
-    commands["simulate.effect"] = "simulate out --refraction-effect --effect-heights 100"
     reference = f"{RUN} --reference {{samples}}/scene/lidar.laz --resolution 2"
     commands["run.reference"] = reference
     commands["run.again"] = f"{RUN} --quiet && {RUN} && run other --config out/run.json"

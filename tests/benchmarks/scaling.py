@@ -17,7 +17,7 @@ import numpy as np
 import pcfix
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Batch, Survey
-from pcfix.refract.intersect import intersect_in_frame
+from pcfix.refract.intersect import intersect
 from pcfix.water.surface import SurfaceAbove
 
 CAMERAS = (50, 200, 1000, 5000)
@@ -63,7 +63,7 @@ def measured(count, points, *, in_strips):
     clock, core = np.inf, np.inf
     for _ in range(6):
         started, used = time.perf_counter(), time.process_time()
-        found = intersect_in_frame(Batch(xyz, above, survey))
+        found = intersect(Batch(xyz, above, survey))
         clock = min(clock, time.perf_counter() - started)
         core = min(core, time.process_time() - used)
     return count, float(found.ray_count.mean()), 1e6 * clock / points, 1e6 * core / points

@@ -23,7 +23,6 @@ from tests.utils.clouds import (
     add_undescribed_bytes,
     block,
     fields,
-    random_cloud,
     read_raw,
     write_cloud,
 )
@@ -108,16 +107,6 @@ def test_drop(tmp_path: Path) -> None:
     assert np.array_equal(after.points, before.points[~noise])
     assert result.dropped == result.noise == noise.sum() > 0
     assert struct.unpack_from("<Q", after.header, 247)[0] == len(after.points)
-
-
-@pytest.mark.parametrize("tile_m", [15.0, 1e6])
-def test_chunks_and_tiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tile_m: float) -> None:
-    s = spoilt_scene(20_000, 100)
-    source = _plain(tmp_path / "in.laz", s.xyz)
-    clean_file(source, tmp_path / "one.las", water=s.water_level_m)
-    monkeypatch.setattr("pcfix.io.las.source.CHUNK_POINTS", 3000)
-    clean_file(source, tmp_path / "two.las", water=s.water_level_m, tile_m=tile_m, jobs=1)
-    assert (tmp_path / "one.las").read_bytes() == (tmp_path / "two.las").read_bytes()
 
 
 def test_record(tmp_path: Path) -> None:
@@ -234,27 +223,3 @@ def test_refused_files(tmp_path: Path) -> None:
             clean_file(*files, **options)
     assert sorted(p.name for p in tmp_path.iterdir()) == before
     assert (tmp_path / "there.las").read_bytes() == b"work"
-
-
-def test_drop_everything_refused(tmp_path: Path) -> None:
-    las = random_cloud(7)
-    las.classification[:], las.withheld[:] = 40, 0
-    las.add_extra_dim(laspy.ExtraBytesParams("RayCount", "uint16"))
-    las.RayCount[:] = 2
-    las.write(tmp_path / "in.las")
-    with refused("cloud.all_noise", points=len(las)):
-        clean_file(tmp_path / "in.las", tmp_path / "out.las", drop=True)
-    assert not (tmp_path / "out.las").exists()
-
-
-def test_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    source = _plain(tmp_path / "in.las", spoilt_scene(20_000, 100).xyz)
-
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("pcfix.blocks.LARGE", 1000)
-    monkeypatch.setattr("os.posix_fallocate", full, raising=False)
-    with pytest.raises(InputError):
-        clean_file(source, tmp_path / "out.las")
-    assert [p.name for p in tmp_path.iterdir()] == ["in.las"]

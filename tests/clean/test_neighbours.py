@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pcfix.clean import neighbours
 from pcfix.clean.neighbours import Neighbours, height_quartiles, make_tiles
 from pcfix.clean.points import Reason, clean_points
 from pcfix.libraries import load_open3d
@@ -79,15 +78,6 @@ def test_tiles_hold_every_point(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (np.diff(cut.start) > 0).all()
     monkeypatch.setattr("pcfix.blocks.ROWS", 77)
     assert np.array_equal(make_tiles(xyz, used, 4.0).row, cut.row)
-
-
-def test_coincident_points(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A thousand points in one place of the plan: an answer, and not a table of all pairs."""
-    monkeypatch.setattr(neighbours, "_MOST_COLUMNS", 64)
-    xyz = np.zeros((1000, 3))
-    xyz[:, 2] = np.arange(1000.0)
-    _, lower, upper = _statistics(xyz, 1.0).T
-    assert (upper > lower).all()
 
 
 @pytest.mark.parametrize("tile_m", mostly_nightly([8.0, 31.0, 400.0], 8.0))

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import doctest
-
 import numpy as np
 import pytest
 
-from pcfix.clean import points as door
 from pcfix.clean.points import Reason, clean_points
 from pcfix.errors import SettingError
 from pcfix.model import WaterPlane
 from pcfix.options.steps import CleanRules
 from tests.clean.scenes import spoilt_scene
-from tests.utils.codes import refused
 
 
 def _scene_reasons(settings: CleanRules | None = None) -> np.ndarray:
@@ -113,16 +109,6 @@ def test_weak_intersections() -> None:
     ]
 
 
-def test_unused_points() -> None:
-    s = spoilt_scene(20_000, 100)
-    used = np.zeros(len(s.xyz), bool)
-    used[::2] = True
-    found = clean_points(s.xyz, water=s.water_level_m, used=used)
-    alone = clean_points(s.xyz[::2].copy(), water=s.water_level_m)
-    assert np.array_equal(found[::2], alone)
-    assert not found[1::2].any()
-
-
 ALL_OFF = {"deviations", "min_rays", "max_ray_miss", "max_incidence", "below", "floating"}
 
 
@@ -139,36 +125,3 @@ ALL_OFF = {"deviations", "min_rays", "max_ray_miss", "max_incidence", "below", "
 def test_settings_refused(choice: dict) -> None:
     with pytest.raises(SettingError):
         CleanRules(**choice)
-
-
-@pytest.mark.parametrize(
-    ("count", "given", "code", "values"),
-    [
-        (100, {"used": np.ones(99, bool)}, "option.shape", {"option": "used", "shape": (99,)}),
-        (100, {"tile_m": -1.0}, "option.range", {"value": -1.0}),
-        (20, {}, "cloud.too_few_points", {"points": 20, "least": 21}),
-        (5, {"settings": CleanRules(neighbours=6)}, "cloud.too_few_points", {"least": 7}),
-        (100, {"water": "above ten points"}, "cloud.too_few_points", {"points": 10, "least": 33}),
-    ],
-)
-def test_arrays_refused(count: int, given: dict, code: str, values: dict) -> None:
-    xyz = spoilt_scene(20_000, 100).xyz[:count]
-    if "water" in given:
-        given = {"water": float(np.sort(xyz[:, 2])[10])}
-    with refused(code, **values):
-        clean_points(xyz, **given)
-    with refused("cloud.not_finite", row=0):
-        clean_points(np.full((100, 3), np.nan))
-
-
-def test_no_spread() -> None:
-    """Coincident points, and a ring on which all distances are the same."""
-    assert not clean_points(np.zeros((50, 3)), water=1.0).any()
-    angle = np.arange(400) * np.pi / 200
-    ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(400)])
-    assert not clean_points(ring * 50).any()
-
-
-def test_docstring() -> None:
-    found = doctest.testmod(door)
-    assert (found.failed, found.attempted > 3) == (0, True)

@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from pcfix.clean.neighbours import nearest_of
 from pcfix.compare.nearest import cloud_to_cloud
-from pcfix.compare.sections import lines_downslope, parse_line, section_along
+from pcfix.compare.sections import parse_line, section_along
 from pcfix.compare.statistics import binned, distribution_of, fit_line, statistics_of
 from pcfix.compare.vertical import heights_at
-from tests.utils.codes import refused
 
 EAST_M, NORTH_M = 456_000.0, 5_432_000.0
 
@@ -61,20 +59,6 @@ def test_c2c():
             np.testing.assert_allclose(cloud_to_cloud(cloud, reference), tree, atol=5e-9)
 
 
-def test_nearest_of_ties():
-    """On a lattice, in the middle of four points: the first ones of the cloud."""
-    reference = np.array([[x, y, k] for k, (x, y) in enumerate(np.ndindex(9, 9))], float)
-    cloud = np.array([[x + 0.5, y + 0.5, 0.0] for x, y in np.ndindex(8, 8)])
-    seen = np.zeros(len(cloud), int)
-    for rows, xyz, distance, near in nearest_of(cloud, reference, 2, 2):
-        np.testing.assert_array_equal(xyz, cloud[rows])
-        np.testing.assert_array_equal(distance, math.sqrt(0.5))
-        first = 9 * (xyz[:, 0] - 0.5) + xyz[:, 1] - 0.5
-        np.testing.assert_array_equal(near[:, :, 2], np.column_stack([first, first + 1]))
-        seen[rows] += 1
-    assert (seen == 1).all()
-
-
 def test_plane_exact():
     rng = np.random.default_rng(5)
     xy = np.array([EAST_M, NORTH_M]) + rng.uniform(1.0, 13.0, (500, 2))
@@ -82,16 +66,6 @@ def test_plane_exact():
     assert not heights.by_nearest.any()
     # the plane is exact; only rounding is left
     np.testing.assert_allclose(heights.height_m, on_the_plane(xy), atol=1e-9)
-
-
-def test_plane_by_lstsq():
-    reference, places = scattered(500, 6), scattered(60, 7)[:, :2]
-    heights = heights_at(places, reference, 9)
-    for place, height, by_nearest in zip(places, *heights, strict=True):
-        near = reference[np.argsort(np.hypot(*(reference[:, :2] - place).T))[:9]]
-        design = np.column_stack([np.ones(9), near[:, :2] - place])
-        slow = near[0, 2] if by_nearest else np.linalg.lstsq(design, near[:, 2])[0][0]
-        assert height == pytest.approx(slow, abs=1e-8)
 
 
 def test_nearest_height_without_plane():
@@ -150,16 +124,6 @@ def test_normal_fit_robust():
     assert normal.histogram_mu_m == pytest.approx(0.1, abs=0.003)
 
 
-@pytest.mark.parametrize("value", [0.0, 0.1, -7.25])
-def test_equal_values(value):
-    found = distribution_of(np.full(20, value))
-    assert found.statistics.mean_m == pytest.approx(value)
-    assert found.normal.histogram_sigma_m is None
-    assert sum(found.histogram.counts) == 20
-    with refused("reference.nothing_compared"):
-        statistics_of(np.empty(0))
-
-
 def test_fit_line():
     depth = np.linspace(0.5, 12.0, 400)
     line = fit_line(depth, -0.05 + depth / 1.34)
@@ -202,32 +166,3 @@ def test_section():
         assert section.heights_m["corrected"][station] == pytest.approx(np.median(heights))
     difference = section.heights_m["reference"] - section.heights_m["corrected"]
     np.testing.assert_allclose(difference, 1.5)
-
-
-def test_section_empty():
-    section = section_along(
-        parse_line("0,0,10,0"), {"corrected": np.array([[9.9, 0.1, -2.0]])}, 0.5
-    )
-    rows = section.table().splitlines()
-    assert rows[0] == "distance_m,corrected_m"
-    assert rows[1] == "0.0000,"
-    assert rows[-1] == "10.0000,-2.0000"
-
-
-@pytest.mark.parametrize("text", ["1,2,3", "a,b,c,d", "1,1,1,1", "1,2,nan,4", ""])
-def test_section_refused(text):
-    with refused("option.section"):
-        parse_line(text)
-
-
-def test_lines_downslope():
-    bed = tilted_grid()  # steepest down: (-0.1, 0.2), that is towards north-north-west
-    lines = lines_downslope(bed, 4)
-    assert len(lines) == 4
-    for line in lines:
-        run = np.array([line.x2 - line.x1, line.y2 - line.y1]) / line.length_m
-        np.testing.assert_allclose(run, np.array([-0.1, 0.2]) / math.hypot(0.1, 0.2), atol=1e-9)
-    across = [0.2 * line.x1 + 0.1 * line.y1 for line in lines]
-    np.testing.assert_allclose(np.diff(across), np.diff(across)[0], rtol=1e-6)
-    with refused("cloud.on_line"):
-        lines_downslope(np.column_stack([np.arange(9.0)] * 3), 2)

@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import re
 
 import laspy
 import numpy as np
@@ -13,7 +14,7 @@ import pcfix
 from pcfix.compare.nearest import spacing_m
 from pcfix.compare.statistics import distances_of
 from pcfix.flow.compare import compare_clouds
-from pcfix.report.comparison import c2c_figure, c2c_lines, comparison_text, evaluation, gauss
+from pcfix.report.comparison import comparison_text, evaluation, gauss
 from tests.compare.test_files import LIDAR, SCENE, lifted, plane, write_las
 from tests.utils.codes import refused
 from tests.utils.program import run_pcfix
@@ -95,17 +96,6 @@ def test_further_cloud(both, other):
     np.testing.assert_array_equal(section.heights_m["Dietrich"], alone.heights_m["corrected"])
 
 
-def test_single_direction(both, corrected):
-    back = compare_clouds(corrected, LIDAR, direction="from-reference", share="0.6,1.0", **WHOLE)
-    assert back.c2c is None
-    assert back.c2c_from_reference.after.statistics == both.c2c_from_reference.after.statistics
-    assert back.c2c_from_reference.after.shares == both.c2c_from_reference.after.shares[:1]
-    there = compare_clouds(corrected, LIDAR, direction="to-reference", **WHOLE)
-    assert there.c2c_from_reference is None
-    assert there.c2c == compare_clouds(corrected, LIDAR, **WHOLE).c2c
-    assert there.vertical == back.vertical == both.vertical
-
-
 def test_submerged(corrected):
     lidar, las = places(LIDAR), laspy.read(corrected)
     given = {"submerged": True, "direction": "from-reference", "water": 0.37}
@@ -145,57 +135,22 @@ def test_classes_of_cloudcompare(count, classes):
     assert [one.share for one in shares] == [0.2, 0.4, 0.4]
 
 
-def test_further_cloud_at_same_places(tmp_path):
-    """So that their figures can be laid side by side: all of Figure 18 has 1136 classes."""
-    reference = write_las(tmp_path / "ref.las", plane(2000, 55))
-    cloud = write_las(tmp_path / "cloud.las", plane(9000, 56, side_m=50.0))
-    small = plane(4000, 57, side_m=20.0)
-    also = {"small": write_las(tmp_path / "small.las", small)}
-    found = compare_clouds(cloud, reference, direction="from-reference", also=also)
-    there = places(reference)
-    beside = there[(there[:, :2] <= places(cloud)[:, :2].max(axis=0) + 1.0).all(axis=1)]
-    count = found.c2c_from_reference.after.statistics.count
-    assert found.also[0].c2c_from_reference.statistics.count == count
-    assert len(beside) <= count < len(there)
-    assert found.also[0].c2c_from_reference.statistics.max_m > 30.0
-
-
 def test_gauss_as_in_cloudcompare(both):
     values = np.concatenate([np.full(500, 1.0), np.full(500, 3.0)])
     plain = compare_clouds(LIDAR, LIDAR, c2c_only=True).as_dict()
     plain["c2c"]["after"]["normal"] = {"mu_m": 2.234814, "sigma_m": 1.441840}
     plain["c2c"]["after"]["histogram"]["counts"] = [1] * 1136
     said = "Gauss: mean = 2.234814 / std.dev. = 1.441840 [1136 classes]"  # of Figure 18a
-    assert c2c_lines(plain) == [("C2C", f"to reference, cloud: {said}")]
     assert gauss(json.loads(json.dumps(plain))["c2c"]["after"]) == said
     of = distances_of(values, None, []).normal
     assert (of.mu_m, of.sigma_m) == (2.0, 1.0)  # divided by n, as CloudCompare does
     text, normal = comparison_text(both), both.c2c.before.normal
-    assert f"to reference, uncorrected: Gauss: mean = {normal.mu_m:.6f} / std.dev. = " in text
-    back = both.also[0].c2c_from_reference
-    share, count = back.shares[0].share, back.statistics.count
-    assert f"of {count:,} points {100 * share:.1f} % are 0.6 to 1 m away" in text
-
-
-def test_histogram_curve(both):
-    figure = c2c_figure(both.as_dict())
-    assert len(figure.axes) == 6  # as it came, corrected, Dietrich; either way
-    normal, count = both.c2c.after.normal, both.c2c.after.statistics.count
-    axes = figure.axes[2]  # of the second row the first
-    assert "mean = " + f"{normal.mu_m:.6f}" in axes.get_title()
-    x, y = axes.lines[0].get_data()
-    width = np.diff(both.c2c.after.histogram.edges_m[:2])[0]
-    top = count * width / (normal.sigma_m * math.sqrt(2.0 * math.pi))
-    assert y.max() == pytest.approx(top, rel=1e-4)
-    assert x[y.argmax()] == pytest.approx(normal.mu_m, abs=0.002)
-    pictures, tables = evaluation(both.as_dict(), [])
-    (picture,) = (one for one in pictures if one.name == "histogram_c2c")
-    assert "From reference, Dietrich" in picture.alt
-    (table,) = (one for one in tables if "Gauss" in one.title)
-    assert table.header[-2:] == ["0.6 to 1 m", "3 to 6 m"]
-    assert table.rows[1][1:4] == [f"{normal.mu_m:.6f}", f"{normal.sigma_m:.6f}", "142"]
-    largest = f"{both.c2c.after.statistics.max_m:.3f}"
-    assert ["C2C to reference, corrected", largest] in [[r[0], r[-1]] for r in tables[0].rows]
+    share = both.also[0].c2c_from_reference.shares[0].share
+    for name, cells in (
+        ("to reference, uncorrected", f"{normal.mu_m:.6f}"),
+        ("from reference, Dietrich", f"{100 * share:.1f} %"),
+    ):
+        assert re.search(rf"  {name} .* {re.escape(cells)}", text)
 
 
 def test_sparse_reference(tmp_path, corrected):
@@ -224,25 +179,6 @@ def test_sparse_reference(tmp_path, corrected):
     assert sparse(reference, cloud, direction="from-reference")[1] == {"cloud.sparse"}
     assert sparse(cloud, reference, direction="both")[1] == {"reference.sparse"}
     assert not sparse(corrected, LIDAR)[1]
-
-
-def test_directions_refused(tmp_path, corrected):
-    """Check points are too far apart to be the nearest, and cells of a raster are not measured."""
-    cloud = write_las(tmp_path / "a.las", plane(30_000, 51), crs=None)
-    rows = [f"{x:.3f},{y:.3f},{z:.4f}" for x, y, z in plane(12, 52)]
-    checks, raster = tmp_path / "checks.csv", tmp_path / "dsm.tif"
-    checks.write_text("\n".join(["x,y,z", *rows]) + "\n")
-    given = compare_clouds(cloud, checks, direction="from-reference")
-    assert given.c2c_from_reference == compare_clouds(cloud, checks).c2c
-    pcfix.grid_dsm(corrected, raster, resolution=1.0)
-    assert compare_clouds(corrected, raster, direction="to-reference").c2c
-    for files, code, ways in (
-        ((cloud, checks), "reference.check_points", ("to-reference", "both")),
-        ((corrected, raster), "reference.no_points", ("from-reference", "both")),
-    ):
-        for way in ways:
-            with refused(code, path=files[1], direction=way):
-                compare_clouds(*files, direction=way)
 
 
 def test_settings_refused(tmp_path):

@@ -14,10 +14,9 @@ import rasterio
 from pyproj import CRS
 
 import pcfix
-from pcfix.compare import m3c2
 from pcfix.compare.statistics import own_of, statistics_of
 from pcfix.flow.compare import compare_clouds
-from pcfix.report.comparison import comparison_text, in_a_sentence
+from pcfix.report.comparison import in_a_sentence
 from tests.utils.codes import refused
 from tests.utils.program import run_pcfix
 from tests.utils.shared import ROOT
@@ -135,19 +134,6 @@ def test_lifted_plane(lift, tmp_path):
         # 1.96 times 1 cm of noise over some 28 and more points of each cloud
         assert 0.001 < along.mean_level_of_detection_m < 0.01
         assert along.significant_share > 0.95
-
-
-@py4dgeo
-def test_m3c2_is_silent(tmp_path, capfd, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(m3c2, "MAX_CORE_POINTS", 700)
-    first, again = (
-        m3c2.m3c2_distances(lifted(plane(5000, 3), 0.1), plane(9000, 4), 1.0) for _ in range(2)
-    )
-    assert first == again
-    assert first.core_points == 700
-    assert capfd.readouterr() == ("", "")
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_ignored_points(tmp_path):
@@ -338,26 +324,6 @@ def test_output_files(tmp_path, corrected):
     assert [p.name for p in sorted(out.glob("section_*"))] == ["section_01.csv", "section_02.csv"]
 
 
-def test_submerged(corrected):
-    wet = compare_clouds(corrected, LIDAR, submerged=True)
-    classes = np.asarray(laspy.read(corrected).classification)
-    assert wet.counts.compared == wet.depth.after.count == (classes == 40).sum()
-    assert wet.counts.not_submerged == (classes != 40).sum()
-    assert wet.shore_bins
-
-
-def test_sections(corrected):
-    (found,) = compare_clouds(corrected, LIDAR, sections=1, corridor=2.0).sections
-    heights = found.heights_m
-    assert list(heights) == ["water", "apparent", "corrected", "reference"]
-    deep = heights["reference"] < -3.0
-    assert deep.sum() > 20
-    # medians of a few dozen points of a few cm of noise, on a bed that falls one in ten
-    assert np.nanmedian(np.abs(heights["corrected"] - heights["reference"])[deep]) < 0.1
-    assert np.nanmin((heights["apparent"] - heights["reference"])[deep]) > 0.5
-    np.testing.assert_allclose(heights["water"][deep], 0.37, atol=0.001)
-
-
 def test_command(tmp_path, corrected, sample):
     words = [corrected, LIDAR, "--out-dir", tmp_path / "o", "--sections", "1"]
     done = run_pcfix("compare", *words)
@@ -379,18 +345,3 @@ def test_noise_of_reference(stated, rmse):
     assert own.rmse_m == (None if rmse is None else pytest.approx(rmse))
     if rmse is not None:
         assert own.within_95_m / errors.within_95_m == pytest.approx(rmse / errors.rmse_m)
-
-
-def test_usual_noise_of_reference(tmp_path):
-    cloud = write_las(tmp_path / "a.las", plane(500, 31, noise_m=0.1), crs=None)
-    lidar = write_las(tmp_path / "b.las", plane(500, 32, noise_m=0.0), crs=None)
-    points = tmp_path / "points.csv"
-    rows = (f"{x},{y},{z}" for x, y, z in plane(100, 33, noise_m=0.0))
-    points.write_text("x,y,z\n" + "\n".join(rows))
-    for reference, sigma in ((lidar, 0.03), (points, 0.02)):
-        own = compare_clouds(cloud, reference).own
-        assert (own.of, own.sigma_reference_m, own.is_assumed) == ("all", sigma, True)
-    told = compare_clouds(cloud, lidar, sigma_reference=0.05)
-    raw = told.vertical.after.statistics
-    assert told.own.rmse_m == pytest.approx(np.sqrt(raw.rmse_m**2 - 0.05**2))
-    assert f"RMSE {told.own.rmse_m:.3f} m" in comparison_text(told)

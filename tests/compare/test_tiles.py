@@ -4,7 +4,6 @@ They are compared with brute force, or NumPy over the whole array.
 """
 
 import json
-import math
 
 import numpy as np
 import pytest
@@ -12,13 +11,9 @@ import pytest
 from pcfix import blocks
 from pcfix.clean import neighbours
 from pcfix.compare import m3c2, nearest
-from pcfix.compare.match import near_in_plan
 from pcfix.compare.nearest import cloud_to_cloud
-from pcfix.compare.statistics import Sample, distances_of, statistics_of
-from pcfix.compare.vertical import heights_at
 from pcfix.errors import InputError
 from pcfix.flow.compare import compare_clouds
-from pcfix.io.files import scratch_arrays
 from pcfix.kernels import threads
 from tests.compare.test_files import py4dgeo, write_las
 from tests.utils.codes import refused
@@ -70,46 +65,6 @@ def test_distances(make, monkeypatch):
         in_small_tiles(monkeypatch, points, rows=350)
         with threads(jobs):
             np.testing.assert_array_equal(cloud_to_cloud(cloud, reference), expected)
-
-
-@pytest.mark.parametrize("make", [clustered, lattice])
-def test_heights(make, monkeypatch):
-    """On the lattice every place has four nearest points, and twelve more that tie for the rest."""
-    cloud, reference = make(1), make(2)
-    reference[:, 2] = np.random.default_rng(5).normal(0.0, 1.0, len(reference))
-    whole = heights_at(cloud, reference, 6)
-    for points in (60, 450):
-        in_small_tiles(monkeypatch, points, rows=350)
-        found = heights_at(cloud, reference, 6)
-        np.testing.assert_array_equal(found.height_m, whole.height_m)
-        np.testing.assert_array_equal(found.by_nearest, whole.by_nearest)
-
-
-@pytest.mark.parametrize("count", [1, 2, 999, 4321])
-def test_order_statistics(count, monkeypatch):
-    values = np.round(np.random.default_rng(count).standard_t(2, count), 2)  # with zeros and ties
-    monkeypatch.setattr(blocks, "ROWS", 100)
-    marks = (0, 0.5, 5, 25, 37.7, 50, 95, 99.5, 100)
-    np.testing.assert_array_equal(Sample(values).percentiles(marks), np.percentile(values, marks))
-    edges = np.histogram_bin_edges(values, 13)
-    assert Sample(values).counts(edges) == np.histogram(values, edges)[0].tolist()
-    s = statistics_of(values)
-    assert s.within_95_m == np.percentile(np.abs(values), 95)
-    assert s.nmad_m == 1.4826 * np.median(np.abs(values - np.median(values)))
-    assert s.mean_m == pytest.approx(math.fsum(values) / count, rel=1e-14, abs=1e-15)
-    assert s.sd_m == pytest.approx(values.std(), rel=1e-13)
-    classes = distances_of(np.abs(values), None, [(0.5, 1.0)]).histogram
-    assert classes.counts == np.histogram(np.abs(values), len(classes.counts))[0].tolist()
-
-
-def test_near_in_plan(monkeypatch):
-    cloud, reference = clustered(1), clustered(2)
-    near = np.sqrt((np.subtract(cloud[:, None, :2], reference[:, :2]) ** 2).sum(axis=2)).min(axis=1)
-    found = near_in_plan(cloud, reference, 3.0)
-    assert found[near <= 3.0].all()
-    assert not found[near > 3.0 * math.sqrt(8.0)].any()
-    monkeypatch.setattr(blocks, "ROWS", 100)
-    np.testing.assert_array_equal(near_in_plan(cloud, reference, 3.0), found)
 
 
 def figures(folder, name):
@@ -211,12 +166,3 @@ def test_disk_after_errors(clouds, tmp_path, monkeypatch):
     with pytest.raises(InputError):
         compare_clouds(clouds / "cloud.las", clouds / "reference.las", summary=summary)
     assert list(tmp_path.iterdir()) == [far]
-
-
-def test_let_go(tmp_path):
-    with scratch_arrays(tmp_path / "out") as empty:
-        array = empty((300_000, 3), np.float64)
-        array[:] = np.arange(900_000.0).reshape(-1, 3)
-        blocks.let_go()
-        assert array.sum() == 899_999.0 * 450_000.0
-    assert list(tmp_path.iterdir()) == []

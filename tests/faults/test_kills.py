@@ -13,7 +13,7 @@ import laspy
 import pytest
 
 import pcfix
-from pcfix.io.drafts import replaced_when_whole
+from pcfix.io.atomic import temporary_output
 from tests.utils.codes import refused
 from tests.utils.zygote import Zygote
 
@@ -136,9 +136,9 @@ def test_leftover_goes_with_the_next_run(inputs, commands, zygote, tmp_path):
 
 
 def test_other_outputs_of_the_folder_stay(tmp_path):
-    with replaced_when_whole(tmp_path / "one.txt") as one:
+    with temporary_output(tmp_path / "one.txt") as one:
         one.write_text("one")
-        with replaced_when_whole(tmp_path / "one") as other:
+        with temporary_output(tmp_path / "one") as other:
             other.write_text("other")
         assert one.read_text() == "one"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["one", "one.txt"]

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from pcfix.errors import InputError, brief
-from pcfix.io.drafts import cannot_write, disk_of
-from pcfix.io.files import check_input, check_output, is_same
+from pcfix.io.files import check_input, check_output
 from tests.utils.clouds import WATER_M, write_cloud
 from tests.utils.codes import refused
 from tests.utils.program import run_pcfix
@@ -132,18 +131,6 @@ def test_names_that_are_not_utf8(odd, raster):
     assert "UTF-8" in done.stderr
 
 
-@pytest.mark.parametrize("share", [0.3, 0.7, 0.99])
-def test_a_raster_of_the_water_that_is_cut(odd, raster, share):
-    (odd / "cut.tif").write_bytes(raster[: int(share * len(raster))])
-    assert refused_command(odd, *label(water="cut.tif")).code == "raster.damaged"
-
-
-def test_a_mesh_whose_comments_are_latin(odd):
-    done = run_pcfix(*label(water="latin.ply"), folder=odd)
-    assert done.returncode == 0, done.stderr
-    (odd / "out.las").unlink()
-
-
 @pytest.fixture
 def closed():
     """A folder that others may look for but not into, and a cloud that they may not read."""
@@ -189,28 +176,3 @@ def test_values_are_cut_and_names_of_files_are_not():
     assert brief(f'give "{columns}"') == f'give "{columns}"'
     command = f"run: 'pip install -e {'/a' * 80}[photos]'"
     assert brief(command) == command
-
-
-def test_full_disk_is_named(tmp_path):
-    error = cannot_write(tmp_path / "out.laz", OSError(28, "No space left on device"))
-    assert error.code == "output.disk_full"
-    assert disk_of(tmp_path).partition(" (")[0] in str(error)
-
-
-def test_two_names_of_one_file(tmp_path):
-    (tmp_path / "a").write_text("")
-    (tmp_path / "b").symlink_to("a")
-    assert is_same(tmp_path / "a", tmp_path / "b")
-    assert is_same(tmp_path / "none", tmp_path / "x" / ".." / "none")
-    assert not is_same(tmp_path / "a", tmp_path / "none")
-
-
-def test_lines_are_those_of_a_list_alone():
-    """Each of many files that failed has a line; what a file says never has."""
-    files = [f"  tile{i}.laz: is damaged; copy it again." for i in range(100)]
-    said = str(InputError("x.y", "\n".join(["100 of 200 files failed:", *files])))
-    assert said.splitlines()[1:] == files
-    assert (
-        str(InputError("x.y", "a.csv: 'one\ntwo' is no number"))
-        == r"a.csv: 'one\ntwo' is no number"
-    )

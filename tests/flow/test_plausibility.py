@@ -10,9 +10,10 @@ from scipy.spatial.transform import Rotation
 import pcfix
 from pcfix.flow.diagnosis import quick_ties
 from pcfix.flow.inputs import Inputs
-from pcfix.flow.plausibility import CloudSample, Flight, plausible
-from pcfix.flow.surfaces import file_points, view_of
+from pcfix.flow.plausibility import SAMPLE_POINTS, CloudSample, Flight, plausible
+from pcfix.flow.surfaces import Points, view_of
 from pcfix.io.las.source import read_xyz
+from tests.utils.codes import refused, warned
 from tests.utils.shared import ROOT, needs
 
 SCENE = ROOT / "samples" / "scene"
@@ -134,6 +135,16 @@ def test_heights_of_tie_points(with_ties):
     assert off_m == pytest.approx(47.0, abs=0.05)
 
 
+def sample_of(path, above_m):
+    """Return the sample of a cloud under water that is this much above `LEVEL_M`."""
+    sample, row, view = CloudSample(), 0, view_of(path)
+    for points in view.chunks():
+        water = LEVEL_M + above_m(points.xyz)
+        sample += CloudSample.of(points, water, row, view.points)
+        row += len(points.xyz)
+    return replace(sample, every=max(1.0, view.points // SAMPLE_POINTS))
+
+
 @pytest.mark.parametrize(
     ("off_m", "north", "expected"),
     [
@@ -143,10 +154,7 @@ def test_heights_of_tie_points(with_ties):
     ],
 )
 def test_shoreline_of_the_cloud(off_m, north, expected):
-    sample = CloudSample(view_of(SCENE / "cloud.laz").points)
-    for points in file_points(SCENE / "cloud.laz", None):
-        up = points.xyz[:, 1] - 4_650_320.0
-        sample.add(points, LEVEL_M + off_m + north * up)
+    sample = sample_of(SCENE / "cloud.laz", lambda xyz: off_m + north * (xyz[:, 1] - 4_650_320.0))
     doubts = {doubt.code: doubt.values for doubt in sample.level_doubts()}
     assert doubts.keys() == expected.keys()
     for code, (name, value) in expected.items():
@@ -175,9 +183,8 @@ def test_real_blocks(name):
     cameras, cloud, level = REAL[name]
     path, view = RENDERED.parent / cameras, view_of(RENDERED.parent / cloud)
     inputs = Inputs(cameras=path, water=0.0)
-    sample = CloudSample(view.points)
-    for points in file_points(RENDERED.parent / cloud, None):
-        sample.add(points, np.full(len(points.xyz), np.nan if level is None else level))
+    above_m = np.nan if level is None else level - LEVEL_M
+    sample = sample_of(RENDERED.parent / cloud, lambda xyz: np.full(len(xyz), above_m))
     ties, flight = quick_ties(inputs, view.crs), Flight(path, level, every=sample.every)
     block = inputs.block(view.crs)[0]
     found = plausible(block, sample.xyz, ties, sample.level_doubts(), flight)
@@ -216,19 +223,20 @@ def test_recorded_heights(scene, tmp_path, drone_m):
 
 @pytest.mark.parametrize("chunk", [100, 7000])
 def test_chunks_of_a_sample(scene, chunk):
-    sample = CloudSample(60_000)
-    for start in range(0, 20_000, chunk):
-        xyz = scene.xyz[start : start + chunk]
-        sample.add(SimpleNamespace(xyz=xyz, colours=None), np.zeros(len(xyz)))
+    sample = CloudSample()
+    for row in range(0, 20_000, chunk):
+        xyz = scene.xyz[row : row + chunk]
+        points = Points(xyz, None, np.zeros(len(xyz), np.uint8))
+        sample += CloudSample.of(points, np.zeros(len(xyz)), row, 60_000)
     assert np.array_equal(sample.xyz, scene.xyz[::2])
 
 
 def test_great_depths(scene):
     some = scene.xyz[::10], scene.cameras
-    with pytest.raises(pcfix.GeometryError, match="60 m"):
+    with refused("water.too_deep"):
         pcfix.correct_points(*some, 45.0, method="snell")
-    with pytest.warns(pcfix.PcfixWarning, match="deeper than 30 m"):
+    with warned("water.deep"):
         deep = pcfix.correct_points(*some, 45.0, method="snell", deep=True)
-    with pytest.warns(pcfix.PcfixWarning, match="deeper than 30 m"):
+    with warned("water.deep"):
         pcfix.correct_points(*some, 30.0, method="snell")
     assert deep.corrected.all()

@@ -23,6 +23,7 @@ from pcfix.refract.regression import (
 )
 from pcfix.water.surface import surface_above
 from tests.utils.batches import batch_of
+from tests.utils.codes import refused
 
 ORIGIN = np.array([500_000.0, 4_600_000.0])
 LEVEL = WaterPlane(12.0)
@@ -215,19 +216,18 @@ def sorted_places():
 
 
 @pytest.mark.parametrize(
-    ("depths", "column", "said"),
+    ("depths", "column", "code"),
     [
-        (lambda xy: np.full(len(xy), 3.0) + np.arange(len(xy)) % 2, "depth", "--least-r2"),
-        (lambda xy: 9.0 - true_at(xy), "depth", "depths"),
-        (lambda xy: np.full(len(xy), 12.5), "z", "12.50 m"),
+        (lambda xy: np.full(len(xy), 3.0) + np.arange(len(xy)) % 2, "depth", "low_r2"),
+        (lambda xy: 9.0 - true_at(xy), "depth", "falling"),
+        (lambda xy: np.full(len(xy), 12.5), "z", "above_water"),
     ],
 )
-def test_depths_that_do_not_fit(tmp_path, depths, column, said):
+def test_depths_refused(tmp_path, depths, column, code):
     xy = sorted_places()
-    with pytest.raises(GeometryError) as caught:
+    with refused(f"check_depths.{code}") as error:
         learn_regression(table(tmp_path, xy, depths(xy), column), parts(cloud()), SETTINGS)
-    assert said in str(caught.value)
-    assert "checks.csv" in str(caught.value)
+    assert "checks.csv" in str(error.value)
 
 
 def test_poor_fit_accepted(tmp_path):
@@ -238,21 +238,18 @@ def test_poor_fit_accepted(tmp_path):
     assert found.notes
 
 
-def test_too_few_depths(tmp_path):
-    xy = places(5)
-    xy[1:4] += 300.0
-    path = table(tmp_path, xy, true_at(xy))
-    with pytest.raises(GeometryError, match="line 3 "):
-        learn_regression(path, parts(cloud()), SETTINGS)
-    with pytest.raises(GeometryError):
-        learn_regression(path, parts(cloud() - [0, 0, -50.0]), SETTINGS)
-    two = table(tmp_path, xy[:2], true_at(xy[:2]))
-    with pytest.raises(GeometryError):
-        learn_regression(two, parts(cloud()), SETTINGS)
-    flat = cloud()
+def test_few_depths(tmp_path):
+    far, flat = places(5), cloud()
+    far[1:4] += 300.0
     flat[:, 2] = 10.0
-    with pytest.raises(GeometryError, match=r"2\.000 m"):
-        learn_regression(table(tmp_path, places(9), np.full(9, 2.7)), parts(flat), SETTINGS)
+    for xy, values, points, code in (
+        (far, true_at(far), cloud(), "no_bed"),
+        (far, true_at(far), cloud() - [0, 0, -50.0], "no_bed"),
+        (far[:2], true_at(far[:2]), cloud(), "no_bed"),
+        (places(9), np.full(9, 2.7), flat, "one_depth"),
+    ):
+        with refused(f"check_depths.{code}", GeometryError):
+            learn_regression(table(tmp_path, xy, values), parts(points), SETTINGS)
 
 
 def test_applied(tmp_path):
@@ -270,3 +267,10 @@ def test_applied(tmp_path):
     assert depth - result.shift_m[:, 2] == pytest.approx(expected, abs=1e-12)
     # the line itself is off by some centimetres, see the first test
     assert depth - result.shift_m[:, 2] == pytest.approx(true_at(xyz), abs=0.06)
+
+
+def test_sigma_beyond_the_depths():
+    line = DepthRegression(0.1, 1.4, 0.3, 0.1, 0.9, 0.2, 0.25, 20, 1.0, 4.0, -0.02)
+    sigma = line.sigma_m(np.array([1.0, 2.5, 4.0, 8.0]))
+    # 0.09 - 0.04 x + 0.01 x^2: 0.41 at 8 m, 0.09 at 4 m
+    assert sigma == pytest.approx([0.25, 0.25, 0.25, np.sqrt(0.25**2 + 0.32)])

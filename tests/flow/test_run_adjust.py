@@ -7,7 +7,6 @@ does it; the cloud is where straight rays of these poses meet.
 from __future__ import annotations
 
 import json
-import shutil
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -19,12 +18,11 @@ import pytest
 from pcfix.adjust.problem import intersect_fixed
 from pcfix.flow.correct import correct_file
 from pcfix.flow.inputs import Inputs
-from pcfix.flow.request import Request, request_of
+from pcfix.flow.request import Request
 from pcfix.flow.run import run_all
-from pcfix.flow.run_adjust import adjust_first, figures_of
+from pcfix.flow.run_adjust import adjust_first
 from pcfix.io.cameras.colmap.writing import write_colmap
 from pcfix.model import TiePoints, Views
-from pcfix.report.run import adjustment_table
 from tests.utils.bent_blocks import GNSS_M, LEVEL_M, TrueBlock
 from tests.utils.codes import refused, warned
 from tests.utils.program import run_pcfix
@@ -32,7 +30,7 @@ from tests.utils.program import run_pcfix
 
 def first_step(request, folder):
     inputs = [path for some in request.files().values() for path in some]
-    return adjust_first(request.adjust_step(), folder, inputs)
+    return adjust_first(request, folder, inputs)
 
 
 ORIGIN_M = (319900.0, 3842700.0, 0.0)
@@ -135,39 +133,19 @@ def test_first_step(finished):
 def test_report(finished):
     folder, _ = finished
     page = (folder / "report.html").read_text()
-    for words in (
-        "Refractive bundle adjustment", "Focal length", "Residuals under water (rms)",
-        "Centres minus GNSS", "as that was asked for", "First the whole cloud, land too",
-    ):  # fmt: skip
+    for words in ("Refractive bundle adjustment", "Focal length", "Centres minus GNSS"):
         assert words in page
     assert '<a href="adjusted/report.html">' in page
     summary = json.loads((folder / "adjusted" / "adjustment.json").read_text())
     assert f"{summary['poses']['moved_rms_m']:.3f} m</td>" in page
     assert summary["gnss"]["rms_before_m"][2] > summary["gnss"]["rms_m"][2]
-
-
-def test_report_compares(finished):
-    folder, _ = finished
-    page = (folder / "report.html").read_text()
     found = json.loads((folder / "compare" / "compare.json").read_text())
-    for name, words in (("bed", "of the bed fell from"), ("land", "Land:")):
+    for name in ("bed", "land"):
         before, after = (found[name][when]["rmse_m"] for when in ("before", "after"))
         assert before > 1.5 * after  # planes through the few points of this scene blur both
-        assert f"{words} {before:.3f} to {after:.3f} m" in page
-        for when in ("as it came", "corrected"):
-            assert f"{name.capitalize()}, vertical error, {when}" in page
+        assert f"{before:.3f} to {after:.3f} m" in page
     counts = [found[name]["after"]["count"] for name in ("bed", "land")]
     assert sum(counts) == found["counts"]["compared"]
-
-
-def test_notes(scene, finished, monkeypatch):
-    note = {"code": "gnss.offset_found", "message": "the GNSS positions lie 0.3 m above"}
-    figures = figures_of(finished[0]) | {"notes": [note]}
-    assert ["Note", "", "The GNSS positions lie 0.3 m above"] in adjustment_table(figures, "p").rows
-    monkeypatch.setattr("pcfix.flow.run.figures_of", lambda _: figures)
-    said = []
-    run_all(scene.whole(), finished[0], say=said.append)
-    assert any(line.strip() == "The GNSS positions lie 0.3 m above" for line in said)
 
 
 def test_resumed(scene, finished):
@@ -175,17 +153,6 @@ def test_resumed(scene, finished):
     said = []
     run_all(scene.whole(), folder, say=said.append)
     assert sum("done before" in line for line in said) == len(STEPS)
-
-
-def test_record(finished, tmp_path, monkeypatch):
-    folder, _ = finished
-    seen = []
-    monkeypatch.setattr("pcfix.flow.run.run_all", lambda request, *_, **__: seen.append(request))
-    words = ["run", str(tmp_path / "again"), "--config", str(folder / "run.json")]
-    done = run_pcfix(*words)
-    assert done.returncode == 0, done.stderr
-    assert seen == [request_of(folder / "run.json")]
-    assert (seen[0].adjust, seen[0].gnss[-8:]) == ("yes", "gnss.csv")
 
 
 def test_auto(scene, tmp_path, monkeypatch):
@@ -212,16 +179,6 @@ def test_auto_without_datum(scene, tmp_path):
     assert len(lines) == 1
     assert lines[0].startswith("adjust    not done: there is no datum")
     assert "not adjusted: there is no datum" in page.read_text()
-
-
-def test_auto_true_poses(scene, tmp_path):
-    step = first_step(scene.request("true", gnss=scene.gnss), tmp_path)
-    assert not step["adjusted"]
-    assert step["is_said"]
-    assert step["is_fine"]
-    step = first_step(scene.request("true"), tmp_path)
-    assert (step["adjusted"], step["is_said"]) == (False, False)
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(("sigma_m", "is_datum"), [(0.03, True), (10.0, False)])
@@ -255,24 +212,6 @@ def test_water_dimension(scene, tmp_path):
     assert "w_surf" in step["why"]
     with refused("water.dimension"):
         first_step(replace(request, adjust="yes"), tmp_path)
-
-
-def test_yes_without_datum(scene, tmp_path):
-    with refused("adjust.no_datum"):
-        run_all(scene.request(adjust="yes"), tmp_path / "out")
-    assert not (tmp_path / "out" / "adjusted").exists()
-    assert not (tmp_path / "out" / "corrected.laz").exists()
-
-
-def test_inputs_kept(scene, finished, tmp_path):
-    shutil.copytree(finished[0] / "adjusted", tmp_path / "out" / "adjusted")
-    request = replace(
-        scene.whole(),
-        cameras=str(tmp_path / "out" / "adjusted" / "colmap"), cameras_offset=None,
-    )  # fmt: skip
-    with refused("output.is_input"):
-        run_all(request, tmp_path / "out", overwrite=True)
-    assert (tmp_path / "out" / "adjusted" / "colmap" / "images.bin").exists()
 
 
 @pytest.mark.parametrize(

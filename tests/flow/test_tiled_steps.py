@@ -139,7 +139,7 @@ def test_other_files_removed(scene, tmp_path):
         (path.parent / ".pcfix").mkdir(parents=True, exist_ok=True)
         path.write_bytes(b"")
         if name != "mine.laz":
-            (path.parent / ".pcfix" / f"{name}.npz").write_bytes(b"")
+            (path.parent / ".pcfix" / f"{name}.tally").write_bytes(b"")
     (tmp_path / "cleaned.laz").write_bytes(b"")
     Files(tmp_path, asked.source).remove_others()
     assert not (tmp_path / "cleaned.laz").exists()

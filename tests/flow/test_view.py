@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import laspy
 import numpy as np
 import pytest
 
 import pcfix
 from pcfix.flow import view
 from pcfix.io.scenes import write_scene
-from pcfix.report.view import GREY, Scale, view_figure
+from pcfix.report.view import GREY, scale_of, view_figure
 from tests.utils.codes import refused
 
 
@@ -47,20 +48,17 @@ def test_scene(folder, tmp_path, monkeypatch):
 
 
 def test_errors(folder, tmp_path, monkeypatch):
-    values = []
-    monkeypatch.setattr(
-        Scale, "colours", lambda self, one: (values.append(one), np.ones((len(one), 3)))[1]
-    )
+    kept = []
+    monkeypatch.setattr(view, "scale_of", lambda *a: (kept.append(a[1]), scale_of(*a))[1])
     pcfix.view_clouds(
         [folder / "corrected.laz"], reference=folder / "lidar.laz", colour="error",
         image=tmp_path / "view.png",
     )  # fmt: skip
-    before, after, target = (
-        np.nanmean(np.abs(one)) if np.isfinite(one).any() else None for one in values
-    )
-    assert before > 1.0
-    assert after < 0.2
-    assert target is None
+    lidar = len(laspy.read(folder / "lidar.laz").points)
+    before, after = np.split(np.abs(kept[0][:-lidar]), 2)
+    assert np.nanmean(before) > 1.0
+    assert np.nanmean(after) < 0.2
+    assert np.isnan(kept[0][-lidar:]).all()
 
 
 @pytest.mark.parametrize(

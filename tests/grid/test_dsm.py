@@ -15,7 +15,6 @@ from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow import dsm as flow
 from pcfix.flow import sorted_points
 from pcfix.flow.dsm import grid_dsm
-from pcfix.grid.lattice import round_resolution
 from pcfix.io.las import source
 from tests.grid.clouds import EAST, NORTH, awkward, scattered, write
 from tests.utils.codes import refused
@@ -70,17 +69,6 @@ def test_no_seams(awkward_cloud, tmp_path, monkeypatch, method, fill):
             parts = run(name)
         for one, other in zip(whole, parts, strict=True):
             np.testing.assert_array_equal(one, other, err_msg=name)
-
-
-@pytest.mark.filterwarnings("ignore::pcfix.errors.PcfixWarning")
-@pytest.mark.parametrize("method", METHODS)
-def test_order_of_points(tmp_path, method):
-    xyz = scattered(3000, 20.0, 20.0)
-    for name, rows in (("a", xyz), ("b", xyz[::-1])):
-        write(tmp_path / f"{name}.las", rows)
-        grid_dsm(tmp_path / f"{name}.las", tmp_path / f"{name}.tif", resolution=0.5, method=method)
-    one, other = (read_raster(tmp_path / f"{n}.tif").array for n in "ab")
-    np.testing.assert_array_equal(one, other)
 
 
 def sloping(x, y):
@@ -178,12 +166,6 @@ def test_chosen_resolution(tmp_path):
         summary = grid_dsm(cloud, tmp_path / "d.tif", overwrite=True)
         assert 2.0 <= count / (side / summary.settings["resolution"]) ** 2 <= 4.0
         assert summary.resolution_is == "chosen"
-
-
-def test_round_resolution():
-    for spacing in np.geomspace(0.003, 30.0, 200):
-        assert 1.99 < (round_resolution(spacing, 0.0) / spacing) ** 2 < 4.01
-        assert round_resolution(spacing, 0.5) >= 0.5
 
 
 @pytest.mark.parametrize("cog", [False, True])
@@ -353,43 +335,6 @@ def test_clouds_refused(tmp_path, monkeypatch):
     assert {p.suffix for p in tmp_path.iterdir()} == {".las"}
 
 
-@pytest.mark.parametrize("content", [b"", b"not a raster", None])
-def test_not_a_raster(tmp_path, content):
-    path = tmp_path / "r.tif"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(InputError):
-        read_raster(path)
-
-
-@pytest.mark.parametrize("count", [1, 2, 3])
-@pytest.mark.parametrize("method", METHODS)
-def test_very_few_points(tmp_path, method, count):
-    """Points on one line make no triangle; all else has a height in each cell."""
-    xyz = np.column_stack([EAST + np.arange(count), np.full(count, NORTH), np.full(count, 4.0)])
-    cloud = write(tmp_path / "c.las", xyz, crs=None)
-    summary = grid_dsm(cloud, tmp_path / "d.tif", resolution=1.0, method=method)
-    assert (summary.width, summary.height, summary.crs) == (count, 1, None)
-    expected = np.nan if method == "tin" else 4.0
-    np.testing.assert_array_equal(heights(tmp_path / "d.tif"), np.full((1, count), expected))
-    assert read_raster(tmp_path / "d.tif").crs is None
-
-
-def test_full_disk(tmp_path, monkeypatch):
-    """Whatever breaks in the middle, an older raster stays and nothing else is left."""
-    cloud = write(tmp_path / "c.las", scattered(500, 10.0, 10.0))
-    (tmp_path / "d.tif").write_bytes(b"older")
-
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(flow.rasters, "write_part", full)
-    with pytest.raises(InputError):
-        grid_dsm(cloud, tmp_path / "d.tif", resolution=1.0, overwrite=True)
-    assert {p.name for p in tmp_path.iterdir()} == {"c.las", "d.tif"}
-    assert (tmp_path / "d.tif").read_bytes() == b"older"
-
-
 def test_summary_and_progress(tmp_path):
     cloud = write(tmp_path / "c.las", scattered(500, 10.0, 10.0))
     steps = []
@@ -420,12 +365,3 @@ def test_stray_point(tmp_path):
     with rasterio.open(tmp_path / "d.tif") as one, rasterio.open(tmp_path / "w.tif") as other:
         differ = one.read(1) != other.read(1)
     assert differ.sum() <= 1  # the cell that the point came from
-
-
-def test_two_places(tmp_path):
-    cloud = laspy.read(SCENE / "cloud.laz")
-    cloud.x[: len(cloud.x) // 10] += 3_000.0
-    cloud.write(tmp_path / "two.laz")
-    found = pcfix.grid_dsm(tmp_path / "two.laz", tmp_path / "d.tif", resolution=1.0)
-    assert (found.stray, found.points_used) == (0, 20_000)
-    assert found.width > 3_000

@@ -10,7 +10,6 @@ import pytest
 import shapely
 
 import pcfix
-from pcfix.flow.checks import check_water
 from pcfix.grid import shoreline
 from pcfix.grid.shoreline import NearWater
 from pcfix.io.scenes import write_scene
@@ -80,13 +79,6 @@ def test_standard_error(beach, tmp_path, off_m):
         assert length == pytest.approx(line.length)
 
 
-def test_apparent_cloud(beach, tmp_path):
-    folder, ground = beach
-    report = check_water(LEVEL_M, cloud=folder / "cloud.laz", shoreline=tmp_path / "shore.gpkg")
-    xy = read_vectors(tmp_path / "shore.gpkg").coordinates[:, :2]
-    assert math.sqrt(np.mean(distance_m(ground, xy) ** 2)) < 2.0 * report.shoreline["sigma_m"]
-
-
 def island_and_pool(count=60_000, noise_m=0.02):
     """Return points of a beach at x = 10 with an island of radius 6 m and a pool of 4 m."""
     rng = np.random.default_rng(5)
@@ -104,7 +96,7 @@ def test_islands_and_pools(monkeypatch, most):
     monkeypatch.setattr(shoreline, "MOST_POINTS", most)
     points, near = island_and_pool(), NearWater()
     for part in np.array_split(points, 7):
-        near.add(part + np.array([4e5, 4e6, 0.0]), part[:, 2])
+        near += NearWater.of(part + np.array([4e5, 4e6, 0.0]), part[:, 2])
     lines = near.lines(lambda xy: np.full(len(xy), 0.01))
     expected = [60.0, 16.0 * math.pi, 12.0 * math.pi, 8.0 * math.pi]
     assert [one.length_m for one in lines] == pytest.approx(expected, rel=0.05)
@@ -123,8 +115,7 @@ def test_flat_water():
     rng = np.random.default_rng(2)
     x, y = rng.uniform(0.0, 50.0, (2, 20_000))
     above = -0.05 + rng.normal(0.0, 0.03, 20_000)
-    near = NearWater()
-    near.add(np.column_stack([x, y, above]), above)
+    near = NearWater.of(np.column_stack([x, y, above]), above)
     assert sum(one.length_m for one in near.lines(lambda xy: np.full(len(xy), 0.02))) < 10.0
     assert NearWater().lines(lambda xy: np.zeros(len(xy))) == []
 

@@ -120,20 +120,6 @@ def test_given_crs(tmp_path):
         read_gnss(path, block(), crs="EPSG:1")
 
 
-def test_missing_grid(tmp_path):
-    rows = [
-        f"{n},{y!r},{x!r},{z!r},0.1" for n, (x, y, z) in zip("ab", degrees().tolist(), strict=True)
-    ]
-    text = "\n".join(["image,lat,lon,ellipsoidal_height,sigma", *rows])
-    cameras = read_gnss(write(tmp_path, text), block("EPSG:32636+5773"))
-    found, reason = gnss_in_frame_of(cameras, "a.xml")
-    assert found.xyz[:, :2] == pytest.approx(XYZ[:, :2], abs=1e-6)
-    assert np.isnan(found.xyz[:, 2]).all()
-    assert np.isnan(found.sigma_m[:, 2]).all()
-    assert (found.sigma_m[:, :2] == 0.1).all()
-    assert "without the grid us_nga_egm96_15.tif" in reason
-
-
 def test_images_without_position(tmp_path):
     path = write(
         tmp_path, "image,x,y,z\nb.jpg,500001,4000002,3\na.jpg,,,\nq.jpg,4,5,6\nu.jpg,7,8,9\n"
@@ -163,18 +149,6 @@ def test_bad_files(tmp_path, text, code):
     path = write(tmp_path, text)
     with refused(code, path=path):
         read_gnss(path, block())
-
-
-@pytest.mark.parametrize("text", ["image,x,y,z\na.jpg,1,2,three\n", "image,x,y\na.jpg,1,2\n"])
-def test_bad_tables(tmp_path, text):
-    with pytest.raises(InputError, match=r"gnss.csv"):
-        read_gnss(write(tmp_path, text), block())
-
-
-def test_ambiguous_name(tmp_path):
-    path = write(tmp_path, "image,x,y,z\na.jpg,1,2,3\n")
-    with refused("images.ambiguous", image="a.jpg"):
-        read_gnss(path, block(labels=("1/a.jpg", "2/a.jpg")))
 
 
 def test_cameras_that_do_not_fit():

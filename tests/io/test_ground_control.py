@@ -100,18 +100,6 @@ def misses_px(found, cameras):
     return np.array(misses)
 
 
-@rig
-@pytest.mark.filterwarnings("ignore::pcfix.errors.PcfixWarning")
-def test_markers_of_a_rig():
-    path = RIG / "markers_micasenses_rededge.xml"
-    cameras = bring_to(read_cameras(path), "EPSG:25830")
-    found = read_ground_control(path, cameras)
-    assert found.xyz[found.names.index("101")].tolist() == [592145.479, 4347051.82, 727.819]
-    assert (found.sigma_m == 0.005).all()
-    # a block held by its GNSS alone, 2 m beside the survey
-    assert np.median(misses_px(found, cameras)) < 30.0
-
-
 def test_disabled_markers(tmp_path):
     path = tmp_path / "markers.xml"
     path.write_text(MARKERS)
@@ -175,13 +163,6 @@ def test_more_columns(tmp_path):
     assert found.under_water.tolist() == [True, False]
 
 
-def test_one_sigma(tmp_path):
-    rows = [f"{row},0.02,0.25" for row in ROWS]
-    found = read(tmp_path, *rows, head=f"{HEAD},sigma,sigma_px")
-    assert found.sigma_m.tolist() == [[0.02] * 3] * 2
-    assert found.sigma_px.tolist() == [0.25] * 3
-
-
 @pytest.mark.parametrize("how", ["comment", "column", "option"])
 def test_its_own_crs(tmp_path, how):
     to_35 = Transformer.from_crs("EPSG:32636", "EPSG:32635", always_xy=True)
@@ -233,22 +214,6 @@ def test_odm(tmp_path, first, named):
     assert found.image_xy.tolist() == [[100.0, 200.0], [1600.0, 0.0], [0.5, 1199.5]]
 
 
-@pytest.mark.parametrize(
-    ("line", "code"),
-    [("500010 4000010 nan 1 2 a.jpg", "table.number"), ("500010 4000010 2 1 2", "gcps.fields")],
-)
-def test_bad_line_of_odm(tmp_path, line, code):
-    rows = ["500010 4000010 2.5 1 2 b.jpg", line]
-    path = write(tmp_path, *rows, head="EPSG:32636", name="gcp_list.txt")
-    with refused(code, path=path, line=3):
-        read_ground_control(path, block())
-
-
-@pytest.mark.parametrize("labels", [("A", "B"), ("x/a.jpg", "y\\b.jpg"), ("a.tif", "b.tif")])
-def test_names_of_images(tmp_path, labels):
-    assert read(tmp_path, *ROWS, cameras=block(labels=labels)).camera.tolist() == [0, 1, 1]
-
-
 def test_unknown_images(tmp_path):
     rows = [*ROWS, "G2,500030.5,4000020.25,-1.75,z.jpg,5,6"]
     fails(tmp_path, rows, "gcps.unknown_image", point="G2", images=["z.jpg"])
@@ -281,20 +246,6 @@ def test_images_without_pose(tmp_path):
 )
 def test_bad_rows(tmp_path, row, code):
     fails(tmp_path, [*ROWS, row], code)
-
-
-@pytest.mark.parametrize(
-    "row",
-    [
-        "G3,500010,4000010,,c.jpg,1,5",
-        "G3,500010,4000010,1,c.jpg,one,5",
-        "G3,500010,4000010,1,,1,5",
-        "G3,500010,4000010,1,c.jpg,1",
-    ],
-)
-def test_incomplete_rows(tmp_path, row):
-    with pytest.raises(InputError, match=r"gcps.csv: line 5"):
-        read(tmp_path, *ROWS, row)
 
 
 @pytest.mark.parametrize(
@@ -380,19 +331,3 @@ def test_points_far_away(tmp_path):
     fails(tmp_path, rows, "gcps.far", swapped=True)
     found = read(tmp_path, *rows, cameras=block("local"), crs="local")
     assert found.xyz.tolist() == [[4000010, 500010, 2.5]]
-
-
-@pytest.mark.parametrize(
-    "text", ["", "G1,500010,4000010,2.5,a.jpg,1,2\n", "{}", "\0\1\2", "EPSG:32636\n"]
-)
-def test_no_table(tmp_path, text):
-    path = tmp_path / "gcps.csv"
-    path.write_text(text)
-    with refused("gcps.format", path=path):
-        read_ground_control(path, block())
-
-
-def test_first_line_is_no_crs(tmp_path):
-    path = write(tmp_path, "500010 4000010 2.5 1 2 a.jpg", head="UTM 36", name="gcp_list.txt")
-    with pytest.raises(InputError, match="UTM 36"):
-        read_ground_control(path, block())

@@ -109,18 +109,6 @@ def test_bad_tides(tmp_path, text, code, values):
         read_tide(table(tmp_path, text))
 
 
-def test_labels(tmp_path):
-    """Without folder and extension; missing and ambiguous ones."""
-    path = table(tmp_path, "label,time\nday1/A.JPG,2026-05-01T10:00Z\nb,2026-05-01T11:00Z\n")
-    times = read_image_times(path, ["B.tif", "C:\\flight\\a"])
-    assert times.time_s.tolist() == [NOON_S - 3600.0, NOON_S - 7200.0]
-    with refused("image_times.missing", images=["c"]):
-        read_image_times(path, ["a", "c"])
-    table(tmp_path, path.read_text() + "day2/A.JPG,2026-05-01T10:00Z\n")
-    with refused("image_times.missing", images=["a"]):
-        read_image_times(path, ["a"])
-
-
 def photo(path, **tags):
     exif = Image.Exif()
     exif.get_ifd(0x8769).update({int(k[1:], 16): v for k, v in tags.items()})
@@ -167,12 +155,6 @@ def test_times_of_other_software(tmp_path, name, content):
         read_image_times(table(tmp_path, zero, name), ["a"])
 
 
-@pytest.mark.parametrize("text", ["{", "[1, 2]", '{"features": [{}]}', "[]"])
-def test_json_without_times(tmp_path, text):
-    with refused("image_times.missing" if text == "[]" else "image_times.not_one"):
-        read_image_times(table(tmp_path, text, "t.json"), ["a"])
-
-
 @odm
 def test_odm_project():
     labels = list(json.loads((ODM / "opensfm/reconstruction.json").read_text())[0]["shots"])
@@ -215,11 +197,6 @@ def test_heights_in_images(tmp_path, text):
     for place in (tmp_path, tmp_path / "cameras.csv"):
         found = read_altitudes(place, ["folder/a", "b", "c"])
         np.testing.assert_array_equal(found, [30.1, np.nan, np.nan])
-
-
-@pytest.mark.parametrize("name", ["none/cameras.csv", "none.psx", "cameras.csv"])
-def test_no_heights(tmp_path, name):
-    assert np.isnan(read_altitudes(tmp_path / name, ["a", "b"])).all()
 
 
 @real

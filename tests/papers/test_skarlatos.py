@@ -7,27 +7,29 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.report.papers import effect_rows, shan_rows
-from pcfix.simulate.refraction_effect import (
-    FLYING_HEIGHTS_M,
-    OVERLAPS,
+from pcfix.simulate.tracing import piercing_points
+from tests.papers.hsu_wang import simulate_bowl
+from tests.papers.refraction_effect import (
+    FLIGHTS,
     PAPER_INDEX,
     SWINGLETCAM,
     ULTRACAM,
     AerialCamera,
     StereoPair,
     effect,
-    effects,
+    effect_rows,
     shan_iterations,
+    true_points,
+    write_all,
 )
 from tests.papers.test_equations import pierced, refracted
 
 PAIR = StereoPair(SWINGLETCAM, 100.0)
 PAIRS = [
     StereoPair(camera, height, overlap)
-    for camera in (SWINGLETCAM, ULTRACAM)
-    for overlap in OVERLAPS[camera]
-    for height in FLYING_HEIGHTS_M[camera]
+    for camera, (heights, overlaps) in FLIGHTS.items()
+    for overlap in overlaps
+    for height in heights
 ]
 each_pair = pytest.mark.parametrize(
     "pair", PAIRS, ids=lambda p: f"{p.flying_height_m:g}-{p.overlap}"
@@ -97,9 +99,9 @@ def test_long_lens():
 
 
 def test_depth_zero():
-    zero, deep = effects([PAIR], (0.0, 15.0), PAPER_INDEX)
+    zero, deep = (effect(PAIR, depth, PAPER_INDEX) for depth in (0.0, 15.0))
     assert np.abs(zero.error_m).max() < 1e-12  # m, rounding of sums of 100 m
-    rows = effect_rows([zero, deep])
+    rows = effect_rows([zero, deep], PAPER_INDEX)
     assert rows[0]["factor_centre"] == rows[0]["factor_corner"] == ""
     assert rows[1]["factor_corner"] == pytest.approx(23.23 / 15.0, abs=0.005 / 15.0)
 
@@ -114,9 +116,6 @@ def test_shan_converges(pair):
     assert largest[2] < 1e-3  # m: the second iteration is below any survey's noise
     assert largest[-1] < 1e-7  # m: s is exact for a level surface, so nothing is left
     assert table[-1].change < 1e-9
-    rows = shan_rows(pair, table)
-    assert rows[0]["camera"] == pair.camera.name and rows[0]["change_tan_a"] == ""
-    assert rows[1]["max_residual_m"] == pytest.approx(table[1].max_m, rel=1e-3)
 
 
 def test_shan_starts_with_straight_rays():
@@ -143,3 +142,37 @@ def test_shan_index_of_one():
     table = shan_iterations(PAIR, 15.0, 1.0)
     assert len(table) == 2
     assert abs(table[0].max_m) < 1e-9
+
+
+def test_effect_index_of_one():
+    still = effect(PAIR, 15.0, 1.0)
+    assert np.abs(still.error_m).max() < 1e-9  # m, rounding of sums about 100
+    assert still.shift_m.max() < 1e-9
+
+
+def test_light_from_true_point():
+    """Fermat's path from the true point: where two rays meet, straight lines meet as well."""
+    apparent = np.array([[0.0, y, -15.0] for y in (0.0, 20.0, 60.0)])  # on the plane of symmetry
+    true = true_points(apparent, PAIR.centres, 1.34)
+    for centre in PAIR.centres:
+        surface = piercing_points(true, np.tile(centre, (3, 1)), 0.0, 1.34)
+        sight, straight = surface - centre, apparent - centre
+        lengths = np.linalg.norm(sight, axis=1) * np.linalg.norm(straight, axis=1)
+        sine = np.cross(sight, straight) / lengths[:, None]  # of two lines of about 120 m
+        assert np.abs(sine).max() < 1e-9
+
+
+def test_correction_agrees():
+    model = effect(PAIR, 15.0, nodes=9)
+    x, y = (side.ravel() for side in np.meshgrid(model.x_m, model.y_m))
+    apparent = np.column_stack([x, y, np.full(len(x), -15.0)])
+    cameras = pcfix.Cameras(("left", "right"), PAIR.centres)
+    corrected = pcfix.correct_points(apparent, cameras, 0.0, index=1.34).xyz
+    assert corrected[:, 2] == pytest.approx(model.error_m.ravel() - 15.0, abs=1e-8)  # m
+
+
+def test_files(tmp_path):
+    found = write_all(tmp_path, bowl=simulate_bowl(0.01))
+    assert len(found) == (2 + 2 * 2) * 16
+    assert {path.suffix for path in tmp_path.iterdir()} == {".csv", ".png"}
+    assert all(path.stat().st_size > 100 for path in tmp_path.iterdir())

@@ -476,13 +476,13 @@ def test_mistakes(tmp_path: Path, options: dict[str, Any]) -> None:
 def test_fault_of_pcfix(tmp_path: Path) -> None:
     (tmp_path / "job.json").write_text(json.dumps(mistaken_job(tmp_path, {})))
     breaking = (
-        "import pcfix.flow.job\n"
-        "whole = pcfix.flow.job.Job.correct\n"
+        "import pcfix.flow.correction\n"
+        "whole = pcfix.flow.correction.correct_chunk\n"
         "def broken(*a, calls=[]):\n"
         "    calls.append(1)\n"
         "    if len(calls) < 31: raise ZeroDivisionError('a fault')\n"
         "    return whole(*a)\n"
-        "pcfix.flow.job.Job.correct = broken\n"
+        "pcfix.flow.correction.correct_chunk = broken\n"
     )
     done = python(breaking + SURVIVE, "job.json", WATER_M, folder=tmp_path)
     assert done.returncode == 0, done.stderr

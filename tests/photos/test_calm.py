@@ -183,6 +183,14 @@ def mapped(place, folder, with_own):
     return cv2.imread(str(place / f"dry_{with_own}" / "f07.png"), 0)
 
 
+def test_no_interval(tmp_path, folder):
+    with warned("frames.no_interval"):
+        pcfix.calm_frames(
+            folder, tmp_path / "calm.png", surface=True, depth=2.0, gsd=0.0425, every=4
+        )
+    assert len(list((tmp_path / "calm_water").glob("*.tif"))) == 3
+
+
 def test_video(tmp_path, folder):
     film = tmp_path / "film.avi"
     writer = cv2.VideoWriter(str(film), cv2.VideoWriter_fourcc(*"MJPG"), 5.0, (240, 180))
@@ -226,10 +234,3 @@ def test_bad_frames(tmp_path, folder, calm):
     with refused("output.suffix"):
         pcfix.calm_frames(folder, tmp_path / "calm.jpg")
     assert not list(tmp_path.glob("calm*"))
-
-
-def test_no_interval(tmp_path, folder):
-    how = {"surface": True, "depth": 2.0, "gsd": 0.0425, "every": 4}
-    with warned("frames.no_interval"):
-        pcfix.calm_frames(folder, tmp_path / "calm.png", **how)
-    assert len(list((tmp_path / "calm_water").glob("*.tif"))) == 3

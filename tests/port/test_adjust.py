@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import pcfix
 from pcfix.adjust.block import Unknowns, plain_block
 from pcfix.adjust.problem import port_of, prepare
 from pcfix.adjust.solve import solve
@@ -25,7 +24,6 @@ from pcfix.port.shapes import port_of as port_of_text
 from pcfix.report.adjustment import adjustment_text
 from tests.utils.adjust_files import EPSG, write_gnss
 from tests.utils.port_scenes import simulate_port
-from tests.utils.program import run_pcfix
 
 pytestmark = pytest.mark.filterwarnings("default::pcfix.errors.PcfixWarning")
 
@@ -67,20 +65,6 @@ def test_poses_and_bed(tmp_path, port):
     assert bed < 2.0 * np.median(found.precision.point_sigma_m[:, 2])
     if port is FLAT:  # a dome about the projection centre hardly bends anything
         assert bed < 0.1 * np.median(np.abs(made.apparent - made.truth)[:, 2])
-
-
-def test_command(tmp_path):
-    made = write_scene(tmp_path, FLAT)
-    words = [
-        "adjust", "model", "out", "--port", "flat:distance=0.02,thickness=0.008",
-        "--gnss", "gnss.csv", "--lens-unknowns", "none", "-q",
-    ]  # fmt: skip
-    done = run_pcfix(*words, folder=tmp_path)
-    assert done.returncode == 0, done.stderr
-    read = pcfix.read_cameras(tmp_path / "out" / "colmap")
-    off = read.centres - made.cameras.centres
-    assert np.sqrt((off**2).mean()) < 0.02  # m: what they were off before
-    assert (tmp_path / "out" / "report.html").is_file()
 
 
 @pytest.mark.parametrize("port", [FLAT, DomePort(0.05, 0.004, 1.49, (0.003, -0.002, 0.006))])

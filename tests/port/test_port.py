@@ -88,18 +88,6 @@ def test_no_refraction(port, n):
         assert np.abs(out[:, :, 4]).max() < ROUNDING
 
 
-def test_on_axis():
-    for port in (FlatPort(0.02, 0.008), DomePort(0.05, 0.004, 1.49, (0.0, 0.0, -0.02))):
-        w = seen(port, [(0.0, 0.0, 2.0)])[0, :, 0]
-        assert unit(w).tolist() == [0.0, 0.0, 1.0]
-
-
-def test_paraxial_limit():
-    # the paraxial limit of a port at the projection centre: the next term is t^2 (n^2 - 1) / 2
-    w = seen(FlatPort(0.0), [(1e-5, 0.0, 1.0)])[0, :, 0]
-    assert w[0] / w[2] == pytest.approx(1e-5 * N_WATER, rel=1e-9)
-
-
 @pytest.mark.parametrize("name", PORTS)
 def test_round_trip(name):
     port, xyz = PORTS[name], points(1)

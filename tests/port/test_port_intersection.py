@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 
 from pcfix import Cameras
 from pcfix.errors import SettingError
-from pcfix.kernels import threads
 from pcfix.lens.imaging import unproject
 from pcfix.model import Outcome
 from pcfix.options.correct import BudgetOptions, ScienceOptions
@@ -94,27 +93,6 @@ def test_covariance_of_noise(noisy):
     assert rms(errors_of(noisy, from_images(noisy)))[2] == pytest.approx(rms(errors)[2], rel=0.1)
 
 
-def test_covariance_of_index():
-    # image places are fixed, so that they are intersected with another index
-    scene = simulate_port(FLAT, points=300, seed=2)
-    step = 1e-3
-    looking = unproject(scene.cameras.lenses[0], scene.image_xy)
-
-    def shifts(index):
-        settings = ScienceOptions(index=index)
-        given = scene.views, scene.cameras, scene.port, settings
-        return intersect_rays(scene.truth, looking, *given).shift_m
-
-    by_n = (shifts(1.34 + step) - shifts(1.34 - step)) / (2.0 * step)
-    budget = BudgetOptions(sigma_image=0.0, sigma_index=1.0)
-    cov = port_covariances(
-        scene.truth, scene.views, scene.cameras, scene.port, ScienceOptions(**vars(budget))
-    )
-    # the intersection weighs rays in space, the covariance residuals in the images: the rays of
-    # another index miss each other, and the two differ by some percent
-    assert np.median(np.abs(np.sqrt(cov[:, 5]) / np.abs(by_n[:, 2]) - 1.0)) < 0.1
-
-
 def test_covariance_of_poses():
     # one camera errs at a time: its centre by 0.1 mm, its attitude by 0.1 mrad, in turn
     scene = simulate_port(FLAT, points=25, seed=3)
@@ -183,13 +161,6 @@ def test_port_views(scene):
     assert seen.camera.tolist() == scene.views.camera.tolist()
 
 
-def test_without_views(scene):
-    # several sets of cameras can explain a point, and those at the border of an image are many in
-    # a block of twelve images: more than half the points must be right
-    found, _ = intersect_through_port(scene.apparent, scene.cameras, scene.port, CONSISTENT)
-    assert np.median(np.abs(errors_of(scene, found)[:, 2])) < 5e-9
-
-
 def test_limits(scene):
     def run(**limits):
         return intersect_through_port(
@@ -205,22 +176,6 @@ def test_limits(scene):
     few = narrow.outcome != Outcome.CORRECTED
     assert few.any()
     assert not narrow.shift_m[few].any()
-
-
-def test_threads(noisy):
-    def run(rows):
-        found = correct_through_port(
-            noisy.apparent[rows], noisy.cameras, noisy.port, CONSISTENT, noisy.views.take(rows)
-        )
-        return found.shift_m, found.covariance_m2
-
-    rows = np.arange(len(noisy.apparent))
-    with threads(3):
-        many = run(rows)
-    with threads(1):
-        one = run(rows[::-3])
-    for a, b in zip(many, one, strict=True):
-        assert a[::-3].tobytes() == b.tobytes()
 
 
 def test_cameras_refused():

@@ -15,8 +15,7 @@ from pcfix.errors import SettingError
 from pcfix.lens.imaging import coefficients, image_and_gradients
 from pcfix.model import Cameras, Lens, Outcome, Views, WaterMesh, WaterPlane, WaterRaster
 from pcfix.options.correct import ScienceOptions
-from pcfix.refract.consistent import check_consistent, consistent
-from pcfix.refract.intersect import intersect
+from pcfix.refract.intersect import check_consistent, consistent, intersect
 from pcfix.refract.methods import correct
 from pcfix.simulate.tracing import triangulate
 from pcfix.water.surface import surface_above
@@ -171,7 +170,7 @@ def exact(request):
 
 
 @pytest.mark.parametrize("shape", [in_utm, as_mesh, as_raster])
-def test_the_truth_comes_home(exact, shape):
+def test_truth_recovered(exact, shape):
     cameras, plane, truth, apparent, lists = exact
     result = run(apparent + UTM, moved(cameras, UTM), shape(plane), views_of(lists))
     assert (result.outcome == Outcome.CORRECTED).all()
@@ -179,7 +178,7 @@ def test_the_truth_comes_home(exact, shape):
     assert apparent + result.shift_m == pytest.approx(truth, abs=MICROMETRE)
 
 
-def test_snell_does_not_come_home(exact):
+def test_snell_is_biased(exact):
     cameras, plane, truth, apparent, lists = exact
     result = run(
         apparent + UTM, moved(cameras, UTM), in_utm(plane), views_of(lists), method="snell"
@@ -188,7 +187,7 @@ def test_snell_does_not_come_home(exact):
     assert np.abs(apparent + result.shift_m - truth).max() > 0.01
 
 
-def test_twin_that_triangulates_fully_agrees(exact):
+def test_full_triangulation(exact):
     # points moved from where a noise-free point can be: the residuals are some pixels
     cameras, plane, truth, apparent, lists = exact
     shifted = apparent + np.random.default_rng(2).normal(0, 0.03, apparent.shape)
@@ -202,7 +201,7 @@ def test_twin_that_triangulates_fully_agrees(exact):
         assert shifted[i] + result.shift_m[i] == pytest.approx(expected, abs=2 * MICROMETRE)
 
 
-def test_index_of_one_changes_nothing(exact):
+def test_index_one(exact):
     cameras, plane, _, apparent, lists = exact
     result = run(apparent + UTM, moved(cameras, UTM), in_utm(plane), views_of(lists), n=1.0)
     # a metre of UTM is known to 1e-9, and the geometry multiplies it by no more than a few
@@ -211,7 +210,7 @@ def test_index_of_one_changes_nothing(exact):
     assert np.abs(here.shift_m).max() < NANOMETRE
 
 
-def test_two_symmetrical_cameras_need_no_triangulation():
+def test_symmetrical_pair():
     # all is in one plane: tan(r) = x / D, tan(i) = x / D', and sin(i) = n sin(r)
     cameras = looking([[-20.0, 0, 70], [20.0, 0, 70]], [15.0, 15.0], [0.0, 180.0])
     depth = 4.0
@@ -223,14 +222,14 @@ def test_two_symmetrical_cameras_need_no_triangulation():
     assert result.ray_miss_m[0] == pytest.approx(0.0, abs=MICROMETRE)
 
 
-def test_straight_below_the_camera_depth_grows_by_the_index():
+def test_straight_down():
     narrow = looking([[-0.5, 0, 70], [0.5, 0, 70]], [0.0, 0.0], [0.0, 0.0])
     result = run(np.array([[0.0, 0.0, -3.0]]), narrow, WaterPlane(0.0), views_of([[0, 1]]))
     # angles of half a degree: their squares are below 1e-4
     assert result.shift_m[0] == pytest.approx([0, 0, -0.34 * 3.0], abs=3e-4)
 
 
-def test_each_camera_has_its_own_level():
+def test_level_per_camera():
     cameras, truth = oblique_block(np.random.default_rng(1)), bed(10, seed=8)
     truth[:5, 2] = np.linspace(0.05, 0.3, 5)  # above the water of some cameras
     offset = np.where(np.arange(len(cameras)) % 2, 0.3, -0.3)
@@ -351,7 +350,7 @@ def eight_under_waves():
     )
 
 
-def test_compiled_and_interpreted_agree(tmp_path):
+def test_interpreted_agrees(tmp_path):
     program = (
         "import numpy as np; from tests.refract.test_consistent import eight_under_waves;"
         f" np.save({str(tmp_path / 'out.npy')!r}, eight_under_waves())"
@@ -363,7 +362,7 @@ def test_compiled_and_interpreted_agree(tmp_path):
     assert np.load(tmp_path / "out.npy") == pytest.approx(eight_under_waves(), abs=MICROMETRE)
 
 
-def test_what_goes_with_the_shift_is_as_of_snell(many):
+def test_counts_as_snell(many):
     points, cameras, water, views = many
     one, other = (
         run(points, cameras, water, views),
@@ -377,7 +376,7 @@ def test_what_goes_with_the_shift_is_as_of_snell(many):
     assert (one.ray_miss_m >= other.ray_miss_m - NANOMETRE).all()
 
 
-def test_ray_miss_is_the_distance_from_the_refracted_rays(many):
+def test_ray_miss(many):
     points, cameras, water, views = many
     result = run(points, cameras, water, views)
     for i in (5, 105, 205):
@@ -394,7 +393,7 @@ def test_ray_miss_is_the_distance_from_the_refracted_rays(many):
         assert result.ray_miss_m[i] == pytest.approx(np.sqrt(np.mean(squares)), abs=MICROMETRE)
 
 
-def test_views_that_are_all_one_camera():
+def test_one_camera_only():
     places = [[-20.0, 0, 70], [20.0, 0, 70], [0.0, 20, 70]]
     cameras = looking(places, [15.0, 15.0, 15.0], [0.0, 180.0, 270.0])
     points = np.array([[0.0, 0, -1], [1.0, 0, -2], [0.5, 0.5, -3], [0.0, 1, -2]])
@@ -405,14 +404,14 @@ def test_views_that_are_all_one_camera():
     assert (result.shift_m[1:3] == 0.0).all()
 
 
-def test_cameras_at_one_place_are_parallel():
+def test_parallel():
     cameras = looking([[0.0, 0, 70], [0.0, 0, 70]], [0.0, 10.0], [0.0, 0.0])
     result = run(np.array([[1.0, 2, -3]]), cameras, WaterPlane(0.0), views_of([[0, 1]]))
     assert result.outcome.tolist() == [Outcome.PARALLEL_RAYS]
     assert (result.shift_m == 0.0).all()
 
 
-def test_points_without_a_solution_keep_that_of_snell():
+def test_unsolved_keep_snell():
     # the second camera looks away: it has no image of the point, and no list gives it a ray
     cameras, water = (
         looking([[-20.0, 0, 70], [20.0, 0, 70]], [15.0, 170.0], [0.0, 0.0]),
@@ -429,7 +428,7 @@ def test_points_without_a_solution_keep_that_of_snell():
     assert result.shift_m == pytest.approx(expected.shift_m, abs=NANOMETRE)
 
 
-def test_cameras_without_angles_or_lenses_are_refused():
+def test_no_orientation():
     cameras = looking([[-20.0, 0, 70], [20.0, 0, 70]], [15.0, 15.0], [0.0, 180.0])
     check_consistent(cameras)
     with refused("cameras.no_orientation", SettingError, missing=["lenses"]):
@@ -466,7 +465,7 @@ LENSES = {
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_gradients_of_the_image_are_differences_of_the_formulas(name):
+def test_image_gradients(name):
     lens, step = LENSES[name], 1e-5
     ahead = np.array([0.0, 0.0, 1.0])
     for direction in ahead + np.random.default_rng(4).uniform(-0.4, 0.4, (6, 3)):
@@ -483,7 +482,7 @@ def test_gradients_of_the_image_are_differences_of_the_formulas(name):
 
 
 @pytest.mark.parametrize("name", ["equidistant", "polynomial", "fov", "dual", "eucm"])
-def test_gradients_on_the_axis_are_those_beside_it(name):
+def test_image_gradients_on_axis(name):
     lens = LENSES[name]
     on, beside = (image_and_gradients(coefficients(lens), x, 0.0, 1.0)[2] for x in (0.0, 1e-7))
     assert on == pytest.approx(beside, abs=1e-2)

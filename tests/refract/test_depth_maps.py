@@ -75,7 +75,7 @@ def best(partners, tolerance):
     return best_pairs(partners, np.empty((25, 2)), tolerance)
 
 
-def test_the_best_pairs_of_parabolas_are_those_that_scipy_finds():
+def test_best_pairs():
     rng = np.random.default_rng(1)
     for count in (2, 3, 5):
         for _ in range(20):
@@ -88,7 +88,7 @@ def test_the_best_pairs_of_parabolas_are_those_that_scipy_finds():
 
 
 @pytest.mark.parametrize("c", [0, 2, 4, 5, 7])
-def test_a_depth_is_that_of_a_slow_twin(c):
+def test_depth_as_twin(c):
     """The same costs, minimised by scipy; the light traced by other means."""
     p, plane, bed = np.array([3.0, 4.0, -4.5]), (0.3, 0.004, -0.003), (-6.5, 0.0, 0.0)
     offset = np.array([0.0, 0.05, -0.03, 0.02, 0.0, 0.04, 0.0, -0.05])
@@ -104,7 +104,8 @@ def test_a_depth_is_that_of_a_slow_twin(c):
         p[None], p[None], np.array([height]), np.zeros((1, 2)), normal[None], CAMERAS.centres,
         offset, nothing, nothing, N_WATER,
     )  # fmt: skip
-    block, partners = Block(points, images_of(None, CAMERAS), matcher()), np.empty((5, 3))
+    block = Block(points, images_of(None, CAMERAS), matcher(), (0.0, 0.0, 0.0), 8.0)
+    partners = np.empty((5, 3))
     length, sight = np.linalg.norm(p - CAMERAS.centres[c]), sight_of(points, 0)
     count = _compare(partners, c, tuple(q - p), length, sight, block)
     # 0.3 to 1 m; scipy's least values are flat within 1e-6 m
@@ -113,7 +114,7 @@ def test_a_depth_is_that_of_a_slow_twin(c):
     )
 
 
-def test_a_depth_needs_an_image_that_was_matched():
+def test_depth_needs_partner():
     none = matcher(matched=np.full((8, 5), -1))
     result = run(
         np.array([[3.0, 4, -4.5]]), WaterPlane(0.3), listed([NADIR]), Learned(matcher=none)
@@ -145,7 +146,7 @@ def inverted(maps, slope, metric, water, offset):
 
 
 @pytest.mark.parametrize("c", [1, 5])
-def test_a_single_map_comes_home(c):
+def test_single_map(c):
     found, true = inverted((c,), (0.0, 0.0), "angles", PLANES["tilted"], OFFSET)
     # no mean to be taken: what is left is scipy's least value and the bisection of the height
     assert found == pytest.approx(true, abs=1e-5)
@@ -153,7 +154,7 @@ def test_a_single_map_comes_home(c):
 
 @pytest.mark.parametrize("maps", [NADIR, MIXED], ids=["nadir", "mixed"])
 @pytest.mark.parametrize("water", PLANES)
-def test_fused_maps_of_a_level_bed_come_home(maps, water):
+def test_fused_maps(maps, water):
     found, true = inverted(maps, (0.0, 0.0), "angles", PLANES[water], OFFSET)
     # ways are balanced as shares of the distances from the cameras, which differ by 3 %, and the
     # maps by decimetres: 0.1 mm from nadir, 0.8 mm with obliques
@@ -162,20 +163,20 @@ def test_fused_maps_of_a_level_bed_come_home(maps, water):
 
 @pytest.mark.parametrize("maps", [NADIR, MIXED], ids=["nadir", "mixed"])
 @pytest.mark.parametrize("metric", ["angles", "pixels"])
-def test_a_sloping_bed_comes_home(maps, metric):
+def test_sloping_bed(maps, metric):
     """The model has a level bed, and angles for pixels; the truth has a slope of 0.15."""
     found, true = inverted(maps, (0.12, -0.09), metric, PLANES["level"], np.zeros(8))
     # 0.5 mm up and down, and 1.7 mm aside with obliques, whose places of the bed are far apart
     assert found == pytest.approx(true, abs=0.005)
 
 
-def test_water_that_does_not_refract_changes_nothing():
+def test_index_one():
     xyz = np.array([[3.0, 4, -4.5], [-6, 2, -1.0]])
     result = run(xyz, WaterPlane(0.3), listed([MIXED, NADIR]), Learned(matcher=matcher()), n=1.0)
     assert np.abs(result.shift_m).max() < 1e-9
 
 
-def test_the_weights_of_a_list_do_not_depend_on_their_unit():
+def test_weight_unit():
     xyz, weight = np.array([[3.0, 4, -4.5]]), [np.array([1.0, 0.5, 2.0, 0.7, 1.2])]
     learned = Learned(matcher=matcher())
     one = run(xyz, WaterPlane(0.3), listed([MIXED], weight), learned)
@@ -186,7 +187,7 @@ def test_the_weights_of_a_list_do_not_depend_on_their_unit():
     assert np.abs(even.shift_m - one.shift_m).max() > 0.01
 
 
-def test_averaged_maps_share_the_weight():
+def test_averaged_maps():
     """A map that was averaged with two others is as good as the three of them with a third each."""
     xyz, averaged = np.array([[3.0, 4, -4.5]]), np.full((8, 8), -1)
     averaged[2, :2] = [1, 5]
@@ -201,7 +202,7 @@ FUSED = np.array([[j for j in range(8) if j != c] + [-1] * 5 for c in range(8)])
 
 
 @pytest.mark.parametrize("with_list", [True, False], ids=["list", "no list"])
-def test_hardly_any_water_gives_numbers(with_list):
+def test_shallow(with_list):
     depth = np.array([1e-12, 1e-6, 1e-3, 0.02, 0.049, 0.2])
     xyz = np.column_stack([np.full(6, 3.0), np.full(6, 4.0), 0.3 - depth])
     learned = Learned(matcher=matcher(fused=FUSED, averaged=FUSED[:, :8].copy()))
@@ -217,7 +218,7 @@ def test_hardly_any_water_gives_numbers(with_list):
 
 
 @pytest.mark.parametrize("with_list", [True, False], ids=["list", "no list"])
-def test_points_of_few_images_have_an_outcome(with_list):
+def test_few_images(with_list):
     """In the middle; far outside; and where one oblique looks alone."""
     xyz = np.array([[3.0, 4, -4.5], [900.0, 0, -4.5], [75.0, 3.0, -3.0]])
     learned = Learned(matcher=matcher(fused=FUSED, averaged=FUSED[:, :8].copy()))
@@ -263,7 +264,7 @@ def rms(values):
 @pytest.mark.parametrize(
     ("name", "most"), mostly_nightly([("nadir", 2.2), ("half oblique", 8.0)], ("nadir", 2.2))
 )
-def test_known_maps_of_a_block_are_undone(name, most):
+def test_block_with_list(name, most):
     """The partners are found from the cloud, nine in ten of them rightly; half a pixel of noise."""
     views = replace(scene_of(name).views, kind="depth-maps")
     error = errors_gsd(name, method="consistent", views=views)
@@ -278,7 +279,7 @@ def test_known_maps_of_a_block_are_undone(name, most):
 @pytest.mark.parametrize(
     ("name", "most"), mostly_nightly([("nadir", 3.0), ("half oblique", 9.0)], ("half oblique", 9.0))
 )
-def test_maps_are_found_where_no_list_tells_them(name, most, monkeypatch):
+def test_block_without_list(name, most, monkeypatch):
     error = errors_gsd(name, method="consistent", camera_set="mvs")
     assert rms(error) < most  # 2.4 and 7.3 GSD
     # 1.3 and 5.2: with fewer wild points the bias of the wrong groups shows
@@ -294,7 +295,7 @@ def test_maps_are_found_where_no_list_tells_them(name, most, monkeypatch):
 # the bed of the surroundings
 
 
-def test_the_bed_is_at_the_height_that_all_points_can_have_come_from():
+def test_bed_of_groups():
     rng = np.random.default_rng(6)
     xyz = np.column_stack([rng.uniform(0, 30, (60_000, 2)), rng.normal(-4, 0.5, 60_000)])
     bed = -6.0 - 0.02 * xyz[:, 0]
@@ -309,7 +310,7 @@ def test_the_bed_is_at_the_height_that_all_points_can_have_come_from():
     assert close.mean() > 0.97
 
 
-def test_many_likely_beds_of_a_point_are_one_vote():
+def test_one_vote_per_point():
     xyz = np.tile([[1.0, 1.0, 0.0]], (5, 1))
     likely = np.full((5, 8), np.nan, np.float32)
     likely[0] = -3.0  # eight groups of one point
@@ -318,13 +319,13 @@ def test_many_likely_beds_of_a_point_are_one_vote():
     assert bed_of(xyz, likely).height_at(xyz[:1, :2]) == pytest.approx([-5.0], abs=WIDTH_M / 2)
 
 
-def test_one_point_is_a_bed():
+def test_bed_of_one_point():
     xyz = np.array([[410_000.0, 4_650_000.0, -2.0]])
     found = bed_of(xyz, np.array([[-1.5, np.nan]], np.float32))
     assert found.height_at(xyz[:, :2]) == pytest.approx([-3.5])
 
 
-def test_nothing_is_known_outside_and_where_no_group_is():
+def test_unknown_bed():
     found = Bed(np.array([[1.0, np.nan], [3.0, 4.0]]), 10.0, 20.0, 2.0)
     xy = np.array(
         [[10.0, 20.0], [13.9, 20.1], [11, 23.9], [13, 22], [9.9, 21], [11, 24.1], [99, 0]]
@@ -338,7 +339,7 @@ def test_nothing_is_known_outside_and_where_no_group_is():
     assert (heights[:40] == -1.0).all() and np.isnan(heights[40:]).all()
 
 
-def test_points_without_a_bed_are_still_corrected():
+def test_no_bed():
     xyz = np.array([[3.0, 4.0, -4.5]])
     one = Learned(matcher=matcher(fused=FUSED))
     far = one._replace(bed=Bed(np.zeros((1, 1)), 500.0, 500.0, 1.0))
@@ -347,7 +348,7 @@ def test_points_without_a_bed_are_still_corrected():
     )
 
 
-def test_the_order_of_points_does_not_change_the_bed():
+def test_bed_in_any_order():
     rng = np.random.default_rng(7)
     xyz = np.column_stack([rng.uniform(0, 20, (500, 2)), rng.normal(-4, 0.3, 500)])
     likely = rng.uniform(-3, 0, (500, 4)).astype(np.float32)
@@ -394,7 +395,7 @@ def rendered_errors_gsd(**choices):
 
 
 @rendered
-def test_a_real_cloud_with_its_list():
+def test_real_cloud_with_list():
     error = rendered_errors_gsd(views=replace(rendered_cloud()[2], kind="depth-maps"))
     assert len(error) > 10_000
     assert rms(error) < 1.2  # 0.9 GSD; triangulated at once the same points have 1.3 to 1.9
@@ -402,7 +403,7 @@ def test_a_real_cloud_with_its_list():
 
 
 @rendered
-def test_a_real_cloud_without_a_list():
+def test_real_cloud_without_list():
     error = rendered_errors_gsd(camera_set="mvs")
     assert len(error) > 10_000
     assert rms(error) < 1.2  # 1.05 GSD

@@ -8,8 +8,14 @@ import pytest
 
 import pcfix
 from pcfix.kernels import threads
-from pcfix.model import WaterRaster
+from pcfix.model import WaterPlane, WaterRaster
+from pcfix.options.correct import ScienceOptions
+from pcfix.refract.batch import Learned
+from pcfix.refract.matcher import matcher_of
+from pcfix.refract.methods import correct
 from pcfix.refract.tiling import TILE, spatial_order
+from pcfix.water.surface import surface_above
+from tests.utils.batches import batch_of
 from tests.utils.beyond_frames import BEYOND_FRAMES
 
 pytestmark = BEYOND_FRAMES
@@ -62,7 +68,7 @@ def views_in_frame(points, cameras):
     return pcfix.Views(start, np.concatenate(rows))
 
 
-def test_frame_test_is_projection(points, cameras):
+def test_frames_are_projection(points, cameras):
     views = views_in_frame(points, cameras)
     result = snell(points, cameras, 0.0)
     seen = np.diff(views.start)
@@ -78,15 +84,14 @@ PAIRS = {"camera_set": "mvs", "matcher": "pairs"}
 WAYS = {
     "snell": {"method": "snell"},
     "snell, waves": {"method": "snell", "water": WAVES},
-    "consistent": {"method": "consistent", "camera_set": "all", "exact": True},
+    "consistent": {"method": "consistent", "camera_set": "all"},
     "consistent, waves": {"method": "consistent", "camera_set": "all", "water": WAVES},
     **{name: {"method": name} for name in ("shan", "butler", "murase", "factor")},
-    "cells": {"method": "consistent", "camera_set": "all"},
     "depth maps": {"method": "consistent", "camera_set": "mvs", "matcher": "depth-maps"},
     "pairs": {"method": "consistent", **PAIRS},
 }
-OF_ALL = ("cells", "depth maps", "pairs")
-"""Polynomials and matchers depend on all points."""
+OF_ALL = ("depth maps", "pairs")
+"""Matchers depend on all points."""
 
 
 def corrected(points, cameras, *, water=0.0, **how):
@@ -94,7 +99,7 @@ def corrected(points, cameras, *, water=0.0, **how):
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_threads_and_company(points, cameras, way):
+def test_any_threads_and_chunks(points, cameras, way):
     how, shuffled = WAYS[way], np.random.default_rng(1).permutation(N)
     whole = corrected(points, cameras, **how)
     assert whole.corrected.any()
@@ -109,23 +114,28 @@ def test_threads_and_company(points, cameras, way):
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_no_points(cameras, way):
-    assert corrected(np.zeros((0, 3)), cameras, **WAYS[way]).xyz.shape == (0, 3)
+def test_no_points(points, cameras, way):
+    how, none = dict(WAYS[way]), np.zeros((0, 3))
+    water = how.pop("water", WaterPlane(0.0))
+    learned = Learned(matcher=matcher_of(cameras, points) if "matcher" in how else None)
+    above = surface_above(water, none)
+    batch = batch_of(none, above, water, cameras, ScienceOptions(**how), learned=learned)
+    assert correct(batch).shift_m.shape == (0, 3)
 
 
-def test_point_by_point_kernel_agrees_to_the_bit(points, cameras):
+def test_listed_as_in_frame(points, cameras):
     every = snell(points, cameras, 0.0)
     chosen = snell(points, cameras, 0.0, max_cameras=len(cameras))
     same(every, chosen)
 
 
-def test_level_plane_and_dimension_agree(points, cameras):
+def test_level_plane_dimension(points, cameras):
     level = snell(points, cameras, 0.25)
     same(level, snell(points, cameras, np.full(N, 0.25)))
     same(level, snell(points, cameras, pcfix.WaterPlane(0.25)))
 
 
-def test_max_cameras_takes_the_steepest(points, cameras):
+def test_max_cameras(points, cameras):
     result = snell(points, cameras, 0.0, max_cameras=3)
     assert result.ray_count.max() == 3
     views = views_in_frame(points, cameras)
@@ -138,13 +148,13 @@ def test_max_cameras_takes_the_steepest(points, cameras):
         assert result.incidence_deg[i] == pytest.approx(np.sort(angle)[2], abs=1e-6)
 
 
-def test_max_angle_limits_the_rays(points, cameras):
+def test_max_angle(points, cameras):
     result = snell(points, cameras, 0.0, max_angle=15.0)
     assert 0 < result.incidence_deg.max() <= 15.0 + 1e-6
     assert set(result.outcome.tolist()) >= {pcfix.Outcome.CORRECTED, pcfix.Outcome.FLAT_RAYS}
 
 
-def test_unusable_rays_say_why():
+def test_unusable_rays():
     two_at_one_place = pcfix.Cameras(("a", "b"), np.array([[0.0, 0, 50], [0, 0, 50]]))
     below = snell([[0, 0, -1.0]], two_at_one_place, 0.0)
     assert below.outcome.tolist() == [pcfix.Outcome.PARALLEL_RAYS]
@@ -155,19 +165,19 @@ def test_unusable_rays_say_why():
     assert result.depth_m.tolist() == [1.0]
 
 
-def test_cameras_used_are_those_with_rays(points, cameras):
+def test_cameras_used(points, cameras):
     result = snell(points, cameras, 0.0)
     views = views_in_frame(points, cameras)
     assert np.array_equal(np.flatnonzero(result.camera_used), np.unique(views.camera))
 
 
-def test_spatial_order_is_a_permutation(points):
+def test_spatial_order(points):
     assert np.array_equal(np.sort(spatial_order(points)), np.arange(N))
     line = np.column_stack([np.zeros(N), np.linspace(0, 1e6, N), np.zeros(N)])
     assert np.array_equal(np.sort(spatial_order(line)), np.arange(N))
 
 
-def test_threads_of_python_may_call_at_once(points, cameras):
+def test_python_threads(points, cameras):
     with ThreadPoolExecutor(4) as pool:
         found = list(pool.map(lambda _: snell(points, cameras, 0.0).xyz, range(8)))
     assert all(np.array_equal(one, found[0]) for one in found)

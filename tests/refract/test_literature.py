@@ -66,7 +66,7 @@ def seen_straight(true, centres, n):
 
 
 @pytest.mark.parametrize("method", ALL)
-def test_index_of_one_changes_nothing(method):
+def test_index_one(method):
     found = run(method, bed(), block(), n=1.0)
     assert (found.outcome == Outcome.CORRECTED).all()
     assert np.abs(found.shift_m).max() < NANOMETRE
@@ -74,7 +74,7 @@ def test_index_of_one_changes_nothing(method):
 
 @pytest.mark.parametrize("n", [1.333, 1.42])
 @pytest.mark.parametrize("method", ALL)
-def test_straight_down_the_depth_grows_by_n(method, n):
+def test_straight_down(method, n):
     # two cameras almost overhead, 0.3 degrees apart from the vertical: the next term is
     # (n^2 - 1) / (2 n) depth tan^2 = 0.05 mm at 5 m
     found = run(method, [[0, 0, -5.0]], [[-0.5, 0, 100.0], [0.5, 0, 100.0]], n)
@@ -82,7 +82,7 @@ def test_straight_down_the_depth_grows_by_n(method, n):
     assert np.abs(found.shift_m[0, :2]).max() < NANOMETRE
 
 
-def test_exactly_overhead_the_depth_is_n_times_or_stays_open():
+def test_exactly_overhead():
     above = [[0, 0, 100.0], [0, 0, 120.0]]
     for method in (*MEANS, "factor"):
         found = run(method, [[0, 0, -5.0]], above)
@@ -100,7 +100,7 @@ def test_exactly_overhead_the_depth_is_n_times_or_stays_open():
     base=st.floats(5, 60),
     n=st.floats(1.01, 1.5),
 )
-def test_two_cameras_at_the_same_incidence_are_exact(depth, aside, base, n):
+def test_same_incidence(depth, aside, base, n):
     # each line of sight lies in the vertical plane through its camera and the true point, so that
     # the apparent point lies on the plumb line of the true one and no method needs to move XY
     true = np.array([3.0, aside, -depth])
@@ -113,7 +113,7 @@ def test_two_cameras_at_the_same_incidence_are_exact(depth, aside, base, n):
         assert found.ray_miss_m[0] < 1e-6
 
 
-def test_a_pair_in_one_vertical_plane_with_the_point_is_exact_but_for_the_means():
+def test_vertical_plane():
     # one camera straight above, one 40 m aside at 60 m: both rays pass the plumb line, at n d
     # and s d, and only the second says how deep the point is: d = D / s
     n, true = 1.34, np.array([0.0, 0.0, -5.0])
@@ -140,7 +140,7 @@ def angles(point, centre, n):
 
 @pytest.mark.parametrize("images", [1, 6])
 @pytest.mark.parametrize("method", MEANS)
-def test_eq_1_of_hsu_and_wang(method, images):
+def test_hsu_wang_1(method, images):
     points, centres = bed(), block()[:images]
     found = run(method, points, centres)
     for i, point in enumerate(points - UTM):
@@ -165,7 +165,7 @@ def by_eq_2(point, s1, s2, n):
 
 
 @pytest.mark.parametrize("images", [2, 5])
-def test_eqs_2_to_4_of_hsu_and_wang(images):
+def test_hsu_wang_2_to_4(images):
     points, centres = bed(), block(images)
     found = run("murase", points, centres)
     for i, point in enumerate(points - UTM):
@@ -177,7 +177,7 @@ def test_eqs_2_to_4_of_hsu_and_wang(images):
     assert (found.shift_m[:, :2] == 0.0).all()
 
 
-def test_one_image_alone_is_what_max_cameras_leaves():
+def test_steepest_image():
     points, centres = bed(), block()
     nearest = run("butler", points, centres, max_cameras=1)
     assert (nearest.ray_count == 1).all()
@@ -205,7 +205,7 @@ def shan_slowly(point, centres, n):
 
 
 @pytest.mark.parametrize("k", [2, 5])
-def test_shan_agrees_with_a_slow_twin(k):
+def test_shan_as_twin(k):
     points, centres = bed(), block(k)
     found = run("shan", points, centres)
     for i, point in enumerate(points):
@@ -214,7 +214,7 @@ def test_shan_agrees_with_a_slow_twin(k):
         assert point - UTM + found.shift_m[i] == pytest.approx(expected, abs=5e-8)
 
 
-def test_shan_says_how_far_the_rays_miss():
+def test_shan_ray_miss():
     points, centres = bed(20), block(4)
     found = run("shan", points, centres)
     for i, point in enumerate(points - UTM):
@@ -228,7 +228,7 @@ def test_shan_says_how_far_the_rays_miss():
         assert found.ray_miss_m[i] == pytest.approx(math.sqrt(square / 4), abs=1e-9)
 
 
-def test_methods_stay_within_their_known_errors_in_a_block_of_nadir_images():
+def test_known_errors():
     # nine images from 80 m, 32 m apart, all of which see the point: their rays pass each other.
     # The bounds were found here and say what the methods are: the largest error as a share of the
     # true depth
@@ -246,7 +246,7 @@ def test_methods_stay_within_their_known_errors_in_a_block_of_nadir_images():
         assert bound / 3 < worst[method] < bound, method
 
 
-def test_what_becomes_of_points_with_fewer_rays():
+def test_few_rays():
     views = Views(np.array([0, 0, 1, 4]), np.array([2, 0, 1, 2]))
     xyz, cameras = bed(3), named(block(3))
     expected = [Outcome.NO_CAMERA, Outcome.ONE_CAMERA, Outcome.CORRECTED]
@@ -264,7 +264,7 @@ def test_what_becomes_of_points_with_fewer_rays():
         assert found.ray_count.tolist() == [1, 1, 3]
 
 
-def test_factor_and_regression_are_lines():
+def test_lines():
     points, centres = bed(), block()
     own = run("factor", points, centres, depth_factor=1.5)
     assert own.shift_m[:, 2] == pytest.approx(0.5 * points[:, 2], abs=1e-12)
@@ -275,7 +275,7 @@ def test_factor_and_regression_are_lines():
     assert low.shift_m[0, 2] == pytest.approx(0.01, abs=1e-15)  # to the surface, not above it
 
 
-def test_regression_is_refused_where_none_was_learned():
+def test_no_regression():
     xyz = bed(3)
     chosen = ScienceOptions(method="regression")
     with refused("regression.missing", SettingError):
@@ -283,7 +283,7 @@ def test_regression_is_refused_where_none_was_learned():
 
 
 @pytest.mark.parametrize("method", BY_CAMERAS)
-def test_water_that_rose_for_all_cameras_is_higher_water(method):
+def test_offset_for_all(method):
     points, centres = bed(), block()
     higher = run(method, points, centres, water=WaterPlane(0.7))
     risen = run(method, points, centres, offset=np.full(6, 0.7))
@@ -294,7 +294,7 @@ def test_water_that_rose_for_all_cameras_is_higher_water(method):
 
 
 @pytest.mark.parametrize("method", ALL)
-def test_a_tilted_surface_counts_as_level_above_each_point(method):
+def test_tilted_as_level(method):
     tilted = WaterPlane(-0.03 * UTM[0] + 0.01 * UTM[1], 0.03, -0.01)
     points, centres = bed(5) - [0, 0, 2.0], block()
     found = run(method, points, centres, water=tilted)
@@ -313,7 +313,7 @@ def test_a_tilted_surface_counts_as_level_above_each_point(method):
     height=st.sampled_from([1e-3, 1.0, 60.0, 2000.0]),
     n=st.floats(1.0, 1.5),
 )
-def test_never_nan_and_never_above_the_water(method, depth, aside, turn, height, n):
+def test_never_above_water(method, depth, aside, turn, height, n):
     centres = [
         [r * math.cos(a), r * math.sin(a), height] for r, a in zip(aside, turn, strict=False)
     ]

@@ -96,7 +96,7 @@ def some_points():
 @pytest.mark.parametrize(
     ("maps", "metric"), [((5,), "angles"), (NADIR, "angles"), (MIXED, "angles"), (MIXED, "pixels")]
 )
-def test_maps_of_other_cameras_come_home(maps, metric):
+def test_maps_of_original_model(maps, metric):
     """Fused by a slow twin that traces light in one geometry and matches in the other."""
     made = absorbed()
     weights = 1.0 / ((made.centres[list(maps)] - [3.0, 4.0, -4.0]) ** 2).sum(axis=1)
@@ -125,7 +125,7 @@ SCALE, SHIFT = 1.03, np.array([5.0, -3.0, 2.0])
 
 
 @pytest.mark.parametrize("kind", ["list", "no list", "pairs", "pairs of the matcher"])
-def test_a_block_that_is_only_elsewhere_makes_the_same_cloud(kind):
+def test_transformed_block(kind):
     """Turned and stretched as a whole, a matcher finds the same places in the images.
 
     Not turned where medians of x, y and z are taken.
@@ -158,7 +158,7 @@ def test_a_block_that_is_only_elsewhere_makes_the_same_cloud(kind):
 
 
 @pytest.mark.parametrize("kind", ["list", "no list", "pairs"])
-def test_the_same_cameras_change_no_bit(kind):
+def test_same_cameras(kind):
     xyz = some_points()
     views = {"list": listed([MIXED] * 60), "pairs": listed([(0, 2, 4, 5, 2, 7)] * 60, "pairs")}.get(
         kind
@@ -170,7 +170,7 @@ def test_the_same_cameras_change_no_bit(kind):
 
 
 @pytest.mark.parametrize("with_list", [True, False], ids=["list", "no list"])
-def test_land_comes_home(with_list):
+def test_land(with_list):
     """A twin fuses land, that is, a bed in water that does not refract."""
     made, maps = absorbed(), MIXED if with_list else (0,)
     weights = 1.0 / ((made.centres[list(maps)] - [3.0, 4.0, 2.0]) ** 2).sum(axis=1)
@@ -201,7 +201,7 @@ def test_land_comes_home(with_list):
     assert np.array_equal(shift_of_land(told), shift)
 
 
-def test_directions_go_through_the_lenses_and_back():
+def test_directions():
     bent = replace(LENS, radial=(-0.05, 0.01), tangential=(0.001, -0.0005))
     made = replace(absorbed(), lenses=(bent,) * 8)
     images = images_of(OriginalModel(np.zeros((0, 3)), made), CAMERAS)
@@ -215,6 +215,6 @@ def test_directions_go_through_the_lenses_and_back():
     assert len(images_of(None, CAMERAS).centres) == 0
 
 
-def test_cameras_without_lenses_are_refused():
+def test_no_lenses():
     with pytest.raises(ValueError, match="twice"):
         images_of(OriginalModel(np.zeros((0, 3)), replace(absorbed(), lenses=None)), CAMERAS)

@@ -34,7 +34,7 @@ def table_of(score, columns):
     return np.where(np.take_along_axis(score, best, axis=1) > 0.0, best, -1)
 
 
-def test_places_give_the_partners_of_the_formula():
+def test_partners_of_places():
     cameras, places = block(np.random.default_rng(1))
     found = matcher_of(cameras, places)
     slow = scores_slowly(cameras, places, in_frame(cameras, places), REPEATED_DEG)
@@ -43,7 +43,7 @@ def test_places_give_the_partners_of_the_formula():
         assert np.array_equal(table, table_of(slow, columns))
 
 
-def test_ties_give_the_partners_of_the_formula():
+def test_partners_of_ties():
     rng = np.random.default_rng(2)
     cameras, places = block(rng)
     places[7] = np.nan  # a tie point without coordinates
@@ -55,7 +55,7 @@ def test_ties_give_the_partners_of_the_formula():
     assert np.array_equal(matcher_of_ties(cameras, ties).fused, table_of(slow, 12))
 
 
-def test_few_images_leave_the_rest_of_the_table_empty():
+def test_few_images():
     cameras = looking([[0.0, 0, 70], [15, 0, 70], [400, 0, 70]], [0.0] * 3, [0.0] * 3)
     places = np.random.default_rng(3).uniform(-20, 20, (300, 3)) * [1, 1, 0.1]
     found = matcher_of(cameras, places)
@@ -64,7 +64,7 @@ def test_few_images_leave_the_rest_of_the_table_empty():
     assert found.focal_px.tolist() == [3600.0] * 3
 
 
-def test_a_lens_in_millimetres_has_the_same_border():
+def test_border_in_mm():
     cameras, _ = block(np.random.default_rng(4))
     lens = cameras.lenses[0]
     mm = 13.2 / 5472  # a pixel of the nominal camera
@@ -81,7 +81,7 @@ def test_a_lens_in_millimetres_has_the_same_border():
 
 
 @pytest.mark.parametrize("obliques", [{}, {"obliques_deg": 35.0, "oblique_share": 0.5}])
-def test_simulated_partners_are_found_from_the_cloud(obliques):
+def test_simulated_partners(obliques):
     """The simulator has the formula of its own, for features that are found again by chance."""
     area = {"area_m": (70.0, 50.0), "lidar_per_m2": 0.0}
     scene = simulate_scene(600, cloud="depth-maps", **area, **obliques)
@@ -108,7 +108,7 @@ def share_found(matched, partners):
 
 
 @rendered
-def test_real_partners_are_found_from_the_cloud():
+def test_real_partners_of_places():
     import laspy
 
     _, cameras, partners = real_block()
@@ -118,7 +118,7 @@ def test_real_partners_are_found_from_the_cloud():
 
 
 @rendered
-def test_real_partners_are_found_from_tie_points():
+def test_real_partners_of_ties():
     local, _, partners = real_block()
     ties = read_tie_points(RENDERED / "colmap", local)
     # 156 of 160, from a seventh of the tie points that the software had

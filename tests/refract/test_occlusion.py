@@ -68,7 +68,7 @@ def walled():
 
 
 @pytest.mark.parametrize("incidence_deg", [15.0, 30.0, 45.0, 60.0])
-def test_wall_hides_what_lies_in_its_shadow(walled, incidence_deg):
+def test_wall(walled, incidence_deg):
     bed, _, occluder = walled
     centres = np.array([[200.0, 0.0, 200.0 / np.tan(np.radians(incidence_deg))]])
     bed = bed[np.abs(bed[:, 1]) < 8.0]
@@ -85,7 +85,7 @@ def test_wall_hides_what_lies_in_its_shadow(walled, incidence_deg):
     assert in_shadow[sure].any()
 
 
-def test_face_of_a_wall_is_seen_from_its_front_but_not_through_the_wall(walled):
+def test_wall_face(walled):
     _, face, occluder = walled
     face = face[(face[:, 2] < WALL_M - 1.0) & (np.abs(face[:, 1]) < 8.0)]
     front, back = [-60.0, 0.0, 60.0], [60.0, 0.0, 20.0]
@@ -95,7 +95,7 @@ def test_face_of_a_wall_is_seen_from_its_front_but_not_through_the_wall(walled):
     assert found[:, 1].all()
 
 
-def test_ledge_under_water_hides_what_lies_behind_it():
+def test_ledge():
     rng = np.random.default_rng(4)
     bed = plain(rng, n=100_000, noise_m=0.01)
     bed[bed[:, 0] > 2.0, 2] += 2.0
@@ -121,7 +121,7 @@ def deck_scene(deck_m=5.0):
     return bed, occluder_of(np.vstack([bed, deck]))
 
 
-def test_deck_hides_what_is_under_it_but_not_from_the_side():
+def test_under_deck():
     bed, occluder = deck_scene()
     under = bed[(np.abs(bed[:, 0] - 2.0) < 0.2) & (np.abs(bed[:, 1]) < 8.0)]
     above, steep, flat = [2.0, 0.0, 80.0], [12.0, 0.0, 80.0], [102.0, 0.0, 50.0]
@@ -131,7 +131,7 @@ def test_deck_hides_what_is_under_it_but_not_from_the_side():
     assert found[:, 0].all() and found[:, 1].all() and not found[:, 2].any()
 
 
-def test_deck_hides_what_lies_behind_it():
+def test_behind_deck():
     bed, occluder = deck_scene()
     behind = bed[(bed[:, 0] < -4.0) & (bed[:, 0] > -5.0) & (np.abs(bed[:, 1]) < 8.0)]
     # rises 1 a metre: 3 to 9 m up where the deck is, 6 m up
@@ -153,7 +153,7 @@ def hidden_by_small_steps(point, centre, occluder):
     return bool((z[last] < occluder.height[row[last], column[last]]).any())
 
 
-def test_blocks_of_cells_are_passed_without_missing_any():
+def test_blocks_of_cells():
     rng = np.random.default_rng(10)
     xyz = rng.uniform([0, 0, 0], [80, 80, 0], (60_000, 3))
     xyz[:, 2] = 4.0 * np.sin(xyz[:, 0] / 4.0) * np.sin(xyz[:, 1] / 5.0)
@@ -174,7 +174,7 @@ def test_blocks_of_cells_are_passed_without_missing_any():
 
 @pytest.mark.parametrize("slope_deg", [0.0, 20.0])
 @pytest.mark.parametrize("noise_in_spacings", [0.0, 0.5, 1.0, 2.0])
-def test_even_bed_hides_nothing_at_45_degrees(slope_deg, noise_in_spacings):
+def test_even_bed(slope_deg, noise_in_spacings):
     rng = np.random.default_rng(6)
     noise_m = noise_in_spacings * 20.0 / np.sqrt(60_000)
     bed = plain(rng, slope_deg=slope_deg, noise_m=noise_m)
@@ -183,12 +183,12 @@ def test_even_bed_hides_nothing_at_45_degrees(slope_deg, noise_in_spacings):
     assert found.mean() < (0.005 if noise_in_spacings else 1e-9)
 
 
-def test_flat_bed_hides_nothing_even_at_80_degrees():
+def test_flat_bed():
     bed = plain(np.random.default_rng(7))
     assert not hidden_of(bed, ring(80.0), occluder_of(bed)).any()
 
 
-def test_flying_points_hide_nothing():
+def test_flying_points():
     rng = np.random.default_rng(8)
     bed = plain(rng, noise_m=0.02)
     flying = rng.random(len(bed)) < 0.003
@@ -199,19 +199,19 @@ def test_flying_points_hide_nothing():
     assert found.mean() < 1e-3
 
 
-def test_where_nothing_is_known_nothing_hides(walled):
+def test_outside(walled):
     _, _, occluder = walled
     outside = np.array([[-500.0, 0.0, -1.0], [5.0, 40.0, -1.0]]) + UTM
     assert not hidden_of(outside, np.array([[0.0, 0.0, 50.0]]) + UTM, occluder).any()
 
 
-def test_camera_below_its_point_is_not_judged(walled):
+def test_camera_below(walled):
     bed, _, occluder = walled
     assert not hidden_of(bed[:100] + UTM, np.array([[0.0, 0.0, -50.0]]) + UTM, occluder).any()
 
 
 @pytest.mark.parametrize("at", [[0.0, 0.0], [1e5, -1e5]])
-def test_point_that_is_alone_or_straight_below_a_camera(at):
+def test_single_point(at):
     one = np.array([[*at, -3.0]])
     for cloud in (one, np.repeat(one, 50, axis=0)):
         occluder = occluder_of(cloud)
@@ -222,7 +222,7 @@ def test_point_that_is_alone_or_straight_below_a_camera(at):
 # --- views ---------------------------------------------------------------------------------------
 
 
-def test_views_lose_hidden_cameras_but_a_point_keeps_all_rather_than_one(walled):
+def test_visible_cameras(walled):
     _, _, occluder = walled
     centres = np.array([[200.0, 0.0, 100.0], [-20.0, 0.0, 60.0], [-30.0, 0.0, 60.0]]) + UTM
     xyz = np.array([[-2.0, 0.0, 0.0], [-2.0, 1.0, 0.0], [-9.0, 0.0, 0.0]]) + UTM
@@ -236,7 +236,7 @@ def test_views_lose_hidden_cameras_but_a_point_keeps_all_rather_than_one(walled)
 
 
 @rendered
-def test_cameras_that_made_a_real_cloud_are_not_called_hidden():
+def test_real_views():
     cameras = pcfix.read_cameras(RENDERED / "cameras.csv")
     las = laspy.read(RENDERED / "cloud.las")
     xyz = np.column_stack([las.x, las.y, las.z])
@@ -293,7 +293,7 @@ def cliff_scene(rng, n=20_000):
     return cameras, true, apparent, cloud, Views(start, camera[seen])
 
 
-def test_cliff_spoils_the_bed_below_it_unless_its_shadow_is_known():
+def test_cliff():
     cameras, true, apparent, cloud, views = cliff_scene(np.random.default_rng(9))
     water, flat = WaterPlane(0.0), SurfaceAbove(np.zeros(len(true)), np.zeros((len(true), 2)))
 

@@ -30,14 +30,14 @@ def bed(seed=1, n=200, deepest=10.0):
     return xyz + UTM
 
 
-def test_index_of_one_changes_nothing():
+def test_index_one():
     result = pcfix.correct_points(bed(), block(), 0.0, index=1.0)
     assert result.corrected.all()
     assert np.abs(result.shift_m).max() < NANOMETRE
 
 
 @pytest.mark.parametrize("n", [1.333, 1.34, 1.42])
-def test_straight_down_depth_grows_by_n(n):
+def test_straight_down(n):
     # two cameras almost overhead: in the paraxial limit depth is multiplied by n; the next
     # term is about depth * tan^2(0.3 deg) / 2 = 0.1 mm at 5 m
     cameras = pcfix.Cameras(("a", "b"), np.array([[-0.5, 0, 100.0], [0.5, 0, 100.0]]))
@@ -47,7 +47,7 @@ def test_straight_down_depth_grows_by_n(n):
 
 
 @pytest.mark.parametrize("plane", [(0.0, 0.0, 0.0), (0.5, 0.003, -0.002), (-0.3, 0.05, 0.08)])
-def test_slow_twin_agrees(plane):
+def test_twin(plane):
     a, b, c = plane
     cameras, points = block(), bed()
     water = pcfix.WaterPlane(a - b * UTM[0] - c * UTM[1], b, c)
@@ -64,7 +64,7 @@ def test_slow_twin_agrees(plane):
     assert checked == 60
 
 
-def test_two_rays_equal_equation_11_as_a_system_of_six_by_five():
+def test_equation_11():
     cameras = pcfix.Cameras(("a", "b"), np.array([[-30.0, 5, 80], [25.0, -10, 75]]))
     point = np.array([3.0, -2.0, -4.0])
     anchors, directions = [], []
@@ -88,7 +88,7 @@ def test_two_rays_equal_equation_11_as_a_system_of_six_by_five():
     slope=st.tuples(st.floats(-0.05, 0.05), st.floats(-0.05, 0.05)),
     n=st.floats(1.01, 1.5),
 )
-def test_out_through_the_surface_and_back_comes_home(x, y, depth, slope, n):
+def test_there_and_back(x, y, depth, slope, n):
     # two cameras symmetric about the vertical plane of the point see rays that truly meet;
     # their straight prolongations meet as well, at the apparent point
     plane = (0.0, *slope)
@@ -111,7 +111,7 @@ def test_out_through_the_surface_and_back_comes_home(x, y, depth, slope, n):
     turn=st.floats(0, 2 * math.pi),
     level=st.floats(-50, 500),
 )
-def test_result_turns_and_rises_with_the_scene(depth, n, turn, level):
+def test_turned_scene(depth, n, turn, level):
     centres = np.array([[-20.0, 3, 60], [15, -12, 65], [4, 30, 70]])
     point = np.array([1.0, 2.0, -depth])
     rotation = np.array(
@@ -129,7 +129,7 @@ def named(centres):
     return pcfix.Cameras(tuple(str(i) for i in range(len(centres))), centres)
 
 
-def test_a_wider_base_looks_shallower_so_its_correction_is_larger():
+def test_wider_base():
     def shift(half_base):
         cameras = named(np.array([[-half_base, 0, 50.0], [half_base, 0, 50.0]]))
         return pcfix.correct_points([[0, 0, -3.0]], cameras, 0.0).shift_m[0, 2]
@@ -139,7 +139,7 @@ def test_a_wider_base_looks_shallower_so_its_correction_is_larger():
     assert shifts[0] == pytest.approx(-0.34 * 3.0, rel=0.01)
 
 
-def test_land_is_bit_identical_and_zero():
+def test_land():
     xyz = np.array([[1.1, 2.2, 0.1], [1.1, 2.2, -1.0], [3.3, 4.4, 0.0]])
     result = pcfix.correct_points(xyz, named(np.array([[0.0, 0, 50], [9, 9, 50]])), 0.0)
     assert result.outcome.tolist() == [0, 1, 0]

@@ -38,7 +38,7 @@ CLOUDS = {
 
 
 @pytest.mark.parametrize("name", mostly_nightly(CLOUDS, "tracks", "depth-maps"))
-def test_a_simulated_cloud_is_told(name):
+def test_simulated_cloud(name):
     scene = simulated(12_000, seed=1, lidar_per_m2=0.0, **CLOUDS[name])
     settings, verdict = told(scene.apparent_xyz, scene.cameras, scene.water)
     kind = {"river of tracks": "tracks"}.get(name, name)
@@ -50,7 +50,7 @@ def test_a_simulated_cloud_is_told(name):
     assert verdict.runner_up.words in str(verdict)
 
 
-def test_auto_is_the_correction_that_was_told():
+def test_auto():
     scene = simulated(12_000, seed=1, lidar_per_m2=0.0)
     points, given = scene.apparent_xyz, (scene.cameras, scene.water)
     found = pcfix.correct_points(points, *given, method="auto")
@@ -61,7 +61,7 @@ def test_auto_is_the_correction_that_was_told():
     np.testing.assert_array_equal(listed.xyz, same.xyz)
 
 
-def test_without_lenses_it_is_snell():
+def test_no_lenses():
     scene = simulated(2_000, seed=1, lidar_per_m2=0.0)
     bare = Cameras(scene.cameras.labels, scene.cameras.centres)
     points = scene.apparent_xyz
@@ -70,14 +70,14 @@ def test_without_lenses_it_is_snell():
     np.testing.assert_array_equal(found.xyz, same.xyz)
 
 
-def test_few_points_tell_nothing():
+def test_few_points():
     scene = simulated(FEWEST_WITHOUT_LIST - 1, seed=1, lidar_per_m2=0.0)
     settings, verdict = told(scene.apparent_xyz, scene.cameras, scene.water)
     assert verdict is None
     assert (settings.method, settings.camera_set) == ("consistent", "all")
 
 
-def test_a_camera_set_limits_what_is_asked():
+def test_camera_set():
     scene = simulated(500, seed=1, lidar_per_m2=0.0)
     batch = Batch(
         scene.apparent_xyz,
@@ -92,7 +92,7 @@ def test_a_camera_set_limits_what_is_asked():
 
 
 @rendered
-def test_a_real_dense_cloud_is_of_depth_maps():
+def test_real_cloud():
     import laspy
 
     local = pcfix.read_cameras(RENDERED / "colmap")
@@ -126,7 +126,7 @@ def some(monkeypatch):
     return xyz, simulated(2000, seed=1).cameras
 
 
-def test_squares_do_not_depend_on_chunks(some):
+def test_squares_any_chunks(some):
     xyz, cameras = some
     whole = in_squares(xyz, cameras, len(xyz))
     assert MOST / 4 < len(whole) <= MOST
@@ -134,7 +134,7 @@ def test_squares_do_not_depend_on_chunks(some):
         np.testing.assert_array_equal(in_squares(xyz, cameras, size), whole)
 
 
-def test_points_in_squares_have_all_their_neighbours(some):
+def test_squares_have_neighbours(some):
     xyz, cameras = some
     found = in_squares(xyz, cameras, 9000)
     square_m = patches.SQUARE_PATCHES * WIDTH_M

@@ -8,7 +8,7 @@ import pytest
 import pcfix
 from pcfix.errors import GeometryError, SettingError
 from pcfix.refract.stereo_factor import NODES, ratios, stereo_factor
-from pcfix.simulate.refraction_effect import SWINGLETCAM, StereoPair, effect
+from tests.papers.refraction_effect import SWINGLETCAM, StereoPair, effect
 from tests.utils.codes import refused
 from tests.utils.twins import light_path
 
@@ -21,12 +21,12 @@ def scene():
     return pcfix.simulate_scene(8000, seed=1, **SCENE)
 
 
-def test_air_changes_nothing_and_narrow_frames_have_the_index():
+def test_limits():
     assert ratios(0.2, 0.5, 0.4, 1.0) == pytest.approx(1.0, abs=1e-12)
     assert ratios(0.001, 0.002, 0.002, N) == pytest.approx(N, abs=1e-5)
 
 
-def test_each_place_is_that_of_traced_light():
+def test_traced_light():
     height, base, along, across = 100.0, 20.0, 0.55, 0.75
     found = ratios(base / height, along, across, N)
     middles = (np.arange(NODES) + 0.5) / NODES * 2.0 - 1.0
@@ -42,12 +42,12 @@ def test_each_place_is_that_of_traced_light():
         assert 0.05 / apparent == pytest.approx(found[i, j], rel=2e-4)
 
 
-def test_the_middle_of_the_overlap_is_that_of_twice_the_nodes():
+def test_nodes():
     fine = np.mean([ratios(0.2, 0.5 + d, 0.75, N).mean() for d in (-1e-4, 1e-4)])
     assert ratios(0.2, 0.5, 0.75, N).mean() == pytest.approx(fine, rel=1e-6)
 
 
-def test_the_map_of_skarlatos_and_agrafiotis_has_it_in_shallow_water():
+def test_skarlatos_agrafiotis():
     """Theirs starts from an exact apparent point, so that bent rays miss, not straight ones."""
     pair = StereoPair(SWINGLETCAM, 100.0)
     along, across = (side / 200.0 for side in SWINGLETCAM.footprint_m(100.0))
@@ -65,7 +65,7 @@ def measured(scene):
     return float(np.mean(true[wet] / apparent[wet]))
 
 
-def test_a_simulated_block_has_it_within_a_percent(scene):
+def test_simulated_block(scene):
     found = stereo_factor(scene.cameras, scene.water.a, N)
     # 1.4427 and 1.433: the points of the cloud have more images than a pair
     assert found.factor == pytest.approx(measured(scene), rel=0.01)
@@ -74,7 +74,7 @@ def test_a_simulated_block_has_it_within_a_percent(scene):
     assert found.base_m == pytest.approx(15.77, abs=0.005)
 
 
-def test_auto_is_that_number_through_arrays(scene):
+def test_auto(scene):
     found = stereo_factor(scene.cameras, scene.water.a, N)
     auto, told = (
         pcfix.correct_points(
@@ -85,13 +85,13 @@ def test_auto_is_that_number_through_arrays(scene):
     assert np.array_equal(auto.xyz, told.xyz)
 
 
-def test_images_that_look_aside_do_not_count():
+def test_obliques_ignored():
     scene = pcfix.simulate_scene(500, seed=1, obliques_deg=35.0, **SCENE)
     found = stereo_factor(scene.cameras, scene.water.a, N)
     assert (found.images, found.aside) == (40, 72)
 
 
-def test_what_tells_no_factor_is_refused(scene):
+def test_refused(scene):
     cameras, level = scene.cameras, scene.water.a
     bare = pcfix.Cameras(cameras.labels, cameras.centres)
     with refused("cameras.no_orientation", SettingError):

@@ -71,7 +71,7 @@ def errors_m(scene, rows, result):
 
 
 @pytest.mark.parametrize("name", mostly_nightly(SCENES, "obliques", "river"))
-def test_known_pairs_without_noise_come_home(name):
+def test_pairs_without_noise(name):
     scene = scene_of(name, 0.0)
     rows = under_water(scene)
     error = errors_m(scene, rows, corrected(scene, rows, pairs_in(scene, rows)))
@@ -94,7 +94,7 @@ def rmse_and_bias(scene, rows, result):
         ("river", 1.1),
     ),
 )
-def test_known_pairs_with_noise_leave_no_bias(name, most):
+def test_pairs_with_noise(name, most):
     scene = scene_of(name, 0.5)
     rows = under_water(scene)
     rmse, bias = rmse_and_bias(scene, rows, corrected(scene, rows, pairs_in(scene, rows)))
@@ -107,7 +107,7 @@ def test_known_pairs_with_noise_leave_no_bias(name, most):
 
 
 @pytest.mark.parametrize("name", ["flat", "obliques"])
-def test_modelled_pairs_are_better_than_one_intersection(name):
+def test_modelled_pairs(name):
     scene = scene_of(name, 0.5)
     rows = under_water(scene)
     learned = Learned(matcher=matcher_of(scene.cameras, scene.apparent_xyz))
@@ -118,7 +118,7 @@ def test_modelled_pairs_are_better_than_one_intersection(name):
     assert rmse < 0.85 * rmse_and_bias(scene, rows, plain)[0]
 
 
-def test_a_matcher_with_the_true_partners_gives_the_known_pairs():
+def test_true_partners():
     scene = scene_of("obliques", 0.5)
     rows = under_water(scene)[:300]
     xyz = scene.apparent_xyz[rows]
@@ -167,7 +167,7 @@ def median_slowly(q, cameras, pairs, planes, n, start):
 
 @pytest.mark.parametrize("lens", [LENS, DISTORTED, FISHEYE], ids=["ideal", "brown", "fisheye"])
 @pytest.mark.parametrize("count", [8, 5])
-def test_a_slow_twin_would_have_made_the_points(lens, count):
+def test_twin(lens, count):
     cameras, water = looking(CENTRES, TILTS, HEADINGS, lens), WaterPlane(0.4, 0.004, -0.003)
     offset = np.array([0.0, 0.05, -0.03, 0.02, 0.0, 0.04])
     planes = [(water.a + up, water.b, water.c) for up in offset]
@@ -175,11 +175,11 @@ def test_a_slow_twin_would_have_made_the_points(lens, count):
     result = run(points, cameras, water, listed([pairs, pairs]), offset=offset)
     for point, shift in zip(points, result.shift_m, strict=True):
         made = median_slowly(point + shift, cameras, pairs, planes, N_WATER, point)
-        # see test_known_pairs_without_noise_come_home; distortion is taken as linear near a ray
+        # see test_pairs_without_noise; distortion is taken as linear near a ray
         assert made == pytest.approx(point, abs=2e-5)
 
 
-def test_scipy_finds_the_same_points():
+def test_scipy():
     cameras, water = looking(CENTRES, TILTS, HEADINGS, LENS), WaterPlane(0.0)
     point = np.array([2.0, -3, -4])
     result = run(point[None], cameras, water, listed([PAIRS]))
@@ -196,13 +196,13 @@ def test_scipy_finds_the_same_points():
 # physics and outcomes
 
 
-def test_water_that_does_not_refract_changes_nothing():
+def test_index_one():
     cameras = looking(CENTRES, TILTS, HEADINGS, LENS)
     result = run(np.array([[1.0, 2, -5]]), cameras, WaterPlane(0.0), listed([PAIRS]), n=1.0)
     assert np.abs(result.shift_m).max() < 1e-5  # the median may be 1e-6 m off
 
 
-def test_a_pair_loses_both_when_it_loses_one():
+def test_pair_loses_camera():
     cameras = looking(CENTRES, TILTS, HEADINGS, LENS)
     points, steep = np.array([[1.0, 2, -5]]), PAIRS[:4]
     result = run(points, cameras, WaterPlane(0.0), listed([PAIRS]), max_angle=30.0)
@@ -212,13 +212,13 @@ def test_a_pair_loses_both_when_it_loses_one():
     assert result.camera_used.tolist() == [True] * 4 + [False] * 2
 
 
-def test_most_cameras_are_counted_once_each():
+def test_max_cameras():
     cameras = looking(CENTRES, TILTS, HEADINGS, LENS)
     result = run(np.array([[1.0, 2, -5]]), cameras, WaterPlane(0.0), listed([PAIRS]), max_cameras=3)
     assert result.ray_count.tolist() == [3]
 
 
-def test_what_becomes_of_points_without_pairs():
+def test_no_pairs():
     cameras = looking(
         [[0.0, 0, 70], [0, 0, 60], [20, 0, 70], [120, 0, 70]], [0.0] * 4, [0.0] * 4, LENS
     )
@@ -237,7 +237,7 @@ def test_what_becomes_of_points_without_pairs():
     assert result.ray_count.tolist() == [2, 0, 0, 0, 0, 2]
 
 
-def test_points_without_a_solution_keep_that_of_snell():
+def test_unsolved_keep_snell():
     # the second camera looks away: it has no image of the point, and no list gives it a ray
     cameras = looking([[-20.0, 0, 70], [20.0, 0, 70]], [15.0, 170.0], [0.0, 0.0], LENS)
     points, water, pairs = np.array([[0.0, 0, -3]]), WaterPlane(0.0), listed([[[0, 1]]])
@@ -250,7 +250,7 @@ def test_points_without_a_solution_keep_that_of_snell():
     assert result.shift_m == pytest.approx(plain.shift_m, abs=1e-9)
 
 
-def test_snell_takes_each_camera_of_the_pairs_once():
+def test_snell_of_pairs():
     scene = scene_of("flat", 0.5)
     rows = under_water(scene)[:200]
     of_pairs = corrected(scene, rows, pairs_in(scene, rows), method="snell")

@@ -63,7 +63,7 @@ def bed(n=60, spread=20.0, seed=6):
     return np.column_stack([rng.uniform(-spread, spread, (n, 2)), rng.uniform(-8, -1, n)]) + UTM
 
 
-def test_height_is_bilinear_and_the_outermost_patch_goes_on():
+def test_height():
     water = raster(waves, (0.7, 1.1), half=15.4)
     plan = np.random.default_rng(0).uniform(-18, 18, (4000, 2))
     found = surface_above(water, np.column_stack([plan, np.zeros(4000)]) + UTM)
@@ -74,7 +74,7 @@ def test_height_is_bilinear_and_the_outermost_patch_goes_on():
     assert found.height_m[inside] == pytest.approx(expected, abs=1e-9)
 
 
-def test_slope_is_the_gradient_of_the_height():
+def test_slope():
     water = raster(waves, (0.7, 1.1))
     plan, step = np.random.default_rng(1).uniform(-50, 50, (500, 2)), 1e-4
     here = np.column_stack([plan, np.zeros(500)]) + UTM
@@ -89,7 +89,7 @@ def test_slope_is_the_gradient_of_the_height():
 
 
 @pytest.mark.filterwarnings("ignore:.*does not cover:pcfix.errors.PcfixWarning")
-def test_an_unknown_cell_makes_four_patches_unknown():
+def test_unknown_cell():
     water = raster(plane(0.0, 0, 0), half=5.0)
     water.height_m[4, 3] = np.nan  # its centre lies at (-1.5, 0.5)
     at = np.array([[-2.4, 0.5, -1], [-1.5, 1.4, -1], [-2.6, 0.5, -1], [-0.4, 0.5, -1], [9, 0, -1]])
@@ -104,7 +104,7 @@ def test_an_unknown_cell_makes_four_patches_unknown():
 
 @pytest.mark.parametrize("abc", [(0.4, 0.0, 0.0), (0.2, 0.003, -0.002), (-0.1, 0.04, 0.03)])
 @pytest.mark.parametrize("options", [{}, {"max_cameras": 3}, {"max_angle": 25.0}])
-def test_a_raster_of_a_plane_equals_the_plane(abc, options):
+def test_raster_of_plane(abc, options):
     a, b, c = abc
     there = pcfix.WaterPlane(a - b * UTM[0] - c * UTM[1], b, c)
     one = pcfix.correct_points(bed(), cameras(), raster(plane(*abc)), **options)
@@ -116,7 +116,7 @@ def test_a_raster_of_a_plane_equals_the_plane(abc, options):
     assert one.incidence_deg == pytest.approx(other.incidence_deg, abs=1e-6)
 
 
-def test_raster_and_mesh_of_a_plane_agree_to_a_millimetre_in_32_bits():
+def test_raster_and_mesh():
     surface = plane(174.8, 0.003, -0.001)  # as of a river: floats in steps of 15 um, slopes of 3e-5
     water = raster(surface, (0.5, 0.5))
     stored = WaterRaster(
@@ -137,7 +137,7 @@ def test_raster_and_mesh_of_a_plane_agree_to_a_millimetre_in_32_bits():
 
 
 @pytest.mark.parametrize("surface", [waves, weir])
-def test_slow_twin_on_the_interpolated_field(surface):
+def test_twin_on_raster(surface):
     water = raster(surface)
     points, block = bed(), cameras()
     result = pcfix.correct_points(points, block, water)
@@ -150,7 +150,7 @@ def test_slow_twin_on_the_interpolated_field(surface):
 
 
 @pytest.mark.parametrize(("cell", "within_m"), [(0.5, 0.01), (0.125, 0.002)])
-def test_a_curved_surface_converges_to_its_formula(cell, within_m):
+def test_curved_converges(cell, within_m):
     points, block = bed(), cameras()
     result = pcfix.correct_points(points, block, raster(weir, (cell, cell)))
     apart = [
@@ -166,7 +166,7 @@ def test_a_curved_surface_converges_to_its_formula(cell, within_m):
     at=st.tuples(st.floats(-20, 20), st.floats(-20, 20)),
     depth=st.floats(0.01, 12.0),
 )
-def test_any_cells_of_any_plane(slope, cell, at, depth):
+def test_any_cells(slope, cell, at, depth):
     surface = plane(0.0, *slope)
     point = np.array([[*at, surface(*at) - depth]])
     block = pcfix.Cameras(cameras().labels, cameras().centres - UTM)
@@ -175,7 +175,7 @@ def test_any_cells_of_any_plane(slope, cell, at, depth):
     assert one.xyz == pytest.approx(other.xyz, abs=MICROMETRE)
 
 
-def test_beyond_the_edge_the_last_plane_goes_on():
+def test_beyond_edge():
     # the raster ends 0.3 m beyond the point; its rays pass the water 1.5 to 3 m away
     abc = (0.1, 0.02, -0.01)
     small = raster(plane(*abc), (0.25, 0.25), half=2.0)
@@ -187,14 +187,14 @@ def test_beyond_the_edge_the_last_plane_goes_on():
     assert one.xyz == pytest.approx(other.xyz, abs=MICROMETRE)
 
 
-def test_a_cliff_in_the_raster_gives_finite_coordinates():
+def test_cliff_in_raster():
     water = raster(lambda x, y: np.where(x > 3.0, -9.0, 0.0) + 0.0 * y)
     result = pcfix.correct_points(bed(), cameras(), water)
     assert np.isfinite(result.xyz).all()
     assert np.isfinite(result.ray_miss_m).all()
 
 
-def test_a_camera_under_the_raster_is_refused():
+def test_camera_under_raster():
     with pytest.raises(pcfix.GeometryError):
         pcfix.correct_points(bed(), cameras(), raster(plane(90.0, 0, 0)))
 
@@ -208,7 +208,7 @@ def test_a_camera_under_the_raster_is_refused():
         (np.full((3, 3), np.inf), (1.0, 1.0)),
     ],
 )
-def test_what_is_no_raster(heights, cell):
+def test_no_raster(heights, cell):
     with pytest.raises(pcfix.SettingError):
         WaterRaster(heights, 0.0, 0.0, cell)
 
@@ -229,7 +229,7 @@ def surfaces():
 
 @pytest.mark.parametrize("kind", surfaces())
 @pytest.mark.parametrize("options", [{}, {"max_cameras": 3}])
-def test_offsets_of_zero_give_the_same_bits(kind, options):
+def test_zero_offsets(kind, options):
     one = pcfix.correct_points(bed(300), cameras(), surfaces()[kind], **options)
     other = pcfix.correct_points(
         bed(300), cameras(), surfaces()[kind], level_offset_m=np.zeros(5), **options
@@ -240,7 +240,7 @@ def test_offsets_of_zero_give_the_same_bits(kind, options):
 
 @pytest.mark.parametrize("kind", surfaces())
 @pytest.mark.parametrize("options", [{}, {"max_cameras": 5}])
-def test_one_offset_for_all_is_another_surface(kind, options):
+def test_one_offset(kind, options):
     water, up = surfaces()[kind], 0.31
     match water:
         case float():
@@ -258,7 +258,7 @@ def test_one_offset_for_all_is_another_surface(kind, options):
 
 
 @pytest.mark.parametrize("kind", ["plane", "raster"])
-def test_slow_twin_of_a_level_of_its_own_for_each_camera(kind):
+def test_twin_of_offsets(kind):
     offset = np.array([-0.4, 0.3, 0.0, 0.7, -0.2])
     result = pcfix.correct_points(bed(), cameras(), surfaces()[kind], level_offset_m=offset)
     base = bilinear(surfaces()["raster"]) if kind == "raster" else plane(0.2, 0.003, 0.0)
@@ -269,7 +269,7 @@ def test_slow_twin_of_a_level_of_its_own_for_each_camera(kind):
 
 
 @pytest.mark.parametrize("options", [{}, {"max_cameras": 2}])
-def test_a_camera_that_saw_the_point_dry_has_a_straight_ray(options):
+def test_dry_camera(options):
     """Its own water lay below the apparent point, so that nothing bent its light."""
     centres = np.array([[-20.0, 0, 50], [20.0, 0, 50]])
     two, point = pcfix.Cameras(("wet", "dry"), centres), np.array([[0.0, 0, -0.1]])
@@ -283,7 +283,7 @@ def test_a_camera_that_saw_the_point_dry_has_a_straight_ray(options):
 
 
 @pytest.mark.parametrize("offset", [np.zeros(4), np.array([0, 0, np.nan, 0, 0]), 0.3])
-def test_offsets_must_be_one_finite_number_per_camera(offset):
+def test_bad_offsets(offset):
     with pytest.raises(pcfix.SettingError):
         pcfix.correct_points(bed(), cameras(), 0.0, level_offset_m=offset)
 
@@ -305,7 +305,7 @@ def traced(truth, block, levels):
     return triangulate(image, block, camera, start, optics, truth), pcfix.Views(start, camera)
 
 
-def test_two_flights_at_two_levels_leave_no_bias_where_each_image_has_its_own():
+def test_two_flights():
     """Traced forwards by other code: the south flown at low water, the north 1 m higher."""
     rng = np.random.default_rng(11)
     flown = fly_block((120.0, 200.0), SceneSettings(), rng).cameras

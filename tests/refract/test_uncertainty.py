@@ -18,7 +18,7 @@ import pytest
 from pcfix.model import NOMINAL_WIDTH_PX, Lens, Outcome, Views, WaterPlane
 from pcfix.options.correct import LEVEL_M, BudgetOptions, ScienceOptions
 from pcfix.refract import uncertainty
-from pcfix.refract.intersect import intersect_in_frame
+from pcfix.refract.intersect import intersect
 from pcfix.refract.methods import correct, with_rays
 from pcfix.refract.regression import DepthRegression
 from pcfix.water.surface import SurfaceAbove, surface_above
@@ -68,8 +68,8 @@ def solved(xyz, cameras, settings, **changed):
     )
 
 
-def intersect(*args):
-    return intersect_in_frame(batch_of(*args))
+def in_frame(*args):
+    return intersect(batch_of(*args))
 
 
 def covariances(xyz, shift_m, above, cameras, settings, views=None, level_sigma_m=None):
@@ -107,7 +107,7 @@ def normalised(method, tilt_deg, source, *size):
 @pytest.mark.parametrize("tilt_deg", [0.0, 35.0], ids=["nadir", "oblique"])
 @pytest.mark.parametrize("method", ["snell", "consistent"])
 @pytest.mark.parametrize("source", SOURCES)
-def test_normalised_errors_have_unit_deviation(source, method, tilt_deg):
+def test_unit_deviation(source, method, tilt_deg):
     ratio = normalised(method, tilt_deg, source)
     # the standard deviation of 1000 draws that all points share is known to 1 / sqrt(2000), 2.2 %;
     # four times that and 1 % for what is of second order
@@ -117,14 +117,14 @@ def test_normalised_errors_have_unit_deviation(source, method, tilt_deg):
         assert known.size == 0 or 0.9 < np.sqrt((known**2).mean()) < 1.1
 
 
-def test_normalised_errors_of_consistent_are_not_biased():
+def test_no_bias():
     ratio = normalised("consistent", 35.0, "image", 12, 100)
     # 12 points x 100 independent draws: a mean is known to 1/35; the rest is of second order
     assert np.abs(ratio.mean(axis=(0, 1))).max() < 0.1
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 35.0], ids=["nadir", "oblique"])
-def test_common_errors_are_the_derivatives_of_consistent(tilt_deg):
+def test_common_errors_consistent(tilt_deg):
     # finite differences of the method itself, of points that a noisy image made: what is left out
     # is second order in residuals of some thousandths of the focal length, less than 3 % of z
     cameras, _, xyz = drawn(tilt_deg, "image", 12, 100)
@@ -159,7 +159,7 @@ def test_common_errors_are_the_derivatives_of_consistent(tilt_deg):
 
 
 @pytest.mark.parametrize("plane", [WaterPlane(0.0), WaterPlane(0.1, 0.004, -0.006)])
-def test_common_errors_are_the_derivatives_of_the_intersection(plane):
+def test_common_errors_snell(plane):
     # finite differences of the intersection itself, every camera in frame; 1 % in z as the turn of
     # M times the distance of a ray from the point is left out
     bed, cameras, _ = scene(35.0, points=300)
@@ -168,7 +168,7 @@ def test_common_errors_are_the_derivatives_of_the_intersection(plane):
     def found(water=plane, index=INDEX):
         above = surface_above(water, bed)
         settings = ScienceOptions(index=index)
-        return intersect(bed, above, water, cameras, settings)
+        return in_frame(bed, above, water, cameras, settings)
 
     base = found()
     moved = base.outcome == Outcome.CORRECTED
@@ -200,9 +200,9 @@ def test_common_errors_are_the_derivatives_of_the_intersection(plane):
     assert np.sqrt(cov[moved, 5].mean()) == pytest.approx(np.sqrt(both.mean()), rel=0.02)
 
 
-def test_a_covariance_is_symmetric_and_positive():
+def test_positive():
     bed, cameras, _ = scene(35.0, points=200)
-    found = intersect(bed, flat(200), LEVEL, cameras, ScienceOptions())
+    found = in_frame(bed, flat(200), LEVEL, cameras, ScienceOptions())
     cov = covariances(
         bed, found.shift_m, flat(200), cameras, ScienceOptions(**vars(SOURCES["all"]))
     )
@@ -210,9 +210,9 @@ def test_a_covariance_is_symmetric_and_positive():
     assert (np.linalg.eigvalsh(full) > 0.0).all()
 
 
-def test_variances_of_sources_add_up():
+def test_sources_add_up():
     bed, cameras, _ = scene(35.0, points=50)
-    found = intersect(bed, flat(50), LEVEL, cameras, ScienceOptions())
+    found = in_frame(bed, flat(50), LEVEL, cameras, ScienceOptions())
     all_of_them = SOURCES["all"]
 
     def cov(errors):
@@ -224,22 +224,22 @@ def test_variances_of_sources_add_up():
 
 
 @pytest.mark.parametrize("method", ["snell", "consistent"])
-def test_both_kernels_agree_to_the_bit(method):
+def test_listed_as_in_frame(method):
     bed, cameras, _ = scene(0.0, points=500)
-    found = intersect(bed, flat(500), LEVEL, cameras, ScienceOptions())
+    found = in_frame(bed, flat(500), LEVEL, cameras, ScienceOptions())
     seen = found.ray_count == len(cameras)
     assert seen.sum() > 300
     for errors in (BudgetOptions(), SOURCES["all"]):
         settings = ScienceOptions(method=method, **vars(errors))
-        every = intersect(bed, flat(500), LEVEL, cameras, settings).covariance_m2
+        every = in_frame(bed, flat(500), LEVEL, cameras, settings).covariance_m2
         views = views_of(500, cameras)
         listed = covariances(bed, found.shift_m, flat(500), cameras, settings, views)
         assert (every[seen] == listed[seen]).all()
 
 
-def test_only_the_steepest_cameras_count():
+def test_steepest():
     bed, cameras, _ = scene(0.0, points=200)
-    found = intersect(bed, flat(200), LEVEL, cameras, ScienceOptions())
+    found = in_frame(bed, flat(200), LEVEL, cameras, ScienceOptions())
     steep = np.linalg.norm(cameras.centres[:, :2] - bed[:, None, :2], axis=2)
     nearest = np.sort(np.argsort(steep, axis=1)[:, :4], axis=1)
     views = Views(np.arange(201) * 4, nearest.ravel())
@@ -249,18 +249,18 @@ def test_only_the_steepest_cameras_count():
     assert (some != covariances(*args, ScienceOptions())).any()
 
 
-def test_the_result_does_not_depend_on_the_other_points():
+def test_other_points():
     bed, cameras, _ = scene(35.0, points=700)
-    found = intersect(bed, flat(700), LEVEL, cameras, ScienceOptions())
+    found = in_frame(bed, flat(700), LEVEL, cameras, ScienceOptions())
     whole = covariances(bed, found.shift_m, flat(700), cameras, ScienceOptions())
     some = slice(100, 333)
     part = covariances(bed[some], found.shift_m[some], flat(233), cameras, ScienceOptions())
     assert (whole[some] == part).all()
 
 
-def test_level_is_the_users_else_the_fits_else_a_default():
+def test_level_sigma():
     bed, cameras, _ = scene(0.0, points=20)
-    found = intersect(bed, flat(20), LEVEL, cameras, ScienceOptions())
+    found = in_frame(bed, flat(20), LEVEL, cameras, ScienceOptions())
 
     def sigma(given, stated=None):
         settings = ScienceOptions(**vars(replace(NONE, sigma_level=stated)))
@@ -277,7 +277,7 @@ def test_level_is_the_users_else_the_fits_else_a_default():
     assert sigma(each)[3] == pytest.approx(LEVEL_M * one[3])
 
 
-def test_points_without_a_solution_have_none():
+def test_unsolved():
     bed, cameras, _ = scene(0.0, points=3)
     bed[1] = [500.0, 500.0, -3.0]  # out of every frame
     found = correct(batch_of(bed, flat(3), LEVEL, cameras, ScienceOptions(method="snell")))
@@ -286,7 +286,7 @@ def test_points_without_a_solution_have_none():
     assert covariances(bed[:0], bed[:0], flat(0), cameras, ScienceOptions()).shape == (0, 6)
 
 
-def test_it_is_skipped_where_nobody_reads_it():
+def test_not_asked():
     bed, cameras, _ = scene(0.0, points=3)
     found = correct(
         batch_of(bed, flat(3), LEVEL, cameras, ScienceOptions(method="snell", dimensions="minimal"))
@@ -294,7 +294,7 @@ def test_it_is_skipped_where_nobody_reads_it():
     assert found.covariance_m2 is None and (found.sigma_z_m == 0.0).all()
 
 
-def test_focal_lengths_in_pixels():
+def test_focal_px():
     lens = Lens(8.8, 13.2, 8.8, 6.6, 4.4, unit="mm")
     assert replace(lens, pixel_size_mm=0.0024).focal_px == pytest.approx(8.8 / 0.0024)
     assert lens.focal_px == pytest.approx(8.8 / 13.2 * NOMINAL_WIDTH_PX)
@@ -302,7 +302,7 @@ def test_focal_lengths_in_pixels():
 
 
 @pytest.mark.parametrize("method", ["shan", "factor", "murase"])
-def test_other_methods_get_the_same_budget(method):
+def test_other_methods(method):
     bed, cameras, rng = scene(0.0, points=15)
     quiet = apparent(bed, cameras, NONE, rng)
     sigma = [
@@ -312,7 +312,7 @@ def test_other_methods_get_the_same_budget(method):
     np.testing.assert_allclose(sigma[0], sigma[1], rtol=0.1)
 
 
-def test_a_regression_has_the_error_of_its_predictions():
+def test_regression():
     from pcfix.refract.batch import Learned
 
     bed, cameras, _ = scene(0.0, points=5)

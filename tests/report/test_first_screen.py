@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from pcfix.compare.statistics import own_of, statistics_of
-from pcfix.report.first_screen import Survey, accuracy_tile, notes_of, water_words
+from pcfix.report.first_screen import Survey, accuracy_tile, notes_of
 
 KNOWN = Survey("", "", "a CRS", "a datum")
-FIT = {"model": "level", "level_m": 0.3694, "sigma_level_m": 0.012, "tilt_percent": 0.0}
 
 
 def summary(sigma=0.05, **more):
@@ -60,18 +59,3 @@ def test_tags():
     nothing = accuracy_tile(summary(uncertainty=None), {})
     assert (nothing.tag, nothing.figures) == ("predicted", [("RMSE", "not known")])
     assert len(notes_of(summary(), Survey(), {})) == 2  # no reference, no vertical datum
-
-
-@pytest.mark.parametrize(
-    ("fit", "sigma_level", "words"),
-    [
-        (None, None, ("level 0.37 m, as given", "0.020 m (assumed)")),
-        (FIT | {"accepted": 30, "points": 32}, None, ("0.369 m, fitted to 30 of 32", "0.012 m")),
-        (FIT | {"model": "auto"}, None, ("found in the cloud",)),
-        (FIT, 0.05, ("0.050 m (as stated)",)),
-    ],
-)
-def test_origin_of_water(fit, sigma_level, words):
-    settings = {**summary().settings, "sigma_level": sigma_level}
-    found = water_words(summary(water_fit=fit, settings=settings))
-    assert all(word in found for word in words)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, replace
+from functools import reduce
+from operator import add
 from pathlib import Path
 
 import numpy as np
@@ -12,16 +14,14 @@ import pytest
 import pcfix
 from pcfix.compare.statistics import binned, tvu_of
 from pcfix.options.correct import BudgetOptions
-from pcfix.refract.tally import ORDERS, Tally, UncertaintyTally, largest_tvu_m
+from pcfix.refract.tally import ORDERS, UncertaintyTally, largest_tvu_m
 from pcfix.report.page import png_of
 from pcfix.report.run import tvu_figure
 from pcfix.report.text import (
     FEWEST,
     budget_words,
     formal_words,
-    strictest_order,
     summary_rows,
-    summary_text,
     tvu_sentence,
     uncertainty_sentence,
 )
@@ -42,10 +42,8 @@ def test_largest_tvu(order):
 
 
 def tally_of(sigma, depth, parts=1):
-    tally = UncertaintyTally()
-    for some in np.array_split(np.arange(len(sigma)), parts):
-        tally.add(sigma[some], depth[some])
-    return tally.as_dict()
+    rows = np.array_split(np.arange(len(sigma)), parts)
+    return reduce(add, [UncertaintyTally.of(sigma[r], depth[r]) for r in rows]).as_dict()
 
 
 def test_shares_and_percentiles():
@@ -65,7 +63,7 @@ def test_chunks():
     assert tally_of(sigma, depth) == tally_of(sigma, depth, parts=7)
     p95 = tally_of(sigma, depth)["sigma_z_m"]["p95"]
     assert p95 == pytest.approx(np.percentile(sigma, 95), abs=0.001)  # a bin
-    assert tally_of(np.zeros(3), np.ones(3)) is UncertaintyTally().as_dict() is None
+    assert tally_of(np.zeros(3), np.ones(3)) is None
 
 
 @pytest.mark.parametrize(
@@ -74,7 +72,6 @@ def test_chunks():
 )
 def test_strictest_order(shares, order):
     found = {"s44": dict(zip(BY_HAND, shares, strict=True))}
-    assert strictest_order(found) == order
     assert (order or "fewer than 95 %") in tvu_sentence(found)
 
 
@@ -95,11 +92,10 @@ def test_budget_words(changes, fitted, words):
 
 def test_figure():
     rng = np.random.default_rng(0)
-    for points in (1, 500):
-        depth, sigma = rng.uniform(0.0, 8.0, points), rng.uniform(0.01, 0.2, points)
-        assert png_of(tvu_figure(depth, sigma)).startswith(b"\x89PNG")
+    depth, sigma = rng.uniform(0.0, 8.0, 500), rng.uniform(0.01, 0.2, 500)
     bins = [asdict(one) for one in binned(depth, rng.normal(0.0, 0.1, 500), None, 1.0)]
-    assert png_of(tvu_figure(depth, sigma, bins)).startswith(b"\x89PNG")
+    for some, measured in ((slice(1), []), (slice(None), bins)):
+        assert png_of(tvu_figure(depth[some], sigma[some], measured)).startswith(b"\x89PNG")
 
 
 def test_measured_tvu():
@@ -138,16 +134,9 @@ def test_model_uncertainty(summary):
     assert summary.uncertainty["of_cloud"] == found
     assert found["per_depth"] > 0.0
     assert f"model uncertainty {100.0 * found['per_depth']:.1f} % of depth" in formal_words(summary)
-    assert Tally(1).uncertainty(made) is None
 
 
 def test_summary_rows(summary):
     rows = dict(summary_rows(summary))
     assert rows["Submerged"] == "14,736 points (74 %), all corrected"
-    assert (
-        rows["Uncertainty"]
-        == f"{summary.uncertainty['tvu_95_m']['mean']:.3f} m at 95 % (predicted)"
-    )
     assert "Uncertainty" not in dict(summary_rows(replace(summary, uncertainty=None)))
-    lines = summary_text(summary).splitlines()
-    assert lines[0].startswith("Corrected ") and all(len(line) < 160 for line in lines[1:-3])

@@ -1,17 +1,17 @@
-"""Every kind of cloud: without refraction the truth comes back, and slow twins agree."""
+"""Every kind of cloud: without refraction the truth comes back, and slow twins agree.
+
+`tests.refract.test_depth_maps` checks fused depth maps: their slow twin undoes simulated ones.
+"""
 
 import math
-from itertools import combinations
-from typing import NamedTuple
 
 import numpy as np
 import pytest
-from scipy.optimize import brentq, least_squares, minimize_scalar
+from scipy.optimize import least_squares
 
 import pcfix
 from pcfix.simulate.scene import ORIGIN_M
-from pcfix.simulate.sight import openmvs_partners
-from tests.utils.twins import bend, light_path
+from tests.utils.twins import light_path
 
 KINDS = ("tracks", "pairs", "depth-maps")
 LENS = (-0.06, 0.02, -0.004, 0.0006, -0.0004)
@@ -104,130 +104,6 @@ def test_pairs_twin():
         slow = [twin.straight(pair, twin.truth[i], twin.xyz[i] + 0.1) for pair in pairs]
         # a pair's angle is small, so scipy's last step is larger in z
         assert twin.xyz[i] == pytest.approx(np.median(slow, axis=0), abs=1e-4)
-
-
-def test_depth_maps_twin(monkeypatch):
-    """Fermat and scipy, loops over images, and groups as sets."""
-    settings = {"bed": "flat", "image_noise": 0.0, "tilt_percent": 1.0, **POSES}
-    kept = []
-    monkeypatch.setattr(
-        "pcfix.simulate.scene.openmvs_partners",
-        lambda *given: kept.append(openmvs_partners(*given)) or kept[-1],
-    )
-    scene = pcfix.simulate_scene(60, cloud="depth-maps", **settings)
-    seen_first = pcfix.simulate_scene(60, **settings).true_xyz - ORIGIN_M  # the same ground
-    twin, partners = Twin(scene), kept[0]
-    assert np.array_equal(scene.neighbours, partners.matched)
-    bed = (twin.plane[0] - 3.0, *twin.plane[1:])
-    for i in (7, 30):
-        weight = scene.views.weight[scene.views.start[i] : scene.views.start[i + 1]].astype(float)
-        used = views_of(scene, i).tolist()
-        shown = [k for k in range(len(scene.cameras)) if twin.in_frame(k, seen_first[i])]
-        begun = twin.straight(shown, seen_first[i], twin.xyz[i] + 0.1)
-        maps = maps_of(twin, scene, partners, shown, begun, bed)
-        seed = next(s for s, group in groups_of(maps, partners, bed) if group == set(used))
-        maps = maps_of(twin, scene, partners, shown, maps[seed].point, bed)
-        # scipy's minimum of a square is known to the root of its precision, 1e-5 m of depth
-        depth = np.array([maps[k].depth for k in used])
-        assert weight == pytest.approx(1.0 / depth**2, rel=1e-5)
-        made = np.average([maps[k].point for k in used], 0, weight)
-        assert twin.xyz[i] == pytest.approx(made, abs=1e-4)
-        shows = np.average([maps[k].shown for k in used], 0, weight)
-        assert twin.truth[i] == pytest.approx(shows, abs=1e-4)
-
-
-class Map(NamedTuple):
-    """What a depth map has along one ray, after averaging: depth, point, and what it shows."""
-
-    origin: np.ndarray
-    depth: float
-    point: np.ndarray
-    shown: np.ndarray
-
-
-def reach(bed, through, origin, point):
-    """Return how far a ray goes to the plane parallel to the bed through a place: 1, to its end."""
-    normal = np.array([-bed[1], -bed[2], 1.0])
-    return (through - origin) @ normal / ((point - origin) @ normal)
-
-
-def maps_of(twin, scene, partners, shown, place, bed):
-    """Return the averaged maps of all images that have one, through a place."""
-    raw = {}
-    for k in shown:
-        if sum(int(j) in shown for j in scene.neighbours[k]) >= 2:
-            raw[k] = depth_of(twin, scene, k, place, bed, shown)
-    maps = {}
-    for k, (seen, depth, point) in raw.items():
-        origin, near = twin.centre(twin.given, k), [(depth, seen)]
-        others = [int(j) for j in partners.averaged[k] if int(j) in raw]
-        for j in others:
-            d = depth * reach(bed, raw[j][2], origin, point)
-            if abs(d - depth) < 0.012 * depth:
-                near.append((d, raw[j][0]))
-        if len(others) >= 2 and len(near) > 1 and len(near) > len(others) + 1 - len(near):
-            mean = np.mean([d for d, _ in near])
-            at = origin + mean / depth * (point - origin)
-            maps[k] = Map(origin, mean, at, np.mean([q for _, q in near], axis=0))
-    return maps
-
-
-def groups_of(maps, partners, bed):
-    """Return the seed and the images of each point that a place makes, in the order of fusion."""
-    free, groups = set(maps), []
-    for k in sorted(maps, key=lambda k: (-partners.known[k], k)):
-        if k not in free:
-            continue
-        group, behind = {k}, set()
-        for j in {int(j) for j in partners.fused[k]} & free:
-            beyond = reach(bed, maps[j].point, maps[j].origin, maps[k].point) - 1.0
-            if abs(beyond) < 0.01:
-                group.add(j)
-            elif beyond > 0:
-                behind.add(j)
-        if len(group) >= 3:
-            groups.append((k, group))
-            free -= group | behind
-    return groups
-
-
-def crossing(plane, origin, direction):
-    """Return where a ray meets z = a + b x + c y."""
-
-    def gap(s):
-        x, y, z = origin + s * direction
-        return z - plane[0] - plane[1] * x - plane[2] * y
-
-    return origin + brentq(gap, 0.0, 500.0, xtol=1e-13) * direction
-
-
-def depth_of(twin, scene, k, fused, bed, shown):
-    """Return the bed that image k sees through a point, its depth there, and the point of that.
-
-    The depth with the least sum of the two lowest of the partners' squares, over all pairs.
-    """
-    origin = twin.centre(twin.given, k)
-    ray = fused - origin
-    ray = ray / (twin.given.rotations[k][2] @ ray)
-    true_ray = twin.true.rotations[k].T @ twin.given.rotations[k] @ ray
-    true_ray = true_ray / np.linalg.norm(true_ray)
-    surface = crossing(twin.plane, twin.centre(twin.true, k), true_ray)
-    normal = np.array([-twin.plane[1], -twin.plane[2], 1.0])
-    under = bend(true_ray, normal / np.linalg.norm(normal), twin.n)
-    place = crossing(bed, surface, under)
-    others = [int(j) for j in scene.neighbours[k] if int(j) in shown]
-    seen = {j: twin.image(j, place) for j in others}
-    found = []
-    for pair in combinations(others, 2):
-
-        def misfit(d, pair=pair):
-            at = origin + d * ray
-            return sum(np.sum((twin.pixels(twin.given, j, at) - seen[j]) ** 2) for j in pair)
-
-        best = minimize_scalar(misfit, bracket=(70.0, 80.0), tol=1e-12)
-        found.append((best.fun, best.x))
-    depth = min(found)[1]
-    return place, depth, origin + depth * ray
 
 
 def test_depth_maps():

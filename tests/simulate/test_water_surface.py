@@ -22,6 +22,7 @@ def pairs(seed=3):
 def waters():
     waves = Waves.random(9, 3.0, 2.0, np.random.default_rng(8))
     return {
+        "level": Water(WaterPlane(0.3), N),
         "tilted": Water(TILTED, N),
         "waves": Water(WaterPlane(0.3), N, waves),
         "tilted waves": Water(TILTED, N, waves),

@@ -39,5 +39,5 @@ def records(*paths):
 
 def finished(folder):
     """Return the outputs in a folder that are on record as finished, and when they were written."""
-    paths = [folder / one.stem for one in (folder / ".pcfix").glob("*.la?.npz")]
+    paths = [folder / one.stem for one in (folder / ".pcfix").glob("*.la?.tally")]
     return {path: path.stat().st_mtime_ns for path in paths}

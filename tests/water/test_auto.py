@@ -6,9 +6,8 @@ import laspy
 import numpy as np
 import pytest
 
-from pcfix.report.water import shoreline_figure
 from pcfix.water.auto import find_water
-from pcfix.water.cues import Break, gain_of, gather, running_mean, tile_moments
+from pcfix.water.cues import Break, gain_of, gather, tile_moments
 from tests.utils.codes import refused
 from tests.utils.shared import needs
 
@@ -92,15 +91,6 @@ def test_water_classes():
     assert found.evidence["classified points"] == len(water)
 
 
-def test_noise_classes():
-    xyz, rgb = shore()
-    bad = np.array([[EAST_M, NORTH_M, 900.0], [EAST_M, NORTH_M, -900.0]])
-    classes = np.r_[np.full(len(xyz), 1), 18, 7]
-    colours = np.vstack([rgb, rgb[:2]])
-    found = find_water(np.vstack([xyz, bad]), rgb=colours, classes=classes)
-    assert found.surface == found_of().surface
-
-
 @pytest.mark.parametrize("offset_m", [+5.0, -12.0])
 def test_land_or_bed_only_refused(offset_m):
     rng = np.random.default_rng(3)
@@ -161,13 +151,6 @@ def test_amplitude_of_break():
     assert gain.gain[0] > gain.gain[1]
 
 
-def test_figure(tmp_path):
-    figure = shoreline_figure(found_of(0.004))
-    figure.savefig(tmp_path / "shoreline.png")
-    assert (tmp_path / "shoreline.png").stat().st_size > 20_000
-    assert "Water" in figure.get_suptitle()
-
-
 @needs_rendered
 def test_real_cloud():
     cloud = laspy.read(RENDERED)
@@ -182,11 +165,3 @@ def test_river_without_land_refused():
     rgb = np.column_stack([cloud.red, cloud.green, cloud.blue])
     with refused("water.not_found", reason="weak"):
         find_water(cloud.xyz, rgb=rgb)
-
-
-@pytest.mark.parametrize("width", [1, 2, 5, 6, 40])
-def test_running_mean(width):
-    from scipy.ndimage import uniform_filter1d
-
-    values = np.random.default_rng(3).uniform(0.0, 1.0, 25)
-    assert running_mean(values, width) == pytest.approx(uniform_filter1d(values, width), rel=1e-14)

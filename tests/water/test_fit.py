@@ -1,12 +1,9 @@
 """Water surfaces fitted to shoreline points: planes, levels, rivers; points without heights."""
 
 import math
-from functools import cache
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.stats import chi2
 
 from pcfix.io.vectors import read_shoreline
@@ -90,39 +87,6 @@ def test_two_fifths_wrong(share):
         assert np.abs(fit_water(points).height_at(corners) - true).max() < 0.07  # 4 sigma
 
 
-def test_many_points():
-    points, corners, true, good = reach(3, n=20_000, share=0.3)
-    fit = fit_water(points, model="plane")
-    assert (fit.accepted == good).mean() > 0.999
-    assert np.abs(fit.height_at(corners) - true).max() < 0.002  # 5 sigma
-    assert fit.sigma_m == pytest.approx(0.025, rel=0.02)
-
-
-@cache
-def as_they_came():
-    points = reach(7, n=20)[0]
-    return points, fit_water(points)
-
-
-@given(st.permutations(range(20)))
-def test_order_of_points(order):
-    points, one = as_they_came()
-    other = fit_water(points[order])
-    assert one.surface == other.surface
-    assert np.array_equal(one.residual_m[order], other.residual_m)
-
-
-@given(st.floats(-0.035, 0.035), st.floats(-0.035, 0.035), st.floats(-50, 3000))
-def test_exact_points(b, c, a):
-    rng = np.random.default_rng(1)
-    xy = rng.uniform(0, 100, (12, 2))
-    z = a + b * xy[:, 0] + c * xy[:, 1]
-    fit = fit_water(np.column_stack([xy + UTM, z]), model="plane")
-    assert fit.height_at(xy + UTM) == pytest.approx(z, abs=1e-8)
-    assert fit.tilt == pytest.approx([b, c], abs=1e-9)
-    assert fit.sigma_m < 1e-8
-
-
 def test_tilt():
     xy = np.array([[x, y] for x in range(0, 100, 10) for y in range(0, 100, 10)], float)
     fit = fit_water(np.column_stack([xy, 5.0 - 0.01 * xy[:, 0]]), model="plane")
@@ -163,26 +127,10 @@ def test_auto_of_few_points(xy):
     assert math.isnan(fit.sigma_level_m) == (len(xy) == 1)
 
 
-def test_three_points():
-    points = np.array([[0.0, 0, 1.0], [100, 0, 1.5], [0, 100, 1.2]])
-    fit = fit_water(points, model="plane")
-    assert fit.residual_m == pytest.approx(np.zeros(3), abs=1e-12)
-    assert np.isnan(fit.sigma_at(points[:, :2])).all()
-
-
 def test_rounded_heights():
     z = np.array([0.37] * 9 + [0.38] * 4 + [0.36] * 2)
     xy = np.random.default_rng(0).uniform(0, 50, (15, 2))
     assert fit_water(np.column_stack([xy, z])).accepted.all()
-
-
-def test_points_without_heights():
-    points = reach(5)[0]
-    points[[3, 8], 2] = np.nan
-    fit = fit_water(points)
-    assert np.isnan(fit.residual_m[[3, 8]]).all()
-    assert not fit.accepted[[3, 8]].any()
-    assert fit.as_dict()["without_height"] == 2
 
 
 def test_notes():
@@ -390,10 +338,3 @@ def test_drawn_line(tmp_path):
     assert error / np.mean(naive) > 4.0
     with_tilt = sum(fit_water(xyz, counts=counts).model != "level" for xyz, counts in drawn[:15])
     assert with_tilt <= 3  # of 15 at 5 %: more in 1 of 100 cases
-
-
-def test_dense_line(tmp_path):
-    """Vertices every 0.1 m take their heights from the same points of the cloud, within 1 m."""
-    xyz, counts = drawn_by_hand(1, tmp_path, every_m=0.1, off_m=0.01)
-    assert counts.sum() == pytest.approx(150.0, rel=0.05)
-    assert len(xyz) >= 3000

@@ -7,7 +7,6 @@ from scipy.spatial import Delaunay
 
 import pcfix
 from pcfix.water.surface import surface_above
-from tests.utils.codes import refused
 from tests.utils.nightly import mostly_nightly
 from tests.utils.twins import bend, stacked_intersection
 
@@ -78,17 +77,6 @@ def first_hit(corners, centre, point):
     assert hit.any(), "the line misses the mesh"
     first = np.flatnonzero(hit)[0]
     return at[first], normal[first]
-
-
-def test_degenerate_facets():
-    vertices = np.array([[0, 0, 0], [10, 0, 0], [0, 10, 0], [0, 0, 5], [5, 5, 1]], float)
-    triangles = np.array([[0, 1, 3], [0, 0, 1], [0, 1, 2]])
-    mesh = pcfix.WaterMesh(vertices, triangles)
-    heights = surface_above(mesh, np.array([[1.0, 1, 0], [9, 9, 0]])).height_m
-    assert heights[0] == 0.0
-    assert np.isnan(heights[1])
-    with refused("water.mesh"):
-        surface_above(pcfix.WaterMesh(vertices, triangles[:2]), np.zeros((1, 3)))
 
 
 @pytest.mark.parametrize("limit_deg", mostly_nightly((12.0, 18.0, 25.0), 18.0))

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.errors import InputError, SettingError
+from pcfix.errors import InputError, SettingError, bad_file
 from pcfix.io.cameras import (
     blocksexchange,
     bundler,
@@ -42,7 +42,6 @@ from pcfix.io.cameras.checks import (
     no_pose,
     reading,
     sensor_unused,
-    wrong,
 )
 from pcfix.io.cameras.formats import Angles, Source
 from pcfix.io.cameras.table.sensor import read_sensor
@@ -65,40 +64,41 @@ class CameraFormat(NamedTuple):
     reader: Any
 
 
-FORMATS = (
-    CameraFormat(
+_FORMATS = (
+    (
         "Agisoft Metashape, PhotoScan",
         "cameras or markers XML, `.psx`, `.psz`; omega-phi-kappa text or reference table with"
         " `--sensor calibration.xml`",
         metashape,
     ),
-    CameraFormat("Pix4D", "the `params` folder, the project folder or one of its tables", pix4d),
-    CameraFormat("OPF: PIX4Dmatic, PIX4Dcatch", "the project (`.opf`) or its folder", opf),
-    CameraFormat("OpenDroneMap", "the project folder, `reconstruction.json`, `shots.geojson`", odm),
-    CameraFormat("OpenSfM", "`reconstruction.json` or its folder", opensfm),
-    CameraFormat("COLMAP", "the model folder or workspace, text or binary", colmap),
-    CameraFormat("MicMac", "the `Ori-...` folder, of MMVII too", micmac),
-    CameraFormat(
+    ("Pix4D", "the `params` folder, the project folder or one of its tables", pix4d),
+    ("OPF: PIX4Dmatic, PIX4Dcatch", "the project (`.opf`) or its folder", opf),
+    ("OpenDroneMap", "the project folder, `reconstruction.json`, `shots.geojson`", odm),
+    ("OpenSfM", "`reconstruction.json` or its folder", opensfm),
+    ("COLMAP", "the model folder or workspace, text or binary", colmap),
+    ("MicMac", "the `Ori-...` folder, of MMVII too", micmac),
+    (
         "Bundler, MVE",
         "`bundle.out`, `synth_0.out`, with the images or their list beside it",
         bundler,
     ),
-    CameraFormat("VisualSFM", "`.nvm`, with the images beside it", nvm),
-    CameraFormat(
+    ("VisualSFM", "`.nvm`, with the images beside it", nvm),
+    (
         "ContextCapture, iTwin Capture, DJI Terra",
         "BlocksExchange XML, plain or zipped",
         blocksexchange,
     ),
-    CameraFormat("RealityCapture (XMP)", "the folder of XMP files", realitycapture),
-    CameraFormat(
+    ("RealityCapture (XMP)", "the folder of XMP files", realitycapture),
+    (
         "CSV table",
         "a table with a header: `label,x,y,z` and, if known, `omega,phi,kappa`, `yaw,pitch,roll`,"
         " `qw,qx,qy,qz` (world to camera) or `r11..r33`; RealityCapture's internal and external"
         " parameters, Metashape's and ODM's lists among them",
         table,
     ),
-    CameraFormat("a format that pcfix does not read", "", unsupported),
+    ("a format that pcfix does not read", "", unsupported),
 )
+FORMATS = tuple(CameraFormat(*each) for each in _FORMATS)
 """In the order in which they are asked: ODM knows more of an OpenSfM file than OpenSfM, and a plain
 table says least of all."""
 TAKE_SENSOR = (table, realitycapture)
@@ -159,7 +159,14 @@ def read_cameras(
     source, form = _recognised(path, sensor, angles)
     try:
         with reading(path):
-            cameras = _with_sensor(source, form.reader.read(source), form)
+            cameras = form.reader.read(source)
+            if source.sensor is not None and form.reader not in TAKE_SENSOR and len(cameras):
+                if cameras.lenses is not None or cameras.rotations is None:
+                    why = "no angles" if cameras.lenses is None else "its own lenses"
+                    raise sensor_unused(source, why)
+                notes = tuple(note for note in cameras.notes if note.code != NO_LENS)
+                lenses = (read_sensor(source.sensor),) * len(cameras)
+                cameras = replace(cameras, lenses=lenses, notes=notes)
             cameras = checked(source.path, cameras)
     except SettingError as error:  # numbers that are finite in the file and not in the world
         raise damaged(path, str(error).rstrip(".")) from error
@@ -219,18 +226,22 @@ def _recognised(
     known = _format_of(source)
     if known is not None and known.reader is not unsupported:
         return source, known
-    inside = _camera_files(where)
+    inside = []  # camera files in a folder
+    for file in sorted(p for p in where.glob("*") if p.suffix.lower() in LISTS and p.is_file()):
+        form = _format_of(Source(file))
+        if form is not None and form.reader is not unsupported:
+            inside.append((file.name, form.software))
     if inside:
-        listed = " and ".join(f"{name} ({software})" for name, software in inside)
+        listed = " and ".join(f"{name} ({software})" for name, software in inside[:3])
         sentence = f"is a folder that holds {listed}. Give {where / inside[0][0]} itself."
-        raise wrong(where, "cameras.folder", sentence, files=[name for name, _ in inside])
+        raise bad_file(where, "cameras.folder", sentence, files=[name for name, _ in inside[:3]])
     if known is not None:
         return source, known
     sentence = (
         "is not a camera file that pcfix knows. Give a CSV table with the columns label, x, y, z"
         " and, if you have them, yaw, pitch, roll."
     )
-    raise wrong(where, "cameras.unknown", sentence)
+    raise bad_file(where, "cameras.unknown", sentence)
 
 
 def takes_sensor(path: File) -> bool:
@@ -238,35 +249,10 @@ def takes_sensor(path: File) -> bool:
     return _recognised(path, None, None)[1].reader in TAKE_SENSOR
 
 
-def _with_sensor(source: Source, cameras: Cameras, form: CameraFormat) -> Cameras:
-    """Return cameras with the lens of ``--sensor`` where their file has none."""
-    if source.sensor is None or form.reader in TAKE_SENSOR or not len(cameras):
-        return cameras
-    if cameras.lenses is not None or cameras.rotations is None:
-        raise sensor_unused(source, "no angles" if cameras.lenses is None else "its own lenses")
-    lenses = (read_sensor(source.sensor),) * len(cameras)
-    notes = tuple(note for note in cameras.notes if note.code != NO_LENS)
-    return replace(cameras, lenses=lenses, notes=notes)
-
-
 def _format_of(source: Source) -> CameraFormat | None:
     """Return the first format that knows the content; standard errors look like poses."""
-    asked = FORMATS[-1:] if unsupported.is_part(source) else FORMATS
-    return next((form for form in asked if _knows(form, source)), None)
-
-
-def _knows(form: CameraFormat, source: Source) -> bool:
-    """Whether a file is of a format; not where it is too damaged to tell."""
-    with suppress(InputError, *DAMAGES), np.errstate(all="ignore"):
-        return bool(form.reader.recognises(source))
-    return False
-
-
-def _camera_files(folder: Path) -> list[tuple[str, str]]:
-    """Return the names of camera files in a folder and their software, three at most."""
-    found = []
-    for path in sorted(p for p in folder.glob("*") if p.suffix.lower() in LISTS and p.is_file()):
-        form = _format_of(Source(path))
-        if form is not None and form.reader is not unsupported:
-            found.append((path.name, form.software))
-    return found[:3]
+    for form in FORMATS[-1:] if unsupported.is_part(source) else FORMATS:
+        with suppress(InputError, *DAMAGES), np.errstate(all="ignore"):  # too damaged to tell
+            if form.reader.recognises(source):
+                return form
+    return None

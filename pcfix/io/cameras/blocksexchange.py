@@ -40,9 +40,9 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from pcfix.errors import InputError, PcfixWarning
+from pcfix.errors import InputError, PcfixWarning, bad_file
 from pcfix.io.cameras import checks, tracks
-from pcfix.io.cameras.checks import damaged, number, read_xml, wrong
+from pcfix.io.cameras.checks import damaged, note, number, read_xml, text_of
 from pcfix.io.cameras.formats import Source
 from pcfix.lens.rotations import from_omega_phi_kappa, from_photogrammetric
 from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, TiePoints
@@ -50,47 +50,27 @@ from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, TiePoints
 ZIP_MAGIC = b"PK\x03\x04"
 COMMENT = re.compile(rb"<!--.*?-->", re.DOTALL)
 TIE_POINTS = re.compile(rb"<TiePoints>(.*?)</TiePoints>", re.DOTALL)
+EXTERNAL = re.compile(rb"<Path>\s*([^<]*?)\s*</Path>")
+DECLARATION = re.compile(rb"<\?xml.*?\?>")
+SRS_OF_ALL = re.compile(rb"<SRSId>\s*([^<]*?)\s*</SRSId>")
 LARGEST_RATIO = 200
 """Of an archive: XML packs 10 to 30 times smaller, a bomb a thousand times."""
-EXIF_CRS = "EPSG:4326"
 MAIN_COMPONENT = "1"
 FIRST_PIXEL = 0.5
 """The centre of the first pixel, seen from its corner."""
-BROWN = (("K1", "K2", "K3"), ("P1", "P2"))
-DIRECTIONS = {"Right": (1, 0), "Left": (-1, 0), "Down": (0, 1), "Up": (0, -1)}
-ORIENTATIONS = {
-    f"X{x}Y{y}": np.array([(*DIRECTIONS[x], 0.0), (*DIRECTIONS[y], 0.0)])
-    for x in DIRECTIONS
-    for y in DIRECTIONS
-    if (x in ("Right", "Left")) != (y in ("Right", "Left"))
-}
+DIRECTIONS = {"Right": (1, 0, 0), "Left": (-1, 0, 0), "Down": (0, 1, 0), "Up": (0, -1, 0)}
 
 
 def recognises(source: Source) -> bool:
     """Whether the root element is BlocksExchange, in a plain file or a zip archive."""
     if source.head.startswith(ZIP_MAGIC):
-        with zipfile.ZipFile(source.path) as archive:
-            stream = archive.open(_document_name(source.path, archive))
-            return b"<BlocksExchange" in stream.read(4096)
+        return b"<BlocksExchange" in _read_bytes(source.path)[:4096]
     return "<BlocksExchange" in source.text
 
 
 def read(source: Source) -> Cameras:
     """Read poses and lenses, in the CRS of the block."""
-    return _read_photos(source.path, _read_document(source.path)[0])[0]
-
-
-def _read_document(path: Path) -> tuple[Element, list[tuple[int, bytes]]]:
-    """Return the root element without its tie points, and those as text with their block's number.
-
-    There can be millions of measurements, which a tree of elements would take minutes for.
-    """
-    data = _read_bytes(path)
-    found = [
-        (data.count(b"<Block>", 0, match.start()) - 1, match[1])
-        for match in TIE_POINTS.finditer(data)
-    ]
-    return read_xml(path, io.BytesIO(TIE_POINTS.sub(b"", data))), found
+    return _read_block(source.path).cameras
 
 
 def _read_bytes(path: Path) -> bytes:
@@ -98,130 +78,126 @@ def _read_bytes(path: Path) -> bytes:
     data = path.read_bytes()
     if data.startswith(ZIP_MAGIC):
         with checks.reading(path), zipfile.ZipFile(path) as archive:
-            data = archive.read(_document_name(path, archive))
+            found = [e for e in archive.infolist() if e.filename.lower().endswith(".xml")]
+            if not found:
+                raise damaged(path, "the archive has no XML document")
+            entry = found[0]
+            if entry.file_size > LARGEST_RATIO * (entry.compress_size + 1):
+                raise damaged(path, "the archive unpacks to far too much")
+            data = archive.read(entry)
     return COMMENT.sub(b"", data)
 
 
-def _document_name(path: Path, archive: zipfile.ZipFile) -> str:
-    for entry in archive.infolist():
-        if entry.filename.lower().endswith(".xml"):
-            if entry.file_size > LARGEST_RATIO * (entry.compress_size + 1):
-                raise damaged(path, "the archive unpacks to far too much")
-            return entry.filename
-    raise damaged(path, "the archive has no XML document")
-
-
 class Photo(NamedTuple):
-    """A photo with at least a position; `key` is its block and id."""
+    """A photo with at least a position; `key` is its block and id, `prior` its GNSS position."""
 
     key: tuple[int, str]
     label: str
+    group: Photogroup
     centre: FloatArray
     rotation: FloatArray | None
-    lens: Lens | None
     srs: str
-    component: str
     prior: tuple[str, FloatArray] | None
 
 
-class Rows(NamedTuple):
-    """For the tie points: row and group of each photo by block and id, and ids of the SRS."""
+class Block(NamedTuple):
+    """All photos of a document that belong together.
 
-    of: dict[tuple[int, str], int]
-    groups: dict[tuple[int, str], Photogroup]
-    srs: str
-    srs_of_blocks: list[str]
+    `tie_points` are the texts of the tie points, with the number and the SRS id of their block:
+    a tree of elements for millions of measurements would take minutes.
+    """
+
+    cameras: Cameras
+    photos: list[Photo]
+    tie_points: list[tuple[int, str, bytes]]
 
 
-def _read_photos(path: Path, root: Element) -> tuple[Cameras, Rows]:
+def _read_block(path: Path) -> Block:
     """Read all photos of a document."""
-    blocks = list(root.iter("Block"))
-    everything: list[Photo] = []
+    data = _read_bytes(path)
+    root = read_xml(path, io.BytesIO(TIE_POINTS.sub(b"", data)))
+    posed: list[Photo] = []
+    outside: list[Photo] = []
     unposed: list[str] = []
     ignored: list[str] = []
-    groups: dict[tuple[int, str], Photogroup] = {}
-    for number_of_block, block in enumerate(blocks):
+    blocks = list(root.iter("Block"))
+    for i, block in enumerate(blocks):
         for element in block.iter("Photogroup"):
             group = Photogroup(path, element)
-            srs = _text(element, "SRSId") or _text(block, "SRSId")
-            posed = group.is_used("ManualPose")
-            ignored += [] if posed else [group.name]
-            lens, axes = group.lens(), group.axes()
+            is_used = group.is_used("ManualPose")
+            ignored += [] if is_used else [group.name]
             for photo in element.iterfind("Photo"):
-                if not posed or photo.find("Pose/Center") is None:
+                if not is_used or photo.find("Pose/Center") is None:
                     unposed.append(_label(photo))
                     continue
-                everything.append(_photo(path, number_of_block, photo, lens, axes, srs))
-                groups[everything[-1].key] = group
+                is_main = text_of(photo, "Component") in ("", MAIN_COMPONENT)
+                srs = text_of(element, "SRSId") or text_of(block, "SRSId")
+                (posed if is_main else outside).append(_photo(path, i, photo, group, srs))
         unposed += [_label(element) for element in block.iterfind("BulkPhotos/Photo")]
-    photos, notes = _of_one_frame(path, everything, ignored)
-    keys, srs = {photo.key for photo in photos}, photos[0].srs
-    rotations = [photo.rotation for photo in photos if photo.rotation is not None]
-    lenses = [photo.lens for photo in photos if photo.lens is not None]
+    everything = posed + outside
+    in_block = posed or outside
+    turned = [photo for photo in in_block if photo.rotation is not None]
+    photos = turned or in_block
+    if not photos:
+        why = " of the block (ManualPose is false)" if ignored else ""
+        raise checks.no_pose(path, f"no photo has a pose{why}")
+    block_of: dict[str, int] = {}
+    twice = [p.label for p in photos if block_of.setdefault(p.label, p.key[0]) != p.key[0]]
+    if twice or len({photo.srs for photo in photos}) > 1:
+        why = f"image {twice[0]} is in several blocks" if twice else "it has several SRS"
+        sentence = f"{why}. Export the one block that the cloud was made from, in one SRS."
+        raise bad_file(path, "cameras.several_blocks", sentence)
+    lenses = [photo.group.lens for photo in photos if photo.group.lens is not None]
+    chosen = {photo.key for photo in photos}
     cameras = Cameras(
         labels=tuple(photo.label for photo in photos),
         centres=np.array([photo.centre for photo in photos]),
-        rotations=np.array(rotations) if rotations else None,
-        lenses=tuple(lenses) if rotations and len(lenses) == len(photos) else None,
-        crs=_crs_of(path, root, srs),
-        notes=notes,
+        rotations=np.array([photo.rotation for photo in photos]) if turned else None,
+        lenses=tuple(lenses) if turned and len(lenses) == len(photos) else None,
+        crs=_crs_of(path, root, photos[0].srs),
+        notes=_notes(path, photos, ignored),
         gnss=_gnss(path, root, photos),
-        unposed=(*unposed, *(photo.label for photo in everything if photo.key not in keys)),
+        unposed=(*unposed, *(photo.label for photo in everything if photo.key not in chosen)),
         source="BlocksExchange",
     )
-    row_of = {photo.key: row for row, photo in enumerate(photos)}
-    return cameras, Rows(row_of, groups, srs, [_text(block, "SRSId") for block in blocks])
+    texts = []
+    for match in TIE_POINTS.finditer(data):
+        i = data.count(b"<Block>", 0, match.start()) - 1
+        texts.append((i, text_of(blocks[i], "SRSId"), match[1]))
+    return Block(cameras, photos, texts)
 
 
-def _photo(
-    path: Path, block: int, element: Element, lens: Lens | None, axes: FloatArray, srs: str
-) -> Photo:
-    """Return a photo that has a position."""
+def _photo(path: Path, block: int, element: Element, group: Photogroup, srs: str) -> Photo:
+    """Return a photo that has a position; `prior` is None or its SRS id ("exif") and place."""
     label = _label(element)
-    return Photo(
-        key=(block, _text(element, "Id")),
-        label=label,
-        centre=_numbers(path, f"image {label}", element, [f"Pose/Center/{a}" for a in "xyz"]),
-        rotation=_rotation(path, label, element.find("Pose/Rotation"), axes),
-        lens=lens,
-        srs=srs,
-        component=_text(element, "Component") or MAIN_COMPONENT,
-        prior=_prior(path, label, element, srs),
-    )
+    metadata, gps = element.find("Pose/Metadata"), element.find("ExifData/GPS")
+    prior, degrees = None, ["Longitude", "Latitude", "Altitude"]
+    if metadata is not None and metadata.find("Center") is not None:
+        place = _numbers(path, f"image {label}, Metadata", metadata, [f"Center/{a}" for a in "xyz"])
+        prior = text_of(metadata, "SRSId") or srs, place
+    elif gps is not None and all(gps.findtext(name) for name in degrees):
+        prior = "exif", _numbers(path, f"image {label}, GPS", gps, degrees)
+    centre = _numbers(path, f"image {label}", element, [f"Pose/Center/{a}" for a in "xyz"])
+    rotation = _rotation(path, label, element.find("Pose/Rotation"), group.axes)
+    return Photo((block, text_of(element, "Id")), label, group, centre, rotation, srs, prior)
 
 
-def _of_one_frame(
-    path: Path, photos: list[Photo], ignored: list[str]
-) -> tuple[list[Photo], tuple[PcfixWarning, ...]]:
-    """Return the photos that belong together, and notes on them."""
-    in_block = [photo for photo in photos if photo.component == MAIN_COMPONENT] or photos
-    turned = [photo for photo in in_block if photo.rotation is not None]
-    kept = turned or in_block
-    if not kept:
-        why = " of the block (ManualPose is false)" if ignored else ""
-        raise checks.no_pose(path, f"no photo has a pose{why}")
+def _notes(path: Path, photos: list[Photo], ignored: list[str]) -> tuple[PcfixWarning, ...]:
     notes = []
     if ignored:
         sentence = (
-            f"{path}: the poses of photogroup {', '.join(ignored[:10])} are not those of the block"
+            f"the poses of photogroup {', '.join(ignored[:10])} are not those of the block"
             " (ManualPose is false). Its photos are left out."
         )
-        notes.append(PcfixWarning("cameras.poses_ignored", sentence, photogroups=ignored))
-    boundless = next((photo.label for photo in kept if photo.lens is None), None)
-    if not turned:
-        sentence = f"{path}: no photo has a rotation, only positions are read."
-        notes.append(PcfixWarning("cameras.no_rotations", sentence))
-    elif boundless is not None:
-        why = f"the photogroup of {boundless} has no frame or focal length"
+        notes.append(note(path, "cameras.poses_ignored", sentence, photogroups=ignored))
+    if photos[0].rotation is None:
+        sentence = "no photo has a rotation, only positions are read."
+        notes.append(note(path, "cameras.no_rotations", sentence))
+    elif any(photo.group.lens is None for photo in photos):
+        label = next(photo.label for photo in photos if photo.group.lens is None)
+        why = f"the photogroup of {label} has no frame or focal length"
         notes.append(checks.without_lens(path, why))
-    systems = {photo.srs for photo in kept}
-    block_of: dict[str, int] = {}
-    twice = [p.label for p in kept if block_of.setdefault(p.label, p.key[0]) != p.key[0]]
-    if twice or len(systems) > 1:
-        why = f"image {twice[0]} is in several blocks" if twice else "it has several SRS"
-        sentence = f"{why}. Export the one block that the cloud was made from, in one SRS."
-        raise wrong(path, "cameras.several_blocks", sentence)
-    return kept, tuple(notes)
+    return tuple(notes)
 
 
 def _rotation(
@@ -244,29 +220,14 @@ def _rotation(
     return None
 
 
-def _prior(path: Path, label: str, element: Element, srs: str) -> tuple[str, FloatArray] | None:
-    """Return the SRS id ("exif" for that of EXIF) and position before the adjustment."""
-    metadata, gps = element.find("Pose/Metadata"), element.find("ExifData/GPS")
-    if metadata is not None and metadata.find("Center") is not None:
-        names = [f"Center/{axis}" for axis in "xyz"]
-        where = f"image {label}, Metadata"
-        return _text(metadata, "SRSId") or srs, _numbers(path, where, metadata, names)
-    names = ["Longitude", "Latitude", "Altitude"]
-    if gps is not None and all(gps.findtext(name) for name in names):
-        return "exif", _numbers(path, f"image {label}, GPS", gps, names)
-    return None
-
-
 def _gnss(path: Path, root: Element, photos: list[Photo]) -> GnssPositions | None:
     """Return one row per photo; positions in the CRS that the first of them has."""
     srs = next((photo.prior[0] for photo in photos if photo.prior is not None), None)
     if srs is None:
         return None
-    xyz = np.full((len(photos), 3), np.nan)
-    for row, photo in enumerate(photos):
-        if photo.prior is not None and photo.prior[0] == srs:
-            xyz[row] = photo.prior[1]
-    crs = EXIF_CRS if srs == "exif" else _crs_of(path, root, srs)
+    nothing = np.full(3, np.nan)
+    xyz = np.array([p.prior[1] if p.prior and p.prior[0] == srs else nothing for p in photos])
+    crs = "EPSG:4326" if srs == "exif" else _crs_of(path, root, srs)
     return GnssPositions(xyz, np.full_like(xyz, np.nan), crs)
 
 
@@ -274,14 +235,14 @@ def _crs_of(path: Path, root: Element, srs_id: str) -> str:
     """Return the CRS of an id as `Cameras` has it; without an id the frame is local."""
     if not srs_id:
         return "local"
-    definitions = {_text(srs, "Id"): _text(srs, "Definition") for srs in root.iter("SRS")}
+    definitions = {text_of(srs, "Id"): srs.findtext("Definition") or "" for srs in root.iter("SRS")}
     if srs_id not in definitions:
         raise damaged(path, f"there is no spatial reference system with the id {srs_id}")
-    definition = definitions[srs_id]
+    definition = definitions[srs_id].strip()
     if not definition.upper().startswith("ENU:"):
         return checks.crs(path, definition)
     words = [*definition[4:].split(","), "0"][:3]
-    latitude, longitude, _ = (float(word) for word in words)
+    latitude, longitude, _ = map(float, words)
     if not (abs(latitude) <= 90.0 and abs(longitude) <= 360.0):
         raise damaged(path, f"'{definition[:80]}' is not ENU:latitude,longitude in degrees")
     return "ENU:" + ",".join(word.strip() for word in words)
@@ -293,151 +254,142 @@ def _numbers(path: Path, where: str, element: Element, names: Sequence[str]) -> 
 
 def _label(element: Element) -> str:
     """Return the name of the image file, or the id of a photo without one."""
-    name = PureWindowsPath(_text(element, "ImagePath")).name
-    return name or f"photo {_text(element, 'Id')}"
-
-
-def _text(element: Element, name: str) -> str:
-    """Return the text of an element inside another, empty where there is none."""
-    return (element.findtext(name) or "").strip()
+    name = PureWindowsPath(text_of(element, "ImagePath")).name
+    return name or f"photo {text_of(element, 'Id')}"
 
 
 class Photogroup:
-    """What the photos of a group share; its numbers are read with messages that name the group."""
+    """What the photos of a group share: camera axes, frame, pixel size and lens, None if unknown.
+
+    `axes` is the matrix from camera axes to x right, y down, z forward.
+    """
 
     def __init__(self, path: Path, element: Element) -> None:
-        self.path = path
-        self.element = element
+        self.path, self.element = path, element
         self.name = (element.findtext("Name") or "without a name").strip()
+        orientation = text_of(element, "CameraOrientation") or "XRightYDown"
+        words = re.fullmatch("X(Right|Left|Up|Down)Y(Right|Left|Up|Down)", orientation)
+        x, y = (DIRECTIONS[word] for word in words.groups()) if words else ((0, 0, 0), (0, 0, 0))
+        self.axes = np.column_stack([x, y, np.cross(x, y)]).astype(np.float64)
+        if not self.axes[:, 2].any():
+            raise self._unsupported(f"camera orientation {orientation}")
+        self.width, self.height = self.numbers("ImageDimensions", ("Width", "Height"))
+        pixel, sensor = self.number("PixelSize"), self.number("SensorSize")
+        if pixel is None and sensor is not None and self.width > 0.0:
+            pixel = sensor / max(self.width, self.height)
+        self.pixel_size_mm = pixel if pixel is not None and pixel > 0.0 else None
+        self.lens = self._lens() if self.is_used("ManualOpticalParams") else None
 
     def number(self, name: str) -> float | None:
         """Return the number of an element, or None where the group has no such element."""
-        text = self.element.findtext(name)
-        where = f"photogroup {self.name}, {name}"
-        return number(self.path, where, text) if text and text.strip() else None
+        text = text_of(self.element, name)
+        return number(self.path, f"photogroup {self.name}, {name}", text) if text else None
 
-    def numbers(self, parent: str, names: tuple[str, ...]) -> list[float]:
+    def numbers(self, parent: str, names: Sequence[str]) -> list[float]:
         """Return numbers below an element, 0 for those that are not there."""
         return [self.number(f"{parent}/{name}") or 0.0 for name in names]
 
     def is_used(self, name: str) -> bool:
         """Whether software uses what the group has: `ManualPose`, `ManualOpticalParams`."""
-        return _text(self.element, name).lower() != "false"
+        return text_of(self.element, name).lower() != "false"
 
-    def axes(self) -> FloatArray:
-        """Return the matrix from camera axes to x right, y down, z forward."""
-        name = _text(self.element, "CameraOrientation") or "XRightYDown"
-        if name not in ORIENTATIONS:
-            raise self._unsupported(f"camera orientation {name}")
-        x, y = ORIENTATIONS[name]
-        return np.column_stack([x, y, np.cross(x, y)])
+    def principal_point(self) -> FloatArray:
+        """Return the principal point in pixels from the corner; the centre where none is given."""
+        x, y = self.number("PrincipalPoint/x"), self.number("PrincipalPoint/y")
+        if x is not None and y is not None:
+            return np.array([x, y]) + FIRST_PIXEL
+        middle = np.array([self.width, self.height]) / 2.0
+        if self.pixel_size_mm is None:
+            return middle
+        mm = self.numbers("PrincipalPoint", ("xmm", "ymm"))
+        return middle + self.axes[:2, :2] @ mm / self.pixel_size_mm
 
-    def pixel_size_mm(self) -> float | None:
-        """Return the size of a pixel, None where the group has none."""
-        pixel, sensor = self.number("PixelSize"), self.number("SensorSize")
-        if pixel is not None:
-            return pixel if pixel > 0.0 else None
-        largest = max(self.size())
-        return sensor / largest if sensor is not None and sensor > 0.0 < largest else None
-
-    def size(self) -> list[float]:
-        """Return width and height in pixels, 0 where they are not there."""
-        return self.numbers("ImageDimensions", ("Width", "Height"))
-
-    def lens(self) -> Lens | None:
-        """Return the lens, or None where the group lacks frame or focal length, or is not used."""
-        if not self.is_used("ManualOpticalParams"):
-            return None
-        kind = _text(self.element, "CameraModelType") or "Perspective"
-        if kind not in ("Perspective", "Fisheye"):
-            raise self._unsupported(f"camera model {kind}")
-        for tag in (str(child.tag) for child in self.element):
-            if "Distortion" in tag and tag not in ("Distortion", "FisheyeDistortion"):
-                raise self._unsupported(f"distortion {tag}")
-        matrix, (width, height) = self._matrix(kind), self.size()
-        if matrix is None or not min(width, height) > 0.0:
-            return None
-        m00, m01, m10, m11 = matrix
-        u, v = self.principal_point()
-        lens = Lens(
-            *(m11, width, height, u, v, m00 - m11, m01, m10),
-            pixel_size_mm=self.pixel_size_mm(),
-            sensor=self.name,
-        )
-        if kind == "Perspective":
-            radial, tangential = (self.numbers("Distortion", names) for names in BROWN)
-            lens = replace(lens, radial=tuple(radial), tangential=tuple(tangential))
-        else:
-            shape = [0.0, 1.0, 0.0, 0.0, 0.0]
-            if self.element.find("FisheyeDistortion") is not None:
-                shape = self.numbers("FisheyeDistortion", ("P0", "P1", "P2", "P3", "P4"))
-            lens = replace(lens, projection="polynomial", shape=tuple(shape))
-        return lens
+    def place(self, mark: Element) -> FloatArray:
+        """Return u, v in pixels from the corner, of a measurement in pixels or in mm."""
+        if mark.find("x") is not None and mark.find("y") is not None:
+            return np.array([float(text_of(mark, axis)) for axis in "xy"]) + FIRST_PIXEL
+        if self.pixel_size_mm is None:
+            raise ValueError("a measurement is in mm, but its photogroup has no pixel size")
+        mm = np.array([float(text_of(mark, name)) for name in ("xmm", "ymm")])
+        return self.principal_point() + self.axes[:2, :2] @ mm / self.pixel_size_mm
 
     def _unsupported(self, what: str) -> InputError:
         what, remedy = f"the {what} of photogroup {self.name}", "Export undistorted photos"
         return checks.unsupported(self.path, what, remedy, photogroup=self.name)
 
-    def principal_point(self) -> tuple[float, float]:
-        """Return the principal point in pixels from the corner; the centre where none is given."""
-        x, y = self.number("PrincipalPoint/x"), self.number("PrincipalPoint/y")
-        if x is not None and y is not None:
-            return x + FIRST_PIXEL, y + FIRST_PIXEL
-        u, v = np.array(self.size()) / 2.0
-        if (pixel := self.pixel_size_mm()) is not None:
-            mm = np.array(self.numbers("PrincipalPoint", ("xmm", "ymm")))
-            u, v = (u, v) + self.axes()[:2, :2] @ mm / pixel
-        return float(u), float(v)
-
-    def _matrix(self, kind: str) -> list[float] | None:
-        """Return the focal lengths and skews, a matrix by rows, or None where there are none."""
-        if kind == "Fisheye" and self.element.find("FisheyeFocalMatrix") is not None:
-            return self.numbers("FisheyeFocalMatrix", ("M_00", "M_01", "M_10", "M_11"))
+    def _lens(self) -> Lens | None:
+        """Return the lens, or None where the group lacks frame or focal length."""
+        kind = text_of(self.element, "CameraModelType") or "Perspective"
+        if kind not in ("Perspective", "Fisheye"):
+            raise self._unsupported(f"camera model {kind}")
+        for tag in (str(child.tag) for child in self.element):
+            if "Distortion" in tag and tag not in ("Distortion", "FisheyeDistortion"):
+                raise self._unsupported(f"distortion {tag}")
         focal, focal_mm = self.number("FocalLengthPixels"), self.number("FocalLength")
-        if focal is None and focal_mm is not None and (pixel := self.pixel_size_mm()) is not None:
-            focal = focal_mm / pixel
-        if focal is None:
+        if focal is None and focal_mm is not None and self.pixel_size_mm is not None:
+            focal = focal_mm / self.pixel_size_mm
+        matrix = None  # focal lengths and skews, by rows
+        if kind == "Fisheye" and self.element.find("FisheyeFocalMatrix") is not None:
+            matrix = self.numbers("FisheyeFocalMatrix", ("M_00", "M_01", "M_10", "M_11"))
+        elif focal is not None and kind == "Fisheye":
+            matrix = [math.pi / 2.0 * focal, 0.0, 0.0, math.pi / 2.0 * focal]
+        elif focal is not None:
+            aspect = self.number("AspectRatio")
+            down = focal if aspect is None else focal * aspect
+            matrix = [focal, self.number("Skew") or 0.0, 0.0, down]
+        if matrix is None or not min(self.width, self.height) > 0.0:
             return None
-        if kind == "Fisheye":
-            return [math.pi / 2.0 * focal, 0.0, 0.0, math.pi / 2.0 * focal]
-        aspect = self.number("AspectRatio")
-        return [focal, self.number("Skew") or 0.0, 0.0, focal if aspect is None else focal * aspect]
-
-
-EXTERNAL = re.compile(rb"<Path>\s*([^<]*?)\s*</Path>")
-DECLARATION = re.compile(rb"<\?xml.*?\?>")
-SRS_OF_ALL = re.compile(rb"<SRSId>\s*([^<]*?)\s*</SRSId>")
+        m00, m01, m10, m11 = matrix
+        x, y = self.principal_point().tolist()
+        lens = Lens(
+            *(m11, self.width, self.height, x, y, m00 - m11, m01, m10),
+            pixel_size_mm=self.pixel_size_mm,
+            sensor=self.name,
+        )
+        if kind == "Perspective":
+            radial = self.numbers("Distortion", ("K1", "K2", "K3"))
+            tangential = self.numbers("Distortion", ("P1", "P2"))
+            return replace(lens, radial=tuple(radial), tangential=tuple(tangential))
+        shape = [0.0, 1.0, 0.0, 0.0, 0.0]
+        if self.element.find("FisheyeDistortion") is not None:
+            shape = self.numbers("FisheyeDistortion", ("P0", "P1", "P2", "P3", "P4"))
+        return replace(lens, projection="polynomial", shape=tuple(shape))
 
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """Read the tie points that a posed photo saw; those of another CRS lose their coordinates."""
     path = source.path
-    root, texts = _read_document(path)
-    rows = _read_photos(path, root)[1]
+    block = _read_block(path)
+    row_of = {photo.key: row for row, photo in enumerate(block.photos)}
     xyz: list[list[float]] = []
     point, camera, uv = [], [], []
-    for block, text in texts:
+    for i, srs_of_block, text in block.tie_points:
         where, inside = _inside(path, text)
         head = SRS_OF_ALL.search(inside[: inside.find(b"<TiePoint>")])
-        srs_of_all = rows.srs_of_blocks[block] if head is None else head[1].decode()
+        srs_of_all = srs_of_block if head is None else head[1].decode()
         with checks.reading(where):
             for element in _elements(inside):
-                keys = [(block, _text(m, "PhotoId")) for m in element.iterfind("Measurement")]
-                pairs = zip(keys, element.iterfind("Measurement"), strict=True)
-                seen = [(key, mark) for key, mark in pairs if key in rows.of]
-                for key, mark in seen:
+                seen = [
+                    (row_of[key], mark)
+                    for mark in element.iterfind("Measurement")
+                    if (key := (i, text_of(mark, "PhotoId"))) in row_of
+                ]
+                if not seen:
+                    continue
+                for row, mark in seen:
                     point.append(len(xyz))
-                    camera.append(rows.of[key])
-                    uv.append(_place(mark, rows.groups[key]))
+                    camera.append(row)
+                    uv.append(block.photos[row].group.place(mark))
                 place = element.find("Position")
-                is_here = (_text(element, "SRSId") or srs_of_all) == rows.srs
-                if seen and place is not None and is_here:
-                    xyz.append([float(_text(place, axis)) for axis in "xyz"])
-                elif seen:
+                is_here = (text_of(element, "SRSId") or srs_of_all) == block.photos[0].srs
+                if place is not None and is_here:
+                    xyz.append([float(text_of(place, axis)) for axis in "xyz"])
+                else:
                     xyz.append([math.nan] * 3)
     if not xyz:
         raise tracks.no_tie_points(path, f"none was seen by one of its {len(cameras)} photos")
-    return tracks.tie_points(np.array(xyz), np.array(point), np.array(camera), np.array(uv))
+    seen_all = tracks.Seen(np.array(xyz), np.array(point), np.array(camera), np.array(uv))
+    return tracks.tie_points(seen_all)
 
 
 def _inside(path: Path, text: bytes) -> tuple[Path, bytes]:
@@ -460,15 +412,3 @@ def _elements(text: bytes) -> Iterator[Element]:
         if element.tag == "TiePoint":
             yield element
             element.clear()
-
-
-def _place(mark: Element, group: Photogroup) -> tuple[float, float]:
-    """Return u, v in pixels from the corner, of a place in pixels or in mm."""
-    if mark.find("x") is not None and mark.find("y") is not None:
-        return float(_text(mark, "x")) + FIRST_PIXEL, float(_text(mark, "y")) + FIRST_PIXEL
-    pixel = group.pixel_size_mm()
-    if pixel is None:
-        raise ValueError("a measurement is in mm, but its photogroup has no pixel size")
-    mm = np.array([float(_text(mark, name)) for name in ("xmm", "ymm")])
-    u, v = group.principal_point() + group.axes()[:2, :2] @ mm / pixel
-    return float(u), float(v)

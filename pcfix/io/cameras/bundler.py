@@ -24,30 +24,24 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.errors import PcfixWarning
 from pcfix.io.cameras import checks, tracks
 from pcfix.io.cameras.formats import Source
+from pcfix.lens.rotations import from_photogrammetric
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
 
 _BUNDLER, _MVE = re.compile(r"#\s*Bundle file v(\d+\.\d+)"), re.compile(r"drews 1\.0")
 _VERSION = "0.3"
 _CAMERA_NUMBERS = 15
-_UP_BACK_TO_DOWN_FORWARD = np.diag([1.0, -1.0, -1.0])
 _FOCAL_OF_LIST = re.compile(r"\s+0\s+[\d.]+$")
 
 
 class Bundle(NamedTuple):
-    """The file: a row of f k1 k2 R t for each camera, and the points."""
+    """The file: a row of f k1 k2 R t for each camera, rows of those with a pose, the points."""
 
-    path: Path
     mve: bool
     cameras: FloatArray
+    posed: IntArray
     points: tracks.PointList
-
-    @property
-    def posed(self) -> IntArray:
-        """Row numbers of the cameras with a pose."""
-        return np.flatnonzero(self.cameras[:, 0] != 0.0)
 
 
 def recognises(source: Source) -> bool:
@@ -57,21 +51,27 @@ def recognises(source: Source) -> bool:
 
 def read(source: Source) -> Cameras:
     """Read the poses of images with a focal length, and their lenses where sizes are known."""
-    bundle = _read(source.path)
-    names, notes = _names(bundle)
-    rows = bundle.posed.tolist()
-    if not rows:
-        raise checks.no_pose(bundle.path, "no image has a pose (all focal lengths are 0)")
-    labels, posed = tuple(names[i] for i in rows), bundle.cameras[rows]
-    rotations = checks.rotations(bundle.path, labels, posed[:, 3:12])
-    lenses, more = _lenses(bundle, labels)
+    path, bundle = source.path, _read(source.path)
+    names = _names(path, bundle)
+    labels, rows = tuple(names[i] for i in bundle.posed), bundle.cameras[bundle.posed]
+    rotations = checks.rotations(path, labels, rows[:, 3:12])
+    focal, k1, k2 = rows[:, :3].T
+    bounds = np.zeros((len(names), 2))
+    if not bundle.mve:
+        np.maximum.at(bounds, bundle.points.image, np.abs(bundle.points.rest[:, 1:]))
+    frames, notes = tracks.frame_sizes(path, labels, focal, 2.0 * bounds[bundle.posed])
+    lenses = None
+    if frames is not None:
+        focal = focal * frames.max(axis=1) if bundle.mve else focal
+        numbers = np.column_stack([focal, frames, k1, k2]).tolist()
+        lenses = tuple(Lens(f, w, h, w / 2.0, h / 2.0, radial=tuple(k)) for f, w, h, *k in numbers)
     return Cameras(
         labels=labels,
-        centres=-np.einsum("kji,kj->ki", rotations, posed[:, 12:]),
-        rotations=rotations if bundle.mve else _UP_BACK_TO_DOWN_FORWARD @ rotations,
+        centres=checks.centres(rotations, rows[:, 12:]),
+        rotations=rotations if bundle.mve else from_photogrammetric(rotations),
         lenses=lenses,
-        notes=(*notes, *more),
-        unposed=tuple(name for i, name in enumerate(names) if i not in rows),
+        notes=notes,
+        unposed=tuple(np.delete(names, bundle.posed).tolist()),
         source="MVE" if bundle.mve else f"Bundler v{_VERSION}",
     )
 
@@ -79,63 +79,38 @@ def read(source: Source) -> Cameras:
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """Read the points and where the images saw them."""
     bundle = _read(source.path)
-    points = bundle.points
     if bundle.mve:
-        raise tracks.no_tie_points(bundle.path, "MVE writes no image coordinates")
-    if not len(points.xyz) or cameras.lenses is None:
-        raise tracks.no_tie_points(bundle.path, "it lists no points")
-    places = points.rest[:, 1:] * (1.0, -1.0)
-    return tracks.from_principal_point(points, bundle.posed, cameras, places)
+        raise tracks.no_tie_points(source.path, "MVE writes no image coordinates")
+    if not len(bundle.points.xyz) or cameras.lenses is None:
+        raise tracks.no_tie_points(source.path, "it lists no points")
+    return bundle.points.seen(bundle.posed, cameras, bundle.points.rest[:, 1:] * (1.0, -1.0))
 
 
 def _read(path: Path) -> Bundle:
-    head, _, body = path.read_bytes().decode("utf-8-sig", "replace").partition("\n")
+    head, _, body = checks.read_text(path).partition("\n")
     version = _BUNDLER.match(head)
     if version and version[1] != _VERSION:
         what = f"Bundler's format v{version[1]}"
         raise checks.unsupported(path, what, f"Export v{_VERSION}", version=version[1])
     values = tracks.numbers(body)
-    cameras, points = int(values[0]), int(values[1])
-    end = 2 + _CAMERA_NUMBERS * cameras
-    listed = tracks.point_list(path, values[end:], points, cameras, 4 if version else 3)
-    rows = values[2:end].reshape(cameras, _CAMERA_NUMBERS)
-    return Bundle(path, version is None, rows, listed)
+    count, points = int(values[0]), int(values[1])
+    end = 2 + _CAMERA_NUMBERS * count
+    listed = tracks.point_list(path, values[end:], points, count, 4 if version else 3)
+    cameras = values[2:end].reshape(count, _CAMERA_NUMBERS)
+    posed = np.flatnonzero(cameras[:, 0] != 0.0)
+    if not len(posed):
+        raise checks.no_pose(path, "no image has a pose (all focal lengths are 0)")
+    return Bundle(version is None, cameras, posed, listed)
 
 
-def _lenses(
-    bundle: Bundle, labels: tuple[str, ...]
-) -> tuple[tuple[Lens, ...] | None, tuple[PcfixWarning, ...]]:
-    focal, k1, k2 = bundle.cameras[bundle.posed, :3].T
-    bounds = np.zeros((len(bundle.cameras), 2))
-    if not bundle.mve:
-        np.maximum.at(bounds, bundle.points.image, np.abs(bundle.points.rest[:, 1:]))
-    frames, notes = tracks.frame_sizes(bundle.path, labels, focal, 2.0 * bounds[bundle.posed])
-    if frames is None:
-        return None, notes
-    if bundle.mve:
-        focal = focal * frames.max(axis=1)
-    rows = np.column_stack([focal, frames, k1, k2]).tolist()
-    return tuple(Lens(f, w, h, w / 2.0, h / 2.0, radial=tuple(k)) for f, w, h, *k in rows), notes
-
-
-def _names(bundle: Bundle) -> tuple[list[str], tuple[PcfixWarning, ...]]:
+def _names(path: Path, bundle: Bundle) -> list[str]:
     """Return the names of all images, from the list beside the file if it fits."""
-    path, count = bundle.path, len(bundle.cameras)
     stem = path.name.removesuffix(".out")
     own = (f"{stem}.list.txt", f"{path.name}.list.txt", f"{stem.removesuffix('.bundle')}.list.txt")
     places = [path.with_name(name) for name in (*own, "list.txt")]
-    found = next((p for p in (*places, path.parent.parent / "list.txt") if p.is_file()), None)
-    numbered = [f"{'view' if bundle.mve else 'camera'} {i}" for i in range(count)]
-    if found is None:
-        return numbered, ()
-    lines = found.read_bytes().decode("utf-8-sig", "replace").splitlines()
-    names = [_FOCAL_OF_LIST.sub("", line.strip()) for line in lines if line.strip()]
-    if len(names) == count:
-        return names, ()
-    note = PcfixWarning(
-        "cameras.list_unused",
-        f"{found}: lists {len(names)} images, but {path.name} has {count} cameras. The images are"
-        " numbered instead.",
-        path=found,
-    )
-    return numbered, (note,)
+    for place in (*places, path.parent.parent / "list.txt"):
+        if place.is_file():
+            lines = [line.strip() for line in checks.read_text(place).splitlines() if line.strip()]
+            if len(lines) == len(bundle.cameras):
+                return [_FOCAL_OF_LIST.sub("", line) for line in lines]
+    return [f"{'view' if bundle.mve else 'camera'} {i}" for i in range(len(bundle.cameras))]

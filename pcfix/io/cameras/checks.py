@@ -1,4 +1,4 @@
-"""Rules for what stands in camera files: numbers, XML and JSON, rotations, lenses and CRS."""
+"""Shared by the readers: errors and notes, numbers, XML and JSON, rotations, lenses, CRS."""
 
 from __future__ import annotations
 
@@ -10,23 +10,26 @@ import struct
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import astuple, replace
 from pathlib import Path
 from typing import IO, Any
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from pcfix.errors import InputError, PcfixError, PcfixWarning
+from pcfix.errors import InputError, PcfixError, PcfixWarning, bad_file
 from pcfix.io.cameras.formats import Source
 from pcfix.io.files import check_output, parse_json, write_bytes
+from pcfix.io.tables import read_lines
 from pcfix.model import Cameras, FloatArray, Lens
 
 ROUNDING = 1e-3
 """Of a rotation's elements: files with four decimals pass, a mirrored or scaled one does not."""
-
+SAME_LENS = 1e-12
+"""Relative difference between the numbers of equal lenses."""
+NO_LENS = "cameras.no_lens"
 DAMAGES = (
     *(ArithmeticError, AttributeError, EOFError, LookupError, MemoryError, OSError, RuntimeError),
     *(SyntaxError, TypeError, ValueError, lzma.LZMAError, sqlite3.Error, struct.error),
@@ -35,59 +38,63 @@ DAMAGES = (
 """What readers run into where a file is cut off, or holds something else than it should."""
 
 
-def wrong(path: object, code: str, sentence: str, /, **values: Any) -> InputError:
-    """Return the error for a file: its path, what is wrong, and what to do."""
-    return InputError(code, f"{path}: {sentence}", **{"path": path, **values})
-
-
-def damaged(path: object, why: object, **values: Any) -> InputError:
+def damaged(path: object, why: object) -> InputError:
     """Return the error for contents that no software writes."""
-    sentence = f"{path}: is damaged or cut off ({why}). Export it again."
-    return InputError("cameras.damaged", sentence, path=path, **values)
+    return bad_file(path, "cameras.damaged", f"is damaged or cut off ({why}). Export it again.")
 
 
 def no_pose(path: Path, why: str = "no image has a pose") -> InputError:
     """Return the error for a file without poses."""
-    sentence = f"{path}: {why}. Align the images first, then export their poses."
-    return InputError("cameras.no_pose", sentence, path=path)
+    sentence = f"{why}. Align the images first, then export their poses."
+    return bad_file(path, "cameras.no_pose", sentence)
 
 
 def unsupported(path: Path, what: str, remedy: str, **values: Any) -> InputError:
     """Return the error for a lens, rotation or frame that pcfix has no model for."""
-    sentence = f"{path}: {what} is not supported. {remedy}."
-    return InputError("cameras.unsupported", sentence, path=path, **values)
+    sentence = f"{what} is not supported. {remedy}."
+    return bad_file(path, "cameras.unsupported", sentence, **values)
 
 
 def missing(path: Path, remedy: str = "Keep all files of the project together") -> InputError:
     """Return the error for a file of a project that is not there."""
-    return wrong(path, "cameras.missing_file", f"is missing. {remedy}.")
-
-
-def several(path: Path, count: int, images: int) -> PcfixWarning:
-    """Return a note on models that are not connected, of which the largest is read."""
-    return PcfixWarning(
-        "cameras.several_models",
-        f"{path}: has {count} models that are not connected. The largest is read, with {images}"
-        " images; those of the others are left out.",
-        models=count,
-        images=images,
-    )
+    return bad_file(path, "cameras.missing_file", f"is missing. {remedy}.")
 
 
 def sensor_unused(source: Source, why: str) -> InputError:
     """Return the error for a sensor that the cameras have no use for."""
-    sentence = f"{source.path}: has {why}, so --sensor {source.sensor} has no use. Leave it out."
-    return InputError("cameras.sensor_unused", sentence, path=source.path, sensor=source.sensor)
+    sentence = f"has {why}, so --sensor {source.sensor} has no use. Leave it out."
+    return bad_file(source.path, "cameras.sensor_unused", sentence, sensor=source.sensor)
 
 
-NO_LENS = "cameras.no_lens"
+def note(path: object, code: str, sentence: str, **values: Any) -> PcfixWarning:
+    """Return a note on what was done on reading a file."""
+    return PcfixWarning(code, f"{path}: {sentence}", path=path, **values)
+
+
+def several(path: Path, count: int, images: int) -> PcfixWarning:
+    """Return a note on models that are not connected, of which the largest is read."""
+    sentence = (
+        f"has {count} models that are not connected. The largest is read, with {images} images;"
+        " those of the others are left out."
+    )
+    return note(path, "cameras.several_models", sentence, models=count, images=images)
 
 
 def without_lens(path: Path, why: str) -> PcfixWarning:
     """Return a note on images without a frame."""
-    return PcfixWarning(
-        NO_LENS, f"{path}: {why}, so every point in front of a camera counts as inside its frame."
-    )
+    sentence = f"{why}, so every point in front of a camera counts as inside its frame."
+    return note(path, NO_LENS, sentence)
+
+
+def repeated(path: Path, labels: Sequence[str], dropped: int = 0) -> tuple[PcfixWarning, ...]:
+    """Return a note where labels repeat: they are no key, and their images are kept apart."""
+    names = [label for label, count in Counter(labels).items() if count > 1]
+    if not names:
+        return ()
+    copies = f"; {dropped} exact copies are dropped" if dropped else ""
+    listed = ", ".join(names[:10]) + (", ..." if len(names) > 10 else "")
+    sentence = f"{len(names)} labels repeat ({listed}). Different positions stay{copies}."
+    return (note(path, "cameras.repeated", sentence, labels=names, dropped=dropped),)
 
 
 @contextmanager
@@ -104,6 +111,57 @@ def reading(path: object) -> Iterator[None]:
         raise damaged(path, error or type(error).__name__) from error
 
 
+def read_text(path: Path) -> str:
+    """Return the text of a file; bytes that are not UTF-8 can only be in names."""
+    return "\n".join(read_lines(path))
+
+
+def read_xml(path: Path, stream: IO[bytes] | None = None) -> Element:
+    """Return the root of a document, from `stream` where it lies in an archive."""
+    from defusedxml.ElementTree import parse
+
+    with reading(path):
+        root: Element = parse(stream if stream is not None else path, forbid_dtd=False).getroot()
+    return root
+
+
+def text_of(element: Element, name: str) -> str:
+    """Return the text of an element inside another, empty where there is none."""
+    return (element.findtext(name) or "").strip().strip('"')
+
+
+def load_json(path: Path) -> Any:
+    """Return what a JSON file holds."""
+    with reading(path):
+        return parse_json(path.read_bytes())
+
+
+def number(path: Path, where: str, text: str | None) -> float:
+    """Return the number in a text; `where` is the image and element, for the message."""
+    try:
+        value = float(text or "")
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        shown = (text or "").strip()
+        sentence = f"{where}: '{shown}' is not a number. Export it again."
+        raise bad_file(path, "cameras.number", sentence, where=where, value=shown)
+    return value
+
+
+def numbers(path: Path, where: str, text: str | None, count: int) -> FloatArray:
+    """Return `count` numbers separated by white space or commas."""
+    words = (text or "").replace(",", " ").split()
+    if len(words) != count:
+        raise damaged(path, f"{where}: {len(words)} numbers instead of {count}")
+    return np.array([number(path, where, word) for word in words])
+
+
+def triple(value: Any) -> FloatArray:
+    """Return the three numbers of a list in a JSON file."""
+    return np.array(value, np.float64).reshape(3)
+
+
 def rotations(path: Path, labels: Sequence[str], matrices: FloatArray) -> FloatArray:
     """Return the proper rotations closest to matrices, shape (k, 3, 3), rounded in their file."""
     matrices = np.asarray(matrices, np.float64).reshape(-1, 3, 3)
@@ -115,7 +173,7 @@ def rotations(path: Path, labels: Sequence[str], matrices: FloatArray) -> FloatA
             f"the rotation of {label} is mirrored, or its axes are not at right angles. Export the"
             " poses again."
         )
-        raise wrong(path, "cameras.rotation", sentence, image=label)
+        raise bad_file(path, "cameras.rotation", sentence, image=label)
     for _ in range(2):  # Newton's iteration to the polar factor squares the rounding each time
         matrices = 1.5 * matrices - 0.5 * matrices @ matrices.transpose(0, 2, 1) @ matrices
     return matrices
@@ -129,21 +187,28 @@ def quaternions(path: Path, labels: Sequence[str], wxyz: FloatArray) -> FloatArr
     if bad.any():
         label = labels[int(np.argmax(bad))]
         sentence = f"the quaternion of {label} has not the length 1. Export the poses again."
-        raise wrong(path, "cameras.rotation", sentence, image=label)
+        raise bad_file(path, "cameras.rotation", sentence, image=label)
     return np.asarray(Rotation.from_quat(np.roll(wxyz, -1, axis=1)).as_matrix())
+
+
+def centres(rotations: FloatArray, translations: FloatArray) -> FloatArray:
+    """Return the projection centres -R't of poses x_camera = R x + t."""
+    return -np.einsum("kji,kj->ki", rotations, translations)
 
 
 def lens(path: Path, name: str, given: Lens) -> Lens:
     """Return the lens when its numbers can be those of a camera."""
     lists = (given.shape, given.radial, given.denominator, given.tangential, given.thin_prism)
-    numbers = (*_lengths(given), *itertools.chain(*lists), *given.distortion_centre)
+    frame = (given.focal, given.width, given.height, given.principal_x, given.principal_y)
+    affine = (given.b1, given.b2, given.b3)
+    numbers = (*frame, *affine, *itertools.chain(*lists), *given.distortion_centre)
     positive = min(given.focal, given.focal + given.b1, given.width, given.height) > 0.0
     if not (positive and np.isfinite(numbers).all()):
         sentence = (
             f"the lens {name} has the focal length {given.focal:g} and the frame {given.width:g} x"
             f" {given.height:g}, or a number that is not finite. Export the calibration again."
         )
-        raise wrong(path, "cameras.lens", sentence, lens=name)
+        raise bad_file(path, "cameras.lens", sentence, lens=name)
     return given
 
 
@@ -156,15 +221,15 @@ def checked(path: Path, cameras: Cameras) -> Cameras:
     return cameras
 
 
-def repeated(path: Path, labels: Sequence[str], dropped: int = 0) -> tuple[PcfixWarning, ...]:
-    """Return a note where labels repeat: they are no key, and their images are kept apart."""
-    names = [label for label, count in Counter(labels).items() if count > 1]
-    if not names:
-        return ()
-    copies = f"; {dropped} exact copies are dropped" if dropped else ""
-    listed = ", ".join(names[:10]) + (", ..." if len(names) > 10 else "")
-    sentence = f"{path}: {len(names)} labels repeat ({listed}). Different positions stay{copies}."
-    return (PcfixWarning("cameras.repeated", sentence, labels=names, dropped=dropped),)
+def terms(given: Mapping[str, float], names: str) -> tuple[float, ...]:
+    """Return coefficients by name, 0 for those that are missing, up to the last that is not 0."""
+    return without_zeros([given.get(name, 0.0) for name in names.split()])
+
+
+def without_zeros(values: Sequence[float]) -> tuple[float, ...]:
+    """Return the values up to the last that is not zero."""
+    last = max((i for i, value in enumerate(values) if value != 0.0), default=-1)
+    return tuple(values[: last + 1])
 
 
 def crs(path: Path, definition: str) -> str:
@@ -177,7 +242,7 @@ def crs(path: Path, definition: str) -> str:
             f"PROJ does not know the CRS '{text[:80]}'. Export the poses in a CRS with an EPSG"
             " code."
         )
-        raise wrong(path, "cameras.crs", sentence, crs=text)
+        raise bad_file(path, "cameras.crs", sentence, crs=text)
     return text
 
 
@@ -199,86 +264,58 @@ def utm_as_code(text: str) -> str:
     return f"EPSG:{(32600 if utm[2].upper() == 'N' else 32700) + int(utm[1])}" if utm else text
 
 
-TOLERANCE = 1e-12
-"""Of every number, relative to the focal length where it is a length."""
+# ---- what writers share ----
+
+
+def block_to_write(
+    path: Path, cameras: Cameras, label_fits: Callable[[str], bool]
+) -> tuple[FloatArray, tuple[Lens, ...]]:
+    """Return rotations and lenses of cameras, with labels that a format can hold."""
+    if cameras.rotations is None or cameras.lenses is None:
+        sentence = "the cameras have no rotations or no lenses, so they cannot be written."
+        raise bad_file(path, "output.no_lenses", sentence)
+    label = next((one for one in cameras.labels if not label_fits(one)), None)
+    if label is not None:
+        sentence = f"the format cannot hold the image name {label!r}. Take another format."
+        raise bad_file(path, "output.label", sentence, image=label)
+    return cameras.rotations, cameras.lenses
+
+
+def lens_not_held(path: Path, given: Lens) -> InputError:
+    """Return the error for a lens that a format cannot hold exactly."""
+    sentence = (
+        f"the format cannot hold the lens {given.sensor or 'of the images'}"
+        f" ({given.projection} in {given.unit}) exactly. Take another format."
+    )
+    return bad_file(path, "output.lens", sentence, lens=given.sensor)
 
 
 def is_same_lens(one: Lens, other: Lens) -> bool:
-    """Whether two lenses take every direction to the same place, but for rounding.
+    """Whether two lenses take every direction to the same place, but for rounding."""
 
-    Zeros at the end of a list of coefficients do not count, nor does the name of the lens.
-    """
-    (kind, lists), (other_kind, other_lists) = _coefficients(one), _coefficients(other)
-    off = np.abs(np.subtract(_lengths(one), _lengths(other))).max()
-    if kind != other_kind or off > TOLERANCE * one.focal * 10.0:
-        return False
-    return all(
-        len(a) == len(b) and np.allclose(a, b, rtol=TOLERANCE, atol=0.0)
-        for a, b in zip(lists, other_lists, strict=True)
+    def same(a: Any, b: Any) -> bool:
+        if not isinstance(a, float | tuple):
+            return bool(a == b)
+        slack = 10.0 * SAME_LENS * one.focal if isinstance(a, float) else 0.0  # of a length
+        return np.shape(a) == np.shape(b) and np.allclose(a, b, rtol=SAME_LENS, atol=slack)
+
+    return all(map(same, astuple(_bare(one)), astuple(_bare(other))))
+
+
+def _bare(lens: Lens) -> Lens:
+    """Return a lens without names, zeros at the end of lists, and switches without effect."""
+    names = ("radial", "denominator", "tangential", "thin_prism")
+    lists: dict[str, Any] = {name: without_zeros(getattr(lens, name)) for name in names}
+    turns, bent = bool(lists["tangential"] or lists["thin_prism"]), any(lists.values())
+    return replace(
+        lens,
+        **lists,
+        distortion_centre=lens.distortion_centre if bent else (0.0, 0.0),
+        inverse=lens.inverse and bent,
+        in_turn=lens.in_turn and turns,
+        pixel_size_mm=None,
+        sensor="",
     )
-
-
-def _coefficients(lens: Lens) -> tuple[tuple[object, ...], tuple[tuple[float, ...], ...]]:
-    """Return the kind of a lens, without switches that switch nothing, and its coefficients."""
-    lists = (lens.radial, lens.denominator, lens.tangential, lens.thin_prism)
-    radial, denominator, tangential, prism = map(without_zeros, lists)
-    turns = bool(tangential or prism)
-    bent = bool(radial or denominator or turns)
-    kind = (lens.projection, lens.unit, lens.inverse and bent, lens.in_turn and turns)
-    centre = lens.distortion_centre if bent else (0.0, 0.0)
-    return kind, (lens.shape, centre, radial, denominator, tangential, prism)
-
-
-def _lengths(lens: Lens) -> tuple[float, ...]:
-    frame = (lens.focal, lens.width, lens.height, lens.principal_x, lens.principal_y)
-    return (*frame, lens.b1, lens.b2, lens.b3)
-
-
-def without_zeros(values: Sequence[float]) -> tuple[float, ...]:
-    """Return the values up to the last that is not zero."""
-    last = max((i for i, value in enumerate(values) if value != 0.0), default=-1)
-    return tuple(values[: last + 1])
-
-
-def read_xml(path: Path, stream: IO[bytes] | None = None) -> Element:
-    """Return the root of a document, from `stream` where it lies in an archive."""
-    from defusedxml.ElementTree import parse
-
-    with reading(path):
-        root: Element = parse(stream if stream is not None else path, forbid_dtd=False).getroot()
-    return root
-
-
-def load_json(path: Path) -> Any:
-    """Return what a JSON file holds."""
-    with reading(path):
-        return parse_json(path.read_bytes())
-
-
-def number(path: Path, where: str, text: str | None) -> float:
-    """Return the number in a text; `where` is the image and element, for the message."""
-    try:
-        value = float(text or "")
-    except ValueError:
-        value = np.nan
-    if not np.isfinite(value):
-        shown = (text or "").strip()
-        sentence = f"{where}: '{shown}' is not a number. Export it again."
-        raise wrong(path, "cameras.number", sentence, where=where, value=shown)
-    return value
-
-
-def numbers(path: Path, where: str, text: str | None, count: int) -> FloatArray:
-    """Return `count` numbers separated by white space or commas."""
-    words = (text or "").replace(",", " ").split()
-    if len(words) != count:
-        raise damaged(path, f"{where}: {len(words)} numbers instead of {count}")
-    return np.array([number(path, where, word) for word in words])
-
-
-def triple(value: Any) -> FloatArray:
-    """Return the three numbers of a list in a JSON file."""
-    return np.array(value, np.float64).reshape(3)
 
 
 def write_new(folder: Path, contents: Mapping[str, bytes]) -> None:
@@ -288,24 +325,3 @@ def write_new(folder: Path, contents: Mapping[str, bytes]) -> None:
         check_output(folder / name, overwrite=False)
     for name, data in contents.items():
         write_bytes(folder / name, data, overwrite=False)
-
-
-def needs_lenses(path: Path) -> InputError:
-    """Return the error for cameras that cannot be written without rotations and lenses."""
-    sentence = f"{path}: the cameras have no rotations or no lenses, so they cannot be written."
-    return InputError("output.no_lenses", sentence, path=path)
-
-
-def lens_not_held(path: Path, given: Lens) -> InputError:
-    """Return the error for a lens that a format cannot hold exactly."""
-    sentence = (
-        f"{path}: the format cannot hold the lens {given.sensor or 'of the images'}"
-        f" ({given.projection} in {given.unit}) exactly. Take another format."
-    )
-    return InputError("output.lens", sentence, path=path, lens=given.sensor)
-
-
-def bad_label(path: Path, label: str) -> InputError:
-    """Return the error for an image whose name cannot stand in a file."""
-    sentence = f"{path}: the format cannot hold the image name {label!r}. Take another format."
-    return InputError("output.label", sentence, path=path, image=label)

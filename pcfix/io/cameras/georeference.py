@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from pcfix.errors import PcfixWarning
-from pcfix.io.cameras.checks import wrong
+from pcfix.errors import PcfixWarning, bad_file
+from pcfix.io.cameras.checks import note
 from pcfix.io.cameras.mistakes import UNDULATION_M
 from pcfix.io.crs import (
     GEOCENTRIC_WGS84,
@@ -55,9 +55,12 @@ from pcfix.model import Cameras, FloatArray, GnssPositions
 if TYPE_CHECKING:
     from pyproj import CRS
 
-
-EARTH_RADII_M = (6.2e6, 7.0e6)
+LOCAL = "local"
+EARTH_RADIUS_M = 6.371e6
+CENTRE_DISTANCE_M = (6.2e6, 7.0e6)
 """Cameras are at no other distance from the centre of the earth."""
+STEP_M = 10.0
+"""Half the distance over which directions are compared."""
 
 
 class Frame(NamedTuple):
@@ -73,42 +76,40 @@ class Frame(NamedTuple):
     topocentric: bool = False
 
     def per_metre(self, xyz: FloatArray) -> FloatArray:
-        """Return how much each number changes per metre along its axis, at points (n, 3)."""
+        """Return how much each number changes per metre along its axis, at points (n, 3).
+
+        Degrees are those of a sphere, as only the directions of the steps count.
+        """
         if not self.direct:
             return np.ones_like(xyz)
-        size = plan_unit(self.crs)[1]
-        up = np.full(len(xyz), 1.0 / abs(metres_up(self.crs)))
+        size = np.full(len(xyz), plan_unit(self.crs)[1])
+        up = np.full(len(xyz), abs(metres_up(self.crs)))
         if self.crs.is_projected:
-            return np.column_stack([np.full((len(xyz), 2), 1.0 / size), up])
-        ellipsoid, latitude, height_m = self.crs.ellipsoid, xyz[:, 1] * size, xyz[:, 2] / up
-        a = ellipsoid.semi_major_metre if ellipsoid is not None else 6378137.0
-        b = ellipsoid.semi_minor_metre if ellipsoid is not None else a
-        e2 = 1.0 - (b / a) ** 2
-        w = np.sqrt(1.0 - e2 * np.sin(latitude) ** 2)
-        parallel_m = (a / w + height_m) * np.maximum(np.cos(latitude), 1e-9)
-        meridian_m = a * (1.0 - e2) / w**3 + height_m
-        return np.column_stack([1.0 / (parallel_m * size), 1.0 / (meridian_m * size), up])
+            return np.asarray(1.0 / np.column_stack([size, size, up]))
+        meridian_m = EARTH_RADIUS_M * size
+        parallel_m = meridian_m * np.maximum(np.cos(xyz[:, 1] * size), 1e-9)
+        return np.asarray(1.0 / np.column_stack([parallel_m, meridian_m, up]))
 
     def check(self, xyz: FloatArray, labels: Sequence[str], name: str) -> None:
         """Raise InputError for numbers that are no place on the earth."""
         if self.topocentric or self.crs.is_projected:
             return
         if self.direct:
+            code, kind = "cameras.degrees", "longitude and latitude"
             turn = 2.0 * np.pi / plan_unit(self.crs)[1] * (1.0 + 1e-9)
             bad = (np.abs(xyz[:, :2]) > [turn, turn / 4.0]).any(axis=1)
         else:
-            radius = np.linalg.norm(xyz, axis=1)
-            bad = ~((radius > EARTH_RADII_M[0]) & (radius < EARTH_RADII_M[1]))
+            code, kind = "cameras.geocentric", "geocentric coordinates"
+            radius, (least, most) = np.linalg.norm(xyz, axis=1), CENTRE_DISTANCE_M
+            bad = ~((radius > least) & (radius < most))
         if bad.any():
             i = int(np.argmax(bad))
-            kind = "longitude and latitude" if self.direct else "geocentric coordinates"
             numbers = ", ".join(f"{number:.10g}" for number in xyz[i])
-            code = "cameras.degrees" if self.direct else "cameras.geocentric"
             sentence = (
                 f"image {labels[i]}: {numbers} are not {kind} ({self.crs.name}). Give the CRS of"
                 " the cameras with --cameras-crs."
             )
-            raise wrong(name, code, sentence, image=labels[i], crs=self.crs.name)
+            raise bad_file(name, code, sentence, image=labels[i], crs=self.crs.name)
 
 
 def frame_of(text: str, name: str) -> Frame:
@@ -124,7 +125,7 @@ def frame_of(text: str, name: str) -> Frame:
         return Frame(geographic, _from_geocentric(crs, geographic))
     if not (crs.is_projected or crs.is_geographic):
         sentence = f"{crs.name} is not a CRS for cameras. Give another with --cameras-crs."
-        raise wrong(name, "cameras.crs", sentence, crs=crs.name)
+        raise bad_file(name, "cameras.crs", sentence, crs=crs.name)
     return Frame(crs, lambda xyz: xyz, direct=True)
 
 
@@ -134,40 +135,6 @@ def _from_geocentric(geocentric: CRS, geographic: CRS) -> Callable[[FloatArray],
 
     step = Transformer.from_crs(geocentric, geographic, always_xy=True)
     return lambda xyz: np.column_stack(step.transform(*xyz.T))
-
-
-LOCAL = "local"
-
-
-class Statement(NamedTuple):
-    """The frame of cameras by their file and by ``--cameras-crs``.
-
-    `crs` is as in `Cameras`, `project` that in which the software delivers its clouds. It is
-    `chosen` if the user gave it, and `trusted` if heights of an unknown system are the cloud's.
-    """
-
-    crs: str | None
-    project: CRS | None
-    chosen: bool = False
-    trusted: bool = False
-
-
-def statement(cameras: Cameras, cameras_crs: str | None, name: str) -> Statement:
-    """Combine the CRS of the file with the user's ``--cameras-crs``, which has priority."""
-    project = _on_earth(cameras.project_crs, name)
-    given = (cameras_crs or "").strip()
-    if not given:
-        return Statement(cameras.crs, project)
-    crs = _on_earth(given, "--cameras-crs")
-    if crs is None:
-        return Statement(given, None, chosen=True, trusted=True)
-    if crs.is_geocentric:
-        return Statement(given, project, chosen=True)
-    trusted = heights_of(crs) == "unstated"
-    own = _on_earth(cameras.crs, name)
-    if own is not None and own.is_geocentric:
-        return Statement(cameras.crs, crs, chosen=True, trusted=trusted)
-    return Statement(given, None, chosen=True, trusted=trusted)
 
 
 def is_tied(crs: str | None, name: str) -> bool:
@@ -183,8 +150,34 @@ def _on_earth(crs: str | None, name: str) -> CRS | None:
     return None if is_local(parsed) else parsed
 
 
-STEP_M = 10.0
-"""Half the distance over which directions are compared."""
+class Statement(NamedTuple):
+    """The frame of cameras by their file and by ``--cameras-crs``, which has priority.
+
+    `crs` is as in `Cameras`, `project` that in which the software delivers its clouds. It is
+    `chosen` if the user gave it, and `trusted` if heights of an unknown system are the cloud's.
+    """
+
+    crs: str | None
+    project: CRS | None
+    chosen: bool = False
+    trusted: bool = False
+
+
+def statement(cameras: Cameras, cameras_crs: str | None, name: str) -> Statement:
+    """Combine the CRS of the file with the user's ``--cameras-crs``."""
+    project = _on_earth(cameras.project_crs, name)
+    given = (cameras_crs or "").strip()
+    if not given:
+        return Statement(cameras.crs, project)
+    crs, own = _on_earth(given, "--cameras-crs"), _on_earth(cameras.crs, name)
+    if crs is None:
+        return Statement(given, None, chosen=True, trusted=True)
+    if crs.is_geocentric:
+        return Statement(given, project, chosen=True)
+    trusted = heights_of(crs) == "unstated"
+    if own is not None and own.is_geocentric:
+        return Statement(cameras.crs, crs, chosen=True, trusted=trusted)
+    return Statement(given, None, chosen=True, trusted=trusted)
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +206,7 @@ class Georeference:
                 f"image {cameras.labels[i]}: its position {x:.10g}, {y:.10g}, {z:.6g} cannot be"
                 f" transformed to {shortened(self.crs or '')}. Check --cameras-crs."
             )
-            raise wrong(self.name, "cameras.not_transformed", sentence, image=cameras.labels[i])
+            raise bad_file(self.name, "cameras.not_transformed", sentence, image=cameras.labels[i])
         if rotations is not None and self.transformation is not None:
             rotations = rotations @ self.turns(cameras.centres).transpose(0, 2, 1)
         return replace(
@@ -238,13 +231,13 @@ class Georeference:
         ahead, behind = (self._forward((at[:, None] + s).reshape(-1, 3)) for s in (steps, -steps))
         if not (np.isfinite(ahead).all() and np.isfinite(behind).all()):
             return np.full((len(xyz), 3, 3), np.nan)
-        vectors = (ahead - behind).reshape(-1, 3, 3).transpose(0, 2, 1) / (2.0 * STEP_M)
+        vectors = (ahead - behind).reshape(-1, 3, 3).transpose(0, 2, 1)
         if (np.linalg.det(vectors) < 0.0).any():
             sentence = (
                 f"the axes of {self.frame.crs.name} are left-handed, so rotations have no meaning"
                 " in it. Export the cameras in another CRS."
             )
-            raise wrong(self.name, "cameras.left_handed", sentence, crs=self.frame.crs.name)
+            raise bad_file(self.name, "cameras.left_handed", sentence, crs=self.frame.crs.name)
         u, _, v = np.linalg.svd(vectors)
         return np.asarray(u @ v)
 
@@ -269,7 +262,8 @@ def georeference(
     cameras : Cameras
         As a reader gave them, in the frame of their file.
     cloud_crs : str, CRS or None
-        Projected, in metres; None where the cloud names none.
+        Projected, in metres. None where the cloud names none: then the way leads to where the
+        software delivers clouds, mostly where the cameras are.
     cameras_crs : str, optional
         Overrides what the file says. ``local``: the numbers are taken as they are. A CRS without
         heights says that these agree with the cloud's, and so does ``ENU:lat,lon,height``. For a
@@ -289,42 +283,30 @@ def georeference(
     offset = np.zeros(3) if offset_m is None else np.asarray(offset_m, np.float64)
     if offset.shape != (3,) or not np.isfinite(offset).all():
         sentence = f"the offset {offset_m} is not three numbers. Give x, y, z."
-        raise wrong(name, "cameras.offset", sentence, value=offset_m)
+        raise bad_file(name, "cameras.offset", sentence, value=offset_m)
     cloud = None if cloud_crs is None else parse_crs(cloud_crs, "the cloud")
     stated = statement(cameras, cameras_crs, name)
-    if is_tied(stated.crs, name):
-        return _from_earth(cloud, stated, cameras, offset, name)
-    if cloud is None:
+    crs, tied = stated.crs or "", is_tied(stated.crs, name)
+    if not tied and cloud is None:
         return Georeference(None, None, offset, stated.crs, (), name)
-    if stated.crs is not None and not stated.chosen and not is_local(cloud):
-        sentence = (
-            f"is in a local frame, but the cloud is in {cloud.name}. Export the cameras in that"
-            " CRS, or give --cameras-crs local if their numbers differ by a shift at most."
-        )
-        raise wrong(name, "cameras.local", sentence, cloud_crs=cloud.name)
-    return Georeference(None, None, offset, crs_text(cloud), (), name)
-
-
-def _from_earth(
-    cloud: CRS | None, stated: Statement, cameras: Cameras, offset: FloatArray, name: str
-) -> Georeference:
-    """Return the way from a frame that is tied to the earth.
-
-    Where the cloud names no CRS, it leads to where the software delivers clouds: mostly where the
-    cameras are.
-    """
-    crs = stated.crs or ""
+    if not tied and cloud is not None:
+        if stated.crs is not None and not stated.chosen and not is_local(cloud):
+            sentence = (
+                f"is in a local frame, but the cloud is in {cloud.name}. Export the cameras in that"
+                " CRS, or give --cameras-crs local if their numbers differ by a shift at most."
+            )
+            raise bad_file(name, "cameras.local", sentence, cloud_crs=cloud.name)
+        return Georeference(None, None, offset, crs_text(cloud), (), name)
     if cloud is not None and is_local(cloud):
         sentence = (
             f"is in {shortened(crs)}, but the cloud is in a local frame ({cloud.name}). Set the"
             " cloud's CRS, or give --cameras-crs local to take the numbers as they are."
         )
-        raise wrong(name, "cloud.local", sentence, crs=crs, cloud_crs=cloud.name)
+        raise bad_file(name, "cloud.local", sentence, crs=crs, cloud_crs=cloud.name)
     frame = frame_of(crs, name)
     if cloud is not None:
         return _into(cloud, frame, stated, cameras, offset, name)
-    as_it_is = frame.topocentric or (frame.direct and frame.crs.is_projected)
-    if as_it_is:
+    if frame.topocentric or (frame.direct and frame.crs.is_projected):
         unit, size = plan_unit(frame.crs)
         words = frame.crs.name + ("" if size == 1.0 else f", unit {unit},")
         words = shortened(crs) if frame.topocentric else words
@@ -335,13 +317,12 @@ def _from_earth(
             f"is in {kind} ({frame.crs.name}) and no cloud names a CRS. Give the cloud, or set its"
             " CRS."
         )
-        raise wrong(name, "cloud.no_crs", sentence, crs=frame.crs.name)
+        raise bad_file(name, "cloud.no_crs", sentence, crs=frame.crs.name)
     else:
         words = stated.project.name
         found = _into(stated.project, frame, stated, cameras, offset, name)
-    sentence = f"{name}: no cloud names a CRS; it is taken to be in {words} as the cameras are."
-    note = PcfixWarning("cloud.crs_assumed", sentence, path=name)
-    return replace(found, notes=(note, *found.notes))
+    sentence = f"no cloud names a CRS; it is taken to be in {words} as the cameras are."
+    return replace(found, notes=(note(name, "cloud.crs_assumed", sentence), *found.notes))
 
 
 def _into(
@@ -354,7 +335,7 @@ def _into(
             f"an offset in metres cannot be added to degrees ({frame.crs.name}). Leave it out, or"
             " export the cameras in a projected CRS."
         )
-        raise wrong(name, "cameras.offset", sentence, value=offset.tolist())
+        raise bad_file(name, "cameras.offset", sentence, value=offset.tolist())
     at = cameras.centres + offset
     frame.check(at, cameras.labels, name)
     target = cloud
@@ -364,48 +345,34 @@ def _into(
     crs, notes = crs_text(target), _height_notes(frame, target, stated, name)
     by_user = stated.trusted and not frame.direct
     heights = not (by_user or heights_agree(frame.crs, target))
-    plan = typed(parts(frame.crs if frame.direct else target)[0])
-    place = "ENU:latitude,longitude,height with the height in the cloud's system"
-    instead = (
-        "or, if the heights of cameras and cloud are known to agree, give --cameras-crs"
-        f" {place if frame.topocentric else f'{plan}, the horizontal CRS alone'}"
-    )
     if frame.direct and not heights and is_same_numbers(frame.crs, target):
         return Georeference(frame, None, offset, crs, notes, name)
+    plan = typed(parts(frame.crs if frame.direct else target)[0])
+    given = f"{plan}, the horizontal CRS alone"
+    if frame.topocentric:
+        given = "ENU:latitude,longitude,height with the height in the cloud's system"
+    instead = "or, if the heights of cameras and cloud are known to agree, give --cameras-crs "
     step = transformation(
-        frame.crs,
-        target,
-        frame.enter(at),
-        name,
-        heights=heights,
-        instead=instead if heights else "",
+        frame.crs, target, frame.enter(at), name, heights=heights, instead=instead + given
     )
-    of_step = (PcfixWarning("crs.transformation", str(note), path=name) for note in step.notes)
+    of_step = (PcfixWarning("crs.transformation", str(one), path=name) for one in step.notes)
     found = Georeference(frame, step, offset, crs, (*of_step, *notes), name)
-    if stated.trusted and not (frame.direct or frame.topocentric):
-        return replace(found, notes=found.notes + _on_trust(found, cameras, frame, target))
+    # heights that --cameras-crs declares can be tested if the GNSS heights are above the geoid too
+    gnss = cameras.gnss
+    testable = heights_of(target) == "gravity" and gnss is not None and gnss.crs is not None
+    if by_user and not frame.topocentric and testable:
+        up = adjusted_minus_gnss(found.cameras(cameras), name).enu_m[:, 2]
+        off = float(np.median(up[np.isfinite(up)])) if np.isfinite(up).any() else 0.0
+        if abs(off) >= UNDULATION_M[0]:
+            sentence = (
+                f"with the heights of --cameras-crs ({target.name}) the cameras are"
+                f" {abs(off):.1f} m {'above' if off > 0.0 else 'below'} their GNSS positions."
+                " Install the grid instead; the file has heights above the ellipsoid"
+                f" ({frame.crs.name})."
+            )
+            differ = note(name, "cameras.heights_differ", sentence, metres=off)
+            return replace(found, notes=(*found.notes, differ))
     return found
-
-
-def _on_trust(
-    found: Georeference, cameras: Cameras, frame: Frame, target: CRS
-) -> tuple[PcfixWarning, ...]:
-    """Return a note where heights that --cameras-crs declares contradict the GNSS positions.
-
-    This can be tested only if the GNSS heights are above the geoid, as those of the cloud.
-    """
-    if heights_of(target) != "gravity" or cameras.gnss is None or cameras.gnss.crs is None:
-        return ()
-    up = adjusted_minus_gnss(found.cameras(cameras), found.name).enu_m[:, 2]
-    off = float(np.median(up[np.isfinite(up)])) if np.isfinite(up).any() else 0.0
-    if abs(off) < UNDULATION_M[0]:
-        return ()
-    sentence = (
-        f"{found.name}: with the heights of --cameras-crs ({target.name}) the cameras are"
-        f" {abs(off):.1f} m {'above' if off > 0.0 else 'below'} their GNSS positions. Install the"
-        f" grid instead; the file has heights above the ellipsoid ({frame.crs.name})."
-    )
-    return (PcfixWarning("cameras.heights_differ", sentence, path=found.name, metres=off),)
 
 
 def _height_notes(
@@ -430,7 +397,7 @@ def _height_notes(
         )
     else:
         return ()
-    return (PcfixWarning("cameras.heights_assumed", f"{name}: {what}.", path=name),)
+    return (note(name, "cameras.heights_assumed", f"{what}."),)
 
 
 @dataclass(frozen=True, eq=False)
@@ -453,30 +420,33 @@ class GnssDifferences:
 def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> GnssDifferences:
     """Return how far the adjusted centres are from where the GNSS stated that they were.
 
+    Without `up` where the heights of the two belong to systems that cannot be compared.
+
     Parameters
     ----------
     cameras : Cameras
         As read or in the cloud's CRS.
     name : str
         Of their file, for messages.
-
-    Returns
-    -------
-    GnssDifferences
-        Without `up` where the heights of the two belong to systems that cannot be compared.
     """
-    gnss, nothing = cameras.gnss, np.full((len(cameras), 3), np.nan)
+    gnss, crs = cameras.gnss, cameras.crs or ""
     if gnss is None:
+        nothing = np.full((len(cameras), 3), np.nan)
         return GnssDifferences(nothing, f"{name}: has no positions of the GNSS.")
-    crs = cameras.crs or ""
-    if gnss.crs is None or gnss.crs == cameras.crs:
-        return GnssDifferences(_in_one_frame(cameras, gnss, name))
-    if not is_tied(cameras.crs, name) or not is_tied(gnss.crs, name):
-        return GnssDifferences(
-            nothing,
+    tied = is_tied(cameras.crs, name)
+    if gnss.crs in (None, cameras.crs):
+        plain, gnss = cameras.centres - gnss.xyz, replace(gnss, crs=crs)
+        if not tied or is_topocentric(crs):
+            return GnssDifferences(plain)
+        frame = frame_of(crs, name)
+        if frame.direct and frame.crs.is_projected:
+            return GnssDifferences(np.asarray(plain / frame.per_metre(cameras.centres)))
+    if gnss.crs is None or not tied or not is_tied(gnss.crs, name):
+        reason = (
             f"{name}: positions of the GNSS and adjusted centres are not both tied to the earth,"
-            " so they cannot be compared.",
+            " so they cannot be compared."
         )
+        return GnssDifferences(np.full((len(cameras), 3), np.nan), reason)
     kinds = [heights_of(frame_of(each, name).crs) for each in (crs, gnss.crs)]
     reason = (
         f"{name}: the CRS of the {'cameras' if kinds[0] == 'unstated' else 'GNSS'} does not"
@@ -487,20 +457,9 @@ def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> GnssDifferen
             return GnssDifferences(_differences(cameras, gnss, name))
         except HeightsError as error:
             reason = str(error).partition("; or, if")[0] + "; only plan is compared."
-    flat = replace(gnss, crs=_in_plan(gnss.crs, name))
-    found = _differences(replace(cameras, crs=_in_plan(crs, name)), flat, name)
+    flat = replace(cameras, crs=_in_plan(crs, name))
+    found = _differences(flat, replace(gnss, crs=_in_plan(gnss.crs, name)), name)
     return GnssDifferences(found * [1.0, 1.0, np.nan], reason)
-
-
-def _in_one_frame(cameras: Cameras, gnss: GnssPositions, name: str) -> FloatArray:
-    """Return the differences where both are in one frame, or the GNSS's is taken to be that."""
-    difference = cameras.centres - gnss.xyz
-    if not is_tied(cameras.crs, name) or is_topocentric(cameras.crs or ""):
-        return difference
-    frame = frame_of(cameras.crs or "", name)
-    if frame.direct:
-        return np.asarray(difference / frame.per_metre(cameras.centres))
-    return _differences(cameras, replace(gnss, crs=cameras.crs), name)
 
 
 def _in_plan(crs: str, name: str) -> str:
@@ -512,19 +471,18 @@ def _in_plan(crs: str, name: str) -> str:
 
 
 def _differences(cameras: Cameras, gnss: GnssPositions, name: str) -> FloatArray:
-    there = np.isfinite(gnss.xyz).all(axis=1)
-    rows = np.flatnonzero(there)
+    """Return the differences in the map of the cameras, or in a map in metres about the block."""
+    rows = np.flatnonzero(np.isfinite(gnss.xyz).all(axis=1))
     found = np.full((len(cameras), 3), np.nan)
     if len(rows) == 0:
         return found
     labels = tuple(cameras.labels[i] for i in rows)
     common = _common(cameras, name)
-    adjusted = Cameras(labels, cameras.centres[rows], crs=cameras.crs)
-    measured = Cameras(labels, gnss.xyz[rows], crs=gnss.crs)
-    one, other = (
-        georeference(part, common, name=name).points(part.centres) for part in (adjusted, measured)
+    adjusted, measured = (
+        georeference(Cameras(labels, xyz, crs=crs), common, name=name).points(xyz)
+        for xyz, crs in ((cameras.centres[rows], cameras.crs), (gnss.xyz[rows], gnss.crs))
     )
-    found[rows] = one - other
+    found[rows] = adjusted - measured
     return found
 
 
@@ -535,18 +493,17 @@ def _common(cameras: Cameras, name: str) -> CRS:
     from pyproj.crs.coordinate_operation import TransverseMercatorConversion
 
     frame = frame_of(cameras.crs or "", name)
-    units = {axis.unit_name for axis in frame.crs.axis_info}
-    if frame.crs.is_projected and units.issubset(METRES):
+    if frame.crs.is_projected and {a.unit_name for a in frame.crs.axis_info}.issubset(METRES):
         return frame.crs
+    flat, vertical = parts(frame.crs)
     base = parts(unbound(frame.crs))[0].geodetic_crs
     if base is None:
-        raise wrong(name, "cameras.crs", f"{frame.crs.name} has no datum.")
-    to_degrees = Transformer.from_crs(parts(frame.crs)[0], "EPSG:4326", always_xy=True)
+        raise bad_file(name, "cameras.crs", f"{frame.crs.name} has no datum.")
+    to_degrees = Transformer.from_crs(flat, "EPSG:4326", always_xy=True)
     middle = np.median(frame.enter(cameras.centres), axis=0)
     longitude, latitude = to_degrees.transform(middle[0], middle[1])
-    base = unbound(base).to_2d()
-    plan = CRS(ProjectedCRS(TransverseMercatorConversion(latitude, longitude), geodetic_crs=base))
-    vertical = parts(frame.crs)[1]
+    mercator = TransverseMercatorConversion(latitude, longitude)
+    plan = CRS(ProjectedCRS(mercator, geodetic_crs=unbound(base).to_2d()))
     if vertical is not None:
         return with_heights(plan, vertical)
     return plan.to_3d() if heights_of(frame.crs) == "ellipsoidal" else plan

@@ -28,6 +28,7 @@ MMVII's files write the formula of each coefficient beside it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from xml.etree.ElementTree import Element
@@ -37,6 +38,7 @@ import numpy as np
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import damaged, number, numbers, read_xml
+from pcfix.io.cameras.checks import text_of as _text
 from pcfix.io.cameras.formats import Source
 from pcfix.model import Cameras, FloatArray, Lens
 
@@ -122,53 +124,68 @@ def _calibration(path: Path, element: Element) -> Lens:
     if convention not in _IS_INVERSE:
         raise _not_held(path, f"convention {convention}")
     focal = number(path, "F", element.findtext("F"))
-    x, y = numbers(path, "PP", element.findtext("PP"), 2).tolist()
-    width, height = numbers(path, "SzIm", element.findtext("SzIm"), 2).tolist()
-    models = [model for entry in element.iter("CalibDistortion") for model in entry]
-    models = [model for model in models if _name(model) not in NO_DISTORTION]
+    principal = numbers(path, "PP", element.findtext("PP"), 2)
+    size = numbers(path, "SzIm", element.findtext("SzIm"), 2)
+    found = [model for entry in element.iter("CalibDistortion") for model in entry]
+    named = [(_text(model, "TypeModele") or str(model.tag), model) for model in found]
+    models = [(name, model) for name, model in named if name not in NO_DISTORTION]
     if len(models) > 1:
-        raise _not_held(path, " after ".join(_name(model) for model in models))
-    (cx, cy), radial, rest = (x, y), np.empty(0), np.empty(0)
-    for model in models:
-        (cx, cy), radial, rest = _distortion(path, model, (x, y))
-    b1, b2 = rest[2:].tolist() or (0.0, 0.0)
-    if b1 or b2:
-        d = _farthest(width, height, cx, cy)
-        away = abs(d * sum(k * d ** (2 * i + 2) for i, k in enumerate(radial.tolist())))
-        if _IS_INVERSE[convention] or not np.hypot(b1, b2) * away <= AFFINITY_PX:
-            raise _not_held(path, f"{_name(models[0])} with an affinity (b1, b2)")
+        raise _not_held(path, " after ".join(name for name, _ in models))
+    centre, radial, rest = principal, np.empty(0), [0.0] * 4  # of P1, P2, b1, b2
+    for name, model in models:
+        if name in UNIFIED:
+            given = [number(path, "Params", e.text) for e in model.findall("Params")]
+            if any(given[9:]):
+                raise damaged(path, f"{name} has {len(given)} Params instead of 9")
+            values = np.array([*given[:9], *(0.0,) * (9 - len(given))])
+            radial, rest = values[:5], values[5:].tolist()
+        elif name in ("ModRad", "ModPhgrStd"):
+            inside = model.find("RadialePart")
+            part = model if inside is None else inside
+            centre = numbers(path, "CDist", part.findtext("CDist"), 2)
+            radial = np.array(
+                [number(path, "CoeffDist", e.text) for e in part.findall("CoeffDist")]
+            )
+            if name == "ModPhgrStd":
+                tags = ("P1", "P2", "b1", "b2")
+                rest = [number(path, tag, model.findtext(tag, "0")) for tag in tags]
+        else:
+            raise _not_held(path, name)
     # MicMac's coefficients are of places in pixels, those of a Lens of places over the focal length
     radial = radial * np.float64(focal) ** (2 * np.arange(len(radial)) + 2)
+    rest = [rest[0] * focal, rest[1] * focal, *rest[2:]]
+    is_inverse = _IS_INVERSE[convention]
+    return _lens(path, focal, size, principal, centre, radial, rest, is_inverse=is_inverse)
+
+
+def _lens(
+    path: Path,
+    focal: float,
+    size: FloatArray,
+    principal: FloatArray,
+    centre: FloatArray,
+    radial: FloatArray,
+    rest: Sequence[float],
+    *,
+    is_inverse: bool = False,
+) -> Lens:
+    """Return the lens of coefficients k1, k2, ... and P1, P2, b1, b2 of places over the focal."""
+    p1, p2, b1, b2 = rest
+    if b1 or b2:  # held where it makes no difference that the lens has them after the distortion
+        farthest = np.hypot(*np.maximum(np.abs(centre), np.abs(size - centre))) / focal
+        r = np.linspace(0.0, farthest, 50)
+        away = focal * np.abs(r**3 * np.polynomial.polynomial.polyval(r * r, radial)).max()
+        if is_inverse or not np.hypot(b1, b2) * away <= AFFINITY_PX:
+            raise _not_held(path, "affinity (b1, b2)")
+    (width, height), (x, y), (cx, cy) = size.tolist(), principal.tolist(), centre.tolist()
     return Lens(
         *(focal, width, height, x + b1 * (x - cx) + b2 * (y - cy), y, b1 * focal, b2 * focal),
-        radial=tuple(radial.tolist()),
-        tangential=tuple((rest[:2] * focal).tolist()),
+        radial=checks.without_zeros(radial.tolist()),
+        tangential=checks.without_zeros([p1, p2]),
         distortion_centre=((cx - x) / focal, (cy - y) / focal),
-        inverse=_IS_INVERSE[convention],
+        inverse=is_inverse,
         sensor=path.stem,
     )
-
-
-def _distortion(
-    path: Path, model: Element, principal: tuple[float, float]
-) -> tuple[tuple[float, float], FloatArray, FloatArray]:
-    """Return the centre (pixels), k1, k2, ... and P1, P2, b1, b2 of a distortion."""
-    name = _name(model)
-    if name in UNIFIED:
-        given = [number(path, "Params", e.text) for e in model.findall("Params")]
-        if any(given[9:]):
-            raise damaged(path, f"{name} has {len(given)} Params instead of 9")
-        values = np.array([*given[:9], *(0.0,) * (9 - len(given))])
-        return principal, values[:5], values[5:]
-    if name not in ("ModRad", "ModPhgrStd"):
-        raise _not_held(path, name)
-    inside = model.find("RadialePart")
-    part = model if inside is None else inside
-    x, y = numbers(path, "CDist", part.findtext("CDist"), 2).tolist()
-    terms = [number(path, "CoeffDist", e.text) for e in part.findall("CoeffDist")]
-    tags = () if name == "ModRad" else ("P1", "P2", "b1", "b2")
-    rest = [number(path, tag, model.findtext(tag, "0")) for tag in tags]
-    return (x, y), np.array(terms), np.array(rest)
 
 
 def _scanned(path: Path, element: Element | None, lens: Lens) -> Lens:
@@ -212,48 +229,25 @@ def _calibration_2(path: Path, root: Element) -> Lens:
     if projection != "Stenope":
         raise _not_held(path, f"projection {projection}")
     focal = number(path, "F", root.findtext(".//PerfectProj/F"))
-    x, y = numbers(path, "PP", root.findtext(".//PerfectProj/PP"), 2).tolist()
-    width, height = numbers(path, "NbPix", root.findtext(".//PixelFrame/NbPix"), 2).tolist()
+    principal = numbers(path, "PP", root.findtext(".//PerfectProj/PP"), 2)
+    size = numbers(path, "NbPix", root.findtext(".//PixelFrame/NbPix"), 2)
     given = {
         str(term.tag): number(path, str(term.tag), term.text)
         for part in root.iterfind(".//Distorsion/*")
         for term in part
     }
-    held = {f"K{i}" for i in range(1, 10)} | {"p1", "p2", "b1", "b2"}
-    others = sorted(name for name, value in given.items() if value and name not in held)
+    names = [f"K{i}" for i in range(1, 10)]
+    others = sorted(k for k, v in given.items() if v and k not in {*names, "p1", "p2", "b1", "b2"})
     if others:
         raise _not_held(path, f"terms {', '.join(others)}")
-    radial = tuple(given.get(f"K{i}", 0.0) for i in range(1, 10))
-    p1, p2, b1, b2 = (given.get(name, 0.0) for name in ("p1", "p2", "b1", "b2"))
-    r = _farthest(width, height, x, y) / focal
-    away = r * sum(abs(k) * r ** (2 * i + 2) for i, k in enumerate(radial))
-    if not focal * np.hypot(b1, b2) * away <= AFFINITY_PX:
-        raise _not_held(path, "affinity (b1, b2)")
-    return Lens(
-        *(focal, width, height, x, y, b1 * focal, b2 * focal),
-        radial=checks.without_zeros(radial),
-        tangential=checks.without_zeros((p1, p2)),
-        sensor=path.stem,
-    )
-
-
-def _farthest(width: float, height: float, x: float, y: float) -> float:
-    """Return the distance of the corner of a frame that is farthest from a place."""
-    return float(np.hypot(max(abs(x), abs(width - x)), max(abs(y), abs(height - y))))
+    radial = np.array([given.get(name, 0.0) for name in names])
+    rest = [given.get(name, 0.0) for name in ("p1", "p2", "b1", "b2")]
+    return _lens(path, focal, size, principal, principal, radial, rest)
 
 
 def _not_held(path: Path, what: str) -> InputError:
     remedy = "Convert the calibration to a radial or Fraser's one (mm3d ConvertCalib)"
     return checks.unsupported(path, f"a calibration with the {what}", remedy, model=what)
-
-
-def _name(model: Element) -> str:
-    return _text(model, "TypeModele") or str(model.tag)
-
-
-def _text(element: Element, name: str) -> str:
-    """Return the text of an element inside another, empty where there is none."""
-    return (element.findtext(name) or "").strip().strip('"')
 
 
 def _first(path: Path, root: Element, tag: str) -> Element:

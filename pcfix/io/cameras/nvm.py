@@ -29,7 +29,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.errors import PcfixWarning
 from pcfix.io.cameras import checks, tracks
 from pcfix.io.cameras.formats import Source
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
@@ -43,10 +42,9 @@ _LEAST_VIEWS = 10
 """Views of one camera from which the middle of its frame is estimated."""
 
 
-class Part(NamedTuple):
+class Model(NamedTuple):
     """A model of the file: names, a row of numbers for each camera, points, FixedK or nothing."""
 
-    path: Path
     names: list[str]
     rows: FloatArray
     points: tracks.PointList
@@ -65,18 +63,27 @@ def recognises(source: Source) -> bool:
 
 def read(source: Source) -> Cameras:
     """Read the poses and lenses of the largest model."""
-    parts = _parts(source.path)
-    part, notes = _largest(parts)
-    labels = tuple(part.names[i] for i in part.posed)
-    rotations, centres = _poses(part)
-    lenses, more = _lenses(part, labels)
-    everything = dict.fromkeys(name for other in parts for name in other.names)
+    path = source.path
+    models = _models(path)
+    model = _largest(path, models)
+    labels = tuple(model.names[i] for i in model.posed)
+    rotations, centres = _poses(path, model)
+    rows, smallest = model.rows[model.posed], _placed(path, model)[1][model.posed]
+    frames, notes = tracks.frame_sizes(path, labels, rows[:, 0], smallest)
+    lenses = []
+    for row, (w, h) in zip(rows.tolist(), () if frames is None else frames.tolist(), strict=False):
+        fx, cx, fy, cy = (row[0], w / 2.0, row[0], h / 2.0) if model.fixed is None else model.fixed
+        lenses.append(Lens(fy, w, h, cx, cy, b1=fx - fy, radial=(row[-2],), inverse=True))
+    with_points = sum(len(one.points.xyz) > 0 for one in models) or len(models)
+    if with_points > 1:
+        notes = (checks.several(path, with_points, len(labels)), *notes)
+    everything = dict.fromkeys(name for one in models for name in one.names)
     return Cameras(
         labels=labels,
         centres=centres,
         rotations=rotations,
-        lenses=lenses,
-        notes=(*notes, *more),
+        lenses=tuple(lenses) or None,
+        notes=notes,
         unposed=tuple(name for name in everything if name not in set(labels)),
         source="VisualSFM",
     )
@@ -84,22 +91,21 @@ def read(source: Source) -> Cameras:
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """Read the points of the largest model and where the images saw them."""
-    part, _ = _largest(_parts(source.path))
-    if not len(part.points.image) or cameras.lenses is None:
+    model = _largest(source.path, _models(source.path))
+    if not len(model.points.image) or cameras.lenses is None:
         raise tracks.no_tie_points(source.path, "it lists no points")
-    return tracks.from_principal_point(part.points, part.posed, cameras, _placed(part)[0])
+    return model.points.seen(model.posed, cameras, _placed(source.path, model)[0])
 
 
-def _parts(path: Path) -> list[Part]:
+def _models(path: Path) -> list[Model]:
     """Return all models of the file."""
-    text = path.read_bytes().decode("utf-8-sig", "replace").lstrip()
-    head, _, body = text.partition("\n")
+    head, _, body = checks.read_text(path).lstrip().partition("\n")
     found = _HEAD.match(head)
     matrix, held = found.groups() if found else (None, None)
     lines = [line for line in body.splitlines() if line.strip() and line.lstrip()[0] != "#"]
     width = _MATRIX_NUMBERS if matrix else _QUATERNION_NUMBERS
     fixed = tuple(tracks.numbers(held)[:4].tolist()) if held else None
-    parts = []
+    models = []
     at = 0
     while at < len(lines) and (count := int(lines[at])) > 0:
         rows = [line.rsplit(None, width) for line in lines[at + 1 : at + 1 + count]]
@@ -109,89 +115,64 @@ def _parts(path: Path) -> list[Part]:
         points = int(lines[at])
         values = tracks.numbers("\n".join(lines[at + 1 : at + 1 + points]))
         listed = tracks.point_list(path, values, points, count, 4)
-        parts.append(Part(path, names, numbers, listed, fixed))
+        models.append(Model(names, numbers, listed, fixed))
         at += 1 + points
-    if not parts:
+    if not models:
         raise checks.no_pose(path, "has no model")
-    return parts
+    return models
 
 
-def _largest(parts: list[Part]) -> tuple[Part, tuple[PcfixWarning, ...]]:
+def _largest(path: Path, models: list[Model]) -> Model:
     """Return the model with most posed images, of those with points if there are any."""
-    models = [part for part in parts if len(part.points.xyz)] or parts
-    largest = max(models, key=lambda part: len(part.posed))
+    with_points = [model for model in models if len(model.points.xyz)]
+    largest = max(with_points or models, key=lambda model: len(model.posed))
     if not len(largest.posed):
-        raise checks.no_pose(largest.path, "no image has a pose (all focal lengths are 0)")
-    if len(models) == 1:
-        return largest, ()
-    return largest, (checks.several(largest.path, len(models), len(largest.posed)),)
+        raise checks.no_pose(path, "no image has a pose (all focal lengths are 0)")
+    return largest
 
 
-def _poses(part: Part) -> tuple[FloatArray, FloatArray]:
+def _poses(path: Path, model: Model) -> tuple[FloatArray, FloatArray]:
     """Return rotations and projection centres of the posed cameras."""
-    rows, labels = part.rows[part.posed], [part.names[i] for i in part.posed]
+    rows, labels = model.rows[model.posed], [model.names[i] for i in model.posed]
     if rows.shape[1] == _QUATERNION_NUMBERS:
-        return checks.quaternions(part.path, labels, rows[:, 1:5]), rows[:, 5:8]
-    rotations = checks.rotations(part.path, labels, rows[:, 1:10])
-    return rotations, -np.einsum("kji,kj->ki", rotations, rows[:, 10:13])
+        return checks.quaternions(path, labels, rows[:, 1:5]), rows[:, 5:8]
+    rotations = checks.rotations(path, labels, rows[:, 1:10])
+    return rotations, checks.centres(rotations, rows[:, 10:13])
 
 
-def _lenses(
-    part: Part, labels: tuple[str, ...]
-) -> tuple[tuple[Lens, ...] | None, tuple[PcfixWarning, ...]]:
-    rows = part.rows[part.posed]
-    smallest = _placed(part)[1][part.posed]
-    frames, notes = tracks.frame_sizes(part.path, labels, rows[:, 0], smallest)
-    if frames is None:
-        return None, notes
-    lenses = []
-    for row, (w, h) in zip(rows.tolist(), frames.tolist(), strict=True):
-        fx, cx, fy, cy = (row[0], w / 2.0, row[0], h / 2.0) if part.fixed is None else part.fixed
-        lenses.append(Lens(fy, w, h, cx, cy, b1=fx - fy, radial=(row[-2],), inverse=True))
-    return tuple(lenses), notes
-
-
-def _placed(part: Part) -> tuple[FloatArray, FloatArray]:
+def _placed(path: Path, model: Model) -> tuple[FloatArray, FloatArray]:
     """Return the places of views from the principal point, and the least frame of each image."""
-    image, seen = part.points.image, part.points.rest[:, 1:].copy()
-    least = np.zeros((len(part.rows), 2))
-    if part.fixed is not None:
-        least[:] = 2.0 * np.array(part.fixed[1::2])
-    elif _from_corner(part):
-        expected = _expected(part)
-        for focal in np.unique(part.rows[part.posed, 0]):
-            rows = part.rows[image, 0] == focal
+    image, seen = model.points.image, model.points.rest[:, 1:].copy()
+    least = np.zeros((len(model.rows), 2))
+    if model.fixed is not None:
+        least[:] = 2.0 * np.array(model.fixed[1::2])
+        return seen, least
+    in_frame = len(seen) and ((seen >= 0.0) & (seen < _LARGEST_PX)).all()
+    expected = _expected(path, model) if in_frame else np.full_like(seen, np.nan)
+    apart = np.abs(seen - expected)
+    if np.isfinite(apart).any() and np.nanmedian(apart) > _FAR_PX:  # OpenSfM's, from the corner
+        for focal in np.unique(model.rows[model.posed, 0]):
+            rows = model.rows[image, 0] == focal
             if np.isfinite(expected[rows]).all(axis=1).sum() >= _LEAST_VIEWS:
                 squeeze, frame = _squeeze_and_frame(expected[rows], seen[rows])
                 seen[rows] = (seen[rows] - frame / 2.0) / squeeze
-                least[part.rows[:, 0] == focal] = frame
+                least[model.rows[:, 0] == focal] = frame
     else:
         np.maximum.at(least, image, 2.0 * np.abs(seen))
     return seen, least
 
 
-def _from_corner(part: Part) -> bool:
-    """Whether places are from the corner: none negative, and far from where points project."""
-    seen = part.points.rest[:, 1:]
-    if not len(seen) or not ((seen >= 0.0) & (seen < _LARGEST_PX)).all():
-        return False
-    apart = np.abs(seen - _expected(part))
-    return bool(np.isfinite(apart).any() and np.nanmedian(apart) > _FAR_PX)
-
-
-def _expected(part: Part) -> FloatArray:
+def _expected(path: Path, model: Model) -> FloatArray:
     """Return where points project without distortion, from the principal point; NaN if nowhere."""
-    points = part.points
-    expected = np.full((len(points.image), 2), np.nan)
-    order = np.argsort(points.image, kind="stable")
-    bounds = np.searchsorted(points.image[order], np.arange(len(part.rows) + 1))
-    for row, rotation, centre in zip(part.posed, *_poses(part), strict=True):
-        rows = order[bounds[row] : bounds[row + 1]]
-        x, y, z = rotation @ (points.xyz[points.point[rows]] - centre).T
-        z = np.where(z > 0.0, z, np.nan)
-        places = part.rows[row, 0] * np.column_stack([x / z, y / z])
-        expected[rows] = np.where(np.abs(places) < _LARGEST_PX, places, np.nan)
-    return expected
+    row_of = np.full(len(model.rows), -1)
+    row_of[model.posed] = np.arange(len(model.posed))
+    rotations, centres = _poses(path, model)
+    row = row_of[model.points.image]
+    rays = model.points.xyz[model.points.point] - centres[row]
+    x, y, z = np.einsum("nij,nj->in", rotations[row], rays)
+    z = np.where((row >= 0) & (z > 0.0), z, np.nan)
+    places = model.rows[model.points.image, 0][:, None] * np.column_stack([x / z, y / z])
+    return np.where(np.abs(places) < _LARGEST_PX, places, np.nan)
 
 
 def _squeeze_and_frame(expected: FloatArray, seen: FloatArray) -> tuple[FloatArray, FloatArray]:

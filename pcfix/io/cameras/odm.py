@@ -33,9 +33,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.errors import PcfixWarning
+from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.cameras import checks, opensfm
-from pcfix.io.cameras.checks import damaged, load_json, triple, wrong
+from pcfix.io.cameras.checks import damaged, load_json, note, triple
 from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.opensfm.models import is_panorama, lens
 from pcfix.io.crs import GEOCENTRIC_WGS84, GEOGRAPHIC_WGS84, Topocentric
@@ -47,12 +47,19 @@ RECONSTRUCTION = "reconstruction.json"
 TRANSFORMATION = "geocoords_transformation.txt"
 TOPOCENTRIC = "reconstruction.topocentric.json"
 ALIGNED_M = 0.1
+SCALE_TOLERANCE = 0.1
+"""Of the squared scale of a map projection; feet, or a matrix of nonsense, are outside."""
+WHOLE_M = 2e-3
+"""Newer ODM puts the origin at whole metres; reference_lla is rounded a little."""
+SAME_FOCAL = 1e-6
+GNSS_KEYS = ("longitude", "latitude", "altitude", "gps_xy_stddev", "gps_z_stddev")
 
 _FOLDERS = ("", "opensfm", "odm_georeferencing", "odm_georeferencing_25d", "odm_report")
 _OF_CRS = ("proj.txt", "coords.txt", "odm_georeferencing_model_geo.txt")
 _SHOTS_HEAD = re.compile(
     r'\s*\{.*"features"\s*:\s*\[.*"(translation|rotation|filename)"', re.DOTALL
 )
+_REFERENCE = re.compile(rb'"(latitude|longitude)"\s*:\s*(-?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)')
 
 
 def recognises(source: Source) -> bool:
@@ -90,7 +97,16 @@ def read(source: Source) -> Cameras:
         unposed=opensfm.left_out(own.labels, [*own.unposed, *listed]),
         source="OpenDroneMap",
     )
-    return cameras if placed.project_crs else _compared(project, cameras)
+    truth, ours = _in_shots(project, cameras)
+    apart = float(np.median(np.hypot(*(ours - truth)[:, :2].T))) if len(ours) else 0.0
+    if placed.project_crs or apart < ALIGNED_M:
+        return cameras
+    sentence = (
+        f"its cameras are {apart:.2f} m from those of {project.find(SHOTS)}. If the project was"
+        " aligned to a reference, give shots.geojson, which fits its cloud."
+    )
+    moved = note(project.poses, "cameras.shots_differ", sentence, metres=apart)
+    return replace(cameras, notes=(*cameras.notes, moved))
 
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
@@ -110,11 +126,8 @@ class Project(NamedTuple):
     def find(self, name: str) -> Path | None:
         """Return a file of this name beside the poses or in the project's own folders."""
         folders = [self.poses.parent] if self.poses else []
-        folders += [self.root / folder for folder in _FOLDERS]
-        for folder in folders:
-            if (folder / name).is_file():
-                return folder / name
-        return None
+        places = [folder / name for folder in (*folders, *(self.root / one for one in _FOLDERS))]
+        return next((place for place in places if place.is_file()), None)
 
     def crs(self) -> str | None:
         """Return the projected CRS that the project names."""
@@ -128,9 +141,7 @@ def _locate(path: Path) -> Project:
     A file is taken as it is; of a folder its reconstruction, or else its shots.geojson.
     """
     folder = path if path.is_dir() else path.parent
-    root = folder
-    if root.name == "undistorted":
-        root = root.parent
+    root = folder.parent if folder.name == "undistorted" else folder
     if root.name in _FOLDERS[1:]:
         root = root.parent
     if not path.is_dir():
@@ -140,24 +151,15 @@ def _locate(path: Path) -> Project:
     return Project(root, next((place for place in places if place.is_file()), None))
 
 
-def _compared(project: Project, cameras: Cameras) -> Cameras:
-    """Return the cameras with a note where the project was moved after the reconstruction."""
-    truth, own = _in_shots(project, cameras)
-    apart = float(np.median(np.hypot(*(own - truth)[:, :2].T))) if len(own) else 0.0
-    if apart < ALIGNED_M:
-        return cameras
-    sentence = (
-        f"{project.poses}: its cameras are {apart:.2f} m from those of {project.find(SHOTS)}. If"
-        " the project was aligned to a reference, give shots.geojson, which fits its cloud."
-    )
-    note = PcfixWarning("cameras.shots_differ", sentence, metres=apart)
-    return replace(cameras, notes=(*cameras.notes, note))
-
-
-SCALE_TOLERANCE = 0.1
-"""Of the squared scale of a map projection; feet, or a matrix of nonsense, are outside."""
-
-_REFERENCE = re.compile(rb'"(latitude|longitude)"\s*:\s*(-?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)')
+def named_crs(path: Path) -> str:
+    """Return the CRS in the first line of a file: a PROJ string, EPSG:n or WGS84 UTM 16N."""
+    text = path.read_bytes()[:4096].decode("utf-8-sig", errors="replace").strip()
+    line = text.partition("\n")[0].strip()
+    crs = checks.utm_as_code(line)
+    if not checks.names_crs(crs):
+        sentence = f"'{line[:80]}' names no CRS. Put its EPSG code there."
+        raise bad_file(path, "cameras.crs", sentence, crs=line)
+    return crs
 
 
 class Frame(NamedTuple):
@@ -180,22 +182,41 @@ class Frame(NamedTuple):
 
 def _frame(project: Project, found: opensfm.Reconstruction) -> Frame:
     """Decide the frame; see the top of this module for the rules."""
-    crs = project.crs()
+    crs, reference = project.crs(), found.reference
     unmoved = Frame(np.eye(3), np.zeros(3), found.cameras.crs or "", crs)
-    if found.reference is None or found.path.name == TOPOCENTRIC:
+    if reference is None or found.path.name == TOPOCENTRIC:
         return unmoved
-    transformation = project.find(TRANSFORMATION)
-    turned = _transformed(transformation, found.reference, crs) if transformation else None
-    if turned is not None:
-        return turned
-    whole = _whole_metres(*found.reference[:2], crs)
+    path = project.find(TRANSFORMATION)
+    if path is not None:
+        with checks.reading(path):
+            rows = [row.split()[:4] for row in checks.read_text(path).splitlines() if row.strip()]
+            matrix = np.array(rows, float).reshape(4, 4)
+        turn, shift = matrix[:3, :3], matrix[:3, 3]
+        if not (np.abs(turn.T @ turn - np.eye(3)).max() <= SCALE_TOLERANCE):
+            raise damaged(path, "it does not turn and shift the reconstruction")
+        lat, lon, _ = reference
+        named = _crs_of_place(lon, lat, shift[0], shift[1], [crs] if crs else _zones(lat, lon))
+        if named is not None:  # else the file is of another origin
+            return Frame(turn, shift, named)
+    whole = _whole_metres(*reference[:2], crs)
     if whole is None:
         return unmoved
     crs, east, north = whole
     moved = Frame(np.eye(3), np.array([east, north, 0.0]), crs)
-    if _is_topocentric(project, found.cameras, found.reference, moved):
-        return unmoved._replace(project_crs=crs)
-    return moved
+    # centres of shots.geojson, else the GNSS, which stays topocentric, tell whether it was moved:
+    # the two readings differ by the meridian convergence and the scale
+    truth, own = _in_shots(project, found.cameras)
+    if len(own) < 3 and found.cameras.gnss is not None:
+        known = np.isfinite(found.cameras.gnss.xyz).all(axis=1)
+        truth = _from_topocentric(found.cameras.gnss.xyz[known], reference, crs)
+        own = found.cameras.centres[known]
+    if len(own) < 3:
+        return moved
+    still_m, moved_m = (
+        np.linalg.norm((guess - truth)[:, :2])
+        for guess in (_from_topocentric(own, reference, crs), moved.points(own))
+    )
+    return unmoved._replace(project_crs=crs) if still_m < 0.5 * moved_m else moved
 
 
 def _reference_of(path: Path) -> tuple[float, float] | None:
@@ -210,64 +231,10 @@ def _reference_of(path: Path) -> tuple[float, float] | None:
 def _in_shots(project: Project, cameras: Cameras) -> tuple[FloatArray, FloatArray]:
     """Return the centres in shots.geojson and ours of the images that are in both."""
     path = project.find(SHOTS)
-    there = _positions(path) if path is not None else {}
+    there = {} if path is None else _shots(path)
     shared = [i for i, label in enumerate(cameras.labels) if label in there]
-    truth = np.array([there[cameras.labels[i]] for i in shared]).reshape(-1, 3)
-    return truth, cameras.centres[shared]
-
-
-def _transformed(
-    path: Path, reference: tuple[float, float, float], crs: str | None
-) -> Frame | None:
-    """Return the frame after geocoords_transformation.txt; None where it is of another origin."""
-    with checks.reading(path):
-        text = path.read_bytes()[:4096].decode("utf-8", errors="replace")
-        rows = [line.split()[:4] for line in text.splitlines() if line.strip()]
-        matrix = np.array(rows, float).reshape(4, 4)
-    turn, shift = matrix[:3, :3], matrix[:3, 3]
-    if not (np.abs(turn.T @ turn - np.eye(3)).max() <= SCALE_TOLERANCE):
-        raise damaged(path, "it does not turn and shift the reconstruction")
-    lat, lon, _ = reference
-    named = _crs_of_place(lon, lat, shift[0], shift[1], [crs] if crs else None)
-    return Frame(turn, shift, named) if named else None
-
-
-def _is_topocentric(
-    project: Project, cameras: Cameras, reference: tuple[float, float, float], moved: Frame
-) -> bool:
-    """Whether a reconstruction with its origin at whole metres was left as OpenSfM made it.
-
-    The centres of shots.geojson tell, or else the GNSS positions, which stay topocentric in any
-    case: the two readings differ by the meridian convergence and the scale.
-    """
-    truth, own = _in_shots(project, cameras)
-    if len(own) < 3 and cameras.gnss is not None:
-        known = np.isfinite(cameras.gnss.xyz).all(axis=1)
-        truth = _from_topocentric(cameras.gnss.xyz[known], reference, moved.crs)
-        own = cameras.centres[known]
-    if len(own) < 3:
-        return False
-    rmse = [
-        np.sqrt(np.mean((guess - truth)[:, :2] ** 2))
-        for guess in (_from_topocentric(own, reference, moved.crs), moved.points(own))
-    ]
-    return bool(rmse[0] < 0.5 * rmse[1])
-
-
-WHOLE_M = 2e-3
-"""Newer ODM puts the origin at whole metres; reference_lla is rounded a little."""
-
-
-def named_crs(path: Path) -> str:
-    """Return the CRS in the first line of a file: a PROJ string, EPSG:n or WGS84 UTM 16N."""
-    text = path.read_bytes()[:4096].decode("utf-8-sig", errors="replace").strip()
-    line = text.splitlines()[0].strip() if text else ""
-    crs = checks.utm_as_code(line)
-    if not checks.names_crs(crs):
-        raise wrong(
-            path, "cameras.crs", f"'{line[:80]}' names no CRS. Put its EPSG code there.", crs=line
-        )
-    return crs
+    truth = [triple(there[cameras.labels[i]]["translation"]) for i in shared]
+    return np.array(truth).reshape(-1, 3), cameras.centres[shared]
 
 
 def _whole_metres(lat: float, lon: float, crs: str | None) -> tuple[str, float, float] | None:
@@ -276,18 +243,19 @@ def _whole_metres(lat: float, lon: float, crs: str | None) -> tuple[str, float, 
     The CRS is the one named, or else UTM, the zone of the reference or one beside it.
     """
     for candidate in [crs] if crs else _zones(lat, lon):
-        east, north = _projected(candidate, lon, lat)
-        if np.hypot(east - np.round(east), north - np.round(north)) < WHOLE_M:
-            return candidate, float(np.round(east)), float(np.round(north))
+        place = _projected(candidate, lon, lat)
+        east, north = np.round(place).tolist()
+        if np.linalg.norm(place - [east, north]) < WHOLE_M:
+            return candidate, east, north
     return None
 
 
 def _crs_of_place(
-    lon: float, lat: float, east: float, north: float, candidates: list[str] | None = None
+    lon: float, lat: float, east: float, north: float, candidates: list[str]
 ) -> str | None:
-    """Return the CRS (by default a UTM zone) in which a place has these coordinates, to a metre."""
-    for candidate in candidates or _zones(lat, lon):
-        if np.hypot(*(_projected(candidate, lon, lat) - np.array([east, north]))) < 1.0:
+    """Return the CRS in which a place has these coordinates, to a metre."""
+    for candidate in candidates:
+        if np.linalg.norm(_projected(candidate, lon, lat) - [east, north]) < 1.0:
             return candidate
     return None
 
@@ -299,10 +267,9 @@ def _from_topocentric(
     from pyproj import Transformer
 
     to_degrees = Transformer.from_crs(GEOCENTRIC_WGS84, GEOGRAPHIC_WGS84, always_xy=True)
-    geographic = np.column_stack(
-        to_degrees.transform(*Topocentric(*reference).to_geocentric(xyz).T)
-    )
-    return np.column_stack([_projected(crs, *geographic[:, :2].T).T, geographic[:, 2]])
+    ecef = Topocentric(*reference).to_geocentric(xyz)
+    geographic = np.column_stack(to_degrees.transform(*ecef.T))
+    return np.column_stack([*_projected(crs, *geographic[:, :2].T), geographic[:, 2]])
 
 
 def _zones(lat: float, lon: float) -> list[str]:
@@ -317,35 +284,30 @@ def _projected(crs: str, lon: float | FloatArray, lat: float | FloatArray) -> Fl
     return np.array(Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(lon, lat))
 
 
-SAME_FOCAL = 1e-6
-GNSS_KEYS = ("longitude", "latitude", "altitude", "gps_xy_stddev", "gps_z_stddev")
-
-
 def _read_shots(project: Project, path: Path) -> Cameras:
     """Read the cameras of shots.geojson, in the projected CRS."""
     with checks.reading(path):
         shots = _shots(path)
         turns = np.array([triple(shot["rotation"]) for shot in shots.values()])
-        centres = np.array(list(_positions(path).values()))
-    labels = tuple(shots)
+        centres = np.array([triple(shot["translation"]) for shot in shots.values()])
+        place = (next(iter(shots.values()))["geometry"] or {}).get("coordinates")
+    labels, crs = tuple(shots), project.crs()
     lenses, notes = _lenses(project, path, shots)
     gnss, listed = read_images(project.find("images.json"), labels)
+    if crs is None and place is not None:  # a project without GNSS has made-up coordinates
+        lon, lat, _ = triple(place).tolist()
+        crs = _crs_of_place(lon, lat, centres[0, 0], centres[0, 1], _zones(lat, lon))
     return Cameras(
         labels=labels,
         centres=centres,
         rotations=from_rotation_vectors(turns),
         lenses=lenses,
-        crs=project.crs() or _crs_of_geometry(shots),
+        crs=crs or "local",
         notes=notes,
         gnss=gnss,
         unposed=opensfm.left_out(labels, listed),
         source="OpenDroneMap",
     )
-
-
-def _positions(path: Path) -> dict[str, FloatArray]:
-    """Return the projection centre of every image of shots.geojson, metres."""
-    return {label: triple(shot["translation"]) for label, shot in _shots(path).items()}
 
 
 def read_images(
@@ -390,9 +352,11 @@ def _shots(path: Path) -> dict[str, dict[str, Any]]:
 def _lenses(
     project: Project, path: Path, shots: dict[str, dict[str, Any]]
 ) -> tuple[tuple[Lens, ...], tuple[PcfixWarning, ...]]:
-    """Return the lens of each shot, and a note where cameras.json does not have it."""
-    beside = project.find("cameras.json")
-    known = {}
+    """Return the lens of each shot, and a note where cameras.json does not have it.
+
+    It is that of the camera that the shot names, or else of the only one that is alike.
+    """
+    beside, known = project.find("cameras.json"), {}
     if beside is not None:
         with checks.reading(beside):
             entries = load_json(beside).items()
@@ -400,43 +364,19 @@ def _lenses(
     lenses, plain = [], 0
     for shot in shots.values():
         width, height, focal = (float(shot[key]) for key in ("width", "height", "focal"))
-        found = _match(known, str(shot.get("camera")), width, height, focal)
-        if found is None:
-            plain += 1
-            focal_px = focal * max(width, height)
-            found = Lens(focal_px, width, height, width / 2.0, height / 2.0)
-        lenses.append(found)
+        scale = max(width, height)
+        alike = [
+            one
+            for one in known.values()
+            if (one.width, one.height) == (width, height)
+            and abs((one.focal + one.b1) / scale - focal) < SAME_FOCAL
+        ]
+        found = known.get(str(shot.get("camera"))) or (alike[0] if len(alike) == 1 else None)
+        plain += found is None
+        lenses.append(found or Lens(focal * scale, width, height, width / 2.0, height / 2.0))
     sentence = (
-        f"{path}: cameras.json has no camera of the size and focal length of {plain} images. Their"
-        " lens is taken as free of distortion."
+        f"cameras.json has no camera of the size and focal length of {plain} images. Their lens"
+        " is taken as free of distortion."
     )
-    note = PcfixWarning("cameras.no_distortion", sentence, images=plain)
-    return tuple(lenses), (note,) if plain else ()
-
-
-def _match(
-    known: dict[str, Lens], name: str, width: float, height: float, focal: float
-) -> Lens | None:
-    """Return the lens of the camera a shot names, or else of the only one that is alike."""
-    if name in known:
-        return known[name]
-    fits = [
-        found
-        for found in known.values()
-        if (found.width, found.height) == (width, height)
-        and abs((found.focal + found.b1) / max(width, height) - focal) < SAME_FOCAL
-    ]
-    return fits[0] if len(fits) == 1 else None
-
-
-def _crs_of_geometry(shots: dict[str, dict[str, Any]]) -> str:
-    """Return the UTM zone that takes a shot's longitude and latitude to its translation.
-
-    A project without GNSS has made-up coordinates, which fit no zone.
-    """
-    shot = next(iter(shots.values()))
-    place = (shot["geometry"] or {}).get("coordinates")
-    if place is None:
-        return "local"
-    (lon, lat, _), (east, north, _) = triple(place), triple(shot["translation"])
-    return _crs_of_place(lon, lat, east, north) or "local"
+    said = note(path, "cameras.no_distortion", sentence, images=plain)
+    return tuple(lenses), (said,) if plain else ()

@@ -30,13 +30,13 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from pcfix.errors import PcfixWarning
+from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.cameras import checks, tracks
-from pcfix.io.cameras.checks import load_json, triple, wrong
+from pcfix.io.cameras.checks import load_json, note, triple
 from pcfix.io.cameras.formats import Source
 from pcfix.io.crs import crs_text, parse_crs, plan_unit
 from pcfix.lens.rotations import from_omega_phi_kappa
-from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, TiePoints
+from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, TiePoints
 
 FORMAT = "application/opf-{}+json"
 PROJECT = FORMAT.format("project")
@@ -68,8 +68,8 @@ def read(source: Source) -> Cameras:
         shot["id"] for capture in given.get("captures", []) for shot in capture.get("cameras", [])
     ]
     if any(shot.get("rolling_shutter") for shot in shots.values()):
-        sentence = f"{path}: its rolling shutter is ignored, each image has one pose."
-        notes += (PcfixWarning("cameras.rolling_shutter", sentence, path=path),)
+        sentence = "its rolling shutter is ignored, each image has one pose."
+        notes += (note(path, "cameras.rolling_shutter", sentence),)
     return Cameras(
         labels=labels,
         centres=frame.enter(xyz),
@@ -130,7 +130,7 @@ def _open_project(path: Path) -> Project:
             f"belongs to an OPF project, of which {len(found)} are there. Give the project file"
             " (.opf) that goes with the cloud."
         )
-        raise wrong(path, "cameras.several_projects", sentence, projects=len(found))
+        raise bad_file(path, "cameras.several_projects", sentence, projects=len(found))
     return _open_project(found[0])
 
 
@@ -172,15 +172,13 @@ def _frame_of(project: Project) -> Frame:
     said = checks.crs(path, scene["crs"]["definition"])
     crs, unit = (said, 1.0) if said == "local" else _with_heights(said, str(path))
     geoid_m = float(scene["crs"].get("geoid_height") or 0.0)
-    notes: tuple[PcfixWarning, ...] = ()
-    if geoid_m:
-        sentence = (
-            f"{path}: its heights are above a constant geoid, {geoid_m:g} m over the ellipsoid, and"
-            " taken for those that its CRS names."
-        )
-        notes = (PcfixWarning("cameras.constant_geoid", sentence, geoid_m=geoid_m),)
+    sentence = (
+        f"its heights are above a constant geoid, {geoid_m:g} m over the ellipsoid, and taken for"
+        " those that its CRS names."
+    )
+    geoid = note(path, "cameras.constant_geoid", sentence, geoid_m=geoid_m)
     project_crs = None if crs == said else said
-    return Frame(crs, project_crs, shift, scale / [1.0, 1.0, unit], notes)
+    return Frame(crs, project_crs, shift, scale / [1.0, 1.0, unit], (geoid,) if geoid_m else ())
 
 
 def _with_heights(text: str, name: str) -> tuple[str, float]:
@@ -257,15 +255,6 @@ MATCHES = "OPF_mesh_primitive_matches"
 OFFSET_BITS = 40
 
 
-class Matches(NamedTuple):
-    """Points of a node, and of each match its point, its camera (-1: not posed) and its place."""
-
-    xyz: FloatArray
-    point: IntArray
-    camera: IntArray
-    uv: FloatArray
-
-
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """Read the tracks of the calibration."""
     project = _open_project(source.path)
@@ -275,16 +264,11 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     found = [node for model in models for node in _nodes(model, row_of)]
     if not any((node.camera >= 0).any() for node in found):
         raise tracks.no_tie_points(project.path, "its calibration has no tracks in its images")
-    before = np.cumsum([0, *(len(node.xyz) for node in found)])
-    return tracks.tie_points(
-        _frame_of(project).enter(np.concatenate([node.xyz for node in found])),
-        np.concatenate([node.point + n for node, n in zip(found, before, strict=False)]),
-        np.concatenate([node.camera for node in found]),
-        np.concatenate([node.uv for node in found]),
-    )
+    frame = _frame_of(project)
+    return tracks.tie_points(*(node._replace(xyz=frame.enter(node.xyz)) for node in found))
 
 
-def _nodes(path: Path, row_of: dict[int, int]) -> Iterator[Matches]:
+def _nodes(path: Path, row_of: dict[int, int]) -> Iterator[tracks.Seen]:
     """Yield the points and matches of the nodes of a model."""
     if not path.is_file():
         raise checks.missing(path)
@@ -297,30 +281,21 @@ def _nodes(path: Path, row_of: dict[int, int]) -> Iterator[Matches]:
                 if "pixelCoordinates" in images:
                     xyz = _accessor(path, model, primitive["attributes"]["POSITION"], 3)
                     uv = _accessor(path, model, images["pixelCoordinates"], 2)
-                    at, point, camera = _matched(path, model, matches, row_of)
-                    if len(point) and point.max() >= len(xyz):
-                        raise checks.damaged(path, "its matches are of points that are not there")
+                    ranges = _accessor(path, model, matches["pointIndexRanges"], 2)
+                    packed = ranges.astype("<u4").view("<u8")[:, 0]
+                    first = (packed & np.uint64(2**OFFSET_BITS - 1)).astype(np.int64)
+                    count = (packed >> np.uint64(OFFSET_BITS)).astype(np.int64)
+                    index = _accessor(path, model, matches["cameraIds"], 1)[:, 0].astype(np.int64)
+                    rows = np.array([row_of.get(i, -1) for i in matches["cameraUids"]], np.int64)
+                    if (first + count > len(index)).any() or len(count) > len(xyz):
+                        raise checks.damaged(path, "its points have more matches than there are")
+                    point = np.repeat(np.arange(len(count)), count)
+                    before = np.repeat(first - (np.cumsum(count) - count), count)
+                    at = np.arange(len(point)) + before
                     matrix = np.array(node.get("matrix", np.eye(4).ravel()), float).reshape(4, 4).T
                     x, y, z = (xyz.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]).T
                     z_up = np.column_stack([x, -z, y])  # the model itself has y up
-                    yield Matches(z_up, point, camera, uv[at].astype(np.float64))
-
-
-def _matched(
-    path: Path, model: Part, matches: Part, row_of: dict[int, int]
-) -> tuple[IntArray, IntArray, IntArray]:
-    """Return the rows of matches that points have, which point each is of, and its camera."""
-    ranges = _accessor(path, model, matches["pointIndexRanges"], 2).astype(np.uint64)
-    packed = ranges[:, 0] | ranges[:, 1] << np.uint64(32)
-    first = (packed & np.uint64(2**OFFSET_BITS - 1)).astype(np.int64)
-    count = (packed >> np.uint64(OFFSET_BITS)).astype(np.int64)
-    index = _accessor(path, model, matches["cameraIds"], 1)[:, 0].astype(np.int64)
-    rows = np.array([row_of.get(i, -1) for i in matches["cameraUids"]], np.int64)
-    if (first + count > len(index)).any():  # before so many are asked for
-        raise checks.damaged(path, "its points have more matches than there are")
-    point = np.repeat(np.arange(len(count)), count)
-    at = np.arange(len(point)) + np.repeat(first - (np.cumsum(count) - count), count)
-    return at, point, rows[index[at]]
+                    yield tracks.Seen(z_up, point, rows[index[at]], uv[at].astype(np.float64))
 
 
 def _accessor(path: Path, model: Part, index: int, width: int) -> Any:

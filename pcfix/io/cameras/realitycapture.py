@@ -28,7 +28,6 @@ to check any of this.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -95,16 +94,21 @@ def read(source: Source) -> Cameras:
     posed = [image for image in images if {"Rotation", "Position"} <= image.fields.keys()]
     if not posed:
         raise checks.no_pose(path, "has no xcr:Rotation and xcr:Position")
-    frames = _frames(source, folder, posed)
+    sensor = source.sensor or folder / "sensor.csv"
+    lens = read_sensor(sensor) if source.sensor or sensor.is_file() else None
+    given = None if lens is None else (lens.width, lens.height)
+    found = [image_size(folder, image.label) or given for image in posed]
+    frames = [frame for frame in found if frame is not None]
+    known = len(frames) == len(posed)
     why = "the size of the images is not in XMP files; put the images beside them or give --sensor"
     relative = any(image.fields.get("Coordinates", "absolute") != "absolute" for image in posed)
     return Cameras(
         labels=tuple(image.label for image in posed),
         centres=np.array([image.numbers("Position", 3) for image in posed]),
         rotations=np.array([image.numbers("Rotation", 9).reshape(3, 3) for image in posed]),
-        lenses=None if frames is None else tuple(map(_lens, posed, frames)),
+        lenses=tuple(map(_lens, posed, frames)) if known else None,
         crs="local" if relative else None,
-        notes=() if frames else (checks.without_lens(path, why),),
+        notes=() if known else (checks.without_lens(path, why),),
         unposed=tuple(image.label for image in images if image not in posed),
         source="RealityCapture",
     )
@@ -131,19 +135,6 @@ def _fields(path: Path) -> dict[str, str]:
             if name.startswith("{" + NAMESPACE):
                 fields[name.partition("}")[2]] = (text or "").strip()
     return fields
-
-
-def _frames(
-    source: Source, folder: Path, images: list[Image]
-) -> Sequence[tuple[float, float]] | None:
-    """Return width and height of each image; None when one of them is not known."""
-    beside = folder / "sensor.csv"
-    sensor = source.sensor or (beside if beside.is_file() else None)
-    lens = None if sensor is None else read_sensor(sensor)
-    given = None if lens is None else (lens.width, lens.height)
-    frames = [image_size(folder, image.label) or given for image in images]
-    known = [frame for frame in frames if frame is not None]
-    return known if len(known) == len(images) else None
 
 
 def _lens(image: Image, frame: tuple[float, float]) -> Lens:

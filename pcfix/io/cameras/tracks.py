@@ -9,11 +9,16 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.errors import NoTiePointsError, PcfixWarning
-from pcfix.io.cameras.checks import damaged, without_lens
+from pcfix.io.cameras.checks import damaged, note, without_lens
 from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, TiePoints, Views
 
 _BEFORE_VIEWS = 7
 """Numbers of a point before its views: x, y, z, red, green, blue, count of views."""
+_SAME_CAMERA = 1.1
+"""Largest ratio between the focal lengths of neighbours among images of one camera."""
+NO_TIE_POINTS = TiePoints(
+    np.empty((0, 3)), Views(np.zeros(1, np.int64), np.empty(0, np.int64)), np.empty((0, 2))
+)
 
 
 def no_tie_points(path: Path, why: str) -> NoTiePointsError:
@@ -22,8 +27,61 @@ def no_tie_points(path: Path, why: str) -> NoTiePointsError:
     return NoTiePointsError("cameras.no_tie_points", sentence, path=path)
 
 
+class Seen(NamedTuple):
+    """Points, and observations of them in any order: row of the point and camera, u and v.
+
+    The camera -1 is one without a pose.
+    """
+
+    xyz: FloatArray
+    point: IntArray
+    camera: IntArray
+    uv: FloatArray
+
+
+def tie_points(*parts: Seen) -> TiePoints:
+    """Join points and gather their observations by point, without those of a camera -1."""
+    before = np.cumsum([0, *(len(part.xyz) for part in parts)])
+    xyz = np.concatenate([part.xyz for part in parts])
+    point = np.concatenate([part.point + n for part, n in zip(parts, before, strict=False)])
+    camera = np.concatenate([part.camera for part in parts])
+    uv = np.concatenate([part.uv for part in parts])
+    kept = np.flatnonzero(camera >= 0)
+    kept = kept[np.argsort(point[kept], kind="stable")]
+    start = np.concatenate([[0], np.cumsum(np.bincount(point[kept], minlength=len(xyz)))])
+    return TiePoints(xyz, Views(start, camera[kept]), uv[kept])
+
+
+def finite(path: Path, ties: TiePoints) -> tuple[TiePoints, PcfixWarning | None]:
+    """Return tie points without those that are not finite, and a note on how many these were.
+
+    A point without any coordinate is one that the source has not placed, and stays.
+    """
+    kept = np.asarray(np.isfinite(ties.xyz).all(axis=1) | np.isnan(ties.xyz).all(axis=1))
+    seen = np.isfinite(ties.image_xy).all(axis=1)
+    if kept.all() and seen.all():
+        return ties, None
+    point = np.repeat(np.arange(len(ties.xyz)), np.diff(ties.views.start))
+    rows = np.flatnonzero(seen & kept[point])
+    number = np.cumsum(kept) - 1
+    left = Seen(ties.xyz[kept], number[point[rows]], ties.views.camera[rows], ties.image_xy[rows])
+    points, observations = int((~kept).sum()), int((~seen).sum())
+    sentence = (
+        f"{points:,} tie points and {observations:,} observations have a number that is not"
+        " finite. They are left out."
+    )
+    code = "cameras.tie_points_not_finite"
+    return tie_points(left), note(path, code, sentence, points=points, observations=observations)
+
+
+def are_seen(tie_points: TiePoints) -> BoolArray:
+    """Return which points have a position and a view."""
+    seen = np.diff(tie_points.views.start) > 0
+    return np.asarray(np.isfinite(tie_points.xyz).all(axis=1) & seen)
+
+
 class PointList(NamedTuple):
-    """Points and views as a file lists them.
+    """Points and views as Bundler and VisualSFM list them.
 
     `xyz` has a row per point; `point`, `image` and `rest` have one per view: which point, which
     image (counted from 0), and the other numbers of the view.
@@ -33,6 +91,14 @@ class PointList(NamedTuple):
     point: IntArray
     image: IntArray
     rest: FloatArray
+
+    def seen(self, posed: IntArray, cameras: Cameras, places: FloatArray) -> TiePoints:
+        """Return tie points; `places` are from the principal points, `posed` rows of the images."""
+        row = np.full(max(posed.max(), self.image.max(initial=0)) + 1, -1)
+        row[posed] = np.arange(len(cameras))
+        camera = row[self.image]
+        middle = [(lens.principal_x, lens.principal_y) for lens in cameras.lenses or ()]
+        return tie_points(Seen(self.xyz, self.point, camera, np.array(middle)[camera] + places))
 
 
 def numbers(text: str) -> FloatArray:
@@ -67,79 +133,15 @@ def point_list(path: Path, body: FloatArray, count: int, images: int, width: int
     return PointList(xyz, point, image.astype(np.int64), rest)
 
 
-def tie_points(xyz: FloatArray, point: IntArray, camera: IntArray, uv: FloatArray) -> TiePoints:
-    """Gather observations (o rows, in any order) by point, without those of a camera -1."""
-    kept = np.flatnonzero(camera >= 0)
-    kept = kept[np.argsort(point[kept], kind="stable")]
-    counts = np.bincount(point[kept], minlength=len(xyz))
-    start = np.concatenate([[0], np.cumsum(counts)])
-    return TiePoints(xyz, Views(start, camera[kept]), uv[kept])
-
-
-def finite(path: Path, ties: TiePoints) -> tuple[TiePoints, PcfixWarning | None]:
-    """Return tie points without those that are not finite, and a note on how many these were.
-
-    A point without any coordinate is one that the source has not placed, and stays.
-    """
-    placed, unplaced = np.isfinite(ties.xyz).all(axis=1), np.isnan(ties.xyz).all(axis=1)
-    kept: BoolArray = np.asarray(placed | unplaced)
-    point = np.repeat(np.arange(len(ties.xyz)), np.diff(ties.views.start))
-    seen = np.isfinite(ties.image_xy).all(axis=1)
-    if kept.all() and seen.all():
-        return ties, None
-    rows = np.flatnonzero(seen & kept[point])
-    number = np.cumsum(kept) - 1
-    left = tie_points(
-        ties.xyz[kept], number[point[rows]], ties.views.camera[rows], ties.image_xy[rows]
-    )
-    points, observations = int((~kept).sum()), int((~seen).sum())
-    return left, PcfixWarning(
-        "cameras.tie_points_not_finite",
-        f"{path}: {points:,} tie points and {observations:,} observations have a number that is not"
-        " finite. They are left out.",
-        points=points,
-        observations=observations,
-    )
-
-
-def from_principal_point(
-    points: PointList, posed: IntArray, cameras: Cameras, places: FloatArray
-) -> TiePoints:
-    """Gather views by point; `places` are from the principal points, `posed` rows of the images."""
-    row = np.full(max(posed.max(), points.image.max(initial=0)) + 1, -1)
-    row[posed] = np.arange(len(cameras))
-    camera = row[points.image]
-    lenses = cameras.lenses or ()
-    middle = np.array([[lens.principal_x, lens.principal_y] for lens in lenses])
-    return tie_points(points.xyz, points.point, camera, middle[camera] + places)
-
-
-NO_TIE_POINTS = TiePoints(
-    np.empty((0, 3)), Views(np.zeros(1, np.int64), np.empty(0, np.int64)), np.empty((0, 2))
-)
-
-
-def are_seen(tie_points: TiePoints) -> BoolArray:
-    """Return which points have a position and a view."""
-    seen = np.diff(tie_points.views.start) > 0
-    return np.asarray(np.isfinite(tie_points.xyz).all(axis=1) & seen)
-
-
-_SAME_CAMERA = 1.1
-"""Largest ratio between the focal lengths of neighbours among images of one camera."""
-
-
 def frame_sizes(
     path: Path, names: Sequence[str], focal_px: FloatArray, smallest_px: FloatArray
 ) -> tuple[FloatArray | None, tuple[PcfixWarning, ...]]:
     """Return width and height of images, from the images themselves or from their tie points.
 
     Where an image cannot be opened, its frame is the smallest that holds all tie points that
-    images of about the same focal length have, about the middle of the frame.
-
-    Images are looked for where the camera file lies, one folder up, and in ``images``.
-    `smallest_px`, shape (k, 2), is the smallest width and height that hold the tie points of an
-    image, 0 where it has none. None where nothing tells the frames.
+    images of about the same focal length have, about the middle of the frame. `smallest_px`, shape
+    (k, 2), is the width and height that hold those of an image, 0 where it has none. None where
+    nothing tells the frames.
     """
     sizes = np.array([image_size(path.parent, name) or (0, 0) for name in names], float)
     missing = sizes[:, 0] == 0
@@ -156,18 +158,18 @@ def frame_sizes(
         bounds[members] = bound if bound.all() else smallest_px.max(axis=0)
     sizes[missing] = bounds[missing]
     first = sizes[missing][0].tolist()
-    note = PcfixWarning(
-        "cameras.frames_estimated",
-        f"{path}: {why}. Their frames are estimated from the tie points, the first as"
-        f" {first[0]:.0f} x {first[1]:.0f} px; put the images beside the file.",
-        images=int(missing.sum()),
-        size_px=first,
+    sentence = (
+        f"{why}. Their frames are estimated from the tie points, the first as {first[0]:.0f} x"
+        f" {first[1]:.0f} px; put the images beside the file."
     )
-    return sizes, (note,)
+    return sizes, (note(path, "cameras.frames_estimated", sentence, size_px=first),)
 
 
 def image_size(folder: Path, name: str) -> tuple[int, int] | None:
-    """Return width and height of an image, None when it is not there or cannot be opened."""
+    """Return width and height of an image, None when it is not there or cannot be opened.
+
+    It is looked for in the folder, one folder up, and in ``images``.
+    """
     from PIL import Image
 
     plain = name.replace("\\", "/")

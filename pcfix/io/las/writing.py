@@ -24,7 +24,7 @@ from laspy.vlrs.vlr import VLR
 from pyproj import CRS
 
 from pcfix.errors import InputError, SettingError
-from pcfix.io.drafts import cannot_write, replaced_when_whole
+from pcfix.io.atomic import cannot_write, temporary_output
 from pcfix.io.files import parse_json
 from pcfix.io.las.columns import Column, column_scale, upgraded
 from pcfix.io.las.part import part_report
@@ -356,7 +356,7 @@ class LasSink:
     def __enter__(self) -> LasSink:
         laz = check_suffix(self._path)
         with ExitStack() as stack:
-            draft = stack.enter_context(replaced_when_whole(self._path))
+            draft = stack.enter_context(temporary_output(self._path))
             self._draft = draft
             stack.enter_context(self._write_errors())
             self._stream = stack.enter_context(draft.open("w+b"))

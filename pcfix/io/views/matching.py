@@ -11,7 +11,8 @@ chunk.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from copy import copy
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from pcfix.io.views.lists import ViewList
 from pcfix.io.views.orders import entries, fitted
 from pcfix.lens.frames import beside_frames
 from pcfix.model import Cameras, FloatArray, IntArray, Views
-from pcfix.sums import Sums
+from pcfix.sums import LEAST, SAME, Sums
 
 _QUERIES = 250_000
 """Points looked up at a time, which bounds the memory."""
@@ -80,6 +81,11 @@ class ViewMatch:
             )
         self._note_order()
 
+    @property
+    def view_list(self) -> ViewList:
+        """The view list."""
+        return self._views
+
     def _note_order(self) -> None:
         order = self._views.orders[0]
         shares = (self.report.share_seen, self._views.share_seen)
@@ -106,6 +112,28 @@ class ViewMatch:
         self.report.beside_entries += int(apart.sum())
         self.report.beside_points += int(np.count_nonzero(apart))
         return views
+
+    def counted(self, xyz: FloatArray, first_row: int) -> tuple[Views, ViewReport]:
+        """Return the cameras of a chunk's points, and the counts of its matches only, no notes."""
+        one = self._anew()
+        views = one.for_chunk(xyz, first_row)
+        self._tree = one._tree  # it takes long to build
+        return views, one.report
+
+    def settled(self, xyz: FloatArray) -> ViewMatch:
+        """Return the match with the order of the images that the first points show."""
+        one = self._anew()
+        one.for_chunk(xyz, 0)
+        one.report = replace(self.report)
+        one._note_order()
+        return one
+
+    def _anew(self) -> ViewMatch:
+        """Return a match that counts from zero."""
+        one = copy(self)
+        none = np.zeros(_BINS + 1, np.int64)
+        one.report = replace(self.report, notes=[], _histogram=none)
+        return one
 
     def _rows(self, xyz: FloatArray, first_row: int, listed: FloatArray) -> IntArray:
         """Return the list's row of each point, -1 if it has none."""
@@ -154,17 +182,15 @@ class ViewMatch:
 class ViewReport(Sums):
     """Counts of the matches so far."""
 
-    added = (
-        *("by_row", "by_position", "unmatched", "without_camera"),
-        *("entries", "unposed_entries", "beside_entries", "beside_points", "_histogram"),
-    )
-    least = ("share_seen",)
-
-    source: str  # kind and path of the list
-    list_points: int
-    image_order: str = ""  # the source of the order of the images
-    share_seen: float | None = None  # see `ViewList`, the lowest of all chunks
-    tolerance_m: float | None = None  # largest distance of a match by position
+    source: str = field(metadata=SAME)  # kind and path of the list
+    list_points: int = field(metadata=SAME)
+    image_order: str = field(default="", metadata=SAME)  # the source of the order of the images
+    share_seen: float | None = field(
+        default=None, metadata=LEAST
+    )  # see `ViewList`, the lowest of all chunks
+    tolerance_m: float | None = field(
+        default=None, metadata=SAME
+    )  # largest distance of a match by position
     by_row: int = 0  # points of the cloud, as the next two
     by_position: int = 0
     unmatched: int = 0
@@ -173,9 +199,11 @@ class ViewReport(Sums):
     unposed_entries: int = 0  # images without a pose, which are ignored
     beside_entries: int = 0  # cameras that cannot have imaged their point, which are ignored
     beside_points: int = 0  # points that these are listed for
-    unposed: tuple[str, ...] = ()  # images without a pose that a list may name
-    weights: bool = False
-    notes: list[PcfixWarning] = field(default_factory=list)
+    unposed: tuple[str, ...] = field(
+        default=(), metadata=SAME
+    )  # images without a pose that a list may name
+    weights: bool = field(default=False, metadata=SAME)
+    notes: list[PcfixWarning] = field(default_factory=list, metadata=SAME)
     _histogram: IntArray = field(default_factory=lambda: np.zeros(_BINS + 1, np.int64), repr=False)
 
     @property

@@ -145,6 +145,7 @@ def test_principal_point(tmp_path, principal, orientation, expected):
     assert (lens.principal_x, lens.principal_y) == pytest.approx(expected)
 
 
+EQUIDISTANT = "<CameraModelType>Fisheye</CameraModelType>"
 MATRIX = (
     "<FisheyeFocalMatrix><M_00>1960</M_00><M_01>2</M_01><M_10>-3</M_10><M_11>1970</M_11>"
     "</FisheyeFocalMatrix>"
@@ -156,23 +157,19 @@ POLYNOMIAL = (
 
 
 @pytest.mark.parametrize("direction", [(0.3, 0.4, 1.0), (-2.0, 1.0, 0.1)])
-def test_fisheye(tmp_path, direction):
-    head = GROUP + "<CameraModelType>Fisheye</CameraModelType>" + MATRIX + POLYNOMIAL
-    lens = read(write(tmp_path, simple(photo(), head=head))).lenses[0]
+@pytest.mark.parametrize("with_matrix", [True, False])
+def test_fisheye(tmp_path, direction, with_matrix):
+    """Without the matrix it is equidistant: pi / 2 times the focal length."""
+    more = MATRIX + POLYNOMIAL if with_matrix else ""
+    lens = read(write(tmp_path, simple(photo(), head=GROUP + EQUIDISTANT + more))).lenses[0]
     x, y, z = direction
     q = 2 / np.pi * np.arctan2(np.hypot(x, y), z)
     rho = q + 0.02 * q**2 - 0.1 * q**3 + 0.01 * q**4
-    xd, yd = rho * np.array([x, y]) / np.hypot(x, y)
-    expected = (3010.5 + 1960 * xd + 2 * yd, 1990.5 - 3 * xd + 1970 * yd)
+    m = np.array([[1960, 2], [-3, 1970]])
+    if not with_matrix:
+        rho, m = q, np.pi / 2 * 4000 * np.eye(2)
+    expected = [3010.5, 1990.5] + m @ (rho * np.array([x, y]) / np.hypot(x, y))
     assert project(lens, np.array([direction]))[0] == pytest.approx(expected)
-
-
-def test_fisheye_without_matrix_is_equidistant(tmp_path):
-    head = GROUP + "<CameraModelType>Fisheye</CameraModelType>"
-    lens = read(write(tmp_path, simple(photo(), head=head))).lenses[0]
-    angle = 1.1
-    uv = project(lens, np.array([[np.sin(angle), 0.0, np.cos(angle)]]))[0]
-    assert uv == pytest.approx([3010.5 + 4000 * angle, 1990.5])
 
 
 def test_photos_without_a_pose_in_the_block_are_left_out(tmp_path):
@@ -217,17 +214,15 @@ def test_positions_alone(tmp_path):
         ("ENU:47.5,8.25", "ENU:47.5,8.25,0"),
         ("ENU:47.5,8.25,410.5", "ENU:47.5,8.25,410.5"),
         ("Local", "local"),
+        ("", "local"),
         ('LOCAL_CS["Local coordinates",UNIT["m",1.0]]', "local"),
     ],
 )
 def test_reference_systems(tmp_path, definition, crs):
     systems = SRS.replace("EPSG:32632", definition)
-    text = document(block(group(photo())), systems=systems)
+    block_srs = "<SRSId>3</SRSId>" if definition else ""
+    text = document(block(group(photo()), srs=block_srs), systems=systems)
     assert read(write(tmp_path, text)).crs == crs
-
-
-def test_block_without_reference_system_is_local(tmp_path):
-    assert read(write(tmp_path, document(block(group(photo()), srs="")))).crs == "local"
 
 
 def test_gps_of_exif(tmp_path):

@@ -104,7 +104,6 @@ def test_list_of_other_images(tmp_path):
     (tmp_path / "list.txt").write_text("one.jpg\n")
     cameras = read(path)
     assert cameras.labels == ("camera 0",)
-    assert "cameras.list_unused" in notes(cameras)
 
 
 def test_mve_with_its_images(tmp_path):

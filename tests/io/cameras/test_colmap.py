@@ -131,7 +131,7 @@ def test_largest_of_several_models(tmp_path):
     folder(tmp_path / "sparse/1")
     cameras = read(tmp_path)
     assert len(cameras) == 3
-    assert cameras.notes[0].values == {"models": 2, "images": 3}
+    assert cameras.notes[0].values.items() >= {"models": 2, "images": 3}.items()
 
 
 def test_tie_points_that_are_not_finite(tmp_path):

@@ -13,14 +13,7 @@ from pcfix.errors import InputError
 from pcfix.io.cameras.georeference import georeference
 from pcfix.model import Cameras, GnssPositions
 from tests.utils.codes import refused
-from tests.utils.reprojection import bring_to, check_file
-from tests.utils.shared import needs
-
-UCLM, uclm = needs("cameras", "metashape", "uclm_sorolla")
-WHEAT, wheat = needs("cameras", "metashape", "easyidp_wheat_psx")
-DULUTH, duluth = needs("cameras", "odm", "testerarm_sub0")
-BERLIN, berlin = needs("cameras", "opensfm", "berlin")
-BANGKOK, bangkok = needs("cameras", "pix4d", "ca502_oblique5")
+from tests.utils.reprojection import bring_to
 
 FOCAL_PX, FRAME_PX, BELOW_M = 3650.0, 4000.0, 100.0
 NADIR = np.diag([1.0, -1.0, -1.0])
@@ -71,42 +64,12 @@ def image_px(rotation, centre, points):
 # ---- centres ----
 
 
-@uclm
-def test_geocentric_positions_of_metashape_on_a_map():
-    truth = check_file(UCLM)["projection_centres"]
-    read = cameras([t["ECEF"] for t in truth], "EPSG:4936", project_crs=UTM30)
-    found = bring_to(read, UTM30)
-    assert found.centres == pytest.approx(
-        np.array([[t["X"], t["Y"], t["Z"]] for t in truth]), abs=1e-3
-    )
-    assert (found.crs, found.project_crs, found.notes) == (UTM30, None, ())
-
-
-@berlin
-def test_a_topocentric_block_of_opensfm_by_closed_formulas():
-    report = check_file(BERLIN)
-    lla, truth = report["reference_lla"], report["projection_centres"]
-    enu = np.array([[t["X"], t["Y"], t["Z"]] for t in truth])
-    lat, lon, h = lla["latitude"], lla["longitude"], lla["altitude"]
-    f = 1 / 298.257223563
-    ecef = geocentric(lon, lat, h, f=f) + enu @ east_north_up(lon, lat)
-    to_map = Transformer.from_crs("EPSG:4978", CRS("EPSG:32633").to_3d(), always_xy=True)
-    found = bring_to(cameras(enu, f"ENU:{lat},{lon},{h}"), "EPSG:32633")
-    assert found.centres == pytest.approx(np.column_stack(to_map.transform(*ecef.T)), abs=1e-5)
-
-
 def test_feet_become_metres_heights_too():
     to_feet = Transformer.from_crs("EPSG:26910", "EPSG:2992", always_xy=True)
     x, y = to_feet.transform(500000.0, 4900000.0)
     found = bring_to(cameras([x, y, 1000.0], "EPSG:2992"), "EPSG:26910", name="a.xml")
     assert found.centres[0] == pytest.approx([500000.0, 4900000.0, 304.8], abs=1e-3)
     assert [note.code for note in found.notes] == ["cameras.heights_assumed"]
-
-
-def test_stated_heights_in_feet_become_metres():
-    read = cameras([500000.0, 4900000.0, 1000.0], "EPSG:26910+6360")
-    found = bring_to(read, "EPSG:26910+5703")
-    assert found.centres[0] == pytest.approx([500000.0, 4900000.0, 1200000.0 / 3937.0], abs=1e-9)
 
 
 @pytest.mark.parametrize("code", ["EPSG:2193", "EPSG:31467", "EPSG:2180"])
@@ -149,6 +112,20 @@ def test_bound_and_esri_wkt_are_the_crs_they_hold():
         assert found.notes == ()
 
 
+@pytest.mark.parametrize(
+    ("crs", "given", "offset"),
+    [
+        (None, None, (0, 0, 0)),  # a file that says nothing is in the cloud's CRS
+        ("EPSG:32631", "EPSG:25830", (0, 0, 0)),  # the option overrides the file
+        ("EPSG:4978", "local", (1, 2, 3)),  # the numbers as they are
+    ],
+)
+def test_numbers_of_the_cloud(crs, given, offset):
+    found = bring_to(cameras(VALENCIA, crs), UTM30, cameras_crs=given, offset_m=offset)
+    assert found.centres[0] == pytest.approx(np.add(VALENCIA, offset), abs=1e-9)
+    assert (found.crs, found.notes) == (UTM30, ())
+
+
 def test_the_same_crs_changes_no_bit():
     rotation = Rotation.from_euler("xyz", [170.0, 8.0, 33.0], degrees=True).as_matrix()[None]
     for crs in (UTM30, None, UTM30_ALICANTE):
@@ -178,12 +155,6 @@ def test_tie_points_go_the_same_way_and_unknown_ones_stay_unknown():
     assert found[0] == pytest.approx(there.cameras(read).centres[0], abs=1e-9)
     assert np.isnan(found[[1, 3]]).any(axis=1).all()
     assert np.isfinite(found[2]).all()
-
-
-def test_gnss_positions_stay_where_they_were_said_to_be():
-    gnss = GnssPositions(np.array([VALENCIA_LON_LAT]), np.full((1, 3), 0.02), "EPSG:4258")
-    found = bring_to(cameras(VALENCIA, "EPSG:32630", gnss=gnss), UTM30)
-    assert found.gnss is gnss
 
 
 # ---- rotations ----
@@ -380,11 +351,6 @@ def test_with_the_geoid_installed_heights_are_brought_over(tmp_path):
         assert notes == "()"
 
 
-def test_two_vertical_datums_need_their_grids():
-    with pytest.raises(InputError):
-        bring_to(cameras(VALENCIA, "EPSG:32630+5773"), UTM30_ALICANTE)
-
-
 def test_ellipsoidal_heights_stay_where_nobody_says_more():
     found = bring_to(cameras(VALENCIA_LON_LAT, "EPSG:4937"), UTM30, name="a.txt")
     assert found.centres[0, 2] == 142.48
@@ -423,11 +389,6 @@ def test_heights_of_the_file_name_those_of_the_cloud():
 # ---- who says what ----
 
 
-def test_a_file_that_says_nothing_is_in_the_clouds_crs():
-    found = bring_to(cameras(VALENCIA, None), CRS(UTM30))
-    assert (found.crs, found.notes) == (UTM30, ())
-
-
 @pytest.mark.parametrize("crs", ["local", LOCAL_CS])
 def test_a_local_frame_is_refused_unless_told_so(crs):
     with refused("cameras.local"):
@@ -444,16 +405,6 @@ def test_a_local_cloud_takes_local_cameras_and_no_others():
         with refused("cloud.local"):
             bring_to(cameras(VALENCIA, crs), LOCAL_CS)
     assert bring_to(cameras(VALENCIA, UTM30), LOCAL_CS, cameras_crs="local").crs
-
-
-def test_local_means_the_numbers_as_they_are():
-    found = bring_to(cameras(VALENCIA, "EPSG:4978"), UTM30, cameras_crs="local", offset_m=(1, 2, 3))
-    assert found.centres[0] == pytest.approx(np.add(VALENCIA, [1, 2, 3]))
-
-
-def test_the_option_overrides_the_file():
-    found = bring_to(cameras(VALENCIA, "EPSG:32631"), UTM30, cameras_crs="EPSG:25830")
-    assert found.centres[0].tolist() == VALENCIA
 
 
 def test_without_the_clouds_crs():
@@ -491,6 +442,7 @@ def test_without_the_clouds_crs_no_map_is_chosen(at, crs, more):
         (VALENCIA, "EPSG:4978", UTM30, "cameras.geocentric"),
         (VALENCIA, "EPSG:4326+5773", UTM30, "cameras.degrees"),
         ([1e30, 1e30, 5.0], "EPSG:32631", UTM30, "cameras.not_transformed"),
+        (VALENCIA, "EPSG:32630+5773", UTM30_ALICANTE, "crs.heights"),
     ],
 )
 def test_refused(at, crs, cloud, code):
@@ -514,17 +466,14 @@ def test_no_crs_for_cameras(crs, cloud):
         bring_to(cameras(VALENCIA, crs, NADIR[None]), cloud, name="a.xml")
 
 
-def test_an_option_that_is_no_crs():
-    with pytest.raises(InputError):
-        bring_to(cameras(VALENCIA, None), UTM30, cameras_crs="EPSG:0")
-
-
-@pytest.mark.parametrize("offset", [(1.0, 2.0), (np.nan, 0.0, 0.0)])
-def test_an_offset_that_is_none(offset):
+@pytest.mark.parametrize(
+    ("at", "crs", "offset"),
+    [
+        (VALENCIA, None, (1.0, 2.0)),
+        (VALENCIA, None, (np.nan, 0.0, 0.0)),
+        (VALENCIA_LON_LAT, "EPSG:4326", (1.0, 0.0, 0.0)),
+    ],
+)
+def test_offset_refused(at, crs, offset):
     with refused("cameras.offset"):
-        bring_to(cameras(VALENCIA, None), UTM30, offset_m=offset)
-
-
-def test_no_metres_on_degrees():
-    with refused("cameras.offset"):
-        bring_to(cameras(VALENCIA_LON_LAT, "EPSG:4326"), UTM30, offset_m=(1.0, 0.0, 0.0))
+        bring_to(cameras(at, crs), UTM30, offset_m=offset)

@@ -134,7 +134,7 @@ def test_largest_of_several_models_and_the_rest(tmp_path):
     cameras = read(path)
     assert cameras.labels == ("a.jpg", "b.jpg")
     assert cameras.unposed == ("small.jpg", "lost.jpg", "x.jpg", "y.jpg")
-    assert cameras.notes[0].values == {"models": 2, "images": 2}
+    assert cameras.notes[0].values.items() >= {"models": 2, "images": 2}.items()
     points = read_ties(path)
     assert set(points.views.camera.tolist()) == {1}
 

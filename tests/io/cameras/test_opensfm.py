@@ -180,7 +180,7 @@ def test_largest_of_several_reconstructions(tmp_path):
     cameras = read(tmp_path, small, large)
     assert cameras.labels == ("a.jpg", "b.jpg")
     assert cameras.unposed == ("x.jpg", "z.jpg")
-    assert cameras.notes[0].values == {"models": 2, "images": 2}
+    assert cameras.notes[0].values.items() >= {"models": 2, "images": 2}.items()
 
 
 def test_reference_beside_the_file(tmp_path):
@@ -215,7 +215,7 @@ def test_panoramas_are_left_out(tmp_path):
     shots = {"a.jpg": SHOT, "pano.jpg": {**SHOT, "camera": "s"}}
     found = read(tmp_path, scene(cameras=cameras, shots=shots))
     assert (found.labels, found.unposed) == (("a.jpg",), ("pano.jpg",))
-    assert found.notes[0].values == {"images": ["pano.jpg"]}
+    assert found.notes[0].values.items() >= {"images": ["pano.jpg"]}.items()
 
 
 @pytest.mark.parametrize(

@@ -39,11 +39,13 @@ from pcfix.io.cameras import checks, tracks
 from pcfix.io.cameras.colmap import files
 from pcfix.io.cameras.formats import Source
 from pcfix.io.crs import is_topocentric
-from pcfix.io.files import read_json
-from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, TiePoints
+from pcfix.model import Cameras, FloatArray, GnssPositions, TiePoints
 
 _PART = re.compile(r"(cameras|images|points3D|rigs|frames)\.(bin|txt)")
 _CAMERA_LINE = re.compile(r"^\s*\d+\s+[A-Z][A-Z_0-9]+(\s+\S+){2}", re.MULTILINE)
+FILE, WRITER = "georeference.json", "pcfix"
+_DATABASE, _FOLDERS_ABOVE = "database.db", 3
+_WGS84 = 0
 
 
 class Model(NamedTuple):
@@ -78,18 +80,18 @@ def read(source: Source) -> Cameras:
     used = dict.fromkeys(image.camera for image in posed)
     lenses = {number: files.lens(listed, number, cameras[number]) for number in used}
     gnss, notes = read_priors(model.folder, labels)
-    place = read_place(model.folder)
-    if place is not None and gnss is not None and gnss.crs is None:
+    offset, crs = read_place(model.folder)
+    if offset.any() and gnss is not None and gnss.crs is None:
         gnss = None  # of the model that the database found, which this one may not be
-    centres = -np.einsum("kji,kj->ki", rotations, poses[:, 4:])
-    several = checks.several(model.folder, model.others + 1, len(posed))
+    if model.others:
+        notes = (checks.several(model.folder, model.others + 1, len(posed)), *notes)
     return Cameras(
         labels=labels,
-        centres=centres if place is None else centres + place.offset_m,
+        centres=checks.centres(rotations, poses[:, 4:]) + offset,
         rotations=rotations,
         lenses=tuple(lenses[image.camera] for image in posed),
-        crs=None if place is None else place.crs,
-        notes=(several, *notes) if model.others else notes,
+        crs=crs,
+        notes=notes,
         gnss=gnss,
         unposed=tuple(image.name for image in images if not image.posed),
         source="COLMAP",
@@ -102,28 +104,19 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     path = model.part("points3D")
     if not path.is_file():
         raise tracks.no_tie_points(path, "there is no such file")
-    points = files.read_points(path)
+    identifiers, xyz = files.read_points(path)
     images = [i for i in files.read_images(model.part("images"), points=True) if i.posed]
-    if not len(points.identifiers) or not any(len(image.points) for image in images):
+    seen = np.concatenate([image.seen for image in images])
+    if not len(identifiers) or not len(seen):
         raise tracks.no_tie_points(path, "the model has no points that its images saw")
-    seen = np.concatenate([image.points for image in images])
-    camera = np.repeat(np.arange(len(cameras)), [len(image.points) for image in images])
-    row = _rows_of(points.identifiers, seen)
-    known = row >= 0
-    xy = np.concatenate([image.xy for image in images])[known]
-    place = read_place(model.folder)
-    xyz = points.xyz if place is None else points.xyz + place.offset_m
-    return tracks.tie_points(xyz, row[known], camera[known], xy)
-
-
-def _rows_of(identifiers: IntArray, wanted: IntArray) -> IntArray:
-    """Return the row of each wanted identifier, -1 where there is none."""
-    order = np.argsort(identifiers)
-    by_identifier = np.argsort(wanted)  # a search in rising order is far quicker
-    place = np.empty(len(wanted), np.int64)
-    place[by_identifier] = np.searchsorted(identifiers[order], wanted[by_identifier])
+    camera = np.repeat(np.arange(len(cameras)), [len(image.seen) for image in images])
+    order, rising = np.argsort(identifiers), np.argsort(seen["point"])
+    place = np.empty(len(seen), np.int64)  # a search in rising order is far quicker
+    place[rising] = np.searchsorted(identifiers[order], seen["point"][rising])
     row = order[np.minimum(place, len(order) - 1)]
-    return np.where(identifiers[row] == wanted, row, -1)
+    known = identifiers[row] == seen["point"]
+    xyz = xyz + read_place(model.folder)[0]
+    return tracks.tie_points(tracks.Seen(xyz, row[known], camera[known], seen["xy"][known]))
 
 
 def _model(source: Source) -> Model:
@@ -153,52 +146,30 @@ def _find(path: Path) -> Model | None:
 def _in_folder(folder: Path, *suffixes: str) -> Model | None:
     for model in (Model(folder, suffix) for suffix in suffixes):
         cameras = model.part("cameras")
-        if not (cameras.is_file() and model.part("images").is_file()):
-            continue
-        if model.suffix == "bin":
-            return model
-        with cameras.open(encoding="utf-8-sig", errors="replace") as stream:
-            if _CAMERA_LINE.search(stream.read(4096)):
-                return model
+        if cameras.is_file() and model.part("images").is_file():
+            with cameras.open(encoding="utf-8-sig", errors="replace") as stream:
+                if model.suffix == "bin" or _CAMERA_LINE.search(stream.read(4096)):
+                    return model
     return None
 
 
-FILE = "georeference.json"
-WRITER = "pcfix"
-
-
-class Place(NamedTuple):
-    """What is added to the positions of a model, shape (3,), metres, and the CRS they then have."""
-
-    offset_m: FloatArray
-    crs: str | None
-
-
-def read_place(folder: Path) -> Place | None:
-    """Return what the file beside a model says; None where there is none by pcfix."""
+def read_place(folder: Path) -> tuple[FloatArray, str | None]:
+    """Return the offset of a model's positions and their CRS, from pcfix's file beside it."""
     path = folder / FILE
-    if not path.is_file():
-        return None
     with checks.reading(path):
-        found = read_json(path)
+        found = checks.load_json(path) if path.is_file() else None
         if not isinstance(found, dict) or found.get("written_by") != WRITER:
-            return None
+            return np.zeros(3), None
         offset, crs = checks.triple(found["offset_m"]), found["crs"]
         if not np.isfinite(offset).all() or not isinstance(crs, str | None):
             raise checks.damaged(path, "it needs offset_m, three numbers, and crs")
-    return Place(offset, crs if crs is None or is_topocentric(crs) else checks.crs(path, crs))
+    return offset, crs if crs is None or is_topocentric(crs) else checks.crs(path, crs)
 
 
 def place_text(offset_m: FloatArray, crs: str | None) -> str:
     """Return the content of the file."""
     place = {"crs": crs, "offset_m": [float(value) for value in offset_m], "written_by": WRITER}
     return json.dumps(place, indent=2) + "\n"
-
-
-_DATABASE = "database.db"
-_FOLDERS_ABOVE = 3
-_WGS84 = 0
-_WGS84_CRS = "EPSG:4979"
 
 
 def read_priors(
@@ -217,8 +188,8 @@ def read_priors(
     found = [(row_of[name], *row) for name, *row in rows if name in row_of]
     systems = {system for *_, system in found}
     if why or len(systems) > 1:
-        sentence = f"{path}: its pose priors {why or 'are in several systems'}. They are left out."
-        return None, (PcfixWarning("cameras.priors_left_out", sentence, path=path),)
+        sentence = f"its pose priors {why or 'are in several systems'}. They are left out."
+        return None, (checks.note(path, "cameras.priors_left_out", sentence),)
     xyz, sigma = np.full((2, len(labels), 3), np.nan)
     for i, position, covariance, _ in found:
         xyz[i] = np.frombuffer(position, "<f8")
@@ -228,9 +199,9 @@ def read_priors(
     xyz[~np.isfinite(xyz).all(axis=1)] = np.nan
     if np.isnan(xyz).all():
         return None, ()
-    wgs84 = systems == {_WGS84}
-    xyz = xyz[:, [1, 0, 2]] if wgs84 else xyz
-    return GnssPositions(xyz, sigma, _WGS84_CRS if wgs84 else None), ()
+    if systems == {_WGS84}:
+        return GnssPositions(xyz[:, [1, 0, 2]], sigma, "EPSG:4979"), ()
+    return GnssPositions(xyz, sigma, None), ()
 
 
 def _rows(path: Path) -> list[tuple[Any, ...]]:

@@ -17,14 +17,13 @@ import mmap
 import re
 import struct
 from collections.abc import Iterator
-from itertools import takewhile
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from pcfix.errors import InputError
-from pcfix.io.cameras.checks import damaged, reading, unsupported
+from pcfix.io.cameras.checks import damaged, reading, terms, unsupported
 from pcfix.model import FloatArray, IntArray, Lens, Projection
 
 _SMALLEST_OMEGA = 1e-6
@@ -41,36 +40,32 @@ class Model(NamedTuple):
     projection: Projection | None
 
 
-def _model(name: str, parameters: str, projection: Projection | None = "perspective") -> Model:
-    return Model(name, tuple(parameters.split()), projection)
-
-
-MODELS = (
-    _model("SIMPLE_PINHOLE", "f cx cy"),
-    _model("PINHOLE", "fx fy cx cy"),
-    _model("SIMPLE_RADIAL", "f cx cy k1"),
-    _model("RADIAL", "f cx cy k1 k2"),
-    _model("OPENCV", "fx fy cx cy k1 k2 p1 p2"),
-    _model("OPENCV_FISHEYE", "fx fy cx cy k1 k2 k3 k4", "equidistant"),
-    _model("FULL_OPENCV", "fx fy cx cy k1 k2 p1 p2 k3 d1 d2 d3"),
-    _model("FOV", "fx fy cx cy omega", "fov"),
-    _model("SIMPLE_RADIAL_FISHEYE", "f cx cy k1", "equidistant"),
-    _model("RADIAL_FISHEYE", "f cx cy k1 k2", "equidistant"),
-    _model("THIN_PRISM_FISHEYE", "fx fy cx cy k1 k2 p1 p2 k3 k4 s1 s3", "equidistant"),
-    _model(
+_TABLE: tuple[tuple[str, str, Projection | None], ...] = (
+    ("SIMPLE_PINHOLE", "f cx cy", "perspective"),
+    ("PINHOLE", "fx fy cx cy", "perspective"),
+    ("SIMPLE_RADIAL", "f cx cy k1", "perspective"),
+    ("RADIAL", "f cx cy k1 k2", "perspective"),
+    ("OPENCV", "fx fy cx cy k1 k2 p1 p2", "perspective"),
+    ("OPENCV_FISHEYE", "fx fy cx cy k1 k2 k3 k4", "equidistant"),
+    ("FULL_OPENCV", "fx fy cx cy k1 k2 p1 p2 k3 d1 d2 d3", "perspective"),
+    ("FOV", "fx fy cx cy omega", "fov"),
+    ("SIMPLE_RADIAL_FISHEYE", "f cx cy k1", "equidistant"),
+    ("RADIAL_FISHEYE", "f cx cy k1 k2", "equidistant"),
+    ("THIN_PRISM_FISHEYE", "fx fy cx cy k1 k2 p1 p2 k3 k4 s1 s3", "equidistant"),
+    (
         "RAD_TAN_THIN_PRISM_FISHEYE",
         "fx fy cx cy k1 k2 k3 k4 k5 k6 p2 p1 s1 s2 s3 s4",
         "equidistant",
     ),
-    _model("SIMPLE_DIVISION", "f cx cy k", "division"),
-    _model("DIVISION", "fx fy cx cy k", "division"),
-    _model("SIMPLE_FISHEYE", "f cx cy", "equidistant"),
-    _model("FISHEYE", "fx fy cx cy", "equidistant"),
-    _model("EUCM", "fx fy cx cy alpha beta", "eucm"),
-    _model("EQUIRECTANGULAR", "w h", None),
+    ("SIMPLE_DIVISION", "f cx cy k", "division"),
+    ("DIVISION", "fx fy cx cy k", "division"),
+    ("SIMPLE_FISHEYE", "f cx cy", "equidistant"),
+    ("FISHEYE", "fx fy cx cy", "equidistant"),
+    ("EUCM", "fx fy cx cy alpha beta", "eucm"),
+    ("EQUIRECTANGULAR", "w h", None),
 )
 """In the order of their numbers in binary files, from 0."""
-
+MODELS = tuple(Model(name, tuple(names.split()), projection) for name, names, projection in _TABLE)
 BY_NAME = {model.name: model for model in MODELS}
 
 
@@ -98,10 +93,10 @@ def lens(path: Path, identifier: int, camera: Camera) -> Lens:
         b1=focal_x - focal,
         projection=projection,
         shape=tuple(given[name] for name in shape),
-        radial=_coefficients(given, "k1", "k2", "k3", "k4", "k5", "k6"),
-        denominator=_coefficients(given, "d1", "d2", "d3"),
-        tangential=_coefficients(given, "p2", "p1"),
-        thin_prism=_coefficients(given, "s1", "s2", "s3", "s4"),
+        radial=terms(given, "k1 k2 k3 k4 k5 k6"),
+        denominator=terms(given, "d1 d2 d3"),
+        tangential=terms(given, "p2 p1"),
+        thin_prism=terms(given, "s1 s2 s3 s4"),
         in_turn=model.name == "RAD_TAN_THIN_PRISM_FISHEYE",
         sensor=f"{identifier} {model.name}",
     )
@@ -112,25 +107,18 @@ def _no_model(path: Path, camera: object, model: object) -> InputError:
     return unsupported(path, what, f"{remedy} (colmap image_undistorter)", model=model)
 
 
-def _coefficients(given: dict[str, float], *names: str) -> tuple[float, ...]:
-    """Return the values up to the last name that the model has, 0 for those between."""
-    there = [i for i, name in enumerate(names) if name in given]
-    return tuple(given.get(name, 0.0) for name in names[: there[-1] + 1]) if there else ()
-
-
 class Image(NamedTuple):
     """A row of the image list.
 
-    `pose` is qw, qx, qy, qz, tx, ty, tz. `xy` (o, 2) and `points` (o,) are the image points that
-    have a point in space, and the identifiers of those; empty where they were not asked for.
+    `pose` is qw, qx, qy, qz, tx, ty, tz. `seen` has the image points that have a point in space,
+    and the identifiers of those; it is empty where they were not asked for.
     """
 
     identifier: int
     pose: tuple[float, ...]
     camera: int
     name: str
-    xy: FloatArray
-    points: IntArray
+    seen: np.ndarray
 
     @property
     def posed(self) -> bool:
@@ -138,22 +126,10 @@ class Image(NamedTuple):
         return bool(np.isfinite(self.pose).all())
 
 
-class Points(NamedTuple):
-    """Identifiers and places of the points in space."""
-
-    identifiers: IntArray
-    xyz: FloatArray
-
-
-NO_XY: FloatArray = np.empty((0, 2))
-NO_POINTS: IntArray = np.empty(0, np.int64)
-
-_COUNT = struct.Struct("<Q")
-_CAMERA = struct.Struct("<IiQQ")
-_IMAGE = struct.Struct("<I7dI")
 OBSERVATION = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
-NO_ROWS = np.empty(0, OBSERVATION)
+_COUNT, _CAMERA, _IMAGE = struct.Struct("<Q"), struct.Struct("<IiQQ"), struct.Struct("<I7dI")
 _POINT_BYTES, _POINT_TO_COUNT, _POINT_TO_COLOUR, _VIEW_BYTES = 51, 43, 32, 8
+_STATED = re.compile(r"#.*Number of (?:cameras|images|points): (\d{1,15})\b")
 
 
 class _Bytes:
@@ -171,12 +147,39 @@ class _Bytes:
         return values
 
     def name(self) -> str:
-        """Return the next text."""
+        """Return the next text, which ends with a zero byte."""
         begin, end = self.at, self.data.find(b"\0", self.at)
         if end < 0:
             raise ValueError("a name does not end")
         self.at = end + 1
         return self.data[begin:end].decode("utf-8", "replace")
+
+
+class _Text:
+    """A text file: its lines without comments, blank ones too, and the rows that it announces."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.stated = path, 0
+
+    def lines(self) -> Iterator[str]:
+        """Yield the lines."""
+        with self.path.open(encoding="utf-8-sig", errors="replace") as stream:
+            for line in stream:
+                if not line.lstrip().startswith("#"):
+                    yield line.strip()
+                elif found := _STATED.match(line.strip()):
+                    self.stated = int(found[1])
+
+    def check(self, rows: int) -> None:
+        """Refuse a file that has fewer rows than its comments announce."""
+        if self.stated > rows:
+            raise damaged(self.path, f"{rows:,} rows instead of {self.stated:,}")
+
+
+def read_cameras(path: Path) -> dict[int, Camera]:
+    """Read ``cameras``, binary or text: identifier, model, width, height, parameters."""
+    with reading(path):
+        return _binary_cameras(path) if path.suffix == ".bin" else _text_cameras(path)
 
 
 def _binary_cameras(path: Path) -> dict[int, Camera]:
@@ -191,63 +194,10 @@ def _binary_cameras(path: Path) -> dict[int, Camera]:
     return cameras
 
 
-def _binary_images(path: Path, *, points: bool) -> list[Image]:
-    file = _Bytes(path)
-    images = []
-    for _ in range(*file.take(_COUNT)):
-        identifier, *pose, camera = file.take(_IMAGE)
-        name = file.name()
-        (count,) = file.take(_COUNT)
-        xy, seen = NO_XY, NO_POINTS
-        if points:
-            rows = np.frombuffer(file.data, OBSERVATION, count, file.at) if count else NO_ROWS
-            rows = rows[rows["point"] >= 0]
-            xy, seen = rows["xy"].astype(np.float64), rows["point"].astype(np.int64)
-        file.at += count * OBSERVATION.itemsize
-        images.append(Image(identifier, tuple(pose), camera, name, xy, seen))
-    if file.at > len(file.data):
-        raise damaged(path, "its last image has too few points")
-    return images
-
-
-def _binary_points(path: Path) -> Points:
-    file = _Bytes(path)
-    (count,) = file.take(_COUNT)
-    data, at, starts = file.data, file.at, []
-    for _ in range(count):  # millions, so without a function call each
-        starts.append(at)
-        at += _POINT_BYTES + _VIEW_BYTES * _COUNT.unpack_from(data, at + _POINT_TO_COUNT)[0]
-    if at > len(data):
-        raise damaged(path, "its last point has too few views")
-    if not starts:
-        return Points(NO_POINTS, np.empty((0, 3)))
-    every_byte = np.frombuffer(data, np.uint8)
-    rows = np.lib.stride_tricks.sliding_window_view(every_byte, _POINT_TO_COLOUR)[starts]
-    place = np.ascontiguousarray(rows[:, _COUNT.size :]).view("<f8")
-    return Points(np.ascontiguousarray(rows[:, : _COUNT.size]).view("<i8")[:, 0], place)
-
-
-_STATED = re.compile(r"Number of (?:cameras|images|points): (\d{1,15})\b")
-
-
-def _lines(path: Path) -> Iterator[str]:
-    """Yield the text of every line, blank ones too, without comments."""
-    with path.open(encoding="utf-8-sig", errors="replace") as stream:
-        yield from (line.strip() for line in stream if not line.lstrip().startswith("#"))
-
-
-def _check_count(path: Path, found: int) -> None:
-    """Refuse a text that has fewer rows than its comments announce."""
-    with path.open(encoding="utf-8-sig", errors="replace") as stream:
-        comments = "".join(takewhile(lambda line: line.lstrip().startswith("#"), stream))
-    stated = _STATED.search(comments)
-    if stated and int(stated[1]) > found:
-        raise damaged(path, f"{found:,} rows instead of {int(stated[1]):,}")
-
-
 def _text_cameras(path: Path) -> dict[int, Camera]:
+    text = _Text(path)
     cameras: dict[int, Camera] = {}
-    for words in filter(None, map(str.split, _lines(path))):
+    for words in filter(None, map(str.split, text.lines())):
         model = BY_NAME.get(words[1])
         if model is None:
             raise _no_model(path, words[0], words[1])
@@ -255,42 +205,8 @@ def _text_cameras(path: Path) -> dict[int, Camera]:
         if len(values) != len(model.parameters):
             raise damaged(path, f"camera {words[0]}: {len(values)} parameters of {model.name}")
         cameras[int(words[0])] = Camera(model, width, height, tuple(values))
-    _check_count(path, len(cameras))
+    text.check(len(cameras))
     return cameras
-
-
-def _text_images(path: Path, *, points: bool) -> list[Image]:
-    """Read two lines for each image; the second has its image points, -1 for those of no point."""
-    images = []
-    lines = _lines(path)
-    for line in filter(None, lines):
-        identifier, *pose, camera, name = line.split(None, 9)
-        below = next(lines, "")
-        if below:
-            int(below.rsplit(None, 1)[-1])  # the line of the next image would end with a name
-        rows = np.array(below.split() if points else (), float).reshape(-1, 3)
-        rows = rows[rows[:, 2] >= 0]
-        seen = rows[:, 2].astype(np.int64)
-        numbers = tuple(map(float, pose))
-        images.append(Image(int(identifier), numbers, int(camera), name, rows[:, :2], seen))
-    _check_count(path, len(images))
-    return images
-
-
-def _text_points(path: Path) -> Points:
-    rows = []
-    for line in filter(None, _lines(path)):
-        identifier, x, y, z = line.split(None, 4)[:4]
-        rows.append((int(identifier), float(x), float(y), float(z)))
-    _check_count(path, len(rows))
-    values = np.array(rows, float).reshape(-1, 4)
-    return Points(values[:, 0].astype(np.int64), values[:, 1:])
-
-
-def read_cameras(path: Path) -> dict[int, Camera]:
-    """Read ``cameras``, binary or text: identifier, model, width, height, parameters."""
-    with reading(path):
-        return _binary_cameras(path) if path.suffix == ".bin" else _text_cameras(path)
 
 
 def read_images(path: Path, *, points: bool) -> list[Image]:
@@ -300,7 +216,68 @@ def read_images(path: Path, *, points: bool) -> list[Image]:
         return form(path, points=points)
 
 
-def read_points(path: Path) -> Points:
+def _binary_images(path: Path, *, points: bool) -> list[Image]:
+    file = _Bytes(path)
+    images = []
+    for _ in range(*file.take(_COUNT)):
+        identifier, *pose, camera = file.take(_IMAGE)
+        name = file.name()
+        (count,) = file.take(_COUNT)
+        seen = np.empty(0, OBSERVATION)
+        if points and count:
+            seen = np.frombuffer(file.data, OBSERVATION, count, file.at)
+            seen = seen[seen["point"] >= 0]
+        file.at += count * OBSERVATION.itemsize
+        images.append(Image(identifier, tuple(pose), camera, name, seen))
+    if file.at > len(file.data):
+        raise damaged(path, "its last image has too few points")
+    return images
+
+
+def _text_images(path: Path, *, points: bool) -> list[Image]:
+    """Read two lines for each image; the second has its image points, -1 for those of no point."""
+    text, images = _Text(path), []
+    lines = text.lines()
+    for line in filter(None, lines):
+        identifier, *pose, camera, name = line.split(None, 9)
+        below = next(lines, "")
+        if below:
+            int(below.rsplit(None, 1)[-1])  # the line of the next image would end with a name
+        rows = np.array(below.split() if points else (), float).reshape(-1, 3)
+        rows = rows[rows[:, 2] >= 0]
+        seen = np.empty(len(rows), OBSERVATION)
+        seen["xy"], seen["point"] = rows[:, :2], rows[:, 2]
+        images.append(Image(int(identifier), tuple(map(float, pose)), int(camera), name, seen))
+    text.check(len(images))
+    return images
+
+
+def read_points(path: Path) -> tuple[IntArray, FloatArray]:
     """Read identifiers and places of ``points3D``; the tracks are in the images too."""
     with reading(path):
         return _binary_points(path) if path.suffix == ".bin" else _text_points(path)
+
+
+def _binary_points(path: Path) -> tuple[IntArray, FloatArray]:
+    file = _Bytes(path)
+    (count,) = file.take(_COUNT)
+    data, at, starts = file.data, file.at, []
+    for _ in range(count):  # millions, so without a function call each
+        starts.append(at)
+        at += _POINT_BYTES + _VIEW_BYTES * _COUNT.unpack_from(data, at + _POINT_TO_COUNT)[0]
+    if at > len(data):
+        raise damaged(path, "its last point has too few views")
+    if not starts:
+        return np.empty(0, np.int64), np.empty((0, 3))
+    every_byte = np.frombuffer(data, np.uint8)
+    rows = np.lib.stride_tricks.sliding_window_view(every_byte, _POINT_TO_COLOUR)[starts]
+    numbers = np.ascontiguousarray(rows).view([("id", "<i8"), ("xyz", "<f8", 3)])[:, 0]
+    return numbers["id"].copy(), numbers["xyz"].copy()
+
+
+def _text_points(path: Path) -> tuple[IntArray, FloatArray]:
+    text = _Text(path)
+    rows = [line.split(None, 4)[:4] for line in text.lines() if line]
+    text.check(len(rows))
+    values = np.array([row[1:] for row in rows], float).reshape(-1, 3)
+    return np.array([int(row[0]) for row in rows], np.int64), values

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pcfix.io.cameras.checks import bad_label, is_same_lens, lens_not_held, needs_lenses, write_new
+from pcfix.io.cameras.checks import block_to_write, is_same_lens, lens_not_held, write_new
 from pcfix.io.cameras.colmap import FILE, place_text
 from pcfix.io.cameras.colmap.files import BY_NAME, MODELS, OBSERVATION, SHAPES, Camera, lens
 from pcfix.io.cameras.tracks import NO_TIE_POINTS, are_seen
@@ -61,15 +61,11 @@ def write_colmap(
         If a file exists.
     """
     target = Path(folder)
-    if cameras.rotations is None or cameras.lenses is None:
-        raise needs_lenses(target)
-    for label in cameras.labels:  # a file would cut it off
-        if not label.strip() or "\0" in label or "\n" in label or label != label.strip():
-            raise bad_label(target, label)
+    _, lenses = block_to_write(target, cameras, _fits)
     middle = np.median(cameras.centres, axis=0)
     middle[2] = 0.0  # heights are small, and easier to read as they are
     offset = np.asarray(np.round(middle / ROUND_M) * ROUND_M if offset_m is None else offset_m)
-    distinct = list(dict.fromkeys(cameras.lenses))
+    distinct = list(dict.fromkeys(lenses))
     number = {lens: i for i, lens in enumerate(distinct, start=1)}
     ties = tie_points or NO_TIE_POINTS
     kept, counts = are_seen(ties), np.diff(ties.views.start)
@@ -82,11 +78,16 @@ def write_colmap(
     start = np.concatenate([[0], np.cumsum(np.bincount(camera, minlength=len(cameras)))])
     contents = {
         "cameras.bin": _cameras([colmap_camera(target, lens) for lens in distinct]),
-        "images.bin": _images(cameras, offset, [number[k] for k in cameras.lenses], seen, start),
+        "images.bin": _images(cameras, offset, [number[k] for k in lenses], seen, start),
         "points3D.bin": _points(ties.xyz[kept] - offset, seen["point"], start),
         FILE: place_text(offset, crs or cameras.crs).encode(),
     }
     write_new(target, contents)
+
+
+def _fits(label: str) -> bool:
+    """Whether COLMAP's files hold a name whole."""
+    return bool(label.strip()) and label == label.strip() and not {"\0", "\n"} & {*label}
 
 
 def colmap_camera(path: Path, given: Lens) -> Camera:

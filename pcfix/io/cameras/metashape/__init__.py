@@ -30,26 +30,37 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
 from xml.etree.ElementTree import Element
 from zipfile import ZipFile
 
 import numpy as np
 
 from pcfix.errors import PcfixWarning
-from pcfix.io.cameras.checks import damaged, number, numbers, reading
+from pcfix.io.cameras.checks import damaged, note, number, numbers, reading, text_of
 from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.metashape import documents
 from pcfix.io.cameras.metashape.block import Block, read_block
 from pcfix.io.cameras.metashape.documents import Chunk, Document, open_archive, recognises, unpacked
-from pcfix.io.cameras.metashape.sensors import read_calibration
-from pcfix.io.cameras.tracks import no_tie_points
+from pcfix.io.cameras.metashape.sensors import name_of, read_calibration
+from pcfix.io.cameras.tracks import Seen, no_tie_points
 from pcfix.io.cameras.tracks import tie_points as gathered
 from pcfix.io.crs import is_local, parse_crs
 from pcfix.io.ply import parse_header
-from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, TiePoints
+from pcfix.model import Cameras, FloatArray, GnssPositions, TiePoints
 
 __all__ = ["read", "read_calibration", "recognises", "tie_points"]
+
+SPREADS: tuple[tuple[str, tuple[int, ...]], ...] = (
+    *(("sxyz", (0, 1, 2)), ("sxy", (0, 1))),
+    *(("sx", (0,)), ("sy", (1,)), ("sz", (2,))),
+)
+"""Names of stated standard deviations and the axes that they are of."""
+DEFAULTS = (
+    ("accuracy_cameras", (0, 1, 2)),
+    ("accuracy_cameras_xy", (0, 1)),
+    ("accuracy_cameras_z", (2,)),
+)
+POINTS, PROJECTIONS = ("x", "y", "z", "id"), ("x", "y", "id")
 
 
 def read(source: Source) -> Cameras:
@@ -58,6 +69,88 @@ def read(source: Source) -> Cameras:
     block = read_block(chunk)
     gnss, notes = gnss_positions(chunk, block)
     return replace(block.cameras, gnss=gnss, notes=(*chunk.notes, *block.cameras.notes, *notes))
+
+
+def gnss_positions(
+    chunk: Chunk, block: Block
+) -> tuple[GnssPositions | None, tuple[PcfixWarning, ...]]:
+    """Return the reference positions of the images of a block, and notes on them.
+
+    Positions that the user unticked are no measurement and left out, unless all are, as is usual
+    when control points alone hold the block.
+    """
+    path = chunk.path
+    given = [image.element.find("reference") for image in block.images]
+    ticked = [None if r is None or r.get("enabled") == "false" else r for r in given]
+    used = given if all(reference is None for reference in ticked) else ticked
+    settings = {
+        (entry.get("name") or "").replace("/", "_"): entry.get("value") or ""
+        for entry in chunk.element.iterfind("settings/property")
+    }
+    start = _sigma(path, "settings of the chunk", settings, DEFAULTS, np.full(3, np.nan))
+    xyz, sigma = np.full((2, len(used), 3), np.nan)
+    for i, (image, reference) in enumerate(zip(block.images, used, strict=True)):
+        where, stated = (
+            f"image {image.label}, reference",
+            {} if reference is None else reference.attrib,
+        )
+        for j, axis in enumerate("xyz"):
+            if axis in stated:
+                xyz[i, j] = number(path, where, stated[axis])
+        sigma[i] = _sigma(path, where, stated, SPREADS, start)
+    if not np.isfinite(xyz[:, :2]).all(axis=1).any():
+        return None, ()
+    sigma = np.where(np.isfinite(xyz) & (sigma > 0.0), sigma, np.nan)
+    crs, notes = _crs(path, chunk.element, xyz)
+    for sensor in dict.fromkeys(image.sensor for image in block.images):
+        if sensor is not None and _has_antenna_offset(path, sensor):
+            label = name_of(sensor)
+            sentence = (
+                f"the GNSS antenna of sensor {label} has an offset from the camera. The GNSS"
+                " positions are those of the antenna."
+            )
+            notes.append(note(path, "cameras.antenna_offset", sentence, sensor=label))
+    return GnssPositions(xyz, sigma, crs), tuple(notes)
+
+
+def _sigma(
+    path: Path,
+    where: str,
+    stated: dict[str, str],
+    spreads: tuple[tuple[str, tuple[int, ...]], ...],
+    start: FloatArray,
+) -> FloatArray:
+    """Return `start` with what is stated, the widest first: one number for its axes, or each."""
+    sigma = start.copy()
+    for name, axes in spreads:
+        if text := stated.get(name):
+            count = 1 if len(text.split()) == 1 else len(axes)
+            sigma[list(axes)] = numbers(path, f"{where}, {name}", text, count)
+    return sigma
+
+
+def _crs(path: Path, chunk: Element, xyz: FloatArray) -> tuple[str, list[PcfixWarning]]:
+    """Return the CRS of the positions; that of the cameras may differ from that of the chunk."""
+    own = text_of(chunk, "camera_reference")
+    text = own or text_of(chunk, "reference") or "LOCAL"
+    if text.upper() == "LOCAL" or is_local(crs := parse_crs(text, str(path))):
+        return "local", []
+    are_degrees = (np.nanmax(np.abs(xyz[:, :2]), axis=0) <= [180.0, 90.0]).all()
+    if not own and not crs.is_geographic and are_degrees:
+        sentence = (
+            "the reference positions of the cameras are degrees, although the CRS of the chunk is"
+            " in metres. They are taken as WGS 84."
+        )
+        return "EPSG:4979", [note(path, "cameras.gnss_in_degrees", sentence)]
+    return text, []
+
+
+def _has_antenna_offset(path: Path, sensor: Element) -> bool:
+    words = text_of(sensor, "antenna/location").split()
+    for reference in sensor.iterfind("antenna/reference"):
+        words += [reference.get(axis) or "0" for axis in "xyz"]
+        words += (reference.get("location") or "").split()
+    return any(number(path, "GNSS antenna", word) != 0.0 for word in words)
 
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
@@ -76,123 +169,7 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     if not any(len(part.point) for part in seen):
         why = "only a project (.psx with its .files folder) or exported markers have them"
         raise no_tie_points(chunk.path, why)
-    before = np.cumsum([0, *(len(part.xyz) for part in seen)])
-    return gathered(
-        np.vstack([part.xyz for part in seen]),
-        np.concatenate([part.point + n for part, n in zip(seen, before, strict=False)]),
-        np.concatenate([part.camera for part in seen]),
-        np.vstack([part.uv for part in seen]),
-    )
-
-
-Spreads: TypeAlias = tuple[tuple[str, tuple[int, ...]], ...]
-"""Names of statements and the axes that they speak of."""
-
-SPREADS: Spreads = (
-    *(("sxyz", (0, 1, 2)), ("sxy", (0, 1))),
-    *(("sx", (0,)), ("sy", (1,)), ("sz", (2,))),
-)
-DEFAULTS: Spreads = (
-    ("accuracy_cameras", (0, 1, 2)),
-    ("accuracy_cameras_xy", (0, 1)),
-    ("accuracy_cameras_z", (2,)),
-)
-LOCAL = "LOCAL"
-
-
-def gnss_positions(
-    chunk: Chunk, block: Block
-) -> tuple[GnssPositions | None, tuple[PcfixWarning, ...]]:
-    """Return the reference positions of the images of a block, and notes on them.
-
-    Positions that the user unticked are no measurement and left out, unless all are, as is usual
-    when control points alone hold the block.
-    """
-    path = chunk.path
-    given = [image.element.find("reference") for image in block.images]
-    ticked = [None if r is None or r.get("enabled") == "false" else r for r in given]
-    used = given if all(reference is None for reference in ticked) else ticked
-    stated = [{} if reference is None else reference.attrib for reference in used]
-    places = [f"image {image.label}, reference" for image in block.images]
-    xyz = np.array(
-        [
-            [number(path, where, given[axis]) if axis in given else np.nan for axis in "xyz"]
-            for where, given in zip(places, stated, strict=True)
-        ]
-    )
-    if not np.isfinite(xyz[:, :2]).all(axis=1).any():
-        return None, ()
-    settings = {
-        (entry.get("name") or "").replace("/", "_"): entry.get("value") or ""
-        for entry in chunk.element.iterfind("settings/property")
-    }
-    nothing = np.full(3, np.nan)
-    start = _sigma(path, "settings of the chunk", settings, DEFAULTS, nothing)
-    rows = [_sigma(path, *row, SPREADS, start) for row in zip(places, stated, strict=True)]
-    sigma = np.where(np.isfinite(xyz) & (np.array(rows) > 0.0), np.array(rows), np.nan)
-    crs, notes = _crs(path, chunk.element, xyz)
-    return GnssPositions(xyz, sigma, crs), (*notes, *_antenna_notes(path, block))
-
-
-def _sigma(
-    path: Path, where: str, stated: dict[str, str], spreads: Spreads, start: FloatArray
-) -> FloatArray:
-    """Return `start` with what is stated, the widest first: one number for its axes, or each."""
-    sigma = start.copy()
-    for name, axes in spreads:
-        if text := stated.get(name):
-            count = 1 if len(text.split()) == 1 else len(axes)
-            sigma[list(axes)] = numbers(path, f"{where}, {name}", text, count)
-    return sigma
-
-
-def _crs(path: Path, chunk: Element, xyz: FloatArray) -> tuple[str, tuple[PcfixWarning, ...]]:
-    """Return the CRS of the positions; that of the cameras may differ from that of the chunk."""
-    own = (chunk.findtext("camera_reference") or "").strip()
-    text = own or (chunk.findtext("reference") or "").strip() or LOCAL
-    if text.upper() == LOCAL or is_local(crs := parse_crs(text, str(path))):
-        return "local", ()
-    are_degrees = (np.nanmax(np.abs(xyz[:, :2]), axis=0) <= [180.0, 90.0]).all()
-    if not own and not crs.is_geographic and are_degrees:
-        sentence = (
-            f"{path}: the reference positions of the cameras are degrees, although the CRS of the"
-            " chunk is in metres. They are taken as WGS 84."
-        )
-        return "EPSG:4979", (PcfixWarning("cameras.gnss_in_degrees", sentence),)
-    return text, ()
-
-
-def _antenna_notes(path: Path, block: Block) -> tuple[PcfixWarning, ...]:
-    notes = []
-    for sensor in dict.fromkeys(image.sensor for image in block.images):
-        antenna = None if sensor is None else sensor.find("antenna")
-        if sensor is None or antenna is None:
-            continue
-        words = (antenna.findtext("location") or "").split()
-        if (reference := antenna.find("reference")) is not None:
-            words += [reference.get(axis) or "0" for axis in "xyz"]
-            words += (reference.get("location") or "").split()
-        if any(number(path, "GNSS antenna", word) != 0.0 for word in words):
-            label = sensor.get("label")
-            sentence = (
-                f"{path}: the GNSS antenna of sensor {label} has an offset from the camera. The"
-                " GNSS positions are those of the antenna."
-            )
-            notes.append(PcfixWarning("cameras.antenna_offset", sentence, sensor=label))
-    return tuple(notes)
-
-
-POINTS = ("x", "y", "z", "id")
-PROJECTIONS = ("x", "y", "id")
-
-
-class Seen(NamedTuple):
-    """Points, and observations of them, camera by camera: row of both, u and v."""
-
-    xyz: FloatArray
-    point: IntArray
-    camera: IntArray
-    uv: FloatArray
+    return gathered(*seen)
 
 
 def _tie_points(frame: Document, block: Block) -> Iterator[Seen]:
@@ -213,29 +190,26 @@ def _tie_points(frame: Document, block: Block) -> Iterator[Seen]:
                 if image.id in files
                 and (component == image.component or None in (component, image.component))
             ]
-            if rows:
-                yield _component(archive, points.get("path") or "", rows, files, block)
-
-
-def _component(
-    archive: ZipFile, points: str, rows: list[int], files: dict[str, str], block: Block
-) -> Seen:
-    """Return the points of one component and where the images in `rows` saw them."""
-    vertices = _vertices(archive, points, POINTS)
-    place = block.places[rows[0]]
-    xyz = np.column_stack([vertices[axis] for axis in "xyz"]).astype(np.float64)
-    xyz = xyz @ place[:3, :3].T + place[:3, 3]
-    order = np.argsort(vertices["id"], kind="stable")
-    ids = vertices["id"][order].astype(np.int64)
-    point, camera, uv = [], [], []
-    for row in rows:
-        marks = _vertices(archive, files[block.images[row].id], PROJECTIONS)
-        found = np.minimum(np.searchsorted(ids, marks["id"].astype(np.int64)), max(len(ids) - 1, 0))
-        known = (ids[found] == marks["id"]) if len(ids) else np.zeros(len(marks), bool)
-        point.append(order[found[known]])
-        camera.append(np.full(int(known.sum()), row))
-        uv.append(np.column_stack([marks["x"], marks["y"]])[known].astype(np.float64))
-    return Seen(xyz, np.concatenate(point), np.concatenate(camera), np.concatenate(uv))
+            if not rows:
+                continue
+            vertices, place = (
+                _vertices(archive, points.get("path") or "", POINTS),
+                block.places[rows[0]],
+            )
+            xyz = np.column_stack([vertices[axis] for axis in "xyz"]).astype(np.float64)
+            order = np.argsort(vertices["id"], kind="stable")
+            ids = vertices["id"][order].astype(np.int64)
+            point, camera, uv = [], [], []
+            for row in rows:
+                marks = _vertices(archive, files[block.images[row].id], PROJECTIONS)
+                track = marks["id"].astype(np.int64)
+                found_at = np.searchsorted(ids, track).clip(max=max(len(ids) - 1, 0))
+                known = ids[found_at] == track if len(ids) else np.zeros(len(marks), bool)
+                point.append(order[found_at[known]])
+                camera.append(np.full(int(known.sum()), row))
+                uv.append(np.column_stack([marks["x"], marks["y"]])[known].astype(np.float64))
+            xyz = xyz @ place[:3, :3].T + place[:3, 3]
+            yield Seen(xyz, np.concatenate(point), np.concatenate(camera), np.concatenate(uv))
 
 
 def _vertices(archive: ZipFile, name: str, needed: tuple[str, ...]) -> np.ndarray:

@@ -3,84 +3,22 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from pcfix.errors import PcfixWarning
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import damaged, number, numbers
+from pcfix.io.cameras.checks import damaged, note, number, numbers, text_of
 from pcfix.io.cameras.metashape import sensors
 from pcfix.io.cameras.metashape.documents import Chunk
 from pcfix.io.crs import METRES, crs_text, is_local, parse_crs, shortened, unbound
 from pcfix.model import Cameras, FloatArray, Lens
 
 LOCAL = "local"
-CHUNK = np.eye(4)
-"""Where the chunk has no place in the world, its own frame is taken."""
-
-
-def _similarity(path: Path, element: Element | None) -> FloatArray | None:
-    """Return the 4x4 matrix of a transform that is one matrix, or has up to three parts."""
-    if element is None:
-        return None
-    where, matrix = "transform of the chunk", np.eye(4)
-    scale, rotation, translation = map(element.findtext, ("scale", "rotation", "translation"))
-    if (element.text or "").strip():
-        matrix = numbers(path, where, element.text, 16).reshape(4, 4)
-    elif scale is None and rotation is None and translation is None:
-        return None
-    if rotation is not None:
-        matrix[:3, :3] = numbers(path, where, rotation, 9).reshape(3, 3)
-    if translation is not None:
-        matrix[:3, 3] = numbers(path, where, translation, 3)
-    inside = float(np.cbrt(np.linalg.det(matrix[:3, :3]))) if scale is None else 1.0
-    size = inside if scale is None else number(path, where, scale)
-    if not size > 0.0:
-        raise damaged(path, f"{where}: the scale {size:g} is not positive")
-    matrix[:3, :3] = size * checks.rotations(path, [where], matrix[:3, :3] / inside)[0]
-    return matrix
-
-
-def _world(path: Path, chunk: Element) -> tuple[str, str | None, tuple[PcfixWarning, ...]]:
-    """Return the frame that a chunk's transforms lead to, its CRS if another, and notes on them."""
-    text = (chunk.findtext("reference") or "").strip()
-    if not text or text.upper() == "LOCAL":
-        return LOCAL, None, ()
-    crs = parse_crs(text, str(path))
-    if is_local(crs):
-        unit = crs.axis_info[0].unit_name
-        sentence = (
-            f"{path}: the local coordinates of the chunk are in {unit}, its transform in metres."
-            " Scale a cloud that was exported in that unit."
-        )
-        note = PcfixWarning("cameras.local_unit", sentence, unit=unit)
-        return LOCAL, None, () if unit in METRES else (note,)
-    base = None if crs.geodetic_crs is None else unbound(crs.geodetic_crs)
-    if base is None:
-        remedy = "Set it again in Metashape's reference settings"
-        raise checks.unsupported(path, f"the CRS {shortened(text)}, which has no datum,", remedy)
-    frame = crs_text(type(crs).from_json_dict(_geocentric(base.to_json_dict())))
-    return frame, frame if crs.is_geocentric else text, ()
-
-
-def _geocentric(base: dict[str, Any]) -> dict[str, Any]:
-    """Return the geocentric CRS, as PROJJSON, on the datum of another."""
-    axes = [
-        {"name": f"Geocentric {a}", "abbreviation": a, "direction": f"geocentric{a}"} for a in "XYZ"
-    ]
-    return {
-        "$schema": base["$schema"],
-        "type": "GeodeticCRS",
-        "name": base["name"],
-        **{key: base[key] for key in ("datum", "datum_ensemble") if key in base},
-        "coordinate_system": {
-            "subtype": "Cartesian",
-            "axis": [{**axis, "unit": "metre"} for axis in axes],
-        },
-    }
 
 
 class Image(NamedTuple):
@@ -110,30 +48,47 @@ def read_block(chunk: Chunk) -> Block:
     path, element = chunk.path, chunk.element
     images = _images(element)
     poses = _poses(path, images)
-    kept, places, why = _select(path, element, [image for image in images if image.id in poses])
+    place_of, has_place = _places(path, element)
+    kept, why = [], Counter[str]()
+    for image in images:
+        kind = "frame" if image.sensor is None else sensors.kind_of(image.sensor)
+        if image.id not in poses:
+            continue
+        if image.element.get("enabled") == "false":
+            why["aligned but disabled"] += 1
+        elif kind not in sensors.PROJECTIONS:
+            why[f"of a {kind} sensor, for which there is no lens"] += 1
+        elif place_of(image) is None:
+            why["in a component that has no transform to the frame of the others"] += 1
+        else:
+            kept.append(image)
+    said = [f"{count} images are {reason}" for reason, count in why.items()]
     if not kept:
         chunk_name = element.get("label") or "without a name"
-        rest = ", ".join([f"{len(images) - len(poses)} are not aligned", *why])
+        rest = ", ".join([f"{len(images) - len(poses)} are not aligned", *said])
         raise checks.no_pose(path, f"of the {len(images)} images of chunk {chunk_name} {rest}")
-    local = any(place is CHUNK for place in places)
-    crs, project_crs, of_world = (LOCAL, None, ()) if local else _world(path, element)
+    notes = [note(path, "cameras.left_out", f"{one}; left out.") for one in said]
+    places = [place for image in kept if (place := place_of(image)) is not None]
+    crs, project_crs, of_world = _world(path, element) if has_place else (LOCAL, None, ())
     in_world = np.array(places) @ np.array([poses[image.id] for image in kept])
     scales = np.cbrt(np.linalg.det(in_world[:, :3, :3]))[:, None, None]
-    lenses, of_lenses = _lenses(path, kept)
+    lenses: dict[Element, Lens] = {}
+    for image in kept:
+        if image.sensor is None:
+            raise damaged(path, f"sensor {image.element.get('sensor_id')} is missing")
+        if image.sensor not in lenses:
+            lenses[image.sensor], of_lens = sensors.lens_of(path, image.sensor, image.label)
+            notes += of_lens
     chosen = {image.id for image in kept}
     cameras = Cameras(
         labels=tuple(image.label for image in kept),
         centres=in_world[:, :3, 3],
         rotations=np.ascontiguousarray((in_world[:, :3, :3] / scales).transpose(0, 2, 1)),
-        lenses=lenses,
+        lenses=tuple(lenses[image.sensor] for image in kept if image.sensor is not None),
         crs=crs,
         project_crs=project_crs,
         unposed=tuple(image.label for image in images if image.id not in chosen),
-        notes=(
-            *(PcfixWarning("cameras.left_out", f"{path}: {one}; left out.") for one in why),
-            *of_lenses,
-            *of_world,
-        ),
+        notes=(*notes, *of_world),
         source=chunk.software,
     )
     return Block(kept, places, cameras)
@@ -163,14 +118,14 @@ def _images(chunk: Element) -> list[Image]:
 
 def _poses(path: Path, images: list[Image]) -> dict[str, FloatArray]:
     """Return camera to chunk, 4x4, of each image that is aligned or whose master is."""
-    aligned = [image for image in images if (image.element.findtext("transform") or "").strip()]
-    texts = [image.element.findtext("transform") for image in aligned]
-    named = zip(aligned, texts, strict=True)
-    rows = [numbers(path, f"image {one.label}, transform", text, 16) for one, text in named]
+    aligned = [image for image in images if text_of(image.element, "transform")]
+    labels = [image.label for image in aligned]
+    rows = [
+        numbers(path, f"image {image.label}, transform", image.element.findtext("transform"), 16)
+        for image in aligned
+    ]
     matrices = np.array(rows).reshape(-1, 4, 4)
-    checks.rotations(path, [image.label for image in aligned], matrices[:, :3, :3])
-    u, _, v = np.linalg.svd(matrices[:, :3, :3])
-    matrices[:, :3, :3] = u @ v
+    matrices[:, :3, :3] = checks.rotations(path, labels, matrices[:, :3, :3])
     masters = dict(zip((image.id for image in aligned), matrices, strict=True))
     offsets: dict[Element, FloatArray] = {}
     poses = dict(masters)
@@ -184,28 +139,8 @@ def _poses(path: Path, images: list[Image]) -> dict[str, FloatArray]:
     return poses
 
 
-def _select(
-    path: Path, chunk: Element, posed: list[Image]
-) -> tuple[list[Image], list[FloatArray], list[str]]:
-    """Return the images to use, the way of each to the world, and what the others are."""
-    kept, places = [], []
-    why: Counter[str] = Counter()
-    for image, place in zip(posed, _places(path, chunk, posed), strict=True):
-        if image.element.get("enabled") == "false":
-            why["aligned but disabled"] += 1
-        elif image.sensor is not None and not sensors.is_central(image.sensor):
-            kind = sensors.kind_of(image.sensor)
-            why[f"of a {kind} sensor, for which there is no lens"] += 1
-        elif place is None:
-            why["in a component that has no transform to the frame of the others"] += 1
-        else:
-            kept.append(image)
-            places.append(place)
-    return kept, places, [f"{count} images are {reason}" for reason, count in why.items()]
-
-
-def _places(path: Path, chunk: Element, posed: list[Image]) -> list[FloatArray | None]:
-    """Return the way of each image to the world, None where its component has no place in it.
+def _places(path: Path, chunk: Element) -> tuple[Callable[[Image], FloatArray | None], bool]:
+    """Return the way of an image to the world (None: it has no place there), and if there is one.
 
     Every component has a frame of its own. One with a transform has a place in the world; one
     without has that of the chunk when it is the active or only one, as the chunk's transform is
@@ -217,24 +152,70 @@ def _places(path: Path, chunk: Element, posed: list[Image]) -> list[FloatArray |
     parent = chunk.find("components")
     active = None if parent is None else parent.get("active_id")
     main = active if active in own else next(iter(own), None)
-    of_main: list[FloatArray | None] = []
-    places: list[FloatArray | None] = []
-    for image in posed:
+    has_place = of_chunk is not None or any(place is not None for place in own.values())
+    of_main = of_chunk if has_place else np.eye(4)
+
+    def place_of(image: Image) -> FloatArray | None:
         is_main = image.component in (None, main) or image.component not in own
         component = own.get(image.component)
-        of_main.append(CHUNK if is_main else None)
-        places.append(of_chunk if component is None and is_main else component)
-    return places if any(place is not None for place in places) else of_main
+        return of_main if component is None and is_main else component
+
+    return place_of, has_place
 
 
-def _lenses(path: Path, images: list[Image]) -> tuple[tuple[Lens, ...], list[PcfixWarning]]:
-    """Return the lens of each image, one object per sensor, and notes."""
-    found: dict[Element | None, Lens] = {}
-    notes: list[PcfixWarning] = []
-    for image in images:
-        if image.sensor is None:
-            raise damaged(path, f"sensor {image.element.get('sensor_id')} is missing")
-        if image.sensor not in found:
-            found[image.sensor] = sensors.lens_of(path, image.sensor, image.label)
-            notes.extend(sensors.notes_on(path, image.sensor))
-    return tuple(found[image.sensor] for image in images), notes
+def _similarity(path: Path, element: Element | None) -> FloatArray | None:
+    """Return the 4x4 matrix of a transform that is one matrix, or has up to three parts."""
+    if element is None:
+        return None
+    where, matrix = "transform of the chunk", np.eye(4)
+    scale, rotation, translation = map(element.findtext, ("scale", "rotation", "translation"))
+    if (element.text or "").strip():
+        matrix = numbers(path, where, element.text, 16).reshape(4, 4)
+    elif scale is None and rotation is None and translation is None:
+        return None
+    if rotation is not None:
+        matrix[:3, :3] = numbers(path, where, rotation, 9).reshape(3, 3)
+    if translation is not None:
+        matrix[:3, 3] = numbers(path, where, translation, 3)
+    inside = float(np.cbrt(np.linalg.det(matrix[:3, :3]))) if scale is None else 1.0
+    size = inside if scale is None else number(path, where, scale)
+    if not size > 0.0:
+        raise damaged(path, f"{where}: the scale {size:g} is not positive")
+    matrix[:3, :3] = size * checks.rotations(path, [where], matrix[:3, :3] / inside)[0]
+    return matrix
+
+
+def _world(path: Path, chunk: Element) -> tuple[str, str | None, tuple[PcfixWarning, ...]]:
+    """Return the frame that a chunk's transforms lead to, its CRS if another, and notes on them."""
+    text = text_of(chunk, "reference")
+    if not text or text.upper() == "LOCAL":
+        return LOCAL, None, ()
+    crs = parse_crs(text, str(path))
+    if is_local(crs):
+        unit = crs.axis_info[0].unit_name
+        sentence = (
+            f"the local coordinates of the chunk are in {unit}, its transform in metres. Scale a"
+            " cloud that was exported in that unit."
+        )
+        said = note(path, "cameras.local_unit", sentence, unit=unit)
+        return LOCAL, None, () if unit in METRES else (said,)
+    if crs.geodetic_crs is None:
+        remedy = "Set it again in Metashape's reference settings"
+        raise checks.unsupported(path, f"the CRS {shortened(text)}, which has no datum,", remedy)
+    base = unbound(crs.geodetic_crs).to_json_dict()
+    geocentric = {  # on the datum of the CRS, as PROJJSON
+        "$schema": base["$schema"],
+        "type": "GeodeticCRS",
+        "name": base["name"],
+        **{key: base[key] for key in ("datum", "datum_ensemble") if key in base},
+        "coordinate_system": {
+            "subtype": "Cartesian",
+            "axis": [
+                {"name": f"Geocentric {a}", "abbreviation": a, "direction": f"geocentric{a}"}
+                | {"unit": "metre"}
+                for a in "XYZ"
+            ],
+        },
+    }
+    frame = crs_text(type(crs).from_json_dict(geocentric))
+    return frame, frame if crs.is_geocentric else text, ()

@@ -11,17 +11,15 @@ from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
 from pcfix.errors import InputError, PcfixWarning
-from pcfix.io.cameras.checks import DAMAGES, damaged, missing, no_pose, read_xml, reading
+from pcfix.io.cameras.checks import DAMAGES, damaged, missing, no_pose, note, read_xml, reading
 from pcfix.io.cameras.formats import Source
 
 ZIP_MAGIC = b"PK\x03\x04"
 ROOT = re.compile(r"\s*(?:<\?.*?\?>\s*|<!--.*?-->\s*)*<(\w+)", re.DOTALL)
 OF_CHUNKS = re.compile(r"<chunks?\b|\bpath=")
-INSIDE = {
-    "document": OF_CHUNKS,
-    "collection": OF_CHUNKS,  # read as a document: no file of such a PhotoScan was at hand
-    "chunk": re.compile(r"<sensors\b"),
-}
+INSIDE = {"document": OF_CHUNKS, "collection": OF_CHUNKS, "chunk": re.compile(r"<sensors\b")}
+MOST_BYTES = 2**30
+"""Largest document or table of points that is unpacked from an archive."""
 
 
 @dataclass(frozen=True)
@@ -83,19 +81,28 @@ def open_chunk(path: Path) -> Chunk:
     if top.root.tag == "chunk":
         return Chunk(path, top, _software(top.root, top.root), ())
     candidates = top.root.findall("chunk") or top.root.findall("chunks/chunk")
-    if not candidates:
-        raise no_pose(path, "has no chunk")
     chunks = top.root.find("chunks")
     active = None if chunks is None else chunks.get("active_id")
     candidates.sort(key=lambda chunk: chunk.get("id") != active)
-    chosen, *others = _with_poses(top, candidates)
-    name, *names = (each.root.get("label") or "without a name" for each in (chosen, *others))
+    found, lost = [], []
+    for candidate in candidates:
+        try:
+            found.append(top.follow(candidate))
+        except InputError as error:
+            lost.append(error)
+    posed = [one for one in found if one.root.find("cameras//camera/transform") is not None]
+    if not posed and lost:
+        raise lost[0]
+    if not found:
+        raise no_pose(path, "has no chunk")
+    chosen, *others = posed or found[:1]
+    names = [each.root.get("label") or "without a name" for each in (chosen, *others)]
     sentence = (
-        f"{path}: {len(others) + 1} chunks have aligned images; read is {name}, not"
-        f" {', '.join(names[:10])}. Make another chunk the active one to read that."
+        f"{len(names)} chunks have aligned images; read is {names[0]}, not"
+        f" {', '.join(names[1:11])}. Make another chunk the active one to read that."
     )
-    note = PcfixWarning("cameras.several_chunks", sentence, chunk=name, others=names)
-    return Chunk(path, chosen, _software(chosen.root, top.root), (note,) if others else ())
+    said = note(path, "cameras.several_chunks", sentence, chunk=names[0], others=names[1:])
+    return Chunk(path, chosen, _software(chosen.root, top.root), (said,) if others else ())
 
 
 def _top(path: Path) -> Document:
@@ -115,24 +122,6 @@ def _top(path: Path) -> Document:
     return Document(root, path)
 
 
-def _with_poses(top: Document, candidates: list[Element]) -> list[Document]:
-    """Return the chunks with poses, or the first where none has some."""
-    posed: list[Document] = []
-    empty: list[Document] = []
-    lost: list[InputError] = []
-    for candidate in candidates:
-        try:
-            chunk = top.follow(candidate)
-        except InputError as error:
-            lost.append(error)
-            continue
-        cameras = chunk.root.iterfind("cameras//camera")
-        (posed if any(c.find("transform") is not None for c in cameras) else empty).append(chunk)
-    if not posed and lost:
-        raise lost[0]
-    return posed or empty[:1]
-
-
 def _software(chunk: Element, top: Element) -> str:
     """Return program and version, or that of the document where the file names no program."""
     entries = (*top.iterfind("meta/property"), *chunk.iterfind("meta/property"))
@@ -145,10 +134,6 @@ def _software(chunk: Element, top: Element) -> str:
     return f"Agisoft Metashape, document {document}" if document else "Agisoft Metashape"
 
 
-MOST_BYTES = 2**30
-"""Largest document or table of points that is unpacked from an archive."""
-
-
 def read_entry(path: Path) -> Document:
     """Return the document in an archive."""
     with open_archive(path) as archive:
@@ -157,9 +142,9 @@ def read_entry(path: Path) -> Document:
 
 def open_archive(path: Path) -> zipfile.ZipFile:
     """Open an archive."""
+    if not path.is_file():
+        raise missing(path)
     with reading(path):
-        if not path.is_file():
-            raise missing(path)
         return zipfile.ZipFile(path)
 
 

@@ -21,24 +21,22 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from pcfix.errors import PcfixWarning
+from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import damaged, number, numbers, read_xml, without_zeros, wrong
+from pcfix.io.cameras.checks import damaged, note, number, numbers, read_xml, terms
 from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.metashape import documents
 from pcfix.model import FloatArray, Lens, Projection
 
-RADIAL = ("k1", "k2", "k3", "k4")
-PARAMETERS = {"f", "fx", "fy", "cx", "cy", "b1", "b2", "skew", *RADIAL, "p1", "p2", "p3", "p4"}
+DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
+PARAMETERS = {"f", "fx", "fy", "cx", "cy", "b1", "b2", "skew", *DISTORTION}
 PROJECTIONS: dict[str, Projection] = {
     "frame": "perspective",
     "fisheye": "equidistant",
     "equidistant_fisheye": "equidistant",
     "equisolid_fisheye": "equisolid",
 }
-
-
-_OFF = ("", "0", "false", "disabled", "none")
+"""Kinds of sensors that a lens can describe: not spherical, cylindrical or RPC."""
 
 
 def read_calibration(path: Path) -> Lens:
@@ -49,7 +47,7 @@ def read_calibration(path: Path) -> Lens:
             f"is not a calibration of Metashape ({root.tag}). Save it from Tools, Camera"
             " Calibration."
         )
-        raise wrong(path, "cameras.no_calibration", sentence)
+        raise bad_file(path, "cameras.no_calibration", sentence)
     kind = (root.findtext("projection") or "frame").strip()
     if kind not in PROJECTIONS:
         remedy = f"Use a lens of type {', '.join(PROJECTIONS)}"
@@ -70,20 +68,19 @@ def _lens_of_calibration(
     }
     if not given.keys() & {"f", "fx", "fy"}:
         raise damaged(path, f"the calibration of sensor {sensor} has no focal length")
-    value = defaultdict(float, given)
     width, height = size
-    if "f" in given:
-        focal, x, y = value["f"], width / 2.0 + value["cx"], height / 2.0 + value["cy"]
-        b1, b2, p1, p2 = (value[name] for name in ("b1", "b2", "p1", "p2"))
-    else:
+    value = defaultdict(float, given)
+    focal, x, y = value["f"], width / 2.0 + value["cx"], height / 2.0 + value["cy"]
+    b1, b2, tangential = value["b1"], value["b2"], "p1 p2 p3 p4"
+    if "f" not in given:
         focal = given.get("fy", value["fx"])
         x, y = given.get("cx", width / 2.0), given.get("cy", height / 2.0)
-        b1, b2, p1, p2 = given.get("fx", focal) - focal, value["skew"], value["p2"], value["p1"]
+        b1, b2, tangential = given.get("fx", focal) - focal, value["skew"], "p2 p1 p3 p4"
     return Lens(
         *(focal, width, height, x, y, b1, b2),
         projection=PROJECTIONS[kind],
-        radial=without_zeros([value[name] for name in RADIAL]),
-        tangential=without_zeros([p1, p2, value["p3"], value["p4"]]),
+        radial=terms(given, "k1 k2 k3 k4"),
+        tangential=terms(given, tangential),
         sensor=sensor,
     )
 
@@ -94,90 +91,71 @@ def name_of(sensor: Element) -> str:
 
 
 def kind_of(sensor: Element) -> str:
-    """Return the type of a sensor, which may be one that no lens can describe."""
+    """Return the type of a sensor, which may be none of `PROJECTIONS`."""
     found = _calibration(sensor)
     return (found is not None and found.get("type")) or sensor.get("type") or "frame"
 
 
-def is_central(sensor: Element) -> bool:
-    """Whether it is a frame camera or a fisheye, not spherical, cylindrical or RPC."""
-    return kind_of(sensor) in PROJECTIONS
-
-
-def lens_of(path: Path, sensor: Element, image: str) -> Lens:
-    """Return the adjusted calibration of a sensor, else the initial one, else its data sheet."""
-    label, kind = name_of(sensor), kind_of(sensor)
-    found = _calibration(sensor)
+def lens_of(path: Path, sensor: Element, image: str) -> tuple[Lens, tuple[PcfixWarning, ...]]:
+    """Return the adjusted calibration, else the initial one, else the data sheet; and notes."""
+    label, found = name_of(sensor), _calibration(sensor)
     size = None if found is None else _resolution(path, label, found)
     size = size or _resolution(path, label, sensor)
-    pixel_mm = _property(path, sensor, "pixel_width")
+    pixel_mm, focal_mm = (_property(path, sensor, n) for n in ("pixel_width", "focal_length"))
+    notes = []
     if found is not None and size is not None:
-        lens = _lens_of_calibration(path, label, kind, found, size)
-        return replace(lens, pixel_size_mm=pixel_mm)
-    focal_mm = _property(path, sensor, "focal_length")
-    if found is not None or size is None or focal_mm is None or pixel_mm is None:
+        lens = _lens_of_calibration(path, label, kind_of(sensor), found, size)
+        lens = replace(lens, pixel_size_mm=pixel_mm)
+        if coefficients := found.findtext("corrections/coeffs"):
+            where, count = f"sensor {label}, corrections", len(coefficients.split())
+            rms_px = float(np.linalg.norm(numbers(path, where, coefficients, count)) / 2.0**0.5)
+            sentence = f"the additional corrections of sensor {label} are ignored ({rms_px:.2f} px"
+            sentence += " rms)."
+            notes.append(note(path, "cameras.corrections", sentence, sensor=label, rms_px=rms_px))
+    elif found is None and size is not None and focal_mm is not None and pixel_mm is not None:
+        lens = Lens(  # what Metashape itself starts from
+            *(focal_mm / pixel_mm, *size, size[0] / 2.0, size[1] / 2.0),
+            projection=PROJECTIONS[kind_of(sensor)],
+            pixel_size_mm=pixel_mm,
+            sensor=label,
+        )
+        sentence = (
+            f"sensor {label} has no calibration. Its focal length is that of the data sheet,"
+            " without distortion."
+        )
+        notes.append(note(path, "cameras.data_sheet_lens", sentence, sensor=label))
+    else:
         sentence = (
             f"the sensor {label} of image {image} has no calibration, or no size. Align the images"
             " in Metashape and export the cameras again."
         )
-        raise wrong(path, "cameras.no_calibration", sentence, sensor=label)
-    width, height = size
-    return Lens(  # what Metashape itself starts from: the data sheet, no distortion
-        *(focal_mm / pixel_mm, width, height, width / 2.0, height / 2.0),
-        projection=PROJECTIONS[kind],
-        pixel_size_mm=pixel_mm,
-        sensor=label,
-    )
+        raise bad_file(path, "cameras.no_calibration", sentence, sensor=label)
+    shutter = [p for p in sensor.iterfind("property") if p.get("name") == "rolling_shutter"]
+    if any((p.get("value") or "0").lower() not in ("0", "false", "disabled") for p in shutter):
+        sentence = (
+            f"the rolling shutter compensation of sensor {label} is ignored, each image has one"
+            " pose. At 5 m/s and 30 ms that is 0.15 m; fly slower where it matters."
+        )
+        notes.append(note(path, "cameras.rolling_shutter", sentence, sensor=label))
+    return lens, tuple(notes)
 
 
 def offset_of(path: Path, sensor: Element) -> FloatArray:
     """Return where a slave is in the frame of its master, a 4x4 matrix in the chunk's unit."""
     label = name_of(sensor)
     offset = np.eye(4)
-    if rotation := (sensor.findtext("rotation") or "").strip():
-        matrix = numbers(path, f"sensor {label}, rotation", rotation, 9).reshape(3, 3)
+    if rotation := checks.text_of(sensor, "rotation"):
+        matrix = numbers(path, f"sensor {label}, rotation", rotation, 9)
         offset[:3, :3] = checks.rotations(path, [f"sensor {label}"], matrix)[0]
-    if location := (sensor.findtext("location") or "").strip():
+    if location := checks.text_of(sensor, "location"):
         offset[:3, 3] = numbers(path, f"sensor {label}, location", location, 3)
     return offset
-
-
-def notes_on(path: Path, sensor: Element) -> tuple[PcfixWarning, ...]:
-    """Return notes on what the lens of a sensor does not have."""
-    label = name_of(sensor)
-    found = _calibration(sensor)
-    notes = []
-    if found is None:
-        sentence = (
-            f"{path}: sensor {label} has no calibration. Its focal length is that of the data"
-            " sheet, without distortion."
-        )
-        notes.append(PcfixWarning("cameras.data_sheet_lens", sentence, sensor=label))
-    elif coefficients := found.findtext("corrections/coeffs"):
-        where = f"sensor {label}, corrections"
-        values = numbers(path, where, coefficients, len(coefficients.split()))
-        rms_px = float(np.sqrt((values**2).sum() / 2.0))
-        sentence = f"{path}: the additional corrections of sensor {label} are ignored"
-        sentence += f" ({rms_px:.2f} px rms)."
-        notes.append(PcfixWarning("cameras.corrections", sentence, sensor=label, rms_px=rms_px))
-    if any(
-        entry.get("name") == "rolling_shutter"  # rolling_shutter_flags say which model
-        and (entry.get("value") or "").lower() not in _OFF
-        for entry in sensor.iterfind("property")
-    ):
-        sentence = (
-            f"{path}: the rolling shutter compensation of sensor {label} is ignored, each image has"
-            " one pose. At 5 m/s and 30 ms that is 0.15 m; fly slower where it matters."
-        )
-        notes.append(PcfixWarning("cameras.rolling_shutter", sentence, sensor=label))
-    return tuple(notes)
 
 
 def _calibration(sensor: Element) -> Element | None:
     """Return the last adjusted calibration, else the last one."""
     found = sensor.findall("calibration")
-    adjusted = [one for one in found if one.get("class") == "adjusted"]
-    chosen = adjusted or found
+    chosen = [one for one in found if one.get("class") == "adjusted"] or found
     return chosen[-1] if chosen else None
 
 
@@ -196,9 +174,6 @@ def _property(path: Path, sensor: Element, name: str) -> float | None:
     return value if value > 0.0 else None
 
 
-DISTORTION = ("k1", "k2", "k3", "p1", "p2")
-
-
 def given_lenses(path: Path) -> dict[str, Lens]:
     """Return the calibrations that were given, by the name of the sensor; none of other software.
 
@@ -209,12 +184,11 @@ def given_lenses(path: Path) -> dict[str, Lens]:
         return {}
     found: dict[str, Lens] = {}
     for sensor in documents.open_chunk(path).element.iterfind("sensors/sensor"):
+        label, kind = name_of(sensor), kind_of(sensor)
         given = [one for one in sensor.findall("calibration") if one.get("class") == "initial"]
-        if not given or not is_central(sensor):
-            continue
-        label = name_of(sensor)
-        size = _resolution(path, label, given[-1])
-        if size and any((given[-1].findtext(k) or "0").strip(" 0.-") for k in DISTORTION):
-            lens = _lens_of_calibration(path, label, kind_of(sensor), given[-1], size)
-            found[label] = checks.lens(path, label, lens)
+        size = _resolution(path, label, given[-1]) if given else None
+        if size is not None and kind in PROJECTIONS:
+            lens = _lens_of_calibration(path, label, kind, given[-1], size)
+            if lens.radial or lens.tangential:
+                found[label] = checks.lens(path, label, lens)
     return found

@@ -20,16 +20,25 @@ https://opensfm.org/docs.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path, PurePath
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.errors import PcfixWarning
 from pcfix.io.cameras import tracks
-from pcfix.io.cameras.checks import damaged, load_json, no_pose, reading, several, triple
+from pcfix.io.cameras.checks import (
+    centres,
+    damaged,
+    load_json,
+    no_pose,
+    note,
+    read_text,
+    reading,
+    several,
+    triple,
+)
 from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.opensfm.models import is_panorama, lens
 from pcfix.lens.rotations import from_rotation_vectors
@@ -84,50 +93,51 @@ class Reconstruction(NamedTuple):
 
 def read_reconstruction(path: Path) -> Reconstruction:
     """Read the reconstruction with the most images."""
+    data = load_json(path)
     with reading(path):
-        return _reconstruction(path, load_json(path))
-
-
-def _reconstruction(path: Path, data: Any) -> Reconstruction:
-    """Return the reconstruction with the most images of a file."""
-    sets = [entry.get("shots", {}) for entry in data]
-    counts = [len(shots) for shots in sets]
-    if not any(counts):
-        raise no_pose(path)
-    best = counts.index(max(counts))
-    chosen, notes = data[best], []
-    others = [name for i, shots in enumerate(sets) if i != best for name in shots]
-    if others:
-        notes.append(several(path, len(data), counts[best]))
-    entries = chosen["cameras"]
-    panoramas = [k for k, shot in sets[best].items() if is_panorama(entries[shot["camera"]])]
-    shots = {k: shot for k, shot in sets[best].items() if k not in set(panoramas)}
-    if panoramas:
-        sentence = f"{path}: {len(panoramas)} images of all-round cameras are left out."
-        notes.append(PcfixWarning("cameras.panoramas", sentence, images=panoramas))
-    if not shots:
-        raise no_pose(path, "all images are of all-round cameras (spherical)")
-    lenses = {k: lens(path, k, entries[k]) for k in {shot["camera"] for shot in shots.values()}}
-    rotations, centres = _poses(chosen, shots)
-    xyz, sigma = _gnss(shots)
-    reference = _reference(path, chosen)
-    crs = "local" if reference is None else "ENU:" + ",".join(map(repr, reference))
-    has_gnss = reference is not None and np.isfinite(xyz).any()
-    listed = path.with_name("image_list.txt")  # the images that the project was given
-    lines = listed.read_text("utf-8", errors="replace").split("\n") if listed.is_file() else []
-    given = [PurePath(line.strip().replace("\\", "/")).name for line in lines if line.strip()]
-    cameras = Cameras(
-        labels=tuple(shots),
-        centres=centres,
-        rotations=rotations,
-        lenses=tuple(lenses[shot["camera"]] for shot in shots.values()),
-        crs=crs,
-        notes=tuple(notes),
-        gnss=GnssPositions(xyz, sigma, crs) if has_gnss else None,
-        unposed=left_out(shots, [*others, *panoramas, *given]),
-        source="OpenSfM",
-    )
-    return Reconstruction(path, cameras, reference, chosen.get("points", {}))
+        sets = [entry.get("shots", {}) for entry in data]
+        counts = [len(shots) for shots in sets]
+        if not any(counts):
+            raise no_pose(path)
+        best = counts.index(max(counts))
+        chosen, notes = data[best], []
+        others = [name for i, shots in enumerate(sets) if i != best for name in shots]
+        if others:
+            notes.append(several(path, len(data), counts[best]))
+        entries = chosen["cameras"]
+        panoramas = [k for k, shot in sets[best].items() if is_panorama(entries[shot["camera"]])]
+        shots = {k: shot for k, shot in sets[best].items() if k not in set(panoramas)}
+        if panoramas:
+            sentence = f"{len(panoramas)} images of all-round cameras are left out."
+            notes.append(note(path, "cameras.panoramas", sentence, images=panoramas))
+        if not shots:
+            raise no_pose(path, "all images are of all-round cameras (spherical)")
+        lenses = {k: lens(path, k, entries[k]) for k in {shot["camera"] for shot in shots.values()}}
+        rotations, shifts = _poses(chosen, shots)
+        xyz, sigma = np.full((2, len(shots), 3), np.nan)
+        for i, shot in enumerate(shots.values()):
+            dop = shot.get("gps_dop")
+            if shot.get("gps_position") is not None and dop != NO_GNSS:
+                xyz[i] = triple(shot["gps_position"])
+                sigma[i] = np.nan if dop is None else dop
+        reference = _reference(path, chosen)
+        crs = "local" if reference is None else "ENU:" + ",".join(map(repr, reference))
+        has_gnss = reference is not None and np.isfinite(xyz).any()
+        listed = path.with_name("image_list.txt")  # the images that the project was given
+        lines = read_text(listed).splitlines() if listed.is_file() else []
+        given = [PurePath(line.strip().replace("\\", "/")).name for line in lines if line.strip()]
+        cameras = Cameras(
+            labels=tuple(shots),
+            centres=centres(rotations, shifts),
+            rotations=rotations,
+            lenses=tuple(lenses[shot["camera"]] for shot in shots.values()),
+            crs=crs,
+            notes=tuple(notes),
+            gnss=GnssPositions(xyz, sigma, crs) if has_gnss else None,
+            unposed=left_out(shots, [*others, *panoramas, *given]),
+            source="OpenSfM",
+        )
+        return Reconstruction(path, cameras, reference, chosen.get("points", {}))
 
 
 def left_out(labels: Iterable[str], others: Iterable[str]) -> tuple[str, ...]:
@@ -138,7 +148,7 @@ def left_out(labels: Iterable[str], others: Iterable[str]) -> tuple[str, ...]:
 
 
 def _poses(chosen: Any, shots: dict[str, Any]) -> tuple[FloatArray, FloatArray]:
-    """Return rotations and centres; x_camera = R x + t.
+    """Return R and t; x_camera = R x + t.
 
     An image on a rig has the pose of the rig in the world, then that of its camera on the rig.
     """
@@ -155,23 +165,12 @@ def _poses(chosen: Any, shots: dict[str, Any]) -> tuple[FloatArray, FloatArray]:
         (rig_r, rig_t), (turn, shift) = map(_pose, riders[label])
         pairs.append((turn @ rig_r, turn @ rig_t + shift))
     rotations, shifts = (np.array(each) for each in zip(*pairs, strict=True))
-    return rotations, -np.einsum("kji,kj->ki", rotations, shifts)
+    return rotations, shifts
 
 
 def _pose(entry: Any) -> tuple[FloatArray, FloatArray]:
     """Return R and t of an entry with an axis-angle rotation."""
     return from_rotation_vectors(triple(entry["rotation"])), triple(entry["translation"])
-
-
-def _gnss(shots: dict[str, Any]) -> tuple[FloatArray, FloatArray]:
-    """Return positions and their standard deviation, NaN where an image has none."""
-    xyz, sigma = np.full((2, len(shots), 3), np.nan)
-    for i, shot in enumerate(shots.values()):
-        dop = shot.get("gps_dop")
-        if shot.get("gps_position") is not None and dop != NO_GNSS:
-            xyz[i] = triple(shot["gps_position"])
-            sigma[i] = np.nan if dop is None else dop
-    return xyz, sigma
 
 
 def _reference(path: Path, chosen: Any) -> tuple[float, float, float] | None:
@@ -206,21 +205,25 @@ def read_tie_points(reconstruction: Reconstruction) -> TiePoints:
     order = np.lexsort((camera, point))
     size = np.array([(lens.width, lens.height) for lens in cameras.lenses or ()])[camera]
     uv = xy * size.max(axis=1, initial=0.0)[:, None] + size / 2.0
-    return tracks.tie_points(xyz, point[order], camera[order], uv[order])
+    return tracks.tie_points(tracks.Seen(xyz, point[order], camera[order], uv[order]))
 
 
 def _observations(
     path: Path, points: list[str], labels: tuple[str, ...]
 ) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return point row, camera row and normalised x, y of every line that has both."""
+    """Return point row, camera row and normalised x, y of every line that has both.
+
+    Lines are read in blocks, as there can be many millions.
+    """
     camera_of, point_of = (
         {name.encode(errors="replace"): i for i, name in enumerate(names)}
         for names in (labels, points)
     )
-    parts = []
+    parts: list[tuple[IntArray, IntArray, FloatArray]] = []
     with path.open("rb") as stream:
-        for block in _blocks(stream):
-            lines = [line.split(b"\t", 5) for line in block.split(b"\n") if line.strip()]
+        while block := stream.readlines(CHUNK_BYTES):
+            lines = [line.split(b"\t", 5) for line in block if line.strip()]
+            lines = lines[1:] if not parts and block[0].startswith(HEADER) else lines
             point = np.array([point_of.get(fields[1], -1) for fields in lines], dtype=np.int64)
             camera = np.array([camera_of.get(fields[0], -1) for fields in lines], dtype=np.int64)
             values = np.array([fields[3:5] for fields in lines], dtype=float).reshape(-1, 2)
@@ -230,17 +233,3 @@ def _observations(
         raise damaged(path, "it is empty")
     point, camera, xy = (np.concatenate(column) for column in zip(*parts, strict=True))
     return point, camera, xy
-
-
-def _blocks(stream: IO[bytes]) -> Iterator[bytes]:
-    """Yield whole lines in blocks, without the header."""
-    rest = stream.readline()
-    if rest.startswith(HEADER):
-        rest = b""
-    while chunk := stream.read(CHUNK_BYTES):
-        whole, newline, tail = (rest + chunk).rpartition(b"\n")
-        if newline:
-            yield whole
-        rest = tail
-    if rest.strip():
-        yield rest

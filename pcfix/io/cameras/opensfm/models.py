@@ -25,15 +25,14 @@ from typing import Any
 
 import numpy as np
 
+from pcfix.errors import bad_file
 from pcfix.io.cameras.checks import (
-    bad_label,
+    block_to_write,
     damaged,
     is_same_lens,
     lens_not_held,
-    needs_lenses,
     unsupported,
     write_new,
-    wrong,
 )
 from pcfix.io.cameras.georeference import frame_of, georeference, is_tied
 from pcfix.io.cameras.tracks import NO_TIE_POINTS, are_seen
@@ -64,6 +63,8 @@ _MODELS: dict[str, tuple[Projection, int]] = {
     "dual": ("dual", 2),
 }
 _TANGENTIAL = frozenset({"brown", "fisheye62", "fisheye624"})
+_WRITTEN = ("perspective", "brown", "fisheye", "fisheye_opencv", "fisheye62", "fisheye624", "dual")
+"""The simplest first."""
 _SIZE = re.compile(r" (\d{2,6}) (\d{2,6}) [a-z_]+\d* ")
 
 
@@ -135,19 +136,28 @@ def write_opensfm(path: File, cameras: Cameras, tie_points: TiePoints | None = N
         If a file exists.
     """
     target = Path(path)
-    if cameras.rotations is None or cameras.lenses is None:
-        raise needs_lenses(target)
-    for label, count in Counter(cameras.labels).items():  # they are keys in the file
-        if count > 1 or "\t" in label or "\n" in label:
-            raise bad_label(target, label)
-    models = {each: opensfm_camera(target, each) for each in dict.fromkeys(cameras.lenses)}
+    times = Counter(cameras.labels)  # they are keys in the file
+    _, lenses = block_to_write(
+        target, cameras, lambda label: times[label] == 1 and not {"\t", "\n"} & {*label}
+    )
+    models = {each: opensfm_camera(target, each) for each in dict.fromkeys(lenses)}
     names = {each: f"pcfix {i}" for i, each in enumerate(models, start=1)}
     ties = tie_points or NO_TIE_POINTS
     kept = np.flatnonzero(are_seen(ties))
+    from scipy.spatial.transform import Rotation
+
     there, points, place = _world(cameras, ties.xyz[kept], str(target))
+    rotations = np.asarray(there.rotations)
+    turns = Rotation.from_matrix(rotations).as_rotvec()
+    shifts = -np.einsum("kij,kj->ki", rotations, there.centres)
     chosen: dict[str, Any] = {
         "cameras": {names[each]: model for each, model in models.items()},
-        "shots": _shots(there, names),
+        "shots": {
+            label: {"rotation": turn, "translation": shift, "camera": names[one]}
+            for label, turn, shift, one in zip(
+                cameras.labels, turns.tolist(), shifts.tolist(), lenses, strict=True
+            )
+        },
         "points": {
             str(i): {"color": list(GREY), "coordinates": row}
             for i, row in enumerate(points.tolist())
@@ -166,44 +176,30 @@ def write_opensfm(path: File, cameras: Cameras, tie_points: TiePoints | None = N
 
 def opensfm_camera(path: Path, given: Lens) -> dict[str, Any]:
     """Return the simplest entry of `cameras` that is exactly this lens."""
-    if given.unit == "px":
-        for camera in _candidates(given):
-            if is_same_lens(lens(path, "1", camera), given):
-                return camera
-    raise lens_not_held(path, given)
-
-
-def _candidates(given: Lens) -> Iterator[dict[str, Any]]:
-    """Yield the entries that may be the lens, the simplest first."""
     scale = max(given.width, given.height)
-    radial = {f"k{i + 1}": value for i, value in enumerate((*given.radial, *(0.0,) * 6)[:6])}
-    p2, p1 = (*given.tangential, 0.0, 0.0)[:2]
+    size = {"width": int(given.width), "height": int(given.height)}
     one = {"focal": given.focal / scale}
-    two: dict[str, Any] = {
+    two = {
         "focal_x": (given.focal + given.b1) / scale,
         "focal_y": given.focal / scale,
         "c_x": (given.principal_x - given.width / 2.0) / scale,
         "c_y": (given.principal_y - given.height / 2.0) / scale,
     }
-    bent = {"p1": p1, "p2": p2}
+    p2, p1 = (*given.tangential, 0.0, 0.0)[:2]
     prism = {f"s{i}": value for i, value in enumerate((*given.thin_prism, *(0.0,) * 4)[:4])}
-    for projection, model, more, count in (
-        ("perspective", "perspective", one, 2),
-        ("perspective", "brown", two | bent, 3),
-        ("equidistant", "fisheye", one, 2),
-        ("equidistant", "fisheye_opencv", two, 4),
-        ("equidistant", "fisheye62", two | bent, 6),
-        ("equidistant", "fisheye624", two | bent | prism, 6),
-        ("dual", "dual", one | {"transition": given.shape[0] if given.shape else 0.5}, 2),
-    ):
+    radial = (*given.radial, *(0.0,) * 6)
+    for model in _WRITTEN if given.unit == "px" else ():
+        projection, count = _MODELS[model]
         if projection == given.projection:
-            yield {
-                "projection_type": model,
-                "width": int(given.width),
-                "height": int(given.height),
-                **more,
-                **dict(list(radial.items())[:count]),
-            }
+            camera: dict[str, Any] = {"projection_type": model, **size}
+            camera |= one if model in ("perspective", "fisheye", "dual") else two
+            camera |= {f"k{i + 1}": radial[i] for i in range(count)}
+            camera |= {"p1": p1, "p2": p2} if model in _TANGENTIAL else {}
+            camera |= prism if model == "fisheye624" else {}
+            camera |= {"transition": (*given.shape, 0.5)[0]} if model == "dual" else {}
+            if is_same_lens(lens(path, "1", camera), given):
+                return camera
+    raise lens_not_held(path, given)
 
 
 def _world(
@@ -219,7 +215,7 @@ def _world(
         return cameras, points, Topocentric.from_text(cameras.crs, name)
     if not parse_crs(cameras.crs, name).is_projected:
         sentence = f"the cameras are in {shortened(cameras.crs)}. Bring them to a projected CRS."
-        raise wrong(name, "output.crs", sentence, crs=cameras.crs)
+        raise bad_file(name, "output.crs", sentence, crs=cameras.crs)
     source, geographic = frame_of(cameras.crs, name).crs, parse_crs(GEOGRAPHIC_WGS84, name)
     stated = heights_of(source) != "unstated"
     to_degrees = transformation(source, geographic, cameras.centres, name, heights=stated).forward
@@ -242,20 +238,6 @@ def _topocentric(degrees: FloatArray, place: Topocentric) -> FloatArray:
         f" +lon_0={place.longitude_deg!r} +h_0={place.height_m!r}"
     )
     return np.column_stack(to_axes.transform(*to_geocentric.transform(*degrees.T)))
-
-
-def _shots(cameras: Cameras, names: dict[Lens, str]) -> dict[str, Any]:
-    from scipy.spatial.transform import Rotation
-
-    rotations = np.asarray(cameras.rotations)
-    turns = Rotation.from_matrix(rotations).as_rotvec().tolist()
-    shifts = -np.einsum("kij,kj->ki", rotations, cameras.centres)
-    return {
-        label: {"rotation": turn, "translation": shift, "camera": names[lens]}
-        for label, turn, shift, lens in zip(
-            cameras.labels, turns, shifts.tolist(), cameras.lenses or (), strict=True
-        )
-    }
 
 
 def _tracks(cameras: Cameras, tie_points: TiePoints, kept: IntArray) -> Iterator[str]:

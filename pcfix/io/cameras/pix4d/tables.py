@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.io.cameras.checks import damaged
+from pcfix.io.cameras.checks import damaged, read_text
 from pcfix.lens.rotations import from_omega_phi_kappa
 from pcfix.model import FloatArray, Lens
 
@@ -27,6 +27,8 @@ FIELDS = {
 }
 SHAPE = re.compile(r"^(.*?)\s*\[\s*(\d{1,2})\s*x\s*(\d{1,2})\s*\]\s*$")
 SENSOR = re.compile(r"sensor width of\s*([-+.\deE]+)\s*x\s*([-+.\deE]+)")
+SAME_FOCAL = 1e-6
+"""Relative: the two files write the same number in pixels and in millimetres."""
 
 
 class Image(NamedTuple):
@@ -39,69 +41,43 @@ class Image(NamedTuple):
 
 
 class Calibration(NamedTuple):
-    """One camera of the calibration file: the sensor in mm, and what else it says."""
+    """One camera of the calibration file: the sensor in mm, and the first number of each line."""
 
     sensor_mm: tuple[float, float]
-    values: dict[str, list[float]]
-
-
-def read_text(path: Path) -> str:
-    """Return the text of a file; bytes that are not UTF-8 can only be in names."""
-    data = path.read_bytes()
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        return data.decode("latin-1")
+    values: dict[str, float]
 
 
 def read_parameters(path: Path) -> list[Image]:
     """Read the camera parameters; their layout is what the header names with sizes."""
     lines = [line for line in read_text(path).splitlines() if line.strip()]
-    header = [
-        number
-        for number, line in enumerate(lines[:20], start=1)
-        if SHAPE.match(line) or line.strip().lower().startswith("camera model")
-    ]
-    row = max(header, default=1)
-    layout = _layout(path, lines[:row])
+    layout, row = [], 1
+    for i, line in enumerate(lines[:20], start=1):
+        if shape := SHAPE.match(line):
+            words = shape[1].lower()
+            name = next((name for word, name in FIELDS.items() if word in words), "")
+            layout.append((name, int(shape[2]) * int(shape[3])))
+        if shape or line.strip().lower().startswith("camera model"):
+            row = i
+    if not {("centre", 3), ("rotation", 9)} <= set(layout):
+        raise damaged(path, "its header has no 'camera position t [3x1]' or 'rotation R [3x3]'")
+    ends = np.cumsum([count for _, count in layout])
     images = []
     while row < len(lines):
-        image, row = _image(path, lines, row, layout)
-        images.append(image)
+        label, *size = lines[row].rsplit(None, 2)
+        words_of: list[str] = []
+        row += 1
+        while len(words_of) < ends[-1] and row < len(lines):
+            words_of += lines[row].split()
+            row += 1
+        if len(words_of) != ends[-1]:
+            raise damaged(path, f"image {label}: {len(words_of)} numbers instead of {ends[-1]}")
+        width, height = _numbers(path, f"image {label}", size)
+        parts = np.split(_numbers(path, f"image {label}", words_of), ends[:-1])
+        fields = {name: part for (name, _), part in zip(layout, parts, strict=True) if name}
+        images.append(Image(label.strip(), float(width), float(height), fields))
     if not images:
         raise damaged(path, "has a header but no images")
     return images
-
-
-def _layout(path: Path, header: list[str]) -> list[tuple[str, int]]:
-    """Return the name and count of numbers of each field; fields that are not known are empty."""
-    layout = []
-    for match in filter(None, map(SHAPE.match, header)):
-        words = match[1].lower()
-        name = next((name for word, name in FIELDS.items() if word in words), "")
-        layout.append((name, int(match[2]) * int(match[3])))
-    if not {("centre", 3), ("rotation", 9)} <= set(layout):
-        raise damaged(path, "its header has no 'camera position t [3x1]' or 'rotation R [3x3]'")
-    return layout
-
-
-def _image(
-    path: Path, lines: list[str], row: int, layout: list[tuple[str, int]]
-) -> tuple[Image, int]:
-    """Return the image that begins in a row, and the row after it."""
-    label, *size = lines[row].rsplit(None, 2)
-    ends = np.cumsum([count for _, count in layout])
-    words: list[str] = []
-    row += 1
-    while len(words) < ends[-1] and row < len(lines):
-        words += lines[row].split()
-        row += 1
-    if len(words) != ends[-1]:
-        raise damaged(path, f"image {label}: {len(words)} numbers instead of {ends[-1]}")
-    width, height = _numbers(path, f"image {label}", size)
-    parts = np.split(_numbers(path, f"image {label}", words), ends[:-1])
-    fields = {name: part for (name, _), part in zip(layout, parts, strict=True) if name}
-    return Image(label.strip(), float(width), float(height), fields), row
 
 
 def _numbers(path: Path, where: str, words: list[str]) -> FloatArray:
@@ -147,13 +123,8 @@ def read_calibrations(path: Path) -> list[Calibration]:
             cameras[-1] = cameras[-1]._replace(sensor_mm=(float(size[0]), float(size[1])))
         elif cameras and len(words) > 1 and not line.startswith("#"):
             values = _numbers(path, f"camera {len(cameras) - 1}, {words[0]}", words[1:])
-            cameras[-1].values[words[0].lower()] = values.tolist()
+            cameras[-1].values[words[0].lower()] = float(values[0])
     return cameras
-
-
-SAME_FOCAL = 1e-6
-"""Relative: the two files write the same number in pixels and in millimetres."""
-POWERS = ("p0", "p1", "p2", "p3", "p4")
 
 
 def lenses_of_images(
@@ -189,11 +160,15 @@ def _lens(image: Image, calibrations: list[Calibration]) -> Lens | None:
             radial=tuple(fields.get("radial", ())),
             tangential=(t2, t1),
         )
-    elif len(calibrations) == 1:
-        return lens_of_calibration(calibrations[0], image)
     else:
-        return None
-    return replace(lens, pixel_size_mm=_pixel_size_mm(lens, calibrations))
+        return lens_of_calibration(calibrations[0], image) if len(calibrations) == 1 else None
+    for calibration in calibrations:  # the pixel size is that of the one with the focal length
+        pixel, focal_mm = calibration.sensor_mm[0] / lens.width, calibration.values.get("f", 0.0)
+        is_fisheye = "c" in calibration.values
+        expected = focal_mm if is_fisheye else focal_mm / pixel if pixel > 0.0 else 0.0
+        if abs(expected - lens.focal) <= SAME_FOCAL * lens.focal:
+            return replace(lens, pixel_size_mm=pixel)
+    return lens
 
 
 def _fisheye(
@@ -217,33 +192,20 @@ def lens_of_calibration(calibration: Calibration, image: Image | None = None) ->
     A fisheye needs the image, as its matrix is in pixels and its principal point in mm. None
     where the calibration does not say enough.
     """
-    values = {name: numbers[0] for name, numbers in calibration.values.items()}
-    value = defaultdict(float, {"p1": 1.0} | values)
+    value = defaultdict(float, {"p1": 1.0} | calibration.values)
     width_mm, height_mm = calibration.sensor_mm
-    if not {"px", "py", "f"} <= values.keys() or not min(width_mm, height_mm) > 0.0:
+    known = {"px", "py", "f"} <= calibration.values.keys() and min(width_mm, height_mm) > 0.0
+    if not known or ("c" in calibration.values and image is None):
         return None
-    if "c" in values:
-        if image is None:
-            return None
+    if "c" in calibration.values and image is not None:
         scale = image.width / width_mm
-        principal = (values["px"] * scale, values["py"] * scale)
-        affine, polynomial = ([value[name] for name in names] for names in ("cdef", POWERS))
-        lens = _fisheye(image, principal, affine, polynomial)
-        return replace(lens, pixel_size_mm=1.0 / scale)
+        principal = (value["px"] * scale, value["py"] * scale)
+        affine, polynomial = (
+            [value[name] for name in names.split()] for names in ("c d e f", "p0 p1 p2 p3 p4")
+        )
+        return replace(_fisheye(image, principal, affine, polynomial), pixel_size_mm=1.0 / scale)
     return Lens(
-        *(values["f"], width_mm, height_mm, values["px"], values["py"]),
+        *(value["f"], width_mm, height_mm, value["px"], value["py"]),
         radial=(value["k1"], value["k2"], value["k3"]),
         tangential=(value["t2"], value["t1"]),
     )
-
-
-def _pixel_size_mm(lens: Lens, calibrations: list[Calibration]) -> float | None:
-    """Return the pixel size by the calibration that has the same focal length."""
-    for calibration in calibrations:
-        pixel = calibration.sensor_mm[0] / lens.width
-        focal_mm = calibration.values.get("f", [0.0])[0]
-        fisheye = "c" in calibration.values
-        expected = focal_mm if fisheye else focal_mm / pixel if pixel > 0.0 else 0.0
-        if abs(expected - lens.focal) <= SAME_FOCAL * lens.focal:
-            return pixel
-    return None

@@ -42,9 +42,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pcfix.errors import InputError, PcfixWarning
+from pcfix.errors import InputError, PcfixWarning, bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import wrong
+from pcfix.io.cameras.checks import note
 from pcfix.io.cameras.formats import Angles, Source
 from pcfix.io.cameras.table.columns import (
     EXIF,
@@ -77,15 +77,17 @@ def recognises(source: Source) -> bool:
 
 def read(source: Source) -> Cameras:
     """Read a table; see `pcfix.read_cameras`."""
-    everything = open_table(source.path)
-    suffix = "_est" if axes(everything.place, "_est") else ""
-    columns, unposed = everything, tuple[str, ...]()
-    if suffix or are_by_gnss(everything):  # else a position that is not there is a mistake
-        lost = np.isnan(centres(everything, suffix)).any(axis=1)
+    columns = open_table(source.path)
+    suffix = "_est" if axes(columns.place, "_est") else ""
+    by_gnss = any(name in EXIF for name in columns.table.header)  # measured, not adjusted
+    by_gnss |= columns.has("sigma_x") and not suffix
+    unposed = tuple[str, ...]()
+    if suffix or by_gnss:  # else a position that is not there is a mistake
+        lost = np.isnan(centres(columns, suffix)).any(axis=1)
         if lost.all():
             raise checks.no_pose(source.path, "no image has a position")
-        unposed = tuple(everything.labels[i] for i in np.flatnonzero(lost))
-        columns = everything.take(np.flatnonzero(~lost))
+        unposed = tuple(columns.labels[i] for i in np.flatnonzero(lost))
+        columns = columns.take(np.flatnonzero(~lost))
     xyz = centres(columns, suffix, needed=True)
     turns = _rotations(columns, source.angles, suffix)
     if turns is None and source.sensor is not None:
@@ -95,19 +97,19 @@ def read(source: Source) -> Cameras:
     for i, label in enumerate(columns.labels):
         first.setdefault((label, xyz[i].tobytes()), i)
     keep = np.array(list(first.values()))
-    notes = checks.repeated(columns.path, columns.labels, len(columns.labels) - len(keep))
+    system, notes = crs(columns)
+    if by_gnss:
+        sentence = "its positions are those of the GNSS, not adjusted ones."
+        notes += (note(columns.path, "cameras.not_adjusted", sentence),)
+    dropped = len(columns.labels) - len(keep)
     gnss = gnss_positions(columns) if suffix else None
-    system, doubt = crs(columns)
-    if are_by_gnss(columns):
-        sentence = f"{columns.path}: its positions are those of the GNSS, not adjusted ones."
-        doubt += (PcfixWarning("cameras.not_adjusted", sentence, path=columns.path),)
     return Cameras(
         labels=tuple(columns.labels[i] for i in keep),
         centres=xyz[keep],
         rotations=None if turns is None else turns[keep],
         lenses=None if lenses is None else tuple(lenses[i] for i in keep),
         crs=system,
-        notes=(*notes, *doubt),
+        notes=(*checks.repeated(columns.path, columns.labels, dropped), *notes),
         gnss=gnss and GnssPositions(gnss.xyz[keep], gnss.sigma_m[keep], gnss.crs),
         unposed=unposed,
         source="CSV table",
@@ -160,7 +162,7 @@ def centres(columns: Columns, suffix: str = "", *, needed: bool = False) -> Floa
                 f"longitude {xyz[i, 0]:g}, latitude {xyz[i, 1]:g} is no place on earth. Are the"
                 " columns swapped, or metres?"
             )
-            raise wrong(columns.where(i), "cameras.degrees", sentence, path=columns.path)
+            raise columns.error(i, "cameras.degrees", sentence)
     xyz[np.isnan(xyz).any(axis=1)] = np.nan
     return xyz
 
@@ -174,7 +176,7 @@ def crs(columns: Columns) -> tuple[str | None, tuple[PcfixWarning, ...]]:
     """
     said, beside = columns.crs, columns.path.with_suffix(".prj")
     if not said and beside != columns.path and beside.is_file():
-        said = beside.read_bytes().decode("utf-8-sig", errors="replace").strip() or None
+        said = checks.read_text(beside).strip() or None
     if said is None:
         if axes(columns.place) != ("longitude", "latitude", "z"):
             return None, ()
@@ -183,18 +185,9 @@ def crs(columns: Columns) -> tuple[str | None, tuple[PcfixWarning, ...]]:
     if said.startswith("LOCAL_CS"):
         return "local", ()
     if not checks.names_crs(said):
-        sentence = (
-            f"{columns.path}: PROJ does not know its CRS '{shortened(said)}'. The cloud's is"
-            " assumed."
-        )
-        return None, (PcfixWarning("cameras.crs_unknown", sentence, crs=said),)
+        sentence = f"PROJ does not know its CRS '{shortened(said)}'. The cloud's is assumed."
+        return None, (note(columns.path, "cameras.crs_unknown", sentence, crs=said),)
     return said, ()
-
-
-def are_by_gnss(columns: Columns) -> bool:
-    """Whether the table shows that its positions are measured, not adjusted."""
-    exif = any(name in EXIF for name in columns.table.header)
-    return exif or (columns.has("sigma_x") and axes(columns.place, "_est") is None)
 
 
 def is_geo(lines: list[str]) -> bool:
@@ -241,9 +234,6 @@ def _rotations(columns: Columns, angles: Angles | None, suffix: str = "") -> Flo
         missing = [role for role in kind if not columns.has(role)]
         if there and missing:
             raise column_missing(columns.path, missing, columns.table.header)
-    if columns.has("alpha") or columns.has("nu"):
-        what = "a table with the angles alpha, nu, kappa"
-        raise checks.unsupported(columns.path, what, "Export omega, phi, kappa")
     if angles is not None:
         roles = opk if angles == "omega-phi-kappa" else ypr
         if not columns.has(*roles):
@@ -270,28 +260,19 @@ def _from_omega_phi_kappa(columns: Columns, opk: Sequence[str]) -> FloatArray:
     place = columns.place
     reality_capture = columns.after_hash and columns.name("label") == "name"
     if place[opk[1]] < place[opk[0]] or reality_capture:
-        raise _ambiguous(
-            columns,
-            "omega, phi, kappa may be turns in another order here",
-            "Export heading, pitch, roll, or give --angles omega-phi-kappa",
-        )
+        what = "omega, phi, kappa may be turns in another order here"
+        remedy = "Export heading, pitch, roll, or give --angles omega-phi-kappa"
+        raise _ambiguous(columns, what, remedy)
     found = rotations.from_omega_phi_kappa(*columns.of(opk).T)
     if columns.has(*MATRIX) and opk == OMEGA_PHI_KAPPA:
         half_chord = np.linalg.norm(found - _from_matrix(columns), axis=(1, 2)) / np.sqrt(8.0)
         apart_deg = np.degrees(2.0 * np.arcsin(np.minimum(half_chord, 1.0)))
         worst = int(np.argmax(apart_deg))
-        if apart_deg[worst] > AGREEMENT_DEG:
-            sentence = (
-                f"omega, phi, kappa and r11 to r33 are {apart_deg[worst]:.3g} degrees apart. Export"
-                " the table again."
-            )
-            raise wrong(
-                columns.where(worst),
-                "cameras.angles_differ",
-                sentence,
-                path=columns.path,
-                degrees=float(apart_deg[worst]),
-            )
+        apart = float(apart_deg[worst])
+        if apart > AGREEMENT_DEG:
+            sentence = f"omega, phi, kappa and r11 to r33 are {apart:.3g} degrees apart. Export"
+            sentence += " the table again."
+            raise columns.error(worst, "cameras.angles_differ", sentence, degrees=apart)
     return found
 
 
@@ -303,12 +284,10 @@ def _from_matrix(columns: Columns) -> FloatArray:
     matrices = columns.of(MATRIX).reshape(-1, 3, 3)
     found = checks.rotations(columns.path, columns.labels, matrices)
     back_is_up = found[:, 2, 2] > 0.0
-    if back_is_up.all():
-        return rotations.from_photogrammetric(found)
-    if back_is_up.any():
+    if back_is_up.any() and not back_is_up.all():
         what = "r33 has both signs, so the axes of the camera are not clear"
         raise _ambiguous(columns, what, "Give omega, phi, kappa")
-    return found
+    return rotations.from_photogrammetric(found) if back_is_up.all() else found
 
 
 def _from_yaw_pitch_roll(columns: Columns, ypr: Sequence[str]) -> FloatArray:
@@ -317,10 +296,9 @@ def _from_yaw_pitch_roll(columns: Columns, ypr: Sequence[str]) -> FloatArray:
     Refused are angles that are more likely those of a gimbal, which are -90 straight down.
     """
     values = columns.of(ypr).T
-    aircraft = rotations.from_aircraft(*values)
+    found, aircraft = rotations.from_yaw_pitch_roll(*values), rotations.from_aircraft(*values)
     if columns.name(ypr[0]).startswith("gimbal"):
         return aircraft
-    found = rotations.from_yaw_pitch_roll(*values)
     if columns.after_hash and columns.name(ypr[0]) == "heading":  # RealityCapture's
         return found
     tilt, other = (  # the angles between the views and straight down
@@ -328,16 +306,14 @@ def _from_yaw_pitch_roll(columns: Columns, ypr: Sequence[str]) -> FloatArray:
         for each in (found, aircraft)
     )
     if other.max() < LOOKS_DOWN_DEG and np.median(other) < np.median(tilt):
-        raise _ambiguous(
-            columns,
+        what = (
             f"with yaw, pitch, roll that are 0 straight down the cameras look {np.median(tilt):.0f}"
-            f" degrees off the vertical, with those of a gimbal {np.median(other):.0f}",
-            "Give --angles yaw-pitch-roll or --angles aircraft",
+            f" degrees off the vertical, with those of a gimbal {np.median(other):.0f}"
         )
+        raise _ambiguous(columns, what, "Give --angles yaw-pitch-roll or --angles aircraft")
     return found
 
 
 def _ambiguous(columns: Columns, what: str, remedy: str) -> InputError:
     """Return the error for angles that the table does not define."""
-    sentence = f"{columns.path}: {what}. {remedy}."
-    return InputError("cameras.angles", sentence, path=columns.path)
+    return bad_file(columns.path, "cameras.angles", f"{what}. {remedy}.")

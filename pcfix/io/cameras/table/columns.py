@@ -8,12 +8,11 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.errors import InputError
-from pcfix.io.cameras.checks import wrong
+from pcfix.errors import InputError, bad_file
 from pcfix.io.tables import Table, delimiter_of, number, read_lines, split_header, table_below
 from pcfix.model import FloatArray, IntArray
 
@@ -42,7 +41,7 @@ SPELLINGS: dict[str, tuple[str, ...]] = {
 """What a column is, and its names; where several are there, the first counts."""
 POSE = ("x", "y", "z", "longitude", "latitude", "yaw", "pitch", "roll", "omega", "phi", "kappa")
 _OWN_NAMES = (
-    *("omega", "phi", "kappa", "qw", "qx", "qy", "qz", "enable", "tx", "ty", "tz", "alpha", "nu"),
+    *("omega", "phi", "kappa", "qw", "qx", "qy", "qz", "enable", "tx", "ty", "tz"),
     *(f"r{i}{j}" for i in "123" for j in "123"),
     *("f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2"),
     *(f"{role}_est" for role in POSE),
@@ -126,7 +125,7 @@ def column_missing(path: Path, missing: Sequence[str], header: Sequence[str]) ->
     sentence = (
         f"the header lacks {', '.join(missing)}; it has {', '.join(header)}. Add the columns."
     )
-    return wrong(path, "table.column_missing", sentence, columns=list(missing))
+    return bad_file(path, "table.column_missing", sentence, columns=list(missing))
 
 
 DEGREES = {
@@ -161,11 +160,11 @@ class Columns:
     @cached_property
     def labels(self) -> list[str]:
         """The names of the images, none empty."""
-        labels = [row[self.place["label"]] for row in self.table.rows]
+        labels = self.table.column(self.name("label"))
         if "" in labels:
             line = self.table.line[labels.index("")]
             sentence = f"line {line}: the image has no name. Give it one."
-            raise wrong(self.path, "table.no_label", sentence, line=line)
+            raise bad_file(self.path, "table.no_label", sentence, line=line)
         if self.name("label") == "sourcefile":
             return [re.split(r"[\\/]", label)[-1] for label in labels]
         return labels
@@ -196,6 +195,10 @@ class Columns:
         """Return file, line and image, for messages."""
         return f"{self.path}: line {self.table.line[row]} (image {self.labels[row]})"
 
+    def error(self, row: int, code: str, sentence: str, **values: Any) -> InputError:
+        """Return an error that names file, line and image."""
+        return InputError(code, f"{self.where(row)}: {sentence}", path=self.path, **values)
+
     def _numbers(self, role: str, *, needed: bool) -> FloatArray:
         if role not in self.place:
             return np.full(len(self.table.rows), np.nan)
@@ -206,15 +209,14 @@ class Columns:
             if needed or texts[i]:
                 name, line = self.name(role), self.table.line[i]
                 sentence = f"column {name}: '{texts[i]}' is not a finite number. Correct it."
-                where = {"path": self.path, "line": line, "value": texts[i]}
-                raise wrong(self.where(int(i)), "table.number", sentence, **where)
+                raise self.error(int(i), "table.number", sentence, line=line, value=texts[i])
         base, unit = role.removesuffix("_est"), self.unit[self.place[role]]
         if base not in (*LENGTHS, *POSE):
             return values
         known, wanted = (METRES, "metres") if base in LENGTHS else (DEGREES, "degrees")
         if unit not in known:
             sentence = f"column {self.name(role)} is in '{unit}'. Give {wanted}."
-            raise wrong(self.path, "table.unit", sentence, value=unit)
+            raise bad_file(self.path, "table.unit", sentence, value=unit)
         return values * known[unit]
 
 
@@ -227,17 +229,17 @@ def read_columns(path: Path) -> Columns:
             "no line names the columns. Put a header above the rows, for example"
             " label,x,y,z,omega,phi,kappa."
         )
-        raise wrong(path, "table.no_header", sentence)
+        raise bad_file(path, "table.no_header", sentence)
     at, names, unit, comment = found[-1]
     place = known(names)
     for role, spellings in SPELLINGS.items():  # a column with the role's own name counts
         alike = [name for name in names if name in spellings]
         if len(alike) > 1 and role not in MANY and (role not in alike or alike.count(role) > 1):
             sentence = f"the columns {', '.join(alike)} may all be {role}. Take out all but one."
-            raise wrong(path, "table.columns_alike", sentence, columns=alike)
+            raise bad_file(path, "table.columns_alike", sentence, columns=alike)
     if {"tx", "ty", "tz"} <= place.keys() and axes(place) is None:
         sentence = "tx, ty, tz may be translations. Give the projection centres as x, y, z."
-        raise wrong(path, "table.translations", sentence)
+        raise bad_file(path, "table.translations", sentence)
     if "label" not in place or not (axes(place) or axes(place, "_est")):
         position = ("longitude", "latitude", "z") if "longitude" in place else ("x", "y", "z")
         lacking = [role for role in ("label", *position) if role not in place]

@@ -17,8 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
+from pcfix.errors import bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import is_same_lens, write_new, wrong
+from pcfix.io.cameras.checks import is_same_lens, write_new
 from pcfix.io.cameras.table.columns import Columns
 from pcfix.io.crs import is_topocentric
 from pcfix.io.files import check_input
@@ -53,7 +54,7 @@ def read_sensor(path: Path) -> Lens:
     table = read_table(path, columns)
     if len(table.rows) != 1:
         sentence = f"has {len(table.rows)} rows. Give one row for all images."
-        raise wrong(path, "cameras.sensor_rows", sentence, rows=len(table.rows))
+        raise bad_file(path, "cameras.sensor_rows", sentence, rows=len(table.rows))
 
     def value(name: str, default: float = 0.0) -> float:
         return table.numbers(name)[0] if name in table.header else default
@@ -73,7 +74,7 @@ def read_sensor(path: Path) -> Lens:
     shares = lens.principal_x / width, lens.principal_y / height
     if not all(0.25 < share < 0.75 for share in shares):
         sentence = "cx, cy is far from the centre. Give pixels from the upper left corner."
-        raise wrong(path, "cameras.principal_point", sentence)
+        raise bad_file(path, "cameras.principal_point", sentence)
     return lens
 
 
@@ -88,7 +89,7 @@ def read_lenses(columns: Columns, sensor: Path | None) -> tuple[Lens, ...]:
     if sensor is None and not path.is_file():
         needed = "width_px,height_px" if own else "focal,sensor_x,sensor_y (mm)"
         sentence = f"has angles but no sensor. Give --sensor a table with the columns {needed}."
-        raise wrong(columns.path, "cameras.sensor_missing", sentence, columns=needed)
+        raise bad_file(columns.path, "cameras.sensor_missing", sentence, columns=needed)
     if not own:
         return (read_sensor(path),) * len(columns.labels)
     if not _is_xml(check_input(path)) and _names(path) >= set(FRAME):
@@ -142,18 +143,20 @@ def write_table(folder: File, cameras: Cameras) -> None:
     SettingError
         If a file exists.
     """
+    from scipy.spatial.transform import Rotation
+
     target = Path(folder)
-    if cameras.rotations is None or cameras.lenses is None:
-        raise checks.needs_lenses(target)
+    _, lenses = checks.block_to_write(target, cameras, lambda _: True)
     if cameras.crs is not None and is_topocentric(cameras.crs):
         sentence = (
             f"a table cannot hold the axes {cameras.crs}. Bring the cameras to a projected CRS"
             " first."
         )
-        raise wrong(target, "output.crs", sentence, crs=cameras.crs)
-    distinct = list(dict.fromkeys(cameras.lenses))
+        raise bad_file(target, "output.crs", sentence, crs=cameras.crs)
+    distinct = list(dict.fromkeys(lenses))
+    own = None  # f, px, py, k1 ... k4, t1, t2 of each row as RealityCapture has them
     if len(distinct) == 1:
-        sensor, poses = _sensor(target, distinct[0]), _poses(cameras, None)
+        sensor = _sensor(target, distinct[0])
     else:
         frames = {(lens.width, lens.height, lens.unit) for lens in distinct}
         if len(frames) > 1 or distinct[0].unit != "px":
@@ -161,22 +164,14 @@ def write_table(folder: File, cameras: Cameras) -> None:
                 "a table holds several lenses only in pixels and of one frame size. Take another"
                 " format."
             )
-            raise wrong(target, "output.lens", sentence)
+            raise bad_file(target, "output.lens", sentence)
         sensor = _row({"width_px": distinct[0].width, "height_px": distinct[0].height})
-        side = max(distinct[0].width, distinct[0].height)
-        own = []
-        for lens in cameras.lenses:  # f, px, py, k1 ... k4, t1, t2 as RealityCapture has them
+        side, own = max(distinct[0].width, distinct[0].height), []
+        for lens in lenses:
             radial, _, tangential = _brown(target, lens, (4, 0, 2))
             x, y = lens.principal_x - lens.width / 2.0, lens.principal_y - lens.height / 2.0
-            row = [lens.focal * FILM_MM / side, x / side, y / side, *radial, *tangential]
-            own.append(row)
-        poses = _poses(cameras, own)
-    write_new(target, {"cameras.csv": poses.encode(), "sensor.csv": sensor.encode()})
-
-
-def _poses(cameras: Cameras, own: list[list[float]] | None) -> str:
-    from scipy.spatial.transform import Rotation
-
+            frame = lens.focal * FILM_MM / side, x / side, y / side
+            own.append([*frame, *radial, *tangential])
     turns = Rotation.from_matrix(np.asarray(cameras.rotations)).as_quat(canonical=True)
     numbers = np.column_stack([cameras.centres, np.roll(turns, 1, axis=1)]).tolist()
     stream = io.StringIO()
@@ -187,14 +182,15 @@ def _poses(cameras: Cameras, own: list[list[float]] | None) -> str:
     for i, label in enumerate(cameras.labels):
         more = [] if own is None else own[i]
         writer.writerow([label, *map(repr, [*numbers[i], *more])])
-    return stream.getvalue()
+    write_new(target, {"cameras.csv": stream.getvalue().encode(), "sensor.csv": sensor.encode()})
 
 
 def _sensor(target: Path, lens: Lens) -> str:
     """Return the one row of the lens of all images."""
     if lens.unit == "mm":
         sides = (lens.focal, lens.width, lens.height)
-        _check_held(target, lens, _centred_mm(*sides))
+        if not is_same_lens(lens, _centred_mm(*sides)):
+            raise checks.lens_not_held(target, lens)
         return _row(dict(zip(MILLIMETRES, sides, strict=True)))
     radial, denominator, tangential = _brown(target, lens, (3, 3, 2))
     values = {"focal_px": lens.focal, "width_px": lens.width, "height_px": lens.height}
@@ -211,13 +207,9 @@ def _brown(target: Path, lens: Lens, counts: Sequence[int]) -> list[tuple[float,
     frame = (lens.focal, lens.width, lens.height, lens.principal_x, lens.principal_y)
     radial, denominator, tangential = lists
     held = Lens(*frame, radial=radial, denominator=denominator, tangential=tangential)
-    _check_held(target, lens, held)
-    return lists
-
-
-def _check_held(target: Path, lens: Lens, held: Lens) -> None:
     if not is_same_lens(lens, held):
         raise checks.lens_not_held(target, lens)
+    return lists
 
 
 def _row(values: dict[str, float]) -> str:

@@ -48,7 +48,7 @@ def temporary_path(target: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def replaced_when_whole(target: Path) -> Iterator[Path]:
+def temporary_output(target: Path) -> Iterator[Path]:
     """Give a path to write to, and rename what is there to the target when the block ends well.
 
     The new file has the permissions of the one that it replaces. Within `all_or_none` the file is
@@ -88,7 +88,7 @@ def all_or_none() -> Iterator[None]:
 
 
 @contextmanager
-def folder_when_whole(target: Path) -> Iterator[Path]:
+def temporary_folder(target: Path) -> Iterator[Path]:
     """Give a folder to write into, which replaces the target when the block ends well."""
     with temporary_path(target) as path, _errors_of(target, path):
         path.mkdir()
@@ -105,10 +105,10 @@ def folder_when_whole(target: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def draft_folder(target: Path) -> Iterator[Path]:
+def scratch_folder(target: Path) -> Iterator[Path]:
     """Give a folder beside a target for intermediate files; it is removed when the block ends.
 
-    Enter it after `replaced_when_whole` of the same target, which removes what it finds.
+    Enter it after `temporary_output` of the same target, which removes what it finds.
     """
     with temporary_path(target.with_name(f"{target.name}.scratch")) as path:
         try:
@@ -119,7 +119,7 @@ def draft_folder(target: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def made_folder(folder: Path) -> Iterator[None]:
+def output_folder(folder: Path) -> Iterator[None]:
     """Make a folder for what the block writes; remove a new one again if the block fails."""
     is_new = not folder.exists()
     try:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pcfix.refract.rays import direction, light_path
-from pcfix.refract.tracing.gradients import COLUMNS, light_and_gradients
+from pcfix.refract.rays import COLUMNS, direction, light_and_gradients, light_path
 from tests.utils.compiled import compiled
 from tests.utils.tracing_twin import through_plane
 
@@ -58,7 +57,7 @@ def filled(p: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("seed", range(40))
 @pytest.mark.parametrize(("z_low", "z_high"), [(-12.0, -3.0), (3.0, 6.0)])
-def test_derivatives_are_the_differences_of_the_slow_twin(seed, z_low, z_high):
+def test_derivatives(seed, z_low, z_high):
     p = scene(seed, z_low, z_high)
     out = filled(p)
     # two ways to the same number, in doubles
@@ -71,7 +70,7 @@ def test_derivatives_are_the_differences_of_the_slow_twin(seed, z_low, z_high):
     assert (out[:, 11] == 0.0).all()
 
 
-def test_straight_below_the_camera_is_no_special_case():
+def test_straight_below():
     p = np.array([1.0, 2.0, -5.0, 1.0, 2.0, 40.0, 0.3, 0.0, 0.0, 1.34])
     out = filled(p)
     for i in range(10):
@@ -80,7 +79,7 @@ def test_straight_below_the_camera_is_no_special_case():
         np.testing.assert_allclose(out[:, 1 + i], expected, rtol=0.0, atol=1e-8)
 
 
-def test_direction_is_continuous_at_the_water():
+def test_continuous_at_water():
     above, below = scene(3, -5.0, -4.0), scene(3, -5.0, -4.0)
     level = above[6] + above[7] * above[0] + above[8] * above[1]
     above[2], below[2] = level + 1e-9, level - 1e-9
@@ -88,7 +87,7 @@ def test_direction_is_continuous_at_the_water():
     np.testing.assert_allclose(filled(above)[:, 0], filled(below)[:, 0], rtol=0.0, atol=1e-9)
 
 
-def test_it_is_the_direction_of_light_path():
+def test_as_light_path():
     p = scene(5, -9.0, -4.0)
     normal, h = plane_of(*p[6:9])
     way = direction(light_path(tuple(p[:3]), tuple(p[3:6]), normal, h, p[9]), normal)
@@ -97,6 +96,6 @@ def test_it_is_the_direction_of_light_path():
 
 
 @pytest.mark.parametrize("camera_z", [-1.0, 0.0])
-def test_nothing_is_known_of_a_camera_in_the_water(camera_z):
+def test_camera_in_water(camera_z):
     p = np.array([0.0, 0.0, -5.0, 3.0, 0.0, camera_z, 0.0, 0.0, 0.0, 1.34])
     assert np.isnan(filled(p)).all()

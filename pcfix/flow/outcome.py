@@ -1,0 +1,293 @@
+"""Check the statistics of a correction, and summarize them."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from itertools import compress
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pcfix.adjust.diagnosis import Evidence
+from pcfix.errors import GeometryError, PcfixWarning
+from pcfix.flow.correction import CloudTally, Plan
+from pcfix.flow.diagnosis import Poses, diagnose_in_passing, quick_ties
+from pcfix.flow.plausibility import CloudSample, Flight, Plausible, plausible
+from pcfix.flow.runner import Ends
+from pcfix.flow.shore import write_shoreline
+from pcfix.io.cameras.mistakes import likely_mistake
+from pcfix.io.las.part import part_report
+from pcfix.io.regressions import write_regression
+from pcfix.io.views import ViewMatch, ViewReport
+from pcfix.model import Cameras, FloatArray, Outcome, WaterDimension
+from pcfix.options.correct import ScienceOptions
+from pcfix.refract.batch import UNLISTED
+from pcfix.refract.choice import views_in_frame
+from pcfix.refract.reconstructions import CAUSES
+from pcfix.refract.regression import LEAST_BEYOND
+from pcfix.refract.tally import Summary, Tally
+from pcfix.version import __version__
+from pcfix.water.checks import refuse_under_water
+
+
+class Findings(NamedTuple):
+    """What the checks of a whole cloud found."""
+
+    plausible: Plausible | None = None
+    poses: Poses | None = None
+    shoreline: dict[str, Any] | None = None
+    water_notes: tuple[str, ...] = ()
+
+
+def check(plan: Plan, tally: CloudTally) -> Findings:
+    """Refuse a result in which cloud, water and cameras do not fit; warn of what is in doubt.
+
+    Writes the shoreline too, if it is asked for.
+
+    Raises
+    ------
+    GeometryError
+        If no point was corrected, and why: none is submerged, or no image shows one.
+    """
+    name, figures = plan.view.name, tally.figures
+    report = _view_report(plan, tally)
+    if report is not None:
+        report.check()
+        for note in report.warnings():
+            warnings.warn(note, stacklevel=2)
+    if plan.transfer is not None and tally.transfer is not None:
+        plan.transfer.check(name, tally.transfer)
+    plan.labelling.check(name, tally.labels)
+    water_notes = _check_water(plan, tally)
+    flat = int(figures.outcomes[Outcome.FLAT_RAYS])
+    if figures.outcomes[Outcome.NO_CAMERA] + flat == figures.submerged:
+        block = plan.cameras.centres, figures.low, figures.high, plan.view.crs
+        mistake = (None if flat else likely_mistake(*block)) or ""
+        raise GeometryError(
+            "cameras.max_angle" if flat else "cameras.no_overlap",
+            f"{name}: {_out_of_sight(plan, figures)} {mistake}".strip(),
+            submerged=figures.submerged,
+            flat=flat,
+        )
+    if not figures.corrected and figures.submerged:
+        reasons = {why: n for why, n in figures.uncorrected().items() if n}
+        listed = "; ".join(f"{n:,}: {why}" for why, n in reasons.items())
+        raise GeometryError(
+            "cameras.none_corrected",
+            f"{name}: none of {figures.submerged:,} submerged points can be corrected ({listed})."
+            " Check that cameras and cloud belong together.",
+            reasons=reasons,
+        )
+    if plan.inputs.port is not None:
+        return Findings()
+    return _check_block(plan, tally)._replace(water_notes=water_notes)
+
+
+def _view_report(plan: Plan, tally: CloudTally) -> ViewReport | None:
+    """Return how the view list fitted, with the notes of reading it."""
+    if tally.views is None or not isinstance(plan.views, ViewMatch):
+        return None
+    return replace(tally.views, notes=plan.views.report.notes)
+
+
+def _check_water(plan: Plan, tally: CloudTally) -> tuple[str, ...]:
+    """Refuse a cloud without submerged points, and water far from it."""
+    name, water = plan.view.name, plan.found.surface
+    if tally.water is None:
+        if tally.figures.submerged == 0:
+            raise GeometryError(
+                "cloud.none_submerged", f"{name}: no point is left to correct. Check the mask."
+            )
+        return ()
+    tally.water.check_submerged(name, water)
+    if isinstance(water, WaterDimension):
+        refuse_under_water(plan.cameras, tally.figures.lowest_water_m, str(water))
+    return tuple(tally.water.check_reach(name, water, deep=plan.options.deep))
+
+
+def _out_of_sight(plan: Plan, figures: Tally) -> str:
+    """Return the sentence for a cloud of which no camera sees a submerged point."""
+    if plan.inputs.port is not None:
+        return "no camera has a point in sight. Check that cameras and cloud have the same CRS."
+    limit, flat = plan.survey.settings.limit_deg, figures.outcomes[Outcome.FLAT_RAYS]
+    if flat:
+        return (
+            f"no submerged point has two rays within {limit or 90.0:g} deg of the surface"
+            f" normal; {flat:,} points have rays at larger angles. Increase --max-angle."
+        )
+    middle = (figures.low + figures.high) / 2.0
+    distance = float(np.hypot(*(plan.cameras.centres - middle)[:, :2].T).min())
+    away = f"{distance / 1000.0:,.1f} km" if distance >= 10_000.0 else f"{distance:,.1f} m"
+    within = f" within {limit:g} degrees" if limit else ""
+    return (
+        f"no camera has a submerged point in sight{within}; the nearest is {away} in plan from"
+        f" the middle of the {figures.submerged:,} submerged points. Check that cameras and cloud"
+        " have the same CRS, and that pitch 0 is straight down."
+    )
+
+
+def _check_block(plan: Plan, tally: CloudTally) -> Findings:
+    """Check cameras, cloud and water against each other; write the shoreline."""
+    inputs, sample, cameras = plan.inputs, tally.sample or CloudSample(), plan.cameras
+    given = inputs.cameras
+    ties = quick_ties(inputs, plan.view.crs) if len(cameras) else None
+    sought = (plan.found.as_dict() or {}).get("model") == "auto"
+    doubts = () if sought else sample.level_doubts()
+    file = "" if isinstance(given, Cameras) else given or ""
+    flight = Flight(file, sample.water_m, plan.views is not None, sample.every)
+    tested = plausible(cameras, sample.xyz, ties, doubts, flight)
+    tested = tested._replace(noted=CAUSES in map(str, _detected(plan, tally)))
+    tested.warn()
+    if not len(cameras):
+        return Findings(tested, Poses(None, "not applicable: no cameras were given"))
+    name = "cameras" if isinstance(given, Cameras) else str(given)
+    n, water = plan.options.refractive_index, plan.found.surface
+    evidence = Evidence(cameras, name, water, n, ties=ties)
+    poses = diagnose_in_passing(inputs, evidence, plan.view, plan.verdicts)
+    shoreline = None
+    if tally.shore is not None:
+        stated = plan.options.sigma_level
+
+        def sigma(xy: FloatArray) -> FloatArray | None:
+            return plan.found.sigma_level_m(xy) if stated is None else np.full(len(xy), stated)
+
+        path, overwrite = plan.options.shoreline or "", plan.options.overwrite
+        shoreline = write_shoreline(path, tally.shore, sigma, plan.view.crs, overwrite=overwrite)
+    return Findings(tested, poses, shoreline)
+
+
+def _detected(plan: Plan, tally: CloudTally) -> list[Any]:
+    """Return the notes on what was detected from the cloud."""
+    verdicts = {str(note): note for one in plan.verdicts for note in one.warnings()}
+    beyond, line = list[str](), plan.regression
+    if tally.beyond is not None and line is not None:
+        least = LEAST_BEYOND if plan.inputs.regression is None else 0.0
+        beyond = tally.beyond.notes(line, least)
+    unlisted = []
+    if UNLISTED in plan.survey.parts:
+        so = " ".join(map(str, plan.of_unlisted))
+        unlisted = [f"Points in no view list are corrected as without a list. {so}"]
+    return [*plan.notes, *beyond, *verdicts.values(), *unlisted]
+
+
+def summarize(plan: Plan, tally: CloudTally, findings: Findings, ends: Ends) -> Summary:
+    """Return the figures of a correction, and write the line of a regression if asked."""
+    path, line, options = plan.options.save_regression, plan.regression, plan.options
+    if path is not None and line is not None:
+        write_regression(path, line, overwrite=options.overwrite)
+    figures, report = tally.figures, _view_report(plan, tally)
+    unused = list(compress(plan.cameras.labels, np.logical_not(figures.camera_used)))
+    uncorrected = figures.uncorrected()
+    not_moved = sum(uncorrected.values()) + int(figures.outcomes[Outcome.NOT_CARRIED])
+    medium = _figures_of_port if plan.inputs.port is not None else _figures_of_water
+    of_medium, own_notes = medium(plan, tally, findings)
+    notes = [
+        *plan.cameras.notes,
+        *([] if report is None else report.warnings()),
+        *plan.labelling.notes,
+        *own_notes,
+    ]
+    return Summary(
+        input=ends.input,
+        output=ends.output,
+        pcfix=__version__,
+        points=figures.points,
+        submerged=figures.submerged,
+        corrected=figures.corrected,
+        uncorrected=uncorrected,
+        dropped=not_moved if options.uncorrected == "drop" else 0,
+        water_unknown=figures.water_unknown,
+        unsure=figures.unsure if options.unsure == "withhold" else None,
+        shift_z_m=figures.shift_z_m(),
+        rays=figures.rays,
+        incidence_deg=round(figures.incidence_deg, 2),
+        cameras=len(plan.cameras),
+        cameras_used=len(plan.cameras) - len(unused),
+        cameras_unused=unused,
+        seconds=round(ends.seconds, 3),
+        views=None if report is None else report.as_dict(),
+        warnings=[
+            (one if isinstance(one, PcfixWarning) else PcfixWarning("", one)).as_dict()
+            for one in notes
+        ],
+        labelling=plan.labelling.report(tally.labels),
+        settings={**options.part(ScienceOptions).as_dict(), **plan.settings},
+        part=None if ends.source is None else part_report(ends.source),
+        **of_medium,
+    )
+
+
+def _figures_of_water(
+    plan: Plan, tally: CloudTally, findings: Findings
+) -> tuple[dict[str, Any], list[Any]]:
+    """Return the part of a summary about depths, water and cameras, and its notes."""
+    moved, water, made = plan.survey.level_offset_m, str(plan.found.surface), plan.made
+    tested, poses = findings.plausible or Plausible(), findings.poses
+    uncertainty, by_poses = tally.figures.uncertainty(made), plan.survey.learned.poses
+    if uncertainty is not None and by_poses is not None:
+        uncertainty["poses_m"] = round(by_poses.middle_m, 4)
+    detected = _detected(plan, tally)
+    if moved is not None:
+        times = f"{moved.min():+.3f} to {moved.max():+.3f} m at the times of the images"
+        water = f"{water}, {times}"
+    carried = None
+    if plan.transfer is not None and tally.transfer is not None:
+        carried = plan.transfer.as_dict(tally.transfer)
+    figures = {
+        "depth_m": tally.figures.depth_m(),
+        "water": water,
+        "water_fit": plan.found.as_dict(),
+        "uncertainty": uncertainty,
+        "carried": carried,
+        "made": made,
+        "told": [one for one in map(str, detected) if made is None or one not in made["because"]],
+        "poses": None if poses is None else poses.as_dict(),
+        "shoreline": findings.shoreline,
+        "fit": tested.as_dict(),
+        "cameras_left_out": _left_out(plan, tally.figures),
+    }
+    of_poses = [poses.warning if poses else "", plan.no_poses]
+    notes = [*tested.doubts, *detected, *plan.found.notes, *plan.own_notes, *findings.water_notes]
+    return figures, [*notes, *filter(None, of_poses)]
+
+
+def _left_out(plan: Plan, figures: Tally) -> dict[str, list[str]]:
+    """Return the unused cameras whose frames hold corrected points, by the reason."""
+    unused, xyz = ~figures.camera_used, np.vstack([np.zeros((0, 3)), *figures.moved])
+    if not len(xyz) or not unused.any():
+        return {}
+    limit, cameras = plan.survey.settings.limit_deg or 90.0, plan.cameras
+    seen = views_in_frame(xyz, cameras)
+    points = np.repeat(np.arange(len(xyz)), np.diff(seen.start))
+    across, along, up = (cameras.centres[seen.camera] - xyz[points]).T
+    steepest = np.full(len(unused), np.inf)
+    np.minimum.at(steepest, seen.camera, np.degrees(np.arctan2(np.hypot(across, along), up)))
+    beyond, within = unused & np.isfinite(steepest) & (steepest > limit), steepest <= limit
+    reasons = {f"beyond {limit:g} degrees alone": beyond, "but are not chosen": unused & within}
+    return {
+        why: list(compress(cameras.labels, rows)) for why, rows in reasons.items() if rows.any()
+    }
+
+
+def _figures_of_port(
+    plan: Plan, tally: CloudTally, findings: Findings
+) -> tuple[dict[str, Any], list[Any]]:
+    """Return the part of a summary about a port: no depths, and no orders by depth."""
+    notes, corrected = list[PcfixWarning](), tally.figures.corrected
+    if plan.survey.settings.method == "snell" and corrected:
+        mean = tally.port_miss_m / corrected
+        sentence = (
+            "The refracted rays of the apparent points miss each other behind the port by"
+            f" {mean:.3f} m on average. --method consistent takes this into account, best with"
+            " --views."
+        )
+        notes.append(PcfixWarning("port.ray_distance", sentence, mean_m=mean))
+    figures: dict[str, Any] = {
+        "depth_m": {},
+        "water": f"all around, seen through a {plan.inputs.port}",
+        "water_fit": None,
+        "uncertainty": None,
+        "told": list(map(str, notes)),
+    }
+    return figures, notes

@@ -1,0 +1,325 @@
+r"""Find the true point from which SfM software would have made the apparent one (tracks).
+
+Software that ignores water intersects straight rays: from the image points x_i of a true point Q it
+computes the point P with the least squared residuals in the images,
+
+    F(Q) = argmin_P  sum_i \|x_i(Q) - pi_i(P)\|^2
+
+with pi_i the projection of camera i, distortion included, and x_i(Q) = pi_i(A_i) the image of the
+point where the light from Q to that camera leaves the water (`pcfix.refract.rays`). P is known
+and Q is unknown, so that nothing is triangulated: at the minimum the derivative is zero,
+
+    g(Q) = sum_i J_i' (x_i(Q) - pi_i(P)) = 0,    J_i = d pi_i / d P
+
+three equations for the three unknowns of Q. `snell` intersects the refracted rays of P in space,
+with equal weights; here the residuals are those that made P.
+
+At the solution the direction w_i of the light is that of P but for the residuals, some pixels of
+thousands. P is seen in the direction -e_i, and w_i is scaled to one along the normal N, so that
+
+    d x_i / d Q = (N.e_i) J_i d w_i / d Q
+
+is known to about a thousandth. From `snell`'s solution each step with the inverse of the sum gains
+about three digits, and two or three steps are enough.
+
+A tile of points is processed camera by camera, as in `pcfix.refract.intersect`: the inner loops
+run over the points and are vectorised, for the usual lens and a plane of water. Points that need
+more steps, under waves for instance, are then searched one by one.
+"""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import numpy as np
+
+from pcfix.kernels import device
+from pcfix.lens.algebra import Vector, beyond, dot, minus, row_of, scaled
+from pcfix.lens.formulas import (
+    B2,
+    B3,
+    CENTRE_X,
+    CENTRE_Y,
+    DISC,
+    FOCAL_X,
+    FOCAL_Y,
+    PLAIN,
+    PRINCIPAL_X,
+    PRINCIPAL_Y,
+    TAIL,
+    TANGENTIAL,
+)
+from pcfix.lens.imaging import image_and_gradients, image_of
+from pcfix.model import FloatArray, IntArray
+from pcfix.refract.batch import Optics
+from pcfix.refract.choice import Rig
+from pcfix.refract.rays import settle_of
+from pcfix.refract.tiling import TILE, inverse_of, nine, product_of, slots, three
+from pcfix.water.surface import Field, Tin
+
+STEPS, MOST_STEPS = 4, 60
+"""Of all points of a tile together, and of a point by itself."""
+
+CLOSE_M = 1e-7
+"""Estimated distance from the solution, from the last two steps."""
+
+# Runs of `TILE` numbers for the rays of one camera: the gradients of the image by P, the image of
+# P, and the plane of the water (N, h), which moves under waves.
+_BY_U, _BY_V, _IMAGE, _PLANE, RAY_RUNS = slots(3, 3, 2, 4)
+
+# Runs for the points: Q, g, d g / d Q, the last step squared, and the state.
+Q, _G, _BY_Q, _STEP2, STATE, POINT_RUNS = slots(3, 3, 9, 1, 1)
+SEARCHED, FOUND, LOST = 0.0, 1.0, 2.0
+
+Plain: TypeAlias = tuple[
+    float, float, float, float, float, float, float, float, float, float, float, float, float,
+    float, float,
+]  # fmt: skip
+"""The usual lens as numbers, which stay in registers."""
+
+
+@device(allocates=True)
+def search_tile(
+    room: FloatArray, rays: FloatArray, tile: FloatArray, marks: FloatArray, near: IntArray,
+    rig: Rig, optics: Optics, n: float, tin: Tin | None, fields: Field | None,
+) -> None:  # fmt: skip
+    """Move Q from the start in `room` to where g is zero; its state says whether it was found.
+
+    `marks`, a row for each of the cameras `near`, say how often each ray counts.
+    """
+    count = marks.shape[1]
+    _search_all(room, rays, tile, marks, near, rig, optics, n, tin, fields, STEPS)
+    one, alone = np.empty(POINT_RUNS * TILE), np.empty(7 * TILE)
+    for j in range(count):
+        if room[STATE * TILE + j] != SEARCHED:
+            continue
+        # a tile of this point only
+        for run in range(7):
+            alone[run * TILE] = tile[run * TILE + j]
+        for run in range(POINT_RUNS):
+            one[run * TILE] = room[run * TILE + j]
+        mine = marks[:, j : j + 1].copy()
+        _search_all(one, rays, alone, mine, near, rig, optics, n, tin, fields, MOST_STEPS)
+        for run in range(POINT_RUNS):
+            room[run * TILE + j] = one[run * TILE]
+
+
+@device(allocates=True)
+def _search_all(
+    room: FloatArray, rays: FloatArray, tile: FloatArray, marks: FloatArray, near: IntArray,
+    rig: Rig, optics: Optics, n: float, tin: Tin | None, fields: Field | None, steps: int,
+) -> None:  # fmt: skip
+    """Take so many steps, or fewer, for the points of a tile that are searched."""
+    count = marks.shape[1]
+    room[_STEP2 * TILE : STATE * TILE] = 0.0
+    for k in range(near.size):
+        lens = optics.lenses[optics.row[near[k]]]
+        if lens[PLAIN] != 0.0:
+            _set_rays(rays[k], tile, marks[k], rig, near[k], optics, _plain(lens))
+        else:
+            _set_rays(rays[k], tile, marks[k], rig, near[k], optics, None)
+    for _ in range(steps):
+        room[_G * TILE : _STEP2 * TILE] = 0.0
+        for k in range(near.size):
+            c, lens = near[k], optics.lenses[optics.row[near[k]]]
+            if tin is not None or fields is not None:
+                _settle(rays[k], room, tile, marks[k], rig, c, n, tin, fields)
+            # numba compiles a version of `_add` for each kind of argument
+            if lens[PLAIN] != 0.0:
+                _add(room, rays[k], tile, marks[k], rig, c, optics, _plain(lens), n)
+            else:
+                _add(room, rays[k], tile, marks[k], rig, c, optics, None, n)
+        if not _step(room, count):
+            break
+
+
+@device
+def _step(room: FloatArray, count: int) -> bool:
+    """Move the points that are searched by -(d g / d Q)^-1 g; return whether any goes on."""
+    searched = False
+    for j in range(count):
+        if room[STATE * TILE + j] != SEARCHED:
+            continue
+        _, inverse = inverse_of(nine(room, _BY_Q * TILE + j))
+        t = product_of(inverse, three(room, _G * TILE + j))
+        size2, before = dot(t, t), room[_STEP2 * TILE + j]
+        _put(room, Q * TILE + j, minus(three(room, Q * TILE + j), t))
+        room[_STEP2 * TILE + j] = size2
+        # NaN: some camera has no image of Q
+        if not size2 < np.inf:
+            room[STATE * TILE + j] = LOST
+        # steps shrink at least as fast as the last one did: the rest is about size^2 / before
+        elif size2 <= CLOSE_M * max(CLOSE_M, np.sqrt(before)):
+            room[STATE * TILE + j] = FOUND
+        else:
+            searched = True
+    return searched
+
+
+@device
+def _set_rays(
+    ray: FloatArray, tile: FloatArray, marks: FloatArray, rig: Rig, c: int, optics: Optics,
+    plain: Plain | None,
+) -> None:  # fmt: skip
+    """Set the image of each point in a camera, its gradients by P (world frame), and the plane."""
+    centre, offset, lens = row_of(rig.centres, c), rig.offset[c], optics.lenses[optics.row[c]]
+    r = optics.rotations[c]
+    right, down, ahead = row_of(r, 0), row_of(r, 1), row_of(r, 2)
+    for j in range(marks.size):
+        p = three(tile, j)
+        way, normal = minus(p, centre), three(tile, 4 * TILE + j)
+        w = dot(right, way), dot(down, way), dot(ahead, way)
+        if plain is None:
+            u, v, g = image_and_gradients(lens, w[0], w[1], w[2])
+        else:
+            u, v, g = _plain_image(plain, w)
+        ray[_IMAGE * TILE + j], ray[(_IMAGE + 1) * TILE + j] = u, v
+        by_u = beyond(beyond(scaled(g[0], right), g[1], down), g[2], ahead)
+        by_v = beyond(beyond(scaled(g[3], right), g[4], down), g[5], ahead)
+        _put(ray, _BY_U * TILE + j, by_u)
+        _put(ray, _BY_V * TILE + j, by_v)
+        _put(ray, _PLANE * TILE + j, normal)
+        # water that stood higher for this image: the point is lowered instead
+        ray[(_PLANE + 3) * TILE + j] = normal[2] * (tile[3 * TILE + j] - (p[2] - offset))
+
+
+@device
+def _put(runs: FloatArray, at: int, a: Vector) -> None:
+    """Write three numbers into runs that follow each other."""
+    runs[at], runs[at + TILE], runs[at + 2 * TILE] = a
+
+
+@device(allocates=True)
+def _settle(
+    ray: FloatArray, room: FloatArray, tile: FloatArray, marks: FloatArray, rig: Rig, c: int,
+    n: float, tin: Tin | None, fields: Field | None,
+) -> None:  # fmt: skip
+    """Move the planes of the rays of one camera to where the light leaves a mesh or raster."""
+    plane, origin = np.empty(4), np.empty(3)
+    for j in range(marks.size):
+        if not marks[j] > 0.0 or room[STATE * TILE + j] != SEARCHED:
+            continue
+        origin[0], origin[1] = tile[j], tile[TILE + j]
+        origin[2] = tile[2 * TILE + j] - rig.offset[c]
+        for i in range(4):
+            plane[i] = ray[(_PLANE + i) * TILE + j]
+        e = minus(row_of(rig.centres, c), three(tile, j))
+        settle_of(c, plane, tin, fields, origin, three(room, Q * TILE + j), e, n)
+        for i in range(4):
+            ray[(_PLANE + i) * TILE + j] = plane[i]
+
+
+@device
+def _add(
+    room: FloatArray, ray: FloatArray, tile: FloatArray, marks: FloatArray, rig: Rig, c: int,
+    optics: Optics, plain: Plain | None, n: float,
+) -> None:  # fmt: skip
+    """Add the residuals of one camera's rays to g(Q), and their part of d g / d Q."""
+    centre, lens, r = row_of(rig.centres, c), optics.lenses[optics.row[c]], optics.rotations[c]
+    right, down, ahead = row_of(r, 0), row_of(r, 1), row_of(r, 2)
+    for j in range(marks.size):
+        e, q = minus(centre, three(tile, j)), three(room, Q * TILE + j)
+        normal, h = three(ray, _PLANE * TILE + j), ray[(_PLANE + 3) * TILE + j]
+        k, root, depth, m2, s = _light(q, e, normal, h, n)
+        w = minus(scaled(k, s), normal)
+        w = dot(right, w), dot(down, w), dot(ahead, w)
+        if plain is None:
+            u, v = image_of(lens, w[0], w[1], w[2])
+        else:
+            u, v, _ = _plain_image(plain, w)
+        # the residual in pixels; a ray that does not count may have none
+        times = marks[j]
+        du = times * (u - ray[_IMAGE * TILE + j]) if times > 0.0 else 0.0
+        dv = times * (v - ray[(_IMAGE + 1) * TILE + j]) if times > 0.0 else 0.0
+        by_u, by_v = three(ray, _BY_U * TILE + j), three(ray, _BY_V * TILE + j)
+        room[_G * TILE + j] += by_u[0] * du + by_v[0] * dv
+        room[(_G + 1) * TILE + j] += by_u[1] * du + by_v[1] * dv
+        room[(_G + 2) * TILE + j] += by_u[2] * du + by_v[2] * dv
+        # d w / d Q = k (I - N N') + s (grad k)'; grad k as in `rays.slope_of_path`
+        across = dot(normal, e)
+        cube = root * root * root
+        below = 1.0 / (across - h + depth * m2 / cube)
+        aside = below * depth * k * k * k * (m2 - 1.0) / cube
+        by_k = beyond(scaled(below * k / root, normal), aside, s)
+        times = times * across if times > 0.0 else 0.0
+        du_q = beyond(scaled(k, minus(by_u, scaled(dot(by_u, normal), normal))), dot(by_u, s), by_k)
+        dv_q = beyond(scaled(k, minus(by_v, scaled(dot(by_v, normal), normal))), dot(by_v, s), by_k)
+        _add_products(room, j, by_u, scaled(times, du_q))
+        _add_products(room, j, by_v, scaled(times, dv_q))
+
+
+@device
+def _add_products(room: FloatArray, j: int, a: Vector, b: Vector) -> None:
+    """Add a b' to d g / d Q."""
+    at = _BY_Q * TILE + j
+    room[at] += a[0] * b[0]
+    room[at + TILE] += a[0] * b[1]
+    room[at + 2 * TILE] += a[0] * b[2]
+    room[at + 3 * TILE] += a[1] * b[0]
+    room[at + 4 * TILE] += a[1] * b[1]
+    room[at + 5 * TILE] += a[1] * b[2]
+    room[at + 6 * TILE] += a[2] * b[0]
+    room[at + 7 * TILE] += a[2] * b[1]
+    room[at + 8 * TILE] += a[2] * b[2]
+
+
+@device(inline="always")
+def _light(
+    q: Vector, e: Vector, normal: Vector, h: float, n: float
+) -> tuple[float, float, float, float, Vector]:
+    """Return k, S, the depth of Q, n^2 (1 above the water), and s; see `rays.light_path`.
+
+    The light of P has the tangent of the incidence angle as a start, from which Newton's method
+    needs two steps: without a condition to end the loop is vectorised.
+    """
+    across, depth = dot(normal, e), h - dot(normal, q)
+    height = across - h
+    s = beyond(minus(q, e), height + depth, normal)
+    m2 = n * n if depth > 0.0 else 1.0
+    a = (m2 - 1.0) * dot(s, s)
+    root = np.sqrt(m2 + (m2 - 1.0) * (dot(e, e) / (across * across) - 1.0))
+    k = 1.0 / (height + depth / root)
+    root = np.sqrt(m2 + a * k * k)
+    k += (1.0 - k * (height + depth / root)) / (height + depth * m2 / (root * root * root))
+    root = np.sqrt(m2 + a * k * k)
+    k += (1.0 - k * (height + depth / root)) / (height + depth * m2 / (root * root * root))
+    return k, root, depth, m2, s
+
+
+@device
+def _plain(c: FloatArray) -> Plain:
+    """Return the numbers of a perspective lens with Brown's distortion."""
+    return (
+        c[TAIL], c[TAIL + 1], c[TAIL + 2], c[TAIL + 3], c[TANGENTIAL], c[TANGENTIAL + 1],
+        c[CENTRE_X], c[CENTRE_Y], c[DISC] * c[DISC], c[FOCAL_X], c[B2], c[B3], c[FOCAL_Y],
+        c[PRINCIPAL_X], c[PRINCIPAL_Y],
+    )  # fmt: skip
+
+
+@device(inline="always")
+def _plain_image(
+    c: Plain, w: Vector
+) -> tuple[float, float, tuple[float, float, float, float, float, float]]:
+    """Do as `pcfix.lens.imaging.image_and_gradients` without branches, for the usual lens."""
+    k1, k2, k3, k4, p1, p2, centre_x, centre_y, disc2, fx, b2, b3, fy, u0, v0 = c
+    inv = 1.0 / w[2]
+    flat_x, flat_y = w[0] * inv, w[1] * inv
+    x, y = flat_x - centre_x, flat_y - centre_y
+    r2 = x * x + y * y
+    # Brown: radial factor g and its derivative by r^2, then tangential terms
+    g = 1.0 + (((k4 * r2 + k3) * r2 + k2) * r2 + k1) * r2
+    twice = 2.0 * (((4.0 * k4 * r2 + 3.0 * k3) * r2 + 2.0 * k2) * r2 + k1)
+    dx = g * x + (p1 * (r2 + 2.0 * x * x) + 2.0 * p2 * x * y) + centre_x
+    dy = g * y + (p2 * (r2 + 2.0 * y * y) + 2.0 * p1 * x * y) + centre_y
+    xx = g + twice * x * x + 6.0 * p1 * x + 2.0 * p2 * y
+    xy = twice * x * y + 2.0 * (p1 * y + p2 * x)
+    yy = g + twice * y * y + 6.0 * p2 * y + 2.0 * p1 * x
+    # behind the camera and beyond the fold of the distortion there is no image
+    seen = (w[2] > 0.0) & (r2 <= disc2)
+    u = u0 + fx * dx + b2 * dy if seen else np.nan
+    v = v0 + fy * dy + b3 * dx if seen else np.nan
+    ua, ub, va, vb = fx * xx + b2 * xy, fx * xy + b2 * yy, fy * xy + b3 * xx, fy * yy + b3 * xy
+    return u, v, (
+        inv * ua, inv * ub, -inv * (ua * flat_x + ub * flat_y),
+        inv * va, inv * vb, -inv * (va * flat_x + vb * flat_y),
+    )  # fmt: skip
