@@ -1,6 +1,6 @@
-"""A block that has absorbed the refraction, mended and corrected, against the truth.
+"""A block that has absorbed the refraction, adjusted and corrected, against the truth.
 
-    python tests/benchmarks/absorbed.py [FOLDER --truth TIF --cameras MODEL] [--every N]
+    python -m tests.benchmarks.absorbed [FOLDER --truth TIF --cameras MODEL] [--every N]
 
 Default: ``rendered_a_free`` of PCFIX_SHARED. The folder has sparse/, cloud.las, dense.vis,
 gnss.csv, gcps.csv and offset.txt; water level 0.37 m, n 1.34. Bias / RMSE of Z in GSD (5 cm), bed
@@ -19,9 +19,9 @@ from pathlib import Path
 
 import laspy
 import numpy as np
-import rasterio
 
 import pcfix
+from tests.benchmarks.accuracy import true_surface
 
 LEVEL, GSD, MARGIN = 0.37, 0.05, 0.1
 WAYS = {
@@ -39,18 +39,6 @@ CORRECTIONS = {
 }
 
 
-def truth_of(path: Path):
-    """Return a function of plan positions: bilinear heights of the true surface."""
-    from scipy.interpolate import RegularGridInterpolator
-
-    with rasterio.open(path) as source:
-        heights, to_map = source.read(1).astype(float), source.transform
-    x = to_map.c + to_map.a * (np.arange(heights.shape[1]) + 0.5)
-    y = to_map.f + to_map.e * (np.arange(heights.shape[0]) + 0.5)
-    grid = RegularGridInterpolator((y[::-1], x), heights[::-1], bounds_error=False)
-    return lambda xy: grid(xy[:, ::-1])
-
-
 def errors(path: Path, truth, every: int) -> str:
     """Return bias and RMSE of Z on bed and land."""
     cloud = laspy.read(path)
@@ -65,7 +53,7 @@ def errors(path: Path, truth, every: int) -> str:
 
 
 def main() -> None:
-    """Mend in each way, correct in each way, and print a line for each."""
+    """Adjust and correct in each way, and print a line for each."""
     shared = Path(os.environ.get("PCFIX_SHARED", "../shared")) / "data"
     words = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     words.add_argument("folder", nargs="?", type=Path, default=shared / "rendered_a_free")
@@ -74,18 +62,18 @@ def main() -> None:
     words.add_argument("--every", type=int, default=1, help="compare every so many-th point")
     given = words.parse_args()
     warnings.simplefilter("ignore", pcfix.PcfixWarning)
-    folder, truth = given.folder, truth_of(given.truth)
+    folder, truth = given.folder, true_surface(given.truth)
     offset = tuple(np.loadtxt(folder / "offset.txt").tolist())
     true = pcfix.read_cameras(given.cameras)
     where = dict(zip(true.labels, true.centres + offset, strict=True))
     print(f"apparent                      {errors(folder / 'cloud.las', truth, given.every)}")
     with tempfile.TemporaryDirectory() as scratch:
         for name, way in WAYS.items():
-            mend_and_correct(name, dict(way), folder, Path(scratch), offset, where, truth, given)
+            adjust_and_correct(name, dict(way), folder, Path(scratch), offset, where, truth, given)
 
 
-def mend_and_correct(name, way, folder, scratch, offset, where, truth, given) -> None:
-    """Print what one way comes to."""
+def adjust_and_correct(name, way, folder, scratch, offset, where, truth, given) -> None:
+    """Print the errors of one way."""
     out = scratch / name.replace(" ", "_").replace(",", "")
     gcps = folder / "gcps.csv" if way.pop("gcps", False) else None
     started = time.perf_counter()

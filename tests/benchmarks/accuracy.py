@@ -1,129 +1,268 @@
-"""How near each method comes to the truth, and how fast, by what it knows of the cameras.
+"""How near each method comes to the truth, and how fast, by what is known of the cameras.
 
-    python tests/benchmarks/accuracy.py
+    python -m tests.benchmarks.accuracy [--points 30000] [--scenes flat oblique] [--sensitivity]
 
-Simulated scenes (`accuracy_scenes.SETTINGS`) and, of the shared test data (environment variable
-PCFIX_SHARED), the clouds that COLMAP and OpenMVS made of rendered images (``rendered_a``, ``_c``).
-All numbers are over the same points of a scene, those under more than 0.2 m of water, in ground
-sampling distances; XY bias is the length of the mean error in plan. Points that a method left
-uncorrected are not in its row; "done" is the share of the others.
+Simulated scenes (`SETTINGS`) and, of the shared test data (environment variable PCFIX_SHARED), the
+clouds that COLMAP and OpenMVS made of rendered images (`REAL`). All numbers are over the same
+points of a scene, those under more than 0.2 m of water, in ground sampling distances. XY bias is
+the length of the mean error in plan. Points that a method left uncorrected are not in its row;
+"done" is the share of the others.
 
-Cameras: "views" are those that made the point, as the software's list has them; "pairs" the
-stereo pairs, which for all but `consistent` are the same cameras; "mvs" a model of dense matching,
-which tracks and pairs are not; "all" every camera whose frame holds the point; "auto" what the
-cloud itself tells, as without any option. "In 95 %" is the share of points whose error in Z is
-within 1.96 SigmaZ.
+Cameras: "views" is the view list of the software; "pairs" the stereo pairs, which for all methods
+but `consistent` are the same cameras; "mvs" a model of dense matching, which tracks and pairs are
+not; "all" every camera whose frame holds the point; "auto" what pcfix detects without any option.
+"In 95 %" is the share of points whose error in Z is within 1.96 SigmaZ.
 
-"floor" is the least-squares triangulation through the water from the listed images, with fresh
-noise of the same size, of 1000 points. Of depth maps the list has no partner images, and each is
-matched anew, so that there it is a scale rather than a limit.
+"floor" is the least-squares triangulation through the water from the listed images, with new
+noise of the same size, of 1000 points. Depth maps are matched anew for each map, so that there it
+is no limit.
 
-``--sensitivity`` prints how wrong inputs come through instead, beside the predicted budget.
+``--sensitivity`` compares the effect of wrong inputs on Z with the predicted budget instead. The
+method is `consistent` with known tracks, one input is wrong at a time, and the budget has only that
+one. Level, index and tilt are common to the scene: measured is the mean change of Z if the
+correction is given a value that is off by one standard deviation (of the tilt about each axis in
+turn, added in quadrature), predicted the mean sigma. The others are random: the scene is simulated
+with them, with several seeds, as a block has few poses; measured is the RMS error of Z, predicted
+the RMS of sigma.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
-import json
 import sys
 import tempfile
 import time
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 import pcfix
-from pcfix.options.correct import ScienceOptions
-
-sys.path.insert(0, str(Path(__file__).parents[2]))
 from pcfix.flow.learning import learn_regression
+from pcfix.io.views import ViewMatch, read_views
 from pcfix.label.labelling import Part
+from pcfix.model import Views, WaterPlane
+from pcfix.options.correct import BudgetOptions, ScienceOptions
+from pcfix.simulate.tracing import piercing_points_of_planes, project
 from pcfix.water.surface import surface_above
-from tests.benchmarks.accuracy_scenes import NAMES, Case, make
-from tests.benchmarks.accuracy_sensitivity import COLUMNS as SENSITIVITY_COLUMNS
-from tests.benchmarks.accuracy_sensitivity import sensitivity
-from tests.benchmarks.accuracy_tables import table
+from tests.utils.shared import needs
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 METHODS = ("butler", "murase", "shan", "snell", "consistent")
 CHECK_DEPTHS, CHECK_NOISE_M = 50, 0.03
-WARM_POINTS = 1000
-COLUMNS = [
-    ("scene", "scene", ""),
-    ("method", "method", ""),
-    ("cameras", "cameras", ""),
-    ("rays", "rays", ".1f"),
-    ("z_bias", "Z bias", "+.2f"),
-    ("z_rmse", "Z RMSE", ".2f"),
-    ("xy_bias", "XY bias", ".2f"),
-    ("xy_rmse", "XY RMSE", ".2f"),
-    ("covered", "in 95 %", ".1%"),
-    ("done", "done", ".1%"),
-    ("points_per_s", "points/s", ",.0f"),
-]
+WARM_POINTS, FLOOR_POINTS = 1000, 1000
+LEAST_DEPTH_M = 0.2
+SHORE = {"bed": "shore", "lidar_per_m2": 0.0}
+SETTINGS = {
+    "flat": SHORE,
+    "oblique": {**SHORE, "obliques_deg": 35.0, "detection": 0.5},
+    "river": {"bed": "river", "lidar_per_m2": 0.0},  # falls by 0.3 %
+    "pairs": {**SHORE, "cloud": "pairs"},
+    "depth-maps": {**SHORE, "cloud": "depth-maps"},
+}
+"""Names of `pcfix.simulate.settings.SceneSettings`; the rest is its default."""
+REAL = ("rendered_a", "rendered_c")
+COLUMNS = {
+    "method": "", "cameras": "", "rays": ".1f", "Z bias": "+.2f", "Z RMSE": ".2f", "XY bias": ".2f",
+    "XY RMSE": ".2f", "in 95 %": ".1%", "done": ".1%", "points/s": ",.0f",
+}  # fmt: skip
 
 
-def rows_of(case: Case, runs: int, seed: int) -> list[dict[str, Any]]:
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A cloud, what the correction is given, and how wrong a result is.
+
+    Attributes
+    ----------
+    words : str
+    xyz : array, shape (n, 3)
+        Apparent points, metres, world frame.
+    cameras : Cameras
+    water : WaterPlane
+    index, gsd_m : float
+    measured : array of bool, shape (n,)
+        Points under more than `LEAST_DEPTH_M` of water, whose errors are taken.
+    known : dict
+        What is known of each point's cameras, as arguments of `pcfix.correct_points`.
+    bed : array, shape (n, 3)
+        The true points; of a scene with a true surface only, that at the apparent x and y.
+    error : callable
+        Of points, shape (m, 3), and their rows: result minus truth, metres; x and y are NaN
+        where only the true surface is known.
+    floor : array, shape (p, 3), or None if the images of a list did not make the point
+    """
+
+    words: str
+    xyz: np.ndarray
+    cameras: pcfix.Cameras
+    water: pcfix.WaterPlane
+    index: float
+    gsd_m: float
+    measured: np.ndarray
+    bed: np.ndarray
+    error: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    known: dict[str, dict[str, Any]] = field(default_factory=dict)
+    floor: np.ndarray | None = None
+
+
+def simulated(name: str, points: int, seed: int) -> Case:
+    """Simulate a scene of `SETTINGS`."""
+    scene = pcfix.simulate_scene(points, seed=seed, **SETTINGS[name])
+    kind = "depth-maps" if name == "depth-maps" else "tracks"
+    known: dict[str, dict[str, Any]] = {"views": {"views": replace(scene.views, kind=kind)}}
+    mvs = {"camera_set": "mvs"}
+    if scene.pairs is not None:
+        pairs = Views(2 * scene.pairs_start, scene.pairs.ravel(), kind="pairs")
+        known["pairs"], mvs["matcher"] = {"views": pairs}, "pairs"
+    measured, floor = measured_of(scene), None
+    if kind == "tracks":
+        rng = np.random.default_rng([seed, 99])
+        rows = np.flatnonzero(measured)
+        rows = np.sort(rng.choice(rows, min(FLOOR_POINTS, len(rows)), replace=False))
+        floor = triangulated_again(scene, rows, rng) - scene.true_xyz[rows]
+    return Case(
+        scene.description, scene.apparent_xyz, scene.cameras, scene.water, scene.refractive_index,
+        scene.gsd_m, measured, scene.true_xyz, lambda xyz, rows: xyz - scene.true_xyz[rows],
+        {**known, "mvs": mvs, "all": {"camera_set": "all"}}, floor,
+    )  # fmt: skip
+
+
+def measured_of(scene: Any) -> np.ndarray:
+    """Return which points of a simulated scene are far enough under water, and were made."""
+    made = np.diff(scene.views.start) > 1
+    apparent = scene.depth_m(scene.apparent_xyz) > 0.0
+    return made & apparent & (scene.depth_m(scene.true_xyz) > LEAST_DEPTH_M)
+
+
+def triangulated_again(scene: Any, rows: np.ndarray, rng: Any) -> np.ndarray:
+    """Return the points whose images through the plane water are nearest to noisy ones, (m, 3).
+
+    Gauss-Newton for all points at once, from the truth. Nothing of `pcfix.refract` is used: light
+    takes Fermat's path (`pcfix.simulate.tracing`), and the derivatives are differences.
+    """
+    truth, views, cameras = scene.true_xyz[rows], scene.views.take(rows), scene.true_cameras
+    owner, water, aside = np.repeat(np.arange(len(truth)), np.diff(views.start)), scene.water, 1e-4
+    x, y = truth[:, :2].mean(axis=0)
+    # near the points, as digits are lost far away
+    anchor = np.array([x, y, water.a + water.b * x + water.c * y])
+    normal = np.array([-water.b, -water.c, 1.0]) / np.sqrt(1.0 + water.b**2 + water.c**2)
+
+    def images(points: np.ndarray) -> np.ndarray:
+        of = points[owner]
+        plane = (np.broadcast_to(part, of.shape) for part in (anchor, normal))
+        centres = cameras.centres[views.camera]
+        way = piercing_points_of_planes(of, centres, *plane, scene.refractive_index)
+        return project(way, cameras, views.camera, cameras.lenses[0])[0]
+
+    seen = images(truth)
+    seen = seen + rng.normal(0.0, scene.settings["image_noise"], seen.shape)
+    points = truth.copy()
+    for _ in range(10):
+        steps = aside * np.eye(3)
+        slopes = [(images(points + d) - images(points - d)) / (2.0 * aside) for d in steps]
+        slope, residual = np.stack(slopes, axis=2), seen - images(points)
+        left = np.add.reduceat(np.einsum("rki,rkj->rij", slope, slope), views.start[:-1])
+        right = np.add.reduceat(np.einsum("rki,rk->ri", slope, residual), views.start[:-1])
+        step = np.linalg.solve(left, right[:, :, None])[:, :, 0]
+        points = points + step
+        if np.abs(step).max() < 1e-6:
+            return points
+    raise ArithmeticError("the triangulation through the water does not converge")
+
+
+def rendered(name: str, points: int) -> Case | None:
+    """Return about so many points of the cloud that OpenMVS made; None without the data."""
+    folder, _ = needs(name)
+    if not folder.exists():
+        return None
+    import laspy
+
+    local = pcfix.read_cameras(folder / "colmap")
+    cameras = replace(local, centres=local.centres + np.loadtxt(folder / "offset.txt"))
+    xyz = np.ascontiguousarray(laspy.read(folder / "cloud.las").xyz)
+    match = ViewMatch(read_views(folder / "dense.vis", cameras), cameras, points=len(xyz))
+    rows = np.arange(0, len(xyz), max(1, len(xyz) // points))
+    xyz, views = xyz[rows], match.for_chunk(xyz, 0).take(rows)
+    height, water, bed = true_surface(folder / "truth_dsm.tif"), pcfix.WaterPlane(0.37), xyz.copy()
+    bed[:, 2] = height(xyz)
+
+    def error(found: np.ndarray, _: np.ndarray) -> np.ndarray:
+        unknown = np.full(len(found), np.nan)
+        return np.column_stack([unknown, unknown, found[:, 2] - height(found)])
+
+    known = {"views": {"views": views}, "mvs": {"camera_set": "mvs"}, "all": {"camera_set": "all"}}
+    measured = (bed[:, 2] < water.a - LEAST_DEPTH_M) & (xyz[:, 2] < water.a)
+    words = f"{len(xyz):,} points, {len(cameras)} rendered images, COLMAP and OpenMVS"
+    return Case(words, xyz, cameras, water, 1.34, 0.05, measured, bed, error, known)
+
+
+def true_surface(path: Path) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the height of a raster at points, bilinear; NaN outside."""
+    import rasterio
+
+    with rasterio.open(path) as raster:
+        heights, place = raster.read(1).astype(np.float64), ~raster.transform
+
+    def height(xyz: np.ndarray) -> np.ndarray:
+        column, row = place * (xyz[:, 0], xyz[:, 1])
+        at = np.array([row - 0.5, column - 0.5])
+        return map_coordinates(heights, at, order=1, cval=np.nan)
+
+    return height
+
+
+def rows_of(case: Case, seed: int) -> list[dict[str, Any]]:
     """Return the rows of a scene: no correction, the floor, then every method."""
     every = np.flatnonzero(case.measured)
     rows = [{"method": "uncorrected", **errors(case, case.error(case.xyz[every], every))}]
     if case.floor is not None:
         rows.append({"method": "floor", **errors(case, case.floor)})
-    rows.append(row_of(case, "factor", None, {}, runs))
-    rows.append(row_of(case, "factor", "auto", {"depth_factor": "auto"}, runs))
-    learned = regression_of(case, seed)
-    rows.append(row_of(case, "regression", None, {"regression": learned}, runs))
-    rows.append(row_of(case, "auto", "auto", {}, runs))
-    if "views" in case.knowledge:
-        rows.append(row_of(case, "auto", "views", case.knowledge["views"], runs))
-    rows.append(row_of(case, "snell", "auto", {}, runs))
-    rows += [
-        row_of(case, method, name, {**options, "max_angle": None}, runs)
+    runs: list[tuple[str, str | None, dict[str, Any]]] = [
+        ("factor", None, {}),
+        ("factor", "auto", {"depth_factor": "auto"}),
+        ("regression", None, {"regression": regression_of(case, seed)}),
+        ("auto", "auto", {}),
+        ("auto", "views", case.known["views"]),
+        ("snell", "auto", {}),
+    ]
+    runs += [
+        (method, name, {**options, "max_angle": None})
         for method in METHODS
-        for name, options in case.knowledge.items()
+        for name, options in case.known.items()
         if name != "pairs" or method == "consistent"
     ]
-    return [{"scene": case.name, **row} for row in rows]
+    return rows + [row_of(case, *one) for one in runs]
 
 
-def row_of(
-    case: Case, method: str, cameras: str | None, options: dict[str, Any], runs: int
-) -> dict[str, Any]:
-    """Correct a scene, and return what came of it."""
+def row_of(case: Case, method: str, cameras: str | None, options: dict[str, Any]) -> dict[str, Any]:
+    """Correct a scene after a small run that compiles, and return its errors and speed."""
     row: dict[str, Any] = {"method": method, "cameras": cameras}
+    options = {"index": case.index, "method": method, **options}
+    views, few = options.get("views"), np.arange(0, len(case.xyz), len(case.xyz) // WARM_POINTS)
+    warm = {**options, "views": None if views is None else views.take(few)}
     try:
-        found, seconds = timed(case, {"method": method, **options}, runs)
+        pcfix.correct_points(case.xyz[few], case.cameras, case.water, **warm)
+        clock = time.perf_counter()
+        found = pcfix.correct_points(case.xyz, case.cameras, case.water, **options)
+        seconds = time.perf_counter() - clock
     except pcfix.PcfixError as refusal:
-        print(f"{case.name}, {method}, {cameras}: {refusal}", file=sys.stderr)
+        print(f"{method}, {cameras}: {refusal}", file=sys.stderr)
         return row
     rows = np.flatnonzero(case.measured & found.corrected)
     error = case.error(found.xyz[rows], rows)
-    rays = float(found.ray_count[rows].mean()) if cameras else None
-    within = np.abs(error[:, 2]) / found.sigma_z_m[rows]
     return {
         **row,
-        "rays": rays,
+        "rays": float(found.ray_count[rows].mean()) if cameras else None,
         **errors(case, error),
-        "covered": float(np.mean(within <= 1.96)),
+        "in 95 %": float(np.mean(np.abs(error[:, 2]) <= 1.96 * found.sigma_z_m[rows])),
         "done": len(rows) / int(case.measured.sum()),
-        "points_per_s": int(found.submerged.sum()) / seconds,
+        "points/s": int(found.submerged.sum()) / seconds,
     }
-
-
-def timed(case: Case, options: dict[str, Any], runs: int) -> tuple[pcfix.Correction, float]:
-    """Return the result and the median of the seconds, after a small run that compiles."""
-    few = np.arange(0, len(case.xyz), max(1, len(case.xyz) // WARM_POINTS))
-    views = options.get("views")
-    warm = {**options, "views": None if views is None else views.take(few)}
-    fixed = {"index": case.refractive_index}
-    pcfix.correct_points(case.xyz[few], case.cameras, case.water, **fixed, **warm)
-    seconds = []
-    for _ in range(runs):
-        clock = time.perf_counter()
-        found = pcfix.correct_points(case.xyz, case.cameras, case.water, **fixed, **options)
-        seconds.append(time.perf_counter() - clock)
-    return found, float(np.median(seconds))
 
 
 def errors(case: Case, error: np.ndarray) -> dict[str, float | None]:
@@ -131,10 +270,10 @@ def errors(case: Case, error: np.ndarray) -> dict[str, float | None]:
     x, y, z = error.T / case.gsd_m
     plan = not np.isnan(x).any()
     return {
-        "z_bias": float(z.mean()),
-        "z_rmse": float(np.sqrt(np.mean(z**2))),
-        "xy_bias": float(np.hypot(x.mean(), y.mean())) if plan else None,
-        "xy_rmse": float(np.sqrt(np.mean(x**2 + y**2))) if plan else None,
+        "Z bias": float(z.mean()),
+        "Z RMSE": float(np.sqrt(np.mean(z**2))),
+        "XY bias": float(np.hypot(x.mean(), y.mean())) if plan else None,
+        "XY RMSE": float(np.sqrt(np.mean(x**2 + y**2))) if plan else None,
     }
 
 
@@ -154,44 +293,111 @@ def regression_of(case: Case, seed: int) -> Any:
         return learn_regression(path, [part], ScienceOptions())
 
 
-def accuracy(given: argparse.Namespace) -> list[dict[str, Any]]:
-    """Print the table scene by scene, or whole as Markdown."""
+SENSITIVITY = {
+    "input": "", "wrong by": "", "bias, cm": "+.2f", "measured, cm": ".2f", "predicted, cm": ".2f",
+    "ratio": ".2f",
+}  # fmt: skip
+SEEDS = 5
+LEVEL_M, INDEX, TILT = 0.05, 0.005, 0.001
+RANDOM = (
+    ("image", "0.5 px", {"image_noise": 0.5}, {"sigma_image": 0.5}),
+    ("image", "1 px", {"image_noise": 1.0}, {"sigma_image": 1.0}),
+    ("centres", "3 cm", {"position_noise_m": 0.03}, {"sigma_centre": 0.03}),
+    ("attitude", "0.01 deg", {"attitude_noise_deg": 0.01}, {"sigma_attitude": 0.01}),
+    ("waves", "1 deg", {"wave_slope_deg": 1.0}, {"sigma_waves": 1.0}),
+)
+"""Name, size, settings of the scene, and options of the budget."""
+
+
+def sensitivity(name: str, points: int, seed: int) -> list[dict[str, Any]]:
+    """Return the rows of a scene; random inputs have `SEEDS` scenes of fewer points."""
+
+    def scene_of(points: int, seed: int, **more: Any) -> Any:
+        return pcfix.simulate_scene(
+            points, seed=seed, **{**SETTINGS[name], "image_noise": 0.0, **more}
+        )
+
+    scene = scene_of(points, seed)
+    level, use, right = scene.water, measured_of(scene), corrected(scene)
+    x, y = scene.cameras.centres[:, :2].mean(axis=0)
+    tilts = (
+        WaterPlane(level.a - TILT * x, level.b + TILT, level.c),
+        WaterPlane(level.a - TILT * y, level.b, level.c + TILT),
+    )
+    degrees = float(np.degrees(np.arctan(TILT)))
+    common = (
+        ("level", "+5 cm", [{"water": replace(level, a=level.a + LEVEL_M)}], LEVEL_M),
+        ("index", "+0.005", [{"index": scene.refractive_index + INDEX}], INDEX),
+        ("tilt", "0.1 %", [{"water": tilted} for tilted in tilts], degrees),
+    )
     rows = []
-    for name in given.scenes:
-        case = make(name, given.points, given.seed)
-        if case is None:
-            print(f"{name}: no data; set PCFIX_SHARED", file=sys.stderr)
-            continue
-        found = rows_of(case, given.runs, given.seed)
-        rows += found
-        if not given.markdown:
-            print(f"\n{name}: {case.words}\n{int(case.measured.sum()):,} points are measured, "
-                  f"errors in GSD of {100 * case.gsd_m:.1f} cm")  # fmt: skip
-            print(table(found, COLUMNS[1:], markdown=False), flush=True)
-    if given.markdown:
-        print(table(rows, COLUMNS, markdown=True))
-    return rows
+    for what, size, wrongs, sigma in common:
+        changes = [(corrected(scene, **wrong).xyz - right.xyz)[use, 2] for wrong in wrongs]
+        measured = np.sqrt(np.sum(np.square(changes), axis=0)).mean()
+        predicted = corrected(scene, **{f"sigma_{what}": sigma}).sigma_z_m[use].mean()
+        rows.append((what, size, np.mean(changes), measured, predicted))
+    for what, size, made, sigmas in RANDOM:
+        off, predicted = [], []
+        for one in range(seed, seed + SEEDS):
+            scene = scene_of(points // SEEDS, one, **made)
+            found = corrected(scene, **sigmas)
+            use = measured_of(scene) & found.corrected
+            off.append((found.xyz - scene.true_xyz)[use, 2])
+            predicted.append(found.sigma_z_m[use])
+        rms = [np.sqrt(np.mean(np.concatenate(one) ** 2)) for one in (off, predicted)]
+        rows.append((what, size, np.concatenate(off).mean(), *rms))
+    return [
+        dict(zip(SENSITIVITY, (what, size, *(100 * v for v in values), values[1] / values[2]),
+                 strict=True))
+        for what, size, *values in rows
+    ]  # fmt: skip
+
+
+def corrected(scene: Any, water: Any = None, **options: float) -> Any:
+    """Correct a scene with its tracks; the budget has only the standard deviations given."""
+    nothing = BudgetOptions(sigma_image=0.0, sigma_level=0.0, sigma_index=0.0)
+    given = {"index": scene.refractive_index, **vars(nothing), **options}
+    water = scene.water if water is None else water
+    return pcfix.correct_points(
+        scene.apparent_xyz, scene.cameras, water, method="consistent", views=scene.views, **given
+    )
+
+
+def show(rows: list[dict[str, Any]], columns: dict[str, str]) -> None:
+    """Print a table; words to the left, numbers to the right, a dash for None."""
+    cells = [
+        ["-" if row.get(key) is None else format(row[key], form) for key, form in columns.items()]
+        for row in rows
+    ]
+    width = [max(map(len, column)) for column in zip(columns, *cells, strict=True)]
+    for line in [list(columns), *cells]:
+        padded = zip(line, width, columns.values(), strict=True)
+        print("  ".join(t.rjust(w) if form else t.ljust(w) for t, w, form in padded), flush=True)
 
 
 def main() -> None:
-    """Print the table that was asked for."""
     ask = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     ask.add_argument("--points", type=int, default=30_000, help="of each scene")
-    ask.add_argument("--scenes", nargs="+", choices=NAMES, default=list(NAMES))
-    ask.add_argument("--runs", type=int, default=1, help="the speed is the median of so many")
+    ask.add_argument("--scenes", nargs="+", choices=(*SETTINGS, *REAL), default=None)
     ask.add_argument("--seed", type=int, default=1)
     ask.add_argument("--sensitivity", action="store_true", help="print the other table")
-    ask.add_argument("--markdown", action="store_true")
-    ask.add_argument("--json", type=Path, help="write the rows there as well")
     given = ask.parse_args()
-    if given.sensitivity:
-        rows = sensitivity(given.points, given.seed)
-        print(table(rows, SENSITIVITY_COLUMNS, markdown=given.markdown))
-    else:
-        rows = accuracy(given)
-    if given.json:
-        asked = {"points": given.points, "seed": given.seed, "runs": given.runs}
-        given.json.write_text(json.dumps({"pcfix": pcfix.__version__, **asked, "rows": rows}))
+    for name in given.scenes or (("flat", "oblique") if given.sensitivity else (*SETTINGS, *REAL)):
+        if given.sensitivity:
+            print(f"\n{name}")
+            show(sensitivity(name, given.points, given.seed), SENSITIVITY)
+            continue
+        case = (
+            rendered(name, given.points)
+            if name in REAL
+            else simulated(name, given.points, given.seed)
+        )
+        if case is None:
+            print(f"{name}: no data; set PCFIX_SHARED", file=sys.stderr)
+            continue
+        print(f"\n{name}: {case.words}\n{int(case.measured.sum()):,} points are measured, "
+              f"errors in GSD of {100 * case.gsd_m:.1f} cm")  # fmt: skip
+        show(rows_of(case, given.seed), COLUMNS)
 
 
 if __name__ == "__main__":

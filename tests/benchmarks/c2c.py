@@ -7,7 +7,7 @@ figures written. CloudCompare gets its points as binary PLY, the quickest to loa
 build of it reads; pcfix gets LAS, and in rows of their own LAZ. Prints the ratios, and mean and
 standard deviation of both.
 
-    python tests/benchmarks/c2c.py [--points 1000000] [--runs 5] [--folder DIR]
+    python -m tests.benchmarks.c2c [--points 1000000] [--runs 5] [--folder DIR]
 """
 
 import argparse
@@ -60,14 +60,8 @@ def main():
     program = shutil.which("CloudCompare")
     if program:
         files = [word for name in names for word in ("-O", f"{name}.ply")]
-        commands["CloudCompare, PLY"] = [
-            program,
-            "-SILENT",
-            "-AUTO_SAVE",
-            "OFF",
-            *files,
-            "-C2C_DIST",
-        ]
+        words = [*["-SILENT", "-AUTO_SAVE", "OFF"], *files, "-C2C_DIST"]
+        commands["CloudCompare, PLY"] = [program, *words]
     report(commands, arguments.runs)
     said = json.loads((folder / "summary.json").read_text())["c2c"]["after"]["statistics"]
     print(f"pcfix: mean {said['mean_m']:.6f} m, sd {said['sd_m']:.6f} m")

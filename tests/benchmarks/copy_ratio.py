@@ -6,7 +6,7 @@ writing of the input and of the very records that the correction writes, each as
 own. Prints times, processor time, the ratios to the latter copy, and the peak memory. How fast the
 kernel is, `scaling.py` tells.
 
-    python tests/benchmarks/copy_ratio.py [--points 5000000] [--cameras 200] [--cloud depth-maps]
+    python -m tests.benchmarks.copy_ratio [--points 5000000] [--cameras 200] [--cloud depth-maps]
         [--folder DIR]
 """
 

@@ -4,7 +4,7 @@ Makes two clouds of a wavy bed once (kept in a folder for the next run), points 
 a square metre, and runs each command as a process of its own. Prints its time and the most memory
 it had resident, pages of temporary files included (what /usr/bin/time -v says).
 
-    python tests/benchmarks/large_clouds.py [--points 20000000] [--folder DIR] [--only NAME]
+    python -m tests.benchmarks.large_clouds [--points 20000000] [--folder DIR] [--only NAME]
 """
 
 import argparse

@@ -1,6 +1,6 @@
 """The real river beside pyBathySfM: true over apparent depth, and where the two differ.
 
-    python tests/benchmarks/river.py
+    python -m tests.benchmarks.river
 
 Needs the folder ``river`` of the shared test data (environment variable PCFIX_SHARED). Depths
 below 2 cm are left out: there the ratio is mostly rounding. "Dietrich" is the peer's formula
@@ -9,16 +9,12 @@ used, so that its rows differ from pyBathySfM's only by the choice of cameras, a
 only by the method.
 """
 
-import sys
 import warnings
-from pathlib import Path
 
 import laspy
 import numpy as np
 
 import pcfix
-
-sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.utils.shared import needs
 
 PEER_INDEX = 1.337

@@ -325,7 +325,7 @@ def table() -> dict[str, str]:
     views = "--views {inputs}/free.vis --method consistent"
     add("carried", carried, {"snell": "", "views": views})
     tiles = "--cameras {samples}/scene/cameras.csv --water 0.37 --summary summary.json"
-    commands["tiles.correct"] = f"correct {{inputs}}/tiles out {tiles} --shoreline shore.geojson"
+    commands["tiles.correct"] = f"correct {{inputs}}/tiles out {tiles} --shoreline shore.gpkg"
     commands["tiles.clean"] = "clean {tiles.correct/out} out --summary summary.json"
     commands["tiles.dsm"] = "dsm {tiles.correct/out} out.tif --resolution 2 --what depth"
     commands["tiles.restore"] = "restore {tiles.correct/out} out"

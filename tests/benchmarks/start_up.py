@@ -3,7 +3,7 @@
 Imports, help, and a correction of the sample scene of 20,000 points: once kernels are kept, and
 with ``--cold`` the first time, in an empty folder for them, which takes a minute.
 
-    python tests/benchmarks/start_up.py [--runs 5] [--cold]
+    python -m tests.benchmarks.start_up [--runs 5] [--cold]
 """
 
 import argparse

@@ -9,7 +9,7 @@ from `scattershot` where it went elsewhere, which on broken surfaces may be anot
 paths. Then the range: the steepest incidence at which all paths come back over a level, and the
 roughest waves at which the method by itself finds 99 % of the rays that there are.
 
-    python tests/benchmarks/tracing.py [--paths 20000]
+    python -m tests.benchmarks.tracing [--paths 20000]
 """
 
 import argparse

@@ -53,7 +53,7 @@ class Bench:
     """The files of a reader's seeds in a folder, one of which is damaged at a time."""
 
     def __init__(self, name: str, folder: Path) -> None:
-        self.reader, self.folder = READERS[name], folder
+        self.name, self.reader, self.folder = name, READERS[name], folder
         self._given: dict[str, Any] = {}
         self.parts: list[Part] = []
         for i, (seed, write) in enumerate(self.reader.seeds.items()):
@@ -136,13 +136,10 @@ def _packed(whole: bytes, entry: str, data: bytes) -> bytes:
 def _place(error: BaseException) -> str:
     """Return what an error is and where in pcfix it came from, the same for each like it."""
     frames = [f for f in traceback.extract_tb(error.__traceback__) if "/pcfix/" in f.filename]
-    where = (
-        "outside"
-        if not frames
-        else (
-            f"{frames[-1].filename.rpartition('/pcfix/')[2]}:{frames[-1].lineno} {frames[-1].name}"
-        )
-    )
+    where = "outside"
+    if frames:
+        file = frames[-1].filename.rpartition("/pcfix/")[2]
+        where = f"{file}:{frames[-1].lineno} {frames[-1].name}"
     return f"{type(error).__name__} at {where}: {str(error)[:200]}"
 
 
@@ -171,12 +168,9 @@ def check_result(found: Any, name: str = "result") -> None:
     if isinstance(found, Cameras):
         _check_cameras(found)
     if isinstance(found, Views):
-        start, ends = found.start, [found.start[0], found.start[-1]]
-        if (
-            (np.diff(start) < 0).any()
-            or ends != [0, len(found.camera)]
-            or found.camera.min(initial=0) < 0
-        ):
+        start, camera = found.start, found.camera
+        fits = (np.diff(start) >= 0).all() and [start[0], start[-1]] == [0, len(camera)]
+        if not fits or camera.min(initial=0) < 0:
             raise Finding(f"{name}: lists of views that do not fit")
     if isinstance(found, TiePoints):
         known = np.isfinite(found.xyz)

@@ -38,11 +38,10 @@ from tests.utils.pose_files import WRITERS
 
 
 class Reader(NamedTuple):
-    """What yields the results of a file, the seeds, and the modules whose lines are counted."""
+    """What yields the results of a file, and the seeds."""
 
     read: Callable[..., Iterator[Any]]
     seeds: dict[str, seeds.Seed]
-    modules: tuple[str, ...]
 
 
 def read_block(path: Path, **options: Any) -> Iterator[Any]:
@@ -109,127 +108,96 @@ def read_members(path: Path) -> Iterator[Any]:
     yield None if found is None else found[1]
 
 
-def camera_reader(module: str, **written: seeds.Seed) -> Reader:
-    return Reader(read_block, written, (f"pcfix.io.cameras.{module}",))
+def camera_reader(**written: seeds.Seed) -> Reader:
+    return Reader(read_block, written)
 
 
 READERS: dict[str, Reader] = {
     "metashape": camera_reader(
-        "metashape",
         project=metashape.tie_project, chunk=seeds.metashape_chunk,
-        **{"in one file": seeds.packed(seeds.metashape_chunk, "a.psz", "doc.xml"),
-           "geocentric": seeds.of("Metashape XML, geocentric")},
+        packed=seeds.packed(seeds.metashape_chunk, "a.psz", "doc.xml"),
+        geocentric=seeds.of("Metashape XML, geocentric"),
     ),
-    "pix4d": camera_reader("pix4d", params=seeds.pix4d_params, block=seeds.of("Pix4D params"),
-                           **seeds.shared("cameras", "pix4d", "lod3_amsterdam")),
-    "opf": camera_reader("opf", tracks=seeds.opf_with_tracks, fisheye=seeds.opf_fisheye),
+    "pix4d": camera_reader(
+        params=seeds.pix4d_params, block=seeds.of("Pix4D params"),
+        **seeds.shared("cameras", "pix4d", "lod3_amsterdam"),
+    ),
+    "opf": camera_reader(tracks=seeds.opf_with_tracks, fisheye=seeds.opf_fisheye),
     "odm": camera_reader(
-        "odm", project=seeds.odm_project, shots=seeds.of("ODM shots.geojson"),
-        today=seeds.of("ODM reconstruction"),
-        **seeds.shared("cameras", "odm", "orthority_odm"),
+        project=seeds.odm_project, shots=seeds.of("ODM shots.geojson"),
+        today=seeds.of("ODM reconstruction"), **seeds.shared("cameras", "odm", "orthority_odm"),
     ),
     "opensfm": camera_reader(
-        "opensfm", lenses=seeds.opensfm_lenses, tracks=seeds.opensfm_with_tracks,
-        block=seeds.of("OpenSfM"),
+        lenses=seeds.opensfm_lenses, tracks=seeds.opensfm_with_tracks, block=seeds.of("OpenSfM")
     ),
     "colmap text": camera_reader(
-        "colmap", model=seeds.colmap_text_folder, block=seeds.of("COLMAP text"),
-        lenses=seeds.colmap_lenses,
+        model=seeds.colmap_text_folder, block=seeds.of("COLMAP text"), lenses=seeds.colmap_lenses
     ),
     "colmap binary": camera_reader(
-        "colmap", model=lambda folder: colmap.binary_folder(folder / "sparse"),
+        model=lambda folder: colmap.binary_folder(folder / "sparse"),
         block=seeds.of("COLMAP binary"), lenses=seeds.colmap_binary_lenses,
     ),
     "micmac": camera_reader(
-        "micmac", block=seeds.of("MicMac"),
+        block=seeds.of("MicMac"),
         **seeds.shared("cameras", "micmac", "li3ds", give="Orientation-00.xml"),
     ),
     "bundler": camera_reader(
-        "bundler", points=lambda folder: bundles.write(folder, bundles.bundle()[0]),
-        block=seeds.of("Bundler"),
+        points=lambda folder: bundles.write(folder, bundles.bundle()[0]), block=seeds.of("Bundler")
     ),
-    "nvm": camera_reader("nvm", points=seeds.nvm_file, block=seeds.of("VisualSFM")),
+    "nvm": camera_reader(points=seeds.nvm_file, block=seeds.of("VisualSFM")),
     "blocksexchange": camera_reader(
-        "blocksexchange", ties=seeds.blocks_exchange, block=seeds.of("BlocksExchange, ENU"),
+        ties=seeds.blocks_exchange, block=seeds.of("BlocksExchange, ENU"),
         packed=seeds.packed(seeds.blocks_exchange, "block.xmlz", "block.xml"),
         **seeds.shared("cameras", "blocksexchange", "paris_doc_example", "Paris2012_one_photo.xml"),
     ),
     "realitycapture": camera_reader(
-        "realitycapture", one=lambda folder: realitycapture.write(folder).parent,
+        one=lambda folder: realitycapture.write(folder).parent,
         block=seeds.of("RealityCapture XMP"),
     ),
     "table": camera_reader(
-        "table", **{one: seeds.of(one) for one in WRITERS if "table" in one or "omega" in one}
+        **{one: seeds.of(one) for one in WRITERS if "table" in one or "omega" in one}
     ),
     "unsupported": camera_reader(
-        "unsupported",
-        **{name: seeds.text(name, data) for name, (data, _) in unsupported.FILES.items()},
+        **{name: seeds.text(name, data) for name, (data, _) in unsupported.FILES.items()}
     ),
-    "views": Reader(
-        read_lists,
-        {"colmap": seeds.vis, "openmvs": seeds.openmvs("<"), "big": seeds.openmvs(">"),
-         "text": seeds.openmvs("", weights=False)},
-        ("pcfix.io.views", "pcfix.io.ply"),
-    ),
-    "mesh": Reader(
-        read_water,
-        {"obj": seeds.text("water.obj", water.OBJ), "ply": seeds.text("water.ply", seeds.PLANE)},
-        ("pcfix.io.water",),
-    ),
-    "raster": Reader(
-        read_water, {"tif": seeds.raster, "turned": seeds.turned_raster},
-        ("pcfix.io.water_rasters",),
-    ),
-    "vectors": Reader(
-        read_lines,
-        {"csv": seeds.text("shore.csv", seeds.LINE),
-         "geojson": seeds.text("water.geojson", seeds.SHAPE),
-         "wkt": seeds.text("a.wkt", "POLYGON Z ((0 0 1, 9 0 1, 9 9 1, 0 0 1))\nPOINT (3 4)\n"),
-         "gpkg": seeds.vector("water.gpkg"), "shp": seeds.vector("water.shp")},
-        ("pcfix.io.vectors",),
-    ),
-    "control": Reader(
-        read_marks,
-        {"table": seeds.text("gcps.csv", "\n".join([control.HEAD, *control.ROWS])),
-         "odm": seeds.text("gcp_list.txt", "EPSG:32636\n500010 4000010 2.5 100 200 a.jpg G1\n"
-                                     "500030 4000020 -1.75 0.5 1199 b.jpg G2\n"),
-         "markers": seeds.markers},
-        ("pcfix.io.ground_control",),
-    ),
-    "gnss": Reader(
-        read_positions,
-        {"table": seeds.text("gnss.csv", seeds.GNSS),
-         "geo": seeds.text("geo.txt", "EPSG:32632\n" + "\n".join(
-             f"{label} {x} {y} {z}" for label, (x, y, z) in
-             zip(seeds.block().labels, seeds.block().centres.tolist(), strict=True))),
-         "images": seeds.odm_images},
-        ("pcfix.io.gnss_positions",),
-    ),
-    "tides": Reader(
-        read_times,
-        {"pictures": seeds.pictures, "tide": seeds.text("tide.csv", seeds.TIDE),
-         "times": seeds.text("times.csv", seeds.TIMES),
-         "images": seeds.odm_images},
-        ("pcfix.io.tides",),
-    ),
+    "views": Reader(read_lists, {
+        "colmap": seeds.vis, "openmvs": seeds.openmvs("<"), "big": seeds.openmvs(">"),
+        "text": seeds.openmvs("", weights=False),
+    }),
+    "mesh": Reader(read_water, {
+        "obj": seeds.text("water.obj", water.OBJ), "ply": seeds.text("water.ply", seeds.PLANE),
+    }),
+    "raster": Reader(read_water, {"tif": seeds.raster, "turned": seeds.turned_raster}),
+    "vectors": Reader(read_lines, {
+        "csv": seeds.text("shore.csv", seeds.LINE),
+        "geojson": seeds.text("water.geojson", seeds.SHAPE),
+        "wkt": seeds.text("a.wkt", "POLYGON Z ((0 0 1, 9 0 1, 9 9 1, 0 0 1))\nPOINT (3 4)\n"),
+        "gpkg": seeds.vector("water.gpkg"), "shp": seeds.vector("water.shp"),
+    }),
+    "control": Reader(read_marks, {
+        "table": seeds.text("gcps.csv", "\n".join([control.HEAD, *control.ROWS])),
+        "odm": seeds.text("gcp_list.txt", "EPSG:32636\n500010 4000010 2.5 100 200 a.jpg G1\n"
+                                          "500030 4000020 -1.75 0.5 1199 b.jpg G2\n"),
+        "markers": seeds.markers,
+    }),
+    "gnss": Reader(read_positions, {
+        "table": seeds.text("gnss.csv", seeds.GNSS), "geo": seeds.text("geo.txt", seeds.GEO),
+        "images": seeds.odm_images,
+    }),
+    "tides": Reader(read_times, {
+        "pictures": seeds.pictures, "tide": seeds.text("tide.csv", seeds.TIDE),
+        "times": seeds.text("times.csv", seeds.TIMES), "images": seeds.odm_images,
+    }),
     "depths": Reader(
-        read_one(read_check_depths),
-        {"table": seeds.text("depths.csv", seeds.DEPTHS)},
-        ("pcfix.io.tables",),
+        read_one(read_check_depths), {"table": seeds.text("depths.csv", seeds.DEPTHS)}
     ),
-    "regression": Reader(
-        read_one(read_regression), {"line": seeds.regression}, ("pcfix.io.regressions",)
-    ),
-    "members": Reader(read_members, {"npz": seeds.members}, ("pcfix.io.members",)),
+    "regression": Reader(read_one(read_regression), {"line": seeds.regression}),
+    "members": Reader(read_members, {"npz": seeds.members}),
     "pictures": Reader(
-        read_picture, {one: seeds.picture(f"a.{one}") for one in ("jpg", "png", "tif")},
-        ("pcfix.io.photographs",),
+        read_picture, {one: seeds.picture(f"a.{one}") for one in ("jpg", "png", "tif")}
     ),
-    "las": Reader(
-        read_points,
-        {"1.4": seeds.cloud("cloud.las", 7), "1.2": seeds.cloud("cloud.las", 3), "copc": seeds.copc,
-         "laz": seeds.cloud("cloud.laz", 6)},
-        ("pcfix.io.las", "pcfix.io.clouds"),
-    ),
+    "las": Reader(read_points, {
+        "1.4": seeds.cloud("cloud.las", 7), "1.2": seeds.cloud("cloud.las", 3), "copc": seeds.copc,
+        "laz": seeds.cloud("cloud.laz", 6),
+    }),
 }  # fmt: skip
-"""By the name that `tests.fuzz.fuzz` takes."""

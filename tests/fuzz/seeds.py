@@ -23,7 +23,6 @@ from pcfix.io.cameras.colmap import place_text
 from pcfix.io.cameras.colmap.files import MODELS
 from pcfix.io.members import FILE, write_members
 from pcfix.model import Cameras, Lens
-from tests.io import test_ground_control as control
 from tests.io import test_views as views
 from tests.io.cameras import test_blocksexchange as blocksexchange
 from tests.io.cameras import test_colmap as colmap
@@ -396,6 +395,10 @@ GNSS = "label,x,y,z,sx,sy,sz\n" + "".join(
     f"{label},{x},{y},{z},0.1,0.1,0.2\n"
     for label, (x, y, z) in zip(block().labels, block().centres.tolist(), strict=True)
 )
+GEO = "EPSG:32632\n" + "\n".join(
+    f"{label} {x} {y} {z}"
+    for label, (x, y, z) in zip(block().labels, block().centres.tolist(), strict=True)
+)
 TIMES = "label,time\n" + "".join(
     f"{one},2026-05-01T10:0{i}:00Z\n" for i, one in enumerate(block().labels)
 )
@@ -405,5 +408,4 @@ SHAPE = {"type": "FeatureCollection", "crs": {"type": "name", "properties": {"na
          "coordinates": [[[500000, 5200000, 1], [500050, 5200000, 1], [500050, 5200050, 1.5],
                           [500000, 5200000, 1]]]}}]}  # fmt: skip
 TIDE = "time,level_m\n2026-05-01T10:00:00Z,1.0\n2026-05-01T11:00:00Z,1.4\n"
-CONTROL = "\n".join([control.HEAD, *control.ROWS])
 DEPTHS = "x,y,depth_m\n500000,5200000,1.5\n500001,5200000,0.25\n"

@@ -22,7 +22,7 @@ def bench(request, tmp_path_factory):
 def test_whole_files(bench):
     for part in {part.seed: part for part in bench.parts}.values():
         results, sentence = bench.read(part, part.data)
-        assert results or "unsupported" in bench.reader.modules[0], sentence
+        assert results or bench.name == "unsupported", sentence
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -73,64 +73,45 @@ FOUND = {
     "records of many bytes": ("las", "1.2", "cloud.las", put(105, "<HI", 60_000, 2**31)),
     "octree behind the end": ("las", "copc", "cloud.copc.laz", put(ROOT + 8, "<Q", 2**40)),
     "dimension of no bytes": ("las", "1.4", "cloud.las", extra_dimension),
-    "infinite place": (
-        *("metashape", "geocentric", "cameras.xml", instead(b"<scale>7.3", b"<scale>9e307")),
-    ),
-    "no transformation": (
-        *("odm", "project", "geocoords_transformation.txt", lambda data: b"\n" * 9),
-    ),
+    "infinite place": ("metashape", "geocentric", "cameras.xml",
+        instead(b"<scale>7.3", b"<scale>9e307")),
+    "no transformation": ("odm", "project", "geocoords_transformation.txt", lambda data: b"\n" * 9),
     "infinitely many cameras": ("bundler", "points", "bundle.out", instead(b"\n2 3", b"\n1e999 3")),
     "image without a name": ("tides", "images", "images.json", instead(b'"IMG_0001.jpg"', b"null")),
     "infinite time": ("tides", "images", "images.json", instead(b"1000000000000.0", b"1e999")),
     # these three ended the process, in open3d or in the index of the facets
     "vertex too many": ("mesh", "ply", "water.ply", instead(b"9 9 1\n", b"9 9 1\n" * 3)),
-    "element of another name": (
-        *("mesh", "ply", "water.ply", instead(b"element vertex", b"element vvertex")),
-    ),
+    "element of another name": ("mesh", "ply", "water.ply",
+        instead(b"element vertex", b"element vvertex")),
     "vertex on no map": ("mesh", "obj", "water.obj", instead(b"v 512000.12345", b"v -1e308")),
-    "corner of many digits": (
-        *("mesh", "obj", "water.obj", instead(b"f 1/", b"f 99999999999999999999/")),
-    ),
-    "mesh of one line": (
-        *("mesh", "obj", "water.obj", instead(b"f 1/1/1 2/1/1 3//1 -1", b"f 1 2 2")),
-    ),
-    "many records of no properties": (
-        *("mesh", "ply", "water.ply"),
-        instead(b"element face 2\n", b"element face 99999999999999999999\nelement f 2\n"),
-    ),
-    "raster without a place": (
-        *("raster", "tif", "water.tif", instead(PLACE, struct.pack("<2d", float("nan"), 5.2e6))),
-    ),
-    "cells beyond the last digit": (
-        *("raster", "turned", "water.tif"),
-        instead(MATRIX, struct.pack("<4d", 1e-20, 0, 0, 5e5)),
-    ),
-    "picture of too many pixels": (
-        *("pictures", "png", "a.png", instead(struct.pack(">I", 60), struct.pack(">I", 2**30))),
-    ),
-    "picture of no pages": (
-        *("pictures", "tif", "a.tif", lambda data: data[:4] + bytes(4) + data[8:]),
-    ),
+    "corner of many digits": ("mesh", "obj", "water.obj",
+        instead(b"f 1/", b"f 99999999999999999999/")),
+    "mesh of one line": ("mesh", "obj", "water.obj", instead(b"f 1/1/1 2/1/1 3//1 -1", b"f 1 2 2")),
+    "many records of no properties": ("mesh", "ply", "water.ply",
+        instead(b"element face 2\n", b"element face 99999999999999999999\nelement f 2\n")),
+    "raster without a place": ("raster", "tif", "water.tif",
+        instead(PLACE, struct.pack("<2d", float("nan"), 5.2e6))),
+    "cells beyond the last digit": ("raster", "turned", "water.tif",
+        instead(MATRIX, struct.pack("<4d", 1e-20, 0, 0, 5e5))),
+    "picture of too many pixels": ("pictures", "png", "a.png",
+        instead(struct.pack(">I", 60), struct.pack(">I", 2**30))),
+    "picture of no pages": ("pictures", "tif", "a.tif",
+        lambda data: data[:4] + bytes(4) + data[8:]),
     "raster of half its bytes": ("raster", "tif", "water.tif", lambda data: data[:900]),
-    "column with many brackets": (
-        *("depths", "table", "depths.csv", instead(b"depth_m", b"depth" + b"(" * 20_000)),
-    ),
-    "labels that are none": (
-        *("members", "npz", "ensemble.npz labels.npy", instead(b"(4,)", b"(2,)")),
-    ),
+    "column with many brackets": ("depths", "table", "depths.csv",
+        instead(b"depth_m", b"depth" + b"(" * 20_000)),
+    "labels that are none": ("members", "npz", "ensemble.npz labels.npy",
+        instead(b"(4,)", b"(2,)")),
     "array that is none": ("members", "npz", "ensemble.npz labels.npy", lambda data: b"no array"),
     "deep brackets of a line": ("regression", "line", "line.json", lambda data: b"[" * 100_000),
     "deep brackets of times": ("tides", "images", "images.json", lambda data: b"[" * 100_000),
-    "deep brackets beside a model": (
-        *("colmap text", "model", "georeference.json", lambda data: b"[" * 100_000),
-    ),
-    "escapes for the terminal": (
-        *("gnss", "table", "gnss.csv", instead(b"IMG_0002.jpg,", b"IMG_0002.jpg,\x1b[2J")),
-    ),
-    "number of many digits": (
-        *("realitycapture", "one", "a.xmp", instead(b"n>10 ", b"n>" + b"9" * 5000 + b" ")),
-    ),
-}
+    "deep brackets beside a model": ("colmap text", "model", "georeference.json",
+        lambda data: b"[" * 100_000),
+    "escapes for the terminal": ("gnss", "table", "gnss.csv",
+        instead(b"IMG_0002.jpg,", b"IMG_0002.jpg,\x1b[2J")),
+    "number of many digits": ("realitycapture", "one", "a.xmp",
+        instead(b"n>10 ", b"n>" + b"9" * 5000 + b" ")),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", FOUND)
