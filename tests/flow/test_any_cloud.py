@@ -216,35 +216,6 @@ def test_frame_and_order(data, scene, turn):
     np.testing.assert_allclose(miss2, expected2, rtol=0, atol=1e-7)
 
 
-@given(data=st.data(), scene=scenes(), point_format=FORMATS)
-def test_encodings(data, scene, point_format):
-    """Turned by quarters, shifted by whole steps, so that both files hold the very points."""
-    method = data.draw(st.sampled_from(["snell", "butler", "shan", "factor"]))
-    given = of_a_point(method)
-    assume((np.abs(scene.height_m(scene.xyz)) > 1e-6).all())
-    turn = data.draw(st.integers(0, 3)) * np.pi / 2.0
-    shift = data.draw(st.sampled_from([(0.0,) * 3, (85e3, -3e4, 7.0)]))
-    cameras = data.draw(st.permutations(range(len(scene.cameras))))
-    points = data.draw(st.permutations(range(len(scene.xyz))))
-    other = scene.moved(turn, shift).reordered(cameras, points)
-    results = []
-    with tempfile.TemporaryDirectory() as folder:
-        for name, one in (("a", scene), ("b", other)):
-            scales, offsets = data.draw(st.sampled_from(ENCODINGS))
-            source, target = (Path(folder, name + data.draw(SUFFIXES)) for _ in range(2))
-            target = target.with_stem(f"{name}-out")
-            one.write(source, point_format, scales=scales, offsets=offsets)
-            assume(correct(one, source, target, **given) is not None)
-            results.append((xyz_of(read_raw(target)), fields(read_raw(target))["class"], scales))
-    (here, _, fine), (there, classes, coarse) = results
-    expected = Scene(here, scene.cameras, scene.plane).moved(turn, shift).xyz[points]
-    quantum = 0.5 * (max(fine) + max(coarse))
-    np.testing.assert_allclose(there, expected, rtol=0, atol=quantum + 1e-6)
-    through_arrays = pcfix.correct_points(other.xyz, other.cameras, other.water, **given)
-    np.testing.assert_allclose(there, through_arrays.xyz, rtol=0, atol=0.5 * max(coarse) + 1e-6)
-    assert (classes[through_arrays.corrected] == 40).all()
-
-
 @st.composite
 def label_options(draw) -> dict[str, object]:
     connected, band = draw(st.booleans()), draw(st.sampled_from([0.0, 0.02, 1.0]))

@@ -2,7 +2,6 @@
 
 import json
 import struct
-import warnings
 from dataclasses import replace
 
 import laspy
@@ -18,8 +17,6 @@ from pcfix.io.cameras.colmap.writing import write_colmap
 from pcfix.lens.imaging import project
 from pcfix.model import Cameras, Lens
 from pcfix.report.cameras import cameras_text
-from tests.io.cameras import test_colmap as colmap
-from tests.utils.codes import warned
 from tests.utils.program import run_pcfix
 from tests.utils.shared import ROOT, needs
 
@@ -160,21 +157,6 @@ def test_groups_of_lenses(lenses, images, different):
     assert [sensor.focal_most for sensor in sensors] == most
 
 
-@pytest.mark.parametrize(("k1", "folds"), [(-0.02, False), (-0.8, True)])
-def test_fold_of_a_lens(k1, folds):
-    """x (1 + k1 x^2) turns at x^2 = -1 / (3 k1): for -0.8 at 0.65 of an angle that ends at 0.90."""
-    sensors = sensors_of((replace(LENS, radial=(k1,)),) * 3)
-    assert (sensors[0].folded > 0.0) == folds
-
-
-def test_nominal_lenses():
-    """Images of a rig without tie points have them, beside others that were calibrated."""
-    nominal = replace(LENS, radial=(), sensor="NIR")
-    sensors = sensors_of((LENS,) * 8 + (nominal,) * 8)
-    assert [sensor.nominal for sensor in sensors] == [False, True]
-    assert not sensors_of((nominal,) * 8)[0].nominal  # as undistorted images are
-
-
 SNELL = {"water": 0.37, "method": "snell", "max_angle": None}
 
 
@@ -192,28 +174,6 @@ def plain(tmp_path_factory):
 def same(one, other, steps=0):
     """Whether coordinates differ by at most so many steps of the file."""
     return all(np.abs(one[axis].astype(np.int64) - other[axis]).max() <= steps for axis in "XYZ")
-
-
-def test_another_zone(tmp_path, plain):
-    east = Transformer.from_crs("EPSG:32633", "EPSG:32634", always_xy=True)
-
-    def moved(xyz):
-        x, y = east.transform(xyz[:, 0], xyz[:, 1])
-        return np.column_stack([x, y, xyz[:, 2]])
-
-    # without angles: yaw counts from grid north, which differs by the convergence
-    def bare(path, **more):
-        lines = table(path, **more).read_text().splitlines()
-        path.write_text("\n".join(",".join(line.split(",")[:4]) for line in lines) + "\n")
-        return path
-
-    here = {"max_angle": 40.0, "sensor": None}
-    expected, _ = corrected(tmp_path, "a.las", cameras=bare(tmp_path / "a.csv"), **here)
-    other = bare(tmp_path / "b.csv", change=moved)
-    found, _ = corrected(tmp_path, "b.las", cameras=other, cameras_crs="EPSG:32634", **here)
-    assert same(found, expected, steps=1)  # PROJ there and back is good to a micrometre
-    with pytest.raises(pcfix.GeometryError):
-        corrected(tmp_path, "c.las", cameras=other, **here)
 
 
 def test_offset_applied(tmp_path, plain):
@@ -272,17 +232,3 @@ def test_views_of_a_real_cloud(tmp_path):
     )  # fmt: skip
     assert summary.corrected == summary.submerged
     assert summary.rays / summary.corrected == pytest.approx(5.5, abs=0.1)  # of the list's README
-
-
-def test_tie_points_cut_short(tmp_path):
-    model = colmap.folder(tmp_path / "sparse")
-    inputs, path = Inputs(cameras=model, water=0.0), model / "points3D.txt"
-    ties = inputs.tie_points(None)
-    assert ties is not None
-    path.write_text(f"# Number of points: {len(ties.xyz) + 1}\n{path.read_text()}")
-    with warned("cameras.tie_points"):
-        assert inputs.tie_points(None) is None
-    path.unlink()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert inputs.tie_points(None) is None

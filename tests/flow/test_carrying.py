@@ -15,9 +15,8 @@ from pcfix.flow.old_cameras import told_apart
 from pcfix.flow.request import Request, request_of
 from pcfix.model import Cameras, Outcome, Views
 from pcfix.report.text import summary_text
-from tests.utils.beyond_frames import BEYOND_FRAMES, DEEP
+from tests.utils.beyond_frames import BEYOND_FRAMES
 from tests.utils.clouds import (
-    CAMERA_HEIGHT_M,
     EAST_M,
     NORTH_M,
     SCALES,
@@ -28,7 +27,7 @@ from tests.utils.clouds import (
     read_raw,
     write_cloud,
 )
-from tests.utils.codes import refused, warned
+from tests.utils.codes import refused
 from tests.utils.nightly import mostly_nightly
 from tests.utils.program import run_pcfix
 from tests.utils.shared import ROOT, needs
@@ -190,15 +189,6 @@ def test_doors_agree(cloud, old, tmp_path):
     assert stage["pdalargs"]["adjusted_from"] == paths["adjusted_from"]
 
 
-def test_chunks(cloud, old, tmp_path, monkeypatch):
-    correct(cloud, cameras=adjusted(old), adjusted_from=old)
-    whole = (tmp_path / "out.las").read_bytes()
-    monkeypatch.setattr("pcfix.io.las.source.CHUNK_POINTS", 333)
-    monkeypatch.setattr("pcfix.adjust.transfer.POINTS_AT_ONCE", 100)
-    correct(cloud, cameras=adjusted(old), adjusted_from=old, jobs=1)
-    assert (tmp_path / "out.las").read_bytes() == whole
-
-
 def test_views(old):
     """They come in another order there, and under whole paths; one was not adjusted."""
     rng = np.random.default_rng(3)
@@ -234,17 +224,6 @@ def test_views(old):
     assert np.array_equal(found.ray_count[has], straight.ray_count[has] - 1)
 
 
-def test_millimetres(cloud, old):
-    px = tuple(
-        replace(lens, focal=6000.0, width=6000.0, height=2400.0, principal_x=3000.0,
-                principal_y=1200.0, unit="px")
-        for lens in old.lenses
-    )  # fmt: skip
-    _, _, one = correct(cloud, cameras=adjusted(old), adjusted_from=old)
-    _, _, other = correct(cloud, cameras=replace(adjusted(old), lenses=px), adjusted_from=old)
-    assert np.abs(shift_of(one) - shift_of(other)).max() <= 1  # step of the file
-
-
 @pytest.mark.parametrize(
     ("change", "code"),
     [
@@ -267,14 +246,6 @@ def test_other_block(cloud, old, change, code):
     with refused(code):
         correct(cloud, cameras=old, adjusted_from=replace(old, **change))
     assert not cloud.with_name("out.las").exists()
-
-
-@DEEP
-def test_one_image_far_off(cloud, old):
-    centres = old.centres.copy()
-    centres[4] += [0.2 * CAMERA_HEIGHT_M, 0.0, 0.0]
-    with warned("adjusted_from.images_apart", image=old.labels[4]):
-        correct(cloud, cameras=old, adjusted_from=replace(old, centres=centres), deep=True)
 
 
 @pytest.mark.parametrize("local", ["old", "new", "both", "neither"])

@@ -6,13 +6,12 @@ import warnings
 import pytest
 
 import pcfix
-from pcfix.errors import PcfixWarning, SettingError
+from pcfix.errors import PcfixWarning
 from pcfix.flow.checks import check_cameras
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.next_steps import adjust_words
 from pcfix.report.cameras import cameras_text
 from tests.utils.crops import middle_of
-from tests.utils.program import run_pcfix
 from tests.utils.shared import ROOT, needs
 
 SCENE = ROOT / "samples" / "scene"
@@ -107,12 +106,6 @@ def test_calibration(tmp_path):
     assert report.diagnosis.size[0] == pytest.approx(0.176, abs=0.01)
 
 
-def test_missing_cloud():
-    with pytest.raises(SettingError):
-        check_cameras(SCENE / "cameras.csv", gcps="gcps.csv")
-    assert run_pcfix("cameras", SCENE / "cameras.csv", "--lens", "a.csv").returncode == 1
-
-
 def test_command():
     inputs = Inputs(
         cameras="my model", water=0.5, cameras_offset=(1.0, 2.0, 3.0), cameras_crs="EPSG:25830",
@@ -127,14 +120,3 @@ def test_command():
     command, because = adjust_words(inputs, "cloud.laz", has_datum=False)
     assert command == f"{head} {tail} --gnss GNSS.csv"
     assert "--gcps" in because
-
-
-@bent
-def test_the_command_line_says_so():
-    done = run_pcfix(
-        "cameras", BENT / "cameras.xml", "--cloud", BENT / "cloud.las", "--water", "0.37",
-        "--gnss", BENT / "gnss.csv",
-    )  # fmt: skip
-    assert done.returncode == 0
-    assert "GNSS: absorbed" in done.stdout
-    assert "pcfix adjust" in done.stdout

@@ -172,24 +172,6 @@ def test_correct_doors(path, tmp_path, mask, choices):
     np.testing.assert_array_equal(out.xyz[dry], las.xyz[dry])
 
 
-def test_plain_correction(path, tmp_path):
-    summary = pcfix.correct_file(
-        path, tmp_path / "out.las", cameras=block(), water=WATER_M, method="snell", max_angle=None
-    )
-    assert summary.labelling is None
-    (vlr,) = [v for v in laspy.read(tmp_path / "out.las").vlrs if v.user_id == "pcfix"]
-    assert "labelling" not in json.loads(vlr.record_data)
-
-
-def test_summary(path, tmp_path, mask):
-    words = ["--water", WATER_M, "--water-mask", mask, "--connected", "--respect-classes", "9, 2"]
-    done = run_pcfix("label", path, tmp_path / "out.las", *words)
-    for label in ("Mask", "Kept class", "Reclassified"):
-        assert f"  {label} " in done.stdout
-    plain = run_pcfix("label", path, tmp_path / "p.las", "--water", WATER_M)
-    assert "Mask" not in plain.stdout and "Class 41" not in plain.stdout
-
-
 def test_separate_pools(tmp_path):
     header = laspy.LasHeader(version="1.4", point_format=6)
     header.scales, header.offsets = np.full(3, 0.001), np.array([EAST_M, NORTH_M, 0.0])
@@ -259,20 +241,6 @@ def test_masks_refused(path, tmp_path, area):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["in.las", "mask.wkt"]
 
 
-def test_outputs_refused(path, tmp_path, mask):
-    label_file(path, tmp_path / "out.las", water=WATER_M)
-    with refused("output.exists"):
-        label_file(path, tmp_path / "out.las", water=WATER_M)
-    given = {"water": WATER_M, "overwrite": True}
-    with refused("output.is_input"):
-        label_file(path, path, **given)
-    with refused("output.is_input"):
-        label_file(path, tmp_path / "out.las", water_mask=mask, summary=mask, **given)
-    with pytest.raises(pcfix.GeometryError):
-        label_file(path, tmp_path / "new.las", water=-50.0)
-    assert not (tmp_path / "new.las").exists()
-
-
 @pytest.mark.parametrize(
     ("words", "code"),
     [
@@ -286,14 +254,6 @@ def test_outputs_refused(path, tmp_path, mask):
 def test_options_refused(path, tmp_path, words, code):
     done = run_pcfix("label", path, tmp_path / "out.las", "--water", WATER_M, *words)
     assert (done.returncode, done.code) == (1, code)
-
-
-def test_arrays_refused():
-    for classes in ([1, 2], np.zeros(1)):
-        with refused("option.shape", option="classes"):
-            label_points([[0, 0, -1.0]], 0.0, classes=classes)
-    with refused("array.shape"):
-        pcfix.correct_points([[0, 0, -1.0]], block(), 0.0, may_be_submerged=[1])
 
 
 def test_pipeline(path, tmp_path, mask):

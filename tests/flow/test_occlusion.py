@@ -70,14 +70,6 @@ def test_second_highest():
     np.testing.assert_array_equal(occluder.height[1:-1, 1:-1], expected.astype(np.float32))
 
 
-def test_cell_size():
-    spacing = np.sqrt(60.0 * 40.0 / 50_000)
-    assert 2.0 <= occluder_of(hills()).cell_m / spacing <= 4.0
-    xyz = hills()
-    strip = xyz[np.abs(xyz[:, 0] - 1.5 * xyz[:, 1] - (UTM[0] - 1.5 * UTM[1])) < 4.0]
-    assert 2.0 <= occluder_of(strip).cell_m / spacing <= 4.0
-
-
 def test_blocks():
     occluder = occluder_of(hills())
     for tops, side in ((occluder.block_top, 8), (occluder.large_block_top, 64)):
@@ -101,15 +93,6 @@ def test_chunks():
         same(builder.build(), whole)
 
 
-def test_noise():
-    xyz = hills()
-    wrong = np.column_stack([xyz[:20_000, :2], np.full(20_000, 100.0)])
-    classes = np.concatenate([np.ones(len(xyz)), np.tile([7, 18], 10_000)]).astype(np.uint8)
-    both = np.vstack([xyz, wrong])
-    assert occluder_of(both, classes).highest_m < 4.0
-    assert occluder_of(both).highest_m == 100.0
-
-
 def test_memory(monkeypatch):
     monkeypatch.setattr(top_surface, "MOST_CELLS", 10_000)
     rng = np.random.default_rng(3)
@@ -119,15 +102,3 @@ def test_memory(monkeypatch):
         occluder = occluder_of(xyz)
         assert occluder.height.size <= 10_000
         assert np.isfinite(occluder.margin).all() and np.isfinite(occluder.highest_m)
-
-
-@pytest.mark.parametrize("n", [1, 2, 50])
-def test_one_place(n):
-    occluder = occluder_of(np.repeat(UTM[None], n, axis=0))
-    assert np.isnan(occluder.height).all()  # no cell beside it
-    assert occluder.highest_m == -np.inf and (occluder.margin == 0.0).all()
-
-
-def test_no_points():
-    assert occluder_of(np.zeros((0, 3))) is None
-    assert occluder_of(UTM[None], np.array([7], np.uint8)) is None

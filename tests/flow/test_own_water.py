@@ -11,7 +11,6 @@ from pcfix.io.water_rasters import write_water_raster
 from pcfix.model import Lens, WaterRaster
 from tests.pdal_stage.test_arrays import arrays_of, metadata_of
 from tests.pdal_stage.test_arrays import run as stage
-from tests.utils.codes import refused
 from tests.utils.program import run_pcfix
 from tests.utils.waves import Sea, bed_seen
 
@@ -116,18 +115,6 @@ def test_bed_under_waves(seen, waters):
 
 
 @pytest.mark.parametrize("method", ["snell", "consistent"])
-def test_one_water(seen, tmp_path, method):
-    """Where the search begins is all that differs: it ends within 1e-9 m of the surface."""
-    folder, options = write(tmp_path / "water", [at(0.0)] * 6), {"method": method}
-    one = raster_of(at(0.0))
-    common = pcfix.correct_points(seen[1], block(), one, camera_set="all", **options)
-    for water in (one, 0.0):
-        own = pcfix.correct_points(seen[1], block(), water, water_per_image=folder, **options)
-        assert own.xyz == pytest.approx(common.xyz, abs=MICROMETRE)
-    assert np.abs(common.xyz - pcfix.correct_points(seen[1], block(), 0.0).xyz).max() > 0.01
-
-
-@pytest.mark.parametrize("method", ["snell", "consistent"])
 def test_raster_missing(seen, tmp_path, method):
     """One image's water is 10 cm higher, as far as its raster goes: as of a tide of 10 cm there."""
     folder = write(tmp_path / "water", [lambda xy: np.where(xy[:, 0] < 0.0, 0.1, np.nan)])
@@ -212,11 +199,3 @@ def test_refused(seen, waters, options):
     given = {"water": 0.0, "water_per_image": waters, **options}
     with pytest.raises((SettingError, InputError)):
         pcfix.correct_points(seen[1], block(), **given)
-
-
-def test_ambiguous(seen, waters):
-    with refused("water.no_overlap"):
-        pcfix.correct_points(seen[1] + [500.0, 0.0, 0.0], block(), 0.0, water_per_image=waters)
-    twice = pcfix.Cameras(("a/DJI_0.JPG", "b/DJI_0.JPG"), (centres() + PLACE)[:2])
-    with pytest.raises(InputError):
-        pcfix.correct_points(seen[1], twice, 0.0, water_per_image=waters)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -12,8 +11,6 @@ import pcfix
 from pcfix.errors import SettingError
 from pcfix.flow import plan as flight
 from pcfix.options.handover import PlanOptions
-from pcfix.report.plan import plan_text
-from tests.utils.program import run_pcfix
 
 DEPTH_M = 4.0
 FLIGHT = {"height": 50.0, "overlap": 0.75, "area": (60.0, 40.0)}
@@ -73,24 +70,6 @@ def test_adjusted_poses():
     )
     assert 0.1 * 0.02 < fine < 0.02  # all images together are better than one
     assert 4.0 * fine < coarse < 12.0 * fine
-
-
-def test_index_of_one():
-    given = PlanOptions(**FLIGHT, index=1.0)
-    share, left_m = flight._absorbed(given, flight._bed(given, DEPTH_M))
-    assert share == 0.0
-    assert abs(left_m) < 1e-6
-
-
-def test_command(monkeypatch, folder, plan):
-    monkeypatch.setattr(pcfix, "plan_flight", lambda *, options, progress: plan, raising=False)
-    done = run_pcfix("plan", "--area", 60, 40, "--lens", "8.8,13.2,8.8,5472")
-    assert done.returncode == 0, done.stderr
-    assert done.stdout == plan_text(plan) + "\n"
-    assert len(plan.cameras) == 28
-    assert (folder / "plan.png").read_bytes()[:4] == b"\x89PNG"
-    found = json.loads((folder / "plan.json").read_text("utf-8"))
-    assert found["depths"][1]["sigma_m"] == plan.deepest.sigma_m
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,6 @@
 """What the errors of an adjustment add to SigmaZ: a slow twin, repeats, and the doors."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import laspy
 import numpy as np
@@ -15,13 +15,12 @@ from pcfix.adjust.problem import solved_cameras
 from pcfix.adjust.transfer import Pair
 from pcfix.flow.pose_errors import Adjustment, Sample, pose_errors, variances, with_poses
 from pcfix.flow.surfaces import Points
-from pcfix.io.members import FILE, find_members, write_members
+from pcfix.io.members import FILE, write_members
 from pcfix.kernels import threads
 from pcfix.model import Cameras, Lens, Views, WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Batch, Survey
 from pcfix.refract.methods import correct
-from pcfix.refract.pose_errors import pose_errors_of
 from pcfix.simulate.tracing import piercing_points, project, triangulate
 from pcfix.water.surface import surface_above
 from tests.utils.beyond_frames import BEYOND_FRAMES
@@ -168,24 +167,6 @@ def test_coverage():
     assert np.mean(bare < 1.96) < 0.5
 
 
-def test_grid():
-    rng = np.random.default_rng(2)
-    xy = rng.uniform((5e5, 4e6), (5e5 + 200.0, 4e6 + 80.0), (1000, 2))
-    hole = np.abs(xy - [5e5 + 100.0, 4e6 + 40.0]).max(axis=1) < 15.0
-
-    def sigma(places):
-        return 0.02 + 1e-4 * (places[:, 0] - 5e5) + 1e-4 * (places[:, 1] - 4e6)
-
-    variance = sigma(xy) ** 2
-    variance[rng.random(len(xy)) < 0.1] = 4.0
-    found = pose_errors_of(xy[~hole], variance[~hole])
-    inside = rng.uniform((5e5 + 8.0, 4e6 + 8.0), (5e5 + 192.0, 4e6 + 72.0), (50, 2))
-    np.testing.assert_allclose(found.at(inside), sigma(inside), rtol=0.15)
-    assert found.middle_m == pytest.approx(0.034, abs=0.002)
-    one = pose_errors_of(xy[:1], variance[:1])
-    assert one.at(xy[:3]) == pytest.approx(np.sqrt(variance[0]))
-
-
 def members_of(cameras, sigma_m):
     """Return members in which the block stands higher or lower as a whole."""
     up = np.array([-1.0, 1.0])[:, None, None] * np.array([0.0, 0.0, sigma_m])
@@ -262,16 +243,3 @@ def test_other_ensemble(files):
     np.testing.assert_array_equal(las.SigmaZ, bare.SigmaZ)
     told, _ = corrected(files, dimensions="minimal")  # then nobody asks for it
     assert not any("ensemble" in note["message"] for note in told.warnings)
-
-
-def test_round_trip(tmp_path):
-    cameras = framed_block()
-    written = members_of(cameras, 0.1)
-    write_members(tmp_path, written)
-    (tmp_path / "opensfm").mkdir()
-    for beside in (tmp_path, tmp_path / "colmap", tmp_path / "opensfm" / "reconstruction.json"):
-        where, read = find_members(beside)
-        assert where == (tmp_path / FILE).resolve()
-        for one in fields(Members):
-            np.testing.assert_array_equal(getattr(read, one.name), getattr(written, one.name))
-    assert find_members(tmp_path.parent / "elsewhere") is None

@@ -1,17 +1,15 @@
 """Clean and compare over many files: what they do to one file of the same points."""
 
-import json
 import shutil
 
 import numpy as np
 import pytest
 
 import pcfix
-from pcfix.flow.request import Files, Request, request_of
 from pcfix.io.scenes import write_scene
 from tests.utils.codes import refused
 from tests.utils.program import run_pcfix
-from tests.utils.tiles import cut, finished, records
+from tests.utils.tiles import cut, records
 
 OWN = ("input", "output", "seconds", "cloud", "reference", "also")
 """Figures that are those of a call."""
@@ -55,23 +53,6 @@ def test_cleaned(more, scene, tmp_path):
     assert (many.input, many.output) == (str(scene / "cloud" / "tiles"), str(tmp_path / "many"))
     assert done == sorted(done)
     assert done[-1] == (4000, 4000)
-
-
-def test_cleaning_resumes(scene, tmp_path):
-    tiles, out = scene / "cloud" / "tiles", tmp_path / "new" / "out"
-
-    def stop(done, total):
-        if len(finished(out)) == 1:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        pcfix.clean_file(tiles, out, **MANY, jobs=1, progress=stop)
-    before = finished(out)
-    assert [path.name for path in tiles_in(out)] == ["tile0.laz"]
-    pcfix.clean_file(tiles, out, **MANY, jobs=1)
-    assert before.items() < finished(out).items()
-    with pytest.raises(pcfix.SettingError):  # by other rules
-        pcfix.clean_file(tiles, out, deviations=2.0)
 
 
 def test_compared(scene, tmp_path):
@@ -124,26 +105,3 @@ def test_refused(scene, tmp_path):
     with pytest.raises(pcfix.PcfixError):  # every point is noise
         pcfix.clean_file(tiles, out, drop=True, radius=1e-6)
     assert not list(tmp_path.iterdir())
-
-
-def test_other_files_removed(scene, tmp_path):
-    paths = tuple(map(str, tiles_in(scene / "cloud" / "tiles")))
-    asked = Request(input=paths, cameras="cameras.csv", water="0.37")
-    (tmp_path / "run.json").write_text(
-        json.dumps({"request": asked.record(), "inputs": [], "steps": {}})
-    )
-    assert request_of(tmp_path / "run.json") == asked
-    assert [str(path) for path in asked.source.paths] == list(paths)
-    for name in ("tile0.laz", "old.laz", "mine.laz"):
-        path = tmp_path / "cleaned" / name
-        (path.parent / ".pcfix").mkdir(parents=True, exist_ok=True)
-        path.write_bytes(b"")
-        if name != "mine.laz":
-            (path.parent / ".pcfix" / f"{name}.tally").write_bytes(b"")
-    (tmp_path / "cleaned.laz").write_bytes(b"")
-    Files(tmp_path, asked.source).remove_others()
-    assert not (tmp_path / "cleaned.laz").exists()
-    assert [path.name for path in tiles_in(tmp_path / "cleaned")] == ["mine.laz", "tile0.laz"]
-    assert len(list((tmp_path / "cleaned" / ".pcfix").iterdir())) == 1
-    Files(tmp_path, tmp_path / "cloud.laz").remove_others()
-    assert [path.name for path in tiles_in(tmp_path / "cleaned")] == ["mine.laz"]

@@ -1,8 +1,6 @@
 """Many files as one cloud: the same points, the same figures, errors."""
 
-import json
 import os
-import pickle
 import signal
 import subprocess
 import sys
@@ -16,8 +14,6 @@ import rasterio
 from pyproj import CRS
 
 import pcfix
-from pcfix.io.files import read_tally
-from pcfix.io.tiles import tiles_of
 from tests.utils.codes import refused
 from tests.utils.nightly import mostly_nightly
 from tests.utils.program import run_pcfix
@@ -127,30 +123,6 @@ def test_raster(corrected, tmp_path):
     assert figures(one) == figures(many)
 
 
-def test_kinds_of_input(cloud):
-    """A folder, a glob, a list, a virtual point cloud (STAC items with relative links), paths."""
-    folder, merged = cloud
-    paths = tuple(tiles_in(folder))
-    names = [f"tiles/{path.name}" for path in paths]
-    listed, index = folder.parent / "list.txt", folder.parent / "index.vpc"
-    listed.write_text("# tiles\n\n" + "\n".join(names))
-    items = [{"type": "Feature", "assets": {"data": {"href": f"./{name}"}}} for name in names]
-    index.write_text(json.dumps({"type": "FeatureCollection", "features": items}))
-    for given in (folder, f"{folder}/*.laz", listed, index, paths):
-        assert [one.resolve() for one in tiles_of(given).paths] == list(paths)
-    assert tiles_of(merged) is None
-
-
-def test_records(cloud, tmp_path):
-    """A record names sums and arrays only: nothing else in it is ever called."""
-    pcfix.label_file(cloud[0], tmp_path / "out", water=0.37)
-    record = tmp_path / "out" / ".pcfix" / "tile0.laz.tally"
-    key, tally = read_tally(record)
-    assert len(key) == 64 and tally.points == 5000
-    record.write_bytes(pickle.dumps((key, Path("elsewhere"))))
-    assert read_tally(record) == ("", None)
-
-
 def test_resumes(cloud, tmp_path):
     given = {"cameras": CAMERAS, "water": 0.37, **PLAIN}
     first = pcfix.correct_file(cloud[0], tmp_path / "out", **given)
@@ -209,12 +181,6 @@ def test_full_disk(cloud, tmp_path, monkeypatch):
     monkeypatch.undo()
     pcfix.correct_file(cloud[0], tmp_path / "out", **given)
     assert len(tiles_in(tmp_path / "out")) == 4
-
-
-def test_refused_result(cloud, tmp_path):
-    with pytest.raises(pcfix.GeometryError):
-        pcfix.correct_file(cloud[0], tmp_path / "out", cameras=CAMERAS, water=-50.0, method="snell")
-    assert tiles_in(tmp_path / "out") == []
 
 
 def test_ctrl_c(tmp_path):
@@ -282,10 +248,3 @@ def test_refused_outputs(cloud, tmp_path):
         assert len(done.stderr.splitlines()) == 1
     done = run_pcfix("label", merged, tmp_path / "a.laz", "--water", "0", "--scheduler", "x:1")
     assert done.returncode == 1
-
-
-def test_overlap(tmp_path):
-    folder, _ = cut(tmp_path / "tiles", 2)
-    (folder / "again.laz").write_bytes((folder / "tile1.laz").read_bytes())
-    with pytest.warns(pcfix.PcfixWarning):
-        tiles_of(folder)

@@ -12,7 +12,7 @@ import pytest
 
 import pcfix
 from pcfix.adjust.block import usable_ties
-from pcfix.adjust.diagnosis import EXPORTS, diagnosis_of, export_of, focal_sign, neighbours_sign
+from pcfix.adjust.diagnosis import diagnosis_of, focal_sign, neighbours_sign
 from pcfix.model import Cameras, Lens, Outcome
 from tests.utils.crops import middle_of
 from tests.utils.nightly import mostly_nightly
@@ -31,11 +31,6 @@ TIES = 1000
 @pytest.fixture(scope="module")
 def bent_middle(tmp_path_factory):
     return middle_of(BENT, tmp_path_factory.mktemp("bent"))
-
-
-@pytest.fixture(scope="module")
-def true_middle(tmp_path_factory):
-    return middle_of(TRUE, tmp_path_factory.mktemp("true"))
 
 
 def run_line(line, **instead):
@@ -112,15 +107,6 @@ def test_flat_rays():
     assert found.outcome.tolist() == [Outcome.FLAT_RAYS, Outcome.CORRECTED, Outcome.NO_CAMERA]
 
 
-def test_limit_without_rays(tmp_path):
-    done = run_pcfix(
-        "correct", SCENE / "cloud.laz", tmp_path / "out.laz", "--cameras",
-        SCENE / "cameras.csv", "--water", "0.37", "--method", "snell", "--max-angle", "0.01",
-    )  # fmt: skip
-    assert done.code == "cameras.max_angle"
-    assert done.error.values["flat"] > 0
-
-
 @pytest.mark.parametrize(
     ("share", "sigma", "is_fused", "absorbed"),
     [
@@ -165,26 +151,3 @@ def test_absorbed(bent_middle, tmp_path, listed):
     assert found["poses"]["absorbed"] is True
     assert found["uncertainty"]["s44"] is None
     assert found["uncertainty"]["why_no_order"]
-
-
-@rendered
-def test_not_absorbed(true_middle, tmp_path):
-    done, found = told_of(true_middle / "cloud.las", TRUE / "cameras.xml", tmp_path)
-    assert "absorbed" not in done.stderr
-    assert found["poses"]["absorbed"] is False
-
-
-def test_readme_summary(tmp_path):
-    """The README shows what is printed where nothing was checked."""
-    done = run_pcfix(
-        "correct", SCENE / "cloud.laz", tmp_path / "out.laz", "--cameras", SCENE / "cameras.csv",
-        "--water", "0.37",
-    )  # fmt: skip
-    assert "not checked" in done.stdout
-
-
-def test_exports():
-    for name, words in EXPORTS.items():
-        cameras = Cameras(("a",), np.zeros((1, 3)), source=f"{name.capitalize()} 2.1")
-        assert words in export_of(cameras)
-    assert "model with tie points" in export_of(Cameras(("a",), np.zeros((1, 3))))

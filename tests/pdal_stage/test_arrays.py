@@ -128,28 +128,6 @@ def test_unsure(tmp_path):
     assert told > np.array(las.Unsure).sum() > 0  # some came withheld
 
 
-def test_packed_classes(cloud, tmp_path):
-    """As PDAL 2.2 hands on point formats 0 to 5."""
-    path, ins, _ = cloud
-    metadata = metadata_of(random_cloud(3).header)
-    classes, flags = ins["Classification"] & 31, ins["ClassFlags"] & 7
-    ins["Classification"], ins["ClassFlags"] = classes | flags << 5, np.zeros_like(flags)
-    outs, _ = run("correct", ins, metadata, cameras=str(tmp_path / "cameras.csv"), water=WATER_M)
-    wet = np.array(laspy.read(path).z) < WATER_M
-    np.testing.assert_array_equal(outs["Classification"], np.where(wet, 40, classes))
-    np.testing.assert_array_equal(outs["ClassFlags"], flags)
-    np.testing.assert_array_equal(outs["SourceClass"], np.where(wet, classes, 0))
-
-
-def test_without_a_scale(cloud, tmp_path):
-    _, ins, _ = cloud
-    xyz = np.column_stack([ins[axis] for axis in "XYZ"]).copy()
-    outs, _ = run("correct", ins, None, cameras=str(tmp_path / "cameras.csv"), water=WATER_M)
-    expected = pcfix.correct_points(xyz, pcfix.read_cameras(tmp_path / "cameras.csv"), WATER_M).xyz
-    found = np.column_stack([outs[axis] for axis in "XYZ"])
-    np.testing.assert_allclose(found, expected, rtol=0, atol=5e-7)  # half a step of 2**-20 m
-
-
 def test_label(cloud):
     _, ins, metadata = cloud
     outs, report = run("label", ins, metadata, water=WATER_M)

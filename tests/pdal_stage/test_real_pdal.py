@@ -131,20 +131,6 @@ def test_pipeline_of_a_call(tmp_path: Path, more: dict[str, Any]) -> None:
 
 
 @needs_pdal
-def test_dimensions_of_the_input(tmp_path: Path) -> None:
-    write_cloud(tmp_path / "cloud.las", 7)
-    cameras_csv(tmp_path / "cameras.csv", block())
-    words = ["cloud.las", "stage.las", "--cameras", "cameras.csv", "--water", WATER_M]
-    done = run_pipeline("program", pipeline_of(tmp_path, *words), tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
-    before, after = laspy.read(tmp_path / "cloud.las"), laspy.read(tmp_path / "stage.las")
-    for name in ("Quality", "Level", "Precise", "Echo"):
-        np.testing.assert_array_equal(np.array(after[name]), np.array(before[name]), name)
-    for axis in range(3):
-        np.testing.assert_array_equal(after[f"Normal{axis}"], before["Normal"][:, axis])
-
-
-@needs_pdal
 @pytest.mark.parametrize("door", mostly_nightly(["program", "python"], "python"))
 def test_water_of_a_dimension(tmp_path: Path, door: str) -> None:
     las = random_cloud(7, plain=True)
@@ -246,30 +232,6 @@ def test_label_recipe(tmp_path: Path) -> None:
 
 
 @needs_pdal
-def test_recipe_with_dsm(tmp_path: Path) -> None:
-    rasterio = pytest.importorskip("rasterio")
-    recipe = ROOT / "pipelines" / "correct_clean_dsm.json"
-    words = options_of("correct_clean_dsm.json", tmp_path)
-    done = pdal(
-        "pipeline", recipe, *words, f"--writers.gdal.filename={tmp_path / 'dsm.tif'}",
-        folder=tmp_path,
-    )  # fmt: skip
-    assert (done.returncode, done.stderr) == (0, "")
-    cloud, truth = laspy.read(tmp_path / "out.las"), laspy.read(SCENE / "truth.laz")
-    assert len(cloud) == len(truth)
-    assert 0 < np.sum(cloud.classification == 7) < 0.05 * len(cloud)
-    with rasterio.open(tmp_path / "dsm.tif") as grid:
-        assert grid.crs.to_epsg() == 32633
-        heights = next(grid.sample(np.column_stack([truth.x, truth.y]).mean(axis=0)[None]))
-        sampled = np.array(list(grid.sample(np.column_stack([truth.x, truth.y])[::20])))[:, 0]
-    assert np.isfinite(heights).all()
-    error = sampled - np.array(truth.z)[::20]
-    # cells of 1 m over a bed with relief: the cloud as it came is 1.3 m too high on average
-    assert abs(np.median(error)) < 0.05
-    assert np.percentile(np.abs(error), 90) < 0.5
-
-
-@needs_pdal
 @pytest.mark.parametrize("point_format", mostly_nightly([2, 7], 7))
 def test_recipe_with_comparison(tmp_path: Path, point_format: int) -> None:
     """Correct, clean and compare in one pipeline do what the commands do, one after the other."""
@@ -306,24 +268,6 @@ def test_recipe_with_comparison(tmp_path: Path, point_format: int) -> None:
     report = (tmp_path / "meta.json").read_text()
     assert f'"noise": {cleaned.noise}' in report
     assert '"c2c": ' in report
-
-
-@needs_pdal
-def test_dropped_noise(tmp_path: Path) -> None:
-    stage = stage_of()
-    stage |= {"source": STAGE_SOURCE.format("clean"), "function": "clean",
-              "pdalargs": {"water": WATER_M, "deviations": 0.5, "drop": True}}  # fmt: skip
-    write_cloud(tmp_path / "cloud.las", 7, plain=True)
-    writer = {"type": "writers.las", "filename": "out.las", "forward": "all",
-              "minor_version": 4, "dataformat_id": 7}  # fmt: skip
-    done = run_pipeline("program", ["cloud.las", stage, writer], tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
-    result = pcfix.clean_file(
-        tmp_path / "cloud.las", tmp_path / "cli.las", water=WATER_M, deviations=0.5, drop=True
-    )
-    assert result.dropped > 0
-    cli, found = laspy.read(tmp_path / "cli.las"), laspy.read(tmp_path / "out.las")
-    np.testing.assert_array_equal(found.xyz, cli.xyz)
 
 
 @needs_pdal
@@ -376,49 +320,6 @@ def test_options_of_recipes(path: Path) -> None:
 # Clouds larger than memory
 
 RUN = "import runpy, sys; sys.argv.pop(0); runpy.run_path(sys.argv[0])"
-STREAMABLE = """
-import sys, pdal
-for stage in pdal.Pipeline(open(sys.argv[1]).read()).stages:
-    print(stage.type, stage.streamable)
-"""
-
-
-@needs_pdal
-def test_no_streaming(tmp_path: Path) -> None:
-    """Neither its C++ (PythonFilter has `run` of a whole view alone) nor either door."""
-    out = f"--writers.las.filename={tmp_path / 'out.las'}"
-    done = pdal("pipeline", "--stream", "pipelines/correct.json", out, folder=ROOT)
-    assert done.returncode != 0
-    assert "Couldn't run pipeline in requested execution mode" in done.stderr
-    said = python(STREAMABLE, ROOT / "pipelines" / "correct.json", folder=ROOT).stdout.splitlines()
-    assert said == ["readers.las True", "filters.python False", "writers.las True"]
-
-
-@needs_pdal
-def test_large_clouds(tmp_path: Path) -> None:
-    script, cloud = ROOT / "pipelines" / "correct_large.py", SCENE / "cloud.laz"
-    side_m = 100.0492  # the first tile ends at x = 410201.72: a strip of dry land
-    done = python(RUN, script, cloud, "out.las", side_m, folder=tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
-    land, last = done.stdout.splitlines()
-    assert "left as it is: pcfix: the pipeline's cloud: " in land
-    assert last == "20,000 of 20,000 points in 3 tiles"
-    assert [path.name for path in tmp_path.iterdir()] == ["out.las"]
-    pcfix.correct_file(
-        cloud, tmp_path / "whole.las", cameras=SCENE / "cameras.csv", water=0.37, method="snell",
-        max_angle=40, occlusion="off",
-    )  # fmt: skip
-    whole, tiles = laspy.read(tmp_path / "whole.las"), laspy.read(tmp_path / "out.las")
-    np.testing.assert_array_equal(tiles.header.scales, whole.header.scales)
-    orders = [np.lexsort((las.X, las.Y, las.Z)) for las in (whole, tiles)]
-    for name in set(whole.point_format.dimension_names) - {"scan_angle", "SigmaZ"}:
-        expected, found = (
-            np.array(las[name], float)[order]
-            for las, order in zip((whole, tiles), orders, strict=True)
-        )
-        np.testing.assert_allclose(found, expected, rtol=0.0, atol=2e-6, err_msg=name)
-    moved = np.array(tiles.RayCount) > 0
-    assert (np.array(tiles.SigmaZ)[moved] > 0.0).all()
 
 
 # Mistakes

@@ -11,7 +11,6 @@ import cv2
 import rasterio
 
 import pcfix
-from pcfix.errors import InputError, SettingError
 from pcfix.flow.photos import map_photos
 from pcfix.io.water_rasters import read_water_raster
 from pcfix.model import Lens
@@ -181,40 +180,6 @@ def mapped(place, folder, with_own):
             dsm=place / "bed.tif", water_per_image=place / "calm_water" if with_own else None,
         )  # fmt: skip
     return cv2.imread(str(place / f"dry_{with_own}" / "f07.png"), 0)
-
-
-def test_no_interval(tmp_path, folder):
-    with warned("frames.no_interval"):
-        pcfix.calm_frames(
-            folder, tmp_path / "calm.png", surface=True, depth=2.0, gsd=0.0425, every=4
-        )
-    assert len(list((tmp_path / "calm_water").glob("*.tif"))) == 3
-
-
-def test_video(tmp_path, folder):
-    film = tmp_path / "film.avi"
-    writer = cv2.VideoWriter(str(film), cv2.VideoWriter_fourcc(*"MJPG"), 5.0, (240, 180))
-    for path in sorted(folder.iterdir())[:6]:
-        writer.write(cv2.imread(str(path)))
-    writer.release()
-    found = pcfix.calm_frames(film, tmp_path / "calm.png", every=2)
-    assert (found.frames, found.columns, found.rows) == (3, 240, 180)
-
-
-@pytest.mark.parametrize(
-    ("keywords", "code"),
-    [
-        ({"surface": True, "gsd": 0.1}, None),
-        ({"surface": True, "depth": 2.0}, None),
-        ({"gsd": 0.1}, None),
-        ({"surface": True, "gsd": 0.1, "depth": -2.0}, "option.range"),
-        ({"every": 7}, "frames.too_few"),
-    ],
-)
-def test_bad_options(tmp_path, folder, keywords, code):
-    with pytest.raises((SettingError, InputError)) as caught:
-        pcfix.calm_frames(folder, tmp_path / "calm.png", **keywords)
-    assert code in (None, caught.value.code)
 
 
 def test_bad_frames(tmp_path, folder, calm):

@@ -13,7 +13,7 @@ from rasterio.transform import from_origin
 
 import pcfix
 from pcfix.io.photographs import read_photograph
-from tests.photos.test_mapping import GSD_M, LENS, LEVEL_M, photo, relief
+from tests.photos.test_mapping import GSD_M, LEVEL_M, photo, relief
 from tests.utils.codes import warned
 from tests.utils.nightly import mostly_nightly
 from tests.utils.program import run_pcfix
@@ -161,30 +161,3 @@ def test_formats(project, tmp_path, suffix, dtype):
     if suffix == "tif":
         with tifffile.TiffFile(tmp_path / "out" / path.name) as file:
             assert file.pages[0].tags["Make"].value == "maker"
-
-
-@pytest.mark.parametrize(
-    ("more", "code"),
-    [
-        (("--resolution", "1"), "option.no_use"),
-        (("--water", "dim:Level"), "water.dimension"),
-        (("--water", "200"), None),  # the cameras are below it
-        (("--spacing", "0"), None),
-    ],
-)
-def test_bad_options(project, more, code):
-    done = run_pcfix(*words(project, *more, out="bad"))
-    assert done.returncode == 1
-    assert done.error is not None
-    assert code in (None, done.code)
-
-
-@pytest.mark.parametrize(
-    ("name", "rows", "code"),
-    [("IMG_0.JPG", 400, "photos.size"), ("DJI_7.JPG", 360, "photos.no_pose")],
-)
-def test_other_block(project, tmp_path, name, rows, code):
-    (tmp_path / "images").mkdir()
-    Image.new("RGB", (LENS.width, rows)).save(tmp_path / "images" / name)
-    done = run_pcfix("photos", tmp_path / "images", tmp_path / "out", *words(project)[3:])
-    assert done.code == code

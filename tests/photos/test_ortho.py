@@ -9,13 +9,12 @@ import cv2
 import rasterio
 
 import pcfix
-from pcfix.errors import SettingError
 from pcfix.model import WaterPlane
 from pcfix.photos.ground import Ground
 from pcfix.photos.mapping import Photo, Scene
-from pcfix.photos.ortho import Picture, blank_in, mosaic, picture_of, seen_at
+from pcfix.photos.ortho import Picture, mosaic, picture_of, seen_at
 from tests.photos.test_mapping import GSD_M, LEVEL_M, displacement_px, photo, relief
-from tests.utils.codes import refused, warned
+from tests.utils.codes import warned
 from tests.utils.renderer import Texture, rendered
 
 TEXTURE = Texture(5.0 * GSD_M, 1.5)
@@ -84,16 +83,6 @@ def test_occluded():
     assert seen.tolist() == [True, False, True]
 
 
-def test_blank():
-    pixels = np.full((60, 80, 3), 90, np.uint8)
-    pixels[:, :20] = 1  # as JPEG leaves it
-    pixels[30, 50:53] = 0  # a shadow
-    blank = blank_in(pixels)
-    assert blank[:, :20].all()
-    assert not blank[:, 30:].any()
-    assert picture_of(pixels, 2, blanks=True).pixels.shape == (30, 40, 3)
-
-
 @pytest.fixture
 def block(tmp_path, pictures):
     """A folder of photographs, their cameras, and a DSM in EPSG:32636."""
@@ -130,15 +119,3 @@ def test_file(tmp_path, block):
     assert (alpha > 0).mean() == pytest.approx(done.covered_share, abs=0.01)
     assert not red[alpha == 0].any()
     assert np.corrcoef(red[alpha > 0], blue[alpha > 0])[0, 1] < -0.99
-
-
-@pytest.mark.filterwarnings("ignore::pcfix.errors.PcfixWarning")
-def test_refused(tmp_path, block):
-    folder, how = block
-    with pytest.raises(SettingError):
-        pcfix.ortho_photo(folder, tmp_path / "ortho.png", **how)
-    grey = cv2.imread(str(folder / "P1.png"), cv2.IMREAD_GRAYSCALE)
-    cv2.imwrite(str(folder / "P1.png"), grey)
-    with refused("photos.kind", bands=1, path=folder / "P1.png"):
-        pcfix.ortho_photo(folder, tmp_path / "ortho.tif", **how, resolution=0.5)
-    assert not list(tmp_path.glob("*ortho*"))

@@ -12,7 +12,7 @@ pytest.importorskip("cv2", reason="photographs need the extra 'photos'")
 import cv2
 
 import pcfix
-from pcfix.errors import InputError, SettingError
+from pcfix.errors import SettingError
 from pcfix.flow.rebuild import round_of
 from pcfix.io.las.writing import write_points
 from pcfix.photos.ground import Ground
@@ -118,13 +118,6 @@ def test_resumed(block):
     assert not list(out.parent.glob("*.part*"))
 
 
-def test_other_call(block):
-    rounds(block, most_rounds=1)
-    with refused("output.exists"):
-        rounds(block, water=0.1)
-    assert rounds(block, water=0.1, overwrite=True, most_rounds=1).done_before == 0
-
-
 @pytest.mark.parametrize(
     "more",
     [
@@ -137,13 +130,6 @@ def test_other_call(block):
 def test_bad_options(block, more):
     with pytest.raises(SettingError):
         rounds(block, **more)
-
-
-def test_bad_programs(block):
-    with pytest.raises(InputError):
-        rounds(block, rebuild="no-such-program {images} {cloud}")
-    with refused("rebuild.failed", exit_code=0):
-        rounds(block, rebuild=f'"{sys.executable}" -c pass {{images}} {{cloud}}')
 
 
 def test_round_of_bed():

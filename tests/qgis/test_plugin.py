@@ -8,7 +8,6 @@ import os
 import shutil
 import subprocess
 import sys
-import time
 import zipfile
 
 import pytest
@@ -19,8 +18,7 @@ from pcfix.cli.plugin import OFFERED, plugin_zip
 from pcfix.io.scenes import write_scene
 from pcfix.options.declare import options_of
 from pcfix.options.survey import RunOptions
-from pcfix.qgis.command import CommandError, program_of, run, words_of
-from tests.utils.program import run_pcfix
+from pcfix.qgis.command import CommandError, program_of, words_of
 
 QGIS = shutil.which("qgis_process.bin") or shutil.which("qgis_process")
 
@@ -80,29 +78,6 @@ def test_no_pcfix(tmp_path):
     program.write_text("#!/bin/sh\n")
     program.chmod(0o755)
     assert program_of(str(tmp_path)) == program_of(str(program)) == str(program)
-
-
-def test_progress(scene, tmp_path, monkeypatch, commands):
-    monkeypatch.setenv("PCFIX_PROGRESS", "lines")
-    done = run_pcfix("label", scene / "cloud.laz", tmp_path / "l.laz", "--water", 0.37)
-    assert done.stderr.splitlines()[-1] == "progress 100"
-    program = (
-        "import sys; print('progress 40'); print('done well'); print('pcfix: no'); sys.exit(1)"
-    )
-    percents, said = [], []
-    with pytest.raises(CommandError, match=r"^no$"):
-        run(sys.executable, ["-c", program], lambda: False, percents.append, said.append)
-    assert percents == [40.0]
-    assert said == ["done well", "pcfix: no"]
-
-
-def test_cancelled():
-    """It is asked to stop, as by Ctrl-C, and does so long before its end."""
-    program = "import time; print('here', flush=True); time.sleep(60)"
-    said, started = [], time.monotonic()
-    with pytest.raises(CommandError, match="Cancelled"):
-        run(sys.executable, ["-c", program], lambda: bool(said), float, said.append)
-    assert time.monotonic() - started < 30.0
 
 
 @pytest.fixture(scope="module")

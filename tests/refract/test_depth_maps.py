@@ -170,23 +170,6 @@ def test_sloping_bed(maps, metric):
     assert found == pytest.approx(true, abs=0.005)
 
 
-def test_index_one():
-    xyz = np.array([[3.0, 4, -4.5], [-6, 2, -1.0]])
-    result = run(xyz, WaterPlane(0.3), listed([MIXED, NADIR]), Learned(matcher=matcher()), n=1.0)
-    assert np.abs(result.shift_m).max() < 1e-9
-
-
-def test_weight_unit():
-    xyz, weight = np.array([[3.0, 4, -4.5]]), [np.array([1.0, 0.5, 2.0, 0.7, 1.2])]
-    learned = Learned(matcher=matcher())
-    one = run(xyz, WaterPlane(0.3), listed([MIXED], weight), learned)
-    other = run(xyz, WaterPlane(0.3), listed([MIXED], [weight[0] * 1e-3]), learned)
-    # weights are 32 bit
-    assert other.shift_m == pytest.approx(one.shift_m, abs=1e-6)
-    even = run(xyz, WaterPlane(0.3), listed([MIXED]), learned)
-    assert np.abs(even.shift_m - one.shift_m).max() > 0.01
-
-
 def test_averaged_maps():
     """A map that was averaged with two others is as good as the three of them with a third each."""
     xyz, averaged = np.array([[3.0, 4, -4.5]]), np.full((8, 8), -1)
@@ -199,22 +182,6 @@ def test_averaged_maps():
 # no answer, and hardly any water
 
 FUSED = np.array([[j for j in range(8) if j != c] + [-1] * 5 for c in range(8)])
-
-
-@pytest.mark.parametrize("with_list", [True, False], ids=["list", "no list"])
-def test_shallow(with_list):
-    depth = np.array([1e-12, 1e-6, 1e-3, 0.02, 0.049, 0.2])
-    xyz = np.column_stack([np.full(6, 3.0), np.full(6, 4.0), 0.3 - depth])
-    learned = Learned(matcher=matcher(fused=FUSED, averaged=FUSED[:, :8].copy()))
-    views = listed([MIXED] * 6) if with_list else None
-    for offset in (np.zeros(8), OFFSET):  # some cameras see the shallow ones above the water
-        result = run(xyz, WaterPlane(0.3), views, learned, offset=offset)
-        assert (result.outcome == Outcome.CORRECTED).all()
-        assert np.isfinite(result.shift_m).all() and np.isfinite(result.ray_miss_m).all()
-        # 0.34 of the depth below level water and 0.6 with obliques; a level 5 cm apart moves more;
-        # where two lines of sight of 70 m meet is rounded to some 1e-9 m
-        most = 0.7 * depth + 0.05 * (offset != 0).any() + 1e-8
-        assert (np.abs(result.shift_m[:, 2]) < most).all()
 
 
 @pytest.mark.parametrize("with_list", [True, False], ids=["list", "no list"])
@@ -310,21 +277,6 @@ def test_bed_of_groups():
     assert close.mean() > 0.97
 
 
-def test_one_vote_per_point():
-    xyz = np.tile([[1.0, 1.0, 0.0]], (5, 1))
-    likely = np.full((5, 8), np.nan, np.float32)
-    likely[0] = -3.0  # eight groups of one point
-    likely[1:4, 0] = -5.0
-    likely[4, 0] = -7.0
-    assert bed_of(xyz, likely).height_at(xyz[:1, :2]) == pytest.approx([-5.0], abs=WIDTH_M / 2)
-
-
-def test_bed_of_one_point():
-    xyz = np.array([[410_000.0, 4_650_000.0, -2.0]])
-    found = bed_of(xyz, np.array([[-1.5, np.nan]], np.float32))
-    assert found.height_at(xyz[:, :2]) == pytest.approx([-3.5])
-
-
 def test_unknown_bed():
     found = Bed(np.array([[1.0, np.nan], [3.0, 4.0]]), 10.0, 20.0, 2.0)
     xy = np.array(
@@ -346,16 +298,6 @@ def test_no_bed():
     assert np.array_equal(
         run(xyz, WaterPlane(0.3), None, one).shift_m, run(xyz, WaterPlane(0.3), None, far).shift_m
     )
-
-
-def test_bed_in_any_order():
-    rng = np.random.default_rng(7)
-    xyz = np.column_stack([rng.uniform(0, 20, (500, 2)), rng.normal(-4, 0.3, 500)])
-    likely = rng.uniform(-3, 0, (500, 4)).astype(np.float32)
-    turned = rng.permutation(500)
-    one, other = bed_of(xyz, likely), bed_of(xyz[turned], likely[turned])
-    # sums of votes in another order differ in the last bit, which could only decide a tie
-    assert other.height_m == pytest.approx(one.height_m, abs=1e-9, nan_ok=True)
 
 
 # a real cloud

@@ -1,6 +1,5 @@
 """Both kernels, any number of threads, tiles and orders: the same bits."""
 
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import numpy as np
@@ -13,7 +12,7 @@ from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Learned
 from pcfix.refract.matcher import matcher_of
 from pcfix.refract.methods import correct
-from pcfix.refract.tiling import TILE, spatial_order
+from pcfix.refract.tiling import TILE
 from pcfix.water.surface import surface_above
 from tests.utils.batches import batch_of
 from tests.utils.beyond_frames import BEYOND_FRAMES
@@ -129,12 +128,6 @@ def test_listed_as_in_frame(points, cameras):
     same(every, chosen)
 
 
-def test_level_plane_dimension(points, cameras):
-    level = snell(points, cameras, 0.25)
-    same(level, snell(points, cameras, np.full(N, 0.25)))
-    same(level, snell(points, cameras, pcfix.WaterPlane(0.25)))
-
-
 def test_max_cameras(points, cameras):
     result = snell(points, cameras, 0.0, max_cameras=3)
     assert result.ray_count.max() == 3
@@ -163,21 +156,3 @@ def test_unusable_rays():
     assert result.outcome.tolist() == [pcfix.Outcome.ONE_CAMERA]
     assert result.xyz.tolist() == [[3, 0, -1.0]]
     assert result.depth_m.tolist() == [1.0]
-
-
-def test_cameras_used(points, cameras):
-    result = snell(points, cameras, 0.0)
-    views = views_in_frame(points, cameras)
-    assert np.array_equal(np.flatnonzero(result.camera_used), np.unique(views.camera))
-
-
-def test_spatial_order(points):
-    assert np.array_equal(np.sort(spatial_order(points)), np.arange(N))
-    line = np.column_stack([np.zeros(N), np.linspace(0, 1e6, N), np.zeros(N)])
-    assert np.array_equal(np.sort(spatial_order(line)), np.arange(N))
-
-
-def test_python_threads(points, cameras):
-    with ThreadPoolExecutor(4) as pool:
-        found = list(pool.map(lambda _: snell(points, cameras, 0.0).xyz, range(8)))
-    assert all(np.array_equal(one, found[0]) for one in found)

@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import pcfix
-from pcfix.errors import SettingError
 from pcfix.model import Outcome, Views, WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Learned
@@ -17,7 +16,6 @@ from pcfix.refract.methods import correct
 from pcfix.refract.regression import DepthRegression
 from pcfix.water.surface import surface_above
 from tests.utils.batches import batch_of
-from tests.utils.codes import refused
 from tests.utils.twins import bend, light_path, stacked_intersection
 
 UTM = np.array([512_345.678, 4_987_654.321, 0.0])
@@ -80,18 +78,6 @@ def test_straight_down(method, n):
     found = run(method, [[0, 0, -5.0]], [[-0.5, 0, 100.0], [0.5, 0, 100.0]], n)
     assert 5.0 - found.shift_m[0, 2] == pytest.approx(5.0 * n, abs=1e-4)
     assert np.abs(found.shift_m[0, :2]).max() < NANOMETRE
-
-
-def test_exactly_overhead():
-    above = [[0, 0, 100.0], [0, 0, 120.0]]
-    for method in (*MEANS, "factor"):
-        found = run(method, [[0, 0, -5.0]], above)
-        assert found.shift_m[0] == pytest.approx([0, 0, -5.0 * 0.34], abs=NANOMETRE)
-        assert found.ray_miss_m[0] == 0.0
-    for method in ("shan", "murase"):  # two vertical rays are one line
-        found = run(method, [[0, 0, -5.0]], above)
-        assert found.outcome[0] == Outcome.PARALLEL_RAYS
-        assert (found.shift_m == 0.0).all()
 
 
 @given(
@@ -177,16 +163,6 @@ def test_hsu_wang_2_to_4(images):
     assert (found.shift_m[:, :2] == 0.0).all()
 
 
-def test_steepest_image():
-    points, centres = bed(), block()
-    nearest = run("butler", points, centres, max_cameras=1)
-    assert (nearest.ray_count == 1).all()
-    for i, point in enumerate(points):
-        steepest = centres[[np.argmin([angles(point, c, 1.34)[0] for c in centres])]]
-        alone = run("butler", [point], steepest)
-        assert nearest.shift_m[i] == pytest.approx(alone.shift_m[0], abs=NANOMETRE)
-
-
 def shan_slowly(point, centres, n):
     """Solve X - u D / s = X_s + u H, and its like in y, for X, Y, D in turn with eq 7 for s."""
     u = (point[:2] - centres[:, :2]) / (centres[:, 2] - point[2])[:, None]
@@ -262,24 +238,6 @@ def test_few_rays():
         found = run(method, xyz, cameras.centres, views=views)
         assert (found.outcome == Outcome.CORRECTED).all()
         assert found.ray_count.tolist() == [1, 1, 3]
-
-
-def test_lines():
-    points, centres = bed(), block()
-    own = run("factor", points, centres, depth_factor=1.5)
-    assert own.shift_m[:, 2] == pytest.approx(0.5 * points[:, 2], abs=1e-12)
-    found = run("regression", points, centres, a=0.1, b=1.4)
-    assert found.shift_m[:, 2] == pytest.approx(-0.1 + 0.4 * points[:, 2], abs=1e-12)
-    assert (found.shift_m[:, :2] == 0.0).all()
-    low = run("regression", [[*UTM[:2], -0.01]], centres, a=-0.1, b=1.4)
-    assert low.shift_m[0, 2] == pytest.approx(0.01, abs=1e-15)  # to the surface, not above it
-
-
-def test_no_regression():
-    xyz = bed(3)
-    chosen = ScienceOptions(method="regression")
-    with refused("regression.missing", SettingError):
-        correct(batch_of(xyz, surface_above(LEVEL, xyz), LEVEL, named(block()), chosen))
 
 
 @pytest.mark.parametrize("method", BY_CAMERAS)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pcfix.model import Cameras, Outcome, WaterPlane
+from pcfix.model import Outcome, WaterPlane
 from pcfix.options.correct import ScienceOptions
-from pcfix.refract.batch import Learned, OriginalModel, images_of, to_adjusted, to_original
+from pcfix.refract.batch import Learned, OriginalModel, to_adjusted, to_original
 from pcfix.refract.matcher import Bed
 from pcfix.refract.methods import correct, on_land, shift_of_land
 from pcfix.water.surface import surface_above
@@ -144,19 +144,6 @@ def test_transformed_block(kind):
     assert other.shift_m == pytest.approx(one.shift_m, abs=2e-3)
 
 
-@pytest.mark.parametrize("kind", ["list", "no list", "pairs"])
-def test_same_cameras(kind):
-    xyz = some_points()
-    views = {
-        "list": listed([MIXED] * 60),
-        "pairs": replace(listed([(0, 2, 4, 5, 2, 7)] * 60), kind="pairs"),
-    }.get(kind)
-    learned = Learned(matcher=matcher(CAMERAS, True))
-    same = Cameras(CAMERAS.labels, CAMERAS.centres.copy(), CAMERAS.rotations.copy(), CAMERAS.lenses)
-    one, other = run(xyz, views, learned, None), run(xyz, views, learned, OriginalModel(xyz, same))
-    assert np.array_equal(one.shift_m, other.shift_m)
-
-
 @pytest.mark.parametrize("with_list", [True, False], ids=["list", "no list"])
 def test_land(with_list):
     """A twin fuses land, that is, a bed in water that does not refract."""
@@ -187,22 +174,3 @@ def test_land(with_list):
     land = formula.learned._replace(land=on_land(batch.survey))
     told = replace(batch, survey=replace(formula, learned=land))
     assert np.array_equal(shift_of_land(told), shift)
-
-
-def test_directions():
-    bent = replace(LENS, radial=(-0.05, 0.01), tangential=(0.001, -0.0005))
-    made = replace(absorbed(), lenses=(bent,) * 8)
-    images = images_of(OriginalModel(np.zeros((0, 3)), made), CAMERAS)
-    for c in range(8):
-        axis = CAMERAS.rotations[c][2] + [0.1, -0.05, 0.02]
-        there = to_original(images, c, tuple(axis))
-        back = np.array(to_adjusted(images, c, there))
-        assert np.linalg.norm(there - axis / np.linalg.norm(axis)) > 1e-3
-        # the distortion is undone to 1e-12
-        assert back / np.linalg.norm(back) == pytest.approx(axis / np.linalg.norm(axis), abs=1e-10)
-    assert len(images_of(None, CAMERAS).centres) == 0
-
-
-def test_no_lenses():
-    with pytest.raises(ValueError, match="twice"):
-        images_of(OriginalModel(np.zeros((0, 3)), replace(absorbed(), lenses=None)), CAMERAS)

@@ -8,7 +8,7 @@ import pytest
 import pcfix
 from pcfix.io.cameras import read_tie_points
 from pcfix.model import TiePoints, Views
-from pcfix.refract.matcher import REPEATED_DEG, matcher_of, matcher_of_ties, without_border
+from pcfix.refract.matcher import REPEATED_DEG, matcher_of, matcher_of_ties
 from pcfix.simulate.scene import simulate_scene
 from tests.utils.depth_map_twin import in_frame, looking, scores_slowly
 from tests.utils.shared import needs
@@ -53,31 +53,6 @@ def test_partners_of_ties():
     ties = TiePoints(places, Views(start, camera), np.zeros((len(camera), 2)))
     slow = scores_slowly(cameras, places, seen)
     assert np.array_equal(matcher_of_ties(cameras, ties).fused, table_of(slow, 12))
-
-
-def test_few_images():
-    cameras = looking([[0.0, 0, 70], [15, 0, 70], [400, 0, 70]], [0.0] * 3, [0.0] * 3)
-    places = np.random.default_rng(3).uniform(-20, 20, (300, 3)) * [1, 1, 0.1]
-    found = matcher_of(cameras, places)
-    assert found.matched.tolist() == [[1] + [-1] * 4, [0] + [-1] * 4, [-1] * 5]
-    assert found.averaged.shape == (3, 8) and found.fused.shape == (3, 12)
-    assert found.focal_px.tolist() == [3600.0] * 3
-
-
-def test_border_in_mm():
-    cameras, _ = block(np.random.default_rng(4))
-    lens = cameras.lenses[0]
-    mm = 13.2 / 5472  # a pixel of the nominal camera
-    values = {
-        name: getattr(lens, name) * 13.2 / lens.width
-        for name in ("focal", "width", "height", "principal_x", "principal_y")
-    }
-    in_mm = replace(cameras, lenses=(replace(lens, unit="mm", **values),) * len(cameras))
-    narrow = without_border(in_mm).lenses[0]
-    assert narrow.width == pytest.approx(13.2 - 16 * mm)
-    assert narrow.principal_x == pytest.approx(6.6 - 8 * mm)
-    in_px = without_border(cameras).lenses[0]
-    assert (in_px.width, in_px.height) == (lens.width - 16, lens.height - 16)
 
 
 @pytest.mark.parametrize("obliques", [{}, {"obliques_deg": 35.0, "oblique_share": 0.5}])

@@ -11,7 +11,6 @@ from pcfix.options.correct import ScienceOptions
 from pcfix.refract import patches
 from pcfix.refract.batch import Batch, Survey
 from pcfix.refract.learning import learn_of_sample
-from pcfix.refract.patches import FEWEST_WITHOUT_LIST
 from pcfix.refract.reconstructions import IN_FRAME, reconstructions_of
 from pcfix.water.surface import surface_above
 from tests.utils.nightly import mostly_nightly
@@ -70,13 +69,6 @@ def test_no_lenses():
     np.testing.assert_array_equal(found.xyz, same.xyz)
 
 
-def test_few_points():
-    scene = simulated(FEWEST_WITHOUT_LIST - 1, seed=1, lidar_per_m2=0.0)
-    settings, verdict = told(scene.apparent_xyz, scene.cameras, scene.water)
-    assert verdict is None
-    assert (settings.method, settings.camera_set) == ("consistent", "all")
-
-
 def test_camera_set():
     scene = simulated(500, seed=1, lidar_per_m2=0.0)
     batch = Batch(
@@ -124,14 +116,6 @@ def some(monkeypatch):
         [456_000, 5_432_000, -3], [456_300, 5_432_200, -1], (40_000, 3)
     )
     return xyz, simulated(2000, seed=1).cameras
-
-
-def test_squares_any_chunks(some):
-    xyz, cameras = some
-    whole = in_squares(xyz, cameras, len(xyz))
-    assert MOST / 4 < len(whole) <= MOST
-    for size in (1000, 7777):
-        np.testing.assert_array_equal(in_squares(xyz, cameras, size), whole)
 
 
 def test_squares_have_neighbours(some):

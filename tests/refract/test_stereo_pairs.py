@@ -165,20 +165,6 @@ def median_slowly(q, cameras, pairs, planes, n, start):
     return np.median(places, axis=0)
 
 
-@pytest.mark.parametrize("lens", [LENS, DISTORTED, FISHEYE], ids=["ideal", "brown", "fisheye"])
-@pytest.mark.parametrize("count", [8, 5])
-def test_twin(lens, count):
-    cameras, water = looking(CENTRES, TILTS, HEADINGS, lens), WaterPlane(0.4, 0.004, -0.003)
-    offset = np.array([0.0, 0.05, -0.03, 0.02, 0.0, 0.04])
-    planes = [(water.a + up, water.b, water.c) for up in offset]
-    points, pairs = np.array([[1.0, 2, -5], [-6, 3, -1.5]]), PAIRS[:count]
-    result = run(points, cameras, water, listed([pairs, pairs]), offset=offset)
-    for point, shift in zip(points, result.shift_m, strict=True):
-        made = median_slowly(point + shift, cameras, pairs, planes, N_WATER, point)
-        # see test_pairs_without_noise; distortion is taken as linear near a ray
-        assert made == pytest.approx(point, abs=2e-5)
-
-
 def test_scipy():
     cameras, water = looking(CENTRES, TILTS, HEADINGS, LENS), WaterPlane(0.0)
     point = np.array([2.0, -3, -4])
@@ -196,12 +182,6 @@ def test_scipy():
 # physics and outcomes
 
 
-def test_index_one():
-    cameras = looking(CENTRES, TILTS, HEADINGS, LENS)
-    result = run(np.array([[1.0, 2, -5]]), cameras, WaterPlane(0.0), listed([PAIRS]), n=1.0)
-    assert np.abs(result.shift_m).max() < 1e-5  # the median may be 1e-6 m off
-
-
 def test_pair_loses_camera():
     cameras = looking(CENTRES, TILTS, HEADINGS, LENS)
     points, steep = np.array([[1.0, 2, -5]]), PAIRS[:4]
@@ -210,12 +190,6 @@ def test_pair_loses_camera():
     assert result.shift_m == pytest.approx(expected.shift_m, abs=0.0)
     assert result.ray_count.tolist() == [4]
     assert result.camera_used.tolist() == [True] * 4 + [False] * 2
-
-
-def test_max_cameras():
-    cameras = looking(CENTRES, TILTS, HEADINGS, LENS)
-    result = run(np.array([[1.0, 2, -5]]), cameras, WaterPlane(0.0), listed([PAIRS]), max_cameras=3)
-    assert result.ray_count.tolist() == [3]
 
 
 def test_no_pairs():
@@ -248,17 +222,3 @@ def test_unsolved_keep_snell():
         result = invert_pairs(batch)
     plain = intersect(replace(batch, views=cameras_of_pairs(pairs)))
     assert result.shift_m == pytest.approx(plain.shift_m, abs=1e-9)
-
-
-def test_snell_of_pairs():
-    scene = scene_of("flat", 0.5)
-    rows = under_water(scene)[:200]
-    of_pairs = corrected(scene, rows, pairs_in(scene, rows), method="snell")
-    of_views = corrected(scene, rows, scene.views.take(rows), method="snell")
-    assert of_pairs.shift_m == pytest.approx(of_views.shift_m, abs=1e-9)  # another order of sums
-
-
-def test_cameras_of_pairs():
-    views = cameras_of_pairs(listed([[[3, 1], [1, 0]], [], [[0, 3], [0, 3]]]))
-    assert views.start.tolist() == [0, 3, 3, 5]
-    assert views.camera.tolist() == [3, 1, 0, 0, 3]

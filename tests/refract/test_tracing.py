@@ -5,11 +5,9 @@ import math
 import numpy as np
 import pytest
 from scipy.interpolate import RegularGridInterpolator
-from scipy.optimize import minimize_scalar
 
 import pcfix
 from pcfix.errors import SettingError
-from pcfix.kernels import threads
 from pcfix.model import WaterDimension, WaterMesh, WaterPlane, WaterRaster
 from pcfix.refract.tracing import METHODS, trace
 from tests.utils.codes import refused
@@ -146,42 +144,6 @@ def test_crease(method):
         assert length(a, i) < length(other, i) + 1e-8
 
 
-@each_method
-def test_trough(method):
-    point, centre = np.array([0.001, 0.0, -5.0]), np.array([0.0, 20.0, 30.0])
-    water = folded(0.05)
-    found = trace(centre, point, water, refractive_index=INDEX, method=method)
-    assert found.converged[0]
-    assert found.on_crease[0]
-
-    def length(y):
-        a = np.array([0.0, y, 0.0])
-        return np.linalg.norm(a - centre) + INDEX * np.linalg.norm(a - point)
-
-    y = minimize_scalar(length, bounds=(0.0, 5.0), method="bounded", options={"xatol": 1e-9}).x
-    # across, the crease is sharp; along it lengths of 40 m in doubles are flat within 1e-6 m
-    np.testing.assert_allclose(found.piercing_xyz[0], [0.0, y, 0.0], rtol=0.0, atol=3e-6)
-    # the plane there would bend the light so: the path goes through it as through a plane
-    b, c = found.slope[0]
-    a = found.piercing_xyz[0]
-    through = through_plane(point, centre, (a[2] - b * a[0] - c * a[1], b, c), INDEX)
-    np.testing.assert_allclose(through, a, rtol=0.0, atol=1e-7)
-
-
-@pytest.mark.parametrize("method", METHODS[:3])
-def test_not_narrowed(method):
-    found = trace(
-        [0, 20, 30],
-        [0.001, 0, -5],
-        folded(0.05),
-        refractive_index=INDEX,
-        method=method,
-        narrow=False,
-    )
-    assert not found.converged[0]
-    assert np.isnan(found.direction).all()
-
-
 def test_several_paths():
     # under a ridge two rays hit the point; the one from the camera's side is the shorter
     water, point, centre = folded(-0.3), np.array([0.0, 0.0, -9.0]), np.array([0.5, 3.0, 30.0])
@@ -220,14 +182,6 @@ def test_shapes_far_from_origin(method):
 
 
 @each_method
-def test_index_one(method):
-    points, centres = pairs(20, steepest_deg=45.0)
-    found = trace(centres, points, raster(waves(5.0)), refractive_index=1.0, method=method)
-    straight = (points - centres) / np.linalg.norm(points - centres, axis=1)[:, None]
-    np.testing.assert_allclose(found.direction, straight, rtol=0.0, atol=1e-9)
-
-
-@each_method
 @pytest.mark.parametrize("water", [WaterPlane(0.0), raster(waves(2.0)), folded(0.01)])
 def test_seen_straight(method, water):
     points = np.array([[1.0, 2.0, 4.0], [500.0, 2.0, -4.0]])
@@ -251,28 +205,6 @@ def test_lost(method):
     assert found.converged.tolist() == [True, False, False, False]
     assert np.isnan(found.direction[1:]).all()
     assert np.isfinite(found.direction[0]).all()
-
-
-@each_method
-def test_low_camera(method):
-    plane = (0.0, 0.1, 0.0)
-    point, centre = np.array([30.0, 0.0, 1.0]), np.array([5.0, 0.0, 2.5])
-    found = trace(centre, point, WaterPlane(*plane), refractive_index=INDEX, method=method)
-    truth = through_plane(point, centre, plane, INDEX)
-    # a miss of 1e-9 m, grazing at 85 degrees
-    np.testing.assert_allclose(found.piercing_xyz[0], truth, rtol=0.0, atol=1e-6)
-
-
-@each_method
-def test_any_threads(method):
-    points, centres = pairs(200, steepest_deg=45.0)
-    water = raster(waves(4.0))
-    with threads(3):
-        many = trace(centres, points, water, refractive_index=INDEX, method=method)
-    with threads(1):
-        one = trace(centres, points, water, refractive_index=INDEX, method=method)
-    np.testing.assert_array_equal(many.piercing_xyz, one.piercing_xyz)
-    np.testing.assert_array_equal(many.iterations, one.iterations)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pcfix.model import Outcome, Views, WaterPlane
+from pcfix.model import Outcome, WaterPlane
 from pcfix.options.correct import LEVEL_M, BudgetOptions, ScienceOptions
 from pcfix.refract import uncertainty
 from pcfix.refract.intersect import intersect
@@ -223,32 +223,6 @@ def test_sources_add_up():
     np.testing.assert_allclose(sum(parts), cov(all_of_them), rtol=0, atol=3e-6 * parts[0].max())
 
 
-@pytest.mark.parametrize("method", ["snell", "consistent"])
-def test_listed_as_in_frame(method):
-    bed, cameras, _ = scene(0.0, points=500)
-    found = in_frame(bed, flat(500), LEVEL, cameras, ScienceOptions())
-    seen = found.ray_count == len(cameras)
-    assert seen.sum() > 300
-    for errors in (BudgetOptions(), SOURCES["all"]):
-        settings = ScienceOptions(method=method, **vars(errors))
-        every = in_frame(bed, flat(500), LEVEL, cameras, settings).covariance_m2
-        views = views_of(500, cameras)
-        listed = covariances(bed, found.shift_m, flat(500), cameras, settings, views)
-        assert (every[seen] == listed[seen]).all()
-
-
-def test_steepest():
-    bed, cameras, _ = scene(0.0, points=200)
-    found = in_frame(bed, flat(200), LEVEL, cameras, ScienceOptions())
-    steep = np.linalg.norm(cameras.centres[:, :2] - bed[:, None, :2], axis=2)
-    nearest = np.sort(np.argsort(steep, axis=1)[:, :4], axis=1)
-    views = Views(np.arange(201) * 4, nearest.ravel())
-    args = bed, found.shift_m, flat(200), cameras
-    some = covariances(*args, ScienceOptions(max_cameras=4))
-    assert (some == covariances(*args, ScienceOptions(), views)).all()
-    assert (some != covariances(*args, ScienceOptions())).any()
-
-
 def test_other_points():
     bed, cameras, _ = scene(35.0, points=700)
     found = in_frame(bed, flat(700), LEVEL, cameras, ScienceOptions())
@@ -275,23 +249,6 @@ def test_level_sigma():
     np.testing.assert_allclose(sigma(each, 0.05), 0.05 * one)
     each[3] = np.nan  # a fit without a point to spare
     assert sigma(each)[3] == pytest.approx(LEVEL_M * one[3])
-
-
-def test_unsolved():
-    bed, cameras, _ = scene(0.0, points=3)
-    bed[1] = [500.0, 500.0, -3.0]  # out of every frame
-    found = correct(batch_of(bed, flat(3), LEVEL, cameras, ScienceOptions(method="snell")))
-    assert (found.covariance_m2[1] == 0.0).all() and found.sigma_z_m[1] == 0.0
-    assert (found.sigma_z_m[[0, 2]] > 0.0).all()
-    assert covariances(bed[:0], bed[:0], flat(0), cameras, ScienceOptions()).shape == (0, 6)
-
-
-def test_not_asked():
-    bed, cameras, _ = scene(0.0, points=3)
-    found = correct(
-        batch_of(bed, flat(3), LEVEL, cameras, ScienceOptions(method="snell", dimensions="minimal"))
-    )
-    assert found.covariance_m2 is None and (found.sigma_z_m == 0.0).all()
 
 
 @pytest.mark.parametrize("method", ["shan", "factor", "murase"])

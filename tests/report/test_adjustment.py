@@ -14,7 +14,7 @@ from pcfix.adjust.precision import Precision, SharedUnknown
 from pcfix.adjust.problem import LogRow
 from pcfix.adjust.result import Adjusted, Before, ControlRow, adjustment_dict, before_of
 from pcfix.errors import PcfixWarning
-from pcfix.model import Cameras, Lens, WaterPlane, WaterRaster
+from pcfix.model import Cameras, Lens, WaterPlane
 from pcfix.report.adjustment import adjustment_page, adjustment_text
 from pcfix.report.adjustment_figures import pictures_of
 from tests.report.test_report import Elements
@@ -203,14 +203,6 @@ def test_page(adjusted, kind):
         assert "Something <decided>" in said
 
 
-def test_bare_text(adjusted):
-    text = adjustment_text(bare(adjusted))
-    assert (
-        "poses fixed" in text and "lens           fixed" in text and "water          none" in text
-    )
-    assert not re.search(r"GNSS|control|check|under water {2}|nan", text)
-
-
 def test_check_points(adjusted):
     """The last point is a check point: none of its three images is used."""
     used = adjusted.used.copy()
@@ -225,25 +217,6 @@ def test_check_points(adjusted):
         "used": 64, "left_out": 5, "of_check_points": 3, "out_of_sight": 0
     }  # fmt: skip
     assert sum(values["residuals"][key]["points"] for key in ("land", "water")) == 22
-
-
-def test_level_of_raster(adjusted):
-    def raster(height):
-        return WaterRaster(np.full((3, 3), height), EAST - 50.0, NORTH + 50.0, (50.0, 50.0))
-
-    it = replace(adjusted, block=replace(adjusted.block, water=raster(0.5)), water=raster(0.53))
-    text = adjustment_text(it)
-    assert "water level    0.500 -> 0.530 m (+0.030, standard error 0.004)" in text
-    assert "tilt" not in text
-
-
-def test_similarity(adjusted):
-    shared = (*adjusted.precision.shared, SharedUnknown("shift z", 0.31, 0.02))
-    precision = replace(adjusted.precision, shared=shared, correlation=np.eye(3))
-    free = Unknowns(poses="similarity", level_sigma_m=0.1)
-    page = adjustment_page(replace(adjusted, precision=precision, unknowns=free))
-    row = re.search(r">shift z</th>(.*?)</tr>", page)[1]
-    assert re.findall(r"<td>(.*?)</td>", row) == ["", "", "+0.31", "0.02", "m"]
 
 
 def test_before(adjusted):

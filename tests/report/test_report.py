@@ -16,9 +16,8 @@ import pytest
 import pcfix
 from pcfix.flow.report import write_report
 from pcfix.grid.maps import MapsBuilder
-from pcfix.report.map_data import Layer, relief
+from pcfix.report.map_data import Layer
 from pcfix.report.page import Report, Table, Tile, render
-from pcfix.report.run import settings_rows
 from tests.utils.browser import needs_browser, open_page
 
 SCENE = Path(__file__).parents[2] / "samples" / "scene"
@@ -188,19 +187,6 @@ def test_escaped():
     assert len(Elements(page).all("script")) == 2
 
 
-def test_settings():
-    given = {"a_b": True, "none": None, "empty": "", "d": {"x": 1.0, "y": [1, 2]}, "f": 0.1 + 0.2}
-    assert settings_rows(given) == [["a b", "yes"], ["d", "x 1; y 1, 2"], ["f", "0.3"]]
-
-
-def test_paths():
-    table = Table("", [], [["/data/of/cloud.laz: 1/2 m/s", "C:\\Users\\me\\a.laz", "a/b.csv"]])
-    maps = MapsBuilder(np.zeros(2), np.ones(2), 10).maps()
-    page = render(Report("", "", table, [], maps, [Layer("", "m", maps.depth_m)], [], []))
-    for words in (">cloud.laz: 1/2 m/s<", ">a.laz<", ">a/b.csv<"):
-        assert words in page
-
-
 def test_cells():
     rng = np.random.default_rng(4)
     xyz = rng.uniform((0, 0, -5), (30, 12, 0), (5000, 3)) + np.array([5e5, 4e6, 0.0])
@@ -227,12 +213,3 @@ def test_cells():
     # points on the very edge of a cell may fall to either side
     assert corner.mean() > 0.97
     assert np.isclose(expected[..., 1], maps.shift_z_m, equal_nan=True).mean() > 0.97
-
-
-def test_relief():
-    columns, rows = np.meshgrid(np.arange(20.0), np.arange(20.0))
-    rising_to_southeast = columns + rows
-    assert relief(rising_to_southeast, 1.0).mean() > 0.9
-    assert relief(-rising_to_southeast, 1.0).mean() < 0.2
-    # half a step of the 254 that the shade has
-    assert relief(np.zeros((20, 20)), 1.0) == pytest.approx(np.sqrt(0.5), abs=0.5 / 254)

@@ -12,11 +12,9 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.compare.statistics import binned, tvu_of
+from pcfix.compare.statistics import tvu_of
 from pcfix.options.correct import BudgetOptions
-from pcfix.refract.tally import ORDERS, UncertaintyTally, largest_tvu_m
-from pcfix.report.page import png_of
-from pcfix.report.run import tvu_figure
+from pcfix.refract.tally import UncertaintyTally
 from pcfix.report.text import (
     FEWEST,
     budget_words,
@@ -35,12 +33,6 @@ BY_HAND = {
 }
 
 
-@pytest.mark.parametrize("order", ORDERS, ids=lambda order: order.name)
-def test_largest_tvu(order):
-    found = largest_tvu_m(order, np.array([0.0, 40.0]))
-    np.testing.assert_allclose(found, BY_HAND[order.name], atol=5e-5)  # as it is printed there
-
-
 def tally_of(sigma, depth, parts=1):
     rows = np.array_split(np.arange(len(sigma)), parts)
     return reduce(add, [UncertaintyTally.of(sigma[r], depth[r]) for r in rows]).as_dict()
@@ -55,15 +47,6 @@ def test_shares_and_percentiles():
     json.dumps(found)
     deep = tally_of(np.full(2, 0.1), np.array([0.0, 20.0]))  # TVU 0.196 m; 0.2121 m at 20 m
     assert deep["s44"]["Exclusive"] == 0.5
-
-
-def test_chunks():
-    rng = np.random.default_rng(0)
-    sigma, depth = rng.gamma(2.0, 0.05, 10_000), rng.uniform(0.0, 10.0, 10_000)
-    assert tally_of(sigma, depth) == tally_of(sigma, depth, parts=7)
-    p95 = tally_of(sigma, depth)["sigma_z_m"]["p95"]
-    assert p95 == pytest.approx(np.percentile(sigma, 95), abs=0.001)  # a bin
-    assert tally_of(np.zeros(3), np.ones(3)) is None
 
 
 @pytest.mark.parametrize(
@@ -88,14 +71,6 @@ def test_strictest_order(shares, order):
 def test_budget_words(changes, fitted, words):
     assert words in budget_words(asdict(replace(BudgetOptions(), **changes)), fitted)
     assert "waves" not in budget_words(asdict(BudgetOptions()))
-
-
-def test_figure():
-    rng = np.random.default_rng(0)
-    depth, sigma = rng.uniform(0.0, 8.0, 500), rng.uniform(0.01, 0.2, 500)
-    bins = [asdict(one) for one in binned(depth, rng.normal(0.0, 0.1, 500), None, 1.0)]
-    for some, measured in ((slice(1), []), (slice(None), bins)):
-        assert png_of(tvu_figure(depth[some], sigma[some], measured)).startswith(b"\x89PNG")
 
 
 def test_measured_tvu():

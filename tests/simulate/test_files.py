@@ -49,25 +49,6 @@ def test_cameras(written):
         assert read.lenses[0].focal == cameras.lenses[0].focal
 
 
-def test_views(written):
-    scene, folder = written
-    name = "fused.ply.vis" if scene.views.weight is None else "dense.ply"
-    raw = read_views(folder / name, pcfix.read_cameras(folder / "cameras.csv")).raw
-    assert np.array_equal(raw.start, scene.views.start)
-    assert np.array_equal(raw.image, scene.views.camera)
-    if scene.views.weight is not None:
-        assert np.array_equal(raw.weight, scene.views.weight)
-        assert np.array_equal(raw.xyz, scene.xyz)
-
-
-def test_clouds(written):
-    scene, folder = written
-    for name, xyz in (("cloud", scene.xyz), ("truth", scene.true_xyz), ("lidar", scene.lidar_xyz)):
-        read = laspy.read(folder / f"{name}.laz")
-        assert np.abs(read.xyz - xyz).max() < 0.00051  # steps of a millimetre
-    assert np.array_equal(read.classification == 40, scene.depth_m(scene.lidar_xyz) > 0.0)
-
-
 def test_pairs(written):
     scene, folder = written
     if scene.neighbours is not None:

@@ -28,8 +28,3 @@ def test_frame():
     assert optics.frames(np.array([[0.0, 0.0], [5471.0, 3647.0]])).all()
     far = np.array([[2736.0 + 9 * 3648.0, 1824.0]])  # nine focal lengths aside
     assert not optics.frames(optics.to_image(far)).any()
-
-
-def test_no_distortion():
-    optics, ideal = make_optics(*CAMERA, ()), np.array([[1.0, 2.0]])
-    assert optics.to_image(ideal) is ideal

@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.options.scenes import SimulateOptions
-from pcfix.simulate.settings import SceneSettings
 from pcfix.simulate.terrain import STEPS
 from tests.utils.codes import refused
 
@@ -26,10 +24,6 @@ FEW = {"points": 200, "lidar_per_m2": 0.2}
 def test_contradictory(code, arguments):
     with refused(code):
         pcfix.simulate_scene(**arguments)
-
-
-def test_defaults():
-    assert SimulateOptions().part(SceneSettings) == SceneSettings()
 
 
 @pytest.mark.parametrize("height", [30.0, 200.0])
@@ -87,12 +81,6 @@ def test_beds():
     _, depth, _ = depths("shore", greatest_depth_m=5.0)
     assert depth.min() < -0.5
     assert 4.5 < depth.max() <= 5.0 + 1e-9
-
-
-def test_lidar():
-    scene = pcfix.simulate_scene(20, bed="flat", lidar_per_m2=1.0, lidar_noise_m=0.2)
-    assert len(scene.lidar_xyz) == 9600
-    assert scene.depth_m(scene.lidar_xyz).std() == pytest.approx(0.2, rel=0.03)
 
 
 def test_waves_and_tilt_corrected():

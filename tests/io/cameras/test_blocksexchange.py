@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pcfix.lens.imaging import project
-from tests.utils.camera_files import brown, notes, read, read_ties
+from tests.utils.camera_files import brown, read, read_ties
 from tests.utils.codes import refused
 from tests.utils.shared import needs
 
@@ -180,29 +180,6 @@ def test_photos_without_a_pose_in_the_block_are_left_out(tmp_path):
     assert cameras.crs == "EPSG:32632"
 
 
-def test_poses_and_lenses_that_software_ignores_are_not_read(tmp_path):
-    ignored = GROUP.replace("wide", "raw") + "<ManualPose>false</ManualPose>"
-    text = document(block(group(photo(1)), group(photo(2), head=ignored)))
-    cameras = read(write(tmp_path, text))
-    assert (cameras.labels, cameras.unposed) == (("p1.jpg",), ("p2.jpg",))
-    assert notes(cameras) == ["cameras.poses_ignored"]
-    with refused("cameras.no_pose"):
-        read(write(tmp_path, simple(photo(1), head=ignored)))
-    head = GROUP + "<ManualOpticalParams>False</ManualOpticalParams><ManualPose>true</ManualPose>"
-    cameras = read(write(tmp_path, simple(photo(1), head=head)))
-    assert cameras.lenses is None
-    assert notes(cameras) == ["cameras.no_lens"]
-
-
-def test_positions_alone(tmp_path):
-    text = simple(photo(1).replace(f"<Rotation>{matrix()}</Rotation>", ""))
-    cameras = read(write(tmp_path, text))
-    assert cameras.rotations is None
-    assert cameras.lenses is None
-    assert cameras.centres.tolist() == [[1, 2, 3]]
-    assert notes(cameras) == ["cameras.no_rotations"]
-
-
 @pytest.mark.parametrize(
     ("definition", "crs"),
     [
@@ -220,17 +197,6 @@ def test_reference_systems(tmp_path, definition, crs):
     block_srs = "<SRSId>3</SRSId>" if definition else ""
     text = document(block(group(photo()), srs=block_srs), systems=systems)
     assert read(write(tmp_path, text)).crs == crs
-
-
-def test_gps_of_exif(tmp_path):
-    gps = (
-        "<ExifData><GPS><Latitude>45.5</Latitude><Longitude>2.5</Longitude>"
-        "<Altitude>1589</Altitude></GPS></ExifData>"
-    )
-    cameras = read(write(tmp_path, simple(photo(1, extra=gps), photo(2))))
-    assert cameras.gnss.xyz[0].tolist() == [2.5, 45.5, 1589]
-    assert np.isnan(cameras.gnss.xyz[1]).all()
-    assert cameras.gnss.crs == "EPSG:4326"
 
 
 TIE = (

@@ -84,12 +84,6 @@ def test_frame_from_tie_points(tmp_path):
     assert notes(cameras) == ["cameras.frames_estimated"]
 
 
-def test_frame_is_of_images_of_about_the_focal_length(tmp_path):
-    near, far = (read(write(tmp_path, bundle(second_f=f)[0])).lenses for f in (720, 1500))
-    assert near[0].width == near[1].width
-    assert (far[1].width, far[1].height) == (2, 4)
-
-
 @pytest.mark.parametrize("name", ["list.txt", "x.list.txt", "x.bundle.out.list.txt", "../list.txt"])
 def test_places_of_the_list(tmp_path, name):
     path = tmp_path / "bundle" / "x.bundle.out"
@@ -97,13 +91,6 @@ def test_places_of_the_list(tmp_path, name):
     write(path.parent, bundle()[0], path.name)
     (path.parent / name).write_text("one.jpg\ntwo.jpg\n")
     assert read(path).labels == ("one.jpg",)
-
-
-def test_list_of_other_images(tmp_path):
-    path = write(tmp_path, bundle()[0])
-    (tmp_path / "list.txt").write_text("one.jpg\n")
-    cameras = read(path)
-    assert cameras.labels == ("camera 0",)
 
 
 def test_mve_with_its_images(tmp_path):
@@ -115,15 +102,6 @@ def test_mve_with_its_images(tmp_path):
     assert cameras.rotations[0] == pytest.approx(TURN, abs=1e-9)
     assert cameras.centres[0] == pytest.approx(CENTRE)
     assert cameras.lenses[0].focal == pytest.approx(320)
-
-
-def test_poses_without_points(tmp_path):
-    text = bundle()[0].replace("2 3\n", "2 0\n", 1)
-    path = write(tmp_path, "\n".join(text.splitlines()[:12]) + "\n")
-    cameras = read(path)
-    assert cameras.lenses is None
-    with refused("cameras.no_tie_points"):
-        read_ties(path)
 
 
 @pytest.mark.parametrize(

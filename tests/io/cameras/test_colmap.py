@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from pcfix.io.cameras import read_tie_points
 from pcfix.io.cameras.colmap.files import MODELS, Camera, lens
 from pcfix.lens.imaging import project
-from tests.utils.camera_files import notes, read, read_ties
+from tests.utils.camera_files import read, read_ties
 from tests.utils.codes import refused, warned
 
 CAMERAS = """# Camera list with one line of data per camera:
@@ -100,20 +100,6 @@ def test_its_tie_points(tmp_path, make):
     assert points.image_xy.tolist() == [[50, 60], [7, 8], [10, 20]]
 
 
-@pytest.mark.parametrize("make", [folder, binary_folder])
-@pytest.mark.parametrize("given", [".", "project", "project/sparse", "project/sparse/0"])
-def test_places_of_a_model(tmp_path, make, given):
-    make(tmp_path / ("sparse" if given == "." else "project/sparse/0"))
-    assert len(read(tmp_path / given)) == 3
-
-
-def test_the_file_named_is_the_form_that_is_read(tmp_path):
-    binary_folder(tmp_path)
-    folder(tmp_path, images="1 1 0 0 0 0 0 0 3 only.jpg\n\n")
-    assert len(read(tmp_path)) == 3
-    assert read(tmp_path / "images.txt").labels == ("only.jpg",)
-
-
 def test_largest_of_several_models(tmp_path):
     folder(tmp_path / "sparse/0", images="1 1 0 0 0 0 0 0 3 x.jpg\n\n")
     folder(tmp_path / "sparse/1")
@@ -182,27 +168,6 @@ def test_pose_priors_of_wgs84(tmp_path, rigs):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["database.db", "sparse"]
 
 
-def test_cartesian_pose_priors(tmp_path):
-    path = folder(tmp_path)
-    rows = [(1, (10, 20, 30), None, 1), (0, (np.nan, np.nan, np.nan), None, 1)]
-    database(tmp_path / "database.db", rows)
-    gnss = read(path).gnss
-    assert gnss.crs is None
-    assert gnss.xyz[2].tolist() == [10, 20, 30]
-    assert np.isnan(gnss.xyz[[0, 1]]).all()
-    assert np.isnan(gnss.sigma_m).all()
-
-
-def test_databases_that_are_left_out(tmp_path):
-    path = folder(tmp_path)
-    (tmp_path / "database.db").write_bytes(b"no database" * 200)
-    assert notes(read(path)) == ["cameras.priors_left_out"]
-    (tmp_path / "database.db").unlink()
-    database(tmp_path / "database.db", [(0, (1, 2, 3), None, 0), (1, (1, 2, 3), None, 1)])
-    assert read(path).gnss is None
-    assert notes(read(path)) == ["cameras.priors_left_out"]
-
-
 @pytest.mark.parametrize(
     ("part", "old", "new", "code"),
     [
@@ -260,13 +225,3 @@ def test_binary_refused(tmp_path, name, at, layout, value):
     (path / f"{name}.bin").write_bytes(data)
     with refused("cameras.unsupported" if value == 99 else "cameras.damaged"):
         read_ties(path)
-
-
-@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
-def test_binary_cut(tmp_path, name):
-    path = binary_folder(tmp_path)
-    data = (path / f"{name}.bin").read_bytes()
-    for length in range(0, len(data), 5):
-        (path / f"{name}.bin").write_bytes(data[:length])
-        with refused("cameras.damaged", path=path / f"{name}.bin"):
-            read_ties(path)

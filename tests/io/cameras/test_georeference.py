@@ -79,19 +79,6 @@ def test_a_map_with_north_first_is_read_east_first(code):
     assert np.hypot(*back.centres[0, :2]) < 1e-2
 
 
-def test_grads_from_paris():
-    crs = CRS("EPSG:4807")
-    degrees = Transformer.from_crs("EPSG:4275", crs, always_xy=True).transform(2.5, 46.5)
-    at = cameras([*degrees, 300.0], "EPSG:4807", NADIR[None])
-    found = bring_to(at, "EPSG:27572")
-    expected = Transformer.from_crs("EPSG:4275", "EPSG:27572", always_xy=True).transform(2.5, 46.5)
-    assert found.centres[0] == pytest.approx([*expected, 300.0], abs=1e-3)
-    gamma = np.radians(2.5 - 2.33722917) * np.sin(np.radians(46.8))  # n of the cone
-    assert np.arctan2(-found.rotations[0, 0, 1], found.rotations[0, 0, 0]) == pytest.approx(
-        -gamma, abs=1e-5
-    )
-
-
 def test_bound_and_esri_wkt_are_the_crs_they_hold():
     bound = CRS(UTM30).to_wkt("WKT1_GDAL").replace(
         'AUTHORITY["EPSG","6258"]', 'TOWGS84[0,0,0,0,0,0,0],AUTHORITY["EPSG","6258"]'
@@ -102,29 +89,6 @@ def test_bound_and_esri_wkt_are_the_crs_they_hold():
         assert found.centres[0].tolist() == VALENCIA
         assert found.rotations[0].tolist() == NADIR.tolist()
         assert found.notes == ()
-
-
-@pytest.mark.parametrize(
-    ("crs", "given", "offset"),
-    [
-        (None, None, (0, 0, 0)),  # a file that says nothing is in the cloud's CRS
-        ("EPSG:32631", "EPSG:25830", (0, 0, 0)),  # the option overrides the file
-        ("EPSG:4978", "local", (1, 2, 3)),  # the numbers as they are
-    ],
-)
-def test_numbers_of_the_cloud(crs, given, offset):
-    found = bring_to(cameras(VALENCIA, crs), UTM30, cameras_crs=given, offset_m=offset)
-    assert found.centres[0] == pytest.approx(np.add(VALENCIA, offset), abs=1e-9)
-    assert (found.crs, found.notes) == (UTM30, ())
-
-
-def test_the_same_crs_changes_no_bit():
-    rotation = Rotation.from_euler("xyz", [170.0, 8.0, 33.0], degrees=True).as_matrix()[None]
-    for crs in (UTM30, None, UTM30_ALICANTE):
-        found = bring_to(cameras(VALENCIA, crs, rotation), crs)
-        assert found.centres.tobytes() == np.array([VALENCIA]).tobytes()
-        assert found.rotations.tobytes() == rotation.tobytes()
-        assert found.crs == crs
 
 
 def test_an_offset_comes_before_all_else():
@@ -369,21 +333,6 @@ def test_heights(at, crs, project, cloud, given, z, codes):
 
 
 # ---- who says what ----
-
-
-@pytest.mark.parametrize("crs", ["local", LOCAL_CS])
-@pytest.mark.parametrize("given", ["Local", UTM30])
-def test_local_frame_by_the_user(crs, given):
-    found = bring_to(cameras(VALENCIA, crs), UTM30, cameras_crs=given)
-    assert (found.crs, found.centres[0].tolist()) == (UTM30, VALENCIA)
-
-
-@pytest.mark.parametrize(
-    ("crs", "given"), [("local", None), (LOCAL_CS, None), (None, None), (UTM30, "local")]
-)
-def test_local_cloud(crs, given):
-    found = bring_to(cameras([1.0, 2, 3], crs), LOCAL_CS, cameras_crs=given)
-    assert found.centres.tolist() == [[1, 2, 3]]
 
 
 @pytest.mark.parametrize(

@@ -67,13 +67,6 @@ def test_in_the_axes_of_a_map():
     assert np.isnan(found.enu_m[2]).all()
 
 
-def test_in_feet_they_are_metres():
-    x, y = Transformer.from_crs("EPSG:4326", "EPSG:2992", always_xy=True).transform(-120.5, 44.0)
-    gnss = GnssPositions(np.array([[x, y, 100.0]]), np.full((1, 3), np.nan), "EPSG:2992")
-    feet = Cameras(("a",), np.array([[x + 10.0, y, 110.0]]), crs="EPSG:2992", gnss=gnss)
-    assert adjusted_minus_gnss(feet).enu_m[0] == pytest.approx([3.048, 0, 3.048], abs=1e-6)
-
-
 @wheat
 def test_a_camera_where_the_gnss_put_it():
     truth = check_file(WHEAT)["projection_centres"]
@@ -118,25 +111,9 @@ def test_heights_that_cannot_be_compared_leave_the_plan(crs, gnss_crs, reason):
     assert lengths == pytest.approx(np.hypot(*ENU_M[:2, :2].T), rel=5e-4)
 
 
-def test_positions_without_a_crs_are_in_that_of_the_cameras():
-    gnss = GnssPositions(np.array([[1.0, 2, 3]]), np.full((1, 3), np.nan), None)
-    for crs in (None, "local", "EPSG:32654", "ENU:1,2,3"):
-        read = Cameras(("a",), np.array([[2.0, 2, 5]]), crs=crs, gnss=gnss)
-        assert adjusted_minus_gnss(read).enu_m.tolist() == [[1.0, 0.0, 2.0]]
-
-
 @pytest.mark.parametrize("crs", [None, "local"])
 def test_a_local_block_cannot_be_compared(crs):
     gnss = GnssPositions(np.array([[LON, LAT, H]]), np.full((1, 3), np.nan), "EPSG:4326")
     found = adjusted_minus_gnss(Cameras(("a",), np.zeros((1, 3)), crs=crs, gnss=gnss), "a.xml")
     assert np.isnan(found.enu_m).all()
     assert "a.xml: positions of the GNSS and adjusted centres are not both tied" in found.reason
-
-
-def test_no_positions_at_all():
-    found = adjusted_minus_gnss(Cameras(("a",), np.zeros((1, 3))), "a.xml")
-    assert found.enu_m.shape == (1, 3)
-    assert found.reason == "a.xml: has no positions of the GNSS."
-    none = GnssPositions(np.full((1, 3), np.nan), np.full((1, 3), np.nan), "EPSG:4326")
-    read = Cameras(("a",), np.array([[5e5, 4e6, 1.0]]), crs="EPSG:32654", gnss=none)
-    assert np.isnan(adjusted_minus_gnss(read).enu_m).all()

@@ -15,7 +15,7 @@ from pcfix.lens.imaging import project
 from pcfix.model import Lens
 from tests.utils.camera_files import brown, notes, read, read_ties
 from tests.utils.codes import refused
-from tests.utils.reprojection import check_file, row_of
+from tests.utils.reprojection import row_of
 from tests.utils.shared import needs
 
 SOROLLA, sorolla = needs("cameras", "metashape", "uclm_sorolla")
@@ -40,10 +40,6 @@ UTM30 = CRS("EPSG:25830").to_wkt("WKT1_GDAL")
 UTM30 = UTM30.replace('AUTHORITY["EPSG","6258"]', 'TOWGS84[0,0,0,0,0,0,0],AUTHORITY["EPSG","6258"]')
 WGS84 = CRS("EPSG:4326").to_wkt("WKT1_GDAL")
 GEOCENTRIC = CRS("EPSG:4978").to_wkt("WKT1_GDAL")
-MILLIMETRES = (
-    'LOCAL_CS["Local Coordinates (mm)",LOCAL_DATUM["Local Datum",0],UNIT["millimetre",0.001,'
-    'AUTHORITY["EPSG","1025"]]]'
-)
 
 
 def calibration(inner="<f>100</f>", kind="frame", use="adjusted", size='width="60" height="40"'):
@@ -162,18 +158,6 @@ def test_sample_with_a_rig_has_degrees_in_a_metric_chunk():
     assert np.abs(off[:, :2]).max() < 10.0  # navigation grade
 
 
-@wheat
-def test_sample_project_without_its_clouds_has_its_markers():
-    cameras, ties = (
-        read(SAMPLES["easyidp_wheat_psx"][0]),
-        read_ties(SAMPLES["easyidp_wheat_psx"][0]),
-    )
-    assert ties.xyz.shape == (6, 3)
-    assert np.isnan(ties.xyz).all()
-    assert len(ties.image_xy) == check_file(WHEAT)["n_observations_used_for_rms"]
-    assert read(WHEAT / "wheat_tanashi.files").centres.tolist() == cameras.centres.tolist()
-
-
 @bodies
 def test_images_turned_by_their_exif_keep_the_axes_of_the_stored_image():
     # portraits: a camera turned to the right has the x axis down, one turned to the left up, so
@@ -237,24 +221,6 @@ def test_world_of_each_kind_of_crs(tmp_path, wkt, crs, project_crs):
     assert cameras.centres.tolist() == [[4932318 - 4, -32706 + 2, 4030484 + 6]]
 
 
-def test_datum_shift_of_the_wkt_is_not_applied_on_the_own_datum(tmp_path):
-    shifted = UTM30.replace("[0,0,0,0,0,0,0]", "[565,50,465,1.9,-1.7,9.1,4.07]")
-    shifted = shifted.replace('AUTHORITY["EPSG","6258"]', "").replace(",]", "]")
-    place = "4932318 -32706 4030484"
-    cameras = read_chunk(tmp_path, rest=transform(place) + f"<reference>{shifted}</reference>")
-    to_map = Transformer.from_crs(cameras.crs, cameras.project_crs, always_xy=True)
-    plain = Transformer.from_crs("EPSG:4936", "EPSG:25830", always_xy=True)
-    assert to_map.transform(*cameras.centres[0])[:2] == pytest.approx(
-        plain.transform(*cameras.centres[0])[:2], abs=1e-3
-    )
-
-
-def test_local_millimetres_are_told(tmp_path):
-    cameras = read_chunk(tmp_path, rest=transform() + f"<reference>{MILLIMETRES}</reference>")
-    assert cameras.crs == "local"
-    assert notes(cameras) == ["cameras.local_unit"]
-
-
 def components(*inner, active=0):
     each = "".join(f'<component id="{i}">{part}</component>' for i, part in enumerate(inner))
     return f'<components next_id="9" active_id="{active}">{each}</components>'
@@ -290,16 +256,6 @@ def test_components(tmp_path, rest, labels, centres, codes):
     assert (cameras.labels, cameras.centres.tolist()) == (labels, centres)
     assert notes(cameras) == codes
     assert len(cameras) + len(cameras.unposed) == 2
-
-
-def test_component_that_lists_its_images(tmp_path):
-    listed = "<partition><partition><camera_ids>1</camera_ids></partition></partition>"
-    cameras = read_chunk(
-        tmp_path,
-        cameras=camera(0) + camera(1),
-        rest=components("", listed + transform("0 0 0", scale="1")) + transform(),
-    )
-    assert cameras.centres.tolist() == [[6, 22, 36], [-2, 1, 3]]
 
 
 def test_slave_sits_on_its_master(tmp_path):
@@ -394,19 +350,6 @@ def test_fisheyes_have_the_distortion_of_a_frame_camera(tmp_path, kind, radius):
     assert project(lens, ray)[0] == pytest.approx(expected, abs=1e-9)
 
 
-def test_of_two_calibrations_the_adjusted_one(tmp_path):
-    both = calibration("<f>1</f>", use="initial") + calibration("<f>2</f>")
-    assert lens_of(tmp_path, both).focal == 2.0
-    assert lens_of(tmp_path, calibration("<f>1</f>", use="initial")).focal == 1.0
-
-
-def test_sensor_with_its_data_sheet_alone(tmp_path):
-    inner = '<property name="pixel_width" value="0.01"/><property name="focal_length" value="8"/>'
-    cameras = read_chunk(tmp_path, sensors=sensor(inner))
-    assert cameras.lenses[0] == Lens(800.0, 60.0, 40.0, 30.0, 20.0, pixel_size_mm=0.01, sensor="S0")
-    assert notes(cameras) == ["cameras.data_sheet_lens"]
-
-
 def test_what_a_lens_here_has_not_is_told(tmp_path):
     corrections = '<corrections type="fourier"><coeffs>3 4 0 0</coeffs></corrections>'
     cameras = read_chunk(
@@ -476,28 +419,6 @@ def test_gnss_positions_and_their_accuracy(tmp_path):
     np.testing.assert_allclose(gnss.xyz, [*xyz, [none] * 3, [none] * 3], rtol=1e-12)
     sigma = [[10, 10, 20], [3, 3, 3], [1, 1, 2], [4, 10, none], [none] * 3, [none] * 3]
     np.testing.assert_allclose(gnss.sigma_m, sigma, rtol=1e-12)
-
-
-def test_gnss_all_unticked(tmp_path):
-    image = camera(0, reference('x="500000" y="4300000" z="100" enabled="false"'))
-    rest = f"<reference>{UTM30}</reference>"
-    rest += '<settings><property name="accuracy/cameras" value="1 2 3"/></settings>'
-    gnss = read_chunk(tmp_path, cameras=image, rest=rest).gnss
-    assert (gnss.crs, gnss.xyz.tolist()) == (UTM30, [[500000, 4300000, 100]])
-    assert gnss.sigma_m.tolist() == [[1, 2, 3]]
-    image = camera(0, reference('x="1" y="2" z="3" sxyz="0"'))
-    gnss = read_chunk(tmp_path, cameras=image).gnss
-    assert gnss.crs == "local" and np.isnan(gnss.sigma_m).all()
-    assert read_chunk(tmp_path, cameras=camera(0, reference('yaw="10"'))).gnss is None
-
-
-def test_antenna_offset_is_told(tmp_path):
-    antenna = "<antenna><location>0 0 0.2</location></antenna>"
-    image = camera(0, reference('x="1" y="2" z="3"'))
-    cameras = read_chunk(tmp_path, sensors=sensor(calibration() + antenna), cameras=image)
-    assert notes(cameras) == ["cameras.antenna_offset"]
-    level = antenna.replace("0.2", "0")
-    assert not read_chunk(tmp_path, sensors=sensor(calibration() + level), cameras=image).notes
 
 
 # Projects

@@ -71,20 +71,6 @@ def test_sample_is_reproduced_exactly():
     assert cameras.notes == ()
 
 
-@li3ds
-@pytest.mark.parametrize(
-    ("name", "calibration", "model"),
-    [
-        ("Orientation-1.xml", "Calib-1.xml", "ModRad after eModelePolyDeg4"),
-        ("", "Calib-1.xml", "ModRad after eModelePolyDeg4"),
-        ("TestOri-2.xml", "TestOri-2.xml", "eModelePolyDeg2"),
-    ],
-)
-def test_samples_with_other_formulas_are_refused(name, calibration, model):
-    with refused("cameras.unsupported", path=LI3DS / calibration, model=model):
-        pcfix.read_cameras(LI3DS / name)
-
-
 def test_matrix_is_camera_to_world(tmp_path):
     cameras = read(tmp_path, embedded(NO_DISTORTION))
     seen = np.array([0.5, -0.25, 4.0])
@@ -139,28 +125,6 @@ def test_distortion_from_observed_to_ideal(tmp_path, model):
         x, y = brown_place(u, v, **terms)
         ray = unproject(cameras.lenses[0], np.array([[u, v]], dtype=float))[0]
         assert ray[:2] / ray[2] == pytest.approx([(x - PP[0]) / F, (y - PP[1]) / F], abs=1e-9)
-
-
-@pytest.mark.parametrize("name", ["eModele_DRad_PPaEqPPs", "eModele_Fraser_PPaEqPPs"])
-def test_unified_names_of_the_radial_and_standard_models(tmp_path, name):
-    tail = (3e-7, -2e-7, 0, 0) if "Fraser" in name else ()
-    cameras = read(tmp_path, embedded(unified(name, [2e-8, -1e-15, 0, 0, 0, *tail], [])))
-    ray = np.array([-0.4, 0.3, 1.0])
-    p1, p2 = tail[:2] or (0.0, 0.0)
-    dx, dy = brown(*(F * ray[:2]), (2e-8, -1e-15), (p1, p2))
-    expected = PP[0] + dx, PP[1] + dy
-    assert project(cameras.lenses[0], ray[None])[0] == pytest.approx(expected, abs=1e-8)
-
-
-def test_scaled_image(tmp_path):
-    affine = "<OrIntImaM2C><I00>5 7</I00><V10>0.5 0.01</V10><V01>0.02 0.25</V01></OrIntImaM2C>"
-    text = orientation(f"<Interne>{interior(RADIAL)}</Interne>", more=affine)
-    lens = read(tmp_path, text).lenses[0]
-    for ray in RAYS:
-        u, v = brown_place(PP[0] + F * ray[0], PP[1] + F * ray[1])
-        expected = (5 + 0.5 * u + 0.02 * v, 7 + 0.01 * u + 0.25 * v)
-        assert project(lens, ray[None])[0] == pytest.approx(expected, abs=1e-8)
-    assert (lens.width, lens.height) == pytest.approx((2060, 790))
 
 
 def calibration_file(path):
@@ -286,21 +250,3 @@ def test_version_2_distorts_the_ideal_place(tmp_path):
 def test_refused(tmp_path, text, code):
     with refused(code):
         read(tmp_path, text)
-
-
-@pytest.mark.parametrize(
-    ("terms", "pose", "code"),
-    [
-        ("<Decentric><p3>0.1</p3></Decentric>", POSE_2, "cameras.unsupported"),
-        (
-            "<Radial><K1>9</K1></Radial><Polynomial><b1>0.1</b1></Polynomial>",
-            POSE_2,
-            "cameras.unsupported",
-        ),
-        ("", POSE_2.replace("Foc-28000", "Foc-1"), "cameras.missing_file"),
-        ("", POSE_2.replace("<Center>5.2", "<Center>x5.2"), "cameras.number"),
-    ],
-)
-def test_version_2_refused(tmp_path, terms, pose, code):
-    with refused(code):
-        pcfix.read_cameras(version_2(tmp_path, terms, pose=pose))

@@ -56,10 +56,6 @@ def test_another_crs(centres, words):
     assert words in likely_mistake(centres, LOW, HIGH, UTM)
 
 
-def test_degrees_where_the_cloud_says_nothing():
-    assert "look like degrees" in likely_mistake(to("EPSG:4326"), LOW, HIGH, None)
-
-
 @pytest.mark.parametrize("crs", [UTM, None])
 def test_local_against_projected(crs):
     origin = np.array([725450.0, 4369125.0, 0.0])
@@ -75,12 +71,6 @@ def test_a_constant_offset_is_given_in_metres():
     shift = (LOW + HIGH)[:2] / 2 - np.median(FITS[:, :2], axis=0) - [3000.0, -4000.0]
     assert f"The cameras are {np.hypot(*shift):.0f} m from the cloud in plan" in found
     assert f"a constant offset of about {shift[0]:.0f}, {shift[1]:.0f} m" in found
-
-
-def test_another_place_of_another_size():
-    far = FITS.mean(axis=0) + 500.0 * (FITS - FITS.mean(axis=0)) + [9e5, 0.0, 0.0]
-    found = likely_mistake(far, LOW, HIGH, UTM)
-    assert "km from the cloud in plan; check the CRS of both" in found
 
 
 @pytest.mark.parametrize("shift", [-50.0 - 100.0, -110.0 - 100.0])
@@ -107,11 +97,6 @@ def test_heights_in_feet():
     assert "their heights are likely in metres, the cloud's in feet" in found
     found = likely_mistake((FITS + valley) / [1, 1, 0.3048], LOW + valley, HIGH + valley, UTM)
     assert "their heights are likely in feet." in found
-
-
-def test_heights_from_another_origin():
-    found = likely_mistake(FITS - [0.0, 0.0, 900.0], LOW, HIGH, UTM)
-    assert "their heights have another origin" in found
 
 
 def test_a_cloud_in_all_zones_at_once():

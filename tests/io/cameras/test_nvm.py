@@ -75,22 +75,6 @@ def test_frame_of_the_image(tmp_path):
     assert points.image_xy == pytest.approx(measured() + np.array([300, 200]))
 
 
-@pytest.mark.parametrize("name", ['"b c.jpg"', "b c.jpg", 'b"c.jpg', "b c.jpg\t"])
-def test_names_with_spaces(tmp_path, name):
-    path = write(tmp_path, model(camera_line(name), points=point_lines(measured())))
-    assert read(path).labels == ("b c.jpg",)
-
-
-def test_fixed_calibration(tmp_path):
-    places = measured(k=0.0) * [1.0, 710 / 700]
-    text = model(camera_line("a.jpg", k=0.0), points=point_lines(places))
-    path = write(tmp_path, text, head="NVM_V3 FixedK 700 310 710 245")
-    lens = read(path).lenses[0]
-    assert (lens.focal, lens.b1, lens.principal_x, lens.principal_y) == (710, -10, 310, 245)
-    assert (lens.width, lens.height) == (620, 490)
-    assert residuals(path).max() < 1e-6
-
-
 def test_matrix_and_translation(tmp_path):
     matrix = TURN.as_matrix()
     numbers = words([F, *matrix.ravel(), *(-matrix @ CENTRE), K, 0])
@@ -130,25 +114,6 @@ def test_largest_of_several_models_and_the_rest(tmp_path):
     assert cameras.notes[0].values.items() >= {"models": 2, "images": 2}.items()
     points = read_ties(path)
     assert set(points.views.camera.tolist()) == {1}
-
-
-def test_images_without_focal_length_have_no_pose(tmp_path):
-    text = model(
-        camera_line("lost.jpg", f=0), camera_line("a.jpg"), points=point_lines(measured(), image=1)
-    )
-    path = write(tmp_path, text)
-    assert read(path).labels == ("a.jpg",)
-    assert read(path).unposed == ("lost.jpg",)
-    assert residuals(path).max() < 1e-5
-
-
-def test_poses_without_points(tmp_path):
-    path = write(tmp_path, model(camera_line("a.jpg")))
-    cameras = read(path)
-    assert cameras.lenses is None
-    assert notes(cameras) == ["cameras.no_lens"]
-    with refused("cameras.no_tie_points"):
-        read_ties(path)
 
 
 @pytest.mark.parametrize(

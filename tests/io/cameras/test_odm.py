@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from pcfix.io.cameras import opensfm
 from pcfix.io.cameras.formats import Source
-from tests.utils.camera_files import is_of, read, read_ties
+from tests.utils.camera_files import read, read_ties
 from tests.utils.codes import refused
 from tests.utils.shared import needs
 
@@ -116,13 +116,6 @@ def test_old_project_turns_by_the_meridian_convergence():
     assert np.degrees(np.arctan2(north[0], north[1])) == pytest.approx(-0.7339, abs=1e-3)
 
 
-def test_reference_at_whole_metres_means_projected_axes(tmp_path):
-    path = project(tmp_path, reconstruction=reconstruction(PLACES))
-    cameras = read(path)
-    assert cameras.centres == pytest.approx(np.add(PLACES, [EAST, NORTH, 0]), abs=1e-6)
-    assert (cameras.crs, cameras.project_crs) == (CRS, None)
-
-
 def test_whole_metres_in_the_crs_that_the_project_names(tmp_path):
     lon, lat = Transformer.from_crs("EPSG:25833", "EPSG:4326", always_xy=True).transform(2e5, 52e5)
     coords = "EPSG:25833\n200000 5200000\n"
@@ -162,14 +155,6 @@ def test_gnss_tells_a_topocentric_reconstruction_from_a_moved_one(tmp_path, move
     assert cameras.gnss.crs.startswith("ENU:")
 
 
-def test_topocentric_copy_of_the_reconstruction(tmp_path):
-    folder = project(
-        tmp_path, reconstruction=reconstruction(PLACES), topocentric=reconstruction(PLACES)
-    )
-    cameras = read(folder / "opensfm" / "reconstruction.topocentric.json")
-    assert cameras.crs == f"ENU:{LAT!r},{LON!r},0.0"
-
-
 def transformation(lon, lat):
     """The affine map of export_geocoords: images of the origin and the unit vectors."""
     steps = exact_utm(np.vstack([np.eye(3), np.zeros(3)]), lon, lat)
@@ -207,22 +192,10 @@ def test_transformation_of_another_origin_is_not_used(tmp_path):
     assert read(path).centres == pytest.approx(np.add(PLACES, [EAST, NORTH, 0]), abs=1e-6)
 
 
-def test_aligned_project_is_told(tmp_path):
-    shots = geojson(np.add(PLACES, [EAST + 1.5, NORTH, 0]))
-    path = project(tmp_path, reconstruction=reconstruction(PLACES), shots=shots)
-    assert read(path).notes[0].values["metres"] == pytest.approx(1.5)
-    assert read(path / "odm_report").centres[0] == pytest.approx([EAST, NORTH, 100])
-
-
 def test_crs_of_shots_follows_from_their_longitude_and_latitude(tmp_path):
     places = np.add(PLACES, [EAST, NORTH, 0])
     shots = geojson(places, {0: (LON, LAT, 100)})
     assert read(project(tmp_path, shots=shots)).crs == CRS
-
-
-@pytest.mark.parametrize("place", [(8, 47, 9), (0.0, 0.0, 0.0)])
-def test_made_up_coordinates_are_local(tmp_path, place):
-    assert read(project(tmp_path, shots=geojson(PLACES, {0: place}))).crs == "local"
 
 
 def test_lens_by_name_or_by_size_and_focal_length(tmp_path):
@@ -233,13 +206,6 @@ def test_lens_by_name_or_by_size_and_focal_length(tmp_path):
     assert read(path).lenses[0].radial[0] == 0.3
     project(tmp_path, shots=geojson(PLACES), cameras={"one": CAMERA, "x": {**other, "width": 400}})
     assert read(path).lenses[0].radial[0] == -0.1
-
-
-@pytest.mark.parametrize("cameras", [{}, {"one": CAMERA, "two": {**CAMERA, "k1": 0.3}}])
-def test_lens_that_cannot_be_told_is_plain(tmp_path, cameras):
-    found = read(project(tmp_path, shots=geojson(PLACES), cameras=cameras))
-    assert (found.lenses[0].focal, found.lenses[0].radial) == (3200, ())
-    assert found.notes[0].values["images"] == 4
 
 
 def test_images_without_pose_and_their_gnss(tmp_path):
@@ -254,12 +220,6 @@ def test_images_without_pose_and_their_gnss(tmp_path):
     assert cameras.gnss.xyz[1] == pytest.approx([LON, LAT, 99])
     assert cameras.gnss.sigma_m[1] == pytest.approx([0.02, 0.02, 0.04])
     assert np.isnan(cameras.gnss.xyz[[0, 2, 3]]).all()
-
-
-def test_opensfm_alone_is_not_claimed(tmp_path):
-    (tmp_path / "reconstruction.json").write_text(json.dumps(reconstruction(PLACES, LON + 1e-4)))
-    assert is_of(tmp_path, opensfm)
-    assert is_of(tmp_path / "reconstruction.json", opensfm)
 
 
 def changed(name, value=None):

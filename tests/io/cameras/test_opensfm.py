@@ -122,11 +122,6 @@ def test_size_of_the_images_may_stand_in_the_name_of_the_camera(tmp_path, name):
     assert (lens.width, lens.height, lens.focal) == (4000, 3000, 3200)
 
 
-def test_image_in_portrait_is_scaled_by_its_height(tmp_path):
-    lens = read(tmp_path, scene(cameras={"c": {**CAMERA, "width": 3000, "height": 4000}})).lenses[0]
-    assert (lens.focal, lens.principal_x, lens.principal_y) == (3200, 1500, 2000)
-
-
 def rigged(**shot):
     return scene(
         shots={"left.jpg": {"camera": "c", **shot}},
@@ -171,23 +166,6 @@ def test_gnss_positions_stand_beside_the_centres(tmp_path):
     assert gnss.crs == "ENU:47.0,8.0,400.0"
 
 
-def test_largest_of_several_reconstructions(tmp_path):
-    (tmp_path / "image_list.txt").write_text("../images/a.jpg\n../images/z.jpg\n")
-    small = scene(shots={"x.jpg": SHOT})
-    large = scene(shots={"a.jpg": SHOT, "b.jpg": SHOT})
-    cameras = read(tmp_path, small, large)
-    assert cameras.labels == ("a.jpg", "b.jpg")
-    assert cameras.unposed == ("x.jpg", "z.jpg")
-    assert cameras.notes[0].values.items() >= {"models": 2, "images": 2}.items()
-
-
-def test_reference_beside_the_file(tmp_path):
-    (tmp_path / "reference_lla.json").write_text(json.dumps(LLA))
-    without = scene()
-    del without["reference_lla"]
-    assert read(tmp_path, without).crs == "ENU:47.0,8.0,400.0"
-
-
 @pytest.mark.parametrize("beside", [None, "../elsewhere/reference_lla.json"])
 def test_without_reference_the_frame_is_local(tmp_path, beside):
     if beside:
@@ -196,16 +174,6 @@ def test_without_reference_the_frame_is_local(tmp_path, beside):
     del without["reference_lla"]
     cameras = read(tmp_path, without)
     assert (cameras.crs, cameras.gnss) == ("local", None)
-
-
-def test_made_up_reference_is_local(tmp_path):
-    zero = {"latitude": 0.0, "longitude": 0.0, "altitude": 0.0}
-    assert read(tmp_path, scene(reference_lla=zero)).crs == "local"
-
-
-def test_projected_coordinates_are_not_called_topocentric(tmp_path):
-    shot = {"camera": "c", "rotation": [0, 0, 0], "translation": [-576684.0, -5188159.0, -200.0]}
-    assert read(tmp_path, scene(shots={"a.jpg": shot})).crs is None
 
 
 def test_panoramas_are_left_out(tmp_path):

@@ -8,10 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import pcfix
-from pcfix.errors import InputError
 from pcfix.io.cameras import read_tie_points
 from tests.utils.camera_files import brown
-from tests.utils.codes import refused, warned
+from tests.utils.codes import refused
 from tests.utils.pose_files.block import Block
 from tests.utils.pose_files.opf import FIRST_ID, Base
 from tests.utils.pose_files.opf import opf as write
@@ -147,18 +146,6 @@ def test_out_of_the_processing_frame_into_the_crs(make, name):
     assert turned == pytest.approx(np.tile(np.eye(3), (2, 1, 1)), abs=1e-9)
 
 
-def test_heights_of_a_crs_without_them_are_ellipsoidal(make):
-    """So says the specification; a cloud that is silent, as PIX4Dmatic's, is taken as it is."""
-    path, _ = make()
-    cameras = pcfix.read_cameras(path)
-    assert cameras.project_crs == "EPSG:32632"
-    found = bring_to(cameras, "EPSG:32632")
-    assert found.centres == pytest.approx(PLACES, abs=1e-6)
-    assert found.notes == ()
-    with pytest.raises(InputError):
-        bring_to(cameras, "EPSG:32632+5783")
-
-
 def test_an_arbitrary_frame_is_local(make, tmp_path):
     path, _ = make()
     local = (
@@ -171,14 +158,6 @@ def test_an_arbitrary_frame_is_local(make, tmp_path):
     project["items"] = [i for i in project["items"] if i["type"] != "scene_reference_frame"]
     path.write_text(json.dumps(project))
     assert pcfix.read_cameras(path).crs == "local"
-
-
-def test_a_constant_geoid_is_said(make, tmp_path):
-    path, _ = make()
-    crs = {"definition": "EPSG:32632+5783", "geoid_height": 47.5}
-    change(tmp_path, "scene-reference-frame.json", crs=crs)
-    with warned("cameras.constant_geoid"):
-        pcfix.read_cameras(path)
 
 
 def test_gnss_is_of_the_reference_camera_east_before_north(make, tmp_path):
@@ -198,13 +177,6 @@ def test_gnss_is_of_the_reference_camera_east_before_north(make, tmp_path):
     assert found.gnss.xyz[1].tolist() == [9.0, 46.95, 512.0]
     assert found.gnss.sigma_m[1].tolist() == [0.03, 0.02, 0.05]
     assert found.unposed == (f"camera {FIRST_ID + 2}",)
-
-
-def test_without_input_cameras_frames_are_boundless(make, tmp_path):
-    path, _ = make()
-    change(tmp_path, "input-cameras.json", sensors=[])
-    with warned("cameras.no_lens"):
-        assert pcfix.read_cameras(path).lenses is None
 
 
 @pytest.mark.parametrize(

@@ -96,15 +96,6 @@ def misses_px(cameras, ties):
             yield np.hypot(*(project(cameras.lenses[i], ray[None]) - ties.image_xy[row]).T)
 
 
-@lod3
-def test_a_wrong_offset_is_noticed_and_the_absolute_table_believed():
-    cameras = read(LOD3)
-    assert cameras.unposed == ("403_0032_00130203.tif",)  # only relative, and the offset is wrong
-    assert notes(cameras) == ["cameras.tables_differ", "cameras.repeated"]
-    assert cameras.notes[0].values["metres"] == pytest.approx(218.28, abs=0.01)
-    assert np.ptp(cameras.centres[:, 2]) < 30.0
-
-
 def test_poses_of_either_table_agree(tmp_path):
     opk = (12.0, -7.0, 140.0)
     turn = Rotation.from_euler("XYZ", opk, degrees=True).as_matrix()
@@ -204,38 +195,6 @@ T2 0.02
 """
 
 
-def test_external_table_with_the_only_calibration(tmp_path):
-    path = params(tmp_path, external=external(("a.jpg", 1, 2, 3, 0, 0, 0)), cam=CAMERA.format(0))
-    cameras = read(path)
-    assert cameras.notes == ()
-    uv = project(cameras.lenses[0], np.array([[0.2, -0.1, 1.0]]))[0]
-    full = read(
-        params(tmp_path / "b", parameters=HEADER + block("a.jpg", (1, 2, 3)), offset="0 0 0")
-    )
-    expected = project(full.lenses[0], np.array([[0.2, -0.1, 1.0]]))[0]
-    assert uv * 500 == pytest.approx(expected)  # 6000 px are 12 mm
-
-
-@pytest.mark.parametrize("where", ["project", "1_initial", "params", "parameters", "external"])
-def test_any_way_into_a_project(tmp_path, where):
-    folder = params(
-        tmp_path,
-        parameters=HEADER + block("a.jpg", (1, 2, 3)),
-        external=external(("a.jpg", 11, 22, 33, 0, 0, 0)),
-        offset="10 20 30",
-    )
-    path = {
-        "project": tmp_path / "job",
-        "1_initial": tmp_path / "job" / "1_initial",
-        "params": folder,
-        "parameters": folder / "job_calibrated_camera_parameters.txt",
-        "external": folder / "job_calibrated_external_camera_parameters.txt",
-    }[where]
-    cameras = read(path)
-    assert cameras.centres.tolist() == [[11, 22, 33]]
-    assert cameras.lenses[0].focal == 4000.0
-
-
 @pytest.mark.parametrize(
     ("files", "code"),
     [
@@ -255,15 +214,6 @@ def test_what_is_missing_is_told(tmp_path, files, code):
     assert cameras.centres.tolist() == [[1, 2, 3]]
     assert cameras.rotations[0] == pytest.approx(DOWN)
     assert notes(cameras) == [code]
-
-
-def test_offsets_of_groups(tmp_path):
-    parameters = HEADER + block("402_1.tif", (1, 2, 3)) + block("403_1.tif", (1, 2, 3))
-    parameters += block("999_1.tif", (1, 2, 3))
-    path = params(tmp_path, parameters=parameters, offset="402 10 20 30\n403 100 200 300\n")
-    cameras = read(path)
-    assert cameras.centres.tolist() == [[11, 22, 33], [101, 202, 303]]
-    assert cameras.unposed == ("999_1.tif",)
 
 
 PROJECT = """<?xml version="1.0" encoding="UTF-8"?>

@@ -64,15 +64,6 @@ def test_samples_give_rotations_without_lenses():
     assert notes(cameras) == ["cameras.no_lens"]
 
 
-@pytest.mark.parametrize("elements", [("Rotation", "Position", "DistortionCoeficients"), ()])
-def test_fields_as_elements_or_attributes(tmp_path, elements):
-    cameras = read(write(tmp_path, elements=elements))
-    assert cameras.labels == ("a.jpg",)
-    assert cameras.centres.tolist() == [[10, 20, 30]]
-    assert cameras.rotations[0] == pytest.approx(TURN)
-    assert cameras.notes == ()
-
-
 @pytest.mark.parametrize(
     ("model", "k", "t"),
     [
@@ -114,13 +105,6 @@ def test_sensor_gives_the_shape(tmp_path, beside):
     lens = read(path, None if beside else sensor).lenses[0]
     uv = project(lens, np.array([[0.2, -0.1, 1.0]]))[0]
     assert uv * 50 == pytest.approx((306 + 450 * 0.2, 188 - 450 * 0.1))
-
-
-@pytest.mark.parametrize(
-    ("coordinates", "crs"), [("absolute", None), ("relative", "local"), ("rigid", "local")]
-)
-def test_frames_of_coordinates(tmp_path, coordinates, crs):
-    assert read(write(tmp_path, Coordinates=coordinates)).crs == crs
 
 
 def test_folder(tmp_path):

@@ -6,7 +6,7 @@ from pyproj import CRS
 
 import pcfix
 from pcfix.io.cameras import table
-from tests.utils.camera_files import notes, read
+from tests.utils.camera_files import read
 from tests.utils.codes import refused, warned
 from tests.utils.shared import needs
 
@@ -78,14 +78,6 @@ def test_river_keeps_cameras_that_share_a_label():
     assert (len(cameras), len(set(cameras.labels))) == (31, 24)
 
 
-def test_exact_copies_count_once(tmp_path):
-    text = "label,x,y,z\na,1,2,3\na,1,2,3\na,1,2,4\nb,1,2,3\n"
-    with warned("cameras.repeated"):
-        cameras = pcfix.read_cameras(write(tmp_path, text, sensor=None))
-    assert cameras.labels == ("a", "a", "b")
-    assert cameras.centres[:, 2].tolist() == [3, 4, 3]
-
-
 # Columns
 
 
@@ -147,12 +139,6 @@ def test_the_crs_of_a_comment(tmp_path, said, crs):
     assert plain(tmp_path, said + "\n#Label,X,Y,Z\na,1,2,3\n").crs == crs
 
 
-def test_a_crs_that_is_not_understood(tmp_path):
-    cameras = plain(tmp_path, '# CoordinateSystem: PROJCS["WGS 84" GEOGCS\n#Label,X,Y,Z\na,1,2,3\n')
-    assert cameras.crs is None
-    assert notes(cameras) == ["cameras.crs_unknown"]
-
-
 # Angles
 
 
@@ -209,21 +195,6 @@ def test_obliques_among_views_down_are_not_taken_for_a_gimbal(tmp_path):
     assert nadir(cameras) == pytest.approx([0, 1, 2, 55, 50])
 
 
-def test_the_option_chooses_between_angles_that_are_both_there(tmp_path):
-    text = "label,x,y,z,yaw,pitch,roll,omega,phi,kappa\na,1,2,3,0,20,0,10,0,0\n"
-    assert nadir(plain(tmp_path, text)) == pytest.approx([10])
-    assert nadir(plain(tmp_path, text, angles="yaw-pitch-roll")) == pytest.approx([20])
-
-
-@pytest.mark.parametrize("flip", [np.eye(3), np.diag([1.0, -1.0, -1.0])])
-def test_matrices_alone_look_down(tmp_path, flip):
-    turn = photogrammetric(0.1, -0.2, 2.0)
-    header = ",".join(f"r{i}{j}" for i in "123" for j in "123")
-    row = ",".join(map(repr, (flip @ turn).ravel().tolist()))
-    cameras = plain(tmp_path, f"label,x,y,z,{header}\na,1,2,3,{row}\n")
-    assert cameras.rotations[0] == pytest.approx(turn, abs=1e-12)
-
-
 # Software
 
 
@@ -253,14 +224,6 @@ def test_metashape_reference_has_estimates_and_sources(tmp_path):
     assert cameras.gnss.sigma_m[0].tolist() == [0.05] * 3
     assert np.isnan(cameras.gnss.xyz[1:]).all()  # b is switched off, d has none
     assert cameras.notes == ()
-
-
-def test_metashape_sources_alone_are_not_adjusted(tmp_path):
-    text = "#Label,X/Longitude,Y/Latitude,Z/Altitude,Accuracy_X/Y_(m),Accuracy_Z_(m)\n"
-    cameras = plain(tmp_path, text + "a,9.5,50.5,90,0.02,0.04\nb,,,,,\n")
-    assert cameras.labels == ("a",)
-    assert cameras.unposed == ("b",)
-    assert notes(cameras) == ["cameras.not_adjusted"]
 
 
 RC = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n"
@@ -333,35 +296,6 @@ def test_geo_txt(tmp_path):
     assert gnss.sigma_m[1].tolist() == [0.02, 0.02, 0.04]
 
 
-def test_geo_txt_as_cameras(tmp_path):
-    path = tmp_path / "geo.txt"
-    path.write_text("EPSG:4326\na.jpg -91.99 46.84 198.6 0 0 0\nb.jpg -91.98 46.84\n")
-    cameras = read(path)
-    assert cameras.centres.tolist() == [[-91.99, 46.84, 198.6]]
-    assert cameras.unposed == ("b.jpg",)
-    assert cameras.rotations is None
-    assert cameras.crs == "EPSG:4326"
-    assert notes(cameras) == ["cameras.not_adjusted"]
-
-
-EXIFTOOL = (
-    "SourceFile,FileName,GPSLatitude,GPSLongitude,GPSAltitude\n"
-    './day/a.JPG,a.JPG,"41 deg 24\' 12.20"" N","2 deg 10\' 26.50"" W",120.5 m Above Sea Level\n'
-    "./day/b.JPG,b.JPG,-41.5,2.5,-3.25\n"
-    "./day/c.JPG,c.JPG,,,\n"
-)
-
-
-def test_exiftool(tmp_path):
-    labels, gnss = gnss_of(write(tmp_path, EXIFTOOL))
-    assert labels == ("a.JPG", "b.JPG", "c.JPG")
-    assert gnss.crs == "EPSG:4326"
-    expected = [-(2 + 10 / 60 + 26.5 / 3600), 41 + 24 / 60 + 12.2 / 3600, 120.5]
-    assert gnss.xyz[0] == pytest.approx(expected, abs=1e-12)
-    assert gnss.xyz[1].tolist() == [2.5, -41.5, -3.25]
-    assert np.isnan(gnss.xyz[2]).all()
-
-
 # Tables that are not right
 
 ANGLED = "label,x,y,z,omega,phi,kappa\n"
@@ -428,12 +362,3 @@ def test_a_projection_beside_a_table_is_its_crs(tmp_path, flavour):
     assert CRS(pcfix.read_cameras(path).crs).equals(CRS(32632), ignore_axis_order=True)
     path.write_text("# crs: EPSG:25832\nlabel,x,y,z\na,500000,5200000,90\n")
     assert pcfix.read_cameras(path).crs == "EPSG:25832"  # what the table itself says counts
-
-
-def test_a_projection_that_is_none_is_noted(tmp_path):
-    """As the project of another software that ends alike."""
-    path = tmp_path / "cameras.csv"
-    path.write_text("label,x,y,z\na,500000,5200000,90\n")
-    path.with_suffix(".prj").write_bytes(b"$PROJECT 6.0.0\n\xff")
-    with warned("cameras.crs_unknown"):
-        assert pcfix.read_cameras(path).crs is None

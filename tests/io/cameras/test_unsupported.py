@@ -1,7 +1,6 @@
 """Files that are known but not read: each is refused by its name."""
 
 import json
-import zipfile
 
 import pytest
 
@@ -76,21 +75,6 @@ def test_part_of_an_export(tmp_path, name, what):
     with refused("cameras.not_read") as caught:
         pcfix.read_cameras(tmp_path / name if what == "file" else tmp_path)
     assert "of Pix4D" in caught.value.values["what"]
-
-
-@pytest.mark.parametrize("beside", ["a.jpg", "offset.xyz"])
-def test_folder_with_a_camera_file(tmp_path, beside):
-    (tmp_path / "poses.csv").write_text("label,x,y,z\na.jpg,1,2,3\n")
-    (tmp_path / beside).write_text("1 2 3\n")
-    with refused("cameras.folder", files=["poses.csv"]):
-        pcfix.read_cameras(tmp_path)
-
-
-def test_zip(tmp_path):
-    with zipfile.ZipFile(tmp_path / "all.zip", "w") as archive:
-        archive.writestr("cameras.csv", "label,x,y,z\n")
-    with refused("cameras.not_read", what="an archive (ZIP)"):
-        pcfix.read_cameras(tmp_path / "all.zip")
 
 
 @pytest.mark.parametrize(

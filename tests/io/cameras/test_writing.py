@@ -9,9 +9,9 @@ from pyproj import CRS, Transformer
 
 from pcfix.errors import InputError, SettingError
 from pcfix.io.cameras import read_cameras, read_tie_points
-from pcfix.io.cameras.colmap.writing import colmap_camera, write_colmap
+from pcfix.io.cameras.colmap.writing import write_colmap
 from pcfix.io.cameras.georeference import georeference
-from pcfix.io.cameras.opensfm.models import opensfm_camera, write_opensfm
+from pcfix.io.cameras.opensfm.models import write_opensfm
 from pcfix.io.cameras.table.sensor import write_table
 from pcfix.lens.imaging import project
 from pcfix.model import Lens, TiePoints, Views
@@ -220,14 +220,6 @@ def test_world_of_opensfm_is_topocentric(tmp_path):
     assert read.rotations == pytest.approx(cameras.rotations @ (u @ v), abs=3e-5)
 
 
-@pytest.mark.parametrize("name", [*COLMAP_LENSES, *OPENSFM_LENSES])
-def test_simplest_model_of_a_lens(tmp_path, name):
-    if name in COLMAP_LENSES:
-        assert colmap_camera(tmp_path, COLMAP_LENSES[name]).model.name == name
-    else:
-        assert opensfm_camera(tmp_path, OPENSFM_LENSES[name])["projection_type"] == name
-
-
 ODD = (
     Lens(1500.0, *FRAME, b2=0.1),
     Lens(1500.0, *FRAME, radial=(0.1, 0.01, 0.001, 1e-4)),
@@ -306,13 +298,6 @@ def test_nothing_is_replaced(tmp_path, form, name):
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
-def test_model_without_tie_points(tmp_path):
-    cameras = replace(small_block(), labels=("a b.jpg", *small_block().labels[1:]))
-    check_block(read_cameras(write("colmap", tmp_path, cameras)), cameras)
-    with refused("cameras.no_tie_points"):
-        read_tie_points(tmp_path, cameras)
-
-
 @pytest.mark.parametrize(
     ("text", "code"),
     [
@@ -327,11 +312,3 @@ def test_georeference_refused(tmp_path, text, code):
     (tmp_path / "georeference.json").write_text(text)
     with refused(code):
         read_cameras(tmp_path)
-
-
-def test_georeference_of_others_says_nothing(tmp_path):
-    write_colmap(tmp_path, small_block(), offset_m=(1.0, 2.0, 3.0))
-    (tmp_path / "georeference.json").write_text('{"offset_m": [1, 2, 3], "crs": "EPSG:32636"}')
-    found = read_cameras(tmp_path)
-    assert found.crs is None
-    assert found.centres == pytest.approx(small_block().centres - [1, 2, 3], abs=2e-9, rel=0.0)
