@@ -386,7 +386,7 @@ def dsm_text(s: DsmSummary) -> str:
     """Return the summary of a DSM."""
     total = s.width * s.height
     low, mean, high = (s.values.get(name, np.nan) for name in ("min", "mean", "max"))
-    values = vars(s) | {
+    values = s.as_dict() | {
         "part_words": _part_words(s.part),
         "low": low, "mean": mean, "high": high,
         "chosen": ", chosen for 2 to 4 points each" if s.resolution_is == "chosen" else "",
