@@ -42,9 +42,9 @@ _COUNTS = (
     ("water", "{water[surface]}", "has_shape"),
 )  # fmt: skip
 _POSES = (
-    ("poses", "centres moved {moved_rms_m:.3f} m (RMS), mean east, north, up {mean} m, largest"
-     " {moved_largest_m:.3f} m ({moved_largest_image}); turned {turned_rms_deg:.4f} deg (RMS)",
-     "moved_rms_m"),
+    ("poses", "RMS movement of the centres {moved_rms_m:.3f} m", "moved_rms_m"),
+    ("", "mean east, north, up {mean} m, largest {moved_largest_m:.3f} m ({moved_largest_image});"
+     " RMS rotation {turned_rms_deg:.4f} deg", "moved_rms_m"),
     ("precision", "standard errors of centres X, Y, Z: mean {centre_mean} m, largest"
      " {centre_largest} m; of angles: mean {angle_mean} deg, largest {angle_largest} deg",
      "centre_mean"),
@@ -214,7 +214,7 @@ def _facts(d: Plain) -> Rows:
         rows += filled(_POSES, d["poses"] | errors | {"mean": mean})
     if (g := d["gnss"]) is not None:
         words = (
-            f"{g['images']:,} images, adjusted minus GNSS east, north, up: mean"
+            f"{g['images']:,} images. Centres minus GNSS east, north, up: mean"
             f" {listed(g['mean_m'], 3, '+')} m, RMS {listed(g['rms_m'])} m, largest"
             f" {fixed(g['largest_m'], 3)} m ({g['largest_image']}); RMS before"
             f" {listed(g.get('rms_before_m'))} m"
