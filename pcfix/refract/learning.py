@@ -10,12 +10,11 @@ import numpy as np
 from pcfix.errors import SettingError
 from pcfix.model import Cameras, TiePoints, ViewKind
 from pcfix.options.correct import ScienceOptions
-from pcfix.refract.batch import UNLISTED, Batch, Learned, Survey, require_orientation
+from pcfix.refract.batch import Batch, Survey, require_orientation
 from pcfix.refract.consistent import check_consistent
 from pcfix.refract.fusion import likely_beds
 from pcfix.refract.matcher import Bed, bed_of, matcher_of, matcher_of_ties, places_for
 from pcfix.refract.methods import batches, on_land, with_rays
-from pcfix.refract.occlusion import occluder_of, wants_occlusion
 from pcfix.refract.patches import FEWEST_WITHOUT_LIST
 from pcfix.refract.reconstructions import (
     ALIKE,
@@ -29,7 +28,6 @@ from pcfix.refract.reconstructions import (
     told_by,
     weigh,
 )
-from pcfix.refract.regression import DepthRegression, raise_no_regression
 from pcfix.refract.stereo_factor import StereoFactor, stereo_factor
 from pcfix.refract.tiling import spatial_order
 from pcfix.water.surface import is_submerged
@@ -124,38 +122,6 @@ def wants_matcher(survey: Survey, views: ViewKind | None) -> bool:
         return settings.models_matcher or settings.method == "auto" or compared
     dense = views in ("depth-maps", "pair-images")
     return compared or (dense and settings.method == "consistent")
-
-
-def learn_of_points(batch: Batch, regression: DepthRegression | None) -> Batch:
-    """Return a batch that is the whole cloud, with land, with what is learned from it.
-
-    Raises
-    ------
-    SettingError
-        If the method lacks something that it needs.
-    """
-    cameras, views = batch.survey.cameras, batch.views
-    kind = None if views is None else views.kind
-    check_method(resolved(batch.survey.settings, cameras, kind), cameras)
-    batch, _ = with_factor(batch)
-    given = batch.survey.settings
-    settings = resolved(given, cameras, kind)
-    if settings.method == "regression" and regression is None:
-        raise_no_regression()
-    hides = wants_occlusion(cameras, settings)
-    listed = settings.occlusion == "auto" and views is not None
-    occluder = occluder_of(batch.xyz) if hides and not listed else None
-    learned = Learned(regression=regression, occluder=occluder)
-    batch = replace(batch, survey=replace(batch.survey, settings=settings, learned=learned))
-    if not wants_sample(batch.survey, kind):
-        return batch
-    survey, _ = learn_of_sample(batch, len(batch))
-    if views is not None and (np.diff(views.start) == 0).any():
-        hidden = occluder_of(batch.xyz) if hides else None
-        as_given = replace(batch.survey, settings=given, learned=Learned(occluder=hidden))
-        unlisted, _ = learn_of_unlisted(replace(batch, survey=as_given), len(batch))
-        survey = replace(survey, parts={UNLISTED: unlisted})
-    return replace(batch, survey=survey)
 
 
 class Near(NamedTuple):
