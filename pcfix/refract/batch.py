@@ -1,11 +1,8 @@
 """Input and output types of the correction methods.
 
-`Survey` is what all points have in common, `Batch` adds what each point has. Methods take a batch
-whose cameras are chosen; `pcfix.refract.methods.correct` chooses them.
-
-A dense matcher compared images in the geometry of its own cameras, right or wrong; the light went
-in that of the true ones. What both have in common is the place in the image: a direction in one
-geometry becomes one in the other through the lens of either (`OriginalModel`, `Images`).
+`Survey` is what all points have in common, `Batch` adds what each point has. A dense matcher
+compared images in the geometry of its own cameras; a direction there becomes one of the adjusted
+cameras by its place in the image (`OriginalModel`, `Images`).
 """
 
 from __future__ import annotations

@@ -26,8 +26,7 @@ BEST_ANGLE_DEG, NARROW_DEG, WIDE_DEG = 12.0, 4.56, 8.4
 LEAST_ANGLE_DEG, LARGEST_ANGLE_DEG = 3.0, 65.0
 LEAST_ANGLE_WEIGHT = 0.1
 REPEATED_DEG = 45.0
-"""Share of features found again in an image at another angle: exp(-(angle / REPEATED_DEG)^2).
-So nadir and oblique images have few tie points in common."""
+"""Share of features found again in an image at another angle: exp(-(angle / REPEATED_DEG)^2)."""
 
 TOLERANCE_PX2 = 0.1
 CELLS = 16

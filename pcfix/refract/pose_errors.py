@@ -13,23 +13,12 @@ POINTS_A_CELL, FEWEST = 12, 4
 
 @dataclass(frozen=True, eq=False)
 class PoseErrors:
-    """Standard errors of Z by the poses, on a grid in plan.
+    """Standard errors of Z by the poses, on a grid in plan."""
 
-    Attributes
-    ----------
-    low : array, shape (2,)
-        South-west corner, metres.
-    cell_m : float
-    sigma_m : array, shape (columns, rows)
-        In the middle of the cells.
-    middle_m : float
-        The root mean square over the bed.
-    """
-
-    low: FloatArray
+    low: FloatArray  # (2,), south-west corner, metres
     cell_m: float
-    sigma_m: FloatArray
-    middle_m: float
+    sigma_m: FloatArray  # (columns, rows), in the middle of the cells
+    middle_m: float  # root mean square over the bed
 
     def at(self, xy: FloatArray) -> FloatArray:
         """Return the standard errors at places, shape (n, 2)."""

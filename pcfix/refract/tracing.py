@@ -67,30 +67,17 @@ NEAR = 0.25
 class Tracing:
     """Paths of n pairs of an object point and a projection centre.
 
-    Attributes
-    ----------
-    piercing_xyz : array, shape (n, 3)
-        Where the light leaves the water, metres, world frame. The point itself where the light
-        goes straight; NaN where no path was found.
-    direction : array, shape (n, 3)
-        Unit vectors from the projection centre to there, world frame.
-    slope : array, shape (n, 2)
-        dz/dx and dz/dy of the surface there; on a crease those of the plane that refracts light as
-        the crease does.
-    iterations : array of int, shape (n,)
-        Steps of the method; shots of grids.
-    converged : array of bool, shape (n,)
-        Whether a path was found.
-    on_crease : array of bool, shape (n,)
-        Whether it leaves through a crease: the shortest path nearby, but no refracted ray.
+    Where light goes straight the piercing point is the object point; NaN where no path was found.
+    A path through a crease is the shortest nearby, but no refracted ray; its slope is that of the
+    plane that refracts light as the crease does.
     """
 
-    piercing_xyz: FloatArray
-    direction: FloatArray
-    slope: FloatArray
-    iterations: IntArray
-    converged: BoolArray
-    on_crease: BoolArray
+    piercing_xyz: FloatArray  # (n, 3), where the light leaves the water, metres, world frame
+    direction: FloatArray  # (n, 3), unit vectors from the projection centre to there
+    slope: FloatArray  # (n, 2), dz/dx and dz/dy of the surface there
+    iterations: IntArray  # (n,), steps of the method; shots of grids
+    converged: BoolArray  # (n,), whether a path was found
+    on_crease: BoolArray  # (n,), whether it leaves through a crease
 
 
 def trace(
