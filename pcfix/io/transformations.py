@@ -149,11 +149,8 @@ def _group(source: CRS, target: CRS, at: FloatArray, name: str) -> TransformerGr
             area = _area(parts(source)[0], at)
             return TransformerGroup(source, target, always_xy=True, area_of_interest=area)
     except (ProjError, IndexError) as error:  # the latter if PROJ finds no operation at all
-        raise bad_file(
-            name,
-            "crs.no_transformation",
-            f"PROJ cannot transform {source.name} to {target.name}. Give another CRS for one.",
-        ) from error
+        sentence = f"PROJ cannot transform {source.name} to {target.name}. Give another CRS."
+        raise bad_file(name, "crs.no_transformation", sentence) from error
 
 
 def heights_agree(source: CRS, target: CRS) -> bool:
@@ -237,12 +234,8 @@ def way_to_cloud(
         if is_local(cloud) and is_local(source):
             return None, ()
         where = (source.name, "the cloud") if is_local(cloud) else (cloud.name, name)
-        raise bad_file(
-            name,
-            "crs.local",
-            f"{where[1]} is in a local frame, the other in {where[0]}. Export both in one CRS, or"
-            " give the file's CRS as 'local' to use its numbers unchanged.",
-        )
+        sentence = f"{where[1]} is in a local frame, the other in {where[0]}. Use one CRS, or give"
+        raise bad_file(name, "crs.local", f"{sentence} that of the file as 'local'.")
     check_projected_metres(cloud, "the cloud")
     if not (source.is_projected or source.is_geographic):
         sentence = f"{source.name} is neither a map projection nor in degrees."
