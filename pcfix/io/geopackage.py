@@ -42,11 +42,8 @@ class Layer(NamedTuple):
 def check_layers(path: Path) -> None:
     """Refuse what `write_layers` cannot write."""
     if path.suffix.lower() != ".gpkg":
-        raise SettingError(
-            "output.suffix",
-            f"{path}: lines are written as GeoPackage. Give a name in .gpkg.",
-            path=path,
-        )
+        sentence = f"{path}: lines are written as GeoPackage. Give a name in .gpkg."
+        raise SettingError("output.suffix", sentence, path=path)
     load_pyogrio()
 
 

@@ -39,30 +39,15 @@ class BrokenTileError(InputError):
 
 @dataclass(frozen=True)
 class Tiles:
-    """Files that are read as one cloud, in their order.
+    """Files that are read as one cloud, in their order."""
 
-    Attributes
-    ----------
-    name : str
-        As the user names them.
-    paths : tuple of path
-    points : tuple of int
-        Of each file.
-    lows, highs : array, shape (files, 3)
-        The corners of each file, metres.
-    step_m : float
-        The coarsest scale.
-    broken : dict
-        The files that cannot be read, and why; they are not in `paths`.
-    """
-
-    name: str
+    name: str  # as the user names them
     paths: tuple[Path, ...]
-    points: tuple[int, ...]
-    lows: FloatArray
+    points: tuple[int, ...]  # of each file
+    lows: FloatArray  # corners of each file, shape (files, 3), metres
     highs: FloatArray
-    step_m: float
-    broken: dict[Path, str] = field(default_factory=dict)
+    step_m: float  # the coarsest scale
+    broken: dict[Path, str] = field(default_factory=dict)  # why other files cannot be read
 
     def __str__(self) -> str:
         return self.name

@@ -254,14 +254,15 @@ def is_ours(vlr: VLR) -> bool:
 
 
 def _note(record: tuple[int, str], content: dict[str, Any]) -> VLR:
-    number, description = record
-    text = json.dumps(content, ensure_ascii=True, separators=(",", ":"))
-    return VLR(USER_ID, number, description, text.encode())
+    return VLR(USER_ID, *record, _json(content))
+
+
+def _json(content: dict[str, Any]) -> bytes:
+    return json.dumps(content, ensure_ascii=True, separators=(",", ":")).encode()
 
 
 def _seal_of(content: dict[str, Any]) -> str:
-    text = json.dumps(content, ensure_ascii=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+    return hashlib.sha256(_json(content)).hexdigest()[:16]
 
 
 # a file has one of these for each cleaning or labelling
