@@ -106,13 +106,11 @@ def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> No
     if options.cameras is None and options.needs_cameras:
         raise _missing("cameras")
     if options.uncorrected == "drop":
-        raise SettingError(
-            "option.not_in_pdal",
-            "uncorrected 'drop': a stage of PDAL cannot set dimensions and drop points at once."
-            f' Use withhold or keep, add "{OUTCOME}=uint8" to add_dimension, and let filters.range'
-            f' keep "{OUTCOME}[0:1]".',
-            option="uncorrected",
+        sentence = (
+            f"uncorrected 'drop' is not for PDAL. Use withhold, add \"{OUTCOME}=uint8\" to"
+            f' add_dimension, and let filters.range keep "{OUTCOME}[0:1]".'
         )
+        raise SettingError("option.not_in_pdal", sentence, option="uncorrected")
     cloud = PdalCloud(ins, namespace.get("metadata"))
     results = Results(cloud, columns_for(options.dimensions, options.unsure))
     plan = read_inputs(options, _view(cloud))

@@ -16,22 +16,14 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
-from typing import NamedTuple
 
-from pcfix.errors import InputError
+from pcfix.errors import InputError, bad_file
 
 LEAST_FREE_BYTES = 65_536
 """With less free space than this, a library that fails without a reason found the disk full."""
 
-
-class _Group(NamedTuple):
-    """Files that appear together."""
-
-    stack: ExitStack
-    complete: dict[Path, Path]
-
-
-_group: ContextVar[_Group | None] = ContextVar("_group", default=None)
+_group: ContextVar[tuple[ExitStack, dict[Path, Path]] | None] = ContextVar("_group", default=None)
+"""What `all_or_none` tidies up, and the temporary file of each target."""
 
 
 @contextmanager
@@ -60,61 +52,54 @@ def temporary_output(target: Path) -> Iterator[Path]:
         ``output.disk_full`` or ``output.cannot_write``.
     """
     group = _group.get()
-    with ExitStack() as stack:
-        path = (stack if group is None else group.stack).enter_context(temporary_path(target))
-        with _errors_of(target, path):
+    with ExitStack() as own:
+        path = (group[0] if group else own).enter_context(temporary_path(target))
+        with _write_errors(target, path):
             yield path
             if target.is_file():
                 path.chmod(stat.S_IMODE(target.stat().st_mode))
             _flush(path)
-        if group is None:
-            _rename(path, target)
+        if group:
+            group[1][target] = path
         else:
-            group.complete[target] = path
+            _rename(path, target)
 
 
 @contextmanager
 def all_or_none() -> Iterator[None]:
     """Let the files that are written in the block appear when it ends well, or none of them."""
+    complete: dict[Path, Path] = {}
     with ExitStack() as stack:
-        group = _Group(stack, {})
-        token = _group.set(group)
+        token = _group.set((stack, complete))
         try:
             yield
         finally:
             _group.reset(token)
-        for target, path in group.complete.items():
+        for target, path in complete.items():
             _rename(path, target)
 
 
 @contextmanager
 def temporary_folder(target: Path) -> Iterator[Path]:
     """Give a folder to write into, which replaces the target when the block ends well."""
-    with temporary_path(target) as path, _errors_of(target, path):
+    with temporary_path(target) as path, _write_errors(target, path):
         path.mkdir()
         yield path
         for one in path.rglob("*"):
             _flush(one)
-        if target.exists():
-            with temporary_path(target.with_name(f"{target.name}.old")) as old:
+        with temporary_path(target.with_name(f"{target.name}.old")) as old:
+            if target.exists():
                 target.rename(old)
-                path.replace(target)
-        else:
             path.replace(target)
         _flush(target.parent)
 
 
 @contextmanager
 def scratch_folder(target: Path) -> Iterator[Path]:
-    """Give a folder beside a target for intermediate files; it is removed when the block ends.
-
-    Enter it after `temporary_output` of the same target, which removes what it finds.
-    """
+    """Give a folder beside a target for intermediate files; it is removed when the block ends."""
     with temporary_path(target.with_name(f"{target.name}.scratch")) as path:
-        try:
+        with _write_errors(target, path):
             path.mkdir()
-        except OSError as error:
-            raise cannot_write(target, error) from error
         yield path
 
 
@@ -122,10 +107,8 @@ def scratch_folder(target: Path) -> Iterator[Path]:
 def output_folder(folder: Path) -> Iterator[None]:
     """Make a folder for what the block writes; remove a new one again if the block fails."""
     is_new = not folder.exists()
-    try:
+    with _write_errors(folder, folder):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise cannot_write(folder, error) from error
     try:
         yield
     except BaseException:
@@ -138,27 +121,11 @@ def output_folder(folder: Path) -> Iterator[None]:
 def cannot_write(target: Path, error: Exception, written: Path | None = None) -> InputError:
     """Return the error for a file that cannot be written; `written` is its temporary path."""
     if is_full_disk(target.absolute().parent, error):
-        return InputError(
-            "output.disk_full",
-            f"{target}: no space left on the disk of {disk_of(target)}. Free some space, or write"
-            " to another disk.",
-            path=target,
-        )
+        sentence = "no space left on the disk. Free some space, or write to another disk."
+        return bad_file(target, "output.disk_full", sentence)
     reason = getattr(error, "strerror", None) or str(error).strip().rstrip(".")
-    if written is not None:
-        reason = reason.replace(str(written), target.name)
-    return InputError(
-        "output.cannot_write", f"{target}: cannot be written ({reason}).", path=target
-    )
-
-
-def disk_of(path: Path) -> str:
-    """Describe where the disk of a path is mounted, and how much of it is free."""
-    around = Path(os.path.realpath(path)).parents
-    mount = next((one for one in around if one.is_mount()), around[-1])
-    with suppress(OSError):
-        return f"{mount} ({shutil.disk_usage(mount).free / 1e6:,.1f} MB free)"
-    return str(mount)
+    reason = reason.replace(str(written), target.name)
+    return bad_file(target, "output.cannot_write", f"cannot be written ({reason}).")
 
 
 def is_full_disk(folder: Path, error: Exception) -> bool:
@@ -173,7 +140,7 @@ def is_full_disk(folder: Path, error: Exception) -> bool:
 
 
 @contextmanager
-def _errors_of(target: Path, path: Path) -> Iterator[None]:
+def _write_errors(target: Path, path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
@@ -181,7 +148,7 @@ def _errors_of(target: Path, path: Path) -> Iterator[None]:
 
 
 def _rename(path: Path, target: Path) -> None:
-    with _errors_of(target, path):
+    with _write_errors(target, path):
         path.replace(target)
     _flush(target.parent)
 

@@ -13,13 +13,13 @@ import numpy.typing as npt
 
 from pcfix.blocks import FEW_ROWS, blocks, empty, kept, let_go, mapped
 from pcfix.compare.match import Reference, SurveyCloud
-from pcfix.errors import InputError, PcfixWarning
+from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.crs import is_same, parts
 from pcfix.io.files import check_input, path_of
 from pcfix.io.las.columns import SHIFTS
 from pcfix.io.las.source import LasSource, coordinates, stated_crs
 from pcfix.io.las.writing import own_settings
-from pcfix.io.rasters import place_of, read_masked
+from pcfix.io.rasters import open_raster, place_of, read_masked
 from pcfix.io.tables import read_table
 from pcfix.io.tiles import SUFFIXES, Clouds, Tiles, cloud_of, open_cloud
 from pcfix.model import (
@@ -104,12 +104,9 @@ def survey_cloud(
         let_go()
     xyz, water_m, bathymetric, *shifts = (column[:first] for column in columns)
     if first == 0:
-        raise InputError(
-            "cloud.nothing_left",
-            f"{name}: every point is withheld or in a class that is skipped"
-            f" ({', '.join(map(str, skip_classes))}); there is nothing to compare.",
-            path=name,
-        )
+        skipped = ", ".join(map(str, skip_classes))
+        sentence = f"every point is withheld or in a class that is skipped ({skipped})."
+        raise bad_file(name, "cloud.nothing_left", sentence)
     exact = given or not mapped(np.isfinite, water_m).any()
     return SurveyCloud(
         name,
@@ -151,12 +148,8 @@ def own_water(source: LasSource) -> WaterSurface | None:
         plane = None if ours is None else ours["water_plane"]
         return None if plane is None else WaterPlane(*map(float, plane))
     except (ValueError, TypeError, KeyError) as error:
-        raise InputError(
-            "cloud.vlr_damaged",
-            f"{source.path}: the VLR in which pcfix recorded the correction is damaged ({error})."
-            " Correct the original again.",
-            path=source.path,
-        ) from error
+        sentence = f"the record of its correction is damaged ({error}). Correct the original again."
+        raise bad_file(source.path, "cloud.vlr_damaged", sentence) from error
 
 
 WATER_CLASSES = (9, 41, 42, 45)
@@ -196,41 +189,25 @@ def read_reference(reference: Clouds) -> Reference:
         return Reference(str(source), xyz, None, sparse=True)
     if suffix in (".tif", ".tiff"):
         return _read_grid(source)
-    raise InputError(
-        "reference.unknown",
-        f"{source}: is not a reference that pcfix can read. Give {KINDS}.",
-        path=source,
-    )
+    sentence = f"is not a reference that pcfix can read. Give {KINDS}."
+    raise bad_file(source, "reference.unknown", sentence)
 
 
 def _read_grid(path: Path) -> Reference:
     """Read the first band of a GeoTIFF as points."""
-    import rasterio
     from pyproj import CRS
-    from rasterio import errors
 
-    try:
-        with rasterio.open(path) as grid:
-            band = read_masked(grid)
-            transform, wkt = grid.transform, grid.crs.to_wkt() if grid.crs else None
-            scale, offset = grid.scales[0], grid.offsets[0]
-    except (errors.RasterioError, errors.RasterioIOError) as error:  # up to 1.3 no kin
-        raise InputError(
-            "raster.damaged", f"{path}: is not a readable GeoTIFF ({error}).", path=path
-        ) from error
+    with open_raster(path) as grid:
+        height = read_masked(grid) * grid.scales[0] + grid.offsets[0]
+        transform, crs = grid.transform, CRS(grid.crs.to_wkt()) if grid.crs else None
     if transform.is_identity:
-        raise InputError(
-            "raster.not_georeferenced",
-            f"{path}: has no georeference. Give a georeferenced GeoTIFF.",
-            path=path,
-        )
-    height = band * scale + offset
+        sentence = "has no georeference. Give a georeferenced GeoTIFF."
+        raise bad_file(path, "raster.not_georeferenced", sentence)
     row, column = np.nonzero(np.isfinite(height))
     if len(row) == 0:
-        raise InputError("raster.empty", f"{path}: no cell contains a height.", path=path)
+        raise bad_file(path, "raster.empty", "no cell contains a height.")
     x, y = place_of(transform, column + 0.5, row + 0.5)
     xyz = np.column_stack([x, y, height[row, column]])
-    crs = CRS.from_wkt(wkt) if wkt else None
     return Reference(str(path), xyz, crs, height.size - len(xyz), raster=True)
 
 
@@ -242,41 +219,18 @@ def check_same_crs(cloud: str, crs: CRS | None, reference: str, other: CRS | Non
     """
     for name, one in ((cloud, crs), (reference, other)):
         if one is not None and one.is_geographic:
-            raise InputError(
-                "crs.degrees",
-                f"{name}: is in degrees ({one.name}). Reproject it to a CRS in metres first.",
-                path=name,
-                crs=one.name,
-            )
+            sentence = f"is in degrees ({one.name}). Reproject it to a CRS in metres first."
+            raise bad_file(name, "crs.degrees", sentence, crs=one.name)
     if crs is None or other is None:
-        if (crs is None) != (other is None):
-            bare, full = (cloud, other) if crs is None else (reference, crs)
-            warnings.warn(
-                PcfixWarning(
-                    "crs.assumed",
-                    f"{bare} names no CRS; {full.name if full else ''} is assumed.",
-                    path=bare,
-                ),
-                stacklevel=3,
-            )
+        if crs is not other:
+            bare, name = (cloud, other.name) if other else (reference, crs.name if crs else "")
+            sentence = f"{bare} names no CRS; {name} is assumed."
+            warnings.warn(PcfixWarning("crs.assumed", sentence, path=bare), stacklevel=3)
         return
-    plan, height = parts(crs)
-    other_plan, other_height = parts(other)
-    if not is_same(plan, other_plan):
-        raise InputError(
-            "crs.differs",
-            f"{cloud} is in {plan.name}, {reference} in {other_plan.name}. Transform the reference"
-            " to the CRS of the cloud first, heights included (PDAL's filters.reprojection).",
-            path=reference,
-            crs=other_plan.name,
-            expected=plan.name,
-        )
-    if height is not None and other_height is not None and not is_same(height, other_height):
-        raise InputError(
-            "crs.heights_differ",
-            f"{cloud} has heights in {height.name}, {reference} in {other_height.name}. Transform"
-            " the heights of the reference first.",
-            path=reference,
-            crs=other_height.name,
-            expected=height.name,
-        )
+    for code, one, another in zip(
+        ("crs.differs", "crs.heights_differ"), parts(crs), parts(other), strict=True
+    ):
+        if one is not None and another is not None and not is_same(one, another):
+            sentence = f"is in {another.name}, the cloud in {one.name}. Transform it to that first."
+            values = {"crs": another.name, "expected": one.name}
+            raise bad_file(reference, code, sentence, **values)

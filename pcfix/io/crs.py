@@ -236,11 +236,6 @@ class Topocentric:
         """Return geocentric coordinates (EPSG:4978) of points (n, 3), metres."""
         from pyproj import Transformer
 
-        to_geocentric = Transformer.from_crs(GEOGRAPHIC_WGS84, GEOCENTRIC_WGS84, always_xy=True)
-        place = self.longitude_deg, self.latitude_deg, self.height_m
-        lon, lat = np.radians(place[:2])
-        # east, north and up in geocentric axes, one a row
-        up = [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)]
-        north = [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)]
-        axes = np.array([[-np.sin(lon), np.cos(lon), 0.0], north, up])
-        return np.asarray(to_geocentric.transform(*place)) + enu @ axes
+        at = f"+lat_0={self.latitude_deg!r} +lon_0={self.longitude_deg!r} +h_0={self.height_m!r}"
+        topocentric = f"+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 {at}"
+        return np.column_stack(Transformer.from_pipeline(topocentric).transform(*enu.T))

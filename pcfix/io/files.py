@@ -24,14 +24,13 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.blocks import Empty, on_disk
-from pcfix.errors import InputError, SettingError, refusal
+from pcfix.errors import InputError, SettingError, bad_file, refusal
 from pcfix.grid.lattice import Window
-from pcfix.io.atomic import disk_of, temporary_output
+from pcfix.io.atomic import temporary_output
 from pcfix.model import FloatArray, IntArray
 from pcfix.options.declare import File
 from pcfix.sums import Sums
 
-LARGE_BYTES = 2**26
 LAST_LINES = 3
 """Of what another program says when it fails."""
 
@@ -39,12 +38,10 @@ LAST_LINES = 3
 def path_of(path: Any) -> Path:
     """Return a path as an object; the address of an object store is refused."""
     if re.match(r"\w{2,}:/", str(path)):  # of s3:// a Path leaves s3:/
-        raise InputError(
-            "input.remote",
-            f"{path}: pcfix reads and writes local files only. Copy the file first, or use"
-            " 'pcfix pipeline': PDAL reads addresses.",
-            path=path,
+        sentence = (
+            "is not a local file. Copy it first, or use 'pcfix pipeline', as PDAL can read it."
         )
+        raise bad_file(path, "input.remote", sentence)
     return path if isinstance(path, Path) else Path(path)
 
 
@@ -59,7 +56,7 @@ def check_input(path: File) -> Path:
         why = f"is {kind}; give a file"
     except OSError as error:
         why = refusal(error)
-    raise InputError("input.unreadable", f"{found}: {why}.", path=found)
+    raise bad_file(found, "input.unreadable", f"{why}.")
 
 
 def kind_of(mode: int) -> str:
@@ -116,38 +113,27 @@ def check_output(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) ->
     SettingError
         If it is one of the inputs, exists without `overwrite`, or has no folder.
     """
+
+    def refused(code: str, sentence: str) -> SettingError:
+        return SettingError(f"output.{code}", f"{target}: {sentence}", path=target)
+
     target = path_of(path)
     for source in inputs:
         if is_same(target, source):
-            raise SettingError(
-                "output.is_input",
-                f"{target}: output and {source} are the same file. Give the output another name.",
-                path=target,
-            )
+            raise refused("is_input", f"is also the input {source}. Give the output another name.")
     try:
         kind = kind_of(target.stat().st_mode)
     except (FileNotFoundError, NotADirectoryError):
-        kind = None
+        if not target.parent.is_dir():
+            sentence = f"the folder {target.parent} does not exist. Make it first."
+            raise refused("no_folder", sentence) from None
+        return target
     except OSError as error:
-        raise SettingError(
-            "output.cannot_write", f"{target}: {refusal(error)}.", path=target
-        ) from error
+        raise refused("cannot_write", f"{refusal(error)}.") from error
     if kind:
-        raise SettingError(
-            "output.not_a_file", f"{target}: the output is {kind}. Give a file name.", path=target
-        )
-    if kind is not None and not overwrite:
-        raise SettingError(
-            "output.exists",
-            f"{target}: the output exists. Add --overwrite to replace it.",
-            path=target,
-        )
-    if not target.parent.is_dir():
-        raise SettingError(
-            "output.no_folder",
-            f"{target}: the folder {target.parent} does not exist. Make it first.",
-            path=target,
-        )
+        raise refused("not_a_file", f"the output is {kind}. Give a file name.")
+    if not overwrite:
+        raise refused("exists", "the output exists. Add --overwrite to replace it.")
     return target
 
 
@@ -211,8 +197,8 @@ def read_json(path: Path) -> Any:
 def write_bytes(path: File, data: bytes, *, overwrite: bool) -> None:
     """Write a small file under the same rules."""
     target = check_output(path, overwrite=overwrite)
-    with temporary_output(target) as draft:
-        draft.write_bytes(data)
+    with temporary_output(target) as temporary:
+        temporary.write_bytes(data)
 
 
 def write_text(path: File, text: str, *, overwrite: bool) -> None:
@@ -229,11 +215,8 @@ def run_logged(words: list[str], log: Path) -> tuple[int, list[str]]:
         with log.open("wb") as stream:
             done = subprocess.run(words, stdout=stream, stderr=subprocess.STDOUT, check=False)
     except OSError as error:
-        raise InputError(
-            "photos.command",
-            f"{words[0]}: cannot be run ({error.strerror or error}).",
-            command=words[0],
-        ) from error
+        sentence = f"{words[0]}: cannot be run ({error.strerror or error})."
+        raise InputError("photos.command", sentence, command=words[0]) from error
     lines = log.read_text("utf-8", errors="replace").splitlines()
     return done.returncode, [line.strip() for line in lines if line.strip()][-LAST_LINES:]
 
@@ -263,13 +246,8 @@ def scratch_arrays(target: Path) -> Iterator[Empty]:
                     stream.truncate(size)
                 one = mmap.mmap(stream.fileno(), size)
         except OSError as error:
-            raise InputError(
-                "output.disk_full",
-                f"{target}: {size / 1e9:,.1f} GB of temporary space are not available on the disk"
-                f" of {disk_of(target)}: {error.strerror or error}. Free some space, or write to"
-                " another disk.",
-                path=target,
-            ) from error
+            sentence = f"its disk lacks {size / 1e9:,.1f} GB of temporary space. Free some space."
+            raise bad_file(target, "output.disk_full", sentence) from error
         maps.add(one)
         return np.frombuffer(one, dtype).reshape(shape)
 
@@ -286,22 +264,18 @@ class Bins:
     """Points sorted by place into one file without a name, on the disk of a folder.
 
     The plane is divided into squares of `side` cells; `corner` is the column and row of a corner of
-    the squares, counted from x = 0 and y = 0. Each point has so many `numbers` (float64): its
-    coordinates, and what else belongs to it.
+    the squares. Each point has `numbers` float64 values: its coordinates, and what belongs to it.
     """
 
     def __init__(self, folder: Path, side: int, corner: Iterable[int], numbers: int = 3) -> None:
         self.side, self._numbers = side, numbers
         self._stream = TemporaryFile(dir=folder)  # noqa: SIM115  # closed with this object
         self._corner = np.array(list(corner), np.int64)
+        # offset in the file and number of points, for the pieces of each square
         self._pieces: dict[tuple[int, int], list[tuple[int, int]]] = {}
-        """Of each square the offsets in the file, and how many points lie there."""
 
     def add(self, cell: IntArray, xyz: FloatArray) -> None:
-        """Store points, shape (n, numbers), by columns and rows of their cells, shape (n, 2).
-
-        Points of one cell keep their order.
-        """
+        """Store points, shape (n, numbers), by columns and rows of their cells, shape (n, 2)."""
         square = (cell - self._corner) // self.side
         order = np.lexsort((square[:, 0], square[:, 1]))
         square, xyz = square[order], xyz[order]
@@ -313,10 +287,7 @@ class Bins:
             offset += self._stream.write(xyz[start:stop].tobytes())
 
     def read(self, cells: Window) -> FloatArray:
-        """Return the points, shape (n, numbers), of all squares that touch a window.
-
-        Points of the squares outside the window are among them.
-        """
+        """Return the points, shape (n, numbers), of all squares that touch a window."""
         data = bytearray()
         for offset, points in self._touched(cells):
             self._stream.seek(offset)
@@ -329,8 +300,9 @@ class Bins:
 
     def _touched(self, cells: Window) -> list[tuple[int, int]]:
         """Return the pieces of all squares that touch a window."""
-        column, row = self._corner.tolist()
-        left, right = (cells.column - column) // self.side, (cells.column_stop - 1 - column)
-        top, bottom = (cells.row - row) // self.side, (cells.row_stop - 1 - row)
-        columns, rows = range(left, right // self.side + 1), range(top, bottom // self.side + 1)
+        first, last = (cells.column, cells.row), (cells.column_stop - 1, cells.row_stop - 1)
+        (left, top), (right, bottom) = (
+            (np.array((first, last)) - self._corner) // self.side
+        ).tolist()
+        columns, rows = range(left, right + 1), range(top, bottom + 1)
         return [piece for r in rows for c in columns for piece in self._pieces.get((c, r), ())]

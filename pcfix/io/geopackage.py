@@ -42,11 +42,8 @@ class Layer(NamedTuple):
 def check_layers(path: Path) -> None:
     """Refuse what `write_layers` cannot write."""
     if path.suffix.lower() != ".gpkg":
-        raise SettingError(
-            "output.suffix",
-            f"{path}: lines are written as GeoPackage. Give a name in .gpkg.",
-            path=path,
-        )
+        sentence = f"{path}: lines are written as GeoPackage. Give a name in .gpkg."
+        raise SettingError("output.suffix", sentence, path=path)
     load_pyogrio()
 
 
@@ -56,40 +53,35 @@ def write_layers(
     """Write layers in a CRS as one GeoPackage."""
     target = check_output(path, overwrite=overwrite)
     wkt = None if crs is None else parse_crs(crs, "the cloud").to_wkt()
-    with temporary_output(target) as draft, warnings.catch_warnings():
+    with temporary_output(target) as temporary, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a cloud may have no CRS
         try:
             for number, one in enumerate(layers):
                 geometry = shapely.to_wkb(np.array([*one.geometries, None], object)[:-1])
                 load_pyogrio().raw.write(
-                    draft, geometry, [np.asarray(v) for v in one.values.values()],
+                    temporary, geometry, [np.asarray(v) for v in one.values.values()],
                     list(one.values), layer=one.name, crs=wkt, driver="GPKG",
                     geometry_type=one.kind, append=number > 0,
                     **({} if number else {"dataset_options": OLDER}),
                 )  # fmt: skip
-            _write_styles(draft, [one for one in layers if one.style])
+            _write_styles(temporary, [one for one in layers if one.style])
         except RuntimeError as error:
-            raise cannot_write(target, error, draft) from error
+            raise cannot_write(target, error, temporary) from error
 
 
 def _write_styles(path: Path, layers: Sequence[Layer]) -> None:
     """Add the table of styles, as QGIS writes it."""
-    if not layers:
-        return
-    same = {"f_table_catalog": "", "f_table_schema": "", "f_geometry_column": "geom"}
-    columns = {
-        **{name: [value] * len(layers) for name, value in same.items()},
-        "f_table_name": [one.name for one in layers],
-        "styleName": [one.name for one in layers],
-        "styleQML": [one.style for one in layers],
-        "styleSLD": [""] * len(layers),
-        "useAsDefault": np.ones(len(layers), bool),
-        "description": ["pcfix"] * len(layers),
-        "owner": [""] * len(layers),
-        "update_time": np.full(len(layers), "2020-01-01", "datetime64[ms]"),
-    }
-    fields = [v if isinstance(v, np.ndarray) else np.array(v, object) for v in columns.values()]
-    load_pyogrio().raw.write(
-        path, None, fields, list(columns), layer=STYLES, driver="GPKG", append=True, crs=None,
-        geometry_type=None,
-    )  # fmt: skip
+    columns: dict[str, Any] = {
+        "f_table_catalog": "", "f_table_schema": "", "f_geometry_column": "geom",
+        "f_table_name": [one.name for one in layers], "styleName": [one.name for one in layers],
+        "styleQML": [one.style for one in layers], "styleSLD": "", "description": "pcfix",
+        "owner": "",
+    }  # fmt: skip
+    fields = {name: np.full(len(layers), value, object) for name, value in columns.items()}
+    fields["useAsDefault"] = np.ones(len(layers), bool)
+    fields["update_time"] = np.full(len(layers), "2020-01-01", "datetime64[ms]")
+    if layers:
+        load_pyogrio().raw.write(
+            path, None, [*fields.values()], [*fields], layer=STYLES, driver="GPKG", append=True,
+            crs=None, geometry_type=None,
+        )  # fmt: skip

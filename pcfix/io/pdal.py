@@ -121,11 +121,7 @@ class Flags:
 
     def __init__(self, ins: Dimensions, packed: bool, unpacked: bool) -> None:
         if "Classification" not in ins:
-            raise SettingError(
-                "cloud.dimension_missing",
-                f'{NAME}: has no Classification. Add "Classification=uint8" to add_dimension.',
-                dimension="Classification",
-            )
+            raise _missing("Classification", "uint8")
         self._ins = ins
         self.unpacked = unpacked
         self.classes = np.array(ins["Classification"], order="C")
@@ -133,13 +129,8 @@ class Flags:
         if packed and "Withheld" not in ins:
             bits = self.classes >> 5
             self.classes &= 31
-            if self._class_flags is None:
-                raise SettingError(
-                    "cloud.dimension_missing",
-                    f"{NAME}: this PDAL has the flags of point formats 0 to 5 in Classification,"
-                    f' where class 40 does not fit. Add "{CLASS_FLAGS}" to add_dimension.',
-                    dimension="ClassFlags",
-                )
+            if self._class_flags is None:  # class 40 does not fit beside flags in Classification
+                raise _missing(*CLASS_FLAGS.split("="))
             self._class_flags |= bits.astype(self._class_flags.dtype)
             self.unpacked = True
         if "Withheld" in ins:
@@ -161,6 +152,11 @@ class Flags:
         return out
 
 
+def _missing(dimension: str, kind: str) -> SettingError:
+    sentence = f'{NAME}: has no {dimension}. Add "{dimension}={kind}" to add_dimension.'
+    return SettingError("cloud.dimension_missing", sentence, dimension=dimension)
+
+
 class Results:
     """The output arrays of a correction: C-contiguous, of PDAL's own types and length."""
 
@@ -168,12 +164,9 @@ class Results:
         """Check that the pipeline added the columns."""
         ins = cloud.ins
         if missing := [c.name for c in columns if c.name not in ins]:
-            raise SettingError(
-                "cloud.dimension_missing",
-                f"add_dimension: {', '.join(missing)} missing. Give"
-                f' "{add_dimension(columns)}", or set dimensions to minimal or none.',
-                dimension=missing[0],
-            )
+            sentence = f"add_dimension: {', '.join(missing)} missing. Give"
+            sentence += f' "{add_dimension(columns)}", or set dimensions to minimal or none.'
+            raise SettingError("cloud.dimension_missing", sentence, dimension=missing[0])
         for column in columns:
             if column.scale != 1.0 and ins[column.name].dtype.kind != "f":
                 sentence = f"add_dimension: {column.name} must be float."

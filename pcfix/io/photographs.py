@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import InputError, PcfixError, SettingError
+from pcfix.errors import PcfixError, SettingError, bad_file
 from pcfix.io.atomic import temporary_output
 from pcfix.io.files import check_output
 from pcfix.libraries import photo_library
@@ -34,16 +34,11 @@ Pixels = npt.NDArray[Any]
 def photographs_in(folder: Path) -> list[Path]:
     """Return the photographs directly in a folder, in the order of their names."""
     if not folder.is_dir():
-        raise InputError(
-            "photos.no_folder",
-            f"{folder}: is not a folder. Give that of the photographs.",
-            path=folder,
-        )
+        sentence = "is not a folder. Give that of the photographs."
+        raise bad_file(folder, "photos.no_folder", sentence)
     found = sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file())
     if not found:
-        raise InputError(
-            "photos.none", f"{folder}: has no photographs ({', '.join(SUFFIXES)}).", path=folder
-        )
+        raise bad_file(folder, "photos.none", f"has no photographs ({', '.join(SUFFIXES)}).")
     return found
 
 
@@ -51,10 +46,8 @@ def size_of(path: Path) -> tuple[int, int]:
     """Return columns and rows of a photograph, from its header."""
     with _readable(path):
         if path.suffix.lower() in TIFF:
-            tifffile = photo_library("tifffile")
-            with tifffile.TiffFile(path) as file:
-                page: Any = file.pages[0]
-                return int(page.imagewidth), int(page.imagelength)
+            with photo_library("tifffile").TiffFile(path) as file:
+                return int(file.pages[0].imagewidth), int(file.pages[0].imagelength)
         from PIL import Image
 
         with Image.open(path) as image:
@@ -63,8 +56,23 @@ def size_of(path: Path) -> tuple[int, int]:
 
 def read_photograph(path: Path) -> Pixels:
     """Return the pixels as stored, shape (rows, columns, bands), not rotated by EXIF."""
+    suffix = path.suffix.lower()
     with _readable(path):
-        pixels = _pixels(path)
+        if suffix in TIFF:
+            with photo_library("tifffile").TiffFile(path) as file:
+                page = file.pages[0]
+                pixels = page.asarray()
+                pixels = pixels if page.planarconfig == 1 else np.moveaxis(pixels, 0, -1)
+        elif suffix in PNG:
+            cv2 = photo_library("cv2")
+            pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+            if pixels is None:
+                raise ValueError("no PNG")
+        else:
+            from PIL import Image
+
+            with Image.open(path) as image:
+                pixels = np.asarray(image)
     return pixels if pixels.ndim == 3 else pixels[..., None]
 
 
@@ -72,36 +80,13 @@ def read_colours(path: Path) -> Pixels:
     """Return pixels of 8 or 16 bits, red before blue in every format, without alpha."""
     pixels = read_photograph(path)
     if pixels.dtype not in (np.uint8, np.uint16):
-        raise InputError(
-            "photos.kind",
-            f"{path}: has {pixels.dtype} pixels. Give photographs of 8 or 16 bits.",
-            path=path,
-            kind=pixels.dtype,
-        )
+        sentence = f"has {pixels.dtype} pixels. Give photographs of 8 or 16 bits."
+        raise bad_file(path, "photos.kind", sentence, kind=pixels.dtype)
     if pixels.shape[2] == 4 and path.suffix.lower() not in TIFF:
         pixels = pixels[..., :3]
     if pixels.shape[2] == 3 and path.suffix.lower() in PNG:
         pixels = pixels[..., ::-1]
     return np.ascontiguousarray(pixels)
-
-
-def _pixels(path: Path) -> Pixels:
-    suffix = path.suffix.lower()
-    if suffix in TIFF:
-        tifffile = photo_library("tifffile")
-        with tifffile.TiffFile(path) as file:
-            page = file.pages[0]
-            return page.asarray() if page.planarconfig == 1 else np.moveaxis(page.asarray(), 0, -1)
-    if suffix in PNG:
-        cv2 = photo_library("cv2")
-        found = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        if found is None:
-            raise ValueError("no PNG")
-        return np.asarray(found)
-    from PIL import Image
-
-    with Image.open(path) as image:
-        return np.asarray(image)
 
 
 @contextmanager
@@ -112,34 +97,25 @@ def _readable(path: Path) -> Iterator[None]:
     except PcfixError:
         raise
     except Exception as error:  # of any kind, where a tag has another type than it should
-        raise InputError(
-            "photos.damaged",
-            f"{path}: is damaged, or not a photograph ({error}). Copy it from the camera again.",
-            path=path,
-        ) from error
+        sentence = f"is damaged, or not a photograph ({error}). Copy it from the camera again."
+        raise bad_file(path, "photos.damaged", sentence) from error
 
 
 def write_photograph(source: Path, target: Path, pixels: Pixels, touched: BoolArray) -> None:
-    """Write a photograph that changed in part.
+    """Write a photograph whose pixels differ from the source where `touched`, with its metadata.
 
-    Parameters
-    ----------
-    source, target : path
-        The original, whose metadata are kept, and the new file, of the same suffix.
-    pixels : array, shape (rows, columns, bands)
-    touched : array of bool, shape (rows, columns)
-        Where the pixels differ from the source.
+    Both files have the same suffix; the shapes are (rows, columns, bands) and (rows, columns).
     """
     suffix = source.suffix.lower()
     write = _write_jpeg if suffix in JPEG else _write_tiff if suffix in TIFF else _write_png
-    with temporary_output(target) as draft:
+    with temporary_output(target) as path:
         if touched.any():
-            write(source, draft, pixels, touched)
+            write(source, path, pixels, touched)
         else:
-            shutil.copyfile(source, draft)
+            shutil.copyfile(source, path)
 
 
-def _write_jpeg(source: Path, draft: Path, pixels: Pixels, touched: BoolArray) -> None:
+def _write_jpeg(source: Path, path: Path, pixels: Pixels, touched: BoolArray) -> None:
     """Encode the changed blocks with the tables of the source, and copy the others."""
     jpeglib = photo_library("jpeglib")
     from PIL import Image
@@ -149,52 +125,43 @@ def _write_jpeg(source: Path, draft: Path, pixels: Pixels, touched: BoolArray) -
         how: dict[str, Any] = {"qtables": old.quantization}
         if old.mode != "L":
             how["subsampling"] = get_sampling(old)
-    Image.fromarray(pixels.squeeze()).save(draft, "JPEG", **how)
-    whole, new = jpeglib.read_dct(str(source)), jpeglib.read_dct(str(draft))
+    Image.fromarray(pixels.squeeze()).save(path, "JPEG", **how)
+    whole, new = jpeglib.read_dct(str(source)), jpeglib.read_dct(str(path))
     most = whole.samp_factor.max(axis=0)
     for name, factor in zip(("Y", "Cb", "Cr"), whole.samp_factor, strict=False):
         blocks = getattr(whole, name)
         if blocks is not None:
             side = 8 * most // factor
-            changed = _any_in_blocks(touched, side, blocks.shape[:2])
+            high, wide = blocks.shape[0] * side[0], blocks.shape[1] * side[1]
+            grid = np.zeros((high, wide), bool)  # the last blocks may reach beyond the image
+            part = touched[:high, :wide]
+            grid[: part.shape[0], : part.shape[1]] = part
+            changed = grid.reshape(-1, side[0], blocks.shape[1], side[1]).any(axis=(1, 3))
             blocks[changed] = getattr(new, name)[changed]
-    whole.write_dct(str(draft))
+    whole.write_dct(str(path))
 
 
-def _any_in_blocks(touched: BoolArray, side: npt.NDArray[Any], shape: tuple[int, int]) -> BoolArray:
-    """Return for each block, whose sides are in pixels, whether any of its pixels changed."""
-    rows, columns = (int(a) for a in side)
-    wide = np.zeros((shape[0] * rows, shape[1] * columns), bool)
-    high, across = min(touched.shape[0], wide.shape[0]), min(touched.shape[1], wide.shape[1])
-    wide[:high, :across] = touched[:high, :across]
-    return np.asarray(wide.reshape(shape[0], rows, shape[1], columns).any(axis=(1, 3)))
-
-
-def _write_tiff(source: Path, draft: Path, pixels: Pixels, touched: BoolArray) -> None:
+def _write_tiff(source: Path, path: Path, pixels: Pixels, touched: BoolArray) -> None:
     """Write the pixels into a copy if they are uncompressed, else a new file with the same tags."""
     tifffile = photo_library("tifffile")
     with tifffile.TiffFile(source) as file:
         page = file.pages[0]
-        plain = page.is_memmappable and page.is_contiguous
-        planar = page.planarconfig == 2
-        kept = [
-            (tag.code, tag.dtype, tag.count, tag.value, True)
-            for tag in page.tags.values()
-            if tag.code in _TIFF_KEPT
-        ]
+        plain, planar = page.is_memmappable and page.is_contiguous, page.planarconfig == 2
+        tags = [tag for tag in page.tags.values() if tag.code in _TIFF_KEPT]
         how: dict[str, Any] = {
-            "photometric": page.photometric, "compression": page.compression, "extratags": kept,
+            "photometric": page.photometric, "compression": page.compression,
+            "extratags": [(tag.code, tag.dtype, tag.count, tag.value, True) for tag in tags],
             "planarconfig": "separate" if planar else "contig",
         }  # fmt: skip
     stored = np.moveaxis(pixels, -1, 0) if planar else pixels
     stored = stored[..., 0] if pixels.shape[2] == 1 and not planar else stored
     if plain:
-        shutil.copyfile(source, draft)
-        place = tifffile.memmap(draft, page=0, mode="r+")
+        shutil.copyfile(source, path)
+        place = tifffile.memmap(path, page=0, mode="r+")
         place[...] = stored.reshape(place.shape)
         place.flush()
-        return
-    tifffile.imwrite(draft, stored, metadata=None, **how)
+    else:
+        tifffile.imwrite(path, stored, metadata=None, **how)
 
 
 _TIFF_KEPT = {270, 271, 272, 274, 282, 283, 296, 305, 306, 315, 700, 33432, 33550, 33922, 34735,
@@ -202,7 +169,7 @@ _TIFF_KEPT = {270, 271, 272, 274, 282, 283, 296, 305, 306, 315, 700, 33432, 3355
 """Texts, resolution, rotation, XMP, GeoTIFF keys, and tags of multispectral cameras."""
 
 
-def _write_png(source: Path, draft: Path, pixels: Pixels, touched: BoolArray) -> None:
+def _write_png(source: Path, path: Path, pixels: Pixels, touched: BoolArray) -> None:
     """Write the pixels, and every other chunk of the source."""
     cv2 = photo_library("cv2")
     _, data = cv2.imencode(".png", pixels)
@@ -214,7 +181,7 @@ def _write_png(source: Path, draft: Path, pixels: Pixels, touched: BoolArray) ->
         out.write(chunk)
         if name == b"IHDR":
             out.writelines(beside)
-    draft.write_bytes(out.getvalue())
+    path.write_bytes(out.getvalue())
 
 
 def _chunks(data: bytes) -> list[tuple[bytes, bytes]]:
@@ -229,25 +196,15 @@ def _chunks(data: bytes) -> list[tuple[bytes, bytes]]:
 
 @dataclass(frozen=True)
 class Frames:
-    """A sequence of images of one size.
+    """A sequence of images of one size, from a folder or from every n-th frame of a video.
 
-    Attributes
-    ----------
-    path : path
-        Of the folder or the video.
-    photographs : tuple of path
-        Empty for a video.
-    names : tuple of str
-        Of the frames, without a suffix.
-    interval_s : float or None
-        Between frames, where a video states it.
-    every : int
-        Only every so many-th frame of a video is used.
+    `photographs` is empty for a video. `interval_s` is the time between frames, where a video
+    states it.
     """
 
     path: Path
     photographs: tuple[Path, ...]
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # without a suffix
     columns: int
     rows: int
     interval_s: float | None = None
@@ -258,37 +215,26 @@ class Frames:
         if self.photographs:
             yield from map(read_photograph, self.photographs)
             return
-        film = _opened(self.path)
-        try:
+        with _opened(self.path) as film:
             for number in range(len(self.names) * self.every):
                 if not film.grab():
-                    raise InputError(
-                        "video.damaged",
-                        f"{self.path}: cannot be read beyond frame {number}. Convert it again.",
-                        path=self.path,
-                        frame=number,
-                    )
+                    sentence = f"cannot be read beyond frame {number}. Convert it again."
+                    raise bad_file(self.path, "video.damaged", sentence, frame=number)
                 if number % self.every == 0:
                     pixels = film.retrieve()[1]
                     yield pixels if pixels.ndim == 3 else pixels[..., None]
-        finally:
-            film.release()
 
 
 def read_frames(path: File, every: int = 1) -> Frames:
     """Return the frames of a folder or a video, every so many-th; none is decoded yet."""
     place = Path(path)
     if not place.exists():
-        raise InputError("frames.missing", f"{place}: there is no such file.", path=place)
+        raise bad_file(place, "frames.missing", "there is no such file.")
     found = _film(place, every) if place.is_file() else _folder(place, every)
-    if len(found.names) < LEAST_FRAMES:
-        raise InputError(
-            "frames.too_few",
-            f"{place}: gives {len(found.names)} frames, but a median needs {LEAST_FRAMES}. Give"
-            " more, or lower --every.",
-            path=place,
-            frames=len(found.names),
-        )
+    count = len(found.names)
+    if count < LEAST_FRAMES:
+        sentence = f"gives {count} frames, of {LEAST_FRAMES} at least. Give more, or lower --every."
+        raise bad_file(place, "frames.too_few", sentence, frames=count)
     return found
 
 
@@ -297,48 +243,37 @@ def _folder(place: Path, every: int) -> Frames:
     sizes = [size_of(one) for one in paths]
     for one, size in zip(paths, sizes, strict=True):
         if size != sizes[0]:
-            raise InputError(
-                "photos.size",
-                f"{one}: has {size[0]} x {size[1]} pixels, but {paths[0].name} {sizes[0][0]} x"
-                f" {sizes[0][1]}. Give frames of one size.",
-                path=one,
-                size=size,
-            )
+            sentence = f"has {size} pixels, {paths[0].name} {sizes[0]}. Give frames of one size."
+            raise bad_file(one, "photos.size", sentence, size=size)
     return Frames(place, paths, tuple(one.stem for one in paths), *sizes[0])
 
 
-def _opened(path: Path) -> Any:
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
     cv2 = photo_library("cv2")
     film = cv2.VideoCapture(str(path))
-    if not film.isOpened():
-        raise InputError(
-            "video.unreadable",
-            f"{path}: OpenCV cannot read this video. Convert it to MP4 (H.264), or give a folder of"
-            " frames.",
-            path=path,
-        )
-    film.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
-    return film
+    try:
+        if not film.isOpened():
+            sentence = "OpenCV cannot read this video. Convert it to MP4, or give its frames."
+            raise bad_file(path, "video.unreadable", sentence)
+        film.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+        yield film
+    finally:
+        film.release()
 
 
 def _film(path: Path, every: int) -> Frames:
     """Count the frames by reading them, as the headers of videos may be wrong."""
     cv2 = photo_library("cv2")
-    film = _opened(path)
-    try:
+    with _opened(path) as film:
         rate = float(film.get(cv2.CAP_PROP_FPS))
         count = 0
         while film.grab():
             count += 1
-        columns, rows = (
-            int(film.get(one)) for one in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
-        )
-    finally:
-        film.release()
-    steps = count // every
-    names = tuple(f"{path.stem}_{every * number:05d}" for number in range(steps))
-    known = 0.1 <= rate <= 10_000.0
-    return Frames(path, (), names, columns, rows, every / rate if known else None, every)
+        size = film.get(cv2.CAP_PROP_FRAME_WIDTH), film.get(cv2.CAP_PROP_FRAME_HEIGHT)
+    names = tuple(f"{path.stem}_{every * number:05d}" for number in range(count // every))
+    interval_s = every / rate if 0.1 <= rate <= 10_000.0 else None
+    return Frames(path, (), names, int(size[0]), int(size[1]), interval_s, every)
 
 
 def check_calm(path: File, frames: Frames, *, overwrite: bool) -> tuple[Path, Path]:
@@ -347,18 +282,11 @@ def check_calm(path: File, frames: Frames, *, overwrite: bool) -> tuple[Path, Pa
     target = check_output(path, overwrite=overwrite, inputs=inputs)
     suffixes = (frames.photographs[0].suffix.lower(),) if frames.photographs else PNG
     if target.suffix.lower() not in suffixes:
-        raise SettingError(
-            "output.suffix",
-            f"{target}: must end in {suffixes[0]}, as the frames do (PNG for a video).",
-            path=target,
-            suffix=suffixes[0],
-        )
+        sentence = f"{target}: must end in {suffixes[0]}, as the frames do (PNG for a video)."
+        raise SettingError("output.suffix", sentence, path=target, suffix=suffixes[0])
     if frames.photographs and target.parent.resolve() == frames.path.resolve():
-        raise SettingError(
-            "output.is_input",
-            f"{target}: is in the folder of the frames. Give a file in another folder.",
-            path=target,
-        )
+        sentence = f"{target}: is in the folder of the frames. Give a file in another folder."
+        raise SettingError("output.is_input", sentence, path=target)
     spread = target.with_name(f"{target.stem}_spread.tif")
     return target, check_output(spread, overwrite=overwrite, inputs=inputs)
 
@@ -369,13 +297,13 @@ def write_calm(target: Path, frames: Frames, pixels: Pixels) -> None:
         everywhere = np.ones(pixels.shape[:2], bool)
         write_photograph(frames.photographs[0], target, pixels, everywhere)
         return
-    with temporary_output(target) as draft:
-        draft.write_bytes(photo_library("cv2").imencode(".png", pixels)[1].tobytes())
+    data = photo_library("cv2").imencode(".png", pixels)[1].tobytes()
+    with temporary_output(target) as path:
+        path.write_bytes(data)
 
 
 def write_spread(target: Path, spread: FloatArray) -> None:
     """Write the spread of the frames, shape (rows, columns), as TIFF of float32."""
-    with temporary_output(target) as draft:
-        photo_library("tifffile").imwrite(
-            draft, spread.astype(np.float32), compression="zlib", metadata=None
-        )
+    tifffile = photo_library("tifffile")
+    with temporary_output(target) as path:
+        tifffile.imwrite(path, spread.astype(np.float32), compression="zlib", metadata=None)

@@ -128,13 +128,9 @@ class Records:
                 self._units, self._item, prefix, header.order == ">", self._start, self._count
             )
         if complete < header.records:
-            raise bad_file(
-                header.name,
-                "ply.cut_short",
-                f"is cut short or damaged: it should have {header.records:,} {header.kind}, and"
-                f" number {complete:,} is not complete. Copy it again.",
-                records=header.records,
-            )
+            sentence = f"is cut short or damaged: of {header.records:,} {header.kind} only"
+            sentence += f" {complete:,} are complete. Copy it again."
+            raise bad_file(header.name, "ply.cut_short", sentence, records=header.records)
 
     def numbers(self, *names: str) -> FloatArray:
         """Return properties that are not lists as columns, shape (n, names)."""

@@ -136,20 +136,12 @@ def new_raster(
 
     size = lattice.resolution_m
     profile = {
-        "driver": "GTiff",
-        "width": lattice.width,
-        "height": lattice.height,
-        "count": len(bands),
-        "dtype": dtype,
-        "nodata": nodata,
+        "driver": "GTiff", "width": lattice.width, "height": lattice.height, "count": len(bands),
+        "dtype": dtype, "nodata": nodata, "interleave": "band", "tiled": True,
+        "blockxsize": TILE, "blockysize": TILE, **_compression(dtype),
         "crs": None if crs is None else rasterio.CRS.from_user_input(crs),
         "transform": from_origin(lattice.left_m, lattice.top_m, size, size),
-        "interleave": "band",
-        "tiled": True,
-        "blockxsize": TILE,
-        "blockysize": TILE,
-        **_compression(dtype),
-    }
+    }  # fmt: skip
     with _written(path), rasterio.open(path, "w", **profile) as target:
         for number, (name, unit) in enumerate(bands.items(), start=1):
             target.set_band_description(number, name)
@@ -237,8 +229,8 @@ def write_dod(dsm: Path, reference: Path, output: Path, *, overwrite: bool = Fal
             height=one.height, resampling=Resampling.bilinear, dtype="float64", nodata=NO_HEIGHT,
         )  # fmt: skip
         profile = one.profile | {"count": 1, "driver": "GTiff"}
-        with temporary_output(target) as draft:
-            with same, _written(draft), rasterio.open(draft, "w", **profile) as sink:
+        with temporary_output(target) as temporary:
+            with same, _written(temporary), rasterio.open(temporary, "w", **profile) as sink:
                 sink.set_band_description(1, "difference")
                 for _, window in sink.block_windows(1):
                     difference = read_masked(one, window=window) - read_masked(same, window=window)
@@ -248,7 +240,7 @@ def write_dod(dsm: Path, reference: Path, output: Path, *, overwrite: bool = Fal
             if known == 0:
                 sentence = f"{dsm} and {reference} have no cell in common. Check their CRS."
                 raise GeometryError("raster.no_overlap", sentence, dsm=dsm, reference=reference)
-            add_overviews(draft)
+            add_overviews(temporary)
     return known
 
 
@@ -303,7 +295,7 @@ def outlines(path: Path, cells: int) -> list[Any]:
 def values_at(path: Path, xy: FloatArray) -> FloatArray:
     """Return the cells of the first band at places (n, 2); NaN for no value."""
     with open_raster(path) as source:
-        found = [
-            cell.astype(np.float64).filled(np.nan)[0] for cell in source.sample(xy, 1, masked=True)
+        cells = [
+            cell.astype(np.float64).filled(np.nan) for cell in source.sample(xy, 1, masked=True)
         ]
-    return np.array(found, np.float64)
+    return np.reshape(cells, -1).astype(np.float64)

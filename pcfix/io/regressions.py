@@ -46,17 +46,11 @@ def read_regression(path: File) -> DepthRegression:
         sentence = f"is not a depth regression ({error}). {_REMEDY}"
         raise bad_file(found, "regression.not_one", sentence) from error
     if not isinstance(content, dict) or content.get("format") != HEADER["format"]:
-        sentence = f"is not a depth regression. {_REMEDY}"
-        raise bad_file(found, "regression.not_one", sentence)
+        raise bad_file(found, "regression.not_one", f"is not a depth regression. {_REMEDY}")
     for name in ("version", "unit"):
         if content.get(name) != HEADER[name]:
-            raise bad_file(
-                found,
-                "regression.version",
-                f"its {name} is {content.get(name)!r}, and pcfix {__version__} reads"
-                f" {HEADER[name]!r}. Fit the line again with --check-depths and --save-regression.",
-                value=content.get(name),
-            )
+            sentence = f"its {name} is {content.get(name)!r}, not {HEADER[name]!r}. Fit it again."
+            raise bad_file(found, "regression.version", sentence, value=content.get(name))
 
     def check(name: str, rule: str, holds: bool) -> None:
         if not holds:
@@ -72,8 +66,8 @@ def read_regression(path: File) -> DepthRegression:
             check(name, "at least 0", name not in _NOT_NEGATIVE or value >= 0.0)
     count, shallowest = content["count"], content["shallowest"]
     check("slope", "above 0", content["slope"] > 0.0)
-    at_least = f"a whole number of at least {LEAST_COUNT}"
-    check("count", at_least, count >= LEAST_COUNT and count == int(count))
+    whole = count >= LEAST_COUNT and count == int(count)
+    check("count", f"a whole number of at least {LEAST_COUNT}", whole)
     check("deepest", f"above shallowest, {shallowest:g}", content["deepest"] > shallowest)
     values = {field: content[name] for name, field in _FIELDS.items()}
     notes = notes_of(count, content["slope"])

@@ -80,11 +80,7 @@ def _contents(scene: Scene) -> dict[str, bytes]:
 def colmap_vis(views: Views) -> bytes:
     """Return view lists in the layout of COLMAP's ``fused.ply.vis``; see its reader."""
     counts = np.diff(views.start)
-    words = np.empty(len(counts) + len(views.camera), "<u4")
-    at = views.start[:-1] + np.arange(len(counts))
-    is_count = np.zeros(len(words), bool)
-    is_count[at] = True
-    words[at], words[~is_count] = counts, views.camera
+    words = np.insert(views.camera.astype("<u4"), views.start[:-1], counts)
     return len(counts).to_bytes(8, "little") + words.tobytes()
 
 
@@ -93,22 +89,17 @@ def openmvs_ply(xyz: FloatArray, views: Views) -> bytes:
 
     Lists longer than 255 have a count of four bytes. The views must have weights.
     """
-    counts = np.diff(views.start)
-    name, size = ("uchar", 1) if counts.max(initial=0) < 256 else ("uint", 4)
-    place = 2 * size + 24 + 8 * counts
-    first = np.cumsum(place) - place
-    data = np.empty(int(place.sum()), np.uint8)
-    entry = np.repeat(first, counts) + 4 * (
-        np.arange(len(views.camera)) - np.repeat(views.start[:-1], counts)
-    )
-    second = first + 24 + size + 4 * counts
-    _put(data, first, xyz.astype("<f8"))
-    _put(data, first + 24, counts.astype(f"<u{size}"))
-    _put(data, entry + 24 + size, views.camera.astype("<u4"))
-    _put(data, second, counts.astype(f"<u{size}"))
-    _put(
-        data, entry + 24 + 2 * size + 4 * np.repeat(counts, counts), np.asarray(views.weight, "<f4")
-    )
+    lengths = np.diff(views.start)
+    name, kind = ("uchar", "u1") if lengths.max(initial=0) < 256 else ("uint", "<u4")
+    places, counts = xyz.astype("<f8"), lengths.astype(kind)
+    cameras, weights = views.camera.astype("<u4"), np.asarray(views.weight, "<f4")
+    rows = [
+        place.tobytes() + count.tobytes() + cameras[one:end].tobytes() + count.tobytes()
+        + weights[one:end].tobytes()
+        for place, count, one, end in zip(
+            places, counts, views.start[:-1], views.start[1:], strict=True
+        )
+    ]  # fmt: skip
     head = [
         "ply",
         "format binary_little_endian 1.0",
@@ -118,14 +109,7 @@ def openmvs_ply(xyz: FloatArray, views: Views) -> bytes:
         f"property list {name} float view_weights",
         "end_header",
     ]
-    return ("\n".join(head) + "\n").encode() + data.tobytes()
-
-
-def _put(data: np.ndarray, places: np.ndarray, records: np.ndarray) -> None:
-    """Write each row of records, as bytes, to its place."""
-    raw = np.ascontiguousarray(records).view(np.uint8).reshape(len(records), -1)
-    for byte in range(raw.shape[1] if len(raw) else 0):
-        data[places + byte] = raw[:, byte]
+    return ("\n".join(head) + "\n").encode() + b"".join(rows)
 
 
 def _facts(scene: Scene, files: dict[str, str]) -> bytes:

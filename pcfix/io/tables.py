@@ -85,18 +85,41 @@ def read_table(path: Path, required: Sequence[str]) -> Table:
     return table_below(path, lines, header, delimiter)
 
 
+_UNIT = re.compile(r"^(.*?)[ _]*[\[(]([^\])]*)[\])]$|^(.*)_(m|cm|mm|ft|deg)$")
+_LONGEST_NAME = 80
+METRES = ("", "m", "metre", "metres", "meter", "meters")
+DEGREES = ("", "deg", "degree", "degrees", "°")
+
+
+def columns_of(
+    path: Path, header: Sequence[str], spellings: Sequence[str], units: Sequence[str]
+) -> list[str]:
+    """Return the columns with one of some names, as in depth_m, Depth (m), x [m], in their order.
+
+    A unit other than these `units` is refused.
+    """
+    found = []
+    for name in header:
+        # the expression takes long on a long name
+        match = _UNIT.match(name) if len(name) < _LONGEST_NAME else None
+        bare, unit = (match[1] or match[3], match[2] or match[4]) if match else (name, "")
+        bare = (bare or "").strip().replace(" ", "_")
+        if bare in spellings:
+            found.append((spellings.index(bare), name))
+            if (unit or "").strip() not in units:
+                sentence = f"column {name} is in '{unit}'. Give metres."
+                raise bad_file(path, "table.unit", sentence, column=name, value=unit)
+    return [name for _, name in sorted(found)]
+
+
 def check_columns(
     path: Path, header: Sequence[str], required: Sequence[str], missing: Sequence[str]
 ) -> None:
     """Refuse a table that lacks columns."""
     if missing:
-        raise bad_file(
-            path,
-            "table.column_missing",
-            f"the header must name the columns {', '.join(required)}."
-            f" {', '.join(missing)} missing (it has: {', '.join(header)}).",
-            missing=list(missing),
-        )
+        sentence = f"the columns {', '.join(required)} are needed; {', '.join(missing)} missing"
+        sentence += f" (it has: {', '.join(header)})."
+        raise bad_file(path, "table.column_missing", sentence, missing=list(missing))
 
 
 def table_below(
@@ -124,13 +147,8 @@ def table_below(
             if not any(field.strip() for field in fields):
                 continue
             if len(fields) != len(header):
-                raise bad_file(
-                    path,
-                    "table.shifted",
-                    f"line {line} has {len(fields)} fields, the header has {len(header)}."
-                    " A column is shifted or missing.",
-                    line=line,
-                )
+                sentence = f"line {line} has {len(fields)} fields, the header has {len(header)}."
+                raise bad_file(path, "table.shifted", sentence, line=line)
             rows.append([field.strip() for field in fields])
             numbers.append(line)
     except csv.Error as error:
@@ -147,9 +165,6 @@ DEPTH_SPELLINGS = {
     "depth": ("depth", "true_depth", "water_depth", "measured_depth"),
     "z": ("z", "height", "elevation", "elev", "altitude"),
 }
-_DEPTH_UNIT = re.compile(r"^(.*?)[ _]*[\[(]([^\])]*)[\])]$|^(.*)_(m|cm|mm|ft)$")
-_LONGEST_NAME = 80
-_METRES = ("", "m", "metre", "metres", "meter", "meters")
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,44 +199,26 @@ def read_check_depths(path: File) -> CheckDepths:
     """
     source = check_input(path)
     table = read_table(source, ())
-    columns = {role: _depth_column(table, role) for role in DEPTH_SPELLINGS}
-    what = "z" if columns["depth"] is None else "depth"
+    columns = {role: _depth_column(table, role) for role in ("x", "y", "depth")}
+    what = "depth" if columns["depth"] else "z"
+    columns[what] = _depth_column(table, what)
     missing = ["depth or z" if r == "z" else r for r in ("x", "y", what) if columns[r] is None]
     check_columns(source, table.header, ("x", "y", "depth or z"), missing)
-    values = []
-    for name, unit in filter(None, (columns[role] for role in ("x", "y", what))):
-        if unit not in _METRES:
-            sentence = f"column {name} is in '{unit}'. Give metres."
-            raise bad_file(source, "table.unit", sentence, column=name, value=unit)
-        values.append(np.array(table.numbers(name), np.float64))
+    values = [np.array(table.numbers(str(columns[role]))) for role in ("x", "y", what)]
     found = CheckDepths(
         str(source), np.column_stack(values[:2]), values[2], what == "z", table.line
     )
     negative = np.flatnonzero(found.value_m < 0.0)
     if len(negative) and not found.are_heights:
-        first = int(negative[0])
-        raise bad_file(
-            source,
-            "check_depths.negative",
-            f"line {found.line[first]}: the depth is {found.value_m[first]:g}; {len(negative)} of"
-            f" {len(found)} are negative. Give depths positive down, or heights of the bed as z.",
-            line=found.line[first],
-            count=len(negative),
-        )
+        line, count = found.line[negative[0]], len(negative)
+        sentence = f"{count} depths are negative (line {line}). Give them positive down, or as z."
+        raise bad_file(source, "check_depths.negative", sentence, line=line, count=count)
     return found
 
 
-def _depth_column(table: Table, role: str) -> tuple[str, str] | None:
-    """Return a column's name in the header and its unit, as in depth_m, Depth (m), x [m]."""
-    there = []
-    for name in table.header:
-        # the expression takes long on a long name
-        found = _DEPTH_UNIT.match(name) if len(name) < _LONGEST_NAME else None
-        bare, unit = (found[1] or found[3], found[2] or found[4]) if found else (name, "")
-        if (bare or "").strip().replace(" ", "_") in DEPTH_SPELLINGS[role]:
-            there.append((name, (unit or "").strip()))
+def _depth_column(table: Table, role: str) -> str | None:
+    there = columns_of(table.path, table.header, DEPTH_SPELLINGS[role], METRES)
     if len(there) > 1:
-        names = [name for name, _ in there]
-        sentence = f"the columns {', '.join(names)} may all be {role}. Remove all but one."
-        raise bad_file(table.path, "table.column_twice", sentence, columns=names)
+        sentence = f"the columns {', '.join(there)} may all be {role}. Remove all but one."
+        raise bad_file(table.path, "table.column_twice", sentence, columns=there)
     return there[0] if there else None

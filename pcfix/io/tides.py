@@ -122,13 +122,8 @@ def _rows(names: Sequence[str], labels: Sequence[str], source: Path) -> list[int
     rows: list[int] = match_labels(labels, names, one_to_one=False).row.tolist()
     missing = [label for label, row in zip(labels, rows, strict=True) if row < 0]
     if missing:
-        raise bad_file(
-            source,
-            "image_times.missing",
-            f"does not say when image {missing[0]} was taken. {len(missing)} of {len(labels)}"
-            " images are missing, or their names are ambiguous.",
-            images=missing,
-        )
+        sentence = f"{len(missing)} images are missing or have ambiguous names: {missing[0]}, ..."
+        raise bad_file(source, "image_times.missing", sentence, images=missing)
     return rows
 
 
@@ -175,26 +170,16 @@ def read_tide(path: File) -> TideTable:
 def level_offsets(
     tide: TideTable, times: ImageTimes, labels: Sequence[str]
 ) -> tuple[FloatArray, tuple[PcfixWarning, ...]]:
-    """Return how much higher than on average the water stood when each of k images was taken.
+    """Return how much higher than on average the water was at each of k images, metres, and notes.
 
     The level is linear between the rows of the table, and continues beyond its ends for at most
-    the interval of the two rows there. The average is over the images, each counting once; it is
-    the level of the water surface that the user gives.
-
-    Returns
-    -------
-    offset : array, shape (k,)
-        Metres.
-    notes : tuple of PcfixWarning
+    the interval of the two rows there. The average over the images is the level that the user
+    gives.
     """
     if tide.zoned != times.zoned:
         with_zone, without = (tide, times) if tide.zoned else (times, tide)
-        raise bad_file(
-            without.name,
-            "time.zone",
-            f"its times have no zone, those of {with_zone.name} have one. Add the zone"
-            " (2026-05-01T12:00:00+02:00, or Z for UTC) to all, or remove it from all.",
-        )
+        sentence = f"its times have no zone, those of {with_zone.name} have one. Add or remove it"
+        raise bad_file(without.name, "time.zone", f"{sentence} (+02:00, or Z for UTC) everywhere.")
     gaps = np.diff(tide.time_s)
     first, last = tide.time_s[0] - gaps[0], tide.time_s[-1] + gaps[-1]
     outside = np.flatnonzero((times.time_s < first) | (times.time_s > last))
@@ -204,26 +189,20 @@ def level_offsets(
             datetime.fromtimestamp(float(one), UTC).strftime("%Y-%m-%d %H:%M:%S")
             for one in (tide.time_s[0], tide.time_s[-1], times.time_s[at])
         )
-        raise bad_file(
-            tide.name,
-            "tide.not_covered",
+        sentence = (
             f"covers {start} to {end}, but image {labels[at]} was taken at {taken}"
-            f" ({outside.size} of {len(labels)} images are outside). Check the zones.",
-            image=labels[at],
-            count=int(outside.size),
+            f" ({outside.size} of {len(labels)} images are outside). Check the zones."
         )
+        values = {"image": labels[at], "count": int(outside.size)}
+        raise bad_file(tide.name, "tide.not_covered", sentence, **values)
     row = np.clip(np.searchsorted(tide.time_s, times.time_s) - 1, 0, len(tide.time_s) - 2)
     share = (times.time_s - tide.time_s[row]) / gaps[row]
     level = tide.level_m[row] + share * np.diff(tide.level_m)[row]
     notes = []
     beyond = int(((share < 0.0) | (share > 1.0)).sum())
     if beyond:
-        sentence = (
-            "images were taken before its first or after its last row; there it is extrapolated."
-        )
-        notes.append(
-            PcfixWarning("tide.extrapolated", f"{tide.name}: {beyond} {sentence}", count=beyond)
-        )
+        sentence = f"{tide.name}: is extrapolated for {beyond} images beyond its first or last row."
+        notes.append(PcfixWarning("tide.extrapolated", sentence, count=beyond))
     longest_h = float(gaps[row].max()) / 3600.0
     if longest_h > LONG_GAP_S / 3600.0:
         sentence = f"{tide.name}: its rows are up to {longest_h:.1f} h apart; give one each hour."

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
+import shapely
 
-from pcfix.errors import InputError, PcfixWarning, SettingError
+from pcfix.errors import InputError, PcfixWarning, SettingError, bad_file
 from pcfix.io.files import path_of, read_json
 from pcfix.io.las.source import LasSource, metric_crs
 from pcfix.model import FloatArray
@@ -38,30 +39,15 @@ class BrokenTileError(InputError):
 
 @dataclass(frozen=True)
 class Tiles:
-    """Files that are read as one cloud, in their order.
+    """Files that are read as one cloud, in their order."""
 
-    Attributes
-    ----------
-    name : str
-        As the user names them.
-    paths : tuple of path
-    points : tuple of int
-        Of each file.
-    lows, highs : array, shape (files, 3)
-        The corners of each file, metres.
-    step_m : float
-        The coarsest scale.
-    broken : dict
-        The files that cannot be read, and why; they are not in `paths`.
-    """
-
-    name: str
+    name: str  # as the user names them
     paths: tuple[Path, ...]
-    points: tuple[int, ...]
-    lows: FloatArray
+    points: tuple[int, ...]  # of each file
+    lows: FloatArray  # corners of each file, shape (files, 3), metres
     highs: FloatArray
-    step_m: float
-    broken: dict[Path, str] = field(default_factory=dict)
+    step_m: float  # the coarsest scale
+    broken: dict[Path, str] = field(default_factory=dict)  # why other files cannot be read
 
     def __str__(self) -> str:
         return self.name
@@ -121,11 +107,8 @@ def check_one_file(cloud: Any, options: Any) -> None:
     for name in ("bounds", "read_resolution") if many else ("scheduler",):
         if getattr(options, name, None) is not None:
             kind = "a single file" if many else "many files (a folder, glob or list of tiles)"
-            raise SettingError(
-                "option.one_file",
-                f"{name.replace('_', '-')} works only with {kind}; omit it.",
-                option=name,
-            )
+            sentence = f"{name.replace('_', '-')} works only with {kind}; omit it."
+            raise SettingError("option.one_file", sentence, option=name)
 
 
 def inputs_of(cloud: Any) -> list[Any]:
@@ -167,41 +150,28 @@ def tiles_of(cloud: Clouds) -> Tiles | None:
         paths = [path_of(one) for one in cloud]
         name = f"{len(paths)} files"
     if not paths:
-        raise InputError(
-            "cloud.no_files",
-            f"{name}: contains no LAS or LAZ files. Give a folder, glob or list that does.",
-            path=name,
-        )
+        sentence = "contains no LAS or LAZ files. Give a folder, glob or list that does."
+        raise bad_file(name, "cloud.no_files", sentence)
     by_name: dict[str, Path] = {}
     for path in paths:
         other = by_name.setdefault(path.name, path)
         if other is not path:
-            raise SettingError(
-                "cloud.same_names",
-                f"{name}: {other} and {path} would both be written as {path.name}. Rename one of"
-                " them, or correct them one by one.",
-                path=path,
-            )
+            sentence = f"{name}: {other} and {path} have the same file name. Rename one of them."
+            raise SettingError("cloud.same_names", sentence, path=path)
     return tiles_from(name, paths)
 
 
 def cloud_of(cloud: Clouds) -> Path | Tiles:
-    """Return a file, or many as one cloud that lacks none of them; see `tiles_of`.
-
-    Raises
-    ------
-    PcfixError
-        If one of many cannot be read: what is made of all would be without its points.
-    """
+    """Return a file, or many as one cloud, see `tiles_of`; one that cannot be read is an error."""
     tiles = tiles_of(cloud)
     if tiles is None:
         return path_of(cloud)
     if tiles.broken:
-        count, why = len(inputs_of(tiles)), "\n".join(f"  {one}" for one in tiles.broken.values())
+        why = "\n".join(f"  {one}" for one in tiles.broken.values())
         raise InputError(
             "cloud.broken_files",
-            f"{tiles}: {len(tiles.broken)} of {count} files cannot be read. Replace them, or give"
-            f" only the others:\n{why}",
+            f"{tiles}: {len(tiles.broken)} of {len(inputs_of(tiles))} files cannot be read. Replace"
+            f" them, or give only the others:\n{why}",
             paths=list(tiles.broken),
         )
     return tiles
@@ -209,43 +179,29 @@ def cloud_of(cloud: Clouds) -> Path | Tiles:
 
 def _listed(path: Path) -> list[Path] | None:
     """Return the files that a path stands for; None if it is that of a single one."""
-    text = str(path)
-    if path.suffix.lower() in SUFFIXES and not glob.has_magic(text):
-        return None
+    text, suffix = str(path), path.suffix.lower()
     if glob.has_magic(text) and not path.exists():
         return sorted(Path(path.anchor).glob(str(path.relative_to(path.anchor))))
-    if path.suffix.lower() == ".vpc":
-        return _of_index(path)
-    if path.suffix.lower() in LISTS and path.is_file():
-        lines = [one.strip() for one in path.read_text("utf-8", errors="replace").splitlines()]
-        return [_beside(path, line) for line in lines if line and not line.startswith("#")]
     if path.is_dir():
         return sorted(one for one in path.iterdir() if one.suffix.lower() in SUFFIXES)
-    return None
-
-
-def _beside(path: Path, text: str) -> Path:
-    """Return a path that a list names: beside the list, else as it is."""
-    return path.parent / text if (path.parent / text).exists() else path_of(text)
-
-
-def _of_index(path: Path) -> list[Path]:
-    """Return the files of a virtual point cloud: a STAC feature collection, an item for each."""
-    try:
-        features = read_json(path)["features"]
-        links = [next(iter(one["assets"].values()))["href"] for one in features]
-        return [_beside(path, link.removeprefix("file://")) for link in links]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, StopIteration) as error:
-        raise InputError(
-            "cloud.index",
-            f"{path}: is not a virtual point cloud ({type(error).__name__}: {error}). Give the"
-            " index that 'pdal_wrench build_vpc' writes, or a folder of tiles.",
-            path=path,
-        ) from error
+    if suffix == ".vpc":  # a STAC feature collection with an item for each file
+        try:
+            assets = [one["assets"] for one in read_json(path)["features"]]
+            names = [next(iter(one.values()))["href"].removeprefix("file://") for one in assets]
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, StopIteration) as error:
+            sentence = "is not a virtual point cloud. Give what 'pdal_wrench build_vpc' writes."
+            raise bad_file(path, "cloud.index", sentence) from error
+    elif suffix in LISTS and path.is_file():
+        lines = [one.strip() for one in path.read_text("utf-8", errors="replace").splitlines()]
+        names = [line for line in lines if line and not line.startswith("#")]
+    else:
+        return None
+    beside = [path.parent / name for name in names]
+    return [one if one.exists() else path_of(name) for one, name in zip(beside, names, strict=True)]
 
 
 def tiles_from(name: str, paths: Iterable[Path]) -> Tiles:
-    """Return files as one cloud; those whose header cannot be read are told apart.
+    """Return files as one cloud; those whose header cannot be read are its `broken` ones.
 
     Raises
     ------
@@ -253,66 +209,61 @@ def tiles_from(name: str, paths: Iterable[Path]) -> Tiles:
         If their coordinate systems or dimensions are not the same, or none can be read.
     """
     kinds: dict[Path, tuple[Any, ...]] = {}
-    heads: dict[Path, tuple[int, FloatArray, FloatArray, float]] = {}
+    heads: list[tuple[int, FloatArray, FloatArray, float]] = []
     broken: dict[Path, str] = {}
     for path in paths:
         try:
             with LasSource(path) as source:
                 header = source.header
-                crs, format = metric_crs(source), header.point_format
-                words = f"CRS {crs.name}" if crs else "no CRS"
-                kinds[path] = (crs, format.id, tuple(format.dimension_names), words)
-                heads[path] = (len(source), header.mins, header.maxs, float(max(header.scales)))
+                crs, form = metric_crs(source), header.point_format
+                kinds[path] = crs, form.id, tuple(form.dimension_names)
+                heads.append((len(source), header.mins, header.maxs, float(max(header.scales))))
         except InputError as error:
             broken[path] = str(error)
     if not heads:
         raise InputError("cloud.broken_files", next(iter(broken.values())), paths=list(broken))
     _refuse_mixed(name, kinds)
-    _warn_of_overlap(name, {path: (low, high) for path, (_, low, high, _) in heads.items()})
-    points, lows, highs, steps = zip(*heads.values(), strict=True)
-    return Tiles(name, tuple(heads), points, np.array(lows), np.array(highs), max(steps), broken)
+    counts, lows, highs, steps = zip(*heads, strict=True)
+    tiles = Tiles(name, tuple(kinds), counts, np.array(lows), np.array(highs), max(steps), broken)
+    _warn_of_overlap(tiles)
+    return tiles
 
 
 def _refuse_mixed(name: str, kinds: dict[Path, tuple[Any, ...]]) -> None:
     """Refuse files of several coordinate systems, point formats or extra dimensions."""
     first, *rest = kinds
-    one = kinds[first]
-    others = [path for path in rest if kinds[path][:3] != one[:3]]
-    if not others:
-        return
-    other = kinds[others[0]]
-    said = [
-        (one[3], other[3]), (f"point format {one[1]}", f"point format {other[1]}"),
-        (f"dimensions {', '.join(one[2])}", f"dimensions {', '.join(other[2])}"),
-    ]  # fmt: skip
-    at = next(i for i in range(3) if one[i] != other[i])
-    more = f" (and {len(others) - 1} more)" if len(others) > 1 else ""
-    raise InputError(
-        "cloud.mixed_tiles",
-        f"{name}: {first.name} has {said[at][0]}, {others[0].name}{more} {said[at][1]}. Convert"
-        " them to the same, or correct them separately.",
-        paths=[first, others[0]],
-    )
+    for other in rest:
+        for words, one, another in zip(
+            ("CRS", "point format", "dimensions"), kinds[first], kinds[other], strict=True
+        ):
+            if one != another:
+                one, another = (getattr(value, "name", value) for value in (one, another))
+                raise InputError(
+                    "cloud.mixed_tiles",
+                    f"{name}: {first.name} has the {words} {one}, {other.name} {another}. Convert"
+                    " them to the same, or correct them separately.",
+                    paths=[first, other],
+                )
 
 
-def _warn_of_overlap(name: str, boxes: dict[Path, tuple[FloatArray, FloatArray]]) -> None:
+def _warn_of_overlap(tiles: Tiles) -> None:
     """Warn of tiles that lie in each other by more than their borders, as points may be double."""
-    order = sorted(boxes, key=lambda path: float(boxes[path][0][0]))
-    found = []
-    for i, one in enumerate(order):
-        for other in order[i + 1 :]:
-            if boxes[other][0][0] > boxes[one][1][0]:
-                break
-            low = np.maximum(boxes[one][0], boxes[other][0])[:2]
-            high = np.minimum(boxes[one][1], boxes[other][1])[:2]
-            sides = [(box[1] - box[0])[:2] for box in (boxes[one], boxes[other])]
-            if (high - low > OVERLAP * np.minimum(*sides)).all() and (high > low).all():
-                found.append((one.name, other.name))
+    boxes = shapely.box(*tiles.lows[:, :2].T, *tiles.highs[:, :2].T)
+    one, other = shapely.STRtree(boxes).query(boxes, predicate="intersects")
+    one, other = np.unique(np.sort(np.column_stack([one, other])[one != other], axis=1), axis=0).T
+    shared = np.minimum(tiles.highs[one], tiles.highs[other]) - np.maximum(
+        tiles.lows[one], tiles.lows[other]
+    )
+    sides = tiles.highs - tiles.lows
+    border = OVERLAP * np.minimum(sides[one], sides[other])
+    deep = ((shared > border) & (shared > 0.0))[:, :2].all(axis=1)
+    pairs = np.column_stack([one, other])[deep]
+    found = [(tiles.paths[i].name, tiles.paths[j].name) for i, j in pairs]
     if found:
         warnings.warn(
             PcfixWarning(
                 "cloud.overlap",
-                f"{name}: the extents of {found[0][0]} and {found[0][1]} overlap ({len(found)}"
+                f"{tiles}: the extents of {found[0][0]} and {found[0][1]} overlap ({len(found)}"
                 " pairs do). Points in both count twice; cut off the buffers of the tiles.",
                 pairs=found,
             ),

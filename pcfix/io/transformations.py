@@ -46,11 +46,7 @@ class HeightsError(InputError):
 
 
 class Transformation(NamedTuple):
-    """From one CRS to another.
-
-    `forward` takes points (n, 3) to points (n, 3), x east or longitude first; not finite for a
-    point that has no place in the other CRS.
-    """
+    """Takes points (n, 3), x east or longitude first; not finite where there is no such place."""
 
     forward: Points
     notes: Notes = ()
@@ -61,16 +57,8 @@ def transformation(
 ) -> Transformation:
     """Return the transformation of `heights` too, or in plan, where only their unit changes.
 
-    Parameters
-    ----------
-    source, target : CRS
-        In plan neither may be geocentric.
-    at : array, shape (n, 3)
-        Places of `source` where the transformation is needed.
-    name : str
-        For messages.
-    heights : bool
-        If they cannot be transformed, a `HeightsError` with the remedy `instead`.
+    It is needed at places (n, 3) of `source`. In plan neither CRS may be geocentric. If heights
+    cannot be transformed it is a `HeightsError` with the remedy `instead`.
     """
     if heights:
         try:
@@ -149,11 +137,8 @@ def _group(source: CRS, target: CRS, at: FloatArray, name: str) -> TransformerGr
             area = _area(parts(source)[0], at)
             return TransformerGroup(source, target, always_xy=True, area_of_interest=area)
     except (ProjError, IndexError) as error:  # the latter if PROJ finds no operation at all
-        raise bad_file(
-            name,
-            "crs.no_transformation",
-            f"PROJ cannot transform {source.name} to {target.name}. Give another CRS for one.",
-        ) from error
+        sentence = f"PROJ cannot transform {source.name} to {target.name}. Give another CRS."
+        raise bad_file(name, "crs.no_transformation", sentence) from error
 
 
 def heights_agree(source: CRS, target: CRS) -> bool:
@@ -202,16 +187,8 @@ def way_to_cloud(
 ) -> tuple[Points | None, Notes]:
     """Return the transformation from a file's CRS to the cloud's, None for none, and notes.
 
-    Parameters
-    ----------
-    crs : str or None
-        The file's; None if it names none, ``local`` to use its numbers unchanged.
-    cloud_crs : str, CRS or None
-        Projected, in metres; None if the cloud names none.
-    at, name
-        See `transformation`.
-    heights : bool
-        Whether z matters.
+    A CRS that is None is not stated; that of the file is ``local`` to use its numbers unchanged.
+    The cloud's is projected, in metres. `heights` says whether z matters.
     """
     cloud = None if cloud_crs is None else parse_crs(cloud_crs, "the cloud")
     if crs is None:
@@ -237,12 +214,8 @@ def way_to_cloud(
         if is_local(cloud) and is_local(source):
             return None, ()
         where = (source.name, "the cloud") if is_local(cloud) else (cloud.name, name)
-        raise bad_file(
-            name,
-            "crs.local",
-            f"{where[1]} is in a local frame, the other in {where[0]}. Export both in one CRS, or"
-            " give the file's CRS as 'local' to use its numbers unchanged.",
-        )
+        sentence = f"{where[1]} is in a local frame, the other in {where[0]}. Use one CRS, or give"
+        raise bad_file(name, "crs.local", f"{sentence} that of the file as 'local'.")
     check_projected_metres(cloud, "the cloud")
     if not (source.is_projected or source.is_geographic):
         sentence = f"{source.name} is neither a map projection nor in degrees."

@@ -16,7 +16,15 @@ import shapely
 from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.crs import parse_crs
 from pcfix.io.files import check_input
-from pcfix.io.tables import check_columns, read_lines, split_header, table_below
+from pcfix.io.tables import (
+    DEGREES,
+    METRES,
+    check_columns,
+    columns_of,
+    read_lines,
+    split_header,
+    table_below,
+)
 from pcfix.io.transformations import LOCAL, way_to_cloud
 from pcfix.libraries import optional_library
 from pcfix.model import FloatArray
@@ -31,18 +39,14 @@ TEXT_SUFFIXES = (".wkt", ".csv", ".txt")
 GDAL_SUFFIXES = (".gpkg", ".shp", ".geojson", ".json")
 KINDS = "GeoPackage (.gpkg), Shapefile (.shp), GeoJSON (.geojson, .json), WKT (.wkt) or CSV (.csv)"
 COLUMNS = {
-    "x": ("x", "easting", "east", "e", "x_m", "easting_m"),
-    "y": ("y", "northing", "north", "n", "y_m", "northing_m"),
+    "x": ("x", "easting", "east", "e"),
+    "y": ("y", "northing", "north", "n"),
     "longitude": ("longitude", "lon", "long", "lng"),
     "latitude": ("latitude", "lat"),
-    "z": (
-        *("z", "height", "h", "altitude", "alt", "elevation", "elev", "level"),
-        *("z_m", "height_m", "altitude_m", "elevation_m", "level_m"),
-    ),
+    "z": ("z", "height", "h", "altitude", "alt", "elevation", "elev", "level"),
     "wkt": ("wkt", "geometry", "geom", "wkt_geom"),
 }
 """Names of a column; the first that the header has is used."""
-_UNIT = re.compile(r"\s*[\[(]\s*(m|metres?|meters?|deg|degrees?|°)\s*[\])]$")
 _WKT = re.compile(
     r"\s*(SRID\s*=\s*\d+\s*;)?\s*((MULTI)?(POINT|LINESTRING|POLYGON)|LINEARRING|GEOMETRYCOLLECTION)"
     r"\s*(ZM|Z|M)?\s*(\(|EMPTY)",
@@ -129,13 +133,8 @@ def read_vectors(path: File, *, crs: str | None = None) -> Vectors:
     wrong = (np.abs(x) > 360.0) | (np.abs(y) > 90.0)
     if stated.is_geographic and stated.axis_info[0].unit_name == "degree" and wrong.any():
         i = int(np.argmax(wrong))
-        raise bad_file(
-            name,
-            "vector.not_degrees",
-            f"{x[i]:.10g}, {y[i]:.10g} is not a longitude and latitude, but its CRS is"
-            f" {stated.name} (the default of GeoJSON). Give the CRS that it is in.",
-            crs=stated.name,
-        )
+        sentence = f"{x[i]:.10g}, {y[i]:.10g} is not in degrees, as {stated.name} is. Give its CRS."
+        raise bad_file(name, "vector.not_degrees", sentence, crs=stated.name)
     return vectors
 
 
@@ -197,13 +196,10 @@ def _read_gdal(path: Path, layer: str | None) -> tuple[Geometries, str | None, s
         raise bad_file(path, "vector.damaged", sentence) from error
     if layer not in names:
         wanted = f"has no layer {layer} with geometries" if layer else f"has {len(names)} layers"
-        raise bad_file(
-            path,
-            "vector.layer",
-            f"{wanted} ({', '.join(names)}). Name one as in {path.name}{LAYER_MARK}layername=NAME.",
-            layer=layer,
-            layers=names,
+        sentence = (
+            f"{wanted} ({', '.join(names)}). Name one: {path.name}{LAYER_MARK}layername=NAME."
         )
+        raise bad_file(path, "vector.layer", sentence, layer=layer, layers=names)
     name = str(path) if layer == path.stem else f"{path}, layer {layer}"
     crs = meta["crs"]
     if path.suffix.lower() in (".geojson", ".json") and crs == WGS84:
@@ -258,10 +254,10 @@ def _from_table(path: Path, lines: list[str], at: int) -> tuple[Geometries, str 
     A point whose height is empty has none.
     """
     names, delimiter = split_header(lines[at])
-    header = [_UNIT.sub("", name) for name in names]
-    table = table_below(path, lines, header, delimiter, at=at, comments=True)
+    table = table_below(path, lines, names, delimiter, at=at, comments=True)
+    units = (*METRES, *DEGREES)
     column = {
-        role: next((name for name in spellings if name in header), None)
+        role: next(iter(columns_of(path, names, spellings, units)), None)
         for role, spellings in COLUMNS.items()
     }
     if column["wkt"] is not None:
@@ -377,13 +373,9 @@ def read_water_polygons(path: File, cloud_crs: str | CRS | None = None) -> Water
             polygons[crossed], method="structure", keep_collapsed=False
         )
         count, area_m2 = int(crossed.sum()), float(shapely.area(polygons[crossed]).sum())
-        vectors = vectors.noted(
-            "mask.repaired",
-            f"{count} of {len(polygons)} polygons cross or touch themselves ({reason}) and were"
-            f" repaired; they now cover {area_m2:.1f} m2.",
-            count=count,
-            area_m2=area_m2,
-        )
+        sentence = f"{count} of {len(polygons)} polygons crossed themselves ({reason}). Repaired,"
+        sentence += f" they cover {area_m2:.1f} m2."
+        vectors = vectors.noted("mask.repaired", sentence, count=count, area_m2=area_m2)
     area = shapely.union_all(polygons)
     if not area.area > 0.0:
         kinds = sorted({geometry.geom_type for geometry in vectors.geometries})

@@ -118,13 +118,8 @@ def _mesh(path: Path) -> WaterMesh:
     double, area_m2 = in_two_sheets(tin)
     share = float(area_m2[double].sum() / area_m2.sum())
     if share > MOST_OVERLAP:
-        raise bad_file(
-            path,
-            "water.mesh_overlap",
-            f"{100.0 * share:.0f} % of the mesh lies above or below another part of it. Export the"
-            " water surface only, not a closed body or several surfaces.",
-            share=share,
-        )
+        sentence = f"{100.0 * share:.0f} % of the mesh lies above another part of it. Export one"
+        raise bad_file(path, "water.mesh_overlap", f"{sentence} open surface.", share=share)
     return mesh
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import shapely
 
 from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.crs import is_local, metres_up, parse_crs, parts
@@ -76,8 +77,7 @@ def read_water_raster(
         to_cloud, from_cloud, notes = _ways(source, cloud_crs, bounds, name)
         part = _read(source, name, None if bounds is None else from_cloud(_edge(bounds)))
         title = source.name.replace("\\", "/").rpartition("/")[2]
-    if not np.isfinite(part.heights).any():
-        raise _no_heights(name)
+    _check_known(part.heights, name)
     for note in notes + part.notes:
         warnings.warn(note, stacklevel=3)
     t = part.transform
@@ -86,22 +86,12 @@ def read_water_raster(
     return _resampled(part, to_cloud or (lambda xyz: xyz), from_cloud, bounds, (name, title))
 
 
-def _no_heights(name: str) -> Exception:
-    sentence = "has no height near the cloud. Check its CRS and its nodata value."
-    return bad_file(name, "water.raster_empty", sentence)
-
-
 def rasters_of_images(
     folder: File, names: Sequence[str]
 ) -> tuple[dict[int, Path], tuple[str, ...]]:
-    """Find the rasters of the water, TIFF files in a folder, that have the names of images.
+    """Find the rasters of the water that have the names of images, by the rows of these.
 
-    Returns
-    -------
-    paths : dict
-        By the rows of the images.
-    notes : tuple of str
-        On images without one.
+    The notes are on images without one.
     """
     files = sorted(Path(folder).glob("*.tif"))
     row, unclear = match_labels(names, [one.stem for one in files])
@@ -110,12 +100,8 @@ def rasters_of_images(
         raise bad_file(folder, "water.image_ambiguous", sentence, image=unclear[0])
     found = {image: files[at] for image, at in enumerate(row.tolist()) if at >= 0}
     if not found:
-        raise bad_file(
-            folder,
-            "water.no_image_rasters",
-            f"has no raster named after an image, such as {Path(names[0]).stem}.tif. Give the"
-            " folder that 'pcfix calm --surface' wrote.",
-        )
+        sentence = f"has no raster named after an image, such as {Path(names[0]).stem}.tif."
+        raise bad_file(folder, "water.no_image_rasters", sentence)
     lost = len(names) - len(found)
     return found, (f"{lost} images have no water raster of their own in {folder}.",) * (lost > 0)
 
@@ -147,7 +133,7 @@ def _ways(
     stated = None if source.crs is None else source.crs.to_wkt()
     share = np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0), (0.5, 0.5)])
     x, y = place_of(source.transform, *(share * [source.width, source.height]).T)
-    at = np.column_stack([x, y, np.zeros(len(x))])
+    at = np.column_stack([x, y, 0.0 * x])
     forward, notes = way_to_cloud(stated, cloud_crs, at, name, heights=True)
     if forward is None or stated is None or cloud_crs is None:
         return None, lambda xyz: xyz, notes
@@ -160,12 +146,10 @@ def _ways(
 
 def _edge(bounds: Bounds) -> FloatArray:
     """Return points along bounds, z = 0."""
-    west, south, east, north = bounds
-    share = np.linspace(0.0, 1.0, _EDGE_POINTS)
-    x, y = west + share * (east - west), south + share * (north - south)
-    along_x = np.concatenate([x, x, np.full_like(y, x[0]), np.full_like(y, x[-1])])
-    along_y = np.concatenate([np.full_like(x, y[0]), np.full_like(x, y[-1]), y, y])
-    return np.column_stack([along_x, along_y, np.zeros(len(along_x))])
+    edge = shapely.box(*bounds).exterior
+    places = shapely.line_interpolate_point(edge, np.linspace(0, 1, 4 * _EDGE_POINTS), True)
+    xy = np.vstack([shapely.get_coordinates(places), shapely.get_coordinates(edge)])
+    return np.column_stack([xy, np.zeros(len(xy))])
 
 
 class _Part(NamedTuple):
@@ -198,10 +182,7 @@ def _read(source: DatasetReader, name: str, near: FloatArray | None) -> _Part:
     heights[np.isinf(heights)] = np.nan
     unknown = int(np.isnan(heights).sum())
     if source.nodata is None and unknown:
-        sentence = (
-            f"{name}: states no nodata value. {unknown:,} cells that are not finite or beyond"
-            f" {IMPOSSIBLE_M:g} m are ignored."
-        )
+        sentence = f"{name}: has no nodata value. {unknown:,} impossible heights are ignored."
         notes = (PcfixWarning("water.raster_nodata", sentence, count=unknown), *notes)
     return _Part(heights, source.window_transform(window), notes)
 
@@ -219,22 +200,20 @@ def _metres(source: DatasetReader, name: str) -> tuple[float, Notes]:
     factor = 1.0 if is_local(crs) else metres_up(crs)
     if factor == 1.0 or parts(crs)[1] is not None:
         return factor, ()
-    sentence = (
-        f"{name}: states no unit of its heights; that of its CRS is assumed ({factor:.4f} m)."
-    )
+    sentence = f"{name}: has no unit of heights; that of its CRS is assumed ({factor:.4f} m)."
     return factor, (PcfixWarning("water.raster_unit", sentence, unit_m=factor),)
 
 
+def _check_known(heights: FloatArray, name: str) -> None:
+    if not np.isfinite(heights).any():
+        sentence = "has no height near the cloud. Check its CRS and its nodata value."
+        raise bad_file(name, "water.raster_empty", sentence)
+
+
 def _check_size(cells: float, name: str) -> None:
-    """Refuse more cells than memory should hold."""
-    if not 0.0 < cells <= MOST_CELLS:
-        raise bad_file(
-            name,
-            "water.raster_size",
-            f"has {cells:,.0f} cells, at most {MOST_CELLS:,} are allowed. Water is smooth, so"
-            " resample it to coarser cells, such as 1 m.",
-            cells=cells,
-        )
+    if not 0.0 < cells <= MOST_CELLS:  # more than memory should hold
+        sentence = f"has {cells:,.0f} cells, {MOST_CELLS:,} at most. Resample it to coarser cells."
+        raise bad_file(name, "water.raster_size", sentence, cells=cells)
 
 
 def _resampled(
@@ -253,8 +232,8 @@ def _resampled(
         sentence = f"its cells have a size of {cell:g} m in the cloud's CRS. Check its CRS."
         raise bad_file(names[0], "water.raster_place", sentence)
     left, top = np.floor(west / cell) * cell, np.ceil(north / cell) * cell
-    columns, rows = int(np.ceil((east - left) / cell)), int(np.ceil((top - south) / cell))
-    columns, rows = max(columns, 2), max(rows, 2)
+    columns = max(int(np.ceil((east - left) / cell)), 2)
+    rows = max(int(np.ceil((top - south) / cell)), 2)
     _check_size(columns * rows, names[0])
     heights = np.empty((rows, columns))
     x = left + (np.arange(columns) + 0.5) * cell
@@ -263,8 +242,7 @@ def _resampled(
         y = top - (first + np.arange(len(strip)) + 0.5) * cell
         plan = np.column_stack([np.tile(x, len(y)), np.repeat(y, len(x)), np.zeros(strip.size)])
         strip[:] = _heights_at(part, from_cloud(plan), to_cloud).reshape(strip.shape)
-    if not np.isfinite(heights).any():
-        raise _no_heights(names[0])
+    _check_known(heights, names[0])
     return WaterRaster(heights, float(left), float(top), (float(cell), float(cell)), names[1])
 
 

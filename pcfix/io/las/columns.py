@@ -153,13 +153,9 @@ def fill(
             if target.dtype != column.dtype(wide=True):
                 raise TooNarrowError
             step = column_scale(column, points.scales)
-            raise InputError(
-                "cloud.too_deep",
-                f"{column.name} reaches {value.max() * step:g} m, more than {target.dtype} can"
-                " hold. Remove the points far below the water, or use a coarser scale.",
-                dimension=column.name,
-                value=float(value.max() * step),
-            )
+            reach = float(value.max() * step)
+            sentence = f"{column.name} reaches {reach:g} m. Remove points far below the water."
+            raise InputError("cloud.too_deep", sentence, dimension=column.name, value=reach)
         target[filled] = value
 
 
@@ -225,15 +221,11 @@ def convert(
 
     array: Records = np.zeros(len(points), point_format.dtype())
     new = laspy.ScaleAwarePointRecord(array, point_format, points.scales, points.offsets)
-    if points.point_format.id == point_format.id and _one_begins_the_other(points.array, array):
-        size = min(points.array.itemsize, array.itemsize)
-        _heads(array, size)[:] = _heads(points.array, size)
-        return new
+    same = points.point_format.id == point_format.id
     for name in points.array.dtype.names:
-        if name in array.dtype.names and name != "bit_fields":
+        if name in array.dtype.names and (same or name != "bit_fields"):
             array[name] = points.array[name]
-    if points.point_format.id == point_format.id:
-        array["bit_fields"] = points.array["bit_fields"]
+    if same:
         return new
     for name in _PACKED:
         new[name][:] = np.asarray(points[name])
@@ -243,20 +235,6 @@ def convert(
     elif "scan_angle_rank" in array.dtype.names and "scan_angle" in old.dtype.names:
         array["scan_angle_rank"] = np.rint(old["scan_angle"] * SCAN_ANGLE_STEP_DEG)
     return new
-
-
-def _one_begins_the_other(one: Records, other: Records) -> bool:
-    layouts = [
-        [(name, *array.dtype.fields[name][:2]) for name in array.dtype.names]
-        for array in (one, other)
-    ]
-    return all(a == b for a, b in zip(*layouts, strict=False))
-
-
-def _heads(array: Records, size: int) -> Records:
-    """Return the first bytes of records, each as one value."""
-    head = np.dtype((np.void, size))
-    return np.ndarray(array.shape, head, array, strides=array.strides)
 
 
 def move(points: laspy.ScaleAwarePointRecord, steps: npt.NDArray[np.int64]) -> None:

@@ -17,7 +17,7 @@ import lazrs
 import numpy as np
 from laspy.copc import Bounds, CopcReader, OctreeNode, load_octree_for_query
 
-from pcfix.errors import InputError, SettingError
+from pcfix.errors import SettingError, bad_file
 from pcfix.model import BoolArray, FloatArray
 
 if sys.platform == "win32":
@@ -30,18 +30,10 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class Part:
-    """What is asked for of a cloud.
+    """What is asked for of a cloud."""
 
-    Attributes
-    ----------
-    bounds : tuple or None
-        South-west and north-east corner, metres; points on the edges belong to it.
-    resolution : float or None
-        Of COPC: the levels down to the first whose spacing is no wider, metres.
-    """
-
-    bounds: Box | None = None
-    resolution: float | None = None
+    bounds: Box | None = None  # west, south, east, north, metres; points on the edges belong to it
+    resolution: float | None = None  # of COPC: levels down to the first with this spacing, metres
 
     def __str__(self) -> str:
         words = []
@@ -72,12 +64,7 @@ class Extent(NamedTuple):
 class CloudPart(AnyPath):
     """The path of a cloud of which a part is asked for; whoever opens it gets no more than that.
 
-    Attributes
-    ----------
-    part : Part
-    extent : Extent or None
-    held : int
-        Once it was opened; the points of the whole file.
+    Once it was opened it has the `extent` of the part, and `held`, the points of the whole file.
     """
 
     part: Part = Part()
@@ -166,12 +153,9 @@ def extent_of(
             ends.append([[one.min() for one in xyz], [one.max() for one in xyz]])
         if not count:
             low, high = header.mins, header.maxs
-            raise InputError(
-                "cloud.bounds",
-                f"{path}: no point lies {path.part}. The cloud reaches from {low[0]:.12g},"
-                f"{low[1]:.12g} to {high[0]:.12g},{high[1]:.12g}.",
-                path=path,
-            )
+            reach = ",".join(f"{one:.12g}" for one in (*low[:2], *high[:2]))
+            sentence = f"no point lies {path.part}. The cloud reaches over {reach}."
+            raise bad_file(path, "cloud.bounds", sentence)
         low, high = np.min(ends, axis=0)[0], np.max(ends, axis=0)[1]
         mins, maxs = (end * header.scales + header.offsets for end in (low, high))
         path.extent, path.held = Extent(count, mins, maxs), int(header.point_count)
@@ -181,9 +165,5 @@ def extent_of(
 def check_levels(path: CloudPart, header: laspy.LasHeader) -> None:
     """Refuse a resolution of what has no levels."""
     if path.part.resolution is not None and not is_copc(header):
-        raise SettingError(
-            "cloud.not_copc",
-            f"{path}: is not a COPC file and has no coarser levels to read. Omit"
-            " --read-resolution, or convert the cloud to COPC first.",
-            path=path,
-        )
+        sentence = f"{path}: is not COPC and has no coarser levels to read. Omit --read-resolution."
+        raise SettingError("cloud.not_copc", sentence, path=path)

@@ -21,7 +21,7 @@ import numpy as np
 from laspy.vlrs.vlr import VLR
 from laspy.vlrs.vlrlist import VLRList
 
-from pcfix.errors import InputError
+from pcfix.errors import bad_file
 from pcfix.io.crs import METRES, shortened
 from pcfix.io.files import check_input
 from pcfix.io.las.part import CloudPart, check_levels, extent_of, is_copc, nodes_in
@@ -114,6 +114,7 @@ def read_records(stream: BinaryIO) -> tuple[list[Record], list[Record]]:
 
     The waveform packets inside a LAS 1.3 file count as an EVLR.
     """
+    stream.seek(0)
     head = stream.read(375)
     if head[:4] != b"LASF":
         raise ValueError("it does not begin with LASF")
@@ -174,25 +175,21 @@ def las_errors(path: Path) -> Iterator[None]:
         if not isinstance(error, _DAMAGED) and type(error).__name__ != _PANIC:
             raise
         reason = str(error).strip().rstrip(".") or type(error).__name__
-        raise InputError(
-            "cloud.damaged",
-            f"{path}: is damaged, or is not a LAS or LAZ file ({reason}). Export or copy it again.",
-            path=path,
-        ) from error
+        sentence = f"is damaged, or is not a LAS or LAZ file ({reason}). Export or copy it again."
+        raise bad_file(path, "cloud.damaged", sentence) from error
 
 
 def refuse_ply(path: Path, head: bytes) -> None:
     """Refuse a cloud in a format that is whole, and not LAS; say how to convert it."""
     if head.startswith((b"ply\n", b"ply\r")):
         millimetres = " ".join(f"--writers.las.scale_{axis}=0.001" for axis in "xyz")
-        raise InputError(
-            "cloud.ply",
-            f"{path}: is a PLY file; pcfix reads LAS and LAZ. Convert it with: pdal translate"
-            f" {path} {path.with_suffix('.laz')} {millimetres} --writers.las.offset_x=auto"
+        sentence = (
+            f"is a PLY file; pcfix reads LAS and LAZ. Convert it with: pdal translate {path}"
+            f" {path.with_suffix('.laz')} {millimetres} --writers.las.offset_x=auto"
             " --writers.las.offset_y=auto --writers.las.offset_z=auto"
-            " --writers.las.a_srs=EPSG:CODE (CODE is that of its CRS)",
-            path=path,
+            " --writers.las.a_srs=EPSG:CODE (CODE is that of its CRS)"
         )
+        raise bad_file(path, "cloud.ply", sentence)
 
 
 class LasSource:
@@ -223,7 +220,6 @@ class LasSource:
         with las_errors(self.path):
             with self.path.open("rb") as stream:
                 refuse_ply(self.path, stream.read(4))
-                stream.seek(0)
                 self.vlrs, self.evlrs = read_records(stream)
                 stream.seek(IDENTITY_PLACE)
                 self.identity = stream.read(_IDENTITY_SIZE)
@@ -240,10 +236,8 @@ class LasSource:
         except BaseException:
             self._reader.close()
             raise
-        small = len(self) * self.header.point_format.size <= KEPT_BYTES
-        self._kept = kept if small else None
-        places_only = places_only and self._kept is None
-        if places_only:
+        self._kept = kept if len(self) * self.header.point_format.size <= KEPT_BYTES else None
+        if places_only and self._kept is None:
             self._selection = self._reader.decompression_selection = _PLACES
 
     def __enter__(self) -> LasSource:
@@ -258,23 +252,15 @@ class LasSource:
     def _check_header(self) -> None:
         scales, offsets = self.header.scales, self.header.offsets
         usable = (scales > 0.0) & (scales <= MOST_SCALE_M)
-        if not (usable.all() and np.isfinite(offsets).all()):
-            raise InputError(
-                "cloud.scales",
-                f"{self.path}: the header's scales {scales.tolist()} must be positive and at most"
-                f" {MOST_SCALE_M:,.0f}, its offsets {offsets.tolist()} finite. Export the cloud"
-                " again.",
-                path=self.path,
+        # steps below the last digit of the offsets would be lost in coordinates
+        if not (usable & (np.abs(offsets) * _LAST_DIGIT <= scales)).all():
+            sentence = (
+                f"the scales {scales.tolist()} of its header are not between 0 and"
+                f" {MOST_SCALE_M:,.0f}, or too small for its offsets {offsets.tolist()}."
             )
-        if (np.abs(offsets) * _LAST_DIGIT > scales).any():
-            raise InputError(
-                "cloud.scales",
-                f"{self.path}: the header's offsets {offsets.tolist()} are too large for steps of"
-                f" {scales.tolist()} m. Export the cloud again.",
-                path=self.path,
-            )
+            raise bad_file(self.path, "cloud.scales", f"{sentence} Export the cloud again.")
         if len(self) == 0:
-            raise InputError("cloud.empty", f"{self.path}: contains no points.", path=self.path)
+            raise bad_file(self.path, "cloud.empty", "contains no points.")
 
     def _check_count(self) -> None:
         """Refuse a header whose number of points disagrees with the points, which would be lost."""
@@ -287,13 +273,8 @@ class LasSource:
             )
         if not least <= stated <= most:
             held = f"{least:,}" if least == most else f"{least:,} to {most:,}"
-            raise InputError(
-                "cloud.count",
-                f"{self.path}: the header counts {stated:,} points, but the file holds {held}."
-                " Export the cloud again.",
-                path=self.path,
-                stated=stated,
-            )
+            sentence = f"its header counts {stated:,} points, but it holds {held}. Export it again."
+            raise bad_file(self.path, "cloud.count", sentence, stated=stated)
 
     def _points_of_records(self) -> tuple[int, float]:
         """Return how many point records fit between the header and what follows the points.
@@ -372,13 +353,9 @@ class LasSource:
             with las_errors(self.path):
                 points = self._reader.read_points(most)
             if len(points) < min(most, self.held - read):
-                raise InputError(
-                    "cloud.count",
-                    f"{self.path}: the file ends after {read + len(points):,} of"
-                    f" {self.held:,} points. Copy it again.",
-                    path=self.path,
-                    stated=self.held,
-                )
+                sentence = f"it ends after {read + len(points):,} of {self.held:,} points."
+                sentence += " Copy it again."
+                raise bad_file(self.path, "cloud.count", sentence, stated=self.held)
             read += len(points)
             yield points
 
@@ -408,12 +385,8 @@ class LasSource:
         if name not in names:
             extra = list(self.header.point_format.extra_dimension_names)
             listing = f"its extra dimensions are {', '.join(extra)}" if extra else "it has none"
-            raise InputError(
-                "cloud.no_dimension",
-                f"{self.path}: has no dimension {name}; {listing}.",
-                path=self.path,
-                dimension=name,
-            )
+            sentence = f"has no dimension {name}; {listing}."
+            raise bad_file(self.path, "cloud.no_dimension", sentence, dimension=name)
         return np.asarray(points[name], dtype=np.float64)
 
 
@@ -424,26 +397,21 @@ def backend(jobs: int | None) -> laspy.LazBackend:
 
 def coordinates(points: laspy.ScaleAwarePointRecord) -> FloatArray:
     """Return x, y, z of a chunk, shape (n, 3), metres."""
-    xyz = np.empty((len(points), 3))
-    for axis, name in enumerate("XYZ"):
-        np.multiply(points.array[name], points.scales[axis], out=xyz[:, axis])
-        xyz[:, axis] += points.offsets[axis]
-    return xyz
+    steps = np.column_stack([points.array[axis] for axis in "XYZ"])
+    return np.asarray(steps * points.scales + points.offsets)
 
 
 def centring_steps(path: File, jobs: int | None = None) -> tuple[int, ...]:
     """Return by how many steps each integer axis must be moved to have its middle at zero."""
     with LasSource(path, jobs) as source:
-        bounds = [
-            [(int(p.array[axis].min()), int(p.array[axis].max())) for axis in "XYZ"]
-            for p in source.chunks()
-        ]
-    low, high = np.min(bounds, axis=0)[:, 0], np.max(bounds, axis=0)[:, 1]
-    return tuple((-(low + high) // 2).tolist())
+        chunks = (p.array for p in source.chunks())
+        ends = [[(p[a].min(), p[a].max()) for a in "XYZ"] for p in chunks]
+    low, high = np.min(ends, axis=0)[:, 0], np.max(ends, axis=0)[:, 1]
+    return tuple((-(low.astype(np.int64) + high) // 2).tolist())
 
 
 def read_xyz(path: File) -> FloatArray:
-    """Return all coordinates of a cloud that fits in memory, shape (n, 3), metres."""
+    """Return all coordinates of a cloud, shape (n, 3), metres."""
     with LasSource(path) as source:
         return np.vstack([coordinates(points) for points in source.chunks()])
 
@@ -456,12 +424,8 @@ def stated_crs(source: LasSource) -> CRS | None:
         with las_errors(source.path):
             crs: CRS | None = source.header.parse_crs()
     except CRSError as error:
-        raise InputError(
-            "cloud.crs",
-            f"{source.path}: its coordinate system cannot be read ({shortened(str(error))})."
-            " Set it again.",
-            path=source.path,
-        ) from error
+        sentence = f"its CRS cannot be read ({shortened(str(error))}). Set it again."
+        raise bad_file(source.path, "cloud.crs", sentence) from error
     return crs
 
 
@@ -475,11 +439,7 @@ def metric_crs(source: LasSource) -> CRS | None:
         return None
     units = {axis.unit_name for axis in crs.axis_info[:2]}
     if not units.issubset(METRES):
-        raise InputError(
-            "cloud.crs_unit",
-            f"{source.path}: its coordinate system {crs.name} is in {' and '.join(sorted(units))}."
-            " Reproject the cloud to one in metres first.",
-            path=source.path,
-            crs=crs.name,
-        )
+        unit = " and ".join(sorted(units))
+        sentence = f"its CRS {crs.name} is in {unit}. Reproject the cloud to metres first."
+        raise bad_file(source.path, "cloud.crs_unit", sentence, crs=crs.name)
     return crs

@@ -23,7 +23,7 @@ from laspy.vlrs.known import ExtraBytesStruct, WktCoordinateSystemVlr
 from laspy.vlrs.vlr import VLR
 from pyproj import CRS
 
-from pcfix.errors import InputError, SettingError
+from pcfix.errors import SettingError, bad_file
 from pcfix.io.atomic import cannot_write, temporary_output
 from pcfix.io.files import parse_json
 from pcfix.io.las.columns import Column, column_scale, upgraded
@@ -187,22 +187,15 @@ def _extra_bytes(
 
 def _refuse_twice(source: LasSource, columns: tuple[Column, ...]) -> None:
     if any(is_ours(v) for v in source.vlrs):
-        raise InputError(
-            "cloud.corrected",
-            f"{source.path}: was already corrected by pcfix. Use the original, or undo the"
-            " correction with 'pcfix restore'.",
-            path=source.path,
-        )
+        sentence = "was already corrected by pcfix. Use the original, or undo it: 'pcfix restore'."
+        raise bad_file(source.path, "cloud.corrected", sentence)
     there = set(source.header.point_format.dimension_names)
     for column in columns:
         if column.name in there:
-            raise InputError(
-                "cloud.dimension_exists",
-                f"{source.path}: already has a dimension {column.name}, which pcfix would write."
-                " Rename it, or use --dimensions none.",
-                path=source.path,
-                dimension=column.name,
+            sentence = (
+                f"already has a dimension {column.name}. Rename it, or use --dimensions none."
             )
+            raise bad_file(source.path, "cloud.dimension_exists", sentence, dimension=column.name)
 
 
 def _copied(header: laspy.LasHeader) -> laspy.LasHeader:
@@ -261,20 +254,20 @@ def is_ours(vlr: VLR) -> bool:
 
 
 def _note(record: tuple[int, str], content: dict[str, Any]) -> VLR:
-    number, description = record
-    text = json.dumps(content, ensure_ascii=True, separators=(",", ":"))
-    return VLR(USER_ID, number, description, text.encode())
+    return VLR(USER_ID, *record, _json(content))
+
+
+def _json(content: dict[str, Any]) -> bytes:
+    return json.dumps(content, ensure_ascii=True, separators=(",", ":")).encode()
 
 
 def _seal_of(content: dict[str, Any]) -> str:
-    text = json.dumps(content, ensure_ascii=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+    return hashlib.sha256(_json(content)).hexdigest()[:16]
 
 
+# a file has one of these for each cleaning or labelling
 cleaning_vlr = partial(_note, (2, "pcfix cleaning (JSON)"))
-"""The VLR that says how a file was cleaned; one for each cleaning."""
 labelling_vlr = partial(_note, (3, "pcfix labelling (JSON)"))
-"""The VLR that says how a file was labelled; one for each labelling."""
 
 
 def own_settings(vlrs: Iterable[VLR]) -> Any:
@@ -295,11 +288,8 @@ def read_settings(vlrs: Iterable[VLR], path: Path) -> dict[str, Any]:
             if content.pop(_SEAL) != _seal_of(content):
                 raise ValueError("its checksum differs")
     if content is None:
-        raise InputError(
-            "cloud.not_corrected",
-            f"{path}: was not corrected by pcfix; there is nothing to undo.",
-            path=path,
-        )
+        sentence = "was not corrected by pcfix; there is nothing to undo."
+        raise bad_file(path, "cloud.not_corrected", sentence)
     return content
 
 
@@ -309,28 +299,19 @@ def record_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except (ValueError, TypeError, LookupError, AttributeError, LaspyException) as error:
-        raise InputError(
-            "cloud.vlr_damaged",
-            f"{path}: the VLR in which pcfix recorded the correction is damaged ({error}). Use the"
-            " original cloud.",
-            path=path,
-        ) from error
+        sentence = f"the record of its correction is damaged ({error}). Use the original cloud."
+        raise bad_file(path, "cloud.vlr_damaged", sentence) from error
 
 
 def check_suffix(path: Path) -> bool:
     """Return whether a name asks for LAZ rather than LAS; a `SettingError` if for neither."""
     suffix = path.suffix.lower()
     if path.name.lower().endswith(".copc.laz"):
-        raise SettingError(
-            "output.copc",
-            f"{path}: pcfix does not write COPC. Write a .laz file and convert it with"
-            " 'pdal translate' (writers.copc) or untwine.",
-            path=path,
-        )
+        sentence = f"{path}: pcfix does not write COPC. Write .laz, and convert it with untwine."
+        raise SettingError("output.copc", sentence, path=path)
     if suffix not in (".las", ".laz"):
-        raise SettingError(
-            "output.suffix", f"{path}: give an output name that ends in .las or .laz.", path=path
-        )
+        sentence = f"{path}: give an output name that ends in .las or .laz."
+        raise SettingError("output.suffix", sentence, path=path)
     return suffix == ".laz"
 
 
@@ -356,10 +337,10 @@ class LasSink:
     def __enter__(self) -> LasSink:
         laz = check_suffix(self._path)
         with ExitStack() as stack:
-            draft = stack.enter_context(temporary_output(self._path))
-            self._draft = draft
+            temporary = stack.enter_context(temporary_output(self._path))
+            self._temporary = temporary
             stack.enter_context(self._write_errors())
-            self._stream = stack.enter_context(draft.open("w+b"))
+            self._stream = stack.enter_context(temporary.open("w+b"))
             self._writer = laspy.LasWriter(
                 self._stream, self.header, do_compress=laz, laz_backend=backend(self._jobs),
                 closefd=False,
@@ -386,7 +367,7 @@ class LasSink:
         try:
             yield
         except (laspy.LaspyException, lazrs.LazrsError, OSError) as error:
-            raise cannot_write(self._path, error, self._draft) from error
+            raise cannot_write(self._path, error, self._temporary) from error
 
 
 def write_points(
@@ -396,20 +377,8 @@ def write_points(
     colours: FloatArray | None = None,
     classes: np.ndarray | None = None,
 ) -> None:
-    """Write points as a new LAS or LAZ file.
-
-    Parameters
-    ----------
-    path : path
-    xyz : array, shape (n, 3)
-        Metres.
-    place : tuple
-        The CRS, as pyproj takes one, and the step of coordinates in metres.
-    colours : array, shape (n, 3), optional
-        Red, green and blue, 16 bit.
-    classes : array, shape (n,), optional
-    """
-    crs, step_m = place
+    """Write points (n, 3), metres, as a new LAS or LAZ file, perhaps with colours of 16 bits."""
+    crs, step_m = place  # what pyproj takes, and the step of coordinates in metres
     header = laspy.LasHeader(version="1.4", point_format=6 if colours is None else 7)
     header.scales = np.full(3, step_m)
     header.offsets = np.floor(xyz.min(axis=0))

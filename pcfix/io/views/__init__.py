@@ -84,11 +84,10 @@ def _fitted(
         except InputError:
             if raw.what != COLMAP_LIST:
                 raise
-        note = PcfixWarning(
-            "views.other_frame",
+        sentence = (
             f"{raw.path}: the PLY file beside it is in another frame than the cameras. Its"
-            " positions are not used; the list is matched with the cloud row by row.",
-            path=raw.path,
+            " positions are not used; the list is matched with the cloud row by row."
         )
+        note = PcfixWarning("views.other_frame", sentence, path=raw.path)
         raw = replace(raw, xyz=None, notes=(*raw.notes, note))
     return ViewList(raw, orders, None, None, _SPACINGS[kind], kind)

@@ -111,14 +111,9 @@ def _colmap(path: Path) -> RawList:
         first, length = np.empty((2, count, 1), np.int64)
         complete, used = list_starts(words, one, one, False, first, length)
     if complete < count or used < len(words):
-        raise bad_file(
-            path,
-            "views.damaged",
-            f"is not a complete COLMAP view list: {complete:,} lists of {count:,} points and"
-            f" {_HEAD + 4 * used:,} of {size:,} bytes can be read. {_REMEDY}",
-            points=count,
-            complete=complete,
-        )
+        sentence = f"is no complete COLMAP view list: {complete:,} of {count:,} lists can be read."
+        values = {"points": count, "complete": complete}
+        raise bad_file(path, "views.damaged", f"{sentence} {_REMEDY}", **values)
     start, number = joined(words, first[:, 0], length[:, 0], 1)
     raw = RawList(path, COLMAP_LIST, start, _checked_images(path, number))
     bare = path.with_suffix("")
@@ -128,12 +123,8 @@ def _colmap(path: Path) -> RawList:
     vertices = read_header(ply).records
     if vertices == count:
         return replace(raw, **_positions(Records(ply)))
-    note = PcfixWarning(
-        "views.other_points",
-        f"{ply}: has {vertices:,} points and the list has {count:,}. Its positions are not used.",
-        path=ply,
-    )
-    return replace(raw, notes=(note,))
+    sentence = f"{ply}: has {vertices:,} points, the list {count:,}. Its positions are not used."
+    return replace(raw, notes=(PcfixWarning("views.other_points", sentence, path=ply),))
 
 
 def _openmvs(path: Path) -> RawList:

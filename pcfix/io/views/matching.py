@@ -53,32 +53,25 @@ class ViewMatch:
         self.report = ViewReport(source, len(views), notes=list(raw.notes), weights=weights)
         if raw.xyz is not None:
             # a match may be off by the rounding of both files, or by a share of the spacing
-            spacing_m, rounding_m = (
-                views.spacing_m or 0.0,
-                _ROUNDING * (step_m / 2 + raw.resolution_m),
-            )
+            spacing_m = views.spacing_m or 0.0
+            rounding_m = _ROUNDING * (step_m / 2 + raw.resolution_m)
             self.report.tolerance_m = max(rounding_m, views.default_spacings * spacing_m)
             self._same_m = max(rounding_m, _SAME * spacing_m)
             if rounding_m > spacing_m / 2:
-                note = PcfixWarning(
-                    "views.rounding",
+                sentence = (
                     f"{raw.path}: positions are rounded to {rounding_m:.2g} m, but points are"
                     f" {spacing_m:.2g} m apart. A point may get its neighbour's list; use files"
-                    " with more decimals.",
-                    rounding_m=rounding_m,
-                    spacing_m=spacing_m,
+                    " with more decimals."
                 )
-                self.report.notes.append(note)
+                values = {"rounding_m": rounding_m, "spacing_m": spacing_m}
+                self.report.notes.append(PcfixWarning("views.rounding", sentence, **values))
         elif points != len(views):
-            cloud = "an unknown number" if points is None else f"{points:,}"
-            raise bad_file(
-                raw.path,
-                "views.other_points",
-                f"has lists of {len(views):,} points, the cloud has {cloud}, and there are no"
-                " positions to match them. Put the PLY file of the list beside it.",
-                listed=len(views),
-                points=points,
+            sentence = (
+                f"has {len(views):,} points, the cloud {points or 'an unknown number'}, and no"
             )
+            sentence += " positions to match them. Put the PLY file of the list beside it."
+            values = {"listed": len(views), "points": points}
+            raise bad_file(raw.path, "views.other_points", sentence, **values)
         self._note_order()
 
     @property
@@ -236,14 +229,13 @@ class ViewReport(Sums):
     def check(self) -> None:
         """Refuse a list that gave no point of the cloud a camera."""
         if self.points and self.entries == 0:
-            raise InputError(
-                "views.no_match",
+            sentence = (
                 f"{self.source}: none of the cloud's {self.points:,} points is in the list"
                 f" ({self.list_points:,} points, {self._tolerance()}). Give the list of this cloud,"
-                " or the offset of its coordinates (--cameras-offset).",
-                points=self.points,
-                listed=self.list_points,
+                " or the offset of its coordinates (--cameras-offset)."
             )
+            values = {"points": self.points, "listed": self.list_points}
+            raise InputError("views.no_match", sentence, **values)
 
     def warnings(self) -> list[PcfixWarning]:
         """Return warnings on points without a list and on images that are ignored."""
@@ -284,10 +276,7 @@ class ViewReport(Sums):
 
 def beside(entries: int, points: int) -> str:
     """Return the sentence on cameras that cannot have imaged the points they are listed for."""
-    return (
-        f"{entries:,} entries, of {points:,} points, name cameras that look elsewhere and are"
-        " ignored. Check that list and poses belong to this cloud."
-    )
+    return f"{entries:,} entries, of {points:,} points, name cameras that look elsewhere: ignored."
 
 
 def spacing_m(xyz: FloatArray) -> float | None:

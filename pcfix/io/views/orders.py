@@ -59,21 +59,14 @@ def image_orders(raw: RawList, cameras: Cameras) -> tuple[ImageOrder, ...]:
     fitting = [order for order in found if most < len(order.camera)]
     if not fitting:
         largest = max(found, key=lambda order: len(order.camera))
-        raise bad_file(
-            raw.path,
-            "views.image_number",
-            f"names image number {most} (from 0), but there are {len(largest.camera)} in"
-            f" {largest.what}. Put the sparse model of the dense workspace beside the list.",
-            value=most,
-        )
+        sentence = f"names image {most} (from 0), but {largest.what} has {len(largest.camera)}."
+        sentence += " Put the sparse model of the dense workspace beside the list."
+        raise bad_file(raw.path, "views.image_number", sentence, value=most)
     known = [order for order in fitting if (order.camera >= 0).any()]
     if not known:
-        raise bad_file(
-            raw.path,
-            "views.other_block",
-            f"no image of {fitting[0].what} is among the cameras (the first are"
-            f" {fitting[0].unposed[0]} and {cameras.labels[0]}). Give the cameras of this block.",
-        )
+        first = f"the first are {fitting[0].unposed[0]} and {cameras.labels[0]}"
+        sentence = f"no image of {fitting[0].what} is among the cameras ({first})."
+        raise bad_file(raw.path, "views.other_block", f"{sentence} Give those of this block.")
     distinct: dict[bytes, ImageOrder] = {}
     for order in known:
         distinct.setdefault(order.camera.tobytes(), order)
@@ -143,13 +136,11 @@ def fitted(views: ViewList, cameras: Cameras, xyz: FloatArray, rows: IntArray) -
         return views
     share, best = max(known, key=lambda pair: pair[0])
     if share < LEAST_SHARE:
-        raise bad_file(
-            views.raw.path,
-            "views.other_images",
+        sentence = (
             f"only {100 * share:.0f} % of the listed cameras have their point in the frame. Put the"
-            " sparse model beside the list, or give its cameras or its offset (--cameras-offset).",
-            share=share,
+            " sparse model beside the list, or give its cameras or its offset (--cameras-offset)."
         )
+        raise bad_file(views.raw.path, "views.other_images", sentence, share=share)
     others = () if len(image) >= _ENOUGH else views.orders[:best] + views.orders[best + 1 :]
     return replace(views, orders=(views.orders[best], *others), share_seen=share)
 
