@@ -33,7 +33,9 @@ SHORT = "io"
 def pytest_configure(config: pytest.Config) -> None:
     """Use no cached kernels with ``-m quick``, so that the guard below sees every kernel call."""
     if config.option.markexpr == "quick":
-        os.environ["NUMBA_CACHE_DIR"] = tempfile.mkdtemp(prefix="pcfix-no-kernels-")
+        empty = tempfile.TemporaryDirectory(prefix="pcfix-no-kernels-")
+        config.add_cleanup(empty.cleanup)
+        os.environ["NUMBA_CACHE_DIR"] = empty.name
 
 
 @pytest.hookimpl(tryfirst=True)

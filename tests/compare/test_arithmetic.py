@@ -11,6 +11,8 @@ from pcfix.compare.sections import parse_line, section_along
 from pcfix.compare.statistics import binned, distribution_of, fit_line, statistics_of
 from pcfix.compare.vertical import heights_at
 
+pytestmark = pytest.mark.quick_but("test_c2c")
+
 EAST_M, NORTH_M = 456_000.0, 5_432_000.0
 
 

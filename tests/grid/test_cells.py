@@ -15,6 +15,8 @@ from tests.grid.twins import exact, slow_hillshade, slow_raster
 from tests.utils.nightly import mostly_nightly
 from tests.utils.rasters import read_raster
 
+pytestmark = pytest.mark.quick_but("test_every_cell")
+
 METHODS = ("mean", "median", "min", "max", "idw", "tin")
 
 FLOAT32_M = 2e-6

@@ -7,6 +7,8 @@ import pytest
 
 from pcfix.grid.contours import contours, depth_interval, interval_of
 
+pytestmark = pytest.mark.quick
+
 
 def test_rings_of_a_cone():
     """A bowl of 1 in 10 about the middle: the ring of a level has ten times its radius."""

@@ -21,6 +21,8 @@ from pcfix.io.transformations import HeightsError, transformation
 from tests.utils.clouds import random_cloud
 from tests.utils.codes import refused
 
+pytestmark = pytest.mark.quick_but("test_unknown")
+
 ESRI = (
     'PROJCS["ETRS_1989_UTM_Zone_30N",GEOGCS["GCS_ETRS_1989",DATUM["D_ETRS_1989",'
     'SPHEROID["GRS_1980",6378137.0,298.257222101]],PRIMEM["Greenwich",0.0],'

@@ -15,6 +15,8 @@ from tests.utils.codes import refused
 from tests.utils.reprojection import bring_to
 from tests.utils.shared import needs
 
+pytestmark = pytest.mark.quick_but("test_camera_files", "test_rendered", "test_samples")
+
 FREE, free = needs("rendered_a_free")
 SAMPLES, samples = needs("cameras")
 

@@ -13,6 +13,8 @@ from tests.utils.codes import refused, warned
 from tests.utils.reprojection import bring_to, check_file
 from tests.utils.shared import needs
 
+pytestmark = pytest.mark.quick_but("test_markers_of_metashape", "test_rendered")
+
 FREE, free = needs("rendered_a_free")
 SOROLLA, sorolla = needs("cameras", "metashape", "uclm_sorolla")
 RIG, rig = needs("cameras", "metashape", "micasense_rig")

@@ -10,6 +10,8 @@ from pcfix.io.tables import read_check_depths
 from pcfix.refract.regression import fit_depths
 from tests.utils.codes import refused
 
+pytestmark = pytest.mark.quick
+
 ROWS = "500001.5,4600002.25,1.5\n500003,4600004,2\n"
 
 

@@ -18,6 +18,10 @@ from pcfix.io.tides import ImageTimes, TideTable, level_offsets, read_image_time
 from tests.utils.codes import refused
 from tests.utils.shared import needs
 
+pytestmark = pytest.mark.quick_but(
+    "test_any_gauge_zero", "test_exif", "test_heights_in_a_metashape_project", "test_odm_project"
+)
+
 CAMERAS, real = needs("cameras")
 ODM, odm = needs("cameras/odm/testerarm_sub0")
 

@@ -12,6 +12,8 @@ from pcfix.io.transformations import HeightsError
 from pcfix.io.vectors import in_cloud_crs, read_shoreline, read_vectors, read_water_polygons
 from tests.utils.codes import refused
 
+pytestmark = pytest.mark.quick_but("test_crs_that_do_not_fit", "test_heights_need_a_grid")
+
 shapely = pytest.importorskip("shapely")
 raw = pytest.importorskip("pyogrio.raw")
 

@@ -11,6 +11,10 @@ from tests.utils.camera_files import brown, read, read_ties
 from tests.utils.codes import refused
 from tests.utils.shared import needs
 
+pytestmark = pytest.mark.quick_but(
+    "test_fisheye", "test_local_frame_at_a_place_and_gnss", "test_perspective_lens"
+)
+
 PARIS, paris = needs("cameras", "blocksexchange", "paris_doc_example", "Paris2012_one_photo.xml")
 ENU, enu = needs("cameras", "blocksexchange", "goodale_enu_one_photo", "AT_one_photo.xml")
 

@@ -8,6 +8,8 @@ from pcfix.lens.imaging import project
 from tests.utils.camera_files import notes, read, read_ties
 from tests.utils.codes import refused
 
+pytestmark = pytest.mark.quick_but("test_pose_lens_and_tie_points")
+
 TURN = Rotation.from_euler("xyz", [170, 12, 34], degrees=True).as_matrix()
 CENTRE = np.array([3.0, -2.0, 50.0])
 POINTS = np.array([[0.0, 1.0, 2.0], [8.0, -6.0, 1.0], [4.0, -3.0, -1.0]])

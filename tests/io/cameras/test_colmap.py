@@ -13,6 +13,8 @@ from pcfix.lens.imaging import project
 from tests.utils.camera_files import read, read_ties
 from tests.utils.codes import refused, warned
 
+pytestmark = pytest.mark.quick_but("test_binary_knows_the_models_by_their_numbers")
+
 CAMERAS = """# Camera list with one line of data per camera:
 #   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]
 3 PINHOLE 800 600 500 510 410 290

@@ -9,6 +9,8 @@ import pcfix
 from pcfix.io.cameras import FORMATS
 from tests.utils.codes import refused
 
+pytestmark = pytest.mark.quick
+
 README = Path(pcfix.__file__).parent / "io" / "cameras" / "README.md"
 PART = re.compile(r"<!-- formats: .*? -->\n(.*?)<!-- end of formats -->", re.DOTALL)
 

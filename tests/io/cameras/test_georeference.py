@@ -15,6 +15,18 @@ from pcfix.model import Cameras, GnssPositions
 from tests.utils.codes import refused
 from tests.utils.reprojection import bring_to
 
+pytestmark = pytest.mark.quick_but(
+    "test_a_map_with_north_first_is_read_east_first",
+    "test_bound_and_esri_wkt_are_the_crs_they_hold",
+    "test_heights",
+    "test_local_cloud",
+    "test_local_frame_by_the_user",
+    "test_numbers_of_the_cloud",
+    "test_offset_refused",
+    "test_points_below_a_camera_fall_on_the_same_pixels",
+    "test_with_the_geoid_installed_heights_are_brought_over",
+)
+
 FOCAL_PX, FRAME_PX, BELOW_M = 3650.0, 4000.0, 100.0
 NADIR = np.diag([1.0, -1.0, -1.0])
 LOCAL_CS = 'LOCAL_CS["Local",LOCAL_DATUM["Local",0],UNIT["metre",1]]'

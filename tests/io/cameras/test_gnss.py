@@ -9,6 +9,12 @@ from pcfix.model import Cameras, GnssPositions
 from tests.utils.reprojection import bring_to, check_file
 from tests.utils.shared import needs
 
+pytestmark = pytest.mark.quick_but(
+    "test_a_camera_where_the_gnss_put_it",
+    "test_differences_are_east_north_up",
+    "test_heights_that_cannot_be_compared_leave_the_plan",
+)
+
 WHEAT, wheat = needs("cameras", "metashape", "easyidp_wheat_psx")
 
 LON, LAT, H = 139.5405, 35.7380, 130.0

@@ -18,6 +18,16 @@ from tests.utils.codes import refused
 from tests.utils.reprojection import row_of
 from tests.utils.shared import needs
 
+pytestmark = pytest.mark.quick_but(
+    "test_fisheyes_have_the_distortion_of_a_frame_camera",
+    "test_images_turned_by_their_exif_keep_the_axes_of_the_stored_image",
+    "test_new_calibration",
+    "test_old_calibration_is_absolute_and_in_the_order_of_opencv",
+    "test_sample_project_without_its_clouds_has_its_markers",
+    "test_sample_says_where_its_gnss_was",
+    "test_sample_with_a_rig_has_degrees_in_a_metric_chunk",
+)
+
 SOROLLA, sorolla = needs("cameras", "metashape", "uclm_sorolla")
 RIG, rig = needs("cameras", "metashape", "micasense_rig")
 WHEAT, wheat = needs("cameras", "metashape", "easyidp_wheat_psx")

@@ -6,6 +6,8 @@ from pyproj import CRS, Transformer
 
 from pcfix.io.cameras.mistakes import likely_mistake
 
+pytestmark = pytest.mark.quick
+
 UTM = "EPSG:25830"
 LOW, HIGH = np.array([725300.0, 4369000.0, 8.0]), np.array([725600.0, 4369250.0, 30.0])
 RNG = np.random.default_rng(1)

@@ -8,6 +8,14 @@ from tests.utils.camera_files import notes, read, read_ties
 from tests.utils.codes import refused
 from tests.utils.reprojection import tie_point_residuals_px
 
+pytestmark = pytest.mark.quick_but(
+    "test_fixed_calibration",
+    "test_images_without_focal_length_have_no_pose",
+    "test_matrix_and_translation",
+    "test_places_from_the_corner",
+    "test_pose_and_lens",
+)
+
 TURN = Rotation.from_euler("xyz", [170, 12, 34], degrees=True)
 CENTRE = np.array([3.0, -2.0, 50.0])
 POINTS = np.random.default_rng(8).uniform((-10, -12, -2), (16, 8, 4), (40, 3))

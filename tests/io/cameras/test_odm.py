@@ -13,6 +13,8 @@ from tests.utils.camera_files import read, read_ties
 from tests.utils.codes import refused
 from tests.utils.shared import needs
 
+pytestmark = pytest.mark.quick_but("test_old_project_turns_by_the_meridian_convergence")
+
 TESTERARM, on_testerarm = needs("cameras", "odm", "testerarm_sub0")
 
 UTM15 = "+proj=utm +zone=15 +datum=WGS84 +units=m +no_defs +type=crs"

@@ -12,6 +12,8 @@ from tests.utils.camera_files import brown, read_ties
 from tests.utils.camera_files import read as read_file
 from tests.utils.codes import refused
 
+pytestmark = pytest.mark.quick_but("test_every_camera_model")
+
 CAMERA = {"projection_type": "perspective", "width": 4000, "height": 3000, "focal": 0.8}
 SHOT = {"camera": "c", "rotation": [0.1, 2.9, 0.3], "translation": [1.0, 2.0, 30.0]}
 LLA = {"latitude": 47.0, "longitude": 8.0, "altitude": 400.0}

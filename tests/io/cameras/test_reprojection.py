@@ -26,6 +26,8 @@ from tests.utils.reprojection import (
 )
 from tests.utils.shared import needs
 
+pytestmark = pytest.mark.quick_but("test_sample")
+
 
 @dataclass(frozen=True)
 class Sample:

@@ -10,6 +10,10 @@ from tests.utils.camera_files import read
 from tests.utils.codes import refused, warned
 from tests.utils.shared import needs
 
+pytestmark = pytest.mark.quick_but(
+    "test_a_projection_that_is_none_is_noted", "test_river_keeps_cameras_that_share_a_label"
+)
+
 RENDERED, rendered = needs("rendered_a")
 RIVER, river = needs("river")
 METASHAPE, metashape = needs("cameras", "metashape_opk", "sfmrefract")

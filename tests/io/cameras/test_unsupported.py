@@ -9,6 +9,8 @@ from pcfix.io.cameras import table, unsupported
 from pcfix.io.cameras.formats import Source
 from tests.utils.codes import refused
 
+pytestmark = pytest.mark.quick
+
 PATB = "1 153.2\n 456010.1 5432010.2 90.3\n 0 1 0\n -1 0 0\n 0 0 1\n"
 SFM = {"version": ["1", "2", "0"], "featuresFolders": [], "views": [{"viewId": "1"}]}
 NERF = {"fl_x": 3000.0, "frames": [{"file_path": "a.jpg", "transform_matrix": []}]}
