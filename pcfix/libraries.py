@@ -17,13 +17,7 @@ def installing(extra: str) -> str:
 
 
 def optional_library(name: str, extra: str, who: str) -> Any:
-    """Import a library of an extra.
-
-    Raises
-    ------
-    InputError
-        ``library.missing``, with the command that installs the extra.
-    """
+    """Import a library of an extra."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
@@ -45,11 +39,6 @@ def load_open3d(part: str = "open3d") -> Any:
 
     The camera drivers in open3d link to libusb-1.0 of the system, which servers often lack; the
     one in the package libusb-package serves as well.
-
-    Raises
-    ------
-    InputError
-        ``library.missing``, with what to install.
     """
     try:
         try:

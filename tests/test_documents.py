@@ -50,7 +50,7 @@ def commands():
 def test_commands():
     assert len(commands()) > 20
     for command, _ in EXAMPLES:
-        prepare(command)
+        prepare(command, everything=True)
     for line, path in commands().items():
         words = shlex.split(line, comments=True)[1:]
         try:

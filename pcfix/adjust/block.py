@@ -228,11 +228,6 @@ def check_datum(block: Block, unknowns: Unknowns, reason: str = "") -> None:
     """Check that GNSS, control points, fixed images or a free network give a datum.
 
     `reason` is why GNSS positions are not used.
-
-    Raises
-    ------
-    GeometryError
-        If none of them does.
     """
     if unknowns.free_network or unknowns.poses == "fixed":
         return
@@ -390,11 +385,6 @@ def block_of(material: Material, ties: TiePoints, sigma_px: float) -> Block:
         Apparent points, in the frame of the cameras.
     sigma_px : float
         Standard deviation of their image coordinates.
-
-    Raises
-    ------
-    GeometryError
-        If a control point lies below the water but is not marked as under water.
     """
     water, n, cameras = material.water, material.refractive_index, material.original
     if material.calibrated is not None:
@@ -493,11 +483,6 @@ def gnss_with_sigma(
         Their file, for messages.
     sigma_m : float or None
         For positions without one; None estimates it from their scatter about the centres.
-
-    Raises
-    ------
-    GeometryError
-        If all positions are offset, which indicates another datum or CRS.
     """
     known = np.isfinite(found.xyz)
     if not known.any():

@@ -539,13 +539,7 @@ class Evidence:
 
 
 def diagnosed(evidence: Evidence) -> Diagnosis:
-    """Look for every sign that the evidence allows.
-
-    Raises
-    ------
-    PcfixError
-        If the cloud cannot be read.
-    """
+    """Look for every sign that the evidence allows."""
     signs = [] if evidence.neighbours is None else [evidence.neighbours]
     if evidence.has_rays:
         signs += _signs_of_rays(evidence)
@@ -605,13 +599,7 @@ def _signs_of_ties(evidence: Evidence) -> tuple[list[Sign], FloatArray | None]:
 
 
 def _mended(evidence: Evidence, apparent: FloatArray | None) -> Mended:
-    """Return the poses that an adjustment with water would have found.
-
-    Raises
-    ------
-    GeometryError
-        If the block is too large, or its points do not determine them.
-    """
+    """Return the poses that an adjustment with water would have found."""
     count, most = len(evidence.cameras), QUICK_IMAGES if evidence.in_passing else MOST_IMAGES
     if count > most or (apparent is None and evidence.view is None):
         why = f"{count} images (limit {most})" if count > most else "no cloud"

@@ -135,11 +135,6 @@ def adjust_cloud(
         Its lens parameters are replaced by one of `lens_sets`.
     lens_sets : list of tuple of str
         Each contains the one before it.
-
-    Raises
-    ------
-    GeometryError
-        If there is no datum, or no choice converges.
     """
     first = candidates[0].block
     check_datum(first, unknowns)
@@ -309,11 +304,6 @@ def solve_unaware(
         Of `straight_columns`.
     is_tested : array of bool, shape (m,)
         Points of the cloud. The others, control points, are adjusted by least squares.
-
-    Raises
-    ------
-    GeometryError
-        If the equations are singular or Newton's steps do not shrink.
     """
     now, log, size = start, list(start.log), np.inf
     for number in range(1, MAX_STEPS + 1):
@@ -513,11 +503,6 @@ def mended(
     ----------
     xyz : array, shape (m, 3)
         Points of the apparent cloud, or tie points, spread over it; a thousand or two.
-
-    Raises
-    ------
-    GeometryError
-        If the cloud does not determine the poses.
     """
     counts = np.bincount(images_of(xyz, cameras).views.camera, minlength=len(cameras))
     row = np.flatnonzero(counts >= LEAST_POINTS)

@@ -74,11 +74,6 @@ def adjust_ties(
     choose_lens : bool
         Whether lens parameters that the block does not determine are fixed, and those that lower
         the residuals freed; else exactly those of the unknowns are free.
-
-    Raises
-    ------
-    GeometryError
-        If the block lacks a datum, does not converge, or has undetermined unknowns.
     """
     check_datum(block, unknowns)
     problem, now = prepare(block, unknowns)

@@ -55,13 +55,7 @@ _REMEDY = (
 
 
 def unknowns_of(rules: AdjustRules, lens: tuple[str, ...]) -> Unknowns:
-    """Return what is free, with these lens parameters.
-
-    Raises
-    ------
-    SettingError
-        If the user names an unknown lens parameter.
-    """
+    """Return what is free, with these lens parameters."""
     for name in rules.lens_unknowns or ():
         if name not in CODES:
             raise SettingError(
@@ -100,13 +94,7 @@ def _lens_of(material: Material, rules: AdjustRules) -> tuple[str, ...]:
 def by_ties(
     material: Material, ties: TiePoints, rules: AdjustRules, progress: Progress | None = None
 ) -> Adjusted:
-    """Adjust a block by measured tie points.
-
-    Raises
-    ------
-    GeometryError
-        If it has no datum, no water below it, or images without points.
-    """
+    """Adjust a block by measured tie points."""
     block = block_of(material, ties, rules.sigma_image or FIRST_SIGMA_PX)
     unknowns = unknowns_of(rules, _lens_of(material, rules))
     check_datum(block, unknowns, material.no_gnss)
@@ -134,11 +122,6 @@ def by_cloud(
     """Adjust a block by points, shape (m, 3), of the apparent cloud that it made.
 
     The guesses say which images contributed to them, each with its name.
-
-    Raises
-    ------
-    GeometryError
-        If the images do not see the cloud, or as of `by_ties`.
     """
     candidates: list[Candidate] = []
     notes: list[PcfixWarning] = []
@@ -248,11 +231,6 @@ def check_marks(
         Of the file.
     is_placed : bool
         Whether GNSS positions have placed the block already.
-
-    Raises
-    ------
-    GeometryError
-        Naming the point that is farthest off.
     """
     marks, _ = marks_of(control)
     found = intersect_fixed(plain_block(cameras, marks))
@@ -309,11 +287,6 @@ def check_control(found: Adjusted, name: str) -> None:
 
     The adjustment distributes a gross error over the coordinates of the point and its marks, so
     both count: the coordinates as they appear in the images.
-
-    Raises
-    ------
-    GeometryError
-        Naming the point that is farthest off.
     """
     block = found.block
     rows = block.tie_points + np.flatnonzero(block.is_surveyed[block.tie_points :])

@@ -134,11 +134,6 @@ def precision_of(
     factor : array, shape (6 + g,), optional
         Further factors of standard errors: of angles and centres of all poses, and of the shared
         unknowns; see `pcfix.adjust.shared_errors`.
-
-    Raises
-    ------
-    GeometryError
-        If unknowns are undetermined.
     """
     reduced, state, given = reduced_at(problem, solution), solution.state, problem.given
     active, k, g = reduced.active, len(state.centres), given.shared

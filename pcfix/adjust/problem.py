@@ -146,13 +146,7 @@ class Solution:
 def prepare(
     block: Block, unknowns: Unknowns, origin: FloatArray | None = None
 ) -> tuple[Problem, Solution]:
-    """Return a problem and its start; the origin is the rounded mean of the cameras by default.
-
-    Raises
-    ------
-    GeometryError
-        If cameras lack angles or lenses, or tilt or shape of a mesh or raster are free.
-    """
+    """Return a problem and its start; the origin is the rounded mean of the cameras by default."""
     cameras, water = block.cameras, block.water
     if cameras.rotations is None or cameras.lenses is None:
         raise GeometryError(
@@ -268,11 +262,6 @@ def _planes(
         Along which the water and each plane have their heights: that nearest to the normal.
     alike : dict
         Numbers that are the same unknown as another one, counted from the first of `WATER_NAMES`.
-
-    Raises
-    ------
-    GeometryError
-        If a plane, or a bundle of parallel planes, has too few points.
     """
     given = block.conditions
     if given is None:

@@ -76,11 +76,6 @@ def solve(
         Of the round, for the log.
     close : float
         Two steps in a row that lower the cost by less than this share end the round.
-
-    Raises
-    ------
-    GeometryError
-        If the normal equations stay singular, or the start has no finite cost.
     """
     rule = Rule(LOSSES[robust], LOSS_SCALE)
     now = replace(start, cost=cost_at(problem, start, rule))

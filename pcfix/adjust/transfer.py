@@ -175,13 +175,7 @@ class Pair:
 
 
 def pair_of(original: Cameras, adjusted: Cameras, place: IntArray) -> Pair:
-    """Return the pair of two models, given the original row of each adjusted image.
-
-    Raises
-    ------
-    GeometryError
-        If the images differ in shape.
-    """
+    """Return the pair of two models, given the original row of each adjusted image."""
     row = np.full(len(original), -1)
     row[place] = np.arange(len(adjusted))
     left_out = tuple(label for label, at in zip(original.labels, row, strict=True) if at < 0)
@@ -310,13 +304,7 @@ class CloudTransfer:
         return replace(ties, xyz=xyz)
 
     def check_models(self, xyz: FloatArray) -> None:
-        """Refuse models in different places, given points of the cloud; warn of single images.
-
-        Raises
-        ------
-        GeometryError
-            ``adjusted_from.apart``.
-        """
+        """Refuse models in different places, given points of the cloud; warn of single images."""
         if not len(xyz):
             return
         original, apart = self.pair.original, self._apart_m()
@@ -350,13 +338,7 @@ class CloudTransfer:
         return np.asarray(np.linalg.norm(apart, axis=1))
 
     def check(self, name: str, counts: TransferCounts) -> None:
-        """Refuse a cloud that the original cameras do not see.
-
-        Raises
-        ------
-        GeometryError
-            If no point was transferred.
-        """
+        """Refuse a cloud that the original cameras do not see."""
         if counts.points == 0 and counts.not_moved:
             words = (
                 f"{name}: no point could be transferred to the adjusted cameras, because {REASON}."

@@ -86,14 +86,7 @@ def flag_weak(
 def flag_neighbours(
     name: str, cloud: Cloud, settings: CleanRules, resources: Resources
 ) -> dict[str, float]:
-    """Run the tests that look at neighbours: see `flag_sparse` and `flag_off_bed`.
-
-    Raises
-    ------
-    InputError
-        ``cloud.too_few_points``: fewer used or submerged points than a neighbourhood has. No
-        submerged points are allowed.
-    """
+    """Run the tests that look at neighbours: see `flag_sparse` and `flag_off_bed`."""
     least = max(LEAST_NEIGHBOURS, settings.nearest)
     used, submerged = int(cloud.used.sum()), int(cloud.submerged.sum())
     if used < least + 1:

@@ -181,13 +181,7 @@ def adjust_into(
 def _read(
     inputs: Inputs, rules: AdjustRules, view: CloudView | None, survey: Survey
 ) -> tuple[Material, ViewList | None, str | CRS | None, list[PcfixWarning]]:
-    """Read and check everything but tie points; return the view list, the CRS and warnings too.
-
-    Raises
-    ------
-    PcfixError
-        If a file cannot be read, or does not fit.
-    """
+    """Read and check everything but tie points; return the view list, the CRS and warnings too."""
     name = str(inputs.cameras) if isinstance(inputs.cameras, str | Path) else "cameras"
     found = inputs.read()
     crs: str | CRS | None = None if view is None else view.crs

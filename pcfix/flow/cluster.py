@@ -119,13 +119,7 @@ def machines(scheduler: str | None, jobs: int | None, points: int) -> Iterator[R
 
 @contextmanager
 def _client_of(address: str) -> Iterator[Any]:
-    """Connect to a scheduler that has workers.
-
-    Raises
-    ------
-    InputError
-        ``cluster.no_answer`` or ``cluster.no_workers``.
-    """
+    """Connect to a scheduler that has workers."""
     distributed = optional_library("distributed", "cluster", f"--scheduler {address}")
     try:
         client = distributed.Client(address, timeout=WAIT_S, set_as_default=False)

@@ -190,14 +190,7 @@ class CloudTally(Sums):
 
 
 def read_inputs(options: CorrectOptions, view: CloudView) -> Plan:
-    """Read the inputs of a correction and check them against each other; estimate nothing.
-
-    Raises
-    ------
-    PcfixError
-        If an input cannot be read or they do not fit, a camera is below the water, or the method
-        lacks something that it needs.
-    """
+    """Read the inputs of a correction and check them against each other; estimate nothing."""
     options = with_index(options)
     inputs = options.part(Inputs)
     if inputs.port is not None:

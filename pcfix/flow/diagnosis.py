@@ -37,13 +37,7 @@ QUICK_BYTES = 25_000_000
 
 
 def diagnose(evidence: Evidence) -> Diagnosis:
-    """Look for every sign that the evidence allows, with the GNSS positions of the cameras.
-
-    Raises
-    ------
-    PcfixError
-        If the cloud cannot be read.
-    """
+    """Look for every sign that the evidence allows, with the GNSS positions of the cameras."""
     if evidence.has_rays and evidence.cameras.gnss is not None:
         try:
             gnss = gnss_in_frame_of(evidence.cameras, evidence.name)[0]

@@ -276,14 +276,6 @@ def learn_regression(
     The parts are the whole apparent cloud, each point with the water above it; they are read once,
     in bounded memory. Points of noise (classes 7 and 18) do not count.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read or is not one of check depths.
-    GeometryError
-        If a height lies above the water, fewer than three check depths lie on submerged points,
-        the depths leave the line open, or it explains too little of them (`least_r2`).
-
     Notes
     -----
     The apparent depth at a check depth is the median of the nearest submerged points, 3 to 16,

@@ -26,16 +26,7 @@ LOCAL = "local"
 
 
 def paired(original: Cameras, adjusted: Cameras) -> Pair:
-    """Match the images of two models in the cloud's CRS by their names.
-
-    Raises
-    ------
-    GeometryError
-        If adjusted images are missing in the original model, a name is ambiguous, or the images
-        differ in shape.
-    SettingError
-        If one model has no angles or no lenses.
-    """
+    """Match the images of two models in the cloud's CRS by their names."""
     for cameras, which in ((original, "adjusted-from"), (adjusted, "cameras")):
         if cameras.rotations is None or cameras.lenses is None:
             missing = "angles" if cameras.rotations is None else "lens"
@@ -85,13 +76,7 @@ class Blocks(NamedTuple):
 
 
 def read_blocks(inputs: Inputs, cloud_crs: str | CRS | None) -> Blocks:
-    """Return cameras in the cloud's CRS, and the view list, checked with the original cameras.
-
-    Raises
-    ------
-    PcfixError
-        If a file cannot be read or does not fit, or the two models are not of one block.
-    """
+    """Return cameras in the cloud's CRS, and the view list, checked with the original cameras."""
     if not inputs.cameras:
         return Blocks(NO_CAMERAS, None, NO_CAMERAS, None)
     if inputs.adjusted_from is None:
@@ -125,11 +110,6 @@ def told_apart(inputs: Inputs) -> tuple[Inputs, Inputs]:
 
     CRS and offset of the cameras are for the file that does not have its own place, or for both if
     both have one. If neither has, the offset is for that with which the two agree best.
-
-    Raises
-    ------
-    PcfixError
-        If a file cannot be read, or the views are tracks of the adjusted model.
     """
     _refuse_adjusted_tracks(inputs)
     source = inputs.cameras if inputs.adjusted_from is None else inputs.adjusted_from

@@ -44,11 +44,6 @@ def check(plan: Plan, tally: CloudTally) -> Findings:
     """Refuse a result in which cloud, water and cameras do not fit; warn of what is in doubt.
 
     Writes the shoreline too, if it is asked for.
-
-    Raises
-    ------
-    GeometryError
-        If no point was corrected, and why: none is submerged, or no image shows one.
     """
     name, figures = plan.view.name, tally.figures
     report = _view_report(plan, tally)

@@ -320,11 +320,6 @@ def round_of(
     difference_m : array, shape (rows, columns)
         DSM minus the one before, NaN where either has no height.
     wet : array of bool, shape (rows, columns)
-
-    Raises
-    ------
-    GeometryError
-        ``cloud.no_overlap``.
     """
     known = np.isfinite(difference_m)
     moved = difference_m[known & wet] if (known & wet).any() else difference_m[known]

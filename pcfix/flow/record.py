@@ -94,13 +94,7 @@ class Record:
 
 
 def read_record(path: Path) -> dict[str, Any]:
-    """Return the content of a record.
-
-    Raises
-    ------
-    InputError
-        If the file is none.
-    """
+    """Return the content of a record."""
     try:
         content: dict[str, Any] = read_json(path)
         _ = content["request"], content["inputs"], content["steps"]

@@ -52,11 +52,6 @@ def run_all(
     as the reference, only these steps are done again. `overwrite` replaces a cloud that was
     corrected in another way, and what else is in the folder. `say` gets a line for each step, `bar`
     shows its progress.
-
-    Raises
-    ------
-    PcfixError
-        With one sentence on what to do; the steps before it stay done.
     """
     inputs = [path for some in request.files().values() for path in some]
     files = Files(out_dir, request.source)

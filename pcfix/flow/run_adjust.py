@@ -54,12 +54,6 @@ def adjust_first(
         `adjusted`, a bool; `model`, the file or folder with the cameras in that of the adjustment;
         `why`; `is_said`, whether that is worth a line; `is_fine`, whether the poses are known to be
         right.
-
-    Raises
-    ------
-    PcfixError
-        If an adjustment was asked for, or files were given for it, and it is impossible. Otherwise
-        the run continues with the original cameras.
     """
     found = {"adjusted": False, "model": None, "why": "", "is_said": False, "is_fine": False}
     try:

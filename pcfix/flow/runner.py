@@ -282,11 +282,6 @@ def file_task(
     check : callable
         Returns the path of an output; see `check_cloud`.
     progress : callable, optional
-
-    Raises
-    ------
-    PcfixError
-        If a file is missing, or would be replaced.
     """
     started = time.perf_counter()
     check_one_file(input, options)

@@ -173,11 +173,6 @@ def find_surface(
         CRS of the shoreline.
     view : CloudView or None
         Without a cloud only surfaces that do not need one.
-
-    Raises
-    ------
-    PcfixError
-        If the surface cannot be read, fitted or found, or needs a cloud.
     """
     from pcfix.io.vectors import is_vector_file
 
@@ -216,11 +211,6 @@ def own_water_of(
         CRS of the cloud, its south-west and its north-east corner, metres.
     level_offset_m : array, shape (k,), optional
         Height of the water above `water` at each image.
-
-    Raises
-    ------
-    InputError
-        ``water.no_overlap`` or ``water.datum``, or if a raster cannot be read.
     """
     if folder is None:
         return None, ()

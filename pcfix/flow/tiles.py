@@ -107,12 +107,6 @@ def run_tiles(
         With jobs, scheduler and overwrite.
     progress : callable, optional
         Called with (points done, points in all) after each file.
-
-    Raises
-    ------
-    PcfixError
-        With the list of the files that failed, once the others are finished, or if the plan
-        cannot be made, or the result is refused.
     """
     started, folder = perf_counter(), path_of(output)
     check_one_file(tiles, options)

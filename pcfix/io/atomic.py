@@ -45,11 +45,6 @@ def temporary_output(target: Path) -> Iterator[Path]:
 
     The new file has the permissions of the one that it replaces. Within `all_or_none` the file is
     renamed when that block ends.
-
-    Raises
-    ------
-    InputError
-        ``output.disk_full`` or ``output.cannot_write``.
     """
     group = _group.get()
     with ExitStack() as own:

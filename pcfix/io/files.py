@@ -106,13 +106,7 @@ def files_around(path: File) -> list[Path]:
 
 
 def check_output(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) -> Path:
-    """Return the path of a file that may be written.
-
-    Raises
-    ------
-    SettingError
-        If it is one of the inputs, exists without `overwrite`, or has no folder.
-    """
+    """Return the path of a file that may be written."""
 
     def refused(code: str, sentence: str) -> SettingError:
         return SettingError(f"output.{code}", f"{target}: {sentence}", path=target)
@@ -228,11 +222,6 @@ def scratch_arrays(target: Path) -> Iterator[Empty]:
     Within the block the large arrays of `pcfix.blocks` are made this way too. Their files have no
     name, so that nothing stays when the process is killed, and the disk gets its space back as soon
     as an array is no longer used.
-
-    Raises
-    ------
-    InputError
-        ``output.disk_full``.
     """
     maps: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
 

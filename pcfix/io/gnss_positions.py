@@ -48,11 +48,6 @@ def read_gnss(path: File, cameras: Cameras, *, crs: str | None = None) -> Camera
     cameras : Cameras
     crs : str, optional
         Of the positions, instead of that in the file. That of the cameras if none is stated.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, an image has two positions, or no image has one.
     """
     source = Path(path) if Path(path).is_dir() else check_input(path)
     if crs is not None and crs.strip().lower() != "local":

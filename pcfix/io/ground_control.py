@@ -143,12 +143,6 @@ def read_ground_control(path: File, cameras: Cameras, *, crs: str | None = None)
         In the cloud's CRS, with lenses in pixels.
     crs : str, optional
         Of the points, instead of that in the file; ``local`` uses the numbers unchanged.
-
-    Raises
-    ------
-    InputError
-        If a field is wrong, rows contradict each other, a mark is outside its image or in an
-        unknown image, or the CRS do not fit.
     """
     marks = read_marks(check_input(path))
     camera, notes = _cameras_of(marks, cameras)

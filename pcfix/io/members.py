@@ -31,11 +31,6 @@ def find_members(cameras: File) -> tuple[Path, Members] | None:
     """Return the members beside a camera file, and their file; None if there is none.
 
     It is in the folder of the adjustment: a model's own folder, or one of the two above it.
-
-    Raises
-    ------
-    InputError
-        If the file is not one of an adjustment.
     """
     path = Path(cameras).resolve()
     found = next((at / FILE for at in (path, *path.parents[:2]) if (at / FILE).is_file()), None)

@@ -130,11 +130,6 @@ def tiles_of(cloud: Clouds) -> Tiles | None:
         A folder, a glob (``tiles/*.laz``), a text list with a path on each line, or a virtual
         point cloud (``.vpc``); paths in these two may be relative to their own folder.
 
-    Raises
-    ------
-    PcfixError
-        If there are no files, or they do not go together.
-
     Warns
     -----
     PcfixWarning
@@ -201,13 +196,7 @@ def _listed(path: Path) -> list[Path] | None:
 
 
 def tiles_from(name: str, paths: Iterable[Path]) -> Tiles:
-    """Return files as one cloud; those whose header cannot be read are its `broken` ones.
-
-    Raises
-    ------
-    InputError
-        If their coordinate systems or dimensions are not the same, or none can be read.
-    """
+    """Return files as one cloud; those whose header cannot be read are its `broken` ones."""
     kinds: dict[Path, tuple[Any, ...]] = {}
     heads: list[tuple[int, FloatArray, FloatArray, float]] = []
     broken: dict[Path, str] = {}

@@ -177,14 +177,7 @@ class Labelling:
         )
 
     def check(self, name: str, counts: LabelCounts, submerged: int | None = None) -> None:
-        """Check that mask, respected classes and dead band leave points below the water.
-
-        Raises
-        ------
-        GeometryError
-            ``option.dead_band`` (if the number of points that became `submerged` is given),
-            ``option.respect_classes`` or ``mask.no_points``.
-        """
+        """Check that mask, respected classes and dead band leave points below the water."""
         left = counts.below - counts.outside_mask - counts.respected
         if submerged == 0 and left and self.settings.dead_band:
             raise GeometryError(

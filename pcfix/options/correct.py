@@ -120,13 +120,7 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
         return self.method not in WITHOUT_CAMERAS or self.depth_factor == "auto"
 
     def check_no_cameras(self) -> None:
-        """Refuse what cannot be done, or has no effect, without cameras.
-
-        Raises
-        ------
-        SettingError
-            With the first option that is about cameras.
-        """
+        """Refuse what cannot be done, or has no effect, without cameras."""
         if self.needs_cameras:
             factor = self.method in WITHOUT_CAMERAS
             wanted = "depth-factor auto" if factor else f"method {self.method}"

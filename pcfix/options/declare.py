@@ -126,13 +126,7 @@ class Option(NamedTuple):
         return self.kinds if self.kinds in ((bool,), (int,), (float,)) else (str,)
 
     def checked(self, value: Any) -> Any:
-        """Return a value as its type.
-
-        Raises
-        ------
-        SettingError
-            If it is another type, not among the choices, or outside the limits.
-        """
+        """Return a value as its type."""
         if isinstance(value, str) and self.parse is not None:
             value = self.parse(self.flag[2:], value)
         if value is None and (self.default is None or type(None) in get_args(self.type)):

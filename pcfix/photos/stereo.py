@@ -72,11 +72,6 @@ def stereo_cloud(
 
     The ground, which need only be approximate, gives the range of depths and the flying height;
     `picture` returns the pixels of an image by its place in `photos`.
-
-    Raises
-    ------
-    GeometryError
-        ``photos.no_pairs``.
     """
     low, high = np.nanquantile(ground.height_m, [0.001, 0.999])
     heights = float(low - SPARE_RELIEF * (high - low) - 1.0), float(high + 1.0)

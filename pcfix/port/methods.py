@@ -106,11 +106,6 @@ def intersect_through_port(
         One row per input point. The ray distance is that of the rays through the apparent point.
     chosen : Views
         The cameras that were used.
-
-    Raises
-    ------
-    SettingError
-        If the cameras have no angles, or the method consistent finds no lenses.
     """
     chosen = port_views(xyz, cameras, port, settings, views)
     found = _intersect_chosen(xyz, chosen, cameras, port, settings)

@@ -111,11 +111,6 @@ def port_of(text: str) -> Port:
     index, 1.49) and ``nx``, ``ny`` (of the unit normal in the camera frame, 0). A dome has
     ``radius`` (m) and optionally ``thickness``, ``glass`` and ``x``, ``y``, ``z`` (of its centre
     relative to the projection centre in the camera frame, m, 0).
-
-    Raises
-    ------
-    SettingError
-        ``port.text`` if the text is not of this form, ``port.range`` if a value breaks its rule.
     """
     kind, _, rest = text.partition(":")
     kind = kind.strip().lower()

@@ -56,13 +56,7 @@ def make_optics(
     sensor_px: tuple[int, int],
     distortion: tuple[float, ...],
 ) -> Optics:
-    """Return the optics of a camera; `distortion` is k1, k2, k3, p1, p2.
-
-    Raises
-    ------
-    SettingError
-        ``scene.distortion``, if the image folds inside the frame.
-    """
+    """Return the optics of a camera; `distortion` is k1, k2, k3, p1, p2."""
     width, height = sensor_px
     focal = focal_mm / sensor_mm[0] * width
     lens = Lens(focal, width, height, width / 2.0, height / 2.0)

@@ -49,11 +49,6 @@ def piercing_points_of_planes(
 
     `anchors` and `normals` are a point of each pair's plane and its unit normal, away from the
     water. A point above the water is its own piercing point.
-
-    Raises
-    ------
-    ArithmeticError
-        If the iteration does not converge.
     """
     depth = np.einsum("mi,mi->m", anchors - points, normals)
     wet = depth > 0.0

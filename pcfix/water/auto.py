@@ -55,14 +55,6 @@ def find_water(
     Returns
     -------
     WaterProposal
-
-    Raises
-    ------
-    SettingError
-        ``option.shape`` if the arrays do not belong together.
-    GeometryError
-        ``cloud.too_few_points``, ``cloud.flat``, or ``water.not_found`` if there is no land, no
-        water, or weak or contradictory evidence.
     """
     points = np.asarray(xyz, np.float64)
     n = len(points)

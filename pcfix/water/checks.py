@@ -216,12 +216,6 @@ class WaterMeeting(Sums):
         """Check for water far above the cloud; warn of points that it does not cover.
 
         `deep` allows depths of more than `TOO_DEEP_M`. Returns the warnings as sentences.
-
-        Raises
-        ------
-        GeometryError
-            ``water.above_cloud`` if all points are deeper than `DEEPEST_M`; ``water.too_deep`` if
-            many are deeper than `TOO_DEEP_M` and that was not allowed.
         """
         found = []
         where = f"below the water ({water})"

@@ -136,14 +136,6 @@ def fit_water(
     -------
     WaterFit
         One row per input point; the order of the points does not matter.
-
-    Raises
-    ------
-    SettingError
-        ``option.choice`` or ``option.shape``.
-    GeometryError
-        ``water.too_few_points``, ``water.on_line``, or ``water.tilt`` if the surface is steeper
-        than `MAX_TILT_PERCENT`.
     """
     if model not in get_args(Model):
         raise SettingError(

@@ -84,12 +84,6 @@ def fit_river(
         Name of the mesh.
     counts : array, shape (n,), optional
         See `pcfix.water.fit.fit_water`.
-
-    Raises
-    ------
-    GeometryError
-        ``water.too_few_points`` for fewer than `FEWEST` points with heights, or all at one place;
-        ``cloud.no_extent`` for empty bounds.
     """
     points = np.asarray(xyz, np.float64)
     known = usable_rows(points)

@@ -188,12 +188,6 @@ def judge(
 
     `near` are the sums about it, with its tilt, and `whole` those over all heights without tilt;
     `sigma_m` is the standard error of its level.
-
-    Raises
-    ------
-    GeometryError
-        ``water.not_found`` if the evidence is weak or contradictory, or all of the cloud is on one
-        side of the surface.
     """
     middle = len(near.heights_m) // 2
     gain = {cue: gain_of(sums) for cue, sums in near.cues}

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -32,10 +32,8 @@ from pcfix.model import (
 from pcfix.water.fit import WaterFit
 from pcfix.water.river import RiverFit
 
-if TYPE_CHECKING:
-    from pcfix.water.auto import WaterProposal
-
-    Evidence: TypeAlias = WaterFit | RiverFit | WaterProposal
+Evidence: TypeAlias = WaterFit | RiverFit | Any
+"""A fit, or a proposal of `pcfix.water.auto`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,11 +73,6 @@ def surface_above(
     """Return the water surface above (or below) points, shape (n, 3), metres, world frame.
 
     A `WaterDimension` needs the values of the cloud's dimension, shape (n,).
-
-    Raises
-    ------
-    SettingError
-        ``option.shape`` if a `WaterDimension` comes without its values, or a wrong number of them.
     """
     match water:
         case WaterPlane(a, b, c):
@@ -226,13 +219,7 @@ class Tin(NamedTuple):
 
 @lru_cache(maxsize=4)
 def build_tin(mesh: WaterMesh) -> Tin:
-    """Index the facets of a mesh by plan position.
-
-    Raises
-    ------
-    GeometryError
-        ``water.mesh`` if no facet has an area in plan, or a vertex is not on Earth.
-    """
+    """Index the facets of a mesh by plan position."""
     if not np.abs(mesh.vertices).max(initial=0.0) < FARTHEST_M:
         raise GeometryError(
             "water.mesh",

@@ -118,7 +118,7 @@ ALL_OFF = {"deviations", "min_rays", "max_ray_miss", "max_incidence", "below", "
         {"neighbours": 5}, {"neighbours": 20.5}, {"deviations": 0.0}, {"deviations": np.nan},
         {"radius": -1.0}, {"radius_neighbours": 0}, {"min_rays": 1}, {"max_ray_miss": np.inf},
         {"max_incidence": 91.0}, {"bed_neighbours": 501}, {"fences": 0.0}, {"below": "deep"},
-        {"floating": -0.1}, dict.fromkeys(ALL_OFF),
+        {"floating": -0.1}, dict.fromkeys(sorted(ALL_OFF)),
     ],
     ids=str,
 )  # fmt: skip

@@ -191,13 +191,6 @@ def read_tie_points(path: File, cameras: Cameras) -> TiePoints:
     -------
     TiePoints
 
-    Raises
-    ------
-    NoTiePointsError
-        If the format has no tie points, or the file has none.
-    InputError
-        If they cannot be read.
-
     Warns
     -----
     PcfixWarning

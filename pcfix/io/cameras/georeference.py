@@ -273,12 +273,6 @@ def georeference(
         Added to the centres before all else, in the axes and the unit of the cameras' frame.
     name : str
         What is being read, for messages.
-
-    Raises
-    ------
-    InputError
-        If a CRS is unknown, the two cannot be brought together, a vertical grid is missing, or
-        the file calls its frame local and the cloud's is not.
     """
     offset = np.zeros(3) if offset_m is None else np.asarray(offset_m, np.float64)
     if offset.shape != (3,) or not np.isfinite(offset).all():

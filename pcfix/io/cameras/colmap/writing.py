@@ -52,13 +52,6 @@ def write_colmap(
         Taken off all positions. Default: the middle of the block, to `ROUND_M`.
     crs : str, optional
         Default: that of the cameras.
-
-    Raises
-    ------
-    InputError
-        If a lens is none that COLMAP has, or the cameras have no rotations.
-    SettingError
-        If a file exists.
     """
     from scipy.spatial.transform import Rotation
 

@@ -120,13 +120,6 @@ def write_opensfm(path: File, cameras: Cameras, tie_points: TiePoints | None = N
         topocentric, or in none.
     tie_points : TiePoints, optional
         In the frame of the cameras; those without a position or without a view are left out.
-
-    Raises
-    ------
-    InputError
-        If a lens is none that OpenSfM has, labels repeat, or the CRS cannot be left.
-    SettingError
-        If a file exists.
     """
     target = Path(path)
     times = Counter(cameras.labels)  # they are keys in the file

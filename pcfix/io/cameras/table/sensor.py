@@ -135,13 +135,6 @@ def write_table(folder: File, cameras: Cameras) -> None:
         Made if need be.
     cameras : Cameras
         With rotations and lenses.
-
-    Raises
-    ------
-    InputError
-        If a lens has what the table cannot say, or the cameras have no rotations.
-    SettingError
-        If a file exists.
     """
     from scipy.spatial.transform import Rotation
 
