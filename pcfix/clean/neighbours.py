@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pcfix.blocks import blocks, bounds, empty, grouped, let_go, mapped, row_numbers
+from pcfix.blocks import bounds, empty, grouped, let_go, mapped, row_numbers
 from pcfix.model import BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
@@ -231,12 +231,6 @@ class Tiles:
             found.append(first + np.flatnonzero(((some >= low) & (some <= high)).all(axis=1)))
         places = np.concatenate(found)
         return np.asarray(places[np.argsort(self.row[places])])
-
-
-def used_rows(used: BoolArray) -> Iterator[IntArray]:
-    """Yield the rows that are used, block by block."""
-    for rows in blocks(len(used)):
-        yield rows.start + np.flatnonzero(used[rows])
 
 
 def make_tiles(

@@ -5,7 +5,6 @@ They are independent of each other: each looks at all used points, whatever anot
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import IntFlag
@@ -14,15 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.blocks import empty
-from pcfix.clean.neighbours import (
-    PIECE_ROWS,
-    SLACK,
-    Neighbours,
-    height_quartiles,
-    make_tiles,
-    used_rows,
-)
+from pcfix.clean.neighbours import PIECE_ROWS, SLACK, Neighbours, height_quartiles, make_tiles
 from pcfix.errors import InputError, SettingError
 from pcfix.kernels import threads
 from pcfix.model import BoolArray, FloatArray, IntArray, WaterSurface
@@ -120,7 +111,7 @@ def flag_sparse(cloud: Cloud, settings: CleanRules, resources: Resources) -> dic
     find, except in clouds where so many points coincide that the mean distance is zero, or where it
     is the same for all points. There open3d takes all points for outliers, and pcfix none.
     """
-    mean_m = empty((len(cloud.xyz),)) if settings.statistical else None
+    mean_m = np.zeros(len(cloud.xyz)) if settings.statistical else None
     for near, rows, xyz in _pieces(cloud.xyz, cloud.used, 3, resources):
         distance, _ = near.nearest(xyz, settings.nearest)
         if mean_m is not None:
@@ -130,13 +121,10 @@ def flag_sparse(cloud: Cloud, settings: CleanRules, resources: Resources) -> dic
             _set(cloud.reasons, rows[lonely], Reason.RADIUS)
     if mean_m is None:
         return {}
-    used, count = cloud.used, int(cloud.used.sum())  # sums in the order of the file
-    mean = math.fsum(float(mean_m[rows].sum()) for rows in used_rows(used)) / count
-    squares = math.fsum(float(((mean_m[rows] - mean) ** 2).sum()) for rows in used_rows(used))
-    sd = math.sqrt(squares / (count - 1))
+    known = mean_m[cloud.used]  # in the order of the file
+    mean, sd = float(known.mean()), float(known.std(ddof=1))
     limit = mean + (settings.deviations or 0.0) * sd
-    for rows in used_rows(used):
-        _set(cloud.reasons, rows[mean_m[rows] > limit * SLACK], Reason.STATISTICAL)
+    _set(cloud.reasons, cloud.used & (mean_m > limit * SLACK), Reason.STATISTICAL)
     return {"mean": mean, "sd": sd, "limit": limit}
 
 

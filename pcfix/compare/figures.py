@@ -21,7 +21,6 @@ from pcfix.compare.statistics import (
     Distribution,
     Line,
     Own,
-    Sample,
     Statistics,
     Tvu,
     binned,
@@ -391,7 +390,7 @@ def _ratio(depth_m: FloatArray, error_m: FloatArray) -> float:
     if not some.any():
         return math.nan
     ratio = _at(some, lambda error, depth: 1.0 - error / depth, error_m, depth_m)
-    return float(Sample(ratio).percentiles(50))
+    return float(np.median(ratio))
 
 
 def _m3c2(match: Match, pairs: AfterBefore[Pairs] | None) -> AfterBefore[M3c2]:
@@ -399,7 +398,7 @@ def _m3c2(match: Match, pairs: AfterBefore[Pairs] | None) -> AfterBefore[M3c2]:
         far = distances_to(match, match.cloud.xyz)
     else:
         far = mapped(np.abs, (pairs.before or pairs.after).error_m)
-    reach = max(MIN_REACH_M, REACH_FACTOR * float(Sample(far).percentiles(99)))
+    reach = max(MIN_REACH_M, REACH_FACTOR * float(np.percentile(far, 99)))
     cloud, target = match.cloud, match.reference.xyz
     return both(lambda xyz: m3c2_distances(xyz, target, reach), cloud.xyz, cloud.apparent)
 

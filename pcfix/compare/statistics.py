@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
-from pcfix.blocks import blocks, empty, grouped, mapped, total
+from pcfix.blocks import blocks, grouped, mapped, total
 from pcfix.errors import GeometryError, SettingError
-from pcfix.model import FloatArray, IntArray
+from pcfix.model import FloatArray
 from pcfix.options.steps import SIGMA_REFERENCE_M
 from pcfix.refract.tally import share_of_orders, within_orders
 
@@ -84,71 +82,8 @@ class Distribution:
     shares: tuple[Share, ...] = ()
 
 
-class Sample:
-    """Values, shape (n,), sorted block by block for order statistics of all of them.
-
-    The rank of a value is the sum of its ranks in the blocks.
-    """
-
-    def __init__(self, values: FloatArray) -> None:
-        self.count = len(values)
-        runs = empty((self.count,))
-        for rows in blocks(self.count):
-            runs[rows] = np.sort(values[rows])
-        self._runs = [runs[rows] for rows in blocks(self.count)]
-
-    def below(self, marks: npt.ArrayLike, *, among: bool = False) -> IntArray:
-        """Return how many values are less than each mark, or less or equal (`among`)."""
-        side: Literal["right", "left"] = "right" if among else "left"
-        return np.sum([np.searchsorted(run, marks, side) for run in self._runs], axis=0)
-
-    def ranked(self, ranks: IntArray) -> FloatArray:
-        """Return the values of ranks, counted from 0.
-
-        They are found by bisection of the bits of floats as whole numbers, which have the same
-        order: exact, and nothing but the marks is held in memory.
-        """
-        if len(self._runs) == 1:
-            return np.asarray(self._runs[0][ranks])
-        low, high = np.full(ranks.shape, _key(-np.inf)), np.full(ranks.shape, _key(np.inf))
-        while (low < high).any():
-            middle = (low >> 1) + (high >> 1) + (low & high & 1)
-            enough = self.below(_value(middle), among=True) > ranks
-            low, high = np.where(enough, low, middle + 1), np.where(enough, middle, high)
-        return _value(low) + 0.0
-
-    def percentiles(self, marks: npt.ArrayLike) -> FloatArray:
-        """Return percentiles, linear between two values as those of numpy."""
-        place = np.asarray(marks) / 100.0 * (self.count - 1)
-        first = np.floor(place).astype(np.int64)
-        a, b = self.ranked(np.array([first, np.minimum(first + 1, self.count - 1)]))
-        part = place - first
-        return np.where(part < 0.5, a + (b - a) * part, b - (b - a) * (1.0 - part))
-
-    def counts(self, edges: FloatArray) -> list[int]:
-        """Return how many values lie between edges; the last edge belongs to the last class."""
-        below = self.below(edges)
-        below[-1] = self.below(edges[-1], among=True)
-        return [int(n) for n in np.diff(below)]
-
-
-def _key(value: npt.ArrayLike) -> IntArray:
-    """Return the bits of floats as whole numbers in the same order."""
-    bits = np.asarray(value, np.float64).view(np.int64)
-    return np.asarray(bits ^ ((bits >> 63) & np.int64(2**63 - 1)))
-
-
-def _value(key: IntArray) -> FloatArray:
-    return np.asarray(key ^ ((key >> 63) & np.int64(2**63 - 1))).view(np.float64)
-
-
-def mean_of(values: FloatArray) -> float:
-    """Return the mean of values, shape (n,)."""
-    return total(np.sum, values) / len(values)
-
-
-def statistics_of(values: FloatArray, sample: Sample | None = None) -> Statistics:
-    """Return the statistics of values, shape (n,), metres, finite; a `sample` has the same values.
+def statistics_of(values: FloatArray) -> Statistics:
+    """Return the statistics of values, shape (n,), metres, finite.
 
     Raises GeometryError ``reference.nothing_compared`` if there are none.
     """
@@ -157,40 +92,36 @@ def statistics_of(values: FloatArray, sample: Sample | None = None) -> Statistic
         raise GeometryError(
             "reference.nothing_compared", "No point is left to compare: there are no differences."
         )
-    sample = sample or Sample(values)
-    marks = sample.percentiles((*PERCENTILES, 0, 100))
-    median, mean = float(marks[PERCENTILES.index(50)]), mean_of(values)
-    sizes = sample if marks[-2] >= 0.0 else Sample(mapped(np.abs, values))
-    deviations = Sample(mapped(lambda some: np.abs(some - median), values))
+    marks = np.percentile(values, (*PERCENTILES, 0, 100))
+    median, mean = float(marks[PERCENTILES.index(50)]), float(values.mean())
     return Statistics(
         count=count,
         mean_m=mean,
-        sd_m=math.sqrt(total(lambda some: np.sum((some - mean) ** 2), values) / count),
-        rmse_m=math.sqrt(total(lambda some: np.sum(some * some), values) / count),
-        nmad_m=float(NMAD_FACTOR * deviations.percentiles(50)),
+        sd_m=float(values.std()),
+        rmse_m=math.sqrt(total(np.dot, values, values) / count),
+        nmad_m=float(NMAD_FACTOR * np.median(np.abs(values - median))),
         median_m=median,
         min_m=float(marks[-2]),
         max_m=float(marks[-1]),
-        within_95_m=float(sizes.percentiles(95)),
+        within_95_m=float(np.percentile(np.abs(values), 95)),
         percentiles_m={
             f"p{name}": float(mark) for name, mark in zip(PERCENTILES, marks, strict=False)
         },
     )
 
 
-def distribution_of(values: FloatArray, sample: Sample | None = None) -> Distribution:
+def distribution_of(values: FloatArray) -> Distribution:
     """Return statistics, histogram and fitted normal distribution of values, shape (n,), metres.
 
     The histogram lies between the outer half percents.
     """
-    sample = sample or Sample(values)
-    low, high = sample.percentiles((TAIL_PERCENT, 100.0 - TAIL_PERCENT)).tolist()
+    low, high = np.percentile(values, (TAIL_PERCENT, 100.0 - TAIL_PERCENT)).tolist()
     if not high > low:
         low, high = low - 0.5e-3, high + 0.5e-3
-    edges = np.histogram_bin_edges(np.empty(0), BINS, (low, high))
-    below, above = int(sample.below(low)), sample.count - int(sample.below(high, among=True))
-    histogram = Histogram(edges.tolist(), sample.counts(edges), below, above)
-    statistics = statistics_of(values, sample)
+    counts, edges = np.histogram(values, BINS, (low, high))
+    outside = int((values < low).sum()), int((values > high).sum())
+    histogram = Histogram(edges.tolist(), counts.tolist(), *outside)
+    statistics = statistics_of(values)
     return Distribution(statistics, histogram, normal_of(statistics, histogram))
 
 
@@ -202,12 +133,11 @@ def distances_of(
     The histogram has all values, shape (n,), metres, in as many classes as given, by default the
     square root of n, rounded up. A band is from its lower bound up to, and without, its upper one.
     """
-    sample = Sample(values)
-    plain = distribution_of(values, sample)
-    ends = np.array([plain.statistics.min_m, plain.statistics.max_m])
-    edges = np.histogram_bin_edges(ends, classes or math.ceil(math.sqrt(len(values))))
-    shares = [Share(*band, float(np.diff(sample.below(band))[0]) / len(values)) for band in bands]
-    histogram = Histogram(edges.tolist(), sample.counts(edges), 0, 0)
+    counts, edges = np.histogram(values, classes or math.ceil(math.sqrt(len(values))))
+    shares = [
+        Share(low, high, float(((values >= low) & (values < high)).mean())) for low, high in bands
+    ]
+    histogram, plain = Histogram(edges.tolist(), counts.tolist(), 0, 0), distribution_of(values)
     return replace(plain, histogram=histogram, shares=tuple(shares))
 
 
@@ -296,7 +226,7 @@ def tvu_of(error_m: FloatArray, depth_m: FloatArray) -> Tvu:
     size = mapped(np.abs, error_m)
     within = sum(within_orders(size[rows], depth_m[rows]) for rows in blocks(len(size)))
     shares = share_of_orders(np.asarray(within), len(size))
-    return Tvu(len(size), float(Sample(size).percentiles(95)), shares)
+    return Tvu(len(size), float(np.percentile(size, 95)), shares)
 
 
 def fit_line(reference_depth_m: FloatArray, depth_m: FloatArray) -> Line | None:
@@ -306,7 +236,7 @@ def fit_line(reference_depth_m: FloatArray, depth_m: FloatArray) -> Line | None:
     """
     if len(depth_m) < 3:
         return None
-    x_mean, y_mean = mean_of(reference_depth_m), mean_of(depth_m)
+    x_mean, y_mean = float(reference_depth_m.mean()), float(depth_m.mean())
 
     def product(a: FloatArray, b: FloatArray, a_mean: float, b_mean: float) -> float:
         return total(lambda u, v: (u - a_mean) @ (v - b_mean), a, b)

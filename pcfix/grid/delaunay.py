@@ -16,7 +16,7 @@ from scipy.spatial import Delaunay, QhullError
 
 from pcfix.grid.lattice import Window
 from pcfix.kernels import cores
-from pcfix.model import BoolArray, FloatArray
+from pcfix.model import FloatArray
 
 MOVED = 1e-4
 """Displacement for the choice of triangles, relative to the spacing of the points."""
@@ -140,20 +140,16 @@ PART_CELLS, PART_MARGINS = 64, 8
 
 
 def _filled(height: FloatArray, window: Window, around: Window, widest: float) -> FloatArray:
+    from scipy.ndimage import binary_erosion
+
     inner = np.array(height[window.within(around)])
     known = ~np.isnan(height)
     if known[window.within(around)].all() or not known.any():
         return inner
-    row, column = np.nonzero(known & ~_surrounded(known))
+    inside = binary_erosion(known, np.ones((3, 3), np.bool_))  # with eight known neighbours
+    row, column = np.nonzero(known & ~inside)
     position = np.column_stack([column + around.column + 0.5, row + around.row + 0.5])
     surface = triangulated(position, height[row, column], window, widest + SLACK_CELLS, 1.0)
     empty = np.isnan(inner)
     inner[empty] = surface[empty]
     return inner
-
-
-def _surrounded(known: BoolArray) -> BoolArray:
-    """Return the cells with eight known neighbours."""
-    from scipy.ndimage import binary_erosion
-
-    return np.asarray(binary_erosion(known, np.ones((3, 3), np.bool_)))

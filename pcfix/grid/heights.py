@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -20,26 +19,15 @@ class Gridding(NamedTuple):
     """The raster and the method of its heights."""
 
     lattice: Lattice
-    method: DsmMethod  # key of `HEIGHTS`
+    method: DsmMethod
     reach_m: float  # diameter of the widest circle around a triangle of the TIN
     spacing_m: float  # of the points; see `pcfix.grid.lattice.Occupancy`
 
     @property
     def margin_cells(self) -> int:
         """The number of cells around a window whose points decide on it."""
-        return HEIGHTS[self.method].margin(self.reach_m / self.lattice.resolution_m)
-
-
-class Block(NamedTuple):
-    """The points of a window, with `Gridding.margin_cells` of margin."""
-
-    position: FloatArray  # (n, 2), columns and rows, in cells from the raster's top left corner
-    cell: IntArray  # (n, 2), column and row of each point's cell
-    z: FloatArray  # (n,), metres
-    window: Window
-    numbers: Cells  # of the window's cells
-    reach: float  # in cells, as the next
-    spacing: float
+        reach = int(np.ceil(self.reach_m / self.lattice.resolution_m)) + 1
+        return {"tin": reach, "idw": 1}.get(self.method, 0)
 
 
 class Gridded(NamedTuple):
@@ -59,13 +47,19 @@ def grid_window(points: FloatArray, cell: IntArray, window: Window, how: Griddin
     inner, shape = window.holds(cell), (window.height, window.width)
     code = (cell[inner, 1] - window.row) * window.width + cell[inner, 0] - window.column
     numbers = cell_numbers(code, points[inner, 2], window.height * window.width)
-    size = how.lattice.resolution_m
-    block = Block(
-        how.lattice.positions(points), cell, points[:, 2], window, numbers,
-        how.reach_m / size, how.spacing_m / size,
-    )  # fmt: skip
-    height = HEIGHTS[how.method].of(block).reshape(shape)
-    return Gridded(height, numbers.points.reshape(shape), numbers.spread.reshape(shape))
+    size, position = how.lattice.resolution_m, how.lattice.positions(points)
+    match how.method:
+        case "tin":
+            reach, spacing = how.reach_m / size, how.spacing_m / size
+            height = triangulated(position, points[:, 2], window, reach, spacing)
+        case "idw":
+            height = inverse_distance(position, cell, points[:, 2], window)
+            height[numbers.points == 0] = np.nan
+        case method:
+            height = getattr(numbers, method)
+    return Gridded(
+        height.reshape(shape), numbers.points.reshape(shape), numbers.spread.reshape(shape)
+    )
 
 
 class Cells(NamedTuple):
@@ -118,15 +112,16 @@ NEAREST_CELLS = 1e-4
 """Least distance of a point from a centre for its weight."""
 
 
-def inverse_distance(block: Block) -> FloatArray:
+def inverse_distance(
+    position: FloatArray, cell: IntArray, z: FloatArray, window: Window
+) -> FloatArray:
     """Return the mean of the heights around each centre, weighted with 1 / distance squared.
 
-    Points farther than `REACH_CELLS` do not count, and cells without a point of their own are NaN.
-    The points cover the window with a margin of a cell.
+    Points farther than `REACH_CELLS` do not count; they cover the window with a margin of a cell.
     """
-    order = np.lexsort((block.z, block.cell[:, 0], block.cell[:, 1]))
-    position, cell, z = block.position[order], block.cell[order], block.z[order]
-    window, cells = block.window, block.window.height * block.window.width
+    order = np.lexsort((z, cell[:, 0], cell[:, 1]))  # sums that do not depend on their order
+    position, cell, z = position[order], cell[order], z[order]
+    cells = window.height * window.width
     weights, total = np.zeros(cells), np.zeros(cells)
     for down in (-1, 0, 1):
         for right in (-1, 0, 1):  # each point counts for its cell and those around it
@@ -137,26 +132,4 @@ def inverse_distance(block: Block) -> FloatArray:
             weight = 1.0 / np.maximum(square[rows], NEAREST_CELLS * NEAREST_CELLS)
             weights += np.bincount(to, weight, cells)
             total += np.bincount(to, weight * z[rows], cells)
-    known = block.numbers.points > 0
-    return np.where(known, total / np.where(known, weights, 1.0), np.nan)
-
-
-class Height(NamedTuple):
-    """A method, and the number of cells around a window that it needs, by `reach`."""
-
-    of: Callable[[Block], FloatArray]
-    margin: Callable[[float], int] = lambda reach: 0
-
-
-HEIGHTS: dict[DsmMethod, Height] = {
-    "mean": Height(lambda block: block.numbers.mean),
-    "median": Height(lambda block: block.numbers.median),
-    "min": Height(lambda block: block.numbers.min),
-    "max": Height(lambda block: block.numbers.max),
-    "idw": Height(inverse_distance, lambda reach: 1),
-    "tin": Height(
-        lambda b: triangulated(b.position, b.z, b.window, b.reach, b.spacing),
-        lambda reach: int(np.ceil(reach)) + 1,
-    ),
-}
-"""The methods of a DSM. A new one is an entry here and in `DsmMethod`."""
+    return np.asarray(total / np.where(weights > 0.0, weights, 1.0))
