@@ -210,10 +210,7 @@ def _read(
     if control is not None and water is not None:
         check_marks(control, original, _gcps_name(survey), is_placed=gnss is not None)
     _check_surfaces(rules.parallel, control, water, _gcps_name(survey))
-    low, high = original.centres.min(axis=0), original.centres.max(axis=0)
-    if view is not None:
-        low, high = view.low, view.high
-    mask = mask_of(inputs.water_mask, crs or original.crs, low[:2], high[:2])
+    mask = mask_of(inputs.water_mask, crs or original.crs)
     material = Material(
         name, original, water, index_of(rules.index, rules.index_formula)[0], gnss, control,
         inputs.port, None if survey.lens is None else _calibration(survey.lens, original),

@@ -171,25 +171,20 @@ class Inputs(InputOptions):
         return replace(ties, xyz=xyz)
 
 
-def mask_of(
-    path: File | None, cloud_crs: str | CRS | None, low: FloatArray, high: FloatArray
-) -> WaterMask | None:
-    """Read the mask in the cloud's CRS, if a file is given.
-
-    `low` and `high`, shape (2,), are the south-west and north-east corner of the cloud, metres.
-    """
+def mask_of(path: File | None, cloud_crs: str | CRS | None) -> WaterMask | None:
+    """Read the mask in the cloud's CRS, if a file is given."""
     if path is None:
         return None
     from pcfix.io.vectors import read_water_polygons
 
     polygons = read_water_polygons(path, cloud_crs)
     _warn(polygons.notes)
-    return WaterMask(polygons.area, polygons.name, low, high, tuple(map(str, polygons.notes)))
+    return WaterMask(polygons.area, polygons.name, tuple(map(str, polygons.notes)))
 
 
 def labelling_of(options: Any, view: CloudView) -> Labelling:
     """Return the rules by which points count as submerged, with the mask in the cloud's CRS."""
-    mask = mask_of(options.water_mask, view.crs, view.low, view.high)
+    mask = mask_of(options.water_mask, view.crs)
     return Labelling(options.part(LabelRules), mask)
 
 

@@ -95,7 +95,7 @@ def label_points(
         )  # fmt: skip
     surface, heights = as_surface(water, len(points))
     if water_mask is None or isinstance(water_mask, str | PathLike):
-        water_mask = mask_of(water_mask, crs, *corners(*points[:, :2].T))
+        water_mask = mask_of(water_mask, crs)
     part = Part(points, surface_above(surface, points, heights), given)
     labelling = Labelling(rules, water_mask).scanned(lambda: [part], *corners(*points[:, :2].T))
     return labelling.labels(part).classes

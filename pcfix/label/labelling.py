@@ -138,7 +138,7 @@ class Labelling:
             x, y = np.ascontiguousarray(part.xyz[rows, :2].T)
             keep = self._is_inside(x, y)
             if self.around is not None and self.around.joined is not None:
-                keep &= self.around.joined[self.around.cells(x, y)]
+                keep &= self.around.joined[self.around.lattice.cells(x, y)]
             at_surface[rows[keep]] = True
         wet &= ~at_surface
         new[wet], new[at_surface] = BATHYMETRIC_POINT, WATER_SURFACE
@@ -158,15 +158,14 @@ class Labelling:
         below, inside, respected = height < 0.0, self._is_inside(x, y), self._is_respected(classes)
         wet, in_pool = inside & ~respected, None
         if self.around is not None:
-            row, column = self.around.cells(x, y)
+            cells = self.around.lattice.cells(x, y)
             unsure = _within(height, self.settings.dead_band)
             if unsure.any():
-                wet &= ~unsure | self.around.is_wet[row, column]
-            if self.around.pools is not None:
-                number = self.around.pools.number[row, column]
-                stays = self.around.pools.stays
-                in_pool = np.bincount(number[wet & ~stays[number]], minlength=len(stays))
-                wet &= stays[number]
+                wet &= ~unsure | self.around.is_wet[cells]
+            if self.around.pool is not None and self.around.stays is not None:
+                pool, stays = self.around.pool[cells], self.around.stays
+                in_pool = np.bincount(pool[wet & ~stays[pool]], minlength=len(stays))
+                wet &= stays[pool]
         return wet, LabelCounts(
             int(below.sum()),
             int((below & ~inside).sum()),
@@ -223,17 +222,19 @@ class Labelling:
 
     def _separate(self, counts: LabelCounts) -> dict[str, Any] | None:
         """Return the number of excluded pools and their points, and the largest of them."""
-        if self.around is None or self.around.pools is None:
+        around = self.around
+        if around is None or around.area_m2 is None:
             return None
-        lattice, pools = self.around.lattice, self.around.pools
-        in_pool = np.zeros(len(pools.stays), np.int64) if counts.in_pool is None else counts.in_pool
-        area, largest = np.where(in_pool > 0, pools.area_m2, 0.0), None
+        lattice, in_pool = around.lattice, counts.in_pool
+        if in_pool is None:
+            in_pool = np.zeros(len(around.area_m2), np.int64)
+        area, largest = np.where(in_pool > 0, around.area_m2, 0.0), None
         if area.any():
             pool = int(np.argmax(area))
-            cells = np.argwhere(pools.number == pool)
+            cells = np.argwhere(around.pool == pool)
             row, column = cells[len(cells) // 2]  # a place inside it
             largest = {
-                "area_m2": round(float(pools.area_m2[pool]), 2),
+                "area_m2": round(float(area[pool]), 2),
                 "points": int(in_pool[pool]),
                 "x": float((lattice.first_column + column + 0.5) * lattice.side_m),
                 "y": float((lattice.first_row + row + 0.5) * lattice.side_m),
