@@ -252,16 +252,8 @@ def _planes(
 
     Parallel planes share two slopes, those of the water if that is one of them.
 
-    Returns
-    -------
-    numbers : list of float
-        Height and two slopes of each plane.
-    names : list of str
-        Of these numbers.
-    axis : array of int
-        Along which the water and each plane have their heights: that nearest to the normal.
-    alike : dict
-        Numbers that are the same unknown as another one, counted from the first of `WATER_NAMES`.
+    Returns their numbers (height and two slopes), names, main axes, and which numbers are the same
+    unknown as another one, counted from the first of `WATER_NAMES`.
     """
     given = block.conditions
     if given is None:

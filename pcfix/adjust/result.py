@@ -296,73 +296,9 @@ def before_of(adjusted: Adjusted) -> Before:
 
 
 def adjustment_dict(adjusted: Adjusted, before: Before | None = None) -> Plain:
-    """Return an adjustment as lists, dicts, numbers and text: the content of adjustment.json.
+    """Return the content of adjustment.json; pcfix/cli/README.md lists its keys.
 
-    Parameters
-    ----------
-    adjusted : Adjusted
-    before : Before, optional
-        Of `before_of`; without it residuals before the adjustment are None.
-
-    Returns
-    -------
-    dict
-        Angles in degrees, otherwise metres or the unit of the images. RMS residuals are those of
-        one coordinate. None for unknown numbers.
-
-        source, engine : str
-            Observations and method.
-        image_unit : {"px", "mm"}
-            Of residuals and lens; keys that end in ``_px`` have it.
-        images, images_fixed : int
-        poses_are : {"free", "fixed", "similarity"}
-        port : bool
-            Whether a housing port refracts instead of water.
-        unknowns : dict
-            `lens`, names of free parameters; standard deviations about the start: `lens_sigma`,
-            `level_sigma_m`, `tilt_sigma`, `index_sigma`, `shape_sigma`, `distance_sigma_m`,
-            `centre_sigma_m`, None if free, 0 if fixed; `free_network`; `parallel`, planes.
-        points : dict
-            `all` with used observations, on `land`, under `water`; `left_out`, tie points without
-            any; `control`, `check`.
-        observations : dict
-            `used`, `left_out`, `of_check_points` (never used), `out_of_sight` (used, but outside
-            the adjusted image).
-        sigma0 : float
-        redundancy : int
-        residuals : dict
-            Of `land` and `water`: `points`, `observations`, `rms_before_px`, `rms_px`, `rms_xy_px`,
-            `rms_m` (on the ground), `sigma_xyz_m` (RMS of the points' standard errors).
-        depth_bins : list of dict
-            `from_m`, `to_m`, `observations`, `rms_before_px`, `rms_px` by depth.
-        lens : list of dict
-            Each free parameter: `sensor`, `images`, `lenses` (the values are those of the first),
-            `name`, `before`, `after`, `sigma`.
-        water : dict or None
-            `surface`; `level`, `index`, `tilt_x`, `tilt_y` (plane), `shape_xx`, `shape_xy`,
-            `shape_yy` (free shape; 1/m) with `before`, `after`, `sigma`, `free`. Below the mean of
-            the projection centres; the level of a mesh or raster is its mean over the points.
-        port_found : dict or None
-            `port`, as --port takes it, and likewise `index`, `distance` or `centre_x`, ...
-        on_surfaces : list of dict
-            Of marked points: `surface`, `points`, `sigma_m`, `rms_m`, `largest_m`, `largest_point`.
-        poses : dict
-            `moved_mean_m` east, north, up; `moved_rms_m`, `moved_largest_m`,
-            `moved_largest_image`; `turned_rms_deg`, `turned_largest_deg`.
-        precision : dict or None
-            `images` that moved; `centre_mean_m`, `centre_largest_m` (x, y, z), `angle_mean_deg`,
-            `angle_largest_deg` (camera axes); `shared`: list of `name`, `added`, `sigma`;
-            `correlation`: their matrix; `doubts`: warnings.
-        gnss : dict or None
-            Adjusted minus GNSS: `images`, `mean_m`, `rms_m`, `rms_before_m` (east, north, up),
-            `largest_m`, `largest_image`.
-        control, check : dict or None
-            Adjusted minus surveyed: `rms_m`, `mean_m` (x, y, z), `rms_px`, and `points`: list of
-            `name`, `dx_m`, `dy_m`, `dz_m`, `rms_px`, `images`.
-        rounds : list of dict
-            `round`, `steps`, `cost`, `observations`, `rms_px` at the end of each round.
-        notes : list of dict
-            `code`, `message` and values of each warning.
+    Residuals before the adjustment need `before`, of `before_of`; without it they are None.
     """
     a, block, u = adjusted, adjusted.block, adjusted.unknowns
     kept = len(block.cameras) if u.poses == "fixed" else 0

@@ -270,12 +270,7 @@ def _pulls_of_field(
 
     The sum of the squares of the movements that they cause is the variance by the field.
 
-    Parameters
-    ----------
-    tile : array of int, shape (o,)
-        Of the frame, from zero, none without observations; each sensor has its own.
-    sigma0 : float
-        A-posteriori standard deviation of unit weight.
+    `tile` numbers the parts of the frame, none without observations; each sensor has its own.
     """
     given, state = problem.given, found.state
     size, count = len(problem.moves), int(tile.max()) + 1
