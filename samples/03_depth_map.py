@@ -5,15 +5,15 @@ Run 01_correct.py first. QGIS opens depth.tif in the colours of depth.qml.
 
 import matplotlib.pyplot as plt
 import numpy as np
+import rasterio
 
 import pcfix
-from pcfix.io.rasters import read_raster
 
 pcfix.grid_dsm(
     "corrected.laz", "depth.tif", what="depth", resolution=2.0, style=True, overwrite=True
 )
-raster = read_raster("depth.tif")
-depth = np.where(raster.array[0] == raster.nodata, np.nan, raster.array[0])
+with rasterio.open("depth.tif") as raster:
+    depth = raster.read(1, masked=True).filled(np.nan)
 plt.imshow(depth, cmap="YlGnBu")
 plt.colorbar(label="depth (m)")
 plt.savefig("depth.png", dpi=120)

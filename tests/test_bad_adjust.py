@@ -75,9 +75,7 @@ def test_words(refuse, code, words, given):
     refuse(code, *words, **given)
 
 
-@pytest.mark.parametrize(
-    "words", [("--free", "hight"), ("--sigma-level=-1",), ("--engine=colmap",)]
-)
+@pytest.mark.parametrize("words", [("--free", "hight"), ("--sigma-level=-1",)])
 def test_options(files, words):
     done = run_pcfix("adjust", "model", "out", "--water", "0", *words, folder=files.folder)
     assert done.returncode == 1

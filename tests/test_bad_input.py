@@ -200,7 +200,8 @@ def refuse(folder, words, code, **values):
 
 
 CLOUDS = {
-    "input.unreadable": ["nowhere.las", "folder.las"],
+    "input.unreadable": ["nowhere.las"],
+    "cloud.no_files": ["folder.las"],
     "cloud.damaged": [
         "text.las", "no.las", "four.las", *(f"c3_{i}.las" for i in range(6)),
         *(f"c6_{i}.las" for i in range(3)), *(f"e6_{i}.las" for i in range(3)),

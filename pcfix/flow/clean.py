@@ -22,8 +22,9 @@ from pcfix.clean.points import (
     flag_weak,
 )
 from pcfix.errors import InputError
-from pcfix.flow.runner import Check, Chunk, Command, Ends, FileTask, Progress, run_command, stream
+from pcfix.flow.runner import Check, Chunk, Command, Ends, FileTask, Progress, stream
 from pcfix.flow.surfaces import CloudView, Points, find_surface, points_of, view_of
+from pcfix.flow.tiles import run_command
 from pcfix.io.files import scratch_arrays
 from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource

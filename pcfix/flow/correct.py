@@ -26,8 +26,9 @@ from pcfix.flow.inputs import Inputs, paths_in
 from pcfix.flow.old_cameras import paired
 from pcfix.flow.outcome import check, summarize
 from pcfix.flow.plausibility import Flight, plausible
-from pcfix.flow.runner import Check, Chunk, Command, FileTask, Progress, run_command, stream
+from pcfix.flow.runner import Check, Chunk, Command, FileTask, Progress, stream
 from pcfix.flow.surfaces import CloudView, Points, corners, points_of, view_of
+from pcfix.flow.tiles import run_command
 from pcfix.io.las import columns
 from pcfix.io.las.source import LasSource, centring_steps
 from pcfix.io.las.writing import corrected_header, corrected_identity

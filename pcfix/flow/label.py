@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from pcfix.errors import SettingError
 from pcfix.flow.inputs import labelling_of, mask_of, paths_in
-from pcfix.flow.runner import Check, Chunk, Command, Ends, FileTask, Progress, run_command, stream
+from pcfix.flow.runner import Check, Chunk, Command, Ends, FileTask, Progress, stream
 from pcfix.flow.surfaces import (
     CloudView,
     Points,
@@ -23,6 +23,7 @@ from pcfix.flow.surfaces import (
     points_of,
     view_of,
 )
+from pcfix.flow.tiles import run_command
 from pcfix.io.las.columns import convert
 from pcfix.io.las.part import part_report
 from pcfix.io.las.source import LasSource

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 MODELS = ("colmap", "opensfm/reconstruction.json", "cameras.csv")
 """The models that an adjustment writes, the preferred one first."""
+FOLDER = "adjusted"
+"""The folder of an adjustment in that of a run."""
 WATER = "water.tif"
 """The water of an adjustment, where it is not a plane and was adjusted."""
 READ_ALIKE = (

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from pcfix.errors import InputError
-from pcfix.flow.runner import Check, Chunk, Command, FileTask, run_command, stream
+from pcfix.flow.runner import Check, Chunk, Command, FileTask, stream
+from pcfix.flow.tiles import run_command
 from pcfix.io.las.columns import (
     SHIFTS,
     UNSURE,

@@ -12,7 +12,7 @@ from pcfix.errors import PcfixError, PcfixWarning, SettingError
 from pcfix.flow.adjust import SUMMARY, Survey, adjust_into
 from pcfix.flow.diagnosis import diagnose, focal_length_of, given_focal_lengths, has_datum, ties_of
 from pcfix.flow.inputs import Inputs
-from pcfix.flow.next_steps import MODELS
+from pcfix.flow.next_steps import FOLDER, MODELS
 from pcfix.flow.surfaces import view_of
 from pcfix.io.files import read_json
 from pcfix.io.gnss_positions import read_gnss
@@ -25,8 +25,6 @@ from pcfix.water.index import with_index
 
 if TYPE_CHECKING:
     from pcfix.flow.request import Request
-
-FOLDER = "adjusted"
 
 
 def outputs_of(folder: Path) -> list[Path]:

@@ -18,11 +18,12 @@ from pcfix.flow.correct import correct_file
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.layers import Drawn, write_map
+from pcfix.flow.next_steps import FOLDER
 from pcfix.flow.old_cameras import read_blocks
 from pcfix.flow.rasters import raster_files, resolution_sentence, write_rasters
 from pcfix.flow.report import write_report
 from pcfix.flow.request import Files, Request
-from pcfix.flow.run_adjust import FOLDER, adjust_first, figures_of, outputs_of
+from pcfix.flow.run_adjust import adjust_first, figures_of, outputs_of
 from pcfix.flow.runner import Progress
 from pcfix.flow.surfaces import view_of
 from pcfix.grid.maps import MOST_CELLS

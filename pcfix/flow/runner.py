@@ -18,13 +18,12 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
-from pcfix.io.atomic import all_or_none
 from pcfix.io.files import check_input, check_output, write_text
 from pcfix.io.las.part import cloud_part
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import LasSink, check_suffix, output_evlrs
-from pcfix.io.tiles import Clouds, Tiles, check_one_file, inputs_of, single, tiles_of
-from pcfix.kernels import telling, threads
+from pcfix.io.tiles import Tiles, check_one_file, inputs_of
+from pcfix.kernels import telling
 from pcfix.options.declare import File
 
 if TYPE_CHECKING:
@@ -130,32 +129,6 @@ class FileTask:
     def seconds(self) -> float:
         """Time since the start."""
         return time.perf_counter() - self.started
-
-
-def run_command(
-    command: Command,
-    input: Clouds,
-    output: File,
-    options: Any,
-    *,
-    reads: Iterable[Any] = (),
-    progress: Progress | None = None,
-) -> Any:
-    """Run a command over one file or many; `reads` are further inputs. Returns its result."""
-    tiles = tiles_of(input)
-    if tiles is not None:
-        from pcfix.flow.tiles import run_tiles
-
-        return run_tiles(command, tiles, output, options, progress)
-    task = file_task(single(input), output, options, reads=reads, progress=progress)
-    with threads(task.jobs), all_or_none():
-        plan = command.plan(task.source, task.target, task.kept)
-        tally, findings = command.process(plan, task, 0, partial(command.check, plan))
-        ends = Ends(str(task.source), str(task.target), task.seconds, task.source)
-        result = command.summarize(plan, tally, findings, ends)
-        if task.summary is not None:
-            write_summary(task, result.as_dict())
-    return result
 
 
 def stream(

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import InputError, PcfixWarning, SettingError
+from pcfix.errors import InputError, PcfixWarning, SettingError, coded
 from pcfix.flow.runner import Chunk, read_ahead
 from pcfix.io.las import source as las
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
@@ -308,8 +308,8 @@ def _fitted(options: WaterOptions, path: File, view: CloudView | None) -> FoundS
         found = fit_river(xyz, _bounds(low, high), name=shore.name, counts=shore.counts)
     else:
         found = fit_water(xyz, model=options.water_model, counts=shore.counts)
-    for note in notes:
-        warnings.warn(note, PcfixWarning, stacklevel=2)
+    for note in coded("water.points", notes):
+        warnings.warn(note, stacklevel=2)
     if (shore.counts < 1.0).any():
         notes.append(
             f"{shore.name}: {len(xyz):,} points along drawn lines count as"

@@ -10,8 +10,9 @@ from __future__ import annotations
 import json
 import pickle
 import warnings
+from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import reduce
+from functools import partial, reduce
 from hashlib import sha256
 from operator import add
 from pathlib import Path
@@ -29,15 +30,17 @@ from pcfix.flow.runner import (
     Progress,
     check_cloud,
     check_summary,
+    file_task,
     write_summary,
 )
+from pcfix.io.atomic import all_or_none
 from pcfix.io.files import file_state, path_of, read_tally, write_tally
-from pcfix.io.tiles import BrokenTileError, Tiles, check_one_file
+from pcfix.io.tiles import BrokenTileError, Clouds, Tiles, check_one_file, single, tiles_of
 from pcfix.io.vectors import LAYER_MARK
 from pcfix.kernels import threads
 from pcfix.options.declare import File, options_of
 
-RECORDS = ".pcfix"
+RECORDS, BEGUN = ".pcfix", "begun "
 HOW = ("overwrite", "jobs", "scheduler", "summary")
 """Options on which no output depends."""
 
@@ -70,6 +73,11 @@ class Tile:
         """Whether the output exists, with the same key."""
         return self.target.is_file() and read_tally(self.record)[0] == self.key
 
+    @property
+    def is_begun(self) -> bool:
+        """Whether a run that was stopped may have written the output."""
+        return read_tally(self.record)[0] == BEGUN + self.key
+
 
 def do_tile(pickled: bytes, tile: Tile, jobs: int | None = None) -> str:
     """Process one file, here or on a worker; return the error, if there was one."""
@@ -83,6 +91,7 @@ def do_tile(pickled: bytes, tile: Tile, jobs: int | None = None) -> str:
         if tile.is_finished:  # by a worker that was lost before it could say so
             return ""
         process, plan = pickle.loads(pickled)
+        write_tally(tile.record, BEGUN + tile.key, None)
         with threads(jobs), warnings.catch_warnings():
             warnings.simplefilter("ignore", PcfixWarning)  # shown when the plan was made
             tally, _ = process(plan, FileTask(tile.source, tile.target, jobs=jobs), tile.row, None)
@@ -92,21 +101,36 @@ def do_tile(pickled: bytes, tile: Tile, jobs: int | None = None) -> str:
     return ""
 
 
+def run_command(
+    command: Command,
+    input: Clouds,
+    output: File,
+    options: Any,
+    *,
+    reads: Iterable[Any] = (),
+    progress: Progress | None = None,
+) -> Any:
+    """Run a command over one file or many; `reads` are further inputs. Returns its result."""
+    tiles = tiles_of(input)
+    if tiles is not None:
+        return run_tiles(command, tiles, output, options, progress)
+    task = file_task(single(input), output, options, reads=reads, progress=progress)
+    with threads(task.jobs), all_or_none():
+        plan = command.plan(task.source, task.target, task.kept)
+        tally, findings = command.process(plan, task, 0, partial(command.check, plan))
+        ends = Ends(str(task.source), str(task.target), task.seconds, task.source)
+        result = command.summarize(plan, tally, findings, ends)
+        if task.summary is not None:
+            write_summary(task, result.as_dict())
+    return result
+
+
 def run_tiles(
     command: Command, tiles: Tiles, output: File, options: Any, progress: Progress | None = None
 ) -> Any:
     """Run a command over all files that are not finished yet, and return its result.
 
-    Parameters
-    ----------
-    command : Command
-    tiles : Tiles
-    output : path
-        Folder of the outputs, which have the names of the inputs.
-    options : OptionSet
-        With jobs, scheduler and overwrite.
-    progress : callable, optional
-        Called with (points done, points in all) after each file.
+    `progress` is called with (points done, points in all) after each file.
     """
     started, folder = perf_counter(), path_of(output)
     check_one_file(tiles, options)
@@ -116,7 +140,8 @@ def run_tiles(
     done = {tile for tile in work.values() if tile.is_finished}
     todo = [tile for tile in work.values() if tile not in done]
     for tile in todo if folder.exists() else ():
-        check_cloud(tile.target, overwrite=options.overwrite, inputs=tiles.paths)
+        replaced = options.overwrite or tile.is_begun
+        check_cloud(tile.target, overwrite=replaced, inputs=tiles.paths)
     result, points = None, sum(one.points for one in todo)
     with threads(options.jobs), machines(options.scheduler, options.jobs, points) as run:
         plan, readable = _planned(command, tiles, folder)

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-import pcfix.refract.occlusion as top_surface
 from pcfix import Cameras
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.occlusion import OccluderBuilder, occluder_of, wants_occlusion
@@ -70,15 +69,6 @@ def test_second_highest():
     np.testing.assert_array_equal(occluder.height[1:-1, 1:-1], expected.astype(np.float32))
 
 
-def test_blocks():
-    occluder = occluder_of(hills())
-    for tops, side in ((occluder.block_top, 8), (occluder.large_block_top, 64)):
-        for (r, c), top in np.ndenumerate(tops):
-            block = occluder.height[r * side : (r + 1) * side, c * side : (c + 1) * side]
-            assert top == np.nanmax(block, initial=-np.inf)
-    assert occluder.highest_m == np.nanmax(occluder.height)
-
-
 def test_chunks():
     xyz = hills()
     whole = occluder_of(xyz)
@@ -91,14 +81,3 @@ def test_chunks():
         for part in np.array_split(shuffled, 9):
             builder.add(part, np.ones(len(part), np.uint8))
         same(builder.build(), whole)
-
-
-def test_memory(monkeypatch):
-    monkeypatch.setattr(top_surface, "MOST_CELLS", 10_000)
-    rng = np.random.default_rng(3)
-    wide = np.column_stack([rng.uniform(0.0, 1e5, (20_000, 2)), rng.normal(0.0, 1.0, 20_000)])
-    line = wide * [1.0, 0.0, 1.0]
-    for xyz in (wide, line):
-        occluder = occluder_of(xyz)
-        assert occluder.height.size <= 10_000
-        assert np.isfinite(occluder.margin).all() and np.isfinite(occluder.highest_m)

@@ -52,7 +52,7 @@ def test_next_commands(bent_middle, tmp_path, monkeypatch):
         "correct", cloud, tmp_path / "bent.laz", "--cameras", BENT / "sparse", "--water", LEVEL_M,
         "--cameras-offset", ",".join(map(str, OFFSET_M)), "--views", listed,
     )  # fmt: skip
-    assert "GNSS.csv stands for the positions of the images" in done.stderr
+    assert "--gnss GNSS.csv" in done.stderr
     line = done.stderr.split("instead): ")[1].splitlines()[0]
     assert f"--views {listed}" in line
     out = run_line(line, **{"GNSS.csv": BENT / "gnss.csv", "OUT": tmp_path / "adjusted"})

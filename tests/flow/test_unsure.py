@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import fields
 from functools import cache
-from pathlib import Path
 
 import laspy
 import numpy as np
@@ -134,15 +133,6 @@ def test_restored(folder, corrected, tmp_path, uncorrected, max_angle):
     assert (tmp_path / "back.las").read_bytes() == (folder / "cloud.las").read_bytes()
 
 
-@pytest.mark.parametrize(("dimensions", "count"), [("minimal", 3), ("none", 0)])
-def test_fewer_dimensions(corrected, dimensions, count):
-    given = ({}, {"dimensions": dimensions})
-    whole, few = (laspy.read(corrected(**more)[1]) for more in given)
-    np.testing.assert_array_equal(whole.withheld, few.withheld)
-    names = list(few.point_format.extra_dimension_names)
-    assert len(names) == count and ("Unsure" in names) == (count > 0)
-
-
 def test_command_line(folder, needed, by_default, tmp_path):
     words = [word for name, value in needed.items() for word in ("--" + name, value)]
     done = run_pcfix(
@@ -150,22 +140,3 @@ def test_command_line(folder, needed, by_default, tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert by_default[1].read_bytes() == (tmp_path / "b.las").read_bytes()
-
-
-@pytest.mark.parametrize(
-    ("more", "why"),
-    [({"max_angle": 15}, "beyond 15 degrees alone"), ({"max_cameras": 2}, "but are not chosen")],
-)
-def test_cameras_left_out(tmp_path, more, why):
-    scene = Path(__file__).parents[2] / "samples" / "scene"
-    cloud, cameras = laspy.read(scene / "cloud.laz"), pcfix.read_cameras(scene / "cameras.csv")
-    found = pcfix.correct_file(
-        scene / "cloud.laz", tmp_path / "out.laz", cameras=scene / "cameras.csv", water=0.37,
-        method="snell", **more,
-    )  # fmt: skip
-    assert found.cameras_left_out == {why: found.cameras_unused}  # the frames overlap the bed
-    bed = cloud.xyz[cloud.xyz[:, 2] < 0.37]
-    for label in found.cameras_unused:
-        across, along, up = (cameras.centres[cameras.labels.index(label)] - bed).T
-        steepest = np.degrees(np.arctan2(np.hypot(across, along), up)).min()
-        assert steepest > 15.0 or "max_angle" not in more

@@ -52,16 +52,6 @@ def test_even_odd(seed):
     np.testing.assert_array_equal(found[off], even_odd(rings, x, y)[off])
 
 
-def test_corners_of_points():
-    rng = np.random.default_rng(5)
-    area, _ = lake(rng)
-    x, y = EAST + rng.uniform(-110, 110, 5000), NORTH + rng.uniform(-110, 110, 5000)
-    expected, middle = shapely.intersects_xy(area, x, y), np.array([EAST, NORTH])
-    for low, high in ((-20, 15), (-500, 500), (40, 300), (3000, 4000), (np.nan, np.nan), (0, 0)):
-        mask = WaterMask(area, "m", middle + low, middle + high)
-        np.testing.assert_array_equal(mask.inside(x, y), expected)
-
-
 def test_border_and_hole():
     square = shapely.box(EAST, NORTH, EAST + 10, NORTH + 10)
     hole = shapely.box(EAST + 4, NORTH + 4, EAST + 6, NORTH + 6)

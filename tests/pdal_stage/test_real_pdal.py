@@ -148,39 +148,6 @@ def test_water_of_a_dimension(tmp_path: Path, door: str) -> None:
     assert_same(tmp_path / "cli.las", tmp_path / "stage.las")
 
 
-@needs_pdal
-@pytest.mark.parametrize("door", mostly_nightly(["program", "python"], "program"))
-def test_libraries_in_one_process(tmp_path: Path, door: str) -> None:
-    """Two PROJ or GDAL libraries in a process have crashed the program at its exit."""
-    pytest.importorskip("rasterio")
-    write_cloud(tmp_path / "cloud.las", 7, plain=True)
-    cameras_csv(tmp_path / "cameras.csv", block())
-    (tmp_path / "water.ply").write_text(
-        "ply\nformat ascii 1.0\nelement vertex 4\nproperty double x\nproperty double y\n"
-        "property double z\nelement face 2\nproperty list uchar int vertex_indices\nend_header\n"
-        f"455000 5431000 {WATER_M}\n457000 5431000 {WATER_M}\n"
-        f"455000 5433000 {WATER_M}\n457000 5433000 {WATER_M}\n3 0 1 2\n3 1 3 2\n"
-    )
-    loading = (
-        "\nimport pcfix.pdal_stage as entry"
-        "\ndef libraries(ins, outs):"
-        "\n    def work(*a):"
-        "\n        import laspy, pyproj, rasterio, open3d, numba, scipy.spatial"
-        "\n        pyproj.Transformer.from_crs(32633, 4326).transform(456000, 5432000)"
-        "\n        rasterio.crs.CRS.from_epsg(32633).to_wkt()"
-        "\n    return entry._run(work, globals(), ins, outs)"
-    )
-    first = {
-        "type": "filters.python", "source": loading, "module": "m", "function": "libraries"
-    }  # fmt: skip
-    job = ["cloud.las", first, stage_of(water="water.ply"),
-           {"type": "writers.las", "filename": "stage.las", "minor_version": 4,
-            "dataformat_id": 7, "forward": "all"}]  # fmt: skip
-    done = run_pipeline(door, job, tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert np.sum(laspy.read(tmp_path / "stage.las").classification == 40) > 100
-
-
 # Recipes
 
 
@@ -268,34 +235,6 @@ def test_recipe_with_comparison(tmp_path: Path, point_format: int) -> None:
     report = (tmp_path / "meta.json").read_text()
     assert f'"noise": {cleaned.noise}' in report
     assert '"c2c": ' in report
-
-
-@needs_pdal
-def test_recipe_for_tiles(tmp_path: Path) -> None:
-    (tmp_path / "tiles").mkdir()
-    las = laspy.read(SCENE / "cloud.laz")
-    for i, rows in enumerate(np.array_split(np.arange(len(las)), 3)):
-        tile = laspy.LasData(las.header)
-        tile.points = las.points[rows]
-        tile.write(tmp_path / "tiles" / f"tile_{i}.laz")
-    recipe = ROOT / "pipelines" / "correct_many.json"
-    words = options_of("correct_many.json", tmp_path)[1:-1]
-    done = pdal("pipeline", recipe, *words, folder=tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
-    tiles = [laspy.read(path) for path in sorted(tmp_path.glob("corrected_*.las"))]
-    assert len(tiles) > 1
-    whole = laspy.read(corrected_scene(tmp_path))
-
-    def rows(cloud: laspy.LasData) -> np.ndarray:
-        names = ["classification", "ShiftX", "ShiftZ", "RayCount"]
-        columns = [cloud.x, cloud.y, cloud.z, *(cloud[name] for name in names)]
-        return np.column_stack([np.round(np.asarray(c, float), 3) for c in columns])
-
-    found, expected = np.vstack([rows(tile) for tile in tiles]), rows(whole)
-    assert found.shape == expected.shape
-    np.testing.assert_allclose(
-        found[np.lexsort(found.T)], expected[np.lexsort(expected.T)], atol=1e-6
-    )
 
 
 @pytest.mark.parametrize("path", RECIPES, ids=lambda path: path.stem)

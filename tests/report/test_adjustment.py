@@ -18,6 +18,7 @@ from pcfix.model import Cameras, Lens, WaterPlane
 from pcfix.report.adjustment import adjustment_page, adjustment_text
 from pcfix.report.adjustment_figures import pictures_of
 from tests.report.test_report import Elements
+from tests.utils.shared import ROOT
 
 FOCAL, HEIGHT, LEVEL = 1000.0, 50.0, 0.5
 EAST, NORTH = 320000.0, 3842000.0
@@ -153,10 +154,10 @@ def test_residuals_on_the_ground(adjusted):
 def test_values(adjusted):
     values = adjustment_dict(adjusted, before_px(adjusted))
     json.dumps(values, allow_nan=False)
-    documented = re.findall(r"^ {8}([a-z_0-9, ]+) : ", adjustment_dict.__doc__, re.M)
-    assert {name for row in documented for name in row.split(", ")} - {"adjusted", "before"} == set(
-        values
-    )
+    reference = (ROOT / "pcfix" / "cli" / "README.md").read_text("utf-8")
+    table = reference[reference.index("| key of `adjustment.json`") :].partition("\n\n")[0]
+    rows = re.findall(r"^\| (`.*?) \|", table, re.M)
+    assert {name.strip("` ") for row in rows for name in row.split(",")} == set(values)
     assert values["precision"]["images"] == 2
     # standard errors 1, 2, 3 cm of one pose, twice these of the other
     assert values["precision"]["centre_mean_m"] == pytest.approx([0.015, 0.03, 0.045])
