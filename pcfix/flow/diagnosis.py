@@ -51,12 +51,12 @@ class Poses(NamedTuple):
     """What is known of the poses of a correction.
 
     absorbed : whether they absorbed the refraction, None if unknown; words : that as a line of a
-    summary; warning : empty if there is none; signs : each in plain values.
+    summary; signs : each in plain values.
     """
 
     absorbed: bool | None
     words: str
-    warning: str = ""
+    warning: PcfixWarning | None = None
     signs: tuple[dict[str, Any], ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
@@ -70,10 +70,9 @@ ADJUSTED = Poses(False, "adjusted with refraction (--adjusted-from)")
 def diagnose_in_passing(
     inputs: Inputs, evidence: Evidence, view: CloudView, verdicts: tuple[Verdict, ...] = ()
 ) -> Poses:
-    """Check the poses with what a correction has read anyway; warn once if they are bent.
+    """Check the poses with what a correction has read anyway; warn if they absorbed refraction.
 
-    The evidence has the cameras in the cloud's CRS and `quick_ties`; the verdicts are on the
-    reconstruction types of the cloud.
+    The evidence has the cameras in the cloud's CRS and `quick_ties`; verdicts are on the cloud.
     """
     if inputs.adjusted_from is not None:
         return ADJUSTED
@@ -106,11 +105,12 @@ def diagnose_in_passing(
             why = f"{' and '.join(silent)} of the file tell too little (see 'pcfix cameras')"
         none = f"the file has neither tie points nor GNSS; {export_of(evidence.cameras)}"
         words = f"not checked for absorbed refraction: {why or none}"
+    warning = None
     if sentence:
         values = {} if found.size is None else {"likely_error_m": found.size[0]}
         warning = PcfixWarning("poses.absorbed", sentence, command=command, **values)
         warnings.warn(warning, stacklevel=3)
-    return Poses(found.absorbed, words, sentence, tuple(found.as_dict()["signs"]))
+    return Poses(found.absorbed, words, warning, tuple(found.as_dict()["signs"]))
 
 
 def ties_of(inputs: Inputs, crs: Any) -> TiePoints | None:

@@ -244,7 +244,7 @@ def _figures_of_water(
         "fit": tested.as_dict(),
         "cameras_left_out": _left_out(plan, tally.figures),
     }
-    of_poses = [poses.warning if poses else "", plan.no_poses]
+    of_poses = [poses.warning if poses else None, plan.no_poses]
     return figures, [
         *tested.doubts,
         *detected,

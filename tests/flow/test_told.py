@@ -53,7 +53,7 @@ def test_next_commands(bent_middle, tmp_path, monkeypatch):
         "--cameras-offset", ",".join(map(str, OFFSET_M)), "--views", listed,
     )  # fmt: skip
     assert "--gnss GNSS.csv" in done.stderr
-    line = done.stderr.split("instead): ")[1].splitlines()[0]
+    line = done.stderr.split("poses first")[1].split(": ", 1)[1].splitlines()[0]
     assert f"--views {listed}" in line
     out = run_line(line, **{"GNSS.csv": BENT / "gnss.csv", "OUT": tmp_path / "adjusted"})
     assert "(direct)" not in out

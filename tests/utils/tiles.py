@@ -3,6 +3,8 @@
 import laspy
 import numpy as np
 
+from pcfix.flow.tiles import BEGUN
+from pcfix.io.files import read_tally
 from tests.utils.shared import ROOT
 
 SCENE = ROOT / "samples" / "scene"
@@ -39,5 +41,6 @@ def records(*paths):
 
 def finished(folder):
     """Return the outputs in a folder that are on record as finished, and when they were written."""
-    paths = [folder / one.stem for one in (folder / ".pcfix").glob("*.la?.tally")]
-    return {path: path.stat().st_mtime_ns for path in paths}
+    found = [one for one in (folder / ".pcfix").glob("*.la?.tally") if read_tally(one)[0]]
+    done = [folder / one.stem for one in found if not read_tally(one)[0].startswith(BEGUN)]
+    return {path: path.stat().st_mtime_ns for path in done}
