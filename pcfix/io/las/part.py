@@ -1,7 +1,4 @@
-"""A part of a cloud: the points within bounds, and of a COPC file those of coarse levels alone.
-
-Of a COPC file only the nodes are read that may have such points; of another every point is.
-"""
+"""A part of a cloud: points within bounds, read by nodes of COPC, and coarse levels of COPC."""
 
 from __future__ import annotations
 
@@ -62,10 +59,7 @@ class Extent(NamedTuple):
 
 
 class CloudPart(AnyPath):
-    """The path of a cloud of which a part is asked for; whoever opens it gets no more than that.
-
-    Once it was opened it has the `extent` of the part, and `held`, the points of the whole file.
-    """
+    """The path of a part of a cloud; once opened it has its `extent`, and `held`, all points."""
 
     part: Part = Part()
     held: int = 0
@@ -77,6 +71,10 @@ def cloud_part(path: Path, options: Any) -> Path:
     part = Part(getattr(options, "bounds", None), getattr(options, "read_resolution", None))
     if part == Part():
         return path
+    west, south, east, north = part.bounds or (0.0, 0.0, 1.0, 1.0)
+    if not (west < east and south < north):
+        words = f"bounds {west:g},{south:g},{east:g},{north:g} must be west,south,east,north."
+        raise SettingError("option.range", words, option="bounds")
     asked = CloudPart(path)
     asked.part = part
     return asked
