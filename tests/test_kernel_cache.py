@@ -11,7 +11,9 @@ from pathlib import Path
 import pytest
 
 from pcfix import kernels
+from tests.utils.nightly import mostly_nightly
 
+VARIABLES = ("XDG_CACHE_HOME", "NUMBA_CACHE_DIR")
 PACKAGE = Path(kernels.__file__).parent
 PROGRAM = """
 import numpy as np
@@ -44,7 +46,7 @@ def run(package, **variables):
     return folder, int(hits), done.stderr
 
 
-@pytest.mark.parametrize("variable", ["XDG_CACHE_HOME", "NUMBA_CACHE_DIR"])
+@pytest.mark.parametrize("variable", mostly_nightly(VARIABLES, VARIABLES[0]))
 def test_second_run_loads(variable, package, tmp_path):
     first, again = (run(package, **{variable: str(tmp_path)}) for _ in range(2))
     assert (first[1], again[1]) == (0, 1)
@@ -59,7 +61,7 @@ def test_imported_source_changes(package, tmp_path):
     assert run(package, NUMBA_CACHE_DIR=str(tmp_path))[0] != first[0]
 
 
-@pytest.mark.parametrize("variable", ["XDG_CACHE_HOME", "NUMBA_CACHE_DIR"])
+@pytest.mark.parametrize("variable", mostly_nightly(VARIABLES, VARIABLES[0]))
 def test_no_cache(variable, package):
     folder, hits, said = run(package, **{variable: "/dev/null"})
     assert (folder, hits) == ("None", 0)

@@ -156,7 +156,7 @@ def dry(block):
         (None, {"gnss": False}, Unknowns(lens=()), {"unknowns": []}),
         (
             None, {"gnss": False}, Unknowns(lens=(), level_sigma_m=FREE, tilt_sigma=FREE),
-            {},
+            {"unknowns": ["level", "tilt_x", "tilt_y"]},
         ),
         (
             dry, {"control": True},

@@ -17,6 +17,7 @@ import laspy
 import pytest
 import rasterio
 
+from tests.utils.nightly import mostly_nightly
 from tests.utils.program import run_pcfix
 
 SCENE = Path(__file__).parents[2] / "samples" / "scene"
@@ -122,7 +123,7 @@ def on_a_disk_of(pages, words, disk, inputs):
 
 
 @pytest.mark.parametrize("growth", [1.5, pytest.param(1.07, marks=pytest.mark.nightly)])
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("name", mostly_nightly(COMMANDS, "correct"))
 def test_full_at_any_stage(name, growth, disk, inputs):
     """The disk grows until the command goes through."""
     before, pages, blamed = state(inputs), 1, []

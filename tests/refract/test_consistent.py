@@ -165,7 +165,7 @@ def exact(request):
     return cameras, plane, truth, apparent_of(truth, cameras, lists, [plane] * len(cameras)), lists
 
 
-@pytest.mark.parametrize("shape", [in_utm, as_mesh, as_raster])
+@pytest.mark.parametrize("shape", mostly_nightly([in_utm, as_mesh, as_raster], in_utm, as_raster))
 def test_truth_recovered(exact, shape):
     cameras, plane, truth, apparent, lists = exact
     result = run(apparent + UTM, moved(cameras, UTM), shape(plane), views_of(lists))

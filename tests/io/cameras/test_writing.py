@@ -94,10 +94,10 @@ def check_block(found, given, centres_m=1e-9, turn=1e-12):
 
 
 def check_ties(found, given, places_m=1e-9, px=0.0):
-    assert found.xyz == pytest.approx(given.xyz, abs=places_m, rel=0.0)
-    assert found.views.start.tolist() == given.views.start.tolist()
-    assert found.views.camera.tolist() == given.views.camera.tolist()
-    assert found.image_xy == pytest.approx(given.image_xy, abs=px, rel=0.0)
+    np.testing.assert_allclose(found.xyz, given.xyz, rtol=0.0, atol=places_m)
+    np.testing.assert_array_equal(found.views.start, given.views.start)
+    np.testing.assert_array_equal(found.views.camera, given.views.camera)
+    np.testing.assert_allclose(found.image_xy, given.image_xy, rtol=0.0, atol=px)
 
 
 @pytest.mark.parametrize("offset", [(320000.0, 3842800.0, 0.0), (0.0, 0.0, 0.0), None])
