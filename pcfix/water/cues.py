@@ -79,8 +79,6 @@ class Gain(NamedTuple):
 
 def gain_of(moments: Moments, times: FloatArray | None = None) -> Gain:
     """Add the tiles, each `times` times, and return the gain of the break."""
-    from scipy.ndimage import uniform_filter1d
-
     sums = moments.sums if times is None else moments.sums * times[:, None, None]
     count = moments.number if times is None else moments.number * times[:, None]
     yy, yx, yf, xx, xf, ff = np.moveaxis(sums.sum(axis=0), -1, 0)
@@ -108,7 +106,9 @@ def gain_of(moments: Moments, times: FloatArray | None = None) -> Gain:
     sigma = np.sqrt(held) / own
     temper = variance * own / (held + _TINY)
     width = max(1, round(_STEADY_M / (moments.heights_m[1] - moments.heights_m[0])))
-    gain = 0.5 * n * np.log(sse / left) * uniform_filter1d(temper, width)
+    around = np.pad(temper, (width // 2, (width - 1) // 2), "symmetric")
+    steady = np.convolve(around, np.full(width, 1.0 / width), "valid")
+    gain = 0.5 * n * np.log(sse / left) * steady
     return Gain(np.where(own > 1e3 * _TINY, gain, 0.0), amplitude, sigma)
 
 
