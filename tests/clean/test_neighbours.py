@@ -100,7 +100,9 @@ OPEN3D = [
 ]
 
 
-@pytest.mark.parametrize(("test", "rules", "arguments"), OPEN3D)
+@pytest.mark.parametrize(
+    ("test", "rules", "arguments"), mostly_nightly(OPEN3D, OPEN3D[0], OPEN3D[-1])
+)
 def test_outliers_of_open3d(test: str, rules: dict, arguments: tuple) -> None:
     o3d, xyz = load_open3d(), spoilt_scene(FEW, OUTLIERS).xyz
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(xyz))

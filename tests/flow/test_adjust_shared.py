@@ -25,7 +25,7 @@ TIES = 3000
 @true
 @pytest.mark.parametrize(
     ("ties", "bed_gsd", "land_gsd"),
-    mostly_nightly([("measured", 1.00, 0.80), ("cloud", 0.98, 0.80)], ("measured", 1.00, 0.80)),
+    mostly_nightly([("measured", 1.00, 0.80), ("cloud", 0.98, 0.80)]),
 )
 def test_rendered_block(tmp_path, monkeypatch, ties, bed_gsd, land_gsd):
     """Before, land lies 19 GSD (of 5 cm) too low; the matcher's own noise is 0.9 and 0.7."""

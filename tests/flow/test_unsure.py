@@ -16,6 +16,7 @@ from pcfix.model import Views
 from pcfix.refract.matcher import without_border
 from pcfix.report.text import summary_text
 from tests.utils.half_oblique import half_oblique, seen_flat, write_half_oblique
+from tests.utils.nightly import mostly_nightly
 from tests.utils.program import run_pcfix
 
 SNELL = {"method": "snell", "max_angle": None, "occlusion": "off"}
@@ -70,7 +71,7 @@ def points_of(way, unsure):
     return pcfix.correct_points(scene.xyz, scene.cameras, scene.water, unsure=unsure, **WAYS[way])
 
 
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("way", mostly_nightly(WAYS, "snell"))
 def test_found(way):
     """They are those whose ray closest to nadir is oblique, and are corrected as others."""
     scene = half_oblique()
