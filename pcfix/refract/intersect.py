@@ -157,7 +157,6 @@ def _intersect(
                 on = marks[seeing]
                 added = add_camera(sums, tile, on, None, rig, c, rule, tin, fields, facet)
             if added:
-                used[c] = True  # threads may write it at once: always the same value
                 near[seeing] = c
                 seeing += 1
         of_point = np.empty(11)
@@ -165,6 +164,11 @@ def _intersect(
             for at in range(11):
                 of_point[at] = sums[at * TILE + j]
             _solve(result[rows[j]], of_point[9], of_point, marks[:seeing, j])
+        for k in range(seeing):
+            if not used[near[k]]:  # threads may write it at once: always the same value
+                for j in range(rows.size):
+                    if marks[k, j] > 0.0 and result[rows[j], _OUTCOME] == CORRECTED:
+                        used[near[k]] = True
         if optics is not None:
             for j in range(rows.size):
                 row = result[rows[j]]
