@@ -31,24 +31,21 @@ def read_altitudes(cameras: File, labels: Sequence[str]) -> FloatArray:
 
     NaN where it is not recorded. At most `MOST_IMAGES` images near the camera file are read.
     """
-    altitudes = np.full(len(labels), np.nan)
+    altitudes, path, found = np.full(len(labels), np.nan), Path(cameras), {}
     with suppress(OSError, InputError):  # no correction needs them
-        path = Path(cameras)
-        found = _of_project(path) if path.suffix.lower() == ".psx" else _of_images(path)
+        if path.suffix.lower() == ".psx":
+            found = _of_project(path)
+        else:
+            root = path if path.is_dir() else path.parent
+            inside = [one for name in FOLDERS for one in sorted(root.joinpath(name).glob("*"))]
+            images = [one for one in inside if one.suffix.lower() in IMAGES and one.is_file()]
+            for image in images[:: 1 + len(images) // MOST_IMAGES]:
+                with image.open("rb") as stream:
+                    if above := _ABOVE.search(stream.read(HEAD_BYTES)):
+                        found[image.name] = float(above[1])
         row = match_labels(list(found), labels, one_to_one=False).row
         altitudes[row[row >= 0]] = np.array(list(found.values()))[row >= 0]
     return altitudes
-
-
-def _of_images(path: Path) -> dict[str, float]:
-    root, found = path if path.is_dir() else path.parent, {}
-    inside = [one for name in FOLDERS for one in sorted(root.joinpath(name).glob("*"))]
-    images = [one for one in inside if one.suffix.lower() in IMAGES and one.is_file()]
-    for image in images[:: 1 + len(images) // MOST_IMAGES]:
-        with image.open("rb") as stream:
-            if above := _ABOVE.search(stream.read(HEAD_BYTES)):
-                found[image.name] = float(above[1])
-    return found
 
 
 def _of_project(path: Path) -> dict[str, float]:

@@ -19,7 +19,7 @@ from pcfix.errors import bad_file
 from pcfix.model import FloatArray
 
 if TYPE_CHECKING:
-    from pyproj import CRS
+    from pyproj import CRS, Transformer
 
 
 Heights = Literal["ellipsoidal", "gravity", "unstated"]
@@ -42,13 +42,9 @@ def parse_crs(given: str | CRS, name: str) -> CRS:
         crs = CRS.from_user_input(int(text) if text.isdecimal() else text)
         parts(crs)  # PROJ writes and reads it again, which may fail
     except (CRSError, ValueError, OverflowError) as error:
-        raise bad_file(
-            name,
-            "crs.unknown",
-            f"the CRS '{shortened(text)}' is not one that PROJ knows. Give an EPSG code"
-            " (EPSG:25830, or EPSG:25830+5782 with the heights), WKT or a PROJ string.",
-            value=shortened(text),
-        ) from error
+        shown = shortened(text)
+        sentence = f"PROJ does not know the CRS '{shown}'. Give a code such as EPSG:25830+5782."
+        raise bad_file(name, "crs.unknown", sentence, value=shown) from error
     if crs.is_vertical and not crs.is_compound and len(crs.axis_info) == 1:
         sentence = f"{crs.name} is a vertical CRS. Add the horizontal one, as EPSG:25830+5782."
         raise bad_file(name, "crs.vertical_only", sentence, crs=crs.name)
@@ -133,15 +129,12 @@ def metres_up(crs: CRS) -> float:
 
 def check_projected_metres(crs: CRS, name: str) -> None:
     """Refuse a cloud that is not in a projected CRS in metres, heights included."""
-    if not crs.is_projected:
-        kind = "degrees" if crs.is_geographic else "no map projection"
-        sentence = f"{crs.name} is in {kind}. Reproject the cloud to metres (such as UTM)."
-        raise bad_file(name, "crs.not_projected", sentence, crs=crs.name)
     units = {axis.unit_name for axis in crs.axis_info}
-    if not units.issubset(METRES):
+    if not crs.is_projected or not units.issubset(METRES):
+        code = "crs.unit" if crs.is_projected else "crs.not_projected"
         unit = " and ".join(sorted(units))
-        sentence = f"{crs.name} is in {unit}. Reproject the cloud to metres, heights included."
-        raise bad_file(name, "crs.unit", sentence, crs=crs.name, unit=unit)
+        sentence = f"{crs.name} is in {unit}. Reproject the cloud to a map in metres, such as UTM."
+        raise bad_file(name, code, sentence, crs=crs.name, unit=unit)
 
 
 def with_heights(plan: CRS, vertical: CRS) -> CRS:
@@ -224,18 +217,28 @@ class Topocentric:
             numbers = latitude, longitude, *(height or [0.0])
             if len(numbers) != 3 or not all(map(isfinite, numbers)):
                 raise ValueError
+            if abs(latitude) > 90.0 or abs(longitude) > 360.0:
+                raise ValueError
         except ValueError:
-            sentence = f"'{shortened(text)}' is not ENU:latitude,longitude,height. Give degrees."
+            sentence = f"'{shortened(text)}' is not ENU:latitude,longitude,height in degrees."
             raise bad_file(name, "crs.origin", sentence, value=text) from None
-        if abs(latitude) > 90.0 or abs(longitude) > 360.0:
-            sentence = f"the origin {shortened(text)} is not on the earth. Give the latitude first."
-            raise bad_file(name, "crs.origin", sentence, value=text)
         return cls(*numbers)
 
     def to_geocentric(self, enu: FloatArray) -> FloatArray:
         """Return geocentric coordinates (EPSG:4978) of points (n, 3), metres."""
+        x, y, z = enu.T
+        return np.column_stack(self._axes().transform(x, y, z, direction="INVERSE"))
+
+    def from_degrees(self, degrees: FloatArray) -> FloatArray:
+        """Return the coordinates here of longitudes, latitudes and heights, shape (n, 3)."""
+        from pyproj import Transformer
+
+        to_geocentric = Transformer.from_crs(GEOGRAPHIC_WGS84, GEOCENTRIC_WGS84, always_xy=True)
+        return np.column_stack(self._axes().transform(*to_geocentric.transform(*degrees.T)))
+
+    def _axes(self) -> Transformer:
+        """Return the transformer from geocentric coordinates to the axes here."""
         from pyproj import Transformer
 
         at = f"+lat_0={self.latitude_deg!r} +lon_0={self.longitude_deg!r} +h_0={self.height_m!r}"
-        topocentric = f"+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 {at}"
-        return np.column_stack(Transformer.from_pipeline(topocentric).transform(*enu.T))
+        return Transformer.from_pipeline(f"+proj=topocentric +ellps=WGS84 {at}")

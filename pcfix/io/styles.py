@@ -95,7 +95,19 @@ def vector_style(symbols: dict[str, Symbol], attribute: str = "", label: str = "
 
     The label is an expression of QGIS.
     """
-    drawn = "\n".join(_symbol(str(row), one) for row, one in enumerate(symbols.values()))
+    texts = []
+    for row, one in enumerate(symbols.values()):
+        kind, options = _LAYERS[one.kind]
+        fields = {"c": ",".join(map(str, one.colour)), "shape": one.shape, "size": one.size}
+        given = "".join(
+            f'<Option type="QString" name="{key}" value={quoteattr(value.format(**fields))}/>'
+            for key, value in options.items()
+        )
+        texts.append(
+            f'<symbol type="{one.kind}" name="{row}" alpha="1"><layer class="{kind}" enabled="1">'
+            f'<Option type="Map">{given}</Option></layer></symbol>'
+        )
+    drawn = "\n".join(texts)
     head, rows = 'type="singleSymbol"', ""
     if attribute:
         head = f'type="categorizedSymbol" attr={quoteattr(attribute)}'
@@ -114,18 +126,3 @@ def vector_style(symbols: dict[str, Symbol], attribute: str = "", label: str = "
             '<placement placement="2" placementFlags="9"/></settings></labeling>'
         )
     return _PAGE.format(categories="Symbology|Labeling", body=body)
-
-
-def _symbol(name: str, one: Symbol) -> str:
-    """Return a symbol of QGIS."""
-    kind, options = _LAYERS[one.kind]
-    colour = ",".join(map(str, one.colour))
-    given = "".join(
-        f'<Option type="QString" name="{key}"'
-        f" value={quoteattr(value.format(c=colour, shape=one.shape, size=one.size))}/>"
-        for key, value in options.items()
-    )
-    return (
-        f'<symbol type="{one.kind}" name="{name}" alpha="1"><layer class="{kind}" enabled="1">'
-        f'<Option type="Map">{given}</Option></layer></symbol>'
-    )

@@ -10,7 +10,7 @@ import re
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -83,9 +83,8 @@ def _from_exif(folder: Path, labels: Sequence[str]) -> ImageTimes:
             with Image.open(file) as image:
                 tags = image.getexif().get_ifd(_EXIF)
         except Exception as error:  # of any kind, if a tag has another type than it should
-            raise bad_file(
-                file, "photos.unreadable", f"is not a readable image ({error})."
-            ) from error
+            sentence = f"is not a readable image ({error})."
+            raise bad_file(file, "photos.unreadable", sentence) from error
         codes = (_DATE_TIME_ORIGINAL, _SUBSECONDS, _OFFSET_ORIGINAL)
         text, fraction, zone = (str(tags.get(code, "")).strip("\0 ") for code in codes)
         if not text:
@@ -97,24 +96,22 @@ def _from_exif(folder: Path, labels: Sequence[str]) -> ImageTimes:
 
 def _from_json(path: Path, labels: Sequence[str]) -> ImageTimes:
     try:
-        times = {str(name): time_s for name, time_s in _json_times(read_json(path)).items()}
+        content = read_json(path)
+        if isinstance(content, dict):  # shots.geojson
+            shots = [one["properties"] for one in content.get("features", ())]
+            pairs = [(one["filename"], one.get("capture_time")) for one in shots]
+        elif content and "shots" in content[0]:  # reconstruction.json
+            items = [item for part in content for item in part["shots"].items()]
+            pairs = [(name, shot.get("capture_time")) for name, shot in items]
+        else:  # images.json, milliseconds
+            pairs = [(one["filename"], float(one.get("utc_time") or 0.0) / 1e3) for one in content]
+        times = {str(name): float(time_s or 0.0) for name, time_s in pairs}
     except (OSError, ValueError, TypeError, AttributeError, LookupError) as error:
         sentence = f"is not a file of OpenDroneMap or OpenSfM ({error}). {_USE_TABLE}"
         raise bad_file(path, "image_times.not_one", sentence) from error
     known = [name for name, time_s in times.items() if 0.0 < time_s < np.inf]
     chosen = [known[row] for row in _rows(known, labels, path)]
     return ImageTimes(np.array([times[name] for name in chosen]), True, str(path))
-
-
-def _json_times(content: Any) -> dict[str, float]:
-    """Return seconds since 1970 by image name, from any of the three layouts."""
-    if isinstance(content, dict):  # shots.geojson
-        shots = [feature["properties"] for feature in content.get("features", ())]
-        return {shot["filename"]: float(shot.get("capture_time") or 0.0) for shot in shots}
-    if content and "shots" in content[0]:  # reconstruction.json
-        shots = [item for part in content for item in part["shots"].items()]
-        return {name: float(shot.get("capture_time") or 0.0) for name, shot in shots}
-    return {one["filename"]: float(one.get("utc_time") or 0.0) / 1000.0 for one in content}
 
 
 def _rows(names: Sequence[str], labels: Sequence[str], source: Path) -> list[int]:
@@ -143,9 +140,7 @@ def _times(source: Path, where: Sequence[str], texts: Sequence[str]) -> ImageTim
     zoned = [moment.tzinfo is not None for moment in moments]
     if any(zoned) != all(zoned):
         odd = zoned.index(not zoned[0])
-        sentence = (
-            f"{where[odd]}: '{texts[odd]}' and others differ in having a zone. Write all alike."
-        )
+        sentence = f"{where[odd]}: only some times have a zone ('{texts[odd]}'). Write all alike."
         raise bad_file(source, "time.zone", sentence, value=texts[odd])
     utc = [moment if zoned[0] else moment.replace(tzinfo=UTC) for moment in moments]
     return ImageTimes(np.array([moment.timestamp() for moment in utc]), zoned[0], str(source))
@@ -176,35 +171,30 @@ def level_offsets(
     the interval of the two rows there. The average over the images is the level that the user
     gives.
     """
+    clock, name = tide.time_s, tide.name
     if tide.zoned != times.zoned:
-        with_zone, without = (tide, times) if tide.zoned else (times, tide)
-        sentence = f"its times have no zone, those of {with_zone.name} have one. Add or remove it"
-        raise bad_file(without.name, "time.zone", f"{sentence} (+02:00, or Z for UTC) everywhere.")
-    gaps = np.diff(tide.time_s)
-    first, last = tide.time_s[0] - gaps[0], tide.time_s[-1] + gaps[-1]
+        without = times if tide.zoned else tide
+        sentence = "its times have no zone, those of the other file have. Add +02:00, or Z for UTC."
+        raise bad_file(without.name, "time.zone", sentence)
+    gaps = np.diff(clock)
+    first, last = clock[0] - gaps[0], clock[-1] + gaps[-1]
     outside = np.flatnonzero((times.time_s < first) | (times.time_s > last))
     if outside.size:
-        at = outside[0]
-        start, end, taken = (
-            datetime.fromtimestamp(float(one), UTC).strftime("%Y-%m-%d %H:%M:%S")
-            for one in (tide.time_s[0], tide.time_s[-1], times.time_s[at])
-        )
-        sentence = (
-            f"covers {start} to {end}, but image {labels[at]} was taken at {taken}"
-            f" ({outside.size} of {len(labels)} images are outside). Check the zones."
-        )
-        values = {"image": labels[at], "count": int(outside.size)}
-        raise bad_file(tide.name, "tide.not_covered", sentence, **values)
-    row = np.clip(np.searchsorted(tide.time_s, times.time_s) - 1, 0, len(tide.time_s) - 2)
-    share = (times.time_s - tide.time_s[row]) / gaps[row]
+        image, at = labels[outside[0]], float(times.time_s[outside[0]])
+        taken = datetime.fromtimestamp(at, UTC).strftime("%Y-%m-%d %H:%M:%S")
+        sentence = f"does not cover image {image}, taken at {taken} ({outside.size} of"
+        sentence += f" {len(labels)} images are outside). Check the zones."
+        raise bad_file(name, "tide.not_covered", sentence, image=image, count=int(outside.size))
+    row = np.clip(np.searchsorted(clock, times.time_s) - 1, 0, len(clock) - 2)
+    share = (times.time_s - clock[row]) / gaps[row]
     level = tide.level_m[row] + share * np.diff(tide.level_m)[row]
     notes = []
     beyond = int(((share < 0.0) | (share > 1.0)).sum())
     if beyond:
-        sentence = f"{tide.name}: is extrapolated for {beyond} images beyond its first or last row."
+        sentence = f"{name}: is extrapolated for {beyond} images beyond its first or last row."
         notes.append(PcfixWarning("tide.extrapolated", sentence, count=beyond))
     longest_h = float(gaps[row].max()) / 3600.0
     if longest_h > LONG_GAP_S / 3600.0:
-        sentence = f"{tide.name}: its rows are up to {longest_h:.1f} h apart; give one each hour."
+        sentence = f"{name}: its rows are up to {longest_h:.1f} h apart; give one each hour."
         notes.append(PcfixWarning("tide.sparse", sentence, hours=longest_h))
     return level - level.mean(), tuple(notes)

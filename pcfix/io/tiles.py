@@ -163,12 +163,8 @@ def cloud_of(cloud: Clouds) -> Path | Tiles:
         return path_of(cloud)
     if tiles.broken:
         why = "\n".join(f"  {one}" for one in tiles.broken.values())
-        raise InputError(
-            "cloud.broken_files",
-            f"{tiles}: {len(tiles.broken)} of {len(inputs_of(tiles))} files cannot be read. Replace"
-            f" them, or give only the others:\n{why}",
-            paths=list(tiles.broken),
-        )
+        sentence = f"{len(tiles.broken)} of {len(inputs_of(tiles))} files cannot be read:\n{why}"
+        raise bad_file(tiles, "cloud.broken_files", sentence, paths=list(tiles.broken))
     return tiles
 
 
@@ -227,12 +223,9 @@ def _refuse_mixed(name: str, kinds: dict[Path, tuple[Any, ...]]) -> None:
         ):
             if one != another:
                 one, another = (getattr(value, "name", value) for value in (one, another))
-                raise InputError(
-                    "cloud.mixed_tiles",
-                    f"{name}: {first.name} has the {words} {one}, {other.name} {another}. Convert"
-                    " them to the same, or correct them separately.",
-                    paths=[first, other],
-                )
+                sentence = f"{first.name} has the {words} {one}, {other.name} {another}. Convert"
+                sentence += " them to the same, or correct them separately."
+                raise bad_file(name, "cloud.mixed_tiles", sentence, paths=[first, other])
 
 
 def _warn_of_overlap(tiles: Tiles) -> None:
@@ -249,12 +242,6 @@ def _warn_of_overlap(tiles: Tiles) -> None:
     pairs = np.column_stack([one, other])[deep]
     found = [(tiles.paths[i].name, tiles.paths[j].name) for i, j in pairs]
     if found:
-        warnings.warn(
-            PcfixWarning(
-                "cloud.overlap",
-                f"{tiles}: the extents of {found[0][0]} and {found[0][1]} overlap ({len(found)}"
-                " pairs do). Points in both count twice; cut off the buffers of the tiles.",
-                pairs=found,
-            ),
-            stacklevel=3,
-        )
+        sentence = f"{tiles}: {' and '.join(found[0])} overlap, as do {len(found)} pairs. Points in"
+        sentence += " both count twice; cut off the buffers of the tiles."
+        warnings.warn(PcfixWarning("cloud.overlap", sentence, pairs=found), stacklevel=3)

@@ -30,7 +30,7 @@ from pcfix.model import FloatArray
 
 if TYPE_CHECKING:
     from pyproj import CRS, Transformer
-    from pyproj.transformer import AreaOfInterest, TransformerGroup
+    from pyproj.transformer import AreaOfInterest
 
 Points = Callable[[FloatArray], FloatArray]
 Notes = tuple[PcfixWarning, ...]
@@ -61,11 +61,7 @@ def transformation(
     cannot be transformed it is a `HeightsError` with the remedy `instead`.
     """
     if heights:
-        try:
-            step, notes = _operation(source, target, at, name, heights=True)
-        except HeightsError as error:
-            remedy = f"; {instead}." if instead else "."
-            raise HeightsError(error.code, f"{error}{remedy}", **error.values) from None
+        step, notes = _operation(source, target, at, name, heights=True, instead=instead)
         return Transformation(lambda xyz: np.column_stack(step.transform(*xyz.T)), notes)
     factor = metres_up(source) / metres_up(target)
     plans = parts(source)[0], parts(target)[0]
@@ -80,10 +76,20 @@ def transformation(
 
 
 def _operation(
-    source: CRS, target: CRS, at: FloatArray, name: str, *, heights: bool
+    source: CRS, target: CRS, at: FloatArray, name: str, *, heights: bool, instead: str = ""
 ) -> tuple[Transformer, Notes]:
     """Return PROJ's best transformation that is not a ballpark where that matters, and notes."""
-    group = _group(source, target, at, name)
+    from pyproj.exceptions import ProjError
+    from pyproj.transformer import TransformerGroup
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a missing grid is named in the error or note
+            area = _area(parts(source)[0], at)
+            group = TransformerGroup(source, target, always_xy=True, area_of_interest=area)
+    except (ProjError, IndexError) as error:  # the latter if PROJ finds no operation at all
+        sentence = f"PROJ cannot transform {source.name} to {target.name}. Give another CRS."
+        raise bad_file(name, "crs.no_transformation", sentence) from error
 
     def is_usable(description: str) -> bool:
         return not (heights and "ballpark vertical" in description.lower())
@@ -102,13 +108,11 @@ def _operation(
     without = f" without the grid {', '.join(grids)}" if grids else ""
     install = f"Install it with '{commands}', or set PROJ_NETWORK=ON"
     if not real:
+        one, other = _height_words(source), _height_words(target)
         why = install if grids else "PROJ knows no transformation between them"
-        raise HeightsError(
-            "crs.heights",
-            f"{name}: {_height_words(source)} cannot be transformed to"
-            f" {_height_words(target)}{without}. {why}",
-            grids=grids,
-        )
+        remedy = f"; {instead}." if instead else "."
+        sentence = f"{name}: {one} cannot be transformed to {other}{without}. {why}{remedy}"
+        raise HeightsError("crs.heights", sentence, grids=grids)
     best = next((one for one in real if np.isfinite(one.transform(*at.T)).all()), real[0])
     names = f"from {source.name} to {target.name}"
     if "ballpark geographic" in best.description.lower():
@@ -125,20 +129,6 @@ def _operation(
     sentence = f"{name}: positions {names} are accurate to about {best.accuracy:g} m{better}."
     values = {"accuracy_m": best.accuracy, "grids": grids}
     return best, (PcfixWarning("crs.accuracy", sentence, **values),)
-
-
-def _group(source: CRS, target: CRS, at: FloatArray, name: str) -> TransformerGroup:
-    from pyproj.exceptions import ProjError
-    from pyproj.transformer import TransformerGroup
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a missing grid is named in the error or note
-            area = _area(parts(source)[0], at)
-            return TransformerGroup(source, target, always_xy=True, area_of_interest=area)
-    except (ProjError, IndexError) as error:  # the latter if PROJ finds no operation at all
-        sentence = f"PROJ cannot transform {source.name} to {target.name}. Give another CRS."
-        raise bad_file(name, "crs.no_transformation", sentence) from error
 
 
 def heights_agree(source: CRS, target: CRS) -> bool:
@@ -202,44 +192,35 @@ def way_to_cloud(
     if cloud is None and is_local(source):
         return None, ()
     if cloud is None:
+        unit = plan_unit(source)[0] if source.is_projected else "degrees"
         if not source.is_projected or plan_unit(source)[1] != 1.0:
-            unit = plan_unit(source)[0] if source.is_projected else "degrees"
-            sentence = (
-                f"is in {unit} ({source.name}), and no cloud names a CRS. Set the cloud's CRS."
-            )
+            sentence = f"is in {unit} ({source.name}), the cloud names no CRS. Set the cloud's CRS."
             raise bad_file(name, "crs.cloud_missing", sentence, unit=unit)
         sentence = f"{name}: no cloud names a CRS; that of the file is assumed ({source.name})."
         return None, (PcfixWarning("crs.assumed", sentence),)
     if is_local(cloud) or is_local(source):
         if is_local(cloud) and is_local(source):
             return None, ()
-        where = (source.name, "the cloud") if is_local(cloud) else (cloud.name, name)
-        sentence = f"{where[1]} is in a local frame, the other in {where[0]}. Use one CRS, or give"
-        raise bad_file(name, "crs.local", f"{sentence} that of the file as 'local'.")
+        sentence = f"is in {source.name}, the cloud in {cloud.name}, of which one is local. Use one"
+        raise bad_file(name, "crs.local", f"{sentence} CRS, or give that of the file as 'local'.")
     check_projected_metres(cloud, "the cloud")
     if not (source.is_projected or source.is_geographic):
         sentence = f"{source.name} is neither a map projection nor in degrees."
         raise bad_file(name, "crs.not_projected", sentence, crs=source.name)
     agree = not heights or heights_agree(source, cloud)
-    notes = _height_notes(source, cloud, name) if heights and agree else ()
-    if agree and is_same_numbers(source, cloud, heights=heights):
-        return None, notes
-    instead = ""
-    if not agree:  # a search for the code of a CRS takes long
-        plan = typed(parts(source)[0])
-        instead = f"or, if the heights agree with the cloud's, give the file's CRS as {plan}"
-    step = transformation(source, cloud, at, name, heights=not agree, instead=instead)
-    return step.forward, (*step.notes, *notes)
-
-
-def _height_notes(source: CRS, cloud: CRS, name: str) -> Notes:
-    """Return a note if one of the two does not state what its heights are."""
-    kinds = heights_of(source), heights_of(cloud)
-    if kinds[0] == "unstated" and kinds[1] != "unstated":
+    kinds, missing = (heights_of(source), heights_of(cloud)), ""
+    notes: Notes = ()
+    if kinds[0] == "unstated" != kinds[1]:
         missing = "the file"
     elif kinds == ("ellipsoidal", "unstated"):
         missing = f"the cloud's CRS ({cloud.name})"
-    else:
-        return ()
-    sentence = f"{name}: {missing} does not state the vertical datum; that of the other is assumed."
-    return (PcfixWarning("crs.heights_assumed", sentence),)
+    if heights and agree and missing:
+        sentence = f"{name}: {missing} names no vertical datum; that of the other is assumed."
+        notes = (PcfixWarning("crs.heights_assumed", sentence),)
+    if agree and is_same_numbers(source, cloud, heights=heights):
+        return None, notes
+    # a search for the code of a CRS takes long
+    plan = "" if agree else typed(parts(source)[0])
+    instead = f"or, if the heights agree with the cloud's, give the file's CRS as {plan}"
+    step = transformation(source, cloud, at, name, heights=not agree, instead=instead)
+    return step.forward, (*step.notes, *notes)

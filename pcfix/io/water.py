@@ -6,7 +6,6 @@ apart at a northing of five million, and a damaged PLY ends the process.
 
 from __future__ import annotations
 
-import math
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,6 +15,7 @@ import numpy as np
 from pcfix.errors import GeometryError, SettingError, bad_file
 from pcfix.io.files import check_input
 from pcfix.io.ply import Records
+from pcfix.io.tables import number
 from pcfix.io.water_rasters import read_water_raster
 from pcfix.model import FloatArray, IntArray, WaterDimension, WaterMesh, WaterPlane, WaterSurface
 from pcfix.options.declare import File
@@ -67,33 +67,22 @@ def read_water(
     WaterPlane(a=0.37, b=0.0, c=0.0)
     """
     text = str(spec).strip()
-    kind, colon, rest = text.partition(":")
-    if colon and kind.lower() == "dim":
-        if not rest:
-            raise _not_water(text, "name the dimension, as in dim:w_surf")
+    kind, _, rest = text.partition(":")
+    if kind.lower() == "dim" and rest:
         return WaterDimension(rest)
-    is_plane = bool(colon) and kind.lower() == "plane"
-    try:
-        numbers = [float(part) for part in (rest.split(",") if is_plane else [text])]
-    except ValueError:
-        numbers = []
-    suffix = Path(text).suffix.lower()
-    if len(numbers) == (3 if is_plane else 1):
-        if not all(map(math.isfinite, numbers)):
-            raise _not_water(text, "the numbers must be finite")
+    is_plane, suffix = kind.lower() == "plane", Path(text).suffix.lower()
+    numbers = [number(part) for part in (rest.split(",") if is_plane else [text])]
+    if len(numbers) == (3 if is_plane else 1) and np.isfinite(numbers).all():
         return WaterPlane(*numbers)
     if is_plane or not (os.path.lexists(text) or suffix[1:2].isalpha()):
-        raise _not_water(text, "plane: needs three numbers a,b,c" if is_plane else f"give {KINDS}")
+        sentence = f"water '{text}' is not understood. Give {KINDS}."
+        raise SettingError("water.spec", sentence, value=text)
     found = check_input(text)
     if suffix in (".obj", ".ply"):
         return _mesh(found)
     if suffix in _NOT_RASTERS:
         raise bad_file(text, "water.format", f"is not a water surface. Give {KINDS}.")
     return read_water_raster(text, cloud_crs, bounds)
-
-
-def _not_water(text: str, rule: str) -> SettingError:
-    return SettingError("water.spec", f"water '{text}' is not understood: {rule}.", value=text)
 
 
 def _mesh(path: Path) -> WaterMesh:
@@ -104,10 +93,9 @@ def _mesh(path: Path) -> WaterMesh:
     vertices, triangles = read(path)
     if len(triangles) == 0:
         raise bad_file(path, "water.mesh_empty", "has no triangles. Export a mesh.")
-    if not np.isfinite(vertices).all():
-        raise bad_file(path, "water.mesh_damaged", "a vertex is not finite. Export it again.")
-    if triangles.min() < 0 or triangles.max() >= len(vertices):
-        sentence = "a face names a vertex that does not exist. Export it again."
+    missing = (triangles < 0) | (triangles >= len(vertices))
+    if missing.any() or not np.isfinite(vertices).all():
+        sentence = "a vertex is missing or not finite. Export it again."
         raise bad_file(path, "water.mesh_damaged", sentence)
     mesh = WaterMesh(vertices, triangles, path.name)
     try:
@@ -118,8 +106,8 @@ def _mesh(path: Path) -> WaterMesh:
     double, area_m2 = in_two_sheets(tin)
     share = float(area_m2[double].sum() / area_m2.sum())
     if share > MOST_OVERLAP:
-        sentence = f"{100.0 * share:.0f} % of the mesh lies above another part of it. Export one"
-        raise bad_file(path, "water.mesh_overlap", f"{sentence} open surface.", share=share)
+        sentence = f"{100.0 * share:.0f} % of the mesh lies above another part. Export one surface."
+        raise bad_file(path, "water.mesh_overlap", sentence, share=share)
     return mesh
 
 
@@ -127,27 +115,23 @@ def _read_obj(path: Path) -> tuple[FloatArray, IntArray]:
     """Return vertices, shape (v, 3), and triangles, shape (t, 3); a polygon is a fan of these."""
     vertices: list[list[float]] = []
     triangles: list[list[int]] = []
-    for number, line in enumerate(path.read_text("latin-1").splitlines(), start=1):
+    for at, line in enumerate(path.read_text("latin-1").splitlines(), start=1):
         key, *fields = line.split() or [""]
         try:
             if key == "v":
                 x, y, z = fields[:3]
                 vertices.append([float(x), float(y), float(z)])
             elif key == "f":
-                corners = [_obj_index(field, len(vertices)) for field in fields]
+                # a corner such as 7, 7/1/3 or, counted from the end, -1
+                rows = [int(field.split("/")[0]) for field in fields]
+                if max(map(abs, rows), default=0) > _MOST_VERTICES:
+                    raise ValueError(f"there is no vertex {max(rows, key=abs)}")
+                corners = [row - 1 if row > 0 else len(vertices) + row for row in rows]
                 triangles += [[corners[0], *corners[i : i + 2]] for i in range(1, len(corners) - 1)]
         except ValueError as error:
-            sentence = f"line {number} is not an OBJ line ({error})."
-            raise bad_file(path, "water.mesh_damaged", sentence, line=number) from error
+            sentence = f"line {at} is not an OBJ line ({error})."
+            raise bad_file(path, "water.mesh_damaged", sentence, line=at) from error
     return np.array(vertices).reshape(-1, 3), np.array(triangles, dtype=np.int64).reshape(-1, 3)
-
-
-def _obj_index(field: str, count: int) -> int:
-    """Return the row of a corner such as ``7``, ``7/1/3`` or, counted from the end, ``-1``."""
-    index = int(field.split("/")[0])
-    if abs(index) > _MOST_VERTICES:
-        raise ValueError(f"there is no vertex {index}")
-    return index - 1 if index > 0 else count + index
 
 
 def _read_ply(path: Path) -> tuple[FloatArray, IntArray]:

@@ -76,8 +76,7 @@ def read_water_raster(
             raise bad_file(name, "water.raster_place", sentence)
         to_cloud, from_cloud, notes = _ways(source, cloud_crs, bounds, name)
         part = _read(source, name, None if bounds is None else from_cloud(_edge(bounds)))
-        title = source.name.replace("\\", "/").rpartition("/")[2]
-    _check_known(part.heights, name)
+    title = name.replace("\\", "/").rpartition("/")[2]
     for note in notes + part.notes:
         warnings.warn(note, stacklevel=3)
     t = part.transform
@@ -114,12 +113,10 @@ def write_water_raster(path: Path, water: WaterRaster, crs: str | None) -> None:
     rows, columns = water.height_m.shape
     named = crs is not None and crs.strip().lower() != LOCAL
     parsed = parse_crs(crs or "", "cameras") if named else None
-    if parsed is not None and is_local(parsed):
-        parsed = None
     profile = {
         "driver": "GTiff", "width": columns, "height": rows, "count": 1, "dtype": "float64",
         "nodata": np.nan, "compress": "deflate", "predictor": 3,
-        "crs": rasterio.CRS.from_wkt(parsed.to_wkt()) if parsed is not None else None,
+        "crs": (parsed and not is_local(parsed) and rasterio.CRS.from_wkt(parsed.to_wkt())) or None,
         "transform": from_origin(water.left_m, water.top_m, *water.cell_m),
     }  # fmt: skip
     with rasterio.open(path, "w", **profile) as target:
@@ -147,7 +144,8 @@ def _ways(
 def _edge(bounds: Bounds) -> FloatArray:
     """Return points along bounds, z = 0."""
     edge = shapely.box(*bounds).exterior
-    places = shapely.line_interpolate_point(edge, np.linspace(0, 1, 4 * _EDGE_POINTS), True)
+    share = np.linspace(0, 1, 4 * _EDGE_POINTS)
+    places = shapely.line_interpolate_point(edge, share, normalized=True)
     xy = np.vstack([shapely.get_coordinates(places), shapely.get_coordinates(edge)])
     return np.column_stack([xy, np.zeros(len(xy))])
 
@@ -184,6 +182,9 @@ def _read(source: DatasetReader, name: str, near: FloatArray | None) -> _Part:
     if source.nodata is None and unknown:
         sentence = f"{name}: has no nodata value. {unknown:,} impossible heights are ignored."
         notes = (PcfixWarning("water.raster_nodata", sentence, count=unknown), *notes)
+    if unknown == heights.size:
+        sentence = "has no height near the cloud. Check its CRS and its nodata value."
+        raise bad_file(name, "water.raster_empty", sentence)
     return _Part(heights, source.window_transform(window), notes)
 
 
@@ -204,12 +205,6 @@ def _metres(source: DatasetReader, name: str) -> tuple[float, Notes]:
     return factor, (PcfixWarning("water.raster_unit", sentence, unit_m=factor),)
 
 
-def _check_known(heights: FloatArray, name: str) -> None:
-    if not np.isfinite(heights).any():
-        sentence = "has no height near the cloud. Check its CRS and its nodata value."
-        raise bad_file(name, "water.raster_empty", sentence)
-
-
 def _check_size(cells: float, name: str) -> None:
     if not 0.0 < cells <= MOST_CELLS:  # more than memory should hold
         sentence = f"has {cells:,.0f} cells, {MOST_CELLS:,} at most. Resample it to coarser cells."
@@ -228,13 +223,10 @@ def _resampled(
     if bounds is not None:
         west, south = max(west, bounds[0]), max(south, bounds[1])
         east, north = min(east, bounds[2]), min(north, bounds[3])
-    if not cell > 0.0 or not max(east - west, north - south) / cell < MOST_CELLS:
-        sentence = f"its cells have a size of {cell:g} m in the cloud's CRS. Check its CRS."
-        raise bad_file(names[0], "water.raster_place", sentence)
     left, top = np.floor(west / cell) * cell, np.ceil(north / cell) * cell
-    columns = max(int(np.ceil((east - left) / cell)), 2)
-    rows = max(int(np.ceil((top - south) / cell)), 2)
-    _check_size(columns * rows, names[0])
+    sides = np.maximum(np.ceil([(east - left) / cell, (top - south) / cell]), 2.0)
+    _check_size(float(sides.prod()), names[0])
+    columns, rows = sides.astype(np.int64).tolist()
     heights = np.empty((rows, columns))
     x = left + (np.arange(columns) + 0.5) * cell
     for first in range(0, rows, max(1, _AT_ONCE // columns)):
@@ -242,7 +234,6 @@ def _resampled(
         y = top - (first + np.arange(len(strip)) + 0.5) * cell
         plan = np.column_stack([np.tile(x, len(y)), np.repeat(y, len(x)), np.zeros(strip.size)])
         strip[:] = _heights_at(part, from_cloud(plan), to_cloud).reshape(strip.shape)
-    _check_known(heights, names[0])
     return WaterRaster(heights, float(left), float(top), (float(cell), float(cell)), names[1])
 
 

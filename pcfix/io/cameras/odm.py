@@ -101,10 +101,8 @@ def read(source: Source) -> Cameras:
     apart = float(np.median(np.hypot(*(ours - truth)[:, :2].T))) if len(ours) else 0.0
     if placed.project_crs or apart < ALIGNED_M:
         return cameras
-    sentence = (
-        f"its cameras are {apart:.2f} m from those of {project.find(SHOTS)}. If the project was"
-        " aligned to a reference, give shots.geojson, which fits its cloud."
-    )
+    sentence = f"its cameras are {apart:.2f} m from those of shots.geojson. Give that, if the cloud"
+    sentence += " was aligned to a reference."
     moved = note(project.poses, "cameras.shots_differ", sentence, metres=apart)
     return replace(cameras, notes=(*cameras.notes, moved))
 
@@ -195,7 +193,7 @@ def _frame(project: Project, found: opensfm.Reconstruction) -> Frame:
         if not (np.abs(turn.T @ turn - np.eye(3)).max() <= SCALE_TOLERANCE):
             raise damaged(path, "it does not turn and shift the reconstruction")
         lat, lon, _ = reference
-        named = _crs_of_place(lon, lat, shift[0], shift[1], [crs] if crs else _zones(lat, lon))
+        named = _crs_of_place(lon, lat, shift[:2], [crs] if crs else _zones(lat, lon))
         if named is not None:  # else the file is of another origin
             return Frame(turn, shift, named)
     whole = _whole_metres(*reference[:2], crs)
@@ -250,14 +248,10 @@ def _whole_metres(lat: float, lon: float, crs: str | None) -> tuple[str, float, 
     return None
 
 
-def _crs_of_place(
-    lon: float, lat: float, east: float, north: float, candidates: list[str]
-) -> str | None:
+def _crs_of_place(lon: float, lat: float, place: FloatArray, candidates: list[str]) -> str | None:
     """Return the CRS in which a place has these coordinates, to a metre."""
-    for candidate in candidates:
-        if np.linalg.norm(_projected(candidate, lon, lat) - [east, north]) < 1.0:
-            return candidate
-    return None
+    there = ((one, _projected(one, lon, lat) - place) for one in candidates)
+    return next((one for one, off in there if np.linalg.norm(off) < 1.0), None)
 
 
 def _from_topocentric(
@@ -296,7 +290,7 @@ def _read_shots(project: Project, path: Path) -> Cameras:
     gnss, listed = read_images(project.find("images.json"), labels)
     if crs is None and place is not None:  # a project without GNSS has made-up coordinates
         lon, lat, _ = triple(place).tolist()
-        crs = _crs_of_place(lon, lat, centres[0, 0], centres[0, 1], _zones(lat, lon))
+        crs = _crs_of_place(lon, lat, centres[0, :2], _zones(lat, lon))
     return Cameras(
         labels=labels,
         centres=centres,
@@ -338,11 +332,8 @@ def _shots(path: Path) -> dict[str, dict[str, Any]]:
     """Return the properties of every feature by file name, with its `geometry`."""
     features = load_json(path)["features"]
     shots = {
-        str(feature["properties"]["filename"]): {
-            **feature["properties"],
-            "geometry": feature.get("geometry"),
-        }
-        for feature in features
+        str(one["properties"]["filename"]): one["properties"] | {"geometry": one.get("geometry")}
+        for one in features
     }
     if not shots or len(shots) < len(features):
         raise damaged(path, f"{len(features)} features have {len(shots)} different filenames")
@@ -374,9 +365,6 @@ def _lenses(
         found = known.get(str(shot.get("camera"))) or (alike[0] if len(alike) == 1 else None)
         plain += found is None
         lenses.append(found or Lens(focal * scale, width, height, width / 2.0, height / 2.0))
-    sentence = (
-        f"cameras.json has no camera of the size and focal length of {plain} images. Their lens"
-        " is taken as free of distortion."
-    )
+    sentence = f"cameras.json has no camera of {plain} images; they get a lens without distortion."
     said = note(path, "cameras.no_distortion", sentence, images=plain)
     return tuple(lenses), (said,) if plain else ()

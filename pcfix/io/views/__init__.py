@@ -84,10 +84,7 @@ def _fitted(
         except InputError:
             if raw.what != COLMAP_LIST:
                 raise
-        sentence = (
-            f"{raw.path}: the PLY file beside it is in another frame than the cameras. Its"
-            " positions are not used; the list is matched with the cloud row by row."
-        )
+        sentence = f"{raw.path}: the PLY file beside it is in another frame and is not used."
         note = PcfixWarning("views.other_frame", sentence, path=raw.path)
         raw = replace(raw, xyz=None, notes=(*raw.notes, note))
     return ViewList(raw, orders, None, None, _SPACINGS[kind], kind)

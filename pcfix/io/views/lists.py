@@ -31,13 +31,8 @@ from pcfix.model import FloatArray, IntArray, TiePoints, ViewKind
 COLMAP_LIST = "COLMAP view list"
 _HEAD = 8
 _IMAGES, _WEIGHTS = "view_indices", "view_weights"
-_OTHERS = {
-    b"LASF": "a LAS file",
-    b"MVSI": "an OpenMVS scene",
-    b"PK\x03\x04": "a ZIP archive or a project",
-    b"SQLi": "a database",
-}
-"""Files that people give instead, by their first bytes."""
+_OTHERS = (b"LASF", b"MVSI", b"PK\x03\x04", b"SQLi")
+"""The first bytes of files that people give instead: clouds, scenes, archives, databases."""
 _REMEDY = "Give COLMAP's fused.ply.vis or OpenMVS's dense PLY, as the software wrote it."
 
 
@@ -91,7 +86,7 @@ def read_list(path: Path) -> RawList:
     with path.open("rb") as stream:
         head = stream.read(4)
     if head in _OTHERS:
-        raise bad_file(path, "views.not_one", f"is {_OTHERS[head]}, not a view list. {_REMEDY}")
+        raise bad_file(path, "views.not_one", f"is not a view list. {_REMEDY}")
     if not head.startswith(b"ply"):
         return _colmap(path)
     beside = path.with_name(f"{path.name}.vis")
@@ -111,7 +106,7 @@ def _colmap(path: Path) -> RawList:
         first, length = np.empty((2, count, 1), np.int64)
         complete, used = list_starts(words, one, one, False, first, length)
     if complete < count or used < len(words):
-        sentence = f"is no complete COLMAP view list: {complete:,} of {count:,} lists can be read."
+        sentence = f"is no complete COLMAP view list: {complete:,} of {count:,} can be read."
         values = {"points": count, "complete": complete}
         raise bad_file(path, "views.damaged", f"{sentence} {_REMEDY}", **values)
     start, number = joined(words, first[:, 0], length[:, 0], 1)
@@ -131,9 +126,7 @@ def _openmvs(path: Path) -> RawList:
     """Read positions, view lists and, if there are any, weights."""
     header = read_header(path)
     if header.item(_IMAGES, is_list=True) is None:
-        names = ", ".join(p.name for p in header.properties)
-        sentence = f"its points have no {_IMAGES} (they have: {names}). {_REMEDY}"
-        raise bad_file(path, "views.no_lists", sentence)
+        raise bad_file(path, "views.no_lists", f"its points have no {_IMAGES}. {_REMEDY}")
     vertices = Records(path)
     start, number = vertices.lists(_IMAGES)
     raw = RawList(path, "OpenMVS point cloud", start, _checked_images(path, number))
@@ -142,9 +135,7 @@ def _openmvs(path: Path) -> RawList:
         return raw
     weight_start, weight = vertices.lists(_WEIGHTS)
     if not np.array_equal(weight_start, start) or not ((weight >= 0.0) & (weight < np.inf)).all():
-        sentence = (
-            f"its {_WEIGHTS} are not one positive number for each of the {_IMAGES}. {_REMEDY}"
-        )
+        sentence = f"its {_WEIGHTS} are not one positive number for each image. {_REMEDY}"
         raise bad_file(path, "views.weights", sentence)
     return replace(raw, weight=weight.astype(np.float32))
 

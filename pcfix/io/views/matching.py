@@ -46,7 +46,7 @@ class ViewMatch:
 
         The cloud's coordinates are rounded to `step_m`, the scale of a LAS file.
         """
-        self._views, self._cameras = views, cameras
+        self.view_list, self._cameras = views, cameras
         self._tree: Any = None  # a cKDTree of the list's positions, when one is needed
         raw = views.raw
         source, weights = f"{raw.what} {raw.path}", raw.weight is not None
@@ -58,33 +58,21 @@ class ViewMatch:
             self.report.tolerance_m = max(rounding_m, views.default_spacings * spacing_m)
             self._same_m = max(rounding_m, _SAME * spacing_m)
             if rounding_m > spacing_m / 2:
-                sentence = (
-                    f"{raw.path}: positions are rounded to {rounding_m:.2g} m, but points are"
-                    f" {spacing_m:.2g} m apart. A point may get its neighbour's list; use files"
-                    " with more decimals."
-                )
+                sentence = f"{raw.path}: positions are rounded to {rounding_m:.2g} m, for points"
+                sentence += f" {spacing_m:.2g} m apart. Points may get lists of their neighbours."
                 values = {"rounding_m": rounding_m, "spacing_m": spacing_m}
                 self.report.notes.append(PcfixWarning("views.rounding", sentence, **values))
         elif points != len(views):
-            sentence = (
-                f"has {len(views):,} points, the cloud {points or 'an unknown number'}, and no"
-            )
-            sentence += " positions to match them. Put the PLY file of the list beside it."
+            sentence = f"has {len(views):,} points, the cloud {points}. Put its PLY file beside it."
             values = {"listed": len(views), "points": points}
             raise bad_file(raw.path, "views.other_points", sentence, **values)
         self._note_order()
 
-    @property
-    def view_list(self) -> ViewList:
-        """The view list."""
-        return self._views
-
     def _note_order(self) -> None:
-        order = self._views.orders[0]
-        shares = (self.report.share_seen, self._views.share_seen)
+        order = self.view_list.orders[0]
+        shares = (self.report.share_seen, self.view_list.share_seen)
         self.report.share_seen = min((s for s in shares if s is not None), default=None)
-        self.report.image_order = order.what
-        self.report.unposed = order.unposed
+        self.report.image_order, self.report.unposed = order.what, order.unposed
 
     def for_chunk(self, xyz: FloatArray, first_row: int) -> Views:
         """Return the cameras of a chunk's points; a point without a match has none.
@@ -93,13 +81,13 @@ class ViewMatch:
         `first_row` on. A list that is matched by row number is refused if its cameras do not see
         them.
         """
-        if self._views.raw.xyz is None:
+        if self.view_list.raw.xyz is None:
             row = np.arange(first_row, first_row + len(xyz))
-            self._views = fitted(self._views, self._cameras, xyz, row)
+            self.view_list = fitted(self.view_list, self._cameras, xyz, row)
             self._note_order()
             self.report.by_row += len(row)
         else:
-            row = self._rows(xyz, first_row, self._views.raw.xyz)
+            row = self._rows(xyz, first_row, self.view_list.raw.xyz)
         views = self._given(row)
         apart = beside_frames(xyz, views, self._cameras)
         self.report.beside_entries += int(apart.sum())
@@ -154,10 +142,10 @@ class ViewMatch:
 
     def _given(self, row: IntArray) -> Views:
         """Turn the images of the given rows into cameras, without images that have no pose."""
-        raw = self._views.raw
+        raw = self.view_list.raw
         listed = np.flatnonzero(row >= 0)
         ends, entry = entries(raw.start, row[listed])
-        camera = self._views.orders[0].camera[raw.image[entry]].astype(np.int64)
+        camera = self.view_list.orders[0].camera[raw.image[entry]].astype(np.int64)
         weight = None if raw.weight is None else raw.weight[entry].copy()
         posed = camera >= 0
         if not posed.all():
@@ -168,23 +156,19 @@ class ViewMatch:
         self.report.entries += len(camera)
         self.report.unposed_entries += len(posed) - len(camera)
         self.report.without_camera += int(np.count_nonzero(start[listed + 1] == 0))
-        return Views(np.cumsum(start), camera, weight, self._views.kind)
+        return Views(np.cumsum(start), camera, weight, self.view_list.kind)
 
 
 @dataclass
 class ViewReport(Sums):
-    """Counts of the matches so far."""
+    """Counts of the matches so far; by row, by position and unmatched are points of the cloud."""
 
     source: str = field(metadata=SAME)  # kind and path of the list
     list_points: int = field(metadata=SAME)
     image_order: str = field(default="", metadata=SAME)  # the source of the order of the images
-    share_seen: float | None = field(
-        default=None, metadata=LEAST
-    )  # see `ViewList`, the lowest of all chunks
-    tolerance_m: float | None = field(
-        default=None, metadata=SAME
-    )  # largest distance of a match by position
-    by_row: int = 0  # points of the cloud, as the next two
+    share_seen: float | None = field(default=None, metadata=LEAST)  # see `ViewList`
+    tolerance_m: float | None = field(default=None, metadata=SAME)  # of a match by position
+    by_row: int = 0
     by_position: int = 0
     unmatched: int = 0
     without_camera: int = 0  # matched points none of whose images has a pose
@@ -192,9 +176,7 @@ class ViewReport(Sums):
     unposed_entries: int = 0  # images without a pose, which are ignored
     beside_entries: int = 0  # cameras that cannot have imaged their point, which are ignored
     beside_points: int = 0  # points that these are listed for
-    unposed: tuple[str, ...] = field(
-        default=(), metadata=SAME
-    )  # images without a pose that a list may name
+    unposed: tuple[str, ...] = field(default=(), metadata=SAME)  # that a list may name
     weights: bool = field(default=False, metadata=SAME)
     notes: list[PcfixWarning] = field(default_factory=list, metadata=SAME)
     _histogram: IntArray = field(default_factory=lambda: np.zeros(_BINS + 1, np.int64), repr=False)
@@ -217,10 +199,7 @@ class ViewReport(Sums):
         self.by_position += len(distance_m)
 
     def distance_m(self, share: float) -> float | None:
-        """Return a quantile of the distances of matches by position; None if there are none.
-
-        To a thousandth of the tolerance.
-        """
+        """Return a quantile of the distances of matches by position, to 0.1 % of the tolerance."""
         if not self.by_position or self.tolerance_m is None:
             return None
         enough = np.cumsum(self._histogram) >= share * self.by_position
@@ -229,11 +208,8 @@ class ViewReport(Sums):
     def check(self) -> None:
         """Refuse a list that gave no point of the cloud a camera."""
         if self.points and self.entries == 0:
-            sentence = (
-                f"{self.source}: none of the cloud's {self.points:,} points is in the list"
-                f" ({self.list_points:,} points, {self._tolerance()}). Give the list of this cloud,"
-                " or the offset of its coordinates (--cameras-offset)."
-            )
+            sentence = f"{self.source}: has none of the cloud's {self.points:,} points. Give the"
+            sentence += " list of this cloud, or the offset of its coordinates (--cameras-offset)."
             values = {"points": self.points, "listed": self.list_points}
             raise InputError("views.no_match", sentence, **values)
 
@@ -245,33 +221,26 @@ class ViewReport(Sums):
             notes.append(PcfixWarning(code, f"{self.source}: {sentence}", **values))
 
         if self.unmatched > _MANY * self.points:
-            count = f"{self.unmatched:,} of the cloud's {self.points:,} points"
-            sentence = f"{count} are not in the list ({self._tolerance()})."
+            sentence = f"lacks {self.unmatched:,} of the cloud's {self.points:,} points."
             note("views.unmatched", sentence, count=self.unmatched, points=self.points)
         if self.share_seen is None and self.entries:
-            sentence = "the cameras have no frames, so the order of its images cannot be tested"
-            note("views.order_untested", f"{sentence} ({self.image_order}).")
+            note("views.order_untested", "the order of its images is untested: no camera frames.")
         if self.unposed_entries:
             named = f", such as {', '.join(self.unposed[:3])}" if self.unposed else ""
-            sentence = f"{self.unposed_entries:,} entries name images without a pose{named}."
-            note("views.unposed", f"{sentence} They are ignored.", count=self.unposed_entries)
+            sentence = f"{self.unposed_entries:,} entries without a pose{named} are ignored."
+            note("views.unposed", sentence, count=self.unposed_entries)
         if self.beside_entries:
             note("views.not_in_frame", beside(self.beside_entries, self.beside_points))
         return notes
 
-    def _tolerance(self) -> str:
-        return "by row" if self.tolerance_m is None else f"tolerance {self.tolerance_m:.3g} m"
-
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
         values = {k: v for k, v in vars(self).items() if not k.startswith("_") and k != "notes"}
-        return {
-            **values,
-            "unposed": list(self.unposed),
-            "cameras_per_point": self.cameras_per_point,
-            "distance_median_m": self.distance_m(0.5),
-            "distance_95_m": self.distance_m(0.95),
-        }
+        values["unposed"] = list(self.unposed)
+        values["cameras_per_point"] = self.cameras_per_point
+        values["distance_median_m"] = self.distance_m(0.5)
+        values["distance_95_m"] = self.distance_m(0.95)
+        return values
 
 
 def beside(entries: int, points: int) -> str:
@@ -280,11 +249,7 @@ def beside(entries: int, points: int) -> str:
 
 
 def spacing_m(xyz: FloatArray) -> float | None:
-    """Return the median distance of a point from its nearest neighbour, metres.
-
-    It is taken from a box about the point in the middle of the file that holds some ten thousand
-    points; None for fewer than two points.
-    """
+    """Return the median distance to the nearest neighbour around the middle of the file, metres."""
     from scipy.spatial import cKDTree
 
     if len(xyz) < 2:

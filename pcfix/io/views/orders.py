@@ -16,7 +16,6 @@ of the cameras of an ordinary block do not.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -50,44 +49,35 @@ _FRAME_HEAD, _DATA = struct.Struct("<II7dI"), struct.Struct("<iIQ")
 def image_orders(raw: RawList, cameras: Cameras) -> tuple[ImageOrder, ...]:
     """Return the orders that the image numbers may follow, the most likely first."""
     found = []
-    for what, names in _model_orders(raw.path.parent):
-        row = match_labels(names, cameras.labels).row.astype(np.int32)
-        unposed = tuple(name for name, r in zip(names, row, strict=True) if r < 0)
-        found.append(ImageOrder(what, row, unposed))
+    for place in _PLACES:
+        with suppress(InputError, OSError, struct.error, ValueError, IndexError, KeyError):
+            for what, names in _orders(raw.path.parent / place):  # a damaged model is skipped
+                row = match_labels(names, cameras.labels).row.astype(np.int32)
+                unposed = tuple(name for name, r in zip(names, row, strict=True) if r < 0)
+                found.append(ImageOrder(what, row, unposed))
     found.append(ImageOrder("the cameras as given", np.arange(len(cameras), dtype=np.int32)))
     most = int(raw.image.max()) if raw.image.size else -1
     fitting = [order for order in found if most < len(order.camera)]
     if not fitting:
         largest = max(found, key=lambda order: len(order.camera))
-        sentence = f"names image {most} (from 0), but {largest.what} has {len(largest.camera)}."
-        sentence += " Put the sparse model of the dense workspace beside the list."
+        sentence = f"names image {most} (from 0); {largest.what} has {len(largest.camera)}. Put the"
+        sentence += " sparse model beside the list."
         raise bad_file(raw.path, "views.image_number", sentence, value=most)
     known = [order for order in fitting if (order.camera >= 0).any()]
     if not known:
-        first = f"the first are {fitting[0].unposed[0]} and {cameras.labels[0]}"
-        sentence = f"no image of {fitting[0].what} is among the cameras ({first})."
-        raise bad_file(raw.path, "views.other_block", f"{sentence} Give those of this block.")
+        sentence = f"no image of {fitting[0].what} is among the cameras. Give those of this block."
+        raise bad_file(raw.path, "views.other_block", sentence)
     distinct: dict[bytes, ImageOrder] = {}
     for order in known:
         distinct.setdefault(order.camera.tobytes(), order)
     return tuple(distinct.values())
 
 
-def _model_orders(folder: Path) -> Iterator[tuple[str, list[str]]]:
-    """Yield the orders of the images of the sparse models of a workspace, and their names.
-
-    A damaged model is skipped.
-    """
-    for place in _PLACES:
-        with suppress(InputError, OSError, struct.error, ValueError, IndexError, KeyError):
-            yield from _orders(folder / place)
-
-
 def _orders(model: Path) -> list[tuple[str, list[str]]]:
-    path = model / "images.bin"
-    if not path.is_file():
-        path = model / "images.txt"
-    if not path.is_file():
+    """Return the orders of the images of a sparse model, and their names."""
+    paths = [model / f"images.{suffix}" for suffix in ("bin", "txt")]
+    path = next((path for path in paths if path.is_file()), None)
+    if path is None:
         return []
     images = read_images(path, points=False)
     name = {image.identifier: image.name for image in images}
@@ -136,10 +126,8 @@ def fitted(views: ViewList, cameras: Cameras, xyz: FloatArray, rows: IntArray) -
         return views
     share, best = max(known, key=lambda pair: pair[0])
     if share < LEAST_SHARE:
-        sentence = (
-            f"only {100 * share:.0f} % of the listed cameras have their point in the frame. Put the"
-            " sparse model beside the list, or give its cameras or its offset (--cameras-offset)."
-        )
+        sentence = f"only {100 * share:.0f} % of the listed cameras have their point in the frame."
+        sentence += " Put the sparse model beside the list, or give its offset (--cameras-offset)."
         raise bad_file(views.raw.path, "views.other_images", sentence, share=share)
     others = () if len(image) >= _ENOUGH else views.orders[:best] + views.orders[best + 1 :]
     return replace(views, orders=(views.orders[best], *others), share_seen=share)

@@ -111,12 +111,8 @@ def test_mve_with_its_images(tmp_path):
     [
         ("v0.3", "v0.4", "cameras.unsupported"),
         ("2 3\n", "2 x\n", "cameras.damaged"),
-        ("2 3\n", "9000000000 3\n", "cameras.damaged"),
-        ("2 3\n", "2 9000000000\n", "cameras.damaged"),
         ("1 0 0 ", "1 7 0 ", "cameras.damaged"),
-        ("1 0 0 ", "-1 0 0 ", "cameras.damaged"),
         ("700 -0.1", "0 -0.1", "cameras.no_pose"),
-        ("700 -0.1", "-700 -0.1", "cameras.lens"),
         (words(TURN[0]), words(-TURN[0]), "cameras.rotation"),
     ],
 )

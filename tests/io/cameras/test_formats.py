@@ -24,10 +24,6 @@ def test_the_table_of_the_readme_is_that_of_the_formats():
     assert found[1] == table, f"put this into {README}:\n{table}"
 
 
-def test_what_is_known_but_not_read_comes_last():
-    assert [bool(each.give) for each in FORMATS] == [True] * (len(FORMATS) - 1) + [False]
-
-
 @pytest.mark.parametrize("angles", [True, False])
 def test_a_sensor_of_positions_alone_is_refused(tmp_path, angles):
     """BlocksExchange without a lens: with rotations the sensor counts, without it says nothing."""

@@ -128,15 +128,10 @@ def test_largest_of_several_models_and_the_rest(tmp_path):
     ("old", "new", "code"),
     [
         ("1\na.jpg", "x\na.jpg", "cameras.damaged"),
-        ("1\na.jpg", "99999999999\na.jpg", "cameras.damaged"),
         ("a.jpg 700 ", "a.jpg ", "cameras.damaged"),
-        ("\n40\n", "\n41\n", "cameras.damaged"),
         (" 1 2 3 1 0 0 ", " 1 2 3 1 3 0 ", "cameras.damaged"),
         ("a.jpg 700 ", "a.jpg 0 ", "cameras.no_pose"),
-        ("a.jpg 700 ", "a.jpg inf ", "cameras.lens"),
-        (words(CENTRE), "nan 0 0", "cameras.damaged"),
         (words(np.roll(TURN.as_quat(), 1)), "1 1 0 0", "cameras.rotation"),
-        ("NVM_V3 ", "NVM_V3 FixedK 700 310", "cameras.damaged"),
     ],
 )
 def test_refused(tmp_path, old, new, code):

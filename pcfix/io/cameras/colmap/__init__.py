@@ -181,14 +181,15 @@ def read_priors(
     if path is None:
         return None, ()
     try:
-        rows, why = _rows(path), ""
+        rows = _rows(path)
     except sqlite3.Error as error:
-        rows, why = [], f"cannot be read ({error})"
+        sentence = f"its pose priors cannot be read ({error}). They are skipped."
+        return None, (checks.note(path, "cameras.priors_left_out", sentence),)
     row_of = {label: i for i, label in enumerate(labels)}
     found = [(row_of[name], *row) for name, *row in rows if name in row_of]
     systems = {system for *_, system in found}
-    if why or len(systems) > 1:
-        sentence = f"its pose priors {why or 'are in several systems'}. They are left out."
+    if len(systems) > 1:
+        sentence = "its pose priors are in several coordinate systems. They are skipped."
         return None, (checks.note(path, "cameras.priors_left_out", sentence),)
     xyz, sigma = np.full((2, len(labels), 3), np.nan)
     for i, position, covariance, _ in found:

@@ -100,30 +100,24 @@ def colmap_camera(path: Path, given: Lens) -> Camera:
     """Return the simplest of COLMAP's cameras that is exactly this lens."""
     whole = float(given.width).is_integer() and float(given.height).is_integer()
     if given.unit == "px" and whole:
-        values = _values(given)
-        for name in PREFERRED:
-            model = BY_NAME[name]
-            if model.projection != given.projection:
-                continue
-            numbers = tuple(values.get(key, 0.0) for key in model.parameters)
+        lists = (
+            ("f", (given.focal,)),
+            ("fx fy", (given.focal + given.b1, given.focal)),
+            ("cx cy", (given.principal_x, given.principal_y)),
+            ("k1 k2 k3 k4 k5 k6", given.radial),
+            ("d1 d2 d3", given.denominator),
+            ("p2 p1", given.tangential),
+            ("s1 s2 s3 s4", given.thin_prism),
+            (" ".join(SHAPES.get(given.projection, ())), given.shape),
+        )
+        values = {key: v for keys, vs in lists for key, v in zip(keys.split(), vs, strict=False)}
+        for model in PREFERRED:
+            names, projection = BY_NAME[model]
+            numbers = tuple(values.get(name, 0.0) for name in names)
             camera = Camera(model, given.width, given.height, numbers)
-            if is_same_lens(lens(path, 1, camera), given):
+            if projection == given.projection and is_same_lens(lens(path, 1, camera), given):
                 return camera
     raise lens_not_held(path, given)
-
-
-def _values(given: Lens) -> dict[str, float]:
-    """Return the parameters of all models by COLMAP's names."""
-    values = {"f": given.focal, "fx": given.focal + given.b1, "fy": given.focal}
-    values |= {"cx": given.principal_x, "cy": given.principal_y}
-    for names, numbers in (
-        (("k1", "k2", "k3", "k4", "k5", "k6"), given.radial),
-        (("d1", "d2", "d3"), given.denominator),
-        (("p2", "p1"), given.tangential),
-        (("s1", "s2", "s3", "s4"), given.thin_prism),
-    ):
-        values |= dict(zip(names, numbers, strict=False))
-    return values | dict(zip(SHAPES.get(given.projection, ()), given.shape, strict=False))
 
 
 def _points(xyz: FloatArray, point: IntArray, image_start: IntArray) -> bytes:

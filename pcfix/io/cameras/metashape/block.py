@@ -127,15 +127,11 @@ def _poses(path: Path, images: list[Image]) -> dict[str, FloatArray]:
     matrices = np.array(rows).reshape(-1, 4, 4)
     matrices[:, :3, :3] = checks.rotations(path, labels, matrices[:, :3, :3])
     masters = dict(zip((image.id for image in aligned), matrices, strict=True))
-    offsets: dict[Element, FloatArray] = {}
     poses = dict(masters)
     for image in images:
         master = masters.get(image.element.get("master_id") or "")
-        if image.id in masters or master is None or image.sensor is None:
-            continue
-        if image.sensor not in offsets:
-            offsets[image.sensor] = sensors.offset_of(path, image.sensor)
-        poses[image.id] = master @ offsets[image.sensor]
+        if image.id not in masters and master is not None and image.sensor is not None:
+            poses[image.id] = master @ sensors.offset_of(path, image.sensor)
     return poses
 
 
@@ -193,29 +189,22 @@ def _world(path: Path, chunk: Element) -> tuple[str, str | None, tuple[PcfixWarn
     crs = parse_crs(text, str(path))
     if is_local(crs):
         unit = crs.axis_info[0].unit_name
-        sentence = (
-            f"the local coordinates of the chunk are in {unit}, its transform in metres. Scale a"
-            " cloud that was exported in that unit."
-        )
+        sentence = f"the local coordinates of the chunk are in {unit}, its transform in metres."
         said = note(path, "cameras.local_unit", sentence, unit=unit)
         return LOCAL, None, () if unit in METRES else (said,)
     if crs.geodetic_crs is None:
         remedy = "Set it again in Metashape's reference settings"
         raise checks.unsupported(path, f"the CRS {shortened(text)}, which has no datum,", remedy)
     base = unbound(crs.geodetic_crs).to_json_dict()
+    axes = [
+        {"name": f"Geocentric {a}", "abbreviation": a, "direction": f"geocentric{a}"}
+        | {"unit": "metre"}
+        for a in "XYZ"
+    ]
     geocentric = {  # on the datum of the CRS, as PROJJSON
-        "$schema": base["$schema"],
+        **{key: base[key] for key in ("$schema", "name", "datum", "datum_ensemble") if key in base},
         "type": "GeodeticCRS",
-        "name": base["name"],
-        **{key: base[key] for key in ("datum", "datum_ensemble") if key in base},
-        "coordinate_system": {
-            "subtype": "Cartesian",
-            "axis": [
-                {"name": f"Geocentric {a}", "abbreviation": a, "direction": f"geocentric{a}"}
-                | {"unit": "metre"}
-                for a in "XYZ"
-            ],
-        },
+        "coordinate_system": {"subtype": "Cartesian", "axis": axes},
     }
     frame = crs_text(type(crs).from_json_dict(geocentric))
     return frame, frame if crs.is_geocentric else text, ()

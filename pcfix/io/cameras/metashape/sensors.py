@@ -43,10 +43,7 @@ def read_calibration(path: Path) -> Lens:
     """Read a calibration that Metashape saved on its own (root element ``calibration``), pixels."""
     root = read_xml(path)
     if root.tag != "calibration":
-        sentence = (
-            f"is not a calibration of Metashape ({root.tag}). Save it from Tools, Camera"
-            " Calibration."
-        )
+        sentence = f"is not a calibration of Metashape ({root.tag}). Save one from its Tools menu."
         raise bad_file(path, "cameras.no_calibration", sentence)
     kind = (root.findtext("projection") or "frame").strip()
     if kind not in PROJECTIONS:
@@ -109,8 +106,7 @@ def lens_of(path: Path, sensor: Element, image: str) -> tuple[Lens, tuple[PcfixW
         if coefficients := found.findtext("corrections/coeffs"):
             where, count = f"sensor {label}, corrections", len(coefficients.split())
             rms_px = float(np.linalg.norm(numbers(path, where, coefficients, count)) / 2.0**0.5)
-            sentence = f"the additional corrections of sensor {label} are ignored ({rms_px:.2f} px"
-            sentence += " rms)."
+            sentence = f"the additional corrections of {label} are ignored ({rms_px:.2f} px rms)."
             notes.append(note(path, "cameras.corrections", sentence, sensor=label, rms_px=rms_px))
     elif found is None and size is not None and focal_mm is not None and pixel_mm is not None:
         lens = Lens(  # what Metashape itself starts from
@@ -119,23 +115,14 @@ def lens_of(path: Path, sensor: Element, image: str) -> tuple[Lens, tuple[PcfixW
             pixel_size_mm=pixel_mm,
             sensor=label,
         )
-        sentence = (
-            f"sensor {label} has no calibration. Its focal length is that of the data sheet,"
-            " without distortion."
-        )
+        sentence = f"sensor {label} has no calibration; the lens of its data sheet is used."
         notes.append(note(path, "cameras.data_sheet_lens", sentence, sensor=label))
     else:
-        sentence = (
-            f"the sensor {label} of image {image} has no calibration, or no size. Align the images"
-            " in Metashape and export the cameras again."
-        )
+        sentence = f"sensor {label} of {image} has no calibration or no size. Align the images."
         raise bad_file(path, "cameras.no_calibration", sentence, sensor=label)
     shutter = [p for p in sensor.iterfind("property") if p.get("name") == "rolling_shutter"]
     if any((p.get("value") or "0").lower() not in ("0", "false", "disabled") for p in shutter):
-        sentence = (
-            f"the rolling shutter compensation of sensor {label} is ignored, each image has one"
-            " pose. At 5 m/s and 30 ms that is 0.15 m; fly slower where it matters."
-        )
+        sentence = f"the rolling shutter of sensor {label} is ignored; each image has one pose."
         notes.append(note(path, "cameras.rolling_shutter", sentence, sensor=label))
     return lens, tuple(notes)
 

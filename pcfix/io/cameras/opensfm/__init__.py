@@ -159,9 +159,8 @@ def _poses(chosen: Any, shots: dict[str, Any]) -> tuple[FloatArray, FloatArray]:
 
 def _pose(entry: Any) -> tuple[FloatArray, FloatArray]:
     """Return R and t of an entry with an axis-angle rotation."""
-    return from_rotation_vectors(checks.triple(entry["rotation"])), checks.triple(
-        entry["translation"]
-    )
+    turn = from_rotation_vectors(checks.triple(entry["rotation"]))
+    return turn, checks.triple(entry["translation"])
 
 
 def _reference(path: Path, chosen: Any) -> tuple[float, float, float] | None:
@@ -175,9 +174,7 @@ def _reference(path: Path, chosen: Any) -> tuple[float, float, float] | None:
     with checks.reading(path):
         lat, lon, alt = (float(entry[key]) for key in ("latitude", "longitude", "altitude"))
         if not (abs(lat) <= 90.0 and abs(lon) <= 360.0 and abs(alt) < np.inf):
-            raise checks.damaged(
-                path, f"reference_lla {lat:g}, {lon:g} is no latitude and longitude"
-            )
+            raise checks.damaged(path, f"reference_lla {lat:g}, {lon:g} is no place on earth")
     return None if lat == lon == 0.0 else (lat, lon, alt)
 
 

@@ -18,7 +18,6 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import astuple, replace
 from pathlib import Path
 from typing import Any
@@ -30,7 +29,6 @@ from pcfix.io.cameras import checks
 from pcfix.io.cameras.georeference import frame_of, georeference, is_tied
 from pcfix.io.cameras.tracks import NO_TIE_POINTS, are_seen
 from pcfix.io.crs import (
-    GEOCENTRIC_WGS84,
     GEOGRAPHIC_WGS84,
     Topocentric,
     heights_of,
@@ -39,7 +37,7 @@ from pcfix.io.crs import (
     shortened,
 )
 from pcfix.io.transformations import transformation
-from pcfix.model import Cameras, FloatArray, IntArray, Lens, Projection, TiePoints
+from pcfix.model import Cameras, FloatArray, Lens, Projection, TiePoints
 from pcfix.options.declare import File
 
 PANORAMAS = frozenset({"equirectangular", "spherical"})
@@ -155,7 +153,18 @@ def write_opensfm(path: File, cameras: Cameras, tie_points: TiePoints | None = N
         chosen["reference_lla"] = dict(zip(keys, astuple(place), strict=True))
         texts["reference_lla.json"] = json.dumps(chosen["reference_lla"], indent=2) + "\n"
     if tie_points is not None:
-        texts["tracks.csv"] = "\n".join(_tracks(cameras, tie_points, kept)) + "\n"
+        views, feature = tie_points.views, np.zeros(len(cameras), np.int64)
+        size = np.array([(lens.width, lens.height) for lens in lenses])[views.camera]
+        xy = (tie_points.image_xy - size / 2.0) / size.max(axis=1, initial=1.0)[:, None]
+        rest = "\t".join(map(str, (FEATURE_SCALE, *GREY, -1, -1)))
+        lines = [TRACKS_HEADER]
+        for track, row in enumerate(kept.tolist()):
+            for i in range(views.start[row], views.start[row + 1]):
+                camera, (x, y) = views.camera[i], xy[i].tolist()
+                image = f"{cameras.labels[camera]}\t{track}\t{feature[camera]}"
+                lines.append(f"{image}\t{x!r}\t{y!r}\t{rest}")
+                feature[camera] += 1  # features count from 0 in each image
+        texts["tracks.csv"] = "\n".join(lines) + "\n"
     texts[target.name] = json.dumps([chosen]) + "\n"
     checks.write_new(target.parent, {name: text.encode() for name, text in texts.items()})
 
@@ -207,36 +216,8 @@ def _world(
     to_degrees = transformation(source, geographic, cameras.centres, name, heights=stated).forward
     longitude, latitude, _ = to_degrees(np.median(cameras.centres, axis=0)[None])[0].tolist()
     place = Topocentric(latitude, longitude, 0.0)
-    centres, points = (_topocentric(to_degrees(xyz), place) for xyz in (cameras.centres, points))
+    centres, points = (place.from_degrees(to_degrees(xyz)) for xyz in (cameras.centres, points))
     text = "ENU:" + ",".join(map(repr, astuple(place)))
     there = replace(cameras, centres=centres, crs=text, project_crs=None, gnss=None)
     turns = georeference(there, cameras.crs, name=name).turns(centres)
     return replace(there, rotations=np.asarray(cameras.rotations) @ turns), points, place
-
-
-def _topocentric(degrees: FloatArray, place: Topocentric) -> FloatArray:
-    """Return longitudes, latitudes and heights in the axes at a place, metres."""
-    from pyproj import Transformer
-
-    to_geocentric = Transformer.from_crs(GEOGRAPHIC_WGS84, GEOCENTRIC_WGS84, always_xy=True)
-    to_axes = Transformer.from_pipeline(
-        f"+proj=topocentric +ellps=WGS84 +lat_0={place.latitude_deg!r}"
-        f" +lon_0={place.longitude_deg!r} +h_0={place.height_m!r}"
-    )
-    return np.column_stack(to_axes.transform(*to_geocentric.transform(*degrees.T)))
-
-
-def _tracks(cameras: Cameras, tie_points: TiePoints, kept: IntArray) -> Iterator[str]:
-    """Yield the lines of tracks.csv; features count from 0 in each image."""
-    views = tie_points.views
-    size = np.array([(lens.width, lens.height) for lens in cameras.lenses or ()])[views.camera]
-    xy = (tie_points.image_xy - size / 2.0) / size.max(axis=1, initial=1.0)[:, None]
-    feature = np.zeros(len(cameras), np.int64)
-    rest = "\t".join(map(str, (FEATURE_SCALE, *GREY, -1, -1)))
-    yield TRACKS_HEADER
-    for track, row in enumerate(kept.tolist()):
-        for i in range(views.start[row], views.start[row + 1]):
-            camera = views.camera[i]
-            x, y = xy[i].tolist()
-            yield f"{cameras.labels[camera]}\t{track}\t{feature[camera]}\t{x!r}\t{y!r}\t{rest}"
-            feature[camera] += 1

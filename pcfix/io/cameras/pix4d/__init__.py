@@ -80,7 +80,15 @@ def read(source: Source) -> Cameras:
     if "parameters" in files:
         images = tables.read_parameters(files["parameters"])
         poses = _poses(files, images)
-        lenses = tables.lenses_of_images([images[row] for row in poses.rows], calibrations)
+        known: dict[object, Lens | None] = {}
+        keys = []
+        for image in (images[row] for row in poses.rows):
+            inner = {k: v for k, v in image.fields.items() if k not in ("centre", "rotation")}
+            keys.append((image.width, image.height, *((k, v.tobytes()) for k, v in inner.items())))
+            if keys[-1] not in known:
+                known[keys[-1]] = tables.lens_of_image(image, calibrations)
+        found = [lens for key in keys if (lens := known[key]) is not None]
+        lenses = tuple(found) if len(found) == len(keys) else None
     else:
         labels, centres, rotations = tables.read_external(files["external"])
         lens = tables.lens_of_calibration(calibrations[0]) if len(calibrations) == 1 else None
@@ -123,10 +131,7 @@ def _find(source: Source) -> Files:
         folder, prefix = tables_there[0]
         prefixes = {one for where, one in tables_there if where == folder}
         if len(prefixes) > 1:
-            sentence = (
-                f"holds the tables of several projects ({', '.join(sorted(prefixes))}). Give one of"
-                " the files instead."
-            )
+            sentence = f"holds several projects ({', '.join(sorted(prefixes))}). Give one file."
             raise bad_file(folder, "cameras.several_projects", sentence, projects=len(prefixes))
     else:
         folder, prefix = path.parent, _prefix(path.name, PARAMETERS, EXTERNAL, GEOGRAPHIC) or ""
@@ -200,11 +205,8 @@ def _poses(files: Files, images: list[tables.Image]) -> Poses:
         turn = float(np.degrees(2.0 * np.arcsin(np.clip(sines, 0.0, 1.0))).max())
         notes = ()
         if apart > AGREE_M or turn > AGREE_DEG:
-            sentence = (
-                f"its poses differ by up to {apart:.2f} m and {turn:.3f} degrees from those of"
-                f" {PARAMETERS} with offset.xyz. The absolute ones are used; images that only the"
-                " other table has are left out."
-            )
+            sentence = f"its poses differ by up to {apart:.2f} m and {turn:.3f} deg from those of"
+            sentence += f" {PARAMETERS} and are used; images that only that has are skipped."
             differ = note(path, "cameras.tables_differ", sentence, metres=apart, degrees=turn)
             centres, notes = np.full_like(centres, np.nan), (differ,)
         centres[both], rotations[both] = there[rows], turned[rows]
@@ -223,10 +225,7 @@ def _absolute(
     if "offset" not in files and "external" in files:
         return np.full_like(local, np.nan), ()
     if "offset" not in files:
-        sentence = (
-            "its positions lack an offset, and there is no offset.xyz beside it. Give the offset"
-            " with --cameras-offset."
-        )
+        sentence = "there is no offset.xyz beside it. Give the offset with --cameras-offset."
         return local, (note(files["parameters"], "cameras.no_offset", sentence),)
     offsets = tables.read_offsets(files["offset"])
     if len({values.tobytes() for _, values in offsets}) == 1:
@@ -259,13 +258,13 @@ def _priors(path: Path, labels: list[str]) -> tuple[GnssPositions | None, list[s
     if kind is None:
         return None, others
     xyz, sigma_m = np.full((2, len(labels), 3), np.nan)
+    axes = ("x", "y", "z") if kind == "xyz" else ("lng", "lat", "alt")
     for i, element in enumerate(of_labels):
-        position = None if element is None or kinds[i] != kind else element.find(kind)
-        if element is None or position is None:
+        if element is None or kinds[i] != kind:
             continue
-        where = f"image {labels[i]}, "
-        axes = ("x", "y", "z") if kind == "xyz" else ("lng", "lat", "alt")
-        xyz[i] = [number(path, where + kind, position.get(axis)) for axis in axes]
+        position, where = element.find(kind), f"image {labels[i]}, "
+        place = {} if position is None else position.attrib
+        xyz[i] = [number(path, where + kind, place.get(axis)) for axis in axes]
         for tag, rows in (("toleranceXY", slice(2)), ("toleranceZ", slice(2, 3))):
             if (tolerance := element.find(tag)) is not None:
                 sigma_m[i, rows] = number(path, where + tag, tolerance.get("value"))

@@ -122,9 +122,7 @@ _PLAIN = {spelling for spellings in SPELLINGS.values() for spelling in spellings
 
 def column_missing(path: Path, missing: Sequence[str], header: Sequence[str]) -> InputError:
     """Return the error for a table that lacks columns."""
-    sentence = (
-        f"the header lacks {', '.join(missing)}; it has {', '.join(header)}. Add the columns."
-    )
+    sentence = f"the header lacks {', '.join(missing)}; it has {', '.join(header)}."
     return bad_file(path, "table.column_missing", sentence, columns=list(missing))
 
 
@@ -225,10 +223,7 @@ def read_columns(path: Path) -> Columns:
     lines = read_lines(path)
     found = [header for header in headers(lines) if is_header(header.names)]
     if not found:
-        sentence = (
-            "no line names the columns. Put a header above the rows, for example"
-            " label,x,y,z,omega,phi,kappa."
-        )
+        sentence = "no line names the columns, for example label,x,y,z,omega,phi,kappa."
         raise bad_file(path, "table.no_header", sentence)
     at, names, unit, comment = found[-1]
     place = known(names)
