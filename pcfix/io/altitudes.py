@@ -34,7 +34,15 @@ def read_altitudes(cameras: File, labels: Sequence[str]) -> FloatArray:
     altitudes, path, found = np.full(len(labels), np.nan), Path(cameras), {}
     with suppress(OSError, InputError):  # no correction needs them
         if path.suffix.lower() == ".psx":
-            found = _of_project(path)
+            chunk = open_chunk(path).document
+            names = {camera.get("id"): camera.get("label") for camera in chunk.root.iter("camera")}
+            for frame in chunk.root.iterfind("frames/frame"):
+                for camera in chunk.follow(frame).root.iter("camera"):
+                    for entry in camera.iter("property"):
+                        label = names.get(camera.get("camera_id"))
+                        if entry.get("name") == "DJI/RelativeAltitude" and label:
+                            with suppress(ValueError):
+                                found[label] = float(entry.get("value", ""))
         else:
             root = path if path.is_dir() else path.parent
             inside = [one for name in FOLDERS for one in sorted(root.joinpath(name).glob("*"))]
@@ -46,16 +54,3 @@ def read_altitudes(cameras: File, labels: Sequence[str]) -> FloatArray:
         row = match_labels(list(found), labels, one_to_one=False).row
         altitudes[row[row >= 0]] = np.array(list(found.values()))[row >= 0]
     return altitudes
-
-
-def _of_project(path: Path) -> dict[str, float]:
-    chunk, found = open_chunk(path).document, {}
-    names = {camera.get("id"): camera.get("label") for camera in chunk.root.iter("camera")}
-    for frame in chunk.root.iterfind("frames/frame"):
-        for camera in chunk.follow(frame).root.iter("camera"):
-            for entry in camera.iter("property"):
-                label = names.get(camera.get("camera_id"))
-                if entry.get("name") == "DJI/RelativeAltitude" and label:
-                    with suppress(ValueError):
-                        found[label] = float(entry.get("value", ""))
-    return found

@@ -144,26 +144,21 @@ def read_reference(reference: Clouds) -> Reference:
         xyz = np.column_stack([table.numbers(name) for name in "xyz"])
         return Reference(str(found), xyz, None, sparse=True)
     if suffix in (".tif", ".tiff"):
-        return _read_grid(found)
+        from pyproj import CRS
+
+        with open_raster(found) as grid:  # the centres of the cells of its first band
+            height = read_masked(grid) * grid.scales[0] + grid.offsets[0]
+            transform, crs = grid.transform, CRS(grid.crs.to_wkt()) if grid.crs else None
+        if transform.is_identity:
+            sentence = "has no georeference. Give a georeferenced GeoTIFF."
+            raise bad_file(found, "raster.not_georeferenced", sentence)
+        row, column = np.nonzero(np.isfinite(height))
+        if len(row) == 0:
+            raise bad_file(found, "raster.empty", "no cell contains a height.")
+        x, y = place_of(transform, column + 0.5, row + 0.5)
+        xyz = np.column_stack([x, y, height[row, column]])
+        return Reference(str(found), xyz, crs, height.size - len(xyz), raster=True)
     raise bad_file(found, "reference.unknown", f"is not a reference. Give {KINDS}.")
-
-
-def _read_grid(path: Path) -> Reference:
-    """Read the first band of a GeoTIFF as points."""
-    from pyproj import CRS
-
-    with open_raster(path) as grid:
-        height = read_masked(grid) * grid.scales[0] + grid.offsets[0]
-        transform, crs = grid.transform, CRS(grid.crs.to_wkt()) if grid.crs else None
-    if transform.is_identity:
-        sentence = "has no georeference. Give a georeferenced GeoTIFF."
-        raise bad_file(path, "raster.not_georeferenced", sentence)
-    row, column = np.nonzero(np.isfinite(height))
-    if len(row) == 0:
-        raise bad_file(path, "raster.empty", "no cell contains a height.")
-    x, y = place_of(transform, column + 0.5, row + 0.5)
-    xyz = np.column_stack([x, y, height[row, column]])
-    return Reference(str(path), xyz, crs, height.size - len(xyz), raster=True)
 
 
 def check_same_crs(cloud: str, crs: CRS | None, reference: str, other: CRS | None) -> None:

@@ -17,6 +17,7 @@ from pcfix.io.cameras.table import gnss_positions, open_table
 from pcfix.io.crs import METRES, is_topocentric, parse_crs
 from pcfix.io.files import check_input
 from pcfix.io.labels import match_labels, unnamed
+from pcfix.io.tables import places
 from pcfix.model import Cameras, GnssPositions
 from pcfix.options.declare import File
 
@@ -62,11 +63,7 @@ def read_gnss(path: File, cameras: Cameras, *, crs: str | None = None) -> Camera
             names, listed = list(read.labels), read.gnss
         else:
             columns = open_table(source)
-            header, place = columns.table.header, dict(columns.place)
-            for role, spellings in SIGMAS.items():
-                there = [header.index(name) for name in spellings if name in header]
-                if there and role not in place:
-                    place[role] = there[0]
+            place = places(columns.table.header, SIGMAS) | columns.place
             columns = replace(columns, place=place)
             names, listed = columns.labels, gnss_positions(columns)
         if listed is None:

@@ -48,7 +48,7 @@ from pcfix.io.cameras.table.columns import Columns, headers, is_header, read_col
 from pcfix.io.crs import is_local, is_topocentric, parse_crs
 from pcfix.io.files import check_input
 from pcfix.io.labels import match_labels, unnamed
-from pcfix.io.tables import number, read_lines
+from pcfix.io.tables import number, places, read_lines
 from pcfix.io.transformations import LOCAL, way_to_cloud
 from pcfix.model import BoolArray, Cameras, FloatArray, GroundControl, IntArray
 from pcfix.options.declare import File
@@ -339,10 +339,7 @@ def _with_roles(columns: Columns) -> Columns:
     """Return columns with the places that they have in a table of marks."""
     header, path = columns.table.header, columns.path
     place = {role: i for role, i in columns.place.items() if role in _POSITION}
-    for role, spellings in SPELLINGS.items():
-        there = [header.index(name) for name in spellings if name in header]
-        if there:
-            place[role] = there[0]
+    place |= places(header, SPELLINGS)
     missing = [_PLAIN.get(role, role) for role in ("point", "label", "u", "v") if role not in place]
     if missing:
         sentence = f"lacks the columns {', '.join(missing)}. Give name, x, y, z, image, u, v."

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Container, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -110,6 +110,12 @@ def columns_of(
                 sentence = f"column {name} is in '{unit}'. Give metres."
                 raise bad_file(path, "table.unit", sentence, column=name, value=unit)
     return [name for _, name in sorted(found)]
+
+
+def places(header: Sequence[str], spellings: Mapping[str, Sequence[str]]) -> dict[str, int]:
+    """Return the number of the column of each role: the first of its spellings that is there."""
+    found = {role: [name for name in names if name in header] for role, names in spellings.items()}
+    return {role: header.index(names[0]) for role, names in found.items() if names}
 
 
 def check_columns(

@@ -207,15 +207,7 @@ def tiles_from(name: str, paths: Iterable[Path]) -> Tiles:
             broken[path] = str(error)
     if not heads:
         raise InputError("cloud.broken_files", next(iter(broken.values())), paths=list(broken))
-    _refuse_mixed(name, kinds)
-    counts, lows, highs, steps = zip(*heads, strict=True)
-    tiles = Tiles(name, tuple(kinds), counts, np.array(lows), np.array(highs), max(steps), broken)
-    _warn_of_overlap(tiles)
-    return tiles
-
-
-def _refuse_mixed(name: str, kinds: dict[Path, tuple[Any, ...]]) -> None:
-    """Refuse files of several coordinate systems, point formats or extra dimensions."""
+    # Refuse files of several coordinate systems, point formats or extra dimensions
     first, *rest = kinds
     for other in rest:
         for words, one, another in zip(
@@ -226,10 +218,9 @@ def _refuse_mixed(name: str, kinds: dict[Path, tuple[Any, ...]]) -> None:
                 sentence = f"{first.name} has the {words} {one}, {other.name} {another}. Convert"
                 sentence += " them to the same, or correct them separately."
                 raise bad_file(name, "cloud.mixed_tiles", sentence, paths=[first, other])
-
-
-def _warn_of_overlap(tiles: Tiles) -> None:
-    """Warn of tiles that lie in each other by more than their borders, as points may be double."""
+    counts, lows, highs, steps = zip(*heads, strict=True)
+    tiles = Tiles(name, tuple(kinds), counts, np.array(lows), np.array(highs), max(steps), broken)
+    # Warn of tiles that lie in each other by more than their borders, as points may be double
     boxes = shapely.box(*tiles.lows[:, :2].T, *tiles.highs[:, :2].T)
     one, other = shapely.STRtree(boxes).query(boxes, predicate="intersects")
     one, other = np.unique(np.sort(np.column_stack([one, other])[one != other], axis=1), axis=0).T
@@ -245,3 +236,4 @@ def _warn_of_overlap(tiles: Tiles) -> None:
         sentence = f"{tiles}: {' and '.join(found[0])} overlap, as do {len(found)} pairs. Points in"
         sentence += " both count twice; cut off the buffers of the tiles."
         warnings.warn(PcfixWarning("cloud.overlap", sentence, pairs=found), stacklevel=3)
+    return tiles

@@ -58,7 +58,25 @@ def likely_mistake(
     for words, moved in _readings(centres, cloud_crs):
         if is_over(moved):
             return f"The cameras would lie over the cloud {words}."
-    return _far(centres, low, high)
+    # no other reading of the numbers fits
+    middle, span = np.median(centres[:, :2], axis=0), np.ptp(centres[:, :2], axis=0).max()
+    centre, size = (low + high)[:2] / 2.0, max((high - low)[:2].max(), 1e-9)
+    cameras, cloud = np.abs(middle).max(), np.abs(centre).max()
+    inside = (np.abs(centres[:, :2]) <= 360.0).all() and np.abs(low[:2]).max() > LOCAL_M
+    if inside and span < 1e-3 * size and np.abs(np.median(centres[:, :2])) > 10.0 * span:
+        return "The cameras look like degrees, the cloud like metres; give --cameras-crs EPSG:4326."
+    if min(cameras, cloud) < LOCAL_M and max(cameras, cloud) > MAP_M:
+        local, other = ("cameras", "cloud") if cameras < cloud else ("cloud", "cameras")
+        verb = "has" if local == "cloud" else "have"
+        advice = "use the same CRS, or give the shift with --cameras-offset."
+        return f"The {local} {verb} local or shifted coordinates, the {other} not; {advice}"
+    x, y = centre - middle
+    apart = np.hypot(x, y)
+    far = f"{apart / 1000.0:,.1f} km" if apart >= 1e4 else f"{apart:.0f} m"
+    advice = "check the CRS of both."
+    if 0.2 < span / size < 5.0:
+        advice = f"perhaps by an offset of {x:.0f}, {y:.0f} m; see --cameras-offset."
+    return f"The cameras are {far} from the cloud in plan; {advice}"
 
 
 def _readings(centres: FloatArray, crs: str | CRS | None) -> Iterator[tuple[str, FloatArray]]:
@@ -116,25 +134,3 @@ def _wrong_height(middle: float, low: FloatArray, high: FloatArray) -> str | Non
         if high[2] < moved < high[2] + limit:
             return f"The cameras are {what}: their heights are likely in {words}."
     return f"The cameras are {what}: their heights have another origin; see --cameras-offset."
-
-
-def _far(centres: FloatArray, low: FloatArray, high: FloatArray) -> str:
-    """Return what is likely wrong where no other reading of the numbers fits."""
-    middle, span = np.median(centres[:, :2], axis=0), np.ptp(centres[:, :2], axis=0).max()
-    centre, size = (low + high)[:2] / 2.0, max((high - low)[:2].max(), 1e-9)
-    cameras, cloud = np.abs(middle).max(), np.abs(centre).max()
-    inside = (np.abs(centres[:, :2]) <= 360.0).all() and np.abs(low[:2]).max() > LOCAL_M
-    if inside and span < 1e-3 * size and np.abs(np.median(centres[:, :2])) > 10.0 * span:
-        return "The cameras look like degrees, the cloud like metres; give --cameras-crs EPSG:4326."
-    if min(cameras, cloud) < LOCAL_M and max(cameras, cloud) > MAP_M:
-        local, other = ("cameras", "cloud") if cameras < cloud else ("cloud", "cameras")
-        verb = "has" if local == "cloud" else "have"
-        advice = "use the same CRS, or give the shift with --cameras-offset."
-        return f"The {local} {verb} local or shifted coordinates, the {other} not; {advice}"
-    x, y = centre - middle
-    apart = np.hypot(x, y)
-    far = f"{apart / 1000.0:,.1f} km" if apart >= 1e4 else f"{apart:.0f} m"
-    advice = "check the CRS of both."
-    if 0.2 < span / size < 5.0:
-        advice = f"perhaps by an offset of {x:.0f}, {y:.0f} m; see --cameras-offset."
-    return f"The cameras are {far} from the cloud in plan; {advice}"

@@ -74,7 +74,12 @@ def recognises(source: Source) -> bool:
         return False
     if any(project.find(name) for name in (*_OF_CRS, SHOTS, TOPOCENTRIC)):
         return True
-    reference = _reference_of(project.poses)
+    with project.poses.open("rb") as stream:
+        view = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+    at = view.find(b'"reference_lla"')  # the file may be large
+    text = view[at : at + 400] if at >= 0 else b""
+    values = {key: float(value) for key, value in _REFERENCE.findall(text)[:2]}
+    reference = (values[b"latitude"], values[b"longitude"]) if len(values) == 2 else None
     return reference is not None and _whole_metres(*reference, None) is not None
 
 
@@ -215,15 +220,6 @@ def _frame(project: Project, found: opensfm.Reconstruction) -> Frame:
         for guess in (_from_topocentric(own, reference, crs), moved.points(own))
     )
     return unmoved._replace(project_crs=crs) if still_m < 0.5 * moved_m else moved
-
-
-def _reference_of(path: Path) -> tuple[float, float] | None:
-    """Return latitude and longitude of a reconstruction's origin without reading all of it."""
-    with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as view:
-        at = view.find(b'"reference_lla"')
-        text = view[at : at + 400] if at >= 0 else b""
-    values = {key: float(value) for key, value in _REFERENCE.findall(text)[:2]}
-    return (values[b"latitude"], values[b"longitude"]) if len(values) == 2 else None
 
 
 def _in_shots(project: Project, cameras: Cameras) -> tuple[FloatArray, FloatArray]:

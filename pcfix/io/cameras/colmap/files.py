@@ -183,7 +183,19 @@ def read_images(path: Path, *, points: bool) -> list[Image]:
     with reading(path):
         if path.suffix == ".bin":
             return _binary_images(path, points=points)
-        return _text_images(path, points=points)
+        images, lines = [], _lines(path)
+        for line in filter(None, lines):
+            identifier, *pose, camera, name = line.split(None, 9)
+            below = next(lines, "")
+            if below:
+                int(below.rsplit(None, 1)[-1])  # the line of the next image would end with a name
+            rows = np.array(below.split() if points else (), float).reshape(-1, 3)
+            rows = rows[rows[:, 2] >= 0]
+            seen = np.empty(len(rows), OBSERVATION)
+            seen["xy"], seen["point"] = rows[:, :2], rows[:, 2]
+            images.append(Image(int(identifier), tuple(map(float, pose)), int(camera), name, seen))
+        _check_count(path, len(images))
+        return images
 
 
 def _binary_images(path: Path, *, points: bool) -> list[Image]:
@@ -203,23 +215,6 @@ def _binary_images(path: Path, *, points: bool) -> list[Image]:
         images.append(Image(identifier, tuple(pose), camera, name, seen))
     if file.at > len(file.data):
         raise damaged(path, "its last image has too few points")
-    return images
-
-
-def _text_images(path: Path, *, points: bool) -> list[Image]:
-    """Read two lines for each image; the second has its image points, -1 for those of no point."""
-    images, lines = [], _lines(path)
-    for line in filter(None, lines):
-        identifier, *pose, camera, name = line.split(None, 9)
-        below = next(lines, "")
-        if below:
-            int(below.rsplit(None, 1)[-1])  # the line of the next image would end with a name
-        rows = np.array(below.split() if points else (), float).reshape(-1, 3)
-        rows = rows[rows[:, 2] >= 0]
-        seen = np.empty(len(rows), OBSERVATION)
-        seen["xy"], seen["point"] = rows[:, :2], rows[:, 2]
-        images.append(Image(int(identifier), tuple(map(float, pose)), int(camera), name, seen))
-    _check_count(path, len(images))
     return images
 
 

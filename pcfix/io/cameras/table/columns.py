@@ -13,7 +13,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pcfix.errors import InputError, bad_file
-from pcfix.io.tables import Table, delimiter_of, number, read_lines, split_header, table_below
+from pcfix.io.tables import (
+    Table,
+    delimiter_of,
+    number,
+    places,
+    read_lines,
+    split_header,
+    table_below,
+)
 from pcfix.model import FloatArray, IntArray
 
 SPELLINGS: dict[str, tuple[str, ...]] = {
@@ -66,15 +74,6 @@ class Header(NamedTuple):
     comment: bool
 
 
-def known(names: Sequence[str]) -> dict[str, int]:
-    """Return what each column is, from its names without units."""
-    first = {
-        role: next((spelling for spelling in spellings if spelling in names), None)
-        for role, spellings in SPELLINGS.items()
-    }
-    return {role: names.index(name) for role, name in first.items() if name is not None}
-
-
 def headers(lines: Sequence[str]) -> Iterator[Header]:
     """Yield the lines that may be a header."""
     for i, line in enumerate(lines[:_FARTHEST_HEADER]):
@@ -99,7 +98,7 @@ def axes(place: Iterable[str], suffix: str = "") -> tuple[str, str, str] | None:
 
 def is_header(names: Sequence[str]) -> bool:
     """Whether at least two of the names that every table of cameras has are among these."""
-    return len(POSITION & known(names).keys()) >= 2
+    return len(POSITION & places(names, SPELLINGS).keys()) >= 2
 
 
 def _split_unit(name: str) -> tuple[str, str]:
@@ -226,7 +225,7 @@ def read_columns(path: Path) -> Columns:
         sentence = "no line names the columns, for example label,x,y,z,omega,phi,kappa."
         raise bad_file(path, "table.no_header", sentence)
     at, names, unit, comment = found[-1]
-    place = known(names)
+    place = places(names, SPELLINGS)
     for role, spellings in SPELLINGS.items():  # a column with the role's own name counts
         alike = [name for name in names if name in spellings]
         if len(alike) > 1 and role not in MANY and (role not in alike or alike.count(role) > 1):
