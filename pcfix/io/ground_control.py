@@ -45,11 +45,10 @@ from pcfix.io.cameras.odm import named_crs
 from pcfix.io.cameras.table import centres
 from pcfix.io.cameras.table import crs as table_crs
 from pcfix.io.cameras.table.columns import Columns, headers, is_header, read_columns
-from pcfix.io.crs import is_local, is_topocentric, parse_crs
+from pcfix.io.crs import LOCAL, is_local, is_topocentric, parse_crs, way_to_cloud
 from pcfix.io.files import check_input
 from pcfix.io.labels import match_labels, unnamed
 from pcfix.io.tables import number, places, read_lines
-from pcfix.io.transformations import LOCAL, way_to_cloud
 from pcfix.model import BoolArray, Cameras, FloatArray, GroundControl, IntArray
 from pcfix.options.declare import File
 

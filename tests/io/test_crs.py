@@ -5,6 +5,7 @@ import pytest
 from pyproj import CRS, Transformer
 
 from pcfix.io.crs import (
+    HeightsError,
     Topocentric,
     check_projected_metres,
     geographic_3d,
@@ -13,8 +14,8 @@ from pcfix.io.crs import (
     metres_up,
     parse_crs,
     parts,
+    transformation,
 )
-from pcfix.io.transformations import HeightsError, transformation
 from tests.utils.codes import refused
 
 pytestmark = pytest.mark.quick_but("test_unknown")

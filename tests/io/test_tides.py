@@ -11,10 +11,16 @@ from PIL import Image
 
 import pcfix
 from pcfix.flow.inputs import Inputs
-from pcfix.io.altitudes import read_altitudes
 from pcfix.io.cameras import read_cameras
 from pcfix.io.scenes import write_scene
-from pcfix.io.tides import ImageTimes, TideTable, level_offsets, read_image_times, read_tide
+from pcfix.io.tides import (
+    ImageTimes,
+    TideTable,
+    level_offsets,
+    read_altitudes,
+    read_image_times,
+    read_tide,
+)
 from tests.utils.codes import refused
 from tests.utils.shared import needs
 

@@ -8,7 +8,7 @@ import pytest
 from pyproj import Transformer
 
 from pcfix.io import vectors
-from pcfix.io.transformations import HeightsError
+from pcfix.io.crs import HeightsError
 from pcfix.io.vectors import in_cloud_crs, read_shoreline, read_vectors, read_water_polygons
 from tests.utils.codes import refused
 

@@ -9,7 +9,7 @@ from rasterio.transform import Affine, from_origin
 
 import pcfix
 from pcfix.io.scenes import write_scene
-from pcfix.io.water_rasters import MARGIN_M
+from pcfix.io.water import MARGIN_M
 from pcfix.water.surface import surface_above
 from tests.utils.codes import refused, warned
 from tests.utils.shared import needs
@@ -269,7 +269,7 @@ FLAT = np.full((20, 20), 10.0)
 )
 def test_bad_rasters(tmp_path, monkeypatch, name, content, more, code):
     path = tmp_path / name
-    monkeypatch.setattr("pcfix.io.water_rasters.MOST_CELLS", 300)
+    monkeypatch.setattr("pcfix.io.water.MOST_CELLS", 300)
     if isinstance(content, bytes):
         path.write_bytes(content)
     else:

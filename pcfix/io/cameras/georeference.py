@@ -27,28 +27,26 @@ from pcfix.io.crs import (
     GEOCENTRIC_WGS84,
     GEOGRAPHIC_WGS84,
     METRES,
+    HeightsError,
     Topocentric,
+    Transformation,
     check_projected_metres,
     crs_text,
     geographic_3d,
+    heights_agree,
     heights_of,
     is_local,
+    is_same_numbers,
     is_topocentric,
     metres_up,
     parse_crs,
     parts,
     plan_unit,
     shortened,
+    transformation,
     typed,
     unbound,
     with_heights,
-)
-from pcfix.io.transformations import (
-    HeightsError,
-    Transformation,
-    heights_agree,
-    is_same_numbers,
-    transformation,
 )
 from pcfix.model import Cameras, FloatArray, GnssPositions
 

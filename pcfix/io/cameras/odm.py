@@ -37,7 +37,7 @@ from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.cameras import checks, opensfm
 from pcfix.io.cameras.checks import damaged, load_json, note, triple
 from pcfix.io.cameras.formats import Source
-from pcfix.io.cameras.opensfm.models import is_panorama, lens
+from pcfix.io.cameras.opensfm import is_panorama, lens
 from pcfix.io.crs import GEOCENTRIC_WGS84, GEOGRAPHIC_WGS84, Topocentric
 from pcfix.lens.rotations import from_rotation_vectors
 from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, TiePoints

@@ -20,11 +20,12 @@ from pcfix.io.views.lists import (
     ImageOrder,
     RawList,
     ViewList,
+    fitted,
+    image_orders,
     read_list,
     tracks_as_list,
 )
 from pcfix.io.views.matching import ViewMatch, ViewReport, spacing_m
-from pcfix.io.views.orders import fitted, image_orders
 from pcfix.model import Cameras, FloatArray, TiePoints, ViewKind
 from pcfix.options.declare import File
 

@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning, bad_file
-from pcfix.io.views.lists import ViewList
-from pcfix.io.views.orders import entries, fitted
+from pcfix.io.views.lists import ViewList, entries, fitted
 from pcfix.lens.frames import beside_frames
 from pcfix.model import Cameras, FloatArray, IntArray, Views
 from pcfix.sums import LEAST, SAME, Sums

@@ -9,9 +9,9 @@ from pyproj import CRS, Transformer
 
 from pcfix.errors import InputError, SettingError
 from pcfix.io.cameras import read_cameras, read_tie_points
-from pcfix.io.cameras.colmap.writing import write_colmap
+from pcfix.io.cameras.colmap import write_colmap
 from pcfix.io.cameras.georeference import georeference
-from pcfix.io.cameras.opensfm.models import write_opensfm
+from pcfix.io.cameras.opensfm import write_opensfm
 from pcfix.io.cameras.table.sensor import write_table
 from pcfix.lens.imaging import project
 from pcfix.model import Lens, TiePoints, Views
