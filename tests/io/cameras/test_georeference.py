@@ -10,14 +10,16 @@ from pyproj import CRS, Transformer
 from scipy.spatial.transform import Rotation
 
 from pcfix.errors import InputError
-from pcfix.io.cameras.georeference import georeference
+from pcfix.io.cameras.georeference import adjusted_minus_gnss, georeference
 from pcfix.model import Cameras, GnssPositions
 from tests.utils.codes import refused
+from tests.utils.nightly import mostly_nightly
 from tests.utils.reprojection import bring_to
 
 pytestmark = pytest.mark.quick_but(
+    "test_differences_are_east_north_up",
+    "test_heights_that_cannot_be_compared_leave_the_plan",
     "test_a_map_with_north_first_is_read_east_first",
-    "test_bound_and_esri_wkt_are_the_crs_they_hold",
     "test_heights",
     "test_local_cloud",
     "test_local_frame_by_the_user",
@@ -89,18 +91,6 @@ def test_a_map_with_north_first_is_read_east_first(code):
     here = f"+proj=tmerc +lat_0={lat} +lon_0={lon} +ellps={ellipsoid} +type=crs"
     back = bring_to(cameras([x, y, 50.0], code), here)
     assert np.hypot(*back.centres[0, :2]) < 1e-2
-
-
-def test_bound_and_esri_wkt_are_the_crs_they_hold():
-    bound = CRS(UTM30).to_wkt("WKT1_GDAL").replace(
-        'AUTHORITY["EPSG","6258"]', 'TOWGS84[0,0,0,0,0,0,0],AUTHORITY["EPSG","6258"]'
-    )  # fmt: skip
-    assert CRS(bound).is_bound
-    for text in (bound, CRS(UTM30).to_wkt("WKT1_ESRI"), "+proj=utm +zone=30 +ellps=GRS80"):
-        found = bring_to(cameras(VALENCIA, text, NADIR[None]), UTM30)
-        assert found.centres[0].tolist() == VALENCIA
-        assert found.rotations[0].tolist() == NADIR.tolist()
-        assert found.notes == ()
 
 
 def test_an_offset_comes_before_all_else():
@@ -276,7 +266,7 @@ with rasterio.open(folder + "/es_ign_egm08-rednap.tif", "w", driver="GTiff", cou
     out.update_tags(TYPE="VERTICAL_OFFSET_GEOGRAPHIC_TO_VERTICAL", AREA_OR_POINT="Point")
     out.set_band_description(1, "geoid_undulation")
 pyproj.datadir.append_data_dir(folder)
-from pcfix.io.cameras.georeference import georeference
+from pcfix.io.cameras.georeference import adjusted_minus_gnss, georeference
 from pcfix.model import Cameras
 ecef = [[float(w) for w in sys.argv[2:5]]]
 read = Cameras(("a",), np.array(ecef), np.eye(3)[None], crs="EPSG:4936",
@@ -392,3 +382,90 @@ def test_without_the_clouds_crs():
 def test_offset_refused(at, crs, offset):
     with refused("cameras.offset"):
         bring_to(cameras(at, crs), UTM30, offset_m=offset)
+
+
+# ---- adjusted centres minus GNSS positions ----
+
+LON, LAT, H = 139.5405, 35.7380, 130.0
+ENU_M = np.array([[1.5, -2.0, 0.5], [0.0, 0.25, -3.0], [np.nan] * 3])
+
+
+def block(crs, gnss_crs, enu_m=ENU_M, height=H, **more):
+    """Return cameras in a CRS and GNSS positions that differ from them by ENU_M."""
+    to_ecef = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
+    axes = east_north_up(LON, LAT)
+    origin = np.array(to_ecef.transform(LON, LAT, height))
+    adjusted = origin + np.array([[0.0, 0, 0], [5.0, 8.0, 1.0], [9.0, -4.0, 0.0]]) @ axes
+    measured = adjusted - enu_m @ axes
+
+    def there(ecef, crs):
+        if crs.startswith("ENU"):
+            return (ecef - origin) @ axes.T
+        target = CRS(crs)
+        target = target if len(target.axis_info) == 3 else target.to_3d()
+        step = Transformer.from_crs("EPSG:4978", target, always_xy=True)
+        return np.column_stack(step.transform(*ecef.T))
+
+    gnss = GnssPositions(there(measured, gnss_crs), np.full((3, 3), np.nan), gnss_crs)
+    labels = ("a", "b", "c")
+    return Cameras(labels, there(adjusted, crs), crs=crs, gnss=gnss, **more)
+
+
+ENU = f"ENU:{LAT},{LON},{H}"
+
+
+@pytest.mark.parametrize("gnss", ["EPSG:4326", "EPSG:4979", "EPSG:4978", "EPSG:32654"])
+@pytest.mark.parametrize("crs", mostly_nightly(["EPSG:4978", "EPSG:4979", "EPSG:4326", ENU], ENU))
+def test_differences_are_east_north_up(crs, gnss):
+    found = adjusted_minus_gnss(block(crs, gnss))
+    assert found.enu_m == pytest.approx(ENU_M, abs=2e-4, nan_ok=True)
+    assert found.reason == ""
+
+
+def test_in_the_axes_of_a_map():
+    read = block("EPSG:4978", "EPSG:4326", project_crs="EPSG:32654")
+    found = adjusted_minus_gnss(bring_to(read, "EPSG:32654"))
+    gamma = np.arctan(np.tan(np.radians(LON - 141.0)) * np.sin(np.radians(LAT)))
+    east, north = ENU_M[:2, :2].T
+    turned = np.column_stack(
+        [east * np.cos(gamma) - north * np.sin(gamma), east * np.sin(gamma) + north * np.cos(gamma)]
+    )
+    assert found.enu_m[:2, :2] == pytest.approx(turned, abs=2e-3)  # scale 0.9997 of 3 m
+    assert found.enu_m[:2, 2] == pytest.approx(ENU_M[:2, 2], abs=1e-4)
+    assert np.isnan(found.enu_m[2]).all()
+
+
+@pytest.mark.parametrize(
+    ("crs", "gnss_crs", "reason"),
+    [
+        ("EPSG:4978", "EPSG:4326+5773", "without the grid us_nga_egm96_15.tif"),
+        ("EPSG:32654+5773", "EPSG:4979", "without the grid us_nga_egm96_15.tif"),
+        ("EPSG:32654+5773", "EPSG:4326", "the CRS of the GNSS names no vertical datum"),
+        ("EPSG:32654", "EPSG:4326+5773", "the CRS of the cameras names no vertical datum"),
+    ],
+)
+def test_heights_that_cannot_be_compared_leave_the_plan(crs, gnss_crs, reason):
+    flat = [text.partition("+")[0] for text in (crs, gnss_crs)]
+    as_metres = block(flat[0], flat[1])
+    read = Cameras(
+        as_metres.labels,
+        as_metres.centres,
+        crs=crs,
+        gnss=GnssPositions(as_metres.gnss.xyz, as_metres.gnss.sigma_m, gnss_crs),
+    )
+    found = adjusted_minus_gnss(read, "a.xml")
+    assert found.reason.startswith("a.xml: ")
+    assert reason in found.reason
+    assert found.reason.endswith("only plan is compared.")
+    assert "--cameras-crs" not in found.reason
+    assert np.isnan(found.enu_m[:, 2]).all()
+    lengths = np.hypot(*found.enu_m[:2, :2].T)
+    assert lengths == pytest.approx(np.hypot(*ENU_M[:2, :2].T), rel=5e-4)
+
+
+@pytest.mark.parametrize("crs", [None, "local"])
+def test_a_local_block_cannot_be_compared(crs):
+    gnss = GnssPositions(np.array([[LON, LAT, H]]), np.full((1, 3), np.nan), "EPSG:4326")
+    found = adjusted_minus_gnss(Cameras(("a",), np.zeros((1, 3)), crs=crs, gnss=gnss), "a.xml")
+    assert np.isnan(found.enu_m).all()
+    assert "they are not compared" in found.reason

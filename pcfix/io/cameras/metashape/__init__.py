@@ -18,7 +18,7 @@ corner of the image and the id of the track. A project of one file has them besi
 Markers stand in the document of the frame, as ``location`` with x and y; only the pinned ones were
 measured, the others Metashape computed from the poses. Where the GNSS put the cameras is their
 ``reference``, in the CRS of the cameras or of the chunk. The formulas of a calibration stand in
-`sensors`.
+`block`.
 
 References: "Agisoft Metashape User Manual, Professional Edition", appendix "Camera models";
 "Metashape Python Reference", Chunk.transform, Sensor.location, CoordinateSystem.geoccs;
@@ -40,9 +40,8 @@ from pcfix.errors import PcfixWarning
 from pcfix.io.cameras.checks import damaged, note, number, numbers, reading, text_of
 from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.metashape import documents
-from pcfix.io.cameras.metashape.block import Block, read_block
+from pcfix.io.cameras.metashape.block import Block, name_of, read_block, read_calibration
 from pcfix.io.cameras.metashape.documents import Chunk, Document, open_archive, recognises, unpacked
-from pcfix.io.cameras.metashape.sensors import name_of, read_calibration
 from pcfix.io.cameras.tracks import Seen, no_tie_points
 from pcfix.io.cameras.tracks import tie_points as gathered
 from pcfix.io.crs import is_local, parse_crs
