@@ -70,7 +70,7 @@ def recognises(source: Source) -> bool:
 
 def read(source: Source) -> Cameras:
     """Read poses and lenses, in the CRS of the block."""
-    return _read_block(source.path).cameras
+    return _read_block(source.path)[0]
 
 
 def _read_bytes(path: Path) -> bytes:
@@ -100,20 +100,12 @@ class Photo(NamedTuple):
     prior: tuple[str, FloatArray] | None
 
 
-class Block(NamedTuple):
-    """All photos of a document that belong together.
+def _read_block(path: Path) -> tuple[Cameras, list[Photo], list[tuple[int, str, bytes]]]:
+    """Read all photos of a document, and the texts of its tie points.
 
-    `tie_points` are the texts of the tie points, with the number and the SRS id of their block:
-    a tree of elements for millions of measurements would take minutes.
+    The texts have the number and the SRS id of their block: a tree of elements for millions of
+    measurements would take minutes.
     """
-
-    cameras: Cameras
-    photos: list[Photo]
-    tie_points: list[tuple[int, str, bytes]]
-
-
-def _read_block(path: Path) -> Block:
-    """Read all photos of a document."""
     data = _read_bytes(path)
     root = read_xml(path, io.BytesIO(TIE_POINTS.sub(b"", data)))
     posed: list[Photo] = []
@@ -170,7 +162,7 @@ def _read_block(path: Path) -> Block:
     for match in TIE_POINTS.finditer(data):
         i = data.count(b"<Block>", 0, match.start()) - 1
         texts.append((i, text_of(blocks[i], "SRSId"), match[1]))
-    return Block(cameras, photos, texts)
+    return cameras, photos, texts
 
 
 def _photo(path: Path, block: int, element: Element, group: Photogroup, srs: str) -> Photo:
@@ -351,11 +343,11 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     from defusedxml.ElementTree import iterparse  # one by one: no tree holds millions of them
 
     path = source.path
-    block = _read_block(path)
-    row_of = {photo.key: row for row, photo in enumerate(block.photos)}
+    _, photos, texts = _read_block(path)
+    row_of = {photo.key: row for row, photo in enumerate(photos)}
     xyz: list[list[float]] = []
     point, camera, uv = [], [], []
-    for i, srs_of_block, text in block.tie_points:
+    for i, srs_of_block, text in texts:
         where, inside = _inside(path, text)
         head = SRS_OF_ALL.search(inside[: inside.find(b"<TiePoint>")])
         srs_of_all = srs_of_block if head is None else head[1].decode()
@@ -374,9 +366,9 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
                 for row, mark in seen:
                     point.append(len(xyz))
                     camera.append(row)
-                    uv.append(block.photos[row].group.place(mark))
+                    uv.append(photos[row].group.place(mark))
                 place, srs = element.find("Position"), text_of(element, "SRSId") or srs_of_all
-                known = place is not None and srs == block.photos[0].srs
+                known = place is not None and srs == photos[0].srs
                 axes = [text_of(place, a) for a in "xyz"] if place is not None and known else ()
                 xyz.append([float(text) for text in axes] or [math.nan] * 3)
                 element.clear()

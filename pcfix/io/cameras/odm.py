@@ -33,7 +33,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.errors import PcfixWarning, bad_file
+from pcfix.errors import bad_file
 from pcfix.io.cameras import checks, opensfm
 from pcfix.io.cameras.checks import damaged, load_json, note, triple
 from pcfix.io.cameras.formats import Source
@@ -282,7 +282,28 @@ def _read_shots(project: Project, path: Path) -> Cameras:
         centres = np.array([triple(shot["translation"]) for shot in shots.values()])
         place = (next(iter(shots.values()))["geometry"] or {}).get("coordinates")
     labels, crs = tuple(shots), project.crs()
-    lenses, notes = _lenses(project, path, shots)
+    # Return the lens of each shot, and a note where cameras.json does not have it
+    beside, known = project.find("cameras.json"), {}
+    if beside is not None:
+        with checks.reading(beside):
+            entries = load_json(beside).items()
+            known = {k: lens(beside, k, entry) for k, entry in entries if not is_panorama(entry)}
+    lenses, plain = [], 0
+    for shot in shots.values():
+        width, height, focal = (float(shot[key]) for key in ("width", "height", "focal"))
+        scale = max(width, height)
+        alike = [
+            one
+            for one in known.values()
+            if (one.width, one.height) == (width, height)
+            and abs((one.focal + one.b1) / scale - focal) < SAME_FOCAL
+        ]
+        found = known.get(str(shot.get("camera"))) or (alike[0] if len(alike) == 1 else None)
+        plain += found is None
+        lenses.append(found or Lens(focal * scale, width, height, width / 2.0, height / 2.0))
+    sentence = f"cameras.json has no camera of {plain} images; they get a lens without distortion."
+    said = note(path, "cameras.no_distortion", sentence, images=plain)
+    lenses, notes = tuple(lenses), (said,) if plain else ()
     gnss, listed = read_images(project.find("images.json"), labels)
     if crs is None and place is not None:  # a project without GNSS has made-up coordinates
         lon, lat, _ = triple(place).tolist()
@@ -334,33 +355,3 @@ def _shots(path: Path) -> dict[str, dict[str, Any]]:
     if not shots or len(shots) < len(features):
         raise damaged(path, f"{len(features)} features have {len(shots)} different filenames")
     return shots
-
-
-def _lenses(
-    project: Project, path: Path, shots: dict[str, dict[str, Any]]
-) -> tuple[tuple[Lens, ...], tuple[PcfixWarning, ...]]:
-    """Return the lens of each shot, and a note where cameras.json does not have it.
-
-    It is that of the camera that the shot names, or else of the only one that is alike.
-    """
-    beside, known = project.find("cameras.json"), {}
-    if beside is not None:
-        with checks.reading(beside):
-            entries = load_json(beside).items()
-            known = {k: lens(beside, k, entry) for k, entry in entries if not is_panorama(entry)}
-    lenses, plain = [], 0
-    for shot in shots.values():
-        width, height, focal = (float(shot[key]) for key in ("width", "height", "focal"))
-        scale = max(width, height)
-        alike = [
-            one
-            for one in known.values()
-            if (one.width, one.height) == (width, height)
-            and abs((one.focal + one.b1) / scale - focal) < SAME_FOCAL
-        ]
-        found = known.get(str(shot.get("camera"))) or (alike[0] if len(alike) == 1 else None)
-        plain += found is None
-        lenses.append(found or Lens(focal * scale, width, height, width / 2.0, height / 2.0))
-    sentence = f"cameras.json has no camera of {plain} images; they get a lens without distortion."
-    said = note(path, "cameras.no_distortion", sentence, images=plain)
-    return tuple(lenses), (said,) if plain else ()

@@ -29,7 +29,6 @@ from pcfix.io.files import check_input
 from pcfix.io.views.lists import (
     COLMAP_LIST,
     ImageOrder,
-    RawList,
     ViewList,
     entries,
     fitted,
@@ -38,7 +37,7 @@ from pcfix.io.views.lists import (
     tracks_as_list,
 )
 from pcfix.lens.frames import beside_frames
-from pcfix.model import Cameras, FloatArray, IntArray, TiePoints, ViewKind, Views
+from pcfix.model import Cameras, FloatArray, IntArray, TiePoints, Views
 from pcfix.options.declare import File
 from pcfix.sums import LEAST, SAME, Sums
 
@@ -66,8 +65,9 @@ def read_views(path: File, cameras: Cameras, *, to_cloud: Transformation | None 
     to_cloud : callable, optional
         Takes positions, shape (n, 3), from the list's frame to the cloud's. Default: the same.
     """
-    raw = read_list(check_input(path))
-    return _fitted(raw, image_orders(raw, cameras), "depth-maps", cameras, to_cloud)
+    views = read_list(check_input(path))
+    orders = image_orders(views, cameras)
+    return _fitted(replace(views, orders=orders), cameras, to_cloud)
 
 
 def track_views(
@@ -78,30 +78,26 @@ def track_views(
     The tie points count the images as `cameras` does; for the others see `read_views`.
     """
     order = ImageOrder("the cameras of the tie points", np.arange(len(cameras), dtype=np.int32))
-    return _fitted(tracks_as_list(path, tie_points), (order,), "tracks", cameras, to_cloud)
+    views = replace(tracks_as_list(path, tie_points), orders=(order,), kind="tracks")
+    return _fitted(views, cameras, to_cloud)
 
 
-def _fitted(
-    raw: RawList,
-    orders: tuple[ImageOrder, ...],
-    kind: ViewKind,
-    cameras: Cameras,
-    to_cloud: Transformation | None,
-) -> ViewList:
+def _fitted(views: ViewList, cameras: Cameras, to_cloud: Transformation | None) -> ViewList:
     """Return a list whose cameras see its points, if it has positions to test that."""
-    if raw.xyz is not None:
-        xyz = raw.xyz if to_cloud is None else to_cloud(raw.xyz)
-        placed = replace(raw, xyz=np.ascontiguousarray(xyz, np.float64))
-        views = ViewList(placed, orders, None, spacing_m(xyz), _SPACINGS[kind], kind)
-        try:
-            return fitted(views, cameras, xyz, np.arange(len(views)))
-        except InputError:
-            if raw.what != COLMAP_LIST:
-                raise
-        sentence = f"{raw.path}: the PLY file beside it is in another frame and is not used."
-        note = PcfixWarning("views.other_frame", sentence, path=raw.path)
-        raw = replace(raw, xyz=None, notes=(*raw.notes, note))
-    return ViewList(raw, orders, None, None, _SPACINGS[kind], kind)
+    views = replace(views, default_spacings=_SPACINGS[views.kind])
+    if views.xyz is None:
+        return views
+    xyz = views.xyz if to_cloud is None else to_cloud(views.xyz)
+    placed = np.ascontiguousarray(xyz, np.float64)
+    try:
+        placed_views = replace(views, xyz=placed, spacing_m=spacing_m(xyz))
+        return fitted(placed_views, cameras, xyz, np.arange(len(views)))
+    except InputError:
+        if views.what != COLMAP_LIST:
+            raise
+    sentence = f"{views.path}: the PLY file beside it is in another frame and is not used."
+    note = PcfixWarning("views.other_frame", sentence, path=views.path)
+    return replace(views, xyz=None, notes=(*views.notes, note))
 
 
 _QUERIES = 250_000
@@ -128,24 +124,23 @@ class ViewMatch:
         """
         self.view_list, self._cameras = views, cameras
         self._tree: Any = None  # a cKDTree of the list's positions, when one is needed
-        raw = views.raw
-        source, weights = f"{raw.what} {raw.path}", raw.weight is not None
-        self.report = ViewReport(source, len(views), notes=list(raw.notes), weights=weights)
-        if raw.xyz is not None:
+        source, weights = f"{views.what} {views.path}", views.weight is not None
+        self.report = ViewReport(source, len(views), notes=list(views.notes), weights=weights)
+        if views.xyz is not None:
             # a match may be off by the rounding of both files, or by a share of the spacing
             spacing_m = views.spacing_m or 0.0
-            rounding_m = _ROUNDING * (step_m / 2 + raw.resolution_m)
+            rounding_m = _ROUNDING * (step_m / 2 + views.resolution_m)
             self.report.tolerance_m = max(rounding_m, views.default_spacings * spacing_m)
             self._same_m = max(rounding_m, _SAME * spacing_m)
             if rounding_m > spacing_m / 2:
-                sentence = f"{raw.path}: positions are rounded to {rounding_m:.2g} m, for points"
+                sentence = f"{views.path}: positions are rounded to {rounding_m:.2g} m, for points"
                 sentence += f" {spacing_m:.2g} m apart. Points may get lists of their neighbours."
                 values = {"rounding_m": rounding_m, "spacing_m": spacing_m}
                 self.report.notes.append(PcfixWarning("views.rounding", sentence, **values))
         elif points != len(views):
             sentence = f"has {len(views):,} points, the cloud {points}. Put its PLY file beside it."
             values = {"listed": len(views), "points": points}
-            raise bad_file(raw.path, "views.other_points", sentence, **values)
+            raise bad_file(views.path, "views.other_points", sentence, **values)
         self._note_order()
 
     def _note_order(self) -> None:
@@ -161,13 +156,13 @@ class ViewMatch:
         `first_row` on. A list that is matched by row number is refused if its cameras do not see
         them.
         """
-        if self.view_list.raw.xyz is None:
+        if self.view_list.xyz is None:
             row = np.arange(first_row, first_row + len(xyz))
             self.view_list = fitted(self.view_list, self._cameras, xyz, row)
             self._note_order()
             self.report.by_row += len(row)
         else:
-            row = self._rows(xyz, first_row, self.view_list.raw.xyz)
+            row = self._rows(xyz, first_row, self.view_list.xyz)
         views = self._given(row)
         apart = beside_frames(xyz, views, self._cameras)
         self.report.beside_entries += int(apart.sum())
@@ -222,11 +217,11 @@ class ViewMatch:
 
     def _given(self, row: IntArray) -> Views:
         """Turn the images of the given rows into cameras, without images that have no pose."""
-        raw = self.view_list.raw
+        views = self.view_list
         listed = np.flatnonzero(row >= 0)
-        ends, entry = entries(raw.start, row[listed])
-        camera = self.view_list.orders[0].camera[raw.image[entry]].astype(np.int64)
-        weight = None if raw.weight is None else raw.weight[entry].copy()
+        ends, entry = entries(views.start, row[listed])
+        camera = self.view_list.orders[0].camera[views.image[entry]].astype(np.int64)
+        weight = None if views.weight is None else views.weight[entry].copy()
         posed = camera >= 0
         if not posed.all():
             ends = np.concatenate([[0], np.cumsum(posed)])[ends]

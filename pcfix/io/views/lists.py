@@ -56,23 +56,6 @@ _REMEDY = "Give COLMAP's fused.ply.vis or OpenMVS's dense PLY, as the software w
 
 
 @dataclass(frozen=True, eq=False)
-class RawList:
-    """The lists of n points as a file has them."""
-
-    path: Path
-    what: str  # the kind of file
-    start: IntArray  # (n + 1,)
-    image: npt.NDArray[np.int32]  # (start[-1],), the file's number of the image
-    weight: npt.NDArray[np.float32] | None = None  # (start[-1],)
-    xyz: FloatArray | None = None  # (n, 3), frame of the file
-    resolution_m: float = 0.0  # how far off a position can be, from the type of its numbers
-    notes: tuple[PcfixWarning, ...] = ()
-
-    def __len__(self) -> int:
-        return len(self.start) - 1
-
-
-@dataclass(frozen=True, eq=False)
 class ImageOrder:
     """One meaning of the image numbers."""
 
@@ -89,18 +72,25 @@ class ViewList:
     if the cameras have no frames. A match by position may be off by `default_spacings`.
     """
 
-    raw: RawList  # with positions in the frame of the cameras
-    orders: tuple[ImageOrder, ...]  # possible meanings of a number; one, once geometry has decided
-    share_seen: float | None
-    spacing_m: float | None  # between neighbouring points, if there are positions
-    default_spacings: float
-    kind: ViewKind  # see `pcfix.model.Views`
+    path: Path
+    what: str  # the kind of file
+    start: IntArray  # (n + 1,)
+    image: npt.NDArray[np.int32]  # (start[-1],), the file's number of the image
+    weight: npt.NDArray[np.float32] | None = None  # (start[-1],)
+    xyz: FloatArray | None = None  # (n, 3), frame of the file, then of the cameras
+    resolution_m: float = 0.0  # how far off a position can be, from the type of its numbers
+    notes: tuple[PcfixWarning, ...] = ()
+    orders: tuple[ImageOrder, ...] = ()  # possible meanings of a number, until geometry decides
+    share_seen: float | None = None
+    spacing_m: float | None = None  # between neighbouring points, if there are positions
+    default_spacings: float = 0.0
+    kind: ViewKind = "depth-maps"  # see `pcfix.model.Views`
 
     def __len__(self) -> int:
-        return len(self.raw)
+        return len(self.start) - 1
 
 
-def read_list(path: Path) -> RawList:
+def read_list(path: Path) -> ViewList:
     """Read the view list of a dense cloud."""
     with path.open("rb") as stream:
         head = stream.read(4)
@@ -113,7 +103,7 @@ def read_list(path: Path) -> RawList:
     return _colmap(beside) if has_lists is None and beside.is_file() else _openmvs(path)
 
 
-def _colmap(path: Path) -> RawList:
+def _colmap(path: Path) -> ViewList:
     """Read ``fused.ply.vis``, and the positions from the PLY file beside it, if there is one."""
     size = path.stat().st_size
     with path.open("rb") as stream:
@@ -129,7 +119,7 @@ def _colmap(path: Path) -> RawList:
         values = {"points": count, "complete": complete}
         raise bad_file(path, "views.damaged", f"{sentence} {_REMEDY}", **values)
     start, number = joined(words, first[:, 0], length[:, 0], 1)
-    raw = RawList(path, COLMAP_LIST, start, _checked_images(path, number))
+    raw = ViewList(path, COLMAP_LIST, start, _checked_images(path, number))
     bare = path.with_suffix("")
     ply = bare if bare.suffix.lower() == ".ply" else bare.with_suffix(".ply")
     if not ply.is_file():
@@ -141,14 +131,14 @@ def _colmap(path: Path) -> RawList:
     return replace(raw, notes=(PcfixWarning("views.other_points", sentence, path=ply),))
 
 
-def _openmvs(path: Path) -> RawList:
+def _openmvs(path: Path) -> ViewList:
     """Read positions, view lists and, if there are any, weights."""
     header = read_header(path)
     if header.item(_IMAGES, is_list=True) is None:
         raise bad_file(path, "views.no_lists", f"its points have no {_IMAGES}. {_REMEDY}")
     vertices = Records(path)
     start, number = vertices.lists(_IMAGES)
-    raw = RawList(path, "OpenMVS point cloud", start, _checked_images(path, number))
+    raw = ViewList(path, "OpenMVS point cloud", start, _checked_images(path, number))
     raw = replace(raw, **_positions(vertices))
     if header.item(_WEIGHTS, is_list=True) is None:
         return raw
@@ -188,7 +178,7 @@ def _checked_images(path: Path, number: npt.NDArray[Any]) -> npt.NDArray[np.int3
     return image
 
 
-def tracks_as_list(path: Path, tie_points: TiePoints) -> RawList:
+def tracks_as_list(path: Path, tie_points: TiePoints) -> ViewList:
     """Return the tie points that have a position, each camera once, sorted."""
     rows = np.flatnonzero(np.isfinite(tie_points.xyz).all(axis=1))
     if rows.size == 0:
@@ -200,7 +190,7 @@ def tracks_as_list(path: Path, tie_points: TiePoints) -> RawList:
     counts = np.bincount(pairs[:, 0], minlength=len(rows))
     xyz = np.ascontiguousarray(tie_points.xyz[rows], np.float64)
     start, camera = np.concatenate([[0], np.cumsum(counts)]), pairs[:, 1].astype(np.int32)
-    return RawList(path, "tie points", start, camera, None, xyz)
+    return ViewList(path, "tie points", start, camera, None, xyz)
 
 
 LEAST_SHARE = 0.95
@@ -219,7 +209,7 @@ _PLACES = (".", "sparse", "sparse/0")
 _FRAME_HEAD, _DATA = struct.Struct("<II7dI"), struct.Struct("<iIQ")
 
 
-def image_orders(raw: RawList, cameras: Cameras) -> tuple[ImageOrder, ...]:
+def image_orders(raw: ViewList, cameras: Cameras) -> tuple[ImageOrder, ...]:
     """Return the orders that the image numbers may follow, the most likely first."""
     found = []
     for place in _PLACES:
@@ -291,8 +281,8 @@ def fitted(views: ViewList, cameras: Cameras, xyz: FloatArray, rows: IntArray) -
     if cameras.rotations is None or cameras.lenses is None:
         return replace(views, orders=views.orders[:1])
     step = max(1, len(rows) // SAMPLE_POINTS)
-    ends, entry = entries(views.raw.start, rows[::step])
-    image, seen_xyz = views.raw.image[entry], np.repeat(xyz[::step], np.diff(ends), axis=0)
+    ends, entry = entries(views.start, rows[::step])
+    image, seen_xyz = views.image[entry], np.repeat(xyz[::step], np.diff(ends), axis=0)
     shares = [share_seen(cameras, order.camera[image], seen_xyz) for order in views.orders]
     known = [(share, i) for i, share in enumerate(shares) if share is not None]
     if not known:
@@ -301,7 +291,7 @@ def fitted(views: ViewList, cameras: Cameras, xyz: FloatArray, rows: IntArray) -
     if share < LEAST_SHARE:
         sentence = f"only {100 * share:.0f} % of the listed cameras have their point in the frame."
         sentence += " Put the sparse model beside the list, or give its offset (--cameras-offset)."
-        raise bad_file(views.raw.path, "views.other_images", sentence, share=share)
+        raise bad_file(views.path, "views.other_images", sentence, share=share)
     others = () if len(image) >= _ENOUGH else views.orders[:best] + views.orders[best + 1 :]
     return replace(views, orders=(views.orders[best], *others), share_seen=share)
 

@@ -24,7 +24,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path, PurePath, PureWindowsPath
-from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -76,38 +75,30 @@ def read(source: Source) -> Cameras:
         remedy = f"Give the params folder of the project; {GEOGRAPHIC} alone does not suffice"
         raise checks.missing(source.path.with_name(PARAMETERS), remedy)
     calibrations = tables.read_calibrations(files["calibration"]) if "calibration" in files else []
-    lenses: tuple[Lens, ...] | None = None
     if "parameters" in files:
         images = tables.read_parameters(files["parameters"])
-        poses = _poses(files, images)
-        known: dict[object, Lens | None] = {}
-        keys = []
-        for image in (images[row] for row in poses.rows):
-            inner = {k: v for k, v in image.fields.items() if k not in ("centre", "rotation")}
-            keys.append((image.width, image.height, *((k, v.tobytes()) for k, v in inner.items())))
-            if keys[-1] not in known:
-                known[keys[-1]] = tables.lens_of_image(image, calibrations)
-        found = [lens for key in keys if (lens := known[key]) is not None]
-        lenses = tuple(found) if len(found) == len(keys) else None
+        rows, centres, rotations, unposed, notes = _poses(files, images)
+        labels = [images[row].label for row in rows]
+        own = [tables.lens_of_image(images[row], calibrations) for row in rows]
     else:
         labels, centres, rotations = tables.read_external(files["external"])
         lens = tables.lens_of_calibration(calibrations[0]) if len(calibrations) == 1 else None
-        lenses = None if lens is None else (lens,) * len(labels)
+        own, unposed = [lens] * len(labels), []
         why = f"there is no {PARAMETERS} beside it"
-        notes = () if lenses else (checks.without_lens(files["external"], why),)
-        poses = Poses(labels, centres, rotations, [], [], notes)
-    gnss, others = _priors(files["project"], poses.labels) if "project" in files else (None, [])
+        notes = () if lens else (checks.without_lens(files["external"], why),)
+    same: dict[Lens, Lens] = {}  # images of a camera share its lens
+    lenses = tuple(same.setdefault(lens, lens) for lens in own if lens is not None)
+    gnss, others = _priors(files["project"], labels) if "project" in files else (None, [])
     wkt = read_text(files["wkt"]).strip() if "wkt" in files else ""
-    unposed = dict.fromkeys([*poses.unposed, *others])
     return Cameras(
-        labels=tuple(poses.labels),
-        centres=poses.centres,
-        rotations=poses.rotations,
-        lenses=lenses,
+        labels=tuple(labels),
+        centres=centres,
+        rotations=rotations,
+        lenses=lenses if len(lenses) == len(labels) else None,
         crs=checks.crs(files["wkt"], wkt) if wkt else None,
-        notes=(*poses.notes, *checks.repeated(source.path, poses.labels)),
+        notes=(*notes, *checks.repeated(source.path, labels)),
         gnss=gnss,
-        unposed=tuple(name for name in unposed if name not in set(poses.labels)),
+        unposed=tuple(n for n in dict.fromkeys([*unposed, *others]) if n not in set(labels)),
         source="Pix4D",
     )
 
@@ -167,19 +158,13 @@ def _prefix(name: str, *endings: str) -> str | None:
     return None
 
 
-class Poses(NamedTuple):
-    """The posed images: labels, centres, rotations, and their rows in the camera parameters."""
+def _poses(
+    files: Files, images: list[tables.Image]
+) -> tuple[list[int], FloatArray, FloatArray, list[str], tuple[PcfixWarning, ...]]:
+    """Return the poses of the two tables; the absolute one is believed.
 
-    labels: list[str]
-    centres: FloatArray
-    rotations: FloatArray
-    rows: list[int]
-    unposed: list[str]
-    notes: tuple[PcfixWarning, ...]
-
-
-def _poses(files: Files, images: list[tables.Image]) -> Poses:
-    """Return the poses of the two tables; the absolute one is believed."""
+    They are rows of the images with a pose, centres, rotations, names without one, and notes.
+    """
     labels = [image.label for image in images]
     turns = np.array([image.fields["rotation"] for image in images])
     rotations = checks.rotations(files["parameters"], labels, turns)
@@ -211,10 +196,9 @@ def _poses(files: Files, images: list[tables.Image]) -> Poses:
             centres, notes = np.full_like(centres, np.nan), (differ,)
         centres[both], rotations[both] = there[rows], turned[rows]
     known = np.isfinite(centres).all(axis=1)
-    kept = np.flatnonzero(known).tolist()
     unposed = [labels[i] for i in np.flatnonzero(~known)] + sorted(set(names) - set(labels))
-    posed = [labels[i] for i in kept]
-    return Poses(posed, centres[known], rotations[known], kept, unposed, notes)
+    kept = np.flatnonzero(known).tolist()
+    return kept, centres[known], rotations[known], unposed, notes
 
 
 def _absolute(
