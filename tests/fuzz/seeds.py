@@ -163,6 +163,10 @@ def blocks_exchange(folder: Path) -> Path:
     return made.write(folder, inside)
 
 
+def bundle_file(folder: Path) -> Path:
+    return nvm.write_bundle(folder, nvm.bundle()[0])
+
+
 def nvm_file(folder: Path) -> Path:
     return nvm.write(
         folder, nvm.model(nvm.camera_line("a.jpg"), points=nvm.point_lines(nvm.measured())[:8])

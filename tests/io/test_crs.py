@@ -17,6 +17,7 @@ from pcfix.io.crs import (
     transformation,
 )
 from tests.utils.codes import refused
+from tests.utils.pose_files.block import geocentric
 
 pytestmark = pytest.mark.quick_but("test_unknown")
 
@@ -146,15 +147,7 @@ def test_geographic_3d(geocentric, geographic):
 
 def test_topocentric():
     lat, lon, h = 52.519, 13.4004, 34.0
-    a, f = 6378137.0, 1 / 298.257223563
-    phi, lam = np.radians([lat, lon])
-    e2 = f * (2 - f)
-    n = a / np.sqrt(1 - e2 * np.sin(phi) ** 2)
-    origin = [
-        (n + h) * np.cos(phi) * np.cos(lam),
-        (n + h) * np.cos(phi) * np.sin(lam),
-        (n * (1 - e2) + h) * np.sin(phi),
-    ]
+    origin = geocentric(lon, lat, h, 6378137.0, 1 / 298.257223563)
     found = Topocentric.from_text(f"ENU:{lat},{lon},{h}", "a").to_geocentric(
         np.array([[0.0, 0, 0], [100.0, -50.0, 20.0]])
     )

@@ -14,6 +14,8 @@ from pcfix.io.cameras.georeference import adjusted_minus_gnss, georeference
 from pcfix.model import Cameras, GnssPositions
 from tests.utils.codes import refused
 from tests.utils.nightly import mostly_nightly
+from tests.utils.pose_files import block
+from tests.utils.pose_files.block import axes_at as east_north_up
 from tests.utils.reprojection import bring_to
 
 pytestmark = pytest.mark.quick_but(
@@ -43,31 +45,8 @@ def cameras(centres, crs, rotations=None, **more):
     return Cameras(labels, centres, rotations, crs=crs, **more)
 
 
-def geocentric(lon, lat, h, a=6378137.0, f=1 / 298.257222101):
-    """Return geocentric coordinates; the textbook formula."""
-    lam, phi = np.radians(lon), np.radians(lat)
-    e2 = f * (2 - f)
-    n = a / np.sqrt(1 - e2 * np.sin(phi) ** 2)
-    return np.stack(
-        [
-            (n + h) * np.cos(phi) * np.cos(lam),
-            (n + h) * np.cos(phi) * np.sin(lam),
-            (n * (1 - e2) + h) * np.sin(phi),
-        ],
-        axis=-1,
-    )
-
-
-def east_north_up(lon, lat):
-    """Return east, north and up in geocentric axes, one a row."""
-    lam, phi = np.radians([lon, lat])
-    return np.array(
-        [
-            [-np.sin(lam), np.cos(lam), 0],
-            [-np.sin(phi) * np.cos(lam), -np.sin(phi) * np.sin(lam), np.cos(phi)],
-            [np.cos(phi) * np.cos(lam), np.cos(phi) * np.sin(lam), np.sin(phi)],
-        ]
-    )
+def geocentric(lon, lat, h, f=1 / 298.257222101):
+    return block.geocentric(lon, lat, h, 6378137.0, f)
 
 
 def image_px(rotation, centre, points):
@@ -390,7 +369,7 @@ LON, LAT, H = 139.5405, 35.7380, 130.0
 ENU_M = np.array([[1.5, -2.0, 0.5], [0.0, 0.25, -3.0], [np.nan] * 3])
 
 
-def block(crs, gnss_crs, enu_m=ENU_M, height=H, **more):
+def moved_block(crs, gnss_crs, enu_m=ENU_M, height=H, **more):
     """Return cameras in a CRS and GNSS positions that differ from them by ENU_M."""
     to_ecef = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
     axes = east_north_up(LON, LAT)
@@ -417,13 +396,13 @@ ENU = f"ENU:{LAT},{LON},{H}"
 @pytest.mark.parametrize("gnss", ["EPSG:4326", "EPSG:4979", "EPSG:4978", "EPSG:32654"])
 @pytest.mark.parametrize("crs", mostly_nightly(["EPSG:4978", "EPSG:4979", "EPSG:4326", ENU], ENU))
 def test_differences_are_east_north_up(crs, gnss):
-    found = adjusted_minus_gnss(block(crs, gnss))
+    found = adjusted_minus_gnss(moved_block(crs, gnss))
     assert found.enu_m == pytest.approx(ENU_M, abs=2e-4, nan_ok=True)
     assert found.reason == ""
 
 
 def test_in_the_axes_of_a_map():
-    read = block("EPSG:4978", "EPSG:4326", project_crs="EPSG:32654")
+    read = moved_block("EPSG:4978", "EPSG:4326", project_crs="EPSG:32654")
     found = adjusted_minus_gnss(bring_to(read, "EPSG:32654"))
     gamma = np.arctan(np.tan(np.radians(LON - 141.0)) * np.sin(np.radians(LAT)))
     east, north = ENU_M[:2, :2].T
@@ -446,7 +425,7 @@ def test_in_the_axes_of_a_map():
 )
 def test_heights_that_cannot_be_compared_leave_the_plan(crs, gnss_crs, reason):
     flat = [text.partition("+")[0] for text in (crs, gnss_crs)]
-    as_metres = block(flat[0], flat[1])
+    as_metres = moved_block(flat[0], flat[1])
     read = Cameras(
         as_metres.labels,
         as_metres.centres,
