@@ -286,8 +286,10 @@ def read_marks(path: Path) -> tuple[list[Mark], str | None]:
     if documents.recognises(Source(path)):
         return _from_metashape(path)
     lines = read_lines(path)
-    rows = _odm_rows(path, lines)
-    if rows is not None:
+    numbered = [(i, line.split()) for i, line in enumerate(lines, start=1) if line.strip()]
+    rows = [(i, fields) for i, fields in numbered[1:] if not fields[0].startswith("#")]
+    first = [number(field) for field in rows[0][1][:5]] if rows else []
+    if len(first) == 5 and np.isfinite([*first[:2], *first[3:]]).all():  # z may be NaN
         return _from_odm(path, rows)
     if not any(is_header(header.names) for header in headers(lines)):
         sentence = "is neither a table of marks nor OpenDroneMap's gcp_list.txt. Line 1 must name"
@@ -379,23 +381,11 @@ def _flags(
     return np.array([text in true for text in found])
 
 
-def _odm_rows(path: Path, lines: list[str]) -> list[tuple[int, list[str]]] | None:
-    """Return line number and fields of the rows of gcp_list.txt, None for other files."""
-    numbered = [(i, line.split()) for i, line in enumerate(lines, start=1) if line.strip()]
-    rows = [(i, fields) for i, fields in numbered[1:] if not fields[0].startswith("#")]
-    if not rows or len(rows[0][1]) < _LEAST_ODM - 1:
-        return None
-    first = [number(field) for field in rows[0][1][:5]]
-    if np.isnan([value for i, value in enumerate(first) if i != 2]).any():  # z may be NaN
-        return None
+def _from_odm(path: Path, rows: list[tuple[int, list[str]]]) -> tuple[list[Mark], str | None]:
     for i, fields in rows:
         if len(fields) < _LEAST_ODM:
             sentence = f"line {i} has {len(fields)} fields. Give x, y, z, u, v, image."
             raise bad_file(path, "gcps.fields", sentence, line=i)
-    return rows
-
-
-def _from_odm(path: Path, rows: list[tuple[int, list[str]]]) -> tuple[list[Mark], str | None]:
     values = np.array([[number(field) for field in fields[:5]] for _, fields in rows])
     for i, k in np.argwhere(~np.isfinite(values))[:1]:
         line, text = rows[i][0], rows[i][1][k]

@@ -227,7 +227,16 @@ def read_frames(path: File, every: int = 1) -> Frames:
     if not place.exists():
         raise bad_file(place, "frames.missing", "there is no such file.")
     if place.is_file():
-        found = _film(place, every)
+        cv2, count = photo_library("cv2"), 0
+        with _opened(place) as film:  # headers of videos may be wrong, so the frames are counted
+            rate = float(film.get(cv2.CAP_PROP_FPS))
+            while film.grab():
+                count += 1
+            columns = int(film.get(cv2.CAP_PROP_FRAME_WIDTH))
+            rows = int(film.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        names = tuple(f"{place.stem}_{every * number:05d}" for number in range(count // every))
+        interval_s = every / rate if 0.1 <= rate <= 10_000.0 else None
+        found = Frames(place, (), names, columns, rows, interval_s, every)
     else:
         paths = tuple(photographs_in(place)[::every])
         sizes = [size_of(one) for one in paths]
@@ -255,20 +264,6 @@ def _opened(path: Path) -> Iterator[Any]:
         yield film
     finally:
         film.release()
-
-
-def _film(path: Path, every: int) -> Frames:
-    """Count the frames by reading them, as the headers of videos may be wrong."""
-    cv2 = photo_library("cv2")
-    with _opened(path) as film:
-        rate = float(film.get(cv2.CAP_PROP_FPS))
-        count = 0
-        while film.grab():
-            count += 1
-        size = film.get(cv2.CAP_PROP_FRAME_WIDTH), film.get(cv2.CAP_PROP_FRAME_HEIGHT)
-    names = tuple(f"{path.stem}_{every * number:05d}" for number in range(count // every))
-    interval_s = every / rate if 0.1 <= rate <= 10_000.0 else None
-    return Frames(path, (), names, int(size[0]), int(size[1]), interval_s, every)
 
 
 def check_calm(path: File, frames: Frames, *, overwrite: bool) -> tuple[Path, Path]:

@@ -336,9 +336,7 @@ def _read(source: DatasetReader, name: str, near: FloatArray | None) -> _Part:
     if source.nodata is None and unknown:
         sentence = f"{name}: has no nodata value. {unknown:,} impossible heights are ignored."
         notes = (PcfixWarning("water.raster_nodata", sentence, count=unknown), *notes)
-    if unknown == heights.size:
-        sentence = "has no height near the cloud. Check its CRS and its nodata value."
-        raise bad_file(name, "water.raster_empty", sentence)
+    _check_known(heights, name)
     return _Part(heights, source.window_transform(window), notes)
 
 
@@ -357,6 +355,12 @@ def _metres(source: DatasetReader, name: str) -> tuple[float, Notes]:
         return factor, ()
     sentence = f"{name}: has no unit of heights; that of its CRS is assumed ({factor:.4f} m)."
     return factor, (PcfixWarning("water.raster_unit", sentence, unit_m=factor),)
+
+
+def _check_known(heights: FloatArray, name: str) -> None:
+    if not np.isfinite(heights).any():
+        sentence = "has no height near the cloud. Check its CRS and its nodata value."
+        raise bad_file(name, "water.raster_empty", sentence)
 
 
 def _check_size(cells: float, name: str) -> None:
@@ -388,6 +392,7 @@ def _resampled(
         y = top - (first + np.arange(len(strip)) + 0.5) * cell
         plan = np.column_stack([np.tile(x, len(y)), np.repeat(y, len(x)), np.zeros(strip.size)])
         strip[:] = _heights_at(part, from_cloud(plan), to_cloud).reshape(strip.shape)
+    _check_known(heights, names[0])
     return WaterRaster(heights, float(left), float(top), (float(cell), float(cell)), names[1])
 
 
@@ -405,7 +410,7 @@ def _extent(part: _Part, to_cloud: Points, name: str) -> tuple[float, Bounds]:
         raise bad_file(name, "water.raster_place", sentence)
     sides = np.hypot(*(placed[-2:] - placed[-3])[:, :2].T)
     (west, south, _), (east, north, _) = placed.min(axis=0), placed.max(axis=0)
-    return float(sides.min()), (float(west), float(south), float(east), float(north))
+    return sides.min(), (float(west), float(south), float(east), float(north))
 
 
 def _heights_at(part: _Part, places: FloatArray, to_cloud: Points) -> FloatArray:

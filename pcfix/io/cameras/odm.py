@@ -282,7 +282,7 @@ def _read_shots(project: Project, path: Path) -> Cameras:
         centres = np.array([triple(shot["translation"]) for shot in shots.values()])
         place = (next(iter(shots.values()))["geometry"] or {}).get("coordinates")
     labels, crs = tuple(shots), project.crs()
-    # Return the lens of each shot, and a note where cameras.json does not have it
+    # the lens is that of the camera that the shot names, or else of the only one that is alike
     beside, known = project.find("cameras.json"), {}
     if beside is not None:
         with checks.reading(beside):
@@ -303,7 +303,6 @@ def _read_shots(project: Project, path: Path) -> Cameras:
         lenses.append(found or Lens(focal * scale, width, height, width / 2.0, height / 2.0))
     sentence = f"cameras.json has no camera of {plain} images; they get a lens without distortion."
     said = note(path, "cameras.no_distortion", sentence, images=plain)
-    lenses, notes = tuple(lenses), (said,) if plain else ()
     gnss, listed = read_images(project.find("images.json"), labels)
     if crs is None and place is not None:  # a project without GNSS has made-up coordinates
         lon, lat, _ = triple(place).tolist()
@@ -312,9 +311,9 @@ def _read_shots(project: Project, path: Path) -> Cameras:
         labels=labels,
         centres=centres,
         rotations=from_rotation_vectors(turns),
-        lenses=lenses,
+        lenses=tuple(lenses),
         crs=crs or "local",
-        notes=notes,
+        notes=(said,) if plain else (),
         gnss=gnss,
         unposed=opensfm.left_out(labels, listed),
         source="OpenDroneMap",
