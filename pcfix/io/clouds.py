@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +25,7 @@ from pcfix.io.tiles import SUFFIXES, Clouds, Tiles, cloud_of, open_cloud
 from pcfix.model import (
     BATHYMETRIC_POINT,
     NOISE_CLASSES,
+    BoolArray,
     FloatArray,
     WaterDimension,
     WaterPlane,
@@ -46,55 +47,98 @@ def read_cloud(
     that pcfix corrected says of its own. An `InputError` if the file is damaged, no point counts,
     or it lacks the dimension that `water` names.
     """
-    skipped = np.isin(np.arange(256), skip_classes)
+    with open_cloud(path) as source:
+        crs = stated_crs(source)
+        own = water or own_water(source)
+        extra = set(source.header.point_format.extra_dimension_names)
+        chunks = (
+            Told(
+                coordinates(points),
+                np.asarray(points["classification"]),
+                np.asarray(points["withheld"]).astype(bool),
+                source.dimension(points, own.name) if isinstance(own, WaterDimension) else None,
+                {name: source.dimension(points, name) for name in extra.intersection(TOLD)},
+            )
+            for chunk in source.chunks()
+            for points in (chunk[rows] for rows in blocks(len(chunk), FEW_ROWS))
+        )
+        given = water is not None
+        return survey_cloud(str(path), crs, chunks, own, given, len(source), skip_classes)
+
+
+TOLD = ("WaterDepth", *SHIFTS)
+"""What the dimensions of a correction say of the water, and of where the points were."""
+
+
+class Told(NamedTuple):
+    """Some points of a cloud, and by name what it says in the dimensions `TOLD`, metres."""
+
+    xyz: FloatArray
+    classes: npt.NDArray[Any]
+    withheld: BoolArray
+    heights: FloatArray | None  # of the water above each, where a dimension was named for it
+    dimensions: dict[str, FloatArray]
+
+
+def survey_cloud(
+    name: str,
+    crs: CRS | None,
+    chunks: Iterable[Told],
+    water: WaterSurface | None,
+    given: bool,
+    most: int,
+    skip_classes: Sequence[int] = NOISE_CLASSES,
+) -> SurveyCloud:
+    """Return the points that count; the water is `given`, or else what the cloud says of its own.
+
+    There are `most` points at most. An `InputError` if none counts.
+    """
     columns: list[npt.NDArray[Any]] = []
     first = count = 0
-    with open_cloud(path) as source:
-        crs, own = stated_crs(source), water or own_water(source)
-        extra = set(source.header.point_format.extra_dimension_names)
-        by_depth = water is None and "WaterDepth" in extra
-        for chunk in source.chunks():
-            for rows in blocks(len(chunk), FEW_ROWS):
-                points = chunk[rows]
-                xyz, classes = coordinates(points), np.asarray(points["classification"])
-                keep = ~(skipped[classes] | np.asarray(points["withheld"]).astype(bool))
-                above = np.full(len(xyz), np.nan)
-                if by_depth:
-                    depth = source.dimension(points, "WaterDepth")
-                    above = np.where(depth > 0.0, xyz[:, 2] + depth, np.nan)
-                elif own is not None:
-                    above = _water_above(own, source, points, xyz)
-                is_bed = kept(keep, classes) == BATHYMETRIC_POINT
-                parts = [kept(keep, xyz), kept(keep, above), is_bed]
-                if extra >= set(SHIFTS):
-                    shifts = [source.dimension(points, name) for name in SHIFTS]
-                    parts.append(np.column_stack(shifts)[keep])
-                columns = columns or [
-                    empty((len(source), *part.shape[1:]), part.dtype) for part in parts
-                ]
-                for column, part in zip(columns, parts, strict=True):
-                    column[first : first + len(part)] = part
-                first, count = first + len(parts[0]), count + len(xyz)
-                let_go()
-    places, water_m, bathymetric, *moved = (column[:first] for column in columns)
+    for points in chunks:
+        parts = _part(points, water, given=given, skip=skip_classes)
+        columns = columns or [empty((most, *part.shape[1:]), part.dtype) for part in parts]
+        for column, part in zip(columns, parts, strict=True):
+            column[first : first + len(part)] = part
+        first, count = first + len(parts[0]), count + len(points.xyz)
+        let_go()
+    xyz, water_m, bathymetric, *shifts = (column[:first] for column in columns)
     if first == 0:
-        listed = ", ".join(map(str, skip_classes))
-        sentence = f"every point is withheld or in a class that is skipped ({listed})."
-        raise bad_file(path, "cloud.nothing_left", sentence)
-    exact = water is not None or not mapped(np.isfinite, water_m).any()
-    surface = own if exact and not isinstance(own, WaterDimension) else None
-    shift = moved[0] if moved else None
-    return SurveyCloud(str(path), places, crs, count - first, shift, bathymetric, water_m, surface)
+        skipped = ", ".join(map(str, skip_classes))
+        sentence = f"every point is withheld or in a class that is skipped ({skipped})."
+        raise bad_file(name, "cloud.nothing_left", sentence)
+    exact = given or not mapped(np.isfinite, water_m).any()
+    return SurveyCloud(
+        name,
+        xyz,
+        crs,
+        count - first,
+        shifts[0] if shifts else None,
+        bathymetric,
+        water_m,
+        water if exact and not isinstance(water, WaterDimension) else None,
+    )
 
 
-def _water_above(
-    water: WaterSurface, source: LasSource, points: Any, xyz: FloatArray
-) -> FloatArray:
-    from pcfix.water.surface import surface_above  # with its compiler, not quick to load
+def _part(
+    points: Told, water: WaterSurface | None, *, given: bool, skip: Sequence[int]
+) -> list[npt.NDArray[Any]]:
+    """Return place, water and whether of the bed of the points that count; perhaps shifts."""
+    xyz, classes, withheld, heights, dimensions = points
+    keep = ~(np.isin(np.arange(256), skip)[classes] | withheld)
+    if not given and "WaterDepth" in dimensions:
+        depth = dimensions["WaterDepth"]
+        above = np.where(depth > 0.0, xyz[:, 2] + depth, np.nan)
+    elif water is not None:
+        from pcfix.water.surface import surface_above  # with its compiler, not quick to load
 
-    named = water.name if isinstance(water, WaterDimension) else ""
-    heights = source.dimension(points, named) if named else None
-    return surface_above(water, xyz, heights).height_m
+        above = surface_above(water, xyz, heights).height_m
+    else:
+        above = np.full(len(xyz), np.nan)
+    found = [kept(keep, xyz), kept(keep, above), kept(keep, classes) == BATHYMETRIC_POINT]
+    if dimensions.keys() >= set(SHIFTS):
+        found.append(np.column_stack([dimensions[name] for name in SHIFTS])[keep])
+    return found
 
 
 def own_water(source: LasSource) -> WaterSurface | None:
@@ -143,22 +187,22 @@ def read_reference(reference: Clouds) -> Reference:
         table = read_table(found, ("x", "y", "z"))
         xyz = np.column_stack([table.numbers(name) for name in "xyz"])
         return Reference(str(found), xyz, None, sparse=True)
-    if suffix in (".tif", ".tiff"):
-        from pyproj import CRS
+    if suffix not in (".tif", ".tiff"):
+        raise bad_file(found, "reference.unknown", f"is not a reference. Give {KINDS}.")
+    from pyproj import CRS
 
-        with open_raster(found) as grid:  # the centres of the cells of its first band
-            height = read_masked(grid) * grid.scales[0] + grid.offsets[0]
-            transform, crs = grid.transform, CRS(grid.crs.to_wkt()) if grid.crs else None
-        if transform.is_identity:
-            sentence = "has no georeference. Give a georeferenced GeoTIFF."
-            raise bad_file(found, "raster.not_georeferenced", sentence)
-        row, column = np.nonzero(np.isfinite(height))
-        if len(row) == 0:
-            raise bad_file(found, "raster.empty", "no cell contains a height.")
-        x, y = place_of(transform, column + 0.5, row + 0.5)
-        xyz = np.column_stack([x, y, height[row, column]])
-        return Reference(str(found), xyz, crs, height.size - len(xyz), raster=True)
-    raise bad_file(found, "reference.unknown", f"is not a reference. Give {KINDS}.")
+    with open_raster(found) as grid:  # the centres of the cells of its first band
+        height = read_masked(grid) * grid.scales[0] + grid.offsets[0]
+        transform, crs = grid.transform, CRS(grid.crs.to_wkt()) if grid.crs else None
+    if transform.is_identity:
+        sentence = "has no georeference. Give a georeferenced GeoTIFF."
+        raise bad_file(found, "raster.not_georeferenced", sentence)
+    row, column = np.nonzero(np.isfinite(height))
+    if len(row) == 0:
+        raise bad_file(found, "raster.empty", "no cell contains a height.")
+    x, y = place_of(transform, column + 0.5, row + 0.5)
+    xyz = np.column_stack([x, y, height[row, column]])
+    return Reference(str(found), xyz, crs, height.size - len(xyz), raster=True)
 
 
 def check_same_crs(cloud: str, crs: CRS | None, reference: str, other: CRS | None) -> None:

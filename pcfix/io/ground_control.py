@@ -289,7 +289,7 @@ def read_marks(path: Path) -> tuple[list[Mark], str | None]:
     numbered = [(i, line.split()) for i, line in enumerate(lines, start=1) if line.strip()]
     rows = [(i, fields) for i, fields in numbered[1:] if not fields[0].startswith("#")]
     first = [number(field) for field in rows[0][1][:5]] if rows else []
-    if len(first) == 5 and np.isfinite([*first[:2], *first[3:]]).all():  # z may be NaN
+    if len(first) == 5 and not np.isnan([*first[:2], *first[3:]]).any():  # z may be NaN
         return _from_odm(path, rows)
     if not any(is_header(header.names) for header in headers(lines)):
         sentence = "is neither a table of marks nor OpenDroneMap's gcp_list.txt. Line 1 must name"

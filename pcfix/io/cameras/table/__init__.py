@@ -125,7 +125,15 @@ _GEO_CRS = re.compile(r"(EPSG:\d+|\+proj=.+|WGS84 UTM \d\d?\s*[NS])\s*", re.IGNO
 def open_table(path: Path) -> Columns:
     """Read a table with a header, or ODM's geo.txt, which has none."""
     lines = read_lines(path)
-    return _read_geo(path, lines) if is_geo(lines) else read_columns(path)
+    if not is_geo(lines):
+        return read_columns(path)
+    split = [(i, line.split()) for i, line in enumerate(lines[1:], start=2)]
+    rows = [[*fields, *[""] * len(GEO)][: len(GEO)] for _, fields in split if fields]
+    table = Table(path, list(GEO), rows, [i for i, fields in split if fields])
+    place = {name: GEO.index(name) for name in ("label", "x", "y", "z")}
+    place |= {"sigma_x": 7, "sigma_y": 7, "sigma_z": 8}  # its angles may be 0 for unknown
+    crs = checks.utm_as_code(lines[0].strip())
+    return Columns(table, place, [""] * len(GEO), after_hash=False, crs=crs)
 
 
 def gnss_positions(columns: Columns) -> GnssPositions | None:
@@ -193,16 +201,6 @@ def is_geo(lines: list[str]) -> bool:
         return False
     first = next((line.split() for line in lines[1:] if line.strip()), [])
     return len(first) >= 3 and np.isnan(number(first[0]))
-
-
-def _read_geo(path: Path, lines: list[str]) -> Columns:
-    split = [(i, line.split()) for i, line in enumerate(lines[1:], start=2)]
-    rows = [[*fields, *[""] * len(GEO)][: len(GEO)] for _, fields in split if fields]
-    table = Table(path, list(GEO), rows, [i for i, fields in split if fields])
-    place = {name: GEO.index(name) for name in ("label", "x", "y", "z")}
-    place |= {"sigma_x": 7, "sigma_y": 7, "sigma_z": 8}  # its angles may be 0 for unknown
-    crs = checks.utm_as_code(lines[0].strip())
-    return Columns(table, place, [""] * len(GEO), after_hash=False, crs=crs)
 
 
 OMEGA_PHI_KAPPA = ("omega", "phi", "kappa")
