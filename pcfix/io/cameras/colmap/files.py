@@ -182,7 +182,23 @@ def read_images(path: Path, *, points: bool) -> list[Image]:
     """Read ``images``; the image points only where they are asked for."""
     with reading(path):
         if path.suffix == ".bin":
-            return _binary_images(path, points=points)
+            file, images = _Bytes(path), []
+            for _ in range(*file.take(_COUNT)):
+                identifier, *pose, camera = file.take(_IMAGE)
+                end = file.data.find(b"\0", file.at)
+                if end < 0:
+                    raise ValueError("a name does not end")
+                name, file.at = file.data[file.at : end].decode("utf-8", "replace"), end + 1
+                (count,) = file.take(_COUNT)
+                seen = np.empty(0, OBSERVATION)
+                if points and count:
+                    seen = np.frombuffer(file.data, OBSERVATION, count, file.at)
+                    seen = seen[seen["point"] >= 0]
+                file.at += count * OBSERVATION.itemsize
+                images.append(Image(identifier, tuple(pose), camera, name, seen))
+            if file.at > len(file.data):
+                raise damaged(path, "its last image has too few points")
+            return images
         images, lines = [], _lines(path)
         for line in filter(None, lines):
             identifier, *pose, camera, name = line.split(None, 9)
@@ -196,26 +212,6 @@ def read_images(path: Path, *, points: bool) -> list[Image]:
             images.append(Image(int(identifier), tuple(map(float, pose)), int(camera), name, seen))
         _check_count(path, len(images))
         return images
-
-
-def _binary_images(path: Path, *, points: bool) -> list[Image]:
-    file, images = _Bytes(path), []
-    for _ in range(*file.take(_COUNT)):
-        identifier, *pose, camera = file.take(_IMAGE)
-        end = file.data.find(b"\0", file.at)
-        if end < 0:
-            raise ValueError("a name does not end")
-        name, file.at = file.data[file.at : end].decode("utf-8", "replace"), end + 1
-        (count,) = file.take(_COUNT)
-        seen = np.empty(0, OBSERVATION)
-        if points and count:
-            seen = np.frombuffer(file.data, OBSERVATION, count, file.at)
-            seen = seen[seen["point"] >= 0]
-        file.at += count * OBSERVATION.itemsize
-        images.append(Image(identifier, tuple(pose), camera, name, seen))
-    if file.at > len(file.data):
-        raise damaged(path, "its last image has too few points")
-    return images
 
 
 def read_points(path: Path) -> tuple[IntArray, FloatArray]:
