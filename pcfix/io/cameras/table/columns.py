@@ -13,15 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pcfix.errors import InputError, bad_file
-from pcfix.io.tables import (
-    Table,
-    delimiter_of,
-    number,
-    places,
-    read_lines,
-    split_header,
-    table_below,
-)
+from pcfix.io.tables import Table, number, places, read_lines, split_header, split_unit, table_below
 from pcfix.model import FloatArray, IntArray
 
 SPELLINGS: dict[str, tuple[str, ...]] = {
@@ -60,7 +52,6 @@ POSITION |= {"x_est", "y_est", "z_est"}
 EXIF = ("gpslongitude", "gpslatitude", "gpsaltitude")
 MANY = ("label", *(f"sigma_{axis}" for axis in "xyz"))  # the first spelling counts
 
-_UNIT = re.compile(r"^(.*?)[ _]*[\[(]([^\])]*)[\])]$|^(.*)_(m|deg|gon|rad)$")
 CRS_COMMENT = re.compile(r"^#\s*(?:coordinatesystem|crs)\s*[:=]\s*(.+)$", re.IGNORECASE)
 _FARTHEST_HEADER = 20
 
@@ -106,14 +97,11 @@ def _split_unit(name: str) -> tuple[str, str]:
 
     Of X/Longitude it is the name that says more.
     """
-    name, unit = name.lstrip("# \"'").lower(), ""
-    match = None if name in _PLAIN else _UNIT.match(name)
-    if match:
-        name, unit = (match[1], match[2]) if match[3] is None else (match[3], match[4])
-    name = name.strip().replace(" ", "_")
+    plain = name.lstrip("# \"'").lower()
+    name, unit = (plain, "") if plain in _PLAIN else split_unit(plain, "m|deg|gon|rad")
     axis, slash, kind = name.partition("/")
     more = slash and axis in ("x", "y", "z") and kind in _PLAIN
-    return kind if more else name, unit.strip()
+    return kind if more else name, unit
 
 
 _PLAIN = {spelling for spellings in SPELLINGS.values() for spelling in spellings}
@@ -240,7 +228,7 @@ def read_columns(path: Path) -> Columns:
         raise column_missing(path, lacking, names)
     comments = comment or any(line.startswith("#") for line in lines[:at])
     below = next((line for line in lines[at + 1 :] if line.strip() and line[0] != "#"), "")
-    delimiter = delimiter_of(below.strip()) if comment else split_header(lines[at].strip())[1]
+    delimiter = split_header((below if comment else lines[at]).strip())[1]
     table = table_below(path, lines, names, delimiter, at=at, comments=comments)
     crs = next(
         (match[1].strip() for line in lines[:at] if (match := CRS_COMMENT.match(line))), None
