@@ -10,7 +10,7 @@ import pytest
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
-from pcfix.io.cameras.colmap.writing import write_colmap
+from pcfix.io.cameras.colmap import write_colmap
 from tests.test_bad_input import listing
 from tests.utils.adjust_files import EPSG, write_block, write_gcps, write_gnss
 from tests.utils.program import run_pcfix

@@ -7,7 +7,7 @@ import json
 from collections.abc import Callable, Iterable
 from typing import Any, get_args, get_type_hints
 
-from pcfix.io.qgis_plugin import packed
+from pcfix.io.styles import packed
 from pcfix.options.declare import Option, options_of
 from pcfix.version import __version__
 

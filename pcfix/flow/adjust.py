@@ -35,8 +35,8 @@ from pcfix.flow.inputs import Inputs, mask_of
 from pcfix.flow.next_steps import WATER as WATER_FILE
 from pcfix.flow.surfaces import CloudView, view_of
 from pcfix.io.atomic import temporary_folder
-from pcfix.io.cameras.colmap.writing import write_colmap
-from pcfix.io.cameras.opensfm.models import write_opensfm
+from pcfix.io.cameras.colmap import write_colmap
+from pcfix.io.cameras.opensfm import write_opensfm
 from pcfix.io.cameras.table.sensor import read_sensor, write_table
 from pcfix.io.crs import is_topocentric, parse_crs
 from pcfix.io.files import check_input, write_text
@@ -45,7 +45,7 @@ from pcfix.io.ground_control import read_ground_control
 from pcfix.io.members import write_members
 from pcfix.io.tiles import Clouds, cloud_of
 from pcfix.io.views import ViewList, ViewMatch
-from pcfix.io.water_rasters import write_water_raster
+from pcfix.io.water import write_water_raster
 from pcfix.model import (
     Cameras,
     FloatArray,

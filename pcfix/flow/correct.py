@@ -34,7 +34,7 @@ from pcfix.io.las.source import LasSource, centring_steps
 from pcfix.io.las.writing import corrected_header, corrected_identity
 from pcfix.io.regressions import read_regression
 from pcfix.io.tiles import Clouds, Tiles
-from pcfix.io.views.matching import beside
+from pcfix.io.views import beside
 from pcfix.label.labelling import Labelling
 from pcfix.lens.frames import beside_frames
 from pcfix.model import (

@@ -391,14 +391,14 @@ def _kind_of(views: ViewMatch | Views | None) -> ViewKind | None:
 
 
 def _path_of(views: ViewMatch | Views | None) -> str | None:
-    return str(views.view_list.raw.path) if isinstance(views, ViewMatch) else None
+    return str(views.view_list.path) if isinstance(views, ViewMatch) else None
 
 
 def _are_all_listed(views: ViewMatch | Views | None, view: CloudView) -> bool:
     """Return whether every point of the cloud can have views."""
     if views is None:
         return True
-    start = views.view_list.raw.start if isinstance(views, ViewMatch) else views.start
+    start = views.view_list.start if isinstance(views, ViewMatch) else views.start
     return len(start) > view.points and bool((np.diff(start) > 0).all())
 
 

@@ -17,10 +17,10 @@ from pcfix.flow.surfaces import points_of
 from pcfix.grid.contours import contours, depth_interval
 from pcfix.grid.shoreline import NearWater
 from pcfix.io import rasters
-from pcfix.io.geopackage import Layer, write_layers
 from pcfix.io.styles import Symbol, vector_style
 from pcfix.io.tables import read_check_depths
 from pcfix.io.tiles import Tiles, open_cloud
+from pcfix.io.vectors import Layer, write_layers
 from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES, Cameras, FloatArray, WaterSurface
 from pcfix.options.correct import LEVEL_M
 from pcfix.options.declare import File

@@ -21,7 +21,7 @@ from pcfix.flow.runner import Progress, check_summary, json_text, write_summary
 from pcfix.io.files import file_state, read_json, write_text
 from pcfix.io.photographs import photographs_in, read_photograph, size_of, write_photograph
 from pcfix.io.rasters import filled_heights, open_raster
-from pcfix.io.water_rasters import rasters_of_images, read_water_raster
+from pcfix.io.water import rasters_of_images, read_water_raster
 from pcfix.kernels import cores, threads
 from pcfix.lens.imaging import unproject
 from pcfix.model import Cameras, FloatArray, Lens, WaterDimension

@@ -15,8 +15,8 @@ import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.flow.surfaces import Points
-from pcfix.io.altitudes import read_altitudes
 from pcfix.io.cameras.georeference import adjusted_minus_gnss
+from pcfix.io.tides import read_altitudes
 from pcfix.lens.frames import cameras_in_sight
 from pcfix.lens.imaging import project
 from pcfix.model import BoolArray, Cameras, FloatArray, TiePoints

@@ -28,9 +28,9 @@ from pcfix.flow.runner import Progress
 from pcfix.flow.surfaces import view_of
 from pcfix.grid.maps import MOST_CELLS
 from pcfix.io.clouds import is_cloud, own_water
-from pcfix.io.geopackage import check_layers
 from pcfix.io.rasters import open_raster, preview, write_dod
 from pcfix.io.tiles import open_cloud
+from pcfix.io.vectors import check_layers
 from pcfix.model import Cameras, WaterSurface
 from pcfix.options.correct import CorrectOptions
 from pcfix.options.declare import options_of

@@ -10,7 +10,7 @@ import shapely
 
 from pcfix.grid.shoreline import NearWater, Shoreline
 from pcfix.io.files import check_output
-from pcfix.io.geopackage import Layer, check_layers, write_layers
+from pcfix.io.vectors import Layer, check_layers, write_layers
 from pcfix.model import FloatArray
 from pcfix.options.correct import LEVEL_M
 from pcfix.options.declare import File

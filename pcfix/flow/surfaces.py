@@ -18,8 +18,7 @@ from pcfix.flow.runner import Chunk, read_ahead
 from pcfix.io.las import source as las
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.tiles import Tiles, open_cloud
-from pcfix.io.water import read_water
-from pcfix.io.water_rasters import rasters_of_images, read_water_raster
+from pcfix.io.water import rasters_of_images, read_water, read_water_raster
 from pcfix.label.labelling import Part
 from pcfix.model import (
     Cameras,

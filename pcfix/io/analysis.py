@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
     from xarray import DataArray
 
-    from pcfix.io.geopackage import Layer
+    from pcfix.io.vectors import Layer
 
 
 def load_for_analysis(name: str) -> Any:

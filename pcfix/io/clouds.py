@@ -182,33 +182,27 @@ def read_reference(reference: Clouds) -> Reference:
     if isinstance(found, Tiles) or is_cloud(check_input(found)):
         cloud = read_cloud(found, skip_classes=NOISE_CLASSES + WATER_CLASSES)
         return Reference(cloud.name, cloud.xyz, cloud.crs, cloud.left_out)
-    source, suffix = found, found.suffix.lower()
+    suffix = found.suffix.lower()
     if suffix in TABLES:
-        table = read_table(source, ("x", "y", "z"))
+        table = read_table(found, ("x", "y", "z"))
         xyz = np.column_stack([table.numbers(name) for name in "xyz"])
-        return Reference(str(source), xyz, None, sparse=True)
-    if suffix in (".tif", ".tiff"):
-        return _read_grid(source)
-    sentence = f"is not a reference that pcfix can read. Give {KINDS}."
-    raise bad_file(source, "reference.unknown", sentence)
-
-
-def _read_grid(path: Path) -> Reference:
-    """Read the first band of a GeoTIFF as points."""
+        return Reference(str(found), xyz, None, sparse=True)
+    if suffix not in (".tif", ".tiff"):
+        raise bad_file(found, "reference.unknown", f"is not a reference. Give {KINDS}.")
     from pyproj import CRS
 
-    with open_raster(path) as grid:
+    with open_raster(found) as grid:  # the centres of the cells of its first band
         height = read_masked(grid) * grid.scales[0] + grid.offsets[0]
         transform, crs = grid.transform, CRS(grid.crs.to_wkt()) if grid.crs else None
     if transform.is_identity:
         sentence = "has no georeference. Give a georeferenced GeoTIFF."
-        raise bad_file(path, "raster.not_georeferenced", sentence)
+        raise bad_file(found, "raster.not_georeferenced", sentence)
     row, column = np.nonzero(np.isfinite(height))
     if len(row) == 0:
-        raise bad_file(path, "raster.empty", "no cell contains a height.")
+        raise bad_file(found, "raster.empty", "no cell contains a height.")
     x, y = place_of(transform, column + 0.5, row + 0.5)
     xyz = np.column_stack([x, y, height[row, column]])
-    return Reference(str(path), xyz, crs, height.size - len(xyz), raster=True)
+    return Reference(str(found), xyz, crs, height.size - len(xyz), raster=True)
 
 
 def check_same_crs(cloud: str, crs: CRS | None, reference: str, other: CRS | None) -> None:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import zlib
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 from zipfile import BadZipFile
 
 import numpy as np
 
-from pcfix.errors import InputError
+from pcfix.errors import bad_file
 from pcfix.options.declare import File
 
 if TYPE_CHECKING:
@@ -41,28 +41,18 @@ def find_members(cameras: File) -> tuple[Path, Members] | None:
     try:
         with np.load(found) as arrays:
             values = {one.name: np.asarray(arrays[one.name]) for one in fields(Members)}
-        labels, lens_names = (values.pop(name) for name in ("labels", "lens_names"))
-        _check(labels, lens_names, values)
+        labels, lens_names = (tuple(values.pop(n).tolist()) for n in ("labels", "lens_names"))
+        m, k, p = len(values["turn"]), len(labels), len(lens_names)
+        shapes = {
+            **{"centres": (k, 3), "focal": (k,), "turn": (m, k, 3), "shift_m": (m, k, 3)},
+            **{"lens": (m, k, p), "water": (m, *values["water"].shape[1:])},
+        }
+        for name, shape in shapes.items():
+            if values[name].shape != shape or not np.isfinite(values[name]).all():
+                raise ValueError(name)
+        if values["water"].shape[1:] not in ((4,), (7,)):
+            raise ValueError("water")
     except (*_NOT_READ, MemoryError) as error:
-        raise InputError(
-            "ensemble.damaged",
-            f"{found}: is not an ensemble of an adjustment. Adjust again, or remove the file.",
-            path=found,
-        ) from error
-    return found, Members(
-        labels=tuple(labels.tolist()), lens_names=tuple(lens_names.tolist()), **values
-    )
-
-
-def _check(labels: Any, lens_names: Any, values: dict[str, Any]) -> None:
-    """Raise a ValueError if arrays are not those of `Members`."""
-    m, k, p = len(values["turn"]), len(labels), len(lens_names)
-    shapes = {
-        **{"centres": (k, 3), "focal": (k,), "turn": (m, k, 3), "shift_m": (m, k, 3)},
-        **{"lens": (m, k, p), "water": (m, *values["water"].shape[1:])},
-    }
-    for name, shape in shapes.items():
-        if values[name].shape != shape or not np.isfinite(values[name]).all():
-            raise ValueError(name)
-    if values["water"].shape[1:] not in ((4,), (7,)):
-        raise ValueError("water")
+        sentence = "is not an ensemble of an adjustment. Adjust again, or remove the file."
+        raise bad_file(found, "ensemble.damaged", sentence) from error
+    return found, Members(labels=labels, lens_names=lens_names, **values)

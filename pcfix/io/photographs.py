@@ -6,7 +6,6 @@ which are copied as they are stored.
 
 from __future__ import annotations
 
-import io
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -34,8 +33,7 @@ Pixels = npt.NDArray[Any]
 def photographs_in(folder: Path) -> list[Path]:
     """Return the photographs directly in a folder, in the order of their names."""
     if not folder.is_dir():
-        sentence = "is not a folder. Give that of the photographs."
-        raise bad_file(folder, "photos.no_folder", sentence)
+        raise bad_file(folder, "photos.no_folder", "is not a folder. Give that of the photographs.")
     found = sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file())
     if not found:
         raise bad_file(folder, "photos.none", f"has no photographs ({', '.join(SUFFIXES)}).")
@@ -107,12 +105,15 @@ def write_photograph(source: Path, target: Path, pixels: Pixels, touched: BoolAr
     Both files have the same suffix; the shapes are (rows, columns, bands) and (rows, columns).
     """
     suffix = source.suffix.lower()
-    write = _write_jpeg if suffix in JPEG else _write_tiff if suffix in TIFF else _write_png
     with temporary_output(target) as path:
-        if touched.any():
-            write(source, path, pixels, touched)
-        else:
+        if not touched.any():
             shutil.copyfile(source, path)
+        elif suffix in JPEG:
+            _write_jpeg(source, path, pixels, touched)
+        elif suffix in TIFF:
+            _write_tiff(source, path, pixels)
+        else:
+            _write_png(source, path, pixels)
 
 
 def _write_jpeg(source: Path, path: Path, pixels: Pixels, touched: BoolArray) -> None:
@@ -141,7 +142,7 @@ def _write_jpeg(source: Path, path: Path, pixels: Pixels, touched: BoolArray) ->
     whole.write_dct(str(path))
 
 
-def _write_tiff(source: Path, path: Path, pixels: Pixels, touched: BoolArray) -> None:
+def _write_tiff(source: Path, path: Path, pixels: Pixels) -> None:
     """Write the pixels into a copy if they are uncompressed, else a new file with the same tags."""
     tifffile = photo_library("tifffile")
     with tifffile.TiffFile(source) as file:
@@ -169,19 +170,14 @@ _TIFF_KEPT = {270, 271, 272, 274, 282, 283, 296, 305, 306, 315, 700, 33432, 3355
 """Texts, resolution, rotation, XMP, GeoTIFF keys, and tags of multispectral cameras."""
 
 
-def _write_png(source: Path, path: Path, pixels: Pixels, touched: BoolArray) -> None:
+def _write_png(source: Path, path: Path, pixels: Pixels) -> None:
     """Write the pixels, and every other chunk of the source."""
-    cv2 = photo_library("cv2")
-    _, data = cv2.imencode(".png", pixels)
-    new, old = _chunks(data.tobytes()), _chunks(source.read_bytes())
+    _, encoded = photo_library("cv2").imencode(".png", pixels)
+    new, old = _chunks(encoded.tobytes()), _chunks(source.read_bytes())
     beside = [chunk for name, chunk in old if name not in _PNG_PIXELS]
-    out = io.BytesIO()
-    out.write(data.tobytes()[:8])
-    for name, chunk in new:
-        out.write(chunk)
-        if name == b"IHDR":
-            out.writelines(beside)
-    path.write_bytes(out.getvalue())
+    head = [chunk for name, chunk in new if name == b"IHDR"]
+    rest = [chunk for name, chunk in new if name != b"IHDR"]
+    path.write_bytes(encoded.tobytes()[:8] + b"".join([*head, *beside, *rest]))
 
 
 def _chunks(data: bytes) -> list[tuple[bytes, bytes]]:
@@ -230,22 +226,30 @@ def read_frames(path: File, every: int = 1) -> Frames:
     place = Path(path)
     if not place.exists():
         raise bad_file(place, "frames.missing", "there is no such file.")
-    found = _film(place, every) if place.is_file() else _folder(place, every)
+    if place.is_file():
+        cv2, count = photo_library("cv2"), 0
+        with _opened(place) as film:  # headers of videos may be wrong, so the frames are counted
+            rate = float(film.get(cv2.CAP_PROP_FPS))
+            while film.grab():
+                count += 1
+            columns = int(film.get(cv2.CAP_PROP_FRAME_WIDTH))
+            rows = int(film.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        names = tuple(f"{place.stem}_{every * number:05d}" for number in range(count // every))
+        interval_s = every / rate if 0.1 <= rate <= 10_000.0 else None
+        found = Frames(place, (), names, columns, rows, interval_s, every)
+    else:
+        paths = tuple(photographs_in(place)[::every])
+        sizes = [size_of(one) for one in paths]
+        for one, size in zip(paths, sizes, strict=True):
+            if size != sizes[0]:
+                sentence = f"has {size} pixels, {paths[0].name} {sizes[0]}. Give one size."
+                raise bad_file(one, "photos.size", sentence, size=size)
+        found = Frames(place, paths, tuple(one.stem for one in paths), *sizes[0])
     count = len(found.names)
     if count < LEAST_FRAMES:
         sentence = f"gives {count} frames, of {LEAST_FRAMES} at least. Give more, or lower --every."
         raise bad_file(place, "frames.too_few", sentence, frames=count)
     return found
-
-
-def _folder(place: Path, every: int) -> Frames:
-    paths = tuple(photographs_in(place)[::every])
-    sizes = [size_of(one) for one in paths]
-    for one, size in zip(paths, sizes, strict=True):
-        if size != sizes[0]:
-            sentence = f"has {size} pixels, {paths[0].name} {sizes[0]}. Give frames of one size."
-            raise bad_file(one, "photos.size", sentence, size=size)
-    return Frames(place, paths, tuple(one.stem for one in paths), *sizes[0])
 
 
 @contextmanager
@@ -260,20 +264,6 @@ def _opened(path: Path) -> Iterator[Any]:
         yield film
     finally:
         film.release()
-
-
-def _film(path: Path, every: int) -> Frames:
-    """Count the frames by reading them, as the headers of videos may be wrong."""
-    cv2 = photo_library("cv2")
-    with _opened(path) as film:
-        rate = float(film.get(cv2.CAP_PROP_FPS))
-        count = 0
-        while film.grab():
-            count += 1
-        size = film.get(cv2.CAP_PROP_FRAME_WIDTH), film.get(cv2.CAP_PROP_FRAME_HEIGHT)
-    names = tuple(f"{path.stem}_{every * number:05d}" for number in range(count // every))
-    interval_s = every / rate if 0.1 <= rate <= 10_000.0 else None
-    return Frames(path, (), names, int(size[0]), int(size[1]), interval_s, every)
 
 
 def check_calm(path: File, frames: Frames, *, overwrite: bool) -> tuple[Path, Path]:
@@ -297,9 +287,9 @@ def write_calm(target: Path, frames: Frames, pixels: Pixels) -> None:
         everywhere = np.ones(pixels.shape[:2], bool)
         write_photograph(frames.photographs[0], target, pixels, everywhere)
         return
-    data = photo_library("cv2").imencode(".png", pixels)[1].tobytes()
+    _, data = photo_library("cv2").imencode(".png", pixels)
     with temporary_output(target) as path:
-        path.write_bytes(data)
+        path.write_bytes(data.tobytes())
 
 
 def write_spread(target: Path, spread: FloatArray) -> None:

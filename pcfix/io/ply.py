@@ -79,10 +79,8 @@ def parse_header(name: str, head: bytes, element: str = "vertex") -> Header:
                 elements[-1][2].append(Property(fields[3], _TYPES[fields[2]], _TYPES[fields[1]]))
             elif key == "property":
                 elements[-1][2].append(Property(fields[1], _TYPES[fields[0]]))
-        if order is None:
-            raise ValueError("no format")
-        if any(count < 0 for _, count, _ in elements):
-            raise ValueError("a negative number of records")
+        if order is None or any(count < 0 for _, count, _ in elements):
+            raise ValueError("no format, or a negative number of records")
         if any(p.length.startswith("f") for _, _, properties in elements for p in properties):
             raise ValueError("a list counted by a fraction")
     except (KeyError, ValueError, IndexError) as error:
@@ -128,8 +126,7 @@ class Records:
                 self._units, self._item, prefix, header.order == ">", self._start, self._count
             )
         if complete < header.records:
-            sentence = f"is cut short or damaged: of {header.records:,} {header.kind} only"
-            sentence += f" {complete:,} are complete. Copy it again."
+            sentence = f"is cut short: {complete:,} of {header.records:,} {header.kind} are there."
             raise bad_file(header.name, "ply.cut_short", sentence, records=header.records)
 
     def numbers(self, *names: str) -> FloatArray:
@@ -163,11 +160,7 @@ def joined(
 ) -> tuple[IntArray, npt.NDArray[Any]]:
     """Copy lists, each of `count` items of `size` units from `first` on, one after another.
 
-    Returns
-    -------
-    start : array, shape (n + 1,)
-        Of each list in the copy.
-    values : array, shape (start[-1],)
+    Return where each starts in the copy, shape (n + 1,), and the copy.
     """
     start = np.concatenate([[0], np.cumsum(count)])
     values = np.empty(start[-1], items.dtype)
@@ -197,8 +190,7 @@ def _units(path: Path, header: Header) -> npt.NDArray[Any]:
             warnings.simplefilter("error", DeprecationWarning)
             return np.fromstring(text, np.float64, sep=" ")[skip:]
     except (DeprecationWarning, ValueError) as error:
-        sentence = "is a text PLY, but not all of it is numbers. Export it again."
-        raise bad_file(path, "ply.text", sentence) from error
+        raise bad_file(path, "ply.text", "not all of its text is numbers. Export again.") from error
 
 
 @device

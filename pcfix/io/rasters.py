@@ -86,8 +86,7 @@ def filled_heights(source: DatasetReader, *, fill: bool) -> FloatArray:
     height = read_masked(source)
     known = np.isfinite(height)
     if not known.any():
-        sentence = "has no heights in its first band. Give a DSM."
-        raise bad_file(source.name, "raster.empty", sentence)
+        raise bad_file(source.name, "raster.empty", "has no heights in its first band. Give a DSM.")
     if not fill or known.all():
         return height
     reach = float(max(height.shape))

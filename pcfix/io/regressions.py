@@ -64,11 +64,11 @@ def read_regression(path: File) -> DepthRegression:
             number = isinstance(value, int | float) and not isinstance(value, bool)
             check(name, "a finite number", number and math.isfinite(value))
             check(name, "at least 0", name not in _NOT_NEGATIVE or value >= 0.0)
-    count, shallowest = content["count"], content["shallowest"]
+    count = content["count"]
     check("slope", "above 0", content["slope"] > 0.0)
     whole = count >= LEAST_COUNT and count == int(count)
     check("count", f"a whole number of at least {LEAST_COUNT}", whole)
-    check("deepest", f"above shallowest, {shallowest:g}", content["deepest"] > shallowest)
+    check("deepest", "above shallowest", content["deepest"] > content["shallowest"])
     values = {field: content[name] for name, field in _FIELDS.items()}
     notes = notes_of(count, content["slope"])
     return DepthRegression(**values, source=str(content.get("source", "")), notes=notes)

@@ -12,7 +12,7 @@ import numpy as np
 
 from pcfix.io.files import check_output, write_bytes
 from pcfix.io.las.writing import write_points
-from pcfix.model import BATHYMETRIC_POINT, Cameras, FloatArray, IntArray, Views
+from pcfix.model import BATHYMETRIC_POINT, Cameras, FloatArray, Views
 from pcfix.options.declare import File
 from pcfix.version import __version__
 
@@ -44,19 +44,7 @@ _FINE_GSD_M = 0.005  # clouds of finer images get steps of 0.1 mm
 
 def write_scene(scene: Scene, out_dir: File, *, overwrite: bool) -> None:
     """Write `FILES`, and those of `OTHERS` that the scene has, into a folder."""
-    folder, contents = Path(out_dir), _contents(scene)
-    files = FILES | {name: text for name, text in OTHERS.items() if name in contents}
-    contents["scene.json"] = _facts(scene, files)
-    folder.mkdir(parents=True, exist_ok=True)
-    for name in files:
-        check_output(folder / name, overwrite=overwrite)
-    _write_clouds(scene, folder)
-    for name, content in contents.items():
-        write_bytes(folder / name, content, overwrite=overwrite)
-
-
-def _contents(scene: Scene) -> dict[str, bytes]:
-    """Return the files of a scene that are neither clouds nor about the others."""
+    folder = Path(out_dir)
     contents = {
         "sensor.csv": _sensor_csv(scene),
         "cameras.csv": _cameras_csv(scene.cameras, scene.yaw_pitch_roll_deg),
@@ -69,12 +57,43 @@ def _contents(scene: Scene) -> dict[str, bytes]:
         true = _cameras_csv(scene.true_cameras, scene.true_yaw_pitch_roll_deg)
         contents["true_cameras.csv"] = true
     if scene.neighbours is not None:
-        contents["neighbours.csv"] = _neighbours_csv(scene.cameras.labels, scene.neighbours)
+        labels = scene.cameras.labels
+        head = ["label", *(f"neighbour_{i + 1}" for i in range(scene.neighbours.shape[1]))]
+        rows = zip(labels, scene.neighbours, strict=True)
+        listed = ([one, *(labels[i] if i >= 0 else "" for i in row)] for one, row in rows)
+        contents["neighbours.csv"] = _csv(head, listed)
     if scene.pairs is not None and scene.pairs_start is not None:
         arrays = io.BytesIO()
         np.savez_compressed(arrays, start=scene.pairs_start, pairs=scene.pairs)
         contents["pairs.npz"] = arrays.getvalue()
-    return contents
+    files = FILES | {name: text for name, text in OTHERS.items() if name in contents}
+    plane = scene.water
+    tilted = f"plane:{plane.a!r},{plane.b!r},{plane.c!r}"
+    facts = {
+        "made_by": f"pcfix {__version__}",
+        "crs": f"EPSG:{scene.epsg}",
+        "water": f"{plane.a!r}" if plane.b == plane.c == 0.0 else tilted,  # as --water takes it
+        "water_level_m": scene.water_level_m,
+        "refractive_index": scene.refractive_index,
+        "gsd_m": scene.gsd_m,
+        "arguments": scene.settings,
+        "files": files,
+    }
+    contents["scene.json"] = (json.dumps(facts, indent=2) + "\n").encode()
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in files:
+        check_output(folder / name, overwrite=overwrite)
+    wet = scene.depth_m(scene.lidar_xyz) > 0.0
+    classes = np.where(wet, BATHYMETRIC_POINT, GROUND).astype(np.uint8)
+    depth = np.clip(scene.depth_m(scene.apparent_xyz) / 10.0, 0.0, 1.0)[:, None]
+    sand, sea = np.array([[214, 196, 150]]), np.array([[22, 66, 110]])
+    colours = np.asarray(np.rint(sand + depth * (sea - sand)) * 257.0)  # 16 bit, bluer with depth
+    place = (scene.epsg, 0.001 if scene.gsd_m >= _FINE_GSD_M else 0.0001)
+    write_points(folder / "cloud.laz", scene.apparent_xyz, place, colours)
+    write_points(folder / "truth.laz", scene.true_xyz, place)
+    write_points(folder / "lidar.laz", scene.lidar_xyz, place, classes=classes)
+    for name, content in contents.items():
+        write_bytes(folder / name, content, overwrite=overwrite)
 
 
 def colmap_vis(views: Views) -> bytes:
@@ -112,23 +131,6 @@ def openmvs_ply(xyz: FloatArray, views: Views) -> bytes:
     return ("\n".join(head) + "\n").encode() + b"".join(rows)
 
 
-def _facts(scene: Scene, files: dict[str, str]) -> bytes:
-    """Return ``scene.json``; `water` is what ``--water`` takes."""
-    plane = scene.water
-    tilted = f"plane:{plane.a!r},{plane.b!r},{plane.c!r}"
-    facts = {
-        "made_by": f"pcfix {__version__}",
-        "crs": f"EPSG:{scene.epsg}",
-        "water": f"{plane.a!r}" if plane.b == plane.c == 0.0 else tilted,
-        "water_level_m": scene.water_level_m,
-        "refractive_index": scene.refractive_index,
-        "gsd_m": scene.gsd_m,
-        "arguments": scene.settings,
-        "files": files,
-    }
-    return (json.dumps(facts, indent=2) + "\n").encode()
-
-
 def _sensor_csv(scene: Scene) -> bytes:
     lens = None if scene.cameras.lenses is None else scene.cameras.lenses[0]
     if lens is None or not lens.radial:
@@ -138,12 +140,6 @@ def _sensor_csv(scene: Scene) -> bytes:
     values |= dict(zip(("k1", "k2", "k3"), lens.radial, strict=True))
     values |= {"p1": p2, "p2": p1}  # OpenCV counts them the other way round
     return _csv(values, [map(repr, values.values())])
-
-
-def _neighbours_csv(labels: tuple[str, ...], neighbours: IntArray) -> bytes:
-    head = ["label", *(f"neighbour_{i + 1}" for i in range(neighbours.shape[1]))]
-    rows = zip(labels, neighbours, strict=True)
-    return _csv(head, ([one, *(labels[i] if i >= 0 else "" for i in row)] for one, row in rows))
 
 
 def _cameras_csv(cameras: Cameras, yaw_pitch_roll_deg: FloatArray) -> bytes:
@@ -156,20 +152,3 @@ def _cameras_csv(cameras: Cameras, yaw_pitch_roll_deg: FloatArray) -> bytes:
 
 def _csv(head: Iterable[str], rows: Iterable[Iterable[str]]) -> bytes:
     return "".join(",".join(row) + "\n" for row in (head, *rows)).encode()
-
-
-def _write_clouds(scene: Scene, folder: Path) -> None:
-    wet = scene.depth_m(scene.lidar_xyz) > 0.0
-    classes = np.where(wet, BATHYMETRIC_POINT, GROUND).astype(np.uint8)
-    step = 0.001 if scene.gsd_m >= _FINE_GSD_M else 0.0001
-    place = (scene.epsg, step)
-    write_points(folder / "cloud.laz", scene.apparent_xyz, place, _colours(scene))
-    write_points(folder / "truth.laz", scene.true_xyz, place)
-    write_points(folder / "lidar.laz", scene.lidar_xyz, place, classes=classes)
-
-
-def _colours(scene: Scene) -> FloatArray:
-    """Return RGB, 16 bit: sand on land, bluer with depth."""
-    depth = np.clip(scene.depth_m(scene.apparent_xyz) / 10.0, 0.0, 1.0)[:, None]
-    sand, sea = np.array([[214, 196, 150]]), np.array([[22, 66, 110]])
-    return np.asarray(np.rint(sand + depth * (sea - sand)) * 257.0)

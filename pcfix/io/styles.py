@@ -2,10 +2,15 @@
 
 QGIS reads the style of a raster from the ``.qml`` file of its name, and those of a GeoPackage from
 its table ``layer_styles``.
+
+The files of the plugin of QGIS, packed as QGIS installs them.
 """
 
 from __future__ import annotations
 
+import io
+import zipfile
+from importlib.resources import files
 from pathlib import Path
 from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
@@ -95,7 +100,19 @@ def vector_style(symbols: dict[str, Symbol], attribute: str = "", label: str = "
 
     The label is an expression of QGIS.
     """
-    drawn = "\n".join(_symbol(str(row), one) for row, one in enumerate(symbols.values()))
+    texts = []
+    for row, one in enumerate(symbols.values()):
+        kind, options = _LAYERS[one.kind]
+        fields = {"c": ",".join(map(str, one.colour)), "shape": one.shape, "size": one.size}
+        given = "".join(
+            f'<Option type="QString" name="{key}" value={quoteattr(value.format(**fields))}/>'
+            for key, value in options.items()
+        )
+        texts.append(
+            f'<symbol type="{one.kind}" name="{row}" alpha="1"><layer class="{kind}" enabled="1">'
+            f'<Option type="Map">{given}</Option></layer></symbol>'
+        )
+    drawn = "\n".join(texts)
     head, rows = 'type="singleSymbol"', ""
     if attribute:
         head = f'type="categorizedSymbol" attr={quoteattr(attribute)}'
@@ -116,16 +133,21 @@ def vector_style(symbols: dict[str, Symbol], attribute: str = "", label: str = "
     return _PAGE.format(categories="Symbology|Labeling", body=body)
 
 
-def _symbol(name: str, one: Symbol) -> str:
-    """Return a symbol of QGIS."""
-    kind, options = _LAYERS[one.kind]
-    colour = ",".join(map(str, one.colour))
-    given = "".join(
-        f'<Option type="QString" name="{key}"'
-        f" value={quoteattr(value.format(c=colour, shape=one.shape, size=one.size))}/>"
-        for key, value in options.items()
-    )
-    return (
-        f'<symbol type="{one.kind}" name="{name}" alpha="1"><layer class="{kind}" enabled="1">'
-        f'<Option type="Map">{given}</Option></layer></symbol>'
-    )
+FOLDER = "pcfix"
+_WHEN = (1980, 1, 1, 0, 0, 0)  # the same input gives the same bytes
+
+
+def packed(table: str, version: str) -> bytes:
+    """Return the plugin as a ZIP file, with a table of its commands as JSON."""
+    stream = io.BytesIO()
+    own = {
+        one.name: one.read_text("utf-8")
+        for one in files("pcfix.qgis").iterdir()
+        if one.name.endswith((".py", ".txt"))
+    }
+    own["metadata.txt"] = own["metadata.txt"].replace("version=0.0", f"version={version}")
+    own["commands.json"] = table
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as file:
+        for name in sorted(own):
+            file.writestr(zipfile.ZipInfo(f"{FOLDER}/{name}", _WHEN), own[name].encode())
+    return stream.getvalue()

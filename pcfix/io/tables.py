@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Container, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -55,16 +55,14 @@ def number(text: str) -> float:
 
 
 def split_header(line: str) -> tuple[list[str], str]:
-    """Return the names of a header line, lower case, and the delimiter between them."""
-    delimiter = delimiter_of(line)
+    """Return the names of a header line, lower case, and the delimiter between them.
+
+    It is the tab, semicolon or comma between the fields, else the space.
+    """
+    delimiter = max(",;\t", key=line.count)
+    delimiter = delimiter if delimiter in line else " "
     names = line.split(None if delimiter == " " else delimiter)
     return [name.strip().strip("\"'").lower() for name in names], delimiter
-
-
-def delimiter_of(line: str) -> str:
-    """Return the tab, semicolon or comma between the fields of a line, else the space."""
-    delimiter = max(",;\t", key=line.count)
-    return delimiter if delimiter in line else " "
 
 
 def read_lines(path: Path) -> list[str]:
@@ -85,10 +83,18 @@ def read_table(path: Path, required: Sequence[str]) -> Table:
     return table_below(path, lines, header, delimiter)
 
 
-_UNIT = re.compile(r"^(.*?)[ _]*[\[(]([^\])]*)[\])]$|^(.*)_(m|cm|mm|ft|deg)$")
 _LONGEST_NAME = 80
 METRES = ("", "m", "metre", "metres", "meter", "meters")
 DEGREES = ("", "deg", "degree", "degrees", "°")
+
+
+def split_unit(name: str, endings: str = "m|cm|mm|ft|deg") -> tuple[str, str]:
+    """Return the name of a column and its unit: depth_m, Depth (m), x [m]."""
+    if len(name) >= _LONGEST_NAME:  # the expression takes long on a long name
+        return name, ""
+    match = re.match(rf"^(.*?)[ _]*[\[(]([^\])]*)[\])]$|^(.*)_({endings})$", name)
+    bare, unit = (match[1] or match[3], match[2] or match[4]) if match else (name, "")
+    return (bare or "").strip().replace(" ", "_"), (unit or "").strip()
 
 
 def columns_of(
@@ -100,16 +106,19 @@ def columns_of(
     """
     found = []
     for name in header:
-        # the expression takes long on a long name
-        match = _UNIT.match(name) if len(name) < _LONGEST_NAME else None
-        bare, unit = (match[1] or match[3], match[2] or match[4]) if match else (name, "")
-        bare = (bare or "").strip().replace(" ", "_")
+        bare, unit = split_unit(name)
         if bare in spellings:
             found.append((spellings.index(bare), name))
-            if (unit or "").strip() not in units:
+            if unit not in units:
                 sentence = f"column {name} is in '{unit}'. Give metres."
                 raise bad_file(path, "table.unit", sentence, column=name, value=unit)
     return [name for _, name in sorted(found)]
+
+
+def places(header: Sequence[str], spellings: Mapping[str, Sequence[str]]) -> dict[str, int]:
+    """Return the number of the column of each role: the first of its spellings that is there."""
+    found = {role: [name for name in names if name in header] for role, names in spellings.items()}
+    return {role: header.index(names[0]) for role, names in found.items() if names}
 
 
 def check_columns(

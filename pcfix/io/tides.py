@@ -1,20 +1,26 @@
-"""Read tide tables and the times of images, and compute the water level of each image.
+"""Read tide tables, and times and flying heights of images; compute the level at each image.
 
 Times with a zone (or Z) are UTC moments. Times without one are the readings of one clock that
 table and images share. The two cannot be compared, so both must be of one kind.
+
+The heights above the take-off place are those that drones recorded in their images: DJI's XMP has
+``drone-dji:RelativeAltitude`` (metres, by the barometer); Metashape stores it in its projects, as
+the property ``DJI/RelativeAltitude`` of each image.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.errors import PcfixWarning, bad_file
+from pcfix.errors import InputError, PcfixWarning, bad_file
+from pcfix.io.cameras.metashape.documents import open_chunk
 from pcfix.io.files import check_input, read_json
 from pcfix.io.labels import match_labels
 from pcfix.io.tables import read_table
@@ -83,9 +89,8 @@ def _from_exif(folder: Path, labels: Sequence[str]) -> ImageTimes:
             with Image.open(file) as image:
                 tags = image.getexif().get_ifd(_EXIF)
         except Exception as error:  # of any kind, if a tag has another type than it should
-            raise bad_file(
-                file, "photos.unreadable", f"is not a readable image ({error})."
-            ) from error
+            sentence = f"is not a readable image ({error})."
+            raise bad_file(file, "photos.unreadable", sentence) from error
         codes = (_DATE_TIME_ORIGINAL, _SUBSECONDS, _OFFSET_ORIGINAL)
         text, fraction, zone = (str(tags.get(code, "")).strip("\0 ") for code in codes)
         if not text:
@@ -97,24 +102,22 @@ def _from_exif(folder: Path, labels: Sequence[str]) -> ImageTimes:
 
 def _from_json(path: Path, labels: Sequence[str]) -> ImageTimes:
     try:
-        times = {str(name): time_s for name, time_s in _json_times(read_json(path)).items()}
+        content = read_json(path)
+        if isinstance(content, dict):  # shots.geojson
+            shots = [one["properties"] for one in content.get("features", ())]
+            pairs = [(one["filename"], one.get("capture_time")) for one in shots]
+        elif content and "shots" in content[0]:  # reconstruction.json
+            items = [item for part in content for item in part["shots"].items()]
+            pairs = [(name, shot.get("capture_time")) for name, shot in items]
+        else:  # images.json, milliseconds
+            pairs = [(one["filename"], float(one.get("utc_time") or 0.0) / 1e3) for one in content]
+        times = {str(name): float(time_s or 0.0) for name, time_s in pairs}
     except (OSError, ValueError, TypeError, AttributeError, LookupError) as error:
         sentence = f"is not a file of OpenDroneMap or OpenSfM ({error}). {_USE_TABLE}"
         raise bad_file(path, "image_times.not_one", sentence) from error
     known = [name for name, time_s in times.items() if 0.0 < time_s < np.inf]
     chosen = [known[row] for row in _rows(known, labels, path)]
     return ImageTimes(np.array([times[name] for name in chosen]), True, str(path))
-
-
-def _json_times(content: Any) -> dict[str, float]:
-    """Return seconds since 1970 by image name, from any of the three layouts."""
-    if isinstance(content, dict):  # shots.geojson
-        shots = [feature["properties"] for feature in content.get("features", ())]
-        return {shot["filename"]: float(shot.get("capture_time") or 0.0) for shot in shots}
-    if content and "shots" in content[0]:  # reconstruction.json
-        shots = [item for part in content for item in part["shots"].items()]
-        return {name: float(shot.get("capture_time") or 0.0) for name, shot in shots}
-    return {one["filename"]: float(one.get("utc_time") or 0.0) / 1000.0 for one in content}
 
 
 def _rows(names: Sequence[str], labels: Sequence[str], source: Path) -> list[int]:
@@ -143,9 +146,7 @@ def _times(source: Path, where: Sequence[str], texts: Sequence[str]) -> ImageTim
     zoned = [moment.tzinfo is not None for moment in moments]
     if any(zoned) != all(zoned):
         odd = zoned.index(not zoned[0])
-        sentence = (
-            f"{where[odd]}: '{texts[odd]}' and others differ in having a zone. Write all alike."
-        )
+        sentence = f"{where[odd]}: only some times have a zone ('{texts[odd]}'). Write all alike."
         raise bad_file(source, "time.zone", sentence, value=texts[odd])
     utc = [moment if zoned[0] else moment.replace(tzinfo=UTC) for moment in moments]
     return ImageTimes(np.array([moment.timestamp() for moment in utc]), zoned[0], str(source))
@@ -176,35 +177,67 @@ def level_offsets(
     the interval of the two rows there. The average over the images is the level that the user
     gives.
     """
+    clock, name = tide.time_s, tide.name
     if tide.zoned != times.zoned:
-        with_zone, without = (tide, times) if tide.zoned else (times, tide)
-        sentence = f"its times have no zone, those of {with_zone.name} have one. Add or remove it"
-        raise bad_file(without.name, "time.zone", f"{sentence} (+02:00, or Z for UTC) everywhere.")
-    gaps = np.diff(tide.time_s)
-    first, last = tide.time_s[0] - gaps[0], tide.time_s[-1] + gaps[-1]
+        without = times if tide.zoned else tide
+        sentence = "its times have no zone, those of the other file have. Add +02:00, or Z for UTC."
+        raise bad_file(without.name, "time.zone", sentence)
+    gaps = np.diff(clock)
+    first, last = clock[0] - gaps[0], clock[-1] + gaps[-1]
     outside = np.flatnonzero((times.time_s < first) | (times.time_s > last))
     if outside.size:
-        at = outside[0]
-        start, end, taken = (
-            datetime.fromtimestamp(float(one), UTC).strftime("%Y-%m-%d %H:%M:%S")
-            for one in (tide.time_s[0], tide.time_s[-1], times.time_s[at])
-        )
-        sentence = (
-            f"covers {start} to {end}, but image {labels[at]} was taken at {taken}"
-            f" ({outside.size} of {len(labels)} images are outside). Check the zones."
-        )
-        values = {"image": labels[at], "count": int(outside.size)}
-        raise bad_file(tide.name, "tide.not_covered", sentence, **values)
-    row = np.clip(np.searchsorted(tide.time_s, times.time_s) - 1, 0, len(tide.time_s) - 2)
-    share = (times.time_s - tide.time_s[row]) / gaps[row]
+        image, at = labels[outside[0]], float(times.time_s[outside[0]])
+        taken = datetime.fromtimestamp(at, UTC).strftime("%Y-%m-%d %H:%M:%S")
+        sentence = f"does not cover image {image}, taken at {taken} ({outside.size} of"
+        sentence += f" {len(labels)} images are outside). Check the zones."
+        raise bad_file(name, "tide.not_covered", sentence, image=image, count=int(outside.size))
+    row = np.clip(np.searchsorted(clock, times.time_s) - 1, 0, len(clock) - 2)
+    share = (times.time_s - clock[row]) / gaps[row]
     level = tide.level_m[row] + share * np.diff(tide.level_m)[row]
     notes = []
     beyond = int(((share < 0.0) | (share > 1.0)).sum())
     if beyond:
-        sentence = f"{tide.name}: is extrapolated for {beyond} images beyond its first or last row."
+        sentence = f"{name}: is extrapolated for {beyond} images beyond its first or last row."
         notes.append(PcfixWarning("tide.extrapolated", sentence, count=beyond))
     longest_h = float(gaps[row].max()) / 3600.0
     if longest_h > LONG_GAP_S / 3600.0:
-        sentence = f"{tide.name}: its rows are up to {longest_h:.1f} h apart; give one each hour."
+        sentence = f"{name}: its rows are up to {longest_h:.1f} h apart; give one each hour."
         notes.append(PcfixWarning("tide.sparse", sentence, hours=longest_h))
     return level - level.mean(), tuple(notes)
+
+
+_WITH_XMP = (".jpg", ".jpeg", ".dng", ".tif", ".tiff")
+FOLDERS = ("", "images")
+"""Where images lie, relative to the folder of the camera file."""
+MOST_IMAGES, HEAD_BYTES = 30, 2**17
+_ABOVE = re.compile(rb"RelativeAltitude(?:=[\"']|>)\s*([+-]?\d+(?:\.\d*)?)")
+
+
+def read_altitudes(cameras: File, labels: Sequence[str]) -> FloatArray:
+    """Return how high each image was taken above the take-off place, shape (k,), metres.
+
+    NaN where it is not recorded. At most `MOST_IMAGES` images near the camera file are read.
+    """
+    altitudes, path, found = np.full(len(labels), np.nan), Path(cameras), {}
+    with suppress(OSError, InputError):  # no correction needs them
+        if path.suffix.lower() == ".psx":
+            chunk = open_chunk(path).document
+            names = {camera.get("id"): camera.get("label") for camera in chunk.root.iter("camera")}
+            for frame in chunk.root.iterfind("frames/frame"):
+                for camera in chunk.follow(frame).root.iter("camera"):
+                    for entry in camera.iter("property"):
+                        label = names.get(camera.get("camera_id"))
+                        if entry.get("name") == "DJI/RelativeAltitude" and label:
+                            with suppress(ValueError):
+                                found[label] = float(entry.get("value", ""))
+        else:
+            root = path if path.is_dir() else path.parent
+            inside = [one for name in FOLDERS for one in sorted(root.joinpath(name).glob("*"))]
+            images = [one for one in inside if one.suffix.lower() in _WITH_XMP and one.is_file()]
+            for image in images[:: 1 + len(images) // MOST_IMAGES]:
+                with image.open("rb") as stream:
+                    if above := _ABOVE.search(stream.read(HEAD_BYTES)):
+                        found[image.name] = float(above[1])
+        row = match_labels(list(found), labels, one_to_one=False).row
+        altitudes[row[row >= 0]] = np.array(list(found.values()))[row >= 0]
+    return altitudes

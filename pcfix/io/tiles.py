@@ -163,12 +163,8 @@ def cloud_of(cloud: Clouds) -> Path | Tiles:
         return path_of(cloud)
     if tiles.broken:
         why = "\n".join(f"  {one}" for one in tiles.broken.values())
-        raise InputError(
-            "cloud.broken_files",
-            f"{tiles}: {len(tiles.broken)} of {len(inputs_of(tiles))} files cannot be read. Replace"
-            f" them, or give only the others:\n{why}",
-            paths=list(tiles.broken),
-        )
+        sentence = f"{len(tiles.broken)} of {len(inputs_of(tiles))} files cannot be read:\n{why}"
+        raise bad_file(tiles, "cloud.broken_files", sentence, paths=list(tiles.broken))
     return tiles
 
 
@@ -211,15 +207,7 @@ def tiles_from(name: str, paths: Iterable[Path]) -> Tiles:
             broken[path] = str(error)
     if not heads:
         raise InputError("cloud.broken_files", next(iter(broken.values())), paths=list(broken))
-    _refuse_mixed(name, kinds)
-    counts, lows, highs, steps = zip(*heads, strict=True)
-    tiles = Tiles(name, tuple(kinds), counts, np.array(lows), np.array(highs), max(steps), broken)
-    _warn_of_overlap(tiles)
-    return tiles
-
-
-def _refuse_mixed(name: str, kinds: dict[Path, tuple[Any, ...]]) -> None:
-    """Refuse files of several coordinate systems, point formats or extra dimensions."""
+    # Refuse files of several coordinate systems, point formats or extra dimensions
     first, *rest = kinds
     for other in rest:
         for words, one, another in zip(
@@ -227,16 +215,12 @@ def _refuse_mixed(name: str, kinds: dict[Path, tuple[Any, ...]]) -> None:
         ):
             if one != another:
                 one, another = (getattr(value, "name", value) for value in (one, another))
-                raise InputError(
-                    "cloud.mixed_tiles",
-                    f"{name}: {first.name} has the {words} {one}, {other.name} {another}. Convert"
-                    " them to the same, or correct them separately.",
-                    paths=[first, other],
-                )
-
-
-def _warn_of_overlap(tiles: Tiles) -> None:
-    """Warn of tiles that lie in each other by more than their borders, as points may be double."""
+                sentence = f"{first.name} has the {words} {one}, {other.name} {another}. Convert"
+                sentence += " them to the same, or correct them separately."
+                raise bad_file(name, "cloud.mixed_tiles", sentence, paths=[first, other])
+    counts, lows, highs, steps = zip(*heads, strict=True)
+    tiles = Tiles(name, tuple(kinds), counts, np.array(lows), np.array(highs), max(steps), broken)
+    # Warn of tiles that lie in each other by more than their borders, as points may be double
     boxes = shapely.box(*tiles.lows[:, :2].T, *tiles.highs[:, :2].T)
     one, other = shapely.STRtree(boxes).query(boxes, predicate="intersects")
     one, other = np.unique(np.sort(np.column_stack([one, other])[one != other], axis=1), axis=0).T
@@ -249,12 +233,7 @@ def _warn_of_overlap(tiles: Tiles) -> None:
     pairs = np.column_stack([one, other])[deep]
     found = [(tiles.paths[i].name, tiles.paths[j].name) for i, j in pairs]
     if found:
-        warnings.warn(
-            PcfixWarning(
-                "cloud.overlap",
-                f"{tiles}: the extents of {found[0][0]} and {found[0][1]} overlap ({len(found)}"
-                " pairs do). Points in both count twice; cut off the buffers of the tiles.",
-                pairs=found,
-            ),
-            stacklevel=3,
-        )
+        sentence = f"{tiles}: {' and '.join(found[0])} overlap, as do {len(found)} pairs. Points in"
+        sentence += " both count twice; cut off the buffers of the tiles."
+        warnings.warn(PcfixWarning("cloud.overlap", sentence, pairs=found), stacklevel=3)
+    return tiles

@@ -1,9 +1,10 @@
-"""Read points, lines and polygons from vector files and tables: shorelines and water masks."""
+"""Read shorelines and water masks from vector files and tables; write layers as a GeoPackage."""
 
 from __future__ import annotations
 
 import re
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,9 +14,10 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from pcfix.errors import PcfixWarning, bad_file
-from pcfix.io.crs import parse_crs
-from pcfix.io.files import check_input
+from pcfix.errors import PcfixWarning, SettingError, bad_file
+from pcfix.io.atomic import cannot_write, temporary_output
+from pcfix.io.crs import LOCAL, parse_crs, way_to_cloud
+from pcfix.io.files import check_input, check_output
 from pcfix.io.tables import (
     DEGREES,
     METRES,
@@ -25,7 +27,6 @@ from pcfix.io.tables import (
     split_header,
     table_below,
 )
-from pcfix.io.transformations import LOCAL, way_to_cloud
 from pcfix.libraries import optional_library
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
@@ -87,10 +88,9 @@ class Vectors:
         """All vertices, shape (n, 3); z is NaN where a geometry has none."""
         return np.asarray(shapely.get_coordinates(self.geometries, include_z=True), np.float64)
 
-    def noted(self, code: str, sentence: str, **values: Any) -> Vectors:
-        """Return the same with one more note."""
-        note = PcfixWarning(code, f"{self.name}: {sentence}", **values)
-        return replace(self, notes=(*self.notes, note))
+    def noted(self, code: str, sentence: str, **values: Any) -> tuple[PcfixWarning, ...]:
+        """Return the notes with one more."""
+        return (*self.notes, PcfixWarning(code, f"{self.name}: {sentence}", **values))
 
 
 def is_vector_file(path: File) -> bool:
@@ -192,13 +192,9 @@ def _read_gdal(path: Path, layer: str | None) -> tuple[Geometries, str | None, s
             geometries = shapely.from_wkb(wkb)
     except (RuntimeError, ValueError, shapely.errors.ShapelyError) as error:
         first = str(error).split(";")[0].strip().rstrip(".")
-        sentence = f"cannot be read ({first}). Export it again."
-        raise bad_file(path, "vector.damaged", sentence) from error
+        raise bad_file(path, "vector.damaged", f"cannot be read ({first}).") from error
     if layer not in names:
-        wanted = f"has no layer {layer} with geometries" if layer else f"has {len(names)} layers"
-        sentence = (
-            f"{wanted} ({', '.join(names)}). Name one: {path.name}{LAYER_MARK}layername=NAME."
-        )
+        sentence = f"has the layers {', '.join(names)}. Name one: {path.name}|layername=NAME."
         raise bad_file(path, "vector.layer", sentence, layer=layer, layers=names)
     name = str(path) if layer == path.stem else f"{path}, layer {layer}"
     crs = meta["crs"]
@@ -232,20 +228,19 @@ def _read_text(path: Path) -> tuple[Geometries, str | None]:
 def _from_wkt(path: Path, lines: list[tuple[int, str]]) -> tuple[Geometries, str | None]:
     """Return the geometry of each numbered line, and the CRS that they name."""
     geometries = np.empty(len(lines), dtype=object)
-    srids: set[str | None] = set()
     for row, (line, text) in enumerate(lines):
-        named = _SRID.match(text)
-        srids.add(f"EPSG:{named.group(1)}" if named else None)
         try:
             geometries[row] = shapely.from_wkt(_SRID.sub("", text).strip())
         except (shapely.errors.ShapelyError, ValueError) as error:
             why = str(error).split(":", 1)[-1].strip()
             sentence = f"line {line} is not WKT ({why}). Write one complete geometry a line."
             raise bad_file(path, "vector.wkt", sentence, line=line) from error
+    srids = {named[1] if (named := _SRID.match(text)) else None for _, text in lines}
     if len(srids) > 1:
         sentence = "its lines name different SRIDs. Write one CRS a file."
         raise bad_file(path, "vector.srids", sentence)
-    return geometries, srids.pop()
+    srid = srids.pop()
+    return geometries, f"EPSG:{srid}" if srid else None
 
 
 def _from_table(path: Path, lines: list[str], at: int) -> tuple[Geometries, str | None]:
@@ -322,12 +317,12 @@ def read_shoreline(
     xyz = np.vstack([given, *between])
     worth = [_worth(line, len(one)) for line, one in zip(drawn, between, strict=True)]
     counts = np.concatenate([np.ones(len(given)), *worth])
-    known = xyz[np.isfinite(xyz[:, 2]), 2]
+    known, notes = xyz[np.isfinite(xyz[:, 2]), 2], vectors.notes
     if len(known) >= FEW and not known.any():  # a flat drawing
         xyz[:, 2] = np.nan
         sentence = f"all {len(known)} heights are exactly 0; they are ignored."
-        vectors = vectors.noted("water.zero_heights", sentence, count=len(known))
-    return Shoreline(xyz, vectors.name, vectors.notes, counts)
+        notes = vectors.noted("water.zero_heights", sentence, count=len(known))
+    return Shoreline(xyz, vectors.name, notes, counts)
 
 
 def _worth(line: Any, points: int) -> FloatArray:
@@ -364,21 +359,86 @@ def read_water_polygons(path: File, cloud_crs: str | CRS | None = None) -> Water
     """Read the polygons inside which points may be submerged, as one area."""
     vectors = in_cloud_crs(read_vectors(path), cloud_crs, heights=False)
     parts = shapely.force_2d(_single_parts(vectors.geometries))
-    is_polygon = shapely.get_type_id(parts) == shapely.GeometryType.POLYGON
-    polygons = parts[is_polygon]
-    crossed = ~shapely.is_valid(polygons)
+    polygons = parts[shapely.get_type_id(parts) == shapely.GeometryType.POLYGON]
+    crossed, notes = ~shapely.is_valid(polygons), vectors.notes
     if crossed.any():
-        reason = shapely.is_valid_reason(polygons[int(np.argmax(crossed))])
         polygons[crossed] = shapely.make_valid(
             polygons[crossed], method="structure", keep_collapsed=False
         )
         count, area_m2 = int(crossed.sum()), float(shapely.area(polygons[crossed]).sum())
-        sentence = f"{count} of {len(polygons)} polygons crossed themselves ({reason}). Repaired,"
+        sentence = f"{count} of {len(polygons)} polygons crossed themselves. Repaired,"
         sentence += f" they cover {area_m2:.1f} m2."
-        vectors = vectors.noted("mask.repaired", sentence, count=count, area_m2=area_m2)
+        notes = vectors.noted("mask.repaired", sentence, count=count, area_m2=area_m2)
     area = shapely.union_all(polygons)
     if not area.area > 0.0:
         kinds = sorted({geometry.geom_type for geometry in vectors.geometries})
         sentence = f"holds no polygon with an area ({', '.join(kinds)}). A mask needs polygons."
         raise bad_file(vectors.name, "mask.no_area", sentence, kinds=kinds)
-    return WaterPolygons(area, vectors.name, vectors.notes)
+    return WaterPolygons(area, vectors.name, notes)
+
+
+OLDER = {"VERSION": "1.2"}
+"""Of GeoPackage: GDAL before 3.7 warns of newer ones."""
+STYLES = "layer_styles"
+"""The table in which QGIS looks for styles, and keeps its own."""
+
+
+class Layer(NamedTuple):
+    """Geometries of one kind (LineString, Point Z ...), by name a value of each, and a style (QML).
+
+    A layer may be empty.
+    """
+
+    name: str
+    kind: str
+    geometries: Sequence[Any]
+    values: dict[str, Any]
+    style: str = ""
+
+
+def check_layers(path: Path) -> None:
+    """Refuse what `write_layers` cannot write."""
+    if path.suffix.lower() != ".gpkg":
+        sentence = f"{path}: lines are written as GeoPackage. Give a name in .gpkg."
+        raise SettingError("output.suffix", sentence, path=path)
+    load_pyogrio()
+
+
+def write_layers(
+    path: File, layers: Sequence[Layer], crs: CRS | str | None, *, overwrite: bool
+) -> None:
+    """Write layers in a CRS as one GeoPackage."""
+    target = check_output(path, overwrite=overwrite)
+    wkt = None if crs is None else parse_crs(crs, "the cloud").to_wkt()
+    with temporary_output(target) as temporary, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a cloud may have no CRS
+        try:
+            for number, one in enumerate(layers):
+                geometry = shapely.to_wkb(np.array([*one.geometries, None], object)[:-1])
+                load_pyogrio().raw.write(
+                    temporary, geometry, [np.asarray(v) for v in one.values.values()],
+                    list(one.values), layer=one.name, crs=wkt, driver="GPKG",
+                    geometry_type=one.kind, append=number > 0,
+                    **({} if number else {"dataset_options": OLDER}),
+                )  # fmt: skip
+            _write_styles(temporary, [one for one in layers if one.style])
+        except RuntimeError as error:
+            raise cannot_write(target, error, temporary) from error
+
+
+def _write_styles(path: Path, layers: Sequence[Layer]) -> None:
+    """Add the table of styles, as QGIS writes it."""
+    columns: dict[str, Any] = {
+        "f_table_catalog": "", "f_table_schema": "", "f_geometry_column": "geom",
+        "f_table_name": [one.name for one in layers], "styleName": [one.name for one in layers],
+        "styleQML": [one.style for one in layers], "styleSLD": "", "description": "pcfix",
+        "owner": "",
+    }  # fmt: skip
+    fields = {name: np.full(len(layers), value, object) for name, value in columns.items()}
+    fields["useAsDefault"] = np.ones(len(layers), bool)
+    fields["update_time"] = np.full(len(layers), "2020-01-01", "datetime64[ms]")
+    if layers:
+        load_pyogrio().raw.write(
+            path, None, [*fields.values()], [*fields], layer=STYLES, driver="GPKG", append=True,
+            crs=None, geometry_type=None,
+        )  # fmt: skip

@@ -1,27 +1,57 @@
-"""Read the water surface: a level, a plane, a dimension, a triangle mesh or a raster.
+"""Read the water surface: a level, a plane, a dimension, a mesh or a raster; write rasters.
 
 Meshes are read here, not by open3d: it returns OBJ coordinates as 32-bit floats, half a metre
 apart at a northing of five million, and a damaged PLY ends the process.
+
+A north-up raster in the cloud's own CRS is used cell by cell. Any other is resampled to a grid in
+the cloud's CRS, with the interpolation of `pcfix.water.surface`, so that a gap stays a gap; GDAL
+would fill half a cell of it. Positions are transformed as those of cameras are, which refuses what
+PROJ can only guess.
 """
 
 from __future__ import annotations
 
-import math
 import os
+import warnings
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import shapely
 
-from pcfix.errors import GeometryError, SettingError, bad_file
+from pcfix.errors import GeometryError, PcfixWarning, SettingError, bad_file
+from pcfix.io.crs import (
+    LOCAL,
+    Notes,
+    Points,
+    is_local,
+    metres_up,
+    parse_crs,
+    parts,
+    transformation,
+    way_to_cloud,
+)
 from pcfix.io.files import check_input
+from pcfix.io.labels import match_labels
 from pcfix.io.ply import Records
-from pcfix.io.water_rasters import read_water_raster
-from pcfix.model import FloatArray, IntArray, WaterDimension, WaterMesh, WaterPlane, WaterSurface
+from pcfix.io.rasters import open_raster, place_of, read_masked
+from pcfix.io.tables import number
+from pcfix.model import (
+    FloatArray,
+    IntArray,
+    WaterDimension,
+    WaterMesh,
+    WaterPlane,
+    WaterRaster,
+    WaterSurface,
+)
 from pcfix.options.declare import File
 
 if TYPE_CHECKING:
     from pyproj import CRS
+    from rasterio.io import DatasetReader
+    from rasterio.transform import Affine
 
 KINDS = (
     "a level such as 0.37, plane:a,b,c, dim:NAME, a mesh (.obj, .ply) or a raster of heights (.tif)"
@@ -67,33 +97,22 @@ def read_water(
     WaterPlane(a=0.37, b=0.0, c=0.0)
     """
     text = str(spec).strip()
-    kind, colon, rest = text.partition(":")
-    if colon and kind.lower() == "dim":
-        if not rest:
-            raise _not_water(text, "name the dimension, as in dim:w_surf")
+    kind, _, rest = text.partition(":")
+    if kind.lower() == "dim" and rest:
         return WaterDimension(rest)
-    is_plane = bool(colon) and kind.lower() == "plane"
-    try:
-        numbers = [float(part) for part in (rest.split(",") if is_plane else [text])]
-    except ValueError:
-        numbers = []
-    suffix = Path(text).suffix.lower()
-    if len(numbers) == (3 if is_plane else 1):
-        if not all(map(math.isfinite, numbers)):
-            raise _not_water(text, "the numbers must be finite")
+    is_plane, suffix = kind.lower() == "plane", Path(text).suffix.lower()
+    numbers = [number(part) for part in (rest.split(",") if is_plane else [text])]
+    if len(numbers) == (3 if is_plane else 1) and np.isfinite(numbers).all():
         return WaterPlane(*numbers)
     if is_plane or not (os.path.lexists(text) or suffix[1:2].isalpha()):
-        raise _not_water(text, "plane: needs three numbers a,b,c" if is_plane else f"give {KINDS}")
+        sentence = f"water '{text}' is not understood. Give {KINDS}."
+        raise SettingError("water.spec", sentence, value=text)
     found = check_input(text)
     if suffix in (".obj", ".ply"):
         return _mesh(found)
     if suffix in _NOT_RASTERS:
         raise bad_file(text, "water.format", f"is not a water surface. Give {KINDS}.")
     return read_water_raster(text, cloud_crs, bounds)
-
-
-def _not_water(text: str, rule: str) -> SettingError:
-    return SettingError("water.spec", f"water '{text}' is not understood: {rule}.", value=text)
 
 
 def _mesh(path: Path) -> WaterMesh:
@@ -104,10 +123,9 @@ def _mesh(path: Path) -> WaterMesh:
     vertices, triangles = read(path)
     if len(triangles) == 0:
         raise bad_file(path, "water.mesh_empty", "has no triangles. Export a mesh.")
-    if not np.isfinite(vertices).all():
-        raise bad_file(path, "water.mesh_damaged", "a vertex is not finite. Export it again.")
-    if triangles.min() < 0 or triangles.max() >= len(vertices):
-        sentence = "a face names a vertex that does not exist. Export it again."
+    missing = (triangles < 0) | (triangles >= len(vertices))
+    if missing.any() or not np.isfinite(vertices).all():
+        sentence = "a vertex is missing or not finite. Export it again."
         raise bad_file(path, "water.mesh_damaged", sentence)
     mesh = WaterMesh(vertices, triangles, path.name)
     try:
@@ -118,8 +136,8 @@ def _mesh(path: Path) -> WaterMesh:
     double, area_m2 = in_two_sheets(tin)
     share = float(area_m2[double].sum() / area_m2.sum())
     if share > MOST_OVERLAP:
-        sentence = f"{100.0 * share:.0f} % of the mesh lies above another part of it. Export one"
-        raise bad_file(path, "water.mesh_overlap", f"{sentence} open surface.", share=share)
+        sentence = f"{100.0 * share:.0f} % of the mesh lies above another part. Export one surface."
+        raise bad_file(path, "water.mesh_overlap", sentence, share=share)
     return mesh
 
 
@@ -127,27 +145,23 @@ def _read_obj(path: Path) -> tuple[FloatArray, IntArray]:
     """Return vertices, shape (v, 3), and triangles, shape (t, 3); a polygon is a fan of these."""
     vertices: list[list[float]] = []
     triangles: list[list[int]] = []
-    for number, line in enumerate(path.read_text("latin-1").splitlines(), start=1):
+    for at, line in enumerate(path.read_text("latin-1").splitlines(), start=1):
         key, *fields = line.split() or [""]
         try:
             if key == "v":
                 x, y, z = fields[:3]
                 vertices.append([float(x), float(y), float(z)])
             elif key == "f":
-                corners = [_obj_index(field, len(vertices)) for field in fields]
+                # a corner such as 7, 7/1/3 or, counted from the end, -1
+                rows = [int(field.split("/")[0]) for field in fields]
+                if max(map(abs, rows), default=0) > _MOST_VERTICES:
+                    raise ValueError(f"there is no vertex {max(rows, key=abs)}")
+                corners = [row - 1 if row > 0 else len(vertices) + row for row in rows]
                 triangles += [[corners[0], *corners[i : i + 2]] for i in range(1, len(corners) - 1)]
         except ValueError as error:
-            sentence = f"line {number} is not an OBJ line ({error})."
-            raise bad_file(path, "water.mesh_damaged", sentence, line=number) from error
+            sentence = f"line {at} is not an OBJ line ({error})."
+            raise bad_file(path, "water.mesh_damaged", sentence, line=at) from error
     return np.array(vertices).reshape(-1, 3), np.array(triangles, dtype=np.int64).reshape(-1, 3)
-
-
-def _obj_index(field: str, count: int) -> int:
-    """Return the row of a corner such as ``7``, ``7/1/3`` or, counted from the end, ``-1``."""
-    index = int(field.split("/")[0])
-    if abs(index) > _MOST_VERTICES:
-        raise ValueError(f"there is no vertex {index}")
-    return index - 1 if index > 0 else count + index
 
 
 def _read_ply(path: Path) -> tuple[FloatArray, IntArray]:
@@ -167,3 +181,247 @@ def _read_ply(path: Path) -> tuple[FloatArray, IntArray]:
     first = np.repeat(start[:-1], count)
     other = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(count) - count, count)
     return vertices.numbers(*"xyz"), corner[np.column_stack([first, other, other + 1])]
+
+
+Bounds = tuple[float, float, float, float]
+
+MARGIN_M = 100.0
+"""Beyond the cloud: piercing points are at most about so far from their points."""
+IMPOSSIBLE_M = 9000.0
+"""No water surface is so far from zero; a height beyond it is a nodata value that is not stated."""
+_UNITS_M = {
+    "": None, "m": 1.0, "metre": 1.0, "meter": 1.0, "metres": 1.0, "meters": 1.0,
+    "cm": 0.01, "mm": 0.001, "ft": 0.3048, "foot": 0.3048, "feet": 0.3048,
+    "us-ft": 1200.0 / 3937.0, "ftus": 1200.0 / 3937.0, "us survey foot": 1200.0 / 3937.0,
+}  # fmt: skip
+MOST_CELLS = 50_000_000
+_EDGE_POINTS = 33
+_AT_ONCE = 1_000_000
+
+
+def read_water_raster(
+    path: File, cloud_crs: str | CRS | None = None, bounds: Bounds | None = None
+) -> WaterRaster:
+    """Read the heights of the water, in the cloud's CRS and metres; warn of what is assumed.
+
+    Parameters
+    ----------
+    path : path
+        A raster of any format that GDAL reads.
+    cloud_crs : str, CRS or None
+        Projected, in metres. If the raster or the cloud names no CRS, that of the other is
+        assumed.
+    bounds : tuple of 4 float, optional
+        West, south, east and north end of the cloud, metres: only this part, and `MARGIN_M`
+        around it, is read. Default, and if one is not finite: the whole raster.
+    """
+    if bounds is not None:
+        west, south, east, north = bounds
+        about = west - MARGIN_M, south - MARGIN_M, east + MARGIN_M, north + MARGIN_M
+        bounds = about if np.isfinite(bounds).all() else None
+    name = str(path)
+    with open_raster(path) as source:
+        if source.count != 1:
+            sentence = f"has {source.count} bands. Write the height of the water as one band."
+            raise bad_file(name, "water.raster_bands", sentence, value=source.count)
+        t = source.transform
+        if t.is_identity or not np.isfinite(t).all() or not abs(t.determinant) > 0.0:
+            sentence = "has no valid geotransform. Export it as GeoTIFF, or with a world file."
+            raise bad_file(name, "water.raster_place", sentence)
+        to_cloud, from_cloud, notes = _ways(source, cloud_crs, bounds, name)
+        part = _read(source, name, None if bounds is None else from_cloud(_edge(bounds)))
+    title = name.replace("\\", "/").rpartition("/")[2]
+    for note in notes + part.notes:
+        warnings.warn(note, stacklevel=3)
+    t = part.transform
+    if to_cloud is None and t.b == t.d == 0.0 and t.a > 0.0 > t.e:  # north-up in the cloud's CRS
+        return WaterRaster(part.heights, float(t.c), float(t.f), (float(t.a), float(-t.e)), title)
+    return _resampled(part, to_cloud or (lambda xyz: xyz), from_cloud, bounds, (name, title))
+
+
+def rasters_of_images(
+    folder: File, names: Sequence[str]
+) -> tuple[dict[int, Path], tuple[str, ...]]:
+    """Find the rasters of the water that have the names of images, by the rows of these.
+
+    The notes are on images without one.
+    """
+    files = sorted(Path(folder).glob("*.tif"))
+    row, unclear = match_labels(names, [one.stem for one in files])
+    if unclear:
+        sentence = f"its raster for {unclear[0]} matches several images. Give images unique names."
+        raise bad_file(folder, "water.image_ambiguous", sentence, image=unclear[0])
+    found = {image: files[at] for image, at in enumerate(row.tolist()) if at >= 0}
+    if not found:
+        sentence = f"has no raster named after an image, such as {Path(names[0]).stem}.tif."
+        raise bad_file(folder, "water.no_image_rasters", sentence)
+    lost = len(names) - len(found)
+    return found, (f"{lost} images have no water raster of their own in {folder}.",) * (lost > 0)
+
+
+def write_water_raster(path: Path, water: WaterRaster, crs: str | None) -> None:
+    """Write a water surface as a GeoTIFF of one band, float64, which `read_water_raster` reads."""
+    import rasterio
+    from rasterio.transform import from_origin
+
+    rows, columns = water.height_m.shape
+    named = crs is not None and crs.strip().lower() != LOCAL
+    parsed = parse_crs(crs or "", "cameras") if named else None
+    profile = {
+        "driver": "GTiff", "width": columns, "height": rows, "count": 1, "dtype": "float64",
+        "nodata": np.nan, "compress": "deflate", "predictor": 3,
+        "crs": (parsed and not is_local(parsed) and rasterio.CRS.from_wkt(parsed.to_wkt())) or None,
+        "transform": from_origin(water.left_m, water.top_m, *water.cell_m),
+    }  # fmt: skip
+    with rasterio.open(path, "w", **profile) as target:
+        target.write(water.height_m, 1)
+
+
+def _ways(
+    source: DatasetReader, cloud_crs: str | CRS | None, bounds: Bounds | None, name: str
+) -> tuple[Points | None, Points, Notes]:
+    """Return the transformation to the cloud (None for none), its inverse in plan, and notes."""
+    stated = None if source.crs is None else source.crs.to_wkt()
+    share = np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0), (0.5, 0.5)])
+    x, y = place_of(source.transform, *(share * [source.width, source.height]).T)
+    at = np.column_stack([x, y, 0.0 * x])
+    forward, notes = way_to_cloud(stated, cloud_crs, at, name, heights=True)
+    if forward is None or stated is None or cloud_crs is None:
+        return None, lambda xyz: xyz, notes
+    cloud, crs = parse_crs(cloud_crs, "the cloud"), parse_crs(stated, name)
+    near = forward(at) if bounds is None else _edge(bounds)
+    back = transformation(cloud, crs, near, name, heights=False)
+    unit = [1.0, 1.0, metres_up(crs)]
+    return lambda xyz: forward(xyz / unit), back.forward, notes
+
+
+def _edge(bounds: Bounds) -> FloatArray:
+    """Return points along bounds, z = 0."""
+    edge = shapely.box(*bounds).exterior
+    share = np.linspace(0, 1, 4 * _EDGE_POINTS)
+    places = shapely.line_interpolate_point(edge, share, normalized=True)
+    xy = np.vstack([shapely.get_coordinates(places), shapely.get_coordinates(edge)])
+    return np.column_stack([xy, np.zeros(len(xy))])
+
+
+class _Part(NamedTuple):
+    """Part of a raster: heights, the transform from (column, row) of it to its CRS, and notes."""
+
+    heights: FloatArray
+    transform: Affine
+    notes: Notes
+
+
+def _read(source: DatasetReader, name: str, near: FloatArray | None) -> _Part:
+    """Read the heights around some places, shape (n, 3), or all; metres of the raster's CRS."""
+    from rasterio.windows import Window
+
+    left, top, right, bottom = 0, 0, source.width, source.height
+    if near is not None and np.isfinite(near).all():
+        column, row = place_of(~source.transform, near[:, 0], near[:, 1])
+        left, right = (int(v) for v in np.clip([column.min() - 2, column.max() + 3], 0, right))
+        top, bottom = (int(v) for v in np.clip([row.min() - 2, row.max() + 3], 0, bottom))
+    if right - left < 2 or bottom - top < 2:
+        sentence = "has fewer than two rows and columns near the cloud. Check its CRS."
+        raise bad_file(name, "water.raster_apart", sentence)
+    _check_size((bottom - top) * (right - left), name)
+    window = Window(left, top, right - left, bottom - top)
+    stored = read_masked(source, window=window)
+    unit_m, notes = _metres(source, name)
+    heights = (stored * source.scales[0] + source.offsets[0]) * unit_m
+    if source.nodata is None:
+        heights[np.abs(heights) > IMPOSSIBLE_M] = np.nan
+    heights[np.isinf(heights)] = np.nan
+    unknown = int(np.isnan(heights).sum())
+    if source.nodata is None and unknown:
+        sentence = f"{name}: has no nodata value. {unknown:,} impossible heights are ignored."
+        notes = (PcfixWarning("water.raster_nodata", sentence, count=unknown), *notes)
+    _check_known(heights, name)
+    return _Part(heights, source.window_transform(window), notes)
+
+
+def _metres(source: DatasetReader, name: str) -> tuple[float, Notes]:
+    """Return how many metres one unit of the heights is: the band's unit, else the CRS's."""
+    stated = (source.units[0] or "").strip()
+    if stated.lower() not in _UNITS_M:
+        sentence = f"its heights are in '{stated}'. Convert them to metres, or correct the unit."
+        raise bad_file(name, "water.raster_unit", sentence, value=stated)
+    factor = _UNITS_M[stated.lower()]
+    if factor is not None or source.crs is None:
+        return factor or 1.0, ()
+    crs = parse_crs(source.crs.to_wkt(), name)
+    factor = 1.0 if is_local(crs) else metres_up(crs)
+    if factor == 1.0 or parts(crs)[1] is not None:
+        return factor, ()
+    sentence = f"{name}: has no unit of heights; that of its CRS is assumed ({factor:.4f} m)."
+    return factor, (PcfixWarning("water.raster_unit", sentence, unit_m=factor),)
+
+
+def _check_known(heights: FloatArray, name: str) -> None:
+    if not np.isfinite(heights).any():
+        sentence = "has no height near the cloud. Check its CRS and its nodata value."
+        raise bad_file(name, "water.raster_empty", sentence)
+
+
+def _check_size(cells: float, name: str) -> None:
+    if not 0.0 < cells <= MOST_CELLS:  # more than memory should hold
+        sentence = f"has {cells:,.0f} cells, {MOST_CELLS:,} at most. Resample it to coarser cells."
+        raise bad_file(name, "water.raster_size", sentence, cells=cells)
+
+
+def _resampled(
+    part: _Part, to_cloud: Points, from_cloud: Points, bounds: Bounds | None, names: tuple[str, str]
+) -> WaterRaster:
+    """Resample to a grid in the cloud's CRS with square cells as small as the raster's smallest.
+
+    `from_cloud` transforms the plan only; `bounds` are in the cloud's CRS; `names` are the
+    raster's for messages and its title.
+    """
+    cell, (west, south, east, north) = _extent(part, to_cloud, names[0])
+    if bounds is not None:
+        west, south = max(west, bounds[0]), max(south, bounds[1])
+        east, north = min(east, bounds[2]), min(north, bounds[3])
+    left, top = np.floor(west / cell) * cell, np.ceil(north / cell) * cell
+    sides = np.maximum(np.ceil([(east - left) / cell, (top - south) / cell]), 2.0)
+    _check_size(float(sides.prod()), names[0])
+    columns, rows = sides.astype(np.int64).tolist()
+    heights = np.empty((rows, columns))
+    x = left + (np.arange(columns) + 0.5) * cell
+    for first in range(0, rows, max(1, _AT_ONCE // columns)):
+        strip = heights[first : first + max(1, _AT_ONCE // columns)]
+        y = top - (first + np.arange(len(strip)) + 0.5) * cell
+        plan = np.column_stack([np.tile(x, len(y)), np.repeat(y, len(x)), np.zeros(strip.size)])
+        strip[:] = _heights_at(part, from_cloud(plan), to_cloud).reshape(strip.shape)
+    _check_known(heights, names[0])
+    return WaterRaster(heights, float(left), float(top), (float(cell), float(cell)), names[1])
+
+
+def _extent(part: _Part, to_cloud: Points, name: str) -> tuple[float, Bounds]:
+    """Return the smaller side of the middle cell, and the bounds, in the cloud's CRS."""
+    rows, columns = part.heights.shape
+    share = np.linspace(0.0, 1.0, _EDGE_POINTS)
+    c, r = (grid.ravel() for grid in np.meshgrid(share * columns, share * rows))
+    amid = columns / 2.0 + np.array([0.0, 1.0, 0.0]), rows / 2.0 + np.array([0.0, 0.0, 1.0])
+    x, y = place_of(part.transform, np.append(c, amid[0]), np.append(r, amid[1]))
+    level = np.full(len(x), np.nanmean(part.heights))
+    placed = to_cloud(np.column_stack([x, y, level]))
+    if not np.isfinite(placed).all():
+        sentence = "extends beyond the area of use of the cloud's CRS. Clip it."
+        raise bad_file(name, "water.raster_place", sentence)
+    sides = np.hypot(*(placed[-2:] - placed[-3])[:, :2].T)
+    (west, south, _), (east, north, _) = placed.min(axis=0), placed.max(axis=0)
+    return sides.min(), (float(west), float(south), float(east), float(north))
+
+
+def _heights_at(part: _Part, places: FloatArray, to_cloud: Points) -> FloatArray:
+    """Return heights in the cloud's CRS at places in the raster's CRS; NaN if unknown."""
+    from pcfix.water.surface import Field, heights_above
+
+    column, row = place_of(~part.transform, places[:, 0], places[:, 1])
+    shape, frame = np.array([[0, *part.heights.shape]]), np.array([[0.5, -0.5, 1.0, 1.0]])
+    cells = Field(part.heights.ravel(), shape, frame, 0)
+    height, _ = heights_above(cells, np.ascontiguousarray(column), np.ascontiguousarray(-row))
+    known = np.isfinite(height)
+    height[known] = to_cloud(np.column_stack([places[known, :2], height[known]]))[:, 2]
+    height[~np.isfinite(height)] = np.nan
+    return np.asarray(height)

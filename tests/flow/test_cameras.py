@@ -13,7 +13,7 @@ import pcfix
 from pcfix.flow.checks import _sensors, check_cameras
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.old_cameras import told_apart
-from pcfix.io.cameras.colmap.writing import write_colmap
+from pcfix.io.cameras.colmap import write_colmap
 from pcfix.lens.imaging import project
 from pcfix.model import Cameras, Lens
 from pcfix.report.cameras import cameras_text

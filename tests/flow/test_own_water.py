@@ -7,7 +7,7 @@ import pytest
 import pcfix
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.correction import OWN_WATER
-from pcfix.io.water_rasters import write_water_raster
+from pcfix.io.water import write_water_raster
 from pcfix.model import Lens, WaterRaster
 from tests.pdal_stage.test_arrays import arrays_of, metadata_of
 from tests.pdal_stage.test_arrays import run as stage

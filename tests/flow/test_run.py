@@ -25,7 +25,7 @@ from pcfix.errors import SettingError
 from pcfix.flow.record import STEPS, Record
 from pcfix.flow.request import Request, request_of, since
 from pcfix.flow.run import run_all
-from pcfix.io import geopackage
+from pcfix.io import vectors
 from pcfix.io.rasters import values_at
 from pcfix.refract.tally import Summary
 from pcfix.report.text import tvu_sentence
@@ -425,7 +425,7 @@ def test_without_reference_and_vectors(tmp_path, monkeypatch):
     def lacking():
         raise SettingError("library.missing", "Vector files need pyogrio.")
 
-    monkeypatch.setattr(geopackage, "load_pyogrio", lacking)
+    monkeypatch.setattr(vectors, "load_pyogrio", lacking)
     page = run_all(request, tmp_path / "out", say=said.append)
     assert sum(line.startswith("map       not written: ") for line in said) == 1
     text = page.read_text()

@@ -21,7 +21,7 @@ from pcfix.flow.inputs import Inputs
 from pcfix.flow.request import Request
 from pcfix.flow.run import run_all
 from pcfix.flow.run_adjust import adjust_first
-from pcfix.io.cameras.colmap.writing import write_colmap
+from pcfix.io.cameras.colmap import write_colmap
 from pcfix.model import TiePoints, Views
 from tests.utils.bent_blocks import GNSS_M, LEVEL_M, TrueBlock
 from tests.utils.codes import refused, warned

@@ -29,7 +29,6 @@ from pcfix.io.views import ViewMatch, read_views
 from tests.fuzz import seeds
 from tests.io import test_ground_control as control
 from tests.io import test_water as water
-from tests.io.cameras import test_bundler as bundles
 from tests.io.cameras import test_colmap as colmap
 from tests.io.cameras import test_metashape as metashape
 from tests.io.cameras import test_realitycapture as realitycapture
@@ -142,7 +141,7 @@ READERS: dict[str, Reader] = {
         **seeds.shared("cameras", "micmac", "li3ds", give="Orientation-00.xml"),
     ),
     "bundler": camera_reader(
-        points=lambda folder: bundles.write(folder, bundles.bundle()[0]), block=seeds.of("Bundler")
+        points=seeds.bundle_file, block=seeds.of("Bundler")
     ),
     "nvm": camera_reader(points=seeds.nvm_file, block=seeds.of("VisualSFM")),
     "blocksexchange": camera_reader(

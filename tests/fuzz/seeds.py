@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from pcfix.io.cameras.colmap import FILE as FILE_OF_PLACE
 from pcfix.io.cameras.colmap import place_text
-from pcfix.io.cameras.colmap.files import MODELS
+from pcfix.io.cameras.colmap.files import BY_NAME
 from pcfix.io.members import FILE, write_members
 from pcfix.model import Cameras, Lens
 from tests.io import test_views as views
@@ -163,6 +163,10 @@ def blocks_exchange(folder: Path) -> Path:
     return made.write(folder, inside)
 
 
+def bundle_file(folder: Path) -> Path:
+    return nvm.write_bundle(folder, nvm.bundle()[0])
+
+
 def nvm_file(folder: Path) -> Path:
     return nvm.write(
         folder, nvm.model(nvm.camera_line("a.jpg"), points=nvm.point_lines(nvm.measured())[:8])
@@ -234,9 +238,9 @@ def camera_lines() -> list[list[object]]:
     """Return a camera of every model of COLMAP, its numbers in the order of the file."""
     numbers = {"f": 500, "fx": 500, "fy": 510, "cx": 410, "cy": 290}
     return [
-        [i + 1, model.name, 800, 600, *(numbers.get(name, 0.01) for name in model.parameters)]
-        for i, model in enumerate(MODELS)
-        if model.projection
+        [i + 1, model, 800, 600, *(numbers.get(name, 0.01) for name in names)]
+        for i, (model, (names, projection)) in enumerate(BY_NAME.items())
+        if projection
     ]
 
 

@@ -118,7 +118,7 @@ def test_given_crs(tmp_path):
     path = write(tmp_path, "\n".join(["image,x,y,z", *rows]))
     found, _ = gnss_in_frame_of(read_gnss(path, block(), crs="EPSG:32635"))
     assert found.xyz == pytest.approx(XYZ, abs=1e-6)
-    with pytest.raises(InputError, match=r"gnss.csv: the CRS 'EPSG:1' is not one"):
+    with pytest.raises(InputError, match=r"PROJ does not know the CRS 'EPSG:1'"):
         read_gnss(path, block(), crs="EPSG:1")
 
 

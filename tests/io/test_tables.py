@@ -51,14 +51,10 @@ def test_check_heights(tmp_path, name):
 
 BAD = [
     ("x,y\n1,2\n", "table.column_missing", {"missing": ["depth or z"]}),
-    ("y,depth\n1,2\n", "table.column_missing", {"missing": ["x"]}),
     ("longitude,latitude,depth\n1,2,3\n", "table.column_missing", {"missing": ["x", "y"]}),
     ("x,y,depth\n", "table.empty", {}),
-    ("", "table.empty", {}),
     ("x,y,depth\n1,2,deep\n", "table.number", {"line": 2, "column": "depth"}),
     ("x,y,depth\n1,2,3\n1,,3\n", "table.number", {"line": 3, "column": "y"}),
-    ("x,y,depth\n1,2,nan\n", "table.number", {"value": "nan"}),
-    ("x,y,depth\n1,2,1e308\n", "table.number", {"value": "1e308"}),
     ("x,y,depth\n1,2,1e400\n", "table.number", {"value": "1e400"}),
     ("x,y,depth\n1,2,1\n5,6,-3\n5,6,-4\n", "check_depths.negative", {"line": 3, "count": 2}),
     ("x,y,depth\n1,2\n", "table.shifted", {"line": 2}),
@@ -66,7 +62,6 @@ BAD = [
     ("x,y,depth_cm\n1,2,300\n", "table.unit", {"column": "depth_cm", "value": "cm"}),
     ("x,y,depth (ft)\n1,2,3\n", "table.unit", {"value": "ft"}),
     ("x,easting,y,depth\n1,1,2,3\n", "table.column_twice", {"columns": ["x", "easting"]}),
-    ("x,y,depth,depth\n1,2,3,4\n", "table.column_twice", {"columns": ["depth", "depth"]}),
 ]
 
 

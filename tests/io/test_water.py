@@ -9,7 +9,7 @@ from rasterio.transform import Affine, from_origin
 
 import pcfix
 from pcfix.io.scenes import write_scene
-from pcfix.io.water_rasters import MARGIN_M
+from pcfix.io.water import MARGIN_M
 from pcfix.water.surface import surface_above
 from tests.utils.codes import refused, warned
 from tests.utils.shared import needs
@@ -269,7 +269,7 @@ FLAT = np.full((20, 20), 10.0)
 )
 def test_bad_rasters(tmp_path, monkeypatch, name, content, more, code):
     path = tmp_path / name
-    monkeypatch.setattr("pcfix.io.water_rasters.MOST_CELLS", 300)
+    monkeypatch.setattr("pcfix.io.water.MOST_CELLS", 300)
     if isinstance(content, bytes):
         path.write_bytes(content)
     else:
@@ -355,38 +355,3 @@ def test_steep_water(scene, tmp_path):
     for water in (plane, mesh, steep):
         with pytest.raises(pcfix.GeometryError, match=r" 6\.0 %"):
             corrected(scene, tmp_path / "a.las", water)
-
-
-def moved(scene, path, up, scale=1.0):
-    """Write the scene's cloud and cameras higher up, or in another unit of height."""
-    folder, _ = scene
-    las = laspy.read(folder / "cloud.laz")
-    las.change_scaling(offsets=[*las.header.offsets[:2], up])
-    las.z = (np.asarray(las.z) + up) * scale
-    las.write(path / "cloud.laz")
-    rows = (folder / "cameras.csv").read_text().splitlines()
-    at = rows[0].split(",").index("z")
-    table = [row.split(",") for row in rows]
-    for row in table[1:]:
-        row[at] = str((float(row[at]) + up + 500.0) * scale)
-    (path / "cameras.csv").write_text("\n".join(map(",".join, table)) + "\n")
-    (path / "sensor.csv").write_text((folder / "sensor.csv").read_text())
-    return path, scene[1]
-
-
-def test_water_far_from_the_cloud(scene, tmp_path):
-    (tmp_path / "feet").mkdir()
-    there, in_feet = (
-        moved(scene, tmp_path, 174.0),
-        moved(scene, tmp_path / "feet", 174.0, 1 / 0.3048),
-    )
-    cases = [
-        (scene, -40, False),
-        (there, 174.37 / 0.3048, True),
-        (there, 400, False),
-        (in_feet, 174.37, True),
-    ]
-    for block, level, feet in cases:
-        with pytest.raises(pcfix.GeometryError) as caught:
-            corrected(block, tmp_path / "a.las", level)
-        assert ("in feet" in str(caught.value)) == feet

@@ -12,7 +12,7 @@ import rasterio
 
 import pcfix
 from pcfix.flow.photos import map_photos
-from pcfix.io.water_rasters import read_water_raster
+from pcfix.io.water import read_water_raster
 from pcfix.model import Lens
 from pcfix.photos.calm import Follower, laid, median_of, register
 from pcfix.photos.mapping import Photo

@@ -14,7 +14,7 @@ from pcfix.adjust.solve import solve
 from pcfix.errors import SettingError
 from pcfix.flow.adjust import adjust_cameras
 from pcfix.flow.next_steps import correct_words
-from pcfix.io.cameras.colmap.writing import write_colmap
+from pcfix.io.cameras.colmap import write_colmap
 from pcfix.kernels import threads
 from pcfix.model import TiePoints
 from pcfix.options.survey import AdjustOptions

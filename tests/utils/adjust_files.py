@@ -9,7 +9,7 @@ import laspy
 import numpy as np
 from pyproj import CRS
 
-from pcfix.io.cameras.colmap.writing import write_colmap
+from pcfix.io.cameras.colmap import write_colmap
 from tests.utils.tie_points import simulate_tie_points
 from tests.utils.unaware_blocks import apparent_cloud, parted, unaware
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from pcfix.adjust.block import Unknowns
 from pcfix.adjust.problem import prepare, solved_cameras
 from pcfix.adjust.solve import solve
-from pcfix.io.cameras.colmap.writing import write_colmap
+from pcfix.io.cameras.colmap import write_colmap
 from pcfix.lens.imaging import unproject
 from pcfix.model import Cameras, GnssPositions, Lens, TiePoints, Views
 from pcfix.simulate.scene import ORIGIN_M

@@ -32,7 +32,7 @@ import io
 import math
 import re
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PureWindowsPath
 from typing import NamedTuple
@@ -70,7 +70,7 @@ def recognises(source: Source) -> bool:
 
 def read(source: Source) -> Cameras:
     """Read poses and lenses, in the CRS of the block."""
-    return _read_block(source.path).cameras
+    return _read_block(source.path)[0]
 
 
 def _read_bytes(path: Path) -> bytes:
@@ -100,20 +100,12 @@ class Photo(NamedTuple):
     prior: tuple[str, FloatArray] | None
 
 
-class Block(NamedTuple):
-    """All photos of a document that belong together.
+def _read_block(path: Path) -> tuple[Cameras, list[Photo], list[tuple[int, str, bytes]]]:
+    """Read all photos of a document, and the texts of its tie points.
 
-    `tie_points` are the texts of the tie points, with the number and the SRS id of their block:
-    a tree of elements for millions of measurements would take minutes.
+    The texts have the number and the SRS id of their block: a tree of elements for millions of
+    measurements would take minutes.
     """
-
-    cameras: Cameras
-    photos: list[Photo]
-    tie_points: list[tuple[int, str, bytes]]
-
-
-def _read_block(path: Path) -> Block:
-    """Read all photos of a document."""
     data = _read_bytes(path)
     root = read_xml(path, io.BytesIO(TIE_POINTS.sub(b"", data)))
     posed: list[Photo] = []
@@ -148,6 +140,12 @@ def _read_block(path: Path) -> Block:
         sentence = f"{why}. Export the one block that the cloud was made from, in one SRS."
         raise bad_file(path, "cameras.several_blocks", sentence)
     lenses = [photo.group.lens for photo in photos if photo.group.lens is not None]
+    gnss, nothing = None, np.full(3, np.nan)
+    of = next((photo.prior[0] for photo in photos if photo.prior is not None), None)
+    if of is not None:  # positions in the CRS that the first of them has
+        xyz = np.array([p.prior[1] if p.prior and p.prior[0] == of else nothing for p in photos])
+        crs = "EPSG:4326" if of == "exif" else _crs_of(path, root, of)
+        gnss = GnssPositions(xyz, np.full_like(xyz, np.nan), crs)
     chosen = {photo.key for photo in photos}
     cameras = Cameras(
         labels=tuple(photo.label for photo in photos),
@@ -156,7 +154,7 @@ def _read_block(path: Path) -> Block:
         lenses=tuple(lenses) if turned and len(lenses) == len(photos) else None,
         crs=_crs_of(path, root, photos[0].srs),
         notes=_notes(path, photos, ignored),
-        gnss=_gnss(path, root, photos),
+        gnss=gnss,
         unposed=(*unposed, *(photo.label for photo in everything if photo.key not in chosen)),
         source="BlocksExchange",
     )
@@ -164,7 +162,7 @@ def _read_block(path: Path) -> Block:
     for match in TIE_POINTS.finditer(data):
         i = data.count(b"<Block>", 0, match.start()) - 1
         texts.append((i, text_of(blocks[i], "SRSId"), match[1]))
-    return Block(cameras, photos, texts)
+    return cameras, photos, texts
 
 
 def _photo(path: Path, block: int, element: Element, group: Photogroup, srs: str) -> Photo:
@@ -185,17 +183,12 @@ def _photo(path: Path, block: int, element: Element, group: Photogroup, srs: str
 def _notes(path: Path, photos: list[Photo], ignored: list[str]) -> tuple[PcfixWarning, ...]:
     notes = []
     if ignored:
-        sentence = (
-            f"the poses of photogroup {', '.join(ignored[:10])} are not those of the block"
-            " (ManualPose is false). Its photos are left out."
-        )
+        sentence = f"photogroup {', '.join(ignored[:10])} is skipped (its ManualPose is false)."
         notes.append(note(path, "cameras.poses_ignored", sentence, photogroups=ignored))
     if photos[0].rotation is None:
-        sentence = "no photo has a rotation, only positions are read."
-        notes.append(note(path, "cameras.no_rotations", sentence))
-    elif any(photo.group.lens is None for photo in photos):
-        label = next(photo.label for photo in photos if photo.group.lens is None)
-        why = f"the photogroup of {label} has no frame or focal length"
+        notes.append(note(path, "cameras.no_rotations", "no photo has a rotation, only positions."))
+    elif (one := next((p for p in photos if p.group.lens is None), None)) is not None:
+        why = f"the photogroup of {one.label} has no frame or focal length"
         notes.append(checks.without_lens(path, why))
     return tuple(notes)
 
@@ -206,29 +199,18 @@ def _rotation(
     """Return world to x right, y down, z forward; None where there is no rotation."""
     if element is None:
         return None
+    where = f"image {label}"
     if element.find("M_00") is not None:
         names = [f"M_{row}{column}" for row in range(3) for column in range(3)]
-        return axes @ _numbers(path, f"image {label}", element, names).reshape(3, 3)
+        return axes @ _numbers(path, where, element, names).reshape(3, 3)
     if element.find("Omega") is not None:
-        angles = _numbers(path, f"image {label}", element, ["Omega", "Phi", "Kappa"])
+        angles = _numbers(path, where, element, ["Omega", "Phi", "Kappa"])
         matrix = from_photogrammetric(from_omega_phi_kappa(*angles.reshape(3, 1)))[0]
         return np.asarray(axes @ matrix)
     if element.find("Pitch") is not None:
         what = f"the rotation of {label} by yaw (or heading), pitch and roll"
-        remedy = "Export rotations as matrices or omega, phi, kappa"
-        raise checks.unsupported(path, what, remedy, image=label)
+        raise checks.unsupported(path, what, "Export rotations as matrices", image=label)
     return None
-
-
-def _gnss(path: Path, root: Element, photos: list[Photo]) -> GnssPositions | None:
-    """Return one row per photo; positions in the CRS that the first of them has."""
-    srs = next((photo.prior[0] for photo in photos if photo.prior is not None), None)
-    if srs is None:
-        return None
-    nothing = np.full(3, np.nan)
-    xyz = np.array([p.prior[1] if p.prior and p.prior[0] == srs else nothing for p in photos])
-    crs = "EPSG:4326" if srs == "exif" else _crs_of(path, root, srs)
-    return GnssPositions(xyz, np.full_like(xyz, np.nan), crs)
 
 
 def _crs_of(path: Path, root: Element, srs_id: str) -> str:
@@ -241,11 +223,11 @@ def _crs_of(path: Path, root: Element, srs_id: str) -> str:
     definition = definitions[srs_id].strip()
     if not definition.upper().startswith("ENU:"):
         return checks.crs(path, definition)
-    words = [*definition[4:].split(","), "0"][:3]
+    words = [word.strip() for word in [*definition[4:].split(","), "0"][:3]]
     latitude, longitude, _ = map(float, words)
     if not (abs(latitude) <= 90.0 and abs(longitude) <= 360.0):
         raise damaged(path, f"'{definition[:80]}' is not ENU:latitude,longitude in degrees")
-    return "ENU:" + ",".join(word.strip() for word in words)
+    return "ENU:" + ",".join(words)
 
 
 def _numbers(path: Path, where: str, element: Element, names: Sequence[str]) -> FloatArray:
@@ -358,34 +340,38 @@ class Photogroup:
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """Read the tie points that a posed photo saw; those of another CRS lose their coordinates."""
+    from defusedxml.ElementTree import iterparse  # one by one: no tree holds millions of them
+
     path = source.path
-    block = _read_block(path)
-    row_of = {photo.key: row for row, photo in enumerate(block.photos)}
+    _, photos, texts = _read_block(path)
+    row_of = {photo.key: row for row, photo in enumerate(photos)}
     xyz: list[list[float]] = []
     point, camera, uv = [], [], []
-    for i, srs_of_block, text in block.tie_points:
+    for i, srs_of_block, text in texts:
         where, inside = _inside(path, text)
         head = SRS_OF_ALL.search(inside[: inside.find(b"<TiePoint>")])
         srs_of_all = srs_of_block if head is None else head[1].decode()
         with checks.reading(where):
-            for element in _elements(inside):
+            for _, element in iterparse(io.BytesIO(b"<All>" + inside + b"</All>")):
+                if element.tag != "TiePoint":
+                    continue
                 seen = [
                     (row_of[key], mark)
                     for mark in element.iterfind("Measurement")
                     if (key := (i, text_of(mark, "PhotoId"))) in row_of
                 ]
                 if not seen:
+                    element.clear()
                     continue
                 for row, mark in seen:
                     point.append(len(xyz))
                     camera.append(row)
-                    uv.append(block.photos[row].group.place(mark))
-                place = element.find("Position")
-                is_here = (text_of(element, "SRSId") or srs_of_all) == block.photos[0].srs
-                if place is not None and is_here:
-                    xyz.append([float(text_of(place, axis)) for axis in "xyz"])
-                else:
-                    xyz.append([math.nan] * 3)
+                    uv.append(photos[row].group.place(mark))
+                place, srs = element.find("Position"), text_of(element, "SRSId") or srs_of_all
+                known = place is not None and srs == photos[0].srs
+                axes = [text_of(place, a) for a in "xyz"] if place is not None and known else ()
+                xyz.append([float(text) for text in axes] or [math.nan] * 3)
+                element.clear()
     if not xyz:
         raise tracks.no_tie_points(path, f"none was seen by one of its {len(cameras)} photos")
     seen_all = tracks.Seen(np.array(xyz), np.array(point), np.array(camera), np.array(uv))
@@ -402,13 +388,3 @@ def _inside(path: Path, text: bytes) -> tuple[Path, bytes]:
         if place.is_file():
             return place, DECLARATION.sub(b"", _read_bytes(place))
     raise checks.missing(path.parent / plain, "Keep the file of the tie points beside the block")
-
-
-def _elements(text: bytes) -> Iterator[Element]:
-    """Yield the tie points of a text one by one, so that no tree holds millions of them."""
-    from defusedxml.ElementTree import iterparse
-
-    for _, element in iterparse(io.BytesIO(b"<All>" + text + b"</All>")):
-        if element.tag == "TiePoint":
-            yield element
-            element.clear()

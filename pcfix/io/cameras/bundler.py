@@ -52,7 +52,15 @@ def recognises(source: Source) -> bool:
 def read(source: Source) -> Cameras:
     """Read the poses of images with a focal length, and their lenses where sizes are known."""
     path, bundle = source.path, _read(source.path)
-    names = _names(path, bundle)
+    names = [f"{'view' if bundle.mve else 'camera'} {i}" for i in range(len(bundle.cameras))]
+    stem = path.name.removesuffix(".out")
+    own = (stem, path.name, stem.removesuffix(".bundle"))
+    places = [path.with_name(name) for name in (*(f"{one}.list.txt" for one in own), "list.txt")]
+    for place in (path.parent.parent / "list.txt", *places[::-1]):  # the last that fits counts
+        if place.is_file():
+            lines = [line.strip() for line in checks.read_text(place).splitlines() if line.strip()]
+            if len(lines) == len(names):
+                names = [_FOCAL_OF_LIST.sub("", line) for line in lines]
     labels, rows = tuple(names[i] for i in bundle.posed), bundle.cameras[bundle.posed]
     rotations = checks.rotations(path, labels, rows[:, 3:12])
     focal, k1, k2 = rows[:, :3].T
@@ -101,16 +109,3 @@ def _read(path: Path) -> Bundle:
     if not len(posed):
         raise checks.no_pose(path, "no image has a pose (all focal lengths are 0)")
     return Bundle(version is None, cameras, posed, listed)
-
-
-def _names(path: Path, bundle: Bundle) -> list[str]:
-    """Return the names of all images, from the list beside the file if it fits."""
-    stem = path.name.removesuffix(".out")
-    own = (f"{stem}.list.txt", f"{path.name}.list.txt", f"{stem.removesuffix('.bundle')}.list.txt")
-    places = [path.with_name(name) for name in (*own, "list.txt")]
-    for place in (*places, path.parent.parent / "list.txt"):
-        if place.is_file():
-            lines = [line.strip() for line in checks.read_text(place).splitlines() if line.strip()]
-            if len(lines) == len(bundle.cameras):
-                return [_FOCAL_OF_LIST.sub("", line) for line in lines]
-    return [f"{'view' if bundle.mve else 'camera'} {i}" for i in range(len(bundle.cameras))]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import lzma
 import re
 import sqlite3
@@ -51,8 +50,7 @@ def no_pose(path: Path, why: str = "no image has a pose") -> InputError:
 
 def unsupported(path: Path, what: str, remedy: str, **values: Any) -> InputError:
     """Return the error for a lens, rotation or frame that pcfix has no model for."""
-    sentence = f"{what} is not supported. {remedy}."
-    return bad_file(path, "cameras.unsupported", sentence, **values)
+    return bad_file(path, "cameras.unsupported", f"{what} is not supported. {remedy}.", **values)
 
 
 def missing(path: Path, remedy: str = "Keep all files of the project together") -> InputError:
@@ -73,10 +71,7 @@ def note(path: object, code: str, sentence: str, **values: Any) -> PcfixWarning:
 
 def several(path: Path, count: int, images: int) -> PcfixWarning:
     """Return a note on models that are not connected, of which the largest is read."""
-    sentence = (
-        f"has {count} models that are not connected. The largest is read, with {images} images;"
-        " those of the others are left out."
-    )
+    sentence = f"has {count} separate models. Only the largest is read, with {images} images."
     return note(path, "cameras.several_models", sentence, models=count, images=images)
 
 
@@ -169,10 +164,7 @@ def rotations(path: Path, labels: Sequence[str], matrices: FloatArray) -> FloatA
     bad = ~((off <= ROUNDING) & (np.linalg.det(np.nan_to_num(matrices, posinf=0.0)) > 0.0))
     if bad.any():
         label = labels[int(np.argmax(bad))]
-        sentence = (
-            f"the rotation of {label} is mirrored, or its axes are not at right angles. Export the"
-            " poses again."
-        )
+        sentence = f"the rotation of {label} is mirrored or skewed. Export the poses again."
         raise bad_file(path, "cameras.rotation", sentence, image=label)
     for _ in range(2):  # Newton's iteration to the polar factor squares the rounding each time
         matrices = 1.5 * matrices - 0.5 * matrices @ matrices.transpose(0, 2, 1) @ matrices
@@ -198,16 +190,11 @@ def centres(rotations: FloatArray, translations: FloatArray) -> FloatArray:
 
 def lens(path: Path, name: str, given: Lens) -> Lens:
     """Return the lens when its numbers can be those of a camera."""
-    lists = (given.shape, given.radial, given.denominator, given.tangential, given.thin_prism)
-    frame = (given.focal, given.width, given.height, given.principal_x, given.principal_y)
-    affine = (given.b1, given.b2, given.b3)
-    numbers = (*frame, *affine, *itertools.chain(*lists), *given.distortion_centre)
+    numbers = np.hstack([v for v in astuple(given) if isinstance(v, float | tuple)])
+    frame = f"{given.width:g} x {given.height:g}"
     positive = min(given.focal, given.focal + given.b1, given.width, given.height) > 0.0
     if not (positive and np.isfinite(numbers).all()):
-        sentence = (
-            f"the lens {name} has the focal length {given.focal:g} and the frame {given.width:g} x"
-            f" {given.height:g}, or a number that is not finite. Export the calibration again."
-        )
+        sentence = f"the lens {name} is damaged (focal length {given.focal:g}, frame {frame})."
         raise bad_file(path, "cameras.lens", sentence, lens=name)
     return given
 
@@ -238,10 +225,7 @@ def crs(path: Path, definition: str) -> str:
     if text.lower() == "local" or text.upper().startswith(("LOCAL_CS", "ENGCRS", "ENGINEERINGCRS")):
         return "local"
     if not names_crs(text):
-        sentence = (
-            f"PROJ does not know the CRS '{text[:80]}'. Export the poses in a CRS with an EPSG"
-            " code."
-        )
+        sentence = f"PROJ does not know the CRS '{text[:80]}'. Export in a CRS with an EPSG code."
         raise bad_file(path, "cameras.crs", sentence, crs=text)
     return text
 
@@ -283,10 +267,8 @@ def block_to_write(
 
 def lens_not_held(path: Path, given: Lens) -> InputError:
     """Return the error for a lens that a format cannot hold exactly."""
-    sentence = (
-        f"the format cannot hold the lens {given.sensor or 'of the images'}"
-        f" ({given.projection} in {given.unit}) exactly. Take another format."
-    )
+    kind = f"{given.sensor or 'of the images'} ({given.projection} in {given.unit})"
+    sentence = f"the format cannot hold the lens {kind} exactly. Take another format."
     return bad_file(path, "output.lens", sentence, lens=given.sensor)
 
 

@@ -27,28 +27,26 @@ from pcfix.io.crs import (
     GEOCENTRIC_WGS84,
     GEOGRAPHIC_WGS84,
     METRES,
+    HeightsError,
     Topocentric,
+    Transformation,
     check_projected_metres,
     crs_text,
     geographic_3d,
+    heights_agree,
     heights_of,
     is_local,
+    is_same_numbers,
     is_topocentric,
     metres_up,
     parse_crs,
     parts,
     plan_unit,
     shortened,
+    transformation,
     typed,
     unbound,
     with_heights,
-)
-from pcfix.io.transformations import (
-    HeightsError,
-    Transformation,
-    heights_agree,
-    is_same_numbers,
-    transformation,
 )
 from pcfix.model import Cameras, FloatArray, GnssPositions
 
@@ -105,10 +103,7 @@ class Frame(NamedTuple):
         if bad.any():
             i = int(np.argmax(bad))
             numbers = ", ".join(f"{number:.10g}" for number in xyz[i])
-            sentence = (
-                f"image {labels[i]}: {numbers} are not {kind} ({self.crs.name}). Give the CRS of"
-                " the cameras with --cameras-crs."
-            )
+            sentence = f"image {labels[i]}: {numbers} are not {kind}. Give --cameras-crs."
             raise bad_file(name, code, sentence, image=labels[i], crs=self.crs.name)
 
 
@@ -165,17 +160,14 @@ class Statement(NamedTuple):
 
 def statement(cameras: Cameras, cameras_crs: str | None, name: str) -> Statement:
     """Combine the CRS of the file with the user's ``--cameras-crs``."""
-    project = _on_earth(cameras.project_crs, name)
-    given = (cameras_crs or "").strip()
+    project, given = _on_earth(cameras.project_crs, name), (cameras_crs or "").strip()
     if not given:
         return Statement(cameras.crs, project)
     crs, own = _on_earth(given, "--cameras-crs"), _on_earth(cameras.crs, name)
-    if crs is None:
-        return Statement(given, None, chosen=True, trusted=True)
-    if crs.is_geocentric:
+    if crs is not None and crs.is_geocentric:
         return Statement(given, project, chosen=True)
-    trusted = heights_of(crs) == "unstated"
-    if own is not None and own.is_geocentric:
+    trusted = crs is None or heights_of(crs) == "unstated"
+    if crs is not None and own is not None and own.is_geocentric:
         return Statement(cameras.crs, crs, chosen=True, trusted=trusted)
     return Statement(given, None, chosen=True, trusted=trusted)
 
@@ -202,10 +194,8 @@ class Georeference:
         if lost.any():
             i = int(np.argmax(lost))
             x, y, z = cameras.centres[i] + self.offset
-            sentence = (
-                f"image {cameras.labels[i]}: its position {x:.10g}, {y:.10g}, {z:.6g} cannot be"
-                f" transformed to {shortened(self.crs or '')}. Check --cameras-crs."
-            )
+            sentence = f"image {cameras.labels[i]}: {x:.10g}, {y:.10g}, {z:.6g} is outside"
+            sentence += f" {shortened(self.crs or '')}. Check --cameras-crs."
             raise bad_file(self.name, "cameras.not_transformed", sentence, image=cameras.labels[i])
         if rotations is not None and self.transformation is not None:
             rotations = rotations @ self.turns(cameras.centres).transpose(0, 2, 1)
@@ -233,10 +223,7 @@ class Georeference:
             return np.full((len(xyz), 3, 3), np.nan)
         vectors = (ahead - behind).reshape(-1, 3, 3).transpose(0, 2, 1)
         if (np.linalg.det(vectors) < 0.0).any():
-            sentence = (
-                f"the axes of {self.frame.crs.name} are left-handed, so rotations have no meaning"
-                " in it. Export the cameras in another CRS."
-            )
+            sentence = f"the axes of {self.frame.crs.name} are left-handed. Use another CRS."
             raise bad_file(self.name, "cameras.left_handed", sentence, crs=self.frame.crs.name)
         u, _, v = np.linalg.svd(vectors)
         return np.asarray(u @ v)
@@ -281,21 +268,17 @@ def georeference(
     cloud = None if cloud_crs is None else parse_crs(cloud_crs, "the cloud")
     stated = statement(cameras, cameras_crs, name)
     crs, tied = stated.crs or "", is_tied(stated.crs, name)
-    if not tied and cloud is None:
-        return Georeference(None, None, offset, stated.crs, (), name)
-    if not tied and cloud is not None:
+    if not tied:
+        if cloud is None:
+            return Georeference(None, None, offset, stated.crs, (), name)
         if stated.crs is not None and not stated.chosen and not is_local(cloud):
-            sentence = (
-                f"is in a local frame, but the cloud is in {cloud.name}. Export the cameras in that"
-                " CRS, or give --cameras-crs local if their numbers differ by a shift at most."
-            )
+            sentence = f"is in a local frame, the cloud in {cloud.name}. Export the cameras in that"
+            sentence += " CRS, or give --cameras-crs local to use their numbers as they are."
             raise bad_file(name, "cameras.local", sentence, cloud_crs=cloud.name)
         return Georeference(None, None, offset, crs_text(cloud), (), name)
     if cloud is not None and is_local(cloud):
-        sentence = (
-            f"is in {shortened(crs)}, but the cloud is in a local frame ({cloud.name}). Set the"
-            " cloud's CRS, or give --cameras-crs local to take the numbers as they are."
-        )
+        sentence = f"is in {shortened(crs)}, the cloud in a local frame. Set the cloud's CRS, or"
+        sentence += " give --cameras-crs local to use the numbers as they are."
         raise bad_file(name, "cloud.local", sentence, crs=crs, cloud_crs=cloud.name)
     frame = frame_of(crs, name)
     if cloud is not None:
@@ -307,10 +290,7 @@ def georeference(
         found = Georeference(None, None, offset, stated.crs, (), name)
     elif frame.direct or stated.project is None or not stated.project.is_projected:
         kind = "degrees" if frame.direct else "geocentric coordinates"
-        sentence = (
-            f"is in {kind} ({frame.crs.name}) and no cloud names a CRS. Give the cloud, or set its"
-            " CRS."
-        )
+        sentence = f"is in {kind} ({frame.crs.name}). Give a cloud that names its CRS."
         raise bad_file(name, "cloud.no_crs", sentence, crs=frame.crs.name)
     else:
         words = stated.project.name
@@ -325,10 +305,7 @@ def _into(
     """Return the way from a frame tied to the earth into a CRS."""
     check_projected_metres(cloud, "the cloud")
     if frame.direct and frame.crs.is_geographic and offset.any():
-        sentence = (
-            f"an offset in metres cannot be added to degrees ({frame.crs.name}). Leave it out, or"
-            " export the cameras in a projected CRS."
-        )
+        sentence = f"an offset in metres cannot be added to degrees ({frame.crs.name}). Omit it."
         raise bad_file(name, "cameras.offset", sentence, value=offset.tolist())
     at = cameras.centres + offset
     frame.check(at, cameras.labels, name)
@@ -342,12 +319,10 @@ def _into(
     if frame.direct and not heights and is_same_numbers(frame.crs, target):
         return Georeference(frame, None, offset, crs, notes, name)
     plan = typed(parts(frame.crs if frame.direct else target)[0])
-    given = f"{plan}, the horizontal CRS alone"
-    if frame.topocentric:
-        given = "ENU:latitude,longitude,height with the height in the cloud's system"
-    instead = "or, if the heights of cameras and cloud are known to agree, give --cameras-crs "
+    given = "ENU:latitude,longitude,height" if frame.topocentric else plan
+    instead = f"or, if the heights of cameras and cloud agree, give --cameras-crs {given}"
     step = transformation(
-        frame.crs, target, frame.enter(at), name, heights=heights, instead=instead + given
+        frame.crs, target, frame.enter(at), name, heights=heights, instead=instead
     )
     of_step = (PcfixWarning("crs.transformation", str(one), path=name) for one in step.notes)
     found = Georeference(frame, step, offset, crs, (*of_step, *notes), name)
@@ -358,12 +333,9 @@ def _into(
         up = adjusted_minus_gnss(found.cameras(cameras), name).enu_m[:, 2]
         off = float(np.median(up[np.isfinite(up)])) if np.isfinite(up).any() else 0.0
         if abs(off) >= UNDULATION_M[0]:
-            sentence = (
-                f"with the heights of --cameras-crs ({target.name}) the cameras are"
-                f" {abs(off):.1f} m {'above' if off > 0.0 else 'below'} their GNSS positions."
-                " Install the grid instead; the file has heights above the ellipsoid"
-                f" ({frame.crs.name})."
-            )
+            side = "above" if off > 0.0 else "below"
+            sentence = f"with the heights of --cameras-crs the cameras are {abs(off):.1f} m {side}"
+            sentence += " their GNSS positions. Install the grid of the geoid instead."
             differ = note(name, "cameras.heights_differ", sentence, metres=off)
             return replace(found, notes=(*found.notes, differ))
     return found
@@ -385,26 +357,18 @@ def _height_notes(
     elif own == "unstated" and cloud != "unstated":
         what = f"does not say what its heights are; taken to be the cloud's ({target.name})"
     elif own == "ellipsoidal" and cloud == "unstated" and is_guess:
-        what = (
-            f"the cloud's CRS ({target.name}) does not say what its heights are; taken to be"
-            f" ellipsoidal, of {frame.crs.name}"
-        )
+        what = f"the cloud's CRS ({target.name}) names no vertical datum; ellipsoidal is assumed"
     else:
         return ()
     return (note(name, "cameras.heights_assumed", f"{what}."),)
 
 
-@dataclass(frozen=True, eq=False)
-class GnssDifferences:
+class GnssDifferences(NamedTuple):
     """Adjusted centres minus positions of the GNSS.
 
-    Attributes
-    ----------
-    enu_m : array, shape (k, 3)
-        East, north, up in metres, in the axes of the cameras' map where they are in one; NaN
-        where a camera has no position, or where the two cannot be compared.
-    reason : str
-        Why some or all of it cannot be compared; empty where all of it is.
+    `enu_m`, shape (k, 3), is east, north, up in metres, in the axes of the cameras' map where they
+    are in one; NaN where a camera has no position, or where the two cannot be compared, and
+    `reason` says why.
     """
 
     enu_m: FloatArray
@@ -436,16 +400,11 @@ def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> GnssDifferen
         if frame.direct and frame.crs.is_projected:
             return GnssDifferences(np.asarray(plain / frame.per_metre(cameras.centres)))
     if gnss.crs is None or not tied or not is_tied(gnss.crs, name):
-        reason = (
-            f"{name}: positions of the GNSS and adjusted centres are not both tied to the earth,"
-            " so they cannot be compared."
-        )
+        reason = f"{name}: the cameras or the GNSS positions name no CRS; they are not compared."
         return GnssDifferences(np.full((len(cameras), 3), np.nan), reason)
     kinds = [heights_of(frame_of(each, name).crs) for each in (crs, gnss.crs)]
-    reason = (
-        f"{name}: the CRS of the {'cameras' if kinds[0] == 'unstated' else 'GNSS'} does not"
-        " say what its heights are, the other does; only plan is compared."
-    )
+    who = "cameras" if kinds[0] == "unstated" else "GNSS"
+    reason = f"{name}: the CRS of the {who} names no vertical datum; only plan is compared."
     if not {"gravity", "unstated"} <= {*kinds}:
         try:
             return GnssDifferences(_differences(cameras, gnss, name))

@@ -35,7 +35,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from pcfix.errors import InputError
+from pcfix.errors import InputError, bad_file
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import damaged, number, numbers, read_xml
 from pcfix.io.cameras.checks import text_of as _text
@@ -68,8 +68,9 @@ def read(source: Source) -> Cameras:
         paths = [path for path in found[0] or found[1] if path.is_file()]
     known: dict[Path, Lens] = {}
     poses = [_orientation(path, known) for path in paths]
+    labels = [path.name.removesuffix(SUFFIX).removeprefix(PREFIX) for path in paths]
     return Cameras(
-        labels=tuple(_image(path) for path in paths),
+        labels=tuple(label.removeprefix(PREFIX_2) for label in labels),
         centres=np.array([centre for centre, _, _ in poses]),
         rotations=np.array([rotation for _, rotation, _ in poses]),
         lenses=tuple(lens for _, _, lens in poses),
@@ -77,15 +78,17 @@ def read(source: Source) -> Cameras:
     )
 
 
-def _image(path: Path) -> str:
-    return path.name.removesuffix(SUFFIX).removeprefix(PREFIX).removeprefix(PREFIX_2)
-
-
 def _orientation(path: Path, known: dict[Path, Lens]) -> tuple[FloatArray, FloatArray, Lens]:
     """Return centre, rotation world to camera, and lens."""
     root = read_xml(path)
-    if root.find(".//NameInternalCalib") is not None:
-        return _orientation_2(path, root, known)
+    if named := _text(root, ".//NameInternalCalib"):  # MMVII
+        tags = ("AxeI", "AxeJ", "AxeK")
+        axes = [numbers(path, tag, root.findtext(f".//RotMatrix/{tag}"), 3) for tag in tags]
+        centre = numbers(path, "Center", root.findtext(".//Center"), 3)
+        where = _calibration_file(path, [path.parent / f"{PurePosixPath(named).name}{SUFFIX}"])
+        if where not in known:
+            known[where] = _calibration_2(where, read_xml(where))
+        return centre, np.array(axes), known[where]
     conic = _first(path, root, "OrientationConique")
     projection = _text(conic, "TypeProj") or "eProjStenope"
     outer = _first(path, conic, "Externe")
@@ -95,8 +98,11 @@ def _orientation(path: Path, known: dict[Path, Lens]) -> tuple[FloatArray, Float
         raise checks.unsupported(path, what, "Write the orientations anew with OriConvert")
     rows = [numbers(path, tag, matrix.findtext(tag), 3) for tag in ("L1", "L2", "L3")]
     centre = numbers(path, "Centre", outer.findtext("Centre"), 3)
-    inner = conic.find("Interne")
-    where = path if inner is not None else _calibration_file(path, conic)
+    inner, where = conic.find("Interne"), path
+    if inner is None:
+        name = PurePosixPath(_text(conic, "FileInterne").replace("\\", "/"))
+        places = [path.parent / name.name, path.resolve().parent.parent / name]
+        where = _calibration_file(path, places)
     if where not in known:
         if inner is None:
             inner = _first(where, read_xml(where), "CalibrationInternConique")
@@ -104,18 +110,13 @@ def _orientation(path: Path, known: dict[Path, Lens]) -> tuple[FloatArray, Float
     return centre, np.array(rows).T, _scanned(path, conic.find("OrIntImaM2C"), known[where])
 
 
-def _calibration_file(path: Path, conic: Element) -> Path:
-    name = PurePosixPath(_text(conic, "FileInterne").replace("\\", "/"))
-    project = path.resolve().parent.parent
-    for candidate in (path.parent / name.name, project / name):
-        if name.name and candidate.is_file():
-            return candidate
-    raise _no_calibration(path, str(name))
-
-
-def _no_calibration(path: Path, name: str) -> InputError:
-    sentence = f"{path}: its calibration '{name}' is not there. Copy it beside the orientation."
-    return InputError("cameras.missing_file", sentence, path=path, file=name)
+def _calibration_file(path: Path, places: Sequence[Path]) -> Path:
+    """Return the first place where the calibration of an orientation is."""
+    for place in places:
+        if place.is_file():
+            return place
+    sentence = f"its calibration '{places[0].name}' is not there. Copy it beside the orientation."
+    raise bad_file(path, "cameras.missing_file", sentence, file=places[0].name)
 
 
 def _calibration(path: Path, element: Element) -> Lens:
@@ -124,8 +125,7 @@ def _calibration(path: Path, element: Element) -> Lens:
     if convention not in _IS_INVERSE:
         raise _not_held(path, f"convention {convention}")
     focal = number(path, "F", element.findtext("F"))
-    principal = numbers(path, "PP", element.findtext("PP"), 2)
-    size = numbers(path, "SzIm", element.findtext("SzIm"), 2)
+    principal, size = (numbers(path, tag, element.findtext(tag), 2) for tag in ("PP", "SzIm"))
     found = [model for entry in element.iter("CalibDistortion") for model in entry]
     named = [(_text(model, "TypeModele") or str(model.tag), model) for model in found]
     models = [(name, model) for name, model in named if name not in NO_DISTORTION]
@@ -143,9 +143,8 @@ def _calibration(path: Path, element: Element) -> Lens:
             inside = model.find("RadialePart")
             part = model if inside is None else inside
             centre = numbers(path, "CDist", part.findtext("CDist"), 2)
-            radial = np.array(
-                [number(path, "CoeffDist", e.text) for e in part.findall("CoeffDist")]
-            )
+            terms = [number(path, "CoeffDist", e.text) for e in part.findall("CoeffDist")]
+            radial = np.array(terms)
             if name == "ModPhgrStd":
                 tags = ("P1", "P2", "b1", "b2")
                 rest = [number(path, tag, model.findtext(tag, "0")) for tag in tags]
@@ -154,23 +153,19 @@ def _calibration(path: Path, element: Element) -> Lens:
     # MicMac's coefficients are of places in pixels, those of a Lens of places over the focal length
     radial = radial * np.float64(focal) ** (2 * np.arange(len(radial)) + 2)
     rest = [rest[0] * focal, rest[1] * focal, *rest[2:]]
-    is_inverse = _IS_INVERSE[convention]
-    return _lens(path, focal, size, principal, centre, radial, rest, is_inverse=is_inverse)
+    frame = size, principal, centre
+    return _lens(path, focal, frame, radial, rest, is_inverse=_IS_INVERSE[convention])
 
 
 def _lens(
-    path: Path,
-    focal: float,
-    size: FloatArray,
-    principal: FloatArray,
-    centre: FloatArray,
-    radial: FloatArray,
-    rest: Sequence[float],
-    *,
-    is_inverse: bool = False,
-) -> Lens:
-    """Return the lens of coefficients k1, k2, ... and P1, P2, b1, b2 of places over the focal."""
-    p1, p2, b1, b2 = rest
+    path: Path, focal: float, frame: tuple[FloatArray, FloatArray, FloatArray], radial: FloatArray,
+    rest: Sequence[float], *, is_inverse: bool = False,
+) -> Lens:  # fmt: skip
+    """Return the lens of coefficients k1, k2, ... and P1, P2, b1, b2 of places over the focal.
+
+    The `frame` is its size, the principal point and the centre of the distortion, pixels.
+    """
+    (p1, p2, b1, b2), (size, principal, centre) = rest, frame
     if b1 or b2:  # held where it makes no difference that the lens has them after the distortion
         farthest = np.hypot(*np.maximum(np.abs(centre), np.abs(size - centre))) / focal
         r = np.linspace(0.0, farthest, 50)
@@ -192,35 +187,17 @@ def _scanned(path: Path, element: Element | None, lens: Lens) -> Lens:
     """Return the lens of an image that is an affine map of the camera's."""
     if element is None:
         return lens
-    origin, along_x, along_y = (
-        numbers(path, tag, element.findtext(tag), 2) for tag in ("I00", "V10", "V01")
-    )
-    turn = np.column_stack([along_x, along_y])
+    tags = ("I00", "V10", "V01")
+    origin, *along = (numbers(path, tag, element.findtext(tag), 2) for tag in tags)
+    turn = np.column_stack(along)
     if not origin.any() and (turn == np.eye(2)).all():
         return lens
     inner = turn @ np.array([[lens.focal + lens.b1, lens.b2], [lens.b3, lens.focal]])
     (m00, m01), (m10, m11) = inner.tolist()
-    place = origin + turn @ np.array([lens.principal_x, lens.principal_y])
-    size = np.abs(turn) @ np.array([lens.width, lens.height])
-    width, height, x, y = np.concatenate([size, place]).tolist()
+    x, y = (origin + turn @ np.array([lens.principal_x, lens.principal_y])).tolist()
+    width, height = (np.abs(turn) @ np.array([lens.width, lens.height])).tolist()
     scanned = replace(lens, focal=m11, b1=m00 - m11, b2=m01, b3=m10)
     return replace(scanned, principal_x=x, principal_y=y, width=width, height=height)
-
-
-def _orientation_2(
-    path: Path, root: Element, known: dict[Path, Lens]
-) -> tuple[FloatArray, FloatArray, Lens]:
-    """Return centre, rotation and lens of a file of MMVII."""
-    tags = ("AxeI", "AxeJ", "AxeK")
-    axes = [numbers(path, tag, root.findtext(f".//RotMatrix/{tag}"), 3) for tag in tags]
-    centre = numbers(path, "Center", root.findtext(".//Center"), 3)
-    name = PurePosixPath(_text(root, ".//NameInternalCalib")).name
-    where = path.parent / f"{name}{SUFFIX}"
-    if where not in known:
-        if not where.is_file():
-            raise _no_calibration(path, where.name)
-        known[where] = _calibration_2(where, read_xml(where))
-    return centre, np.array(axes), known[where]
 
 
 def _calibration_2(path: Path, root: Element) -> Lens:
@@ -231,18 +208,15 @@ def _calibration_2(path: Path, root: Element) -> Lens:
     focal = number(path, "F", root.findtext(".//PerfectProj/F"))
     principal = numbers(path, "PP", root.findtext(".//PerfectProj/PP"), 2)
     size = numbers(path, "NbPix", root.findtext(".//PixelFrame/NbPix"), 2)
-    given = {
-        str(term.tag): number(path, str(term.tag), term.text)
-        for part in root.iterfind(".//Distorsion/*")
-        for term in part
-    }
+    terms = [term for part in root.iterfind(".//Distorsion/*") for term in part]
+    given = {str(term.tag): number(path, str(term.tag), term.text) for term in terms}
     names = [f"K{i}" for i in range(1, 10)]
     others = sorted(k for k, v in given.items() if v and k not in {*names, "p1", "p2", "b1", "b2"})
     if others:
         raise _not_held(path, f"terms {', '.join(others)}")
     radial = np.array([given.get(name, 0.0) for name in names])
     rest = [given.get(name, 0.0) for name in ("p1", "p2", "b1", "b2")]
-    return _lens(path, focal, size, principal, principal, radial, rest)
+    return _lens(path, focal, (size, principal, principal), radial, rest)
 
 
 def _not_held(path: Path, what: str) -> InputError:

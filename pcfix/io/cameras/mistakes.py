@@ -58,7 +58,25 @@ def likely_mistake(
     for words, moved in _readings(centres, cloud_crs):
         if is_over(moved):
             return f"The cameras would lie over the cloud {words}."
-    return _far(centres, low, high)
+    # no other reading of the numbers fits
+    middle, span = np.median(centres[:, :2], axis=0), np.ptp(centres[:, :2], axis=0).max()
+    centre, size = (low + high)[:2] / 2.0, max((high - low)[:2].max(), 1e-9)
+    cameras, cloud = np.abs(middle).max(), np.abs(centre).max()
+    inside = (np.abs(centres[:, :2]) <= 360.0).all() and np.abs(low[:2]).max() > LOCAL_M
+    if inside and span < 1e-3 * size and np.abs(np.median(centres[:, :2])) > 10.0 * span:
+        return "The cameras look like degrees, the cloud like metres; give --cameras-crs EPSG:4326."
+    if min(cameras, cloud) < LOCAL_M and max(cameras, cloud) > MAP_M:
+        local, other = ("cameras", "cloud") if cameras < cloud else ("cloud", "cameras")
+        verb = "has" if local == "cloud" else "have"
+        advice = "use the same CRS, or give the shift with --cameras-offset."
+        return f"The {local} {verb} local or shifted coordinates, the {other} not; {advice}"
+    x, y = centre - middle
+    apart = np.hypot(x, y)
+    far = f"{apart / 1000.0:,.1f} km" if apart >= 1e4 else f"{apart:.0f} m"
+    advice = "check the CRS of both."
+    if 0.2 < span / size < 5.0:
+        advice = f"perhaps by an offset of {x:.0f}, {y:.0f} m; see --cameras-offset."
+    return f"The cameras are {far} from the cloud in plan; {advice}"
 
 
 def _readings(centres: FloatArray, crs: str | CRS | None) -> Iterator[tuple[str, FloatArray]]:
@@ -111,42 +129,8 @@ def _wrong_height(middle: float, low: FloatArray, high: FloatArray) -> str | Non
     if below > 0.0:
         what = f"{below:.0f} m below the lowest point of the cloud"
     if off <= UNDULATION_M[1]:
-        return (
-            f"The cameras are {what}: heights of one are likely above the ellipsoid and of the"
-            " other above the geoid. See the vertical CRS of both."
-        )
-    feet = ("feet", middle * FOOT_M), ("metres, the cloud's in feet", middle / FOOT_M)
-    for words, moved in feet:
+        return f"The cameras are {what}: heights above the ellipsoid and geoid are mixed."
+    for words, moved in (("feet", middle * FOOT_M), ("metres, not feet", middle / FOOT_M)):
         if high[2] < moved < high[2] + limit:
             return f"The cameras are {what}: their heights are likely in {words}."
     return f"The cameras are {what}: their heights have another origin; see --cameras-offset."
-
-
-def _far(centres: FloatArray, low: FloatArray, high: FloatArray) -> str:
-    """Return what is likely wrong where no other reading of the numbers fits."""
-    middle, span = np.median(centres[:, :2], axis=0), np.ptp(centres[:, :2], axis=0).max()
-    centre, size = (low + high)[:2] / 2.0, max((high - low)[:2].max(), 1e-9)
-    cameras, cloud = np.abs(middle).max(), np.abs(centre).max()
-    inside = (np.abs(centres[:, :2]) <= 360.0).all() and np.abs(low[:2]).max() > LOCAL_M
-    if inside and span < 1e-3 * size and np.abs(np.median(centres[:, :2])) > 10.0 * span:
-        return (
-            "The cameras look like degrees, the cloud is in metres; give --cameras-crs EPSG:4326,"
-            " and a cloud that names its CRS."
-        )
-    if min(cameras, cloud) < LOCAL_M and max(cameras, cloud) > MAP_M:
-        local, other = ("cameras", "cloud") if cameras < cloud else ("cloud", "cameras")
-        shift = ", or give the shift with --cameras-offset" if local == "cameras" else ""
-        verb = "is" if local == "cloud" else "are"
-        return (
-            f"The {local} {verb} near the origin, in local or shifted coordinates, but the {other}"
-            f" not; export the {local} in the CRS of the {other}{shift}."
-        )
-    x, y = centre - middle
-    apart = np.hypot(x, y)
-    far = f"{apart / 1000.0:,.1f} km" if apart >= 1e4 else f"{apart:.0f} m"
-    if 0.2 < span / size < 5.0:
-        return (
-            f"The cameras are {far} from the cloud in plan and the block is about as large: a"
-            f" constant offset of about {x:.0f}, {y:.0f} m, or another site; see --cameras-offset."
-        )
-    return f"The cameras are {far} from the cloud in plan; check the CRS of both."

@@ -148,7 +148,17 @@ def _placed(path: Path, model: Model) -> tuple[FloatArray, FloatArray]:
         least[:] = 2.0 * np.array(model.fixed[1::2])
         return seen, least
     in_frame = len(seen) and ((seen >= 0.0) & (seen < _LARGEST_PX)).all()
-    expected = _expected(path, model) if in_frame else np.full_like(seen, np.nan)
+    expected = np.full_like(seen, np.nan)
+    if in_frame:  # where points project without distortion
+        row_of = np.full(len(model.rows), -1)
+        row_of[model.posed] = np.arange(len(model.posed))
+        rotations, centres = _poses(path, model)
+        row = row_of[image]
+        rays = model.points.xyz[model.points.point] - centres[row]
+        x, y, z = np.einsum("nij,nj->in", rotations[row], rays)
+        z = np.where((row >= 0) & (z > 0.0), z, np.nan)
+        places = model.rows[image, 0][:, None] * np.column_stack([x / z, y / z])
+        expected = np.where(np.abs(places) < _LARGEST_PX, places, np.nan)
     apart = np.abs(seen - expected)
     if np.isfinite(apart).any() and np.nanmedian(apart) > _FAR_PX:  # OpenSfM's, from the corner
         for focal in np.unique(model.rows[model.posed, 0]):
@@ -160,19 +170,6 @@ def _placed(path: Path, model: Model) -> tuple[FloatArray, FloatArray]:
     else:
         np.maximum.at(least, image, 2.0 * np.abs(seen))
     return seen, least
-
-
-def _expected(path: Path, model: Model) -> FloatArray:
-    """Return where points project without distortion, from the principal point; NaN if nowhere."""
-    row_of = np.full(len(model.rows), -1)
-    row_of[model.posed] = np.arange(len(model.posed))
-    rotations, centres = _poses(path, model)
-    row = row_of[model.points.image]
-    rays = model.points.xyz[model.points.point] - centres[row]
-    x, y, z = np.einsum("nij,nj->in", rotations[row], rays)
-    z = np.where((row >= 0) & (z > 0.0), z, np.nan)
-    places = model.rows[model.points.image, 0][:, None] * np.column_stack([x / z, y / z])
-    return np.where(np.abs(places) < _LARGEST_PX, places, np.nan)
 
 
 def _squeeze_and_frame(expected: FloatArray, seen: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -33,11 +33,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.errors import PcfixWarning, bad_file
+from pcfix.errors import bad_file
 from pcfix.io.cameras import checks, opensfm
 from pcfix.io.cameras.checks import damaged, load_json, note, triple
 from pcfix.io.cameras.formats import Source
-from pcfix.io.cameras.opensfm.models import is_panorama, lens
+from pcfix.io.cameras.opensfm import is_panorama, lens
 from pcfix.io.crs import GEOCENTRIC_WGS84, GEOGRAPHIC_WGS84, Topocentric
 from pcfix.lens.rotations import from_rotation_vectors
 from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, TiePoints
@@ -74,7 +74,12 @@ def recognises(source: Source) -> bool:
         return False
     if any(project.find(name) for name in (*_OF_CRS, SHOTS, TOPOCENTRIC)):
         return True
-    reference = _reference_of(project.poses)
+    with project.poses.open("rb") as stream:
+        view = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+    at = view.find(b'"reference_lla"')  # the file may be large
+    text = view[at : at + 400] if at >= 0 else b""
+    values = {key: float(value) for key, value in _REFERENCE.findall(text)[:2]}
+    reference = (values[b"latitude"], values[b"longitude"]) if len(values) == 2 else None
     return reference is not None and _whole_metres(*reference, None) is not None
 
 
@@ -101,10 +106,8 @@ def read(source: Source) -> Cameras:
     apart = float(np.median(np.hypot(*(ours - truth)[:, :2].T))) if len(ours) else 0.0
     if placed.project_crs or apart < ALIGNED_M:
         return cameras
-    sentence = (
-        f"its cameras are {apart:.2f} m from those of {project.find(SHOTS)}. If the project was"
-        " aligned to a reference, give shots.geojson, which fits its cloud."
-    )
+    sentence = f"its cameras are {apart:.2f} m from those of shots.geojson. Give that, if the cloud"
+    sentence += " was aligned to a reference."
     moved = note(project.poses, "cameras.shots_differ", sentence, metres=apart)
     return replace(cameras, notes=(*cameras.notes, moved))
 
@@ -195,7 +198,7 @@ def _frame(project: Project, found: opensfm.Reconstruction) -> Frame:
         if not (np.abs(turn.T @ turn - np.eye(3)).max() <= SCALE_TOLERANCE):
             raise damaged(path, "it does not turn and shift the reconstruction")
         lat, lon, _ = reference
-        named = _crs_of_place(lon, lat, shift[0], shift[1], [crs] if crs else _zones(lat, lon))
+        named = _crs_of_place(lon, lat, shift[:2], [crs] if crs else _zones(lat, lon))
         if named is not None:  # else the file is of another origin
             return Frame(turn, shift, named)
     whole = _whole_metres(*reference[:2], crs)
@@ -217,15 +220,6 @@ def _frame(project: Project, found: opensfm.Reconstruction) -> Frame:
         for guess in (_from_topocentric(own, reference, crs), moved.points(own))
     )
     return unmoved._replace(project_crs=crs) if still_m < 0.5 * moved_m else moved
-
-
-def _reference_of(path: Path) -> tuple[float, float] | None:
-    """Return latitude and longitude of a reconstruction's origin without reading all of it."""
-    with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as view:
-        at = view.find(b'"reference_lla"')
-        text = view[at : at + 400] if at >= 0 else b""
-    values = {key: float(value) for key, value in _REFERENCE.findall(text)[:2]}
-    return (values[b"latitude"], values[b"longitude"]) if len(values) == 2 else None
 
 
 def _in_shots(project: Project, cameras: Cameras) -> tuple[FloatArray, FloatArray]:
@@ -250,14 +244,10 @@ def _whole_metres(lat: float, lon: float, crs: str | None) -> tuple[str, float, 
     return None
 
 
-def _crs_of_place(
-    lon: float, lat: float, east: float, north: float, candidates: list[str]
-) -> str | None:
+def _crs_of_place(lon: float, lat: float, place: FloatArray, candidates: list[str]) -> str | None:
     """Return the CRS in which a place has these coordinates, to a metre."""
-    for candidate in candidates:
-        if np.linalg.norm(_projected(candidate, lon, lat) - [east, north]) < 1.0:
-            return candidate
-    return None
+    there = ((one, _projected(one, lon, lat) - place) for one in candidates)
+    return next((one for one, off in there if np.linalg.norm(off) < 1.0), None)
 
 
 def _from_topocentric(
@@ -292,18 +282,38 @@ def _read_shots(project: Project, path: Path) -> Cameras:
         centres = np.array([triple(shot["translation"]) for shot in shots.values()])
         place = (next(iter(shots.values()))["geometry"] or {}).get("coordinates")
     labels, crs = tuple(shots), project.crs()
-    lenses, notes = _lenses(project, path, shots)
+    # the lens is that of the camera that the shot names, or else of the only one that is alike
+    beside, known = project.find("cameras.json"), {}
+    if beside is not None:
+        with checks.reading(beside):
+            entries = load_json(beside).items()
+            known = {k: lens(beside, k, entry) for k, entry in entries if not is_panorama(entry)}
+    lenses, plain = [], 0
+    for shot in shots.values():
+        width, height, focal = (float(shot[key]) for key in ("width", "height", "focal"))
+        scale = max(width, height)
+        alike = [
+            one
+            for one in known.values()
+            if (one.width, one.height) == (width, height)
+            and abs((one.focal + one.b1) / scale - focal) < SAME_FOCAL
+        ]
+        found = known.get(str(shot.get("camera"))) or (alike[0] if len(alike) == 1 else None)
+        plain += found is None
+        lenses.append(found or Lens(focal * scale, width, height, width / 2.0, height / 2.0))
+    sentence = f"cameras.json has no camera of {plain} images; they get a lens without distortion."
+    said = note(path, "cameras.no_distortion", sentence, images=plain)
     gnss, listed = read_images(project.find("images.json"), labels)
     if crs is None and place is not None:  # a project without GNSS has made-up coordinates
         lon, lat, _ = triple(place).tolist()
-        crs = _crs_of_place(lon, lat, centres[0, 0], centres[0, 1], _zones(lat, lon))
+        crs = _crs_of_place(lon, lat, centres[0, :2], _zones(lat, lon))
     return Cameras(
         labels=labels,
         centres=centres,
         rotations=from_rotation_vectors(turns),
-        lenses=lenses,
+        lenses=tuple(lenses),
         crs=crs or "local",
-        notes=notes,
+        notes=(said,) if plain else (),
         gnss=gnss,
         unposed=opensfm.left_out(labels, listed),
         source="OpenDroneMap",
@@ -338,45 +348,9 @@ def _shots(path: Path) -> dict[str, dict[str, Any]]:
     """Return the properties of every feature by file name, with its `geometry`."""
     features = load_json(path)["features"]
     shots = {
-        str(feature["properties"]["filename"]): {
-            **feature["properties"],
-            "geometry": feature.get("geometry"),
-        }
-        for feature in features
+        str(one["properties"]["filename"]): one["properties"] | {"geometry": one.get("geometry")}
+        for one in features
     }
     if not shots or len(shots) < len(features):
         raise damaged(path, f"{len(features)} features have {len(shots)} different filenames")
     return shots
-
-
-def _lenses(
-    project: Project, path: Path, shots: dict[str, dict[str, Any]]
-) -> tuple[tuple[Lens, ...], tuple[PcfixWarning, ...]]:
-    """Return the lens of each shot, and a note where cameras.json does not have it.
-
-    It is that of the camera that the shot names, or else of the only one that is alike.
-    """
-    beside, known = project.find("cameras.json"), {}
-    if beside is not None:
-        with checks.reading(beside):
-            entries = load_json(beside).items()
-            known = {k: lens(beside, k, entry) for k, entry in entries if not is_panorama(entry)}
-    lenses, plain = [], 0
-    for shot in shots.values():
-        width, height, focal = (float(shot[key]) for key in ("width", "height", "focal"))
-        scale = max(width, height)
-        alike = [
-            one
-            for one in known.values()
-            if (one.width, one.height) == (width, height)
-            and abs((one.focal + one.b1) / scale - focal) < SAME_FOCAL
-        ]
-        found = known.get(str(shot.get("camera"))) or (alike[0] if len(alike) == 1 else None)
-        plain += found is None
-        lenses.append(found or Lens(focal * scale, width, height, width / 2.0, height / 2.0))
-    sentence = (
-        f"cameras.json has no camera of the size and focal length of {plain} images. Their lens"
-        " is taken as free of distortion."
-    )
-    said = note(path, "cameras.no_distortion", sentence, images=plain)
-    return tuple(lenses), (said,) if plain else ()

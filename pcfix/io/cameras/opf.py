@@ -63,18 +63,28 @@ def read(source: Source) -> Cameras:
     labels = tuple(names.get(i, f"camera {i}") for i in shots)
     xyz = np.array([triple(shot["position"]) for shot in shots.values()]).reshape(-1, 3)
     angles = np.array([triple(s["orientation_deg"]) for s in shots.values()]).reshape(-1, 3)
-    lenses, notes = _lenses(path, calibrated, given)
+    sensors = {sensor["id"]: sensor for sensor in given.get("sensors", [])}
+    known = {
+        sensor["id"]: _lens(path, sensor, sensors[sensor["id"]])
+        for sensor in calibrated["sensors"]
+        if "image_size_px" in sensors.get(sensor["id"], {})
+    }
+    used, notes = [shot["sensor_id"] for shot in calibrated["cameras"]], []
+    lost = [i for i in used if i not in known]
+    if lost:
+        why = f"the input cameras have no frame of sensor {lost[0]}"
+        notes.append(checks.without_lens(path, why))
     captured = [
         shot["id"] for capture in given.get("captures", []) for shot in capture.get("cameras", [])
     ]
     if any(shot.get("rolling_shutter") for shot in shots.values()):
         sentence = "its rolling shutter is ignored, each image has one pose."
-        notes += (note(path, "cameras.rolling_shutter", sentence),)
+        notes.append(note(path, "cameras.rolling_shutter", sentence))
     return Cameras(
         labels=labels,
         centres=frame.enter(xyz),
         rotations=from_omega_phi_kappa(*angles.T) if len(shots) else None,
-        lenses=lenses,
+        lenses=None if lost else tuple(known[i] for i in used) or None,
         crs=frame.crs,
         project_crs=frame.project_crs,
         notes=(*frame.notes, *notes, *checks.repeated(path, labels)),
@@ -126,10 +136,7 @@ def _open_project(path: Path) -> Project:
         above = path.resolve().parent
         found = [*sorted(above.glob("*.opf")), *sorted(above.parent.glob("*.opf"))]
     if len(found) != 1 or found[0] == path:
-        sentence = (
-            f"belongs to an OPF project, of which {len(found)} are there. Give the project file"
-            " (.opf) that goes with the cloud."
-        )
+        sentence = f"belongs to one of {len(found)} OPF projects. Give the project file (.opf)."
         raise bad_file(path, "cameras.several_projects", sentence, projects=len(found))
     return _open_project(found[0])
 
@@ -172,10 +179,7 @@ def _frame_of(project: Project) -> Frame:
     said = checks.crs(path, scene["crs"]["definition"])
     crs, unit = (said, 1.0) if said == "local" else _with_heights(said, str(path))
     geoid_m = float(scene["crs"].get("geoid_height") or 0.0)
-    sentence = (
-        f"its heights are above a constant geoid, {geoid_m:g} m over the ellipsoid, and taken for"
-        " those that its CRS names."
-    )
+    sentence = f"its heights are above a constant geoid, {geoid_m:g} m, taken for its CRS."
     geoid = note(path, "cameras.constant_geoid", sentence, geoid_m=geoid_m)
     project_crs = None if crs == said else said
     return Frame(crs, project_crs, shift, scale / [1.0, 1.0, unit], (geoid,) if geoid_m else ())
@@ -187,23 +191,6 @@ def _with_heights(text: str, name: str) -> tuple[str, float]:
     if len(crs.axis_info) != 2:
         return text, 1.0
     return crs_text(crs.to_3d()), 1.0 if crs.is_geographic else plan_unit(crs)[1]
-
-
-def _lenses(
-    path: Path, calibrated: Part, given: Part
-) -> tuple[tuple[Lens, ...] | None, tuple[PcfixWarning, ...]]:
-    """Return the lens of each image, or None and a note where one has no frame."""
-    sensors = {sensor["id"]: sensor for sensor in given.get("sensors", [])}
-    known = {
-        sensor["id"]: _lens(path, sensor, sensors[sensor["id"]])
-        for sensor in calibrated["sensors"]
-        if "image_size_px" in sensors.get(sensor["id"], {})
-    }
-    used = [shot["sensor_id"] for shot in calibrated["cameras"]]
-    lost = next((i for i in used if i not in known), None)
-    if lost is None:
-        return tuple(known[i] for i in used) or None, ()
-    return None, (checks.without_lens(path, f"the input cameras have no frame of sensor {lost}"),)
 
 
 def _lens(path: Path, sensor: Part, given: Part) -> Lens:

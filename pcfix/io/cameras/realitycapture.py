@@ -70,8 +70,7 @@ class Image(NamedTuple):
 
     def number(self, name: str, default: str = "0") -> float:
         """Return the number of a field."""
-        where = f"image {self.label}, xcr:{name}"
-        return number(self.path, where, self.fields.get(name, default))
+        return number(self.path, f"image {self.label}, xcr:{name}", self.fields.get(name, default))
 
 
 def recognises(source: Source) -> bool:

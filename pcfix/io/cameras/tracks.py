@@ -66,10 +66,7 @@ def finite(path: Path, ties: TiePoints) -> tuple[TiePoints, PcfixWarning | None]
     number = np.cumsum(kept) - 1
     left = Seen(ties.xyz[kept], number[point[rows]], ties.views.camera[rows], ties.image_xy[rows])
     points, observations = int((~kept).sum()), int((~seen).sum())
-    sentence = (
-        f"{points:,} tie points and {observations:,} observations have a number that is not"
-        " finite. They are left out."
-    )
+    sentence = f"{points:,} tie points and {observations:,} observations are not finite; ignored."
     code = "cameras.tie_points_not_finite"
     return tie_points(left), note(path, code, sentence, points=points, observations=observations)
 
@@ -147,7 +144,7 @@ def frame_sizes(
     missing = sizes[:, 0] == 0
     if not missing.any():
         return sizes, ()
-    why = f"the size of {missing.sum()} images is not in the file, nor are the images beside it"
+    why = f"the size of {missing.sum()} images is unknown. Put the images beside the file"
     if not smallest_px.any():
         return None, (without_lens(path, why),)
     order = np.argsort(focal_px)
@@ -158,10 +155,7 @@ def frame_sizes(
         bounds[members] = bound if bound.all() else smallest_px.max(axis=0)
     sizes[missing] = bounds[missing]
     first = sizes[missing][0].tolist()
-    sentence = (
-        f"{why}. Their frames are estimated from the tie points, the first as {first[0]:.0f} x"
-        f" {first[1]:.0f} px; put the images beside the file."
-    )
+    sentence = f"{why}; until then they are estimated (first {first[0]:.0f} x {first[1]:.0f} px)."
     return sizes, (note(path, "cameras.frames_estimated", sentence, size_px=first),)
 
 

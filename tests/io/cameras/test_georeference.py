@@ -10,14 +10,18 @@ from pyproj import CRS, Transformer
 from scipy.spatial.transform import Rotation
 
 from pcfix.errors import InputError
-from pcfix.io.cameras.georeference import georeference
+from pcfix.io.cameras.georeference import adjusted_minus_gnss, georeference
 from pcfix.model import Cameras, GnssPositions
 from tests.utils.codes import refused
+from tests.utils.nightly import mostly_nightly
+from tests.utils.pose_files import block
+from tests.utils.pose_files.block import axes_at as east_north_up
 from tests.utils.reprojection import bring_to
 
 pytestmark = pytest.mark.quick_but(
+    "test_differences_are_east_north_up",
+    "test_heights_that_cannot_be_compared_leave_the_plan",
     "test_a_map_with_north_first_is_read_east_first",
-    "test_bound_and_esri_wkt_are_the_crs_they_hold",
     "test_heights",
     "test_local_cloud",
     "test_local_frame_by_the_user",
@@ -41,31 +45,8 @@ def cameras(centres, crs, rotations=None, **more):
     return Cameras(labels, centres, rotations, crs=crs, **more)
 
 
-def geocentric(lon, lat, h, a=6378137.0, f=1 / 298.257222101):
-    """Return geocentric coordinates; the textbook formula."""
-    lam, phi = np.radians(lon), np.radians(lat)
-    e2 = f * (2 - f)
-    n = a / np.sqrt(1 - e2 * np.sin(phi) ** 2)
-    return np.stack(
-        [
-            (n + h) * np.cos(phi) * np.cos(lam),
-            (n + h) * np.cos(phi) * np.sin(lam),
-            (n * (1 - e2) + h) * np.sin(phi),
-        ],
-        axis=-1,
-    )
-
-
-def east_north_up(lon, lat):
-    """Return east, north and up in geocentric axes, one a row."""
-    lam, phi = np.radians([lon, lat])
-    return np.array(
-        [
-            [-np.sin(lam), np.cos(lam), 0],
-            [-np.sin(phi) * np.cos(lam), -np.sin(phi) * np.sin(lam), np.cos(phi)],
-            [np.cos(phi) * np.cos(lam), np.cos(phi) * np.sin(lam), np.sin(phi)],
-        ]
-    )
+def geocentric(lon, lat, h, f=1 / 298.257222101):
+    return block.geocentric(lon, lat, h, 6378137.0, f)
 
 
 def image_px(rotation, centre, points):
@@ -89,18 +70,6 @@ def test_a_map_with_north_first_is_read_east_first(code):
     here = f"+proj=tmerc +lat_0={lat} +lon_0={lon} +ellps={ellipsoid} +type=crs"
     back = bring_to(cameras([x, y, 50.0], code), here)
     assert np.hypot(*back.centres[0, :2]) < 1e-2
-
-
-def test_bound_and_esri_wkt_are_the_crs_they_hold():
-    bound = CRS(UTM30).to_wkt("WKT1_GDAL").replace(
-        'AUTHORITY["EPSG","6258"]', 'TOWGS84[0,0,0,0,0,0,0],AUTHORITY["EPSG","6258"]'
-    )  # fmt: skip
-    assert CRS(bound).is_bound
-    for text in (bound, CRS(UTM30).to_wkt("WKT1_ESRI"), "+proj=utm +zone=30 +ellps=GRS80"):
-        found = bring_to(cameras(VALENCIA, text, NADIR[None]), UTM30)
-        assert found.centres[0].tolist() == VALENCIA
-        assert found.rotations[0].tolist() == NADIR.tolist()
-        assert found.notes == ()
 
 
 def test_an_offset_comes_before_all_else():
@@ -244,9 +213,7 @@ def test_a_missing_geoid_is_refused_and_named():
         assert "es_ign_egm08-rednap.tif" in message
         assert "pyproj sync" in message
         assert "PROJ_NETWORK=ON" in message
-        assert message.endswith(
-            "known to agree, give --cameras-crs EPSG:25830, the horizontal CRS alone."
-        )
+        assert message.endswith("agree, give --cameras-crs EPSG:25830.")
 
 
 @pytest.mark.parametrize(("undulation_m", "agree"), [(51.5, False), (0.2, True)])
@@ -278,7 +245,7 @@ with rasterio.open(folder + "/es_ign_egm08-rednap.tif", "w", driver="GTiff", cou
     out.update_tags(TYPE="VERTICAL_OFFSET_GEOGRAPHIC_TO_VERTICAL", AREA_OR_POINT="Point")
     out.set_band_description(1, "geoid_undulation")
 pyproj.datadir.append_data_dir(folder)
-from pcfix.io.cameras.georeference import georeference
+from pcfix.io.cameras.georeference import adjusted_minus_gnss, georeference
 from pcfix.model import Cameras
 ecef = [[float(w) for w in sys.argv[2:5]]]
 read = Cameras(("a",), np.array(ecef), np.eye(3)[None], crs="EPSG:4936",
@@ -351,26 +318,17 @@ def test_heights(at, crs, project, cloud, given, z, codes):
     ("at", "crs", "project", "cloud", "code"),
     [
         (VALENCIA, "local", None, UTM30, "cameras.local"),
-        (VALENCIA, LOCAL_CS, None, UTM30, "cameras.local"),
         (VALENCIA, UTM30, None, LOCAL_CS, "cloud.local"),
-        (VALENCIA, "ENU:1,2,3", None, LOCAL_CS, "cloud.local"),
-        (VALENCIA, "EPSG:4978", None, LOCAL_CS, "cloud.local"),
         (VALENCIA_LON_LAT, "EPSG:4326", None, None, "cloud.no_crs"),
         (ALICANTE_ECEF, "EPSG:4936", None, None, "cloud.no_crs"),
-        (ALICANTE_ECEF, "EPSG:4936", "EPSG:4258", None, "cloud.no_crs"),
-        (ALICANTE_ECEF, "EPSG:4936", LOCAL_CS, None, "cloud.no_crs"),
         (VALENCIA, "EPSG:4326", None, UTM30, "cameras.degrees"),
         (VALENCIA, "EPSG:4978", None, UTM30, "cameras.geocentric"),
-        (VALENCIA, "EPSG:4326+5773", None, UTM30, "cameras.degrees"),
         ([1e30, 1e30, 5.0], "EPSG:32631", None, UTM30, "cameras.not_transformed"),
         (VALENCIA, "EPSG:32630+5773", None, UTM30_ALICANTE, "crs.heights"),
-        ([0.0, 0, 50], ENU_FRAME, None, UTM30_ALICANTE, "crs.heights"),
         (VALENCIA, "nonsense", None, UTM30, "crs.unknown"),
-        (VALENCIA, UTM30, None, "nonsense", "crs.unknown"),
         (VALENCIA, "EPSG:32630", None, "EPSG:4326", "crs.not_projected"),
         (VALENCIA, "EPSG:32630", None, "EPSG:2992", "crs.unit"),
         (VALENCIA, "ENU:39", None, UTM30, "crs.origin"),
-        (VALENCIA, "EPSG:5703", None, UTM30, "crs.vertical_only"),
     ],
 )
 def test_refused(at, crs, project, cloud, code):
@@ -403,3 +361,90 @@ def test_without_the_clouds_crs():
 def test_offset_refused(at, crs, offset):
     with refused("cameras.offset"):
         bring_to(cameras(at, crs), UTM30, offset_m=offset)
+
+
+# ---- adjusted centres minus GNSS positions ----
+
+LON, LAT, H = 139.5405, 35.7380, 130.0
+ENU_M = np.array([[1.5, -2.0, 0.5], [0.0, 0.25, -3.0], [np.nan] * 3])
+
+
+def moved_block(crs, gnss_crs, enu_m=ENU_M, height=H, **more):
+    """Return cameras in a CRS and GNSS positions that differ from them by ENU_M."""
+    to_ecef = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
+    axes = east_north_up(LON, LAT)
+    origin = np.array(to_ecef.transform(LON, LAT, height))
+    adjusted = origin + np.array([[0.0, 0, 0], [5.0, 8.0, 1.0], [9.0, -4.0, 0.0]]) @ axes
+    measured = adjusted - enu_m @ axes
+
+    def there(ecef, crs):
+        if crs.startswith("ENU"):
+            return (ecef - origin) @ axes.T
+        target = CRS(crs)
+        target = target if len(target.axis_info) == 3 else target.to_3d()
+        step = Transformer.from_crs("EPSG:4978", target, always_xy=True)
+        return np.column_stack(step.transform(*ecef.T))
+
+    gnss = GnssPositions(there(measured, gnss_crs), np.full((3, 3), np.nan), gnss_crs)
+    labels = ("a", "b", "c")
+    return Cameras(labels, there(adjusted, crs), crs=crs, gnss=gnss, **more)
+
+
+ENU = f"ENU:{LAT},{LON},{H}"
+
+
+@pytest.mark.parametrize("gnss", ["EPSG:4326", "EPSG:4979", "EPSG:4978", "EPSG:32654"])
+@pytest.mark.parametrize("crs", mostly_nightly(["EPSG:4978", "EPSG:4979", "EPSG:4326", ENU], ENU))
+def test_differences_are_east_north_up(crs, gnss):
+    found = adjusted_minus_gnss(moved_block(crs, gnss))
+    assert found.enu_m == pytest.approx(ENU_M, abs=2e-4, nan_ok=True)
+    assert found.reason == ""
+
+
+def test_in_the_axes_of_a_map():
+    read = moved_block("EPSG:4978", "EPSG:4326", project_crs="EPSG:32654")
+    found = adjusted_minus_gnss(bring_to(read, "EPSG:32654"))
+    gamma = np.arctan(np.tan(np.radians(LON - 141.0)) * np.sin(np.radians(LAT)))
+    east, north = ENU_M[:2, :2].T
+    turned = np.column_stack(
+        [east * np.cos(gamma) - north * np.sin(gamma), east * np.sin(gamma) + north * np.cos(gamma)]
+    )
+    assert found.enu_m[:2, :2] == pytest.approx(turned, abs=2e-3)  # scale 0.9997 of 3 m
+    assert found.enu_m[:2, 2] == pytest.approx(ENU_M[:2, 2], abs=1e-4)
+    assert np.isnan(found.enu_m[2]).all()
+
+
+@pytest.mark.parametrize(
+    ("crs", "gnss_crs", "reason"),
+    [
+        ("EPSG:4978", "EPSG:4326+5773", "without the grid us_nga_egm96_15.tif"),
+        ("EPSG:32654+5773", "EPSG:4979", "without the grid us_nga_egm96_15.tif"),
+        ("EPSG:32654+5773", "EPSG:4326", "the CRS of the GNSS names no vertical datum"),
+        ("EPSG:32654", "EPSG:4326+5773", "the CRS of the cameras names no vertical datum"),
+    ],
+)
+def test_heights_that_cannot_be_compared_leave_the_plan(crs, gnss_crs, reason):
+    flat = [text.partition("+")[0] for text in (crs, gnss_crs)]
+    as_metres = moved_block(flat[0], flat[1])
+    read = Cameras(
+        as_metres.labels,
+        as_metres.centres,
+        crs=crs,
+        gnss=GnssPositions(as_metres.gnss.xyz, as_metres.gnss.sigma_m, gnss_crs),
+    )
+    found = adjusted_minus_gnss(read, "a.xml")
+    assert found.reason.startswith("a.xml: ")
+    assert reason in found.reason
+    assert found.reason.endswith("only plan is compared.")
+    assert "--cameras-crs" not in found.reason
+    assert np.isnan(found.enu_m[:, 2]).all()
+    lengths = np.hypot(*found.enu_m[:2, :2].T)
+    assert lengths == pytest.approx(np.hypot(*ENU_M[:2, :2].T), rel=5e-4)
+
+
+@pytest.mark.parametrize("crs", [None, "local"])
+def test_a_local_block_cannot_be_compared(crs):
+    gnss = GnssPositions(np.array([[LON, LAT, H]]), np.full((1, 3), np.nan), "EPSG:4326")
+    found = adjusted_minus_gnss(Cameras(("a",), np.zeros((1, 3)), crs=crs, gnss=gnss), "a.xml")
+    assert np.isnan(found.enu_m).all()
+    assert "they are not compared" in found.reason

@@ -536,25 +536,12 @@ def test_markers_of_an_export(tmp_path):
         (chunk(cameras=camera(0, "")), "cameras.no_pose"),
         ("<chunks/>", "cameras.no_pose"),
         (chunk(sensors=""), "cameras.damaged"),
-        (chunk(sensors=sensor("")), "cameras.no_calibration"),
-        (
-            chunk(sensors='<sensor id="0" label="S0"><calibration><f>1</f></calibration></sensor>'),
-            "cameras.no_calibration",
-        ),
         (chunk(sensors=sensor(calibration(""))), "cameras.damaged"),
         (chunk(sensors=sensor(calibration("<f>0</f>"))), "cameras.lens"),
-        (chunk(sensors=sensor(calibration("<f>nan</f>"))), "cameras.number"),
         (chunk(cameras=camera(0, "<transform>1 2 3</transform>")), "cameras.damaged"),
-        (
-            chunk(cameras=camera(0, "<transform>-1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1</transform>")),
-            "cameras.rotation",
-        ),
         (chunk(rest=transform(rotation="1 0 0 0 1 0 0 0 2")), "cameras.rotation"),
-        (chunk(rest=transform(scale="-1")), "cameras.damaged"),
         (chunk(rest=transform("x 1 2")), "cameras.number"),
-        (chunk(cameras=camera(0, reference('x="1" y="2" z="3" sxy="1 2 3"'))), "cameras.damaged"),
         (chunk()[:-30], "cameras.damaged"),
-        (f'<!DOCTYPE d [<!ENTITY a "b">]>{chunk()}', "cameras.damaged"),
     ],
 )
 def test_refused(tmp_path, content, code):
@@ -567,9 +554,7 @@ def test_refused(tmp_path, content, code):
     ("file", "entries", "code"),
     [
         ("project.zip", None, "cameras.missing_file"),
-        ("0/chunk.zip", None, "cameras.missing_file"),
         ("0/chunk.zip", {"other.xml": ""}, "cameras.damaged"),
-        ("0/chunk.zip", {"doc.xml": "<document><chunk"}, "cameras.damaged"),
     ],
 )
 def test_project_refused(tmp_path, file, entries, code):
@@ -584,12 +569,7 @@ def test_project_refused(tmp_path, file, entries, code):
 
 @pytest.mark.parametrize(
     ("name", "content"),
-    [
-        ("points0.ply", ply(MARK, [])),
-        ("p1.ply", ply(MARK, [(1, 2, 3, 4)])[:-1]),
-        ("p1.ply", ply((*MARK[:3], ("float", "id")), [])),
-        ("p1.ply", None),
-    ],
+    [("points0.ply", ply(MARK, [])), ("p1.ply", ply((*MARK[:3], ("float", "id")), []))],
 )
 def test_tie_points_refused(tmp_path, name, content):
     path = tie_project(tmp_path)

@@ -62,33 +62,24 @@ def test_another_crs(centres, words):
 def test_local_against_projected(crs):
     origin = np.array([725450.0, 4369125.0, 0.0])
     found = likely_mistake(FITS - origin, LOW, HIGH, crs)
-    assert found.startswith("The cameras are near the origin, in local or shifted coordinates")
+    assert found.startswith("The cameras have local or shifted coordinates, the cloud not")
     assert "--cameras-offset" in found
     found = likely_mistake(FITS, LOW - origin, HIGH - origin, None)
-    assert found.startswith("The cloud is near the origin, in local or shifted coordinates")
+    assert found.startswith("The cloud has local or shifted coordinates")
 
 
 def test_a_constant_offset_is_given_in_metres():
     found = likely_mistake(FITS + np.array([3000.0, -4000.0, 0.0]), LOW, HIGH, UTM)
     shift = (LOW + HIGH)[:2] / 2 - np.median(FITS[:, :2], axis=0) - [3000.0, -4000.0]
     assert f"The cameras are {np.hypot(*shift):.0f} m from the cloud in plan" in found
-    assert f"a constant offset of about {shift[0]:.0f}, {shift[1]:.0f} m" in found
+    assert f"an offset of {shift[0]:.0f}, {shift[1]:.0f} m" in found
 
 
 @pytest.mark.parametrize("shift", [-50.0 - 100.0, -110.0 - 100.0])
 def test_cameras_below_the_ground_by_a_geoid(shift):
     found = likely_mistake(FITS + np.array([0.0, 0.0, shift]), LOW, HIGH, UTM)
     assert "below the lowest point of the cloud" in found
-    assert "above the ellipsoid and of the other above the geoid" in found
-
-
-def test_absurdly_high_over_a_small_cloud():
-    low, high = np.array([725440.0, 4369110.0, 8.0]), np.array([725460.0, 4369130.0, 9.0])
-    near = 0.1 * (FITS - FITS.mean(axis=0)) + [725450.0, 4369120.0, 330.0]
-    found = likely_mistake(near, low, high, UTM)
-    assert "m above the cloud" in found
-    assert "geoid" in found
-    assert likely_mistake(near - [0.0, 0.0, 50.0], low, high, UTM) is None
+    assert "heights above the ellipsoid and geoid are mixed" in found
 
 
 def test_heights_in_feet():
@@ -96,7 +87,7 @@ def test_heights_in_feet():
     assert "above the cloud" in found
     valley = np.array([0.0, 0.0, 1500.0])
     found = likely_mistake((FITS + valley) * [1, 1, 0.3048], LOW + valley, HIGH + valley, UTM)
-    assert "their heights are likely in metres, the cloud's in feet" in found
+    assert "their heights are likely in metres, not feet" in found
     found = likely_mistake((FITS + valley) / [1, 1, 0.3048], LOW + valley, HIGH + valley, UTM)
     assert "their heights are likely in feet." in found
 

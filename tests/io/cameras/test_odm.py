@@ -11,6 +11,7 @@ from pcfix.io.cameras import opensfm
 from pcfix.io.cameras.formats import Source
 from tests.utils.camera_files import read, read_ties
 from tests.utils.codes import refused
+from tests.utils.pose_files.block import axes_at
 from tests.utils.shared import needs
 
 pytestmark = pytest.mark.quick_but("test_old_project_turns_by_the_meridian_convergence")
@@ -35,20 +36,9 @@ def to_ecef(lon, lat, h):
     )
 
 
-def enu_axes(lon, lat):
-    lon, lat = np.radians([lon, lat])
-    return np.array(
-        [
-            [-np.sin(lon), np.cos(lon), 0.0],
-            [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)],
-            [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)],
-        ]
-    )
-
-
 def exact_utm(enu, lon=LON, lat=LAT):
     """Topocentric to UTM by way of the earth's centre."""
-    ecef = to_ecef(lon, lat, 0.0) + enu @ enu_axes(lon, lat)
+    ecef = to_ecef(lon, lat, 0.0) + enu @ axes_at(lon, lat)
     back = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
     return np.column_stack(TO_UTM.transform(*back.transform(*ecef.T)))
 
@@ -239,19 +229,10 @@ def changed(name, value=None):
     [
         ({"shots": changed("filename")}, "cameras.damaged"),
         ({"shots": changed("filename", "0.jpg")}, "cameras.damaged"),
-        ({"shots": changed("rotation")}, "cameras.damaged"),
-        ({"shots": changed("translation")}, "cameras.damaged"),
         ({"shots": changed("focal", 0)}, "cameras.lens"),
         ({"shots": geojson(PLACES), "proj": "+proj=nowhere"}, "cameras.crs"),
-        ({"shots": geojson(PLACES), "coords": "\n"}, "cameras.crs"),
-        ({"shots": geojson(PLACES), "cameras": [1]}, "cameras.damaged"),
-        ({"shots": geojson(PLACES), "images": {"a": 1}}, "cameras.damaged"),
         (
             {"reconstruction": reconstruction(PLACES), "transformation": "1 0 0\n0 1"},
-            "cameras.damaged",
-        ),
-        (
-            {"reconstruction": reconstruction(PLACES), "transformation": "9 0 0 9\n" * 4},
             "cameras.damaged",
         ),
     ],

@@ -215,20 +215,13 @@ def test_tracks_of_every_version(tmp_path, header, tail):
 @pytest.mark.parametrize(
     ("change", "code"),
     [
-        ({"shots": {"a.jpg": {**SHOT, "rotation": [1, 2]}}}, "cameras.damaged"),
         ({"shots": {"a.jpg": {**SHOT, "translation": [1, 2, 10**400]}}}, "cameras.damaged"),
-        ({"shots": {"a.jpg": {"camera": "c"}}}, "cameras.damaged"),
-        ({"shots": {"a.jpg": {**SHOT, "camera": "d"}}}, "cameras.damaged"),
         ({"shots": {}}, "cameras.no_pose"),
         ({"cameras": {"c": {**CAMERA, "projection_type": "pinhole9"}}}, "cameras.unsupported"),
         ({"cameras": {"c": {**CAMERA, "focal": 0}}}, "cameras.lens"),
-        ({"cameras": {"c": {**CAMERA, "focal": float("nan")}}}, "cameras.lens"),
         ({"cameras": {"c": {"width": 4000, "height": 3000}}}, "cameras.damaged"),
-        ({"cameras": {"c": {"focal": 0.8}}}, "cameras.damaged"),
         ({"cameras": {"c": {"projection_type": "equirectangular"}}}, "cameras.no_pose"),
-        ({"reference_lla": {"latitude": 47.0}}, "cameras.damaged"),
         ({"reference_lla": {**LLA, "latitude": 4700.0}}, "cameras.damaged"),
-        ({**rigged(), "rig_cameras": {}}, "cameras.damaged"),
     ],
 )
 def test_refused(tmp_path, change, code):
@@ -243,8 +236,6 @@ def test_refused(tmp_path, change, code):
         ([1, 2, 3], None, "cameras.no_tie_points"),
         (None, "a.jpg\t1\t2\t0\t0\n", "cameras.no_tie_points"),
         ([1, 2], "a.jpg\t1\t2\t0\t0\n", "cameras.damaged"),
-        ([1, 2, 3], "", "cameras.damaged"),
-        ([1, 2, 3], "a.jpg\t1\t2\n", "cameras.damaged"),
         ([1, 2, 3], "a.jpg\t1\t2\tx\t0.5\t1\n", "cameras.damaged"),
     ],
 )

@@ -194,16 +194,6 @@ def test_gnss_is_of_the_reference_camera_east_before_north(make, tmp_path):
             {"sensors": [{"id": 7, "internals": {"type": "x", "principal_point_px": [1, 2]}}]},
             "cameras.unsupported",
         ),
-        (
-            "calibrated-cameras.json",
-            {"cameras": [{"id": FIRST_ID, "sensor_id": 7, "position": [0, 0, 0]}]},
-            "cameras.damaged",
-        ),
-        (
-            "scene-reference-frame.json",
-            {"base_to_canonical": {"shift": [0, 0, 0], "scale": [0, 1, 1], "swap_xy": False}},
-            "cameras.damaged",
-        ),
         ("scene-reference-frame.json", {"crs": {"definition": "nowhere"}}, "cameras.crs"),
     ],
 )

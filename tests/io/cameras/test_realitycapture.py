@@ -126,7 +126,6 @@ def test_folder(tmp_path):
         ({"Position": "1 2 x"}, "cameras.number"),
         ({"Rotation": "2 0 0 0 2 0 0 0 2"}, "cameras.rotation"),
         ({"FocalLength35mm": "0"}, "cameras.lens"),
-        ({"FocalLength35mm": None}, "cameras.number"),
         ({"DistortionModel": "rationalP2D1"}, "cameras.unsupported"),
         ({"Rotation": None}, "cameras.no_pose"),
     ],

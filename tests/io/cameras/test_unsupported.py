@@ -1,11 +1,13 @@
-"""Files that are known but not read: each is refused by its name."""
+"""The table of formats, and files that are known but not read: each is refused by its name."""
 
 import json
+import re
+from pathlib import Path
 
 import pytest
 
 import pcfix
-from pcfix.io.cameras import table, unsupported
+from pcfix.io.cameras import FORMATS, table, unsupported
 from pcfix.io.cameras.formats import Source
 from tests.utils.codes import refused
 
@@ -13,38 +15,19 @@ pytestmark = pytest.mark.quick
 
 PATB = "1 153.2\n 456010.1 5432010.2 90.3\n 0 1 0\n -1 0 0\n 0 0 1\n"
 SFM = {"version": ["1", "2", "0"], "featuresFolders": [], "views": [{"viewId": "1"}]}
-NERF = {"fl_x": 3000.0, "frames": [{"file_path": "a.jpg", "transform_matrix": []}]}
 
 FILES = {
     "a.jpg": (b"\xff\xd8\xff\xe0\0\x10JFIF", "an image"),
-    "a.tif": (b"II*\0\x08\0\0\0", "an image"),
     "a.las": (b"LASF\0\0", "a point cloud (LAS, LAZ)"),
-    "a.ply": (b"ply\nformat ascii 1.0\n", "a point cloud or mesh (PLY)"),
-    "a.gpkg": (b"SQLite format 3\0", "a GeoPackage or other SQLite database"),
-    "a.shp": (b"\0\0\x27\x0a\0\0", "a shapefile"),
-    "a.gz": (b"\x1f\x8b\x08", "an archive (gzip)"),
-    "a.mvs": (b"MVSI\x07\0\0\0", "a scene of OpenMVS"),
     "a.p4d": (b'<?xml version="1.0"?>\n<!DOCTYPE Pix4D>\n', "a project of Pix4D"),
     "a.rcproj": (b"<RealityCaptureProject>", "a project of RealityCapture"),
-    "a.kml": (b'<?xml version="1.0"?><kml xmlns="http://www.opengis.net/kml/2.2">', "KML"),
-    "a.jxl": (b'<?xml version="1.0"?><JOBFile jobName="a">', "a survey job (Trimble, Leica)"),
     "a.prj": (b"$PROJECT 15.0.0\n  $ANGULAR_UNITS : deg\n$END\n", "Inpho"),
-    "b.prj": (b"# cut\n$PHOTO\n  $PHOTO_NUM : 12\n", "Inpho"),
-    "a.sup": (b"IMAGE_FILE a.tif\nSENSOR_TYPE FRAME\n", "a support file of SOCET SET"),
-    "itera.dat": (b"ORIA  12 1 456010.1 5432010.2 90.3 0.1 0.2 0.3\n", "a file of BINGO"),
     "a.ori": (PATB.encode(), "PATB"),
     "a.sfm": (json.dumps(SFM).encode(), "AliceVision"),
-    "sfm_data.json": (b'{\n "sfm_data_version": "0.3",\n "views": []}', "a scene of OpenMVG"),
-    "transforms.json": (json.dumps(NERF).encode(), "nerfstudio"),
     "gcp_list.txt": (b"EPSG:32632\n500 5000 10 120 80 a.jpg\n", "ground control points"),
     "sensor.csv": (b"focal,sensor_x,sensor_y\n8.8,13.2,8.8\n", "a table of the sensor"),
-    "AutoCal_Foc-8800.xml": (
-        b"<ExportAPERO><CalibrationInternConique><F>3</F></CalibrationInternConique></ExportAPERO>",
-        "a calibration of MicMac",
-    ),
     "cameras.json": (b'{"v2 dji": {"projection_type": "brown"}}', "without poses"),
     "bare.csv": (b"a.jpg,456010,5432010,90\nb.jpg,456060,5432010,90\n", "without a header"),
-    "bare.txt": (b"456010 5432010 90\n456060 5432010 90\n", "a table without a header"),
 }
 
 
@@ -60,9 +43,6 @@ def test_file(tmp_path, name):
 
 PARTS = {
     "a_calibrated_images_position.txt": "a.jpg,456010.1,5432010.2,90.3\n",
-    "a_pmatrix.txt": "a.jpg 1 2 3 4 5 6 7 8 9 10 11 12\n",
-    "a_offset.xyz": "456000.000 5432000.000 90.000\n",
-    "a_pix4d_calibrated_internal_camera_parameters.cam": "F 8.8\nPx 6.6\nPy 4.4\n",
     "a_calibrated_external_camera_parameters_error.txt": (
         "imageName X Y Z Omega Phi Kappa\na.jpg 0.01 0.01 0.02 0.001 0.001 0.001\n"
     ),
@@ -83,9 +63,6 @@ def test_part_of_an_export(tmp_path, name, what):
     ("inside", "what"),
     [
         ("DJI_0001.JPG", "a folder of images"),
-        ("sfm_data.bin", "OpenMVG"),
-        ("cameras.sfm", "AliceVision"),
-        ("transforms.json", "nerfstudio"),
         ("1_initial", "Pix4D"),
         ("AutoCal_Foc-8800.xml", "MicMac"),
         ("cameras.json", "OpenDroneMap"),
@@ -103,9 +80,7 @@ def test_folder(tmp_path, inside, what):
     "data",
     [
         b"",
-        b"\0\1\2\3",
         b"some words\nand more words\n",
-        b"a.jpg,456010\n",
         b"<?xml version='1.0'?><other/>",
         b'{"something": "else"}',
     ],
@@ -115,3 +90,38 @@ def test_unknown(tmp_path, data):
     assert not unsupported.recognises(Source(tmp_path / "what"))
     with refused("cameras.unknown"):
         pcfix.read_cameras(tmp_path / "what")
+
+
+README = Path(pcfix.__file__).parent / "io" / "cameras" / "README.md"
+PART = re.compile(r"<!-- formats: .*? -->\n(.*?)<!-- end of formats -->", re.DOTALL)
+
+
+def test_the_table_of_the_readme_is_that_of_the_formats():
+    lines = ["| software | what to give |", "|---|---|"]
+    lines += [f"| {each.software} | {each.give} |" for each in FORMATS if each.give]
+    table = "\n".join(lines) + "\n"
+    found = PART.search(README.read_text())
+    assert found is not None
+    assert found[1] == table, f"put this into {README}:\n{table}"
+
+
+@pytest.mark.parametrize("angles", [True, False])
+def test_a_sensor_of_positions_alone_is_refused(tmp_path, angles):
+    """BlocksExchange without a lens: with rotations the sensor counts, without it says nothing."""
+    turn = "".join(f"<M_{i}{j}>{float(i == j)}</M_{i}{j}>" for i in range(3) for j in range(3))
+    rotation = f"<Rotation>{turn}</Rotation>" if angles else ""
+    photo = (
+        f"<Photo><Id>0</Id><ImagePath>a.jpg</ImagePath><Pose>{rotation}"
+        "<Center><x>1</x><y>2</y><z>3</z></Center></Pose></Photo>"
+    )
+    (tmp_path / "b.xml").write_text(
+        '<BlocksExchange version="3.2"><Block><Photogroups><Photogroup><Name>g</Name>'
+        f"{photo}</Photogroup></Photogroups></Block></BlocksExchange>"
+    )
+    sensor = tmp_path / "s.csv"
+    sensor.write_text("focal,sensor_x,sensor_y\n8.8,13.2,8.8\n")
+    if angles:
+        assert pcfix.read_cameras(tmp_path / "b.xml", sensor).lenses[0].focal == 8.8
+    else:
+        with refused("cameras.sensor_unused"):
+            pcfix.read_cameras(tmp_path / "b.xml", sensor)

@@ -9,7 +9,7 @@ axes: ``x_cam = R x + t``, so the projection centre is ``-R' t``. Pixels start a
 corner of the upper left pixel. The world is that of the alignment, if there was one, often minus an
 offset; the files name no CRS, so it is None, unless ``georeference.json`` of pcfix lies beside
 them (``crs``, text or null, ``offset_m``, three numbers, ``written_by``): its offset is then added
-to centres and tie points, and its CRS is theirs. `files` has the lenses, `writing` writes models.
+to centres and tie points, and its CRS is theirs. `files` has the lenses.
 
 Images keep the order of the file. An image point belongs to the point in space whose identifier it
 has, -1 for none; ``points3D`` lists the same as tracks.
@@ -20,6 +20,10 @@ camera), the position as three doubles, its covariance as nine, and the coordina
 WGS84 with latitude, longitude, height, 1 is Cartesian, -1 not defined. The covariance is of metres
 east, north, up, or of the Cartesian axes (https://colmap.github.io/database.html and
 ``src/colmap/geometry/pose_prior.h``).
+
+Models are written in binary, without ``rigs`` and ``frames``, which COLMAP makes itself. Images
+and cameras are numbered from 1 in the order of the block, points in the order of the tie points.
+Positions are written minus an offset, which ``georeference.json`` keeps.
 """
 
 from __future__ import annotations
@@ -27,6 +31,7 @@ from __future__ import annotations
 import json
 import re
 import sqlite3
+import struct
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
@@ -36,10 +41,14 @@ import numpy as np
 
 from pcfix.errors import PcfixWarning
 from pcfix.io.cameras import checks, tracks
+from pcfix.io.cameras.checks import block_to_write, is_same_lens, lens_not_held, write_new
 from pcfix.io.cameras.colmap import files
+from pcfix.io.cameras.colmap.files import BY_NAME, MODELS, OBSERVATION, SHAPES, Camera, lens
 from pcfix.io.cameras.formats import Source
+from pcfix.io.cameras.tracks import NO_TIE_POINTS, are_seen
 from pcfix.io.crs import is_topocentric
-from pcfix.model import Cameras, FloatArray, GnssPositions, TiePoints
+from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, TiePoints
+from pcfix.options.declare import File
 
 _PART = re.compile(r"(cameras|images|points3D|rigs|frames)\.(bin|txt)")
 _CAMERA_LINE = re.compile(r"^\s*\d+\s+[A-Z][A-Z_0-9]+(\s+\S+){2}", re.MULTILINE)
@@ -181,14 +190,15 @@ def read_priors(
     if path is None:
         return None, ()
     try:
-        rows, why = _rows(path), ""
+        rows = _rows(path)
     except sqlite3.Error as error:
-        rows, why = [], f"cannot be read ({error})"
+        sentence = f"its pose priors cannot be read ({error}). They are skipped."
+        return None, (checks.note(path, "cameras.priors_left_out", sentence),)
     row_of = {label: i for i, label in enumerate(labels)}
     found = [(row_of[name], *row) for name, *row in rows if name in row_of]
     systems = {system for *_, system in found}
-    if why or len(systems) > 1:
-        sentence = f"its pose priors {why or 'are in several systems'}. They are left out."
+    if len(systems) > 1:
+        sentence = "its pose priors are in several coordinate systems. They are skipped."
         return None, (checks.note(path, "cameras.priors_left_out", sentence),)
     xyz, sigma = np.full((2, len(labels), 3), np.nan)
     for i, position, covariance, _ in found:
@@ -220,3 +230,118 @@ def _rows(path: Path) -> list[tuple[Any, ...]]:
             f" WHERE {camera} AND typeof(position) = 'blob' AND length(position) = 24"
             " AND typeof(images.name) = 'text'"
         ).fetchall()
+
+
+PREFERRED = (
+    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"),
+    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE"),
+    *("RAD_TAN_THIN_PRISM_FISHEYE", "FOV", "SIMPLE_DIVISION", "DIVISION", "EUCM"),
+)
+"""The simplest first; those that only new versions of COLMAP know come last."""
+GREY = (128, 128, 128)
+ROUND_M = 100.0
+
+
+def write_colmap(
+    folder: File,
+    cameras: Cameras,
+    tie_points: TiePoints | None = None,
+    *,
+    offset_m: tuple[float, float, float] | None = None,
+    crs: str | None = None,
+) -> None:
+    """Write a block as a binary COLMAP model.
+
+    Parameters
+    ----------
+    folder : path
+        Made if need be.
+    cameras : Cameras
+        With rotations and lenses in pixels.
+    tie_points : TiePoints, optional
+        In the frame of the cameras; those without a position or without a view are left out.
+    offset_m : tuple of 3 float, optional
+        Taken off all positions. Default: the middle of the block, to `ROUND_M`.
+    crs : str, optional
+        Default: that of the cameras.
+    """
+    from scipy.spatial.transform import Rotation
+
+    target = Path(folder)
+    _, lenses = block_to_write(  # a file would cut off other names
+        target, cameras, lambda name: name == name.strip() != "" and not {"\0", "\n"} & {*name}
+    )
+    middle = np.median(cameras.centres, axis=0)
+    middle[2] = 0.0  # heights are small, and easier to read as they are
+    offset = np.asarray(np.round(middle / ROUND_M) * ROUND_M if offset_m is None else offset_m)
+    distinct = list(dict.fromkeys(lenses))
+    number = {lens: i for i, lens in enumerate(distinct, start=1)}
+    ties = tie_points or NO_TIE_POINTS
+    kept, counts = are_seen(ties), np.diff(ties.views.start)
+    of_kept = np.repeat(kept, counts)
+    camera = ties.views.camera[of_kept]
+    order = np.argsort(camera, kind="stable")  # COLMAP lists the image points image by image
+    seen = np.empty(len(camera), OBSERVATION)
+    seen["xy"] = ties.image_xy[of_kept][order]
+    seen["point"] = np.repeat(np.cumsum(kept), counts)[of_kept][order]
+    start = np.concatenate([[0], np.cumsum(np.bincount(camera, minlength=len(cameras)))])
+    listed = [struct.pack("<Q", len(distinct))]
+    for i, camera_of in enumerate((colmap_camera(target, one) for one in distinct), start=1):
+        size = int(camera_of.width), int(camera_of.height)
+        listed.append(struct.pack("<IiQQ", i, MODELS.index(camera_of.model), *size))
+        listed.append(np.array(camera_of.values, "<f8").tobytes())
+    rotations = np.asarray(cameras.rotations)
+    turns = np.roll(Rotation.from_matrix(rotations).as_quat(canonical=True), 1, axis=1)
+    shifts = -np.einsum("kij,kj->ki", rotations, cameras.centres - offset)
+    images = [struct.pack("<Q", len(cameras))]
+    for i, (label, one) in enumerate(zip(cameras.labels, lenses, strict=True)):
+        first, last = start[i : i + 2]
+        images.append(struct.pack("<I7dI", i + 1, *turns[i], *shifts[i], number[one]))
+        images.append(label.encode() + b"\0" + struct.pack("<Q", last - first))
+        images.append(seen[first:last].tobytes())
+    contents = {
+        "cameras.bin": b"".join(listed),
+        "images.bin": b"".join(images),
+        "points3D.bin": _points(ties.xyz[kept] - offset, seen["point"], start),
+        FILE: place_text(offset, crs or cameras.crs).encode(),
+    }
+    write_new(target, contents)
+
+
+def colmap_camera(path: Path, given: Lens) -> Camera:
+    """Return the simplest of COLMAP's cameras that is exactly this lens."""
+    whole = float(given.width).is_integer() and float(given.height).is_integer()
+    if given.unit == "px" and whole:
+        lists = (
+            ("f", (given.focal,)),
+            ("fx fy", (given.focal + given.b1, given.focal)),
+            ("cx cy", (given.principal_x, given.principal_y)),
+            ("k1 k2 k3 k4 k5 k6", given.radial),
+            ("d1 d2 d3", given.denominator),
+            ("p2 p1", given.tangential),
+            ("s1 s2 s3 s4", given.thin_prism),
+            (" ".join(SHAPES.get(given.projection, ())), given.shape),
+        )
+        values = {key: v for keys, vs in lists for key, v in zip(keys.split(), vs, strict=False)}
+        for model in PREFERRED:
+            names, projection = BY_NAME[model]
+            numbers = tuple(values.get(name, 0.0) for name in names)
+            camera = Camera(model, given.width, given.height, numbers)
+            if projection == given.projection and is_same_lens(lens(path, 1, camera), given):
+                return camera
+    raise lens_not_held(path, given)
+
+
+def _points(xyz: FloatArray, point: IntArray, image_start: IntArray) -> bytes:
+    """Return the points, each with image number and number in the image of its views; no errors."""
+    image = np.repeat(np.arange(len(image_start) - 1), np.diff(image_start))
+    within = np.arange(len(image)) - image_start[image]
+    order = np.argsort(point, kind="stable")
+    views = np.column_stack([image + 1, within])[order].astype("<u4")
+    start = np.cumsum(np.bincount(point, minlength=len(xyz) + 1))
+    parts = [struct.pack("<Q", len(xyz))]
+    for i, place in enumerate(xyz):
+        first, last = start[i : i + 2]
+        parts.append(struct.pack("<Q3d3BdQ", i + 1, *place, *GREY, 0.0, last - first))
+        parts.append(views[first:last].tobytes())
+    return b"".join(parts)

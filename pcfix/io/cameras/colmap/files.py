@@ -32,14 +32,7 @@ SHAPES = {"fov": ("omega",), "division": ("k",), "eucm": ("alpha", "beta")}
 """COLMAP's names of the parameters of a projection."""
 
 
-class Model(NamedTuple):
-    """A camera model; `parameters` are the names in the order of the file."""
-
-    name: str
-    parameters: tuple[str, ...]
-    projection: Projection | None
-
-
+_TWELVE = "fx fy cx cy k1 k2 k3 k4 k5 k6 p2 p1 s1 s2 s3 s4"
 _TABLE: tuple[tuple[str, str, Projection | None], ...] = (
     ("SIMPLE_PINHOLE", "f cx cy", "perspective"),
     ("PINHOLE", "fx fy cx cy", "perspective"),
@@ -52,11 +45,7 @@ _TABLE: tuple[tuple[str, str, Projection | None], ...] = (
     ("SIMPLE_RADIAL_FISHEYE", "f cx cy k1", "equidistant"),
     ("RADIAL_FISHEYE", "f cx cy k1 k2", "equidistant"),
     ("THIN_PRISM_FISHEYE", "fx fy cx cy k1 k2 p1 p2 k3 k4 s1 s3", "equidistant"),
-    (
-        "RAD_TAN_THIN_PRISM_FISHEYE",
-        "fx fy cx cy k1 k2 k3 k4 k5 k6 p2 p1 s1 s2 s3 s4",
-        "equidistant",
-    ),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", _TWELVE, "equidistant"),
     ("SIMPLE_DIVISION", "f cx cy k", "division"),
     ("DIVISION", "fx fy cx cy k", "division"),
     ("SIMPLE_FISHEYE", "f cx cy", "equidistant"),
@@ -65,14 +54,15 @@ _TABLE: tuple[tuple[str, str, Projection | None], ...] = (
     ("EQUIRECTANGULAR", "w h", None),
 )
 """In the order of their numbers in binary files, from 0."""
-MODELS = tuple(Model(name, tuple(names.split()), projection) for name, names, projection in _TABLE)
-BY_NAME = {model.name: model for model in MODELS}
+MODELS = tuple(name for name, _, _ in _TABLE)
+BY_NAME = {name: (tuple(names.split()), projection) for name, names, projection in _TABLE}
+"""The names of the parameters of each model, in the order of the file, and its projection."""
 
 
 class Camera(NamedTuple):
     """A row of the camera list."""
 
-    model: Model
+    model: str
     width: float
     height: float
     values: tuple[float, ...]
@@ -80,12 +70,12 @@ class Camera(NamedTuple):
 
 def lens(path: Path, identifier: int, camera: Camera) -> Lens:
     """Return the lens of a camera."""
-    model = camera.model
-    if model.projection is None:
-        raise _no_model(path, identifier, model.name)
-    given = dict(zip(model.parameters, camera.values, strict=True))
+    names, projection = BY_NAME[camera.model]
+    if projection is None:
+        raise _no_model(path, identifier, camera.model)
+    given = dict(zip(names, camera.values, strict=True))
     focal_x, focal = given.get("fx", given.get("f", 0.0)), given.get("fy", given.get("f", 0.0))
-    projection, shape = model.projection, SHAPES.get(model.projection, ())
+    shape = SHAPES.get(projection, ())
     if projection == "fov" and abs(given["omega"]) < _SMALLEST_OMEGA:
         projection, shape = "perspective", ()
     return Lens(
@@ -97,14 +87,14 @@ def lens(path: Path, identifier: int, camera: Camera) -> Lens:
         denominator=terms(given, "d1 d2 d3"),
         tangential=terms(given, "p2 p1"),
         thin_prism=terms(given, "s1 s2 s3 s4"),
-        in_turn=model.name == "RAD_TAN_THIN_PRISM_FISHEYE",
-        sensor=f"{identifier} {model.name}",
+        in_turn=camera.model == "RAD_TAN_THIN_PRISM_FISHEYE",
+        sensor=f"{identifier} {camera.model}",
     )
 
 
 def _no_model(path: Path, camera: object, model: object) -> InputError:
     what, remedy = f"the model {model} of camera {camera}", "Give the undistorted model"
-    return unsupported(path, what, f"{remedy} (colmap image_undistorter)", model=model)
+    return unsupported(path, what, remedy, model=model)
 
 
 class Image(NamedTuple):
@@ -129,7 +119,8 @@ class Image(NamedTuple):
 OBSERVATION = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 _COUNT, _CAMERA, _IMAGE = struct.Struct("<Q"), struct.Struct("<IiQQ"), struct.Struct("<I7dI")
 _POINT_BYTES, _POINT_TO_COUNT, _POINT_TO_COLOUR, _VIEW_BYTES = 51, 43, 32, 8
-_STATED = re.compile(r"#.*Number of (?:cameras|images|points): (\d{1,15})\b")
+_STATED = re.compile(r"^#.*Number of (?:cameras|images|points): (\d{1,15})\b", re.MULTILINE)
+_HEAD_CHARACTERS = 4096
 
 
 class _Bytes:
@@ -146,138 +137,102 @@ class _Bytes:
         self.at += form.size
         return values
 
-    def name(self) -> str:
-        """Return the next text, which ends with a zero byte."""
-        begin, end = self.at, self.data.find(b"\0", self.at)
-        if end < 0:
-            raise ValueError("a name does not end")
-        self.at = end + 1
-        return self.data[begin:end].decode("utf-8", "replace")
+
+def _lines(path: Path) -> Iterator[str]:
+    """Yield the lines of a text file, blank ones too; comments may state how many rows it has."""
+    with path.open(encoding="utf-8-sig", errors="replace") as stream:
+        for line in stream:
+            if not line.lstrip().startswith("#"):
+                yield line.strip()
 
 
-class _Text:
-    """A text file: its lines without comments, blank ones too, and the rows that it announces."""
-
-    def __init__(self, path: Path) -> None:
-        self.path, self.stated = path, 0
-
-    def lines(self) -> Iterator[str]:
-        """Yield the lines."""
-        with self.path.open(encoding="utf-8-sig", errors="replace") as stream:
-            for line in stream:
-                if not line.lstrip().startswith("#"):
-                    yield line.strip()
-                elif found := _STATED.match(line.strip()):
-                    self.stated = int(found[1])
-
-    def check(self, rows: int) -> None:
-        """Refuse a file that has fewer rows than its comments announce."""
-        if self.stated > rows:
-            raise damaged(self.path, f"{rows:,} rows instead of {self.stated:,}")
+def _check_count(path: Path, rows: int) -> None:
+    """Refuse a text that has fewer rows than its comments announce."""
+    with path.open(encoding="utf-8-sig", errors="replace") as stream:
+        head = stream.read(_HEAD_CHARACTERS)
+    if (stated := _STATED.search(head)) and int(stated[1]) > rows:
+        raise damaged(path, f"{rows:,} rows instead of {int(stated[1]):,}")
 
 
 def read_cameras(path: Path) -> dict[int, Camera]:
     """Read ``cameras``, binary or text: identifier, model, width, height, parameters."""
+    cameras: dict[int, Camera] = {}
     with reading(path):
-        return _binary_cameras(path) if path.suffix == ".bin" else _text_cameras(path)
-
-
-def _binary_cameras(path: Path) -> dict[int, Camera]:
-    file = _Bytes(path)
-    cameras: dict[int, Camera] = {}
-    for _ in range(*file.take(_COUNT)):
-        identifier, number, width, height = file.take(_CAMERA)
-        if not 0 <= number < len(MODELS):
-            raise _no_model(path, identifier, number)
-        values = file.take(struct.Struct(f"<{len(MODELS[number].parameters)}d"))
-        cameras[identifier] = Camera(MODELS[number], float(width), float(height), values)
-    return cameras
-
-
-def _text_cameras(path: Path) -> dict[int, Camera]:
-    text = _Text(path)
-    cameras: dict[int, Camera] = {}
-    for words in filter(None, map(str.split, text.lines())):
-        model = BY_NAME.get(words[1])
-        if model is None:
-            raise _no_model(path, words[0], words[1])
-        width, height, *values = (float(word) for word in words[2:])
-        if len(values) != len(model.parameters):
-            raise damaged(path, f"camera {words[0]}: {len(values)} parameters of {model.name}")
-        cameras[int(words[0])] = Camera(model, width, height, tuple(values))
-    text.check(len(cameras))
+        if path.suffix == ".bin":
+            file = _Bytes(path)
+            for _ in range(*file.take(_COUNT)):
+                identifier, number, width, height = file.take(_CAMERA)
+                if not 0 <= number < len(MODELS):
+                    raise _no_model(path, identifier, number)
+                values = file.take(struct.Struct(f"<{len(BY_NAME[MODELS[number]][0])}d"))
+                cameras[identifier] = Camera(MODELS[number], float(width), float(height), values)
+            return cameras
+        for name, model, *words in filter(None, map(str.split, _lines(path))):
+            if model not in BY_NAME:
+                raise _no_model(path, name, model)
+            width, height, *numbers = map(float, words)
+            if len(numbers) != len(BY_NAME[model][0]):
+                raise damaged(path, f"camera {name}: {len(numbers)} parameters of {model}")
+            cameras[int(name)] = Camera(model, width, height, tuple(numbers))
+        _check_count(path, len(cameras))
     return cameras
 
 
 def read_images(path: Path, *, points: bool) -> list[Image]:
     """Read ``images``; the image points only where they are asked for."""
-    form = _binary_images if path.suffix == ".bin" else _text_images
     with reading(path):
-        return form(path, points=points)
-
-
-def _binary_images(path: Path, *, points: bool) -> list[Image]:
-    file = _Bytes(path)
-    images = []
-    for _ in range(*file.take(_COUNT)):
-        identifier, *pose, camera = file.take(_IMAGE)
-        name = file.name()
-        (count,) = file.take(_COUNT)
-        seen = np.empty(0, OBSERVATION)
-        if points and count:
-            seen = np.frombuffer(file.data, OBSERVATION, count, file.at)
-            seen = seen[seen["point"] >= 0]
-        file.at += count * OBSERVATION.itemsize
-        images.append(Image(identifier, tuple(pose), camera, name, seen))
-    if file.at > len(file.data):
-        raise damaged(path, "its last image has too few points")
-    return images
-
-
-def _text_images(path: Path, *, points: bool) -> list[Image]:
-    """Read two lines for each image; the second has its image points, -1 for those of no point."""
-    text, images = _Text(path), []
-    lines = text.lines()
-    for line in filter(None, lines):
-        identifier, *pose, camera, name = line.split(None, 9)
-        below = next(lines, "")
-        if below:
-            int(below.rsplit(None, 1)[-1])  # the line of the next image would end with a name
-        rows = np.array(below.split() if points else (), float).reshape(-1, 3)
-        rows = rows[rows[:, 2] >= 0]
-        seen = np.empty(len(rows), OBSERVATION)
-        seen["xy"], seen["point"] = rows[:, :2], rows[:, 2]
-        images.append(Image(int(identifier), tuple(map(float, pose)), int(camera), name, seen))
-    text.check(len(images))
-    return images
+        if path.suffix == ".bin":
+            file, images = _Bytes(path), []
+            for _ in range(*file.take(_COUNT)):
+                identifier, *pose, camera = file.take(_IMAGE)
+                end = file.data.find(b"\0", file.at)
+                if end < 0:
+                    raise ValueError("a name does not end")
+                name, file.at = file.data[file.at : end].decode("utf-8", "replace"), end + 1
+                (count,) = file.take(_COUNT)
+                seen = np.empty(0, OBSERVATION)
+                if points and count:
+                    seen = np.frombuffer(file.data, OBSERVATION, count, file.at)
+                    seen = seen[seen["point"] >= 0]
+                file.at += count * OBSERVATION.itemsize
+                images.append(Image(identifier, tuple(pose), camera, name, seen))
+            if file.at > len(file.data):
+                raise damaged(path, "its last image has too few points")
+            return images
+        images, lines = [], _lines(path)
+        for line in filter(None, lines):
+            identifier, *pose, camera, name = line.split(None, 9)
+            below = next(lines, "")
+            if below:
+                int(below.rsplit(None, 1)[-1])  # the line of the next image would end with a name
+            rows = np.array(below.split() if points else (), float).reshape(-1, 3)
+            rows = rows[rows[:, 2] >= 0]
+            seen = np.empty(len(rows), OBSERVATION)
+            seen["xy"], seen["point"] = rows[:, :2], rows[:, 2]
+            images.append(Image(int(identifier), tuple(map(float, pose)), int(camera), name, seen))
+        _check_count(path, len(images))
+        return images
 
 
 def read_points(path: Path) -> tuple[IntArray, FloatArray]:
     """Read identifiers and places of ``points3D``; the tracks are in the images too."""
     with reading(path):
-        return _binary_points(path) if path.suffix == ".bin" else _text_points(path)
-
-
-def _binary_points(path: Path) -> tuple[IntArray, FloatArray]:
-    file = _Bytes(path)
-    (count,) = file.take(_COUNT)
-    data, at, starts = file.data, file.at, []
-    for _ in range(count):  # millions, so without a function call each
-        starts.append(at)
-        at += _POINT_BYTES + _VIEW_BYTES * _COUNT.unpack_from(data, at + _POINT_TO_COUNT)[0]
-    if at > len(data):
-        raise damaged(path, "its last point has too few views")
-    if not starts:
-        return np.empty(0, np.int64), np.empty((0, 3))
-    every_byte = np.frombuffer(data, np.uint8)
-    rows = np.lib.stride_tricks.sliding_window_view(every_byte, _POINT_TO_COLOUR)[starts]
-    numbers = np.ascontiguousarray(rows).view([("id", "<i8"), ("xyz", "<f8", 3)])[:, 0]
-    return numbers["id"].copy(), numbers["xyz"].copy()
-
-
-def _text_points(path: Path) -> tuple[IntArray, FloatArray]:
-    text = _Text(path)
-    rows = [line.split(None, 4)[:4] for line in text.lines() if line]
-    text.check(len(rows))
-    values = np.array([row[1:] for row in rows], float).reshape(-1, 3)
-    return np.array([int(row[0]) for row in rows], np.int64), values
+        if path.suffix != ".bin":
+            lines = [line.split(None, 4)[:4] for line in _lines(path) if line]
+            _check_count(path, len(lines))
+            values = np.array([line[1:] for line in lines], float).reshape(-1, 3)
+            return np.array([int(line[0]) for line in lines], np.int64), values
+        file = _Bytes(path)
+        (count,) = file.take(_COUNT)
+        data, at, starts = file.data, file.at, []
+        for _ in range(count):  # millions, so without a function call each
+            starts.append(at)
+            at += _POINT_BYTES + _VIEW_BYTES * _COUNT.unpack_from(data, at + _POINT_TO_COUNT)[0]
+        if at > len(data):
+            raise damaged(path, "its last point has too few views")
+        if not starts:
+            return np.empty(0, np.int64), np.empty((0, 3))
+        every_byte = np.frombuffer(data, np.uint8)
+        rows = np.lib.stride_tricks.sliding_window_view(every_byte, _POINT_TO_COLOUR)[starts]
+        numbers = np.ascontiguousarray(rows).view([("id", "<i8"), ("xyz", "<f8", 3)])[:, 0]
+        return numbers["id"].copy(), numbers["xyz"].copy()

@@ -18,7 +18,7 @@ corner of the image and the id of the track. A project of one file has them besi
 Markers stand in the document of the frame, as ``location`` with x and y; only the pinned ones were
 measured, the others Metashape computed from the poses. Where the GNSS put the cameras is their
 ``reference``, in the CRS of the cameras or of the chunk. The formulas of a calibration stand in
-`sensors`.
+`block`.
 
 References: "Agisoft Metashape User Manual, Professional Edition", appendix "Camera models";
 "Metashape Python Reference", Chunk.transform, Sensor.location, CoordinateSystem.geoccs;
@@ -30,6 +30,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeAlias
 from xml.etree.ElementTree import Element
 from zipfile import ZipFile
 
@@ -39,9 +40,8 @@ from pcfix.errors import PcfixWarning
 from pcfix.io.cameras.checks import damaged, note, number, numbers, reading, text_of
 from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.metashape import documents
-from pcfix.io.cameras.metashape.block import Block, read_block
+from pcfix.io.cameras.metashape.block import Block, name_of, read_block, read_calibration
 from pcfix.io.cameras.metashape.documents import Chunk, Document, open_archive, recognises, unpacked
-from pcfix.io.cameras.metashape.sensors import name_of, read_calibration
 from pcfix.io.cameras.tracks import Seen, no_tie_points
 from pcfix.io.cameras.tracks import tie_points as gathered
 from pcfix.io.crs import is_local, parse_crs
@@ -50,12 +50,13 @@ from pcfix.model import Cameras, FloatArray, GnssPositions, TiePoints
 
 __all__ = ["read", "read_calibration", "recognises", "tie_points"]
 
-SPREADS: tuple[tuple[str, tuple[int, ...]], ...] = (
+Spreads: TypeAlias = "tuple[tuple[str, tuple[int, ...]], ...]"
+"""Names of stated standard deviations and the axes that they are of."""
+SPREADS: Spreads = (
     *(("sxyz", (0, 1, 2)), ("sxy", (0, 1))),
     *(("sx", (0,)), ("sy", (1,)), ("sz", (2,))),
 )
-"""Names of stated standard deviations and the axes that they are of."""
-DEFAULTS = (
+DEFAULTS: Spreads = (
     ("accuracy_cameras", (0, 1, 2)),
     ("accuracy_cameras_xy", (0, 1)),
     ("accuracy_cameras_z", (2,)),
@@ -87,42 +88,37 @@ def gnss_positions(
         (entry.get("name") or "").replace("/", "_"): entry.get("value") or ""
         for entry in chunk.element.iterfind("settings/property")
     }
-    start = _sigma(path, "settings of the chunk", settings, DEFAULTS, np.full(3, np.nan))
+    start = spreads(path, "settings of the chunk", settings, DEFAULTS, np.full(3, np.nan))
     xyz, sigma = np.full((2, len(used), 3), np.nan)
     for i, (image, reference) in enumerate(zip(block.images, used, strict=True)):
-        where, stated = (
-            f"image {image.label}, reference",
-            {} if reference is None else reference.attrib,
-        )
+        where = f"image {image.label}, reference"
+        stated = {} if reference is None else reference.attrib
         for j, axis in enumerate("xyz"):
             if axis in stated:
                 xyz[i, j] = number(path, where, stated[axis])
-        sigma[i] = _sigma(path, where, stated, SPREADS, start)
+        sigma[i] = spreads(path, where, stated, SPREADS, start)
     if not np.isfinite(xyz[:, :2]).all(axis=1).any():
         return None, ()
     sigma = np.where(np.isfinite(xyz) & (sigma > 0.0), sigma, np.nan)
     crs, notes = _crs(path, chunk.element, xyz)
     for sensor in dict.fromkeys(image.sensor for image in block.images):
-        if sensor is not None and _has_antenna_offset(path, sensor):
+        antenna = [] if sensor is None else text_of(sensor, "antenna/location").split()
+        for shift in () if sensor is None else sensor.iterfind("antenna/reference"):
+            antenna += [shift.get(axis) or "0" for axis in "xyz"]
+            antenna += (shift.get("location") or "").split()
+        if sensor is not None and any(number(path, "GNSS antenna", one) for one in antenna):
             label = name_of(sensor)
-            sentence = (
-                f"the GNSS antenna of sensor {label} has an offset from the camera. The GNSS"
-                " positions are those of the antenna."
-            )
+            sentence = f"the GNSS positions are those of the antenna (sensor {label}), not offset."
             notes.append(note(path, "cameras.antenna_offset", sentence, sensor=label))
     return GnssPositions(xyz, sigma, crs), tuple(notes)
 
 
-def _sigma(
-    path: Path,
-    where: str,
-    stated: dict[str, str],
-    spreads: tuple[tuple[str, tuple[int, ...]], ...],
-    start: FloatArray,
+def spreads(
+    path: Path, where: str, stated: dict[str, str], names: Spreads, start: FloatArray
 ) -> FloatArray:
     """Return `start` with what is stated, the widest first: one number for its axes, or each."""
     sigma = start.copy()
-    for name, axes in spreads:
+    for name, axes in names:
         if text := stated.get(name):
             count = 1 if len(text.split()) == 1 else len(axes)
             sigma[list(axes)] = numbers(path, f"{where}, {name}", text, count)
@@ -137,20 +133,9 @@ def _crs(path: Path, chunk: Element, xyz: FloatArray) -> tuple[str, list[PcfixWa
         return "local", []
     are_degrees = (np.nanmax(np.abs(xyz[:, :2]), axis=0) <= [180.0, 90.0]).all()
     if not own and not crs.is_geographic and are_degrees:
-        sentence = (
-            "the reference positions of the cameras are degrees, although the CRS of the chunk is"
-            " in metres. They are taken as WGS 84."
-        )
+        sentence = "the camera positions are degrees in a CRS in metres; WGS 84 is assumed."
         return "EPSG:4979", [note(path, "cameras.gnss_in_degrees", sentence)]
     return text, []
-
-
-def _has_antenna_offset(path: Path, sensor: Element) -> bool:
-    words = text_of(sensor, "antenna/location").split()
-    for reference in sensor.iterfind("antenna/reference"):
-        words += [reference.get(axis) or "0" for axis in "xyz"]
-        words += (reference.get("location") or "").split()
-    return any(number(path, "GNSS antenna", word) != 0.0 for word in words)
 
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
@@ -163,19 +148,21 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     block = read_block(chunk)
     if len(block.images) != len(cameras):
         raise damaged(chunk.path, f"{len(block.images)} aligned images, {len(cameras)} cameras")
-    first = chunk.element.find("frames/frame")
-    frame = None if first is None else chunk.document.follow(first)
+    frame = chunk.frame
     seen = [] if frame is None else [*_tie_points(frame, block), _markers(frame, block)]
     if not any(len(part.point) for part in seen):
-        why = "only a project (.psx with its .files folder) or exported markers have them"
-        raise no_tie_points(chunk.path, why)
+        raise no_tie_points(chunk.path, "only a project (.psx with its folder) or markers have any")
     return gathered(*seen)
 
 
 def _tie_points(frame: Document, block: Block) -> Iterator[Seen]:
     """Yield the points of every component that has a place; their archive may be left out."""
     clouds = (*frame.root.iterfind("point_cloud"), *frame.root.iterfind("tie_points"))
-    found = (frame.follow(cloud) for cloud in clouds if frame.leads_to_a_file(cloud))
+    found = [
+        frame.follow(cloud)
+        for cloud in clouds
+        if (path := frame.leads_to(cloud)) is None or path.is_file()
+    ]
     document = next((d for d in found if d.root.find("projections") is not None), None)
     if document is None:
         return
@@ -192,10 +179,8 @@ def _tie_points(frame: Document, block: Block) -> Iterator[Seen]:
             ]
             if not rows:
                 continue
-            vertices, place = (
-                _vertices(archive, points.get("path") or "", POINTS),
-                block.places[rows[0]],
-            )
+            vertices = _vertices(archive, points.get("path") or "", POINTS)
+            place = block.places[rows[0]]
             xyz = np.column_stack([vertices[axis] for axis in "xyz"]).astype(np.float64)
             order = np.argsort(vertices["id"], kind="stable")
             ids = vertices["id"][order].astype(np.int64)
@@ -229,22 +214,11 @@ def _vertices(archive: ZipFile, name: str, needed: tuple[str, ...]) -> np.ndarra
 def _markers(frame: Document, block: Block) -> Seen:
     """Return the markers that were measured; they have no position."""
     row_of = {image.id: i for i, image in enumerate(block.images)}
-    point: list[int] = []
-    camera, uv, count = [], [], 0
-    for marker in frame.root.iterfind("markers//marker"):
-        before = len(point)
-        for mark in marker.iterfind("location"):
-            row = row_of.get(mark.get("camera_id") or "")
-            if row is None or "false" in (mark.get("pinned"), mark.get("valid")):
-                continue
-            where = f"marker {marker.get('marker_id')}, camera {mark.get('camera_id')}"
-            point.append(count)
-            camera.append(row)
-            uv.append([number(frame.path, where, mark.get(axis)) for axis in "xy"])
-        count += len(point) > before
+    marks = [mark for mark in documents.measured_marks(frame) if mark[1] in row_of]
+    names = {name: i for i, name in enumerate(dict.fromkeys(name for name, _, _ in marks))}
     return Seen(
-        np.full((count, 3), np.nan),
-        np.array(point, dtype=np.int64),
-        np.array(camera, dtype=np.int64),
-        np.array(uv, dtype=np.float64).reshape(-1, 2),
+        np.full((len(names), 3), np.nan),
+        np.array([names[name] for name, _, _ in marks], np.int64),
+        np.array([row_of[camera] for _, camera, _ in marks], np.int64),
+        np.array([uv for _, _, uv in marks], np.float64).reshape(-1, 2),
     )

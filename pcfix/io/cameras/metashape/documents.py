@@ -5,13 +5,15 @@ from __future__ import annotations
 import io
 import re
 import zipfile
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
 from pcfix.errors import InputError, PcfixWarning
-from pcfix.io.cameras.checks import DAMAGES, damaged, missing, no_pose, note, read_xml, reading
+from pcfix.io.cameras import checks
+from pcfix.io.cameras.checks import damaged, missing, note, number, read_xml, reading
 from pcfix.io.cameras.formats import Source
 
 ZIP_MAGIC = b"PK\x03\x04"
@@ -31,18 +33,13 @@ class Document:
 
     def follow(self, element: Element) -> Document:
         """Return what an element stands for: itself, or the document its path leads to."""
-        relative = element.get("path")
-        if relative is None:
-            return Document(element, self.path)
-        return read_entry(self._file(relative))
+        path = self.leads_to(element)
+        return Document(element, self.path) if path is None else read_entry(path)
 
-    def leads_to_a_file(self, element: Element) -> bool:
-        """Whether what an element stands for is there: in the same document, or as a file."""
+    def leads_to(self, element: Element) -> Path | None:
+        """Return the file that an element stands for; None if it stands for itself."""
         relative = element.get("path")
-        return relative is None or self._file(relative).is_file()
-
-    def _file(self, relative: str) -> Path:
-        return self.path.parent / relative.replace("\\", "/")
+        return None if relative is None else self.path.parent / relative.replace("\\", "/")
 
 
 class Chunk(NamedTuple):
@@ -58,6 +55,12 @@ class Chunk(NamedTuple):
         """The ``chunk`` element."""
         return self.document.root
 
+    @property
+    def frame(self) -> Document | None:
+        """The first frame, which has the images of every marker and the tie points."""
+        first = self.element.find("frames/frame")
+        return None if first is None else self.document.follow(first)
+
 
 def recognises(source: Source) -> bool:
     """Whether the content is a project, a chunk, or an archive of one."""
@@ -68,7 +71,7 @@ def recognises(source: Source) -> bool:
         try:
             with zipfile.ZipFile(source.path) as archive, archive.open("doc.xml") as stream:
                 text = stream.read(len(source.head)).decode("utf-8", errors="replace")
-        except DAMAGES:
+        except checks.DAMAGES:
             return False
     root = ROOT.match(text)
     inside = INSIDE.get(root[1]) if root else None
@@ -94,15 +97,23 @@ def open_chunk(path: Path) -> Chunk:
     if not posed and lost:
         raise lost[0]
     if not found:
-        raise no_pose(path, "has no chunk")
+        raise checks.no_pose(path, "has no chunk")
     chosen, *others = posed or found[:1]
     names = [each.root.get("label") or "without a name" for each in (chosen, *others)]
-    sentence = (
-        f"{len(names)} chunks have aligned images; read is {names[0]}, not"
-        f" {', '.join(names[1:11])}. Make another chunk the active one to read that."
-    )
+    sentence = f"several chunks have aligned images; {names[0]} is read. Activate another for that."
     said = note(path, "cameras.several_chunks", sentence, chunk=names[0], others=names[1:])
     return Chunk(path, chosen, _software(chosen.root, top.root), (said,) if others else ())
+
+
+def measured_marks(frame: Document) -> Iterator[tuple[str, str, tuple[float, float]]]:
+    """Yield marker, camera and image coordinates of what was measured, not computed."""
+    for marker in frame.root.iterfind("markers//marker"):
+        for mark in marker.iterfind("location"):
+            if "false" not in (mark.get("pinned"), mark.get("valid")):
+                name, camera = marker.get("marker_id") or "", mark.get("camera_id") or ""
+                where = f"marker {name}, camera {camera}"
+                u, v = (number(frame.path, where, mark.get(axis)) for axis in "xy")
+                yield name, camera, (u, v)
 
 
 def _top(path: Path) -> Document:
@@ -126,10 +137,9 @@ def _software(chunk: Element, top: Element) -> str:
     """Return program and version, or that of the document where the file names no program."""
     entries = (*top.iterfind("meta/property"), *chunk.iterfind("meta/property"))
     about = {entry.get("name"): entry.get("value", "") for entry in entries}
-    version = about.get("Info/LastSavedSoftwareVersion")
-    version = version or about.get("Info/OriginalSoftwareVersion")
-    if version:
-        return f"{about.get('Info/OriginalSoftwareName') or 'Agisoft Metashape'} {version}"
+    last, first = (about.get(f"Info/{one}SoftwareVersion") for one in ("LastSaved", "Original"))
+    if last or first:
+        return f"{about.get('Info/OriginalSoftwareName') or 'Agisoft Metashape'} {last or first}"
     document = top.get("version") or chunk.get("version")
     return f"Agisoft Metashape, document {document}" if document else "Agisoft Metashape"
 

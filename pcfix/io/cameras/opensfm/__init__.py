@@ -15,23 +15,51 @@ divided by the larger side, the origin in the image centre.
 
 References: "Reconstruction file", "Coordinate Systems" and "Rig Models" in the manual,
 https://opensfm.org/docs.
+
+The camera models of OpenSfM as a Lens in pixels, and a block written with them.
+
+Image coordinates are divided by the larger side of the image, the origin is its centre, x right
+and y down; so are `focal`, `focal_x`, `focal_y`, `c_x` and `c_y`. The tangential terms follow
+OpenCV (p1 with 2 x y in x). Distortion acts on the projected coordinates, which are angles for
+the fisheye models.
+
+OpenSfM's world is topocentric. Cameras in a projected CRS are taken to the axes east, north, up at
+the middle of the block, at height 0, by the inverse of what `georeference` does on reading: centres
+and tie points through PROJ, rotations by the turn of the axes at their own centre. Heights are
+taken as ellipsoidal where the CRS does not say what they are, as the reader takes them back.
+Cameras in no CRS keep their numbers, and no reference is written. The file of tracks is of version
+2: image, track, feature, x, y, scale, red, green, blue, segmentation, instance.
 """
 
 from __future__ import annotations
 
+import json
 import re
+from collections import Counter
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import astuple, replace
 from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from pcfix.errors import bad_file
 from pcfix.io.cameras import checks, tracks
 from pcfix.io.cameras.formats import Source
-from pcfix.io.cameras.opensfm.models import is_panorama, lens
+from pcfix.io.cameras.georeference import frame_of, georeference, is_tied
+from pcfix.io.cameras.tracks import NO_TIE_POINTS, are_seen
+from pcfix.io.crs import (
+    GEOGRAPHIC_WGS84,
+    Topocentric,
+    heights_of,
+    is_topocentric,
+    parse_crs,
+    shortened,
+    transformation,
+)
 from pcfix.lens.rotations import from_rotation_vectors
-from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, TiePoints
+from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, Projection, TiePoints
+from pcfix.options.declare import File
 
 TOPOCENTRIC_LIMIT_M = 1e5
 
@@ -159,9 +187,8 @@ def _poses(chosen: Any, shots: dict[str, Any]) -> tuple[FloatArray, FloatArray]:
 
 def _pose(entry: Any) -> tuple[FloatArray, FloatArray]:
     """Return R and t of an entry with an axis-angle rotation."""
-    return from_rotation_vectors(checks.triple(entry["rotation"])), checks.triple(
-        entry["translation"]
-    )
+    turn = from_rotation_vectors(checks.triple(entry["rotation"]))
+    return turn, checks.triple(entry["translation"])
 
 
 def _reference(path: Path, chosen: Any) -> tuple[float, float, float] | None:
@@ -175,9 +202,7 @@ def _reference(path: Path, chosen: Any) -> tuple[float, float, float] | None:
     with checks.reading(path):
         lat, lon, alt = (float(entry[key]) for key in ("latitude", "longitude", "altitude"))
         if not (abs(lat) <= 90.0 and abs(lon) <= 360.0 and abs(alt) < np.inf):
-            raise checks.damaged(
-                path, f"reference_lla {lat:g}, {lon:g} is no latitude and longitude"
-            )
+            raise checks.damaged(path, f"reference_lla {lat:g}, {lon:g} is no place on earth")
     return None if lat == lon == 0.0 else (lat, lon, alt)
 
 
@@ -226,3 +251,186 @@ def _observations(
         raise checks.damaged(path, "it is empty")
     point, camera, xy = (np.concatenate(column) for column in zip(*parts, strict=True))
     return point, camera, xy
+
+
+PANORAMAS = frozenset({"equirectangular", "spherical"})
+
+_MODELS: dict[str, tuple[Projection, int]] = {
+    "perspective": ("perspective", 2),
+    "simple_radial": ("perspective", 1),
+    "radial": ("perspective", 2),
+    "brown": ("perspective", 3),
+    "fisheye": ("equidistant", 2),
+    "fisheye_opencv": ("equidistant", 4),
+    "fisheye62": ("equidistant", 6),
+    "fisheye624": ("equidistant", 6),
+    "dual": ("dual", 2),
+}
+_TANGENTIAL = frozenset({"brown", "fisheye62", "fisheye624"})
+_WRITTEN = ("perspective", "brown", "fisheye", "fisheye_opencv", "fisheye62", "fisheye624", "dual")
+"""The simplest first."""
+_SIZE = re.compile(r" (\d{2,6}) (\d{2,6}) [a-z_]+\d* ")
+
+
+def is_panorama(camera: dict[str, Any]) -> bool:
+    """Whether a camera sees all around, which no plane image with a frame can hold."""
+    return str(camera.get("projection_type")) in PANORAMAS
+
+
+def lens(path: Path, name: str, camera: dict[str, Any]) -> Lens:
+    """Return the lens of an entry of `cameras`."""
+    model = str(camera.get("projection_type", "perspective"))
+    if model not in _MODELS:
+        remedy = f"Use one of {', '.join(_MODELS)}"
+        what = f"the projection_type '{model}' of camera {name}"
+        raise checks.unsupported(path, what, remedy, model=model, camera=name)
+
+    def value(key: str, default: float = 0.0) -> float:
+        return float(camera.get(key, default))
+
+    width, height = value("width"), value("height")
+    named = _SIZE.search(name)  # the size, in old files
+    if not (width and height) and named:
+        width, height = float(named[1]), float(named[2])
+    if not (width and height):
+        raise checks.damaged(path, f"the width and height of camera {name} are missing")
+    scale = max(width, height)
+    fx = float(camera["focal_x" if "focal_x" in camera else "focal"])
+    fy = value("focal_y", fx) if "focal_x" in camera else fx
+    keys = ("c_x", "c_y", "p1", "p2", "s0", "s1", "s2", "s3")
+    cx, cy, p1, p2, *prism = (value(key) for key in keys)
+    projection, radial = _MODELS[model]
+    return Lens(
+        *(fy * scale, width, height, width / 2.0 + cx * scale, height / 2.0 + cy * scale),
+        b1=(fx - fy) * scale,
+        projection=projection,
+        shape=(value("transition", 0.5),) if model == "dual" else (),
+        radial=tuple(value(f"k{i + 1}") for i in range(radial)),
+        tangential=(p2, p1) if model in _TANGENTIAL else (),
+        thin_prism=tuple(prism) if model == "fisheye624" else (),
+        sensor=name,
+    )
+
+
+TRACKS_HEADER = "OPENSFM_TRACKS_VERSION_v2"
+GREY = (128, 128, 128)
+FEATURE_SCALE = 0.001
+"""Of a feature, in units of the larger side; OpenSfM wants some number."""
+
+
+def write_opensfm(path: File, cameras: Cameras, tie_points: TiePoints | None = None) -> None:
+    """Write a block as an OpenSfM reconstruction.
+
+    Parameters
+    ----------
+    path : path
+        Of the reconstruction, usually ``reconstruction.json``; ``tracks.csv`` (with tie points)
+        and ``reference_lla.json`` (with a CRS) go beside it.
+    cameras : Cameras
+        With rotations, lenses in pixels, and labels that are all different; in a projected CRS,
+        topocentric, or in none.
+    tie_points : TiePoints, optional
+        In the frame of the cameras; those without a position or without a view are left out.
+    """
+    target = Path(path)
+    times = Counter(cameras.labels)  # they are keys in the file
+    _, lenses = checks.block_to_write(
+        target, cameras, lambda label: times[label] == 1 and not {"\t", "\n"} & {*label}
+    )
+    models = {each: opensfm_camera(target, each) for each in dict.fromkeys(lenses)}
+    names = {each: f"pcfix {i}" for i, each in enumerate(models, start=1)}
+    ties = tie_points or NO_TIE_POINTS
+    kept = np.flatnonzero(are_seen(ties))
+    from scipy.spatial.transform import Rotation
+
+    there, points, place = _world(cameras, ties.xyz[kept], str(target))
+    rotations = np.asarray(there.rotations)
+    turns = Rotation.from_matrix(rotations).as_rotvec()
+    shifts = -np.einsum("kij,kj->ki", rotations, there.centres)
+    chosen: dict[str, Any] = {
+        "cameras": {names[each]: model for each, model in models.items()},
+        "shots": {
+            label: {"rotation": turn, "translation": shift, "camera": names[one]}
+            for label, turn, shift, one in zip(
+                cameras.labels, turns.tolist(), shifts.tolist(), lenses, strict=True
+            )
+        },
+        "points": {
+            str(i): {"color": list(GREY), "coordinates": row}
+            for i, row in enumerate(points.tolist())
+        },
+    }
+    texts = {}
+    if place is not None:
+        keys = ("latitude", "longitude", "altitude")
+        chosen["reference_lla"] = dict(zip(keys, astuple(place), strict=True))
+        texts["reference_lla.json"] = json.dumps(chosen["reference_lla"], indent=2) + "\n"
+    if tie_points is not None:
+        views, feature = tie_points.views, np.zeros(len(cameras), np.int64)
+        size = np.array([(lens.width, lens.height) for lens in lenses])[views.camera]
+        xy = (tie_points.image_xy - size / 2.0) / size.max(axis=1, initial=1.0)[:, None]
+        rest = "\t".join(map(str, (FEATURE_SCALE, *GREY, -1, -1)))
+        lines = [TRACKS_HEADER]
+        for track, row in enumerate(kept.tolist()):
+            for i in range(views.start[row], views.start[row + 1]):
+                camera, (x, y) = views.camera[i], xy[i].tolist()
+                image = f"{cameras.labels[camera]}\t{track}\t{feature[camera]}"
+                lines.append(f"{image}\t{x!r}\t{y!r}\t{rest}")
+                feature[camera] += 1  # features count from 0 in each image
+        texts["tracks.csv"] = "\n".join(lines) + "\n"
+    texts[target.name] = json.dumps([chosen]) + "\n"
+    checks.write_new(target.parent, {name: text.encode() for name, text in texts.items()})
+
+
+def opensfm_camera(path: Path, given: Lens) -> dict[str, Any]:
+    """Return the simplest entry of `cameras` that is exactly this lens."""
+    scale = max(given.width, given.height)
+    size = {"width": int(given.width), "height": int(given.height)}
+    one = {"focal": given.focal / scale}
+    two = {
+        "focal_x": (given.focal + given.b1) / scale,
+        "focal_y": given.focal / scale,
+        "c_x": (given.principal_x - given.width / 2.0) / scale,
+        "c_y": (given.principal_y - given.height / 2.0) / scale,
+    }
+    p2, p1 = (*given.tangential, 0.0, 0.0)[:2]
+    prism = {f"s{i}": value for i, value in enumerate((*given.thin_prism, *(0.0,) * 4)[:4])}
+    radial = (*given.radial, *(0.0,) * 6)
+    for model in _WRITTEN if given.unit == "px" else ():
+        projection, count = _MODELS[model]
+        if projection == given.projection:
+            camera: dict[str, Any] = {"projection_type": model, **size}
+            camera |= one if model in ("perspective", "fisheye", "dual") else two
+            camera |= {f"k{i + 1}": radial[i] for i in range(count)}
+            camera |= {"p1": p1, "p2": p2} if model in _TANGENTIAL else {}
+            camera |= prism if model == "fisheye624" else {}
+            camera |= {"transition": (*given.shape, 0.5)[0]} if model == "dual" else {}
+            if checks.is_same_lens(lens(path, "1", camera), given):
+                return camera
+    raise checks.lens_not_held(path, given)
+
+
+def _world(
+    cameras: Cameras, points: FloatArray, name: str
+) -> tuple[Cameras, FloatArray, Topocentric | None]:
+    """Return cameras and points in the world of the file, and its origin where it has one.
+
+    From a projected CRS they go to axes east, north, up at the middle of the block.
+    """
+    if cameras.crs is None or not is_tied(cameras.crs, name):
+        return cameras, points, None
+    if is_topocentric(cameras.crs):
+        return cameras, points, Topocentric.from_text(cameras.crs, name)
+    if not parse_crs(cameras.crs, name).is_projected:
+        sentence = f"the cameras are in {shortened(cameras.crs)}. Bring them to a projected CRS."
+        raise bad_file(name, "output.crs", sentence, crs=cameras.crs)
+    source, geographic = frame_of(cameras.crs, name).crs, parse_crs(GEOGRAPHIC_WGS84, name)
+    stated = heights_of(source) != "unstated"
+    to_degrees = transformation(source, geographic, cameras.centres, name, heights=stated).forward
+    longitude, latitude, _ = to_degrees(np.median(cameras.centres, axis=0)[None])[0].tolist()
+    place = Topocentric(latitude, longitude, 0.0)
+    centres, points = (place.from_degrees(to_degrees(xyz)) for xyz in (cameras.centres, points))
+    text = "ENU:" + ",".join(map(repr, astuple(place)))
+    there = replace(cameras, centres=centres, crs=text, project_crs=None, gnss=None)
+    turns = georeference(there, cameras.crs, name=name).turns(centres)
+    return replace(there, rotations=np.asarray(cameras.rotations) @ turns), points, place

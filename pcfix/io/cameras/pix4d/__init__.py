@@ -24,7 +24,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path, PurePath, PureWindowsPath
-from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -76,30 +75,30 @@ def read(source: Source) -> Cameras:
         remedy = f"Give the params folder of the project; {GEOGRAPHIC} alone does not suffice"
         raise checks.missing(source.path.with_name(PARAMETERS), remedy)
     calibrations = tables.read_calibrations(files["calibration"]) if "calibration" in files else []
-    lenses: tuple[Lens, ...] | None = None
     if "parameters" in files:
         images = tables.read_parameters(files["parameters"])
-        poses = _poses(files, images)
-        lenses = tables.lenses_of_images([images[row] for row in poses.rows], calibrations)
+        rows, centres, rotations, unposed, notes = _poses(files, images)
+        labels = [images[row].label for row in rows]
+        own = [tables.lens_of_image(images[row], calibrations) for row in rows]
     else:
         labels, centres, rotations = tables.read_external(files["external"])
         lens = tables.lens_of_calibration(calibrations[0]) if len(calibrations) == 1 else None
-        lenses = None if lens is None else (lens,) * len(labels)
+        own, unposed = [lens] * len(labels), []
         why = f"there is no {PARAMETERS} beside it"
-        notes = () if lenses else (checks.without_lens(files["external"], why),)
-        poses = Poses(labels, centres, rotations, [], [], notes)
-    gnss, others = _priors(files["project"], poses.labels) if "project" in files else (None, [])
+        notes = () if lens else (checks.without_lens(files["external"], why),)
+    same: dict[Lens, Lens] = {}  # images of a camera share its lens
+    lenses = tuple(same.setdefault(lens, lens) for lens in own if lens is not None)
+    gnss, others = _priors(files["project"], labels) if "project" in files else (None, [])
     wkt = read_text(files["wkt"]).strip() if "wkt" in files else ""
-    unposed = dict.fromkeys([*poses.unposed, *others])
     return Cameras(
-        labels=tuple(poses.labels),
-        centres=poses.centres,
-        rotations=poses.rotations,
-        lenses=lenses,
+        labels=tuple(labels),
+        centres=centres,
+        rotations=rotations,
+        lenses=lenses if len(lenses) == len(labels) else None,
         crs=checks.crs(files["wkt"], wkt) if wkt else None,
-        notes=(*poses.notes, *checks.repeated(source.path, poses.labels)),
+        notes=(*notes, *checks.repeated(source.path, labels)),
         gnss=gnss,
-        unposed=tuple(name for name in unposed if name not in set(poses.labels)),
+        unposed=tuple(n for n in dict.fromkeys([*unposed, *others]) if n not in set(labels)),
         source="Pix4D",
     )
 
@@ -123,10 +122,7 @@ def _find(source: Source) -> Files:
         folder, prefix = tables_there[0]
         prefixes = {one for where, one in tables_there if where == folder}
         if len(prefixes) > 1:
-            sentence = (
-                f"holds the tables of several projects ({', '.join(sorted(prefixes))}). Give one of"
-                " the files instead."
-            )
+            sentence = f"holds several projects ({', '.join(sorted(prefixes))}). Give one file."
             raise bad_file(folder, "cameras.several_projects", sentence, projects=len(prefixes))
     else:
         folder, prefix = path.parent, _prefix(path.name, PARAMETERS, EXTERNAL, GEOGRAPHIC) or ""
@@ -162,19 +158,13 @@ def _prefix(name: str, *endings: str) -> str | None:
     return None
 
 
-class Poses(NamedTuple):
-    """The posed images: labels, centres, rotations, and their rows in the camera parameters."""
+def _poses(
+    files: Files, images: list[tables.Image]
+) -> tuple[list[int], FloatArray, FloatArray, list[str], tuple[PcfixWarning, ...]]:
+    """Return the poses of the two tables; the absolute one is believed.
 
-    labels: list[str]
-    centres: FloatArray
-    rotations: FloatArray
-    rows: list[int]
-    unposed: list[str]
-    notes: tuple[PcfixWarning, ...]
-
-
-def _poses(files: Files, images: list[tables.Image]) -> Poses:
-    """Return the poses of the two tables; the absolute one is believed."""
+    They are rows of the images with a pose, centres, rotations, names without one, and notes.
+    """
     labels = [image.label for image in images]
     turns = np.array([image.fields["rotation"] for image in images])
     rotations = checks.rotations(files["parameters"], labels, turns)
@@ -200,19 +190,15 @@ def _poses(files: Files, images: list[tables.Image]) -> Poses:
         turn = float(np.degrees(2.0 * np.arcsin(np.clip(sines, 0.0, 1.0))).max())
         notes = ()
         if apart > AGREE_M or turn > AGREE_DEG:
-            sentence = (
-                f"its poses differ by up to {apart:.2f} m and {turn:.3f} degrees from those of"
-                f" {PARAMETERS} with offset.xyz. The absolute ones are used; images that only the"
-                " other table has are left out."
-            )
+            sentence = f"its poses differ by up to {apart:.2f} m and {turn:.3f} deg from those of"
+            sentence += f" {PARAMETERS} and are used; images that only that has are skipped."
             differ = note(path, "cameras.tables_differ", sentence, metres=apart, degrees=turn)
             centres, notes = np.full_like(centres, np.nan), (differ,)
         centres[both], rotations[both] = there[rows], turned[rows]
     known = np.isfinite(centres).all(axis=1)
-    kept = np.flatnonzero(known).tolist()
     unposed = [labels[i] for i in np.flatnonzero(~known)] + sorted(set(names) - set(labels))
-    posed = [labels[i] for i in kept]
-    return Poses(posed, centres[known], rotations[known], kept, unposed, notes)
+    kept = np.flatnonzero(known).tolist()
+    return kept, centres[known], rotations[known], unposed, notes
 
 
 def _absolute(
@@ -223,10 +209,7 @@ def _absolute(
     if "offset" not in files and "external" in files:
         return np.full_like(local, np.nan), ()
     if "offset" not in files:
-        sentence = (
-            "its positions lack an offset, and there is no offset.xyz beside it. Give the offset"
-            " with --cameras-offset."
-        )
+        sentence = "there is no offset.xyz beside it. Give the offset with --cameras-offset."
         return local, (note(files["parameters"], "cameras.no_offset", sentence),)
     offsets = tables.read_offsets(files["offset"])
     if len({values.tobytes() for _, values in offsets}) == 1:
@@ -259,13 +242,13 @@ def _priors(path: Path, labels: list[str]) -> tuple[GnssPositions | None, list[s
     if kind is None:
         return None, others
     xyz, sigma_m = np.full((2, len(labels), 3), np.nan)
+    axes = ("x", "y", "z") if kind == "xyz" else ("lng", "lat", "alt")
     for i, element in enumerate(of_labels):
-        position = None if element is None or kinds[i] != kind else element.find(kind)
-        if element is None or position is None:
+        if element is None or kinds[i] != kind:
             continue
-        where = f"image {labels[i]}, "
-        axes = ("x", "y", "z") if kind == "xyz" else ("lng", "lat", "alt")
-        xyz[i] = [number(path, where + kind, position.get(axis)) for axis in axes]
+        position, where = element.find(kind), f"image {labels[i]}, "
+        place = {} if position is None else position.attrib
+        xyz[i] = [number(path, where + kind, place.get(axis)) for axis in axes]
         for tag, rows in (("toleranceXY", slice(2)), ("toleranceZ", slice(2, 3))):
             if (tolerance := element.find(tag)) is not None:
                 sigma_m[i, rows] = number(path, where + tag, tolerance.get("value"))

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.io.cameras.checks import damaged, read_text
+from pcfix.io.cameras.checks import damaged, number, read_text
 from pcfix.lens.rotations import from_omega_phi_kappa
 from pcfix.model import FloatArray, Lens
 
@@ -27,6 +27,7 @@ FIELDS = {
 }
 SHAPE = re.compile(r"^(.*?)\s*\[\s*(\d{1,2})\s*x\s*(\d{1,2})\s*\]\s*$")
 SENSOR = re.compile(r"sensor width of\s*([-+.\deE]+)\s*x\s*([-+.\deE]+)")
+Calibrations = list[dict[str, float]]
 SAME_FOCAL = 1e-6
 """Relative: the two files write the same number in pixels and in millimetres."""
 
@@ -38,13 +39,6 @@ class Image(NamedTuple):
     width: float
     height: float
     fields: dict[str, FloatArray]
-
-
-class Calibration(NamedTuple):
-    """One camera of the calibration file: the sensor in mm, and the first number of each line."""
-
-    sensor_mm: tuple[float, float]
-    values: dict[str, float]
 
 
 def read_parameters(path: Path) -> list[Image]:
@@ -81,13 +75,7 @@ def read_parameters(path: Path) -> list[Image]:
 
 
 def _numbers(path: Path, where: str, words: list[str]) -> FloatArray:
-    try:
-        values = np.array(words, dtype=float)
-    except ValueError as error:
-        raise damaged(path, f"{where}: {error}") from error
-    if not np.isfinite(values).all():
-        raise damaged(path, f"{where}: a number is not finite")
-    return values
+    return np.array([number(path, where, word) for word in words])
 
 
 def read_external(path: Path) -> tuple[list[str], FloatArray, FloatArray]:
@@ -111,41 +99,26 @@ def read_offsets(path: Path) -> list[tuple[str, FloatArray]]:
     return offsets
 
 
-def read_calibrations(path: Path) -> list[Calibration]:
-    """Read the cameras of a ``pix4d_..._internal_camera_parameters.cam``."""
-    cameras: list[Calibration] = []
+def read_calibrations(path: Path) -> list[dict[str, float]]:
+    """Read the cameras of a ``pix4d_..._internal_camera_parameters.cam``.
+
+    Of each come the first number of each line by its name, and `width`, `height` of the sensor, mm.
+    """
+    cameras: list[dict[str, float]] = []
     for line in read_text(path).splitlines():
         words = line.split()
         if line.lower().startswith("pix4d camera calibration file"):
-            cameras.append(Calibration((0.0, 0.0), {}))
+            cameras.append({"width": 0.0, "height": 0.0})
         elif cameras and (match := SENSOR.search(line)):
-            size = _numbers(path, "the sensor size", [match[1], match[2]])
-            cameras[-1] = cameras[-1]._replace(sensor_mm=(float(size[0]), float(size[1])))
+            size = _numbers(path, "the sensor size", [match[1], match[2]]).tolist()
+            cameras[-1] |= dict(zip(("width", "height"), size, strict=True))
         elif cameras and len(words) > 1 and not line.startswith("#"):
-            values = _numbers(path, f"camera {len(cameras) - 1}, {words[0]}", words[1:])
-            cameras[-1].values[words[0].lower()] = float(values[0])
+            value = number(path, f"camera {len(cameras) - 1}, {words[0]}", words[1])
+            cameras[-1][words[0].lower()] = value
     return cameras
 
 
-def lenses_of_images(
-    images: list[Image], calibrations: list[Calibration]
-) -> tuple[Lens, ...] | None:
-    """Return the lens of each image; None when an image has none."""
-    known: dict[object, Lens | None] = {}
-    lenses = []
-    for image in images:
-        own = [(k, v.tobytes()) for k, v in image.fields.items() if k not in ("centre", "rotation")]
-        key = (image.width, image.height, *own)
-        if key not in known:
-            known[key] = _lens(image, calibrations)
-        lens = known[key]
-        if lens is None:
-            return None
-        lenses.append(lens)
-    return tuple(lenses)
-
-
-def _lens(image: Image, calibrations: list[Calibration]) -> Lens | None:
+def lens_of_image(image: Image, calibrations: Calibrations) -> Lens | None:
     """Return the lens in pixels, from the block of the image or the only calibration."""
     fields: dict[str, list[float]] = {k: v.tolist() for k, v in image.fields.items()}
     matrix = fields.get("matrix", [])
@@ -163,8 +136,8 @@ def _lens(image: Image, calibrations: list[Calibration]) -> Lens | None:
     else:
         return lens_of_calibration(calibrations[0], image) if len(calibrations) == 1 else None
     for calibration in calibrations:  # the pixel size is that of the one with the focal length
-        pixel, focal_mm = calibration.sensor_mm[0] / lens.width, calibration.values.get("f", 0.0)
-        is_fisheye = "c" in calibration.values
+        pixel, focal_mm = calibration["width"] / lens.width, calibration.get("f", 0.0)
+        is_fisheye = "c" in calibration
         expected = focal_mm if is_fisheye else focal_mm / pixel if pixel > 0.0 else 0.0
         if abs(expected - lens.focal) <= SAME_FOCAL * lens.focal:
             return replace(lens, pixel_size_mm=pixel)
@@ -172,38 +145,30 @@ def _lens(image: Image, calibrations: list[Calibration]) -> Lens | None:
 
 
 def _fisheye(
-    image: Image,
-    principal: tuple[float, float],
-    affine: Sequence[float],
-    polynomial: Sequence[float],
+    image: Image, principal: Sequence[float], affine: Sequence[float], shape: Sequence[float]
 ) -> Lens:
     """Return the lens (u, v) = principal + [c d; e f] rho, rho the polynomial of 2 theta / pi."""
     c, d, e, f = affine
-    return Lens(
-        *(f, image.width, image.height, *principal, c - f, d, e),
-        projection="polynomial",
-        shape=tuple(polynomial),
-    )
+    frame = (f, image.width, image.height, principal[0], principal[1])
+    return Lens(*frame, c - f, d, e, projection="polynomial", shape=tuple(shape))
 
 
-def lens_of_calibration(calibration: Calibration, image: Image | None = None) -> Lens | None:
+def lens_of_calibration(calibration: dict[str, float], image: Image | None = None) -> Lens | None:
     """Return the lens of a calibration: in pixels where an image tells how many, else in mm.
 
     A fisheye needs the image, as its matrix is in pixels and its principal point in mm. None
     where the calibration does not say enough.
     """
-    value = defaultdict(float, {"p1": 1.0} | calibration.values)
-    width_mm, height_mm = calibration.sensor_mm
-    known = {"px", "py", "f"} <= calibration.values.keys() and min(width_mm, height_mm) > 0.0
-    if not known or ("c" in calibration.values and image is None):
+    value, is_fisheye = defaultdict(float, {"p1": 1.0} | calibration), "c" in calibration
+    width_mm, height_mm = value["width"], value["height"]
+    known = {"px", "py", "f"} <= calibration.keys() and min(width_mm, height_mm) > 0.0
+    if not known or (is_fisheye and image is None):
         return None
-    if "c" in calibration.values and image is not None:
+    if is_fisheye and image is not None:
         scale = image.width / width_mm
         principal = (value["px"] * scale, value["py"] * scale)
-        affine, polynomial = (
-            [value[name] for name in names.split()] for names in ("c d e f", "p0 p1 p2 p3 p4")
-        )
-        return replace(_fisheye(image, principal, affine, polynomial), pixel_size_mm=1.0 / scale)
+        affine, shape = ([value[n] for n in t.split()] for t in ("c d e f", "p0 p1 p2 p3 p4"))
+        return replace(_fisheye(image, principal, affine, shape), pixel_size_mm=1.0 / scale)
     return Lens(
         *(value["f"], width_mm, height_mm, value["px"], value["py"]),
         radial=(value["k1"], value["k2"], value["k3"]),

@@ -42,7 +42,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pcfix.errors import InputError, PcfixWarning, bad_file
+from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import note
 from pcfix.io.cameras.formats import Angles, Source
@@ -125,7 +125,15 @@ _GEO_CRS = re.compile(r"(EPSG:\d+|\+proj=.+|WGS84 UTM \d\d?\s*[NS])\s*", re.IGNO
 def open_table(path: Path) -> Columns:
     """Read a table with a header, or ODM's geo.txt, which has none."""
     lines = read_lines(path)
-    return _read_geo(path, lines) if is_geo(lines) else read_columns(path)
+    if not is_geo(lines):
+        return read_columns(path)
+    split = [(i, line.split()) for i, line in enumerate(lines[1:], start=2)]
+    rows = [[*fields, *[""] * len(GEO)][: len(GEO)] for _, fields in split if fields]
+    table = Table(path, list(GEO), rows, [i for i, fields in split if fields])
+    place = {name: GEO.index(name) for name in ("label", "x", "y", "z")}
+    place |= {"sigma_x": 7, "sigma_y": 7, "sigma_z": 8}  # its angles may be 0 for unknown
+    crs = checks.utm_as_code(lines[0].strip())
+    return Columns(table, place, [""] * len(GEO), after_hash=False, crs=crs)
 
 
 def gnss_positions(columns: Columns) -> GnssPositions | None:
@@ -158,10 +166,7 @@ def centres(columns: Columns, suffix: str = "", *, needed: bool = False) -> Floa
         bad = (np.abs(xyz[:, :2]) > [360.0, 90.0]).any(axis=1)
         if bad.any():
             i = int(np.argmax(bad))
-            sentence = (
-                f"longitude {xyz[i, 0]:g}, latitude {xyz[i, 1]:g} is no place on earth. Are the"
-                " columns swapped, or metres?"
-            )
+            sentence = f"longitude {xyz[i, 0]:g}, latitude {xyz[i, 1]:g} is no place on earth."
             raise columns.error(i, "cameras.degrees", sentence)
     xyz[np.isnan(xyz).any(axis=1)] = np.nan
     return xyz
@@ -198,21 +203,6 @@ def is_geo(lines: list[str]) -> bool:
     return len(first) >= 3 and np.isnan(number(first[0]))
 
 
-def _read_geo(path: Path, lines: list[str]) -> Columns:
-    rows, numbers = [], []
-    for i, line in enumerate(lines[1:], start=2):
-        fields = line.split()
-        if fields:
-            rows.append([*fields, *[""] * len(GEO)][: len(GEO)])
-            numbers.append(i)
-    place = {name: GEO.index(name) for name in ("label", "x", "y", "z")}
-    place |= {"sigma_x": 7, "sigma_y": 7, "sigma_z": 8}  # its angles may be 0 for unknown
-    table = Table(path, list(GEO), rows, numbers)
-    return Columns(
-        table, place, [""] * len(GEO), after_hash=False, crs=checks.utm_as_code(lines[0].strip())
-    )
-
-
 OMEGA_PHI_KAPPA = ("omega", "phi", "kappa")
 YAW_PITCH_ROLL = ("yaw", "pitch", "roll")
 QUATERNION = ("qw", "qx", "qy", "qz")
@@ -240,7 +230,21 @@ def _rotations(columns: Columns, angles: Angles | None, suffix: str = "") -> Flo
             raise column_missing(columns.path, roles, columns.table.header)
         return FROM_ANGLES[angles](*columns.of(roles).T)
     if columns.has(*opk):
-        return _from_omega_phi_kappa(columns, opk)
+        place = columns.place
+        reality_capture = columns.after_hash and columns.name("label") == "name"
+        if place[opk[1]] < place[opk[0]] or reality_capture:
+            sentence = "omega, phi, kappa may be turns in another order here. Export heading,"
+            sentence += " pitch, roll, or give --angles omega-phi-kappa."
+            raise bad_file(columns.path, "cameras.angles", sentence)
+        found = rotations.from_omega_phi_kappa(*columns.of(opk).T)
+        if columns.has(*MATRIX) and opk == OMEGA_PHI_KAPPA:  # they must be the same turn
+            half_chord = np.linalg.norm(found - _from_matrix(columns), axis=(1, 2)) / np.sqrt(8.0)
+            apart_deg = np.degrees(2.0 * np.arcsin(np.minimum(half_chord, 1.0)))
+            worst, apart = int(np.argmax(apart_deg)), float(apart_deg.max())
+            if apart > AGREEMENT_DEG:
+                sentence = f"omega, phi, kappa and r11 to r33 are {apart:.3g} degrees apart."
+                raise columns.error(worst, "cameras.angles_differ", sentence, degrees=apart)
+        return found
     if columns.has(*QUATERNION):
         return checks.quaternions(columns.path, columns.labels, columns.of(QUATERNION))
     if columns.has(*MATRIX):
@@ -255,27 +259,6 @@ FROM_ANGLES = {
 }
 
 
-def _from_omega_phi_kappa(columns: Columns, opk: Sequence[str]) -> FloatArray:
-    """Return rotations from the angles; a matrix beside them must be the same turn."""
-    place = columns.place
-    reality_capture = columns.after_hash and columns.name("label") == "name"
-    if place[opk[1]] < place[opk[0]] or reality_capture:
-        what = "omega, phi, kappa may be turns in another order here"
-        remedy = "Export heading, pitch, roll, or give --angles omega-phi-kappa"
-        raise _ambiguous(columns, what, remedy)
-    found = rotations.from_omega_phi_kappa(*columns.of(opk).T)
-    if columns.has(*MATRIX) and opk == OMEGA_PHI_KAPPA:
-        half_chord = np.linalg.norm(found - _from_matrix(columns), axis=(1, 2)) / np.sqrt(8.0)
-        apart_deg = np.degrees(2.0 * np.arcsin(np.minimum(half_chord, 1.0)))
-        worst = int(np.argmax(apart_deg))
-        apart = float(apart_deg[worst])
-        if apart > AGREEMENT_DEG:
-            sentence = f"omega, phi, kappa and r11 to r33 are {apart:.3g} degrees apart. Export"
-            sentence += " the table again."
-            raise columns.error(worst, "cameras.angles_differ", sentence, degrees=apart)
-    return found
-
-
 def _from_matrix(columns: Columns) -> FloatArray:
     """Return rotations from r11 ... r33, to axes either y up, z back or y down, z forward.
 
@@ -285,8 +268,8 @@ def _from_matrix(columns: Columns) -> FloatArray:
     found = checks.rotations(columns.path, columns.labels, matrices)
     back_is_up = found[:, 2, 2] > 0.0
     if back_is_up.any() and not back_is_up.all():
-        what = "r33 has both signs, so the axes of the camera are not clear"
-        raise _ambiguous(columns, what, "Give omega, phi, kappa")
+        sentence = "r33 has both signs, so the axes are not clear. Give omega, phi, kappa."
+        raise bad_file(columns.path, "cameras.angles", sentence)
     return rotations.from_photogrammetric(found) if back_is_up.all() else found
 
 
@@ -306,14 +289,7 @@ def _from_yaw_pitch_roll(columns: Columns, ypr: Sequence[str]) -> FloatArray:
         for each in (found, aircraft)
     )
     if other.max() < LOOKS_DOWN_DEG and np.median(other) < np.median(tilt):
-        what = (
-            f"with yaw, pitch, roll that are 0 straight down the cameras look {np.median(tilt):.0f}"
-            f" degrees off the vertical, with those of a gimbal {np.median(other):.0f}"
-        )
-        raise _ambiguous(columns, what, "Give --angles yaw-pitch-roll or --angles aircraft")
+        sentence = "yaw, pitch, roll are likely those of a gimbal. Give --angles aircraft, or"
+        sentence += " --angles yaw-pitch-roll."
+        raise bad_file(columns.path, "cameras.angles", sentence)
     return found
-
-
-def _ambiguous(columns: Columns, what: str, remedy: str) -> InputError:
-    """Return the error for angles that the table does not define."""
-    return bad_file(columns.path, "cameras.angles", f"{what}. {remedy}.")

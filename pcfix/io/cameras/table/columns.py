@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pcfix.errors import InputError, bad_file
-from pcfix.io.tables import Table, delimiter_of, number, read_lines, split_header, table_below
+from pcfix.io.tables import Table, number, places, read_lines, split_header, split_unit, table_below
 from pcfix.model import FloatArray, IntArray
 
 SPELLINGS: dict[str, tuple[str, ...]] = {
@@ -52,7 +52,6 @@ POSITION |= {"x_est", "y_est", "z_est"}
 EXIF = ("gpslongitude", "gpslatitude", "gpsaltitude")
 MANY = ("label", *(f"sigma_{axis}" for axis in "xyz"))  # the first spelling counts
 
-_UNIT = re.compile(r"^(.*?)[ _]*[\[(]([^\])]*)[\])]$|^(.*)_(m|deg|gon|rad)$")
 CRS_COMMENT = re.compile(r"^#\s*(?:coordinatesystem|crs)\s*[:=]\s*(.+)$", re.IGNORECASE)
 _FARTHEST_HEADER = 20
 
@@ -64,15 +63,6 @@ class Header(NamedTuple):
     names: list[str]
     units: list[str]
     comment: bool
-
-
-def known(names: Sequence[str]) -> dict[str, int]:
-    """Return what each column is, from its names without units."""
-    first = {
-        role: next((spelling for spelling in spellings if spelling in names), None)
-        for role, spellings in SPELLINGS.items()
-    }
-    return {role: names.index(name) for role, name in first.items() if name is not None}
 
 
 def headers(lines: Sequence[str]) -> Iterator[Header]:
@@ -99,7 +89,7 @@ def axes(place: Iterable[str], suffix: str = "") -> tuple[str, str, str] | None:
 
 def is_header(names: Sequence[str]) -> bool:
     """Whether at least two of the names that every table of cameras has are among these."""
-    return len(POSITION & known(names).keys()) >= 2
+    return len(POSITION & places(names, SPELLINGS).keys()) >= 2
 
 
 def _split_unit(name: str) -> tuple[str, str]:
@@ -107,14 +97,11 @@ def _split_unit(name: str) -> tuple[str, str]:
 
     Of X/Longitude it is the name that says more.
     """
-    name, unit = name.lstrip("# \"'").lower(), ""
-    match = None if name in _PLAIN else _UNIT.match(name)
-    if match:
-        name, unit = (match[1], match[2]) if match[3] is None else (match[3], match[4])
-    name = name.strip().replace(" ", "_")
+    plain = name.lstrip("# \"'").lower()
+    name, unit = (plain, "") if plain in _PLAIN else split_unit(plain, "m|deg|gon|rad")
     axis, slash, kind = name.partition("/")
     more = slash and axis in ("x", "y", "z") and kind in _PLAIN
-    return kind if more else name, unit.strip()
+    return kind if more else name, unit
 
 
 _PLAIN = {spelling for spellings in SPELLINGS.values() for spelling in spellings}
@@ -122,9 +109,7 @@ _PLAIN = {spelling for spellings in SPELLINGS.values() for spelling in spellings
 
 def column_missing(path: Path, missing: Sequence[str], header: Sequence[str]) -> InputError:
     """Return the error for a table that lacks columns."""
-    sentence = (
-        f"the header lacks {', '.join(missing)}; it has {', '.join(header)}. Add the columns."
-    )
+    sentence = f"the header lacks {', '.join(missing)}; it has {', '.join(header)}."
     return bad_file(path, "table.column_missing", sentence, columns=list(missing))
 
 
@@ -225,13 +210,10 @@ def read_columns(path: Path) -> Columns:
     lines = read_lines(path)
     found = [header for header in headers(lines) if is_header(header.names)]
     if not found:
-        sentence = (
-            "no line names the columns. Put a header above the rows, for example"
-            " label,x,y,z,omega,phi,kappa."
-        )
+        sentence = "no line names the columns, for example label,x,y,z,omega,phi,kappa."
         raise bad_file(path, "table.no_header", sentence)
     at, names, unit, comment = found[-1]
-    place = known(names)
+    place = places(names, SPELLINGS)
     for role, spellings in SPELLINGS.items():  # a column with the role's own name counts
         alike = [name for name in names if name in spellings]
         if len(alike) > 1 and role not in MANY and (role not in alike or alike.count(role) > 1):
@@ -246,7 +228,7 @@ def read_columns(path: Path) -> Columns:
         raise column_missing(path, lacking, names)
     comments = comment or any(line.startswith("#") for line in lines[:at])
     below = next((line for line in lines[at + 1 :] if line.strip() and line[0] != "#"), "")
-    delimiter = delimiter_of(below.strip()) if comment else split_header(lines[at].strip())[1]
+    delimiter = split_header((below if comment else lines[at]).strip())[1]
     table = table_below(path, lines, names, delimiter, at=at, comments=comments)
     crs = next(
         (match[1].strip() for line in lines[:at] if (match := CRS_COMMENT.match(line))), None

@@ -141,10 +141,7 @@ def write_table(folder: File, cameras: Cameras) -> None:
     target = Path(folder)
     _, lenses = checks.block_to_write(target, cameras, lambda _: True)
     if cameras.crs is not None and is_topocentric(cameras.crs):
-        sentence = (
-            f"a table cannot hold the axes {cameras.crs}. Bring the cameras to a projected CRS"
-            " first."
-        )
+        sentence = f"a table cannot hold the axes {cameras.crs}. Use a projected CRS."
         raise bad_file(target, "output.crs", sentence, crs=cameras.crs)
     distinct = list(dict.fromkeys(lenses))
     own = None  # f, px, py, k1 ... k4, t1, t2 of each row as RealityCapture has them
@@ -153,11 +150,7 @@ def write_table(folder: File, cameras: Cameras) -> None:
     else:
         frames = {(lens.width, lens.height, lens.unit) for lens in distinct}
         if len(frames) > 1 or distinct[0].unit != "px":
-            sentence = (
-                "a table holds several lenses only in pixels and of one frame size. Take another"
-                " format."
-            )
-            raise bad_file(target, "output.lens", sentence)
+            raise checks.lens_not_held(target, distinct[1])
         sensor = _row({"width_px": distinct[0].width, "height_px": distinct[0].height})
         side, own = max(distinct[0].width, distinct[0].height), []
         for lens in lenses:
