@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
@@ -13,7 +12,7 @@ from pcfix.compare.sections import SectionLine, lines_downslope
 from pcfix.errors import GeometryError
 from pcfix.flow.rasters import BED, DEPTH, UNCERTAINTY
 from pcfix.flow.shore import shoreline_layer
-from pcfix.flow.surfaces import points_of
+from pcfix.flow.surfaces import points_of, view_of
 from pcfix.grid.contours import contours, depth_interval
 from pcfix.grid.shoreline import NearWater
 from pcfix.io import rasters
@@ -33,45 +32,38 @@ DARK, RED, GREY = (8, 48, 107), (203, 24, 29), (120, 120, 120)
 ORANGE, GREEN = (253, 141, 60), (35, 139, 69)
 
 
-class Drawn(NamedTuple):
-    """The parts of a run that the map shows.
+def write_map(
+    path: Path,
+    cloud: Path | Tiles,
+    folder: Path,
+    *,
+    water: WaterSurface,
+    sigma_level_m: float | None,
+    cameras: Cameras,
+    unused: Sequence[str],
+    sections: Sequence[Mapping[str, float]],
+    check_points: FloatArray,
+    check_depths: File | None,
+) -> dict[str, int]:
+    """Write all layers of a run in a folder; return how many features each has.
 
     `sigma_level_m` is the standard error of the water level, None where unknown; `sections` are the
     lines of the comparison; `check_points`, shape (n, 4), are x, y, reference height, and cloud
     minus reference.
     """
-
-    cloud: Path | Tiles
-    folder: Path
-    water: WaterSurface
-    sigma_level_m: float | None
-    cameras: Cameras
-    unused: list[str]
-    sections: list[Mapping[str, float]]
-    check_points: FloatArray
-    check_depths: File | None
-
-
-def write_map(path: Path, drawn: Drawn, crs: Any) -> dict[str, int]:
-    """Write all layers; return how many features each has."""
-    layers = [
-        _area(drawn.folder),
-        contours_layer(drawn.folder),
-        _waterline(drawn),
-        _sections(drawn),
-        _cameras(drawn.cameras, drawn.unused),
-        *_check_points(drawn),
-    ]
-    write_layers(path, layers, crs, overwrite=True)
-    return {one.name: len(one.geometries) for one in layers}
-
-
-def _area(folder: Path) -> Layer:
-    """Return the outline of the corrected bed."""
     shapes = rasters.outlines(folder / DEPTH, MOST_CELLS)
     area = shapely.area(np.array(shapes, object)) if shapes else np.zeros(0)
     style = vector_style({"area": Symbol("fill", DARK, 0.5)})
-    return Layer("corrected_area", "Polygon", shapes, {"area_m2": area}, style)
+    layers = [
+        Layer("corrected_area", "Polygon", shapes, {"area_m2": area}, style),
+        contours_layer(folder),
+        _waterline(cloud, water, LEVEL_M if sigma_level_m is None else sigma_level_m),
+        _sections(sections, folder),
+        _cameras(cameras, unused),
+        *_checks(folder, check_points, check_depths),
+    ]
+    write_layers(path, layers, view_of(cloud).crs, overwrite=True)
+    return {one.name: len(one.geometries) for one in layers}
 
 
 def contours_layer(folder: Path, interval: float | None = None) -> Layer:
@@ -89,30 +81,27 @@ def contours_layer(folder: Path, interval: float | None = None) -> Layer:
     return Layer("depth_contours", "LineString", lines, values, style)
 
 
-def _waterline(drawn: Drawn) -> Layer:
+def _waterline(cloud: Path | Tiles, water: WaterSurface, sigma_m: float) -> Layer:
     """Return where the water meets the corrected cloud."""
     near = NearWater()
-    with open_cloud(drawn.cloud) as source:
+    with open_cloud(cloud) as source:
         for chunk in source.chunks():
-            points = points_of(chunk, source, drawn.water)
-            above = (
-                points.xyz[:, 2] - surface_above(drawn.water, points.xyz, points.heights).height_m
-            )
+            points = points_of(chunk, source, water)
+            above = points.xyz[:, 2] - surface_above(water, points.xyz, points.heights).height_m
             bed = points.classes == BATHYMETRIC_POINT
             above[bed] = -source.dimension(chunk, "WaterDepth")[bed]
             above[np.isin(points.classes, NOISE_CLASSES) | (chunk["withheld"] == 1)] = np.nan
             near += NearWater.of(points.xyz, above, source.dimension(chunk, "SigmaZ"))
-    sigma = LEVEL_M if drawn.sigma_level_m is None else drawn.sigma_level_m
-    lines = near.lines(lambda xy: np.full(len(xy), sigma))
+    lines = near.lines(lambda xy: np.full(len(xy), sigma_m))
     style = vector_style({"line": Symbol("line", RED, 0.5)})
     return shoreline_layer("waterline", lines, style)
 
 
-def _sections(drawn: Drawn) -> Layer:
+def _sections(sections: Sequence[Mapping[str, float]], folder: Path) -> Layer:
     """Return the cross-sections of the comparison, else lines down the slope of the bed."""
-    lines = [SectionLine(s["x1"], s["y1"], s["x2"], s["y2"]) for s in drawn.sections]
+    lines = [SectionLine(s["x1"], s["y1"], s["x2"], s["y2"]) for s in sections]
     if not lines:
-        bed, bounds = rasters.preview(drawn.folder / BED)
+        bed, bounds = rasters.preview(folder / BED)
         row, column = np.nonzero(np.isfinite(bed))
         xy = rasters.centres(np.column_stack([column, row]), bed, bounds)
         try:
@@ -126,29 +115,29 @@ def _sections(drawn: Drawn) -> Layer:
     return Layer("cross_sections", "LineString", ends, values, style)
 
 
-def _cameras(cameras: Cameras, unused: list[str]) -> Layer:
+def _cameras(cameras: Cameras, unused: Sequence[str]) -> Layer:
     """Return the projection centres, and whether each was used."""
-    use = ["not used" if label in set(unused) else "used" for label in cameras.labels]
+    use = np.where(np.isin(cameras.labels, unused), "not used", "used").astype(object)
     symbols = {"used": Symbol("marker", GREEN, 2.0), "not used": Symbol("marker", GREY, 1.6)}
-    values = {"label": np.array(cameras.labels, object), "use": np.array(use, object)}
+    values = {"label": np.array(cameras.labels, object), "use": use}
     points = list(shapely.points(cameras.centres))
     return Layer("cameras", "Point Z", points, values, vector_style(symbols, "use"))
 
 
-def _check_points(drawn: Drawn) -> list[Layer]:
+def _checks(folder: Path, points: FloatArray, depths: File | None) -> list[Layer]:
     """Return surveyed points with the differences of the cloud, or of the map of depths."""
     symbol = {"point": Symbol("marker", ORANGE, 2.2, "diamond")}
     style = vector_style(symbol, label="""format_number("residual_m", 2)""")
     layers = []
-    if len(drawn.check_points):
-        values = {"z_m": drawn.check_points[:, 2], "residual_m": drawn.check_points[:, 3]}
-        points = list(shapely.points(drawn.check_points[:, :3]))
-        layers.append(Layer("check_points", "Point Z", points, values, style))
-    if drawn.check_depths is not None:
-        checks = read_check_depths(Path(drawn.check_depths))
+    if len(points):
+        values = {"z_m": points[:, 2], "residual_m": points[:, 3]}
+        places = list(shapely.points(points[:, :3]))
+        layers.append(Layer("check_points", "Point Z", places, values, style))
+    if depths is not None:
+        checks = read_check_depths(Path(depths))
         raster = BED if checks.are_heights else DEPTH
-        more = rasters.values_at(drawn.folder / raster, checks.xy) - checks.value_m
+        more = rasters.values_at(folder / raster, checks.xy) - checks.value_m
         values = {"measured_m": checks.value_m, "residual_m": more}
-        points = list(shapely.points(checks.xy))
-        layers.append(Layer("check_depths", "Point", points, values, style))
+        places = list(shapely.points(checks.xy))
+        layers.append(Layer("check_depths", "Point", places, values, style))
     return layers

@@ -82,13 +82,6 @@ def all_notes(d: Plain) -> list[str]:
     return list(dict.fromkeys(note[:1].upper() + note[1:] for note in notes))
 
 
-def reason_sentence(adjusted: bool, why: str) -> str:
-    """Return why a run adjusted the cameras, or why not."""
-    if adjusted:
-        return f" The cameras were adjusted first, as {why}."
-    return f" The cameras were not adjusted: {why}."
-
-
 def _residuals(d: Plain) -> str:
     """Return the RMS residuals on land and under water; empty without any."""
     known = [(where, d["residuals"][key]["rms_px"]) for key, where in WHERE]
