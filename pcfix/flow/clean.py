@@ -22,7 +22,7 @@ from pcfix.clean.points import (
     flag_weak,
 )
 from pcfix.errors import InputError
-from pcfix.flow.runner import Check, Chunk, Command, Ends, FileTask, Progress, stream
+from pcfix.flow.runner import Chunk, Command, Ends, Progress, streaming
 from pcfix.flow.surfaces import CloudView, Points, find_surface, points_of, view_of
 from pcfix.flow.tiles import run_command
 from pcfix.io.files import scratch_arrays
@@ -84,7 +84,7 @@ def clean_file(
     command = Command(
         "clean",
         plan=partial(_plan_file, given, how, progress),
-        process=_clean_cloud,
+        process=partial(streaming, _Cleaning),
         check=lambda plan, tally: None,
         summarize=_summarize,
     )
@@ -274,12 +274,6 @@ def _plan_file(
     summary = search.summary("", "", drop=options.drop, seconds=0.0)
     content = {**search.content(), "drop": options.drop}
     return CleanPlan(np.packbits(noise), options.drop, content, summary)
-
-
-def _clean_cloud(
-    plan: CleanPlan, task: FileTask, row: int = 0, check: Check | None = None
-) -> tuple[Any, Any]:
-    return stream(task, partial(_Cleaning, plan), row, check)
 
 
 class _Cleaning:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from pcfix.errors import SettingError
 from pcfix.flow.inputs import labelling_of, mask_of, paths_in
-from pcfix.flow.runner import Check, Chunk, Command, Ends, FileTask, Progress, stream
+from pcfix.flow.runner import Chunk, Command, Ends, Progress, streaming
 from pcfix.flow.surfaces import (
     CloudView,
     Points,
@@ -136,7 +136,9 @@ def label_file(
         If a file, an option or the water cannot be used; no output is left behind.
     """
     given = taken(LabelOptions, options, keywords, "label_file")
-    command = Command("label", partial(_plan_file, given), _label_cloud, check, _summarize)
+    command = Command(
+        "label", partial(_plan_file, given), partial(streaming, _Labelling), check, _summarize
+    )
     result: LabelSummary = run_command(
         command, input, output, given, reads=paths_in(given), progress=progress
     )
@@ -205,12 +207,6 @@ def _plan_file(
     options: LabelOptions, cloud: Path | Tiles, target: Path, kept: list[Chunk] | None = None
 ) -> LabelPlan:
     return plan_labelling(options, view_of(cloud, options.jobs))
-
-
-def _label_cloud(
-    plan: LabelPlan, task: FileTask, row: int = 0, check: Check | None = None
-) -> tuple[Any, Any]:
-    return stream(task, partial(_Labelling, plan), row, check)
 
 
 class _Labelling:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from pcfix.flow.dsm import grid_dsm
-from pcfix.flow.runner import Progress, part_of
+from pcfix.flow.runner import Progress
 from pcfix.flow.sorted_points import BLOCK_CELLS, point_spacing_m
 from pcfix.grid.colours import relief_colours
 from pcfix.grid.lattice import Lattice, Window, round_resolution
@@ -59,8 +59,12 @@ def write_rasters(
     }
     made = {}
     for number, (name, options) in enumerate(asked.items()):
-        part = part_of(progress, number, len(asked))
-        made[name] = grid_dsm(cloud, folder / name, options=options, progress=part)
+
+        def tell(done: int, total: int, number: int = number) -> None:
+            if progress is not None:
+                progress(number * total + done, len(asked) * total)
+
+        made[name] = grid_dsm(cloud, folder / name, options=options, progress=tell)
     _write_shaded(folder)
     density = (cell_m / spacing_m) ** 2 if spacing_m else None
     return {

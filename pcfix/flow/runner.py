@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
@@ -43,13 +43,6 @@ def no_bar(title: str) -> AbstractContextManager[None]:
     return nullcontext()
 
 
-def part_of(progress: Progress | None, number: int, count: int) -> Progress | None:
-    """Return the progress of one of several equal jobs."""
-    if progress is None:
-        return None
-    return lambda done, total: progress(number * total + done, count * total)
-
-
 class FileWork(Protocol):
     """What a command does to one file."""
 
@@ -76,7 +69,7 @@ class Command:
         all that the points have in common, which can be pickled.
     process : callable
         Takes one file through a plan: (plan, task, first row of the cloud, check or None). Returns
-        the statistics, and the findings of the check.
+        the statistics, and the findings of the check; see `streaming`.
     check : callable
         Of a plan and the statistics of the whole cloud: refuses what cannot be right.
     summarize : callable
@@ -149,58 +142,62 @@ def stream(
                 task.progress(done + min(of_chunk, chunk), total)
 
         with LasSink(task.target, work.header, *last) as sink:
-            write = WriteBehind(lambda points, result: sink.write(work.apply(points, result)))
-            with write if task.jobs != 1 else nullcontext():
+
+            def write(points: Chunk, result: Any) -> None:
+                sink.write(work.apply(points, result))
+
+            with _thread(task.jobs) as writer:
+                written: Future[None] | None = None
                 for points in read_ahead(source.chunks(), task.jobs):
                     count = len(points)
                     with telling(partial(tell, count)):
                         result, one = work.compute(points, row + done)
-                    write(points, result)
+                    if written is not None:
+                        written.result()  # at most one chunk waits to be written
+                    written = writer.submit(write, points, result)
                     tally = one if tally is None else tally + one
                     done += count
                     tell(0, 0)
+                if written is not None:
+                    written.result()
             if check is not None:
                 findings = check(tally)
     return tally, findings
 
 
+def streaming(
+    work: Callable[[Any, LasSource], FileWork],
+    plan: Any,
+    task: FileTask,
+    row: int = 0,
+    check: Check | None = None,
+) -> tuple[Any, Any]:
+    """Take a file through a command whose `work` on an opened file needs its plan alone."""
+    return stream(task, partial(work, plan), row, check)
+
+
 def read_ahead(chunks: Iterator[Any], jobs: int | None) -> Iterator[Any]:
     """Yield chunks while the next one is read; with one job without a thread."""
-    if jobs == 1:
-        yield from chunks
-        return
-    with ThreadPoolExecutor(1) as reader:
+    with _thread(jobs) as reader:
         following = reader.submit(next, chunks, None)
         while (one := following.result()) is not None:
             following = reader.submit(next, chunks, None)
             yield one
 
 
-class WriteBehind:
-    """Calls a function in order: at once or, in a ``with`` block, in another thread."""
+def _thread(jobs: int | None) -> Executor:
+    """Return another thread, or this one for a single job."""
+    return _ThisThread() if jobs == 1 else ThreadPoolExecutor(1)
 
-    def __init__(self, write: Callable[..., None]) -> None:
-        self._write = write
-        self._pool: ThreadPoolExecutor | None = None
-        self._last: Future[None] | None = None
 
-    def __enter__(self) -> None:
-        self._pool = ThreadPoolExecutor(1)
+class _ThisThread(Executor):
+    """Runs each call at once."""
 
-    def __exit__(self, kind: Any, *error: object) -> None:
-        if self._pool is not None:
-            self._pool.shutdown()
-        if self._last is not None and kind is None:
-            self._last.result()
-
-    def __call__(self, *given: Any) -> None:
-        """Call, once the call before has returned."""
-        if self._pool is None:
-            return self._write(*given)
-        if self._last is not None:
-            self._last.result()
-        self._last = self._pool.submit(self._write, *given)
-        return None
+    def submit(self, call: Any, /, *given: Any, **keywords: Any) -> Future[Any]:
+        """Return what a call gave."""
+        future: Future[Any] = Future()
+        future.set_result(call(*given, **keywords))
+        return future
 
 
 def json_text(content: dict[str, Any]) -> str:
