@@ -8,6 +8,7 @@ depend on the size of chunks, squares and windows.
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict, replace
 from functools import partial
@@ -16,11 +17,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.flow.runner import FileTask, Progress, file_task, write_summary
+from pcfix.flow.runner import Progress, file_task, write_summary
 from pcfix.flow.sorted_points import BLOCK_CELLS, DIMENSIONS, SortedPoints, point_spacing_m
 from pcfix.grid.delaunay import fill_holes, margin_cells
 from pcfix.grid.heights import Gridding, as_uncertainty, grid_window
-from pcfix.grid.lattice import round_resolution
+from pcfix.grid.lattice import Lattice, round_resolution
 from pcfix.grid.model import NO_LIGHT, DsmSummary, Tally, hillshade
 from pcfix.io import rasters
 from pcfix.io.atomic import scratch_folder, temporary_output
@@ -114,157 +115,131 @@ def grid_dsm(
     if given.resolution is None:
         spacing_m = point_spacing_m(cloud, rules)
         rules = replace(rules, resolution=round_resolution(spacing_m, 0.0))
+
+    def report(share: float) -> None:
+        """Report the progress, in points."""
+        if progress is not None:
+            progress(round(share * count), count)
+
     with ExitStack() as stack:
         targets = {"dsm": task.target, **more}
         drafts = {
             name: stack.enter_context(temporary_output(path)) for name, path in targets.items()
         }
         folder = stack.enter_context(scratch_folder(task.target))
-        gridding = _Gridding(task, cloud, rules, given.cog, folder)
-        gridding.write(**drafts)
+        with open_cloud(cloud) as source:
+            crs, count = metric_crs(source), len(source)
+            corrected = any(is_ours(vlr) for vlr in source.vlrs)
+            points = SortedPoints(
+                source, rules, folder, lambda done, total: report(0.5 * done / total),
+                lambda: open_cloud(cloud, places_only=True),
+            )  # fmt: skip
+        lattice, spacing_m = points.lattice, points.near.spacing_m
+        fill_m, is_tin = rules.fill or 0.0, rules.method == "tin"
+        # the widest circle around a triangle
+        reach_m = max(TIN_REACH_SPACINGS * spacing_m, TIN_REACH_CELLS * rules.cell_m, fill_m)
+        how = Gridding(lattice, rules.method, reach_m, spacing_m)
+        # a cloud optimised file is a copy, with overviews of its own
+        paths = {name: folder / f"{name}.tif" if given.cog else drafts[name] for name in drafts}
+        plan = None if crs is None else parts(crs)[0]
+        unit = METRE if rules.what in ("height", *DIMENSIONS) else ""
+        made = {"pcfix": __version__, "corrected": corrected, **asdict(rules)}
+        new = partial(rasters.new_raster, lattice=lattice, tags={"PCFIX": json.dumps(made)})
+        with ExitStack() as files:
+            of_height = crs if rules.what == "height" else plan
+            dsm = files.enter_context(new(paths["dsm"], crs=of_height, bands={rules.what: unit}))
+            counts = None
+            if "counts" in paths:
+                bands = {"count": "", "spread": unit}
+                counts = files.enter_context(new(paths["counts"], crs=plan, bands=bands))
+            if is_tin or rules.fill is None:
+                tally = _grid(points, how, rules.what, dsm, counts, report)
+            else:
+                unfilled = folder / "unfilled.tif"
+                with rasters.new_raster(unfilled, lattice, None, {"height": METRE}) as heights:
+                    tally = _grid(points, how, rules.what, heights, counts, report)
+                _fill(unfilled, dsm, lattice, fill_m / rules.cell_m, tally)
+        if "hillshade" in paths:
+            _shade(paths["dsm"], paths["hillshade"], lattice, plan, rules)
+        for name, path in paths.items():
+            if given.cog:
+                rasters.copy_as_cog(path, drafts[name])
+            else:
+                rasters.add_overviews(path)
     if given.style:
         write_text(style, raster_style(task.target, rules.what), overwrite=given.overwrite)
-    result = replace(
-        gridding.summary(),
+    result = DsmSummary(
+        input=str(task.source),
+        output=str(task.target),
         hillshade=str(more["hillshade"]) if "hillshade" in more else None,
         counts=str(more["counts"]) if "counts" in more else None,
+        what=rules.what,
+        pcfix=__version__,
+        crs=None if crs is None else crs.name,
+        heights=crs_words(crs)[1] or None,
+        width=lattice.width,
+        height=lattice.height,
+        bounds_m=lattice.bounds_m,
+        points=count,
+        points_used=points.near.points,
+        cells=tally.cells,
+        filled=tally.filled,
+        empty=lattice.width * lattice.height - tally.known,
+        points_per_cell=points.near.points / tally.cells,
+        spacing_m=spacing_m,
+        hole_m=reach_m if is_tin else rules.fill,
+        settings=asdict(rules),
+        seconds=round(task.seconds, 3),
+        values=tally.values(),
         resolution_is="given" if given.resolution else "chosen",
+        part=part_report(task.source),
+        stray=points.stray,
     )
     write_summary(task, result.as_dict())
     return result
 
 
-class _Gridding:
-    """The gridding of one cloud: its sorted points, and the rasters that are made of them."""
+def _grid(
+    points: SortedPoints, how: Gridding, what: str, heights: DatasetWriter,
+    counts: DatasetWriter | None, report: Callable[[float], None],
+) -> Tally:  # fmt: skip
+    """Write values to one raster, numbers of points and their spread to another."""
+    tally, done, lattice = Tally(), 0, points.lattice
+    for window in points.windows(TIN_BLOCK_POINTS if how.method == "tin" else BLOCK_POINTS):
+        bands = grid_window(*points.points_in(window.grown(how.margin_cells)), window, how)
+        if what == "uncertainty":
+            bands = as_uncertainty(bands)
+        rasters.write_part(heights, bands[0], window, 1)
+        if counts is not None:
+            for band, values in enumerate(bands[1:], start=1):
+                rasters.write_part(counts, values, window, band)
+        tally.add(bands)
+        done += window.height * window.width
+        report(0.5 + 0.5 * done / (lattice.height * lattice.width))
+    return tally
 
-    def __init__(
-        self, task: FileTask, cloud: Path | Tiles, settings: DsmRules, cog: bool, folder: Path
-    ) -> None:
-        """Sort the points into files of a temporary folder."""
-        self.task, self.settings, self.cog, self.folder = task, settings, cog, folder
-        self.tally = Tally()
-        with open_cloud(cloud) as source:
-            self.crs, self.points = metric_crs(source), len(source)
-            self.corrected = any(is_ours(vlr) for vlr in source.vlrs)
-            self.sorted = SortedPoints(
-                source, settings, folder, lambda done, total: self.report(0.5 * done / total),
-                lambda: open_cloud(cloud, places_only=True),
-            )  # fmt: skip
-        self.plan = None if self.crs is None else parts(self.crs)[0]
-        self.near, self.lattice = self.sorted.near, self.sorted.lattice
-        spacings = TIN_REACH_SPACINGS * self.near.spacing_m
-        cells = TIN_REACH_CELLS * settings.cell_m
-        self.reach_m = max(spacings, cells, settings.fill or 0.0)  # widest circle of the TIN
 
-    def write(self, dsm: Path, hillshade: Path | None = None, counts: Path | None = None) -> None:
-        """Write the raster, and its hillshade and its counts if paths are given."""
-        what, folder = self.settings.what, self.folder
-        made = {"pcfix": __version__, "corrected": self.corrected, **asdict(self.settings)}
-        unit = METRE if what in ("height", *DIMENSIONS) else ""
-        crs = self.crs if what == "height" else self.plan
-        plain = folder / "dsm.tif" if self.cog else dsm
-        numbers = folder / "counts.tif" if self.cog else counts
-        new = partial(rasters.new_raster, lattice=self.lattice, tags={"PCFIX": json.dumps(made)})
-        with ExitStack() as stack:
-            out, both = stack.enter_context(new(plain, crs=crs, bands={what: unit})), None
-            if numbers is not None and counts is not None:
-                bands = {"count": "", "spread": unit}
-                both = stack.enter_context(new(numbers, crs=self.plan, bands=bands))
-            if self.settings.fill is None or self.settings.method == "tin":
-                self.grid(out, both)
-            else:
-                self.grid_and_fill(out, both)
-        if hillshade is not None:
-            self.shade(plain, hillshade)
-        self.finish(plain, dsm)
-        if numbers is not None and counts is not None:
-            self.finish(numbers, counts)
+def _fill(
+    unfilled: Path, dsm: DatasetWriter, lattice: Lattice, widest: float, tally: Tally
+) -> None:
+    """Write a raster with its holes filled, as wide as some cells, and count what was filled."""
+    with rasters.open_raster(unfilled) as heights:
+        for window in lattice.windows(BLOCK_CELLS):
+            around = window.grown(margin_cells(widest)).clipped(lattice.window)
+            height = fill_holes(rasters.read_heights(heights, around), window, around, widest)
+            rasters.write_part(dsm, height, window, 1)
+            tally.filled += int((~np.isnan(height)).sum())
+    tally.filled -= tally.known
+    tally.known += tally.filled
 
-    def grid(self, heights: DatasetWriter, counts: DatasetWriter | None) -> None:
-        """Write values to one raster, numbers of points and their spread to another."""
-        done, lattice = 0, self.lattice
-        how = Gridding(lattice, self.settings.method, self.reach_m, self.near.spacing_m)
-        limit = TIN_BLOCK_POINTS if self.settings.method == "tin" else BLOCK_POINTS
-        for window in self.sorted.windows(limit):
-            points = self.sorted.points_in(window.grown(how.margin_cells))
-            bands = grid_window(*points, window, how)
-            if self.settings.what == "uncertainty":
-                bands = as_uncertainty(bands)
-            rasters.write_part(heights, bands[0], window, 1)
-            if counts is not None:
-                for band, values in enumerate(bands[1:], start=1):
-                    rasters.write_part(counts, values, window, band)
-            self.tally.add(bands)
-            done += window.height * window.width
-            self.report(0.5 + 0.5 * done / (lattice.height * lattice.width))
 
-    def grid_and_fill(self, dsm: DatasetWriter, counts: DatasetWriter | None) -> None:
-        """Write values to a temporary raster, and from there, with holes filled, to the DSM."""
-        unfilled, tally = self.folder / "unfilled.tif", self.tally
-        with rasters.new_raster(unfilled, self.lattice, None, {"height": METRE}) as heights:
-            self.grid(heights, counts)
-        widest = (self.settings.fill or 0.0) / self.settings.cell_m
-        with rasters.open_raster(unfilled) as heights:
-            for window in self.lattice.windows(BLOCK_CELLS):
-                around = window.grown(margin_cells(widest)).clipped(self.lattice.window)
-                height = fill_holes(rasters.read_heights(heights, around), window, around, widest)
-                rasters.write_part(dsm, height, window, 1)
-                tally.filled += int((~np.isnan(height)).sum())
-        tally.filled -= tally.known
-        tally.known += tally.filled
-
-    def shade(self, dsm: Path, target: Path) -> None:
-        """Write the hillshade of a DSM."""
-        plain = self.folder / "hillshade.tif" if self.cog else target
-        s, bands = self.settings, {"hillshade": ""}
-        new = rasters.new_raster(
-            plain, self.lattice, self.plan, bands, dtype="uint8", nodata=NO_LIGHT
-        )
-        with rasters.open_raster(dsm) as heights, new as out:
-            for window in self.lattice.windows(BLOCK_CELLS):
-                height = rasters.read_within(heights, window.grown(1), self.lattice.window)
-                light = hillshade(height, s.cell_m, s.azimuth, s.altitude)
-                rasters.write_part(out, light, window, 1)
-        self.finish(plain, target)
-
-    def finish(self, plain: Path, target: Path) -> None:
-        """Add overviews; a cloud optimised file is a copy with its own."""
-        if self.cog:
-            rasters.copy_as_cog(plain, target)
-        else:
-            rasters.add_overviews(plain)
-
-    def report(self, share: float) -> None:
-        """Report the progress, in points."""
-        if self.task.progress is not None:
-            self.task.progress(round(share * self.points), self.points)
-
-    def summary(self) -> DsmSummary:
-        """Return the figures of the raster."""
-        settings, lattice, tally = self.settings, self.lattice, self.tally
-        return DsmSummary(
-            input=str(self.task.source),
-            output=str(self.task.target),
-            hillshade=None,
-            counts=None,
-            what=settings.what,
-            pcfix=__version__,
-            crs=None if self.crs is None else self.crs.name,
-            heights=crs_words(self.crs)[1] or None,
-            width=lattice.width,
-            height=lattice.height,
-            bounds_m=lattice.bounds_m,
-            points=self.points,
-            points_used=self.near.points,
-            cells=tally.cells,
-            filled=tally.filled,
-            empty=lattice.width * lattice.height - tally.known,
-            points_per_cell=self.near.points / tally.cells,
-            spacing_m=self.near.spacing_m,
-            hole_m=self.reach_m if settings.method == "tin" else settings.fill,
-            settings=asdict(settings),
-            seconds=round(self.task.seconds, 3),
-            values=tally.values(),
-            part=part_report(self.task.source),
-            stray=self.sorted.stray,
-        )
+def _shade(dsm: Path, target: Path, lattice: Lattice, plan: Any, rules: DsmRules) -> None:
+    """Write the hillshade of a DSM."""
+    new = rasters.new_raster(
+        target, lattice, plan, {"hillshade": ""}, dtype="uint8", nodata=NO_LIGHT
+    )
+    with rasters.open_raster(dsm) as heights, new as out:
+        for window in lattice.windows(BLOCK_CELLS):
+            height = rasters.read_within(heights, window.grown(1), lattice.window)
+            light = hillshade(height, rules.cell_m, rules.azimuth, rules.altitude)
+            rasters.write_part(out, light, window, 1)

@@ -104,10 +104,21 @@ class SortedPoints:
             progress(done, len(source))
         _refuse_none(self.near.points, source.path, settings.surface)
         if first is not None:
-            _warn_of_stray(source.path, self.stray, first)
-        low, high = self.near.low, self.near.high
+            place = ", ".join(f"{value:,.2f}" for value in first)
+            sentence = (
+                f"{source.path}: {self.stray:,} points far from all others are not gridded, the"
+                f" first at {place}. Remove them, or grid their part of the cloud separately."
+            )
+            warnings.warn(PcfixWarning("dsm.stray", sentence, points=self.stray), stacklevel=3)
+        low, high, spacing_m = self.near.low, self.near.high, self.near.spacing_m
         refuse_size(low, high, resolution, str(source.path))
-        _warn_of_fine_cells(self.near.spacing_m, resolution)
+        if resolution**2 < FEWEST_A_CELL * spacing_m**2:
+            density = (resolution / spacing_m) ** 2
+            sentence = (
+                f"The resolution {resolution:g} m is finer than the points allow: their spacing is"
+                f" {spacing_m:.2g} m, or {density:.2g} points a cell. Use at least that spacing."
+            )
+            warnings.warn(PcfixWarning("dsm.fine", sentence, spacing_m=spacing_m), stacklevel=4)
         self.lattice = lattice_over(low, high, resolution)
 
     def windows(self, limit: int) -> Iterator[Window]:
@@ -117,7 +128,8 @@ class SortedPoints:
 
     def _halved(self, window: Window, side: int, limit: int) -> Iterator[Window]:
         """Yield a window, or its quarters where it has too many points."""
-        if side <= self._bins.side or self._bins.count(self._stored(window)) <= limit:
+        stored = window.moved(self.lattice.first_row, self.lattice.first_column)
+        if side <= self._bins.side or self._bins.count(stored) <= limit:
             yield window
             return
         half = side // 2
@@ -126,19 +138,15 @@ class SortedPoints:
                 quarter = Window(row, row + half, column, column + half).clipped(window)
                 yield from self._halved(quarter, half, limit)
 
-    def _stored(self, window: Window) -> Window:
-        """Return a window of the raster as the store counts cells."""
-        return window.moved(self.lattice.first_row, self.lattice.first_column)
-
     def points_in(self, window: Window) -> tuple[FloatArray, IntArray]:
         """Return the points of a window, and their columns and rows in the raster.
 
         The first are metres in the world frame, shape (n, 3), with what the raster is made of in
         the place of z; the second have shape (n, 2).
         """
-        xyz = self._bins.read(self._stored(window))
-        first = [self.lattice.first_column, self.lattice.first_row]
-        cell = cells_of(xyz, self._resolution_m) - first
+        row, column = self.lattice.first_row, self.lattice.first_column
+        xyz = self._bins.read(window.moved(row, column))
+        cell = cells_of(xyz, self._resolution_m) - [column, row]
         rows = window.holds(cell)
         return xyz[rows], cell[rows]
 
@@ -192,15 +200,6 @@ def _bulk_of(again: Callable[[], LasSource], count: int, resolution_m: float) ->
     return np.array([low - size, high + size])
 
 
-def _warn_of_stray(path: Path, count: int, first: FloatArray) -> None:
-    place = ", ".join(f"{value:,.2f}" for value in first)
-    sentence = (
-        f"{path}: {count:,} points far from all others are not gridded, the first at {place}."
-        " Remove them, or grid their part of the cloud separately."
-    )
-    warnings.warn(PcfixWarning("dsm.stray", sentence, points=count), stacklevel=2)
-
-
 def _refuse_none(points: int, source: Path | Tiles, surface: SurfaceChoice) -> None:
     if points:
         return
@@ -216,13 +215,3 @@ def _refuse_none(points: int, source: Path | Tiles, surface: SurfaceChoice) -> N
         f"{source}: all points are noise (classes 7 and 18) or withheld. Classify it again.",
         path=source,
     )
-
-
-def _warn_of_fine_cells(spacing_m: float, resolution_m: float) -> None:
-    if resolution_m**2 < FEWEST_A_CELL * spacing_m**2:
-        density = (resolution_m / spacing_m) ** 2
-        sentence = (
-            f"The resolution {resolution_m:g} m is finer than the points allow: their spacing is"
-            f" {spacing_m:.2g} m, or {density:.2g} points a cell. Use at least that spacing."
-        )
-        warnings.warn(PcfixWarning("dsm.fine", sentence, spacing_m=spacing_m), stacklevel=5)
