@@ -22,7 +22,7 @@ from pcfix.clean.points import (
     flag_weak,
 )
 from pcfix.errors import InputError
-from pcfix.flow.runner import Chunk, Command, Ends, Progress, streaming
+from pcfix.flow.runner import Chunk, Command, Progress, streaming
 from pcfix.flow.surfaces import CloudView, Points, find_surface, points_of, view_of
 from pcfix.flow.tiles import run_command
 from pcfix.io.files import scratch_arrays
@@ -86,7 +86,9 @@ def clean_file(
         plan=partial(_plan_file, given, how, progress),
         process=partial(streaming, _Cleaning),
         check=lambda plan, tally: None,
-        summarize=_summarize,
+        summarize=lambda plan, tally, findings, ends: replace(
+            plan.summary, input=ends.input, output=ends.output, seconds=round(ends.seconds, 3)
+        ),
     )
     last = None
     if progress is not None:  # writing is the last of the passes
@@ -161,7 +163,19 @@ class NoiseSearch:
         first = 0
         for one in chunks:
             count = len(one.withheld)
-            self._add(one, slice(first, first + count))
+            rows = slice(first, first + count)
+            xyz, heights, classes, *_ = one.points
+            self.cloud.xyz[rows] = xyz
+            used[rows] = ~(one.withheld | np.isin(classes, NOISE_CLASSES))
+            rays, miss, incidence = (one.rays.get(name) for name in RAY_DIMENSIONS)
+            if rays is not None:
+                flag_weak(self._rules, reasons[rows], rays, miss, incidence)
+                reasons[rows][~used[rows]] = 0
+            if self.water is not None:
+                above = surface_above(self.water, xyz, heights)
+                submerged[rows] = used[rows] & is_submerged(xyz[:, 2], above)
+            elif rays is not None:
+                submerged[rows] = used[rows] & (rays > 0)
             first += count
             let_go()
             if resources.progress is not None:
@@ -180,21 +194,6 @@ class NoiseSearch:
         self._distance_m = flag_neighbours(self._name, self.cloud, self._rules, resources)
         self.cloud = self.cloud._replace(xyz=np.zeros((0, 3)))  # frees the disk
         return reasons != 0
-
-    def _add(self, one: Tested, rows: slice) -> None:
-        """Store coordinates and masks of some points, and flag weak intersections."""
-        cloud, (xyz, heights, classes, *_) = self.cloud, one.points
-        used = ~(one.withheld | np.isin(classes, NOISE_CLASSES))
-        rays, miss, incidence = (one.rays.get(name) for name in RAY_DIMENSIONS)
-        if rays is not None:
-            flag_weak(self._rules, cloud.reasons[rows], rays, miss, incidence)
-            cloud.reasons[rows][~used] = 0
-        cloud.xyz[rows], cloud.used[rows] = xyz, used
-        if self.water is not None:
-            above = surface_above(self.water, xyz, heights)
-            cloud.submerged[rows] = used & is_submerged(xyz[:, 2], above)
-        elif rays is not None:
-            cloud.submerged[rows] = used & (rays > 0)
 
     def content(self) -> dict[str, Any]:
         """Return what the record in the file and the summary have in common."""
@@ -298,11 +297,6 @@ class _Cleaning:
         new.array["classification"][noise] = LOW_NOISE
         new["withheld"][:] = np.asarray(new["withheld"]) | noise
         return new
-
-
-def _summarize(plan: CleanPlan, tally: int, findings: None, ends: Ends) -> CleanSummary:
-    seconds = round(ends.seconds, 3)
-    return replace(plan.summary, input=ends.input, output=ends.output, seconds=seconds)
 
 
 def _tested(cloud: Path | Tiles, water: WaterSurface | None, jobs: int | None) -> Iterator[Tested]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import astuple, dataclass
 from functools import partial
 from os import PathLike
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,7 +27,7 @@ from pcfix.io.las.columns import convert
 from pcfix.io.las.part import part_report
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import corrected_identity, labelling_vlr, noted_header
-from pcfix.io.tiles import Clouds, Tiles
+from pcfix.io.tiles import Clouds
 from pcfix.label.areas import WaterMask
 from pcfix.label.labelling import LabelCounts, Labelling, LabelSummary, Part, sets_class
 from pcfix.model import WaterPlane, WaterSurface
@@ -137,7 +136,11 @@ def label_file(
     """
     given = taken(LabelOptions, options, keywords, "label_file")
     command = Command(
-        "label", partial(_plan_file, given), partial(streaming, _Labelling), check, _summarize
+        "label",
+        lambda cloud, target, kept: plan_labelling(given, view_of(cloud, given.jobs)),
+        partial(streaming, _Labelling),
+        check,
+        _summarize,
     )
     result: LabelSummary = run_command(
         command, input, output, given, reads=paths_in(given), progress=progress
@@ -201,12 +204,6 @@ def check(plan: LabelPlan, tally: LabelTally) -> None:
     below = tally.submerged + tally.water_surface
     plan.labelling.check(plan.name, tally.excluded, below)
     check_submerged(below, plan.name, plan.water)
-
-
-def _plan_file(
-    options: LabelOptions, cloud: Path | Tiles, target: Path, kept: list[Chunk] | None = None
-) -> LabelPlan:
-    return plan_labelling(options, view_of(cloud, options.jobs))
 
 
 class _Labelling:
