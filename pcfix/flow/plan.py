@@ -60,10 +60,6 @@ class _Bed(NamedTuple):
     image_xy: FloatArray
     cameras: Cameras
 
-    @property
-    def ties(self) -> TiePoints:
-        return TiePoints(self.apparent, self.views, self.image_xy)
-
 
 def plan_flight(
     *,
@@ -97,28 +93,40 @@ def plan_flight(
     if given.plot is not None:
         check_output(given.plot, overwrite=given.overwrite)
     deepest = max(given.depth)
-    others = _alternatives(given)
-    steps = len(given.depth) + len(others)
+    # other flights, each with its changed option
+    overlap, height = 0.5 + 0.5 * given.overlap, round(0.7 * given.height, 1)
+    others = [(f"--height {height:g}", replace(given, height=height))]
+    if overlap <= 0.95:
+        others.append((f"--overlap {overlap:g}", replace(given, overlap=overlap)))
+    if given.obliques is None:
+        others.append(("--obliques 20", replace(given, obliques=20.0)))
+    if given.sigma_level is None or given.sigma_level > 0.01:
+        others.append(("--sigma-level 0.01", replace(given, sigma_level=0.01)))
     beds: list[DepthPlan] = []
     tried: list[Alternative] = []
 
     def step() -> None:
         if progress is not None:
-            progress(len(beds) + len(tried), steps)
+            progress(len(beds) + len(tried), len(given.depth) + len(others))
 
     with threads(1):  # for so few points, threads do not pay
-        for depth in given.depth:
-            beds.append(_depth_plan(given, depth))
+        for depth_m in given.depth:
+            bed = _bed(given, depth_m)
+            whole, sigma_m, adjusted_m = _sigma(given, bed)
+            parts_m = {part: _rms(_budget(given, bed, part).sigma_z_m) for part in PARTS}
+            parts_m["poses"] = float(np.hypot(parts_m["poses"], adjusted_m))
+            apparent_m, rays = float(-bed.apparent[:, 2].mean()), float(whole.ray_count.mean())
+            absorbed = _absorbed(given, bed)
+            beds.append(DepthPlan(depth_m, apparent_m, rays, sigma_m, parts_m, *absorbed))
             step()
         for words, other in others:
             sigma_m = _sigma(other, _bed(other, deepest))[1]
-            images = len(_flown(other).cameras)
-            tried.append(Alternative(words, images, sigma_m))
+            tried.append(Alternative(words, len(_flown(other).cameras), sigma_m))
             step()
-    scene = _scene(given, deepest)
+    scene, flown = _scene(given, deepest), _flown(given)
     off_nadir = float(np.degrees(np.arctan(scene.optics.reach))) + (given.obliques or 0.0)
     plan = Plan(
-        cameras=_flown(given).cameras, area_m=given.area, height_m=given.height,
+        cameras=flown.cameras, area_m=given.area, height_m=given.height,
         gsd_m=scene.gsd_m, base_m=scene.base_and_spacing_m[0],
         spacing_m=scene.base_and_spacing_m[1], obliques_deg=given.obliques,
         overlap=given.overlap, sidelap=given.sidelap, flattest_deg=off_nadir,
@@ -129,19 +137,6 @@ def plan_flight(
         write_bytes(given.plot, png_of(plan_figure(plan)), overwrite=given.overwrite)
     write_summary(given, plan.as_dict())
     return plan
-
-
-def _alternatives(given: PlanOptions) -> list[tuple[str, PlanOptions]]:
-    """Return other flights, each with its changed option."""
-    overlap, height = 0.5 + 0.5 * given.overlap, round(0.7 * given.height, 1)
-    found = [(f"--height {height:g}", replace(given, height=height))]
-    if overlap <= 0.95:
-        found.append((f"--overlap {overlap:g}", replace(given, overlap=overlap)))
-    if given.obliques is None:
-        found.append(("--obliques 20", replace(given, obliques=20.0)))
-    if given.sigma_level is None or given.sigma_level > 0.01:
-        found.append(("--sigma-level 0.01", replace(given, sigma_level=0.01)))
-    return found
 
 
 def _scene(given: PlanOptions, depth_m: float) -> SceneSettings:
@@ -210,23 +205,6 @@ def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def _depth_plan(given: PlanOptions, depth_m: float) -> DepthPlan:
-    bed = _bed(given, depth_m)
-    whole, sigma_m, adjusted_m = _sigma(given, bed)
-    parts = {part: _rms(_budget(given, bed, part).sigma_z_m) for part in PARTS}
-    parts["poses"] = float(np.hypot(parts["poses"], adjusted_m))
-    absorbed, left = _absorbed(given, bed)
-    return DepthPlan(
-        depth_m=depth_m,
-        apparent_m=float(-bed.apparent[:, 2].mean()),
-        rays=float(whole.ray_count.mean()),
-        sigma_m=sigma_m,
-        parts_m=parts,
-        absorbed=absorbed,
-        left_m=left,
-    )
-
-
 def _sigma(given: PlanOptions, bed: _Bed) -> tuple[Correction, float, float]:
     """Return a corrected bed, its standard error, and the part from adjusted poses.
 
@@ -271,7 +249,8 @@ def _absorbed(given: PlanOptions, bed: _Bed) -> tuple[float, float]:
 def _prepared(given: PlanOptions, bed: _Bed, *, through_water: bool) -> Any:
     """Return the adjustment of the block, at the true poses."""
     water = WaterPlane(0.0) if through_water else None
-    ties = replace(bed.ties, xyz=bed.truth if through_water else bed.apparent)
+    xyz = bed.truth if through_water else bed.apparent
+    ties = TiePoints(xyz, bed.views, bed.image_xy)
     wet = np.full(len(bed.truth), through_water)
     index = _refraction(given).refractive_index if through_water else 1.0
     block = replace(

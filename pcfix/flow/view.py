@@ -100,7 +100,17 @@ def view_clouds(
     values = _values(given.colour, layers, surface)
     scale = scale_of(given.colour, np.concatenate(values))
     colours = [scale.to_rgba(np.ma.masked_invalid(one))[:, :3] for one in values]
-    scene = _scene(layers, colours, cameras, surface)
+    # all about their common centre
+    low = np.min([one.xyz.min(axis=0) for one in layers], axis=0)
+    high = np.max([one.xyz.max(axis=0) for one in layers], axis=0)
+    lines = np.zeros((0, 2, 3)) if cameras is None else _frusta(cameras, float(high[2]))
+    water, triangles = _sheet(surface, low, high)
+    ends = np.vstack([low, high, lines.reshape(-1, 3)])
+    origin = (ends.min(axis=0) + ends.max(axis=0)) / 2.0
+    scene = Scene3d(
+        [one.name for one in layers], [one.xyz - origin for one in layers], colours,
+        lines - origin, water - origin, triangles,
+    )  # fmt: skip
     if given.image is None:
         show(scene, f"pcfix view: {given.colour}")
         return ""
@@ -145,7 +155,7 @@ def _values(colour: str, layers: list[_Layer], surface: WaterSurface | None) -> 
         found = None
         if colour == "error":
             target = layers[-1]
-            found = None if one is target else _error(one.xyz, target.xyz)
+            found = None if one is target else _height_above(target.xyz, one.xyz)
         elif colour == "height":
             found = one.xyz[:, 2]
         elif colour == "depth":
@@ -167,33 +177,14 @@ def _values(colour: str, layers: list[_Layer], surface: WaterSurface | None) -> 
     return values
 
 
-def _error(xyz: FloatArray, reference: FloatArray) -> FloatArray:
-    """Return the height above a reference, NaN away from it."""
+def _height_above(reference: FloatArray, xyz: FloatArray) -> FloatArray:
+    """Return the heights of points above a reference, NaN away from it."""
     gap_m = max(GAP_SPACINGS * mean_spacing_m(reference[:, :2]), LEAST_GAP_M)
     near, error = near_in_plan(xyz[:, :2], reference[:, :2], gap_m), np.full(len(xyz), np.nan)
     if near.any():
         found = heights_at(xyz[near, :2], reference, min(NEIGHBOURS, len(reference)))
         error[near] = xyz[near, 2] - found.height_m
     return error
-
-
-def _scene(
-    layers: list[_Layer],
-    rgb: list[FloatArray],
-    cameras: Cameras | None,
-    surface: WaterSurface | None,
-) -> Scene3d:
-    """Return clouds, cameras and water about the centre of all."""
-    low = np.min([one.xyz.min(axis=0) for one in layers], axis=0)
-    high = np.max([one.xyz.max(axis=0) for one in layers], axis=0)
-    lines = np.zeros((0, 2, 3)) if cameras is None else _frusta(cameras, float(high[2]))
-    water, triangles = _sheet(surface, low, high)
-    ends = np.vstack([low, high, lines.reshape(-1, 3)])
-    origin = (ends.min(axis=0) + ends.max(axis=0)) / 2.0
-    return Scene3d(
-        [one.name for one in layers], [one.xyz - origin for one in layers], rgb, lines - origin,
-        water - origin, triangles,
-    )  # fmt: skip
 
 
 def _frusta(cameras: Cameras, ground_m: float) -> FloatArray:
@@ -224,13 +215,9 @@ def _sheet(
     x, y = (side.ravel() for side in np.meshgrid(*sides))
     xyz = np.column_stack([x, y, np.zeros(len(x))])
     xyz[:, 2] = surface_above(surface, xyz).height_m
-    corner = np.arange(len(x)).reshape(WATER_CELLS + 1, -1)
-    a, b, c, d = (
-        part.ravel()
-        for part in (corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1])
-    )
-    triangles = np.vstack([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
+    at = np.arange(len(x)).reshape(WATER_CELLS + 1, -1)
+    a, b, c, d = at[:-1, :-1], at[:-1, 1:], at[1:, 1:], at[1:, :-1]
+    triangles = np.stack([[a, b, c], [a, c, d]]).transpose(0, 2, 3, 1).reshape(-1, 3)
     known = np.isfinite(xyz[:, 2])
-    return np.where(known[:, None], xyz, (low + high) / 2.0), triangles[
-        known[triangles].all(axis=1)
-    ]
+    xyz = np.where(known[:, None], xyz, (low + high) / 2.0)
+    return xyz, triangles[known[triangles].all(axis=1)]

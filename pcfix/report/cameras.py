@@ -183,7 +183,38 @@ def cameras_text(r: CamerasReport) -> str:
         rows.append(("Above water", f"{low:.1f} to {high:.1f} m, mean {mean:.1f} m"))
     if r.tilt_deg is not None:
         rows.append(("Tilt", "median {:.1f} deg, largest {:.1f} deg".format(*r.tilt_deg)))
-    rows += [*_gnss_rows(r.gnss), *_fit_rows(r.fit), *_refraction_rows(r)]
+    if (g := r.gnss) is not None:
+        mean, sd = (
+            ", ".join("-" if v is None else f"{v:{sign}.3f}" for v in values)
+            for values, sign in ((g.mean_m, "+"), (g.sd_m, ""))
+        )
+        words = (
+            f"{g.images:,} images; adjusted minus GNSS east, north, up: mean {mean} m, sd {sd} m;"
+            f" largest {g.largest_m:.3f} m ({g.largest_image})"
+        )
+        rows += [("GNSS", words)] if g.images else []
+        rows += [("" if g.images else "GNSS", g.reason)] if g.reason or not g.images else []
+    if (fit := r.fit) is not None:
+        seen = ", ".join(f"{name}: {100.0 * part:.1f} %" for name, part in fit.seen_by.items())
+        rows += [
+            ("Cloud", f"{fit.cloud} ({fit.points_sampled:,} points sampled)"),
+            ("Visible", f"share of points by number of cameras: {seen}"),
+        ]
+        if fit.distance_m > 0.0:
+            rows.append(("Distance", f"{fit.distance_m:,.1f} m in plan between block and cloud"))
+        if fit.below_ground:
+            rows.append(("Below ground", f"{fit.below_ground} cameras"))
+        rows.append(("Check", fit.verdict or fit.tested))
+    if (found := r.diagnosis) is not None:
+        says = {True: "absorbed", False: "not absorbed", None: "open"}
+        if found.absorbed:
+            verdict = found.sentence(*r.remedy)
+        elif found.absorbed is False and found.decided_by is not None:
+            verdict = f"the poses have not absorbed the refraction, by {found.decided_by.name}"
+        else:
+            verdict = f"not known; give control points (--gcps), or {export_of(cameras)}"
+        rows.append(("Refraction", verdict))
+        rows += [("", f"{s.name}: {says[s.speaks]}. {s.words}") for s in found.signs]
     return aligned(f"{r.path}: {cameras.source or 'cameras'}", rows, cameras.notes)
 
 
@@ -216,47 +247,6 @@ def _short(crs: str | None) -> str:
     if crs is None or len(crs) < SHORT_CRS:
         return crs or ""
     return crs.split('"')[1] if '"' in crs else crs[:SHORT_CRS] + " ..."
-
-
-def _gnss_rows(g: GnssResiduals | None) -> list[tuple[str, str]]:
-    if g is None or g.images == 0:
-        return [] if g is None else [("GNSS", g.reason)]
-    mean = ", ".join("-" if v is None else f"{v:+.3f}" for v in g.mean_m)
-    sd = ", ".join("-" if v is None else f"{v:.3f}" for v in g.sd_m)
-    words = (
-        f"{g.images:,} images; adjusted minus GNSS east, north, up: mean {mean} m, sd {sd} m;"
-        f" largest {g.largest_m:.3f} m ({g.largest_image})"
-    )
-    return [("GNSS", words), *([("", g.reason)] if g.reason else [])]
-
-
-def _fit_rows(fit: Fit | None) -> list[tuple[str, str]]:
-    if fit is None:
-        return []
-    seen = ", ".join(f"{name}: {100.0 * part:.1f} %" for name, part in fit.seen_by.items())
-    rows = [("Cloud", f"{fit.cloud} ({fit.points_sampled:,} points sampled)")]
-    rows.append(("Visible", f"share of points by number of cameras: {seen}"))
-    if fit.distance_m > 0.0:
-        rows.append(("Distance", f"{fit.distance_m:,.1f} m in plan between block and cloud"))
-    if fit.below_ground:
-        rows.append(("Below ground", f"{fit.below_ground} cameras"))
-    return [*rows, ("Check", fit.verdict or fit.tested)]
-
-
-def _refraction_rows(report: CamerasReport) -> list[tuple[str, str]]:
-    """Return each sign of absorbed refraction, and what they come to."""
-    found = report.diagnosis
-    if found is None:
-        return []
-    says = {True: "absorbed", False: "not absorbed", None: "open"}
-    if found.absorbed:
-        verdict = found.sentence(*report.remedy)
-    elif found.absorbed is False and found.decided_by is not None:
-        verdict = f"the poses have not absorbed the refraction, by {found.decided_by.name}"
-    else:
-        verdict = f"not known; give control points (--gcps), or {export_of(report.cameras)}"
-    rows = [("", f"{s.name}: {says[s.speaks]}. {s.words}") for s in found.signs]
-    return [("Refraction", verdict), *rows]
 
 
 def draw_footprints(plan: Axes, cameras: Cameras, level_m: float, **look: Any) -> bool:
