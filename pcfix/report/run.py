@@ -112,9 +112,25 @@ def run_report(
     pictures = [*_pictures(corrected), *_uncertainty_picture(corrected.sample, s, later)]
     pictures += later.pictures
     order = {name: place for place, name in enumerate(FIRST_FIGURES)}
+    mean = s.shift_z_m["mean"]
+    lead = (
+        f"Correction for refraction of {name_of(s.input)}: {s.corrected:,} of {s.points:,} points"
+        f" are under water and were moved, {abs(mean):.2f} m"
+        f" {'higher' if mean > 0.0 else 'deeper'} on average."
+    )
+    if s.carried is not None:
+        lead += (
+            " Before that, the whole cloud was transferred to the adjusted poses, which moved it by"
+            f" {s.carried['shift_m']['rms']:.2f} m (rms)."
+        )
+    # the rows of the terminal, with the detected reconstruction type in words
+    facts = {"Cloud": name_of(s.input), "Points": f"{s.points:,}", **dict(summary_rows(s))}
+    facts |= {"Method": f"{s.made['method']}. {s.made['because']}"} if s.made else {}
+    facts |= {"Uncertainty": uncertainty_sentence(s, later.tvu)}
+    rows = [[label, words] for label, words in facts.items() if label and words]
     return Report(
         title=survey.project or Path(name_of(s.input)).stem,
-        lead=_lead(s) + later.verdict,
+        lead=lead + later.verdict,
         head=head_of(s, survey),
         tiles=tiles_of(s, survey, later.compared, corrected.depth_m),
         warnings=notes_of(s, survey, later.compared),
@@ -125,7 +141,7 @@ def run_report(
         tables=[*later.tables, *_orders(s, later.tvu)],
         files=files,
         provenance=[
-            _facts(s, later.tvu),
+            Table("In short", [], rows),
             Table("Settings", ["setting", "value"], settings_rows(s.settings)),
             inputs,
             Table("Software", ["name", "version"], versions),
@@ -168,30 +184,6 @@ def _worded(value: Any) -> str:
     if isinstance(value, list | tuple):
         return ", ".join(map(_worded, value))
     return f"{value:.6g}" if isinstance(value, float) else str(value)
-
-
-def _lead(s: Summary) -> str:
-    mean = s.shift_z_m["mean"]
-    transferred = ""
-    if s.carried is not None:
-        transferred = (
-            " Before that, the whole cloud was transferred to the adjusted poses, which moved it by"
-            f" {s.carried['shift_m']['rms']:.2f} m (rms)."
-        )
-    return (
-        f"Correction for refraction of {name_of(s.input)}: {s.corrected:,} of {s.points:,} points"
-        f" are under water and were moved, {abs(mean):.2f} m"
-        f" {'higher' if mean > 0.0 else 'deeper'} on average.{transferred}"
-    )
-
-
-def _facts(s: Summary, measured: Plain | None) -> Table:
-    """Return the rows of the terminal, with the detected reconstruction type in words."""
-    words = dict(summary_rows(s))
-    words |= {"Method": f"{s.made['method']}. {s.made['because']}"} if s.made else {}
-    words |= {"Uncertainty": uncertainty_sentence(s, measured)}
-    rows = [[label, text] for label, text in words.items() if label and text]
-    return Table("In short", [], [["Cloud", name_of(s.input)], ["Points", f"{s.points:,}"], *rows])
 
 
 def _pictures(corrected: Corrected) -> list[Picture]:
