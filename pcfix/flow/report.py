@@ -17,15 +17,14 @@ from pcfix.io.las.source import coordinates, stated_crs
 from pcfix.io.tiles import Tiles, open_cloud
 from pcfix.model import NOISE_CLASSES, Cameras, FloatArray, WaterSurface
 from pcfix.refract.tally import Summary
-from pcfix.report.first_screen import Survey
 from pcfix.report.page import Report, Table, render
-from pcfix.report.run import NOTHING_LATER, Corrected, Later, run_report
+from pcfix.report.run import Corrected, Later, Survey, run_report
 
 NEEDED = (*SHIFTS, "WaterDepth", "RayCount")
 SIGMA_Z = "SigmaZ"
 SAMPLE_POINTS = 200_000
 """Points in histogram and uncertainty figure, evenly spread over the file."""
-NO_SURVEY = Survey()
+NO_SURVEY, NOTHING_LATER = Survey(), Later()
 PAGE = "report.html"
 ENDINGS = (".laz", ".las", ".tif", ".gpkg", ".csv", ".html", ".json")
 RESULTS = {

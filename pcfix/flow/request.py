@@ -10,8 +10,8 @@ from typing import Any
 
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.inputs import Inputs, paths_in
+from pcfix.flow.maps import SURFACE
 from pcfix.flow.next_steps import FOLDER
-from pcfix.flow.rasters import SURFACE
 from pcfix.flow.record import VERSION, belonging, read_record
 from pcfix.flow.tiles import HOW, RECORDS
 from pcfix.io.clouds import reference_of

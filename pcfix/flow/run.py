@@ -19,10 +19,9 @@ from pcfix.flow.compare import compare_clouds
 from pcfix.flow.correct import correct_file
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.inputs import Inputs
-from pcfix.flow.layers import write_map
+from pcfix.flow.maps import SECTIONS, raster_files, resolution_sentence, write_map, write_rasters
 from pcfix.flow.next_steps import FOLDER
 from pcfix.flow.old_cameras import read_blocks
-from pcfix.flow.rasters import raster_files, resolution_sentence, write_rasters
 from pcfix.flow.record import Record
 from pcfix.flow.report import write_report
 from pcfix.flow.request import Files, Request, since
@@ -43,16 +42,15 @@ from pcfix.options.steps import CleanOptions, DistanceOptions
 from pcfix.refract.tally import Summary
 from pcfix.report.adjustment import adjustment_sentence, adjustment_tables, all_notes
 from pcfix.report.comparison import evaluation, in_a_sentence
-from pcfix.report.first_screen import Survey, in_short, is_found
 from pcfix.report.page import Picture, Table
-from pcfix.report.run import Later
+from pcfix.report.run import Later, Survey, in_short, is_found
 from pcfix.report.text import uncertainty_sentence
 from pcfix.report.water import found_picture
 
 Plain = dict[str, Any]
 
 RECORD = "run.json"
-SECTIONS = 3
+
 DOD, REFERENCE_DSM = "dod.tif", "reference_dsm.tif"
 
 
