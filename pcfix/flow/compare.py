@@ -77,7 +77,6 @@ def compare_clouds(
     given = taken(CompareOptions, options, keywords, "compare_clouds")
     lines = [parse_line(line) if isinstance(line, str) else line for line in given.section]
     clouds = [] if isinstance(cloud, Held) else [cloud_of(cloud)]
-    held = cloud if isinstance(cloud, Held) else _in_file(clouds[0])
     also = {name: cloud_of(path) for name, path in given.also}
     surveyed = reference_of(reference)
     read = (*clouds, surveyed, *also.values())
@@ -86,25 +85,21 @@ def compare_clouds(
         load_py4dgeo()
     water = None
     if given.water is not None:
-        from pcfix.flow.surfaces import find_surface  # slow to import
+        from pcfix.flow.surfaces import find_surface, view_of  # slow to import
 
-        water = find_surface(given.water, WaterOptions(), held.view()).surface
-    with scratch_arrays(_beside(given)):
-        target, whole = read_reference(surveyed), held.read(water)
+        view = cloud.view() if isinstance(cloud, Held) else view_of(clouds[0])
+        water = find_surface(given.water, WaterOptions(), view).surface
+    outputs = [path for path in (given.out_dir, given.summary, given.plot) if path is not None]
+    beside = Path([*outputs, Path(tempfile.gettempdir()) / "pcfix"][0])
+    with scratch_arrays(beside):  # arrays of large clouds
+        target = read_reference(surveyed)
+        whole = cloud.read(water) if isinstance(cloud, Held) else read_cloud(clouds[0], water)
         check_same_crs(whole.name, whole.crs, target.name, target.crs)
         matched = match(whole, target, given.part(CompareRules), given=water is not None)
         others = {name: _further(one, water, matched) for name, one in also.items()}
         result = figures_of(matched, lines, started, others)
     _write(result, given)
     return result
-
-
-def _beside(given: CompareOptions) -> Path:
-    """Return the output beside which the arrays of large clouds are stored."""
-    for path in (given.out_dir, given.summary, given.plot):
-        if path is not None:
-            return Path(path)
-    return Path(tempfile.gettempdir()) / "pcfix"
 
 
 def _further(path: Path | Tiles, water: WaterSurface | None, first: Match) -> Match:
@@ -117,17 +112,6 @@ def _further(path: Path | Tiles, water: WaterSurface | None, first: Match) -> Ma
         cloud = replace(cloud, water_m=known)
     found = match(cloud, target, first.settings, given=water is not None)
     return replace(found, places=first.places)
-
-
-def _in_file(cloud: Path | Tiles) -> Held:
-    """Return the cloud of a LAS or LAZ file, or of many."""
-
-    def view() -> CloudView:
-        from pcfix.flow.surfaces import view_of  # slow to import
-
-        return view_of(cloud)
-
-    return Held(view, lambda water: read_cloud(cloud, water))
 
 
 def _check_outputs(given: CompareOptions, inputs: list[File]) -> None:

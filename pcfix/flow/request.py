@@ -48,12 +48,12 @@ class Request(RunOptions):
         super().check()
         wrong = ""
         if self.adjust == "no" and self.only_to_adjust:
-            wrong = f"{self.only_to_adjust[0]} is for an adjustment only. Remove it, or use auto"
+            wrong = f"{self.only_to_adjust[0]} is for an adjustment only. Remove it, or use auto."
         elif self.adjust == "yes" and self.why_not_adjust:
-            wrong = f"{self.why_not_adjust}. Remove one of the two options"
+            wrong = f"{self.why_not_adjust}. Remove one of the two options."
         if wrong:
-            sentence = f"--adjust {self.adjust}: {wrong}."
-            raise SettingError("option.conflict", sentence, option="adjust", value=self.adjust)
+            wrong = f"--adjust {self.adjust}: {wrong}"
+            raise SettingError("option.conflict", wrong, option="adjust", value=self.adjust)
         self.part(Inputs)
         with_index(self.part(RunOptions))
 
