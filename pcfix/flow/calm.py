@@ -74,17 +74,7 @@ class WaterFound(NamedTuple):
 
 @dataclass(frozen=True)
 class CalmSummary:
-    """The result of `calm_frames`.
-
-    Attributes
-    ----------
-    corners : int
-        By which the frames were registered.
-    scatter_px, moved_px : float
-        Median scatter of a corner along an axis; largest movement of the frame's centre.
-    spread : float
-        Median over the image of the spread of the frames, grey values.
-    """
+    """The result of `calm_frames`."""
 
     input: str
     output: str
@@ -92,10 +82,10 @@ class CalmSummary:
     frames: int
     columns: int
     rows: int
-    corners: int
-    scatter_px: float
-    moved_px: float
-    spread: float
+    corners: int  # by which the frames were registered
+    scatter_px: float  # of a corner along an axis, median
+    moved_px: float  # largest movement of the frame's centre
+    spread: float  # of the frames, median over the image, grey values
     seconds: float
     water: WaterFound | None
     notes: tuple[PcfixWarning, ...] = ()

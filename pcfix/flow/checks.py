@@ -92,7 +92,19 @@ def check_cameras(
         cameras = read_gnss(given.gnss, cameras)
     diagnosis, remedy = None, ("", "")
     if view is not None and surface is not None:
-        diagnosis = diagnose(_evidence(given, inputs, cameras, view, surface))
+        reference = None if given.reference is None else read_reference(given.reference)
+        if reference is not None:
+            crs = None if isinstance(view.crs, str) else view.crs
+            check_same_crs(view.name, crs, reference.name, reference.crs)
+        control = None if given.gcps is None else read_ground_control(given.gcps, cameras).surveyed
+        lens = given.lens
+        evidence = Evidence(
+            cameras, str(path), surface, index_of(given.index, given.index_formula)[0],
+            view=view, reference=reference, control=control,
+            calibrated=given_focal_lengths(str(path)) if lens is None else focal_length_of(lens),
+            ties=ties_of(inputs, view.crs),
+        )  # fmt: skip
+        diagnosis = diagnose(evidence)
         surveys = {name: getattr(given, name) for name in ("gnss", "gcps", "lens", "index")}
         remedy = adjust_words(inputs, view.name, has_datum=has_datum(cameras, str(path)), **surveys)
     level = None
@@ -184,28 +196,6 @@ def check_water(
     return report
 
 
-def _evidence(
-    given: CamerasCheckOptions,
-    inputs: Inputs,
-    cameras: Cameras,
-    view: CloudView,
-    surface: WaterSurface,
-) -> Evidence:
-    """Collect all evidence on whether the poses have absorbed refraction."""
-    path, lens, gcps = str(inputs.cameras), given.lens, given.gcps
-    reference = None if given.reference is None else read_reference(given.reference)
-    if reference is not None:
-        crs = None if isinstance(view.crs, str) else view.crs
-        check_same_crs(view.name, crs, reference.name, reference.crs)
-    return Evidence(
-        cameras, path, surface, index_of(given.index, given.index_formula)[0],
-        view=view, reference=reference,
-        control=None if gcps is None else read_ground_control(gcps, cameras).surveyed,
-        calibrated=given_focal_lengths(path) if lens is None else focal_length_of(lens),
-        ties=ties_of(inputs, view.crs),
-    )  # fmt: skip
-
-
 def _sample(
     view: CloudView, most: int, water: WaterSurface | None = None
 ) -> tuple[FloatArray, FloatArray | None]:
@@ -283,6 +273,7 @@ def _folded(lens: Lens) -> float:
 
 
 def _gnss(cameras: Cameras, name: str) -> GnssResiduals | None:
+    """Return how far the projection centres are from their GNSS positions."""
     if cameras.gnss is None:
         return None
     found = adjusted_minus_gnss(cameras, name)

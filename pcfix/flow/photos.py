@@ -46,29 +46,19 @@ CLOUDS = (".las", ".laz")
 
 @dataclass(frozen=True)
 class PhotosSummary:
-    """The result of `map_photos`.
-
-    Attributes
-    ----------
-    images, done_before : int
-        Images written, and those among them that an earlier call wrote.
-    black_share : float
-        Share of pixels without ground, occluded, or outside the original image.
-    spacing_px : int
-        Between the nodes of the grid.
-    """
+    """The result of `map_photos`."""
 
     images: int
-    done_before: int
+    done_before: int  # images among them that an earlier call wrote
     megapixels: float
     seconds: float
     largest_shift_px: float
-    black_share: float
+    black_share: float  # of the pixels: without ground, occluded, or outside the original image
     mapping: str
     dsm: str
     water: str
     refractive_index: float
-    spacing_px: int
+    spacing_px: int  # of the nodes of the grid
     notes: tuple[PcfixWarning, ...]
 
 
@@ -206,28 +196,16 @@ def plain(summary: Any) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class PhotoBlock:
-    """Photographs with their poses, and what they see.
-
-    Attributes
-    ----------
-    step_px : int
-        Between the nodes of the grid.
-    crs : CRS, str or None
-        Of the DSM and of all coordinates.
-    gsd_m : float
-        A pixel on the lowest ground, median of the images.
-    waters : dict
-        Water rasters of single images, by their stems.
-    """
+    """Photographs with their poses, and what they see."""
 
     paths: tuple[Path, ...]
     photos: tuple[Photo, ...]
     scene: Scene
-    step_px: int
+    step_px: int  # between the nodes of the grid
     notes: tuple[PcfixWarning, ...]
-    crs: Any
-    gsd_m: float
-    waters: dict[str, Path]
+    crs: Any  # CRS, str or None, of the DSM and of all coordinates
+    gsd_m: float  # a pixel on the lowest ground, median of the images
+    waters: dict[str, Path]  # water rasters of single images, by their stems
 
     def scene_of(self, path: Path) -> Scene:
         """Return the scene of an image, with its own water where that is known."""
@@ -328,14 +306,8 @@ def read_heights(
 ) -> tuple[FloatArray, tuple[float, float, float], str | None, bool]:
     """Read a DSM, or grid a cloud in a folder for temporary files.
 
-    Returns
-    -------
-    heights : array, shape (rows, columns)
-    origin : tuple of float
-        Left, top and size of the cells.
-    crs : str or None
-    corrected : bool
-        Whether pcfix made it of a corrected cloud.
+    Returns the heights, shape (rows, columns); left, top and size of the cells; the CRS; and
+    whether pcfix made it of a corrected cloud.
     """
     path = Path(dsm)
     if path.suffix.lower() in CLOUDS:

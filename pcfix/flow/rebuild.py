@@ -52,42 +52,29 @@ COMMAND_ONLY = ("overwrite", "jobs", "summary", "rebuild", "until_gsd", "most_ro
 
 @dataclass(frozen=True)
 class Round:
-    """The change in a round: DSM minus the one before, over submerged cells (all if none are).
-
-    `within_gsd` is the share of the cells that moved by at most a ground pixel.
-    """
+    """The change in a round: DSM minus the one before, over submerged cells (all if none are)."""
 
     cloud: str
     dsm: str
     cells: int
     mean_m: float
     sd_m: float
-    within_gsd: float
+    within_gsd: float  # share of the cells that moved by at most a ground pixel
 
 
 @dataclass(frozen=True)
 class RebuildSummary:
-    """The result of `pcfix.rebuild_rounds`.
-
-    Attributes
-    ----------
-    done_before : int
-        Rounds that an earlier call finished.
-    settled : bool
-        Whether the last round moved the bed by less than the threshold.
-    compared : str or None
-        The folder with its results, where a reference was given.
-    """
+    """The result of `pcfix.rebuild_rounds`."""
 
     rounds: tuple[Round, ...]
-    done_before: int
-    settled: bool
+    done_before: int  # rounds that an earlier call finished
+    settled: bool  # whether the last round moved the bed by less than the threshold
     gsd_m: float
     threshold_m: float
     seconds: float
     mapping: str
     rebuild: str
-    compared: str | None
+    compared: str | None  # folder of the comparison, where a reference was given
     notes: tuple[PcfixWarning, ...]
 
 
@@ -299,15 +286,10 @@ def _difference(block: PhotoBlock, cloud: Path, dsm: Path, before: Path) -> Roun
 def round_of(
     files: tuple[str, str], difference_m: FloatArray, wet: BoolArray, gsd_m: float
 ) -> Round:
-    """Return the change in a round.
+    """Return the change in a round, of whose files cloud and DSM are named.
 
-    Parameters
-    ----------
-    files : tuple of str
-        Its cloud and its DSM.
-    difference_m : array, shape (rows, columns)
-        DSM minus the one before, NaN where either has no height.
-    wet : array of bool, shape (rows, columns)
+    `difference_m`, shape (rows, columns), is the DSM minus the one before, NaN where either has no
+    height; `wet`, of the same shape, tells what is under water.
     """
     known = np.isfinite(difference_m)
     moved = difference_m[known & wet] if (known & wet).any() else difference_m[known]

@@ -60,22 +60,12 @@ def write_report(
     later: Later = NOTHING_LATER,
     overwrite: bool = False,
 ) -> Report:
-    """Write ``report.html`` and ``figures/*.png`` about a corrected cloud.
+    """Write ``report.html`` and ``figures/*.png`` about a corrected cloud, into an existing folder.
 
-    Parameters
-    ----------
-    corrected : Path or Tiles
-        A cloud from `correct_file` with all dimensions, cleaned or not.
-    out_dir : Path
-        A folder that exists.
-    summary, cameras, water
-        The result and the inputs of `correct_file`.
-    inputs : sequence of Path
-        Files whose size and checksum the page lists.
-    survey : Survey
-        Name of the project and date of the images.
-    later : Later
-        The results of other steps of a run.
+    `corrected` is from `correct_file` with all dimensions, cleaned or not; `summary`, `cameras` and
+    `water` are its result and its inputs. The page lists size and checksum of the files `inputs`.
+    `survey` has the name of the project and the date of the images, `later` the results of other
+    steps of a run.
     """
     rows = [[path.name, f"{path.stat().st_size:,}", sha256(path)] for path in inputs]
     maps, depth_m, sample, crs, heights = _read(corrected, later.resolution_m)

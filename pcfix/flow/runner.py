@@ -61,19 +61,12 @@ class FileWork(Protocol):
 class Command:
     """A command that rewrites clouds, as functions.
 
-    Attributes
-    ----------
-    name : str
-    plan : callable
-        Of a cloud, the path of the output, and chunks to keep in memory (`FileTask.kept`): returns
-        all that the points have in common, which can be pickled.
-    process : callable
-        Takes one file through a plan: (plan, task, first row of the cloud, check or None). Returns
-        the statistics, and the findings of the check; see `streaming`.
-    check : callable
-        Of a plan and the statistics of the whole cloud: refuses what cannot be right.
-    summarize : callable
-        Of a plan, statistics, findings, and `Ends`: returns the result.
+    `plan` takes a cloud, the path of the output, and chunks to keep in memory (`FileTask.kept`),
+    and returns all that the points have in common, which can be pickled. `process` takes one file
+    through a plan (plan, task, first row of the cloud, check or None), and returns the statistics
+    and the findings of the check; see `streaming`. `check` refuses, by plan and statistics of the
+    whole cloud, what cannot be right. `summarize` makes the result of plan, statistics, findings
+    and `Ends`.
     """
 
     name: str
@@ -95,28 +88,16 @@ class Ends:
 
 @dataclass(frozen=True)
 class FileTask:
-    """A cloud to read, a cloud to write, and how.
-
-    Attributes
-    ----------
-    summary : path or None
-        JSON file for the summary.
-    progress : callable or None
-        Called with (points done, points in all), after each chunk and while it is computed.
-    started : float
-        `time.perf_counter` then.
-    kept : list
-        The chunks of a small cloud that is read several times; see `LasSource`.
-    """
+    """A cloud to read, a cloud to write, and how."""
 
     source: Path
     target: Path
-    summary: File | None = None
+    summary: File | None = None  # JSON file
     overwrite: bool = False
     jobs: int | None = None
-    progress: Progress | None = None
+    progress: Progress | None = None  # called with (points done, points in all)
     started: float = field(default_factory=time.perf_counter)
-    kept: list[Chunk] = field(default_factory=list)
+    kept: list[Chunk] = field(default_factory=list)  # of a small cloud that is read several times
 
     @property
     def seconds(self) -> float:
@@ -239,19 +220,9 @@ def file_task(
 ) -> FileTask:
     """Return the task of a command after checking that its files may be read and written.
 
-    Parameters
-    ----------
-    input, output : path
-        The input may be many files.
-    options : OptionSet
-        With overwrite and, if the command has them, summary and jobs.
-    reads : iterable
-        Further inputs; values that are no paths do not count.
-    more : iterable of path
-        Further outputs, checked like the output.
-    check : callable
-        Returns the path of an output; see `check_cloud`.
-    progress : callable, optional
+    The input may be many files; `options` has overwrite and, if the command has them, summary and
+    jobs. `reads` are further inputs, of which values that are no paths do not count; `more` are
+    further outputs, checked like the output, by `check`.
     """
     started = time.perf_counter()
     check_one_file(input, options)

@@ -23,34 +23,24 @@ SHORT_CRS, SHOWN_NAMES = 60, 5
 
 @dataclass(frozen=True)
 class Sensor:
-    """The images of one interior orientation, or of several alike; None where not stated.
-
-    Attributes
-    ----------
-    lenses, frames : int
-        How many lenses and frame sizes differ; `focal` and `focal_most` are the limits.
-    folded : float
-        Share of the frame beyond the fold of the distortion.
-    nominal : bool
-        Whether it is not calibrated, though others of the block are.
-    """
+    """The images of one interior orientation, or of several alike; None where not stated."""
 
     name: str
     images: int
     width: float
     height: float
-    focal: float
+    focal: float  # the shortest of them
     unit: str
     focal_mm: float | None
     pixel_size_um: float | None
     projection: str
     distorted: bool
     gsd_m: float | None
-    lenses: int = 1
+    lenses: int = 1  # that differ
     focal_most: float | None = None
-    frames: int = 1
-    folded: float = 0.0
-    nominal: bool = False
+    frames: int = 1  # sizes that differ
+    folded: float = 0.0  # share of the frame beyond the fold of the distortion
+    nominal: bool = False  # not calibrated, though others of the block are
 
 
 @dataclass(frozen=True)
@@ -67,29 +57,15 @@ class GnssResiduals:
 
 @dataclass(frozen=True)
 class Fit:
-    """How well cameras and cloud match.
-
-    Attributes
-    ----------
-    seen_by : dict
-        Share of the cloud's points that 0, 1, 2, 3 or more cameras have in their frame.
-    distance_m : float
-        In plan, between the boxes around block and cloud.
-    below_ground : int
-        Cameras lower than the cloud's highest point within their reach in plan.
-    verdict : str
-        What is likely wrong; empty where they match.
-    tested : str
-        What was tested, and what was not.
-    """
+    """How well cameras and cloud match."""
 
     cloud: str
     points_sampled: int
-    seen_by: dict[str, float]
-    distance_m: float
-    below_ground: int
-    verdict: str
-    tested: str = "not checked"
+    seen_by: dict[str, float]  # share of the points that 0, 1, 2, 3 or more frames hold
+    distance_m: float  # in plan, between the boxes around block and cloud
+    below_ground: int  # cameras lower than the cloud's highest point within their reach in plan
+    verdict: str  # what is likely wrong; empty where they match
+    tested: str = "not checked"  # what was tested, and what was not
 
     @property
     def fits(self) -> bool:
@@ -99,43 +75,21 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class CamerasReport:
-    """The report of ``pcfix cameras``.
-
-    Attributes
-    ----------
-    cameras : Cameras
-        In the cloud's CRS, where there is a cloud.
-    crs_read : str or None
-        CRS of the file.
-    height_above_water_m : tuple of 3 float, or None
-        Least, mean and largest; None where the water is not known.
-    tilt_deg : tuple of 2 float, or None
-        Median and largest angle of the optical axes from nadir.
-    sample_xyz : array, shape (m, 3)
-        Points of the cloud, for a picture; none without a cloud.
-    level_m : float or None
-        Mean height of the water.
-    problem : str
-        Why `cameras` are not in a map and have no heights; empty where they are.
-    diagnosis : Diagnosis or None
-        Whether the poses have absorbed the refraction; None without a cloud or water.
-    remedy : tuple of 2 str
-        The command that corrects the poses, and a remark on it.
-    """
+    """The report of ``pcfix cameras``."""
 
     path: str
-    cameras: Cameras
-    crs_read: str | None
+    cameras: Cameras  # in the cloud's CRS, where there is a cloud
+    crs_read: str | None  # of the file
     sensors: tuple[Sensor, ...]
-    height_above_water_m: tuple[float, float, float] | None
-    tilt_deg: tuple[float, float] | None
+    height_above_water_m: tuple[float, float, float] | None  # least, mean, largest
+    tilt_deg: tuple[float, float] | None  # of the optical axes from nadir: median, largest
     gnss: GnssResiduals | None
     fit: Fit | None
-    sample_xyz: FloatArray
-    level_m: float | None
-    problem: str = ""
-    diagnosis: Diagnosis | None = None
-    remedy: tuple[str, str] = ("", "")
+    sample_xyz: FloatArray  # points of the cloud, shape (m, 3), for a picture
+    level_m: float | None  # mean height of the water
+    problem: str = ""  # why the cameras are not in a map and have no heights
+    diagnosis: Diagnosis | None = None  # whether the poses have absorbed the refraction
+    remedy: tuple[str, str] = ("", "")  # the command that corrects the poses, and a remark
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""

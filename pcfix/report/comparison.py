@@ -246,17 +246,10 @@ def evaluation(
     sections: list[Plain],
     dod: tuple[FloatArray, tuple[float, float, float, float]] | None = None,
 ) -> tuple[list[Picture], list[Table]]:
-    """Return pictures and tables.
+    """Return pictures and tables of a `Comparison.as_dict`.
 
-    Parameters
-    ----------
-    compared : dict
-        `Comparison.as_dict`.
-    sections : list of dict
-        With ``distance_m`` and ``heights_m`` as lists, None where nothing is known.
-    dod : pair, optional
-        Difference of the surfaces, shape (rows, columns), metres, and its west, east, south and
-        north.
+    `sections` have ``distance_m`` and ``heights_m`` as lists, None where nothing is known; `dod` is
+    the difference of the surfaces, shape (rows, columns), metres, and its west, east, south, north.
     """
     pictures = _histograms(compared)
     if dod is not None:

@@ -30,24 +30,14 @@ SMOOTH_CELLS = 1.5
 
 @dataclass(frozen=True)
 class Layer:
-    """One choice of the map: values of cells, shape (rows, columns), NaN where unknown.
-
-    Attributes
-    ----------
-    ramp : str
-        A ramp of `pcfix.grid.colours`.
-    plus_minus : str
-        Name of the layer with the uncertainty of this one at 95 %.
-    is_centred : bool
-        Whether its colours are centred on zero.
-    """
+    """One choice of the map: values of cells, shape (rows, columns), NaN where unknown."""
 
     name: str
     unit: str
     values: FloatArray
-    ramp: str = HEIGHT
-    plus_minus: str = ""
-    is_centred: bool = False
+    ramp: str = HEIGHT  # of `pcfix.grid.colours`
+    plus_minus: str = ""  # name of the layer with the uncertainty of this one at 95 %
+    is_centred: bool = False  # whether its colours are centred on zero
     has_contours: bool = False
 
 

@@ -26,32 +26,15 @@ LARGE_SHARE = 0.5
 
 @dataclass(frozen=True)
 class DepthPlan:
-    """The prediction for a flat bed of one depth.
-
-    Attributes
-    ----------
-    apparent_m : float
-        Apparent depth, reconstructed with straight rays.
-    rays : float
-        Per point, on average.
-    sigma_m : float
-        Standard error of the corrected heights, rms over the bed.
-    parts_m : dict
-        Its parts from image, level, waves, index and poses; their squares add up.
-    absorbed : float
-        Share of the misfit in the images, 0 to 1, that poses and focal length absorb in an ordinary
-        bundle adjustment.
-    left_m : float
-        True minus corrected height, mean, where the bed is corrected with such poses.
-    """
+    """The prediction for a flat bed of one depth."""
 
     depth_m: float
-    apparent_m: float
-    rays: float
-    sigma_m: float
-    parts_m: dict[str, float]
-    absorbed: float
-    left_m: float
+    apparent_m: float  # depth as reconstructed with straight rays
+    rays: float  # per point, on average
+    sigma_m: float  # standard error of the corrected heights, rms over the bed
+    parts_m: dict[str, float]  # of image, level, waves, index and poses; their squares add up
+    absorbed: float  # share of the misfit that poses and focal length of an ordinary block absorb
+    left_m: float  # true minus corrected height with such poses, mean
 
     @property
     def order(self) -> str:
@@ -71,33 +54,21 @@ class Alternative:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A planned flight and its prediction.
+    """A planned flight and its prediction."""
 
-    Attributes
-    ----------
-    cameras : Cameras
-        As a drone would fly them: strips along x from the origin, the water at height 0.
-    height_m, gsd_m, base_m, spacing_m : float
-        Above the water, at the water, between images, between strips.
-    flattest_deg : float
-        Largest incidence angle of the rays in the corners of the frames.
-    budget : dict
-        The standard deviations by the names of their options.
-    """
-
-    cameras: Cameras
+    cameras: Cameras  # as a drone would fly them: strips along x from the origin, water at 0
     area_m: tuple[float, float]
-    height_m: float
-    gsd_m: float
-    base_m: float
-    spacing_m: float
+    height_m: float  # above the water
+    gsd_m: float  # at the water
+    base_m: float  # between images
+    spacing_m: float  # between strips
     obliques_deg: float | None
     overlap: float
     sidelap: float
-    flattest_deg: float
+    flattest_deg: float  # largest incidence angle of the rays in the corners of the frames
     index: float
     gnss_sigma_m: float
-    budget: dict[str, float | None]
+    budget: dict[str, float | None]  # the standard deviations by the names of their options
     depths: tuple[DepthPlan, ...]
     alternatives: tuple[Alternative, ...]
 

@@ -54,49 +54,27 @@ UNKNOWN_DATUM = "vertical datum not known"
 
 @dataclass(frozen=True, eq=False)
 class Corrected:
-    """A corrected cloud and what it was corrected with.
-
-    Attributes
-    ----------
-    depth_m : dict
-        Least (min), mean and greatest (max) depth of the bed's points that are not noise.
-    sample : array, shape (m, 3)
-        Z shift, depth and standard error of Z of corrected points, metres; zero where unknown.
-    """
+    """A corrected cloud and what it was corrected with."""
 
     summary: Summary
     survey: Survey
     cameras: Cameras
     water: WaterSurface
     maps: Maps
-    depth_m: dict[str, float]
-    sample: FloatArray
+    depth_m: dict[str, float]  # min, mean and max of the bed's points that are not noise
+    sample: FloatArray  # shape (m, 3): Z shift, depth and standard error of Z, zero where unknown
 
 
 @dataclass(frozen=True)
 class Later:
-    """What other steps of a run add to its page.
+    """What other steps of a run add to its page."""
 
-    Attributes
-    ----------
-    pictures, tables : sequence
-        The most important first.
-    verdict : str
-        One sentence that they come to.
-    compared : dict
-        `Comparison.as_dict`; measured figures replace predicted ones.
-    difference : pair, optional
-        Cloud minus reference, shape (rows, columns), metres, and its extent.
-    resolution_m : float, optional
-        Of the rasters and of the map.
-    """
-
-    pictures: Sequence[Picture] = ()
+    pictures: Sequence[Picture] = ()  # the most important first
     tables: Sequence[Table] = ()
-    verdict: str = ""
-    compared: Plain = field(default_factory=dict)
-    difference: tuple[FloatArray, Extent] | None = None
-    resolution_m: float | None = None
+    verdict: str = ""  # one sentence that they come to
+    compared: Plain = field(default_factory=dict)  # `Comparison.as_dict`
+    difference: tuple[FloatArray, Extent] | None = None  # cloud minus reference, metres
+    resolution_m: float | None = None  # of the rasters and of the map
 
     @property
     def tvu(self) -> Plain | None:

@@ -42,25 +42,15 @@ _FIT: RowTable = (
 
 @dataclass(frozen=True, eq=False)
 class WaterReport:
-    """The report of ``pcfix water``.
-
-    Attributes
-    ----------
-    below, unknown : float or None
-        Share of the cloud's points below the surface, and of those without a surface above them.
-    sample_xyz : array, shape (m, 3)
-        Points of the cloud, evenly spread, for a picture.
-    shoreline : dict or None
-        File, lines and length of the shoreline that was written.
-    """
+    """The report of ``pcfix water``."""
 
     spec: str
     found: FoundSurface
     cloud: str | None
-    below: float | None
-    unknown: float | None
-    sample_xyz: FloatArray
-    shoreline: dict[str, Any] | None = None
+    below: float | None  # share of the cloud's points below the surface
+    unknown: float | None  # share of those without a surface above them
+    sample_xyz: FloatArray  # points of the cloud, shape (m, 3), for a picture
+    shoreline: dict[str, Any] | None = None  # file, lines and length of the one that was written
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
