@@ -375,29 +375,26 @@ def in_short(tiles: Sequence[Tile]) -> str:
 
 def accuracy_tile(s: Summary, compared: Plain) -> Tile:
     """Return the accuracy of the bed: measured where there is a reference, else predicted."""
-    if compared.get("own"):
-        return _measured(compared)
-    title, unknown = "Accuracy of the bed", "not known"
-    if s.uncertainty is None:
-        why = "There is no reference, and the points have no standard errors."
-        return Tile(title, "predicted", [("RMSE", unknown)], [why])
-    sigma, tvu = s.uncertainty["sigma_z_m"]["mean"], s.uncertainty["tvu_95_m"]["mean"]
-    figures = [("standard error", f"{sigma:.3f} m"), ("95 %", f"{tvu:.3f} m"), ("bias", unknown)]
-    why = (
-        "No reference was given. The prediction follows from assumed errors without a common bias."
-    )
-    return Tile(title, "predicted", figures, [why])
-
-
-def _measured(compared: Plain) -> Tile:
+    if not compared.get("own"):
+        title, unknown = "Accuracy of the bed", "not known"
+        if s.uncertainty is None:
+            why = "There is no reference, and the points have no standard errors."
+            return Tile(title, "predicted", [("RMSE", unknown)], [why])
+        sigma, tvu = s.uncertainty["sigma_z_m"]["mean"], s.uncertainty["tvu_95_m"]["mean"]
+        figures = [
+            ("standard error", f"{sigma:.3f} m"), ("95 %", f"{tvu:.3f} m"), ("bias", unknown),
+        ]  # fmt: skip
+        why = (
+            "No reference was given. The prediction follows from assumed errors without a common"
+            " bias."
+        )
+        return Tile(title, "predicted", figures, [why])
     own, pair = compared["own"], raw_of(compared)
     raw, before = pair["after"], pair["before"]
-    name = name_of(compared["reference"])
-    of = "bed" if own["of"] == "bed" else "cloud (bed and land are not separated)"
     known = raw if own["rmse_m"] is None else own
     noise = noise_sentence(own, raw)
     notes = [
-        f"At {raw['count']:,} points against {name}"
+        f"At {raw['count']:,} points against {name_of(compared['reference'])}"
         + (f"; before the correction, RMSE {before['rmse_m']:.3f} m." if before else "."),
         noise[:1].upper() + noise[1:],
     ]
@@ -407,10 +404,10 @@ def _measured(compared: Plain) -> Tile:
             f"Land: bias {signed(land['mean_m'])}, RMSE {land['rmse_m']:.3f} m, reference included."
         )
     figures = [
-        ("bias", signed(own["mean_m"])),
-        ("RMSE", f"{known['rmse_m']:.3f} m"),
+        ("bias", signed(own["mean_m"])), ("RMSE", f"{known['rmse_m']:.3f} m"),
         ("95 %", f"{known['within_95_m']:.3f} m"),
-    ]
+    ]  # fmt: skip
+    of = "bed" if own["of"] == "bed" else "cloud (bed and land are not separated)"
     return Tile(f"Accuracy of the {of}", "measured", figures, notes)
 
 

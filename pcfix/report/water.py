@@ -54,33 +54,29 @@ class WaterReport:
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
+        found, fit, points = self.found, self.found.evidence, None
+        if found.points is not None and isinstance(fit, WaterFit | RiverFit):
+            points = [
+                {
+                    "xyz": [float(v) if np.isfinite(v) else None for v in xyz],
+                    "residual_m": float(residual) if np.isfinite(residual) else None,
+                    "accepted": bool(accepted),
+                }
+                for xyz, residual, accepted in zip(
+                    found.points, fit.residual_m, fit.accepted, strict=True
+                )
+            ]
         return {
             "water": self.spec,
-            "surface": str(self.found.surface),
-            "fit": self.found.as_dict(),
-            "points": _residuals(self.found),
+            "surface": str(found.surface),
+            "fit": found.as_dict(),
+            "points": points,
             "cloud": self.cloud,
             "share_below": self.below,
             "share_unknown": self.unknown,
             "shoreline": self.shoreline,
-            "notes": list(map(str, self.found.notes)),
+            "notes": list(map(str, found.notes)),
         }
-
-
-def _residuals(found: FoundSurface) -> list[dict[str, Any]] | None:
-    """Return each fitted point with its residual, None where it has no height."""
-    fit = found.evidence
-    if found.points is None or not isinstance(fit, WaterFit | RiverFit):
-        return None
-    rows = zip(found.points, fit.residual_m, fit.accepted, strict=True)
-    return [
-        {
-            "xyz": [float(v) if np.isfinite(v) else None for v in xyz],
-            "residual_m": float(residual) if np.isfinite(residual) else None,
-            "accepted": bool(accepted),
-        }
-        for xyz, residual, accepted in rows
-    ]
 
 
 def water_text(report: WaterReport) -> str:
