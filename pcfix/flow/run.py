@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,40 +18,28 @@ from pcfix.flow.clean import clean_file
 from pcfix.flow.compare import compare_clouds
 from pcfix.flow.correct import correct_file
 from pcfix.flow.dsm import grid_dsm
-from pcfix.flow.inputs import Inputs
 from pcfix.flow.maps import SECTIONS, raster_files, resolution_sentence, write_map, write_rasters
-from pcfix.flow.next_steps import FOLDER
-from pcfix.flow.old_cameras import read_blocks
 from pcfix.flow.record import Record
-from pcfix.flow.report import write_report
-from pcfix.flow.request import Files, Request, since
+from pcfix.flow.report import report_run
+from pcfix.flow.request import Files, Request, cameras_of, since, water_of
 from pcfix.flow.run_adjust import adjust_first, figures_of, outputs_of
 from pcfix.flow.runner import Bar, Progress, no_bar
 from pcfix.flow.shore import check_shoreline
-from pcfix.flow.surfaces import view_of
 from pcfix.flow.tiles import check_folder
-from pcfix.grid.maps import MOST_CELLS
-from pcfix.io.clouds import is_cloud, own_water
+from pcfix.io.clouds import is_cloud
 from pcfix.io.geopackage import check_layers
-from pcfix.io.rasters import open_raster, preview, write_dod
-from pcfix.io.tiles import Tiles, check_one_file, open_cloud
-from pcfix.model import Cameras, WaterSurface
+from pcfix.io.rasters import write_dod
+from pcfix.io.tiles import Tiles, check_one_file
 from pcfix.options.correct import CorrectOptions
 from pcfix.options.declare import options_of
 from pcfix.options.steps import CleanOptions, DistanceOptions
-from pcfix.refract.tally import Summary
-from pcfix.report.adjustment import adjustment_sentence, adjustment_tables, all_notes
-from pcfix.report.comparison import evaluation, in_a_sentence
-from pcfix.report.page import Picture, Table
-from pcfix.report.run import Later, Survey, in_short, is_found
-from pcfix.report.text import uncertainty_sentence
-from pcfix.report.water import found_picture
+from pcfix.report.adjustment import adjustment_sentence, all_notes
 
 Plain = dict[str, Any]
 
 RECORD = "run.json"
 
-DOD, REFERENCE_DSM = "dod.tif", "reference_dsm.tif"
+REFERENCE_DSM = "reference_dsm.tif"
 
 
 def run_all(
@@ -148,7 +136,7 @@ def run_all(
 
     page, done = step(
         "report", "Writing the report", [files.report],
-        lambda _: _report(request, files, inputs, first, corrected, compared),
+        lambda _: report_run(request, files, inputs, first, corrected, compared),
     )  # fmt: skip
     say(f"{done}{files.report}: {page['in_short']}")
     return files.report
@@ -195,7 +183,7 @@ def _grid(request: Request, files: Files, errors: bool, progress: Progress | Non
     """Write all rasters."""
     return write_rasters(
         files.cleaned_cloud, files.folder, resolution=request.resolution,
-        cameras=_cameras(request, files), errors=errors, progress=progress,
+        cameras=cameras_of(request, files), errors=errors, progress=progress,
     )  # fmt: skip
 
 
@@ -206,14 +194,14 @@ def _compare(request: Request, files: Files) -> Plain:
         files.cleaned_cloud, reference, out_dir=files.compare, sections=SECTIONS, overwrite=True,
         **{one.name: getattr(request, one.name) for one in options_of(DistanceOptions)},
     )  # fmt: skip
-    if _has_dod(request):
+    if request.has_surface:
         heights = Path(str(reference))
         if is_cloud(reference):
             heights = files.compare / REFERENCE_DSM
             with warnings.catch_warnings():  # the cells are those of the cloud
                 warnings.simplefilter("ignore", PcfixWarning)
-                grid_dsm(reference, heights, resolution=_resolution(files), overwrite=True)
-        write_dod(files.surface, heights, files.compare / DOD, overwrite=True)
+                grid_dsm(reference, heights, resolution=files.resolution_m, overwrite=True)
+        write_dod(files.surface, heights, files.dod, overwrite=True)
     sections = [
         {
             "distance_m": section.distance_m.tolist(),
@@ -228,86 +216,16 @@ def _compare(request: Request, files: Files) -> Plain:
     return {"figures": result.as_dict(), "sections": sections, "check_points": points}
 
 
-def _has_dod(request: Request) -> bool:
-    """Whether the comparison makes a raster of differences: not with check points."""
-    suffix = Path(str(request.reference)).suffix.lower()
-    return is_cloud(request.surveyed) or suffix in (".tif", ".tiff")
-
-
 def _draw_map(request: Request, files: Files, corrected: Plain, compared: Plain) -> dict[str, int]:
     """Write the vector layers; the water's height has one standard error for all places."""
     fitted = (corrected["water_fit"] or {}).get("sigma_level_m")
     return write_map(
         files.map, files.cleaned_cloud, files.folder,
-        water=_water(request, files),
+        water=water_of(request, files),
         sigma_level_m=fitted if request.sigma_level is None else request.sigma_level,
-        cameras=_cameras(request, files),
+        cameras=cameras_of(request, files),
         unused=corrected["cameras_unused"],
         sections=compared.get("figures", {}).get("sections", []),
         check_points=np.array(compared.get("check_points", [])).reshape(-1, 4),
         check_depths=request.check_depths,
     )  # fmt: skip
-
-
-def _report(
-    request: Request, files: Files, inputs: list[Path], first: Plain, corrected: Plain,
-    compared: Plain,
-) -> Plain:  # fmt: skip
-    """Write the page."""
-    pictures, tables, dod, verdict = list[Picture](), list[Table](), None, ""
-    if first["adjusted"]:
-        verdict = f" The cameras were adjusted first, as {first['why']}."
-    elif first["is_said"]:
-        verdict = f" The cameras were not adjusted: {first['why']}."
-    if compared:
-        dod = preview(files.compare / DOD, MOST_CELLS) if _has_dod(request) else None
-        pictures, tables = evaluation(compared["figures"], compared["sections"], dod)
-        verdict += in_a_sentence(compared["figures"])
-    if first["adjusted"]:
-        tables += adjustment_tables(figures_of(files.folder), f"{FOLDER}/report.html")
-    summary, again, cameras = Summary(**corrected), _inputs(request), _cameras(request, files)
-    if is_found(summary):
-        pictures.append(found_picture(again.surface(view_of(request.source))))
-    later = Later(pictures, tables, verdict, compared.get("figures", {}), dod, _resolution(files))
-    page = write_report(
-        files.cleaned_cloud, files.folder, summary=summary, cameras=cameras,
-        water=_water(request, files), inputs=inputs, later=later, overwrite=True,
-        survey=Survey(request.project or "", request.date or again.dates(cameras)),
-    )  # fmt: skip
-    return {
-        "in_short": in_short(page.tiles),
-        "uncertainty": uncertainty_sentence(summary, later.tvu),
-        "title": page.title,
-        "tiles": [asdict(tile) for tile in page.tiles],
-        "place": page.place,
-    }
-
-
-# What several steps read
-
-
-def _inputs(request: Request) -> Inputs:
-    """Return the inputs of the correction, without the view list."""
-    return replace(request, views=None).part(Inputs)
-
-
-def _cameras(request: Request, files: Files) -> Cameras:
-    """Return the cameras in the CRS of the cloud; notes were shown when it was corrected."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", PcfixWarning)
-        return read_blocks(_inputs(request), view_of(files.corrected_cloud).crs).cameras
-
-
-def _water(request: Request, files: Files) -> WaterSurface:
-    """Return the surface as the corrected cloud states it, else as it was asked for."""
-    cloud = files.corrected_cloud
-    with warnings.catch_warnings():  # they were shown when the cloud was corrected
-        warnings.simplefilter("ignore", PcfixWarning)
-        with open_cloud(cloud) as source:
-            stated = own_water(source)
-        return stated or _inputs(request).surface(view_of(cloud)).surface
-
-
-def _resolution(files: Files) -> float:
-    with open_raster(files.surface) as dsm:
-        return float(dsm.res[0])
