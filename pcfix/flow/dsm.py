@@ -380,7 +380,7 @@ class SortedPoints:
         """
         row, column = self.lattice.first_row, self.lattice.first_column
         xyz = self._bins.read(window.moved(row, column))
-        cell = cells_of(xyz, self._resolution_m) - [column, row]
+        cell = cells_of(xyz, self._resolution_m) - np.array([column, row])
         rows = window.holds(cell)
         return xyz[rows], cell[rows]
 

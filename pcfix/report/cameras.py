@@ -138,12 +138,13 @@ def cameras_text(r: CamerasReport) -> str:
     if r.tilt_deg is not None:
         rows.append(("Tilt", "median {:.1f} deg, largest {:.1f} deg".format(*r.tilt_deg)))
     if (g := r.gnss) is not None:
-        mean, sd = (
+        means, deviations = (
             ", ".join("-" if v is None else f"{v:{sign}.3f}" for v in values)
             for values, sign in ((g.mean_m, "+"), (g.sd_m, ""))
         )
         words = (
-            f"{g.images:,} images; adjusted minus GNSS east, north, up: mean {mean} m, sd {sd} m;"
+            f"{g.images:,} images; adjusted minus GNSS east, north, up: mean {means} m, sd"
+            f" {deviations} m;"
             f" largest {g.largest_m:.3f} m ({g.largest_image})"
         )
         rows += [("GNSS", words)] if g.images else []

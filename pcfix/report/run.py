@@ -45,7 +45,6 @@ Pair = tuple[str, str]
 SHIFT = "True minus apparent Z (m)"
 FIRST_FIGURES = ("water", "section_1", "depth_bins", "uncertainty", "cameras", "shift")
 """Those that are shown where they are there, the first four of them."""
-Plain = dict[str, Any]
 CONTRADICTS = 1.5
 """Measured and predicted errors that differ by a larger factor contradict each other."""
 SHOWN_NOTES = 3
