@@ -22,14 +22,14 @@ from pcfix.flow.diagnosis import (
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.next_steps import adjust_words
 from pcfix.flow.plausibility import Flight, plausible
-from pcfix.flow.runner import check_summary, write_summary
+from pcfix.flow.runner import check_summary, write_plot, write_summary
 from pcfix.flow.shore import check_shoreline, write_shoreline
 from pcfix.flow.surfaces import CloudView, file_points, find_surface, view_of
 from pcfix.grid.shoreline import NearWater
 from pcfix.io.cameras.georeference import adjusted_minus_gnss
 from pcfix.io.cameras.mistakes import UNDULATION_M, likely_mistake
 from pcfix.io.clouds import check_same_crs, read_reference
-from pcfix.io.files import check_input, check_output, write_bytes
+from pcfix.io.files import check_input
 from pcfix.io.gnss_positions import read_gnss
 from pcfix.io.ground_control import read_ground_control
 from pcfix.lens.frames import cameras_in_sight
@@ -38,7 +38,6 @@ from pcfix.model import Cameras, FloatArray, Lens, TiePoints, WaterDimension, Wa
 from pcfix.options.declare import File, taken
 from pcfix.options.survey import CamerasCheckOptions, WaterCheckOptions
 from pcfix.report.cameras import CamerasReport, Fit, GnssResiduals, Sensor, block_figure
-from pcfix.report.page import png_of
 from pcfix.report.water import WaterReport, water_figure
 from pcfix.water.index import index_of
 from pcfix.water.surface import surface_above
@@ -63,12 +62,9 @@ def check_cameras(
         absorbed refraction, see `pcfix.adjust.diagnosis`.
     """
     given = taken(CamerasCheckOptions, options, keywords, "check_cameras")
-    cloud, plot = given.cloud, given.plot
-    check_summary(given, [path])
-    if plot is not None:
-        files = [path, cloud, given.gnss, given.gcps, given.lens, given.reference]
-        known = [file for file in files if file is not None]
-        check_output(plot, overwrite=given.overwrite, inputs=known)
+    cloud = given.cloud
+    files = [path, cloud, given.gnss, given.gcps, given.lens, given.reference]
+    check_summary(given, [file for file in files if file is not None])
     if cloud is None or given.water is None:
         for name in ("gcps", "lens", "reference"):
             if getattr(given, name) is not None:
@@ -146,8 +142,8 @@ def check_cameras(
         diagnosis=diagnosis,
         remedy=remedy,
     )
-    if plot is not None:
-        write_bytes(plot, png_of(block_figure(report)), overwrite=given.overwrite)
+    if given.plot is not None:
+        write_plot(given, block_figure(report))
     write_summary(given, report.as_dict())
     return report
 
@@ -165,11 +161,9 @@ def check_water(
         Or its attributes as keywords.
     """
     given = taken(WaterCheckOptions, options, keywords, "check_water")
-    cloud, plot = given.cloud, given.plot
-    check_summary(given)
+    cloud = given.cloud
     inputs = [] if cloud is None else [cloud]
-    if plot is not None:
-        check_output(plot, overwrite=given.overwrite, inputs=inputs)
+    check_summary(given, inputs)
     check_shoreline(given.shoreline, overwrite=given.overwrite, inputs=inputs)
     view = None if cloud is None else view_of(check_input(cloud))
     found = shown_once(lambda: find_surface(spec, given, view), lambda found: found.notes)
@@ -190,8 +184,8 @@ def check_water(
         )
     name = None if view is None else view.name
     report = WaterReport(str(spec), found, name, below, unknown, sample, shoreline)
-    if plot is not None:
-        write_bytes(plot, png_of(water_figure(report)), overwrite=given.overwrite)
+    if given.plot is not None:
+        write_plot(given, water_figure(report))
     write_summary(given, report.as_dict())
     return report
 

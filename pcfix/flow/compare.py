@@ -18,10 +18,10 @@ from pcfix.compare.m3c2 import load_py4dgeo
 from pcfix.compare.match import Match, SurveyCloud, match
 from pcfix.compare.sections import parse_line
 from pcfix.errors import SettingError
-from pcfix.flow.runner import check_summary, json_text, write_summary
+from pcfix.flow.runner import check_summary, json_text, write_plot, write_summary
 from pcfix.io.atomic import all_or_none, output_folder
 from pcfix.io.clouds import check_same_crs, read_cloud, read_reference, reference_of
-from pcfix.io.files import check_output, scratch_arrays, write_bytes, write_text
+from pcfix.io.files import check_output, scratch_arrays, write_text
 from pcfix.io.tiles import Clouds, Tiles, cloud_of, inputs_of
 from pcfix.model import WaterSurface
 from pcfix.options.declare import File, taken
@@ -132,8 +132,6 @@ def _check_outputs(given: CompareOptions, inputs: list[File]) -> None:
         if folder.is_dir():
             for path in [*(folder / name for name in names), *folder.glob("section_*.csv")]:
                 check_output(path, overwrite=given.overwrite, inputs=inputs)
-    if given.plot is not None:
-        check_output(given.plot, overwrite=given.overwrite, inputs=inputs)
     check_summary(given, inputs)
 
 
@@ -151,10 +149,8 @@ def _write(result: Comparison, given: CompareOptions) -> None:
                 write_text(folder / name, content, overwrite=given.overwrite)
         if given.plot is not None:
             from pcfix.report.comparison import c2c_figure
-            from pcfix.report.page import png_of
 
-            picture = png_of(c2c_figure(result.as_dict()))
-            write_bytes(given.plot, picture, overwrite=given.overwrite)
+            write_plot(given, c2c_figure(result.as_dict()))
         write_summary(given, result.as_dict())
     if folder is not None:
         for path in folder.glob("section_*.csv"):  # of an earlier comparison with more

@@ -23,16 +23,14 @@ from pcfix.adjust.solve import solve
 from pcfix.errors import PcfixWarning, SettingError
 from pcfix.flow.correct import correct_points
 from pcfix.flow.pose_errors import Adjustment, Sample, pose_errors
-from pcfix.flow.runner import check_summary, write_summary
+from pcfix.flow.runner import check_summary, write_plot, write_summary
 from pcfix.flow.surfaces import Points
-from pcfix.io.files import check_output, write_bytes
 from pcfix.kernels import threads
 from pcfix.model import Cameras, Correction, FloatArray, TiePoints, Views, WaterPlane
 from pcfix.options.correct import BudgetOptions, RefractionOptions, ScienceOptions
 from pcfix.options.declare import options_of, taken
 from pcfix.options.handover import PlanOptions
 from pcfix.refract.batch import Survey
-from pcfix.report.page import png_of
 from pcfix.report.plan import Alternative, DepthPlan, Plan, plan_figure
 from pcfix.simulate.block import Block, fly_block
 from pcfix.simulate.scene import Streams, lay_out, points_on
@@ -90,8 +88,6 @@ def plan_flight(
     """
     given = taken(PlanOptions, options, keywords, "plan_flight")
     check_summary(given)
-    if given.plot is not None:
-        check_output(given.plot, overwrite=given.overwrite)
     deepest = max(given.depth)
     # other flights, each with its changed option
     overlap, height = 0.5 + 0.5 * given.overlap, round(0.7 * given.height, 1)
@@ -134,7 +130,7 @@ def plan_flight(
         budget=given.part(BudgetOptions).as_dict(), depths=tuple(beds), alternatives=tuple(tried),
     )  # fmt: skip
     if given.plot is not None:
-        write_bytes(given.plot, png_of(plan_figure(plan)), overwrite=given.overwrite)
+        write_plot(given, plan_figure(plan))
     write_summary(given, plan.as_dict())
     return plan
 

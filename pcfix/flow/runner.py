@@ -18,7 +18,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
-from pcfix.io.files import check_input, check_output, write_text
+from pcfix.io.files import check_input, check_output, write_bytes, write_text
 from pcfix.io.las.part import cloud_part
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import LasSink, check_suffix, output_evlrs
@@ -28,6 +28,7 @@ from pcfix.options.declare import File
 
 if TYPE_CHECKING:
     import laspy
+    from matplotlib.figure import Figure
 
 Chunk: TypeAlias = "laspy.ScaleAwarePointRecord"
 Header: TypeAlias = "laspy.LasHeader"
@@ -187,9 +188,9 @@ def json_text(content: dict[str, Any]) -> str:
 
 
 def check_summary(options: Any, inputs: Iterable[File] = ()) -> None:
-    """Refuse a summary or a regression file that could not be written, before the work begins."""
+    """Refuse small outputs that could not be written, before the work begins."""
     known = list(inputs)
-    for name in ("summary", "save_regression"):
+    for name in ("plot", "summary", "save_regression"):
         path = getattr(options, name, None)
         if path is not None:
             known.append(check_output(path, overwrite=options.overwrite, inputs=known))
@@ -199,6 +200,13 @@ def write_summary(options: Any, summary: dict[str, Any]) -> None:
     """Write a summary as JSON if the options, with overwrite, name a file for it."""
     if options.summary is not None:
         write_text(options.summary, json_text(summary), overwrite=options.overwrite)
+
+
+def write_plot(options: Any, figure: Figure) -> None:
+    """Write a figure to the PNG file that the options, with overwrite, name."""
+    from pcfix.report.page import png_of
+
+    write_bytes(options.plot, png_of(figure), overwrite=options.overwrite)
 
 
 def check_cloud(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) -> Path:
