@@ -123,7 +123,12 @@ def rebuild_rounds(
     record = _opened(target, given)
     finished = sum("mean_m" in one for one in record["rounds"])
     start = str(given.dsm) if Path(given.dsm).suffix.lower() in CLOUDS else None
-    given = _with_raster(given, target)
+    if start is not None:  # a cloud is gridded to the folder
+        raster = target / "dsm.tif"
+        fresh = raster.exists() and raster.stat().st_mtime_ns > Path(start).stat().st_mtime_ns
+        if given.overwrite or not fresh:
+            grid_dsm(start, raster, resolution=given.resolution, overwrite=True)
+        given = replace(given, dsm=raster, resolution=None)
     with threads(given.jobs), TemporaryDirectory() as scratch:
         block = block_of(given, paths, Path(scratch))
     threshold_m = round(given.until_gsd * block.gsd_m, 5)
@@ -208,17 +213,6 @@ def _opened(target: Path, given: PhotosOptions) -> dict[str, Any]:
     new["rounds"] = []
     write_text(path, json_text(new), overwrite=True)
     return new
-
-
-def _with_raster(given: PhotosOptions, target: Path) -> PhotosOptions:
-    """Return options whose DSM is a raster; a cloud is gridded to the folder."""
-    if Path(given.dsm).suffix.lower() not in CLOUDS:
-        return given
-    raster = target / "dsm.tif"
-    fresh = raster.exists() and raster.stat().st_mtime_ns > Path(given.dsm).stat().st_mtime_ns
-    if given.overwrite or not fresh:
-        grid_dsm(given.dsm, raster, resolution=given.resolution, overwrite=True)
-    return replace(given, dsm=raster, resolution=None)
 
 
 def _keep(target: Path, record: dict[str, Any], number: int, kept: dict[str, Any]) -> None:

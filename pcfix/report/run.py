@@ -86,8 +86,7 @@ def run_report(corrected: Corrected, inputs: Table, files: Sequence[Pair], later
     s, maps, survey = corrected.summary, corrected.maps, corrected.survey
     versions = [["pcfix", __version__], ["Python", platform.python_version()]]
     versions += [[name, version(name)] for name in ("numpy", "scipy", "numba", "laspy", "lazrs")]
-    pictures = [*_pictures(corrected), *_uncertainty_picture(corrected.sample, s, later)]
-    pictures += later.pictures
+    pictures = [*_pictures(corrected, later), *later.pictures]
     order = {name: place for place, name in enumerate(FIRST_FIGURES)}
     mean = s.shift_z_m["mean"]
     lead = (
@@ -163,7 +162,8 @@ def _worded(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _pictures(corrected: Corrected) -> list[Picture]:
+def _pictures(corrected: Corrected, later: Later) -> list[Picture]:
+    """Return maps, a histogram, the cameras, and TVU over depth where there are standard errors."""
     s, maps, depth = corrected.summary, corrected.maps, corrected.depth_m
     interval = depth_interval(maps.depth_m, maps.uncertainty_m)
     shade = relief(maps.height_m, maps.cell_m)
@@ -198,6 +198,21 @@ def _pictures(corrected: Corrected) -> list[Picture]:
             f" {s.cameras_used} of {s.cameras} see corrected points."
         )
         pictures.append(Picture("cameras", "Cameras", alt, cameras_figure(corrected)))
+    known = corrected.sample[:, 2] > 0.0
+    if s.uncertainty is not None and known.any():
+        bins = later.compared["depth_bins"] if later.tvu else []
+        dots = (
+            " Dots: the limit that 95 % of the differences to the reference keep, its noise"
+            " included."
+        )
+        alt = (
+            "Total vertical uncertainty at 95 % (1.96 standard errors of Z) over depth, and the"
+            f" limits of the orders of IHO S-44. {formal_words(s)}.{dots if bins else ''}"
+            " S-44 has requirements other than the TVU: position, features and coverage."
+        )
+        _, depth_m, sigma_z_m = corrected.sample[known].T
+        figure = tvu_figure(depth_m, sigma_z_m, bins)
+        pictures.append(Picture("uncertainty", "Vertical uncertainty", alt, figure))
     return pictures
 
 
@@ -241,24 +256,6 @@ def cameras_figure(corrected: Corrected) -> Figure:
     label_side(profile)
     profile.legend(loc="best")
     return figure
-
-
-def _uncertainty_picture(sample: FloatArray, s: Summary, later: Later) -> list[Picture]:
-    """Return TVU over depth, where the cloud has standard errors."""
-    known = sample[:, 2] > 0.0
-    if s.uncertainty is None or not known.any():
-        return []
-    bins = later.compared["depth_bins"] if later.tvu else []
-    dots = (
-        " Dots: the limit that 95 % of the differences to the reference keep, its noise included."
-    )
-    text = (
-        "Total vertical uncertainty at 95 % (1.96 standard errors of Z) over depth, and the limits"
-        f" of the orders of IHO S-44. {formal_words(s)}.{dots if bins else ''}"
-        " S-44 has requirements other than the TVU: position, features and coverage."
-    )
-    figure = tvu_figure(sample[known, 1], sample[known, 2], bins)
-    return [Picture("uncertainty", "Vertical uncertainty", text, figure)]
 
 
 def tvu_figure(
