@@ -251,7 +251,22 @@ def evaluation(
     `sections` have ``distance_m`` and ``heights_m`` as lists, None where nothing is known; `dod` is
     the difference of the surfaces, shape (rows, columns), metres, and its west, east, south, north.
     """
-    pictures = _histograms(compared)
+    pictures, pair = [], compared["vertical"]
+    if pair is not None:
+        times = [(name, colour, pair[when]) for when, name, colour in TIMES if pair[when]]
+        figure, panels = new_figure(8.0, 2.4 * len(times) + 0.4, nrows=len(times), squeeze=False)
+        for axes, (name, colour, of) in zip(panels[:, 0], times, strict=True):
+            s = of["statistics"]
+            label = f"{name}: mean {s['mean_m']:.3f}, sd {s['sd_m']:.3f} m"
+            _histogram(axes, of, (s["mean_m"], s["sd_m"]), color=colour, label=label)
+        panels[-1, 0].set_xlabel("Cloud minus reference, Z (m)")
+        alt = f"Vertical error: histograms with fitted Gaussians. {_moments(times)}"
+        pictures.append(Picture("histogram_vertical", "Vertical error", alt, figure))
+    title = "Distance to the nearest point (C2C)"
+    c2c = [(f"{way}, {name}", colour, of) for way, name, colour, of in c2c_rows(compared)]
+    alt = f"{title}: histograms with fitted Gaussians. {_moments(c2c)}"
+    alt += _noted(compared, "cloud.sparse", "reference.sparse")
+    pictures.append(Picture("histogram_c2c", title, alt, c2c_figure(compared)))
     if dod is not None:
         reach = float(np.nanpercentile(np.abs(dod[0]), 98.0))
         alt = (
@@ -272,25 +287,6 @@ def evaluation(
     ]  # fmt: skip
     pictures += [_section(number, one) for number, one in enumerate(sections, start=1)]
     return pictures, _tables(compared)
-
-
-def _histograms(compared: Plain) -> list[Picture]:
-    pictures, pair = [], compared["vertical"]
-    if pair is not None:
-        rows = [(name, colour, pair[when]) for when, name, colour in TIMES if pair[when]]
-        figure, panels = new_figure(8.0, 2.4 * len(rows) + 0.4, nrows=len(rows), squeeze=False)
-        for axes, (name, colour, of) in zip(panels[:, 0], rows, strict=True):
-            s = of["statistics"]
-            label = f"{name}: mean {s['mean_m']:.3f}, sd {s['sd_m']:.3f} m"
-            _histogram(axes, of, (s["mean_m"], s["sd_m"]), color=colour, label=label)
-        panels[-1, 0].set_xlabel("Cloud minus reference, Z (m)")
-        alt = f"Vertical error: histograms with fitted Gaussians. {_moments(rows)}"
-        pictures.append(Picture("histogram_vertical", "Vertical error", alt, figure))
-    title = "Distance to the nearest point (C2C)"
-    rows = [(f"{way}, {name}", colour, of) for way, name, colour, of in c2c_rows(compared)]
-    alt = f"{title}: histograms with fitted Gaussians. {_moments(rows)}"
-    alt += _noted(compared, "cloud.sparse", "reference.sparse")
-    return [*pictures, Picture("histogram_c2c", title, alt, c2c_figure(compared))]
 
 
 def _moments(rows: list[tuple[str, str, Plain]]) -> str:
