@@ -14,6 +14,7 @@ from pcfix.flow.next_steps import FOLDER
 from pcfix.flow.request import Files, Request, cameras_of, inputs_of_run, water_of
 from pcfix.flow.run_adjust import figures_of
 from pcfix.flow.surfaces import view_of
+from pcfix.flow.water import found_picture
 from pcfix.grid.maps import MOST_CELLS, Maps, MapsBuilder
 from pcfix.io.crs import crs_words
 from pcfix.io.files import sha256, write_bytes, write_text
@@ -28,7 +29,6 @@ from pcfix.report.comparison import evaluation, in_a_sentence
 from pcfix.report.page import Picture, Report, Table, render
 from pcfix.report.run import Corrected, Later, Survey, in_short, is_found, run_report
 from pcfix.report.text import uncertainty_sentence
-from pcfix.report.water import found_picture
 
 Plain = dict[str, Any]
 NEEDED = (*SHIFTS, "WaterDepth", "RayCount")
