@@ -62,7 +62,12 @@ def write_rasters(
     By default the cells have 2 to 4 points, and are no smaller than a pixel on the ground. Returns
     the facts for ``run.json``.
     """
-    gsd_m = _gsd_m(cloud, cameras)
+    gsd_m = None  # a pixel on the ground at nadir, median
+    if cameras.lenses:
+        with open_cloud(cloud) as source:
+            middle = float(source.header.mins[2] + source.header.maxs[2]) / 2.0
+        focal = np.array([lens.focal_px for lens in cameras.lenses])
+        gsd_m = float(np.median((cameras.centres[:, 2] - middle) / focal))
     spacing_m = point_spacing_m(cloud, DsmRules())
     cell_m = resolution or round_resolution(spacing_m, gsd_m or 0.0)
     plain = DsmOptions(resolution=cell_m, cog=True, style=True, overwrite=True)
@@ -98,16 +103,6 @@ def resolution_sentence(made: dict[str, Any], *, given: bool) -> str:
     parts += [] if gsd_m is None else [f"GSD {gsd_m:.2g} m"]
     more = f" ({', '.join(parts)})" if parts else ""
     return f", cells of {made['resolution_m']:g} m{', as given' if given else ''}{more}"
-
-
-def _gsd_m(cloud: Path | Tiles, cameras: Cameras) -> float | None:
-    """Return the size of a pixel on the ground at nadir, median; None without lenses."""
-    if not cameras.lenses:
-        return None
-    with open_cloud(cloud) as source:
-        middle = float(source.header.mins[2] + source.header.maxs[2]) / 2.0
-    focal = np.array([lens.focal_px for lens in cameras.lenses])
-    return float(np.median((cameras.centres[:, 2] - middle) / focal))
 
 
 def _write_shaded(folder: Path) -> None:

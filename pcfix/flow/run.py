@@ -105,15 +105,25 @@ def run_all(
         say(f"{'adjust':<9} not done: {first['why']}")
     say(f"{done}{files.corrected}")
 
+    # the corrected cloud marks which points are below the water
+    how = CleanOptions(overwrite=True, jobs=jobs, scheduler=asked.scheduler)
     _, done = step(
         "clean", "Cleaning", files.parts(files.cleaned),
-        partial(_clean, files, CleanOptions(overwrite=True, jobs=jobs, scheduler=asked.scheduler)),
+        lambda progress: clean_file(
+            files.corrected_cloud, files.cleaned, options=how, progress=progress
+        ).as_dict(),
     )  # fmt: skip
     say(f"{done}{files.cleaned}")
 
     errors = corrected["uncertainty"] is not None
     outputs = raster_files(out_dir, errors=errors)
-    made, done = step("dsm", "Gridding", outputs, partial(_grid, request, files, errors))
+    made, done = step(
+        "dsm", "Gridding", outputs,
+        lambda progress: write_rasters(
+            files.cleaned_cloud, out_dir, resolution=request.resolution,
+            cameras=cameras_of(request, files), errors=errors, progress=progress,
+        ),
+    )  # fmt: skip
     given = request.resolution is not None
     say(f"{done}{outputs[0]}{resolution_sentence(made, given=given)}")
 
@@ -171,20 +181,6 @@ def _correct(request: Request, files: Files, jobs: int | None, progress: Progres
         options = replace(options, save_regression=files.regression)
     files.remove_others()
     return vars(correct_file(request.source, files.corrected, options=options, progress=progress))
-
-
-def _clean(files: Files, options: CleanOptions, progress: Progress | None) -> Plain:
-    """Flag the noise; the corrected cloud marks which points are below the water."""
-    cloud, target = files.corrected_cloud, files.cleaned
-    return clean_file(cloud, target, options=options, progress=progress).as_dict()
-
-
-def _grid(request: Request, files: Files, errors: bool, progress: Progress | None) -> Plain:
-    """Write all rasters."""
-    return write_rasters(
-        files.cleaned_cloud, files.folder, resolution=request.resolution,
-        cameras=cameras_of(request, files), errors=errors, progress=progress,
-    )  # fmt: skip
 
 
 def _compare(request: Request, files: Files) -> Plain:
