@@ -151,7 +151,7 @@ def _label(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
 
 def _clean(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
     from pcfix.clean.points import Resources
-    from pcfix.flow.clean import RAY_DIMENSIONS, NoiseSearch, Tested
+    from pcfix.flow.clean import RAY_DIMENSIONS, Tested, find_noise
     from pcfix.flow.runner import check_summary, write_summary
     from pcfix.kernels import threads
     from pcfix.options.steps import CleanOptions
@@ -160,22 +160,25 @@ def _clean(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
     options = _options(namespace, CleanOptions)
     cloud = PdalCloud(ins, namespace.get("metadata"))
     flags, rays = cloud.flags, cloud.columns(tuple(RAY_DIMENSIONS))
-    search = NoiseSearch(NAME, options, lambda: _view(cloud), ins)
     check_summary(options)
-    chunks = (
-        Tested(points, flags.withheld[rows], {name: rays[name][rows] for name in rays})
-        for rows, points in _chunks(cloud, search.water)
-    )
+
+    def chunks(water: WaterSurface | None) -> Iterator[Tested]:
+        for rows, points in _chunks(cloud, water):
+            yield Tested(points, flags.withheld[rows], {name: rays[name][rows] for name in rays})
+
     with threads(options.jobs):
-        noise = search.run(chunks, len(cloud), Resources(jobs=options.jobs))
+        noise, found = find_noise(
+            NAME, options, lambda: _view(cloud), ins, chunks, len(cloud),
+            Resources(jobs=options.jobs),
+        )  # fmt: skip
     if options.drop:
         outs["Mask"] = ~noise
     else:
         flags.withheld |= noise
         outs["Classification"] = np.where(noise, LOW_NOISE, flags.classes).astype(np.uint8)
         outs.update(flags.dimensions())
-    seconds = time.perf_counter() - started
-    summary = search.summary(NAME, NAME, drop=options.drop, seconds=seconds).as_dict()
+    seconds = round(time.perf_counter() - started, 3)
+    summary = {**found.as_dict(), "input": NAME, "output": NAME, "seconds": seconds}
     write_summary(options, summary)
     namespace["out_metadata"] = metadata_of(summary, None if options.drop else flags)
 

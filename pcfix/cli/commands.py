@@ -256,8 +256,7 @@ def cameras(
     options: Annotated[CamerasCheckOptions, FLAGS] = CamerasCheckOptions(),
 ) -> None:
     """Inspect a camera file: contents, fit to the cloud, absorbed refraction."""
-    from pcfix.flow.checks import check_cameras
-    from pcfix.report.cameras import cameras_text
+    from pcfix.flow.cameras import cameras_text, check_cameras
 
     say(cameras_text(check_cameras(path, options)))
 
@@ -269,8 +268,7 @@ def water(
     options: Annotated[WaterCheckOptions, FLAGS] = WaterCheckOptions(),
 ) -> None:
     """Read, fit or detect a water surface, with its standard error."""
-    from pcfix.flow.checks import check_water
-    from pcfix.report.water import water_text
+    from pcfix.flow.water import check_water, water_text
 
     say(water_text(check_water(spec, options)))
 
@@ -307,7 +305,7 @@ def simulate(
 
 def plan(*, options: Annotated[PlanOptions, FLAGS] = PlanOptions(), quiet: Quiet = False) -> None:
     """Predict the accuracy of a planned flight."""
-    from pcfix.report.plan import plan_text
+    from pcfix.flow.plan import plan_text
 
     with progress_bar("Planning", quiet, unit="beds") as progress:
         found = pcfix.plan_flight(options=options, progress=progress)

@@ -6,7 +6,7 @@ import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -60,7 +60,7 @@ from pcfix.model import (
     WaterSurface,
 )
 from pcfix.options.declare import File, taken
-from pcfix.options.survey import WATER_UNKNOWNS, AdjustOptions, AdjustRules
+from pcfix.options.survey import WATER_UNKNOWNS, AdjustOptions
 from pcfix.port.shapes import FlatPort, Port
 from pcfix.refract.choice import views_in_frame
 from pcfix.water.index import index_of
@@ -78,16 +78,6 @@ _EXPORTS = (
     " Metashape project (.psx, .psz) or its BlocksExchange export, Pix4D's params folder with its"
     " tp_ file, and Bundler's .out."
 )
-
-
-class Survey(NamedTuple):
-    """Measurements besides the images; see `adjust_cameras`."""
-
-    gcps: File | GroundControl | None = None
-    gnss: File | None = None
-    lens: File | None = None
-    gcps_crs: str | None = None
-    gnss_crs: str | None = None
 
 
 def adjust_cameras(
@@ -130,64 +120,26 @@ def adjust_cameras(
         keywords["free_network"] = "free" if keywords["free_network"] else "observed"
     given = taken(AdjustOptions, options, keywords, "adjust_cameras")
     inputs = replace(given.part(Inputs), cameras=model)
-    survey = Survey(given.gcps, given.gnss, given.lens, given.gcps_crs, given.gnss_crs)
     target = None if out_dir is None else Path(out_dir)
-    return adjust_into(
-        target, inputs, survey, given.part(AdjustRules), given.cloud,
-        overwrite=given.overwrite, progress=progress,
-    )  # fmt: skip
+    return adjust_into(target, inputs, given, given.cloud, progress)
 
 
 def adjust_into(
-    folder: Path | None, inputs: Inputs, survey: Survey, rules: AdjustRules,
-    cloud: Clouds | None = None, *, overwrite: bool = False, progress: Progress | None = None,
+    folder: Path | None, inputs: Inputs, given: AdjustOptions, cloud: Clouds | None,
+    progress: Progress | None = None,
 ) -> Adjusted:  # fmt: skip
-    """Adjust cameras with options that were read; see `adjust_cameras`."""
-    unknowns_of(rules, ())
+    """Adjust the cameras of some inputs; of the options all others count. See `adjust_cameras`."""
+    # 1. The block, its water, and what was surveyed
+    water_unknowns = unknowns_of(given, ())
     if folder is not None:
-        _check_folder(folder, overwrite, inputs.paths())
+        _check_folder(folder, given.overwrite, inputs.paths())
     view = None if cloud is None else view_of(cloud_of(cloud))
-    material, views, crs, notes = _read(inputs, rules, view, survey)
-    ties = None if rules.ties == "cloud" else inputs.tie_points(crs, placed=False)
-    if ties is not None:
-        ties = usable_ties(with_places(ties, material.original), material.original)
-    count = 0 if ties is None else len(ties.xyz)
-    if ties is not None and count >= LEAST_TIES:
-        found = by_ties(material, ties, rules, progress)
-    elif view is None or rules.ties == "measured":
-        cloud_too = "" if rules.ties == "measured" else ", and there is no --cloud"
-        words = (
-            f"{material.name}: has {count} usable tie points ({LEAST_TIES} are"
-            f" needed){cloud_too}. {_EXPORTS}"
-        )
-        raise InputError("cameras.no_ties", words, path=material.name, ties=count, least=LEAST_TIES)
-    else:
-        xyz, listed = _sample(view, views, material.original)
-        guesses = {"all images in frame": views_in_frame(xyz, material.original)}
-        if listed is not None:
-            guesses["the images of the view list"] = listed
-        found = by_cloud(material, xyz, guesses, rules, progress)
-    if material.control is not None:
-        check_control(found, _gcps_name(survey))
-    found = replace(found, notes=[*notes, *found.notes])
-    if folder is not None:
-        _write(folder, found, str(inputs.cameras))
-    return found
-
-
-# Reading
-
-
-def _read(
-    inputs: Inputs, rules: AdjustRules, view: CloudView | None, survey: Survey
-) -> tuple[Material, ViewList | None, str | CRS | None, list[PcfixWarning]]:
-    """Read and check everything but tie points; return the view list, the CRS and warnings too."""
     name = str(inputs.cameras) if isinstance(inputs.cameras, str | Path) else "cameras"
-    found = inputs.read()
+    read = inputs.read()
     crs: str | CRS | None = None if view is None else view.crs
-    if view is None and found.crs is not None and not is_topocentric(found.crs):
-        crs = found.crs if parse_crs(found.crs, "cameras").is_projected else None
-    original, views = inputs.block(crs, found)
+    if view is None and read.crs is not None and not is_topocentric(read.crs):
+        crs = read.crs if parse_crs(read.crs, "cameras").is_projected else None
+    original, views = inputs.block(crs, read)
     if original.rotations is None or original.lenses is None:
         words = (
             f"{name}: an adjustment needs angles and a lens of every image. Give the project or"
@@ -201,38 +153,63 @@ def _read(
             " a level, plane, raster, mesh or shoreline."
         )
         raise SettingError("water.dimension", words, value=str(water))
-    check_images(name, original, water, rules.fixed_images)
-    _check_free(rules, inputs.port)
-    gnss, reason, notes = _gnss(original, name, survey, rules.gnss_sigma)
-    control = survey.gcps
+    check_images(name, original, water, given.fixed_images)
+    _check_free(given, inputs.port)
+    gnss, reason, notes = _gnss(original, name, given)
+    control = given.gcps
+    gcps = "gcps" if isinstance(control, GroundControl) else str(control)
     if control is not None and not isinstance(control, GroundControl):
-        control = read_ground_control(control, original, crs=survey.gcps_crs)
+        control = read_ground_control(control, original, crs=given.gcps_crs)
     if control is not None and water is not None:
-        check_marks(control, original, _gcps_name(survey), is_placed=gnss is not None)
-    _check_surfaces(rules.parallel, control, water, _gcps_name(survey))
+        check_marks(control, original, gcps, is_placed=gnss is not None)
+    _check_surfaces(given.parallel, control, water, gcps)
     mask = mask_of(inputs.water_mask, crs or original.crs)
     material = Material(
-        name, original, water, index_of(rules.index, rules.index_formula)[0], gnss, control,
-        inputs.port, None if survey.lens is None else _calibration(survey.lens, original),
-        None if mask is None else mask.inside, unknowns_of(rules, ()).level_sigma_m, reason,
-        rules.parallel,
+        name, original, water, index_of(given.index, given.index_formula)[0], gnss, control,
+        inputs.port, None if given.lens is None else _calibration(given.lens, original),
+        None if mask is None else mask.inside, water_unknowns.level_sigma_m, reason,
+        given.parallel,
     )  # fmt: skip
-    return material, views, crs, notes
+
+    # 2. Tie points as they were measured, or points of the cloud
+    ties = None if given.ties == "cloud" else inputs.tie_points(crs, placed=False)
+    if ties is not None:
+        ties = usable_ties(with_places(ties, original), original)
+    count = 0 if ties is None else len(ties.xyz)
+    if ties is not None and count >= LEAST_TIES:
+        found = by_ties(material, ties, given, progress)
+    elif view is None or given.ties == "measured":
+        cloud_too = "" if given.ties == "measured" else ", and there is no --cloud"
+        words = (
+            f"{name}: has {count} usable tie points ({LEAST_TIES} are needed){cloud_too}."
+            f" {_EXPORTS}"
+        )
+        raise InputError("cameras.no_ties", words, path=name, ties=count, least=LEAST_TIES)
+    else:
+        xyz, listed = _sample(view, views, original)
+        guesses = {"all images in frame": views_in_frame(xyz, original)}
+        if listed is not None:
+            guesses["the images of the view list"] = listed
+        found = by_cloud(material, xyz, guesses, given, progress)
+
+    # 3. The result
+    if control is not None:
+        check_control(found, gcps)
+    found = replace(found, notes=[*notes, *found.notes])
+    if folder is not None:
+        _write(folder, found, str(inputs.cameras))
+    return found
 
 
-def _gcps_name(survey: Survey) -> str:
-    return "gcps" if isinstance(survey.gcps, GroundControl) else str(survey.gcps)
-
-
-def _check_free(rules: AdjustRules, port: Port | None) -> None:
+def _check_free(given: AdjustOptions, port: Port | None) -> None:
     """Refuse unknowns that water or port do not have."""
     what, known = "the water", [*WATER_UNKNOWNS[:4]]
     if port is not None:
         is_flat = isinstance(port, FlatPort)
         what = "a flat port" if is_flat else "a dome"
         known = ["index", "distance" if is_flat else "centre"]
-    given = {"level": rules.sigma_level, "tilt": rules.sigma_tilt}
-    for name in (*rules.free, *(name for name, sigma in given.items() if sigma)):
+    stated = {"level": given.sigma_level, "tilt": given.sigma_tilt}
+    for name in (*given.free, *(name for name, sigma in stated.items() if sigma)):
         if name not in known:
             raise SettingError(
                 "option.choice",
@@ -264,22 +241,22 @@ def _check_surfaces(
 
 
 def _gnss(
-    original: Cameras, name: str, survey: Survey, sigma_m: float | None
+    original: Cameras, name: str, given: AdjustOptions
 ) -> tuple[GnssPositions | None, str, list[PcfixWarning]]:
     """Return GNSS positions in the block's frame, why they are not used, and warnings."""
     cameras = original
-    if survey.gnss is not None:
-        cameras, name = read_gnss(survey.gnss, original, crs=survey.gnss_crs), str(survey.gnss)
+    if given.gnss is not None:
+        cameras, name = read_gnss(given.gnss, original, crs=given.gnss_crs), str(given.gnss)
     if cameras.gnss is None:
         return None, "", []
     try:
         found, reason = gnss_in_frame_of(cameras, name)
     except PcfixError as error:
-        if survey.gnss is not None:
+        if given.gnss is not None:
             raise
         words = f"{error} The GNSS positions of the camera file are not used."
         return None, "", [PcfixWarning(error.code or "gnss.not_used", words, **error.values)]
-    gnss, notes = gnss_with_sigma(original.centres, found, name, sigma_m)
+    gnss, notes = gnss_with_sigma(original.centres, found, name, given.gnss_sigma)
     if reason:
         notes = [PcfixWarning("gnss.not_used", reason, path=name), *notes]
     return gnss, reason, notes
@@ -361,7 +338,7 @@ def _write(folder: Path, found: Adjusted, model: str) -> None:
 
 def _write_models(folder: Path, found: Adjusted) -> None:
     """Write the model in each format that holds its lenses exactly."""
-    ties, cameras, opensfm = adjusted_ties(found), found.cameras, folder / "opensfm"
+    ties, cameras, opensfm = _adjusted_ties(found), found.cameras, folder / "opensfm"
     writers = {
         "colmap": partial(write_colmap, folder / "colmap", cameras, ties, crs=cameras.crs),
         "opensfm": partial(write_opensfm, opensfm / "reconstruction.json", cameras, ties),
@@ -385,7 +362,7 @@ def _write_models(folder: Path, found: Adjusted) -> None:
         )
 
 
-def adjusted_ties(found: Adjusted) -> TiePoints | None:
+def _adjusted_ties(found: Adjusted) -> TiePoints | None:
     """Return the adjusted tie points without outliers; None if the cloud replaced them."""
     if found.source == "cloud":
         return None

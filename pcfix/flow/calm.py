@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -74,17 +74,7 @@ class WaterFound(NamedTuple):
 
 @dataclass(frozen=True)
 class CalmSummary:
-    """The result of `calm_frames`.
-
-    Attributes
-    ----------
-    corners : int
-        By which the frames were registered.
-    scatter_px, moved_px : float
-        Median scatter of a corner along an axis; largest movement of the frame's centre.
-    spread : float
-        Median over the image of the spread of the frames, grey values.
-    """
+    """The result of `calm_frames`."""
 
     input: str
     output: str
@@ -92,10 +82,10 @@ class CalmSummary:
     frames: int
     columns: int
     rows: int
-    corners: int
-    scatter_px: float
-    moved_px: float
-    spread: float
+    corners: int  # by which the frames were registered
+    scatter_px: float  # of a corner along an axis, median
+    moved_px: float  # largest movement of the frame's centre
+    spread: float  # of the frames, median over the image, grey values
     seconds: float
     water: WaterFound | None
     notes: tuple[PcfixWarning, ...] = ()
@@ -133,19 +123,42 @@ def calm_frames(
         raise SettingError(
             "output.exists", f"{folder}: exists. Add --overwrite to replace it.", path=folder
         )
-    count = _Counted(progress, len(found.names) * (1 + given.surface + (not given.still)))
+    total = len(found.names) * (1 + given.surface + (not given.still))
+    done = 0
+
+    def count(some: Iterable[Any]) -> Iterator[Any]:
+        """Yield frames, and report each that was gone through."""
+        nonlocal done
+        for frame in some:
+            yield frame
+            done += 1
+            if progress is not None:
+                progress(done, total)
+
     with threads(given.jobs), scratch_arrays(target) as empty:
         view, crs = _view(given, found) if given.surface else (None, None)
-        way = _registered(found, count, still=given.still)
-        median, spread, stack = _median(found, way, empty, count)
-        notes: tuple[PcfixWarning, ...] = ()
-        water = None
+        way = _registered(found, count(found), still=given.still)
+        median, spread, stack = _median(found, way, empty, count(found))
+        notes, water = list[PcfixWarning](), None
         if view is not None:
-            waters, nodes, water = _water(given, found, view, count, median=median, stack=stack)
+            interval = given.interval * given.every if given.interval else found.interval_s
+            nodes = nodes_of(view, given.resolution)
+            measured = _displacements(median, view, nodes, count(stack))
+            waters, water = _water(view, nodes, *measured, interval, str(folder))
             with temporary_folder(folder) as draft:
                 _write_waters(draft, found.names, view.level_m, nodes, waters, crs)
-            water = water._replace(folder=str(folder))
-            notes = _notes_of(water, tied=bool(given.interval or found.interval_s))
+            if interval is None:
+                words = (
+                    "The time between frames is not known, so each frame is fitted alone. Give"
+                    " --interval."
+                )
+                notes.append(PcfixWarning("frames.no_interval", words))
+            if water.explained < LEAST_EXPLAINED:
+                words = (
+                    f"Waves explain only {100 * water.explained:.0f} % of the slopes (a current,"
+                    " glints, a wrong interval or depth). Do not rely on the surfaces."
+                )
+                notes.append(PcfixWarning("waves.explained", words, explained=water.explained))
     write_calm(target, found, median)
     write_spread(beside, spread)
     middle = np.array([0.5 * found.columns, 0.5 * found.rows, 1.0])
@@ -157,33 +170,19 @@ def calm_frames(
         scatter_px=round(float(np.median(way.scatter_px)) if len(way.scatter_px) else 0.0, 3),
         moved_px=round(float(np.hypot(*(moved[:, :2] / moved[:, 2:] - middle[:2]).T).max()), 2),
         spread=round(float(np.nanmedian(spread)), 2),
-        seconds=round(time.perf_counter() - started, 3), water=water, notes=notes,
+        seconds=round(time.perf_counter() - started, 3), water=water, notes=tuple(notes),
     )  # fmt: skip
     write_summary(given, plain(summary) | {"water": water and water._asdict()})
     return summary
 
 
-class _Counted:
-    """Counts frames as they are gone through."""
-
-    def __init__(self, progress: Progress | None, total: int) -> None:
-        self._progress, self._total, self._done = progress, total, 0
-
-    def __call__(self, frames: Any) -> Iterator[Any]:
-        for frame in frames:
-            yield frame
-            self._done += 1
-            if self._progress is not None:
-                self._progress(self._done, self._total)
-
-
-def _registered(frames: Frames, count: _Counted, *, still: bool) -> Registration:
+def _registered(frames: Frames, images: Iterable[Any], *, still: bool) -> Registration:
     """Register all frames to the first, unless the camera stood still."""
     if still:
         return Registration(np.tile(np.eye(3), (len(frames.names), 1, 1)), np.empty(0))
     follower: Follower | None = None
     places: list[FloatArray] = []
-    for frame in count(frames):
+    for frame in images:
         follower = follower or Follower(frame)
         places.append(follower.follow(frame) if places else follower.full(follower.at))
     way = register(np.stack(places))
@@ -199,11 +198,11 @@ def _registered(frames: Frames, count: _Counted, *, still: bool) -> Registration
 
 
 def _median(
-    frames: Frames, way: Registration, empty: Callable[..., Any], count: _Counted
+    frames: Frames, way: Registration, empty: Callable[..., Any], images: Iterable[Any]
 ) -> tuple[npt.NDArray[Any], FloatArray, Any]:
     """Return the median, its spread, and the registered frames, which are on disk."""
     stack: Any = None
-    for number, frame in enumerate(count(frames)):
+    for number, frame in enumerate(images):
         if stack is None:
             stack = empty((len(frames.names), *frame.shape), frame.dtype)
         if frame.shape != stack.shape[1:] or frame.dtype != stack.dtype:
@@ -287,23 +286,28 @@ def _bed(given: CalmOptions) -> tuple[Callable[[FloatArray], FloatArray], str | 
     return lambda xy: surface_above(raster, xy).height_m, crs
 
 
-def _water(
-    given: CalmOptions, frames: Frames, view: View, count: _Counted, *, median: Any, stack: Any
-) -> tuple[list[tuple[FloatArray, FloatArray]], Nodes, WaterFound]:
-    """Fit the water of each frame; return heights and standard errors, cells, and a summary."""
-    nodes = nodes_of(view, given.resolution)
-    measure = Displacements(median, view, nodes)
-    interval = given.interval * given.every if given.interval else frames.interval_s
-    times = np.arange(len(stack), dtype=np.float64) * (interval or 0.0)
-    measured = []
-    for frame in count(stack):
+def _displacements(
+    median: Any, view: View, nodes: Nodes, images: Iterable[Any]
+) -> tuple[FloatArray, FloatArray]:
+    """Return by how much the bed is displaced at the nodes in each frame, and weights."""
+    measure, measured = Displacements(median, view, nodes), []
+    for frame in images:
         measured.append(measure.of(frame))
         let_go()
     shifts, weights = (np.stack(one) for one in zip(*measured, strict=True))
     weights[:, still(shifts, weights)] = 0.0
-    middle = nodes.xy.mean(axis=0)
-    depth = float(np.nanmedian(view.level_m - view.bed(nodes.xy[nodes.seen])))
-    heights = np.full((len(stack), len(nodes.xy)), view.level_m)
+    return shifts, weights
+
+
+def _water(
+    view: View, nodes: Nodes, shifts: FloatArray, weights: FloatArray, interval: float | None,
+    folder: str,
+) -> tuple[list[tuple[FloatArray, FloatArray]], WaterFound]:  # fmt: skip
+    """Fit the water of each frame; return heights and standard errors, and a summary."""
+    times = np.arange(len(shifts), dtype=np.float64) * (interval or 0.0)
+    middle, seen = nodes.xy.mean(axis=0), nodes.seen
+    depth = float(np.nanmedian(view.level_m - view.bed(nodes.xy[seen])))
+    heights = np.full((len(shifts), len(nodes.xy)), view.level_m)
     found: list[tuple[FloatArray, FloatArray]] = []
     for _ in range(PASSES):
         slope = np.stack(
@@ -323,24 +327,22 @@ def _water(
         if interval is not None:  # time ties the frames together
             waves = [fit_waves(data, depth)] * len(times)
         else:
-            each = zip(data.slope, data.weight, strict=True)
             waves = [
                 fit_waves(data._replace(slope=s[None], weight=w[None], time_s=np.zeros(1)), depth)
-                for s, w in each
+                for s, w in zip(data.slope, data.weight, strict=True)
             ]
         found = [w.at(nodes.xy - middle, t) for w, t in zip(waves, times, strict=True)]
         heights = view.level_m + np.stack([height for height, _ in found])
-    seen = nodes.seen
     weight = data.weight[..., None]
     energy = float((weight * data.slope**2).sum() / (2.0 * weight.sum()))
     summary = WaterFound(
-        folder="", waves=max(len(one.number) for one in waves),
+        folder=folder, waves=max(len(one.number) for one in waves),
         slope_deg=round(float(np.degrees(np.sqrt(energy))), 3),
         height_m=round(float(np.std([one[0][seen] for one in found])), 4),
         sigma_m=round(float(np.sqrt(np.mean([one[1][seen] ** 2 for one in found]))), 4),
         explained=round(float(np.mean([one.explained for one in waves])), 3),
     )  # fmt: skip
-    return found, nodes, summary
+    return found, summary
 
 
 def _write_waters(
@@ -363,19 +365,3 @@ def _write_waters(
                 new_raster(draft, lattice, parsed, {band: "m"}) as target,
             ):
                 write_part(target, values.reshape(nodes.shape), lattice.window, 1)
-
-
-def _notes_of(water: WaterFound, *, tied: bool) -> tuple[PcfixWarning, ...]:
-    notes = []
-    if not tied:
-        words = (
-            "The time between frames is not known, so each frame is fitted alone. Give --interval."
-        )
-        notes.append(PcfixWarning("frames.no_interval", words))
-    if water.explained < LEAST_EXPLAINED:
-        words = (
-            f"Waves explain only {100 * water.explained:.0f} % of the slopes (a current, glints, a"
-            " wrong interval or depth). Do not rely on the surfaces."
-        )
-        notes.append(PcfixWarning("waves.explained", words, explained=water.explained))
-    return tuple(notes)

@@ -22,7 +22,7 @@ from pcfix.clean.points import (
     flag_weak,
 )
 from pcfix.errors import InputError
-from pcfix.flow.runner import Check, Chunk, Command, Ends, FileTask, Progress, stream
+from pcfix.flow.runner import Chunk, Command, Progress, streaming
 from pcfix.flow.surfaces import CloudView, Points, find_surface, points_of, view_of
 from pcfix.flow.tiles import run_command
 from pcfix.io.files import scratch_arrays
@@ -84,9 +84,11 @@ def clean_file(
     command = Command(
         "clean",
         plan=partial(_plan_file, given, how, progress),
-        process=_clean_cloud,
+        process=partial(streaming, _Cleaning),
         check=lambda plan, tally: None,
-        summarize=_summarize,
+        summarize=lambda plan, tally, findings, ends: replace(
+            plan.summary, input=ends.input, output=ends.output, seconds=round(ends.seconds, 3)
+        ),
     )
     last = None
     if progress is not None:  # writing is the last of the passes
@@ -110,121 +112,94 @@ class Tested(NamedTuple):
     rays: dict[str, FloatArray]
 
 
-class NoiseSearch:
-    """The tests of a whole cloud, from a file or a PDAL pipeline.
+def find_noise(
+    name: str,
+    options: CleanOptions,
+    view: Callable[[], CloudView],
+    names: Collection[str],
+    chunks: Callable[[WaterSurface | None], Iterable[Tested]],
+    n: int,
+    resources: Resources,
+    *,
+    has_rays: bool = True,
+) -> tuple[BoolArray, CleanSummary]:
+    """Run the tests on a whole cloud of n points, from a file or a PDAL pipeline.
 
-    Parameters
-    ----------
-    name : str
-        Name of the cloud, for messages.
-    options : CleanOptions
-    view : callable
-        Returns the cloud as a water surface needs it.
-    names : collection of str
-        The dimensions of the cloud.
-    has_rays : bool
-        False if the cloud was corrected without cameras.
+    The cloud has some dimensions by `names`. `view` returns it as a water surface needs it, and
+    `chunks` its points under that surface. `has_rays` is False if it was corrected without cameras.
+    Returns which points are noise, shape (n,), and a summary without files and time.
     """
+    rules, not_run = options.part(CleanRules), list[str]()
+    if rules.weak and not has_rays:
+        rules = replace(rules, weak=False)
+        not_run.append(f"{', '.join(_NEEDS)}: the cloud was corrected without cameras")
+    water = None
+    if options.water is not None:
+        water = find_surface(options.water, WaterOptions(), view()).surface
+    has = [one for one in RAY_DIMENSIONS if {"RayCount", one} <= set(names)]
+    not_run += [
+        f"{test}: the cloud has no dimension {dimension if has else 'RayCount'}"
+        for (test, limit), dimension in zip(_NEEDS.items(), RAY_DIMENSIONS, strict=True)
+        if getattr(rules, limit) is not None and dimension not in has
+    ]
+    if rules.below_or_floating and water is None and not has:
+        not_run.append("below bed, floating: no --water, and no dimension RayCount")
 
-    cloud: Cloud
-
-    def __init__(
-        self,
-        name: str,
-        options: CleanOptions,
-        view: Callable[[], CloudView],
-        names: Collection[str],
-        *,
-        has_rays: bool = True,
-    ) -> None:
-        rules = options.part(CleanRules)
-        self._name, self._not_run = name, list[str]()
-        if rules.weak and not has_rays:
-            rules = replace(rules, weak=False)
-            self._not_run.append(f"{', '.join(_NEEDS)}: the cloud was corrected without cameras")
-        given = options.water
-        self.water = None if given is None else find_surface(given, WaterOptions(), view()).surface
-        has = [one for one in RAY_DIMENSIONS if {"RayCount", one} <= set(names)]
-        self._not_run += [
-            f"{test}: the cloud has no dimension {dimension if has else 'RayCount'}"
-            for (test, limit), dimension in zip(_NEEDS.items(), RAY_DIMENSIONS, strict=True)
-            if getattr(rules, limit) is not None and dimension not in has
-        ]
-        if rules.below_or_floating and self.water is None and not has:
-            self._not_run.append("below bed, floating: no --water, and no dimension RayCount")
-        self._rules = rules
-
-    def run(self, chunks: Iterable[Tested], n: int, resources: Resources) -> BoolArray:
-        """Run the tests on all n points; return which are noise, shape (n,)."""
-        used, submerged, reasons = (np.zeros(n, kind) for kind in (bool, bool, np.uint8))
-        self.cloud = Cloud(empty((n, 3)), used, submerged, reasons)
-        first = 0
-        for one in chunks:
-            count = len(one.withheld)
-            self._add(one, slice(first, first + count))
-            first += count
-            let_go()
-            if resources.progress is not None:
-                resources.progress(count)
-        if not used.any():
-            raise InputError(
-                "cloud.all_withheld",
-                f"{self._name}: all {n:,} points are withheld or noise (class 7 or 18). There is"
-                " nothing left to clean.",
-                path=self._name, points=n,
-            )  # fmt: skip
-        if not self._rules.below_or_floating:
-            submerged[:] = False
-        elif self.water is not None:
-            check_submerged(int(submerged.sum()), self._name, self.water)
-        self._distance_m = flag_neighbours(self._name, self.cloud, self._rules, resources)
-        self.cloud = self.cloud._replace(xyz=np.zeros((0, 3)))  # frees the disk
-        return reasons != 0
-
-    def _add(self, one: Tested, rows: slice) -> None:
-        """Store coordinates and masks of some points, and flag weak intersections."""
-        cloud, (xyz, heights, classes, *_) = self.cloud, one.points
-        used = ~(one.withheld | np.isin(classes, NOISE_CLASSES))
-        rays, miss, incidence = (one.rays.get(name) for name in RAY_DIMENSIONS)
+    used, submerged, reasons = (np.zeros(n, kind) for kind in (bool, bool, np.uint8))
+    cloud = Cloud(empty((n, 3)), used, submerged, reasons)
+    first = 0
+    for one in chunks(water):
+        count = len(one.withheld)
+        rows = slice(first, first + count)
+        xyz, heights, classes, *_ = one.points
+        cloud.xyz[rows] = xyz
+        used[rows] = ~(one.withheld | np.isin(classes, NOISE_CLASSES))
+        rays, miss, incidence = (one.rays.get(dimension) for dimension in RAY_DIMENSIONS)
         if rays is not None:
-            flag_weak(self._rules, cloud.reasons[rows], rays, miss, incidence)
-            cloud.reasons[rows][~used] = 0
-        cloud.xyz[rows], cloud.used[rows] = xyz, used
-        if self.water is not None:
-            above = surface_above(self.water, xyz, heights)
-            cloud.submerged[rows] = used & is_submerged(xyz[:, 2], above)
+            flag_weak(rules, reasons[rows], rays, miss, incidence)
+            reasons[rows][~used[rows]] = 0
+        if water is not None:
+            above = surface_above(water, xyz, heights)
+            submerged[rows] = used[rows] & is_submerged(xyz[:, 2], above)
         elif rays is not None:
-            cloud.submerged[rows] = used & (rays > 0)
-
-    def content(self) -> dict[str, Any]:
-        """Return what the record in the file and the summary have in common."""
-        reasons = self.cloud.reasons
-        return {
-            "pcfix": __version__,
-            "settings": asdict(self._rules),
-            "water": None if self.water is None else str(self.water),
-            "reasons": {
-                str(reason.name).lower(): int(np.count_nonzero(reasons & np.uint8(reason)))
-                for reason in Reason
-            },
-        }
-
-    def summary(self, input: str, output: str, *, drop: bool, seconds: float) -> CleanSummary:
-        """Return the numbers of the cleaning."""
-        cloud, noise = self.cloud, int(np.count_nonzero(self.cloud.reasons))
-        return CleanSummary(
-            input=input,
-            output=output,
-            points=len(cloud.used),
-            set_aside=int((~cloud.used).sum()),
-            submerged=int(cloud.submerged.sum()),
-            noise=noise,
-            dropped=noise if drop else 0,
-            neighbour_distance_m=self._distance_m,
-            not_run=self._not_run,
-            seconds=round(seconds, 3),
-            **self.content(),
-        )
+            submerged[rows] = used[rows] & (rays > 0)
+        first += count
+        let_go()
+        if resources.progress is not None:
+            resources.progress(count)
+    if not used.any():
+        raise InputError(
+            "cloud.all_withheld",
+            f"{name}: all {n:,} points are withheld or noise (class 7 or 18). There is nothing left"
+            " to clean.",
+            path=name, points=n,
+        )  # fmt: skip
+    if not rules.below_or_floating:
+        submerged[:] = False
+    elif water is not None:
+        check_submerged(int(submerged.sum()), name, water)
+    distance_m = flag_neighbours(name, cloud, rules, resources)
+    noise = reasons != 0
+    count = int(noise.sum())
+    return noise, CleanSummary(
+        input="",
+        output="",
+        pcfix=__version__,
+        points=n,
+        set_aside=int((~used).sum()),
+        submerged=int(submerged.sum()),
+        noise=count,
+        reasons={
+            str(reason.name).lower(): int(np.count_nonzero(reasons & np.uint8(reason)))
+            for reason in Reason
+        },
+        dropped=count if options.drop else 0,
+        neighbour_distance_m=distance_m,
+        not_run=not_run,
+        water=None if water is None else str(water),
+        settings=asdict(rules),
+        seconds=0.0,
+    )
 
 
 class CleanPlan(NamedTuple):
@@ -232,7 +207,6 @@ class CleanPlan(NamedTuple):
 
     noise: npt.NDArray[np.uint8]
     drop: bool
-    content: dict[str, Any]
     summary: CleanSummary
 
 
@@ -242,8 +216,7 @@ def _plan_file(
 ) -> CleanPlan:  # fmt: skip
     """Find the noise of a whole cloud; large arrays are on the disk of the target."""
     with open_cloud(cloud) as source:
-        names = set(source.header.point_format.dimension_names)
-        points = len(source)
+        names, points = set(source.header.point_format.dimension_names), len(source)
         try:
             ours = own_settings(source.vlrs)
         except ValueError:  # a damaged record is reported where its content is needed
@@ -257,13 +230,22 @@ def _plan_file(
         if progress is not None:
             progress(passed // _PASSES, points)
 
-    search = NoiseSearch(str(cloud), options, lambda: view_of(cloud), names, has_rays=has_rays)
+    def chunks(water: WaterSurface | None) -> Iterator[Tested]:
+        with open_cloud(cloud, how.jobs) as source:
+            shown = [name for name in RAY_DIMENSIONS if name in names]
+            for chunk in source.chunks():
+                rays = {name: source.dimension(chunk, name) for name in shown}
+                withheld = np.asarray(chunk["withheld"]).astype(np.bool_)
+                yield Tested(points_of(chunk, source, water), withheld, rays)
+
     beside = target.absolute()
     if not beside.parent.is_dir():  # the folder of many files is made later
         beside = next(one for one in beside.parents if one.is_dir()) / target.name
     with scratch_arrays(beside):
-        tested = _tested(cloud, search.water, how.jobs)
-        noise = search.run(tested, points, how._replace(progress=count))
+        noise, summary = find_noise(
+            str(cloud), options, lambda: view_of(cloud), names, chunks, points,
+            how._replace(progress=count), has_rays=has_rays,
+        )  # fmt: skip
     if options.drop and noise.all():
         raise InputError(
             "cloud.all_noise",
@@ -271,15 +253,7 @@ def _plan_file(
             " out --drop.",
             path=cloud, points=points,
         )  # fmt: skip
-    summary = search.summary("", "", drop=options.drop, seconds=0.0)
-    content = {**search.content(), "drop": options.drop}
-    return CleanPlan(np.packbits(noise), options.drop, content, summary)
-
-
-def _clean_cloud(
-    plan: CleanPlan, task: FileTask, row: int = 0, check: Check | None = None
-) -> tuple[Any, Any]:
-    return stream(task, partial(_Cleaning, plan), row, check)
+    return CleanPlan(np.packbits(noise), options.drop, summary)
 
 
 class _Cleaning:
@@ -287,7 +261,9 @@ class _Cleaning:
 
     def __init__(self, plan: CleanPlan, source: LasSource) -> None:
         self._plan = plan
-        self.header = noted_header(source, cleaning_vlr(plan.content))
+        found = plan.summary.as_dict()
+        content = {name: found[name] for name in ("pcfix", "settings", "water", "reasons")}
+        self.header = noted_header(source, cleaning_vlr({**content, "drop": plan.drop}))
         self.identity = corrected_identity(source)
 
     def compute(self, points: Chunk, row: int) -> tuple[BoolArray, int]:
@@ -304,17 +280,3 @@ class _Cleaning:
         new.array["classification"][noise] = LOW_NOISE
         new["withheld"][:] = np.asarray(new["withheld"]) | noise
         return new
-
-
-def _summarize(plan: CleanPlan, tally: int, findings: None, ends: Ends) -> CleanSummary:
-    seconds = round(ends.seconds, 3)
-    return replace(plan.summary, input=ends.input, output=ends.output, seconds=seconds)
-
-
-def _tested(cloud: Path | Tiles, water: WaterSurface | None, jobs: int | None) -> Iterator[Tested]:
-    with open_cloud(cloud, jobs) as source:
-        names = set(source.header.point_format.dimension_names)
-        for chunk in source.chunks():
-            rays = {name: source.dimension(chunk, name) for name in RAY_DIMENSIONS if name in names}
-            withheld = np.asarray(chunk["withheld"]).astype(np.bool_)
-            yield Tested(points_of(chunk, source, water), withheld, rays)

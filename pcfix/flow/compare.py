@@ -18,10 +18,10 @@ from pcfix.compare.m3c2 import load_py4dgeo
 from pcfix.compare.match import Match, SurveyCloud, match
 from pcfix.compare.sections import parse_line
 from pcfix.errors import SettingError
-from pcfix.flow.runner import check_summary, json_text, write_summary
+from pcfix.flow.runner import check_summary, json_text, write_plot, write_summary
 from pcfix.io.atomic import all_or_none, output_folder
 from pcfix.io.clouds import check_same_crs, read_cloud, read_reference, reference_of
-from pcfix.io.files import check_output, scratch_arrays, write_bytes, write_text
+from pcfix.io.files import check_output, scratch_arrays, write_text
 from pcfix.io.tiles import Clouds, Tiles, cloud_of, inputs_of
 from pcfix.model import WaterSurface
 from pcfix.options.declare import File, taken
@@ -77,7 +77,6 @@ def compare_clouds(
     given = taken(CompareOptions, options, keywords, "compare_clouds")
     lines = [parse_line(line) if isinstance(line, str) else line for line in given.section]
     clouds = [] if isinstance(cloud, Held) else [cloud_of(cloud)]
-    held = cloud if isinstance(cloud, Held) else _in_file(clouds[0])
     also = {name: cloud_of(path) for name, path in given.also}
     surveyed = reference_of(reference)
     read = (*clouds, surveyed, *also.values())
@@ -86,25 +85,21 @@ def compare_clouds(
         load_py4dgeo()
     water = None
     if given.water is not None:
-        from pcfix.flow.surfaces import find_surface  # slow to import
+        from pcfix.flow.surfaces import find_surface, view_of  # slow to import
 
-        water = find_surface(given.water, WaterOptions(), held.view()).surface
-    with scratch_arrays(_beside(given)):
-        target, whole = read_reference(surveyed), held.read(water)
+        view = cloud.view() if isinstance(cloud, Held) else view_of(clouds[0])
+        water = find_surface(given.water, WaterOptions(), view).surface
+    outputs = [path for path in (given.out_dir, given.summary, given.plot) if path is not None]
+    beside = Path([*outputs, Path(tempfile.gettempdir()) / "pcfix"][0])
+    with scratch_arrays(beside):  # arrays of large clouds
+        target = read_reference(surveyed)
+        whole = cloud.read(water) if isinstance(cloud, Held) else read_cloud(clouds[0], water)
         check_same_crs(whole.name, whole.crs, target.name, target.crs)
         matched = match(whole, target, given.part(CompareRules), given=water is not None)
         others = {name: _further(one, water, matched) for name, one in also.items()}
         result = figures_of(matched, lines, started, others)
     _write(result, given)
     return result
-
-
-def _beside(given: CompareOptions) -> Path:
-    """Return the output beside which the arrays of large clouds are stored."""
-    for path in (given.out_dir, given.summary, given.plot):
-        if path is not None:
-            return Path(path)
-    return Path(tempfile.gettempdir()) / "pcfix"
 
 
 def _further(path: Path | Tiles, water: WaterSurface | None, first: Match) -> Match:
@@ -117,17 +112,6 @@ def _further(path: Path | Tiles, water: WaterSurface | None, first: Match) -> Ma
         cloud = replace(cloud, water_m=known)
     found = match(cloud, target, first.settings, given=water is not None)
     return replace(found, places=first.places)
-
-
-def _in_file(cloud: Path | Tiles) -> Held:
-    """Return the cloud of a LAS or LAZ file, or of many."""
-
-    def view() -> CloudView:
-        from pcfix.flow.surfaces import view_of  # slow to import
-
-        return view_of(cloud)
-
-    return Held(view, lambda water: read_cloud(cloud, water))
 
 
 def _check_outputs(given: CompareOptions, inputs: list[File]) -> None:
@@ -148,8 +132,6 @@ def _check_outputs(given: CompareOptions, inputs: list[File]) -> None:
         if folder.is_dir():
             for path in [*(folder / name for name in names), *folder.glob("section_*.csv")]:
                 check_output(path, overwrite=given.overwrite, inputs=inputs)
-    if given.plot is not None:
-        check_output(given.plot, overwrite=given.overwrite, inputs=inputs)
     check_summary(given, inputs)
 
 
@@ -167,10 +149,8 @@ def _write(result: Comparison, given: CompareOptions) -> None:
                 write_text(folder / name, content, overwrite=given.overwrite)
         if given.plot is not None:
             from pcfix.report.comparison import c2c_figure
-            from pcfix.report.page import png_of
 
-            picture = png_of(c2c_figure(result.as_dict()))
-            write_bytes(given.plot, picture, overwrite=given.overwrite)
+            write_plot(given, c2c_figure(result.as_dict()))
         write_summary(given, result.as_dict())
     if folder is not None:
         for path in folder.glob("section_*.csv"):  # of an earlier comparison with more

@@ -31,50 +31,41 @@ def run_demo(
         with bar(f"Simulating, {kind}") as progress:
             scene = simulate_scene(points, block=kind, progress=progress)
         write_scene(scene, folder, overwrite=overwrite)
-        corrected = _corrected(scene, folder, f"pcfix demo, {kind} block", overwrite, bar)
-        table = _table(scene, corrected)
-        sections.append(
-            f"{folder}\n{scene.description}\n{table}\nreport: {folder / REPORT / 'report.html'}"
+        request = Request(
+            input=str(folder / "cloud.laz"),
+            cameras=str(folder / "cameras.csv"),
+            water=str(scene.water_level_m),
+            reference=str(folder / "lidar.laz"),
+            index=scene.refractive_index,
+            method="consistent",
+            views=str(folder / "fused.ply.vis"),
+            views_are="tracks",
+            project=f"pcfix demo, {kind} block",
         )
+        page = run_all(request, folder / REPORT, overwrite=overwrite, bar=bar)
+        table = _table(scene, read_xyz(folder / REPORT / "corrected.laz"))
+        sections.append(f"{folder}\n{scene.description}\n{table}\nreport: {page}")
     return "\n\n".join(sections)
 
 
 def _table(scene: Scene, corrected: FloatArray) -> str:
-    deep = scene.true_xyz[:, 2] < scene.water_level_m - LEAST_DEPTH_M
-    below = scene.apparent_xyz[:, 2] < scene.water_level_m
+    """Return the errors of the bed without and with a correction, in centimetres and GSD."""
+    level, n = scene.water_level_m, scene.refractive_index
+    deep = scene.true_xyz[:, 2] < level - LEAST_DEPTH_M
     times_n = scene.apparent_xyz.copy()
-    depth = scene.water_level_m - times_n[below, 2]
-    times_n[below, 2] = scene.water_level_m - scene.refractive_index * depth
-    by_default = correct_points(
-        scene.apparent_xyz, scene.cameras, scene.water, index=scene.refractive_index
-    )
-    rows = [
-        ("uncorrected", scene.apparent_xyz),
-        (f"depth times {scene.refractive_index:g}", times_n),
-        ("default options", by_default.xyz),
-        ("with the view list", corrected),
-    ]
+    below = times_n[:, 2] < level
+    times_n[below, 2] = level - n * (level - times_n[below, 2])
+    by_default = correct_points(scene.apparent_xyz, scene.cameras, scene.water, index=n)
+    rows = {
+        "uncorrected": scene.apparent_xyz,
+        f"depth times {n:g}": times_n,
+        "default options": by_default.xyz,
+        "with the view list": corrected,
+    }
     head = f"error of {deep.sum():,} bed points"
     lines = [f"{head:<30}{'mean Z':>20}{'RMSE Z':>20}{'RMSE XY':>20}"]
-    for name, xyz in rows:
+    for name, xyz in rows.items():
         errors = errors_against_truth(xyz[deep], scene.true_xyz[deep])
         cells = (f"{100 * e:.1f} cm {e / scene.gsd_m:6.1f} GSD" for e in errors)
         lines.append(f"{name:<30}" + "".join(f"{cell:>20}" for cell in cells))
     return "\n".join(lines)
-
-
-def _corrected(scene: Scene, folder: Path, project: str, overwrite: bool, bar: Bar) -> FloatArray:
-    """Run all steps on the scene's files and read the corrected cloud."""
-    request = Request(
-        input=str(folder / "cloud.laz"),
-        cameras=str(folder / "cameras.csv"),
-        water=str(scene.water_level_m),
-        reference=str(folder / "lidar.laz"),
-        index=scene.refractive_index,
-        method="consistent",
-        views=str(folder / "fused.ply.vis"),
-        views_are="tracks",
-        project=project,
-    )
-    run_all(request, folder / REPORT, overwrite=overwrite, bar=bar)
-    return read_xyz(folder / REPORT / "corrected.laz")

@@ -8,6 +8,8 @@ depend on the size of chunks, squares and windows.
 from __future__ import annotations
 
 import json
+import warnings
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import asdict, replace
 from functools import partial
@@ -16,26 +18,37 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.flow.runner import FileTask, Progress, file_task, write_summary
-from pcfix.flow.sorted_points import BLOCK_CELLS, DIMENSIONS, SortedPoints, point_spacing_m
+from pcfix.errors import InputError, PcfixWarning, SettingError
+from pcfix.flow.runner import Progress, file_task, write_summary
 from pcfix.grid.delaunay import fill_holes, margin_cells
 from pcfix.grid.heights import Gridding, as_uncertainty, grid_window
-from pcfix.grid.lattice import round_resolution
+from pcfix.grid.lattice import (
+    Lattice,
+    Occupancy,
+    Window,
+    cells_of,
+    fits,
+    lattice_over,
+    refuse_size,
+    round_resolution,
+)
 from pcfix.grid.model import NO_LIGHT, DsmSummary, Tally, hillshade
 from pcfix.io import rasters
 from pcfix.io.atomic import scratch_folder, temporary_output
 from pcfix.io.crs import crs_words, parts
-from pcfix.io.files import check_output, write_text
+from pcfix.io.files import Bins, check_output, write_text
 from pcfix.io.las.part import part_report
-from pcfix.io.las.source import metric_crs
+from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.las.writing import is_ours
 from pcfix.io.styles import raster_style
 from pcfix.io.tiles import Clouds, Tiles, cloud_of, inputs_of, open_cloud
+from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES, BoolArray, FloatArray, IntArray
 from pcfix.options.declare import File, taken
-from pcfix.options.steps import DsmOptions, DsmRules
+from pcfix.options.steps import MIN_RESOLUTION_M, DsmOptions, DsmRules, SurfaceChoice
 from pcfix.version import __version__
 
 if TYPE_CHECKING:
+    import laspy
     from rasterio.io import DatasetWriter
 
 BLOCK_POINTS = 2_000_000
@@ -46,6 +59,18 @@ TIN_REACH_CELLS = 3.0
 """Largest diameter of circles around triangles: the larger of the two, or --fill."""
 
 METRE = "metre"
+BLOCK_CELLS = 1024
+"""Longest side of a window; a power of two."""
+BIN_POINTS = 200_000
+"""So many points a square of the store has, on average."""
+SIGMA_Z = "SigmaZ"
+FEWEST_A_CELL = 0.9
+"""Points, on average where there are any; fewer are worth a warning."""
+DIMENSIONS = {"depth": "WaterDepth", "uncertainty": SIGMA_Z}
+"""What is not height is made of a dimension: of one of these, or of that of its own name."""
+SPARSE = 20.0
+"""Cells a point, from which it is looked whether some points lie far from the others."""
+BULK_SAMPLE, BEYOND_BULK = 1_000_000, 1e-3
 
 
 def grid_dsm(
@@ -114,157 +139,313 @@ def grid_dsm(
     if given.resolution is None:
         spacing_m = point_spacing_m(cloud, rules)
         rules = replace(rules, resolution=round_resolution(spacing_m, 0.0))
+
+    def report(share: float) -> None:
+        """Report the progress, in points."""
+        if progress is not None:
+            progress(round(share * count), count)
+
     with ExitStack() as stack:
         targets = {"dsm": task.target, **more}
         drafts = {
             name: stack.enter_context(temporary_output(path)) for name, path in targets.items()
         }
         folder = stack.enter_context(scratch_folder(task.target))
-        gridding = _Gridding(task, cloud, rules, given.cog, folder)
-        gridding.write(**drafts)
+        with open_cloud(cloud) as source:
+            crs, count = metric_crs(source), len(source)
+            corrected = any(is_ours(vlr) for vlr in source.vlrs)
+            points = SortedPoints(
+                source, rules, folder, lambda done, total: report(0.5 * done / total),
+                lambda: open_cloud(cloud, places_only=True),
+            )  # fmt: skip
+        lattice, spacing_m = points.lattice, points.near.spacing_m
+        fill_m, is_tin = rules.fill or 0.0, rules.method == "tin"
+        # the widest circle around a triangle
+        reach_m = max(TIN_REACH_SPACINGS * spacing_m, TIN_REACH_CELLS * rules.cell_m, fill_m)
+        how = Gridding(lattice, rules.method, reach_m, spacing_m)
+        # a cloud optimised file is a copy, with overviews of its own
+        paths = {name: folder / f"{name}.tif" if given.cog else drafts[name] for name in drafts}
+        plan = None if crs is None else parts(crs)[0]
+        unit = METRE if rules.what in ("height", *DIMENSIONS) else ""
+        made = {"pcfix": __version__, "corrected": corrected, **asdict(rules)}
+        new = partial(rasters.new_raster, lattice=lattice, tags={"PCFIX": json.dumps(made)})
+        with ExitStack() as files:
+            of_height = crs if rules.what == "height" else plan
+            dsm = files.enter_context(new(paths["dsm"], crs=of_height, bands={rules.what: unit}))
+            counts = None
+            if "counts" in paths:
+                bands = {"count": "", "spread": unit}
+                counts = files.enter_context(new(paths["counts"], crs=plan, bands=bands))
+            if is_tin or rules.fill is None:
+                tally = _grid(points, how, rules.what, dsm, counts, report)
+            else:
+                unfilled = folder / "unfilled.tif"
+                with rasters.new_raster(unfilled, lattice, None, {"height": METRE}) as heights:
+                    tally = _grid(points, how, rules.what, heights, counts, report)
+                _fill(unfilled, dsm, lattice, fill_m / rules.cell_m, tally)
+        if "hillshade" in paths:
+            _shade(paths["dsm"], paths["hillshade"], lattice, plan, rules)
+        for name, path in paths.items():
+            if given.cog:
+                rasters.copy_as_cog(path, drafts[name])
+            else:
+                rasters.add_overviews(path)
     if given.style:
         write_text(style, raster_style(task.target, rules.what), overwrite=given.overwrite)
-    result = replace(
-        gridding.summary(),
+    result = DsmSummary(
+        input=str(task.source),
+        output=str(task.target),
         hillshade=str(more["hillshade"]) if "hillshade" in more else None,
         counts=str(more["counts"]) if "counts" in more else None,
+        what=rules.what,
+        pcfix=__version__,
+        crs=None if crs is None else crs.name,
+        heights=crs_words(crs)[1] or None,
+        width=lattice.width,
+        height=lattice.height,
+        bounds_m=lattice.bounds_m,
+        points=count,
+        points_used=points.near.points,
+        cells=tally.cells,
+        filled=tally.filled,
+        empty=lattice.width * lattice.height - tally.known,
+        points_per_cell=points.near.points / tally.cells,
+        spacing_m=spacing_m,
+        hole_m=reach_m if is_tin else rules.fill,
+        settings=asdict(rules),
+        seconds=round(task.seconds, 3),
+        values=tally.values(),
         resolution_is="given" if given.resolution else "chosen",
+        part=part_report(task.source),
+        stray=points.stray,
     )
     write_summary(task, result.as_dict())
     return result
 
 
-class _Gridding:
-    """The gridding of one cloud: its sorted points, and the rasters that are made of them."""
+def _grid(
+    points: SortedPoints, how: Gridding, what: str, heights: DatasetWriter,
+    counts: DatasetWriter | None, report: Callable[[float], None],
+) -> Tally:  # fmt: skip
+    """Write values to one raster, numbers of points and their spread to another."""
+    tally, done, lattice = Tally(), 0, points.lattice
+    for window in points.windows(TIN_BLOCK_POINTS if how.method == "tin" else BLOCK_POINTS):
+        bands = grid_window(*points.points_in(window.grown(how.margin_cells)), window, how)
+        if what == "uncertainty":
+            bands = as_uncertainty(bands)
+        rasters.write_part(heights, bands[0], window, 1)
+        if counts is not None:
+            for band, values in enumerate(bands[1:], start=1):
+                rasters.write_part(counts, values, window, band)
+        tally.add(bands)
+        done += window.height * window.width
+        report(0.5 + 0.5 * done / (lattice.height * lattice.width))
+    return tally
+
+
+def _fill(
+    unfilled: Path, dsm: DatasetWriter, lattice: Lattice, widest: float, tally: Tally
+) -> None:
+    """Write a raster with its holes filled, as wide as some cells, and count what was filled."""
+    with rasters.open_raster(unfilled) as heights:
+        for window in lattice.windows(BLOCK_CELLS):
+            around = window.grown(margin_cells(widest)).clipped(lattice.window)
+            height = fill_holes(rasters.read_heights(heights, around), window, around, widest)
+            rasters.write_part(dsm, height, window, 1)
+            tally.filled += int((~np.isnan(height)).sum())
+    tally.filled -= tally.known
+    tally.known += tally.filled
+
+
+def _shade(dsm: Path, target: Path, lattice: Lattice, plan: Any, rules: DsmRules) -> None:
+    """Write the hillshade of a DSM."""
+    new = rasters.new_raster(
+        target, lattice, plan, {"hillshade": ""}, dtype="uint8", nodata=NO_LIGHT
+    )
+    with rasters.open_raster(dsm) as heights, new as out:
+        for window in lattice.windows(BLOCK_CELLS):
+            height = rasters.read_within(heights, window.grown(1), lattice.window)
+            light = hillshade(height, rules.cell_m, rules.azimuth, rules.altitude)
+            rasters.write_part(out, light, window, 1)
+
+
+def point_spacing_m(cloud: Path | Tiles, settings: DsmRules) -> float:
+    """Return the side of the square that each point of a raster has for itself, metres."""
+    with open_cloud(cloud) as source:
+        area, _ = _stated_extent(source, MIN_RESOLUTION_M)
+        near = Occupancy(area, len(source), MIN_RESOLUTION_M)
+        for points in source.chunks():
+            near.add(coordinates(points)[_wanted(points, settings.surface)])
+    _refuse_none(near.points, cloud, settings.surface)
+    return near.spacing_m
+
+
+class SortedPoints:
+    """The points that a raster is made of, in a folder of the caller, and the raster's lattice.
+
+    Attributes
+    ----------
+    near : Occupancy
+        How many points there are, and how close together.
+    stray : int
+        How many are left out, as they lie far from all others.
+    lattice : Lattice
+
+    Raises
+    ------
+    PcfixError
+        If no points are left, or the raster would be too large.
+    """
 
     def __init__(
-        self, task: FileTask, cloud: Path | Tiles, settings: DsmRules, cog: bool, folder: Path
-    ) -> None:
-        """Sort the points into files of a temporary folder."""
-        self.task, self.settings, self.cog, self.folder = task, settings, cog, folder
-        self.tally = Tally()
-        with open_cloud(cloud) as source:
-            self.crs, self.points = metric_crs(source), len(source)
-            self.corrected = any(is_ours(vlr) for vlr in source.vlrs)
-            self.sorted = SortedPoints(
-                source, settings, folder, lambda done, total: self.report(0.5 * done / total),
-                lambda: open_cloud(cloud, places_only=True),
-            )  # fmt: skip
-        self.plan = None if self.crs is None else parts(self.crs)[0]
-        self.near, self.lattice = self.sorted.near, self.sorted.lattice
-        spacings = TIN_REACH_SPACINGS * self.near.spacing_m
-        cells = TIN_REACH_CELLS * settings.cell_m
-        self.reach_m = max(spacings, cells, settings.fill or 0.0)  # widest circle of the TIN
+        self, source: LasSource, settings: DsmRules, folder: Path, progress: Progress,
+        again: Callable[[], LasSource],
+    ) -> None:  # fmt: skip
+        """Read the cloud, store the wanted points, and lay out the raster.
 
-    def write(self, dsm: Path, hillshade: Path | None = None, counts: Path | None = None) -> None:
-        """Write the raster, and its hillshade and its counts if paths are given."""
-        what, folder = self.settings.what, self.folder
-        made = {"pcfix": __version__, "corrected": self.corrected, **asdict(self.settings)}
-        unit = METRE if what in ("height", *DIMENSIONS) else ""
-        crs = self.crs if what == "height" else self.plan
-        plain = folder / "dsm.tif" if self.cog else dsm
-        numbers = folder / "counts.tif" if self.cog else counts
-        new = partial(rasters.new_raster, lattice=self.lattice, tags={"PCFIX": json.dumps(made)})
-        with ExitStack() as stack:
-            out, both = stack.enter_context(new(plain, crs=crs, bands={what: unit})), None
-            if numbers is not None and counts is not None:
-                bands = {"count": "", "spread": unit}
-                both = stack.enter_context(new(numbers, crs=self.plan, bands=bands))
-            if self.settings.fill is None or self.settings.method == "tin":
-                self.grid(out, both)
-            else:
-                self.grid_and_fill(out, both)
-        if hillshade is not None:
-            self.shade(plain, hillshade)
-        self.finish(plain, dsm)
-        if numbers is not None and counts is not None:
-            self.finish(numbers, counts)
+        Where its extent looks too large for its points it is opened `again`, to be looked at first.
+        """
+        resolution = settings.cell_m
+        self._resolution_m = resolution
+        area, corner = _stated_extent(source, resolution)
+        self._dimension = _dimension_of(source, settings.what)
+        cells = max(np.sqrt(BIN_POINTS / (len(source) / area)) / resolution, 1.0)
+        side = int(min(2 ** np.floor(np.log2(cells)), BLOCK_CELLS))  # of a square with so many
+        self._bins = Bins(folder, side, cells_of(corner, resolution)[0], 3)
+        self.near = Occupancy(area, len(source), resolution)
+        sparse = area > SPARSE * len(source) * resolution**2
+        bulk = _bulk_of(again, len(source), resolution) if sparse else None
+        self.stray, first = 0, None
+        done = 0
+        for points in source.chunks():
+            xyz = coordinates(points)
+            if self._dimension is not None:
+                xyz[:, 2] = source.dimension(points, self._dimension)
+            wanted = _wanted(points, settings.surface) & np.isfinite(xyz[:, 2])
+            if self._dimension == SIGMA_Z:
+                wanted &= xyz[:, 2] > 0.0  # others have none
+            xyz = xyz[wanted]
+            if bulk is not None:
+                inside = ((xyz[:, :2] >= bulk[0]) & (xyz[:, :2] <= bulk[1])).all(axis=1)
+                self.stray += int((~inside).sum())
+                first = xyz[~inside][0] if first is None and not inside.all() else first
+                xyz = xyz[inside]
+            self.near.add(xyz)
+            if len(xyz) and fits(self.near.low, self.near.high, resolution):
+                self._bins.add(cells_of(xyz, resolution), xyz)
+            # too large a raster is refused below, when the whole extent is known
+            done += len(points)
+            progress(done, len(source))
+        _refuse_none(self.near.points, source.path, settings.surface)
+        if first is not None:
+            place = ", ".join(f"{value:,.2f}" for value in first)
+            sentence = (
+                f"{source.path}: {self.stray:,} points far from all others are not gridded, the"
+                f" first at {place}. Remove them, or grid their part of the cloud separately."
+            )
+            warnings.warn(PcfixWarning("dsm.stray", sentence, points=self.stray), stacklevel=3)
+        low, high, spacing_m = self.near.low, self.near.high, self.near.spacing_m
+        refuse_size(low, high, resolution, str(source.path))
+        if resolution**2 < FEWEST_A_CELL * spacing_m**2:
+            density = (resolution / spacing_m) ** 2
+            sentence = (
+                f"The resolution {resolution:g} m is finer than the points allow: their spacing is"
+                f" {spacing_m:.2g} m, or {density:.2g} points a cell. Use at least that spacing."
+            )
+            warnings.warn(PcfixWarning("dsm.fine", sentence, spacing_m=spacing_m), stacklevel=4)
+        self.lattice = lattice_over(low, high, resolution)
 
-    def grid(self, heights: DatasetWriter, counts: DatasetWriter | None) -> None:
-        """Write values to one raster, numbers of points and their spread to another."""
-        done, lattice = 0, self.lattice
-        how = Gridding(lattice, self.settings.method, self.reach_m, self.near.spacing_m)
-        limit = TIN_BLOCK_POINTS if self.settings.method == "tin" else BLOCK_POINTS
-        for window in self.sorted.windows(limit):
-            points = self.sorted.points_in(window.grown(how.margin_cells))
-            bands = grid_window(*points, window, how)
-            if self.settings.what == "uncertainty":
-                bands = as_uncertainty(bands)
-            rasters.write_part(heights, bands[0], window, 1)
-            if counts is not None:
-                for band, values in enumerate(bands[1:], start=1):
-                    rasters.write_part(counts, values, window, band)
-            self.tally.add(bands)
-            done += window.height * window.width
-            self.report(0.5 + 0.5 * done / (lattice.height * lattice.width))
+    def windows(self, limit: int) -> Iterator[Window]:
+        """Yield windows that cover the raster, small enough to have about `limit` points."""
+        for window in self.lattice.windows(BLOCK_CELLS):
+            yield from self._halved(window, BLOCK_CELLS, limit)
 
-    def grid_and_fill(self, dsm: DatasetWriter, counts: DatasetWriter | None) -> None:
-        """Write values to a temporary raster, and from there, with holes filled, to the DSM."""
-        unfilled, tally = self.folder / "unfilled.tif", self.tally
-        with rasters.new_raster(unfilled, self.lattice, None, {"height": METRE}) as heights:
-            self.grid(heights, counts)
-        widest = (self.settings.fill or 0.0) / self.settings.cell_m
-        with rasters.open_raster(unfilled) as heights:
-            for window in self.lattice.windows(BLOCK_CELLS):
-                around = window.grown(margin_cells(widest)).clipped(self.lattice.window)
-                height = fill_holes(rasters.read_heights(heights, around), window, around, widest)
-                rasters.write_part(dsm, height, window, 1)
-                tally.filled += int((~np.isnan(height)).sum())
-        tally.filled -= tally.known
-        tally.known += tally.filled
+    def _halved(self, window: Window, side: int, limit: int) -> Iterator[Window]:
+        """Yield a window, or its quarters where it has too many points."""
+        stored = window.moved(self.lattice.first_row, self.lattice.first_column)
+        if side <= self._bins.side or self._bins.count(stored) <= limit:
+            yield window
+            return
+        half = side // 2
+        for row in range(window.row, window.row_stop, half):
+            for column in range(window.column, window.column_stop, half):
+                quarter = Window(row, row + half, column, column + half).clipped(window)
+                yield from self._halved(quarter, half, limit)
 
-    def shade(self, dsm: Path, target: Path) -> None:
-        """Write the hillshade of a DSM."""
-        plain = self.folder / "hillshade.tif" if self.cog else target
-        s, bands = self.settings, {"hillshade": ""}
-        new = rasters.new_raster(
-            plain, self.lattice, self.plan, bands, dtype="uint8", nodata=NO_LIGHT
+    def points_in(self, window: Window) -> tuple[FloatArray, IntArray]:
+        """Return the points of a window, and their columns and rows in the raster.
+
+        The first are metres in the world frame, shape (n, 3), with what the raster is made of in
+        the place of z; the second have shape (n, 2).
+        """
+        row, column = self.lattice.first_row, self.lattice.first_column
+        xyz = self._bins.read(window.moved(row, column))
+        cell = cells_of(xyz, self._resolution_m) - np.array([column, row])
+        rows = window.holds(cell)
+        return xyz[rows], cell[rows]
+
+
+def _dimension_of(source: LasSource, what: str) -> str | None:
+    """Return the dimension that a raster is made of, None for heights."""
+    name = None if what == "height" else DIMENSIONS.get(what, what)
+    known = list(source.header.point_format.dimension_names)
+    if name is None or name in known:
+        return name
+    if what in DIMENSIONS:
+        raise InputError(
+            "cloud.no_dimension",
+            f"{source.path}: has no dimension {name}, which --what {what} needs. Correct the cloud"
+            " first, with --dimensions all.",
+            path=source.path, dimension=name,
+        )  # fmt: skip
+    raise SettingError(
+        "option.choice",
+        f"{source.path}: has no dimension {what}. --what is one of height, {', '.join(DIMENSIONS)},"
+        f" {', '.join(known)}.",
+        option="what", value=what,
+    )  # fmt: skip
+
+
+def _wanted(points: laspy.ScaleAwarePointRecord, surface: SurfaceChoice) -> BoolArray:
+    classes = np.asarray(points["classification"])
+    wanted = classes == BATHYMETRIC_POINT if surface == "bed" else ~np.isin(classes, NOISE_CLASSES)
+    return np.asarray(wanted & ~np.asarray(points["withheld"]).astype(bool))
+
+
+def _stated_extent(source: LasSource, resolution_m: float) -> tuple[float, FloatArray]:
+    """Return area and north-west corner, shape (1, 2), of the header; they need not be right."""
+    low, high = source.header.mins[:2], source.header.maxs[:2]
+    area, corner = float(np.prod(high - low)), np.array([[low[0], high[1]]])
+    area = max(area, resolution_m**2) if np.isfinite(area) else resolution_m**2
+    return area, corner if (np.abs(corner) < 1e9).all() else np.zeros((1, 2))
+
+
+def _bulk_of(again: Callable[[], LasSource], count: int, resolution_m: float) -> FloatArray:
+    """Return the south-west and north-east corner of where nearly all points lie, shape (2, 2).
+
+    The box that all but a thousandth are in, to either side, grows by its own size; a cloud of two
+    places has all in it.
+    """
+    step = 1 + count // BULK_SAMPLE
+    with again() as cloud:
+        some = [coordinates(points)[::step, :2] for points in cloud.chunks()]
+    low, high = np.quantile(np.vstack(some), (BEYOND_BULK, 1.0 - BEYOND_BULK), axis=0)
+    size = np.maximum(high - low, resolution_m)
+    return np.array([low - size, high + size])
+
+
+def _refuse_none(points: int, source: Path | Tiles, surface: SurfaceChoice) -> None:
+    if points:
+        return
+    if surface == "bed":
+        raise InputError(
+            "dsm.no_bed",
+            f"{source}: has no point of class {BATHYMETRIC_POINT} (bed) that is not withheld."
+            " Correct the cloud first, or use --surface all.",
+            path=source,
         )
-        with rasters.open_raster(dsm) as heights, new as out:
-            for window in self.lattice.windows(BLOCK_CELLS):
-                height = rasters.read_within(heights, window.grown(1), self.lattice.window)
-                light = hillshade(height, s.cell_m, s.azimuth, s.altitude)
-                rasters.write_part(out, light, window, 1)
-        self.finish(plain, target)
-
-    def finish(self, plain: Path, target: Path) -> None:
-        """Add overviews; a cloud optimised file is a copy with its own."""
-        if self.cog:
-            rasters.copy_as_cog(plain, target)
-        else:
-            rasters.add_overviews(plain)
-
-    def report(self, share: float) -> None:
-        """Report the progress, in points."""
-        if self.task.progress is not None:
-            self.task.progress(round(share * self.points), self.points)
-
-    def summary(self) -> DsmSummary:
-        """Return the figures of the raster."""
-        settings, lattice, tally = self.settings, self.lattice, self.tally
-        return DsmSummary(
-            input=str(self.task.source),
-            output=str(self.task.target),
-            hillshade=None,
-            counts=None,
-            what=settings.what,
-            pcfix=__version__,
-            crs=None if self.crs is None else self.crs.name,
-            heights=crs_words(self.crs)[1] or None,
-            width=lattice.width,
-            height=lattice.height,
-            bounds_m=lattice.bounds_m,
-            points=self.points,
-            points_used=self.near.points,
-            cells=tally.cells,
-            filled=tally.filled,
-            empty=lattice.width * lattice.height - tally.known,
-            points_per_cell=self.near.points / tally.cells,
-            spacing_m=self.near.spacing_m,
-            hole_m=self.reach_m if settings.method == "tin" else settings.fill,
-            settings=asdict(settings),
-            seconds=round(self.task.seconds, 3),
-            values=tally.values(),
-            part=part_report(self.task.source),
-            stray=self.sorted.stray,
-        )
+    raise InputError(
+        "cloud.all_withheld",
+        f"{source}: all points are noise (classes 7 and 18) or withheld. Classify it again.",
+        path=source,
+    )

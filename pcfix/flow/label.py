@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import astuple, dataclass
 from functools import partial
 from os import PathLike
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ import numpy.typing as npt
 
 from pcfix.errors import SettingError
 from pcfix.flow.inputs import labelling_of, mask_of, paths_in
-from pcfix.flow.runner import Check, Chunk, Command, Ends, FileTask, Progress, stream
+from pcfix.flow.runner import Chunk, Command, Ends, Progress, streaming
 from pcfix.flow.surfaces import (
     CloudView,
     Points,
@@ -28,7 +27,7 @@ from pcfix.io.las.columns import convert
 from pcfix.io.las.part import part_report
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import corrected_identity, labelling_vlr, noted_header
-from pcfix.io.tiles import Clouds, Tiles
+from pcfix.io.tiles import Clouds
 from pcfix.label.areas import WaterMask
 from pcfix.label.labelling import LabelCounts, Labelling, LabelSummary, Part, sets_class
 from pcfix.model import WaterPlane, WaterSurface
@@ -136,7 +135,13 @@ def label_file(
         If a file, an option or the water cannot be used; no output is left behind.
     """
     given = taken(LabelOptions, options, keywords, "label_file")
-    command = Command("label", partial(_plan_file, given), _label_cloud, check, _summarize)
+    command = Command(
+        "label",
+        lambda cloud, target, kept: plan_labelling(given, view_of(cloud, given.jobs)),
+        partial(streaming, _Labelling),
+        check,
+        _summarize,
+    )
     result: LabelSummary = run_command(
         command, input, output, given, reads=paths_in(given), progress=progress
     )
@@ -199,18 +204,6 @@ def check(plan: LabelPlan, tally: LabelTally) -> None:
     below = tally.submerged + tally.water_surface
     plan.labelling.check(plan.name, tally.excluded, below)
     check_submerged(below, plan.name, plan.water)
-
-
-def _plan_file(
-    options: LabelOptions, cloud: Path | Tiles, target: Path, kept: list[Chunk] | None = None
-) -> LabelPlan:
-    return plan_labelling(options, view_of(cloud, options.jobs))
-
-
-def _label_cloud(
-    plan: LabelPlan, task: FileTask, row: int = 0, check: Check | None = None
-) -> tuple[Any, Any]:
-    return stream(task, partial(_Labelling, plan), row, check)
 
 
 class _Labelling:

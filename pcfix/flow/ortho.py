@@ -14,12 +14,12 @@ from pcfix.errors import GeometryError, InputError, PcfixWarning
 from pcfix.flow.inputs import paths_in
 from pcfix.flow.photos import CLOUDS, PhotoBlock, block_of, plain, warn_all
 from pcfix.flow.runner import Progress, check_summary, write_summary
-from pcfix.grid.lattice import Lattice, Window, lattice_over, refuse_size
+from pcfix.grid.lattice import Lattice, lattice_over, refuse_size
 from pcfix.io import rasters
 from pcfix.io.atomic import scratch_folder, temporary_output
 from pcfix.io.photographs import photographs_in, read_colours
 from pcfix.kernels import threads
-from pcfix.model import FloatArray, WaterPlane
+from pcfix.model import WaterPlane
 from pcfix.options.declare import File, options_of, taken
 from pcfix.options.photos import OrthoOptions, PhotosOptions
 from pcfix.photos.ortho import Picture, mosaic, picture_of
@@ -80,9 +80,21 @@ def ortho_photo(
     target = rasters.check_tif(output, overwrite=given.overwrite, inputs=known)
     check_summary(given, [*known, target])
     with threads(given.jobs), temporary_output(target) as draft, scratch_folder(target) as folder:
-        block = block_of(_as_photos(given), paths, folder)
+        # without water, its level is below all ground
+        same = {one.name: getattr(given, one.name) for one in options_of(OrthoOptions)}
+        same["water"] = NO_WATER if given.water is None else given.water
+        is_cloud = Path(given.dsm).suffix.lower() in CLOUDS
+        same["resolution"] = 2.0 * given.resolution if is_cloud and given.resolution else None
+        block = block_of(PhotosOptions(**same), paths, folder)
         warn_all(block.notes)
-        lattice = _lattice(block, given)
+        # the cells over the DSM; their side is the ground pixel, rounded to two digits
+        bed = block.scene.ground
+        rows, columns = bed.height_m.shape
+        low = np.array([bed.left_m, bed.top_m - rows * bed.cell_m])
+        high = np.array([bed.left_m + columns * bed.cell_m, bed.top_m])
+        side = given.resolution or float(f"{block.gsd_m:.1e}")
+        refuse_size(low, high, side, str(given.dsm))
+        lattice = lattice_over(low, high - 1e-6 * side, side)
         covered, ground = _write(block, lattice, given, folder / "plain.tif", progress)
         if not covered:
             raise GeometryError(
@@ -98,26 +110,6 @@ def ortho_photo(
     )  # fmt: skip
     write_summary(given, plain(summary))
     return summary
-
-
-def _as_photos(given: OrthoOptions) -> PhotosOptions:
-    """Return the options for `block_of`; without water, its level is below all ground."""
-    same = {one.name: getattr(given, one.name) for one in options_of(OrthoOptions)}
-    same["water"] = NO_WATER if given.water is None else given.water
-    is_cloud = Path(given.dsm).suffix.lower() in CLOUDS
-    same["resolution"] = 2.0 * given.resolution if is_cloud and given.resolution else None
-    return PhotosOptions(**same)
-
-
-def _lattice(block: PhotoBlock, given: OrthoOptions) -> Lattice:
-    """Return the cells over the DSM; their side is the ground pixel, rounded to two digits."""
-    ground = block.scene.ground
-    rows, columns = ground.height_m.shape
-    low = np.array([ground.left_m, ground.top_m - rows * ground.cell_m])
-    high = np.array([ground.left_m + columns * ground.cell_m, ground.top_m])
-    side = given.resolution or float(f"{block.gsd_m:.1e}")
-    refuse_size(low, high, side, str(given.dsm))
-    return lattice_over(low, high - 1e-6 * side, side)
 
 
 def _write(
@@ -142,6 +134,7 @@ def _write(
             )
         return picture_of(pixels, shrunk, blanks=given.water is None)
 
+    side = lattice.resolution_m
     names = COLOURS.get(bands, tuple(f"band {b + 1}" for b in range(bands)))
     covered = ground = done = 0
     layers = dict.fromkeys((*names, "alpha"), "")
@@ -149,13 +142,20 @@ def _write(
         path, lattice, block.crs, layers, dtype=str(dtype), nodata=None
     ) as target:  # fmt: skip
         for window in lattice.windows(TILE_CELLS):
-            xyz, known = _cells(block, lattice, window)
+            # the centres of the cells that have a height
+            x = lattice.left_m + (np.arange(window.column, window.column_stop) + 0.5) * side
+            y = lattice.top_m - (np.arange(window.row, window.row_stop) + 0.5) * side
+            xy = np.column_stack([np.tile(x, len(y)), np.repeat(y, len(x))])
+            z = block.scene.ground.heights_at(xy)
+            known = np.isfinite(z)
+            xyz = np.column_stack([xy, z])[known]
             found = mosaic(xyz, block.photos, block.scene, picture) if len(xyz) else None
             ground += len(xyz)
             if found is not None:
                 tile = np.zeros((bands + 1, window.height, window.width), dtype)
                 most = np.iinfo(dtype).max
                 colour = np.where(found.covered[:, None], found.colour, 0.0)
+                known = known.reshape(window.height, window.width)
                 tile[:-1, known] = np.clip(np.rint(colour), 0, most).T
                 tile[-1, known] = most * found.covered
                 for number, band in enumerate(tile, start=1):
@@ -165,14 +165,3 @@ def _write(
             if progress is not None:
                 progress(done, lattice.height * lattice.width)
     return covered, ground
-
-
-def _cells(block: PhotoBlock, lattice: Lattice, window: Window) -> tuple[FloatArray, Any]:
-    """Return the centres of the cells that have a height, shape (n, 3), and which they are."""
-    side = lattice.resolution_m
-    x = lattice.left_m + (np.arange(window.column, window.column_stop) + 0.5) * side
-    y = lattice.top_m - (np.arange(window.row, window.row_stop) + 0.5) * side
-    xy = np.column_stack([np.tile(x, len(y)), np.repeat(y, len(x))])
-    z = block.scene.ground.heights_at(xy)
-    known = np.isfinite(z)
-    return np.column_stack([xy, z])[known], known.reshape(window.height, window.width)

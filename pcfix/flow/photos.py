@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-import tempfile
 import time
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import Any, cast
 
 import numpy as np
 
@@ -46,29 +46,19 @@ CLOUDS = (".las", ".laz")
 
 @dataclass(frozen=True)
 class PhotosSummary:
-    """The result of `map_photos`.
-
-    Attributes
-    ----------
-    images, done_before : int
-        Images written, and those among them that an earlier call wrote.
-    black_share : float
-        Share of pixels without ground, occluded, or outside the original image.
-    spacing_px : int
-        Between the nodes of the grid.
-    """
+    """The result of `map_photos`."""
 
     images: int
-    done_before: int
+    done_before: int  # images among them that an earlier call wrote
     megapixels: float
     seconds: float
     largest_shift_px: float
-    black_share: float
+    black_share: float  # of the pixels: without ground, occluded, or outside the original image
     mapping: str
     dsm: str
     water: str
     refractive_index: float
-    spacing_px: int
+    spacing_px: int  # of the nodes of the grid
     notes: tuple[PcfixWarning, ...]
 
 
@@ -99,6 +89,7 @@ def map_photos(
     PcfixError
         Images that are finished are kept.
     """
+    started = time.perf_counter()
     given = taken(PhotosOptions, options, keywords, "map_photos")
     folder, target = Path(images), Path(out)
     if target.resolve() == folder.resolve():
@@ -108,24 +99,88 @@ def map_photos(
             path=target,
         )
     check_summary(given)
-    started, paths = time.perf_counter(), photographs_in(folder)
-    with threads(given.jobs), tempfile.TemporaryDirectory() as scratch:
+    paths = photographs_in(folder)
+    mapped: Any = exact if given.mapping == "exact" else paper
+    with threads(given.jobs), TemporaryDirectory() as scratch:
         block = block_of(given, paths, Path(scratch))
-        old = _begin(target, given, block)
-        found = _all(block, target, old, given.mapping, progress)
-    pixels = sum(one.pixels for one in found)
-    notes = (*block.notes, *_black_notes(found, given))
+        old = _written_before(target, given, block)
+        todo = [
+            one for one in zip(block.paths, block.photos, strict=True) if one[0].name not in old
+        ]
+
+        def write(path: Path, photo: Photo) -> tuple[str, int, int, float]:
+            """Write a photograph; return its name, pixels, black pixels, and largest shift."""
+            shifts = mapped(photo, block.scene_of(path), block.step_px)
+            new = resample(read_photograph(path), shifts)
+            write_photograph(path, target / path.name, new.image, new.touched)
+            pixels = new.touched.size
+            largest = float(np.abs(shifts.shift_px).max())
+            return path.name, pixels, round(new.black_share * pixels), largest
+
+        found: list[tuple[str, int, int, float]] = []
+        with threads(1), ThreadPoolExecutor(max(1, min(cores(), len(todo)))) as pool:
+            jobs = [pool.submit(write, *one) for one in todo]
+            try:
+                for job in jobs:
+                    found.append(job.result())
+                    if progress is not None:
+                        progress(len(old) + len(found), len(block.paths))
+            finally:
+                for job in jobs:
+                    job.cancel()
+    notes = list(block.notes)
+    poor = [
+        (black / pixels, name) for name, pixels, black, _ in found if black > MOST_BLACK * pixels
+    ]
+    if poor:
+        worst, name = max(poor)
+        words = (
+            f"{given.dsm}: does not cover all that {len(poor)} photographs see; more than"
+            f" {100 * MOST_BLACK:.0f} % of them is black ({name}: {100 * worst:.0f} %)."
+        )
+        notes.append(PcfixWarning("dsm.too_small", words, photographs=len(poor)))
     warn_all(notes)
+    pixels = sum(one[1] for one in found)
     summary = PhotosSummary(
         images=len(block.photos), done_before=len(old), megapixels=round(1e-6 * pixels, 1),
         seconds=round(time.perf_counter() - started, 3),
-        largest_shift_px=round(max((one.shift_px for one in found), default=0.0), 2),
-        black_share=round(sum(one.black for one in found) / max(pixels, 1), 5),
+        largest_shift_px=round(max((one[3] for one in found), default=0.0), 2),
+        black_share=round(sum(one[2] for one in found) / max(pixels, 1), 5),
         mapping=given.mapping, dsm=str(given.dsm), water=str(block.scene.water),
-        refractive_index=block.scene.refractive_index, spacing_px=block.step_px, notes=notes,
+        refractive_index=block.scene.refractive_index, spacing_px=block.step_px,
+        notes=tuple(notes),
     )  # fmt: skip
     write_summary(given, plain(summary))
     return summary
+
+
+def _written_before(target: Path, given: PhotosOptions, block: PhotoBlock) -> set[str]:
+    """Return the names that an equal call has written, and record this call in the folder."""
+    target.mkdir(parents=True, exist_ok=True)
+    asked = given.as_dict()
+    for name in ("overwrite", "jobs", "summary"):
+        asked.pop(name)
+    files = [*input_states(given), *map(file_state, block.waters.values())]
+    record = {"pcfix": __version__, "asked": asked, "files": files}
+    place = target / RECORD
+    there = {path.name for path in block.paths if (target / path.name).exists()}
+    if there and not given.overwrite:
+        if not place.exists() or read_json(place) != json.loads(json.dumps(record)):
+            raise SettingError(
+                "output.exists",
+                f"{target / min(there)}: exists, and was not written by an equal call. Add"
+                " --overwrite to replace it, or give another folder.",
+                path=target / min(there),
+            )
+        return there
+    write_text(place, json_text(record), overwrite=True)
+    return set()
+
+
+def input_states(given: PhotosOptions) -> list[dict[str, Any]]:
+    """Return size and time of the input files, to recognise an equal call."""
+    files = [given.cameras, given.dsm, given.sensor, given.water]
+    return [file_state(Path(f)) for f in files if f is not None and Path(str(f)).exists()]
 
 
 def warn_all(notes: Iterable[PcfixWarning]) -> None:
@@ -141,28 +196,16 @@ def plain(summary: Any) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class PhotoBlock:
-    """Photographs with their poses, and what they see.
-
-    Attributes
-    ----------
-    step_px : int
-        Between the nodes of the grid.
-    crs : CRS, str or None
-        Of the DSM and of all coordinates.
-    gsd_m : float
-        A pixel on the lowest ground, median of the images.
-    waters : dict
-        Water rasters of single images, by their stems.
-    """
+    """Photographs with their poses, and what they see."""
 
     paths: tuple[Path, ...]
     photos: tuple[Photo, ...]
     scene: Scene
-    step_px: int
+    step_px: int  # between the nodes of the grid
     notes: tuple[PcfixWarning, ...]
-    crs: Any
-    gsd_m: float
-    waters: dict[str, Path]
+    crs: Any  # CRS, str or None, of the DSM and of all coordinates
+    gsd_m: float  # a pixel on the lowest ground, median of the images
+    waters: dict[str, Path]  # water rasters of single images, by their stems
 
     def scene_of(self, path: Path) -> Scene:
         """Return the scene of an image, with its own water where that is known."""
@@ -190,9 +233,20 @@ def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> PhotoBlo
             "--resolution is for a cloud; the DSM has its own.",
             option="resolution",
         )
-    notes = _provenance_notes(corrected, given)
+    is_exact, notes = given.mapping == "exact", list[PcfixWarning]()
+    if corrected and not is_exact:
+        raise SettingError(
+            "dsm.corrected",
+            f"{given.dsm}: is of a corrected cloud, but --mapping paper needs the apparent bed."
+            " Give the DSM of the uncorrected cloud, or --mapping exact.",
+            path=given.dsm,
+        )
+    if not corrected:
+        bed = "the true bed, as from 'pcfix correct'" if is_exact else "the apparent bed"
+        words = f"{given.dsm}: does not state whether it was corrected; it is used as {bed}."
+        notes.append(PcfixWarning("dsm.origin_unknown", words, path=given.dsm))
     cameras, _ = inputs.block(crs, read)
-    rows, lost = _matched(paths, cameras, name)
+    row_of, lost = _poses_of(paths, cameras, name)
     notes += lost
     surface = inputs.surface().surface
     if isinstance(surface, WaterDimension):
@@ -202,18 +256,17 @@ def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> PhotoBlo
             water=str(given.water),
         )
     check_above_water(cameras, surface)
-    ground = ground_of(heights, *origin)
-    mine = tuple(path for path, row in zip(paths, rows, strict=True) if row >= 0)
-    rotations: Any = cameras.rotations
-    photos = tuple(
-        Photo(
-            cameras.labels[row], cameras.centres[row], rotations[row],
-            lens_of(path, cameras, row, size_of(path)),
-        )
-        for path, row in zip(paths, rows, strict=True) if row >= 0
-    )  # fmt: skip
+    ground, photos, rotations = (
+        ground_of(heights, *origin),
+        list[Photo](),
+        cast(Any, cameras.rotations),
+    )
+    for path, row in row_of.items():
+        lens = lens_of(path, cameras, row, size_of(path))
+        photos.append(Photo(cameras.labels[row], cameras.centres[row], rotations[row], lens))
     waters: dict[str, Path] = {}
     if given.water_per_image is not None:
+        mine = list(row_of)
         found, few = rasters_of_images(given.water_per_image, [path.name for path in mine])
         waters = {mine[row].stem: path for row, path in found.items()}
         notes += [PcfixWarning("water.images_missing", note) for note in few]
@@ -227,11 +280,25 @@ def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> PhotoBlo
             path=name,
             lowest_m=low,
         )
-    _check_seen(photos, ground, given)
+    if not any(_sees(photo, ground) for photo in photos):
+        raise GeometryError(
+            "cameras.no_overlap",
+            f"{given.dsm}: none of the {len(photos)} photographs sees it. Check its CRS and that of"
+            f" {given.cameras} (--cameras-crs, --cameras-offset).",
+            path=given.dsm,
+        )
     gsd = float(np.median(sizes))
     step = given.spacing or max(LEAST_STEP_PX, int(np.ceil(ground.cell_m / gsd)))
     scene = Scene(ground, surface, index_of(given.index, given.index_formula)[0])
-    return PhotoBlock(mine, photos, scene, step, tuple(notes), crs, gsd, waters)
+    return PhotoBlock(tuple(row_of), tuple(photos), scene, step, tuple(notes), crs, gsd, waters)
+
+
+def _sees(photo: Photo, ground: Ground) -> bool:
+    """Whether an image sees any of the ground."""
+    nodes, _ = nodes_of(photo.lens, COARSE_STEP_PX)
+    rays = unproject(photo.lens, nodes) @ photo.rotation
+    rays = rays[np.isfinite(rays).all(axis=1)]
+    return bool(np.isfinite(ground.hit(photo.centre, rays)).any())
 
 
 def read_heights(
@@ -239,14 +306,8 @@ def read_heights(
 ) -> tuple[FloatArray, tuple[float, float, float], str | None, bool]:
     """Read a DSM, or grid a cloud in a folder for temporary files.
 
-    Returns
-    -------
-    heights : array, shape (rows, columns)
-    origin : tuple of float
-        Left, top and size of the cells.
-    crs : str or None
-    corrected : bool
-        Whether pcfix made it of a corrected cloud.
+    Returns the heights, shape (rows, columns); left, top and size of the cells; the CRS; and
+    whether pcfix made it of a corrected cloud.
     """
     path = Path(dsm)
     if path.suffix.lower() in CLOUDS:
@@ -266,33 +327,16 @@ def read_heights(
     return heights, (t.c, t.f, t.a), crs, corrected
 
 
-def _provenance_notes(corrected: bool, given: PhotosOptions) -> list[PcfixWarning]:
-    """Refuse the DSM of a corrected cloud for the mapping of the paper; note what is unknown."""
-    is_exact = given.mapping == "exact"
-    if corrected and is_exact:
-        return []
-    if corrected:
-        raise SettingError(
-            "dsm.corrected",
-            f"{given.dsm}: is of a corrected cloud, but --mapping paper needs the apparent bed."
-            " Give the DSM of the uncorrected cloud, or --mapping exact.",
-            path=given.dsm,
-        )
-    bed = "the true bed, as from 'pcfix correct'" if is_exact else "the apparent bed"
-    words = f"{given.dsm}: does not state whether it was corrected; it is used as {bed}."
-    return [PcfixWarning("dsm.origin_unknown", words, path=given.dsm)]
-
-
-def _matched(
+def _poses_of(
     paths: list[Path], cameras: Cameras, name: str
-) -> tuple[list[int], list[PcfixWarning]]:
-    """Return the row of the pose of each photograph, -1 for none, and a note on those without."""
+) -> tuple[dict[Path, int], list[PcfixWarning]]:
+    """Return the row of the pose of each photograph that has one, and a note on the others."""
     by_name: dict[str, int] = {}
     for row, label in enumerate(cameras.labels):
         for key in (Path(label).name.lower(), Path(label).stem.lower()):
             by_name.setdefault(key, row)
-    rows = [by_name.get(p.name.lower(), by_name.get(p.stem.lower(), -1)) for p in paths]
-    lost = [path.name for path, row in zip(paths, rows, strict=True) if row < 0]
+    rows = {p: by_name.get(p.name.lower(), by_name.get(p.stem.lower(), -1)) for p in paths}
+    lost = [path.name for path, row in rows.items() if row < 0]
     if len(lost) == len(paths):
         raise InputError(
             "photos.no_pose",
@@ -301,17 +345,17 @@ def _matched(
             path=name,
             photograph=lost[0],
         )
-    if not lost:
-        return rows, []
-    words = f"{name}: {len(lost)} photographs have no pose and are ignored, such as {lost[0]}."
-    return rows, [PcfixWarning("photos.no_pose", words, count=len(lost))]
+    notes = []
+    if lost:
+        words = f"{name}: {len(lost)} photographs have no pose and are ignored, such as {lost[0]}."
+        notes.append(PcfixWarning("photos.no_pose", words, count=len(lost)))
+    return {path: row for path, row in rows.items() if row >= 0}, notes
 
 
 def lens_of(path: Path, cameras: Cameras, row: int, size: tuple[int, int]) -> Lens:
     """Return the lens in pixels of an image of some columns and rows; both must match."""
     columns, rows = size
-    lenses: Any = cameras.lenses
-    lens: Lens = lenses[row]
+    lens = cast(tuple[Lens, ...], cameras.lenses)[row]
     if lens.unit == "px":
         matches, scale = size == (round(lens.width), round(lens.height)), 1.0
     else:
@@ -330,102 +374,3 @@ def lens_of(path: Path, cameras: Cameras, row: int, size: tuple[int, int]) -> Le
     lengths = ("focal", "principal_x", "principal_y", "b1", "b2", "b3")
     scaled = {one: getattr(lens, one) * scale for one in lengths}
     return replace(lens, width=columns, height=rows, unit="px", **scaled)
-
-
-def _check_seen(photos: tuple[Photo, ...], ground: Ground, given: PhotosOptions) -> None:
-    """Refuse a ground that no image sees."""
-    for photo in photos:
-        nodes, _ = nodes_of(photo.lens, COARSE_STEP_PX)
-        rays = unproject(photo.lens, nodes) @ photo.rotation
-        if np.isfinite(ground.hit(photo.centre, rays[np.isfinite(rays).all(axis=1)])).any():
-            return
-    raise GeometryError(
-        "cameras.no_overlap",
-        f"{given.dsm}: none of the {len(photos)} photographs sees it. Check its CRS and that of"
-        f" {given.cameras} (--cameras-crs, --cameras-offset).",
-        path=given.dsm,
-    )
-
-
-def _begin(target: Path, given: PhotosOptions, block: PhotoBlock) -> set[str]:
-    """Return the names that an equal call has written, and record this call in the folder."""
-    target.mkdir(parents=True, exist_ok=True)
-    asked = given.as_dict()
-    for name in ("overwrite", "jobs", "summary"):
-        asked.pop(name)
-    record = {
-        "pcfix": __version__,
-        "asked": asked,
-        "files": input_states(given) + [file_state(path) for path in block.waters.values()],
-    }
-    place = target / RECORD
-    there = {path.name for path in block.paths if (target / path.name).exists()}
-    if there and not given.overwrite:
-        if not place.exists() or read_json(place) != json.loads(json.dumps(record)):
-            raise SettingError(
-                "output.exists",
-                f"{target / min(there)}: exists, and was not written by an equal call. Add"
-                " --overwrite to replace it, or give another folder.",
-                path=target / min(there),
-            )
-        return there
-    write_text(place, json_text(record), overwrite=True)
-    return set()
-
-
-def input_states(given: PhotosOptions) -> list[dict[str, Any]]:
-    """Return size and time of the input files, to recognise an equal call."""
-    files = [given.cameras, given.dsm, given.sensor, given.water]
-    return [file_state(Path(f)) for f in files if f is not None and Path(str(f)).exists()]
-
-
-@dataclass(frozen=True)
-class _Written:
-    """One photograph that was written."""
-
-    name: str
-    pixels: int
-    black: int
-    shift_px: float
-
-
-def _all(
-    block: PhotoBlock, target: Path, old: set[str], mapping: str, progress: Progress | None
-) -> list[_Written]:
-    """Map the photographs that are not written yet, as many at a time as there are threads."""
-    todo = [pair for pair in zip(block.paths, block.photos, strict=True) if pair[0].name not in old]
-    mapped: Callable[..., Any] = exact if mapping == "exact" else paper
-
-    def write(path: Path, photo: Photo) -> _Written:
-        shifts = mapped(photo, block.scene_of(path), block.step_px)
-        found = resample(read_photograph(path), shifts)
-        write_photograph(path, target / path.name, found.image, found.touched)
-        pixels, shift = found.touched.size, float(np.abs(shifts.shift_px).max())
-        return _Written(path.name, pixels, round(found.black_share * pixels), shift)
-
-    done: list[_Written] = []
-    with threads(1), ThreadPoolExecutor(max(1, min(cores(), len(todo)))) as pool:
-        jobs = [pool.submit(write, *pair) for pair in todo]
-        try:
-            for job in jobs:
-                done.append(job.result())
-                if progress is not None:
-                    progress(len(old) + len(done), len(block.paths))
-        finally:
-            for job in jobs:
-                job.cancel()
-    return done
-
-
-def _black_notes(found: list[_Written], given: PhotosOptions) -> list[PcfixWarning]:
-    """Return a note on photographs that are black over a large part."""
-    poor = [one for one in found if one.black > MOST_BLACK * one.pixels]
-    if not poor:
-        return []
-    worst = max(poor, key=lambda one: one.black / one.pixels)
-    words = (
-        f"{given.dsm}: does not cover all that {len(poor)} photographs see; more than"
-        f" {100 * MOST_BLACK:.0f} % of them is black ({worst.name}:"
-        f" {100 * worst.black / worst.pixels:.0f} %)."
-    )
-    return [PcfixWarning("dsm.too_small", words, photographs=len(poor))]

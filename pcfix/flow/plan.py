@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -21,24 +21,28 @@ from pcfix.adjust.precision import precision_of
 from pcfix.adjust.problem import prepare, solved_cameras
 from pcfix.adjust.solve import solve
 from pcfix.errors import PcfixWarning, SettingError
+from pcfix.flow.cameras import draw_footprints
 from pcfix.flow.correct import correct_points
 from pcfix.flow.pose_errors import Adjustment, Sample, pose_errors
-from pcfix.flow.runner import check_summary, write_summary
+from pcfix.flow.runner import check_summary, write_plot, write_summary
 from pcfix.flow.surfaces import Points
-from pcfix.io.files import check_output, write_bytes
 from pcfix.kernels import threads
 from pcfix.model import Cameras, Correction, FloatArray, TiePoints, Views, WaterPlane
 from pcfix.options.correct import BudgetOptions, RefractionOptions, ScienceOptions
 from pcfix.options.declare import options_of, taken
 from pcfix.options.handover import PlanOptions
 from pcfix.refract.batch import Survey
-from pcfix.report.page import png_of
-from pcfix.report.plan import Alternative, DepthPlan, Plan, plan_figure
+from pcfix.refract.tally import COVERAGE_95, ORDERS, largest_tvu_m
+from pcfix.report.page import AFTER, BEFORE, REFERENCE, WATER, Table, label_plan, new_figure
+from pcfix.report.text import aligned
 from pcfix.simulate.block import Block, fly_block
 from pcfix.simulate.scene import Streams, lay_out, points_on
 from pcfix.simulate.settings import SceneSettings
 from pcfix.simulate.sight import see
 from pcfix.water.index import index_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 POINTS = 400
 """Of each bed; they are also the tie points of the adjustments."""
@@ -49,6 +53,19 @@ PARTS = {
     "image": ("sigma_image",), "level": ("sigma_level", "sigma_tilt"), "waves": ("sigma_waves",),
     "index": ("sigma_index",), "poses": ("sigma_centre", "sigma_attitude"),
 }  # fmt: skip
+_COLOURS = {
+    "image": BEFORE, "level": WATER, "waves": "#7a5195", "index": "#8a8a8a", "poses": "#58a55c",
+}  # fmt: skip
+USUAL_OVERLAP, USUAL_SIDELAP = 0.75, 0.65
+"""Of Mulsow's flights over lakes (2024)."""
+LARGE_SHARE = 0.5
+_REMEDY = {
+    "image": "noise in the images: fly lower, or with more overlap or obliques",
+    "level": "the water level: measure it better, at the time of the flight",
+    "waves": "waves: wait for calmer water",
+    "index": "the refractive index: measure salinity and temperature",
+    "poses": "poses: use RTK or more control points",
+}
 
 
 class _Bed(NamedTuple):
@@ -59,10 +76,6 @@ class _Bed(NamedTuple):
     views: Views
     image_xy: FloatArray
     cameras: Cameras
-
-    @property
-    def ties(self) -> TiePoints:
-        return TiePoints(self.apparent, self.views, self.image_xy)
 
 
 def plan_flight(
@@ -94,31 +107,41 @@ def plan_flight(
     """
     given = taken(PlanOptions, options, keywords, "plan_flight")
     check_summary(given)
-    if given.plot is not None:
-        check_output(given.plot, overwrite=given.overwrite)
     deepest = max(given.depth)
-    others = _alternatives(given)
-    steps = len(given.depth) + len(others)
+    # other flights, each with its changed option
+    overlap, height = 0.5 + 0.5 * given.overlap, round(0.7 * given.height, 1)
+    others = [(f"--height {height:g}", replace(given, height=height))]
+    if overlap <= 0.95:
+        others.append((f"--overlap {overlap:g}", replace(given, overlap=overlap)))
+    if given.obliques is None:
+        others.append(("--obliques 20", replace(given, obliques=20.0)))
+    if given.sigma_level is None or given.sigma_level > 0.01:
+        others.append(("--sigma-level 0.01", replace(given, sigma_level=0.01)))
     beds: list[DepthPlan] = []
     tried: list[Alternative] = []
 
     def step() -> None:
         if progress is not None:
-            progress(len(beds) + len(tried), steps)
+            progress(len(beds) + len(tried), len(given.depth) + len(others))
 
     with threads(1):  # for so few points, threads do not pay
-        for depth in given.depth:
-            beds.append(_depth_plan(given, depth))
+        for depth_m in given.depth:
+            bed = _bed(given, depth_m)
+            whole, sigma_m, adjusted_m = _sigma(given, bed)
+            parts_m = {part: _rms(_budget(given, bed, part).sigma_z_m) for part in PARTS}
+            parts_m["poses"] = float(np.hypot(parts_m["poses"], adjusted_m))
+            apparent_m, rays = float(-bed.apparent[:, 2].mean()), float(whole.ray_count.mean())
+            absorbed = _absorbed(given, bed)
+            beds.append(DepthPlan(depth_m, apparent_m, rays, sigma_m, parts_m, *absorbed))
             step()
         for words, other in others:
             sigma_m = _sigma(other, _bed(other, deepest))[1]
-            images = len(_flown(other).cameras)
-            tried.append(Alternative(words, images, sigma_m))
+            tried.append(Alternative(words, len(_flown(other).cameras), sigma_m))
             step()
-    scene = _scene(given, deepest)
+    scene, flown = _scene(given, deepest), _flown(given)
     off_nadir = float(np.degrees(np.arctan(scene.optics.reach))) + (given.obliques or 0.0)
     plan = Plan(
-        cameras=_flown(given).cameras, area_m=given.area, height_m=given.height,
+        cameras=flown.cameras, area_m=given.area, height_m=given.height,
         gsd_m=scene.gsd_m, base_m=scene.base_and_spacing_m[0],
         spacing_m=scene.base_and_spacing_m[1], obliques_deg=given.obliques,
         overlap=given.overlap, sidelap=given.sidelap, flattest_deg=off_nadir,
@@ -126,22 +149,9 @@ def plan_flight(
         budget=given.part(BudgetOptions).as_dict(), depths=tuple(beds), alternatives=tuple(tried),
     )  # fmt: skip
     if given.plot is not None:
-        write_bytes(given.plot, png_of(plan_figure(plan)), overwrite=given.overwrite)
+        write_plot(given, plan_figure(plan))
     write_summary(given, plan.as_dict())
     return plan
-
-
-def _alternatives(given: PlanOptions) -> list[tuple[str, PlanOptions]]:
-    """Return other flights, each with its changed option."""
-    overlap, height = 0.5 + 0.5 * given.overlap, round(0.7 * given.height, 1)
-    found = [(f"--height {height:g}", replace(given, height=height))]
-    if overlap <= 0.95:
-        found.append((f"--overlap {overlap:g}", replace(given, overlap=overlap)))
-    if given.obliques is None:
-        found.append(("--obliques 20", replace(given, obliques=20.0)))
-    if given.sigma_level is None or given.sigma_level > 0.01:
-        found.append(("--sigma-level 0.01", replace(given, sigma_level=0.01)))
-    return found
 
 
 def _scene(given: PlanOptions, depth_m: float) -> SceneSettings:
@@ -210,23 +220,6 @@ def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def _depth_plan(given: PlanOptions, depth_m: float) -> DepthPlan:
-    bed = _bed(given, depth_m)
-    whole, sigma_m, adjusted_m = _sigma(given, bed)
-    parts = {part: _rms(_budget(given, bed, part).sigma_z_m) for part in PARTS}
-    parts["poses"] = float(np.hypot(parts["poses"], adjusted_m))
-    absorbed, left = _absorbed(given, bed)
-    return DepthPlan(
-        depth_m=depth_m,
-        apparent_m=float(-bed.apparent[:, 2].mean()),
-        rays=float(whole.ray_count.mean()),
-        sigma_m=sigma_m,
-        parts_m=parts,
-        absorbed=absorbed,
-        left_m=left,
-    )
-
-
 def _sigma(given: PlanOptions, bed: _Bed) -> tuple[Correction, float, float]:
     """Return a corrected bed, its standard error, and the part from adjusted poses.
 
@@ -271,7 +264,8 @@ def _absorbed(given: PlanOptions, bed: _Bed) -> tuple[float, float]:
 def _prepared(given: PlanOptions, bed: _Bed, *, through_water: bool) -> Any:
     """Return the adjustment of the block, at the true poses."""
     water = WaterPlane(0.0) if through_water else None
-    ties = replace(bed.ties, xyz=bed.truth if through_water else bed.apparent)
+    xyz = bed.truth if through_water else bed.apparent
+    ties = TiePoints(xyz, bed.views, bed.image_xy)
     wet = np.full(len(bed.truth), through_water)
     index = _refraction(given).refractive_index if through_water else 1.0
     block = replace(
@@ -281,3 +275,164 @@ def _prepared(given: PlanOptions, bed: _Bed, *, through_water: bool) -> Any:
         gnss_sigma_m=np.full((len(bed.cameras), 3), given.gnss_sigma),
     )
     return prepare(block, Unknowns(lens=() if through_water else ("f",)))
+
+
+@dataclass(frozen=True)
+class DepthPlan:
+    """The prediction for a flat bed of one depth."""
+
+    depth_m: float
+    apparent_m: float  # depth as reconstructed with straight rays
+    rays: float  # per point, on average
+    sigma_m: float  # standard error of the corrected heights, rms over the bed
+    parts_m: dict[str, float]  # of image, level, waves, index and poses; their squares add up
+    absorbed: float  # share of the misfit that poses and focal length of an ordinary block absorb
+    left_m: float  # true minus corrected height with such poses, mean
+
+    @property
+    def order(self) -> str:
+        """The strictest order of S-44 that the uncertainty at 95 % would keep, or a dash."""
+        depth, tvu = np.array([self.depth_m]), COVERAGE_95 * self.sigma_m
+        return next((one.name for one in ORDERS if tvu <= largest_tvu_m(one, depth)[0]), "-")
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """Another flight: the changed option, its images, and its standard error of the deepest bed."""
+
+    change: str
+    images: int
+    sigma_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A planned flight and its prediction."""
+
+    cameras: Cameras  # as a drone would fly them: strips along x from the origin, water at 0
+    area_m: tuple[float, float]
+    height_m: float  # above the water
+    gsd_m: float  # at the water
+    base_m: float  # between images
+    spacing_m: float  # between strips
+    obliques_deg: float | None
+    overlap: float
+    sidelap: float
+    flattest_deg: float  # largest incidence angle of the rays in the corners of the frames
+    index: float
+    gnss_sigma_m: float
+    budget: dict[str, float | None]  # the standard deviations by the names of their options
+    depths: tuple[DepthPlan, ...]
+    alternatives: tuple[Alternative, ...]
+
+    @property
+    def deepest(self) -> DepthPlan:
+        """The greatest depth."""
+        return max(self.depths, key=lambda one: one.depth_m)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        plain = {name: value for name, value in vars(self).items() if name != "cameras"}
+        plain["alternatives"] = [vars(one) for one in self.alternatives]
+        depths = [vars(one) | {"s44": one.order} for one in self.depths]
+        return {**plain, "images": len(self.cameras), "depths": depths, "advice": advice_of(self)}
+
+
+def plan_text(plan: Plan) -> str:
+    """Return the plan as the terminal shows it."""
+    obliques = "" if plan.obliques_deg is None else f", with obliques of {plan.obliques_deg:g} deg"
+    deepest = plan.deepest
+    flight = [
+        ("Images", f"{len(plan.cameras):,}, every {plan.base_m:.1f} m in strips"
+         f" {plan.spacing_m:.1f} m apart{obliques}"),
+        ("GSD", f"{100.0 * plan.gsd_m:.2f} cm at the water"),
+    ]  # fmt: skip
+    head = "Planned {:g} m above the water over {:g} x {:g} m".format(plan.height_m, *plan.area_m)
+    header = ["depth", "apparent", "rays", *deepest.parts_m, "total", "95 %", "S-44 order",
+              "absorbed", "bias"]  # fmt: skip
+    errors = [
+        [
+            f"{one.depth_m:.4g} m", f"{one.apparent_m:.2f} m", f"{one.rays:.1f}",
+            *(f"{100.0 * part:.2f}" for part in one.parts_m.values()),
+            f"{100.0 * one.sigma_m:.2f}", f"{100.0 * COVERAGE_95 * one.sigma_m:.2f}", one.order,
+            f"{one.absorbed:.0%}", f"{100.0 * one.left_m:+.1f}",
+        ]
+        for one in plan.depths
+    ]  # fmt: skip
+    title = f"Standard errors of the corrected bed in cm (refractive index {plan.index:g}):"
+    table = ["", title, *Table(title, header, errors).lines()]
+    rows = [
+        ("poses", f"after 'pcfix adjust' with GNSS of {plan.gnss_sigma_m:g} m and a calibrated"
+         " lens, unless --sigma-centre or --sigma-attitude are given"),
+        ("absorbed", "the share of the refraction that an ordinary bundle adjustment absorbs, at"
+         " worst: no land, no control points"),
+        ("bias", "true minus corrected height with such poses"),
+        ("Now", f"{100.0 * deepest.sigma_m:.2f} cm at a depth of {deepest.depth_m:g} m"),
+        *((one.change, f"{100.0 * one.sigma_m:.2f} cm, {one.images:,} images")
+          for one in plan.alternatives),
+    ]  # fmt: skip
+    notes = [f"  {label:<18} {text}" for label, text in rows]
+    return "\n".join([aligned(head, flight), *table, *notes, "", *advice_of(plan)])
+
+
+def advice_of(plan: Plan) -> list[str]:
+    """Return advice on the flight and the day, a sentence or two each.
+
+    Skarlatos & Agrafiotis 2018, section 3.3, for sun, wind, water and bed; overlaps after Mulsow.
+    """
+    deepest, found = plan.deepest, list[str]()
+    if plan.overlap < USUAL_OVERLAP or plan.sidelap < USUAL_SIDELAP:
+        found.append(
+            f"Overlap: fly {USUAL_OVERLAP:.0%} along and {USUAL_SIDELAP:.0%} across or more. Only"
+            f" {deepest.rays:.0f} images see a point of the bed."
+        )
+    most = max(deepest.parts_m, key=lambda part: deepest.parts_m[part])
+    if deepest.parts_m[most] ** 2 > LARGE_SHARE * deepest.sigma_m**2:
+        found.append(f"Most of the error at {deepest.depth_m:g} m is {_REMEDY[most]}.")
+    found.append(
+        "Poses: keep land and control points in the block, and run 'pcfix adjust'. Without them an"
+        f" ordinary bundle adjustment absorbs {deepest.absorbed:.0%} of the refraction, and the bed"
+        f" is {abs(deepest.left_m):.2f} m off."
+    )
+    sun = 90.0 - plan.flattest_deg
+    mirror = (
+        f"Below {sun:.0f} deg, no frame shows its reflection in calm water."
+        if sun > 0.0
+        else "Frames can show its reflection at any height of the sun."
+    )
+    found.append(
+        "Sun: fly under an overcast sky, or within 60 minutes of dawn or dusk (90 in winter)."
+        f" {mirror}"
+    )
+    wind = (
+        "'pcfix calm' combines frames taken through waves"
+        if plan.budget["sigma_waves"]
+        else "see what --sigma-waves 1 adds"
+    )
+    found.append(f"Wind: wait for a calm day; {wind}. The water must be clear, the bed textured.")
+    return found
+
+
+def plan_figure(plan: Plan) -> Figure:
+    """Draw the block in plan, and the standard errors over the depth."""
+    figure, (block, errors) = new_figure(10.0, 4.6, ncols=2)
+    cameras = plan.cameras
+    draw_footprints(block, cameras, 0.0, linewidth=0.5, alpha=0.5)
+    block.plot(*cameras.centres[:, :2].T, "^", color=AFTER, markersize=4, label="images")
+    x, y = plan.area_m
+    block.plot([0, x, x, 0, 0], [0, 0, y, y, 0], color=REFERENCE, label="area")
+    block.plot([], [], color=WATER, label="footprints at the water")
+    label_plan(block)
+    block.legend(loc="upper right")
+    block.set_title(f"{len(cameras):,} images, GSD {100.0 * plan.gsd_m:.2f} cm")
+    beds = sorted(plan.depths, key=lambda one: one.depth_m)
+    depth = [one.depth_m for one in beds]
+    for part, colour in _COLOURS.items():
+        values = [100.0 * one.parts_m[part] for one in beds]
+        errors.plot(depth, values, ".-", color=colour, label=part)
+    total = [100.0 * one.sigma_m for one in beds]
+    errors.plot(depth, total, "o-", color=REFERENCE, linewidth=2, label="total")
+    errors.set(xlabel="Depth (m)", ylabel="Standard error of Z (cm)", ylim=(0.0, None))
+    errors.set_title("Predicted standard error of the bed")
+    errors.legend(loc="best")
+    return figure

@@ -52,42 +52,29 @@ COMMAND_ONLY = ("overwrite", "jobs", "summary", "rebuild", "until_gsd", "most_ro
 
 @dataclass(frozen=True)
 class Round:
-    """The change in a round: DSM minus the one before, over submerged cells (all if none are).
-
-    `within_gsd` is the share of the cells that moved by at most a ground pixel.
-    """
+    """The change in a round: DSM minus the one before, over submerged cells (all if none are)."""
 
     cloud: str
     dsm: str
     cells: int
     mean_m: float
     sd_m: float
-    within_gsd: float
+    within_gsd: float  # share of the cells that moved by at most a ground pixel
 
 
 @dataclass(frozen=True)
 class RebuildSummary:
-    """The result of `pcfix.rebuild_rounds`.
-
-    Attributes
-    ----------
-    done_before : int
-        Rounds that an earlier call finished.
-    settled : bool
-        Whether the last round moved the bed by less than the threshold.
-    compared : str or None
-        The folder with its results, where a reference was given.
-    """
+    """The result of `pcfix.rebuild_rounds`."""
 
     rounds: tuple[Round, ...]
-    done_before: int
-    settled: bool
+    done_before: int  # rounds that an earlier call finished
+    settled: bool  # whether the last round moved the bed by less than the threshold
     gsd_m: float
     threshold_m: float
     seconds: float
     mapping: str
     rebuild: str
-    compared: str | None
+    compared: str | None  # folder of the comparison, where a reference was given
     notes: tuple[PcfixWarning, ...]
 
 
@@ -136,16 +123,44 @@ def rebuild_rounds(
     record = _opened(target, given)
     finished = sum("mean_m" in one for one in record["rounds"])
     start = str(given.dsm) if Path(given.dsm).suffix.lower() in CLOUDS else None
-    given = _with_raster(given, target)
+    if start is not None:  # a cloud is gridded to the folder
+        raster = target / "dsm.tif"
+        fresh = raster.exists() and raster.stat().st_mtime_ns > Path(start).stat().st_mtime_ns
+        if given.overwrite or not fresh:
+            grid_dsm(start, raster, resolution=given.resolution, overwrite=True)
+        given = replace(given, dsm=raster, resolution=None)
     with threads(given.jobs), TemporaryDirectory() as scratch:
         block = block_of(given, paths, Path(scratch))
-    run = _Run(Path(images), target, given, block, progress, record)
     threshold_m = round(given.until_gsd * block.gsd_m, 5)
     rounds: list[Round] = []
     notes: list[PcfixWarning] = []
     while len(rounds) < given.most_rounds and not (rounds and abs(rounds[-1].mean_m) < threshold_m):
         number = len(rounds) + 1
-        one = run.round(number, Path(rounds[-1].dsm) if rounds else Path(given.dsm))
+        before = Path(rounds[-1].dsm if rounds else given.dsm)
+        folder = target / f"round{number}"
+        cloud, dsm = folder / "cloud.laz", folder / "dsm.tif"
+        kept = record["rounds"][number - 1] if number <= len(record["rounds"]) else {}
+        has_cloud = cloud.exists() and kept.get("state") == file_state(cloud)
+        if has_cloud and "mean_m" in kept and dsm.exists():
+            one = Round(**{name: kept[name] for name in Round.__dataclass_fields__})
+        else:
+            finished = min(finished, number - 1)
+            with warnings.catch_warnings():
+                if number > 1:  # the DSM is pcfix's own
+                    warnings.filterwarnings("ignore", ".*does not state whether", PcfixWarning)
+                if not has_cloud:
+                    how = replace(
+                        given, dsm=before, resolution=None, summary=None,
+                        **RebuildOptions().as_dict(),
+                    )  # fmt: skip
+                    map_photos(images, folder / "images", options=how, progress=progress)
+                    with threads(given.jobs):
+                        _reconstruct(given, block, number, folder / "images", cloud, progress)
+                    kept = {"command": given.rebuild, "state": file_state(cloud)}
+                    _keep(target, record, number, kept)
+                grid_dsm(cloud, dsm, resolution=block.scene.ground.cell_m, overwrite=True)
+            one = _difference(block, cloud, dsm, before)
+            _keep(target, record, number, {**kept, **asdict(one)})
         rounds.append(one)
         if say is not None:
             say(
@@ -153,10 +168,16 @@ def rebuild_rounds(
                 f" {one.sd_m:.3f} m), {100 * one.within_gsd:.0f} % of it by at most one pixel"
             )
         if number == PAPER_ROUNDS and given.mapping == "paper":
-            notes.append(_paper_note(block.scene.refractive_index))
+            n = block.scene.refractive_index
+            excess = 1.0 / (n * (2.0 - n)) - 1.0  # near nadir the depth tends to h0 / (2 - n)
+            words = (
+                "--mapping paper tends to the apparent depth over 2 - n, here up to"
+                f" {100 * excess:.0f} % too deep. Correct the cloud and use --mapping exact."
+            )
+            notes.append(PcfixWarning("photos.paper_limit", words, excess=excess))
             warnings.warn(notes[-1], stacklevel=2)
     summary = RebuildSummary(
-        rounds=tuple(rounds), done_before=min(finished, run.first_new - 1),
+        rounds=tuple(rounds), done_before=min(finished, len(rounds)),
         settled=abs(rounds[-1].mean_m) < threshold_m, gsd_m=round(block.gsd_m, 5),
         threshold_m=threshold_m, seconds=round(time.perf_counter() - started, 3),
         mapping=given.mapping, rebuild=str(given.rebuild),
@@ -194,77 +215,42 @@ def _opened(target: Path, given: PhotosOptions) -> dict[str, Any]:
     return new
 
 
-def _with_raster(given: PhotosOptions, target: Path) -> PhotosOptions:
-    """Return options whose DSM is a raster; a cloud is gridded to the folder."""
-    if Path(given.dsm).suffix.lower() not in CLOUDS:
-        return given
-    raster = target / "dsm.tif"
-    fresh = raster.exists() and raster.stat().st_mtime_ns > Path(given.dsm).stat().st_mtime_ns
-    if given.overwrite or not fresh:
-        grid_dsm(given.dsm, raster, resolution=given.resolution, overwrite=True)
-    return replace(given, dsm=raster, resolution=None)
+def _keep(target: Path, record: dict[str, Any], number: int, kept: dict[str, Any]) -> None:
+    """Record a round, for a later call to resume."""
+    record["rounds"][number - 1 :] = [kept]
+    write_text(target / RECORD, json_text(record), overwrite=True)
 
 
-@dataclass
-class _Run:
-    """The rounds of one call, and what they share."""
+def _reconstruct(
+    given: PhotosOptions, block: PhotoBlock, number: int, images: Path, cloud: Path,
+    progress: Progress | None,
+) -> None:  # fmt: skip
+    """Make the cloud of a round, by a program of the user's or by stereo pairs."""
+    if given.rebuild == "stereo":
+        import cv2
 
-    images: Path
-    target: Path
-    given: PhotosOptions
-    block: PhotoBlock
-    progress: Progress | None
-    record: dict[str, Any]
-    first_new: int = 1_000_000
-    """Number of the first round that was not finished before."""
+        @lru_cache(maxsize=CACHED_PHOTOGRAPHS)
+        def picture(row: int) -> Grey:
+            pixels = read_colours(images / block.paths[row].name)
+            grey = pixels[..., 0]
+            if pixels.shape[2] >= 3:
+                grey = cv2.cvtColor(np.ascontiguousarray(pixels[..., :3]), cv2.COLOR_RGB2GRAY)
+            if grey.dtype == np.uint16:
+                grey = (grey >> 8).astype(np.uint8)
+            return Grey(np.ascontiguousarray(grey), blank_in(pixels))
 
-    def round(self, number: int, before: Path) -> Round:
-        """Return a round; its parts that are finished are skipped."""
-        folder = self.target / f"round{number}"
-        cloud, dsm = folder / "cloud.laz", folder / "dsm.tif"
-        rounds = self.record["rounds"]
-        left = rounds[number - 1] if number <= len(rounds) else {}
-        made = cloud.exists() and left.get("state") == file_state(cloud)
-        if made and "mean_m" in left and dsm.exists():
-            return Round(**{name: left[name] for name in Round.__dataclass_fields__})
-        self.first_new = min(self.first_new, number)
-        with warnings.catch_warnings():
-            if number > 1:  # the DSM is pcfix's own
-                warnings.filterwarnings("ignore", ".*does not state whether", PcfixWarning)
-            if not made:
-                how = replace(
-                    self.given, dsm=before, resolution=None, summary=None,
-                    **RebuildOptions().as_dict(),
-                )  # fmt: skip
-                map_photos(self.images, folder / "images", options=how, progress=self.progress)
-                self._cloud(number, folder / "images", cloud)
-                left = {"command": self.given.rebuild, "state": file_state(cloud)}
-                self._keep(number, left)
-            cell = self.block.scene.ground.cell_m
-            grid_dsm(cloud, dsm, resolution=cell, overwrite=True)
-        one = self._difference(cloud, dsm, before)
-        self._keep(number, {**left, **asdict(one)})
-        return one
-
-    def _keep(self, number: int, left: dict[str, Any]) -> None:
-        """Record a round, for a later call to resume."""
-        self.record["rounds"][number - 1 :] = [left]
-        write_text(self.target / RECORD, json_text(self.record), overwrite=True)
-
-    def _cloud(self, number: int, images: Path, cloud: Path) -> None:
-        """Make the cloud, by a program of the user's or by stereo pairs."""
-        if self.given.rebuild == "stereo":
-            with threads(self.given.jobs):
-                return self._stereo(images, cloud)
-        cloud.unlink(missing_ok=True)
-        places = {"images": images, "cameras": self.given.cameras, "cloud": cloud}
-        words = shlex.split(self.given.rebuild or "")
-        for name, place in places.items():
-            words = [word.replace(f"{{{name}}}", str(Path(place).resolve())) for word in words]
-        log = cloud.with_name("rebuild.log")
-        code, last = run_logged(words, log)
-        if code == 0 and cloud.exists():
-            return None
+        side = STEREO_CELL_PIXELS * block.gsd_m
+        xyz = stereo_cloud(block.photos, block.scene.ground, side, picture, progress)
+        write_points(cloud, xyz, (block.crs, STEREO_STEP_M))
+        return
+    cloud.unlink(missing_ok=True)
+    places = {"images": images, "cameras": given.cameras, "cloud": cloud}
+    words = shlex.split(given.rebuild or "")
+    for name, place in places.items():
+        words = [word.replace(f"{{{name}}}", str(Path(place).resolve())) for word in words]
+    log = cloud.with_name("rebuild.log")
+    code, last = run_logged(words, log)
+    if code or not cloud.exists():
         wrong = f"ended with code {code}" if code else f"wrote no {cloud}"
         raise InputError(
             "rebuild.failed",
@@ -275,51 +261,29 @@ class _Run:
             log=log,
         )
 
-    def _stereo(self, images: Path, cloud: Path) -> None:
-        import cv2
 
-        @lru_cache(maxsize=CACHED_PHOTOGRAPHS)
-        def picture(row: int) -> Grey:
-            pixels = read_colours(images / self.block.paths[row].name)
-            grey = pixels[..., 0]
-            if pixels.shape[2] >= 3:
-                grey = cv2.cvtColor(np.ascontiguousarray(pixels[..., :3]), cv2.COLOR_RGB2GRAY)
-            if grey.dtype == np.uint16:
-                grey = (grey >> 8).astype(np.uint8)
-            return Grey(np.ascontiguousarray(grey), blank_in(pixels))
-
-        ground = self.block.scene.ground
-        side = STEREO_CELL_PIXELS * self.block.gsd_m
-        xyz = stereo_cloud(self.block.photos, ground, side, picture, self.progress)
-        write_points(cloud, xyz, (self.block.crs, STEREO_STEP_M))
-
-    def _difference(self, cloud: Path, dsm: Path, before: Path) -> Round:
-        """Return by how much the DSM of a round differs from that before, under water."""
-        raster = dsm.with_name("difference.tif")
-        write_dod(dsm, before, raster, overwrite=True)
-        with open_raster(raster) as source, open_raster(dsm) as heights:
-            moved, z, transform = read_masked(source), read_masked(heights), source.transform
-        row, column = np.nonzero(np.isfinite(moved))
-        x, y = place_of(transform, column + 0.5, row + 0.5)
-        xyz = np.column_stack([x, y, z[row, column]])
-        wet = np.zeros(moved.shape, bool)
-        water = surface_above(self.block.scene.water, xyz).height_m
-        wet[row, column] = np.nan_to_num(water - xyz[:, 2], nan=0.0) > 0.0
-        return round_of((str(cloud), str(dsm)), moved, wet, self.block.gsd_m)
+def _difference(block: PhotoBlock, cloud: Path, dsm: Path, before: Path) -> Round:
+    """Return by how much the DSM of a round differs from that before, under water."""
+    raster = dsm.with_name("difference.tif")
+    write_dod(dsm, before, raster, overwrite=True)
+    with open_raster(raster) as source, open_raster(dsm) as heights:
+        moved, z, transform = read_masked(source), read_masked(heights), source.transform
+    row, column = np.nonzero(np.isfinite(moved))
+    x, y = place_of(transform, column + 0.5, row + 0.5)
+    xyz = np.column_stack([x, y, z[row, column]])
+    wet = np.zeros(moved.shape, bool)
+    water = surface_above(block.scene.water, xyz).height_m
+    wet[row, column] = np.nan_to_num(water - xyz[:, 2], nan=0.0) > 0.0
+    return round_of((str(cloud), str(dsm)), moved, wet, block.gsd_m)
 
 
 def round_of(
     files: tuple[str, str], difference_m: FloatArray, wet: BoolArray, gsd_m: float
 ) -> Round:
-    """Return the change in a round.
+    """Return the change in a round, of whose files cloud and DSM are named.
 
-    Parameters
-    ----------
-    files : tuple of str
-        Its cloud and its DSM.
-    difference_m : array, shape (rows, columns)
-        DSM minus the one before, NaN where either has no height.
-    wet : array of bool, shape (rows, columns)
+    `difference_m`, shape (rows, columns), is the DSM minus the one before, NaN where either has no
+    height; `wet`, of the same shape, tells what is under water.
     """
     known = np.isfinite(difference_m)
     moved = difference_m[known & wet] if (known & wet).any() else difference_m[known]
@@ -332,16 +296,6 @@ def round_of(
     within = float((np.abs(moved) <= gsd_m).mean())
     mean, sd = float(moved.mean()), float(moved.std())
     return Round(*files, len(moved), round(mean, 5), round(sd, 5), round(within, 5))
-
-
-def _paper_note(index: float) -> PcfixWarning:
-    excess = 1.0 / (index * (2.0 - index)) - 1.0  # near nadir the depth tends to h0 / (2 - n)
-    return PcfixWarning(
-        "photos.paper_limit",
-        "--mapping paper tends to the apparent depth over 2 - n, here up to"
-        f" {100 * excess:.0f} % too deep. Correct the cloud and use --mapping exact.",
-        excess=excess,
-    )
 
 
 def _compared(

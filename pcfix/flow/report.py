@@ -3,29 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from pcfix.errors import InputError
-from pcfix.grid.maps import Maps, MapsBuilder
+from pcfix.flow.next_steps import FOLDER
+from pcfix.flow.request import Files, Request, cameras_of, inputs_of_run, water_of
+from pcfix.flow.run_adjust import figures_of
+from pcfix.flow.surfaces import view_of
+from pcfix.flow.water import found_picture
+from pcfix.grid.maps import MOST_CELLS, Maps, MapsBuilder
 from pcfix.io.crs import crs_words
 from pcfix.io.files import sha256, write_bytes, write_text
 from pcfix.io.las.columns import SHIFTS
 from pcfix.io.las.source import coordinates, stated_crs
+from pcfix.io.rasters import preview
 from pcfix.io.tiles import Tiles, open_cloud
 from pcfix.model import NOISE_CLASSES, Cameras, FloatArray, WaterSurface
 from pcfix.refract.tally import Summary
-from pcfix.report.first_screen import Survey
-from pcfix.report.page import Report, Table, render
-from pcfix.report.run import NOTHING_LATER, Corrected, Later, run_report
+from pcfix.report.adjustment import adjustment_tables
+from pcfix.report.comparison import evaluation, in_a_sentence
+from pcfix.report.page import Picture, Report, Table, render
+from pcfix.report.run import Corrected, Later, Survey, in_short, is_found, run_report
+from pcfix.report.text import uncertainty_sentence
 
+Plain = dict[str, Any]
 NEEDED = (*SHIFTS, "WaterDepth", "RayCount")
 SIGMA_Z = "SigmaZ"
 SAMPLE_POINTS = 200_000
 """Points in histogram and uncertainty figure, evenly spread over the file."""
-NO_SURVEY = Survey()
+NO_SURVEY, NOTHING_LATER = Survey(), Later()
 PAGE = "report.html"
 ENDINGS = (".laz", ".las", ".tif", ".gpkg", ".csv", ".html", ".json")
 RESULTS = {
@@ -49,6 +59,44 @@ RESULTS = {
 """The results of a run by name; only existing ones are listed."""
 
 
+def report_run(
+    request: Request, files: Files, inputs: list[Path], first: Plain, corrected: Plain,
+    compared: Plain,
+) -> Plain:  # fmt: skip
+    """Write the page of a run, and return what it says in short."""
+    pictures, tables, dod, verdict = list[Picture](), list[Table](), None, ""
+    if first["adjusted"]:
+        verdict = f" The cameras were adjusted first, as {first['why']}."
+    elif first["is_said"]:
+        verdict = f" The cameras were not adjusted: {first['why']}."
+    if compared:
+        dod = preview(files.dod, MOST_CELLS) if request.has_surface else None
+        pictures, tables = evaluation(compared["figures"], compared["sections"], dod)
+        verdict += in_a_sentence(compared["figures"])
+    if first["adjusted"]:
+        tables += adjustment_tables(figures_of(files.folder), f"{FOLDER}/report.html")
+    summary, again, cameras = (
+        Summary(**corrected),
+        inputs_of_run(request),
+        cameras_of(request, files),
+    )
+    if is_found(summary):
+        pictures.append(found_picture(again.surface(view_of(request.source))))
+    later = Later(pictures, tables, verdict, compared.get("figures", {}), dod, files.resolution_m)
+    page = write_report(
+        files.cleaned_cloud, files.folder, summary=summary, cameras=cameras,
+        water=water_of(request, files), inputs=inputs, later=later, overwrite=True,
+        survey=Survey(request.project or "", request.date or again.dates(cameras)),
+    )  # fmt: skip
+    return {
+        "in_short": in_short(page.tiles),
+        "uncertainty": uncertainty_sentence(summary, later.tvu),
+        "title": page.title,
+        "tiles": [asdict(tile) for tile in page.tiles],
+        "place": page.place,
+    }
+
+
 def write_report(
     corrected: Path | Tiles,
     out_dir: Path,
@@ -61,22 +109,12 @@ def write_report(
     later: Later = NOTHING_LATER,
     overwrite: bool = False,
 ) -> Report:
-    """Write ``report.html`` and ``figures/*.png`` about a corrected cloud.
+    """Write ``report.html`` and ``figures/*.png`` about a corrected cloud, into an existing folder.
 
-    Parameters
-    ----------
-    corrected : Path or Tiles
-        A cloud from `correct_file` with all dimensions, cleaned or not.
-    out_dir : Path
-        A folder that exists.
-    summary, cameras, water
-        The result and the inputs of `correct_file`.
-    inputs : sequence of Path
-        Files whose size and checksum the page lists.
-    survey : Survey
-        Name of the project and date of the images.
-    later : Later
-        The results of other steps of a run.
+    `corrected` is from `correct_file` with all dimensions, cleaned or not; `summary`, `cameras` and
+    `water` are its result and its inputs. The page lists size and checksum of the files `inputs`.
+    `survey` has the name of the project and the date of the images, `later` the results of other
+    steps of a run.
     """
     rows = [[path.name, f"{path.stat().st_size:,}", sha256(path)] for path in inputs]
     maps, depth_m, sample, crs, heights = _read(corrected, later.resolution_m)

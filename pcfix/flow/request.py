@@ -10,13 +10,17 @@ from typing import Any
 
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.inputs import Inputs, paths_in
+from pcfix.flow.maps import SURFACE
 from pcfix.flow.next_steps import FOLDER
-from pcfix.flow.rasters import SURFACE
+from pcfix.flow.old_cameras import read_blocks
 from pcfix.flow.record import VERSION, belonging, read_record
+from pcfix.flow.surfaces import view_of
 from pcfix.flow.tiles import HOW, RECORDS
-from pcfix.io.clouds import reference_of
+from pcfix.io.clouds import is_cloud, own_water, reference_of
 from pcfix.io.files import files_in
-from pcfix.io.tiles import Tiles, cloud_of, inputs_of, tiles_from, tiles_of
+from pcfix.io.rasters import open_raster
+from pcfix.io.tiles import Tiles, cloud_of, inputs_of, open_cloud, tiles_from, tiles_of
+from pcfix.model import Cameras, WaterSurface
 from pcfix.options.correct import CorrectOptions
 from pcfix.options.declare import named, options_of
 from pcfix.options.steps import DistanceOptions
@@ -38,6 +42,12 @@ class Request(RunOptions):
         """The cloud, in one file or many."""
         return tiles_of(self.input) or Path(str(self.input))
 
+    @property
+    def has_surface(self) -> bool:
+        """Whether the reference has heights everywhere: not check points."""
+        suffix = Path(str(self.reference)).suffix.lower()
+        return is_cloud(self.surveyed) or suffix in (".tif", ".tiff")
+
     @cached_property
     def surveyed(self) -> Path | Tiles:
         """The reference, in one file or many."""
@@ -48,12 +58,12 @@ class Request(RunOptions):
         super().check()
         wrong = ""
         if self.adjust == "no" and self.only_to_adjust:
-            wrong = f"{self.only_to_adjust[0]} is for an adjustment only. Remove it, or use auto"
+            wrong = f"{self.only_to_adjust[0]} is for an adjustment only. Remove it, or use auto."
         elif self.adjust == "yes" and self.why_not_adjust:
-            wrong = f"{self.why_not_adjust}. Remove one of the two options"
+            wrong = f"{self.why_not_adjust}. Remove one of the two options."
         if wrong:
-            sentence = f"--adjust {self.adjust}: {wrong}."
-            raise SettingError("option.conflict", sentence, option="adjust", value=self.adjust)
+            wrong = f"--adjust {self.adjust}: {wrong}"
+            raise SettingError("option.conflict", wrong, option="adjust", value=self.adjust)
         self.part(Inputs)
         with_index(self.part(RunOptions))
 
@@ -153,11 +163,17 @@ class Files:
         self.corrected, self.cleaned = (folder / f"{one}{ending}" for one in CLOUDS)
         self.surface, self.map = folder / SURFACE, folder / "map.gpkg"
         self.compare, self.report = folder / "compare", folder / "report.html"
-        self.regression = folder / "regression.json"
+        self.regression, self.dod = folder / "regression.json", self.compare / "dod.tif"
 
     def parts(self, target: Path) -> list[Path]:
         """Return the files of a cloud."""
         return [target] if self._many is None else [target / one.name for one in self._many]
+
+    @property
+    def resolution_m(self) -> float:
+        """Side of the cells of the rasters, once they are there."""
+        with open_raster(self.surface) as dsm:
+            return float(dsm.res[0])
 
     @cached_property
     def corrected_cloud(self) -> Path | Tiles:
@@ -183,3 +199,25 @@ class Files:
             for path in {self.folder / f"{one}.laz", *made} - kept:
                 path.unlink(missing_ok=True)
                 made.get(path, path).unlink(missing_ok=True)
+
+
+def inputs_of_run(request: Request) -> Inputs:
+    """Return the inputs of the correction, without the view list."""
+    return replace(request, views=None).part(Inputs)
+
+
+def cameras_of(request: Request, files: Files) -> Cameras:
+    """Return the cameras in the CRS of the cloud; notes were shown when it was corrected."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PcfixWarning)
+        return read_blocks(inputs_of_run(request), view_of(files.corrected_cloud).crs).cameras
+
+
+def water_of(request: Request, files: Files) -> WaterSurface:
+    """Return the surface as the corrected cloud states it, else as it was asked for."""
+    cloud = files.corrected_cloud
+    with warnings.catch_warnings():  # they were shown when the cloud was corrected
+        warnings.simplefilter("ignore", PcfixWarning)
+        with open_cloud(cloud) as source:
+            stated = own_water(source)
+        return stated or inputs_of_run(request).surface(view_of(cloud)).surface

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from pcfix.errors import InputError
-from pcfix.flow.runner import Check, Chunk, Command, FileTask, stream
+from pcfix.flow.runner import Chunk, Command, streaming
 from pcfix.flow.tiles import run_command
 from pcfix.io.las.columns import (
     SHIFTS,
@@ -62,7 +63,7 @@ def restore_file(
     command = Command(
         "restore",
         plan=lambda cloud, target, kept: None,
-        process=_restore_cloud,
+        process=partial(streaming, _Restoring),
         check=lambda plan, points: None,
         summarize=lambda plan, points, findings, ends: points,
     )
@@ -70,16 +71,10 @@ def restore_file(
     return points
 
 
-def _restore_cloud(
-    plan: None, task: FileTask, row: int = 0, check: Check | None = None
-) -> tuple[Any, Any]:
-    return stream(task, _Restoring, row, check)
-
-
 class _Restoring:
     """The restoring of one file: its header of before, and each chunk."""
 
-    def __init__(self, source: LasSource) -> None:
+    def __init__(self, plan: None, source: LasSource) -> None:
         content = read_settings(source.vlrs, source.path)
         with record_errors(source.path):
             names = _ours(source, content["settings"])

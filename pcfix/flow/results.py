@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pcfix.errors import InputError, SettingError
-from pcfix.flow.layers import contours_layer
-from pcfix.flow.rasters import BED, DEPTH, SHADED, SURFACE, UNCERTAINTY
+from pcfix.flow.maps import BED, DEPTH, SHADED, SURFACE, UNCERTAINTY, contours_layer
 from pcfix.flow.record import read_record
 from pcfix.flow.request import Files, Request
 from pcfix.flow.run import RECORD, run_all

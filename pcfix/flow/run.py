@@ -2,39 +2,44 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from pcfix.compare.m3c2 import load_py4dgeo
-from pcfix.errors import SettingError
-from pcfix.flow import run_steps
+from pcfix.errors import PcfixWarning, SettingError
+from pcfix.flow.clean import clean_file
+from pcfix.flow.compare import compare_clouds
+from pcfix.flow.correct import correct_file
+from pcfix.flow.dsm import grid_dsm
+from pcfix.flow.maps import SECTIONS, raster_files, resolution_sentence, write_map, write_rasters
 from pcfix.flow.record import Record
-from pcfix.flow.request import Files, Request, since
-from pcfix.flow.run_steps import Run, Step, adjusted_words
-from pcfix.flow.runner import Bar, no_bar
+from pcfix.flow.report import report_run
+from pcfix.flow.request import Files, Request, cameras_of, since, water_of
+from pcfix.flow.run_adjust import adjust_first, figures_of, outputs_of
+from pcfix.flow.runner import Bar, Progress, no_bar
 from pcfix.flow.shore import check_shoreline
 from pcfix.flow.tiles import check_folder
+from pcfix.io.clouds import is_cloud
+from pcfix.io.vectors import check_layers
+from pcfix.io.rasters import write_dod
 from pcfix.io.tiles import Tiles, check_one_file
+from pcfix.options.correct import CorrectOptions
+from pcfix.options.declare import options_of
+from pcfix.options.steps import CleanOptions, DistanceOptions
+from pcfix.report.adjustment import adjustment_sentence, all_notes
+
+Plain = dict[str, Any]
 
 RECORD = "run.json"
-STEPS = (
-    Step("adjust", "Adjusting", run_steps.adjust, run_steps.outputs_of_adjust),
-    Step("correct", "Correcting", run_steps.correct, run_steps.outputs_of_correct),
-    Step("clean", "Cleaning", run_steps.clean, lambda run: run.files.parts(run.files.cleaned)),
-    Step("dsm", "Gridding", run_steps.grid, run_steps.outputs_of_grid),
-    Step(
-        "compare", "Comparing", run_steps.compare,
-        lambda run: [run.files.compare / "compare.json"],
-        lambda run: "" if run.request.reference is None else None,
-    ),
-    Step(
-        "map", "Drawing the map", run_steps.draw_map,
-        lambda run: [run.files.map], run_steps.why_no_map,
-    ),
-    Step("report", "Writing the report", run_steps.report, lambda run: [run.files.report]),
-)  # fmt: skip
-"""In their order; each depends on those before it."""
+
+REFERENCE_DSM = "reference_dsm.tif"
 
 
 def run_all(
@@ -54,7 +59,7 @@ def run_all(
     shows its progress.
     """
     inputs = [path for some in request.files().values() for path in some]
-    files = Files(out_dir, request.source)
+    files, asked = Files(out_dir, request.source), request
     if request.m3c2:
         load_py4dgeo()
     check_one_file(request.source, request)
@@ -62,26 +67,88 @@ def run_all(
         check_folder(files.corrected, request.source)
     record = _opened(request, out_dir, overwrite)
     check_shoreline(request.shoreline, overwrite=overwrite or record.resumes, inputs=inputs)
-    run = Run(request, files, tuple(inputs), jobs)
-    for step in STEPS:
-        why_not = step.why_not(run)
-        if why_not:
-            say(f"{step.name:<9} not written: {why_not}")
-        if why_not is not None:
-            continue
-        with bar(step.title) as progress:
-            outputs = step.outputs(run)
-            work = partial(step.work, run, progress)
-            result, was_done = record.step(step.name, outputs, work)
-        was_said = run.says_adjusted
-        run = run.after(step.name, result)
-        if run.says_adjusted and not was_said:
-            for line in adjusted_words(run, was_done):
-                say(line)
-        if step.name != "adjust":
-            shown = {"correct": files.corrected, "clean": files.cleaned}.get(step.name, outputs[0])
-            done = "done before" if was_done else "done"
-            say(f"{step.name:<9} {done}: {shown}{run_steps.words_of(step.name, run)}")
+
+    def step(
+        name: str, title: str, outputs: list[Path], work: Callable[[Progress | None], Any]
+    ) -> tuple[Any, str]:
+        """Do a step unless it is done; return its result, and the start of its line."""
+        with bar(title) as progress:
+            result, was_done = record.step(name, outputs, partial(work, progress))
+        return result, f"{name:<9} {'done before' if was_done else 'done'}: "
+
+    outputs = outputs_of(out_dir)
+    first, done = step(
+        "adjust", "Adjusting", outputs, lambda _: adjust_first(asked, out_dir, inputs, jobs)
+    )
+    if first["adjusted"]:
+        figures = figures_of(out_dir)
+        say(f"{done}{outputs[0]}")
+        for words in (adjustment_sentence(figures), *all_notes(figures)):
+            say(f"{'':<9} {words}")
+    elif first["is_said"]:
+        say(f"{'adjust':<9} not done: {first['why']}")
+    request = request.with_adjusted(out_dir, first)
+
+    outputs = files.parts(files.corrected)
+    outputs += [] if request.check_depths is None else [files.regression]
+    outputs += [] if request.shoreline is None else [Path(request.shoreline)]
+    corrected, done = step(
+        "correct", "Correcting", outputs, partial(_correct, request, files, jobs)
+    )
+    poses = corrected["poses"]
+    if first["is_fine"] and poses is not None and poses["absorbed"] is None:
+        # the first step has surveys that the correction has not
+        words = "did not absorb the refraction, as the first step found"
+        corrected = {**corrected, "poses": {**poses, "absorbed": False, "words": words}}
+    if not first["is_said"] and first["why"] and (corrected["poses"] or {}).get("absorbed"):
+        first = {**first, "is_said": True}
+        say(f"{'adjust':<9} not done: {first['why']}")
+    say(f"{done}{files.corrected}")
+
+    # the corrected cloud marks which points are below the water
+    how = CleanOptions(overwrite=True, jobs=jobs, scheduler=asked.scheduler)
+    _, done = step(
+        "clean", "Cleaning", files.parts(files.cleaned),
+        lambda progress: clean_file(
+            files.corrected_cloud, files.cleaned, options=how, progress=progress
+        ).as_dict(),
+    )  # fmt: skip
+    say(f"{done}{files.cleaned}")
+
+    errors = corrected["uncertainty"] is not None
+    outputs = raster_files(out_dir, errors=errors)
+    made, done = step(
+        "dsm", "Gridding", outputs,
+        lambda progress: write_rasters(
+            files.cleaned_cloud, out_dir, resolution=request.resolution,
+            cameras=cameras_of(request, files), errors=errors, progress=progress,
+        ),
+    )  # fmt: skip
+    given = request.resolution is not None
+    say(f"{done}{outputs[0]}{resolution_sentence(made, given=given)}")
+
+    compared: Plain = {}
+    if request.reference is not None:
+        outputs = [files.compare / "compare.json"]
+        compared, done = step("compare", "Comparing", outputs, lambda _: _compare(request, files))
+        say(f"{done}{outputs[0]}")
+
+    try:
+        check_layers(files.map)
+    except SettingError as error:
+        say(f"{'map':<9} not written: {error}")
+    else:
+        _, done = step(
+            "map", "Drawing the map", [files.map],
+            lambda _: _draw_map(request, files, corrected, compared),
+        )  # fmt: skip
+        say(f"{done}{files.map}")
+
+    page, done = step(
+        "report", "Writing the report", [files.report],
+        lambda _: report_run(request, files, inputs, first, corrected, compared),
+    )  # fmt: skip
+    say(f"{done}{files.report}: {page['in_short']}")
     return files.report
 
 
@@ -105,3 +172,56 @@ def _opened(request: Request, out_dir: Path, overwrite: bool) -> Record:
             changed=record.changed,
         )
     return record
+
+
+def _correct(request: Request, files: Files, jobs: int | None, progress: Progress | None) -> Plain:
+    """Correct the cloud."""
+    options = replace(request, overwrite=True, jobs=jobs).part(CorrectOptions)
+    if request.check_depths is not None:
+        options = replace(options, save_regression=files.regression)
+    files.remove_others()
+    return vars(correct_file(request.source, files.corrected, options=options, progress=progress))
+
+
+def _compare(request: Request, files: Files) -> Plain:
+    """Compare the cleaned cloud with the reference, and write a raster of differences."""
+    reference = request.surveyed
+    result = compare_clouds(
+        files.cleaned_cloud, reference, out_dir=files.compare, sections=SECTIONS, overwrite=True,
+        **{one.name: getattr(request, one.name) for one in options_of(DistanceOptions)},
+    )  # fmt: skip
+    if request.has_surface:
+        heights = Path(str(reference))
+        if is_cloud(reference):
+            heights = files.compare / REFERENCE_DSM
+            with warnings.catch_warnings():  # the cells are those of the cloud
+                warnings.simplefilter("ignore", PcfixWarning)
+                grid_dsm(reference, heights, resolution=files.resolution_m, overwrite=True)
+        write_dod(files.surface, heights, files.dod, overwrite=True)
+    sections = [
+        {
+            "distance_m": section.distance_m.tolist(),
+            "heights_m": {
+                name: [None if math.isnan(value) else value for value in heights_m.tolist()]
+                for name, heights_m in section.heights_m.items()
+            },
+        }
+        for section in result.sections
+    ]
+    points = [] if result.check_points is None else result.check_points.tolist()
+    return {"figures": result.as_dict(), "sections": sections, "check_points": points}
+
+
+def _draw_map(request: Request, files: Files, corrected: Plain, compared: Plain) -> dict[str, int]:
+    """Write the vector layers; the water's height has one standard error for all places."""
+    fitted = (corrected["water_fit"] or {}).get("sigma_level_m")
+    return write_map(
+        files.map, files.cleaned_cloud, files.folder,
+        water=water_of(request, files),
+        sigma_level_m=fitted if request.sigma_level is None else request.sigma_level,
+        cameras=cameras_of(request, files),
+        unused=corrected["cameras_unused"],
+        sections=compared.get("figures", {}).get("sections", []),
+        check_points=np.array(compared.get("check_points", [])).reshape(-1, 4),
+        check_depths=request.check_depths,
+    )  # fmt: skip

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from pcfix.adjust.diagnosis import MOST_STATED_M, Evidence
 from pcfix.errors import PcfixError, PcfixWarning, SettingError
-from pcfix.flow.adjust import SUMMARY, Survey, adjust_into
+from pcfix.flow.adjust import SUMMARY, adjust_into
 from pcfix.flow.diagnosis import diagnose, focal_length_of, given_focal_lengths, has_datum, ties_of
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.next_steps import FOLDER, MODELS
@@ -20,7 +20,7 @@ from pcfix.io.ground_control import read_ground_control
 from pcfix.io.members import FILE as MEMBERS
 from pcfix.kernels import threads
 from pcfix.model import WaterDimension
-from pcfix.options.survey import AdjustRules
+from pcfix.options.survey import AdjustOptions
 from pcfix.water.index import with_index
 
 if TYPE_CHECKING:
@@ -123,9 +123,10 @@ def _adjust(request: Request, target: Path, files: list[Path], jobs: int | None)
             f"{inside}: is in {target}, which the adjustment replaces. Give another OUT_DIR.",
             path=inside,
         )
-    survey = Survey(request.gcps, request.gnss, request.lens)
-    rules = AdjustRules(index=with_index(request).refractive_index)
+    given = AdjustOptions(
+        gcps=request.gcps, gnss=request.gnss, lens=request.lens,
+        index=with_index(request).refractive_index, overwrite=True,
+    )  # fmt: skip
     with threads(jobs):
-        inputs = request.part(Inputs)
-        adjust_into(target, inputs, survey, rules, request.source, overwrite=True)
+        adjust_into(target, request.part(Inputs), given, request.source)
     return next(name for name in MODELS if (target / name).exists())

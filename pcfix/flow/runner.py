@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
@@ -18,7 +18,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
-from pcfix.io.files import check_input, check_output, write_text
+from pcfix.io.files import check_input, check_output, write_bytes, write_text
 from pcfix.io.las.part import cloud_part
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import LasSink, check_suffix, output_evlrs
@@ -28,6 +28,7 @@ from pcfix.options.declare import File
 
 if TYPE_CHECKING:
     import laspy
+    from matplotlib.figure import Figure
 
 Chunk: TypeAlias = "laspy.ScaleAwarePointRecord"
 Header: TypeAlias = "laspy.LasHeader"
@@ -41,13 +42,6 @@ Check: TypeAlias = Callable[[Any], Any]
 def no_bar(title: str) -> AbstractContextManager[None]:
     """Show nothing."""
     return nullcontext()
-
-
-def part_of(progress: Progress | None, number: int, count: int) -> Progress | None:
-    """Return the progress of one of several equal jobs."""
-    if progress is None:
-        return None
-    return lambda done, total: progress(number * total + done, count * total)
 
 
 class FileWork(Protocol):
@@ -68,19 +62,12 @@ class FileWork(Protocol):
 class Command:
     """A command that rewrites clouds, as functions.
 
-    Attributes
-    ----------
-    name : str
-    plan : callable
-        Of a cloud, the path of the output, and chunks to keep in memory (`FileTask.kept`): returns
-        all that the points have in common, which can be pickled.
-    process : callable
-        Takes one file through a plan: (plan, task, first row of the cloud, check or None). Returns
-        the statistics, and the findings of the check.
-    check : callable
-        Of a plan and the statistics of the whole cloud: refuses what cannot be right.
-    summarize : callable
-        Of a plan, statistics, findings, and `Ends`: returns the result.
+    `plan` takes a cloud, the path of the output, and chunks to keep in memory (`FileTask.kept`),
+    and returns all that the points have in common, which can be pickled. `process` takes one file
+    through a plan (plan, task, first row of the cloud, check or None), and returns the statistics
+    and the findings of the check; see `streaming`. `check` refuses, by plan and statistics of the
+    whole cloud, what cannot be right. `summarize` makes the result of plan, statistics, findings
+    and `Ends`.
     """
 
     name: str
@@ -102,28 +89,16 @@ class Ends:
 
 @dataclass(frozen=True)
 class FileTask:
-    """A cloud to read, a cloud to write, and how.
-
-    Attributes
-    ----------
-    summary : path or None
-        JSON file for the summary.
-    progress : callable or None
-        Called with (points done, points in all), after each chunk and while it is computed.
-    started : float
-        `time.perf_counter` then.
-    kept : list
-        The chunks of a small cloud that is read several times; see `LasSource`.
-    """
+    """A cloud to read, a cloud to write, and how."""
 
     source: Path
     target: Path
-    summary: File | None = None
+    summary: File | None = None  # JSON file
     overwrite: bool = False
     jobs: int | None = None
-    progress: Progress | None = None
+    progress: Progress | None = None  # called with (points done, points in all)
     started: float = field(default_factory=time.perf_counter)
-    kept: list[Chunk] = field(default_factory=list)
+    kept: list[Chunk] = field(default_factory=list)  # of a small cloud that is read several times
 
     @property
     def seconds(self) -> float:
@@ -149,58 +124,62 @@ def stream(
                 task.progress(done + min(of_chunk, chunk), total)
 
         with LasSink(task.target, work.header, *last) as sink:
-            write = WriteBehind(lambda points, result: sink.write(work.apply(points, result)))
-            with write if task.jobs != 1 else nullcontext():
+
+            def write(points: Chunk, result: Any) -> None:
+                sink.write(work.apply(points, result))
+
+            with _thread(task.jobs) as writer:
+                written: Future[None] | None = None
                 for points in read_ahead(source.chunks(), task.jobs):
                     count = len(points)
                     with telling(partial(tell, count)):
                         result, one = work.compute(points, row + done)
-                    write(points, result)
+                    if written is not None:
+                        written.result()  # at most one chunk waits to be written
+                    written = writer.submit(write, points, result)
                     tally = one if tally is None else tally + one
                     done += count
                     tell(0, 0)
+                if written is not None:
+                    written.result()
             if check is not None:
                 findings = check(tally)
     return tally, findings
 
 
+def streaming(
+    work: Callable[[Any, LasSource], FileWork],
+    plan: Any,
+    task: FileTask,
+    row: int = 0,
+    check: Check | None = None,
+) -> tuple[Any, Any]:
+    """Take a file through a command whose `work` on an opened file needs its plan alone."""
+    return stream(task, partial(work, plan), row, check)
+
+
 def read_ahead(chunks: Iterator[Any], jobs: int | None) -> Iterator[Any]:
     """Yield chunks while the next one is read; with one job without a thread."""
-    if jobs == 1:
-        yield from chunks
-        return
-    with ThreadPoolExecutor(1) as reader:
+    with _thread(jobs) as reader:
         following = reader.submit(next, chunks, None)
         while (one := following.result()) is not None:
             following = reader.submit(next, chunks, None)
             yield one
 
 
-class WriteBehind:
-    """Calls a function in order: at once or, in a ``with`` block, in another thread."""
+def _thread(jobs: int | None) -> Executor:
+    """Return another thread, or this one for a single job."""
+    return _ThisThread() if jobs == 1 else ThreadPoolExecutor(1)
 
-    def __init__(self, write: Callable[..., None]) -> None:
-        self._write = write
-        self._pool: ThreadPoolExecutor | None = None
-        self._last: Future[None] | None = None
 
-    def __enter__(self) -> None:
-        self._pool = ThreadPoolExecutor(1)
+class _ThisThread(Executor):
+    """Runs each call at once."""
 
-    def __exit__(self, kind: Any, *error: object) -> None:
-        if self._pool is not None:
-            self._pool.shutdown()
-        if self._last is not None and kind is None:
-            self._last.result()
-
-    def __call__(self, *given: Any) -> None:
-        """Call, once the call before has returned."""
-        if self._pool is None:
-            return self._write(*given)
-        if self._last is not None:
-            self._last.result()
-        self._last = self._pool.submit(self._write, *given)
-        return None
+    def submit(self, call: Any, /, *given: Any, **keywords: Any) -> Future[Any]:
+        """Return what a call gave."""
+        future: Future[Any] = Future()
+        future.set_result(call(*given, **keywords))
+        return future
 
 
 def json_text(content: dict[str, Any]) -> str:
@@ -209,9 +188,9 @@ def json_text(content: dict[str, Any]) -> str:
 
 
 def check_summary(options: Any, inputs: Iterable[File] = ()) -> None:
-    """Refuse a summary or a regression file that could not be written, before the work begins."""
+    """Refuse small outputs that could not be written, before the work begins."""
     known = list(inputs)
-    for name in ("summary", "save_regression"):
+    for name in ("plot", "summary", "save_regression"):
         path = getattr(options, name, None)
         if path is not None:
             known.append(check_output(path, overwrite=options.overwrite, inputs=known))
@@ -221,6 +200,13 @@ def write_summary(options: Any, summary: dict[str, Any]) -> None:
     """Write a summary as JSON if the options, with overwrite, name a file for it."""
     if options.summary is not None:
         write_text(options.summary, json_text(summary), overwrite=options.overwrite)
+
+
+def write_plot(options: Any, figure: Figure) -> None:
+    """Write a figure to the PNG file that the options, with overwrite, name."""
+    from pcfix.report.page import png_of
+
+    write_bytes(options.plot, png_of(figure), overwrite=options.overwrite)
 
 
 def check_cloud(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) -> Path:
@@ -242,19 +228,9 @@ def file_task(
 ) -> FileTask:
     """Return the task of a command after checking that its files may be read and written.
 
-    Parameters
-    ----------
-    input, output : path
-        The input may be many files.
-    options : OptionSet
-        With overwrite and, if the command has them, summary and jobs.
-    reads : iterable
-        Further inputs; values that are no paths do not count.
-    more : iterable of path
-        Further outputs, checked like the output.
-    check : callable
-        Returns the path of an output; see `check_cloud`.
-    progress : callable, optional
+    The input may be many files; `options` has overwrite and, if the command has them, summary and
+    jobs. `reads` are further inputs, of which values that are no paths do not count; `more` are
+    further outputs, checked like the output, by `check`.
     """
     started = time.perf_counter()
     check_one_file(input, options)

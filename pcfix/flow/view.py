@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -15,18 +17,23 @@ from pcfix.compare.vertical import heights_at
 from pcfix.errors import InputError, SettingError
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.surfaces import find_surface, view_of
+from pcfix.grid import colours
 from pcfix.io.clouds import check_same_crs, read_reference
 from pcfix.io.files import check_input, check_output, write_bytes
 from pcfix.io.las.columns import SHIFTS
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.lens.imaging import unproject
+from pcfix.libraries import load_open3d
 from pcfix.model import Cameras, FloatArray, IntArray, WaterDimension, WaterSurface
 from pcfix.options.declare import File, taken
 from pcfix.options.handover import ViewerOptions
 from pcfix.refract.tally import COVERAGE_95
-from pcfix.report.page import png_of
-from pcfix.report.view import Scene3d, scale_of, show, view_figure
+from pcfix.report.page import new_figure, png_of
 from pcfix.water.surface import surface_above
+
+if TYPE_CHECKING:
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.figure import Figure
 
 NEIGHBOURS, GAP_SPACINGS, LEAST_GAP_M = 8, 5.0, 1.0
 """The defaults of a comparison."""
@@ -40,6 +47,21 @@ _REMEDY = {
     "uncertainty": "Give a cloud from 'pcfix correct --dimensions all'.",
     "error": "Cloud and reference do not overlap.",
     "height": "Its heights are not numbers.",
+}
+WATER_COLOUR = (0.29, 0.64, 0.78, 0.25)
+CAMERA_COLOUR = (0.04, 0.37, 0.54)
+AZIMUTH_DEG, ELEVATION_DEG = -119.0, 29.0
+"""The view is from the south-west, from above."""
+MOST_DOTS = 30_000
+GREY = 0.72
+"""Of points without a value, such as land where depths are shown."""
+MOST_PERCENT = 98.0
+RAMPS = {
+    "depth": (colours.DEPTH, "Depth below the water (m)"),
+    "shift": (colours.HEIGHT, "Lowered by the correction (m)"),
+    "error": (colours.DIFFERENCE, "Height above the reference (m)"),
+    "uncertainty": (colours.UNCERTAINTY, "Uncertainty of Z at 95 % (m)"),
+    "height": (colours.HEIGHT, "Height (m)"),
 }
 
 
@@ -99,8 +121,18 @@ def view_clouds(
         cameras, _ = inputs.block(first.crs)
     values = _values(given.colour, layers, surface)
     scale = scale_of(given.colour, np.concatenate(values))
-    colours = [scale.to_rgba(np.ma.masked_invalid(one))[:, :3] for one in values]
-    scene = _scene(layers, colours, cameras, surface)
+    rgb = [scale.to_rgba(np.ma.masked_invalid(one))[:, :3] for one in values]
+    # all about their common centre
+    low = np.min([one.xyz.min(axis=0) for one in layers], axis=0)
+    high = np.max([one.xyz.max(axis=0) for one in layers], axis=0)
+    lines = np.zeros((0, 2, 3)) if cameras is None else _frusta(cameras, float(high[2]))
+    water, triangles = _sheet(surface, low, high)
+    ends = np.vstack([low, high, lines.reshape(-1, 3)])
+    origin = (ends.min(axis=0) + ends.max(axis=0)) / 2.0
+    scene = Scene3d(
+        [one.name for one in layers], [one.xyz - origin for one in layers], rgb,
+        lines - origin, water - origin, triangles,
+    )  # fmt: skip
     if given.image is None:
         show(scene, f"pcfix view: {given.colour}")
         return ""
@@ -145,7 +177,7 @@ def _values(colour: str, layers: list[_Layer], surface: WaterSurface | None) -> 
         found = None
         if colour == "error":
             target = layers[-1]
-            found = None if one is target else _error(one.xyz, target.xyz)
+            found = None if one is target else _height_above(target.xyz, one.xyz)
         elif colour == "height":
             found = one.xyz[:, 2]
         elif colour == "depth":
@@ -167,33 +199,14 @@ def _values(colour: str, layers: list[_Layer], surface: WaterSurface | None) -> 
     return values
 
 
-def _error(xyz: FloatArray, reference: FloatArray) -> FloatArray:
-    """Return the height above a reference, NaN away from it."""
+def _height_above(reference: FloatArray, xyz: FloatArray) -> FloatArray:
+    """Return the heights of points above a reference, NaN away from it."""
     gap_m = max(GAP_SPACINGS * mean_spacing_m(reference[:, :2]), LEAST_GAP_M)
     near, error = near_in_plan(xyz[:, :2], reference[:, :2], gap_m), np.full(len(xyz), np.nan)
     if near.any():
         found = heights_at(xyz[near, :2], reference, min(NEIGHBOURS, len(reference)))
         error[near] = xyz[near, 2] - found.height_m
     return error
-
-
-def _scene(
-    layers: list[_Layer],
-    rgb: list[FloatArray],
-    cameras: Cameras | None,
-    surface: WaterSurface | None,
-) -> Scene3d:
-    """Return clouds, cameras and water about the centre of all."""
-    low = np.min([one.xyz.min(axis=0) for one in layers], axis=0)
-    high = np.max([one.xyz.max(axis=0) for one in layers], axis=0)
-    lines = np.zeros((0, 2, 3)) if cameras is None else _frusta(cameras, float(high[2]))
-    water, triangles = _sheet(surface, low, high)
-    ends = np.vstack([low, high, lines.reshape(-1, 3)])
-    origin = (ends.min(axis=0) + ends.max(axis=0)) / 2.0
-    return Scene3d(
-        [one.name for one in layers], [one.xyz - origin for one in layers], rgb, lines - origin,
-        water - origin, triangles,
-    )  # fmt: skip
 
 
 def _frusta(cameras: Cameras, ground_m: float) -> FloatArray:
@@ -224,13 +237,102 @@ def _sheet(
     x, y = (side.ravel() for side in np.meshgrid(*sides))
     xyz = np.column_stack([x, y, np.zeros(len(x))])
     xyz[:, 2] = surface_above(surface, xyz).height_m
-    corner = np.arange(len(x)).reshape(WATER_CELLS + 1, -1)
-    a, b, c, d = (
-        part.ravel()
-        for part in (corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1])
-    )
-    triangles = np.vstack([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
+    at = np.arange(len(x)).reshape(WATER_CELLS + 1, -1)
+    a, b, c, d = at[:-1, :-1], at[:-1, 1:], at[1:, 1:], at[1:, :-1]
+    triangles = np.stack([[a, b, c], [a, c, d]]).transpose(0, 2, 3, 1).reshape(-1, 3)
     known = np.isfinite(xyz[:, 2])
-    return np.where(known[:, None], xyz, (low + high) / 2.0), triangles[
-        known[triangles].all(axis=1)
-    ]
+    xyz = np.where(known[:, None], xyz, (low + high) / 2.0)
+    return xyz, triangles[known[triangles].all(axis=1)]
+
+
+@dataclass(frozen=True, eq=False)
+class Scene3d:
+    """Named clouds with their colours, frusta of cameras, and the water, metres from an origin.
+
+    `lines` has the shape (m, 2, 3); `triangles` are rows of `water`.
+    """
+
+    names: list[str]
+    xyz: list[FloatArray]
+    rgb: list[FloatArray]
+    lines: FloatArray
+    water: FloatArray
+    triangles: IntArray
+
+
+def scale_of(what: str, values: FloatArray) -> ScalarMappable:
+    """Return the colour scale of values, NaN where unknown; it leaves out 2 % at the ends.
+
+    Its ``to_rgba`` gives colours; those of NaN are grey.
+    """
+    from matplotlib import colormaps
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    known = values[np.isfinite(values)]
+    if what == "error":
+        high = max(float(np.percentile(np.abs(known), MOST_PERCENT)), 1e-3)
+        low = -high
+    else:
+        low = float(np.percentile(known, 100.0 - MOST_PERCENT)) if what == "height" else 0.0
+        high = max(float(np.percentile(known, MOST_PERCENT)), low + 1e-3)
+    ramp = colormaps[RAMPS[what][0]].with_extremes(bad=(GREY, GREY, GREY))
+    return ScalarMappable(Normalize(low, high), ramp)
+
+
+def show(scene: Scene3d, title: str) -> None:
+    """Open open3d's viewer with a switch for each cloud, and return when it is closed."""
+    on_x = sys.platform.startswith("linux")
+    if on_x and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise SettingError(
+            "view.no_screen", "There is no screen to open a window on. Give --image FILE.png."
+        )
+    o3d = load_open3d()
+    points, record = o3d.utility.Vector3dVector, o3d.visualization.rendering.MaterialRecord
+    things = []
+
+    def add(name: str, geometry: Any, shader: str, **look: Any) -> None:
+        material = record()
+        for key, value in {"shader": shader, **look}.items():
+            setattr(material, key, value)
+        things.append({"name": name, "geometry": geometry, "material": material})
+
+    for name, xyz, rgb in zip(scene.names, scene.xyz, scene.rgb, strict=True):
+        cloud = o3d.geometry.PointCloud(points(xyz))
+        cloud.colors = points(rgb)
+        add(name, cloud, "defaultUnlit", point_size=2.5)
+    if len(scene.lines):
+        ends = np.arange(2 * len(scene.lines)).reshape(-1, 2)
+        pairs = o3d.utility.Vector2iVector(ends)
+        lines = o3d.geometry.LineSet(points(scene.lines.reshape(-1, 3)), pairs)
+        lines.paint_uniform_color(CAMERA_COLOUR)
+        add("cameras", lines, "unlitLine", line_width=1.0)
+    if len(scene.triangles):
+        triangles = o3d.utility.Vector3iVector(scene.triangles)
+        mesh = o3d.geometry.TriangleMesh(points(scene.water), triangles)
+        mesh.compute_vertex_normals()  # without them, and with other shaders, open3d 0.20 crashes
+        add("water", mesh, "defaultLitTransparency", base_color=WATER_COLOUR)
+    o3d.visualization.draw(things, title=title, show_ui=True, bg_color=(1.0, 1.0, 1.0, 1.0))
+
+
+def view_figure(scene: Scene3d, scale: ScalarMappable, what: str) -> Figure:
+    """Draw each cloud as dots with its name, side by side, and the scale of the colours."""
+    count = len(scene.names)
+    figure, axes = new_figure(
+        0.8 + 6.4 * count, 5.2, ncols=count, squeeze=False, subplot_kw={"projection": "3d"}
+    )
+    for panel, name, xyz, rgb in zip(axes[0], scene.names, scene.xyz, scene.rgb, strict=True):
+        step = max(1, len(xyz) // MOST_DOTS)
+        panel.set_title(name)
+        panel.scatter(*xyz[::step].T, c=rgb[::step], s=1, depthshade=False)
+        for line in scene.lines:
+            panel.plot(*line.T, color=CAMERA_COLOUR, linewidth=0.5)
+        if len(scene.triangles):
+            x, y, z = scene.water.T
+            panel.plot_trisurf(x, y, scene.triangles, z, color=WATER_COLOUR, linewidth=0)
+        panel.view_init(ELEVATION_DEG, AZIMUTH_DEG)
+        panel.set_aspect("equal")
+        panel.set(xlabel="East (m)", ylabel="North (m)", zlabel="Height (m)")
+    label = RAMPS[what][1]
+    figure.colorbar(scale, ax=list(axes[0]), label=label, shrink=0.8, extend="both")
+    return figure

@@ -82,13 +82,6 @@ def all_notes(d: Plain) -> list[str]:
     return list(dict.fromkeys(note[:1].upper() + note[1:] for note in notes))
 
 
-def reason_sentence(adjusted: bool, why: str) -> str:
-    """Return why a run adjusted the cameras, or why not."""
-    if adjusted:
-        return f" The cameras were adjusted first, as {why}."
-    return f" The cameras were not adjusted: {why}."
-
-
 def _residuals(d: Plain) -> str:
     """Return the RMS residuals on land and under water; empty without any."""
     known = [(where, d["residuals"][key]["rms_px"]) for key, where in WHERE]
@@ -112,11 +105,7 @@ def adjustment_sentence(d: Plain) -> str:
 def adjustment_text(adjusted: Adjusted, before: Before | None = None) -> str:
     """Return the summary of an adjustment as text.
 
-    Parameters
-    ----------
-    adjusted : Adjusted
-    before : Before, optional
-        Of `before_of`, for the residuals before.
+    `before` is of `before_of`, for the residuals before.
     """
     d = adjustment_dict(adjusted, before)
     lines = [f"{label:<14} {words}" for label, words in _facts(d)] + _residual_table(d).lines()
@@ -134,11 +123,7 @@ def adjustment_text(adjusted: Adjusted, before: Before | None = None) -> str:
 def adjustment_page(adjusted: Adjusted, before: Before | None = None) -> str:
     """Return the report of an adjustment as one self-contained HTML page.
 
-    Parameters
-    ----------
-    adjusted : Adjusted
-    before : Before, optional
-        Of `before_of`; then residuals and points before are shown too.
+    With `before`, of `before_of`, residuals and points before are shown too.
     """
     d = adjustment_dict(adjusted, before)
     maps, layers = _map(adjusted, before)
@@ -201,9 +186,30 @@ def _facts(d: Plain) -> Rows:
         "undone": "; adjustment without water undone" if d["engine"] == "unaware" else "",
     })  # fmt: skip
     rows += [] if d["lens"] else [("lens", "fixed")]
-    rows += [(label, _change_words(row, unit)) for label, row, unit in _unknowns(d)]
-    rows += _fixed_water(d)
-    rows += [(f"on {one['surface']}", _surface_words(one, d)) for one in d["on_surfaces"]]
+    for label, row, unit in _unknowns(d):
+        before, after, change, error = _change(row)
+        error = "" if row["sigma"] is None else f", standard error {error}"
+        rows.append((label, f"{before} -> {after}{f' {unit}' if unit else ''} ({change}{error})"))
+    if d["water"] is None:
+        rows.append(("water", "none, a housing port refracts" if d["port"] else "none"))
+        if len(d["port_found"] or {}) > 1:
+            rows.append(("port", f"--port {d['port_found']['port']}"))
+    for key, (label, unit) in _WATER.items():  # a level surface has no tilt to show
+        v = (d["water"] or d["port_found"] or {}).get(key)
+        if v is not None and not v["free"] and not (key.startswith("tilt") and v["after"] == 0.0):
+            rows.append((label, f"{v['after']:.6g}{f' {unit}' if unit else ''}, fixed"))
+    parallel = d["unknowns"]["parallel"]
+    for one in d["on_surfaces"]:
+        name = one["surface"]
+        others = [other for other in parallel if other != name and name in parallel]
+        words = (
+            f"{one['points']:,} marked points, distance RMS {fixed(one['rms_m'], 4)} m (given"
+            f" {one['sigma_m']:g} m), largest {fixed(one['largest_m'], 4)} m"
+            f" ({one['largest_point']})"
+        )
+        rows.append(
+            (f"on {name}", words + (f"; parallel to {', '.join(others)}" if others else ""))
+        )
     if d["poses_are"] != "fixed":
         errors = {
             f"{what}_{which}": listed(precision[f"{what}_{which}_{unit}"], 4)
@@ -247,12 +253,6 @@ def _change(row: Plain) -> list[str]:
     return [short(before, sigma), short(after, sigma), short(after - before, sigma, "+"), error]
 
 
-def _change_words(row: Plain, unit: str) -> str:
-    before, after, change, error = _change(row)
-    error = "" if row["sigma"] is None else f", standard error {error}"
-    return f"{before} -> {after}{f' {unit}' if unit else ''} ({change}{error})"
-
-
 def _unknowns(d: Plain) -> list[tuple[str, Plain, str]]:
     """Return label, values and unit of what was free of lens, water and port."""
     several = len({row["sensor"] for row in d["lens"]}) > 1
@@ -268,31 +268,6 @@ def _unknowns(d: Plain) -> list[tuple[str, Plain, str]]:
         if (value := found.get(key)) is not None and value["free"]:
             rows.append((label, value, unit))
     return rows
-
-
-def _fixed_water(d: Plain) -> Rows:
-    """Return what was not free of water and port; a level surface has no tilt to show."""
-    water, port = d["water"], d["port_found"]
-    rows = []
-    if water is None:
-        rows = [("water", "none, a housing port refracts" if d["port"] else "none")]
-        if port is not None and len(port) > 1:
-            rows.append(("port", f"--port {port['port']}"))
-    for key, (label, unit) in _WATER.items():
-        v = (water or port or {}).get(key)
-        if v is not None and not v["free"] and not (key.startswith("tilt") and v["after"] == 0.0):
-            rows.append((label, f"{v['after']:.6g}{f' {unit}' if unit else ''}, fixed"))
-    return rows
-
-
-def _surface_words(one: Plain, d: Plain) -> str:
-    parallel = d["unknowns"]["parallel"]
-    others = [name for name in parallel if name != one["surface"] and one["surface"] in parallel]
-    return (
-        f"{one['points']:,} marked points, distance RMS {fixed(one['rms_m'], 4)} m (given"
-        f" {one['sigma_m']:g} m), largest {fixed(one['largest_m'], 4)} m ({one['largest_point']})"
-        + (f"; parallel to {', '.join(others)}" if others else "")
-    )
 
 
 # Maps
@@ -335,8 +310,19 @@ def _means(a: Adjusted, values: FloatArray) -> Maps:
 def _tables(d: Plain) -> list[Table]:
     """Return the tables that have rows, residuals first."""
     unit, p = d["image_unit"], d["precision"]
+    # lens and water before and after, as far as they were free
+    rows = [[label, *_change(row), of] for label, row, of in _unknowns(d)]
+    if d["poses_are"] == "similarity" and p is not None:
+        units = {"shift": "m", "turn": "rad", "scale": ""}
+        for row in p["shared"]:
+            if (kind := row["name"].partition(" ")[0]) in units:
+                sigma = row["sigma"]
+                error = "-" if sigma is None else f"{sigma:.2g}"
+                added = short(row["added"], sigma, "+")
+                rows.append([row["name"], "", "", added, error, units[kind]])
     header = ["", "before", "after", "change", "standard error", "unit"]
-    tables = [_residual_table(d), Table("Lens and water", header, _unknown_rows(d))]
+    tables = [_residual_table(d), Table("Lens and water", header, rows)]
+
     shared = [] if p is None else [row["name"].replace("_", " ") for row in p["shared"]]
     if len(shared) > 1:
         rows = [
@@ -344,10 +330,20 @@ def _tables(d: Plain) -> list[Table]:
             for name, row in zip(shared, p["correlation"], strict=True)
         ]
         tables.append(Table("Correlations of the shared unknowns", ["", *shared], rows))
+
+    rows = []
+    for role in ("control", "check"):
+        one = d[role] or {"points": []}
+        for row in one["points"]:
+            off = [fixed(row[key], 3, "+") for key in ("dx_m", "dy_m", "dz_m")]
+            rows.append([row["name"], role, *off, fixed(row["rms_px"], 2), str(row["images"])])
+        if one["points"]:
+            off = [fixed(value, 3) for value in one["rms_m"]]
+            rows.append([f"RMS, {role}", role, *off, fixed(one["rms_px"], 2), ""])
     header = ["", "role", "dX (m)", "dY (m)", "dZ (m)", f"RMS ({unit})", "images"]
-    title = "Control and check points, adjusted minus surveyed"
-    tables.append(Table(title, header, _surveyed_rows(d)))
-    rounds = [
+    tables.append(Table("Control and check points, adjusted minus surveyed", header, rows))
+
+    rows = [
         [
             str(row["round"]), str(row["steps"]), f"{row['observations']:,}",
             fixed(row["cost"], 1), fixed(row["rms_px"], 4),
@@ -355,7 +351,7 @@ def _tables(d: Plain) -> list[Table]:
         for row in d["rounds"]
     ]  # fmt: skip
     header = ["round", "steps", "observations", "cost", f"RMS ({unit})"]
-    return [table for table in [*tables, Table("Rounds", header, rounds)] if table.rows]
+    return [table for table in [*tables, Table("Rounds", header, rows)] if table.rows]
 
 
 def _residual_table(d: Plain) -> Table:
@@ -376,34 +372,6 @@ def _residual_table(d: Plain) -> Table:
         if (r := d["residuals"][key])["points"]
     ]  # fmt: skip
     return Table("Residuals and precision on land and under water", header, rows)
-
-
-def _unknown_rows(d: Plain) -> list[list[str]]:
-    """Return lens and water before and after, as far as they were free."""
-    rows = [[label, *_change(row), unit] for label, row, unit in _unknowns(d)]
-    if d["poses_are"] == "similarity" and d["precision"] is not None:
-        units = {"shift": "m", "turn": "rad", "scale": ""}
-        for row in d["precision"]["shared"]:
-            if (kind := row["name"].partition(" ")[0]) in units:
-                sigma = row["sigma"]
-                error = "-" if sigma is None else f"{sigma:.2g}"
-                added = short(row["added"], sigma, "+")
-                rows.append([row["name"], "", "", added, error, units[kind]])
-    return rows
-
-
-def _surveyed_rows(d: Plain) -> list[list[str]]:
-    """Return every control and check point."""
-    rows = []
-    for role in ("control", "check"):
-        one = d[role] or {"points": []}
-        for row in one["points"]:
-            off = [fixed(row[key], 3, "+") for key in ("dx_m", "dy_m", "dz_m")]
-            rows.append([row["name"], role, *off, fixed(row["rms_px"], 2), str(row["images"])])
-        if one["points"]:
-            off = [fixed(value, 3) for value in one["rms_m"]]
-            rows.append([f"RMS, {role}", role, *off, fixed(one["rms_px"], 2), ""])
-    return rows
 
 
 def _what_was_free(d: Plain) -> Table:

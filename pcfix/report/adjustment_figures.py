@@ -14,8 +14,7 @@ from pcfix.report.page import AFTER, BEFORE, WATER, Picture, label_plan, new_fig
 from pcfix.water.surface import surface_above
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    pass
 
 MOST_POINTS = 6000
 COLUMNS = 14
@@ -50,8 +49,26 @@ def _block(d: Plain, a: Adjusted) -> Picture | None:
     share = float(np.clip(size[1] / max(size[0], 1e-9), 0.25, 1.2))
     n = len(shown)
     figure, panels = new_figure(8.0, n * (5.2 * share + 1.4), nrows=n, squeeze=False)
+    xyz = a.xyz[a.is_observed]
+    xyz = xyz[:: max(1, len(xyz) // MOST_POINTS)]
+    side = float(max(np.ptp(a.cameras.centres[:, :2], axis=0).max(), 1e-3))
     for axes, (title, vectors, rows) in zip(panels.ravel(), shown, strict=True):
-        _arrows(figure, axes, a, vectors, rows)
+        # in plan as arrows, in height as colour
+        axes.plot(*xyz[:, :2].T, ".", color="0.85", markersize=1.5, zorder=1)
+        (x, y, _), (dx, dy, up) = a.cameras.centres[rows].T, np.nan_to_num(vectors[rows]).T
+        key = nice_step(max(float(np.percentile(np.hypot(dx, dy), 95.0)), 1e-6) / 2.0)
+        longer, reach = ARROW * side / key, max(float(np.abs(up).max()), 1e-6)
+        arrows = axes.quiver(
+            x, y, dx, dy, up, cmap=DIFFERENCE, scale=1.0 / longer, clim=(-reach, reach),
+            edgecolor="0.3", linewidth=0.5, width=0.007, **ARROW_LOOK,
+        )  # fmt: skip
+        axes.plot(x, y, "o", color="0.2", markersize=1.5, zorder=2)
+        figure.colorbar(arrows, ax=axes, label="Up (m)", shrink=0.8)
+        axes.quiverkey(arrows, 0.85, 1.05, key, f"{key:g} m", labelpos="E")
+        axes.update_datalim(np.column_stack([x + longer * dx, y + longer * dy]))
+        axes.margins(0.05)
+        axes.autoscale_view()
+        label_plan(axes)
         axes.set_title(title, loc="left", pad=12.0)
     alt = (
         "The block in plan. Enlarged arrows show how far each projection centre moved, and its"
@@ -59,29 +76,6 @@ def _block(d: Plain, a: Adjusted) -> Picture | None:
         f" The centres moved by {d['poses']['moved_rms_m']:.3f} m (rms)."
     )
     return Picture("block", "Projection centres", alt, figure)
-
-
-def _arrows(figure: Figure, axes: Axes, a: Adjusted, vectors: FloatArray, rows: BoolArray) -> None:
-    """Draw vectors at the projection centres: in plan as arrows, in height as colour."""
-    xyz = a.xyz[a.is_observed]
-    xyz = xyz[:: max(1, len(xyz) // MOST_POINTS)]
-    axes.plot(*xyz[:, :2].T, ".", color="0.85", markersize=1.5, zorder=1)
-    (x, y, _), (dx, dy, up) = a.cameras.centres[rows].T, np.nan_to_num(vectors[rows]).T
-    side = float(max(np.ptp(a.cameras.centres[:, :2], axis=0).max(), 1e-3))
-    key = nice_step(max(float(np.percentile(np.hypot(dx, dy), 95.0)), 1e-6) / 2.0)
-    reach = max(float(np.abs(up).max()), 1e-6)
-    arrows = axes.quiver(
-        x, y, dx, dy, up, cmap=DIFFERENCE, scale=key / (ARROW * side), clim=(-reach, reach),
-        edgecolor="0.3", linewidth=0.5, width=0.007, **ARROW_LOOK,
-    )  # fmt: skip
-    axes.plot(x, y, "o", color="0.2", markersize=1.5, zorder=2)
-    figure.colorbar(arrows, ax=axes, label="Up (m)", shrink=0.8)
-    axes.quiverkey(arrows, 0.85, 1.05, key, f"{key:g} m", labelpos="E")
-    longer = ARROW * side / key
-    axes.update_datalim(np.column_stack([x + longer * dx, y + longer * dy]))
-    axes.margins(0.05)
-    axes.autoscale_view()
-    label_plan(axes)
 
 
 def _by_depth(d: Plain, before: Before | None) -> Picture | None:

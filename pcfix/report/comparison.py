@@ -190,61 +190,52 @@ def gauss(of: Plain) -> str:
 
 def _tables(compared: Plain) -> list[Table]:
     """Return the tables for terminal and page; those without rows are omitted."""
-    bins = [_bins(title, compared[key]) for key, (title, _, _) in BINS.items()]
-    tables = [_statistics(compared), _c2c(compared), _depth_lines(compared), *bins]
-    return [table for table in tables if table.rows]
-
-
-def _statistics(compared: Plain) -> Table:
     names = {when: name for when, name, _ in TIMES}
+    c2c = c2c_rows(compared)
     found = [(f"{SIGNED[key][1]}, {names[when]}", s) for key, when, s in _signed(compared)]
-    found += [(f"C2C {way}, {name}", of["statistics"]) for way, name, _, of in c2c_rows(compared)]
+    found += [(f"C2C {way}, {name}", of["statistics"]) for way, name, _, of in c2c]
     rows = []
     for title, s in found:
         marks = s["percentiles_m"]
         values = [*(s[key] for key in MOMENTS.values()), marks["p5"], marks["p95"], s["max_m"]]
         rows.append([title, f"{s['count']:,}", *(f"{value:.3f}" for value in values)])
     title = f"Against {name_of(compared['reference'])} (m)"
-    return Table(title, ["", "points", *MOMENTS, "5 %", "95 %", "max"], rows)
+    tables = [Table(title, ["", "points", *MOMENTS, "5 %", "95 %", "max"], rows)]
 
-
-def _c2c(compared: Plain) -> Table:
-    rows = c2c_rows(compared)
-    bands = rows[0][-1].get("shares", ()) if rows else ()
+    bands = c2c[0][-1].get("shares", ()) if c2c else ()
     header = ["", "mean (m)", "std.dev. (m)", "classes"]
     header += [f"{one['low_m']:g} to {one['high_m']:g} m" for one in bands]
-    cells = [
+    rows = [
         [
             f"{way}, {name}", f"{of['normal']['mu_m']:.6f}", f"{of['normal']['sigma_m']:.6f}",
             str(len(of["histogram"]["counts"])),
             *(f"{100 * one['share']:.1f} %" for one in of.get("shares", ())),
         ]
-        for way, name, _, of in rows
+        for way, name, _, of in c2c
     ]  # fmt: skip
-    return Table("C2C: Gauss as CloudCompare fits it", header, cells)
+    tables.append(Table("C2C: Gauss as CloudCompare fits it", header, rows))
 
-
-def _depth_lines(compared: Plain) -> Table:
     lines = [(name, (compared["depth"] or {}).get(when)) for when, name, _ in TIMES]
     rows = [
         [name, f"{fit['slope']:.4f}", f"{fit['intercept_m']:+.3f}", f"{fit['r2']:.4f}"]
         for name, fit in lines
         if fit is not None
     ]
-    return Table("Depth against reference depth", ["", "slope", "intercept (m)", "r²"], rows)
+    header = ["", "slope", "intercept (m)", "r²"]
+    tables.append(Table("Depth against reference depth", header, rows))
 
-
-def _bins(title: str, bins: list[Plain]) -> Table:
-    """Return the errors of each class of depth or of distance from the shore."""
+    # of each class of depth or of distance from the shore
     figures = {"bias": "mean_m", "sd": "sd_m", "RMSE": "rmse_m", "NMAD": "nmad_m"}
-    header = [f"{figure}, {name}" for _, name, _ in TIMES for figure in figures]
-    rows = []
-    for one in bins:
-        both = [one[when] for when, _, _ in TIMES]
-        cells = ["" if s is None else f"{s[key]:.3f}" for s in both for key in figures.values()]
-        name = f"{one['from_m']:g} to {one['to_m']:g}"
-        rows.append([name, f"{one['after']['count']:,}", *cells])
-    return Table(title, ["", "points", *header], rows)
+    header = ["", "points", *(f"{one}, {name}" for name in names.values() for one in figures)]
+    for key, (title, _, _) in BINS.items():
+        rows = []
+        for one in compared[key]:
+            both = [one[when] for when in names]
+            cells = ["" if s is None else f"{s[of]:.3f}" for s in both for of in figures.values()]
+            name = f"{one['from_m']:g} to {one['to_m']:g}"
+            rows.append([name, f"{one['after']['count']:,}", *cells])
+        tables.append(Table(title, header, rows))
+    return [table for table in tables if table.rows]
 
 
 # Pictures
@@ -255,19 +246,27 @@ def evaluation(
     sections: list[Plain],
     dod: tuple[FloatArray, tuple[float, float, float, float]] | None = None,
 ) -> tuple[list[Picture], list[Table]]:
-    """Return pictures and tables.
+    """Return pictures and tables of a `Comparison.as_dict`.
 
-    Parameters
-    ----------
-    compared : dict
-        `Comparison.as_dict`.
-    sections : list of dict
-        With ``distance_m`` and ``heights_m`` as lists, None where nothing is known.
-    dod : pair, optional
-        Difference of the surfaces, shape (rows, columns), metres, and its west, east, south and
-        north.
+    `sections` have ``distance_m`` and ``heights_m`` as lists, None where nothing is known; `dod` is
+    the difference of the surfaces, shape (rows, columns), metres, and its west, east, south, north.
     """
-    pictures = _histograms(compared)
+    pictures, pair = [], compared["vertical"]
+    if pair is not None:
+        times = [(name, colour, pair[when]) for when, name, colour in TIMES if pair[when]]
+        figure, panels = new_figure(8.0, 2.4 * len(times) + 0.4, nrows=len(times), squeeze=False)
+        for axes, (name, colour, of) in zip(panels[:, 0], times, strict=True):
+            s = of["statistics"]
+            label = f"{name}: mean {s['mean_m']:.3f}, sd {s['sd_m']:.3f} m"
+            _histogram(axes, of, (s["mean_m"], s["sd_m"]), color=colour, label=label)
+        panels[-1, 0].set_xlabel("Cloud minus reference, Z (m)")
+        alt = f"Vertical error: histograms with fitted Gaussians. {_moments(times)}"
+        pictures.append(Picture("histogram_vertical", "Vertical error", alt, figure))
+    title = "Distance to the nearest point (C2C)"
+    c2c = [(f"{way}, {name}", colour, of) for way, name, colour, of in c2c_rows(compared)]
+    alt = f"{title}: histograms with fitted Gaussians. {_moments(c2c)}"
+    alt += _noted(compared, "cloud.sparse", "reference.sparse")
+    pictures.append(Picture("histogram_c2c", title, alt, c2c_figure(compared)))
     if dod is not None:
         reach = float(np.nanpercentile(np.abs(dod[0]), 98.0))
         alt = (
@@ -288,25 +287,6 @@ def evaluation(
     ]  # fmt: skip
     pictures += [_section(number, one) for number, one in enumerate(sections, start=1)]
     return pictures, _tables(compared)
-
-
-def _histograms(compared: Plain) -> list[Picture]:
-    pictures, pair = [], compared["vertical"]
-    if pair is not None:
-        rows = [(name, colour, pair[when]) for when, name, colour in TIMES if pair[when]]
-        figure, panels = new_figure(8.0, 2.4 * len(rows) + 0.4, nrows=len(rows), squeeze=False)
-        for axes, (name, colour, of) in zip(panels[:, 0], rows, strict=True):
-            s = of["statistics"]
-            label = f"{name}: mean {s['mean_m']:.3f}, sd {s['sd_m']:.3f} m"
-            _histogram(axes, of, (s["mean_m"], s["sd_m"]), color=colour, label=label)
-        panels[-1, 0].set_xlabel("Cloud minus reference, Z (m)")
-        alt = f"Vertical error: histograms with fitted Gaussians. {_moments(rows)}"
-        pictures.append(Picture("histogram_vertical", "Vertical error", alt, figure))
-    title = "Distance to the nearest point (C2C)"
-    rows = [(f"{way}, {name}", colour, of) for way, name, colour, of in c2c_rows(compared)]
-    alt = f"{title}: histograms with fitted Gaussians. {_moments(rows)}"
-    alt += _noted(compared, "cloud.sparse", "reference.sparse")
-    return [*pictures, Picture("histogram_c2c", title, alt, c2c_figure(compared))]
 
 
 def _moments(rows: list[tuple[str, str, Plain]]) -> str:

@@ -30,24 +30,14 @@ SMOOTH_CELLS = 1.5
 
 @dataclass(frozen=True)
 class Layer:
-    """One choice of the map: values of cells, shape (rows, columns), NaN where unknown.
-
-    Attributes
-    ----------
-    ramp : str
-        A ramp of `pcfix.grid.colours`.
-    plus_minus : str
-        Name of the layer with the uncertainty of this one at 95 %.
-    is_centred : bool
-        Whether its colours are centred on zero.
-    """
+    """One choice of the map: values of cells, shape (rows, columns), NaN where unknown."""
 
     name: str
     unit: str
     values: FloatArray
-    ramp: str = HEIGHT
-    plus_minus: str = ""
-    is_centred: bool = False
+    ramp: str = HEIGHT  # of `pcfix.grid.colours`
+    plus_minus: str = ""  # name of the layer with the uncertainty of this one at 95 %
+    is_centred: bool = False  # whether its colours are centred on zero
     has_contours: bool = False
 
 
@@ -59,7 +49,7 @@ def map_json(maps: Maps, layers: list[Layer]) -> str:
     west, _, _, north = maps.extent_m
     rows, columns = maps.height_m.shape
     shade = np.where(np.isfinite(maps.height_m), relief(maps.height_m, maps.cell_m) * 254.0, 0.0)
-    data = {
+    data: dict[str, Any] = {
         "rows": rows,
         "columns": columns,
         "west": west,
@@ -68,22 +58,17 @@ def map_json(maps: Maps, layers: list[Layer]) -> str:
         "noData": _NO_DATA,
         "shade": _packed(shade),
         "layers": [_of_layer(layer) for layer in layers],
-        **next((_contours(a, maps.uncertainty_m) for a in layers if a.has_contours), _NO_CONTOURS),
+        "interval": 0,
+        "contours": [],
     }
+    for layer in layers:
+        if layer.has_contours:  # lines whose places count from the corner of the map
+            data["interval"] = interval = depth_interval(layer.values, maps.uncertainty_m)
+            data["contours"] = [
+                {"level": level, "line": np.round(place + 0.5, 1).ravel().tolist()}
+                for level, place in contours(layer.values, interval)
+            ]
     return json.dumps(data, allow_nan=False).replace("<", "\\u003c")
-
-
-_NO_CONTOURS: dict[str, Any] = {"interval": 0, "contours": []}
-
-
-def _contours(layer: Layer, uncertainty_m: FloatArray) -> dict[str, Any]:
-    """Return lines whose places count from the corner of the map."""
-    interval = depth_interval(layer.values, uncertainty_m)
-    lines = [
-        {"level": level, "line": np.round(place + 0.5, 1).ravel().tolist()}
-        for level, place in contours(layer.values, interval)
-    ]
-    return {"interval": interval, "contours": lines}
 
 
 def relief(height_m: FloatArray, cell_m: float) -> FloatArray:

@@ -179,34 +179,20 @@ class Tile:
 
 @dataclass(frozen=True)
 class Report:
-    """The contents of the page, in its order.
-
-    Attributes
-    ----------
-    head : Table
-        Beside the map.
-    place : str
-        CRS and vertical datum of the map.
-    pictures : list of Picture
-        The first `FIGURES` are shown, the others folded.
-    tables : list of Table
-        The first is shown, the others folded.
-    files : list of pair
-        Path from the page, and its contents.
-    """
+    """The contents of the page, in its order."""
 
     title: str
     lead: str
-    head: Table
+    head: Table  # beside the map
     warnings: list[str]
     maps: Maps
     layers: list[Layer]
-    pictures: list[Picture]
-    tables: list[Table]
+    pictures: list[Picture]  # the first `FIGURES` are shown, the others folded
+    tables: list[Table]  # the first is shown, the others folded
     provenance: list[Table] = field(default_factory=list)
     tiles: Sequence[Tile] = ()
-    place: str = ""
-    files: Sequence[tuple[str, str]] = ()
+    place: str = ""  # CRS and vertical datum of the map
+    files: Sequence[tuple[str, str]] = ()  # path from the page, and its contents
 
 
 _FOLDERS = re.compile(r"(?<![\w.:/~-])(?:[A-Za-z]:)?[/\\](?:[^/\\\s:*?\"<>|]+[/\\])+")

@@ -17,7 +17,7 @@ from pcfix.grid.contours import contours, depth_interval
 from pcfix.grid.maps import Extent, Maps
 from pcfix.model import Cameras, FloatArray, WaterPlane, WaterSurface
 from pcfix.refract.tally import COVERAGE_95, ORDERS, Summary, largest_tvu_m
-from pcfix.report.first_screen import Survey, head_of, notes_of, tiles_of
+from pcfix.report.comparison import noise_sentence, raw_of, signed
 from pcfix.report.map_data import Layer, relief
 from pcfix.report.page import (
     AFTER,
@@ -27,68 +27,53 @@ from pcfix.report.page import (
     Picture,
     Report,
     Table,
+    Tile,
     label_plan,
     label_side,
     map_figure,
     name_of,
     new_figure,
 )
-from pcfix.report.text import formal_words, summary_rows, uncertainty_sentence
+from pcfix.report.text import FEWEST, formal_words, summary_rows, uncertainty_sentence
 from pcfix.version import __version__
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-
 Plain = dict[str, Any]
 Pair = tuple[str, str]
+SHIFT = "True minus apparent Z (m)"
+FIRST_FIGURES = ("water", "section_1", "depth_bins", "uncertainty", "cameras", "shift")
+"""Those that are shown where they are there, the first four of them."""
+CONTRADICTS = 1.5
+"""Measured and predicted errors that differ by a larger factor contradict each other."""
+SHOWN_NOTES = 3
+UNKNOWN_DATUM = "vertical datum not known"
 
 
 @dataclass(frozen=True, eq=False)
 class Corrected:
-    """A corrected cloud and what it was corrected with.
-
-    Attributes
-    ----------
-    depth_m : dict
-        Least (min), mean and greatest (max) depth of the bed's points that are not noise.
-    sample : array, shape (m, 3)
-        Z shift, depth and standard error of Z of corrected points, metres; zero where unknown.
-    """
+    """A corrected cloud and what it was corrected with."""
 
     summary: Summary
     survey: Survey
     cameras: Cameras
     water: WaterSurface
     maps: Maps
-    depth_m: dict[str, float]
-    sample: FloatArray
+    depth_m: dict[str, float]  # min, mean and max of the bed's points that are not noise
+    sample: FloatArray  # shape (m, 3): Z shift, depth and standard error of Z, zero where unknown
 
 
 @dataclass(frozen=True)
 class Later:
-    """What other steps of a run add to its page.
+    """What other steps of a run add to its page."""
 
-    Attributes
-    ----------
-    pictures, tables : sequence
-        The most important first.
-    verdict : str
-        One sentence that they come to.
-    compared : dict
-        `Comparison.as_dict`; measured figures replace predicted ones.
-    difference : pair, optional
-        Cloud minus reference, shape (rows, columns), metres, and its extent.
-    resolution_m : float, optional
-        Of the rasters and of the map.
-    """
-
-    pictures: Sequence[Picture] = ()
+    pictures: Sequence[Picture] = ()  # the most important first
     tables: Sequence[Table] = ()
-    verdict: str = ""
-    compared: Plain = field(default_factory=dict)
-    difference: tuple[FloatArray, Extent] | None = None
-    resolution_m: float | None = None
+    verdict: str = ""  # one sentence that they come to
+    compared: Plain = field(default_factory=dict)  # `Comparison.as_dict`
+    difference: tuple[FloatArray, Extent] | None = None  # cloud minus reference, metres
+    resolution_m: float | None = None  # of the rasters and of the map
 
     @property
     def tvu(self) -> Plain | None:
@@ -96,25 +81,32 @@ class Later:
         return self.compared.get("tvu")
 
 
-NOTHING_LATER = Later()
-SHIFT = "True minus apparent Z (m)"
-FIRST_FIGURES = ("water", "section_1", "depth_bins", "uncertainty", "cameras", "shift")
-"""Those that are shown where they are there, the first four of them."""
-
-
-def run_report(
-    corrected: Corrected, inputs: Table, files: Sequence[Pair], later: Later = NOTHING_LATER
-) -> Report:
+def run_report(corrected: Corrected, inputs: Table, files: Sequence[Pair], later: Later) -> Report:
     """Return what the page of a run says; `inputs` went in, and `files` lie beside it."""
     s, maps, survey = corrected.summary, corrected.maps, corrected.survey
     versions = [["pcfix", __version__], ["Python", platform.python_version()]]
     versions += [[name, version(name)] for name in ("numpy", "scipy", "numba", "laspy", "lazrs")]
-    pictures = [*_pictures(corrected), *_uncertainty_picture(corrected.sample, s, later)]
-    pictures += later.pictures
+    pictures = [*_pictures(corrected, later), *later.pictures]
     order = {name: place for place, name in enumerate(FIRST_FIGURES)}
+    mean = s.shift_z_m["mean"]
+    lead = (
+        f"Correction for refraction of {name_of(s.input)}: {s.corrected:,} of {s.points:,} points"
+        f" are under water and were moved, {abs(mean):.2f} m"
+        f" {'higher' if mean > 0.0 else 'deeper'} on average."
+    )
+    if s.carried is not None:
+        lead += (
+            " Before that, the whole cloud was transferred to the adjusted poses, which moved it by"
+            f" {s.carried['shift_m']['rms']:.2f} m (rms)."
+        )
+    # the rows of the terminal, with the detected reconstruction type in words
+    facts = {"Cloud": name_of(s.input), "Points": f"{s.points:,}", **dict(summary_rows(s))}
+    facts |= {"Method": f"{s.made['method']}. {s.made['because']}"} if s.made else {}
+    facts |= {"Uncertainty": uncertainty_sentence(s, later.tvu)}
+    rows = [[label, words] for label, words in facts.items() if label and words]
     return Report(
         title=survey.project or Path(name_of(s.input)).stem,
-        lead=_lead(s) + later.verdict,
+        lead=lead + later.verdict,
         head=head_of(s, survey),
         tiles=tiles_of(s, survey, later.compared, corrected.depth_m),
         warnings=notes_of(s, survey, later.compared),
@@ -125,7 +117,7 @@ def run_report(
         tables=[*later.tables, *_orders(s, later.tvu)],
         files=files,
         provenance=[
-            _facts(s, later.tvu),
+            Table("In short", [], rows),
             Table("Settings", ["setting", "value"], settings_rows(s.settings)),
             inputs,
             Table("Software", ["name", "version"], versions),
@@ -170,31 +162,8 @@ def _worded(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _lead(s: Summary) -> str:
-    mean = s.shift_z_m["mean"]
-    transferred = ""
-    if s.carried is not None:
-        transferred = (
-            " Before that, the whole cloud was transferred to the adjusted poses, which moved it by"
-            f" {s.carried['shift_m']['rms']:.2f} m (rms)."
-        )
-    return (
-        f"Correction for refraction of {name_of(s.input)}: {s.corrected:,} of {s.points:,} points"
-        f" are under water and were moved, {abs(mean):.2f} m"
-        f" {'higher' if mean > 0.0 else 'deeper'} on average.{transferred}"
-    )
-
-
-def _facts(s: Summary, measured: Plain | None) -> Table:
-    """Return the rows of the terminal, with the detected reconstruction type in words."""
-    words = dict(summary_rows(s))
-    words |= {"Method": f"{s.made['method']}. {s.made['because']}"} if s.made else {}
-    words |= {"Uncertainty": uncertainty_sentence(s, measured)}
-    rows = [[label, text] for label, text in words.items() if label and text]
-    return Table("In short", [], [["Cloud", name_of(s.input)], ["Points", f"{s.points:,}"], *rows])
-
-
-def _pictures(corrected: Corrected) -> list[Picture]:
+def _pictures(corrected: Corrected, later: Later) -> list[Picture]:
+    """Return maps, a histogram, the cameras, and TVU over depth where there are standard errors."""
     s, maps, depth = corrected.summary, corrected.maps, corrected.depth_m
     interval = depth_interval(maps.depth_m, maps.uncertainty_m)
     shade = relief(maps.height_m, maps.cell_m)
@@ -229,6 +198,21 @@ def _pictures(corrected: Corrected) -> list[Picture]:
             f" {s.cameras_used} of {s.cameras} see corrected points."
         )
         pictures.append(Picture("cameras", "Cameras", alt, cameras_figure(corrected)))
+    known = corrected.sample[:, 2] > 0.0
+    if s.uncertainty is not None and known.any():
+        bins = later.compared["depth_bins"] if later.tvu else []
+        dots = (
+            " Dots: the limit that 95 % of the differences to the reference keep, its noise"
+            " included."
+        )
+        alt = (
+            "Total vertical uncertainty at 95 % (1.96 standard errors of Z) over depth, and the"
+            f" limits of the orders of IHO S-44. {formal_words(s)}.{dots if bins else ''}"
+            " S-44 has requirements other than the TVU: position, features and coverage."
+        )
+        _, depth_m, sigma_z_m = corrected.sample[known].T
+        figure = tvu_figure(depth_m, sigma_z_m, bins)
+        pictures.append(Picture("uncertainty", "Vertical uncertainty", alt, figure))
     return pictures
 
 
@@ -272,24 +256,6 @@ def cameras_figure(corrected: Corrected) -> Figure:
     label_side(profile)
     profile.legend(loc="best")
     return figure
-
-
-def _uncertainty_picture(sample: FloatArray, s: Summary, later: Later) -> list[Picture]:
-    """Return TVU over depth, where the cloud has standard errors."""
-    known = sample[:, 2] > 0.0
-    if s.uncertainty is None or not known.any():
-        return []
-    bins = later.compared["depth_bins"] if later.tvu else []
-    dots = (
-        " Dots: the limit that 95 % of the differences to the reference keep, its noise included."
-    )
-    text = (
-        "Total vertical uncertainty at 95 % (1.96 standard errors of Z) over depth, and the limits"
-        f" of the orders of IHO S-44. {formal_words(s)}.{dots if bins else ''}"
-        " S-44 has requirements other than the TVU: position, features and coverage."
-    )
-    figure = tvu_figure(sample[known, 1], sample[known, 2], bins)
-    return [Picture("uncertainty", "Vertical uncertainty", text, figure)]
 
 
 def tvu_figure(
@@ -340,3 +306,153 @@ def _orders(s: Summary, measured: Plain | None) -> list[Table]:
     limit = "within sqrt(a^2 + (b depth)^2)"
     header = ["order", "a", "b", *(f"points with {name} {limit}" for name in known)]
     return [Table("Orders of IHO S-44, vertical", header, rows)] if known else []
+
+
+@dataclass(frozen=True)
+class Survey:
+    """Project, date of the images, CRS, and vertical datum; empty where not known."""
+
+    project: str = ""
+    date: str = ""
+    crs: str = ""
+    heights: str = ""
+
+    @property
+    def place(self) -> str:
+        """CRS and vertical datum of the map."""
+        return f"{self.crs or 'CRS not stated'}; heights: {self.heights or UNKNOWN_DATUM}."
+
+
+def head_of(s: Summary, survey: Survey) -> Table:
+    """Return the lines beside the map."""
+    shown = ("Submerged", "Cameras", "Water", "")
+    rows = [
+        ["Images", survey.date or "date not stated"],
+        ["CRS", survey.crs or "not stated by the cloud"],
+        ["Heights", survey.heights or f"{UNKNOWN_DATUM}: the cloud states none"],
+        ["Points", f"{s.points:,}"],
+        *([label, text] for label, text in summary_rows(s) if label in shown),
+    ]
+    return Table("The project", [], rows)
+
+
+def is_found(s: Summary) -> bool:
+    """Whether the water was sought in the cloud."""
+    return s.water_fit is not None and s.water_fit["model"] == "auto"
+
+
+def tiles_of(s: Summary, survey: Survey, compared: Plain, depth_m: Plain) -> list[Tile]:
+    """Return the three tiles: depth (`depth_m` with min, mean and max), accuracy, notes."""
+    mean = s.shift_z_m["mean"]
+    way = "up" if mean > 0.0 else "down"
+    depths = [
+        ("range", f"{depth_m['min']:.2f} to {depth_m['max']:.2f} m"),
+        ("mean", f"{depth_m['mean']:.2f} m"),
+    ]
+    moved = f"{s.corrected:,} points of the bed moved {way} by {abs(mean):.2f} m on average."
+    notes = notes_of(s, survey, compared)[:SHOWN_NOTES] or ["None."]
+    return [
+        Tile("Depth", figures=depths, notes=[moved]),
+        accuracy_tile(s, compared),
+        Tile("Warnings", notes=notes),
+    ]
+
+
+def in_short(tiles: Sequence[Tile]) -> str:
+    """Return the figures of `tiles_of` in a line, for the terminal."""
+    parts = []
+    for tile in tiles:
+        if tile.figures:
+            tag = f", {tile.tag}" if tile.tag else ""
+            figures = ", ".join(f"{name} {value}" for name, value in tile.figures)
+            parts.append(f"{tile.title[0].lower()}{tile.title[1:]}{tag}: {figures}")
+    return "; ".join(parts)
+
+
+def accuracy_tile(s: Summary, compared: Plain) -> Tile:
+    """Return the accuracy of the bed: measured where there is a reference, else predicted."""
+    if not compared.get("own"):
+        title, unknown = "Accuracy of the bed", "not known"
+        if s.uncertainty is None:
+            why = "There is no reference, and the points have no standard errors."
+            return Tile(title, "predicted", [("RMSE", unknown)], [why])
+        sigma, tvu = s.uncertainty["sigma_z_m"]["mean"], s.uncertainty["tvu_95_m"]["mean"]
+        figures = [
+            ("standard error", f"{sigma:.3f} m"), ("95 %", f"{tvu:.3f} m"), ("bias", unknown),
+        ]  # fmt: skip
+        why = (
+            "No reference was given. The prediction follows from assumed errors without a common"
+            " bias."
+        )
+        return Tile(title, "predicted", figures, [why])
+    own, pair = compared["own"], raw_of(compared)
+    raw, before = pair["after"], pair["before"]
+    known = raw if own["rmse_m"] is None else own
+    noise = noise_sentence(own, raw)
+    notes = [
+        f"At {raw['count']:,} points against {name_of(compared['reference'])}"
+        + (f"; before the correction, RMSE {before['rmse_m']:.3f} m." if before else "."),
+        noise[:1].upper() + noise[1:],
+    ]
+    if own["of"] == "bed" and compared["land"]:
+        land = compared["land"]["after"]
+        notes.append(
+            f"Land: bias {signed(land['mean_m'])}, RMSE {land['rmse_m']:.3f} m, reference included."
+        )
+    figures = [
+        ("bias", signed(own["mean_m"])), ("RMSE", f"{known['rmse_m']:.3f} m"),
+        ("95 %", f"{known['within_95_m']:.3f} m"),
+    ]  # fmt: skip
+    of = "bed" if own["of"] == "bed" else "cloud (bed and land are not separated)"
+    return Tile(f"Accuracy of the {of}", "measured", figures, notes)
+
+
+def notes_of(s: Summary, survey: Survey, compared: Plain) -> list[str]:
+    """Return what to check, the most important first."""
+    notes = [] if not compared.get("own") else _contradictions(s, compared)
+    if not compared.get("own"):
+        notes.append("No reference: the accuracy is predicted. Check points on the bed measure it.")
+    if s.poses is not None and s.poses["absorbed"] is None and s.cameras:
+        notes.append(f"Poses: {s.poses['words']}.")
+    if not survey.heights:
+        notes.append(
+            "The vertical datum is not known: water level, cloud and reference must have the same."
+        )
+    fate = {"withhold": "withheld", "keep": "kept", "drop": "dropped"}[s.settings["uncorrected"]]
+    notes += [
+        f"{count:,} points under water could not be corrected ({reason}). They were not moved and"
+        f" are {fate}."
+        for reason, count in s.uncorrected.items()
+        if count
+    ]
+    if s.water_unknown:
+        notes.append(f"{s.water_unknown:,} points have no known water surface above them.")
+    notes += [one["message"] for one in s.warnings]
+    notes += [one["message"] for one in compared.get("notes", ())]
+    return [note[:1].upper() + note[1:] for note in notes]
+
+
+def _contradictions(s: Summary, compared: Plain) -> list[str]:
+    """Return notes where measured errors are not the predicted ones, or the bed has a bias."""
+    own, bed = compared["own"], compared.get("bed")
+    if not bed:
+        return []
+    notes, after, noise = [], bed["after"], own["sigma_reference_m"]
+    if s.uncertainty is not None and after["count"] >= FEWEST:
+        sigma, measured = s.uncertainty["sigma_z_m"]["mean"], after["rmse_m"]
+        expected = (sigma**2 + noise**2) ** 0.5
+        if not 1.0 / CONTRADICTS <= measured / expected <= CONTRADICTS:
+            is_larger = measured > expected
+            notes.append(
+                f"The measured errors of the bed are {'larger' if is_larger else 'smaller'} than"
+                f" the predicted ones (RMSE {measured:.3f} m, predicted {expected:.3f} m with the"
+                f" reference's noise; 95 % predicted {COVERAGE_95 * sigma:.3f} m without): "
+                f"{'use the measured ones' if is_larger else 'the predicted ones are cautious'}."
+            )
+    bias = after["mean_m"]
+    if abs(bias) > max(after["sd_m"], noise):
+        notes.append(
+            f"The bed is too {'high' if bias > 0.0 else 'low'} by {abs(bias):.3f} m on average,"
+            " more than it scatters. Check water level, refractive index, vertical datum and poses."
+        )
+    return notes

@@ -165,7 +165,24 @@ def summary_text(summary: Summary) -> str:
 
 def summary_rows(s: Summary) -> Rows:
     """Return the facts of a correction, for the terminal and the report page."""
-    fit = s.water_fit or {}
+    fit, made, index = s.water_fit or {}, s.made, s.settings["index"]
+    method = str(s.settings["method"])
+    if made is not None and "made_of" in made:
+        sure = "detected" if made["sure"] else "detected, not certain"
+        method = f"{made['method']}, {made['made_of']} ({sure})"
+    elif made is not None:
+        method = f"{made['method']}. {made['because']}"
+    check = ""
+    if s.fit is not None and s.cameras:
+        unchecked = "; ".join(s.fit["unchecked"])
+        check = "cameras match the cloud" + (f" (not tested: {unchecked})" if unchecked else "")
+        if s.fit["doubts"]:
+            check = "cameras may not match the cloud; see the warnings"
+        elif not s.fit["fits"]:
+            check = "cameras and cloud could not be tested"
+    deeper_cm = None  # straight down, depth is in proportion to the index
+    if s.settings["index_from"] and s.depth_m:
+        deeper_cm = 100.0 * (1.0 - DEFAULT_REFRACTIVE_INDEX / index) * s.depth_m["mean"]
     values = vars(s) | {
         "part_words": _part_words(s.part),
         "fate": _FATE[s.settings["uncorrected"]],
@@ -174,16 +191,16 @@ def summary_rows(s: Summary) -> Rows:
         "corrected_words": "all corrected" if s.corrected == s.submerged
         else f"{s.corrected:,} corrected ({share(s.corrected, s.submerged)})",
         "unsure_share": share(s.unsure or 0, s.corrected),
-        "method": _method(s),
+        "method": method,
         "rays_per_point": s.rays / max(s.corrected, 1),
         "no_cameras": not s.cameras,
         "unused": _unused(s),
         "fit_points": ", {accepted} of {points} points".format(**fit) if "points" in fit else "",
-        "deeper_cm": _deeper_cm(s),
+        "deeper_cm": deeper_cm,
         "no_uncertainty": s.uncertainty is None and s.settings["dimensions"] == "all"
         and not s.cameras,
         "order": order_sentence(s),
-        "check": _check(s),
+        "check": check,
     }  # fmt: skip
     rows = filled(_CORRECTED, values)
     place = 1 + next((i for i, (label, _) in enumerate(rows) if label == "Submerged"), 0)
@@ -211,16 +228,6 @@ def _part_words(part: Plain | None) -> str:
     return f"a part of {part['of']:,} points,{words}"
 
 
-def _method(s: Summary) -> str:
-    made = s.made
-    if made is None:
-        return str(s.settings["method"])
-    if "made_of" not in made:
-        return f"{made['method']}. {made['because']}"
-    sure = "detected" if made["sure"] else "detected, not certain"
-    return f"{made['method']}, {made['made_of']} ({sure})"
-
-
 def _unused(s: Summary) -> str:
     """Return which cameras were not used, by the reason."""
     excluded = [name for names in s.cameras_left_out.values() for name in names]
@@ -232,25 +239,6 @@ def _unused(s: Summary) -> str:
         for why, names in groups.items()
         if names
     )
-
-
-def _deeper_cm(s: Summary) -> float | None:
-    """Return what a water's own index changes: straight down, depth is in proportion to it."""
-    if not s.settings["index_from"] or not s.depth_m:
-        return None
-    return 100.0 * (1.0 - DEFAULT_REFRACTIVE_INDEX / s.settings["index"]) * s.depth_m["mean"]
-
-
-def _check(s: Summary) -> str:
-    """Return what the test of cameras against cloud came to."""
-    if s.fit is None or not s.cameras:
-        return ""
-    if s.fit["doubts"]:
-        return "cameras may not match the cloud; see the warnings"
-    if not s.fit["fits"]:
-        return "cameras and cloud could not be tested"
-    more = f" (not tested: {'; '.join(s.fit['unchecked'])})" if s.fit["unchecked"] else ""
-    return f"cameras match the cloud{more}"
 
 
 def shoreline_rows(found: Plain | None) -> Rows:
@@ -307,12 +295,8 @@ _BUDGET: RowTable = (
 def budget_words(errors: Plain, level_from_fit: float | None = None) -> str:
     """Return the standard deviations that were assumed, as ``image 0.5 px, level 0.020 m``.
 
-    Parameters
-    ----------
-    errors : dict
-        The settings of a summary, with the options ``sigma_...``.
-    level_from_fit : float, optional
-        Standard error of the level that a fit gave, where the user stated none.
+    `errors` are the settings of a summary. Where the user stated none for the level, it is that of
+    a fit, if there was one.
     """
     level, source = errors["sigma_level"], ""
     if level is None:

@@ -10,13 +10,12 @@ import pytest
 from pyproj import CRS, Transformer
 
 import pcfix
-from pcfix.flow.checks import _sensors, check_cameras
+from pcfix.flow.cameras import _sensors, cameras_text, check_cameras
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.old_cameras import told_apart
 from pcfix.io.cameras.colmap import write_colmap
 from pcfix.lens.imaging import project
 from pcfix.model import Cameras, Lens
-from pcfix.report.cameras import cameras_text
 from tests.utils.program import run_pcfix
 from tests.utils.shared import ROOT, needs
 

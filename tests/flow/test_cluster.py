@@ -54,7 +54,7 @@ def cloud(tmp_path_factory):
 
 
 def test_refused(scheduler, cloud, tmp_path, monkeypatch):
-    monkeypatch.setattr("pcfix.flow.cluster.WAIT_S", 1)
+    monkeypatch.setattr("pcfix.flow.tiles.WAIT_S", 1)
     folder, address = scheduler
     words = ("label", cloud[0], tmp_path / "out", "--water", "0.37", "--scheduler")
     with socket.socket() as deaf:
@@ -112,7 +112,7 @@ def test_killed_worker(scheduler, workers, cloud, tmp_path):
 @pytest.mark.usefixtures("workers")
 def test_cleaned(scheduler, cloud, tmp_path, monkeypatch):
     here = pcfix.clean_file(cloud[0], tmp_path / "here")
-    monkeypatch.setattr("pcfix.flow.cluster.in_processes", None)  # nothing is done on this machine
+    monkeypatch.setattr("pcfix.flow.tiles.in_processes", None)  # nothing is done on this machine
     there = pcfix.clean_file(cloud[0], tmp_path / "there", scheduler=scheduler[1])
     assert there.noise == here.noise
     for path in cloud[0].iterdir():

@@ -7,10 +7,9 @@ import pytest
 
 import pcfix
 from pcfix.errors import PcfixWarning
-from pcfix.flow.checks import check_cameras
+from pcfix.flow.cameras import cameras_text, check_cameras
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.next_steps import adjust_words
-from pcfix.report.cameras import cameras_text
 from tests.utils.crops import middle_of
 from tests.utils.shared import ROOT, needs
 

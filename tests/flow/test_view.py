@@ -7,8 +7,8 @@ import pytest
 
 import pcfix
 from pcfix.flow import view
+from pcfix.flow.view import GREY, view_figure
 from pcfix.io.scenes import write_scene
-from pcfix.report.view import GREY, view_figure
 from tests.utils.codes import refused
 
 

@@ -9,7 +9,7 @@ import rasterio
 from scipy.spatial.transform import Rotation
 
 import pcfix
-from pcfix.flow.checks import check_water
+from pcfix.flow.water import check_water
 from tests.utils.codes import refused
 from tests.utils.program import run_pcfix
 from tests.utils.shared import ROOT

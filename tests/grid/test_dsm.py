@@ -13,7 +13,6 @@ import rasterio
 import pcfix
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow import dsm as flow
-from pcfix.flow import sorted_points
 from pcfix.flow.dsm import grid_dsm
 from pcfix.io.las import source
 from tests.grid.clouds import EAST, NORTH, awkward, scattered, write
@@ -62,7 +61,7 @@ def test_no_seams(awkward_cloud, tmp_path, monkeypatch, method, fill):
     for name, sizes in SIZES.items():
         with monkeypatch.context() as patch:
             for key, value in sizes.items():
-                for module in (source, flow, sorted_points):
+                for module in (source, flow):
                     if hasattr(module, key):
                         patch.setattr(module, key, value)
             patch.setattr(flow, "TIN_BLOCK_POINTS", sizes.get("BLOCK_POINTS", 400_000))

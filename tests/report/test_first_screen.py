@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pcfix.compare.statistics import own_of, statistics_of
-from pcfix.report.first_screen import Survey, accuracy_tile, notes_of
+from pcfix.report.run import Survey, accuracy_tile, notes_of
 
 KNOWN = Survey("", "", "a CRS", "a datum")
 

@@ -1,19 +1,30 @@
-"""The report of ``pcfix water`` on a water surface: its summary, and a picture of its evidence."""
+"""Describe a water surface: as it was given, fitted or found in a cloud; ``pcfix water``."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pcfix.errors import shown_once
+from pcfix.flow.cameras import sample_of
+from pcfix.flow.runner import check_summary, write_plot, write_summary
+from pcfix.flow.shore import check_shoreline, write_shoreline
+from pcfix.flow.surfaces import file_points, find_surface, view_of
 from pcfix.grid.colours import DIFFERENCE
-from pcfix.model import FloatArray
+from pcfix.grid.shoreline import NearWater
+from pcfix.io.files import check_input
+from pcfix.model import FloatArray, WaterDimension
+from pcfix.options.declare import taken
+from pcfix.options.survey import WaterCheckOptions
 from pcfix.report.page import AFTER, BEFORE, WATER, Picture, draw_cloud, label_plan, new_figure
 from pcfix.report.text import Rows, RowTable, aligned, filled, shoreline_rows
 from pcfix.water.auto import WaterProposal
 from pcfix.water.fit import WaterFit
 from pcfix.water.river import RiverFit
+from pcfix.water.surface import surface_above
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -21,6 +32,8 @@ if TYPE_CHECKING:
 
     from pcfix.water.surface import FoundSurface
 
+SAMPLE_POINTS = 200_000
+"""Points of the cloud that are compared with the water, evenly spread."""
 MOST_LISTED = 10
 WITNESSES = ("brightness", "noise")
 """Evidence that does not fix the level; it is drawn with thin lines."""
@@ -40,57 +53,85 @@ _FIT: RowTable = (
 )  # fmt: skip
 
 
+def check_water(
+    spec: Any, options: WaterCheckOptions | None = None, **keywords: Any
+) -> WaterReport:
+    """Read, fit or find a water surface, and describe it; ``pcfix water``.
+
+    Parameters
+    ----------
+    spec : WaterSurface, float, str or path
+        See `pcfix.flow.surfaces.find_surface`.
+    options : WaterCheckOptions, optional
+        Or its attributes as keywords.
+    """
+    given = taken(WaterCheckOptions, options, keywords, "check_water")
+    cloud = given.cloud
+    inputs = [] if cloud is None else [cloud]
+    check_summary(given, inputs)
+    check_shoreline(given.shoreline, overwrite=given.overwrite, inputs=inputs)
+    view = None if cloud is None else view_of(check_input(cloud))
+    found = shown_once(lambda: find_surface(spec, given, view), lambda found: found.notes)
+    sample, below, unknown, shoreline = np.zeros((0, 3)), None, None, None
+    if view is not None:
+        sample, _ = sample_of(view, SAMPLE_POINTS)
+        if not isinstance(found.surface, WaterDimension):
+            height = surface_above(found.surface, sample, None).height_m
+            unknown = float(np.mean(~np.isfinite(height)))
+            below = float(np.mean(sample[:, 2] < height))
+    if view is not None and given.shoreline is not None:
+        points = NearWater()
+        for one in file_points(Path(view.name), found.surface):
+            above = surface_above(found.surface, one.xyz, one.heights)
+            points += NearWater.of(one.xyz, one.xyz[:, 2] - above.height_m)
+        shoreline = write_shoreline(
+            given.shoreline, points, found.sigma_level_m, view.crs, overwrite=given.overwrite
+        )
+    name = None if view is None else view.name
+    report = WaterReport(str(spec), found, name, below, unknown, sample, shoreline)
+    if given.plot is not None:
+        write_plot(given, water_figure(report))
+    write_summary(given, report.as_dict())
+    return report
+
+
 @dataclass(frozen=True, eq=False)
 class WaterReport:
-    """The report of ``pcfix water``.
-
-    Attributes
-    ----------
-    below, unknown : float or None
-        Share of the cloud's points below the surface, and of those without a surface above them.
-    sample_xyz : array, shape (m, 3)
-        Points of the cloud, evenly spread, for a picture.
-    shoreline : dict or None
-        File, lines and length of the shoreline that was written.
-    """
+    """The report of ``pcfix water``."""
 
     spec: str
     found: FoundSurface
     cloud: str | None
-    below: float | None
-    unknown: float | None
-    sample_xyz: FloatArray
-    shoreline: dict[str, Any] | None = None
+    below: float | None  # share of the cloud's points below the surface
+    unknown: float | None  # share of those without a surface above them
+    sample_xyz: FloatArray  # points of the cloud, shape (m, 3), for a picture
+    shoreline: dict[str, Any] | None = None  # file, lines and length of the one that was written
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
+        found, fit, points = self.found, self.found.evidence, None
+        if found.points is not None and isinstance(fit, WaterFit | RiverFit):
+            points = [
+                {
+                    "xyz": [float(v) if np.isfinite(v) else None for v in xyz],
+                    "residual_m": float(residual) if np.isfinite(residual) else None,
+                    "accepted": bool(accepted),
+                }
+                for xyz, residual, accepted in zip(
+                    found.points, fit.residual_m, fit.accepted, strict=True
+                )
+            ]
         return {
             "water": self.spec,
-            "surface": str(self.found.surface),
-            "fit": self.found.as_dict(),
-            "points": _residuals(self.found),
+            "surface": str(found.surface),
+            "fit": found.as_dict(),
+            "points": points,
             "cloud": self.cloud,
             "share_below": self.below,
             "share_unknown": self.unknown,
             "shoreline": self.shoreline,
-            "notes": list(map(str, self.found.notes)),
+            "notes": list(map(str, found.notes)),
         }
-
-
-def _residuals(found: FoundSurface) -> list[dict[str, Any]] | None:
-    """Return each fitted point with its residual, None where it has no height."""
-    fit = found.evidence
-    if found.points is None or not isinstance(fit, WaterFit | RiverFit):
-        return None
-    rows = zip(found.points, fit.residual_m, fit.accepted, strict=True)
-    return [
-        {
-            "xyz": [float(v) if np.isfinite(v) else None for v in xyz],
-            "residual_m": float(residual) if np.isfinite(residual) else None,
-            "accepted": bool(accepted),
-        }
-        for xyz, residual, accepted in rows
-    ]
 
 
 def water_text(report: WaterReport) -> str:

@@ -1,0 +1,493 @@
+"""Inspect a camera file: contents, fit to a cloud, absorbed refraction; ``pcfix cameras``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pcfix.adjust.diagnosis import Diagnosis, Evidence, export_of
+from pcfix.errors import InputError, SettingError, shown_once
+from pcfix.flow.diagnosis import (
+    diagnose,
+    focal_length_of,
+    given_focal_lengths,
+    has_datum,
+    quick_ties,
+    ties_of,
+)
+from pcfix.flow.inputs import Inputs
+from pcfix.flow.next_steps import adjust_words
+from pcfix.flow.plausibility import Flight, plausible
+from pcfix.flow.runner import check_summary, write_plot, write_summary
+from pcfix.flow.surfaces import CloudView, file_points, view_of
+from pcfix.io.cameras.georeference import adjusted_minus_gnss
+from pcfix.io.cameras.mistakes import UNDULATION_M, likely_mistake
+from pcfix.io.clouds import check_same_crs, read_reference
+from pcfix.io.files import check_input
+from pcfix.io.gnss_positions import read_gnss
+from pcfix.io.ground_control import read_ground_control
+from pcfix.lens.frames import cameras_in_sight, footprint
+from pcfix.lens.imaging import unproject
+from pcfix.model import Cameras, FloatArray, Lens, TiePoints, WaterDimension, WaterSurface
+from pcfix.options.declare import File, taken
+from pcfix.options.survey import CamerasCheckOptions
+from pcfix.report.page import AFTER, WATER, draw_cloud, label_plan, label_side, new_figure
+from pcfix.report.text import aligned
+from pcfix.water.index import index_of
+from pcfix.water.surface import surface_above
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+MOST_SENSORS = 8
+"""Lines on lenses; if there are more, they are grouped by sensor and frame, or by kind."""
+SAMPLE_POINTS = 50_000
+"""Points of the cloud that are tested in the frames, evenly spread."""
+MOST_FOOTPRINTS = 400
+SHORT_CRS, SHOWN_NAMES = 60, 5
+
+
+def check_cameras(
+    path: File, options: CamerasCheckOptions | None = None, **keywords: Any
+) -> CamerasReport:
+    """Inspect a camera file: contents, fit to a cloud, absorbed refraction; ``pcfix cameras``.
+
+    Parameters
+    ----------
+    path : path
+        See `pcfix.read_cameras`.
+    options : CamerasCheckOptions, optional
+        Or its attributes as keywords. With a cloud and water it is tested whether the poses have
+        absorbed refraction, see `pcfix.adjust.diagnosis`.
+    """
+    given = taken(CamerasCheckOptions, options, keywords, "check_cameras")
+    cloud = given.cloud
+    files = [path, cloud, given.gnss, given.gcps, given.lens, given.reference]
+    check_summary(given, [file for file in files if file is not None])
+    if cloud is None or given.water is None:
+        for name in ("gcps", "lens", "reference"):
+            if getattr(given, name) is not None:
+                sentence = f"{name} needs cloud and water, to test for absorbed refraction."
+                raise SettingError("option.needs", sentence, options=[name, "cloud", "water"])
+    water = 0.0 if given.water is None else given.water
+    inputs = replace(replace(given, water=water).part(Inputs), cameras=path)
+    read = shown_once(inputs.read, lambda cameras: cameras.notes)
+    view = None if cloud is None else view_of(check_input(cloud))
+    surface = None if given.water is None else inputs.surface(view).surface
+    xyz, heights, problem = np.zeros((0, 3)), None, ""
+    if view is not None:
+        xyz, heights = sample_of(view, SAMPLE_POINTS, surface)
+        cameras = inputs.block(view.crs, read)[0]
+    else:
+        try:
+            cameras = inputs.block(None, read)[0]
+        except InputError as error:
+            cameras, problem = read, str(error)
+    if given.gnss is not None:
+        cameras = read_gnss(given.gnss, cameras)
+    diagnosis, remedy = None, ("", "")
+    if view is not None and surface is not None:
+        reference = None if given.reference is None else read_reference(given.reference)
+        if reference is not None:
+            crs = None if isinstance(view.crs, str) else view.crs
+            check_same_crs(view.name, crs, reference.name, reference.crs)
+        control = None if given.gcps is None else read_ground_control(given.gcps, cameras).surveyed
+        lens = given.lens
+        evidence = Evidence(
+            cameras, str(path), surface, index_of(given.index, given.index_formula)[0],
+            view=view, reference=reference, control=control,
+            calibrated=given_focal_lengths(str(path)) if lens is None else focal_length_of(lens),
+            ties=ties_of(inputs, view.crs),
+        )  # fmt: skip
+        diagnosis = diagnose(evidence)
+        surveys = {name: getattr(given, name) for name in ("gnss", "gcps", "lens", "index")}
+        remedy = adjust_words(inputs, view.name, has_datum=has_datum(cameras, str(path)), **surveys)
+    level = None
+    if surface is not None and not (isinstance(surface, WaterDimension) and heights is None):
+        at = cameras.centres if heights is None else xyz
+        known_m = surface_above(surface, at, heights).height_m
+        level = float(np.nanmean(known_m)) if np.isfinite(known_m).any() else None
+    above = range_m = tilt_deg = None
+    if level is not None and not problem:  # geocentric cameras have no heights
+        above = cameras.centres[:, 2] - level
+        range_m = float(above.min()), float(above.mean()), float(above.max())
+    if cameras.rotations is not None and not problem:
+        tilt = np.degrees(np.arccos(np.clip(-cameras.rotations[:, 2, 2], -1.0, 1.0)))
+        tilt_deg = float(np.median(tilt)), float(tilt.max())
+    gnss, fit = _gnss(cameras, str(path)), None
+    if view is not None:
+        flight = Flight(path, level, every=view.points / max(len(xyz), 1))
+        fit = _fit(cameras, view, xyz, quick_ties(inputs, view.crs), flight)
+        up = None if gnss is None or inputs.cameras_crs is None else gnss.mean_m[2]
+        if up is not None and abs(up) >= UNDULATION_M[0] and not fit.verdict:
+            verdict = (
+                f"With --cameras-crs the cameras are {abs(up):.1f} m"
+                f" {'above' if up > 0.0 else 'below'} their GNSS heights. One of them is likely"
+                " above the ellipsoid and the other above the geoid; check the vertical CRS."
+            )
+            fit = replace(fit, verdict=verdict)
+    report = CamerasReport(
+        path=str(path),
+        cameras=cameras,
+        crs_read=read.crs,
+        sensors=_sensors(cameras, above),
+        height_above_water_m=range_m,
+        tilt_deg=tilt_deg,
+        gnss=gnss,
+        fit=fit,
+        sample_xyz=xyz,
+        level_m=level,
+        problem=problem,
+        diagnosis=diagnosis,
+        remedy=remedy,
+    )
+    if given.plot is not None:
+        write_plot(given, block_figure(report))
+    write_summary(given, report.as_dict())
+    return report
+
+
+def sample_of(
+    view: CloudView, most: int, water: WaterSurface | None = None
+) -> tuple[FloatArray, FloatArray | None]:
+    """Return points evenly spread over the file, and their water heights if it has any."""
+    every = max(1, view.points // most)
+    parts, heights = [], []
+    for xyz, height, *_ in file_points(Path(view.name), water):
+        parts.append(xyz[::every])
+        if height is not None:
+            heights.append(height[::every])
+    return np.vstack(parts), np.concatenate(heights) if heights else None
+
+
+def _sensors(cameras: Cameras, above_m: FloatArray | None) -> tuple[Sensor, ...]:
+    """Return the lenses of a block: each separately, or grouped by frame or kind if many."""
+    lenses = cameras.lenses
+    if lenses is None:
+        return ()
+    keys: list[Callable[[Lens], Any]] = [
+        lambda lens: lens,
+        lambda lens: (lens.sensor, lens.width, lens.height, lens.unit, lens.projection),
+        lambda lens: (lens.unit, lens.projection, _is_distorted(lens)),
+    ]
+    groups: dict[Any, list[int]] = {}
+    for key in keys:
+        groups = {}
+        for row, lens in enumerate(lenses):
+            groups.setdefault(key(lens), []).append(row)
+        # separately only if most lenses have several images
+        if len(groups) <= MOST_SENSORS and (key is not keys[0] or len(groups) <= len(lenses) // 2):
+            break
+    calibrated = any(_is_distorted(lens) for lens in lenses)
+    return tuple(_sensor(lenses, rows, above_m, calibrated) for rows in groups.values())
+
+
+def _is_distorted(lens: Lens) -> bool:
+    return any((*lens.radial, *lens.denominator, *lens.tangential, *lens.thin_prism))
+
+
+def _sensor(
+    lenses: tuple[Lens, ...], rows: list[int], above_m: FloatArray | None, calibrated: bool
+) -> Sensor:
+    lens, alike = lenses[rows[0]], list(dict.fromkeys(lenses[row] for row in rows))
+    pixel = lens.pixel_size_mm
+    focal_px = lens.focal if lens.unit == "px" else None if pixel is None else lens.focal / pixel
+    above = None if above_m is None else float(np.mean(above_m[rows]))
+    middle = (lens.principal_x, lens.principal_y) == (lens.width / 2.0, lens.height / 2.0)
+    return Sensor(
+        name=lens.sensor if all(one.sensor == lens.sensor for one in alike) else "several",
+        images=len(rows),
+        width=lens.width,
+        height=lens.height,
+        focal=min(one.focal for one in alike),
+        unit=lens.unit,
+        focal_mm=lens.focal if lens.unit == "mm" else None if pixel is None else lens.focal * pixel,
+        pixel_size_um=None if pixel is None else 1000.0 * pixel,
+        projection=lens.projection,
+        distorted=_is_distorted(lens),
+        gsd_m=above / focal_px if above is not None and above > 0.0 and focal_px else None,
+        lenses=len(alike),
+        focal_most=max(one.focal for one in alike),
+        frames=len({(one.width, one.height) for one in alike}),
+        folded=max(_folded(one) for one in alike[:: 1 + len(alike) // 20]),
+        nominal=calibrated and middle and not _is_distorted(lens),
+    )
+
+
+def _folded(lens: Lens) -> float:
+    """Return the share of the frame that no direction is imaged to, beyond the fold of the lens."""
+    if not _is_distorted(lens):  # the border of a fisheye's image is none
+        return 0.0
+    across = np.linspace(0.0, 1.0, 41)
+    places = np.stack(np.meshgrid(across * lens.width, across * lens.height), axis=-1)
+    return float(np.mean(np.isnan(unproject(lens, places.reshape(-1, 2))).any(axis=1)))
+
+
+def _gnss(cameras: Cameras, name: str) -> GnssResiduals | None:
+    """Return how far the projection centres are from their GNSS positions."""
+    if cameras.gnss is None:
+        return None
+    found = adjusted_minus_gnss(cameras, name)
+    rows = np.flatnonzero(np.isfinite(found.enu_m[:, 0]))
+    if len(rows) == 0:
+        return GnssResiduals(0, (None,) * 3, (None,) * 3, 0.0, "", found.reason)
+    enu = found.enu_m[rows]
+    length = np.sqrt(np.nansum(enu * enu, axis=1))
+    worst = int(np.argmax(length))
+    mean, sd = (
+        tuple(float(one) if np.isfinite(one) else None for one in values)
+        for values in (enu.mean(axis=0), enu.std(axis=0))
+    )
+    image = cameras.labels[rows[worst]]
+    return GnssResiduals(len(rows), mean, sd, float(length[worst]), image, found.reason)
+
+
+def _fit(
+    cameras: Cameras, view: CloudView, xyz: FloatArray, ties: TiePoints | None, flight: Flight
+) -> Fit:
+    """Test cameras against a sample of the cloud."""
+    from scipy.spatial import cKDTree
+
+    visible = cameras_in_sight(xyz, cameras)
+    shares = {str(k): float(np.mean(visible == k)) for k in (0, 1, 2)}
+    shares["3 or more"] = float(np.mean(visible >= 3))
+    low, high, centres = xyz.min(axis=0), xyz.max(axis=0), cameras.centres
+    apart = np.maximum(np.maximum(low - centres.max(axis=0), centres.min(axis=0) - high), 0.0)[:2]
+    # cameras lower than the nearest point of the cloud in plan
+    reach = float(np.hypot(*np.ptp(xyz[:, :2], axis=0))) * 0.1 + 1.0
+    distance, row = (np.asarray(one) for one in cKDTree(xyz[:, :2]).query(centres[:, :2]))
+    below = int(np.count_nonzero((distance < reach) & (centres[:, 2] <= xyz[row, 2])))
+    verdict = likely_mistake(centres, low, high, view.crs) or ""
+    if not verdict and below:
+        verdict = (
+            f"{below} of {len(cameras)} cameras are below the ground. Check the vertical datum and"
+            " the order of the axes."
+        )
+    found = plausible(cameras, xyz, ties, flight=flight)
+    verdict = verdict or " ".join(map(str, found.doubts))
+    return Fit(view.name, len(xyz), shares, float(np.hypot(*apart)), below, verdict, str(found))
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """The images of one interior orientation, or of several alike; None where not stated."""
+
+    name: str
+    images: int
+    width: float
+    height: float
+    focal: float  # the shortest of them
+    unit: str
+    focal_mm: float | None
+    pixel_size_um: float | None
+    projection: str
+    distorted: bool
+    gsd_m: float | None
+    lenses: int = 1  # that differ
+    focal_most: float | None = None
+    frames: int = 1  # sizes that differ
+    folded: float = 0.0  # share of the frame beyond the fold of the distortion
+    nominal: bool = False  # not calibrated, though others of the block are
+
+
+@dataclass(frozen=True)
+class GnssResiduals:
+    """Adjusted centres minus positions of the GNSS, metres east, north, up."""
+
+    images: int
+    mean_m: tuple[float | None, ...]
+    sd_m: tuple[float | None, ...]
+    largest_m: float
+    largest_image: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How well cameras and cloud match."""
+
+    cloud: str
+    points_sampled: int
+    seen_by: dict[str, float]  # share of the points that 0, 1, 2, 3 or more frames hold
+    distance_m: float  # in plan, between the boxes around block and cloud
+    below_ground: int  # cameras lower than the cloud's highest point within their reach in plan
+    verdict: str  # what is likely wrong; empty where they match
+    tested: str = "not checked"  # what was tested, and what was not
+
+    @property
+    def fits(self) -> bool:
+        """Whether nothing looks wrong."""
+        return not self.verdict
+
+
+@dataclass(frozen=True, eq=False)
+class CamerasReport:
+    """The report of ``pcfix cameras``."""
+
+    path: str
+    cameras: Cameras  # in the cloud's CRS, where there is a cloud
+    crs_read: str | None  # of the file
+    sensors: tuple[Sensor, ...]
+    height_above_water_m: tuple[float, float, float] | None  # least, mean, largest
+    tilt_deg: tuple[float, float] | None  # of the optical axes from nadir: median, largest
+    gnss: GnssResiduals | None
+    fit: Fit | None
+    sample_xyz: FloatArray  # points of the cloud, shape (m, 3), for a picture
+    level_m: float | None  # mean height of the water
+    problem: str = ""  # why the cameras are not in a map and have no heights
+    diagnosis: Diagnosis | None = None  # whether the poses have absorbed the refraction
+    remedy: tuple[str, str] = ("", "")  # the command that corrects the poses, and a remark
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        cameras, fit = self.cameras, self.fit
+        return {
+            "path": self.path,
+            "source": cameras.source,
+            "images_posed": len(cameras),
+            "images_unposed": list(cameras.unposed),
+            "crs_read": self.crs_read,
+            "crs": cameras.crs,
+            "sensors": [asdict(sensor) for sensor in self.sensors],
+            "height_above_water_m": self.height_above_water_m,
+            "tilt_deg": self.tilt_deg,
+            "problem": self.problem,
+            "gnss": self.gnss and asdict(self.gnss),
+            "fit": fit and {**asdict(fit), "fits": fit.fits},
+            "refraction": self.diagnosis and self.diagnosis.as_dict(),
+            "notes": [str(note) for note in cameras.notes],
+        }
+
+
+def cameras_text(r: CamerasReport) -> str:
+    """Return the summary of a camera file."""
+    cameras, missing = r.cameras, r.cameras.unposed
+    images = f"{len(cameras):,} with a pose"
+    if missing:
+        more = ", ..." if len(missing) > SHOWN_NAMES else ""
+        images += f", {len(missing):,} without: {', '.join(missing[:SHOWN_NAMES])}{more}"
+    rows = [("Images", images), *(row for one in r.sensors for row in sensor_rows(one))]
+    if not r.sensors:
+        rows.append(("Sensor", "none: the frames are not known"))
+    if cameras.rotations is None:
+        rows.append(("Angles", "none: every camera counts as visible from every point"))
+    rows.append(("CRS", _short(r.crs_read) or "not stated"))
+    if cameras.crs != r.crs_read:
+        rows.append(("CRS of cloud", _short(cameras.crs) or "not stated"))
+    if r.problem:
+        rows.append(("Problem", r.problem))
+    else:
+        z = cameras.centres[:, 2]
+        rows.append(("Heights", f"{z.min():.2f} to {z.max():.2f} m, mean {z.mean():.2f} m"))
+    if r.height_above_water_m is not None:
+        low, mean, high = r.height_above_water_m
+        rows.append(("Above water", f"{low:.1f} to {high:.1f} m, mean {mean:.1f} m"))
+    if r.tilt_deg is not None:
+        rows.append(("Tilt", "median {:.1f} deg, largest {:.1f} deg".format(*r.tilt_deg)))
+    if (g := r.gnss) is not None:
+        means, deviations = (
+            ", ".join("-" if v is None else f"{v:{sign}.3f}" for v in values)
+            for values, sign in ((g.mean_m, "+"), (g.sd_m, ""))
+        )
+        words = (
+            f"{g.images:,} images; adjusted minus GNSS east, north, up: mean {means} m, sd"
+            f" {deviations} m;"
+            f" largest {g.largest_m:.3f} m ({g.largest_image})"
+        )
+        rows += [("GNSS", words)] if g.images else []
+        rows += [("" if g.images else "GNSS", g.reason)] if g.reason or not g.images else []
+    if (fit := r.fit) is not None:
+        seen = ", ".join(f"{name}: {100.0 * part:.1f} %" for name, part in fit.seen_by.items())
+        rows += [
+            ("Cloud", f"{fit.cloud} ({fit.points_sampled:,} points sampled)"),
+            ("Visible", f"share of points by number of cameras: {seen}"),
+        ]
+        if fit.distance_m > 0.0:
+            rows.append(("Distance", f"{fit.distance_m:,.1f} m in plan between block and cloud"))
+        if fit.below_ground:
+            rows.append(("Below ground", f"{fit.below_ground} cameras"))
+        rows.append(("Check", fit.verdict or fit.tested))
+    if (found := r.diagnosis) is not None:
+        says = {True: "absorbed", False: "not absorbed", None: "open"}
+        if found.absorbed:
+            verdict = found.sentence(*r.remedy)
+        elif found.absorbed is False and found.decided_by is not None:
+            verdict = f"the poses have not absorbed the refraction, by {found.decided_by.name}"
+        else:
+            verdict = f"not known; give control points (--gcps), or {export_of(cameras)}"
+        rows.append(("Refraction", verdict))
+        rows += [("", f"{s.name}: {says[s.speaks]}. {s.words}") for s in found.signs]
+    return aligned(f"{r.path}: {cameras.source or 'cameras'}", rows, cameras.notes)
+
+
+def sensor_rows(s: Sensor) -> list[tuple[str, str]]:
+    """Return frame, focal length and pixel size of a sensor, and what is wrong with its lens."""
+    low, high = f"{s.focal:.6g}", f"{s.focal_most or s.focal:.6g}"
+    size = f"{s.width:g} x {s.height:g} {s.unit}"
+    parts = [
+        f"{s.images:,} images" + (f" with {s.lenses:,} different lenses" if s.lenses > 1 else ""),
+        f"{s.frames} sizes as {size}" if s.frames > 1 else size,
+        f"focal length {low if low == high else f'{low} to {high}'} {s.unit}",
+    ]
+    if s.pixel_size_um is not None and s.focal_mm is not None:
+        parts[-1] += "" if s.lenses > 1 else f" = {s.focal_mm:.3f} mm"
+        parts.append(f"pixel {s.pixel_size_um:.2f} um")
+    parts += [s.projection, *(["distorted"] if s.distorted else [])]
+    parts += [] if s.gsd_m is None else [f"GSD {100.0 * s.gsd_m:.2f} cm at the water"]
+    rows = [("Sensor", f"{s.name or 'unnamed'}: {', '.join(parts)}")]
+    if s.folded:
+        rows.append(("", f"the distortion folds within the frame: {100.0 * s.folded:.2g} % of it is"
+                     " not used; check the radial coefficients"))  # fmt: skip
+    if s.nominal:
+        rows.append(("", "not calibrated, unlike the others; its images likely had no tie points,"
+                     " so do not trust their poses"))  # fmt: skip
+    return rows
+
+
+def _short(crs: str | None) -> str:
+    """Return the name of a CRS, whose text may be pages long."""
+    if crs is None or len(crs) < SHORT_CRS:
+        return crs or ""
+    return crs.split('"')[1] if '"' in crs else crs[:SHORT_CRS] + " ..."
+
+
+def draw_footprints(plan: Axes, cameras: Cameras, level_m: float, **look: Any) -> bool:
+    """Draw footprints on a level, of at most `MOST_FOOTPRINTS` images; return whether any exist."""
+    is_drawn = False
+    for row in range(0, len(cameras), max(1, len(cameras) // MOST_FOOTPRINTS)):
+        border = footprint(cameras, row, level_m)
+        if len(border) and np.isfinite(border).all():
+            plan.plot(*np.vstack([border, border[:1]]).T, color=WATER, **look)
+            is_drawn = True
+    return is_drawn
+
+
+def block_figure(report: CamerasReport) -> Figure:
+    """Draw the block in plan, with the footprints of its frames, and from the south."""
+    cameras, xyz = report.cameras, report.sample_xyz
+    figure, (plan, side) = new_figure(8.0, 8.5, nrows=2, height_ratios=[5, 2])
+    level = report.level_m  # of the footprints: the water, or else the middle of the cloud
+    if level is None:
+        level = float(np.median(xyz[:, 2])) if len(xyz) else np.nan
+    shown = draw_cloud(figure, plan, xyz, report.level_m, label="cloud")
+    if len(shown):
+        side.plot(shown[:, 0], shown[:, 2], ".", color="0.6", markersize=1, label="cloud")
+    has_footprints = draw_footprints(plan, cameras, level, linewidth=0.6, alpha=0.6)
+    plan.plot(*cameras.centres[:, :2].T, "^", color=AFTER, markersize=4, label="cameras")
+    if has_footprints:
+        plan.plot([], [], color=WATER, label=f"footprints at {level:.1f} m")
+    side.plot(cameras.centres[:, 0], cameras.centres[:, 2], "^", color=AFTER, markersize=4)
+    if report.level_m is not None:
+        side.axhline(report.level_m, color=WATER, label="water")
+    label_plan(plan, 20.0)
+    label_side(side)
+    side.tick_params(axis="x", labelrotation=20)
+    plan.legend(loc="upper right")
+    if side.get_legend_handles_labels()[0]:
+        side.legend(loc="best")
+    return figure

@@ -1,0 +1,259 @@
+"""The rasters and vector layers that a run writes for a GIS."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+
+from pcfix.compare.sections import SectionLine, lines_downslope
+from pcfix.errors import GeometryError
+from pcfix.flow.dsm import BLOCK_CELLS, grid_dsm, point_spacing_m
+from pcfix.flow.runner import Progress
+from pcfix.flow.shore import shoreline_layer
+from pcfix.flow.surfaces import points_of, view_of
+from pcfix.grid.colours import relief_colours
+from pcfix.grid.contours import contours, depth_interval
+from pcfix.grid.lattice import Lattice, Window, round_resolution
+from pcfix.grid.model import hillshade
+from pcfix.grid.shoreline import NearWater
+from pcfix.io import rasters
+from pcfix.io.atomic import scratch_folder, temporary_output
+from pcfix.io.vectors import Layer, write_layers
+from pcfix.io.styles import Symbol, limits_of, vector_style
+from pcfix.io.tables import read_check_depths
+from pcfix.io.tiles import Tiles, open_cloud
+from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES, Cameras, FloatArray, WaterSurface
+from pcfix.options.correct import LEVEL_M
+from pcfix.options.declare import File
+from pcfix.options.steps import DsmOptions, DsmRules
+from pcfix.water.surface import surface_above
+
+SURFACE, BED, DEPTH, UNCERTAINTY = "surface.tif", "bed.tif", "depth.tif", "uncertainty.tif"
+COUNTS, SHADED = "surface_counts.tif", "shaded.tif"
+HOLE_CELLS = 3.0
+"""Width of holes that are filled: of cells with random points, one in twenty is empty."""
+SUN_DEG = 315.0, 45.0
+MOST_CELLS = 4_000_000
+"""Of the rasters for contours and outline."""
+SECTIONS = 3
+DARK, RED, GREY = (8, 48, 107), (203, 24, 29), (120, 120, 120)
+ORANGE, GREEN = (253, 141, 60), (35, 139, 69)
+
+
+def raster_files(folder: Path, *, errors: bool) -> list[Path]:
+    """Return the files of `write_rasters`; `errors` is whether the cloud has standard errors."""
+    maps = [SURFACE, BED, DEPTH, *([UNCERTAINTY] if errors else [])]
+    files = [folder / name for name in (*maps, COUNTS, SHADED)]
+    return [*files, *((folder / name).with_suffix(".qml") for name in maps)]
+
+
+def write_rasters(
+    cloud: Path | Tiles, folder: Path, *, resolution: float | None, cameras: Cameras, errors: bool,
+    progress: Progress | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Write all rasters of a corrected cloud as cloud optimised GeoTIFF, with styles for QGIS.
+
+    By default the cells have 2 to 4 points, and are no smaller than a pixel on the ground. Returns
+    the facts for ``run.json``.
+    """
+    gsd_m = None  # a pixel on the ground at nadir, median
+    if cameras.lenses:
+        with open_cloud(cloud) as source:
+            middle = float(source.header.mins[2] + source.header.maxs[2]) / 2.0
+        focal = np.array([lens.focal_px for lens in cameras.lenses])
+        gsd_m = float(np.median((cameras.centres[:, 2] - middle) / focal))
+    spacing_m = point_spacing_m(cloud, DsmRules())
+    cell_m = resolution or round_resolution(spacing_m, gsd_m or 0.0)
+    plain = DsmOptions(resolution=cell_m, cog=True, style=True, overwrite=True)
+    filled = replace(plain, fill=HOLE_CELLS * cell_m)
+    asked = {
+        SURFACE: replace(filled, counts=folder / COUNTS),
+        BED: replace(filled, surface="bed"),
+        DEPTH: replace(filled, what="depth"),
+        **({UNCERTAINTY: replace(plain, what="uncertainty")} if errors else {}),
+    }
+    made = {}
+    for number, (name, options) in enumerate(asked.items()):
+
+        def tell(done: int, total: int, number: int = number) -> None:
+            if progress is not None:
+                progress(number * total + done, len(asked) * total)
+
+        made[name] = grid_dsm(cloud, folder / name, options=options, progress=tell)
+    _write_shaded(folder)
+    density = (cell_m / spacing_m) ** 2 if spacing_m else None
+    return {
+        "resolution_m": cell_m,
+        "points_per_cell": density,
+        "gsd_m": gsd_m,
+        **{Path(name).stem: summary.as_dict() for name, summary in made.items()},
+    }
+
+
+def resolution_sentence(made: dict[str, Any], *, given: bool) -> str:
+    """Return the size of the cells of the rasters, and its reason."""
+    density, gsd_m = made["points_per_cell"], made["gsd_m"]
+    parts = [] if density is None else [f"{density:.1f} points each"]
+    parts += [] if gsd_m is None else [f"GSD {gsd_m:.2g} m"]
+    more = f" ({', '.join(parts)})" if parts else ""
+    return f", cells of {made['resolution_m']:g} m{', as given' if given else ''}{more}"
+
+
+def _write_shaded(folder: Path) -> None:
+    """Write the picture: the bed in the colours of its depth, the land grey."""
+    target = folder / SHADED
+    high = limits_of(rasters.preview(folder / DEPTH)[0], "depth")[1]
+    with ExitStack() as stack:
+        draft = stack.enter_context(temporary_output(target))
+        plain = stack.enter_context(scratch_folder(target)) / SHADED
+        surface = stack.enter_context(rasters.open_raster(folder / SURFACE))
+        depth = stack.enter_context(rasters.open_raster(folder / DEPTH))
+        lattice = rasters.lattice_of(surface)
+        bands = dict.fromkeys(("red", "green", "blue", "alpha"), "")
+        plan = None if depth.crs is None else depth.crs.to_wkt()
+        with rasters.new_raster(plain, lattice, plan, bands, dtype="uint8", nodata=None) as out:
+            for window, height, deep in _parts(surface, depth, lattice):
+                light = hillshade(height, lattice.resolution_m, *SUN_DEG)
+                colours = relief_colours(light, deep, high, flat=np.sin(np.radians(SUN_DEG[1])))
+                for number, band in enumerate(colours, start=1):
+                    rasters.write_part(out, band, window, number)
+        rasters.copy_as_cog(plain, draft)
+
+
+def _parts(
+    surface: Any, depth: Any, lattice: Lattice
+) -> Iterator[tuple[Window, FloatArray, FloatArray]]:
+    """Yield windows with their heights, one cell wider all around, and their depths.
+
+    Holes of the surface are filled between land and bed, so some cells are under water that have
+    no depth: that of the water beside them.
+    """
+    from scipy.ndimage import minimum_filter
+
+    below, edge = rasters.lattice_of(depth), int(HOLE_CELLS)
+    row, column = below.first_row - lattice.first_row, below.first_column - lattice.first_column
+    for window in lattice.windows(BLOCK_CELLS):
+        wide = window.grown(edge)
+        height = rasters.read_within(surface, wide, lattice.window)
+        deep = rasters.read_within(depth, wide.moved(-row, -column), below.window)
+        level = minimum_filter(np.nan_to_num(height + deep, nan=np.inf), 2 * edge + 1)
+        is_wet = np.isnan(deep) & (height < level) & np.isfinite(level)
+        deep = np.where(is_wet, level - height, deep)
+        yield window, height[edge - 1 : 1 - edge, edge - 1 : 1 - edge], deep[edge:-edge, edge:-edge]
+
+
+def write_map(
+    path: Path,
+    cloud: Path | Tiles,
+    folder: Path,
+    *,
+    water: WaterSurface,
+    sigma_level_m: float | None,
+    cameras: Cameras,
+    unused: Sequence[str],
+    sections: Sequence[Mapping[str, float]],
+    check_points: FloatArray,
+    check_depths: File | None,
+) -> dict[str, int]:
+    """Write all layers of a run in a folder; return how many features each has.
+
+    `sigma_level_m` is the standard error of the water level, None where unknown; `sections` are the
+    lines of the comparison; `check_points`, shape (n, 4), are x, y, reference height, and cloud
+    minus reference.
+    """
+    shapes = rasters.outlines(folder / DEPTH, MOST_CELLS)
+    area = shapely.area(np.array(shapes, object)) if shapes else np.zeros(0)
+    style = vector_style({"area": Symbol("fill", DARK, 0.5)})
+    layers = [
+        Layer("corrected_area", "Polygon", shapes, {"area_m2": area}, style),
+        contours_layer(folder),
+        _waterline(cloud, water, LEVEL_M if sigma_level_m is None else sigma_level_m),
+        _sections(sections, folder),
+        _cameras(cameras, unused),
+        *_checks(folder, check_points, check_depths),
+    ]
+    write_layers(path, layers, view_of(cloud).crs, overwrite=True)
+    return {one.name: len(one.geometries) for one in layers}
+
+
+def contours_layer(folder: Path, interval: float | None = None) -> Layer:
+    """Return the depth contours; the default interval follows from the uncertainty."""
+    depth, bounds = rasters.preview(folder / DEPTH, MOST_CELLS)
+    if interval is None:
+        path = folder / UNCERTAINTY
+        sigma = rasters.preview(path)[0] if path.exists() else np.zeros(0)
+        interval = depth_interval(depth, sigma)
+    found = contours(depth, interval)
+    lines = [shapely.linestrings(rasters.centres(one.place, depth, bounds)) for one in found]
+    level = np.array([one.level for one in found])
+    values = {"depth_m": level, "interval_m": np.full(len(found), interval)}
+    style = vector_style({"line": Symbol("line", DARK, 0.25)}, label='"depth_m"')
+    return Layer("depth_contours", "LineString", lines, values, style)
+
+
+def _waterline(cloud: Path | Tiles, water: WaterSurface, sigma_m: float) -> Layer:
+    """Return where the water meets the corrected cloud."""
+    near = NearWater()
+    with open_cloud(cloud) as source:
+        for chunk in source.chunks():
+            points = points_of(chunk, source, water)
+            above = points.xyz[:, 2] - surface_above(water, points.xyz, points.heights).height_m
+            bed = points.classes == BATHYMETRIC_POINT
+            above[bed] = -source.dimension(chunk, "WaterDepth")[bed]
+            above[np.isin(points.classes, NOISE_CLASSES) | (chunk["withheld"] == 1)] = np.nan
+            near += NearWater.of(points.xyz, above, source.dimension(chunk, "SigmaZ"))
+    lines = near.lines(lambda xy: np.full(len(xy), sigma_m))
+    style = vector_style({"line": Symbol("line", RED, 0.5)})
+    return shoreline_layer("waterline", lines, style)
+
+
+def _sections(sections: Sequence[Mapping[str, float]], folder: Path) -> Layer:
+    """Return the cross-sections of the comparison, else lines down the slope of the bed."""
+    lines = [SectionLine(s["x1"], s["y1"], s["x2"], s["y2"]) for s in sections]
+    if not lines:
+        bed, bounds = rasters.preview(folder / BED)
+        row, column = np.nonzero(np.isfinite(bed))
+        xy = rasters.centres(np.column_stack([column, row]), bed, bounds)
+        try:
+            lines = list(lines_downslope(np.column_stack([xy, bed[row, column]]), SECTIONS))
+        except GeometryError:  # the bed is a line in plan
+            lines = []
+    names = np.array([f"Cross-section {n}" for n, _ in enumerate(lines, start=1)], object)
+    values = {"name": names, "length_m": np.array([one.length_m for one in lines])}
+    ends = [shapely.linestrings([(one.x1, one.y1), (one.x2, one.y2)]) for one in lines]
+    style = vector_style({"line": Symbol("line", GREY, 0.4)}, label='"name"')
+    return Layer("cross_sections", "LineString", ends, values, style)
+
+
+def _cameras(cameras: Cameras, unused: Sequence[str]) -> Layer:
+    """Return the projection centres, and whether each was used."""
+    use = np.where(np.isin(cameras.labels, unused), "not used", "used").astype(object)
+    symbols = {"used": Symbol("marker", GREEN, 2.0), "not used": Symbol("marker", GREY, 1.6)}
+    values = {"label": np.array(cameras.labels, object), "use": use}
+    points = list(shapely.points(cameras.centres))
+    return Layer("cameras", "Point Z", points, values, vector_style(symbols, "use"))
+
+
+def _checks(folder: Path, points: FloatArray, depths: File | None) -> list[Layer]:
+    """Return surveyed points with the differences of the cloud, or of the map of depths."""
+    symbol = {"point": Symbol("marker", ORANGE, 2.2, "diamond")}
+    style = vector_style(symbol, label="""format_number("residual_m", 2)""")
+    layers = []
+    if len(points):
+        values = {"z_m": points[:, 2], "residual_m": points[:, 3]}
+        places = list(shapely.points(points[:, :3]))
+        layers.append(Layer("check_points", "Point Z", places, values, style))
+    if depths is not None:
+        checks = read_check_depths(Path(depths))
+        raster = BED if checks.are_heights else DEPTH
+        more = rasters.values_at(folder / raster, checks.xy) - checks.value_m
+        values = {"measured_m": checks.value_m, "residual_m": more}
+        places = list(shapely.points(checks.xy))
+        layers.append(Layer("check_depths", "Point", places, values, style))
+    return layers
