@@ -5,16 +5,15 @@ from __future__ import annotations
 import pytest
 
 import pcfix
-from pcfix.cli.commands import EXAMPLES
-from pcfix.cli.flags import kind_of
+from pcfix.cli.commands import COMMANDS
 from pcfix.options.correct import CorrectOptions, ScienceOptions
-from pcfix.options.declare import options_of
+from pcfix.options.declare import OptionSet, options_of
 from pcfix.options.shared import Panel
 from pcfix.water.index import with_index
 from tests.utils.codes import refused
 from tests.utils.program import run_pcfix
 
-KINDS = [kind_of(command) for command, _ in EXAMPLES]
+KINDS = [one.kind for one in COMMANDS.values()]
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
@@ -23,6 +22,7 @@ def test_declared(kind):
     assert len(set(names)) == len(names)
     for one in options_of(kind):
         assert one.panel in list(Panel)
+        assert one.home is not OptionSet
         assert one.help.endswith(".")
         assert one.default is None or one.checked(one.default) == one.default
         assert not one.needs or one.needs.split()[0] in {*names, "reference"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any, Literal
 
@@ -34,55 +34,37 @@ class CleanRules(OptionSet, panel=Panel.TESTS):
     to the neighbours finds, in a cloud of even spacing, also its edges and corners.
     """
 
-    statistical: bool = option(True, "Test the mean distance to the nearest points in space.")
-    neighbours: int = option(
-        20,
-        "Nearest points of the statistical test, including the point itself.",
-        least=LEAST_NEIGHBOURS,
-        most=MOST_NEIGHBOURS,
-    )
-    deviations: float | None = option(
-        4.0,
-        "Noise if the mean distance to the neighbours exceeds that of all points by this many"
-        " standard deviations.",
-        above=0,
-    )
-    radius: float | None = option(
-        None,
-        "Noise if fewer than --radius-neighbours others are nearer.",
-        unit="m",
-        above=0,
-        default_is="no such test",
-    )
-    radius_neighbours: int = option(3, "See --radius.", least=1, most=MOST_NEIGHBOURS)
-    weak: bool = option(True, "Test rays, ray distance and incidence of corrected points.")
-    min_rays: int | None = option(3, "Noise if corrected from fewer rays.", least=2)
-    max_ray_miss: float | None = option(
-        0.5, "Noise if the rays are further from the point (RayMiss).", unit="m", above=0
-    )
-    max_incidence: float | None = option(
-        75.0, "Noise if a ray has a larger incidence angle.", unit="deg", above=0, most=90
-    )
-    bed_neighbours: int = option(
-        32,
-        "Nearest submerged points in plan from which the bed is estimated.",
-        least=LEAST_NEIGHBOURS,
-        most=MOST_NEIGHBOURS,
-    )
-    fences: float = option(
-        3.0,
-        "Noise if outside the interquartile range of their heights by this many times the range,"
-        " and by more than --below or --floating.",
-        above=0,
-    )
-    below: float | None = option(0.3, "Minimum distance of noise below the bed.", unit="m", above=0)
-    floating: float | None = option(
-        0.5, "Minimum distance of noise above the bed.", unit="m", above=0
-    )
+    statistical: bool = option(True)
+    """Test the mean distance to the nearest points in space."""
+    neighbours: int = option(20, least=LEAST_NEIGHBOURS, most=MOST_NEIGHBOURS)
+    """Nearest points of the statistical test, including the point itself."""
+    deviations: float | None = option(4.0, above=0)
+    """Noise if the mean distance to the neighbours exceeds that of all points by this many standard
+    deviations."""
+    radius: float | None = option(None, basic=True, unit="m", above=0, default_is="no such test")
+    """Noise if fewer than --radius-neighbours others are nearer."""
+    radius_neighbours: int = option(3, least=1, most=MOST_NEIGHBOURS)
+    """See --radius."""
+    weak: bool = option(True)
+    """Test rays, ray distance and incidence of corrected points."""
+    min_rays: int | None = option(3, basic=True, least=2)
+    """Noise if corrected from fewer rays."""
+    max_ray_miss: float | None = option(0.5, basic=True, unit="m", above=0)
+    """Noise if the rays are further from the point (RayMiss)."""
+    max_incidence: float | None = option(75.0, basic=True, unit="deg", above=0, most=90)
+    """Noise if a ray has a larger incidence angle."""
+    bed_neighbours: int = option(32, least=LEAST_NEIGHBOURS, most=MOST_NEIGHBOURS)
+    """Nearest submerged points in plan from which the bed is estimated."""
+    fences: float = option(3.0, above=0)
+    """Noise if outside the interquartile range of their heights by this many times the range, and
+    by more than --below or --floating."""
+    below: float | None = option(0.3, off=True, unit="m", above=0)
+    """Minimum distance of noise below the bed."""
+    floating: float | None = option(0.5, basic=True, off=True, unit="m", above=0)
+    """Minimum distance of noise above the bed."""
 
     def check(self) -> None:
         """Switch off what is not asked for; something must be left."""
-        super().check()
         if not self.statistical:
             object.__setattr__(self, "deviations", None)
         if not self.weak:
@@ -110,37 +92,33 @@ class CleanOptions(TileOptions, SummaryOption, CleanRules, panel=Panel.OUTPUT):
     """The options of ``pcfix clean``."""
 
     water: Any = option(
-        None,
-        "Water surface, as for 'pcfix correct': points below it are tested against the bed.",
-        default_is="the points that pcfix corrected",
-        metavar="SPEC",
+        None, basic=True, default_is="the points that pcfix corrected", metavar="SPEC"
     )
-    drop: bool = option(False, "Drop noise. Otherwise it gets class 7 and the withheld flag.")
+    """Water surface, as for 'pcfix correct': points below it are tested against the bed."""
+    drop: bool = option(False, basic=True)
+    """Drop noise. Otherwise it gets class 7 and the withheld flag."""
 
 
 class DsmRules(OptionSet, panel=Panel.RASTER):
     """How a cloud becomes a raster."""
 
     resolution: float | None = option(
-        None, "Cell size.", unit="m", least=MIN_RESOLUTION_M, default_is="2 to 4 points a cell"
+        None, basic=True, unit="m", least=MIN_RESOLUTION_M, default_is="2 to 4 points a cell"
     )
-    what: str = option(
-        "height",
-        "Value of a cell: height; depth of the bed below the water; uncertainty, the vertical one"
-        " of the bed at 95 %; or a dimension, by its name.",
-        metavar="height|depth|uncertainty|DIMENSION",
-    )
-    method: DsmMethod = option("mean", "Gridding method.")
-    surface: SurfaceChoice = option(
-        "all", "Grid land and bed without noise, or only the bed (class 40)."
-    )
-    fill: float | None = option(
-        None, "Fill holes up to this width; they get count 0.", unit="m", above=0
-    )
-    azimuth: float = option(315.0, "Sun of the hillshade, clockwise from north.", unit="deg")
-    altitude: float = option(
-        45.0, "Sun of the hillshade, above the horizon.", unit="deg", above=0, most=90
-    )
+    """Cell size."""
+    what: str = option("height", metavar="height|depth|uncertainty|DIMENSION")
+    """Value of a cell: height; depth of the bed below the water; uncertainty, the vertical one of
+    the bed at 95 %; or a dimension, by its name."""
+    method: DsmMethod = option("mean", basic=True)
+    """Gridding method."""
+    surface: SurfaceChoice = option("all", basic=True)
+    """Grid land and bed without noise, or only the bed (class 40)."""
+    fill: float | None = option(None, unit="m", above=0)
+    """Fill holes up to this width; they get count 0."""
+    azimuth: float = option(315.0, unit="deg")
+    """Sun of the hillshade, clockwise from north."""
+    altitude: float = option(45.0, unit="deg", above=0, most=90)
+    """Sun of the hillshade, above the horizon."""
 
     @property
     def cell_m(self) -> float:
@@ -153,7 +131,6 @@ class DsmRules(OptionSet, panel=Panel.RASTER):
 
     def check(self) -> None:
         """Check that the other options fit to the value, and the width of holes to the cells."""
-        super().check()
         if self.what == "uncertainty" and (self.method != "mean" or self.fill is not None):
             raise SettingError(
                 "option.excludes",
@@ -178,12 +155,14 @@ class DsmRules(OptionSet, panel=Panel.RASTER):
 class DsmOptions(PartOptions, OverwriteOption, SummaryOption, DsmRules, panel=Panel.OUTPUT):
     """The options of ``pcfix dsm``."""
 
-    hillshade: File | None = option(None, "GeoTIFF for a hillshade.")
-    counts: File | None = option(
-        None, "GeoTIFF for the number of points in each cell, and their spread."
-    )
-    style: bool = option(False, "Also write a QGIS style (.qml).")
-    cog: bool = option(False, "Write a cloud optimised GeoTIFF.")
+    hillshade: File | None = option(None)
+    """GeoTIFF for a hillshade."""
+    counts: File | None = option(None)
+    """GeoTIFF for the number of points in each cell, and their spread."""
+    style: bool = option(False)
+    """Also write a QGIS style (.qml)."""
+    cog: bool = option(False)
+    """Write a cloud optimised GeoTIFF."""
 
 
 LAYERS = ("water", "apparent", "corrected", "reference")
@@ -195,65 +174,10 @@ SIGMA_REFERENCE_M = {"cloud": 0.03, "raster": 0.03, "table of check points": 0.0
 """Assumed noise of a height by kind of reference: LiDAR over hard ground, RTK or levelling."""
 
 
-class DistanceOptions(OptionSet, panel=Panel.FIGURES):
-    """What a comparison, or that of a run, measures besides the vertical error.
-
-    `share` and `also` hold pairs: of bounds in metres, and of a name and a path. They may be given
-    as texts; `also` may be a dict too.
-    """
-
-    m3c2: bool = option(
-        False, "Also compare by M3C2, with py4dgeo: the extra m3c2.", needs="reference"
-    )
-    direction: Direction | None = option(
-        None,
-        "C2C from each point of the cloud to the nearest of the reference, the other way round, or"
-        " both.",
-        needs="reference",
-        default_is="to-reference; from each check point",
-    )
-    classes: int | None = option(
-        None,
-        "Number of classes of the C2C histograms.",
-        least=2,
-        most=100_000,
-        needs="reference",
-        default_is="square root of the number of distances",
-    )
-    share: tuple[Any, ...] = option(
-        (),
-        "Report the share of the C2C distances from LOW to HIGH metres; may be repeated.",
-        needs="reference",
-        metavar="LOW,HIGH",
-    )
-    also: tuple[Any, ...] = option(
-        (),
-        "Another cloud for the C2C table and the cross-sections; may be repeated.",
-        needs="reference",
-        metavar="NAME=CLOUD",
-    )
-    sigma_reference: float | None = option(
-        None,
-        "Standard deviation of a height of the reference, which is removed from the errors of the"
-        " cloud.",
-        unit="m",
-        least=0,
-        needs="reference",
-        default_is=", ".join(f"{sigma:g} of a {kind}" for kind, sigma in SIGMA_REFERENCE_M.items()),
-    )
-
-    def check(self) -> None:
-        """Take texts apart."""
-        super().check()
-        # a stage of PDAL may give one text in the place of several
-        shares = (self.share,) if isinstance(self.share, str) else self.share
-        object.__setattr__(self, "share", tuple(map(_band, shares)))
-        object.__setattr__(self, "also", tuple(_named_clouds(self.also)))
-
-    @property
-    def from_reference(self) -> bool:
-        """Whether C2C is wanted from each point of the reference."""
-        return self.direction in ("from-reference", "both")
+def _bands(given: Any) -> tuple[tuple[float, float], ...]:
+    """Return the bounds of shares, each of which may be a text."""
+    # a stage of PDAL may give one text in the place of several
+    return tuple(map(_band, (given,) if isinstance(given, str) else given))
 
 
 def _band(given: Any) -> tuple[float, float]:
@@ -273,10 +197,10 @@ def _band(given: Any) -> tuple[float, float]:
     return low, high
 
 
-def _named_clouds(given: Any) -> Iterator[tuple[str, str]]:
-    """Yield name and path of each further cloud."""
+def _named_clouds(given: Any) -> tuple[tuple[str, str], ...]:
+    """Return name and path of each further cloud."""
     pairs = given.items() if isinstance(given, Mapping) else given
-    known = set(LAYERS)
+    known: dict[str, str] = dict.fromkeys(LAYERS, "")
     for one in (pairs,) if isinstance(pairs, str) else pairs:
         name, mark, path = one.partition("=") if isinstance(one, str) else (one[0], "=", one[1])
         text = f"{name}{mark}{path}"
@@ -294,31 +218,75 @@ def _named_clouds(given: Any) -> Iterator[tuple[str, str]]:
                 option="also",
                 value=name,
             )
-        known.add(name)
-        yield name, os.fspath(path)
+        known[name] = os.fspath(path)
+    return tuple(known.items())[len(LAYERS) :]
+
+
+class DistanceOptions(OptionSet, panel=Panel.FIGURES):
+    """What a comparison, or that of a run, measures besides the vertical error.
+
+    `share` and `also` hold pairs: of bounds in metres, and of a name and a path. They may be given
+    as texts; `also` may be a dict too.
+    """
+
+    m3c2: bool = option(False, needs="reference")
+    """Also compare by M3C2, with py4dgeo: the extra m3c2."""
+    direction: Direction | None = option(
+        None, needs="reference", default_is="to-reference; from each check point"
+    )
+    """C2C from each point of the cloud to the nearest of the reference, the other way round, or
+    both."""
+    classes: int | None = option(
+        None,
+        least=2,
+        most=100_000,
+        needs="reference",
+        default_is="square root of the number of distances",
+    )
+    """Number of classes of the C2C histograms."""
+    share: tuple[Any, ...] = option((), then=_bands, needs="reference", metavar="LOW,HIGH")
+    """Report the share of the C2C distances from LOW to HIGH metres; may be repeated."""
+    also: tuple[Any, ...] = option(
+        (), basic=True, then=_named_clouds, needs="reference", metavar="NAME=CLOUD"
+    )
+    """Another cloud for the C2C table and the cross-sections; may be repeated."""
+    sigma_reference: float | None = option(
+        None,
+        unit="m",
+        least=0,
+        needs="reference",
+        default_is=", ".join(f"{sigma:g} of a {kind}" for kind, sigma in SIGMA_REFERENCE_M.items()),
+    )
+    """Standard deviation of a height of the reference, which is removed from the errors of the
+    cloud."""
+
+    @property
+    def from_reference(self) -> bool:
+        """Whether C2C is wanted from each point of the reference."""
+        return self.direction in ("from-reference", "both")
 
 
 class CompareRules(DistanceOptions, panel=Panel.FIGURES):
     """What is measured of two clouds."""
 
-    submerged: bool = option(False, "Compare only points of class 40, or below --water.")
-    c2c_only: bool = option(False, "Only distances to the nearest point; no signed differences.")
-    neighbours: int = option(
-        PLANE_POINTS, "Reference points of each fitted plane.", least=LEAST_PLANE_POINTS
-    )
-    bin_width: float = option(1.0, "Bins of the table by depth.", unit="m", above=0)
-    shore_bin_width: float = option(
-        10.0, "Bins of the table by distance from shore.", unit="m", above=0
-    )
+    submerged: bool = option(False, basic=True)
+    """Compare only points of class 40, or below --water."""
+    c2c_only: bool = option(False)
+    """Only distances to the nearest point; no signed differences."""
+    neighbours: int = option(PLANE_POINTS, least=LEAST_PLANE_POINTS)
+    """Reference points of each fitted plane."""
+    bin_width: float = option(1.0, unit="m", above=0)
+    """Bins of the table by depth."""
+    shore_bin_width: float = option(10.0, unit="m", above=0)
+    """Bins of the table by distance from shore."""
     max_gap: float | None = option(
-        None,
-        "Points up to this distance outside the reference are compared.",
-        unit="m",
-        above=0,
-        default_is="5 point spacings, at least 1",
+        None, unit="m", above=0, default_is="5 point spacings, at least 1"
     )
-    sections: int = option(0, "Number of automatic cross-sections, down the slope.", least=0)
-    corridor: float = option(1.0, "Half-width of a cross-section.", unit="m", above=0)
+    """Points up to this distance outside the reference are compared."""
+    sections: int = option(0, least=0)
+    """Number of automatic cross-sections, down the slope."""
+    corridor: float = option(1.0, unit="m", above=0)
+    """Half-width of a cross-section."""
 
     @property
     def vertical(self) -> bool:
@@ -329,25 +297,21 @@ class CompareRules(DistanceOptions, panel=Panel.FIGURES):
 class ReferenceOption(OptionSet, panel=Panel.OUTPUT):
     """The reference of a cloud."""
 
-    reference: File | None = option(
-        None, "LiDAR cloud, CSV check points or GeoTIFF to compare with."
-    )
+    reference: File | None = option(None, basic=True)
+    """LiDAR cloud, CSV check points or GeoTIFF to compare with."""
 
 
 class CompareOptions(OverwriteOption, SummaryOption, CompareRules, panel=Panel.OUTPUT):
     """The options of ``pcfix compare``."""
 
-    out_dir: File | None = option(None, "Folder for compare.json, depth tables and sections (CSV).")
-    water: Any = option(
-        None,
-        "Water surface, as for 'pcfix correct'.",
-        default_is="what the cloud says",
-        metavar="SPEC",
-    )
-    section: tuple[Any, ...] = option(
-        (), "A cross-section x1,y1,x2,y2; may be repeated.", metavar="X,Y,X,Y"
-    )
-    plot: File | None = option(None, "PNG of the C2C histograms, with Gauss curves.")
+    out_dir: File | None = option(None, basic=True)
+    """Folder for compare.json, depth tables and sections (CSV)."""
+    water: Any = option(None, basic=True, default_is="what the cloud says", metavar="SPEC")
+    """Water surface, as for 'pcfix correct'."""
+    section: tuple[Any, ...] = option((), basic=True, metavar="X,Y,X,Y")
+    """A cross-section x1,y1,x2,y2; may be repeated."""
+    plot: File | None = option(None, basic=True)
+    """PNG of the C2C histograms, with Gauss curves."""
 
 
 class StageCompareOptions(ReferenceOption, CompareOptions):

@@ -8,20 +8,35 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from pcfix.cli.commands import EXAMPLES
-from pcfix.cli.flags import kind_of
-from pcfix.options.declare import table_of
+from pcfix.cli.commands import COMMANDS
+from pcfix.options.declare import Option, OptionSet, options_of
 
 DOCUMENT = Path(__file__).parents[2] / "pcfix" / "cli" / "README.md"
 
 
+def table_of(kind: type[OptionSet]) -> str:
+    """Return the options of a class as a table."""
+    rows = ["| option | meaning | default |", "|---|---|---|"]
+    for one in options_of(kind):
+        flag = f"{one.flag} {_value(one)}".strip()
+        rows.append(f"| `{flag}` | {one.help_text} | {one.needed_text} |")
+    return "\n".join(rows)
+
+
+def _value(one: Option) -> str:
+    if one.choices or one.metavar:
+        return "\\|".join(one.choices) or one.metavar
+    kind = "N" if one.kinds != (str,) else "TEXT"
+    return "PATH" if one.is_path else "" if bool in one.kinds else kind
+
+
 def with_tables(text: str) -> str:
     """Return a document with a current table between the marks of each command."""
-    kinds = {command.__name__: kind_of(command) for command, _ in EXAMPLES}
 
     def between(found: re.Match[str]) -> str:
         name = found.group(1)
-        return f"<!-- options of {name} -->\n{table_of(kinds[name])}\n<!-- end -->"
+        table = table_of(COMMANDS[name.replace("_", "-")].kind)
+        return f"<!-- options of {name} -->\n{table}\n<!-- end -->"
 
     return re.sub(r"<!-- options of (\w+) -->\n.*?<!-- end -->", between, text, flags=re.S)
 
