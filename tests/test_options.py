@@ -23,7 +23,7 @@ def test_declared(kind):
     for one in options_of(kind):
         assert one.panel in list(Panel)
         assert one.home is not OptionSet
-        assert one.help.endswith(".")
+        assert one.help.partition(" [")[0].endswith(".")
         assert one.default is None or one.checked(one.default) == one.default
         assert not one.needs or one.needs.split()[0] in {*names, "reference"}
     kind()

@@ -50,12 +50,9 @@ def main(tokens: Sequence[str] | None = None) -> None:
         gc.set_threshold(50_000, 20, 50)
         atexit.register(gc.freeze)
         _run(arguments)
-    except CycloptsError as error:
-        if isinstance(error.__cause__, PcfixError):
-            _stop(str(error.__cause__), 1)
-        _stop(f"{error}\n{_try(arguments)}", 2)
-    except UsageError as error:
-        _stop(f"{error}\n{_try(arguments)}", 2)
+    except (CycloptsError, UsageError) as error:
+        words = ["pcfix", *(one for one in arguments[:1] if one in COMMANDS), "--help"]
+        _stop(f"{error}\nTry '{' '.join(words)}'.", 2)
     except PcfixError as error:
         _stop(str(error), 1)
     except UnicodeEncodeError as error:
@@ -99,12 +96,6 @@ def _end_by_signals() -> None:
         number = getattr(signal, name, None)
         if number is not None and signal.getsignal(number) is signal.SIG_DFL:
             signal.signal(number, end)
-
-
-def _try(arguments: list[str]) -> str:
-    """Return where help is."""
-    names = [one for one in arguments[:1] if one in COMMANDS]
-    return f"Try '{' '.join(['pcfix', *names, '--help'])}'."
 
 
 def _stop(sentence: str, code: int) -> None:

@@ -6,34 +6,34 @@ import json
 import sys
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
-
-from cyclopts import Parameter
+from typing import Any
 
 import pcfix
 from pcfix.cli.flags import COMMANDS, UsageError, command, progress_bar, say, status_line
 from pcfix.options.correct import CorrectOptions, LabelOptions
-from pcfix.options.handover import PlanOptions, PluginOptions, ViewerOptions
 from pcfix.options.photos import CalmOptions, OrthoOptions, PhotosOptions
-from pcfix.options.scenes import DemoOptions, SimulateOptions
-from pcfix.options.shared import TileOptions
-from pcfix.options.steps import CleanOptions, CompareOptions, DsmOptions
+from pcfix.options.scenes import DemoOptions, PlanOptions, SimulateOptions
+from pcfix.options.shared import OverwriteOption, TileOptions
+from pcfix.options.steps import CleanOptions, CompareOptions, DsmOptions, ViewerOptions
 from pcfix.options.survey import AdjustOptions, CamerasCheckOptions, RunOptions, WaterCheckOptions
 
-Input = Annotated[Path, Parameter(help="LAS or LAZ cloud.")]
 TILED = "LAS or LAZ cloud; a folder, glob, list (.txt) or index (.vpc) of tiles."
-Inputs = Annotated[str, Parameter(help=TILED)]
-Output = Annotated[Path, Parameter(help="LAS or LAZ to write; a folder for tiles.")]
+CLOUD = "LAS or LAZ to write; a folder for tiles."
 
 
-@command("pcfix run cloud.laz out --cameras cameras.xml --water 0.37 --reference lidar.laz")
+@command(
+    "pcfix run cloud.laz out --cameras cameras.xml --water 0.37 --reference lidar.laz",
+    input=TILED,
+    out_dir="Folder for all results.",
+    config="Repeat the run of this run.json.",
+)
 def run(
-    input: Annotated[str | None, Parameter(help=TILED)] = None,
-    out_dir: Annotated[Path | None, Parameter(help="Folder for all results.")] = None,
+    input: str | None = None,
+    out_dir: Path | None = None,
     /,
     *,
     options: RunOptions,
-    config: Annotated[Path | None, Parameter(help="Repeat the run of this run.json.")] = None,
+    config: Path | None = None,
     quiet: bool,
 ) -> None:
     """Adjust, correct, clean, grid, compare and report; resumes where it stopped.
@@ -60,8 +60,12 @@ def run(
     )
 
 
-@command("pcfix correct cloud.laz corrected.laz --cameras cameras.csv --water 0.37")
-def correct(input: Inputs, output: Output, /, *, options: CorrectOptions, quiet: bool) -> None:
+@command(
+    "pcfix correct cloud.laz corrected.laz --cameras cameras.csv --water 0.37",
+    input=TILED,
+    output=CLOUD,
+)
+def correct(input: str, output: Path, /, *, options: CorrectOptions, quiet: bool) -> None:
     """Correct a point cloud for refraction at the water surface."""
     from pcfix.report.text import summary_text
 
@@ -70,15 +74,14 @@ def correct(input: Inputs, output: Output, /, *, options: CorrectOptions, quiet:
     say(summary_text(result), quiet)
 
 
-@command("pcfix adjust sparse adjusted --water 0.37 --cloud cloud.laz --gnss gnss.csv")
+@command(
+    "pcfix adjust sparse adjusted --water 0.37 --cloud cloud.laz --gnss gnss.csv",
+    model="Camera poses, with tie points or beside a cloud.",
+    out="Folder for the adjusted model.",
+    jobs="Threads.",
+)
 def adjust(
-    model: Annotated[Path, Parameter(help="Camera poses, with tie points or beside a cloud.")],
-    out: Annotated[Path, Parameter(help="Folder for the adjusted model.")],
-    /,
-    *,
-    options: AdjustOptions,
-    quiet: bool,
-    jobs: Annotated[int | None, Parameter(help="Threads.", group="Output")] = None,
+    model: Path, out: Path, /, *, options: AdjustOptions, quiet: bool, jobs: int | None = None
 ) -> None:
     """Refine camera poses and lens by a refractive bundle adjustment."""
     from pcfix.flow.next_steps import correct_words
@@ -92,8 +95,8 @@ def adjust(
     say(f"Next{cloud}: {correct_words(found, model, out, options)}", quiet)
 
 
-@command("pcfix label cloud.laz labelled.laz --water shore.csv")
-def label(input: Inputs, output: Output, /, *, options: LabelOptions, quiet: bool) -> None:
+@command("pcfix label cloud.laz labelled.laz --water shore.csv", input=TILED, output=CLOUD)
+def label(input: str, output: Path, /, *, options: LabelOptions, quiet: bool) -> None:
     """Classify points below the water surface (class 40)."""
     from pcfix.report.text import labelling_text
 
@@ -102,8 +105,8 @@ def label(input: Inputs, output: Output, /, *, options: LabelOptions, quiet: boo
     say(labelling_text(result), quiet)
 
 
-@command("pcfix clean corrected.laz cleaned.laz")
-def clean(input: Inputs, output: Output, /, *, options: CleanOptions, quiet: bool) -> None:
+@command("pcfix clean corrected.laz cleaned.laz", input=TILED, output=CLOUD)
+def clean(input: str, output: Path, /, *, options: CleanOptions, quiet: bool) -> None:
     """Flag noise: outliers, weak intersections, points far from the bed."""
     from pcfix.report.text import cleaning_text
 
@@ -112,15 +115,12 @@ def clean(input: Inputs, output: Output, /, *, options: CleanOptions, quiet: boo
     say(cleaning_text(result), quiet)
 
 
-@command("pcfix dsm cleaned.laz bed.tif --resolution 0.5 --surface bed")
-def dsm(
-    input: Inputs,
-    output: Annotated[Path, Parameter(help="GeoTIFF to write.")],
-    /,
-    *,
-    options: DsmOptions,
-    quiet: bool,
-) -> None:
+@command(
+    "pcfix dsm cleaned.laz bed.tif --resolution 0.5 --surface bed",
+    input=TILED,
+    output="GeoTIFF to write.",
+)
+def dsm(input: str, output: Path, /, *, options: DsmOptions, quiet: bool) -> None:
     """Grid a cloud to a GeoTIFF: height, count and spread."""
     from pcfix.report.text import dsm_text
 
@@ -129,15 +129,12 @@ def dsm(
     say(dsm_text(result), quiet)
 
 
-@command("pcfix ortho images bed.tif --cameras cameras.xml --dsm dsm.tif --water 0.37")
-def ortho(
-    images: Annotated[Path, Parameter(help="Folder of photographs.")],
-    output: Annotated[Path, Parameter(help="GeoTIFF to write.")],
-    /,
-    *,
-    options: OrthoOptions,
-    quiet: bool,
-) -> None:
+@command(
+    "pcfix ortho images bed.tif --cameras cameras.xml --dsm dsm.tif --water 0.37",
+    images="Folder of photographs.",
+    output="GeoTIFF to write.",
+)
+def ortho(images: Path, output: Path, /, *, options: OrthoOptions, quiet: bool) -> None:
     """Make an orthophoto of land and bed from photographs and the corrected DSM."""
     from pcfix.report.text import ortho_text
 
@@ -146,18 +143,12 @@ def ortho(
     say(ortho_text(result), quiet)
 
 
-@command("pcfix compare cleaned.laz lidar.laz --submerged")
-def compare(
-    cloud: Inputs,
-    reference: Annotated[
-        str,
-        Parameter(help="LAS or LAZ, or tiles; CSV check points (x,y,z), or a GeoTIFF of heights."),
-    ],
-    /,
-    *,
-    options: CompareOptions,
-    quiet: bool,
-) -> None:
+@command(
+    "pcfix compare cleaned.laz lidar.laz --submerged",
+    cloud=TILED,
+    reference="LAS or LAZ, or tiles; CSV check points (x,y,z), or a GeoTIFF of heights.",
+)
+def compare(cloud: str, reference: str, /, *, options: CompareOptions, quiet: bool) -> None:
     """Compare a cloud with a reference, before and after correction."""
     from pcfix.report.comparison import comparison_text
 
@@ -165,15 +156,12 @@ def compare(
     say(comparison_text(result), quiet)
 
 
-@command("pcfix photos images dry --cameras cameras.xml --dsm bed.tif --water 0.37")
-def photos(
-    images: Annotated[Path, Parameter(help="Folder of photographs.")],
-    out_dir: Annotated[Path, Parameter(help="Folder for the results, or for the rounds.")],
-    /,
-    *,
-    options: PhotosOptions,
-    quiet: bool,
-) -> None:
+@command(
+    "pcfix photos images dry --cameras cameras.xml --dsm bed.tif --water 0.37",
+    images="Folder of photographs.",
+    out_dir="Folder for the results, or for the rounds.",
+)
+def photos(images: Path, out_dir: Path, /, *, options: PhotosOptions, quiet: bool) -> None:
     """Remove refraction from photographs, for use in any SfM software."""
     from pcfix.report.text import photos_text, rounds_text
 
@@ -187,15 +175,12 @@ def photos(
     say(text, quiet)
 
 
-@command("pcfix calm frames calm.jpg --surface --depth 2.5 --gsd 0.01 --interval 0.2")
-def calm(
-    frames: Annotated[Path, Parameter(help="Folder of photographs, or a video.")],
-    out: Annotated[Path, Parameter(help="Image to write, of the frames' format; PNG of a video.")],
-    /,
-    *,
-    options: CalmOptions,
-    quiet: bool,
-) -> None:
+@command(
+    "pcfix calm frames calm.jpg --surface --depth 2.5 --gsd 0.01 --interval 0.2",
+    frames="Folder of photographs, or a video.",
+    out="Image to write, of the frames' format; PNG of a video.",
+)
+def calm(frames: Path, out: Path, /, *, options: CalmOptions, quiet: bool) -> None:
     """Combine a burst of frames into one image as seen through calm water."""
     from pcfix.report.text import calm_text
 
@@ -204,25 +189,22 @@ def calm(
     say(calm_text(result), quiet)
 
 
-@command("pcfix view corrected.laz --reference lidar.laz --colour error --image errors.png")
-def view(
-    *clouds: Annotated[Path, Parameter(help="LAS or LAZ clouds.")],
-    options: ViewerOptions,
-    quiet: bool,
-) -> None:
+@command(
+    "pcfix view corrected.laz --reference lidar.laz --colour error --image errors.png",
+    clouds="LAS or LAZ clouds.",
+)
+def view(*clouds: Path, options: ViewerOptions, quiet: bool) -> None:
     """Show clouds in 3D, before and after, with reference, cameras and water."""
     found = pcfix.view_clouds(clouds, options=options)
     if found:
         say(found, quiet)
 
 
-@command("pcfix cameras cameras.xml --cloud cloud.laz --water 0.37 --plot block.png")
-def cameras(
-    path: Annotated[Path, Parameter(help="File or folder of camera poses.")],
-    /,
-    *,
-    options: CamerasCheckOptions,
-) -> None:
+@command(
+    "pcfix cameras cameras.xml --cloud cloud.laz --water 0.37 --plot block.png",
+    path="File or folder of camera poses.",
+)
+def cameras(path: Path, /, *, options: CamerasCheckOptions) -> None:
     """Inspect a camera file: contents, fit to the cloud, absorbed refraction."""
     from pcfix.flow.checks import check_cameras
     from pcfix.report.cameras import cameras_text
@@ -230,13 +212,11 @@ def cameras(
     say(cameras_text(check_cameras(path, options)))
 
 
-@command("pcfix water shore.csv --cloud cloud.laz --plot water.png")
-def water(
-    spec: Annotated[str, Parameter(help="As --water of 'pcfix correct'.")],
-    /,
-    *,
-    options: WaterCheckOptions,
-) -> None:
+@command(
+    "pcfix water shore.csv --cloud cloud.laz --plot water.png",
+    spec="As --water of 'pcfix correct'.",
+)
+def water(spec: str, /, *, options: WaterCheckOptions) -> None:
     """Read, fit or detect a water surface, with its standard error."""
     from pcfix.flow.checks import check_water
     from pcfix.report.water import water_text
@@ -244,22 +224,16 @@ def water(
     say(water_text(check_water(spec, options)))
 
 
-@command("pcfix restore corrected.laz cloud.laz")
-def restore(input: Inputs, output: Output, /, *, options: TileOptions, quiet: bool) -> None:
+@command("pcfix restore corrected.laz cloud.laz", input=TILED, output=CLOUD)
+def restore(input: str, output: Path, /, *, options: TileOptions, quiet: bool) -> None:
     """Undo a correction exactly."""
     with progress_bar("Restoring", quiet) as progress:
         points = pcfix.restore_file(input, output, options=options, progress=progress)
     say(f"{input} -> {output}: {points:,} points restored", quiet)
 
 
-@command("pcfix simulate scene --points 20000")
-def simulate(
-    out_dir: Annotated[Path, Parameter(help="Folder for the scene.")],
-    /,
-    *,
-    options: SimulateOptions,
-    quiet: bool,
-) -> None:
+@command("pcfix simulate scene --points 20000", out_dir="Folder for the scene.")
+def simulate(out_dir: Path, /, *, options: SimulateOptions, quiet: bool) -> None:
     """Simulate a scene with known truth: cloud, cameras, truth, LiDAR."""
     from pcfix.io.scenes import write_scene
 
@@ -269,16 +243,14 @@ def simulate(
     say(f"{out_dir}: {scene.description}", quiet)
 
 
-@command("pcfix pipeline cloud.laz corrected.laz --cameras cameras.csv --water 0.37")
+@command(
+    "pcfix pipeline cloud.laz corrected.laz --cameras cameras.csv --water 0.37",
+    input="LAS or LAZ cloud.",
+    output="LAS or LAZ to write.",
+    stage="Only the stage, for your own pipeline.",
+)
 def pipeline(
-    input: Input,
-    output: Annotated[Path | None, Parameter(help="LAS or LAZ to write.")] = None,
-    /,
-    *,
-    options: CorrectOptions,
-    stage: Annotated[
-        bool, Parameter(negative=(), help="Only the stage, for your own pipeline.", group="Output")
-    ] = False,
+    input: Path, output: Path | None = None, /, *, options: CorrectOptions, stage: bool = False
 ) -> None:
     """Print the PDAL pipeline of the same 'pcfix correct', as JSON."""
     from pcfix.flow.pipeline import pipeline_for, stage_for
@@ -302,10 +274,8 @@ def plan(*, options: PlanOptions, quiet: bool) -> None:
     say(plan_text(found), quiet)
 
 
-@command("pcfix qgis-plugin pcfix.zip")
-def qgis_plugin(
-    out: Annotated[Path, Parameter(help="ZIP to write.")], /, *, options: PluginOptions, quiet: bool
-) -> None:
+@command("pcfix qgis-plugin pcfix.zip", out="ZIP to write.")
+def qgis_plugin(out: Path, /, *, options: OverwriteOption, quiet: bool) -> None:
     """Write the QGIS plugin: the commands of pcfix as algorithms of its toolbox.
 
     In QGIS: Plugins > Manage and Install Plugins > Install from ZIP.
@@ -320,14 +290,8 @@ def qgis_plugin(
     )  # fmt: skip
 
 
-@command("pcfix demo")
-def demo(
-    out_dir: Annotated[Path, Parameter(help="Folder to make.")] = Path("pcfix-demo"),
-    /,
-    *,
-    options: DemoOptions,
-    quiet: bool,
-) -> None:
+@command("pcfix demo", out_dir="Folder to make.")
+def demo(out_dir: Path = Path("pcfix-demo"), /, *, options: DemoOptions, quiet: bool) -> None:
     """Simulate scenes, correct them, and compare with the truth."""
     from pcfix.flow.demo import run_demo
 

@@ -38,16 +38,13 @@ class Command(NamedTuple):
 
     call: Callable[..., None]
     example: str
+    helps: dict[str, str]
+    """What its arguments and own flags mean."""
 
     @property
-    def hints(self) -> dict[str, Any]:
-        """The types of its arguments."""
-        return get_type_hints(self.call, include_extras=True)
-
-    @property
-    def kind(self) -> type[OptionSet]:
+    def kind(self) -> Any:
         """The class of its options."""
-        return self.hints["options"]  # type: ignore[no-any-return]
+        return get_type_hints(self.call)["options"]
 
     @property
     def has_many(self) -> bool:
@@ -56,24 +53,27 @@ class Command(NamedTuple):
 
     def flat(self, *, everything: bool = False) -> Callable[..., None]:
         """Return the command as cyclopts takes it: a function with a keyword for each option."""
-        hints, options, kind = self.hints, options_of(self.kind), self.kind
+        hints, kind = get_type_hints(self.call), self.kind
         every = everything or not self.has_many
         shown = []
-        for one in inspect.signature(self.call).parameters.values():
-            if one.name == "options":
-                shown += [_keyword(each, every or each.basic) for each in options]
-            elif one.name == "quiet":
+        for name, one in inspect.signature(self.call).parameters.items():
+            if name == "options":
+                shown += [_keyword(each, every or each.basic) for each in options_of(kind)]
+            elif name == "quiet":
                 shown.append(one.replace(annotation=Annotated[bool, _QUIET], default=False))
             else:
-                shown.append(one.replace(annotation=hints[one.name]))
+                asked = Parameter(help=self.helps[name], negative=())
+                if name in ("jobs", "stage"):
+                    asked = Parameter.combine(asked, Parameter(group=_GROUPS[Panel.OUTPUT]))
+                shown.append(one.replace(annotation=Annotated[hints[name], asked]))
 
         def call(*places: Any, **given: Any) -> None:
-            values = {one.name: given.pop(one.name) for one in options if one.name in given}
-            asked = kind(**values)
-            if given.get("config") is None:
-                check_needed(asked)
-            own = {"quiet": False} if "quiet" in hints else {}
-            self.call(*places, options=asked, **{**own, **given})
+            names = [one.name for one in options_of(kind) if one.name in given]
+            options = kind(**{name: given.pop(name) for name in names})
+            if given.get("config") is None:  # an earlier run says the rest
+                check_needed(options)
+            quiet = {"quiet": given.pop("quiet", False)} if "quiet" in hints else {}
+            self.call(*places, options=options, **quiet, **given)
 
         call.__signature__ = inspect.Signature(shown)  # type: ignore[attr-defined]
         return call
@@ -83,11 +83,11 @@ COMMANDS: dict[str, Command] = {}
 """The commands by name, in the order of the help."""
 
 
-def command(example: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Make a function a command, with an example for its help."""
+def command(example: str, **helps: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Make a function a command, with an example and what its arguments mean."""
 
     def add(call: Callable[..., None]) -> Callable[..., None]:
-        COMMANDS[call.__name__.replace("_", "-")] = Command(call, example)
+        COMMANDS[call.__name__.replace("_", "-")] = Command(call, example, helps)
         return call
 
     return add
@@ -118,7 +118,7 @@ def _keyword(one: Option, is_shown: bool) -> inspect.Parameter:
     default = "" if one.needed else one.default_text
     has_opposite = one.off or (one.type is bool and one.default)
     parameter = Parameter(
-        help=f"{one.help_text}{f' ({one.needed_text})' if one.needed else ''}",
+        help=f"{one.help} ({one.needed})" if one.needed else one.help,
         group=_GROUPS[Panel(one.panel)],
         show=is_shown,
         negative_bool="no-" if has_opposite else (),

@@ -29,7 +29,7 @@ def plugin_zip(commands: Mapping[str, Command]) -> bytes:
 
 
 def _command(name: str, command: Command) -> dict[str, Any]:
-    options, hints = options_of(command.kind), command.hints
+    options = options_of(command.kind)
     names = [one.name for one in options]
     return {
         "name": name,
@@ -38,7 +38,7 @@ def _command(name: str, command: Command) -> dict[str, Any]:
             {
                 "name": name,
                 "kind": _PLACES.get(name, "cloud"),
-                "help": hints[name].__metadata__[0].help,
+                "help": command.helps[name],
                 "unit": "",
                 "default": None,
                 "needed": True,
@@ -55,17 +55,18 @@ def _option(one: Option, *, replaced: bool) -> dict[str, Any]:
     kind, default = _kind(one), one.default
     if kind not in ("bool", "int", "float", "choice"):
         default = None  # an empty text is pcfix's own default
+    help, _, unit = one.help.partition(" [")
     default_words = f" Default: {one.default_text}." if one.default_text else ""
     return {
         "name": one.name,
         "flag": one.flag,
         "kind": kind,
         "choices": list(one.choices),
-        "unit": one.unit,
+        "unit": unit.removesuffix("]"),
         "default": default,
         "repeated": one.repeats,
-        "needed": one.needed and not one.default_is and not replaced,
-        "help": one.help + default_words,
+        "needed": one.needed == "needed" and not replaced,
+        "help": help + default_words,
     }
 
 

@@ -22,7 +22,7 @@ from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.lens.imaging import unproject
 from pcfix.model import Cameras, FloatArray, IntArray, WaterDimension, WaterSurface
 from pcfix.options.declare import File, taken
-from pcfix.options.handover import ViewerOptions
+from pcfix.options.steps import ViewerOptions
 from pcfix.refract.tally import COVERAGE_95
 from pcfix.report.page import png_of
 from pcfix.report.view import Scene3d, scale_of, show, view_figure

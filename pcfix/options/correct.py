@@ -54,35 +54,23 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
     """Dense matcher of --camera-set mvs: fused depth maps (OpenMVS, COLMAP), or the median of
     stereo pairs (MicMac, SURE)."""
     max_angle: float | str | None = option(
-        "auto",
-        basic=True,
-        unit="deg",
-        above=0,
-        most=90,
-        parse=number_or("auto", "none"),
-        metavar="DEG",
-        default_is="auto; 80 without angles",
+        "auto", basic=True, above=0, most=90, parse=number_or("auto", "none"), metavar="DEG"
     )
     """Maximum incidence angle of a ray, from the surface normal; none for no limit. With auto it is
-    estimated from the cloud, for methods that weigh all rays alike."""
-    max_cameras: int | None = option(None, least=1, default_is="no limit")
-    """Maximum number of rays per point; those closest to nadir are used."""
+    estimated from the cloud, for methods that weigh all rays alike. [deg] [default: auto; 80
+    without angles]"""
+    max_cameras: int | None = option(None, least=1)
+    """Maximum number of rays per point; those closest to nadir are used. [default: no limit]"""
     occlusion: Occlusion = option("auto")
     """Skip cameras from which the cloud occludes the point; auto: if there are oblique images."""
     exact: bool = option(False)
     """Solve every point exactly. Otherwise depth maps are interpolated where that is within 0.05
     ground pixels."""
     depth_factor: float | str | None = option(
-        None,
-        least=1,
-        most=3,
-        needs="method factor",
-        parse=number_or("auto"),
-        metavar="N",
-        default_is="the refractive index",
+        None, least=1, most=3, needs="method factor", parse=number_or("auto"), metavar="N"
     )
     """Ratio of true to apparent depth; auto: from the height, focal length and base of the cameras.
-    """
+    [default: the refractive index]"""
     least_r2: float = option(0.5, least=0, most=1)
     """With --method regression: refuse a fit with a lower r2."""
     index_from: str = ""
@@ -138,22 +126,20 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
 class BudgetOptions(OptionSet, panel=Panel.BUDGET):
     """Standard deviations of the inputs of a correction; see `pcfix.refract.uncertainty`."""
 
-    sigma_image: float = option(0.5, unit="px", least=0)
-    """Standard deviation of an image coordinate."""
-    sigma_level: float | None = option(
-        None, unit="m", least=0, default_is=f"that of its fit, else {LEVEL_M:g}"
-    )
-    """Standard deviation of the water level."""
-    sigma_tilt: float = option(0.0, unit="deg", least=0)
-    """Standard deviation of the slope of the water, about each axis."""
+    sigma_image: float = option(0.5, least=0)
+    """Standard deviation of an image coordinate. [px]"""
+    sigma_level: float | None = option(None, least=0)
+    """Standard deviation of the water level. [m] [default: that of its fit, else 0.02]"""
+    sigma_tilt: float = option(0.0, least=0)
+    """Standard deviation of the slope of the water, about each axis. [deg]"""
     sigma_index: float = option(0.002, least=0)
     """Standard deviation of the refractive index."""
-    sigma_waves: float = option(0.0, unit="deg", least=0)
-    """Standard deviation of the slope of waves, from ray to ray."""
-    sigma_centre: float = option(0.0, unit="m", least=0)
-    """Standard deviation of a projection centre, each axis."""
-    sigma_attitude: float = option(0.0, unit="deg", least=0)
-    """Standard deviation of the attitude, about each axis."""
+    sigma_waves: float = option(0.0, least=0)
+    """Standard deviation of the slope of waves, from ray to ray. [deg]"""
+    sigma_centre: float = option(0.0, least=0)
+    """Standard deviation of a projection centre, each axis. [m]"""
+    sigma_attitude: float = option(0.0, least=0)
+    """Standard deviation of the attitude, about each axis. [deg]"""
 
 
 class RefractionOptions(BudgetOptions, MethodOptions, panel=Panel.OUTPUT):
@@ -180,17 +166,9 @@ class ScienceOptions(RefractionOptions, panel=Panel.OUTPUT):
 
 
 class CorrectOptions(
-    PartOptions,
-    ShorelineOption,
-    TileOptions,
-    SummaryOption,
-    ScienceOptions,
-    WaterPerImageOption,
-    MaskOption,
-    LandRules,
-    InputOptions,
-    panel=Panel.OUTPUT,
-):
+    PartOptions, ShorelineOption, TileOptions, SummaryOption, ScienceOptions, WaterPerImageOption,
+    MaskOption, LandRules, InputOptions, panel=Panel.OUTPUT,
+):  # fmt: skip
     """The options of ``pcfix correct``; in Python they are `pcfix.Options`."""
 
     save_regression: File | None = option(None, needs="check_depths")
@@ -200,10 +178,12 @@ class CorrectOptions(
 class LabelRules(LandRules, panel=Panel.WATER):
     """Which points count as submerged, besides those below the surface; see `pcfix.label`."""
 
-    band: float = option(0.0, unit="m", least=0, default_is="no class 41")
-    """Points up to this distance from the surface, above or below, become class 41."""
-    dead_band: float = option(0.0, unit="m", least=0, default_is="none")
-    """Points up to this distance from the surface get the label of their surroundings."""
+    band: float = option(0.0, least=0)
+    """Points up to this distance from the surface, above or below, become class 41. [m] [default:
+    no class 41]"""
+    dead_band: float = option(0.0, least=0)
+    """Points up to this distance from the surface get the label of their surroundings. [m]
+    [default: none]"""
     reset: bool = option(False)
     """Set points of class 40 or 41 that are neither to class 1."""
 

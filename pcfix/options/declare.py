@@ -2,9 +2,10 @@
 
 An option is a field of an `OptionSet` with its help below it::
 
-    max_cameras: int | None = option(None, least=1, default_is="no limit")
-    \"\"\"Maximum number of rays per point; those closest to nadir are used.\"\"\"
+    read_resolution: float | None = option(None, above=0)
+    \"\"\"Size of a square with one point. [m] [default: all levels]\"\"\"
 
+The text is the help, with the unit, and with the default in words if the value says too little.
 A class holds the options of one subject, and the class of a command lists those it consists of; no
 class is reached twice. Names are the same everywhere: ``max_angle`` in Python and JSON is
 ``--max-angle`` on the command line.
@@ -44,49 +45,74 @@ Set = TypeVar("Set", bound="OptionSet")
 
 
 class Option(NamedTuple):
-    """An option of a class."""
+    """An option of a class.
+
+    Attributes
+    ----------
+    name, type, default
+        As those of its field.
+    home : type
+        The class that declares it.
+    basic : bool
+        Whether most people need it; ``--help`` of a command with many options shows no others.
+    least, above, most : float or None
+        Limits of a number, or of each of several; `above` itself is not allowed.
+    needed, instead : str
+        ``"needed"`` if it must be given, with when not, and another option that can replace it.
+    needs : str
+        Another option without which this one has no effect, or one and the value that it must have:
+        ``"method factor"``.
+    requires : tuple of str
+        Options that must be given with it; of ``"cameras or gsd"`` exactly one.
+    parse, then : callable or None
+        Returns the value, given the option's name and a text; returns what the program uses, given
+        a value of the right type.
+    metavar, panel : str
+        Placeholder of the value, and panel of the help if it is not that of the class.
+    off : bool
+        Whether ``--no-NAME`` is a flag too; a switch that is on always has one.
+    """
 
     name: str
     type: Any
     default: Any
     home: type
-    """The class that declares it."""
     basic: bool = False
-    """Whether most people need it; ``--help`` of a command with many shows no others."""
-    unit: str = ""
-    """Unit of the value: m, deg, px."""
     least: float | None = None
     above: float | None = None
     most: float | None = None
-    """Limits of a number, or of each of several; `above` itself is not allowed."""
-    default_is: str = ""
-    """The default in words, if it is not the value."""
-    needed: bool = False
-    """Whether it must be given; `default_is` says when not."""
+    needed: str = ""
     instead: str = ""
-    """Another option of the command that can replace it."""
     needs: str = ""
-    """Another option without which it has no effect, or one and its value: ``"method factor"``."""
     requires: tuple[str, ...] = ()
-    """Other options that must be given with it; of ``"cameras or gsd"`` exactly one."""
     parse: Callable[[str, str], Any] | None = None
-    """Returns the value, given the option's name and a text."""
     then: Callable[[Any], Any] | None = None
-    """Returns what the program uses for a value of the right type."""
     metavar: str = ""
-    """Placeholder of the value."""
-    off: bool = False
-    """Whether ``--no-NAME`` is a flag; a switch that is on always has one."""
     panel: str = ""
-    """Panel of the help, if it is not that of the class."""
+    off: bool = False
+
+    @property
+    def _text(self) -> str:
+        """The text below its declaration, or below that of a base that it replaces."""
+        found = (
+            _texts(base.__module__).get((base.__name__, self.name)) for base in self.home.__mro__
+        )
+        return next(filter(None, found))
 
     @property
     def help(self) -> str:
-        """What it means: the text below its declaration."""
-        at = self.home.__mro__
-        return next(
-            filter(None, (_texts(one.__module__).get((one.__name__, self.name)) for one in at))
-        )
+        """What it means, with the unit."""
+        return self._text.partition(" [default: ")[0]
+
+    @property
+    def default_text(self) -> str:
+        """Its default, in words if there are any; empty without a default."""
+        words = self._text.partition(" [default: ")[2].removesuffix("]")
+        if words or self.default in (None, ()) or self.default is False:
+            return words
+        if isinstance(self.default, tuple):
+            return ("," if self.parse else " ").join(f"{value:g}" for value in self.default)
+        return f"{self.default:g}" if isinstance(self.default, float) else str(self.default)
 
     @property
     def flag(self) -> str:
@@ -114,25 +140,6 @@ class Option(NamedTuple):
     def repeats(self) -> bool:
         """Whether it may be given several times on the command line."""
         return self.default == () and self.parse is None
-
-    @property
-    def help_text(self) -> str:
-        """Its help, with the unit."""
-        return self.help + (f" [{self.unit}]" if self.unit else "")
-
-    @property
-    def default_text(self) -> str:
-        """Its default, in words if there are any; empty without a default."""
-        if self.default_is or self.default in (None, ()) or self.default is False:
-            return self.default_is
-        if isinstance(self.default, tuple):
-            return ("," if self.parse else " ").join(f"{value:g}" for value in self.default)
-        return f"{self.default:g}" if isinstance(self.default, float) else str(self.default)
-
-    @property
-    def needed_text(self) -> str:
-        """Whether it is needed, and when not."""
-        return ", ".join(filter(None, ["needed" if self.needed else "", self.default_text]))
 
     @property
     def plain_kinds(self) -> tuple[type, ...]:
@@ -222,34 +229,35 @@ class OptionSet:
         options = {one.name: one for one in options_of(type(self))}
         for name, one in options.items():
             object.__setattr__(self, name, one.checked(getattr(self, name)))
-        given = {name for name, one in options.items() if getattr(self, name) != one.default}
-        for one in (options[name] for name in options if name in given):
+
+        def is_given(name: str) -> bool:
+            return bool(getattr(self, name) != options[name].default)
+
+        for name, one in options.items():
             other, _, wanted = one.needs.partition(" ")
-            if other in options and (
-                getattr(self, other) != wanted if wanted else other not in given
-            ):
+            met = other not in options or (
+                getattr(self, other) == wanted if wanted else is_given(other)
+            )
+            if not met and is_given(name):
                 flag = f"{options[other].flag} {wanted}".strip()
                 raise SettingError(
                     "option.needs",
                     f"{one.flag[2:]} has no effect without {flag}. Give both, or neither.",
-                    option=one.name,
+                    option=name,
                     needs=one.needs,
                 )
-            for words in one.requires:
-                names = words.split(" or ")
-                if len(given.intersection(names)) != 1:
-                    needs = f"needs either {words}" if names[1:] else f"needs {words}"
-                    raise SettingError(
-                        "option.missing",
-                        f"{one.flag[2:]} {needs}. Give {'one of them' if names[1:] else 'it'}.",
-                        option=names[0],
-                    )
+            for others in one.requires:
+                names = others.split(" or ")
+                if is_given(name) and sum(map(is_given, names)) != 1:
+                    give = "exactly one of them" if names[1:] else "both"
+                    sentence = f"{one.flag[2:]} needs {others}: give {give}."
+                    raise SettingError("option.missing", sentence, option=names[0])
         for group in reversed(type(self).__mro__):
             if "check" in vars(group):
-                group.check(self)
+                vars(group)["check"](self)
 
     def check(self) -> None:
-        """Check what the options of this class say together."""
+        """Check what the options of a class say together; called for each class of a command."""
 
     def part(self, kind: type[Set]) -> Set:
         """Return those options that another class has too."""
@@ -294,14 +302,13 @@ def options_of(kind: type) -> tuple[Option, ...]:
         for base in reversed(kind.__mro__):
             homes |= dict.fromkeys(inspect.get_annotations(base), base)
         hints = get_type_hints(kind)
-        declared = [(one, one.metadata.get("option")) for one in fields(kind)]
         _KNOWN[kind] = tuple(
             Option(
                 one.name, hints[one.name], one.default, homes[one.name],
-                **{"panel": homes[one.name].panel, **more},
+                **{"panel": homes[one.name].panel, **one.metadata["option"]},
             )
-            for one, more in declared
-            if more is not None
+            for one in fields(kind)
+            if "option" in one.metadata
         )  # fmt: skip
     return _KNOWN[kind]
 
@@ -311,10 +318,11 @@ def _texts(module: str) -> dict[tuple[str, str], str]:
     """Return the texts below the fields of the classes of a module, by class and field."""
     found = {}
     for kind in ast.parse(inspect.getsource(sys.modules[module])).body:
-        for one, below in pairwise(kind.body if isinstance(kind, ast.ClassDef) else ()):
-            match one, below:
-                case ast.AnnAssign(ast.Name(name)), ast.Expr(ast.Constant(str(text))):
-                    found[kind.name, name] = " ".join(text.split())
+        if isinstance(kind, ast.ClassDef):
+            for pair in pairwise(kind.body):
+                match pair:
+                    case ast.AnnAssign(ast.Name(name)), ast.Expr(ast.Constant(str(text))):
+                        found[kind.name, name] = " ".join(text.split())
     return found
 
 

@@ -27,30 +27,14 @@ class OrthoOptions(
 ):
     """The options of ``pcfix ortho``."""
 
-    dsm: Any = option(None, basic=True, metavar="PATH", needed=True)
+    dsm: Any = option(None, basic=True, metavar="PATH", needed="needed")
     """True heights of land and bed: a GeoTIFF, or a corrected cloud (.las, .laz), which is gridded
     to cells twice as wide as those of the orthophoto."""
-    resolution: float | None = option(
-        None, basic=True, unit="m", above=0, default_is="a ground pixel"
-    )
-    """Cell size."""
+    resolution: float | None = option(None, basic=True, above=0)
+    """Cell size. [m] [default: a ground pixel]"""
     water: Any = option(None, basic=True, metavar="SPEC")
     """Water surface, as for 'pcfix photos', for photographs as taken; without it refraction must
     have been removed from them."""
-
-
-class MappingRules(OptionSet, panel=Panel.METHOD):
-    """How a photograph is resampled."""
-
-    mapping: Mapping = option("exact", basic=True)
-    """exact: trace the light back from the true bed; paper: eq 12 of Skarlatos & Agrafiotis 2018 on
-    the apparent bed, one round of their iteration."""
-    spacing: int | None = option(
-        None, unit="px", least=1, most=512, default_is="a cell of the DSM, at least 8 px"
-    )
-    """Spacing of the grid nodes over the photograph."""
-    holes: Holes = option("fill")
-    """Interpolate holes of the DSM, or make them black."""
 
 
 def _command(given: str) -> str:
@@ -83,25 +67,24 @@ class RebuildOptions(OptionSet, panel=Panel.ROUNDS):
 
 
 class PhotosOptions(
-    WaterPerImageOption,
-    JobOptions,
-    SummaryOption,
-    RebuildOptions,
-    MappingRules,
-    IndexOptions,
-    NeededOptions,
-    CamerasOptions,
-    panel=Panel.NEED,
-):
+    WaterPerImageOption, JobOptions, SummaryOption, RebuildOptions, IndexOptions, NeededOptions,
+    CamerasOptions, panel=Panel.NEED,
+):  # fmt: skip
     """The options of ``pcfix photos``."""
 
-    dsm: Any = option(None, basic=True, metavar="PATH", needed=True)
+    dsm: Any = option(None, basic=True, metavar="PATH", needed="needed")
     """Heights of land and bed: a GeoTIFF, or a cloud (.las, .laz), which is gridded; corrected for
     --mapping exact, apparent for paper."""
-    resolution: float | None = option(
-        None, basic=True, unit="m", above=0, default_is="2 to 4 points a cell"
-    )
-    """Cell size to which a cloud is gridded."""
+    resolution: float | None = option(None, basic=True, above=0)
+    """Cell size to which a cloud is gridded. [m] [default: 2 to 4 points a cell]"""
+    mapping: Mapping = option("exact", basic=True, panel=Panel.METHOD)
+    """exact: trace the light back from the true bed; paper: eq 12 of Skarlatos & Agrafiotis 2018 on
+    the apparent bed, one round of their iteration."""
+    spacing: int | None = option(None, least=1, most=512, panel=Panel.METHOD)
+    """Spacing of the grid nodes over the photograph. [px] [default: a cell of the DSM, at least 8
+    px]"""
+    holes: Holes = option("fill", panel=Panel.METHOD)
+    """Interpolate holes of the DSM, or make them black."""
 
 
 class CalmOptions(JobOptions, SummaryOption, CameraFileOptions, IndexOptions, panel=Panel.WATER):
@@ -113,21 +96,18 @@ class CalmOptions(JobOptions, SummaryOption, CameraFileOptions, IndexOptions, pa
     depth: Any = option(None, basic=True, metavar="SPEC", needs="surface")
     """With --surface: true depth in metres, or heights of the bed: a GeoTIFF or cloud, which is
     apparent unless pcfix corrected it."""
-    level: float = option(0.0, unit="m")
-    """With --surface: height of the calm water."""
+    level: float = option(0.0)
+    """With --surface: height of the calm water. [m]"""
     cameras: Any = option(None, basic=True, metavar="PATH", needs="surface")
     """With --surface: pose of the hovering camera, by the name of the first frame, or the only one
     in the file."""
-    gsd: float | None = option(None, basic=True, unit="m", above=0, needs="surface")
-    """With --surface, instead of --cameras, for a nadir view: pixel size at the bed."""
-    interval: float | None = option(
-        None, unit="s", above=0, needs="surface", default_is="what the video says"
-    )
-    """With --surface: time between frames, before --every; without it frames are independent."""
-    resolution: float | None = option(
-        None, basic=True, unit="m", above=0, default_is="that of 2,000 cells"
-    )
-    """Cell size of the rasters of the water."""
+    gsd: float | None = option(None, basic=True, above=0, needs="surface")
+    """With --surface, instead of --cameras, for a nadir view: pixel size at the bed. [m]"""
+    interval: float | None = option(None, above=0, needs="surface")
+    """With --surface: time between frames, before --every; without it frames are independent. [s]
+    [default: what the video says]"""
+    resolution: float | None = option(None, basic=True, above=0)
+    """Cell size of the rasters of the water. [m] [default: that of 2,000 cells]"""
     every: int = option(1, least=1, most=100_000, panel=Panel.METHOD)
     """Use every Nth frame."""
     still: bool = option(False, panel=Panel.METHOD)

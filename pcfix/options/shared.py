@@ -39,15 +39,9 @@ class IndexOptions(OptionSet, panel=Panel.WATER):
     """The refractive index of the water."""
 
     index: float | str | None = option(
-        None,
-        basic=True,
-        least=1.0,
-        most=1.5,
-        parse=number_or(),
-        default_is=f"{DEFAULT_REFRACTIVE_INDEX:g}",
-        metavar="N",
+        None, basic=True, least=1.0, most=1.5, parse=number_or(), metavar="N"
     )
-    """Refractive index of the water relative to air: a number, fresh or sea."""
+    """Refractive index of the water relative to air: a number, fresh or sea. [default: 1.34]"""
     index_formula: IndexFormula = option("skarlatos")
     """Formula of the index from salinity, temperature and wavelength: Skarlatos & Agrafiotis 2018,
     eq 13, or Quan & Fry 1995."""
@@ -64,14 +58,14 @@ class WaterOptions(OptionSet, panel=Panel.WATER):
     water_model: WaterModel = option("auto")
     """Surface fitted to shoreline points: level, plane, plane tilted along the points only, or
     river; auto chooses among the first three."""
-    water_crs: str | None = option(None, default_is="what their file says", metavar="CRS")
-    """CRS of the shoreline points."""
+    water_crs: str | None = option(None, metavar="CRS")
+    """CRS of the shoreline points. [default: what their file says]"""
 
 
 class NeededOptions(WaterOptions, panel=Panel.NEED):
     """The water surface."""
 
-    water: Any = option(None, basic=True, metavar="SPEC", needed=True, instead="port")
+    water: Any = option(None, basic=True, metavar="SPEC", needed="needed", instead="port")
     """Water surface: a level (0.37), plane:a,b,c, dim:NAME, a mesh (.obj, .ply), a raster (.tif),
     shoreline points (.csv, .gpkg, .shp, .geojson, .wkt), or auto."""
 
@@ -89,27 +83,26 @@ class LandRules(OptionSet, panel=Panel.WATER):
 
     connected: bool = option(False, basic=True, off=True)
     """Correct only the main water body and its connected parts; ignore separate pools."""
-    least_pool: float | None = option(
-        None, unit="m2", least=0.0, needs="connected", default_is="a tenth of the largest water"
-    )
-    """Pools of at least this area are not ignored."""
+    least_pool: float | None = option(None, least=0.0, needs="connected")
+    """Pools of at least this area are not ignored. [m2] [default: a tenth of the largest water]"""
     respect_classes: tuple[int, ...] = option(
         (),
         least=0,
         most=255,
         parse=numbers,
         then=lambda found: tuple(sorted({*found})),
-        default_is="none",
         metavar="N,N",
     )
-    """Points of these classes are never submerged; 2,5,6 are ground, trees and buildings."""
+    """Points of these classes are never submerged; 2,5,6 are ground, trees and buildings. [default:
+    none]"""
 
 
 class MaskOption(OptionSet, panel=Panel.WATER):
     """Where points may be submerged."""
 
-    water_mask: File | None = option(None, basic=True, default_is="everywhere")
-    """Polygons (.gpkg, .shp, .geojson, .wkt) inside which points may be submerged."""
+    water_mask: File | None = option(None, basic=True)
+    """Polygons (.gpkg, .shp, .geojson, .wkt) inside which points may be submerged. [default:
+    everywhere]"""
 
 
 class PortOptions(OptionSet, panel=Panel.WATER):
@@ -124,26 +117,23 @@ class PortOptions(OptionSet, panel=Panel.WATER):
 class CameraFileOptions(OptionSet, panel=Panel.CAMERAS):
     """How a camera file is read."""
 
-    sensor: File | None = option(None, default_is="sensor.csv beside the cameras")
+    sensor: File | None = option(None)
     """Interior orientation, if the cameras have none: CSV focal,sensor_x,sensor_y in mm, or a
-    Metashape calibration."""
-    angles: Angles | None = option(None, default_is="yaw-pitch-roll")
+    Metashape calibration. [default: sensor.csv beside the cameras]"""
+    angles: Angles | None = option(None)
     """Angles of a table whose header does not name them; in aircraft, pitch -90 is straight down.
-    """
-    cameras_crs: str | None = option(
-        None, basic=True, default_is="what their file says, else the cloud's", metavar="CRS"
-    )
-    """CRS of the cameras, such as EPSG:25830; 'local' uses the numbers as they are."""
-    cameras_offset: tuple[float, float, float] | None = option(
-        None, unit="m", parse=numbers, metavar="X,Y,Z"
-    )
-    """Added to the projection centres, for models shifted to the origin."""
+    [default: yaw-pitch-roll]"""
+    cameras_crs: str | None = option(None, basic=True, metavar="CRS")
+    """CRS of the cameras, such as EPSG:25830; 'local' uses the numbers as they are. [default: what
+    their file says, else the cloud's]"""
+    cameras_offset: tuple[float, float, float] | None = option(None, parse=numbers, metavar="X,Y,Z")
+    """Added to the projection centres, for models shifted to the origin. [m]"""
 
 
 class CamerasOptions(CameraFileOptions, panel=Panel.NEED):
     """The exterior orientation."""
 
-    cameras: Any = option(None, basic=True, metavar="PATH", needed=True)
+    cameras: Any = option(None, basic=True, metavar="PATH", needed="needed")
     """File or folder of camera poses: Metashape, Pix4D, OPF, ODM, OpenSfM, COLMAP, MicMac, Bundler,
     VisualSFM, BlocksExchange, RealityCapture, or a CSV table."""
 
@@ -163,13 +153,9 @@ class SurveyOptions(ViewOptions, CamerasOptions, NeededOptions, panel=Panel.CAME
     """Inputs of a correction through a water surface, as the user names them."""
 
     cameras: Any = option(
-        None,
-        basic=True,
-        metavar="PATH",
-        needed=True,
-        panel=Panel.NEED,
-        default_is="not with --method factor or regression",
-    )
+        None, basic=True, metavar="PATH", panel=Panel.NEED,
+        needed="needed, not with --method factor or regression",
+    )  # fmt: skip
     adjusted_from: Any = option(None, basic=True, metavar="PATH")
     """Original camera file, if --cameras is the output of 'pcfix adjust'. The cloud is first
     transferred to the adjusted poses."""
@@ -179,16 +165,15 @@ class SurveyOptions(ViewOptions, CamerasOptions, NeededOptions, panel=Panel.CAME
     """Line that --save-regression wrote for another cloud, instead of --check-depths."""
     tide: File | None = option(None, panel=Panel.WATER)
     """CSV time,level_m: each image gets the water level of its time."""
-    image_times: File | None = option(
-        None, default_is="what the camera file says", panel=Panel.WATER
-    )
-    """With --tide: CSV label,time, or the folder of the images."""
-    salinity: float | None = option(None, unit="PSU", default_is="35", panel=Panel.WATER)
-    """Salinity of the water, to compute the refractive index."""
-    temperature: float | None = option(None, unit="deg C", default_is="15", panel=Panel.WATER)
-    """Temperature of the water."""
-    wavelength: float | None = option(None, unit="um", default_is="0.53", panel=Panel.WATER)
-    """Wavelength of the light."""
+    image_times: File | None = option(None, panel=Panel.WATER)
+    """With --tide: CSV label,time, or the folder of the images. [default: what the camera file
+    says]"""
+    salinity: float | None = option(None, panel=Panel.WATER)
+    """Salinity of the water, to compute the refractive index. [PSU] [default: 35]"""
+    temperature: float | None = option(None, panel=Panel.WATER)
+    """Temperature of the water. [deg C] [default: 15]"""
+    wavelength: float | None = option(None, panel=Panel.WATER)
+    """Wavelength of the light. [um] [default: 0.53]"""
 
 
 class InputOptions(SurveyOptions, PortOptions):
@@ -199,11 +184,12 @@ class PartOptions(OptionSet, panel=Panel.INPUT):
     """Which points of a cloud are read; see `pcfix.io.las.part`."""
 
     bounds: tuple[float, float, float, float] | None = option(
-        None, unit="m", parse=numbers, metavar="X,Y,X,Y", default_is="all"
+        None, parse=numbers, metavar="X,Y,X,Y"
     )
-    """Read only the points in this box (west, south, east, north)."""
-    read_resolution: float | None = option(None, unit="m", above=0, default_is="all levels")
-    """Read only the coarse levels of a COPC file, about one point in each square of this side."""
+    """Read only the points in this box (west, south, east, north). [m] [default: all]"""
+    read_resolution: float | None = option(None, above=0)
+    """Read only the coarse levels of a COPC file, about one point in each square of this side. [m]
+    [default: all levels]"""
 
 
 class OverwriteOption(OptionSet, panel=Panel.OUTPUT):
@@ -216,8 +202,9 @@ class OverwriteOption(OptionSet, panel=Panel.OUTPUT):
 class JobOptions(OverwriteOption, panel=Panel.OUTPUT):
     """How the work is done."""
 
-    jobs: int | None = option(None, basic=True, least=1, default_is="all cores")
-    """Number of threads; with many files, of files processed at the same time."""
+    jobs: int | None = option(None, basic=True, least=1)
+    """Number of threads; with many files, of files processed at the same time. [default: all cores]
+    """
 
 
 class TileOptions(JobOptions, panel=Panel.OUTPUT):

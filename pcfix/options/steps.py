@@ -1,4 +1,4 @@
-"""The options of the steps after a correction: clean, dsm and compare."""
+"""The options of the steps after a correction: clean, dsm, compare and view."""
 
 from __future__ import annotations
 
@@ -11,7 +11,15 @@ from typing import Any, Literal
 
 from pcfix.errors import SettingError
 from pcfix.options.declare import File, OptionSet, option
-from pcfix.options.shared import OverwriteOption, Panel, PartOptions, SummaryOption, TileOptions
+from pcfix.options.shared import (
+    CameraFileOptions,
+    OverwriteOption,
+    Panel,
+    PartOptions,
+    SummaryOption,
+    TileOptions,
+    WaterOptions,
+)
 
 LEAST_NEIGHBOURS, MOST_NEIGHBOURS = 6, 500
 MAX_HOLE_CELLS = 1000
@@ -22,6 +30,7 @@ LEAST_PLANE_POINTS, PLANE_POINTS = 6, 8
 DsmMethod = Literal["mean", "median", "min", "max", "idw", "tin"]
 SurfaceChoice = Literal["all", "bed"]
 Direction = Literal["to-reference", "from-reference", "both"]
+Colour = Literal["depth", "shift", "error", "uncertainty", "height"]
 
 
 class CleanRules(OptionSet, panel=Panel.TESTS):
@@ -41,27 +50,27 @@ class CleanRules(OptionSet, panel=Panel.TESTS):
     deviations: float | None = option(4.0, above=0)
     """Noise if the mean distance to the neighbours exceeds that of all points by this many standard
     deviations."""
-    radius: float | None = option(None, basic=True, unit="m", above=0, default_is="no such test")
-    """Noise if fewer than --radius-neighbours others are nearer."""
+    radius: float | None = option(None, basic=True, above=0)
+    """Noise if fewer than --radius-neighbours others are nearer. [m] [default: no such test]"""
     radius_neighbours: int = option(3, least=1, most=MOST_NEIGHBOURS)
     """See --radius."""
     weak: bool = option(True)
     """Test rays, ray distance and incidence of corrected points."""
     min_rays: int | None = option(3, basic=True, least=2)
     """Noise if corrected from fewer rays."""
-    max_ray_miss: float | None = option(0.5, basic=True, unit="m", above=0)
-    """Noise if the rays are further from the point (RayMiss)."""
-    max_incidence: float | None = option(75.0, basic=True, unit="deg", above=0, most=90)
-    """Noise if a ray has a larger incidence angle."""
+    max_ray_miss: float | None = option(0.5, basic=True, above=0)
+    """Noise if the rays are further from the point (RayMiss). [m]"""
+    max_incidence: float | None = option(75.0, basic=True, above=0, most=90)
+    """Noise if a ray has a larger incidence angle. [deg]"""
     bed_neighbours: int = option(32, least=LEAST_NEIGHBOURS, most=MOST_NEIGHBOURS)
     """Nearest submerged points in plan from which the bed is estimated."""
     fences: float = option(3.0, above=0)
     """Noise if outside the interquartile range of their heights by this many times the range, and
     by more than --below or --floating."""
-    below: float | None = option(0.3, off=True, unit="m", above=0)
-    """Minimum distance of noise below the bed."""
-    floating: float | None = option(0.5, basic=True, off=True, unit="m", above=0)
-    """Minimum distance of noise above the bed."""
+    below: float | None = option(0.3, off=True, above=0)
+    """Minimum distance of noise below the bed. [m]"""
+    floating: float | None = option(0.5, basic=True, off=True, above=0)
+    """Minimum distance of noise above the bed. [m]"""
 
     def check(self) -> None:
         """Switch off what is not asked for; something must be left."""
@@ -91,10 +100,9 @@ class CleanRules(OptionSet, panel=Panel.TESTS):
 class CleanOptions(TileOptions, SummaryOption, CleanRules, panel=Panel.OUTPUT):
     """The options of ``pcfix clean``."""
 
-    water: Any = option(
-        None, basic=True, default_is="the points that pcfix corrected", metavar="SPEC"
-    )
-    """Water surface, as for 'pcfix correct': points below it are tested against the bed."""
+    water: Any = option(None, basic=True, metavar="SPEC")
+    """Water surface, as for 'pcfix correct': points below it are tested against the bed. [default:
+    the points that pcfix corrected]"""
     drop: bool = option(False, basic=True)
     """Drop noise. Otherwise it gets class 7 and the withheld flag."""
 
@@ -102,10 +110,8 @@ class CleanOptions(TileOptions, SummaryOption, CleanRules, panel=Panel.OUTPUT):
 class DsmRules(OptionSet, panel=Panel.RASTER):
     """How a cloud becomes a raster."""
 
-    resolution: float | None = option(
-        None, basic=True, unit="m", least=MIN_RESOLUTION_M, default_is="2 to 4 points a cell"
-    )
-    """Cell size."""
+    resolution: float | None = option(None, basic=True, least=MIN_RESOLUTION_M)
+    """Cell size. [m] [default: 2 to 4 points a cell]"""
     what: str = option("height", metavar="height|depth|uncertainty|DIMENSION")
     """Value of a cell: height; depth of the bed below the water; uncertainty, the vertical one of
     the bed at 95 %; or a dimension, by its name."""
@@ -113,12 +119,12 @@ class DsmRules(OptionSet, panel=Panel.RASTER):
     """Gridding method."""
     surface: SurfaceChoice = option("all", basic=True)
     """Grid land and bed without noise, or only the bed (class 40)."""
-    fill: float | None = option(None, unit="m", above=0)
-    """Fill holes up to this width; they get count 0."""
-    azimuth: float = option(315.0, unit="deg")
-    """Sun of the hillshade, clockwise from north."""
-    altitude: float = option(45.0, unit="deg", above=0, most=90)
-    """Sun of the hillshade, above the horizon."""
+    fill: float | None = option(None, above=0)
+    """Fill holes up to this width; they get count 0. [m]"""
+    azimuth: float = option(315.0)
+    """Sun of the hillshade, clockwise from north. [deg]"""
+    altitude: float = option(45.0, above=0, most=90)
+    """Sun of the hillshade, above the horizon. [deg]"""
 
     @property
     def cell_m(self) -> float:
@@ -231,34 +237,20 @@ class DistanceOptions(OptionSet, panel=Panel.FIGURES):
 
     m3c2: bool = option(False, needs="reference")
     """Also compare by M3C2, with py4dgeo: the extra m3c2."""
-    direction: Direction | None = option(
-        None, needs="reference", default_is="to-reference; from each check point"
-    )
+    direction: Direction | None = option(None, needs="reference")
     """C2C from each point of the cloud to the nearest of the reference, the other way round, or
-    both."""
-    classes: int | None = option(
-        None,
-        least=2,
-        most=100_000,
-        needs="reference",
-        default_is="square root of the number of distances",
-    )
-    """Number of classes of the C2C histograms."""
+    both. [default: to-reference; from each check point]"""
+    classes: int | None = option(None, least=2, most=100_000, needs="reference")
+    """Number of classes of the C2C histograms. [default: square root of the number of distances]"""
     share: tuple[Any, ...] = option((), then=_bands, needs="reference", metavar="LOW,HIGH")
     """Report the share of the C2C distances from LOW to HIGH metres; may be repeated."""
     also: tuple[Any, ...] = option(
         (), basic=True, then=_named_clouds, needs="reference", metavar="NAME=CLOUD"
     )
     """Another cloud for the C2C table and the cross-sections; may be repeated."""
-    sigma_reference: float | None = option(
-        None,
-        unit="m",
-        least=0,
-        needs="reference",
-        default_is=", ".join(f"{sigma:g} of a {kind}" for kind, sigma in SIGMA_REFERENCE_M.items()),
-    )
+    sigma_reference: float | None = option(None, least=0, needs="reference")
     """Standard deviation of a height of the reference, which is removed from the errors of the
-    cloud."""
+    cloud. [m] [default: 0.03 of a cloud, 0.03 of a raster, 0.02 of a table of check points]"""
 
     @property
     def from_reference(self) -> bool:
@@ -275,18 +267,17 @@ class CompareRules(DistanceOptions, panel=Panel.FIGURES):
     """Only distances to the nearest point; no signed differences."""
     neighbours: int = option(PLANE_POINTS, least=LEAST_PLANE_POINTS)
     """Reference points of each fitted plane."""
-    bin_width: float = option(1.0, unit="m", above=0)
-    """Bins of the table by depth."""
-    shore_bin_width: float = option(10.0, unit="m", above=0)
-    """Bins of the table by distance from shore."""
-    max_gap: float | None = option(
-        None, unit="m", above=0, default_is="5 point spacings, at least 1"
-    )
-    """Points up to this distance outside the reference are compared."""
+    bin_width: float = option(1.0, above=0)
+    """Bins of the table by depth. [m]"""
+    shore_bin_width: float = option(10.0, above=0)
+    """Bins of the table by distance from shore. [m]"""
+    max_gap: float | None = option(None, above=0)
+    """Points up to this distance outside the reference are compared. [m] [default: 5 point
+    spacings, at least 1]"""
     sections: int = option(0, least=0)
     """Number of automatic cross-sections, down the slope."""
-    corridor: float = option(1.0, unit="m", above=0)
-    """Half-width of a cross-section."""
+    corridor: float = option(1.0, above=0)
+    """Half-width of a cross-section. [m]"""
 
     @property
     def vertical(self) -> bool:
@@ -306,8 +297,8 @@ class CompareOptions(OverwriteOption, SummaryOption, CompareRules, panel=Panel.O
 
     out_dir: File | None = option(None, basic=True)
     """Folder for compare.json, depth tables and sections (CSV)."""
-    water: Any = option(None, basic=True, default_is="what the cloud says", metavar="SPEC")
-    """Water surface, as for 'pcfix correct'."""
+    water: Any = option(None, basic=True, metavar="SPEC")
+    """Water surface, as for 'pcfix correct'. [default: what the cloud says]"""
     section: tuple[Any, ...] = option((), basic=True, metavar="X,Y,X,Y")
     """A cross-section x1,y1,x2,y2; may be repeated."""
     plot: File | None = option(None, basic=True)
@@ -316,3 +307,20 @@ class CompareOptions(OverwriteOption, SummaryOption, CompareRules, panel=Panel.O
 
 class StageCompareOptions(ReferenceOption, CompareOptions):
     """The options of the stage ``compare`` of PDAL, whose cloud is in no file."""
+
+
+class ViewerOptions(OverwriteOption, CameraFileOptions, WaterOptions, panel=Panel.OUTPUT):
+    """The options of ``pcfix view``."""
+
+    colour: Colour = option("depth")
+    """Value shown by colour; error needs --reference, others need extra dimensions."""
+    reference: File | None = option(None, basic=True)
+    """LiDAR cloud, CSV check points or GeoTIFF to show, and to compute errors from."""
+    cameras: Any = option(None, basic=True, metavar="PATH")
+    """Camera poses to show, as for 'pcfix correct'."""
+    water: Any = option(None, basic=True, metavar="SPEC")
+    """Water surface to show, as for 'pcfix correct'; also for depths of clouds without them."""
+    image: File | None = option(None)
+    """PNG to draw instead of opening a window."""
+    points: int = option(2_000_000, basic=True, least=1)
+    """Maximum number of points of each cloud, evenly spread."""

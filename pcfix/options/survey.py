@@ -38,20 +38,17 @@ class SurveyedOptions(OptionSet, panel=Panel.CAMERAS):
     gcps: Any = option(None, basic=True, metavar="PATH")
     """Control and check points with their image points: CSV
     name,x,y,z,image,u,v[,role,under_water], ODM's gcp_list.txt, or Metashape's markers."""
-    gnss: File | None = option(None, basic=True, default_is="what the cameras have")
-    """GNSS positions of the images: CSV image,x,y,z[,sx,sy,sz], a geotag list, or a camera file."""
+    gnss: File | None = option(None, basic=True)
+    """GNSS positions of the images: CSV image,x,y,z[,sx,sy,sz], a geotag list, or a camera file.
+    [default: what the cameras have]"""
     lens: File | None = option(None, basic=True)
     """Calibrated lens, held fixed: as --sensor, or a Metashape calibration."""
 
 
 class CamerasCheckOptions(
-    OverwriteOption,
-    SummaryOption,
-    SurveyedOptions,
-    CameraFileOptions,
-    IndexOptions,
+    OverwriteOption, SummaryOption, SurveyedOptions, CameraFileOptions, IndexOptions,
     panel=Panel.CAMERAS,
-):
+):  # fmt: skip
     """The options of ``pcfix cameras``."""
 
     cloud: File | None = option(None, basic=True)
@@ -77,27 +74,17 @@ class WaterCheckOptions(OverwriteOption, SummaryOption, WaterOptions, panel=Pane
 
 
 class RunOptions(
-    ReferenceOption,
-    ShorelineOption,
-    TileOptions,
-    DistanceOptions,
-    SurveyedOptions,
-    RefractionOptions,
-    MaskOption,
-    LandRules,
-    SurveyOptions,
-    panel=Panel.OUTPUT,
-):
+    ReferenceOption, ShorelineOption, TileOptions, DistanceOptions, SurveyedOptions,
+    RefractionOptions, MaskOption, LandRules, SurveyOptions, panel=Panel.OUTPUT,
+):  # fmt: skip
     """The options of ``pcfix run``: everything that its results depend on is in ``run.json``."""
 
-    resolution: float | None = option(
-        None, basic=True, unit="m", above=0, default_is="2 to 4 points a cell, or the GSD"
-    )
-    """Cell size of the rasters."""
-    project: str | None = option(None, basic=True, default_is="the name of the cloud")
-    """Name of the project, the title of the report."""
-    date: str | None = option(None, default_is="what --image-times says")
-    """Date of the images, for the report."""
+    resolution: float | None = option(None, basic=True, above=0)
+    """Cell size of the rasters. [m] [default: 2 to 4 points a cell, or the GSD]"""
+    project: str | None = option(None, basic=True)
+    """Name of the project, the title of the report. [default: the name of the cloud]"""
+    date: str | None = option(None)
+    """Date of the images, for the report. [default: what --image-times says]"""
     adjust: AdjustWhen = option("auto", basic=True)
     """First refine the cameras, as 'pcfix adjust'; auto: if they have absorbed refraction, and
     there are GNSS positions or --gcps."""
@@ -111,23 +98,20 @@ def _lens_names(option: str, text: str) -> tuple[str, ...]:
 class AdjustRules(IndexOptions, panel=Panel.UNKNOWNS):
     """How a block is adjusted."""
 
-    free: tuple[WaterUnknown, ...] = option(
-        (), basic=True, parse=words, default_is="nothing", metavar="NAMES"
-    )
+    free: tuple[WaterUnknown, ...] = option((), basic=True, parse=words, metavar="NAMES")
     """Unknowns of the water: some of level,tilt,index,shape (curved, to the second order); of a
-    port: distance (flat), centre (dome), index."""
+    port: distance (flat), centre (dome), index. [default: nothing]"""
     parallel: tuple[str, ...] = option((), parse=words, metavar="NAMES")
     """Planes of --gcps that are parallel, such as floor,deck; water is one too."""
-    sigma_level: float | None = option(None, unit="m", above=0)
-    """Let the level move, with this standard deviation."""
-    sigma_tilt: float | None = option(None, unit="deg", above=0)
-    """Let the tilt move, with this standard deviation."""
+    sigma_level: float | None = option(None, above=0)
+    """Let the level move, with this standard deviation. [m]"""
+    sigma_tilt: float | None = option(None, above=0)
+    """Let the tilt move, with this standard deviation. [deg]"""
     sigma_index: float | None = option(None, above=0)
     """Let the refractive index move, with this standard deviation."""
-    lens_unknowns: tuple[str, ...] | None = option(
-        None, parse=_lens_names, default_is="those that the block determines", metavar="NAMES"
-    )
-    """Unknowns of the lens: none, or some of f,cx,cy,k1...,p1,p2,b1,b2."""
+    lens_unknowns: tuple[str, ...] | None = option(None, parse=_lens_names, metavar="NAMES")
+    """Unknowns of the lens: none, or some of f,cx,cy,k1...,p1,p2,b1,b2. [default: those that the
+    block determines]"""
     poses: Poses = option("free")
     """Adjust poses one by one, not at all, or all together."""
     fixed_images: tuple[str, ...] = option((), parse=words, metavar="A,B")
@@ -137,24 +121,18 @@ class AdjustRules(IndexOptions, panel=Panel.UNKNOWNS):
     original poses."""
     ties: Ties = option("auto")
     """Use measured tie points, or points of the cloud; auto: measured if there are any."""
-    gnss_sigma: float | None = option(None, unit="m", above=0, default_is="from their residuals")
-    """Standard deviation of GNSS positions that have none."""
-    sigma_image: float | None = option(None, unit="px", above=0, default_is="from their residuals")
-    """Standard deviation of tie points in the images."""
+    gnss_sigma: float | None = option(None, above=0)
+    """Standard deviation of GNSS positions that have none. [m] [default: from their residuals]"""
+    sigma_image: float | None = option(None, above=0)
+    """Standard deviation of tie points in the images. [px] [default: from their residuals]"""
     outliers: bool = option(True)
     """Search for outliers and exclude them."""
 
 
 class AdjustOptions(
-    OverwriteOption,
-    AdjustRules,
-    SurveyedOptions,
-    ViewOptions,
-    CameraFileOptions,
-    PortOptions,
-    NeededOptions,
-    panel=Panel.CAMERAS,
-):
+    OverwriteOption, AdjustRules, SurveyedOptions, ViewOptions, CameraFileOptions, PortOptions,
+    NeededOptions, panel=Panel.CAMERAS,
+):  # fmt: skip
     """The options of ``pcfix adjust``."""
 
     cloud: File | None = option(None, basic=True)
@@ -163,5 +141,5 @@ class AdjustOptions(
     """CRS of the GNSS positions."""
     gcps_crs: str | None = option(None, metavar="CRS")
     """CRS of the control points."""
-    water_mask: File | None = option(None, basic=True, default_is="everywhere")
-    """Polygons inside which points may be submerged."""
+    water_mask: File | None = option(None, basic=True)
+    """Polygons inside which points may be submerged. [default: everywhere]"""

@@ -19,7 +19,7 @@ def table_of(kind: type[OptionSet]) -> str:
     rows = ["| option | meaning | default |", "|---|---|---|"]
     for one in options_of(kind):
         flag = f"{one.flag} {_value(one)}".strip()
-        rows.append(f"| `{flag}` | {one.help_text} | {one.needed_text} |")
+        rows.append(f"| `{flag}` | {one.help} | {one.needed or one.default_text} |")
     return "\n".join(rows)
 
 
