@@ -20,15 +20,11 @@ from pcfix.options.shared import (
     WaterPerImageOption,
 )
 
-Uncorrected = Literal["withhold", "keep", "drop"]
 Unsure = Literal["keep", "withhold"]
 Dimensions = Literal["all", "minimal", "none"]
 Method = Literal[
     "auto", "snell", "consistent", "shan", "butler", "murase", "dietrich", "factor", "regression"
 ]
-CameraSet = Literal["auto", "mvs", "all"]
-Occlusion = Literal["auto", "on", "off"]
-MatcherKind = Literal["depth-maps", "pairs"]
 
 WITHOUT_CAMERAS = ("factor", "regression")
 """Methods that use the apparent depth only."""
@@ -47,10 +43,10 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
 
     method: Method = option("auto", basic=True)
     """Correction method. auto: consistent if the cameras have angles and lenses, else snell."""
-    camera_set: CameraSet = option("auto")
+    camera_set: Literal["auto", "mvs", "all"] = option("auto")
     """Cameras used when there is no view list: every visible camera (all), or those that a dense
     matcher would use (mvs); auto: mvs with --method consistent, else all."""
-    matcher: MatcherKind = option("depth-maps")
+    matcher: Literal["depth-maps", "pairs"] = option("depth-maps")
     """Dense matcher of --camera-set mvs: fused depth maps (OpenMVS, COLMAP), or the median of
     stereo pairs (MicMac, SURE)."""
     max_angle: float | str | None = option(
@@ -61,7 +57,7 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
     without angles]"""
     max_cameras: int | None = option(None, least=1)
     """Maximum number of rays per point; those closest to nadir are used. [default: no limit]"""
-    occlusion: Occlusion = option("auto")
+    occlusion: Literal["auto", "on", "off"] = option("auto")
     """Skip cameras from which the cloud occludes the point; auto: if there are oblique images."""
     exact: bool = option(False)
     """Solve every point exactly. Otherwise depth maps are interpolated where that is within 0.05
@@ -159,7 +155,7 @@ class PointsOptions(RefractionOptions, WaterPerImageOption):
 class ScienceOptions(RefractionOptions, panel=Panel.OUTPUT):
     """Everything that a corrected file depends on, besides its inputs; the file records it."""
 
-    uncorrected: Uncorrected = option("withhold", basic=True)
+    uncorrected: Literal["withhold", "keep", "drop"] = option("withhold", basic=True)
     """Submerged points with fewer than two usable rays: flag, keep or drop them."""
     dimensions: Dimensions = option("all")
     """Extra dimensions; 'pcfix restore' needs all."""

@@ -18,9 +18,6 @@ from pcfix.options.shared import (
     WaterPerImageOption,
 )
 
-Mapping = Literal["exact", "paper"]
-Holes = Literal["fill", "black"]
-
 
 class OrthoOptions(
     JobOptions, SummaryOption, IndexOptions, WaterOptions, CamerasOptions, panel=Panel.NEED
@@ -77,13 +74,13 @@ class PhotosOptions(
     --mapping exact, apparent for paper."""
     resolution: float | None = option(None, basic=True, above=0)
     """Cell size to which a cloud is gridded. [m] [default: 2 to 4 points a cell]"""
-    mapping: Mapping = option("exact", basic=True, panel=Panel.METHOD)
+    mapping: Literal["exact", "paper"] = option("exact", basic=True, panel=Panel.METHOD)
     """exact: trace the light back from the true bed; paper: eq 12 of Skarlatos & Agrafiotis 2018 on
     the apparent bed, one round of their iteration."""
     spacing: int | None = option(None, least=1, most=512, panel=Panel.METHOD)
     """Spacing of the grid nodes over the photograph. [px] [default: a cell of the DSM, at least 8
     px]"""
-    holes: Holes = option("fill", panel=Panel.METHOD)
+    holes: Literal["fill", "black"] = option("fill", panel=Panel.METHOD)
     """Interpolate holes of the DSM, or make them black."""
 
 

@@ -13,7 +13,6 @@ from pcfix.options.shared import IndexOptions, OverwriteOption, Panel, SummaryOp
 
 BlockKind = Literal["nadir", "oblique"]
 BedKind = Literal["shore", "flat", "slope", "steps", "river"]
-CloudKind = Literal["tracks", "pairs", "depth-maps"]
 
 _MOST_DEPTHS = 100
 
@@ -86,7 +85,7 @@ class SceneCloudOptions(OptionSet, panel=Panel.CLOUDS):
 
     points: int = option(100_000, basic=True, least=1)
     """Points of the cloud."""
-    cloud: CloudKind = option("tracks", basic=True)
+    cloud: Literal["tracks", "pairs", "depth-maps"] = option("tracks", basic=True)
     """Reconstruction type: tracks, the median of stereo pairs, or fused depth maps."""
     detection: float = option(1.0, least=0.01, most=1)
     """Probability that an image that shows a point contributes to it; at least three do."""
@@ -118,21 +117,25 @@ class DemoOptions(OverwriteOption, panel=Panel.OUTPUT):
 
 def _depths(option: str, text: str) -> tuple[float, ...]:
     """Return the depths of a list, or of FROM:TO:STEP; a single one is the greatest of five."""
-    if ":" not in text:
+    if ":" in text:
+        first = last = step = math.nan
+        with suppress(ValueError):
+            first, last, step = (float(word) for word in text.split(":"))
+        count = (last - first) / step + 1.0 + 1e-9 if step > 0.0 else math.nan
+        if not (first <= last and 1.0 <= count < _MOST_DEPTHS + 1):
+            raise SettingError(
+                "option.type",
+                f"{option} {text} must be FROM:TO:STEP upwards, with at most {_MOST_DEPTHS}"
+                " depths.",
+                option=option.replace("-", "_"),
+                value=text,
+            )
+        found = tuple(round(first + i * step, 9) for i in range(int(count)))
+    else:
         found = numbers(option, text)
-        return found if len(found) != 1 else tuple(found[0] * i / 5 for i in range(1, 6))
-    first = last = step = math.nan
-    with suppress(ValueError):
-        first, last, step = (float(word) for word in text.split(":"))
-    count = (last - first) / step + 1.0 + 1e-9 if step > 0.0 else math.nan
-    if not (first <= last and 1.0 <= count < _MOST_DEPTHS + 1):
-        raise SettingError(
-            "option.type",
-            f"{option} {text} must be FROM:TO:STEP upwards, with at most {_MOST_DEPTHS} depths.",
-            option=option.replace("-", "_"),
-            value=text,
-        )
-    return tuple(round(first + i * step, 9) for i in range(int(count)))
+    if len(found) == 1:
+        found = tuple(found[0] * share for share in (0.2, 0.4, 0.6, 0.8, 1.0))
+    return found
 
 
 class PlanOptions(OverwriteOption, SummaryOption, BudgetOptions, IndexOptions, panel=Panel.FLIGHT):

@@ -7,10 +7,7 @@ from typing import Any, Literal
 
 from pcfix.options.declare import File, OptionSet, number_or, numbers, option
 
-ViewsAre = Literal["auto", "tracks", "depth-maps", "pairs"]
-Angles = Literal["omega-phi-kappa", "yaw-pitch-roll", "aircraft"]
 IndexFormula = Literal["skarlatos", "quan-fry"]
-WaterModel = Literal["auto", "level", "plane", "along", "river"]
 
 DEFAULT_REFRACTIVE_INDEX = 1.34
 
@@ -55,7 +52,7 @@ class IndexOptions(OptionSet, panel=Panel.WATER):
 class WaterOptions(OptionSet, panel=Panel.WATER):
     """How a water surface is fitted to shoreline points."""
 
-    water_model: WaterModel = option("auto")
+    water_model: Literal["auto", "level", "plane", "along", "river"] = option("auto")
     """Surface fitted to shoreline points: level, plane, plane tilted along the points only, or
     river; auto chooses among the first three."""
     water_crs: str | None = option(None, metavar="CRS")
@@ -120,7 +117,7 @@ class CameraFileOptions(OptionSet, panel=Panel.CAMERAS):
     sensor: File | None = option(None)
     """Interior orientation, if the cameras have none: CSV focal,sensor_x,sensor_y in mm, or a
     Metashape calibration. [default: sensor.csv beside the cameras]"""
-    angles: Angles | None = option(None)
+    angles: Literal["omega-phi-kappa", "yaw-pitch-roll", "aircraft"] | None = option(None)
     """Angles of a table whose header does not name them; in aircraft, pitch -90 is straight down.
     [default: yaw-pitch-roll]"""
     cameras_crs: str | None = option(None, basic=True, metavar="CRS")
@@ -144,7 +141,7 @@ class ViewOptions(OptionSet, panel=Panel.CAMERAS):
     views: File | None = option(None, basic=True)
     """View list: the images that contributed to each point. COLMAP's fused.ply.vis, the dense PLY
     of OpenMVS, or the camera file itself for the tracks of its tie points."""
-    views_are: ViewsAre = option("auto")
+    views_are: Literal["auto", "tracks", "depth-maps", "pairs"] = option("auto")
     """Images in the view list: those of a track, of depth maps that were averaged, or of stereo
     pairs; auto detects it from the cloud."""
 

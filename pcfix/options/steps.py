@@ -29,8 +29,6 @@ LEAST_PLANE_POINTS, PLANE_POINTS = 6, 8
 
 DsmMethod = Literal["mean", "median", "min", "max", "idw", "tin"]
 SurfaceChoice = Literal["all", "bed"]
-Direction = Literal["to-reference", "from-reference", "both"]
-Colour = Literal["depth", "shift", "error", "uncertainty", "height"]
 
 
 class CleanRules(OptionSet, panel=Panel.TESTS):
@@ -237,7 +235,9 @@ class DistanceOptions(OptionSet, panel=Panel.FIGURES):
 
     m3c2: bool = option(False, needs="reference")
     """Also compare by M3C2, with py4dgeo: the extra m3c2."""
-    direction: Direction | None = option(None, needs="reference")
+    direction: Literal["to-reference", "from-reference", "both"] | None = option(
+        None, needs="reference"
+    )
     """C2C from each point of the cloud to the nearest of the reference, the other way round, or
     both. [default: to-reference; from each check point]"""
     classes: int | None = option(None, least=2, most=100_000, needs="reference")
@@ -312,7 +312,7 @@ class StageCompareOptions(ReferenceOption, CompareOptions):
 class ViewerOptions(OverwriteOption, CameraFileOptions, WaterOptions, panel=Panel.OUTPUT):
     """The options of ``pcfix view``."""
 
-    colour: Colour = option("depth")
+    colour: Literal["depth", "shift", "error", "uncertainty", "height"] = option("depth")
     """Value shown by colour; error needs --reference, others need extra dimensions."""
     reference: File | None = option(None, basic=True)
     """LiDAR cloud, CSV check points or GeoTIFF to show, and to compute errors from."""

@@ -24,10 +24,6 @@ from pcfix.options.shared import (
 )
 from pcfix.options.steps import DistanceOptions, ReferenceOption
 
-Poses = Literal["free", "fixed", "similarity"]
-Datum = Literal["observed", "free"]
-Ties = Literal["auto", "measured", "cloud"]
-AdjustWhen = Literal["auto", "yes", "no"]
 WaterUnknown = Literal["level", "tilt", "index", "shape", "distance", "centre"]
 WATER_UNKNOWNS: tuple[str, ...] = get_args(WaterUnknown)
 
@@ -85,7 +81,7 @@ class RunOptions(
     """Name of the project, the title of the report. [default: the name of the cloud]"""
     date: str | None = option(None)
     """Date of the images, for the report. [default: what --image-times says]"""
-    adjust: AdjustWhen = option("auto", basic=True)
+    adjust: Literal["auto", "yes", "no"] = option("auto", basic=True)
     """First refine the cameras, as 'pcfix adjust'; auto: if they have absorbed refraction, and
     there are GNSS positions or --gcps."""
 
@@ -112,14 +108,14 @@ class AdjustRules(IndexOptions, panel=Panel.UNKNOWNS):
     lens_unknowns: tuple[str, ...] | None = option(None, parse=_lens_names, metavar="NAMES")
     """Unknowns of the lens: none, or some of f,cx,cy,k1...,p1,p2,b1,b2. [default: those that the
     block determines]"""
-    poses: Poses = option("free")
+    poses: Literal["free", "fixed", "similarity"] = option("free")
     """Adjust poses one by one, not at all, or all together."""
     fixed_images: tuple[str, ...] = option((), parse=words, metavar="A,B")
     """Images that keep their pose."""
-    datum: Datum = option("observed")
+    datum: Literal["observed", "free"] = option("observed")
     """Datum of the block: from observations, or free: mean position, direction and scale of the
     original poses."""
-    ties: Ties = option("auto")
+    ties: Literal["auto", "measured", "cloud"] = option("auto")
     """Use measured tie points, or points of the cloud; auto: measured if there are any."""
     gnss_sigma: float | None = option(None, above=0)
     """Standard deviation of GNSS positions that have none. [m] [default: from their residuals]"""
