@@ -92,8 +92,7 @@ def _end_by_signals() -> None:
     def end(number: int, frame: Any) -> None:
         raise _EndedError(number)
 
-    for name in ("SIGTERM", "SIGHUP"):
-        number = getattr(signal, name, None)
+    for number in (getattr(signal, one, None) for one in ("SIGTERM", "SIGHUP")):
         if number is not None and signal.getsignal(number) is signal.SIG_DFL:
             signal.signal(number, end)
 

@@ -37,14 +37,10 @@ class Command(NamedTuple):
     """A command: a function of positional arguments, of `options`, and of flags of its own."""
 
     call: Callable[..., None]
+    kind: type[OptionSet]
     example: str
     helps: dict[str, str]
     """What its arguments and own flags mean."""
-
-    @property
-    def kind(self) -> Any:
-        """The class of its options."""
-        return get_type_hints(self.call)["options"]
 
     @property
     def has_many(self) -> bool:
@@ -53,12 +49,11 @@ class Command(NamedTuple):
 
     def flat(self, *, everything: bool = False) -> Callable[..., None]:
         """Return the command as cyclopts takes it: a function with a keyword for each option."""
-        hints, kind = get_type_hints(self.call), self.kind
-        every = everything or not self.has_many
-        shown = []
+        every, options = everything or not self.has_many, options_of(self.kind)
+        hints, shown = get_type_hints(self.call), []
         for name, one in inspect.signature(self.call).parameters.items():
             if name == "options":
-                shown += [_keyword(each, every or each.basic) for each in options_of(kind)]
+                shown += [_keyword(each, every or each.basic) for each in options]
             elif name == "quiet":
                 shown.append(one.replace(annotation=Annotated[bool, _QUIET], default=False))
             else:
@@ -68,12 +63,12 @@ class Command(NamedTuple):
                 shown.append(one.replace(annotation=Annotated[hints[name], asked]))
 
         def call(*places: Any, **given: Any) -> None:
-            names = [one.name for one in options_of(kind) if one.name in given]
-            options = kind(**{name: given.pop(name) for name in names})
+            names = [one.name for one in options if one.name in given]
+            asked = self.kind(**{name: given.pop(name) for name in names})
             if given.get("config") is None:  # an earlier run says the rest
-                check_needed(options)
+                check_needed(asked)
             quiet = {"quiet": given.pop("quiet", False)} if "quiet" in hints else {}
-            self.call(*places, options=options, **quiet, **given)
+            self.call(*places, options=asked, **quiet, **given)
 
         call.__signature__ = inspect.Signature(shown)  # type: ignore[attr-defined]
         return call
@@ -87,7 +82,8 @@ def command(example: str, **helps: str) -> Callable[[Callable[..., None]], Calla
     """Make a function a command, with an example and what its arguments mean."""
 
     def add(call: Callable[..., None]) -> Callable[..., None]:
-        COMMANDS[call.__name__.replace("_", "-")] = Command(call, example, helps)
+        kind = get_type_hints(call)["options"]
+        COMMANDS[call.__name__.replace("_", "-")] = Command(call, kind, example, helps)
         return call
 
     return add

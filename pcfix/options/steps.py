@@ -6,11 +6,10 @@ import math
 import os
 import re
 from collections.abc import Mapping
-from contextlib import suppress
 from typing import Any, Literal
 
 from pcfix.errors import SettingError
-from pcfix.options.declare import File, OptionSet, option
+from pcfix.options.declare import File, OptionSet, numbers, option
 from pcfix.options.shared import (
     CameraFileOptions,
     OverwriteOption,
@@ -178,52 +177,44 @@ SIGMA_REFERENCE_M = {"cloud": 0.03, "raster": 0.03, "table of check points": 0.0
 """Assumed noise of a height by kind of reference: LiDAR over hard ground, RTK or levelling."""
 
 
-def _bands(given: Any) -> tuple[tuple[float, float], ...]:
+def _bands(given: Any) -> tuple[tuple[float, ...], ...]:
     """Return the bounds of shares, each of which may be a text."""
+    bands = []
     # a stage of PDAL may give one text in the place of several
-    return tuple(map(_band, (given,) if isinstance(given, str) else given))
-
-
-def _band(given: Any) -> tuple[float, float]:
-    """Return the bounds of a share."""
-    low = high = math.nan
-    with suppress(ValueError, TypeError):
-        low, high = (float(v) for v in (given.split(",") if isinstance(given, str) else given))
-    if not 0.0 <= low < high < math.inf:
-        text = given if isinstance(given, str) else ",".join(map(str, given))
-        raise SettingError(
-            "option.type",
-            f"share '{text}' must be LOW,HIGH: two distances in metres, not negative, the lower one"
-            " first.",
-            option="share",
-            value=text,
-        )
-    return low, high
+    for one in (given,) if isinstance(given, str) else given:
+        band = numbers("share", one) if isinstance(one, str) else tuple(map(float, one))
+        if len(band) != 2 or not 0.0 <= band[0] < band[1] < math.inf:
+            text = one if isinstance(one, str) else ",".join(map(str, one))
+            raise SettingError(
+                "option.type",
+                f"share '{text}' must be LOW,HIGH: two distances in metres, not negative, the lower"
+                " one first.",
+                option="share",
+                value=text,
+            )
+        bands.append(band)
+    return tuple(bands)
 
 
 def _named_clouds(given: Any) -> tuple[tuple[str, str], ...]:
     """Return name and path of each further cloud."""
     pairs = given.items() if isinstance(given, Mapping) else given
-    known: dict[str, str] = dict.fromkeys(LAYERS, "")
+    found: dict[str, str] = {}
     for one in (pairs,) if isinstance(pairs, str) else pairs:
-        name, mark, path = one.partition("=") if isinstance(one, str) else (one[0], "=", one[1])
-        text = f"{name}{mark}{path}"
-        if not (_NAME.fullmatch(name) and os.fspath(path)):
+        text = one if isinstance(one, str) else f"{one[0]}={os.fspath(one[1])}"
+        name, _, path = text.partition("=")
+        if not (_NAME.fullmatch(name) and path):
             raise SettingError(
                 "option.type",
                 f"also '{text}' must be NAME=CLOUD. A name has letters, digits, spaces and . + - _",
                 option="also",
                 value=text,
             )
-        if name in known:
-            raise SettingError(
-                "option.name_taken",
-                f"also '{text}': the name {name} is taken. Give another one.",
-                option="also",
-                value=name,
-            )
-        known[name] = os.fspath(path)
-    return tuple(known.items())[len(LAYERS) :]
+        if name in LAYERS or name in found:
+            sentence = f"also '{text}': the name {name} is taken. Give another one."
+            raise SettingError("option.name_taken", sentence, option="also", value=name)
+        found[name] = path
+    return tuple(found.items())
 
 
 class DistanceOptions(OptionSet, panel=Panel.FIGURES):
