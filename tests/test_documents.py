@@ -52,9 +52,8 @@ def test_commands():
     for line, path in commands().items():
         words = shlex.split(line, comments=True)[1:]
         try:
-            app = app_for(words, everything=True)
+            app, kind = app_for(words), COMMANDS[words[0]].kind
             given = app.parse_args(words, exit_on_error=False, print_error=False)[1].arguments
-            kind = COMMANDS[words[0]].kind
             kind(**{one.name: given[one.name] for one in options_of(kind) if one.name in given})
         except Exception as error:
             pytest.fail(f"{path.name}: {line}: {error}")

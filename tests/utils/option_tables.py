@@ -9,7 +9,7 @@ import re
 from pathlib import Path
 
 from pcfix.cli.commands import COMMANDS
-from pcfix.options.declare import Option, OptionSet, options_of
+from pcfix.options.declare import OptionSet, options_of
 
 DOCUMENT = Path(__file__).parents[2] / "pcfix" / "cli" / "README.md"
 
@@ -18,16 +18,11 @@ def table_of(kind: type[OptionSet]) -> str:
     """Return the options of a class as a table."""
     rows = ["| option | meaning | default |", "|---|---|---|"]
     for one in options_of(kind):
-        flag = f"{one.flag} {_value(one)}".strip()
+        plain = "" if bool in one.kinds else "TEXT" if one.kinds == (str,) else "N"
+        value = "\\|".join(one.choices) or one.metavar or ("PATH" if one.is_path else plain)
+        flag = f"{one.flag} {value}".strip()
         rows.append(f"| `{flag}` | {one.help} | {one.needed or one.default_text} |")
     return "\n".join(rows)
-
-
-def _value(one: Option) -> str:
-    if one.choices or one.metavar:
-        return "\\|".join(one.choices) or one.metavar
-    kind = "N" if one.kinds != (str,) else "TEXT"
-    return "PATH" if one.is_path else "" if bool in one.kinds else kind
 
 
 def with_tables(text: str) -> str:
