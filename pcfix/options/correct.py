@@ -28,11 +28,6 @@ Method = Literal[
 
 WITHOUT_CAMERAS = ("factor", "regression")
 """Methods that use the apparent depth only."""
-_ABOUT_CAMERAS = (
-    "sensor", "angles", "cameras_crs", "cameras_offset", "views", "views_are", "adjusted_from",
-    "tide", "image_times", "camera_set", "matcher", "max_angle", "max_cameras", "occlusion",
-    "unsure",
-)  # fmt: skip
 
 LEVEL_M = 0.02
 """Assumed standard deviation of a water level."""
@@ -43,21 +38,27 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
 
     method: Method = option("auto", basic=True)
     """Correction method. auto: consistent if the cameras have angles and lenses, else snell."""
-    camera_set: Literal["auto", "mvs", "all"] = option("auto")
+    camera_set: Literal["auto", "mvs", "all"] = option("auto", with_cameras=True)
     """Cameras used when there is no view list: every visible camera (all), or those that a dense
     matcher would use (mvs); auto: mvs with --method consistent, else all."""
-    matcher: Literal["depth-maps", "pairs"] = option("depth-maps")
+    matcher: Literal["depth-maps", "pairs"] = option("depth-maps", with_cameras=True)
     """Dense matcher of --camera-set mvs: fused depth maps (OpenMVS, COLMAP), or the median of
     stereo pairs (MicMac, SURE)."""
     max_angle: float | str | None = option(
-        "auto", basic=True, above=0, most=90, parse=number_or("auto", "none"), metavar="DEG"
+        "auto",
+        with_cameras=True,
+        basic=True,
+        above=0,
+        most=90,
+        parse=number_or("auto", "none"),
+        metavar="DEG",
     )
     """Maximum incidence angle of a ray, from the surface normal; none for no limit. With auto it is
     estimated from the cloud, for methods that weigh all rays alike. [deg] [default: auto; 80
     without angles]"""
-    max_cameras: int | None = option(None, least=1)
+    max_cameras: int | None = option(None, with_cameras=True, least=1)
     """Maximum number of rays per point; those closest to nadir are used. [default: no limit]"""
-    occlusion: Literal["auto", "on", "off"] = option("auto")
+    occlusion: Literal["auto", "on", "off"] = option("auto", with_cameras=True)
     """Skip cameras from which the cloud occludes the point; auto: if there are oblique images."""
     exact: bool = option(False)
     """Solve every point exactly. Otherwise depth maps are interpolated where that is within 0.05
@@ -99,7 +100,7 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
                 f"cameras are missing: {wanted} needs them. Give them, or {other}.",
             )
         for one in options_of(type(self)):
-            if one.name in _ABOUT_CAMERAS and getattr(self, one.name) not in (one.default, "off"):
+            if one.with_cameras and getattr(self, one.name) not in (one.default, "off"):
                 raise SettingError(
                     "option.needs",
                     f"{one.flag[2:]} has no effect without cameras. Give both, or neither.",
@@ -141,7 +142,7 @@ class BudgetOptions(OptionSet, panel=Panel.BUDGET):
 class RefractionOptions(BudgetOptions, MethodOptions, panel=Panel.OUTPUT):
     """Everything that the correction of points depends on."""
 
-    unsure: Unsure = option("keep")
+    unsure: Unsure = option("keep", with_cameras=True)
     """Corrected points seen only by oblique images, all rays beyond 35 degrees, without a view
     list: kept as others, or flagged withheld."""
     deep: bool = option(False, panel=Panel.WATER)

@@ -59,6 +59,8 @@ class Option(NamedTuple):
         Limits of a number, or of each of several; `above` itself is not allowed.
     needed, instead : str
         ``"needed"`` if it must be given, with when not, and another option that can replace it.
+    with_cameras : bool
+        Whether it has no effect without cameras.
     needs : str
         Another option without which this one has no effect, or one and the value that it must have:
         ``"method factor"``.
@@ -83,6 +85,7 @@ class Option(NamedTuple):
     most: float | None = None
     needed: str = ""
     instead: str = ""
+    with_cameras: bool = False
     needs: str = ""
     requires: tuple[str, ...] = ()
     parse: Callable[[str, str], Any] | None = None

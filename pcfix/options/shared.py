@@ -114,16 +114,20 @@ class PortOptions(OptionSet, panel=Panel.WATER):
 class CameraFileOptions(OptionSet, panel=Panel.CAMERAS):
     """How a camera file is read."""
 
-    sensor: File | None = option(None)
+    sensor: File | None = option(None, with_cameras=True)
     """Interior orientation, if the cameras have none: CSV focal,sensor_x,sensor_y in mm, or a
     Metashape calibration. [default: sensor.csv beside the cameras]"""
-    angles: Literal["omega-phi-kappa", "yaw-pitch-roll", "aircraft"] | None = option(None)
+    angles: Literal["omega-phi-kappa", "yaw-pitch-roll", "aircraft"] | None = option(
+        None, with_cameras=True
+    )
     """Angles of a table whose header does not name them; in aircraft, pitch -90 is straight down.
     [default: yaw-pitch-roll]"""
-    cameras_crs: str | None = option(None, basic=True, metavar="CRS")
+    cameras_crs: str | None = option(None, with_cameras=True, basic=True, metavar="CRS")
     """CRS of the cameras, such as EPSG:25830; 'local' uses the numbers as they are. [default: what
     their file says, else the cloud's]"""
-    cameras_offset: tuple[float, float, float] | None = option(None, parse=numbers, metavar="X,Y,Z")
+    cameras_offset: tuple[float, float, float] | None = option(
+        None, with_cameras=True, parse=numbers, metavar="X,Y,Z"
+    )
     """Added to the projection centres, for models shifted to the origin. [m]"""
 
 
@@ -138,10 +142,10 @@ class CamerasOptions(CameraFileOptions, panel=Panel.NEED):
 class ViewOptions(OptionSet, panel=Panel.CAMERAS):
     """Which images contributed to each point."""
 
-    views: File | None = option(None, basic=True)
+    views: File | None = option(None, with_cameras=True, basic=True)
     """View list: the images that contributed to each point. COLMAP's fused.ply.vis, the dense PLY
     of OpenMVS, or the camera file itself for the tracks of its tie points."""
-    views_are: Literal["auto", "tracks", "depth-maps", "pairs"] = option("auto")
+    views_are: Literal["auto", "tracks", "depth-maps", "pairs"] = option("auto", with_cameras=True)
     """Images in the view list: those of a track, of depth maps that were averaged, or of stereo
     pairs; auto detects it from the cloud."""
 
@@ -153,16 +157,16 @@ class SurveyOptions(ViewOptions, CamerasOptions, NeededOptions, panel=Panel.CAME
         None, basic=True, metavar="PATH", panel=Panel.NEED,
         needed="needed, not with --method factor or regression",
     )  # fmt: skip
-    adjusted_from: Any = option(None, basic=True, metavar="PATH")
+    adjusted_from: Any = option(None, with_cameras=True, basic=True, metavar="PATH")
     """Original camera file, if --cameras is the output of 'pcfix adjust'. The cloud is first
     transferred to the adjusted poses."""
     check_depths: File | None = option(None)
     """With --method regression: CSV x,y,depth of measured depths, m."""
     regression: File | None = option(None)
     """Line that --save-regression wrote for another cloud, instead of --check-depths."""
-    tide: File | None = option(None, panel=Panel.WATER)
+    tide: File | None = option(None, with_cameras=True, panel=Panel.WATER)
     """CSV time,level_m: each image gets the water level of its time."""
-    image_times: File | None = option(None, panel=Panel.WATER)
+    image_times: File | None = option(None, with_cameras=True, panel=Panel.WATER)
     """With --tide: CSV label,time, or the folder of the images. [default: what the camera file
     says]"""
     salinity: float | None = option(None, panel=Panel.WATER)
