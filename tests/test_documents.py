@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from pcfix.cli import app
-from pcfix.cli.commands import EXAMPLES
-from pcfix.cli.flags import prepare
+from pcfix.cli import app_for
+from pcfix.cli.commands import COMMANDS
+from pcfix.options.declare import options_of
 from tests.utils.option_tables import DOCUMENT, with_tables
 
 ROOT = Path(__file__).parents[1]
@@ -49,11 +49,11 @@ def commands():
 
 def test_commands():
     assert len(commands()) > 20
-    for command, _ in EXAMPLES:
-        prepare(command, everything=True)
     for line, path in commands().items():
         words = shlex.split(line, comments=True)[1:]
         try:
-            app.parse_args(words, exit_on_error=False, print_error=False)
+            app, kind = app_for(words), COMMANDS[words[0]].kind
+            given = app.parse_args(words, exit_on_error=False, print_error=False)[1].arguments
+            kind(**{one.name: given[one.name] for one in options_of(kind) if one.name in given})
         except Exception as error:
             pytest.fail(f"{path.name}: {line}: {error}")

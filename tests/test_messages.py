@@ -45,7 +45,7 @@ MESSAGES = [
         ["restore", "cloud.las", "back.las"],
         "cloud.las: was not corrected by pcfix; there is nothing to undo.",
     ),
-    (["correct", "a.las", "b.las"], "--cameras is needed\nTry 'pcfix correct --help'."),
+    (["correct", "a.las", "b.las"], "--water is needed, or --port\nTry 'pcfix correct --help'."),
 ]
 
 

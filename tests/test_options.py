@@ -5,25 +5,27 @@ from __future__ import annotations
 import pytest
 
 import pcfix
-from pcfix.cli.commands import EXAMPLES
-from pcfix.cli.flags import kind_of
-from pcfix.options.correct import CorrectOptions, ScienceOptions
+from pcfix.cli.commands import COMMANDS
+from pcfix.options.correct import LEVEL_M, CorrectOptions, ScienceOptions
 from pcfix.options.declare import options_of
-from pcfix.options.shared import Panel
+from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX, Panel
+from pcfix.options.steps import SIGMA_REFERENCE_M
+from pcfix.options.survey import RunOptions
 from pcfix.water.index import with_index
 from tests.utils.codes import refused
 from tests.utils.program import run_pcfix
 
-KINDS = [kind_of(command) for command, _ in EXAMPLES]
+KINDS = [one.kind for one in COMMANDS.values()]
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
 def test_declared(kind):
     names = [one.name for one in options_of(kind)]
-    assert len(set(names)) == len(names)
+    groups = [group for base in kind.__bases__ for group in base.__mro__[:-2]]
+    assert len({*groups}) == len(groups)  # none is reached twice
     for one in options_of(kind):
         assert one.panel in list(Panel)
-        assert one.help.endswith(".")
+        assert one.help.partition(" [")[0].endswith(".")
         assert one.default is None or one.checked(one.default) == one.default
         assert not one.needs or one.needs.split()[0] in {*names, "reference"}
     kind()
@@ -76,6 +78,15 @@ def test_help():
     assert all(f" {name} " in every for name in names)
     assert 12 <= sum(f" {name} " in short for name in names) <= 18
     assert "pcfix correct --help-all" in short
+
+
+def test_defaults_in_words():
+    """Texts that name a default say what the code has."""
+    found = {one.name: one.default_text for one in options_of(RunOptions)}
+    sigmas = (f"{sigma:g} of a {kind}" for kind, sigma in SIGMA_REFERENCE_M.items())
+    assert found["index"] == f"{DEFAULT_REFRACTIVE_INDEX:g}"
+    assert found["sigma_level"].endswith(f" {LEVEL_M:g}")
+    assert found["sigma_reference"] == ", ".join(sigmas)
 
 
 def test_part():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import gc
+import inspect
 import signal
 import sys
 import warnings
@@ -12,29 +13,31 @@ from typing import Any
 
 from cyclopts import App, CycloptsError
 
-from pcfix.cli.commands import EXAMPLES
-from pcfix.cli.flags import UsageError, has_many, name_of, prepare
+import pcfix.cli.commands  # noqa: F401 (fills COMMANDS)
+from pcfix.cli.flags import COMMANDS, UsageError
 from pcfix.errors import PcfixError, brief, refusal, show_warning
 from pcfix.version import __version__
 
-app = App(
-    name="pcfix",
-    help="Refraction correction of through-water photogrammetric point clouds.",
-    version=f"pcfix {__version__}",
-    version_flags=["--version"],
-    help_flags=["--help", "-h"],
-    help_format="plaintext",
-    suppress_keyboard_interrupt=False,
-)
-for place, (command, example) in enumerate(EXAMPLES):
-    summary, _, more = str(command.__doc__).partition("\n")
-    lines = [summary, *(line.strip() for line in more.splitlines()), "", f"Example: {example}"]
-    app.command(
-        command,
-        name=name_of(command),
-        help="\n".join(lines).replace("\n\n\n", "\n\n"),
-        sort_key=place,
+
+def app_for(arguments: Sequence[str], *, everything: bool = False) -> App:
+    """Return the program, of which only the command of the arguments gets its flags."""
+    app = App(
+        name="pcfix",
+        help="Refraction correction of through-water photogrammetric point clouds.",
+        version=f"pcfix {__version__}",
+        version_flags=["--version"],
+        help_flags=["--help", "-h"],
+        help_format="plaintext",
+        suppress_keyboard_interrupt=False,
     )
+    for place, (name, one) in enumerate(COMMANDS.items()):
+        is_asked = name in arguments[:1]
+        lines = [str(inspect.getdoc(one.call)), "", f"Example: {one.example}"]
+        if is_asked and one.has_many and not everything:
+            lines.append(f"All options: pcfix {name} --help-all")
+        call = one.flat(everything=everything) if is_asked else one.call
+        app.command(call, name=name, help="\n".join(lines), sort_key=place)
+    return app
 
 
 def main(tokens: Sequence[str] | None = None) -> None:
@@ -47,12 +50,9 @@ def main(tokens: Sequence[str] | None = None) -> None:
         gc.set_threshold(50_000, 20, 50)
         atexit.register(gc.freeze)
         _run(arguments)
-    except CycloptsError as error:
-        if isinstance(error.__cause__, PcfixError):
-            _stop(str(error.__cause__), 1)
-        _stop(f"{error}\n{_try(arguments)}", 2)
-    except UsageError as error:
-        _stop(f"{error}\n{_try(arguments)}", 2)
+    except (CycloptsError, UsageError) as error:
+        words = ["pcfix", *(one for one in arguments[:1] if one in COMMANDS), "--help"]
+        _stop(f"{error}\nTry '{' '.join(words)}'.", 2)
     except PcfixError as error:
         _stop(str(error), 1)
     except UnicodeEncodeError as error:
@@ -75,15 +75,10 @@ def _run(arguments: list[str]) -> None:
     warnings.showwarning = show_warning
     everything = "--help-all" in arguments
     arguments = ["--help" if one == "--help-all" else one for one in arguments]
-    for command, _ in EXAMPLES:
-        name = name_of(command)
-        if name in arguments[:1]:
-            prepare(command, everything=everything)
-            if has_many(command) and not everything:
-                app[name].help += f"\nAll options: pcfix {name} --help-all"
-    if arguments in ([], *([name] for name in app if name not in ("demo", "--version"))):
+    app = app_for(arguments, everything=everything)
+    if arguments in ([], *([name] for name in COMMANDS if name != "demo")):
         app([*arguments, "--help"], result_action="return_value")
-        sys.exit(0 if arguments in (["--help"], ["-h"]) else 2)
+        sys.exit(2)
     app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
 
 
@@ -97,16 +92,9 @@ def _end_by_signals() -> None:
     def end(number: int, frame: Any) -> None:
         raise _EndedError(number)
 
-    for name in ("SIGTERM", "SIGHUP"):
-        number = getattr(signal, name, None)
+    for number in (getattr(signal, one, None) for one in ("SIGTERM", "SIGHUP")):
         if number is not None and signal.getsignal(number) is signal.SIG_DFL:
             signal.signal(number, end)
-
-
-def _try(arguments: list[str]) -> str:
-    """Return where help is."""
-    name = next((name_of(c) for c, _ in EXAMPLES if name_of(c) in arguments[:1]), "")
-    return f"Try '{' '.join(filter(None, ('pcfix', name, '--help')))}'."
 
 
 def _stop(sentence: str, code: int) -> None:

@@ -4,37 +4,37 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
-
-from cyclopts import Parameter
+from typing import Any
 
 import pcfix
-from pcfix.cli.flags import FLAGS, Quiet, UsageError, check_needed, progress_bar, say, status_line
+from pcfix.cli.flags import COMMANDS, UsageError, command, progress_bar, say, status_line
 from pcfix.options.correct import CorrectOptions, LabelOptions
-from pcfix.options.handover import PlanOptions, PluginOptions, ViewerOptions
 from pcfix.options.photos import CalmOptions, OrthoOptions, PhotosOptions
-from pcfix.options.scenes import DemoOptions, SimulateOptions
-from pcfix.options.shared import TileOptions
-from pcfix.options.steps import CleanOptions, CompareOptions, DsmOptions
+from pcfix.options.scenes import DemoOptions, PlanOptions, SimulateOptions
+from pcfix.options.shared import OverwriteOption, TileOptions
+from pcfix.options.steps import CleanOptions, CompareOptions, DsmOptions, ViewerOptions
 from pcfix.options.survey import AdjustOptions, CamerasCheckOptions, RunOptions, WaterCheckOptions
 
-Input = Annotated[Path, Parameter(help="LAS or LAZ cloud.")]
 TILED = "LAS or LAZ cloud; a folder, glob, list (.txt) or index (.vpc) of tiles."
-Inputs = Annotated[str, Parameter(help=TILED)]
-Output = Annotated[Path, Parameter(help="LAS or LAZ to write; a folder for tiles.")]
+CLOUD = "LAS or LAZ to write; a folder for tiles."
 
 
+@command(
+    "pcfix run cloud.laz out --cameras cameras.xml --water 0.37 --reference lidar.laz",
+    input=TILED,
+    out_dir="Folder for all results.",
+    config="Repeat the run of this run.json.",
+)
 def run(
-    input: Annotated[str | None, Parameter(help=TILED)] = None,
-    out_dir: Annotated[Path | None, Parameter(help="Folder for all results.")] = None,
+    input: str | None = None,
+    out_dir: Path | None = None,
     /,
     *,
-    options: Annotated[RunOptions, FLAGS] = RunOptions(),
-    config: Annotated[Path | None, Parameter(help="Repeat the run of this run.json.")] = None,
-    quiet: Quiet = False,
+    options: RunOptions,
+    config: Path | None = None,
+    quiet: bool,
 ) -> None:
     """Adjust, correct, clean, grid, compare and report; resumes where it stopped.
 
@@ -47,7 +47,6 @@ def run(
     if config is None:
         if input is None or out_dir is None:
             raise UsageError("INPUT and OUT_DIR are needed")
-        check_needed(options)
         pcfix.run(input, out_dir, options=options, **shown)
         return
     from pcfix.flow.request import request_of
@@ -61,18 +60,13 @@ def run(
     )
 
 
-def correct(
-    input: Inputs,
-    output: Output,
-    /,
-    *,
-    options: Annotated[CorrectOptions, FLAGS] = CorrectOptions(),
-    quiet: Quiet = False,
-) -> None:
+@command(
+    "pcfix correct cloud.laz corrected.laz --cameras cameras.csv --water 0.37",
+    input=TILED,
+    output=CLOUD,
+)
+def correct(input: str, output: Path, /, *, options: CorrectOptions, quiet: bool) -> None:
     """Correct a point cloud for refraction at the water surface."""
-    check_needed(options, water=False)
-    if options.water is None and options.port is None:
-        raise UsageError("--water is needed, or --port for a cloud taken under water")
     from pcfix.report.text import summary_text
 
     with progress_bar("Correcting", quiet) as progress:
@@ -80,41 +74,16 @@ def correct(
     say(summary_text(result), quiet)
 
 
-def pipeline(
-    input: Input,
-    output: Annotated[Path | None, Parameter(help="LAS or LAZ to write.")] = None,
-    /,
-    *,
-    options: Annotated[CorrectOptions, FLAGS] = CorrectOptions(),
-    stage: Annotated[
-        bool, Parameter(negative=(), help="Only the stage, for your own pipeline.", group="Output")
-    ] = False,
-) -> None:
-    """Print the PDAL pipeline of the same 'pcfix correct', as JSON."""
-    from pcfix.flow.pipeline import pipeline_for, stage_for
-
-    check_needed(options)
-    if stage:
-        content = stage_for(input, options)
-    elif output is None:
-        raise UsageError("OUTPUT is needed, or --stage for the stage alone")
-    else:
-        content = pipeline_for(input, output, options)
-    say(json.dumps(content, indent=2))
-
-
+@command(
+    "pcfix adjust sparse adjusted --water 0.37 --cloud cloud.laz --gnss gnss.csv",
+    model="Camera poses, with tie points or beside a cloud.",
+    out="Folder for the adjusted model.",
+    jobs="Threads.",
+)
 def adjust(
-    model: Annotated[Path, Parameter(help="Camera poses, with tie points or beside a cloud.")],
-    out: Annotated[Path, Parameter(help="Folder for the adjusted model.")],
-    /,
-    *,
-    options: Annotated[AdjustOptions, FLAGS] = AdjustOptions(),
-    quiet: Quiet = False,
-    jobs: Annotated[int | None, Parameter(help="Threads.", group="Output")] = None,
+    model: Path, out: Path, /, *, options: AdjustOptions, quiet: bool, jobs: int | None = None
 ) -> None:
     """Refine camera poses and lens by a refractive bundle adjustment."""
-    if (options.water is None) == (options.port is None):
-        raise UsageError("give --water, or --port for images taken under water")
     from pcfix.flow.next_steps import correct_words
     from pcfix.kernels import threads
     from pcfix.report.adjustment import adjustment_text, before_of
@@ -126,16 +95,9 @@ def adjust(
     say(f"Next{cloud}: {correct_words(found, model, out, options)}", quiet)
 
 
-def label(
-    input: Inputs,
-    output: Output,
-    /,
-    *,
-    options: Annotated[LabelOptions, FLAGS] = LabelOptions(),
-    quiet: Quiet = False,
-) -> None:
+@command("pcfix label cloud.laz labelled.laz --water shore.csv", input=TILED, output=CLOUD)
+def label(input: str, output: Path, /, *, options: LabelOptions, quiet: bool) -> None:
     """Classify points below the water surface (class 40)."""
-    check_needed(options)
     from pcfix.report.text import labelling_text
 
     with progress_bar("Labelling", quiet) as progress:
@@ -143,14 +105,8 @@ def label(
     say(labelling_text(result), quiet)
 
 
-def clean(
-    input: Inputs,
-    output: Output,
-    /,
-    *,
-    options: Annotated[CleanOptions, FLAGS] = CleanOptions(),
-    quiet: Quiet = False,
-) -> None:
+@command("pcfix clean corrected.laz cleaned.laz", input=TILED, output=CLOUD)
+def clean(input: str, output: Path, /, *, options: CleanOptions, quiet: bool) -> None:
     """Flag noise: outliers, weak intersections, points far from the bed."""
     from pcfix.report.text import cleaning_text
 
@@ -159,16 +115,13 @@ def clean(
     say(cleaning_text(result), quiet)
 
 
-def dsm(
-    input: Inputs,
-    output: Annotated[Path, Parameter(help="GeoTIFF to write.")],
-    /,
-    *,
-    options: Annotated[DsmOptions, FLAGS] = DsmOptions(),
-    quiet: Quiet = False,
-) -> None:
+@command(
+    "pcfix dsm cleaned.laz bed.tif --resolution 0.5 --surface bed",
+    input=TILED,
+    output="GeoTIFF to write.",
+)
+def dsm(input: str, output: Path, /, *, options: DsmOptions, quiet: bool) -> None:
     """Grid a cloud to a GeoTIFF: height, count and spread."""
-    check_needed(options)
     from pcfix.report.text import dsm_text
 
     with progress_bar("Gridding", quiet) as progress:
@@ -176,16 +129,40 @@ def dsm(
     say(dsm_text(result), quiet)
 
 
-def photos(
-    images: Annotated[Path, Parameter(help="Folder of photographs.")],
-    out_dir: Annotated[Path, Parameter(help="Folder for the results, or for the rounds.")],
-    /,
-    *,
-    options: Annotated[PhotosOptions, FLAGS] = PhotosOptions(),
-    quiet: Quiet = False,
-) -> None:
+@command(
+    "pcfix ortho images bed.tif --cameras cameras.xml --dsm dsm.tif --water 0.37",
+    images="Folder of photographs.",
+    output="GeoTIFF to write.",
+)
+def ortho(images: Path, output: Path, /, *, options: OrthoOptions, quiet: bool) -> None:
+    """Make an orthophoto of land and bed from photographs and the corrected DSM."""
+    from pcfix.report.text import ortho_text
+
+    with progress_bar("Laying out", quiet, unit="cells") as progress:
+        result = pcfix.ortho_photo(images, output, options=options, progress=progress)
+    say(ortho_text(result), quiet)
+
+
+@command(
+    "pcfix compare cleaned.laz lidar.laz --submerged",
+    cloud=TILED,
+    reference="LAS or LAZ, or tiles; CSV check points (x,y,z), or a GeoTIFF of heights.",
+)
+def compare(cloud: str, reference: str, /, *, options: CompareOptions, quiet: bool) -> None:
+    """Compare a cloud with a reference, before and after correction."""
+    from pcfix.report.comparison import comparison_text
+
+    result = pcfix.compare_clouds(cloud, reference, options=options)
+    say(comparison_text(result), quiet)
+
+
+@command(
+    "pcfix photos images dry --cameras cameras.xml --dsm bed.tif --water 0.37",
+    images="Folder of photographs.",
+    out_dir="Folder for the results, or for the rounds.",
+)
+def photos(images: Path, out_dir: Path, /, *, options: PhotosOptions, quiet: bool) -> None:
     """Remove refraction from photographs, for use in any SfM software."""
-    check_needed(options)
     from pcfix.report.text import photos_text, rounds_text
 
     with progress_bar("Mapping", quiet, unit="photographs") as progress:
@@ -198,49 +175,12 @@ def photos(
     say(text, quiet)
 
 
-def ortho(
-    images: Annotated[Path, Parameter(help="Folder of photographs.")],
-    output: Annotated[Path, Parameter(help="GeoTIFF to write.")],
-    /,
-    *,
-    options: Annotated[OrthoOptions, FLAGS] = OrthoOptions(),
-    quiet: Quiet = False,
-) -> None:
-    """Make an orthophoto of land and bed from photographs and the corrected DSM."""
-    check_needed(options)
-    from pcfix.report.text import ortho_text
-
-    with progress_bar("Laying out", quiet, unit="cells") as progress:
-        result = pcfix.ortho_photo(images, output, options=options, progress=progress)
-    say(ortho_text(result), quiet)
-
-
-def compare(
-    cloud: Inputs,
-    reference: Annotated[
-        str,
-        Parameter(help="LAS or LAZ, or tiles; CSV check points (x,y,z), or a GeoTIFF of heights."),
-    ],
-    /,
-    *,
-    options: Annotated[CompareOptions, FLAGS] = CompareOptions(),
-    quiet: Quiet = False,
-) -> None:
-    """Compare a cloud with a reference, before and after correction."""
-    from pcfix.report.comparison import comparison_text
-
-    result = pcfix.compare_clouds(cloud, reference, options=options)
-    say(comparison_text(result), quiet)
-
-
-def calm(
-    frames: Annotated[Path, Parameter(help="Folder of photographs, or a video.")],
-    out: Annotated[Path, Parameter(help="Image to write, of the frames' format; PNG of a video.")],
-    /,
-    *,
-    options: Annotated[CalmOptions, FLAGS] = CalmOptions(),
-    quiet: Quiet = False,
-) -> None:
+@command(
+    "pcfix calm frames calm.jpg --surface --depth 2.5 --gsd 0.01 --interval 0.2",
+    frames="Folder of photographs, or a video.",
+    out="Image to write, of the frames' format; PNG of a video.",
+)
+def calm(frames: Path, out: Path, /, *, options: CalmOptions, quiet: bool) -> None:
     """Combine a burst of frames into one image as seen through calm water."""
     from pcfix.report.text import calm_text
 
@@ -249,51 +189,49 @@ def calm(
     say(calm_text(result), quiet)
 
 
-def cameras(
-    path: Annotated[Path, Parameter(help="File or folder of camera poses.")],
-    /,
-    *,
-    options: Annotated[CamerasCheckOptions, FLAGS] = CamerasCheckOptions(),
-) -> None:
+@command(
+    "pcfix view corrected.laz --reference lidar.laz --colour error --image errors.png",
+    clouds="LAS or LAZ clouds.",
+)
+def view(*clouds: Path, options: ViewerOptions, quiet: bool) -> None:
+    """Show clouds in 3D, before and after, with reference, cameras and water."""
+    found = pcfix.view_clouds(clouds, options=options)
+    if found:
+        say(found, quiet)
+
+
+@command(
+    "pcfix cameras cameras.xml --cloud cloud.laz --water 0.37 --plot block.png",
+    path="File or folder of camera poses.",
+)
+def cameras(path: Path, /, *, options: CamerasCheckOptions) -> None:
     """Inspect a camera file: contents, fit to the cloud, absorbed refraction."""
     from pcfix.flow.cameras import cameras_text, check_cameras
 
     say(cameras_text(check_cameras(path, options)))
 
 
-def water(
-    spec: Annotated[str, Parameter(help="As --water of 'pcfix correct'.")],
-    /,
-    *,
-    options: Annotated[WaterCheckOptions, FLAGS] = WaterCheckOptions(),
-) -> None:
+@command(
+    "pcfix water shore.csv --cloud cloud.laz --plot water.png",
+    spec="As --water of 'pcfix correct'.",
+)
+def water(spec: str, /, *, options: WaterCheckOptions) -> None:
     """Read, fit or detect a water surface, with its standard error."""
     from pcfix.flow.water import check_water, water_text
 
     say(water_text(check_water(spec, options)))
 
 
-def restore(
-    input: Inputs,
-    output: Output,
-    /,
-    *,
-    options: Annotated[TileOptions, FLAGS] = TileOptions(),
-    quiet: Quiet = False,
-) -> None:
+@command("pcfix restore corrected.laz cloud.laz", input=TILED, output=CLOUD)
+def restore(input: str, output: Path, /, *, options: TileOptions, quiet: bool) -> None:
     """Undo a correction exactly."""
     with progress_bar("Restoring", quiet) as progress:
         points = pcfix.restore_file(input, output, options=options, progress=progress)
     say(f"{input} -> {output}: {points:,} points restored", quiet)
 
 
-def simulate(
-    out_dir: Annotated[Path, Parameter(help="Folder for the scene.")],
-    /,
-    *,
-    options: Annotated[SimulateOptions, FLAGS] = SimulateOptions(),
-    quiet: Quiet = False,
-) -> None:
+@command("pcfix simulate scene --points 20000", out_dir="Folder for the scene.")
+def simulate(out_dir: Path, /, *, options: SimulateOptions, quiet: bool) -> None:
     """Simulate a scene with known truth: cloud, cameras, truth, LiDAR."""
     from pcfix.io.scenes import write_scene
 
@@ -303,7 +241,29 @@ def simulate(
     say(f"{out_dir}: {scene.description}", quiet)
 
 
-def plan(*, options: Annotated[PlanOptions, FLAGS] = PlanOptions(), quiet: Quiet = False) -> None:
+@command(
+    "pcfix pipeline cloud.laz corrected.laz --cameras cameras.csv --water 0.37",
+    input="LAS or LAZ cloud.",
+    output="LAS or LAZ to write.",
+    stage="Only the stage, for your own pipeline.",
+)
+def pipeline(
+    input: Path, output: Path | None = None, /, *, options: CorrectOptions, stage: bool = False
+) -> None:
+    """Print the PDAL pipeline of the same 'pcfix correct', as JSON."""
+    from pcfix.flow.pipeline import pipeline_for, stage_for
+
+    if stage:
+        content = stage_for(input, options)
+    elif output is None:
+        raise UsageError("OUTPUT is needed, or --stage for the stage alone")
+    else:
+        content = pipeline_for(input, output, options)
+    say(json.dumps(content, indent=2))
+
+
+@command("pcfix plan --height 60 --overlap 0.8 --sidelap 0.7 --depth 5 --plot plan.png")
+def plan(*, options: PlanOptions, quiet: bool) -> None:
     """Predict the accuracy of a planned flight."""
     from pcfix.flow.plan import plan_text
 
@@ -312,24 +272,8 @@ def plan(*, options: Annotated[PlanOptions, FLAGS] = PlanOptions(), quiet: Quiet
     say(plan_text(found), quiet)
 
 
-def view(
-    *clouds: Annotated[Path, Parameter(help="LAS or LAZ clouds.")],
-    options: Annotated[ViewerOptions, FLAGS] = ViewerOptions(),
-    quiet: Quiet = False,
-) -> None:
-    """Show clouds in 3D, before and after, with reference, cameras and water."""
-    found = pcfix.view_clouds(clouds, options=options)
-    if found:
-        say(found, quiet)
-
-
-def qgis_plugin(
-    out: Annotated[Path, Parameter(help="ZIP to write.")],
-    /,
-    *,
-    options: Annotated[PluginOptions, FLAGS] = PluginOptions(),
-    quiet: Quiet = False,
-) -> None:
+@command("pcfix qgis-plugin pcfix.zip", out="ZIP to write.")
+def qgis_plugin(out: Path, /, *, options: OverwriteOption, quiet: bool) -> None:
     """Write the QGIS plugin: the commands of pcfix as algorithms of its toolbox.
 
     In QGIS: Plugins > Manage and Install Plugins > Install from ZIP.
@@ -337,46 +281,17 @@ def qgis_plugin(
     from pcfix.cli.plugin import plugin_zip
     from pcfix.io.files import write_bytes
 
-    write_bytes(out, plugin_zip(one for one, _ in EXAMPLES), overwrite=options.overwrite)
+    write_bytes(out, plugin_zip(COMMANDS), overwrite=options.overwrite)
     say(
         f"{out}: install it in QGIS, then set its environment to {Path(sys.prefix)} in"
         " Settings > Options > Processing > Providers > pcfix.", quiet,
     )  # fmt: skip
 
 
-def demo(
-    out_dir: Annotated[Path, Parameter(help="Folder to make.")] = Path("pcfix-demo"),
-    /,
-    *,
-    options: Annotated[DemoOptions, FLAGS] = DemoOptions(),
-    quiet: Quiet = False,
-) -> None:
+@command("pcfix demo", out_dir="Folder to make.")
+def demo(out_dir: Path = Path("pcfix-demo"), /, *, options: DemoOptions, quiet: bool) -> None:
     """Simulate scenes, correct them, and compare with the truth."""
     from pcfix.flow.demo import run_demo
 
     bar = partial(progress_bar, quiet=quiet)
     say(run_demo(out_dir, points=options.points, overwrite=options.overwrite, bar=bar))
-
-
-EXAMPLES: tuple[tuple[Callable[..., None], str], ...] = (
-    (run, "pcfix run cloud.laz out --cameras cameras.xml --water 0.37 --reference lidar.laz"),
-    (correct, "pcfix correct cloud.laz corrected.laz --cameras cameras.csv --water 0.37"),
-    (adjust, "pcfix adjust sparse adjusted --water 0.37 --cloud cloud.laz --gnss gnss.csv"),
-    (label, "pcfix label cloud.laz labelled.laz --water shore.csv"),
-    (clean, "pcfix clean corrected.laz cleaned.laz"),
-    (dsm, "pcfix dsm cleaned.laz bed.tif --resolution 0.5 --surface bed"),
-    (ortho, "pcfix ortho images bed.tif --cameras cameras.xml --dsm dsm.tif --water 0.37"),
-    (compare, "pcfix compare cleaned.laz lidar.laz --submerged"),
-    (photos, "pcfix photos images dry --cameras cameras.xml --dsm bed.tif --water 0.37"),
-    (calm, "pcfix calm frames calm.jpg --surface --depth 2.5 --gsd 0.01 --interval 0.2"),
-    (view, "pcfix view corrected.laz --reference lidar.laz --colour error --image errors.png"),
-    (cameras, "pcfix cameras cameras.xml --cloud cloud.laz --water 0.37 --plot block.png"),
-    (water, "pcfix water shore.csv --cloud cloud.laz --plot water.png"),
-    (restore, "pcfix restore corrected.laz cloud.laz"),
-    (simulate, "pcfix simulate scene --points 20000"),
-    (pipeline, "pcfix pipeline cloud.laz corrected.laz --cameras cameras.csv --water 0.37"),
-    (plan, "pcfix plan --height 60 --overlap 0.8 --sidelap 0.7 --depth 5 --plot plan.png"),
-    (qgis_plugin, "pcfix qgis-plugin pcfix.zip"),
-    (demo, "pcfix demo"),
-)
-"""The commands in the order of the help, each with an example."""

@@ -2,120 +2,132 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, get_args, get_type_hints
+from typing import Annotated, Any, NamedTuple, get_type_hints
 
 from cyclopts import Group, Parameter
 
 from pcfix.options.declare import Option, OptionSet, options_of
 from pcfix.options.shared import Panel
 
-FLAGS = Parameter(name="*")
-"""Of a command's argument: each option of its class is a flag."""
-
-_GROUPS: dict[str, Group] = {
-    name: Group(name.value, sort_key=order) for order, name in enumerate(Panel)
-}
-
-
 MANY = 20
-"""Of a command with more options `--help` shows the essential ones, and `--help-all` all."""
-_ESSENTIAL = {
-    "adjust", "adjusted_from", "also", "bed", "block", "cameras", "cameras_crs", "cloud",
-    "connected", "depth", "drop", "dsm", "floating", "free", "gcps", "gnss", "gsd", "index",
-    "jobs", "lens", "mapping", "max_angle", "max_incidence", "max_ray_miss", "method",
-    "min_rays", "out_dir", "overwrite", "plot", "points", "port", "project", "radius",
-    "rebuild", "reference", "resolution", "section", "seed", "shoreline", "submerged",
-    "summary", "surface", "uncorrected", "views", "water", "water_mask",
-}  # fmt: skip
-"""Options that most people need, by name."""
+"""With more options than these, `--help` shows the basic ones, and `--help-all` all."""
+_GROUPS = {name: Group(name.value, sort_key=order) for order, name in enumerate(Panel)}
+_QUIET = Parameter(
+    name=["--quiet", "-q"],
+    negative=(),
+    allow_repeating=True,
+    group=_GROUPS[Panel.OUTPUT],
+    help="No summary and no progress.",
+    show_default=False,
+)
 
 
 class UsageError(Exception):
     """Flags that do not go together; exit code 2."""
 
 
-def name_of(command: Callable[..., None]) -> str:
-    """Return the name of a command on the command line."""
-    return command.__name__.replace("_", "-")
+class Command(NamedTuple):
+    """A command: a function of positional arguments, of `options`, and of flags of its own."""
+
+    call: Callable[..., None]
+    kind: type[OptionSet]
+    example: str
+    helps: dict[str, str]
+    """What its arguments and own flags mean."""
+
+    @property
+    def has_many(self) -> bool:
+        """Whether it has more options than `--help` shows."""
+        return len(options_of(self.kind)) > MANY
+
+    def flat(self, *, everything: bool = False) -> Callable[..., None]:
+        """Return the command as cyclopts takes it: a function with a keyword for each option."""
+        every, options = everything or not self.has_many, options_of(self.kind)
+        hints, shown = get_type_hints(self.call), []
+        for name, one in inspect.signature(self.call).parameters.items():
+            if name == "options":
+                shown += [_keyword(each, every or each.basic) for each in options]
+            elif name == "quiet":
+                shown.append(one.replace(annotation=Annotated[bool, _QUIET], default=False))
+            else:
+                asked = Parameter(help=self.helps[name], negative=())
+                if name in ("jobs", "stage"):
+                    asked = Parameter.combine(asked, Parameter(group=_GROUPS[Panel.OUTPUT]))
+                shown.append(one.replace(annotation=Annotated[hints[name], asked]))
+
+        def call(*places: Any, **given: Any) -> None:
+            names = [one.name for one in options if one.name in given]
+            asked = self.kind(**{name: given.pop(name) for name in names})
+            if given.get("config") is None:  # an earlier run says the rest
+                check_needed(asked)
+            quiet = {"quiet": given.pop("quiet", False)} if "quiet" in hints else {}
+            self.call(*places, options=asked, **quiet, **given)
+
+        call.__signature__ = inspect.Signature(shown)  # type: ignore[attr-defined]
+        return call
 
 
-def kind_of(command: Callable[..., None]) -> Any:
-    """Return the class of the options of a command."""
-    return get_args(get_type_hints(command, include_extras=True)["options"])[0]
+COMMANDS: dict[str, Command] = {}
+"""The commands by name, in the order of the help."""
 
 
-def has_many(command: Callable[..., None]) -> bool:
-    """Return whether a command has more options than `--help` shows."""
-    return len(options_of(kind_of(command))) > MANY
+def command(example: str, **helps: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Make a function a command, with an example and what its arguments mean."""
+
+    def add(call: Callable[..., None]) -> Callable[..., None]:
+        kind = get_type_hints(call)["options"]
+        COMMANDS[call.__name__.replace("_", "-")] = Command(call, kind, example, helps)
+        return call
+
+    return add
 
 
-def prepare(command: Callable[..., None], *, everything: bool) -> None:
-    """Give cyclopts the options of a command: their types, panels and help."""
-    kind, every = kind_of(command), everything or not has_many(command)
-    hints = {
-        one.name: Annotated[_type(one), _parameter(one, every or one.name in _ESSENTIAL)]
-        for one in options_of(kind)
-    }
-    hints["index_from"] = Annotated[str, Parameter(parse=False)]
-    for base in kind.__mro__:
-        own = vars(base).get("__annotations__", {})
-        own.update({name: hints[name] for name in own.keys() & hints.keys()})
-    kind.__init__.__annotations__.update({**hints, "return": None})
-
-
-def check_needed(options: OptionSet, *, water: bool = True) -> None:
-    """Refuse a command without the options that it needs; `water` tells whether that is one."""
+def check_needed(options: OptionSet) -> None:
+    """Refuse a command without the options that it needs."""
     for one in options_of(type(options)):
-        wanted = one.needed and (water or one.name != "water")
-        wanted = wanted and (one.name != "cameras" or getattr(options, "needs_cameras", True))
+        wanted = one.needed and (one.name != "cameras" or getattr(options, "needs_cameras", True))
         if wanted and getattr(options, one.name) is None:
-            raise UsageError(f"{one.flag} is needed")
+            if not one.instead or not hasattr(options, one.instead):
+                raise UsageError(f"{one.flag} is needed")
+            if getattr(options, one.instead) is None:
+                raise UsageError(f"{one.flag} is needed, or --{one.instead}")
 
 
-def _type(one: Option) -> Any:
-    """Return the type that cyclopts makes of the text; for an option with a parser it is text."""
-    if one.metavar == "PATH" or os.PathLike[str] in one.kinds:
-        return Path | None
-    if one.parse is not None or one.type is Any:
-        return str | one.type if isinstance(one.default, tuple) else str | None
-    if one.default == ():
-        return tuple[str, ...]
-    return one.type | None if one.default is None else one.type
-
-
-def _parameter(one: Option, is_shown: bool) -> Parameter:
+def _keyword(one: Option, is_shown: bool) -> inspect.Parameter:
+    """Return an option as a keyword; text for a parser is not taken apart before."""
+    kind: Any = one.type
+    if one.is_path:
+        kind = Path | None
+    elif one.repeats:
+        kind = tuple[str, ...]
+    elif one.parse is not None or kind is Any:
+        kind = str | one.type if isinstance(one.default, tuple) else str | None
+    elif one.default is None:
+        kind = one.type | None
     default = "" if one.needed else one.default_text
-    has_opposite = one.type is bool and (one.default or one.name == "connected")
-    return Parameter(
-        help=f"{one.help_text}{f' ({one.needed_text})' if one.needed else ''}",
-        group=_GROUPS[one.panel],
+    has_opposite = one.off or (one.type is bool and one.default)
+    parameter = Parameter(
+        help=f"{one.help} ({one.needed})" if one.needed else one.help,
+        group=_GROUPS[Panel(one.panel)],
         show=is_shown,
         negative_bool="no-" if has_opposite else (),
-        negative_none="no-" if one.name in ("below", "floating") else (),
+        negative_none="no-" if has_opposite else (),
         negative_iterable=(),
         allow_repeating=True,  # the last one counts
-        allow_leading_hyphen=one.metavar in ("X,Y,Z", "X,Y,X,Y", "LOW,HIGH"),  # below zero
+        allow_leading_hyphen="," in one.metavar,  # a first number below zero
         show_default=(lambda value: default) if default else False,
     )
-
-
-Quiet = Annotated[
-    bool,
-    Parameter(
-        name=["--quiet", "-q"],
-        negative=(),
-        allow_repeating=True,
-        group=_GROUPS[Panel.OUTPUT],
-        help="No summary and no progress.",
-        show_default=False,
-    ),
-]
+    return inspect.Parameter(
+        one.name, inspect.Parameter.KEYWORD_ONLY, default=one.default,
+        annotation=Annotated[kind, parameter],
+    )  # fmt: skip
 
 
 def _announce_compiling() -> None:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import inspect
 import json
-from collections.abc import Callable, Iterable
-from typing import Any, get_args, get_type_hints
+from collections.abc import Mapping
+from typing import Any
 
+from pcfix.cli.flags import Command
 from pcfix.io.styles import packed
 from pcfix.options.declare import Option, options_of
 from pcfix.version import __version__
@@ -21,52 +22,51 @@ _WRITTEN = ("summary", "shoreline", "save_regression", "plot")
 """Options with a file to write; `out_dir` is a folder."""
 
 
-def plugin_zip(commands: Iterable[Callable[..., None]]) -> bytes:
+def plugin_zip(commands: Mapping[str, Command]) -> bytes:
     """Return the plugin, with the commands among those given that it offers."""
-    by_name = {command.__name__: command for command in commands}
-    table = {"version": __version__, "commands": [_command(by_name[name]) for name in OFFERED]}
+    table = {"version": __version__, "commands": [_command(n, commands[n]) for n in OFFERED]}
     return packed(json.dumps(table, indent=1) + "\n", __version__)
 
 
-def _command(command: Callable[..., None]) -> dict[str, Any]:
-    hints = get_type_hints(command, include_extras=True)
-    options = options_of(get_args(hints["options"])[0])
-    has_port = any(one.name == "port" for one in options)
+def _command(name: str, command: Command) -> dict[str, Any]:
+    options = options_of(command.kind)
+    names = [one.name for one in options]
     return {
-        "name": command.__name__,
-        "help": inspect.getdoc(command),
+        "name": name,
+        "help": inspect.getdoc(command.call),
         "places": [
             {
                 "name": name,
                 "kind": _PLACES.get(name, "cloud"),
-                "help": next(one.help for one in get_args(hints[name])[1:] if hasattr(one, "help")),
+                "help": command.helps[name],
                 "unit": "",
                 "default": None,
                 "needed": True,
             }
-            for name, one in inspect.signature(command).parameters.items()
+            for name, one in inspect.signature(command.call).parameters.items()
             if one.kind is inspect.Parameter.POSITIONAL_ONLY
         ],
-        "options": [_option(one, instead=has_port and one.name == "water") for one in options],
+        "options": [_option(one, replaced=one.instead in names) for one in options],
     }
 
 
-def _option(one: Option, *, instead: bool) -> dict[str, Any]:
-    """Return an option for a form; with `instead`, another option can replace it."""
+def _option(one: Option, *, replaced: bool) -> dict[str, Any]:
+    """Return an option for a form; with `replaced`, another one can replace it."""
     kind, default = _kind(one), one.default
     if kind not in ("bool", "int", "float", "choice"):
         default = None  # an empty text is pcfix's own default
+    help, _, unit = one.help.partition(" [")
     default_words = f" Default: {one.default_text}." if one.default_text else ""
     return {
         "name": one.name,
         "flag": one.flag,
         "kind": kind,
         "choices": list(one.choices),
-        "unit": one.unit,
+        "unit": unit.removesuffix("]"),
         "default": default,
-        "repeated": one.default == () and one.parse is None,
-        "needed": one.needed and not one.default_is and not instead,
-        "help": one.help + default_words,
+        "repeated": one.repeats,
+        "needed": one.needed == "needed" and not replaced,
+        "help": help + default_words,
     }
 
 
@@ -75,7 +75,7 @@ def _kind(one: Option) -> str:
         return "written"
     if one.name == "out_dir":
         return "folder written"
-    if one.metavar == "PATH" or one.placeholder == "PATH":
+    if one.is_path:
         return "file"
     if one.choices and one.parse is None:
         return "choice"

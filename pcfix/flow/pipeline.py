@@ -13,7 +13,6 @@ from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import check_suffix
 from pcfix.io.pdal import CLASS_FLAGS, OUTCOME, STAGE_SOURCE, add_dimension
 from pcfix.options.correct import CorrectOptions
-from pcfix.options.shared import PartOptions
 
 if TYPE_CHECKING:
     import laspy
@@ -65,12 +64,14 @@ def pipeline_for(input: Path, output: Path, options: CorrectOptions) -> dict[str
 
 
 def _stage(options: CorrectOptions) -> dict[str, Any]:
-    if options.part(PartOptions) != PartOptions():
-        raise SettingError(
-            "option.no_use",
-            "--bounds and --read-resolution have no use in a pipeline. Give readers.copc its own.",
-            option="bounds",
-        )
+    for name in ("bounds", "read_resolution", "port"):
+        if getattr(options, name) is not None:
+            raise SettingError(
+                "option.no_use",
+                f"--{name.replace('_', '-')} has no use in a pipeline. Choose the points by options"
+                " of readers.copc, and use 'pcfix correct' for a cloud taken under water.",
+                option=name,
+            )
     drop, plain = options.uncorrected == "drop", options.plain()
     columns = columns_for(options.dimensions, options.unsure)
     first = {name: plain[name] for name in ("cameras", "water") if name in plain}

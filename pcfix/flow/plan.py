@@ -30,7 +30,7 @@ from pcfix.kernels import threads
 from pcfix.model import Cameras, Correction, FloatArray, TiePoints, Views, WaterPlane
 from pcfix.options.correct import BudgetOptions, RefractionOptions, ScienceOptions
 from pcfix.options.declare import options_of, taken
-from pcfix.options.handover import PlanOptions
+from pcfix.options.scenes import PlanOptions
 from pcfix.refract.batch import Survey
 from pcfix.refract.tally import COVERAGE_95, ORDERS, largest_tvu_m
 from pcfix.report.page import AFTER, BEFORE, REFERENCE, WATER, Table, label_plan, new_figure

@@ -55,7 +55,6 @@ class Request(RunOptions):
 
     def check(self) -> None:
         """Refuse options that exclude each other."""
-        super().check()
         wrong = ""
         if self.adjust == "no" and self.only_to_adjust:
             wrong = f"{self.only_to_adjust[0]} is for an adjustment only. Remove it, or use auto."

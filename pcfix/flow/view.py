@@ -26,7 +26,7 @@ from pcfix.lens.imaging import unproject
 from pcfix.libraries import load_open3d
 from pcfix.model import Cameras, FloatArray, IntArray, WaterDimension, WaterSurface
 from pcfix.options.declare import File, taken
-from pcfix.options.handover import ViewerOptions
+from pcfix.options.steps import ViewerOptions
 from pcfix.refract.tally import COVERAGE_95
 from pcfix.report.page import new_figure, png_of
 from pcfix.water.surface import surface_above

@@ -10,33 +10,24 @@ from pcfix.options.shared import (
     IndexOptions,
     InputOptions,
     LandRules,
+    MaskOption,
     NeededOptions,
     Panel,
     PartOptions,
     ShorelineOption,
-    SubmergedOptions,
     SummaryOption,
     TileOptions,
     WaterPerImageOption,
 )
 
-Uncorrected = Literal["withhold", "keep", "drop"]
 Unsure = Literal["keep", "withhold"]
 Dimensions = Literal["all", "minimal", "none"]
 Method = Literal[
     "auto", "snell", "consistent", "shan", "butler", "murase", "dietrich", "factor", "regression"
 ]
-CameraSet = Literal["auto", "mvs", "all"]
-Occlusion = Literal["auto", "on", "off"]
-MatcherKind = Literal["depth-maps", "pairs"]
 
 WITHOUT_CAMERAS = ("factor", "regression")
 """Methods that use the apparent depth only."""
-_ABOUT_CAMERAS = (
-    "sensor", "angles", "cameras_crs", "cameras_offset", "views", "views_are", "adjusted_from",
-    "tide", "image_times", "camera_set", "matcher", "max_angle", "max_cameras", "occlusion",
-    "unsure",
-)  # fmt: skip
 
 LEVEL_M = 0.02
 """Assumed standard deviation of a water level."""
@@ -45,66 +36,45 @@ LEVEL_M = 0.02
 class MethodOptions(IndexOptions, panel=Panel.METHOD):
     """The rays that are used, and how the true point follows from the apparent one."""
 
-    method: Method = option(
-        "auto",
-        "Correction method. auto: consistent if the cameras have angles and lenses, else snell.",
-    )
-    camera_set: CameraSet = option(
-        "auto",
-        "Cameras used when there is no view list: every visible camera (all), or those that a"
-        " dense matcher would use (mvs); auto: mvs with --method consistent, else all.",
-    )
-    matcher: MatcherKind = option(
-        "depth-maps",
-        "Dense matcher of --camera-set mvs: fused depth maps (OpenMVS, COLMAP), or the median of"
-        " stereo pairs (MicMac, SURE).",
-    )
+    method: Method = option("auto", basic=True)
+    """Correction method. auto: consistent if the cameras have angles and lenses, else snell."""
+    camera_set: Literal["auto", "mvs", "all"] = option("auto", with_cameras=True)
+    """Cameras used when there is no view list: every visible camera (all), or those that a dense
+    matcher would use (mvs); auto: mvs with --method consistent, else all."""
+    matcher: Literal["depth-maps", "pairs"] = option("depth-maps", with_cameras=True)
+    """Dense matcher of --camera-set mvs: fused depth maps (OpenMVS, COLMAP), or the median of
+    stereo pairs (MicMac, SURE)."""
     max_angle: float | str | None = option(
         "auto",
-        "Maximum incidence angle of a ray, from the surface normal; none for no limit. With auto"
-        " it is estimated from the cloud, for methods that weigh all rays alike.",
-        unit="deg",
+        with_cameras=True,
+        basic=True,
         above=0,
         most=90,
         parse=number_or("auto", "none"),
         metavar="DEG",
-        default_is="auto; 80 without angles",
     )
-    max_cameras: int | None = option(
-        None,
-        "Maximum number of rays per point; those closest to nadir are used.",
-        least=1,
-        default_is="no limit",
-    )
-    occlusion: Occlusion = option(
-        "auto",
-        "Skip cameras from which the cloud occludes the point; auto: if there are oblique images.",
-    )
-    exact: bool = option(
-        False,
-        "Solve every point exactly. Otherwise depth maps are interpolated where that is within"
-        " 0.05 ground pixels.",
-    )
+    """Maximum incidence angle of a ray, from the surface normal; none for no limit. With auto it is
+    estimated from the cloud, for methods that weigh all rays alike. [deg] [default: auto; 80
+    without angles]"""
+    max_cameras: int | None = option(None, with_cameras=True, least=1)
+    """Maximum number of rays per point; those closest to nadir are used. [default: no limit]"""
+    occlusion: Literal["auto", "on", "off"] = option("auto", with_cameras=True)
+    """Skip cameras from which the cloud occludes the point; auto: if there are oblique images."""
+    exact: bool = option(False)
+    """Solve every point exactly. Otherwise depth maps are interpolated where that is within 0.05
+    ground pixels."""
     depth_factor: float | str | None = option(
-        None,
-        "Ratio of true to apparent depth; auto: from the height, focal length and base of the"
-        " cameras.",
-        least=1,
-        most=3,
-        needs="method factor",
-        parse=number_or("auto"),
-        metavar="N",
-        default_is="the refractive index",
+        None, least=1, most=3, needs="method factor", parse=number_or("auto"), metavar="N"
     )
-    least_r2: float = option(
-        0.5, "With --method regression: refuse a fit with a lower r2.", least=0, most=1
-    )
+    """Ratio of true to apparent depth; auto: from the height, focal length and base of the cameras.
+    [default: the refractive index]"""
+    least_r2: float = option(0.5, least=0, most=1)
+    """With --method regression: refuse a fit with a lower r2."""
     index_from: str = ""
     """Which water the index is of, if it was not given as a number; not an option."""
 
     def check(self) -> None:
         """Check that one ray is enough for the method."""
-        super().check()
         if self.max_cameras == 1 and self.method not in ("butler", "dietrich"):
             raise SettingError(
                 "option.range",
@@ -130,7 +100,7 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
                 f"cameras are missing: {wanted} needs them. Give them, or {other}.",
             )
         for one in options_of(type(self)):
-            if one.name in _ABOUT_CAMERAS and getattr(self, one.name) not in (one.default, "off"):
+            if one.with_cameras and getattr(self, one.name) not in (one.default, "off"):
                 raise SettingError(
                     "option.needs",
                     f"{one.flag[2:]} has no effect without cameras. Give both, or neither.",
@@ -153,44 +123,30 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
 class BudgetOptions(OptionSet, panel=Panel.BUDGET):
     """Standard deviations of the inputs of a correction; see `pcfix.refract.uncertainty`."""
 
-    sigma_image: float = option(
-        0.5, "Standard deviation of an image coordinate.", unit="px", least=0
-    )
-    sigma_level: float | None = option(
-        None,
-        "Standard deviation of the water level.",
-        unit="m",
-        least=0,
-        default_is=f"that of its fit, else {LEVEL_M:g}",
-    )
-    sigma_tilt: float = option(
-        0.0, "Standard deviation of the slope of the water, about each axis.", unit="deg", least=0
-    )
-    sigma_index: float = option(0.002, "Standard deviation of the refractive index.", least=0)
-    sigma_waves: float = option(
-        0.0, "Standard deviation of the slope of waves, from ray to ray.", unit="deg", least=0
-    )
-    sigma_centre: float = option(
-        0.0, "Standard deviation of a projection centre, each axis.", unit="m", least=0
-    )
-    sigma_attitude: float = option(
-        0.0, "Standard deviation of the attitude, about each axis.", unit="deg", least=0
-    )
+    sigma_image: float = option(0.5, least=0)
+    """Standard deviation of an image coordinate. [px]"""
+    sigma_level: float | None = option(None, least=0)
+    """Standard deviation of the water level. [m] [default: that of its fit, else 0.02]"""
+    sigma_tilt: float = option(0.0, least=0)
+    """Standard deviation of the slope of the water, about each axis. [deg]"""
+    sigma_index: float = option(0.002, least=0)
+    """Standard deviation of the refractive index."""
+    sigma_waves: float = option(0.0, least=0)
+    """Standard deviation of the slope of waves, from ray to ray. [deg]"""
+    sigma_centre: float = option(0.0, least=0)
+    """Standard deviation of a projection centre, each axis. [m]"""
+    sigma_attitude: float = option(0.0, least=0)
+    """Standard deviation of the attitude, about each axis. [deg]"""
 
 
 class RefractionOptions(BudgetOptions, MethodOptions, panel=Panel.OUTPUT):
     """Everything that the correction of points depends on."""
 
-    unsure: Unsure = option(
-        "keep",
-        "Corrected points seen only by oblique images, all rays beyond 35 degrees, without a view"
-        " list: kept as others, or flagged withheld.",
-    )
-    deep: bool = option(
-        False,
-        "Accept depths of more than 60 m, which usually mean a wrong water level.",
-        panel=Panel.WATER,
-    )
+    unsure: Unsure = option("keep", with_cameras=True)
+    """Corrected points seen only by oblique images, all rays beyond 35 degrees, without a view
+    list: kept as others, or flagged withheld."""
+    deep: bool = option(False, panel=Panel.WATER)
+    """Accept depths of more than 60 m, which usually mean a wrong water level."""
 
 
 class PointsOptions(RefractionOptions, WaterPerImageOption):
@@ -200,52 +156,36 @@ class PointsOptions(RefractionOptions, WaterPerImageOption):
 class ScienceOptions(RefractionOptions, panel=Panel.OUTPUT):
     """Everything that a corrected file depends on, besides its inputs; the file records it."""
 
-    uncorrected: Uncorrected = option(
-        "withhold", "Submerged points with fewer than two usable rays: flag, keep or drop them."
-    )
-    dimensions: Dimensions = option("all", "Extra dimensions; 'pcfix restore' needs all.")
+    uncorrected: Literal["withhold", "keep", "drop"] = option("withhold", basic=True)
+    """Submerged points with fewer than two usable rays: flag, keep or drop them."""
+    dimensions: Dimensions = option("all")
+    """Extra dimensions; 'pcfix restore' needs all."""
 
 
 class CorrectOptions(
-    PartOptions,
-    ShorelineOption,
-    TileOptions,
-    SummaryOption,
-    ScienceOptions,
-    WaterPerImageOption,
-    SubmergedOptions,
-    InputOptions,
-    panel=Panel.OUTPUT,
-):
+    PartOptions, ShorelineOption, TileOptions, SummaryOption, ScienceOptions, WaterPerImageOption,
+    MaskOption, LandRules, InputOptions, panel=Panel.OUTPUT,
+):  # fmt: skip
     """The options of ``pcfix correct``; in Python they are `pcfix.Options`."""
 
-    save_regression: File | None = option(
-        None, "JSON file for the line fitted to --check-depths.", needs="check_depths"
-    )
+    save_regression: File | None = option(None, needs="check_depths")
+    """JSON file for the line fitted to --check-depths."""
 
 
 class LabelRules(LandRules, panel=Panel.WATER):
     """Which points count as submerged, besides those below the surface; see `pcfix.label`."""
 
-    band: float = option(
-        0.0,
-        "Points up to this distance from the surface, above or below, become class 41.",
-        unit="m",
-        least=0,
-        default_is="no class 41",
-    )
-    dead_band: float = option(
-        0.0,
-        "Points up to this distance from the surface get the label of their surroundings.",
-        unit="m",
-        least=0,
-        default_is="none",
-    )
-    reset: bool = option(False, "Set points of class 40 or 41 that are neither to class 1.")
+    band: float = option(0.0, least=0)
+    """Points up to this distance from the surface, above or below, become class 41. [m] [default:
+    no class 41]"""
+    dead_band: float = option(0.0, least=0)
+    """Points up to this distance from the surface get the label of their surroundings. [m]
+    [default: none]"""
+    reset: bool = option(False)
+    """Set points of class 40 or 41 that are neither to class 1."""
 
     def check(self) -> None:
         """Check that the dead band is wider."""
-        super().check()
         if 0.0 < self.dead_band <= self.band:
             raise SettingError(
                 "option.range",
@@ -257,7 +197,7 @@ class LabelRules(LandRules, panel=Panel.WATER):
             )
 
 
-class StageLabelOptions(LabelRules, SubmergedOptions, NeededOptions):
+class StageLabelOptions(LabelRules, MaskOption, NeededOptions):
     """The options of the stage ``label`` of PDAL, which writes no files."""
 
 

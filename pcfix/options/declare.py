@@ -1,20 +1,29 @@
 """How an option is declared: one entry, from which every door and its documentation is made.
 
-An option is a field of an `OptionSet`, ``name: type = option(default, help, ...)``. The classes are
-panels of the help; a command has a class that inherits some of them. Names are the same everywhere:
-``max_angle`` in Python and JSON is ``--max-angle`` on the command line.
+An option is a field of an `OptionSet` with its help below it::
+
+    read_resolution: float | None = option(None, above=0)
+    \"\"\"Size of a square with one point. [m] [default: all levels]\"\"\"
+
+The text is the help, with the unit, and with the default in words if the value says too little.
+A class holds the options of one subject, and the class of a command lists those it consists of; no
+class is reached twice. Names are the same everywhere: ``max_angle`` in Python and JSON is
+``--max-angle`` on the command line.
 """
 
 from __future__ import annotations
 
+import ast
 import difflib
+import inspect
 import math
 import os
 import sys
 import types
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields
-from inspect import get_annotations
+from functools import cache
+from itertools import pairwise
 from typing import (
     Any,
     ClassVar,
@@ -26,6 +35,7 @@ from typing import (
     dataclass_transform,
     get_args,
     get_origin,
+    get_type_hints,
 )
 
 from pcfix.errors import SettingError
@@ -39,39 +49,73 @@ class Option(NamedTuple):
 
     Attributes
     ----------
-    help, unit : str
-        One sentence, and the unit of the value: m, deg, px.
+    name, type, default
+        As those of its field.
+    home : type
+        The class that declares it.
+    basic : bool
+        Whether most people need it; ``--help`` of a command with many options shows no others.
     least, above, most : float or None
         Limits of a number, or of each of several; `above` itself is not allowed.
-    default_is : str
-        The default in words, if it is not the value.
-    needed : bool
-        Whether it must be given; `default_is` says when not.
+    needed, instead : str
+        ``"needed"`` if it must be given, with when not, and another option that can replace it.
+    with_cameras : bool
+        Whether it has no effect without cameras.
     needs : str
         Another option without which this one has no effect, or one and the value that it must have:
         ``"method factor"``.
-    parse : callable or None
-        Returns the value, given the option's name and a text.
+    requires : tuple of str
+        Options that must be given with it; of ``"cameras or gsd"`` exactly one.
+    parse, then : callable or None
+        Returns the value, given the option's name and a text; returns what the program uses, given
+        a value of the right type.
     metavar, panel : str
         Placeholder of the value, and panel of the help if it is not that of the class.
-    name, type, default
-        From its field; see `options_of`.
+    off : bool
+        Whether ``--no-NAME`` is a flag too; a switch that is on always has one.
     """
 
-    help: str
-    unit: str = ""
+    name: str
+    type: Any
+    default: Any
+    home: type
+    basic: bool = False
     least: float | None = None
     above: float | None = None
     most: float | None = None
-    default_is: str = ""
-    needed: bool = False
+    needed: str = ""
+    instead: str = ""
+    with_cameras: bool = False
     needs: str = ""
+    requires: tuple[str, ...] = ()
     parse: Callable[[str, str], Any] | None = None
+    then: Callable[[Any], Any] | None = None
     metavar: str = ""
-    name: str = ""
-    type: Any = None
-    default: Any = None
     panel: str = ""
+    off: bool = False
+
+    @property
+    def _text(self) -> str:
+        """The text below its declaration, or below that of a base that it replaces."""
+        found = (
+            _texts(base.__module__).get((base.__name__, self.name)) for base in self.home.__mro__
+        )
+        return next(filter(None, found))
+
+    @property
+    def help(self) -> str:
+        """What it means, with the unit."""
+        return self._text.partition(" [default: ")[0]
+
+    @property
+    def default_text(self) -> str:
+        """Its default, in words if there are any; empty without a default."""
+        words = self._text.partition(" [default: ")[2].removesuffix("]")
+        if words or self.default in (None, ()) or self.default is False:
+            return words
+        if isinstance(self.default, tuple):
+            return ("," if self.parse else " ").join(f"{value:g}" for value in self.default)
+        return f"{self.default:g}" if isinstance(self.default, float) else str(self.default)
 
     @property
     def flag(self) -> str:
@@ -91,30 +135,14 @@ class Option(NamedTuple):
         return next((get_args(kind) for kind in self.kinds if get_origin(kind) is Literal), ())
 
     @property
-    def help_text(self) -> str:
-        """Its sentence, with the unit."""
-        return self.help + (f" [{self.unit}]" if self.unit else "")
+    def is_path(self) -> bool:
+        """Whether its value is a file or folder."""
+        return self.metavar == "PATH" or os.PathLike[str] in self.kinds
 
     @property
-    def default_text(self) -> str:
-        """Its default, in words if there are any; empty without a default."""
-        if self.default_is or self.default in (None, ()) or self.default is False:
-            return self.default_is
-        if isinstance(self.default, tuple):
-            return ("," if self.parse else " ").join(f"{value:g}" for value in self.default)
-        return f"{self.default:g}" if isinstance(self.default, float) else str(self.default)
-
-    @property
-    def needed_text(self) -> str:
-        """Whether it is needed, and when not."""
-        return ", ".join(filter(None, ["needed" if self.needed else "", self.default_text]))
-
-    @property
-    def placeholder(self) -> str:
-        """The kind of its value: a path, a number, a text, or nothing for a switch."""
-        if os.PathLike[str] in self.kinds:
-            return "PATH"
-        return "" if bool in self.kinds else "N" if self.kinds != (str,) else "TEXT"
+    def repeats(self) -> bool:
+        """Whether it may be given several times on the command line."""
+        return self.default == () and self.parse is None
 
     @property
     def plain_kinds(self) -> tuple[type, ...]:
@@ -122,28 +150,28 @@ class Option(NamedTuple):
         if self.parse is not None:
             return (float, str) if float in self.kinds else (str, int)
         if self.type is Any:
-            return (str,) if self.metavar == "PATH" else (str, float)
+            return (str,) if self.is_path else (str, float)
         return self.kinds if self.kinds in ((bool,), (int,), (float,)) else (str,)
 
     def checked(self, value: Any) -> Any:
-        """Return a value as its type."""
+        """Return a value as its type, or refuse it."""
         if isinstance(value, str) and self.parse is not None:
             value = self.parse(self.flag[2:], value)
         if value is None and (self.default is None or type(None) in get_args(self.type)):
             return None
         several = next((get_args(kind) for kind in self.kinds if get_origin(kind) is tuple), None)
         if several is None:
-            return self._checked_one(value, self.kinds)
-        if several[0] is Any:  # the class takes it apart
-            return tuple(value) if isinstance(value, list) else value
-        count = None if several[-1] is Ellipsis else len(several)
-        if isinstance(value, str) or not isinstance(value, Iterable):
-            raise self._wrong("type", value, "must be several values, as a list")
-        values = tuple(self._checked_one(one, several[:1]) for one in value)
-        if count is not None and len(values) != count:
-            form = f", {self.metavar}" if self.metavar else ""
-            raise self._wrong("count", value, f"must be {count} values{form}")
-        return values
+            value = self._checked_one(value, self.kinds)
+        elif several[0] is Any:
+            value = tuple(value) if isinstance(value, list) else value
+        else:
+            if isinstance(value, str) or not isinstance(value, Iterable):
+                raise self._wrong("type", value, "must be several values, as a list")
+            value = tuple(self._checked_one(one, several[:1]) for one in value)
+            if several[-1] is not Ellipsis and len(value) != len(several):
+                form = f", {self.metavar}" if self.metavar else ""
+                raise self._wrong("count", value, f"must be {len(several)} values{form}")
+        return value if self.then is None else self.then(value)
 
     def _checked_one(self, value: Any, kinds: tuple[Any, ...]) -> Any:
         """Return a single value as one of some types."""
@@ -156,10 +184,8 @@ class Option(NamedTuple):
         if isinstance(value, str) or not hasattr(value, "__float__"):
             raise self._wrong("type", value, "must be a number")
         number, least = float(value), self.least if self.above is None else self.above
-        low, high = (
-            -math.inf if least is None else least,
-            math.inf if self.most is None else self.most,
-        )
+        low = -math.inf if least is None else least
+        high = math.inf if self.most is None else self.most
         if not (math.isfinite(number) and low <= number <= high) or number == self.above:
             limits = {"at least": self.least, "above": self.above, "at most": self.most}
             words = [f"{word} {x:g}" for word, x in limits.items() if x is not None]
@@ -180,9 +206,9 @@ class Option(NamedTuple):
         )  # fmt: skip
 
 
-def option(default: Any, help: str, **more: Any) -> Any:
-    """Declare an option; for the names of `more` see `Option`."""
-    return field(default=default, metadata={"option": Option(help, **more)})
+def option(default: Any, **declared: Any) -> Any:
+    """Declare an option; for the names of `declared` see `Option`."""
+    return field(default=default, metadata={"option": declared})
 
 
 @dataclass_transform(kw_only_default=True, frozen_default=True)
@@ -206,22 +232,35 @@ class OptionSet:
         options = {one.name: one for one in options_of(type(self))}
         for name, one in options.items():
             object.__setattr__(self, name, one.checked(getattr(self, name)))
+
+        def is_given(name: str) -> bool:
+            return bool(getattr(self, name) != options[name].default)
+
         for name, one in options.items():
             other, _, wanted = one.needs.partition(" ")
-            if other in options and getattr(self, name) != one.default:
-                value = getattr(self, other)
-                if value != wanted if wanted else value == options[other].default:
-                    flag = f"{options[other].flag} {wanted}".strip()
-                    raise SettingError(
-                        "option.needs",
-                        f"{one.flag[2:]} has no effect without {flag}. Give both, or neither.",
-                        option=name,
-                        needs=one.needs,
-                    )
-        self.check()
+            met = other not in options or (
+                getattr(self, other) == wanted if wanted else is_given(other)
+            )
+            if not met and is_given(name):
+                flag = f"{options[other].flag} {wanted}".strip()
+                raise SettingError(
+                    "option.needs",
+                    f"{one.flag[2:]} has no effect without {flag}. Give both, or neither.",
+                    option=name,
+                    needs=one.needs,
+                )
+            for others in one.requires:
+                names = others.split(" or ")
+                if is_given(name) and sum(map(is_given, names)) != 1:
+                    give = "exactly one of them" if names[1:] else "both"
+                    sentence = f"{one.flag[2:]} needs {others}: give {give}."
+                    raise SettingError("option.missing", sentence, option=names[0])
+        for group in reversed(type(self).__mro__):
+            if "check" in vars(group):
+                vars(group)["check"](self)
 
     def check(self) -> None:
-        """Check what options say together."""
+        """Check what the options of a class say together; called for each class of a command."""
 
     def part(self, kind: type[Set]) -> Set:
         """Return those options that another class has too."""
@@ -261,28 +300,33 @@ _KNOWN: dict[type, tuple[Option, ...]] = {}
 
 def options_of(kind: type) -> tuple[Option, ...]:
     """Return the options of a class, in the order of its help."""
-    if kind in _KNOWN:
-        return _KNOWN[kind]
-    homes = {name: base for base in reversed(kind.__mro__) for name in get_annotations(base)}
-    found = []
-    for one in (one for one in fields(kind) if "option" in one.metadata):
-        home = homes[one.name]
-        hint = eval(str(one.type), vars(sys.modules[home.__module__]))
-        declared: Option = one.metadata["option"]
-        panel = declared.panel or vars(home).get("panel", "")
-        found.append(declared._replace(name=one.name, type=hint, default=one.default, panel=panel))
-    _KNOWN[kind] = tuple(found)
+    if kind not in _KNOWN:
+        homes: dict[str, Any] = {}
+        for base in reversed(kind.__mro__):
+            homes |= dict.fromkeys(inspect.get_annotations(base), base)
+        hints = get_type_hints(kind)
+        _KNOWN[kind] = tuple(
+            Option(
+                one.name, hints[one.name], one.default, homes[one.name],
+                **{"panel": homes[one.name].panel, **one.metadata["option"]},
+            )
+            for one in fields(kind)
+            if "option" in one.metadata
+        )  # fmt: skip
     return _KNOWN[kind]
 
 
-def table_of(kind: type) -> str:
-    """Return the options of a class as a table of a document."""
-    rows = ["| option | meaning | default |", "|---|---|---|"]
-    for one in options_of(kind):
-        value = "\\|".join(one.choices) or one.metavar or one.placeholder
-        flag = f"{one.flag} {value}".strip()
-        rows.append(f"| `{flag}` | {one.help_text} | {one.needed_text} |")
-    return "\n".join(rows)
+@cache
+def _texts(module: str) -> dict[tuple[str, str], str]:
+    """Return the texts below the fields of the classes of a module, by class and field."""
+    found = {}
+    for kind in ast.parse(inspect.getsource(sys.modules[module])).body:
+        if isinstance(kind, ast.ClassDef):
+            for pair in pairwise(kind.body):
+                match pair:
+                    case ast.AnnAssign(ast.Name(name)), ast.Expr(ast.Constant(str(text))):
+                        found[kind.name, name] = " ".join(text.split())
+    return found
 
 
 def taken(kind: type[Set], given: OptionSet | None, keywords: Mapping[str, Any], where: str) -> Set:

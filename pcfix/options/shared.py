@@ -7,10 +7,7 @@ from typing import Any, Literal
 
 from pcfix.options.declare import File, OptionSet, number_or, numbers, option
 
-ViewsAre = Literal["auto", "tracks", "depth-maps", "pairs"]
-Angles = Literal["omega-phi-kappa", "yaw-pitch-roll", "aircraft"]
 IndexFormula = Literal["skarlatos", "quan-fry"]
-WaterModel = Literal["auto", "level", "plane", "along", "river"]
 
 DEFAULT_REFRACTIVE_INDEX = 1.34
 
@@ -39,19 +36,12 @@ class IndexOptions(OptionSet, panel=Panel.WATER):
     """The refractive index of the water."""
 
     index: float | str | None = option(
-        None,
-        "Refractive index of the water relative to air: a number, fresh or sea.",
-        least=1.0,
-        most=1.5,
-        parse=number_or(),
-        default_is=f"{DEFAULT_REFRACTIVE_INDEX:g}",
-        metavar="N",
+        None, basic=True, least=1.0, most=1.5, parse=number_or(), metavar="N"
     )
-    index_formula: IndexFormula = option(
-        "skarlatos",
-        "Formula of the index from salinity, temperature and wavelength: Skarlatos & Agrafiotis"
-        " 2018, eq 13, or Quan & Fry 1995.",
-    )
+    """Refractive index of the water relative to air: a number, fresh or sea. [default: 1.34]"""
+    index_formula: IndexFormula = option("skarlatos")
+    """Formula of the index from salinity, temperature and wavelength: Skarlatos & Agrafiotis 2018,
+    eq 13, or Quan & Fry 1995."""
 
     @property
     def refractive_index(self) -> float:
@@ -62,189 +52,129 @@ class IndexOptions(OptionSet, panel=Panel.WATER):
 class WaterOptions(OptionSet, panel=Panel.WATER):
     """How a water surface is fitted to shoreline points."""
 
-    water_model: WaterModel = option(
-        "auto",
-        "Surface fitted to shoreline points: level, plane, plane tilted along the points only, or"
-        " river; auto chooses among the first three.",
-    )
-    water_crs: str | None = option(
-        None, "CRS of the shoreline points.", default_is="what their file says", metavar="CRS"
-    )
+    water_model: Literal["auto", "level", "plane", "along", "river"] = option("auto")
+    """Surface fitted to shoreline points: level, plane, plane tilted along the points only, or
+    river; auto chooses among the first three."""
+    water_crs: str | None = option(None, metavar="CRS")
+    """CRS of the shoreline points. [default: what their file says]"""
 
 
 class NeededOptions(WaterOptions, panel=Panel.NEED):
     """The water surface."""
 
-    water: Any = option(
-        None,
-        "Water surface: a level (0.37), plane:a,b,c, dim:NAME, a mesh (.obj, .ply), a raster"
-        " (.tif), shoreline points (.csv, .gpkg, .shp, .geojson, .wkt), or auto.",
-        metavar="SPEC",
-        needed=True,
-    )
+    water: Any = option(None, basic=True, metavar="SPEC", needed="needed", instead="port")
+    """Water surface: a level (0.37), plane:a,b,c, dim:NAME, a mesh (.obj, .ply), a raster (.tif),
+    shoreline points (.csv, .gpkg, .shp, .geojson, .wkt), or auto."""
 
 
 class WaterPerImageOption(OptionSet, panel=Panel.WATER):
     """A water surface of its own for each image."""
 
-    water_per_image: File | None = option(
-        None,
-        "Folder of rasters of the water, named as the images; see 'pcfix calm --surface'. --water"
-        " is used for the other images.",
-    )
+    water_per_image: File | None = option(None)
+    """Folder of rasters of the water, named as the images; see 'pcfix calm --surface'. --water is
+    used for the other images."""
 
 
 class LandRules(OptionSet, panel=Panel.WATER):
     """Which points below the surface are land all the same."""
 
-    connected: bool = option(
-        False, "Correct only the main water body and its connected parts; ignore separate pools."
-    )
-    least_pool: float | None = option(
-        None,
-        "Pools of at least this area are not ignored.",
-        unit="m2",
-        least=0.0,
-        needs="connected",
-        default_is="a tenth of the largest water",
-    )
+    connected: bool = option(False, basic=True, off=True)
+    """Correct only the main water body and its connected parts; ignore separate pools."""
+    least_pool: float | None = option(None, least=0.0, needs="connected")
+    """Pools of at least this area are not ignored. [m2] [default: a tenth of the largest water]"""
     respect_classes: tuple[int, ...] = option(
         (),
-        "Points of these classes are never submerged; 2,5,6 are ground, trees and buildings.",
         least=0,
         most=255,
         parse=numbers,
-        default_is="none",
+        then=lambda found: tuple(sorted({*found})),
         metavar="N,N",
     )
-
-    def check(self) -> None:
-        """Sort the classes."""
-        super().check()
-        object.__setattr__(self, "respect_classes", tuple(sorted({*self.respect_classes})))
+    """Points of these classes are never submerged; 2,5,6 are ground, trees and buildings. [default:
+    none]"""
 
 
-class SubmergedOptions(LandRules, panel=Panel.WATER):
-    """Where, and which, points may be submerged."""
+class MaskOption(OptionSet, panel=Panel.WATER):
+    """Where points may be submerged."""
 
-    water_mask: File | None = option(
-        None,
-        "Polygons (.gpkg, .shp, .geojson, .wkt) inside which points may be submerged.",
-        default_is="everywhere",
-    )
+    water_mask: File | None = option(None, basic=True)
+    """Polygons (.gpkg, .shp, .geojson, .wkt) inside which points may be submerged. [default:
+    everywhere]"""
 
 
 class PortOptions(OptionSet, panel=Panel.WATER):
     """A housing under water."""
 
-    port: Any = option(
-        None,
-        "Housing port, for a cloud taken under water, instead of --water:"
-        " flat:distance=M[,thickness=M,glass=N,nx=,ny=] or"
-        " dome:radius=M[,thickness=M,glass=N,x=M,y=M,z=M], seen from the projection centre.",
-        metavar="SPEC",
-    )
+    port: Any = option(None, basic=True, metavar="SPEC")
+    """Housing port, for a cloud taken under water, instead of --water:
+    flat:distance=M[,thickness=M,glass=N,nx=,ny=] or
+    dome:radius=M[,thickness=M,glass=N,x=M,y=M,z=M], seen from the projection centre."""
 
 
 class CameraFileOptions(OptionSet, panel=Panel.CAMERAS):
     """How a camera file is read."""
 
-    sensor: File | None = option(
-        None,
-        "Interior orientation, if the cameras have none: CSV focal,sensor_x,sensor_y in mm, or a"
-        " Metashape calibration.",
-        default_is="sensor.csv beside the cameras",
+    sensor: File | None = option(None, with_cameras=True)
+    """Interior orientation, if the cameras have none: CSV focal,sensor_x,sensor_y in mm, or a
+    Metashape calibration. [default: sensor.csv beside the cameras]"""
+    angles: Literal["omega-phi-kappa", "yaw-pitch-roll", "aircraft"] | None = option(
+        None, with_cameras=True
     )
-    angles: Angles | None = option(
-        None,
-        "Angles of a table whose header does not name them; in aircraft, pitch -90 is straight"
-        " down.",
-        default_is="yaw-pitch-roll",
-    )
-    cameras_crs: str | None = option(
-        None,
-        "CRS of the cameras, such as EPSG:25830; 'local' uses the numbers as they are.",
-        default_is="what their file says, else the cloud's",
-        metavar="CRS",
-    )
+    """Angles of a table whose header does not name them; in aircraft, pitch -90 is straight down.
+    [default: yaw-pitch-roll]"""
+    cameras_crs: str | None = option(None, with_cameras=True, basic=True, metavar="CRS")
+    """CRS of the cameras, such as EPSG:25830; 'local' uses the numbers as they are. [default: what
+    their file says, else the cloud's]"""
     cameras_offset: tuple[float, float, float] | None = option(
-        None,
-        "Added to the projection centres, for models shifted to the origin.",
-        unit="m",
-        parse=numbers,
-        metavar="X,Y,Z",
+        None, with_cameras=True, parse=numbers, metavar="X,Y,Z"
     )
-
-
-CAMERAS: dict[str, Any] = {
-    "help": "File or folder of camera poses: Metashape, Pix4D, OPF, ODM, OpenSfM, COLMAP, MicMac,"
-    " Bundler, VisualSFM, BlocksExchange, RealityCapture, or a CSV table.",
-    "metavar": "PATH",
-    "needed": True,
-}
+    """Added to the projection centres, for models shifted to the origin. [m]"""
 
 
 class CamerasOptions(CameraFileOptions, panel=Panel.NEED):
     """The exterior orientation."""
 
-    cameras: Any = option(None, **CAMERAS)
+    cameras: Any = option(None, basic=True, metavar="PATH", needed="needed")
+    """File or folder of camera poses: Metashape, Pix4D, OPF, ODM, OpenSfM, COLMAP, MicMac, Bundler,
+    VisualSFM, BlocksExchange, RealityCapture, or a CSV table."""
 
 
 class ViewOptions(OptionSet, panel=Panel.CAMERAS):
     """Which images contributed to each point."""
 
-    views: File | None = option(
-        None,
-        "View list: the images that contributed to each point. COLMAP's fused.ply.vis, the dense"
-        " PLY of OpenMVS, or the camera file itself for the tracks of its tie points.",
-    )
-    views_are: ViewsAre = option(
-        "auto",
-        "Images in the view list: those of a track, of depth maps that were averaged, or of"
-        " stereo pairs; auto detects it from the cloud.",
-    )
+    views: File | None = option(None, with_cameras=True, basic=True)
+    """View list: the images that contributed to each point. COLMAP's fused.ply.vis, the dense PLY
+    of OpenMVS, or the camera file itself for the tracks of its tie points."""
+    views_are: Literal["auto", "tracks", "depth-maps", "pairs"] = option("auto", with_cameras=True)
+    """Images in the view list: those of a track, of depth maps that were averaged, or of stereo
+    pairs; auto detects it from the cloud."""
 
 
 class SurveyOptions(ViewOptions, CamerasOptions, NeededOptions, panel=Panel.CAMERAS):
     """Inputs of a correction through a water surface, as the user names them."""
 
     cameras: Any = option(
-        None, default_is="not with --method factor or regression", panel=Panel.NEED, **CAMERAS
-    )
-    adjusted_from: Any = option(
-        None,
-        "Original camera file, if --cameras is the output of 'pcfix adjust'. The cloud is first"
-        " transferred to the adjusted poses.",
-        metavar="PATH",
-    )
-    check_depths: File | None = option(
-        None, "With --method regression: CSV x,y,depth of measured depths, m."
-    )
-    regression: File | None = option(
-        None, "Line that --save-regression wrote for another cloud, instead of --check-depths."
-    )
-    tide: File | None = option(
-        None, "CSV time,level_m: each image gets the water level of its time.", panel=Panel.WATER
-    )
-    image_times: File | None = option(
-        None,
-        "With --tide: CSV label,time, or the folder of the images.",
-        default_is="what the camera file says",
-        panel=Panel.WATER,
-    )
-    salinity: float | None = option(
-        None,
-        "Salinity of the water, to compute the refractive index.",
-        unit="PSU",
-        default_is="35",
-        panel=Panel.WATER,
-    )
-    temperature: float | None = option(
-        None, "Temperature of the water.", unit="deg C", default_is="15", panel=Panel.WATER
-    )
-    wavelength: float | None = option(
-        None, "Wavelength of the light.", unit="um", default_is="0.53", panel=Panel.WATER
-    )
+        None, basic=True, metavar="PATH", panel=Panel.NEED,
+        needed="needed, not with --method factor or regression",
+    )  # fmt: skip
+    adjusted_from: Any = option(None, with_cameras=True, basic=True, metavar="PATH")
+    """Original camera file, if --cameras is the output of 'pcfix adjust'. The cloud is first
+    transferred to the adjusted poses."""
+    check_depths: File | None = option(None)
+    """With --method regression: CSV x,y,depth of measured depths, m."""
+    regression: File | None = option(None)
+    """Line that --save-regression wrote for another cloud, instead of --check-depths."""
+    tide: File | None = option(None, with_cameras=True, panel=Panel.WATER)
+    """CSV time,level_m: each image gets the water level of its time."""
+    image_times: File | None = option(None, with_cameras=True, panel=Panel.WATER)
+    """With --tide: CSV label,time, or the folder of the images. [default: what the camera file
+    says]"""
+    salinity: float | None = option(None, panel=Panel.WATER)
+    """Salinity of the water, to compute the refractive index. [PSU] [default: 35]"""
+    temperature: float | None = option(None, panel=Panel.WATER)
+    """Temperature of the water. [deg C] [default: 15]"""
+    wavelength: float | None = option(None, panel=Panel.WATER)
+    """Wavelength of the light. [um] [default: 0.53]"""
 
 
 class InputOptions(SurveyOptions, PortOptions):
@@ -255,58 +185,45 @@ class PartOptions(OptionSet, panel=Panel.INPUT):
     """Which points of a cloud are read; see `pcfix.io.las.part`."""
 
     bounds: tuple[float, float, float, float] | None = option(
-        None,
-        "Read only the points in this box (west, south, east, north).",
-        unit="m",
-        parse=numbers,
-        metavar="X,Y,X,Y",
-        default_is="all",
+        None, parse=numbers, metavar="X,Y,X,Y"
     )
-    read_resolution: float | None = option(
-        None,
-        "Read only the coarse levels of a COPC file, about one point in each square of this side.",
-        unit="m",
-        above=0,
-        default_is="all levels",
-    )
+    """Read only the points in this box (west, south, east, north). [m] [default: all]"""
+    read_resolution: float | None = option(None, above=0)
+    """Read only the coarse levels of a COPC file, about one point in each square of this side. [m]
+    [default: all levels]"""
 
 
 class OverwriteOption(OptionSet, panel=Panel.OUTPUT):
     """What becomes of files that exist."""
 
-    overwrite: bool = option(False, "Replace an output that exists.")
+    overwrite: bool = option(False, basic=True)
+    """Replace an output that exists."""
 
 
 class JobOptions(OverwriteOption, panel=Panel.OUTPUT):
     """How the work is done."""
 
-    jobs: int | None = option(
-        None,
-        "Number of threads; with many files, of files processed at the same time.",
-        least=1,
-        default_is="all cores",
-    )
+    jobs: int | None = option(None, basic=True, least=1)
+    """Number of threads; with many files, of files processed at the same time. [default: all cores]
+    """
 
 
 class TileOptions(JobOptions, panel=Panel.OUTPUT):
     """How the work is done where the input may be many files."""
 
-    scheduler: str | None = option(
-        None,
-        "With many files: process them on the cluster of this Dask scheduler, tcp://host:8786.",
-        metavar="ADDRESS",
-    )
+    scheduler: str | None = option(None, metavar="ADDRESS")
+    """With many files: process them on the cluster of this Dask scheduler, tcp://host:8786."""
 
 
 class SummaryOption(OptionSet, panel=Panel.OUTPUT):
     """The summary as a file."""
 
-    summary: File | None = option(None, "JSON file for the summary.")
+    summary: File | None = option(None, basic=True)
+    """JSON file for the summary."""
 
 
 class ShorelineOption(OptionSet, panel=Panel.OUTPUT):
     """The line at which the water meets the cloud."""
 
-    shoreline: File | None = option(
-        None, "GeoPackage (.gpkg) for the shoreline of the cloud, with its standard error."
-    )
+    shoreline: File | None = option(None, basic=True)
+    """GeoPackage (.gpkg) for the shoreline of the cloud, with its standard error."""

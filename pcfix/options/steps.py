@@ -1,17 +1,24 @@
-"""The options of the steps after a correction: clean, dsm and compare."""
+"""The options of the steps after a correction: clean, dsm, compare and view."""
 
 from __future__ import annotations
 
 import math
 import os
 import re
-from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Mapping
 from typing import Any, Literal
 
 from pcfix.errors import SettingError
-from pcfix.options.declare import File, OptionSet, option
-from pcfix.options.shared import OverwriteOption, Panel, PartOptions, SummaryOption, TileOptions
+from pcfix.options.declare import File, OptionSet, numbers, option
+from pcfix.options.shared import (
+    CameraFileOptions,
+    OverwriteOption,
+    Panel,
+    PartOptions,
+    SummaryOption,
+    TileOptions,
+    WaterOptions,
+)
 
 LEAST_NEIGHBOURS, MOST_NEIGHBOURS = 6, 500
 MAX_HOLE_CELLS = 1000
@@ -21,7 +28,6 @@ LEAST_PLANE_POINTS, PLANE_POINTS = 6, 8
 
 DsmMethod = Literal["mean", "median", "min", "max", "idw", "tin"]
 SurfaceChoice = Literal["all", "bed"]
-Direction = Literal["to-reference", "from-reference", "both"]
 
 
 class CleanRules(OptionSet, panel=Panel.TESTS):
@@ -34,55 +40,37 @@ class CleanRules(OptionSet, panel=Panel.TESTS):
     to the neighbours finds, in a cloud of even spacing, also its edges and corners.
     """
 
-    statistical: bool = option(True, "Test the mean distance to the nearest points in space.")
-    neighbours: int = option(
-        20,
-        "Nearest points of the statistical test, including the point itself.",
-        least=LEAST_NEIGHBOURS,
-        most=MOST_NEIGHBOURS,
-    )
-    deviations: float | None = option(
-        4.0,
-        "Noise if the mean distance to the neighbours exceeds that of all points by this many"
-        " standard deviations.",
-        above=0,
-    )
-    radius: float | None = option(
-        None,
-        "Noise if fewer than --radius-neighbours others are nearer.",
-        unit="m",
-        above=0,
-        default_is="no such test",
-    )
-    radius_neighbours: int = option(3, "See --radius.", least=1, most=MOST_NEIGHBOURS)
-    weak: bool = option(True, "Test rays, ray distance and incidence of corrected points.")
-    min_rays: int | None = option(3, "Noise if corrected from fewer rays.", least=2)
-    max_ray_miss: float | None = option(
-        0.5, "Noise if the rays are further from the point (RayMiss).", unit="m", above=0
-    )
-    max_incidence: float | None = option(
-        75.0, "Noise if a ray has a larger incidence angle.", unit="deg", above=0, most=90
-    )
-    bed_neighbours: int = option(
-        32,
-        "Nearest submerged points in plan from which the bed is estimated.",
-        least=LEAST_NEIGHBOURS,
-        most=MOST_NEIGHBOURS,
-    )
-    fences: float = option(
-        3.0,
-        "Noise if outside the interquartile range of their heights by this many times the range,"
-        " and by more than --below or --floating.",
-        above=0,
-    )
-    below: float | None = option(0.3, "Minimum distance of noise below the bed.", unit="m", above=0)
-    floating: float | None = option(
-        0.5, "Minimum distance of noise above the bed.", unit="m", above=0
-    )
+    statistical: bool = option(True)
+    """Test the mean distance to the nearest points in space."""
+    neighbours: int = option(20, least=LEAST_NEIGHBOURS, most=MOST_NEIGHBOURS)
+    """Nearest points of the statistical test, including the point itself."""
+    deviations: float | None = option(4.0, above=0)
+    """Noise if the mean distance to the neighbours exceeds that of all points by this many standard
+    deviations."""
+    radius: float | None = option(None, basic=True, above=0)
+    """Noise if fewer than --radius-neighbours others are nearer. [m] [default: no such test]"""
+    radius_neighbours: int = option(3, least=1, most=MOST_NEIGHBOURS)
+    """See --radius."""
+    weak: bool = option(True)
+    """Test rays, ray distance and incidence of corrected points."""
+    min_rays: int | None = option(3, basic=True, least=2)
+    """Noise if corrected from fewer rays."""
+    max_ray_miss: float | None = option(0.5, basic=True, above=0)
+    """Noise if the rays are further from the point (RayMiss). [m]"""
+    max_incidence: float | None = option(75.0, basic=True, above=0, most=90)
+    """Noise if a ray has a larger incidence angle. [deg]"""
+    bed_neighbours: int = option(32, least=LEAST_NEIGHBOURS, most=MOST_NEIGHBOURS)
+    """Nearest submerged points in plan from which the bed is estimated."""
+    fences: float = option(3.0, above=0)
+    """Noise if outside the interquartile range of their heights by this many times the range, and
+    by more than --below or --floating."""
+    below: float | None = option(0.3, off=True, above=0)
+    """Minimum distance of noise below the bed. [m]"""
+    floating: float | None = option(0.5, basic=True, off=True, above=0)
+    """Minimum distance of noise above the bed. [m]"""
 
     def check(self) -> None:
         """Switch off what is not asked for; something must be left."""
-        super().check()
         if not self.statistical:
             object.__setattr__(self, "deviations", None)
         if not self.weak:
@@ -109,38 +97,31 @@ class CleanRules(OptionSet, panel=Panel.TESTS):
 class CleanOptions(TileOptions, SummaryOption, CleanRules, panel=Panel.OUTPUT):
     """The options of ``pcfix clean``."""
 
-    water: Any = option(
-        None,
-        "Water surface, as for 'pcfix correct': points below it are tested against the bed.",
-        default_is="the points that pcfix corrected",
-        metavar="SPEC",
-    )
-    drop: bool = option(False, "Drop noise. Otherwise it gets class 7 and the withheld flag.")
+    water: Any = option(None, basic=True, metavar="SPEC")
+    """Water surface, as for 'pcfix correct': points below it are tested against the bed. [default:
+    the points that pcfix corrected]"""
+    drop: bool = option(False, basic=True)
+    """Drop noise. Otherwise it gets class 7 and the withheld flag."""
 
 
 class DsmRules(OptionSet, panel=Panel.RASTER):
     """How a cloud becomes a raster."""
 
-    resolution: float | None = option(
-        None, "Cell size.", unit="m", least=MIN_RESOLUTION_M, default_is="2 to 4 points a cell"
-    )
-    what: str = option(
-        "height",
-        "Value of a cell: height; depth of the bed below the water; uncertainty, the vertical one"
-        " of the bed at 95 %; or a dimension, by its name.",
-        metavar="height|depth|uncertainty|DIMENSION",
-    )
-    method: DsmMethod = option("mean", "Gridding method.")
-    surface: SurfaceChoice = option(
-        "all", "Grid land and bed without noise, or only the bed (class 40)."
-    )
-    fill: float | None = option(
-        None, "Fill holes up to this width; they get count 0.", unit="m", above=0
-    )
-    azimuth: float = option(315.0, "Sun of the hillshade, clockwise from north.", unit="deg")
-    altitude: float = option(
-        45.0, "Sun of the hillshade, above the horizon.", unit="deg", above=0, most=90
-    )
+    resolution: float | None = option(None, basic=True, least=MIN_RESOLUTION_M)
+    """Cell size. [m] [default: 2 to 4 points a cell]"""
+    what: str = option("height", metavar="height|depth|uncertainty|DIMENSION")
+    """Value of a cell: height; depth of the bed below the water; uncertainty, the vertical one of
+    the bed at 95 %; or a dimension, by its name."""
+    method: DsmMethod = option("mean", basic=True)
+    """Gridding method."""
+    surface: SurfaceChoice = option("all", basic=True)
+    """Grid land and bed without noise, or only the bed (class 40)."""
+    fill: float | None = option(None, above=0)
+    """Fill holes up to this width; they get count 0. [m]"""
+    azimuth: float = option(315.0)
+    """Sun of the hillshade, clockwise from north. [deg]"""
+    altitude: float = option(45.0, above=0, most=90)
+    """Sun of the hillshade, above the horizon. [deg]"""
 
     @property
     def cell_m(self) -> float:
@@ -153,7 +134,6 @@ class DsmRules(OptionSet, panel=Panel.RASTER):
 
     def check(self) -> None:
         """Check that the other options fit to the value, and the width of holes to the cells."""
-        super().check()
         if self.what == "uncertainty" and (self.method != "mean" or self.fill is not None):
             raise SettingError(
                 "option.excludes",
@@ -178,12 +158,14 @@ class DsmRules(OptionSet, panel=Panel.RASTER):
 class DsmOptions(PartOptions, OverwriteOption, SummaryOption, DsmRules, panel=Panel.OUTPUT):
     """The options of ``pcfix dsm``."""
 
-    hillshade: File | None = option(None, "GeoTIFF for a hillshade.")
-    counts: File | None = option(
-        None, "GeoTIFF for the number of points in each cell, and their spread."
-    )
-    style: bool = option(False, "Also write a QGIS style (.qml).")
-    cog: bool = option(False, "Write a cloud optimised GeoTIFF.")
+    hillshade: File | None = option(None)
+    """GeoTIFF for a hillshade."""
+    counts: File | None = option(None)
+    """GeoTIFF for the number of points in each cell, and their spread."""
+    style: bool = option(False)
+    """Also write a QGIS style (.qml)."""
+    cog: bool = option(False)
+    """Write a cloud optimised GeoTIFF."""
 
 
 LAYERS = ("water", "apparent", "corrected", "reference")
@@ -195,6 +177,46 @@ SIGMA_REFERENCE_M = {"cloud": 0.03, "raster": 0.03, "table of check points": 0.0
 """Assumed noise of a height by kind of reference: LiDAR over hard ground, RTK or levelling."""
 
 
+def _bands(given: Any) -> tuple[tuple[float, ...], ...]:
+    """Return the bounds of shares, each of which may be a text."""
+    bands = []
+    # a stage of PDAL may give one text in the place of several
+    for one in (given,) if isinstance(given, str) else given:
+        band = numbers("share", one) if isinstance(one, str) else tuple(map(float, one))
+        if len(band) != 2 or not 0.0 <= band[0] < band[1] < math.inf:
+            text = one if isinstance(one, str) else ",".join(map(str, one))
+            raise SettingError(
+                "option.type",
+                f"share '{text}' must be LOW,HIGH: two distances in metres, not negative, the lower"
+                " one first.",
+                option="share",
+                value=text,
+            )
+        bands.append(band)
+    return tuple(bands)
+
+
+def _named_clouds(given: Any) -> tuple[tuple[str, str], ...]:
+    """Return name and path of each further cloud."""
+    pairs = given.items() if isinstance(given, Mapping) else given
+    found: dict[str, str] = {}
+    for one in (pairs,) if isinstance(pairs, str) else pairs:
+        text = one if isinstance(one, str) else f"{one[0]}={os.fspath(one[1])}"
+        name, _, path = text.partition("=")
+        if not (_NAME.fullmatch(name) and path):
+            raise SettingError(
+                "option.type",
+                f"also '{text}' must be NAME=CLOUD. A name has letters, digits, spaces and . + - _",
+                option="also",
+                value=text,
+            )
+        if name in LAYERS or name in found:
+            sentence = f"also '{text}': the name {name} is taken. Give another one."
+            raise SettingError("option.name_taken", sentence, option="also", value=name)
+        found[name] = path
+    return tuple(found.items())
+
+
 class DistanceOptions(OptionSet, panel=Panel.FIGURES):
     """What a comparison, or that of a run, measures besides the vertical error.
 
@@ -202,53 +224,24 @@ class DistanceOptions(OptionSet, panel=Panel.FIGURES):
     as texts; `also` may be a dict too.
     """
 
-    m3c2: bool = option(
-        False, "Also compare by M3C2, with py4dgeo: the extra m3c2.", needs="reference"
+    m3c2: bool = option(False, needs="reference")
+    """Also compare by M3C2, with py4dgeo: the extra m3c2."""
+    direction: Literal["to-reference", "from-reference", "both"] | None = option(
+        None, needs="reference"
     )
-    direction: Direction | None = option(
-        None,
-        "C2C from each point of the cloud to the nearest of the reference, the other way round, or"
-        " both.",
-        needs="reference",
-        default_is="to-reference; from each check point",
-    )
-    classes: int | None = option(
-        None,
-        "Number of classes of the C2C histograms.",
-        least=2,
-        most=100_000,
-        needs="reference",
-        default_is="square root of the number of distances",
-    )
-    share: tuple[Any, ...] = option(
-        (),
-        "Report the share of the C2C distances from LOW to HIGH metres; may be repeated.",
-        needs="reference",
-        metavar="LOW,HIGH",
-    )
+    """C2C from each point of the cloud to the nearest of the reference, the other way round, or
+    both. [default: to-reference; from each check point]"""
+    classes: int | None = option(None, least=2, most=100_000, needs="reference")
+    """Number of classes of the C2C histograms. [default: square root of the number of distances]"""
+    share: tuple[Any, ...] = option((), then=_bands, needs="reference", metavar="LOW,HIGH")
+    """Report the share of the C2C distances from LOW to HIGH metres; may be repeated."""
     also: tuple[Any, ...] = option(
-        (),
-        "Another cloud for the C2C table and the cross-sections; may be repeated.",
-        needs="reference",
-        metavar="NAME=CLOUD",
+        (), basic=True, then=_named_clouds, needs="reference", metavar="NAME=CLOUD"
     )
-    sigma_reference: float | None = option(
-        None,
-        "Standard deviation of a height of the reference, which is removed from the errors of the"
-        " cloud.",
-        unit="m",
-        least=0,
-        needs="reference",
-        default_is=", ".join(f"{sigma:g} of a {kind}" for kind, sigma in SIGMA_REFERENCE_M.items()),
-    )
-
-    def check(self) -> None:
-        """Take texts apart."""
-        super().check()
-        # a stage of PDAL may give one text in the place of several
-        shares = (self.share,) if isinstance(self.share, str) else self.share
-        object.__setattr__(self, "share", tuple(map(_band, shares)))
-        object.__setattr__(self, "also", tuple(_named_clouds(self.also)))
+    """Another cloud for the C2C table and the cross-sections; may be repeated."""
+    sigma_reference: float | None = option(None, least=0, needs="reference")
+    """Standard deviation of a height of the reference, which is removed from the errors of the
+    cloud. [m] [default: 0.03 of a cloud, 0.03 of a raster, 0.02 of a table of check points]"""
 
     @property
     def from_reference(self) -> bool:
@@ -256,69 +249,26 @@ class DistanceOptions(OptionSet, panel=Panel.FIGURES):
         return self.direction in ("from-reference", "both")
 
 
-def _band(given: Any) -> tuple[float, float]:
-    """Return the bounds of a share."""
-    low = high = math.nan
-    with suppress(ValueError, TypeError):
-        low, high = (float(v) for v in (given.split(",") if isinstance(given, str) else given))
-    if not 0.0 <= low < high < math.inf:
-        text = given if isinstance(given, str) else ",".join(map(str, given))
-        raise SettingError(
-            "option.type",
-            f"share '{text}' must be LOW,HIGH: two distances in metres, not negative, the lower one"
-            " first.",
-            option="share",
-            value=text,
-        )
-    return low, high
-
-
-def _named_clouds(given: Any) -> Iterator[tuple[str, str]]:
-    """Yield name and path of each further cloud."""
-    pairs = given.items() if isinstance(given, Mapping) else given
-    known = set(LAYERS)
-    for one in (pairs,) if isinstance(pairs, str) else pairs:
-        name, mark, path = one.partition("=") if isinstance(one, str) else (one[0], "=", one[1])
-        text = f"{name}{mark}{path}"
-        if not (_NAME.fullmatch(name) and os.fspath(path)):
-            raise SettingError(
-                "option.type",
-                f"also '{text}' must be NAME=CLOUD. A name has letters, digits, spaces and . + - _",
-                option="also",
-                value=text,
-            )
-        if name in known:
-            raise SettingError(
-                "option.name_taken",
-                f"also '{text}': the name {name} is taken. Give another one.",
-                option="also",
-                value=name,
-            )
-        known.add(name)
-        yield name, os.fspath(path)
-
-
 class CompareRules(DistanceOptions, panel=Panel.FIGURES):
     """What is measured of two clouds."""
 
-    submerged: bool = option(False, "Compare only points of class 40, or below --water.")
-    c2c_only: bool = option(False, "Only distances to the nearest point; no signed differences.")
-    neighbours: int = option(
-        PLANE_POINTS, "Reference points of each fitted plane.", least=LEAST_PLANE_POINTS
-    )
-    bin_width: float = option(1.0, "Bins of the table by depth.", unit="m", above=0)
-    shore_bin_width: float = option(
-        10.0, "Bins of the table by distance from shore.", unit="m", above=0
-    )
-    max_gap: float | None = option(
-        None,
-        "Points up to this distance outside the reference are compared.",
-        unit="m",
-        above=0,
-        default_is="5 point spacings, at least 1",
-    )
-    sections: int = option(0, "Number of automatic cross-sections, down the slope.", least=0)
-    corridor: float = option(1.0, "Half-width of a cross-section.", unit="m", above=0)
+    submerged: bool = option(False, basic=True)
+    """Compare only points of class 40, or below --water."""
+    c2c_only: bool = option(False)
+    """Only distances to the nearest point; no signed differences."""
+    neighbours: int = option(PLANE_POINTS, least=LEAST_PLANE_POINTS)
+    """Reference points of each fitted plane."""
+    bin_width: float = option(1.0, above=0)
+    """Bins of the table by depth. [m]"""
+    shore_bin_width: float = option(10.0, above=0)
+    """Bins of the table by distance from shore. [m]"""
+    max_gap: float | None = option(None, above=0)
+    """Points up to this distance outside the reference are compared. [m] [default: 5 point
+    spacings, at least 1]"""
+    sections: int = option(0, least=0)
+    """Number of automatic cross-sections, down the slope."""
+    corridor: float = option(1.0, above=0)
+    """Half-width of a cross-section. [m]"""
 
     @property
     def vertical(self) -> bool:
@@ -329,26 +279,39 @@ class CompareRules(DistanceOptions, panel=Panel.FIGURES):
 class ReferenceOption(OptionSet, panel=Panel.OUTPUT):
     """The reference of a cloud."""
 
-    reference: File | None = option(
-        None, "LiDAR cloud, CSV check points or GeoTIFF to compare with."
-    )
+    reference: File | None = option(None, basic=True)
+    """LiDAR cloud, CSV check points or GeoTIFF to compare with."""
 
 
 class CompareOptions(OverwriteOption, SummaryOption, CompareRules, panel=Panel.OUTPUT):
     """The options of ``pcfix compare``."""
 
-    out_dir: File | None = option(None, "Folder for compare.json, depth tables and sections (CSV).")
-    water: Any = option(
-        None,
-        "Water surface, as for 'pcfix correct'.",
-        default_is="what the cloud says",
-        metavar="SPEC",
-    )
-    section: tuple[Any, ...] = option(
-        (), "A cross-section x1,y1,x2,y2; may be repeated.", metavar="X,Y,X,Y"
-    )
-    plot: File | None = option(None, "PNG of the C2C histograms, with Gauss curves.")
+    out_dir: File | None = option(None, basic=True)
+    """Folder for compare.json, depth tables and sections (CSV)."""
+    water: Any = option(None, basic=True, metavar="SPEC")
+    """Water surface, as for 'pcfix correct'. [default: what the cloud says]"""
+    section: tuple[Any, ...] = option((), basic=True, metavar="X,Y,X,Y")
+    """A cross-section x1,y1,x2,y2; may be repeated."""
+    plot: File | None = option(None, basic=True)
+    """PNG of the C2C histograms, with Gauss curves."""
 
 
 class StageCompareOptions(ReferenceOption, CompareOptions):
     """The options of the stage ``compare`` of PDAL, whose cloud is in no file."""
+
+
+class ViewerOptions(OverwriteOption, CameraFileOptions, WaterOptions, panel=Panel.OUTPUT):
+    """The options of ``pcfix view``."""
+
+    colour: Literal["depth", "shift", "error", "uncertainty", "height"] = option("depth")
+    """Value shown by colour; error needs --reference, others need extra dimensions."""
+    reference: File | None = option(None, basic=True)
+    """LiDAR cloud, CSV check points or GeoTIFF to show, and to compute errors from."""
+    cameras: Any = option(None, basic=True, metavar="PATH")
+    """Camera poses to show, as for 'pcfix correct'."""
+    water: Any = option(None, basic=True, metavar="SPEC")
+    """Water surface to show, as for 'pcfix correct'; also for depths of clouds without them."""
+    image: File | None = option(None)
+    """PNG to draw instead of opening a window."""
+    points: int = option(2_000_000, basic=True, least=1)
+    """Maximum number of points of each cloud, evenly spread."""

@@ -27,7 +27,6 @@ class SceneSettings(SceneOptions):
 
     def check(self) -> None:
         """Check what options say together."""
-        super().check()
         object.__setattr__(self, "index", index_of(self.index, self.index_formula)[0])
         pitch = [mm / px for mm, px in zip(self.sensor_mm, self.sensor_px, strict=True)]
         rise = self.water_tilt * float(np.hypot(*self.area_m))

@@ -10,7 +10,7 @@ import pytest
 import pcfix
 from pcfix.errors import SettingError
 from pcfix.flow import plan as flight
-from pcfix.options.handover import PlanOptions
+from pcfix.options.scenes import PlanOptions
 
 DEPTH_M = 4.0
 FLIGHT = {"height": 50.0, "overlap": 0.75, "area": (60.0, 40.0)}

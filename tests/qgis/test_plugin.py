@@ -13,7 +13,7 @@ import zipfile
 import pytest
 
 import pcfix
-from pcfix.cli.commands import EXAMPLES
+from pcfix.cli.commands import COMMANDS
 from pcfix.cli.plugin import OFFERED, plugin_zip
 from pcfix.io.scenes import write_scene
 from pcfix.options.declare import options_of
@@ -25,7 +25,7 @@ QGIS = shutil.which("qgis_process.bin") or shutil.which("qgis_process")
 
 @pytest.fixture(scope="module")
 def packed():
-    return plugin_zip(one for one, _ in EXAMPLES)
+    return plugin_zip(COMMANDS)
 
 
 @pytest.fixture(scope="module")

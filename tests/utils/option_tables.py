@@ -8,20 +8,30 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from pcfix.cli.commands import EXAMPLES
-from pcfix.cli.flags import kind_of
-from pcfix.options.declare import table_of
+from pcfix.cli.commands import COMMANDS
+from pcfix.options.declare import OptionSet, options_of
 
 DOCUMENT = Path(__file__).parents[2] / "pcfix" / "cli" / "README.md"
 
 
+def table_of(kind: type[OptionSet]) -> str:
+    """Return the options of a class as a table."""
+    rows = ["| option | meaning | default |", "|---|---|---|"]
+    for one in options_of(kind):
+        plain = "" if bool in one.kinds else "TEXT" if one.kinds == (str,) else "N"
+        value = "\\|".join(one.choices) or one.metavar or ("PATH" if one.is_path else plain)
+        flag = f"{one.flag} {value}".strip()
+        rows.append(f"| `{flag}` | {one.help} | {one.needed or one.default_text} |")
+    return "\n".join(rows)
+
+
 def with_tables(text: str) -> str:
     """Return a document with a current table between the marks of each command."""
-    kinds = {command.__name__: kind_of(command) for command, _ in EXAMPLES}
 
     def between(found: re.Match[str]) -> str:
         name = found.group(1)
-        return f"<!-- options of {name} -->\n{table_of(kinds[name])}\n<!-- end -->"
+        table = table_of(COMMANDS[name.replace("_", "-")].kind)
+        return f"<!-- options of {name} -->\n{table}\n<!-- end -->"
 
     return re.sub(r"<!-- options of (\w+) -->\n.*?<!-- end -->", between, text, flags=re.S)
 
