@@ -3,40 +3,28 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import fields, replace
+from dataclasses import fields
 from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.adjust.transfer import CloudTransfer
 from pcfix.errors import InputError, PcfixWarning, SettingError
-from pcfix.flow.correction import (
-    CloudTally,
-    Plan,
-    correct_chunk,
-    plan_correction,
-    read_inputs,
-    water_plan,
-)
-from pcfix.flow.inputs import Inputs, paths_in
-from pcfix.flow.old_cameras import paired
-from pcfix.flow.outcome import check, summarize
-from pcfix.flow.plausibility import Flight, plausible
+from pcfix.flow.correction import CloudTally, Plan, correct_chunk
+from pcfix.flow.inputs import CameraInputs, Inputs, paired, paths_in
+from pcfix.flow.outcome import check, check_fit, summarize
+from pcfix.flow.planning import plan_correction, plan_of, read_inputs
 from pcfix.flow.runner import Check, Chunk, Command, FileTask, Progress, stream
 from pcfix.flow.surfaces import CloudView, Points, corners, points_of, view_of
 from pcfix.flow.tiles import run_command
 from pcfix.io.las import columns
 from pcfix.io.las.source import LasSource, centring_steps
 from pcfix.io.las.writing import corrected_header, corrected_identity
-from pcfix.io.regressions import read_regression
 from pcfix.io.tiles import Clouds, Tiles
-from pcfix.io.views.matching import beside
 from pcfix.label.labelling import Labelling
-from pcfix.lens.frames import beside_frames
 from pcfix.model import (
     BATHYMETRIC_POINT,
     NO_CAMERAS,
@@ -48,12 +36,13 @@ from pcfix.model import (
 )
 from pcfix.options.correct import CorrectOptions, LabelRules, PointsOptions, RefractionOptions
 from pcfix.options.declare import File, taken
-from pcfix.refract.learning import check_method, resolved
-from pcfix.refract.regression import DepthRegression, raise_no_regression
 from pcfix.refract.tally import Summary
 from pcfix.water.checks import as_surface, checked_points
 from pcfix.water.index import with_index
 from pcfix.water.surface import FoundSurface
+
+if TYPE_CHECKING:
+    from pcfix.refract.regression import DepthRegression
 
 
 def correct_points(
@@ -150,51 +139,54 @@ def correct_points(
     cameras = cameras or NO_CAMERAS
     xyz = checked_points(xyz)
     surface, heights = as_surface(water, len(xyz))
-    offset = None if level_offset_m is None else _offsets(level_offset_m, len(cameras))
+    offset: FloatArray | None = None
+    if level_offset_m is not None:
+        offset = np.ascontiguousarray(level_offset_m, dtype=np.float64)
+        if offset.shape != (len(cameras),) or not np.isfinite(offset).all():
+            raise SettingError(
+                "array.shape",
+                f"level_offset_m must be {len(cameras)} finite numbers, one per camera, not of"
+                f" shape {offset.shape}.",
+            )
+    original = cameras if adjusted_from is None else adjusted_from
     if views is not None:
-        _check_views(views, xyz, adjusted_from or cameras)
+        _check_views(views, xyz, original)
     points = Points(xyz, heights, _classes(may_be_submerged, len(xyz)))
-    low, high = corners(xyz[:, 0], xyz[:, 1])
-    view = CloudView("xyz", None, low, high, len(xyz), lambda water=None: iter([points]))
-    inputs = Inputs(cameras=cameras, water=surface)
-    found = FoundSurface(surface)
-    plan = water_plan(with_index(all_options), inputs, view, cameras, found, views, offset)
-    check_method(resolved(plan.survey.settings, cameras, plan.kind), cameras)
-    transfer = None if adjusted_from is None else CloudTransfer(paired(adjusted_from, cameras))
-    line = read_regression(regression) if isinstance(regression, str | PathLike) else regression
-    if plan.survey.settings.method == "regression" and line is None:
-        raise_no_regression()
-    only = LabelRules(respect_classes=(NOT_SUBMERGED,))
-    plan = replace(plan, transfer=transfer, labelling=Labelling(only))
-    plan = plan_correction(plan, line)
+    view = CloudView(
+        "xyz", None, *corners(*xyz[:, :2].T), len(xyz), lambda water=None: iter([points])
+    )
+    pair = None if adjusted_from is None else paired(adjusted_from, cameras)
+    line, notes = regression, list[str]()
+    if isinstance(line, str | PathLike):
+        from pcfix.io.regressions import read_regression
+
+        line = read_regression(line)
+        notes = list(line.notes)
+    plan = plan_of(
+        with_index(all_options),
+        Inputs(cameras=cameras, water=surface),
+        view,
+        CameraInputs(cameras, None, original, pair),
+        FoundSurface(surface),
+        views,
+        offset,
+        Labelling(LabelRules(respect_classes=(NOT_SUBMERGED,))),
+        line,
+    )
+    plan = plan_correction(plan)
     correction, tally = correct_chunk(plan, points, 0, covariances=True)
-    # refuse or warn of what does not fit together, as for a file
-    if tally.water is not None and tally.sample is not None:
+    if tally.water is not None:
         tally.water.check_reach("xyz", surface, deep=given.deep)
-        sample = tally.sample
-        flight = Flight(water_m=sample.water_m, every=sample.every)
-        plausible(cameras, sample.xyz, None, sample.level_doubts(), flight).warn()
-    notes: list[str] = [*plan.own_notes]
+    check_fit(plan, tally)
     if line is not None and line is not regression and tally.beyond is not None:
-        notes += [*line.notes, *tally.beyond.notes(line)]
-    for note in notes:
+        notes += tally.beyond.notes(line)
+    for note in (*plan.own_notes, *notes):
         warnings.warn(PcfixWarning("points.note", note), stacklevel=2)
     return correction
 
 
 NOT_SUBMERGED = 255
 """The class of points that may not be submerged, for the rules of a labelling."""
-
-
-def _offsets(level_offset_m: npt.ArrayLike, k: int) -> FloatArray:
-    offset = np.ascontiguousarray(level_offset_m, dtype=np.float64)
-    if offset.shape != (k,) or not np.isfinite(offset).all():
-        raise SettingError(
-            "array.shape",
-            f"level_offset_m must be {k} finite numbers, one per camera, not of shape"
-            f" {offset.shape}.",
-        )
-    return offset
 
 
 def _classes(may_be_submerged: npt.ArrayLike | None, n: int) -> npt.NDArray[np.uint8]:
@@ -226,6 +218,9 @@ def _check_views(views: Views, points: FloatArray, cameras: Cameras) -> None:
         raise SettingError(
             "views.camera", f"views name camera {camera.max()}, but there are {len(cameras)}."
         )
+    from pcfix.io.views.matching import beside
+    from pcfix.lens.frames import beside_frames
+
     counts = beside_frames(points, views, cameras)
     if counts.any():
         entries, outside = int(counts.sum()), int(np.count_nonzero(counts))

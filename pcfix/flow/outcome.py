@@ -5,36 +5,33 @@ from __future__ import annotations
 import warnings
 from dataclasses import replace
 from itertools import compress
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pcfix.adjust.diagnosis import Evidence
 from pcfix.errors import GeometryError, PcfixWarning, coded
 from pcfix.flow.correction import CloudTally, Plan
-from pcfix.flow.diagnosis import Poses, diagnose_in_passing, quick_ties
-from pcfix.flow.plausibility import CloudSample, Flight, Plausible, plausible
+from pcfix.flow.plausibility import CloudSample, Plausible, plausible
 from pcfix.flow.runner import Ends
-from pcfix.flow.shore import write_shoreline
-from pcfix.io.cameras.mistakes import likely_mistake
 from pcfix.io.las.part import part_report
-from pcfix.io.regressions import write_regression
-from pcfix.io.views import ViewMatch, ViewReport
-from pcfix.model import Cameras, FloatArray, Outcome, WaterDimension
+from pcfix.model import Cameras, FloatArray, Outcome, TiePoints, WaterDimension
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import UNLISTED
 from pcfix.refract.choice import views_in_frame
 from pcfix.refract.reconstructions import CAUSES
-from pcfix.refract.regression import LEAST_BEYOND
 from pcfix.refract.tally import Summary, Tally
 from pcfix.version import __version__
 from pcfix.water.checks import refuse_under_water
+
+if TYPE_CHECKING:
+    from pcfix.flow.diagnosis import Poses
+    from pcfix.io.views import ViewReport
 
 
 class Findings(NamedTuple):
     """What the checks of a whole cloud found."""
 
-    plausible: Plausible | None = None
+    plausible: Plausible = Plausible()
     poses: Poses | None = None
     shoreline: dict[str, Any] | None = None
     water_notes: tuple[str, ...] = ()
@@ -54,9 +51,20 @@ def check(plan: Plan, tally: CloudTally) -> Findings:
     if plan.transfer is not None and tally.transfer is not None:
         plan.transfer.check(name, tally.transfer)
     plan.labelling.check(name, tally.labels)
-    water_notes = _check_water(plan, tally)
+    water_notes, water = list[str](), plan.found.surface
+    if tally.water is not None:
+        tally.water.check_submerged(name, water)
+        if isinstance(water, WaterDimension):
+            refuse_under_water(plan.cameras, figures.lowest_water_m, str(water))
+        water_notes = tally.water.check_reach(name, water, deep=plan.options.deep)
+    elif figures.submerged == 0:
+        raise GeometryError(
+            "cloud.none_submerged", f"{name}: no point is left to correct. Check the mask."
+        )
     flat = int(figures.outcomes[Outcome.FLAT_RAYS])
     if figures.outcomes[Outcome.NO_CAMERA] + flat == figures.submerged:
+        from pcfix.io.cameras.mistakes import likely_mistake
+
         block = plan.cameras.centres, figures.low, figures.high, plan.view.crs
         mistake = (None if flat else likely_mistake(*block)) or ""
         raise GeometryError(
@@ -76,29 +84,19 @@ def check(plan: Plan, tally: CloudTally) -> Findings:
         )
     if plan.inputs.port is not None:
         return Findings()
-    return _check_block(plan, tally)._replace(water_notes=water_notes)
+    from pcfix.flow.diagnosis import diagnose_in_passing, quick_ties
+
+    ties = quick_ties(plan.inputs, plan.view.crs) if len(plan.cameras) else None
+    tested = check_fit(plan, tally, ties)
+    poses = diagnose_in_passing(plan, ties)
+    return Findings(tested, poses, _write_shoreline(plan, tally), tuple(water_notes))
 
 
 def _view_report(plan: Plan, tally: CloudTally) -> ViewReport | None:
     """Return how the view list fitted, with the notes of reading it."""
-    if tally.views is None or not isinstance(plan.views, ViewMatch):
+    if tally.views is None or plan.match is None:
         return None
-    return replace(tally.views, notes=plan.views.report.notes)
-
-
-def _check_water(plan: Plan, tally: CloudTally) -> tuple[str, ...]:
-    """Refuse a cloud without submerged points, and water far from it."""
-    name, water = plan.view.name, plan.found.surface
-    if tally.water is None:
-        if tally.figures.submerged == 0:
-            raise GeometryError(
-                "cloud.none_submerged", f"{name}: no point is left to correct. Check the mask."
-            )
-        return ()
-    tally.water.check_submerged(name, water)
-    if isinstance(water, WaterDimension):
-        refuse_under_water(plan.cameras, tally.figures.lowest_water_m, str(water))
-    return tuple(tally.water.check_reach(name, water, deep=plan.options.deep))
+    return replace(tally.views, notes=plan.match.report.notes)
 
 
 def _out_of_sight(plan: Plan, figures: Tally) -> str:
@@ -122,34 +120,33 @@ def _out_of_sight(plan: Plan, figures: Tally) -> str:
     )
 
 
-def _check_block(plan: Plan, tally: CloudTally) -> Findings:
-    """Check cameras, cloud and water against each other; write the shoreline."""
-    inputs, sample, cameras = plan.inputs, tally.sample or CloudSample(), plan.cameras
-    given = inputs.cameras
-    ties = quick_ties(inputs, plan.view.crs) if len(cameras) else None
+def check_fit(plan: Plan, tally: CloudTally, ties: TiePoints | None = None) -> Plausible:
+    """Test cameras, cloud and water against each other; warn of every doubt."""
+    sample, given = tally.sample or CloudSample(), plan.inputs.cameras
     sought = (plan.found.as_dict() or {}).get("model") == "auto"
-    doubts = () if sought else sample.level_doubts()
-    file = "" if isinstance(given, Cameras) else given or ""
-    flight = Flight(file, sample.water_m, plan.views is not None, sample.every)
-    tested = plausible(cameras, sample.xyz, ties, doubts, flight)
+    tested = plausible(
+        plan.cameras, sample.xyz, ties, () if sought else sample.level_doubts(),
+        file="" if isinstance(given, Cameras) else given or "", water_m=sample.water_m,
+        listed=plan.views is not None, every=sample.every,
+    )  # fmt: skip
     tested = tested._replace(noted=CAUSES in map(str, _detected(plan, tally)))
-    tested.warn()
-    if not len(cameras):
-        return Findings(tested, Poses(None, "not applicable: no cameras were given"))
-    name = "cameras" if isinstance(given, Cameras) else str(given)
-    n, water = plan.options.refractive_index, plan.found.surface
-    evidence = Evidence(cameras, name, water, n, ties=ties)
-    poses = diagnose_in_passing(inputs, evidence, plan.view, plan.verdicts)
-    shoreline = None
-    if tally.shore is not None:
-        stated = plan.options.sigma_level
+    for doubt in tested.doubts:
+        warnings.warn(doubt, stacklevel=3)
+    return tested
 
-        def sigma(xy: FloatArray) -> FloatArray | None:
-            return plan.found.sigma_level_m(xy) if stated is None else np.full(len(xy), stated)
 
-        path, overwrite = plan.options.shoreline or "", plan.options.overwrite
-        shoreline = write_shoreline(path, tally.shore, sigma, plan.view.crs, overwrite=overwrite)
-    return Findings(tested, poses, shoreline)
+def _write_shoreline(plan: Plan, tally: CloudTally) -> dict[str, Any] | None:
+    """Write the shoreline if it is asked for; return its figures."""
+    path, stated = plan.options.shoreline, plan.options.sigma_level
+    if tally.shore is None or path is None:
+        return None
+    from pcfix.flow.shore import write_shoreline
+
+    def sigma(xy: FloatArray) -> FloatArray | None:
+        return plan.found.sigma_level_m(xy) if stated is None else np.full(len(xy), stated)
+
+    overwrite = plan.options.overwrite
+    return write_shoreline(path, tally.shore, sigma, plan.view.crs, overwrite=overwrite)
 
 
 def _detected(plan: Plan, tally: CloudTally) -> list[PcfixWarning]:
@@ -157,6 +154,8 @@ def _detected(plan: Plan, tally: CloudTally) -> list[PcfixWarning]:
     verdicts = {str(note): note for one in plan.verdicts for note in one.warnings()}
     beyond, line = list[str](), plan.regression
     if tally.beyond is not None and line is not None:
+        from pcfix.refract.regression import LEAST_BEYOND
+
         least = LEAST_BEYOND if plan.inputs.regression is None else 0.0
         beyond = tally.beyond.notes(line, least)
     unlisted = []
@@ -175,6 +174,8 @@ def summarize(plan: Plan, tally: CloudTally, findings: Findings, ends: Ends) -> 
     """Return the figures of a correction, and write the line of a regression if asked."""
     path, line, options = plan.options.save_regression, plan.regression, plan.options
     if path is not None and line is not None:
+        from pcfix.io.regressions import write_regression
+
         write_regression(path, line, overwrite=options.overwrite)
     figures, report = tally.figures, _view_report(plan, tally)
     unused = list(compress(plan.cameras.labels, np.logical_not(figures.camera_used)))
@@ -220,7 +221,7 @@ def _figures_of_water(
 ) -> tuple[dict[str, Any], list[Any]]:
     """Return the part of a summary about depths, water and cameras, and its notes."""
     moved, water, made = plan.survey.level_offset_m, str(plan.found.surface), plan.made
-    tested, poses = findings.plausible or Plausible(), findings.poses
+    tested, poses = findings.plausible, findings.poses
     uncertainty, by_poses = tally.figures.uncertainty(made), plan.survey.learned.poses
     if uncertainty is not None and by_poses is not None:
         uncertainty["poses_m"] = round(by_poses.middle_m, 4)

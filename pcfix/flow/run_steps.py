@@ -16,10 +16,9 @@ from pcfix.flow.clean import clean_file
 from pcfix.flow.compare import compare_clouds
 from pcfix.flow.correct import correct_file
 from pcfix.flow.dsm import grid_dsm
-from pcfix.flow.inputs import Inputs
+from pcfix.flow.inputs import Inputs, read_blocks
 from pcfix.flow.layers import Drawn, write_map
 from pcfix.flow.next_steps import FOLDER
-from pcfix.flow.old_cameras import read_blocks
 from pcfix.flow.rasters import raster_files, resolution_sentence, write_rasters
 from pcfix.flow.report import write_report
 from pcfix.flow.request import Files, Request

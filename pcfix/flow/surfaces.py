@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -18,8 +18,6 @@ from pcfix.flow.runner import Chunk, read_ahead
 from pcfix.io.las import source as las
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.tiles import Tiles, open_cloud
-from pcfix.io.water import read_water
-from pcfix.io.water_rasters import rasters_of_images, read_water_raster
 from pcfix.label.labelling import Part
 from pcfix.model import (
     Cameras,
@@ -32,12 +30,13 @@ from pcfix.model import (
 )
 from pcfix.options.declare import File
 from pcfix.options.shared import WaterOptions
-from pcfix.water.fit import WaterFit
-from pcfix.water.river import RiverFit
 from pcfix.water.surface import FoundSurface, OwnWater, build_fields, surface_above
 
 if TYPE_CHECKING:
     from pyproj import CRS
+
+    from pcfix.water.fit import WaterFit
+    from pcfix.water.river import RiverFit
 
 
 class Points(NamedTuple):
@@ -53,20 +52,18 @@ class Points(NamedTuple):
 
     def take(self, rows: IntArray | slice) -> Points:
         """Return some of the points."""
-        colours = None if self.colours is None else tuple(one[rows] for one in self.colours)
-        names = [name for name in self._fields if name != "colours"]
-        some = {name: getattr(self, name) for name in names}
-        some = {name: None if one is None else one[rows] for name, one in some.items()}
-        return Points(**some, colours=colours)
+        some = {
+            name: one[rows] for name, one in self._asdict().items() if isinstance(one, np.ndarray)
+        }
+        if self.colours is not None:
+            some["colours"] = tuple(one[rows] for one in self.colours)
+        return self._replace(**some)
 
 
 RGB = ("red", "green", "blue")
 
 SAMPLE_POINTS = 2_000_000
 """Points of a cloud that are searched for water, evenly spread."""
-
-
-CloudPlace: TypeAlias = "tuple[CRS | str | None, FloatArray, FloatArray]"
 
 
 @dataclass(frozen=True)
@@ -175,6 +172,7 @@ def find_surface(
         Without a cloud only surfaces that do not need one.
     """
     from pcfix.io.vectors import is_vector_file
+    from pcfix.io.water import read_water
 
     if not isinstance(water, str | PathLike | float | int):
         return FoundSurface(water)
@@ -195,7 +193,7 @@ def own_water_of(
     folder: File | None,
     cameras: Cameras,
     water: WaterSurface,
-    view: CloudPlace,
+    view: CloudView,
     level_offset_m: FloatArray | None = None,
 ) -> tuple[OwnWater | None, tuple[str, ...]]:
     """Return the separate water surfaces of images, and notes on them.
@@ -207,13 +205,14 @@ def own_water_of(
     cameras : Cameras
     water : WaterSurface
         That of the other images.
-    view : CRS, and two arrays, shape (2,)
-        CRS of the cloud, its south-west and its north-east corner, metres.
+    view : CloudView
     level_offset_m : array, shape (k,), optional
         Height of the water above `water` at each image.
     """
     if folder is None:
         return None, ()
+    from pcfix.io.water_rasters import rasters_of_images, read_water_raster
+
     if isinstance(water, WaterMesh):
         raise SettingError(
             "option.exclusive",
@@ -221,11 +220,16 @@ def own_water_of(
             " level, a plane or a raster.",
             options=["water_per_image", "water"],
         )
-    crs, low, high = view
+    low, high = view.low, view.high
     paths, notes = rasters_of_images(folder, cameras.labels)
-    heights = _read_alike(paths, crs)
     errors = {row: path.parent / "sigma" / path.name for row, path in paths.items()}
-    sigma = _read_alike({row: path for row, path in errors.items() if path.is_file()}, crs)
+    heights, sigma = dict[int, WaterRaster](), dict[int, WaterRaster]()
+    for files, read in ((paths, heights), (errors, sigma)):
+        with warnings.catch_warnings():  # those of the first raster are enough
+            for row, path in files.items():
+                if files is paths or path.is_file():
+                    read[row] = read_water_raster(path, view.crs)
+                    warnings.simplefilter("ignore", PcfixWarning)
     if len(sigma) < len(heights):
         lost = len(heights) - len(sigma)
         notes += (f"{folder}: {lost} rasters have no standard errors in the folder sigma.",)
@@ -252,16 +256,6 @@ def own_water_of(
         )  # fmt: skip
     k, common = len(cameras), water if isinstance(water, WaterRaster) else None
     return OwnWater(build_fields(heights, k, common), build_fields(sigma, k)), notes
-
-
-def _read_alike(paths: dict[int, Path], crs: CRS | str | None) -> dict[int, WaterRaster]:
-    """Read rasters of one kind, and show the warnings of the first only."""
-    rasters = dict[int, WaterRaster]()
-    with warnings.catch_warnings():
-        for row, path in paths.items():
-            rasters[row] = read_water_raster(path, crs)
-            warnings.simplefilter("ignore", PcfixWarning)
-    return rasters
 
 
 def _bounds(low: FloatArray, high: FloatArray) -> tuple[float, float, float, float]:
