@@ -12,9 +12,9 @@ import numpy as np
 from pcfix.errors import GeometryError, SettingError
 from pcfix.flow.surfaces import CloudView, Points, parts_of
 from pcfix.io.regressions import read_regression
-from pcfix.io.tables import CheckDepths, read_check_depths
+from pcfix.io.tables import read_check_depths
 from pcfix.label.labelling import Part
-from pcfix.model import NOISE_CLASSES, BoolArray, FloatArray, IntArray
+from pcfix.model import NOISE_CLASSES
 from pcfix.options.correct import ScienceOptions
 from pcfix.options.declare import File
 from pcfix.refract.batch import Survey
@@ -87,7 +87,7 @@ def learn_regression(
     within four times the distance between neighbouring points there. Check depths with fewer are
     excluded, with a note; an outlier is noted too, but used.
     """
-    checks = read_check_depths(path)
+    checks, notes = read_check_depths(path), list[str]()
     around = ApparentDepths(checks.xy)
     for part in parts:
         rows = np.flatnonzero(~np.isin(part.classes, NOISE_CLASSES))
@@ -95,11 +95,35 @@ def learn_regression(
         around.add(part.xyz[rows], surface)
     radius = REACH * around.spacing_m
     apparent, level, covered = around.medians(radius)
-    left_out = _left_out(checks, around.distance_m[:, 0], covered, radius)
-    if left_out and covered.sum() < LEAST_COUNT:
-        raise GeometryError("check_depths.no_bed", left_out, covered=int(covered.sum()))
+    if not covered.all():
+        first = int(np.argmin(covered))
+        nearest, there = around.distance_m[first, 0], "the cloud has no submerged point"
+        if np.isfinite(nearest):
+            there = (
+                f"the nearest submerged point is {nearest:,.2f} m away, and {LEAST_NEIGHBOURS}"
+                f" are needed within {radius:.2f} m"
+            )
+        notes.append(
+            f"{checks.where(first)}: {int((~covered).sum())} of {len(checks)} check depths have no"
+            f" bed around them: {there}. Check that they have the cloud's CRS and lie in the water."
+        )
+        if covered.sum() < LEAST_COUNT:
+            raise GeometryError("check_depths.no_bed", notes[0], covered=int(covered.sum()))
     rows = np.flatnonzero(covered)
-    true = _true_depths(checks, level, rows)
+    true = np.asarray(checks.value_m[rows])
+    if checks.are_heights:  # they are subtracted from the water above them
+        true = level[rows] - true
+        above = np.flatnonzero(true < 0.0)
+        if len(above):
+            first = int(rows[above[0]])
+            raise GeometryError(
+                "check_depths.above_water",
+                f"{checks.where(first)}: the height {checks.value_m[first]:.2f} m is above the"
+                f" water, {level[first]:.2f} m there ({len(above)} of {len(rows)} are). Give"
+                " heights of the bed in the cloud's vertical datum, or depths in a column depth.",
+                height_m=float(checks.value_m[first]),
+                count=len(above),
+            )
     try:
         found = fit_depths(apparent[rows], true)
     except GeometryError as error:
@@ -113,55 +137,11 @@ def learn_regression(
             r2=found.r2,
             least=settings.least_r2,
         )
-    notes = (left_out,) if left_out else ()
-    return replace(found, notes=(*notes, *found.notes, *_outlier_notes(checks, found, rows)))
-
-
-def _left_out(
-    checks: CheckDepths, nearest_m: FloatArray, covered: BoolArray, radius_m: float
-) -> str:
-    """Describe the check depths where the cloud has no bed; empty if there are none."""
-    if covered.all():
-        return ""
-    first = int(np.argmin(covered))
-    there = "the cloud has no submerged point"
-    if np.isfinite(nearest_m[first]):
-        there = (
-            f"the nearest submerged point is {nearest_m[first]:,.2f} m away, and {LEAST_NEIGHBOURS}"
-            f" are needed within {radius_m:.2f} m"
+    notes += found.notes
+    if found.outliers:
+        lines = ", ".join(str(checks.line[rows[i]]) for i in found.outliers[:5])
+        notes.append(
+            f"{checks.where(int(rows[found.outliers[0]]))}: {len(found.outliers)} check depths are"
+            f" outliers (lines {lines}) and were used. Correct or remove them."
         )
-    return (
-        f"{checks.where(first)}: {int((~covered).sum())} of {len(checks)} check depths have no bed"
-        f" around them: {there}. Check that they have the cloud's CRS and lie in the water."
-    )
-
-
-def _true_depths(checks: CheckDepths, level_m: FloatArray, rows: IntArray) -> FloatArray:
-    """Return the true depths, metres; heights are subtracted from the water above them."""
-    if not checks.are_heights:
-        return checks.value_m[rows]
-    depth = level_m[rows] - checks.value_m[rows]
-    above = np.flatnonzero(depth < 0.0)
-    if len(above):
-        first = int(rows[above[0]])
-        raise GeometryError(
-            "check_depths.above_water",
-            f"{checks.where(first)}: the height {checks.value_m[first]:.2f} m is above the water,"
-            f" {level_m[first]:.2f} m there ({len(above)} of {len(rows)} are). Give heights of the"
-            " bed in the cloud's vertical datum, or depths in a column depth.",
-            height_m=float(checks.value_m[first]),
-            count=len(above),
-        )
-    return np.asarray(depth)
-
-
-def _outlier_notes(checks: CheckDepths, found: DepthRegression, rows: IntArray) -> tuple[str, ...]:
-    """Return a note on check depths far off the line, if there are any."""
-    if not found.outliers:
-        return ()
-    first = int(rows[found.outliers[0]])
-    lines = ", ".join(str(checks.line[rows[i]]) for i in found.outliers[:5])
-    return (
-        f"{checks.where(first)}: {len(found.outliers)} check depths are outliers (lines {lines})"
-        " and were used. Correct or remove them.",
-    )
+    return replace(found, notes=tuple(notes))

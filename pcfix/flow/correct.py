@@ -1,4 +1,8 @@
-"""Correct a LAS or LAZ cloud, or arrays, for refraction: two doors to one calculation."""
+"""Correct a LAS or LAZ cloud, or arrays, for refraction: two doors to one calculation.
+
+A plan is made for the whole cloud (`pcfix.flow.planning`), each chunk is corrected by it
+(`pcfix.flow.correction`), and the statistics are checked and summarized (`pcfix.flow.outcome`).
+"""
 
 from __future__ import annotations
 
@@ -43,189 +47,6 @@ from pcfix.water.surface import FoundSurface
 
 if TYPE_CHECKING:
     from pcfix.refract.regression import DepthRegression
-
-
-def correct_points(
-    xyz: npt.ArrayLike,
-    cameras: Cameras | None,
-    water: WaterSurface | float | npt.ArrayLike,
-    *,
-    options: RefractionOptions | None = None,
-    views: Views | None = None,
-    may_be_submerged: npt.ArrayLike | None = None,
-    level_offset_m: npt.ArrayLike | None = None,
-    adjusted_from: Cameras | None = None,
-    regression: DepthRegression | File | None = None,
-    **keywords: Any,
-) -> Correction:
-    """Correct apparent points for refraction at the water surface.
-
-    Parameters
-    ----------
-    xyz : array, shape (n, 3)
-        Points as the SfM software placed them, metres, world frame. Those below the water
-        surface are moved, the others come back bit for bit.
-    cameras : Cameras or None
-        Poses in the same frame; see `pcfix.read_cameras`. The methods factor and regression do
-        without: then no point has rays, an incidence or, with factor, a standard error.
-    water : WaterSurface, float, or array of shape (n,)
-        The water surface (see `pcfix.read_water`), its level in metres, or its height above
-        each point, NaN where it is not known.
-    options : RefractionOptions, optional
-        Or its attributes as keywords, as of ``pcfix correct``: index, method, max_angle (degrees
-        from the surface normal), max_cameras, camera_set, matcher, depth_factor, unsure (with
-        ``"withhold"`` the result says which are), sigma_image and the other standard errors;
-        `xyz` is taken for the whole cloud, so with a part of one set ``occlusion="off"``. With
-        water_per_image, rasters in the frame of the points, what is submerged, and how deep, goes
-        by `water`.
-    views : Views, optional
-        Which cameras made each point, rows of `adjusted_from` where that is given, else of
-        `cameras`. Default: as the option `camera_set` says.
-    may_be_submerged : array of bool, shape (n,), optional
-        The other points are land, even below the surface; `pcfix.label_points` finds them.
-        Default: all.
-    level_offset_m : array, shape (k,), optional
-        How much higher than `water` the surface stood when each camera took its image, as
-        `pcfix.io.tides.level_offsets` finds it. Each ray bends at its own surface; which points
-        are submerged, and how deep, goes by `water`. Default: zero.
-    adjusted_from : Cameras, optional
-        Those that the points were made with, in the same frame, where `cameras` are the same
-        images (matched by their labels) adjusted since. All points, land too, are first taken
-        from those to these; see `pcfix.adjust.transfer`.
-    regression : DepthRegression or path, optional
-        With the method regression: see `pcfix.refract.regression`, or the file of a line.
-
-    Returns
-    -------
-    Correction
-        One row per input point, in the same order.
-
-    Raises
-    ------
-    SettingError
-        If an argument is outside its rule, or a coordinate is not finite.
-    GeometryError
-        If a camera stands under the water.
-
-    Notes
-    -----
-    With the method snell, for each camera the line from the projection centre to the apparent
-    point is bent where it pierces the surface (Snell in vector form, Skarlatos & Agrafiotis
-    2018, eq 10); the true point is the one nearest to all bent rays in the sense of least squares
-    (eq 11, for any number of rays). Nothing is iterated and no sum depends on the number of
-    threads.
-
-    Examples
-    --------
-    Two cameras 100 m above a bed that looks 2 m deep:
-
-    >>> import numpy as np, pcfix
-    >>> cameras = pcfix.Cameras(("a", "b"), np.array([[-20.0, 0, 100], [20.0, 0, 100]]))
-    >>> result = pcfix.correct_points([[0.0, 0.0, -2.0]], cameras, 0.0)
-    >>> result.xyz.round(3).tolist()
-    [[0.0, 0.0, -2.703]]
-    """
-    given = taken(PointsOptions, options, keywords, "correct_points")
-    all_options = CorrectOptions(**{one.name: getattr(given, one.name) for one in fields(given)})
-    if not cameras:
-        all_options.check_no_cameras()
-        if not (views is None and level_offset_m is None and adjusted_from is None):
-            raise SettingError(
-                "option.needs",
-                "views, level_offset_m and adjusted_from have no effect without cameras. Give both,"
-                " or neither.",
-                needs="cameras",
-            )
-    cameras = cameras or NO_CAMERAS
-    xyz = checked_points(xyz)
-    surface, heights = as_surface(water, len(xyz))
-    offset: FloatArray | None = None
-    if level_offset_m is not None:
-        offset = np.ascontiguousarray(level_offset_m, dtype=np.float64)
-        if offset.shape != (len(cameras),) or not np.isfinite(offset).all():
-            raise SettingError(
-                "array.shape",
-                f"level_offset_m must be {len(cameras)} finite numbers, one per camera, not of"
-                f" shape {offset.shape}.",
-            )
-    original = cameras if adjusted_from is None else adjusted_from
-    if views is not None:
-        _check_views(views, xyz, original)
-    points = Points(xyz, heights, _classes(may_be_submerged, len(xyz)))
-    view = CloudView(
-        "xyz", None, *corners(*xyz[:, :2].T), len(xyz), lambda water=None: iter([points])
-    )
-    pair = None if adjusted_from is None else paired(adjusted_from, cameras)
-    line, notes = regression, list[str]()
-    if isinstance(line, str | PathLike):
-        from pcfix.io.regressions import read_regression
-
-        line = read_regression(line)
-        notes = list(line.notes)
-    plan = plan_of(
-        with_index(all_options),
-        Inputs(cameras=cameras, water=surface),
-        view,
-        CameraInputs(cameras, None, original, pair),
-        FoundSurface(surface),
-        views,
-        offset,
-        Labelling(LabelRules(respect_classes=(NOT_SUBMERGED,))),
-        line,
-    )
-    plan = plan_correction(plan)
-    correction, tally = correct_chunk(plan, points, 0, covariances=True)
-    if tally.water is not None:
-        tally.water.check_reach("xyz", surface, deep=given.deep)
-    check_fit(plan, tally)
-    if line is not None and line is not regression and tally.beyond is not None:
-        notes += tally.beyond.notes(line)
-    for note in (*plan.own_notes, *notes):
-        warnings.warn(PcfixWarning("points.note", note), stacklevel=2)
-    return correction
-
-
-NOT_SUBMERGED = 255
-"""The class of points that may not be submerged, for the rules of a labelling."""
-
-
-def _classes(may_be_submerged: npt.ArrayLike | None, n: int) -> npt.NDArray[np.uint8]:
-    """Return the classes of points, of which some may not be submerged."""
-    classes = np.zeros(n, np.uint8)
-    if may_be_submerged is not None:
-        allowed = np.asarray(may_be_submerged)
-        if allowed.shape != (n,) or allowed.dtype != np.bool_:
-            raise SettingError(
-                "array.shape",
-                f"may_be_submerged must be {n} booleans, not {allowed.dtype} of shape"
-                f" {allowed.shape}.",
-            )
-        classes[~allowed] = NOT_SUBMERGED
-    return classes
-
-
-def _check_views(views: Views, points: FloatArray, cameras: Cameras) -> None:
-    """Refuse views that are no table of these points, and warn of points outside their images."""
-    n, start, camera = len(points), views.start, views.camera
-    is_table = len(start) == n + 1 and start[0] == 0 and start[-1] == len(camera)
-    if not is_table or (np.diff(start) < 0).any():
-        raise SettingError(
-            "views.table",
-            f"views must have {n + 1} starts that do not decrease, from 0 to the number of"
-            " entries.",
-        )
-    if len(camera) and not 0 <= camera.min() <= camera.max() < len(cameras):
-        raise SettingError(
-            "views.camera", f"views name camera {camera.max()}, but there are {len(cameras)}."
-        )
-    from pcfix.io.views.matching import beside
-    from pcfix.lens.frames import beside_frames
-
-    counts = beside_frames(points, views, cameras)
-    if counts.any():
-        entries, outside = int(counts.sum()), int(np.count_nonzero(counts))
-        note = PcfixWarning("views.outside", f"views: {beside(entries, outside)}", entries=entries)
-        warnings.warn(note, stacklevel=3)
 
 
 def correct_file(
@@ -336,3 +157,171 @@ class Correcting:
             some["withheld"][:] = flagged.astype(np.uint8)
         drops = self._plan.options.uncorrected == "drop"
         return new[~correction.uncorrected] if drops else new
+
+
+def correct_points(
+    xyz: npt.ArrayLike,
+    cameras: Cameras | None,
+    water: WaterSurface | float | npt.ArrayLike,
+    *,
+    options: RefractionOptions | None = None,
+    views: Views | None = None,
+    may_be_submerged: npt.ArrayLike | None = None,
+    level_offset_m: npt.ArrayLike | None = None,
+    adjusted_from: Cameras | None = None,
+    regression: DepthRegression | File | None = None,
+    **keywords: Any,
+) -> Correction:
+    """Correct apparent points for refraction at the water surface.
+
+    Parameters
+    ----------
+    xyz : array, shape (n, 3)
+        Apparent points, metres, world frame: the whole cloud, else set ``occlusion="off"``. Points
+        above the water surface are returned bit for bit.
+    cameras : Cameras or None
+        Poses in the same frame; see `pcfix.read_cameras`. The methods factor and regression need
+        none.
+    water : WaterSurface, float, or array of shape (n,)
+        The water surface (see `pcfix.read_water`), its level in metres, or its height above
+        each point, NaN where it is unknown.
+    options : RefractionOptions, optional
+        Or its attributes as keywords, as of ``pcfix correct``: index, method, max_angle (degrees
+        from the surface normal), max_cameras, camera_set, matcher, depth_factor, unsure (with
+        ``"withhold"`` the result has a flag), sigma_image and the other standard deviations. With
+        water_per_image, `water` still decides which points are submerged, and how deep.
+    views : Views, optional
+        The view list: the images that contributed to each point, as rows of `adjusted_from` if it
+        is given, else of `cameras`. Default: as the option `camera_set` says.
+    may_be_submerged : array of bool, shape (n,), optional
+        The other points are land, even below the surface; `pcfix.label_points` finds them.
+        Default: all.
+    level_offset_m : array, shape (k,), optional
+        Height of the water above `water` when each image was taken; see
+        `pcfix.io.tides.level_offsets`. Each ray is refracted at its own surface; `water` decides
+        which points are submerged, and how deep. Default: zero.
+    adjusted_from : Cameras, optional
+        The original cameras, in the same frame, if `cameras` are the same images (matched by their
+        labels) after an adjustment. All points are first transferred to the adjusted cameras; see
+        `pcfix.adjust.transfer`.
+    regression : DepthRegression or path, optional
+        For the method regression: see `pcfix.refract.regression`, or the file of a line.
+
+    Returns
+    -------
+    Correction
+        One row per input point, in the same order.
+
+    Raises
+    ------
+    SettingError
+        If an argument is outside its range, or a coordinate is not finite.
+    GeometryError
+        If a camera is below the water.
+
+    Examples
+    --------
+    Two cameras 100 m above a bed that looks 2 m deep:
+
+    >>> import numpy as np, pcfix
+    >>> cameras = pcfix.Cameras(("a", "b"), np.array([[-20.0, 0, 100], [20.0, 0, 100]]))
+    >>> result = pcfix.correct_points([[0.0, 0.0, -2.0]], cameras, 0.0)
+    >>> result.xyz.round(3).tolist()
+    [[0.0, 0.0, -2.703]]
+    """
+    given = taken(PointsOptions, options, keywords, "correct_points")
+    all_options = CorrectOptions(**{one.name: getattr(given, one.name) for one in fields(given)})
+    if not cameras:
+        all_options.check_no_cameras()
+        if not (views is None and level_offset_m is None and adjusted_from is None):
+            raise SettingError(
+                "option.needs",
+                "views, level_offset_m and adjusted_from have no effect without cameras. Give both,"
+                " or neither.",
+                needs="cameras",
+            )
+    cameras = cameras or NO_CAMERAS
+    xyz = checked_points(xyz)
+    surface, heights = as_surface(water, len(xyz))
+    offset: FloatArray | None = None
+    if level_offset_m is not None:
+        offset = np.ascontiguousarray(level_offset_m, dtype=np.float64)
+        if offset.shape != (len(cameras),) or not np.isfinite(offset).all():
+            raise SettingError(
+                "array.shape",
+                f"level_offset_m must be {len(cameras)} finite numbers, one per camera, not of"
+                f" shape {offset.shape}.",
+            )
+    original = cameras if adjusted_from is None else adjusted_from
+    if views is not None:
+        _check_views(views, xyz, original)
+    classes = np.zeros(len(xyz), np.uint8)
+    if may_be_submerged is not None:
+        allowed = np.asarray(may_be_submerged)
+        if allowed.shape != classes.shape or allowed.dtype != np.bool_:
+            raise SettingError(
+                "array.shape",
+                f"may_be_submerged must be {len(xyz)} booleans, not {allowed.dtype} of shape"
+                f" {allowed.shape}.",
+            )
+        classes[~allowed] = NOT_SUBMERGED
+    points = Points(xyz, heights, classes)
+    view = CloudView(
+        "xyz", None, *corners(*xyz[:, :2].T), len(xyz), lambda water=None: iter([points])
+    )
+    pair = None if adjusted_from is None else paired(adjusted_from, cameras)
+    line, notes = regression, list[str]()
+    if isinstance(line, str | PathLike):
+        from pcfix.io.regressions import read_regression
+
+        line = read_regression(line)
+        notes = list(line.notes)
+    plan = plan_of(
+        with_index(all_options),
+        Inputs(cameras=cameras, water=surface),
+        view,
+        CameraInputs(cameras, None, original, pair),
+        FoundSurface(surface),
+        views,
+        offset,
+        Labelling(LabelRules(respect_classes=(NOT_SUBMERGED,))),
+        line,
+    )
+    plan = plan_correction(plan)
+    correction, tally = correct_chunk(plan, points, 0, covariances=True)
+    if tally.water is not None:
+        tally.water.check_reach("xyz", surface, deep=given.deep)
+    check_fit(plan, tally)
+    if line is not None and line is not regression and tally.beyond is not None:
+        notes += tally.beyond.notes(line)
+    for note in (*plan.own_notes, *notes):
+        warnings.warn(PcfixWarning("points.note", note), stacklevel=2)
+    return correction
+
+
+NOT_SUBMERGED = 255
+"""The class of points that may not be submerged, for the rules of a labelling."""
+
+
+def _check_views(views: Views, points: FloatArray, cameras: Cameras) -> None:
+    """Refuse views that are no table of these points, and warn of points outside their images."""
+    n, start, camera = len(points), views.start, views.camera
+    is_table = len(start) == n + 1 and start[0] == 0 and start[-1] == len(camera)
+    if not is_table or (np.diff(start) < 0).any():
+        raise SettingError(
+            "views.table",
+            f"views must have {n + 1} starts that do not decrease, from 0 to the number of"
+            " entries.",
+        )
+    if len(camera) and not 0 <= camera.min() <= camera.max() < len(cameras):
+        raise SettingError(
+            "views.camera", f"views name camera {camera.max()}, but there are {len(cameras)}."
+        )
+    from pcfix.io.views.matching import beside
+    from pcfix.lens.frames import beside_frames
+
+    counts = beside_frames(points, views, cameras)
+    if counts.any():
+        entries, outside = int(counts.sum()), int(np.count_nonzero(counts))
+        note = PcfixWarning("views.outside", f"views: {beside(entries, outside)}", entries=entries)
+        warnings.warn(note, stacklevel=3)

@@ -26,7 +26,6 @@ from pcfix.errors import (
 )
 from pcfix.flow.surfaces import CloudView, find_surface
 from pcfix.io.cameras import read_cameras, read_tie_points, takes_sensor
-from pcfix.io.cameras.georeference import Georeference, georeference
 from pcfix.io.labels import match_labels
 from pcfix.io.vectors import LAYER_MARK
 from pcfix.label.areas import WaterMask
@@ -41,6 +40,7 @@ if TYPE_CHECKING:
     from pyproj import CRS
 
     from pcfix.adjust.transfer import CloudTransfer, Pair
+    from pcfix.io.cameras.georeference import Georeference
     from pcfix.io.views import ViewList
 
 LOCAL = "local"
@@ -157,6 +157,8 @@ class Inputs(InputOptions):
 
     def _georeferenced(self, read: Cameras, cloud_crs: str | CRS | None) -> Georeference:
         """Return the transformation from the frame of the camera file to the cloud's CRS."""
+        from pcfix.io.cameras.georeference import georeference
+
         return georeference(
             read, cloud_crs, cameras_crs=self.cameras_crs, offset_m=self.cameras_offset,
             name=str(self.cameras),
@@ -232,7 +234,14 @@ def both_models(inputs: Inputs) -> tuple[Inputs, Inputs]:
     CRS and offset of the cameras are for the file that does not have its own place, or for both if
     both have one. If neither has, the offset is for that with which the two agree best.
     """
-    _refuse_adjusted_tracks(inputs)
+    given = (inputs.views, inputs.cameras, inputs.adjusted_from)
+    listed, path, old = (None if isinstance(one, Cameras) else one for one in given)
+    if listed is not None and path is not None and Path(listed) == Path(path) != Path(old or ""):
+        words = (
+            f"--views: the tie points of {path} are adjusted ones, not those of the cloud. Give"
+            " the model of --adjusted-from, or the view list of the cloud."
+        )
+        raise SettingError("views.adjusted", words, path=path)
     source = inputs.cameras if inputs.adjusted_from is None else inputs.adjusted_from
     both = [
         replace(inputs, cameras=source, adjusted_from=None),
@@ -262,20 +271,6 @@ def both_models(inputs: Inputs) -> tuple[Inputs, Inputs]:
 def _without(both: list[Inputs], kept: Sequence[bool], **changes: Any) -> list[Inputs]:
     """Return the inputs, changed where they are not kept."""
     return [one if keep else replace(one, **changes) for one, keep in zip(both, kept, strict=True)]
-
-
-def _refuse_adjusted_tracks(inputs: Inputs) -> None:
-    """Refuse the tracks of the adjusted model as views of the cloud."""
-    given = (inputs.views, inputs.cameras, inputs.adjusted_from)
-    views, cameras, original = (None if isinstance(one, Cameras) else one for one in given)
-    if views is None or cameras is None or Path(views) != Path(cameras):
-        return
-    if original is None or Path(original) != Path(cameras):
-        words = (
-            f"--views: the tie points of {cameras} are adjusted ones, not those of the cloud. Give"
-            " the model of --adjusted-from, or the view list of the cloud."
-        )
-        raise SettingError("views.adjusted", words, path=cameras)
 
 
 def original_ties(

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 class Findings(NamedTuple):
     """What the checks of a whole cloud found."""
 
-    plausible: Plausible = Plausible()
+    plausible: Plausible | None = None
     poses: Poses | None = None
     shoreline: dict[str, Any] | None = None
     water_notes: tuple[str, ...] = ()
@@ -63,13 +63,9 @@ def check(plan: Plan, tally: CloudTally) -> Findings:
         )
     flat = int(figures.outcomes[Outcome.FLAT_RAYS])
     if figures.outcomes[Outcome.NO_CAMERA] + flat == figures.submerged:
-        from pcfix.io.cameras.mistakes import likely_mistake
-
-        block = plan.cameras.centres, figures.low, figures.high, plan.view.crs
-        mistake = (None if flat else likely_mistake(*block)) or ""
         raise GeometryError(
             "cameras.max_angle" if flat else "cameras.no_overlap",
-            f"{name}: {_out_of_sight(plan, figures)} {mistake}".strip(),
+            f"{name}: {_out_of_sight(plan, figures, flat)}",
             submerged=figures.submerged,
             flat=flat,
         )
@@ -99,25 +95,29 @@ def _view_report(plan: Plan, tally: CloudTally) -> ViewReport | None:
     return replace(tally.views, notes=plan.match.report.notes)
 
 
-def _out_of_sight(plan: Plan, figures: Tally) -> str:
+def _out_of_sight(plan: Plan, figures: Tally, flat: int) -> str:
     """Return the sentence for a cloud of which no camera sees a submerged point."""
-    if plan.inputs.port is not None:
-        return "no camera has a point in sight. Check that cameras and cloud have the same CRS."
-    limit, flat = plan.survey.settings.limit_deg, figures.outcomes[Outcome.FLAT_RAYS]
+    limit = plan.survey.settings.limit_deg
     if flat:
         return (
             f"no submerged point has two rays within {limit or 90.0:g} deg of the surface"
             f" normal; {flat:,} points have rays at larger angles. Increase --max-angle."
         )
-    middle = (figures.low + figures.high) / 2.0
-    distance = float(np.hypot(*(plan.cameras.centres - middle)[:, :2].T).min())
-    away = f"{distance / 1000.0:,.1f} km" if distance >= 10_000.0 else f"{distance:,.1f} m"
-    within = f" within {limit:g} degrees" if limit else ""
-    return (
-        f"no camera has a submerged point in sight{within}; the nearest is {away} in plan from"
-        f" the middle of the {figures.submerged:,} submerged points. Check that cameras and cloud"
-        " have the same CRS, and that pitch 0 is straight down."
-    )
+    from pcfix.io.cameras.mistakes import likely_mistake
+
+    sentence = "no camera has a point in sight. Check that cameras and cloud have the same CRS."
+    if plan.inputs.port is None:
+        middle = (figures.low + figures.high) / 2.0
+        distance = float(np.hypot(*(plan.cameras.centres - middle)[:, :2].T).min())
+        away = f"{distance / 1000.0:,.1f} km" if distance >= 10_000.0 else f"{distance:,.1f} m"
+        within = f" within {limit:g} degrees" if limit else ""
+        sentence = (
+            f"no camera has a submerged point in sight{within}; the nearest is {away} in plan from"
+            f" the middle of the {figures.submerged:,} submerged points. Check that cameras and"
+            " cloud have the same CRS, and that pitch 0 is straight down."
+        )
+    mistake = likely_mistake(plan.cameras.centres, figures.low, figures.high, plan.view.crs)
+    return f"{sentence} {mistake or ''}".strip()
 
 
 def check_fit(plan: Plan, tally: CloudTally, ties: TiePoints | None = None) -> Plausible:
@@ -158,12 +158,22 @@ def _detected(plan: Plan, tally: CloudTally) -> list[PcfixWarning]:
 
         least = LEAST_BEYOND if plan.inputs.regression is None else 0.0
         beyond = tally.beyond.notes(line, least)
+    corrected, rays = tally.figures.corrected, list[PcfixWarning]()
+    if plan.inputs.port is not None and plan.survey.settings.method == "snell" and corrected:
+        mean = tally.port_miss_m / corrected
+        sentence = (
+            "The refracted rays of the apparent points miss each other behind the port by"
+            f" {mean:.3f} m on average. --method consistent takes this into account, best with"
+            " --views."
+        )
+        rays.append(PcfixWarning("port.ray_distance", sentence, mean_m=mean))
     unlisted = []
     if UNLISTED in plan.survey.parts:
         so = " ".join(map(str, plan.of_unlisted))
         unlisted = [f"Points in no view list are corrected as without a list. {so}"]
     return [
         *plan.notes,
+        *rays,
         *coded("regression.range", beyond),
         *coded("cloud.reconstruction", verdicts.values()),
         *coded("views.unlisted", unlisted),
@@ -181,13 +191,30 @@ def summarize(plan: Plan, tally: CloudTally, findings: Findings, ends: Ends) -> 
     unused = list(compress(plan.cameras.labels, np.logical_not(figures.camera_used)))
     uncorrected = figures.uncorrected()
     not_moved = sum(uncorrected.values()) + int(figures.outcomes[Outcome.NOT_CARRIED])
-    medium = _figures_of_port if plan.inputs.port is not None else _figures_of_water
-    of_medium, own_notes = medium(plan, tally, findings)
+    poses, transfer, moved = findings.poses, plan.transfer, plan.survey.level_offset_m
+    made, detected, water = plan.made, _detected(plan, tally), str(plan.found.surface)
+    depth, left_out = figures.depth_m(), dict[str, list[str]]()
+    uncertainty, by_poses = figures.uncertainty(made), plan.survey.learned.poses
+    if plan.inputs.port is not None:  # no depths, and no orders by depth
+        depth, uncertainty, water = {}, None, f"all around, seen through a {plan.inputs.port}"
+    else:
+        left_out = _left_out(plan, figures)
+    if uncertainty is not None and by_poses is not None:
+        uncertainty["poses_m"] = round(by_poses.middle_m, 4)
+    if moved is not None:
+        times = f"{moved.min():+.3f} to {moved.max():+.3f} m at the times of the images"
+        water = f"{water}, {times}"
+    of_poses = [None if poses is None else poses.warning, plan.no_poses]
     notes = [
         *plan.cameras.notes,
         *([] if report is None else report.warnings()),
         *coded("cloud.labels", plan.labelling.notes),
-        *own_notes,
+        *(() if findings.plausible is None else findings.plausible.doubts),
+        *detected,
+        *coded("water.surface", plan.found.notes),
+        *coded("water.images", plan.own_notes),
+        *coded("water.extent", findings.water_notes),
+        *coded("cameras.poses", filter(None, of_poses)),
     ]
     return Summary(
         input=ends.input,
@@ -200,60 +227,30 @@ def summarize(plan: Plan, tally: CloudTally, findings: Findings, ends: Ends) -> 
         dropped=not_moved if options.uncorrected == "drop" else 0,
         water_unknown=figures.water_unknown,
         unsure=figures.unsure if options.unsure == "withhold" else None,
+        depth_m=depth,
         shift_z_m=figures.shift_z_m(),
         rays=figures.rays,
         incidence_deg=round(figures.incidence_deg, 2),
         cameras=len(plan.cameras),
         cameras_used=len(plan.cameras) - len(unused),
         cameras_unused=unused,
+        cameras_left_out=left_out,
         seconds=round(ends.seconds, 3),
         views=None if report is None else report.as_dict(),
         warnings=[one.as_dict() for one in notes],
         labelling=plan.labelling.report(tally.labels),
         settings={**options.part(ScienceOptions).as_dict(), **plan.settings},
         part=None if ends.source is None else part_report(ends.source),
-        **of_medium,
+        water=water,
+        water_fit=plan.found.as_dict(),
+        uncertainty=uncertainty,
+        carried=transfer.as_dict(tally.transfer) if transfer and tally.transfer else None,
+        made=made,
+        told=[one for one in map(str, detected) if made is None or one not in made["because"]],
+        poses=None if poses is None else poses.as_dict(),
+        shoreline=findings.shoreline,
+        fit=None if findings.plausible is None else findings.plausible.as_dict(),
     )
-
-
-def _figures_of_water(
-    plan: Plan, tally: CloudTally, findings: Findings
-) -> tuple[dict[str, Any], list[Any]]:
-    """Return the part of a summary about depths, water and cameras, and its notes."""
-    moved, water, made = plan.survey.level_offset_m, str(plan.found.surface), plan.made
-    tested, poses = findings.plausible, findings.poses
-    uncertainty, by_poses = tally.figures.uncertainty(made), plan.survey.learned.poses
-    if uncertainty is not None and by_poses is not None:
-        uncertainty["poses_m"] = round(by_poses.middle_m, 4)
-    detected = _detected(plan, tally)
-    if moved is not None:
-        times = f"{moved.min():+.3f} to {moved.max():+.3f} m at the times of the images"
-        water = f"{water}, {times}"
-    carried = None
-    if plan.transfer is not None and tally.transfer is not None:
-        carried = plan.transfer.as_dict(tally.transfer)
-    figures = {
-        "depth_m": tally.figures.depth_m(),
-        "water": water,
-        "water_fit": plan.found.as_dict(),
-        "uncertainty": uncertainty,
-        "carried": carried,
-        "made": made,
-        "told": [one for one in map(str, detected) if made is None or one not in made["because"]],
-        "poses": None if poses is None else poses.as_dict(),
-        "shoreline": findings.shoreline,
-        "fit": tested.as_dict(),
-        "cameras_left_out": _left_out(plan, tally.figures),
-    }
-    of_poses = [poses.warning if poses else None, plan.no_poses]
-    return figures, [
-        *tested.doubts,
-        *detected,
-        *coded("water.surface", plan.found.notes),
-        *coded("water.images", plan.own_notes),
-        *coded("water.extent", findings.water_notes),
-        *coded("cameras.poses", filter(None, of_poses)),
-    ]
 
 
 def _left_out(plan: Plan, figures: Tally) -> dict[str, list[str]]:
@@ -272,26 +269,3 @@ def _left_out(plan: Plan, figures: Tally) -> dict[str, list[str]]:
     return {
         why: list(compress(cameras.labels, rows)) for why, rows in reasons.items() if rows.any()
     }
-
-
-def _figures_of_port(
-    plan: Plan, tally: CloudTally, findings: Findings
-) -> tuple[dict[str, Any], list[Any]]:
-    """Return the part of a summary about a port: no depths, and no orders by depth."""
-    notes, corrected = list[PcfixWarning](), tally.figures.corrected
-    if plan.survey.settings.method == "snell" and corrected:
-        mean = tally.port_miss_m / corrected
-        sentence = (
-            "The refracted rays of the apparent points miss each other behind the port by"
-            f" {mean:.3f} m on average. --method consistent takes this into account, best with"
-            " --views."
-        )
-        notes.append(PcfixWarning("port.ray_distance", sentence, mean_m=mean))
-    figures: dict[str, Any] = {
-        "depth_m": {},
-        "water": f"all around, seen through a {plan.inputs.port}",
-        "water_fit": None,
-        "uncertainty": None,
-        "told": list(map(str, notes)),
-    }
-    return figures, notes

@@ -23,7 +23,7 @@ from pcfix.flow.inputs import (
     read_blocks,
 )
 from pcfix.flow.surfaces import CloudView, Points, first_points, own_water_of, parts_of
-from pcfix.model import NOISE_CLASSES, Cameras, FloatArray, TiePoints, Views, WaterPlane
+from pcfix.model import NOISE_CLASSES, FloatArray, Views, WaterPlane
 from pcfix.options.correct import CorrectOptions, ScienceOptions
 from pcfix.refract.batch import FLAT_DEG, UNLISTED, Batch, Learned, Survey, stacked
 from pcfix.refract.learning import (
@@ -57,8 +57,8 @@ if TYPE_CHECKING:
 
 FLAT_SHARE, FLAT_SAMPLE = 0.01, 20_000
 """Share of the submerged points above which it is noted, and size of the sample for it."""
-FLYING_HEIGHT_M = 100.0
-"""If the water below the cameras is unknown, for the width of squares."""
+HEIGHT_M = 100.0
+"""Flying height if the water below the cameras is unknown, for the width of squares."""
 BED_POINTS_A_M2 = 5.0
 FEWEST_BED_POINTS, MOST_BED_POINTS = 125_000, 1_000_000
 """Size of the sample of the cloud that the bed of the surroundings is estimated from."""
@@ -85,7 +85,17 @@ def read_inputs(options: CorrectOptions, view: CloudView) -> Plan:
 
         match = ViewMatch(blocks.views, blocks.listed, points=view.points, step_m=view.step_m)
     if inputs.port is not None:
-        survey, port = _behind_port(blocks.cameras, options), {"port": asdict(inputs.port)}
+        cameras, settings = blocks.cameras, options
+        if cameras.rotations is None:
+            raise SettingError(
+                "cameras.no_angles",
+                "port: it is fixed to the camera, and these cameras have no angles. Give a camera"
+                " file with angles.",
+            )
+        if options.method == "auto":
+            known = cameras.lenses is not None
+            settings = replace(options, method="consistent" if known else "snell")
+        survey, port = Survey(WaterPlane(np.inf), cameras, settings), {"port": asdict(inputs.port)}
         found = FoundSurface(survey.water)
         return Plan(options, inputs, view, survey, found, labelling_of(options, view), match,
                     kind_of(match), settings=port)  # fmt: skip
@@ -160,21 +170,6 @@ def _check_port(options: CorrectOptions) -> None:
             " Leave it out; the methods are snell and consistent.",
             option=name,
         )
-
-
-def _behind_port(cameras: Cameras, options: CorrectOptions) -> Survey:
-    """Return the survey of a cloud that was taken under water."""
-    if cameras.rotations is None:
-        raise SettingError(
-            "cameras.no_angles",
-            "port: it is fixed to the camera, and these cameras have no angles. Give a camera"
-            " file with angles.",
-        )
-    settings: ScienceOptions = options
-    if settings.method == "auto":
-        known = cameras.lenses is not None
-        settings = replace(settings, method="consistent" if known else "snell")
-    return Survey(WaterPlane(np.inf), cameras, settings)
 
 
 def plan_correction(plan: Plan) -> Plan:
@@ -255,7 +250,13 @@ def _learn_of_cloud(plan: Plan, chunks: Chunks) -> Plan:
     notes = [*plan.notes, *coded("cloud.depth_factor", [] if factor is None else [factor])]
     if factor is not None:
         survey, given = sample.survey, replace(given, depth_factor=factor.factor)
-    notes += _note_corrected(sample, ties)
+    ratio = None if ties is None else depth_ratio(submerged_of(sample), ties)
+    if ratio is not None and ratio > CORRECTED_RATIO:
+        sentence = (
+            f"The cloud is {ratio:.2f} times as deep as the tie points of its cameras, as if it"
+            " had been corrected before. Give the cloud as the matcher wrote it."
+        )
+        notes.append(PcfixWarning("cloud.corrected_before", sentence, ratio=ratio))
     hint = hint_of((view.software, plan.cameras.source))
     if views is None:
         survey, verdicts = learn_of_sample(sample, view.points, ties, hint, near)
@@ -268,18 +269,6 @@ def _learn_of_cloud(plan: Plan, chunks: Chunks) -> Plan:
         unlisted, of_unlisted = learn_of_unlisted(bare, view.points, ties, hint, near)
         survey = replace(survey, parts={UNLISTED: unlisted})
     return replace(plan, survey=survey, of_unlisted=of_unlisted, notes=tuple(notes))
-
-
-def _note_corrected(sample: Batch, ties: TiePoints | None) -> list[PcfixWarning]:
-    """Note a cloud that is deeper than the tie points of its cameras."""
-    ratio = None if ties is None else depth_ratio(submerged_of(sample), ties)
-    if ratio is None or ratio <= CORRECTED_RATIO:
-        return []
-    sentence = (
-        f"The cloud is {ratio:.2f} times as deep as the tie points of its cameras, as if it"
-        " had been corrected before. Give the cloud as the matcher wrote it."
-    )
-    return [PcfixWarning("cloud.corrected_before", sentence, ratio=ratio)]
 
 
 def _note_flat(sample: Batch, survey: Survey) -> list[PcfixWarning]:
@@ -327,7 +316,13 @@ def _sample(plan: Plan, chunks: Chunks) -> tuple[Batch, Near | None]:
     dense = dense if np.isfinite(dense) else MOST_BED_POINTS  # unknown bounds
     step = max(1, view.points // int(np.clip(dense, FEWEST_BED_POINTS, MOST_BED_POINTS)))
     near_step = max(1, view.points // int(max(dense, FEWEST_BED_POINTS)))
-    squares = Squares(PATCH_WIDTH * _flying_height_m(survey)) if near_step < step else None
+    squares = None
+    if near_step < step:
+        centres = survey.cameras.centres
+        unknown = np.full(len(centres), np.nan)
+        above = centres[:, 2] - surface_above(survey.water, centres, unknown).height_m
+        above = above[above > 0.0]
+        squares = Squares(PATCH_WIDTH * (float(np.median(above)) if len(above) else HEIGHT_M))
 
     def every(step: int, row: int, points: Points) -> Batch:
         rows = np.arange(-row % step, len(points.xyz), step)
@@ -341,12 +336,3 @@ def _sample(plan: Plan, chunks: Chunks) -> tuple[Batch, Near | None]:
             squares.add(submerged_of(every(near_step, row, points)))
         row += len(points.xyz)
     return stacked(taken), None if squares is None else Near(squares.all(), near_step)
-
-
-def _flying_height_m(survey: Survey) -> float:
-    """Return the median height of the cameras above the water below them."""
-    centres = survey.cameras.centres
-    unknown = np.full(len(centres), np.nan)
-    above = centres[:, 2] - surface_above(survey.water, centres, unknown).height_m
-    above = above[above > 0.0]
-    return float(np.median(above)) if len(above) else FLYING_HEIGHT_M

@@ -14,7 +14,6 @@ import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.flow.surfaces import Points
-from pcfix.io.cameras.georeference import adjusted_minus_gnss
 from pcfix.lens.frames import cameras_in_sight
 from pcfix.lens.imaging import project
 from pcfix.model import BoolArray, Cameras, FloatArray, TiePoints
@@ -38,6 +37,14 @@ SHIFTS, SHIFTED_POINTS = (0.1, 0.2, 0.4, 0.8), 500
 """Of the flying height, and the points that are tested with shifted cameras."""
 MOST_PER_PIXEL, AROUND = 10.0, 8
 """Points of a cloud for each pixel of an image; matchers make one at most, or a few."""
+
+
+class Result(NamedTuple):
+    """The result of one test: what fits, what does not, or what could not be tested."""
+
+    fit: str = ""
+    doubt: PcfixWarning | None = None
+    unchecked: str = ""
 
 
 class Plausible(NamedTuple):
@@ -379,18 +386,12 @@ TAKE_OFF_M, MOST_SHARE = (-15.0, 25.0), 0.1
 """How high above the water drones take off, and the share of their height that barometers err."""
 
 
-class Result(NamedTuple):
-    """The result of one test: what fits, what does not, or what could not be tested."""
-
-    fit: str = ""
-    doubt: PcfixWarning | None = None
-    unchecked: str = ""
-
-
 def positions(cameras: Cameras, name: str) -> Result:
     """Compare the places of cameras with those that their GNSS recorded."""
     if cameras.gnss is None:
         return Result()
+    from pcfix.io.cameras.georeference import adjusted_minus_gnss
+
     try:
         found = adjusted_minus_gnss(cameras, name).enu_m[:, :2]
     except InputError:
@@ -401,11 +402,12 @@ def positions(cameras: Cameras, name: str) -> Result:
     middle = float(np.median(apart))
     if middle <= MOST_APART_M:
         return Result(f"positions {middle:.1f} m in plan from their GNSS")
-    sentence = (
+    return _doubt(
+        "cameras.gnss",
         f"The cameras are {middle:.4g} m in plan from their GNSS positions (median of"
-        f" {len(apart)}). Check their CRS and offset."
+        f" {len(apart)}). Check their CRS and offset.",
+        off_m=middle,
     )
-    return Result(doubt=PcfixWarning("cameras.gnss", sentence, off_m=middle))
 
 
 def flying_heights(cameras: Cameras, file: File, water_m: float | None) -> Result:
@@ -423,10 +425,11 @@ def flying_heights(cameras: Cameras, file: File, water_m: float | None) -> Resul
     where = f"{abs(off):.0f} m {'above' if off > 0.0 else 'below'} the water"
     if low - least <= off <= high + least:
         return Result(f"heights as recorded in flight, from a take-off {where}")
-    sentence = (
+    return _doubt(
+        "cameras.flying_height",
         f"The cameras are {above:.0f} m above the water, and recorded {flown:.0f} m above their"
         f" take-off (median of {len(rows)}), which would be {where}. Unless it was, check the"
-        " vertical datum and the unit of cameras and water."
+        " vertical datum and the unit of cameras and water.",
+        above_water_m=above,
+        above_take_off_m=flown,
     )
-    values = {"above_water_m": above, "above_take_off_m": flown}
-    return Result(doubt=PcfixWarning("cameras.flying_height", sentence, **values))

@@ -52,7 +52,7 @@ class Points(NamedTuple):
 
     def take(self, rows: IntArray | slice) -> Points:
         """Return some of the points."""
-        some = {
+        some: dict[str, Any] = {
             name: one[rows] for name, one in self._asdict().items() if isinstance(one, np.ndarray)
         }
         if self.colours is not None:
@@ -118,18 +118,22 @@ def file_points(
 
 def first_points(chunks: Iterable[Points]) -> Points:
     """Return the first points of a cloud, as many as a chunk has, without colours."""
-    parts: list[Points] = []
-    count = 0
+    parts, count = list[Points](), 0
     for one in chunks:
-        some = one.take(slice(0, las.CHUNK_POINTS - count))
-        parts.append(some._replace(colours=None))
-        count += len(some.xyz)
+        parts.append(one.take(slice(0, las.CHUNK_POINTS - count)))
+        count += len(parts[-1].xyz)
         if count >= las.CHUNK_POINTS:
             break
-    joined: list[Any] = [
-        None if column[0] is None else np.concatenate(column) for column in zip(*parts, strict=True)
+    return joined_points(parts)
+
+
+def joined_points(parts: list[Points]) -> Points:
+    """Return consecutive points as one, without colours."""
+    columns: list[Any] = [
+        None if column[0] is None else np.concatenate(column)
+        for column in zip(*(one._replace(colours=None) for one in parts), strict=True)
     ]
-    return Points(*joined)
+    return Points(*columns)
 
 
 def points_of(chunk: Chunk, source: LasSource, water: WaterSurface | None) -> Points:
