@@ -198,7 +198,7 @@ def plan_correction(plan: Plan) -> Plan:
         line, notes = regression_of(inputs, view, chunks(), plan.survey)
         survey = replace(plan.survey, learned=plan.survey.learned._replace(regression=line))
         plan = replace(plan, survey=survey, notes=tuple(coded("regression.fit", notes)))
-    plan = _learn_of_cloud(plan, chunks)
+    plan = _estimated_from_cloud(plan, chunks)
     if plan.options.depth_factor == "auto":
         found = {"depth_factor": plan.survey.settings.depth_factor}
         plan = replace(plan, settings={**plan.settings, **found})
@@ -232,7 +232,7 @@ def _with_type_of_list(plan: Plan, first: Points) -> Plan:
     return replace(plan, survey=with_verdict(plan.survey, verdict), kind=kind, verdicts=(verdict,))
 
 
-def _learn_of_cloud(plan: Plan, chunks: Chunks) -> Plan:
+def _estimated_from_cloud(plan: Plan, chunks: Chunks) -> Plan:
     """Resolve every option that is ``auto``, and estimate what the points have in common."""
     survey, view, views = plan.survey, plan.view, plan.views
     given = survey.settings if survey.own_water is not None else plan.options

@@ -117,7 +117,7 @@ def file_points(
 
 
 def first_points(chunks: Iterable[Points]) -> Points:
-    """Return the first points of a cloud, as many as a chunk has, without colours."""
+    """Return the first points of a cloud, as many as a chunk has."""
     parts, count = list[Points](), 0
     for one in chunks:
         parts.append(one.take(slice(0, las.CHUNK_POINTS - count)))
@@ -128,12 +128,16 @@ def first_points(chunks: Iterable[Points]) -> Points:
 
 
 def joined_points(parts: list[Points]) -> Points:
-    """Return consecutive points as one, without colours."""
-    columns: list[Any] = [
-        None if column[0] is None else np.concatenate(column)
-        for column in zip(*(one._replace(colours=None) for one in parts), strict=True)
-    ]
-    return Points(*columns)
+    """Return consecutive points as one, with the attributes that all of them have."""
+    columns = dict[str, Any]()
+    for name, column in zip(Points._fields, zip(*parts, strict=True), strict=True):
+        if any(one is None for one in column):
+            columns[name] = None
+        elif name == "colours":
+            columns[name] = tuple(map(np.concatenate, zip(*column, strict=True)))
+        else:
+            columns[name] = np.concatenate(column)
+    return Points(**columns)
 
 
 def points_of(chunk: Chunk, source: LasSource, water: WaterSurface | None) -> Points:
@@ -273,32 +277,41 @@ def _found(view: CloudView | None) -> FoundSurface:
     if view is None:
         text = "The water surface 'auto' is found in a cloud. Give the cloud too."
         raise SettingError("cloud.missing", text)
-    every, row = max(1, view.points // SAMPLE_POINTS), 0
-    parts = []
+    every, row, parts = max(1, view.points // SAMPLE_POINTS), 0, list[Points]()
     for some in view.chunks():
-        rgb = None if some.colours is None else np.column_stack(some.colours)
-        columns = (some.xyz, rgb, some.classes, some.returns)
-        parts.append([a if a is None else a[-row % every :: every] for a in columns])
+        parts.append(some.take(np.arange(-row % every, len(some.xyz), every)))
         row += len(some.xyz)
-    whole: list[Any] = [
-        None if any(a is None for a in arrays) else np.concatenate(arrays)
-        for arrays in zip(*parts, strict=True)
-    ]
-    xyz, rgb, classes, returns = whole
-    proposal = find_water(xyz, rgb=rgb, classes=classes, number_of_returns=returns)
+    whole = joined_points(parts)
+    rgb = None if whole.colours is None else np.column_stack(whole.colours)
+    proposal = find_water(
+        whole.xyz, rgb=rgb, classes=whole.classes, number_of_returns=whole.returns
+    )
     return FoundSurface(proposal.surface, proposal, proposal.shoreline)
 
 
 def _fitted(options: WaterOptions, path: File, view: CloudView | None) -> FoundSurface:
     """Return the surface fitted to shoreline points."""
-    from pcfix.io.vectors import read_shoreline
-    from pcfix.water.fit import fit_water
+    from pcfix.io.vectors import SHORE_RADIUS_M, read_shoreline
+    from pcfix.water.fit import fit_water, heights_from_cloud, is_near
     from pcfix.water.river import fit_river
 
     shore = read_shoreline(path, None if view is None else view.crs, crs=options.water_crs)
     xyz, notes = shore.xyz, list[Any](shore.notes)
-    if np.isnan(xyz[:, 2]).any():
-        xyz = _with_heights(xyz, shore.name, view, notes)
+    lacking = np.isnan(xyz[:, 2])
+    if lacking.any():  # they get the heights of the cloud
+        if view is None:
+            text = f"{shore.name} has points without a height. Give the cloud too."
+            raise InputError("cloud.missing", text, path=shore.name)
+        places = xyz[lacking, :2]
+        near = [seen.xyz[is_near(places, seen.xyz, SHORE_RADIUS_M)] for seen in view.chunks()]
+        heights = heights_from_cloud(places, np.vstack(near), SHORE_RADIUS_M)
+        notes.append(
+            f"{shore.name}: {int(lacking.sum()):,} points have no height and get that of the cloud"
+            f" within {SHORE_RADIUS_M:g} m; {int(np.isnan(heights).sum()):,} have none and are"
+            " ignored."
+        )
+        xyz = xyz.copy()
+        xyz[lacking, 2] = heights
     found: WaterFit | RiverFit
     if options.water_model == "river":
         corners = (xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0))
@@ -314,26 +327,3 @@ def _fitted(options: WaterOptions, path: File, view: CloudView | None) -> FoundS
             f" {shore.counts.sum():.0f} independent ones."
         )
     return FoundSurface(found.surface, found, xyz, (*map(str, notes), *found.notes))
-
-
-def _with_heights(
-    xyz: FloatArray, name: str, view: CloudView | None, notes: list[Any]
-) -> FloatArray:
-    """Return points with the heights of the cloud where they have none."""
-    from pcfix.io.vectors import SHORE_RADIUS_M
-    from pcfix.water.fit import heights_from_cloud, is_near
-
-    if view is None:
-        text = f"{name} has points without a height. Give the cloud too."
-        raise InputError("cloud.missing", text, path=name)
-    lacking = np.isnan(xyz[:, 2])
-    places = xyz[lacking, :2]
-    near = [seen.xyz[is_near(places, seen.xyz, SHORE_RADIUS_M)] for seen in view.chunks()]
-    heights = heights_from_cloud(places, np.vstack(near), SHORE_RADIUS_M)
-    notes.append(
-        f"{name}: {int(lacking.sum()):,} points have no height and get that of the cloud within"
-        f" {SHORE_RADIUS_M:g} m; {int(np.isnan(heights).sum()):,} have none and are ignored."
-    )
-    filled = xyz.copy()
-    filled[lacking, 2] = heights
-    return filled
