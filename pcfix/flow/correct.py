@@ -63,9 +63,9 @@ def correct_file(
     ----------
     input, output : path
         The names end in ``.las`` or ``.laz``; the output is LAS 1.4, point format 6, 7 or 8 (9
-        or 10 for inputs with waveforms). For many files (a list of paths, or what else
-        `pcfix.io.tiles.tiles_of` takes) the output is a folder, and every point becomes what it
-        would in one file of them all.
+        or 10 for inputs with waveforms). For many files (a list of paths; see
+        `pcfix.io.tiles.tiles_of`) the output is a folder, and every point is corrected as in one
+        file of all points.
     options : CorrectOptions, optional
         Or its attributes as keywords, as of ``pcfix correct``: ``cameras`` (a path or
         `pcfix.Cameras`), ``water`` (what `pcfix.read_water` takes, a `pcfix.WaterSurface`,
@@ -76,12 +76,12 @@ def correct_file(
     Returns
     -------
     Summary
-        Of them all.
+        Of all files.
 
     Raises
     ------
     PcfixError
-        With one sentence on what to mend; no output is left behind.
+        With one sentence on what to change. No output is left behind.
     """
     given = taken(CorrectOptions, options, keywords, "correct_file")
     command = Command("correct", partial(plan_file, given), correct_cloud, check, summarize)

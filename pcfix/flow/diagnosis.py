@@ -1,4 +1,4 @@
-"""Did the poses of a correction absorb the refraction? What is read to find out."""
+"""Find out whether the poses of a correction have absorbed the refraction."""
 
 from __future__ import annotations
 

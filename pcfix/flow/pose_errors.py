@@ -1,7 +1,7 @@
 """Errors of a corrected bed by the errors of an adjustment: a sample is corrected with each member.
 
 The images do not change: the cameras of each member intersect the images of the points again,
-whether the cloud came from the original cameras or from the adjusted ones.
+whether the original or the adjusted cameras made the cloud.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Adjustment(NamedTuple):
 
 
 def adjustment_of(path: File | Cameras, cameras: Cameras) -> tuple[Adjustment | None, str]:
-    """Return the adjustment of cameras, if its file is beside them, and a note."""
+    """Return the adjustment of cameras, if its file is in their folder, and a note."""
     if isinstance(path, Cameras):
         return None, ""
     try:

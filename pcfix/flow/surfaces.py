@@ -68,7 +68,7 @@ SAMPLE_POINTS = 2_000_000
 
 @dataclass(frozen=True)
 class CloudView:
-    """A cloud in one file, in many, or in memory: what is known of it, and all its points."""
+    """A cloud in one file, in many, or in memory: its properties, and all its points."""
 
     name: str  # for messages
     crs: CRS | str | None
