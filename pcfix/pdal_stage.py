@@ -93,9 +93,10 @@ def _run(work: Work, namespace: dict[str, Any], ins: Dimensions, outs: Dimension
 
 
 def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
-    from pcfix.flow.correction import correct_chunk, plan_correction, read_inputs
+    from pcfix.flow.correction import correct_chunk
     from pcfix.flow.inputs import paths_in
     from pcfix.flow.outcome import check, summarize
+    from pcfix.flow.planning import plan_correction, read_inputs
     from pcfix.flow.runner import Ends, check_summary, write_summary
     from pcfix.io.las.columns import columns_for
     from pcfix.kernels import threads

@@ -17,11 +17,10 @@ from pcfix.flow.diagnosis import (
     given_focal_lengths,
     has_datum,
     quick_ties,
-    ties_of,
 )
-from pcfix.flow.inputs import Inputs
+from pcfix.flow.inputs import Inputs, ties_of
 from pcfix.flow.next_steps import adjust_words
-from pcfix.flow.plausibility import Flight, plausible
+from pcfix.flow.plausibility import plausible
 from pcfix.flow.runner import check_summary, write_plot, write_summary
 from pcfix.flow.surfaces import CloudView, file_points, view_of
 from pcfix.io.cameras.georeference import adjusted_minus_gnss
@@ -121,7 +120,7 @@ def check_cameras(
         tilt_deg = float(np.median(tilt)), float(tilt.max())
     gnss, fit = _gnss(cameras, str(path)), None
     if view is not None:
-        flight = Flight(path, level, every=view.points / max(len(xyz), 1))
+        flight = {"file": path, "water_m": level, "every": view.points / max(len(xyz), 1)}
         fit = _fit(cameras, view, xyz, quick_ties(inputs, view.crs), flight)
         up = None if gnss is None or inputs.cameras_crs is None else gnss.mean_m[2]
         if up is not None and abs(up) >= UNDULATION_M[0] and not fit.verdict:
@@ -248,7 +247,11 @@ def _gnss(cameras: Cameras, name: str) -> GnssResiduals | None:
 
 
 def _fit(
-    cameras: Cameras, view: CloudView, xyz: FloatArray, ties: TiePoints | None, flight: Flight
+    cameras: Cameras,
+    view: CloudView,
+    xyz: FloatArray,
+    ties: TiePoints | None,
+    flight: dict[str, Any],
 ) -> Fit:
     """Test cameras against a sample of the cloud."""
     from scipy.spatial import cKDTree
@@ -268,7 +271,7 @@ def _fit(
             f"{below} of {len(cameras)} cameras are below the ground. Check the vertical datum and"
             " the order of the axes."
         )
-    found = plausible(cameras, xyz, ties, flight=flight)
+    found = plausible(cameras, xyz, ties, **flight)
     verdict = verdict or " ".join(map(str, found.doubts))
     return Fit(view.name, len(xyz), shares, float(np.hypot(*apart)), below, verdict, str(found))
 

@@ -1,42 +1,34 @@
-"""Correct a LAS or LAZ cloud, or arrays, for refraction: two doors to one calculation."""
+"""Correct a LAS or LAZ cloud, or arrays, for refraction: two doors to one calculation.
+
+A plan is made for the whole cloud (`pcfix.flow.planning`), each chunk is corrected by it
+(`pcfix.flow.correction`), and the statistics are checked and summarized (`pcfix.flow.outcome`).
+"""
 
 from __future__ import annotations
 
 import warnings
-from dataclasses import fields, replace
+from dataclasses import fields
 from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.adjust.transfer import CloudTransfer
 from pcfix.errors import InputError, PcfixWarning, SettingError
-from pcfix.flow.correction import (
-    CloudTally,
-    Plan,
-    correct_chunk,
-    plan_correction,
-    read_inputs,
-    water_plan,
-)
-from pcfix.flow.inputs import Inputs, paths_in
-from pcfix.flow.old_cameras import paired
-from pcfix.flow.outcome import check, summarize
-from pcfix.flow.plausibility import Flight, plausible
+from pcfix.flow.correction import CloudTally, Plan, correct_chunk
+from pcfix.flow.inputs import CameraInputs, Inputs, paired, paths_in
+from pcfix.flow.outcome import check, check_fit, summarize
+from pcfix.flow.planning import plan_correction, plan_of, read_inputs
 from pcfix.flow.runner import Check, Chunk, Command, FileTask, Progress, stream
 from pcfix.flow.surfaces import CloudView, Points, corners, points_of, view_of
 from pcfix.flow.tiles import run_command
 from pcfix.io.las import columns
 from pcfix.io.las.source import LasSource, centring_steps
 from pcfix.io.las.writing import corrected_header, corrected_identity
-from pcfix.io.regressions import read_regression
 from pcfix.io.tiles import Clouds, Tiles
-from pcfix.io.views import beside
 from pcfix.label.labelling import Labelling
-from pcfix.lens.frames import beside_frames
 from pcfix.model import (
     BATHYMETRIC_POINT,
     NO_CAMERAS,
@@ -48,189 +40,13 @@ from pcfix.model import (
 )
 from pcfix.options.correct import CorrectOptions, LabelRules, PointsOptions, RefractionOptions
 from pcfix.options.declare import File, taken
-from pcfix.refract.learning import check_method, resolved
-from pcfix.refract.regression import DepthRegression, raise_no_regression
 from pcfix.refract.tally import Summary
 from pcfix.water.checks import as_surface, checked_points
 from pcfix.water.index import with_index
 from pcfix.water.surface import FoundSurface
 
-
-def correct_points(
-    xyz: npt.ArrayLike,
-    cameras: Cameras | None,
-    water: WaterSurface | float | npt.ArrayLike,
-    *,
-    options: RefractionOptions | None = None,
-    views: Views | None = None,
-    may_be_submerged: npt.ArrayLike | None = None,
-    level_offset_m: npt.ArrayLike | None = None,
-    adjusted_from: Cameras | None = None,
-    regression: DepthRegression | File | None = None,
-    **keywords: Any,
-) -> Correction:
-    """Correct apparent points for refraction at the water surface.
-
-    Parameters
-    ----------
-    xyz : array, shape (n, 3)
-        Points as the SfM software placed them, metres, world frame. Those below the water
-        surface are moved, the others come back bit for bit.
-    cameras : Cameras or None
-        Poses in the same frame; see `pcfix.read_cameras`. The methods factor and regression do
-        without: then no point has rays, an incidence or, with factor, a standard error.
-    water : WaterSurface, float, or array of shape (n,)
-        The water surface (see `pcfix.read_water`), its level in metres, or its height above
-        each point, NaN where it is not known.
-    options : RefractionOptions, optional
-        Or its attributes as keywords, as of ``pcfix correct``: index, method, max_angle (degrees
-        from the surface normal), max_cameras, camera_set, matcher, depth_factor, unsure (with
-        ``"withhold"`` the result says which are), sigma_image and the other standard errors;
-        `xyz` is taken for the whole cloud, so with a part of one set ``occlusion="off"``. With
-        water_per_image, rasters in the frame of the points, what is submerged, and how deep, goes
-        by `water`.
-    views : Views, optional
-        Which cameras made each point, rows of `adjusted_from` where that is given, else of
-        `cameras`. Default: as the option `camera_set` says.
-    may_be_submerged : array of bool, shape (n,), optional
-        The other points are land, even below the surface; `pcfix.label_points` finds them.
-        Default: all.
-    level_offset_m : array, shape (k,), optional
-        How much higher than `water` the surface stood when each camera took its image, as
-        `pcfix.io.tides.level_offsets` finds it. Each ray bends at its own surface; which points
-        are submerged, and how deep, goes by `water`. Default: zero.
-    adjusted_from : Cameras, optional
-        Those that the points were made with, in the same frame, where `cameras` are the same
-        images (matched by their labels) adjusted since. All points, land too, are first taken
-        from those to these; see `pcfix.adjust.transfer`.
-    regression : DepthRegression or path, optional
-        With the method regression: see `pcfix.refract.regression`, or the file of a line.
-
-    Returns
-    -------
-    Correction
-        One row per input point, in the same order.
-
-    Raises
-    ------
-    SettingError
-        If an argument is outside its rule, or a coordinate is not finite.
-    GeometryError
-        If a camera stands under the water.
-
-    Notes
-    -----
-    With the method snell, for each camera the line from the projection centre to the apparent
-    point is bent where it pierces the surface (Snell in vector form, Skarlatos & Agrafiotis
-    2018, eq 10); the true point is the one nearest to all bent rays in the sense of least squares
-    (eq 11, for any number of rays). Nothing is iterated and no sum depends on the number of
-    threads.
-
-    Examples
-    --------
-    Two cameras 100 m above a bed that looks 2 m deep:
-
-    >>> import numpy as np, pcfix
-    >>> cameras = pcfix.Cameras(("a", "b"), np.array([[-20.0, 0, 100], [20.0, 0, 100]]))
-    >>> result = pcfix.correct_points([[0.0, 0.0, -2.0]], cameras, 0.0)
-    >>> result.xyz.round(3).tolist()
-    [[0.0, 0.0, -2.703]]
-    """
-    given = taken(PointsOptions, options, keywords, "correct_points")
-    all_options = CorrectOptions(**{one.name: getattr(given, one.name) for one in fields(given)})
-    if not cameras:
-        all_options.check_no_cameras()
-        if not (views is None and level_offset_m is None and adjusted_from is None):
-            raise SettingError(
-                "option.needs",
-                "views, level_offset_m and adjusted_from have no effect without cameras. Give both,"
-                " or neither.",
-                needs="cameras",
-            )
-    cameras = cameras or NO_CAMERAS
-    xyz = checked_points(xyz)
-    surface, heights = as_surface(water, len(xyz))
-    offset = None if level_offset_m is None else _offsets(level_offset_m, len(cameras))
-    if views is not None:
-        _check_views(views, xyz, adjusted_from or cameras)
-    points = Points(xyz, heights, _classes(may_be_submerged, len(xyz)))
-    low, high = corners(xyz[:, 0], xyz[:, 1])
-    view = CloudView("xyz", None, low, high, len(xyz), lambda water=None: iter([points]))
-    inputs = Inputs(cameras=cameras, water=surface)
-    found = FoundSurface(surface)
-    plan = water_plan(with_index(all_options), inputs, view, cameras, found, views, offset)
-    check_method(resolved(plan.survey.settings, cameras, plan.kind), cameras)
-    transfer = None if adjusted_from is None else CloudTransfer(paired(adjusted_from, cameras))
-    line = read_regression(regression) if isinstance(regression, str | PathLike) else regression
-    if plan.survey.settings.method == "regression" and line is None:
-        raise_no_regression()
-    only = LabelRules(respect_classes=(NOT_SUBMERGED,))
-    plan = replace(plan, transfer=transfer, labelling=Labelling(only))
-    plan = plan_correction(plan, line)
-    correction, tally = correct_chunk(plan, points, 0, covariances=True)
-    # refuse or warn of what does not fit together, as for a file
-    if tally.water is not None and tally.sample is not None:
-        tally.water.check_reach("xyz", surface, deep=given.deep)
-        sample = tally.sample
-        flight = Flight(water_m=sample.water_m, every=sample.every)
-        plausible(cameras, sample.xyz, None, sample.level_doubts(), flight).warn()
-    notes: list[str] = [*plan.own_notes]
-    if line is not None and line is not regression and tally.beyond is not None:
-        notes += [*line.notes, *tally.beyond.notes(line)]
-    for note in notes:
-        warnings.warn(PcfixWarning("points.note", note), stacklevel=2)
-    return correction
-
-
-NOT_SUBMERGED = 255
-"""The class of points that may not be submerged, for the rules of a labelling."""
-
-
-def _offsets(level_offset_m: npt.ArrayLike, k: int) -> FloatArray:
-    offset = np.ascontiguousarray(level_offset_m, dtype=np.float64)
-    if offset.shape != (k,) or not np.isfinite(offset).all():
-        raise SettingError(
-            "array.shape",
-            f"level_offset_m must be {k} finite numbers, one per camera, not of shape"
-            f" {offset.shape}.",
-        )
-    return offset
-
-
-def _classes(may_be_submerged: npt.ArrayLike | None, n: int) -> npt.NDArray[np.uint8]:
-    """Return the classes of points, of which some may not be submerged."""
-    classes = np.zeros(n, np.uint8)
-    if may_be_submerged is not None:
-        allowed = np.asarray(may_be_submerged)
-        if allowed.shape != (n,) or allowed.dtype != np.bool_:
-            raise SettingError(
-                "array.shape",
-                f"may_be_submerged must be {n} booleans, not {allowed.dtype} of shape"
-                f" {allowed.shape}.",
-            )
-        classes[~allowed] = NOT_SUBMERGED
-    return classes
-
-
-def _check_views(views: Views, points: FloatArray, cameras: Cameras) -> None:
-    """Refuse views that are no table of these points, and warn of points outside their images."""
-    n, start, camera = len(points), views.start, views.camera
-    is_table = len(start) == n + 1 and start[0] == 0 and start[-1] == len(camera)
-    if not is_table or (np.diff(start) < 0).any():
-        raise SettingError(
-            "views.table",
-            f"views must have {n + 1} starts that do not decrease, from 0 to the number of"
-            " entries.",
-        )
-    if len(camera) and not 0 <= camera.min() <= camera.max() < len(cameras):
-        raise SettingError(
-            "views.camera", f"views name camera {camera.max()}, but there are {len(cameras)}."
-        )
-    counts = beside_frames(points, views, cameras)
-    if counts.any():
-        entries, outside = int(counts.sum()), int(np.count_nonzero(counts))
-        note = PcfixWarning("views.outside", f"views: {beside(entries, outside)}", entries=entries)
-        warnings.warn(note, stacklevel=3)
+if TYPE_CHECKING:
+    from pcfix.refract.regression import DepthRegression
 
 
 def correct_file(
@@ -247,9 +63,9 @@ def correct_file(
     ----------
     input, output : path
         The names end in ``.las`` or ``.laz``; the output is LAS 1.4, point format 6, 7 or 8 (9
-        or 10 for inputs with waveforms). For many files (a list of paths, or what else
-        `pcfix.io.tiles.tiles_of` takes) the output is a folder, and every point becomes what it
-        would in one file of them all.
+        or 10 for inputs with waveforms). For many files (a list of paths; see
+        `pcfix.io.tiles.tiles_of`) the output is a folder, and every point is corrected as in one
+        file of all points.
     options : CorrectOptions, optional
         Or its attributes as keywords, as of ``pcfix correct``: ``cameras`` (a path or
         `pcfix.Cameras`), ``water`` (what `pcfix.read_water` takes, a `pcfix.WaterSurface`,
@@ -260,12 +76,12 @@ def correct_file(
     Returns
     -------
     Summary
-        Of them all.
+        Of all files.
 
     Raises
     ------
     PcfixError
-        With one sentence on what to mend; no output is left behind.
+        With one sentence on what to change. No output is left behind.
     """
     given = taken(CorrectOptions, options, keywords, "correct_file")
     command = Command("correct", partial(plan_file, given), correct_cloud, check, summarize)
@@ -341,3 +157,171 @@ class Correcting:
             some["withheld"][:] = flagged.astype(np.uint8)
         drops = self._plan.options.uncorrected == "drop"
         return new[~correction.uncorrected] if drops else new
+
+
+def correct_points(
+    xyz: npt.ArrayLike,
+    cameras: Cameras | None,
+    water: WaterSurface | float | npt.ArrayLike,
+    *,
+    options: RefractionOptions | None = None,
+    views: Views | None = None,
+    may_be_submerged: npt.ArrayLike | None = None,
+    level_offset_m: npt.ArrayLike | None = None,
+    adjusted_from: Cameras | None = None,
+    regression: DepthRegression | File | None = None,
+    **keywords: Any,
+) -> Correction:
+    """Correct apparent points for refraction at the water surface.
+
+    Parameters
+    ----------
+    xyz : array, shape (n, 3)
+        Apparent points, metres, world frame: the whole cloud, else set ``occlusion="off"``. Points
+        above the water surface are returned bit for bit.
+    cameras : Cameras or None
+        Poses in the same frame; see `pcfix.read_cameras`. The methods factor and regression need
+        none.
+    water : WaterSurface, float, or array of shape (n,)
+        The water surface (see `pcfix.read_water`), its level in metres, or its height above
+        each point, NaN where it is unknown.
+    options : RefractionOptions, optional
+        Or its attributes as keywords, as of ``pcfix correct``: index, method, max_angle (degrees
+        from the surface normal), max_cameras, camera_set, matcher, depth_factor, unsure (with
+        ``"withhold"`` the result has a flag), sigma_image and the other standard deviations. With
+        water_per_image, `water` still decides which points are submerged, and how deep.
+    views : Views, optional
+        The view list: the images that contributed to each point, as rows of `adjusted_from` if it
+        is given, else of `cameras`. Default: as the option `camera_set` says.
+    may_be_submerged : array of bool, shape (n,), optional
+        The other points are land, even below the surface; `pcfix.label_points` finds them.
+        Default: all.
+    level_offset_m : array, shape (k,), optional
+        Height of the water above `water` when each image was taken; see
+        `pcfix.io.tides.level_offsets`. Each ray is refracted at its own surface; `water` decides
+        which points are submerged, and how deep. Default: zero.
+    adjusted_from : Cameras, optional
+        The original cameras, in the same frame, if `cameras` are the same images (matched by their
+        labels) after an adjustment. All points are first transferred to the adjusted cameras; see
+        `pcfix.adjust.transfer`.
+    regression : DepthRegression or path, optional
+        For the method regression: see `pcfix.refract.regression`, or the file of a line.
+
+    Returns
+    -------
+    Correction
+        One row per input point, in the same order.
+
+    Raises
+    ------
+    SettingError
+        If an argument is outside its range, or a coordinate is not finite.
+    GeometryError
+        If a camera is below the water.
+
+    Examples
+    --------
+    Two cameras 100 m above a bed that looks 2 m deep:
+
+    >>> import numpy as np, pcfix
+    >>> cameras = pcfix.Cameras(("a", "b"), np.array([[-20.0, 0, 100], [20.0, 0, 100]]))
+    >>> result = pcfix.correct_points([[0.0, 0.0, -2.0]], cameras, 0.0)
+    >>> result.xyz.round(3).tolist()
+    [[0.0, 0.0, -2.703]]
+    """
+    given = taken(PointsOptions, options, keywords, "correct_points")
+    all_options = CorrectOptions(**{one.name: getattr(given, one.name) for one in fields(given)})
+    if not cameras:
+        all_options.check_no_cameras()
+        if not (views is None and level_offset_m is None and adjusted_from is None):
+            raise SettingError(
+                "option.needs",
+                "views, level_offset_m and adjusted_from have no effect without cameras. Give both,"
+                " or neither.",
+                needs="cameras",
+            )
+    cameras = cameras or NO_CAMERAS
+    xyz = checked_points(xyz)
+    surface, heights = as_surface(water, len(xyz))
+    offset: FloatArray | None = None
+    if level_offset_m is not None:
+        offset = np.ascontiguousarray(level_offset_m, dtype=np.float64)
+        if offset.shape != (len(cameras),) or not np.isfinite(offset).all():
+            raise SettingError(
+                "array.shape",
+                f"level_offset_m must be {len(cameras)} finite numbers, one per camera, not of"
+                f" shape {offset.shape}.",
+            )
+    original = cameras if adjusted_from is None else adjusted_from
+    if views is not None:
+        _check_views(views, xyz, original)
+    classes = np.zeros(len(xyz), np.uint8)
+    if may_be_submerged is not None:
+        allowed = np.asarray(may_be_submerged)
+        if allowed.shape != classes.shape or allowed.dtype != np.bool_:
+            raise SettingError(
+                "array.shape",
+                f"may_be_submerged must be {len(xyz)} booleans, not {allowed.dtype} of shape"
+                f" {allowed.shape}.",
+            )
+        classes[~allowed] = NOT_SUBMERGED
+    points = Points(xyz, heights, classes)
+    view = CloudView(
+        "xyz", None, *corners(*xyz[:, :2].T), len(xyz), lambda water=None: iter([points])
+    )
+    pair = None if adjusted_from is None else paired(adjusted_from, cameras)
+    line, notes = regression, list[str]()
+    if isinstance(line, str | PathLike):
+        from pcfix.io.regressions import read_regression
+
+        line = read_regression(line)
+        notes = list(line.notes)
+    plan = plan_of(
+        with_index(all_options),
+        Inputs(cameras=cameras, water=surface),
+        view,
+        CameraInputs(cameras, None, original, pair),
+        FoundSurface(surface),
+        views,
+        offset,
+        Labelling(LabelRules(respect_classes=(NOT_SUBMERGED,))),
+        line,
+    )
+    plan = plan_correction(plan)
+    correction, tally = correct_chunk(plan, points, 0, covariances=True)
+    if tally.water is not None:
+        tally.water.check_reach("xyz", surface, deep=given.deep)
+    check_fit(plan, tally)
+    if line is not None and line is not regression and tally.beyond is not None:
+        notes += tally.beyond.notes(line)
+    for note in (*plan.own_notes, *notes):
+        warnings.warn(PcfixWarning("points.note", note), stacklevel=2)
+    return correction
+
+
+NOT_SUBMERGED = 255
+"""The class of points that may not be submerged, for the rules of a labelling."""
+
+
+def _check_views(views: Views, points: FloatArray, cameras: Cameras) -> None:
+    """Refuse views that are no table of these points, and warn of points outside their images."""
+    n, start, camera = len(points), views.start, views.camera
+    is_table = len(start) == n + 1 and start[0] == 0 and start[-1] == len(camera)
+    if not is_table or (np.diff(start) < 0).any():
+        raise SettingError(
+            "views.table",
+            f"views must have {n + 1} starts that do not decrease, from 0 to the number of"
+            " entries.",
+        )
+    if len(camera) and not 0 <= camera.min() <= camera.max() < len(cameras):
+        raise SettingError(
+            "views.camera", f"views name camera {camera.max()}, but there are {len(cameras)}."
+        )
+    from pcfix.io.views import beside
+    from pcfix.lens.frames import beside_frames
+
+    counts = beside_frames(points, views, cameras)
+    if counts.any():
+        entries, outside = int(counts.sum()), int(np.count_nonzero(counts))
+        note = PcfixWarning("views.outside", f"views: {beside(entries, outside)}", entries=entries)
+        warnings.warn(note, stacklevel=3)

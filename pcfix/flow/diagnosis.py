@@ -1,11 +1,11 @@
-"""Did the poses of a correction absorb the refraction? What is read to find out."""
+"""Find out whether the poses of a correction have absorbed the refraction."""
 
 from __future__ import annotations
 
 import warnings
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -18,16 +18,17 @@ from pcfix.adjust.diagnosis import (
     neighbours_sign,
 )
 from pcfix.errors import InputError, PcfixError, PcfixWarning
-from pcfix.flow.inputs import Inputs
+from pcfix.flow.inputs import Inputs, ties_of
 from pcfix.flow.next_steps import adjust_words
-from pcfix.flow.surfaces import CloudView
 from pcfix.io.cameras.metashape.block import given_lenses
 from pcfix.io.cameras.table.sensor import read_sensor
 from pcfix.io.gnss_positions import gnss_in_frame_of
 from pcfix.model import Cameras, TiePoints
 from pcfix.options.declare import File
 from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
-from pcfix.refract.reconstructions import Verdict
+
+if TYPE_CHECKING:
+    from pcfix.flow.correction import Plan
 
 LEAST_POSITIONS = 3
 """GNSS positions that determine position, orientation and scale of a block."""
@@ -67,57 +68,54 @@ class Poses(NamedTuple):
 ADJUSTED = Poses(False, "adjusted with refraction (--adjusted-from)")
 
 
-def diagnose_in_passing(
-    inputs: Inputs, evidence: Evidence, view: CloudView, verdicts: tuple[Verdict, ...] = ()
-) -> Poses:
+def diagnose_in_passing(plan: Plan, ties: TiePoints | None) -> Poses:
     """Check the poses with what a correction has read anyway; warn if they absorbed refraction.
 
-    The evidence has the cameras in the cloud's CRS and `quick_ties`; verdicts are on the cloud.
+    The ties are `quick_ties`.
     """
+    inputs, cameras = plan.inputs, plan.cameras
+    if not len(cameras):
+        return Poses(None, "not applicable: no cameras were given")
     if inputs.adjusted_from is not None:
         return ADJUSTED
     path = None if isinstance(inputs.cameras, Cameras) else inputs.cameras
-    told = [(one.straight, one.is_fused) for one in verdicts if one.straight is not None]
-    sign = neighbours_sign(*told[-1][0], is_fused=told[-1][1]) if told else None
-    evidence, why = replace(evidence, view=view, neighbours=sign, in_passing=True), ""
+    found = [(one.straight, one.is_fused) for one in plan.verdicts if one.straight is not None]
+    n, why = plan.options.refractive_index, ""
+    evidence = Evidence(
+        cameras, "cameras" if path is None else str(path), plan.found.surface, n, ties=ties,
+        view=plan.view, in_passing=True,
+        neighbours=neighbours_sign(*found[-1][0], is_fused=found[-1][1]) if found else None,
+    )  # fmt: skip
     try:
         if path is not None and _size_of(Path(path)) > QUICK_BYTES:
             why = f"the file is larger than {QUICK_BYTES / 1e6:g} MB; use 'pcfix cameras'"
         elif path is not None:
             ties = evidence.ties if evidence.has_rays else None
             evidence = replace(evidence, ties=ties, calibrated=given_focal_lengths(path))
-        found = diagnose(evidence)
+        diagnosis = diagnose(evidence)
     except (PcfixError, OSError) as error:  # this check stops no correction
         return Poses(None, f"not checked for absorbed refraction: {error}")
-    n = evidence.refractive_index
     command, because = adjust_words(
-        inputs, view.name, has_datum=has_datum(evidence.cameras, evidence.name),
+        inputs, plan.view.name, has_datum=has_datum(evidence.cameras, evidence.name),
         index=None if n == DEFAULT_REFRACTIVE_INDEX else n,
     )  # fmt: skip
-    sentence = found.sentence(command, because)
-    decided = found.decided_by
+    sentence = diagnosis.sentence(command, because)
+    decided = diagnosis.decided_by
     if decided is not None:
-        did = "absorbed" if found.absorbed else "did not absorb"
+        did = "absorbed" if diagnosis.absorbed else "did not absorb"
         words = f"{did} the refraction, by {decided.name}{'; see the warning' * bool(sentence)}"
     else:
-        silent = [one.name for one in found.signs if one.name in ("tie points", "GNSS")]
+        silent = [one.name for one in diagnosis.signs if one.name in ("tie points", "GNSS")]
         if not why and silent:
             why = f"{' and '.join(silent)} of the file tell too little (see 'pcfix cameras')"
         none = f"the file has neither tie points nor GNSS; {export_of(evidence.cameras)}"
         words = f"not checked for absorbed refraction: {why or none}"
     warning = None
     if sentence:
-        values = {} if found.size is None else {"likely_error_m": found.size[0]}
+        values = {} if diagnosis.size is None else {"likely_error_m": diagnosis.size[0]}
         warning = PcfixWarning("poses.absorbed", sentence, command=command, **values)
         warnings.warn(warning, stacklevel=3)
-    return Poses(found.absorbed, words, warning, tuple(found.as_dict()["signs"]))
-
-
-def ties_of(inputs: Inputs, crs: Any) -> TiePoints | None:
-    """Return the tie points of the camera file in the cloud's CRS, if it has any."""
-    with warnings.catch_warnings():  # they were shown when the cameras were read
-        warnings.simplefilter("ignore", PcfixWarning)
-        return inputs.tie_points(crs)
+    return Poses(diagnosis.absorbed, words, warning, tuple(diagnosis.as_dict()["signs"]))
 
 
 def quick_ties(inputs: Inputs, crs: Any) -> TiePoints | None:

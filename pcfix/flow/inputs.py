@@ -1,35 +1,49 @@
-"""Read the inputs of a correction: cameras, view list, water, tide and mask."""
+"""Read the inputs of a correction: cameras, view list, water, tide and mask.
+
+A cloud may be corrected with other cameras than those that made it: `adjusted_from` are the
+original ones, `cameras` the same images adjusted since.
+"""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pcfix.errors import InputError, NoTiePointsError, PcfixError, PcfixWarning, SettingError
+from pcfix.errors import (
+    GeometryError,
+    InputError,
+    NoTiePointsError,
+    PcfixError,
+    PcfixWarning,
+    SettingError,
+)
 from pcfix.flow.surfaces import CloudView, find_surface
-from pcfix.io.cameras import read_cameras, read_tie_points
-from pcfix.io.cameras.georeference import Georeference, georeference
+from pcfix.io.cameras import read_cameras, read_tie_points, takes_sensor
+from pcfix.io.labels import match_labels
 from pcfix.io.vectors import LAYER_MARK
-from pcfix.io.views import ViewList
 from pcfix.label.areas import WaterMask
 from pcfix.label.labelling import Labelling
-from pcfix.model import Cameras, FloatArray, TiePoints, ViewKind
+from pcfix.model import NO_CAMERAS, Cameras, FloatArray, IntArray, TiePoints, ViewKind
 from pcfix.options.correct import LabelRules
 from pcfix.options.declare import File, options_of
 from pcfix.options.shared import InputOptions
-from pcfix.port.shapes import port_of
 from pcfix.water.surface import FoundSurface
 
 if TYPE_CHECKING:
     from pyproj import CRS
 
+    from pcfix.adjust.transfer import CloudTransfer, Pair
+    from pcfix.io.cameras.georeference import Georeference
+    from pcfix.io.views import ViewList
 
+LOCAL = "local"
 TIMED = (".json", ".geojson")
 """Camera files that may hold the time of each image."""
 
@@ -38,8 +52,8 @@ class Inputs(InputOptions):
     """Cameras, view list and water as the user gives them.
 
     `cameras` and `adjusted_from` may be `pcfix.Cameras`, then in the cloud's CRS; `water` may be a
-    `pcfix.WaterSurface`, `port` a `Port`. `pcfix.flow.old_cameras` decides whether views, offset
-    and CRS belong to `cameras` or `adjusted_from`.
+    `pcfix.WaterSurface`, `port` a `Port`. `both_models` decides whether views, offset and CRS
+    belong to `cameras` or `adjusted_from`.
     """
 
     water_mask: File | None = None
@@ -60,6 +74,8 @@ class Inputs(InputOptions):
                 options=["water", "port"],
             )
         if isinstance(self.port, str):
+            from pcfix.port.shapes import port_of
+
             object.__setattr__(self, "port", port_of(self.port))
 
     def paths(self) -> list[File]:
@@ -141,6 +157,8 @@ class Inputs(InputOptions):
 
     def _georeferenced(self, read: Cameras, cloud_crs: str | CRS | None) -> Georeference:
         """Return the transformation from the frame of the camera file to the cloud's CRS."""
+        from pcfix.io.cameras.georeference import georeference
+
         return georeference(
             read, cloud_crs, cameras_crs=self.cameras_crs, offset_m=self.cameras_offset,
             name=str(self.cameras),
@@ -169,6 +187,156 @@ class Inputs(InputOptions):
         xyz = np.full((len(ties.xyz), 3), np.nan)
         xyz[known] = way.points(ties.xyz[known])
         return replace(ties, xyz=xyz)
+
+
+class CameraInputs(NamedTuple):
+    """The cameras of a correction, in the cloud's CRS."""
+
+    cameras: Cameras  # to correct with, `NO_CAMERAS` without any
+    views: ViewList | None  # of the cloud
+    listed: Cameras  # the cameras that the view list counts, which made the cloud
+    pair: Pair | None  # both, if they differ
+
+
+def read_blocks(inputs: Inputs, cloud_crs: str | CRS | None) -> CameraInputs:
+    """Return cameras in the cloud's CRS, and the view list, checked with the original cameras."""
+    if not inputs.cameras:
+        return CameraInputs(NO_CAMERAS, None, NO_CAMERAS, None)
+    if inputs.adjusted_from is None:
+        cameras, views = inputs.block(cloud_crs)
+        return CameraInputs(cameras, views, cameras, None)
+    original, adjusted = both_models(inputs)
+    cameras, _ = adjusted.block(cloud_crs)
+    try:
+        listed, views = original.block(cloud_crs)
+    except InputError:  # a view list does not fit cameras in another place
+        _refuse_apart(replace(original, views=None).block(cloud_crs)[0], cameras)
+        raise
+    _refuse_apart(listed, cameras)
+    return CameraInputs(cameras, views, listed, paired(listed, cameras))
+
+
+def _refuse_apart(original: Cameras, adjusted: Cameras) -> None:
+    """Refuse two models in different places."""
+    centres = original.centres[_rows(original.labels, adjusted.labels)]
+    apart = float(np.median(np.linalg.norm(adjusted.centres - centres, axis=1)))
+    if apart > np.ptp(np.vstack([centres, adjusted.centres]), axis=0).max() / 2.0:
+        words = (
+            f"--adjusted-from: its cameras are {apart:,.0f} m from the adjusted ones. Give the"
+            " offset of the shifted one: --cameras-offset counts for the file that has no CRS."
+        )
+        raise GeometryError("adjusted_from.apart", words, apart_m=apart)
+
+
+def both_models(inputs: Inputs) -> tuple[Inputs, Inputs]:
+    """Return the inputs with the original cameras and those with the adjusted ones.
+
+    CRS and offset of the cameras are for the file that does not have its own place, or for both if
+    both have one. If neither has, the offset is for that with which the two agree best.
+    """
+    given = (inputs.views, inputs.cameras, inputs.adjusted_from)
+    listed, path, old = (None if isinstance(one, Cameras) else one for one in given)
+    if listed is not None and path is not None and Path(listed) == Path(path) != Path(old or ""):
+        words = (
+            f"--views: the tie points of {path} are adjusted ones, not those of the cloud. Give"
+            " the model of --adjusted-from, or the view list of the cloud."
+        )
+        raise SettingError("views.adjusted", words, path=path)
+    source = inputs.cameras if inputs.adjusted_from is None else inputs.adjusted_from
+    both = [
+        replace(inputs, cameras=source, adjusted_from=None),
+        replace(inputs, views=None, adjusted_from=None),
+    ]
+    tables = [not isinstance(one.cameras, Cameras) and takes_sensor(one.cameras) for one in both]
+    if inputs.sensor is not None and any(tables):  # a model has its own lens
+        both = _without(both, tables, sensor=None)
+    if inputs.cameras_crs is None and inputs.cameras_offset is None:
+        return both[0], both[1]
+    original, adjusted = read = [one.read() for one in both]
+    tied = [
+        isinstance(given.cameras, Cameras) or cameras.crs not in (None, LOCAL)
+        for given, cameras in zip(both, read, strict=True)
+    ]
+    if any(tied) and not all(tied):
+        both = _without(both, [not one for one in tied], cameras_crs=None, cameras_offset=None)
+    elif inputs.cameras_offset is not None and not any(tied):
+        apart = adjusted.centres - original.centres[_rows(original.labels, adjusted.labels)]
+        offset = np.array(inputs.cameras_offset)
+        moves = {(True, True): apart, (True, False): apart - offset, (False, True): apart + offset}
+        best = min(moves, key=lambda way: np.median(np.linalg.norm(moves[way], axis=1)))
+        both = _without(both, best, cameras_offset=None)
+    return both[0], both[1]
+
+
+def _without(both: list[Inputs], kept: Sequence[bool], **changes: Any) -> list[Inputs]:
+    """Return the inputs, changed where they are not kept."""
+    return [one if keep else replace(one, **changes) for one, keep in zip(both, kept, strict=True)]
+
+
+def original_ties(
+    inputs: Inputs, transfer: CloudTransfer | None, cloud_crs: str | CRS | None
+) -> TiePoints | None:
+    """Return the tie points of the model that made the cloud, with the cameras of a transfer.
+
+    Those of the original model show best which images made the cloud; second best are the adjusted
+    ones, transferred back.
+    """
+    if transfer is None:
+        return ties_of(inputs, cloud_crs)
+    from pcfix.adjust.transfer import renumbered
+
+    original, adjusted = both_models(inputs)
+    ties = original.tie_points(cloud_crs)
+    if ties is None:
+        ties = adjusted.tie_points(cloud_crs)
+        return None if ties is None else transfer.back(ties)
+    views, entry = renumbered(ties.views, transfer.pair.row)
+    return replace(ties, views=views, image_xy=ties.image_xy[entry])
+
+
+def paired(original: Cameras, adjusted: Cameras) -> Pair:
+    """Match the images of two models in the cloud's CRS by their names."""
+    for cameras, which in ((original, "adjusted-from"), (adjusted, "cameras")):
+        if cameras.rotations is None or cameras.lenses is None:
+            missing = "angles" if cameras.rotations is None else "lens"
+            words = (
+                f"--{which}: has no {missing}, without which points have no image. Give the model"
+                " itself, or --sensor."
+            )
+            raise SettingError(f"cameras.no_{missing}", words, option=which)
+    from pcfix.adjust.transfer import pair_of
+
+    return pair_of(original, adjusted, _rows(original.labels, adjusted.labels))
+
+
+def _rows(original: tuple[str, ...], adjusted: tuple[str, ...]) -> IntArray:
+    """Return the row in the original labels of each adjusted one."""
+    if original == adjusted:  # then even repeated names are unambiguous
+        return np.arange(len(adjusted))
+    row, unclear = match_labels(adjusted, original)
+    repeated = [label for label, count in Counter(adjusted).items() if count > 1]
+    if ambiguous := [*repeated, *unclear]:
+        words = (
+            f"--adjusted-from: image name {ambiguous[0]} is ambiguous. Give every image its own"
+            " name."
+        )
+        raise GeometryError("adjusted_from.ambiguous", words, image=ambiguous[0])
+    if (row < 0).any():
+        unknown = [label for label, at in zip(adjusted, row, strict=True) if at < 0]
+        words = (
+            f"--adjusted-from: has no image {unknown[0]} ({len(unknown)} of {len(adjusted)} images"
+            f" of the cameras are missing; its first is {original[0]}). Give the model from which"
+            " the cameras were adjusted."
+        )
+        raise GeometryError("adjusted_from.no_image", words, image=unknown[0], missing=len(unknown))
+    return row
+
+
+def ties_of(inputs: Inputs, crs: Any) -> TiePoints | None:
+    """Return the tie points of the camera file in the cloud's CRS, if it has any."""
+    with warnings.catch_warnings():  # they were shown when the cameras were read
+        warnings.simplefilter("ignore", PcfixWarning)
+        return inputs.tie_points(crs)
 
 
 def mask_of(path: File | None, cloud_crs: str | CRS | None) -> WaterMask | None:

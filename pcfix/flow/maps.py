@@ -24,10 +24,10 @@ from pcfix.grid.model import hillshade
 from pcfix.grid.shoreline import NearWater
 from pcfix.io import rasters
 from pcfix.io.atomic import scratch_folder, temporary_output
-from pcfix.io.vectors import Layer, write_layers
 from pcfix.io.styles import Symbol, limits_of, vector_style
 from pcfix.io.tables import read_check_depths
 from pcfix.io.tiles import Tiles, open_cloud
+from pcfix.io.vectors import Layer, write_layers
 from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES, Cameras, FloatArray, WaterSurface
 from pcfix.options.correct import LEVEL_M
 from pcfix.options.declare import File

@@ -1,4 +1,4 @@
-"""Commands that the user is told to run next, ready to paste.
+"""Commands that pcfix recommends to run next, ready to paste.
 
 A file that was not given has a name in capitals.
 """

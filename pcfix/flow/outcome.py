@@ -5,30 +5,27 @@ from __future__ import annotations
 import warnings
 from dataclasses import replace
 from itertools import compress
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pcfix.adjust.diagnosis import Evidence
 from pcfix.errors import GeometryError, PcfixWarning, coded
 from pcfix.flow.correction import CloudTally, Plan
-from pcfix.flow.diagnosis import Poses, diagnose_in_passing, quick_ties
-from pcfix.flow.plausibility import CloudSample, Flight, Plausible, plausible
+from pcfix.flow.plausibility import CloudSample, Plausible, plausible
 from pcfix.flow.runner import Ends
-from pcfix.flow.shore import write_shoreline
-from pcfix.io.cameras.mistakes import likely_mistake
 from pcfix.io.las.part import part_report
-from pcfix.io.regressions import write_regression
-from pcfix.io.views import ViewMatch, ViewReport
-from pcfix.model import Cameras, FloatArray, Outcome, WaterDimension
+from pcfix.model import Cameras, FloatArray, Outcome, TiePoints, WaterDimension
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import UNLISTED
 from pcfix.refract.choice import views_in_frame
 from pcfix.refract.reconstructions import CAUSES
-from pcfix.refract.regression import LEAST_BEYOND
 from pcfix.refract.tally import Summary, Tally
 from pcfix.version import __version__
 from pcfix.water.checks import refuse_under_water
+
+if TYPE_CHECKING:
+    from pcfix.flow.diagnosis import Poses
+    from pcfix.io.views import ViewReport
 
 
 class Findings(NamedTuple):
@@ -54,14 +51,21 @@ def check(plan: Plan, tally: CloudTally) -> Findings:
     if plan.transfer is not None and tally.transfer is not None:
         plan.transfer.check(name, tally.transfer)
     plan.labelling.check(name, tally.labels)
-    water_notes = _check_water(plan, tally)
+    water_notes, water = list[str](), plan.found.surface
+    if tally.water is not None:
+        tally.water.check_submerged(name, water)
+        if isinstance(water, WaterDimension):
+            refuse_under_water(plan.cameras, figures.lowest_water_m, str(water))
+        water_notes = tally.water.check_reach(name, water, deep=plan.options.deep)
+    elif figures.submerged == 0:
+        raise GeometryError(
+            "cloud.none_submerged", f"{name}: no point is left to correct. Check the mask."
+        )
     flat = int(figures.outcomes[Outcome.FLAT_RAYS])
     if figures.outcomes[Outcome.NO_CAMERA] + flat == figures.submerged:
-        block = plan.cameras.centres, figures.low, figures.high, plan.view.crs
-        mistake = (None if flat else likely_mistake(*block)) or ""
         raise GeometryError(
             "cameras.max_angle" if flat else "cameras.no_overlap",
-            f"{name}: {_out_of_sight(plan, figures)} {mistake}".strip(),
+            f"{name}: {_out_of_sight(plan, figures, flat)}",
             submerged=figures.submerged,
             flat=flat,
         )
@@ -76,80 +80,73 @@ def check(plan: Plan, tally: CloudTally) -> Findings:
         )
     if plan.inputs.port is not None:
         return Findings()
-    return _check_block(plan, tally)._replace(water_notes=water_notes)
+    from pcfix.flow.diagnosis import diagnose_in_passing, quick_ties
+
+    ties = quick_ties(plan.inputs, plan.view.crs) if len(plan.cameras) else None
+    tested = check_fit(plan, tally, ties)
+    poses = diagnose_in_passing(plan, ties)
+    return Findings(tested, poses, _write_shoreline(plan, tally), tuple(water_notes))
 
 
 def _view_report(plan: Plan, tally: CloudTally) -> ViewReport | None:
     """Return how the view list fitted, with the notes of reading it."""
-    if tally.views is None or not isinstance(plan.views, ViewMatch):
+    if tally.views is None or plan.match is None:
         return None
-    return replace(tally.views, notes=plan.views.report.notes)
+    return replace(tally.views, notes=plan.match.report.notes)
 
 
-def _check_water(plan: Plan, tally: CloudTally) -> tuple[str, ...]:
-    """Refuse a cloud without submerged points, and water far from it."""
-    name, water = plan.view.name, plan.found.surface
-    if tally.water is None:
-        if tally.figures.submerged == 0:
-            raise GeometryError(
-                "cloud.none_submerged", f"{name}: no point is left to correct. Check the mask."
-            )
-        return ()
-    tally.water.check_submerged(name, water)
-    if isinstance(water, WaterDimension):
-        refuse_under_water(plan.cameras, tally.figures.lowest_water_m, str(water))
-    return tuple(tally.water.check_reach(name, water, deep=plan.options.deep))
-
-
-def _out_of_sight(plan: Plan, figures: Tally) -> str:
+def _out_of_sight(plan: Plan, figures: Tally, flat: int) -> str:
     """Return the sentence for a cloud of which no camera sees a submerged point."""
-    if plan.inputs.port is not None:
-        return "no camera has a point in sight. Check that cameras and cloud have the same CRS."
-    limit, flat = plan.survey.settings.limit_deg, figures.outcomes[Outcome.FLAT_RAYS]
+    limit = plan.survey.settings.limit_deg
     if flat:
         return (
             f"no submerged point has two rays within {limit or 90.0:g} deg of the surface"
             f" normal; {flat:,} points have rays at larger angles. Increase --max-angle."
         )
-    middle = (figures.low + figures.high) / 2.0
-    distance = float(np.hypot(*(plan.cameras.centres - middle)[:, :2].T).min())
-    away = f"{distance / 1000.0:,.1f} km" if distance >= 10_000.0 else f"{distance:,.1f} m"
-    within = f" within {limit:g} degrees" if limit else ""
-    return (
-        f"no camera has a submerged point in sight{within}; the nearest is {away} in plan from"
-        f" the middle of the {figures.submerged:,} submerged points. Check that cameras and cloud"
-        " have the same CRS, and that pitch 0 is straight down."
-    )
+    from pcfix.io.cameras.mistakes import likely_mistake
+
+    sentence = "no camera has a point in sight. Check that cameras and cloud have the same CRS."
+    if plan.inputs.port is None:
+        middle = (figures.low + figures.high) / 2.0
+        distance = float(np.hypot(*(plan.cameras.centres - middle)[:, :2].T).min())
+        away = f"{distance / 1000.0:,.1f} km" if distance >= 10_000.0 else f"{distance:,.1f} m"
+        within = f" within {limit:g} degrees" if limit else ""
+        sentence = (
+            f"no camera has a submerged point in sight{within}; the nearest is {away} in plan from"
+            f" the middle of the {figures.submerged:,} submerged points. Check that cameras and"
+            " cloud have the same CRS, and that pitch 0 is straight down."
+        )
+    mistake = likely_mistake(plan.cameras.centres, figures.low, figures.high, plan.view.crs)
+    return f"{sentence} {mistake or ''}".strip()
 
 
-def _check_block(plan: Plan, tally: CloudTally) -> Findings:
-    """Check cameras, cloud and water against each other; write the shoreline."""
-    inputs, sample, cameras = plan.inputs, tally.sample or CloudSample(), plan.cameras
-    given = inputs.cameras
-    ties = quick_ties(inputs, plan.view.crs) if len(cameras) else None
+def check_fit(plan: Plan, tally: CloudTally, ties: TiePoints | None = None) -> Plausible:
+    """Test cameras, cloud and water against each other; warn of every doubt."""
+    sample, given = tally.sample or CloudSample(), plan.inputs.cameras
     sought = (plan.found.as_dict() or {}).get("model") == "auto"
-    doubts = () if sought else sample.level_doubts()
-    file = "" if isinstance(given, Cameras) else given or ""
-    flight = Flight(file, sample.water_m, plan.views is not None, sample.every)
-    tested = plausible(cameras, sample.xyz, ties, doubts, flight)
+    tested = plausible(
+        plan.cameras, sample.xyz, ties, () if sought else sample.level_doubts(),
+        file="" if isinstance(given, Cameras) else given or "", water_m=sample.water_m,
+        listed=plan.views is not None, every=sample.every,
+    )  # fmt: skip
     tested = tested._replace(noted=CAUSES in map(str, _detected(plan, tally)))
-    tested.warn()
-    if not len(cameras):
-        return Findings(tested, Poses(None, "not applicable: no cameras were given"))
-    name = "cameras" if isinstance(given, Cameras) else str(given)
-    n, water = plan.options.refractive_index, plan.found.surface
-    evidence = Evidence(cameras, name, water, n, ties=ties)
-    poses = diagnose_in_passing(inputs, evidence, plan.view, plan.verdicts)
-    shoreline = None
-    if tally.shore is not None:
-        stated = plan.options.sigma_level
+    for doubt in tested.doubts:
+        warnings.warn(doubt, stacklevel=3)
+    return tested
 
-        def sigma(xy: FloatArray) -> FloatArray | None:
-            return plan.found.sigma_level_m(xy) if stated is None else np.full(len(xy), stated)
 
-        path, overwrite = plan.options.shoreline or "", plan.options.overwrite
-        shoreline = write_shoreline(path, tally.shore, sigma, plan.view.crs, overwrite=overwrite)
-    return Findings(tested, poses, shoreline)
+def _write_shoreline(plan: Plan, tally: CloudTally) -> dict[str, Any] | None:
+    """Write the shoreline if it is asked for; return its figures."""
+    path, stated = plan.options.shoreline, plan.options.sigma_level
+    if tally.shore is None or path is None:
+        return None
+    from pcfix.flow.shore import write_shoreline
+
+    def sigma(xy: FloatArray) -> FloatArray | None:
+        return plan.found.sigma_level_m(xy) if stated is None else np.full(len(xy), stated)
+
+    overwrite = plan.options.overwrite
+    return write_shoreline(path, tally.shore, sigma, plan.view.crs, overwrite=overwrite)
 
 
 def _detected(plan: Plan, tally: CloudTally) -> list[PcfixWarning]:
@@ -157,14 +154,26 @@ def _detected(plan: Plan, tally: CloudTally) -> list[PcfixWarning]:
     verdicts = {str(note): note for one in plan.verdicts for note in one.warnings()}
     beyond, line = list[str](), plan.regression
     if tally.beyond is not None and line is not None:
+        from pcfix.refract.regression import LEAST_BEYOND
+
         least = LEAST_BEYOND if plan.inputs.regression is None else 0.0
         beyond = tally.beyond.notes(line, least)
+    corrected, rays = tally.figures.corrected, list[PcfixWarning]()
+    if plan.inputs.port is not None and plan.survey.settings.method == "snell" and corrected:
+        mean = tally.port_miss_m / corrected
+        sentence = (
+            "The refracted rays of the apparent points miss each other behind the port by"
+            f" {mean:.3f} m on average. --method consistent takes this into account, best with"
+            " --views."
+        )
+        rays.append(PcfixWarning("port.ray_distance", sentence, mean_m=mean))
     unlisted = []
     if UNLISTED in plan.survey.parts:
         so = " ".join(map(str, plan.of_unlisted))
         unlisted = [f"Points in no view list are corrected as without a list. {so}"]
     return [
         *plan.notes,
+        *rays,
         *coded("regression.range", beyond),
         *coded("cloud.reconstruction", verdicts.values()),
         *coded("views.unlisted", unlisted),
@@ -175,18 +184,37 @@ def summarize(plan: Plan, tally: CloudTally, findings: Findings, ends: Ends) -> 
     """Return the figures of a correction, and write the line of a regression if asked."""
     path, line, options = plan.options.save_regression, plan.regression, plan.options
     if path is not None and line is not None:
+        from pcfix.io.regressions import write_regression
+
         write_regression(path, line, overwrite=options.overwrite)
     figures, report = tally.figures, _view_report(plan, tally)
     unused = list(compress(plan.cameras.labels, np.logical_not(figures.camera_used)))
     uncorrected = figures.uncorrected()
     not_moved = sum(uncorrected.values()) + int(figures.outcomes[Outcome.NOT_CARRIED])
-    medium = _figures_of_port if plan.inputs.port is not None else _figures_of_water
-    of_medium, own_notes = medium(plan, tally, findings)
+    poses, transfer, moved = findings.poses, plan.transfer, plan.survey.level_offset_m
+    made, detected, water = plan.made, _detected(plan, tally), str(plan.found.surface)
+    depth, left_out = figures.depth_m(), dict[str, list[str]]()
+    uncertainty, by_poses = figures.uncertainty(made), plan.survey.learned.poses
+    if plan.inputs.port is not None:  # no depths, and no orders by depth
+        depth, uncertainty, water = {}, None, f"all around, seen through a {plan.inputs.port}"
+    else:
+        left_out = _left_out(plan, figures)
+    if uncertainty is not None and by_poses is not None:
+        uncertainty["poses_m"] = round(by_poses.middle_m, 4)
+    if moved is not None:
+        times = f"{moved.min():+.3f} to {moved.max():+.3f} m at the times of the images"
+        water = f"{water}, {times}"
+    of_poses = [None if poses is None else poses.warning, plan.no_poses]
     notes = [
         *plan.cameras.notes,
         *([] if report is None else report.warnings()),
         *coded("cloud.labels", plan.labelling.notes),
-        *own_notes,
+        *(() if findings.plausible is None else findings.plausible.doubts),
+        *detected,
+        *coded("water.surface", plan.found.notes),
+        *coded("water.images", plan.own_notes),
+        *coded("water.extent", findings.water_notes),
+        *coded("cameras.poses", filter(None, of_poses)),
     ]
     return Summary(
         input=ends.input,
@@ -199,60 +227,30 @@ def summarize(plan: Plan, tally: CloudTally, findings: Findings, ends: Ends) -> 
         dropped=not_moved if options.uncorrected == "drop" else 0,
         water_unknown=figures.water_unknown,
         unsure=figures.unsure if options.unsure == "withhold" else None,
+        depth_m=depth,
         shift_z_m=figures.shift_z_m(),
         rays=figures.rays,
         incidence_deg=round(figures.incidence_deg, 2),
         cameras=len(plan.cameras),
         cameras_used=len(plan.cameras) - len(unused),
         cameras_unused=unused,
+        cameras_left_out=left_out,
         seconds=round(ends.seconds, 3),
         views=None if report is None else report.as_dict(),
         warnings=[one.as_dict() for one in notes],
         labelling=plan.labelling.report(tally.labels),
         settings={**options.part(ScienceOptions).as_dict(), **plan.settings},
         part=None if ends.source is None else part_report(ends.source),
-        **of_medium,
+        water=water,
+        water_fit=plan.found.as_dict(),
+        uncertainty=uncertainty,
+        carried=transfer.as_dict(tally.transfer) if transfer and tally.transfer else None,
+        made=made,
+        told=[one for one in map(str, detected) if made is None or one not in made["because"]],
+        poses=None if poses is None else poses.as_dict(),
+        shoreline=findings.shoreline,
+        fit=None if findings.plausible is None else findings.plausible.as_dict(),
     )
-
-
-def _figures_of_water(
-    plan: Plan, tally: CloudTally, findings: Findings
-) -> tuple[dict[str, Any], list[Any]]:
-    """Return the part of a summary about depths, water and cameras, and its notes."""
-    moved, water, made = plan.survey.level_offset_m, str(plan.found.surface), plan.made
-    tested, poses = findings.plausible or Plausible(), findings.poses
-    uncertainty, by_poses = tally.figures.uncertainty(made), plan.survey.learned.poses
-    if uncertainty is not None and by_poses is not None:
-        uncertainty["poses_m"] = round(by_poses.middle_m, 4)
-    detected = _detected(plan, tally)
-    if moved is not None:
-        times = f"{moved.min():+.3f} to {moved.max():+.3f} m at the times of the images"
-        water = f"{water}, {times}"
-    carried = None
-    if plan.transfer is not None and tally.transfer is not None:
-        carried = plan.transfer.as_dict(tally.transfer)
-    figures = {
-        "depth_m": tally.figures.depth_m(),
-        "water": water,
-        "water_fit": plan.found.as_dict(),
-        "uncertainty": uncertainty,
-        "carried": carried,
-        "made": made,
-        "told": [one for one in map(str, detected) if made is None or one not in made["because"]],
-        "poses": None if poses is None else poses.as_dict(),
-        "shoreline": findings.shoreline,
-        "fit": tested.as_dict(),
-        "cameras_left_out": _left_out(plan, tally.figures),
-    }
-    of_poses = [poses.warning if poses else None, plan.no_poses]
-    return figures, [
-        *tested.doubts,
-        *detected,
-        *coded("water.surface", plan.found.notes),
-        *coded("water.images", plan.own_notes),
-        *coded("water.extent", findings.water_notes),
-        *coded("cameras.poses", filter(None, of_poses)),
-    ]
 
 
 def _left_out(plan: Plan, figures: Tally) -> dict[str, list[str]]:
@@ -271,26 +269,3 @@ def _left_out(plan: Plan, figures: Tally) -> dict[str, list[str]]:
     return {
         why: list(compress(cameras.labels, rows)) for why, rows in reasons.items() if rows.any()
     }
-
-
-def _figures_of_port(
-    plan: Plan, tally: CloudTally, findings: Findings
-) -> tuple[dict[str, Any], list[Any]]:
-    """Return the part of a summary about a port: no depths, and no orders by depth."""
-    notes, corrected = list[PcfixWarning](), tally.figures.corrected
-    if plan.survey.settings.method == "snell" and corrected:
-        mean = tally.port_miss_m / corrected
-        sentence = (
-            "The refracted rays of the apparent points miss each other behind the port by"
-            f" {mean:.3f} m on average. --method consistent takes this into account, best with"
-            " --views."
-        )
-        notes.append(PcfixWarning("port.ray_distance", sentence, mean_m=mean))
-    figures: dict[str, Any] = {
-        "depth_m": {},
-        "water": f"all around, seen through a {plan.inputs.port}",
-        "water_fit": None,
-        "uncertainty": None,
-        "told": list(map(str, notes)),
-    }
-    return figures, notes

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pcfix.errors import InputError, SettingError
-from pcfix.flow.correction import read_inputs
+from pcfix.flow.planning import read_inputs
 from pcfix.flow.surfaces import view_of
 from pcfix.io.las.columns import UPGRADE, Column, columns_for
 from pcfix.io.las.source import LasSource

@@ -6,7 +6,6 @@ cloud; what cannot be tested is listed as not checked. None of it changes a resu
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -15,8 +14,6 @@ import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.flow.surfaces import Points
-from pcfix.io.cameras.georeference import adjusted_minus_gnss
-from pcfix.io.tides import read_altitudes
 from pcfix.lens.frames import cameras_in_sight
 from pcfix.lens.imaging import project
 from pcfix.model import BoolArray, Cameras, FloatArray, TiePoints
@@ -42,6 +39,14 @@ MOST_PER_PIXEL, AROUND = 10.0, 8
 """Points of a cloud for each pixel of an image; matchers make one at most, or a few."""
 
 
+class Result(NamedTuple):
+    """The result of one test: what fits, what does not, or what could not be tested."""
+
+    fit: str = ""
+    doubt: PcfixWarning | None = None
+    unchecked: str = ""
+
+
 class Plausible(NamedTuple):
     """The results of the tests."""
 
@@ -49,11 +54,6 @@ class Plausible(NamedTuple):
     doubts: tuple[PcfixWarning, ...] = ()  # tests that were not
     unchecked: tuple[str, ...] = ()  # what could not be tested
     noted: bool = False  # whether the discontinuities of the cloud raised doubts too
-
-    def warn(self) -> None:
-        """Warn of every doubt."""
-        for doubt in self.doubts:
-            warnings.warn(doubt, stacklevel=3)
 
     def __str__(self) -> str:
         """Return a line that claims no more than was tested."""
@@ -139,21 +139,16 @@ class CloudSample(Sums):
         return tuple(doubts)
 
 
-class Flight(NamedTuple):
-    """What else is known of the cameras."""
-
-    file: File = ""  # of the cameras
-    water_m: float | None = None  # median height of the water
-    listed: bool = False  # whether the listed images were found to hold their points
-    every: float = 1.0  # points of the cloud for each of the sample
-
-
 def plausible(
     cameras: Cameras,
     cloud: FloatArray,
     ties: TiePoints | None = None,
     level_doubts: tuple[PcfixWarning, ...] = (),
-    flight: Flight | None = None,
+    *,
+    file: File = "",
+    water_m: float | None = None,
+    listed: bool = False,
+    every: float = 1.0,
 ) -> Plausible:
     """Test cameras and cloud against each other.
 
@@ -167,21 +162,26 @@ def plausible(
         Of these cameras.
     level_doubts : tuple of PcfixWarning
         See `CloudSample.level_doubts`.
-    flight : Flight, optional
+    file : path
+        Of the cameras.
+    water_m : float, optional
+        Median height of the water.
+    listed : bool
+        Whether the listed images were found to hold their points.
+    every : float
+        Points of the whole cloud for each of `cloud`.
     """
     if not len(cameras) or not len(cloud):
         return Plausible((), level_doubts)
-    known = flight or Flight()
     xyz = np.ascontiguousarray(cloud[:: 1 + len(cloud) // IN_FRAMES])
-    flown = flying_heights(cameras, known.file, known.water_m) if known.file else Result()
+    flown = flying_heights(cameras, file, water_m) if file else Result()
     heights = _heights(cameras, cloud, ties)
     if heights.unchecked and any(flown):
         heights = Result()
-    listed = known.listed and cameras.lenses
     results = [
         *(test(cameras, xyz) for test in (_far, _frames, _directions)),
-        Result("listed points in the frames of their images" if listed else ""),
-        *(positions(cameras, str(known.file)), heights, flown, _spacing(cameras, cloud, known)),
+        Result("listed points in the frames of their images" if listed and cameras.lenses else ""),
+        *(positions(cameras, str(file)), heights, flown, _spacing(cameras, cloud, every)),
     ]
     fits, doubts, unchecked = (tuple(filter(None, found)) for found in zip(*results, strict=True))
     return Plausible(fits, (*level_doubts, *doubts), unchecked)
@@ -254,7 +254,7 @@ def _pixel_m(cameras: Cameras, xyz: FloatArray) -> float | None:
     return _above(cameras, xyz) / float(np.median([one.focal_px for one in lenses]))
 
 
-def _spacing(cameras: Cameras, cloud: FloatArray, flight: Flight) -> Result:
+def _spacing(cameras: Cameras, cloud: FloatArray, every: float) -> Result:
     """Compare the spacing of the points with the size of the pixels."""
     pixel = _pixel_m(cameras, cloud)
     if pixel is None or len(cloud) <= AROUND:
@@ -263,7 +263,7 @@ def _spacing(cameras: Cameras, cloud: FloatArray, flight: Flight) -> Result:
 
     places = cloud[:, :2]
     reach = np.asarray(cKDTree(places).query(places[:: 1 + len(places) // TIES], k=AROUND + 1)[0])
-    area = np.pi * float(np.median(reach[:, -1])) ** 2 / (AROUND * flight.every)
+    area = np.pi * float(np.median(reach[:, -1])) ** 2 / (AROUND * every)
     per_pixel = pixel**2 / area if area > 0.0 else 0.0
     if per_pixel <= MOST_PER_PIXEL:
         return Result()
@@ -386,18 +386,12 @@ TAKE_OFF_M, MOST_SHARE = (-15.0, 25.0), 0.1
 """How high above the water drones take off, and the share of their height that barometers err."""
 
 
-class Result(NamedTuple):
-    """The result of one test: what fits, what does not, or what could not be tested."""
-
-    fit: str = ""
-    doubt: PcfixWarning | None = None
-    unchecked: str = ""
-
-
 def positions(cameras: Cameras, name: str) -> Result:
     """Compare the places of cameras with those that their GNSS recorded."""
     if cameras.gnss is None:
         return Result()
+    from pcfix.io.cameras.georeference import adjusted_minus_gnss
+
     try:
         found = adjusted_minus_gnss(cameras, name).enu_m[:, :2]
     except InputError:
@@ -408,15 +402,18 @@ def positions(cameras: Cameras, name: str) -> Result:
     middle = float(np.median(apart))
     if middle <= MOST_APART_M:
         return Result(f"positions {middle:.1f} m in plan from their GNSS")
-    sentence = (
+    return _doubt(
+        "cameras.gnss",
         f"The cameras are {middle:.4g} m in plan from their GNSS positions (median of"
-        f" {len(apart)}). Check their CRS and offset."
+        f" {len(apart)}). Check their CRS and offset.",
+        off_m=middle,
     )
-    return Result(doubt=PcfixWarning("cameras.gnss", sentence, off_m=middle))
 
 
 def flying_heights(cameras: Cameras, file: File, water_m: float | None) -> Result:
     """Compare the heights of cameras above the water with those recorded above take-off."""
+    from pcfix.io.tides import read_altitudes
+
     recorded = read_altitudes(file, cameras.labels)
     rows = np.flatnonzero(np.isfinite(recorded))
     if not len(rows) or water_m is None:
@@ -428,10 +425,11 @@ def flying_heights(cameras: Cameras, file: File, water_m: float | None) -> Resul
     where = f"{abs(off):.0f} m {'above' if off > 0.0 else 'below'} the water"
     if low - least <= off <= high + least:
         return Result(f"heights as recorded in flight, from a take-off {where}")
-    sentence = (
+    return _doubt(
+        "cameras.flying_height",
         f"The cameras are {above:.0f} m above the water, and recorded {flown:.0f} m above their"
         f" take-off (median of {len(rows)}), which would be {where}. Unless it was, check the"
-        " vertical datum and the unit of cameras and water."
+        " vertical datum and the unit of cameras and water.",
+        above_water_m=above,
+        above_take_off_m=flown,
     )
-    values = {"above_water_m": above, "above_take_off_m": flown}
-    return Result(doubt=PcfixWarning("cameras.flying_height", sentence, **values))

@@ -1,7 +1,7 @@
 """Errors of a corrected bed by the errors of an adjustment: a sample is corrected with each member.
 
 The images do not change: the cameras of each member intersect the images of the points again,
-whether the cloud came from the original cameras or from the adjusted ones.
+whether the original or the adjusted cameras made the cloud.
 """
 
 from __future__ import annotations
@@ -15,9 +15,8 @@ import numpy as np
 
 from pcfix.adjust.transfer import CloudTransfer, Pair
 from pcfix.errors import InputError, PcfixWarning
-from pcfix.flow.surfaces import Points
+from pcfix.flow.surfaces import Points, joined_points
 from pcfix.io.members import find_members
-from pcfix.io.views import ViewMatch
 from pcfix.model import NOISE_CLASSES, Cameras, FloatArray, IntArray, Outcome, Views
 from pcfix.options.declare import File
 from pcfix.refract.batch import Batch, OriginalModel, Survey
@@ -27,6 +26,7 @@ from pcfix.water.surface import is_submerged, surface_above
 
 if TYPE_CHECKING:
     from pcfix.adjust.precision import Members
+    from pcfix.io.views import ViewMatch
 
 SAMPLE_POINTS, BED_POINTS = 20_000, 1000
 """Of the cloud, and of its points under water; a thousand is enough, as the errors are smooth."""
@@ -40,7 +40,7 @@ class Adjustment(NamedTuple):
 
 
 def adjustment_of(path: File | Cameras, cameras: Cameras) -> tuple[Adjustment | None, str]:
-    """Return the adjustment of cameras, if its file is beside them, and a note."""
+    """Return the adjustment of cameras, if its file is in their folder, and a note."""
     if isinstance(path, Cameras):
         return None, ""
     try:
@@ -72,39 +72,21 @@ class Sample(NamedTuple):
 
 
 def sample_of(chunks: Iterable[Points], match: ViewMatch | None, step: int) -> Sample:
-    """Return every `step`-th point of a cloud, without noise."""
-    row, parts = 0, list[Sample]()
-    for points in chunks:
-        seen = None if match is None else match.counted(points.xyz, row)[0]
-        rows = np.arange(-row % step, len(points.xyz), step)
-        rows = rows[~np.isin(points.classes[rows], NOISE_CLASSES)]
-        parts.append(Sample(points, seen).take(rows))
-        row += len(points.xyz)
-    return _joined(parts)
-
-
-def _joined(parts: list[Sample]) -> Sample:
-    """Return consecutive samples as one, without the weights of their views."""
-    points, listed = [part.points for part in parts], [part.listed for part in parts]
-    heights = [one.heights for one in points if one.heights is not None]
-    sources = [one.sources for one in points if one.sources is not None]
-    known = [one for one in listed if one is not None]
-    counts = [np.diff(one.start) for one in known]
-    return Sample(
-        Points(
-            np.vstack([one.xyz for one in points]),
-            np.concatenate(heights) if heights else None,
-            np.concatenate([one.classes for one in points]),
-            np.concatenate(sources) if sources else None,
-        ),
-        Views(
-            np.cumsum(np.concatenate([[0], *counts])),
-            np.concatenate([one.camera for one in known]),
-            kind=known[0].kind,
-        )
-        if known
-        else None,
-    )
+    """Return every `step`-th point of a cloud, without noise, and without weights of its views."""
+    row, points, views = 0, list[Points](), list[Views]()
+    for one in chunks:
+        rows = np.arange(-row % step, len(one.xyz), step)
+        rows = rows[~np.isin(one.classes[rows], NOISE_CLASSES)]
+        points.append(one.take(rows))
+        if match is not None:
+            views.append(match.counted(one.xyz, row)[0].take(rows))
+        row += len(one.xyz)
+    if not views:
+        return Sample(joined_points(points), None)
+    counts = [np.diff(one.start) for one in views]
+    start = np.cumsum(np.concatenate([[0], *counts]))
+    listed = Views(start, np.concatenate([one.camera for one in views]), kind=views[0].kind)
+    return Sample(joined_points(points), listed)
 
 
 def pose_errors(

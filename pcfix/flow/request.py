@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from pcfix.errors import InputError, PcfixWarning, SettingError
-from pcfix.flow.inputs import Inputs, paths_in
+from pcfix.flow.inputs import Inputs, paths_in, read_blocks
 from pcfix.flow.maps import SURFACE
 from pcfix.flow.next_steps import FOLDER
-from pcfix.flow.old_cameras import read_blocks
 from pcfix.flow.record import VERSION, belonging, read_record
 from pcfix.flow.surfaces import view_of
 from pcfix.flow.tiles import HOW, RECORDS

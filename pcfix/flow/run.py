@@ -27,9 +27,9 @@ from pcfix.flow.runner import Bar, Progress, no_bar
 from pcfix.flow.shore import check_shoreline
 from pcfix.flow.tiles import check_folder
 from pcfix.io.clouds import is_cloud
-from pcfix.io.vectors import check_layers
 from pcfix.io.rasters import write_dod
 from pcfix.io.tiles import Tiles, check_one_file
+from pcfix.io.vectors import check_layers
 from pcfix.options.correct import CorrectOptions
 from pcfix.options.declare import options_of
 from pcfix.options.steps import CleanOptions, DistanceOptions

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 from pcfix.adjust.diagnosis import MOST_STATED_M, Evidence
 from pcfix.errors import PcfixError, PcfixWarning, SettingError
 from pcfix.flow.adjust import SUMMARY, adjust_into
-from pcfix.flow.diagnosis import diagnose, focal_length_of, given_focal_lengths, has_datum, ties_of
-from pcfix.flow.inputs import Inputs
+from pcfix.flow.diagnosis import diagnose, focal_length_of, given_focal_lengths, has_datum
+from pcfix.flow.inputs import Inputs, ties_of
 from pcfix.flow.next_steps import FOLDER, MODELS
 from pcfix.flow.surfaces import view_of
 from pcfix.io.files import read_json

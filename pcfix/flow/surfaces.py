@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +18,6 @@ from pcfix.flow.runner import Chunk, read_ahead
 from pcfix.io.las import source as las
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.tiles import Tiles, open_cloud
-from pcfix.io.water import rasters_of_images, read_water, read_water_raster
 from pcfix.label.labelling import Part
 from pcfix.model import (
     Cameras,
@@ -31,12 +30,13 @@ from pcfix.model import (
 )
 from pcfix.options.declare import File
 from pcfix.options.shared import WaterOptions
-from pcfix.water.fit import WaterFit
-from pcfix.water.river import RiverFit
 from pcfix.water.surface import FoundSurface, OwnWater, build_fields, surface_above
 
 if TYPE_CHECKING:
     from pyproj import CRS
+
+    from pcfix.water.fit import WaterFit
+    from pcfix.water.river import RiverFit
 
 
 class Points(NamedTuple):
@@ -52,11 +52,12 @@ class Points(NamedTuple):
 
     def take(self, rows: IntArray | slice) -> Points:
         """Return some of the points."""
-        colours = None if self.colours is None else tuple(one[rows] for one in self.colours)
-        names = [name for name in self._fields if name != "colours"]
-        some = {name: getattr(self, name) for name in names}
-        some = {name: None if one is None else one[rows] for name, one in some.items()}
-        return Points(**some, colours=colours)
+        some: dict[str, Any] = {
+            name: one[rows] for name, one in self._asdict().items() if isinstance(one, np.ndarray)
+        }
+        if self.colours is not None:
+            some["colours"] = tuple(one[rows] for one in self.colours)
+        return self._replace(**some)
 
 
 RGB = ("red", "green", "blue")
@@ -65,12 +66,9 @@ SAMPLE_POINTS = 2_000_000
 """Points of a cloud that are searched for water, evenly spread."""
 
 
-CloudPlace: TypeAlias = "tuple[CRS | str | None, FloatArray, FloatArray]"
-
-
 @dataclass(frozen=True)
 class CloudView:
-    """A cloud in one file, in many, or in memory: what is known of it, and all its points."""
+    """A cloud in one file, in many, or in memory: its properties, and all its points."""
 
     name: str  # for messages
     crs: CRS | str | None
@@ -119,19 +117,27 @@ def file_points(
 
 
 def first_points(chunks: Iterable[Points]) -> Points:
-    """Return the first points of a cloud, as many as a chunk has, without colours."""
-    parts: list[Points] = []
-    count = 0
+    """Return the first points of a cloud, as many as a chunk has."""
+    parts, count = list[Points](), 0
     for one in chunks:
-        some = one.take(slice(0, las.CHUNK_POINTS - count))
-        parts.append(some._replace(colours=None))
-        count += len(some.xyz)
+        parts.append(one.take(slice(0, las.CHUNK_POINTS - count)))
+        count += len(parts[-1].xyz)
         if count >= las.CHUNK_POINTS:
             break
-    joined: list[Any] = [
-        None if column[0] is None else np.concatenate(column) for column in zip(*parts, strict=True)
-    ]
-    return Points(*joined)
+    return joined_points(parts)
+
+
+def joined_points(parts: list[Points]) -> Points:
+    """Return consecutive points as one, with the attributes that all of them have."""
+    columns = dict[str, Any]()
+    for name, column in zip(Points._fields, zip(*parts, strict=True), strict=True):
+        if any(one is None for one in column):
+            columns[name] = None
+        elif name == "colours":
+            columns[name] = tuple(map(np.concatenate, zip(*column, strict=True)))
+        else:
+            columns[name] = np.concatenate(column)
+    return Points(**columns)
 
 
 def points_of(chunk: Chunk, source: LasSource, water: WaterSurface | None) -> Points:
@@ -174,6 +180,7 @@ def find_surface(
         Without a cloud only surfaces that do not need one.
     """
     from pcfix.io.vectors import is_vector_file
+    from pcfix.io.water import read_water
 
     if not isinstance(water, str | PathLike | float | int):
         return FoundSurface(water)
@@ -194,7 +201,7 @@ def own_water_of(
     folder: File | None,
     cameras: Cameras,
     water: WaterSurface,
-    view: CloudPlace,
+    view: CloudView,
     level_offset_m: FloatArray | None = None,
 ) -> tuple[OwnWater | None, tuple[str, ...]]:
     """Return the separate water surfaces of images, and notes on them.
@@ -206,13 +213,14 @@ def own_water_of(
     cameras : Cameras
     water : WaterSurface
         That of the other images.
-    view : CRS, and two arrays, shape (2,)
-        CRS of the cloud, its south-west and its north-east corner, metres.
+    view : CloudView
     level_offset_m : array, shape (k,), optional
         Height of the water above `water` at each image.
     """
     if folder is None:
         return None, ()
+    from pcfix.io.water import rasters_of_images, read_water_raster
+
     if isinstance(water, WaterMesh):
         raise SettingError(
             "option.exclusive",
@@ -220,11 +228,16 @@ def own_water_of(
             " level, a plane or a raster.",
             options=["water_per_image", "water"],
         )
-    crs, low, high = view
+    low, high = view.low, view.high
     paths, notes = rasters_of_images(folder, cameras.labels)
-    heights = _read_alike(paths, crs)
     errors = {row: path.parent / "sigma" / path.name for row, path in paths.items()}
-    sigma = _read_alike({row: path for row, path in errors.items() if path.is_file()}, crs)
+    heights, sigma = dict[int, WaterRaster](), dict[int, WaterRaster]()
+    for files, read in ((paths, heights), (errors, sigma)):
+        with warnings.catch_warnings():  # those of the first raster are enough
+            for row, path in files.items():
+                if files is paths or path.is_file():
+                    read[row] = read_water_raster(path, view.crs)
+                    warnings.simplefilter("ignore", PcfixWarning)
     if len(sigma) < len(heights):
         lost = len(heights) - len(sigma)
         notes += (f"{folder}: {lost} rasters have no standard errors in the folder sigma.",)
@@ -253,16 +266,6 @@ def own_water_of(
     return OwnWater(build_fields(heights, k, common), build_fields(sigma, k)), notes
 
 
-def _read_alike(paths: dict[int, Path], crs: CRS | str | None) -> dict[int, WaterRaster]:
-    """Read rasters of one kind, and show the warnings of the first only."""
-    rasters = dict[int, WaterRaster]()
-    with warnings.catch_warnings():
-        for row, path in paths.items():
-            rasters[row] = read_water_raster(path, crs)
-            warnings.simplefilter("ignore", PcfixWarning)
-    return rasters
-
-
 def _bounds(low: FloatArray, high: FloatArray) -> tuple[float, float, float, float]:
     """Return the bounds west, south, east and north of a box."""
     return float(low[0]), float(low[1]), float(high[0]), float(high[1])
@@ -274,32 +277,41 @@ def _found(view: CloudView | None) -> FoundSurface:
     if view is None:
         text = "The water surface 'auto' is found in a cloud. Give the cloud too."
         raise SettingError("cloud.missing", text)
-    every, row = max(1, view.points // SAMPLE_POINTS), 0
-    parts = []
+    every, row, parts = max(1, view.points // SAMPLE_POINTS), 0, list[Points]()
     for some in view.chunks():
-        rgb = None if some.colours is None else np.column_stack(some.colours)
-        columns = (some.xyz, rgb, some.classes, some.returns)
-        parts.append([a if a is None else a[-row % every :: every] for a in columns])
+        parts.append(some.take(np.arange(-row % every, len(some.xyz), every)))
         row += len(some.xyz)
-    whole: list[Any] = [
-        None if any(a is None for a in arrays) else np.concatenate(arrays)
-        for arrays in zip(*parts, strict=True)
-    ]
-    xyz, rgb, classes, returns = whole
-    proposal = find_water(xyz, rgb=rgb, classes=classes, number_of_returns=returns)
+    whole = joined_points(parts)
+    rgb = None if whole.colours is None else np.column_stack(whole.colours)
+    proposal = find_water(
+        whole.xyz, rgb=rgb, classes=whole.classes, number_of_returns=whole.returns
+    )
     return FoundSurface(proposal.surface, proposal, proposal.shoreline)
 
 
 def _fitted(options: WaterOptions, path: File, view: CloudView | None) -> FoundSurface:
     """Return the surface fitted to shoreline points."""
-    from pcfix.io.vectors import read_shoreline
-    from pcfix.water.fit import fit_water
+    from pcfix.io.vectors import SHORE_RADIUS_M, read_shoreline
+    from pcfix.water.fit import fit_water, heights_from_cloud, is_near
     from pcfix.water.river import fit_river
 
     shore = read_shoreline(path, None if view is None else view.crs, crs=options.water_crs)
     xyz, notes = shore.xyz, list[Any](shore.notes)
-    if np.isnan(xyz[:, 2]).any():
-        xyz = _with_heights(xyz, shore.name, view, notes)
+    lacking = np.isnan(xyz[:, 2])
+    if lacking.any():  # they get the heights of the cloud
+        if view is None:
+            text = f"{shore.name} has points without a height. Give the cloud too."
+            raise InputError("cloud.missing", text, path=shore.name)
+        places = xyz[lacking, :2]
+        near = [seen.xyz[is_near(places, seen.xyz, SHORE_RADIUS_M)] for seen in view.chunks()]
+        heights = heights_from_cloud(places, np.vstack(near), SHORE_RADIUS_M)
+        notes.append(
+            f"{shore.name}: {int(lacking.sum()):,} points have no height and get that of the cloud"
+            f" within {SHORE_RADIUS_M:g} m; {int(np.isnan(heights).sum()):,} have none and are"
+            " ignored."
+        )
+        xyz = xyz.copy()
+        xyz[lacking, 2] = heights
     found: WaterFit | RiverFit
     if options.water_model == "river":
         corners = (xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0))
@@ -315,26 +327,3 @@ def _fitted(options: WaterOptions, path: File, view: CloudView | None) -> FoundS
             f" {shore.counts.sum():.0f} independent ones."
         )
     return FoundSurface(found.surface, found, xyz, (*map(str, notes), *found.notes))
-
-
-def _with_heights(
-    xyz: FloatArray, name: str, view: CloudView | None, notes: list[Any]
-) -> FloatArray:
-    """Return points with the heights of the cloud where they have none."""
-    from pcfix.io.vectors import SHORE_RADIUS_M
-    from pcfix.water.fit import heights_from_cloud, is_near
-
-    if view is None:
-        text = f"{name} has points without a height. Give the cloud too."
-        raise InputError("cloud.missing", text, path=name)
-    lacking = np.isnan(xyz[:, 2])
-    places = xyz[lacking, :2]
-    near = [seen.xyz[is_near(places, seen.xyz, SHORE_RADIUS_M)] for seen in view.chunks()]
-    heights = heights_from_cloud(places, np.vstack(near), SHORE_RADIUS_M)
-    notes.append(
-        f"{name}: {int(lacking.sum()):,} points have no height and get that of the cloud within"
-        f" {SHORE_RADIUS_M:g} m; {int(np.isnan(heights).sum()):,} have none and are ignored."
-    )
-    filled = xyz.copy()
-    filled[lacking, 2] = heights
-    return filled

@@ -10,7 +10,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -21,11 +21,13 @@ from pcfix.lens.algebra import Vector, dot, minus, row_of, times, transposed_tim
 from pcfix.lens.imaging import direction_of, image_of, lens_table
 from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Outcome, Views, WaterSurface
 from pcfix.options.correct import ScienceOptions
-from pcfix.refract.matcher import Bed, Matcher
-from pcfix.refract.occlusion import Occluder
-from pcfix.refract.pose_errors import PoseErrors
-from pcfix.refract.regression import DepthRegression
 from pcfix.water.surface import OwnWater, SurfaceAbove
+
+if TYPE_CHECKING:
+    from pcfix.refract.matcher import Bed, Matcher
+    from pcfix.refract.occlusion import Occluder
+    from pcfix.refract.pose_errors import PoseErrors
+    from pcfix.refract.regression import DepthRegression
 
 NO_CAMERA, ONE_CAMERA = int(Outcome.NO_CAMERA), int(Outcome.ONE_CAMERA)
 PARALLEL, CORRECTED = int(Outcome.PARALLEL_RAYS), int(Outcome.CORRECTED)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -11,10 +11,6 @@ from pcfix.errors import SettingError
 from pcfix.model import Cameras, TiePoints, ViewKind
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Batch, Survey, require_orientation
-from pcfix.refract.fusion import likely_beds
-from pcfix.refract.intersect import check_consistent
-from pcfix.refract.map_table import LEAST_POINTS, layers_of
-from pcfix.refract.matcher import Bed, bed_of, matcher_of, matcher_of_ties, places_for
 from pcfix.refract.methods import batches, on_land, with_rays
 from pcfix.refract.patches import FEWEST_WITHOUT_LIST
 from pcfix.refract.reconstructions import (
@@ -26,12 +22,15 @@ from pcfix.refract.reconstructions import (
     Reconstruction,
     Verdict,
     reconstructions_of,
-    told_by,
+    type_given,
     weigh,
 )
-from pcfix.refract.stereo_factor import StereoFactor, stereo_factor
 from pcfix.refract.tiling import cell_side, spatial_order
 from pcfix.water.surface import is_submerged
+
+if TYPE_CHECKING:
+    from pcfix.refract.matcher import Bed
+    from pcfix.refract.stereo_factor import StereoFactor
 
 
 def check_method(settings: ScienceOptions, cameras: Cameras) -> None:
@@ -39,7 +38,7 @@ def check_method(settings: ScienceOptions, cameras: Cameras) -> None:
     if settings.camera_set == "mvs":
         require_orientation(cameras, "camera-set mvs")
     if settings.method == "consistent":
-        check_consistent(cameras)
+        require_orientation(cameras, "Method consistent", "use method snell")
     if settings.depth_factor == "auto":
         require_orientation(cameras, "depth-factor auto")
 
@@ -85,6 +84,8 @@ def with_factor(batch: Batch) -> tuple[Batch, StereoFactor | None]:
     survey = batch.survey
     if survey.settings.depth_factor != "auto":
         return batch, None
+    from pcfix.refract.stereo_factor import stereo_factor
+
     known = batch.surface.height_m[np.isfinite(batch.surface.height_m)]
     found = None
     if len(known):  # else no point is submerged, which is an error elsewhere
@@ -158,7 +159,7 @@ def learn_of_sample(
     if batch.views is not None:
         verdict = weigh_lists(sample, is_open=False)
         learned = survey.learned._replace(dense=_is_dense(sample, points / max(len(batch), 1)))
-        survey = as_told(replace(survey, learned=learned), verdict)
+        survey = with_verdict(replace(survey, learned=learned), verdict)
         return survey, () if verdict is None else (verdict,)
     near = near or Near(sample, points / max(len(batch), 1))
     survey, verdicts = _weighed(replace(near.batch, survey=survey), near.step, hint)
@@ -167,7 +168,7 @@ def learn_of_sample(
         # land has the reconstruction type of the cloud, also where a formula corrects the bed
         made = survey
         for one in verdicts:
-            if one.is_told and one.is_against:
+            if one.is_given and one.is_against:
                 made = replace(made, settings=one.runner_up.settings(made.settings))
         land = on_land(made)
         if not made.settings.models_matcher:
@@ -183,6 +184,8 @@ def learn_of_sample(
 
 def _is_dense(sample: Batch, step: float) -> bool:
     """Whether the cells of depth maps have enough points, `step` for each of the sample."""
+    from pcfix.refract.map_table import LEAST_POINTS, layers_of
+
     cell = np.floor(sample.xyz[:, :2] / cell_side(sample))
     cells = len(np.unique(np.column_stack([cell, layers_of(sample)]), axis=0))
     return len(sample) * step >= LEAST_POINTS * max(cells, 1)
@@ -244,22 +247,22 @@ def _weighed(sample: Batch, step: float, hint: Hint | None) -> tuple[Survey, tup
     reconstructions = reconstructions_of(sample)
     if survey.settings.method == "auto" and len(reconstructions) > 1:
         verdict = weigh(sample, reconstructions, step, hint=hint)
-        survey = as_told(survey, verdict, reconstructions[0])
+        survey = with_verdict(survey, verdict, reconstructions[0])
         return survey, () if verdict is None else (verdict,)
     if survey.settings.method == "auto":
-        survey = as_told(survey, None, reconstructions[0])
+        survey = with_verdict(survey, None, reconstructions[0])
     verdicts = list[Verdict | None]()
     if _wants_limit(survey.settings, None):
         verdicts.append(weigh(replace(sample, survey=survey), LIMITS, step))
-        survey = as_told(survey, verdicts[0], LIMITS[0])
+        survey = with_verdict(survey, verdicts[0], LIMITS[0])
     if _wants_comparison(survey):
-        told = told_by(replace(sample, survey=survey))
+        told = type_given(replace(sample, survey=survey))
         verdicts.append(weigh(sample, IN_FRAME, step, told=told))
-        survey = as_told(survey, verdicts[-1])
+        survey = with_verdict(survey, verdicts[-1])
     return survey, tuple(one for one in verdicts if one is not None)
 
 
-def as_told(
+def with_verdict(
     survey: Survey, verdict: Verdict | None, else_as: Reconstruction | None = None
 ) -> Survey:
     """Return a survey with the options and the model uncertainty of a verdict."""
@@ -272,6 +275,8 @@ def as_told(
 
 def with_matcher(batch: Batch, ties: TiePoints | None) -> Survey:
     """Return the survey with the predicted partners of the images."""
+    from pcfix.refract.matcher import matcher_of, matcher_of_ties, places_for
+
     survey = batch.survey
     places, matched = batch.original_model or (batch.xyz, survey.cameras)
     if ties is not None:
@@ -284,6 +289,9 @@ def with_matcher(batch: Batch, ties: TiePoints | None) -> Survey:
 
 def _learn_bed(batch: Batch) -> Bed | None:
     """Return the bed that agrees with a sample of fused points; None if no image sees a point."""
+    from pcfix.refract.fusion import likely_beds
+    from pcfix.refract.matcher import bed_of
+
     order = spatial_order(batch.xyz)
     likely = [likely_beds(with_rays(batch.take(rows))) for rows in batches(order)]
     table = np.full((len(batch), max(part.shape[1] for part in likely)), np.nan, np.float32)
@@ -327,4 +335,4 @@ def weigh_lists(batch: Batch, *, is_open: bool) -> Verdict | None:
         return weigh(batch, reconstructions_of(batch), 1.0)
     if not _wants_comparison(batch.survey):
         return None
-    return weigh(batch, reconstructions_of(batch), 1.0, told=told_by(batch))
+    return weigh(batch, reconstructions_of(batch), 1.0, told=type_given(batch))

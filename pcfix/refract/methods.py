@@ -1,48 +1,47 @@
 """Correct points by the method of a name.
 
 ``snell`` and tracks with all cameras in frame choose cameras in their kernels; the others get
-batches of points with chosen cameras.
+batches of points with chosen cameras. A method is loaded when it is first used.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any, TypeAlias
+from importlib import import_module
+from typing import Any
 
 import numpy as np
 
 from pcfix.model import FloatArray, IntArray, Outcome, WaterPlane
-from pcfix.refract import literature
 from pcfix.refract.batch import Batch, Intersection, Survey
 from pcfix.refract.choice import cameras_of_pairs, chosen_views, is_bent
-from pcfix.refract.fusion import invert_depth_maps, invert_fusion
-from pcfix.refract.intersect import consistent, intersect
-from pcfix.refract.matcher import steepest_and_partners, without_border
-from pcfix.refract.occlusion import visible_cameras
-from pcfix.refract.stereo_pairs import invert_pairs
 from pcfix.refract.tiling import spatial_order
 from pcfix.refract.uncertainty import with_model_uncertainty, with_uncertainty
 from pcfix.water.surface import SurfaceAbove
 
-Method: TypeAlias = Callable[[Batch], Intersection]
-
 POINTS_AT_ONCE = 100_000
 """Bounds the memory of the lists of cameras: some 50 MB at 40 rays per point."""
 
-METHODS: dict[str, Method] = {
-    "snell": intersect,
-    "consistent": consistent,
-    "shan": literature.shan,
-    "butler": literature.butler,
-    "murase": literature.murase,
-    "dietrich": literature.butler,
-    "factor": literature.factor,
-    "regression": literature.regression,
+METHODS = {
+    "snell": "intersect.intersect",
+    "consistent": "intersect.consistent",
+    "shan": "literature.shan",
+    "butler": "literature.butler",
+    "murase": "literature.murase",
+    "dietrich": "literature.butler",
+    "factor": "literature.factor",
+    "regression": "literature.regression",
 }
-"""By the names of `pcfix.options.Method`: a new method is a function and an entry."""
-
-_IN_FRAME = (intersect, consistent)
+"""Module and function by the names of `pcfix.options.Method`: a new method is a function and an
+entry."""
+_FUSED, _MAPS, _PAIRS = (
+    "fusion.invert_fusion",
+    "fusion.invert_depth_maps",
+    "stereo_pairs.invert_pairs",
+)
+"""What `consistent` is for dense clouds."""
+_IN_FRAME = (METHODS["snell"], METHODS["consistent"])
 """Methods whose kernels choose among all cameras."""
 
 
@@ -74,19 +73,19 @@ def _named_by_limit(found: Intersection, batch: Batch) -> Intersection:
 def _corrected(batch: Batch) -> Intersection:
     """Correct points of one reconstruction type."""
     survey, views, pairs = batch.survey, batch.views, None
-    method = _method(batch)
+    name = _method(batch)
+    module, function = name.split(".")
+    method = getattr(import_module(f"pcfix.refract.{module}"), function)
     if views is not None and views.kind == "pairs":
         pairs, batch = views, replace(batch, views=cameras_of_pairs(views))
-    if method in _IN_FRAME and _takes_all_in_frame(batch):
+    if name in _IN_FRAME and _takes_all_in_frame(batch):
         return with_model_uncertainty(method(batch), batch)
     order = spatial_order(batch.xyz)
     parts = []
     for rows in batches(order):
         part = with_rays(batch.take(rows))
-        if method is invert_pairs and pairs is not None:
-            found = invert_pairs(part, pairs.take(rows))
-        else:
-            found = method(part)
+        listed = () if name != _PAIRS or pairs is None else (pairs.take(rows),)
+        found = method(part, *listed)
         known = with_uncertainty(found, part)
         if survey.settings.unsure != "keep":
             unsure = (found.outcome == Outcome.CORRECTED) & part.seen_flat() & (batch.views is None)
@@ -115,7 +114,7 @@ def shift_of_land(batch: Batch) -> FloatArray:
     depths of some images. That is inverted as on the bed, without water. Zero for tracks.
     """
     batch = replace(batch, survey=batch.survey.learned.land or on_land(batch.survey))
-    if _method(batch) not in (invert_fusion, invert_depth_maps, invert_pairs):
+    if _method(batch) not in (_FUSED, _MAPS, _PAIRS):
         return np.zeros((len(batch), 3))
     at_themselves = SurfaceAbove(batch.xyz[:, 2].copy(), np.zeros((len(batch), 2)))
     return correct(replace(batch, surface=at_themselves)).shift_m
@@ -137,7 +136,7 @@ def on_land(survey: Survey) -> Survey:
     )
 
 
-def _method(batch: Batch) -> Method:
+def _method(batch: Batch) -> str:
     """Return the function that corrects; for `consistent` it depends on the reconstruction type."""
     settings, views = batch.survey.settings, batch.views
     if settings.method != "consistent":
@@ -145,10 +144,8 @@ def _method(batch: Batch) -> Method:
     modelled = "tracks" if batch.survey.learned.matcher is None else settings.matcher
     kind = modelled if views is None else views.kind
     if kind == "depth-maps":
-        return invert_fusion if views is None else invert_depth_maps
-    if kind in ("pairs", "pair-images"):
-        return invert_pairs
-    return consistent
+        return _FUSED if views is None else _MAPS
+    return _PAIRS if kind in ("pairs", "pair-images") else METHODS["consistent"]
 
 
 def with_rays(batch: Batch) -> Batch:
@@ -165,9 +162,13 @@ def with_rays(batch: Batch) -> Batch:
     if seeds or learned.occluder is not None:  # the number is limited in the end
         whole = any_number
     if by_model:
+        from pcfix.refract.matcher import steepest_and_partners, without_border
+
         whole = replace(whole, cameras=without_border(survey.cameras))
     views, is_final = chosen_views(replace(batch, survey=whole)), whole.settings == survey.settings
     if learned.occluder is not None:
+        from pcfix.refract.occlusion import visible_cameras
+
         views = visible_cameras(batch.xyz, survey.cameras.centres, views, learned.occluder)
     if seeds and learned.matcher is not None:
         centres = survey.cameras.centres

@@ -17,8 +17,6 @@ from pcfix.model import FloatArray, IntArray, Outcome, ViewKind
 from pcfix.options.correct import Dimensions, ScienceOptions
 from pcfix.refract import patches
 from pcfix.refract.batch import Batch, ModelUncertainty
-from pcfix.refract.fusion import likely_beds
-from pcfix.refract.matcher import bed_of
 from pcfix.refract.methods import correct, with_rays
 from pcfix.refract.patches import Patches, shares
 
@@ -125,7 +123,7 @@ class Verdict(NamedTuple):
     patches: int  # 0 without evidence
     model_uncertainty: ModelUncertainty
     by: str = ""  # other evidence that decided; empty if the discontinuities did
-    is_told: bool = False  # whether the user set the type
+    is_given: bool = False  # whether the user set the type
     remarks: tuple[str, ...] = ()  # what makes the evidence weak
     of: str = ""  # the points it is about; empty for all
     straight: tuple[float, float] | None = None
@@ -148,8 +146,8 @@ class Verdict(NamedTuple):
     def warnings(self) -> tuple[str, ...]:
         """Return what the user must know, a sentence each."""
         differs = self.is_against and abs(self.deeper_m) > self.model_uncertainty.formal_m
-        unsure = differs if self.is_told else not self.is_sure
-        is_type = "method" in self.chosen.changes and not self.is_told
+        unsure = differs if self.is_given else not self.is_sure
+        is_type = "method" in self.chosen.changes and not self.is_given
         poor = not self.is_sure and self.share > FITS
         absurd = self.share < min(MOST_BEYOND, -SURE * self.sigma)
         none_fits = is_type and self.patches > 0 and (poor or absurd)
@@ -175,10 +173,10 @@ class Verdict(NamedTuple):
         way = "lower" if self.deeper_m >= 0.0 else "higher"
         points = self.of[:1].upper() + self.of[1:] or "Cloud"
         how = "set by the user"
-        if not self.is_told:
+        if not self.is_given:
             by = self.by or ("" if self.patches else "its density")
             how = f"detected{f' by {by}' if by else ''}{'' if self.is_sure else ', not certain'}"
-        fit = ", which fits better" if self.is_told and self.is_against else ""
+        fit = ", which fits better" if self.is_given and self.is_against else ""
         text = (
             f"{points}: {self.chosen.words} ({how}). Next best: {self.runner_up.words}{fit}; the"
             f" bed would be {abs(self.deeper_m):.3f} m {way}."
@@ -207,7 +205,7 @@ def reconstructions_of(batch: Batch) -> tuple[Reconstruction, ...]:
     return LISTED if batch.survey.learned.matcher is not None else LISTED[:1]
 
 
-def told_by(batch: Batch) -> Reconstruction:
+def type_given(batch: Batch) -> Reconstruction:
     """Return the type that the options set, with limits of angles resolved."""
     settings, views = batch.survey.settings, batch.views
     changes: dict[str, Any] = {"method": settings.method, "max_angle": settings.max_angle}
@@ -286,7 +284,7 @@ def weigh(
         patches=beds.patches,
         model_uncertainty=_model_uncertainty(part, beds, best, among),
         by=by,
-        is_told=told is not None,
+        is_given=told is not None,
         remarks=remarks,
         straight=straight,
     )
@@ -403,6 +401,9 @@ def _heights(part: Batch, around: Batch, way: Reconstruction) -> FloatArray:
     settings, learned = part.survey.settings, part.survey.learned
     fuses = settings.method == "consistent" and settings.matcher == "depth-maps"
     if part.views is None and fuses and learned.matcher is not None:
+        from pcfix.refract.fusion import likely_beds
+        from pcfix.refract.matcher import bed_of
+
         # the bed identifies the images of a point: it must be that of other points
         likely = likely_beds(with_rays(_as(around, way)))
         bed = bed_of(around.xyz, likely) if np.isfinite(likely).any() else None

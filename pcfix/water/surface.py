@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -29,10 +29,12 @@ from pcfix.model import (
     WaterRaster,
     WaterSurface,
 )
-from pcfix.water.fit import WaterFit
-from pcfix.water.river import RiverFit
 
-Evidence: TypeAlias = WaterFit | RiverFit | Any
+if TYPE_CHECKING:
+    from pcfix.water.fit import WaterFit
+    from pcfix.water.river import RiverFit
+
+Evidence: TypeAlias = "WaterFit | RiverFit | Any"
 """A fit, or a proposal of `pcfix.water.auto`."""
 
 

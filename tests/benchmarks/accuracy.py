@@ -41,7 +41,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 import pcfix
-from pcfix.flow.learning import learn_regression
+from pcfix.flow.check_depths import learn_regression
 from pcfix.io.views import ViewMatch, read_views
 from pcfix.label.labelling import Part
 from pcfix.model import Views, WaterPlane

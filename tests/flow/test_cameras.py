@@ -11,8 +11,7 @@ from pyproj import CRS, Transformer
 
 import pcfix
 from pcfix.flow.cameras import _sensors, cameras_text, check_cameras
-from pcfix.flow.inputs import Inputs
-from pcfix.flow.old_cameras import told_apart
+from pcfix.flow.inputs import Inputs, both_models
 from pcfix.io.cameras.colmap import write_colmap
 from pcfix.lens.imaging import project
 from pcfix.model import Cameras, Lens
@@ -191,9 +190,9 @@ def test_sensor_of_the_original_cameras(tmp_path):
     lens = replace(LENS, radial=())
     write_colmap(tmp_path / "model", replace(read, lenses=(lens,) * len(read)))
     model = Inputs(cameras=tmp_path / "model", adjusted_from=CAMERAS, sensor=SENSOR, water=0.37)
-    old, new = told_apart(model)
+    old, new = both_models(model)
     assert (old.sensor, new.sensor) == (SENSOR, None)
-    old, new = told_apart(replace(model, cameras=CAMERAS))
+    old, new = both_models(replace(model, cameras=CAMERAS))
     assert (old.sensor, new.sensor) == (SENSOR, SENSOR)
 
 

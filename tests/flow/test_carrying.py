@@ -10,8 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import pcfix
-from pcfix.flow.inputs import Inputs
-from pcfix.flow.old_cameras import told_apart
+from pcfix.flow.inputs import Inputs, both_models
 from pcfix.flow.request import Request, request_of
 from pcfix.model import Cameras, Outcome, Views
 from pcfix.report.text import summary_text
@@ -264,7 +263,7 @@ def test_offset(tmp_path, old, local, said):
         cameras=tmp_path / "new.csv", water=WATER_M, adjusted_from=tmp_path / "old.csv",
         cameras_offset=tuple(offset),
     )  # fmt: skip
-    before, after = told_apart(inputs)
+    before, after = both_models(inputs)
     if local == "neither":  # then it is of both, as it is of one file that says its CRS
         assert before.cameras_offset == after.cameras_offset == tuple(offset)
         return

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 import pcfix
-from pcfix.flow import learning
+from pcfix.flow import planning
 from pcfix.model import Outcome, TiePoints, Views
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract import patches
@@ -128,13 +128,13 @@ def test_large_cloud(cloud, tmp_path, monkeypatch):
     scene = scene_of(cloud, points=16_000)
     path = as_file(tmp_path / "large.las", scene.apparent_xyz, 0)
     for name in ("FEWEST_BED_POINTS", "MOST_BED_POINTS"):
-        monkeypatch.setattr(learning, name, 1200)
+        monkeypatch.setattr(planning, name, 1200)
     monkeypatch.setattr(patches, "MOST_IN_SQUARES", 10_000)
     given = {"cameras": scene.cameras, "water": scene.water, "overwrite": True}
     made = pcfix.correct_file(path, tmp_path / "out.las", **given).made
     assert made["sure"]
     assert made["made_of"] == IN_FRAME[["tracks", "depth-maps"].index(cloud)].words
-    monkeypatch.setattr(learning, "Squares", lambda width_m: None)
+    monkeypatch.setattr(planning, "Squares", lambda width_m: None)
     assert "sure" not in pcfix.correct_file(path, tmp_path / "out.las", **given).made
 
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 import pcfix
 from pcfix.flow.diagnosis import quick_ties
 from pcfix.flow.inputs import Inputs
-from pcfix.flow.plausibility import SAMPLE_POINTS, CloudSample, Flight, plausible
+from pcfix.flow.plausibility import SAMPLE_POINTS, CloudSample, plausible
 from pcfix.flow.surfaces import Points, view_of
 from pcfix.io.las.source import read_xyz
 from tests.utils.codes import refused, warned
@@ -99,7 +99,7 @@ def test_good_block(scene):
     assert (len(found.fits), len(found.unchecked)) == (2, 2)
     bare = plausible(replace(scene.cameras, rotations=None, lenses=None), scene.xyz)
     assert not bare.fits
-    listed = plausible(scene.cameras, scene.xyz, flight=Flight(listed=True))
+    listed = plausible(scene.cameras, scene.xyz, listed=True)
     assert len(listed.fits) == 3
 
 
@@ -185,9 +185,10 @@ def test_real_blocks(name):
     inputs = Inputs(cameras=path, water=0.0)
     above_m = np.nan if level is None else level - LEVEL_M
     sample = sample_of(RENDERED.parent / cloud, lambda xyz: np.full(len(xyz), above_m))
-    ties, flight = quick_ties(inputs, view.crs), Flight(path, level, every=sample.every)
+    ties = quick_ties(inputs, view.crs)
     block = inputs.block(view.crs)[0]
-    found = plausible(block, sample.xyz, ties, sample.level_doubts(), flight)
+    flight = {"file": path, "water_m": level, "every": sample.every}
+    found = plausible(block, sample.xyz, ties, sample.level_doubts(), **flight)
     assert not found.doubts
     assert found.fits[0].startswith("100 % of the points")
 
@@ -204,9 +205,9 @@ def test_gnss_positions():
 @rendered
 def test_points_per_pixel(with_ties):
     """A cloud of about a point a pixel, of which some are here."""
-    every = Flight(every=8.0 * 25.0)
-    assert not plausible(with_ties.cameras, with_ties.xyz, flight=every).doubts
-    assert "cameras.too_high" in codes(plausible(in_feet(with_ties), with_ties.xyz, flight=every))
+    every = 8.0 * 25.0
+    assert not plausible(with_ties.cameras, with_ties.xyz, every=every).doubts
+    assert "cameras.too_high" in codes(plausible(in_feet(with_ties), with_ties.xyz, every=every))
 
 
 @pytest.mark.parametrize("drone_m", [78.0, 33.0, 130.0])
@@ -216,7 +217,7 @@ def test_recorded_heights(scene, tmp_path, drone_m):
     for label in scene.cameras.labels:
         xmp = f'\xff\xd8 <rdf drone-dji:RelativeAltitude="{drone_m:+.2f}" drone-dji:Roll="0">'
         (tmp_path / "images" / label).write_bytes(xmp.encode("latin-1"))
-    found = plausible(scene.cameras, scene.xyz, flight=Flight(tmp_path / "cameras.csv", LEVEL_M))
+    found = plausible(scene.cameras, scene.xyz, file=tmp_path / "cameras.csv", water_m=LEVEL_M)
     assert codes(found) == ([] if drone_m == 78.0 else ["cameras.flying_height"])
     assert not any(one.startswith("heights") for one in found.unchecked)
 

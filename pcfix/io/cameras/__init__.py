@@ -4,7 +4,7 @@ A format module has ``recognises(source)``, which is cheap, ``read(source)`` and
 has tie points, ``tie_points(source, cameras)``. `read_cameras` turns what damaged contents raise
 into an `InputError`, and checks rotations and lenses; a module raises an `InputError` itself where
 it can say more than "damaged". To add a format, write its module and an entry of `FORMATS`, from
-which its line in README.md of this folder follows.
+which its line in README.md of this folder follows. A module is loaded when its turn comes.
 """
 
 from __future__ import annotations
@@ -12,28 +12,13 @@ from __future__ import annotations
 import warnings
 from contextlib import suppress
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from pcfix.errors import InputError, SettingError, bad_file
-from pcfix.io.cameras import (
-    blocksexchange,
-    bundler,
-    colmap,
-    metashape,
-    micmac,
-    nvm,
-    odm,
-    opensfm,
-    opf,
-    pix4d,
-    realitycapture,
-    table,
-    tracks,
-    unsupported,
-)
 from pcfix.io.cameras.checks import (
     DAMAGES,
     NO_LENS,
@@ -44,8 +29,6 @@ from pcfix.io.cameras.checks import (
     sensor_unused,
 )
 from pcfix.io.cameras.formats import Angles, Source
-from pcfix.io.cameras.table.sensor import read_sensor
-from pcfix.io.cameras.tracks import no_tie_points
 from pcfix.io.files import check_input
 from pcfix.model import Cameras, TiePoints
 from pcfix.options.declare import File
@@ -61,48 +44,53 @@ class CameraFormat(NamedTuple):
 
     software: str
     give: str
-    reader: Any
+    module: str
+
+    @property
+    def reader(self) -> Any:
+        """The module of this folder."""
+        return import_module(f"{__name__}.{self.module}")
 
 
+UNSUPPORTED = CameraFormat("a format that pcfix does not read", "", "unsupported")
 _FORMATS = (
     (
         "Agisoft Metashape, PhotoScan",
         "cameras or markers XML, `.psx`, `.psz`; omega-phi-kappa text or reference table with"
         " `--sensor calibration.xml`",
-        metashape,
+        "metashape",
     ),
-    ("Pix4D", "the `params` folder, the project folder or one of its tables", pix4d),
-    ("OPF: PIX4Dmatic, PIX4Dcatch", "the project (`.opf`) or its folder", opf),
-    ("OpenDroneMap", "the project folder, `reconstruction.json`, `shots.geojson`", odm),
-    ("OpenSfM", "`reconstruction.json` or its folder", opensfm),
-    ("COLMAP", "the model folder or workspace, text or binary", colmap),
-    ("MicMac", "the `Ori-...` folder, of MMVII too", micmac),
+    ("Pix4D", "the `params` folder, the project folder or one of its tables", "pix4d"),
+    ("OPF: PIX4Dmatic, PIX4Dcatch", "the project (`.opf`) or its folder", "opf"),
+    ("OpenDroneMap", "the project folder, `reconstruction.json`, `shots.geojson`", "odm"),
+    ("OpenSfM", "`reconstruction.json` or its folder", "opensfm"),
+    ("COLMAP", "the model folder or workspace, text or binary", "colmap"),
+    ("MicMac", "the `Ori-...` folder, of MMVII too", "micmac"),
     (
         "Bundler, MVE",
         "`bundle.out`, `synth_0.out`, with the images or their list beside it",
-        bundler,
+        "bundler",
     ),
-    ("VisualSFM", "`.nvm`, with the images beside it", nvm),
+    ("VisualSFM", "`.nvm`, with the images beside it", "nvm"),
     (
         "ContextCapture, iTwin Capture, DJI Terra",
         "BlocksExchange XML, plain or zipped",
-        blocksexchange,
+        "blocksexchange",
     ),
-    ("RealityCapture (XMP)", "the folder of XMP files", realitycapture),
+    ("RealityCapture (XMP)", "the folder of XMP files", "realitycapture"),
     (
         "CSV table",
         "a table with a header: `label,x,y,z` and, if known, `omega,phi,kappa`, `yaw,pitch,roll`,"
         " `qw,qx,qy,qz` (world to camera) or `r11..r33`; RealityCapture's internal and external"
         " parameters, Metashape's and ODM's lists among them",
-        table,
+        "table",
     ),
-    ("a format that pcfix does not read", "", unsupported),
 )
-FORMATS = tuple(CameraFormat(*each) for each in _FORMATS)
+FORMATS = (*(CameraFormat(*each) for each in _FORMATS), UNSUPPORTED)
 """In the order in which they are asked: ODM knows more of an OpenSfM file than OpenSfM, and a plain
 table says least of all."""
-TAKE_SENSOR = (table, realitycapture)
-"""Readers that look for the sensor themselves."""
+TAKE_SENSOR = ("table", "realitycapture")
+"""Modules that look for the sensor themselves."""
 
 
 def read_cameras(
@@ -160,10 +148,12 @@ def read_cameras(
     try:
         with reading(path):
             cameras = form.reader.read(source)
-            if source.sensor is not None and form.reader not in TAKE_SENSOR and len(cameras):
+            if source.sensor is not None and form.module not in TAKE_SENSOR and len(cameras):
                 if cameras.lenses is not None or cameras.rotations is None:
                     why = "no angles" if cameras.lenses is None else "its own lenses"
                     raise sensor_unused(source, why)
+                from pcfix.io.cameras.table.sensor import read_sensor
+
                 notes = tuple(note for note in cameras.notes if note.code != NO_LENS)
                 lenses = (read_sensor(source.sensor),) * len(cameras)
                 cameras = replace(cameras, lenses=lenses, notes=notes)
@@ -197,11 +187,13 @@ def read_tie_points(path: File, cameras: Cameras) -> TiePoints:
         When numbers are not finite: such observations, and points with such a coordinate, are
         left out.
     """
+    from pcfix.io.cameras.tracks import finite, no_tie_points
+
     source, form = _recognised(path, None, None)
     if not hasattr(form.reader, "tie_points"):
         raise no_tie_points(source.path, f"the format ({form.software}) has none")
     with reading(path):
-        ties, note = tracks.finite(source.path, form.reader.tie_points(source, cameras))
+        ties, note = finite(source.path, form.reader.tie_points(source, cameras))
     if note is not None:
         warnings.warn(note, stacklevel=2)
     return ties
@@ -217,12 +209,12 @@ def _recognised(
         angles,
     )
     known = _format_of(source)
-    if known is not None and known.reader is not unsupported:
+    if known not in (None, UNSUPPORTED):
         return source, known
     inside = []  # camera files in a folder
     for file in sorted(p for p in where.glob("*") if p.suffix.lower() in LISTS and p.is_file()):
         form = _format_of(Source(file))
-        if form is not None and form.reader is not unsupported:
+        if form not in (None, UNSUPPORTED):
             inside.append((file.name, form.software))
     if inside:
         listed = " and ".join(f"{name} ({software})" for name, software in inside[:3])
@@ -239,12 +231,13 @@ def _recognised(
 
 def takes_sensor(path: File) -> bool:
     """Whether the format of a file keeps the lens in a file of its own."""
-    return _recognised(path, None, None)[1].reader in TAKE_SENSOR
+    return _recognised(path, None, None)[1].module in TAKE_SENSOR
 
 
 def _format_of(source: Source) -> CameraFormat | None:
     """Return the first format that knows the content; standard errors look like poses."""
-    for form in FORMATS[-1:] if unsupported.is_part(source) else FORMATS:
+    is_part = UNSUPPORTED.reader.is_part(source)
+    for form in FORMATS[-1:] if is_part else FORMATS:
         with suppress(InputError, *DAMAGES), np.errstate(all="ignore"):  # too damaged to tell
             if form.reader.recognises(source):
                 return form

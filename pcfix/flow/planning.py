@@ -1,0 +1,338 @@
+"""Make the plan of a correction: read and check its inputs, then learn what the cloud shows.
+
+`read_inputs` estimates nothing; `plan_correction` resolves every ``auto``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict, replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pcfix.errors import PcfixWarning, SettingError, coded
+from pcfix.flow.correction import Plan, batch_of, kind_of, transferred
+from pcfix.flow.inputs import (
+    CameraInputs,
+    Inputs,
+    labelling_of,
+    original_ties,
+    paths_in,
+    read_blocks,
+)
+from pcfix.flow.surfaces import CloudView, Points, first_points, own_water_of, parts_of
+from pcfix.model import NOISE_CLASSES, FloatArray, Views, WaterPlane
+from pcfix.options.correct import CorrectOptions, ScienceOptions
+from pcfix.refract.batch import FLAT_DEG, UNLISTED, Batch, Learned, Survey, stacked
+from pcfix.refract.learning import (
+    CORRECTED_RATIO,
+    Near,
+    check_method,
+    depth_ratio,
+    for_own_water,
+    learn_of_sample,
+    learn_of_unlisted,
+    resolved,
+    submerged_of,
+    wants_sample,
+    weigh_lists,
+    with_factor,
+    with_matcher,
+    with_verdict,
+)
+from pcfix.refract.methods import with_rays
+from pcfix.refract.patches import PATCH_WIDTH, Squares
+from pcfix.refract.reconstructions import hint_of
+from pcfix.water.checks import check_above_water, check_tilt
+from pcfix.water.index import with_index
+from pcfix.water.surface import FoundSurface, is_submerged, surface_above
+
+if TYPE_CHECKING:
+    from pcfix.io.views import ViewMatch
+    from pcfix.label.labelling import Labelling
+    from pcfix.refract.occlusion import Occluder
+    from pcfix.refract.regression import DepthRegression
+
+FLAT_SHARE, FLAT_SAMPLE = 0.01, 20_000
+"""Share of the submerged points above which it is noted, and size of the sample for it."""
+HEIGHT_M = 100.0
+"""Flying height if the water below the cameras is unknown, for the width of squares."""
+BED_POINTS_A_M2 = 5.0
+FEWEST_BED_POINTS, MOST_BED_POINTS = 125_000, 1_000_000
+"""Size of the sample of the cloud that the bed of the surroundings is estimated from."""
+_ABOUT_WATER = (
+    "tide", "water_per_image", "image_times", "check_depths", "regression", "water_crs",
+    "water_model", "connected", "adjusted_from", "unsure", "shoreline",
+)  # fmt: skip
+
+Chunks = Callable[[], Iterable[Points]]
+"""The whole cloud, chunk by chunk, transferred to the adjusted cameras if there are any."""
+
+
+def read_inputs(options: CorrectOptions, view: CloudView) -> Plan:
+    """Read the inputs of a correction and check them against each other; estimate nothing."""
+    options = with_index(options)
+    inputs = options.part(Inputs)
+    if inputs.port is not None:
+        _check_port(options)
+    elif not options.cameras:
+        options.check_no_cameras()
+    blocks, match = read_blocks(inputs, view.crs), None
+    if blocks.views is not None:
+        from pcfix.io.views import ViewMatch
+
+        match = ViewMatch(blocks.views, blocks.listed, points=view.points, step_m=view.step_m)
+    if inputs.port is not None:
+        cameras, settings = blocks.cameras, options
+        if cameras.rotations is None:
+            raise SettingError(
+                "cameras.no_angles",
+                "port: it is fixed to the camera, and these cameras have no angles. Give a camera"
+                " file with angles.",
+            )
+        if options.method == "auto":
+            known = cameras.lenses is not None
+            settings = replace(options, method="consistent" if known else "snell")
+        survey, port = Survey(WaterPlane(np.inf), cameras, settings), {"port": asdict(inputs.port)}
+        found = FoundSurface(survey.water)
+        return Plan(options, inputs, view, survey, found, labelling_of(options, view), match,
+                    kind_of(match), settings=port)  # fmt: skip
+    if options.shoreline is not None:
+        from pcfix.flow.shore import check_shoreline
+
+        reads = paths_in(options)
+        check_shoreline(options.shoreline, overwrite=options.overwrite, inputs=reads)
+    found = inputs.surface(view)
+    offset = inputs.level_offset_m(blocks.cameras)
+    plan = plan_of(options, inputs, view, blocks, found, match, offset)
+    check_tilt(found.surface)
+    method = plan.survey.settings.method
+    if method == "regression" or (inputs.check_depths or inputs.regression) is not None:
+        from pcfix.flow.check_depths import check_regression
+
+        check_regression(method, inputs)
+    if inputs.regression is not None:
+        plan = replace(plan, settings={"regression": str(inputs.regression), **plan.settings})
+    if options.dimensions == "all" and method != "regression" and len(blocks.cameras):
+        from pcfix.flow.pose_errors import adjustment_of
+
+        adjustment, no_poses = adjustment_of(inputs.cameras, blocks.cameras)
+        plan = replace(plan, adjustment=adjustment, no_poses=no_poses)
+    return plan
+
+
+def plan_of(
+    options: CorrectOptions, inputs: Inputs, view: CloudView, blocks: CameraInputs,
+    found: FoundSurface, views: ViewMatch | Views | None, offset: FloatArray | None,
+    labelling: Labelling | None = None, line: DepthRegression | None = None,
+) -> Plan:  # fmt: skip
+    """Return the plan of a correction through a water surface, with nothing estimated yet.
+
+    `offset`, shape (k,), is how much higher the water stood when each image was taken, and `line`
+    that of a regression if it is known.
+    """
+    cameras, kind = blocks.cameras, kind_of(views)
+    check_above_water(cameras, found.surface, offset)
+    settings: ScienceOptions = options
+    folder = options.water_per_image
+    if folder is not None:
+        settings = for_own_water(options, cameras, kind)
+    own, notes = own_water_of(folder, cameras, found.surface, view, offset)
+    settings = resolved(settings, cameras, kind)
+    check_method(settings, cameras)
+    transfer = None
+    if blocks.pair is not None:
+        from pcfix.adjust.transfer import CloudTransfer
+
+        transfer = CloudTransfer(blocks.pair)
+    survey = Survey(found.surface, cameras, settings, offset, Learned(line), own_water=own)
+    return Plan(
+        options, inputs, view, survey, found,
+        labelling or labelling_of(options, view),
+        views, kind, transfer, settings={} if folder is None else {"water_per_image": str(folder)},
+        own_notes=notes,
+    )  # fmt: skip
+
+
+def _check_port(options: CorrectOptions) -> None:
+    """Refuse options that need a water surface."""
+    plain = CorrectOptions()
+    excluded = [name for name in _ABOUT_WATER if getattr(options, name) != getattr(plain, name)]
+    excluded += ["camera_set"] * (options.camera_set == "mvs")
+    excluded += ["occlusion"] * (options.occlusion == "on")
+    excluded += ["method"] * (options.method not in ("auto", "snell", "consistent"))
+    for name in excluded:
+        raise SettingError(
+            "port.excludes",
+            f"{name.replace('_', '-')} {getattr(options, name)} has no effect with a port."
+            " Leave it out; the methods are snell and consistent.",
+            option=name,
+        )
+
+
+def plan_correction(plan: Plan) -> Plan:
+    """Return the plan with everything estimated that points have in common; resolve ``auto``.
+
+    The cloud is read a few times: for the surroundings of labels, the surface that occludes points,
+    a sample that shows the reconstruction type, and the points of its view list.
+    """
+    if plan.inputs.port is not None:
+        return plan
+    inputs, view, transfer, match = plan.inputs, plan.view, plan.transfer, plan.match
+    water, first = plan.found.surface, None
+    if plan.views is not None or transfer is not None:
+        first = first_points(view.chunks(water))
+        if match is not None:
+            match = match.settled(first.xyz)
+            plan = replace(plan, views=match)
+        if transfer is not None:
+            transfer.check_models(first.xyz)
+    chunks = partial(_whole_cloud, plan)
+    labelling = plan.labelling.scanned(lambda: parts_of(chunks(), water), view.low, view.high)
+    plan = replace(plan, labelling=labelling)
+    if (inputs.check_depths or inputs.regression) is not None and plan.regression is None:
+        from pcfix.flow.check_depths import regression_of
+
+        line, notes = regression_of(inputs, view, chunks(), plan.survey)
+        survey = replace(plan.survey, learned=plan.survey.learned._replace(regression=line))
+        plan = replace(plan, survey=survey, notes=tuple(coded("regression.fit", notes)))
+    plan = _estimated_from_cloud(plan, chunks)
+    if plan.options.depth_factor == "auto":
+        found = {"depth_factor": plan.survey.settings.depth_factor}
+        plan = replace(plan, settings={**plan.settings, **found})
+    if plan.adjustment is not None:
+        from pcfix.flow.pose_errors import SAMPLE_POINTS, pose_errors, sample_of, with_poses
+
+        sample = sample_of(view.chunks(water), match, 1 + view.points // SAMPLE_POINTS)
+        pair = None if transfer is None else transfer.pair
+        errors = pose_errors(sample, plan.survey, plan.adjustment, pair)
+        plan = replace(plan, survey=with_poses(plan.survey, errors))
+    return plan if first is None or plan.views is None else _with_type_of_list(plan, first)
+
+
+def _whole_cloud(plan: Plan) -> Iterator[Points]:
+    """Yield the whole cloud, transferred to the adjusted cameras if there are any."""
+    row = 0
+    for points in plan.view.chunks(plan.found.surface):
+        yield points if plan.transfer is None else transferred(plan, points, row)[0]
+        row += len(points.xyz)
+
+
+def _with_type_of_list(plan: Plan, first: Points) -> Plan:
+    """Return the plan with the type of its view list, as the first points show it."""
+    points, views, *_ = transferred(plan, first, 0)
+    batch = replace(batch_of(points, plan.survey, plan.original), views=views)
+    is_open = plan.inputs.views_are == "auto" and plan.kind == "depth-maps"
+    verdict = weigh_lists(submerged_of(batch), is_open=is_open and plan.match is not None)
+    if verdict is None:
+        return plan
+    kind = verdict.chosen.kind or plan.kind
+    return replace(plan, survey=with_verdict(plan.survey, verdict), kind=kind, verdicts=(verdict,))
+
+
+def _estimated_from_cloud(plan: Plan, chunks: Chunks) -> Plan:
+    """Resolve every option that is ``auto``, and estimate what the points have in common."""
+    survey, view, views = plan.survey, plan.view, plan.views
+    given = survey.settings if survey.own_water is not None else plan.options
+    occluder = _occluder(plan, chunks, listed=views is not None)
+    survey = replace(survey, learned=survey.learned._replace(occluder=occluder))
+    plan, some_listed = replace(plan, survey=survey), False
+    if views is not None:
+        start = views.start if isinstance(views, Views) else views.view_list.start
+        some_listed = len(start) <= view.points or not bool((np.diff(start) > 0).all())
+    if not (some_listed or wants_sample(survey, plan.kind)):
+        return plan
+    sample, near = _sample(plan, chunks)
+    ties = original_ties(plan.inputs, plan.transfer, view.crs)
+    sample, factor = with_factor(sample)
+    notes = [*plan.notes, *coded("cloud.depth_factor", [] if factor is None else [factor])]
+    if factor is not None:
+        survey, given = sample.survey, replace(given, depth_factor=factor.factor)
+    ratio = None if ties is None else depth_ratio(submerged_of(sample), ties)
+    if ratio is not None and ratio > CORRECTED_RATIO:
+        sentence = (
+            f"The cloud is {ratio:.2f} times as deep as the tie points of its cameras, as if it"
+            " had been corrected before. Give the cloud as the matcher wrote it."
+        )
+        notes.append(PcfixWarning("cloud.corrected_before", sentence, ratio=ratio))
+    hint = hint_of((view.software, plan.cameras.source))
+    if views is None:
+        survey, verdicts = learn_of_sample(sample, view.points, ties, hint, near)
+        notes += _note_flat(sample, survey)
+        return replace(plan, survey=survey, verdicts=verdicts, notes=tuple(notes))
+    survey, of_unlisted = with_matcher(sample, ties), plan.of_unlisted
+    if some_listed:
+        learned = plan.survey.learned._replace(occluder=_occluder(plan, chunks, listed=False))
+        bare = replace(sample, survey=replace(survey, settings=given, learned=learned))
+        unlisted, of_unlisted = learn_of_unlisted(bare, view.points, ties, hint, near)
+        survey = replace(survey, parts={UNLISTED: unlisted})
+    return replace(plan, survey=survey, of_unlisted=of_unlisted, notes=tuple(notes))
+
+
+def _note_flat(sample: Batch, survey: Survey) -> list[PcfixWarning]:
+    """Note how many points only oblique images see, and where."""
+    rows = np.flatnonzero(is_submerged(sample.xyz[:, 2], sample.surface))
+    wet = replace(sample.take(rows[:: 1 + len(rows) // FLAT_SAMPLE]), survey=survey)
+    flat = with_rays(wet).seen_flat() if len(wet) else np.zeros(0, np.bool_)
+    if flat.sum() <= FLAT_SHARE * len(flat):
+        return []
+    low, high = np.percentile(wet.xyz[flat, :2], (2.0, 98.0), axis=0)
+    keeps = survey.settings.unsure == "keep"
+    sentence = (
+        f"About {100.0 * flat.mean():.0f} % of the submerged points have only rays beyond"
+        f" {FLAT_DEG:g} degrees, nearly all between {low[0]:.0f}, {low[1]:.0f} and"
+        f" {high[0]:.0f}, {high[1]:.0f}. Their depths are the least certain; add nadir images"
+        + (", or flag them with --unsure withhold." if keeps else ".")
+    )
+    return [PcfixWarning("cloud.obliques_only", sentence, share=float(flat.mean()))]
+
+
+def _occluder(plan: Plan, chunks: Chunks, *, listed: bool) -> Occluder | None:
+    """Return the surface of the cloud, if it may hide points from cameras."""
+    survey, view = plan.survey, plan.view
+    if listed and survey.settings.occlusion == "auto":
+        return None  # listed cameras saw their points
+    from pcfix.refract.occlusion import OccluderBuilder, wants_occlusion
+
+    if not (view.points and wants_occlusion(survey.cameras, survey.settings)):
+        return None
+    builder = OccluderBuilder(view.low, view.high, view.points)
+    for points in chunks():
+        builder.add(points.xyz, points.classes)
+    return builder.build()
+
+
+def _sample(plan: Plan, chunks: Chunks) -> tuple[Batch, Near | None]:
+    """Return points of the whole cloud, evenly spread over its order, without noise.
+
+    If these may be too far apart to detect the reconstruction type, submerged points in squares
+    too.
+    """
+    view, survey = plan.view, plan.survey
+    area_m2 = np.prod(np.maximum(np.subtract(view.high, view.low)[:2], 1.0))
+    dense = BED_POINTS_A_M2 * float(area_m2)
+    dense = dense if np.isfinite(dense) else MOST_BED_POINTS  # unknown bounds
+    step = max(1, view.points // int(np.clip(dense, FEWEST_BED_POINTS, MOST_BED_POINTS)))
+    near_step = max(1, view.points // int(max(dense, FEWEST_BED_POINTS)))
+    squares = None
+    if near_step < step:
+        centres = survey.cameras.centres
+        unknown = np.full(len(centres), np.nan)
+        above = centres[:, 2] - surface_above(survey.water, centres, unknown).height_m
+        above = above[above > 0.0]
+        squares = Squares(PATCH_WIDTH * (float(np.median(above)) if len(above) else HEIGHT_M))
+
+    def every(step: int, row: int, points: Points) -> Batch:
+        rows = np.arange(-row % step, len(points.xyz), step)
+        rows = rows[~np.isin(points.classes[rows], NOISE_CLASSES)]
+        return batch_of(points.take(rows), survey, plan.original)
+
+    taken, row = list[Batch](), 0
+    for points in chunks():
+        taken.append(every(step, row, points))
+        if squares is not None:
+            squares.add(submerged_of(every(near_step, row, points)))
+        row += len(points.xyz)
+    return stacked(taken), None if squares is None else Near(squares.all(), near_step)
