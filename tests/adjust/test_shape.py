@@ -62,6 +62,7 @@ def test_comes_home():
     np.testing.assert_allclose(surface_above(water, made.truth).height_m, wanted, atol=2e-5)
 
 
+@pytest.mark.nightly
 def test_noise():
     """Level, tilt and shape with their correlations, over draws of all noise."""
     made, rng, chi2, repeats = scene(300), np.random.default_rng(5), [], 16

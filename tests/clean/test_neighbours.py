@@ -51,7 +51,7 @@ def _statistics(xyz: np.ndarray, tile_m: float) -> np.ndarray:
     return out
 
 
-@pytest.mark.parametrize("make", mostly_nightly([_clustered, _lattice], _clustered))
+@pytest.mark.parametrize("make", mostly_nightly([_clustered, _lattice]))
 def test_statistics_of_all_pairs(make) -> None:
     xyz = make()
     twin_mean = np.sort(_pairs(xyz, 3), axis=1)[:, :K].mean(axis=1)

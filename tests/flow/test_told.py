@@ -43,6 +43,7 @@ def run_line(line, **instead):
 
 
 @bent
+@pytest.mark.nightly
 @pytest.mark.usefixtures("undrawn")
 def test_next_commands(bent_middle, tmp_path, monkeypatch):
     """From the warning by `pcfix adjust` to the corrected cloud, as printed."""

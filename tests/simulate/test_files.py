@@ -73,7 +73,7 @@ def test_view_lists(tmp_path, longest):
     (tmp_path / "dense.ply").write_bytes(openmvs_ply(xyz, views))
     (tmp_path / "other.vis").write_bytes(colmap_vis(views))
     for name in ("dense.ply", "other.vis"):
-        raw = read_views(tmp_path / name, cameras).raw
+        raw = read_views(tmp_path / name, cameras)
         assert np.array_equal(raw.start, views.start)
         assert np.array_equal(raw.image, camera)
 
