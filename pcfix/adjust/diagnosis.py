@@ -225,9 +225,9 @@ def diagnosis_of(signs: list[Sign]) -> Diagnosis:
 def export_of(cameras: Cameras) -> str:
     """Return what the user has to give so that the poses can be checked."""
     source = cameras.source.lower()
-    other = "give a model with tie points (COLMAP's, Bundler's .out)"
+    other = "export a model with tie points (COLMAP or Bundler)"
     found = next((words for name, words in EXPORTS.items() if name in source), other)
-    return f"{found}, or try 'pcfix cameras --gnss'"
+    return f"{found}, or run 'pcfix cameras FILE --gnss GNSS.csv'"
 
 
 # Tie points

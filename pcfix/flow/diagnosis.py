@@ -108,7 +108,7 @@ def diagnose_in_passing(plan: Plan, ties: TiePoints | None) -> Poses:
         silent = [one.name for one in diagnosis.signs if one.name in ("tie points", "GNSS")]
         if not why and silent:
             why = f"{' and '.join(silent)} of the file tell too little (see 'pcfix cameras')"
-        none = f"the file has neither tie points nor GNSS; {export_of(evidence.cameras)}"
+        none = f"no tie points and no GNSS positions; {export_of(evidence.cameras)}"
         words = f"not checked for absorbed refraction: {why or none}"
     warning = None
     if sentence:

@@ -56,7 +56,7 @@ class Reconstruction(NamedTuple):
         return replace(given, **gone, **self.changes)
 
 
-_TRACKS, _MAPS, _PAIRS = "intersected rays", "fused depth maps", "stereo pairs"
+_TRACKS, _MAPS, _PAIRS = "tracks", "depth maps", "stereo pairs"
 IN_FRAME = (
     Reconstruction(_TRACKS, {"method": "consistent", "camera_set": "all"}),
     Reconstruction(_MAPS, {"method": "consistent", "camera_set": "mvs", "matcher": "depth-maps"}),

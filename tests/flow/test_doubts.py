@@ -153,8 +153,8 @@ def test_sources(tmp_path):
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("Agisoft Metashape 2.1.0", "fused depth maps"),
-        ("PDAL 2.8 (OpenMVS)", "fused depth maps"),
+        ("Agisoft Metashape 2.1.0", "depth maps"),
+        ("PDAL 2.8 (OpenMVS)", "depth maps"),
         ("MicMac", "stereo pairs"),
     ],
 )
