@@ -56,6 +56,7 @@ def test_offset(files, adjust):
     assert offset_of(adjust(UP_M))[1][2] > 2.0 * sigma_m[2]
 
 
+@pytest.mark.nightly
 def test_weak_datum(adjust):
     note = note_of(adjust(rows=slice(0, 3)), "gnss.weak")
     assert (note.values["gnss"], note.values["control"], note.values["in_line"]) == (3, 0, True)

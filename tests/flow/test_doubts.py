@@ -99,6 +99,7 @@ def as_file(path, xyz, sources, gsd_m=0.001):
     return path
 
 
+@pytest.mark.nightly
 def test_merged_clouds(tmp_path):
     clouds = [scene_of(cloud) for cloud in ("tracks", "depth-maps")]
     assert np.array_equal(clouds[0].cameras.centres, clouds[1].cameras.centres)

@@ -287,7 +287,7 @@ def noisy(block):
     return cameras, truth, apparent, views, floor
 
 
-@pytest.mark.parametrize("scene", mostly_nightly(["nadir", "oblique", "river"], "oblique"))
+@pytest.mark.parametrize("scene", mostly_nightly(["nadir", "oblique", "river"]))
 def test_noise_floor(scene):
     cameras, truth, apparent, views, floor = noisy("nadir" if scene == "nadir" else "oblique")
     turn, plane = np.eye(3), (0.0, 0.0, 0.0)
