@@ -256,7 +256,7 @@ def pipeline(
     if stage:
         content = stage_for(input, options)
     elif output is None:
-        raise UsageError("OUTPUT is needed, or --stage for the stage alone")
+        raise UsageError("Give OUTPUT, or --stage to print only the stage")
     else:
         content = pipeline_for(input, output, options)
     say(json.dumps(content, indent=2))

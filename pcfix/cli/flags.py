@@ -34,7 +34,7 @@ class UsageError(Exception):
 
 
 class Command(NamedTuple):
-    """A command: a function of positional arguments, of `options`, and of flags of its own."""
+    """A command: a function of positional arguments, of `options`, and of further flags."""
 
     call: Callable[..., None]
     kind: type[OptionSet]
@@ -101,7 +101,7 @@ def check_needed(options: OptionSet) -> None:
 
 
 def _keyword(one: Option, is_shown: bool) -> inspect.Parameter:
-    """Return an option as a keyword; text for a parser is not taken apart before."""
+    """Return an option as a keyword; text that a parser reads is passed on unchanged."""
     kind: Any = one.type
     if one.is_path:
         kind = Path | None
