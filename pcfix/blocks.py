@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
+from pcfix.running import current
+
 Array: TypeAlias = npt.NDArray[Any]
-Empty: TypeAlias = Callable[[tuple[int, ...], npt.DTypeLike], Array]
-"""Makes an array of a shape and type, values not set: `numpy.empty`, or one on disk."""
 
 ROWS = 1_000_000
 FEW_ROWS = 65_536
@@ -25,37 +24,22 @@ anew from the system for each of them costs more than what is done with it."""
 LARGE = 2_000_000
 """Rows from which on an array goes to disk, where there is a place for it."""
 
-_on_disk: Empty = np.empty
-_let_go: Callable[[], object] = tuple
-
-
-@contextmanager
-def on_disk(empty: Empty, let_go: Callable[[], object]) -> Iterator[None]:
-    """Have large arrays made by `empty`; `let_go` takes out of memory what of them is on disk."""
-    global _on_disk, _let_go
-    before = _on_disk, _let_go
-    _on_disk, _let_go = empty, let_go
-    try:
-        yield
-    finally:
-        _on_disk, _let_go = before
-
 
 def empty(shape: tuple[int, ...], dtype: npt.DTypeLike = np.float64) -> Array:
     """Return an array, on disk where it is large, values not set."""
-    return _on_disk(shape, dtype) if shape[0] > LARGE else np.empty(shape, dtype)
+    return current().empty(shape, dtype) if shape[0] > LARGE else np.empty(shape, dtype)
 
 
-def let_go() -> None:
-    """Take out of memory what was read of arrays on disk; it is read again when it is asked for."""
-    _let_go()
+def release() -> None:
+    """Remove what was read of arrays on disk from memory; it is read again where it is used."""
+    current().release()
 
 
 def blocks(count: int, most: int = ROWS) -> Iterator[slice]:
     """Yield all rows, at most so many at a time."""
     for first in range(0, count, most):
         yield slice(first, min(first + most, count))
-        _let_go()
+        release()
 
 
 def mapped(function: Callable[..., Any], *arrays: Array) -> Array:

@@ -99,8 +99,8 @@ def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> No
     from pcfix.flow.planning import plan_correction, read_inputs
     from pcfix.flow.runner import Ends, check_summary, write_summary
     from pcfix.io.las.columns import columns_for
-    from pcfix.kernels import threads
     from pcfix.options.correct import CorrectOptions
+    from pcfix.running import threads
 
     started = time.perf_counter()
     options = _options(namespace, CorrectOptions, needed=("water",))
@@ -154,8 +154,8 @@ def _clean(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
     from pcfix.clean.points import Resources
     from pcfix.flow.clean import RAY_DIMENSIONS, Tested, find_noise
     from pcfix.flow.runner import check_summary, write_summary
-    from pcfix.kernels import threads
     from pcfix.options.steps import CleanOptions
+    from pcfix.running import threads
 
     started = time.perf_counter()
     options = _options(namespace, CleanOptions)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pcfix.blocks import bounds, empty, grouped, let_go, mapped, row_numbers
+from pcfix.blocks import bounds, empty, grouped, mapped, release, row_numbers
 from pcfix.model import BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
@@ -220,7 +220,7 @@ class Tiles:
         for first, last in pairwise(self.start):
             for begin in range(int(first), int(last), size):
                 yield slice(begin, min(begin + size, int(last)))
-                let_go()
+                release()
 
     def within(self, low: FloatArray, high: FloatArray) -> IntArray:
         """Return the places of the points in a box, (3,) each, in the order of the cloud."""
@@ -286,7 +286,7 @@ def make_tiles(
             order = np.lexsort((places[a:b, 0], strip))
             places[a:b], row[a:b] = places[a:b][order], row[a:b][order]
         boxes.append(bounds(places[a:b]))
-        let_go()
+        release()
     low, high = np.swapaxes(np.array(boxes), 0, 1)
     return Tiles(places[: start[-1]], row[: start[-1]], start, low, high)
 

@@ -15,9 +15,9 @@ import numpy.typing as npt
 
 from pcfix.clean.neighbours import PIECE_ROWS, SLACK, Neighbours, height_quartiles, make_tiles
 from pcfix.errors import InputError, SettingError
-from pcfix.kernels import threads
 from pcfix.model import BoolArray, FloatArray, IntArray, WaterSurface
 from pcfix.options.steps import LEAST_NEIGHBOURS, CleanRules
+from pcfix.running import threads
 from pcfix.water.checks import as_surface, checked_column, checked_points
 from pcfix.water.surface import is_submerged, surface_above
 

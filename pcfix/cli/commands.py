@@ -85,8 +85,8 @@ def adjust(
 ) -> None:
     """Refine camera poses and lens by a refractive bundle adjustment."""
     from pcfix.flow.next_steps import correct_words
-    from pcfix.kernels import threads
     from pcfix.report.adjustment import adjustment_text, before_of
+    from pcfix.running import threads
 
     with threads(jobs), status_line("Adjusting", quiet) as progress:
         found = pcfix.adjust_cameras(model, out, options=options, progress=progress)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.blocks import let_go
+from pcfix.blocks import release
 from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.photos import lens_of, plain, read_heights, warn_all
@@ -23,7 +23,6 @@ from pcfix.io.crs import parse_crs
 from pcfix.io.files import scratch_arrays
 from pcfix.io.photographs import Frames, check_calm, read_frames, write_calm, write_spread
 from pcfix.io.rasters import new_raster, write_part
-from pcfix.kernels import threads
 from pcfix.model import FloatArray, Lens, WaterRaster
 from pcfix.options.declare import File, taken
 from pcfix.options.photos import CalmOptions
@@ -47,6 +46,7 @@ from pcfix.photos.waves import (
     slopes_of,
     still,
 )
+from pcfix.running import threads
 from pcfix.water.index import index_of
 from pcfix.water.surface import surface_above
 
@@ -215,7 +215,7 @@ def _median(
             )
         same = np.array_equal(way.homography[number], np.eye(3))
         stack[number] = frame if same else laid(frame, way.homography[number])
-        let_go()
+        release()
     shape = stack.shape[1:3]
     median = np.empty(stack.shape[1:], stack.dtype)
     spread = np.empty(shape, np.float32)
@@ -224,7 +224,7 @@ def _median(
         bottom = min(top + at_once, shape[0])
         known = np.stack([covered(one, shape, top, bottom) for one in way.homography])
         median[top:bottom], spread[top:bottom] = median_of(stack[:, top:bottom], known)
-        let_go()
+        release()
     return median, spread, stack
 
 
@@ -293,7 +293,7 @@ def _displacements(
     measure, measured = Displacements(median, view, nodes), []
     for frame in images:
         measured.append(measure.of(frame))
-        let_go()
+        release()
     shifts, weights = (np.stack(one) for one in zip(*measured, strict=True))
     weights[:, still(shifts, weights)] = 0.0
     return shifts, weights

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.blocks import empty, let_go
+from pcfix.blocks import empty, release
 from pcfix.clean.points import (
     CleanSummary,
     Cloud,
@@ -164,7 +164,7 @@ def find_noise(
         elif rays is not None:
             submerged[rows] = used[rows] & (rays > 0)
         first += count
-        let_go()
+        release()
         if resources.progress is not None:
             resources.progress(count)
     if not used.any():

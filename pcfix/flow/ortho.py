@@ -18,11 +18,11 @@ from pcfix.grid.lattice import Lattice, lattice_over, refuse_size
 from pcfix.io import rasters
 from pcfix.io.atomic import scratch_folder, temporary_output
 from pcfix.io.photographs import photographs_in, read_colours
-from pcfix.kernels import threads
 from pcfix.model import WaterPlane
 from pcfix.options.declare import File, options_of, taken
 from pcfix.options.photos import OrthoOptions, PhotosOptions
 from pcfix.photos.ortho import Picture, mosaic, picture_of
+from pcfix.running import threads
 
 TILE_CELLS = 512
 CACHE_BYTES = 400_000_000

@@ -22,13 +22,13 @@ from pcfix.io.files import file_state, read_json, write_text
 from pcfix.io.photographs import photographs_in, read_photograph, size_of, write_photograph
 from pcfix.io.rasters import filled_heights, open_raster
 from pcfix.io.water import rasters_of_images, read_water_raster
-from pcfix.kernels import cores, threads
 from pcfix.lens.imaging import unproject
 from pcfix.model import Cameras, FloatArray, Lens, WaterDimension
 from pcfix.options.declare import File, taken
 from pcfix.options.photos import PhotosOptions
 from pcfix.photos.ground import Ground, ground_of
 from pcfix.photos.mapping import Photo, Scene, exact, nodes_of, paper, resample
+from pcfix.running import current, threads
 from pcfix.version import __version__
 from pcfix.water.checks import check_above_water
 from pcfix.water.index import index_of
@@ -110,7 +110,8 @@ def map_photos(
 
         def write(path: Path, photo: Photo) -> tuple[str, int, int, float]:
             """Write a photograph; return its name, pixels, black pixels, and largest shift."""
-            shifts = mapped(photo, block.scene_of(path), block.step_px)
+            with threads(1):  # each photograph has a thread
+                shifts = mapped(photo, block.scene_of(path), block.step_px)
             new = resample(read_photograph(path), shifts)
             write_photograph(path, target / path.name, new.image, new.touched)
             pixels = new.touched.size
@@ -118,7 +119,7 @@ def map_photos(
             return path.name, pixels, round(new.black_share * pixels), largest
 
         found: list[tuple[str, int, int, float]] = []
-        with threads(1), ThreadPoolExecutor(max(1, min(cores(), len(todo)))) as pool:
+        with ThreadPoolExecutor(max(1, min(current().threads, len(todo)))) as pool:
             jobs = [pool.submit(write, *one) for one in todo]
             try:
                 for job in jobs:

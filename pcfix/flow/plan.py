@@ -26,7 +26,6 @@ from pcfix.flow.correct import correct_points
 from pcfix.flow.pose_errors import Adjustment, Sample, pose_errors
 from pcfix.flow.runner import check_summary, write_plot, write_summary
 from pcfix.flow.surfaces import Points
-from pcfix.kernels import threads
 from pcfix.model import Cameras, Correction, FloatArray, TiePoints, Views, WaterPlane
 from pcfix.options.correct import BudgetOptions, RefractionOptions, ScienceOptions
 from pcfix.options.declare import options_of, taken
@@ -35,6 +34,7 @@ from pcfix.refract.batch import Survey
 from pcfix.refract.tally import COVERAGE_95, ORDERS, largest_tvu_m
 from pcfix.report.page import AFTER, BEFORE, REFERENCE, WATER, Table, label_plan, new_figure
 from pcfix.report.text import aligned
+from pcfix.running import threads
 from pcfix.simulate.block import Block, fly_block
 from pcfix.simulate.scene import Streams, lay_out, points_on
 from pcfix.simulate.settings import SceneSettings

@@ -31,12 +31,12 @@ from pcfix.io.files import check_input, file_state, read_json, run_logged, write
 from pcfix.io.las.writing import write_points
 from pcfix.io.photographs import photographs_in, read_colours
 from pcfix.io.rasters import open_raster, place_of, read_masked, write_dod
-from pcfix.kernels import threads
 from pcfix.model import BoolArray, FloatArray
 from pcfix.options.declare import File, taken
 from pcfix.options.photos import PhotosOptions, RebuildOptions
 from pcfix.photos.ortho import blank_in
 from pcfix.photos.stereo import Grey, stereo_cloud
+from pcfix.running import threads
 from pcfix.version import __version__
 from pcfix.water.surface import surface_above
 

@@ -18,9 +18,9 @@ from pcfix.io.files import read_json
 from pcfix.io.gnss_positions import read_gnss
 from pcfix.io.ground_control import read_ground_control
 from pcfix.io.members import FILE as MEMBERS
-from pcfix.kernels import threads
 from pcfix.model import WaterDimension
 from pcfix.options.survey import AdjustOptions
+from pcfix.running import threads
 from pcfix.water.index import with_index
 
 if TYPE_CHECKING:

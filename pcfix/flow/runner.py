@@ -23,8 +23,8 @@ from pcfix.io.las.part import cloud_part
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import LasSink, check_suffix, output_evlrs
 from pcfix.io.tiles import Tiles, check_one_file, inputs_of
-from pcfix.kernels import telling
 from pcfix.options.declare import File
+from pcfix.running import running
 
 if TYPE_CHECKING:
     import laspy
@@ -115,36 +115,45 @@ def stream(
     the statistics, and the findings of the check.
     """
     with LasSource(task.source, task.jobs, kept=task.kept or None) as source:
-        work, total = begin(source), len(source)
-        last = output_evlrs(source), work.identity, task.jobs
-        tally, findings, done = None, None, 0
-
-        def tell(chunk: int, of_chunk: int) -> None:
-            if task.progress is not None:
-                task.progress(done + min(of_chunk, chunk), total)
-
-        with LasSink(task.target, work.header, *last) as sink:
+        work, total, done = begin(source), len(source), 0
+        tally, findings = None, None
+        sink = LasSink(task.target, work.header, output_evlrs(source), work.identity, task.jobs)
+        with sink, _thread(task.jobs) as writer:
 
             def write(points: Chunk, result: Any) -> None:
                 sink.write(work.apply(points, result))
 
-            with _thread(task.jobs) as writer:
-                written: Future[None] | None = None
-                for points in read_ahead(source.chunks(), task.jobs):
-                    count = len(points)
-                    with telling(partial(tell, count)):
-                        result, one = work.compute(points, row + done)
-                    if written is not None:
-                        written.result()  # at most one chunk waits to be written
-                    written = writer.submit(write, points, result)
-                    tally = one if tally is None else tally + one
-                    done += count
-                    tell(0, 0)
+            written: Future[None] | None = None
+            for points in read_ahead(source.chunks(), task.jobs):
+                report = _reporter(task.progress, done, len(points), total)
+                with running(report=report):
+                    result, one = work.compute(points, row + done)
                 if written is not None:
-                    written.result()
+                    written.result()  # at most one chunk waits to be written
+                written = writer.submit(write, points, result)
+                tally = one if tally is None else tally + one
+                done += len(points)
+                report(len(points))
+            if written is not None:
+                written.result()
             if check is not None:
                 findings = check(tally)
     return tally, findings
+
+
+def _reporter(
+    progress: Progress | None, before: int, count: int, total: int
+) -> Callable[[float], None]:
+    """Return what reports the points that are done of a chunk, after those `before` it."""
+    done = 0.0
+
+    def report(points: float) -> None:
+        nonlocal done
+        done = min(done + points, float(count))
+        if progress is not None:
+            progress(before + round(done), total)
+
+    return report
 
 
 def streaming(

@@ -44,9 +44,9 @@ from pcfix.io.atomic import all_or_none
 from pcfix.io.files import file_state, path_of, read_tally, write_tally
 from pcfix.io.tiles import BrokenTileError, Clouds, Tiles, check_one_file, single, tiles_of
 from pcfix.io.vectors import LAYER_MARK
-from pcfix.kernels import cores, threads
 from pcfix.libraries import optional_library
 from pcfix.options.declare import File, options_of
+from pcfix.running import current, threads
 
 RECORDS, BEGUN = ".pcfix", "begun "
 HOW = ("overwrite", "jobs", "scheduler", "summary")
@@ -258,27 +258,43 @@ def in_processes(
     """Yield tasks with their errors as they are done, with the same `shared` for all.
 
     At most `most` processes share `jobs` threads, all cores by default. A single one is this
-    process.
+    process. If a process dies, the tasks that are not done continue one at a time, each in its own
+    process: so only those whose process dies again have an error.
     """
-    count = min(most, jobs or cores(), len(tasks))
+    jobs = jobs or current().threads
+    count = min(most, jobs, len(tasks))
     if count <= 1:
         for task in tasks:
             yield task, work(shared, task, jobs)
         return
+    lost = []
+    with _processes(count) as pool:
+        with _without_main():
+            given = shared, max(1, jobs // count)
+            futures = {pool.submit(_interruptible, work, given, task): task for task in tasks}
+        for future in as_completed(futures):
+            try:
+                yield futures[future], future.result()
+            except BrokenProcessPool:
+                lost.append(futures[future])
+    for task in lost:
+        with _processes(1) as pool:
+            with _without_main():
+                future = pool.submit(_interruptible, work, (shared, jobs), task)
+            try:
+                why = future.result()
+            except BrokenProcessPool:
+                why = f"{task}: its process ended suddenly, probably for lack of memory."
+        yield task, why
+
+
+@contextmanager
+def _processes(count: int) -> Iterator[Executor]:
+    """Give an executor of new processes, which Ctrl-C interrupts in their tasks."""
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(count, context, initializer=_ignore_interrupts) as pool:
-        with _without_main():
-            given = shared, max(1, (jobs or cores()) // count)
-            futures = {pool.submit(_interruptible, work, given, task): task for task in tasks}
         try:
-            for future in as_completed(futures):
-                yield futures[future], future.result()
-        except BrokenProcessPool as error:
-            raise InputError(
-                "tiles.process_ended",
-                "A process ended suddenly, probably for lack of memory. Run the same command with"
-                " fewer --jobs; it continues.",
-            ) from error
+            yield pool
         except BaseException:
             for process in multiprocessing.active_children():
                 if process.pid is not None:  # it is not started yet

@@ -15,8 +15,8 @@ import numpy as np
 from scipy.spatial import Delaunay, QhullError
 
 from pcfix.grid.lattice import Window
-from pcfix.kernels import cores
 from pcfix.model import FloatArray
+from pcfix.running import current
 
 MOVED = 1e-4
 """Displacement for the choice of triangles, relative to the spacing of the points."""
@@ -130,7 +130,7 @@ def fill_holes(height: FloatArray, window: Window, around: Window, widest: float
         about = part.grown(margin).clipped(around)
         filled[part.within(window)] = _filled(height[about.within(around)], part, about, widest)
 
-    with ThreadPoolExecutor(cores()) as pool:
+    with ThreadPoolExecutor(current().threads) as pool:
         list(pool.map(fill, window.parts(side)))
     return filled
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.blocks import FEW_ROWS, blocks, empty, kept, let_go, mapped
+from pcfix.blocks import FEW_ROWS, blocks, empty, kept, mapped, release
 from pcfix.compare.match import Reference, SurveyCloud
 from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.crs import is_same, parts
@@ -101,7 +101,7 @@ def survey_cloud(
         for column, part in zip(columns, parts, strict=True):
             column[first : first + len(part)] = part
         first, count = first + len(parts[0]), count + len(points.xyz)
-        let_go()
+        release()
     xyz, water_m, bathymetric, *shifts = (column[:first] for column in columns)
     if first == 0:
         skipped = ", ".join(map(str, skip_classes))

@@ -23,12 +23,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.blocks import Empty, on_disk
 from pcfix.errors import InputError, SettingError, bad_file, refusal
 from pcfix.grid.lattice import Window
 from pcfix.io.atomic import temporary_output
 from pcfix.model import FloatArray, IntArray
 from pcfix.options.declare import File
+from pcfix.running import Empty, running
 from pcfix.sums import Sums
 
 LAST_LINES = 3
@@ -240,12 +240,12 @@ def scratch_arrays(target: Path) -> Iterator[Empty]:
         maps.add(one)
         return np.frombuffer(one, dtype).reshape(shape)
 
-    def let_go() -> None:
+    def release() -> None:
         for one in maps:
             if hasattr(mmap, "MADV_DONTNEED"):
                 one.madvise(mmap.MADV_DONTNEED)
 
-    with on_disk(empty, let_go):
+    with running(empty=empty, release=release):
         yield empty
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from pcfix.kernels import threads
+from pcfix.running import threads
 
 
 @pytest.fixture(autouse=True)

@@ -26,9 +26,9 @@ import pcfix
 from pcfix.errors import PcfixWarning
 from pcfix.flow.photos import block_of
 from pcfix.io.photographs import photographs_in, read_photograph
-from pcfix.kernels import threads
 from pcfix.options.photos import PhotosOptions
 from pcfix.photos.mapping import exact, resample
+from pcfix.running import threads
 from tests.utils.renderer import Relief, Texture, rendered
 from tests.utils.shared import SHARED
 

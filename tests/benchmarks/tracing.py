@@ -17,9 +17,9 @@ import time
 
 import numpy as np
 
-from pcfix.kernels import threads
 from pcfix.model import WaterMesh, WaterPlane, WaterRaster
 from pcfix.refract.tracing import METHODS, trace
+from pcfix.running import threads
 
 INDEX = 1.34
 HEAD = (

@@ -14,7 +14,7 @@ from pcfix.compare import m3c2, nearest
 from pcfix.compare.nearest import cloud_to_cloud
 from pcfix.errors import InputError
 from pcfix.flow.compare import compare_clouds
-from pcfix.kernels import threads
+from pcfix.running import threads
 from tests.compare.test_files import py4dgeo, write_las
 from tests.utils.codes import refused
 

@@ -12,8 +12,8 @@ import pcfix
 from pcfix.adjust.block import straight_images
 from pcfix.flow.adjust import adjust_cameras
 from pcfix.flow.next_steps import correct_words
-from pcfix.kernels import threads
 from pcfix.options.survey import AdjustOptions
+from pcfix.running import threads
 from tests.utils.adjust_files import IMAGE_PX, write_block
 from tests.utils.codes import refused, warned
 from tests.utils.program import run_pcfix

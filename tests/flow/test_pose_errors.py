@@ -16,11 +16,11 @@ from pcfix.adjust.transfer import Pair
 from pcfix.flow.pose_errors import Adjustment, Sample, pose_errors, variances, with_poses
 from pcfix.flow.surfaces import Points
 from pcfix.io.members import FILE, write_members
-from pcfix.kernels import threads
 from pcfix.model import Cameras, Lens, Views, WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Batch, Survey
 from pcfix.refract.methods import correct
+from pcfix.running import threads
 from pcfix.simulate.tracing import piercing_points, project, triangulate
 from pcfix.water.surface import surface_above
 from tests.utils.beyond_frames import BEYOND_FRAMES

@@ -14,6 +14,7 @@ import rasterio
 from pyproj import CRS
 
 import pcfix
+from pcfix.flow.tiles import in_processes
 from tests.utils.codes import refused
 from tests.utils.nightly import mostly_nightly
 from tests.utils.program import run_pcfix
@@ -181,6 +182,19 @@ def test_full_disk(cloud, tmp_path, monkeypatch):
     monkeypatch.undo()
     pcfix.correct_file(cloud[0], tmp_path / "out", **given)
     assert len(tiles_in(tmp_path / "out")) == 4
+
+
+def ended_by_two(shared, task, jobs):
+    """End the process of task 2, as the system does for lack of memory."""
+    if task == 2:
+        os._exit(1)
+    return "" if task % 2 else f"error of {task}"
+
+
+def test_process_ends():
+    found = dict(in_processes(ended_by_two, b"", range(5), most=2, jobs=2))
+    assert found.pop(2).startswith("2: its process ended")
+    assert found == {0: "error of 0", 1: "", 3: "", 4: "error of 4"}
 
 
 def test_ctrl_c(tmp_path):

@@ -15,13 +15,13 @@ from pcfix.errors import SettingError
 from pcfix.flow.adjust import adjust_cameras
 from pcfix.flow.next_steps import correct_words
 from pcfix.io.cameras.colmap import write_colmap
-from pcfix.kernels import threads
 from pcfix.model import TiePoints
 from pcfix.options.survey import AdjustOptions
 from pcfix.port.light import coefficients
 from pcfix.port.shapes import DomePort, FlatPort
 from pcfix.port.shapes import port_of as port_of_text
 from pcfix.report.adjustment import adjustment_text
+from pcfix.running import threads
 from tests.utils.adjust_files import EPSG, write_gnss
 from tests.utils.port_scenes import simulate_port
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.kernels import threads
 from pcfix.model import WaterPlane, WaterRaster
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Learned
 from pcfix.refract.matcher import matcher_of
 from pcfix.refract.methods import correct
 from pcfix.refract.tiling import TILE
+from pcfix.running import threads
 from pcfix.water.surface import surface_above
 from tests.utils.batches import batch_of
 from tests.utils.beyond_frames import BEYOND_FRAMES

@@ -6,12 +6,12 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from pcfix.kernels import threads
 from pcfix.model import WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import FLAT_DEG, Batch, Survey
 from pcfix.refract.learning import learn_of_sample
 from pcfix.refract.methods import correct, with_rays
+from pcfix.running import threads
 from pcfix.water.surface import is_submerged, surface_above
 from tests.utils.batches import batch_of
 from tests.utils.depth_map_twin import looking

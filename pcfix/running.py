@@ -1,0 +1,84 @@
+"""How a command runs: its threads, its progress, and where its large arrays are.
+
+These travel in one value, `Run`, that `running` sets for the current thread, so that no kernel or
+search has them as arguments. No result depends on them. Other threads begin with the defaults.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from pcfix.errors import SettingError
+
+Empty: TypeAlias = Callable[[tuple[int, ...], npt.DTypeLike], npt.NDArray[Any]]
+"""Makes an array of a shape and type, values not set: `numpy.empty`, or one on disk."""
+
+
+def _nothing(*given: object) -> None:
+    """Do nothing."""
+
+
+def _available_cores() -> int:
+    """Return the number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@dataclass(frozen=True)
+class Run:
+    """How the work of a command is done.
+
+    Attributes
+    ----------
+    threads : int
+        Number of threads of kernels and searches.
+    report : callable
+        Called with the number of points that a method of correction has just finished.
+    empty : callable
+        Makes large arrays; `pcfix.io.files.scratch_arrays` makes them on disk.
+    release : callable
+        Removes what was read of arrays on disk from memory.
+    """
+
+    threads: int
+    report: Callable[[float], None] = _nothing
+    empty: Empty = np.empty
+    release: Callable[[], None] = _nothing
+
+
+_RUN = ContextVar("pcfix_run", default=Run(_available_cores()))  # noqa: B039 (frozen)
+
+
+def current() -> Run:
+    """Return how the current thread runs."""
+    return _RUN.get()
+
+
+@contextmanager
+def running(**changes: Any) -> Iterator[None]:
+    """Change fields of the current `Run` until the block ends."""
+    token = _RUN.set(replace(_RUN.get(), **changes))
+    try:
+        yield
+    finally:
+        _RUN.reset(token)
+
+
+@contextmanager
+def threads(jobs: int | None) -> Iterator[None]:
+    """Run with this number of threads; None changes nothing. Raises SettingError below 1."""
+    if jobs is not None and jobs < 1:
+        raise SettingError(
+            "option.range", f"jobs {jobs} is less than 1.", option="jobs", value=jobs
+        )
+    with running(threads=jobs or current().threads):
+        yield
