@@ -21,7 +21,9 @@ HOUSE = Path(__file__).parents[1] / "pcfix"
 # The floors, from the ground up. What shares a floor stands side by side; a file may import from
 # lower floors and from its own room. "pcfix" is the front door, pcfix/__init__.py.
 FLOORS = (
-    ("version", "errors", "blocks", "qgis"),
+    ("version", "errors", "qgis"),
+    ("running",),
+    ("blocks",),
     ("libraries",),
     ("kernels",),
     ("options",),
