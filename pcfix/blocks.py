@@ -1,7 +1,7 @@
-"""Rows block by block: arrays that are larger than memory lie in files, and are never held whole.
+"""Arrays that are larger than memory: they are in files, and are processed in blocks of rows.
 
-What is done to each row by itself, and every sum, goes by blocks of `ROWS` rows in the order of the
-file. So a result depends neither on tiles nor on threads, and up to one block it is plain numpy.
+Operations on single rows, and sums, go through blocks of `ROWS` rows in the order of the file. So a
+result depends neither on tiles nor on threads. An array of one block is plain numpy.
 """
 
 from __future__ import annotations
@@ -19,10 +19,9 @@ Array: TypeAlias = npt.NDArray[Any]
 
 ROWS = 1_000_000
 FEW_ROWS = 65_536
-"""Rows of a block whose intermediate arrays stay in the processor's cache: memory that is fetched
-anew from the system for each of them costs more than what is done with it."""
+"""Rows of a block whose intermediate arrays fit into the processor's cache."""
 LARGE = 2_000_000
-"""Rows from which on an array goes to disk, where there is a place for it."""
+"""An array with more rows is on disk, if there is a folder for it."""
 
 
 def empty(shape: tuple[int, ...], dtype: npt.DTypeLike = np.float64) -> Array:
@@ -36,14 +35,14 @@ def release() -> None:
 
 
 def blocks(count: int, most: int = ROWS) -> Iterator[slice]:
-    """Yield all rows, at most so many at a time."""
+    """Yield slices of all rows, of at most `most` each."""
     for first in range(0, count, most):
         yield slice(first, min(first + most, count))
         release()
 
 
 def mapped(function: Callable[..., Any], *arrays: Array) -> Array:
-    """Return a function of arrays, (n, ...), whose rows depend on the same rows of these alone."""
+    """Return a function of arrays, (n, ...), that is computed row by row."""
     count, result = len(arrays[0]), None
     if count <= ROWS:
         return np.asarray(function(*arrays))

@@ -89,12 +89,12 @@ class Lens:
     inverse : bool
         Brown's formula goes from (x', y') to (x, y) instead.
     in_turn : bool
-        The tangential and thin prism terms take x, y and r as the radial terms left them
-        (COLMAP's RAD_TAN_THIN_PRISM_FISHEYE).
+        The tangential and thin prism terms use x, y and r after the radial terms (COLMAP's
+        RAD_TAN_THIN_PRISM_FISHEYE).
     pixel_size_mm : float or None
-        Where the source tells it, and the other numbers are pixels.
+        Physical size, if the source has it and the other numbers are pixels.
     sensor : str
-        What the source calls it.
+        Its name in the source.
     unit : {"px", "mm"}
     """
 
@@ -121,14 +121,14 @@ class Lens:
 
     @property
     def pixel_size(self) -> float:
-        """The length of a pixel in the unit of the lens, nominal where nothing tells it."""
+        """Size of a pixel in the unit of the lens; nominal if it is not known."""
         if self.unit == "px":
             return 1.0
         return self.pixel_size_mm or max(self.width, self.height) / NOMINAL_WIDTH_PX
 
     @property
     def focal_px(self) -> float:
-        """The focal length in pixels, nominal where nothing tells how large they are."""
+        """Focal length in pixels; nominal if their size is not known."""
         if self.unit == "px" or self.pixel_size_mm is not None:
             return self.focal / self.pixel_size
         return self.focal / max(self.width, self.height) * NOMINAL_WIDTH_PX
@@ -136,7 +136,7 @@ class Lens:
 
 @dataclass(frozen=True, eq=False)
 class GnssPositions:
-    """Where the GNSS said that the projection centres were, beside where they were adjusted to.
+    """GNSS positions of the projection centres.
 
     Attributes
     ----------
@@ -260,7 +260,7 @@ class WaterMesh:
     triangles : array, shape (t, 3)
         Row numbers of `vertices`.
     name : str
-        Where it came from.
+        Its file.
     """
 
     vertices: FloatArray
@@ -275,8 +275,8 @@ class WaterMesh:
 class WaterRaster:
     """Heights on a regular grid, bilinear between the centres of the cells.
 
-    A place is known where all four centres around it are; in the outer half of the cells at
-    the edge the outermost four go on. So a raster without gaps covers exactly its cells.
+    The height of a place is known if those of all four centres around it are. In the outer half of
+    the cells at the edge it is extrapolated, so that a raster without gaps covers all its cells.
 
     Attributes
     ----------
@@ -287,7 +287,7 @@ class WaterRaster:
     cell_m : tuple of 2 float
         Width and height of a cell.
     name : str
-        Where it came from.
+        Its file.
     """
 
     height_m: FloatArray
@@ -383,20 +383,20 @@ class GroundControl:
     sigma_m : array, shape (m, 3)
         Their standard deviations along x, y, z.
     is_check : array of bool, shape (m,)
-        Points that are held out of an adjustment, to check it.
+        Check points, which an adjustment does not use.
     under_water : array of bool, shape (m,)
-        Points of which the survey says that they lie under water.
+        Points under water, according to the survey.
     point, camera : array of int, shape (o,)
         Row of `names` and row of the cameras of each measurement in an image.
     image_xy : array, shape (o, 2)
-        Where, in the unit of the lens, from the upper left corner of the image.
+        Image coordinates in the unit of the lens, from the upper left corner.
     sigma_px : array, shape (o,)
         Standard deviations of u and v.
     crs : str or None
-        None where the source does not say.
+        None if the source does not say.
     on : tuple of str, length m or 0
-        On which surface each point lies: ``water``, the name of a plane, or empty. Those on one
-        may be without coordinates: NaN, and infinite standard deviations.
+        The surface of each point: ``water``, the name of a plane, or empty. Points on a surface may
+        have no coordinates: NaN, and infinite standard deviations.
     on_sigma_m : array, shape (m,) or (0,)
         Standard deviation of their distance from it.
     """
@@ -436,7 +436,7 @@ class GroundControl:
 
 
 class Outcome(IntEnum):
-    """What became of a point, and why."""
+    """Whether a point was corrected, and why not."""
 
     LAND = 0
     CORRECTED = 1
@@ -457,12 +457,12 @@ PART_POINTS = 32_768
 class Correction:
     """The result for n points, one row per input point; zero on land.
 
-    Where the points were made with cameras that were adjusted since, land has a shift too.
+    If the cameras were adjusted after the points were reconstructed, land has a shift too.
 
     Attributes
     ----------
     apparent_xyz : array, shape (n, 3)
-        The points as they came, metres, world frame.
+        Apparent points, metres, world frame.
     shift_m : array, shape (n, 3)
         True minus apparent.
     outcome : array of uint8, shape (n,)
@@ -477,21 +477,21 @@ class Correction:
     incidence_deg : array, shape (n,)
         The largest incidence angle in air among the rays used.
     sigma_z_m : array, shape (n,)
-        Standard error of Z: what the options ``sigma_...`` come to by the law of propagation, and
-        what the cloud itself tells, where it has enough points: mismatches, and by how much other
-        ways to make such a cloud would have the bed elsewhere (`pcfix.refract.reconstructions`).
+        Standard error of Z: the options ``sigma_...`` by the law of error propagation and, in
+        clouds with enough points, matching noise and the difference to other reconstruction types
+        (`pcfix.refract.reconstructions`).
     camera_used : array of bool, shape (k,)
-        Which cameras gave at least one ray.
+        Cameras with at least one ray.
     water_known : array of bool, shape (n,)
         Whether the water surface has a height above the point.
     lowest_water_m : float
         The lowest height of the water surface above any point; infinite where none is known.
     covariance_m2 : array, shape (n, 6), or None
-        The same for all coordinates: xx, xy, xz, yy, yz, zz; see `pcfix.refract.uncertainty`.
-        None where it was not asked for.
+        Covariances of the coordinates: xx, xy, xz, yy, yz, zz; see `pcfix.refract.uncertainty`.
+        None if they were not requested.
     unsure : array of bool, shape (n,), or None
-        Corrected points that flat obliques alone see, and no list says which images made them;
-        see `pcfix.refract.batch.Batch.seen_flat`. None where the option `unsure` does not ask.
+        Corrected points that only oblique images see, without a view list; see
+        `pcfix.refract.batch.Batch.seen_flat`. None if the option `unsure` is ``keep``.
     """
 
     apparent_xyz: FloatArray
@@ -509,10 +509,10 @@ class Correction:
     unsure: BoolArray | None = None
 
     def parts(self) -> Iterator[tuple[slice, Correction]]:
-        """Yield the rows and the results of some points after others, as many as caches hold.
+        """Yield consecutive rows and their results, without covariances.
 
-        What goes over the points more than once is several times as fast on them. Covariances stay
-        out.
+        The rows fit into the processor's cache: several operations on them are much faster than on
+        all points.
         """
         per_point = [
             name for name, value in vars(self).items()
@@ -525,7 +525,7 @@ class Correction:
 
     @cached_property
     def xyz(self) -> FloatArray:
-        """True points, metres, world frame; land and uncorrected points as they came."""
+        """Corrected points, metres, world frame; land and uncorrected points are apparent ones."""
         xyz = self.apparent_xyz.copy()
         xyz[self.moved] += self.shift_m[self.moved]
         return xyz
@@ -537,16 +537,16 @@ class Correction:
 
     @property
     def corrected(self) -> BoolArray:
-        """Points that refraction was taken out of."""
+        """Corrected points."""
         return np.asarray(self.outcome == Outcome.CORRECTED)
 
     @property
     def uncorrected(self) -> BoolArray:
-        """Points that should have been moved and could not."""
+        """Submerged points that could not be corrected."""
         return np.asarray(self.outcome > Outcome.CORRECTED)
 
     @cached_property
     def moved(self) -> BoolArray:
-        """Points with a shift: the corrected ones, and land that adjusted cameras took along."""
+        """Points with a shift: corrected ones, and land after a transfer to adjusted cameras."""
         x, y, z = self.shift_m.T  # axis by axis: numpy is slow along the short one
         return np.asarray(self.corrected | (x != 0.0) | (y != 0.0) | (z != 0.0))

@@ -8,7 +8,7 @@ surface: all points are below it, whatever their height, and have no depth.
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass, field, replace
+from dataclasses import astuple, dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -274,10 +274,8 @@ def _through_port(plan: Plan, batch: Batch, rows: IntArray) -> Correction:
     return _spread(batch, rows, found, np.zeros(len(batch)), np.ones(len(batch), np.bool_))
 
 
-_PER_POINT = (
-    "shift_m", "outcome", "ray_count", "ray_miss_m", "incidence_deg", "sigma_z_m", "covariance_m2",
-    "unsure",
-)  # fmt: skip
+_PER_POINT = {one.name for one in fields(Correction)} & {*Intersection._fields} - {"camera_used"}
+"""Results for each point, which methods return for the submerged ones."""
 
 
 def _spread(

@@ -207,25 +207,8 @@ def read_blocks(inputs: Inputs, cloud_crs: str | CRS | None) -> CameraInputs:
         return CameraInputs(cameras, views, cameras, None)
     original, adjusted = both_models(inputs)
     cameras, _ = adjusted.block(cloud_crs)
-    try:
-        listed, views = original.block(cloud_crs)
-    except InputError:  # a view list does not fit cameras in another place
-        _refuse_apart(replace(original, views=None).block(cloud_crs)[0], cameras)
-        raise
-    _refuse_apart(listed, cameras)
+    listed, views = original.block(cloud_crs)
     return CameraInputs(cameras, views, listed, paired(listed, cameras))
-
-
-def _refuse_apart(original: Cameras, adjusted: Cameras) -> None:
-    """Refuse two models in different places."""
-    centres = original.centres[_rows(original.labels, adjusted.labels)]
-    apart = float(np.median(np.linalg.norm(adjusted.centres - centres, axis=1)))
-    if apart > np.ptp(np.vstack([centres, adjusted.centres]), axis=0).max() / 2.0:
-        words = (
-            f"--adjusted-from: its cameras are {apart:,.0f} m from the adjusted ones. Give the"
-            " offset of the shifted one: --cameras-offset counts for the file that has no CRS."
-        )
-        raise GeometryError("adjusted_from.apart", words, apart_m=apart)
 
 
 def both_models(inputs: Inputs) -> tuple[Inputs, Inputs]:

@@ -33,7 +33,6 @@ from pcfix.refract.learning import (
     depth_ratio,
     for_own_water,
     learn_of_sample,
-    learn_of_unlisted,
     resolved,
     submerged_of,
     wants_sample,
@@ -236,15 +235,20 @@ def _estimated_from_cloud(plan: Plan, chunks: Chunks) -> Plan:
     """Resolve every option that is ``auto``, and estimate what the points have in common."""
     survey, view, views = plan.survey, plan.view, plan.views
     given = survey.settings if survey.own_water is not None else plan.options
-    occluder = _occluder(plan, chunks, listed=views is not None)
-    survey = replace(survey, learned=survey.learned._replace(occluder=occluder))
-    plan, some_listed = replace(plan, survey=survey), False
+    some_listed = False
     if views is not None:
         start = views.start if isinstance(views, Views) else views.view_list.start
         some_listed = len(start) <= view.points or not bool((np.diff(start) > 0).all())
-    if not (some_listed or wants_sample(survey, plan.kind)):
+    # listed cameras saw their points, so that nothing hides them
+    may_hide = views is None or survey.settings.occlusion != "auto"
+    wants = some_listed or wants_sample(survey, plan.kind)
+    sample, near, occluder = _scanned(plan, chunks, sample=wants, occluder=may_hide or some_listed)
+    if may_hide:
+        survey = replace(survey, learned=survey.learned._replace(occluder=occluder))
+    plan = replace(plan, survey=survey)
+    if sample is None:
         return plan
-    sample, near = _sample(plan, chunks)
+    sample = replace(sample, survey=survey)
     ties = original_ties(plan.inputs, plan.transfer, view.crs)
     sample, factor = with_factor(sample)
     notes = [*plan.notes, *coded("cloud.depth_factor", [] if factor is None else [factor])]
@@ -264,9 +268,12 @@ def _estimated_from_cloud(plan: Plan, chunks: Chunks) -> Plan:
         return replace(plan, survey=survey, verdicts=verdicts, notes=tuple(notes))
     survey, of_unlisted = with_matcher(sample, ties), plan.of_unlisted
     if some_listed:
-        learned = plan.survey.learned._replace(occluder=_occluder(plan, chunks, listed=False))
-        bare = replace(sample, survey=replace(survey, settings=given, learned=learned))
-        unlisted, of_unlisted = learn_of_unlisted(bare, view.points, ties, hint, near)
+        learned = plan.survey.learned._replace(occluder=occluder)
+        settings = resolved(given, plan.cameras, None)
+        bare = replace(survey, settings=settings, learned=learned)
+        unlisted, of_unlisted = learn_of_sample(
+            replace(sample, survey=bare), view.points, ties, hint, near
+        )
         survey = replace(survey, parts={UNLISTED: unlisted})
     return replace(plan, survey=survey, of_unlisted=of_unlisted, notes=tuple(notes))
 
@@ -289,35 +296,29 @@ def _note_flat(sample: Batch, survey: Survey) -> list[PcfixWarning]:
     return [PcfixWarning("cloud.obliques_only", sentence, share=float(flat.mean()))]
 
 
-def _occluder(plan: Plan, chunks: Chunks, *, listed: bool) -> Occluder | None:
-    """Return the surface of the cloud, if it may hide points from cameras."""
-    survey, view = plan.survey, plan.view
-    if listed and survey.settings.occlusion == "auto":
-        return None  # listed cameras saw their points
-    from pcfix.refract.occlusion import OccluderBuilder, wants_occlusion
+def _scanned(
+    plan: Plan, chunks: Chunks, *, sample: bool, occluder: bool
+) -> tuple[Batch | None, Near | None, Occluder | None]:
+    """Read the whole cloud once, for a sample of it and for the surface that hides points.
 
-    if not (view.points and wants_occlusion(survey.cameras, survey.settings)):
-        return None
-    builder = OccluderBuilder(view.low, view.high, view.points)
-    for points in chunks():
-        builder.add(points.xyz, points.classes)
-    return builder.build()
-
-
-def _sample(plan: Plan, chunks: Chunks) -> tuple[Batch, Near | None]:
-    """Return points of the whole cloud, evenly spread over its order, without noise.
-
-    If these may be too far apart to detect the reconstruction type, submerged points in squares
-    too.
+    The sample is evenly spread over the order of the cloud, without noise. If its points may be too
+    far apart to detect the reconstruction type, submerged points in squares are returned too.
     """
-    view, survey = plan.view, plan.survey
+    view, survey, builder = plan.view, plan.survey, None
+    if occluder:
+        from pcfix.refract.occlusion import OccluderBuilder, wants_occlusion
+
+        if view.points and wants_occlusion(survey.cameras, survey.settings):
+            builder = OccluderBuilder(view.low, view.high, view.points)
+    if not sample and builder is None:
+        return None, None, None
     area_m2 = np.prod(np.maximum(np.subtract(view.high, view.low)[:2], 1.0))
     dense = BED_POINTS_A_M2 * float(area_m2)
     dense = dense if np.isfinite(dense) else MOST_BED_POINTS  # unknown bounds
     step = max(1, view.points // int(np.clip(dense, FEWEST_BED_POINTS, MOST_BED_POINTS)))
     near_step = max(1, view.points // int(max(dense, FEWEST_BED_POINTS)))
     squares = None
-    if near_step < step:
+    if sample and near_step < step:
         centres = survey.cameras.centres
         unknown = np.full(len(centres), np.nan)
         above = centres[:, 2] - surface_above(survey.water, centres, unknown).height_m
@@ -331,8 +332,15 @@ def _sample(plan: Plan, chunks: Chunks) -> tuple[Batch, Near | None]:
 
     taken, row = list[Batch](), 0
     for points in chunks():
-        taken.append(every(step, row, points))
+        if builder is not None:
+            builder.add(points.xyz, points.classes)
+        if sample:
+            taken.append(every(step, row, points))
         if squares is not None:
             squares.add(submerged_of(every(near_step, row, points)))
         row += len(points.xyz)
-    return stacked(taken), None if squares is None else Near(squares.all(), near_step)
+    return (
+        stacked(taken) if sample else None,
+        None if squares is None else Near(squares.all(), near_step),
+        None if builder is None else builder.build(),
+    )

@@ -225,22 +225,6 @@ def _learn_of_sources(
     return replace(surveys[most], parts=others), tuple(verdicts)
 
 
-def learn_of_unlisted(
-    batch: Batch,
-    points: int,
-    ties: TiePoints | None = None,
-    hint: Hint | None = None,
-    near: Near | None = None,
-) -> tuple[Survey, tuple[Verdict, ...]]:
-    """Do as `learn_of_sample` without view lists, for points that have none.
-
-    `batch.survey.settings` are the original ones, with ``auto``.
-    """
-    settings = resolved(batch.survey.settings, batch.survey.cameras, None)
-    bare = replace(batch, views=None, survey=replace(batch.survey, settings=settings))
-    return learn_of_sample(bare, points, ties, hint, near)
-
-
 def _weighed(sample: Batch, step: float, hint: Hint | None) -> tuple[Survey, tuple[Verdict, ...]]:
     """Resolve ``auto`` and set the model uncertainty, for submerged points without lists."""
     survey = sample.survey
