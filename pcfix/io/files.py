@@ -277,21 +277,13 @@ class Bins:
 
     def read(self, cells: Window) -> FloatArray:
         """Return the points, shape (n, numbers), of all squares that touch a window."""
-        data = bytearray()
-        for offset, points in self._touched(cells):
-            self._stream.seek(offset)
-            data += self._stream.read(points * self._numbers * 8)
-        return np.frombuffer(data).reshape(-1, self._numbers)
-
-    def count(self, cells: Window) -> int:
-        """Return how many points `read` would return."""
-        return sum(points for _, points in self._touched(cells))
-
-    def _touched(self, cells: Window) -> list[tuple[int, int]]:
-        """Return the pieces of all squares that touch a window."""
         first, last = (cells.column, cells.row), (cells.column_stop - 1, cells.row_stop - 1)
         (left, top), (right, bottom) = (
             (np.array((first, last)) - self._corner) // self.side
         ).tolist()
-        columns, rows = range(left, right + 1), range(top, bottom + 1)
-        return [piece for r in rows for c in columns for piece in self._pieces.get((c, r), ())]
+        data = bytearray()
+        for square in ((c, r) for r in range(top, bottom + 1) for c in range(left, right + 1)):
+            for offset, points in self._pieces.get(square, ()):
+                self._stream.seek(offset)
+                data += self._stream.read(points * self._numbers * 8)
+        return np.frombuffer(data).reshape(-1, self._numbers)
