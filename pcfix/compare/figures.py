@@ -357,7 +357,7 @@ def _by_depth(match: Match, pairs: AfterBefore[Pairs], notes: list[PcfixWarning]
     rules, shore_bins = match.settings, tuple[Bin, ...]()
     if match.dry.any():
         dry = kept(match.dry, match.whole.xyz)[:, :2]
-        shore = nearest_distance(kept(wet, after.xy), dry, 2)
+        shore = nearest_distance(kept(wet, after.xy), dry)
         shore_bins = binned(shore, error, error_before, rules.shore_bin_width)
     else:
         text = "The cloud has no dry point, so there are no figures by distance from the shore."

@@ -109,7 +109,7 @@ class Match:
         if len(self.water_points) == 0:
             return None
         height = empty((len(xy),))
-        for rows, _, _, near in nearest_of(xy, self.water_points, 1, 2):
+        for rows, _, near in nearest_of(xy, self.water_points, 1):
             height[rows] = near[:, 0, 2]
         return height
 

@@ -33,7 +33,7 @@ def heights_at(xy: FloatArray, surface: FloatArray, neighbours: int) -> Heights:
     these points lie on a line, or the place far outside them, the height of the nearest is used.
     """
     height, by_nearest = empty((len(xy),)), empty((len(xy),), np.bool_)
-    for rows, here, _, near in nearest_of(xy, surface, neighbours, 2):
+    for rows, here, near in nearest_of(xy, surface, neighbours):
         near[:, :, :2] -= here[:, np.newaxis, :2]
         height[rows], by_nearest[rows] = _plane_at_origin(near)
     return Heights(height, by_nearest)
