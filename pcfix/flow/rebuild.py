@@ -8,7 +8,6 @@ and the DSM of the round before. With the mapping ``exact`` and the true bed, on
 
 from __future__ import annotations
 
-import json
 import shlex
 import shutil
 import time
@@ -25,7 +24,7 @@ import numpy as np
 from pcfix.errors import GeometryError, InputError, PcfixError, PcfixWarning, SettingError
 from pcfix.flow.compare import compare_clouds
 from pcfix.flow.dsm import grid_dsm
-from pcfix.flow.photos import CLOUDS, PhotoBlock, block_of, input_states, map_photos, plain
+from pcfix.flow.photos import CLOUDS, PhotoBlock, block_of, call_record, map_photos, plain
 from pcfix.flow.runner import Progress, check_summary, json_text, write_summary
 from pcfix.io.files import check_input, file_state, read_json, run_logged, write_text
 from pcfix.io.las.writing import write_points
@@ -36,8 +35,6 @@ from pcfix.options.declare import File, taken
 from pcfix.options.photos import PhotosOptions, RebuildOptions
 from pcfix.photos.ortho import blank_in
 from pcfix.photos.stereo import Grey, stereo_cloud
-from pcfix.running import threads
-from pcfix.version import __version__
 from pcfix.water.surface import surface_above
 
 RECORD = "pcfix-rebuild.json"
@@ -189,27 +186,21 @@ def rebuild_rounds(
 
 def _opened(target: Path, given: PhotosOptions) -> dict[str, Any]:
     """Return the record of a folder: the options and inputs, and the rounds that it has."""
-    path = target / RECORD
-    asked = {k: str(v) for k, v in given.as_dict().items() if k not in COMMAND_ONLY}
-    new: dict[str, Any] = {"pcfix": __version__, "asked": asked, "files": input_states(given)}
+    path, new = target / RECORD, call_record(given, COMMAND_ONLY)
+    sentence = ""
     if path.exists() and not given.overwrite:
         old: dict[str, Any] = read_json(path)
-        if {name: old.get(name) for name in new} != json.loads(json.dumps(new)):
-            raise SettingError(
-                "output.exists",
-                f"{target}: has the rounds of another call. Add --overwrite to replace them,"
-                " or give another folder.",
-                path=target,
-            )
-        return old
+        if {name: old.get(name) for name in new} == new:
+            return old
+        sentence = f"{target}: has the rounds of another call."
     for folder in target.glob("round[0-9]*"):
-        if not given.overwrite:
-            raise SettingError(
-                "output.exists",
-                f"{folder}: exists. Add --overwrite, or give another folder.",
-                path=folder,
-            )
-        shutil.rmtree(folder)
+        if given.overwrite:
+            shutil.rmtree(folder)
+        else:
+            sentence = sentence or f"{folder}: exists."
+    if sentence:
+        sentence += " Add --overwrite to replace them, or give another folder."
+        raise SettingError("output.exists", sentence, path=target)
     new["rounds"] = []
     write_text(path, json_text(new), overwrite=True)
     return new

@@ -57,10 +57,9 @@ def grid_window(points: FloatArray, cell: IntArray, window: Window, how: Griddin
             height[cells["points"] == 0] = np.nan
         case method:
             height = cells[method]
-    height, count, spread = (
-        one.reshape(shape) for one in (height, cells["points"], cells["spread"])
+    return Gridded(
+        height.reshape(shape), cells["points"].reshape(shape), cells["spread"].reshape(shape)
     )
-    return Gridded(height, count, spread)
 
 
 def cell_statistics(cell: IntArray, z: FloatArray, size: int) -> dict[str, Any]:
