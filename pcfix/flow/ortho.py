@@ -152,15 +152,15 @@ def _write(
             found = mosaic(xyz, block.photos, block.scene, picture) if len(xyz) else None
             ground += len(xyz)
             if found is not None:
+                colour, is_seen = found
                 tile = np.zeros((bands + 1, window.height, window.width), dtype)
                 most = np.iinfo(dtype).max
-                colour = np.where(found.covered[:, None], found.colour, 0.0)
                 known = known.reshape(window.height, window.width)
                 tile[:-1, known] = np.clip(np.rint(colour), 0, most).T
-                tile[-1, known] = most * found.covered
+                tile[-1, known] = most * is_seen
                 for number, band in enumerate(tile, start=1):
                     rasters.write_part(target, band, window, number)
-                covered += int(found.covered.sum())
+                covered += int(is_seen.sum())
             done += window.height * window.width
             if progress is not None:
                 progress(done, lattice.height * lattice.width)

@@ -165,12 +165,9 @@ def _fitted(one: FloatArray, other: FloatArray, weight: FloatArray) -> FloatArra
     middle, size = one.mean(axis=0), one.std() + 1e-9
     (x, y), (u, v) = ((one - middle) / size).T, ((other - middle) / size).T
     zero, full = np.zeros(len(x)), np.ones(len(x))
-    rows = np.vstack(
-        [
-            np.column_stack([x, y, full, zero, zero, zero, -u * x, -u * y]),
-            np.column_stack([zero, zero, zero, x, y, full, -v * x, -v * y]),
-        ]
-    )
+    of_u = np.column_stack([x, y, full, zero, zero, zero, -u * x, -u * y])
+    of_v = np.column_stack([zero, zero, zero, x, y, full, -v * x, -v * y])
+    rows = np.vstack([of_u, of_v])
     root = np.sqrt(np.tile(weight, 2))
     found = np.linalg.lstsq(rows * root[:, None], np.concatenate([u, v]) * root, rcond=None)[0]
     scale = np.array([[size, 0.0, middle[0]], [0.0, size, middle[1]], [0.0, 0.0, 1.0]])

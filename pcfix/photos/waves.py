@@ -148,31 +148,29 @@ class Displacements:
 
     def __init__(self, median: npt.NDArray[Any], view: View, nodes: Nodes) -> None:
         cv2 = photo_library("cv2")
-        self._median, self._view, self._nodes = grey8(median), view, nodes
+        self._median, self._seen = grey8(median), nodes.seen
         texture = cv2.cornerMinEigenVal(self._median, 7).astype(np.float64)
         weight = texture / (texture + np.median(texture[texture > 0.0]) + 1e-30)
         self._weight = weight.astype(np.float32)
-        gsd = nodes.cell_m / 2.0 * np.ones(2)
         centre = np.append(nodes.xy[len(nodes.xy) // 2], view.level_m)
-        step = np.array([[-gsd[0], 0.0, 0.0], [gsd[0], 0.0, 0.0]]) + centre
-        side = int(np.hypot(*np.diff(_pixels(view, step), axis=0)[0]))
+        ends = centre + np.array([[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0]]) * nodes.cell_m
+        side = int(np.hypot(*np.diff(_pixels(view, ends), axis=0)[0]))
         self._side = (side | 1, side | 1)
         self._flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         self._flow.setFinestScale(0)  # waves are short, and patches of 8 px smooth enough
         self._base = cv2.blur(self._weight, self._side)
+        level = np.full(len(nodes.xy), view.level_m)
+        self._at = (_pixels(view, np.column_stack([nodes.xy, level])) - 0.5).astype(np.float32)
 
     def of(self, frame: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:
         """Return displacements, shape (n, 2), pixels, and weights, shape (n,), at the level."""
         cv2 = photo_library("cv2")
         flow = self._flow.calc(grey8(frame), self._median, None)
         mean = cv2.blur(flow * self._weight[..., None], self._side) / (self._base[..., None] + 1e-9)
-        height = np.full(len(self._nodes.xy), self._view.level_m)
-        at = (_pixels(self._view, np.column_stack([self._nodes.xy, height])) - 0.5).astype(
-            np.float32
-        )
+        at = self._at
         shift = cv2.remap(mean, at[:, :1], at[:, 1:], cv2.INTER_LINEAR)[:, 0]
         weight = cv2.remap(self._base, at[:, :1], at[:, 1:], cv2.INTER_LINEAR)[:, 0]
-        return shift.astype(np.float64), np.where(self._nodes.seen, weight, 0.0).astype(np.float64)
+        return shift.astype(np.float64), np.where(self._seen, weight, 0.0).astype(np.float64)
 
 
 def slopes_of(view: View, xy: FloatArray, height_m: FloatArray, shift_px: FloatArray) -> FloatArray:
@@ -255,8 +253,8 @@ def fit_waves(given: Slopes, depth_m: float) -> Waves:
     spectrum, weight = _Spectrum(given, depth_m), given.weight[..., None]
     chosen, residual = np.empty(0, np.int64), given.slope
     slope, covariance = np.empty(0), np.empty((0, 0))
-    total = max(float((weight * given.slope**2).sum()), 1e-30)
     left = float((weight * given.slope**2).sum())
+    total = max(left, 1e-30)
     for _ in range(ROUNDS):
         # those with most energy that are not chosen, well above that of white noise
         energy = spectrum.energy(residual)
@@ -266,9 +264,8 @@ def fit_waves(given: Slopes, depth_m: float) -> Waves:
         if not len(more):
             break
         chosen = np.concatenate([chosen, more])
-        slope, covariance, residual = _solved(
-            given, spectrum.number[chosen], spectrum.frequency[chosen]
-        )
+        waves = spectrum.number[chosen], spectrum.frequency[chosen]
+        slope, covariance, residual = _solved(given, *waves)
         before, left = left, float((weight * residual**2).sum())
         if before - left < LEAST_GAIN * total:
             break
@@ -337,17 +334,13 @@ class _Spectrum:
         every = np.stack(np.meshgrid(x, y), axis=2).reshape(-1, 2)
         size = np.hypot(*every.T)
         longest = 2.0 * given.cell_m * max(given.shape)
-        may = (size >= 2.0 * np.pi / longest) & (
-            size <= 2.0 * np.pi / (SHORTEST_CELLS * given.cell_m)
-        )
+        least, most = 2.0 * np.pi / longest, 2.0 * np.pi / (SHORTEST_CELLS * given.cell_m)
+        may = (size >= least) & (size <= most)
         if len(given.time_s) == 1:  # a wave and its opposite look the same
             may &= (every[:, 0] > 0.0) | ((every[:, 0] == 0.0) & (every[:, 1] > 0.0))
-        self._rows = np.flatnonzero(may)
-        self._shape = (rows, columns)
-        self.number = every[may]
-        size = size[may]
-        self._size = size
-        self.frequency = np.sqrt(GRAVITY * size * np.tanh(size * depth_m))
+        self._rows, self._shape = np.flatnonzero(may), (rows, columns)
+        self.number, self._size = every[may], size[may]
+        self.frequency = np.sqrt(GRAVITY * self._size * np.tanh(self._size * depth_m))
 
     def _transformed(self, slope: FloatArray, weight: FloatArray) -> npt.NDArray[np.complex128]:
         """Return the slope along each wave number of a frame, as its Fourier coefficient."""
