@@ -204,8 +204,8 @@ def _height_above(reference: FloatArray, xyz: FloatArray) -> FloatArray:
     gap_m = max(GAP_SPACINGS * mean_spacing_m(reference[:, :2]), LEAST_GAP_M)
     near, error = near_in_plan(xyz[:, :2], reference[:, :2], gap_m), np.full(len(xyz), np.nan)
     if near.any():
-        found = heights_at(xyz[near, :2], reference, min(NEIGHBOURS, len(reference)))
-        error[near] = xyz[near, 2] - found.height_m
+        height, _ = heights_at(xyz[near, :2], reference, min(NEIGHBOURS, len(reference)))
+        error[near] = xyz[near, 2] - height
     return error
 
 
