@@ -31,8 +31,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.model import Cameras, FloatArray, IntArray, Lens, Views
-from pcfix.simulate.sight import Part, Partners, Sight, starts_of
+from pcfix.model import Cameras, FloatArray, IntArray, Lens
+from pcfix.simulate.sight import Part, Partners, Sight
 from pcfix.simulate.tracing import bed_points, piercing_points_of_planes, project, rotations_of
 
 AVERAGED_WITHIN = 0.012
@@ -107,41 +107,17 @@ def fuse_depth_maps(
     A place with fewer than three matching depth maps is not moved and has no cameras. `normals`,
     shape (n, 3), are unit normals of the true surface; `rng` makes noise and selects points.
     """
-    matching = _matching(sight, normals, partners, rng)
-    luck = rng.uniform(0.0, 1.0, len(sight.point))
-    place = sight.intersected(sight.ideal)
-    maps = depth_maps(matching, place)
-    seed, group = _groups(matching, maps, luck)
-    seeded = np.flatnonzero(seed >= 0)
-    place[seeded] = maps.points(seed[seeded], maps.averaged[seed[seeded]])
-    maps = depth_maps(matching, place)
-    rows = np.flatnonzero((group >= 0) & (group == seed[sight.point]))
-    # without those whose depth is not that of their point's place
-    rig = sight.rig
-    _, z = project(place[sight.point[rows]], rig.given, sight.camera[rows], rig.optics.lens)
-    rows = rows[np.abs(maps.averaged[rows] - z) < AGREE * z]
-    count = np.bincount(sight.point[rows], minlength=len(seed))
-    rows = rows[count[sight.point[rows]] >= LEAST_FUSED]
-    point, weight = sight.point[rows], 1.0 / maps.averaged[rows] ** 2
-    xyz = maps.points(rows, maps.averaged[rows])
-    fused, true = (_means(v, weight, point, sight.truth) for v in (xyz, maps.shown[rows]))
-    views = Views(starts_of(point, len(fused)), sight.camera[rows], weight.astype(np.float32))
-    return Part(fused, true, views)
-
-
-def _matching(
-    sight: Sight, normals: FloatArray, partners: Partners, rng: np.random.Generator
-) -> Matching:
-    rig, rows = sight.rig, sight.rows()
+    rig, row_of = sight.rig, sight.rows()
 
     def there(table: IntArray) -> IntArray:
+        """Return the rows of the images that a table names for the image of each row."""
         others = table[sight.camera]
-        return np.where(others >= 0, rows[sight.point[:, None], others], -1)
+        return np.where(others >= 0, row_of[sight.point[:, None], others], -1)
 
     partner = there(partners.matched)
     partner[(partner >= 0).sum(axis=1) < LEAST_PARTNERS] = -1
     points, centres = sight.truth[sight.point], rig.true.centres[sight.camera]
-    return Matching(
+    matching = Matching(
         sight,
         rig.water.tangent_planes(points, centres, sight.camera),
         normals,
@@ -152,6 +128,24 @@ def _matching(
         rng.normal(0.0, rig.image_noise_px, (*partner.shape, 2)),
         rng.gumbel(0.0, COST_NOISE * rig.image_noise_px**2, partner.shape),
     )
+    luck = rng.uniform(0.0, 1.0, len(sight.point))
+    place = sight.intersected(sight.ideal)
+    maps = depth_maps(matching, place)
+    seed, group = _groups(matching, maps, luck)
+    seeded = np.flatnonzero(seed >= 0)
+    place[seeded] = maps.points(seed[seeded], maps.averaged[seed[seeded]])
+    maps = depth_maps(matching, place)
+    rows = np.flatnonzero((group >= 0) & (group == seed[sight.point]))
+    # without those whose depth is not that of their point's place
+    _, z = project(place[sight.point[rows]], rig.given, sight.camera[rows], rig.optics.lens)
+    rows = rows[np.abs(maps.averaged[rows] - z) < AGREE * z]
+    count = np.bincount(sight.point[rows], minlength=len(seed))
+    rows = rows[count[sight.point[rows]] >= LEAST_FUSED]
+    point, weight = sight.point[rows], 1.0 / maps.averaged[rows] ** 2
+    xyz = maps.points(rows, maps.averaged[rows])
+    fused, true = (_means(v, weight, point, sight.truth) for v in (xyz, maps.shown[rows]))
+    count = np.bincount(point, minlength=len(fused))
+    return Part(fused, true, sight.camera[rows], count, weight.astype(np.float32))
 
 
 def depth_maps(matching: Matching, place: FloatArray) -> Maps:
@@ -266,8 +260,14 @@ def _averaged(matching: Matching, maps: Maps) -> tuple[FloatArray, FloatArray]:
     rows = np.arange(len(maps.depth))
     total, shown, agreeing = maps.depth.copy(), maps.seen.copy(), np.ones(len(rows))
     disagreeing = np.zeros(len(rows))
+    normal = matching.normals[matching.sight.point]
     for neighbour in matching.averaged.T:
-        depth = _met(matching, maps, neighbour)
+        # where each ray meets the neighbour's map: a plane parallel to the bed, through its point
+        own = np.flatnonzero(neighbour >= 0)
+        there = maps.points(neighbour[own], maps.depth[neighbour[own]])
+        gap = np.einsum("mi,mi->m", there - maps.origin[own], normal[own])
+        depth = np.full(len(rows), np.nan)
+        depth[own] = gap / np.einsum("mi,mi->m", maps.ray[own], normal[own])
         agrees = np.abs(depth - maps.depth) < AVERAGED_WITHIN * maps.depth
         total[agrees] += depth[agrees]
         shown[agrees] += maps.seen[neighbour[agrees]]
@@ -276,20 +276,6 @@ def _averaged(matching: Matching, maps: Maps) -> tuple[FloatArray, FloatArray]:
     kept = (agreeing > 1.0) & (agreeing > disagreeing) & (agreeing + disagreeing > LEAST_COVER)
     depth = np.where(kept, total / agreeing, np.nan)
     return depth, shown / agreeing[:, None]
-
-
-def _met(matching: Matching, maps: Maps, other: IntArray) -> FloatArray:
-    """Return at what depth each ray meets the map of another row, NaN for none.
-
-    There the other map is a plane parallel to the bed, through its own point at its depth.
-    """
-    met = np.full(len(maps.ray), np.nan)
-    rows = np.flatnonzero(other >= 0)
-    there = maps.points(other[rows], maps.depth[other[rows]])
-    normal = matching.normals[matching.sight.point[rows]]
-    gap = np.einsum("mi,mi->m", there - maps.origin[rows], normal)
-    met[rows] = gap / np.einsum("mi,mi->m", maps.ray[rows], normal)
-    return met
 
 
 def _groups(matching: Matching, maps: Maps, luck: FloatArray) -> tuple[IntArray, IntArray]:
@@ -303,7 +289,11 @@ def _groups(matching: Matching, maps: Maps, luck: FloatArray) -> tuple[IntArray,
     for camera in np.argsort(-matching.known, kind="stable"):
         seeds = np.flatnonzero((sight.camera == camera) & free)
         there = matching.fused[seeds]
-        distance = _beyond(matching, maps, seeds, there)
+        # how far beyond the points of the seeds these maps are, relative
+        at = maps.points(seeds, maps.averaged[seeds])[:, None]
+        normal = matching.normals[sight.point[seeds]][:, None]
+        reach = (maps.averaged[there][..., None] * maps.ray[there] * normal).sum(axis=2)
+        distance = reach / ((at - maps.origin[there]) * normal).sum(axis=2) - 1.0
         usable = (there >= 0) & free[there]
         members = usable & (np.abs(distance) < AGREE)
         kept = 1 + members.sum(axis=1) >= LEAST_FUSED
@@ -317,14 +307,6 @@ def _groups(matching: Matching, maps: Maps, luck: FloatArray) -> tuple[IntArray,
         luckier = (chosen[point] < 0) | (luck[seeds] > luck[chosen[point]])
         chosen[point[luckier]] = seeds[luckier]
     return chosen, group
-
-
-def _beyond(matching: Matching, maps: Maps, seeds: IntArray, there: IntArray) -> FloatArray:
-    """Return how far beyond the points of seeds the maps of other rows are, relative, (s, 12)."""
-    at = maps.points(seeds, maps.averaged[seeds])[:, None]
-    normal = matching.normals[matching.sight.point[seeds]][:, None]
-    reach = (maps.averaged[there][..., None] * maps.ray[there] * normal).sum(axis=2)
-    return np.asarray(reach / ((at - maps.origin[there]) * normal).sum(axis=2) - 1.0)
 
 
 def _means(

@@ -24,6 +24,7 @@ from pcfix.simulate.sight import (
     neighbour_table,
     openmvs_partners,
     see,
+    starts,
 )
 from pcfix.simulate.terrain import Terrain
 from pcfix.simulate.tracing import Water, Waves
@@ -172,14 +173,12 @@ def simulate_scene(
     lidar = points_on(terrain, round(area_m2 * chosen.lidar_per_m2), rng)
     lidar[:, 2] += rng.normal(0.0, chosen.lidar_noise_m, len(lidar))
     cameras = cameras_in_world(given.cameras)
+    columns: Any = zip(*parts, strict=True)
+    whole = Part(*(None if one[0] is None else np.concatenate(one) for one in columns))
     return Scene(
-        apparent_xyz=np.vstack([part.xyz for part in parts]) + ORIGIN_M,
-        true_xyz=np.vstack([part.true_xyz for part in parts]) + ORIGIN_M,
-        views=Views(
-            _starts([part.views.start for part in parts]),
-            _joined([part.views.camera for part in parts]),
-            _joined([part.views.weight for part in parts]),
-        ),
+        apparent_xyz=whole.xyz + ORIGIN_M,
+        true_xyz=whole.true_xyz + ORIGIN_M,
+        views=Views(starts(whole.counts), whole.camera, whole.weight),
         cameras=cameras,
         yaw_pitch_roll_deg=given.yaw_pitch_roll_deg,
         lidar_xyz=lidar + ORIGIN_M,
@@ -193,20 +192,9 @@ def simulate_scene(
         true_cameras=cameras if given is flown else cameras_in_world(flown.cameras),
         true_yaw_pitch_roll_deg=flown.yaw_pitch_roll_deg,
         neighbours=partners.matched if isinstance(partners, Partners) else partners,
-        pairs=_joined([part.pairs for part in parts]),
-        pairs_start=_starts([part.pairs_start for part in parts]),
+        pairs=whole.pairs,
+        pairs_start=None if whole.pair_counts is None else starts(whole.pair_counts),
     )
-
-
-def _joined(arrays: list[Any]) -> Any:
-    """Return the arrays of all parts in one; None if they have none."""
-    return None if arrays[0] is None else np.concatenate(arrays)
-
-
-def _starts(arrays: list[Any]) -> Any:
-    """Return where the rows of each point of all parts begin."""
-    counts = _joined([None if one is None else np.diff(one) for one in arrays])
-    return None if counts is None else np.concatenate([[0], np.cumsum(counts)])
 
 
 class Site(NamedTuple):
@@ -277,7 +265,7 @@ def _observe(truth: FloatArray, site: Site, partners: Partners | IntArray | None
     sight = see(truth, rig, streams.detection)
     if partners is None:
         apparent = sight.intersected(rig.observed(sight.ideal, streams.main))
-        return Part(apparent, truth, Views(sight.start, sight.camera))
+        return Part(apparent, truth, sight.camera, np.diff(sight.start))
     if isinstance(partners, Partners):
         normals = site.terrain.normals(*truth[:, :2].T)
         return fuse_depth_maps(sight, normals, partners, streams.matching)
