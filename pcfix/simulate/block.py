@@ -67,10 +67,8 @@ def _plan(extent_m: tuple[float, float], chosen: SceneSettings) -> tuple[FloatAr
         angles.append(np.column_stack([yaw, np.zeros((len(nadir), 2))]))
     pitch = OBLIQUE_PITCH_DEG if chosen.obliques_deg is None else chosen.obliques_deg
     back = chosen.flying_height_m * np.tan(np.radians(pitch))
-    directions, share = (
-        chosen.oblique_directions if chosen.has_obliques else 0,
-        chosen.oblique_share,
-    )
+    directions = chosen.oblique_directions if chosen.has_obliques else 0
+    share = chosen.oblique_share
     stretch = 1.0  # of the steps of a ring
     if share is not None and share != 1.0:
         density = share / (1.0 - share) / chosen.oblique_directions

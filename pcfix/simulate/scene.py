@@ -173,8 +173,10 @@ def simulate_scene(
     lidar = points_on(terrain, round(area_m2 * chosen.lidar_per_m2), rng)
     lidar[:, 2] += rng.normal(0.0, chosen.lidar_noise_m, len(lidar))
     cameras = cameras_in_world(given.cameras)
-    columns: Any = zip(*parts, strict=True)
-    whole = Part(*(None if one[0] is None else np.concatenate(one) for one in columns))
+    columns: list[Any] = [
+        None if one[0] is None else np.concatenate(one) for one in zip(*parts, strict=True)
+    ]
+    whole = Part(*columns)
     return Scene(
         apparent_xyz=whole.xyz + ORIGIN_M,
         true_xyz=whole.true_xyz + ORIGIN_M,
