@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.clean.neighbours import PIECE_ROWS, SLACK, Neighbours, height_quartiles, make_tiles
-from pcfix.errors import InputError
+from pcfix.errors import bad_file
 from pcfix.model import BoolArray, FloatArray, IntArray, WaterSurface
 from pcfix.options.steps import LEAST_NEIGHBOURS, CleanRules
 from pcfix.running import threads
@@ -77,20 +77,18 @@ def flag_neighbours(
     least = max(LEAST_NEIGHBOURS, settings.nearest)
     used, submerged = int(cloud.used.sum()), int(cloud.submerged.sum())
     if used < least + 1:
-        raise InputError(
-            "cloud.too_few_points",
-            f"{name}: has {used:,} points that are neither withheld nor noise, too few for a"
-            f" neighbourhood of {least}. Use fewer neighbours, or skip the cleaning.",
-            path=name, points=used, least=least + 1,
-        )  # fmt: skip
-    if settings.below_or_floating and 0 < submerged < settings.bed_neighbours + 1:
-        raise InputError(
-            "cloud.too_few_points",
-            f"{name}: has {submerged:,} submerged points, too few for a neighbourhood of"
-            f" {settings.bed_neighbours} on the bed. Use fewer bed-neighbours, or switch off the"
-            " tests below and floating.",
-            path=name, points=submerged, least=settings.bed_neighbours + 1,
-        )  # fmt: skip
+        sentence = (
+            f"has {used:,} points that are neither withheld nor noise, too few for a neighbourhood"
+            f" of {least}. Use fewer neighbours, or skip the cleaning."
+        )
+        raise bad_file(name, "cloud.too_few_points", sentence, points=used, least=least + 1)
+    least = settings.bed_neighbours
+    if settings.below_or_floating and 0 < submerged < least + 1:
+        sentence = (
+            f"has {submerged:,} submerged points, too few for a neighbourhood of {least} on the"
+            " bed. Use fewer bed-neighbours, or switch off the tests below and floating."
+        )
+        raise bad_file(name, "cloud.too_few_points", sentence, points=submerged, least=least + 1)
     distances = flag_sparse(cloud, settings, progress) if settings.nearest else {}
     if settings.below_or_floating and submerged:
         flag_off_bed(cloud, settings, progress)

@@ -294,12 +294,12 @@ def _pairs(match: Match) -> AfterBefore[Pairs]:
     name = match.whole.name if sparse else match.reference.name
     count = len(match.cloud if sparse else match.reference.xyz)
     if count < k:
-        raise GeometryError(
-            "cloud.too_few_points" if sparse else "reference.too_few_points",
+        sentence = (
             f"{name}: {count} points are too few for planes through {k} neighbours. Give more"
-            " points (at least 6, with --neighbours 6).",
-            path=name, points=count, least=k,
-        )  # fmt: skip
+            " points (at least 6, with --neighbours 6)."
+        )
+        code = f"{'cloud' if sparse else 'reference'}.too_few_points"
+        raise GeometryError(code, sentence, path=name, points=count, least=k)
 
     def pairs(xyz: FloatArray) -> Pairs:
         if sparse:

@@ -268,14 +268,9 @@ def cloud_to_cloud(xyz: FloatArray, reference: FloatArray) -> FloatArray:
     Both have the shape (n, 3), metres, world frame. The distance has no sign. Where the two clouds
     sample a surface at different places it is at least about half the spacing of the reference.
     """
-    near = CellSearch(_tiles(reference))
-    if len(xyz) <= 2 * TILE_POINTS:
-        return near.nearest(xyz, 1)[0][:, 0]
-    asked = _tiles(xyz)
-    distance = empty((len(xyz),))
+    near, asked, distance = CellSearch(_tiles(reference)), _tiles(xyz), empty((len(xyz),))
     for piece in asked.pieces(2 * TILE_POINTS):
-        found = near.nearest(asked.xyz[piece], 1)[0][:, 0]
-        distance[asked.row[piece]] = found
+        distance[asked.row[piece]] = near.nearest(asked.xyz[piece], 1)[0][:, 0]
     return distance
 
 

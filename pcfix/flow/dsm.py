@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.errors import InputError, PcfixWarning, SettingError
+from pcfix.errors import PcfixWarning, SettingError, bad_file
 from pcfix.flow.runner import Progress, file_task, write_summary
 from pcfix.grid.delaunay import fill_holes, margin_cells
 from pcfix.grid.heights import Gridding, as_uncertainty, grid_window
@@ -374,22 +374,18 @@ class SortedPoints:
 def _dimension_of(source: LasSource, what: str) -> str | None:
     """Return the dimension that a raster is made of, None for heights."""
     name = None if what == "height" else DIMENSIONS.get(what, what)
-    known = list(source.header.point_format.dimension_names)
-    if name is None or name in known:
+    names = list(source.header.point_format.dimension_names)
+    if name is None or name in names:
         return name
     if what in DIMENSIONS:
-        raise InputError(
-            "cloud.no_dimension",
-            f"{source.path}: has no dimension {name}, which --what {what} needs. Correct the cloud"
-            " first, with --dimensions all.",
-            path=source.path, dimension=name,
-        )  # fmt: skip
-    raise SettingError(
-        "option.choice",
-        f"{source.path}: has no dimension {what}. --what is one of height, {', '.join(DIMENSIONS)},"
-        f" {', '.join(known)}.",
-        option="what", value=what,
-    )  # fmt: skip
+        sentence = (
+            f"has no dimension {name}, which --what {what} needs. Correct the cloud first, with"
+            " --dimensions all."
+        )
+        raise bad_file(source.path, "cloud.no_dimension", sentence, dimension=name)
+    known = ", ".join(("height", *DIMENSIONS, *names))
+    sentence = f"{source.path}: has no dimension {what}. --what is one of {known}."
+    raise SettingError("option.choice", sentence, option="what", value=what)
 
 
 def _wanted(points: laspy.ScaleAwarePointRecord, surface: SurfaceChoice) -> BoolArray:
@@ -421,17 +417,13 @@ def _bulk_of(cloud: Path | Tiles, count: int, resolution_m: float) -> FloatArray
 
 
 def _refuse_none(points: int, source: Path | Tiles, surface: SurfaceChoice) -> None:
-    if points:
-        return
-    if surface == "bed":
-        raise InputError(
-            "dsm.no_bed",
-            f"{source}: has no point of class {BATHYMETRIC_POINT} (bed) that is not withheld."
-            " Correct the cloud first, or use --surface all.",
-            path=source,
+    """Raise an error if no point is left."""
+    if points == 0 and surface == "bed":
+        sentence = (
+            f"has no point of class {BATHYMETRIC_POINT} (bed) that is not withheld. Correct the"
+            " cloud first, or use --surface all."
         )
-    raise InputError(
-        "cloud.all_withheld",
-        f"{source}: all points are noise (classes 7 and 18) or withheld. Classify it again.",
-        path=source,
-    )
+        raise bad_file(source, "dsm.no_bed", sentence)
+    if points == 0:
+        sentence = "all points are noise (classes 7 and 18) or withheld. Classify it again."
+        raise bad_file(source, "cloud.all_withheld", sentence)

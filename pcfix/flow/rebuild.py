@@ -109,9 +109,8 @@ def rebuild_rounds(
     started = time.perf_counter()
     given = taken(PhotosOptions, options, keywords, "rebuild_rounds")
     if given.rebuild is None:
-        raise SettingError(
-            "option.missing", "--rebuild is missing. Give stereo, or a command.", option="rebuild"
-        )
+        sentence = "--rebuild is missing. Give stereo, or a command."
+        raise SettingError("option.missing", sentence, option="rebuild")
     paths, target = photographs_in(Path(images)), Path(out)
     check_summary(given)
     if given.reference is not None:
@@ -247,10 +246,8 @@ def _reconstruct(
             "rebuild.failed",
             f"--rebuild {wrong} in round {number}: {' / '.join(last) or 'no message'} (see {log})."
             " Correct it and call again, which resumes here.",
-            exit_code=code,
-            round=number,
-            log=log,
-        )
+            exit_code=code, round=number, log=log,
+        )  # fmt: skip
 
 
 def _difference(block: PhotoBlock, cloud: Path, dsm: Path, before: Path) -> Round:
@@ -279,11 +276,8 @@ def round_of(
     known = np.isfinite(difference_m)
     moved = difference_m[known & wet] if (known & wet).any() else difference_m[known]
     if not len(moved):
-        raise GeometryError(
-            "cloud.no_overlap",
-            f"{files[0]}: does not overlap the DSM of the round before. Check its CRS.",
-            path=files[0],
-        )
+        sentence = f"{files[0]}: does not overlap the DSM of the round before. Check its CRS."
+        raise GeometryError("cloud.no_overlap", sentence, path=files[0])
     within = float((np.abs(moved) <= gsd_m).mean())
     mean, sd = float(moved.mean()), float(moved.std())
     return Round(*files, len(moved), round(mean, 5), round(sd, 5), round(within, 5))

@@ -7,6 +7,7 @@ does not depend on other points. All sums are of whole numbers, for the same rea
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,24 +18,16 @@ from pcfix.model import BoolArray, FloatArray, IntArray
 Flags = npt.NDArray[np.uint8]
 
 
+@dataclass(frozen=True)
 class WaterMask:
     """The polygons inside which points may be submerged.
 
     A point on the border, of a hole too, is inside.
-
-    Parameters
-    ----------
-    area : shapely Polygon or MultiPolygon
-        Valid, in the cloud's CRS, metres.
-    name : str
-        For messages.
-    notes : tuple of str
-        Notes of the reader, for the summary.
     """
 
-    def __init__(self, area: Any, name: str = "mask", notes: tuple[str, ...] = ()) -> None:
-        self.area, self.name, self.notes = area, name, notes
-        self.bounds: tuple[float, float, float, float] = area.bounds
+    area: Any  # shapely Polygon or MultiPolygon, valid, in the cloud's CRS, metres
+    name: str = "mask"  # for messages
+    notes: tuple[str, ...] = ()  # of the reader, for the summary
 
     def inside(self, x: FloatArray, y: FloatArray) -> BoolArray:
         """Return which of n plan positions, metres, world frame, are inside."""

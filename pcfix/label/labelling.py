@@ -196,14 +196,14 @@ class Labelling:
             )  # fmt: skip
         if self.mask is None or counts.outside_mask < max(counts.below, 1):
             return
-        west, south, east, north = self.mask.bounds
+        west, south, east, north = bounds = self.mask.area.bounds
         (x0, y0), (x1, y1) = counts.low, counts.high
         raise GeometryError(
             "mask.no_points",
             f"{self.mask.name} (x {west:.1f} to {east:.1f}, y {south:.1f} to {north:.1f}) contains"
             f" none of the points of {name} below the water (x {x0:.1f} to {x1:.1f}, y {y0:.1f} to"
             f" {y1:.1f}). Check the CRS of both, and that the polygons are of water.",
-            path=self.mask.name, points=counts.below, bounds=self.mask.bounds,
+            path=self.mask.name, points=counts.below, bounds=bounds,
         )  # fmt: skip
 
     def report(self, counts: LabelCounts) -> dict[str, Any] | None:

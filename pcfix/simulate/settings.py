@@ -53,17 +53,11 @@ class SceneSettings(SceneOptions):
                 tilt_percent=100 * self.water_tilt,
             )
         if self.neighbours is not None and self.cloud == "tracks":
-            sentence = (
-                "neighbours is for clouds of pairs and depth maps. Give one, or leave it out."
-            )
+            sentence = "neighbours is only for clouds of pairs and depth maps. Leave it out."
             raise SettingError("option.no_use", sentence, option="neighbours")
         if self.oblique_share is not None and not self.has_obliques:
-            raise SettingError(
-                "option.no_use",
-                f"oblique share {self.oblique_share:g} needs obliques. Give the block oblique, or"
-                " their angle.",
-                option="oblique_share",
-            )
+            sentence = f"oblique share {self.oblique_share:g} needs obliques. Give their angle."
+            raise SettingError("option.no_use", sentence, option="oblique_share")
 
     @property
     def has_obliques(self) -> bool:
