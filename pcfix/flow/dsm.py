@@ -275,8 +275,7 @@ def _grid(
 def point_spacing_m(cloud: Path | Tiles, settings: DsmRules) -> float:
     """Return the side of the square that each point of a raster has for itself, metres."""
     with open_cloud(cloud) as source:
-        area, _ = _stated_extent(source, MIN_RESOLUTION_M)
-        near = Occupancy(area, len(source), MIN_RESOLUTION_M)
+        near = Occupancy(_stated_area(source, MIN_RESOLUTION_M), len(source), MIN_RESOLUTION_M)
         for points in source.chunks():
             near.add(coordinates(points)[_wanted(points, settings.surface)])
     _refuse_none(near.points, cloud, settings.surface)
@@ -289,9 +288,9 @@ class SortedPoints:
     Attributes
     ----------
     near : Occupancy
-        How many points there are, and how close together.
+        Number and spacing of the points.
     stray : int
-        How many are left out, as they lie far from all others.
+        Points that are ignored because they lie far from all others.
     lattice : Lattice
 
     Raises
@@ -310,22 +309,19 @@ class SortedPoints:
         """
         resolution = settings.cell_m
         self._resolution_m = resolution
-        area, corner = _stated_extent(source, resolution)
-        self._dimension = _dimension_of(source, settings.what)
-        cells = max(np.sqrt(BIN_POINTS / (len(source) / area)) / resolution, 1.0)
-        side = int(min(2 ** np.floor(np.log2(cells)), BLOCK_CELLS))  # of a square with so many
-        self._bins = Bins(folder, side, cells_of(corner, resolution)[0], 3)
+        area, dimension = _stated_area(source, resolution), _dimension_of(source, settings.what)
+        cells = np.sqrt(BIN_POINTS / (len(source) / area)) / resolution
+        self._bins = Bins(folder, int(np.clip(cells, 1, BLOCK_CELLS)))
         self.near = Occupancy(area, len(source), resolution)
         sparse = area > SPARSE * len(source) * resolution**2
         bulk = _bulk_of(cloud, len(source), resolution) if sparse else None
-        self.stray, first = 0, None
-        done = 0
+        self.stray, first, done = 0, None, 0
         for points in source.chunks():
             xyz = coordinates(points)
-            if self._dimension is not None:
-                xyz[:, 2] = source.dimension(points, self._dimension)
+            if dimension is not None:
+                xyz[:, 2] = source.dimension(points, dimension)
             wanted = _wanted(points, settings.surface) & np.isfinite(xyz[:, 2])
-            if self._dimension == SIGMA_Z:
+            if dimension == SIGMA_Z:
                 wanted &= xyz[:, 2] > 0.0  # others have none
             xyz = xyz[wanted]
             if bulk is not None:
@@ -394,12 +390,10 @@ def _wanted(points: laspy.ScaleAwarePointRecord, surface: SurfaceChoice) -> Bool
     return np.asarray(wanted & ~np.asarray(points["withheld"]).astype(bool))
 
 
-def _stated_extent(source: LasSource, resolution_m: float) -> tuple[float, FloatArray]:
-    """Return area and north-west corner, shape (1, 2), of the header; they need not be right."""
-    low, high = source.header.mins[:2], source.header.maxs[:2]
-    area, corner = float(np.prod(high - low)), np.array([[low[0], high[1]]])
-    area = max(area, resolution_m**2) if np.isfinite(area) else resolution_m**2
-    return area, corner if (np.abs(corner) < 1e9).all() else np.zeros((1, 2))
+def _stated_area(source: LasSource, resolution_m: float) -> float:
+    """Return the area of a cloud as its header states it, which need not be right, m2."""
+    area = float(np.prod(source.header.maxs[:2] - source.header.mins[:2]))
+    return max(area, resolution_m**2) if np.isfinite(area) else resolution_m**2
 
 
 def _bulk_of(cloud: Path | Tiles, count: int, resolution_m: float) -> FloatArray:
