@@ -33,14 +33,7 @@ _ENTRIES = 4_000_000
 
 
 class Neighbours:
-    """Search neighbours among the points of tiles.
-
-    Parameters
-    ----------
-    tiles : Tiles
-    axes : {3, 2}
-        Distances in space, or in plan.
-    """
+    """Search neighbours among the points of tiles, in space (3 axes) or in plan (2 axes)."""
 
     def __init__(self, tiles: Tiles, axes: int) -> None:
         self.tiles, self.axes = tiles, axes
@@ -58,19 +51,10 @@ class Neighbours:
     def nearest(self, xyz: FloatArray, k: int) -> tuple[FloatArray, IntArray]:
         """Return the k nearest points of the tiles, which hold at least k.
 
-        Parameters
-        ----------
-        xyz : array, shape (q, 3)
-            Queries are quicker if these are near to each other.
-        k : int
-
-        Returns
-        -------
-        distance_m : array, shape (q, k)
-            Ascending.
-        place : array of int, shape (q, k)
-            Index in the arrays of the tiles. The order of equally far points is not defined, nor
-            which of them are returned if the last ones are equally far.
+        Queries are quicker if the points, shape (q, 3), are near to each other. Returns distances
+        (m), ascending, and indices in the arrays of the tiles, both of shape (q, k). The order of
+        equally far points is not defined, nor which of them are returned if the last ones are
+        equally far.
         """
         points = np.ascontiguousarray(xyz[:, : self.axes])
         distance = np.full((len(points), k), np.inf)
@@ -240,19 +224,11 @@ def make_tiles(
     """Sort the used points into square tiles.
 
     The tiles cover all but the outermost hundredth of the points, so that no outlier stretches
-    them; points beyond belong to the tile at the edge.
-
-    Parameters
-    ----------
-    xyz : array, shape (n, 3), or (n, 2) in plan
-        Metres, world frame.
-    used : array of bool, shape (n,), optional
-        At least one is true; default all.
-    points : int, optional
-        Points that a tile holds, about; default `POINTS_PER_TILE`.
-    strips : bool
-        Whether to sort the points of a tile along narrow strips. A tree is queried twice as fast in
-        this order: each point finds in the processor's cache what its predecessor needed.
+    them; points beyond belong to the tile at the edge. Points have the shape (n, 3), or (n, 2) in
+    plan, metres, world frame; at least one is used, by default all. A tile holds about `points`, by
+    default `POINTS_PER_TILE`. With `strips` the points of a tile are sorted along narrow strips. A
+    tree is queried twice as fast in this order: each point finds in the processor's cache what its
+    predecessor needed.
     """
     step = max(1, len(xyz) // _SAMPLE)
     sample = xyz[::step] if used is None else xyz[::step][used[::step]]

@@ -64,10 +64,6 @@ def compare_clouds(
         ``x1,y1,x2,y2`` or `pcfix.compare.sections.SectionLine`, `share` texts or pairs, `also`
         texts, pairs or a dict of paths by name.
 
-    Returns
-    -------
-    Comparison
-
     Raises
     ------
     PcfixError

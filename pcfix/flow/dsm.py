@@ -107,10 +107,6 @@ def grid_dsm(
     progress : callable, optional
         Called with (points done, all points); reading and gridding count half each.
 
-    Returns
-    -------
-    DsmSummary
-
     Raises
     ------
     PcfixError
@@ -283,20 +279,11 @@ def point_spacing_m(cloud: Path | Tiles, settings: DsmRules) -> float:
 
 
 class SortedPoints:
-    """The points that a raster is made of, in a folder of the caller, and the raster's lattice.
+    """The points that a raster is made of, in a folder of the caller, and the raster's `lattice`.
 
-    Attributes
-    ----------
-    near : Occupancy
-        Number and spacing of the points.
-    stray : int
-        Points that are ignored because they lie far from all others.
-    lattice : Lattice
-
-    Raises
-    ------
-    PcfixError
-        If no points are left, or the raster would be too large.
+    `near` has the number and spacing of the points; `stray` counts those that are ignored because
+    they lie far from all others. Raises PcfixError if no points are left, or the raster would be
+    too large.
     """
 
     def __init__(

@@ -92,10 +92,6 @@ def plan_flight(
     progress : callable, optional
         Called with (steps done, steps in all).
 
-    Returns
-    -------
-    Plan
-
     Examples
     --------
     >>> import pcfix

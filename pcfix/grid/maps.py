@@ -61,21 +61,15 @@ class Maps:
 
 
 class MapsBuilder:
-    """Sums per cell.
-
-    Parameters
-    ----------
-    low, high : array, shape (2,)
-        Corners of the area in plan, metres.
-    points : int
-        Number of points to come.
-    resolution_m : float, optional
-        Resolution of a raster of the same points; the cells have this size or a multiple of it.
-    """
+    """Sums per cell."""
 
     def __init__(
         self, low: FloatArray, high: FloatArray, points: int, resolution_m: float | None = None
     ) -> None:
+        """Lay out cells between two corners in plan, (2,), metres, for a number of points.
+
+        With the resolution of a raster of the same points, the cells have it or a multiple of it.
+        """
         size = np.maximum(high - low, 1e-3)
         if resolution_m is None:
             sparse_m = np.sqrt(POINTS_PER_CELL * size.prod() / max(points, 1))

@@ -15,18 +15,14 @@ MOST_CELLS = 6_000_000
 class Ground:
     """A surface of land and bed, with heights at the centres of cells.
 
-    Attributes
-    ----------
-    height_m : array, shape (rows, columns)
-        World frame, NaN where unknown; the first row is the northern one.
-    left_m, top_m : float
-        Upper left corner of the upper left cell.
-    middle : array, shape (3,)
-        Origin of the coordinates for ray casting, so that single precision is enough.
+    Coordinates for ray casting count from its `middle`, so that single precision is enough.
     """
 
     def __init__(self, height_m: FloatArray, left_m: float, top_m: float, cell_m: float) -> None:
-        """Build the surface of triangles."""
+        """Build triangles from heights, shape (rows, columns), world frame, NaN where unknown.
+
+        The first row is the northern one; the corner is that of the upper left cell.
+        """
         self.height_m, self.left_m, self.top_m, self.cell_m = height_m, left_m, top_m, cell_m
         rows, columns = height_m.shape
         known = np.isfinite(height_m)
@@ -54,12 +50,8 @@ class Ground:
     def hit(self, origin: FloatArray, direction: FloatArray) -> FloatArray:
         """Return the distance along rays to the ground, metres; infinite where they miss it.
 
-        Parameters
-        ----------
-        origin : array, shape (n, 3) or (3,)
-            Metres, world frame.
-        direction : array, shape (n, 3)
-            Unit vectors. Distances are good to 1e-7 of themselves.
+        Origins, shape (n, 3) or (3,), are in the world frame; directions, shape (n, 3), are unit
+        vectors. Distances are good to 1e-7 of themselves.
         """
         rays = np.empty((len(direction), 6), np.float32)
         rays[:, :3], rays[:, 3:] = origin - self.middle, direction

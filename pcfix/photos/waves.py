@@ -176,17 +176,9 @@ class Displacements:
 def slopes_of(view: View, xy: FloatArray, height_m: FloatArray, shift_px: FloatArray) -> FloatArray:
     """Return the slopes of the surface that displace the bed, by Snell's law in vector form.
 
-    Parameters
-    ----------
-    xy, height_m : array, shape (n, 2) and (n,)
-        Piercing points, world frame.
-    shift_px : array, shape (n, 2)
-        From the pixel of a frame to the pixel of the median that shows the same.
-
-    Returns
-    -------
-    array, shape (n, 2)
-        dz/dx and dz/dy; NaN where the bed is unknown or not under water.
+    `xy`, (n, 2), and `height_m`, (n,), are piercing points, world frame; `shift_px`, (n, 2), leads
+    from the pixel of a frame to the pixel of the median that shows the same. Returns dz/dx and
+    dz/dy, shape (n, 2); NaN where the bed is unknown or not under water.
     """
     pierced = np.column_stack([xy, height_m])
     seen = pierced - view.photo.centre
@@ -202,26 +194,15 @@ def slopes_of(view: View, xy: FloatArray, height_m: FloatArray, shift_px: FloatA
 class Waves:
     """Plane waves and their precision.
 
-    Attributes
-    ----------
-    number : array, shape (m, 2)
-        Wave numbers k, rad/m.
-    frequency : array, shape (m,)
-        w, rad/s.
-    slope, covariance : array, shape (2 m,) and (2 m, 2 m)
-        Amplitudes of the slope (k times that of the height), cosines then sines.
-    left_over_m : float
-        Heights, rms, that correspond to the residual slopes.
-    explained : float
-        Share of the energy of the slopes.
+    Amplitudes are those of the slope (k times that of the height), cosines then sines.
     """
 
-    number: FloatArray
-    frequency: FloatArray
-    slope: FloatArray
-    covariance: FloatArray
-    left_over_m: float
-    explained: float
+    number: FloatArray  # (m, 2), wave numbers k, rad/m
+    frequency: FloatArray  # (m,), w, rad/s
+    slope: FloatArray  # (2 m,), amplitudes
+    covariance: FloatArray  # (2 m, 2 m), of these
+    left_over_m: float  # heights, rms, that correspond to the residual slopes
+    explained: float  # share of the energy of the slopes
 
     def at(self, xy: FloatArray, time_s: float) -> tuple[FloatArray, FloatArray]:
         """Return heights above the level and their standard errors, each of shape (n,)."""

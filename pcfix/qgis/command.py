@@ -62,10 +62,7 @@ def run(
 ) -> None:
     """Run pcfix to its end and pass on what it prints.
 
-    Raises
-    ------
-    CommandError
-        With the last line that it printed if it fails, or if it was cancelled.
+    Raises CommandError, with the last line that it printed, if it fails or was cancelled.
     """
     kept = {k: v for k, v in os.environ.items() if k not in ("PYTHONHOME", "PYTHONPATH")}
     try:

@@ -38,48 +38,29 @@ _TRACK_PAIRS_AT_ONCE, _DENSE_PAIRS_AT_ONCE = 2_000_000, 50_000
 class Scene:
     """A simulated scene; metres, UTM.
 
-    Attributes
-    ----------
-    apparent_xyz, true_xyz : array, shape (n, 3)
-        The cloud of the SfM software, and the truth, row by row. A point in fewer than three images
-        or depth maps has no views and is not moved.
-    views : Views
-        The cameras of each point, for depth maps with weights.
-    cameras, true_cameras : Cameras
-        The given ones, with which the cloud is intersected, and those of the images; the same
-        object without pose noise.
-    lidar_xyz : array, shape (m, 3)
-        A reference cloud of the true surface with noise.
-    water_level_m : float
-        Of the mean water plane `water` in the middle of the area.
-    sensor_mm : tuple of float
-        Focal length, sensor width and height.
-    settings : dict
-        The arguments that made it.
-    neighbours : array, shape (k, c), or None
-        The images that each was matched with, -1 for none; None for a cloud of tracks.
-    pairs, pairs_start : array, shape (p, 2) and (n + 1,), or None
-        The cameras of each stereo pair of a cloud of pairs, point by point.
+    A point in fewer than three images or depth maps has no views and is not moved. The cloud is
+    intersected with `cameras`; the images were taken with `true_cameras`, the same object without
+    pose noise.
     """
 
-    apparent_xyz: FloatArray
-    true_xyz: FloatArray
-    views: Views
+    apparent_xyz: FloatArray  # (n, 3), the cloud of the SfM software
+    true_xyz: FloatArray  # (n, 3), the truth, row by row
+    views: Views  # the cameras of each point, for depth maps with weights
     cameras: Cameras
     yaw_pitch_roll_deg: FloatArray
-    lidar_xyz: FloatArray
-    water_level_m: float
+    lidar_xyz: FloatArray  # (m, 3), a reference cloud of the true surface with noise
+    water_level_m: float  # of the mean water plane `water` in the middle of the area
     refractive_index: float
     gsd_m: float
-    sensor_mm: tuple[float, float, float]
+    sensor_mm: tuple[float, float, float]  # focal length, sensor width and height
     epsg: int
-    settings: dict[str, Any]
+    settings: dict[str, Any]  # the arguments that made it
     water: WaterPlane
     true_cameras: Cameras
     true_yaw_pitch_roll_deg: FloatArray
-    neighbours: IntArray | None = None
-    pairs: IntArray | None = None
-    pairs_start: IntArray | None = None
+    neighbours: IntArray | None = None  # (k, c), images that each was matched with, -1 for none
+    pairs: IntArray | None = None  # (p, 2), cameras of the stereo pairs of all points
+    pairs_start: IntArray | None = None  # (n + 1,), where the pairs of each point begin
 
     @property
     def xyz(self) -> FloatArray:
