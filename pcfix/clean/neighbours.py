@@ -19,6 +19,7 @@ import numpy as np
 
 from pcfix.blocks import bounds, empty, grouped, mapped, release, row_numbers
 from pcfix.model import BoolArray, FloatArray, IntArray
+from pcfix.running import current
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -90,7 +91,7 @@ class Neighbours:
             points[rows],
             k=list(range(1, min(k, tree.n) + 1)),
             distance_upper_bound=float(distance[rows, -1].max()) * SLACK,
-            workers=cores(),
+            workers=current().threads,
         )
         new, places = np.asarray(found[0]), np.asarray(found[1]) + self.tiles.start[tile]
         if np.isinf(distance[rows, 0]).all():  # nothing to merge with

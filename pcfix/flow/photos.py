@@ -116,7 +116,7 @@ def map_photos(
             return path.name, pixels, round(new.black_share * pixels), largest
 
         found: list[tuple[str, int, int, float]] = []
-        with threads(1), ThreadPoolExecutor(max(1, min(cores(), len(todo)))) as pool:
+        with ThreadPoolExecutor(max(1, min(current().threads, len(todo)))) as pool:
             for one in pool.map(write, todo.keys(), todo.values()):
                 found.append(one)
                 if progress is not None:

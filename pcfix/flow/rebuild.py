@@ -35,6 +35,7 @@ from pcfix.options.declare import File, taken
 from pcfix.options.photos import PhotosOptions, RebuildOptions
 from pcfix.photos.ortho import blank_in
 from pcfix.photos.stereo import Grey, stereo_cloud
+from pcfix.running import threads
 from pcfix.water.surface import surface_above
 
 RECORD = "pcfix-rebuild.json"
