@@ -192,7 +192,12 @@ class Site(NamedTuple):
 
 def lay_out(chosen: SceneSettings) -> Site:
     """Return ground and block of a scene, in local coordinates."""
-    streams, extent = Streams.of(chosen.seed), _extent(chosen)
+    streams, extent = Streams.of(chosen.seed), chosen.area_m
+    if chosen.cameras is not None:  # the area that about so many nadir images cover
+        (length, width), (base, spacing) = extent, chosen.base_and_spacing_m
+        side = float(np.sqrt(chosen.cameras * base * spacing * length / width))
+        across = chosen.cameras * base * spacing / side - 1.5 * spacing
+        extent = max(side - 1.5 * base, base), max(across, spacing / 2.0)
     plane = chosen.water_plane(extent)
     terrain = Terrain.random(chosen.bed, extent, plane, chosen.depth_m, streams.main)
     flown = fly_block(extent, chosen, streams.main)
@@ -208,17 +213,6 @@ def lay_out(chosen: SceneSettings) -> Site:
         chosen.detection,
     )  # fmt: skip
     return Site(terrain, flown, given, rig, streams)
-
-
-def _extent(chosen: SceneSettings) -> tuple[float, float]:
-    """Return length and width of the area that about so many nadir images cover."""
-    length, width = chosen.area_m
-    if chosen.cameras is None:
-        return length, width
-    base, spacing = chosen.base_and_spacing_m
-    side = float(np.sqrt(chosen.cameras * base * spacing * length / width))
-    reach = max(side - 1.5 * base, base)
-    return reach, max(chosen.cameras * base * spacing / side - 1.5 * spacing, spacing / 2.0)
 
 
 def points_on(terrain: Terrain, count: int, rng: np.random.Generator) -> FloatArray:
