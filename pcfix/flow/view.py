@@ -165,12 +165,16 @@ def _read(path: Path, most: int) -> tuple[list[_Layer], Any]:
 
 def _values(colour: str, layers: list[_Layer], surface: WaterSurface | None) -> list[FloatArray]:
     """Return the values for the colours of each layer, NaN where unknown."""
-    values = []
+    values, target = [], layers[-1].xyz
     for one in layers:
         found = None
-        if colour == "error":
-            target = layers[-1]
-            found = None if one is target else _height_above(target.xyz, one.xyz)
+        if colour == "error" and one is not layers[-1]:  # NaN away from the reference
+            gap_m = max(GAP_SPACINGS * mean_spacing_m(target[:, :2]), LEAST_GAP_M)
+            near = near_in_plan(one.xyz[:, :2], target[:, :2], gap_m)
+            found = np.full(len(one.xyz), np.nan)
+            if near.any():
+                k = min(NEIGHBOURS, len(target))
+                found[near] = one.xyz[near, 2] - heights_at(one.xyz[near, :2], target, k)[0]
         elif colour == "height":
             found = one.xyz[:, 2]
         elif colour == "depth":
@@ -178,7 +182,7 @@ def _values(colour: str, layers: list[_Layer], surface: WaterSurface | None) -> 
             if found is None and surface is not None and not isinstance(surface, WaterDimension):
                 found = surface_above(surface, one.xyz).height_m - one.xyz[:, 2]
             found = None if found is None else np.where(found > 0.0, found, np.nan)
-        else:
+        elif colour != "error":
             name, sign = {"shift": ("ShiftZ", -1.0), "uncertainty": ("SigmaZ", COVERAGE_95)}[colour]
             if name in one.known:
                 found = np.where(one.known[name] != 0.0, sign * one.known[name], np.nan)
@@ -187,16 +191,6 @@ def _values(colour: str, layers: list[_Layer], surface: WaterSurface | None) -> 
         sentence = f"No cloud has values for --colour {colour}. {_REMEDY[colour]}"
         raise SettingError("view.no_values", sentence, colour=colour)
     return values
-
-
-def _height_above(reference: FloatArray, xyz: FloatArray) -> FloatArray:
-    """Return the heights of points above a reference, NaN away from it."""
-    gap_m = max(GAP_SPACINGS * mean_spacing_m(reference[:, :2]), LEAST_GAP_M)
-    near, error = near_in_plan(xyz[:, :2], reference[:, :2], gap_m), np.full(len(xyz), np.nan)
-    if near.any():
-        height, _ = heights_at(xyz[near, :2], reference, min(NEIGHBOURS, len(reference)))
-        error[near] = xyz[near, 2] - height
-    return error
 
 
 def _frusta(cameras: Cameras, ground_m: float) -> FloatArray:
