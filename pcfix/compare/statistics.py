@@ -235,13 +235,8 @@ def fit_line(reference_depth_m: FloatArray, depth_m: FloatArray) -> Line | None:
     if len(depth_m) < 3:
         return None
     x_mean, y_mean = float(reference_depth_m.mean()), float(depth_m.mean())
-
-    def product(a: FloatArray, b: FloatArray, a_mean: float, b_mean: float) -> float:
-        return total(lambda u, v: (u - a_mean) @ (v - b_mean), a, b)
-
-    xx = product(reference_depth_m, reference_depth_m, x_mean, x_mean)
-    yy = product(depth_m, depth_m, y_mean, y_mean)
-    xy = product(reference_depth_m, depth_m, x_mean, y_mean)
+    x, y = reference_depth_m - x_mean, depth_m - y_mean
+    xx, yy, xy = float(x @ x), float(y @ y), float(x @ y)
     scale = max(float(-reference_depth_m.min()), float(reference_depth_m.max()), 1e-9)
     if xx <= len(depth_m) * (1e-9 * scale) ** 2:
         return None

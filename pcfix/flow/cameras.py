@@ -91,19 +91,7 @@ def check_cameras(
         cameras = read_gnss(given.gnss, cameras)
     diagnosis, remedy = None, ("", "")
     if view is not None and surface is not None:
-        reference = None if given.reference is None else read_reference(given.reference)
-        if reference is not None:
-            crs = None if isinstance(view.crs, str) else view.crs
-            check_same_crs(view.name, crs, reference.name, reference.crs)
-        control = None if given.gcps is None else read_ground_control(given.gcps, cameras).surveyed
-        lens = given.lens
-        evidence = Evidence(
-            cameras, str(path), surface, index_of(given.index, given.index_formula)[0],
-            view=view, reference=reference, control=control,
-            calibrated=given_focal_lengths(str(path)) if lens is None else focal_length_of(lens),
-            ties=ties_of(inputs, view.crs),
-        )  # fmt: skip
-        diagnosis = diagnose(evidence)
+        diagnosis = _diagnosed(given, inputs, cameras, view, surface)
         surveys = {name: getattr(given, name) for name in ("gnss", "gcps", "lens", "index")}
         remedy = adjust_words(inputs, view.name, has_datum=has_datum(cameras, str(path)), **surveys)
     level = above = range_m = tilt_deg = None
@@ -123,10 +111,11 @@ def check_cameras(
         fit = _fit(cameras, view, xyz, quick_ties(inputs, view.crs), flight)
         up = None if gnss is None or inputs.cameras_crs is None else gnss.mean_m[2]
         if up is not None and abs(up) >= UNDULATION_M[0] and not fit.verdict:
+            side = "above" if up > 0.0 else "below"
             verdict = (
-                f"With --cameras-crs the cameras are {abs(up):.1f} m"
-                f" {'above' if up > 0.0 else 'below'} their GNSS heights. One of them is likely"
-                " above the ellipsoid and the other above the geoid; check the vertical CRS."
+                f"With --cameras-crs the cameras are {abs(up):.1f} m {side} their GNSS heights. One"
+                " of them is likely above the ellipsoid and the other above the geoid; check the"
+                " vertical CRS."
             )
             fit = replace(fit, verdict=verdict)
     report = CamerasReport(
@@ -148,6 +137,26 @@ def check_cameras(
         write_plot(given, block_figure(report))
     write_summary(given, report.as_dict())
     return report
+
+
+def _diagnosed(
+    given: CamerasCheckOptions, inputs: Inputs, cameras: Cameras, view: CloudView,
+    surface: WaterSurface,
+) -> Diagnosis:  # fmt: skip
+    """Test whether the poses have absorbed refraction."""
+    path, lens = str(inputs.cameras), given.lens
+    reference = None if given.reference is None else read_reference(given.reference)
+    if reference is not None:
+        crs = None if isinstance(view.crs, str) else view.crs
+        check_same_crs(view.name, crs, reference.name, reference.crs)
+    evidence = Evidence(
+        cameras, path, surface, index_of(given.index, given.index_formula)[0], view=view,
+        reference=reference,
+        control=None if given.gcps is None else read_ground_control(given.gcps, cameras).surveyed,
+        calibrated=given_focal_lengths(path) if lens is None else focal_length_of(lens),
+        ties=ties_of(inputs, view.crs),
+    )  # fmt: skip
+    return diagnose(evidence)
 
 
 def sample_of(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from pcfix.io import rasters
 from pcfix.io.atomic import scratch_folder, temporary_output
 from pcfix.io.photographs import photographs_in, read_colours
 from pcfix.model import WaterPlane
-from pcfix.options.declare import File, options_of, taken
+from pcfix.options.declare import File, taken
 from pcfix.options.photos import OrthoOptions, PhotosOptions
 from pcfix.photos.ortho import Picture, mosaic, picture_of
 from pcfix.running import threads
@@ -81,11 +81,11 @@ def ortho_photo(
     check_summary(given, [*known, target])
     with threads(given.jobs), temporary_output(target) as draft, scratch_folder(target) as folder:
         # without water, its level is below all ground
-        same = {one.name: getattr(given, one.name) for one in options_of(OrthoOptions)}
-        same["water"] = NO_WATER if given.water is None else given.water
+        water = NO_WATER if given.water is None else given.water
         is_cloud = Path(given.dsm).suffix.lower() in CLOUDS
-        same["resolution"] = 2.0 * given.resolution if is_cloud and given.resolution else None
-        block = block_of(PhotosOptions(**same), paths, folder)
+        coarse_m = 2.0 * given.resolution if is_cloud and given.resolution else None
+        same = replace(given, water=water, resolution=coarse_m).part(PhotosOptions)
+        block = block_of(same, paths, folder)
         warn_all(block.notes)
         # the cells over the DSM; their side is the ground pixel, rounded to two digits
         bed = block.scene.ground
