@@ -102,7 +102,7 @@ def flag_sparse(cloud: Cloud, settings: CleanRules, progress: Counted | None) ->
     the mean distances to the neighbours, metres; empty without the statistical test.
 
     Both tests find what open3d's ``remove_statistical_outlier`` and ``remove_radius_outlier``
-    find, except in clouds where so many points coincide that the mean distance is zero, or where it
+    find, except in clouds where enough points coincide that the mean distance is zero, or where it
     is the same for all points. There open3d takes all points for outliers, and pcfix none.
     """
     mean_m = np.zeros(len(cloud.xyz)) if settings.statistical else None

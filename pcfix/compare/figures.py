@@ -149,7 +149,7 @@ def bins_table(bins: Iterable[Bin]) -> str:
 
 
 SPARSER = 2.0
-"""A cloud is called sparse if its spacing is so many times that of the other."""
+"""Ratio of the spacings of two clouds from which one is called sparse."""
 AS_DEEP, TOO_DEEP = 0.10, 0.15
 """Relative to the depth: a cloud whose apparent depths differ from the reference by at most the
 first, and whose corrected ones by more than the second, was corrected twice. Refraction makes

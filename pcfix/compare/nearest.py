@@ -24,7 +24,7 @@ from pcfix.model import FloatArray, IntArray
 POINTS_PER_CELL = 3.0
 MAX_CELLS = 20_000_000
 MAX_RINGS = 10
-"""After so many rings a search is left to the tree."""
+"""Rings of cells after which a tree is searched instead."""
 
 
 Indices: TypeAlias = npt.NDArray[np.int32]
@@ -87,7 +87,7 @@ def spacing_m(points: FloatArray) -> float:
 
 
 def _side(extent: FloatArray, cells: float) -> float:
-    """Return the side of so many squares over a rectangle, or along a narrow one."""
+    """Return the side of a number of squares over a rectangle, or along a narrow one."""
     area, length = float(extent.prod()), float(extent.max())
     return max(float(np.sqrt(area / cells)), length / cells, length * 1e-6, 1e-9)
 

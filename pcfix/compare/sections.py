@@ -12,7 +12,7 @@ from pcfix.errors import GeometryError, SettingError
 from pcfix.model import FloatArray
 
 STATIONS = 200
-"""At most so many stations; they are at least a quarter of the corridor's width apart."""
+"""Maximum number of stations; they are at least a quarter of the corridor's width apart."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -107,7 +107,7 @@ def calm_frames(
         Folder of photographs of one size, in the order of their names, or a video.
     out : path
         Image in the format of the frames, with the metadata of the first; PNG for a video. The
-        spread is written beside it, and with `surface` a folder of rasters of the water.
+        spread is written next to it, and with `surface` a folder of rasters of the water.
     options : CalmOptions, optional
         Or its attributes as keywords.
     progress : callable, optional
@@ -151,9 +151,7 @@ def calm_frames(
             with temporary_folder(folder) as draft:
                 _write_waters(draft, found.names, view.level_m, nodes, waters, crs)
             if interval is None:
-                words = (
-                    "The time between frames is unknown, so each is fitted alone. Give --interval."
-                )
+                words = "The times are unknown, so frames are fitted separately. Give --interval."
                 notes.append(PcfixWarning("frames.no_interval", words))
             if water.explained < LEAST_EXPLAINED:
                 words = (

@@ -86,8 +86,8 @@ def compare_clouds(
         view = cloud.view() if isinstance(cloud, Held) else view_of(clouds[0])
         water = find_surface(given.water, WaterOptions(), view).surface
     outputs = [path for path in (given.out_dir, given.summary, given.plot) if path is not None]
-    beside = Path([*outputs, Path(tempfile.gettempdir()) / "pcfix"][0])
-    with scratch_arrays(beside):  # arrays of large clouds
+    near = Path([*outputs, Path(tempfile.gettempdir()) / "pcfix"][0])
+    with scratch_arrays(near):  # arrays of large clouds
         target = read_reference(surveyed)
         whole = cloud.read(water) if isinstance(cloud, Held) else read_cloud(clouds[0], water)
         check_same_crs(whole.name, whole.crs, target.name, target.crs)

@@ -227,7 +227,7 @@ def _write_rasters(
             with rasters.new_raster(unfilled, lattice, None, {"height": METRE}) as heights:
                 tally = _grid(points, how, rules.what, heights, counts, report)
             with rasters.open_raster(unfilled) as heights:
-                for window in lattice.windows(BLOCK_CELLS):
+                for window in lattice.window.parts(BLOCK_CELLS):
                     around = window.grown(margin_cells(widest)).clipped(lattice.window)
                     known = rasters.read_heights(heights, around)
                     height = fill_holes(known, window, around, widest)
@@ -239,7 +239,7 @@ def _write_rasters(
             paths["hillshade"], lattice, plan, {"hillshade": ""}, dtype="uint8", nodata=NO_LIGHT
         )
         with rasters.open_raster(paths["dsm"]) as heights, shade as out:
-            for window in lattice.windows(BLOCK_CELLS):
+            for window in lattice.window.parts(BLOCK_CELLS):
                 height = rasters.read_within(heights, window.grown(1), lattice.window)
                 light = hillshade(height, rules.cell_m, rules.azimuth, rules.altitude)
                 rasters.write_part(out, light, window, 1)
@@ -252,9 +252,9 @@ def _grid(
 ) -> CellTally:  # fmt: skip
     """Write values to one raster, numbers of points and their spread to another."""
     tally, done, lattice = CellTally(), 0, points.lattice
-    # about so many points a window where points are everywhere
+    # windows have about this number of points if points are everywhere
     side = np.sqrt(WINDOW_POINTS) * how.spacing_m / lattice.resolution_m or BLOCK_CELLS
-    for window in lattice.windows(int(np.clip(side, 1, BLOCK_CELLS))):
+    for window in lattice.window.parts(int(np.clip(side, 1, BLOCK_CELLS))):
         bands = grid_window(*points.points_in(window.grown(how.margin_cells)), window, how)
         if what == "uncertainty":
             bands = as_uncertainty(bands)
@@ -279,7 +279,7 @@ def point_spacing_m(cloud: Path | Tiles, settings: DsmRules) -> float:
 
 
 class SortedPoints:
-    """The points that a raster is made of, in a folder of the caller, and the raster's `lattice`.
+    """The points of a raster, in a file in a folder, and the raster's `lattice`.
 
     `near` has the number and spacing of the points; `stray` counts those that are ignored because
     they lie far from all others. Raises PcfixError if no points are left, or the raster would be
@@ -344,8 +344,8 @@ class SortedPoints:
     def points_in(self, window: Window) -> tuple[FloatArray, IntArray]:
         """Return the points of a window, and their columns and rows in the raster.
 
-        The first are metres in the world frame, shape (n, 3), with what the raster is made of in
-        the place of z; the second have shape (n, 2).
+        The first are metres in the world frame, shape (n, 3), with the gridded values in the place
+        of z; the second have shape (n, 2).
         """
         row, column = self.lattice.first_row, self.lattice.first_column
         xyz = self._bins.read(window.moved(row, column))
@@ -355,7 +355,7 @@ class SortedPoints:
 
 
 def _dimension_of(source: LasSource, what: str) -> str | None:
-    """Return the dimension that a raster is made of, None for heights."""
+    """Return the dimension whose values are gridded, None for heights."""
     name = None if what == "height" else DIMENSIONS.get(what, what)
     names = list(source.header.point_format.dimension_names)
     if name is None or name in names:

@@ -119,9 +119,8 @@ def _write(
     first = read_colours(block.paths[0])
     bands, dtype = first.shape[2], first.dtype
     shrunk = max(1, int(lattice.resolution_m / block.gsd_m))
-    kept = max(4, CACHE_BYTES // first.nbytes)
 
-    @lru_cache(maxsize=kept)
+    @lru_cache(maxsize=max(4, CACHE_BYTES // first.nbytes))
     def picture(row: int) -> Picture:
         pixels = read_colours(block.paths[row])
         if pixels.shape[2] != bands or pixels.dtype != dtype:
@@ -141,7 +140,7 @@ def _write(
     with rasters.new_raster(
         path, lattice, block.crs, layers, dtype=str(dtype), nodata=None
     ) as target:  # fmt: skip
-        for window in lattice.windows(TILE_CELLS):
+        for window in lattice.window.parts(TILE_CELLS):
             # the centres of the cells that have a height
             x = lattice.left_m + (np.arange(window.column, window.column_stop) + 0.5) * side
             y = lattice.top_m - (np.arange(window.row, window.row_stop) + 0.5) * side

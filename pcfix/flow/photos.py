@@ -88,7 +88,7 @@ def map_photos(
     Raises
     ------
     PcfixError
-        Images that are finished are kept.
+        Finished images stay.
     """
     started = time.perf_counter()
     given = taken(PhotosOptions, options, keywords, "map_photos")

@@ -40,7 +40,7 @@ from pcfix.water.surface import surface_above
 
 RECORD = "pcfix-rebuild.json"
 PAPER_ROUNDS = 3
-"""After so many, the mapping by eq 12 is close to its fixed point, which is not the bed."""
+"""Rounds after which the mapping by eq 12 is close to its fixed point, which is not the bed."""
 STEREO_CELL_PIXELS = 2.0
 STEREO_STEP_M = 0.001
 CACHED_PHOTOGRAPHS = 16
@@ -105,7 +105,7 @@ def rebuild_rounds(
     Raises
     ------
     PcfixError
-        Rounds that are finished are kept.
+        Finished rounds stay.
     """
     started = time.perf_counter()
     given = taken(PhotosOptions, options, keywords, "rebuild_rounds")
@@ -136,10 +136,10 @@ def rebuild_rounds(
         before = Path(rounds[-1].dsm if rounds else given.dsm)
         folder = target / f"round{number}"
         cloud, dsm = folder / "cloud.laz", folder / "dsm.tif"
-        kept = record["rounds"][number - 1] if number <= len(record["rounds"]) else {}
-        has_cloud = cloud.exists() and kept.get("state") == file_state(cloud)
-        if has_cloud and "mean_m" in kept and dsm.exists():
-            one = Round(**{name: kept[name] for name in Round.__dataclass_fields__})
+        noted = record["rounds"][number - 1] if number <= len(record["rounds"]) else {}
+        has_cloud = cloud.exists() and noted.get("state") == file_state(cloud)
+        if has_cloud and "mean_m" in noted and dsm.exists():
+            one = Round(**{name: noted[name] for name in Round.__dataclass_fields__})
         else:
             finished = min(finished, number - 1)
             with warnings.catch_warnings():
@@ -153,11 +153,11 @@ def rebuild_rounds(
                     map_photos(images, folder / "images", options=how, progress=progress)
                     with threads(given.jobs):
                         _reconstruct(given, block, number, folder / "images", cloud, progress)
-                    kept = {"command": given.rebuild, "state": file_state(cloud)}
-                    _keep(target, record, number, kept)
+                    noted = {"command": given.rebuild, "state": file_state(cloud)}
+                    _note(target, record, number, noted)
                 grid_dsm(cloud, dsm, resolution=block.scene.ground.cell_m, overwrite=True)
             one = _difference(block, cloud, dsm, before)
-            _keep(target, record, number, {**kept, **asdict(one)})
+            _note(target, record, number, noted | asdict(one))
         rounds.append(one)
         if say is not None:
             say(
@@ -206,9 +206,9 @@ def _opened(target: Path, given: PhotosOptions) -> dict[str, Any]:
     return new
 
 
-def _keep(target: Path, record: dict[str, Any], number: int, kept: dict[str, Any]) -> None:
+def _note(target: Path, record: dict[str, Any], number: int, noted: dict[str, Any]) -> None:
     """Record a round, for a later call to resume."""
-    record["rounds"][number - 1 :] = [kept]
+    record["rounds"][number - 1 :] = [noted]
     write_text(target / RECORD, json_text(record), overwrite=True)
 
 
@@ -272,7 +272,7 @@ def round_of(
     """Return the change in a round, of whose files cloud and DSM are named.
 
     `difference_m`, shape (rows, columns), is the DSM minus the one before, NaN where either has no
-    height; `wet`, of the same shape, tells what is under water.
+    height; `wet`, of the same shape, is what lies under water.
     """
     known = np.isfinite(difference_m)
     moved = difference_m[known & wet] if (known & wet).any() else difference_m[known]

@@ -159,8 +159,8 @@ def _read(path: Path | Tiles, resolution_m: float | None) -> Plain:
         every = max(1, len(source) // SAMPLE_POINTS)
         sample, low, high, total, count = [], np.inf, -np.inf, 0.0, 0
         for points in source.chunks():
-            kept = ~np.isin(np.asarray(points["classification"]), NOISE_CLASSES)
-            points = points[kept & ~np.asarray(points["withheld"]).astype(bool)]
+            good = ~np.isin(np.asarray(points["classification"]), NOISE_CLASSES)
+            points = points[good & ~np.asarray(points["withheld"]).astype(bool)]
             moved = np.asarray(points["RayCount"]) > 0
             columns = ["WaterDepth", "ShiftZ", "RayCount"] + [SIGMA_Z] * (SIGMA_Z in dimensions)
             values = np.zeros((int(moved.sum()), 4))

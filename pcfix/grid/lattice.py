@@ -111,10 +111,6 @@ class Lattice:
         """The whole raster."""
         return Window(0, self.height, 0, self.width)
 
-    def windows(self, side: int) -> Iterator[Window]:
-        """Yield squares of `side` cells that cover the raster, row by row."""
-        return self.window.parts(side)
-
     def positions(self, xyz: FloatArray) -> FloatArray:
         """Return columns and rows of points, shape (n, 2), cells from the top left corner."""
         away = np.column_stack([xyz[:, 0] - self.left_m, self.top_m - xyz[:, 1]])

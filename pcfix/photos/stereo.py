@@ -31,7 +31,7 @@ SPARE_RELIEF = 0.5
 """The bed is searched this share of the range of heights below the ground."""
 BLOCK_PX = 5
 FEWEST_PAIRS = 2
-"""A cell needs so many pairs, and half of its own, within a pixel of parallax of the median."""
+"""Pairs, and half of its own, that a cell needs within a pixel of parallax of the median."""
 HALF = 1 << 31
 """Added to columns, so that those west of x = 0 do not run into the row of their number."""
 

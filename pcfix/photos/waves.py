@@ -24,7 +24,7 @@ which has no curl, needs no border condition, and ties the frames together by th
 relation (no current, no surface tension, mean depth). The waves with most energy on the dispersion
 shell of the spectrum are chosen, some at a time, and fitted by least squares to the slopes of all
 frames, weighted by the texture of the bed, with a prior of the slopes' own variance. Where the time
-between frames is not known, each frame is fitted alone.
+between frames is not known, each frame is fitted separately.
 
 The median over few frames keeps about the mean of each wave over them, and the slopes lack it. So
 each wave is fitted less its mean over the frames.
@@ -60,7 +60,7 @@ ROUNDS = 6
 LEAST_GAIN = 0.003
 """Share of the slopes' energy that a further round must explain."""
 OVER_NOISE = 8.0
-"""A wave needs so many times the mean energy of the shell."""
+"""Energy that a wave needs, in multiples of the mean of the shell."""
 STILL = 0.15
 """Share of the usual displacement below which a node is land."""
 

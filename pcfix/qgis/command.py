@@ -64,12 +64,12 @@ def run(
 
     Raises CommandError, with the last line that it printed, if it fails or was cancelled.
     """
-    kept = {k: v for k, v in os.environ.items() if k not in ("PYTHONHOME", "PYTHONPATH")}
+    outer = {k: v for k, v in os.environ.items() if k not in ("PYTHONHOME", "PYTHONPATH")}
     try:
         process = subprocess.Popen(
             [program, *words], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT, text=True, encoding="utf-8", errors="replace",
-            env={**kept, "PCFIX_PROGRESS": "lines", "PYTHONIOENCODING": "utf-8"},
+            env={**outer, "PCFIX_PROGRESS": "lines", "PYTHONIOENCODING": "utf-8"},
         )  # fmt: skip
     except OSError as error:
         raise CommandError(f"{program} cannot be run ({error.strerror}). {HELP}") from error

@@ -1,6 +1,6 @@
 """The summaries of the commands, as tables of rows.
 
-A row is (label, format, needs): the format takes values by name, and the row is left out where the
+A row is (label, format, needs): the format takes values by name, and the row is omitted if the
 value that it needs is missing or zero. Terminal and report page use the same rows.
 """
 

@@ -1,4 +1,4 @@
-"""A whole scene: ground, water, images, and the cloud that software would have made of them."""
+"""A scene: ground, water, images, and the cloud that software would reconstruct from them."""
 
 from __future__ import annotations
 
@@ -193,7 +193,7 @@ class Site(NamedTuple):
 def lay_out(chosen: SceneSettings) -> Site:
     """Return ground and block of a scene, in local coordinates."""
     streams, extent = Streams.of(chosen.seed), chosen.area_m
-    if chosen.cameras is not None:  # the area that about so many nadir images cover
+    if chosen.cameras is not None:  # the area that about this number of nadir images covers
         (length, width), (base, spacing) = extent, chosen.base_and_spacing_m
         side = float(np.sqrt(chosen.cameras * base * spacing * length / width))
         across = chosen.cameras * base * spacing / side - 1.5 * spacing
