@@ -151,7 +151,6 @@ def _label(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
 
 
 def _clean(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
-    from pcfix.clean.points import Resources
     from pcfix.flow.clean import RAY_DIMENSIONS, Tested, find_noise
     from pcfix.flow.runner import check_summary, write_summary
     from pcfix.options.steps import CleanOptions
@@ -168,10 +167,7 @@ def _clean(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
             yield Tested(points, flags.withheld[rows], {name: rays[name][rows] for name in rays})
 
     with threads(options.jobs):
-        noise, found = find_noise(
-            NAME, options, lambda: _view(cloud), ins, chunks, len(cloud),
-            Resources(jobs=options.jobs),
-        )  # fmt: skip
+        noise, found = find_noise(NAME, options, lambda: _view(cloud), ins, chunks, len(cloud))
     if options.drop:
         outs["Mask"] = ~noise
     else:

@@ -19,6 +19,7 @@ import numpy as np
 
 from pcfix.blocks import bounds, empty, grouped, mapped, release, row_numbers
 from pcfix.model import BoolArray, FloatArray, IntArray
+from pcfix.running import current
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -33,19 +34,10 @@ _ENTRIES = 4_000_000
 
 
 class Neighbours:
-    """Search neighbours among the points of tiles.
+    """Search neighbours among the points of tiles, in space (3 axes) or in plan (2 axes)."""
 
-    Parameters
-    ----------
-    tiles : Tiles
-    axes : {3, 2}
-        Distances in space, or in plan.
-    jobs : int, optional
-        Threads; default all cores.
-    """
-
-    def __init__(self, tiles: Tiles, axes: int, jobs: int | None = None) -> None:
-        self.tiles, self.axes, self.workers = tiles, axes, -1 if jobs is None else jobs
+    def __init__(self, tiles: Tiles, axes: int) -> None:
+        self.tiles, self.axes = tiles, axes
         self._low, self._high = tiles.low[:, :axes], tiles.high[:, :axes]
 
         @lru_cache(maxsize=_TREES)
@@ -60,19 +52,10 @@ class Neighbours:
     def nearest(self, xyz: FloatArray, k: int) -> tuple[FloatArray, IntArray]:
         """Return the k nearest points of the tiles, which hold at least k.
 
-        Parameters
-        ----------
-        xyz : array, shape (q, 3)
-            Queries are quicker if these are near to each other.
-        k : int
-
-        Returns
-        -------
-        distance_m : array, shape (q, k)
-            Ascending.
-        place : array of int, shape (q, k)
-            Index in the arrays of the tiles. The order of equally far points is not defined, nor
-            which of them are returned if the last ones are equally far.
+        Queries are quicker if the points, shape (q, 3), are near to each other. Returns distances
+        (m), ascending, and indices in the arrays of the tiles, both of shape (q, k). The order of
+        equally far points is not defined, nor which of them are returned if the last ones are
+        equally far.
         """
         points = np.ascontiguousarray(xyz[:, : self.axes])
         distance = np.full((len(points), k), np.inf)
@@ -108,7 +91,7 @@ class Neighbours:
             points[rows],
             k=list(range(1, min(k, tree.n) + 1)),
             distance_upper_bound=float(distance[rows, -1].max()) * SLACK,
-            workers=self.workers,
+            workers=current().threads,
         )
         new, places = np.asarray(found[0]), np.asarray(found[1]) + self.tiles.start[tile]
         if np.isinf(distance[rows, 0]).all():  # nothing to merge with
@@ -140,26 +123,25 @@ class Neighbours:
 
 
 def nearest_of(
-    places: FloatArray, points: FloatArray, k: int, axes: int
-) -> Iterator[tuple[IntArray, FloatArray, FloatArray, FloatArray]]:
-    """Yield rows (c,) of places, these, and distances (c, k) and places of their k nearest points.
+    places: FloatArray, points: FloatArray, k: int
+) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
+    """Yield rows (c,) of places, these places, and their k nearest points in plan, (c, k, 3).
 
     Places and points, (n, 2) or (n, 3), are in one frame, metres; there are at least k points. The
     nearest comes first; of equally far ones, the first of the cloud.
     """
-    near, asked = Neighbours(make_tiles(points), axes), make_tiles(places)
+    near, asked = Neighbours(make_tiles(points), 2), make_tiles(places)
     for piece in asked.pieces(PIECE_ROWS):
         row, xyz = asked.row[piece], asked.xyz[piece]
         for some, distance, place in near.with_ties(xyz, k, 1):
             order = np.lexsort((near.tiles.row[place], distance), axis=1)[:, :k]
             first = np.take_along_axis(place, order, axis=1)
-            distance = np.take_along_axis(distance, order, axis=1)
-            yield row[some], xyz[some], distance, near.tiles.xyz[first]
+            yield row[some], xyz[some], near.tiles.xyz[first]
 
 
-def nearest_distance(places: FloatArray, points: FloatArray, axes: int) -> FloatArray:
-    """Return the distance (m) of each place, (n,), to the nearest point; see `nearest_of`."""
-    near, asked = Neighbours(make_tiles(points), axes), make_tiles(places)
+def nearest_distance(places: FloatArray, points: FloatArray) -> FloatArray:
+    """Return the distance (m) in plan of each place, (n,), to the nearest point."""
+    near, asked = Neighbours(make_tiles(points), 2), make_tiles(places)
     distance = empty((len(places),))
     for piece in asked.pieces(PIECE_ROWS):
         distance[asked.row[piece]] = near.nearest(asked.xyz[piece], 1)[0][:, 0]
@@ -236,27 +218,18 @@ class Tiles:
 def make_tiles(
     xyz: FloatArray,
     used: BoolArray | None = None,
-    tile_m: float | None = None,
-    points: int = POINTS_PER_TILE,
+    points: int | None = None,
     *,
     strips: bool = True,
 ) -> Tiles:
     """Sort the used points into square tiles.
 
     The tiles cover all but the outermost hundredth of the points, so that no outlier stretches
-    them; points beyond belong to the tile at the edge.
-
-    Parameters
-    ----------
-    xyz : array, shape (n, 3), or (n, 2) in plan
-        Metres, world frame.
-    used : array of bool, shape (n,), optional
-        At least one is true; default all.
-    tile_m : float, optional
-        Side of a tile; default such that a tile holds about `points`.
-    strips : bool
-        Whether to sort the points of a tile along narrow strips. A tree is queried twice as fast in
-        this order: each point finds in the processor's cache what its predecessor needed.
+    them; points beyond belong to the tile at the edge. Points have the shape (n, 3), or (n, 2) in
+    plan, metres, world frame; at least one is used, by default all. A tile holds about `points`, by
+    default `POINTS_PER_TILE`. With `strips` the points of a tile are sorted along narrow strips. A
+    tree is queried twice as fast in this order: each point finds in the processor's cache what its
+    predecessor needed.
     """
     step = max(1, len(xyz) // _SAMPLE)
     sample = xyz[::step] if used is None else xyz[::step][used[::step]]
@@ -264,8 +237,8 @@ def make_tiles(
         sample = np.array(xyz[int(np.argmax(used))])[None, :]
     origin, high = np.percentile(sample[:, :2], (1.0, 99.0), axis=0)
     extent = np.maximum(high - origin, 1e-3)
-    share = points / (len(xyz) if used is None else int(used.sum()))
-    side = math.sqrt(float(extent.prod()) * share) if tile_m is None else tile_m
+    share = (points or POINTS_PER_TILE) / (len(xyz) if used is None else int(used.sum()))
+    side = math.sqrt(float(extent.prod()) * share)
     side = max(side, float(extent.max()) / _MOST_TILES_A_SIDE)
     columns, rows = np.ceil(extent / side).astype(int).tolist()
 

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.clean.neighbours import PIECE_ROWS, SLACK, Neighbours, height_quartiles, make_tiles
-from pcfix.errors import InputError, SettingError
+from pcfix.errors import bad_file
 from pcfix.model import BoolArray, FloatArray, IntArray, WaterSurface
 from pcfix.options.steps import LEAST_NEIGHBOURS, CleanRules
 from pcfix.running import threads
@@ -22,6 +22,7 @@ from pcfix.water.checks import as_surface, checked_column, checked_points
 from pcfix.water.surface import is_submerged, surface_above
 
 ReasonArray = npt.NDArray[np.uint8]
+Counted = Callable[[int], None]
 
 
 class Reason(IntFlag):
@@ -43,14 +44,6 @@ class Cloud(NamedTuple):
     used: BoolArray  # (n,), the points to test; the others are not neighbours of any
     submerged: BoolArray  # (n,), those of them to test against the bed
     reasons: ReasonArray  # (n,), bits of `Reason`, set by the tests
-
-
-class Resources(NamedTuple):
-    """Settings of the work that do not change the result; see `make_tiles`, `Neighbours`."""
-
-    tile_m: float | None = None
-    jobs: int | None = None
-    progress: Callable[[int], None] | None = None  # called with the number of points of each piece
 
 
 def flag_weak(
@@ -75,44 +68,45 @@ def flag_weak(
 
 
 def flag_neighbours(
-    name: str, cloud: Cloud, settings: CleanRules, resources: Resources
+    name: str, cloud: Cloud, settings: CleanRules, progress: Counted | None = None
 ) -> dict[str, float]:
-    """Run the tests that look at neighbours: see `flag_sparse` and `flag_off_bed`."""
+    """Run the tests that look at neighbours: see `flag_sparse` and `flag_off_bed`.
+
+    `progress` is called with the number of points of each piece that a test has done.
+    """
     least = max(LEAST_NEIGHBOURS, settings.nearest)
     used, submerged = int(cloud.used.sum()), int(cloud.submerged.sum())
     if used < least + 1:
-        raise InputError(
-            "cloud.too_few_points",
-            f"{name}: has {used:,} points that are neither withheld nor noise, too few for a"
-            f" neighbourhood of {least}. Use fewer neighbours, or skip the cleaning.",
-            path=name, points=used, least=least + 1,
-        )  # fmt: skip
-    if settings.below_or_floating and 0 < submerged < settings.bed_neighbours + 1:
-        raise InputError(
-            "cloud.too_few_points",
-            f"{name}: has {submerged:,} submerged points, too few for a neighbourhood of"
-            f" {settings.bed_neighbours} on the bed. Use fewer bed-neighbours, or switch off the"
-            " tests below and floating.",
-            path=name, points=submerged, least=settings.bed_neighbours + 1,
-        )  # fmt: skip
-    distances = flag_sparse(cloud, settings, resources) if settings.nearest else {}
+        sentence = (
+            f"has {used:,} points that are neither withheld nor noise, too few for a neighbourhood"
+            f" of {least}. Use fewer neighbours, or skip the cleaning."
+        )
+        raise bad_file(name, "cloud.too_few_points", sentence, points=used, least=least + 1)
+    least = settings.bed_neighbours
+    if settings.below_or_floating and 0 < submerged < least + 1:
+        sentence = (
+            f"has {submerged:,} submerged points, too few for a neighbourhood of {least} on the"
+            " bed. Use fewer bed-neighbours, or switch off the tests below and floating."
+        )
+        raise bad_file(name, "cloud.too_few_points", sentence, points=submerged, least=least + 1)
+    distances = flag_sparse(cloud, settings, progress) if settings.nearest else {}
     if settings.below_or_floating and submerged:
-        flag_off_bed(cloud, settings, resources)
+        flag_off_bed(cloud, settings, progress)
     return distances
 
 
-def flag_sparse(cloud: Cloud, settings: CleanRules, resources: Resources) -> dict[str, float]:
+def flag_sparse(cloud: Cloud, settings: CleanRules, progress: Counted | None) -> dict[str, float]:
     """Flag statistical and radius outliers: `Reason.STATISTICAL` and `RADIUS`.
 
     More than ``settings.nearest`` points are used. Returns mean, standard deviation and limit of
     the mean distances to the neighbours, metres; empty without the statistical test.
 
     Both tests find what open3d's ``remove_statistical_outlier`` and ``remove_radius_outlier``
-    find, except in clouds where so many points coincide that the mean distance is zero, or where it
+    find, except in clouds where enough points coincide that the mean distance is zero, or where it
     is the same for all points. There open3d takes all points for outliers, and pcfix none.
     """
     mean_m = np.zeros(len(cloud.xyz)) if settings.statistical else None
-    for near, rows, xyz in _pieces(cloud.xyz, cloud.used, 3, resources):
+    for near, rows, xyz in _pieces(cloud.xyz, cloud.used, 3, progress):
         distance, _ = near.nearest(xyz, settings.nearest)
         if mean_m is not None:
             mean_m[rows] = distance[:, : settings.neighbours].mean(axis=1)
@@ -128,13 +122,13 @@ def flag_sparse(cloud: Cloud, settings: CleanRules, resources: Resources) -> dic
     return {"mean": mean, "sd": sd, "limit": limit}
 
 
-def flag_off_bed(cloud: Cloud, settings: CleanRules, resources: Resources) -> None:
+def flag_off_bed(cloud: Cloud, settings: CleanRules, progress: Counted | None) -> None:
     """Flag submerged points below the bed (`Reason.BELOW_BED`) and above it (`FLOATING`).
 
     The bed at a point is the middle half, by height, of the submerged points nearest to it in plan;
     see `CleanRules`. At least ``settings.bed_neighbours`` points are submerged.
     """
-    for near, rows, xyz in _pieces(cloud.xyz, cloud.submerged, 2, resources):
+    for near, rows, xyz in _pieces(cloud.xyz, cloud.submerged, 2, progress):
         lower, upper = height_quartiles(near, xyz, settings.bed_neighbours).T
         fence, z = settings.fences * (upper - lower), xyz[:, 2]
         if settings.below is not None:
@@ -146,15 +140,15 @@ def flag_off_bed(cloud: Cloud, settings: CleanRules, resources: Resources) -> No
 
 
 def _pieces(
-    xyz: FloatArray, used: BoolArray, axes: int, resources: Resources
+    xyz: FloatArray, used: BoolArray, axes: int, progress: Counted | None
 ) -> Iterator[tuple[Neighbours, IntArray, FloatArray]]:
     """Yield the search, and rows and coordinates of the used points, piece by piece."""
-    tiles = make_tiles(xyz, used, resources.tile_m)
-    near = Neighbours(tiles, axes, resources.jobs)
+    tiles = make_tiles(xyz, used)
+    near = Neighbours(tiles, axes)
     for piece in tiles.pieces(PIECE_ROWS):
         yield near, tiles.row[piece], tiles.xyz[piece]
-        if resources.progress is not None:
-            resources.progress(piece.stop - piece.start)
+        if progress is not None:
+            progress(piece.stop - piece.start)
 
 
 def _set(reasons: ReasonArray, where: BoolArray | IntArray, reason: Reason) -> None:
@@ -171,7 +165,6 @@ def clean_points(
     incidence_deg: npt.ArrayLike | None = None,
     used: npt.ArrayLike | None = None,
     settings: CleanRules | None = None,
-    tile_m: float | None = None,
     jobs: int | None = None,
 ) -> npt.NDArray[np.uint8]:
     """Find the points that are noise, and the reasons.
@@ -192,8 +185,6 @@ def clean_points(
         Points to test; the others are not neighbours of any. Default: all.
     settings : CleanRules, optional
         The thresholds.
-    tile_m : float, optional
-        Side of the square tiles of the search; the result does not depend on it.
     jobs : int, optional
         Threads; default all cores.
 
@@ -225,7 +216,6 @@ def clean_points(
     """
     points = checked_points(xyz)
     settings = settings or CleanRules()
-    check_tile(tile_m)
     n = len(points)
     given, rays, miss, incidence = (
         None if one is None else checked_column(name, one, (n,))
@@ -245,18 +235,8 @@ def clean_points(
         submerged = is_submerged(points[:, 2], surface_above(surface, points, heights))
     with threads(jobs):
         cloud = Cloud(points, mask, mask & submerged, reasons)
-        flag_neighbours("xyz", cloud, settings, Resources(tile_m, jobs=jobs))
+        flag_neighbours("xyz", cloud, settings)
     return reasons
-
-
-def check_tile(tile_m: float | None) -> None:
-    """Raise SettingError ``option.range`` if the side of the tiles is not positive."""
-    if tile_m is not None and not 0.0 < tile_m < np.inf:
-        raise SettingError(
-            "option.range",
-            f"tile_m is {tile_m:g}: it must be positive. Give metres, or None.",
-            option="tile_m", value=tile_m,
-        )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -73,7 +73,7 @@ class Further:
     c2c_from_reference: Distribution | None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Comparison:
     """A cloud against a reference; all errors are cloud minus reference, metres."""
 
@@ -86,13 +86,13 @@ class Comparison:
     c2c_from_reference: AfterBefore[Distribution] | None
     also: tuple[Further, ...]  # further clouds
     vertical: AfterBefore[Distribution] | None  # signed, along the vertical
-    bed: AfterBefore[Statistics] | None  # the same of submerged places and of the others
-    land: AfterBefore[Statistics] | None
+    bed: AfterBefore[Statistics] | None = None  # the same of submerged places and of the others
+    land: AfterBefore[Statistics] | None = None
     own: Own | None  # of the bed, or of all, without the noise of the reference
-    depth: AfterBefore[Line | None] | None  # depth against reference depth, if water is known
-    depth_bins: tuple[Bin, ...]  # submerged places by reference depth
-    shore_bins: tuple[Bin, ...]  # and by distance in plan from the nearest dry point
-    tvu: Tvu | None  # of all submerged places
+    depth: AfterBefore[Line | None] | None = None  # against reference depth, if water is known
+    depth_bins: tuple[Bin, ...] = ()  # submerged places by reference depth
+    shore_bins: tuple[Bin, ...] = ()  # and by distance in plan from the nearest dry point
+    tvu: Tvu | None = None  # of all submerged places
     m3c2: AfterBefore[M3c2] | None
     sections: tuple[Section, ...]
     settings: CompareRules
@@ -149,7 +149,7 @@ def bins_table(bins: Iterable[Bin]) -> str:
 
 
 SPARSER = 2.0
-"""A cloud is called sparse if its spacing is so many times that of the other."""
+"""Ratio of the spacings of two clouds from which one is called sparse."""
 AS_DEEP, TOO_DEEP = 0.10, 0.15
 """Relative to the depth: a cloud whose apparent depths differ from the reference by at most the
 first, and whose corrected ones by more than the second, was corrected twice. Refraction makes
@@ -171,13 +171,11 @@ def figures_of(
     whole, reference = match.whole, match.reference
     notes = []
     if match.cloud.shift_m is None:
-        notes.append(
-            PcfixWarning(
-                "cloud.no_shifts",
-                "The cloud has no dimensions ShiftX, ShiftY and ShiftZ, so its apparent points are"
-                " not compared.",
-            )
+        text = (
+            "The cloud has no dimensions ShiftX, ShiftY and ShiftZ, so its apparent points are not"
+            " compared."
         )
+        notes.append(PcfixWarning("cloud.no_shifts", text))
     c2c, c2c_from_reference = found = c2c_of(match)
     notes += sparse_notes(match, found)
     pairs = vertical = residuals = None
@@ -187,8 +185,7 @@ def figures_of(
         if reference.sparse:
             after = pairs.after
             residuals = np.column_stack([after.xy, after.reference_m, after.error_m])
-    by_depth = {} if pairs is None else _by_depth(match, pairs, notes)
-    own = None
+    by_depth, own = {} if pairs is None else _by_depth(match, pairs, notes), None
     if vertical is not None:
         bed, stated = by_depth.get("bed"), match.settings.sigma_reference
         errors = vertical.after.statistics if bed is None else bed.after
@@ -208,9 +205,6 @@ def figures_of(
         by_nearest=0 if pairs is None else int(pairs.after.by_nearest.sum()),
         reference_compared=len(match.places) if match.settings.from_reference else 0,
     )
-    nothing = {
-        "bed": None, "land": None, "depth": None, "depth_bins": (), "shore_bins": (), "tvu": None
-    }  # fmt: skip
     return Comparison(
         cloud=whole.name,
         reference=reference.name,
@@ -221,7 +215,7 @@ def figures_of(
         also=tuple(also),
         vertical=vertical,
         own=own,
-        **{**nothing, **by_depth},
+        **by_depth,
         m3c2=_m3c2(match, pairs) if match.settings.m3c2 else None,
         sections=_sections(match, lines, others),
         settings=match.settings,
@@ -286,15 +280,11 @@ def sparse_notes(match: Match, found: C2c) -> list[PcfixWarning]:
             remedy = "Use the vertical error, or give the reference as points."
         elif None not in found:
             remedy = f"Use C2C from each point of the {sparse}."
-        notes.append(
-            PcfixWarning(
-                f"{sparse}.sparse",
-                f"C2C to the {sparse} ({mean:.3f} m on average) mostly measures the spacing of its"
-                f" points: {apart:.2g} m, {times:.0f} times that of the {dense}. {remedy}",
-                spacing_m=apart,
-                times=times,
-            )
+        text = (
+            f"C2C to the {sparse} ({mean:.3f} m on average) mostly measures the spacing of its"
+            f" points: {apart:.2g} m, {times:.0f} times that of the {dense}. {remedy}"
         )
+        notes.append(PcfixWarning(f"{sparse}.sparse", text, spacing_m=apart, times=times))
     return notes
 
 
@@ -304,19 +294,19 @@ def _pairs(match: Match) -> AfterBefore[Pairs]:
     name = match.whole.name if sparse else match.reference.name
     count = len(match.cloud if sparse else match.reference.xyz)
     if count < k:
-        raise GeometryError(
-            "cloud.too_few_points" if sparse else "reference.too_few_points",
+        sentence = (
             f"{name}: {count} points are too few for planes through {k} neighbours. Give more"
-            " points (at least 6, with --neighbours 6).",
-            path=name, points=count, least=k,
-        )  # fmt: skip
+            " points (at least 6, with --neighbours 6)."
+        )
+        code = f"{'cloud' if sparse else 'reference'}.too_few_points"
+        raise GeometryError(code, sentence, path=name, points=count, least=k)
 
     def pairs(xyz: FloatArray) -> Pairs:
         if sparse:
-            plane = heights_at(match.places, xyz, k)
-            return Pairs(match.places[:, :2], plane.height_m, match.places[:, 2], plane.by_nearest)
-        plane = heights_at(xyz, match.reference.xyz, k)
-        return Pairs(xyz[:, :2], xyz[:, 2], plane.height_m, plane.by_nearest)
+            height, by_nearest = heights_at(match.places, xyz, k)
+            return Pairs(match.places[:, :2], height, match.places[:, 2], by_nearest)
+        height, by_nearest = heights_at(xyz, match.reference.xyz, k)
+        return Pairs(xyz[:, :2], xyz[:, 2], height, by_nearest)
 
     return both(pairs, match.cloud.xyz, match.cloud.apparent)
 
@@ -345,19 +335,16 @@ def _by_depth(match: Match, pairs: AfterBefore[Pairs], notes: list[PcfixWarning]
         line_before = fit_line(depth_before, mapped(np.subtract, depth_before, error_before))
         corrected, apparent = _ratio(depth, error), _ratio(depth_before, error_before)
         if abs(apparent - 1.0) <= AS_DEEP and corrected > 1.0 + TOO_DEEP:
-            notes.append(
-                PcfixWarning(
-                    "cloud.corrected_twice",
-                    "The input cloud had the depths of the reference already: it was likely"
-                    " corrected before.",
-                    apparent_ratio=apparent,
-                    corrected_ratio=corrected,
-                )
+            text = (
+                "The input cloud had the depths of the reference already: it was likely corrected"
+                " before."
             )
+            ratios = {"apparent_ratio": apparent, "corrected_ratio": corrected}
+            notes.append(PcfixWarning("cloud.corrected_twice", text, **ratios))
     rules, shore_bins = match.settings, tuple[Bin, ...]()
     if match.dry.any():
         dry = kept(match.dry, match.whole.xyz)[:, :2]
-        shore = nearest_distance(kept(wet, after.xy), dry, 2)
+        shore = nearest_distance(kept(wet, after.xy), dry)
         shore_bins = binned(shore, error, error_before, rules.shore_bin_width)
     else:
         text = "The cloud has no dry point, so there are no figures by distance from the shore."

@@ -65,56 +65,22 @@ def m3c2_distances(xyz: FloatArray, reference: FloatArray, max_distance_m: float
     the shape (m, 3), both metres, world frame. The cylinders reach at least `max_distance_m` to
     either side. Raises GeometryError ``reference.no_overlap`` if no cylinder holds points of both.
     """
+    py4dgeo = load_py4dgeo()
     clouds = make_tiles(xyz, points=TILE_POINTS), make_tiles(reference, points=TILE_POINTS)
-    spacing = max(
-        *(point_spacing_m(*one) for one in zip((xyz, reference), clouds, strict=True)), 1e-3
-    )
+    spacings = (point_spacing_m(*one) for one in zip((xyz, reference), clouds, strict=True))
+    spacing = max(1e-3, *spacings)
     normal, cylinder = NORMAL_SPACINGS * spacing, CYLINDER_SPACINGS * spacing
     # py4dgeo cuts a cylinder into lengths of its radius: an odd number of them, as a core point on
     # the border of two would count twice, once or not at all
     pieces = 2 * math.ceil((max_distance_m / cylinder - 1.0) / 2.0) + 1
     max_distance_m = (max(pieces, 1) - 1e-6) * cylinder
     core = xyz[sample_rows(len(xyz), MAX_CORE_POINTS)]
-    distance, detection = _in_tiles(clouds, core, normal, cylinder, max_distance_m)
-    known = np.isfinite(distance)
-    if not known.any():
-        raise GeometryError(
-            "reference.no_overlap",
-            f"M3C2: no cylinder of {cylinder:.3g} m radius holds points of both clouds within"
-            f" {max_distance_m:.3g} m. Check that they overlap.",
-            radius_m=cylinder, max_distance_m=max_distance_m,
-        )  # fmt: skip
-    found, limits = distance[known], detection[known]
-    certain = np.isfinite(limits)
-    return M3c2(
-        len(core),
-        statistics_of(found),
-        float(limits[certain].mean()) if certain.any() else float("nan"),
-        float((np.abs(found[certain]) > limits[certain]).mean()) if certain.any() else 0.0,
-        normal,
-        cylinder,
-        max_distance_m,
-    )
-
-
-def _in_tiles(
-    clouds: tuple[Tiles, Tiles],
-    core: FloatArray,
-    normal_m: float,
-    cylinder_m: float,
-    max_distance_m: float,
-) -> tuple[FloatArray, FloatArray]:
-    """Return distance and level of detection of each core point (n, 3); NaN if unknown.
-
-    A tile of core points gets both clouds with a margin as wide as a normal or a tilted cylinder
-    reaches.
-    """
-    py4dgeo = load_py4dgeo()
-    found = np.full((2, len(core)), np.nan)
-    reach = max(normal_m, math.hypot(cylinder_m, max_distance_m)) * SLACK
+    # a tile of core points gets both clouds with a margin as wide as a normal or a tilted cylinder
+    reach = max(normal, math.hypot(cylinder, max_distance_m)) * SLACK
     share = len(core) / max(len(one.row) for one in clouds)
     tiles = make_tiles(core, points=max(1, round(TILE_POINTS * share)))
     origin = np.floor(clouds[1].low.min(axis=0))
+    distance, detection = np.full((2, len(core)), np.nan)
     for piece in tiles.pieces(len(core)):
         some = tiles.xyz[piece]
         low, high = some.min(axis=0) - reach, some.max(axis=0) + reach
@@ -123,16 +89,36 @@ def _in_tiles(
             continue
         with _silence():
             epoch = py4dgeo.Epoch(cloud)
-            distance, uncertainty = py4dgeo.M3C2(
+            found, uncertainty = py4dgeo.M3C2(
                 epochs=(py4dgeo.Epoch(below), epoch),
                 corepoints=np.ascontiguousarray(some - origin),
-                normal_radii=[normal_m],
-                cyl_radius=cylinder_m,
+                normal_radii=[normal],
+                cyl_radius=cylinder,
                 max_distance=max_distance_m,
                 cloud_for_normals=epoch,
             ).run()
-        found[:, tiles.row[piece]] = distance, uncertainty["lodetection"]
-    return found[0], found[1]
+        row = tiles.row[piece]
+        distance[row], detection[row] = found, uncertainty["lodetection"]
+    known = np.isfinite(distance)
+    if not known.any():
+        sentence = (
+            f"M3C2: no cylinder of {cylinder:.3g} m radius holds points of both clouds within"
+            f" {max_distance_m:.3g} m. Check that they overlap."
+        )
+        values = {"radius_m": cylinder, "max_distance_m": max_distance_m}
+        raise GeometryError("reference.no_overlap", sentence, **values)
+    distance, detection = distance[known], detection[known]
+    certain = np.isfinite(detection)
+    beyond = np.abs(distance[certain]) > detection[certain]
+    return M3c2(
+        len(core),
+        statistics_of(distance),
+        float(detection[certain].mean()) if certain.any() else float("nan"),
+        float(beyond.mean()) if certain.any() else 0.0,
+        normal,
+        cylinder,
+        max_distance_m,
+    )
 
 
 @contextlib.contextmanager

@@ -11,7 +11,7 @@ import numpy as np
 from pcfix.blocks import blocks, bounds, empty, kept, mapped
 from pcfix.clean.neighbours import nearest_of
 from pcfix.compare.nearest import mean_spacing_m
-from pcfix.errors import GeometryError, InputError, SettingError
+from pcfix.errors import GeometryError, SettingError, bad_file
 from pcfix.model import BoolArray, FloatArray, IntArray, WaterSurface
 from pcfix.options.steps import CompareRules
 
@@ -109,7 +109,7 @@ class Match:
         if len(self.water_points) == 0:
             return None
         height = empty((len(xy),))
-        for rows, _, _, near in nearest_of(xy, self.water_points, 1, 2):
+        for rows, _, near in nearest_of(xy, self.water_points, 1):
             height[rows] = near[:, 0, 2]
         return height
 
@@ -140,12 +140,11 @@ def match(whole: SurveyCloud, target: Reference, settings: CompareRules, *, give
         wet |= whole.bathymetric
     chosen = wet if settings.submerged else np.ones(len(whole), np.bool_)
     if not chosen.any():
-        raise InputError(
-            "cloud.not_submerged",
-            f"{whole.name}: no point is of class 40 or below the water. Give the water surface with"
-            " --water, or leave out --submerged.",
-            path=whole.name,
+        sentence = (
+            "no point is of class 40 or below the water. Give the water surface with --water, or"
+            " leave out --submerged."
         )
+        raise bad_file(whole.name, "cloud.not_submerged", sentence)
     not_submerged = int(len(whole) - chosen.sum())
     places, near = target.xyz, chosen
     if target.sparse or settings.from_reference:
@@ -168,30 +167,26 @@ def match(whole: SurveyCloud, target: Reference, settings: CompareRules, *, give
             " CRS of both.",
             cloud=whole.name, reference=target.name, bounds=boxes,
         )  # fmt: skip
-    cloud = whole.take(near)
+    cloud, by_place = whole.take(near), target.sparse or settings.from_reference
     asked = whole.take(chosen) if settings.from_reference and not target.sparse else cloud
     found = Match(
         whole, cloud, kept(near, wet), ~wet, target, places, asked, outside, not_submerged, settings
     )  # fmt: skip
-    by_place = target.sparse or settings.from_reference
-    return _only_wet_places(found) if by_place and settings.submerged else found
-
-
-def _only_wet_places(found: Match) -> Match:
-    """Exclude points of the reference above the water, if the water is known."""
-    surface = found.water_at(found.places[:, :2])
+    surface = found.water_at(places[:, :2]) if by_place and settings.submerged else None
     if surface is None:
         return found
-    wet = mapped(lambda xyz, water: xyz[:, 2] < water, found.places, surface)
-    if not wet.any():
-        raise GeometryError(
-            "reference.not_submerged",
-            f"{found.reference.name}: none of its points near the cloud is under water. Check the"
-            " water level, or leave out --submerged.",
-            path=found.reference.name,
+    # without the places of the reference above the water
+    under = mapped(lambda xyz, water: xyz[:, 2] < water, places, surface)
+    if not under.any():
+        sentence = (
+            "none of its points near the cloud is under water. Check the water level, or leave out"
+            " --submerged."
         )
-    dry = int((~wet).sum()) if found.reference.sparse else 0
-    return replace(found, places=kept(wet, found.places), not_submerged=found.not_submerged + dry)
+        raise GeometryError(
+            "reference.not_submerged", f"{target.name}: {sentence}", path=target.name
+        )
+    dry = int((~under).sum()) if target.sparse else 0
+    return replace(found, places=kept(under, places), not_submerged=not_submerged + dry)
 
 
 def _gap(xyz: FloatArray, settings: CompareRules) -> float:

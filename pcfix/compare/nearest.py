@@ -24,7 +24,7 @@ from pcfix.model import FloatArray, IntArray
 POINTS_PER_CELL = 3.0
 MAX_CELLS = 20_000_000
 MAX_RINGS = 10
-"""After so many rings a search is left to the tree."""
+"""Rings of cells after which a tree is searched instead."""
 
 
 Indices: TypeAlias = npt.NDArray[np.int32]
@@ -87,7 +87,7 @@ def spacing_m(points: FloatArray) -> float:
 
 
 def _side(extent: FloatArray, cells: float) -> float:
-    """Return the side of so many squares over a rectangle, or along a narrow one."""
+    """Return the side of a number of squares over a rectangle, or along a narrow one."""
     area, length = float(extent.prod()), float(extent.max())
     return max(float(np.sqrt(area / cells)), length / cells, length * 1e-6, 1e-9)
 
@@ -268,14 +268,9 @@ def cloud_to_cloud(xyz: FloatArray, reference: FloatArray) -> FloatArray:
     Both have the shape (n, 3), metres, world frame. The distance has no sign. Where the two clouds
     sample a surface at different places it is at least about half the spacing of the reference.
     """
-    near = CellSearch(_tiles(reference))
-    if len(xyz) <= 2 * TILE_POINTS:
-        return near.nearest(xyz, 1)[0][:, 0]
-    asked = _tiles(xyz)
-    distance = empty((len(xyz),))
+    near, asked, distance = CellSearch(_tiles(reference)), _tiles(xyz), empty((len(xyz),))
     for piece in asked.pieces(2 * TILE_POINTS):
-        found = near.nearest(asked.xyz[piece], 1)[0][:, 0]
-        distance[asked.row[piece]] = found
+        distance[asked.row[piece]] = near.nearest(asked.xyz[piece], 1)[0][:, 0]
     return distance
 
 

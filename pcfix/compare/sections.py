@@ -12,7 +12,7 @@ from pcfix.errors import GeometryError, SettingError
 from pcfix.model import FloatArray
 
 STATIONS = 200
-"""At most so many stations; they are at least a quarter of the corridor's width apart."""
+"""Maximum number of stations; they are at least a quarter of the corridor's width apart."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,11 +27,8 @@ class SectionLine:
     def __post_init__(self) -> None:
         """Check that the line has a length."""
         if not (np.isfinite(self.length_m) and self.length_m > 0.0):
-            raise SettingError(
-                "option.section",
-                f"section {self} has no length. Give two different points x1,y1,x2,y2.",
-                value=str(self),
-            )
+            sentence = f"section {self} has no length. Give two different points x1,y1,x2,y2."
+            raise SettingError("option.section", sentence, value=str(self))
 
     def __str__(self) -> str:
         return f"{self.x1:.10g},{self.y1:.10g},{self.x2:.10g},{self.y2:.10g}"
@@ -77,11 +74,8 @@ def parse_line(text: str) -> SectionLine:
     try:
         x1, y1, x2, y2 = (float(part) for part in text.split(","))
     except ValueError:
-        raise SettingError(
-            "option.section",
-            f"section '{text}' is not four numbers x1,y1,x2,y2. Give them in the CRS of the cloud.",
-            value=text,
-        ) from None
+        sentence = "is not four numbers x1,y1,x2,y2. Give them in the CRS of the cloud."
+        raise SettingError("option.section", f"section '{text}' {sentence}", value=text) from None
     return SectionLine(x1, y1, x2, y2)
 
 

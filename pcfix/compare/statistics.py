@@ -104,9 +104,7 @@ def statistics_of(values: FloatArray) -> Statistics:
         min_m=float(marks[-2]),
         max_m=float(marks[-1]),
         within_95_m=float(np.percentile(np.abs(values), 95)),
-        percentiles_m={
-            f"p{name}": float(mark) for name, mark in zip(PERCENTILES, marks, strict=False)
-        },
+        percentiles_m={f"p{p}": float(m) for p, m in zip(PERCENTILES, marks, strict=False)},
     )
 
 
@@ -237,21 +235,13 @@ def fit_line(reference_depth_m: FloatArray, depth_m: FloatArray) -> Line | None:
     if len(depth_m) < 3:
         return None
     x_mean, y_mean = float(reference_depth_m.mean()), float(depth_m.mean())
-
-    def product(a: FloatArray, b: FloatArray, a_mean: float, b_mean: float) -> float:
-        return total(lambda u, v: (u - a_mean) @ (v - b_mean), a, b)
-
-    xx = product(reference_depth_m, reference_depth_m, x_mean, x_mean)
-    yy = product(depth_m, depth_m, y_mean, y_mean)
-    xy = product(reference_depth_m, depth_m, x_mean, y_mean)
+    x, y = reference_depth_m - x_mean, depth_m - y_mean
+    xx, yy, xy = float(x @ x), float(y @ y), float(x @ y)
     scale = max(float(-reference_depth_m.min()), float(reference_depth_m.max()), 1e-9)
-    count = len(depth_m)
-    if xx <= count * (1e-9 * scale) ** 2:
+    if xx <= len(depth_m) * (1e-9 * scale) ** 2:
         return None
-    slope = xy / xx
-    intercept = y_mean - slope * x_mean
     r2 = xy * xy / (xx * yy) if yy > 0.0 else 1.0
-    return Line(slope, intercept, r2, count)
+    return Line(xy / xx, y_mean - xy / xx * x_mean, r2, len(depth_m))
 
 
 def binned(
@@ -267,12 +257,8 @@ def binned(
     place = mapped(lambda some: np.floor(some / width_m), by_m)
     numbers = np.unique(np.hstack([np.unique(place[rows]) for rows in blocks(len(place))]))
     if len(numbers) > MAX_BINS:
-        raise SettingError(
-            "option.range",
-            f"A bin width of {width_m:g} m makes {len(numbers):,} bins. Use a larger one.",
-            value=width_m,
-            bins=len(numbers),
-        )
+        sentence = f"A bin width of {width_m:g} m makes {len(numbers):,} bins. Use a larger one."
+        raise SettingError("option.range", sentence, value=width_m, bins=len(numbers))
     group = mapped(lambda some: np.searchsorted(numbers, some).astype(np.uint16), place)
     errors = [after_m] if before_m is None else [after_m, before_m]
     start, errors = grouped(group, len(numbers), *errors)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import TypeAlias
 
 import numpy as np
 
@@ -12,31 +12,26 @@ from pcfix.blocks import empty, mapped
 from pcfix.clean.neighbours import nearest_of
 from pcfix.model import BoolArray, FloatArray
 
+Heights: TypeAlias = tuple[FloatArray, BoolArray]
+"""World Z of a surface at n places, (n,), and where it is that of the nearest point."""
 MIN_SHAPE = 1e-3
 """Points are on a line if the determinant of their covariance over its squared trace is less."""
 MAX_REACH = 3.0
 """Largest distance of a place from the neighbours' centre, in their standard deviations."""
 
 
-class Heights(NamedTuple):
-    """Heights of a surface at n places."""
-
-    height_m: FloatArray  # (n,), world Z
-    by_nearest: BoolArray  # (n,), no plane could be fitted: the nearest point's height is used
-
-
 def heights_at(xy: FloatArray, surface: FloatArray, neighbours: int) -> Heights:
-    """Return the height of a surface at places in plan.
+    """Return the height of a surface at places in plan, and where it is that of one point.
 
     At each place, (n, 2) or (n, 3), a plane is fitted by least squares in Z to the `neighbours`
     points of the surface, (m, 3), that are nearest in plan, and evaluated; metres, world frame. If
     these points lie on a line, or the place far outside them, the height of the nearest is used.
     """
     height, by_nearest = empty((len(xy),)), empty((len(xy),), np.bool_)
-    for rows, here, _, near in nearest_of(xy, surface, neighbours, 2):
+    for rows, here, near in nearest_of(xy, surface, neighbours):
         near[:, :, :2] -= here[:, np.newaxis, :2]
         height[rows], by_nearest[rows] = _plane_at_origin(near)
-    return Heights(height, by_nearest)
+    return height, by_nearest
 
 
 def _plane_at_origin(near: FloatArray) -> Heights:
@@ -55,7 +50,7 @@ def _plane_at_origin(near: FloatArray) -> Heights:
     reach = (vv * mu * mu - 2.0 * uv * mu * mv + uu * mv * mv) / safe
     fitted = flat & (reach <= MAX_REACH**2)
     plane = middle[:, 2] - slope_u * mu - slope_v * mv
-    return Heights(np.where(fitted, plane, near[:, 0, 2]), ~fitted)
+    return np.where(fitted, plane, near[:, 0, 2]), ~fitted
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.blocks import release
-from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError
+from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError, bad_file
 from pcfix.flow.inputs import Inputs
-from pcfix.flow.photos import lens_of, plain, read_heights, warn_all
+from pcfix.flow.photos import photo_of, plain, read_heights, warn_all
 from pcfix.flow.runner import Progress, check_summary, write_summary
 from pcfix.grid.lattice import Lattice
 from pcfix.io.atomic import temporary_folder, temporary_output
@@ -107,7 +107,7 @@ def calm_frames(
         Folder of photographs of one size, in the order of their names, or a video.
     out : path
         Image in the format of the frames, with the metadata of the first; PNG for a video. The
-        spread is written beside it, and with `surface` a folder of rasters of the water.
+        spread is written next to it, and with `surface` a folder of rasters of the water.
     options : CalmOptions, optional
         Or its attributes as keywords.
     progress : callable, optional
@@ -120,9 +120,8 @@ def calm_frames(
     target, beside = check_calm(out, found, overwrite=given.overwrite)
     folder = target.with_name(f"{target.stem}_water")
     if given.surface and folder.exists() and not given.overwrite:
-        raise SettingError(
-            "output.exists", f"{folder}: exists. Add --overwrite to replace it.", path=folder
-        )
+        sentence = f"{folder}: exists. Add --overwrite to replace it."
+        raise SettingError("output.exists", sentence, path=folder)
     total = len(found.names) * (1 + given.surface + (not given.still))
     done = 0
 
@@ -131,6 +130,7 @@ def calm_frames(
         nonlocal done
         for frame in some:
             yield frame
+            release()
             done += 1
             if progress is not None:
                 progress(done, total)
@@ -143,15 +143,15 @@ def calm_frames(
         if view is not None:
             interval = given.interval * given.every if given.interval else found.interval_s
             nodes = nodes_of(view, given.resolution)
-            measured = _displacements(median, view, nodes, count(stack))
-            waters, water = _water(view, nodes, *measured, interval, str(folder))
+            measure = Displacements(median, view, nodes)
+            measured = [measure.of(frame) for frame in count(stack)]
+            shifts, weights = (np.stack(one) for one in zip(*measured, strict=True))
+            weights[:, still(shifts, weights)] = 0.0
+            waters, water = _water(view, nodes, shifts, weights, interval, str(folder))
             with temporary_folder(folder) as draft:
                 _write_waters(draft, found.names, view.level_m, nodes, waters, crs)
             if interval is None:
-                words = (
-                    "The time between frames is not known, so each frame is fitted alone. Give"
-                    " --interval."
-                )
+                words = "The times are unknown, so frames are fitted separately. Give --interval."
                 notes.append(PcfixWarning("frames.no_interval", words))
             if water.explained < LEAST_EXPLAINED:
                 words = (
@@ -188,11 +188,12 @@ def _registered(frames: Frames, images: Iterable[Any], *, still: bool) -> Regist
     way = register(np.stack(places))
     lost = np.flatnonzero(~np.isfinite(way.homography).all(axis=(1, 2)))
     if len(lost):
+        names = [frames.names[row] for row in lost]
         raise InputError(
             "frames.no_overlap",
             f"{frames.path}: {len(lost)} frames share fewer than {LEAST_CORNERS} corners with the"
-            f" first, such as {frames.names[lost[0]]}. Leave them out, or begin with another.",
-            frames=[frames.names[row] for row in lost],
+            f" first, such as {names[0]}. Leave them out, or begin with another.",
+            frames=names,
         )
     return way
 
@@ -215,7 +216,6 @@ def _median(
             )
         same = np.array_equal(way.homography[number], np.eye(3))
         stack[number] = frame if same else laid(frame, way.homography[number])
-        release()
     shape = stack.shape[1:3]
     median = np.empty(stack.shape[1:], stack.dtype)
     spread = np.empty(shape, np.float32)
@@ -246,16 +246,11 @@ def _view(given: CalmOptions, frames: Frames) -> tuple[View, str | None]:
     rows = [row for row, label in enumerate(cameras.labels) if Path(label).stem == first]
     rows = [0] if len(cameras.labels) == 1 else rows
     if len(rows) != 1 or cameras.rotations is None or cameras.lenses is None:
-        raise InputError(
-            "photos.no_pose",
-            f"{given.cameras}: has no single pose with angles and a lens for {first}. Give one row"
-            " of that name.",
-            path=given.cameras,
-            photograph=first,
+        sentence = (
+            f"has no single pose with angles and a lens for {first}. Give one row of that name."
         )
-    row = rows[0]
-    lens = lens_of(frames.path, cameras, row, size)
-    photo = Photo(cameras.labels[row], cameras.centres[row], cameras.rotations[row], lens)
+        raise bad_file(given.cameras, "photos.no_pose", sentence, photograph=first)
+    photo = photo_of(frames.path, cameras, rows[0], size)
     return View(photo, level, index, bed), crs or cameras.crs
 
 
@@ -268,12 +263,8 @@ def _bed(given: CalmOptions) -> tuple[Callable[[FloatArray], FloatArray], str | 
         depth = np.nan
     if np.isfinite(depth):
         if not depth > 0.0:
-            raise SettingError(
-                "option.range",
-                f"depth {depth:g} is not positive. Give metres below the level.",
-                option="depth",
-                value=depth,
-            )
+            sentence = f"depth {depth:g} is not positive. Give metres below the level."
+            raise SettingError("option.range", sentence, option="depth", value=depth)
         return lambda xy: np.full(len(xy), level - depth), None
     with tempfile.TemporaryDirectory() as scratch:
         height, (left, top, cell), crs, corrected = read_heights(
@@ -284,19 +275,6 @@ def _bed(given: CalmOptions) -> tuple[Callable[[FloatArray], FloatArray], str | 
         height = np.where(height < level, level - index * (level - height), height)
     raster = WaterRaster(height, left, top, (cell, cell), "bed")
     return lambda xy: surface_above(raster, xy).height_m, crs
-
-
-def _displacements(
-    median: Any, view: View, nodes: Nodes, images: Iterable[Any]
-) -> tuple[FloatArray, FloatArray]:
-    """Return by how much the bed is displaced at the nodes in each frame, and weights."""
-    measure, measured = Displacements(median, view, nodes), []
-    for frame in images:
-        measured.append(measure.of(frame))
-        release()
-    shifts, weights = (np.stack(one) for one in zip(*measured, strict=True))
-    weights[:, still(shifts, weights)] = 0.0
-    return shifts, weights
 
 
 def _water(

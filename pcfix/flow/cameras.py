@@ -91,27 +91,14 @@ def check_cameras(
         cameras = read_gnss(given.gnss, cameras)
     diagnosis, remedy = None, ("", "")
     if view is not None and surface is not None:
-        reference = None if given.reference is None else read_reference(given.reference)
-        if reference is not None:
-            crs = None if isinstance(view.crs, str) else view.crs
-            check_same_crs(view.name, crs, reference.name, reference.crs)
-        control = None if given.gcps is None else read_ground_control(given.gcps, cameras).surveyed
-        lens = given.lens
-        evidence = Evidence(
-            cameras, str(path), surface, index_of(given.index, given.index_formula)[0],
-            view=view, reference=reference, control=control,
-            calibrated=given_focal_lengths(str(path)) if lens is None else focal_length_of(lens),
-            ties=ties_of(inputs, view.crs),
-        )  # fmt: skip
-        diagnosis = diagnose(evidence)
+        diagnosis = _diagnosed(given, inputs, cameras, view, surface)
         surveys = {name: getattr(given, name) for name in ("gnss", "gcps", "lens", "index")}
         remedy = adjust_words(inputs, view.name, has_datum=has_datum(cameras, str(path)), **surveys)
-    level = None
+    level = above = range_m = tilt_deg = None
     if surface is not None and not (isinstance(surface, WaterDimension) and heights is None):
         at = cameras.centres if heights is None else xyz
         known_m = surface_above(surface, at, heights).height_m
         level = float(np.nanmean(known_m)) if np.isfinite(known_m).any() else None
-    above = range_m = tilt_deg = None
     if level is not None and not problem:  # geocentric cameras have no heights
         above = cameras.centres[:, 2] - level
         range_m = float(above.min()), float(above.mean()), float(above.max())
@@ -124,10 +111,11 @@ def check_cameras(
         fit = _fit(cameras, view, xyz, quick_ties(inputs, view.crs), flight)
         up = None if gnss is None or inputs.cameras_crs is None else gnss.mean_m[2]
         if up is not None and abs(up) >= UNDULATION_M[0] and not fit.verdict:
+            side = "above" if up > 0.0 else "below"
             verdict = (
-                f"With --cameras-crs the cameras are {abs(up):.1f} m"
-                f" {'above' if up > 0.0 else 'below'} their GNSS heights. One of them is likely"
-                " above the ellipsoid and the other above the geoid; check the vertical CRS."
+                f"With --cameras-crs the cameras are {abs(up):.1f} m {side} their GNSS heights. One"
+                " of them is likely above the ellipsoid and the other above the geoid; check the"
+                " vertical CRS."
             )
             fit = replace(fit, verdict=verdict)
     report = CamerasReport(
@@ -149,6 +137,26 @@ def check_cameras(
         write_plot(given, block_figure(report))
     write_summary(given, report.as_dict())
     return report
+
+
+def _diagnosed(
+    given: CamerasCheckOptions, inputs: Inputs, cameras: Cameras, view: CloudView,
+    surface: WaterSurface,
+) -> Diagnosis:  # fmt: skip
+    """Test whether the poses have absorbed refraction."""
+    path, lens = str(inputs.cameras), given.lens
+    reference = None if given.reference is None else read_reference(given.reference)
+    if reference is not None:
+        crs = None if isinstance(view.crs, str) else view.crs
+        check_same_crs(view.name, crs, reference.name, reference.crs)
+    evidence = Evidence(
+        cameras, path, surface, index_of(given.index, given.index_formula)[0], view=view,
+        reference=reference,
+        control=None if given.gcps is None else read_ground_control(given.gcps, cameras).surveyed,
+        calibrated=given_focal_lengths(path) if lens is None else focal_length_of(lens),
+        ties=ties_of(inputs, view.crs),
+    )  # fmt: skip
+    return diagnose(evidence)
 
 
 def sample_of(
@@ -182,25 +190,27 @@ def _sensors(cameras: Cameras, above_m: FloatArray | None) -> tuple[Sensor, ...]
         # separately only if most lenses have several images
         if len(groups) <= MOST_SENSORS and (key is not keys[0] or len(groups) <= len(lenses) // 2):
             break
-    calibrated = any(_is_distorted(lens) for lens in lenses)
-    return tuple(_sensor(lenses, rows, above_m, calibrated) for rows in groups.values())
+    calibrated = any(map(_is_distorted, lenses))
+    above = np.full(len(lenses), np.nan) if above_m is None else above_m
+    return tuple(
+        _sensor([lenses[row] for row in rows], float(np.mean(above[rows])), calibrated)
+        for rows in groups.values()
+    )
 
 
 def _is_distorted(lens: Lens) -> bool:
     return any((*lens.radial, *lens.denominator, *lens.tangential, *lens.thin_prism))
 
 
-def _sensor(
-    lenses: tuple[Lens, ...], rows: list[int], above_m: FloatArray | None, calibrated: bool
-) -> Sensor:
-    lens, alike = lenses[rows[0]], list(dict.fromkeys(lenses[row] for row in rows))
+def _sensor(lenses: list[Lens], above_m: float, calibrated: bool) -> Sensor:
+    """Return a sensor from the lenses of its images, `above_m` the water on average."""
+    lens, alike = lenses[0], list(dict.fromkeys(lenses))
     pixel = lens.pixel_size_mm
     focal_px = lens.focal if lens.unit == "px" else None if pixel is None else lens.focal / pixel
-    above = None if above_m is None else float(np.mean(above_m[rows]))
     middle = (lens.principal_x, lens.principal_y) == (lens.width / 2.0, lens.height / 2.0)
     return Sensor(
         name=lens.sensor if all(one.sensor == lens.sensor for one in alike) else "several",
-        images=len(rows),
+        images=len(lenses),
         width=lens.width,
         height=lens.height,
         focal=min(one.focal for one in alike),
@@ -209,7 +219,7 @@ def _sensor(
         pixel_size_um=None if pixel is None else 1000.0 * pixel,
         projection=lens.projection,
         distorted=_is_distorted(lens),
-        gsd_m=above / focal_px if above is not None and above > 0.0 and focal_px else None,
+        gsd_m=above_m / focal_px if above_m > 0.0 and focal_px else None,
         lenses=len(alike),
         focal_most=max(one.focal for one in alike),
         frames=len({(one.width, one.height) for one in alike}),
@@ -237,13 +247,12 @@ def _gnss(cameras: Cameras, name: str) -> GnssResiduals | None:
         return GnssResiduals(0, (None,) * 3, (None,) * 3, 0.0, "", found.reason)
     enu = found.enu_m[rows]
     length = np.sqrt(np.nansum(enu * enu, axis=1))
-    worst = int(np.argmax(length))
+    image = cameras.labels[rows[int(np.argmax(length))]]
     mean, sd = (
         tuple(float(one) if np.isfinite(one) else None for one in values)
         for values in (enu.mean(axis=0), enu.std(axis=0))
     )
-    image = cameras.labels[rows[worst]]
-    return GnssResiduals(len(rows), mean, sd, float(length[worst]), image, found.reason)
+    return GnssResiduals(len(rows), mean, sd, float(length.max()), image, found.reason)
 
 
 def _fit(

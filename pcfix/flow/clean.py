@@ -12,15 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.blocks import empty, release
-from pcfix.clean.points import (
-    CleanSummary,
-    Cloud,
-    Reason,
-    Resources,
-    check_tile,
-    flag_neighbours,
-    flag_weak,
-)
+from pcfix.clean.points import CleanSummary, Cloud, Reason, flag_neighbours, flag_weak
 from pcfix.errors import InputError
 from pcfix.flow.runner import Chunk, Command, Progress, streaming
 from pcfix.flow.surfaces import CloudView, Points, find_surface, points_of, view_of
@@ -46,7 +38,6 @@ def clean_file(
     output: File,
     *,
     options: CleanOptions | None = None,
-    tile_m: float | None = None,
     progress: Progress | None = None,
     **keywords: Any,
 ) -> CleanSummary:
@@ -64,8 +55,6 @@ def clean_file(
         `pcfix.correct_file`: neighbours are those of the whole cloud.
     options : CleanOptions, optional
         Or its attributes as keywords: the options of ``pcfix clean``.
-    tile_m : float, optional
-        Side of the square tiles of the search. The result does not depend on it.
     progress : callable, optional
         Called with (points done, all points), over all passes.
 
@@ -79,11 +68,9 @@ def clean_file(
         If a file, an option or the cloud cannot be used; no output is left behind.
     """
     given = taken(CleanOptions, options, keywords, "clean_file")
-    check_tile(tile_m)
-    how = Resources(tile_m, given.jobs)
     command = Command(
         "clean",
-        plan=partial(_plan_file, given, how, progress),
+        plan=partial(_plan_file, given, progress),
         process=partial(streaming, _Cleaning),
         check=lambda plan, tally: None,
         summarize=lambda plan, tally, findings, ends: replace(
@@ -119,7 +106,7 @@ def find_noise(
     names: Collection[str],
     chunks: Callable[[WaterSurface | None], Iterable[Tested]],
     n: int,
-    resources: Resources,
+    progress: Callable[[int], None] | None = None,
     *,
     has_rays: bool = True,
 ) -> tuple[BoolArray, CleanSummary]:
@@ -165,8 +152,8 @@ def find_noise(
             submerged[rows] = used[rows] & (rays > 0)
         first += count
         release()
-        if resources.progress is not None:
-            resources.progress(count)
+        if progress is not None:
+            progress(count)
     if not used.any():
         raise InputError(
             "cloud.all_withheld",
@@ -178,7 +165,7 @@ def find_noise(
         submerged[:] = False
     elif water is not None:
         check_submerged(int(submerged.sum()), name, water)
-    distance_m = flag_neighbours(name, cloud, rules, resources)
+    distance_m = flag_neighbours(name, cloud, rules, progress)
     noise = reasons != 0
     count = int(noise.sum())
     return noise, CleanSummary(
@@ -211,7 +198,7 @@ class CleanPlan(NamedTuple):
 
 
 def _plan_file(
-    options: CleanOptions, how: Resources, progress: Progress | None,
+    options: CleanOptions, progress: Progress | None,
     cloud: Path | Tiles, target: Path, kept: list[Chunk] | None = None,
 ) -> CleanPlan:  # fmt: skip
     """Find the noise of a whole cloud; large arrays are on the disk of the target."""
@@ -231,7 +218,7 @@ def _plan_file(
             progress(passed // _PASSES, points)
 
     def chunks(water: WaterSurface | None) -> Iterator[Tested]:
-        with open_cloud(cloud, how.jobs) as source:
+        with open_cloud(cloud, options.jobs) as source:
             shown = [name for name in RAY_DIMENSIONS if name in names]
             for chunk in source.chunks():
                 rays = {name: source.dimension(chunk, name) for name in shown}
@@ -244,7 +231,7 @@ def _plan_file(
     with scratch_arrays(beside):
         noise, summary = find_noise(
             str(cloud), options, lambda: view_of(cloud), names, chunks, points,
-            how._replace(progress=count), has_rays=has_rays,
+            count, has_rays=has_rays,
         )  # fmt: skip
     if options.drop and noise.all():
         raise InputError(

@@ -64,10 +64,6 @@ def compare_clouds(
         ``x1,y1,x2,y2`` or `pcfix.compare.sections.SectionLine`, `share` texts or pairs, `also`
         texts, pairs or a dict of paths by name.
 
-    Returns
-    -------
-    Comparison
-
     Raises
     ------
     PcfixError
@@ -90,8 +86,8 @@ def compare_clouds(
         view = cloud.view() if isinstance(cloud, Held) else view_of(clouds[0])
         water = find_surface(given.water, WaterOptions(), view).surface
     outputs = [path for path in (given.out_dir, given.summary, given.plot) if path is not None]
-    beside = Path([*outputs, Path(tempfile.gettempdir()) / "pcfix"][0])
-    with scratch_arrays(beside):  # arrays of large clouds
+    near = Path([*outputs, Path(tempfile.gettempdir()) / "pcfix"][0])
+    with scratch_arrays(near):  # arrays of large clouds
         target = read_reference(surveyed)
         whole = cloud.read(water) if isinstance(cloud, Held) else read_cloud(clouds[0], water)
         check_same_crs(whole.name, whole.crs, target.name, target.crs)
@@ -119,15 +115,11 @@ def _check_outputs(given: CompareOptions, inputs: list[File]) -> None:
     if given.out_dir is not None:
         folder = Path(given.out_dir)
         if folder.exists() and not folder.is_dir():
-            raise SettingError(
-                "output.no_folder", f"{folder} is a file. Give a folder.", path=folder
-            )
+            sentence = f"{folder} is a file. Give a folder."
+            raise SettingError("output.no_folder", sentence, path=folder)
         if not folder.parent.is_dir():
-            raise SettingError(
-                "output.no_folder",
-                f"{folder}: the folder {folder.parent} does not exist. Make it.",
-                path=folder.parent,
-            )
+            sentence = f"{folder}: the folder {folder.parent} does not exist. Make it."
+            raise SettingError("output.no_folder", sentence, path=folder.parent)
         names = ["compare.json", "depth_bins.csv", "shore_bins.csv"]
         if folder.is_dir():
             for path in [*(folder / name for name in names), *folder.glob("section_*.csv")]:
@@ -136,6 +128,7 @@ def _check_outputs(given: CompareOptions, inputs: list[File]) -> None:
 
 
 def _write(result: Comparison, given: CompareOptions) -> None:
+    """Write the files of a comparison, and remove those of an earlier one with more sections."""
     files: dict[str, str] = {}
     folder = None if given.out_dir is None else Path(given.out_dir)
     with nullcontext() if folder is None else output_folder(folder), all_or_none():
@@ -153,6 +146,6 @@ def _write(result: Comparison, given: CompareOptions) -> None:
             write_plot(given, c2c_figure(result.as_dict()))
         write_summary(given, result.as_dict())
     if folder is not None:
-        for path in folder.glob("section_*.csv"):  # of an earlier comparison with more
+        for path in folder.glob("section_*.csv"):
             if path.name not in files:
                 path.unlink()

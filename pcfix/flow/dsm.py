@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict, replace
 from functools import partial
@@ -18,12 +18,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.errors import InputError, PcfixWarning, SettingError
+from pcfix.errors import PcfixWarning, SettingError, bad_file
 from pcfix.flow.runner import Progress, file_task, write_summary
 from pcfix.grid.delaunay import fill_holes, margin_cells
 from pcfix.grid.heights import Gridding, as_uncertainty, grid_window
 from pcfix.grid.lattice import (
-    Lattice,
     Occupancy,
     Window,
     cells_of,
@@ -32,7 +31,7 @@ from pcfix.grid.lattice import (
     refuse_size,
     round_resolution,
 )
-from pcfix.grid.model import NO_LIGHT, DsmSummary, Tally, hillshade
+from pcfix.grid.model import NO_LIGHT, CellTally, DsmSummary, hillshade
 from pcfix.io import rasters
 from pcfix.io.atomic import scratch_folder, temporary_output
 from pcfix.io.crs import crs_words, parts
@@ -51,25 +50,24 @@ if TYPE_CHECKING:
     import laspy
     from rasterio.io import DatasetWriter
 
-BLOCK_POINTS = 2_000_000
-TIN_BLOCK_POINTS = 400_000
-"""Windows are halved until they have at most so many points."""
+WINDOW_POINTS = 400_000
+"""Points that are gridded at once, about."""
 TIN_REACH_SPACINGS = 5.0
 TIN_REACH_CELLS = 3.0
 """Largest diameter of circles around triangles: the larger of the two, or --fill."""
 
 METRE = "metre"
 BLOCK_CELLS = 1024
-"""Longest side of a window; a power of two."""
+"""Longest side of a window."""
 BIN_POINTS = 200_000
-"""So many points a square of the store has, on average."""
+"""Points in a square of the store, on average."""
 SIGMA_Z = "SigmaZ"
 FEWEST_A_CELL = 0.9
-"""Points, on average where there are any; fewer are worth a warning."""
+"""Points per cell, on average where there are any; fewer give a warning."""
 DIMENSIONS = {"depth": "WaterDepth", "uncertainty": SIGMA_Z}
-"""What is not height is made of a dimension: of one of these, or of that of its own name."""
+"""Dimensions of these quantities; any other quantity is the dimension of its name."""
 SPARSE = 20.0
-"""Cells a point, from which it is looked whether some points lie far from the others."""
+"""Cells per point; if there are more, some points may lie far from all others."""
 BULK_SAMPLE, BEYOND_BULK = 1_000_000, 1e-3
 
 
@@ -109,10 +107,6 @@ def grid_dsm(
     progress : callable, optional
         Called with (points done, all points); reading and gridding count half each.
 
-    Returns
-    -------
-    DsmSummary
-
     Raises
     ------
     PcfixError
@@ -124,9 +118,9 @@ def grid_dsm(
         If the cells are so small that most have no point.
     """
     given = taken(DsmOptions, options, keywords, "grid_dsm")
-    more = {name: getattr(given, name) for name in ("hillshade", "counts")}
-    more = {name: Path(path) for name, path in more.items() if path is not None}
-    cloud = cloud_of(input)
+    rules, cloud = given.part(DsmRules), cloud_of(input)
+    named = {"hillshade": given.hillshade, "counts": given.counts}
+    more = {name: Path(path) for name, path in named.items() if path is not None}
     task = file_task(
         cloud, output, given,
         more=more.values(), check=rasters.check_tif, progress=progress,
@@ -135,10 +129,8 @@ def grid_dsm(
     style = task.target.with_suffix(".qml")
     if given.style:
         check_output(style, overwrite=given.overwrite, inputs=inputs_of(cloud))
-    rules = given.part(DsmRules)
     if given.resolution is None:
-        spacing_m = point_spacing_m(cloud, rules)
-        rules = replace(rules, resolution=round_resolution(spacing_m, 0.0))
+        rules = replace(rules, resolution=round_resolution(point_spacing_m(cloud, rules), 0.0))
 
     def report(share: float) -> None:
         """Report the progress, in points."""
@@ -154,37 +146,17 @@ def grid_dsm(
         with open_cloud(cloud) as source:
             crs, count = metric_crs(source), len(source)
             corrected = any(is_ours(vlr) for vlr in source.vlrs)
-            points = SortedPoints(
-                source, rules, folder, lambda done, total: report(0.5 * done / total),
-                lambda: open_cloud(cloud, places_only=True),
-            )  # fmt: skip
+            points = SortedPoints(cloud, source, rules, folder, report)
         lattice, spacing_m = points.lattice, points.near.spacing_m
-        fill_m, is_tin = rules.fill or 0.0, rules.method == "tin"
         # the widest circle around a triangle
-        reach_m = max(TIN_REACH_SPACINGS * spacing_m, TIN_REACH_CELLS * rules.cell_m, fill_m)
+        reach_m = max(
+            TIN_REACH_SPACINGS * spacing_m, TIN_REACH_CELLS * rules.cell_m, rules.fill or 0.0
+        )
         how = Gridding(lattice, rules.method, reach_m, spacing_m)
         # a cloud optimised file is a copy, with overviews of its own
         paths = {name: folder / f"{name}.tif" if given.cog else drafts[name] for name in drafts}
-        plan = None if crs is None else parts(crs)[0]
-        unit = METRE if rules.what in ("height", *DIMENSIONS) else ""
-        made = {"pcfix": __version__, "corrected": corrected, **asdict(rules)}
-        new = partial(rasters.new_raster, lattice=lattice, tags={"PCFIX": json.dumps(made)})
-        with ExitStack() as files:
-            of_height = crs if rules.what == "height" else plan
-            dsm = files.enter_context(new(paths["dsm"], crs=of_height, bands={rules.what: unit}))
-            counts = None
-            if "counts" in paths:
-                bands = {"count": "", "spread": unit}
-                counts = files.enter_context(new(paths["counts"], crs=plan, bands=bands))
-            if is_tin or rules.fill is None:
-                tally = _grid(points, how, rules.what, dsm, counts, report)
-            else:
-                unfilled = folder / "unfilled.tif"
-                with rasters.new_raster(unfilled, lattice, None, {"height": METRE}) as heights:
-                    tally = _grid(points, how, rules.what, heights, counts, report)
-                _fill(unfilled, dsm, lattice, fill_m / rules.cell_m, tally)
-        if "hillshade" in paths:
-            _shade(paths["dsm"], paths["hillshade"], lattice, plan, rules)
+        tags = {"pcfix": __version__, "corrected": corrected, **asdict(rules)}
+        tally, filled = _write_rasters(points, how, rules, paths, folder, crs, tags, report)
         for name, path in paths.items():
             if given.cog:
                 rasters.copy_as_cog(path, drafts[name])
@@ -207,11 +179,11 @@ def grid_dsm(
         points=count,
         points_used=points.near.points,
         cells=tally.cells,
-        filled=tally.filled,
-        empty=lattice.width * lattice.height - tally.known,
+        filled=tally.filled + filled,
+        empty=lattice.width * lattice.height - tally.known - filled,
         points_per_cell=points.near.points / tally.cells,
         spacing_m=spacing_m,
-        hole_m=reach_m if is_tin else rules.fill,
+        hole_m=reach_m if rules.method == "tin" else rules.fill,
         settings=asdict(rules),
         seconds=round(task.seconds, 3),
         values=tally.values(),
@@ -223,13 +195,66 @@ def grid_dsm(
     return result
 
 
+def _write_rasters(
+    points: SortedPoints,
+    how: Gridding,
+    rules: DsmRules,
+    paths: dict[str, Path],
+    folder: Path,
+    crs: Any,
+    tags: dict[str, Any],
+    report: Callable[[float], None],
+) -> tuple[CellTally, int]:
+    """Write the raster, and hillshade and counts where they have a path.
+
+    Returns the statistics of the cells, and how many were filled after that.
+    """
+    lattice, filled, is_height = points.lattice, 0, rules.what == "height"
+    plan = None if crs is None else parts(crs)[0]
+    unit = METRE if is_height or rules.what in DIMENSIONS else ""
+    new = partial(rasters.new_raster, lattice=lattice, tags={"PCFIX": json.dumps(tags)})
+    with ExitStack() as files:
+        bands = {rules.what: unit}
+        dsm = files.enter_context(new(paths["dsm"], crs=crs if is_height else plan, bands=bands))
+        counts = None
+        if "counts" in paths:
+            bands = {"count": "", "spread": unit}
+            counts = files.enter_context(new(paths["counts"], crs=plan, bands=bands))
+        if how.method == "tin" or rules.fill is None:
+            tally = _grid(points, how, rules.what, dsm, counts, report)
+        else:
+            unfilled, widest = folder / "unfilled.tif", rules.fill / rules.cell_m
+            with rasters.new_raster(unfilled, lattice, None, {"height": METRE}) as heights:
+                tally = _grid(points, how, rules.what, heights, counts, report)
+            with rasters.open_raster(unfilled) as heights:
+                for window in lattice.window.parts(BLOCK_CELLS):
+                    around = window.grown(margin_cells(widest)).clipped(lattice.window)
+                    known = rasters.read_heights(heights, around)
+                    height = fill_holes(known, window, around, widest)
+                    rasters.write_part(dsm, height, window, 1)
+                    filled += int((~np.isnan(height)).sum())
+            filled -= tally.known
+    if "hillshade" in paths:
+        shade = rasters.new_raster(
+            paths["hillshade"], lattice, plan, {"hillshade": ""}, dtype="uint8", nodata=NO_LIGHT
+        )
+        with rasters.open_raster(paths["dsm"]) as heights, shade as out:
+            for window in lattice.window.parts(BLOCK_CELLS):
+                height = rasters.read_within(heights, window.grown(1), lattice.window)
+                light = hillshade(height, rules.cell_m, rules.azimuth, rules.altitude)
+                rasters.write_part(out, light, window, 1)
+    return tally, filled
+
+
 def _grid(
     points: SortedPoints, how: Gridding, what: str, heights: DatasetWriter,
     counts: DatasetWriter | None, report: Callable[[float], None],
-) -> Tally:  # fmt: skip
+) -> CellTally:  # fmt: skip
     """Write values to one raster, numbers of points and their spread to another."""
-    tally, done, lattice = Tally(), 0, points.lattice
-    for window in points.windows(TIN_BLOCK_POINTS if how.method == "tin" else BLOCK_POINTS):
+    tally, done, lattice = CellTally(), 0, points.lattice
+    # windows have about this number of points if points are everywhere
+    side = np.sqrt(WINDOW_POINTS) * how.spacing_m / lattice.resolution_m or BLOCK_CELLS
+    for window in lattice.window.parts(int(np.clip(side, 1, BLOCK_CELLS))):
         bands = grid_window(*points.points_in(window.grown(how.margin_cells)), window, how)
         if what == "uncertainty":
             bands = as_uncertainty(bands)
@@ -237,43 +262,16 @@ def _grid(
         if counts is not None:
             for band, values in enumerate(bands[1:], start=1):
                 rasters.write_part(counts, values, window, band)
-        tally.add(bands)
+        tally += CellTally.of(bands)
         done += window.height * window.width
         report(0.5 + 0.5 * done / (lattice.height * lattice.width))
     return tally
 
 
-def _fill(
-    unfilled: Path, dsm: DatasetWriter, lattice: Lattice, widest: float, tally: Tally
-) -> None:
-    """Write a raster with its holes filled, as wide as some cells, and count what was filled."""
-    with rasters.open_raster(unfilled) as heights:
-        for window in lattice.windows(BLOCK_CELLS):
-            around = window.grown(margin_cells(widest)).clipped(lattice.window)
-            height = fill_holes(rasters.read_heights(heights, around), window, around, widest)
-            rasters.write_part(dsm, height, window, 1)
-            tally.filled += int((~np.isnan(height)).sum())
-    tally.filled -= tally.known
-    tally.known += tally.filled
-
-
-def _shade(dsm: Path, target: Path, lattice: Lattice, plan: Any, rules: DsmRules) -> None:
-    """Write the hillshade of a DSM."""
-    new = rasters.new_raster(
-        target, lattice, plan, {"hillshade": ""}, dtype="uint8", nodata=NO_LIGHT
-    )
-    with rasters.open_raster(dsm) as heights, new as out:
-        for window in lattice.windows(BLOCK_CELLS):
-            height = rasters.read_within(heights, window.grown(1), lattice.window)
-            light = hillshade(height, rules.cell_m, rules.azimuth, rules.altitude)
-            rasters.write_part(out, light, window, 1)
-
-
 def point_spacing_m(cloud: Path | Tiles, settings: DsmRules) -> float:
     """Return the side of the square that each point of a raster has for itself, metres."""
     with open_cloud(cloud) as source:
-        area, _ = _stated_extent(source, MIN_RESOLUTION_M)
-        near = Occupancy(area, len(source), MIN_RESOLUTION_M)
+        near = Occupancy(_stated_area(source, MIN_RESOLUTION_M), len(source), MIN_RESOLUTION_M)
         for points in source.chunks():
             near.add(coordinates(points)[_wanted(points, settings.surface)])
     _refuse_none(near.points, cloud, settings.surface)
@@ -281,48 +279,36 @@ def point_spacing_m(cloud: Path | Tiles, settings: DsmRules) -> float:
 
 
 class SortedPoints:
-    """The points that a raster is made of, in a folder of the caller, and the raster's lattice.
+    """The points of a raster, in a file in a folder, and the raster's `lattice`.
 
-    Attributes
-    ----------
-    near : Occupancy
-        How many points there are, and how close together.
-    stray : int
-        How many are left out, as they lie far from all others.
-    lattice : Lattice
-
-    Raises
-    ------
-    PcfixError
-        If no points are left, or the raster would be too large.
+    `near` has the number and spacing of the points; `stray` counts those that are ignored because
+    they lie far from all others. Raises PcfixError if no points are left, or the raster would be
+    too large.
     """
 
     def __init__(
-        self, source: LasSource, settings: DsmRules, folder: Path, progress: Progress,
-        again: Callable[[], LasSource],
+        self, cloud: Path | Tiles, source: LasSource, settings: DsmRules, folder: Path,
+        report: Callable[[float], None],
     ) -> None:  # fmt: skip
-        """Read the cloud, store the wanted points, and lay out the raster.
+        """Read a cloud, which is open as `source`, store the wanted points, and lay out the raster.
 
-        Where its extent looks too large for its points it is opened `again`, to be looked at first.
+        If the extent is too large for the number of points, the cloud is read once before.
         """
         resolution = settings.cell_m
         self._resolution_m = resolution
-        area, corner = _stated_extent(source, resolution)
-        self._dimension = _dimension_of(source, settings.what)
-        cells = max(np.sqrt(BIN_POINTS / (len(source) / area)) / resolution, 1.0)
-        side = int(min(2 ** np.floor(np.log2(cells)), BLOCK_CELLS))  # of a square with so many
-        self._bins = Bins(folder, side, cells_of(corner, resolution)[0], 3)
+        area, dimension = _stated_area(source, resolution), _dimension_of(source, settings.what)
+        cells = np.sqrt(BIN_POINTS / (len(source) / area)) / resolution
+        self._bins = Bins(folder, int(np.clip(cells, 1, BLOCK_CELLS)))
         self.near = Occupancy(area, len(source), resolution)
         sparse = area > SPARSE * len(source) * resolution**2
-        bulk = _bulk_of(again, len(source), resolution) if sparse else None
-        self.stray, first = 0, None
-        done = 0
+        bulk = _bulk_of(cloud, len(source), resolution) if sparse else None
+        self.stray, first, done = 0, None, 0
         for points in source.chunks():
             xyz = coordinates(points)
-            if self._dimension is not None:
-                xyz[:, 2] = source.dimension(points, self._dimension)
+            if dimension is not None:
+                xyz[:, 2] = source.dimension(points, dimension)
             wanted = _wanted(points, settings.surface) & np.isfinite(xyz[:, 2])
-            if self._dimension == SIGMA_Z:
+            if dimension == SIGMA_Z:
                 wanted &= xyz[:, 2] > 0.0  # others have none
             xyz = xyz[wanted]
             if bulk is not None:
@@ -335,7 +321,7 @@ class SortedPoints:
                 self._bins.add(cells_of(xyz, resolution), xyz)
             # too large a raster is refused below, when the whole extent is known
             done += len(points)
-            progress(done, len(source))
+            report(0.5 * done / len(source))
         _refuse_none(self.near.points, source.path, settings.surface)
         if first is not None:
             place = ", ".join(f"{value:,.2f}" for value in first)
@@ -355,28 +341,11 @@ class SortedPoints:
             warnings.warn(PcfixWarning("dsm.fine", sentence, spacing_m=spacing_m), stacklevel=4)
         self.lattice = lattice_over(low, high, resolution)
 
-    def windows(self, limit: int) -> Iterator[Window]:
-        """Yield windows that cover the raster, small enough to have about `limit` points."""
-        for window in self.lattice.windows(BLOCK_CELLS):
-            yield from self._halved(window, BLOCK_CELLS, limit)
-
-    def _halved(self, window: Window, side: int, limit: int) -> Iterator[Window]:
-        """Yield a window, or its quarters where it has too many points."""
-        stored = window.moved(self.lattice.first_row, self.lattice.first_column)
-        if side <= self._bins.side or self._bins.count(stored) <= limit:
-            yield window
-            return
-        half = side // 2
-        for row in range(window.row, window.row_stop, half):
-            for column in range(window.column, window.column_stop, half):
-                quarter = Window(row, row + half, column, column + half).clipped(window)
-                yield from self._halved(quarter, half, limit)
-
     def points_in(self, window: Window) -> tuple[FloatArray, IntArray]:
         """Return the points of a window, and their columns and rows in the raster.
 
-        The first are metres in the world frame, shape (n, 3), with what the raster is made of in
-        the place of z; the second have shape (n, 2).
+        The first are metres in the world frame, shape (n, 3), with the gridded values in the place
+        of z; the second have shape (n, 2).
         """
         row, column = self.lattice.first_row, self.lattice.first_column
         xyz = self._bins.read(window.moved(row, column))
@@ -386,24 +355,20 @@ class SortedPoints:
 
 
 def _dimension_of(source: LasSource, what: str) -> str | None:
-    """Return the dimension that a raster is made of, None for heights."""
+    """Return the dimension whose values are gridded, None for heights."""
     name = None if what == "height" else DIMENSIONS.get(what, what)
-    known = list(source.header.point_format.dimension_names)
-    if name is None or name in known:
+    names = list(source.header.point_format.dimension_names)
+    if name is None or name in names:
         return name
     if what in DIMENSIONS:
-        raise InputError(
-            "cloud.no_dimension",
-            f"{source.path}: has no dimension {name}, which --what {what} needs. Correct the cloud"
-            " first, with --dimensions all.",
-            path=source.path, dimension=name,
-        )  # fmt: skip
-    raise SettingError(
-        "option.choice",
-        f"{source.path}: has no dimension {what}. --what is one of height, {', '.join(DIMENSIONS)},"
-        f" {', '.join(known)}.",
-        option="what", value=what,
-    )  # fmt: skip
+        sentence = (
+            f"has no dimension {name}, which --what {what} needs. Correct the cloud first, with"
+            " --dimensions all."
+        )
+        raise bad_file(source.path, "cloud.no_dimension", sentence, dimension=name)
+    known = ", ".join(("height", *DIMENSIONS, *names))
+    sentence = f"{source.path}: has no dimension {what}. --what is one of {known}."
+    raise SettingError("option.choice", sentence, option="what", value=what)
 
 
 def _wanted(points: laspy.ScaleAwarePointRecord, surface: SurfaceChoice) -> BoolArray:
@@ -412,40 +377,34 @@ def _wanted(points: laspy.ScaleAwarePointRecord, surface: SurfaceChoice) -> Bool
     return np.asarray(wanted & ~np.asarray(points["withheld"]).astype(bool))
 
 
-def _stated_extent(source: LasSource, resolution_m: float) -> tuple[float, FloatArray]:
-    """Return area and north-west corner, shape (1, 2), of the header; they need not be right."""
-    low, high = source.header.mins[:2], source.header.maxs[:2]
-    area, corner = float(np.prod(high - low)), np.array([[low[0], high[1]]])
-    area = max(area, resolution_m**2) if np.isfinite(area) else resolution_m**2
-    return area, corner if (np.abs(corner) < 1e9).all() else np.zeros((1, 2))
+def _stated_area(source: LasSource, resolution_m: float) -> float:
+    """Return the area of a cloud as its header states it, which need not be right, m2."""
+    area = float(np.prod(source.header.maxs[:2] - source.header.mins[:2]))
+    return max(area, resolution_m**2) if np.isfinite(area) else resolution_m**2
 
 
-def _bulk_of(again: Callable[[], LasSource], count: int, resolution_m: float) -> FloatArray:
+def _bulk_of(cloud: Path | Tiles, count: int, resolution_m: float) -> FloatArray:
     """Return the south-west and north-east corner of where nearly all points lie, shape (2, 2).
 
-    The box that all but a thousandth are in, to either side, grows by its own size; a cloud of two
-    places has all in it.
+    The box of all but a thousandth of the points on each side grows by its own size, so that a
+    cloud of two places is inside it.
     """
     step = 1 + count // BULK_SAMPLE
-    with again() as cloud:
-        some = [coordinates(points)[::step, :2] for points in cloud.chunks()]
+    with open_cloud(cloud, places_only=True) as source:
+        some = [coordinates(points)[::step, :2] for points in source.chunks()]
     low, high = np.quantile(np.vstack(some), (BEYOND_BULK, 1.0 - BEYOND_BULK), axis=0)
     size = np.maximum(high - low, resolution_m)
     return np.array([low - size, high + size])
 
 
 def _refuse_none(points: int, source: Path | Tiles, surface: SurfaceChoice) -> None:
-    if points:
-        return
-    if surface == "bed":
-        raise InputError(
-            "dsm.no_bed",
-            f"{source}: has no point of class {BATHYMETRIC_POINT} (bed) that is not withheld."
-            " Correct the cloud first, or use --surface all.",
-            path=source,
+    """Raise an error if no point is left."""
+    if points == 0 and surface == "bed":
+        sentence = (
+            f"has no point of class {BATHYMETRIC_POINT} (bed) that is not withheld. Correct the"
+            " cloud first, or use --surface all."
         )
-    raise InputError(
-        "cloud.all_withheld",
-        f"{source}: all points are noise (classes 7 and 18) or withheld. Classify it again.",
-        path=source,
-    )
+        raise bad_file(source, "dsm.no_bed", sentence)
+    if points == 0:
+        sentence = "all points are noise (classes 7 and 18) or withheld. Classify it again."
+        raise bad_file(source, "cloud.all_withheld", sentence)

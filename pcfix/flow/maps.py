@@ -78,31 +78,31 @@ def write_rasters(
         DEPTH: replace(filled, what="depth"),
         **({UNCERTAINTY: replace(plain, what="uncertainty")} if errors else {}),
     }
-    made = {}
+    summaries = {}
     for number, (name, options) in enumerate(asked.items()):
 
-        def tell(done: int, total: int, number: int = number) -> None:
+        def report(done: int, total: int, number: int = number) -> None:
             if progress is not None:
                 progress(number * total + done, len(asked) * total)
 
-        made[name] = grid_dsm(cloud, folder / name, options=options, progress=tell)
+        summaries[name] = grid_dsm(cloud, folder / name, options=options, progress=report)
     _write_shaded(folder)
     density = (cell_m / spacing_m) ** 2 if spacing_m else None
     return {
         "resolution_m": cell_m,
         "points_per_cell": density,
         "gsd_m": gsd_m,
-        **{Path(name).stem: summary.as_dict() for name, summary in made.items()},
+        **{Path(name).stem: summary.as_dict() for name, summary in summaries.items()},
     }
 
 
-def resolution_sentence(made: dict[str, Any], *, given: bool) -> str:
+def resolution_sentence(facts: dict[str, Any], *, given: bool) -> str:
     """Return the size of the cells of the rasters, and its reason."""
-    density, gsd_m = made["points_per_cell"], made["gsd_m"]
+    density, gsd_m = facts["points_per_cell"], facts["gsd_m"]
     parts = [] if density is None else [f"{density:.1f} points each"]
     parts += [] if gsd_m is None else [f"GSD {gsd_m:.2g} m"]
     more = f" ({', '.join(parts)})" if parts else ""
-    return f", cells of {made['resolution_m']:g} m{', as given' if given else ''}{more}"
+    return f", cells of {facts['resolution_m']:g} m{', as given' if given else ''}{more}"
 
 
 def _write_shaded(folder: Path) -> None:
@@ -132,13 +132,13 @@ def _parts(
     """Yield windows with their heights, one cell wider all around, and their depths.
 
     Holes of the surface are filled between land and bed, so some cells are under water that have
-    no depth: that of the water beside them.
+    no depth: it follows from the water next to them.
     """
     from scipy.ndimage import minimum_filter
 
     below, edge = rasters.lattice_of(depth), int(HOLE_CELLS)
     row, column = below.first_row - lattice.first_row, below.first_column - lattice.first_column
-    for window in lattice.windows(BLOCK_CELLS):
+    for window in lattice.window.parts(BLOCK_CELLS):
         wide = window.grown(edge)
         height = rasters.read_within(surface, wide, lattice.window)
         deep = rasters.read_within(depth, wide.moved(-row, -column), below.window)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from pcfix.io import rasters
 from pcfix.io.atomic import scratch_folder, temporary_output
 from pcfix.io.photographs import photographs_in, read_colours
 from pcfix.model import WaterPlane
-from pcfix.options.declare import File, options_of, taken
+from pcfix.options.declare import File, taken
 from pcfix.options.photos import OrthoOptions, PhotosOptions
 from pcfix.photos.ortho import Picture, mosaic, picture_of
 from pcfix.running import threads
@@ -81,11 +81,11 @@ def ortho_photo(
     check_summary(given, [*known, target])
     with threads(given.jobs), temporary_output(target) as draft, scratch_folder(target) as folder:
         # without water, its level is below all ground
-        same = {one.name: getattr(given, one.name) for one in options_of(OrthoOptions)}
-        same["water"] = NO_WATER if given.water is None else given.water
+        water = NO_WATER if given.water is None else given.water
         is_cloud = Path(given.dsm).suffix.lower() in CLOUDS
-        same["resolution"] = 2.0 * given.resolution if is_cloud and given.resolution else None
-        block = block_of(PhotosOptions(**same), paths, folder)
+        coarse_m = 2.0 * given.resolution if is_cloud and given.resolution else None
+        same = replace(given, water=water, resolution=coarse_m).part(PhotosOptions)
+        block = block_of(same, paths, folder)
         warn_all(block.notes)
         # the cells over the DSM; their side is the ground pixel, rounded to two digits
         bed = block.scene.ground
@@ -119,9 +119,8 @@ def _write(
     first = read_colours(block.paths[0])
     bands, dtype = first.shape[2], first.dtype
     shrunk = max(1, int(lattice.resolution_m / block.gsd_m))
-    kept = max(4, CACHE_BYTES // first.nbytes)
 
-    @lru_cache(maxsize=kept)
+    @lru_cache(maxsize=max(4, CACHE_BYTES // first.nbytes))
     def picture(row: int) -> Picture:
         pixels = read_colours(block.paths[row])
         if pixels.shape[2] != bands or pixels.dtype != dtype:
@@ -141,7 +140,7 @@ def _write(
     with rasters.new_raster(
         path, lattice, block.crs, layers, dtype=str(dtype), nodata=None
     ) as target:  # fmt: skip
-        for window in lattice.windows(TILE_CELLS):
+        for window in lattice.window.parts(TILE_CELLS):
             # the centres of the cells that have a height
             x = lattice.left_m + (np.arange(window.column, window.column_stop) + 0.5) * side
             y = lattice.top_m - (np.arange(window.row, window.row_stop) + 0.5) * side
@@ -152,15 +151,15 @@ def _write(
             found = mosaic(xyz, block.photos, block.scene, picture) if len(xyz) else None
             ground += len(xyz)
             if found is not None:
+                colour, is_seen = found
                 tile = np.zeros((bands + 1, window.height, window.width), dtype)
                 most = np.iinfo(dtype).max
-                colour = np.where(found.covered[:, None], found.colour, 0.0)
                 known = known.reshape(window.height, window.width)
                 tile[:-1, known] = np.clip(np.rint(colour), 0, most).T
-                tile[-1, known] = most * found.covered
+                tile[-1, known] = most * is_seen
                 for number, band in enumerate(tile, start=1):
                     rasters.write_part(target, band, window, number)
-                covered += int(found.covered.sum())
+                covered += int(is_seen.sum())
             done += window.height * window.width
             if progress is not None:
                 progress(done, lattice.height * lattice.width)

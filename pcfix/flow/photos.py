@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 import warnings
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -14,11 +14,12 @@ from typing import Any, cast
 
 import numpy as np
 
-from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError
+from pcfix.errors import GeometryError, PcfixWarning, SettingError, bad_file
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.runner import Progress, check_summary, json_text, write_summary
 from pcfix.io.files import file_state, read_json, write_text
+from pcfix.io.labels import match_labels
 from pcfix.io.photographs import photographs_in, read_photograph, size_of, write_photograph
 from pcfix.io.rasters import filled_heights, open_raster
 from pcfix.io.water import rasters_of_images, read_water_raster
@@ -87,26 +88,22 @@ def map_photos(
     Raises
     ------
     PcfixError
-        Images that are finished are kept.
+        Finished images stay.
     """
     started = time.perf_counter()
     given = taken(PhotosOptions, options, keywords, "map_photos")
     folder, target = Path(images), Path(out)
     if target.resolve() == folder.resolve():
-        raise SettingError(
-            "output.is_input",
-            f"{target}: is the folder of the photographs. Give another one.",
-            path=target,
-        )
+        sentence = f"{target}: is the folder of the photographs. Give another one."
+        raise SettingError("output.is_input", sentence, path=target)
     check_summary(given)
     paths = photographs_in(folder)
-    mapped: Any = exact if given.mapping == "exact" else paper
+    mapped = exact if given.mapping == "exact" else paper
     with threads(given.jobs), TemporaryDirectory() as scratch:
         block = block_of(given, paths, Path(scratch))
         old = _written_before(target, given, block)
-        todo = [
-            one for one in zip(block.paths, block.photos, strict=True) if one[0].name not in old
-        ]
+        both = zip(block.paths, block.photos, strict=True)
+        todo = {path: photo for path, photo in both if path.name not in old}
 
         def write(path: Path, photo: Photo) -> tuple[str, int, int, float]:
             """Write a photograph; return its name, pixels, black pixels, and largest shift."""
@@ -120,15 +117,10 @@ def map_photos(
 
         found: list[tuple[str, int, int, float]] = []
         with ThreadPoolExecutor(max(1, min(current().threads, len(todo)))) as pool:
-            jobs = [pool.submit(write, *one) for one in todo]
-            try:
-                for job in jobs:
-                    found.append(job.result())
-                    if progress is not None:
-                        progress(len(old) + len(found), len(block.paths))
-            finally:
-                for job in jobs:
-                    job.cancel()
+            for one in pool.map(write, todo.keys(), todo.values()):
+                found.append(one)
+                if progress is not None:
+                    progress(len(old) + len(found), len(block.paths))
     notes = list(block.notes)
     poor = [
         (black / pixels, name) for name, pixels, black, _ in found if black > MOST_BLACK * pixels
@@ -158,15 +150,11 @@ def map_photos(
 def _written_before(target: Path, given: PhotosOptions, block: PhotoBlock) -> set[str]:
     """Return the names that an equal call has written, and record this call in the folder."""
     target.mkdir(parents=True, exist_ok=True)
-    asked = given.as_dict()
-    for name in ("overwrite", "jobs", "summary"):
-        asked.pop(name)
-    files = [*input_states(given), *map(file_state, block.waters.values())]
-    record = {"pcfix": __version__, "asked": asked, "files": files}
+    record = call_record(given, ("overwrite", "jobs", "summary"), block.waters.values())
     place = target / RECORD
     there = {path.name for path in block.paths if (target / path.name).exists()}
     if there and not given.overwrite:
-        if not place.exists() or read_json(place) != json.loads(json.dumps(record)):
+        if not place.exists() or read_json(place) != record:
             raise SettingError(
                 "output.exists",
                 f"{target / min(there)}: exists, and was not written by an equal call. Add"
@@ -178,10 +166,21 @@ def _written_before(target: Path, given: PhotosOptions, block: PhotoBlock) -> se
     return set()
 
 
-def input_states(given: PhotosOptions) -> list[dict[str, Any]]:
-    """Return size and time of the input files, to recognise an equal call."""
+def call_record(
+    given: PhotosOptions, ignored: Collection[str], more: Iterable[Path] = ()
+) -> dict[str, Any]:
+    """Return what identifies an equal call: options, and size and time of the input files.
+
+    The values are those of a JSON file. Some options are ignored; `more` are further files.
+    """
+    asked = {name: value for name, value in given.as_dict().items() if name not in ignored}
     files = [given.cameras, given.dsm, given.sensor, given.water]
-    return [file_state(Path(f)) for f in files if f is not None and Path(str(f)).exists()]
+    paths = [Path(one) for one in files if one is not None and Path(str(one)).exists()]
+    states = [file_state(path) for path in (*paths, *more)]
+    found: dict[str, Any] = json.loads(
+        json.dumps({"pcfix": __version__, "asked": asked, "files": states})
+    )
+    return found
 
 
 def warn_all(notes: Iterable[PcfixWarning]) -> None:
@@ -220,20 +219,14 @@ def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> PhotoBlo
     name, inputs = str(given.cameras), given.part(Inputs)
     read = inputs.read()
     if read.rotations is None or read.lenses is None:
-        raise InputError(
-            "cameras.incomplete",
-            f"{name}: has no angles or no lenses. Photographs need both for each image.",
-            path=name,
-        )
+        sentence = "has no angles or no lenses. Photographs need both for each image."
+        raise bad_file(name, "cameras.incomplete", sentence)
+    if Path(given.dsm).suffix.lower() not in CLOUDS and given.resolution is not None:
+        sentence = "--resolution is for a cloud; the DSM has its own."
+        raise SettingError("option.no_use", sentence, option="resolution")
     heights, origin, crs, corrected = read_heights(
         given.dsm, given.resolution, scratch, fill=given.holes == "fill"
     )
-    if Path(given.dsm).suffix.lower() not in CLOUDS and given.resolution is not None:
-        raise SettingError(
-            "option.no_use",
-            "--resolution is for a cloud; the DSM has its own.",
-            option="resolution",
-        )
     is_exact, notes = given.mapping == "exact", list[PcfixWarning]()
     if corrected and not is_exact:
         raise SettingError(
@@ -247,29 +240,31 @@ def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> PhotoBlo
         words = f"{given.dsm}: does not state whether it was corrected; it is used as {bed}."
         notes.append(PcfixWarning("dsm.origin_unknown", words, path=given.dsm))
     cameras, _ = inputs.block(crs, read)
-    row_of, lost = _poses_of(paths, cameras, name)
-    notes += lost
+    row = match_labels([path.name for path in paths], cameras.labels, one_to_one=False).row
+    lost = [path.name for path, one in zip(paths, row, strict=True) if one < 0]
+    if len(lost) == len(paths):
+        sentence = (
+            f"has no pose of the photographs ({lost[0]} against {cameras.labels[0]}). Give the"
+            " folder whose files have the names in the camera file."
+        )
+        raise bad_file(name, "photos.no_pose", sentence, photograph=lost[0])
+    if lost:
+        words = f"{name}: {len(lost)} photographs have no pose and are ignored, such as {lost[0]}."
+        notes.append(PcfixWarning("photos.no_pose", words, count=len(lost)))
+    paths = [path for path, one in zip(paths, row, strict=True) if one >= 0]
+    photos = [
+        photo_of(path, cameras, one, size_of(path))
+        for path, one in zip(paths, row[row >= 0], strict=True)
+    ]
     surface = inputs.surface().surface
     if isinstance(surface, WaterDimension):
-        raise SettingError(
-            "water.dimension",
-            "--water dim:NAME is for clouds. Give a level, plane, mesh or raster.",
-            water=str(given.water),
-        )
+        sentence = "--water dim:NAME is for clouds. Give a level, plane, mesh or raster."
+        raise SettingError("water.dimension", sentence, water=str(given.water))
     check_above_water(cameras, surface)
-    ground, photos, rotations = (
-        ground_of(heights, *origin),
-        list[Photo](),
-        cast(Any, cameras.rotations),
-    )
-    for path, row in row_of.items():
-        lens = lens_of(path, cameras, row, size_of(path))
-        photos.append(Photo(cameras.labels[row], cameras.centres[row], rotations[row], lens))
-    waters: dict[str, Path] = {}
+    ground, waters = ground_of(heights, *origin), dict[str, Path]()
     if given.water_per_image is not None:
-        mine = list(row_of)
-        found, few = rasters_of_images(given.water_per_image, [path.name for path in mine])
-        waters = {mine[row].stem: path for row, path in found.items()}
+        found, few = rasters_of_images(given.water_per_image, [path.name for path in paths])
+        waters = {paths[at].stem: path for at, path in found.items()}
         notes += [PcfixWarning("water.images_missing", note) for note in few]
     low = float(np.nanmin(ground.height_m))
     sizes = [(photo.centre[2] - low) / photo.lens.focal for photo in photos]
@@ -278,9 +273,8 @@ def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> PhotoBlo
             "cameras.below_ground",
             f"{name}: cameras are below the DSM, whose lowest height is {low:.1f} m. Check its CRS"
             " and vertical datum.",
-            path=name,
-            lowest_m=low,
-        )
+            path=name, lowest_m=low,
+        )  # fmt: skip
     if not any(_sees(photo, ground) for photo in photos):
         raise GeometryError(
             "cameras.no_overlap",
@@ -291,7 +285,7 @@ def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> PhotoBlo
     gsd = float(np.median(sizes))
     step = given.spacing or max(LEAST_STEP_PX, int(np.ceil(ground.cell_m / gsd)))
     scene = Scene(ground, surface, index_of(given.index, given.index_formula)[0])
-    return PhotoBlock(tuple(row_of), tuple(photos), scene, step, tuple(notes), crs, gsd, waters)
+    return PhotoBlock(tuple(paths), tuple(photos), scene, step, tuple(notes), crs, gsd, waters)
 
 
 def _sees(photo: Photo, ground: Ground) -> bool:
@@ -319,59 +313,32 @@ def read_heights(
         crs = None if source.crs is None else source.crs.to_wkt()
         heights = filled_heights(source, fill=fill)
     if abs(t.a + t.e) >= 1e-6 * t.a or t.b or t.d:
-        raise InputError(
-            "raster.rotated",
-            f"{dsm}: its cells are rotated or not square. Warp it to north up first.",
-            path=dsm,
-        )
+        sentence = "its cells are rotated or not square. Warp it to north up first."
+        raise bad_file(dsm, "raster.rotated", sentence)
     corrected = bool(json.loads(tags.get("PCFIX", "{}")).get("corrected"))
     return heights, (t.c, t.f, t.a), crs, corrected
 
 
-def _poses_of(
-    paths: list[Path], cameras: Cameras, name: str
-) -> tuple[dict[Path, int], list[PcfixWarning]]:
-    """Return the row of the pose of each photograph that has one, and a note on the others."""
-    by_name: dict[str, int] = {}
-    for row, label in enumerate(cameras.labels):
-        for key in (Path(label).name.lower(), Path(label).stem.lower()):
-            by_name.setdefault(key, row)
-    rows = {p: by_name.get(p.name.lower(), by_name.get(p.stem.lower(), -1)) for p in paths}
-    lost = [path.name for path, row in rows.items() if row < 0]
-    if len(lost) == len(paths):
-        raise InputError(
-            "photos.no_pose",
-            f"{name}: has no pose of the photographs ({lost[0]} against {cameras.labels[0]})."
-            " Give the folder whose files have the names in the camera file.",
-            path=name,
-            photograph=lost[0],
-        )
-    notes = []
-    if lost:
-        words = f"{name}: {len(lost)} photographs have no pose and are ignored, such as {lost[0]}."
-        notes.append(PcfixWarning("photos.no_pose", words, count=len(lost)))
-    return {path: row for path, row in rows.items() if row >= 0}, notes
+def photo_of(path: Path, cameras: Cameras, row: int, size: tuple[int, int]) -> Photo:
+    """Return an image of some columns and rows, with its pose and its lens in pixels.
 
-
-def lens_of(path: Path, cameras: Cameras, row: int, size: tuple[int, int]) -> Lens:
-    """Return the lens in pixels of an image of some columns and rows; both must match."""
-    columns, rows = size
-    lens = cast(tuple[Lens, ...], cameras.lenses)[row]
+    The cameras have angles and lenses; size or shape of the frame must match the image.
+    """
+    (columns, rows), lens = size, cast(tuple[Lens, ...], cameras.lenses)[row]
+    scale = 1.0 if lens.unit == "px" else columns / lens.width
     if lens.unit == "px":
-        matches, scale = size == (round(lens.width), round(lens.height)), 1.0
+        matches = size == (round(lens.width), round(lens.height))
     else:
-        scale = columns / lens.width
         matches = abs(rows / lens.height / scale - 1.0) <= LENS_TOLERANCE
     if not matches:
-        raise InputError(
-            "photos.size",
-            f"{path}: has {columns} x {rows} pixels, but the camera file says {lens.width:g} x"
-            f" {lens.height:g} {lens.unit}. Give the photographs that were aligned.",
-            path=path,
-            size=size,
+        sentence = (
+            f"has {columns} x {rows} pixels, but the camera file says {lens.width:g} x"
+            f" {lens.height:g} {lens.unit}. Give the photographs that were aligned."
         )
-    if lens.unit == "px":
-        return lens
-    lengths = ("focal", "principal_x", "principal_y", "b1", "b2", "b3")
-    scaled = {one: getattr(lens, one) * scale for one in lengths}
-    return replace(lens, width=columns, height=rows, unit="px", **scaled)
+        raise bad_file(path, "photos.size", sentence, size=size)
+    if lens.unit != "px":
+        lengths = ("focal", "principal_x", "principal_y", "b1", "b2", "b3")
+        scaled = {one: getattr(lens, one) * scale for one in lengths}
+        lens = replace(lens, width=columns, height=rows, unit="px", **scaled)
+    rotation = cast(FloatArray, cameras.rotations)[row]
+    return Photo(cameras.labels[row], cameras.centres[row], rotation, lens)

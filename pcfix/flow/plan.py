@@ -35,8 +35,7 @@ from pcfix.refract.tally import COVERAGE_95, ORDERS, largest_tvu_m
 from pcfix.report.page import AFTER, BEFORE, REFERENCE, WATER, Table, label_plan, new_figure
 from pcfix.report.text import aligned
 from pcfix.running import threads
-from pcfix.simulate.block import Block, fly_block
-from pcfix.simulate.scene import Streams, lay_out, points_on
+from pcfix.simulate.scene import lay_out, points_on
 from pcfix.simulate.settings import SceneSettings
 from pcfix.simulate.sight import see
 from pcfix.water.index import index_of
@@ -94,10 +93,6 @@ def plan_flight(
     progress : callable, optional
         Called with (steps done, steps in all).
 
-    Returns
-    -------
-    Plan
-
     Examples
     --------
     >>> import pcfix
@@ -136,12 +131,12 @@ def plan_flight(
             step()
         for words, other in others:
             sigma_m = _sigma(other, _bed(other, deepest))[1]
-            tried.append(Alternative(words, len(_flown(other).cameras), sigma_m))
+            tried.append(Alternative(words, len(_flown(other)), sigma_m))
             step()
     scene, flown = _scene(given, deepest), _flown(given)
     off_nadir = float(np.degrees(np.arctan(scene.optics.reach))) + (given.obliques or 0.0)
     plan = Plan(
-        cameras=flown.cameras, area_m=given.area, height_m=given.height,
+        cameras=flown, area_m=given.area, height_m=given.height,
         gsd_m=scene.gsd_m, base_m=scene.base_and_spacing_m[0],
         spacing_m=scene.base_and_spacing_m[1], obliques_deg=given.obliques,
         overlap=given.overlap, sidelap=given.sidelap, flattest_deg=off_nadir,
@@ -165,10 +160,9 @@ def _scene(given: PlanOptions, depth_m: float) -> SceneSettings:
     )  # fmt: skip
 
 
-def _flown(given: PlanOptions) -> Block:
-    """Return the whole block of the flight."""
-    scene = _scene(given, max(given.depth))
-    return fly_block(given.area, scene, Streams.of(scene.seed).main)
+def _flown(given: PlanOptions) -> Cameras:
+    """Return the images of the whole flight."""
+    return lay_out(_scene(given, max(given.depth))).flown.cameras
 
 
 def _bed(given: PlanOptions, depth_m: float) -> _Bed:
@@ -181,14 +175,13 @@ def _bed(given: PlanOptions, depth_m: float) -> _Bed:
     sight = see(points_on(site.terrain, POINTS, rng), site.rig, rng)
     seen = np.flatnonzero(sight.paired)
     if len(seen) < FEWEST_SEEN:
+        share = len(seen) / POINTS
         raise SettingError(
             "plan.overlap",
             f"Overlap {given.overlap:g} and sidelap {given.sidelap:g}: three images see only"
-            f" {100 * len(seen) / POINTS:.0f} % of a bed {depth_m:g} m deep. Give more overlap.",
-            overlap=given.overlap,
-            sidelap=given.sidelap,
-            share=len(seen) / POINTS,
-        )
+            f" {share:.0%} of a bed {depth_m:g} m deep. Give more overlap.",
+            overlap=given.overlap, sidelap=given.sidelap, share=share,
+        )  # fmt: skip
     views = Views(sight.start, sight.camera).take(seen)
     apparent = sight.intersected(sight.ideal)[seen]
     block = plain_block(site.flown.cameras, TiePoints(sight.truth[seen], views, sight.ideal))
@@ -225,9 +218,8 @@ def _sigma(given: PlanOptions, bed: _Bed) -> tuple[Correction, float, float]:
 
     If no precision of the poses is given, they are those of an adjustment through the water.
     """
-    whole, adjusted = _budget(given, bed), 0.0
-    if given.sigma_centre == given.sigma_attitude == 0.0:
-        adjusted = _of_adjusted_poses(given, bed)
+    has_no_sigma = given.sigma_centre == given.sigma_attitude == 0.0
+    whole, adjusted = _budget(given, bed), _of_adjusted_poses(given, bed) if has_no_sigma else 0.0
     return whole, float(np.hypot(_rms(whole.sigma_z_m), adjusted)), adjusted
 
 

@@ -8,7 +8,6 @@ and the DSM of the round before. With the mapping ``exact`` and the true bed, on
 
 from __future__ import annotations
 
-import json
 import shlex
 import shutil
 import time
@@ -25,7 +24,7 @@ import numpy as np
 from pcfix.errors import GeometryError, InputError, PcfixError, PcfixWarning, SettingError
 from pcfix.flow.compare import compare_clouds
 from pcfix.flow.dsm import grid_dsm
-from pcfix.flow.photos import CLOUDS, PhotoBlock, block_of, input_states, map_photos, plain
+from pcfix.flow.photos import CLOUDS, PhotoBlock, block_of, call_record, map_photos, plain
 from pcfix.flow.runner import Progress, check_summary, json_text, write_summary
 from pcfix.io.files import check_input, file_state, read_json, run_logged, write_text
 from pcfix.io.las.writing import write_points
@@ -37,12 +36,11 @@ from pcfix.options.photos import PhotosOptions, RebuildOptions
 from pcfix.photos.ortho import blank_in
 from pcfix.photos.stereo import Grey, stereo_cloud
 from pcfix.running import threads
-from pcfix.version import __version__
 from pcfix.water.surface import surface_above
 
 RECORD = "pcfix-rebuild.json"
 PAPER_ROUNDS = 3
-"""After so many, the mapping by eq 12 is close to its fixed point, which is not the bed."""
+"""Rounds after which the mapping by eq 12 is close to its fixed point, which is not the bed."""
 STEREO_CELL_PIXELS = 2.0
 STEREO_STEP_M = 0.001
 CACHED_PHOTOGRAPHS = 16
@@ -107,14 +105,13 @@ def rebuild_rounds(
     Raises
     ------
     PcfixError
-        Rounds that are finished are kept.
+        Finished rounds stay.
     """
     started = time.perf_counter()
     given = taken(PhotosOptions, options, keywords, "rebuild_rounds")
     if given.rebuild is None:
-        raise SettingError(
-            "option.missing", "--rebuild is missing. Give stereo, or a command.", option="rebuild"
-        )
+        sentence = "--rebuild is missing. Give stereo, or a command."
+        raise SettingError("option.missing", sentence, option="rebuild")
     paths, target = photographs_in(Path(images)), Path(out)
     check_summary(given)
     if given.reference is not None:
@@ -139,10 +136,10 @@ def rebuild_rounds(
         before = Path(rounds[-1].dsm if rounds else given.dsm)
         folder = target / f"round{number}"
         cloud, dsm = folder / "cloud.laz", folder / "dsm.tif"
-        kept = record["rounds"][number - 1] if number <= len(record["rounds"]) else {}
-        has_cloud = cloud.exists() and kept.get("state") == file_state(cloud)
-        if has_cloud and "mean_m" in kept and dsm.exists():
-            one = Round(**{name: kept[name] for name in Round.__dataclass_fields__})
+        noted = record["rounds"][number - 1] if number <= len(record["rounds"]) else {}
+        has_cloud = cloud.exists() and noted.get("state") == file_state(cloud)
+        if has_cloud and "mean_m" in noted and dsm.exists():
+            one = Round(**{name: noted[name] for name in Round.__dataclass_fields__})
         else:
             finished = min(finished, number - 1)
             with warnings.catch_warnings():
@@ -156,11 +153,11 @@ def rebuild_rounds(
                     map_photos(images, folder / "images", options=how, progress=progress)
                     with threads(given.jobs):
                         _reconstruct(given, block, number, folder / "images", cloud, progress)
-                    kept = {"command": given.rebuild, "state": file_state(cloud)}
-                    _keep(target, record, number, kept)
+                    noted = {"command": given.rebuild, "state": file_state(cloud)}
+                    _note(target, record, number, noted)
                 grid_dsm(cloud, dsm, resolution=block.scene.ground.cell_m, overwrite=True)
             one = _difference(block, cloud, dsm, before)
-            _keep(target, record, number, {**kept, **asdict(one)})
+            _note(target, record, number, noted | asdict(one))
         rounds.append(one)
         if say is not None:
             say(
@@ -189,35 +186,29 @@ def rebuild_rounds(
 
 def _opened(target: Path, given: PhotosOptions) -> dict[str, Any]:
     """Return the record of a folder: the options and inputs, and the rounds that it has."""
-    path = target / RECORD
-    asked = {k: str(v) for k, v in given.as_dict().items() if k not in COMMAND_ONLY}
-    new: dict[str, Any] = {"pcfix": __version__, "asked": asked, "files": input_states(given)}
+    path, new = target / RECORD, call_record(given, COMMAND_ONLY)
+    sentence = ""
     if path.exists() and not given.overwrite:
         old: dict[str, Any] = read_json(path)
-        if {name: old.get(name) for name in new} != json.loads(json.dumps(new)):
-            raise SettingError(
-                "output.exists",
-                f"{target}: has the rounds of another call. Add --overwrite to replace them,"
-                " or give another folder.",
-                path=target,
-            )
-        return old
+        if {name: old.get(name) for name in new} == new:
+            return old
+        sentence = f"{target}: has the rounds of another call."
     for folder in target.glob("round[0-9]*"):
-        if not given.overwrite:
-            raise SettingError(
-                "output.exists",
-                f"{folder}: exists. Add --overwrite, or give another folder.",
-                path=folder,
-            )
-        shutil.rmtree(folder)
+        if given.overwrite:
+            shutil.rmtree(folder)
+        else:
+            sentence = sentence or f"{folder}: exists."
+    if sentence:
+        sentence += " Add --overwrite to replace them, or give another folder."
+        raise SettingError("output.exists", sentence, path=target)
     new["rounds"] = []
     write_text(path, json_text(new), overwrite=True)
     return new
 
 
-def _keep(target: Path, record: dict[str, Any], number: int, kept: dict[str, Any]) -> None:
+def _note(target: Path, record: dict[str, Any], number: int, noted: dict[str, Any]) -> None:
     """Record a round, for a later call to resume."""
-    record["rounds"][number - 1 :] = [kept]
+    record["rounds"][number - 1 :] = [noted]
     write_text(target / RECORD, json_text(record), overwrite=True)
 
 
@@ -256,10 +247,8 @@ def _reconstruct(
             "rebuild.failed",
             f"--rebuild {wrong} in round {number}: {' / '.join(last) or 'no message'} (see {log})."
             " Correct it and call again, which resumes here.",
-            exit_code=code,
-            round=number,
-            log=log,
-        )
+            exit_code=code, round=number, log=log,
+        )  # fmt: skip
 
 
 def _difference(block: PhotoBlock, cloud: Path, dsm: Path, before: Path) -> Round:
@@ -283,16 +272,13 @@ def round_of(
     """Return the change in a round, of whose files cloud and DSM are named.
 
     `difference_m`, shape (rows, columns), is the DSM minus the one before, NaN where either has no
-    height; `wet`, of the same shape, tells what is under water.
+    height; `wet`, of the same shape, is what lies under water.
     """
     known = np.isfinite(difference_m)
     moved = difference_m[known & wet] if (known & wet).any() else difference_m[known]
     if not len(moved):
-        raise GeometryError(
-            "cloud.no_overlap",
-            f"{files[0]}: does not overlap the DSM of the round before. Check its CRS.",
-            path=files[0],
-        )
+        sentence = f"{files[0]}: does not overlap the DSM of the round before. Check its CRS."
+        raise GeometryError("cloud.no_overlap", sentence, path=files[0])
     within = float((np.abs(moved) <= gsd_m).mean())
     mean, sd = float(moved.mean()), float(moved.std())
     return Round(*files, len(moved), round(mean, 5), round(sd, 5), round(within, 5))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -15,19 +15,19 @@ from pcfix.flow.request import Files, Request, cameras_of, inputs_of_run, water_
 from pcfix.flow.run_adjust import figures_of
 from pcfix.flow.surfaces import view_of
 from pcfix.flow.water import found_picture
-from pcfix.grid.maps import MOST_CELLS, Maps, MapsBuilder
+from pcfix.grid.maps import MOST_CELLS, MapsBuilder
 from pcfix.io.crs import crs_words
 from pcfix.io.files import sha256, write_bytes, write_text
 from pcfix.io.las.columns import SHIFTS
 from pcfix.io.las.source import coordinates, stated_crs
 from pcfix.io.rasters import preview
 from pcfix.io.tiles import Tiles, open_cloud
-from pcfix.model import NOISE_CLASSES, Cameras, FloatArray, WaterSurface
+from pcfix.model import NOISE_CLASSES, Cameras, WaterSurface
 from pcfix.refract.tally import Summary
 from pcfix.report.adjustment import adjustment_tables
 from pcfix.report.comparison import evaluation, in_a_sentence
 from pcfix.report.page import Picture, Report, Table, render
-from pcfix.report.run import Corrected, Later, Survey, in_short, is_found, run_report
+from pcfix.report.run import RunResults, in_short, is_found, run_report
 from pcfix.report.text import uncertainty_sentence
 
 Plain = dict[str, Any]
@@ -35,7 +35,6 @@ NEEDED = (*SHIFTS, "WaterDepth", "RayCount")
 SIGMA_Z = "SigmaZ"
 SAMPLE_POINTS = 200_000
 """Points in histogram and uncertainty figure, evenly spread over the file."""
-NO_SURVEY, NOTHING_LATER = Survey(), Later()
 PAGE = "report.html"
 ENDINGS = (".laz", ".las", ".tif", ".gpkg", ".csv", ".html", ".json")
 RESULTS = {
@@ -75,22 +74,20 @@ def report_run(
         verdict += in_a_sentence(compared["figures"])
     if first["adjusted"]:
         tables += adjustment_tables(figures_of(files.folder), f"{FOLDER}/report.html")
-    summary, again, cameras = (
-        Summary(**corrected),
-        inputs_of_run(request),
-        cameras_of(request, files),
-    )
+    summary, again = Summary(**corrected), inputs_of_run(request)
+    cameras = cameras_of(request, files)
     if is_found(summary):
         pictures.append(found_picture(again.surface(view_of(request.source))))
-    later = Later(pictures, tables, verdict, compared.get("figures", {}), dod, files.resolution_m)
     page = write_report(
         files.cleaned_cloud, files.folder, summary=summary, cameras=cameras,
-        water=water_of(request, files), inputs=inputs, later=later, overwrite=True,
-        survey=Survey(request.project or "", request.date or again.dates(cameras)),
+        water=water_of(request, files), inputs=inputs, resolution_m=files.resolution_m,
+        overwrite=True, project=request.project or "", date=request.date or again.dates(cameras),
+        pictures=pictures, tables=tables, verdict=verdict, compared=compared.get("figures", {}),
+        difference=dod,
     )  # fmt: skip
     return {
         "in_short": in_short(page.tiles),
-        "uncertainty": uncertainty_sentence(summary, later.tvu),
+        "uncertainty": uncertainty_sentence(summary, compared.get("figures", {}).get("tvu")),
         "title": page.title,
         "tiles": [asdict(tile) for tile in page.tiles],
         "place": page.place,
@@ -105,23 +102,21 @@ def write_report(
     cameras: Cameras,
     water: WaterSurface,
     inputs: Sequence[Path],
-    survey: Survey = NO_SURVEY,
-    later: Later = NOTHING_LATER,
+    resolution_m: float | None = None,
     overwrite: bool = False,
+    **more: Any,
 ) -> Report:
     """Write ``report.html`` and ``figures/*.png`` about a corrected cloud, into an existing folder.
 
     `corrected` is from `correct_file` with all dimensions, cleaned or not; `summary`, `cameras` and
     `water` are its result and its inputs. The page lists size and checksum of the files `inputs`.
-    `survey` has the name of the project and the date of the images, `later` the results of other
-    steps of a run.
+    `resolution_m` is that of the rasters; `more` are the results of other steps of a run, see
+    `pcfix.report.run.RunResults`.
     """
     rows = [[path.name, f"{path.stat().st_size:,}", sha256(path)] for path in inputs]
-    maps, depth_m, sample, crs, heights = _read(corrected, later.resolution_m)
-    survey = replace(survey, crs=crs, heights=heights)
-    found = Corrected(summary, survey, cameras, water, maps, depth_m, sample)
+    run = RunResults(summary, cameras, water, **_read(corrected, resolution_m), **more)
     table = Table("Input files", ["file", "bytes", "SHA-256"], rows)
-    report = run_report(found, table, _beside(out_dir), later)
+    report = run_report(run, table, _beside(out_dir))
     figures = out_dir / "figures"
     figures.mkdir(exist_ok=True)
     for picture in report.pictures:
@@ -143,12 +138,10 @@ def _beside(folder: Path) -> list[tuple[str, str]]:
     ]
 
 
-def _read(
-    path: Path | Tiles, resolution_m: float | None
-) -> tuple[Maps, dict[str, float], FloatArray, str, str]:
+def _read(path: Path | Tiles, resolution_m: float | None) -> Plain:
     """Return maps, depths, a sample, CRS and vertical datum of a cloud, without noise.
 
-    The sample, shape (m, 3), has shift in Z, depth and standard error of Z of corrected points.
+    The names are those of `RunResults`.
     """
     with open_cloud(path) as source:
         dimensions = set(source.header.point_format.dimension_names)
@@ -166,8 +159,8 @@ def _read(
         every = max(1, len(source) // SAMPLE_POINTS)
         sample, low, high, total, count = [], np.inf, -np.inf, 0.0, 0
         for points in source.chunks():
-            kept = ~np.isin(np.asarray(points["classification"]), NOISE_CLASSES)
-            points = points[kept & ~np.asarray(points["withheld"]).astype(bool)]
+            good = ~np.isin(np.asarray(points["classification"]), NOISE_CLASSES)
+            points = points[good & ~np.asarray(points["withheld"]).astype(bool)]
             moved = np.asarray(points["RayCount"]) > 0
             columns = ["WaterDepth", "ShiftZ", "RayCount"] + [SIGMA_Z] * (SIGMA_Z in dimensions)
             values = np.zeros((int(moved.sum()), 4))
@@ -180,4 +173,7 @@ def _read(
             total, count = total + float(depth.sum()), count + len(depth)
         crs, heights = crs_words(stated_crs(source))
     depth_m = {"min": float(low), "mean": total / max(count, 1), "max": float(high)}
-    return builder.maps(), depth_m, np.vstack(sample), crs, heights
+    return {
+        "maps": builder.maps(), "depth_m": depth_m, "sample": np.vstack(sample), "crs": crs,
+        "heights": heights,
+    }  # fmt: skip

@@ -98,18 +98,15 @@ def view_clouds(
     if given.image is not None:
         check_output(given.image, overwrite=given.overwrite, inputs=clouds)
     if given.colour == "error" and given.reference is None:
-        raise SettingError(
-            "option.missing",
-            "--colour error is the height above a reference. Give --reference too.",
-            option="reference",
-        )
+        sentence = "--colour error is the height above a reference. Give --reference too."
+        raise SettingError("option.missing", sentence, option="reference")
     paths = [check_input(cloud) for cloud in clouds]
     first = view_of(paths[0])
     surface = None if given.water is None else find_surface(given.water, given, first).surface
-    layers = [layer for path in paths for layer in _read(path, given.points)]
-    crs = _crs(paths[0])
-    for path in paths[1:]:
-        check_same_crs(str(paths[0]), crs, str(path), _crs(path))
+    read = {path: _read(path, given.points) for path in paths}
+    layers, crs = [layer for some, _ in read.values() for layer in some], read[paths[0]][1]
+    for path, (_, other) in read.items():
+        check_same_crs(str(paths[0]), crs, str(path), other)
     if given.reference is not None:
         target = read_reference(given.reference)
         check_same_crs(str(paths[0]), crs, target.name, target.crs)
@@ -141,15 +138,11 @@ def view_clouds(
     return f"{given.image}: {', '.join(scene.names)} by {given.colour}"
 
 
-def _crs(path: Path) -> Any:
-    with LasSource(path) as source:
-        return metric_crs(source)
-
-
-def _read(path: Path, most: int) -> list[_Layer]:
-    """Return a cloud, and before it the cloud before its correction, where that is known."""
+def _read(path: Path, most: int) -> tuple[list[_Layer], Any]:
+    """Return a cloud, if known also as it was before its correction, and its CRS."""
     xyz, known = [], dict[str, list[FloatArray]]()
     with LasSource(path) as source:
+        crs = metric_crs(source)
         names = [n for n in SHOWN if n in source.header.point_format.extra_dimension_names]
         step, row = 1 + (len(source) - 1) // most, 0
         for points in source.chunks():
@@ -162,22 +155,26 @@ def _read(path: Path, most: int) -> list[_Layer]:
         raise InputError("cloud.empty", f"{path}: has no points to show.", path=path)
     after = _Layer(path.name, np.vstack(xyz), {n: np.concatenate(v) for n, v in known.items()})
     if not known.keys() >= {*SHIFTS, "WaterDepth"}:
-        return [after]
+        return [after], crs
     shift = np.column_stack([after.known[name] for name in SHIFTS])
     depth = after.known["WaterDepth"]
     apparent = np.where(depth > 0.0, depth + shift[:, 2], 0.0)
     before = _Layer(f"{path.name} before", after.xyz - shift, {"WaterDepth": apparent})
-    return [before, after]
+    return [before, after], crs
 
 
 def _values(colour: str, layers: list[_Layer], surface: WaterSurface | None) -> list[FloatArray]:
     """Return the values for the colours of each layer, NaN where unknown."""
-    values = []
+    values, target = [], layers[-1].xyz
     for one in layers:
         found = None
-        if colour == "error":
-            target = layers[-1]
-            found = None if one is target else _height_above(target.xyz, one.xyz)
+        if colour == "error" and one is not layers[-1]:  # NaN away from the reference
+            gap_m = max(GAP_SPACINGS * mean_spacing_m(target[:, :2]), LEAST_GAP_M)
+            near = near_in_plan(one.xyz[:, :2], target[:, :2], gap_m)
+            found = np.full(len(one.xyz), np.nan)
+            if near.any():
+                k = min(NEIGHBOURS, len(target))
+                found[near] = one.xyz[near, 2] - heights_at(one.xyz[near, :2], target, k)[0]
         elif colour == "height":
             found = one.xyz[:, 2]
         elif colour == "depth":
@@ -185,28 +182,15 @@ def _values(colour: str, layers: list[_Layer], surface: WaterSurface | None) -> 
             if found is None and surface is not None and not isinstance(surface, WaterDimension):
                 found = surface_above(surface, one.xyz).height_m - one.xyz[:, 2]
             found = None if found is None else np.where(found > 0.0, found, np.nan)
-        else:
+        elif colour != "error":
             name, sign = {"shift": ("ShiftZ", -1.0), "uncertainty": ("SigmaZ", COVERAGE_95)}[colour]
             if name in one.known:
                 found = np.where(one.known[name] != 0.0, sign * one.known[name], np.nan)
         values.append(np.full(len(one.xyz), np.nan) if found is None else found)
     if not any(np.isfinite(one).any() for one in values):
-        raise SettingError(
-            "view.no_values",
-            f"No cloud has values for --colour {colour}. {_REMEDY[colour]}",
-            colour=colour,
-        )
+        sentence = f"No cloud has values for --colour {colour}. {_REMEDY[colour]}"
+        raise SettingError("view.no_values", sentence, colour=colour)
     return values
-
-
-def _height_above(reference: FloatArray, xyz: FloatArray) -> FloatArray:
-    """Return the heights of points above a reference, NaN away from it."""
-    gap_m = max(GAP_SPACINGS * mean_spacing_m(reference[:, :2]), LEAST_GAP_M)
-    near, error = near_in_plan(xyz[:, :2], reference[:, :2], gap_m), np.full(len(xyz), np.nan)
-    if near.any():
-        found = heights_at(xyz[near, :2], reference, min(NEIGHBOURS, len(reference)))
-        error[near] = xyz[near, 2] - found.height_m
-    return error
 
 
 def _frusta(cameras: Cameras, ground_m: float) -> FloatArray:

@@ -242,12 +242,9 @@ def shoreline_figure(found: WaterProposal) -> Figure:
     heights -= (found.ground[:, :2] - found.centre_xy) @ found.tilt
     _draw_shoreline(axes["plan"], figure, found, heights)
     # heights to show: the ground, but no more than is needed to see the level
-    low, high = np.percentile(heights, [1.0, 99.0])
+    low, high = np.percentile(heights, [1.0, 99.0]).tolist()
     most = 4.0 * max(1.5, 8.0 * found.sigma_level_m)
-    limits = (
-        found.level_m + min(max(float(low), -most), -0.2),
-        found.level_m + max(min(float(high), most), 0.2),
-    )
+    limits = found.level_m + min(max(low, -most), -0.2), found.level_m + max(min(high, most), 0.2)
     axes["heights"].hist(heights + found.level_m, bins=90, range=limits, color="0.65")
     axes["heights"].set(xlabel="Apparent height (m)", ylabel="Cells")
     evidence = axes["evidence"]
@@ -262,20 +259,16 @@ def shoreline_figure(found: WaterProposal) -> Figure:
     reach = 2.0 * found.sigma_level_m
     for side in (axes["heights"], evidence):
         side.axvline(found.level_m, color=WATER, label="water")
-        side.axvspan(
-            found.level_m - reach, found.level_m + reach, color=WATER, alpha=0.3, linewidth=0
-        )
+        ends = found.level_m - reach, found.level_m + reach
+        side.axvspan(*ends, color=WATER, alpha=0.3, linewidth=0)
         side.set_xlim(limits)
     axes["heights"].legend(loc="best")
-    evidence.legend(
-        loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=3, fontsize="small", frameon=False
-    )
+    look = {"bbox_to_anchor": (0.5, -0.18), "ncols": 3, "fontsize": "small", "frameon": False}
+    evidence.legend(loc="upper center", **look)
     tilt = 100.0 * float(np.hypot(*found.tilt))
     kind = f", tilt {tilt:.2f} %" if tilt > 0.0 else ""
-    figure.suptitle(
-        f"Water {found.level_m:.3f} ± {found.sigma_level_m:.3f} m{kind},"
-        f" confidence {found.confidence:.2f}"
-    )
+    level = f"{found.level_m:.3f} ± {found.sigma_level_m:.3f} m"
+    figure.suptitle(f"Water {level}{kind}, confidence {found.confidence:.2f}")
     return figure
 
 
@@ -294,7 +287,6 @@ def _draw_shoreline(axes: Axes, figure: Figure, found: WaterProposal, above_m: F
     shore_x, shore_y = (found.shoreline[:, :2] - corner).T
     name = f"shoreline, {len(found.shoreline):,} places"
     axes.plot(shore_x, shore_y, ".", color="#c2185b", markersize=3, label=name)
-    axes.set_aspect("equal")
-    axes.set_xlabel(f"East (m) from {corner[0]:,.0f}")
-    axes.set_ylabel(f"North (m) from {corner[1]:,.0f}")
+    east, north = (f"(m) from {place:,.0f}" for place in corner)
+    axes.set(aspect="equal", xlabel=f"East {east}", ylabel=f"North {north}")
     axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), frameon=False, borderaxespad=0.0)

@@ -7,10 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pcfix.adjust.result import nice_step
 from pcfix.grid.maps import smoothed
 from pcfix.model import FloatArray
 
-MOST_LEVELS = 15
+MOST_LEVELS, LEAST_INTERVAL_M = 15, 1e-3
 SMOOTH_CELLS = 1.0
 """Standard deviation of the filter before the lines are drawn."""
 LEAST_CELLS = 12.0
@@ -24,21 +25,15 @@ class Contour(NamedTuple):
     place: FloatArray
 
 
-def interval_of(height: float, least: float) -> float:
-    """Return 1, 2 or 5 times a power of ten that divides a height into few levels.
-
-    It is at least `least`, such as the uncertainty.
-    """
-    wanted = max(height / MOST_LEVELS, least, 1e-3)
-    power = 10.0 ** math.floor(math.log10(wanted) + 1e-9)
-    return next(s * power for s in (1.0, 2.0, 5.0, 10.0) if s * power >= wanted * (1.0 - 1e-9))
-
-
 def depth_interval(depth_m: FloatArray, uncertainty_m: FloatArray) -> float:
-    """Return the interval for a map of depths; both NaN if unknown, of any shape."""
+    """Return the interval for a map of depths: few levels, and not finer than the uncertainty.
+
+    It is 1, 2 or 5 times a power of ten, metres. Both arrays are NaN if unknown, of any shape.
+    """
     known = uncertainty_m[np.isfinite(uncertainty_m)]
     deepest = np.max(depth_m, where=np.isfinite(depth_m), initial=0.0)
-    return interval_of(float(deepest), float(np.median(known)) if known.size else 0.0)
+    sigma = float(np.median(known)) if known.size else 0.0
+    return nice_step(max(float(deepest) / MOST_LEVELS, sigma, LEAST_INTERVAL_M))
 
 
 def contours(values: FloatArray, interval: float) -> list[Contour]:

@@ -27,25 +27,12 @@ _MIX = np.array([0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB], np
 def triangulated(
     position: FloatArray, z: FloatArray, window: Window, widest: float, spacing: float
 ) -> FloatArray:
-    """Return the height of the triangle above each centre.
+    """Return the height (m) of the triangle above each centre of a window; NaN outside all.
 
-    Parameters
-    ----------
-    position : array, shape (n, 2)
-        Columns and rows, in cells from the top left corner of the raster, of at least the points
-        within `widest` of the window. Of several at one place the mean height is used.
-    z : array, shape (n,)
-        Heights, metres.
-    window : Window
-    widest : float
-        Diameter of the widest circle around a triangle, cells.
-    spacing : float
-        A usual distance between points, cells.
-
-    Returns
-    -------
-    array, shape (window.height, window.width)
-        Metres; NaN outside all triangles.
+    `position`, shape (n, 2), are columns and rows, in cells from the top left corner of the raster,
+    of at least the points within `widest` of the window; `z`, shape (n,), their heights (m). Of
+    several points at one place the mean height is used. `widest` is the diameter of the widest
+    circle around a triangle and `spacing` a usual distance between points, cells.
     """
     out = np.full(window.height * window.width, np.nan)
     position, z = _one_a_place(position, z)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -46,7 +46,7 @@ def grid_window(points: FloatArray, cell: IntArray, window: Window, how: Griddin
     """
     inner, shape = window.holds(cell), (window.height, window.width)
     code = (cell[inner, 1] - window.row) * window.width + cell[inner, 0] - window.column
-    numbers = cell_numbers(code, points[inner, 2], window.height * window.width)
+    cells = cell_statistics(code, points[inner, 2], window.height * window.width)
     size, position = how.lattice.resolution_m, how.lattice.positions(points)
     match how.method:
         case "tin":
@@ -54,31 +54,21 @@ def grid_window(points: FloatArray, cell: IntArray, window: Window, how: Griddin
             height = triangulated(position, points[:, 2], window, reach, spacing)
         case "idw":
             height = inverse_distance(position, cell, points[:, 2], window)
-            height[numbers.points == 0] = np.nan
+            height[cells["points"] == 0] = np.nan
         case method:
-            height = getattr(numbers, method)
+            height = cells[method]
     return Gridded(
-        height.reshape(shape), numbers.points.reshape(shape), numbers.spread.reshape(shape)
+        height.reshape(shape), cells["points"].reshape(shape), cells["spread"].reshape(shape)
     )
 
 
-class Cells(NamedTuple):
-    """Statistics of the points of n cells, each of shape (n,); NaN without points."""
+def cell_statistics(cell: IntArray, z: FloatArray, size: int) -> dict[str, Any]:
+    """Return statistics of `size` cells, from the cell and height of each point, shape (k,).
 
-    points: IntArray
-    mean: FloatArray
-    median: FloatArray
-    min: FloatArray
-    max: FloatArray
-    spread: FloatArray
-
-
-def cell_numbers(cell: IntArray, z: FloatArray, size: int) -> Cells:
-    """Return the statistics of `size` cells, from the cell and height of each point, shape (k,).
-
-    Heights are summed in ascending order, as differences from the lowest of their cell, so that
-    the result does not depend on the order of the points or the vertical datum. `spread` is the
-    population standard deviation of the heights: 0 in a cell with one point.
+    They are points (the number), mean, median, min, max and spread, NaN without points. Heights are
+    summed in ascending order, as differences from the lowest of their cell, so that the result
+    does not depend on the order of the points or the vertical datum. `spread` is the population
+    standard deviation of the heights: 0 in a cell with one point.
     """
     order = np.lexsort((z, cell))
     z, count = z[order], np.bincount(cell, minlength=size)
@@ -90,10 +80,10 @@ def cell_numbers(cell: IntArray, z: FloatArray, size: int) -> Cells:
     offset = np.add.reduceat(above, first) / n
     scatter = np.sqrt(np.add.reduceat((above - np.repeat(offset, n)) ** 2, first) / n)
     median = (z[first + (n - 1) // 2] + z[first + n // 2]) / 2.0
-    columns = (low + offset, median, low, z[first + n - 1], scatter)
-    whole = np.full((len(columns), size), np.nan)
-    whole[:, filled] = columns
-    return Cells(count, *whole)
+    whole = np.full((5, size), np.nan)
+    whole[:, filled] = low + offset, median, low, z[first + n - 1], scatter
+    names = ("mean", "median", "min", "max", "spread")
+    return {"points": count, **dict(zip(names, whole, strict=True))}
 
 
 def as_uncertainty(bands: Gridded) -> Gridded:

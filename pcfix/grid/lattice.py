@@ -111,10 +111,6 @@ class Lattice:
         """The whole raster."""
         return Window(0, self.height, 0, self.width)
 
-    def windows(self, side: int) -> Iterator[Window]:
-        """Yield squares of `side` cells that cover the raster, row by row."""
-        return self.window.parts(side)
-
     def positions(self, xyz: FloatArray) -> FloatArray:
         """Return columns and rows of points, shape (n, 2), cells from the top left corner."""
         away = np.column_stack([xyz[:, 0] - self.left_m, self.top_m - xyz[:, 1]])
@@ -140,8 +136,7 @@ def lattice_over(low: FloatArray, high: FloatArray, resolution_m: float) -> Latt
 
 def fits(low: FloatArray, high: FloatArray, resolution_m: float) -> bool:
     """Return whether a raster over the rectangle has at most `MAX_CELLS`."""
-    columns, rows = _size(low, high, resolution_m)
-    return columns * rows <= MAX_CELLS
+    return bool(np.prod(_size(low, high, resolution_m)) <= MAX_CELLS)
 
 
 def refuse_size(low: FloatArray, high: FloatArray, resolution_m: float, name: str) -> None:
@@ -153,19 +148,17 @@ def refuse_size(low: FloatArray, high: FloatArray, resolution_m: float, name: st
     while not fits(low, high, finest):
         step = 10.0 ** (math.floor(math.log10(finest * 1.0000001)) - 2)
         finest = round(finest / step + 1.0) * step
-    raise SettingError(
-        "option.resolution",
+    sentence = (
         f"{name}: a resolution of {resolution_m:g} m makes {columns:,.0f} x {rows:,.0f} cells, more"
-        f" than {MAX_CELLS:,}. Use {finest:g} m or more.",
-        value=resolution_m, finest=finest,
-    )  # fmt: skip
+        f" than {MAX_CELLS:,}. Use {finest:g} m or more."
+    )
+    raise SettingError("option.resolution", sentence, value=resolution_m, finest=finest)
 
 
-def _size(low: FloatArray, high: FloatArray, resolution_m: float) -> tuple[float, float]:
+def _size(low: FloatArray, high: FloatArray, resolution_m: float) -> FloatArray:
     """Return columns and rows, as floats, which cannot overflow."""
-    first = np.floor((low + EDGE_M) / resolution_m)
-    columns, rows = (np.floor((high + EDGE_M) / resolution_m) - first + 1.0).tolist()
-    return columns, rows
+    first, last = (np.floor((corner + EDGE_M) / resolution_m) for corner in (low, high))
+    return np.asarray(last - first + 1.0)
 
 
 POINTS_A_CELL = 2.0, 4.0

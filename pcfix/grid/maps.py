@@ -10,11 +10,11 @@ from pcfix.model import BoolArray, FloatArray, IntArray
 
 LONG_SIDE_CELLS = 360
 MOST_CELLS = 500_000
-"""At most so many cells of a map, so that a page with six maps stays below 8 MB."""
+"""Maximum number of cells of a map, so that a page with six maps stays below 8 MB."""
 POINTS_PER_CELL = 6.0
-"""At least so many points per cell: a sparse cloud gets larger cells, with few holes."""
+"""Least number of points per cell: a sparse cloud gets larger cells, with few holes."""
 FEWEST_AROUND = 5
-"""An empty cell with so many known neighbours of eight gets their mean."""
+"""Known neighbours, of eight, whose mean an empty cell gets."""
 
 Extent = tuple[float, float, float, float]
 """West, east, south and north, metres."""
@@ -61,21 +61,15 @@ class Maps:
 
 
 class MapsBuilder:
-    """Sums per cell.
-
-    Parameters
-    ----------
-    low, high : array, shape (2,)
-        Corners of the area in plan, metres.
-    points : int
-        Number of points to come.
-    resolution_m : float, optional
-        Resolution of a raster of the same points; the cells have this size or a multiple of it.
-    """
+    """Sums per cell."""
 
     def __init__(
         self, low: FloatArray, high: FloatArray, points: int, resolution_m: float | None = None
     ) -> None:
+        """Lay out cells between two corners in plan, (2,), metres, for a number of points.
+
+        With the resolution of a raster of the same points, the cells have it or a multiple of it.
+        """
         size = np.maximum(high - low, 1e-3)
         if resolution_m is None:
             sparse_m = np.sqrt(POINTS_PER_CELL * size.prod() / max(points, 1))
@@ -93,9 +87,9 @@ class MapsBuilder:
         self._moved = np.zeros((5, cells))
 
     def add(
-        self, xyz: FloatArray, moved: BoolArray | None = None, told: FloatArray | None = None
+        self, xyz: FloatArray, moved: BoolArray | None = None, values: FloatArray | None = None
     ) -> None:
-        """Add n points, shape (n, 3), and for the m that `moved` the columns `told`, shape (m, 4).
+        """Add n points, shape (n, 3), and for the m that `moved` some values, shape (m, 4).
 
         These are depth, shift in Z, number of rays and standard error of Z.
         """
@@ -104,8 +98,8 @@ class MapsBuilder:
         row = np.clip(row, 0, self._rows - 1)
         cell = (self._rows - 1 - row) * self._columns + column
         self._sum(self._all, cell, xyz[:, 2])
-        if moved is not None and told is not None:
-            depth, shift, rays, sigma = told.T
+        if moved is not None and values is not None:
+            depth, shift, rays, sigma = values.T
             self._sum(self._moved, cell[moved], depth, shift, rays, sigma**2)
 
     @staticmethod

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from pcfix.model import FloatArray
+from pcfix.sums import LEAST, MOST, Sums
 
 if TYPE_CHECKING:
     from pcfix.grid.heights import Gridded
@@ -50,36 +50,37 @@ class DsmSummary:
         return asdict(self)
 
 
-@dataclass
-class Tally:
-    """Counts and values of the cells of a DSM, accumulated over windows."""
+@dataclass(frozen=True)
+class CellTally(Sums):
+    """Counts and values of the cells of a DSM, added up over windows."""
 
-    cells: int = 0
-    filled: int = 0
-    known: int = 0
+    cells: int = 0  # with points
+    filled: int = 0  # with a value but no points
+    known: int = 0  # with a value
     total: float = 0.0
-    low: float = math.inf
-    high: float = -math.inf
-    gridded: int = 0
+    low: float = field(default=np.inf, metadata=LEAST)
+    high: float = field(default=-np.inf, metadata=MOST)
 
-    def add(self, bands: Gridded) -> None:
-        """Add a part of the raster."""
+    @classmethod
+    def of(cls, bands: Gridded) -> CellTally:
+        """Return those of a part of the raster."""
         known = ~np.isnan(bands.height)
-        self.cells += int((bands.points > 0).sum())
-        self.filled += int((known & (bands.points == 0)).sum())
-        self.known += int(known.sum())
         values = bands.height[known]
-        self.gridded += values.size
-        self.total += float(values.sum())
-        self.low = min(self.low, float(values.min(initial=math.inf)))
-        self.high = max(self.high, float(values.max(initial=-math.inf)))
+        return cls(
+            cells=int((bands.points > 0).sum()),
+            filled=int((known & (bands.points == 0)).sum()),
+            known=values.size,
+            total=float(values.sum()),
+            low=float(values.min(initial=np.inf)),
+            high=float(values.max(initial=-np.inf)),
+        )
 
     def values(self) -> dict[str, float]:
         """Return least, mean and largest; nothing if no cell has a value."""
-        if not self.gridded:
+        if not self.known:
             return {}
-        mean = self.total / self.gridded
-        return {"min": round(self.low, 4), "mean": round(mean, 4), "max": round(self.high, 4)}
+        values = {"min": self.low, "mean": self.total / self.known, "max": self.high}
+        return {name: round(float(value), 4) for name, value in values.items()}
 
 
 NO_LIGHT = 0

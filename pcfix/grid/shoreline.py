@@ -20,7 +20,7 @@ from pcfix.sums import Sums
 REACH_M = 2.0
 """Points farther above or below the water are not used."""
 MOST_POINTS = 2_000_000
-"""At most so many points are kept, evenly spread."""
+"""Maximum number of points in memory, evenly spread."""
 POINTS_PER_CELL = 4.0
 MAX_CELLS = 25_000_000
 SMOOTH_CELLS = 1.0
@@ -53,7 +53,7 @@ class NearWater(Sums):
     """Points of a cloud near the height of the water; those of two parts of it are added with +."""
 
     parts: tuple[FloatArray, ...] = ()  # (n, 5) each: x, y, z, height above the water, sigma
-    every: int = 1  # one of so many points is kept
+    every: int = 1  # one point in this number is used
 
     @classmethod
     def of(
@@ -94,8 +94,8 @@ class NearWater(Sums):
         places = (field.low + np.asarray(line) * field.cell_m for line in maker.lines(0.0))
         found = [_measured(xy, field, sigma_level_m) for xy in places]
         least_m = LEAST_CELLS * field.cell_m
-        kept = [one for one in found if one.length_m >= max(least_m, LEAST_SIGMAS * one.sigma_m)]
-        return sorted(kept, key=lambda one: -one.length_m)
+        long = [one for one in found if one.length_m >= max(least_m, LEAST_SIGMAS * one.sigma_m)]
+        return sorted(long, key=lambda one: -one.length_m)
 
 
 def _cell_m(xy: FloatArray) -> float:

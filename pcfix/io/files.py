@@ -252,20 +252,19 @@ def scratch_arrays(target: Path) -> Iterator[Empty]:
 class Bins:
     """Points sorted by place into one file without a name, on the disk of a folder.
 
-    The plane is divided into squares of `side` cells; `corner` is the column and row of a corner of
-    the squares. Each point has `numbers` float64 values: its coordinates, and what belongs to it.
+    The plane is divided into squares of `side` cells. Each point has three float64 values: x, y and
+    height or another quantity.
     """
 
-    def __init__(self, folder: Path, side: int, corner: Iterable[int], numbers: int = 3) -> None:
-        self.side, self._numbers = side, numbers
+    def __init__(self, folder: Path, side: int) -> None:
+        self.side = side
         self._stream = TemporaryFile(dir=folder)  # noqa: SIM115  # closed with this object
-        self._corner = np.array(list(corner), np.int64)
         # offset in the file and number of points, for the pieces of each square
         self._pieces: dict[tuple[int, int], list[tuple[int, int]]] = {}
 
     def add(self, cell: IntArray, xyz: FloatArray) -> None:
-        """Store points, shape (n, numbers), by columns and rows of their cells, shape (n, 2)."""
-        square = (cell - self._corner) // self.side
+        """Store points, shape (n, 3), by columns and rows of their cells, shape (n, 2)."""
+        square = cell // self.side
         order = np.lexsort((square[:, 0], square[:, 1]))
         square, xyz = square[order], xyz[order]
         first = np.flatnonzero((np.diff(square, axis=0, prepend=square[:1] - 1) != 0).any(axis=1))
@@ -276,22 +275,12 @@ class Bins:
             offset += self._stream.write(xyz[start:stop].tobytes())
 
     def read(self, cells: Window) -> FloatArray:
-        """Return the points, shape (n, numbers), of all squares that touch a window."""
+        """Return the points, shape (n, 3), of all squares that touch a window."""
+        rows = range(cells.row // self.side, (cells.row_stop - 1) // self.side + 1)
+        columns = range(cells.column // self.side, (cells.column_stop - 1) // self.side + 1)
         data = bytearray()
-        for offset, points in self._touched(cells):
-            self._stream.seek(offset)
-            data += self._stream.read(points * self._numbers * 8)
-        return np.frombuffer(data).reshape(-1, self._numbers)
-
-    def count(self, cells: Window) -> int:
-        """Return how many points `read` would return."""
-        return sum(points for _, points in self._touched(cells))
-
-    def _touched(self, cells: Window) -> list[tuple[int, int]]:
-        """Return the pieces of all squares that touch a window."""
-        first, last = (cells.column, cells.row), (cells.column_stop - 1, cells.row_stop - 1)
-        (left, top), (right, bottom) = (
-            (np.array((first, last)) - self._corner) // self.side
-        ).tolist()
-        columns, rows = range(left, right + 1), range(top, bottom + 1)
-        return [piece for r in rows for c in columns for piece in self._pieces.get((c, r), ())]
+        for square in ((column, row) for row in rows for column in columns):
+            for offset, points in self._pieces.get(square, ()):
+                self._stream.seek(offset)
+                data += self._stream.read(points * 3 * 8)
+        return np.frombuffer(data).reshape(-1, 3)

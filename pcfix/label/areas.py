@@ -7,6 +7,7 @@ does not depend on other points. All sums are of whole numbers, for the same rea
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,24 +18,16 @@ from pcfix.model import BoolArray, FloatArray, IntArray
 Flags = npt.NDArray[np.uint8]
 
 
+@dataclass(frozen=True)
 class WaterMask:
     """The polygons inside which points may be submerged.
 
     A point on the border, of a hole too, is inside.
-
-    Parameters
-    ----------
-    area : shapely Polygon or MultiPolygon
-        Valid, in the cloud's CRS, metres.
-    name : str
-        For messages.
-    notes : tuple of str
-        Notes of the reader, for the summary.
     """
 
-    def __init__(self, area: Any, name: str = "mask", notes: tuple[str, ...] = ()) -> None:
-        self.area, self.name, self.notes = area, name, notes
-        self.bounds: tuple[float, float, float, float] = area.bounds
+    area: Any  # shapely Polygon or MultiPolygon, valid, in the cloud's CRS, metres
+    name: str = "mask"  # for messages
+    notes: tuple[str, ...] = ()  # of the reader, for the summary
 
     def inside(self, x: FloatArray, y: FloatArray) -> BoolArray:
         """Return which of n plan positions, metres, world frame, are inside."""
@@ -47,10 +40,10 @@ class WaterMask:
 MOST_CELLS = 2**24
 """Limits the memory; a larger cloud has larger cells."""
 POINTS_A_CELL = 4.0
-"""Cells are the smallest with so many points per water cell, on average."""
+"""Least mean number of points per water cell; cells are the smallest that have it."""
 FINEST_M = 2.0**-10
 SHARE_OF_LARGEST = 0.1
-"""Pools of at least this share of the area of the largest water body are kept."""
+"""Pools of at least this share of the area of the largest water body count as water."""
 _VOTE = 1000
 _AROUND = np.ones((3, 3), np.bool_)
 
@@ -93,7 +86,7 @@ class Surroundings(NamedTuple):
     pool: npt.NDArray[np.int32] | None = None  # (rows, columns), 0 for none, else an index below
     area_m2: FloatArray | None = None  # of the cells with submerged points of each pool
     stays: BoolArray | None = None  # whether a pool counts as water
-    joined: BoolArray | None = None  # (rows, columns), a kept pool is in the cell or beside it
+    joined: BoolArray | None = None  # (rows, columns), a pool of water is in or next to the cell
 
 
 class Grid:

@@ -196,51 +196,45 @@ class Labelling:
             )  # fmt: skip
         if self.mask is None or counts.outside_mask < max(counts.below, 1):
             return
-        west, south, east, north = self.mask.bounds
+        west, south, east, north = bounds = self.mask.area.bounds
         (x0, y0), (x1, y1) = counts.low, counts.high
         raise GeometryError(
             "mask.no_points",
             f"{self.mask.name} (x {west:.1f} to {east:.1f}, y {south:.1f} to {north:.1f}) contains"
             f" none of the points of {name} below the water (x {x0:.1f} to {x1:.1f}, y {y0:.1f} to"
             f" {y1:.1f}). Check the CRS of both, and that the polygons are of water.",
-            path=self.mask.name, points=counts.below, bounds=self.mask.bounds,
+            path=self.mask.name, points=counts.below, bounds=bounds,
         )  # fmt: skip
 
     def report(self, counts: LabelCounts) -> dict[str, Any] | None:
         """Return rules and counts of excluded points as plain values; None without rules."""
         if self.is_plain:
             return None
+        around, separate = self.around, None
+        if around is not None and around.area_m2 is not None:  # pools that are excluded
+            in_pool = np.zeros_like(around.area_m2) if counts.in_pool is None else counts.in_pool
+            area, largest = np.where(in_pool > 0, around.area_m2, 0.0), None
+            if area.any():
+                pool, side = int(np.argmax(area)), around.lattice.side_m
+                cells = np.argwhere(around.pool == pool)
+                row, column = cells[len(cells) // 2]  # a place inside it
+                largest = {
+                    "area_m2": round(float(area[pool]), 2),
+                    "points": int(in_pool[pool]),
+                    "x": float((around.lattice.first_column + column + 0.5) * side),
+                    "y": float((around.lattice.first_row + row + 0.5) * side),
+                }
+            pools, points = int((area > 0.0).sum()), int(in_pool.sum())
+            separate = {"pools": pools, "points": points, "largest": largest}
         return {
             "settings": asdict(self.settings),
             "water_mask": None if self.mask is None else self.mask.name,
             "below": counts.below,
             "outside_mask": counts.outside_mask,
             "respected": counts.respected,
-            "cell_m": None if self.around is None else self.around.lattice.side_m,
-            "separate": self._separate(counts),
+            "cell_m": None if around is None else around.lattice.side_m,
+            "separate": separate,
         }
-
-    def _separate(self, counts: LabelCounts) -> dict[str, Any] | None:
-        """Return the number of excluded pools and their points, and the largest of them."""
-        around = self.around
-        if around is None or around.area_m2 is None:
-            return None
-        lattice, in_pool = around.lattice, counts.in_pool
-        if in_pool is None:
-            in_pool = np.zeros(len(around.area_m2), np.int64)
-        area, largest = np.where(in_pool > 0, around.area_m2, 0.0), None
-        if area.any():
-            pool = int(np.argmax(area))
-            cells = np.argwhere(around.pool == pool)
-            row, column = cells[len(cells) // 2]  # a place inside it
-            largest = {
-                "area_m2": round(float(area[pool]), 2),
-                "points": int(in_pool[pool]),
-                "x": float((lattice.first_column + column + 0.5) * lattice.side_m),
-                "y": float((lattice.first_row + row + 0.5) * lattice.side_m),
-            }
-        count, points = int((area > 0.0).sum()), int(in_pool.sum())
-        return {"pools": count, "points": points, "largest": largest}
 
 
 def _within(height: FloatArray, reach_m: float) -> BoolArray:

@@ -115,16 +115,11 @@ def _coarse(one: tuple[FloatArray, Any], other: tuple[FloatArray, Any]) -> Any:
 class Registration(NamedTuple):
     """The homographies from frames to the first, and the scatter of the corners.
 
-    Attributes
-    ----------
-    homography : array, shape (f, 3, 3)
-        In pixels, the centre of the first pixel at (0, 0); NaN where a frame has none.
-    scatter_px : array, shape (k,)
-        Standard deviation of each corner along an axis.
+    Homographies are in pixels, with the centre of the first pixel at (0, 0).
     """
 
-    homography: FloatArray
-    scatter_px: FloatArray
+    homography: FloatArray  # (f, 3, 3), NaN where a frame has none
+    scatter_px: FloatArray  # (k,), standard deviation of each corner along an axis
 
 
 def register(places: FloatArray) -> Registration:
@@ -165,12 +160,9 @@ def _fitted(one: FloatArray, other: FloatArray, weight: FloatArray) -> FloatArra
     middle, size = one.mean(axis=0), one.std() + 1e-9
     (x, y), (u, v) = ((one - middle) / size).T, ((other - middle) / size).T
     zero, full = np.zeros(len(x)), np.ones(len(x))
-    rows = np.vstack(
-        [
-            np.column_stack([x, y, full, zero, zero, zero, -u * x, -u * y]),
-            np.column_stack([zero, zero, zero, x, y, full, -v * x, -v * y]),
-        ]
-    )
+    of_u = np.column_stack([x, y, full, zero, zero, zero, -u * x, -u * y])
+    of_v = np.column_stack([zero, zero, zero, x, y, full, -v * x, -v * y])
+    rows = np.vstack([of_u, of_v])
     root = np.sqrt(np.tile(weight, 2))
     found = np.linalg.lstsq(rows * root[:, None], np.concatenate([u, v]) * root, rcond=None)[0]
     scale = np.array([[size, 0.0, middle[0]], [0.0, size, middle[1]], [0.0, 0.0, 1.0]])
@@ -208,18 +200,10 @@ def median_of(
 ) -> tuple[npt.NDArray[Any], npt.NDArray[np.float32]]:
     """Return the median over registered frames and their spread about it.
 
-    Parameters
-    ----------
-    frames : array, shape (f, rows, columns, bands)
-    known : array of bool, shape (f, rows, columns)
-        Where each has pixels; the median is 0 where none has.
-
-    Returns
-    -------
-    median : array, shape (rows, columns, bands)
-        Of the frames' type.
-    spread : array, shape (rows, columns)
-        NMAD, mean over the bands; NaN where fewer than three frames are known.
+    Frames have the shape (f, rows, columns, bands); `known`, shape (f, rows, columns), is where
+    each has pixels. The median, shape (rows, columns, bands), has their type and is 0 where no
+    frame is known. The spread, shape (rows, columns), is the NMAD, mean over the bands; NaN where
+    fewer than three frames are known.
     """
     count = known.sum(axis=0)[..., None, None]
     values = frames.astype(np.float32)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any
-
 import numpy as np
 
 from pcfix.errors import SettingError
@@ -15,70 +12,50 @@ MOST_CELLS = 6_000_000
 """Of the surface for ray casting (200 bytes each); a raster with more is averaged."""
 
 
-@dataclass(frozen=True, eq=False)
 class Ground:
     """A surface of land and bed, with heights at the centres of cells.
 
-    Attributes
-    ----------
-    height_m : array, shape (rows, columns)
-        World frame, NaN where unknown; the first row is the northern one.
-    left_m, top_m : float
-        Upper left corner of the upper left cell.
-    middle : array, shape (3,)
-        Origin of the coordinates for ray casting, so that single precision is enough.
+    Coordinates for ray casting count from its `middle`, so that single precision is enough.
     """
 
-    height_m: FloatArray
-    left_m: float
-    top_m: float
-    cell_m: float
-    middle: FloatArray = field(init=False, repr=False)
-    _scene: Any = field(init=False, repr=False)
+    def __init__(self, height_m: FloatArray, left_m: float, top_m: float, cell_m: float) -> None:
+        """Build triangles from heights, shape (rows, columns), world frame, NaN where unknown.
 
-    def __post_init__(self) -> None:
-        """Build the surface of triangles."""
-        rows, columns = self.height_m.shape
-        known = np.isfinite(self.height_m)
+        The first row is the northern one; the corner is that of the upper left cell.
+        """
+        self.height_m, self.left_m, self.top_m, self.cell_m = height_m, left_m, top_m, cell_m
+        rows, columns = height_m.shape
+        known = np.isfinite(height_m)
         if min(rows, columns) < 2 or not known.any():
             raise SettingError("dsm.empty", "The DSM has fewer than two rows or no heights.")
-        x = self.left_m + (np.arange(columns) + 0.5) * self.cell_m
-        y = self.top_m - (np.arange(rows) + 0.5) * self.cell_m
-        right, low = (
-            self.left_m + 0.5 * columns * self.cell_m,
-            self.top_m - 0.5 * rows * self.cell_m,
-        )
-        middle = np.array([right, low, float(np.nanmean(self.height_m))])
-        z = np.where(known, self.height_m - middle[2], 0.0)
-        corners = np.column_stack(
-            [np.tile(x - middle[0], rows), np.repeat(y - middle[1], columns), z.ravel()]
-        ).astype(np.float32)
+        middle = left_m + 0.5 * columns * cell_m, top_m - 0.5 * rows * cell_m
+        self.middle = np.array([*middle, float(np.nanmean(height_m))])
+        x = left_m + (np.arange(columns) + 0.5) * cell_m - self.middle[0]
+        y = top_m - (np.arange(rows) + 0.5) * cell_m - self.middle[1]
+        z = np.where(known, height_m - self.middle[2], 0.0)
+        corners = np.column_stack([np.tile(x, rows), np.repeat(y, columns), z.ravel()])
         # two triangles for each square of four known heights
         whole = known[:-1, :-1] & known[:-1, 1:] & known[1:, :-1] & known[1:, 1:]
         one = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1))[whole]
         below, beside = one + columns, one + 1
         faces = np.vstack(
             [np.column_stack([one, below, beside]), np.column_stack([beside, below, below + 1])]
-        ).astype(np.uint32)
+        )
         tensor = load_open3d("open3d.core").Tensor.from_numpy
-        scene = load_open3d("open3d.t.geometry").RaycastingScene()
-        scene.add_triangles(tensor(corners), tensor(faces))
-        object.__setattr__(self, "middle", middle)
-        object.__setattr__(self, "_scene", scene)
+        self._scene = load_open3d("open3d.t.geometry").RaycastingScene()
+        self._scene.add_triangles(
+            tensor(corners.astype(np.float32)), tensor(faces.astype(np.uint32))
+        )
 
     def hit(self, origin: FloatArray, direction: FloatArray) -> FloatArray:
         """Return the distance along rays to the ground, metres; infinite where they miss it.
 
-        Parameters
-        ----------
-        origin : array, shape (n, 3) or (3,)
-            Metres, world frame.
-        direction : array, shape (n, 3)
-            Unit vectors. Distances are good to 1e-7 of themselves.
+        Origins, shape (n, 3) or (3,), are in the world frame; directions, shape (n, 3), are unit
+        vectors. Distances are good to 1e-7 of themselves.
         """
         rays = np.empty((len(direction), 6), np.float32)
         rays[:, :3], rays[:, 3:] = origin - self.middle, direction
-        return self._scene.cast_rays(rays)["t_hit"].numpy().astype(np.float64)
+        return np.asarray(self._scene.cast_rays(rays)["t_hit"].numpy(), np.float64)
 
     def heights_at(self, xy: FloatArray) -> FloatArray:
         """Interpolate heights between the centres of cells, shape (n,); NaN where unknown."""

@@ -61,20 +61,13 @@ class Scene:
 class Shifts(NamedTuple):
     """The mapping at the nodes of a grid.
 
-    Attributes
-    ----------
-    step_px : int
-        Between nodes. The first node is half a step outside the upper left corner of the image,
-        so that the nodes surround it.
-    shift_px : array of float32, shape (rows, columns, 2)
-        From the pixel to the source of its colour, in u and v; exactly 0 on land.
-    known : array of bool, shape (rows, columns)
-        Whether there is ground under the node, not occluded.
+    The first node is half a step outside the upper left corner of the image, so that the nodes
+    surround it.
     """
 
-    step_px: int
-    shift_px: FloatArray
-    known: BoolArray
+    step_px: int  # between nodes
+    shift_px: FloatArray  # (rows, columns, 2), float32, to the source of the colour; 0 on land
+    known: BoolArray  # (rows, columns), whether there is ground under the node, not occluded
 
 
 def nodes_of(lens: Lens, step_px: int) -> tuple[FloatArray, tuple[int, int]]:

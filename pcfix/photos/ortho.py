@@ -42,6 +42,25 @@ class Picture(NamedTuple):
     shrunk: int = 1
     blank: BoolArray | None = None
 
+    def is_blank(self, place: FloatArray) -> BoolArray:
+        """Return which places, shape (n, 2), have no picture."""
+        if self.blank is None:
+            return np.zeros(len(place), bool)
+        rows, columns = self.blank.shape
+        column, row = (place / self.shrunk).astype(int).T
+        return self.blank[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)]
+
+    def at(self, place: FloatArray) -> npt.NDArray[Any]:
+        """Return the pixels at places, shape (n, bands), bicubic."""
+        import cv2
+
+        n = len(place)
+        at = np.zeros((-(-n // REMAP_COLUMNS) * REMAP_COLUMNS, 2), np.float32)
+        at[:n] = place / self.shrunk - 0.5
+        u, v = (np.ascontiguousarray(one).reshape(-1, REMAP_COLUMNS) for one in at.T)
+        found = cv2.remap(self.pixels, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(found.reshape(len(at), -1)[:n])
+
 
 def picture_of(pixels: npt.NDArray[Any], shrunk: int = 1, *, blanks: bool = False) -> Picture:
     """Return an image, reduced for coarse rasters; with `blanks`, black areas have no picture."""
@@ -72,17 +91,12 @@ def blank_in(pixels: npt.NDArray[Any]) -> BoolArray:
     return np.asarray(cv2.dilate(wide, square) > 0)
 
 
-class Mosaic(NamedTuple):
-    """Colours of cells, shape (n, bands), and whether any image sees them."""
-
-    colour: FloatArray
-    covered: BoolArray
-
-
 def mosaic(
     xyz: FloatArray, photos: Sequence[Photo], scene: Scene, picture: Callable[[int], Picture]
-) -> Mosaic | None:
-    """Return the colours of places on the ground, shape (n, 3); None where no image sees any.
+) -> tuple[FloatArray, BoolArray] | None:
+    """Return the colours of places on the ground, shape (n, 3), and whether any image sees them.
+
+    Colours have the shape (n, bands); None if no image sees any place.
 
     `picture` returns the pixels of an image by its place in `photos`.
     """
@@ -101,7 +115,7 @@ def mosaic(
         for k in np.flatnonzero(wanted.any(axis=1)):
             rows = np.flatnonzero(wanted[k])
             place[k, rows], seen = seen_at(photos[near[k]], xyz[rows], scene)
-            seen[seen] = ~_is_blank(picture(near[k]), place[k, rows[seen]])
+            seen[seen] = ~picture(near[k]).is_blank(place[k, rows[seen]])
             slope[k, rows[~seen]] = np.inf
             looked[k, rows] = True
     covered = np.isfinite(best)
@@ -112,11 +126,11 @@ def mosaic(
     colour: Any = 0.0
     for k in np.flatnonzero((share > 0.0).any(axis=1)):
         rows = np.flatnonzero(share[k] > 0.0)
-        found = _colours(picture(near[k]), place[k, rows])
+        found = picture(near[k]).at(place[k, rows])
         if np.isscalar(colour):
             colour = np.zeros((len(xyz), found.shape[1]), np.float32)
         colour[rows] += share[k, rows, None] * found
-    return Mosaic(colour, covered)
+    return colour, covered
 
 
 def slope_of(photo: Photo, xyz: FloatArray) -> npt.NDArray[np.float32]:
@@ -149,24 +163,3 @@ def seen_at(photo: Photo, xyz: FloatArray, scene: Scene) -> tuple[FloatArray, Bo
     rows = np.flatnonzero(seen)
     seen[rows] = ~hidden(scene.ground, pierced[rows], xyz[rows])
     return place, seen
-
-
-def _is_blank(picture: Picture, place: FloatArray) -> BoolArray:
-    if picture.blank is None:
-        return np.zeros(len(place), bool)
-    rows, columns = picture.blank.shape
-    column = np.clip((place[:, 0] / picture.shrunk).astype(int), 0, columns - 1)
-    row = np.clip((place[:, 1] / picture.shrunk).astype(int), 0, rows - 1)
-    return np.asarray(picture.blank[row, column])
-
-
-def _colours(picture: Picture, place: FloatArray) -> npt.NDArray[Any]:
-    """Return the pixels at places, shape (n, bands), bicubic."""
-    import cv2
-
-    n = len(place)
-    at = np.zeros((-(-n // REMAP_COLUMNS) * REMAP_COLUMNS, 2), np.float32)
-    at[:n] = place / picture.shrunk - 0.5
-    u, v = (np.ascontiguousarray(one).reshape(-1, REMAP_COLUMNS) for one in at.T)
-    found = cv2.remap(picture.pixels, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(found.reshape(len(at), -1)[:n])

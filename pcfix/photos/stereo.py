@@ -31,7 +31,7 @@ SPARE_RELIEF = 0.5
 """The bed is searched this share of the range of heights below the ground."""
 BLOCK_PX = 5
 FEWEST_PAIRS = 2
-"""A cell needs so many pairs, and half of its own, within a pixel of parallax of the median."""
+"""Pairs, and half of its own, that a cell needs within a pixel of parallax of the median."""
 HALF = 1 << 31
 """Added to columns, so that those west of x = 0 do not run into the row of their number."""
 
@@ -75,8 +75,8 @@ def stereo_cloud(
     """
     low, high = np.nanquantile(ground.height_m, [0.001, 0.999])
     heights = float(low - SPARE_RELIEF * (high - low) - 1.0), float(high + 1.0)
-    pairs = pairs_of(photos, float(np.nanmedian(ground.height_m)))
-    cells, z = [], []
+    middle = float(np.nanmedian(ground.height_m))
+    pairs, cells, z = pairs_of(photos, middle), [], []
     for done, (one, other) in enumerate(pairs, start=1):
         xyz = pair_points(photos[one], photos[other], picture(one), picture(other), heights)
         own, mean = _means(xyz, cell_m)
@@ -91,7 +91,6 @@ def stereo_cloud(
             " photogrammetry package.",
             pairs=len(pairs),
         )
-    middle = float(np.nanmedian(ground.height_m))
     parallax = [
         (photo.centre[2] - middle) / (BASE_SHARES[1] * min(photo.lens.width, photo.lens.height))
         for photo in photos
@@ -138,24 +137,19 @@ def rectified(left: Photo, right: Photo, heights: tuple[float, float]) -> Rectif
     plane = [focal * one[:, :2] / one[:, 2:] for one in ahead]
     top = max(one[:, 1].min() for one in plane)
     bottom = min(one[:, 1].max() for one in plane)
-    far = []
-    for height in heights:
-        length = (left.centre[2] - height) / -corners[0][:, 2]
-        far += list(length * ahead[0][:, 2])
-    far = [one for one in far if one > 0.0]
+    lengths = [(left.centre[2] - height) / -corners[0][:, 2] for height in heights]
+    far = [one for length in lengths for one in length * ahead[0][:, 2] if one > 0.0]
     if not far or bottom - top < 8 * BLOCK_PX:
         return None
     least = int(np.floor(focal * base / max(far))) - SPARE_PX
     most = int(np.ceil(focal * base / min(far))) + SPARE_PX
     start = max(plane[0][:, 0].min(), plane[1][:, 0].min() + least)
     stop = min(plane[0][:, 0].max(), plane[1][:, 0].max() + most)
+    width, height = int(stop - start), int(bottom - top)
     disparities = -(-(most - least) // 16) * 16
-    width = int(stop - start)
     if width <= disparities + 8 * BLOCK_PX:
         return None
-    return Rectified(
-        rotation, base, focal, start, top, width, int(bottom - top), least, disparities
-    )
+    return Rectified(rotation, base, focal, start, top, width, height, least, disparities)
 
 
 def pair_points(
@@ -210,9 +204,8 @@ def _turned(photo: Photo, grey: Grey, frame: Rectified, least_px: int) -> tuple[
 def _means(xyz: FloatArray, cell_m: float) -> tuple[IntArray, FloatArray]:
     """Return the cells with points, as one number each, and their mean heights."""
     column, row = np.floor(xyz[:, :2] / cell_m).astype(np.int64).T
-    cells, inverse, counts = np.unique(
-        (row << 32) + column + HALF, return_inverse=True, return_counts=True
-    )
+    number = (row << 32) + column + HALF
+    cells, inverse, counts = np.unique(number, return_inverse=True, return_counts=True)
     return cells, np.bincount(inverse, xyz[:, 2], len(cells)) / counts
 
 
@@ -222,9 +215,8 @@ def _fused(cells: IntArray, z: FloatArray, cell_m: float, parallax_m: float) -> 
     z = z[order]
     own, first, counts = np.unique(cells[order], return_index=True, return_counts=True)
     height = 0.5 * (z[first + (counts - 1) // 2] + z[first + counts // 2])
-    agreeing = np.add.reduceat(
-        np.abs(z - np.repeat(height, counts)) <= parallax_m, first, dtype=int
-    )
+    agrees = np.abs(z - np.repeat(height, counts)) <= parallax_m
+    agreeing = np.add.reduceat(agrees, first, dtype=int)
     row = own >> 32
     column = own - (row << 32) - HALF
     xyz = np.column_stack([(column + 0.5) * cell_m, (row + 0.5) * cell_m, height])

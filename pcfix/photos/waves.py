@@ -24,7 +24,7 @@ which has no curl, needs no border condition, and ties the frames together by th
 relation (no current, no surface tension, mean depth). The waves with most energy on the dispersion
 shell of the spectrum are chosen, some at a time, and fitted by least squares to the slopes of all
 frames, weighted by the texture of the bed, with a prior of the slopes' own variance. Where the time
-between frames is not known, each frame is fitted alone.
+between frames is not known, each frame is fitted separately.
 
 The median over few frames keeps about the mean of each wave over them, and the slopes lack it. So
 each wave is fitted less its mean over the frames.
@@ -60,7 +60,7 @@ ROUNDS = 6
 LEAST_GAIN = 0.003
 """Share of the slopes' energy that a further round must explain."""
 OVER_NOISE = 8.0
-"""A wave needs so many times the mean energy of the shell."""
+"""Energy that a wave needs, in multiples of the mean of the shell."""
 STILL = 0.15
 """Share of the usual displacement below which a node is land."""
 
@@ -148,47 +148,37 @@ class Displacements:
 
     def __init__(self, median: npt.NDArray[Any], view: View, nodes: Nodes) -> None:
         cv2 = photo_library("cv2")
-        self._median, self._view, self._nodes = grey8(median), view, nodes
+        self._median, self._seen = grey8(median), nodes.seen
         texture = cv2.cornerMinEigenVal(self._median, 7).astype(np.float64)
         weight = texture / (texture + np.median(texture[texture > 0.0]) + 1e-30)
         self._weight = weight.astype(np.float32)
-        gsd = nodes.cell_m / 2.0 * np.ones(2)
         centre = np.append(nodes.xy[len(nodes.xy) // 2], view.level_m)
-        step = np.array([[-gsd[0], 0.0, 0.0], [gsd[0], 0.0, 0.0]]) + centre
-        side = int(np.hypot(*np.diff(_pixels(view, step), axis=0)[0]))
+        ends = centre + np.array([[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0]]) * nodes.cell_m
+        side = int(np.hypot(*np.diff(_pixels(view, ends), axis=0)[0]))
         self._side = (side | 1, side | 1)
         self._flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         self._flow.setFinestScale(0)  # waves are short, and patches of 8 px smooth enough
         self._base = cv2.blur(self._weight, self._side)
+        level = np.full(len(nodes.xy), view.level_m)
+        self._at = (_pixels(view, np.column_stack([nodes.xy, level])) - 0.5).astype(np.float32)
 
     def of(self, frame: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:
         """Return displacements, shape (n, 2), pixels, and weights, shape (n,), at the level."""
         cv2 = photo_library("cv2")
         flow = self._flow.calc(grey8(frame), self._median, None)
         mean = cv2.blur(flow * self._weight[..., None], self._side) / (self._base[..., None] + 1e-9)
-        height = np.full(len(self._nodes.xy), self._view.level_m)
-        at = (_pixels(self._view, np.column_stack([self._nodes.xy, height])) - 0.5).astype(
-            np.float32
-        )
+        at = self._at
         shift = cv2.remap(mean, at[:, :1], at[:, 1:], cv2.INTER_LINEAR)[:, 0]
         weight = cv2.remap(self._base, at[:, :1], at[:, 1:], cv2.INTER_LINEAR)[:, 0]
-        return shift.astype(np.float64), np.where(self._nodes.seen, weight, 0.0).astype(np.float64)
+        return shift.astype(np.float64), np.where(self._seen, weight, 0.0).astype(np.float64)
 
 
 def slopes_of(view: View, xy: FloatArray, height_m: FloatArray, shift_px: FloatArray) -> FloatArray:
     """Return the slopes of the surface that displace the bed, by Snell's law in vector form.
 
-    Parameters
-    ----------
-    xy, height_m : array, shape (n, 2) and (n,)
-        Piercing points, world frame.
-    shift_px : array, shape (n, 2)
-        From the pixel of a frame to the pixel of the median that shows the same.
-
-    Returns
-    -------
-    array, shape (n, 2)
-        dz/dx and dz/dy; NaN where the bed is unknown or not under water.
+    `xy`, (n, 2), and `height_m`, (n,), are piercing points, world frame; `shift_px`, (n, 2), leads
+    from the pixel of a frame to the pixel of the median that shows the same. Returns dz/dx and
+    dz/dy, shape (n, 2); NaN where the bed is unknown or not under water.
     """
     pierced = np.column_stack([xy, height_m])
     seen = pierced - view.photo.centre
@@ -204,26 +194,15 @@ def slopes_of(view: View, xy: FloatArray, height_m: FloatArray, shift_px: FloatA
 class Waves:
     """Plane waves and their precision.
 
-    Attributes
-    ----------
-    number : array, shape (m, 2)
-        Wave numbers k, rad/m.
-    frequency : array, shape (m,)
-        w, rad/s.
-    slope, covariance : array, shape (2 m,) and (2 m, 2 m)
-        Amplitudes of the slope (k times that of the height), cosines then sines.
-    left_over_m : float
-        Heights, rms, that correspond to the residual slopes.
-    explained : float
-        Share of the energy of the slopes.
+    Amplitudes are those of the slope (k times that of the height), cosines then sines.
     """
 
-    number: FloatArray
-    frequency: FloatArray
-    slope: FloatArray
-    covariance: FloatArray
-    left_over_m: float
-    explained: float
+    number: FloatArray  # (m, 2), wave numbers k, rad/m
+    frequency: FloatArray  # (m,), w, rad/s
+    slope: FloatArray  # (2 m,), amplitudes
+    covariance: FloatArray  # (2 m, 2 m), of these
+    left_over_m: float  # heights, rms, that correspond to the residual slopes
+    explained: float  # share of the energy of the slopes
 
     def at(self, xy: FloatArray, time_s: float) -> tuple[FloatArray, FloatArray]:
         """Return heights above the level and their standard errors, each of shape (n,)."""
@@ -255,8 +234,8 @@ def fit_waves(given: Slopes, depth_m: float) -> Waves:
     spectrum, weight = _Spectrum(given, depth_m), given.weight[..., None]
     chosen, residual = np.empty(0, np.int64), given.slope
     slope, covariance = np.empty(0), np.empty((0, 0))
-    total = max(float((weight * given.slope**2).sum()), 1e-30)
     left = float((weight * given.slope**2).sum())
+    total = max(left, 1e-30)
     for _ in range(ROUNDS):
         # those with most energy that are not chosen, well above that of white noise
         energy = spectrum.energy(residual)
@@ -266,9 +245,8 @@ def fit_waves(given: Slopes, depth_m: float) -> Waves:
         if not len(more):
             break
         chosen = np.concatenate([chosen, more])
-        slope, covariance, residual = _solved(
-            given, spectrum.number[chosen], spectrum.frequency[chosen]
-        )
+        waves = spectrum.number[chosen], spectrum.frequency[chosen]
+        slope, covariance, residual = _solved(given, *waves)
         before, left = left, float((weight * residual**2).sum())
         if before - left < LEAST_GAIN * total:
             break
@@ -337,17 +315,13 @@ class _Spectrum:
         every = np.stack(np.meshgrid(x, y), axis=2).reshape(-1, 2)
         size = np.hypot(*every.T)
         longest = 2.0 * given.cell_m * max(given.shape)
-        may = (size >= 2.0 * np.pi / longest) & (
-            size <= 2.0 * np.pi / (SHORTEST_CELLS * given.cell_m)
-        )
+        least, most = 2.0 * np.pi / longest, 2.0 * np.pi / (SHORTEST_CELLS * given.cell_m)
+        may = (size >= least) & (size <= most)
         if len(given.time_s) == 1:  # a wave and its opposite look the same
             may &= (every[:, 0] > 0.0) | ((every[:, 0] == 0.0) & (every[:, 1] > 0.0))
-        self._rows = np.flatnonzero(may)
-        self._shape = (rows, columns)
-        self.number = every[may]
-        size = size[may]
-        self._size = size
-        self.frequency = np.sqrt(GRAVITY * size * np.tanh(size * depth_m))
+        self._rows, self._shape = np.flatnonzero(may), (rows, columns)
+        self.number, self._size = every[may], size[may]
+        self.frequency = np.sqrt(GRAVITY * self._size * np.tanh(self._size * depth_m))
 
     def _transformed(self, slope: FloatArray, weight: FloatArray) -> npt.NDArray[np.complex128]:
         """Return the slope along each wave number of a frame, as its Fourier coefficient."""

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import os
-import queue
 import shutil
 import signal
 import subprocess
 import threading
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 HELP = (
     "Install pcfix into an environment (pip install pcfix), and give that environment, or its"
@@ -62,27 +62,26 @@ def run(
 ) -> None:
     """Run pcfix to its end and pass on what it prints.
 
-    Raises
-    ------
-    CommandError
-        With the last line that it printed if it fails, or if it was cancelled.
+    Raises CommandError, with the last line that it printed, if it fails or was cancelled.
     """
-    kept = {k: v for k, v in os.environ.items() if k not in ("PYTHONHOME", "PYTHONPATH")}
+    outer = {k: v for k, v in os.environ.items() if k not in ("PYTHONHOME", "PYTHONPATH")}
     try:
         process = subprocess.Popen(
             [program, *words], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT, text=True, encoding="utf-8", errors="replace",
-            env={**kept, "PCFIX_PROGRESS": "lines", "PYTHONIOENCODING": "utf-8"},
+            env={**outer, "PCFIX_PROGRESS": "lines", "PYTHONIOENCODING": "utf-8"},
         )  # fmt: skip
     except OSError as error:
         raise CommandError(f"{program} cannot be run ({error.strerror}). {HELP}") from error
+    threading.Thread(target=_watch, args=(process, is_cancelled), daemon=True).start()
     last = ""
-    for line in _lines(process, is_cancelled):
-        if line.startswith(PROGRESS):
-            percent(float(line[len(PROGRESS) :]))
-        elif line.strip():
-            last = line
-            say(line)
+    with process:
+        for line in map(str.rstrip, process.stdout or ()):
+            if line.startswith(PROGRESS):
+                percent(float(line[len(PROGRESS) :]))
+            elif line:
+                last = line
+                say(line)
     if is_cancelled():
         raise CommandError("Cancelled; unfinished output was removed.")
     if process.returncode:
@@ -91,33 +90,17 @@ def run(
         )
 
 
-def _lines(process: subprocess.Popen[str], is_cancelled: Callable[[], bool]) -> Iterator[str]:
-    """Yield the lines of a process; if cancelled it is interrupted and, after a while, killed."""
-    lines: queue.Queue[str | None] = queue.Queue()
-
-    def read(stream: IO[str]) -> None:
-        with stream:
-            for line in stream:
-                lines.put(line.rstrip())
-        lines.put(None)
-
-    threading.Thread(target=read, args=(process.stdout,), daemon=True).start()
-    while True:
+def _watch(process: subprocess.Popen[str], is_cancelled: Callable[[], bool]) -> None:
+    """Interrupt a process if it is cancelled, and kill it after a while."""
+    while process.poll() is None:
+        time.sleep(_WAIT_S)
         if is_cancelled():
             if os.name == "nt":
                 process.terminate()
             else:
                 process.send_signal(signal.SIGINT)
-            break
-        try:
-            line = lines.get(timeout=_WAIT_S)
-        except queue.Empty:
-            continue
-        if line is None:
-            break
-        yield line
-    try:
-        process.wait(_PATIENCE_S)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
+            try:
+                process.wait(_PATIENCE_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+            return

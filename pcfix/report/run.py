@@ -48,45 +48,42 @@ FIRST_FIGURES = ("water", "section_1", "depth_bins", "uncertainty", "cameras", "
 CONTRADICTS = 1.5
 """Measured and predicted errors that differ by a larger factor contradict each other."""
 SHOWN_NOTES = 3
+BESIDE_MAP = ("Submerged", "Cameras", "Water", "")
+"""Labels of the rows that are also shown beside the map."""
 UNKNOWN_DATUM = "vertical datum not known"
 
 
 @dataclass(frozen=True, eq=False)
-class Corrected:
-    """A corrected cloud and what it was corrected with."""
+class RunResults:
+    """Everything that the page of a run shows."""
 
     summary: Summary
-    survey: Survey
     cameras: Cameras
     water: WaterSurface
     maps: Maps
     depth_m: dict[str, float]  # min, mean and max of the bed's points that are not noise
     sample: FloatArray  # shape (m, 3): Z shift, depth and standard error of Z, zero where unknown
-
-
-@dataclass(frozen=True)
-class Later:
-    """What other steps of a run add to its page."""
-
-    pictures: Sequence[Picture] = ()  # the most important first
+    crs: str = ""  # of the cloud, and its vertical datum; empty if not known
+    heights: str = ""
+    project: str = ""
+    date: str = ""  # of the images
+    pictures: Sequence[Picture] = ()  # of other steps, the most important first
     tables: Sequence[Table] = ()
-    verdict: str = ""  # one sentence that they come to
+    verdict: str = ""  # one sentence on them
     compared: Plain = field(default_factory=dict)  # `Comparison.as_dict`
     difference: tuple[FloatArray, Extent] | None = None  # cloud minus reference, metres
-    resolution_m: float | None = None  # of the rasters and of the map
 
     @property
     def tvu(self) -> Plain | None:
-        """That of the bed as it was measured, where it was."""
+        """The measured uncertainty of the bed, if there was a reference."""
         return self.compared.get("tvu")
 
 
-def run_report(corrected: Corrected, inputs: Table, files: Sequence[Pair], later: Later) -> Report:
-    """Return what the page of a run says; `inputs` went in, and `files` lie beside it."""
-    s, maps, survey = corrected.summary, corrected.maps, corrected.survey
+def run_report(run: RunResults, inputs: Table, files: Sequence[Pair]) -> Report:
+    """Return the page of a run; `inputs` lists the files read, `files` those beside the page."""
+    s, depth = run.summary, run.depth_m
     versions = [["pcfix", __version__], ["Python", platform.python_version()]]
     versions += [[name, version(name)] for name in ("numpy", "scipy", "numba", "laspy", "lazrs")]
-    pictures = [*_pictures(corrected, later), *later.pictures]
     order = {name: place for place, name in enumerate(FIRST_FIGURES)}
     mean = s.shift_z_m["mean"]
     lead = (
@@ -99,56 +96,74 @@ def run_report(corrected: Corrected, inputs: Table, files: Sequence[Pair], later
             " Before that, the whole cloud was transferred to the adjusted poses, which moved it by"
             f" {s.carried['shift_m']['rms']:.2f} m (rms)."
         )
+    rows = summary_rows(s)
+    beside = [
+        ["Images", run.date or "date not stated"],
+        ["CRS", run.crs or "not stated by the cloud"],
+        ["Heights", run.heights or f"{UNKNOWN_DATUM}: the cloud states none"],
+        ["Points", f"{s.points:,}"],
+        *([label, words] for label, words in rows if label in BESIDE_MAP),
+    ]
+    notes = notes_of(s, run.heights, run.compared)
+    moved = (
+        f"{s.corrected:,} points of the bed moved {'up' if mean > 0.0 else 'down'} by"
+        f" {abs(mean):.2f} m on average."
+    )
+    depths = [
+        ("range", f"{depth['min']:.2f} to {depth['max']:.2f} m"),
+        ("mean", f"{depth['mean']:.2f} m"),
+    ]
     # the rows of the terminal, with the detected reconstruction type in words
-    facts = {"Cloud": name_of(s.input), "Points": f"{s.points:,}", **dict(summary_rows(s))}
+    facts = {"Cloud": name_of(s.input), "Points": f"{s.points:,}", **dict(rows)}
     facts |= {"Method": f"{s.made['method']}. {s.made['because']}"} if s.made else {}
-    facts |= {"Uncertainty": uncertainty_sentence(s, later.tvu)}
-    rows = [[label, words] for label, words in facts.items() if label and words]
+    facts |= {"Uncertainty": uncertainty_sentence(s, run.tvu)}
+    settings = [
+        [name.replace("_", " "), _worded(value)]
+        for name, value in s.settings.items()
+        if value not in (None, "", {}, [])
+    ]
     return Report(
-        title=survey.project or Path(name_of(s.input)).stem,
-        lead=lead + later.verdict,
-        head=head_of(s, survey),
-        tiles=tiles_of(s, survey, later.compared, corrected.depth_m),
-        warnings=notes_of(s, survey, later.compared),
-        maps=maps,
-        place=survey.place,
-        layers=_layers(maps, later),
-        pictures=sorted(pictures, key=lambda one: order.get(one.name, len(order))),
-        tables=[*later.tables, *_orders(s, later.tvu)],
+        title=run.project or Path(name_of(s.input)).stem,
+        lead=lead + run.verdict,
+        head=Table("The project", [], beside),
+        tiles=[
+            Tile("Depth", figures=depths, notes=[moved]),
+            accuracy_tile(s, run.compared),
+            Tile("Warnings", notes=notes[:SHOWN_NOTES] or ["None."]),
+        ],
+        warnings=notes,
+        maps=run.maps,
+        place=f"{run.crs or 'CRS not stated'}; heights: {run.heights or UNKNOWN_DATUM}.",
+        layers=_layers(run),
+        pictures=sorted(
+            [*_pictures(run), *run.pictures], key=lambda one: order.get(one.name, len(order))
+        ),
+        tables=[*run.tables, *_orders(s, run.tvu)],
         files=files,
         provenance=[
-            Table("In short", [], rows),
-            Table("Settings", ["setting", "value"], settings_rows(s.settings)),
+            Table("In short", [], [[label, words] for label, words in facts.items() if words]),
+            Table("Settings", ["setting", "value"], settings),
             inputs,
             Table("Software", ["name", "version"], versions),
         ],
     )
 
 
-def _layers(maps: Maps, later: Later) -> list[Layer]:
+def _layers(run: RunResults) -> list[Layer]:
     """Return the choices of the map, depth first."""
-    known = np.isfinite(maps.uncertainty_m).any()
+    maps, known = run.maps, np.isfinite(run.maps.uncertainty_m).any()
     by = "Uncertainty (95 %)" if known else ""
     layers = [Layer("Depth", "m", maps.depth_m, DEPTH, by, has_contours=True)]
     if known:
         layers.append(Layer(by, "m", maps.uncertainty_m, UNCERTAINTY))
-    if later.difference is not None:
-        values = maps.sampled(*later.difference)
+    if run.difference is not None:
+        values = maps.sampled(*run.difference)
         layers.append(Layer("Cloud minus reference", "m", values, DIFFERENCE, is_centred=True))
     return [
         *layers,
         Layer("Rays", "", maps.rays, RAYS),
         Layer("Shift in Z", "m", maps.shift_z_m),
         Layer("Height", "m", maps.height_m),
-    ]
-
-
-def settings_rows(settings: Plain) -> list[list[str]]:
-    """Return settings as a reader reads them, without those that were not set."""
-    return [
-        [name.replace("_", " "), _worded(value)]
-        for name, value in settings.items()
-        if value not in (None, "", {}, [])
     ]
 
 
@@ -162,9 +177,9 @@ def _worded(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _pictures(corrected: Corrected, later: Later) -> list[Picture]:
+def _pictures(run: RunResults) -> list[Picture]:
     """Return maps, a histogram, the cameras, and TVU over depth where there are standard errors."""
-    s, maps, depth = corrected.summary, corrected.maps, corrected.depth_m
+    s, maps, depth = run.summary, run.maps, run.depth_m
     interval = depth_interval(maps.depth_m, maps.uncertainty_m)
     shade = relief(maps.height_m, maps.cell_m)
     depths = map_figure(maps.depth_m, maps.extent_m, "Depth (m)", shade, cmap=DEPTH)
@@ -189,7 +204,7 @@ def _pictures(corrected: Corrected, later: Later) -> list[Picture]:
         Picture(
             "shift_histogram", "How far the points moved",
             "Histogram of the shift in Z of the corrected points.",
-            histogram_figure(corrected.sample[:, 0], "shift in Z", SHIFT),
+            shift_histogram(run.sample[:, 0]),
         ),
     ]  # fmt: skip
     if s.cameras:
@@ -197,10 +212,10 @@ def _pictures(corrected: Corrected, later: Later) -> list[Picture]:
             "Projection centres over the cloud, in plan and seen from the south;"
             f" {s.cameras_used} of {s.cameras} see corrected points."
         )
-        pictures.append(Picture("cameras", "Cameras", alt, cameras_figure(corrected)))
-    known = corrected.sample[:, 2] > 0.0
+        pictures.append(Picture("cameras", "Cameras", alt, cameras_figure(run)))
+    known = run.sample[:, 2] > 0.0
     if s.uncertainty is not None and known.any():
-        bins = later.compared["depth_bins"] if later.tvu else []
+        bins = run.compared["depth_bins"] if run.tvu else []
         dots = (
             " Dots: the limit that 95 % of the differences to the reference keep, its noise"
             " included."
@@ -210,30 +225,30 @@ def _pictures(corrected: Corrected, later: Later) -> list[Picture]:
             f" limits of the orders of IHO S-44. {formal_words(s)}.{dots if bins else ''}"
             " S-44 has requirements other than the TVU: position, features and coverage."
         )
-        _, depth_m, sigma_z_m = corrected.sample[known].T
+        _, depth_m, sigma_z_m = run.sample[known].T
         figure = tvu_figure(depth_m, sigma_z_m, bins)
         pictures.append(Picture("uncertainty", "Vertical uncertainty", alt, figure))
     return pictures
 
 
-def histogram_figure(values: FloatArray, name: str, label: str) -> Figure:
-    """Draw the distribution of some values, without half a percent at each end."""
+def shift_histogram(values: FloatArray) -> Figure:
+    """Draw the distribution of shifts in Z, metres, without half a percent at each end."""
     figure, axes = new_figure()
     low, high = np.percentile(values, [0.5, 99.5])
     if high <= low:
         low, high = low - 0.5, high + 0.5
-    text = f"{name}: mean {values.mean():.3f}, sd {values.std():.3f}"
+    text = f"shift in Z: mean {values.mean():.3f}, sd {values.std():.3f}"
     edges = np.linspace(low, high, 81)
     axes.hist(values, edges, density=True, color=BEFORE, alpha=0.55, label=text)
-    axes.set(xlabel=label, ylabel="Density")
+    axes.set(xlabel=SHIFT, ylabel="Density")
     axes.legend(loc="best")
     return figure
 
 
-def cameras_figure(corrected: Corrected) -> Figure:
+def cameras_figure(run: RunResults) -> Figure:
     """Draw the projection centres in plan and in profile over the cloud."""
-    maps, cameras, water = corrected.maps, corrected.cameras, corrected.water
-    used = ~np.isin(np.array(cameras.labels), corrected.summary.cameras_unused)
+    maps, cameras, water = run.maps, run.cameras, run.water
+    used = ~np.isin(np.array(cameras.labels), run.summary.cameras_unused)
     figure, (plan, profile) = new_figure(8.0, 7.0, nrows=2, height_ratios=[3, 2])
     plan.imshow(maps.height_m, extent=maps.extent_m, cmap="Greys_r", alpha=0.6)
     depth = plan.imshow(maps.depth_m, extent=maps.extent_m, cmap=DEPTH)
@@ -258,9 +273,7 @@ def cameras_figure(corrected: Corrected) -> Figure:
     return figure
 
 
-def tvu_figure(
-    depth_m: FloatArray, sigma_z_m: FloatArray, measured: Sequence[Plain] = ()
-) -> Figure:
+def tvu_figure(depth_m: FloatArray, sigma_z_m: FloatArray, measured: Sequence[Plain]) -> Figure:
     """Draw TVU at 95 % over depth, and the limits of the orders of IHO S-44 up to one above it.
 
     `measured` are the `Comparison.depth_bins` of a reference, in plain values.
@@ -308,58 +321,13 @@ def _orders(s: Summary, measured: Plain | None) -> list[Table]:
     return [Table("Orders of IHO S-44, vertical", header, rows)] if known else []
 
 
-@dataclass(frozen=True)
-class Survey:
-    """Project, date of the images, CRS, and vertical datum; empty where not known."""
-
-    project: str = ""
-    date: str = ""
-    crs: str = ""
-    heights: str = ""
-
-    @property
-    def place(self) -> str:
-        """CRS and vertical datum of the map."""
-        return f"{self.crs or 'CRS not stated'}; heights: {self.heights or UNKNOWN_DATUM}."
-
-
-def head_of(s: Summary, survey: Survey) -> Table:
-    """Return the lines beside the map."""
-    shown = ("Submerged", "Cameras", "Water", "")
-    rows = [
-        ["Images", survey.date or "date not stated"],
-        ["CRS", survey.crs or "not stated by the cloud"],
-        ["Heights", survey.heights or f"{UNKNOWN_DATUM}: the cloud states none"],
-        ["Points", f"{s.points:,}"],
-        *([label, text] for label, text in summary_rows(s) if label in shown),
-    ]
-    return Table("The project", [], rows)
-
-
 def is_found(s: Summary) -> bool:
     """Whether the water was sought in the cloud."""
     return s.water_fit is not None and s.water_fit["model"] == "auto"
 
 
-def tiles_of(s: Summary, survey: Survey, compared: Plain, depth_m: Plain) -> list[Tile]:
-    """Return the three tiles: depth (`depth_m` with min, mean and max), accuracy, notes."""
-    mean = s.shift_z_m["mean"]
-    way = "up" if mean > 0.0 else "down"
-    depths = [
-        ("range", f"{depth_m['min']:.2f} to {depth_m['max']:.2f} m"),
-        ("mean", f"{depth_m['mean']:.2f} m"),
-    ]
-    moved = f"{s.corrected:,} points of the bed moved {way} by {abs(mean):.2f} m on average."
-    notes = notes_of(s, survey, compared)[:SHOWN_NOTES] or ["None."]
-    return [
-        Tile("Depth", figures=depths, notes=[moved]),
-        accuracy_tile(s, compared),
-        Tile("Warnings", notes=notes),
-    ]
-
-
 def in_short(tiles: Sequence[Tile]) -> str:
-    """Return the figures of `tiles_of` in a line, for the terminal."""
+    """Return the figures of tiles in a line, for the terminal."""
     parts = []
     for tile in tiles:
         if tile.figures:
@@ -407,14 +375,14 @@ def accuracy_tile(s: Summary, compared: Plain) -> Tile:
     return Tile(f"Accuracy of the {of}", "measured", figures, notes)
 
 
-def notes_of(s: Summary, survey: Survey, compared: Plain) -> list[str]:
-    """Return what to check, the most important first."""
+def notes_of(s: Summary, heights: str, compared: Plain) -> list[str]:
+    """Return what to check, the most important first; `heights` is the vertical datum."""
     notes = [] if not compared.get("own") else _contradictions(s, compared)
     if not compared.get("own"):
         notes.append("No reference: the accuracy is predicted. Check points on the bed measure it.")
     if s.poses is not None and s.poses["absorbed"] is None and s.cameras:
         notes.append(f"Poses: {s.poses['words']}.")
-    if not survey.heights:
+    if not heights:
         notes.append(
             "The vertical datum is not known: water level, cloud and reference must have the same."
         )

@@ -1,6 +1,6 @@
 """The summaries of the commands, as tables of rows.
 
-A row is (label, format, needs): the format takes values by name, and the row is left out where the
+A row is (label, format, needs): the format takes values by name, and the row is omitted if the
 value that it needs is missing or zero. Terminal and report page use the same rows.
 """
 
@@ -50,6 +50,7 @@ _LABELLING: RowTable = (
     ("Pools", "{pools[points]:,} points in {pools[pools]:,} separate pools stay land; the largest,"
      " {pools[largest][area_m2]:,.1f} m2 with {pools[largest][points]:,} points, is at"
      " {pools[largest][x]:.1f}, {pools[largest][y]:.1f}", "pools"),
+    ("Pools", "none separate from the water", "no_pools"),
 )  # fmt: skip
 _CORRECTED: RowTable = (
     _PART,
@@ -249,12 +250,9 @@ def _labelling_rows(labelling: Plain | None) -> Rows:
     """Return what stays land although it lies below the surface."""
     if labelling is None:
         return []
-    pools = labelling["separate"]
-    values = labelling | {"pools": pools if pools and pools["pools"] else None}
-    rows = filled(_LABELLING, values)
-    return (
-        [*rows, ("Pools", "none separate from the water")] if pools and not pools["pools"] else rows
-    )
+    pools = labelling["separate"] or {}
+    values = {"pools": pools if pools.get("pools") else None, "no_pools": pools.get("pools") == 0}
+    return filled(_LABELLING, labelling | values)
 
 
 def share(part: int, whole: int) -> str:

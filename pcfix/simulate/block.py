@@ -68,22 +68,18 @@ def _plan(extent_m: tuple[float, float], chosen: SceneSettings) -> tuple[FloatAr
     pitch = OBLIQUE_PITCH_DEG if chosen.obliques_deg is None else chosen.obliques_deg
     back = chosen.flying_height_m * np.tan(np.radians(pitch))
     directions = chosen.oblique_directions if chosen.has_obliques else 0
-    for heading in 360.0 / max(directions, 1) * np.arange(directions):
-        away = back * np.array([np.sin(np.radians(heading)), np.cos(np.radians(heading))])
-        ring = _grid(*extent_m, *_ring_m(chosen)) - away
-        places.append(ring)
-        angles.append(np.tile([heading, pitch, 0.0], (len(ring), 1)))
-    return np.vstack(places), np.vstack(angles)
-
-
-def _ring_m(chosen: SceneSettings) -> tuple[float, float]:
-    """Return the steps of each direction's obliques along and across the strips."""
-    base, spacing = chosen.base_and_spacing_m
-    share, stretch = chosen.oblique_share, 1.0
+    share = chosen.oblique_share
+    stretch = 1.0  # of the steps of a ring
     if share is not None and share != 1.0:
         density = share / (1.0 - share) / chosen.oblique_directions
         stretch = float(np.sqrt(1.0 / (_RING_BASES * _RING_SPACINGS) / density))
-    return _RING_BASES * base * stretch, _RING_SPACINGS * spacing * stretch
+    steps = _RING_BASES * base * stretch, _RING_SPACINGS * spacing * stretch
+    for heading in 360.0 / max(directions, 1) * np.arange(directions):
+        away = back * np.array([np.sin(np.radians(heading)), np.cos(np.radians(heading))])
+        ring = _grid(*extent_m, *steps) - away
+        places.append(ring)
+        angles.append(np.tile([heading, pitch, 0.0], (len(ring), 1)))
+    return np.vstack(places), np.vstack(angles)
 
 
 def _grid(length_m: float, width_m: float, base_m: float, spacing_m: float) -> FloatArray:

@@ -31,8 +31,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.model import Cameras, FloatArray, IntArray, Lens, Views
-from pcfix.simulate.sight import Part, Partners, Sight, starts_of
+from pcfix.model import Cameras, FloatArray, IntArray, Lens
+from pcfix.simulate.sight import Part, Partners, Sight
 from pcfix.simulate.tracing import bed_points, piercing_points_of_planes, project, rotations_of
 
 AVERAGED_WITHIN = 0.012
@@ -46,25 +46,6 @@ COST_NOISE = 0.28
 
 _STEPS = 20
 _CONVERGED_M = 1e-9
-
-
-class Matching(NamedTuple):
-    """What the depths of all m references, the rows of `sight`, are found with.
-
-    `water` has an anchor and a normal for each row of `sight`, `normals` the bed's for each point.
-    Partners and neighbours are rows of `sight`, -1 for none, shape (m, c), (m, 8) and (m, 12).
-    Partner j of row i has the image noise ``noise_px[i, j]`` and the extra cost ``cost_px2[i, j]``.
-    """
-
-    sight: Sight
-    water: tuple[FloatArray, FloatArray]
-    normals: FloatArray
-    partner: IntArray
-    averaged: IntArray
-    fused: IntArray
-    known: IntArray
-    noise_px: FloatArray
-    cost_px2: FloatArray
 
 
 class Sightings(NamedTuple):
@@ -107,17 +88,16 @@ def fuse_depth_maps(
     A place with fewer than three matching depth maps is not moved and has no cameras. `normals`,
     shape (n, 3), are unit normals of the true surface; `rng` makes noise and selects points.
     """
-    matching = _matching(sight, normals, partners, rng)
+    rig, matching = sight.rig, _Matching(sight, normals, partners, rng)
     luck = rng.uniform(0.0, 1.0, len(sight.point))
     place = sight.intersected(sight.ideal)
-    maps = depth_maps(matching, place)
-    seed, group = _groups(matching, maps, luck)
+    maps = matching.maps(place)
+    seed, group = matching.groups(maps, luck)
     seeded = np.flatnonzero(seed >= 0)
     place[seeded] = maps.points(seed[seeded], maps.averaged[seed[seeded]])
-    maps = depth_maps(matching, place)
+    maps = matching.maps(place)
     rows = np.flatnonzero((group >= 0) & (group == seed[sight.point]))
     # without those whose depth is not that of their point's place
-    rig = sight.rig
     _, z = project(place[sight.point[rows]], rig.given, sight.camera[rows], rig.optics.lens)
     rows = rows[np.abs(maps.averaged[rows] - z) < AGREE * z]
     count = np.bincount(sight.point[rows], minlength=len(seed))
@@ -125,52 +105,155 @@ def fuse_depth_maps(
     point, weight = sight.point[rows], 1.0 / maps.averaged[rows] ** 2
     xyz = maps.points(rows, maps.averaged[rows])
     fused, true = (_means(v, weight, point, sight.truth) for v in (xyz, maps.shown[rows]))
-    views = Views(starts_of(point, len(fused)), sight.camera[rows], weight.astype(np.float32))
-    return Part(fused, true, views)
+    count = np.bincount(point, minlength=len(fused))
+    return Part(fused, true, sight.camera[rows], count, weight.astype(np.float32))
 
 
-def _matching(
-    sight: Sight, normals: FloatArray, partners: Partners, rng: np.random.Generator
-) -> Matching:
-    rig, rows = sight.rig, sight.rows()
+class _Matching:
+    """What the depths of all m references, the rows of `sight`, are found with.
 
-    def there(table: IntArray) -> IntArray:
-        others = table[sight.camera]
-        return np.where(others >= 0, rows[sight.point[:, None], others], -1)
+    `water` has an anchor and a normal for each row of `sight`, `normals` the bed's for each point.
+    Partners and neighbours are rows of `sight`, -1 for none, shape (m, c), (m, 8) and (m, 12).
+    Partner j of row i has the image noise ``noise_px[i, j]`` and the extra cost ``cost_px2[i, j]``.
+    """
 
-    partner = there(partners.matched)
-    partner[(partner >= 0).sum(axis=1) < LEAST_PARTNERS] = -1
-    points, centres = sight.truth[sight.point], rig.true.centres[sight.camera]
-    return Matching(
-        sight,
-        rig.water.tangent_planes(points, centres, sight.camera),
-        normals,
-        partner,
-        there(partners.averaged),
-        there(partners.fused),
-        partners.known,
-        rng.normal(0.0, rig.image_noise_px, (*partner.shape, 2)),
-        rng.gumbel(0.0, COST_NOISE * rig.image_noise_px**2, partner.shape),
-    )
+    def __init__(
+        self, sight: Sight, normals: FloatArray, partners: Partners, rng: np.random.Generator
+    ) -> None:
+        rig, row_of = sight.rig, sight.rows()
 
+        def there(table: IntArray) -> IntArray:
+            """Return the rows of the images that a table names for the image of each row."""
+            others = table[sight.camera]
+            return np.where(others >= 0, row_of[sight.point[:, None], others], -1)
 
-def depth_maps(matching: Matching, place: FloatArray) -> Maps:
-    """Return the depths of all references along their rays through a place of each point."""
-    sight, rig = matching.sight, matching.sight.rig
-    point, camera, lens = sight.point, sight.camera, rig.optics.lens
-    pixels, depth = project(place[point], rig.given, camera, lens)
-    seen = bed_points(
-        rig.true.centres[camera],
-        _rays(pixels, rig.true, camera, lens),
-        matching.water,
-        (sight.truth[point], matching.normals[point]),
-        rig.water.refractive_index,
-    )
-    origin, ray = rig.given.centres[camera], _rays(pixels, rig.given, camera, lens)
-    depth = _depths(matching, (origin, ray, depth), seen)
-    maps = Maps(origin, ray, depth, depth, seen, seen)
-    averaged, shown = _averaged(matching, maps)
-    return maps._replace(averaged=averaged, shown=shown)
+        self.sight, self.normals, self.known = sight, normals, partners.known
+        points, centres = sight.truth[sight.point], rig.true.centres[sight.camera]
+        self.water = rig.water.tangent_planes(points, centres, sight.camera)
+        self.partner = there(partners.matched)
+        self.partner[(self.partner >= 0).sum(axis=1) < LEAST_PARTNERS] = -1
+        self.averaged, self.fused = there(partners.averaged), there(partners.fused)
+        shape = self.partner.shape
+        self.noise_px = rng.normal(0.0, rig.image_noise_px, (*shape, 2))
+        self.cost_px2 = rng.gumbel(0.0, COST_NOISE * rig.image_noise_px**2, shape)
+
+    def maps(self, place: FloatArray) -> Maps:
+        """Return the depths of all references along their rays through a place of each point."""
+        sight, rig = self.sight, self.sight.rig
+        point, camera, lens = sight.point, sight.camera, rig.optics.lens
+        pixels, depth = project(place[point], rig.given, camera, lens)
+        seen = bed_points(
+            rig.true.centres[camera],
+            _rays(pixels, rig.true, camera, lens),
+            self.water,
+            (sight.truth[point], self.normals[point]),
+            rig.water.refractive_index,
+        )
+        origin, ray = rig.given.centres[camera], _rays(pixels, rig.given, camera, lens)
+        depth = self._depths((origin, ray, depth), seen)
+        maps = Maps(origin, ray, depth, depth, seen, seen)
+        averaged, shown = self._averaged(maps)
+        return maps._replace(averaged=averaged, shown=shown)
+
+    def _depths(
+        self, rays: tuple[FloatArray, FloatArray, FloatArray], seen: FloatArray
+    ) -> FloatArray:
+        """Return the depth of the best pair of partners along each ray, from a first depth."""
+        rig, (reference, slot) = self.sight.rig, np.nonzero(self.partner >= 0)
+        row = self.partner[reference, slot]
+        measured = self._measured(row, seen[reference], self.noise_px[reference, slot])
+        origin, ray, first = rays
+        camera, given, lens = self.sight.camera[row], rig.given, rig.optics.lens
+        turn = rotations_of(given)[camera]
+        sightings = Sightings(
+            reference,
+            measured,
+            np.einsum("mij,mj->im", turn, origin[reference] - given.centres[camera]),
+            np.einsum("mij,mj->im", turn, ray[reference]),
+        )
+        depth = _least_squares(first, sightings, lens)
+        depth[~(np.abs(depth - first) < MOST_OFF * first)] = np.nan  # the images agree nowhere
+        residual, slope = _residuals(depth, sightings, lens)
+        shape = self.partner.shape
+        squares, right, curved = np.full(shape, np.inf), np.zeros(shape), np.ones(shape)
+        squares[reference, slot] = (residual**2).sum(axis=1) + self.cost_px2[reference, slot]
+        right[reference, slot] = (slope * residual).sum(axis=1)
+        curved[reference, slot] = (slope**2).sum(axis=1)
+        # the pair whose sum of squares becomes least: sum - (sum of right)^2 / sum of curved
+        one, other = np.triu_indices(shape[1], 1)
+        gain = (right[:, one] + right[:, other]) ** 2 / (curved[:, one] + curved[:, other])
+        best = np.argmin(squares[:, one] + squares[:, other] - gain, axis=1)
+        taken = (one[best][reference] == slot) | (other[best][reference] == slot)
+        sightings = Sightings(
+            reference[taken], measured[taken], sightings.start[:, taken], sightings.way[:, taken]
+        )
+        depth = _least_squares(depth, sightings, lens)
+        return np.where(np.abs(depth - first) < MOST_OFF * first, depth, np.nan)
+
+    def _measured(self, row: IntArray, seen: FloatArray, noise_px: FloatArray) -> FloatArray:
+        """Return where the images of some rows of `sight` show places of the bed, ideal pixels."""
+        rig, camera = self.sight.rig, self.sight.camera[row]
+        anchors, normals = (part[row] for part in self.water)
+        centres, n = rig.true.centres[camera], rig.water.refractive_index
+        surface = piercing_points_of_planes(seen, centres, anchors, normals, n)
+        ideal, _ = project(surface, rig.true, camera, rig.optics.lens)
+        return rig.optics.to_ideal(rig.optics.to_image(ideal) + noise_px)
+
+    def _averaged(self, maps: Maps) -> tuple[FloatArray, FloatArray]:
+        """Return the mean depths of each and its neighbouring maps, and the mean places of the bed.
+
+        A depth is dropped if less than two neighbours see its place, if none agrees, or if as many
+        disagree as agree, itself among them.
+        """
+        rows = np.arange(len(maps.depth))
+        total, shown, agreeing = maps.depth.copy(), maps.seen.copy(), np.ones(len(rows))
+        disagreeing = np.zeros(len(rows))
+        normal = self.normals[self.sight.point]
+        for neighbour in self.averaged.T:
+            # where the ray meets the neighbour's map, a plane through its point parallel to the bed
+            own = np.flatnonzero(neighbour >= 0)
+            there = maps.points(neighbour[own], maps.depth[neighbour[own]])
+            gap = np.einsum("mi,mi->m", there - maps.origin[own], normal[own])
+            depth = np.full(len(rows), np.nan)
+            depth[own] = gap / np.einsum("mi,mi->m", maps.ray[own], normal[own])
+            agrees = np.abs(depth - maps.depth) < AVERAGED_WITHIN * maps.depth
+            total[agrees] += depth[agrees]
+            shown[agrees] += maps.seen[neighbour[agrees]]
+            agreeing += agrees
+            disagreeing += np.isfinite(depth) & ~agrees
+        kept = (agreeing > 1.0) & (agreeing > disagreeing) & (agreeing + disagreeing > LEAST_COVER)
+        depth = np.where(kept, total / agreeing, np.nan)
+        return depth, shown / agreeing[:, None]
+
+    def groups(self, maps: Maps, luck: FloatArray) -> tuple[IntArray, IntArray]:
+        """Return the seed of the luckiest point of each place, and the seed that used up each row.
+
+        Both are rows of `sight`, -1 where there is none.
+        """
+        sight = self.sight
+        chosen, group = np.full(len(sight.start) - 1, -1), np.full(len(sight.point), -1)
+        free = np.isfinite(maps.averaged)
+        for camera in np.argsort(-self.known, kind="stable"):
+            seeds = np.flatnonzero((sight.camera == camera) & free)
+            there = self.fused[seeds]
+            # how far beyond the points of the seeds these maps are, relative
+            at = maps.points(seeds, maps.averaged[seeds])[:, None]
+            normal = self.normals[sight.point[seeds]][:, None]
+            reach = (maps.averaged[there][..., None] * maps.ray[there] * normal).sum(axis=2)
+            distance = reach / ((at - maps.origin[there]) * normal).sum(axis=2) - 1.0
+            usable = (there >= 0) & free[there]
+            members = usable & (np.abs(distance) < AGREE)
+            kept = 1 + members.sum(axis=1) >= LEAST_FUSED
+            behind = usable & (distance >= AGREE)
+            free[there[(members | behind) & kept[:, None]]] = False
+            seeds, there, members = seeds[kept], there[kept], members[kept]
+            free[seeds] = False
+            group[seeds] = seeds
+            group[there[members]] = np.repeat(seeds, members.sum(axis=1))
+            point = sight.point[seeds]
+            luckier = (chosen[point] < 0) | (luck[seeds] > luck[chosen[point]])
+            chosen[point[luckier]] = seeds[luckier]
+        return chosen, group
 
 
 def _rays(pixels: FloatArray, cameras: Cameras, camera: IntArray, lens: Lens) -> FloatArray:
@@ -178,54 +261,6 @@ def _rays(pixels: FloatArray, cameras: Cameras, camera: IntArray, lens: Lens) ->
     plane = (pixels - [lens.principal_x, lens.principal_y]) / lens.focal
     inside = np.column_stack([plane, np.ones(len(plane))])
     return np.asarray(np.einsum("mij,mi->mj", rotations_of(cameras)[camera], inside))
-
-
-def _depths(
-    matching: Matching, rays: tuple[FloatArray, FloatArray, FloatArray], seen: FloatArray
-) -> FloatArray:
-    """Return the depth of the best pair of partners along each ray, from a first depth."""
-    rig, (reference, slot) = matching.sight.rig, np.nonzero(matching.partner >= 0)
-    row = matching.partner[reference, slot]
-    measured = _measured(matching, row, seen[reference], matching.noise_px[reference, slot])
-    origin, ray, first = rays
-    camera, given, lens = matching.sight.camera[row], rig.given, rig.optics.lens
-    turn = rotations_of(given)[camera]
-    sightings = Sightings(
-        reference,
-        measured,
-        np.einsum("mij,mj->im", turn, origin[reference] - given.centres[camera]),
-        np.einsum("mij,mj->im", turn, ray[reference]),
-    )
-    depth = _least_squares(first, sightings, lens)
-    depth[~(np.abs(depth - first) < MOST_OFF * first)] = np.nan  # the images agree nowhere
-    residual, slope = _residuals(depth, sightings, lens)
-    shape = matching.partner.shape
-    squares, right, curved = np.full(shape, np.inf), np.zeros(shape), np.ones(shape)
-    squares[reference, slot] = (residual**2).sum(axis=1) + matching.cost_px2[reference, slot]
-    right[reference, slot] = (slope * residual).sum(axis=1)
-    curved[reference, slot] = (slope**2).sum(axis=1)
-    # the pair whose sum of squares becomes least: sum - (sum of right)^2 / sum of curved
-    one, other = np.triu_indices(shape[1], 1)
-    gain = (right[:, one] + right[:, other]) ** 2 / (curved[:, one] + curved[:, other])
-    best = np.argmin(squares[:, one] + squares[:, other] - gain, axis=1)
-    taken = (one[best][reference] == slot) | (other[best][reference] == slot)
-    sightings = Sightings(
-        reference[taken], measured[taken], sightings.start[:, taken], sightings.way[:, taken]
-    )
-    depth = _least_squares(depth, sightings, lens)
-    return np.where(np.abs(depth - first) < MOST_OFF * first, depth, np.nan)
-
-
-def _measured(
-    matching: Matching, row: IntArray, seen: FloatArray, noise_px: FloatArray
-) -> FloatArray:
-    """Return where the images of some rows of `sight` show places of the bed, ideal pixels."""
-    rig, camera = matching.sight.rig, matching.sight.camera[row]
-    anchors, normals = (part[row] for part in matching.water)
-    centres, n = rig.true.centres[camera], rig.water.refractive_index
-    surface = piercing_points_of_planes(seen, centres, anchors, normals, n)
-    ideal, _ = project(surface, rig.true, camera, rig.optics.lens)
-    return rig.optics.to_ideal(rig.optics.to_image(ideal) + noise_px)
 
 
 def _least_squares(depth: FloatArray, sightings: Sightings, lens: Lens) -> FloatArray:
@@ -255,76 +290,6 @@ def _residuals(
     seen = np.column_stack([lens.focal * u + lens.principal_x, lens.focal * v + lens.principal_y])
     slope = np.column_stack([scale * (way[0] - u * way[2]), scale * (way[1] - v * way[2])])
     return sightings.measured - seen, slope
-
-
-def _averaged(matching: Matching, maps: Maps) -> tuple[FloatArray, FloatArray]:
-    """Return the mean depths of each and its neighbouring maps, and the mean places of the bed.
-
-    A depth is dropped if less than two neighbours see its place, if none agrees, or if as many
-    disagree as agree, itself among them.
-    """
-    rows = np.arange(len(maps.depth))
-    total, shown, agreeing = maps.depth.copy(), maps.seen.copy(), np.ones(len(rows))
-    disagreeing = np.zeros(len(rows))
-    for neighbour in matching.averaged.T:
-        depth = _met(matching, maps, neighbour)
-        agrees = np.abs(depth - maps.depth) < AVERAGED_WITHIN * maps.depth
-        total[agrees] += depth[agrees]
-        shown[agrees] += maps.seen[neighbour[agrees]]
-        agreeing += agrees
-        disagreeing += np.isfinite(depth) & ~agrees
-    kept = (agreeing > 1.0) & (agreeing > disagreeing) & (agreeing + disagreeing > LEAST_COVER)
-    depth = np.where(kept, total / agreeing, np.nan)
-    return depth, shown / agreeing[:, None]
-
-
-def _met(matching: Matching, maps: Maps, other: IntArray) -> FloatArray:
-    """Return at what depth each ray meets the map of another row, NaN for none.
-
-    There the other map is a plane parallel to the bed, through its own point at its depth.
-    """
-    met = np.full(len(maps.ray), np.nan)
-    rows = np.flatnonzero(other >= 0)
-    there = maps.points(other[rows], maps.depth[other[rows]])
-    normal = matching.normals[matching.sight.point[rows]]
-    gap = np.einsum("mi,mi->m", there - maps.origin[rows], normal)
-    met[rows] = gap / np.einsum("mi,mi->m", maps.ray[rows], normal)
-    return met
-
-
-def _groups(matching: Matching, maps: Maps, luck: FloatArray) -> tuple[IntArray, IntArray]:
-    """Return the seed of the luckiest point of each place, and the seed that used up each row.
-
-    Both are rows of `sight`, -1 where there is none.
-    """
-    sight = matching.sight
-    chosen, group = np.full(len(sight.start) - 1, -1), np.full(len(sight.point), -1)
-    free = np.isfinite(maps.averaged)
-    for camera in np.argsort(-matching.known, kind="stable"):
-        seeds = np.flatnonzero((sight.camera == camera) & free)
-        there = matching.fused[seeds]
-        distance = _beyond(matching, maps, seeds, there)
-        usable = (there >= 0) & free[there]
-        members = usable & (np.abs(distance) < AGREE)
-        kept = 1 + members.sum(axis=1) >= LEAST_FUSED
-        behind = usable & (distance >= AGREE)
-        free[there[(members | behind) & kept[:, None]]] = False
-        seeds, there, members = seeds[kept], there[kept], members[kept]
-        free[seeds] = False
-        group[seeds] = seeds
-        group[there[members]] = np.repeat(seeds, members.sum(axis=1))
-        point = sight.point[seeds]
-        luckier = (chosen[point] < 0) | (luck[seeds] > luck[chosen[point]])
-        chosen[point[luckier]] = seeds[luckier]
-    return chosen, group
-
-
-def _beyond(matching: Matching, maps: Maps, seeds: IntArray, there: IntArray) -> FloatArray:
-    """Return how far beyond the points of seeds the maps of other rows are, relative, (s, 12)."""
-    at = maps.points(seeds, maps.averaged[seeds])[:, None]
-    normal = matching.normals[matching.sight.point[seeds]][:, None]
-    reach = (maps.averaged[there][..., None] * maps.ray[there] * normal).sum(axis=2)
-    return np.asarray(reach / ((at - maps.origin[there]) * normal).sum(axis=2) - 1.0)
 
 
 def _means(

@@ -1,4 +1,4 @@
-"""A whole scene: ground, water, images, and the cloud that software would have made of them."""
+"""A scene: ground, water, images, and the cloud that software would reconstruct from them."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from pcfix.simulate.sight import (
     neighbour_table,
     openmvs_partners,
     see,
+    starts,
 )
 from pcfix.simulate.terrain import Terrain
 from pcfix.simulate.tracing import Water, Waves
@@ -37,48 +38,29 @@ _TRACK_PAIRS_AT_ONCE, _DENSE_PAIRS_AT_ONCE = 2_000_000, 50_000
 class Scene:
     """A simulated scene; metres, UTM.
 
-    Attributes
-    ----------
-    apparent_xyz, true_xyz : array, shape (n, 3)
-        The cloud of the SfM software, and the truth, row by row. A point in fewer than three images
-        or depth maps has no views and is not moved.
-    views : Views
-        The cameras of each point, for depth maps with weights.
-    cameras, true_cameras : Cameras
-        The given ones, with which the cloud is intersected, and those of the images; the same
-        object without pose noise.
-    lidar_xyz : array, shape (m, 3)
-        A reference cloud of the true surface with noise.
-    water_level_m : float
-        Of the mean water plane `water` in the middle of the area.
-    sensor_mm : tuple of float
-        Focal length, sensor width and height.
-    settings : dict
-        The arguments that made it.
-    neighbours : array, shape (k, c), or None
-        The images that each was matched with, -1 for none; None for a cloud of tracks.
-    pairs, pairs_start : array, shape (p, 2) and (n + 1,), or None
-        The cameras of each stereo pair of a cloud of pairs, point by point.
+    A point in fewer than three images or depth maps has no views and is not moved. The cloud is
+    intersected with `cameras`; the images were taken with `true_cameras`, the same object without
+    pose noise.
     """
 
-    apparent_xyz: FloatArray
-    true_xyz: FloatArray
-    views: Views
+    apparent_xyz: FloatArray  # (n, 3), the cloud of the SfM software
+    true_xyz: FloatArray  # (n, 3), the truth, row by row
+    views: Views  # the cameras of each point, for depth maps with weights
     cameras: Cameras
     yaw_pitch_roll_deg: FloatArray
-    lidar_xyz: FloatArray
-    water_level_m: float
+    lidar_xyz: FloatArray  # (m, 3), a reference cloud of the true surface with noise
+    water_level_m: float  # of the mean water plane `water` in the middle of the area
     refractive_index: float
     gsd_m: float
-    sensor_mm: tuple[float, float, float]
+    sensor_mm: tuple[float, float, float]  # focal length, sensor width and height
     epsg: int
-    settings: dict[str, Any]
+    settings: dict[str, Any]  # the arguments that made it
     water: WaterPlane
     true_cameras: Cameras
     true_yaw_pitch_roll_deg: FloatArray
-    neighbours: IntArray | None = None
-    pairs: IntArray | None = None
-    pairs_start: IntArray | None = None
+    neighbours: IntArray | None = None  # (k, c), images that each was matched with, -1 for none
+    pairs: IntArray | None = None  # (p, 2), cameras of the stereo pairs of all points
+    pairs_start: IntArray | None = None  # (n + 1,), where the pairs of each point begin
 
     @property
     def xyz(self) -> FloatArray:
@@ -172,14 +154,14 @@ def simulate_scene(
     lidar = points_on(terrain, round(area_m2 * chosen.lidar_per_m2), rng)
     lidar[:, 2] += rng.normal(0.0, chosen.lidar_noise_m, len(lidar))
     cameras = cameras_in_world(given.cameras)
+    columns: list[Any] = [
+        None if one[0] is None else np.concatenate(one) for one in zip(*parts, strict=True)
+    ]
+    whole = Part(*columns)
     return Scene(
-        apparent_xyz=np.vstack([part.xyz for part in parts]) + ORIGIN_M,
-        true_xyz=np.vstack([part.true_xyz for part in parts]) + ORIGIN_M,
-        views=Views(
-            _starts([part.views.start for part in parts]),
-            _joined([part.views.camera for part in parts]),
-            _joined([part.views.weight for part in parts]),
-        ),
+        apparent_xyz=whole.xyz + ORIGIN_M,
+        true_xyz=whole.true_xyz + ORIGIN_M,
+        views=Views(starts(whole.counts), whole.camera, whole.weight),
         cameras=cameras,
         yaw_pitch_roll_deg=given.yaw_pitch_roll_deg,
         lidar_xyz=lidar + ORIGIN_M,
@@ -193,20 +175,9 @@ def simulate_scene(
         true_cameras=cameras if given is flown else cameras_in_world(flown.cameras),
         true_yaw_pitch_roll_deg=flown.yaw_pitch_roll_deg,
         neighbours=partners.matched if isinstance(partners, Partners) else partners,
-        pairs=_joined([part.pairs for part in parts]),
-        pairs_start=_starts([part.pairs_start for part in parts]),
+        pairs=whole.pairs,
+        pairs_start=None if whole.pair_counts is None else starts(whole.pair_counts),
     )
-
-
-def _joined(arrays: list[Any]) -> Any:
-    """Return the arrays of all parts in one; None if they have none."""
-    return None if arrays[0] is None else np.concatenate(arrays)
-
-
-def _starts(arrays: list[Any]) -> Any:
-    """Return where the rows of each point of all parts begin."""
-    counts = _joined([None if one is None else np.diff(one) for one in arrays])
-    return None if counts is None else np.concatenate([[0], np.cumsum(counts)])
 
 
 class Site(NamedTuple):
@@ -221,7 +192,12 @@ class Site(NamedTuple):
 
 def lay_out(chosen: SceneSettings) -> Site:
     """Return ground and block of a scene, in local coordinates."""
-    streams, extent = Streams.of(chosen.seed), _extent(chosen)
+    streams, extent = Streams.of(chosen.seed), chosen.area_m
+    if chosen.cameras is not None:  # the area that about this number of nadir images covers
+        (length, width), (base, spacing) = extent, chosen.base_and_spacing_m
+        side = float(np.sqrt(chosen.cameras * base * spacing * length / width))
+        across = chosen.cameras * base * spacing / side - 1.5 * spacing
+        extent = max(side - 1.5 * base, base), max(across, spacing / 2.0)
     plane = chosen.water_plane(extent)
     terrain = Terrain.random(chosen.bed, extent, plane, chosen.depth_m, streams.main)
     flown = fly_block(extent, chosen, streams.main)
@@ -237,17 +213,6 @@ def lay_out(chosen: SceneSettings) -> Site:
         chosen.detection,
     )  # fmt: skip
     return Site(terrain, flown, given, rig, streams)
-
-
-def _extent(chosen: SceneSettings) -> tuple[float, float]:
-    """Return length and width of the area that about so many nadir images cover."""
-    length, width = chosen.area_m
-    if chosen.cameras is None:
-        return length, width
-    base, spacing = chosen.base_and_spacing_m
-    side = float(np.sqrt(chosen.cameras * base * spacing * length / width))
-    reach = max(side - 1.5 * base, base)
-    return reach, max(chosen.cameras * base * spacing / side - 1.5 * spacing, spacing / 2.0)
 
 
 def points_on(terrain: Terrain, count: int, rng: np.random.Generator) -> FloatArray:
@@ -277,7 +242,7 @@ def _observe(truth: FloatArray, site: Site, partners: Partners | IntArray | None
     sight = see(truth, rig, streams.detection)
     if partners is None:
         apparent = sight.intersected(rig.observed(sight.ideal, streams.main))
-        return Part(apparent, truth, Views(sight.start, sight.camera))
+        return Part(apparent, truth, sight.camera, np.diff(sight.start))
     if isinstance(partners, Partners):
         normals = site.terrain.normals(*truth[:, :2].T)
         return fuse_depth_maps(sight, normals, partners, streams.matching)

@@ -38,12 +38,12 @@ class SceneSettings(SceneOptions):
                 pixel_um=[1000 * side for side in pitch],
             )
         if self.flying_height_m <= 0.5 * self.depth_m:
+            heights = {"flying_height_m": self.flying_height_m, "depth_m": self.depth_m}
             raise SettingError(
                 "scene.too_low",
                 f"Flying height {self.flying_height_m:g} m is not more than half the greatest depth"
                 f" {self.depth_m:g} m. Fly higher or give a smaller greatest depth.",
-                flying_height_m=self.flying_height_m,
-                depth_m=self.depth_m,
+                **heights,
             )
         if rise > 0.25 * self.flying_height_m:
             raise SettingError(
@@ -53,19 +53,11 @@ class SceneSettings(SceneOptions):
                 tilt_percent=100 * self.water_tilt,
             )
         if self.neighbours is not None and self.cloud == "tracks":
-            raise SettingError(
-                "option.no_use",
-                "neighbours is for clouds of pairs and depth maps. Give one of those, or leave it"
-                " out.",
-                option="neighbours",
-            )
+            sentence = "neighbours is only for clouds of pairs and depth maps. Leave it out."
+            raise SettingError("option.no_use", sentence, option="neighbours")
         if self.oblique_share is not None and not self.has_obliques:
-            raise SettingError(
-                "option.no_use",
-                f"oblique share {self.oblique_share:g} needs obliques. Give the block oblique, or"
-                " their angle.",
-                option="oblique_share",
-            )
+            sentence = f"oblique share {self.oblique_share:g} needs obliques. Give their angle."
+            raise SettingError("option.no_use", sentence, option="oblique_share")
 
     @property
     def has_obliques(self) -> bool:

@@ -8,20 +8,25 @@ measures it anew in both images, and the point is the median of the intersection
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.model import Cameras, FloatArray, IntArray, Views
+from pcfix.model import Cameras, FloatArray, IntArray
 from pcfix.simulate.optics import Optics
 from pcfix.simulate.tracing import Water, project, rotations_of, triangulate
 
 LEAST_VIEWS = 3
 
 
+def starts(counts: IntArray) -> IntArray:
+    """Return where the rows of each point begin, and the end, from their numbers."""
+    return np.concatenate([[0], np.cumsum(counts)])
+
+
 def starts_of(point: IntArray, count: int) -> IntArray:
-    """Return where the rows of each of `count` points begin, and the end, where rows are sorted."""
-    return np.concatenate([[0], np.cumsum(np.bincount(point, minlength=count))])
+    """Return the same from the point of each row, sorted; there are `count` points."""
+    return starts(np.bincount(point, minlength=count))
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,15 +142,18 @@ LEAST_SCORE = 0.03
 class Part(NamedTuple):
     """Some points of a cloud, shape (n, 3), the true points, and the images of each.
 
-    In a cloud of pairs, point i has the rows ``pairs_start[i]`` to ``pairs_start[i + 1]`` of
-    `pairs`, shape (p, 2), the lower camera first.
+    `camera` lists the images of all points in turn, and `counts`, shape (n,), how many each has;
+    `weight` are their weights. In a cloud of pairs `pairs`, shape (p, 2), and `pair_counts` do
+    the same for the stereo pairs, the lower camera first.
     """
 
     xyz: FloatArray
     true_xyz: FloatArray
-    views: Views
+    camera: IntArray
+    counts: IntArray
+    weight: Any = None
     pairs: IntArray | None = None
-    pairs_start: IntArray | None = None
+    pair_counts: IntArray | None = None
 
 
 class Partners(NamedTuple):
@@ -289,6 +297,6 @@ def match_pairs(sight: Sight, table: IntArray, rng: np.random.Generator) -> Part
         xyz[paired, axis] = (ordered[low[paired]] + ordered[high[paired]]) / 2.0
     used = np.zeros(len(sight.point), bool)
     used[both] = True
-    views = Views(starts_of(sight.point[used], len(truth)), sight.camera[used])
+    count = np.bincount(sight.point[used], minlength=len(truth))
     pairs = np.column_stack([sight.camera[one], sight.camera[other]])
-    return Part(xyz, truth, views, pairs, start)
+    return Part(xyz, truth, sight.camera[used], count, None, pairs, np.diff(start))

@@ -170,7 +170,7 @@ def triangulate(
 
 
 _COMPONENTS = 8
-"""Sinusoids of a field; with so many, slopes are nearly normally distributed."""
+"""Sinusoids of a field: enough that slopes are nearly normally distributed."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -217,7 +217,6 @@ def test_refused_files(tmp_path: Path) -> None:
         (SettingError, (good, tmp_path / "there.las"), {}),
         (SettingError, (good, tmp_path / "out.txt"), {}),
         (SettingError, (good, out), {"jobs": 0}),
-        (SettingError, (good, out), {"tile_m": 0.0}),
     ]:
         with pytest.raises(kind):
             clean_file(*files, **options)

@@ -40,9 +40,9 @@ def _pairs(xyz: np.ndarray, axes: int) -> np.ndarray:
     return np.sqrt((apart**2).sum(axis=-1))
 
 
-def _statistics(xyz: np.ndarray, tile_m: float) -> np.ndarray:
+def _statistics(xyz: np.ndarray, points: int) -> np.ndarray:
     """Mean distance in space, lower and upper quartile of heights, of every point."""
-    cut = make_tiles(xyz, tile_m=tile_m)
+    cut = make_tiles(xyz, points=points)
     near, plan, out = Neighbours(cut, 3), Neighbours(cut, 2), np.empty((len(xyz), 3))
     for piece in cut.pieces(100):
         some = cut.xyz[piece]
@@ -60,32 +60,33 @@ def test_statistics_of_all_pairs(make) -> None:
     twin_quartiles = np.array(
         [np.percentile(xyz[plan[i] <= far[i] * (1 + 1e-9), 2], (25, 75)) for i in range(len(xyz))]
     )
-    whole = _statistics(xyz, 1e9)
+    whole = _statistics(xyz, 1_000_000)
     # rounding of sums of a dozen distances
     np.testing.assert_allclose(whole[:, 0], twin_mean, rtol=1e-13)
     np.testing.assert_allclose(whole[:, 1:], twin_quartiles, rtol=0, atol=1e-12)
-    for tile_m in (0.5, 3.0, 7.3, 25.0):
-        assert np.array_equal(_statistics(xyz, tile_m), whole)
+    for points in (2, 20, 90, 400):
+        assert np.array_equal(_statistics(xyz, points), whole)
 
 
 def test_tiles_hold_every_point(monkeypatch: pytest.MonkeyPatch) -> None:
     xyz = _clustered()
     used = np.random.default_rng(1).random(len(xyz)) < 0.7
-    cut = make_tiles(xyz, used, 4.0)
+    cut = make_tiles(xyz, used, 10)
     assert len(cut) > 20
     assert np.array_equal(np.sort(cut.row), np.flatnonzero(used))
     assert np.array_equal(cut.xyz, xyz[cut.row])
     assert (np.diff(cut.start) > 0).all()
     monkeypatch.setattr("pcfix.blocks.ROWS", 77)
-    assert np.array_equal(make_tiles(xyz, used, 4.0).row, cut.row)
+    assert np.array_equal(make_tiles(xyz, used, 10).row, cut.row)
 
 
-@pytest.mark.parametrize("tile_m", mostly_nightly([8.0, 31.0, 400.0], 8.0))
-def test_tiles_do_not_matter(tile_m: float) -> None:
+@pytest.mark.parametrize("points", mostly_nightly([100, 1000, 5000], 100))
+def test_tiles_do_not_matter(points: int, monkeypatch: pytest.MonkeyPatch) -> None:
     s = spoilt_scene(FEW, OUTLIERS)
     settings = CleanRules(deviations=2.0, radius=1.0)
     whole = clean_points(s.xyz, water=s.water_level_m, settings=settings)
-    cut = clean_points(s.xyz, water=s.water_level_m, settings=settings, tile_m=tile_m, jobs=1)
+    monkeypatch.setattr("pcfix.clean.neighbours.POINTS_PER_TILE", points)
+    cut = clean_points(s.xyz, water=s.water_level_m, settings=settings, jobs=1)
     assert np.array_equal(cut, whole)
     for reason in (Reason.STATISTICAL, Reason.RADIUS, Reason.BELOW_BED, Reason.FLOATING):
         assert (whole & reason).any()
@@ -108,6 +109,6 @@ def test_outliers_of_open3d(test: str, rules: dict, arguments: tuple) -> None:
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(xyz))
     _, kept = getattr(cloud, f"remove_{test}_outlier")(*arguments)
     settings = CleanRules(**rules, below=None, floating=None)
-    found = clean_points(xyz, settings=settings, tile_m=20.0)
+    found = clean_points(xyz, settings=settings)
     assert np.array_equal(np.flatnonzero(found == 0), np.asarray(kept))
     assert len(kept) < len(xyz)

@@ -39,7 +39,7 @@ def tiles_in(folder):
     return sorted(folder.glob("*.la[sz]"))
 
 
-@pytest.mark.parametrize("more", [{}, {"drop": True}, {"water": 0.37, "radius": 2.0, "tile_m": 30}])
+@pytest.mark.parametrize("more", [{}, {"drop": True}, {"water": 0.37, "radius": 2.0}])
 def test_cleaned(more, scene, tmp_path):
     one = pcfix.clean_file(scene / "cloud" / "merged.laz", tmp_path / "one.las", **MANY, **more)
     done = []

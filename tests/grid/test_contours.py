@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pcfix.grid.contours import contours, depth_interval, interval_of
+from pcfix.grid.contours import contours, depth_interval
 
 pytestmark = pytest.mark.quick
 
@@ -26,16 +26,11 @@ def test_rings_of_a_cone():
     assert contours(np.full((5, 5), np.nan), 1.0) == []
 
 
-@pytest.mark.parametrize(
-    ("height", "least", "expected"),
-    [(12.0, 0.0, 1.0), (1.0, 0.0, 0.1), (1.0, 0.3, 0.5), (80, 0, 10)],
-)
-def test_interval(height, least, expected):
-    assert interval_of(height, least) == pytest.approx(expected)
-
-
 def test_depth_interval():
     depth, unknown = np.array([[0.0, 1.0], [np.nan, 12.0]]), np.array([np.nan, 1.5, 1.5])
     assert depth_interval(depth, np.zeros(0)) == 1.0
+    assert depth_interval(np.array([1.0]), np.zeros(0)) == pytest.approx(0.1)
+    assert depth_interval(np.array([1.0]), np.array([0.3])) == pytest.approx(0.5)
+    assert depth_interval(np.array([80.0]), np.zeros(0)) == 10.0
     assert depth_interval(depth, unknown) == 2.0
     assert depth_interval(np.full((2, 2), np.nan), unknown) == 2.0

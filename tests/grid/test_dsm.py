@@ -40,7 +40,7 @@ SIZES = {
     "chunks": {"CHUNK_POINTS": 700},
     "squares": {"BIN_POINTS": 90},
     "windows": {"BLOCK_CELLS": 16, "BIN_POINTS": 300},
-    "all": {"CHUNK_POINTS": 1234, "BIN_POINTS": 40, "BLOCK_CELLS": 32, "BLOCK_POINTS": 100},
+    "all": {"CHUNK_POINTS": 1234, "BIN_POINTS": 40, "BLOCK_CELLS": 32, "WINDOW_POINTS": 100},
 }
 
 
@@ -64,7 +64,6 @@ def test_no_seams(awkward_cloud, tmp_path, monkeypatch, method, fill):
                 for module in (source, flow):
                     if hasattr(module, key):
                         patch.setattr(module, key, value)
-            patch.setattr(flow, "TIN_BLOCK_POINTS", sizes.get("BLOCK_POINTS", 400_000))
             parts = run(name)
         for one, other in zip(whole, parts, strict=True):
             np.testing.assert_array_equal(one, other, err_msg=name)
