@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Iterable
 from pathlib import Path
@@ -32,12 +31,9 @@ FILES = {
 
 OTHERS = {
     "fused.ply.vis": "the cameras of each point of the cloud, row by row, in COLMAP's layout",
-    "dense.ply": "the cloud with the cameras of each point and their weights, in OpenMVS's layout",
     "true_cameras.csv": "the true poses of the images",
-    "neighbours.csv": "label of each image and of those it was matched with, best first",
-    "pairs.npz": "start and pairs: point i has the stereo pairs start[i] to start[i + 1]",
 }
-"""Files of some scenes; the view list is one of the first two, for depth maps the second."""
+"""Files of some scenes."""
 
 _FINE_GSD_M = 0.005  # clouds of finer images get steps of 0.1 mm
 
@@ -48,24 +44,11 @@ def write_scene(scene: Scene, out_dir: File, *, overwrite: bool) -> None:
     contents = {
         "sensor.csv": _sensor_csv(scene),
         "cameras.csv": _cameras_csv(scene.cameras, scene.yaw_pitch_roll_deg),
+        "fused.ply.vis": colmap_vis(scene.views),
     }
-    if scene.views.weight is None:
-        contents["fused.ply.vis"] = colmap_vis(scene.views)
-    else:
-        contents["dense.ply"] = openmvs_ply(scene.apparent_xyz, scene.views)
     if scene.true_cameras is not scene.cameras:
         true = _cameras_csv(scene.true_cameras, scene.true_yaw_pitch_roll_deg)
         contents["true_cameras.csv"] = true
-    if scene.neighbours is not None:
-        labels = scene.cameras.labels
-        head = ["label", *(f"neighbour_{i + 1}" for i in range(scene.neighbours.shape[1]))]
-        rows = zip(labels, scene.neighbours, strict=True)
-        listed = ([one, *(labels[i] if i >= 0 else "" for i in row)] for one, row in rows)
-        contents["neighbours.csv"] = _csv(head, listed)
-    if scene.pairs is not None and scene.pairs_start is not None:
-        arrays = io.BytesIO()
-        np.savez_compressed(arrays, start=scene.pairs_start, pairs=scene.pairs)
-        contents["pairs.npz"] = arrays.getvalue()
     files = FILES | {name: text for name, text in OTHERS.items() if name in contents}
     plane = scene.water
     tilted = f"plane:{plane.a!r},{plane.b!r},{plane.c!r}"
@@ -101,34 +84,6 @@ def colmap_vis(views: Views) -> bytes:
     counts = np.diff(views.start)
     words = np.insert(views.camera.astype("<u4"), views.start[:-1], counts)
     return len(counts).to_bytes(8, "little") + words.tobytes()
-
-
-def openmvs_ply(xyz: FloatArray, views: Views) -> bytes:
-    """Return a cloud in the layout of OpenMVS's dense PLY, positions in double precision.
-
-    Lists longer than 255 have a count of four bytes. The views must have weights.
-    """
-    lengths = np.diff(views.start)
-    name, kind = ("uchar", "u1") if lengths.max(initial=0) < 256 else ("uint", "<u4")
-    places, counts = xyz.astype("<f8"), lengths.astype(kind)
-    cameras, weights = views.camera.astype("<u4"), np.asarray(views.weight, "<f4")
-    rows = [
-        place.tobytes() + count.tobytes() + cameras[one:end].tobytes() + count.tobytes()
-        + weights[one:end].tobytes()
-        for place, count, one, end in zip(
-            places, counts, views.start[:-1], views.start[1:], strict=True
-        )
-    ]  # fmt: skip
-    head = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"element vertex {len(xyz)}",
-        *(f"property double {axis}" for axis in "xyz"),
-        f"property list {name} uint view_indices",
-        f"property list {name} float view_weights",
-        "end_header",
-    ]
-    return ("\n".join(head) + "\n").encode() + b"".join(rows)
 
 
 def _sensor_csv(scene: Scene) -> bytes:

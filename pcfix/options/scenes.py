@@ -85,12 +85,8 @@ class SceneCloudOptions(OptionSet, panel=Panel.CLOUDS):
 
     points: int = option(100_000, basic=True, least=1)
     """Points of the cloud."""
-    cloud: Literal["tracks", "pairs", "depth-maps"] = option("tracks", basic=True)
-    """Reconstruction type: tracks, the median of stereo pairs, or fused depth maps."""
     detection: float = option(1.0, least=0.01, most=1)
     """Probability that an image that shows a point contributes to it; at least three do."""
-    neighbours: int | None = option(None, least=1, most=20)
-    """Images with which each is matched. [default: pairs 4, depth-maps 5]"""
     lidar_per_m2: float = option(2.0, least=0, most=10_000)
     """Points of the LiDAR per m2."""
     lidar_noise_m: float = option(0.05, least=0, most=10)

@@ -12,40 +12,29 @@ from pcfix.model import Cameras, FloatArray, IntArray, Views, WaterPlane
 from pcfix.options.declare import taken
 from pcfix.options.scenes import SceneOptions
 from pcfix.simulate.block import Block, fly_block, misplaced
-from pcfix.simulate.depth_maps import fuse_depth_maps
 from pcfix.simulate.settings import SceneSettings
-from pcfix.simulate.sight import (
-    SAMPLE,
-    TIES,
-    Part,
-    Partners,
-    Rig,
-    match_pairs,
-    neighbour_table,
-    openmvs_partners,
-    see,
-    starts,
-)
+from pcfix.simulate.sight import Rig, see, starts
 from pcfix.simulate.terrain import Terrain
 from pcfix.simulate.tracing import Water, Waves
 
 ORIGIN_M = np.array([410_200.0, 4_650_300.0, 0.0])  # in UTM zone 33 north
 EPSG = 32633
-_TRACK_PAIRS_AT_ONCE, _DENSE_PAIRS_AT_ONCE = 2_000_000, 50_000
+PAIRS_AT_ONCE = 2_000_000
+"""Points times images that are traced at once, which bounds the memory."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
     """A simulated scene; metres, UTM.
 
-    A point in fewer than three images or depth maps has no views and is not moved. The cloud is
+    A point in fewer than three images has no views and is not moved. The cloud is
     intersected with `cameras`; the images were taken with `true_cameras`, the same object without
     pose noise.
     """
 
     apparent_xyz: FloatArray  # (n, 3), the cloud of the SfM software
     true_xyz: FloatArray  # (n, 3), the truth, row by row
-    views: Views  # the cameras of each point, for depth maps with weights
+    views: Views  # the cameras of each point
     cameras: Cameras
     yaw_pitch_roll_deg: FloatArray
     lidar_xyz: FloatArray  # (m, 3), a reference cloud of the true surface with noise
@@ -58,9 +47,6 @@ class Scene:
     water: WaterPlane
     true_cameras: Cameras
     true_yaw_pitch_roll_deg: FloatArray
-    neighbours: IntArray | None = None  # (k, c), images that each was matched with, -1 for none
-    pairs: IntArray | None = None  # (p, 2), cameras of the stereo pairs of all points
-    pairs_start: IntArray | None = None  # (n + 1,), where the pairs of each point begin
 
     @property
     def xyz(self) -> FloatArray:
@@ -131,23 +117,45 @@ def simulate_scene(
     Examples
     --------
     >>> import pcfix
-    >>> scene = pcfix.simulate_scene(500, bed="flat", flying_height_m=60, cloud="pairs")
-    >>> scene.pairs.shape[1]
-    2
+    >>> scene = pcfix.simulate_scene(500, bed="flat", flying_height_m=60)
+    >>> scene.apparent_xyz.shape
+    (500, 3)
     """
     if points is not None:
         keywords["points"] = points
     chosen = taken(SceneOptions, options, keywords, "simulate_scene").part(SceneSettings)
     site = lay_out(chosen)
+    truth = points_on(site.terrain, chosen.points, site.streams.main)
+    return scene_of(chosen, site, truth, observe_tracks, PAIRS_AT_ONCE, progress)
+
+
+class Part(NamedTuple):
+    """Some points of a cloud, and the images of each.
+
+    `camera` lists the images of all points in turn.
+    """
+
+    xyz: FloatArray  # (n, 3)
+    true_xyz: FloatArray  # (n, 3)
+    camera: IntArray  # (m,)
+    counts: IntArray  # (n,), images of each point
+    weight: Any = None  # (m,), of each image
+
+
+def scene_of(
+    chosen: SceneSettings,
+    site: Site,
+    truth: FloatArray,
+    observe: Callable[[FloatArray, Site], Part],
+    pairs_at_once: int,
+    progress: Callable[[int, int], None] | None = None,
+) -> Scene:
+    """Return the scene of a site; `observe` reconstructs the cloud of some true points, (n, 3)."""
     terrain, flown, given, rng = site.terrain, site.flown, site.given, site.streams.main
-    truth = points_on(terrain, chosen.points, rng)
-    partners = _partners(chosen, truth, site)
-    # parts of bounded memory
-    pairs = _TRACK_PAIRS_AT_ONCE if partners is None else _DENSE_PAIRS_AT_ONCE
-    at_once = max(1, pairs // len(flown.cameras))
-    parts: list[Part] = []
+    parts = list[Part]()
+    at_once = max(1, pairs_at_once // len(flown.cameras))
     for first in range(0, len(truth), at_once):
-        parts.append(_observe(truth[first : first + at_once], site, partners))
+        parts.append(observe(truth[first : first + at_once], site))
         if progress is not None:
             progress(min(first + at_once, len(truth)), len(truth))
     area_m2 = terrain.length_m * terrain.width_m
@@ -174,9 +182,6 @@ def simulate_scene(
         water=plane_in_world(terrain.water),
         true_cameras=cameras if given is flown else cameras_in_world(flown.cameras),
         true_yaw_pitch_roll_deg=flown.yaw_pitch_roll_deg,
-        neighbours=partners.matched if isinstance(partners, Partners) else partners,
-        pairs=whole.pairs,
-        pairs_start=None if whole.pair_counts is None else starts(whole.pair_counts),
     )
 
 
@@ -222,31 +227,11 @@ def points_on(terrain: Terrain, count: int, rng: np.random.Generator) -> FloatAr
     return np.column_stack([plan, terrain.height(*plan.T)])
 
 
-def _partners(chosen: SceneSettings, truth: FloatArray, site: Site) -> Partners | IntArray | None:
-    """Return the images that each is matched with, as the kind of cloud needs them."""
-    if chosen.cloud == "tracks":
-        return None
-    rig, rng = site.rig, np.random.default_rng(0)
-    sure = replace(rig, detection=1.0)
-    if chosen.cloud == "pairs":
-        sample = truth[:: max(1, len(truth) // SAMPLE)][:SAMPLE]
-        return neighbour_table(see(sample, sure, rng), chosen.matched_with)
-    sample = points_on(site.terrain, max(TIES, 10 * len(rig.true)), rng)
-    every = see(sample, sure, rng)
-    return openmvs_partners(every.intersected(every.ideal), every, chosen.matched_with, rng)
-
-
-def _observe(truth: FloatArray, site: Site, partners: Partners | IntArray | None) -> Part:
-    """Return the cloud of some points."""
-    rig, streams = site.rig, site.streams
-    sight = see(truth, rig, streams.detection)
-    if partners is None:
-        apparent = sight.intersected(rig.observed(sight.ideal, streams.main))
-        return Part(apparent, truth, sight.camera, np.diff(sight.start))
-    if isinstance(partners, Partners):
-        normals = site.terrain.normals(*truth[:, :2].T)
-        return fuse_depth_maps(sight, normals, partners, streams.matching)
-    return match_pairs(sight, partners, streams.matching)
+def observe_tracks(truth: FloatArray, site: Site) -> Part:
+    """Intersect each point from all images that show it."""
+    sight = see(truth, site.rig, site.streams.detection)
+    apparent = sight.intersected(site.rig.observed(sight.ideal, site.streams.main))
+    return Part(apparent, truth, sight.camera, np.diff(sight.start))
 
 
 def cameras_in_world(cameras: Cameras) -> Cameras:

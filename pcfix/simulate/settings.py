@@ -15,7 +15,6 @@ from pcfix.simulate.terrain import BEDS
 from pcfix.water.index import index_of
 
 RIVER_TILT_PERCENT = 0.3
-_NEIGHBOURS = {"tracks": 0, "pairs": 4, "depth-maps": 5}
 
 
 class SceneSettings(SceneOptions):
@@ -52,9 +51,6 @@ class SceneSettings(SceneOptions):
                 f" too much for a flight at {self.flying_height_m:g} m. Give a smaller one.",
                 tilt_percent=100 * self.water_tilt,
             )
-        if self.neighbours is not None and self.cloud == "tracks":
-            sentence = "neighbours is only for clouds of pairs and depth maps. Leave it out."
-            raise SettingError("option.no_use", sentence, option="neighbours")
         if self.oblique_share is not None and not self.has_obliques:
             sentence = f"oblique share {self.oblique_share:g} needs obliques. Give their angle."
             raise SettingError("option.no_use", sentence, option="oblique_share")
@@ -76,11 +72,6 @@ class SceneSettings(SceneOptions):
         if self.tilt_percent is None:
             return RIVER_TILT_PERCENT / 100.0 if self.bed == "river" else 0.0
         return self.tilt_percent / 100.0
-
-    @property
-    def matched_with(self) -> int:
-        """How many images each is matched with."""
-        return _NEIGHBOURS[self.cloud] if self.neighbours is None else self.neighbours
 
     @cached_property
     def optics(self) -> Optics:

@@ -48,6 +48,7 @@ from pcfix.model import Views, WaterPlane
 from pcfix.options.correct import BudgetOptions, ScienceOptions
 from pcfix.simulate.tracing import piercing_points_of_planes, project
 from pcfix.water.surface import surface_above
+from tests.utils.matchers import matched_scene
 from tests.utils.shared import needs
 
 if TYPE_CHECKING:
@@ -112,7 +113,7 @@ class Case:
 
 def simulated(name: str, points: int, seed: int) -> Case:
     """Simulate a scene of `SETTINGS`."""
-    scene = pcfix.simulate_scene(points, seed=seed, **SETTINGS[name])
+    scene = matched_scene(points, seed=seed, **SETTINGS[name])
     kind = "depth-maps" if name == "depth-maps" else "tracks"
     known: dict[str, dict[str, Any]] = {"views": {"views": replace(scene.views, kind=kind)}}
     mvs = {"camera_set": "mvs"}

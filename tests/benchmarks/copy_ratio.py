@@ -81,10 +81,14 @@ def parsed(about):
 
 def make(cloud, arguments):
     """Simulate in a process of its own: what this one holds would count as its children's."""
-    folder, words = cloud.parent, ["--overwrite"]
-    for name in ("points", "cameras", "cloud"):
-        words += [f"--{name}", getattr(arguments, name)]
-    run([sys.executable, "-m", "pcfix", "simulate", folder, *words])
+    folder = cloud.parent
+    given = f"{arguments.points}, cameras={arguments.cameras}, cloud={arguments.cloud!r}"
+    script = (
+        "from pcfix.io.scenes import write_scene\n"
+        "from tests.utils.matchers import matched_scene\n"
+        f"write_scene(matched_scene({given}), {str(folder)!r}, overwrite=True)"
+    )
+    run([sys.executable, "-c", script])
     (folder / "cloud.laz").rename(cloud)
     (folder / "cameras.csv").rename(camera_table(cloud))
 

@@ -17,9 +17,9 @@ from pcfix.refract.batch import Batch, Survey
 from pcfix.refract.learning import CORRECTED_RATIO, depth_ratio, learn_of_sample
 from pcfix.refract.patches import grid_m
 from pcfix.refract.reconstructions import IN_FRAME, hint_of
-from pcfix.simulate.scene import simulate_scene
 from pcfix.water.surface import surface_above
 from tests.io.test_views import write_ply, write_vis
+from tests.utils.matchers import matched_scene
 from tests.utils.nightly import mostly_nightly
 
 BLOCK = {"seed": 1, "lidar_per_m2": 0.0}
@@ -28,7 +28,7 @@ OBLIQUE = {**BLOCK, "bed": "shore", "obliques_deg": 35.0, "detection": 0.5}
 
 @cache
 def scene_of(cloud="tracks", points=12_000, **settings):
-    return simulate_scene(points, cloud=cloud, **{**BLOCK, **settings})
+    return matched_scene(points, cloud=cloud, **{**BLOCK, **settings})
 
 
 def wet(scene):

@@ -16,6 +16,7 @@ from pyproj import CRS
 import pcfix
 from pcfix.flow.tiles import in_processes
 from tests.utils.codes import refused
+from tests.utils.matchers import matched_scene
 from tests.utils.nightly import mostly_nightly
 from tests.utils.program import run_pcfix
 from tests.utils.tiles import SCENE, cut, finished, records, write
@@ -74,10 +75,10 @@ def test_tiles_and_jobs(count, jobs, tmp_path):
 def test_view_list(tmp_path):
     from pcfix.io.scenes import write_scene
 
-    write_scene(pcfix.simulate_scene(3000, cloud="depth-maps"), tmp_path / "s", overwrite=False)
+    write_scene(matched_scene(3000, cloud="depth-maps"), tmp_path / "s", overwrite=False)
     folder, merged = cut(tmp_path / "tiles", 2, cloud=tmp_path / "s" / "cloud.laz")
     given = {"cameras": tmp_path / "s" / "cameras.csv", "water": 0.37}
-    given["views"] = tmp_path / "s" / "dense.ply"
+    given["views"] = tmp_path / "s" / "fused.ply.vis"
     one = pcfix.correct_file(merged, tmp_path / "merged.las", **given)
     many = pcfix.correct_file(folder, tmp_path / "out", **given)
     assert many.made == one.made

@@ -13,9 +13,9 @@ from pcfix.refract.batch import Learned
 from pcfix.refract.learning import weigh_lists
 from pcfix.refract.matcher import matcher_of
 from pcfix.refract.patches import FEWEST_POINTS
-from pcfix.simulate.scene import simulate_scene
 from pcfix.water.surface import surface_above
 from tests.utils.batches import batch_of
+from tests.utils.matchers import matched_scene
 from tests.utils.nightly import mostly_nightly
 from tests.utils.shared import needs
 
@@ -31,7 +31,7 @@ def kind_of(xyz, cameras, water, views, n=1.34):
 
 
 def under_water(cloud, points=1200, **settings):
-    scene = simulate_scene(points, cloud=cloud, lidar_per_m2=0.0, **settings)
+    scene = matched_scene(points, cloud=cloud, lidar_per_m2=0.0, **settings)
     return scene, np.flatnonzero(scene.depth_m(scene.xyz) > 0.0)
 
 

@@ -16,11 +16,11 @@ from pcfix.refract.depth_maps import _compare, best_pairs, sight_of
 from pcfix.refract.map_table import Block
 from pcfix.refract.matcher import WIDTH_M, Bed, Matcher, bed_of
 from pcfix.refract.methods import correct
-from pcfix.simulate.scene import simulate_scene
 from pcfix.water.surface import surface_above
 from tests.utils.batches import batch_of
 from tests.utils.compiled import compiled
 from tests.utils.depth_map_twin import LENS, costs_of, fused_slowly, looking, on_bed, slow_depth
+from tests.utils.matchers import matched_scene
 from tests.utils.nightly import mostly_nightly
 from tests.utils.shared import needs
 
@@ -210,7 +210,7 @@ SCENES = {
 
 @lru_cache
 def scene_of(name):
-    return simulate_scene(1500, **FLAT, **SCENES[name])
+    return matched_scene(1500, **FLAT, **SCENES[name])
 
 
 def errors_gsd(name, **choices):

@@ -9,8 +9,8 @@ import pcfix
 from pcfix.io.cameras import read_tie_points
 from pcfix.model import TiePoints, Views
 from pcfix.refract.matcher import REPEATED_DEG, matcher_of, matcher_of_ties
-from pcfix.simulate.scene import simulate_scene
 from tests.utils.depth_map_twin import in_frame, looking, scores_slowly
+from tests.utils.matchers import matched_scene
 from tests.utils.shared import needs
 
 RENDERED, rendered = needs("rendered_a")
@@ -59,7 +59,7 @@ def test_partners_of_ties():
 def test_simulated_partners(obliques):
     """The simulator has the formula of its own, for features that are found again by chance."""
     area = {"area_m": (70.0, 50.0), "lidar_per_m2": 0.0}
-    scene = simulate_scene(600, cloud="depth-maps", **area, **obliques)
+    scene = matched_scene(600, cloud="depth-maps", **area, **obliques)
     found = matcher_of(scene.cameras, scene.xyz).matched
     partners = {i: [j for j in row if j >= 0] for i, row in enumerate(scene.neighbours.tolist())}
     assert share_found(found, partners) > 0.85  # 0.95 and 0.92 of larger blocks with more points

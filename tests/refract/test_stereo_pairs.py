@@ -15,12 +15,12 @@ from pcfix.refract.intersect import intersect
 from pcfix.refract.matcher import matcher_of
 from pcfix.refract.methods import correct
 from pcfix.refract.stereo_pairs import invert_pairs
-from pcfix.simulate.scene import simulate_scene
 from pcfix.water.surface import surface_above
 from tests.utils.batches import batch_of
 from tests.utils.codes import warned
 from tests.utils.consistent_twin import seen_through_water, triangulated_straight
 from tests.utils.depth_map_twin import LENS, looking
+from tests.utils.matchers import matched_scene
 from tests.utils.nightly import mostly_nightly
 
 N_WATER = 1.34
@@ -38,7 +38,7 @@ SCENES = {
 
 @lru_cache
 def scene_of(name, noise_px, points=1500):
-    return simulate_scene(points, cloud="pairs", image_noise=noise_px, **SCENES[name])
+    return matched_scene(points, cloud="pairs", image_noise=noise_px, **SCENES[name])
 
 
 def under_water(scene):

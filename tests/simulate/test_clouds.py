@@ -11,6 +11,7 @@ from scipy.optimize import least_squares
 
 import pcfix
 from pcfix.simulate.scene import ORIGIN_M
+from tests.utils.matchers import matched_scene
 from tests.utils.twins import light_path
 
 KINDS = ("tracks", "pairs", "depth-maps")
@@ -28,9 +29,7 @@ MICROMETRE = 1e-6
     ],
 )
 def test_truth_without_refraction(kind, more):
-    scene = pcfix.simulate_scene(
-        150, cloud=kind, index=1.0, image_noise=0.0, lidar_per_m2=0.1, **more
-    )
+    scene = matched_scene(150, cloud=kind, index=1.0, image_noise=0.0, lidar_per_m2=0.1, **more)
     assert np.diff(scene.views.start).mean() > 3
     assert scene.xyz == pytest.approx(scene.true_xyz, abs=MICROMETRE)
 
@@ -91,7 +90,7 @@ def test_tracks_twin():
 
 
 def test_pairs_twin():
-    scene = pcfix.simulate_scene(60, cloud="pairs", image_noise=0.0, tilt_percent=1.0, **POSES)
+    scene = matched_scene(60, cloud="pairs", image_noise=0.0, tilt_percent=1.0, **POSES)
     twin = Twin(scene)
     for i in (5, 33, 59):
         pairs = scene.pairs[scene.pairs_start[i] : scene.pairs_start[i + 1]]
@@ -107,7 +106,7 @@ def test_pairs_twin():
 
 
 def test_depth_maps():
-    scene = pcfix.simulate_scene(400, cloud="depth-maps", image_noise=0.3, obliques_deg=25.0)
+    scene = matched_scene(400, cloud="depth-maps", image_noise=0.3, obliques_deg=25.0)
     made = np.diff(scene.views.start) > 0
     assert made.mean() > 0.95
     assert scene.views.weight.min() > 0.0
@@ -122,7 +121,7 @@ def test_depth_maps():
 
 
 def test_neighbours():
-    scene = pcfix.simulate_scene(300, cloud="depth-maps", forward_overlap=0.9)
+    scene = matched_scene(300, cloud="depth-maps", forward_overlap=0.9)
     best = scene.neighbours[:, 0]
     assert (best >= 0).all()
     centres = scene.true_cameras.centres

@@ -7,19 +7,17 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.io.scenes import FILES, OTHERS, colmap_vis, openmvs_ply, write_scene
+from pcfix.io.scenes import FILES, OTHERS, colmap_vis, write_scene
 from pcfix.io.views import read_views
 from pcfix.model import Views
 from tests.utils.program import run_pcfix
 
-KINDS = ("tracks", "pairs", "depth-maps")
 
-
-@pytest.fixture(scope="module", params=KINDS)
-def written(request, tmp_path_factory):
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene")
     scene = pcfix.simulate_scene(
-        300, cloud=request.param, tilt_percent=0.7, position_noise_m=0.02, lidar_per_m2=0.2,
+        300, tilt_percent=0.7, position_noise_m=0.02, lidar_per_m2=0.2,
         distortion=(-0.05, 0.02, -0.003, 0.0006, -0.0004),
     )  # fmt: skip
     write_scene(scene, folder, overwrite=False)
@@ -49,33 +47,15 @@ def test_cameras(written):
         assert read.lenses[0].focal == cameras.lenses[0].focal
 
 
-def test_pairs(written):
-    scene, folder = written
-    if scene.neighbours is not None:
-        rows = (folder / "neighbours.csv").read_text().splitlines()
-        assert len(rows) == len(scene.cameras) + 1
-        best = scene.cameras.labels[scene.neighbours[0, 0]]
-        assert rows[1].split(",")[:2] == [scene.cameras.labels[0], best]
-    if scene.pairs is not None:
-        arrays = np.load(folder / "pairs.npz")
-        assert np.array_equal(arrays["pairs"], scene.pairs)
-        assert np.array_equal(arrays["start"], scene.pairs_start)
-
-
-@pytest.mark.parametrize("longest", [3, 300])
-def test_view_lists(tmp_path, longest):
-    counts = np.array([0, longest, 2, 0])
-    camera = np.concatenate([np.arange(longest), [4, 1]])
-    weight = np.linspace(0.1, 1, longest + 2).astype(np.float32)
-    views = Views(np.concatenate([[0], np.cumsum(counts)]), camera, weight)
-    xyz = np.arange(12.0).reshape(4, 3) + 0.123456789
+def test_view_lists(tmp_path):
+    counts = np.array([0, 300, 2, 0])
+    camera = np.concatenate([np.arange(300), [4, 1]])
+    views = Views(np.concatenate([[0], np.cumsum(counts)]), camera)
     cameras = pcfix.Cameras(tuple(map(str, range(300))), np.zeros((300, 3)))
-    (tmp_path / "dense.ply").write_bytes(openmvs_ply(xyz, views))
     (tmp_path / "other.vis").write_bytes(colmap_vis(views))
-    for name in ("dense.ply", "other.vis"):
-        raw = read_views(tmp_path / name, cameras)
-        assert np.array_equal(raw.start, views.start)
-        assert np.array_equal(raw.image, camera)
+    raw = read_views(tmp_path / "other.vis", cameras)
+    assert np.array_equal(raw.start, views.start)
+    assert np.array_equal(raw.image, camera)
 
 
 def test_flume_step(tmp_path):
@@ -87,7 +67,7 @@ def test_flume_step(tmp_path):
 
 
 def test_command(tmp_path):
-    words = "--points 150 --obliques-deg 35 --area-m 60 40 --bed river --cloud pairs --quiet"
+    words = "--points 150 --obliques-deg 35 --area-m 60 40 --bed river --quiet"
     words += " --wave-slope-deg 1.5 --distortion -0.03 0 0 0 0 --lidar-per-m2 0.5"
     done = run_pcfix("simulate", tmp_path, *words.split())
     assert done.returncode == 0, done.stderr

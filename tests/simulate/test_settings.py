@@ -18,7 +18,6 @@ FEW = {"points": 200, "lidar_per_m2": 0.2}
         ("scene.distortion", {"distortion": (-0.9, 0, 0, 0, 0)}),
         ("scene.tilt", {"tilt_percent": 19.0, "area_m": (500, 80)}),
         ("option.no_use", {"oblique_share": 0.5}),
-        ("option.no_use", {"neighbours": 5}),
     ],
 )
 def test_contradictory(code, arguments):

@@ -2,6 +2,6 @@
 
 from functools import lru_cache
 
-from pcfix.simulate.scene import simulate_scene
+from tests.utils.matchers import matched_scene
 
-simulated = lru_cache(maxsize=8)(simulate_scene)
+simulated = lru_cache(maxsize=8)(matched_scene)

@@ -32,8 +32,10 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.model import Cameras, FloatArray, IntArray, Lens
-from pcfix.simulate.sight import Part, Partners, Sight
+from pcfix.simulate.scene import Part
+from pcfix.simulate.sight import Sight
 from pcfix.simulate.tracing import bed_points, piercing_points_of_planes, project, rotations_of
+from tests.utils.matchers.pairs import Partners
 
 AVERAGED_WITHIN = 0.012
 AGREE = 0.01

@@ -1,0 +1,64 @@
+"""Scenes whose clouds were made by simulated dense matchers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pcfix.simulate.scene import Part, Scene, lay_out, points_on, scene_of, simulate_scene
+from pcfix.simulate.settings import SceneSettings
+from pcfix.simulate.sight import see, starts
+from tests.utils.matchers.depth_maps import fuse_depth_maps
+from tests.utils.matchers.pairs import SAMPLE, TIES, match_pairs, neighbour_table, openmvs_partners
+
+NEIGHBOURS = {"pairs": 4, "depth-maps": 5}
+"""Images with which each is matched."""
+PAIRS_AT_ONCE = 50_000
+
+
+@dataclass(frozen=True, eq=False)
+class MatchedScene(Scene):
+    """A scene with the images that each image was matched with, shape (k, c), -1 for none.
+
+    In a cloud of pairs, point i has the stereo pairs ``pairs[pairs_start[i]:pairs_start[i + 1]]``.
+    """
+
+    neighbours: np.ndarray | None = None
+    pairs: np.ndarray | None = None
+    pairs_start: np.ndarray | None = None
+
+
+def matched_scene(points: int, *, cloud: str = "tracks", **keywords) -> Scene:
+    """Simulate a scene as `pcfix.simulate_scene`, with a cloud of tracks, pairs or depth-maps."""
+    if cloud == "tracks":
+        return MatchedScene(**vars(simulate_scene(points, **keywords)))
+    chosen = SceneSettings(points=points, **keywords)
+    site, count = lay_out(chosen), NEIGHBOURS[cloud]
+    truth = points_on(site.terrain, points, site.streams.main)
+    rig, rng, matching = site.rig, np.random.default_rng(0), site.streams.matching
+    sure, pairs, counts = replace(rig, detection=1.0), [], []
+    if cloud == "pairs":
+        sample = truth[:: max(1, len(truth) // SAMPLE)][:SAMPLE]
+        table = neighbour_table(see(sample, sure, rng), count)
+    else:
+        sample = points_on(site.terrain, max(TIES, 10 * len(rig.true)), rng)
+        every = see(sample, sure, rng)
+        partners = openmvs_partners(every.intersected(every.ideal), every, count, rng)
+        table = partners.matched
+
+    def observe(some, site) -> Part:
+        sight = see(some, rig, site.streams.detection)
+        if cloud == "depth-maps":
+            normals = site.terrain.normals(*some[:, :2].T)
+            return fuse_depth_maps(sight, normals, partners, matching)
+        part, of_part, count_of = match_pairs(sight, table, matching)
+        pairs.append(of_part)
+        counts.append(count_of)
+        return part
+
+    scene = vars(scene_of(chosen, site, truth, observe, PAIRS_AT_ONCE))
+    if cloud == "depth-maps":
+        return MatchedScene(**scene, neighbours=table)
+    start = starts(np.concatenate(counts))
+    return MatchedScene(**scene, neighbours=table, pairs=np.concatenate(pairs), pairs_start=start)
