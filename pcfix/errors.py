@@ -27,7 +27,7 @@ class CodedError(Exception):
     """
 
     def __init__(self, code: str, message: object, **values: Any) -> None:
-        self.code, self.message, self.values = code, brief(str(message)), values
+        self.code, self.message, self.values = code, str(message), values
         super().__init__(code, self.message)
 
     def __str__(self) -> str:
@@ -84,20 +84,8 @@ def _plain(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
-MOST_LETTERS, LONGEST_VALUE, LONGEST_NAME = 800, 60, 255
+MOST_LETTERS = 800
 _LIST = re.compile(r"\n(?=  )")
-_UNBROKEN = re.compile(rf"[^\s,/\\'\":;()]{{{LONGEST_VALUE + 1},}}")
-_FILE_NAME = re.compile(r"\.\w{1,6}$")
-
-
-def brief(message: str) -> str:
-    """Shorten every unbroken value to 60 characters, and every file name to 255."""
-
-    def shortened(match: re.Match[str]) -> str:
-        is_name = len(match[0]) <= LONGEST_NAME and _FILE_NAME.search(match[0])
-        return match[0] if is_name else match[0][: LONGEST_VALUE - 3] + "..."
-
-    return _UNBROKEN.sub(shortened, message)
 
 
 def printable(message: str) -> str:

@@ -15,7 +15,7 @@ from cyclopts import App, CycloptsError
 
 import pcfix.cli.commands  # noqa: F401 (fills COMMANDS)
 from pcfix.cli.flags import COMMANDS, UsageError
-from pcfix.errors import PcfixError, brief, refusal, show_warning
+from pcfix.errors import PcfixError, printable, refusal, show_warning
 from pcfix.version import __version__
 
 
@@ -98,5 +98,5 @@ def _end_by_signals() -> None:
 
 
 def _stop(sentence: str, code: int) -> None:
-    sys.stderr.write(f"pcfix: {brief(sentence)}\n")
+    sys.stderr.write(f"pcfix: {printable(sentence)}\n")
     sys.exit(code)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pcfix.errors import InputError, brief
+from pcfix.errors import InputError
 from pcfix.io.files import check_input, check_output
 from tests.utils.clouds import WATER_M, write_cloud
 from tests.utils.codes import refused
@@ -111,7 +111,7 @@ def test_not_a_file(odd, kind, place):
     words, code = PLACES[place]
     done = refused_command(odd, *words(KINDS[kind]))
     assert done.code == OTHERS.get((kind, place), code), done.stderr
-    assert LONG[:61] not in done.stderr
+    assert len(done.stderr) < 900
     assert stat.S_ISFIFO((odd / "pipe").stat().st_mode)
 
 
@@ -164,15 +164,7 @@ def test_files_that_may_not_be_read(closed, name):
             os.seteuid(0)
 
 
-def test_values_are_cut_and_names_of_files_are_not():
-    name = "CA502_ReDateTime_reprocess_calibrated_external_camera_parameters_wgs84.txt"
-    assert brief(f"/long/{name}: line 2: '{LONG}' is no number") == (
-        f"/long/{name}: line 2: '{LONG[:57]}...' is no number"
-    )
-    assert str(InputError("x.y", f"index {LONG}, or {LONG}: no")) == (
-        f"index {LONG[:57]}..., or {LONG[:57]}...: no"
-    )
-    columns = ",".join(f"Column{i}=float" for i in range(20))  # what the user is to give
-    assert brief(f'give "{columns}"') == f'give "{columns}"'
-    command = f"run: 'pip install -e {'/a' * 80}[photos]'"
-    assert brief(command) == command
+def test_long_value():
+    shown = str(InputError("x.y", f"/long/name.txt: '{'9' * 5000}' is no number. Give one."))
+    assert len(shown) < 800
+    assert shown.startswith("/long/name.txt: '999") and shown.endswith("9' is no number. Give one.")
