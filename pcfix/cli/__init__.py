@@ -52,13 +52,13 @@ def main(tokens: Sequence[str] | None = None) -> None:
         _run(arguments)
     except (CycloptsError, UsageError) as error:
         words = ["pcfix", *(one for one in arguments[:1] if one in COMMANDS), "--help"]
-        _stop(f"{error}\nTry '{' '.join(words)}'.", 2)
+        _stop(f"{printable(str(error))}\nTry '{' '.join(words)}'.", 2)
     except PcfixError as error:
         _stop(str(error), 1)
     except UnicodeEncodeError as error:
         if error.encoding != "utf-8" or "\n" in error.object:
             raise
-        _stop(f"{error.object}: the name is not in UTF-8. Rename the file.", 1)
+        _stop(printable(f"{error.object}: the name is not in UTF-8. Rename the file."), 1)
     except _EndedError as end:
         _stop("stopped.", 128 + end.args[0])
     except KeyboardInterrupt as stop:
@@ -68,7 +68,7 @@ def main(tokens: Sequence[str] | None = None) -> None:
     except OSError as error:
         if error.filename is None:
             raise
-        _stop(f"{error.filename}: {refusal(error)}.", 1)
+        _stop(printable(f"{error.filename}: {refusal(error)}."), 1)
 
 
 def _run(arguments: list[str]) -> None:
@@ -98,5 +98,5 @@ def _end_by_signals() -> None:
 
 
 def _stop(sentence: str, code: int) -> None:
-    sys.stderr.write(f"pcfix: {printable(sentence)}\n")
+    sys.stderr.write(f"pcfix: {sentence}\n")
     sys.exit(code)
