@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 FloatArray: TypeAlias = npt.NDArray[np.float64]
 SingleArray: TypeAlias = npt.NDArray[Any]
-"""Of float32, whose numbers are taken for float by those who check types."""
+"""An array of float32, whose numbers type checkers take for float."""
 IntArray: TypeAlias = npt.NDArray[np.int64]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 
@@ -136,21 +136,11 @@ class Lens:
 
 @dataclass(frozen=True, eq=False)
 class GnssPositions:
-    """GNSS positions of the projection centres.
+    """GNSS positions of the projection centres of k images."""
 
-    Attributes
-    ----------
-    xyz : array, shape (k, 3)
-        One row per camera, NaN where there is none, in `crs`.
-    sigma_m : array, shape (k, 3)
-        Stated standard deviation east, north, up in metres, NaN where none is stated.
-    crs : str or None
-        Of `xyz`, with the order of axes x (east, longitude), y (north, latitude), z.
-    """
-
-    xyz: FloatArray
-    sigma_m: FloatArray
-    crs: str | None
+    xyz: FloatArray  # (k, 3), in `crs`, NaN if unknown
+    sigma_m: FloatArray  # (k, 3), stated standard deviations east, north, up; NaN if unknown
+    crs: str | None  # axes in the order east or longitude, north or latitude, height
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,9 +168,9 @@ class Cameras:
         The CRS in which the software delivers its clouds, where that is not `crs`.
     gnss : GnssPositions or None
     unposed : tuple of str
-        Images without a pose, which are left out.
+        Images without a pose, which are excluded.
     notes : tuple of PcfixWarning
-        What was done on reading, for the summary.
+        Notes of the reader, for the summary.
     source : str
         The software and its version.
     """
@@ -219,7 +209,7 @@ class Cameras:
 
 
 NO_CAMERAS = Cameras((), np.zeros((0, 3)))
-"""Of a correction that looks at none; see `MethodOptions.check_no_cameras`."""
+"""For a correction without cameras; see `MethodOptions.check_no_cameras`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -353,66 +343,32 @@ class Views:
 
 @dataclass(frozen=True, eq=False)
 class TiePoints:
-    """The m points of a sparse model and where the images saw them.
+    """The m points of a sparse model, and their o image points."""
 
-    Attributes
-    ----------
-    xyz : array, shape (m, 3)
-        In the frame of the cameras that were read with them; NaN where the source has none.
-    views : Views
-        Which cameras saw each point.
-    image_xy : array, shape (o, 2)
-        Where, one row per entry of ``views.camera``: in the unit of the lens, usually pixels,
-        from the upper left corner of the image.
-    """
-
-    xyz: FloatArray
-    views: Views
-    image_xy: FloatArray
+    xyz: FloatArray  # (m, 3), in the frame of the cameras that were read with them; NaN if unknown
+    views: Views  # the cameras that observed each point
+    image_xy: FloatArray  # (o, 2), in the unit of the lens from the upper left corner, as `views`
 
 
 @dataclass(frozen=True, eq=False)
 class GroundControl:
-    """Surveyed points and where the images show them.
+    """The m surveyed points, and their o image points.
 
-    Attributes
-    ----------
-    names : tuple of str, length m
-    xyz : array, shape (m, 3)
-        Surveyed coordinates, metres, in `crs`.
-    sigma_m : array, shape (m, 3)
-        Their standard deviations along x, y, z.
-    is_check : array of bool, shape (m,)
-        Check points, which an adjustment does not use.
-    under_water : array of bool, shape (m,)
-        Points under water, according to the survey.
-    point, camera : array of int, shape (o,)
-        Row of `names` and row of the cameras of each measurement in an image.
-    image_xy : array, shape (o, 2)
-        Image coordinates in the unit of the lens, from the upper left corner.
-    sigma_px : array, shape (o,)
-        Standard deviations of u and v.
-    crs : str or None
-        None if the source does not say.
-    on : tuple of str, length m or 0
-        The surface of each point: ``water``, the name of a plane, or empty. Points on a surface may
-        have no coordinates: NaN, and infinite standard deviations.
-    on_sigma_m : array, shape (m,) or (0,)
-        Standard deviation of their distance from it.
+    A point on a surface (``on``) may have no coordinates: NaN, and infinite standard deviations.
     """
 
     names: tuple[str, ...]
-    xyz: FloatArray
-    sigma_m: FloatArray
-    is_check: BoolArray
-    under_water: BoolArray
-    point: IntArray
-    camera: IntArray
-    image_xy: FloatArray
-    sigma_px: FloatArray
-    crs: str | None = None
-    on: tuple[str, ...] = ()
-    on_sigma_m: FloatArray = field(default_factory=lambda: np.zeros(0))
+    xyz: FloatArray  # (m, 3), metres, in `crs`
+    sigma_m: FloatArray  # (m, 3), standard deviations along x, y, z
+    is_check: BoolArray  # (m,), check points, which an adjustment does not use
+    under_water: BoolArray  # (m,), according to the survey
+    point: IntArray  # (o,), row of `names`
+    camera: IntArray  # (o,), row of the cameras
+    image_xy: FloatArray  # (o, 2), in the unit of the lens, from the upper left corner
+    sigma_px: FloatArray  # (o,), standard deviations of u and v
+    crs: str | None = None  # None if the source does not say
+    on: tuple[str, ...] = ()  # surface of each point, if any: ``water``, name of a plane, or empty
+    on_sigma_m: FloatArray = field(default_factory=lambda: np.zeros(0))  # of the distance from it
 
     @property
     def surveyed(self) -> GroundControl:
@@ -444,13 +400,13 @@ class Outcome(IntEnum):
     ONE_CAMERA = 3
     PARALLEL_RAYS = 4
     NOT_CARRIED = 5
-    """Under water or not, it could not be taken from the old cameras to adjusted ones."""
+    """It could not be transferred to the adjusted cameras."""
     FLAT_RAYS = 6
     """Two cameras or more see it, but fewer than two within the largest angle."""
 
 
 PART_POINTS = 32_768
-"""Of a result, that `Correction.parts` takes at a time: an array of them has 256 kB."""
+"""Points of each of `Correction.parts`: an array of them has 256 kB."""
 
 
 @dataclass(frozen=True, eq=False)
