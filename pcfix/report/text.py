@@ -168,10 +168,10 @@ def summary_rows(s: Summary) -> Rows:
     """Return the facts of a correction, for the terminal and the report page."""
     fit, made, index = s.water_fit or {}, s.made, s.settings["index"]
     method = str(s.settings["method"])
-    if made is not None and "made_of" in made:
+    if made is not None and made.get("made_of", "") not in ("", method):
         sure = "detected" if made["sure"] else "detected, not certain"
         method = f"{made['method']}, {made['made_of']} ({sure})"
-    elif made is not None:
+    elif made is not None and "made_of" not in made:
         method = f"{made['method']}. {made['because']}"
     check = ""
     if s.fit is not None and s.cameras:
