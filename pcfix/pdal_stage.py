@@ -25,6 +25,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import numpy as np
@@ -44,7 +45,6 @@ if TYPE_CHECKING:
 Stage: TypeAlias = Callable[[Dimensions, Dimensions], bool]
 Work: TypeAlias = Callable[[dict[str, Any], Dimensions, Dimensions], None]
 
-_WORD = {str: "a text", float: "a number", int: "a whole number", bool: "true or false"}
 COLOURS = ("Red", "Green", "Blue")
 
 
@@ -237,26 +237,18 @@ def _missing(name: str) -> SettingError:
 
 
 def _converted(one: Option, value: Any) -> Any:
-    """Convert a value of JSON to the type of the option; numbers may be text."""
-    if one.default == () and one.parse is None:  # may be repeated on the command line
-        texts = value if isinstance(value, list) else [value]
-        if all(isinstance(text, str) for text in texts):
-            return tuple(texts)
-    kinds = one.plain_kinds
-    for kind in kinds:
-        if isinstance(value, kind) and (kind is bool or not isinstance(value, bool)):
-            return str(value) if kind is int and one.parse is not None else value
-        if kind in (int, float) and isinstance(value, int | float | str):
-            try:
-                number = float(value)
-            except ValueError:
-                continue
-            if isinstance(value, bool) or (kind is int and not number.is_integer()):
-                continue
-            return kind(number)
-    words = " or ".join(_WORD[kind] for kind in kinds)
-    sentence = f"pdalargs: {one.name} must be {words}, not {json.dumps(value)}."
-    raise SettingError("option.type", sentence, option=one.name, value=value)
+    """Return a value of JSON as the options take it: numbers may be text, one of several alone."""
+    if one.repeats and not isinstance(value, list):
+        return (value,)
+    if isinstance(value, str) and one.parse is None and {int, float} & {*one.kinds}:
+        with suppress(ValueError):
+            return float(value)
+    if isinstance(value, int | float) and isinstance(one.default, tuple):
+        return str(value)
+    if one.type is Any and isinstance(value, list | dict | bool):
+        sentence = f"pdalargs: {one.name} must be a text or a number, not {json.dumps(value)}."
+        raise SettingError("option.type", sentence, option=one.name, value=value)
+    return value
 
 
 def _slices(n: int) -> Iterator[slice]:

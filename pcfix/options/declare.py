@@ -144,15 +144,6 @@ class Option(NamedTuple):
         """Whether it may be given several times on the command line."""
         return self.default == () and self.parse is None
 
-    @property
-    def plain_kinds(self) -> tuple[type, ...]:
-        """The types that its value may have in JSON, in the order in which they are tried."""
-        if self.parse is not None:
-            return (float, str) if float in self.kinds else (str, int)
-        if self.type is Any:
-            return (str,) if self.is_path else (str, float)
-        return self.kinds if self.kinds in ((bool,), (int,), (float,)) else (str,)
-
     def checked(self, value: Any) -> Any:
         """Return a value as its type, or refuse it."""
         if isinstance(value, str) and self.parse is not None:
@@ -179,9 +170,13 @@ class Option(NamedTuple):
             if value not in get_args(kinds[0]):
                 raise self._wrong("choice", value, f"is not one of {', '.join(get_args(kinds[0]))}")
             return value
+        if kinds == (bool,) and value not in (True, False):
+            raise self._wrong("type", value, "must be true or false")
+        if os.PathLike[str] in kinds and not isinstance(value, str | os.PathLike):
+            raise self._wrong("type", value, "must be a file or folder")
         if not {int, float} & {*kinds} or (str in kinds and isinstance(value, str)):
             return value
-        if isinstance(value, str) or not hasattr(value, "__float__"):
+        if isinstance(value, str | bool) or not hasattr(value, "__float__"):
             raise self._wrong("type", value, "must be a number")
         number, least = float(value), self.least if self.above is None else self.above
         low = -math.inf if least is None else least
