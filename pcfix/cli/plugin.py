@@ -18,8 +18,6 @@ _PLACES = {
     "spec": "text",
 }  # fmt: skip
 """Kinds of the positional arguments; the others are clouds."""
-_WRITTEN = ("summary", "shoreline", "save_regression", "plot")
-"""Options with a file to write; `out_dir` is a folder."""
 
 
 def plugin_zip(commands: Mapping[str, Command]) -> bytes:
@@ -71,10 +69,8 @@ def _option(one: Option, *, replaced: bool) -> dict[str, Any]:
 
 
 def _kind(one: Option) -> str:
-    if one.name in _WRITTEN:
-        return "written"
-    if one.name == "out_dir":
-        return "folder written"
+    if one.writes:
+        return "folder written" if one.name == "out_dir" else "written"
     if one.is_path:
         return "file"
     if one.choices and one.parse is None:

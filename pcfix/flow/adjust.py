@@ -31,7 +31,7 @@ from pcfix.adjust.methods import (
 from pcfix.adjust.problem import Progress
 from pcfix.adjust.result import Adjusted
 from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError
-from pcfix.flow.inputs import Inputs, mask_of
+from pcfix.flow.inputs import Inputs, mask_of, paths_in
 from pcfix.flow.next_steps import WATER as WATER_FILE
 from pcfix.flow.surfaces import CloudView, view_of
 from pcfix.io.atomic import temporary_folder
@@ -132,7 +132,7 @@ def adjust_into(
     # 1. The block, its water, and what was surveyed
     water_unknowns = unknowns_of(given, ())
     if folder is not None:
-        _check_folder(folder, given.overwrite, inputs.paths())
+        _check_folder(folder, given.overwrite, paths_in(inputs))
     view = None if cloud is None else view_of(cloud_of(cloud))
     name = str(inputs.cameras) if isinstance(inputs.cameras, str | Path) else "cameras"
     read = inputs.read()

@@ -32,8 +32,8 @@ from pcfix.label.areas import WaterMask
 from pcfix.label.labelling import Labelling
 from pcfix.model import NO_CAMERAS, Cameras, FloatArray, IntArray, TiePoints, ViewKind
 from pcfix.options.correct import LabelRules
-from pcfix.options.declare import File, options_of
-from pcfix.options.shared import InputOptions
+from pcfix.options.declare import File, OptionSet, options_of
+from pcfix.options.shared import InputOptions, MaskOption
 from pcfix.water.surface import FoundSurface
 
 if TYPE_CHECKING:
@@ -48,15 +48,13 @@ TIMED = (".json", ".geojson")
 """Camera files that may hold the time of each image."""
 
 
-class Inputs(InputOptions):
+class Inputs(MaskOption, InputOptions):
     """Cameras, view list and water as the user gives them.
 
     `cameras` and `adjusted_from` may be `pcfix.Cameras`, then in the cloud's CRS; `water` may be a
     `pcfix.WaterSurface`, `port` a `Port`. `both_models` decides whether views, offset and CRS
     belong to `cameras` or `adjusted_from`.
     """
-
-    water_mask: File | None = None
 
     def check(self) -> None:
         """Check that there is either a water surface or a housing port."""
@@ -77,10 +75,6 @@ class Inputs(InputOptions):
             from pcfix.port.shapes import port_of
 
             object.__setattr__(self, "port", port_of(self.port))
-
-    def paths(self) -> list[File]:
-        """Return the options that may be files, which no output may replace."""
-        return paths_in(self)
 
     def surface(self, view: CloudView | None = None) -> FoundSurface:
         """Return the water surface over a cloud; see `pcfix.flow.surfaces.find_surface`."""
@@ -344,15 +338,15 @@ def _warn(notes: Iterable[str | PcfixWarning]) -> None:
         warnings.warn(note, PcfixWarning, stacklevel=3)
 
 
-NO_FILES = ("port", "water_model", "water_crs", "views_are", "angles", "cameras_crs")
-
-
-def paths_in(options: Any, but: tuple[str, ...] = ()) -> list[File]:
-    """Return the options of a command, except `but`, that may be files that it reads.
+def paths_in(options: OptionSet, but: tuple[str, ...] = ()) -> list[Path]:
+    """Return the input files that the options of a command name, except the options `but`.
 
     The layer of a vector file is removed.
     """
-    names = [one.name for one in options_of(InputOptions)] + ["water_mask", "water_per_image"]
-    given = [getattr(options, name, None) for name in names if name not in (*NO_FILES, *but)]
-    paths = [str(one) for one in given if isinstance(one, str | PathLike)]
+    named = [
+        getattr(options, one.name)
+        for one in options_of(type(options))
+        if (one.is_path or one.name == "water") and not one.writes and one.name not in but
+    ]
+    paths = [str(one) for one in named if isinstance(one, str | PathLike)]
     return [Path(path.partition(LAYER_MARK)[0]) for path in paths]

@@ -98,10 +98,14 @@ class Request(RunOptions):
         kept = {name: values[name] for name in values if name not in HOW}
         return {**kept, VERSION: __version__}
 
+    @property
+    def _named(self) -> list[Path]:
+        """The files of the first step, but for the cloud and the water."""
+        return paths_in(self, but=("water", "reference"))
+
     def files(self) -> dict[str, list[Path]]:
         """Return the input files, each of which exists, by the first step that reads them."""
-        names = [*paths_in(self, but=("water",)), self.gcps, self.gnss, self.lens]
-        found = [*_files_of(self.source), *(p for n in names if n is not None for p in files_in(n))]
+        found = [*_files_of(self.source), *(one for path in self._named for one in files_in(path))]
         found += [Path(self.water)] if Path(self.water).is_file() else []
         compared = [] if self.reference is None else _files_of(self.surveyed)
         compared += [path for _, one in self.also for path in _files_of(cloud_of(one))]
@@ -111,7 +115,7 @@ class Request(RunOptions):
         """Return the input files with those that belong to them, but none in the results."""
         read = self.files()
         own = results.resolve()
-        more = {one for name in paths_in(self, but=("water",)) for one in belonging(name)}
+        more = {one for path in self._named for one in belonging(path)}
         more = {one for one in more if own not in one.resolve().parents}
         return {**read, "adjust": list(dict.fromkeys([*read["adjust"], *sorted(more)]))}
 

@@ -168,7 +168,7 @@ class CorrectOptions(
 ):  # fmt: skip
     """The options of ``pcfix correct``; in Python they are `pcfix.Options`."""
 
-    save_regression: File | None = option(None, needs="check_depths")
+    save_regression: File | None = option(None, writes=True, needs="check_depths")
     """JSON file for the line fitted to --check-depths."""
 
 

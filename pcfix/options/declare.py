@@ -73,6 +73,8 @@ class Option(NamedTuple):
         Placeholder of the value, and panel of the help if it is not that of the class.
     off : bool
         Whether ``--no-NAME`` is a flag too; a switch that is on always has one.
+    writes : bool
+        Whether it names an output.
     """
 
     name: str
@@ -93,6 +95,7 @@ class Option(NamedTuple):
     metavar: str = ""
     panel: str = ""
     off: bool = False
+    writes: bool = False
 
     @property
     def _text(self) -> str:

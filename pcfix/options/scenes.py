@@ -157,5 +157,5 @@ class PlanOptions(OverwriteOption, SummaryOption, BudgetOptions, IndexOptions, p
     """Depths of the bed: the greatest, a list, or FROM:TO:STEP. [m]"""
     gnss_sigma: float = option(0.03, above=0)
     """Standard deviation of GNSS positions of the images, each axis. [m]"""
-    plot: File | None = option(None, basic=True, panel=Panel.OUTPUT)
+    plot: File | None = option(None, writes=True, basic=True, panel=Panel.OUTPUT)
     """PNG of the block and of the errors by depth."""

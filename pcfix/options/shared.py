@@ -218,12 +218,12 @@ class TileOptions(JobOptions, panel=Panel.OUTPUT):
 class SummaryOption(OptionSet, panel=Panel.OUTPUT):
     """The summary as a file."""
 
-    summary: File | None = option(None, basic=True)
+    summary: File | None = option(None, writes=True, basic=True)
     """JSON file for the summary."""
 
 
 class ShorelineOption(OptionSet, panel=Panel.OUTPUT):
     """The line at which the water meets the cloud."""
 
-    shoreline: File | None = option(None, basic=True)
+    shoreline: File | None = option(None, writes=True, basic=True)
     """GeoPackage (.gpkg) for the shoreline of the cloud, with its standard error."""

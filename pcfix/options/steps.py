@@ -158,9 +158,9 @@ class DsmRules(OptionSet, panel=Panel.RASTER):
 class DsmOptions(PartOptions, OverwriteOption, SummaryOption, DsmRules, panel=Panel.OUTPUT):
     """The options of ``pcfix dsm``."""
 
-    hillshade: File | None = option(None)
+    hillshade: File | None = option(None, writes=True)
     """GeoTIFF for a hillshade."""
-    counts: File | None = option(None)
+    counts: File | None = option(None, writes=True)
     """GeoTIFF for the number of points in each cell, and their spread."""
     style: bool = option(False)
     """Also write a QGIS style (.qml)."""
@@ -286,13 +286,13 @@ class ReferenceOption(OptionSet, panel=Panel.OUTPUT):
 class CompareOptions(OverwriteOption, SummaryOption, CompareRules, panel=Panel.OUTPUT):
     """The options of ``pcfix compare``."""
 
-    out_dir: File | None = option(None, basic=True)
+    out_dir: File | None = option(None, writes=True, basic=True)
     """Folder for compare.json, depth tables and sections (CSV)."""
     water: Any = option(None, basic=True, metavar="SPEC")
     """Water surface, as for 'pcfix correct'. [default: what the cloud says]"""
     section: tuple[Any, ...] = option((), basic=True, metavar="X,Y,X,Y")
     """A cross-section x1,y1,x2,y2; may be repeated."""
-    plot: File | None = option(None, basic=True)
+    plot: File | None = option(None, writes=True, basic=True)
     """PNG of the C2C histograms, with Gauss curves."""
 
 
@@ -311,7 +311,7 @@ class ViewerOptions(OverwriteOption, CameraFileOptions, WaterOptions, panel=Pane
     """Camera poses to show, as for 'pcfix correct'."""
     water: Any = option(None, basic=True, metavar="SPEC")
     """Water surface to show, as for 'pcfix correct'; also for depths of clouds without them."""
-    image: File | None = option(None)
+    image: File | None = option(None, writes=True)
     """PNG to draw instead of opening a window."""
     points: int = option(2_000_000, basic=True, least=1)
     """Maximum number of points of each cloud, evenly spread."""

@@ -54,7 +54,7 @@ class CamerasCheckOptions(
     absorbed refraction."""
     reference: File | None = option(None, basic=True)
     """Survey of land or bed: LiDAR (.las, .laz), grid (.tif) or CSV x,y,z."""
-    plot: File | None = option(None, basic=True)
+    plot: File | None = option(None, writes=True, basic=True)
     """PNG of the block in plan and from the side."""
 
 
@@ -63,9 +63,9 @@ class WaterCheckOptions(OverwriteOption, SummaryOption, WaterOptions, panel=Pane
 
     cloud: File | None = option(None, basic=True)
     """LAS or LAZ cloud under the water surface."""
-    plot: File | None = option(None, basic=True)
+    plot: File | None = option(None, writes=True, basic=True)
     """PNG of points and residuals, or of the evidence for auto."""
-    shoreline: File | None = option(None, basic=True, needs="cloud")
+    shoreline: File | None = option(None, writes=True, basic=True, needs="cloud")
     """GeoPackage (.gpkg) for the shoreline of the cloud, with its standard error."""
 
 

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from itertools import pairwise
 from pathlib import Path
 
 import laspy
@@ -15,6 +16,7 @@ from pyproj import CRS
 
 import pcfix
 from pcfix.flow.tiles import in_processes
+from tests.io.test_views import write_ply
 from tests.utils.codes import refused
 from tests.utils.matchers import matched_scene
 from tests.utils.nightly import mostly_nightly
@@ -75,10 +77,16 @@ def test_tiles_and_jobs(count, jobs, tmp_path):
 def test_view_list(tmp_path):
     from pcfix.io.scenes import write_scene
 
-    write_scene(matched_scene(3000, cloud="depth-maps"), tmp_path / "s", overwrite=False)
+    scene = matched_scene(3000, cloud="depth-maps")
+    write_scene(scene, tmp_path / "s", overwrite=False)
     folder, merged = cut(tmp_path / "tiles", 2, cloud=tmp_path / "s" / "cloud.laz")
     given = {"cameras": tmp_path / "s" / "cameras.csv", "water": 0.37}
-    given["views"] = tmp_path / "s" / "fused.ply.vis"
+    given["views"] = tmp_path / "dense.ply"
+    rows = [slice(*pair) for pair in pairwise(scene.views.start)]
+    lists, weights = (
+        [one[some].tolist() for some in rows] for one in (scene.views.camera, scene.views.weight)
+    )
+    write_ply(given["views"], scene.apparent_xyz, lists, weights, position="double")
     one = pcfix.correct_file(merged, tmp_path / "merged.las", **given)
     many = pcfix.correct_file(folder, tmp_path / "out", **given)
     assert many.made == one.made

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 import pcfix
-from pcfix.flow.inputs import Inputs
+from pcfix.flow.inputs import Inputs, paths_in
 from pcfix.io.cameras import read_cameras
 from pcfix.io.scenes import write_scene
 from pcfix.io.tides import (
@@ -188,7 +188,7 @@ def test_inputs(tmp_path):
     inputs = Inputs(cameras=file, water=0.37, tide=tide, image_times=times)
     level = np.interp(minutes, [0, 30, 60], [1.0, 1.3, 1.4])
     assert inputs.level_offset_m(cameras) == pytest.approx(level - level.mean(), abs=1e-9)
-    assert {tide, times} <= set(inputs.paths())
+    assert {tide, times} <= set(paths_in(inputs))
     assert Inputs(cameras=cameras, water=0.37).level_offset_m(cameras) is None
 
 
