@@ -41,7 +41,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import InputError, PcfixWarning, bad_file
-from pcfix.io.cameras.colmap.files import read_images
+from pcfix.io.cameras.colmap import read_images
 from pcfix.io.labels import match_labels
 from pcfix.io.ply import Records, joined, list_starts, read_header
 from pcfix.lens.imaging import project
