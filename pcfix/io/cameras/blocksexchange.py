@@ -159,8 +159,8 @@ def _read_block(path: Path) -> tuple[Cameras, list[Photo], list[tuple[int, str, 
         notes.append(note(path, "cameras.poses_ignored", sentence, photogroups=ignored))
     if not turned:
         notes.append(note(path, "cameras.no_rotations", "no photo has a rotation, only positions."))
-    elif (one := next((p for p in photos if p.group.lens is None), None)) is not None:
-        why = f"the photogroup of {one.label} has no frame or focal length"
+    elif (bare := next((p for p in photos if p.group.lens is None), None)) is not None:
+        why = f"the photogroup of {bare.label} has no frame or focal length"
         notes.append(checks.without_lens(path, why))
     chosen = {photo.key for photo in photos}
     cameras = Cameras(
