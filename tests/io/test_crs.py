@@ -148,10 +148,12 @@ def test_geographic_3d(geocentric, geographic):
 def test_topocentric():
     lat, lon, h = 52.519, 13.4004, 34.0
     origin = geocentric(lon, lat, h, 6378137.0, 1 / 298.257223563)
-    found = Topocentric.from_text(f"ENU:{lat},{lon},{h}", "a").to_geocentric(
-        np.array([[0.0, 0, 0], [100.0, -50.0, 20.0]])
-    )
-    assert found[0] == pytest.approx(origin, abs=1e-6)
+    place = Topocentric.from_text(f"ENU:{lat},{lon},{h}", "a")
+    enu = np.array([[0.0, 0, 0], [100.0, -50.0, 20.0]])
+    lon_1, lat_1, h_1 = place.to_degrees(enu)[0]
+    found = geocentric(lon_1, lat_1, h_1, 6378137.0, 1 / 298.257223563)
+    assert found == pytest.approx(origin, abs=1e-6)
+    assert place.from_degrees(place.to_degrees(enu)) == pytest.approx(enu, abs=1e-6)
     assert Topocentric.from_text("enu: 39.9, -83.0", "a") == Topocentric(39.9, -83.0, 0.0)
 
 

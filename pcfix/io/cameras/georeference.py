@@ -24,8 +24,8 @@ from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.cameras.checks import note
 from pcfix.io.cameras.mistakes import UNDULATION_M
 from pcfix.io.crs import (
-    GEOCENTRIC_WGS84,
     GEOGRAPHIC_WGS84,
+    LOCAL,
     METRES,
     HeightsError,
     Topocentric,
@@ -53,7 +53,6 @@ from pcfix.model import Cameras, FloatArray, GnssPositions
 if TYPE_CHECKING:
     from pyproj import CRS
 
-LOCAL = "local"
 EARTH_RADIUS_M = 6.371e6
 CENTRE_DISTANCE_M = (6.2e6, 7.0e6)
 """Cameras are at no other distance from the centre of the earth."""
@@ -111,25 +110,18 @@ def frame_of(text: str, name: str) -> Frame:
     """Return the frame that a text names: a CRS, or ``ENU:latitude,longitude,height``."""
     if is_topocentric(text):
         place = Topocentric.from_text(text, name)
-        crs = parse_crs(GEOGRAPHIC_WGS84, name)
-        enter = _from_geocentric(parse_crs(GEOCENTRIC_WGS84, name), crs)
-        return Frame(crs, lambda enu: enter(place.to_geocentric(enu)), topocentric=True)
+        return Frame(parse_crs(GEOGRAPHIC_WGS84, name), place.to_degrees, topocentric=True)
     crs = parse_crs(text, name)
     if crs.is_geocentric:
-        geographic = geographic_3d(crs)
-        return Frame(geographic, _from_geocentric(crs, geographic))
+        from pyproj import Transformer
+
+        geographic = geographic_3d(crs)  # on the same datum
+        step = Transformer.from_crs(crs, geographic, always_xy=True)
+        return Frame(geographic, lambda xyz: np.column_stack(step.transform(*xyz.T)))
     if not (crs.is_projected or crs.is_geographic):
         sentence = f"{crs.name} is not a CRS for cameras. Give another with --cameras-crs."
         raise bad_file(name, "cameras.crs", sentence, crs=crs.name)
     return Frame(crs, lambda xyz: xyz, direct=True)
-
-
-def _from_geocentric(geocentric: CRS, geographic: CRS) -> Callable[[FloatArray], FloatArray]:
-    """Return the conversion of geocentric points to longitude, latitude, height on one datum."""
-    from pyproj import Transformer
-
-    step = Transformer.from_crs(geocentric, geographic, always_xy=True)
-    return lambda xyz: np.column_stack(step.transform(*xyz.T))
 
 
 def is_tied(crs: str | None, name: str) -> bool:
@@ -143,33 +135,6 @@ def _on_earth(crs: str | None, name: str) -> CRS | None:
         return None
     parsed = parse_crs(crs, name)
     return None if is_local(parsed) else parsed
-
-
-class Statement(NamedTuple):
-    """The frame of cameras by their file and by ``--cameras-crs``, which has priority.
-
-    `crs` is as in `Cameras`, `project` that in which the software delivers its clouds. It is
-    `chosen` if the user gave it, and `trusted` if heights of an unknown system are the cloud's.
-    """
-
-    crs: str | None
-    project: CRS | None
-    chosen: bool = False
-    trusted: bool = False
-
-
-def statement(cameras: Cameras, cameras_crs: str | None, name: str) -> Statement:
-    """Combine the CRS of the file with the user's ``--cameras-crs``."""
-    project, given = _on_earth(cameras.project_crs, name), (cameras_crs or "").strip()
-    if not given:
-        return Statement(cameras.crs, project)
-    crs, own = _on_earth(given, "--cameras-crs"), _on_earth(cameras.crs, name)
-    if crs is not None and crs.is_geocentric:
-        return Statement(given, project, chosen=True)
-    trusted = crs is None or heights_of(crs) == "unstated"
-    if crs is not None and own is not None and own.is_geocentric:
-        return Statement(cameras.crs, crs, chosen=True, trusted=trusted)
-    return Statement(given, None, chosen=True, trusted=trusted)
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,15 +207,15 @@ def georeference(
     offset_m: tuple[float, float, float] | None = None,
     name: str = "cameras",
 ) -> Georeference:
-    """Return the way into the cloud's CRS, for cameras, tie points and others.
+    """Return the transformation to the cloud's CRS, for cameras, tie points and others.
 
     Parameters
     ----------
     cameras : Cameras
         As a reader gave them, in the frame of their file.
     cloud_crs : str, CRS or None
-        Projected, in metres. None where the cloud names none: then the way leads to where the
-        software delivers clouds, mostly where the cameras are.
+        Projected, in metres. None where the cloud names none: then they are brought to where
+        the software delivers clouds, mostly where the cameras are.
     cameras_crs : str, optional
         Overrides what the file says. ``local``: the numbers are taken as they are. A CRS without
         heights says that these agree with the cloud's, and so does ``ENU:lat,lon,height``. For a
@@ -266,12 +231,21 @@ def georeference(
         sentence = f"the offset {offset_m} is not three numbers. Give x, y, z."
         raise bad_file(name, "cameras.offset", sentence, value=offset_m)
     cloud = None if cloud_crs is None else parse_crs(cloud_crs, "the cloud")
-    stated = statement(cameras, cameras_crs, name)
-    crs, tied = stated.crs or "", is_tied(stated.crs, name)
-    if not tied:
+    # the frame of the cameras, and the CRS in which their software delivers clouds
+    stated, project, given = cameras.crs, _on_earth(cameras.project_crs, name), cameras_crs or ""
+    trusted = False  # heights of an unknown system are the cloud's
+    if given.strip():
+        stated, chosen = given.strip(), _on_earth(given, "--cameras-crs")
+        if chosen is None or not chosen.is_geocentric:
+            trusted = chosen is None or heights_of(chosen) == "unstated"
+            own = None if chosen is None else _on_earth(cameras.crs, name)
+            is_project = own is not None and own.is_geocentric
+            stated, project = (cameras.crs, chosen) if is_project else (stated, None)
+    crs = stated or ""
+    if not is_tied(stated, name):
         if cloud is None:
-            return Georeference(None, None, offset, stated.crs, (), name)
-        if stated.crs is not None and not stated.chosen and not is_local(cloud):
+            return Georeference(None, None, offset, stated, (), name)
+        if stated is not None and not given.strip() and not is_local(cloud):
             sentence = f"is in a local frame, the cloud in {cloud.name}. Export the cameras in that"
             sentence += " CRS, or give --cameras-crs local to use their numbers as they are."
             raise bad_file(name, "cameras.local", sentence, cloud_crs=cloud.name)
@@ -282,27 +256,28 @@ def georeference(
         raise bad_file(name, "cloud.local", sentence, crs=crs, cloud_crs=cloud.name)
     frame = frame_of(crs, name)
     if cloud is not None:
-        return _into(cloud, frame, stated, cameras, offset, name)
+        return _into(cloud, frame, project, cameras, offset, name, trusted=trusted)
     if frame.topocentric or (frame.direct and frame.crs.is_projected):
         unit, size = plan_unit(frame.crs)
         words = frame.crs.name + ("" if size == 1.0 else f", unit {unit},")
         words = shortened(crs) if frame.topocentric else words
-        found = Georeference(None, None, offset, stated.crs, (), name)
-    elif frame.direct or stated.project is None or not stated.project.is_projected:
+        found = Georeference(None, None, offset, stated, (), name)
+    elif frame.direct or project is None or not project.is_projected:
         kind = "degrees" if frame.direct else "geocentric coordinates"
         sentence = f"is in {kind} ({frame.crs.name}). Give a cloud that names its CRS."
         raise bad_file(name, "cloud.no_crs", sentence, crs=frame.crs.name)
     else:
-        words = stated.project.name
-        found = _into(stated.project, frame, stated, cameras, offset, name)
+        words = project.name
+        found = _into(project, frame, project, cameras, offset, name, trusted=trusted)
     sentence = f"no cloud names a CRS; it is taken to be in {words} as the cameras are."
     return replace(found, notes=(note(name, "cloud.crs_assumed", sentence), *found.notes))
 
 
 def _into(
-    cloud: CRS, frame: Frame, stated: Statement, cameras: Cameras, offset: FloatArray, name: str
-) -> Georeference:
-    """Return the way from a frame tied to the earth into a CRS."""
+    cloud: CRS, frame: Frame, project: CRS | None, cameras: Cameras, offset: FloatArray, name: str,
+    *, trusted: bool,
+) -> Georeference:  # fmt: skip
+    """Return the transformation of a frame that is tied to the earth to a CRS."""
     check_projected_metres(cloud, "the cloud")
     if frame.direct and frame.crs.is_geographic and offset.any():
         sentence = f"an offset in metres cannot be added to degrees ({frame.crs.name}). Omit it."
@@ -311,10 +286,12 @@ def _into(
     frame.check(at, cameras.labels, name)
     target = cloud
     if heights_of(cloud) == "unstated":  # then the heights are those that the software uses
-        vertical = parts(frame.crs if stated.project is None else stated.project)[1]
+        vertical = parts(frame.crs if project is None else project)[1]
         target = cloud if vertical is None else with_heights(cloud, vertical)
-    crs, notes = crs_text(target), _height_notes(frame, target, stated, name)
-    by_user = stated.trusted and not frame.direct
+    crs = crs_text(target)
+    assumed = _assumed_heights(frame, target, project, trusted)
+    notes = (note(name, "cameras.heights_assumed", f"{assumed}."),) if assumed else ()
+    by_user = trusted and not frame.direct
     heights = not (by_user or heights_agree(frame.crs, target))
     if frame.direct and not heights and is_same_numbers(frame.crs, target):
         return Georeference(frame, None, offset, crs, notes, name)
@@ -341,26 +318,20 @@ def _into(
     return found
 
 
-def _height_notes(
-    frame: Frame, target: CRS, stated: Statement, name: str
-) -> tuple[PcfixWarning, ...]:
-    """Return a note on what is assumed about heights, if anything."""
+def _assumed_heights(frame: Frame, target: CRS, project: CRS | None, trusted: bool) -> str:
+    """Return what is assumed about heights, in words; nothing if both sides state theirs."""
     own, cloud = heights_of(frame.crs), heights_of(target)
     unit, size = plan_unit(frame.crs)
     axes = [e.semi_major_metre for e in (frame.crs.ellipsoid, target.ellipsoid) if e is not None]
     other_datum = bool(axes) and max(axes) - min(axes) > 1.0
-    is_guess = other_datum or (stated.project is None and not frame.topocentric)
+    is_guess = other_datum or (project is None and not frame.topocentric)
     if own == "unstated" and frame.crs.is_projected and size != 1.0:
-        what = f"heights are taken to be in {unit}, as x and y are"
-    elif stated.trusted:
-        return ()
-    elif own == "unstated" and cloud != "unstated":
-        what = f"does not say what its heights are; taken to be the cloud's ({target.name})"
-    elif own == "ellipsoidal" and cloud == "unstated" and is_guess:
-        what = f"the cloud's CRS ({target.name}) names no vertical datum; ellipsoidal is assumed"
-    else:
-        return ()
-    return (note(name, "cameras.heights_assumed", f"{what}."),)
+        return f"heights are taken to be in {unit}, as x and y are"
+    if own == "unstated" != cloud and not trusted:
+        return f"does not say what its heights are; taken to be the cloud's ({target.name})"
+    if own == "ellipsoidal" and cloud == "unstated" and is_guess and not trusted:
+        return f"the cloud's CRS ({target.name}) names no vertical datum; ellipsoidal is assumed"
+    return ""
 
 
 class GnssDifferences(NamedTuple):

@@ -38,7 +38,7 @@ from pcfix.io.cameras import checks, opensfm
 from pcfix.io.cameras.checks import damaged, load_json, note, triple
 from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.opensfm import is_panorama, lens
-from pcfix.io.crs import GEOCENTRIC_WGS84, GEOGRAPHIC_WGS84, Topocentric
+from pcfix.io.crs import Topocentric
 from pcfix.lens.rotations import from_rotation_vectors
 from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, TiePoints
 
@@ -254,12 +254,8 @@ def _from_topocentric(
     xyz: FloatArray, reference: tuple[float, float, float], crs: str
 ) -> FloatArray:
     """Return topocentric points in a projected CRS, heights on the ellipsoid, shape (n, 3)."""
-    from pyproj import Transformer
-
-    to_degrees = Transformer.from_crs(GEOCENTRIC_WGS84, GEOGRAPHIC_WGS84, always_xy=True)
-    ecef = Topocentric(*reference).to_geocentric(xyz)
-    geographic = np.column_stack(to_degrees.transform(*ecef.T))
-    return np.column_stack([*_projected(crs, *geographic[:, :2].T), geographic[:, 2]])
+    degrees = Topocentric(*reference).to_degrees(xyz)
+    return np.column_stack([*_projected(crs, *degrees[:, :2].T), degrees[:, 2]])
 
 
 def _zones(lat: float, lon: float) -> list[str]:
