@@ -106,6 +106,8 @@ def nodes_in(
     """
     with CopcReader.open(path) as reader:
         header, info, levels, box = reader.header, reader.copc_info, None, None
+        if info.hierarchy_root_offset + info.hierarchy_root_size > path.stat().st_size:
+            raise ValueError("its octree begins or ends behind its end")
         if part.resolution is not None:
             halvings = math.ceil(math.log2(info.spacing / part.resolution))
             levels = range(max(halvings, 0) + 1)
@@ -143,6 +145,9 @@ def extent_of(
     path: CloudPart, header: laspy.LasHeader, chunks: Iterator[laspy.ScaleAwarePointRecord]
 ) -> Extent:
     """Return how many points a part has, and where; an `InputError` if it has none."""
+    if path.part.resolution is not None and not is_copc(header):
+        sentence = f"{path}: is not COPC and has no coarser levels to read. Omit --read-resolution."
+        raise SettingError("cloud.not_copc", sentence, path=path)
     if path.extent is None:
         count, ends = 0, []
         for points in chunks:
@@ -158,10 +163,3 @@ def extent_of(
         mins, maxs = (end * header.scales + header.offsets for end in (low, high))
         path.extent, path.held = Extent(count, mins, maxs), int(header.point_count)
     return path.extent
-
-
-def check_levels(path: CloudPart, header: laspy.LasHeader) -> None:
-    """Refuse a resolution of what has no levels."""
-    if path.part.resolution is not None and not is_copc(header):
-        sentence = f"{path}: is not COPC and has no coarser levels to read. Omit --read-resolution."
-        raise SettingError("cloud.not_copc", sentence, path=path)
