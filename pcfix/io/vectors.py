@@ -210,18 +210,13 @@ def _read_text(path: Path) -> tuple[Geometries, str | None]:
     for longitude and latitude it is WGS 84.
     """
     lines = read_lines(path)
-    stated = [found.group(1).strip() for line in lines[:20] if (found := _CRS.match(line.strip()))]
-    used = [
-        (number, line)
-        for number, line in enumerate(lines, start=1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
+    stated = [found[1].strip() for line in lines[:20] if (found := _CRS.match(line.strip()))]
+    numbered = enumerate(lines, start=1)
+    used = [(n, line) for n, line in numbered if line.strip() and line.lstrip()[0] != "#"]
     if not used:
         raise bad_file(path, "vector.empty", "is empty.")
-    if _WKT.match(used[0][1]):
-        geometries, crs = _from_wkt(path, used)
-    else:
-        geometries, crs = _from_table(path, lines, used[0][0] - 1)
+    is_wkt = _WKT.match(used[0][1])
+    geometries, crs = _from_wkt(path, used) if is_wkt else _from_table(path, lines, used[0][0] - 1)
     return geometries, stated[0] if stated else crs
 
 
@@ -421,13 +416,17 @@ def write_layers(
                     geometry_type=one.kind, append=number > 0,
                     **({} if number else {"dataset_options": OLDER}),
                 )  # fmt: skip
-            _write_styles(temporary, [one for one in layers if one.style])
+            if styled := [one for one in layers if one.style]:
+                load_pyogrio().raw.write(
+                    temporary, None, *_styles(styled), layer=STYLES, driver="GPKG", append=True,
+                    crs=None, geometry_type=None,
+                )  # fmt: skip
         except RuntimeError as error:
             raise cannot_write(target, error, temporary) from error
 
 
-def _write_styles(path: Path, layers: Sequence[Layer]) -> None:
-    """Add the table of styles, as QGIS writes it."""
+def _styles(layers: Sequence[Layer]) -> tuple[list[Any], list[str]]:
+    """Return the columns of the table of styles as QGIS writes it, and their names."""
     columns: dict[str, Any] = {
         "f_table_catalog": "", "f_table_schema": "", "f_geometry_column": "geom",
         "f_table_name": [one.name for one in layers], "styleName": [one.name for one in layers],
@@ -437,8 +436,4 @@ def _write_styles(path: Path, layers: Sequence[Layer]) -> None:
     fields = {name: np.full(len(layers), value, object) for name, value in columns.items()}
     fields["useAsDefault"] = np.ones(len(layers), bool)
     fields["update_time"] = np.full(len(layers), "2020-01-01", "datetime64[ms]")
-    if layers:
-        load_pyogrio().raw.write(
-            path, None, [*fields.values()], [*fields], layer=STYLES, driver="GPKG", append=True,
-            crs=None, geometry_type=None,
-        )  # fmt: skip
+    return [*fields.values()], [*fields]

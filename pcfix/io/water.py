@@ -228,7 +228,18 @@ def read_water_raster(
         if t.is_identity or not np.isfinite(t).all() or not abs(t.determinant) > 0.0:
             sentence = "has no valid geotransform. Export it as GeoTIFF, or with a world file."
             raise bad_file(name, "water.raster_place", sentence)
-        to_cloud, from_cloud, notes = _ways(source, cloud_crs, bounds, name)
+        stated = None if source.crs is None else source.crs.to_wkt()
+        share = np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0), (0.5, 0.5)])
+        x, y = place_of(t, *(share * [source.width, source.height]).T)
+        at = np.column_stack([x, y, 0.0 * x])
+        to_cloud, notes = way_to_cloud(stated, cloud_crs, at, name, heights=True)
+        from_cloud: Points = np.asarray  # in plan
+        if to_cloud is not None and stated is not None and cloud_crs is not None:
+            cloud, crs = parse_crs(cloud_crs, "the cloud"), parse_crs(stated, name)
+            near = to_cloud(at) if bounds is None else _edge(bounds)
+            from_cloud = transformation(cloud, crs, near, name, heights=False).forward
+            forward, unit = to_cloud, [1.0, 1.0, metres_up(crs)]
+            to_cloud = lambda xyz: forward(xyz / unit)  # noqa: E731
         part = _read(source, name, None if bounds is None else from_cloud(_edge(bounds)))
     title = name.replace("\\", "/").rpartition("/")[2]
     for note in notes + part.notes:
@@ -277,24 +288,6 @@ def write_water_raster(path: Path, water: WaterRaster, crs: str | None) -> None:
         target.write(water.height_m, 1)
 
 
-def _ways(
-    source: DatasetReader, cloud_crs: str | CRS | None, bounds: Bounds | None, name: str
-) -> tuple[Points | None, Points, Notes]:
-    """Return the transformation to the cloud (None for none), its inverse in plan, and notes."""
-    stated = None if source.crs is None else source.crs.to_wkt()
-    share = np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0), (0.5, 0.5)])
-    x, y = place_of(source.transform, *(share * [source.width, source.height]).T)
-    at = np.column_stack([x, y, 0.0 * x])
-    forward, notes = way_to_cloud(stated, cloud_crs, at, name, heights=True)
-    if forward is None or stated is None or cloud_crs is None:
-        return None, lambda xyz: xyz, notes
-    cloud, crs = parse_crs(cloud_crs, "the cloud"), parse_crs(stated, name)
-    near = forward(at) if bounds is None else _edge(bounds)
-    back = transformation(cloud, crs, near, name, heights=False)
-    unit = [1.0, 1.0, metres_up(crs)]
-    return lambda xyz: forward(xyz / unit), back.forward, notes
-
-
 def _edge(bounds: Bounds) -> FloatArray:
     """Return points along bounds, z = 0."""
     edge = shapely.box(*bounds).exterior
@@ -327,34 +320,29 @@ def _read(source: DatasetReader, name: str, near: FloatArray | None) -> _Part:
     _check_size((bottom - top) * (right - left), name)
     window = Window(left, top, right - left, bottom - top)
     stored = read_masked(source, window=window)
-    unit_m, notes = _metres(source, name)
-    heights = (stored * source.scales[0] + source.offsets[0]) * unit_m
+    # one unit of the heights is that of the band, else that of the CRS
+    unit, notes = (source.units[0] or "").strip(), list[PcfixWarning]()
+    if unit.lower() not in _UNITS_M:
+        sentence = f"its heights are in '{unit}'. Convert them to metres, or correct the unit."
+        raise bad_file(name, "water.raster_unit", sentence, value=unit)
+    unit_m = _UNITS_M[unit.lower()]
+    if unit_m is None and source.crs is not None:
+        crs = parse_crs(source.crs.to_wkt(), name)
+        unit_m = 1.0 if is_local(crs) else metres_up(crs)
+        if unit_m != 1.0 and parts(crs)[1] is None:
+            sentence = f"{name}: has no unit of heights; that of its CRS is assumed"
+            sentence += f" ({unit_m:.4f} m)."
+            notes.append(PcfixWarning("water.raster_unit", sentence, unit_m=unit_m))
+    heights = (stored * source.scales[0] + source.offsets[0]) * (unit_m or 1.0)
     if source.nodata is None:
         heights[np.abs(heights) > IMPOSSIBLE_M] = np.nan
     heights[np.isinf(heights)] = np.nan
     unknown = int(np.isnan(heights).sum())
     if source.nodata is None and unknown:
         sentence = f"{name}: has no nodata value. {unknown:,} impossible heights are ignored."
-        notes = (PcfixWarning("water.raster_nodata", sentence, count=unknown), *notes)
+        notes.insert(0, PcfixWarning("water.raster_nodata", sentence, count=unknown))
     _check_known(heights, name)
-    return _Part(heights, source.window_transform(window), notes)
-
-
-def _metres(source: DatasetReader, name: str) -> tuple[float, Notes]:
-    """Return how many metres one unit of the heights is: the band's unit, else the CRS's."""
-    stated = (source.units[0] or "").strip()
-    if stated.lower() not in _UNITS_M:
-        sentence = f"its heights are in '{stated}'. Convert them to metres, or correct the unit."
-        raise bad_file(name, "water.raster_unit", sentence, value=stated)
-    factor = _UNITS_M[stated.lower()]
-    if factor is not None or source.crs is None:
-        return factor or 1.0, ()
-    crs = parse_crs(source.crs.to_wkt(), name)
-    factor = 1.0 if is_local(crs) else metres_up(crs)
-    if factor == 1.0 or parts(crs)[1] is not None:
-        return factor, ()
-    sentence = f"{name}: has no unit of heights; that of its CRS is assumed ({factor:.4f} m)."
-    return factor, (PcfixWarning("water.raster_unit", sentence, unit_m=factor),)
+    return _Part(heights, source.window_transform(window), tuple(notes))
 
 
 def _check_known(heights: FloatArray, name: str) -> None:

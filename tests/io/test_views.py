@@ -234,7 +234,7 @@ def test_tolerance(tmp_path, cameras, scene):
     views = read_views(write_ply(tmp_path / "d.ply", xyz, lists), cameras)
     moved = xyz + np.array([0, 0, 0.3])
     strict = ViewMatch(views, cameras)
-    loose = ViewMatch(replace(views, default_spacings=0.3001 / views.spacing_m), cameras)
+    loose = ViewMatch(replace(views, tolerance_spacings=0.3001 / views.spacing_m), cameras)
     assert strict.report.tolerance_m < 0.3
     assert given(strict, moved)[0] == [[]] * 400 and strict.report.unmatched == 400
     with refused("views.no_match", points=400, listed=400):
