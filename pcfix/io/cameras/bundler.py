@@ -26,6 +26,7 @@ import numpy as np
 
 from pcfix.io.cameras import checks, tracks
 from pcfix.io.cameras.formats import Source
+from pcfix.io.tables import read_lines
 from pcfix.lens.rotations import from_photogrammetric
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
 
@@ -58,7 +59,7 @@ def read(source: Source) -> Cameras:
     places = [path.with_name(name) for name in (*(f"{one}.list.txt" for one in own), "list.txt")]
     for place in (path.parent.parent / "list.txt", *places[::-1]):  # the last that fits counts
         if place.is_file():
-            lines = [line.strip() for line in checks.read_text(place).splitlines() if line.strip()]
+            lines = [line.strip() for line in read_lines(place) if line.strip()]
             if len(lines) == len(names):
                 names = [_FOCAL_OF_LIST.sub("", line) for line in lines]
     labels, rows = tuple(names[i] for i in bundle.posed), bundle.cameras[bundle.posed]
@@ -95,12 +96,12 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
 
 
 def _read(path: Path) -> Bundle:
-    head, _, body = checks.read_text(path).partition("\n")
+    head, *body = read_lines(path)
     version = _BUNDLER.match(head)
     if version and version[1] != _VERSION:
         what = f"Bundler's format v{version[1]}"
         raise checks.unsupported(path, what, f"Export v{_VERSION}", version=version[1])
-    values = tracks.numbers(body)
+    values = np.array(" ".join(body).split(), np.float64)
     count, points = int(values[0]), int(values[1])
     end = 2 + _CAMERA_NUMBERS * count
     listed = tracks.point_list(path, values[end:], points, count, 4 if version else 3)

@@ -21,8 +21,7 @@ import numpy as np
 from pcfix.errors import InputError, PcfixError, PcfixWarning, bad_file
 from pcfix.io.cameras.formats import Source
 from pcfix.io.files import check_output, parse_json, write_bytes
-from pcfix.io.tables import read_lines
-from pcfix.model import Cameras, FloatArray, Lens
+from pcfix.model import BoolArray, Cameras, FloatArray, Lens
 
 ROUNDING = 1e-3
 """Of a rotation's elements: files with four decimals pass, a mirrored or scaled one does not."""
@@ -106,11 +105,6 @@ def reading(path: object) -> Iterator[None]:
         raise damaged(path, error or type(error).__name__) from error
 
 
-def read_text(path: Path) -> str:
-    """Return the text of a file; bytes that are not UTF-8 can only be in names."""
-    return "\n".join(read_lines(path))
-
-
 def read_xml(path: Path, stream: IO[bytes] | None = None) -> Element:
     """Return the root of a document, from `stream` where it lies in an archive."""
     from defusedxml.ElementTree import parse
@@ -161,11 +155,8 @@ def rotations(path: Path, labels: Sequence[str], matrices: FloatArray) -> FloatA
     """Return the proper rotations closest to matrices, shape (k, 3, 3), rounded in their file."""
     matrices = np.asarray(matrices, np.float64).reshape(-1, 3, 3)
     off = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    bad = ~((off <= ROUNDING) & (np.linalg.det(np.nan_to_num(matrices, posinf=0.0)) > 0.0))
-    if bad.any():
-        label = labels[int(np.argmax(bad))]
-        sentence = f"the rotation of {label} is mirrored or skewed. Export the poses again."
-        raise bad_file(path, "cameras.rotation", sentence, image=label)
+    good = (off <= ROUNDING) & (np.linalg.det(np.nan_to_num(matrices, posinf=0.0)) > 0.0)
+    _check_rotations(path, labels, good, "the rotation of {} is mirrored or skewed")
     for _ in range(2):  # Newton's iteration to the polar factor squares the rounding each time
         matrices = 1.5 * matrices - 0.5 * matrices @ matrices.transpose(0, 2, 1) @ matrices
     return matrices
@@ -175,12 +166,16 @@ def quaternions(path: Path, labels: Sequence[str], wxyz: FloatArray) -> FloatArr
     """Return the rotations, shape (k, 3, 3), of unit quaternions (k, 4), the scalar first."""
     from scipy.spatial.transform import Rotation
 
-    bad = ~(np.abs(np.linalg.norm(wxyz, axis=1) - 1.0) <= ROUNDING)
-    if bad.any():
-        label = labels[int(np.argmax(bad))]
-        sentence = f"the quaternion of {label} has not the length 1. Export the poses again."
-        raise bad_file(path, "cameras.rotation", sentence, image=label)
+    good = np.abs(np.linalg.norm(wxyz, axis=1) - 1.0) <= ROUNDING
+    _check_rotations(path, labels, good, "the quaternion of {} has not the length 1")
     return np.asarray(Rotation.from_quat(np.roll(wxyz, -1, axis=1)).as_matrix())
+
+
+def _check_rotations(path: Path, labels: Sequence[str], good: BoolArray, what: str) -> None:
+    if not good.all():
+        label = labels[int(np.argmin(good))]
+        sentence = f"{what.format(label)}. Export the poses again."
+        raise bad_file(path, "cameras.rotation", sentence, image=label)
 
 
 def centres(rotations: FloatArray, translations: FloatArray) -> FloatArray:

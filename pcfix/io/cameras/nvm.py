@@ -31,6 +31,7 @@ import numpy as np
 
 from pcfix.io.cameras import checks, tracks
 from pcfix.io.cameras.formats import Source
+from pcfix.io.tables import read_lines
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
 
 _HEAD = re.compile(r"NVM_V3(_R9T)?\b(?:\s*FixedK\s+(.*))?")
@@ -99,12 +100,11 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
 
 def _models(path: Path) -> list[Model]:
     """Return all models of the file."""
-    head, _, body = checks.read_text(path).lstrip().partition("\n")
+    head, *lines = [x for line in read_lines(path) if (x := line.strip()) and x[0] != "#"]
     found = _HEAD.match(head)
     matrix, held = found.groups() if found else (None, None)
-    lines = [line for line in body.splitlines() if line.strip() and line.lstrip()[0] != "#"]
     width = _MATRIX_NUMBERS if matrix else _QUATERNION_NUMBERS
-    fixed = tuple(tracks.numbers(held)[:4].tolist()) if held else None
+    fixed = tuple(map(float, held.split()[:4])) if held else None
     models = []
     at = 0
     while at < len(lines) and (count := int(lines[at])) > 0:
@@ -113,7 +113,7 @@ def _models(path: Path) -> list[Model]:
         numbers = np.array([row[1:] for row in rows], np.float64).reshape(count, width)
         at += 1 + count
         points = int(lines[at])
-        values = tracks.numbers("\n".join(lines[at + 1 : at + 1 + points]))
+        values = np.array(" ".join(lines[at + 1 : at + 1 + points]).split(), np.float64)
         listed = tracks.point_list(path, values, points, count, 4)
         models.append(Model(names, numbers, listed, fixed))
         at += 1 + points

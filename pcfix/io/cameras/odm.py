@@ -39,6 +39,7 @@ from pcfix.io.cameras.checks import damaged, load_json, note, triple
 from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.opensfm import is_panorama, lens
 from pcfix.io.crs import Topocentric
+from pcfix.io.tables import read_lines
 from pcfix.lens.rotations import from_rotation_vectors
 from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, TiePoints
 
@@ -192,7 +193,7 @@ def _frame(project: Project, found: opensfm.Reconstruction) -> Frame:
     path = project.find(TRANSFORMATION)
     if path is not None:
         with checks.reading(path):
-            rows = [row.split()[:4] for row in checks.read_text(path).splitlines() if row.strip()]
+            rows = [row.split()[:4] for row in read_lines(path) if row.strip()]
             matrix = np.array(rows, float).reshape(4, 4)
         turn, shift = matrix[:3, :3], matrix[:3, 3]
         if not (np.abs(turn.T @ turn - np.eye(3)).max() <= SCALE_TOLERANCE):

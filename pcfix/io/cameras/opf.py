@@ -58,7 +58,11 @@ def read(source: Source) -> Cameras:
     project = _open_project(source.path)
     path, calibrated = project.part("calibration", "calibrated-cameras")
     _, given = project.part("input_cameras", "input-cameras", needed=False)
-    frame, names = _frame_of(project), _image_names(project)
+    frame, names = _frame_of(project), dict[int, str]()
+    for listed in project.files("camera_list", FORMAT.format("camera-list")):
+        for camera in load_json(listed)["cameras"] if listed.is_file() else []:
+            name = camera["uri"].replace("\\", "/").rpartition("/")[2]
+            names[camera["id"]] = unquote(name.removesuffix("#page=0"))  # others keep their page
     shots = {shot["id"]: shot for shot in calibrated["cameras"]}
     labels = tuple(names.get(i, f"camera {i}") for i in shots)
     xyz = np.array([triple(shot["position"]) for shot in shots.values()]).reshape(-1, 3)
@@ -139,16 +143,6 @@ def _open_project(path: Path) -> Project:
         sentence = f"belongs to one of {len(found)} OPF projects. Give the project file (.opf)."
         raise bad_file(path, "cameras.several_projects", sentence, projects=len(found))
     return _open_project(found[0])
-
-
-def _image_names(project: Project) -> dict[int, str]:
-    """Return the names of the images by their ids; of a page of a file with its number."""
-    names = {}
-    for path in project.files("camera_list", FORMAT.format("camera-list")):
-        for camera in load_json(path)["cameras"] if path.is_file() else []:
-            name = camera["uri"].replace("\\", "/").rpartition("/")[2]
-            names[camera["id"]] = unquote(name.removesuffix("#page=0"))
-    return names
 
 
 class Frame(NamedTuple):

@@ -33,8 +33,9 @@ import numpy as np
 
 from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.cameras import checks, tracks
-from pcfix.io.cameras.checks import damaged, note, number, read_text, read_xml
+from pcfix.io.cameras.checks import damaged, note, number, read_xml
 from pcfix.io.cameras.formats import Source
+from pcfix.io.tables import read_lines
 from pcfix.lens.rotations import from_omega_phi_kappa
 from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, TiePoints
 
@@ -107,7 +108,7 @@ def read(source: Source) -> Cameras:
     same: dict[Lens, Lens] = {}  # images of a camera share its lens
     lenses = tuple(same.setdefault(lens, lens) for lens in own if lens is not None)
     gnss, others = _priors(files["project"], labels) if "project" in files else (None, [])
-    wkt = read_text(files["wkt"]).strip() if "wkt" in files else ""
+    wkt = " ".join(read_lines(files["wkt"])).strip() if "wkt" in files else ""
     return Cameras(
         labels=tuple(labels),
         centres=centres,
@@ -228,7 +229,7 @@ def _absolute(files: Files, images: list[Image]) -> tuple[FloatArray, tuple[Pcfi
         sentence = "there is no offset.xyz beside it. Give the offset with --cameras-offset."
         return local, (note(files["parameters"], "cameras.no_offset", sentence),)
     # one line, or one for each group of images whose names begin alike
-    lines = [line.split() for line in read_text(files["offset"]).replace(",", " ").splitlines()]
+    lines = [line.replace(",", " ").split() for line in read_lines(files["offset"])]
     offsets = [
         (" ".join(words[:-3]), _numbers(files["offset"], "the offset", words[-3:]))
         for words in lines
@@ -294,7 +295,7 @@ class Image(NamedTuple):
 
 def read_parameters(path: Path) -> list[Image]:
     """Read the camera parameters; their layout is what the header names with sizes."""
-    lines = [line for line in read_text(path).splitlines() if line.strip()]
+    lines = [line for line in read_lines(path) if line.strip()]
     layout, row = [], 1
     for i, line in enumerate(lines[:20], start=1):
         if shape := SHAPE.match(line):
@@ -331,7 +332,7 @@ def _numbers(path: Path, where: str, words: list[str]) -> FloatArray:
 
 def read_external(path: Path) -> tuple[list[str], FloatArray, FloatArray]:
     """Read the absolute table: labels, centres (k, 3) and rotations (k, 3, 3)."""
-    rows = [line.rsplit(None, 6) for line in read_text(path).splitlines()[1:] if line.strip()]
+    rows = [line.rsplit(None, 6) for line in read_lines(path)[1:] if line.strip()]
     if not rows:
         raise damaged(path, "has a header but no images")
     values = np.array([_numbers(path, f"image {row[0]}", row[1:]) for row in rows])
@@ -345,7 +346,7 @@ def read_calibrations(path: Path) -> list[dict[str, float]]:
     Of each come the first number of each line by its name, and `width`, `height` of the sensor, mm.
     """
     cameras: list[dict[str, float]] = []
-    for line in read_text(path).splitlines():
+    for line in read_lines(path):
         words = line.split()
         if line.lower().startswith("pix4d camera calibration file"):
             cameras.append({"width": 0.0, "height": 0.0})
@@ -444,7 +445,7 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
         names, point = np.unique(points[posed], return_inverse=True)
         known = {}  # where the adjustment placed the control points
         if "gcps" in files:
-            lines = [line.split(",") for line in read_text(files["gcps"]).splitlines()[1:]]
+            lines = [line.split(",") for line in read_lines(files["gcps"])[1:]]
             known = {row[0].strip(): checks.triple(row[4:7]) for row in lines if len(row) > 1}
         unknown = np.full(3, np.nan)
         xyz = np.array([known.get(name.partition("_")[2], unknown) for name in names.tolist()])
@@ -459,7 +460,7 @@ def _measured(path: Path, rows: dict[str, int]) -> list[tuple[str, int, list[str
     """
     found = []
     image: tuple[int, list[str]] | None = None
-    for line in read_text(path).splitlines():
+    for line in read_lines(path):
         words = line.split()
         if not words or words[0] == "-99":
             image = None

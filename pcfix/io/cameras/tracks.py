@@ -98,11 +98,6 @@ class PointList(NamedTuple):
         return tie_points(Seen(self.xyz, self.point, camera, np.array(middle)[camera] + places))
 
 
-def numbers(text: str) -> FloatArray:
-    """Return all numbers of a text that holds nothing else but white space."""
-    return np.array(text.split(), np.float64)
-
-
 def point_list(path: Path, body: FloatArray, count: int, images: int, width: int) -> PointList:
     """Take apart a list of x y z, red green blue, n, and n views of `width` numbers.
 

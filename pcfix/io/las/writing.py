@@ -26,7 +26,7 @@ from pyproj import CRS
 from pcfix.errors import SettingError, bad_file
 from pcfix.io.atomic import cannot_write, temporary_output
 from pcfix.io.files import parse_json
-from pcfix.io.las.columns import Column, column_scale, upgraded
+from pcfix.io.las.columns import UPGRADE, Column, column_scale
 from pcfix.io.las.part import part_report
 from pcfix.io.las.source import (
     IDENTITY_PLACE,
@@ -114,7 +114,8 @@ def _upgraded(
     """
     old = source.header
     header = _copied(old)
-    point_format = upgraded(old.point_format)
+    point_format = laspy.PointFormat(UPGRADE[old.point_format.id])
+    point_format.dimensions.extend(old.point_format.extra_dimensions)
     for param in params:
         point_format.add_extra_dimension(param)
     version = max(old.version, laspy.header.Version(1, 4))

@@ -57,6 +57,7 @@ from pcfix.io.crs import (
     shortened,
     transformation,
 )
+from pcfix.io.tables import read_lines
 from pcfix.lens.rotations import from_rotation_vectors
 from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, Projection, TiePoints
 from pcfix.options.declare import File
@@ -141,7 +142,7 @@ def read_reconstruction(path: Path) -> Reconstruction:
         crs = "local" if reference is None else "ENU:" + ",".join(map(repr, reference))
         has_gnss = reference is not None and np.isfinite(xyz).any()
         listed = path.with_name("image_list.txt")  # the images that the project was given
-        lines = checks.read_text(listed).splitlines() if listed.is_file() else []
+        lines = read_lines(listed) if listed.is_file() else []
         given = [PurePath(line.strip().replace("\\", "/")).name for line in lines if line.strip()]
         cameras = Cameras(
             labels=tuple(shots),
@@ -218,39 +219,27 @@ def read_tie_points(reconstruction: Reconstruction) -> TiePoints:
         why = "it has no points" if not points else "tracks.csv is not beside it"
         raise tracks.no_tie_points(path, why)
     xyz = np.array([point["coordinates"] for point in points.values()], float).reshape(-1, 3)
-    with checks.reading(beside):
-        point, camera, xy = _observations(beside, list(points), cameras.labels)
-    order = np.lexsort((camera, point))
-    size = np.array([(lens.width, lens.height) for lens in cameras.lenses or ()])[camera]
-    uv = xy * size.max(axis=1, initial=0.0)[:, None] + size / 2.0
-    return tracks.tie_points(tracks.Seen(xyz, point[order], camera[order], uv[order]))
-
-
-def _observations(
-    path: Path, points: list[str], labels: tuple[str, ...]
-) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return point row, camera row and normalised x, y of every line that has both.
-
-    Lines are read in blocks, as there can be many millions.
-    """
     camera_of, point_of = (
         {name.encode(errors="replace"): i for i, name in enumerate(names)}
-        for names in (labels, points)
+        for names in (cameras.labels, points)
     )
     parts: list[tuple[IntArray, IntArray, FloatArray]] = []
-    with path.open("rb") as stream:
-        while block := stream.readlines(CHUNK_BYTES):
+    with checks.reading(beside), beside.open("rb") as stream:
+        while block := stream.readlines(CHUNK_BYTES):  # there can be many millions of lines
             lines = [line.split(b"\t", 5) for line in block if line.strip()]
             lines = lines[1:] if not parts and block[0].startswith(HEADER) else lines
             point = np.array([point_of.get(fields[1], -1) for fields in lines], dtype=np.int64)
             camera = np.array([camera_of.get(fields[0], -1) for fields in lines], dtype=np.int64)
             values = np.array([fields[3:5] for fields in lines], dtype=float).reshape(-1, 2)
-            keep = (point >= 0) & (camera >= 0)
-            parts.append((point[keep], camera[keep], values[keep]))
+            known = (point >= 0) & (camera >= 0)
+            parts.append((point[known], camera[known], values[known]))
     if not parts:
-        raise checks.damaged(path, "it is empty")
+        raise checks.damaged(beside, "it is empty")
     point, camera, xy = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return point, camera, xy
+    order = np.lexsort((camera, point))
+    size = np.array([(lens.width, lens.height) for lens in cameras.lenses or ()])[camera]
+    uv = xy * size.max(axis=1, initial=0.0)[:, None] + size / 2.0
+    return tracks.tie_points(tracks.Seen(xyz, point[order], camera[order], uv[order]))
 
 
 PANORAMAS = frozenset({"equirectangular", "spherical"})

@@ -421,7 +421,7 @@ def crs(columns: Columns) -> tuple[str | None, tuple[PcfixWarning, ...]]:
     """
     said, beside = columns.crs, columns.path.with_suffix(".prj")
     if not said and beside != columns.path and beside.is_file():
-        said = checks.read_text(beside).strip() or None
+        said = " ".join(read_lines(beside)).strip() or None
     if said is None:
         if axes(columns.place) != ("longitude", "latitude", "z"):
             return None, ()
