@@ -37,8 +37,8 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning, bad_file
+from pcfix.io.cameras.checks import Source
 from pcfix.io.cameras.checks import number as xml_number
-from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.metashape import SPREADS, documents, spreads
 from pcfix.io.cameras.metashape.documents import Chunk
 from pcfix.io.cameras.odm import named_crs

@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import shapely
@@ -114,11 +114,6 @@ def check_one_file(cloud: Any, options: Any) -> None:
 def inputs_of(cloud: Any) -> list[Any]:
     """Return the files of a cloud, one or many."""
     return [*cloud.paths, *cloud.broken] if isinstance(cloud, Tiles) else [cloud]
-
-
-def single(cloud: Clouds) -> File:
-    """Return the path of a single file."""
-    return cast(File, cloud)
 
 
 def tiles_of(cloud: Clouds) -> Tiles | None:

@@ -22,13 +22,14 @@ from pcfix.errors import InputError, SettingError, bad_file
 from pcfix.io.cameras.checks import (
     DAMAGES,
     NO_LENS,
+    Angles,
+    Source,
     checked,
     damaged,
     no_pose,
     reading,
     sensor_unused,
 )
-from pcfix.io.cameras.formats import Angles, Source
 from pcfix.io.files import check_input
 from pcfix.model import Cameras, TiePoints
 from pcfix.options.declare import File

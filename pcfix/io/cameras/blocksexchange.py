@@ -42,12 +42,10 @@ import numpy as np
 
 from pcfix.errors import InputError, bad_file
 from pcfix.io.cameras import checks, tracks
-from pcfix.io.cameras.checks import damaged, note, number, read_xml, text_of
-from pcfix.io.cameras.formats import Source
+from pcfix.io.cameras.checks import ZIP_MAGIC, Source, damaged, note, number, read_xml, text_of
 from pcfix.lens.rotations import from_omega_phi_kappa, from_photogrammetric
 from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, TiePoints
 
-ZIP_MAGIC = b"PK\x03\x04"
 COMMENT = re.compile(rb"<!--.*?-->", re.DOTALL)
 TIE_POINTS = re.compile(rb"<TiePoints>(.*?)</TiePoints>", re.DOTALL)
 EXTERNAL = re.compile(rb"<Path>\s*([^<]*?)\s*</Path>")

@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.io.cameras import checks, tracks
-from pcfix.io.cameras.formats import Source
+from pcfix.io.cameras.checks import Source
 from pcfix.io.tables import read_lines
 from pcfix.lens.rotations import from_photogrammetric
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints

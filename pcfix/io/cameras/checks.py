@@ -1,4 +1,4 @@
-"""Shared by the readers: errors and notes, numbers, XML and JSON, rotations, lenses, CRS."""
+"""Shared by the readers: their input, errors, numbers, XML and JSON, rotations, lenses, CRS."""
 
 from __future__ import annotations
 
@@ -11,18 +11,19 @@ import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import astuple, replace
+from dataclasses import astuple, dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Literal
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from pcfix.errors import InputError, PcfixError, PcfixWarning, bad_file
-from pcfix.io.cameras.formats import Source
-from pcfix.io.files import check_output, parse_json, write_bytes
+from pcfix.io.files import check_input, check_output, parse_json, write_bytes
 from pcfix.model import BoolArray, Cameras, FloatArray, Lens
 
+ZIP_MAGIC = b"PK\x03\x04"
 ROUNDING = 1e-3
 """Of a rotation's elements: files with four decimals pass, a mirrored or scaled one does not."""
 SAME_LENS = 1e-12
@@ -34,6 +35,41 @@ DAMAGES = (
     *(zipfile.BadZipFile, zlib.error),
 )
 """What readers run into where a file is cut off, or holds something else than it should."""
+
+Angles = Literal["omega-phi-kappa", "yaw-pitch-roll", "aircraft"]
+
+_HEAD_BYTES = 4096
+
+
+@dataclass(frozen=True)
+class Source:
+    """A file or folder that may hold cameras, and what the user said about it.
+
+    `sensor` is the ``--sensor`` file, `angles` the kind of angles of a table whose header does not
+    say it.
+    """
+
+    path: Path
+    sensor: Path | None = None
+    angles: Angles | None = None
+
+    @cached_property
+    def head(self) -> bytes:
+        """The first bytes of a file; nothing of a folder."""
+        if self.path.is_dir():
+            return b""
+        with check_input(self.path).open("rb") as stream:
+            return stream.read(_HEAD_BYTES)
+
+    @cached_property
+    def text(self) -> str:
+        """The first bytes as text, without a byte order mark."""
+        return self.head.decode("utf-8-sig", errors="replace")
+
+    @cached_property
+    def names(self) -> frozenset[str]:
+        """Names of what lies in a folder; nothing for a file."""
+        return frozenset(p.name for p in self.path.iterdir()) if self.path.is_dir() else frozenset()
 
 
 def damaged(path: object, why: object) -> InputError:

@@ -50,8 +50,7 @@ import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.cameras import checks, tracks
-from pcfix.io.cameras.checks import damaged, terms
-from pcfix.io.cameras.formats import Source
+from pcfix.io.cameras.checks import Source, damaged, terms
 from pcfix.io.cameras.tracks import NO_TIE_POINTS, are_seen
 from pcfix.io.crs import is_topocentric
 from pcfix.io.tables import read_lines

@@ -37,9 +37,8 @@ import numpy as np
 
 from pcfix.errors import InputError, bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import damaged, number, numbers, read_xml
+from pcfix.io.cameras.checks import Source, damaged, number, numbers, read_xml
 from pcfix.io.cameras.checks import text_of as _text
-from pcfix.io.cameras.formats import Source
 from pcfix.model import Cameras, FloatArray, Lens
 
 PREFIX, PREFIX_2, SUFFIX = "Orientation-", "Ori-PerspCentral-", ".xml"

@@ -35,8 +35,7 @@ import numpy as np
 
 from pcfix.errors import bad_file
 from pcfix.io.cameras import checks, opensfm
-from pcfix.io.cameras.checks import damaged, load_json, note, triple
-from pcfix.io.cameras.formats import Source
+from pcfix.io.cameras.checks import Source, damaged, load_json, note, triple
 from pcfix.io.cameras.opensfm import is_panorama, lens
 from pcfix.io.crs import Topocentric
 from pcfix.io.tables import read_lines

@@ -32,8 +32,7 @@ import numpy as np
 
 from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.cameras import checks, tracks
-from pcfix.io.cameras.checks import load_json, note, triple
-from pcfix.io.cameras.formats import Source
+from pcfix.io.cameras.checks import Source, load_json, note, triple
 from pcfix.io.crs import crs_text, parse_crs, plan_unit
 from pcfix.lens.rotations import from_omega_phi_kappa
 from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, TiePoints
@@ -146,7 +145,7 @@ def _open_project(path: Path) -> Project:
 
 
 class Frame(NamedTuple):
-    """The way from the processing CRS to coordinates east, north, up of the project's."""
+    """The processing CRS: coordinates east, north, up of `crs` times `scale`, plus `shift`."""
 
     crs: str
     project_crs: str | None

@@ -33,8 +33,7 @@ import numpy as np
 
 from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.cameras import checks, tracks
-from pcfix.io.cameras.checks import damaged, note, number, read_xml
-from pcfix.io.cameras.formats import Source
+from pcfix.io.cameras.checks import Source, damaged, note, number, read_xml
 from pcfix.io.tables import read_lines
 from pcfix.lens.rotations import from_omega_phi_kappa
 from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, TiePoints

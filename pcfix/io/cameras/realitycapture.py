@@ -35,8 +35,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import number, numbers, read_xml
-from pcfix.io.cameras.formats import Source
+from pcfix.io.cameras.checks import Source, number, numbers, read_xml
 from pcfix.io.cameras.table.sensor import read_sensor
 from pcfix.io.cameras.tracks import image_size
 from pcfix.model import Cameras, FloatArray, Lens

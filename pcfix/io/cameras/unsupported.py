@@ -13,7 +13,7 @@ from typing import NoReturn
 import numpy as np
 
 from pcfix.errors import bad_file
-from pcfix.io.cameras.formats import Source
+from pcfix.io.cameras.checks import Source
 from pcfix.io.tables import number
 
 POSES = "Give the file or folder with the camera poses"

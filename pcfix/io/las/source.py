@@ -226,7 +226,6 @@ class LasSource:
             with las_errors(self.path):
                 self.held = len(self)
             self._check_header()
-            self._check_count()
             if isinstance(self.path, CloudPart):
                 extent = extent_of(self.path, self.header, self._chunks_of(self.path))
                 self._reader.seek(0)
@@ -249,6 +248,7 @@ class LasSource:
         return int(self.header.point_count)
 
     def _check_header(self) -> None:
+        """Refuse unusable scales, an empty cloud, and a count that disagrees with the points."""
         scales, offsets = self.header.scales, self.header.offsets
         usable = (scales > 0.0) & (scales <= MOST_SCALE_M)
         # steps below the last digit of the offsets would be lost in coordinates
@@ -258,18 +258,13 @@ class LasSource:
                 f" {MOST_SCALE_M:,.0f}, or too small for its offsets {offsets.tolist()}."
             )
             raise bad_file(self.path, "cloud.scales", f"{sentence} Export the cloud again.")
-        if len(self) == 0:
-            raise bad_file(self.path, "cloud.empty", "contains no points.")
-
-    def _check_count(self) -> None:
-        """Refuse a header whose number of points disagrees with the points, which would be lost."""
         stated = len(self)
+        if stated == 0:
+            raise bad_file(self.path, "cloud.empty", "contains no points.")
+        # points that the header does not count would be lost
+        packed = self.header.are_points_compressed
         with las_errors(self.path):
-            least, most = (
-                self._points_of_chunks()
-                if self.header.are_points_compressed
-                else self._points_of_records()
-            )
+            least, most = self._points_of_chunks() if packed else self._points_of_records()
         if not least <= stated <= most:
             held = f"{least:,}" if least == most else f"{least:,} to {most:,}"
             sentence = f"its header counts {stated:,} points, but it holds {held}. Export it again."

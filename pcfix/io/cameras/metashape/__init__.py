@@ -49,8 +49,7 @@ import numpy as np
 
 from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import damaged, note, number, numbers, read_xml, terms, text_of
-from pcfix.io.cameras.formats import Source
+from pcfix.io.cameras.checks import Source, damaged, note, number, numbers, read_xml, terms, text_of
 from pcfix.io.cameras.metashape import documents
 from pcfix.io.cameras.metashape.documents import Chunk, Document, open_archive, recognises, unpacked
 from pcfix.io.cameras.tracks import Seen, no_tie_points

@@ -13,10 +13,17 @@ from xml.etree.ElementTree import Element
 
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import damaged, missing, note, number, read_xml, reading
-from pcfix.io.cameras.formats import Source
+from pcfix.io.cameras.checks import (
+    ZIP_MAGIC,
+    Source,
+    damaged,
+    missing,
+    note,
+    number,
+    read_xml,
+    reading,
+)
 
-ZIP_MAGIC = b"PK\x03\x04"
 ROOT = re.compile(r"\s*(?:<\?.*?\?>\s*|<!--.*?-->\s*)*<(\w+)", re.DOTALL)
 OF_CHUNKS = re.compile(r"<chunks?\b|\bpath=")
 INSIDE = {"document": OF_CHUNKS, "collection": OF_CHUNKS, "chunk": re.compile(r"<sensors\b")}

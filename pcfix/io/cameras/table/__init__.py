@@ -48,8 +48,7 @@ import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning, bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import note
-from pcfix.io.cameras.formats import Angles, Source
+from pcfix.io.cameras.checks import Angles, Source, note
 from pcfix.io.cameras.table.sensor import (
     DISTORTION,
     FILM_MM,
