@@ -15,18 +15,10 @@ import numpy.typing as npt
 import shapely
 
 from pcfix.errors import PcfixWarning, SettingError, bad_file
+from pcfix.io import tables
 from pcfix.io.atomic import cannot_write, temporary_output
 from pcfix.io.crs import LOCAL, parse_crs, way_to_cloud
 from pcfix.io.files import check_input, check_output
-from pcfix.io.tables import (
-    DEGREES,
-    METRES,
-    check_columns,
-    columns_of,
-    read_lines,
-    split_header,
-    table_below,
-)
 from pcfix.libraries import optional_library
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
@@ -209,7 +201,7 @@ def _read_text(path: Path) -> tuple[Geometries, str | None]:
     A comment ``# crs: EPSG:25830`` above the rest names it, or ``SRID=25830;`` before a WKT;
     for longitude and latitude it is WGS 84.
     """
-    lines = read_lines(path)
+    lines = tables.read_lines(path)
     stated = [found[1].strip() for line in lines[:20] if (found := _CRS.match(line.strip()))]
     numbered = enumerate(lines, start=1)
     used = [(n, line) for n, line in numbered if line.strip() and line.lstrip()[0] != "#"]
@@ -243,11 +235,11 @@ def _from_table(path: Path, lines: list[str], at: int) -> tuple[Geometries, str 
 
     A point whose height is empty has none.
     """
-    names, delimiter = split_header(lines[at])
-    table = table_below(path, lines, names, delimiter, at=at, comments=True)
-    units = (*METRES, *DEGREES)
+    names, delimiter = tables.split_header(lines[at])
+    table = tables.table_below(path, lines, names, delimiter, at=at, comments=True)
+    units = (*tables.METRES, *tables.DEGREES)
     column = {
-        role: next(iter(columns_of(path, names, spellings, units)), None)
+        role: next(iter(tables.columns_of(path, names, spellings, units)), None)
         for role, spellings in COLUMNS.items()
     }
     if column["wkt"] is not None:
@@ -256,7 +248,9 @@ def _from_table(path: Path, lines: list[str], at: int) -> tuple[Geometries, str 
     if x is None or y is None:
         x, y, crs = column["longitude"], column["latitude"], WGS84
     if x is None or y is None:
-        check_columns(path, names, ("x and y", "or longitude and latitude", "or wkt"), ("x, y",))
+        tables.check_columns(
+            path, names, ("x and y", "or longitude and latitude", "or wkt"), ("x, y",)
+        )
     plan = np.column_stack([table.numbers(str(x)), table.numbers(str(y))])
     if column["z"] is None:
         return np.asarray(shapely.points(plan)), crs

@@ -21,17 +21,8 @@ import numpy as np
 import shapely
 
 from pcfix.errors import GeometryError, PcfixWarning, SettingError, bad_file
-from pcfix.io.crs import (
-    LOCAL,
-    Notes,
-    Points,
-    is_local,
-    metres_up,
-    parse_crs,
-    parts,
-    transformation,
-    way_to_cloud,
-)
+from pcfix.io import crs as systems
+from pcfix.io.crs import Points
 from pcfix.io.files import check_input
 from pcfix.io.labels import match_labels
 from pcfix.io.ply import Records
@@ -232,13 +223,13 @@ def read_water_raster(
         share = np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0), (0.5, 0.5)])
         x, y = place_of(t, *(share * [source.width, source.height]).T)
         at = np.column_stack([x, y, 0.0 * x])
-        to_cloud, notes = way_to_cloud(stated, cloud_crs, at, name, heights=True)
+        to_cloud, notes = systems.way_to_cloud(stated, cloud_crs, at, name, heights=True)
         from_cloud: Points = np.asarray  # in plan
         if to_cloud is not None and stated is not None and cloud_crs is not None:
-            cloud, crs = parse_crs(cloud_crs, "the cloud"), parse_crs(stated, name)
+            cloud, crs = systems.parse_crs(cloud_crs, "the cloud"), systems.parse_crs(stated, name)
             near = to_cloud(at) if bounds is None else _edge(bounds)
-            from_cloud = transformation(cloud, crs, near, name, heights=False).forward
-            forward, unit = to_cloud, [1.0, 1.0, metres_up(crs)]
+            from_cloud = systems.transformation(cloud, crs, near, name, heights=False).forward
+            forward, unit = to_cloud, [1.0, 1.0, systems.metres_up(crs)]
             to_cloud = lambda xyz: forward(xyz / unit)  # noqa: E731
         part = _read(source, name, None if bounds is None else from_cloud(_edge(bounds)))
     title = name.replace("\\", "/").rpartition("/")[2]
@@ -276,12 +267,14 @@ def write_water_raster(path: Path, water: WaterRaster, crs: str | None) -> None:
     from rasterio.transform import from_origin
 
     rows, columns = water.height_m.shape
-    named = crs is not None and crs.strip().lower() != LOCAL
-    parsed = parse_crs(crs or "", "cameras") if named else None
+    system = None
+    if crs is not None and crs.strip().lower() != systems.LOCAL:
+        parsed = systems.parse_crs(crs, "cameras")
+        system = None if systems.is_local(parsed) else rasterio.CRS.from_wkt(parsed.to_wkt())
     profile = {
         "driver": "GTiff", "width": columns, "height": rows, "count": 1, "dtype": "float64",
         "nodata": np.nan, "compress": "deflate", "predictor": 3,
-        "crs": (parsed and not is_local(parsed) and rasterio.CRS.from_wkt(parsed.to_wkt())) or None,
+        "crs": system,
         "transform": from_origin(water.left_m, water.top_m, *water.cell_m),
     }  # fmt: skip
     with rasterio.open(path, "w", **profile) as target:
@@ -302,7 +295,7 @@ class _Part(NamedTuple):
 
     heights: FloatArray
     transform: Affine
-    notes: Notes
+    notes: systems.Notes
 
 
 def _read(source: DatasetReader, name: str, near: FloatArray | None) -> _Part:
@@ -327,9 +320,9 @@ def _read(source: DatasetReader, name: str, near: FloatArray | None) -> _Part:
         raise bad_file(name, "water.raster_unit", sentence, value=unit)
     unit_m = _UNITS_M[unit.lower()]
     if unit_m is None and source.crs is not None:
-        crs = parse_crs(source.crs.to_wkt(), name)
-        unit_m = 1.0 if is_local(crs) else metres_up(crs)
-        if unit_m != 1.0 and parts(crs)[1] is None:
+        crs = systems.parse_crs(source.crs.to_wkt(), name)
+        unit_m = 1.0 if systems.is_local(crs) else systems.metres_up(crs)
+        if unit_m != 1.0 and systems.parts(crs)[1] is None:
             sentence = f"{name}: has no unit of heights; that of its CRS is assumed"
             sentence += f" ({unit_m:.4f} m)."
             notes.append(PcfixWarning("water.raster_unit", sentence, unit_m=unit_m))

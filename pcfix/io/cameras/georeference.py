@@ -21,33 +21,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pcfix.errors import PcfixWarning, bad_file
+from pcfix.io import crs as systems
 from pcfix.io.cameras.checks import note
 from pcfix.io.cameras.mistakes import UNDULATION_M
-from pcfix.io.crs import (
-    GEOGRAPHIC_WGS84,
-    LOCAL,
-    METRES,
-    HeightsError,
-    Topocentric,
-    Transformation,
-    check_projected_metres,
-    crs_text,
-    geographic_3d,
-    heights_agree,
-    heights_of,
-    is_local,
-    is_same_numbers,
-    is_topocentric,
-    metres_up,
-    parse_crs,
-    parts,
-    plan_unit,
-    shortened,
-    transformation,
-    typed,
-    unbound,
-    with_heights,
-)
 from pcfix.model import Cameras, FloatArray, GnssPositions
 
 if TYPE_CHECKING:
@@ -79,8 +55,8 @@ class Frame(NamedTuple):
         """
         if not self.direct:
             return np.ones_like(xyz)
-        size = np.full(len(xyz), plan_unit(self.crs)[1])
-        up = np.full(len(xyz), abs(metres_up(self.crs)))
+        size = np.full(len(xyz), systems.plan_unit(self.crs)[1])
+        up = np.full(len(xyz), abs(systems.metres_up(self.crs)))
         if self.crs.is_projected:
             return np.asarray(1.0 / np.column_stack([size, size, up]))
         meridian_m = EARTH_RADIUS_M * size
@@ -93,7 +69,7 @@ class Frame(NamedTuple):
             return
         if self.direct:
             code, kind = "cameras.degrees", "longitude and latitude"
-            turn = 2.0 * np.pi / plan_unit(self.crs)[1] * (1.0 + 1e-9)
+            turn = 2.0 * np.pi / systems.plan_unit(self.crs)[1] * (1.0 + 1e-9)
             bad = (np.abs(xyz[:, :2]) > [turn, turn / 4.0]).any(axis=1)
         else:
             code, kind = "cameras.geocentric", "geocentric coordinates"
@@ -108,14 +84,15 @@ class Frame(NamedTuple):
 
 def frame_of(text: str, name: str) -> Frame:
     """Return the frame that a text names: a CRS, or ``ENU:latitude,longitude,height``."""
-    if is_topocentric(text):
-        place = Topocentric.from_text(text, name)
-        return Frame(parse_crs(GEOGRAPHIC_WGS84, name), place.to_degrees, topocentric=True)
-    crs = parse_crs(text, name)
+    if systems.is_topocentric(text):
+        place = systems.Topocentric.from_text(text, name)
+        crs = systems.parse_crs(systems.GEOGRAPHIC_WGS84, name)
+        return Frame(crs, place.to_degrees, topocentric=True)
+    crs = systems.parse_crs(text, name)
     if crs.is_geocentric:
         from pyproj import Transformer
 
-        geographic = geographic_3d(crs)  # on the same datum
+        geographic = systems.geographic_3d(crs)  # on the same datum
         step = Transformer.from_crs(crs, geographic, always_xy=True)
         return Frame(geographic, lambda xyz: np.column_stack(step.transform(*xyz.T)))
     if not (crs.is_projected or crs.is_geographic):
@@ -126,15 +103,15 @@ def frame_of(text: str, name: str) -> Frame:
 
 def is_tied(crs: str | None, name: str) -> bool:
     """Whether a frame has its place on the earth."""
-    return crs is not None and (is_topocentric(crs) or _on_earth(crs, name) is not None)
+    return crs is not None and (systems.is_topocentric(crs) or _on_earth(crs, name) is not None)
 
 
 def _on_earth(crs: str | None, name: str) -> CRS | None:
     """Return a CRS that is tied to the earth; None for axes at a place and local frames."""
-    if crs is None or crs.strip().lower() == LOCAL or is_topocentric(crs):
+    if crs is None or crs.strip().lower() == systems.LOCAL or systems.is_topocentric(crs):
         return None
-    parsed = parse_crs(crs, name)
-    return None if is_local(parsed) else parsed
+    parsed = systems.parse_crs(crs, name)
+    return None if systems.is_local(parsed) else parsed
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +123,7 @@ class Georeference:
     """
 
     frame: Frame | None
-    transformation: Transformation | None
+    transformation: systems.Transformation | None
     offset: FloatArray
     crs: str | None
     notes: tuple[PcfixWarning, ...]
@@ -160,7 +137,7 @@ class Georeference:
             i = int(np.argmax(lost))
             x, y, z = cameras.centres[i] + self.offset
             sentence = f"image {cameras.labels[i]}: {x:.10g}, {y:.10g}, {z:.6g} is outside"
-            sentence += f" {shortened(self.crs or '')}. Check --cameras-crs."
+            sentence += f" {systems.shortened(self.crs or '')}. Check --cameras-crs."
             raise bad_file(self.name, "cameras.not_transformed", sentence, image=cameras.labels[i])
         if rotations is not None and self.transformation is not None:
             rotations = rotations @ self.turns(cameras.centres).transpose(0, 2, 1)
@@ -230,14 +207,14 @@ def georeference(
     if offset.shape != (3,) or not np.isfinite(offset).all():
         sentence = f"the offset {offset_m} is not three numbers. Give x, y, z."
         raise bad_file(name, "cameras.offset", sentence, value=offset_m)
-    cloud = None if cloud_crs is None else parse_crs(cloud_crs, "the cloud")
+    cloud = None if cloud_crs is None else systems.parse_crs(cloud_crs, "the cloud")
     # the frame of the cameras, and the CRS in which their software delivers clouds
     stated, project, given = cameras.crs, _on_earth(cameras.project_crs, name), cameras_crs or ""
     trusted = False  # heights of an unknown system are the cloud's
     if given.strip():
         stated, chosen = given.strip(), _on_earth(given, "--cameras-crs")
         if chosen is None or not chosen.is_geocentric:
-            trusted = chosen is None or heights_of(chosen) == "unstated"
+            trusted = chosen is None or systems.heights_of(chosen) == "unstated"
             own = None if chosen is None else _on_earth(cameras.crs, name)
             is_project = own is not None and own.is_geocentric
             stated, project = (cameras.crs, chosen) if is_project else (stated, None)
@@ -245,22 +222,24 @@ def georeference(
     if not is_tied(stated, name):
         if cloud is None:
             return Georeference(None, None, offset, stated, (), name)
-        if stated is not None and not given.strip() and not is_local(cloud):
+        if stated is not None and not given.strip() and not systems.is_local(cloud):
             sentence = f"is in a local frame, the cloud in {cloud.name}. Export the cameras in that"
             sentence += " CRS, or give --cameras-crs local to use their numbers as they are."
             raise bad_file(name, "cameras.local", sentence, cloud_crs=cloud.name)
-        return Georeference(None, None, offset, crs_text(cloud), (), name)
-    if cloud is not None and is_local(cloud):
-        sentence = f"is in {shortened(crs)}, the cloud in a local frame. Set the cloud's CRS, or"
+        return Georeference(None, None, offset, systems.crs_text(cloud), (), name)
+    if cloud is not None and systems.is_local(cloud):
+        sentence = (
+            f"is in {systems.shortened(crs)}, the cloud in a local frame. Set the cloud's CRS, or"
+        )
         sentence += " give --cameras-crs local to use the numbers as they are."
         raise bad_file(name, "cloud.local", sentence, crs=crs, cloud_crs=cloud.name)
     frame = frame_of(crs, name)
     if cloud is not None:
         return _into(cloud, frame, project, cameras, offset, name, trusted=trusted)
     if frame.topocentric or (frame.direct and frame.crs.is_projected):
-        unit, size = plan_unit(frame.crs)
+        unit, size = systems.plan_unit(frame.crs)
         words = frame.crs.name + ("" if size == 1.0 else f", unit {unit},")
-        words = shortened(crs) if frame.topocentric else words
+        words = systems.shortened(crs) if frame.topocentric else words
         found = Georeference(None, None, offset, stated, (), name)
     elif frame.direct or project is None or not project.is_projected:
         kind = "degrees" if frame.direct else "geocentric coordinates"
@@ -278,34 +257,34 @@ def _into(
     *, trusted: bool,
 ) -> Georeference:  # fmt: skip
     """Return the transformation of a frame that is tied to the earth to a CRS."""
-    check_projected_metres(cloud, "the cloud")
+    systems.check_projected_metres(cloud, "the cloud")
     if frame.direct and frame.crs.is_geographic and offset.any():
         sentence = f"an offset in metres cannot be added to degrees ({frame.crs.name}). Omit it."
         raise bad_file(name, "cameras.offset", sentence, value=offset.tolist())
     at = cameras.centres + offset
     frame.check(at, cameras.labels, name)
     target = cloud
-    if heights_of(cloud) == "unstated":  # then the heights are those that the software uses
-        vertical = parts(frame.crs if project is None else project)[1]
-        target = cloud if vertical is None else with_heights(cloud, vertical)
-    crs = crs_text(target)
+    if systems.heights_of(cloud) == "unstated":  # then the heights are those that the software uses
+        vertical = systems.parts(frame.crs if project is None else project)[1]
+        target = cloud if vertical is None else systems.with_heights(cloud, vertical)
+    crs = systems.crs_text(target)
     assumed = _assumed_heights(frame, target, project, trusted)
     notes = (note(name, "cameras.heights_assumed", f"{assumed}."),) if assumed else ()
     by_user = trusted and not frame.direct
-    heights = not (by_user or heights_agree(frame.crs, target))
-    if frame.direct and not heights and is_same_numbers(frame.crs, target):
+    heights = not (by_user or systems.heights_agree(frame.crs, target))
+    if frame.direct and not heights and systems.is_same_numbers(frame.crs, target):
         return Georeference(frame, None, offset, crs, notes, name)
-    plan = typed(parts(frame.crs if frame.direct else target)[0])
+    plan = systems.typed(systems.parts(frame.crs if frame.direct else target)[0])
     given = "ENU:latitude,longitude,height" if frame.topocentric else plan
     instead = f"or, if the heights of cameras and cloud agree, give --cameras-crs {given}"
-    step = transformation(
+    step = systems.transformation(
         frame.crs, target, frame.enter(at), name, heights=heights, instead=instead
     )
     of_step = (PcfixWarning("crs.transformation", str(one), path=name) for one in step.notes)
     found = Georeference(frame, step, offset, crs, (*of_step, *notes), name)
     # heights that --cameras-crs declares can be tested if the GNSS heights are above the geoid too
     gnss = cameras.gnss
-    testable = heights_of(target) == "gravity" and gnss is not None and gnss.crs is not None
+    testable = systems.heights_of(target) == "gravity" and gnss is not None and gnss.crs is not None
     if by_user and not frame.topocentric and testable:
         up = adjusted_minus_gnss(found.cameras(cameras), name).enu_m[:, 2]
         off = float(np.median(up[np.isfinite(up)])) if np.isfinite(up).any() else 0.0
@@ -320,8 +299,8 @@ def _into(
 
 def _assumed_heights(frame: Frame, target: CRS, project: CRS | None, trusted: bool) -> str:
     """Return what is assumed about heights, in words; nothing if both sides state theirs."""
-    own, cloud = heights_of(frame.crs), heights_of(target)
-    unit, size = plan_unit(frame.crs)
+    own, cloud = systems.heights_of(frame.crs), systems.heights_of(target)
+    unit, size = systems.plan_unit(frame.crs)
     axes = [e.semi_major_metre for e in (frame.crs.ellipsoid, target.ellipsoid) if e is not None]
     other_datum = bool(axes) and max(axes) - min(axes) > 1.0
     is_guess = other_datum or (project is None and not frame.topocentric)
@@ -365,7 +344,7 @@ def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> GnssDifferen
     tied = is_tied(cameras.crs, name)
     if gnss.crs in (None, cameras.crs):
         plain, gnss = cameras.centres - gnss.xyz, replace(gnss, crs=crs)
-        if not tied or is_topocentric(crs):
+        if not tied or systems.is_topocentric(crs):
             return GnssDifferences(plain)
         frame = frame_of(crs, name)
         if frame.direct and frame.crs.is_projected:
@@ -373,13 +352,13 @@ def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> GnssDifferen
     if gnss.crs is None or not tied or not is_tied(gnss.crs, name):
         reason = f"{name}: the cameras or the GNSS positions name no CRS; they are not compared."
         return GnssDifferences(np.full((len(cameras), 3), np.nan), reason)
-    kinds = [heights_of(frame_of(each, name).crs) for each in (crs, gnss.crs)]
+    kinds = [systems.heights_of(frame_of(each, name).crs) for each in (crs, gnss.crs)]
     who = "cameras" if kinds[0] == "unstated" else "GNSS"
     reason = f"{name}: the CRS of the {who} names no vertical datum; only plan is compared."
     if not {"gravity", "unstated"} <= {*kinds}:
         try:
             return GnssDifferences(_differences(cameras, gnss, name))
-        except HeightsError as error:
+        except systems.HeightsError as error:
             reason = str(error).partition("; or, if")[0] + "; only plan is compared."
     flat = replace(cameras, crs=_in_plan(crs, name))
     found = _differences(flat, replace(gnss, crs=_in_plan(gnss.crs, name)), name)
@@ -388,10 +367,10 @@ def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> GnssDifferen
 
 def _in_plan(crs: str, name: str) -> str:
     """Return a CRS without its vertical part; ellipsoidal heights may stay, no grid needs them."""
-    if is_topocentric(crs):
+    if systems.is_topocentric(crs):
         return crs
-    parsed = parse_crs(crs, name)
-    return crs if parsed.is_geocentric else crs_text(parts(parsed)[0])
+    parsed = systems.parse_crs(crs, name)
+    return crs if parsed.is_geocentric else systems.crs_text(systems.parts(parsed)[0])
 
 
 def _differences(cameras: Cameras, gnss: GnssPositions, name: str) -> FloatArray:
@@ -417,17 +396,19 @@ def _common(cameras: Cameras, name: str) -> CRS:
     from pyproj.crs.coordinate_operation import TransverseMercatorConversion
 
     frame = frame_of(cameras.crs or "", name)
-    if frame.crs.is_projected and {a.unit_name for a in frame.crs.axis_info}.issubset(METRES):
+    if frame.crs.is_projected and {a.unit_name for a in frame.crs.axis_info}.issubset(
+        systems.METRES
+    ):
         return frame.crs
-    flat, vertical = parts(frame.crs)
-    base = parts(unbound(frame.crs))[0].geodetic_crs
+    flat, vertical = systems.parts(frame.crs)
+    base = systems.parts(systems.unbound(frame.crs))[0].geodetic_crs
     if base is None:
         raise bad_file(name, "cameras.crs", f"{frame.crs.name} has no datum.")
     to_degrees = Transformer.from_crs(flat, "EPSG:4326", always_xy=True)
     middle = np.median(frame.enter(cameras.centres), axis=0)
     longitude, latitude = to_degrees.transform(middle[0], middle[1])
     mercator = TransverseMercatorConversion(latitude, longitude)
-    plan = CRS(ProjectedCRS(mercator, geodetic_crs=unbound(base).to_2d()))
+    plan = CRS(ProjectedCRS(mercator, geodetic_crs=systems.unbound(base).to_2d()))
     if vertical is not None:
-        return with_heights(plan, vertical)
-    return plan.to_3d() if heights_of(frame.crs) == "ellipsoidal" else plan
+        return systems.with_heights(plan, vertical)
+    return plan.to_3d() if systems.heights_of(frame.crs) == "ellipsoidal" else plan

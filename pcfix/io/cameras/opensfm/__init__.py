@@ -44,19 +44,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pcfix.errors import bad_file
+from pcfix.io import crs as systems
 from pcfix.io.cameras import checks, tracks
 from pcfix.io.cameras.checks import Source
 from pcfix.io.cameras.georeference import frame_of, georeference, is_tied
 from pcfix.io.cameras.tracks import NO_TIE_POINTS, are_seen
-from pcfix.io.crs import (
-    GEOGRAPHIC_WGS84,
-    Topocentric,
-    heights_of,
-    is_topocentric,
-    parse_crs,
-    shortened,
-    transformation,
-)
 from pcfix.io.tables import read_lines
 from pcfix.lens.rotations import from_rotation_vectors
 from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, Projection, TiePoints
@@ -401,23 +393,26 @@ def opensfm_camera(path: Path, given: Lens) -> dict[str, Any]:
 
 def _world(
     cameras: Cameras, points: FloatArray, name: str
-) -> tuple[Cameras, FloatArray, Topocentric | None]:
+) -> tuple[Cameras, FloatArray, systems.Topocentric | None]:
     """Return cameras and points in the world of the file, and its origin where it has one.
 
     From a projected CRS they go to axes east, north, up at the middle of the block.
     """
     if cameras.crs is None or not is_tied(cameras.crs, name):
         return cameras, points, None
-    if is_topocentric(cameras.crs):
-        return cameras, points, Topocentric.from_text(cameras.crs, name)
-    if not parse_crs(cameras.crs, name).is_projected:
-        sentence = f"the cameras are in {shortened(cameras.crs)}. Bring them to a projected CRS."
+    if systems.is_topocentric(cameras.crs):
+        return cameras, points, systems.Topocentric.from_text(cameras.crs, name)
+    source = frame_of(cameras.crs, name).crs
+    if not systems.parse_crs(cameras.crs, name).is_projected:
+        sentence = f"the cameras are in {systems.shortened(cameras.crs)}."
+        sentence += " Bring them to a projected CRS."
         raise bad_file(name, "output.crs", sentence, crs=cameras.crs)
-    source, geographic = frame_of(cameras.crs, name).crs, parse_crs(GEOGRAPHIC_WGS84, name)
-    stated = heights_of(source) != "unstated"
-    to_degrees = transformation(source, geographic, cameras.centres, name, heights=stated).forward
+    geographic = systems.parse_crs(systems.GEOGRAPHIC_WGS84, name)
+    stated = systems.heights_of(source) != "unstated"
+    step = systems.transformation(source, geographic, cameras.centres, name, heights=stated)
+    to_degrees = step.forward
     longitude, latitude, _ = to_degrees(np.median(cameras.centres, axis=0)[None])[0].tolist()
-    place = Topocentric(latitude, longitude, 0.0)
+    place = systems.Topocentric(latitude, longitude, 0.0)
     centres, points = (place.from_degrees(to_degrees(xyz)) for xyz in (cameras.centres, points))
     text = "ENU:" + ",".join(map(repr, astuple(place)))
     there = replace(cameras, centres=centres, crs=text, project_crs=None, gnss=None)

@@ -47,6 +47,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning, bad_file
+from pcfix.io import tables
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import Angles, Source, note
 from pcfix.io.cameras.table.sensor import (
@@ -59,16 +60,6 @@ from pcfix.io.cameras.table.sensor import (
 )
 from pcfix.io.crs import shortened
 from pcfix.io.files import check_input
-from pcfix.io.tables import (
-    Table,
-    number,
-    places,
-    read_lines,
-    read_table,
-    split_header,
-    split_unit,
-    table_below,
-)
 from pcfix.lens import rotations
 from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens
 
@@ -172,12 +163,12 @@ _GEO_CRS = re.compile(r"(EPSG:\d+|\+proj=.+|WGS84 UTM \d\d?\s*[NS])\s*", re.IGNO
 
 def open_table(path: Path) -> Columns:
     """Read a table with a header, or ODM's geo.txt, which has none."""
-    lines = read_lines(path)
+    lines = tables.read_lines(path)
     if not is_geo(lines):
         return read_columns(path)
     split = [(i, line.split()) for i, line in enumerate(lines[1:], start=2)]
     rows = [[*fields, *[""] * len(GEO)][: len(GEO)] for _, fields in split if fields]
-    table = Table(path, list(GEO), rows, [i for i, fields in split if fields])
+    table = tables.Table(path, list(GEO), rows, [i for i, fields in split if fields])
     place = {name: GEO.index(name) for name in ("label", "x", "y", "z")}
     place |= {"sigma_x": 7, "sigma_y": 7, "sigma_z": 8}  # its angles may be 0 for unknown
     crs = checks.utm_as_code(lines[0].strip())
@@ -212,7 +203,7 @@ def headers(lines: Sequence[str]) -> Iterator[Header]:
         text = line.strip().lstrip("#").strip() if comment else line.strip()
         if not text or CRS_COMMENT.match(line):
             continue
-        found = [_split_unit(name) for name in split_header(text)[0]]
+        found = [_split_unit(name) for name in tables.split_header(text)[0]]
         yield Header(i, [name for name, _ in found], [unit for _, unit in found], comment)
         if not comment:
             return
@@ -229,7 +220,7 @@ def axes(place: Iterable[str], suffix: str = "") -> tuple[str, str, str] | None:
 
 def is_header(names: Sequence[str]) -> bool:
     """Whether at least two of the names that every table of cameras has are among these."""
-    return len(POSITION & places(names, SPELLINGS).keys()) >= 2
+    return len(POSITION & tables.places(names, SPELLINGS).keys()) >= 2
 
 
 def _split_unit(name: str) -> tuple[str, str]:
@@ -238,7 +229,7 @@ def _split_unit(name: str) -> tuple[str, str]:
     Of X/Longitude it is the name that says more.
     """
     plain = name.lstrip("# \"'").lower()
-    name, unit = (plain, "") if plain in _PLAIN else split_unit(plain, "m|deg|gon|rad")
+    name, unit = (plain, "") if plain in _PLAIN else tables.split_unit(plain, "m|deg|gon|rad")
     axis, slash, kind = name.partition("/")
     more = slash and axis in ("x", "y", "z") and kind in _PLAIN
     return kind if more else name, unit
@@ -271,7 +262,7 @@ class Columns:
     says.
     """
 
-    table: Table
+    table: tables.Table
     place: dict[str, int]
     unit: list[str]
     after_hash: bool
@@ -328,7 +319,7 @@ class Columns:
         if role not in self.place:
             return np.full(len(self.table.rows), np.nan)
         texts = [row[self.place[role]] for row in self.table.rows]
-        read = exif_number if self.name(role) in EXIF else number
+        read = exif_number if self.name(role) in EXIF else tables.number
         values = np.array([read(text) for text in texts])
         for i in np.flatnonzero(~np.isfinite(values)):
             if needed or texts[i]:
@@ -347,13 +338,13 @@ class Columns:
 
 def read_columns(path: Path) -> Columns:
     """Read a table with a header line, which may be a comment."""
-    lines = read_lines(path)
+    lines = tables.read_lines(path)
     found = [header for header in headers(lines) if is_header(header.names)]
     if not found:
         sentence = "no line names the columns, for example label,x,y,z,omega,phi,kappa."
         raise bad_file(path, "table.no_header", sentence)
     at, names, unit, comment = found[-1]
-    place = places(names, SPELLINGS)
+    place = tables.places(names, SPELLINGS)
     for role, spellings in SPELLINGS.items():  # a column with the role's own name counts
         alike = [name for name in names if name in spellings]
         if len(alike) > 1 and role not in MANY and (role not in alike or alike.count(role) > 1):
@@ -368,8 +359,8 @@ def read_columns(path: Path) -> Columns:
         raise column_missing(path, lacking, names)
     comments = comment or any(line.startswith("#") for line in lines[:at])
     below = next((line for line in lines[at + 1 :] if line.strip() and line[0] != "#"), "")
-    delimiter = split_header((below if comment else lines[at]).strip())[1]
-    table = table_below(path, lines, names, delimiter, at=at, comments=comments)
+    delimiter = tables.split_header((below if comment else lines[at]).strip())[1]
+    table = tables.table_below(path, lines, names, delimiter, at=at, comments=comments)
     crs = next(
         (match[1].strip() for line in lines[:at] if (match := CRS_COMMENT.match(line))), None
     )
@@ -378,9 +369,9 @@ def read_columns(path: Path) -> Columns:
 
 def exif_number(text: str) -> float:
     """Return the number in what exiftool writes: 24 deg 40' 48.5" S, 86.5 m Below Sea Level."""
-    parts = [number(part) for part in re.findall(r"[\d.]+", text)]
+    parts = [tables.number(part) for part in re.findall(r"[\d.]+", text)]
     if "deg" not in text and "Sea Level" not in text:
-        return number(text)
+        return tables.number(text)
     if not 1 <= len(parts) <= 3:
         return np.nan
     value = math.fsum(part / 60.0**i for i, part in enumerate(parts))
@@ -420,7 +411,7 @@ def crs(columns: Columns) -> tuple[str | None, tuple[PcfixWarning, ...]]:
     """
     said, beside = columns.crs, columns.path.with_suffix(".prj")
     if not said and beside != columns.path and beside.is_file():
-        said = " ".join(read_lines(beside)).strip() or None
+        said = " ".join(tables.read_lines(beside)).strip() or None
     if said is None:
         if axes(columns.place) != ("longitude", "latitude", "z"):
             return None, ()
@@ -439,7 +430,7 @@ def is_geo(lines: list[str]) -> bool:
     if not lines or not _GEO_CRS.fullmatch(lines[0]):
         return False
     first = next((line.split() for line in lines[1:] if line.strip()), [])
-    return len(first) >= 3 and np.isnan(number(first[0]))
+    return len(first) >= 3 and np.isnan(tables.number(first[0]))
 
 
 OMEGA_PHI_KAPPA = ("omega", "phi", "kappa")
@@ -502,7 +493,7 @@ def read_lenses(columns: Columns, sensor: Path | None) -> tuple[Lens, ...]:
     if not own:
         return (read_sensor(path),) * len(columns.labels)
     if not is_xml(check_input(path)) and column_names(path) >= set(FRAME):
-        width, height = (read_table(path, FRAME).numbers(name)[0] for name in FRAME)
+        width, height = (tables.read_table(path, FRAME).numbers(name)[0] for name in FRAME)
     else:
         lens = read_sensor(path)
         width, height = lens.width, lens.height
