@@ -358,7 +358,18 @@ def _resampled(
     `from_cloud` transforms the plan only; `bounds` are in the cloud's CRS; `names` are the
     raster's for messages and its title.
     """
-    cell, (west, south, east, north) = _extent(part, to_cloud, names[0])
+    # where the raster is, from points all over it, and the sides of its middle cell
+    high, wide = part.heights.shape
+    share = np.linspace(0.0, 1.0, _EDGE_POINTS)
+    c, r = (grid.ravel() for grid in np.meshgrid(share * wide, share * high))
+    amid = wide / 2.0 + np.array([0.0, 1.0, 0.0]), high / 2.0 + np.array([0.0, 0.0, 1.0])
+    x, y = place_of(part.transform, np.append(c, amid[0]), np.append(r, amid[1]))
+    placed = to_cloud(np.column_stack([x, y, np.full(len(x), np.nanmean(part.heights))]))
+    if not np.isfinite(placed).all():
+        sentence = "extends beyond the area of use of the cloud's CRS. Clip it."
+        raise bad_file(names[0], "water.raster_place", sentence)
+    cell = np.hypot(*(placed[-2:] - placed[-3])[:, :2].T).min()
+    (west, south, _), (east, north, _) = placed.min(axis=0), placed.max(axis=0)
     if bounds is not None:
         west, south = max(west, bounds[0]), max(south, bounds[1])
         east, north = min(east, bounds[2]), min(north, bounds[3])
@@ -375,23 +386,6 @@ def _resampled(
         strip[:] = _heights_at(part, from_cloud(plan), to_cloud).reshape(strip.shape)
     _check_known(heights, names[0])
     return WaterRaster(heights, float(left), float(top), (float(cell), float(cell)), names[1])
-
-
-def _extent(part: _Part, to_cloud: Points, name: str) -> tuple[float, Bounds]:
-    """Return the smaller side of the middle cell, and the bounds, in the cloud's CRS."""
-    rows, columns = part.heights.shape
-    share = np.linspace(0.0, 1.0, _EDGE_POINTS)
-    c, r = (grid.ravel() for grid in np.meshgrid(share * columns, share * rows))
-    amid = columns / 2.0 + np.array([0.0, 1.0, 0.0]), rows / 2.0 + np.array([0.0, 0.0, 1.0])
-    x, y = place_of(part.transform, np.append(c, amid[0]), np.append(r, amid[1]))
-    level = np.full(len(x), np.nanmean(part.heights))
-    placed = to_cloud(np.column_stack([x, y, level]))
-    if not np.isfinite(placed).all():
-        sentence = "extends beyond the area of use of the cloud's CRS. Clip it."
-        raise bad_file(name, "water.raster_place", sentence)
-    sides = np.hypot(*(placed[-2:] - placed[-3])[:, :2].T)
-    (west, south, _), (east, north, _) = placed.min(axis=0), placed.max(axis=0)
-    return sides.min(), (float(west), float(south), float(east), float(north))
 
 
 def _heights_at(part: _Part, places: FloatArray, to_cloud: Points) -> FloatArray:

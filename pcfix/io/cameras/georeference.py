@@ -98,7 +98,11 @@ def frame_of(text: str, name: str) -> Frame:
     if not (crs.is_projected or crs.is_geographic):
         sentence = f"{crs.name} is not a CRS for cameras. Give another with --cameras-crs."
         raise bad_file(name, "cameras.crs", sentence, crs=crs.name)
-    return Frame(crs, lambda xyz: xyz, direct=True)
+    return Frame(crs, _same, direct=True)
+
+
+def _same(xyz: FloatArray) -> FloatArray:
+    return xyz
 
 
 def is_tied(crs: str | None, name: str) -> bool:
@@ -118,12 +122,12 @@ def _on_earth(crs: str | None, name: str) -> CRS | None:
 class Georeference:
     """The transformation from the frame of a camera file into another CRS.
 
-    `frame` is that of the file, None where its numbers are taken as they are; `offset`, shape (3,),
-    is added first; `crs` is the result's, as in `Cameras.crs`.
+    `forward` takes points of the file, to which `offset`, shape (3,), is added first. `frame` is
+    that of the file; None where the axes are the same. `crs` is the result's, as in `Cameras.crs`.
     """
 
+    forward: systems.Points
     frame: Frame | None
-    transformation: systems.Transformation | None
     offset: FloatArray
     crs: str | None
     notes: tuple[PcfixWarning, ...]
@@ -139,7 +143,7 @@ class Georeference:
             sentence = f"image {cameras.labels[i]}: {x:.10g}, {y:.10g}, {z:.6g} is outside"
             sentence += f" {systems.shortened(self.crs or '')}. Check --cameras-crs."
             raise bad_file(self.name, "cameras.not_transformed", sentence, image=cameras.labels[i])
-        if rotations is not None and self.transformation is not None:
+        if rotations is not None and self.frame is not None:
             rotations = rotations @ self.turns(cameras.centres).transpose(0, 2, 1)
         return replace(
             cameras,
@@ -152,15 +156,15 @@ class Georeference:
 
     def points(self, xyz: FloatArray) -> FloatArray:
         """Return points (n, 3) there; NaN where one is not finite or has no place there."""
-        return np.where(np.isfinite(found := self._forward(xyz + self.offset)), found, np.nan)
+        return np.where(np.isfinite(found := self.forward(xyz + self.offset)), found, np.nan)
 
     def turns(self, xyz: FloatArray) -> FloatArray:
         """Return the rotations from the source's axes to the target's at points (n, 3)."""
-        if self.frame is None or self.transformation is None:
+        if self.frame is None:
             return np.broadcast_to(np.eye(3), (len(xyz), 3, 3))
         at = xyz + self.offset
         steps = STEP_M * np.eye(3) * self.frame.per_metre(at)[:, None, :]
-        ahead, behind = (self._forward((at[:, None] + s).reshape(-1, 3)) for s in (steps, -steps))
+        ahead, behind = (self.forward((at[:, None] + s).reshape(-1, 3)) for s in (steps, -steps))
         if not (np.isfinite(ahead).all() and np.isfinite(behind).all()):
             return np.full((len(xyz), 3, 3), np.nan)
         vectors = (ahead - behind).reshape(-1, 3, 3).transpose(0, 2, 1)
@@ -169,11 +173,6 @@ class Georeference:
             raise bad_file(self.name, "cameras.left_handed", sentence, crs=self.frame.crs.name)
         u, _, v = np.linalg.svd(vectors)
         return np.asarray(u @ v)
-
-    def _forward(self, xyz: FloatArray) -> FloatArray:
-        if self.frame is None or self.transformation is None:
-            return xyz
-        return self.transformation.forward(self.frame.enter(xyz))
 
 
 def georeference(
@@ -221,12 +220,12 @@ def georeference(
     crs = stated or ""
     if not is_tied(stated, name):
         if cloud is None:
-            return Georeference(None, None, offset, stated, (), name)
+            return Georeference(_same, None, offset, stated, (), name)
         if stated is not None and not given.strip() and not systems.is_local(cloud):
             sentence = f"is in a local frame, the cloud in {cloud.name}. Export the cameras in that"
             sentence += " CRS, or give --cameras-crs local to use their numbers as they are."
             raise bad_file(name, "cameras.local", sentence, cloud_crs=cloud.name)
-        return Georeference(None, None, offset, systems.crs_text(cloud), (), name)
+        return Georeference(_same, None, offset, systems.crs_text(cloud), (), name)
     if cloud is not None and systems.is_local(cloud):
         sentence = (
             f"is in {systems.shortened(crs)}, the cloud in a local frame. Set the cloud's CRS, or"
@@ -240,7 +239,7 @@ def georeference(
         unit, size = systems.plan_unit(frame.crs)
         words = frame.crs.name + ("" if size == 1.0 else f", unit {unit},")
         words = systems.shortened(crs) if frame.topocentric else words
-        found = Georeference(None, None, offset, stated, (), name)
+        found = Georeference(_same, None, offset, stated, (), name)
     elif frame.direct or project is None or not project.is_projected:
         kind = "degrees" if frame.direct else "geocentric coordinates"
         sentence = f"is in {kind} ({frame.crs.name}). Give a cloud that names its CRS."
@@ -273,7 +272,7 @@ def _into(
     by_user = trusted and not frame.direct
     heights = not (by_user or systems.heights_agree(frame.crs, target))
     if frame.direct and not heights and systems.is_same_numbers(frame.crs, target):
-        return Georeference(frame, None, offset, crs, notes, name)
+        return Georeference(_same, None, offset, crs, notes, name)
     plan = systems.typed(systems.parts(frame.crs if frame.direct else target)[0])
     given = "ENU:latitude,longitude,height" if frame.topocentric else plan
     instead = f"or, if the heights of cameras and cloud agree, give --cameras-crs {given}"
@@ -281,7 +280,9 @@ def _into(
         frame.crs, target, frame.enter(at), name, heights=heights, instead=instead
     )
     of_step = (PcfixWarning("crs.transformation", str(one), path=name) for one in step.notes)
-    found = Georeference(frame, step, offset, crs, (*of_step, *notes), name)
+    found = Georeference(
+        lambda xyz: step.forward(frame.enter(xyz)), frame, offset, crs, (*of_step, *notes), name
+    )
     # heights that --cameras-crs declares can be tested if the GNSS heights are above the geoid too
     gnss = cameras.gnss
     testable = systems.heights_of(target) == "gravity" and gnss is not None and gnss.crs is not None

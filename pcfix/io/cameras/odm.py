@@ -38,6 +38,7 @@ from pcfix.io.cameras import checks, opensfm
 from pcfix.io.cameras.checks import Source, damaged, load_json, note, triple
 from pcfix.io.cameras.opensfm import is_panorama, lens
 from pcfix.io.crs import Topocentric
+from pcfix.io.labels import unnamed
 from pcfix.io.tables import read_lines
 from pcfix.lens.rotations import from_rotation_vectors
 from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, TiePoints
@@ -99,7 +100,7 @@ def read(source: Source) -> Cameras:
         crs=placed.crs,
         project_crs=placed.project_crs,
         gnss=gnss or own.gnss,
-        unposed=opensfm.left_out(own.labels, [*own.unposed, *listed]),
+        unposed=unnamed([*own.unposed, *listed], own.labels),
         source="OpenDroneMap",
     )
     truth, ours = _in_shots(project, cameras)
@@ -311,7 +312,7 @@ def _read_shots(project: Project, path: Path) -> Cameras:
         crs=crs or "local",
         notes=(said,) if plain else (),
         gnss=gnss,
-        unposed=opensfm.left_out(labels, listed),
+        unposed=unnamed(listed, labels),
         source="OpenDroneMap",
     )
 

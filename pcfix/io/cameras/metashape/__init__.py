@@ -444,7 +444,15 @@ def gnss_positions(
     if not np.isfinite(xyz[:, :2]).all(axis=1).any():
         return None, ()
     sigma = np.where(np.isfinite(xyz) & (sigma > 0.0), sigma, np.nan)
-    crs, notes = _crs(path, chunk.element, xyz)
+    # the CRS of the cameras may differ from that of the chunk
+    own, notes = text_of(chunk.element, "camera_reference"), []
+    crs = own or text_of(chunk.element, "reference") or "LOCAL"
+    are_degrees = bool((np.nanmax(np.abs(xyz[:, :2]), axis=0) <= [180.0, 90.0]).all())
+    if crs.upper() == "LOCAL" or is_local(parsed := parse_crs(crs, str(path))):
+        crs = "local"
+    elif are_degrees and not own and not parsed.is_geographic:
+        sentence = "the camera positions are degrees in a CRS in metres; WGS 84 is assumed."
+        crs, notes = "EPSG:4979", [note(path, "cameras.gnss_in_degrees", sentence)]
     for sensor in dict.fromkeys(image.sensor for image in block.images):
         antenna = [] if sensor is None else text_of(sensor, "antenna/location").split()
         for shift in () if sensor is None else sensor.iterfind("antenna/reference"):
@@ -467,19 +475,6 @@ def spreads(
             count = 1 if len(text.split()) == 1 else len(axes)
             sigma[list(axes)] = numbers(path, f"{where}, {name}", text, count)
     return sigma
-
-
-def _crs(path: Path, chunk: Element, xyz: FloatArray) -> tuple[str, list[PcfixWarning]]:
-    """Return the CRS of the positions; that of the cameras may differ from that of the chunk."""
-    own = text_of(chunk, "camera_reference")
-    text = own or text_of(chunk, "reference") or "LOCAL"
-    if text.upper() == "LOCAL" or is_local(crs := parse_crs(text, str(path))):
-        return "local", []
-    are_degrees = (np.nanmax(np.abs(xyz[:, :2]), axis=0) <= [180.0, 90.0]).all()
-    if not own and not crs.is_geographic and are_degrees:
-        sentence = "the camera positions are degrees in a CRS in metres; WGS 84 is assumed."
-        return "EPSG:4979", [note(path, "cameras.gnss_in_degrees", sentence)]
-    return text, []
 
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:

@@ -36,7 +36,6 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Iterable
 from dataclasses import astuple, replace
 from pathlib import Path, PurePath
 from typing import Any, NamedTuple
@@ -49,6 +48,7 @@ from pcfix.io.cameras import checks, tracks
 from pcfix.io.cameras.checks import Source
 from pcfix.io.cameras.georeference import frame_of, georeference, is_tied
 from pcfix.io.cameras.tracks import NO_TIE_POINTS, are_seen
+from pcfix.io.labels import unnamed
 from pcfix.io.tables import read_lines
 from pcfix.lens.rotations import from_rotation_vectors
 from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, Projection, TiePoints
@@ -144,17 +144,10 @@ def read_reconstruction(path: Path) -> Reconstruction:
             crs=crs,
             notes=tuple(notes),
             gnss=GnssPositions(xyz, sigma, crs) if has_gnss else None,
-            unposed=left_out(shots, [*others, *panoramas, *given]),
+            unposed=unnamed([*others, *panoramas, *given], shots),
             source="OpenSfM",
         )
         return Reconstruction(path, cameras, reference, chosen.get("points", {}))
-
-
-def left_out(labels: Iterable[str], others: Iterable[str]) -> tuple[str, ...]:
-    """Return the names among `others` that no label has, with or without the file extension."""
-    known = {name for label in labels for name in (label, PurePath(label).stem)}
-    names = dict.fromkeys(others)
-    return tuple(n for n in names if n not in known and PurePath(n).stem not in known)
 
 
 def _poses(chosen: Any, shots: dict[str, Any]) -> tuple[FloatArray, FloatArray]:
