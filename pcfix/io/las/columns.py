@@ -189,16 +189,6 @@ def to_withhold(correction: Correction, *, withhold: bool) -> BoolArray:
     return rows if correction.unsure is None else rows | correction.unsure
 
 
-def is_corrected(points: laspy.ScaleAwarePointRecord) -> BoolArray:
-    """Return which rows of an output file refraction was taken out of."""
-    return np.asarray(points.array["RayCount"] > 0)
-
-
-def is_marked_uncorrected(points: laspy.ScaleAwarePointRecord) -> BoolArray:
-    """Return which rows of an output file pcfix should have moved and could not."""
-    return np.asarray((points.array["RayCount"] == 0) & (points.array["WaterDepth"] > 0))
-
-
 def convert(
     points: laspy.ScaleAwarePointRecord, point_format: laspy.PointFormat
 ) -> laspy.ScaleAwarePointRecord:

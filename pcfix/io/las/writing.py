@@ -169,11 +169,6 @@ def restored_header(source: LasSource, before: dict[str, Any], drop: set[str]) -
     return header
 
 
-def output_evlrs(source: LasSource) -> list[Record]:
-    """Return the EVLRs to carry over: all but the index of a COPC file, which would be wrong."""
-    return [v for v in source.evlrs if v.user_id != "copc"]
-
-
 def _extra_bytes(
     columns: tuple[Column, ...], scales: FloatArray, *, wide: bool
 ) -> tuple[list[laspy.ExtraBytesParams], bytes]:
