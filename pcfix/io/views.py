@@ -487,13 +487,17 @@ class ViewMatch:
             from scipy.spatial import cKDTree
 
             self._tree = cKDTree(listed, balanced_tree=False, compact_nodes=False)
-        reach = float(np.nextafter(self.report.tolerance_m or 0.0, np.inf))
+        tolerance_m = self.report.tolerance_m or 0.0
+        reach, step = float(np.nextafter(tolerance_m, np.inf)), tolerance_m / _BINS
         for at in range(0, len(rest), _QUERIES):
             some = rest[at : at + _QUERIES]
             away, nearest = self._tree.query(xyz[some], distance_upper_bound=reach, workers=-1)
             distance = np.asarray(away)
             found = np.isfinite(distance)
-            self.report.add_distances(distance[found])
+            bins = np.ceil(distance[found] / step) if step else np.zeros(found.sum())
+            bins = bins.astype(np.int64).clip(0, _BINS)
+            self.report._histogram += np.bincount(bins, minlength=_BINS + 1)
+            self.report.by_position += len(bins)
             self.report.unmatched += int(np.count_nonzero(~found))
             row[some] = np.where(found, nearest, -1)
         return row
@@ -544,18 +548,6 @@ class ViewReport(Sums):
         """Points of the cloud so far."""
         return self.by_row + self.by_position + self.unmatched
 
-    @property
-    def cameras_per_point(self) -> float:
-        """Mean over the points that have a list."""
-        return self.entries / max(self.by_row + self.by_position, 1)
-
-    def add_distances(self, distance_m: FloatArray) -> None:
-        """Count the distances of matches by position."""
-        step = (self.tolerance_m or 0.0) / _BINS
-        bins = np.ceil(distance_m / step) if step else np.zeros(len(distance_m))
-        self._histogram += np.bincount(bins.astype(np.int64).clip(0, _BINS), minlength=_BINS + 1)
-        self.by_position += len(distance_m)
-
     def distance_m(self, share: float) -> float | None:
         """Return a quantile of the distances of matches by position, to 0.1 % of the tolerance."""
         if not self.by_position or self.tolerance_m is None:
@@ -595,7 +587,7 @@ class ViewReport(Sums):
         """Return plain values, ready for JSON."""
         values = {k: v for k, v in vars(self).items() if not k.startswith("_") and k != "notes"}
         values["unposed"] = list(self.unposed)
-        values["cameras_per_point"] = self.cameras_per_point
+        values["cameras_per_point"] = self.entries / max(self.by_row + self.by_position, 1)
         values["distance_median_m"] = self.distance_m(0.5)
         values["distance_95_m"] = self.distance_m(0.95)
         return values

@@ -138,7 +138,7 @@ def test_real_vis_and_ply():
     assert (report.by_row, report.unmatched, report.share_seen) == (250_000, 0, 1.0)
     assert min(map(len, expected)) == 3 and max(map(len, expected)) == 13  # at least 3 depth maps
     assert expected[0] == [11, 12, 13, 22, 29] and weights is None
-    assert report.cameras_per_point == pytest.approx(1352598 / 250_000)
+    assert report.as_dict()["cameras_per_point"] == pytest.approx(1352598 / 250_000)
 
     offset = np.loadtxt(RENDERED / "offset.txt", comments="#")
     views = read_views(RENDERED / "dense.ply", cameras, to_cloud=lambda points: points + offset)
