@@ -49,10 +49,7 @@ CONTENTS: tuple[tuple[bytes, Refusal], ...] = (
     (rb"\A(EPSG:\d|\+proj=|WGS84 UTM )[^\n]*\n\s*[-+.\d]+[ \t]+[-+.\d]+[ \t]", GCPS),
     (rb"\A(\xef\xbb\xbf)?focal", ("a table of the sensor", "Give it by --sensor")),
     (rb"\A\s*\$PROJECT\b|^\s*\$(PHOTO_NUM|EXT_ORI)\b", ("a project of Inpho (Trimble)", OPK)),
-    (
-        rb"^\s*(SENSOR_TYPE|IMAGE_SUPPORT|TRIANGULATION_TYPE)\s",
-        ("a support file of SOCET SET", OPK),
-    ),
+    (rb"^\s*(SENSOR_TYPE|IMAGE_SUPPORT|TRIANGULATION_TYPE)\s", SOCET),
     (rb"^\s*(ORI[AE]|PRO[JI]|GEOI|BILD)\s+\S+\s+\S", ("a file of BINGO", OPK)),
     (rb"<(CalibrationInternConique|InternalCalibration)>", MICMAC),
     (rb'"projection_type"', ODM),

@@ -229,20 +229,18 @@ def read_tie_points(reconstruction: Reconstruction) -> TiePoints:
 
 PANORAMAS = frozenset({"equirectangular", "spherical"})
 
-_MODELS: dict[str, tuple[Projection, int]] = {
-    "perspective": ("perspective", 2),
-    "simple_radial": ("perspective", 1),
-    "radial": ("perspective", 2),
-    "brown": ("perspective", 3),
-    "fisheye": ("equidistant", 2),
-    "fisheye_opencv": ("equidistant", 4),
-    "fisheye62": ("equidistant", 6),
-    "fisheye624": ("equidistant", 6),
-    "dual": ("dual", 2),
+_MODELS: dict[str, tuple[str, Projection]] = {
+    "perspective": ("focal k1 k2", "perspective"),
+    "simple_radial": ("focal_x focal_y c_x c_y k1", "perspective"),
+    "radial": ("focal_x focal_y c_x c_y k1 k2", "perspective"),
+    "brown": ("focal_x focal_y c_x c_y k1 k2 k3 p1 p2", "perspective"),
+    "fisheye": ("focal k1 k2", "equidistant"),
+    "fisheye_opencv": ("focal_x focal_y c_x c_y k1 k2 k3 k4", "equidistant"),
+    "fisheye62": ("focal_x focal_y c_x c_y k1 k2 k3 k4 k5 k6 p1 p2", "equidistant"),
+    "fisheye624": ("focal_x focal_y c_x c_y k1 k2 k3 k4 k5 k6 p1 p2 s0 s1 s2 s3", "equidistant"),
+    "dual": ("focal k1 k2 transition", "dual"),
 }
-_TANGENTIAL = frozenset({"brown", "fisheye62", "fisheye624"})
-_WRITTEN = ("perspective", "brown", "fisheye", "fisheye_opencv", "fisheye62", "fisheye624", "dual")
-"""The simplest first."""
+"""The parameters of each model as files name them, and its projection; the simplest first."""
 _SIZE = re.compile(r" (\d{2,6}) (\d{2,6}) [a-z_]+\d* ")
 
 
@@ -271,17 +269,17 @@ def lens(path: Path, name: str, camera: dict[str, Any]) -> Lens:
     scale = max(width, height)
     fx = float(camera["focal_x" if "focal_x" in camera else "focal"])
     fy = value("focal_y", fx) if "focal_x" in camera else fx
-    keys = ("c_x", "c_y", "p1", "p2", "s0", "s1", "s2", "s3")
-    cx, cy, p1, p2, *prism = (value(key) for key in keys)
-    projection, radial = _MODELS[model]
+    names, projection = _MODELS[model]
+    there = names.split()
     return Lens(
-        *(fy * scale, width, height, width / 2.0 + cx * scale, height / 2.0 + cy * scale),
+        *(fy * scale, width, height),
+        *(width / 2.0 + value("c_x") * scale, height / 2.0 + value("c_y") * scale),
         b1=(fx - fy) * scale,
         projection=projection,
-        shape=(value("transition", 0.5),) if model == "dual" else (),
-        radial=tuple(value(f"k{i + 1}") for i in range(radial)),
-        tangential=(p2, p1) if model in _TANGENTIAL else (),
-        thin_prism=tuple(prism) if model == "fisheye624" else (),
+        shape=(value("transition", 0.5),) if "transition" in there else (),
+        radial=tuple(value(key) for key in there if key[0] == "k"),
+        tangential=(value("p2"), value("p1")) if "p1" in there else (),
+        thin_prism=tuple(value(key) for key in there if key[0] == "s"),
         sensor=name,
     )
 
@@ -359,28 +357,28 @@ def write_opensfm(path: File, cameras: Cameras, tie_points: TiePoints | None = N
 def opensfm_camera(path: Path, given: Lens) -> dict[str, Any]:
     """Return the simplest entry of `cameras` that is exactly this lens."""
     scale = max(given.width, given.height)
-    size = {"width": int(given.width), "height": int(given.height)}
-    one = {"focal": given.focal / scale}
-    two = {
+    lists = (
+        ("k1 k2 k3 k4 k5 k6", given.radial),
+        ("p2 p1", given.tangential),
+        ("s0 s1 s2 s3", given.thin_prism),
+    )
+    values = {key: v for keys, vs in lists for key, v in zip(keys.split(), vs, strict=False)}
+    values |= {
+        "focal": given.focal / scale,
         "focal_x": (given.focal + given.b1) / scale,
         "focal_y": given.focal / scale,
         "c_x": (given.principal_x - given.width / 2.0) / scale,
         "c_y": (given.principal_y - given.height / 2.0) / scale,
+        "transition": (*given.shape, 0.5)[0],
     }
-    p2, p1 = (*given.tangential, 0.0, 0.0)[:2]
-    prism = {f"s{i}": value for i, value in enumerate((*given.thin_prism, *(0.0,) * 4)[:4])}
-    radial = (*given.radial, *(0.0,) * 6)
-    for model in _WRITTEN if given.unit == "px" else ():
-        projection, count = _MODELS[model]
-        if projection == given.projection:
-            camera: dict[str, Any] = {"projection_type": model, **size}
-            camera |= one if model in ("perspective", "fisheye", "dual") else two
-            camera |= {f"k{i + 1}": radial[i] for i in range(count)}
-            camera |= {"p1": p1, "p2": p2} if model in _TANGENTIAL else {}
-            camera |= prism if model == "fisheye624" else {}
-            camera |= {"transition": (*given.shape, 0.5)[0]} if model == "dual" else {}
-            if checks.is_same_lens(lens(path, "1", camera), given):
-                return camera
+    size = {"width": int(given.width), "height": int(given.height)}
+    for model, (names, projection) in _MODELS.items() if given.unit == "px" else ():
+        if projection != given.projection or model in ("simple_radial", "radial"):
+            continue  # not every version of OpenSfM knows these two
+        camera: dict[str, Any] = {"projection_type": model, **size}
+        camera |= {name: values.get(name, 0.0) for name in names.split()}
+        if checks.is_same_lens(lens(path, "1", camera), given):
+            return camera
     raise checks.lens_not_held(path, given)
 
 
