@@ -164,7 +164,7 @@ def cloud_of(cloud: Clouds) -> Path | Tiles:
 
 
 def _listed(path: Path) -> list[Path] | None:
-    """Return the files that a path stands for; None if it is that of a single one."""
+    """Return the files that a path lists; None if it is that of a single cloud."""
     text, suffix = str(path), path.suffix.lower()
     if glob.has_magic(text) and not path.exists():
         return sorted(Path(path.anchor).glob(str(path.relative_to(path.anchor))))

@@ -115,7 +115,7 @@ def read_views(path: File, cameras: Cameras, *, to_cloud: Transformation | None 
     ----------
     path : path
         COLMAP's ``fused.ply.vis``, or the dense PLY file of OpenMVS with its ``view_indices``. For
-        COLMAP the ``fused.ply`` will do if the list lies beside it. Images are counted as in a
+        COLMAP the ``fused.ply`` will do if the list is beside it. Images are counted as in a
         sparse model beside the list, or as the cameras are, whichever the geometry confirms.
     cameras : Cameras
         In the cloud's frame.
@@ -401,7 +401,7 @@ class ViewMatch:
     def __init__(
         self, views: ViewList, cameras: Cameras, *, points: int | None = None, step_m: float = 0.0
     ) -> None:
-        """Check that a list, read with these cameras, can belong to a cloud of so many points.
+        """Check that a list, read with these cameras, can belong to a cloud of so many `points`.
 
         The cloud's coordinates are rounded to `step_m`, the scale of a LAS file.
         """
@@ -454,20 +454,20 @@ class ViewMatch:
 
     def counted(self, xyz: FloatArray, first_row: int) -> tuple[Views, ViewReport]:
         """Return the cameras of a chunk's points, and the counts of its matches only, no notes."""
-        one = self._anew()
+        one = self._restarted()
         views = one.for_chunk(xyz, first_row)
         self._tree = one._tree  # it takes long to build
         return views, one.report
 
     def settled(self, xyz: FloatArray) -> ViewMatch:
         """Return the match with the order of the images that the first points show."""
-        one = self._anew()
+        one = self._restarted()
         one.for_chunk(xyz, 0)
         one.report = replace(self.report)
         one._note_order()
         return one
 
-    def _anew(self) -> ViewMatch:
+    def _restarted(self) -> ViewMatch:
         """Return a match that counts from zero."""
         one = copy(self)
         none = np.zeros(_BINS + 1, np.int64)

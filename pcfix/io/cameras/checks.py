@@ -68,7 +68,7 @@ class Source:
 
     @cached_property
     def names(self) -> frozenset[str]:
-        """Names of what lies in a folder; nothing for a file."""
+        """Names of the contents of a folder; none for a file."""
         return frozenset(p.name for p in self.path.iterdir()) if self.path.is_dir() else frozenset()
 
 
@@ -117,7 +117,7 @@ def without_lens(path: Path, why: str) -> PcfixWarning:
 
 
 def repeated(path: Path, labels: Sequence[str], dropped: int = 0) -> tuple[PcfixWarning, ...]:
-    """Return a note where labels repeat: they are no key, and their images are kept apart."""
+    """Return a note where labels repeat: they are no key, and their images stay separate."""
     names = [label for label, count in Counter(labels).items() if count > 1]
     if not names:
         return ()
@@ -142,7 +142,7 @@ def reading(path: object) -> Iterator[None]:
 
 
 def read_xml(path: Path, stream: IO[bytes] | None = None) -> Element:
-    """Return the root of a document, from `stream` where it lies in an archive."""
+    """Return the root of a document, from `stream` if it is in an archive."""
     from defusedxml.ElementTree import parse
 
     with reading(path):

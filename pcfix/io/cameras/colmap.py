@@ -7,7 +7,7 @@ pose of every image in rigs also. Definition: https://colmap.github.io/format.ht
 A pose is a unit quaternion, scalar first, and a translation, both world to camera, in OpenCV
 axes: ``x_cam = R x + t``, so the projection centre is ``-R' t``. Pixels start at the upper left
 corner of the upper left pixel. The world is that of the alignment, if there was one, often minus an
-offset; the files name no CRS, so it is None, unless ``georeference.json`` of pcfix lies beside
+offset; the files name no CRS, so it is None, unless ``georeference.json`` of pcfix is beside
 them (``crs``, text or null, ``offset_m``, three numbers, ``written_by``): its offset is then added
 to centres and tie points, and its CRS is theirs.
 
@@ -65,7 +65,7 @@ _WGS84 = 0
 
 
 class Model(NamedTuple):
-    """Where a model lies; `others` counts further ones beside it."""
+    """The folder of a model; `others` counts further models beside it."""
 
     folder: Path
     suffix: str

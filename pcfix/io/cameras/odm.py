@@ -7,7 +7,7 @@ the first line of coords.txt. Its reconstruction has been in three frames:
   (turn by the meridian convergence, scale, shift) that makes projected coordinates of it, and so
   of the cloud;
 - then with the axes of the projected CRS, less its coordinates of the reference; the reference is
-  at whole metres, which tells this frame from a true topocentric one;
+  at whole metres, which distinguishes this frame from a topocentric one;
 - topocentric again in versions that project the finished cloud point by point, and in
   reconstruction.topocentric.json, which the second kind keeps.
 
@@ -207,7 +207,7 @@ def _frame(project: Project, found: opensfm.Reconstruction) -> Frame:
         return unmoved
     crs, east, north = whole
     moved = Frame(np.eye(3), np.array([east, north, 0.0]), crs)
-    # centres of shots.geojson, else the GNSS, which stays topocentric, tell whether it was moved:
+    # centres of shots.geojson, else the GNSS, which stays topocentric, show whether it was moved:
     # the two readings differ by the meridian convergence and the scale
     truth, own = _in_shots(project, found.cameras)
     if len(own) < 3 and found.cameras.gnss is not None:

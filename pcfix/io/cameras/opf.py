@@ -127,7 +127,7 @@ class Project(NamedTuple):
 
 
 def _open_project(path: Path) -> Project:
-    """Read the project that a path is, that lies in a folder, or that a part belongs to."""
+    """Read the project at a path, in a folder, or that a part belongs to."""
     if path.is_dir():
         found = sorted(path.glob("*.opf"))
     else:

@@ -85,7 +85,7 @@ def recognises(source: Source) -> bool:
 
 
 def is_part(source: Source) -> bool:
-    """Whether a file is by its name one part of an export that alone has no poses."""
+    """Whether a file is by its name a part of an export without poses."""
     return source.path.is_file() and any(re.fullmatch(p, source.path.name) for p, _ in PARTS)
 
 

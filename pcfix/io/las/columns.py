@@ -165,18 +165,18 @@ def fill(
 def changed_rows(correction: Correction, withheld: BoolArray, *, withhold: bool) -> BoolArray:
     """Return the rows that get values: corrected ones, and uncorrected ones not yet withheld.
 
-    An uncorrected point that came withheld is left wholly as it was, so that `restore` can tell
-    it from one that pcfix withheld; by the same mark, a depth, it tells those that are withheld
-    because they could not be carried over.
+    An uncorrected point that is withheld in the input stays as it is, so that `restore` can
+    distinguish it from one that pcfix withheld. Points that are withheld because they could not be
+    transferred have the same mark, a depth.
     """
     marked = correction.uncorrected if withhold else correction.submerged
     return correction.corrected | (marked & ~withheld)
 
 
 def unsure_anew(correction: Correction, withheld: BoolArray) -> Correction:
-    """Return a correction in which no point that came withheld is unsure.
+    """Return a correction in which no point that is withheld in the input is unsure.
 
-    So `restore` can tell these from the unsure ones, which are withheld by pcfix.
+    So `restore` can distinguish these from the unsure ones, which are withheld by pcfix.
     """
     if correction.unsure is None:
         return correction

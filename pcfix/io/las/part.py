@@ -96,9 +96,9 @@ def is_copc(header: laspy.LasHeader) -> bool:
 def nodes_in(
     path: Path, part: Part, selection: laspy.DecompressionSelection, most: int
 ) -> Iterator[laspy.ScaleAwarePointRecord]:
-    """Yield points of the nodes of a COPC file that a part may touch, at most so many at a time.
+    """Yield points of the nodes of a COPC file that a part may touch, at most `most` at a time.
 
-    They come in the order of the file; a node that has more comes alone.
+    They come in the order of the file; a node with more points is one batch.
     """
     with CopcReader.open(path) as reader:
         header, info, levels, box = reader.header, reader.copc_info, None, None

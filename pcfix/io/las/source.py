@@ -160,7 +160,7 @@ def _read(stream: BinaryIO, start: int, count: int, layout: str, end: int) -> li
 
 
 def append_evlrs(stream: BinaryIO, records: Sequence[Record], minor_version: int) -> None:
-    """Append EVLRs to a file that is otherwise whole, and tell its header."""
+    """Append EVLRs to a file that is otherwise complete, and state them in its header."""
     start = stream.seek(0, os.SEEK_END)
     if records and minor_version >= 4:
         stream.seek(235)
@@ -191,7 +191,7 @@ class LasSource:
 
     It has `path`, laspy's `header`, `vlrs` and `evlrs` from `read_records`, and `identity`: system
     identifier, generating software and date as they are in the file, where other software writes
-    what laspy would not. Of a `CloudPart` it has the points of the part alone, and the header says
+    what laspy would not. Of a `CloudPart` it has only the points of the part, and the header says
     so; `held` is how many points the whole file has.
     """
 
@@ -206,7 +206,7 @@ class LasSource:
         """Open; an `InputError` if the file is missing, damaged, empty, or its scales unusable.
 
         With `places_only` nothing is unpacked but coordinates, classes, sources and colours, where
-        the file holds its dimensions apart (LAZ of format 6 and up); the others may be zero then.
+        the file stores its dimensions separately (LAZ of format 6 and up); the others may be zero then.
         The chunks of a small cloud are put into `kept`, for the next to read it, and must not be
         changed.
         """

@@ -63,7 +63,7 @@ def corrected_header(
     """Return the header of a corrected file: LAS 1.4, the input's records, and pcfix's own.
 
     The `columns` are added as extra dimensions, of their `wide` types or the narrow ones, and a VLR
-    with `content` and what the file was before. Each integer axis will be moved by so many `steps`,
+    with `content` and what the file was before. Each integer axis will be moved by its `steps`,
     for which the offsets make up. An `InputError` if the cloud already has a dimension of one of
     these names, or was corrected before.
     """
@@ -89,8 +89,8 @@ def corrected_header(
         **changes,
     }
     part = part_report(source.path)
-    told = {**content, **({} if part is None else {"part": part}), "before": before}
-    note = _note(_SETTINGS, {**told, _SEAL: _seal_of(told)})
+    settings = {**content, **({} if part is None else {"part": part}), "before": before}
+    note = _note(_SETTINGS, {**settings, _SEAL: _seal_of(settings)})
     _set_records(header, [*vlrs, note], described + records)
     return header
 

@@ -422,7 +422,7 @@ def gnss_positions(
     """Return the reference positions of the images of a block, and notes on them.
 
     Positions that the user unticked are no measurement and left out, unless all are, as is usual
-    when control points alone hold the block.
+    when only control points determine the block.
     """
     path = chunk.path
     given = [image.element.find("reference") for image in block.images]
@@ -480,7 +480,7 @@ def spreads(
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """Read the tie points of a project, then the markers, with what was measured of them.
 
-    A marker has no position (NaN), as the file tells only where the survey put it. Projections
+    A marker has no position (NaN), as the file has only its surveyed coordinates. Projections
     that Metashape itself computed are left out.
     """
     chunk = documents.open_chunk(source.path)

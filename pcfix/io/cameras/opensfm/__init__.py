@@ -3,7 +3,7 @@
 The file is a list of reconstructions, each with `cameras`, `shots` and `points`. A shot's
 `rotation` (axis times angle, radians) and `translation` take world to camera, x right, y down, z
 forward, so the projection centre is -R't. The world is topocentric, metres east, north and up at
-`reference_lla`, which stands in the reconstruction or in reference_lla.json; `gps_position` is in
+`reference_lla`, which is in the reconstruction or in reference_lla.json; `gps_position` is in
 the same frame, `gps_dop` its standard deviation in metres. Without a reference the frame is local.
 Where a shot rides on a rig and has no pose of its own, it is that of the rig camera (rig to
 camera) after that of the rig instance (world to rig). Coordinates too large to be topocentric come

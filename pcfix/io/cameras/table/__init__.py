@@ -18,7 +18,7 @@ may stand in it (x[m], omega[gon]). What its columns may be called is in `SPELLI
     exiftool's GimbalPitchDegree): Rz(-yaw) Rx(90 + pitch) Rz(-roll). Angles that fit this better
     than the former are refused until the user says which they are.
   - qw, qx, qy, qz: world to camera with axes x right, y down, z forward, as in COLMAP.
-  - r11 ... r33 alone: world to camera, to either of the two axes; the cameras look down.
+  - only r11 ... r33: world to camera, to either of the two axes; the cameras look down.
 
 Axes of the world are those of the CRS of the positions: its grid north, or for degrees the east,
 north and up of the place. Values called ``_est`` are adjusted ones; the others beside them are then
@@ -403,7 +403,7 @@ def centres(columns: Columns, suffix: str = "", *, needed: bool = False) -> Floa
 
 
 def crs(columns: Columns) -> tuple[str | None, tuple[PcfixWarning, ...]]:
-    """Return the CRS that a table says or shows, and what to tell about it.
+    """Return the CRS that a table states or implies, and notes on it.
 
     Longitude and latitude without more are those of WGS 84. Heights then are ellipsoidal only
     if the header calls them so; else the CRS has no heights. A ``.prj`` of the table's name beside

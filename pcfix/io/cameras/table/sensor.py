@@ -5,7 +5,7 @@ The lens is that of a table beside it, a calibration, or the table's own columns
 to the camera (x right, y down, z forward), after a comment with the CRS where there is one; and
 ``sensor.csv``, with the lens in pixels with OpenCV's names or, of an undistorted lens in mm, as
 focal, sensor_x, sensor_y. Where the images have several lenses of one frame, each row of
-``cameras.csv`` has its own (f, px, py, k1 ... k4, t1, t2) and ``sensor.csv`` says the frame alone.
+``cameras.csv`` has its own (f, px, py, k1 ... k4, t1, t2) and ``sensor.csv`` has only the frame.
 """
 
 from __future__ import annotations
@@ -158,7 +158,7 @@ def _sensor(target: Path, lens: Lens) -> str:
 
 
 def _brown(target: Path, lens: Lens, counts: Sequence[int]) -> list[tuple[float, ...]]:
-    """Return radial, denominator and tangential coefficients, so many, if they are the lens."""
+    """Return radial, denominator and tangential coefficients, padded to `counts`, if they are the lens."""
     given = (lens.radial, lens.denominator, lens.tangential)
     lists = [(*k, *(0.0,) * n)[:n] for k, n in zip(given, counts, strict=True)]
     frame = (lens.focal, lens.width, lens.height, lens.principal_x, lens.principal_y)
