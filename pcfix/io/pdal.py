@@ -204,7 +204,7 @@ class Results:
 
 
 def metadata_of(figures: Metadata, flags: Flags | None = None) -> Metadata:
-    """Return a summary as PDAL's metadata; later stages learn from it that `flags` were unpacked."""
+    """Return a summary as PDAL's metadata, for later stages also whether `flags` were unpacked."""
     values = {k: v for k, v in figures.items() if k not in ("input", "output") and v is not None}
     if flags is not None and flags.unpacked:
         values[UNPACKED] = True

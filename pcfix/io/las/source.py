@@ -206,8 +206,8 @@ class LasSource:
         """Open; an `InputError` if the file is missing, damaged, empty, or its scales unusable.
 
         With `places_only` nothing is unpacked but coordinates, classes, sources and colours, where
-        the file stores its dimensions separately (LAZ of format 6 and up); the others may be zero then.
-        The chunks of a small cloud are put into `kept`, for the next to read it, and must not be
+        the file stores its dimensions separately (LAZ of format 6 and up); the others may be zero
+        then. The chunks of a small cloud are put into `kept`, for the next reader, and must not be
         changed.
         """
         self.path = check_input(path)

@@ -158,7 +158,7 @@ def _sensor(target: Path, lens: Lens) -> str:
 
 
 def _brown(target: Path, lens: Lens, counts: Sequence[int]) -> list[tuple[float, ...]]:
-    """Return radial, denominator and tangential coefficients, padded to `counts`, if they are the lens."""
+    """Return `counts` radial, denominator and tangential coefficients, if they are the lens."""
     given = (lens.radial, lens.denominator, lens.tangential)
     lists = [(*k, *(0.0,) * n)[:n] for k, n in zip(given, counts, strict=True)]
     frame = (lens.focal, lens.width, lens.height, lens.principal_x, lens.principal_y)
