@@ -238,12 +238,6 @@ def _split_unit(name: str) -> tuple[str, str]:
 _PLAIN = {spelling for spellings in SPELLINGS.values() for spelling in spellings}
 
 
-def column_missing(path: Path, missing: Sequence[str], header: Sequence[str]) -> InputError:
-    """Return the error for a table that lacks columns."""
-    sentence = f"the header lacks {', '.join(missing)}; it has {', '.join(header)}."
-    return bad_file(path, "table.column_missing", sentence, columns=list(missing))
-
-
 DEGREES = {
     **dict.fromkeys(("", "deg", "degree", "degrees", "°"), 1.0),
     **dict.fromkeys(("gon", "gons", "grad", "grads"), 0.9),
@@ -307,13 +301,10 @@ class Columns:
         """Return the same with NaN for empty fields and for columns that are not there."""
         return np.column_stack([self._numbers(role, needed=False) for role in roles])
 
-    def where(self, row: int) -> str:
-        """Return file, line and image, for messages."""
-        return f"{self.path}: line {self.table.line[row]} (image {self.labels[row]})"
-
     def error(self, row: int, code: str, sentence: str, **values: Any) -> InputError:
         """Return an error that names file, line and image."""
-        return InputError(code, f"{self.where(row)}: {sentence}", path=self.path, **values)
+        where = f"line {self.table.line[row]} (image {self.labels[row]})"
+        return bad_file(self.path, code, f"{where}: {sentence}", **values)
 
     def _numbers(self, role: str, *, needed: bool) -> FloatArray:
         if role not in self.place:
@@ -356,7 +347,7 @@ def read_columns(path: Path) -> Columns:
     if "label" not in place or not (axes(place) or axes(place, "_est")):
         position = ("longitude", "latitude", "z") if "longitude" in place else ("x", "y", "z")
         lacking = [role for role in ("label", *position) if role not in place]
-        raise column_missing(path, lacking, names)
+        tables.check_columns(path, names, ("label", *position), lacking)
     comments = comment or any(line.startswith("#") for line in lines[:at])
     below = next((line for line in lines[at + 1 :] if line.strip() and line[0] != "#"), "")
     delimiter = tables.split_header((below if comment else lines[at]).strip())[1]
@@ -453,11 +444,11 @@ def _rotations(columns: Columns, angles: Angles | None, suffix: str = "") -> Flo
         there = [role for role in kind if columns.has(role)]
         missing = [role for role in kind if not columns.has(role)]
         if there and missing:
-            raise column_missing(columns.path, missing, columns.table.header)
+            tables.check_columns(columns.path, columns.table.header, kind, missing)
     if angles is not None:
         roles = opk if angles == "omega-phi-kappa" else ypr
-        if not columns.has(*roles):
-            raise column_missing(columns.path, roles, columns.table.header)
+        missing = [role for role in roles if not columns.has(role)]
+        tables.check_columns(columns.path, columns.table.header, roles, missing)
         return FROM_ANGLES[angles](*columns.of(roles).T)
     if columns.has(*opk):
         place = columns.place
