@@ -93,12 +93,6 @@ def missing(path: Path, remedy: str = "Keep all files of the project together") 
     return bad_file(path, "cameras.missing_file", f"is missing. {remedy}.")
 
 
-def sensor_unused(source: Source, why: str) -> InputError:
-    """Return the error for a sensor that the cameras have no use for."""
-    sentence = f"has {why}, so --sensor {source.sensor} has no use. Leave it out."
-    return bad_file(source.path, "cameras.sensor_unused", sentence, sensor=source.sensor)
-
-
 def note(path: object, code: str, sentence: str, **values: Any) -> PcfixWarning:
     """Return a note on what was done on reading a file."""
     return PcfixWarning(code, f"{path}: {sentence}", path=path, **values)

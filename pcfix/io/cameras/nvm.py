@@ -65,8 +65,7 @@ def recognises(source: Source) -> bool:
 def read(source: Source) -> Cameras:
     """Read the poses and lenses of the largest model."""
     path = source.path
-    models = _models(path)
-    model = _largest(path, models)
+    model, models = _largest(path)
     labels = tuple(model.names[i] for i in model.posed)
     rotations, centres = _poses(path, model)
     rows, smallest = model.rows[model.posed], _placed(path, model)[1][model.posed]
@@ -92,14 +91,14 @@ def read(source: Source) -> Cameras:
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """Read the points of the largest model and where the images saw them."""
-    model = _largest(source.path, _models(source.path))
+    model, _ = _largest(source.path)
     if not len(model.points.image) or cameras.lenses is None:
         raise tracks.no_tie_points(source.path, "it lists no points")
     return model.points.seen(model.posed, cameras, _placed(source.path, model)[0])
 
 
-def _models(path: Path) -> list[Model]:
-    """Return all models of the file."""
+def _largest(path: Path) -> tuple[Model, list[Model]]:
+    """Return the model with most posed images, of those with points if there are any, and all."""
     head, *lines = [x for line in read_lines(path) if (x := line.strip()) and x[0] != "#"]
     found = _HEAD.match(head)
     matrix, held = found.groups() if found else (None, None)
@@ -119,16 +118,11 @@ def _models(path: Path) -> list[Model]:
         at += 1 + points
     if not models:
         raise checks.no_pose(path, "has no model")
-    return models
-
-
-def _largest(path: Path, models: list[Model]) -> Model:
-    """Return the model with most posed images, of those with points if there are any."""
     with_points = [model for model in models if len(model.points.xyz)]
     largest = max(with_points or models, key=lambda model: len(model.posed))
     if not len(largest.posed):
         raise checks.no_pose(path, "no image has a pose (all focal lengths are 0)")
-    return largest
+    return largest, models
 
 
 def _poses(path: Path, model: Model) -> tuple[FloatArray, FloatArray]:

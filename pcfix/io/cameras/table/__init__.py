@@ -129,8 +129,6 @@ def read(source: Source) -> Cameras:
         columns = columns.take(np.flatnonzero(~lost))
     xyz = centres(columns, suffix, needed=True)
     turns = _rotations(columns, source.angles, suffix)
-    if turns is None and source.sensor is not None:
-        raise checks.sensor_unused(source, "no angles")
     lenses = None if turns is None else read_lenses(columns, source.sensor)
     first: dict[tuple[str, bytes], int] = {}  # labels are no key, but an exact copy counts once
     for i, label in enumerate(columns.labels):
