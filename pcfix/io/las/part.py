@@ -102,8 +102,6 @@ def nodes_in(
     """
     with CopcReader.open(path) as reader:
         header, info, levels, box = reader.header, reader.copc_info, None, None
-        if info.hierarchy_root_offset + info.hierarchy_root_size > path.stat().st_size:
-            raise ValueError("its octree begins or ends behind its end")
         if part.resolution is not None:
             halvings = math.ceil(math.log2(info.spacing / part.resolution))
             levels = range(max(halvings, 0) + 1)

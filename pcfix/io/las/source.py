@@ -347,10 +347,14 @@ class LasSource:
 
     def _chunks_of(self, path: CloudPart) -> Iterator[laspy.ScaleAwarePointRecord]:
         """Yield the points of a part."""
-        chunks = self._whole()
-        if is_copc(self.header):
-            chunks = nodes_in(path, path.part, self._selection, CHUNK_POINTS)
         with las_errors(self.path):
+            chunks = self._whole()
+            if is_copc(self.header):
+                info = self.header.vlrs[0]
+                end = info.hierarchy_root_offset + info.hierarchy_root_size
+                if end > path.stat().st_size:  # laspy would take memory for all of it
+                    raise ValueError("its octree begins or ends behind its end")
+                chunks = nodes_in(path, path.part, self._selection, CHUNK_POINTS)
             for points in chunks:
                 inside = path.part.holds(points)
                 if inside.any():
