@@ -17,7 +17,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import isfinite
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -256,34 +256,29 @@ class HeightsError(InputError):
     """Heights of two systems that cannot be transformed into each other."""
 
 
-class Transformation(NamedTuple):
-    """Takes points (n, 3), x east or longitude first; not finite where there is no such place."""
-
-    forward: Points
-    notes: Notes = ()
-
-
 def transformation(
     source: CRS, target: CRS, at: FloatArray, name: str, *, heights: bool, instead: str = ""
-) -> Transformation:
+) -> tuple[Points, Notes]:
     """Return the transformation of `heights` too, or in plan, where only their unit changes.
 
-    It is needed at places (n, 3) of `source`. In plan neither CRS may be geocentric. If heights
-    cannot be transformed it is a `HeightsError` with the remedy `instead`.
+    It takes points (n, 3), x east or longitude first; numbers that it returns are not finite where
+    there is no such place. It is needed at places (n, 3) of `source`. In plan neither CRS may be
+    geocentric. If heights cannot be transformed it is a `HeightsError` with the remedy `instead`.
+    Also return notes on what is assumed.
     """
     if heights:
         step, notes = _operation(source, target, at, name, heights=True, instead=instead)
-        return Transformation(lambda xyz: np.column_stack(step.transform(*xyz.T)), notes)
+        return lambda xyz: np.column_stack(step.transform(*xyz.T)), notes
     factor = metres_up(source) / metres_up(target)
     plans = parts(source)[0], parts(target)[0]
     if is_same(*plans):
-        return Transformation(lambda xyz: xyz * [1.0, 1.0, factor])
+        return lambda xyz: xyz * [1.0, 1.0, factor], ()
     step, notes = _operation(*plans, at, name, heights=False)
 
     def forward(xyz: FloatArray) -> FloatArray:
         return np.column_stack([*step.transform(xyz[:, 0], xyz[:, 1]), factor * xyz[:, 2]])
 
-    return Transformation(forward, notes)
+    return forward, notes
 
 
 def _operation(
@@ -435,5 +430,5 @@ def way_to_cloud(
     # a search for the code of a CRS takes long
     plan = "" if agree else typed(parts(source)[0])
     instead = f"or, if the heights agree with the cloud's, give the file's CRS as {plan}"
-    step = transformation(source, cloud, at, name, heights=not agree, instead=instead)
-    return step.forward, (*step.notes, *notes)
+    forward, more = transformation(source, cloud, at, name, heights=not agree, instead=instead)
+    return forward, (*more, *notes)

@@ -182,7 +182,8 @@ def _read_gdal(path: Path, layer: str | None) -> tuple[Geometries, str | None, s
                 warnings.simplefilter("ignore")  # M values, which are not needed, are lost
                 meta, _, wkb, _ = pyogrio.raw.read(path, layer=layer, columns=[])
             geometries = shapely.from_wkb(wkb)
-    except (RuntimeError, ValueError, shapely.errors.ShapelyError) as error:
+    # pyogrio raises a NameError where a CRS is not text
+    except (RuntimeError, ValueError, NameError, shapely.errors.ShapelyError) as error:
         first = str(error).split(";")[0].strip().rstrip(".")
         raise bad_file(path, "vector.damaged", f"cannot be read ({first}).") from error
     if layer not in names:

@@ -41,18 +41,18 @@ chunk.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
 from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import InputError, PcfixWarning, bad_file
 from pcfix.io.cameras.colmap import read_images
+from pcfix.io.crs import Points
 from pcfix.io.files import check_input
 from pcfix.io.labels import match_labels
 from pcfix.io.ply import Records, joined, list_starts, read_header
@@ -62,7 +62,6 @@ from pcfix.model import Cameras, FloatArray, IntArray, TiePoints, ViewKind, View
 from pcfix.options.declare import File
 from pcfix.sums import LEAST, SAME, Sums
 
-Transformation: TypeAlias = "Callable[[FloatArray], FloatArray]"
 COLMAP_LIST = "COLMAP view list"
 _HEAD = 8
 _IMAGES, _WEIGHTS = "view_indices", "view_weights"
@@ -108,7 +107,7 @@ class ViewList:
         return len(self.start) - 1
 
 
-def read_views(path: File, cameras: Cameras, *, to_cloud: Transformation | None = None) -> ViewList:
+def read_views(path: File, cameras: Cameras, *, to_cloud: Points | None = None) -> ViewList:
     """Read the view list of a dense cloud.
 
     Parameters
@@ -137,7 +136,7 @@ def read_views(path: File, cameras: Cameras, *, to_cloud: Transformation | None 
 
 
 def track_views(
-    path: Path, tie_points: TiePoints, cameras: Cameras, *, to_cloud: Transformation | None = None
+    path: Path, tie_points: TiePoints, cameras: Cameras, *, to_cloud: Points | None = None
 ) -> ViewList:
     """Make a view list of the tracks of a sparse model that was read from `path`.
 
@@ -160,7 +159,7 @@ def track_views(
     return _placed(views, cameras, to_cloud)
 
 
-def _placed(views: ViewList, cameras: Cameras, to_cloud: Transformation | None) -> ViewList:
+def _placed(views: ViewList, cameras: Cameras, to_cloud: Points | None) -> ViewList:
     """Return a list with positions in the cloud's frame, whose cameras see its points."""
     if views.xyz is None:
         return views

@@ -228,7 +228,7 @@ def read_water_raster(
         if to_cloud is not None and stated is not None and cloud_crs is not None:
             cloud, crs = systems.parse_crs(cloud_crs, "the cloud"), systems.parse_crs(stated, name)
             near = to_cloud(at) if bounds is None else _edge(bounds)
-            from_cloud = systems.transformation(cloud, crs, near, name, heights=False).forward
+            from_cloud, _ = systems.transformation(cloud, crs, near, name, heights=False)
             forward, unit = to_cloud, [1.0, 1.0, systems.metres_up(crs)]
             to_cloud = lambda xyz: forward(xyz / unit)  # noqa: E731
         part = _read(source, name, None if bounds is None else from_cloud(_edge(bounds)))

@@ -159,9 +159,9 @@ def test_topocentric():
 
 def test_plan_in_feet():
     crs = CRS("EPSG:2992"), CRS("EPSG:26910")
-    step = transformation(*crs, np.zeros((1, 3)), "a", heights=False)
+    forward, _ = transformation(*crs, np.zeros((1, 3)), "a", heights=False)
     x, y = Transformer.from_crs("EPSG:26910", "EPSG:2992", always_xy=True).transform(5e5, 4.9e6)
-    assert step.forward(np.array([[x, y, 1000.0]])) == pytest.approx(
+    assert forward(np.array([[x, y, 1000.0]])) == pytest.approx(
         np.array([[5e5, 4.9e6, 304.8]]), abs=1e-3
     )
 
@@ -202,7 +202,8 @@ def test_plan_that_cannot_be_transformed(source, target, at, code):
     ],
 )
 def test_notes(source, codes):
-    step = transformation(CRS(source), CRS("EPSG:25830"), VALENCIA, "a.xml", heights=False)
-    assert [note.code for note in step.notes] == codes
+    target = CRS("EPSG:25830")
+    _, notes = transformation(CRS(source), target, VALENCIA, "a.xml", heights=False)
+    assert [note.code for note in notes] == codes
     if codes == ["crs.accuracy"]:
-        assert step.notes[0].values["grids"] == ["es_ign_SPED2ETV2.tif"]
+        assert notes[0].values["grids"] == ["es_ign_SPED2ETV2.tif"]

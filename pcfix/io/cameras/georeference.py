@@ -276,12 +276,12 @@ def _into(
     plan = systems.typed(systems.parts(frame.crs if frame.direct else target)[0])
     given = "ENU:latitude,longitude,height" if frame.topocentric else plan
     instead = f"or, if the heights of cameras and cloud agree, give --cameras-crs {given}"
-    step = systems.transformation(
+    forward, of_step = systems.transformation(
         frame.crs, target, frame.enter(at), name, heights=heights, instead=instead
     )
-    of_step = (PcfixWarning("crs.transformation", str(one), path=name) for one in step.notes)
+    accuracy = (PcfixWarning("crs.transformation", str(one), path=name) for one in of_step)
     found = Georeference(
-        lambda xyz: step.forward(frame.enter(xyz)), frame, offset, crs, (*of_step, *notes), name
+        lambda xyz: forward(frame.enter(xyz)), frame, offset, crs, (*accuracy, *notes), name
     )
     # heights that --cameras-crs declares can be tested if the GNSS heights are above the geoid too
     gnss = cameras.gnss

@@ -400,8 +400,9 @@ def _world(
         raise bad_file(name, "output.crs", sentence, crs=cameras.crs)
     geographic = systems.parse_crs(systems.GEOGRAPHIC_WGS84, name)
     stated = systems.heights_of(source) != "unstated"
-    step = systems.transformation(source, geographic, cameras.centres, name, heights=stated)
-    to_degrees = step.forward
+    to_degrees, _ = systems.transformation(
+        source, geographic, cameras.centres, name, heights=stated
+    )
     longitude, latitude, _ = to_degrees(np.median(cameras.centres, axis=0)[None])[0].tolist()
     place = systems.Topocentric(latitude, longitude, 0.0)
     centres, points = (place.from_degrees(to_degrees(xyz)) for xyz in (cameras.centres, points))
