@@ -41,7 +41,7 @@ import os
 import re
 import sqlite3
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -53,7 +53,6 @@ from pcfix.io.cameras import checks, tracks
 from pcfix.io.cameras.checks import Source, damaged, terms
 from pcfix.io.cameras.tracks import NO_TIE_POINTS, are_seen
 from pcfix.io.crs import is_topocentric
-from pcfix.io.tables import read_lines
 from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, Projection, TiePoints
 from pcfix.options.declare import File
 
@@ -329,6 +328,7 @@ OBSERVATION = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 _COUNT, _CAMERA, _IMAGE = struct.Struct("<Q"), struct.Struct("<IiQQ"), struct.Struct("<I7dI")
 _POINT_BYTES, _POINT_TO_COUNT, _POINT_TO_COLOUR, _VIEW_BYTES = 51, 43, 32, 8
 _STATED = re.compile(r"^#.*Number of (?:cameras|images|points): (\d{1,15})\b", re.MULTILINE)
+_HEAD_CHARACTERS = 4096
 
 
 def _take(file: mmap.mmap, form: struct.Struct) -> tuple[Any, ...]:
@@ -342,17 +342,20 @@ def _open(path: Path) -> mmap.mmap:
         return mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
 
 
-def _lines(path: Path) -> tuple[list[str], int]:
-    """Return the lines of a text file, blank ones too, and how many rows its comments announce."""
-    lines = read_lines(path)
-    stated = _STATED.search("\n".join(lines[:20]))
-    rows = [line.strip() for line in lines if not line.lstrip().startswith("#")]
-    return rows, int(stated[1]) if stated else 0
+def _lines(path: Path) -> Iterator[str]:
+    """Yield the lines of a text file, blank ones too, but no comments."""
+    with path.open(encoding="utf-8-sig", errors="replace") as stream:
+        for line in stream:
+            if not line.lstrip().startswith("#"):
+                yield line.strip()
 
 
-def _check_count(path: Path, rows: int, stated: int) -> None:
-    if rows < stated:
-        raise damaged(path, f"{rows:,} rows instead of {stated:,}")
+def _check_count(path: Path, rows: int) -> None:
+    """Refuse a text that has fewer rows than its comments announce."""
+    with path.open(encoding="utf-8-sig", errors="replace") as stream:
+        stated = _STATED.search(stream.read(_HEAD_CHARACTERS))
+    if stated and rows < int(stated[1]):
+        raise damaged(path, f"{rows:,} rows instead of {int(stated[1]):,}")
 
 
 def read_list(path: Path) -> dict[int, Camera]:
@@ -368,15 +371,14 @@ def read_list(path: Path) -> dict[int, Camera]:
                 values = _take(file, struct.Struct(f"<{len(BY_NAME[MODELS[number]][0])}d"))
                 cameras[identifier] = Camera(MODELS[number], float(width), float(height), values)
             return cameras
-        lines, stated = _lines(path)
-        for name, model, *words in filter(None, map(str.split, lines)):
+        for name, model, *words in filter(None, map(str.split, _lines(path))):
             if model not in BY_NAME:
                 raise _no_model(path, name, model)
             width, height, *numbers = map(float, words)
             if len(numbers) != len(BY_NAME[model][0]):
                 raise damaged(path, f"camera {name}: {len(numbers)} parameters of {model}")
             cameras[int(name)] = Camera(model, width, height, tuple(numbers))
-        _check_count(path, len(cameras), stated)
+        _check_count(path, len(cameras))
     return cameras
 
 
@@ -399,8 +401,7 @@ def read_images(path: Path, *, points: bool) -> list[Image]:
                 file.seek(count * OBSERVATION.itemsize, os.SEEK_CUR)
                 images.append(Image(identifier, tuple(pose), camera, name, seen))
             return images
-        images, (listed, stated) = [], _lines(path)
-        lines = iter(listed)
+        images, lines = [], _lines(path)
         for line in filter(None, lines):
             identifier, *pose, camera, name = line.split(None, 9)
             below = next(lines, "")
@@ -411,7 +412,7 @@ def read_images(path: Path, *, points: bool) -> list[Image]:
             seen = np.empty(len(rows), OBSERVATION)
             seen["xy"], seen["point"] = rows[:, :2], rows[:, 2]
             images.append(Image(int(identifier), tuple(map(float, pose)), int(camera), name, seen))
-        _check_count(path, len(images), stated)
+        _check_count(path, len(images))
         return images
 
 
@@ -419,9 +420,8 @@ def read_points(path: Path) -> tuple[IntArray, FloatArray]:
     """Read identifiers and places of ``points3D``; the tracks are in the images too."""
     with checks.reading(path):
         if path.suffix != ".bin":
-            listed, stated = _lines(path)
-            lines = [line.split(None, 4)[:4] for line in listed if line]
-            _check_count(path, len(lines), stated)
+            lines = [line.split(None, 4)[:4] for line in _lines(path) if line]
+            _check_count(path, len(lines))
             values = np.array([line[1:] for line in lines], float).reshape(-1, 3)
             return np.array([int(line[0]) for line in lines], np.int64), values
         data, starts = _open(path), []
