@@ -20,7 +20,7 @@ from pcfix.adjust.diagnosis import (
 from pcfix.errors import InputError, PcfixError, PcfixWarning
 from pcfix.flow.inputs import Inputs, ties_of
 from pcfix.flow.next_steps import adjust_words
-from pcfix.io.cameras.metashape.block import given_lenses
+from pcfix.io.cameras.metashape import given_lenses
 from pcfix.io.cameras.table.sensor import read_sensor
 from pcfix.io.gnss_positions import gnss_in_frame_of
 from pcfix.model import Cameras, TiePoints

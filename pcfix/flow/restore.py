@@ -11,15 +11,7 @@ import numpy as np
 from pcfix.errors import InputError
 from pcfix.flow.runner import Chunk, Command, streaming
 from pcfix.flow.tiles import run_command
-from pcfix.io.las.columns import (
-    SHIFTS,
-    UNSURE,
-    columns_for,
-    convert,
-    is_corrected,
-    is_marked_uncorrected,
-    move,
-)
+from pcfix.io.las.columns import SHIFTS, UNSURE, columns_for, convert, move
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import read_settings, record_errors, restored_header
 from pcfix.io.tiles import Clouds
@@ -89,9 +81,9 @@ class _Restoring:
 
     def apply(self, points: Chunk, result: None) -> Chunk:
         """Give points their original coordinates, classes and flags."""
-        moved = is_corrected(points)
+        moved = np.asarray(points.array["RayCount"] > 0)
         points.array["classification"][moved] = points.array["SourceClass"][moved]
-        ours = is_marked_uncorrected(points)
+        ours = np.asarray(~moved & (points.array["WaterDepth"] > 0))  # and could not be corrected
         if self._has_unsure:
             ours |= points.array[UNSURE.name] > 0
         withheld = np.asarray(points["withheld"]).astype(bool)

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 from pcfix.io.files import check_input, check_output, write_bytes, write_text
 from pcfix.io.las.part import cloud_part
 from pcfix.io.las.source import LasSource
-from pcfix.io.las.writing import LasSink, check_suffix, output_evlrs
+from pcfix.io.las.writing import check_suffix, las_writer
 from pcfix.io.tiles import Tiles, check_one_file, inputs_of
 from pcfix.options.declare import File
 from pcfix.running import running
@@ -117,11 +117,13 @@ def stream(
     with LasSource(task.source, task.jobs, kept=task.kept or None) as source:
         work, total, done = begin(source), len(source), 0
         tally, findings = None, None
-        sink = LasSink(task.target, work.header, output_evlrs(source), work.identity, task.jobs)
-        with sink, _thread(task.jobs) as writer:
+        # the index of a COPC file would be wrong
+        evlrs = [one for one in source.evlrs if one.user_id != "copc"]
+        last = evlrs, work.identity, task.jobs
+        with las_writer(task.target, work.header, *last) as append, _thread(task.jobs) as writer:
 
             def write(points: Chunk, result: Any) -> None:
-                sink.write(work.apply(points, result))
+                append(work.apply(points, result))
 
             written: Future[None] | None = None
             for points in read_ahead(source.chunks(), task.jobs):

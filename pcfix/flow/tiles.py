@@ -25,7 +25,7 @@ from operator import add
 from pathlib import Path
 from time import perf_counter
 from types import ModuleType
-from typing import Any
+from typing import Any, cast
 
 from pcfix import version
 from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError
@@ -42,7 +42,7 @@ from pcfix.flow.runner import (
 )
 from pcfix.io.atomic import all_or_none
 from pcfix.io.files import file_state, path_of, read_tally, write_tally
-from pcfix.io.tiles import BrokenTileError, Clouds, Tiles, check_one_file, single, tiles_of
+from pcfix.io.tiles import BrokenTileError, Clouds, Tiles, check_one_file, tiles_of
 from pcfix.io.vectors import LAYER_MARK
 from pcfix.libraries import optional_library
 from pcfix.options.declare import File, options_of
@@ -128,7 +128,7 @@ def run_command(
     tiles = tiles_of(input)
     if tiles is not None:
         return run_tiles(command, tiles, output, options, progress)
-    task = file_task(single(input), output, options, reads=reads, progress=progress)
+    task = file_task(cast("File", input), output, options, reads=reads, progress=progress)
     with threads(task.jobs), all_or_none():
         plan = command.plan(task.source, task.target, task.kept)
         tally, findings = command.process(plan, task, 0, partial(command.check, plan))

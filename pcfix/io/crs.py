@@ -17,7 +17,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import isfinite
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -100,13 +100,6 @@ def is_same(one: CRS, other: CRS) -> bool:
     return code is not None and code == other.to_epsg()
 
 
-def is_same_vertical_datum(one: CRS, other: CRS) -> bool:
-    """Whether two vertical CRS have the same datum, in whatever unit."""
-    datums = [crs if crs.datum is None else crs.datum for crs in (one, other)]
-    names = ["".join(c for c in datum.name.lower() if c.isalnum()) for datum in datums]
-    return is_same(one, other) or (names[0] == names[1] and names[0] not in ("", "unknown"))
-
-
 def unbound(crs: CRS) -> CRS:
     """Return a CRS without its shift to WGS 84 (TOWGS84)."""
     return crs.source_crs if crs.is_bound and crs.source_crs is not None else crs
@@ -183,7 +176,7 @@ def shortened(text: str) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-GEOCENTRIC_WGS84, GEOGRAPHIC_WGS84 = "EPSG:4978", "EPSG:4979"
+GEOGRAPHIC_WGS84 = "EPSG:4979"
 
 
 def geographic_3d(crs: CRS) -> CRS:
@@ -230,24 +223,24 @@ class Topocentric:
             raise bad_file(name, "crs.origin", sentence, value=text) from None
         return cls(*numbers)
 
-    def to_geocentric(self, enu: FloatArray) -> FloatArray:
-        """Return geocentric coordinates (EPSG:4978) of points (n, 3), metres."""
-        x, y, z = enu.T
-        return np.column_stack(self._axes().transform(x, y, z, direction="INVERSE"))
+    def to_degrees(self, enu: FloatArray) -> FloatArray:
+        """Return longitudes, latitudes and ellipsoidal heights (EPSG:4979) of points (n, 3)."""
+        return self._transformed(enu, "INVERSE")
 
     def from_degrees(self, degrees: FloatArray) -> FloatArray:
         """Return the coordinates here of longitudes, latitudes and heights, shape (n, 3)."""
-        from pyproj import Transformer
+        return self._transformed(degrees, "FORWARD")
 
-        to_geocentric = Transformer.from_crs(GEOGRAPHIC_WGS84, GEOCENTRIC_WGS84, always_xy=True)
-        return np.column_stack(self._axes().transform(*to_geocentric.transform(*degrees.T)))
-
-    def _axes(self) -> Transformer:
-        """Return the transformer from geocentric coordinates to the axes here."""
+    def _transformed(self, xyz: FloatArray, direction: str) -> FloatArray:
         from pyproj import Transformer
 
         at = f"+lat_0={self.latitude_deg!r} +lon_0={self.longitude_deg!r} +h_0={self.height_m!r}"
-        return Transformer.from_pipeline(f"+proj=topocentric +ellps=WGS84 {at}")
+        geocentric = "+step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84"
+        step = Transformer.from_pipeline(
+            f"+proj=pipeline {geocentric} +step +proj=topocentric +ellps=WGS84 {at}"
+        )
+        x, y, z = xyz.T
+        return np.column_stack(step.transform(x, y, z, direction=direction))
 
 
 Points = Callable[[FloatArray], FloatArray]
@@ -263,34 +256,29 @@ class HeightsError(InputError):
     """Heights of two systems that cannot be transformed into each other."""
 
 
-class Transformation(NamedTuple):
-    """Takes points (n, 3), x east or longitude first; not finite where there is no such place."""
-
-    forward: Points
-    notes: Notes = ()
-
-
 def transformation(
     source: CRS, target: CRS, at: FloatArray, name: str, *, heights: bool, instead: str = ""
-) -> Transformation:
+) -> tuple[Points, Notes]:
     """Return the transformation of `heights` too, or in plan, where only their unit changes.
 
-    It is needed at places (n, 3) of `source`. In plan neither CRS may be geocentric. If heights
-    cannot be transformed it is a `HeightsError` with the remedy `instead`.
+    It takes points (n, 3), x east or longitude first; numbers that it returns are not finite where
+    there is no such place. It is needed at places (n, 3) of `source`. In plan neither CRS may be
+    geocentric. If heights cannot be transformed it is a `HeightsError` with the remedy `instead`.
+    Also return notes on what is assumed.
     """
     if heights:
         step, notes = _operation(source, target, at, name, heights=True, instead=instead)
-        return Transformation(lambda xyz: np.column_stack(step.transform(*xyz.T)), notes)
+        return lambda xyz: np.column_stack(step.transform(*xyz.T)), notes
     factor = metres_up(source) / metres_up(target)
     plans = parts(source)[0], parts(target)[0]
     if is_same(*plans):
-        return Transformation(lambda xyz: xyz * [1.0, 1.0, factor])
+        return lambda xyz: xyz * [1.0, 1.0, factor], ()
     step, notes = _operation(*plans, at, name, heights=False)
 
     def forward(xyz: FloatArray) -> FloatArray:
         return np.column_stack([*step.transform(xyz[:, 0], xyz[:, 1]), factor * xyz[:, 2]])
 
-    return Transformation(forward, notes)
+    return forward, notes
 
 
 def _operation(
@@ -355,8 +343,10 @@ def heights_agree(source: CRS, target: CRS) -> bool:
     if "unstated" in kinds:
         return True
     (plan, vertical), (other_plan, other) = parts(source), parts(target)
-    if vertical is not None and other is not None:
-        return is_same_vertical_datum(vertical, other)
+    if vertical is not None and other is not None:  # one datum may be in different units
+        datums = [crs if crs.datum is None else crs.datum for crs in (vertical, other)]
+        one, two = ("".join(c for c in d.name.lower() if c.isalnum()) for d in datums)
+        return is_same(vertical, other) or (one == two and one not in ("", "unknown"))
     return kinds[0] == kinds[1] and is_same(plan, other_plan)
 
 
@@ -440,5 +430,5 @@ def way_to_cloud(
     # a search for the code of a CRS takes long
     plan = "" if agree else typed(parts(source)[0])
     instead = f"or, if the heights agree with the cloud's, give the file's CRS as {plan}"
-    step = transformation(source, cloud, at, name, heights=not agree, instead=instead)
-    return step.forward, (*step.notes, *notes)
+    forward, more = transformation(source, cloud, at, name, heights=not agree, instead=instead)
+    return forward, (*more, *notes)

@@ -168,7 +168,7 @@ _OF_ARRAYS = ("_reconstruct", "_frombuffer", "ndarray", "dtype", "scalar")
 
 
 def file_state(path: Path) -> dict[str, Any]:
-    """Return what tells whether a file changed, in plain values."""
+    """Return size and time of a file, by which a change is recognized, in plain values."""
     if not path.exists():
         return {"path": str(path), "bytes": None}
     found = path.stat()

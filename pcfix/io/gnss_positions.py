@@ -10,7 +10,7 @@ import numpy as np
 
 from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.cameras import read_cameras, table
-from pcfix.io.cameras.formats import Source
+from pcfix.io.cameras.checks import Source
 from pcfix.io.cameras.georeference import adjusted_minus_gnss, is_tied
 from pcfix.io.cameras.odm import read_images
 from pcfix.io.cameras.table import gnss_positions, open_table

@@ -37,14 +37,13 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning, bad_file
+from pcfix.io.cameras.checks import Source
 from pcfix.io.cameras.checks import number as xml_number
-from pcfix.io.cameras.formats import Source
 from pcfix.io.cameras.metashape import SPREADS, documents, spreads
 from pcfix.io.cameras.metashape.documents import Chunk
 from pcfix.io.cameras.odm import named_crs
-from pcfix.io.cameras.table import centres
+from pcfix.io.cameras.table import Columns, centres, headers, is_header, read_columns
 from pcfix.io.cameras.table import crs as table_crs
-from pcfix.io.cameras.table.columns import Columns, headers, is_header, read_columns
 from pcfix.io.crs import LOCAL, is_local, is_topocentric, parse_crs, way_to_cloud
 from pcfix.io.files import check_input
 from pcfix.io.labels import match_labels, unnamed

@@ -5,6 +5,7 @@ from __future__ import annotations
 import zlib
 from dataclasses import fields
 from pathlib import Path
+from tokenize import TokenError
 from typing import TYPE_CHECKING
 from zipfile import BadZipFile
 
@@ -17,7 +18,10 @@ if TYPE_CHECKING:
     from pcfix.adjust.precision import Members
 
 FILE = "ensemble.npz"
-_NOT_READ = (OSError, ValueError, TypeError, KeyError, EOFError, BadZipFile, zlib.error)
+_NOT_READ = (
+    *(OSError, ValueError, TypeError, KeyError, EOFError, BadZipFile, zlib.error),
+    *(SyntaxError, TokenError),  # of numpy, which reads the heads of arrays as Python does
+)
 
 
 def write_members(folder: Path, members: Members) -> None:

@@ -18,8 +18,7 @@ from pcfix.io.las.columns import (
     Column,
     changed_rows,
     column_scale,
-    in_steps,
-    rows_of,
+    filled,
     shift_steps,
     to_withhold,
     unsure_anew,
@@ -191,10 +190,8 @@ class Results:
         withheld = self._flags.withheld[rows]
         correction = unsure_anew(correction, withheld)
         changed = changed_rows(correction, withheld, withhold=withhold)
-        for column in self._columns:
-            filled = rows_of(column, correction, changed)
-            values = in_steps(column, correction, moved, classes, filled)
-            out[column.name][rows][filled] = values * column_scale(column, scales)
+        for column, some, values in filled(self._columns, correction, moved, classes, changed):
+            out[column.name][rows][some] = values * column_scale(column, scales)
         out["Classification"][rows][correction.corrected] = BATHYMETRIC_POINT
         if OUTCOME in out:
             out[OUTCOME][rows] = correction.outcome
@@ -207,7 +204,7 @@ class Results:
 
 
 def metadata_of(figures: Metadata, flags: Flags | None = None) -> Metadata:
-    """Return a summary as PDAL's metadata; it tells later stages that `flags` were unpacked."""
+    """Return a summary as PDAL's metadata, for later stages also whether `flags` were unpacked."""
     values = {k: v for k, v in figures.items() if k not in ("input", "output") and v is not None}
     if flags is not None and flags.unpacked:
         values[UNPACKED] = True

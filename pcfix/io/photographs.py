@@ -222,7 +222,7 @@ class Frames:
 
 
 def read_frames(path: File, every: int = 1) -> Frames:
-    """Return the frames of a folder or a video, every so many-th; none is decoded yet."""
+    """Return the frames of a folder or a video, one in `every`; none is decoded yet."""
     place = Path(path)
     if not place.exists():
         raise bad_file(place, "frames.missing", "there is no such file.")

@@ -294,7 +294,5 @@ def outlines(path: Path, cells: int) -> list[Any]:
 def values_at(path: Path, xy: FloatArray) -> FloatArray:
     """Return the cells of the first band at places (n, 2); NaN for no value."""
     with open_raster(path) as source:
-        cells = [
-            cell.astype(np.float64).filled(np.nan) for cell in source.sample(xy, 1, masked=True)
-        ]
-    return np.reshape(cells, -1).astype(np.float64)
+        cells = source.sample(xy, 1, masked=True)
+        return np.ravel([cell.astype(np.float64).filled(np.nan) for cell in cells])

@@ -42,11 +42,11 @@ def read_regression(path: File) -> DepthRegression:
     found = check_input(path)
     try:
         content = read_json(found)
+        if not isinstance(content, dict) or content.get("format") != HEADER["format"]:
+            raise ValueError(f"its format is not {HEADER['format']}")
     except (OSError, ValueError) as error:
         sentence = f"is not a depth regression ({error}). {_REMEDY}"
         raise bad_file(found, "regression.not_one", sentence) from error
-    if not isinstance(content, dict) or content.get("format") != HEADER["format"]:
-        raise bad_file(found, "regression.not_one", f"is not a depth regression. {_REMEDY}")
     for name in ("version", "unit"):
         if content.get(name) != HEADER[name]:
             sentence = f"its {name} is {content.get(name)!r}, not {HEADER[name]!r}. Fit it again."

@@ -34,11 +34,6 @@ _PAGE = """<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>
 """
 
 
-def hex_colour(colour: tuple[int, ...]) -> str:
-    """Return red, green and blue, 0 to 255, as #rrggbb."""
-    return "#" + "".join(f"{part:02x}" for part in colour)
-
-
 def limits_of(values: FloatArray, what: str) -> tuple[float, float]:
     """Return the values for the first and the last colour of a map; NaN does not count."""
     known = values[np.isfinite(values)]
@@ -52,11 +47,12 @@ def limits_of(values: FloatArray, what: str) -> tuple[float, float]:
 def raster_style(path: Path, what: str) -> str:
     """Return the style of a raster of one band, by what it holds."""
     low, high = limits_of(preview(path)[0], what)
-    items = "\n".join(
-        f'     <item value="{low + share * (high - low):.6g}" color="{hex_colour(colour)}"'
-        f' alpha="255" label="{low + share * (high - low):.2f}"/>'
-        for share, colour in stops_of(RAMPS.get(what, HEIGHT))
-    )
+    items = []
+    for share, colour in stops_of(RAMPS.get(what, HEIGHT)):
+        value, code = low + share * (high - low), "".join(f"{part:02x}" for part in colour)
+        item = f'     <item value="{value:.6g}" color="#{code}" alpha="255" label="{value:.2f}"/>'
+        items.append(item)
+    listed = "\n".join(items)
     body = f""" <pipe>
   <rasterrenderer type="singlebandpseudocolor" band="1" opacity="1" alphaBand="-1"
     classificationMin="{low:.6g}" classificationMax="{high:.6g}">
@@ -64,7 +60,7 @@ def raster_style(path: Path, what: str) -> str:
    <rastershader>
     <colorrampshader colorRampType="INTERPOLATED" classificationMode="1" clip="0"
       minimumValue="{low:.6g}" maximumValue="{high:.6g}">
-{items}
+{listed}
     </colorrampshader>
    </rastershader>
   </rasterrenderer>

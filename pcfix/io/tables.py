@@ -208,12 +208,20 @@ def read_check_depths(path: File) -> CheckDepths:
     """
     source = check_input(path)
     table = read_table(source, ())
-    columns = {role: _depth_column(table, role) for role in ("x", "y", "depth")}
-    what = "depth" if columns["depth"] else "z"
-    columns[what] = _depth_column(table, what)
-    missing = ["depth or z" if r == "z" else r for r in ("x", "y", what) if columns[r] is None]
+    column: dict[str, str] = {}
+    for role in ("x", "y", "depth", "z"):
+        if role == "z" and "depth" in column:  # then heights are not looked at
+            break
+        there = columns_of(source, table.header, DEPTH_SPELLINGS[role], METRES)
+        if len(there) > 1:
+            sentence = f"the columns {', '.join(there)} may all be {role}. Remove all but one."
+            raise bad_file(source, "table.column_twice", sentence, columns=there)
+        if there:
+            column[role] = there[0]
+    what = "depth" if "depth" in column else "z"
+    missing = ["depth or z" if r == "z" else r for r in ("x", "y", what) if r not in column]
     check_columns(source, table.header, ("x", "y", "depth or z"), missing)
-    values = [np.array(table.numbers(str(columns[role]))) for role in ("x", "y", what)]
+    values = [np.array(table.numbers(column[role])) for role in ("x", "y", what)]
     found = CheckDepths(
         str(source), np.column_stack(values[:2]), values[2], what == "z", table.line
     )
@@ -223,11 +231,3 @@ def read_check_depths(path: File) -> CheckDepths:
         sentence = f"{count} depths are negative (line {line}). Give them positive down, or as z."
         raise bad_file(source, "check_depths.negative", sentence, line=line, count=count)
     return found
-
-
-def _depth_column(table: Table, role: str) -> str | None:
-    there = columns_of(table.path, table.header, DEPTH_SPELLINGS[role], METRES)
-    if len(there) > 1:
-        sentence = f"the columns {', '.join(there)} may all be {role}. Remove all but one."
-        raise bad_file(table.path, "table.column_twice", sentence, columns=there)
-    return there[0] if there else None

@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import shapely
@@ -116,11 +116,6 @@ def inputs_of(cloud: Any) -> list[Any]:
     return [*cloud.paths, *cloud.broken] if isinstance(cloud, Tiles) else [cloud]
 
 
-def single(cloud: Clouds) -> File:
-    """Return the path of a single file."""
-    return cast(File, cloud)
-
-
 def tiles_of(cloud: Clouds) -> Tiles | None:
     """Return many files as one cloud; None if a path is that of a single file.
 
@@ -169,7 +164,7 @@ def cloud_of(cloud: Clouds) -> Path | Tiles:
 
 
 def _listed(path: Path) -> list[Path] | None:
-    """Return the files that a path stands for; None if it is that of a single one."""
+    """Return the files that a path lists; None if it is that of a single cloud."""
     text, suffix = str(path), path.suffix.lower()
     if glob.has_magic(text) and not path.exists():
         return sorted(Path(path.anchor).glob(str(path.relative_to(path.anchor))))

@@ -15,18 +15,10 @@ import numpy.typing as npt
 import shapely
 
 from pcfix.errors import PcfixWarning, SettingError, bad_file
+from pcfix.io import tables
 from pcfix.io.atomic import cannot_write, temporary_output
 from pcfix.io.crs import LOCAL, parse_crs, way_to_cloud
 from pcfix.io.files import check_input, check_output
-from pcfix.io.tables import (
-    DEGREES,
-    METRES,
-    check_columns,
-    columns_of,
-    read_lines,
-    split_header,
-    table_below,
-)
 from pcfix.libraries import optional_library
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
@@ -190,7 +182,8 @@ def _read_gdal(path: Path, layer: str | None) -> tuple[Geometries, str | None, s
                 warnings.simplefilter("ignore")  # M values, which are not needed, are lost
                 meta, _, wkb, _ = pyogrio.raw.read(path, layer=layer, columns=[])
             geometries = shapely.from_wkb(wkb)
-    except (RuntimeError, ValueError, shapely.errors.ShapelyError) as error:
+    # pyogrio raises a NameError where a CRS is not text
+    except (RuntimeError, ValueError, NameError, shapely.errors.ShapelyError) as error:
         first = str(error).split(";")[0].strip().rstrip(".")
         raise bad_file(path, "vector.damaged", f"cannot be read ({first}).") from error
     if layer not in names:
@@ -209,19 +202,14 @@ def _read_text(path: Path) -> tuple[Geometries, str | None]:
     A comment ``# crs: EPSG:25830`` above the rest names it, or ``SRID=25830;`` before a WKT;
     for longitude and latitude it is WGS 84.
     """
-    lines = read_lines(path)
-    stated = [found.group(1).strip() for line in lines[:20] if (found := _CRS.match(line.strip()))]
-    used = [
-        (number, line)
-        for number, line in enumerate(lines, start=1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
+    lines = tables.read_lines(path)
+    stated = [found[1].strip() for line in lines[:20] if (found := _CRS.match(line.strip()))]
+    numbered = enumerate(lines, start=1)
+    used = [(n, line) for n, line in numbered if line.strip() and line.lstrip()[0] != "#"]
     if not used:
         raise bad_file(path, "vector.empty", "is empty.")
-    if _WKT.match(used[0][1]):
-        geometries, crs = _from_wkt(path, used)
-    else:
-        geometries, crs = _from_table(path, lines, used[0][0] - 1)
+    is_wkt = _WKT.match(used[0][1])
+    geometries, crs = _from_wkt(path, used) if is_wkt else _from_table(path, lines, used[0][0] - 1)
     return geometries, stated[0] if stated else crs
 
 
@@ -248,11 +236,11 @@ def _from_table(path: Path, lines: list[str], at: int) -> tuple[Geometries, str 
 
     A point whose height is empty has none.
     """
-    names, delimiter = split_header(lines[at])
-    table = table_below(path, lines, names, delimiter, at=at, comments=True)
-    units = (*METRES, *DEGREES)
+    names, delimiter = tables.split_header(lines[at])
+    table = tables.table_below(path, lines, names, delimiter, at=at, comments=True)
+    units = (*tables.METRES, *tables.DEGREES)
     column = {
-        role: next(iter(columns_of(path, names, spellings, units)), None)
+        role: next(iter(tables.columns_of(path, names, spellings, units)), None)
         for role, spellings in COLUMNS.items()
     }
     if column["wkt"] is not None:
@@ -261,7 +249,9 @@ def _from_table(path: Path, lines: list[str], at: int) -> tuple[Geometries, str 
     if x is None or y is None:
         x, y, crs = column["longitude"], column["latitude"], WGS84
     if x is None or y is None:
-        check_columns(path, names, ("x and y", "or longitude and latitude", "or wkt"), ("x, y",))
+        tables.check_columns(
+            path, names, ("x and y", "or longitude and latitude", "or wkt"), ("x, y",)
+        )
     plan = np.column_stack([table.numbers(str(x)), table.numbers(str(y))])
     if column["z"] is None:
         return np.asarray(shapely.points(plan)), crs
@@ -421,13 +411,17 @@ def write_layers(
                     geometry_type=one.kind, append=number > 0,
                     **({} if number else {"dataset_options": OLDER}),
                 )  # fmt: skip
-            _write_styles(temporary, [one for one in layers if one.style])
+            if styled := [one for one in layers if one.style]:
+                load_pyogrio().raw.write(
+                    temporary, None, *_styles(styled), layer=STYLES, driver="GPKG", append=True,
+                    crs=None, geometry_type=None,
+                )  # fmt: skip
         except RuntimeError as error:
             raise cannot_write(target, error, temporary) from error
 
 
-def _write_styles(path: Path, layers: Sequence[Layer]) -> None:
-    """Add the table of styles, as QGIS writes it."""
+def _styles(layers: Sequence[Layer]) -> tuple[list[Any], list[str]]:
+    """Return the columns of the table of styles as QGIS writes it, and their names."""
     columns: dict[str, Any] = {
         "f_table_catalog": "", "f_table_schema": "", "f_geometry_column": "geom",
         "f_table_name": [one.name for one in layers], "styleName": [one.name for one in layers],
@@ -437,8 +431,4 @@ def _write_styles(path: Path, layers: Sequence[Layer]) -> None:
     fields = {name: np.full(len(layers), value, object) for name, value in columns.items()}
     fields["useAsDefault"] = np.ones(len(layers), bool)
     fields["update_time"] = np.full(len(layers), "2020-01-01", "datetime64[ms]")
-    if layers:
-        load_pyogrio().raw.write(
-            path, None, [*fields.values()], [*fields], layer=STYLES, driver="GPKG", append=True,
-            crs=None, geometry_type=None,
-        )  # fmt: skip
+    return [*fields.values()], [*fields]

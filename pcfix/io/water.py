@@ -21,17 +21,8 @@ import numpy as np
 import shapely
 
 from pcfix.errors import GeometryError, PcfixWarning, SettingError, bad_file
-from pcfix.io.crs import (
-    LOCAL,
-    Notes,
-    Points,
-    is_local,
-    metres_up,
-    parse_crs,
-    parts,
-    transformation,
-    way_to_cloud,
-)
+from pcfix.io import crs as systems
+from pcfix.io.crs import Points
 from pcfix.io.files import check_input
 from pcfix.io.labels import match_labels
 from pcfix.io.ply import Records
@@ -228,7 +219,18 @@ def read_water_raster(
         if t.is_identity or not np.isfinite(t).all() or not abs(t.determinant) > 0.0:
             sentence = "has no valid geotransform. Export it as GeoTIFF, or with a world file."
             raise bad_file(name, "water.raster_place", sentence)
-        to_cloud, from_cloud, notes = _ways(source, cloud_crs, bounds, name)
+        stated = None if source.crs is None else source.crs.to_wkt()
+        share = np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0), (0.5, 0.5)])
+        x, y = place_of(t, *(share * [source.width, source.height]).T)
+        at = np.column_stack([x, y, 0.0 * x])
+        to_cloud, notes = systems.way_to_cloud(stated, cloud_crs, at, name, heights=True)
+        from_cloud: Points = np.asarray  # in plan
+        if to_cloud is not None and stated is not None and cloud_crs is not None:
+            cloud, crs = systems.parse_crs(cloud_crs, "the cloud"), systems.parse_crs(stated, name)
+            near = to_cloud(at) if bounds is None else _edge(bounds)
+            from_cloud, _ = systems.transformation(cloud, crs, near, name, heights=False)
+            forward, unit = to_cloud, [1.0, 1.0, systems.metres_up(crs)]
+            to_cloud = lambda xyz: forward(xyz / unit)  # noqa: E731
         part = _read(source, name, None if bounds is None else from_cloud(_edge(bounds)))
     title = name.replace("\\", "/").rpartition("/")[2]
     for note in notes + part.notes:
@@ -265,34 +267,18 @@ def write_water_raster(path: Path, water: WaterRaster, crs: str | None) -> None:
     from rasterio.transform import from_origin
 
     rows, columns = water.height_m.shape
-    named = crs is not None and crs.strip().lower() != LOCAL
-    parsed = parse_crs(crs or "", "cameras") if named else None
+    system = None
+    if crs is not None and crs.strip().lower() != systems.LOCAL:
+        parsed = systems.parse_crs(crs, "cameras")
+        system = None if systems.is_local(parsed) else rasterio.CRS.from_wkt(parsed.to_wkt())
     profile = {
         "driver": "GTiff", "width": columns, "height": rows, "count": 1, "dtype": "float64",
         "nodata": np.nan, "compress": "deflate", "predictor": 3,
-        "crs": (parsed and not is_local(parsed) and rasterio.CRS.from_wkt(parsed.to_wkt())) or None,
+        "crs": system,
         "transform": from_origin(water.left_m, water.top_m, *water.cell_m),
     }  # fmt: skip
     with rasterio.open(path, "w", **profile) as target:
         target.write(water.height_m, 1)
-
-
-def _ways(
-    source: DatasetReader, cloud_crs: str | CRS | None, bounds: Bounds | None, name: str
-) -> tuple[Points | None, Points, Notes]:
-    """Return the transformation to the cloud (None for none), its inverse in plan, and notes."""
-    stated = None if source.crs is None else source.crs.to_wkt()
-    share = np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0), (0.5, 0.5)])
-    x, y = place_of(source.transform, *(share * [source.width, source.height]).T)
-    at = np.column_stack([x, y, 0.0 * x])
-    forward, notes = way_to_cloud(stated, cloud_crs, at, name, heights=True)
-    if forward is None or stated is None or cloud_crs is None:
-        return None, lambda xyz: xyz, notes
-    cloud, crs = parse_crs(cloud_crs, "the cloud"), parse_crs(stated, name)
-    near = forward(at) if bounds is None else _edge(bounds)
-    back = transformation(cloud, crs, near, name, heights=False)
-    unit = [1.0, 1.0, metres_up(crs)]
-    return lambda xyz: forward(xyz / unit), back.forward, notes
 
 
 def _edge(bounds: Bounds) -> FloatArray:
@@ -309,7 +295,7 @@ class _Part(NamedTuple):
 
     heights: FloatArray
     transform: Affine
-    notes: Notes
+    notes: systems.Notes
 
 
 def _read(source: DatasetReader, name: str, near: FloatArray | None) -> _Part:
@@ -327,34 +313,29 @@ def _read(source: DatasetReader, name: str, near: FloatArray | None) -> _Part:
     _check_size((bottom - top) * (right - left), name)
     window = Window(left, top, right - left, bottom - top)
     stored = read_masked(source, window=window)
-    unit_m, notes = _metres(source, name)
-    heights = (stored * source.scales[0] + source.offsets[0]) * unit_m
+    # one unit of the heights is that of the band, else that of the CRS
+    unit, notes = (source.units[0] or "").strip(), list[PcfixWarning]()
+    if unit.lower() not in _UNITS_M:
+        sentence = f"its heights are in '{unit}'. Convert them to metres, or correct the unit."
+        raise bad_file(name, "water.raster_unit", sentence, value=unit)
+    unit_m = _UNITS_M[unit.lower()]
+    if unit_m is None and source.crs is not None:
+        crs = systems.parse_crs(source.crs.to_wkt(), name)
+        unit_m = 1.0 if systems.is_local(crs) else systems.metres_up(crs)
+        if unit_m != 1.0 and systems.parts(crs)[1] is None:
+            sentence = f"{name}: has no unit of heights; that of its CRS is assumed"
+            sentence += f" ({unit_m:.4f} m)."
+            notes.append(PcfixWarning("water.raster_unit", sentence, unit_m=unit_m))
+    heights = (stored * source.scales[0] + source.offsets[0]) * (unit_m or 1.0)
     if source.nodata is None:
         heights[np.abs(heights) > IMPOSSIBLE_M] = np.nan
     heights[np.isinf(heights)] = np.nan
     unknown = int(np.isnan(heights).sum())
     if source.nodata is None and unknown:
         sentence = f"{name}: has no nodata value. {unknown:,} impossible heights are ignored."
-        notes = (PcfixWarning("water.raster_nodata", sentence, count=unknown), *notes)
+        notes.insert(0, PcfixWarning("water.raster_nodata", sentence, count=unknown))
     _check_known(heights, name)
-    return _Part(heights, source.window_transform(window), notes)
-
-
-def _metres(source: DatasetReader, name: str) -> tuple[float, Notes]:
-    """Return how many metres one unit of the heights is: the band's unit, else the CRS's."""
-    stated = (source.units[0] or "").strip()
-    if stated.lower() not in _UNITS_M:
-        sentence = f"its heights are in '{stated}'. Convert them to metres, or correct the unit."
-        raise bad_file(name, "water.raster_unit", sentence, value=stated)
-    factor = _UNITS_M[stated.lower()]
-    if factor is not None or source.crs is None:
-        return factor or 1.0, ()
-    crs = parse_crs(source.crs.to_wkt(), name)
-    factor = 1.0 if is_local(crs) else metres_up(crs)
-    if factor == 1.0 or parts(crs)[1] is not None:
-        return factor, ()
-    sentence = f"{name}: has no unit of heights; that of its CRS is assumed ({factor:.4f} m)."
-    return factor, (PcfixWarning("water.raster_unit", sentence, unit_m=factor),)
+    return _Part(heights, source.window_transform(window), tuple(notes))
 
 
 def _check_known(heights: FloatArray, name: str) -> None:
@@ -377,7 +358,18 @@ def _resampled(
     `from_cloud` transforms the plan only; `bounds` are in the cloud's CRS; `names` are the
     raster's for messages and its title.
     """
-    cell, (west, south, east, north) = _extent(part, to_cloud, names[0])
+    # where the raster is, from points all over it, and the sides of its middle cell
+    high, wide = part.heights.shape
+    share = np.linspace(0.0, 1.0, _EDGE_POINTS)
+    c, r = (grid.ravel() for grid in np.meshgrid(share * wide, share * high))
+    amid = wide / 2.0 + np.array([0.0, 1.0, 0.0]), high / 2.0 + np.array([0.0, 0.0, 1.0])
+    x, y = place_of(part.transform, np.append(c, amid[0]), np.append(r, amid[1]))
+    placed = to_cloud(np.column_stack([x, y, np.full(len(x), np.nanmean(part.heights))]))
+    if not np.isfinite(placed).all():
+        sentence = "extends beyond the area of use of the cloud's CRS. Clip it."
+        raise bad_file(names[0], "water.raster_place", sentence)
+    cell = np.hypot(*(placed[-2:] - placed[-3])[:, :2].T).min()
+    (west, south, _), (east, north, _) = placed.min(axis=0), placed.max(axis=0)
     if bounds is not None:
         west, south = max(west, bounds[0]), max(south, bounds[1])
         east, north = min(east, bounds[2]), min(north, bounds[3])
@@ -394,23 +386,6 @@ def _resampled(
         strip[:] = _heights_at(part, from_cloud(plan), to_cloud).reshape(strip.shape)
     _check_known(heights, names[0])
     return WaterRaster(heights, float(left), float(top), (float(cell), float(cell)), names[1])
-
-
-def _extent(part: _Part, to_cloud: Points, name: str) -> tuple[float, Bounds]:
-    """Return the smaller side of the middle cell, and the bounds, in the cloud's CRS."""
-    rows, columns = part.heights.shape
-    share = np.linspace(0.0, 1.0, _EDGE_POINTS)
-    c, r = (grid.ravel() for grid in np.meshgrid(share * columns, share * rows))
-    amid = columns / 2.0 + np.array([0.0, 1.0, 0.0]), rows / 2.0 + np.array([0.0, 0.0, 1.0])
-    x, y = place_of(part.transform, np.append(c, amid[0]), np.append(r, amid[1]))
-    level = np.full(len(x), np.nanmean(part.heights))
-    placed = to_cloud(np.column_stack([x, y, level]))
-    if not np.isfinite(placed).all():
-        sentence = "extends beyond the area of use of the cloud's CRS. Clip it."
-        raise bad_file(name, "water.raster_place", sentence)
-    sides = np.hypot(*(placed[-2:] - placed[-3])[:, :2].T)
-    (west, south, _), (east, north, _) = placed.min(axis=0), placed.max(axis=0)
-    return sides.min(), (float(west), float(south), float(east), float(north))
 
 
 def _heights_at(part: _Part, places: FloatArray, to_cloud: Points) -> FloatArray:

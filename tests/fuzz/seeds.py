@@ -18,9 +18,8 @@ from PIL import Image
 from pyogrio import raw
 from scipy.spatial.transform import Rotation
 
+from pcfix.io.cameras.colmap import BY_NAME, place_text
 from pcfix.io.cameras.colmap import FILE as FILE_OF_PLACE
-from pcfix.io.cameras.colmap import place_text
-from pcfix.io.cameras.colmap.files import BY_NAME
 from pcfix.io.members import FILE, write_members
 from pcfix.model import Cameras, Lens
 from tests.io import test_views as views

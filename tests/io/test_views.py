@@ -138,7 +138,7 @@ def test_real_vis_and_ply():
     assert (report.by_row, report.unmatched, report.share_seen) == (250_000, 0, 1.0)
     assert min(map(len, expected)) == 3 and max(map(len, expected)) == 13  # at least 3 depth maps
     assert expected[0] == [11, 12, 13, 22, 29] and weights is None
-    assert report.cameras_per_point == pytest.approx(1352598 / 250_000)
+    assert report.as_dict()["cameras_per_point"] == pytest.approx(1352598 / 250_000)
 
     offset = np.loadtxt(RENDERED / "offset.txt", comments="#")
     views = read_views(RENDERED / "dense.ply", cameras, to_cloud=lambda points: points + offset)
@@ -234,7 +234,7 @@ def test_tolerance(tmp_path, cameras, scene):
     views = read_views(write_ply(tmp_path / "d.ply", xyz, lists), cameras)
     moved = xyz + np.array([0, 0, 0.3])
     strict = ViewMatch(views, cameras)
-    loose = ViewMatch(replace(views, default_spacings=0.3001 / views.spacing_m), cameras)
+    loose = ViewMatch(replace(views, tolerance_spacings=0.3001 / views.spacing_m), cameras)
     assert strict.report.tolerance_m < 0.3
     assert given(strict, moved)[0] == [[]] * 400 and strict.report.unmatched == 400
     with refused("views.no_match", points=400, listed=400):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pcfix
 from pcfix.io.cameras import FORMATS, read_tie_points
-from pcfix.io.cameras.formats import Source
+from pcfix.io.cameras.checks import Source
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -22,13 +22,13 @@ from pcfix.errors import InputError, SettingError, bad_file
 from pcfix.io.cameras.checks import (
     DAMAGES,
     NO_LENS,
+    Angles,
+    Source,
     checked,
     damaged,
     no_pose,
     reading,
-    sensor_unused,
 )
-from pcfix.io.cameras.formats import Angles, Source
 from pcfix.io.files import check_input
 from pcfix.model import Cameras, TiePoints
 from pcfix.options.declare import File
@@ -148,15 +148,8 @@ def read_cameras(
     try:
         with reading(path):
             cameras = form.reader.read(source)
-            if source.sensor is not None and form.module not in TAKE_SENSOR and len(cameras):
-                if cameras.lenses is not None or cameras.rotations is None:
-                    why = "no angles" if cameras.lenses is None else "its own lenses"
-                    raise sensor_unused(source, why)
-                from pcfix.io.cameras.table.sensor import read_sensor
-
-                notes = tuple(note for note in cameras.notes if note.code != NO_LENS)
-                lenses = (read_sensor(source.sensor),) * len(cameras)
-                cameras = replace(cameras, lenses=lenses, notes=notes)
+            if source.sensor is not None and len(cameras):
+                cameras = _with_sensor(source, cameras, form.module in TAKE_SENSOR)
             cameras = checked(source.path, cameras)
     except SettingError as error:  # numbers that are finite in the file and not in the world
         raise damaged(path, str(error).rstrip(".")) from error
@@ -165,6 +158,20 @@ def read_cameras(
     for note in cameras.notes:
         warnings.warn(note, stacklevel=2)
     return cameras
+
+
+def _with_sensor(source: Source, cameras: Cameras, has_read_it: bool) -> Cameras:
+    """Return cameras with the lens of the sensor, unless their reader has used it already."""
+    if cameras.rotations is None or not (has_read_it or cameras.lenses is None):
+        why = "no angles" if cameras.lenses is None else "its own lenses"
+        sentence = f"has {why}, so --sensor {source.sensor} has no use. Leave it out."
+        raise bad_file(source.path, "cameras.sensor_unused", sentence, sensor=source.sensor)
+    if has_read_it or source.sensor is None:
+        return cameras
+    from pcfix.io.cameras.table.sensor import read_sensor
+
+    notes = tuple(note for note in cameras.notes if note.code != NO_LENS)
+    return replace(cameras, lenses=(read_sensor(source.sensor),) * len(cameras), notes=notes)
 
 
 def read_tie_points(path: File, cameras: Cameras) -> TiePoints:

@@ -40,14 +40,12 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from pcfix.errors import InputError, PcfixWarning, bad_file
+from pcfix.errors import InputError, bad_file
 from pcfix.io.cameras import checks, tracks
-from pcfix.io.cameras.checks import damaged, note, number, read_xml, text_of
-from pcfix.io.cameras.formats import Source
+from pcfix.io.cameras.checks import ZIP_MAGIC, Source, damaged, note, number, read_xml, text_of
 from pcfix.lens.rotations import from_omega_phi_kappa, from_photogrammetric
 from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, TiePoints
 
-ZIP_MAGIC = b"PK\x03\x04"
 COMMENT = re.compile(rb"<!--.*?-->", re.DOTALL)
 TIE_POINTS = re.compile(rb"<TiePoints>(.*?)</TiePoints>", re.DOTALL)
 EXTERNAL = re.compile(rb"<Path>\s*([^<]*?)\s*</Path>")
@@ -56,6 +54,8 @@ SRS_OF_ALL = re.compile(rb"<SRSId>\s*([^<]*?)\s*</SRSId>")
 LARGEST_RATIO = 200
 """Of an archive: XML packs 10 to 30 times smaller, a bomb a thousand times."""
 MAIN_COMPONENT = "1"
+CENTRE = [f"Pose/Center/{axis}" for axis in "xyz"]
+DEGREES = ["Longitude", "Latitude", "Altitude"]
 FIRST_PIXEL = 0.5
 """The centre of the first pixel, seen from its corner."""
 DIRECTIONS = {"Right": (1, 0, 0), "Left": (-1, 0, 0), "Down": (0, 1, 0), "Up": (0, -1, 0)}
@@ -124,7 +124,12 @@ def _read_block(path: Path) -> tuple[Cameras, list[Photo], list[tuple[int, str, 
                     continue
                 is_main = text_of(photo, "Component") in ("", MAIN_COMPONENT)
                 srs = text_of(element, "SRSId") or text_of(block, "SRSId")
-                (posed if is_main else outside).append(_photo(path, i, photo, group, srs))
+                label, key = _label(photo), (i, text_of(photo, "Id"))
+                centre = _numbers(path, f"image {label}", photo, CENTRE)
+                turn = _rotation(path, label, photo.find("Pose/Rotation"), group.axes)
+                prior = _prior(path, label, photo, srs)
+                one = Photo(key, label, group, centre, turn, srs, prior)
+                (posed if is_main else outside).append(one)
         unposed += [_label(element) for element in block.iterfind("BulkPhotos/Photo")]
     everything = posed + outside
     in_block = posed or outside
@@ -146,6 +151,15 @@ def _read_block(path: Path) -> tuple[Cameras, list[Photo], list[tuple[int, str, 
         xyz = np.array([p.prior[1] if p.prior and p.prior[0] == of else nothing for p in photos])
         crs = "EPSG:4326" if of == "exif" else _crs_of(path, root, of)
         gnss = GnssPositions(xyz, np.full_like(xyz, np.nan), crs)
+    notes = []
+    if ignored:
+        sentence = f"photogroup {', '.join(ignored[:10])} is skipped (its ManualPose is false)."
+        notes.append(note(path, "cameras.poses_ignored", sentence, photogroups=ignored))
+    if not turned:
+        notes.append(note(path, "cameras.no_rotations", "no photo has a rotation, only positions."))
+    elif (bare := next((p for p in photos if p.group.lens is None), None)) is not None:
+        why = f"the photogroup of {bare.label} has no frame or focal length"
+        notes.append(checks.without_lens(path, why))
     chosen = {photo.key for photo in photos}
     cameras = Cameras(
         labels=tuple(photo.label for photo in photos),
@@ -153,7 +167,7 @@ def _read_block(path: Path) -> tuple[Cameras, list[Photo], list[tuple[int, str, 
         rotations=np.array([photo.rotation for photo in photos]) if turned else None,
         lenses=tuple(lenses) if turned and len(lenses) == len(photos) else None,
         crs=_crs_of(path, root, photos[0].srs),
-        notes=_notes(path, photos, ignored),
+        notes=tuple(notes),
         gnss=gnss,
         unposed=(*unposed, *(photo.label for photo in everything if photo.key not in chosen)),
         source="BlocksExchange",
@@ -165,32 +179,15 @@ def _read_block(path: Path) -> tuple[Cameras, list[Photo], list[tuple[int, str, 
     return cameras, photos, texts
 
 
-def _photo(path: Path, block: int, element: Element, group: Photogroup, srs: str) -> Photo:
-    """Return a photo that has a position; `prior` is None or its SRS id ("exif") and place."""
-    label = _label(element)
-    metadata, gps = element.find("Pose/Metadata"), element.find("ExifData/GPS")
-    prior, degrees = None, ["Longitude", "Latitude", "Altitude"]
+def _prior(path: Path, label: str, photo: Element, srs: str) -> tuple[str, FloatArray] | None:
+    """Return the GNSS position of a photo, and its SRS id, which is "exif" for WGS 84."""
+    metadata, gps = photo.find("Pose/Metadata"), photo.find("ExifData/GPS")
     if metadata is not None and metadata.find("Center") is not None:
         place = _numbers(path, f"image {label}, Metadata", metadata, [f"Center/{a}" for a in "xyz"])
-        prior = text_of(metadata, "SRSId") or srs, place
-    elif gps is not None and all(gps.findtext(name) for name in degrees):
-        prior = "exif", _numbers(path, f"image {label}, GPS", gps, degrees)
-    centre = _numbers(path, f"image {label}", element, [f"Pose/Center/{a}" for a in "xyz"])
-    rotation = _rotation(path, label, element.find("Pose/Rotation"), group.axes)
-    return Photo((block, text_of(element, "Id")), label, group, centre, rotation, srs, prior)
-
-
-def _notes(path: Path, photos: list[Photo], ignored: list[str]) -> tuple[PcfixWarning, ...]:
-    notes = []
-    if ignored:
-        sentence = f"photogroup {', '.join(ignored[:10])} is skipped (its ManualPose is false)."
-        notes.append(note(path, "cameras.poses_ignored", sentence, photogroups=ignored))
-    if photos[0].rotation is None:
-        notes.append(note(path, "cameras.no_rotations", "no photo has a rotation, only positions."))
-    elif (one := next((p for p in photos if p.group.lens is None), None)) is not None:
-        why = f"the photogroup of {one.label} has no frame or focal length"
-        notes.append(checks.without_lens(path, why))
-    return tuple(notes)
+        return text_of(metadata, "SRSId") or srs, place
+    if gps is not None and all(gps.findtext(name) for name in DEGREES):
+        return "exif", _numbers(path, f"image {label}, GPS", gps, DEGREES)
+    return None
 
 
 def _rotation(
@@ -348,7 +345,14 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     xyz: list[list[float]] = []
     point, camera, uv = [], [], []
     for i, srs_of_block, text in texts:
-        where, inside = _inside(path, text)
+        where, inside = path, text
+        if (other := EXTERNAL.search(text)) is not None:  # the points are in a file of their own
+            plain = other[1].decode(errors="replace").replace("\\", "/")
+            places = (path.parent / plain, path.parent / PureWindowsPath(plain).name)
+            where = next((place for place in places if place.is_file()), places[0])
+            if not where.is_file():
+                raise checks.missing(where, "Keep the file of the tie points beside the block")
+            inside = DECLARATION.sub(b"", _read_bytes(where))
         head = SRS_OF_ALL.search(inside[: inside.find(b"<TiePoint>")])
         srs_of_all = srs_of_block if head is None else head[1].decode()
         with checks.reading(where):
@@ -376,15 +380,3 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
         raise tracks.no_tie_points(path, f"none was seen by one of its {len(cameras)} photos")
     seen_all = tracks.Seen(np.array(xyz), np.array(point), np.array(camera), np.array(uv))
     return tracks.tie_points(seen_all)
-
-
-def _inside(path: Path, text: bytes) -> tuple[Path, bytes]:
-    """Return the text itself, or that of the file beside the document that it names."""
-    other = EXTERNAL.search(text)
-    if other is None:
-        return path, text
-    plain = other[1].decode(errors="replace").replace("\\", "/")
-    for place in (path.parent / plain, path.parent / PureWindowsPath(plain).name):
-        if place.is_file():
-            return place, DECLARATION.sub(b"", _read_bytes(place))
-    raise checks.missing(path.parent / plain, "Keep the file of the tie points beside the block")

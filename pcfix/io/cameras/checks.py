@@ -1,4 +1,4 @@
-"""Shared by the readers: errors and notes, numbers, XML and JSON, rotations, lenses, CRS."""
+"""Shared by the readers: their input, errors, numbers, XML and JSON, rotations, lenses, CRS."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import astuple, replace
+from dataclasses import astuple, dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Literal
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from pcfix.errors import InputError, PcfixError, PcfixWarning, bad_file
-from pcfix.io.cameras.formats import Source
-from pcfix.io.files import check_output, parse_json, write_bytes
-from pcfix.io.tables import read_lines
-from pcfix.model import Cameras, FloatArray, Lens
+from pcfix.io.files import check_input, check_output, parse_json, write_bytes
+from pcfix.model import BoolArray, Cameras, FloatArray, Lens
 
+ZIP_MAGIC = b"PK\x03\x04"
 ROUNDING = 1e-3
 """Of a rotation's elements: files with four decimals pass, a mirrored or scaled one does not."""
 SAME_LENS = 1e-12
@@ -35,6 +35,41 @@ DAMAGES = (
     *(zipfile.BadZipFile, zlib.error),
 )
 """What readers run into where a file is cut off, or holds something else than it should."""
+
+Angles = Literal["omega-phi-kappa", "yaw-pitch-roll", "aircraft"]
+
+_HEAD_BYTES = 4096
+
+
+@dataclass(frozen=True)
+class Source:
+    """A file or folder that may hold cameras, and what the user said about it.
+
+    `sensor` is the ``--sensor`` file, `angles` the kind of angles of a table whose header does not
+    say it.
+    """
+
+    path: Path
+    sensor: Path | None = None
+    angles: Angles | None = None
+
+    @cached_property
+    def head(self) -> bytes:
+        """The first bytes of a file; nothing of a folder."""
+        if self.path.is_dir():
+            return b""
+        with check_input(self.path).open("rb") as stream:
+            return stream.read(_HEAD_BYTES)
+
+    @cached_property
+    def text(self) -> str:
+        """The first bytes as text, without a byte order mark."""
+        return self.head.decode("utf-8-sig", errors="replace")
+
+    @cached_property
+    def names(self) -> frozenset[str]:
+        """Names of the contents of a folder; none for a file."""
+        return frozenset(p.name for p in self.path.iterdir()) if self.path.is_dir() else frozenset()
 
 
 def damaged(path: object, why: object) -> InputError:
@@ -58,12 +93,6 @@ def missing(path: Path, remedy: str = "Keep all files of the project together") 
     return bad_file(path, "cameras.missing_file", f"is missing. {remedy}.")
 
 
-def sensor_unused(source: Source, why: str) -> InputError:
-    """Return the error for a sensor that the cameras have no use for."""
-    sentence = f"has {why}, so --sensor {source.sensor} has no use. Leave it out."
-    return bad_file(source.path, "cameras.sensor_unused", sentence, sensor=source.sensor)
-
-
 def note(path: object, code: str, sentence: str, **values: Any) -> PcfixWarning:
     """Return a note on what was done on reading a file."""
     return PcfixWarning(code, f"{path}: {sentence}", path=path, **values)
@@ -82,7 +111,7 @@ def without_lens(path: Path, why: str) -> PcfixWarning:
 
 
 def repeated(path: Path, labels: Sequence[str], dropped: int = 0) -> tuple[PcfixWarning, ...]:
-    """Return a note where labels repeat: they are no key, and their images are kept apart."""
+    """Return a note where labels repeat: they are no key, and their images stay separate."""
     names = [label for label, count in Counter(labels).items() if count > 1]
     if not names:
         return ()
@@ -106,13 +135,8 @@ def reading(path: object) -> Iterator[None]:
         raise damaged(path, error or type(error).__name__) from error
 
 
-def read_text(path: Path) -> str:
-    """Return the text of a file; bytes that are not UTF-8 can only be in names."""
-    return "\n".join(read_lines(path))
-
-
 def read_xml(path: Path, stream: IO[bytes] | None = None) -> Element:
-    """Return the root of a document, from `stream` where it lies in an archive."""
+    """Return the root of a document, from `stream` if it is in an archive."""
     from defusedxml.ElementTree import parse
 
     with reading(path):
@@ -161,11 +185,8 @@ def rotations(path: Path, labels: Sequence[str], matrices: FloatArray) -> FloatA
     """Return the proper rotations closest to matrices, shape (k, 3, 3), rounded in their file."""
     matrices = np.asarray(matrices, np.float64).reshape(-1, 3, 3)
     off = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    bad = ~((off <= ROUNDING) & (np.linalg.det(np.nan_to_num(matrices, posinf=0.0)) > 0.0))
-    if bad.any():
-        label = labels[int(np.argmax(bad))]
-        sentence = f"the rotation of {label} is mirrored or skewed. Export the poses again."
-        raise bad_file(path, "cameras.rotation", sentence, image=label)
+    good = (off <= ROUNDING) & (np.linalg.det(np.nan_to_num(matrices, posinf=0.0)) > 0.0)
+    _check_rotations(path, labels, good, "the rotation of {} is mirrored or skewed")
     for _ in range(2):  # Newton's iteration to the polar factor squares the rounding each time
         matrices = 1.5 * matrices - 0.5 * matrices @ matrices.transpose(0, 2, 1) @ matrices
     return matrices
@@ -175,12 +196,16 @@ def quaternions(path: Path, labels: Sequence[str], wxyz: FloatArray) -> FloatArr
     """Return the rotations, shape (k, 3, 3), of unit quaternions (k, 4), the scalar first."""
     from scipy.spatial.transform import Rotation
 
-    bad = ~(np.abs(np.linalg.norm(wxyz, axis=1) - 1.0) <= ROUNDING)
-    if bad.any():
-        label = labels[int(np.argmax(bad))]
-        sentence = f"the quaternion of {label} has not the length 1. Export the poses again."
-        raise bad_file(path, "cameras.rotation", sentence, image=label)
+    good = np.abs(np.linalg.norm(wxyz, axis=1) - 1.0) <= ROUNDING
+    _check_rotations(path, labels, good, "the quaternion of {} has not the length 1")
     return np.asarray(Rotation.from_quat(np.roll(wxyz, -1, axis=1)).as_matrix())
+
+
+def _check_rotations(path: Path, labels: Sequence[str], good: BoolArray, what: str) -> None:
+    if not good.all():
+        label = labels[int(np.argmin(good))]
+        sentence = f"{what.format(label)}. Export the poses again."
+        raise bad_file(path, "cameras.rotation", sentence, image=label)
 
 
 def centres(rotations: FloatArray, translations: FloatArray) -> FloatArray:

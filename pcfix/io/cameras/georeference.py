@@ -21,39 +21,14 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pcfix.errors import PcfixWarning, bad_file
+from pcfix.io import crs as systems
 from pcfix.io.cameras.checks import note
 from pcfix.io.cameras.mistakes import UNDULATION_M
-from pcfix.io.crs import (
-    GEOCENTRIC_WGS84,
-    GEOGRAPHIC_WGS84,
-    METRES,
-    HeightsError,
-    Topocentric,
-    Transformation,
-    check_projected_metres,
-    crs_text,
-    geographic_3d,
-    heights_agree,
-    heights_of,
-    is_local,
-    is_same_numbers,
-    is_topocentric,
-    metres_up,
-    parse_crs,
-    parts,
-    plan_unit,
-    shortened,
-    transformation,
-    typed,
-    unbound,
-    with_heights,
-)
 from pcfix.model import Cameras, FloatArray, GnssPositions
 
 if TYPE_CHECKING:
     from pyproj import CRS
 
-LOCAL = "local"
 EARTH_RADIUS_M = 6.371e6
 CENTRE_DISTANCE_M = (6.2e6, 7.0e6)
 """Cameras are at no other distance from the centre of the earth."""
@@ -80,8 +55,8 @@ class Frame(NamedTuple):
         """
         if not self.direct:
             return np.ones_like(xyz)
-        size = np.full(len(xyz), plan_unit(self.crs)[1])
-        up = np.full(len(xyz), abs(metres_up(self.crs)))
+        size = np.full(len(xyz), systems.plan_unit(self.crs)[1])
+        up = np.full(len(xyz), abs(systems.metres_up(self.crs)))
         if self.crs.is_projected:
             return np.asarray(1.0 / np.column_stack([size, size, up]))
         meridian_m = EARTH_RADIUS_M * size
@@ -94,7 +69,7 @@ class Frame(NamedTuple):
             return
         if self.direct:
             code, kind = "cameras.degrees", "longitude and latitude"
-            turn = 2.0 * np.pi / plan_unit(self.crs)[1] * (1.0 + 1e-9)
+            turn = 2.0 * np.pi / systems.plan_unit(self.crs)[1] * (1.0 + 1e-9)
             bad = (np.abs(xyz[:, :2]) > [turn, turn / 4.0]).any(axis=1)
         else:
             code, kind = "cameras.geocentric", "geocentric coordinates"
@@ -109,79 +84,50 @@ class Frame(NamedTuple):
 
 def frame_of(text: str, name: str) -> Frame:
     """Return the frame that a text names: a CRS, or ``ENU:latitude,longitude,height``."""
-    if is_topocentric(text):
-        place = Topocentric.from_text(text, name)
-        crs = parse_crs(GEOGRAPHIC_WGS84, name)
-        enter = _from_geocentric(parse_crs(GEOCENTRIC_WGS84, name), crs)
-        return Frame(crs, lambda enu: enter(place.to_geocentric(enu)), topocentric=True)
-    crs = parse_crs(text, name)
+    if systems.is_topocentric(text):
+        place = systems.Topocentric.from_text(text, name)
+        crs = systems.parse_crs(systems.GEOGRAPHIC_WGS84, name)
+        return Frame(crs, place.to_degrees, topocentric=True)
+    crs = systems.parse_crs(text, name)
     if crs.is_geocentric:
-        geographic = geographic_3d(crs)
-        return Frame(geographic, _from_geocentric(crs, geographic))
+        from pyproj import Transformer
+
+        geographic = systems.geographic_3d(crs)  # on the same datum
+        step = Transformer.from_crs(crs, geographic, always_xy=True)
+        return Frame(geographic, lambda xyz: np.column_stack(step.transform(*xyz.T)))
     if not (crs.is_projected or crs.is_geographic):
         sentence = f"{crs.name} is not a CRS for cameras. Give another with --cameras-crs."
         raise bad_file(name, "cameras.crs", sentence, crs=crs.name)
-    return Frame(crs, lambda xyz: xyz, direct=True)
+    return Frame(crs, _same, direct=True)
 
 
-def _from_geocentric(geocentric: CRS, geographic: CRS) -> Callable[[FloatArray], FloatArray]:
-    """Return the conversion of geocentric points to longitude, latitude, height on one datum."""
-    from pyproj import Transformer
-
-    step = Transformer.from_crs(geocentric, geographic, always_xy=True)
-    return lambda xyz: np.column_stack(step.transform(*xyz.T))
+def _same(xyz: FloatArray) -> FloatArray:
+    return xyz
 
 
 def is_tied(crs: str | None, name: str) -> bool:
     """Whether a frame has its place on the earth."""
-    return crs is not None and (is_topocentric(crs) or _on_earth(crs, name) is not None)
+    return crs is not None and (systems.is_topocentric(crs) or _on_earth(crs, name) is not None)
 
 
 def _on_earth(crs: str | None, name: str) -> CRS | None:
     """Return a CRS that is tied to the earth; None for axes at a place and local frames."""
-    if crs is None or crs.strip().lower() == LOCAL or is_topocentric(crs):
+    if crs is None or crs.strip().lower() == systems.LOCAL or systems.is_topocentric(crs):
         return None
-    parsed = parse_crs(crs, name)
-    return None if is_local(parsed) else parsed
-
-
-class Statement(NamedTuple):
-    """The frame of cameras by their file and by ``--cameras-crs``, which has priority.
-
-    `crs` is as in `Cameras`, `project` that in which the software delivers its clouds. It is
-    `chosen` if the user gave it, and `trusted` if heights of an unknown system are the cloud's.
-    """
-
-    crs: str | None
-    project: CRS | None
-    chosen: bool = False
-    trusted: bool = False
-
-
-def statement(cameras: Cameras, cameras_crs: str | None, name: str) -> Statement:
-    """Combine the CRS of the file with the user's ``--cameras-crs``."""
-    project, given = _on_earth(cameras.project_crs, name), (cameras_crs or "").strip()
-    if not given:
-        return Statement(cameras.crs, project)
-    crs, own = _on_earth(given, "--cameras-crs"), _on_earth(cameras.crs, name)
-    if crs is not None and crs.is_geocentric:
-        return Statement(given, project, chosen=True)
-    trusted = crs is None or heights_of(crs) == "unstated"
-    if crs is not None and own is not None and own.is_geocentric:
-        return Statement(cameras.crs, crs, chosen=True, trusted=trusted)
-    return Statement(given, None, chosen=True, trusted=trusted)
+    parsed = systems.parse_crs(crs, name)
+    return None if systems.is_local(parsed) else parsed
 
 
 @dataclass(frozen=True, eq=False)
 class Georeference:
     """The transformation from the frame of a camera file into another CRS.
 
-    `frame` is that of the file, None where its numbers are taken as they are; `offset`, shape (3,),
-    is added first; `crs` is the result's, as in `Cameras.crs`.
+    `forward` takes points of the file, to which `offset`, shape (3,), is added first. `frame` is
+    that of the file; None where the axes are the same. `crs` is the result's, as in `Cameras.crs`.
     """
 
+    forward: systems.Points
     frame: Frame | None
-    transformation: Transformation | None
     offset: FloatArray
     crs: str | None
     notes: tuple[PcfixWarning, ...]
@@ -195,9 +141,9 @@ class Georeference:
             i = int(np.argmax(lost))
             x, y, z = cameras.centres[i] + self.offset
             sentence = f"image {cameras.labels[i]}: {x:.10g}, {y:.10g}, {z:.6g} is outside"
-            sentence += f" {shortened(self.crs or '')}. Check --cameras-crs."
+            sentence += f" {systems.shortened(self.crs or '')}. Check --cameras-crs."
             raise bad_file(self.name, "cameras.not_transformed", sentence, image=cameras.labels[i])
-        if rotations is not None and self.transformation is not None:
+        if rotations is not None and self.frame is not None:
             rotations = rotations @ self.turns(cameras.centres).transpose(0, 2, 1)
         return replace(
             cameras,
@@ -210,15 +156,15 @@ class Georeference:
 
     def points(self, xyz: FloatArray) -> FloatArray:
         """Return points (n, 3) there; NaN where one is not finite or has no place there."""
-        return np.where(np.isfinite(found := self._forward(xyz + self.offset)), found, np.nan)
+        return np.where(np.isfinite(found := self.forward(xyz + self.offset)), found, np.nan)
 
     def turns(self, xyz: FloatArray) -> FloatArray:
         """Return the rotations from the source's axes to the target's at points (n, 3)."""
-        if self.frame is None or self.transformation is None:
+        if self.frame is None:
             return np.broadcast_to(np.eye(3), (len(xyz), 3, 3))
         at = xyz + self.offset
         steps = STEP_M * np.eye(3) * self.frame.per_metre(at)[:, None, :]
-        ahead, behind = (self._forward((at[:, None] + s).reshape(-1, 3)) for s in (steps, -steps))
+        ahead, behind = (self.forward((at[:, None] + s).reshape(-1, 3)) for s in (steps, -steps))
         if not (np.isfinite(ahead).all() and np.isfinite(behind).all()):
             return np.full((len(xyz), 3, 3), np.nan)
         vectors = (ahead - behind).reshape(-1, 3, 3).transpose(0, 2, 1)
@@ -227,11 +173,6 @@ class Georeference:
             raise bad_file(self.name, "cameras.left_handed", sentence, crs=self.frame.crs.name)
         u, _, v = np.linalg.svd(vectors)
         return np.asarray(u @ v)
-
-    def _forward(self, xyz: FloatArray) -> FloatArray:
-        if self.frame is None or self.transformation is None:
-            return xyz
-        return self.transformation.forward(self.frame.enter(xyz))
 
 
 def georeference(
@@ -242,15 +183,15 @@ def georeference(
     offset_m: tuple[float, float, float] | None = None,
     name: str = "cameras",
 ) -> Georeference:
-    """Return the way into the cloud's CRS, for cameras, tie points and others.
+    """Return the transformation to the cloud's CRS, for cameras, tie points and others.
 
     Parameters
     ----------
     cameras : Cameras
         As a reader gave them, in the frame of their file.
     cloud_crs : str, CRS or None
-        Projected, in metres. None where the cloud names none: then the way leads to where the
-        software delivers clouds, mostly where the cameras are.
+        Projected, in metres. None where the cloud names none: then they are brought to where
+        the software delivers clouds, mostly where the cameras are.
     cameras_crs : str, optional
         Overrides what the file says. ``local``: the numbers are taken as they are. A CRS without
         heights says that these agree with the cloud's, and so does ``ENU:lat,lon,height``. For a
@@ -265,70 +206,86 @@ def georeference(
     if offset.shape != (3,) or not np.isfinite(offset).all():
         sentence = f"the offset {offset_m} is not three numbers. Give x, y, z."
         raise bad_file(name, "cameras.offset", sentence, value=offset_m)
-    cloud = None if cloud_crs is None else parse_crs(cloud_crs, "the cloud")
-    stated = statement(cameras, cameras_crs, name)
-    crs, tied = stated.crs or "", is_tied(stated.crs, name)
-    if not tied:
+    cloud = None if cloud_crs is None else systems.parse_crs(cloud_crs, "the cloud")
+    # the frame of the cameras, and the CRS in which their software delivers clouds
+    stated, project, given = cameras.crs, _on_earth(cameras.project_crs, name), cameras_crs or ""
+    trusted = False  # heights of an unknown system are the cloud's
+    if given.strip():
+        stated, chosen = given.strip(), _on_earth(given, "--cameras-crs")
+        if chosen is None or not chosen.is_geocentric:
+            trusted = chosen is None or systems.heights_of(chosen) == "unstated"
+            own = None if chosen is None else _on_earth(cameras.crs, name)
+            is_project = own is not None and own.is_geocentric
+            stated, project = (cameras.crs, chosen) if is_project else (stated, None)
+    crs = stated or ""
+    if not is_tied(stated, name):
         if cloud is None:
-            return Georeference(None, None, offset, stated.crs, (), name)
-        if stated.crs is not None and not stated.chosen and not is_local(cloud):
+            return Georeference(_same, None, offset, stated, (), name)
+        if stated is not None and not given.strip() and not systems.is_local(cloud):
             sentence = f"is in a local frame, the cloud in {cloud.name}. Export the cameras in that"
             sentence += " CRS, or give --cameras-crs local to use their numbers as they are."
             raise bad_file(name, "cameras.local", sentence, cloud_crs=cloud.name)
-        return Georeference(None, None, offset, crs_text(cloud), (), name)
-    if cloud is not None and is_local(cloud):
-        sentence = f"is in {shortened(crs)}, the cloud in a local frame. Set the cloud's CRS, or"
+        return Georeference(_same, None, offset, systems.crs_text(cloud), (), name)
+    if cloud is not None and systems.is_local(cloud):
+        sentence = (
+            f"is in {systems.shortened(crs)}, the cloud in a local frame. Set the cloud's CRS, or"
+        )
         sentence += " give --cameras-crs local to use the numbers as they are."
         raise bad_file(name, "cloud.local", sentence, crs=crs, cloud_crs=cloud.name)
     frame = frame_of(crs, name)
     if cloud is not None:
-        return _into(cloud, frame, stated, cameras, offset, name)
+        return _into(cloud, frame, project, cameras, offset, name, trusted=trusted)
     if frame.topocentric or (frame.direct and frame.crs.is_projected):
-        unit, size = plan_unit(frame.crs)
+        unit, size = systems.plan_unit(frame.crs)
         words = frame.crs.name + ("" if size == 1.0 else f", unit {unit},")
-        words = shortened(crs) if frame.topocentric else words
-        found = Georeference(None, None, offset, stated.crs, (), name)
-    elif frame.direct or stated.project is None or not stated.project.is_projected:
+        words = systems.shortened(crs) if frame.topocentric else words
+        found = Georeference(_same, None, offset, stated, (), name)
+    elif frame.direct or project is None or not project.is_projected:
         kind = "degrees" if frame.direct else "geocentric coordinates"
         sentence = f"is in {kind} ({frame.crs.name}). Give a cloud that names its CRS."
         raise bad_file(name, "cloud.no_crs", sentence, crs=frame.crs.name)
     else:
-        words = stated.project.name
-        found = _into(stated.project, frame, stated, cameras, offset, name)
+        words = project.name
+        found = _into(project, frame, project, cameras, offset, name, trusted=trusted)
     sentence = f"no cloud names a CRS; it is taken to be in {words} as the cameras are."
     return replace(found, notes=(note(name, "cloud.crs_assumed", sentence), *found.notes))
 
 
 def _into(
-    cloud: CRS, frame: Frame, stated: Statement, cameras: Cameras, offset: FloatArray, name: str
-) -> Georeference:
-    """Return the way from a frame tied to the earth into a CRS."""
-    check_projected_metres(cloud, "the cloud")
+    cloud: CRS, frame: Frame, project: CRS | None, cameras: Cameras, offset: FloatArray, name: str,
+    *, trusted: bool,
+) -> Georeference:  # fmt: skip
+    """Return the transformation of a frame that is tied to the earth to a CRS."""
+    systems.check_projected_metres(cloud, "the cloud")
     if frame.direct and frame.crs.is_geographic and offset.any():
         sentence = f"an offset in metres cannot be added to degrees ({frame.crs.name}). Omit it."
         raise bad_file(name, "cameras.offset", sentence, value=offset.tolist())
     at = cameras.centres + offset
     frame.check(at, cameras.labels, name)
     target = cloud
-    if heights_of(cloud) == "unstated":  # then the heights are those that the software uses
-        vertical = parts(frame.crs if stated.project is None else stated.project)[1]
-        target = cloud if vertical is None else with_heights(cloud, vertical)
-    crs, notes = crs_text(target), _height_notes(frame, target, stated, name)
-    by_user = stated.trusted and not frame.direct
-    heights = not (by_user or heights_agree(frame.crs, target))
-    if frame.direct and not heights and is_same_numbers(frame.crs, target):
-        return Georeference(frame, None, offset, crs, notes, name)
-    plan = typed(parts(frame.crs if frame.direct else target)[0])
+    if systems.heights_of(cloud) == "unstated":  # then the heights are those that the software uses
+        vertical = systems.parts(frame.crs if project is None else project)[1]
+        target = cloud if vertical is None else systems.with_heights(cloud, vertical)
+    crs = systems.crs_text(target)
+    assumed = _assumed_heights(frame, target, project, trusted)
+    notes = (note(name, "cameras.heights_assumed", f"{assumed}."),) if assumed else ()
+    by_user = trusted and not frame.direct
+    heights = not (by_user or systems.heights_agree(frame.crs, target))
+    if frame.direct and not heights and systems.is_same_numbers(frame.crs, target):
+        return Georeference(_same, None, offset, crs, notes, name)
+    plan = systems.typed(systems.parts(frame.crs if frame.direct else target)[0])
     given = "ENU:latitude,longitude,height" if frame.topocentric else plan
     instead = f"or, if the heights of cameras and cloud agree, give --cameras-crs {given}"
-    step = transformation(
+    forward, of_step = systems.transformation(
         frame.crs, target, frame.enter(at), name, heights=heights, instead=instead
     )
-    of_step = (PcfixWarning("crs.transformation", str(one), path=name) for one in step.notes)
-    found = Georeference(frame, step, offset, crs, (*of_step, *notes), name)
+    accuracy = (PcfixWarning("crs.transformation", str(one), path=name) for one in of_step)
+    found = Georeference(
+        lambda xyz: forward(frame.enter(xyz)), frame, offset, crs, (*accuracy, *notes), name
+    )
     # heights that --cameras-crs declares can be tested if the GNSS heights are above the geoid too
     gnss = cameras.gnss
-    testable = heights_of(target) == "gravity" and gnss is not None and gnss.crs is not None
+    testable = systems.heights_of(target) == "gravity" and gnss is not None and gnss.crs is not None
     if by_user and not frame.topocentric and testable:
         up = adjusted_minus_gnss(found.cameras(cameras), name).enu_m[:, 2]
         off = float(np.median(up[np.isfinite(up)])) if np.isfinite(up).any() else 0.0
@@ -341,26 +298,20 @@ def _into(
     return found
 
 
-def _height_notes(
-    frame: Frame, target: CRS, stated: Statement, name: str
-) -> tuple[PcfixWarning, ...]:
-    """Return a note on what is assumed about heights, if anything."""
-    own, cloud = heights_of(frame.crs), heights_of(target)
-    unit, size = plan_unit(frame.crs)
+def _assumed_heights(frame: Frame, target: CRS, project: CRS | None, trusted: bool) -> str:
+    """Return what is assumed about heights, in words; nothing if both sides state theirs."""
+    own, cloud = systems.heights_of(frame.crs), systems.heights_of(target)
+    unit, size = systems.plan_unit(frame.crs)
     axes = [e.semi_major_metre for e in (frame.crs.ellipsoid, target.ellipsoid) if e is not None]
     other_datum = bool(axes) and max(axes) - min(axes) > 1.0
-    is_guess = other_datum or (stated.project is None and not frame.topocentric)
+    is_guess = other_datum or (project is None and not frame.topocentric)
     if own == "unstated" and frame.crs.is_projected and size != 1.0:
-        what = f"heights are taken to be in {unit}, as x and y are"
-    elif stated.trusted:
-        return ()
-    elif own == "unstated" and cloud != "unstated":
-        what = f"does not say what its heights are; taken to be the cloud's ({target.name})"
-    elif own == "ellipsoidal" and cloud == "unstated" and is_guess:
-        what = f"the cloud's CRS ({target.name}) names no vertical datum; ellipsoidal is assumed"
-    else:
-        return ()
-    return (note(name, "cameras.heights_assumed", f"{what}."),)
+        return f"heights are taken to be in {unit}, as x and y are"
+    if own == "unstated" != cloud and not trusted:
+        return f"does not say what its heights are; taken to be the cloud's ({target.name})"
+    if own == "ellipsoidal" and cloud == "unstated" and is_guess and not trusted:
+        return f"the cloud's CRS ({target.name}) names no vertical datum; ellipsoidal is assumed"
+    return ""
 
 
 class GnssDifferences(NamedTuple):
@@ -394,7 +345,7 @@ def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> GnssDifferen
     tied = is_tied(cameras.crs, name)
     if gnss.crs in (None, cameras.crs):
         plain, gnss = cameras.centres - gnss.xyz, replace(gnss, crs=crs)
-        if not tied or is_topocentric(crs):
+        if not tied or systems.is_topocentric(crs):
             return GnssDifferences(plain)
         frame = frame_of(crs, name)
         if frame.direct and frame.crs.is_projected:
@@ -402,13 +353,13 @@ def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> GnssDifferen
     if gnss.crs is None or not tied or not is_tied(gnss.crs, name):
         reason = f"{name}: the cameras or the GNSS positions name no CRS; they are not compared."
         return GnssDifferences(np.full((len(cameras), 3), np.nan), reason)
-    kinds = [heights_of(frame_of(each, name).crs) for each in (crs, gnss.crs)]
+    kinds = [systems.heights_of(frame_of(each, name).crs) for each in (crs, gnss.crs)]
     who = "cameras" if kinds[0] == "unstated" else "GNSS"
     reason = f"{name}: the CRS of the {who} names no vertical datum; only plan is compared."
     if not {"gravity", "unstated"} <= {*kinds}:
         try:
             return GnssDifferences(_differences(cameras, gnss, name))
-        except HeightsError as error:
+        except systems.HeightsError as error:
             reason = str(error).partition("; or, if")[0] + "; only plan is compared."
     flat = replace(cameras, crs=_in_plan(crs, name))
     found = _differences(flat, replace(gnss, crs=_in_plan(gnss.crs, name)), name)
@@ -417,10 +368,10 @@ def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> GnssDifferen
 
 def _in_plan(crs: str, name: str) -> str:
     """Return a CRS without its vertical part; ellipsoidal heights may stay, no grid needs them."""
-    if is_topocentric(crs):
+    if systems.is_topocentric(crs):
         return crs
-    parsed = parse_crs(crs, name)
-    return crs if parsed.is_geocentric else crs_text(parts(parsed)[0])
+    parsed = systems.parse_crs(crs, name)
+    return crs if parsed.is_geocentric else systems.crs_text(systems.parts(parsed)[0])
 
 
 def _differences(cameras: Cameras, gnss: GnssPositions, name: str) -> FloatArray:
@@ -446,17 +397,19 @@ def _common(cameras: Cameras, name: str) -> CRS:
     from pyproj.crs.coordinate_operation import TransverseMercatorConversion
 
     frame = frame_of(cameras.crs or "", name)
-    if frame.crs.is_projected and {a.unit_name for a in frame.crs.axis_info}.issubset(METRES):
+    if frame.crs.is_projected and {a.unit_name for a in frame.crs.axis_info}.issubset(
+        systems.METRES
+    ):
         return frame.crs
-    flat, vertical = parts(frame.crs)
-    base = parts(unbound(frame.crs))[0].geodetic_crs
+    flat, vertical = systems.parts(frame.crs)
+    base = systems.parts(systems.unbound(frame.crs))[0].geodetic_crs
     if base is None:
         raise bad_file(name, "cameras.crs", f"{frame.crs.name} has no datum.")
     to_degrees = Transformer.from_crs(flat, "EPSG:4326", always_xy=True)
     middle = np.median(frame.enter(cameras.centres), axis=0)
     longitude, latitude = to_degrees.transform(middle[0], middle[1])
     mercator = TransverseMercatorConversion(latitude, longitude)
-    plan = CRS(ProjectedCRS(mercator, geodetic_crs=unbound(base).to_2d()))
+    plan = CRS(ProjectedCRS(mercator, geodetic_crs=systems.unbound(base).to_2d()))
     if vertical is not None:
-        return with_heights(plan, vertical)
-    return plan.to_3d() if heights_of(frame.crs) == "ellipsoidal" else plan
+        return systems.with_heights(plan, vertical)
+    return plan.to_3d() if systems.heights_of(frame.crs) == "ellipsoidal" else plan

@@ -37,9 +37,8 @@ import numpy as np
 
 from pcfix.errors import InputError, bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import damaged, number, numbers, read_xml
+from pcfix.io.cameras.checks import Source, damaged, number, numbers, read_xml
 from pcfix.io.cameras.checks import text_of as _text
-from pcfix.io.cameras.formats import Source
 from pcfix.model import Cameras, FloatArray, Lens
 
 PREFIX, PREFIX_2, SUFFIX = "Orientation-", "Ori-PerspCentral-", ".xml"
@@ -95,7 +94,7 @@ def _orientation(path: Path, known: dict[Path, Lens]) -> tuple[FloatArray, Float
     convention, matrix = _text(outer, "KnownConv"), outer.find("ParamRotation/CodageMatr")
     if projection != "eProjStenope" or convention not in _IS_INVERSE or matrix is None:
         what = f"the projection {projection} with rotations by {convention or 'angles'}"
-        raise checks.unsupported(path, what, "Write the orientations anew with OriConvert")
+        raise checks.unsupported(path, what, "Write the orientations again with OriConvert")
     rows = [numbers(path, tag, matrix.findtext(tag), 3) for tag in ("L1", "L2", "L3")]
     centre = numbers(path, "Centre", outer.findtext("Centre"), 3)
     inner, where = conic.find("Interne"), path

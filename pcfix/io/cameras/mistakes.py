@@ -22,7 +22,7 @@ UNDULATION_M = (15.0, 110.0)
 LOCAL_M, MAP_M = 2e4, 1e5
 """Coordinates below the first are likely local, beyond the second those of a map."""
 ABSURD_HEIGHTS = 3.0
-"""Cameras stand at most so many times the cloud's width above it."""
+"""Largest height of cameras above the cloud, in widths of the cloud."""
 _SAMPLE = 200
 
 
@@ -42,7 +42,7 @@ def likely_mistake(
     Returns
     -------
     str or None
-        One sentence; None where the block stands over the cloud.
+        One sentence; None where the block is over the cloud.
     """
     centres = np.asarray(centres, np.float64)[:: max(1, len(centres) // _SAMPLE)]
     low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)

@@ -30,7 +30,8 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.io.cameras import checks, tracks
-from pcfix.io.cameras.formats import Source
+from pcfix.io.cameras.checks import Source
+from pcfix.io.tables import read_lines
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
 
 _HEAD = re.compile(r"NVM_V3(_R9T)?\b(?:\s*FixedK\s+(.*))?")
@@ -64,8 +65,7 @@ def recognises(source: Source) -> bool:
 def read(source: Source) -> Cameras:
     """Read the poses and lenses of the largest model."""
     path = source.path
-    models = _models(path)
-    model = _largest(path, models)
+    model, models = _largest(path)
     labels = tuple(model.names[i] for i in model.posed)
     rotations, centres = _poses(path, model)
     rows, smallest = model.rows[model.posed], _placed(path, model)[1][model.posed]
@@ -91,20 +91,19 @@ def read(source: Source) -> Cameras:
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """Read the points of the largest model and where the images saw them."""
-    model = _largest(source.path, _models(source.path))
+    model, _ = _largest(source.path)
     if not len(model.points.image) or cameras.lenses is None:
         raise tracks.no_tie_points(source.path, "it lists no points")
     return model.points.seen(model.posed, cameras, _placed(source.path, model)[0])
 
 
-def _models(path: Path) -> list[Model]:
-    """Return all models of the file."""
-    head, _, body = checks.read_text(path).lstrip().partition("\n")
+def _largest(path: Path) -> tuple[Model, list[Model]]:
+    """Return the model with most posed images, of those with points if there are any, and all."""
+    head, *lines = [x for line in read_lines(path) if (x := line.strip()) and x[0] != "#"]
     found = _HEAD.match(head)
     matrix, held = found.groups() if found else (None, None)
-    lines = [line for line in body.splitlines() if line.strip() and line.lstrip()[0] != "#"]
     width = _MATRIX_NUMBERS if matrix else _QUATERNION_NUMBERS
-    fixed = tuple(tracks.numbers(held)[:4].tolist()) if held else None
+    fixed = tuple(map(float, held.split()[:4])) if held else None
     models = []
     at = 0
     while at < len(lines) and (count := int(lines[at])) > 0:
@@ -113,22 +112,17 @@ def _models(path: Path) -> list[Model]:
         numbers = np.array([row[1:] for row in rows], np.float64).reshape(count, width)
         at += 1 + count
         points = int(lines[at])
-        values = tracks.numbers("\n".join(lines[at + 1 : at + 1 + points]))
+        values = np.array(" ".join(lines[at + 1 : at + 1 + points]).split(), np.float64)
         listed = tracks.point_list(path, values, points, count, 4)
         models.append(Model(names, numbers, listed, fixed))
         at += 1 + points
     if not models:
         raise checks.no_pose(path, "has no model")
-    return models
-
-
-def _largest(path: Path, models: list[Model]) -> Model:
-    """Return the model with most posed images, of those with points if there are any."""
     with_points = [model for model in models if len(model.points.xyz)]
     largest = max(with_points or models, key=lambda model: len(model.posed))
     if not len(largest.posed):
         raise checks.no_pose(path, "no image has a pose (all focal lengths are 0)")
-    return largest
+    return largest, models
 
 
 def _poses(path: Path, model: Model) -> tuple[FloatArray, FloatArray]:

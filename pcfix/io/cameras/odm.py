@@ -7,7 +7,7 @@ the first line of coords.txt. Its reconstruction has been in three frames:
   (turn by the meridian convergence, scale, shift) that makes projected coordinates of it, and so
   of the cloud;
 - then with the axes of the projected CRS, less its coordinates of the reference; the reference is
-  at whole metres, which tells this frame from a true topocentric one;
+  at whole metres, which distinguishes this frame from a topocentric one;
 - topocentric again in versions that project the finished cloud point by point, and in
   reconstruction.topocentric.json, which the second kind keeps.
 
@@ -35,10 +35,11 @@ import numpy as np
 
 from pcfix.errors import bad_file
 from pcfix.io.cameras import checks, opensfm
-from pcfix.io.cameras.checks import damaged, load_json, note, triple
-from pcfix.io.cameras.formats import Source
+from pcfix.io.cameras.checks import Source, damaged, load_json, note, triple
 from pcfix.io.cameras.opensfm import is_panorama, lens
-from pcfix.io.crs import GEOCENTRIC_WGS84, GEOGRAPHIC_WGS84, Topocentric
+from pcfix.io.crs import Topocentric
+from pcfix.io.labels import unnamed
+from pcfix.io.tables import read_lines
 from pcfix.lens.rotations import from_rotation_vectors
 from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, TiePoints
 
@@ -99,7 +100,7 @@ def read(source: Source) -> Cameras:
         crs=placed.crs,
         project_crs=placed.project_crs,
         gnss=gnss or own.gnss,
-        unposed=opensfm.left_out(own.labels, [*own.unposed, *listed]),
+        unposed=unnamed([*own.unposed, *listed], own.labels),
         source="OpenDroneMap",
     )
     truth, ours = _in_shots(project, cameras)
@@ -192,7 +193,7 @@ def _frame(project: Project, found: opensfm.Reconstruction) -> Frame:
     path = project.find(TRANSFORMATION)
     if path is not None:
         with checks.reading(path):
-            rows = [row.split()[:4] for row in checks.read_text(path).splitlines() if row.strip()]
+            rows = [row.split()[:4] for row in read_lines(path) if row.strip()]
             matrix = np.array(rows, float).reshape(4, 4)
         turn, shift = matrix[:3, :3], matrix[:3, 3]
         if not (np.abs(turn.T @ turn - np.eye(3)).max() <= SCALE_TOLERANCE):
@@ -206,7 +207,7 @@ def _frame(project: Project, found: opensfm.Reconstruction) -> Frame:
         return unmoved
     crs, east, north = whole
     moved = Frame(np.eye(3), np.array([east, north, 0.0]), crs)
-    # centres of shots.geojson, else the GNSS, which stays topocentric, tell whether it was moved:
+    # centres of shots.geojson, else the GNSS, which stays topocentric, show whether it was moved:
     # the two readings differ by the meridian convergence and the scale
     truth, own = _in_shots(project, found.cameras)
     if len(own) < 3 and found.cameras.gnss is not None:
@@ -254,12 +255,8 @@ def _from_topocentric(
     xyz: FloatArray, reference: tuple[float, float, float], crs: str
 ) -> FloatArray:
     """Return topocentric points in a projected CRS, heights on the ellipsoid, shape (n, 3)."""
-    from pyproj import Transformer
-
-    to_degrees = Transformer.from_crs(GEOCENTRIC_WGS84, GEOGRAPHIC_WGS84, always_xy=True)
-    ecef = Topocentric(*reference).to_geocentric(xyz)
-    geographic = np.column_stack(to_degrees.transform(*ecef.T))
-    return np.column_stack([*_projected(crs, *geographic[:, :2].T), geographic[:, 2]])
+    degrees = Topocentric(*reference).to_degrees(xyz)
+    return np.column_stack([*_projected(crs, *degrees[:, :2].T), degrees[:, 2]])
 
 
 def _zones(lat: float, lon: float) -> list[str]:
@@ -315,7 +312,7 @@ def _read_shots(project: Project, path: Path) -> Cameras:
         crs=crs or "local",
         notes=(said,) if plain else (),
         gnss=gnss,
-        unposed=opensfm.left_out(labels, listed),
+        unposed=unnamed(listed, labels),
         source="OpenDroneMap",
     )
 

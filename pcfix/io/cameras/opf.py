@@ -32,8 +32,7 @@ import numpy as np
 
 from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.cameras import checks, tracks
-from pcfix.io.cameras.checks import load_json, note, triple
-from pcfix.io.cameras.formats import Source
+from pcfix.io.cameras.checks import Source, load_json, note, triple
 from pcfix.io.crs import crs_text, parse_crs, plan_unit
 from pcfix.lens.rotations import from_omega_phi_kappa
 from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, TiePoints
@@ -58,7 +57,11 @@ def read(source: Source) -> Cameras:
     project = _open_project(source.path)
     path, calibrated = project.part("calibration", "calibrated-cameras")
     _, given = project.part("input_cameras", "input-cameras", needed=False)
-    frame, names = _frame_of(project), _image_names(project)
+    frame, names = _frame_of(project), dict[int, str]()
+    for listed in project.files("camera_list", FORMAT.format("camera-list")):
+        for camera in load_json(listed)["cameras"] if listed.is_file() else []:
+            name = camera["uri"].replace("\\", "/").rpartition("/")[2]
+            names[camera["id"]] = unquote(name.removesuffix("#page=0"))  # others keep their page
     shots = {shot["id"]: shot for shot in calibrated["cameras"]}
     labels = tuple(names.get(i, f"camera {i}") for i in shots)
     xyz = np.array([triple(shot["position"]) for shot in shots.values()]).reshape(-1, 3)
@@ -124,7 +127,7 @@ class Project(NamedTuple):
 
 
 def _open_project(path: Path) -> Project:
-    """Read the project that a path is, that lies in a folder, or that a part belongs to."""
+    """Read the project at a path, in a folder, or that a part belongs to."""
     if path.is_dir():
         found = sorted(path.glob("*.opf"))
     else:
@@ -141,18 +144,8 @@ def _open_project(path: Path) -> Project:
     return _open_project(found[0])
 
 
-def _image_names(project: Project) -> dict[int, str]:
-    """Return the names of the images by their ids; of a page of a file with its number."""
-    names = {}
-    for path in project.files("camera_list", FORMAT.format("camera-list")):
-        for camera in load_json(path)["cameras"] if path.is_file() else []:
-            name = camera["uri"].replace("\\", "/").rpartition("/")[2]
-            names[camera["id"]] = unquote(name.removesuffix("#page=0"))
-    return names
-
-
 class Frame(NamedTuple):
-    """The way from the processing CRS to coordinates east, north, up of the project's."""
+    """The processing CRS: coordinates east, north, up of `crs` times `scale`, plus `shift`."""
 
     crs: str
     project_crs: str | None

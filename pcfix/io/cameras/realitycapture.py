@@ -14,7 +14,7 @@ x' = ... + t1 (r^2 + 2 x^2) + 2 t2 x y; models named brown3 leave k4 out, those 
 last two. The division model undoes the distortion after the calibration matrix, about the centre
 of the image: m = m' / (1 + k1 |m'|^2), m and m' places in shares of the larger side.
 
-The width and height are not in the file: they come from the image beside it, or from the
+The width and height are not in the file: they are those of the image beside it, or from the
 proportions of ``--sensor``. Positions called relative or rigid are in a local frame; absolute
 ones are in the CRS of the export, which the file does not name. `latitude` and `longitude` are
 not those of the image.
@@ -35,8 +35,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import number, numbers, read_xml
-from pcfix.io.cameras.formats import Source
+from pcfix.io.cameras.checks import Source, number, numbers, read_xml
 from pcfix.io.cameras.table.sensor import read_sensor
 from pcfix.io.cameras.tracks import image_size
 from pcfix.model import Cameras, FloatArray, Lens
@@ -65,7 +64,7 @@ class Image(NamedTuple):
     fields: dict[str, str]
 
     def numbers(self, name: str, count: int) -> FloatArray:
-        """Return so many numbers of a field."""
+        """Return the numbers of a field, `count` of them."""
         return numbers(self.path, f"image {self.label}, xcr:{name}", self.fields.get(name), count)
 
     def number(self, name: str, default: str = "0") -> float:

@@ -98,11 +98,6 @@ class PointList(NamedTuple):
         return tie_points(Seen(self.xyz, self.point, camera, np.array(middle)[camera] + places))
 
 
-def numbers(text: str) -> FloatArray:
-    """Return all numbers of a text that holds nothing else but white space."""
-    return np.array(text.split(), np.float64)
-
-
 def point_list(path: Path, body: FloatArray, count: int, images: int, width: int) -> PointList:
     """Take apart a list of x y z, red green blue, n, and n views of `width` numbers.
 
@@ -138,7 +133,7 @@ def frame_sizes(
     Where an image cannot be opened, its frame is the smallest that holds all tie points that
     images of about the same focal length have, about the middle of the frame. `smallest_px`, shape
     (k, 2), is the width and height that hold those of an image, 0 where it has none. None where
-    nothing tells the frames.
+    neither is known.
     """
     sizes = np.array([image_size(path.parent, name) or (0, 0) for name in names], float)
     missing = sizes[:, 0] == 0

@@ -13,7 +13,7 @@ from typing import NoReturn
 import numpy as np
 
 from pcfix.errors import bad_file
-from pcfix.io.cameras.formats import Source
+from pcfix.io.cameras.checks import Source
 from pcfix.io.tables import number
 
 POSES = "Give the file or folder with the camera poses"
@@ -49,10 +49,7 @@ CONTENTS: tuple[tuple[bytes, Refusal], ...] = (
     (rb"\A(EPSG:\d|\+proj=|WGS84 UTM )[^\n]*\n\s*[-+.\d]+[ \t]+[-+.\d]+[ \t]", GCPS),
     (rb"\A(\xef\xbb\xbf)?focal", ("a table of the sensor", "Give it by --sensor")),
     (rb"\A\s*\$PROJECT\b|^\s*\$(PHOTO_NUM|EXT_ORI)\b", ("a project of Inpho (Trimble)", OPK)),
-    (
-        rb"^\s*(SENSOR_TYPE|IMAGE_SUPPORT|TRIANGULATION_TYPE)\s",
-        ("a support file of SOCET SET", OPK),
-    ),
+    (rb"^\s*(SENSOR_TYPE|IMAGE_SUPPORT|TRIANGULATION_TYPE)\s", SOCET),
     (rb"^\s*(ORI[AE]|PRO[JI]|GEOI|BILD)\s+\S+\s+\S", ("a file of BINGO", OPK)),
     (rb"<(CalibrationInternConique|InternalCalibration)>", MICMAC),
     (rb'"projection_type"', ODM),
@@ -88,7 +85,7 @@ def recognises(source: Source) -> bool:
 
 
 def is_part(source: Source) -> bool:
-    """Whether a file is by its name one part of an export that alone has no poses."""
+    """Whether a file is by its name a part of an export without poses."""
     return source.path.is_file() and any(re.fullmatch(p, source.path.name) for p, _ in PARTS)
 
 

@@ -8,6 +8,7 @@ PDAL's stage take name, type and unit from them, and a test holds the documentat
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -111,23 +112,27 @@ def shift_steps(correction: Correction, scales: FloatArray) -> npt.NDArray[np.in
     return np.rint(correction.shift_m / scales).astype(np.int64)
 
 
-def in_steps(
-    column: Column,
+def filled(
+    columns: tuple[Column, ...],
     correction: Correction,
     moved: npt.NDArray[np.int64],
     classes: npt.NDArray[Any],
-    rows: BoolArray,
-) -> npt.NDArray[Any]:
-    """Return a column's values of the given rows, whole numbers of its scale.
+    changed: BoolArray,
+) -> Iterator[tuple[Column, BoolArray, npt.NDArray[Any]]]:
+    """Yield each column, the rows that get values, and these as whole numbers of its scale.
 
-    `moved` is from `shift_steps`, shape (n, 3); `classes`, shape (n,), are those before.
+    The rows are the `changed` ones, and for shifts all that moved. `moved` is from `shift_steps`,
+    shape (n, 3); `classes`, shape (n,), are those before.
     """
-    if column.scale == 0.0:
-        return np.asarray(moved[rows, SHIFTS.index(column.name)])
-    value = (getattr(correction, column.of) if column.of else classes)[rows]
-    if column.scale != 1.0:
-        value = np.rint(value / column.scale)
-    return value if column.least is None else np.asarray(np.maximum(value, column.least))
+    for column in columns:
+        rows = changed | correction.moved if column.name in SHIFTS else changed
+        if column.scale == 0.0:
+            yield column, rows, moved[rows, SHIFTS.index(column.name)]
+            continue
+        value = (getattr(correction, column.of) if column.of else classes)[rows]
+        if column.scale != 1.0:
+            value = np.rint(value / column.scale)
+        yield column, rows, value if column.least is None else np.maximum(value, column.least)
 
 
 def fill(
@@ -142,11 +147,9 @@ def fill(
     A `TooNarrowError` if a value does not fit its type and the type may be widened.
     """
     classes = np.array(points["classification"])
-    for column in columns:
+    for column, some, value in filled(columns, correction, moved, classes, rows):
         target = points.array[column.name]
         limits = np.iinfo(target.dtype)
-        filled = rows_of(column, correction, rows)
-        value = in_steps(column, correction, moved, classes, filled)
         if column.saturates:
             value = np.minimum(value, limits.max)
         if value.size and (value.min() < limits.min or value.max() > limits.max):
@@ -156,29 +159,24 @@ def fill(
             reach = float(value.max() * step)
             sentence = f"{column.name} reaches {reach:g} m. Remove points far below the water."
             raise InputError("cloud.too_deep", sentence, dimension=column.name, value=reach)
-        target[filled] = value
-
-
-def rows_of(column: Column, correction: Correction, changed: BoolArray) -> BoolArray:
-    """Return the rows that get values of a column: the changed ones, and for shifts all moved."""
-    return changed | correction.moved if column.name in SHIFTS else changed
+        target[some] = value
 
 
 def changed_rows(correction: Correction, withheld: BoolArray, *, withhold: bool) -> BoolArray:
     """Return the rows that get values: corrected ones, and uncorrected ones not yet withheld.
 
-    An uncorrected point that came withheld is left wholly as it was, so that `restore` can tell
-    it from one that pcfix withheld; by the same mark, a depth, it tells those that are withheld
-    because they could not be carried over.
+    An uncorrected point that is withheld in the input stays as it is, so that `restore` can
+    distinguish it from one that pcfix withheld. Points that are withheld because they could not be
+    transferred have the same mark, a depth.
     """
     marked = correction.uncorrected if withhold else correction.submerged
     return correction.corrected | (marked & ~withheld)
 
 
 def unsure_anew(correction: Correction, withheld: BoolArray) -> Correction:
-    """Return a correction in which no point that came withheld is unsure.
+    """Return a correction in which no point that is withheld in the input is unsure.
 
-    So `restore` can tell these from the unsure ones, which are withheld by pcfix.
+    So `restore` can distinguish these from the unsure ones, which are withheld by pcfix.
     """
     if correction.unsure is None:
         return correction
@@ -189,25 +187,6 @@ def to_withhold(correction: Correction, *, withhold: bool) -> BoolArray:
     """Return the rows to be flagged: the unsure, and the uncorrected where these are withheld."""
     rows = correction.uncorrected if withhold else np.zeros(len(correction.outcome), np.bool_)
     return rows if correction.unsure is None else rows | correction.unsure
-
-
-def is_corrected(points: laspy.ScaleAwarePointRecord) -> BoolArray:
-    """Return which rows of an output file refraction was taken out of."""
-    return np.asarray(points.array["RayCount"] > 0)
-
-
-def is_marked_uncorrected(points: laspy.ScaleAwarePointRecord) -> BoolArray:
-    """Return which rows of an output file pcfix should have moved and could not."""
-    return np.asarray((points.array["RayCount"] == 0) & (points.array["WaterDepth"] > 0))
-
-
-def upgraded(point_format: laspy.PointFormat) -> laspy.PointFormat:
-    """Return the output's point format, with the input's extra dimensions."""
-    import laspy  # it loads pyproj, which PDAL's stage must not before it runs
-
-    new = laspy.PointFormat(UPGRADE[point_format.id])
-    new.dimensions.extend(point_format.extra_dimensions)
-    return new
 
 
 def convert(

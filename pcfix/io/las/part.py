@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import laspy
 import lazrs
@@ -50,20 +50,16 @@ class Part:
         return np.asarray((x >= west) & (x <= east) & (y >= south) & (y <= north))
 
 
-class Extent(NamedTuple):
-    """How many points a part has, and their lowest and highest coordinates."""
-
-    points: int
-    mins: FloatArray
-    maxs: FloatArray
-
-
 class CloudPart(AnyPath):
-    """The path of a part of a cloud; once opened it has its `extent`, and `held`, all points."""
+    """The path of a part of a cloud.
+
+    Once opened it has its `extent`, the number of points and their lowest and highest coordinates,
+    and `held`, the number of all points of the cloud.
+    """
 
     part: Part = Part()
     held: int = 0
-    extent: Extent | None = None
+    extent: tuple[int, FloatArray, FloatArray] | None = None
 
 
 def cloud_part(path: Path, options: Any) -> Path:
@@ -85,7 +81,7 @@ def part_report(path: Path) -> dict[str, Any] | None:
     if not isinstance(path, CloudPart) or path.extent is None:
         return None
     return {
-        "points": path.extent.points,
+        "points": path.extent[0],
         "of": path.held,
         "bounds": None if path.part.bounds is None else list(path.part.bounds),
         "read_resolution": path.part.resolution,
@@ -100,9 +96,9 @@ def is_copc(header: laspy.LasHeader) -> bool:
 def nodes_in(
     path: Path, part: Part, selection: laspy.DecompressionSelection, most: int
 ) -> Iterator[laspy.ScaleAwarePointRecord]:
-    """Yield points of the nodes of a COPC file that a part may touch, at most so many at a time.
+    """Yield points of the nodes of a COPC file that a part may touch, at most `most` at a time.
 
-    They come in the order of the file; a node that has more comes alone.
+    They come in the order of the file; a node with more points is one batch.
     """
     with CopcReader.open(path) as reader:
         header, info, levels, box = reader.header, reader.copc_info, None, None
@@ -141,8 +137,11 @@ def _unpacked(
 
 def extent_of(
     path: CloudPart, header: laspy.LasHeader, chunks: Iterator[laspy.ScaleAwarePointRecord]
-) -> Extent:
+) -> tuple[int, FloatArray, FloatArray]:
     """Return how many points a part has, and where; an `InputError` if it has none."""
+    if path.part.resolution is not None and not is_copc(header):
+        sentence = f"{path}: is not COPC and has no coarser levels to read. Omit --read-resolution."
+        raise SettingError("cloud.not_copc", sentence, path=path)
     if path.extent is None:
         count, ends = 0, []
         for points in chunks:
@@ -156,12 +155,5 @@ def extent_of(
             raise bad_file(path, "cloud.bounds", sentence)
         low, high = np.min(ends, axis=0)[0], np.max(ends, axis=0)[1]
         mins, maxs = (end * header.scales + header.offsets for end in (low, high))
-        path.extent, path.held = Extent(count, mins, maxs), int(header.point_count)
+        path.extent, path.held = (count, mins, maxs), int(header.point_count)
     return path.extent
-
-
-def check_levels(path: CloudPart, header: laspy.LasHeader) -> None:
-    """Refuse a resolution of what has no levels."""
-    if path.part.resolution is not None and not is_copc(header):
-        sentence = f"{path}: is not COPC and has no coarser levels to read. Omit --read-resolution."
-        raise SettingError("cloud.not_copc", sentence, path=path)

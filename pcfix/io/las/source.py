@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from copy import copy
 from pathlib import Path
@@ -24,7 +24,7 @@ from laspy.vlrs.vlrlist import VLRList
 from pcfix.errors import bad_file
 from pcfix.io.crs import METRES, shortened
 from pcfix.io.files import check_input
-from pcfix.io.las.part import CloudPart, check_levels, extent_of, is_copc, nodes_in
+from pcfix.io.las.part import CloudPart, extent_of, is_copc, nodes_in
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
 
@@ -55,6 +55,13 @@ _PLACES = (
     .decompress_classification()
     .decompress_point_source_id()
     .decompress_rgb()
+)
+
+_PLY = (
+    "is a PLY file; pcfix reads LAS and LAZ. Convert it with: pdal translate {} {}"
+    " --writers.las.scale_x=0.001 --writers.las.scale_y=0.001 --writers.las.scale_z=0.001"
+    " --writers.las.offset_x=auto --writers.las.offset_y=auto --writers.las.offset_z=auto"
+    " --writers.las.a_srs=EPSG:CODE (CODE is that of its CRS)"
 )
 
 MOST_SCALE_M = 1000.0
@@ -152,8 +159,8 @@ def _read(stream: BinaryIO, start: int, count: int, layout: str, end: int) -> li
     return records
 
 
-def append_evlrs(stream: BinaryIO, records: list[Record], minor_version: int) -> None:
-    """Append EVLRs to a file that is otherwise whole, and tell its header."""
+def append_evlrs(stream: BinaryIO, records: Sequence[Record], minor_version: int) -> None:
+    """Append EVLRs to a file that is otherwise complete, and state them in its header."""
     start = stream.seek(0, os.SEEK_END)
     if records and minor_version >= 4:
         stream.seek(235)
@@ -179,25 +186,12 @@ def las_errors(path: Path) -> Iterator[None]:
         raise bad_file(path, "cloud.damaged", sentence) from error
 
 
-def refuse_ply(path: Path, head: bytes) -> None:
-    """Refuse a cloud in a format that is whole, and not LAS; say how to convert it."""
-    if head.startswith((b"ply\n", b"ply\r")):
-        millimetres = " ".join(f"--writers.las.scale_{axis}=0.001" for axis in "xyz")
-        sentence = (
-            f"is a PLY file; pcfix reads LAS and LAZ. Convert it with: pdal translate {path}"
-            f" {path.with_suffix('.laz')} {millimetres} --writers.las.offset_x=auto"
-            " --writers.las.offset_y=auto --writers.las.offset_z=auto"
-            " --writers.las.a_srs=EPSG:CODE (CODE is that of its CRS)"
-        )
-        raise bad_file(path, "cloud.ply", sentence)
-
-
 class LasSource:
     """An open LAS or LAZ file; use it as a context manager.
 
     It has `path`, laspy's `header`, `vlrs` and `evlrs` from `read_records`, and `identity`: system
     identifier, generating software and date as they are in the file, where other software writes
-    what laspy would not. Of a `CloudPart` it has the points of the part alone, and the header says
+    what laspy would not. Of a `CloudPart` it has only the points of the part, and the header says
     so; `held` is how many points the whole file has.
     """
 
@@ -212,14 +206,16 @@ class LasSource:
         """Open; an `InputError` if the file is missing, damaged, empty, or its scales unusable.
 
         With `places_only` nothing is unpacked but coordinates, classes, sources and colours, where
-        the file holds its dimensions apart (LAZ of format 6 and up); the others may be zero then.
-        The chunks of a small cloud are put into `kept`, for the next to read it, and must not be
+        the file stores its dimensions separately (LAZ of format 6 and up); the others may be zero
+        then. The chunks of a small cloud are put into `kept`, for the next reader, and must not be
         changed.
         """
         self.path = check_input(path)
+        to_laz = self.path.with_suffix(".laz")
         with las_errors(self.path):
             with self.path.open("rb") as stream:
-                refuse_ply(self.path, stream.read(4))
+                if stream.read(4) in (b"ply\n", b"ply\r"):
+                    raise bad_file(self.path, "cloud.ply", _PLY.format(self.path, to_laz))
                 self.vlrs, self.evlrs = read_records(stream)
                 stream.seek(IDENTITY_PLACE)
                 self.identity = stream.read(_IDENTITY_SIZE)
@@ -230,9 +226,11 @@ class LasSource:
             with las_errors(self.path):
                 self.held = len(self)
             self._check_header()
-            self._check_count()
             if isinstance(self.path, CloudPart):
-                self._take_part(self.path)
+                extent = extent_of(self.path, self.header, self._chunks_of(self.path))
+                self._reader.seek(0)
+                self.header = copy(self.header)
+                self.header.point_count, self.header.mins, self.header.maxs = extent
         except BaseException:
             self._reader.close()
             raise
@@ -250,6 +248,7 @@ class LasSource:
         return int(self.header.point_count)
 
     def _check_header(self) -> None:
+        """Refuse unusable scales, an empty cloud, and a count that disagrees with the points."""
         scales, offsets = self.header.scales, self.header.offsets
         usable = (scales > 0.0) & (scales <= MOST_SCALE_M)
         # steps below the last digit of the offsets would be lost in coordinates
@@ -259,18 +258,13 @@ class LasSource:
                 f" {MOST_SCALE_M:,.0f}, or too small for its offsets {offsets.tolist()}."
             )
             raise bad_file(self.path, "cloud.scales", f"{sentence} Export the cloud again.")
-        if len(self) == 0:
-            raise bad_file(self.path, "cloud.empty", "contains no points.")
-
-    def _check_count(self) -> None:
-        """Refuse a header whose number of points disagrees with the points, which would be lost."""
         stated = len(self)
+        if stated == 0:
+            raise bad_file(self.path, "cloud.empty", "contains no points.")
+        # points that the header does not count would be lost
+        packed = self.header.are_points_compressed
         with las_errors(self.path):
-            least, most = (
-                self._points_of_chunks()
-                if self.header.are_points_compressed
-                else self._points_of_records()
-            )
+            least, most = self._points_of_chunks() if packed else self._points_of_records()
         if not least <= stated <= most:
             held = f"{least:,}" if least == most else f"{least:,} to {most:,}"
             sentence = f"its header counts {stated:,} points, but it holds {held}. Export it again."
@@ -322,14 +316,6 @@ class LasSource:
                 (last,) = struct.unpack("<I", stream.read(4))
         return (chunks - 1) * chunk_points + last, chunks * chunk_points
 
-    def _take_part(self, path: CloudPart) -> None:
-        """Let the header tell of a part, whose points are counted the first time."""
-        check_levels(path, self.header)
-        extent = extent_of(path, self.header, self._chunks_of(path))
-        self._reader.seek(0)
-        self.header = copy(self.header)
-        self.header.point_count, self.header.mins, self.header.maxs = extent
-
     def chunks(self) -> Iterator[laspy.ScaleAwarePointRecord]:
         """Yield all points, in order, at most `CHUNK_POINTS` at a time, or a larger node of COPC.
 
@@ -359,22 +345,20 @@ class LasSource:
             read += len(points)
             yield points
 
-    def _nodes(self, path: CloudPart) -> Iterator[laspy.ScaleAwarePointRecord]:
-        with las_errors(self.path):
-            info = self.header.vlrs[0]
-            if info.hierarchy_root_offset + info.hierarchy_root_size > path.stat().st_size:
-                raise ValueError("its octree begins or ends behind its end")
-            yield from nodes_in(path, path.part, self._selection, CHUNK_POINTS)
-
     def _chunks_of(self, path: CloudPart) -> Iterator[laspy.ScaleAwarePointRecord]:
         """Yield the points of a part."""
-        chunks = self._whole()
-        if is_copc(self.header):
-            chunks = self._nodes(path)
-        for points in chunks:
-            inside = path.part.holds(points)
-            if inside.any():
-                yield points[inside]
+        with las_errors(self.path):
+            chunks = self._whole()
+            if is_copc(self.header):
+                info = self.header.vlrs[0]
+                end = info.hierarchy_root_offset + info.hierarchy_root_size
+                if end > path.stat().st_size:  # laspy would take memory for all of it
+                    raise ValueError("its octree begins or ends behind its end")
+                chunks = nodes_in(path, path.part, self._selection, CHUNK_POINTS)
+            for points in chunks:
+                inside = path.part.holds(points)
+                if inside.any():
+                    yield points[inside]
 
     def dimension(self, points: laspy.ScaleAwarePointRecord, name: str) -> FloatArray:
         """Return one dimension of a chunk, scaled, as float64.

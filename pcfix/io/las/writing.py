@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from copy import deepcopy
 from functools import partial
 from pathlib import Path
@@ -26,7 +26,7 @@ from pyproj import CRS
 from pcfix.errors import SettingError, bad_file
 from pcfix.io.atomic import cannot_write, temporary_output
 from pcfix.io.files import parse_json
-from pcfix.io.las.columns import Column, column_scale, upgraded
+from pcfix.io.las.columns import UPGRADE, Column, column_scale
 from pcfix.io.las.part import part_report
 from pcfix.io.las.source import (
     IDENTITY_PLACE,
@@ -63,12 +63,19 @@ def corrected_header(
     """Return the header of a corrected file: LAS 1.4, the input's records, and pcfix's own.
 
     The `columns` are added as extra dimensions, of their `wide` types or the narrow ones, and a VLR
-    with `content` and what the file was before. Each integer axis will be moved by so many `steps`,
+    with `content` and what the file was before. Each integer axis will be moved by its `steps`,
     for which the offsets make up. An `InputError` if the cloud already has a dimension of one of
     these names, or was corrected before.
     """
-    _refuse_twice(source, columns)
     old = source.header
+    if any(is_ours(v) for v in source.vlrs):
+        sentence = "was already corrected by pcfix. Use the original, or undo it: 'pcfix restore'."
+        raise bad_file(source.path, "cloud.corrected", sentence)
+    there = set(old.point_format.dimension_names)
+    twice = next((column.name for column in columns if column.name in there), None)
+    if twice is not None:
+        sentence = f"already has a dimension {twice}. Rename it, or use --dimensions none."
+        raise bad_file(source.path, "cloud.dimension_exists", sentence, dimension=twice)
     params, records = _extra_bytes(columns, old.scales, wide=wide)
     header, vlrs, described, changes = _upgraded(source, params)
     header.offsets = old.offsets - np.array(steps) * old.scales
@@ -82,8 +89,8 @@ def corrected_header(
         **changes,
     }
     part = part_report(source.path)
-    told = {**content, **({} if part is None else {"part": part}), "before": before}
-    note = _note(_SETTINGS, {**told, _SEAL: _seal_of(told)})
+    settings = {**content, **({} if part is None else {"part": part}), "before": before}
+    note = _note(_SETTINGS, {**settings, _SEAL: _seal_of(settings)})
     _set_records(header, [*vlrs, note], described + records)
     return header
 
@@ -107,21 +114,26 @@ def _upgraded(
     """
     old = source.header
     header = _copied(old)
-    point_format = upgraded(old.point_format)
+    point_format = laspy.PointFormat(UPGRADE[old.point_format.id])
+    point_format.dimensions.extend(old.point_format.extra_dimensions)
     for param in params:
         point_format.add_extra_dimension(param)
     version = max(old.version, laspy.header.Version(1, 4))
     header.set_version_and_point_format(version, point_format)
     vlrs = [v for v in source.vlrs if not _is_layout(v)]
-    wkt = _wkt_for(header, source)
-    if wkt is not None:
-        vlrs.append(wkt)
+    crs = None
+    if old.point_format.id < 6 and not header.global_encoding.wkt:  # formats 6 and up want WKT
+        with las_errors(source.path):
+            crs = old.parse_crs()
+    if crs is not None:
+        wkt = WktCoordinateSystemVlr(crs.to_wkt("WKT1_GDAL")).record_data_bytes()
+        vlrs.append(VLR("LASF_Projection", 2112, "OGC COORDINATE SYSTEM WKT", wkt))
         header.global_encoding.wkt = True
     described, undescribed = _extra_bytes_of(source)
     for dimension in undescribed:
         described += bytes(ExtraBytesStruct(dimension.name.encode(), (0, dimension.num_bits // 8)))
     names = [dimension.name for dimension in undescribed]
-    return header, vlrs, described, {"added_wkt": wkt is not None, "undescribed": names}
+    return header, vlrs, described, {"added_wkt": crs is not None, "undescribed": names}
 
 
 def corrected_identity(source: LasSource) -> bytes:
@@ -157,11 +169,6 @@ def restored_header(source: LasSource, before: dict[str, Any], drop: set[str]) -
     return header
 
 
-def output_evlrs(source: LasSource) -> list[Record]:
-    """Return the EVLRs to carry over: all but the index of a COPC file, which would be wrong."""
-    return [v for v in source.evlrs if v.user_id != "copc"]
-
-
 def _extra_bytes(
     columns: tuple[Column, ...], scales: FloatArray, *, wide: bool
 ) -> tuple[list[laspy.ExtraBytesParams], bytes]:
@@ -185,21 +192,8 @@ def _extra_bytes(
     return params, records
 
 
-def _refuse_twice(source: LasSource, columns: tuple[Column, ...]) -> None:
-    if any(is_ours(v) for v in source.vlrs):
-        sentence = "was already corrected by pcfix. Use the original, or undo it: 'pcfix restore'."
-        raise bad_file(source.path, "cloud.corrected", sentence)
-    there = set(source.header.point_format.dimension_names)
-    for column in columns:
-        if column.name in there:
-            sentence = (
-                f"already has a dimension {column.name}. Rename it, or use --dimensions none."
-            )
-            raise bad_file(source.path, "cloud.dimension_exists", sentence, dimension=column.name)
-
-
 def _copied(header: laspy.LasHeader) -> laspy.LasHeader:
-    """Return a copy without the names that laspy cannot always write; `LasSink` sets them."""
+    """Return a copy without the names that laspy cannot always write; `las_writer` sets them."""
     copy = deepcopy(header)
     copy.system_identifier = copy.generating_software = ""
     return copy
@@ -234,18 +228,6 @@ def _set_records(header: laspy.LasHeader, vlrs: list[VLR], described: bytes) -> 
     elif described:
         records.append(VLR(*EXTRA_BYTES, "Extra Bytes Record", described))
     header._vlrs = RecordList(records)
-
-
-def _wkt_for(header: laspy.LasHeader, source: LasSource) -> VLR | None:
-    """Return the CRS as WKT, which formats 6 and up want, where the input has only GeoTIFF keys."""
-    if source.header.point_format.id >= 6 or header.global_encoding.wkt:
-        return None
-    with las_errors(source.path):
-        crs = source.header.parse_crs()
-    if crs is None:
-        return None
-    wkt = WktCoordinateSystemVlr(crs.to_wkt("WKT1_GDAL"))
-    return VLR("LASF_Projection", 2112, "OGC COORDINATE SYSTEM WKT", wkt.record_data_bytes())
 
 
 def is_ours(vlr: VLR) -> bool:
@@ -315,59 +297,44 @@ def check_suffix(path: Path) -> bool:
     return suffix == ".laz"
 
 
-class LasSink:
-    """An output file that is being written; use it as a context manager.
+@contextmanager
+def las_writer(
+    path: Path,
+    header: laspy.LasHeader,
+    evlrs: Sequence[Record] = (),
+    identity: bytes = b"",
+    jobs: int | None = None,
+) -> Iterator[Callable[[laspy.ScaleAwarePointRecord], None]]:
+    """Give a function that appends points, in the header's format and scale, to a new file.
 
     The suffix of its path decides between LAS and LAZ; the `evlrs` follow the points, and
     `identity` goes into the header as it is (see `LasSource`).
     """
+    laz = check_suffix(path)
+    with temporary_output(path) as temporary, temporary.open("w+b") as stream:
+        with _write_errors(path, temporary):
+            writer = laspy.LasWriter(
+                stream, header, do_compress=laz, laz_backend=backend(jobs), closefd=False
+            )
 
-    def __init__(
-        self,
-        path: Path,
-        header: laspy.LasHeader,
-        evlrs: list[Record] | None = None,
-        identity: bytes = b"",
-        jobs: int | None = None,
-    ) -> None:
-        self.header = header
-        self._path, self._evlrs, self._identity, self._jobs = path, evlrs or [], identity, jobs
-        self._stack = ExitStack()
+        def write(points: laspy.ScaleAwarePointRecord) -> None:
+            with _write_errors(path, temporary):
+                writer.write_points(points)
 
-    def __enter__(self) -> LasSink:
-        laz = check_suffix(self._path)
-        with ExitStack() as stack:
-            temporary = stack.enter_context(temporary_output(self._path))
-            self._temporary = temporary
-            stack.enter_context(self._write_errors())
-            self._stream = stack.enter_context(temporary.open("w+b"))
-            self._writer = laspy.LasWriter(
-                self._stream, self.header, do_compress=laz, laz_backend=backend(self._jobs),
-                closefd=False,
-            )  # fmt: skip
-            self._stack = stack.pop_all()
-        return self
+        yield write
+        with _write_errors(path, temporary):
+            writer.close()
+            append_evlrs(stream, evlrs, header.version.minor)
+            stream.seek(IDENTITY_PLACE)
+            stream.write(identity)
 
-    def write(self, points: laspy.ScaleAwarePointRecord) -> None:
-        """Append points, in the header's format and scale."""
-        with self._write_errors():
-            self._writer.write_points(points)
 
-    def __exit__(self, kind: Any, value: Any, traceback: Any) -> None:
-        with self._stack, self._write_errors():  # before what else is on the disk goes
-            if kind is not None:
-                raise value
-            self._writer.close()
-            append_evlrs(self._stream, self._evlrs, self.header.version.minor)
-            self._stream.seek(IDENTITY_PLACE)
-            self._stream.write(self._identity)
-
-    @contextmanager
-    def _write_errors(self) -> Iterator[None]:
-        try:
-            yield
-        except (laspy.LaspyException, lazrs.LazrsError, OSError) as error:
-            raise cannot_write(self._path, error, self._temporary) from error
+@contextmanager
+def _write_errors(path: Path, temporary: Path) -> Iterator[None]:
+    try:
+        yield
+    except (LaspyException, lazrs.LazrsError, OSError) as error:
+        raise cannot_write(path, error, temporary) from error
 
 
 def write_points(
@@ -395,5 +362,5 @@ def write_points(
     if colours is not None:
         for i, name in enumerate(("red", "green", "blue")):
             points.array[name] = colours[:, i]
-    with LasSink(path, header, []) as sink:
-        sink.write(points)
+    with las_writer(path, header) as write:
+        write(points)

@@ -9,7 +9,7 @@ import pytest
 from pyproj import CRS, Transformer
 
 from pcfix.io.cameras import metashape
-from pcfix.io.cameras.formats import Source
+from pcfix.io.cameras.checks import Source
 from pcfix.io.cameras.metashape import read_calibration
 from pcfix.lens.imaging import project
 from pcfix.model import Lens

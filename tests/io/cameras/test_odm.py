@@ -8,7 +8,7 @@ from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
 from pcfix.io.cameras import opensfm
-from pcfix.io.cameras.formats import Source
+from pcfix.io.cameras.checks import Source
 from tests.utils.camera_files import read, read_ties
 from tests.utils.codes import refused
 from tests.utils.pose_files.block import axes_at

@@ -8,7 +8,7 @@ import pytest
 
 import pcfix
 from pcfix.io.cameras import FORMATS, table, unsupported
-from pcfix.io.cameras.formats import Source
+from pcfix.io.cameras.checks import Source
 from tests.utils.codes import refused
 
 pytestmark = pytest.mark.quick

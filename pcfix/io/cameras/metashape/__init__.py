@@ -17,8 +17,18 @@ component and the id of the track, ``projections`` of each camera have x and y i
 corner of the image and the id of the track. A project of one file has them beside its document.
 Markers stand in the document of the frame, as ``location`` with x and y; only the pinned ones were
 measured, the others Metashape computed from the poses. Where the GNSS put the cameras is their
-``reference``, in the CRS of the cameras or of the chunk. The formulas of a calibration stand in
-`block`.
+``reference``, in the CRS of the cameras or of the chunk.
+
+Calibration. With (x, y) the direction, (X, Y) / Z for a frame camera, and r its length:
+
+    x' = x (1 + k1 r^2 + ... + k4 r^8) + (p1 (r^2 + 2 x^2) + 2 p2 x y) (1 + p3 r^2 + p4 r^4)
+    u = width / 2 + cx + x' f + x' b1 + y' b2        v = height / 2 + cy + y' f
+
+y' with p1 and p2 exchanged. Pixels start at the corner of the image. A fisheye is equidistant,
+r = theta, and since version 2.3 can be equisolid, r = 2 sin(theta / 2); both get the same
+distortion. Files of PhotoScan up to 1.2 can have fx and fy instead of f; there cx and cy count
+from the corner, and p1 and p2 change places. Decisive is the element, as the version of the
+document is not.
 
 References: "Agisoft Metashape User Manual, Professional Edition", appendix "Camera models";
 "Metashape Python Reference", Chunk.transform, Sensor.location, CoordinateSystem.geoccs;
@@ -27,28 +37,28 @@ References: "Agisoft Metashape User Manual, Professional Edition", appendix "Cam
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 from xml.etree.ElementTree import Element
 from zipfile import ZipFile
 
 import numpy as np
 
-from pcfix.errors import PcfixWarning
-from pcfix.io.cameras.checks import damaged, note, number, numbers, reading, text_of
-from pcfix.io.cameras.formats import Source
+from pcfix.errors import PcfixWarning, bad_file
+from pcfix.io.cameras import checks
+from pcfix.io.cameras.checks import Source, damaged, note, number, numbers, read_xml, terms, text_of
 from pcfix.io.cameras.metashape import documents
-from pcfix.io.cameras.metashape.block import Block, name_of, read_block, read_calibration
 from pcfix.io.cameras.metashape.documents import Chunk, Document, open_archive, recognises, unpacked
 from pcfix.io.cameras.tracks import Seen, no_tie_points
 from pcfix.io.cameras.tracks import tie_points as gathered
-from pcfix.io.crs import is_local, parse_crs
+from pcfix.io.crs import LOCAL, METRES, crs_text, is_local, parse_crs, shortened, unbound
 from pcfix.io.ply import parse_header
-from pcfix.model import Cameras, FloatArray, GnssPositions, TiePoints
+from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, Projection, TiePoints
 
-__all__ = ["read", "read_calibration", "recognises", "tie_points"]
+__all__ = ["given_lenses", "read", "read_calibration", "recognises", "tie_points"]
 
 Spreads: TypeAlias = "tuple[tuple[str, tuple[int, ...]], ...]"
 """Names of stated standard deviations and the axes that they are of."""
@@ -61,7 +71,16 @@ DEFAULTS: Spreads = (
     ("accuracy_cameras_xy", (0, 1)),
     ("accuracy_cameras_z", (2,)),
 )
-POINTS, PROJECTIONS = ("x", "y", "z", "id"), ("x", "y", "id")
+POINTS, MARKS = ("x", "y", "z", "id"), ("x", "y", "id")
+DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
+PARAMETERS = {"f", "fx", "fy", "cx", "cy", "b1", "b2", "skew", *DISTORTION}
+PROJECTIONS: dict[str, Projection] = {
+    "frame": "perspective",
+    "fisheye": "equidistant",
+    "equidistant_fisheye": "equidistant",
+    "equisolid_fisheye": "equisolid",
+}
+"""Kinds of sensors that a lens can describe: not spherical, cylindrical or RPC."""
 
 
 def read(source: Source) -> Cameras:
@@ -72,13 +91,338 @@ def read(source: Source) -> Cameras:
     return replace(block.cameras, gnss=gnss, notes=(*chunk.notes, *block.cameras.notes, *notes))
 
 
+class Image(NamedTuple):
+    """An image and the elements that speak of it; `component` is where its pose is at home."""
+
+    id: str
+    label: str
+    element: Element
+    sensor: Element | None
+    component: str | None
+
+
+class Block(NamedTuple):
+    """The images with a pose, in the order of the file, and their matrices from chunk to world."""
+
+    images: list[Image]
+    places: list[FloatArray]
+    cameras: Cameras
+
+
+def read_block(chunk: Chunk) -> Block:
+    """Read the images of a chunk.
+
+    Left out are images that are not aligned, disabled (they took no part in the dense cloud), not
+    of a central projection, or in a component without a place in the frame of the others.
+    """
+    path, element = chunk.path, chunk.element
+    images = _images(element)
+    poses = _poses(path, images)
+    place_of, has_place = _places(path, element)
+    kept, why = [], Counter[str]()
+    for image in images:
+        kind = "frame" if image.sensor is None else kind_of(image.sensor)
+        if image.id not in poses:
+            continue
+        if image.element.get("enabled") == "false":
+            why["aligned but disabled"] += 1
+        elif kind not in PROJECTIONS:
+            why[f"of a {kind} sensor, for which there is no lens"] += 1
+        elif place_of(image) is None:
+            why["in a component that has no transform to the frame of the others"] += 1
+        else:
+            kept.append(image)
+    said = [f"{count} images are {reason}" for reason, count in why.items()]
+    if not kept:
+        chunk_name = element.get("label") or "without a name"
+        rest = ", ".join([f"{len(images) - len(poses)} are not aligned", *said])
+        raise checks.no_pose(path, f"of the {len(images)} images of chunk {chunk_name} {rest}")
+    notes = [note(path, "cameras.left_out", f"{one}; left out.") for one in said]
+    places = [place for image in kept if (place := place_of(image)) is not None]
+    crs, project_crs, of_world = _world(path, element) if has_place else (LOCAL, None, ())
+    in_world = np.array(places) @ np.array([poses[image.id] for image in kept])
+    scales = np.cbrt(np.linalg.det(in_world[:, :3, :3]))[:, None, None]
+    lenses: dict[Element, Lens] = {}
+    for image in kept:
+        if image.sensor is None:
+            raise damaged(path, f"sensor {image.element.get('sensor_id')} is missing")
+        if image.sensor not in lenses:
+            lenses[image.sensor], of_lens = lens_of(path, image.sensor, image.label)
+            notes += of_lens
+    chosen = {image.id for image in kept}
+    cameras = Cameras(
+        labels=tuple(image.label for image in kept),
+        centres=in_world[:, :3, 3],
+        rotations=np.ascontiguousarray((in_world[:, :3, :3] / scales).transpose(0, 2, 1)),
+        lenses=tuple(lenses[image.sensor] for image in kept if image.sensor is not None),
+        crs=crs,
+        project_crs=project_crs,
+        unposed=tuple(image.label for image in images if image.id not in chosen),
+        notes=(*notes, *of_world),
+        source=chunk.software,
+    )
+    return Block(kept, places, cameras)
+
+
+def _images(chunk: Element) -> list[Image]:
+    """Return the photos of a chunk, also those in groups; keyframes of animations are none."""
+    found = {sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")}
+    listed = {
+        number: component.get("id")
+        for component in chunk.iterfind("components/component")
+        for ids in component.iter("camera_ids")
+        for number in (ids.text or "").split()
+    }
+    homes: dict[str, str | None] = {}
+    images: list[Image] = []
+    for camera in chunk.iterfind("cameras//camera"):
+        if camera.get("type", "regular") == "regular":
+            number = camera.get("id") or f"#{len(images)}"
+            label = camera.get("label") or f"number {number}"
+            home = camera.get("component_id") or listed.get(number)
+            homes[number] = home or homes.get(camera.get("master_id") or "")
+            sensor = found.get(camera.get("sensor_id"))
+            images.append(Image(number, label, camera, sensor, homes[number]))
+    return images
+
+
+def _poses(path: Path, images: list[Image]) -> dict[str, FloatArray]:
+    """Return camera to chunk, 4x4, of each image that is aligned or whose master is."""
+    aligned = [image for image in images if text_of(image.element, "transform")]
+    labels = [image.label for image in aligned]
+    rows = [
+        numbers(path, f"image {image.label}, transform", image.element.findtext("transform"), 16)
+        for image in aligned
+    ]
+    matrices = np.array(rows).reshape(-1, 4, 4)
+    matrices[:, :3, :3] = checks.rotations(path, labels, matrices[:, :3, :3])
+    masters = dict(zip((image.id for image in aligned), matrices, strict=True))
+    poses = dict(masters)
+    for image in images:
+        master = masters.get(image.element.get("master_id") or "")
+        if image.id not in masters and master is not None and image.sensor is not None:
+            where, offset = f"sensor {name_of(image.sensor)}", np.eye(4)  # in the unit of the chunk
+            if rotation := text_of(image.sensor, "rotation"):
+                matrix = numbers(path, f"{where}, rotation", rotation, 9)
+                offset[:3, :3] = checks.rotations(path, [where], matrix)[0]
+            if location := text_of(image.sensor, "location"):
+                offset[:3, 3] = numbers(path, f"{where}, location", location, 3)
+            poses[image.id] = master @ offset
+    return poses
+
+
+def _places(path: Path, chunk: Element) -> tuple[Callable[[Image], FloatArray | None], bool]:
+    """Return the way of an image to the world (None: it has no place there), and if there is one.
+
+    Every component has a frame of its own. One with a transform has a place in the world; one
+    without has that of the chunk when it is the active or only one, as the chunk's transform is
+    that of its active component. Where none has a place, the world is the frame of the chunk.
+    """
+    of_chunk = _similarity(path, chunk.find("transform"))
+    components = chunk.findall("components/component")
+    own = {c.get("id"): _similarity(path, c.find("transform")) for c in components}
+    parent = chunk.find("components")
+    active = None if parent is None else parent.get("active_id")
+    main = active if active in own else next(iter(own), None)
+    has_place = of_chunk is not None or any(place is not None for place in own.values())
+    of_main = of_chunk if has_place else np.eye(4)
+
+    def place_of(image: Image) -> FloatArray | None:
+        is_main = image.component in (None, main) or image.component not in own
+        component = own.get(image.component)
+        return of_main if component is None and is_main else component
+
+    return place_of, has_place
+
+
+def _similarity(path: Path, element: Element | None) -> FloatArray | None:
+    """Return the 4x4 matrix of a transform that is one matrix, or has up to three parts."""
+    if element is None:
+        return None
+    where, matrix = "transform of the chunk", np.eye(4)
+    scale, rotation, translation = map(element.findtext, ("scale", "rotation", "translation"))
+    if (element.text or "").strip():
+        matrix = numbers(path, where, element.text, 16).reshape(4, 4)
+    elif scale is None and rotation is None and translation is None:
+        return None
+    if rotation is not None:
+        matrix[:3, :3] = numbers(path, where, rotation, 9).reshape(3, 3)
+    if translation is not None:
+        matrix[:3, 3] = numbers(path, where, translation, 3)
+    inside = float(np.cbrt(np.linalg.det(matrix[:3, :3]))) if scale is None else 1.0
+    size = inside if scale is None else number(path, where, scale)
+    if not size > 0.0:
+        raise damaged(path, f"{where}: the scale {size:g} is not positive")
+    matrix[:3, :3] = size * checks.rotations(path, [where], matrix[:3, :3] / inside)[0]
+    return matrix
+
+
+def _world(path: Path, chunk: Element) -> tuple[str, str | None, tuple[PcfixWarning, ...]]:
+    """Return the frame that a chunk's transforms lead to, its CRS if another, and notes on them."""
+    text = text_of(chunk, "reference")
+    if not text or text.upper() == "LOCAL":
+        return LOCAL, None, ()
+    crs = parse_crs(text, str(path))
+    if is_local(crs):
+        unit = crs.axis_info[0].unit_name
+        sentence = f"the local coordinates of the chunk are in {unit}, its transform in metres."
+        said = note(path, "cameras.local_unit", sentence, unit=unit)
+        return LOCAL, None, () if unit in METRES else (said,)
+    if crs.geodetic_crs is None:
+        remedy = "Set it again in Metashape's reference settings"
+        raise checks.unsupported(path, f"the CRS {shortened(text)}, which has no datum,", remedy)
+    base = unbound(crs.geodetic_crs).to_json_dict()
+    axes = [
+        {"name": f"Geocentric {a}", "abbreviation": a, "direction": f"geocentric{a}"}
+        | {"unit": "metre"}
+        for a in "XYZ"
+    ]
+    geocentric = {  # on the datum of the CRS, as PROJJSON
+        **{key: base[key] for key in ("$schema", "name", "datum", "datum_ensemble") if key in base},
+        "type": "GeodeticCRS",
+        "coordinate_system": {"subtype": "Cartesian", "axis": axes},
+    }
+    frame = crs_text(type(crs).from_json_dict(geocentric))
+    return frame, frame if crs.is_geocentric else text, ()
+
+
+def read_calibration(path: Path) -> Lens:
+    """Read a calibration that Metashape saved on its own (root element ``calibration``), pixels."""
+    root = read_xml(path)
+    if root.tag != "calibration":
+        sentence = f"is not a calibration of Metashape ({root.tag}). Save one from its Tools menu."
+        raise bad_file(path, "cameras.no_calibration", sentence)
+    kind = (root.findtext("projection") or "frame").strip()
+    if kind not in PROJECTIONS:
+        remedy = f"Use a lens of type {', '.join(PROJECTIONS)}"
+        raise checks.unsupported(path, f"the projection '{kind}'", remedy, model=kind)
+    width, height = (number(path, side, root.findtext(side)) for side in ("width", "height"))
+    lens = _lens_of_calibration(path, path.stem, kind, root, (width, height))
+    return checks.lens(path, path.stem, lens)
+
+
+def _lens_of_calibration(
+    path: Path, sensor: str, kind: str, calibration: Element, size: tuple[float, float]
+) -> Lens:
+    """Return the lens of a calibration of a known kind, for an image of a size in pixels."""
+    given = {
+        entry.tag: number(path, f"sensor {sensor}, {entry.tag}", entry.text)
+        for entry in calibration
+        if entry.tag in PARAMETERS
+    }
+    if not given.keys() & {"f", "fx", "fy"}:
+        raise damaged(path, f"the calibration of sensor {sensor} has no focal length")
+    width, height = size
+    value = defaultdict(float, given)
+    focal, x, y = value["f"], width / 2.0 + value["cx"], height / 2.0 + value["cy"]
+    b1, b2, tangential = value["b1"], value["b2"], "p1 p2 p3 p4"
+    if "f" not in given:
+        focal = given.get("fy", value["fx"])
+        x, y = given.get("cx", width / 2.0), given.get("cy", height / 2.0)
+        b1, b2, tangential = given.get("fx", focal) - focal, value["skew"], "p2 p1 p3 p4"
+    return Lens(
+        *(focal, width, height, x, y, b1, b2),
+        projection=PROJECTIONS[kind],
+        radial=terms(given, "k1 k2 k3 k4"),
+        tangential=terms(given, tangential),
+        sensor=sensor,
+    )
+
+
+def name_of(sensor: Element) -> str:
+    """Return the label of a sensor, or its number."""
+    return sensor.get("label") or f"number {sensor.get('id')}"
+
+
+def kind_of(sensor: Element) -> str:
+    """Return the type of a sensor, which may be none of `PROJECTIONS`."""
+    found = _calibration(sensor)
+    return (found is not None and found.get("type")) or sensor.get("type") or "frame"
+
+
+def lens_of(path: Path, sensor: Element, image: str) -> tuple[Lens, tuple[PcfixWarning, ...]]:
+    """Return the adjusted calibration, else the initial one, else the data sheet; and notes."""
+    label, found = name_of(sensor), _calibration(sensor)
+    size = None if found is None else _resolution(path, label, found)
+    size = size or _resolution(path, label, sensor)
+    pixel_mm, focal_mm = (_property(path, sensor, n) for n in ("pixel_width", "focal_length"))
+    notes = []
+    if found is not None and size is not None:
+        lens = _lens_of_calibration(path, label, kind_of(sensor), found, size)
+        lens = replace(lens, pixel_size_mm=pixel_mm)
+        if coefficients := found.findtext("corrections/coeffs"):
+            where, count = f"sensor {label}, corrections", len(coefficients.split())
+            rms_px = float(np.linalg.norm(numbers(path, where, coefficients, count)) / 2.0**0.5)
+            sentence = f"the additional corrections of {label} are ignored ({rms_px:.2f} px rms)."
+            notes.append(note(path, "cameras.corrections", sentence, sensor=label, rms_px=rms_px))
+    elif found is None and size is not None and focal_mm is not None and pixel_mm is not None:
+        lens = Lens(  # what Metashape itself starts from
+            *(focal_mm / pixel_mm, *size, size[0] / 2.0, size[1] / 2.0),
+            projection=PROJECTIONS[kind_of(sensor)],
+            pixel_size_mm=pixel_mm,
+            sensor=label,
+        )
+        sentence = f"sensor {label} has no calibration; the lens of its data sheet is used."
+        notes.append(note(path, "cameras.data_sheet_lens", sentence, sensor=label))
+    else:
+        sentence = f"sensor {label} of {image} has no calibration or no size. Align the images."
+        raise bad_file(path, "cameras.no_calibration", sentence, sensor=label)
+    shutter = [p for p in sensor.iterfind("property") if p.get("name") == "rolling_shutter"]
+    if any((p.get("value") or "0").lower() not in ("0", "false", "disabled") for p in shutter):
+        sentence = f"the rolling shutter of sensor {label} is ignored; each image has one pose."
+        notes.append(note(path, "cameras.rolling_shutter", sentence, sensor=label))
+    return lens, tuple(notes)
+
+
+def _calibration(sensor: Element) -> Element | None:
+    """Return the last adjusted calibration, else the last one."""
+    found = sensor.findall("calibration")
+    chosen = [one for one in found if one.get("class") == "adjusted"] or found
+    return chosen[-1] if chosen else None
+
+
+def _resolution(path: Path, label: str, element: Element) -> tuple[float, float] | None:
+    found = element.find("resolution")
+    if found is None:
+        return None
+    where = f"sensor {label}, resolution"
+    return number(path, where, found.get("width")), number(path, where, found.get("height"))
+
+
+def _property(path: Path, sensor: Element, name: str) -> float | None:
+    """Return a positive property of a sensor, or None."""
+    text = next((p.get("value") for p in sensor.iterfind("property") if p.get("name") == name), "0")
+    value = number(path, f"sensor {name_of(sensor)}, {name}", text)
+    return value if value > 0.0 else None
+
+
+def given_lenses(path: Path) -> dict[str, Lens]:
+    """Return the calibrations that were given, by the name of the sensor; none of other software.
+
+    The calibration of class ``initial`` counts if it has distortion. Without, it is the focal
+    length that the images' EXIF states, which says little.
+    """
+    if not documents.recognises(Source(path)):
+        return {}
+    found: dict[str, Lens] = {}
+    for sensor in documents.open_chunk(path).element.iterfind("sensors/sensor"):
+        label, kind = name_of(sensor), kind_of(sensor)
+        given = [one for one in sensor.findall("calibration") if one.get("class") == "initial"]
+        size = _resolution(path, label, given[-1]) if given else None
+        if size is not None and kind in PROJECTIONS:
+            lens = _lens_of_calibration(path, label, kind, given[-1], size)
+            if lens.radial or lens.tangential:
+                found[label] = checks.lens(path, label, lens)
+    return found
+
+
 def gnss_positions(
     chunk: Chunk, block: Block
 ) -> tuple[GnssPositions | None, tuple[PcfixWarning, ...]]:
     """Return the reference positions of the images of a block, and notes on them.
 
     Positions that the user unticked are no measurement and left out, unless all are, as is usual
-    when control points alone hold the block.
+    when only control points determine the block.
     """
     path = chunk.path
     given = [image.element.find("reference") for image in block.images]
@@ -100,7 +444,15 @@ def gnss_positions(
     if not np.isfinite(xyz[:, :2]).all(axis=1).any():
         return None, ()
     sigma = np.where(np.isfinite(xyz) & (sigma > 0.0), sigma, np.nan)
-    crs, notes = _crs(path, chunk.element, xyz)
+    # the CRS of the cameras may differ from that of the chunk
+    own, notes = text_of(chunk.element, "camera_reference"), []
+    crs = own or text_of(chunk.element, "reference") or "LOCAL"
+    are_degrees = bool((np.nanmax(np.abs(xyz[:, :2]), axis=0) <= [180.0, 90.0]).all())
+    if crs.upper() == "LOCAL" or is_local(parsed := parse_crs(crs, str(path))):
+        crs = "local"
+    elif are_degrees and not own and not parsed.is_geographic:
+        sentence = "the camera positions are degrees in a CRS in metres; WGS 84 is assumed."
+        crs, notes = "EPSG:4979", [note(path, "cameras.gnss_in_degrees", sentence)]
     for sensor in dict.fromkeys(image.sensor for image in block.images):
         antenna = [] if sensor is None else text_of(sensor, "antenna/location").split()
         for shift in () if sensor is None else sensor.iterfind("antenna/reference"):
@@ -125,23 +477,10 @@ def spreads(
     return sigma
 
 
-def _crs(path: Path, chunk: Element, xyz: FloatArray) -> tuple[str, list[PcfixWarning]]:
-    """Return the CRS of the positions; that of the cameras may differ from that of the chunk."""
-    own = text_of(chunk, "camera_reference")
-    text = own or text_of(chunk, "reference") or "LOCAL"
-    if text.upper() == "LOCAL" or is_local(crs := parse_crs(text, str(path))):
-        return "local", []
-    are_degrees = (np.nanmax(np.abs(xyz[:, :2]), axis=0) <= [180.0, 90.0]).all()
-    if not own and not crs.is_geographic and are_degrees:
-        sentence = "the camera positions are degrees in a CRS in metres; WGS 84 is assumed."
-        return "EPSG:4979", [note(path, "cameras.gnss_in_degrees", sentence)]
-    return text, []
-
-
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """Read the tie points of a project, then the markers, with what was measured of them.
 
-    A marker has no position (NaN), as the file tells only where the survey put it. Projections
+    A marker has no position (NaN), as the file has only its surveyed coordinates. Projections
     that Metashape itself computed are left out.
     """
     chunk = documents.open_chunk(source.path)
@@ -149,7 +488,18 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     if len(block.images) != len(cameras):
         raise damaged(chunk.path, f"{len(block.images)} aligned images, {len(cameras)} cameras")
     frame = chunk.frame
-    seen = [] if frame is None else [*_tie_points(frame, block), _markers(frame, block)]
+    seen = []
+    if frame is not None:
+        row_of = {image.id: i for i, image in enumerate(block.images)}
+        marks = [mark for mark in documents.measured_marks(frame) if mark[1] in row_of]
+        names = {name: i for i, name in enumerate(dict.fromkeys(name for name, _, _ in marks))}
+        markers = Seen(
+            np.full((len(names), 3), np.nan),
+            np.array([names[name] for name, _, _ in marks], np.int64),
+            np.array([row_of[camera] for _, camera, _ in marks], np.int64),
+            np.array([uv for _, _, uv in marks], np.float64).reshape(-1, 2),
+        )
+        seen = [*_tie_points(frame, block), markers]
     if not any(len(part.point) for part in seen):
         raise no_tie_points(chunk.path, "only a project (.psx with its folder) or markers have any")
     return gathered(*seen)
@@ -186,7 +536,7 @@ def _tie_points(frame: Document, block: Block) -> Iterator[Seen]:
             ids = vertices["id"][order].astype(np.int64)
             point, camera, uv = [], [], []
             for row in rows:
-                marks = _vertices(archive, files[block.images[row].id], PROJECTIONS)
+                marks = _vertices(archive, files[block.images[row].id], MARKS)
                 track = marks["id"].astype(np.int64)
                 found_at = np.searchsorted(ids, track).clip(max=max(len(ids) - 1, 0))
                 known = ids[found_at] == track if len(ids) else np.zeros(len(marks), bool)
@@ -204,21 +554,8 @@ def _vertices(archive: ZipFile, name: str, needed: tuple[str, ...]) -> np.ndarra
     kinds = [(p.name, header.order + p.item) for p in header.properties if not p.length]
     if not header.order or header.skipped or not {*needed} <= dict(kinds).keys():
         raise damaged(where, f"it is not a binary PLY of vertices with {', '.join(needed)}")
-    with reading(where):
+    with checks.reading(where):
         vertices = np.frombuffer(data, np.dtype(kinds), header.records, header.end)
         if vertices["id"].dtype.kind not in "iu":
             raise damaged(where, "the id is not a whole number")
     return vertices
-
-
-def _markers(frame: Document, block: Block) -> Seen:
-    """Return the markers that were measured; they have no position."""
-    row_of = {image.id: i for i, image in enumerate(block.images)}
-    marks = [mark for mark in documents.measured_marks(frame) if mark[1] in row_of]
-    names = {name: i for i, name in enumerate(dict.fromkeys(name for name, _, _ in marks))}
-    return Seen(
-        np.full((len(names), 3), np.nan),
-        np.array([names[name] for name, _, _ in marks], np.int64),
-        np.array([row_of[camera] for _, camera, _ in marks], np.int64),
-        np.array([uv for _, _, uv in marks], np.float64).reshape(-1, 2),
-    )

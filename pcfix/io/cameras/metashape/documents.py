@@ -13,10 +13,17 @@ from xml.etree.ElementTree import Element
 
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import damaged, missing, note, number, read_xml, reading
-from pcfix.io.cameras.formats import Source
+from pcfix.io.cameras.checks import (
+    ZIP_MAGIC,
+    Source,
+    damaged,
+    missing,
+    note,
+    number,
+    read_xml,
+    reading,
+)
 
-ZIP_MAGIC = b"PK\x03\x04"
 ROOT = re.compile(r"\s*(?:<\?.*?\?>\s*|<!--.*?-->\s*)*<(\w+)", re.DOTALL)
 OF_CHUNKS = re.compile(r"<chunks?\b|\bpath=")
 INSIDE = {"document": OF_CHUNKS, "collection": OF_CHUNKS, "chunk": re.compile(r"<sensors\b")}
@@ -26,18 +33,18 @@ MOST_BYTES = 2**30
 
 @dataclass(frozen=True)
 class Document:
-    """An element, and the file or archive it stands in."""
+    """An element, and the file or archive that contains it."""
 
     root: Element
     path: Path
 
     def follow(self, element: Element) -> Document:
-        """Return what an element stands for: itself, or the document its path leads to."""
+        """Return the document that an element refers to by its path, or the element itself."""
         path = self.leads_to(element)
         return Document(element, self.path) if path is None else read_entry(path)
 
     def leads_to(self, element: Element) -> Path | None:
-        """Return the file that an element stands for; None if it stands for itself."""
+        """Return the file that an element refers to; None if it has no path."""
         relative = element.get("path")
         return None if relative is None else self.path.parent / relative.replace("\\", "/")
 
@@ -117,7 +124,7 @@ def measured_marks(frame: Document) -> Iterator[tuple[str, str, tuple[float, flo
 
 
 def _top(path: Path) -> Document:
-    """Return the outermost document; that of a .psx lies in the folder beside it."""
+    """Return the outermost document; that of a .psx is in the folder beside it."""
     if path.is_dir():
         return read_entry(path / "project.zip")
     with path.open("rb") as stream:

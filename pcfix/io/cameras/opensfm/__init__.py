@@ -3,7 +3,7 @@
 The file is a list of reconstructions, each with `cameras`, `shots` and `points`. A shot's
 `rotation` (axis times angle, radians) and `translation` take world to camera, x right, y down, z
 forward, so the projection centre is -R't. The world is topocentric, metres east, north and up at
-`reference_lla`, which stands in the reconstruction or in reference_lla.json; `gps_position` is in
+`reference_lla`, which is in the reconstruction or in reference_lla.json; `gps_position` is in
 the same frame, `gps_dop` its standard deviation in metres. Without a reference the frame is local.
 Where a shot rides on a rig and has no pose of its own, it is that of the rig camera (rig to
 camera) after that of the rig instance (world to rig). Coordinates too large to be topocentric come
@@ -36,7 +36,6 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Iterable
 from dataclasses import astuple, replace
 from pathlib import Path, PurePath
 from typing import Any, NamedTuple
@@ -44,19 +43,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pcfix.errors import bad_file
+from pcfix.io import crs as systems
 from pcfix.io.cameras import checks, tracks
-from pcfix.io.cameras.formats import Source
+from pcfix.io.cameras.checks import Source
 from pcfix.io.cameras.georeference import frame_of, georeference, is_tied
 from pcfix.io.cameras.tracks import NO_TIE_POINTS, are_seen
-from pcfix.io.crs import (
-    GEOGRAPHIC_WGS84,
-    Topocentric,
-    heights_of,
-    is_topocentric,
-    parse_crs,
-    shortened,
-    transformation,
-)
+from pcfix.io.labels import unnamed
+from pcfix.io.tables import read_lines
 from pcfix.lens.rotations import from_rotation_vectors
 from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, Projection, TiePoints
 from pcfix.options.declare import File
@@ -141,7 +134,7 @@ def read_reconstruction(path: Path) -> Reconstruction:
         crs = "local" if reference is None else "ENU:" + ",".join(map(repr, reference))
         has_gnss = reference is not None and np.isfinite(xyz).any()
         listed = path.with_name("image_list.txt")  # the images that the project was given
-        lines = checks.read_text(listed).splitlines() if listed.is_file() else []
+        lines = read_lines(listed) if listed.is_file() else []
         given = [PurePath(line.strip().replace("\\", "/")).name for line in lines if line.strip()]
         cameras = Cameras(
             labels=tuple(shots),
@@ -151,17 +144,10 @@ def read_reconstruction(path: Path) -> Reconstruction:
             crs=crs,
             notes=tuple(notes),
             gnss=GnssPositions(xyz, sigma, crs) if has_gnss else None,
-            unposed=left_out(shots, [*others, *panoramas, *given]),
+            unposed=unnamed([*others, *panoramas, *given], shots),
             source="OpenSfM",
         )
         return Reconstruction(path, cameras, reference, chosen.get("points", {}))
-
-
-def left_out(labels: Iterable[str], others: Iterable[str]) -> tuple[str, ...]:
-    """Return the names among `others` that no label has, with or without the file extension."""
-    known = {name for label in labels for name in (label, PurePath(label).stem)}
-    names = dict.fromkeys(others)
-    return tuple(n for n in names if n not in known and PurePath(n).stem not in known)
 
 
 def _poses(chosen: Any, shots: dict[str, Any]) -> tuple[FloatArray, FloatArray]:
@@ -218,57 +204,43 @@ def read_tie_points(reconstruction: Reconstruction) -> TiePoints:
         why = "it has no points" if not points else "tracks.csv is not beside it"
         raise tracks.no_tie_points(path, why)
     xyz = np.array([point["coordinates"] for point in points.values()], float).reshape(-1, 3)
-    with checks.reading(beside):
-        point, camera, xy = _observations(beside, list(points), cameras.labels)
+    camera_of, point_of = (
+        {name.encode(errors="replace"): i for i, name in enumerate(names)}
+        for names in (cameras.labels, points)
+    )
+    parts: list[tuple[IntArray, IntArray, FloatArray]] = []
+    with checks.reading(beside), beside.open("rb") as stream:
+        while block := stream.readlines(CHUNK_BYTES):  # there can be many millions of lines
+            lines = [line.split(b"\t", 5) for line in block if line.strip()]
+            lines = lines[1:] if not parts and block[0].startswith(HEADER) else lines
+            point = np.array([point_of.get(fields[1], -1) for fields in lines], dtype=np.int64)
+            camera = np.array([camera_of.get(fields[0], -1) for fields in lines], dtype=np.int64)
+            values = np.array([fields[3:5] for fields in lines], dtype=float).reshape(-1, 2)
+            known = (point >= 0) & (camera >= 0)
+            parts.append((point[known], camera[known], values[known]))
+    if not parts:
+        raise checks.damaged(beside, "it is empty")
+    point, camera, xy = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.lexsort((camera, point))
     size = np.array([(lens.width, lens.height) for lens in cameras.lenses or ()])[camera]
     uv = xy * size.max(axis=1, initial=0.0)[:, None] + size / 2.0
     return tracks.tie_points(tracks.Seen(xyz, point[order], camera[order], uv[order]))
 
 
-def _observations(
-    path: Path, points: list[str], labels: tuple[str, ...]
-) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return point row, camera row and normalised x, y of every line that has both.
-
-    Lines are read in blocks, as there can be many millions.
-    """
-    camera_of, point_of = (
-        {name.encode(errors="replace"): i for i, name in enumerate(names)}
-        for names in (labels, points)
-    )
-    parts: list[tuple[IntArray, IntArray, FloatArray]] = []
-    with path.open("rb") as stream:
-        while block := stream.readlines(CHUNK_BYTES):
-            lines = [line.split(b"\t", 5) for line in block if line.strip()]
-            lines = lines[1:] if not parts and block[0].startswith(HEADER) else lines
-            point = np.array([point_of.get(fields[1], -1) for fields in lines], dtype=np.int64)
-            camera = np.array([camera_of.get(fields[0], -1) for fields in lines], dtype=np.int64)
-            values = np.array([fields[3:5] for fields in lines], dtype=float).reshape(-1, 2)
-            keep = (point >= 0) & (camera >= 0)
-            parts.append((point[keep], camera[keep], values[keep]))
-    if not parts:
-        raise checks.damaged(path, "it is empty")
-    point, camera, xy = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return point, camera, xy
-
-
 PANORAMAS = frozenset({"equirectangular", "spherical"})
 
-_MODELS: dict[str, tuple[Projection, int]] = {
-    "perspective": ("perspective", 2),
-    "simple_radial": ("perspective", 1),
-    "radial": ("perspective", 2),
-    "brown": ("perspective", 3),
-    "fisheye": ("equidistant", 2),
-    "fisheye_opencv": ("equidistant", 4),
-    "fisheye62": ("equidistant", 6),
-    "fisheye624": ("equidistant", 6),
-    "dual": ("dual", 2),
+_MODELS: dict[str, tuple[str, Projection]] = {
+    "perspective": ("focal k1 k2", "perspective"),
+    "simple_radial": ("focal_x focal_y c_x c_y k1", "perspective"),
+    "radial": ("focal_x focal_y c_x c_y k1 k2", "perspective"),
+    "brown": ("focal_x focal_y c_x c_y k1 k2 k3 p1 p2", "perspective"),
+    "fisheye": ("focal k1 k2", "equidistant"),
+    "fisheye_opencv": ("focal_x focal_y c_x c_y k1 k2 k3 k4", "equidistant"),
+    "fisheye62": ("focal_x focal_y c_x c_y k1 k2 k3 k4 k5 k6 p1 p2", "equidistant"),
+    "fisheye624": ("focal_x focal_y c_x c_y k1 k2 k3 k4 k5 k6 p1 p2 s0 s1 s2 s3", "equidistant"),
+    "dual": ("focal k1 k2 transition", "dual"),
 }
-_TANGENTIAL = frozenset({"brown", "fisheye62", "fisheye624"})
-_WRITTEN = ("perspective", "brown", "fisheye", "fisheye_opencv", "fisheye62", "fisheye624", "dual")
-"""The simplest first."""
+"""The parameters of each model as files name them, and its projection; the simplest first."""
 _SIZE = re.compile(r" (\d{2,6}) (\d{2,6}) [a-z_]+\d* ")
 
 
@@ -297,17 +269,17 @@ def lens(path: Path, name: str, camera: dict[str, Any]) -> Lens:
     scale = max(width, height)
     fx = float(camera["focal_x" if "focal_x" in camera else "focal"])
     fy = value("focal_y", fx) if "focal_x" in camera else fx
-    keys = ("c_x", "c_y", "p1", "p2", "s0", "s1", "s2", "s3")
-    cx, cy, p1, p2, *prism = (value(key) for key in keys)
-    projection, radial = _MODELS[model]
+    names, projection = _MODELS[model]
+    there = names.split()
     return Lens(
-        *(fy * scale, width, height, width / 2.0 + cx * scale, height / 2.0 + cy * scale),
+        *(fy * scale, width, height),
+        *(width / 2.0 + value("c_x") * scale, height / 2.0 + value("c_y") * scale),
         b1=(fx - fy) * scale,
         projection=projection,
-        shape=(value("transition", 0.5),) if model == "dual" else (),
-        radial=tuple(value(f"k{i + 1}") for i in range(radial)),
-        tangential=(p2, p1) if model in _TANGENTIAL else (),
-        thin_prism=tuple(prism) if model == "fisheye624" else (),
+        shape=(value("transition", 0.5),) if "transition" in there else (),
+        radial=tuple(value(key) for key in there if key[0] == "k"),
+        tangential=(value("p2"), value("p1")) if "p1" in there else (),
+        thin_prism=tuple(value(key) for key in there if key[0] == "s"),
         sensor=name,
     )
 
@@ -385,50 +357,54 @@ def write_opensfm(path: File, cameras: Cameras, tie_points: TiePoints | None = N
 def opensfm_camera(path: Path, given: Lens) -> dict[str, Any]:
     """Return the simplest entry of `cameras` that is exactly this lens."""
     scale = max(given.width, given.height)
-    size = {"width": int(given.width), "height": int(given.height)}
-    one = {"focal": given.focal / scale}
-    two = {
+    lists = (
+        ("k1 k2 k3 k4 k5 k6", given.radial),
+        ("p2 p1", given.tangential),
+        ("s0 s1 s2 s3", given.thin_prism),
+    )
+    values = {key: v for keys, vs in lists for key, v in zip(keys.split(), vs, strict=False)}
+    values |= {
+        "focal": given.focal / scale,
         "focal_x": (given.focal + given.b1) / scale,
         "focal_y": given.focal / scale,
         "c_x": (given.principal_x - given.width / 2.0) / scale,
         "c_y": (given.principal_y - given.height / 2.0) / scale,
+        "transition": (*given.shape, 0.5)[0],
     }
-    p2, p1 = (*given.tangential, 0.0, 0.0)[:2]
-    prism = {f"s{i}": value for i, value in enumerate((*given.thin_prism, *(0.0,) * 4)[:4])}
-    radial = (*given.radial, *(0.0,) * 6)
-    for model in _WRITTEN if given.unit == "px" else ():
-        projection, count = _MODELS[model]
-        if projection == given.projection:
-            camera: dict[str, Any] = {"projection_type": model, **size}
-            camera |= one if model in ("perspective", "fisheye", "dual") else two
-            camera |= {f"k{i + 1}": radial[i] for i in range(count)}
-            camera |= {"p1": p1, "p2": p2} if model in _TANGENTIAL else {}
-            camera |= prism if model == "fisheye624" else {}
-            camera |= {"transition": (*given.shape, 0.5)[0]} if model == "dual" else {}
-            if checks.is_same_lens(lens(path, "1", camera), given):
-                return camera
+    size = {"width": int(given.width), "height": int(given.height)}
+    for model, (names, projection) in _MODELS.items() if given.unit == "px" else ():
+        if projection != given.projection or model in ("simple_radial", "radial"):
+            continue  # not every version of OpenSfM knows these two
+        camera: dict[str, Any] = {"projection_type": model, **size}
+        camera |= {name: values.get(name, 0.0) for name in names.split()}
+        if checks.is_same_lens(lens(path, "1", camera), given):
+            return camera
     raise checks.lens_not_held(path, given)
 
 
 def _world(
     cameras: Cameras, points: FloatArray, name: str
-) -> tuple[Cameras, FloatArray, Topocentric | None]:
+) -> tuple[Cameras, FloatArray, systems.Topocentric | None]:
     """Return cameras and points in the world of the file, and its origin where it has one.
 
     From a projected CRS they go to axes east, north, up at the middle of the block.
     """
     if cameras.crs is None or not is_tied(cameras.crs, name):
         return cameras, points, None
-    if is_topocentric(cameras.crs):
-        return cameras, points, Topocentric.from_text(cameras.crs, name)
-    if not parse_crs(cameras.crs, name).is_projected:
-        sentence = f"the cameras are in {shortened(cameras.crs)}. Bring them to a projected CRS."
+    if systems.is_topocentric(cameras.crs):
+        return cameras, points, systems.Topocentric.from_text(cameras.crs, name)
+    source = frame_of(cameras.crs, name).crs
+    if not systems.parse_crs(cameras.crs, name).is_projected:
+        sentence = f"the cameras are in {systems.shortened(cameras.crs)}."
+        sentence += " Bring them to a projected CRS."
         raise bad_file(name, "output.crs", sentence, crs=cameras.crs)
-    source, geographic = frame_of(cameras.crs, name).crs, parse_crs(GEOGRAPHIC_WGS84, name)
-    stated = heights_of(source) != "unstated"
-    to_degrees = transformation(source, geographic, cameras.centres, name, heights=stated).forward
+    geographic = systems.parse_crs(systems.GEOGRAPHIC_WGS84, name)
+    stated = systems.heights_of(source) != "unstated"
+    to_degrees, _ = systems.transformation(
+        source, geographic, cameras.centres, name, heights=stated
+    )
     longitude, latitude, _ = to_degrees(np.median(cameras.centres, axis=0)[None])[0].tolist()
-    place = Topocentric(latitude, longitude, 0.0)
+    place = systems.Topocentric(latitude, longitude, 0.0)
     centres, points = (place.from_degrees(to_degrees(xyz)) for xyz in (cameras.centres, points))
     text = "ENU:" + ",".join(map(repr, astuple(place)))
     there = replace(cameras, centres=centres, crs=text, project_crs=None, gnss=None)

@@ -1,7 +1,7 @@
 """Plain tables of poses: a header line, then one image a row.
 
 Fields are separated by comma, semicolon, tab or spaces; the header may be a comment (#), and units
-may stand in it (x[m], omega[gon]). What its columns may be called is in `columns.SPELLINGS`:
+may stand in it (x[m], omega[gon]). What its columns may be called is in `SPELLINGS`:
 
 - the image: label, name, image, filename, PhotoID, imageName, SourceFile, ...
 - its projection centre: x, y, z; easting, northing, height; or longitude, latitude, altitude in
@@ -18,7 +18,7 @@ may stand in it (x[m], omega[gon]). What its columns may be called is in `column
     exiftool's GimbalPitchDegree): Rz(-yaw) Rx(90 + pitch) Rz(-roll). Angles that fit this better
     than the former are refused until the user says which they are.
   - qw, qx, qy, qz: world to camera with axes x right, y down, z forward, as in COLMAP.
-  - r11 ... r33 alone: world to camera, to either of the two axes; the cameras look down.
+  - only r11 ... r33: world to camera, to either of the two axes; the cameras look down.
 
 Axes of the world are those of the CRS of the positions: its grid north, or for degrees the east,
 north and up of the place. Values called ``_est`` are adjusted ones; the others beside them are then
@@ -36,32 +36,71 @@ its f, px, py and the order of t1, t2 are those of AliceVision's reader of the s
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.errors import PcfixWarning, bad_file
+from pcfix.errors import InputError, PcfixWarning, bad_file
+from pcfix.io import tables
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import note
-from pcfix.io.cameras.formats import Angles, Source
-from pcfix.io.cameras.table.columns import (
-    EXIF,
-    Columns,
-    axes,
-    column_missing,
-    headers,
-    is_header,
-    read_columns,
+from pcfix.io.cameras.checks import Angles, Source, note
+from pcfix.io.cameras.table.sensor import (
+    DISTORTION,
+    FILM_MM,
+    FRAME,
+    column_names,
+    is_xml,
+    read_sensor,
 )
-from pcfix.io.cameras.table.sensor import read_lenses, read_sensor
 from pcfix.io.crs import shortened
-from pcfix.io.tables import Table, number, read_lines
+from pcfix.io.files import check_input
 from pcfix.lens import rotations
-from pcfix.model import Cameras, FloatArray, GnssPositions
+from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens
 
-__all__ = ["read", "read_sensor", "recognises"]
+SPELLINGS: dict[str, tuple[str, ...]] = {
+    "label": (
+        *("label", "name", "image", "imagename", "image_name", "filename", "file_name", "file"),
+        *("photoid", "photo_id", "photo", "photoname", "photo_name", "picture", "sourcefile"),
+    ),
+    "x": ("x", "easting", "east", "projectedx"),
+    "y": ("y", "northing", "north", "projectedy"),
+    "z": (
+        *("z", "altitude", "height", "alt", "elevation", "projectedz", "gpsaltitude"),
+        *("ellipsoidal_height", "ellipsoid_height", "ellipsoidalheight", "ellipsoidheight"),
+    ),
+    "longitude": ("longitude", "lon", "long", "lng", "gpslongitude"),
+    "latitude": ("latitude", "lat", "gpslatitude"),
+    "yaw": ("yaw", "heading", "gimbalyawdegree"),
+    "pitch": ("pitch", "gimbalpitchdegree"),
+    "roll": ("roll", "gimbalrolldegree"),
+    "longitude_ref": ("gpslongituderef",),
+    "latitude_ref": ("gpslatituderef",),
+    "sigma_x": ("sigma_x", "accuracy_x", "accuracy_x/y", "accuracy_x/y/z", "accuracy_horz", "hacc"),
+    "sigma_y": ("sigma_y", "accuracy_y", "accuracy_x/y", "accuracy_x/y/z", "accuracy_horz", "hacc"),
+    "sigma_z": ("sigma_z", "accuracy_z", "accuracy_x/y/z", "accuracy_vert", "vacc"),
+}
+"""What a column is, and its names; where several are there, the first counts."""
+POSE = ("x", "y", "z", "longitude", "latitude", "yaw", "pitch", "roll", "omega", "phi", "kappa")
+_OWN_NAMES = (
+    *("omega", "phi", "kappa", "qw", "qx", "qy", "qz", "enable", "tx", "ty", "tz"),
+    *(f"r{i}{j}" for i in "123" for j in "123"),
+    *("f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2"),
+    *(f"{role}_est" for role in POSE),
+)
+SPELLINGS |= {name: (name,) for name in _OWN_NAMES}
+POSITION = {"label", "x", "y", "z", "longitude", "latitude", "tx", "ty", "tz"}
+POSITION |= {"x_est", "y_est", "z_est"}
+EXIF = ("gpslongitude", "gpslatitude", "gpsaltitude")
+MANY = ("label", *(f"sigma_{axis}" for axis in "xyz"))  # the first spelling counts
+
+CRS_COMMENT = re.compile(r"^#\s*(?:coordinatesystem|crs)\s*[:=]\s*(.+)$", re.IGNORECASE)
+_FARTHEST_HEADER = 20
 
 
 def recognises(source: Source) -> bool:
@@ -90,8 +129,6 @@ def read(source: Source) -> Cameras:
         columns = columns.take(np.flatnonzero(~lost))
     xyz = centres(columns, suffix, needed=True)
     turns = _rotations(columns, source.angles, suffix)
-    if turns is None and source.sensor is not None:
-        raise checks.sensor_unused(source, "no angles")
     lenses = None if turns is None else read_lenses(columns, source.sensor)
     first: dict[tuple[str, bytes], int] = {}  # labels are no key, but an exact copy counts once
     for i, label in enumerate(columns.labels):
@@ -124,12 +161,12 @@ _GEO_CRS = re.compile(r"(EPSG:\d+|\+proj=.+|WGS84 UTM \d\d?\s*[NS])\s*", re.IGNO
 
 def open_table(path: Path) -> Columns:
     """Read a table with a header, or ODM's geo.txt, which has none."""
-    lines = read_lines(path)
+    lines = tables.read_lines(path)
     if not is_geo(lines):
         return read_columns(path)
     split = [(i, line.split()) for i, line in enumerate(lines[1:], start=2)]
     rows = [[*fields, *[""] * len(GEO)][: len(GEO)] for _, fields in split if fields]
-    table = Table(path, list(GEO), rows, [i for i, fields in split if fields])
+    table = tables.Table(path, list(GEO), rows, [i for i, fields in split if fields])
     place = {name: GEO.index(name) for name in ("label", "x", "y", "z")}
     place |= {"sigma_x": 7, "sigma_y": 7, "sigma_z": 8}  # its angles may be 0 for unknown
     crs = checks.utm_as_code(lines[0].strip())
@@ -146,6 +183,188 @@ def gnss_positions(columns: Columns) -> GnssPositions | None:
         xyz[off] = np.nan
     sigma = columns.where_there(("sigma_x", "sigma_y", "sigma_z"))
     return GnssPositions(xyz, sigma, crs(columns)[0])
+
+
+class Header(NamedTuple):
+    """A line that may be a header: its number from 0, names, their units, whether a comment."""
+
+    at: int
+    names: list[str]
+    units: list[str]
+    comment: bool
+
+
+def headers(lines: Sequence[str]) -> Iterator[Header]:
+    """Yield the lines that may be a header."""
+    for i, line in enumerate(lines[:_FARTHEST_HEADER]):
+        comment = line.lstrip("\"' ").startswith("#")
+        text = line.strip().lstrip("#").strip() if comment else line.strip()
+        if not text or CRS_COMMENT.match(line):
+            continue
+        found = [_split_unit(name) for name in tables.split_header(text)[0]]
+        yield Header(i, [name for name, _ in found], [unit for _, unit in found], comment)
+        if not comment:
+            return
+
+
+def axes(place: Iterable[str], suffix: str = "") -> tuple[str, str, str] | None:
+    """Return the three columns of a position: x, y, z or longitude, latitude, z."""
+    for first, second in (("x", "y"), ("longitude", "latitude")):
+        three = (first + suffix, second + suffix, "z" + suffix)
+        if {*three} <= {*place}:
+            return three
+    return None
+
+
+def is_header(names: Sequence[str]) -> bool:
+    """Whether at least two of the names that every table of cameras has are among these."""
+    return len(POSITION & tables.places(names, SPELLINGS).keys()) >= 2
+
+
+def _split_unit(name: str) -> tuple[str, str]:
+    """Return the name of a column and its unit: omega[deg], accuracy_x_(m).
+
+    Of X/Longitude it is the name that says more.
+    """
+    plain = name.lstrip("# \"'").lower()
+    name, unit = (plain, "") if plain in _PLAIN else tables.split_unit(plain, "m|deg|gon|rad")
+    axis, slash, kind = name.partition("/")
+    more = slash and axis in ("x", "y", "z") and kind in _PLAIN
+    return kind if more else name, unit
+
+
+_PLAIN = {spelling for spellings in SPELLINGS.values() for spelling in spellings}
+
+
+DEGREES = {
+    **dict.fromkeys(("", "deg", "degree", "degrees", "°"), 1.0),
+    **dict.fromkeys(("gon", "gons", "grad", "grads"), 0.9),
+    **dict.fromkeys(("rad", "radian", "radians"), 180.0 / np.pi),
+}
+METRES = dict.fromkeys(("", "m", "metre", "metres", "meter", "meters"), 1.0)
+LENGTHS = ("x", "y", "z", "sigma_x", "sigma_y", "sigma_z")
+
+
+@dataclass(frozen=True)
+class Columns:
+    """A table whose columns are known; its header has their names, lower case, without units.
+
+    `place` leads from what a column is, a key of `SPELLINGS`, to its number; `unit` is that of each
+    column as the header has it; the header is a comment where `after_hash`; `crs` is what a comment
+    says.
+    """
+
+    table: tables.Table
+    place: dict[str, int]
+    unit: list[str]
+    after_hash: bool
+    crs: str | None
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return self.table.path
+
+    @cached_property
+    def labels(self) -> list[str]:
+        """The names of the images, none empty."""
+        labels = self.table.column(self.name("label"))
+        if "" in labels:
+            line = self.table.line[labels.index("")]
+            sentence = f"line {line}: the image has no name. Give it one."
+            raise bad_file(self.path, "table.no_label", sentence, line=line)
+        if self.name("label") == "sourcefile":
+            return [re.split(r"[\\/]", label)[-1] for label in labels]
+        return labels
+
+    def take(self, rows: IntArray) -> Columns:
+        """Return the columns with some of their rows."""
+        lines = [self.table.line[i] for i in rows]
+        table = self.table._replace(rows=[self.table.rows[i] for i in rows], line=lines)
+        return replace(self, table=table)
+
+    def has(self, *roles: str) -> bool:
+        """Whether all these are there."""
+        return all(role in self.place for role in roles)
+
+    def name(self, role: str) -> str:
+        """Return what the file calls it."""
+        return self.table.header[self.place[role]]
+
+    def of(self, roles: Iterable[str]) -> FloatArray:
+        """Return columns of finite numbers, metres and degrees, shape (k, number of roles)."""
+        return np.column_stack([self._numbers(role, needed=True) for role in roles])
+
+    def where_there(self, roles: Iterable[str]) -> FloatArray:
+        """Return the same with NaN for empty fields and for columns that are not there."""
+        return np.column_stack([self._numbers(role, needed=False) for role in roles])
+
+    def error(self, row: int, code: str, sentence: str, **values: Any) -> InputError:
+        """Return an error that names file, line and image."""
+        where = f"line {self.table.line[row]} (image {self.labels[row]})"
+        return bad_file(self.path, code, f"{where}: {sentence}", **values)
+
+    def _numbers(self, role: str, *, needed: bool) -> FloatArray:
+        if role not in self.place:
+            return np.full(len(self.table.rows), np.nan)
+        texts = [row[self.place[role]] for row in self.table.rows]
+        read = exif_number if self.name(role) in EXIF else tables.number
+        values = np.array([read(text) for text in texts])
+        for i in np.flatnonzero(~np.isfinite(values)):
+            if needed or texts[i]:
+                name, line = self.name(role), self.table.line[i]
+                sentence = f"column {name}: '{texts[i]}' is not a finite number. Correct it."
+                raise self.error(int(i), "table.number", sentence, line=line, value=texts[i])
+        base, unit = role.removesuffix("_est"), self.unit[self.place[role]]
+        if base not in (*LENGTHS, *POSE):
+            return values
+        known, wanted = (METRES, "metres") if base in LENGTHS else (DEGREES, "degrees")
+        if unit not in known:
+            sentence = f"column {self.name(role)} is in '{unit}'. Give {wanted}."
+            raise bad_file(self.path, "table.unit", sentence, value=unit)
+        return values * known[unit]
+
+
+def read_columns(path: Path) -> Columns:
+    """Read a table with a header line, which may be a comment."""
+    lines = tables.read_lines(path)
+    found = [header for header in headers(lines) if is_header(header.names)]
+    if not found:
+        sentence = "no line names the columns, for example label,x,y,z,omega,phi,kappa."
+        raise bad_file(path, "table.no_header", sentence)
+    at, names, unit, comment = found[-1]
+    place = tables.places(names, SPELLINGS)
+    for role, spellings in SPELLINGS.items():  # a column with the role's own name counts
+        alike = [name for name in names if name in spellings]
+        if len(alike) > 1 and role not in MANY and (role not in alike or alike.count(role) > 1):
+            sentence = f"the columns {', '.join(alike)} may all be {role}. Take out all but one."
+            raise bad_file(path, "table.columns_alike", sentence, columns=alike)
+    if {"tx", "ty", "tz"} <= place.keys() and axes(place) is None:
+        sentence = "tx, ty, tz may be translations. Give the projection centres as x, y, z."
+        raise bad_file(path, "table.translations", sentence)
+    if "label" not in place or not (axes(place) or axes(place, "_est")):
+        position = ("longitude", "latitude", "z") if "longitude" in place else ("x", "y", "z")
+        lacking = [role for role in ("label", *position) if role not in place]
+        tables.check_columns(path, names, ("label", *position), lacking)
+    comments = comment or any(line.startswith("#") for line in lines[:at])
+    below = next((line for line in lines[at + 1 :] if line.strip() and line[0] != "#"), "")
+    delimiter = tables.split_header((below if comment else lines[at]).strip())[1]
+    table = tables.table_below(path, lines, names, delimiter, at=at, comments=comments)
+    crs = next(
+        (match[1].strip() for line in lines[:at] if (match := CRS_COMMENT.match(line))), None
+    )
+    return Columns(table, place, unit, comment, crs)
+
+
+def exif_number(text: str) -> float:
+    """Return the number in what exiftool writes: 24 deg 40' 48.5" S, 86.5 m Below Sea Level."""
+    parts = [tables.number(part) for part in re.findall(r"[\d.]+", text)]
+    if "deg" not in text and "Sea Level" not in text:
+        return tables.number(text)
+    if not 1 <= len(parts) <= 3:
+        return np.nan
+    value = math.fsum(part / 60.0**i for i, part in enumerate(parts))
+    return -value if text.endswith(("S", "W")) or "Below" in text else value
 
 
 def centres(columns: Columns, suffix: str = "", *, needed: bool = False) -> FloatArray:
@@ -173,7 +392,7 @@ def centres(columns: Columns, suffix: str = "", *, needed: bool = False) -> Floa
 
 
 def crs(columns: Columns) -> tuple[str | None, tuple[PcfixWarning, ...]]:
-    """Return the CRS that a table says or shows, and what to tell about it.
+    """Return the CRS that a table states or implies, and notes on it.
 
     Longitude and latitude without more are those of WGS 84. Heights then are ellipsoidal only
     if the header calls them so; else the CRS has no heights. A ``.prj`` of the table's name beside
@@ -181,7 +400,7 @@ def crs(columns: Columns) -> tuple[str | None, tuple[PcfixWarning, ...]]:
     """
     said, beside = columns.crs, columns.path.with_suffix(".prj")
     if not said and beside != columns.path and beside.is_file():
-        said = checks.read_text(beside).strip() or None
+        said = " ".join(tables.read_lines(beside)).strip() or None
     if said is None:
         if axes(columns.place) != ("longitude", "latitude", "z"):
             return None, ()
@@ -200,7 +419,7 @@ def is_geo(lines: list[str]) -> bool:
     if not lines or not _GEO_CRS.fullmatch(lines[0]):
         return False
     first = next((line.split() for line in lines[1:] if line.strip()), [])
-    return len(first) >= 3 and np.isnan(number(first[0]))
+    return len(first) >= 3 and np.isnan(tables.number(first[0]))
 
 
 OMEGA_PHI_KAPPA = ("omega", "phi", "kappa")
@@ -223,11 +442,11 @@ def _rotations(columns: Columns, angles: Angles | None, suffix: str = "") -> Flo
         there = [role for role in kind if columns.has(role)]
         missing = [role for role in kind if not columns.has(role)]
         if there and missing:
-            raise column_missing(columns.path, missing, columns.table.header)
+            tables.check_columns(columns.path, columns.table.header, kind, missing)
     if angles is not None:
         roles = opk if angles == "omega-phi-kappa" else ypr
-        if not columns.has(*roles):
-            raise column_missing(columns.path, roles, columns.table.header)
+        missing = [role for role in roles if not columns.has(role)]
+        tables.check_columns(columns.path, columns.table.header, roles, missing)
         return FROM_ANGLES[angles](*columns.of(roles).T)
     if columns.has(*opk):
         place = columns.place
@@ -250,6 +469,36 @@ def _rotations(columns: Columns, angles: Angles | None, suffix: str = "") -> Flo
     if columns.has(*MATRIX):
         return _from_matrix(columns)
     return _from_yaw_pitch_roll(columns, ypr) if columns.has(*ypr) else None
+
+
+def read_lenses(columns: Columns, sensor: Path | None) -> tuple[Lens, ...]:
+    """Return the lens of each row: that of the sensor, or RealityCapture's own columns."""
+    own = columns.has("f", "px", "py")
+    path = sensor or columns.path.with_name("sensor.csv")
+    if sensor is None and not path.is_file():
+        needed = "width_px,height_px" if own else "focal,sensor_x,sensor_y (mm)"
+        sentence = f"has angles but no sensor. Give --sensor a table with the columns {needed}."
+        raise bad_file(columns.path, "cameras.sensor_missing", sentence, columns=needed)
+    if not own:
+        return (read_sensor(path),) * len(columns.labels)
+    if not is_xml(check_input(path)) and column_names(path) >= set(FRAME):
+        width, height = (tables.read_table(path, FRAME).numbers(name)[0] for name in FRAME)
+    else:
+        lens = read_sensor(path)
+        width, height = lens.width, lens.height
+    largest = max(width, height)
+    brown = np.nan_to_num(columns.where_there(DISTORTION))
+    rows = [tuple(row) for row in np.hstack([columns.of(("f", "px", "py")), brown]).tolist()]
+    lenses = {
+        (focal, x, y, *k): Lens(
+            *(focal * largest / FILM_MM, width, height),
+            *(width / 2.0 + x * largest, height / 2.0 + y * largest),
+            radial=tuple(k[:4]),
+            tangential=tuple(k[4:]),
+        )
+        for focal, x, y, *k in dict.fromkeys(rows)
+    }
+    return tuple(lenses[row] for row in rows)
 
 
 FROM_ANGLES = {

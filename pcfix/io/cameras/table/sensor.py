@@ -5,7 +5,7 @@ The lens is that of a table beside it, a calibration, or the table's own columns
 to the camera (x right, y down, z forward), after a comment with the CRS where there is one; and
 ``sensor.csv``, with the lens in pixels with OpenCV's names or, of an undistorted lens in mm, as
 focal, sensor_x, sensor_y. Where the images have several lenses of one frame, each row of
-``cameras.csv`` has its own (f, px, py, k1 ... k4, t1, t2) and ``sensor.csv`` says the frame alone.
+``cameras.csv`` has its own (f, px, py, k1 ... k4, t1, t2) and ``sensor.csv`` has only the frame.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ import numpy as np
 from pcfix.errors import bad_file
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import is_same_lens, write_new
-from pcfix.io.cameras.table.columns import Columns
 from pcfix.io.crs import is_topocentric
 from pcfix.io.files import check_input
 from pcfix.io.tables import read_lines, read_table, split_header
@@ -46,11 +45,11 @@ def read_sensor(path: Path) -> Lens:
         width_px, height_px and, where known, OpenCV's cx, cy (pixels from the upper left corner
         of the image), k1 ... k6, p1, p2.
     """
-    if _is_xml(check_input(path)):
+    if is_xml(check_input(path)):
         from pcfix.io.cameras.metashape import read_calibration
 
         return read_calibration(path)
-    columns = PIXELS if _names(path) >= set(PIXELS) else MILLIMETRES
+    columns = PIXELS if column_names(path) >= set(PIXELS) else MILLIMETRES
     table = read_table(path, columns)
     if len(table.rows) != 1:
         sentence = f"has {len(table.rows)} rows. Give one row for all images."
@@ -82,42 +81,14 @@ def _centred_mm(focal: float, width: float, height: float) -> Lens:
     return Lens(focal, width, height, width / 2.0, height / 2.0, unit="mm")
 
 
-def read_lenses(columns: Columns, sensor: Path | None) -> tuple[Lens, ...]:
-    """Return the lens of each row: that of the sensor, or RealityCapture's own columns."""
-    own = columns.has("f", "px", "py")
-    path = sensor or columns.path.with_name("sensor.csv")
-    if sensor is None and not path.is_file():
-        needed = "width_px,height_px" if own else "focal,sensor_x,sensor_y (mm)"
-        sentence = f"has angles but no sensor. Give --sensor a table with the columns {needed}."
-        raise bad_file(columns.path, "cameras.sensor_missing", sentence, columns=needed)
-    if not own:
-        return (read_sensor(path),) * len(columns.labels)
-    if not _is_xml(check_input(path)) and _names(path) >= set(FRAME):
-        width, height = (read_table(path, FRAME).numbers(name)[0] for name in FRAME)
-    else:
-        lens = read_sensor(path)
-        width, height = lens.width, lens.height
-    largest = max(width, height)
-    brown = np.nan_to_num(columns.where_there(DISTORTION))
-    rows = [tuple(row) for row in np.hstack([columns.of(("f", "px", "py")), brown]).tolist()]
-    lenses = {
-        (focal, x, y, *k): Lens(
-            *(focal * largest / FILM_MM, width, height),
-            *(width / 2.0 + x * largest, height / 2.0 + y * largest),
-            radial=tuple(k[:4]),
-            tangential=tuple(k[4:]),
-        )
-        for focal, x, y, *k in dict.fromkeys(rows)
-    }
-    return tuple(lenses[row] for row in rows)
-
-
-def _is_xml(path: Path) -> bool:
+def is_xml(path: Path) -> bool:
+    """Whether a file is a calibration of Metashape, not a table."""
     with path.open("rb") as stream:
         return stream.read(64).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
 
 
-def _names(path: Path) -> set[str]:
+def column_names(path: Path) -> set[str]:
+    """Return the names in the first line of a table."""
     lines = read_lines(path)
     return set(split_header(lines[0].strip())[0]) if lines else set()
 
@@ -187,7 +158,7 @@ def _sensor(target: Path, lens: Lens) -> str:
 
 
 def _brown(target: Path, lens: Lens, counts: Sequence[int]) -> list[tuple[float, ...]]:
-    """Return radial, denominator and tangential coefficients, so many, if they are the lens."""
+    """Return `counts` radial, denominator and tangential coefficients, if they are the lens."""
     given = (lens.radial, lens.denominator, lens.tangential)
     lists = [(*k, *(0.0,) * n)[:n] for k, n in zip(given, counts, strict=True)]
     frame = (lens.focal, lens.width, lens.height, lens.principal_x, lens.principal_y)

@@ -7,9 +7,16 @@ pose of every image in rigs also. Definition: https://colmap.github.io/format.ht
 A pose is a unit quaternion, scalar first, and a translation, both world to camera, in OpenCV
 axes: ``x_cam = R x + t``, so the projection centre is ``-R' t``. Pixels start at the upper left
 corner of the upper left pixel. The world is that of the alignment, if there was one, often minus an
-offset; the files name no CRS, so it is None, unless ``georeference.json`` of pcfix lies beside
+offset; the files name no CRS, so it is None, unless ``georeference.json`` of pcfix is beside
 them (``crs``, text or null, ``offset_m``, three numbers, ``written_by``): its offset is then added
-to centres and tie points, and its CRS is theirs. `files` has the lenses.
+to centres and tie points, and its CRS is theirs.
+
+Binary files are little-endian, with counts before lists and names that end with a zero byte; text
+files have a line per camera and point, two per image, and ``#`` before comments. The parameters of
+a camera are those of COLMAP's own list, in its order (https://colmap.github.io/cameras.html and,
+for models that are not there yet, ``src/colmap/sensor/models`` of COLMAP 4). p1 and p2 are in
+OpenCV's order, except in the model of Project Aria's cameras (RAD_TAN_THIN_PRISM_FISHEYE), where
+they are in Brown's, and where the tangential and prism terms are of the radially distorted place.
 
 Images keep the order of the file. An image point belongs to the point in space whose identifier it
 has, -1 for none; ``points3D`` lists the same as tracks.
@@ -29,25 +36,24 @@ Positions are written minus an offset, which ``georeference.json`` keeps.
 from __future__ import annotations
 
 import json
+import mmap
+import os
 import re
 import sqlite3
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.errors import PcfixWarning
+from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.cameras import checks, tracks
-from pcfix.io.cameras.checks import block_to_write, is_same_lens, lens_not_held, write_new
-from pcfix.io.cameras.colmap import files
-from pcfix.io.cameras.colmap.files import BY_NAME, MODELS, OBSERVATION, SHAPES, Camera, lens
-from pcfix.io.cameras.formats import Source
+from pcfix.io.cameras.checks import Source, damaged, terms
 from pcfix.io.cameras.tracks import NO_TIE_POINTS, are_seen
 from pcfix.io.crs import is_topocentric
-from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, TiePoints
+from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, Projection, TiePoints
 from pcfix.options.declare import File
 
 _PART = re.compile(r"(cameras|images|points3D|rigs|frames)\.(bin|txt)")
@@ -58,7 +64,7 @@ _WGS84 = 0
 
 
 class Model(NamedTuple):
-    """Where a model lies; `others` counts further ones beside it."""
+    """The folder of a model; `others` counts further models beside it."""
 
     folder: Path
     suffix: str
@@ -76,10 +82,10 @@ def recognises(source: Source) -> bool:
 
 def read(source: Source) -> Cameras:
     """Read the poses of registered images and their lenses."""
-    model = _model(source)
+    model = _model_at(source.path)
     listed, path = model.part("cameras"), model.part("images")
-    cameras = files.read_cameras(listed)
-    images = files.read_images(path, points=False)
+    cameras = read_list(listed)
+    images = read_images(path, points=False)
     posed = [image for image in images if image.posed]
     if not posed:
         raise checks.no_pose(path)
@@ -87,7 +93,7 @@ def read(source: Source) -> Cameras:
     labels = tuple(image.name for image in posed)
     rotations = checks.quaternions(path, labels, poses[:, :4])
     used = dict.fromkeys(image.camera for image in posed)
-    lenses = {number: files.lens(listed, number, cameras[number]) for number in used}
+    lenses = {number: lens_of(listed, number, cameras[number]) for number in used}
     gnss, notes = read_priors(model.folder, labels)
     offset, crs = read_place(model.folder)
     if offset.any() and gnss is not None and gnss.crs is None:
@@ -109,12 +115,12 @@ def read(source: Source) -> Cameras:
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """Read the points in space and where the images saw them."""
-    model = _model(source)
+    model = _model_at(source.path)
     path = model.part("points3D")
     if not path.is_file():
         raise tracks.no_tie_points(path, "there is no such file")
-    identifiers, xyz = files.read_points(path)
-    images = [i for i in files.read_images(model.part("images"), points=True) if i.posed]
+    identifiers, xyz = read_points(path)
+    images = [i for i in read_images(model.part("images"), points=True) if i.posed]
     seen = np.concatenate([image.seen for image in images])
     if not len(identifiers) or not len(seen):
         raise tracks.no_tie_points(path, "the model has no points that its images saw")
@@ -128,10 +134,10 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     return tracks.tie_points(tracks.Seen(xyz, row[known], camera[known], seen["xy"][known]))
 
 
-def _model(source: Source) -> Model:
-    found = _find(source.path)
+def _model_at(path: Path) -> Model:
+    found = _find(path)
     if found is None:
-        raise checks.missing(source.path / "cameras.bin")
+        raise checks.missing(path / "cameras.bin")
     return found
 
 
@@ -189,8 +195,22 @@ def read_priors(
     path = next((p / _DATABASE for p in places if (p / _DATABASE).is_file()), None)
     if path is None:
         return None, ()
+    # nothing is written or locked: a database without a log of changes cannot change meanwhile
+    unchanging = not path.with_name(path.name + "-wal").exists()
+    uri = path.resolve().as_uri() + ("?immutable=1" if unchanging else "?mode=ro")
     try:
-        rows = _rows(path)
+        with closing(sqlite3.connect(uri, uri=True, timeout=1.0)) as database:
+            columns = {row[1] for row in database.execute("PRAGMA table_info(pose_priors)")}
+            if not columns:
+                return None, ()
+            image = "corr_data_id" if "corr_data_id" in columns else "image_id"
+            camera = "corr_sensor_type = 0" if "corr_sensor_type" in columns else "1"
+            rows = database.execute(
+                "SELECT images.name, position, position_covariance, coordinate_system"
+                f" FROM pose_priors JOIN images ON images.image_id = pose_priors.{image}"
+                f" WHERE {camera} AND typeof(position) = 'blob' AND length(position) = 24"
+                " AND typeof(images.name) = 'text'"
+            ).fetchall()
     except sqlite3.Error as error:
         sentence = f"its pose priors cannot be read ({error}). They are skipped."
         return None, (checks.note(path, "cameras.priors_left_out", sentence),)
@@ -214,22 +234,209 @@ def read_priors(
     return GnssPositions(xyz, sigma, None), ()
 
 
-def _rows(path: Path) -> list[tuple[Any, ...]]:
-    """Return name, position, covariance and coordinate system; nothing is written or locked."""
-    whole = not path.with_name(path.name + "-wal").exists()
-    uri = path.resolve().as_uri() + ("?immutable=1" if whole else "?mode=ro")
-    with closing(sqlite3.connect(uri, uri=True, timeout=1.0)) as database:
-        columns = {row[1] for row in database.execute("PRAGMA table_info(pose_priors)")}
-        if not columns:
-            return []
-        image = "corr_data_id" if "corr_data_id" in columns else "image_id"
-        camera = "corr_sensor_type = 0" if "corr_sensor_type" in columns else "1"
-        return database.execute(
-            "SELECT images.name, position, position_covariance, coordinate_system"
-            f" FROM pose_priors JOIN images ON images.image_id = pose_priors.{image}"
-            f" WHERE {camera} AND typeof(position) = 'blob' AND length(position) = 24"
-            " AND typeof(images.name) = 'text'"
-        ).fetchall()
+_SMALLEST_OMEGA = 1e-6
+"""Below, in radians, the FOV model is a perspective one to double precision."""
+SHAPES = {"fov": ("omega",), "division": ("k",), "eucm": ("alpha", "beta")}
+"""COLMAP's names of the parameters of a projection."""
+
+
+_TWELVE = "fx fy cx cy k1 k2 k3 k4 k5 k6 p2 p1 s1 s2 s3 s4"
+_TABLE: tuple[tuple[str, str, Projection | None], ...] = (
+    ("SIMPLE_PINHOLE", "f cx cy", "perspective"),
+    ("PINHOLE", "fx fy cx cy", "perspective"),
+    ("SIMPLE_RADIAL", "f cx cy k1", "perspective"),
+    ("RADIAL", "f cx cy k1 k2", "perspective"),
+    ("OPENCV", "fx fy cx cy k1 k2 p1 p2", "perspective"),
+    ("OPENCV_FISHEYE", "fx fy cx cy k1 k2 k3 k4", "equidistant"),
+    ("FULL_OPENCV", "fx fy cx cy k1 k2 p1 p2 k3 d1 d2 d3", "perspective"),
+    ("FOV", "fx fy cx cy omega", "fov"),
+    ("SIMPLE_RADIAL_FISHEYE", "f cx cy k1", "equidistant"),
+    ("RADIAL_FISHEYE", "f cx cy k1 k2", "equidistant"),
+    ("THIN_PRISM_FISHEYE", "fx fy cx cy k1 k2 p1 p2 k3 k4 s1 s3", "equidistant"),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", _TWELVE, "equidistant"),
+    ("SIMPLE_DIVISION", "f cx cy k", "division"),
+    ("DIVISION", "fx fy cx cy k", "division"),
+    ("SIMPLE_FISHEYE", "f cx cy", "equidistant"),
+    ("FISHEYE", "fx fy cx cy", "equidistant"),
+    ("EUCM", "fx fy cx cy alpha beta", "eucm"),
+    ("EQUIRECTANGULAR", "w h", None),
+)
+"""In the order of their numbers in binary files, from 0."""
+MODELS = tuple(name for name, _, _ in _TABLE)
+BY_NAME = {name: (tuple(names.split()), projection) for name, names, projection in _TABLE}
+"""The names of the parameters of each model, in the order of the file, and its projection."""
+
+
+class Camera(NamedTuple):
+    """A row of the camera list."""
+
+    model: str
+    width: float
+    height: float
+    values: tuple[float, ...]
+
+
+def lens_of(path: Path, identifier: int, camera: Camera) -> Lens:
+    """Return the lens of a camera."""
+    names, projection = BY_NAME[camera.model]
+    if projection is None:
+        raise _no_model(path, identifier, camera.model)
+    given = dict(zip(names, camera.values, strict=True))
+    focal_x, focal = given.get("fx", given.get("f", 0.0)), given.get("fy", given.get("f", 0.0))
+    shape = SHAPES.get(projection, ())
+    if projection == "fov" and abs(given["omega"]) < _SMALLEST_OMEGA:
+        projection, shape = "perspective", ()
+    return Lens(
+        *(focal, camera.width, camera.height, given["cx"], given["cy"]),
+        b1=focal_x - focal,
+        projection=projection,
+        shape=tuple(given[name] for name in shape),
+        radial=terms(given, "k1 k2 k3 k4 k5 k6"),
+        denominator=terms(given, "d1 d2 d3"),
+        tangential=terms(given, "p2 p1"),
+        thin_prism=terms(given, "s1 s2 s3 s4"),
+        in_turn=camera.model == "RAD_TAN_THIN_PRISM_FISHEYE",
+        sensor=f"{identifier} {camera.model}",
+    )
+
+
+def _no_model(path: Path, camera: object, model: object) -> InputError:
+    what, remedy = f"the model {model} of camera {camera}", "Give the undistorted model"
+    return checks.unsupported(path, what, remedy, model=model)
+
+
+class Image(NamedTuple):
+    """A row of the image list.
+
+    `pose` is qw, qx, qy, qz, tx, ty, tz. `seen` has the image points that have a point in space,
+    and the identifiers of those; it is empty where they were not asked for.
+    """
+
+    identifier: int
+    pose: tuple[float, ...]
+    camera: int
+    name: str
+    seen: np.ndarray
+
+    @property
+    def posed(self) -> bool:
+        """Whether it has a pose at all; COLMAP itself writes no others."""
+        return bool(np.isfinite(self.pose).all())
+
+
+OBSERVATION = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
+_COUNT, _CAMERA, _IMAGE = struct.Struct("<Q"), struct.Struct("<IiQQ"), struct.Struct("<I7dI")
+_POINT_BYTES, _POINT_TO_COUNT, _POINT_TO_COLOUR, _VIEW_BYTES = 51, 43, 32, 8
+_STATED = re.compile(r"^#.*Number of (?:cameras|images|points): (\d{1,15})\b", re.MULTILINE)
+_HEAD_CHARACTERS = 4096
+
+
+def _take(file: mmap.mmap, form: struct.Struct) -> tuple[Any, ...]:
+    """Return the next numbers of a binary file."""
+    return form.unpack(file.read(form.size))
+
+
+def _open(path: Path) -> mmap.mmap:
+    """Map a binary file, until nothing refers to it any more."""
+    with path.open("rb") as stream:
+        return mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+
+
+def _lines(path: Path) -> Iterator[str]:
+    """Yield the lines of a text file, blank ones too, but no comments."""
+    with path.open(encoding="utf-8-sig", errors="replace") as stream:
+        for line in stream:
+            if not line.lstrip().startswith("#"):
+                yield line.strip()
+
+
+def _check_count(path: Path, rows: int) -> None:
+    """Refuse a text that has fewer rows than its comments announce."""
+    with path.open(encoding="utf-8-sig", errors="replace") as stream:
+        stated = _STATED.search(stream.read(_HEAD_CHARACTERS))
+    if stated and rows < int(stated[1]):
+        raise damaged(path, f"{rows:,} rows instead of {int(stated[1]):,}")
+
+
+def read_list(path: Path) -> dict[int, Camera]:
+    """Read ``cameras``, binary or text: identifier, model, width, height, parameters."""
+    cameras: dict[int, Camera] = {}
+    with checks.reading(path):
+        if path.suffix == ".bin":
+            file = _open(path)
+            for _ in range(*_take(file, _COUNT)):
+                identifier, number, width, height = _take(file, _CAMERA)
+                if not 0 <= number < len(MODELS):
+                    raise _no_model(path, identifier, number)
+                values = _take(file, struct.Struct(f"<{len(BY_NAME[MODELS[number]][0])}d"))
+                cameras[identifier] = Camera(MODELS[number], float(width), float(height), values)
+            return cameras
+        for name, model, *words in filter(None, map(str.split, _lines(path))):
+            if model not in BY_NAME:
+                raise _no_model(path, name, model)
+            width, height, *numbers = map(float, words)
+            if len(numbers) != len(BY_NAME[model][0]):
+                raise damaged(path, f"camera {name}: {len(numbers)} parameters of {model}")
+            cameras[int(name)] = Camera(model, width, height, tuple(numbers))
+        _check_count(path, len(cameras))
+    return cameras
+
+
+def read_images(path: Path, *, points: bool) -> list[Image]:
+    """Read ``images``; the image points only where they are asked for."""
+    with checks.reading(path):
+        if path.suffix == ".bin":
+            file, images = _open(path), []
+            for _ in range(*_take(file, _COUNT)):
+                identifier, *pose, camera = _take(file, _IMAGE)
+                end = file.find(b"\0", file.tell())
+                if end < 0:
+                    raise ValueError("a name does not end")
+                name = file.read(end + 1 - file.tell())[:-1].decode("utf-8", "replace")
+                (count,) = _take(file, _COUNT)
+                seen = np.empty(0, OBSERVATION)
+                if points and count:
+                    seen = np.frombuffer(file, OBSERVATION, count, file.tell())
+                    seen = seen[seen["point"] >= 0]
+                file.seek(count * OBSERVATION.itemsize, os.SEEK_CUR)
+                images.append(Image(identifier, tuple(pose), camera, name, seen))
+            return images
+        images, lines = [], _lines(path)
+        for line in filter(None, lines):
+            identifier, *pose, camera, name = line.split(None, 9)
+            below = next(lines, "")
+            if below:
+                int(below.rsplit(None, 1)[-1])  # the line of the next image would end with a name
+            rows = np.array(below.split() if points else (), float).reshape(-1, 3)
+            rows = rows[rows[:, 2] >= 0]
+            seen = np.empty(len(rows), OBSERVATION)
+            seen["xy"], seen["point"] = rows[:, :2], rows[:, 2]
+            images.append(Image(int(identifier), tuple(map(float, pose)), int(camera), name, seen))
+        _check_count(path, len(images))
+        return images
+
+
+def read_points(path: Path) -> tuple[IntArray, FloatArray]:
+    """Read identifiers and places of ``points3D``; the tracks are in the images too."""
+    with checks.reading(path):
+        if path.suffix != ".bin":
+            lines = [line.split(None, 4)[:4] for line in _lines(path) if line]
+            _check_count(path, len(lines))
+            values = np.array([line[1:] for line in lines], float).reshape(-1, 3)
+            return np.array([int(line[0]) for line in lines], np.int64), values
+        data, starts = _open(path), []
+        (count,), at = _take(data, _COUNT), _COUNT.size
+        for _ in range(count):  # millions, so without a function call each
+            starts.append(at)
+            at += _POINT_BYTES + _VIEW_BYTES * _COUNT.unpack_from(data, at + _POINT_TO_COUNT)[0]
+        if at > len(data):
+            raise damaged(path, "its last point has too few views")
+        if not starts:
+            return np.empty(0, np.int64), np.empty((0, 3))
+        every_byte = np.frombuffer(data, np.uint8)
+        rows = np.lib.stride_tricks.sliding_window_view(every_byte, _POINT_TO_COLOUR)[starts]
+        numbers = np.ascontiguousarray(rows).view([("id", "<i8"), ("xyz", "<f8", 3)])[:, 0]
+        return numbers["id"].copy(), numbers["xyz"].copy()
 
 
 PREFERRED = (
@@ -237,7 +444,7 @@ PREFERRED = (
     *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE"),
     *("RAD_TAN_THIN_PRISM_FISHEYE", "FOV", "SIMPLE_DIVISION", "DIVISION", "EUCM"),
 )
-"""The simplest first; those that only new versions of COLMAP know come last."""
+"""For writing: the simplest first; those that only new versions of COLMAP know come last."""
 GREY = (128, 128, 128)
 ROUND_M = 100.0
 
@@ -268,7 +475,7 @@ def write_colmap(
     from scipy.spatial.transform import Rotation
 
     target = Path(folder)
-    _, lenses = block_to_write(  # a file would cut off other names
+    _, lenses = checks.block_to_write(  # a file would cut off other names
         target, cameras, lambda name: name == name.strip() != "" and not {"\0", "\n"} & {*name}
     )
     middle = np.median(cameras.centres, axis=0)
@@ -305,7 +512,7 @@ def write_colmap(
         "points3D.bin": _points(ties.xyz[kept] - offset, seen["point"], start),
         FILE: place_text(offset, crs or cameras.crs).encode(),
     }
-    write_new(target, contents)
+    checks.write_new(target, contents)
 
 
 def colmap_camera(path: Path, given: Lens) -> Camera:
@@ -327,9 +534,11 @@ def colmap_camera(path: Path, given: Lens) -> Camera:
             names, projection = BY_NAME[model]
             numbers = tuple(values.get(name, 0.0) for name in names)
             camera = Camera(model, given.width, given.height, numbers)
-            if projection == given.projection and is_same_lens(lens(path, 1, camera), given):
+            if projection == given.projection and checks.is_same_lens(
+                lens_of(path, 1, camera), given
+            ):
                 return camera
-    raise lens_not_held(path, given)
+    raise checks.lens_not_held(path, given)
 
 
 def _points(xyz: FloatArray, point: IntArray, image_start: IntArray) -> bytes:

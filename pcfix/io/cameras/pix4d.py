@@ -21,18 +21,21 @@ References: Pix4D, "What does the Output Params Folder contain?" (support.pix4d.
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path, PurePath, PureWindowsPath
+from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.cameras import checks, tracks
-from pcfix.io.cameras.checks import damaged, note, number, read_text, read_xml
-from pcfix.io.cameras.formats import Source
-from pcfix.io.cameras.pix4d import tables
+from pcfix.io.cameras.checks import Source, damaged, note, number, read_xml
+from pcfix.io.tables import read_lines
+from pcfix.lens.rotations import from_omega_phi_kappa
 from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, TiePoints
 
 PARAMETERS = "calibrated_camera_parameters.txt"
@@ -55,10 +58,25 @@ HEADERS = (
     ["imagename", "longitude", "latitude", "altitude", "omega", "phi", "kappa"],
 )
 FOLDERS = ("", "params", "1_initial/params", "*/params", "*/1_initial/params")
-"""Where a project may have its tables."""
+"""Where a project may have its """
 Files = dict[str, Path]
 """The files of a project that are there, by the names in `NAMES`, and ``project``."""
 AGREE_M, AGREE_DEG = 0.01, 0.001
+FIELDS = {
+    "camera matrix": "matrix",
+    "radial": "radial",
+    "tangential": "tangential",
+    "affine": "affine",
+    "polynomial": "polynomial",
+    "principal": "principal",
+    "position": "centre",
+    "rotation": "rotation",
+}
+SHAPE = re.compile(r"^(.*?)\s*\[\s*(\d{1,2})\s*x\s*(\d{1,2})\s*\]\s*$")
+SENSOR = re.compile(r"sensor width of\s*([-+.\deE]+)\s*x\s*([-+.\deE]+)")
+Calibrations = list[dict[str, float]]
+SAME_FOCAL = 1e-6
+"""Relative: the two files write the same number in pixels and in millimetres."""
 
 
 def recognises(source: Source) -> bool:
@@ -74,22 +92,22 @@ def read(source: Source) -> Cameras:
     if not files.keys() & {"parameters", "external"}:
         remedy = f"Give the params folder of the project; {GEOGRAPHIC} alone does not suffice"
         raise checks.missing(source.path.with_name(PARAMETERS), remedy)
-    calibrations = tables.read_calibrations(files["calibration"]) if "calibration" in files else []
+    calibrations = read_calibrations(files["calibration"]) if "calibration" in files else []
     if "parameters" in files:
-        images = tables.read_parameters(files["parameters"])
+        images = read_parameters(files["parameters"])
         rows, centres, rotations, unposed, notes = _poses(files, images)
         labels = [images[row].label for row in rows]
-        own = [tables.lens_of_image(images[row], calibrations) for row in rows]
+        own = [lens_of_image(images[row], calibrations) for row in rows]
     else:
-        labels, centres, rotations = tables.read_external(files["external"])
-        lens = tables.lens_of_calibration(calibrations[0]) if len(calibrations) == 1 else None
+        labels, centres, rotations = read_external(files["external"])
+        lens = lens_of_calibration(calibrations[0]) if len(calibrations) == 1 else None
         own, unposed = [lens] * len(labels), []
         why = f"there is no {PARAMETERS} beside it"
         notes = () if lens else (checks.without_lens(files["external"], why),)
     same: dict[Lens, Lens] = {}  # images of a camera share its lens
     lenses = tuple(same.setdefault(lens, lens) for lens in own if lens is not None)
     gnss, others = _priors(files["project"], labels) if "project" in files else (None, [])
-    wkt = read_text(files["wkt"]).strip() if "wkt" in files else ""
+    wkt = " ".join(read_lines(files["wkt"])).strip() if "wkt" in files else ""
     return Cameras(
         labels=tuple(labels),
         centres=centres,
@@ -159,7 +177,7 @@ def _prefix(name: str, *endings: str) -> str | None:
 
 
 def _poses(
-    files: Files, images: list[tables.Image]
+    files: Files, images: list[Image]
 ) -> tuple[list[int], FloatArray, FloatArray, list[str], tuple[PcfixWarning, ...]]:
     """Return the poses of the two tables; the absolute one is believed.
 
@@ -172,7 +190,7 @@ def _poses(
     names: list[str] = []
     if "external" in files:
         path = files["external"]
-        names, there, turned = tables.read_external(path)
+        names, there, turned = read_external(path)
         left: dict[str, list[int]] = defaultdict(list)
         for row, name in enumerate(names):
             left[name].append(row)
@@ -201,9 +219,7 @@ def _poses(
     return kept, centres[known], rotations[known], unposed, notes
 
 
-def _absolute(
-    files: Files, images: list[tables.Image]
-) -> tuple[FloatArray, tuple[PcfixWarning, ...]]:
+def _absolute(files: Files, images: list[Image]) -> tuple[FloatArray, tuple[PcfixWarning, ...]]:
     """Return the centres with the offset added; NaN where several offsets name no such image."""
     local = np.array([image.fields["centre"] for image in images])
     if "offset" not in files and "external" in files:
@@ -211,7 +227,15 @@ def _absolute(
     if "offset" not in files:
         sentence = "there is no offset.xyz beside it. Give the offset with --cameras-offset."
         return local, (note(files["parameters"], "cameras.no_offset", sentence),)
-    offsets = tables.read_offsets(files["offset"])
+    # one line, or one for each group of images whose names begin alike
+    lines = [line.replace(",", " ").split() for line in read_lines(files["offset"])]
+    offsets = [
+        (" ".join(words[:-3]), _numbers(files["offset"], "the offset", words[-3:]))
+        for words in lines
+        if words
+    ]
+    if not offsets or any(len(values) != 3 for _, values in offsets):
+        raise damaged(files["offset"], "it should have the offset x y z")
     if len({values.tobytes() for _, values in offsets}) == 1:
         return local + offsets[0][1], ()
     added = np.full_like(local, np.nan)
@@ -259,6 +283,139 @@ def _priors(path: Path, labels: list[str]) -> tuple[GnssPositions | None, list[s
     return GnssPositions(xyz, sigma_m, checks.crs(path, text) if text.strip() else None), others
 
 
+class Image(NamedTuple):
+    """One image of the camera parameters; `fields` has its numbers by the names in `FIELDS`."""
+
+    label: str
+    width: float
+    height: float
+    fields: dict[str, FloatArray]
+
+
+def read_parameters(path: Path) -> list[Image]:
+    """Read the camera parameters; their layout is what the header names with sizes."""
+    lines = [line for line in read_lines(path) if line.strip()]
+    layout, row = [], 1
+    for i, line in enumerate(lines[:20], start=1):
+        if shape := SHAPE.match(line):
+            words = shape[1].lower()
+            name = next((name for word, name in FIELDS.items() if word in words), "")
+            layout.append((name, int(shape[2]) * int(shape[3])))
+        if shape or line.strip().lower().startswith("camera model"):
+            row = i
+    if not {("centre", 3), ("rotation", 9)} <= set(layout):
+        raise damaged(path, "its header has no 'camera position t [3x1]' or 'rotation R [3x3]'")
+    ends = np.cumsum([count for _, count in layout])
+    images = []
+    while row < len(lines):
+        label, *size = lines[row].rsplit(None, 2)
+        words_of: list[str] = []
+        row += 1
+        while len(words_of) < ends[-1] and row < len(lines):
+            words_of += lines[row].split()
+            row += 1
+        if len(words_of) != ends[-1]:
+            raise damaged(path, f"image {label}: {len(words_of)} numbers instead of {ends[-1]}")
+        width, height = _numbers(path, f"image {label}", size)
+        parts = np.split(_numbers(path, f"image {label}", words_of), ends[:-1])
+        fields = {name: part for (name, _), part in zip(layout, parts, strict=True) if name}
+        images.append(Image(label.strip(), float(width), float(height), fields))
+    if not images:
+        raise damaged(path, "has a header but no images")
+    return images
+
+
+def _numbers(path: Path, where: str, words: list[str]) -> FloatArray:
+    return np.array([number(path, where, word) for word in words])
+
+
+def read_external(path: Path) -> tuple[list[str], FloatArray, FloatArray]:
+    """Read the absolute table: labels, centres (k, 3) and rotations (k, 3, 3)."""
+    rows = [line.rsplit(None, 6) for line in read_lines(path)[1:] if line.strip()]
+    if not rows:
+        raise damaged(path, "has a header but no images")
+    values = np.array([_numbers(path, f"image {row[0]}", row[1:]) for row in rows])
+    rotations = from_omega_phi_kappa(*values[:, 3:].T)
+    return [row[0].strip() for row in rows], values[:, :3], rotations
+
+
+def read_calibrations(path: Path) -> list[dict[str, float]]:
+    """Read the cameras of a ``pix4d_..._internal_camera_parameters.cam``.
+
+    Of each come the first number of each line by its name, and `width`, `height` of the sensor, mm.
+    """
+    cameras: list[dict[str, float]] = []
+    for line in read_lines(path):
+        words = line.split()
+        if line.lower().startswith("pix4d camera calibration file"):
+            cameras.append({"width": 0.0, "height": 0.0})
+        elif cameras and (match := SENSOR.search(line)):
+            size = _numbers(path, "the sensor size", [match[1], match[2]]).tolist()
+            cameras[-1] |= dict(zip(("width", "height"), size, strict=True))
+        elif cameras and len(words) > 1 and not line.startswith("#"):
+            value = number(path, f"camera {len(cameras) - 1}, {words[0]}", words[1])
+            cameras[-1][words[0].lower()] = value
+    return cameras
+
+
+def lens_of_image(image: Image, calibrations: Calibrations) -> Lens | None:
+    """Return the lens in pixels, from the block of the image or the only calibration."""
+    fields: dict[str, list[float]] = {k: v.tolist() for k, v in image.fields.items()}
+    matrix = fields.get("matrix", [])
+    if {"affine", "polynomial"} <= fields.keys() and (matrix or "principal" in fields):
+        x, y = fields["principal"][:2] if "principal" in fields else (matrix[2], matrix[5])
+        lens = _fisheye(image, (x, y), fields["affine"], fields["polynomial"])
+    elif matrix:
+        fx, skew, x, _, fy, y, *_ = matrix
+        t1, t2 = (*fields.get("tangential", ()), 0.0, 0.0)[:2]
+        lens = Lens(
+            *(fy, image.width, image.height, x, y, fx - fy, skew),
+            radial=tuple(fields.get("radial", ())),
+            tangential=(t2, t1),
+        )
+    else:
+        return lens_of_calibration(calibrations[0], image) if len(calibrations) == 1 else None
+    for calibration in calibrations:  # the pixel size is that of the one with the focal length
+        pixel, focal_mm = calibration["width"] / lens.width, calibration.get("f", 0.0)
+        is_fisheye = "c" in calibration
+        expected = focal_mm if is_fisheye else focal_mm / pixel if pixel > 0.0 else 0.0
+        if abs(expected - lens.focal) <= SAME_FOCAL * lens.focal:
+            return replace(lens, pixel_size_mm=pixel)
+    return lens
+
+
+def _fisheye(
+    image: Image, principal: Sequence[float], affine: Sequence[float], shape: Sequence[float]
+) -> Lens:
+    """Return the lens (u, v) = principal + [c d; e f] rho, rho the polynomial of 2 theta / pi."""
+    c, d, e, f = affine
+    frame = (f, image.width, image.height, principal[0], principal[1])
+    return Lens(*frame, c - f, d, e, projection="polynomial", shape=tuple(shape))
+
+
+def lens_of_calibration(calibration: dict[str, float], image: Image | None = None) -> Lens | None:
+    """Return the lens of a calibration: in pixels where an image tells how many, else in mm.
+
+    A fisheye needs the image, as its matrix is in pixels and its principal point in mm. None
+    where the calibration does not say enough.
+    """
+    value, is_fisheye = defaultdict(float, {"p1": 1.0} | calibration), "c" in calibration
+    width_mm, height_mm = value["width"], value["height"]
+    known = {"px", "py", "f"} <= calibration.keys() and min(width_mm, height_mm) > 0.0
+    if not known or (is_fisheye and image is None):
+        return None
+    if is_fisheye and image is not None:
+        scale = image.width / width_mm
+        principal = (value["px"] * scale, value["py"] * scale)
+        affine, shape = ([value[n] for n in t.split()] for t in ("c d e f", "p0 p1 p2 p3 p4"))
+        return replace(_fisheye(image, principal, affine, shape), pixel_size_mm=1.0 / scale)
+    return Lens(
+        *(value["f"], width_mm, height_mm, value["px"], value["py"]),
+        radial=(value["k1"], value["k2"], value["k3"]),
+        tangential=(value["t2"], value["t1"]),
+    )
+
+
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """Read ``tp_bingo.txt``, or ``tp_pix4d.txt`` where there is no other."""
     files = _find(source)
@@ -287,7 +444,7 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
         names, point = np.unique(points[posed], return_inverse=True)
         known = {}  # where the adjustment placed the control points
         if "gcps" in files:
-            lines = [line.split(",") for line in read_text(files["gcps"]).splitlines()[1:]]
+            lines = [line.split(",") for line in read_lines(files["gcps"])[1:]]
             known = {row[0].strip(): checks.triple(row[4:7]) for row in lines if len(row) > 1}
         unknown = np.full(3, np.nan)
         xyz = np.array([known.get(name.partition("_")[2], unknown) for name in names.tolist()])
@@ -302,7 +459,7 @@ def _measured(path: Path, rows: dict[str, int]) -> list[tuple[str, int, list[str
     """
     found = []
     image: tuple[int, list[str]] | None = None
-    for line in read_text(path).splitlines():
+    for line in read_lines(path):
         words = line.split()
         if not words or words[0] == "-99":
             image = None

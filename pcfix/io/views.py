@@ -1,0 +1,611 @@
+"""Read view lists, which say which cameras contributed to each point of a dense cloud.
+
+Read one with `read_views`, or make one of tie points with `track_views`; then `ViewMatch` gives its
+lists to the rows of a cloud, chunk by chunk.
+
+``fused.ply.vis``, which COLMAP's stereo fusion writes beside ``fused.ply``, is little-endian: a
+uint64 number of points; then for each point, in the order of the vertices of ``fused.ply``, a
+uint32 number of images and that many uint32 image numbers. An image number counts the registered
+images of the sparse model in the dense workspace, from 0; it is not COLMAP's IMAGE_ID. Defined by
+COLMAP's source, mvs/fusion.cc and mvs/model.cc. The images are those whose depth maps were fused at
+the point.
+
+The dense cloud of OpenMVS (and so of ODM) is a PLY file with two lists at each vertex:
+``view_indices`` names the depth maps that were fused at the point, by the number of their image in
+the scene, from 0; ``view_weights`` are their weights. The importers number the images in their
+order: InterfaceCOLMAP in that of ``images.txt``, OpenSfM's exporter (ODM) in that of the shots of
+the undistorted reconstruction. Defined by OpenMVS's source, libs/MVS/PointCloud.cpp and
+apps/InterfaceCOLMAP. The images that a depth map was matched against are not named.
+
+A list does not name its images. A number counts them in the order of the dense matcher:
+
+- COLMAP uses the registered images of its sparse model. Some versions have them in the order of
+  ``images.bin`` or ``images.txt``, which is arbitrary; others by ascending IMAGE_ID; those with
+  rigs frame by frame, by ascending FRAME_ID (``Reconstruction::RegImageIds``).
+- OpenMVS uses the order of its importer, for COLMAP that of ``images.txt``.
+
+So every order that a sparse model beside the list allows is a candidate, then that of the cameras
+that are given. Geometry decides: a depth map holds only what its image shows, so nearly every
+listed camera must have the apparent point in its frame. With image numbers off by one, a quarter
+of the cameras of an ordinary block do not.
+
+A row of the cloud gets the list of the same row if the list's position agrees with it to a
+fraction of the spacing, whatever the numbers of rows. Every other row gets the list of the nearest
+point within a tolerance. The default tolerance is as strict: neighbours in a dense cloud often
+have other images (on a real one, points 5 cm apart hardly have a camera in common), so a list is
+used for its own point only. A list without positions is matched by row number only; then the
+numbers of points must agree, and the listed cameras must have the points in their frames, chunk by
+chunk.
+"""
+
+from __future__ import annotations
+
+import struct
+from contextlib import suppress
+from copy import copy
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from pcfix.errors import InputError, PcfixWarning, bad_file
+from pcfix.io.cameras.colmap import read_images
+from pcfix.io.crs import Points
+from pcfix.io.files import check_input
+from pcfix.io.labels import match_labels
+from pcfix.io.ply import Records, joined, list_starts, read_header
+from pcfix.lens.frames import beside_frames
+from pcfix.lens.imaging import project
+from pcfix.model import Cameras, FloatArray, IntArray, TiePoints, ViewKind, Views
+from pcfix.options.declare import File
+from pcfix.sums import LEAST, SAME, Sums
+
+COLMAP_LIST = "COLMAP view list"
+_HEAD = 8
+_IMAGES, _WEIGHTS = "view_indices", "view_weights"
+_OTHERS = (b"LASF", b"MVSI", b"PK\x03\x04", b"SQLi")
+"""The first bytes of files that people give instead: clouds, scenes, archives, databases."""
+_REMEDY = "Give COLMAP's fused.ply.vis or OpenMVS's dense PLY, as the software wrote it."
+
+
+@dataclass(frozen=True, eq=False)
+class ImageOrder:
+    """One meaning of the image numbers."""
+
+    what: str  # its source
+    camera: npt.NDArray[np.int32]  # (images,), rows of `Cameras`, -1 without one
+    unposed: tuple[str, ...] = ()  # images without a row
+
+
+@dataclass(frozen=True, eq=False)
+class ViewList:
+    """The cameras that contributed to each of n points; `ViewMatch` gives them to a cloud's rows.
+
+    `share_seen` of the listed cameras have the point in their frame; None before it is tested, or
+    if the cameras have no frames. A match by position may be off by `tolerance_spacings`. That of a
+    track is large: on a real block the nearest one holds 77 % of a dense point's images at any
+    distance up to two spacings, as a tie point represents its surroundings.
+    """
+
+    path: Path
+    what: str  # the kind of file
+    start: IntArray  # (n + 1,)
+    image: npt.NDArray[np.int32]  # (start[-1],), the file's number of the image
+    weight: npt.NDArray[np.float32] | None = None  # (start[-1],)
+    xyz: FloatArray | None = None  # (n, 3), frame of the file, then of the cameras
+    resolution_m: float = 0.0  # how far off a position can be, from the type of its numbers
+    notes: tuple[PcfixWarning, ...] = ()
+    orders: tuple[ImageOrder, ...] = ()  # possible meanings of a number, until geometry decides
+    share_seen: float | None = None
+    spacing_m: float | None = None  # between neighbouring points, if there are positions
+    tolerance_spacings: float = 0.05
+    kind: ViewKind = "depth-maps"  # see `pcfix.model.Views`
+
+    def __len__(self) -> int:
+        return len(self.start) - 1
+
+
+def read_views(path: File, cameras: Cameras, *, to_cloud: Points | None = None) -> ViewList:
+    """Read the view list of a dense cloud.
+
+    Parameters
+    ----------
+    path : path
+        COLMAP's ``fused.ply.vis``, or the dense PLY file of OpenMVS with its ``view_indices``. For
+        COLMAP the ``fused.ply`` will do if the list is beside it. Images are counted as in a
+        sparse model beside the list, or as the cameras are, whichever the geometry confirms.
+    cameras : Cameras
+        In the cloud's frame.
+    to_cloud : callable, optional
+        Takes positions, shape (n, 3), from the list's frame to the cloud's. Default: the same.
+    """
+    found = check_input(path)
+    with found.open("rb") as stream:
+        head = stream.read(4)
+    if head in _OTHERS:
+        raise bad_file(found, "views.not_one", f"is not a view list. {_REMEDY}")
+    vis, read = found.with_name(f"{found.name}.vis"), _openmvs
+    if not head.startswith(b"ply"):
+        read = _colmap
+    elif read_header(found).item(_IMAGES, is_list=True) is None and vis.is_file():
+        found, read = vis, _colmap
+    views = read(found)
+    return _placed(replace(views, orders=image_orders(views, cameras)), cameras, to_cloud)
+
+
+def track_views(
+    path: Path, tie_points: TiePoints, cameras: Cameras, *, to_cloud: Points | None = None
+) -> ViewList:
+    """Make a view list of the tracks of a sparse model that was read from `path`.
+
+    The tie points count the images as `cameras` does; for the others see `read_views`. Those that
+    have a position are used, each of their cameras once.
+    """
+    rows = np.flatnonzero(np.isfinite(tie_points.xyz).all(axis=1))
+    if rows.size == 0:
+        sentence = "has no tie points with positions. Give another view list."
+        raise bad_file(path, "views.no_positions", sentence)
+    listed = tie_points.views.take(rows)
+    row = np.repeat(np.arange(len(rows)), np.diff(listed.start))
+    pairs = np.unique(np.column_stack([row, listed.camera]), axis=0)  # a track may name one twice
+    start = np.concatenate([[0], np.cumsum(np.bincount(pairs[:, 0], minlength=len(rows)))])
+    order = ImageOrder("the cameras of the tie points", np.arange(len(cameras), dtype=np.int32))
+    views = ViewList(
+        path, "tie points", start, pairs[:, 1].astype(np.int32), xyz=tie_points.xyz[rows],
+        orders=(order,), tolerance_spacings=2.0, kind="tracks",
+    )  # fmt: skip
+    return _placed(views, cameras, to_cloud)
+
+
+def _placed(views: ViewList, cameras: Cameras, to_cloud: Points | None) -> ViewList:
+    """Return a list with positions in the cloud's frame, whose cameras see its points."""
+    if views.xyz is None:
+        return views
+    xyz = views.xyz if to_cloud is None else to_cloud(views.xyz)
+    xyz = np.ascontiguousarray(xyz, np.float64)
+    try:
+        placed = replace(views, xyz=xyz, spacing_m=spacing_m(xyz))
+        return fitted(placed, cameras, xyz, np.arange(len(views)))
+    except InputError:
+        if views.what != COLMAP_LIST:
+            raise
+    sentence = f"{views.path}: the PLY file beside it is in another frame and is not used."
+    note = PcfixWarning("views.other_frame", sentence, path=views.path)
+    return replace(views, xyz=None, notes=(*views.notes, note))
+
+
+def _colmap(path: Path) -> ViewList:
+    """Read ``fused.ply.vis``, and the positions from the PLY file beside it, if there is one."""
+    size = path.stat().st_size
+    with path.open("rb") as stream:
+        count = int.from_bytes(stream.read(_HEAD), "little")
+    complete, used, words = 0, 0, np.zeros(1, np.uint32)
+    if size % 4 == 0 and 0 < count <= (size - _HEAD) // 4:
+        words = np.memmap(path, "<u4", "r", offset=_HEAD)
+        one = np.ones(1, np.int64)
+        first, length = np.empty((2, count, 1), np.int64)
+        complete, used = list_starts(words, one, one, False, first, length)
+    if complete < count or used < len(words):
+        sentence = f"is no complete COLMAP view list: {complete:,} of {count:,} can be read."
+        values = {"points": count, "complete": complete}
+        raise bad_file(path, "views.damaged", f"{sentence} {_REMEDY}", **values)
+    start, number = joined(words, first[:, 0], length[:, 0], 1)
+    raw = ViewList(path, COLMAP_LIST, start, _checked_images(path, number))
+    bare = path.with_suffix("")
+    ply = bare if bare.suffix.lower() == ".ply" else bare.with_suffix(".ply")
+    if not ply.is_file():
+        return raw
+    vertices = read_header(ply).records
+    if vertices == count:
+        return replace(raw, **_positions(Records(ply)))
+    sentence = f"{ply}: has {vertices:,} points, the list {count:,}. Its positions are not used."
+    return replace(raw, notes=(PcfixWarning("views.other_points", sentence, path=ply),))
+
+
+def _openmvs(path: Path) -> ViewList:
+    """Read positions, view lists and, if there are any, weights."""
+    header = read_header(path)
+    if header.item(_IMAGES, is_list=True) is None:
+        raise bad_file(path, "views.no_lists", f"its points have no {_IMAGES}. {_REMEDY}")
+    vertices = Records(path)
+    start, number = vertices.lists(_IMAGES)
+    raw = ViewList(path, "OpenMVS point cloud", start, _checked_images(path, number))
+    raw = replace(raw, **_positions(vertices))
+    if header.item(_WEIGHTS, is_list=True) is None:
+        return raw
+    weight_start, weight = vertices.lists(_WEIGHTS)
+    if not np.array_equal(weight_start, start) or not ((weight >= 0.0) & (weight < np.inf)).all():
+        sentence = f"its {_WEIGHTS} are not one positive number for each image. {_REMEDY}"
+        raise bad_file(path, "views.weights", sentence)
+    return replace(raw, weight=weight.astype(np.float32))
+
+
+def _positions(vertices: Records) -> dict[str, Any]:
+    """Return the vertices of a PLY file, and how coarse the type of their numbers is, metres."""
+    header = vertices.header
+    if header.records == 0 or None in (header.item(axis, is_list=False) for axis in "xyz"):
+        sentence = f"has no points with x, y and z. {_REMEDY}"
+        raise bad_file(header.name, "views.no_positions", sentence)
+    xyz = vertices.numbers(*"xyz")
+    finite = np.isfinite(xyz).all(axis=1)
+    if not finite.all():
+        row = int(np.argmin(finite))
+        sentence = f"vertex {row:,} has no finite position. Export the points again."
+        raise bad_file(header.name, "views.not_finite", sentence, row=row)
+    single = header.item("x", is_list=False) == "f4"
+    step = float(np.spacing(np.float32(np.abs(xyz).max()))) if single else 0.0
+    return {"xyz": xyz, "resolution_m": step}
+
+
+def _checked_images(path: Path, number: npt.NDArray[Any]) -> npt.NDArray[np.int32]:
+    """Return image numbers as int32, if they are whole and not negative."""
+    with np.errstate(invalid="ignore"):  # NaN and infinity of a text
+        image = number.astype(np.int32)
+    wrong = np.flatnonzero((image < 0) | (image != number))
+    if wrong.size:
+        value = number[wrong[0]].item()
+        sentence = f"names image {value}, which is not a whole number from 0 on. {_REMEDY}"
+        raise bad_file(path, "views.image_number", sentence, value=value)
+    return image
+
+
+LEAST_SHARE = 0.95
+"""Of listed cameras whose frame holds the point: 1.00 on a real dense cloud, 0.75 with image
+numbers off by one, 0.4 in a random order."""
+
+MARGIN = 0.02
+"""Of the frame's sides: other lens models or adjustments move an edge by less."""
+
+SAMPLE_POINTS = 20_000
+
+_ENOUGH = 1000
+"""Entries that are enough to choose the order of the images; with fewer, later chunks decide."""
+
+_PLACES = (".", "sparse", "sparse/0")
+_FRAME_HEAD, _DATA = struct.Struct("<II7dI"), struct.Struct("<iIQ")
+
+
+def image_orders(raw: ViewList, cameras: Cameras) -> tuple[ImageOrder, ...]:
+    """Return the orders that the image numbers may follow, the most likely first."""
+    found = []
+    for place in _PLACES:
+        with suppress(InputError, OSError, struct.error, ValueError, IndexError, KeyError):
+            for what, names in _orders(raw.path.parent / place):  # a damaged model is skipped
+                row = match_labels(names, cameras.labels).row.astype(np.int32)
+                unposed = tuple(name for name, r in zip(names, row, strict=True) if r < 0)
+                found.append(ImageOrder(what, row, unposed))
+    found.append(ImageOrder("the cameras as given", np.arange(len(cameras), dtype=np.int32)))
+    most = int(raw.image.max()) if raw.image.size else -1
+    fitting = [order for order in found if most < len(order.camera)]
+    if not fitting:
+        largest = max(found, key=lambda order: len(order.camera))
+        sentence = f"names image {most} (from 0); {largest.what} has {len(largest.camera)}. Put the"
+        sentence += " sparse model beside the list."
+        raise bad_file(raw.path, "views.image_number", sentence, value=most)
+    known = [order for order in fitting if (order.camera >= 0).any()]
+    if not known:
+        sentence = f"no image of {fitting[0].what} is among the cameras. Give those of this block."
+        raise bad_file(raw.path, "views.other_block", sentence)
+    distinct: dict[bytes, ImageOrder] = {}
+    for order in known:
+        distinct.setdefault(order.camera.tobytes(), order)
+    return tuple(distinct.values())
+
+
+def _orders(model: Path) -> list[tuple[str, list[str]]]:
+    """Return the orders of the images of a sparse model, and their names."""
+    paths = [model / f"images.{suffix}" for suffix in ("bin", "txt")]
+    path = next((path for path in paths if path.is_file()), None)
+    if path is None:
+        return []
+    images = read_images(path, points=False)
+    name = {image.identifier: image.name for image in images}
+    by_frame = [name[i] for ids in _frames(model) for i in ids if i in name]
+    orders = [
+        (f"the frames of {model}", by_frame if len(by_frame) == len(images) else []),
+        (f"the images of {model}", [image.name for image in images]),
+        (f"the images of {model} by IMAGE_ID", [name[i] for i in sorted(name)]),
+    ]
+    return [(what, names) for what, names in orders if names]
+
+
+def _frames(model: Path) -> list[list[int]]:
+    """Return the image ids of each frame of a model with rigs, in the order of COLMAP.
+
+    See https://colmap.github.io/format.html for ``frames.bin``.
+    """
+    path = model / "frames.bin"
+    if not path.is_file():
+        return []
+    data, at, frames = path.read_bytes(), 8, {}
+    for _ in range(*struct.unpack_from("<Q", data)):
+        frame_id, *_, images = _FRAME_HEAD.unpack_from(data, at)
+        at += _FRAME_HEAD.size
+        end = at + _DATA.size * images
+        entries = [_DATA.unpack_from(data, place) for place in range(at, end, _DATA.size)]
+        frames[frame_id] = sorted((sensor, image) for kind, sensor, image in entries if kind == 0)
+        at = end
+    return [[image for _, image in frames[i]] for i in sorted(frames)]
+
+
+def fitted(views: ViewList, cameras: Cameras, xyz: FloatArray, rows: IntArray) -> ViewList:
+    """Choose the order of images with which the listed cameras see the points.
+
+    The apparent points, shape (m, 3), are in the frame of the cameras; `rows`, shape (m,), are
+    theirs of the list.
+    """
+    if cameras.rotations is None or cameras.lenses is None:
+        return replace(views, orders=views.orders[:1])
+    step = max(1, len(rows) // SAMPLE_POINTS)
+    ends, entry = entries(views.start, rows[::step])
+    image, seen_xyz = views.image[entry], np.repeat(xyz[::step], np.diff(ends), axis=0)
+    shares = [share_seen(cameras, order.camera[image], seen_xyz) for order in views.orders]
+    known = [(share, i) for i, share in enumerate(shares) if share is not None]
+    if not known:
+        return views
+    share, best = max(known, key=lambda pair: pair[0])
+    if share < LEAST_SHARE:
+        sentence = f"only {100 * share:.0f} % of the listed cameras have their point in the frame."
+        sentence += " Put the sparse model beside the list, or give its offset (--cameras-offset)."
+        raise bad_file(views.path, "views.other_images", sentence, share=share)
+    others = () if len(image) >= _ENOUGH else views.orders[:best] + views.orders[best + 1 :]
+    return replace(views, orders=(views.orders[best], *others), share_seen=share)
+
+
+def entries(start: IntArray, rows: IntArray) -> tuple[IntArray, slice | IntArray]:
+    """Return where the lists of some rows start in a copy, and which entries these are."""
+    counts = start[rows + 1] - start[rows]
+    ends = np.concatenate([[0], np.cumsum(counts)])
+    if len(rows) and rows[-1] - rows[0] == len(rows) - 1 and (np.diff(rows) == 1).all():
+        return ends, slice(int(start[rows[0]]), int(start[rows[-1] + 1]))  # without a copy
+    return ends, np.repeat(start[rows] - ends[:-1], counts) + np.arange(ends[-1])
+
+
+def share_seen(cameras: Cameras, camera: npt.NDArray[np.int32], xyz: FloatArray) -> float | None:
+    """Return the share of cameras whose frame holds their point, None without any.
+
+    `camera`, shape (m,), has rows of cameras with rotations and lenses, of which negative ones do
+    not count; `xyz`, shape (m, 3), the point of each.
+    """
+    order = np.argsort(camera, kind="stable")
+    ends = np.searchsorted(camera[order], np.arange(len(cameras) + 1))
+    seen = 0
+    for i, lens in enumerate(cameras.lenses or ()):
+        some = xyz[order[ends[i] : ends[i + 1]]]
+        u, v = project(lens, (some - cameras.centres[i]) @ np.asarray(cameras.rotations)[i].T).T
+        wide, high = MARGIN * lens.width, MARGIN * lens.height
+        inside = (u >= -wide) & (u <= lens.width + wide) & (v >= -high) & (v <= lens.height + high)
+        seen += int(np.count_nonzero(inside))
+    count = int(ends[-1] - ends[0])
+    return seen / count if count else None
+
+
+_QUERIES = 250_000
+"""Points looked up at a time, which bounds the memory."""
+_SAME = 0.05
+"""A fraction of the spacing within which two positions are those of one point."""
+_ROUNDING = 1.01 * np.sqrt(3.0)
+"""Of three coordinates that are each off by half a step, relative to that half step."""
+_BINS = 1000
+_MANY = 0.1
+"""A share of points without a list from which on the user is warned."""
+_NEIGHBOURS = 20_000
+
+
+class ViewMatch:
+    """A view list and a cloud whose chunks come in order; `report` counts the matches."""
+
+    def __init__(
+        self, views: ViewList, cameras: Cameras, *, points: int | None = None, step_m: float = 0.0
+    ) -> None:
+        """Check that a list, read with these cameras, can belong to a cloud of so many `points`.
+
+        The cloud's coordinates are rounded to `step_m`, the scale of a LAS file.
+        """
+        self.view_list, self._cameras = views, cameras
+        self._tree: Any = None  # a cKDTree of the list's positions, when one is needed
+        source, weights = f"{views.what} {views.path}", views.weight is not None
+        self.report = ViewReport(source, len(views), notes=list(views.notes), weights=weights)
+        if views.xyz is not None:
+            # a match may be off by the rounding of both files, or by a share of the spacing
+            spacing_m = views.spacing_m or 0.0
+            rounding_m = _ROUNDING * (step_m / 2 + views.resolution_m)
+            self.report.tolerance_m = max(rounding_m, views.tolerance_spacings * spacing_m)
+            self._same_m = max(rounding_m, _SAME * spacing_m)
+            if rounding_m > spacing_m / 2:
+                sentence = f"{views.path}: positions are rounded to {rounding_m:.2g} m, for points"
+                sentence += f" {spacing_m:.2g} m apart. Points may get lists of their neighbours."
+                values = {"rounding_m": rounding_m, "spacing_m": spacing_m}
+                self.report.notes.append(PcfixWarning("views.rounding", sentence, **values))
+        elif points != len(views):
+            sentence = f"has {len(views):,} points, the cloud {points}. Put its PLY file beside it."
+            values = {"listed": len(views), "points": points}
+            raise bad_file(views.path, "views.other_points", sentence, **values)
+        self._note_order()
+
+    def _note_order(self) -> None:
+        order = self.view_list.orders[0]
+        shares = (self.report.share_seen, self.view_list.share_seen)
+        self.report.share_seen = min((s for s in shares if s is not None), default=None)
+        self.report.image_order, self.report.unposed = order.what, order.unposed
+
+    def for_chunk(self, xyz: FloatArray, first_row: int) -> Views:
+        """Return the cameras of a chunk's points; a point without a match has none.
+
+        The points, shape (n, 3), are apparent ones in the frame of the cameras, from the cloud's
+        `first_row` on. A list that is matched by row number is refused if its cameras do not see
+        them.
+        """
+        if self.view_list.xyz is None:
+            row = np.arange(first_row, first_row + len(xyz))
+            self.view_list = fitted(self.view_list, self._cameras, xyz, row)
+            self._note_order()
+            self.report.by_row += len(row)
+        else:
+            row = self._rows(xyz, first_row, self.view_list.xyz)
+        views = self._given(row)
+        apart = beside_frames(xyz, views, self._cameras)
+        self.report.beside_entries += int(apart.sum())
+        self.report.beside_points += int(np.count_nonzero(apart))
+        return views
+
+    def counted(self, xyz: FloatArray, first_row: int) -> tuple[Views, ViewReport]:
+        """Return the cameras of a chunk's points, and the counts of its matches only, no notes."""
+        one = self._restarted()
+        views = one.for_chunk(xyz, first_row)
+        self._tree = one._tree  # it takes long to build
+        return views, one.report
+
+    def settled(self, xyz: FloatArray) -> ViewMatch:
+        """Return the match with the order of the images that the first points show."""
+        one = self._restarted()
+        one.for_chunk(xyz, 0)
+        one.report = replace(self.report)
+        one._note_order()
+        return one
+
+    def _restarted(self) -> ViewMatch:
+        """Return a match that counts from zero."""
+        one = copy(self)
+        none = np.zeros(_BINS + 1, np.int64)
+        one.report = replace(self.report, notes=[], _histogram=none)
+        return one
+
+    def _rows(self, xyz: FloatArray, first_row: int, listed: FloatArray) -> IntArray:
+        """Return the list's row of each point, -1 if it has none."""
+        row = np.full(len(xyz), -1)
+        beside = listed[first_row : first_row + len(xyz)]
+        apart_m = np.linalg.norm(beside - xyz[: len(beside)], axis=1)
+        near = apart_m <= self._same_m
+        row[: len(beside)][near] = first_row + np.flatnonzero(near)
+        self.report.by_row += int(np.count_nonzero(near))
+        rest = np.flatnonzero(row < 0)
+        if len(rest) and self._tree is None:
+            from scipy.spatial import cKDTree
+
+            self._tree = cKDTree(listed, balanced_tree=False, compact_nodes=False)
+        tolerance_m = self.report.tolerance_m or 0.0
+        reach, step = float(np.nextafter(tolerance_m, np.inf)), tolerance_m / _BINS
+        for at in range(0, len(rest), _QUERIES):
+            some = rest[at : at + _QUERIES]
+            away, nearest = self._tree.query(xyz[some], distance_upper_bound=reach, workers=-1)
+            distance = np.asarray(away)
+            found = np.isfinite(distance)
+            bins = np.ceil(distance[found] / step) if step else np.zeros(found.sum())
+            bins = bins.astype(np.int64).clip(0, _BINS)
+            self.report._histogram += np.bincount(bins, minlength=_BINS + 1)
+            self.report.by_position += len(bins)
+            self.report.unmatched += int(np.count_nonzero(~found))
+            row[some] = np.where(found, nearest, -1)
+        return row
+
+    def _given(self, row: IntArray) -> Views:
+        """Turn the images of the given rows into cameras, without images that have no pose."""
+        views = self.view_list
+        listed = np.flatnonzero(row >= 0)
+        ends, entry = entries(views.start, row[listed])
+        camera = self.view_list.orders[0].camera[views.image[entry]].astype(np.int64)
+        weight = None if views.weight is None else views.weight[entry].copy()
+        posed = camera >= 0
+        if not posed.all():
+            ends = np.concatenate([[0], np.cumsum(posed)])[ends]
+            camera, weight = camera[posed], None if weight is None else weight[posed]
+        start = np.zeros(len(row) + 1, np.int64)
+        start[listed + 1] = np.diff(ends)
+        self.report.entries += len(camera)
+        self.report.unposed_entries += len(posed) - len(camera)
+        self.report.without_camera += int(np.count_nonzero(start[listed + 1] == 0))
+        return Views(np.cumsum(start), camera, weight, self.view_list.kind)
+
+
+@dataclass
+class ViewReport(Sums):
+    """Counts of the matches so far; by row, by position and unmatched are points of the cloud."""
+
+    source: str = field(metadata=SAME)  # kind and path of the list
+    list_points: int = field(metadata=SAME)
+    image_order: str = field(default="", metadata=SAME)  # the source of the order of the images
+    share_seen: float | None = field(default=None, metadata=LEAST)  # see `ViewList`
+    tolerance_m: float | None = field(default=None, metadata=SAME)  # of a match by position
+    by_row: int = 0
+    by_position: int = 0
+    unmatched: int = 0
+    without_camera: int = 0  # matched points none of whose images has a pose
+    entries: int = 0  # cameras of all lists that were matched
+    unposed_entries: int = 0  # images without a pose, which are ignored
+    beside_entries: int = 0  # cameras that cannot have imaged their point, which are ignored
+    beside_points: int = 0  # points that these are listed for
+    unposed: tuple[str, ...] = field(default=(), metadata=SAME)  # that a list may name
+    weights: bool = field(default=False, metadata=SAME)
+    notes: list[PcfixWarning] = field(default_factory=list, metadata=SAME)
+    _histogram: IntArray = field(default_factory=lambda: np.zeros(_BINS + 1, np.int64), repr=False)
+
+    @property
+    def points(self) -> int:
+        """Points of the cloud so far."""
+        return self.by_row + self.by_position + self.unmatched
+
+    def distance_m(self, share: float) -> float | None:
+        """Return a quantile of the distances of matches by position, to 0.1 % of the tolerance."""
+        if not self.by_position or self.tolerance_m is None:
+            return None
+        enough = np.cumsum(self._histogram) >= share * self.by_position
+        return float(int(np.argmax(enough)) * self.tolerance_m / _BINS)
+
+    def check(self) -> None:
+        """Refuse a list that gave no point of the cloud a camera."""
+        if self.points and self.entries == 0:
+            sentence = f"{self.source}: has none of the cloud's {self.points:,} points. Give the"
+            sentence += " list of this cloud, or the offset of its coordinates (--cameras-offset)."
+            values = {"points": self.points, "listed": self.list_points}
+            raise InputError("views.no_match", sentence, **values)
+
+    def warnings(self) -> list[PcfixWarning]:
+        """Return warnings on points without a list and on images that are ignored."""
+        notes = list(self.notes)
+
+        def note(code: str, sentence: str, **values: Any) -> None:
+            notes.append(PcfixWarning(code, f"{self.source}: {sentence}", **values))
+
+        if self.unmatched > _MANY * self.points:
+            sentence = f"lacks {self.unmatched:,} of the cloud's {self.points:,} points."
+            note("views.unmatched", sentence, count=self.unmatched, points=self.points)
+        if self.share_seen is None and self.entries:
+            note("views.order_untested", "the order of its images is untested: no camera frames.")
+        if self.unposed_entries:
+            named = f", such as {', '.join(self.unposed[:3])}" if self.unposed else ""
+            sentence = f"{self.unposed_entries:,} entries without a pose{named} are ignored."
+            note("views.unposed", sentence, count=self.unposed_entries)
+        if self.beside_entries:
+            note("views.not_in_frame", beside(self.beside_entries, self.beside_points))
+        return notes
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        values = {k: v for k, v in vars(self).items() if not k.startswith("_") and k != "notes"}
+        values["unposed"] = list(self.unposed)
+        values["cameras_per_point"] = self.entries / max(self.by_row + self.by_position, 1)
+        values["distance_median_m"] = self.distance_m(0.5)
+        values["distance_95_m"] = self.distance_m(0.95)
+        return values
+
+
+def beside(entries: int, points: int) -> str:
+    """Return the sentence on cameras that cannot have imaged the points they are listed for."""
+    return f"{entries:,} entries, of {points:,} points, name cameras that look elsewhere: ignored."
+
+
+def spacing_m(xyz: FloatArray) -> float | None:
+    """Return the median distance to the nearest neighbour around the middle of the file, metres."""
+    from scipy.spatial import cKDTree
+
+    if len(xyz) < 2:
+        return None
+    centre = xyz[len(xyz) // 2]
+    away = np.maximum(np.abs(xyz[:, 0] - centre[0]), np.abs(xyz[:, 1] - centre[1]))
+    near = min(_NEIGHBOURS, len(xyz) - 1)
+    box = xyz[away <= np.partition(away, near)[near]]
+    distance = np.asarray(cKDTree(box).query(box[:_NEIGHBOURS], k=2)[0])
+    return float(np.median(distance[:, 1]))
