@@ -146,6 +146,7 @@ class Correcting:
         withhold = self._plan.options.uncorrected == "withhold"
         for rows, part in correction.parts():
             some = new[rows]
+            # whole steps of the file's own scale, so that 'pcfix restore' gets back every bit
             moved = columns.shift_steps(part, some.scales)
             columns.move(some, moved + self._steps)
             withheld = np.asarray(some["withheld"]).astype(bool)

@@ -206,7 +206,7 @@ def correct_chunk(
         miss_m = float(correction.ray_miss_m[submerged].sum())
         return correction, CloudTally(figures, labels, counts, port_miss_m=miss_m)
     if step is not None:
-        submerged &= step.moved
+        submerged &= step.moved  # a point without a place in the adjusted block is left where it is
     correction = _through_water(plan, batch, np.flatnonzero(submerged), covariances=covariances)
     beyond, line = None, plan.regression
     if line is not None:
@@ -245,7 +245,8 @@ def _through_water(plan: Plan, batch: Batch, rows: IntArray, *, covariances: boo
     found = correct(wet)
     if not covariances:
         found = found._replace(covariance_m2=None)
-    # depth below the water after the correction, negative above it
+    # Depth below the water after the correction, negative above it: the corrected point is in
+    # another place in plan, where a sloping surface has another height.
     slope, (shift_x, shift_y, shift_z) = wet.surface.slope, found.shift_m.T
     rise = slope[:, 0] * shift_x + slope[:, 1] * shift_y
     below = np.asarray(wet.surface.height_m + rise - (wet.xyz[:, 2] + shift_z))

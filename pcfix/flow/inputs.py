@@ -237,6 +237,7 @@ def both_models(inputs: Inputs) -> tuple[Inputs, Inputs]:
     if any(tied) and not all(tied):
         both = _without(both, [not one for one in tied], cameras_crs=None, cameras_offset=None)
     elif inputs.cameras_offset is not None and not any(tied):
+        # Nobody says which of the two files is shifted: try the offset on both, and on either.
         apart = adjusted.centres - original.centres[_rows(original.labels, adjusted.labels)]
         offset = np.array(inputs.cameras_offset)
         moves = {(True, True): apart, (True, False): apart - offset, (False, True): apart + offset}

@@ -42,6 +42,8 @@ def check(plan: Plan, tally: CloudTally) -> Findings:
 
     Writes the shoreline too, if it is asked for.
     """
+    # From the general to the particular: a view list of another cloud, or a mask elsewhere, would
+    # also leave points without cameras.
     name, figures = plan.view.name, tally.figures
     report = _view_report(plan, tally)
     if report is not None:

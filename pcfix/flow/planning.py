@@ -182,6 +182,7 @@ def plan_correction(plan: Plan) -> Plan:
     inputs, view, transfer, match = plan.inputs, plan.view, plan.transfer, plan.match
     water, first = plan.found.surface, None
     if plan.views is not None or transfer is not None:
+        # the first points show whether the list is in the order of the cloud, or has coordinates
         first = first_points(view.chunks(water))
         if match is not None:
             match = match.settled(first.xyz)
@@ -312,6 +313,7 @@ def _scanned(
             builder = OccluderBuilder(view.low, view.high, view.points)
     if not sample and builder is None:
         return None, None, None
+    # the bed of depth maps needs about 5 points per square metre, wherever the cloud is denser
     area_m2 = np.prod(np.maximum(np.subtract(view.high, view.low)[:2], 1.0))
     dense = BED_POINTS_A_M2 * float(area_m2)
     dense = dense if np.isfinite(dense) else MOST_BED_POINTS  # unknown bounds
@@ -319,6 +321,7 @@ def _scanned(
     near_step = max(1, view.points // int(max(dense, FEWEST_BED_POINTS)))
     squares = None
     if sample and near_step < step:
+        # patches for the detection of the type must be as dense as the cloud: take some squares
         centres = survey.cameras.centres
         unknown = np.full(len(centres), np.nan)
         above = centres[:, 2] - surface_above(survey.water, centres, unknown).height_m

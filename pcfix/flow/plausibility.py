@@ -213,6 +213,7 @@ def _frames(cameras: Cameras, xyz: FloatArray) -> Result:
     """Test whether each point is in two frames or more, as its reconstruction needs two."""
     if cameras.lenses is None or cameras.rotations is None:
         return Result(unchecked="frames (the cameras have no lenses or no angles)")
+    # A wrong CRS, datum, unit or convention of angles moves frames off the points.
     unseen = float(np.mean(cameras_in_sight(xyz, cameras) < 2))
     if unseen <= MOST_UNSEEN:
         seen = f"{100.0 * (1.0 - unseen):.4g} % of the points in two frames or more"
@@ -289,7 +290,7 @@ def _directions(cameras: Cameras, xyz: FloatArray) -> Result:
     rows = np.flatnonzero((length > 0.0) & (length < usual) & steep[:-1] & steep[1:])
     if len(rows) < LEAST_STEPS:
         return no_lines
-    top = -cameras.rotations[rows, 1]
+    top = -cameras.rotations[rows, 1]  # direction of the upper edge of the image, in the world
     heading, yaw = np.arctan2(*step[rows].T), np.arctan2(top[:, 0], top[:, 1])
     turn = _common(heading - yaw)
     if turn is None:

@@ -54,6 +54,7 @@ class Record:
         }
         self._keys: dict[str, str] = {}
         key = ""
+        # A chain: the key of a step changes with those of all steps before it.
         for step in STEPS:
             options = {name: value for name, value in request.items() if since(name) == step}
             depends = json.dumps([key, options, states.get(step)], sort_keys=True)
@@ -81,7 +82,7 @@ class Record:
         if was_done:
             done = self._earlier[name]
         else:
-            self._earlier = {}  # what follows was made from other files
+            self._earlier = {}  # the later steps read other files now
             result = json.loads(json.dumps(work()))
             done = {
                 "key": self._keys[name],

@@ -131,14 +131,14 @@ def stream(
                 with running(report=report):
                     result, one = work.compute(points, row + done)
                 if written is not None:
-                    written.result()  # at most one chunk waits to be written
+                    written.result()  # at most one chunk waits, which bounds the memory
                 written = writer.submit(write, points, result)
                 tally = one if tally is None else tally + one
                 done += len(points)
                 report(len(points))
             if written is not None:
                 written.result()
-            if check is not None:
+            if check is not None:  # before the temporary file is renamed
                 findings = check(tally)
     return tally, findings
 

@@ -242,6 +242,7 @@ def own_water_of(
         lost = len(heights) - len(sigma)
         notes += (f"{folder}: {lost} rasters have no standard errors in the folder sigma.",)
     offset = np.zeros(len(cameras)) if level_offset_m is None else level_offset_m
+    # The rasters must overlap the cloud, and have the vertical datum of the common water.
     places, apart = [], []
     for image, raster in heights.items():
         rows, columns = np.nonzero(np.isfinite(raster.height_m))

@@ -105,6 +105,7 @@ def do_tile(pickled: bytes, tile: Tile, jobs: int | None = None) -> str:
         if tile.is_finished:  # by a worker that was lost before it could say so
             return ""
         process, plan = pickle.loads(pickled)
+        # If this process dies, the mark says that the output may be replaced.
         write_tally(tile.record, BEGUN + tile.key, None)
         with threads(jobs), warnings.catch_warnings():
             warnings.simplefilter("ignore", PcfixWarning)  # shown when the plan was made
@@ -151,6 +152,7 @@ def run_tiles(
     check_folder(folder, tiles)
     check_summary(options, tiles.paths)
     work = _work(command.name, tiles, folder, options)
+    # A tile is finished if its output exists with the key of these options and inputs.
     done = {tile for tile in work.values() if tile.is_finished}
     todo = [tile for tile in work.values() if tile not in done]
     for tile in todo if folder.exists() else ():
@@ -178,6 +180,7 @@ def run_tiles(
             # in the order of the files, so that no sum depends on which was first
             tallies = [read_tally(tile.record)[1] for tile in work.values() if tile in done]
             tally = reduce(add, tallies) if tallies[0] is not None else None
+            # Only the statistics of the whole cloud show whether cameras and water fit.
             try:
                 findings = command.check(plan, tally)
             except PcfixError:
