@@ -614,8 +614,10 @@ def with_places(ties: TiePoints, cameras: Cameras) -> TiePoints:
     return replace(ties, xyz=xyz)
 
 
-def ties_of_cloud(xyz: FloatArray, views: Views, cameras: Cameras) -> TiePoints:
-    """Return apparent points, shape (m, 3), as tie points, imaged by straight rays.
+def ties_of_cloud(
+    xyz: FloatArray, views: Views, cameras: Cameras, least: int = LEAST_VIEWS
+) -> TiePoints:
+    """Return apparent points in enough images, shape (m, 3), as tie points with straight rays.
 
     The views say which cameras contributed to them, or have them in their frame.
     """
@@ -625,8 +627,7 @@ def ties_of_cloud(xyz: FloatArray, views: Views, cameras: Cameras) -> TiePoints:
     counts = np.bincount(owner[seen], minlength=len(xyz))
     start = np.concatenate([[0], np.cumsum(counts)])
     tracks = Views(start, np.asarray(views.camera)[seen])
-    rows = np.flatnonzero(counts >= LEAST_VIEWS)
-    return taken(TiePoints(xyz, tracks, image[seen]), rows)
+    return taken(TiePoints(xyz, tracks, image[seen]), np.flatnonzero(counts >= least))
 
 
 def straight_images(xyz: FloatArray, camera: IntArray, cameras: Cameras) -> FloatArray:

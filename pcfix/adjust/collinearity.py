@@ -88,6 +88,9 @@ class Given(NamedTuple):
         points; on, on_weight, axis : points on surfaces: 0 water, 1, 2, ... planes, -1 none (on has
         length 0 if there is no such point), 1 / standard deviation of the distance, and for each
         surface the axis along which it has its height: 2 is up.
+    Petrov-Galerkin (`pcfix.adjust.from_cloud`)
+        tests : shape (t, 2, 9 + g), columns to which the residuals of the first t observations are
+        orthogonal; t = 0 in a least squares adjustment, whose own Jacobian has that role.
     """
 
     start: IntArray
@@ -114,12 +117,14 @@ class Given(NamedTuple):
     on: IntArray
     on_weight: FloatArray
     axis: IntArray
+    tests: FloatArray
 
 
-POSE, POINT, SURFACE = 0, 6, 9
+POINT, SURFACE, SHARED = 6, 9, 9
 WIDTH = SURFACE + PLANES
-"""Columns of derivatives: omega and C, Q, and the parameters of `pcfix.adjust.block.WATER_NAMES`.
-"""
+"""Columns of the derivatives of an image: omega and C, Q from `POINT` on, and from `SURFACE` on the
+parameters of `pcfix.adjust.block.WATER_NAMES`. In a row of the equations the shared unknowns follow
+instead, from `SHARED` on."""
 
 
 class Workspace(NamedTuple):
@@ -131,11 +136,14 @@ class Workspace(NamedTuple):
     origin : shape (3,), the block's origin, seen from the water level.
     by_shape : shape (3, 3), derivatives of the light by d, e, f.
     port : shape (7,), the port with its estimated parameters.
-    own, shared, r : shapes (most, 2, `WIDTH`), (most, 2, g) and (most, 2): weighted derivatives
-    and residuals of the observations of a point.
-    row : shape (most,), which observation each of them is.
+    own : shape (2, `WIDTH`), derivatives of an image.
+    right, left : shape (most, 2, 9 + g), the weighted rows of a point, and what tests them: the
+    same array in a least squares adjustment.
+    r : shape (most, 2), weighted residuals; row : shape (most,), which observation each of them is.
     v, rhs : shapes (3, 3) and (3,), normal equations of the point.
-    w, w_shared, y : shapes (most, 6, 3), (g, 3) and (6, 3), W = J'B, W_g and W V^-1.
+    w, w_right : shape (most, 6, 3), W = J'B of each row, with J of the left and B of the right
+    side, and the reverse; w_shared, w_shared_right : shape (g, 3), the same of shared unknowns.
+    y : shape (6, 3), W V^-1.
     """
 
     light: FloatArray
@@ -146,41 +154,33 @@ class Workspace(NamedTuple):
     by_shape: FloatArray
     port: FloatArray
     own: FloatArray
-    shared: FloatArray
+    right: FloatArray
+    left: FloatArray
     r: FloatArray
     row: IntArray
     v: FloatArray
     rhs: FloatArray
     w: FloatArray
+    w_right: FloatArray
     w_shared: FloatArray
+    w_shared_right: FloatArray
     y: FloatArray
 
 
 def workspace(given: Given) -> Workspace:
     """Return a new workspace."""
     most = int(np.diff(given.start).max(initial=0)) + 1  # one more for a `condition`
-    g = given.shared
-    light, plane, ahead, behind, origin, by_shape, port = (
-        np.empty(shape) for shape in ((3, 12), 4, 3, (3, 8), 3, (3, 3), 7)
-    )
-    own, shared, r, v, rhs, w, w_shared, y = (
-        np.zeros(shape)
-        for shape in (
-            (most, 2, WIDTH),
-            (most, 2, g),
-            (most, 2),
-            (3, 3),
-            3,
-            (most, 6, 3),
-            (g, 3),
-            (6, 3),
-        )
-    )
-    row = np.empty(most, np.int64)
-    return Workspace(
-        light, plane, ahead, behind, origin, by_shape, port,
-        own, shared, r, row, v, rhs, w, w_shared, y,
-    )  # fmt: skip
+    scratch = [np.zeros(shape) for shape in ((3, 12), 4, 3, (3, 8), 3, (3, 3), 7, (2, WIDTH))]
+    rows = (most, 2, SHARED + given.shared)
+    right, r, row = np.zeros(rows), np.zeros((most, 2)), np.zeros(most, np.int64)
+    v, rhs, y = np.zeros((3, 3)), np.zeros(3), np.zeros((6, 3))
+    w, w_shared = np.zeros((most, 6, 3)), np.zeros((given.shared, 3))
+    left, w_right, w_shared_right = right, w, w_shared
+    if len(given.tests):
+        left, w_right = np.zeros_like(right), np.zeros_like(w)
+        w_shared_right = np.zeros_like(w_shared)
+    rest = (right, left, r, row, v, rhs, w, w_right, w_shared, w_shared_right, y)
+    return Workspace._make((*scratch, *rest))
 
 
 # The water
@@ -451,7 +451,7 @@ def condition(state: State, given: Given, p: int, work: Workspace, at: int) -> b
     """
     if given.on.size == 0 or given.on[p] < 0:
         return False
-    own, shared, r = work.own[at], work.shared[at], work.r[at]
+    row, r = work.right[at], work.r[at]
     q, numbers, number, weight = state.xyz[p], state.water, given.on[p], given.on_weight[p]
     up = given.axis[number]
     x, y = q[(up + 1) % 3], q[(up + 2) % 3]
@@ -466,16 +466,16 @@ def condition(state: State, given: Given, p: int, work: Workspace, at: int) -> b
         z += numbers[0]
     if np.isnan(z):
         return False
-    own[:], shared[:], r[1] = 0.0, 0.0, 0.0
+    row[:], r[1] = 0.0, 0.0
     r[0] = weight * (z - q[up])
-    own[0, POINT + up] = weight
-    own[0, POINT + (up + 1) % 3], own[0, POINT + (up + 2) % 3] = -weight * b, -weight * c
+    row[0, POINT + up] = weight
+    row[0, POINT + (up + 1) % 3], row[0, POINT + (up + 2) % 3] = -weight * b, -weight * c
     columns, by = given.column, (1.0, x, y)
     for i in range(3):
         if columns[first + i] >= 0:
-            shared[0, columns[first + i]] -= weight * by[i]
+            row[0, SHARED + columns[first + i]] -= weight * by[i]
     by = (x * x, x * y, y * y)
     for i in range(3):
         if number == 0 and columns[SHAPE + i] >= 0:
-            shared[0, columns[SHAPE + i]] -= weight * by[i]
+            row[0, SHARED + columns[SHAPE + i]] -= weight * by[i]
     return True

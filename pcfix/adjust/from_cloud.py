@@ -26,7 +26,7 @@ several choices the one under which these fit best is taken.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
@@ -38,19 +38,10 @@ from pcfix.adjust.block import (
     deeper,
     plain_block,
     some_cameras,
-    straight_images,
+    ties_of_cloud,
 )
-from pcfix.adjust.collinearity import POINT, SURFACE, Given, State, Workspace
-from pcfix.adjust.normal import (
-    PARTS,
-    PLAIN,
-    change_of,
-    in_parts,
-    linearise,
-    linearise_point,
-    residuals,
-    step_of_point,
-)
+from pcfix.adjust.collinearity import SHARED
+from pcfix.adjust.normal import PLAIN, TESTED, linearised, pair_slots, point_steps, residuals
 from pcfix.adjust.precision import precision_of
 from pcfix.adjust.problem import (
     LogRow,
@@ -65,11 +56,9 @@ from pcfix.adjust.problem import (
     survey_cost,
 )
 from pcfix.adjust.result import Adjusted, adjusted_of
-from pcfix.adjust.solve import moved_by
+from pcfix.adjust.solve import moved_by, reduced_at
 from pcfix.errors import GeometryError, PcfixWarning
-from pcfix.kernels import Span, device, kernel
-from pcfix.lens.algebra import inverted
-from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, TiePoints, WaterSurface
+from pcfix.model import Cameras, FloatArray, IntArray, WaterSurface
 from pcfix.refract.choice import views_in_frame
 from pcfix.water.surface import is_submerged, surface_above
 
@@ -186,7 +175,7 @@ def adjust_cloud(
                 reason=error.code,
             )
         )
-    found = adjusted_of(chosen.problem, chosen.found, known, notes, "cloud", "unaware")
+    found = adjusted_of(chosen.problem, chosen.found, known, notes, "cloud")
     return replace(found, sigma0=sigma0, redundancy=free)
 
 
@@ -233,9 +222,8 @@ def _trial(one: Candidate, unknowns: Unknowns, sigma_px: float, progress: Progre
     problem, start = prepare(block, unknowns)
     before, at_rest = prepare(replace(block, cameras=one.original), unknowns)
     tests = straight_columns(before, at_rest, one.apparent_xyz - before.origin)
-    is_tested = np.arange(len(block.xyz)) < m
-    found = solve_unaware(problem, start, tests, is_tested, progress)
-    marks, weight = problem.used & ~is_tested[owner], problem.given.weight
+    found = solve_unaware(problem, start, tests[: block.start[m]], progress)
+    marks, weight = problem.used & (owner >= m), problem.given.weight
     r = residuals(found.state, problem.given)[marks]
     in_images = float((r * r * weight[marks][:, None] ** 2).sum())
     surveyed = problem.given.surveyed_weight > 0.0
@@ -261,37 +249,16 @@ def straight_columns(problem: Problem, start: Solution, apparent_xyz: FloatArray
         By pose, point and shared unknowns; the residuals are orthogonal to these columns.
     """
     o = len(problem.given.camera)
-    tests = np.zeros((o, 2, SURFACE + problem.given.shared))
     dry = problem.given._replace(wet=np.zeros(len(problem.given.wet), np.bool_), weight=np.ones(o))
     state = start.state._replace(xyz=np.ascontiguousarray(apparent_xyz))
-    in_parts(lambda span, _, work: _columns(span, state, dry, tests, work), dry)
+    rows = linearised(state, dry, PLAIN, 0, len(apparent_xyz))
+    tests = np.zeros((o, 2, SHARED + problem.given.shared))
+    tests[rows.observation[rows.is_image]] = rows.columns[rows.is_image]
     return tests
 
 
-@device
-def _copy_columns(work: Workspace, a: int, columns: FloatArray) -> None:
-    """Copy the derivatives of an observation by its own and the shared unknowns."""
-    for k in range(2):
-        for j in range(SURFACE):
-            columns[k, j] = work.own[a, k, j]
-        for j in range(work.shared.shape[2]):
-            columns[k, SURFACE + j] = work.shared[a, k, j]
-
-
-@kernel
-def _columns(span: Span, state: State, given: Given, tests: FloatArray, work: Workspace) -> None:
-    for p in range(*span):
-        for o in range(given.start[p], given.start[p + 1]):
-            if linearise(state, given, PLAIN, p, o, work, 0):
-                _copy_columns(work, 0, tests[o])
-
-
 def solve_unaware(
-    problem: Problem,
-    start: Solution,
-    tests: FloatArray,
-    is_tested: BoolArray,
-    progress: Progress | None = None,
+    problem: Problem, start: Solution, tests: FloatArray, progress: Progress | None = None
 ) -> Solution:
     """Find poses, lens and points whose residuals are orthogonal to the original columns.
 
@@ -300,14 +267,25 @@ def solve_unaware(
     problem, start : Problem, Solution
         Of `pcfix.adjust.problem.prepare`; points of the cloud were observed where the original
         cameras image them.
-    tests : array, shape (o, 2, 9 + g)
-        Of `straight_columns`.
-    is_tested : array of bool, shape (m,)
-        Points of the cloud. The others, control points, are adjusted by least squares.
+    tests : array, shape (t, 2, 9 + g)
+        Of `straight_columns`, for the points of the cloud. The others, control points, are adjusted
+        by least squares.
     """
+    given = problem.given._replace(tests=tests)
+    slots = pair_slots(given.start, given.camera, len(problem.block.cameras), ordered=True)
+    tested = replace(problem, given=given, slots=slots)
     now, log, size = start, list(start.log), np.inf
     for number in range(1, MAX_STEPS + 1):
-        step, points = _newton(problem, now, tests, is_tested)
+        reduced, step = reduced_at(tested, now, TESTED), np.zeros(len(problem.moves))
+        matrix: Any = reduced.matrix  # not symmetric
+        scale = 1.0 / np.sqrt(np.maximum(np.abs(matrix.diagonal()), 1e-300))
+        try:
+            step[reduced.active] = scale * np.linalg.solve(
+                matrix * scale * scale[:, None], scale * reduced.right
+            )
+        except np.linalg.LinAlgError:
+            raise _unsolved("the equations are singular") from None
+        points = point_steps(now.state, given, TESTED, step)
         moved = moved_by(problem, now, step, points)
         size = float(np.abs(points).max(initial=0.0)) if np.isfinite(points).all() else np.inf
         if moved is None or not size < LARGE_STEP_M:
@@ -329,136 +307,6 @@ def _unsolved(why: str) -> GeometryError:
         f"The poses cannot be adjusted by the cloud: {why}. Give tie points, GNSS positions of more"
         " images, or control points.",
     )
-
-
-def _newton(
-    problem: Problem, now: Solution, tests: FloatArray, is_tested: BoolArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the steps of poses and shared unknowns, shape (6 k + g,), and of the points."""
-    from scipy.linalg import solve as solve_full
-
-    size, given, state = len(problem.moves), problem.given, now.state
-    parts = PARTS if size <= 3000 else 2  # of memory
-    matrix, right = np.zeros((parts, size, size)), np.zeros((parts, size))
-    in_parts(
-        lambda span, part, work: _sum_tested(
-            span, state, given, tests, is_tested, matrix[part], right[part], work
-        ),
-        given,
-        parts,
-    )
-    total, side = matrix.sum(axis=0), right.sum(axis=0)
-    _, extra, extra_right = priors_at(problem, now)
-    total += extra if extra.ndim == 2 else np.diag(extra)
-    side += extra_right
-    step, active = np.zeros(size), np.flatnonzero(problem.moves)
-    scale = 1.0 / np.sqrt(np.maximum(np.abs(total.diagonal()[active]), 1e-300))
-    part = total[np.ix_(active, active)] * scale * scale[:, None]
-    try:
-        step[active] = scale * solve_full(part, scale * side[active])
-    except np.linalg.LinAlgError:
-        raise _unsolved("the equations are singular") from None
-    points = np.zeros((len(state.xyz), 3))
-    in_parts(
-        lambda span, _, work: _tested_points(
-            span, state, given, tests, is_tested, step, points, work
-        ),
-        given,
-    )
-    return step, points
-
-
-@device(allocates=True)
-def _test_point(
-    state: State, given: Given, tests: FloatArray, is_tested: bool, p: int, work: Workspace,
-    left: FloatArray,
-) -> int:  # fmt: skip
-    """Linearise a point and fill in the columns that test it; return how many rows count.
-
-    `left`, shape (most, 2, 9 + g), has the original columns if the point is tested, else those of
-    the point itself. The workspace has V = B_left' B, inverted, and B_left' r.
-    """
-    count, _ = linearise_point(state, given, PLAIN, p, work)
-    v, rhs = work.v, work.rhs
-    if not is_tested:
-        for a in range(count):
-            _copy_columns(work, a, left[a])
-        return count
-    v[:], rhs[:] = 0.0, 0.0
-    for a in range(count):
-        left[a] = given.weight[work.row[a]] * tests[work.row[a]]
-        for k in range(2):
-            for i in range(3):
-                rhs[i] += left[a, k, POINT + i] * work.r[a, k]
-                for j in range(3):
-                    v[i, j] += left[a, k, POINT + i] * work.own[a, k, POINT + j]
-    return count if count and inverted(v, 1e-12) else 0
-
-
-@kernel(allocates=True)
-def _sum_tested(
-    span: Span, state: State, given: Given, tests: FloatArray, is_tested: BoolArray,
-    matrix: FloatArray, side: FloatArray, work: Workspace,
-) -> None:  # fmt: skip
-    """Add up left'(pose, shared) times right, with the points eliminated: W_left V^-1 W_right."""
-    g, k, most, v, rhs = given.shared, len(state.centres), len(work.own), work.v, work.rhs
-    size = 6 * most + g
-    left, column = np.empty((most, 2, SURFACE + g)), np.empty(size, np.int64)
-    w_right, w_left, y = np.empty((3, size)), np.empty((size, 3)), np.empty(3)
-    for p in range(*span):
-        count = _test_point(state, given, tests, is_tested[p], p, work, left)
-        if count == 0:
-            continue
-        used = 6 * count + g
-        w_right[:, :used], w_left[:used] = 0.0, 0.0
-        for i in range(g):
-            column[6 * count + i] = 6 * k + i
-        for a in range(count):
-            own, shared, camera = work.own[a], work.shared[a], 6 * given.camera[work.row[a]]
-            for i in range(6):
-                column[6 * a + i] = camera + i
-            for axis in range(2):
-                for i in range(6 + g):
-                    # row i: a pose column, or a shared one at the border of the matrix
-                    of_pose = i < 6
-                    row = camera + i if of_pose else 6 * k + i - 6
-                    place = 6 * a + i if of_pose else 6 * count + i - 6
-                    by_left = left[a, axis, i] if of_pose else left[a, axis, SURFACE + i - 6]
-                    by_right = own[axis, i] if of_pose else shared[axis, i - 6]
-                    side[row] += by_left * work.r[a, axis]
-                    for j in range(6):
-                        matrix[row, camera + j] += by_left * own[axis, j]
-                    for j in range(g):
-                        matrix[row, 6 * k + j] += by_left * shared[axis, j]
-                    for j in range(3):
-                        w_left[place, j] += by_left * own[axis, POINT + j]
-                        w_right[j, place] += left[a, axis, POINT + j] * by_right
-        for i in range(used):
-            for j in range(3):
-                y[j] = w_left[i, 0] * v[0, j] + w_left[i, 1] * v[1, j] + w_left[i, 2] * v[2, j]
-            side[column[i]] -= y[0] * rhs[0] + y[1] * rhs[1] + y[2] * rhs[2]
-            line = matrix[column[i]]
-            for j in range(used):
-                line[column[j]] -= (
-                    y[0] * w_right[0, j] + y[1] * w_right[1, j] + y[2] * w_right[2, j]
-                )
-
-
-@kernel(allocates=True)
-def _tested_points(
-    span: Span, state: State, given: Given, tests: FloatArray, is_tested: BoolArray,
-    moved: FloatArray, steps: FloatArray, work: Workspace,
-) -> None:  # fmt: skip
-    left = np.empty((len(work.own), 2, SURFACE + given.shared))
-    for p in range(*span):
-        count = _test_point(state, given, tests, is_tested[p], p, work, left)
-        for a in range(count):
-            change = change_of(given, work, a, moved)
-            for i in range(3):
-                for axis in range(2):
-                    work.rhs[i] -= left[a, axis, POINT + i] * change[axis]
-        if count:
-            step_of_point(work, steps[p])
 
 
 # What absorbed refraction has done to a block
@@ -485,15 +333,6 @@ class Mended(NamedTuple):
     bed_m: FloatArray
 
 
-def images_of(xyz: FloatArray, cameras: Cameras) -> TiePoints:
-    """Return the points, shape (m, 3), in three or more frames, with straight images there."""
-    views = views_in_frame(xyz, cameras)
-    rows = np.flatnonzero(np.diff(views.start) >= LEAST_IMAGES_OF_POINT)
-    views = views.take(rows)
-    owner = np.repeat(rows, np.diff(views.start))
-    return TiePoints(xyz[rows], views, straight_images(xyz[owner], views.camera, cameras))
-
-
 def mended(
     xyz: FloatArray, cameras: Cameras, water: WaterSurface, refractive_index: float
 ) -> Mended:
@@ -504,12 +343,13 @@ def mended(
     xyz : array, shape (m, 3)
         Points of the apparent cloud, or tie points, spread over it; a thousand or two.
     """
-    counts = np.bincount(images_of(xyz, cameras).views.camera, minlength=len(cameras))
-    row = np.flatnonzero(counts >= LEAST_POINTS)
+    least, in_frame = LEAST_IMAGES_OF_POINT, views_in_frame(xyz, cameras)
+    shown = ties_of_cloud(xyz, in_frame, cameras, least).views.camera
+    row = np.flatnonzero(np.bincount(shown, minlength=len(cameras)) >= LEAST_POINTS)
     if len(row) < LEAST_IMAGES:
         raise _unsolved(f"only {len(row)} images have {LEAST_POINTS} points of the cloud")
     cameras = some_cameras(cameras, row)
-    ties = images_of(xyz, cameras)
+    ties = ties_of_cloud(xyz, views_in_frame(xyz, cameras), cameras, least)
     above = surface_above(water, ties.xyz)
     wet = is_submerged(ties.xyz[:, 2], above)
     if not wet.any():
@@ -523,7 +363,7 @@ def mended(
     )
     problem, begin = prepare(block, Unknowns(lens=("f",)))
     tests = straight_columns(problem, begin, ties.xyz - problem.origin)
-    found = solve_unaware(problem, begin, tests, np.ones(len(wet), np.bool_))
+    found = solve_unaware(problem, begin, tests)
     higher = found.state.xyz[:, 2] + problem.origin[2] - intersect_fixed(block).xyz[:, 2]
     known = np.isfinite(higher)
     return Mended(solved_cameras(problem, found), row, higher[~wet & known], higher[wet & known])

@@ -112,7 +112,7 @@ def adjust_ties(
                 share=share,
             )
         )
-    return adjusted_of(problem, now, precision, notes, "tie points", "direct")
+    return adjusted_of(problem, now, precision, notes, "tie points")
 
 
 def _cleaned(

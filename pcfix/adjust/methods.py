@@ -36,6 +36,7 @@ from pcfix.adjust.solve import reduced_at, solver
 from pcfix.errors import GeometryError, PcfixWarning, SettingError
 from pcfix.model import Cameras, FloatArray, GroundControl, IntArray, TiePoints, Views, WaterSurface
 from pcfix.options.survey import AdjustRules
+from pcfix.refract.choice import views_in_frame
 from pcfix.water.surface import surface_above
 
 LEAST_TIES = 100
@@ -109,20 +110,22 @@ def by_ties(
     if found.precision is not None:
         notes += undetermined(found.precision, unknowns)
         notes += correlated(found.precision)
-        if found.origin is not None:
-            wet = found.is_wet & np.isfinite(found.xyz).all(axis=1)
-            notes += shape_notes(found.precision, (found.xyz - found.origin)[wet, :2])
+        wet = found.is_wet & np.isfinite(found.xyz).all(axis=1)
+        notes += shape_notes(found.precision, (found.xyz - found.origin)[wet, :2])
     return replace(found, notes=[*notes, *datum_notes(found), *bed_notes(found)])
 
 
 def by_cloud(
-    material: Material, xyz: FloatArray, guesses: dict[str, Views], rules: AdjustRules,
+    material: Material, xyz: FloatArray, listed: Views | None, rules: AdjustRules,
     progress: Progress | None = None,
 ) -> Adjusted:  # fmt: skip
     """Adjust a block by points, shape (m, 3), of the apparent cloud that it made.
 
-    The guesses say which images contributed to them, each with its name.
+    The view list, if there is one, says which images contributed to them; so may all in frame.
     """
+    guesses = {"all images in frame": views_in_frame(xyz, material.original)}
+    if listed is not None:
+        guesses["the images of the view list"] = listed
     candidates: list[Candidate] = []
     notes: list[PcfixWarning] = []
     for name, views in guesses.items():
@@ -359,8 +362,7 @@ def offset_of(found: Adjusted) -> tuple[FloatArray, FloatArray] | None:
         sigma_px=np.where(found.used, found.block.sigma_px, np.inf),
     )  # fmt: skip
     problem, now = prepare(block, found.unknowns, found.origin)
-    if found.numbers is not None:
-        now = replace(now, state=now.state._replace(water=found.numbers))
+    now = replace(now, state=now.state._replace(water=found.numbers))
     problem = with_sigma(problem, noise_px(problem, now))
     weight = block.gnss_weights
     # axes of each image in the world: right, ahead, up

@@ -11,18 +11,22 @@ As each point is seen by few cameras, it is eliminated at once (Schur complement
 
 Only pairs of cameras that share a point have a block in S, so the cost is linear in the points. The
 points are summed in a fixed number of parts, so that the result does not depend on the threads.
+
+If the residuals shall be orthogonal to other columns than their own derivatives (`Given.tests`),
+the first factor of each product has those columns, and S is not symmetric.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from pcfix.adjust.block import PLANES
 from pcfix.adjust.collinearity import (
     POINT,
+    SHARED,
     SURFACE,
     Given,
     State,
@@ -37,7 +41,8 @@ from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import inverted
 from pcfix.model import BoolArray, FloatArray, IntArray
 
-PARTS = 8
+PARTS, MANY_PAIRS = 8, 250_000
+"""Parts of the sums, two of them from so many pairs of cameras on (72 MB each)."""
 LOST = 1e6
 """Cost of an observation whose point has left its image, as a weighted square."""
 
@@ -59,19 +64,26 @@ class Rule(NamedTuple):
 
 
 PLAIN = Rule()
+TESTED = Rule(singular=1e-12)
 UNDAMPED = Rule(singular=1e-11)
 """Leaves out points whose rays meet at less than about 1e-5 rad, which have no finite covariance.
 """
 
 
-def in_parts(run: Callable[[Span, int, Workspace], None], given: Given, parts: int = PARTS) -> None:
-    """Call ``run((first, last), part, workspace)`` for all parts of the points, in threads."""
-    m = len(given.start) - 1
+def in_parts(
+    run: Callable[..., None], state: State, given: Given, *more: Any, sums: Sequence[Any] = ()
+) -> None:
+    """Call ``run((first, last), state, given, *more, workspace)`` for parts of the points.
+
+    With `sums` there are as many parts, and each call gets its own after the others.
+    """
+    m, parts = len(given.start) - 1, len(sums) or PARTS
 
     def run_all(span: Span) -> None:
         work = workspace(given)
         for part in range(*span):
-            run((part * m // parts, (part + 1) * m // parts), part, work)
+            first, last = part * m // parts, (part + 1) * m // parts
+            run((first, last), state, given, *more, *sums[part : part + 1], work)
 
     in_tiles(run_all, parts)
 
@@ -87,7 +99,7 @@ def linearise(
 
     Returns whether the observation counts.
     """
-    own, shared, r = work.own[at], work.shared[at], work.r[at]
+    own, row, r = work.own, work.right[at], work.r[at]
     c, w = given.camera[o], given.weight[o]
     if w == 0.0:
         return False
@@ -103,45 +115,45 @@ def linearise(
         w *= np.sqrt(1.0 / (1.0 + square / (rule.scale * rule.scale)))
     group = given.group[c]
     first, last = given.first_lens[group], given.first_lens[group + 1]
+    shared = row[:, SHARED:]
     shared[:] = 0.0
     if last > first:
         lens, codes = state.lenses[given.lens_row[c]], given.code[first:last]
         lens_gradients(lens, work.ahead, codes, shared[:, first:last])
-    for i in range(min(PLANES, given.column.size)):
-        if given.column[i] >= 0:
-            shared[0, given.column[i]] = own[0, SURFACE + i]
-            shared[1, given.column[i]] = own[1, SURFACE + i]
+    for axis in range(2):
+        for i in range(SURFACE):
+            row[axis, i] = own[axis, i]
+        for i in range(min(PLANES, given.column.size)):
+            if given.column[i] >= 0:
+                shared[axis, given.column[i]] = own[axis, SURFACE + i]
     if given.similarity >= 0:
-        _similarity_gradients(state, given, c, own, shared)
+        _similarity_gradients(state, given, c, row)
     r *= w
-    own *= w
-    shared *= w
+    row *= w
     return True
 
 
 @device
-def _similarity_gradients(
-    state: State, given: Given, c: int, own: FloatArray, shared: FloatArray
-) -> None:
+def _similarity_gradients(state: State, given: Given, c: int, row: FloatArray) -> None:
     """Fill in the derivatives by a shift t, a turn phi and a scale s of all poses together.
 
     C moves by t + phi x d + s d with d = C - pivot, and R by exp(-R phi) R. Single poses do not
     move then.
     """
-    r, pivot, at = state.rotations[c], given.pivot, given.similarity
+    r, pivot, at = state.rotations[c], given.pivot, SHARED + given.similarity
     dx = state.centres[c, 0] - pivot[0]
     dy = state.centres[c, 1] - pivot[1]
     dz = state.centres[c, 2] - pivot[2]
-    for row in range(2):
-        cx, cy, cz = own[row, 3], own[row, 4], own[row, 5]
-        shared[row, at], shared[row, at + 1], shared[row, at + 2] = cx, cy, cz
+    for axis in range(2):
+        cx, cy, cz = row[axis, 3], row[axis, 4], row[axis, 5]
+        row[axis, at], row[axis, at + 1], row[axis, at + 2] = cx, cy, cz
         turn = (dy * cz - dz * cy, dz * cx - dx * cz, dx * cy - dy * cx)
         for i in range(3):
-            rolled = r[0, i] * own[row, 0] + r[1, i] * own[row, 1] + r[2, i] * own[row, 2]
-            shared[row, at + 3 + i] = turn[i] - rolled
-        shared[row, at + 6] = dx * cx + dy * cy + dz * cz
-        for i in range(6):
-            own[row, i] = 0.0
+            rolled = r[0, i] * row[axis, 0] + r[1, i] * row[axis, 1] + r[2, i] * row[axis, 2]
+            row[axis, at + 3 + i] = turn[i] - rolled
+        row[axis, at + 6] = dx * cx + dy * cy + dz * cz
+        for i in range(POINT):
+            row[axis, i] = 0.0
 
 
 @device
@@ -158,12 +170,12 @@ def linearise_point(
     for o in range(given.start[p], given.start[p + 1]):
         if linearise(state, given, rule, p, o, work, count):
             work.row[count] = o
-            _add_point(work, count)
+            _add_point(given, work, count)
             count += 1
     images = count
     if count and condition(state, given, p, work, count):
         work.row[count] = work.row[0]  # any camera will do: the derivatives by its pose are zero
-        _add_point(work, count)
+        _add_point(given, work, count)
         count += 1
     for i in range(3):
         weight = given.surveyed_weight[p, i]
@@ -178,21 +190,20 @@ def linearise_point(
 
 
 @device
-def _add_point(work: Workspace, at: int) -> None:
-    """Add B'B and B'r of a row."""
-    v, rhs, own, r = work.v, work.rhs, work.own[at], work.r[at]
-    for i in range(3):
+def _add_point(given: Given, work: Workspace, at: int) -> None:
+    """Set what tests a row, and add its B'B and B'r."""
+    v, rhs, right, left, r = work.v, work.rhs, work.right[at], work.left[at], work.r[at]
+    o = work.row[at]
+    if len(given.tests):
+        for axis in range(2):
+            for i in range(left.shape[1]):
+                is_tested = o < len(given.tests)
+                test = given.weight[o] * given.tests[o, axis, i] if is_tested else right[axis, i]
+                left[axis, i] = test
+    for i in range(POINT, POINT + 3):
         for j in range(3):
-            v[i, j] += own[0, POINT + i] * own[0, POINT + j] + own[1, POINT + i] * own[1, POINT + j]
-        rhs[i] += own[0, POINT + i] * r[0] + own[1, POINT + i] * r[1]
-
-
-@device
-def step_of_point(work: Workspace, step: FloatArray) -> None:
-    """Fill in V^-1 times the right side."""
-    v, rhs = work.v, work.rhs
-    for i in range(3):
-        step[i] = v[i, 0] * rhs[0] + v[i, 1] * rhs[1] + v[i, 2] * rhs[2]
+            v[i - POINT, j] += left[0, i] * right[0, POINT + j] + left[1, i] * right[1, POINT + j]
+        rhs[i - POINT] += left[0, i] * r[0] + left[1, i] * r[1]
 
 
 # Residuals
@@ -204,7 +215,7 @@ def residuals(state: State, given: Given) -> FloatArray:
     NaN where the camera does not image the point.
     """
     found = np.empty((len(given.camera), 2))
-    in_parts(lambda span, _, work: _residuals(span, state, given, found, work), given)
+    in_parts(_residuals, state, given, found)
     return found
 
 
@@ -233,8 +244,9 @@ def cost_of(squares: FloatArray, rule: Rule) -> float:
 class Sums(NamedTuple):
     """The reduced normal equations.
 
-    blocks : shape (slots, 6, 6), S_ij of the pairs of cameras of `pair_slots`, i <= j.
-    border : shape (k, 6, g); corner : shape (g, g).
+    blocks : shape (slots, 6, 6), S_ij of the pairs of cameras of `pair_slots`.
+    border : shape (k, 6, g), rows of poses and columns of shared unknowns; corner : shape (g, g).
+    foot : shape (k, g, 6), rows of shared unknowns; empty if S is symmetric.
     poses, shared : shape (k, 6) and (g,), the right sides.
     diagonal, shared_diagonal : diagonals of U and U_gg, for the damping.
     """
@@ -242,25 +254,28 @@ class Sums(NamedTuple):
     blocks: FloatArray
     border: FloatArray
     corner: FloatArray
+    foot: FloatArray
     poses: FloatArray
     shared: FloatArray
     diagonal: FloatArray
     shared_diagonal: FloatArray
 
 
-def pair_slots(start: IntArray, camera: IntArray, cameras: int) -> tuple[IntArray, IntArray]:
-    """Return the block of each pair of cameras, shape (k, k), and the pairs i <= j of the blocks.
+def pair_slots(
+    start: IntArray, camera: IntArray, cameras: int, *, ordered: bool = False
+) -> tuple[IntArray, IntArray]:
+    """Return the block of each pair i, j of cameras, shape (k, k), and the pairs of the blocks.
 
-    It is -1 for two cameras that share no point.
+    It is -1 for two cameras that share no point, and, without `ordered`, if i > j.
     """
     from scipy.sparse import csr_array
 
     sees = csr_array((np.ones(len(camera)), camera, start), (len(start) - 1, cameras))
     share = (sees.T @ sees).toarray() > 0.0
     np.fill_diagonal(share, True)
-    i, j = np.nonzero(np.triu(share))
+    i, j = np.nonzero(share if ordered else np.triu(share))
     slot = np.full((cameras, cameras), -1)
-    slot[i, j] = slot[j, i] = np.arange(len(i))
+    slot[i, j] = np.arange(len(i))
     return slot, np.column_stack([i, j])
 
 
@@ -270,11 +285,11 @@ def normal_equations(
     """Return the reduced normal equations at a state, `slots` as of `pair_slots`."""
     slot, pairs = slots
     k, g = len(state.centres), given.shared
-    shapes = (len(pairs), 6, 6), (k, 6, g), (g, g), (k, 6), (g,), (k, 6), (g,)
-    sums = [Sums(*map(np.zeros, shapes)) for _ in range(PARTS)]
-    in_parts(
-        lambda span, part, work: _sum_up(span, state, given, rule, slot, sums[part], work), given
-    )
+    foot = (k, g, 6) if len(given.tests) else (0, 0, 0)
+    shapes = (len(pairs), 6, 6), (k, 6, g), (g, g), foot, (k, 6), (g,), (k, 6), (g,)
+    parts = PARTS if len(pairs) < MANY_PAIRS else 2  # of memory
+    sums = [Sums(*map(np.zeros, shapes)) for _ in range(parts)]
+    in_parts(_sum_up, state, given, rule, slot, sums=sums)
     return Sums(*(np.sum(each, axis=0) for each in zip(*sums, strict=True)))
 
 
@@ -285,37 +300,51 @@ def _sum_up(
     """Add up the reduced normal equations of some points."""
     for p in range(*span):
         count, _ = linearise_point(state, given, rule, p, work)
-        work.w_shared[:] = 0.0
+        work.w_shared[:], work.w_shared_right[:] = 0.0, 0.0
         for a in range(count):
             _add_row(sums, given.camera[work.row[a]], slot, work, a)
         for a in range(count):
             _eliminate(sums, given, slot, work, a, count)
         if count:
-            _eliminate_shared(sums, work)
+            _eliminate_shared(sums, given, work, count)
 
 
 @device
 def _add_row(sums: Sums, c: int, slot: IntArray, work: Workspace, a: int) -> None:
     """Add U and right sides of one row, of camera c, and keep its W and W_g."""
-    own, shared, r, w, w_shared = work.own[a], work.shared[a], work.r[a], work.w[a], work.w_shared
-    u, border = sums.blocks[slot[c, c]], sums.border[c]
-    g = shared.shape[1]
+    left, right, r = work.left[a], work.right[a], work.r[a]
+    u, border, w, w_shared = sums.blocks[slot[c, c]], sums.border[c], work.w[a], work.w_shared
+    g = right.shape[1] - SHARED
     for i in range(6):
+        by_u, by_v = left[0, i], left[1, i]
         for j in range(6):
-            u[i, j] += own[0, i] * own[0, j] + own[1, i] * own[1, j]
+            u[i, j] += by_u * right[0, j] + by_v * right[1, j]
         for j in range(g):
-            border[i, j] += own[0, i] * shared[0, j] + own[1, i] * shared[1, j]
+            border[i, j] += by_u * right[0, SHARED + j] + by_v * right[1, SHARED + j]
         for j in range(3):
-            w[i, j] = own[0, i] * own[0, POINT + j] + own[1, i] * own[1, POINT + j]
-        sums.diagonal[c, i] += own[0, i] * own[0, i] + own[1, i] * own[1, i]
-        sums.poses[c, i] += own[0, i] * r[0] + own[1, i] * r[1]
+            w[i, j] = by_u * right[0, POINT + j] + by_v * right[1, POINT + j]
+        sums.diagonal[c, i] += by_u * right[0, i] + by_v * right[1, i]
+        sums.poses[c, i] += by_u * r[0] + by_v * r[1]
     for i in range(g):
+        by_u, by_v = left[0, SHARED + i], left[1, SHARED + i]
         for j in range(g):
-            sums.corner[i, j] += shared[0, i] * shared[0, j] + shared[1, i] * shared[1, j]
+            sums.corner[i, j] += by_u * right[0, SHARED + j] + by_v * right[1, SHARED + j]
         for j in range(3):
-            w_shared[i, j] += shared[0, i] * own[0, POINT + j] + shared[1, i] * own[1, POINT + j]
-        sums.shared_diagonal[i] += shared[0, i] ** 2 + shared[1, i] ** 2
-        sums.shared[i] += shared[0, i] * r[0] + shared[1, i] * r[1]
+            w_shared[i, j] += by_u * right[0, POINT + j] + by_v * right[1, POINT + j]
+        sums.shared_diagonal[i] += by_u * right[0, SHARED + i] + by_v * right[1, SHARED + i]
+        sums.shared[i] += by_u * r[0] + by_v * r[1]
+    if len(sums.foot):  # not symmetric: also with left and right exchanged
+        for j in range(6):
+            for i in range(g):
+                of_foot = left[0, SHARED + i] * right[0, j] + left[1, SHARED + i] * right[1, j]
+                sums.foot[c, i, j] += of_foot
+            for i in range(3):
+                of_pose = left[0, POINT + i] * right[0, j] + left[1, POINT + i] * right[1, j]
+                work.w_right[a, j, i] = of_pose
+        for j in range(g):
+            by_u, by_v = right[0, SHARED + j], right[1, SHARED + j]
+            for i in range(3):
+                work.w_shared_right[j, i] += left[0, POINT + i] * by_u + left[1, POINT + i] * by_v
 
 
 @device
@@ -323,44 +352,53 @@ def _eliminate(
     sums: Sums, given: Given, slot: IntArray, work: Workspace, a: int, count: int
 ) -> None:
     """Subtract the terms of row a with V^-1 from the equations, W_a V^-1 W_b' for all b."""
-    v, rhs, w, w_shared, y = work.v, work.rhs, work.w, work.w_shared, work.y
+    rhs, w_right, w_shared, y = work.rhs, work.w_right, work.w_shared_right, work.y
     c = given.camera[work.row[a]]
     for i in range(6):
-        for j in range(3):
-            y[i, j] = w[a, i, 0] * v[0, j] + w[a, i, 1] * v[1, j] + w[a, i, 2] * v[2, j]
+        _times_inverse(work.w[a, i], work.v, y[i])
         sums.poses[c, i] -= y[i, 0] * rhs[0] + y[i, 1] * rhs[1] + y[i, 2] * rhs[2]
         for j in range(len(w_shared)):
             sums.border[c, i, j] -= (
                 y[i, 0] * w_shared[j, 0] + y[i, 1] * w_shared[j, 1] + y[i, 2] * w_shared[j, 2]
             )
     for b in range(count):
-        # each pair of cameras once, the smaller first; both orders if one sees the point twice
-        if given.camera[work.row[b]] >= c:
-            s = sums.blocks[slot[c, given.camera[work.row[b]]]]
+        # each pair of cameras that has a slot; both orders if one camera sees the point twice
+        at = slot[c, given.camera[work.row[b]]]
+        if at >= 0:
+            s, w = sums.blocks[at], w_right[b]
             for i in range(6):
                 for j in range(6):
-                    s[i, j] -= y[i, 0] * w[b, j, 0] + y[i, 1] * w[b, j, 1] + y[i, 2] * w[b, j, 2]
+                    s[i, j] -= y[i, 0] * w[j, 0] + y[i, 1] * w[j, 1] + y[i, 2] * w[j, 2]
 
 
 @device
-def _eliminate_shared(sums: Sums, work: Workspace) -> None:
+def _eliminate_shared(sums: Sums, given: Given, work: Workspace, count: int) -> None:
     """Subtract W_g V^-1 W_g' and its right side."""
-    v, rhs, w = work.v, work.rhs, work.w_shared
-    for i in range(len(w)):
-        y0 = w[i, 0] * v[0, 0] + w[i, 1] * v[1, 0] + w[i, 2] * v[2, 0]
-        y1 = w[i, 0] * v[0, 1] + w[i, 1] * v[1, 1] + w[i, 2] * v[2, 1]
-        y2 = w[i, 0] * v[0, 2] + w[i, 1] * v[1, 2] + w[i, 2] * v[2, 2]
-        sums.shared[i] -= y0 * rhs[0] + y1 * rhs[1] + y2 * rhs[2]
-        for j in range(len(w)):
-            sums.corner[i, j] -= y0 * w[j, 0] + y1 * w[j, 1] + y2 * w[j, 2]
+    rhs, w_right, w_shared, y = work.rhs, work.w_right, work.w_shared_right, work.y[0]
+    for i in range(len(w_shared)):
+        _times_inverse(work.w_shared[i], work.v, y)
+        sums.shared[i] -= y[0] * rhs[0] + y[1] * rhs[1] + y[2] * rhs[2]
+        for j in range(len(w_shared)):
+            sums.corner[i, j] -= (
+                y[0] * w_shared[j, 0] + y[1] * w_shared[j, 1] + y[2] * w_shared[j, 2]
+            )
+        for a in range(count if len(sums.foot) else 0):
+            foot, w = sums.foot[given.camera[work.row[a]]], w_right[a]
+            for j in range(6):
+                foot[i, j] -= y[0] * w[j, 0] + y[1] * w[j, 1] + y[2] * w[j, 2]
+
+
+@device
+def _times_inverse(w: FloatArray, v: FloatArray, y: FloatArray) -> None:
+    """Fill in y = w V^-1."""
+    for j in range(3):
+        y[j] = w[0] * v[0, j] + w[1] * v[1, j] + w[2] * v[2, j]
 
 
 def point_steps(state: State, given: Given, rule: Rule, moved: FloatArray) -> FloatArray:
     """Return the steps of the points, shape (m, 3), given those of all others, (6 k + g,)."""
     steps = np.zeros((len(state.xyz), 3))
-    in_parts(
-        lambda span, _, work: _point_steps(span, state, given, rule, moved, steps, work), given
-    )
+    in_parts(_point_steps, state, given, rule, moved, steps)
     return steps
 
 
@@ -369,46 +407,78 @@ def _point_steps(
     span: Span, state: State, given: Given, rule: Rule, moved: FloatArray, steps: FloatArray,
     work: Workspace,
 ) -> None:  # fmt: skip
+    first, v, rhs = len(moved) - given.shared, work.v, work.rhs
     for p in range(*span):
         count, _ = linearise_point(state, given, rule, p, work)
         for a in range(count):
-            own, change = work.own[a], change_of(given, work, a, moved)
-            for i in range(3):
-                work.rhs[i] -= own[0, POINT + i] * change[0] + own[1, POINT + i] * change[1]
-        if count:
-            step_of_point(work, steps[p])
+            # by how much the other unknowns change this row
+            camera = 6 * given.camera[work.row[a]]
+            for axis in range(2):
+                row, change = work.right[a, axis], 0.0
+                for i in range(6):
+                    change += row[i] * moved[camera + i]
+                for i in range(given.shared):
+                    change += row[SHARED + i] * moved[first + i]
+                for i in range(3):
+                    rhs[i] -= work.left[a, axis, POINT + i] * change
+        for i in range(3 if count else 0):
+            steps[p, i] = v[i, 0] * rhs[0] + v[i, 1] * rhs[1] + v[i, 2] * rhs[2]
 
 
-@device
-def change_of(given: Given, work: Workspace, a: int, moved: FloatArray) -> tuple[float, float]:
-    """Return by how much a step of poses and shared unknowns changes row a."""
-    own, shared, camera = work.own[a], work.shared[a], 6 * given.camera[work.row[a]]
-    first, by_u, by_v = len(moved) - given.shared, 0.0, 0.0
-    for i in range(6):
-        by_u += own[0, i] * moved[camera + i]
-        by_v += own[1, i] * moved[camera + i]
-    for i in range(given.shared):
-        by_u += shared[0, i] * moved[first + i]
-        by_v += shared[1, i] * moved[first + i]
-    return by_u, by_v
+# The equations of single observations, and covariances
 
 
-# Undamped equations at a solution
+class Rows(NamedTuple):
+    """Observations of m points, weighted and linearised; rows that do not count are zero.
+
+    Each point has a row for each observation, and one more for a condition.
+
+    columns : shape (n, 2, 9 + g), derivatives by pose, point and shared unknowns.
+    r : shape (n, 2), residuals.
+    observation : shape (n,), of a condition any observation of its point.
+    is_image : shape (n,), whether the row is an image, not a condition.
+    inverse, rhs : shapes (m, 3, 3) and (m, 3), V^-1 and the right side of each point.
+    """
+
+    columns: FloatArray
+    r: FloatArray
+    observation: IntArray
+    is_image: BoolArray
+    inverse: FloatArray
+    rhs: FloatArray
 
 
-def fixed_points(state: State, given: Given) -> BoolArray:
-    """Return which points are fixed by their observations and their survey, shape (m,)."""
-    is_fixed = np.zeros(len(state.xyz), np.bool_)
-    in_parts(lambda span, _, work: _fixed_points(span, state, given, is_fixed, work), given)
-    return is_fixed
+def linearised(state: State, given: Given, rule: Rule, first: int, last: int) -> Rows:
+    """Return the rows of the points first to last."""
+    m = last - first
+    n = int(given.start[last] - given.start[first]) + m
+    rows = Rows(
+        np.zeros((n, 2, SHARED + given.shared)), np.zeros((n, 2)), np.zeros(n, np.int64),
+        np.zeros(n, np.bool_), np.zeros((m, 3, 3)), np.zeros((m, 3)),
+    )  # fmt: skip
+    _linearised((first, last), state, given, rule, rows, workspace(given))
+    return rows
 
 
 @kernel
-def _fixed_points(
-    span: Span, state: State, given: Given, is_fixed: BoolArray, work: Workspace
+def _linearised(
+    span: Span, state: State, given: Given, rule: Rule, rows: Rows, work: Workspace
 ) -> None:
     for p in range(*span):
-        is_fixed[p] = linearise_point(state, given, UNDAMPED, p, work)[0] > 0
+        count, images = linearise_point(state, given, rule, p, work)
+        point = p - span[0]
+        first = given.start[p] - given.start[span[0]] + point
+        for a in range(count):
+            at = first + a
+            rows.observation[at], rows.is_image[at] = work.row[a], a < images
+            for axis in range(2):
+                rows.r[at, axis] = work.r[a, axis]
+                for i in range(rows.columns.shape[2]):
+                    rows.columns[at, axis, i] = work.right[a, axis, i]
+        for i in range(3 if count else 0):
+            rows.rhs[point, i] = work.rhs[i]
+            for j in range(3):
+                rows.inverse[point, i, j] = work.v[i, j]
 
 
 def point_covariances(
@@ -422,10 +492,7 @@ def point_covariances(
     place = np.full(6 * len(state.centres) + given.shared, -1, np.int64)
     place[active] = np.arange(len(active))
     out = np.full((len(state.xyz), 6), np.nan)
-    in_parts(
-        lambda span, _, work: _point_covariances(span, state, given, place, inverse, out, work),
-        given,
-    )
+    in_parts(_point_covariances, state, given, place, inverse, out)
     return out
 
 
@@ -435,31 +502,30 @@ def _point_covariances(
     work: Workspace,
 ) -> None:  # fmt: skip
     g, v, poses = given.shared, work.v, 6 * len(state.centres)
-    y, at = np.empty((6 * len(work.own) + g, 3)), np.empty(6 * len(work.own) + g, np.int64)
+    y, at = np.empty((6 * len(work.row) + g, 3)), np.empty(6 * len(work.row) + g, np.int64)
     w, total = np.empty(3), np.empty((3, 3))
     for p in range(*span):
         count, _ = linearise_point(state, given, UNDAMPED, p, work)
         if count == 0:
             continue
-        # y: rows of W V^-1, of the unknowns that move
+        # y: rows of W V^-1, of the unknowns that move; at: their places in the inverse
         used = 0
-        for a in range(count):
-            own, camera = work.own[a], 6 * given.camera[work.row[a]]
-            for i in range(6):
-                if place[camera + i] >= 0:
-                    for j in range(3):
-                        w[j] = own[0, i] * own[0, POINT + j] + own[1, i] * own[1, POINT + j]
-                    at[used], used = place[camera + i], used + 1
-                    _times_inverse(w, v, y[used - 1])
-        for i in range(g):
-            if place[poses + i] >= 0:
-                w[:] = 0.0
-                for a in range(count):
-                    own, by = work.own[a], work.shared[a, :, i]
-                    for j in range(3):
-                        w[j] += by[0] * own[0, POINT + j] + by[1] * own[1, POINT + j]
-                at[used], used = place[poses + i], used + 1
-                _times_inverse(w, v, y[used - 1])
+        for i in range(6 * count + g):
+            # a pose parameter of one row, or a shared unknown, which is in all of them
+            of_pose = i < 6 * count
+            column = i % 6 if of_pose else SHARED + i - 6 * count
+            unknown = poses + i - 6 * count
+            if of_pose:
+                unknown = 6 * given.camera[work.row[i // 6]] + column
+            if place[unknown] < 0:
+                continue
+            w[:] = 0.0
+            for a in range(i // 6 if of_pose else 0, i // 6 + 1 if of_pose else count):
+                row = work.right[a]
+                for j in range(3):
+                    w[j] += row[0, column] * row[0, POINT + j] + row[1, column] * row[1, POINT + j]
+            at[used], used = place[unknown], used + 1
+            _times_inverse(w, v, y[used - 1])
         total[:] = v
         for i in range(used):
             s0, s1, s2 = 0.0, 0.0, 0.0
@@ -472,10 +538,3 @@ def _point_covariances(
                 total[j, 2] += y[i, j] * s2
         out[p, 0], out[p, 1], out[p, 2] = total[0, 0], total[0, 1], total[0, 2]
         out[p, 3], out[p, 4], out[p, 5] = total[1, 1], total[1, 2], total[2, 2]
-
-
-@device
-def _times_inverse(w: FloatArray, v: FloatArray, y: FloatArray) -> None:
-    """Fill in y = w V^-1."""
-    for j in range(3):
-        y[j] = w[0] * v[0, j] + w[1] * v[1, j] + w[2] * v[2, j]

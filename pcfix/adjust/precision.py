@@ -30,7 +30,7 @@ from pcfix.adjust.block import (
     lens_parameter,
     moved_lens,
 )
-from pcfix.adjust.normal import fixed_points, point_covariances
+from pcfix.adjust.normal import point_covariances
 from pcfix.adjust.problem import Problem, Solution, polynomial, pose_gradients
 from pcfix.adjust.solve import (
     BED,
@@ -143,14 +143,11 @@ def precision_of(
     notes: list[PcfixWarning] = []
     points: FloatArray | None = None
     members: Members | None = None
-    if loose := int((~fixed_points(state, given)).sum()):
-        notes.append(
-            PcfixWarning(
-                "adjust.loose_points",
-                f"{loose:,} points are not determined by their images and have no covariance.",
-                points=loose,
-            )
-        )
+    is_fixed = np.isfinite(point_covariances(state, given, active[:0], np.zeros((0, 0)))[:, 0])
+    if not is_fixed.all():
+        loose = int((~is_fixed).sum())
+        words = f"{loose:,} points are not determined by their images and have no covariance."
+        notes.append(PcfixWarning("adjust.loose_points", words, points=loose))
     if len(active) <= DENSE_UP_TO:
         inverse = _inverse(reduced)
         if inverse is None:

@@ -28,7 +28,7 @@ from pcfix.adjust.block import (
     sensor_groups,
     usable_codes,
 )
-from pcfix.adjust.collinearity import Given, State, Workspace, condition
+from pcfix.adjust.collinearity import SHARED, Given, State, Workspace, condition
 from pcfix.adjust.normal import PLAIN, Rule, cost_of, in_parts, pair_slots, point_steps, residuals
 from pcfix.errors import GeometryError
 from pcfix.kernels import Span, kernel
@@ -162,7 +162,7 @@ def prepare(
             " raster."
         )
         raise GeometryError("adjust.fixed_surface", words, unknown=what)
-    numbers = _surface_numbers(block, origin)
+    numbers = surface_numbers(block, origin)
     planes, plane_names, axis, alike = _planes(block, origin, numbers)
     # columns of the shared unknowns: lenses, then surface and planes, then a similarity
     first_lens = np.concatenate([[0], np.cumsum([len(one) for one in codes])]).astype(np.int64)
@@ -214,6 +214,7 @@ def prepare(
         if conditions is None
         else np.where(conditions.on >= 0, 1.0 / conditions.sigma_m, 0.0),
         axis=axis,
+        tests=np.zeros((0, 2, SHARED + len(names))),
     )
     poses = [
         unknowns.poses == "free" and label not in unknowns.fixed_images for label in cameras.labels
@@ -230,7 +231,7 @@ def prepare(
     return problem, Solution(state, cameras.lenses, np.zeros(len(names)), np.inf, [])
 
 
-def _surface_numbers(block: Block, origin: FloatArray) -> FloatArray:
+def surface_numbers(block: Block, origin: FloatArray) -> FloatArray:
     """Return the start values of `WATER_NAMES`, shape (11,)."""
     water, numbers = block.water, np.zeros(len(WATER_NAMES))
     numbers[INDEX] = block.refractive_index
@@ -468,7 +469,7 @@ def survey_cost(problem: Problem, found: Solution) -> float:
 def surface_distances(problem: Problem, found: Solution) -> FloatArray:
     """Return surface minus point, shape (m,), metres along its axis; NaN for points on none."""
     off, given, state = np.full(len(found.state.xyz), np.nan), problem.given, found.state
-    in_parts(lambda span, _, work: _surface_distances(span, state, given, off, work), given)
+    in_parts(_surface_distances, state, given, off)
     return off
 
 

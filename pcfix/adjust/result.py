@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
@@ -14,6 +14,7 @@ from pcfix.adjust.block import (
     LEAST_VIEWS,
     NAMES,
     PORT,
+    SHAPE,
     WATER,
     WATER_NAMES,
     Block,
@@ -25,6 +26,7 @@ from pcfix.adjust.block import (
 from pcfix.adjust.normal import residuals
 from pcfix.adjust.precision import Precision, correlated, undetermined
 from pcfix.adjust.problem import (
+    Intersected,
     LogRow,
     Problem,
     Solution,
@@ -33,6 +35,7 @@ from pcfix.adjust.problem import (
     prepare,
     solved_cameras,
     surface_distances,
+    surface_numbers,
     water_of,
 )
 from pcfix.adjust.solve import solve
@@ -45,10 +48,14 @@ Source = Literal["tie points", "cloud"]
 Plain = dict[str, Any]
 
 MOST_DEPTH_BINS = 8
+WATER_SIGMAS = (
+    "level_sigma_m", "tilt_sigma", "index_sigma", "shape_sigma", "distance_sigma_m",
+    "centre_sigma_m",
+)  # fmt: skip
+"""Standard deviations among `Unknowns`."""
 
 
-@dataclass(frozen=True)
-class ControlRow:
+class ControlRow(NamedTuple):
     """A surveyed point: adjusted minus surveyed in metres, and its residuals in the images."""
 
     name: str
@@ -100,18 +107,17 @@ class Adjusted:
     rounds : list of LogRow
     source : {"tie points", "cloud"}
         What was observed: measured tie points, or images of the apparent cloud.
-    engine : str
     precision : Precision or None
     gnss_residual_m : array, shape (k, 3)
         Adjusted projection centres minus GNSS positions; NaN where there is none.
     control : list of ControlRow
     notes : list of PcfixWarning
+    origin, numbers : array
+        Origin of the block's frame, and `pcfix.adjust.collinearity.State.water` there.
     port : Port or None
         Adjusted.
     on_surfaces : list of OnSurface
         Of points that lie on the water or on planes.
-    origin, numbers : array or None
-        Origin of the block's frame, and `pcfix.adjust.collinearity.State.water` there.
     """
 
     block: Block
@@ -127,27 +133,19 @@ class Adjusted:
     redundancy: int
     rounds: list[LogRow]
     source: Source
-    engine: str
     precision: Precision | None
     gnss_residual_m: FloatArray
     control: list[ControlRow]
     notes: list[PcfixWarning]
+    origin: FloatArray
+    numbers: FloatArray
     port: Port | None = None
     on_surfaces: list[OnSurface] = field(default_factory=list)
-    origin: FloatArray | None = None
-    numbers: FloatArray | None = None
 
     @property
     def is_observed(self) -> BoolArray:
         """Points with observations that were used, shape (m,)."""
         return np.bincount(self.block.owner[self.used], minlength=len(self.xyz)) > 0
-
-    def residual_m(self) -> FloatArray:
-        """Return the residuals on the ground, by distance over focal length, shape (o, 2)."""
-        block, camera = self.block, self.block.camera
-        away = np.linalg.norm(self.xyz[block.owner] - self.cameras.centres[camera], axis=1)
-        focal = np.array([lens.focal for lens in self.cameras.lenses or ()])[camera]
-        return np.asarray(self.residual_px * (away / focal)[:, None])
 
     def depth_m(self) -> FloatArray | None:
         """Return the depths of the points below the water, shape (m,); None without water.
@@ -178,7 +176,7 @@ def redundancy_of(problem: Problem) -> int:
 
 def adjusted_of(
     problem: Problem, now: Solution, precision: Precision | None, notes: list[PcfixWarning],
-    source: Source, engine: str,
+    source: Source,
 ) -> Adjusted:  # fmt: skip
     """Return a solution as a result, with check points intersected."""
     block, state = problem.block, now.state
@@ -203,7 +201,6 @@ def adjusted_of(
         redundancy=redundancy_of(problem),
         rounds=now.log,
         source=source,
-        engine=engine,
         precision=precision,
         gnss_residual_m=np.where(block.gnss_weights > 0.0, off, np.nan),
         control=_control_rows(block, xyz, r),
@@ -265,37 +262,26 @@ def _on_surfaces(problem: Problem, now: Solution) -> list[OnSurface]:
 # Plain values
 
 
-class Before(NamedTuple):
-    """The block with its original poses, lenses and water.
-
-    xyz : shape (m, 3), true points, metres, world frame; NaN where rays do not intersect.
-    residual_px : shape (o, 2), measured minus computed; NaN there too.
-    """
-
-    xyz: FloatArray
-    residual_px: FloatArray
-
-
-def before_of(adjusted: Adjusted) -> Before:
-    """Intersect the points with the original poses, with refraction.
+def before_of(adjusted: Adjusted) -> Intersected:
+    """Intersect the points with the original poses, lenses and water, with refraction.
 
     Control points are intersected like all others, so that the residuals do not contain their
     survey; observations that the adjustment excluded stay excluded.
     """
     block = adjusted.block
-    free = replace(
-        block,
-        sigma_px=np.where(adjusted.used, block.sigma_px, np.inf),
-        surveyed_sigma_m=np.full_like(block.surveyed_sigma_m, np.inf),
+    found = intersect_fixed(
+        replace(
+            block,
+            sigma_px=np.where(adjusted.used, block.sigma_px, np.inf),
+            surveyed_sigma_m=np.full_like(block.surveyed_sigma_m, np.inf),
+        )
     )
-    found = intersect_fixed(free)
     met = (np.isfinite(found.squares) & adjusted.is_observed)[:, None]
-    problem, start = prepare(replace(free, xyz=found.xyz), Unknowns(poses="fixed", lens=()))
-    residual_px = residuals(start.state, problem.given)
-    return Before(np.where(met, found.xyz, np.nan), np.where(met[block.owner], residual_px, np.nan))
+    residual_px = np.where(met[block.owner], found.residual_px, np.nan)
+    return Intersected(np.where(met, found.xyz, np.nan), residual_px, found.start)
 
 
-def adjustment_dict(adjusted: Adjusted, before: Before | None = None) -> Plain:
+def adjustment_dict(adjusted: Adjusted, before: Intersected | None = None) -> Plain:
     """Return the content of adjustment.json; pcfix/cli/README.md lists its keys.
 
     Residuals before the adjustment need `before`, of `before_of`; without it they are None.
@@ -304,28 +290,23 @@ def adjustment_dict(adjusted: Adjusted, before: Before | None = None) -> Plain:
     kept = len(block.cameras) if u.poses == "fixed" else 0
     known, lenses = a.precision, block.cameras.lenses or ()
     notes = {str(one): one for one in [*a.notes, *(known.notes if known is not None else ())]}
-    return {
+    found = {
         "source": a.source,
-        "engine": a.engine,
+        "engine": "unaware" if a.source == "cloud" else "direct",
         "image_unit": lenses[0].unit,
         "images": len(block.cameras),
         "images_fixed": kept or sum(label in u.fixed_images for label in block.cameras.labels),
         "poses_are": u.poses,
         "port": block.port is not None,
         "unknowns": {
-            "lens": list(u.lens),
-            "lens_sigma": {name: number(value) for name, value in u.lens_sigma.items()},
-            "level_sigma_m": number(u.level_sigma_m),
-            "tilt_sigma": number(u.tilt_sigma),
-            "index_sigma": number(u.index_sigma),
-            "shape_sigma": number(u.shape_sigma),
-            "distance_sigma_m": number(u.distance_sigma_m),
-            "centre_sigma_m": number(u.centre_sigma_m),
+            "lens": u.lens,
+            "lens_sigma": u.lens_sigma,
+            **{name: getattr(u, name) for name in WATER_SIGMAS},
             "free_network": u.free_network,
-            "parallel": list(() if block.conditions is None else block.conditions.parallel),
+            "parallel": () if block.conditions is None else block.conditions.parallel,
         },
         **_counts(a),
-        "sigma0": number(a.sigma0),
+        "sigma0": a.sigma0,
         "redundancy": int(a.redundancy),
         "residuals": {
             "land": _residuals(a, before, ~a.is_wet),
@@ -345,40 +326,39 @@ def adjustment_dict(adjusted: Adjusted, before: Before | None = None) -> Plain:
             {
                 "round": row.round,
                 "steps": row.step,
-                "cost": number(row.cost),
+                "cost": row.cost,
                 "observations": row.observations,
-                "rms_px": number(row.rms_px),
+                "rms_px": row.rms_px,
             }
             for row in {row.round: row for row in a.rounds}.values()
         ],
         "notes": [one.as_dict() for one in notes.values()],
     }
+    return dict(_plain(found))
 
 
-def number(value: float | np.floating[Any] | None) -> float | None:
-    """Return a plain number; None if it is not finite."""
-    return float(value) if value is not None and np.isfinite(value) else None
+def _plain(value: Any) -> Any:
+    """Return a value as JSON can hold it: arrays as lists, None for numbers that are not finite."""
+    if isinstance(value, dict):
+        return {name: _plain(one) for name, one in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
-def numbers(values: FloatArray) -> list[float | None]:
-    """Return plain numbers, None for those that are not finite."""
-    return [number(value) for value in values]
+def mean(values: FloatArray) -> FloatArray:
+    """Return the mean of the finite values, of each column; NaN if there is none."""
+    known = np.isfinite(values)
+    count = known.sum(axis=0)
+    total = np.where(known, values, 0.0).sum(axis=0)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-def rms(values: FloatArray) -> float | None:
-    """Return the root mean square of the finite values; None if there is none."""
-    known = values[np.isfinite(values)]
-    return number(np.sqrt(np.mean(known * known))) if known.size else None
-
-
-def mean(values: FloatArray) -> float | None:
-    """Return the mean of the finite values; None if there is none."""
-    known = values[np.isfinite(values)]
-    return number(known.mean()) if known.size else None
-
-
-def _columns(of: Callable[[FloatArray], float | None], values: FloatArray) -> list[float | None]:
-    return [of(column) for column in values.T]
+def rms(values: FloatArray) -> FloatArray:
+    """Return the root mean square of the finite values, of each column; NaN if there is none."""
+    return np.asarray(np.sqrt(mean(values * values)))
 
 
 def nice_step(least: float) -> float:
@@ -397,45 +377,49 @@ def _counts(a: Adjusted) -> Plain:
     of_check = is_check[a.block.owner]
     return {
         "points": {
-            "all": int(observed.sum()),
-            "land": int((observed & ~a.is_wet).sum()),
-            "water": int((observed & a.is_wet).sum()),
-            "left_out": int((~observed & ~is_check).sum()),
+            "all": observed.sum(),
+            "land": (observed & ~a.is_wet).sum(),
+            "water": (observed & a.is_wet).sum(),
+            "left_out": (~observed & ~is_check).sum(),
             "control": roles.count("control"),
             "check": roles.count("check"),
         },
         "observations": {
-            "used": int(a.used.sum()),
-            "left_out": int((~a.used & ~of_check).sum()),
-            "of_check_points": int(of_check.sum()),
-            "out_of_sight": int((np.isnan(a.residual_px).any(axis=1) & a.used).sum()),
+            "used": a.used.sum(),
+            "left_out": (~a.used & ~of_check).sum(),
+            "of_check_points": of_check.sum(),
+            "out_of_sight": (np.isnan(a.residual_px).any(axis=1) & a.used).sum(),
         },
     }
 
 
-def _residuals(a: Adjusted, before: Before | None, points: BoolArray) -> Plain:
+def _residuals(a: Adjusted, before: Intersected | None, points: BoolArray) -> Plain:
     points = points & a.is_observed
     rows = a.used & points[a.block.owner]
     sigma = None if a.precision is None else a.precision.point_sigma_m
+    block, camera = a.block, a.block.camera[rows]
+    # on the ground: by distance over focal length
+    away = np.linalg.norm(a.xyz[block.owner[rows]] - a.cameras.centres[camera], axis=1)
+    focal = np.array([lens.focal for lens in a.cameras.lenses or ()])[camera]
     return {
-        "points": int(points.sum()),
+        "points": points.sum(),
         **_fit(a, before, rows),
-        "rms_xy_px": _columns(rms, a.residual_px[rows]),
-        "rms_m": rms(a.residual_m()[rows]),
-        "sigma_xyz_m": None if sigma is None else _columns(rms, sigma[points]),
+        "rms_xy_px": rms(a.residual_px[rows]),
+        "rms_m": rms((a.residual_px[rows] * (away / focal)[:, None]).ravel()),
+        "sigma_xyz_m": None if sigma is None else rms(sigma[points]),
     }
 
 
-def _fit(a: Adjusted, before: Before | None, rows: BoolArray) -> Plain:
+def _fit(a: Adjusted, before: Intersected | None, rows: BoolArray) -> Plain:
     """Return the number of some observations, and their residuals."""
     return {
-        "observations": int(rows.sum()),
-        "rms_before_px": None if before is None else rms(before.residual_px[rows]),
-        "rms_px": rms(a.residual_px[rows]),
+        "observations": rows.sum(),
+        "rms_before_px": None if before is None else rms(before.residual_px[rows].ravel()),
+        "rms_px": rms(a.residual_px[rows].ravel()),
     }
 
 
-def _depth_bins(a: Adjusted, before: Before | None) -> list[Plain]:
+def _depth_bins(a: Adjusted, before: Intersected | None) -> list[Plain]:
     depth = a.depth_m()
     if depth is None or not a.is_wet.any():
         return []
@@ -449,10 +433,6 @@ def _depth_bins(a: Adjusted, before: Before | None) -> list[Plain]:
         if rows.any():
             bins.append({"from_m": i * step, "to_m": (i + 1) * step, **_fit(a, before, rows)})
     return bins
-
-
-def _sigma(a: Adjusted, name: str) -> float | None:
-    return None if a.precision is None else number(a.precision.sigma_of(name))
 
 
 def _lens(a: Adjusted) -> list[Plain]:
@@ -470,7 +450,7 @@ def _lens(a: Adjusted) -> list[Plain]:
                 "name": NAMES[code],
                 "before": lens_parameter(first, code),
                 "after": lens_parameter(after, code),
-                "sigma": _sigma(a, unknown),
+                "sigma": None if a.precision is None else a.precision.sigma_of(unknown),
             })  # fmt: skip
     return rows
 
@@ -479,48 +459,39 @@ def _water(a: Adjusted) -> Plain | None:
     original, adjusted = a.block.water, a.water
     if original is None or adjusted is None:
         return None
-    free = dict(zip(WATER_NAMES, a.unknowns.water_sigma, strict=True))
-    values: dict[str, tuple[float, float]] = {
-        "index": (a.block.refractive_index, a.refractive_index)
-    }
-    if a.unknowns.shape_sigma and a.numbers is not None and a.origin is not None:
-        start = prepare(a.block, a.unknowns, a.origin)[1].state.water
-        for i, name in enumerate(WATER_NAMES[:PORT]):
-            base = float(a.origin[2]) if name == "level" else 0.0
-            values[name] = base + float(start[i]), base + float(a.numbers[i])
-    elif isinstance(original, WaterPlane) and isinstance(adjusted, WaterPlane):
-        # the estimated level is that at the origin of the block
-        x, y, _ = np.round(a.block.cameras.centres.mean(axis=0)).tolist()
-        levels = [one.a + one.b * x + one.c * y for one in (original, adjusted)]
-        values["level"] = levels[0], levels[1]
-        values["tilt_x"] = original.b, adjusted.b
-        values["tilt_y"] = original.c, adjusted.c
-    else:
-        heights = [surface_above(water, a.xyz).height_m for water in (original, adjusted)]
-        known = np.isfinite(heights).all(axis=0)
-        if known.any():
-            values["level"] = float(heights[0][known].mean()), float(heights[1][known].mean())
-    found: Plain = {
-        name: {"before": was, "after": now, "sigma": _sigma(a, name), "free": bool(free[name])}
-        for name, (was, now) in values.items()
-    }
-    return {"surface": str(adjusted), **found}
+    names, height_m = ["level", "index"], float(a.origin[2])
+    if isinstance(original, WaterPlane):
+        names[1:1] = ["tilt_x", "tilt_y"]
+    else:  # the number is what is added to a mesh or raster
+        heights = surface_above(original, a.xyz).height_m
+        height_m = float(mean(heights))
+        names = names if np.isfinite(heights).any() else ["index"]
+    names += WATER_NAMES[SHAPE:PORT] if a.unknowns.shape_sigma else []
+    return {"surface": str(adjusted), **_numbers(a, names, height_m)}
 
 
 def _port(a: Adjusted) -> Plain | None:
-    if a.port is None or a.numbers is None:
+    if a.port is None:
         return None
-    start = prepare(a.block, a.unknowns, a.origin)[1].state.water
-    found: Plain = {"port": spec_of(a.port)}
-    for i, (name, sigma) in enumerate(zip(WATER_NAMES, a.unknowns.water_sigma, strict=True)):
-        if sigma and (i == INDEX or i >= PORT):
-            found[name] = {
-                "before": float(start[i]),
-                "after": float(a.numbers[i]),
-                "sigma": _sigma(a, name),
-                "free": True,
-            }
-    return found
+    free = zip(WATER_NAMES, a.unknowns.water_sigma, strict=True)
+    of_port = ("index", *WATER_NAMES[PORT:])
+    names = [name for name, sigma in free if sigma and name in of_port]
+    return {"port": spec_of(a.port), **_numbers(a, names)}
+
+
+def _numbers(a: Adjusted, names: Sequence[str], height_m: float = 0.0) -> dict[str, Plain]:
+    """Return parameters of the refracting surface; the level is about a height."""
+    start = surface_numbers(a.block, a.origin)
+    rows = {}
+    for name in names:
+        i, base = WATER_NAMES.index(name), height_m if name == "level" else 0.0
+        rows[name] = {
+            "before": base + start[i],
+            "after": base + a.numbers[i],
+            "sigma": None if a.precision is None else a.precision.sigma_of(name),
+            "free": bool(a.unknowns.water_sigma[i]),
+        }
+    return rows
 
 
 def _poses(a: Adjusted) -> Plain:
@@ -529,28 +500,25 @@ def _poses(a: Adjusted) -> Plain:
     before, after = np.asarray(a.block.cameras.rotations), np.asarray(a.cameras.rotations)
     turned = np.degrees(Rotation.from_matrix(after @ before.transpose(0, 2, 1)).magnitude())
     return {
-        "moved_mean_m": numbers(moved.mean(axis=0)),
+        "moved_mean_m": moved.mean(axis=0),
         "moved_rms_m": rms(far),
-        "moved_largest_m": number(far.max()),
+        "moved_largest_m": far.max(),
         "moved_largest_image": a.cameras.labels[int(far.argmax())],
         "turned_rms_deg": rms(turned),
-        "turned_largest_deg": number(turned.max()),
+        "turned_largest_deg": turned.max(),
     }
 
 
 def _precision(p: Precision, unknowns: Unknowns) -> Plain:
     centre, angle = p.centre_sigma_m, p.angle_sigma_deg
     moves = (centre > 0.0).any(axis=1) | (angle > 0.0).any(axis=1)
-    found: Plain = {"images": int(moves.sum())}
+    found: Plain = {"images": moves.sum()}
     for name, values in (("centre_{}_m", centre[moves]), ("angle_{}_deg", angle[moves])):
         known = bool(moves.any())
-        found[name.format("mean")] = numbers(values.mean(axis=0)) if known else None
-        found[name.format("largest")] = numbers(values.max(axis=0)) if known else None
-    found["shared"] = [
-        {"name": row.name, "added": number(row.added), "sigma": number(row.sigma)}
-        for row in p.shared
-    ]
-    found["correlation"] = [numbers(row) for row in p.correlation]
+        found[name.format("mean")] = values.mean(axis=0) if known else None
+        found[name.format("largest")] = values.max(axis=0) if known else None
+    found["shared"] = [row._asdict() for row in p.shared]
+    found["correlation"] = p.correlation
     found["doubts"] = [one.as_dict() for one in [*undetermined(p, unknowns), *correlated(p)]]
     return found
 
@@ -562,11 +530,11 @@ def _gnss(a: Adjusted) -> Plain | None:
     off = a.gnss_residual_m[known]
     far = np.linalg.norm(np.nan_to_num(off), axis=1)
     return {
-        "images": int(known.sum()),
-        "mean_m": _columns(mean, off),
-        "rms_m": _columns(rms, off),
-        "rms_before_m": _columns(rms, (a.block.cameras.centres - a.block.gnss_xyz)[known]),
-        "largest_m": number(far.max()),
+        "images": known.sum(),
+        "mean_m": mean(off),
+        "rms_m": rms(off),
+        "rms_before_m": rms((a.block.cameras.centres - a.block.gnss_xyz)[known]),
+        "largest_m": far.max(),
         "largest_image": a.cameras.labels[int(np.flatnonzero(known)[far.argmax()])],
     }
 
@@ -575,19 +543,10 @@ def _surveyed(rows: Sequence[ControlRow]) -> Plain | None:
     if not rows:
         return None
     off = np.array([[row.dx_m, row.dy_m, row.dz_m] for row in rows], np.float64)
+    points = [row._asdict() for row in rows]
     return {
-        "rms_m": _columns(rms, off),
-        "mean_m": _columns(mean, off),
+        "rms_m": rms(off),
+        "mean_m": mean(off),
         "rms_px": rms(np.array([row.rms_px for row in rows], np.float64)),
-        "points": [
-            {
-                "name": row.name,
-                "dx_m": number(row.dx_m),
-                "dy_m": number(row.dy_m),
-                "dz_m": number(row.dz_m),
-                "rms_px": number(row.rms_px),
-                "images": row.images,
-            }
-            for row in rows
-        ],
+        "points": [{name: row[name] for name in row if name != "role"} for row in points],
     }

@@ -21,19 +21,18 @@ that fields too small to be found count too. The unknowns move by A^-1 B e.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import fdtri
 
 from pcfix.adjust.block import CX, CY, FOCAL, effect_at_corner
-from pcfix.adjust.collinearity import POINT, Given, State, Workspace
-from pcfix.adjust.normal import UNDAMPED, in_parts, linearise_point, residuals
+from pcfix.adjust.collinearity import POINT, SHARED
+from pcfix.adjust.normal import UNDAMPED, Rows, linearised, residuals
 from pcfix.adjust.precision import Precision
 from pcfix.adjust.problem import Problem, Solution, water_of
 from pcfix.adjust.solve import Reduced, reduced_at, solver
 from pcfix.errors import PcfixWarning
-from pcfix.kernels import Span, device, kernel
 from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.water.surface import surface_above
 
@@ -57,6 +56,7 @@ shifts features with their slope, and outliers of the original adjustment are mi
 Focal length and principal point absorb it, so that poses and bed are right, and residuals do not
 show it. Rendered blocks, whose lens is known, had up to 1.5 times this."""
 
+POINTS_AT_ONCE = 5000
 POSE = ("angle about x", "angle about y", "angle about z", "centre x", "centre y", "centre z")
 
 
@@ -187,55 +187,70 @@ def pulls_of(problem: Problem, found: Solution, group: IntArray, drawn: FloatArr
     drawn : array, shape (o, 2) or (0, 2)
         Weighted residuals to use instead.
     """
-    pulls, given = np.zeros((int(group.max(initial=0)) + 1, len(problem.moves))), problem.given
-    rows, state = np.ascontiguousarray(group, np.int64), found.state
-    in_parts(
-        lambda span, _, work: _sum_pulls(span, state, given, rows, drawn, pulls, work), given, 1
-    )
+    count = int(group.max(initial=0)) + 1
+    pulls = np.zeros((count, len(problem.moves)))
+    for part in _parts(problem, found):
+        rows, r = part.rows, part.rows.r
+        if len(drawn):
+            r = np.where(rows.is_image[:, None], drawn[rows.observation], r)
+        pulls += part.product(part.by_group(group, r, count), part.others)
     return pulls
 
 
-@kernel(allocates=True)
-def _sum_pulls(
-    span: Span, state: State, given: Given, group: IntArray, drawn: FloatArray, pulls: FloatArray,
-    work: Workspace,
-) -> None:  # fmt: skip
-    left = np.empty((len(work.own), 2))
-    for p in range(*span):
-        count, images = linearise_point(state, given, UNDAMPED, p, work)
-        for a in range(count):
-            r = drawn[work.row[a]] if len(drawn) and a < images else work.r[a]
-            _add_pull(given, work, count, a, r[0], r[1], left, pulls[group[work.row[a]]])
+class _Part(NamedTuple):
+    """The linearised observations of some points: rows u and v of each, as sparse matrices.
 
-
-@device
-def _add_pull(
-    given: Given, work: Workspace, count: int, a: int, by_u: float, by_v: float, left: FloatArray,
-    sums: FloatArray,
-) -> None:  # fmt: skip
-    """Add J'(e - B V^-1 B'e) of a point's rows to sums, for a change e of row a only.
-
-    It is the right side of a change of one observation, with the point eliminated. `left`, shape
-    (count, 2), is filled with what is left of the change in each row.
+    others, points : columns A of poses and shared unknowns, and B of the points.
+    inverse : V^-1 of all points, a block diagonal matrix.
     """
-    v, own = work.v, work.own
-    first = len(sums) - given.shared
-    for b in range(count):
-        left[b, 0], left[b, 1] = (by_u, by_v) if a == b else (0.0, 0.0)
-    for i in range(3):
-        # movement of the point along axis i
-        moved = 0.0
-        for j in range(3):
-            moved += v[i, j] * (own[a, 0, POINT + j] * by_u + own[a, 1, POINT + j] * by_v)
-        for b in range(count):
-            left[b, 0] -= own[b, 0, POINT + i] * moved
-            left[b, 1] -= own[b, 1, POINT + i] * moved
-    for b in range(count):
-        camera = 6 * given.camera[work.row[b]]
-        for i in range(6):
-            sums[camera + i] += own[b, 0, i] * left[b, 0] + own[b, 1, i] * left[b, 1]
-        for i in range(given.shared):
-            sums[first + i] += work.shared[b, 0, i] * left[b, 0] + work.shared[b, 1, i] * left[b, 1]
+
+    rows: Rows
+    others: Any
+    points: Any
+    inverse: Any
+
+    def product(self, x: Any, y: Any) -> FloatArray:
+        """Return X'Y with the points eliminated, X'Y - X'B V^-1 B'Y."""
+        eliminated = (x.T @ self.points) @ (self.inverse @ (self.points.T @ y))
+        return np.asarray((x.T @ y - eliminated).toarray())
+
+    def by_group(self, group: IntArray, values: FloatArray, count: int) -> Any:
+        """Return values of u and v, shape (n, 2), in the column of their group."""
+        column = np.repeat(group[self.rows.observation], 2)
+        return _rows_of(values, column.reshape(-1, 1), count)
+
+
+def _rows_of(values: FloatArray, columns: IntArray, count: int) -> Any:
+    """Return a sparse matrix with equally many values in each row."""
+    from scipy.sparse import csr_array
+
+    first = np.arange(0, columns.size + 1, columns.shape[1])
+    return csr_array((values.ravel(), columns.ravel(), first), (len(columns), count))
+
+
+def _parts(problem: Problem, found: Solution) -> Iterator[_Part]:
+    """Yield the observations of all points, of some thousands at a time to save memory."""
+    from scipy.sparse import bsr_array
+
+    given, k, m = problem.given, len(found.state.centres), len(found.state.xyz)
+    for first in range(0, m, POINTS_AT_ONCE):
+        last = min(first + POINTS_AT_ONCE, m)
+        rows = linearised(found.state, given, UNDAMPED, first, last)
+        pose = 6 * given.camera[rows.observation][:, None] + np.arange(6)
+        shared = np.broadcast_to(6 * k + np.arange(given.shared), (len(pose), given.shared))
+        # one row more than observations in each point
+        owner = np.repeat(np.arange(last - first), np.diff(given.start[first : last + 1]) + 1)
+        of_point = 3 * owner[:, None] + np.arange(3)
+        both = np.delete(rows.columns, np.s_[POINT:SHARED], axis=2)
+        blocks = (rows.inverse, np.arange(last - first), np.arange(last - first + 1))
+        yield _Part(
+            rows,
+            _rows_of(both, np.repeat(np.hstack([pose, shared]), 2, axis=0), len(problem.moves)),
+            _rows_of(
+                rows.columns[:, :, POINT:SHARED], np.repeat(of_point, 2, axis=0), 3 * (last - first)
+            ),
+            bsr_array(blocks).tocsr(),
+        )
 
 
 # A smooth field over the frame
@@ -251,17 +266,6 @@ NO_FIELD = 1e-9
 """Share of the largest eigenvalue below which a field leaves nothing in the residuals."""
 
 
-class _Tiles(NamedTuple):
-    """Shifts along u and v of each tile of the frame, 2 t candidates.
-
-    pulls : B', shape (2 t, u); matrix : C, shape (2 t, 2 t); right : shape (2 t,).
-    """
-
-    pulls: FloatArray
-    matrix: FloatArray
-    right: FloatArray
-
-
 def _pulls_of_field(
     problem: Problem, found: Solution, tile: IntArray, sigma0: float, reduced: Reduced,
     solve_for: Callable[[FloatArray], FloatArray],
@@ -272,14 +276,20 @@ def _pulls_of_field(
 
     `tile` numbers the parts of the frame, none without observations; each sensor has its own.
     """
-    given, state = problem.given, found.state
-    size, count = len(problem.moves), int(tile.max()) + 1
-    tiles = _Tiles(np.zeros((2 * count, size)), np.zeros((2 * count,) * 2), np.zeros(2 * count))
-    rows = np.ascontiguousarray(tile, np.int64)
-    in_parts(lambda span, _, work: _sum_tiles(span, state, given, rows, tiles, work), given, 1)
-    taken_up = solve_for(np.column_stack([tiles.pulls[:, reduced.active].T, reduced.right]))
-    rest = np.column_stack([tiles.matrix, tiles.right])
-    rest -= tiles.pulls[:, reduced.active] @ taken_up
+    # B', C and right sides of shifts along u and v of each tile, 2 t candidates
+    count = int(tile.max()) + 1
+    pulls, rest = np.zeros((2 * count, len(problem.moves))), np.zeros((2 * count, 2 * count + 1))
+    for part in _parts(problem, found):
+        at, is_image = part.rows.observation, part.rows.is_image
+        weight = np.repeat(np.where(is_image, problem.given.weight[at], 0.0), 2)
+        column = (2 * tile[at][:, None] + np.arange(2)).reshape(-1, 1)
+        shifts = _rows_of(weight, column, 2 * count)
+        pulls += part.product(shifts, part.others)
+        rest[:, :-1] += part.product(shifts, shifts)
+        of_points = part.points @ (part.inverse @ part.rows.rhs.ravel())
+        rest[:, -1] += shifts.T @ (part.rows.r.ravel() - of_points)
+    active = pulls[:, reduced.active]
+    rest -= active @ solve_for(np.column_stack([active.T, reduced.right]))
     # in the eigenvectors of K R K' the pulls are independent, so that the likelihood is a product
     likely, halves = np.zeros((len(RANGES), len(STEPS))), []
     square = (LARGEST_PX * STEPS**3) ** 2  # dense where s is small
@@ -295,7 +305,7 @@ def _pulls_of_field(
     s2_of = (weight * square).sum(axis=1) / weight.sum()
     of_all = np.sum([s2 * half @ half.T for s2, half in zip(s2_of, halves, strict=True)], axis=0)
     whole = np.linalg.cholesky(of_all + 1e-12 * np.eye(2 * count))
-    return np.asarray(whole.T @ tiles.pulls)
+    return np.asarray(whole.T @ pulls)
 
 
 def _covariances_of_tiles(problem: Problem, tile: IntArray) -> list[FloatArray]:
@@ -311,30 +321,6 @@ def _covariances_of_tiles(problem: Problem, tile: IntArray) -> list[FloatArray]:
         np.asarray(np.kron(np.where(alike, np.exp(-0.5 * apart / length**2), 0.0), np.eye(2)))
         for length in RANGES
     ]
-
-
-@kernel(allocates=True)
-def _sum_tiles(
-    span: Span, state: State, given: Given, tile: IntArray, sums: _Tiles, work: Workspace
-) -> None:
-    """Add up B, C and right sides of a shift by one pixel, with the points eliminated."""
-    left, v = np.empty((len(work.own), 2)), work.v
-    for p in range(*span):
-        count, images = linearise_point(state, given, UNDAMPED, p, work)
-        for a in range(images):
-            weight = given.weight[work.row[a]]
-            for axis in range(2):
-                at, rest, own = 2 * tile[work.row[a]] + axis, work.r[a, axis], work.own[a, axis]
-                for i in range(3):
-                    for j in range(3):
-                        rest -= v[i, j] * own[POINT + j] * work.rhs[i]
-                sums.right[at] += weight * rest
-                by_u, by_v = (weight, 0.0) if axis == 0 else (0.0, weight)
-                _add_pull(given, work, count, a, by_u, by_v, left, sums.pulls[at])
-                for b in range(images):
-                    row = work.row[b]
-                    for k in range(2):
-                        sums.matrix[at, 2 * tile[row] + k] += given.weight[row] * left[b, k]
 
 
 # Observations of different quality

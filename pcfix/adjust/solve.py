@@ -203,7 +203,8 @@ def reduced_at(problem: Problem, found: Solution, rule: Rule = UNDAMPED) -> Redu
     own = np.diag(extra) if extra.ndim == 2 else extra
     damped = np.concatenate([sums.diagonal.ravel(), sums.shared_diagonal])
     damped = rule.damping * (damped + own) + (0.0 if extra.ndim == 2 else extra)
-    if size > DENSE_UP_TO:
+    is_tested = bool(len(problem.given.tests))  # then the matrix is not symmetric
+    if size > DENSE_UP_TO and not is_tested:
         from scipy import sparse
 
         total = _sparse(sums, pairs, k, g) + sparse.diags_array(damped)
@@ -212,9 +213,12 @@ def reduced_at(problem: Problem, found: Solution, rule: Rule = UNDAMPED) -> Redu
     matrix = np.zeros((size, size))
     blocks = matrix[: 6 * k, : 6 * k].reshape(k, 6, k, 6)
     blocks[pairs[:, 0], :, pairs[:, 1], :] = sums.blocks
-    blocks[pairs[:, 1], :, pairs[:, 0], :] = sums.blocks.transpose(0, 2, 1)
     matrix[: 6 * k, 6 * k :] = sums.border.reshape(6 * k, g)
-    matrix[6 * k :, : 6 * k] = matrix[: 6 * k, 6 * k :].T
+    if is_tested:
+        matrix[6 * k :, : 6 * k] = sums.foot.transpose(1, 0, 2).reshape(g, 6 * k)
+    else:
+        blocks[pairs[:, 1], :, pairs[:, 0], :] = sums.blocks.transpose(0, 2, 1)
+        matrix[6 * k :, : 6 * k] = matrix[: 6 * k, 6 * k :].T
     matrix[6 * k :, 6 * k :] = sums.corner
     matrix += extra if extra.ndim == 2 else 0.0
     matrix[np.diag_indices(size)] += damped
@@ -226,18 +230,8 @@ def _sparse(sums: Sums, pairs: IntArray, k: int, g: int) -> Any:
     from scipy import sparse
 
     i, j = pairs[:, 0], pairs[:, 1]
-    upper = sparse.coo_array(
-        (
-            sums.blocks.ravel(),
-            (
-                np.broadcast_to(
-                    6 * i[:, None, None] + np.arange(6)[:, None], sums.blocks.shape
-                ).ravel(),
-                np.broadcast_to(6 * j[:, None, None] + np.arange(6), sums.blocks.shape).ravel(),
-            ),
-        ),
-        (6 * k, 6 * k),
-    ).tocsc()
+    first = np.searchsorted(i, np.arange(k + 1))  # the pairs are in order
+    upper = sparse.bsr_array((sums.blocks, j, first), (6 * k, 6 * k)).tocsc()
     on_diagonal = sparse.block_diag(list(sums.blocks[i == j]), "csc")
     body = upper + upper.T - on_diagonal
     if g == 0:

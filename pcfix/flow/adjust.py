@@ -62,7 +62,6 @@ from pcfix.model import (
 from pcfix.options.declare import File, taken
 from pcfix.options.survey import WATER_UNKNOWNS, AdjustOptions
 from pcfix.port.shapes import FlatPort, Port
-from pcfix.refract.choice import views_in_frame
 from pcfix.water.index import index_of
 
 if TYPE_CHECKING:
@@ -187,10 +186,7 @@ def adjust_into(
         raise InputError("cameras.no_ties", words, path=name, ties=count, least=LEAST_TIES)
     else:
         xyz, listed = _sample(view, views, original)
-        guesses = {"all images in frame": views_in_frame(xyz, original)}
-        if listed is not None:
-            guesses["the images of the view list"] = listed
-        found = by_cloud(material, xyz, guesses, given, progress)
+        found = by_cloud(material, xyz, listed, given, progress)
 
     # 3. The result
     if control is not None:

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.adjust.result import Adjusted, Before, Plain, adjustment_dict, before_of
+from pcfix.adjust.problem import Intersected
+from pcfix.adjust.result import Adjusted, Plain, adjustment_dict, before_of
 from pcfix.grid.colours import DEPTH, DIFFERENCE, RAYS, UNCERTAINTY
 from pcfix.grid.maps import Maps, MapsBuilder
 from pcfix.model import FloatArray
@@ -19,7 +20,7 @@ from pcfix.report.map_data import Layer
 from pcfix.report.page import Report, Table, render
 from pcfix.report.text import Rows, filled, share
 
-__all__ = ["Before", "adjustment_dict", "adjustment_page", "adjustment_text", "before_of"]
+__all__ = ["adjustment_dict", "adjustment_page", "adjustment_text", "before_of"]
 
 WHERE = (("land", "on land"), ("water", "under water"))
 MOST_LISTED = 12
@@ -102,7 +103,7 @@ def adjustment_sentence(d: Plain) -> str:
     return ", ".join([*parts, *([f"residuals {residuals}"] if residuals else [])])
 
 
-def adjustment_text(adjusted: Adjusted, before: Before | None = None) -> str:
+def adjustment_text(adjusted: Adjusted, before: Intersected | None = None) -> str:
     """Return the summary of an adjustment as text.
 
     `before` is of `before_of`, for the residuals before.
@@ -120,7 +121,7 @@ def adjustment_text(adjusted: Adjusted, before: Before | None = None) -> str:
     return "\n".join([*lines, *(f"Note: {note}" for note in all_notes(d))])
 
 
-def adjustment_page(adjusted: Adjusted, before: Before | None = None) -> str:
+def adjustment_page(adjusted: Adjusted, before: Intersected | None = None) -> str:
     """Return the report of an adjustment as one self-contained HTML page.
 
     With `before`, of `before_of`, residuals and points before are shown too.
@@ -183,7 +184,7 @@ def _facts(d: Plain) -> Rows:
         "o_share": share(o["left_out"], o["used"] + o["left_out"]),
         "sigma0_words": fixed(d["sigma0"], 3), "rounds_count": len(rounds),
         "steps": sum(row["steps"] for row in rounds), "has_shape": has_shape,
-        "undone": "; adjustment without water undone" if d["engine"] == "unaware" else "",
+        "undone": "; adjustment without water undone" if d["source"] == "cloud" else "",
     })  # fmt: skip
     rows += [] if d["lens"] else [("lens", "fixed")]
     for label, row, unit in _unknowns(d):
@@ -273,7 +274,7 @@ def _unknowns(d: Plain) -> list[tuple[str, Plain, str]]:
 # Maps
 
 
-def _map(a: Adjusted, before: Before | None) -> tuple[Maps, list[Layer]]:
+def _map(a: Adjusted, before: Intersected | None) -> tuple[Maps, list[Layer]]:
     """Return maps of the points, averaged in cells."""
     unit = (a.block.cameras.lenses or ())[0].unit
     heights, depth = _means(a, a.xyz[:, 2]), a.depth_m()

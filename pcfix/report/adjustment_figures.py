@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.adjust.block import sensor_groups
-from pcfix.adjust.result import Adjusted, Before, Plain, nice_step, rms
+from pcfix.adjust.problem import Intersected
+from pcfix.adjust.result import Adjusted, Plain, nice_step, rms
 from pcfix.grid.colours import DIFFERENCE
 from pcfix.model import BoolArray, FloatArray
 from pcfix.report.page import AFTER, BEFORE, WATER, Picture, label_plan, new_figure
@@ -25,7 +26,7 @@ ARROW = 0.07
 ARROW_LOOK: Plain = {"angles": "xy", "scale_units": "xy", "zorder": 3}
 
 
-def pictures_of(d: Plain, adjusted: Adjusted, before: Before | None) -> list[Picture]:
+def pictures_of(d: Plain, adjusted: Adjusted, before: Intersected | None) -> list[Picture]:
     """Return the pictures of an adjustment."""
     drawn = (
         _block(d, adjusted), _by_depth(d, before), _vectors(adjusted, before),
@@ -78,7 +79,7 @@ def _block(d: Plain, a: Adjusted) -> Picture | None:
     return Picture("block", "Projection centres", alt, figure)
 
 
-def _by_depth(d: Plain, before: Before | None) -> Picture | None:
+def _by_depth(d: Plain, before: Intersected | None) -> Picture | None:
     """Draw residuals by depth, land first."""
     land = d["residuals"]["land"]
     bins = [("land", land)] if land["observations"] else []
@@ -111,7 +112,7 @@ def _by_depth(d: Plain, before: Before | None) -> Picture | None:
     return Picture("residuals_by_depth", "Residuals by depth", alt, figure)
 
 
-def _vectors(a: Adjusted, before: Before | None) -> Picture | None:
+def _vectors(a: Adjusted, before: Intersected | None) -> Picture | None:
     """Draw mean residual vectors over the image, of the sensor with most observations."""
     lenses = a.block.cameras.lenses or ()
     group, _ = sensor_groups(lenses)
@@ -135,11 +136,13 @@ def _vectors(a: Adjusted, before: Before | None) -> Picture | None:
         axes.locator_params(nbins=5)
         axes.set_xlabel(f"u ({lens.unit})")
     panels[0, 0].set_ylabel(f"v ({lens.unit})")
-    rest = {name: rms(np.concatenate(m[2:])) for name, m, _ in cells}
+    rest = {name: float(rms(np.concatenate(m[2:]))) for name, m, _ in cells if len(m[2])}
     alt = (
         f"Mean residuals (measured minus computed) by place in the image, enlarged alike; sensor"
         f" {lens.sensor or main + 1}. Lens and poses did not absorb these: "
-        + ", ".join(f"{name} {value:.3f} {lens.unit} rms" for name, value in rest.items() if value)
+        + ", ".join(
+            f"{name} {value:.3f} {lens.unit} rms" for name, value in rest.items() if value > 0.0
+        )
         + "."
     )
     return Picture("residual_vectors", "Residuals over the image", alt, figure)
@@ -162,7 +165,7 @@ def _cell_means(
     return u, v, du[column, row], dv[column, row]
 
 
-def _section(a: Adjusted, before: Before | None) -> Picture | None:
+def _section(a: Adjusted, before: Intersected | None) -> Picture | None:
     """Draw the points in a strip along the longest extent of the block, with the water."""
     middle = a.xyz.mean(axis=0)
     plan = a.xyz[:, :2] - middle[:2]

@@ -223,7 +223,7 @@ def test_similarity():
     given = given_of(similarity=0, shared=7, pivot=pivot)
     work = workspace(given)
     assert linearise(state_of(q, centre, rotation, lens, water), given, Rule(), 0, 0, work, 0)
-    assert not work.own[0, :, :6].any()  # the poses do not move on their own
+    assert not work.right[0, :, :6].any()  # the poses do not move on their own
     wanted = []
     for i in range(7):
         ends = []
@@ -235,4 +235,4 @@ def test_similarity():
             moved = pivot + by[:3] + (1.0 + by[6]) * turn @ (centre - pivot)
             ends.append(at(q, moved, rotation @ turn.T, lens, water, given))
         wanted.append((ends[0] - ends[1]) / (2.0 * step))
-    close(work.shared[0], np.column_stack(wanted))
+    close(work.right[0, :, 9:], np.column_stack(wanted))

@@ -11,8 +11,8 @@ import pytest
 
 from pcfix.adjust.block import Block, Unknowns
 from pcfix.adjust.precision import Precision, SharedUnknown
-from pcfix.adjust.problem import LogRow
-from pcfix.adjust.result import Adjusted, Before, ControlRow, adjustment_dict, before_of
+from pcfix.adjust.problem import Intersected, LogRow
+from pcfix.adjust.result import Adjusted, ControlRow, adjustment_dict, before_of
 from pcfix.errors import PcfixWarning
 from pcfix.model import Cameras, Lens, WaterPlane
 from pcfix.report.adjustment import adjustment_page, adjustment_text
@@ -88,12 +88,14 @@ def adjusted():
         ControlRow("G2", "control", 0.010, 0.020, -0.050, 0.7, 2),
         ControlRow("C1", "check", -0.040, 0.000, 0.060, 0.8, 3),
     ]
+    origin = np.round(before.centres.mean(axis=0))
     gnss = np.array([[0.01, 0.02, 0.03], [0.05, -0.02, 0.09], [np.nan] * 3])
     return Adjusted(
         make_block(xyz, pinhole(xyz, before), before), Unknowns(level_sigma_m=0.1), after,
         WaterPlane(LEVEL + 0.02), 1.34, xyz, residual, used, is_wet, 1.234, 60, rounds,
-        "tie points", "direct", make_precision(len(xyz)), gnss, control,
-        [PcfixWarning("adjust.lens", "something <decided>")],
+        "tie points", make_precision(len(xyz)), gnss, control,
+        [PcfixWarning("adjust.lens", "something <decided>")], origin,
+        np.array([LEVEL + 0.02 - origin[2], 0.0, 0.0, 1.34, *[0.0] * 7]),
     )  # fmt: skip
 
 
@@ -111,7 +113,7 @@ def make_precision(m):
 def before_px(adjusted):
     """Return residuals before that are 1.2 px on land and 2.4 px under water."""
     size = np.where(adjusted.is_wet, 2.4, 1.2).repeat(3)[:, None]
-    return Before(adjusted.xyz - [0.0, 0.0, 1.0], size * np.array([1.0, 1.0]))
+    return Intersected(adjusted.xyz - [0.0, 0.0, 1.0], size * np.ones(2), adjusted.block.start)
 
 
 def test_text(adjusted):
