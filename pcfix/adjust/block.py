@@ -494,14 +494,11 @@ def gnss_with_sigma(
     if silent.any() and sigma_m is None:
         rest = off - np.nanmedian(off, axis=0)
         sigma_m = max(1.4826 * float(np.nanmedian(np.abs(rest))), LEAST_GNSS_SIGMA_M)
-        notes.append(
-            PcfixWarning(
-                "gnss.no_sigma",
-                f"The GNSS positions have no standard deviations; {sigma_m:.2f} m is assumed, from"
-                " their scatter about the projection centres. Give --gnss-sigma if you know it.",
-                sigma_m=sigma_m,
-            )
+        words = (
+            f"The GNSS positions have no standard deviations; {sigma_m:.2f} m is assumed, from"
+            " their scatter about the projection centres. Give --gnss-sigma if you know it."
         )
+        notes.append(PcfixWarning("gnss.no_sigma", words, sigma_m=sigma_m))
     if silent.any():
         sigma[silent] = sigma_m
     mean = np.nan_to_num(np.nanmean(off, axis=0))

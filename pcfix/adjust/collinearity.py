@@ -141,9 +141,6 @@ class Workspace(NamedTuple):
     same array in a least squares adjustment.
     r : shape (most, 2), weighted residuals; row : shape (most,), which observation each of them is.
     v, rhs : shapes (3, 3) and (3,), normal equations of the point.
-    w, w_right : shape (most, 6, 3), W = J'B of each row, with J of the left and B of the right
-    side, and the reverse; w_shared, w_shared_right : shape (g, 3), the same of shared unknowns.
-    y : shape (6, 3), W V^-1.
     """
 
     light: FloatArray
@@ -160,27 +157,16 @@ class Workspace(NamedTuple):
     row: IntArray
     v: FloatArray
     rhs: FloatArray
-    w: FloatArray
-    w_right: FloatArray
-    w_shared: FloatArray
-    w_shared_right: FloatArray
-    y: FloatArray
 
 
 def workspace(given: Given) -> Workspace:
     """Return a new workspace."""
     most = int(np.diff(given.start).max(initial=0)) + 1  # one more for a `condition`
     scratch = [np.zeros(shape) for shape in ((3, 12), 4, 3, (3, 8), 3, (3, 3), 7, (2, WIDTH))]
-    rows = (most, 2, SHARED + given.shared)
-    right, r, row = np.zeros(rows), np.zeros((most, 2)), np.zeros(most, np.int64)
-    v, rhs, y = np.zeros((3, 3)), np.zeros(3), np.zeros((6, 3))
-    w, w_shared = np.zeros((most, 6, 3)), np.zeros((given.shared, 3))
-    left, w_right, w_shared_right = right, w, w_shared
-    if len(given.tests):
-        left, w_right = np.zeros_like(right), np.zeros_like(w)
-        w_shared_right = np.zeros_like(w_shared)
-    rest = (right, left, r, row, v, rhs, w, w_right, w_shared, w_shared_right, y)
-    return Workspace._make((*scratch, *rest))
+    right = np.zeros((most, 2, SHARED + given.shared))
+    left = np.zeros_like(right) if len(given.tests) else right
+    r, row, v, rhs = np.zeros((most, 2)), np.zeros(most, np.int64), np.zeros((3, 3)), np.zeros(3)
+    return Workspace._make((*scratch, right, left, r, row, v, rhs))
 
 
 # The water

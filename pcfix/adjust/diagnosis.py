@@ -115,7 +115,6 @@ SENTENCES = {
     ),
 }
 """What each sign found, in the order in which they decide."""
-ORDER = ("tie points", "GNSS", "bed", "land", "control points", "neighbours", "focal length")
 SIZES = ("land", "GNSS", "tie points", "control points", "bed", "focal length")
 """Signs by how well they know the likely error: measured on land before predicted."""
 
@@ -183,11 +182,9 @@ class Diagnosis:
     @property
     def size(self) -> tuple[float, str] | None:
         """The likely error in metres, and which error that is."""
-        known = {sign.name: sign for sign in self.signs if sign.size_m is not None and sign.speaks}
-        for name in SIZES:
-            if name in known:
-                return float(known[name].size_m or 0.0), known[name].basis
-        return None
+        known = [sign for sign in self.signs if sign.size_m is not None and sign.speaks]
+        best = min(known, key=lambda sign: SIZES.index(sign.name), default=None)
+        return None if best is None else (float(best.size_m or 0.0), best.basis)
 
     def sentence(self, command: str, because: str = "") -> str:
         """Return a warning with the command that helps; empty if the poses seem right.
@@ -219,7 +216,7 @@ class Diagnosis:
 
 def diagnosis_of(signs: list[Sign]) -> Diagnosis:
     """Return the signs in the order in which they decide."""
-    return Diagnosis(tuple(sorted(signs, key=lambda sign: ORDER.index(sign.name))))
+    return Diagnosis(tuple(sorted(signs, key=lambda sign: [*SENTENCES].index(sign.name))))
 
 
 def export_of(cameras: Cameras) -> str:
@@ -271,14 +268,15 @@ def tie_point_sign(straight: Intersected, refracted: Intersected, depth_m: Float
     )
     cell = rank * PARTS // len(rank)
     share, sigma = _jackknifed(over, under, cell[:, 0] * PARTS + cell[:, 1])
-    figures = {
-        "share": share, "sigma_share": sigma, "land_px": _rms(straight, land),
-        "wet_straight_px": _rms(straight, wet), "wet_refracted_px": _rms(refracted, wet),
-        "straight_px_per_m": _slope(straight, wet, depth_m),
-        "refracted_px_per_m": _slope(refracted, wet, depth_m),
-    }  # fmt: skip
-    if land.sum() < LEAST_POINTS:
-        del figures["land_px"]
+    figures = {"share": share, "sigma_share": sigma}
+    for name, found in (("straight", straight), ("refracted", refracted)):
+        figures[f"wet_{name}_px"] = _rms(found, wet)
+        size = np.sqrt(found.squares[wet] / redundancy[wet])
+        is_flat = not np.ptp(depth_m[wet]) > 0.0
+        growth = 0.0 if is_flat else float(np.polyfit(depth_m[wet], size, 1)[0])
+        figures[f"{name}_px_per_m"] = growth
+    if land.sum() >= LEAST_POINTS:
+        figures["land_px"] = _rms(straight, land)
     return Sign("tie points", figures, _side(share, sigma))
 
 
@@ -305,22 +303,15 @@ def _rms(found: Intersected, rows: BoolArray) -> float:
     return float(np.sqrt(found.squares[rows].sum() / max(found.redundancy[rows].sum(), 1)))
 
 
-def _slope(found: Intersected, rows: BoolArray, depth_m: FloatArray) -> float:
-    """Return how residuals grow with depth, px per metre."""
-    size = np.sqrt(found.squares[rows] / found.redundancy[rows])
-    return float(np.polyfit(depth_m[rows], size, 1)[0]) if np.ptp(depth_m[rows]) > 0.0 else 0.0
-
-
 def sized(sign: Sign, mended: Mended) -> Sign:
     """Return a sign with the likely error, if refraction was absorbed."""
     if not sign.speaks:
         return sign
-    bed = float(np.sqrt(np.mean(mended.bed_m**2)))
-    if not len(mended.land_m):
-        return replace(sign, size_m=bed, basis="RMS, heights of the bed after its correction")
-    land = float(np.sqrt(np.mean(mended.land_m**2)))
-    basis = f"RMS, heights of the land; of the bed after its correction {bed:.2g} m"
-    return replace(sign, size_m=land, basis=basis)
+    size, basis = float(np.sqrt(np.mean(mended.bed_m**2))), "bed after its correction"
+    if len(mended.land_m):
+        basis = f"land; of the {basis} {size:.2g} m"
+        size = float(np.sqrt(np.mean(mended.land_m**2)))
+    return replace(sign, size_m=size, basis=f"RMS, heights of the {basis}")
 
 
 # GNSS
@@ -405,13 +396,19 @@ def land_sign(higher_m: FloatArray, gsd_m: float, against: str) -> Sign:
     found = higher_m[np.isfinite(higher_m)]
     if len(found) < 3:
         return Sign("land", {}, None, why=f"only {len(found)} places of {against} on land")
-    bias = float(np.median(found))
-    spread = 1.4826 * float(np.median(np.abs(found - bias)))
-    # the standard error of a median is 1.2533 times that of a mean
-    limit = max(SIGMAS * 1.2533 * spread / np.sqrt(len(found)), LAND_GSD * gsd_m)
+    bias, spread, sigma = _median_of(found)
+    limit = max(SIGMAS * sigma, LAND_GSD * gsd_m)
     figures = {"bias_m": bias, "spread_m": spread, "limit_m": limit, "places": float(len(found))}
     basis = f"height of the land against {against}"
     return Sign("land", figures, True if abs(bias) > limit else None, abs(bias), basis)
+
+
+def _median_of(values: FloatArray) -> tuple[float, float, float]:
+    """Return the median, the robust standard deviation, and the median's standard error."""
+    middle = float(np.median(values))
+    spread = 1.4826 * float(np.median(np.abs(values - middle)))
+    # 1.2533 times the standard error of a mean
+    return middle, spread, 1.2533 * spread / float(np.sqrt(len(values)))
 
 
 def bed_sign(apparent_m: FloatArray, true_m: FloatArray, refractive_index: float) -> Sign:
@@ -419,9 +416,7 @@ def bed_sign(apparent_m: FloatArray, true_m: FloatArray, refractive_index: float
     deep = np.isfinite(apparent_m) & (true_m > LEAST_DEPTH_M) & (apparent_m > 0.0)
     if deep.sum() < 3:
         return Sign("bed", {}, None, why=f"only {deep.sum()} measured depths")
-    ratio = apparent_m[deep] / true_m[deep]
-    share = float(np.median(ratio))
-    sigma = 1.2533 * 1.4826 * float(np.median(np.abs(ratio - share))) / np.sqrt(deep.sum())
+    share, _, sigma = _median_of(apparent_m[deep] / true_m[deep])
     limit = (1.0 + 1.0 / refractive_index) / 2.0  # between straight and refracted rays
     is_sure = abs(share - limit) > SIGMAS * sigma
     after = true_m[deep] - refractive_index * apparent_m[deep]

@@ -41,7 +41,7 @@ from pcfix.adjust.block import (
     ties_of_cloud,
 )
 from pcfix.adjust.collinearity import SHARED
-from pcfix.adjust.normal import PLAIN, TESTED, linearised, pair_slots, point_steps, residuals
+from pcfix.adjust.normal import PLAIN, TESTED, linearised, point_steps, residuals
 from pcfix.adjust.precision import precision_of
 from pcfix.adjust.problem import (
     LogRow,
@@ -272,8 +272,7 @@ def solve_unaware(
         by least squares.
     """
     given = problem.given._replace(tests=tests)
-    slots = pair_slots(given.start, given.camera, len(problem.block.cameras), ordered=True)
-    tested = replace(problem, given=given, slots=slots)
+    tested = replace(problem, given=given)
     now, log, size = start, list(start.log), np.inf
     for number in range(1, MAX_STEPS + 1):
         reduced, step = reduced_at(tested, now, TESTED), np.zeros(len(problem.moves))

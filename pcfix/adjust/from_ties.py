@@ -13,7 +13,7 @@ R = C - B' A^-1 B, and lower the squares by c' R^-1 c.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.special import chdtri
@@ -90,7 +90,12 @@ def adjust_ties(
         weak = weak_lens_parameters(problem, now, precision)
         kept = [name for name in unknowns.lens if name not in weak]
         more = missing_lens_parameters(problem, now, sigma0_of(problem, now))
-        notes = _lens_notes([*kept, *more], weak, more)
+        tests = f" ({', '.join(more)} found by tests of the residuals)" if more else ""
+        words = f"Lens parameters free: {', '.join([*kept, *more])}{tests}."
+        notes = [PcfixWarning("adjust.lens", words, free=[*kept, *more], found=more)]
+        if weak:
+            words = f"The block does not determine {', '.join(weak)} of the lens; they were fixed."
+            notes.append(PcfixWarning("adjust.weak_lens", words, fixed=weak))
         if weak or more:
             clean, now = _with_lens(clean, now, (*kept, *more), outliers, progress)
             problem, now, precision = _settled(clean, now, LAST_ROUND + 2, estimate, progress)
@@ -102,16 +107,13 @@ def adjust_ties(
     counted = np.isfinite(block.sigma_px) & problem.of_ties
     share = 1.0 - float(problem.used[counted].mean())
     if share >= MANY_OUT:
-        notes.append(
-            PcfixWarning(
-                "adjust.many_outliers",
-                f"{100.0 * share:.0f} % of the tie point observations are outliers (more than"
-                f" {OUTLIER_SIGMAS:g} standard deviations): mismatches, waves, moving objects, or"
-                " another lens or water surface than assumed. Check that the matching is the cause;"
-                " otherwise the standard errors are too small.",
-                share=share,
-            )
+        words = (
+            f"{100.0 * share:.0f} % of the tie point observations are outliers (more than"
+            f" {OUTLIER_SIGMAS:g} standard deviations): mismatches, waves, moving objects, or"
+            " another lens or water surface than assumed. Check that the matching is the cause;"
+            " otherwise the standard errors are too small."
         )
+        notes.append(PcfixWarning("adjust.many_outliers", words, share=share))
     return adjusted_of(problem, now, precision, notes, "tie points")
 
 
@@ -249,17 +251,6 @@ def default_lens(lenses: tuple[Lens, ...]) -> tuple[str, ...]:
     )
 
 
-def _lens_notes(free: list[str], weak: list[str], more: list[str]) -> list[PcfixWarning]:
-    """Return notes on which lens parameters are free, and what the tests found."""
-    tests = f" ({', '.join(more)} found by tests of the residuals)" if more else ""
-    words = f"Lens parameters free: {', '.join(free)}{tests}."
-    notes = [PcfixWarning("adjust.lens", words, free=free, found=more)]
-    if weak:
-        words = f"The block does not determine {', '.join(weak)} of the lens; they were fixed."
-        notes.append(PcfixWarning("adjust.weak_lens", words, fixed=weak))
-    return notes
-
-
 def weak_lens_parameters(problem: Problem, found: Solution, precision: Precision) -> list[str]:
     """Return lens parameters, except the focal length, that the block hardly determines.
 
@@ -279,15 +270,6 @@ def weak_lens_parameters(problem: Problem, found: Solution, precision: Precision
     return [] if squares > chdtri(max(len(rows), 1), BENT) else weak
 
 
-class _Candidates(NamedTuple):
-    """Lens parameters to test: codes, effects at the corner of the frame, R and c."""
-
-    code: IntArray
-    effect: FloatArray
-    matrix: FloatArray
-    pull: FloatArray
-
-
 def missing_lens_parameters(problem: Problem, now: Solution, sigma0: float) -> list[str]:
     """Return lens parameters that lower the squares by more than chance does, the best first.
 
@@ -298,37 +280,38 @@ def missing_lens_parameters(problem: Problem, now: Solution, sigma0: float) -> l
     sigma0 : float
         A-posteriori standard deviation of unit weight.
     """
-    tried = _candidates(problem, now)
+    found = _candidates(problem, now)
+    if found is None:
+        return []
+    code, effect, matrix, pull = found
+
+    def squares(codes: list[int]) -> tuple[float, FloatArray]:
+        """Return by how much these lower the squares, and their effects' standard errors."""
+        rows = np.isin(code, codes)
+        covariance = np.linalg.inv(matrix[np.ix_(rows, rows)])
+        gain = float(pull[rows] @ covariance @ pull[rows]) / max(sigma0, 1.0) ** 2
+        return gain, sigma0 * np.sqrt(covariance.diagonal()) * effect[rows]
+
     chosen: list[int] = []
-    while tried is not None:
-        gains = {
-            int(code): gain
-            for code in np.unique(tried.code)
-            if code not in chosen and (gain := _gain(tried, [*chosen, int(code)], sigma0))
-        }
+    while True:
+        before, gains = squares(chosen)[0], dict[int, float]()
+        for one in np.unique(code[~np.isin(code, chosen)]).tolist():
+            after, sigma_px = squares([*chosen, one])
+            limit = chdtri(int((code == one).sum()), SURE)
+            if (sigma_px <= WEAK_PX).all() and after - before > limit:
+                gains[one] = after - before
         if not gains:
-            break
+            return [NAMES[one] for one in chosen]
         chosen.append(max(gains, key=gains.__getitem__))
-    return [NAMES[code] for code in chosen]
 
 
-def _gain(tried: _Candidates, codes: list[int], sigma0: float) -> float:
-    """Return by how much the last parameter lowers the squares; zero if not significantly."""
-    rows = np.isin(tried.code, codes)
-    before = np.isin(tried.code, codes[:-1])
-    covariance = np.linalg.inv(tried.matrix[np.ix_(rows, rows)])
-    if (sigma0 * np.sqrt(covariance.diagonal()) * tried.effect[rows] > WEAK_PX).any():
-        return 0.0
-    gain = float(tried.pull[rows] @ covariance @ tried.pull[rows])
-    if before.any():
-        kept = np.linalg.solve(tried.matrix[np.ix_(before, before)], tried.pull[before])
-        gain -= float(tried.pull[before] @ kept)
-    gain /= max(sigma0, 1.0) ** 2
-    return gain if gain > chdtri(int(rows.sum() - before.sum()), SURE) else 0.0
+def _candidates(
+    problem: Problem, now: Solution
+) -> tuple[IntArray, FloatArray, FloatArray, FloatArray] | None:
+    """Return codes of lens parameters to test, their effects at the corner of the frame, R and c.
 
-
-def _candidates(problem: Problem, now: Solution) -> _Candidates | None:
-    """Return the candidates; None if there are none, or the equations are singular."""
+    None if there are none, or the equations are singular.
+    """
     lenses = problem.block.cameras.lenses or ()
     names = problem.unknowns.lens
     if any(lens.projection != "perspective" for lens in lenses):
@@ -336,10 +319,8 @@ def _candidates(problem: Problem, now: Solution) -> _Candidates | None:
     more = tuple(name for name in TRIED if name not in names)
     wide, start = prepare(problem.block, replace(problem.unknowns, lens=names + more))
     wide, given = wide.weighted(problem.given.weight), wide.given
-    codes = [CODES[name] for name in more]
-    is_tried = np.concatenate([
-        np.isin(given.code, codes), np.zeros(given.shared - len(given.code), np.bool_),
-    ])  # fmt: skip
+    is_tried = np.zeros(given.shared, np.bool_)
+    is_tried[: len(given.code)] = np.isin(given.code, [CODES[name] for name in more])
     shared = np.zeros(given.shared)
     shared[~is_tried] = now.shared
     reduced = reduced_at(wide, replace(start, state=now.state, lenses=now.lenses, shared=shared))
@@ -353,13 +334,12 @@ def _candidates(problem: Problem, now: Solution) -> _Candidates | None:
     if not isinstance(matrix, np.ndarray):
         border, own = border.toarray(), own.toarray()
     taken = solve_for(np.column_stack([border, reduced.right[~mine]]))
+    effect = np.concatenate([
+        [effect_at_corner(lenses[images[0]], code) for code in codes]
+        for images, codes in zip(wide.groups, wide.codes, strict=True)
+    ])  # fmt: skip
     rows = np.flatnonzero(is_tried)
-    group = np.searchsorted(given.first_lens, rows, side="right") - 1
-    effect = [
-        effect_at_corner(lenses[wide.groups[i][0]], int(given.code[row]))
-        for i, row in zip(group.tolist(), rows, strict=True)
-    ]
-    return _Candidates(
-        given.code[rows], np.array(effect), own - border.T @ taken[:, :-1],
+    return (
+        given.code[rows], effect[rows], own - border.T @ taken[:, :-1],
         reduced.right[mine] - border.T @ taken[:, -1],
     )  # fmt: skip

@@ -65,22 +65,24 @@ def unknowns_of(rules: AdjustRules, lens: tuple[str, ...]) -> Unknowns:
                 option="lens_unknowns",
                 value=name,
             )
+
+    def sigma_of(name: str, stated: float | None = None) -> float:
+        """Return a standard deviation: zero fixes a parameter, infinity frees it."""
+        if stated is None:
+            return np.inf if name in rules.free else 0.0
+        return stated
+
     tilt = None if rules.sigma_tilt is None else float(np.tan(np.radians(rules.sigma_tilt)))
-    sigma = {"level": rules.sigma_level, "tilt": tilt, "index": rules.sigma_index}
-    water = {
-        name: (np.inf if value is None else value) if name in rules.free or value else 0.0
-        for name, value in sigma.items()
-    }
     return Unknowns(
         poses=rules.poses,
         fixed_images=rules.fixed_images,
         lens=lens,
-        level_sigma_m=water["level"],
-        tilt_sigma=water["tilt"],
-        index_sigma=water["index"],
-        shape_sigma=np.inf if "shape" in rules.free else 0.0,
-        distance_sigma_m=np.inf if "distance" in rules.free else 0.0,
-        centre_sigma_m=np.inf if "centre" in rules.free else 0.0,
+        level_sigma_m=sigma_of("level", rules.sigma_level),
+        tilt_sigma=sigma_of("tilt", tilt),
+        index_sigma=sigma_of("index", rules.sigma_index),
+        shape_sigma=sigma_of("shape"),
+        distance_sigma_m=sigma_of("distance"),
+        centre_sigma_m=sigma_of("centre"),
         free_network=rules.datum == "free",
     )
 

@@ -9,8 +9,8 @@ As each point is seen by few cameras, it is eliminated at once (Schur complement
 
     S_ij -= W_i V^-1 W_j',   S_ig -= W_i V^-1 W_g',   S_gg -= W_g V^-1 W_g'
 
-Only pairs of cameras that share a point have a block in S, so the cost is linear in the points. The
-points are summed in a fixed number of parts, so that the result does not depend on the threads.
+so that the cost is linear in the points. They are summed in a fixed number of parts, so that the
+result does not depend on the threads.
 
 If the residuals shall be orthogonal to other columns than their own derivatives (`Given.tests`),
 the first factor of each product has those columns, and S is not symmetric.
@@ -18,7 +18,7 @@ the first factor of each product has those columns, and S is not symmetric.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,8 +41,11 @@ from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import inverted
 from pcfix.model import BoolArray, FloatArray, IntArray
 
-PARTS, MANY_PAIRS = 8, 250_000
-"""Parts of the sums, two of them from so many pairs of cameras on (72 MB each)."""
+PARTS, PARTS_BYTES = 8, 100_000_000
+"""Parts in which points are summed, and the size of the matrices of all parts."""
+DENSE_UP_TO = 6000
+"""Unknowns up to which a full matrix is faster than a sparse one, and small (288 MB)."""
+POINTS_AT_ONCE = 5000
 LOST = 1e6
 """Cost of an observation whose point has left its image, as a weighted square."""
 
@@ -241,151 +244,102 @@ def cost_of(squares: FloatArray, rule: Rule) -> float:
 # All points
 
 
-class Sums(NamedTuple):
-    """The reduced normal equations.
+class Equations(NamedTuple):
+    """The reduced normal equations of poses and shared unknowns, u = 6 k + g.
 
-    blocks : shape (slots, 6, 6), S_ij of the pairs of cameras of `pair_slots`.
-    border : shape (k, 6, g), rows of poses and columns of shared unknowns; corner : shape (g, g).
-    foot : shape (k, g, 6), rows of shared unknowns; empty if S is symmetric.
-    poses, shared : shape (k, 6) and (g,), the right sides.
-    diagonal, shared_diagonal : diagonals of U and U_gg, for the damping.
+    matrix : shape (u, u), dense or scipy's sparse one; right : shape (u,).
+    diagonal : shape (u,), that of U and U_gg, for the damping.
     """
 
-    blocks: FloatArray
-    border: FloatArray
-    corner: FloatArray
-    foot: FloatArray
-    poses: FloatArray
-    shared: FloatArray
+    matrix: Any
+    right: FloatArray
     diagonal: FloatArray
-    shared_diagonal: FloatArray
 
 
-def pair_slots(
-    start: IntArray, camera: IntArray, cameras: int, *, ordered: bool = False
-) -> tuple[IntArray, IntArray]:
-    """Return the block of each pair i, j of cameras, shape (k, k), and the pairs of the blocks.
-
-    It is -1 for two cameras that share no point, and, without `ordered`, if i > j.
-    """
-    from scipy.sparse import csr_array
-
-    sees = csr_array((np.ones(len(camera)), camera, start), (len(start) - 1, cameras))
-    share = (sees.T @ sees).toarray() > 0.0
-    np.fill_diagonal(share, True)
-    i, j = np.nonzero(share if ordered else np.triu(share))
-    slot = np.full((cameras, cameras), -1)
-    slot[i, j] = np.arange(len(i))
-    return slot, np.column_stack([i, j])
-
-
-def normal_equations(
-    state: State, given: Given, rule: Rule, slots: tuple[IntArray, IntArray]
-) -> Sums:
-    """Return the reduced normal equations at a state, `slots` as of `pair_slots`."""
-    slot, pairs = slots
-    k, g = len(state.centres), given.shared
-    foot = (k, g, 6) if len(given.tests) else (0, 0, 0)
-    shapes = (len(pairs), 6, 6), (k, 6, g), (g, g), foot, (k, 6), (g,), (k, 6), (g,)
-    parts = PARTS if len(pairs) < MANY_PAIRS else 2  # of memory
-    sums = [Sums(*map(np.zeros, shapes)) for _ in range(parts)]
-    in_parts(_sum_up, state, given, rule, slot, sums=sums)
-    return Sums(*(np.sum(each, axis=0) for each in zip(*sums, strict=True)))
+def normal_equations(state: State, given: Given, rule: Rule) -> Equations:
+    """Return the reduced normal equations at a state."""
+    size = 6 * len(state.centres) + given.shared
+    if size > DENSE_UP_TO and not len(given.tests):
+        return _sparse_equations(state, given, rule)
+    parts = min(max(PARTS_BYTES // (8 * size * size), 1), PARTS)
+    sums = [Equations(np.zeros((size, size)), np.zeros(size), np.zeros(size)) for _ in range(parts)]
+    in_parts(_sum_up, state, given, rule, sums=sums)
+    for other in sums[1:]:
+        for mine, more in zip(sums[0], other, strict=True):
+            mine += more
+    matrix = sums[0].matrix
+    for i in range(1, 0 if len(given.tests) else size):
+        matrix[:i, i] = matrix[i, :i]
+    return sums[0]
 
 
-@kernel
+@kernel(allocates=True)
 def _sum_up(
-    span: Span, state: State, given: Given, rule: Rule, slot: IntArray, sums: Sums, work: Workspace
+    span: Span, state: State, given: Given, rule: Rule, sums: Equations, work: Workspace
 ) -> None:
-    """Add up the reduced normal equations of some points."""
+    """Add up the reduced normal equations of some points: the lower triangle if symmetric."""
+    g, poses, rhs, is_tested = given.shared, 6 * len(state.centres), work.rhs, len(given.tests) > 0
+    most, y = 6 * len(work.row) + g, np.empty(3)
+    w, w_right, unknown = np.empty((most, 3)), np.empty((most, 3)), np.empty(most, np.int64)
     for p in range(*span):
         count, _ = linearise_point(state, given, rule, p, work)
-        work.w_shared[:], work.w_shared_right[:] = 0.0, 0.0
+        if count == 0:
+            continue
         for a in range(count):
-            _add_row(sums, given.camera[work.row[a]], slot, work, a)
-        for a in range(count):
-            _eliminate(sums, given, slot, work, a, count)
-        if count:
-            _eliminate_shared(sums, given, work, count)
+            camera = 6 * given.camera[work.row[a]]
+            for axis in range(2):
+                left, row, r = work.left[a, axis], work.right[a, axis], work.r[a, axis]
+                for i in range(6 + g):
+                    # a column of the pose, or a shared one: its row of the matrix
+                    column, at = (i, camera + i) if i < 6 else (SHARED + i - 6, poses + i - 6)
+                    line, by = sums.matrix[at], left[column]
+                    sums.right[at] += by * r
+                    sums.diagonal[at] += by * row[column]
+                    for j in range(6):
+                        line[camera + j] += by * row[j]
+                    for j in range(g):
+                        line[poses + j] += by * row[SHARED + j]
+        used = _couple(given, poses, work, count, w, w_right, unknown)
+        for i in range(used):
+            _times_inverse(w[i], work.v, y)
+            line = sums.matrix[unknown[i]]
+            sums.right[unknown[i]] -= y[0] * rhs[0] + y[1] * rhs[1] + y[2] * rhs[2]
+            for b in range(count + 1):
+                # the six columns of a camera, or all shared ones
+                at, width = 6 * b, 6 if b < count else g
+                first = unknown[at] if width else 0
+                if first <= unknown[i] or is_tested:
+                    for j in range(width):
+                        w_j = w_right[at + j]
+                        line[first + j] -= y[0] * w_j[0] + y[1] * w_j[1] + y[2] * w_j[2]
 
 
 @device
-def _add_row(sums: Sums, c: int, slot: IntArray, work: Workspace, a: int) -> None:
-    """Add U and right sides of one row, of camera c, and keep its W and W_g."""
-    left, right, r = work.left[a], work.right[a], work.r[a]
-    u, border, w, w_shared = sums.blocks[slot[c, c]], sums.border[c], work.w[a], work.w_shared
-    g = right.shape[1] - SHARED
-    for i in range(6):
-        by_u, by_v = left[0, i], left[1, i]
-        for j in range(6):
-            u[i, j] += by_u * right[0, j] + by_v * right[1, j]
-        for j in range(g):
-            border[i, j] += by_u * right[0, SHARED + j] + by_v * right[1, SHARED + j]
+def _couple(
+    given: Given, poses: int, work: Workspace, count: int, w: FloatArray, w_right: FloatArray,
+    unknown: IntArray,
+) -> int:  # fmt: skip
+    """Fill in W = J'B of the unknowns of a point, six of each row's camera and then the shared.
+
+    `w_right` has left and right exchanged; `unknown` are the numbers of the unknowns. Returns how
+    many there are.
+    """
+    used = 6 * count + given.shared
+    for i in range(used):
+        is_pose = i < 6 * count
+        column = i % 6 if is_pose else SHARED + i - 6 * count
+        unknown[i] = poses + i - 6 * count
+        if is_pose:
+            unknown[i] = 6 * given.camera[work.row[i // 6]] + column
         for j in range(3):
-            w[i, j] = by_u * right[0, POINT + j] + by_v * right[1, POINT + j]
-        sums.diagonal[c, i] += by_u * right[0, i] + by_v * right[1, i]
-        sums.poses[c, i] += by_u * r[0] + by_v * r[1]
-    for i in range(g):
-        by_u, by_v = left[0, SHARED + i], left[1, SHARED + i]
-        for j in range(g):
-            sums.corner[i, j] += by_u * right[0, SHARED + j] + by_v * right[1, SHARED + j]
-        for j in range(3):
-            w_shared[i, j] += by_u * right[0, POINT + j] + by_v * right[1, POINT + j]
-        sums.shared_diagonal[i] += by_u * right[0, SHARED + i] + by_v * right[1, SHARED + i]
-        sums.shared[i] += by_u * r[0] + by_v * r[1]
-    if len(sums.foot):  # not symmetric: also with left and right exchanged
-        for j in range(6):
-            for i in range(g):
-                of_foot = left[0, SHARED + i] * right[0, j] + left[1, SHARED + i] * right[1, j]
-                sums.foot[c, i, j] += of_foot
-            for i in range(3):
-                of_pose = left[0, POINT + i] * right[0, j] + left[1, POINT + i] * right[1, j]
-                work.w_right[a, j, i] = of_pose
-        for j in range(g):
-            by_u, by_v = right[0, SHARED + j], right[1, SHARED + j]
-            for i in range(3):
-                work.w_shared_right[j, i] += left[0, POINT + i] * by_u + left[1, POINT + i] * by_v
-
-
-@device
-def _eliminate(
-    sums: Sums, given: Given, slot: IntArray, work: Workspace, a: int, count: int
-) -> None:
-    """Subtract the terms of row a with V^-1 from the equations, W_a V^-1 W_b' for all b."""
-    rhs, w_right, w_shared, y = work.rhs, work.w_right, work.w_shared_right, work.y
-    c = given.camera[work.row[a]]
-    for i in range(6):
-        _times_inverse(work.w[a, i], work.v, y[i])
-        sums.poses[c, i] -= y[i, 0] * rhs[0] + y[i, 1] * rhs[1] + y[i, 2] * rhs[2]
-        for j in range(len(w_shared)):
-            sums.border[c, i, j] -= (
-                y[i, 0] * w_shared[j, 0] + y[i, 1] * w_shared[j, 1] + y[i, 2] * w_shared[j, 2]
-            )
-    for b in range(count):
-        # each pair of cameras that has a slot; both orders if one camera sees the point twice
-        at = slot[c, given.camera[work.row[b]]]
-        if at >= 0:
-            s, w = sums.blocks[at], w_right[b]
-            for i in range(6):
-                for j in range(6):
-                    s[i, j] -= y[i, 0] * w[j, 0] + y[i, 1] * w[j, 1] + y[i, 2] * w[j, 2]
-
-
-@device
-def _eliminate_shared(sums: Sums, given: Given, work: Workspace, count: int) -> None:
-    """Subtract W_g V^-1 W_g' and its right side."""
-    rhs, w_right, w_shared, y = work.rhs, work.w_right, work.w_shared_right, work.y[0]
-    for i in range(len(w_shared)):
-        _times_inverse(work.w_shared[i], work.v, y)
-        sums.shared[i] -= y[0] * rhs[0] + y[1] * rhs[1] + y[2] * rhs[2]
-        for j in range(len(w_shared)):
-            sums.corner[i, j] -= (
-                y[0] * w_shared[j, 0] + y[1] * w_shared[j, 1] + y[2] * w_shared[j, 2]
-            )
-        for a in range(count if len(sums.foot) else 0):
-            foot, w = sums.foot[given.camera[work.row[a]]], w_right[a]
-            for j in range(6):
-                foot[i, j] -= y[0] * w[j, 0] + y[1] * w[j, 1] + y[2] * w[j, 2]
+            w[i, j], w_right[i, j] = 0.0, 0.0
+            # a pose is in one row, a shared unknown in all of them
+            for a in range(i // 6 if is_pose else 0, i // 6 + 1 if is_pose else count):
+                left, right = work.left[a], work.right[a]
+                for axis in range(2):
+                    w[i, j] += left[axis, column] * right[axis, POINT + j]
+                    w_right[i, j] += right[axis, column] * left[axis, POINT + j]
+    return used
 
 
 @device
@@ -481,6 +435,69 @@ def _linearised(
                 rows.inverse[point, i, j] = work.v[i, j]
 
 
+class Part(NamedTuple):
+    """Linearised observations of some points: u and v of each row, as sparse matrices.
+
+    others, points : columns A of poses and shared unknowns, and B of the points.
+    inverse : V^-1 of all points, a block diagonal matrix.
+    """
+
+    rows: Rows
+    others: Any
+    points: Any
+    inverse: Any
+
+    def product(self, x: Any, y: Any) -> Any:
+        """Return X'Y with the points eliminated, X'Y - X'B V^-1 B'Y."""
+        return x.T @ y - (x.T @ self.points) @ (self.inverse @ (self.points.T @ y))
+
+    def left_over(self) -> FloatArray:
+        """Return the residuals of u and v after a step of the points only."""
+        step = self.inverse @ self.rows.rhs.ravel()
+        return np.asarray(self.rows.r.ravel() - self.points @ step)
+
+
+def sparse_rows(values: FloatArray, columns: IntArray, count: int) -> Any:
+    """Return a sparse matrix with equally many values in each row, at these columns."""
+    from scipy.sparse import csr_array
+
+    first = np.arange(0, columns.size + 1, columns.shape[1])
+    return csr_array((values.ravel(), columns.ravel(), first), (len(columns), count))
+
+
+def parts_of(state: State, given: Given, rule: Rule) -> Iterator[Part]:
+    """Yield the observations of all points, of some thousands at a time to save memory."""
+    from scipy.sparse import bsr_array
+
+    k, g, m = len(state.centres), given.shared, len(state.xyz)
+    for first in range(0, m, POINTS_AT_ONCE):
+        last = min(first + POINTS_AT_ONCE, m)
+        rows, numbers = linearised(state, given, rule, first, last), np.arange(last - first)
+        # one row more than observations in each point
+        owner = np.repeat(numbers, np.diff(given.start[first : last + 1]) + 1)
+        pose = 6 * given.camera[rows.observation][:, None] + np.arange(6)
+        shared = np.broadcast_to(6 * k + np.arange(g), (len(pose), g))
+        of_others = np.repeat(np.hstack([pose, shared]), 2, axis=0)
+        of_points = np.repeat(3 * owner[:, None] + np.arange(3), 2, axis=0)
+        columns = np.delete(rows.columns, np.s_[POINT:SHARED], axis=2)
+        yield Part(
+            rows,
+            sparse_rows(columns, of_others, 6 * k + g),
+            sparse_rows(rows.columns[:, :, POINT:SHARED], of_points, 3 * len(numbers)),
+            bsr_array((rows.inverse, numbers, np.arange(len(numbers) + 1))).tocsr(),
+        )
+
+
+def _sparse_equations(state: State, given: Given, rule: Rule) -> Equations:
+    matrix: Any = 0
+    right, diagonal = np.zeros((2, 6 * len(state.centres) + given.shared))
+    for part in parts_of(state, given, rule):
+        matrix = part.product(part.others, part.others) + matrix
+        right += part.others.T @ part.left_over()
+        diagonal += (part.others**2).sum(axis=0)
+    return Equations(matrix, right, diagonal)
+
+
 def point_covariances(
     state: State, given: Given, active: IntArray, inverse: FloatArray
 ) -> FloatArray:
@@ -501,36 +518,25 @@ def _point_covariances(
     span: Span, state: State, given: Given, place: IntArray, inverse: FloatArray, out: FloatArray,
     work: Workspace,
 ) -> None:  # fmt: skip
-    g, v, poses = given.shared, work.v, 6 * len(state.centres)
-    y, at = np.empty((6 * len(work.row) + g, 3)), np.empty(6 * len(work.row) + g, np.int64)
-    w, total = np.empty(3), np.empty((3, 3))
+    most, poses = 6 * len(work.row) + given.shared, 6 * len(state.centres)
+    w, y, unknown = np.empty((most, 3)), np.empty((most, 3)), np.empty(most, np.int64)
+    total = np.empty((3, 3))
     for p in range(*span):
         count, _ = linearise_point(state, given, UNDAMPED, p, work)
         if count == 0:
             continue
-        # y: rows of W V^-1, of the unknowns that move; at: their places in the inverse
+        # y: rows of W V^-1, of the unknowns that move; then their places in the inverse
         used = 0
-        for i in range(6 * count + g):
-            # a pose parameter of one row, or a shared unknown, which is in all of them
-            of_pose = i < 6 * count
-            column = i % 6 if of_pose else SHARED + i - 6 * count
-            unknown = poses + i - 6 * count
-            if of_pose:
-                unknown = 6 * given.camera[work.row[i // 6]] + column
-            if place[unknown] < 0:
-                continue
-            w[:] = 0.0
-            for a in range(i // 6 if of_pose else 0, i // 6 + 1 if of_pose else count):
-                row = work.right[a]
-                for j in range(3):
-                    w[j] += row[0, column] * row[0, POINT + j] + row[1, column] * row[1, POINT + j]
-            at[used], used = place[unknown], used + 1
-            _times_inverse(w, v, y[used - 1])
-        total[:] = v
+        for i in range(_couple(given, poses, work, count, w, y, unknown)):
+            at = place[unknown[i]]
+            if at >= 0:
+                _times_inverse(w[i], work.v, y[used])
+                unknown[used], used = at, used + 1
+        total[:] = work.v
         for i in range(used):
             s0, s1, s2 = 0.0, 0.0, 0.0
             for j in range(used):
-                q = inverse[at[i], at[j]]
+                q = inverse[unknown[i], unknown[j]]
                 s0, s1, s2 = s0 + q * y[j, 0], s1 + q * y[j, 1], s2 + q * y[j, 2]
             for j in range(3):
                 total[j, 0] += y[i, j] * s0

@@ -268,24 +268,18 @@ def correlated(precision: Precision) -> list[PcfixWarning]:
 
     Pairs of k1, k2, ... are always correlated, which does no harm.
     """
-    names = [row.name for row in precision.shared]
-    pairs: list[tuple[float, str, str, str]] = []
-    for i, name in enumerate(names):
-        for j in range(i):
-            r = float(precision.correlation[i, j])
-            if abs(r) > STRONG and not (name[0] == names[j][0] == "k"):
-                beds = (names[j] in BED) + (name in BED)
-                remedy = ", or give control points at several heights" if beds == 1 else ""
-                pairs.append((r, words_of(names[j]), words_of(name), remedy))
-    return [
-        PcfixWarning(
-            "adjust.correlated",
-            f"{a} and {b} are strongly correlated (r = {r:.3f}). Fix one of them{remedy}.",
-            unknowns=[a, b],
-            correlation=r,
-        )
-        for r, a, b, remedy in sorted(pairs, key=lambda row: -abs(row[0]))
-    ]
+    names, notes = [row.name for row in precision.shared], []
+    rows, columns = np.nonzero(np.tril(np.abs(precision.correlation) > STRONG, -1))
+    for i, j in zip(rows.tolist(), columns.tolist(), strict=True):
+        r, pair = float(precision.correlation[i, j]), [names[j], names[i]]
+        if pair[0][0] == pair[1][0] == "k":
+            continue
+        is_bed = [name in BED for name in pair]
+        remedy = ", or give control points at several heights" if sum(is_bed) == 1 else ""
+        one, other = map(words_of, pair)
+        words = f"{one} and {other} are strongly correlated (r = {r:.3f}). Fix one of them{remedy}."
+        notes.append(PcfixWarning("adjust.correlated", words, unknowns=[one, other], correlation=r))
+    return sorted(notes, key=lambda note: -abs(note.values["correlation"]))
 
 
 def undetermined(precision: Precision, unknowns: Unknowns) -> list[PcfixWarning]:
@@ -295,25 +289,22 @@ def undetermined(precision: Precision, unknowns: Unknowns) -> list[PcfixWarning]
     for row in precision.shared:
         limit, unit, _ = LIMITS.get(row.name, (np.inf, "", ""))
         prior = given.get(row.name.partition(" of sensor ")[0], np.inf)
-        values = {"unknown": row.name, "sigma": row.sigma}
         if row.sigma > limit:
-            notes.append(
-                PcfixWarning(
-                    "adjust.undetermined",
-                    f"{words_of(row.name)} is undetermined: standard error {row.sigma:.2g}{unit}"
-                    f" (limit {limit:g}{unit}). Fix it to a measured value.",
-                    **values,
-                )
+            code = "adjust.undetermined"
+            words = (
+                f"is undetermined: standard error {row.sigma:.2g}{unit} (limit {limit:g}{unit})."
+                " Fix it to a measured value."
             )
         elif prior < np.inf and row.sigma > NO_NEWS * prior:
-            notes.append(
-                PcfixWarning(
-                    "adjust.not_improved",
-                    f"{words_of(row.name)} was not improved: the images tell no more than its"
-                    f" standard deviation of {prior:g}{unit}.",
-                    **values,
-                )
+            code = "adjust.not_improved"
+            words = (
+                "was not improved: the images tell no more than its standard deviation of"
+                f" {prior:g}{unit}."
             )
+        else:
+            continue
+        words = f"{words_of(row.name)} {words}"
+        notes.append(PcfixWarning(code, words, unknown=row.name, sigma=row.sigma))
     return notes
 
 
@@ -341,18 +332,13 @@ def shape_notes(precision: Precision, wet_xy: FloatArray) -> list[PcfixWarning]:
         f"curvature {1000.0 * bend:.2g} mm (RMS over the bed), standard error"
         f" {1000.0 * error:.2g} mm. Remove shape from --free"
     )
-    values = {"bend_m": bend, "sigma_m": error}
+    code, words = "adjust.flat", f"the water is not curved: {figures}."
     if error > LEAST_BEND_M:
-        return [
-            PcfixWarning(
-                "adjust.shape_undetermined",
-                f"the shape of the water is undetermined: {figures}, or mark waterline points.",
-                **values,
-            )
-        ]
-    if chi2 > chdtri(len(rows), SURE):
+        code = "adjust.shape_undetermined"
+        words = f"the shape of the water is undetermined: {figures}, or mark waterline points."
+    elif chi2 > chdtri(len(rows), SURE):
         return []
-    return [PcfixWarning("adjust.flat", f"the water is not curved: {figures}.", **values)]
+    return [PcfixWarning(code, words, bend_m=bend, sigma_m=error)]
 
 
 # The ensemble

@@ -29,7 +29,7 @@ from pcfix.adjust.block import (
     usable_codes,
 )
 from pcfix.adjust.collinearity import SHARED, Given, State, Workspace, condition
-from pcfix.adjust.normal import PLAIN, Rule, cost_of, in_parts, pair_slots, point_steps, residuals
+from pcfix.adjust.normal import PLAIN, Rule, cost_of, in_parts, point_steps, residuals
 from pcfix.errors import GeometryError
 from pcfix.kernels import Span, kernel
 from pcfix.lens.imaging import lens_table
@@ -94,8 +94,6 @@ class Problem:
         Rows of the cameras of each sensor.
     codes : list of tuple of int
         Free lens parameters of each sensor.
-    slots : tuple of arrays
-        See `pcfix.adjust.normal.pair_slots`.
     moves : array of bool, shape (6 k + g,)
         Which of the poses and shared unknowns are free.
     names : list of str
@@ -108,7 +106,6 @@ class Problem:
     given: Given
     groups: list[list[int]]
     codes: list[tuple[int, ...]]
-    slots: tuple[IntArray, IntArray]
     moves: BoolArray
     names: list[str]
 
@@ -221,7 +218,6 @@ def prepare(
     ]
     problem = Problem(
         block, unknowns, origin, given, groups, codes,
-        pair_slots(given.start, given.camera, len(cameras)),
         np.concatenate([np.repeat(poses, 6), np.ones(len(names), bool)]), names,
     )  # fmt: skip
     state = State(

@@ -21,14 +21,12 @@ that fields too small to be found count too. The unknowns move by A^-1 B e.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import fdtri
 
 from pcfix.adjust.block import CX, CY, FOCAL, effect_at_corner
-from pcfix.adjust.collinearity import POINT, SHARED
-from pcfix.adjust.normal import UNDAMPED, Rows, linearised, residuals
+from pcfix.adjust.normal import UNDAMPED, parts_of, residuals, sparse_rows
 from pcfix.adjust.precision import Precision
 from pcfix.adjust.problem import Problem, Solution, water_of
 from pcfix.adjust.solve import Reduced, reduced_at, solver
@@ -56,7 +54,6 @@ shifts features with their slope, and outliers of the original adjustment are mi
 Focal length and principal point absorb it, so that poses and bed are right, and residuals do not
 show it. Rendered blocks, whose lens is known, had up to 1.5 times this."""
 
-POINTS_AT_ONCE = 5000
 POSE = ("angle about x", "angle about y", "angle about z", "centre x", "centre y", "centre z")
 
 
@@ -189,68 +186,13 @@ def pulls_of(problem: Problem, found: Solution, group: IntArray, drawn: FloatArr
     """
     count = int(group.max(initial=0)) + 1
     pulls = np.zeros((count, len(problem.moves)))
-    for part in _parts(problem, found):
-        rows, r = part.rows, part.rows.r
+    for part in parts_of(found.state, problem.given, UNDAMPED):
+        at, r = part.rows.observation, part.rows.r
         if len(drawn):
-            r = np.where(rows.is_image[:, None], drawn[rows.observation], r)
-        pulls += part.product(part.by_group(group, r, count), part.others)
+            r = np.where(part.rows.is_image[:, None], drawn[at], r)
+        grouped = sparse_rows(r, np.repeat(group[at], 2)[:, None], count)
+        pulls += part.product(grouped, part.others).toarray()
     return pulls
-
-
-class _Part(NamedTuple):
-    """The linearised observations of some points: rows u and v of each, as sparse matrices.
-
-    others, points : columns A of poses and shared unknowns, and B of the points.
-    inverse : V^-1 of all points, a block diagonal matrix.
-    """
-
-    rows: Rows
-    others: Any
-    points: Any
-    inverse: Any
-
-    def product(self, x: Any, y: Any) -> FloatArray:
-        """Return X'Y with the points eliminated, X'Y - X'B V^-1 B'Y."""
-        eliminated = (x.T @ self.points) @ (self.inverse @ (self.points.T @ y))
-        return np.asarray((x.T @ y - eliminated).toarray())
-
-    def by_group(self, group: IntArray, values: FloatArray, count: int) -> Any:
-        """Return values of u and v, shape (n, 2), in the column of their group."""
-        column = np.repeat(group[self.rows.observation], 2)
-        return _rows_of(values, column.reshape(-1, 1), count)
-
-
-def _rows_of(values: FloatArray, columns: IntArray, count: int) -> Any:
-    """Return a sparse matrix with equally many values in each row."""
-    from scipy.sparse import csr_array
-
-    first = np.arange(0, columns.size + 1, columns.shape[1])
-    return csr_array((values.ravel(), columns.ravel(), first), (len(columns), count))
-
-
-def _parts(problem: Problem, found: Solution) -> Iterator[_Part]:
-    """Yield the observations of all points, of some thousands at a time to save memory."""
-    from scipy.sparse import bsr_array
-
-    given, k, m = problem.given, len(found.state.centres), len(found.state.xyz)
-    for first in range(0, m, POINTS_AT_ONCE):
-        last = min(first + POINTS_AT_ONCE, m)
-        rows = linearised(found.state, given, UNDAMPED, first, last)
-        pose = 6 * given.camera[rows.observation][:, None] + np.arange(6)
-        shared = np.broadcast_to(6 * k + np.arange(given.shared), (len(pose), given.shared))
-        # one row more than observations in each point
-        owner = np.repeat(np.arange(last - first), np.diff(given.start[first : last + 1]) + 1)
-        of_point = 3 * owner[:, None] + np.arange(3)
-        both = np.delete(rows.columns, np.s_[POINT:SHARED], axis=2)
-        blocks = (rows.inverse, np.arange(last - first), np.arange(last - first + 1))
-        yield _Part(
-            rows,
-            _rows_of(both, np.repeat(np.hstack([pose, shared]), 2, axis=0), len(problem.moves)),
-            _rows_of(
-                rows.columns[:, :, POINT:SHARED], np.repeat(of_point, 2, axis=0), 3 * (last - first)
-            ),
-            bsr_array(blocks).tocsr(),
-        )
 
 
 # A smooth field over the frame
@@ -279,15 +221,14 @@ def _pulls_of_field(
     # B', C and right sides of shifts along u and v of each tile, 2 t candidates
     count = int(tile.max()) + 1
     pulls, rest = np.zeros((2 * count, len(problem.moves))), np.zeros((2 * count, 2 * count + 1))
-    for part in _parts(problem, found):
+    for part in parts_of(found.state, problem.given, UNDAMPED):
         at, is_image = part.rows.observation, part.rows.is_image
         weight = np.repeat(np.where(is_image, problem.given.weight[at], 0.0), 2)
         column = (2 * tile[at][:, None] + np.arange(2)).reshape(-1, 1)
-        shifts = _rows_of(weight, column, 2 * count)
-        pulls += part.product(shifts, part.others)
-        rest[:, :-1] += part.product(shifts, shifts)
-        of_points = part.points @ (part.inverse @ part.rows.rhs.ravel())
-        rest[:, -1] += shifts.T @ (part.rows.r.ravel() - of_points)
+        shifts = sparse_rows(weight, column, 2 * count)
+        pulls += part.product(shifts, part.others).toarray()
+        rest[:, :-1] += part.product(shifts, shifts).toarray()
+        rest[:, -1] += shifts.T @ part.left_over()
     active = pulls[:, reduced.active]
     rest -= active @ solve_for(np.column_stack([active.T, reduced.right]))
     # in the eigenvectors of K R K' the pulls are independent, so that the likelihood is a product

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -21,7 +21,6 @@ from pcfix.adjust.normal import (
     SQUARES,
     UNDAMPED,
     Rule,
-    Sums,
     normal_equations,
     point_steps,
 )
@@ -33,9 +32,6 @@ from pcfix.port.shapes import DomePort, FlatPort, Port
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
-
-DENSE_UP_TO = 6000
-"""Unknowns up to which a full matrix is faster than a sparse one, and small (288 MB)."""
 
 LOSSES = {"squares": SQUARES, "huber": HUBER, "cauchy": CAUCHY}
 LOSS_SCALE = 2.0
@@ -194,50 +190,22 @@ class Reduced(NamedTuple):
 
 def reduced_at(problem: Problem, found: Solution, rule: Rule = UNDAMPED) -> Reduced:
     """Return the reduced normal equations at a solution, with prior knowledge."""
-    k, g, pairs = len(found.state.centres), problem.given.shared, problem.slots[1]
-    size, active = 6 * k + g, np.flatnonzero(problem.moves)
-    sums = normal_equations(found.state, problem.given, rule, problem.slots)
+    active = np.flatnonzero(problem.moves)
+    total, right, diagonal = normal_equations(found.state, problem.given, rule)
     _, extra, extra_right = priors_at(problem, found)
-    right = np.concatenate([sums.poses.ravel(), sums.shared]) + extra_right
+    right = right + extra_right
     # the damping is a factor on the diagonal before the points were eliminated
     own = np.diag(extra) if extra.ndim == 2 else extra
-    damped = np.concatenate([sums.diagonal.ravel(), sums.shared_diagonal])
-    damped = rule.damping * (damped + own) + (0.0 if extra.ndim == 2 else extra)
-    is_tested = bool(len(problem.given.tests))  # then the matrix is not symmetric
-    if size > DENSE_UP_TO and not is_tested:
-        from scipy import sparse
-
-        total = _sparse(sums, pairs, k, g) + sparse.diags_array(damped)
-        total += sparse.csc_array(extra) if extra.ndim == 2 else 0
-        return Reduced(total.tocsc()[active][:, active], right[active], active)
-    matrix = np.zeros((size, size))
-    blocks = matrix[: 6 * k, : 6 * k].reshape(k, 6, k, 6)
-    blocks[pairs[:, 0], :, pairs[:, 1], :] = sums.blocks
-    matrix[: 6 * k, 6 * k :] = sums.border.reshape(6 * k, g)
-    if is_tested:
-        matrix[6 * k :, : 6 * k] = sums.foot.transpose(1, 0, 2).reshape(g, 6 * k)
-    else:
-        blocks[pairs[:, 1], :, pairs[:, 0], :] = sums.blocks.transpose(0, 2, 1)
-        matrix[6 * k :, : 6 * k] = matrix[: 6 * k, 6 * k :].T
-    matrix[6 * k :, 6 * k :] = sums.corner
-    matrix += extra if extra.ndim == 2 else 0.0
-    matrix[np.diag_indices(size)] += damped
-    return Reduced(matrix[np.ix_(active, active)], right[active], active)
-
-
-def _sparse(sums: Sums, pairs: IntArray, k: int, g: int) -> Any:
-    """Return the sums as a sparse matrix."""
+    damped = rule.damping * (diagonal + own) + (0.0 if extra.ndim == 2 else extra)
+    if isinstance(total, np.ndarray):
+        total += extra if extra.ndim == 2 else 0.0
+        total[np.diag_indices(len(total))] += damped
+        return Reduced(total[np.ix_(active, active)], right[active], active)
     from scipy import sparse
 
-    i, j = pairs[:, 0], pairs[:, 1]
-    first = np.searchsorted(i, np.arange(k + 1))  # the pairs are in order
-    upper = sparse.bsr_array((sums.blocks, j, first), (6 * k, 6 * k)).tocsc()
-    on_diagonal = sparse.block_diag(list(sums.blocks[i == j]), "csc")
-    body = upper + upper.T - on_diagonal
-    if g == 0:
-        return body
-    border = sparse.csc_array(sums.border.reshape(6 * k, g))
-    return sparse.block_array([[body, border], [border.T, sparse.csc_array(sums.corner)]]).tocsc()
+    total = total + sparse.diags_array(damped)
+    total += sparse.csc_array(extra) if extra.ndim == 2 else 0
+    return Reduced(total.tocsc()[active][:, active], right[active], active)
 
 
 def solver(reduced: Reduced) -> Callable[[FloatArray], FloatArray] | None:

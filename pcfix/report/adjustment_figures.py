@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,9 +13,6 @@ from pcfix.grid.colours import DIFFERENCE
 from pcfix.model import BoolArray, FloatArray
 from pcfix.report.page import AFTER, BEFORE, WATER, Picture, label_plan, new_figure
 from pcfix.water.surface import surface_above
-
-if TYPE_CHECKING:
-    pass
 
 MOST_POINTS = 6000
 COLUMNS = 14
