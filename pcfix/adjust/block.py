@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -73,6 +73,27 @@ both."""
 
 FEW_IMAGES = 5.0
 """Images per lens, on average, below which the lenses of one sensor share their corrections."""
+
+
+class LogRow(NamedTuple):
+    """One step of an adjustment."""
+
+    round: int
+    step: int
+    cost: float
+    damping: float
+    observations: int
+    rms_px: float
+
+    def __str__(self) -> str:
+        return (
+            f"round {self.round}, step {self.step}, {self.observations:,} observations,"
+            f" {self.rms_px:.3f} px"
+        )
+
+
+Progress = Callable[[LogRow], None]
+"""Is called after each step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,6 +243,18 @@ class Unknowns:
             *(self.shape_sigma,) * 3,
             *(self.distance_sigma_m, *(self.centre_sigma_m,) * 3),
         )
+
+
+def similarity_gradients(d: FloatArray) -> FloatArray:
+    """Return how places d from the pivot move with shift, turn and scale, shape (k, 3, 7)."""
+    by = np.zeros((len(d), 3, 7))
+    by[:, [0, 1, 2], [0, 1, 2]] = 1.0
+    x, y, z = d.T
+    by[:, 0, 4], by[:, 0, 5] = z, -y
+    by[:, 1, 3], by[:, 1, 5] = -z, x
+    by[:, 2, 3], by[:, 2, 4] = y, -x
+    by[:, :, 6] = d
+    return by
 
 
 def check_datum(block: Block, unknowns: Unknowns, reason: str = "") -> None:
@@ -560,27 +593,25 @@ def taken(ties: TiePoints, rows: IntArray) -> TiePoints:
 def usable_ties(ties: TiePoints, cameras: Cameras, most: int = TIE_POINTS) -> TiePoints:
     """Return the tie points that can be adjusted; a random part of them if there are very many.
 
-    They have coordinates, two images or more, and a sufficient angle between their rays.
+    They have coordinates, two images or more, and a sufficient angle between their rays: twice the
+    largest angle between a ray and the mean ray of its point.
     """
     seen = np.diff(ties.views.start) >= LEAST_VIEWS
     rows = np.flatnonzero(np.isfinite(ties.xyz).all(axis=1) & seen)
-    rows = rows[_ray_angle_deg(taken(ties, rows), cameras) >= LEAST_ANGLE_DEG]
+    some = taken(ties, rows)
+    owner = np.repeat(np.arange(len(rows)), np.diff(some.views.start))
+    ray = cameras.centres[some.views.camera] - some.xyz[owner]
+    ray /= np.linalg.norm(ray, axis=1)[:, None]
+    mean = np.zeros((len(rows), 3))
+    np.add.at(mean, owner, ray)
+    mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-12)[:, None]
+    cosine = np.full(len(rows), 1.0)
+    np.minimum.at(cosine, owner, np.einsum("oi,oi->o", ray, mean[owner]))
+    angle_deg = 2.0 * np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    rows = rows[angle_deg >= LEAST_ANGLE_DEG]
     if len(rows) > most:
         rows = np.sort(np.random.default_rng(0).choice(rows, most, replace=False))
     return taken(ties, rows)
-
-
-def _ray_angle_deg(ties: TiePoints, cameras: Cameras) -> FloatArray:
-    """Return twice the largest angle between a ray and the mean ray of its point."""
-    owner = np.repeat(np.arange(len(ties.xyz)), np.diff(ties.views.start))
-    ray = cameras.centres[ties.views.camera] - ties.xyz[owner]
-    ray /= np.linalg.norm(ray, axis=1)[:, None]
-    mean = np.zeros((len(ties.xyz), 3))
-    np.add.at(mean, owner, ray)
-    mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-12)[:, None]
-    cosine = np.full(len(mean), 1.0)
-    np.minimum.at(cosine, owner, np.einsum("oi,oi->o", ray, mean[owner]))
-    return 2.0 * np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
 def with_places(ties: TiePoints, cameras: Cameras) -> TiePoints:

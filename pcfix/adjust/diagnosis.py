@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.adjust.block import deeper, plain_block, straight_images, taken
+from pcfix.adjust.block import deeper, plain_block, similarity_gradients, straight_images, taken
 from pcfix.errors import GeometryError
 from pcfix.model import (
     BoolArray,
@@ -323,7 +323,7 @@ def gnss_is_suspicious(centres: FloatArray, off_m: FloatArray, sigma_m: FloatArr
     `off_m` is adjusted minus GNSS, NaN where there is none; `sigma_m` is stated, NaN if not.
     """
     rows = np.isfinite(off_m)
-    y, base = off_m[rows], _as_a_whole(centres)[rows]
+    y, base = off_m[rows], similarity_gradients(centres - centres.mean(axis=0))[rows]
     if len(y) < 3 * base.shape[1]:
         return False
     left = _rest(y, base)
@@ -345,13 +345,6 @@ def gnss_is_suspicious(centres: FloatArray, off_m: FloatArray, sigma_m: FloatArr
     return bool(gain > 3.0)  # F of 9 and some dozens: 1 %
 
 
-def _as_a_whole(centres: FloatArray) -> FloatArray:
-    """Return how centres move with shift, turn and scale of the block, shape (k, 3, 7)."""
-    from pcfix.adjust.problem import similarity_gradients  # not quick to load
-
-    return similarity_gradients(centres - centres.mean(axis=0))
-
-
 def _rest(y: FloatArray, columns: FloatArray) -> FloatArray:
     """Return the residuals of a least squares fit."""
     return np.asarray(y - columns @ np.linalg.lstsq(columns, y, rcond=None)[0])
@@ -369,7 +362,7 @@ def gnss_sign(centres: FloatArray, off_m: FloatArray, sigma_m: FloatArray, mende
     """
     centres, off_m = centres[mended.row], off_m[mended.row]
     rows = np.isfinite(off_m)
-    y, base = off_m[rows], _as_a_whole(centres)[rows]
+    y, base = off_m[rows], similarity_gradients(centres - centres.mean(axis=0))[rows]
     clear = _rest((centres - mended.cameras.centres)[rows], base)
     share = float(clear @ y) / max(float(clear @ clear), 1e-300)
     left = _rest(y, np.column_stack([base, clear]))

@@ -33,6 +33,8 @@ from scipy.special import chdtri
 
 from pcfix.adjust.block import (
     Block,
+    LogRow,
+    Progress,
     Unknowns,
     check_datum,
     deeper,
@@ -44,9 +46,7 @@ from pcfix.adjust.collinearity import SHARED
 from pcfix.adjust.normal import PLAIN, TESTED, linearised, point_steps, residuals
 from pcfix.adjust.precision import precision_of
 from pcfix.adjust.problem import (
-    LogRow,
     Problem,
-    Progress,
     Solution,
     counts_of,
     intersect_fixed,

@@ -23,6 +23,7 @@ from pcfix.adjust.block import (
     LEAST_VIEWS,
     NAMES,
     Block,
+    Progress,
     Robust,
     Unknowns,
     check_datum,
@@ -31,7 +32,7 @@ from pcfix.adjust.block import (
 )
 from pcfix.adjust.normal import residuals
 from pcfix.adjust.precision import Precision, precision_of
-from pcfix.adjust.problem import Problem, Progress, Solution, prepare
+from pcfix.adjust.problem import Problem, Solution, prepare
 from pcfix.adjust.result import Adjusted, adjusted_of, sigma0_of
 from pcfix.adjust.shared_errors import common_errors, disagreement_of, weighed
 from pcfix.adjust.solve import reduced_at, solve, solver
@@ -102,7 +103,7 @@ def adjust_ties(
     factor, shared = disagreement_of(problem, now, precision)
     factor = factor * common_errors(problem, precision)
     precision = precision_of(problem, now, precision.sigma0, factor)
-    quality = weighed(clean, now, clean.of_ties)[1] if estimate else []
+    quality = weighed(clean, now)[1] if estimate else []
     notes += [*quality, *shared]
     counted = np.isfinite(block.sigma_px) & problem.of_ties
     share = 1.0 - float(problem.used[counted].mean())
@@ -164,7 +165,7 @@ def _settled(
     """
     if estimate:
         problem = with_sigma(problem, noise_px(problem, now, robust=False))
-        problem = weighed(problem, now, problem.of_ties)[0]
+        problem = weighed(problem, now)[0]
     now = solve(problem, now, "squares", number=number, progress=progress)
     return problem, now, precision_of(problem, now, sigma0_of(problem, now))
 

@@ -17,6 +17,7 @@ from pcfix.adjust.block import (
     FIRST_SIGMA_PX,
     Block,
     Material,
+    Progress,
     Unknowns,
     block_of,
     check_datum,
@@ -30,7 +31,7 @@ from pcfix.adjust.block import (
 from pcfix.adjust.from_cloud import Candidate, adjust_cloud
 from pcfix.adjust.from_ties import adjust_ties, default_lens, noise_px, with_sigma
 from pcfix.adjust.precision import correlated, shape_notes, undetermined
-from pcfix.adjust.problem import Progress, intersect_fixed, prepare
+from pcfix.adjust.problem import intersect_fixed, prepare
 from pcfix.adjust.result import Adjusted
 from pcfix.adjust.solve import reduced_at, solver
 from pcfix.errors import GeometryError, PcfixWarning, SettingError

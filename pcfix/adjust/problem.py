@@ -6,9 +6,8 @@ surveyed points, standard deviations of lens, water and index.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -23,9 +22,11 @@ from pcfix.adjust.block import (
     WATER,
     WATER_NAMES,
     Block,
+    LogRow,
     Unknowns,
     inverse_variances,
     sensor_groups,
+    similarity_gradients,
     usable_codes,
 )
 from pcfix.adjust.collinearity import SHARED, Given, State, Workspace, condition
@@ -48,6 +49,9 @@ from pcfix.port.light import coefficients as port_coefficients
 from pcfix.port.shapes import DomePort, FlatPort, Port
 from pcfix.water.surface import build_field, build_tin
 
+if TYPE_CHECKING:
+    from scipy.sparse import csc_array
+
 NETWORK_SIGMA_M = 1e-4
 """Standard deviation of the mean of the projection centres in a free network."""
 
@@ -55,27 +59,6 @@ CELLS = 400
 """Of a raster of curved water, along its longer side: a bend of 10 cm is kept within 1 um."""
 MARGIN = 0.2
 """By which that raster exceeds the block, as a share of its extent."""
-
-
-class LogRow(NamedTuple):
-    """One step of an adjustment."""
-
-    round: int
-    step: int
-    cost: float
-    damping: float
-    observations: int
-    rms_px: float
-
-    def __str__(self) -> str:
-        return (
-            f"round {self.round}, step {self.step}, {self.observations:,} observations,"
-            f" {self.rms_px:.3f} px"
-        )
-
-
-Progress = Callable[[LogRow], None]
-"""Is called after each step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -355,61 +338,48 @@ def polynomial(water: FloatArray, x: FloatArray | float, y: FloatArray | float) 
 # Prior knowledge
 
 
-def priors_at(problem: Problem, found: Solution) -> tuple[float, FloatArray, FloatArray]:
+def priors_at(problem: Problem, found: Solution) -> tuple[float, csc_array, FloatArray]:
     """Return what prior knowledge of poses, lens and water adds to the equations of a state.
 
     Returns
     -------
     cost : float
-    matrix : array, shape (u,) or (u, u)
-        Its diagonal, if it has no other entries.
+    matrix : sparse array, shape (u, u)
     right : array, shape (u,)
     """
+    from scipy import sparse
+
     given, block = problem.given, problem.block
-    k, g = len(block.cameras), given.shared
-    diagonal, right = np.zeros(6 * k + g), np.zeros(6 * k + g)
+    k, size = len(block.cameras), len(problem.moves)
+    diagonal, right = np.zeros(size), np.zeros(size)
     weight = block.gnss_weights
     off = np.where(weight > 0.0, block.gnss_xyz - problem.origin - found.state.centres, 0.0)
     shared = inverse_variances(found.shared, _shared_sigma(problem))
     cost = float((weight * off * off).sum() + (shared * found.shared**2).sum())
     diagonal[6 * k :], right[6 * k :] = shared, -shared * found.shared
+    # weighted observations of several unknowns at once: their derivatives and residuals
+    rows, left = np.zeros((0, size)), np.zeros(0)
     if given.similarity >= 0:
-        matrix, at = np.diag(diagonal), 6 * k + given.similarity
-        by = similarity_gradients(found.state.centres - given.pivot)
-        matrix[at:, at:] += np.einsum("kia,ki,kib->ab", by, weight, by)
-        right[at:] += np.einsum("kia,ki->a", by, weight * off)
-        return cost, matrix, right
-    diagonal[: 6 * k].reshape(k, 6)[:, 3:] = weight
-    right[: 6 * k].reshape(k, 6)[:, 3:] = weight * off
-    if not problem.unknowns.free_network:
-        return cost, diagonal, right
-    # a free network: seven more observations hold mean, direction and scale of the centres
-    start = block.cameras.centres - problem.origin
-    d = start - start.mean(axis=0)
-    by = similarity_gradients(d) / np.array([1.0] * 3 + [np.sqrt((d * d).sum() / k)] * 4)
-    rows = np.zeros((7, len(right)))
-    rows[:, : 6 * k].reshape(7, k, 6)[:, :, 3:] = by.transpose(2, 0, 1) / k
-    rows = rows[_undetermined_motions(problem)]
-    of_centres = rows[:, : 6 * k].reshape(len(rows), k, 6)[:, :, 3:]
-    moved = np.einsum("akj,kj->a", of_centres, found.state.centres - start)
-    tight = 1.0 / NETWORK_SIGMA_M**2
-    return (
-        cost + tight * float((moved * moved).sum()),
-        np.diag(diagonal) + tight * rows.T @ rows,
-        right - tight * rows.T @ moved,
-    )
-
-
-def similarity_gradients(d: FloatArray) -> FloatArray:
-    """Return how places d from the pivot move with shift, turn and scale, shape (k, 3, 7)."""
-    by = np.zeros((len(d), 3, 7))
-    by[:, [0, 1, 2], [0, 1, 2]] = 1.0
-    x, y, z = d.T
-    by[:, 0, 4], by[:, 0, 5] = z, -y
-    by[:, 1, 3], by[:, 1, 5] = -z, x
-    by[:, 2, 3], by[:, 2, 4] = y, -x
-    by[:, :, 6] = d
-    return by
+        by = np.sqrt(weight)[:, :, None] * similarity_gradients(found.state.centres - given.pivot)
+        rows = np.zeros((3 * k, size))
+        rows[:, 6 * k + given.similarity :] = by.reshape(3 * k, 7)
+        left = (np.sqrt(weight) * off).ravel()
+    else:
+        diagonal[: 6 * k].reshape(k, 6)[:, 3:] = weight
+        right[: 6 * k].reshape(k, 6)[:, 3:] = weight * off
+    if problem.unknowns.free_network and given.similarity < 0:
+        # seven observations hold mean, direction and scale of the centres
+        start = block.cameras.centres - problem.origin
+        d = start - start.mean(axis=0)
+        by = similarity_gradients(d) / np.array([1.0] * 3 + [np.sqrt((d * d).sum() / k)] * 4)
+        by = by[:, :, _undetermined_motions(problem)] / k / NETWORK_SIGMA_M
+        rows = np.zeros((by.shape[2], size))
+        rows[:, : 6 * k].reshape(-1, k, 6)[:, :, 3:] = by.transpose(2, 0, 1)
+        left = -np.einsum("kja,kj->a", by, found.state.centres - start)
+        cost += float((left * left).sum())
+    several = sparse.csc_array(rows)
+    matrix = sparse.diags_array(diagonal) + several.T @ several
+    return cost, matrix.tocsc(), right + rows.T @ left
 
 
 def pose_gradients(state: State, pivot: FloatArray) -> FloatArray:

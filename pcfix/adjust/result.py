@@ -18,6 +18,7 @@ from pcfix.adjust.block import (
     WATER,
     WATER_NAMES,
     Block,
+    LogRow,
     Unknowns,
     lens_parameter,
     sensor_groups,
@@ -27,7 +28,6 @@ from pcfix.adjust.normal import residuals
 from pcfix.adjust.precision import Precision, correlated, undetermined
 from pcfix.adjust.problem import (
     Intersected,
-    LogRow,
     Problem,
     Solution,
     intersect_fixed,

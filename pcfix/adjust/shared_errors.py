@@ -31,7 +31,7 @@ from pcfix.adjust.precision import Precision
 from pcfix.adjust.problem import Problem, Solution, water_of
 from pcfix.adjust.solve import Reduced, reduced_at, solver
 from pcfix.errors import PcfixWarning
-from pcfix.model import BoolArray, FloatArray, IntArray
+from pcfix.model import FloatArray, IntArray
 from pcfix.water.surface import surface_above
 
 SURE = 0.99
@@ -280,23 +280,17 @@ LEAST_GAP = 0.2
 """Between two flying heights, as a share of the lower."""
 
 
-def weighed(problem: Problem, now: Solution, ties: BoolArray) -> tuple[Problem, list[PcfixWarning]]:
-    """Weight observations by the noise of their group, and return a warning if groups differ.
+def weighed(problem: Problem, now: Solution) -> tuple[Problem, list[PcfixWarning]]:
+    """Weight tie points by the noise of their group, and return a warning if groups differ.
 
     Each side of the water and each kind of image has its own variance of unit weight: weighted
     squares over its share of the redundancy, of which each point takes three. Groups whose
     variances differ (F-test), and by enough to matter, are weighted by their own (Foerstner 1979,
     one step).
-
-    Parameters
-    ----------
-    ties : array of bool, shape (o,)
-        Observations of tie points; others keep their weights.
     """
     weight, owner, noise = problem.given.weight, problem.block.owner, dict[str, float]()
-    used = ties & (weight > 0.0)
     r = residuals(now.state, problem.given)
-    used &= np.isfinite(r).all(axis=1)
+    used = problem.of_ties & problem.used & np.isfinite(r).all(axis=1)
     square = (np.where(used[:, None], r, 0.0) ** 2).sum(axis=1)
     redundancy = 2.0 - 3.0 / np.maximum(np.bincount(owner, used)[owner], 2.0)
     for names, group in _groups_by_quality(problem, now):

@@ -13,7 +13,17 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pcfix.adjust.block import CODES, INDEX, MOTIONS, PLANES, PORT, Robust, moved_lens
+from pcfix.adjust.block import (
+    CODES,
+    INDEX,
+    MOTIONS,
+    PLANES,
+    PORT,
+    LogRow,
+    Progress,
+    Robust,
+    moved_lens,
+)
 from pcfix.adjust.collinearity import State
 from pcfix.adjust.normal import (
     CAUCHY,
@@ -24,7 +34,7 @@ from pcfix.adjust.normal import (
     normal_equations,
     point_steps,
 )
-from pcfix.adjust.problem import LogRow, Problem, Progress, Solution, cost_at, counts_of, priors_at
+from pcfix.adjust.problem import Problem, Solution, cost_at, counts_of, priors_at
 from pcfix.errors import GeometryError
 from pcfix.lens.imaging import lens_table
 from pcfix.model import FloatArray, IntArray
@@ -195,17 +205,15 @@ def reduced_at(problem: Problem, found: Solution, rule: Rule = UNDAMPED) -> Redu
     _, extra, extra_right = priors_at(problem, found)
     right = right + extra_right
     # the damping is a factor on the diagonal before the points were eliminated
-    own = np.diag(extra) if extra.ndim == 2 else extra
-    damped = rule.damping * (diagonal + own) + (0.0 if extra.ndim == 2 else extra)
+    damped = rule.damping * (diagonal + extra.diagonal())
     if isinstance(total, np.ndarray):
-        total += extra if extra.ndim == 2 else 0.0
+        total += extra.toarray()
         total[np.diag_indices(len(total))] += damped
         return Reduced(total[np.ix_(active, active)], right[active], active)
-    from scipy import sparse
+    from scipy.sparse import diags_array
 
-    total = total + sparse.diags_array(damped)
-    total += sparse.csc_array(extra) if extra.ndim == 2 else 0
-    return Reduced(total.tocsc()[active][:, active], right[active], active)
+    total = (total + extra + diags_array(damped)).tocsc()
+    return Reduced(total[active][:, active], right[active], active)
 
 
 def solver(reduced: Reduced) -> Callable[[FloatArray], FloatArray] | None:

@@ -14,6 +14,7 @@ from pcfix.adjust.block import (
     LEAST_VIEWS,
     WATER,
     Material,
+    Progress,
     gnss_with_sigma,
     usable_ties,
     with_places,
@@ -28,7 +29,6 @@ from pcfix.adjust.methods import (
     check_marks,
     unknowns_of,
 )
-from pcfix.adjust.problem import Progress
 from pcfix.adjust.result import Adjusted
 from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError
 from pcfix.flow.inputs import Inputs, mask_of, paths_in
@@ -39,7 +39,7 @@ from pcfix.io.cameras.colmap import write_colmap
 from pcfix.io.cameras.opensfm import write_opensfm
 from pcfix.io.cameras.table.sensor import read_sensor, write_table
 from pcfix.io.crs import is_topocentric, parse_crs
-from pcfix.io.files import check_input, write_text
+from pcfix.io.files import write_text
 from pcfix.io.gnss_positions import gnss_in_frame_of, read_gnss
 from pcfix.io.ground_control import read_ground_control
 from pcfix.io.members import write_members
@@ -115,8 +115,6 @@ def adjust_cameras(
         If an input cannot be read or does not fit, the block has no datum, or unknowns cannot be
         separated. Nothing is written then.
     """
-    if "free_network" in keywords:  # an older, logical name of the datum
-        keywords["free_network"] = "free" if keywords["free_network"] else "observed"
     given = taken(AdjustOptions, options, keywords, "adjust_cameras")
     inputs = replace(given.part(Inputs), cameras=model)
     target = None if out_dir is None else Path(out_dir)
@@ -260,7 +258,7 @@ def _gnss(
 
 def _calibration(path: File, cameras: Cameras) -> Lens:
     """Return a calibration of images of this size."""
-    one = read_sensor(check_input(path))
+    one = read_sensor(Path(path))
     for lens in set(cameras.lenses or ()):
         if (lens.width, lens.height, lens.unit) != (one.width, one.height, one.unit):
             words = (

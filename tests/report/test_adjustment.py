@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pcfix.adjust.block import Block, Unknowns
+from pcfix.adjust.block import Block, LogRow, Unknowns
 from pcfix.adjust.precision import Precision, SharedUnknown
-from pcfix.adjust.problem import Intersected, LogRow
+from pcfix.adjust.problem import Intersected
 from pcfix.adjust.result import Adjusted, ControlRow, adjustment_dict, before_of
 from pcfix.errors import PcfixWarning
 from pcfix.model import Cameras, Lens, WaterPlane
