@@ -360,12 +360,6 @@ def image_and_all_gradients(
     return u, v
 
 
-_CENTRE_X, _CENTRE_Y, _INVERSE = formulas.CENTRE_X, formulas.CENTRE_Y, formulas.INVERSE
-_FOCAL_X, _FOCAL_Y, _B2, _B3 = formulas.FOCAL_X, formulas.FOCAL_Y, formulas.B2, formulas.B3
-_RADIALS, _DENOMINATORS, _TAIL = formulas.RADIALS, formulas.DENOMINATORS, formulas.TAIL
-_TANGENTIAL = formulas.TANGENTIAL
-
-
 @device
 def lens_gradients(c: FloatArray, ahead: FloatArray, codes: IntArray, out: FloatArray) -> None:
     """Fill in the derivatives of the image of a direction, camera frame, by lens parameters.
@@ -375,8 +369,8 @@ def lens_gradients(c: FloatArray, ahead: FloatArray, codes: IntArray, out: Float
     that d x' = -J^-1 d B.
     """
     px, py = in_plane(c, ahead[0], ahead[1], ahead[2])
-    px, py = px - c[_CENTRE_X], py - c[_CENTRE_Y]
-    inverse = c[_INVERSE] != 0.0
+    px, py = px - c[formulas.CENTRE_X], py - c[formulas.CENTRE_Y]
+    inverse = c[formulas.INVERSE] != 0.0
     if inverse:
         ax, ay = undistorted(c, px, py)
         dx, dy = ax, ay
@@ -385,19 +379,19 @@ def lens_gradients(c: FloatArray, ahead: FloatArray, codes: IntArray, out: Float
     else:
         ax, ay = px, py
         dx, dy = distorted(c, px, py)
-    fx, fy, b2, b3 = c[_FOCAL_X], c[_FOCAL_Y], c[_B2], c[_B3]
+    fx, fy, b2, b3 = c[formulas.FOCAL_X], c[formulas.FOCAL_Y], c[formulas.B2], c[formulas.B3]
     for i in range(codes.size):
         code = codes[i]
         if code == FOCAL:
-            out[0, i], out[1, i] = dx + c[_CENTRE_X], dy + c[_CENTRE_Y]
+            out[0, i], out[1, i] = dx + c[formulas.CENTRE_X], dy + c[formulas.CENTRE_Y]
         elif code == CX:
             out[0, i], out[1, i] = 1.0, 0.0
         elif code == CY:
             out[0, i], out[1, i] = 0.0, 1.0
         elif code == B1:
-            out[0, i], out[1, i] = dx + c[_CENTRE_X], 0.0
+            out[0, i], out[1, i] = dx + c[formulas.CENTRE_X], 0.0
         elif code == B2:
-            out[0, i], out[1, i] = dy + c[_CENTRE_Y], 0.0
+            out[0, i], out[1, i] = dy + c[formulas.CENTRE_Y], 0.0
         else:
             bx, by = _brown_gradient(c, ax, ay, code)
             if inverse:
@@ -412,13 +406,13 @@ def _brown_gradient(c: FloatArray, x: float, y: float, code: int) -> tuple[float
     if code >= K1:
         # radial terms are divided by a polynomial in rational models
         below, power = 1.0, 1.0
-        first = _TAIL + int(c[_RADIALS])
-        for i in range(int(c[_DENOMINATORS])):
+        first = formulas.TAIL + int(c[formulas.RADIALS])
+        for i in range(int(c[formulas.DENOMINATORS])):
             power *= r2
             below += c[first + i] * power
         power = r2 ** (code - K1 + 1) / below
         return x * power, y * power
-    more = 1.0 + (c[_TANGENTIAL + 2] + c[_TANGENTIAL + 3] * r2) * r2
+    more = 1.0 + (c[formulas.TANGENTIAL + 2] + c[formulas.TANGENTIAL + 3] * r2) * r2
     if code == P1:
         return (r2 + 2.0 * x * x) * more, 2.0 * x * y * more
     return 2.0 * x * y * more, (r2 + 2.0 * y * y) * more

@@ -310,8 +310,11 @@ def _sum_up(
                 first = unknown[at] if width else 0
                 if first <= unknown[i] or is_tested:
                     for j in range(width):
-                        w_j = w_right[at + j]
-                        line[first + j] -= y[0] * w_j[0] + y[1] * w_j[1] + y[2] * w_j[2]
+                        line[first + j] -= (
+                            y[0] * w_right[at + j, 0]
+                            + y[1] * w_right[at + j, 1]
+                            + y[2] * w_right[at + j, 2]
+                        )
 
 
 @device
