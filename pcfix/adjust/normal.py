@@ -497,7 +497,7 @@ def _sparse_equations(state: State, given: Given, rule: Rule) -> Equations:
     for part in parts_of(state, given, rule):
         matrix = part.product(part.others, part.others) + matrix
         right += part.others.T @ part.left_over()
-        diagonal += (part.others**2).sum(axis=0)
+        diagonal += part.others.power(2).sum(axis=0)
     return Equations(matrix, right, diagonal)
 
 

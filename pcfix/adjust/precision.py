@@ -13,6 +13,7 @@ covariance. Whatever is computed with each of them in turn scatters by all error
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -138,41 +139,50 @@ def precision_of(
     reduced, state, given = reduced_at(problem, solution), solution.state, problem.given
     active, k, g = reduced.active, len(state.centres), given.shared
     times = np.ones(6 + g) if factor is None else factor
-    each = np.concatenate([np.tile(times[:6], k), times[6:]])[active]
-    variance = sigma0 * sigma0
+    variance, u = sigma0 * sigma0, len(active)
     notes: list[PcfixWarning] = []
-    points: FloatArray | None = None
-    members: Members | None = None
     is_fixed = np.isfinite(point_covariances(state, given, active[:0], np.zeros((0, 0)))[:, 0])
     if not is_fixed.all():
         loose = int((~is_fixed).sum())
         words = f"{loose:,} points are not determined by their images and have no covariance."
         notes.append(PcfixWarning("adjust.loose_points", words, points=loose))
-    if len(active) <= DENSE_UP_TO:
+    inverse, solve_for = None, None
+    if u <= DENSE_UP_TO:
         inverse = _inverse(reduced)
-        if inverse is None:
-            raise singular(problem, solution)
+    else:
+        solve_for = solver(reduced)
+        words = (
+            f"The block has {u:,} unknowns (limit {DENSE_UP_TO:,}), so its points have no"
+            " covariances, and the correction cannot use the errors of the poses."
+        )
+        notes.append(PcfixWarning("adjust.too_large", words, unknowns=u))
+    if inverse is None and solve_for is None:
+        raise singular(problem, solution)
+
+    def columns(rows: IntArray) -> FloatArray:
+        """Return some columns of the inverse."""
+        if inverse is not None:
+            return inverse[:, rows]
+        unit = np.zeros((u, len(rows)))
+        unit[rows, np.arange(len(rows))] = 1.0
+        return np.zeros(0) if solve_for is None else solve_for(unit)
+
+    last = np.arange(u - g, u)
+    of_shared = columns(last)[last] * times[6:] * times[6:, None]
+    poses = _pose_blocks(k, active, columns) * times[:6] * times[:6, None]
+    if given.similarity >= 0:
+        by, at = pose_gradients(state, given.pivot), given.similarity
+        poses = by @ of_shared[at:, at:] @ by.transpose(0, 2, 1)
+    if (np.diag(of_shared) < 0.0).any() or (np.einsum("kii->ki", poses) < 0.0).any():
+        raise singular(problem, solution)
+    points: FloatArray | None = None
+    members: Members | None = None
+    if inverse is not None:
+        each = np.concatenate([np.tile(times[:6], k), times[6:]])[active]
         inverse *= each
         inverse *= each[:, None]
-        of_shared = inverse[len(active) - g :, len(active) - g :]
-        poses = _pose_blocks(problem, solution, active, inverse)
         points = variance * point_covariances(state, given, active, inverse)
         members = members_of(problem, solution, active, sigma0 * drawn(inverse))
-    else:
-        found = _by_parts(reduced, k, g)
-        if found is None:
-            raise singular(problem, solution)
-        of_shared, poses = found
-        of_shared *= times[6:] * times[6:, None]
-        poses *= times[:6] * times[:6, None]
-        notes.append(
-            PcfixWarning(
-                "adjust.too_large",
-                f"The block has {len(active):,} unknowns (limit {DENSE_UP_TO:,}), so its points"
-                " have no covariances, and the correction cannot use the errors of the poses.",
-                unknowns=len(active),
-            )
-        )
     sigma = np.sqrt(np.diag(of_shared))
     correlation = of_shared / sigma / sigma[:, None]
     rows = zip(problem.names, solution.shared.tolist(), (sigma * sigma0).tolist(), strict=True)
@@ -180,6 +190,17 @@ def precision_of(
         sigma0, variance * poses.reshape(k, 6, 6), tuple(SharedUnknown(*row) for row in rows),
         correlation, points, tuple(notes), members,
     )  # fmt: skip
+
+
+def _pose_blocks(k: int, active: IntArray, columns: Callable[[IntArray], FloatArray]) -> FloatArray:
+    """Return the covariance of each pose, shape (k, 6, 6), from columns of the inverse."""
+    poses = np.zeros((k, 6, 6))
+    first = np.flatnonzero(np.isin(active, 6 * np.arange(k)))  # six in a row belong to a pose
+    for part in np.array_split(first, max(1, len(first) // 32)):
+        rows = part[:, None] + np.arange(6)
+        found = columns(rows.ravel()).reshape(len(active), len(part), 6)
+        poses[active[part] // 6] = found[rows, np.arange(len(part))[:, None]]
+    return poses
 
 
 def _inverse(reduced: Reduced) -> FloatArray | None:
@@ -212,39 +233,6 @@ def _inverse(reduced: Reduced) -> FloatArray | None:
     a *= scale
     a *= scale[:, None]
     return np.asarray(a)
-
-
-def _pose_blocks(
-    problem: Problem, solution: Solution, active: IntArray, inverse: FloatArray
-) -> FloatArray:
-    """Return the covariance of each pose, shape (k, 6, 6)."""
-    k, at = len(solution.state.centres), problem.given.similarity
-    if at >= 0:
-        by = pose_gradients(solution.state, problem.given.pivot)
-        return np.asarray(by @ inverse[at : at + 7, at : at + 7] @ by.transpose(0, 2, 1))
-    poses = np.zeros((k, 6, 6))
-    first = np.flatnonzero(np.isin(active, 6 * np.arange(k)))  # six in a row belong to a pose
-    rows = first[:, None] + np.arange(6)
-    poses[active[first] // 6] = inverse[rows[:, :, None], rows[:, None, :]]
-    return poses
-
-
-def _by_parts(reduced: Reduced, k: int, g: int) -> tuple[FloatArray, FloatArray] | None:
-    """Return covariances of the shared unknowns and of each pose, without the whole inverse."""
-    active, solve_for = reduced.active, solver(reduced)
-    if solve_for is None:
-        return None
-    u, poses = len(active), np.zeros((k, 6, 6))
-    of_shared = solve_for(np.eye(u, g, g - u))[u - g :]  # the last g unknowns
-    first = np.flatnonzero(np.isin(active, 6 * np.arange(k)))
-    for part in np.array_split(first, max(1, len(first) // 32)):
-        rows = part[:, None] + np.arange(6)
-        unit = np.zeros((u, rows.size))
-        unit[rows.ravel(), np.arange(rows.size)] = 1.0
-        found = solve_for(unit).reshape(u, len(part), 6)
-        poses[active[part] // 6] = found[rows, np.arange(len(part))[:, None]]
-    variances = np.concatenate([np.diag(of_shared), np.einsum("kii->ki", poses).ravel()])
-    return (of_shared, poses) if (variances >= 0.0).all() else None
 
 
 # What is known poorly
