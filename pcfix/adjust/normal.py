@@ -267,9 +267,9 @@ def normal_equations(state: State, given: Given, rule: Rule) -> Equations:
     for other in sums[1:]:
         for mine, more in zip(sums[0], other, strict=True):
             mine += more
-    matrix = sums[0].matrix
-    for i in range(1, 0 if len(given.tests) else size):
-        matrix[:i, i] = matrix[i, :i]
+    if not len(given.tests):  # the upper triangle is that below
+        for i in range(1, size):
+            sums[0].matrix[:i, i] = sums[0].matrix[i, :i]
     return sums[0]
 
 
@@ -285,6 +285,7 @@ def _sum_up(
         count, _ = linearise_point(state, given, rule, p, work)
         if count == 0:
             continue
+        # J'J and J'r of each row
         for a in range(count):
             camera = 6 * given.camera[work.row[a]]
             for axis in range(2):
@@ -299,13 +300,15 @@ def _sum_up(
                         line[camera + j] += by * row[j]
                     for j in range(g):
                         line[poses + j] += by * row[SHARED + j]
+        # minus W V^-1 W' and W V^-1 B'r
         used = _couple(given, poses, work, count, w, w_right, unknown)
         for i in range(used):
             _times_inverse(w[i], work.v, y)
             line = sums.matrix[unknown[i]]
             sums.right[unknown[i]] -= y[0] * rhs[0] + y[1] * rhs[1] + y[2] * rhs[2]
             for b in range(count + 1):
-                # the six columns of a camera, or all shared ones
+                # the six columns of a camera, or all shared ones; if S is symmetric, those of the
+                # lower triangle
                 at, width = 6 * b, 6 if b < count else g
                 first = unknown[at] if width else 0
                 if first <= unknown[i] or is_tested:
@@ -385,7 +388,7 @@ def _point_steps(
 # The equations of single observations, and covariances
 
 
-class Rows(NamedTuple):
+class LinearisedRows(NamedTuple):
     """Observations of m points, weighted and linearised; rows that do not count are zero.
 
     Each point has a row for each observation, and one more for a condition.
@@ -405,11 +408,11 @@ class Rows(NamedTuple):
     rhs: FloatArray
 
 
-def linearised(state: State, given: Given, rule: Rule, first: int, last: int) -> Rows:
+def linearised(state: State, given: Given, rule: Rule, first: int, last: int) -> LinearisedRows:
     """Return the rows of the points first to last."""
     m = last - first
     n = int(given.start[last] - given.start[first]) + m
-    rows = Rows(
+    rows = LinearisedRows(
         np.zeros((n, 2, SHARED + given.shared)), np.zeros((n, 2)), np.zeros(n, np.int64),
         np.zeros(n, np.bool_), np.zeros((m, 3, 3)), np.zeros((m, 3)),
     )  # fmt: skip
@@ -419,7 +422,7 @@ def linearised(state: State, given: Given, rule: Rule, first: int, last: int) ->
 
 @kernel
 def _linearised(
-    span: Span, state: State, given: Given, rule: Rule, rows: Rows, work: Workspace
+    span: Span, state: State, given: Given, rule: Rule, rows: LinearisedRows, work: Workspace
 ) -> None:
     for p in range(*span):
         count, images = linearise_point(state, given, rule, p, work)
@@ -438,21 +441,22 @@ def _linearised(
                 rows.inverse[point, i, j] = work.v[i, j]
 
 
-class Part(NamedTuple):
+class SparseRows(NamedTuple):
     """Linearised observations of some points: u and v of each row, as sparse matrices.
 
     others, points : columns A of poses and shared unknowns, and B of the points.
-    inverse : V^-1 of all points, a block diagonal matrix.
+    inverse : V^-1 of all points, a block diagonal matrix; coupling : V^-1 B'A.
     """
 
-    rows: Rows
+    rows: LinearisedRows
     others: Any
     points: Any
     inverse: Any
+    coupling: Any
 
-    def product(self, x: Any, y: Any) -> Any:
-        """Return X'Y with the points eliminated, X'Y - X'B V^-1 B'Y."""
-        return x.T @ y - (x.T @ self.points) @ (self.inverse @ (self.points.T @ y))
+    def product(self, x: Any) -> Any:
+        """Return X'A with the points eliminated, X'A - X'B V^-1 B'A."""
+        return x.T @ self.others - (x.T @ self.points) @ self.coupling
 
     def left_over(self) -> FloatArray:
         """Return the residuals of u and v after a step of the points only."""
@@ -460,7 +464,7 @@ class Part(NamedTuple):
         return np.asarray(self.rows.r.ravel() - self.points @ step)
 
 
-def sparse_rows(values: FloatArray, columns: IntArray, count: int) -> Any:
+def sparse_matrix(values: FloatArray, columns: IntArray, count: int) -> Any:
     """Return a sparse matrix with equally many values in each row, at these columns."""
     from scipy.sparse import csr_array
 
@@ -468,7 +472,7 @@ def sparse_rows(values: FloatArray, columns: IntArray, count: int) -> Any:
     return csr_array((values.ravel(), columns.ravel(), first), (len(columns), count))
 
 
-def parts_of(state: State, given: Given, rule: Rule) -> Iterator[Part]:
+def sparse_rows_of(state: State, given: Given, rule: Rule) -> Iterator[SparseRows]:
     """Yield the observations of all points, of some thousands at a time to save memory."""
     from scipy.sparse import bsr_array
 
@@ -483,19 +487,17 @@ def parts_of(state: State, given: Given, rule: Rule) -> Iterator[Part]:
         of_others = np.repeat(np.hstack([pose, shared]), 2, axis=0)
         of_points = np.repeat(3 * owner[:, None] + np.arange(3), 2, axis=0)
         columns = np.delete(rows.columns, np.s_[POINT:SHARED], axis=2)
-        yield Part(
-            rows,
-            sparse_rows(columns, of_others, 6 * k + g),
-            sparse_rows(rows.columns[:, :, POINT:SHARED], of_points, 3 * len(numbers)),
-            bsr_array((rows.inverse, numbers, np.arange(len(numbers) + 1))).tocsr(),
-        )
+        others = sparse_matrix(columns, of_others, 6 * k + g)
+        points = sparse_matrix(rows.columns[:, :, POINT:SHARED], of_points, 3 * len(numbers))
+        inverse = bsr_array((rows.inverse, numbers, np.arange(len(numbers) + 1))).tocsr()
+        yield SparseRows(rows, others, points, inverse, inverse @ (points.T @ others))
 
 
 def _sparse_equations(state: State, given: Given, rule: Rule) -> Equations:
     matrix: Any = 0
     right, diagonal = np.zeros((2, 6 * len(state.centres) + given.shared))
-    for part in parts_of(state, given, rule):
-        matrix = part.product(part.others, part.others) + matrix
+    for part in sparse_rows_of(state, given, rule):
+        matrix = part.product(part.others) + matrix
         right += part.others.T @ part.left_over()
         diagonal += part.others.power(2).sum(axis=0)
     return Equations(matrix, right, diagonal)

@@ -26,7 +26,7 @@ import numpy as np
 from scipy.special import fdtri
 
 from pcfix.adjust.block import CX, CY, FOCAL, effect_at_corner
-from pcfix.adjust.normal import UNDAMPED, parts_of, residuals, sparse_rows
+from pcfix.adjust.normal import UNDAMPED, residuals, sparse_matrix, sparse_rows_of
 from pcfix.adjust.precision import Precision
 from pcfix.adjust.problem import Problem, Solution, water_of
 from pcfix.adjust.solve import Reduced, reduced_at, solver
@@ -82,16 +82,17 @@ def disagreement_of(
     if solve_for is None:
         return 1.0 + added, []
     drawn = np.random.default_rng(1).normal(0.0, formal.sigma0, problem.given.image_xy.shape)
-    nothing, shared = np.zeros((0, 2)), []
+    shared = []
 
     def share_of(pulls: FloatArray) -> FloatArray:
         moved = solve_for(pulls[:, reduced.active].T)
         return _share_of(formal, reduced.active, (moved**2).sum(axis=1))
 
-    by_chance = share_of(pulls_of(problem, found, groups[ALONE], drawn))
-    for words, count in counts.items():
-        if count < LEAST_GROUPS:
-            continue
+    many = [words for words in groups if counts[words] >= LEAST_GROUPS]
+    own = [words for words in many if words != FRAME]
+    pulls = pulls_of(problem, found, [groups[words] for words in (ALONE, *own)], drawn)
+    by_chance, *shares = map(share_of, pulls)
+    for words in many:
         if words == FRAME:
             field = _pulls_of_field(
                 problem, found, groups[words], formal.sigma0, reduced, solve_for
@@ -99,8 +100,8 @@ def disagreement_of(
             more = share_of(field)
             is_more = more > NOTED
         else:
-            together = share_of(pulls_of(problem, found, groups[words], nothing))
-            is_more = together > fdtri(count - 1, counts[ALONE] - 1, SURE) * by_chance
+            together = shares[own.index(words)]
+            is_more = together > fdtri(counts[words] - 1, counts[ALONE] - 1, SURE) * by_chance
             more = np.where(is_more, together - by_chance, 0.0)
         added += more
         if is_more.any():
@@ -174,24 +175,27 @@ def _share_of(formal: Precision, active: IntArray, moved2: FloatArray) -> FloatA
     return np.concatenate([share[: 6 * k].reshape(k, 6).sum(axis=0) / free, share[6 * k :]])
 
 
-def pulls_of(problem: Problem, found: Solution, group: IntArray, drawn: FloatArray) -> FloatArray:
-    """Return the right side of the reduced equations by groups, shape (groups, 6 k + g).
+def pulls_of(
+    problem: Problem, found: Solution, groups: list[IntArray], drawn: FloatArray
+) -> list[FloatArray]:
+    """Return the right side of the reduced equations by groups, each of shape (groups, 6 k + g).
 
     Parameters
     ----------
-    group : array of int, shape (o,)
-        Of each observation, from zero.
-    drawn : array, shape (o, 2) or (0, 2)
-        Weighted residuals to use instead.
+    groups : list of array of int, shape (o,)
+        Several groupings of the observations, from zero.
+    drawn : array, shape (o, 2)
+        Weighted residuals to use instead in the first grouping.
     """
-    count = int(group.max(initial=0)) + 1
-    pulls = np.zeros((count, len(problem.moves)))
-    for part in parts_of(found.state, problem.given, UNDAMPED):
-        at, r = part.rows.observation, part.rows.r
-        if len(drawn):
-            r = np.where(part.rows.is_image[:, None], drawn[at], r)
-        grouped = sparse_rows(r, np.repeat(group[at], 2)[:, None], count)
-        pulls += part.product(grouped, part.others).toarray()
+    counts = [int(group.max(initial=0)) + 1 for group in groups]
+    pulls = [np.zeros((count, len(problem.moves))) for count in counts]
+    for part in sparse_rows_of(found.state, problem.given, UNDAMPED):
+        at, own = part.rows.observation, part.rows.r
+        r = np.where(part.rows.is_image[:, None], drawn[at], own)
+        for group, count, total in zip(groups, counts, pulls, strict=True):
+            grouped = sparse_matrix(r, np.repeat(group[at], 2)[:, None], count)
+            total += part.product(grouped).toarray()
+            r = own
     return pulls
 
 
@@ -221,13 +225,14 @@ def _pulls_of_field(
     # B', C and right sides of shifts along u and v of each tile, 2 t candidates
     count = int(tile.max()) + 1
     pulls, rest = np.zeros((2 * count, len(problem.moves))), np.zeros((2 * count, 2 * count + 1))
-    for part in parts_of(found.state, problem.given, UNDAMPED):
+    for part in sparse_rows_of(found.state, problem.given, UNDAMPED):
         at, is_image = part.rows.observation, part.rows.is_image
         weight = np.repeat(np.where(is_image, problem.given.weight[at], 0.0), 2)
         column = (2 * tile[at][:, None] + np.arange(2)).reshape(-1, 1)
-        shifts = sparse_rows(weight, column, 2 * count)
-        pulls += part.product(shifts, part.others).toarray()
-        rest[:, :-1] += part.product(shifts, shifts).toarray()
+        shifts = sparse_matrix(weight, column, 2 * count)
+        pulls += part.product(shifts).toarray()
+        taken_up = part.inverse @ (part.points.T @ shifts)
+        rest[:, :-1] += (shifts.T @ shifts - (shifts.T @ part.points) @ taken_up).toarray()
         rest[:, -1] += shifts.T @ part.left_over()
     active = pulls[:, reduced.active]
     rest -= active @ solve_for(np.column_stack([active.T, reduced.right]))
