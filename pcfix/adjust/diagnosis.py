@@ -182,8 +182,8 @@ class Diagnosis:
     @property
     def size(self) -> tuple[float, str] | None:
         """The likely error in metres, and which error that is."""
-        known = [sign for sign in self.signs if sign.size_m is not None and sign.speaks]
-        best = min(known, key=lambda sign: SIZES.index(sign.name), default=None)
+        known = {sign.name: sign for sign in self.signs if sign.size_m is not None and sign.speaks}
+        best = next((known[name] for name in SIZES if name in known), None)
         return None if best is None else (float(best.size_m or 0.0), best.basis)
 
     def sentence(self, command: str, because: str = "") -> str:
