@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from typing import Any, Generic, Literal, TypeAlias, TypeVar
 
 import numpy as np
@@ -13,7 +14,7 @@ import numpy as np
 from pcfix.blocks import kept, mapped
 from pcfix.clean.neighbours import nearest_distance
 from pcfix.compare.m3c2 import M3c2, m3c2_distances
-from pcfix.compare.match import Match
+from pcfix.compare.match import Match, heights_at
 from pcfix.compare.nearest import cloud_to_cloud, spacing_m
 from pcfix.compare.sections import Section, SectionLine, lines_downslope, section_along
 from pcfix.compare.statistics import (
@@ -31,7 +32,6 @@ from pcfix.compare.statistics import (
     statistics_of,
     tvu_of,
 )
-from pcfix.compare.vertical import Pairs, heights_at
 from pcfix.errors import GeometryError, PcfixWarning
 from pcfix.model import BoolArray, FloatArray
 from pcfix.options.steps import CompareRules
@@ -46,6 +46,21 @@ class AfterBefore(Generic[Figure]):
 
     after: Figure
     before: Figure | None
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Two heights at each of n places, world Z."""
+
+    xy: FloatArray  # (n, 2), metres, world frame
+    measured_m: FloatArray  # (n,), of the cloud
+    reference_m: FloatArray  # (n,)
+    by_nearest: BoolArray  # (n,), one of the two heights is that of a single point
+
+    @cached_property
+    def error_m(self) -> FloatArray:
+        """Measured minus reference, shape (n,): positive where the cloud is too high."""
+        return mapped(np.subtract, self.measured_m, self.reference_m)
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,6 +17,10 @@ from pcfix.options.steps import CompareRules
 
 GAP_SPACINGS, MIN_GAP_M = 5.0, 1.0
 """A point counts up to this distance outside the other cloud, unless the user sets it."""
+MIN_SHAPE = 1e-3
+"""Points are on a line if the determinant of their covariance over its squared trace is less."""
+MAX_REACH = 3.0
+"""Largest distance of a place from the neighbours' centre, in their standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,3 +218,33 @@ def near_in_plan(xy: FloatArray, other_xy: FloatArray, limit_m: float) -> BoolAr
     steps = np.array([-1, 0, 1])
     near = np.unique(held[:, None, None] + steps[:, None] * size[0] + steps)
     return mapped(lambda some: np.isin(squares(some), near), xy)
+
+
+def heights_at(
+    xy: FloatArray, surface: FloatArray, neighbours: int
+) -> tuple[FloatArray, BoolArray]:
+    """Return the height of a surface at places in plan, (n,), and where it is that of one point.
+
+    At each place, (n, 2) or (n, 3), a plane is fitted by least squares in Z to the `neighbours`
+    points of the surface, (m, 3), that are nearest in plan, and evaluated; metres, world frame. If
+    these points lie on a line, or the place far outside them, the height of the nearest is used.
+    """
+    height, by_nearest = empty((len(xy),)), empty((len(xy),), np.bool_)
+    for rows, here, near in nearest_of(xy, surface, neighbours):
+        near[:, :, :2] -= here[:, np.newaxis, :2]
+        middle = near.mean(axis=1)
+        u, v, z = np.moveaxis(near - middle[:, np.newaxis], 2, 0)
+        uu, uv, vv = (u * u).mean(axis=1), (u * v).mean(axis=1), (v * v).mean(axis=1)
+        uz, vz = (u * z).mean(axis=1), (v * z).mean(axis=1)
+        determinant, trace = uu * vv - uv * uv, uu + vv
+        flat = determinant > MIN_SHAPE * trace * trace
+        safe = np.where(flat, determinant, 1.0)
+        # normal equations of z = a + slope_u u + slope_v v about the mean
+        slope_u, slope_v = (vv * uz - uv * vz) / safe, (uu * vz - uv * uz) / safe
+        mu, mv = middle[:, 0], middle[:, 1]
+        # squared distance of the place from the mean, in standard deviations (Mahalanobis)
+        reach = (vv * mu * mu - 2.0 * uv * mu * mv + uu * mv * mv) / safe
+        fitted = flat & (reach <= MAX_REACH**2)
+        plane = middle[:, 2] - slope_u * mu - slope_v * mv
+        height[rows], by_nearest[rows] = np.where(fitted, plane, near[:, 0, 2]), ~fitted
+    return height, by_nearest

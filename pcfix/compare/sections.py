@@ -38,12 +38,6 @@ class SectionLine:
         """Length in plan."""
         return float(np.hypot(self.x2 - self.x1, self.y2 - self.y1))
 
-    def along_across(self, xy: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the distance along the line from its start, and to its left, metres."""
-        east, north = (self.x2 - self.x1) / self.length_m, (self.y2 - self.y1) / self.length_m
-        u, v = xy[:, 0] - self.x1, xy[:, 1] - self.y1
-        return np.asarray(u * east + v * north), np.asarray(v * east - u * north)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Section:
@@ -88,12 +82,13 @@ def section_along(line: SectionLine, layers: dict[str, FloatArray], half_width_m
     step = max(line.length_m / STATIONS, 0.5 * half_width_m)
     stations = np.linspace(0.0, line.length_m, max(round(line.length_m / step), 1) + 1)
     window, heights = max(step, half_width_m), {}
+    east, north = (line.x2 - line.x1) / line.length_m, (line.y2 - line.y1) / line.length_m
     for name, xyz in layers.items():
         found = []
         for rows in blocks(len(xyz)):
-            along, across = line.along_across(xyz[rows])
-            inside = np.abs(across) <= half_width_m
-            found.append((along[inside], xyz[rows, 2][inside]))
+            u, v = xyz[rows, 0] - line.x1, xyz[rows, 1] - line.y1
+            inside = np.abs(v * east - u * north) <= half_width_m
+            found.append(((u * east + v * north)[inside], xyz[rows, 2][inside]))
         along, z = np.hstack(found)
         order = np.argsort(along, kind="stable")
         along, z = along[order], z[order]

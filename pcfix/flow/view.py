@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pcfix.compare.match import near_in_plan
+from pcfix.compare.match import heights_at, near_in_plan
 from pcfix.compare.nearest import mean_spacing_m
-from pcfix.compare.vertical import heights_at
 from pcfix.errors import InputError, SettingError
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.surfaces import find_surface, view_of

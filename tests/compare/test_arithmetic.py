@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from pcfix.compare.match import heights_at
 from pcfix.compare.nearest import cloud_to_cloud
 from pcfix.compare.sections import parse_line, section_along
 from pcfix.compare.statistics import binned, distribution_of, fit_line, statistics_of
-from pcfix.compare.vertical import heights_at
 
 pytestmark = pytest.mark.quick_but("test_c2c")
 
