@@ -40,19 +40,19 @@ def cells(scene):
 
 def test_bed_in_place(scene, pictures):
     xyz, side = cells(scene)
-    found = mosaic(xyz, PHOTOS, scene, lambda k: picture_of(pictures[k][..., None]))
+    colour, covered = mosaic(xyz, PHOTOS, scene, lambda k: picture_of(pictures[k][..., None]))
     truth = np.rint(255.0 * TEXTURE(xyz[:, :2])).astype(np.uint8).reshape(side, side)
-    made = np.clip(np.rint(found.colour), 0, 255).astype(np.uint8).reshape(side, side)
-    hidden = cv2.dilate((~found.covered).astype(np.uint8).reshape(side, side), np.ones((25, 25)))
+    made = np.clip(np.rint(colour), 0, 255).astype(np.uint8).reshape(side, side)
+    hidden = cv2.dilate((~covered).astype(np.uint8).reshape(side, side), np.ones((25, 25)))
     made = np.where(hidden > 0, truth, made)
     off = np.hypot(*displacement_px(made, truth).T)
-    straight = mosaic(
+    straight, _ = mosaic(
         xyz, PHOTOS, Scene(scene.ground, WaterPlane(-1e5), 1.34),
         lambda k: picture_of(pictures[k][..., None]),
     )  # fmt: skip
-    without = np.clip(np.rint(straight.colour), 0, 255).astype(np.uint8).reshape(side, side)
+    without = np.clip(np.rint(straight), 0, 255).astype(np.uint8).reshape(side, side)
     bent = np.hypot(*displacement_px(np.where(hidden > 0, truth, without), truth).T)
-    assert found.covered.mean() > 0.97
+    assert covered.mean() > 0.97
     # px: photographs sampled without a filter, and resampled
     assert np.quantile(off, [0.5, 0.95]) == pytest.approx([0.0, 0.0], abs=0.2)
     assert np.quantile(bent, 0.95) > 1.0  # there is something to trace
@@ -61,13 +61,13 @@ def test_bed_in_place(scene, pictures):
 def test_seam(scene):
     xyz, _ = cells(scene)
     flat = [np.full((360, 480, 1), grey, np.uint8) for grey in (50, 150)]
-    found = mosaic(xyz, PHOTOS, scene, lambda k: Picture(flat[k]))
-    west = found.covered & (xyz[:, 0] < -2.0)
-    east = found.covered & (xyz[:, 0] > 2.0)
-    mixed = found.covered & (found.colour[:, 0] > 60.0) & (found.colour[:, 0] < 140.0)
-    assert np.median(found.colour[west]) == 50.0
-    assert np.median(found.colour[east]) == 150.0
-    assert (found.colour[west] == 50.0).mean() > 0.95  # the rest is behind boulder and ledge
+    colour, covered = mosaic(xyz, PHOTOS, scene, lambda k: Picture(flat[k]))
+    west = covered & (xyz[:, 0] < -2.0)
+    east = covered & (xyz[:, 0] > 2.0)
+    mixed = covered & (colour[:, 0] > 60.0) & (colour[:, 0] < 140.0)
+    assert np.median(colour[west]) == 50.0
+    assert np.median(colour[east]) == 150.0
+    assert (colour[west] == 50.0).mean() > 0.95  # the rest is behind boulder and ledge
     assert 0.0 < mixed.mean() < 0.1
     assert np.abs(xyz[mixed, 0]).max() < 4.0
 
