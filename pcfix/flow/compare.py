@@ -15,14 +15,14 @@ import numpy as np
 from pcfix.blocks import mapped
 from pcfix.compare.figures import Comparison, bins_table, figures_of
 from pcfix.compare.m3c2 import load_py4dgeo
-from pcfix.compare.match import Match, SurveyCloud, match
+from pcfix.compare.match import SurveyCloud, match
 from pcfix.compare.sections import parse_line
 from pcfix.errors import SettingError
 from pcfix.flow.runner import check_summary, json_text, write_plot, write_summary
 from pcfix.io.atomic import all_or_none, output_folder
 from pcfix.io.clouds import check_same_crs, read_cloud, read_reference, reference_of
 from pcfix.io.files import check_output, scratch_arrays, write_text
-from pcfix.io.tiles import Clouds, Tiles, cloud_of, inputs_of
+from pcfix.io.tiles import Clouds, cloud_of, inputs_of
 from pcfix.model import WaterSurface
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import WaterOptions
@@ -92,22 +92,19 @@ def compare_clouds(
         whole = cloud.read(water) if isinstance(cloud, Held) else read_cloud(clouds[0], water)
         check_same_crs(whole.name, whole.crs, target.name, target.crs)
         matched = match(whole, target, given.part(CompareRules), given=water is not None)
-        others = {name: _further(one, water, matched) for name, one in also.items()}
+        others = {}
+        for name, one in also.items():  # further clouds, at the places of the first
+            further = read_cloud(one, water)
+            check_same_crs(further.name, further.crs, target.name, target.crs)
+            over = matched.water_at(further.xyz) if matched.settings.submerged else None
+            if over is not None:  # the water of the first, where its own is unknown
+                heights = mapped(lambda w, v: np.where(np.isnan(w), v, w), further.water_m, over)
+                further = replace(further, water_m=heights)
+            found = match(further, target, matched.settings, given=water is not None)
+            others[name] = replace(found, places=matched.places)
         result = figures_of(matched, lines, started, others)
     _write(result, given)
     return result
-
-
-def _further(path: Path | Tiles, water: WaterSurface | None, first: Match) -> Match:
-    """Match a further cloud at the places of the first, with its water where its own is unknown."""
-    cloud, target = read_cloud(path, water), first.reference
-    check_same_crs(cloud.name, cloud.crs, target.name, target.crs)
-    over = first.water_at(cloud.xyz) if first.settings.submerged else None
-    if over is not None:
-        known = mapped(lambda own, w: np.where(np.isnan(own), w, own), cloud.water_m, over)
-        cloud = replace(cloud, water_m=known)
-    found = match(cloud, target, first.settings, given=water is not None)
-    return replace(found, places=first.places)
 
 
 def _check_outputs(given: CompareOptions, inputs: list[File]) -> None:

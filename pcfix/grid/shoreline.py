@@ -91,9 +91,17 @@ class NearWater(Sums):
         if wanted_m > field.cell_m:  # so that the line's own scatter is half a cell
             field = _field_of(points, wanted_m)
         maker = contour_generator(z=np.ma.masked_invalid(field.above_m))
-        places = (field.low + np.asarray(line) * field.cell_m for line in maker.lines(0.0))
-        found = [_measured(xy, field, sigma_level_m) for xy in places]
-        least_m = LEAST_CELLS * field.cell_m
+        found, least_m = [], LEAST_CELLS * field.cell_m
+        for line in maker.lines(0.0):
+            xy = field.low + np.asarray(line) * field.cell_m
+            # the standard error of the heights over the slope, rms along the line
+            slope = np.maximum(np.nan_to_num(_at(field, field.slope, xy)), FLATTEST)
+            height_m = np.hypot(sigma_level_m(xy), _at(field, field.sigma_z_m, xy))
+            step = np.hypot(*np.diff(xy, axis=0).T)
+            weight = np.append(step, 0.0) + np.append(0.0, step)
+            sigma = math.sqrt(float(np.average((height_m / slope) ** 2, weights=weight)))
+            level = float(np.nanmean(_at(field, field.water_m, xy)))
+            found.append(Shoreline(xy, level, sigma))
         long = [one for one in found if one.length_m >= max(least_m, LEAST_SIGMAS * one.sigma_m)]
         return sorted(long, key=lambda one: -one.length_m)
 
@@ -163,15 +171,3 @@ def _at(field: _Field, values: FloatArray, xy: FloatArray) -> FloatArray:
 
     place = ((xy - field.low) / field.cell_m)[:, ::-1].T
     return np.asarray(map_coordinates(values, place, order=1, mode="nearest"))
-
-
-def _measured(
-    xy: FloatArray, field: _Field, sigma_level_m: Callable[[FloatArray], FloatArray]
-) -> Shoreline:
-    """Return a line with its standard error: that of the heights over the slope."""
-    slope = np.maximum(np.nan_to_num(_at(field, field.slope, xy)), FLATTEST)
-    height_m = np.hypot(sigma_level_m(xy), _at(field, field.sigma_z_m, xy))
-    step = np.hypot(*np.diff(xy, axis=0).T)
-    weight = np.append(step, 0.0) + np.append(0.0, step)
-    sigma = math.sqrt(float(np.average((height_m / slope) ** 2, weights=weight)))
-    return Shoreline(xy, float(np.nanmean(_at(field, field.water_m, xy))), sigma)

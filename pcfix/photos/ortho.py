@@ -100,7 +100,13 @@ def mosaic(
 
     `picture` returns the pixels of an image by its place in `photos`.
     """
-    slopes = [slope_of(photo, xyz) for photo in photos]
+    slopes = []  # tangents of straight rays from nadir; infinite far outside the frame
+    for photo in photos:
+        away, lens = xyz - photo.centre, photo.lens
+        at = project(lens, away @ photo.rotation.T) / [lens.width, lens.height]
+        inside = ((at > -SPARE_SHARE) & (at < 1.0 + SPARE_SHARE)).all(axis=1) & (away[:, 2] < 0.0)
+        tangent = np.hypot(away[:, 0], away[:, 1]) / np.where(inside, -away[:, 2], 1.0)
+        slopes.append(np.where(inside, tangent, np.inf).astype(np.float32))
     near = [k for k, one in enumerate(slopes) if np.isfinite(one).any()]
     if not near:
         return None
@@ -131,17 +137,6 @@ def mosaic(
             colour = np.zeros((len(xyz), found.shape[1]), np.float32)
         colour[rows] += share[k, rows, None] * found
     return colour, covered
-
-
-def slope_of(photo: Photo, xyz: FloatArray) -> npt.NDArray[np.float32]:
-    """Return the tangent of straight rays from nadir; infinite far outside the frame."""
-    away = xyz - photo.centre
-    lens = photo.lens
-    place = project(lens, away @ photo.rotation.T) / [lens.width, lens.height]
-    inside = ((place > -SPARE_SHARE) & (place < 1.0 + SPARE_SHARE)).all(axis=1)
-    inside &= away[:, 2] < 0.0
-    tangent = np.hypot(away[:, 0], away[:, 1]) / np.where(inside, -away[:, 2], 1.0)
-    return np.where(inside, tangent, np.inf).astype(np.float32)
 
 
 def seen_at(photo: Photo, xyz: FloatArray, scene: Scene) -> tuple[FloatArray, BoolArray]:
