@@ -92,6 +92,8 @@ def _offsets(position: FloatArray) -> FloatArray:
     return np.asarray((mixed >> np.uint64(11)) / 2.0**53 - 0.5)
 
 
+PART_CELLS, PART_MARGINS = 64, 8
+"""Side of a part, cells: small triangulations take half the time per point."""
 SLACK_CELLS = 1.5
 """Rims k + 1 cells apart enclose k empty ones; circles through their corners are a bit wider."""
 
@@ -109,34 +111,25 @@ def fill_holes(height: FloatArray, window: Window, around: Window, widest: float
     of the survey, are filled too. `around`, the shape of the heights (metres, NaN if unknown), is
     the window with `margin_cells` of margin, as far as the raster reaches.
     """
+    from scipy.ndimage import binary_erosion
+
     margin = margin_cells(widest)
     side = max(PART_CELLS, PART_MARGINS * margin)
     filled = np.empty((window.height, window.width))
 
     def fill(part: Window) -> None:
+        """Fill the holes of a part of the window."""
         about = part.grown(margin).clipped(around)
-        filled[part.within(window)] = _filled(height[about.within(around)], part, about, widest)
+        near = height[about.within(around)]
+        inner, known = near[part.within(about)], ~np.isnan(near)
+        if known.any() and np.isnan(inner).any():
+            inside = binary_erosion(known, np.ones((3, 3), np.bool_))  # with eight known neighbours
+            row, column = np.nonzero(known & ~inside)
+            position = np.column_stack([column + about.column + 0.5, row + about.row + 0.5])
+            surface = triangulated(position, near[row, column], part, widest + SLACK_CELLS, 1.0)
+            inner = np.where(np.isnan(inner), surface, inner)
+        filled[part.within(window)] = inner
 
     with ThreadPoolExecutor(current().threads) as pool:
         list(pool.map(fill, window.parts(side)))
     return filled
-
-
-PART_CELLS, PART_MARGINS = 64, 8
-"""Side of a part, cells: small triangulations take half the time per point."""
-
-
-def _filled(height: FloatArray, window: Window, around: Window, widest: float) -> FloatArray:
-    from scipy.ndimage import binary_erosion
-
-    inner = np.array(height[window.within(around)])
-    known = ~np.isnan(height)
-    if known[window.within(around)].all() or not known.any():
-        return inner
-    inside = binary_erosion(known, np.ones((3, 3), np.bool_))  # with eight known neighbours
-    row, column = np.nonzero(known & ~inside)
-    position = np.column_stack([column + around.column + 0.5, row + around.row + 0.5])
-    surface = triangulated(position, height[row, column], window, widest + SLACK_CELLS, 1.0)
-    empty = np.isnan(inner)
-    inner[empty] = surface[empty]
-    return inner
