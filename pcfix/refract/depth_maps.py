@@ -38,6 +38,7 @@ from pcfix.refract.batch import (
     Batch,
     Chosen,
     Intersection,
+    normal_above,
     to_adjusted,
     to_original,
 )
@@ -124,16 +125,14 @@ def room_for(k: int) -> Room:
 @device
 def sight_of(points: Chosen, i: int) -> Sight:
     """Return point i."""
-    normal = row_of(points.normals, i)
+    normal = normal_above(points, i)
     above = normal[2] * (points.height[i] - points.xyz[i, 2])
     return Sight(row_of(points.xyz, i), row_of(points.original_xyz, i), above, normal)
 
 
-@device
+@device(forceinline=True)
 def original_up(sight: Sight, block: Block, c: int) -> Vector:
     """Return the vector from the point to the projection centre, both of the original model."""
-    if len(block.images.centres) == 0:
-        return minus(row_of(block.points.centres, c), sight.now)
     return minus(row_of(block.images.centres, c), sight.original)
 
 
@@ -179,7 +178,7 @@ def find_lines(
     again, rise = room.again[: maps.size], min(RISE * lines.bed, -LEAST_DEPTH_M)
     for q in range(maps.size):
         fitted = has_terms(table, maps[q])
-        again[q] = 1.0 if not fitted or len(block.images.centres) else 0.0
+        again[q] = 0.0 if fitted and block.images.same else 1.0
     look(maps, again, lines.bed + rise, sight, block, table, room)
     for q in range(maps.size):
         lines.slope[q] = room.looks[q, DEPTH]
@@ -198,7 +197,7 @@ def find_lines(
 @device
 def set_steep(table: Table, layer: int, block: Block, room: Room) -> None:
     """Set how the depths in the maps of a cell change with the bed, from a point in its middle."""
-    if len(block.images.centres):  # the middle has no place in the original model
+    if not block.images.same:  # the middle has no place in the original model
         return
     (x, y), (_, b, c) = (table.middle[0], table.middle[1]), block.water
     normal, depth = normal_of(b, c), SHALLOWEST_M * LAYER ** (layer - 0.5)
@@ -248,7 +247,7 @@ def settle_bed(
     row[OUTCOME] = NO_CAMERA if maps.size == 0 else ONE_CAMERA
     bed, looks, near = depths.bed, room.looks[: maps.size], CLOSE_M
     step = balance(depths.t, depths.slope, weight)
-    if table.place.size and maps.size and not len(block.images.centres):
+    if table.place.size and maps.size and block.images.same:
         c = maps[0]
         near = max(near, NEAR_PX * _length(sight, block, c) / block.matcher.focal_px[c])
     for _ in range(MAX_LOOKS):
@@ -275,7 +274,7 @@ def settle_bed(
     row[OUTCOME], row[_COUNT] = CORRECTED, count
 
 
-@device
+@device(forceinline=True)
 def _look(
     out: FloatArray, c: int, bed: float, sight: Sight, block: Block, table: Table, room: Room
 ) -> None:
@@ -296,9 +295,7 @@ def _look(
     out[_X], out[_Y] = q[0], q[1]
     out[_X_BY_HEIGHT], out[_Y_BY_HEIGHT] = d[0] * down, d[1] * down
     depth, under, count = dot(normal, minus(a, q)), f * length, -1
-    away, per_depth = length, length * per_across
-    if len(block.images.centres):
-        length = _length(sight, block, c)
+    away, per_depth, length = length, length * per_across, _length(sight, block, c)
     # from the polynomials, or exactly where these do not reach
     if has_terms(table, c):
         usual = away - under + USUAL * depth * per_depth - length
@@ -314,14 +311,14 @@ def _look(
     out[BY_HEIGHT] = -steep * change / length if t == t else np.nan
 
 
-@device
+@device(forceinline=True)
 def _length(sight: Sight, block: Block, c: int) -> float:
     """Return the distance of the point from the projection centre in the original model, metres."""
     up = original_up(sight, block, c)
     return np.sqrt(dot(up, up))
 
 
-@device
+@device(forceinline=True)
 def _ray(c: int, sight: Sight, block: Block) -> tuple[Vector, Vector, float]:
     """Return the ray on which image c shows the point.
 
@@ -330,7 +327,7 @@ def _ray(c: int, sight: Sight, block: Block) -> tuple[Vector, Vector, float]:
     """
     up = minus(row_of(block.points.centres, c), sight.now)
     above = sight.above + sight.normal[2] * block.points.offset[c]
-    if len(block.images.centres) == 0:
+    if block.images.same:
         return (0.0, 0.0, 0.0), up, above
     # the ray of the original image, in the adjusted camera
     d = to_adjusted(block.images, c, scaled(-1.0, original_up(sight, block, c)))

@@ -40,7 +40,7 @@ from pcfix.refract.map_table import (
     table_of,
 )
 from pcfix.refract.matcher import WIDTH_M, Matcher
-from pcfix.refract.tiling import are_same, cameras_of, cells_of, counts_of
+from pcfix.refract.tiling import are_same, cells_of, counts_of
 
 AGREE = 0.01
 """Depths that differ by less, relative, are fused."""
@@ -170,21 +170,35 @@ def _invert_cells(
                     seeing[a] = seeing[a] or a >= 0
             fitted = table_of(rows[0], layer[rows[0]], seeing, block)
             depth_maps.set_steep(fitted, layer[rows[0]], block, room)
-        for at in range(rows.size):
-            i, cameras = rows[at], cameras_of(points, rows[at])
-            table = fitted if reads(block, i) else none
-            sight = depth_maps.sight_of(points, i)
-            if listed:
-                weight = given[points.start[i] : points.start[i + 1]] if given.size else given
-                _invert_listed(result[i], cameras, weight, groups, sight, block, table, room)
-                continue
-            # points with the same cameras share their groups
-            if at == 0 or not are_same(cameras, cameras_of(points, rows[at - 1])):
-                _group(groups, cameras, matcher)
-            if len(likely):
-                _set_likely(likely[i], cameras, groups, sight, block, table, room)
-            else:
-                _invert_one(result[i], cameras, given[i], groups, sight, block, table, room)
+        _invert_points(rows, listed, given, result, likely, groups, block, fitted, none, room)
+
+
+@device
+def _invert_points(
+    rows: IntArray, listed: bool, given: FloatArray, result: FloatArray, likely: FloatArray,
+    groups: Groups, block: Block, fitted: Table, none: Table, room: Room,
+) -> None:  # fmt: skip
+    """Do as `_invert_cells` for the points of one cell, with its polynomials.
+
+    It makes no arrays, so that references to the many that it reads are not counted.
+    """
+    points, before = block.points, rows[:0]
+    for i in rows:
+        first, last = points.start[i], points.start[i + 1]
+        cameras, table = points.camera[first:last], fitted if reads(block, i) else none
+        sight = depth_maps.sight_of(points, i)
+        if listed:
+            weight = given[first:last] if given.size else given
+            _invert_listed(result[i], cameras, weight, groups, sight, block, table, room)
+            continue
+        # points with the same cameras share their groups
+        if not are_same(cameras, before):
+            _group(groups, cameras, block.matcher)
+        before = cameras
+        if len(likely):
+            _set_likely(likely[i], cameras, groups, sight, block, table, room)
+        else:
+            _invert_one(result[i], cameras, given[i], groups, sight, block, table, room)
 
 
 @device
@@ -309,7 +323,7 @@ def _average_around(seed: int, groups: Groups, depths: Lines, rise: float) -> No
         _average(q, groups, depths)
 
 
-@device
+@device(forceinline=True)
 def _average(q: int, groups: Groups, depths: Lines) -> None:
     """Average a depth with those of its partners that agree."""
     own, total, change, count = groups.own[q], 0.0, 0.0, 0.0
@@ -325,7 +339,7 @@ def _average(q: int, groups: Groups, depths: Lines) -> None:
     groups.depth[q], groups.change[q] = total * each, change * each
 
 
-@device
+@device(forceinline=True)
 def _fuse(seed: int, groups: Groups) -> tuple[float, float]:
     """Return how far up the bed is for the group of a seed, and how many maps the group has."""
     total, change, members = 0.0, 0.0, 0.0

@@ -23,7 +23,7 @@ from pcfix.lens.frames import (
     Pyramid,
     frames_of,
     in_frame,
-    may_hold,
+    mark,
     no_frames,
     pyramid,
 )
@@ -47,7 +47,7 @@ from pcfix.refract.rays import line_terms, nearest_point, pierce, ray_distance, 
 from pcfix.refract.tiling import TILE, nine, spatial_order, three, tiles_of
 from pcfix.refract.tracks import FOUND, LOST, POINT_RUNS, RAY_RUNS, SEARCHED, STATE, Q, search_tile
 from pcfix.refract.uncertainty import Budget, room_of
-from pcfix.water.surface import Field, Tin, locate
+from pcfix.water.surface import Field, Tin
 
 # Columns of the result: a row is one cache line, as points are written in scattered order.
 _DISTANCE, _INCIDENCE, _COUNT, _OUTCOME, _FOUND, _WIDTH = 3, 4, 5, 6, 7, 8
@@ -128,47 +128,21 @@ def _intersect(
         rays, search = np.empty((len(centres), RAY_RUNS * TILE)), np.empty(POINT_RUNS * TILE)
     low, high = tiling.corners_of(order[span[0] * TILE : span[1] * TILE], points.xyz)
     around = camera[:0] if start.size else tiling.cameras_around(frames, centres, low, high)
-    facet = np.full(TILE, -1)
     for t in range(*span):
         # a tile of neighbours, its sums, and the cameras near it
         rows = order[t * TILE : (t + 1) * TILE]
         tile, sums = np.empty(7 * TILE), np.zeros(11 * TILE)
         low, high = tiling.gather(tile, rows, points)
         sums[10 * TILE :] = 1.0
-        if tin is not None:  # the facet above each point, where piercing starts
-            for j in range(rows.size):
-                facet[j] = locate(tin, tile[j], tile[TILE + j])
         if start.size:
             near, marks = tiling.marks_of_lists(start, camera, rows, len(centres))
         else:
-            near = around[_may_hold(frames, around, centres, low, high)]
+            near = tiling.near_cameras(around, frames, centres, low, high)
             marks = np.empty((near.size, rows.size))
-        seeing = 0
-        for k in range(near.size):
-            c, added, some = near[k], 0, True
-            if start.size:
-                marks[seeing] = marks[k]
-            elif frames.row[c] == NOT_DISTORTED:  # the pyramid is tested on the way
-                g, some = pyramid(frames.planes[c]), False
-                added = add_camera(sums, tile, marks[seeing], g, rig, c, rule, tin, fields, facet)
-            else:
-                some = tiling.mark_camera(marks[seeing], tile, frames, c, centres[c], low, high)
-            if some:
-                on = marks[seeing]
-                added = add_camera(sums, tile, on, None, rig, c, rule, tin, fields, facet)
-            if added:
-                near[seeing] = c
-                seeing += 1
-        of_point = np.empty(11)
-        for j in range(rows.size):
-            for at in range(11):
-                of_point[at] = sums[at * TILE + j]
-            _solve(result[rows[j]], of_point[9], of_point, marks[:seeing, j])
-        for k in range(seeing):
-            if not used[near[k]]:  # threads may write it at once: always the same value
-                for j in range(rows.size):
-                    if marks[k, j] > 0.0 and result[rows[j], _OUTCOME] == CORRECTED:
-                        used[near[k]] = True
+        seeing = _add_cameras(
+            sums, tile, marks, near, start.size > 0, rig, frames, rule, tin, fields, low, high
+        )
+        _solve(result, used, rows, sums, marks[:seeing], near)
         if optics is not None:
             for j in range(rows.size):
                 row = result[rows[j]]
@@ -187,26 +161,48 @@ def _intersect(
                     row[_DISTANCE] = ray_distance(sums[9 * TILE + j], nine(sums, j), vector(row))
         if len(covariance):
             room = room_of(tile, result, rows)
-            for k in range(seeing):
-                uncertainty.add_errors(room, tile, marks[k], rig, near[k], rule, budget)
+            uncertainty.add_errors(room, tile, marks[:seeing], near, rig, rule, budget)
             uncertainty.finish_tile(covariance, rows, room, tile, level_sigma, budget)
 
 
-@device(allocates=True)
-def _may_hold(
-    frames: Frames, around: IntArray, centres: FloatArray, low: FloatArray, high: FloatArray
-) -> BoolArray:
-    """Return which cameras may hold a point of a box by their pyramids."""
-    near = np.empty(around.size, np.bool_)
-    for k in range(around.size):
-        near[k] = may_hold(frames.planes[around[k]], centres[around[k]], low, high)
-    return near
+# Where arrays may be made, references to them are counted, at the cost of two locked operations for
+# every row of an array that is handed on. So the loops over cameras and points are functions that
+# make none.
+
+
+@device
+def _add_cameras(
+    sums: FloatArray, tile: FloatArray, marks: FloatArray, near: IntArray, listed: bool, rig: Rig,
+    frames: Frames, rule: Rule, tin: Tin | None, fields: Field | None, low: FloatArray,
+    high: FloatArray,
+) -> int:  # fmt: skip
+    """Add the rays of the cameras `near` a tile, whose box is `low` to `high`.
+
+    The cameras that give a ray, and their marks, are moved to the front; returns how many they are.
+    """
+    seeing = 0
+    for k in range(near.size):
+        c, on, added, some = near[k], marks[seeing], 0, True
+        if listed:
+            for j in range(on.size):
+                on[j] = marks[k, j]
+        elif frames.row[c] == NOT_DISTORTED:  # the pyramid is tested on the way
+            g, some = pyramid(frames.planes[c]), False
+            added = add_camera(sums, tile, on, g, rig, c, rule, tin, fields)
+        else:
+            some = mark(on, tile, TILE, frames, c, rig.centres[c], low, high)
+        if some:
+            added = add_camera(sums, tile, on, None, rig, c, rule, tin, fields)
+        if added:
+            near[seeing] = c
+            seeing += 1
+    return seeing
 
 
 @device
 def add_camera(
     sums: FloatArray, tile: FloatArray, marks: FloatArray, g: Pyramid | None, rig: Rig, c: int,
-    rule: Rule, tin: Tin | None, fields: Field | None, facet: IntArray,
+    rule: Rule, tin: Tin | None, fields: Field | None,
 ) -> int:  # fmt: skip
     """Add one camera's rays to the sums of a tile; return how many.
 
@@ -235,7 +231,7 @@ def add_camera(
         q = 1.0 / (length2 * height)
         f = h * length2 * q if use and h > 0.0 else 0.0
         if (tin is not None or fields is not None) and use and h > 0.0:
-            f, normal = pierce(c, tin, fields, (x, y, z - offset), e, h, normal, facet[j])
+            f, normal = pierce(c, tin, fields, (x, y, z - offset), e, h, normal)
             height = dot(normal, e)
             q = 1.0 / (length2 * height)
         # 1 / L^2
@@ -260,22 +256,32 @@ def add_camera(
 
 
 @device
-def _solve(row: FloatArray, k: float, sums: FloatArray, marks: FloatArray) -> None:
-    """Solve one point and write its row; a point without a solution keeps a shift of zero.
+def _solve(
+    result: FloatArray, used: BoolArray, rows: IntArray, sums: FloatArray, marks: FloatArray,
+    near: IntArray,
+) -> None:  # fmt: skip
+    """Solve the points of a tile and write their rows; without a solution the shift stays zero.
 
-    A list may name a camera several times, as its `marks` say.
+    Sets which cameras are used; `marks` has a row for each of those `near`.
     """
-    if k < 2.0:
-        row[_OUTCOME] = ONE_CAMERA if k == 1.0 else NO_CAMERA
-        return
-    solved, q, distance, _ = nearest_point(k, sums)
-    if not solved:
-        most = 0.0
-        for times in marks:
-            most = max(most, times)
-        row[_OUTCOME] = ONE_CAMERA if most == k else PARALLEL
-        return
-    row[0], row[1], row[2] = q
-    row[_DISTANCE], row[_FOUND] = distance, 1.0
-    row[_INCIDENCE] = np.degrees(np.arccos(np.sqrt(min(sums[10], 1.0))))
-    row[_COUNT], row[_OUTCOME] = k, CORRECTED
+    for j in range(rows.size):
+        row, k = result[rows[j]], sums[9 * TILE + j]
+        if k < 2.0:
+            row[_OUTCOME] = ONE_CAMERA if k == 1.0 else NO_CAMERA
+            continue
+        solved, q, distance = nearest_point(k, nine(sums, j))
+        if not solved:
+            most = 0.0  # a list may name a camera several times, as its marks say
+            for times in marks[:, j]:
+                most = max(most, times)
+            row[_OUTCOME] = ONE_CAMERA if most == k else PARALLEL
+            continue
+        row[0], row[1], row[2] = q
+        row[_DISTANCE], row[_FOUND] = distance, 1.0
+        row[_INCIDENCE] = np.degrees(np.arccos(np.sqrt(min(sums[10 * TILE + j], 1.0))))
+        row[_COUNT], row[_OUTCOME] = k, CORRECTED
+    for k in range(len(marks)):
+        if not used[near[k]]:  # threads may write it at once: always the same value
+            for j in range(rows.size):
+                if marks[k, j] > 0.0 and result[rows[j], _OUTCOME] == CORRECTED:
+                    used[near[k]] = True

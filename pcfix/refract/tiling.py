@@ -12,20 +12,9 @@ import numpy as np
 
 from pcfix.kernels import device
 from pcfix.lens.algebra import Nine, Vector
-from pcfix.lens.frames import (
-    ALL,
-    NOT_DISTORTED,
-    NOTHING,
-    SOME,
-    Frames,
-    judge,
-    mark,
-    mark_pyramid,
-    may_hold,
-    pyramid,
-)
+from pcfix.lens.frames import NOT_DISTORTED, NOTHING, Frames, judge, may_hold
 from pcfix.model import FloatArray, IntArray, WaterPlane
-from pcfix.refract.batch import Batch, Chosen
+from pcfix.refract.batch import Batch, Chosen, normal_above
 
 TILE = 128
 """Points of a tile: its sums (11 numbers a point) stay in the processor's first cache."""
@@ -55,7 +44,8 @@ def spatial_order(xyz: FloatArray) -> IntArray:
     row = np.minimum(((y - y.min()) * (1.0 / cell_m)).astype(np.int64), rows - 1)
     # row after row to and fro, so that the next cell is always a neighbour
     within = np.where(row & 1, columns - 1 - column, column)
-    return np.argsort(row * columns + within, kind="stable")
+    # there are fewer than 2^16 cells; numpy sorts such small numbers in two passes
+    return np.argsort((row * columns + within).astype(np.uint16), kind="stable")
 
 
 def cell_side(batch: Batch) -> float:
@@ -129,8 +119,8 @@ def gather(tile: FloatArray, rows: IntArray, points: Chosen) -> tuple[FloatArray
             value = points.xyz[i, axis]
             tile[axis * TILE + j] = value
             low[axis], high[axis] = min(low[axis], value), max(high[axis], value)
-            tile[(4 + axis) * TILE + j] = points.normals[i, axis]
-        tile[3 * TILE + j] = points.height[i]
+        tile[3 * TILE + j], normal = points.height[i], normal_above(points, i)
+        tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j] = normal
     return low, high
 
 
@@ -142,13 +132,13 @@ def slots(*widths: int) -> tuple[int, ...]:
     return (0, *accumulate(widths))
 
 
-@device
+@device(forceinline=True)
 def three(runs: FloatArray, at: int) -> Vector:
     """Return the numbers of a point from three runs that follow each other."""
     return runs[at], runs[at + TILE], runs[at + 2 * TILE]
 
 
-@device
+@device(forceinline=True)
 def nine(runs: FloatArray, at: int) -> Nine:
     """Return the numbers of a point from nine runs that follow each other."""
     a, b, c = three(runs, at), three(runs, at + 3 * TILE), three(runs, at + 6 * TILE)
@@ -199,26 +189,6 @@ def near_cameras(
     return near[:count]
 
 
-@device
-def mark_camera(
-    marks: FloatArray, tile: FloatArray, frames: Frames, c: int, centre: FloatArray,
-    low: FloatArray, high: FloatArray,
-) -> bool:  # fmt: skip
-    """Mark the points of a tile that lie in the frame of camera c; return whether any may."""
-    m = marks.size
-    x, y, z = tile[:m], tile[TILE : TILE + m], tile[2 * TILE : 2 * TILE + m]
-    if frames.row[c] == NOT_DISTORTED:  # the frame is a pyramid of four planes
-        mark_pyramid(marks, x, y, z, centre, pyramid(frames.planes[c]))
-        return True
-    # many boxes lie within a distorted frame, or beside it, as a whole
-    held = judge(frames, c, centre, low, high)
-    if held == ALL:
-        marks[:] = 1.0
-    if held != SOME:
-        return bool(held != NOTHING)
-    return bool(mark(marks, x, y, z, centre, frames, c) > 0)
-
-
 @device(allocates=True)
 def marks_of_lists(
     start: IntArray, camera: IntArray, rows: IntArray, k: int
@@ -243,26 +213,7 @@ def marks_of_lists(
     return named[:count], marks
 
 
-@device(allocates=True)
-def marks_in_frame(
-    around: IntArray, tile: FloatArray, frames: Frames, centres: FloatArray, low: FloatArray,
-    high: FloatArray, count: int,
-) -> tuple[IntArray, FloatArray]:  # fmt: skip
-    """Return the cameras whose frames hold points of a tile, and which points these are.
-
-    `low` and `high` are the box of its `count` points, `around` the cameras to choose from.
-    """
-    near = near_cameras(around, frames, centres, low, high)
-    marks = np.empty((near.size, count))
-    seeing = 0
-    for c in near:
-        if mark_camera(marks[seeing], tile, frames, c, centres[c], low, high):
-            near[seeing] = c
-            seeing += 1
-    return near[:seeing], marks[:seeing]
-
-
-@device
+@device(forceinline=True)
 def product_of(m: Nine, x: Vector) -> Vector:
     """Return a matrix times a vector."""
     return (
@@ -272,7 +223,7 @@ def product_of(m: Nine, x: Vector) -> Vector:
     )
 
 
-@device
+@device(forceinline=True)
 def inverse_of(m: Nine) -> tuple[float, Nine]:
     """Return the determinant of a matrix and its inverse, meaningless if that is 0."""
     a, b, c, d, e, f, g, h, i = m

@@ -287,7 +287,7 @@ def add_rays(
         room[_HEIGHT * TILE + j] = h
 
 
-@device
+@device(forceinline=True)
 def _seen(room: SingleArray, j: int, bend: float) -> Seen:
     """Return how often a ray counts; e, N, H, L^2, h, y and r where the light bends."""
     at = _AWAY * TILE + j
@@ -302,7 +302,7 @@ def _seen(room: SingleArray, j: int, bend: float) -> Seen:
     return room[_COUNT * TILE + j], e, normal, dot(normal, e), dot(e, e), h, y, bend
 
 
-@device
+@device(forceinline=True)
 def _bent(
     height: float, length2: float, h: float, y: float, bend: float
 ) -> tuple[float, float, float, float, float, float, float]:
@@ -319,7 +319,7 @@ def _bent(
     )  # fmt: skip
 
 
-@device
+@device(forceinline=True)
 def _weight(one: float, e: Vector, length2: float, axis: Vector, square: float) -> Symmetric:
     """Return J'J of a camera whose squared focal length (px) is `square`, at P.
 
@@ -343,7 +343,7 @@ def _weight(one: float, e: Vector, length2: float, axis: Vector, square: float) 
     )  # fmt: skip
 
 
-@device
+@device(forceinline=True)
 def _add_three(sums: FloatArray, at: int, c: float, a: Vector) -> None:
     """Add c a."""
     sums[at] += c * a[0]
@@ -351,7 +351,7 @@ def _add_three(sums: FloatArray, at: int, c: float, a: Vector) -> None:
     sums[at + 2 * TILE] += c * a[2]
 
 
-@device
+@device(forceinline=True)
 def _add_six(sums: FloatArray, at: int, m: Symmetric) -> None:
     sums[at] += m[0]
     sums[at + TILE] += m[1]
@@ -361,7 +361,7 @@ def _add_six(sums: FloatArray, at: int, m: Symmetric) -> None:
     sums[at + 5 * TILE] += m[5]
 
 
-@device
+@device(forceinline=True)
 def _add_nine(sums: FloatArray, at: int, c: float, m: Symmetric, g: Vector, q: Vector) -> None:
     """Add c m + g q'."""
     sums[at] += c * m[0] + g[0] * q[0]
@@ -375,7 +375,7 @@ def _add_nine(sums: FloatArray, at: int, c: float, m: Symmetric, g: Vector, q: V
     sums[at + 8 * TILE] += c * m[5] + g[2] * q[2]
 
 
-@device
+@device(forceinline=True)
 def _in_space(
     one: float, e: Vector, normal: Vector, height: float, length2: float, bend: float,
     kappa: float, inv2: float,
@@ -440,7 +440,7 @@ def add_in_images(room: SingleArray, count: int, sight: Sight) -> None:
         _add_six(room, SIGHT * TILE + j, w)
 
 
-@device
+@device(forceinline=True)
 def _inverse(height: float, length2: float, away: float, beta: float) -> tuple[float, float]:
     """Return what D^-1 does to p across d, and along it."""
     # 1 - m + beta rho^2
@@ -534,8 +534,7 @@ def _of_lists(
         tiling.gather(tile, rows, points)
         room = room_of(tile, shift, rows)
         named, marks = tiling.marks_of_lists(start, camera, rows, len(rig.centres))
-        for at in range(named.size):
-            add_errors(room, tile, marks[at], rig, named[at], rule, budget)
+        add_errors(room, tile, marks, named, rig, rule, budget)
         finish_tile(result, rows, room, tile, level_sigma, budget)
 
 
@@ -547,24 +546,25 @@ def differ_by_ray(budget: Budget) -> bool:
 
 @device
 def add_errors(
-    room: SingleArray, tile: FloatArray, marks: FloatArray, rig: Rig, c: int, rule: Rule,
+    room: SingleArray, tile: FloatArray, marks: FloatArray, near: IntArray, rig: Rig, rule: Rule,
     budget: Budget,
 ) -> None:  # fmt: skip
-    """Add the rays of one camera to the points of a tile that have a mark."""
-    x, y, z = row_of(rig.axes, c)
-    square = _single(rig.focal_px[c] * rig.focal_px[c])
-    sight = (_single(x), _single(y), _single(z)), square, _single(rule.bend)
-    count = marks.size
-    add_rays(room, tile, marks, rig, c, rule)
-    # the derivative of consistent, or that of snell
-    if budget.in_images:
-        add_in_images(room, count, sight)
-    else:
-        add_in_space(room, count, sight)
-    if budget.tilt > 0.0:
-        add_tilt(room, count, sight, budget.in_images)
-    if differ_by_ray(budget):
-        add_noise(room, count, sight, budget)
+    """Add the rays of cameras to the points of a tile; `marks` has a row for each of `near`."""
+    for k in range(len(marks)):
+        c, count = near[k], marks.shape[1]
+        x, y, z = row_of(rig.axes, c)
+        square = _single(rig.focal_px[c] * rig.focal_px[c])
+        sight = (_single(x), _single(y), _single(z)), square, _single(rule.bend)
+        add_rays(room, tile, marks[k], rig, c, rule)
+        # the derivative of consistent, or that of snell
+        if budget.in_images:
+            add_in_images(room, count, sight)
+        else:
+            add_in_space(room, count, sight)
+        if budget.tilt > 0.0:
+            add_tilt(room, count, sight, budget.in_images)
+        if differ_by_ray(budget):
+            add_noise(room, count, sight, budget)
 
 
 @device(allocates=True)
@@ -603,7 +603,7 @@ def finish_tile(
             result[rows[j], at] = out[at * TILE + j]
 
 
-@device
+@device(forceinline=True)
 def _write(
     out: FloatArray, j: int, solved: bool, by_delta: Nine, b: Nine, sums: FloatArray,
     tile: FloatArray, level_sigma: float, budget: Budget,
@@ -623,7 +623,7 @@ def _write(
     out[5 * TILE + j] = cov[5] if solved else 0.0
 
 
-@device
+@device(forceinline=True)
 def _columns(
     by_delta: Nine, sums: FloatArray, tile: FloatArray, j: int, level_sigma: float, budget: Budget
 ) -> tuple[Vector, Vector, Vector, Vector]:
@@ -651,7 +651,7 @@ def _columns(
     )
 
 
-@device
+@device(forceinline=True)
 def _six(sums: FloatArray, at: int) -> Symmetric:
     return (
         sums[at], sums[at + TILE], sums[at + 2 * TILE],
@@ -659,12 +659,12 @@ def _six(sums: FloatArray, at: int) -> Symmetric:
     )  # fmt: skip
 
 
-@device
+@device(forceinline=True)
 def _full(m: Symmetric) -> Nine:
     return m[0], m[1], m[2], m[1], m[3], m[4], m[2], m[4], m[5]
 
 
-@device
+@device(forceinline=True)
 def _product(a: Nine, b: Nine) -> Nine:
     """Return a matrix times a matrix."""
     x = product_of(a, (b[0], b[3], b[6]))

@@ -119,6 +119,14 @@ class Field(NamedTuple):
     which: int  # the raster
 
 
+@device
+def field_of(fields: Field | None, which: int) -> Field | None:
+    """Return another one of the same rasters; None where there are none."""
+    if fields is None:
+        return None
+    return Field(fields.heights, fields.shape, fields.frame, which)
+
+
 @lru_cache(maxsize=4)
 def build_field(raster: WaterRaster) -> Field:
     """Return a raster for the kernels."""
