@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -257,27 +257,21 @@ class Bed(NamedTuple):
 
     def height_at(self, xy: FloatArray) -> FloatArray:
         """Return the height at each place, NaN where the cell has none."""
-        x, y = (xy[:, 0] - self.left_m) / self.cell_m, (xy[:, 1] - self.bottom_m) / self.cell_m
-        own = self._at(np.floor(y).astype(int), np.floor(x).astype(int))
-        if not self.between:
-            return own
-        total, weights = np.zeros(len(xy)), np.zeros(len(xy))
-        for up, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
-            row, column = np.floor(y - 0.5).astype(int) + up, np.floor(x - 0.5).astype(int) + right
-            height = self._at(row, column)
-            weight = (1.0 - np.abs(y - row - 0.5)) * (1.0 - np.abs(x - column - 0.5))
-            weight = np.where(np.isfinite(height), weight, 0.0)
-            total, weights = total + weight * np.nan_to_num(height), weights + weight
-        known = np.isfinite(own) & (weights > 0.0)
-        return np.where(known, total / np.where(known, weights, 1.0), np.nan)
+        from scipy.ndimage import map_coordinates
 
-    def _at(self, row: IntArray, column: IntArray) -> FloatArray:
-        """Return the heights of cells, NaN beside the grid."""
-        rows, columns = self.height_m.shape
-        inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-        height = np.full(len(row), np.nan)
-        height[inside] = self.height_m[row[inside], column[inside]]
-        return height
+        place = (xy.T[::-1] - [[self.bottom_m], [self.left_m]]) / self.cell_m
+        cell: dict[str, Any] = {"mode": "grid-constant", "output": np.float64}
+        own = map_coordinates(self.height_m, np.floor(place), order=0, cval=np.nan, **cell)
+        if not self.between:
+            return np.asarray(own)
+        # the mean of the four nearest middles of cells that have a height
+        known = np.isfinite(self.height_m)
+        total, weight = (
+            map_coordinates(values, place - 0.5, order=1, **cell)
+            for values in (np.where(known, self.height_m, 0.0), known.astype(np.float64))
+        )
+        inside = np.isfinite(own) & (weight > 0.0)
+        return np.where(inside, total / np.where(inside, weight, 1.0), np.nan)
 
 
 def bed_of(xyz: FloatArray, likely_m: FloatArray) -> Bed:

@@ -23,8 +23,7 @@ is known to about a thousandth. From `snell`'s solution each step with the inver
 about three digits, and two or three steps are enough.
 
 A tile of points is processed camera by camera, as in `pcfix.refract.intersect`: the inner loops
-run over the points and are vectorised, for the usual lens and a plane of water. Points that need
-more steps, under waves for instance, are then searched one by one.
+run over the points and are vectorised, for the usual lens and a plane of water.
 """
 
 from __future__ import annotations
@@ -42,8 +41,8 @@ from pcfix.refract.rays import settle
 from pcfix.refract.tiling import TILE, inverse_of, nine, product_of, slots, three
 from pcfix.water.surface import Field, Tin, field_of
 
-STEPS, MOST_STEPS = 4, 60
-"""Of all points of a tile together, and of a point by itself."""
+MOST_STEPS = 60
+"""Two or three are usual; under waves a point may need many."""
 
 CLOSE_M = 1e-7
 """Estimated distance from the solution, from the last two steps."""
@@ -64,31 +63,9 @@ def search_tile(
 ) -> None:  # fmt: skip
     """Move Q from the start in `room` to where g is zero; its state says whether it was found.
 
-    `marks`, a row for each of the cameras `near`, say how often each ray counts.
+    `marks`, a row for each of the cameras `near`, say how often each ray counts. A point that is
+    found, or lost, stays where it is, so that the others of its tile do not matter.
     """
-    count = marks.shape[1]
-    _search_all(room, rays, tile, marks, near, rig, optics, n, tin, fields, STEPS)
-    one, alone = np.empty(POINT_RUNS * TILE), np.empty(7 * TILE)
-    for j in range(count):
-        if room[STATE * TILE + j] != SEARCHED:
-            continue
-        # a tile of this point only
-        for run in range(7):
-            alone[run * TILE] = tile[run * TILE + j]
-        for run in range(POINT_RUNS):
-            one[run * TILE] = room[run * TILE + j]
-        mine = marks[:, j : j + 1].copy()
-        _search_all(one, rays, alone, mine, near, rig, optics, n, tin, fields, MOST_STEPS)
-        for run in range(POINT_RUNS):
-            room[run * TILE + j] = one[run * TILE]
-
-
-@device(allocates=True)
-def _search_all(
-    room: FloatArray, rays: FloatArray, tile: FloatArray, marks: FloatArray, near: IntArray,
-    rig: Rig, optics: Optics, n: float, tin: Tin | None, fields: Field | None, steps: int,
-) -> None:  # fmt: skip
-    """Take so many steps, or fewer, for the points of a tile that are searched."""
     count = marks.shape[1]
     room[_STEP2 * TILE : STATE * TILE] = 0.0
     for k in range(near.size):
@@ -97,7 +74,7 @@ def _search_all(
             _set_rays(rays[k], tile, marks[k], rig, near[k], optics, plain_lens(lens))
         else:
             _set_rays(rays[k], tile, marks[k], rig, near[k], optics, None)
-    for _ in range(steps):
+    for _ in range(MOST_STEPS):
         room[_G * TILE : _STEP2 * TILE] = 0.0
         for k in range(near.size):
             c, lens = near[k], optics.lenses[optics.row[near[k]]]

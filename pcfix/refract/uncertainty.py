@@ -593,8 +593,8 @@ def finish_tile(
         for j in range(rows.size):
             # Q moves by (sum M)^-1 sum M delta, and with P by (sum M)^-1 (sum M D) (sum W)^-1
             k = sums[j]
-            det, by_delta = inverse_of(_full(_six(sums, BY_Q * TILE + j)))
-            full, by_sight = inverse_of(_full(_six(sums, SIGHT * TILE + j)))
+            det, by_delta = inverse_of(_symmetric(sums, BY_Q * TILE + j))
+            full, by_sight = inverse_of(_symmetric(sums, SIGHT * TILE + j))
             by_noise = _product(_product(by_delta, nine(sums, BY_P * TILE + j)), by_sight)
             solved = (k >= 2.0) & (det >= MIN_DETERMINANT * k * k * k) & (full > 0.0)
             _write(out, j, solved, by_delta, by_noise, sums, tile, sigma[j], budget)
@@ -609,7 +609,7 @@ def _write(
     tile: FloatArray, level_sigma: float, budget: Budget,
 ) -> None:  # fmt: skip
     """Write the covariance of a point: B R B' of the noise, and that of each common error."""
-    r = _full(_six(sums, NOISE * TILE + j))
+    r = _symmetric(sums, NOISE * TILE + j)
     n = _product(_product(b, r), (b[0], b[3], b[6], b[1], b[4], b[7], b[2], b[5], b[8]))
     # each common error is one standard deviation times a column
     level, index, u, v = _columns(by_delta, sums, tile, j, level_sigma, budget)
@@ -652,16 +652,10 @@ def _columns(
 
 
 @device(forceinline=True)
-def _six(sums: FloatArray, at: int) -> Symmetric:
-    return (
-        sums[at], sums[at + TILE], sums[at + 2 * TILE],
-        sums[at + 3 * TILE], sums[at + 4 * TILE], sums[at + 5 * TILE],
-    )  # fmt: skip
-
-
-@device(forceinline=True)
-def _full(m: Symmetric) -> Nine:
-    return m[0], m[1], m[2], m[1], m[3], m[4], m[2], m[4], m[5]
+def _symmetric(sums: FloatArray, at: int) -> Nine:
+    """Return the matrix of which six runs hold xx, xy, xz, yy, yz and zz."""
+    (xx, xy, xz), (yy, yz, zz) = three(sums, at), three(sums, at + 3 * TILE)
+    return xx, xy, xz, xy, yy, yz, xz, yz, zz
 
 
 @device(forceinline=True)
