@@ -249,15 +249,9 @@ def in_frame(g: Pyramid, e: Vector) -> bool:
 
 
 @device
-def _image(lens: FloatArray, r: FloatArray, e: Vector) -> tuple[float, float]:
-    """Return u, v of the point at C - e for a lens with rotation r."""
-    return image_of(lens, *scaled(-1.0, times(r, e)))
-
-
-@device
 def _images(lens: FloatArray, r: FloatArray, e: Vector) -> bool:
-    """Whether u, v are in the frame."""
-    u, v = _image(lens, r, e)
+    """Whether the point at C - e is in the frame of a lens with rotation r."""
+    u, v = image_of(lens, *scaled(-1.0, times(r, e)))
     return (u >= 0.0) & (u <= lens[WIDTH]) & (v >= 0.0) & (v <= lens[HEIGHT])
 
 
@@ -342,7 +336,7 @@ def judge(frames: Frames, c: int, centre: FloatArray, low: FloatArray, high: Flo
     if np.arccos(max(-1.0, min(1.0, along))) > frames.cone[c, 3] + turn:
         return NOTHING
     lens, r = frames.lenses[frames.row[c]], frames.rotations[c]
-    u, v = _image(lens, r, e)
+    u, v = image_of(lens, *scaled(-1.0, times(r, e)))
     within = min(min(u, lens[WIDTH] - u), min(v, lens[HEIGHT] - v))
     # no ray of the ball is imaged farther than this from the image of its middle
     move, margin = turn * frames.reach[c, 0], frames.reach[c, 1]

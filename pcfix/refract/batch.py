@@ -67,10 +67,6 @@ class OriginalModel(NamedTuple):
     xyz: FloatArray  # (m, 3), original apparent points, metres, world frame
     cameras: Cameras  # in the order of the adjusted ones, with angles and lenses
 
-    def take(self, rows: IntArray) -> OriginalModel:
-        """Return some of the points."""
-        return OriginalModel(self.xyz[rows], self.cameras)
-
 
 @dataclass(frozen=True, eq=False)
 class Survey:
@@ -116,7 +112,7 @@ class Batch:
 
     def take(self, rows: IntArray) -> Batch:
         """Return some of the points, in the order of `rows`."""
-        sigma = self.level_sigma_m
+        sigma, model = self.level_sigma_m, self.original_model
         return replace(
             self,
             xyz=self.xyz.take(rows, axis=0),  # four times as fast as with brackets
@@ -124,7 +120,7 @@ class Batch:
                 self.surface.height_m[rows], self.surface.slope.take(rows, axis=0)
             ),
             views=None if self.views is None else self.views.take(rows),
-            original_model=None if self.original_model is None else self.original_model.take(rows),
+            original_model=None if model is None else model._replace(xyz=model.xyz[rows]),
             level_sigma_m=None if sigma is None else sigma[rows],
             source=None if self.source is None else self.source[rows],
         )

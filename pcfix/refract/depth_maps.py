@@ -43,7 +43,6 @@ from pcfix.refract.batch import (
     to_original,
 )
 from pcfix.refract.map_table import (
-    CUBIC,
     LAYER,
     SHALLOWEST_M,
     USUAL,
@@ -54,7 +53,6 @@ from pcfix.refract.map_table import (
     read_table,
     water_at,
 )
-from pcfix.refract.matcher import MATCHED
 from pcfix.refract.rays import direction, light_path, refracted
 
 MAX_LOOKS = 5
@@ -111,15 +109,6 @@ class Room(NamedTuple):
     partners: FloatArray  # (partners, 3), of `_compare`
     pairs: FloatArray  # (pairs of partners, 2), of `best_pairs`
     powers: FloatArray  # of the polynomials of a cell
-
-
-@device(allocates=True)
-def room_for(k: int) -> Room:
-    """Return temporary arrays."""
-    return Room(
-        np.empty(k), np.empty(k), np.empty(k), np.empty(k), np.empty((k, 6)),
-        np.empty((MATCHED, 3)), np.empty((MATCHED * MATCHED, 2)), np.empty(CUBIC),
-    )  # fmt: skip
 
 
 @device

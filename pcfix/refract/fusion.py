@@ -30,6 +30,7 @@ from pcfix.refract import depth_maps
 from pcfix.refract.batch import Batch, Intersection
 from pcfix.refract.depth_maps import ABSENT, AVERAGED_WITHIN, Lines, Room, Sight
 from pcfix.refract.map_table import (
+    CUBIC,
     LEAST_POINTS,
     Block,
     Table,
@@ -39,7 +40,7 @@ from pcfix.refract.map_table import (
     reads,
     table_of,
 )
-from pcfix.refract.matcher import WIDTH_M, Matcher
+from pcfix.refract.matcher import MATCHED, WIDTH_M, Matcher
 from pcfix.refract.tiling import are_same, cells_of, counts_of
 
 AGREE = 0.01
@@ -153,7 +154,10 @@ def _invert_cells(
     """
     points, (order, first, layer), matcher = block.points, cells, block.matcher
     k, none = len(points.centres), no_table()
-    room = depth_maps.room_for(k)
+    room = Room(
+        np.empty(k), np.empty(k), np.empty(k), np.empty(k), np.empty((k, 6)),
+        np.empty((MATCHED, 3)), np.empty((MATCHED * MATCHED, 2)), np.empty(CUBIC),
+    )  # fmt: skip
     groups = Groups(
         np.full((k, matcher.averaged.shape[1] + 1), ABSENT),
         np.full((k, matcher.fused.shape[1] + 1), ABSENT),
@@ -196,22 +200,13 @@ def _invert_points(
             _group(groups, cameras, block.matcher)
         before = cameras
         if len(likely):
-            _set_likely(likely[i], cameras, groups, sight, block, table, room)
+            bed = depth_maps.likely_bed(sight, block)
+            depths = _rises_of(bed, cameras, groups, sight, block, table, room)
+            for seed in range(cameras.size):
+                if depths.slope[seed] == depths.slope[seed]:
+                    likely[i, seed] = bed + groups.rise[seed]
         else:
             _invert_one(result[i], cameras, given[i], groups, sight, block, table, room)
-
-
-@device
-def _set_likely(
-    likely: FloatArray, maps: IntArray, groups: Groups, sight: Sight, block: Block, table: Table,
-    room: Room,
-) -> None:  # fmt: skip
-    """Write the height of the bed if the group of each seed had made the point."""
-    bed = depth_maps.likely_bed(sight, block)
-    depths = _rises_of(bed, maps, groups, sight, block, table, room)
-    for seed in range(maps.size):
-        if depths.slope[seed] == depths.slope[seed]:
-            likely[seed] = depths.bed + groups.rise[seed]
 
 
 @device

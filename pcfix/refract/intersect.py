@@ -103,7 +103,7 @@ def _intersected(batch: Batch, optics: Optics | None) -> Intersection:
     outcome = result[:, _OUTCOME].astype(np.uint8)
     moved = outcome == CORRECTED
     warn_of_unsolved("method consistent found no solution", result[moved, _FOUND] > 0.0)
-    found = Intersection(
+    return Intersection(
         shift_m=result[:, :3],
         outcome=outcome,
         ray_count=result[:, _COUNT].astype(np.int32),
@@ -111,8 +111,8 @@ def _intersected(batch: Batch, optics: Optics | None) -> Intersection:
         sigma_z_m=np.zeros(len(batch)),
         incidence_deg=result[:, _INCIDENCE],
         camera_used=used,
+        covariance_m2=covariance if survey.settings.dimensions == "all" else None,
     )
-    return uncertainty.with_errors(found, covariance if len(covariance) == len(batch) else None)
 
 
 @kernel(allocates=True)

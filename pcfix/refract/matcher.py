@@ -169,7 +169,12 @@ def _find_partners(
                     found = 1.0 if tracked else np.exp(-((angle / REPEATED_DEG) ** 2))
                     # full weight for images that are as near or up to FINER times farther away
                     weight = (FINER / scale) ** 2 if scale > FINER else min(scale * scale, 1.0)
-                    sums[j, TOTAL] += found * _angle_weight(angle) * weight
+                    # a Gaussian around the best angle, wider towards large ones
+                    off = (angle - BEST_ANGLE_DEG) / (
+                        NARROW_DEG if angle < BEST_ANGLE_DEG else WIDE_DEG
+                    )
+                    weight *= max(np.exp(-0.5 * off * off), LEAST_ANGLE_WEIGHT)
+                    sums[j, TOTAL] += found * weight
                     sums[j, ANGLES] += found * angle
                     sums[j, SCALES] += found * scale
                     sums[j, COMMON] += found
@@ -201,14 +206,6 @@ def _score(sums: FloatArray, covered: int) -> float:
     if not SCALE_RANGE[0] <= sums[SCALES] / common <= SCALE_RANGE[1]:
         return 0.0
     return float(sums[TOTAL] * area)
-
-
-@device
-def _angle_weight(angle_deg: float) -> float:
-    wide = NARROW_DEG if angle_deg < BEST_ANGLE_DEG else WIDE_DEG
-    # a Gaussian around the best angle, wider towards large ones
-    off = (angle_deg - BEST_ANGLE_DEG) / wide
-    return max(np.exp(-0.5 * off * off), LEAST_ANGLE_WEIGHT)
 
 
 def steepest_and_partners(

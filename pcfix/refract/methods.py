@@ -17,7 +17,7 @@ from pcfix.model import FloatArray, IntArray, Outcome, WaterPlane
 from pcfix.refract.batch import Batch, Intersection, Survey
 from pcfix.refract.choice import cameras_of_pairs, chosen_views, is_bent
 from pcfix.refract.tiling import spatial_order
-from pcfix.refract.uncertainty import with_model_uncertainty, with_uncertainty
+from pcfix.refract.uncertainty import with_uncertainty
 from pcfix.water.surface import SurfaceAbove
 
 POINTS_AT_ONCE = 100_000
@@ -79,7 +79,7 @@ def _corrected(batch: Batch) -> Intersection:
     if views is not None and views.kind == "pairs":
         pairs, batch = views, replace(batch, views=cameras_of_pairs(views))
     if name in _IN_FRAME and _takes_all_in_frame(batch):
-        return with_model_uncertainty(method(batch), batch)
+        return with_uncertainty(method(batch), batch)
     order = spatial_order(batch.xyz)
     parts = []
     for rows in batches(order):
@@ -91,7 +91,7 @@ def _corrected(batch: Batch) -> Intersection:
             unsure = (found.outcome == Outcome.CORRECTED) & part.seen_flat() & (batch.views is None)
             known = known._replace(unsure=unsure)
         parts.append(known)
-    return with_model_uncertainty(joined(parts, order, len(survey.cameras)), batch)
+    return joined(parts, order, len(survey.cameras))
 
 
 def _takes_all_in_frame(batch: Batch) -> bool:

@@ -75,7 +75,7 @@ from pcfix.refract.rays import (
     ray_distance,
     refracted,
 )
-from pcfix.refract.tiling import are_same, cameras_of, cells_of
+from pcfix.refract.tiling import are_same, cells_of
 
 MAX_STEPS = 40
 ALIKE = 0.5
@@ -160,7 +160,7 @@ def _invert(
     pairs, places = np.empty((most_pairs, 2), np.int64), np.empty((3, most_pairs))
     inverse = np.empty((3, 3))
     for t in range(*span):
-        before = -1
+        before, seeing_before = -1, points.camera[:0]
         for i in order[first[t] : first[t + 1]]:
             cameras = points.camera[start[i] : start[i + 1]]
             flags, normal = used[start[i] : start[i + 1]], normal_above(points, i)
@@ -185,7 +185,7 @@ def _invert(
             # the result row first holds the start of the search, NaN without one
             near = result[i, :3]
             near[:] = np.nan
-            if before >= 0 and are_same(cameras, cameras_of(points, before)):
+            if before >= 0 and are_same(cameras, seeing_before):
                 depth = points.height[i] - points.xyz[i, 2]
                 there = points.height[before] - points.xyz[before, 2]
                 # the shift grows with the depth, unless the depths differ much
@@ -194,7 +194,7 @@ def _invert(
                         near[axis] = result[before, axis] * (depth / there)
             point = _Point(normal, points.n, rays, cameras, flags, pairs[:wide], places[:, :wide])
             _solve(result[i], point, images, inverse)
-            before = i if result[i, _FOUND] > 0.0 else -1
+            before, seeing_before = i if result[i, _FOUND] > 0.0 else -1, cameras
 
 
 @device
@@ -376,11 +376,17 @@ def _search(
     by y, the good Broyden update is B + (s - B y) s'B / (s'B y); where it does not, B starts again
     with half the step.
     """
+    rays, pairs, places = point.rays, point.pairs, point.places
     q, nearest, at_nearest, best, share = start, start, (0.0, 0.0, 0.0), np.inf, 1.0
     for _ in range(MAX_STEPS):
-        _place_pairs(q, point, images)
+        # where the pairs would place Q; NaN where a camera has no image of it
+        for j in range(point.used.size):
+            if point.used[j]:
+                _see(rays[j], q, point.cameras[j], point, images)
+        for p in range(len(pairs)):
+            places[0, p], places[1, p], places[2, p] = _meet(rays[pairs[p, 0]], rays[pairs[p, 1]])
         # the median is relative to P, so that it is F itself
-        f = _median(point.places[0]), _median(point.places[1]), _median(point.places[2])
+        f = _median(places[0]), _median(places[1]), _median(places[2])
         size = np.sqrt(dot(f, f))
         if size <= CLOSE_M:
             return True, q
@@ -410,18 +416,6 @@ def _as_from_above(inverse: FloatArray, share: float, n: float) -> None:
     """Set B to a share of the inverse derivative for light from straight above."""
     inverse[:] = 0.0
     inverse[0, 0], inverse[1, 1], inverse[2, 2] = share, share, share * n
-
-
-@device
-def _place_pairs(q: Vector, point: _Point, images: Images) -> None:
-    """Set where the pairs would have placed Q; NaN where a camera has no image of it."""
-    rays, pairs, places = point.rays, point.pairs, point.places
-    for j in range(point.used.size):
-        if point.used[j]:
-            _see(rays[j], q, point.cameras[j], point, images)
-    for p in range(len(pairs)):
-        place = _meet(rays[pairs[p, 0]], rays[pairs[p, 1]])
-        places[0, p], places[1, p], places[2, p] = place
 
 
 @device

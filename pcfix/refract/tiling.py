@@ -80,12 +80,6 @@ def cells_of(batch: Batch, layer: IntArray | None = None) -> tuple[IntArray, Int
     return order, np.concatenate([[0], new, [len(order)]])
 
 
-@device(allocates=True)
-def cameras_of(points: Chosen, i: int) -> IntArray:
-    """Return the cameras of a point."""
-    return points.camera[points.start[i] : points.start[i + 1]]
-
-
 @device
 def are_same(a: IntArray, b: IntArray) -> bool:
     """Whether two lists of cameras are the same."""
@@ -100,7 +94,7 @@ def counts_of(rows: IntArray, points: Chosen) -> IntArray:
     """Return how many of some points each camera sees, by their lists."""
     seen = np.zeros(len(points.centres), np.int64)
     for i in rows:
-        for c in cameras_of(points, i):
+        for c in points.camera[points.start[i] : points.start[i + 1]]:
             seen[c] += 1
     return seen
 

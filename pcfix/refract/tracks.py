@@ -51,12 +51,12 @@ CLOSE_M = 1e-7
 # P, and the plane of the water (N, h), which moves under waves.
 _BY_U, _BY_V, _IMAGE, _PLANE, RAY_RUNS = slots(3, 3, 2, 4)
 
-# Runs for the points: Q, g, d g / d Q, the last step squared, and the state.
-Q, _G, _BY_Q, _STEP2, STATE, POINT_RUNS = slots(3, 3, 9, 1, 1)
+# Runs for the points: Q, g, d g / d Q, the last step squared, the state, and a run for temporaries.
+Q, _G, _BY_Q, _STEP2, STATE, _TEMPORARY, POINT_RUNS = slots(3, 3, 9, 1, 1, 1)
 SEARCHED, FOUND, LOST = 0.0, 1.0, 2.0
 
 
-@device(allocates=True)
+@device
 def search_tile(
     room: FloatArray, rays: FloatArray, tile: FloatArray, marks: FloatArray, near: IntArray,
     rig: Rig, optics: Optics, n: float, tin: Tin | None, fields: Field | None,
@@ -145,13 +145,14 @@ def _put(runs: FloatArray, at: int, a: Vector) -> None:
     runs[at], runs[at + TILE], runs[at + 2 * TILE] = a
 
 
-@device(allocates=True)
+@device
 def _settle(
     ray: FloatArray, room: FloatArray, tile: FloatArray, marks: FloatArray, rig: Rig, c: int,
     n: float, tin: Tin | None, fields: Field | None,
 ) -> None:  # fmt: skip
     """Move the planes of the rays of one camera to where the light leaves a mesh or raster."""
-    plane, origin = np.empty(4), np.empty(3)
+    temporary = room[_TEMPORARY * TILE :]
+    plane, origin = temporary[:4], temporary[4:7]
     for j in range(marks.size):
         if not marks[j] > 0.0 or room[STATE * TILE + j] != SEARCHED:
             continue

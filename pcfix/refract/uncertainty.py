@@ -128,47 +128,37 @@ def covariances(batch: Batch, shift_m: FloatArray) -> FloatArray:
 
 
 def with_uncertainty(found: Intersection, batch: Batch) -> Intersection:
-    """Return a result with its covariances and standard errors of Z, if asked for."""
-    survey = batch.survey
-    if survey.settings.dimensions != "all" or found.covariance_m2 is not None:
-        return with_errors(found, found.covariance_m2)
-    covariance, line = covariances(batch, found.shift_m), survey.learned.regression
-    if survey.settings.method == "regression" and line is not None:
-        covariance[:, [_XZ, _YZ]] = 0.0
-        covariance[:, _ZZ] = line.sigma_m(batch.surface.height_m - batch.xyz[:, 2]) ** 2
-    if found.ambiguity_m is not None:  # of depth maps
-        cameras = survey.cameras
-        focal_px = float(np.median([lens.focal_px for lens in cameras.lenses or ()]))
-        gsd_m = (np.median(cameras.centres[:, 2]) - batch.surface.height_m) / focal_px
-        covariance[:, _ZZ] += found.ambiguity_m**2 + (MODEL_GSD * gsd_m) ** 2
-    return with_errors(found, covariance)
+    """Return a result with its covariances and standard errors of Z, if the settings ask for them.
 
-
-def with_errors(found: Intersection, covariance: FloatArray | None) -> Intersection:
-    """Return a result with covariances (modified in place) and standard errors of Z."""
+    To the errors of the budget are added those of the model of depth maps, of the reconstruction
+    type, of mismatches and of adjusted poses, where these were estimated.
+    """
+    survey, covariance, ambiguity = batch.survey, found.covariance_m2, found.ambiguity_m
     found = found._replace(ambiguity_m=None)
+    if survey.settings.dimensions != "all":
+        return found
+    learned, surface, moved = survey.learned, batch.surface, found.outcome == Outcome.CORRECTED
     if covariance is None:
-        return found._replace(sigma_z_m=np.zeros(len(found.outcome)))
-    moved = found.outcome == Outcome.CORRECTED
+        covariance, line = covariances(batch, found.shift_m), learned.regression
+        if survey.settings.method == "regression" and line is not None:
+            covariance[:, [_XZ, _YZ]] = 0.0
+            covariance[:, _ZZ] = line.sigma_m(surface.height_m - batch.xyz[:, 2]) ** 2
     if not moved.all():
         covariance[~moved] = 0.0
+    variance = covariance[moved, _ZZ]
+    if ambiguity is not None:  # of depth maps
+        cameras = survey.cameras
+        focal_px = float(np.median([lens.focal_px for lens in cameras.lenses or ()]))
+        gsd_m = (np.median(cameras.centres[:, 2]) - surface.height_m[moved]) / focal_px
+        variance += ambiguity[moved] ** 2 + (MODEL_GSD * gsd_m) ** 2
+    if learned.model_uncertainty is not None:
+        model, z = learned.model_uncertainty, batch.xyz[:, 2] + found.shift_m[:, 2]
+        depth = (surface.height_m - z)[moved]
+        variance += model.scatter_m**2 + (model.per_depth * depth) ** 2
+    if learned.poses is not None:
+        variance += learned.poses.at(batch.xyz[moved, :2]) ** 2
+    covariance[moved, _ZZ] = variance
     return found._replace(sigma_z_m=np.sqrt(covariance[:, _ZZ]), covariance_m2=covariance)
-
-
-def with_model_uncertainty(found: Intersection, batch: Batch) -> Intersection:
-    """Add the uncertainties of the model and the poses to the covariances, if there are any."""
-    model, poses = batch.survey.learned.model_uncertainty, batch.survey.learned.poses
-    if (model is None and poses is None) or found.covariance_m2 is None:
-        return found
-    moved = found.outcome == Outcome.CORRECTED
-    covariance = found.covariance_m2
-    if model is not None:
-        depth = batch.surface.height_m - (batch.xyz[:, 2] + found.shift_m[:, 2])
-        more = model.scatter_m**2 + (model.per_depth * depth) ** 2
-        covariance[:, _ZZ] += np.where(moved, more, 0.0)
-    if poses is not None:
-        covariance[moved, _ZZ] += poses.at(batch.xyz[moved, :2]) ** 2
-    return with_errors(found, covariance)
 
 
 def level_sigma_of(batch: Batch) -> FloatArray:
