@@ -154,11 +154,6 @@ class Batch:
         return self.views
 
     @property
-    def listed(self) -> tuple[IntArray, IntArray]:
-        """The cameras that were chosen, for kernels: first entry of each point, and the cameras."""
-        return np.asarray(self.rays.start, np.int64), np.asarray(self.rays.camera, np.int64)
-
-    @property
     def counts(self) -> IntArray:
         """Rays of each point, shape (m,)."""
         return np.diff(self.rays.start)
@@ -198,12 +193,6 @@ class Batch:
         """Return which points have rays beyond `FLAT_DEG` from the normal only."""
         return np.asarray((self.counts > 0) & (self.angles_deg()[:, 0] > FLAT_DEG))
 
-    def camera_used(self, moved: BoolArray) -> BoolArray:
-        """Return which cameras give a ray to a point that is moved, shape (k,)."""
-        used = np.zeros(len(self.survey.cameras), np.bool_)
-        used[self.rays.camera[np.repeat(moved, self.counts)]] = True
-        return used
-
     def result(
         self,
         shift_m: FloatArray,
@@ -212,8 +201,9 @@ class Batch:
         ray_miss_m: FloatArray | None = None,
     ) -> Intersection:
         """Return the result of a method that gives shifts; zeros for points that are not moved."""
-        moved = outcome == Outcome.CORRECTED
-        zero = np.zeros(len(self.xyz))
+        moved, zero = outcome == Outcome.CORRECTED, np.zeros(len(self.xyz))
+        used = np.zeros(len(self.survey.cameras), np.bool_)
+        used[self.rays.camera[np.repeat(moved, self.counts)]] = True
         return Intersection(
             shift_m=np.where(moved[:, None], shift_m, 0.0),
             outcome=outcome,
@@ -221,7 +211,7 @@ class Batch:
             ray_miss_m=zero if ray_miss_m is None else np.where(moved, ray_miss_m, 0.0),
             sigma_z_m=zero,
             incidence_deg=np.where(moved, self.angles_deg()[:, 1], 0.0),
-            camera_used=self.camera_used(moved),
+            camera_used=used,
         )
 
 

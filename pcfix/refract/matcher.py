@@ -242,8 +242,8 @@ _STEPS = 2.0
 class Bed(NamedTuple):
     """The bed of the surroundings as heights on a grid; NaN where nothing is known.
 
-    It serves only to choose among the likely beds of a point (`pcfix.refract.fusion`); no point is
-    put onto it.
+    It serves only to choose among the likely beds of a point (`pcfix.refract.depth_maps`); no point
+    is put onto it.
     """
 
     height_m: FloatArray  # (rows, columns), world frame, southern row first
@@ -274,7 +274,7 @@ class Bed(NamedTuple):
 def bed_of(xyz: FloatArray, likely_m: FloatArray) -> Bed:
     """Return the bed that agrees with most apparent points, cell by cell.
 
-    `likely_m`, shape (m, h), are the `pcfix.refract.fusion.likely_beds`.
+    `likely_m`, shape (m, h), are the `pcfix.refract.depth_maps.likely_beds`.
     """
     low, high = xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0)
     cell = _cell_m(xyz[:, :2], low, high)

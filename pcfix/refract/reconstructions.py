@@ -402,7 +402,7 @@ def _heights(part: Batch, around: Batch, way: Reconstruction) -> FloatArray:
     settings, learned = part.survey.settings, part.survey.learned
     fuses = settings.method == "consistent" and settings.matcher == "depth-maps"
     if part.views is None and fuses and learned.matcher is not None:
-        from pcfix.refract.fusion import likely_beds
+        from pcfix.refract.depth_maps import likely_beds
         from pcfix.refract.matcher import bed_of
 
         # the bed identifies the images of a point: it must be that of other points
