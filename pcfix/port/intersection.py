@@ -42,7 +42,7 @@ from pcfix.port.shapes import Port
 from pcfix.refract.batch import CORRECTED, NO_CAMERA, ONE_CAMERA, PARALLEL, Intersection
 from pcfix.refract.choice import ANY_NUMBER, NOMINAL_FOCAL_PX
 from pcfix.refract.rays import NO_LINE, nearest_point, plus_line
-from pcfix.refract.tiling import TILE, cameras_around, near_cameras, spatial_order
+from pcfix.refract.tiling import TILE, cameras_around, corners_of, near_cameras, spatial_order
 
 _MISS, _COSINE, _OUTCOME = 3, 4, 5
 """Columns of the result after the shift."""
@@ -220,14 +220,12 @@ def _box(xyz: FloatArray, rows: IntArray, shift: FloatArray) -> tuple[FloatArray
     The straight line to a true point may miss a frame that its refracted light reaches, by at most
     the shift.
     """
-    low, high, wide = xyz[rows[0]].copy(), xyz[rows[0]].copy(), 0.0
-    for i in rows:
-        for axis in range(3):
-            moved = shift[i, axis] if shift.size else 0.0
-            low[axis] = min(low[axis], xyz[i, axis] + min(moved, 0.0))
-            high[axis] = max(high[axis], xyz[i, axis] + max(moved, 0.0))
-            wide = max(wide, abs(moved))
-    return low - wide, high + wide
+    low, high = corners_of(rows, xyz)
+    if shift.size:
+        shortest, longest = corners_of(rows, shift)
+        wide = max(-shortest.min(), longest.max())
+        low, high = low + np.minimum(shortest, 0.0) - wide, high + np.maximum(longest, 0.0) + wide
+    return low, high
 
 
 @device(allocates=True)

@@ -204,8 +204,7 @@ def _choose(
     """
     chosen, cosine2 = np.empty(candidates.size, np.int32), np.empty(candidates.size)
     is_limited = rule.least_cosine2 > 0.0 or rule.most < candidates.size
-    x, y, z = tile[j], tile[TILE + j], tile[2 * TILE + j]
-    upward = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
+    (x, y, z), upward = tiling.three(tile, j), tiling.three(tile, 4 * TILE + j)
     k = 0
     for at in range(candidates.size):
         c = candidates[at]

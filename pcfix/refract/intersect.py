@@ -44,7 +44,7 @@ from pcfix.refract.batch import (
 )
 from pcfix.refract.choice import Rig, Rule, rig_of, rule_of, shapes_of
 from pcfix.refract.rays import line_terms, nearest_point, pierce, ray_distance, refracted
-from pcfix.refract.tiling import TILE, nine, spatial_order, three, tiles_of
+from pcfix.refract.tiling import TILE, nine, put, spatial_order, three, tiles_of
 from pcfix.refract.tracks import FOUND, LOST, POINT_RUNS, RAY_RUNS, SEARCHED, STATE, Q, search_tile
 from pcfix.refract.uncertainty import Budget, room_of
 from pcfix.water.surface import Field, Tin
@@ -147,8 +147,7 @@ def _intersect(
             for j in range(rows.size):
                 row = result[rows[j]]
                 search[STATE * TILE + j] = SEARCHED if row[_OUTCOME] == CORRECTED else LOST
-                for i in range(3):
-                    search[(Q + i) * TILE + j] = row[i]
+                put(search, Q * TILE + j, vector(row))
             search_tile(
                 search, rays, tile, marks[:seeing], near[:seeing], rig, optics, points.n, tin,
                 fields,
@@ -214,10 +213,10 @@ def add_camera(
     least_cosine2, r = rule.least_cosine2, rule.bend
     rays = 0
     for j in range(marks.size):
-        x, y, z = tile[j], tile[TILE + j], tile[2 * TILE + j]
+        x, y, z = three(tile, j)
         # from the point to the centre; N, H = N.e; h, the height of the water over P
         e = minus(centre, (x, y, z))
-        normal = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
+        normal = three(tile, 4 * TILE + j)
         height = dot(normal, e)
         h = normal[2] * (tile[3 * TILE + j] - (z - offset))
         length2 = dot(e, e)

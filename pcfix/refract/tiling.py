@@ -13,7 +13,7 @@ import numpy as np
 from pcfix.kernels import device
 from pcfix.lens.algebra import Nine, Vector
 from pcfix.lens.frames import NOT_DISTORTED, NOTHING, Frames, judge, may_hold
-from pcfix.model import FloatArray, IntArray, WaterPlane
+from pcfix.model import FloatArray, IntArray, SingleArray, WaterPlane
 from pcfix.refract.batch import Batch, Chosen, normal_above
 
 TILE = 128
@@ -113,8 +113,8 @@ def gather(tile: FloatArray, rows: IntArray, points: Chosen) -> tuple[FloatArray
             value = points.xyz[i, axis]
             tile[axis * TILE + j] = value
             low[axis], high[axis] = min(low[axis], value), max(high[axis], value)
-        tile[3 * TILE + j], normal = points.height[i], normal_above(points, i)
-        tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j] = normal
+        tile[3 * TILE + j] = points.height[i]
+        put(tile, 4 * TILE + j, normal_above(points, i))
     return low, high
 
 
@@ -127,9 +127,15 @@ def slots(*widths: int) -> tuple[int, ...]:
 
 
 @device(forceinline=True)
-def three(runs: FloatArray, at: int) -> Vector:
+def three(runs: FloatArray | SingleArray, at: int) -> Vector:
     """Return the numbers of a point from three runs that follow each other."""
     return runs[at], runs[at + TILE], runs[at + 2 * TILE]
+
+
+@device(forceinline=True)
+def put(runs: FloatArray | SingleArray, at: int, a: Vector) -> None:
+    """Write the numbers of a point into three runs that follow each other."""
+    runs[at], runs[at + TILE], runs[at + 2 * TILE] = a
 
 
 @device(forceinline=True)

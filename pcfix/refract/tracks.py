@@ -38,7 +38,7 @@ from pcfix.model import FloatArray, IntArray
 from pcfix.refract.batch import Optics
 from pcfix.refract.choice import Rig
 from pcfix.refract.rays import settle
-from pcfix.refract.tiling import TILE, inverse_of, nine, product_of, slots, three
+from pcfix.refract.tiling import TILE, inverse_of, nine, product_of, put, slots, three
 from pcfix.water.surface import Field, Tin, field_of
 
 MOST_STEPS = 60
@@ -99,7 +99,7 @@ def _step(room: FloatArray, count: int) -> bool:
         _, inverse = inverse_of(nine(room, _BY_Q * TILE + j))
         t = product_of(inverse, three(room, _G * TILE + j))
         size2, before = dot(t, t), room[_STEP2 * TILE + j]
-        _put(room, Q * TILE + j, minus(three(room, Q * TILE + j), t))
+        put(room, Q * TILE + j, minus(three(room, Q * TILE + j), t))
         room[_STEP2 * TILE + j] = size2
         # NaN: some camera has no image of Q
         if not size2 < np.inf:
@@ -132,17 +132,11 @@ def _set_rays(
         ray[_IMAGE * TILE + j], ray[(_IMAGE + 1) * TILE + j] = u, v
         by_u = beyond(beyond(scaled(g[0], right), g[1], down), g[2], ahead)
         by_v = beyond(beyond(scaled(g[3], right), g[4], down), g[5], ahead)
-        _put(ray, _BY_U * TILE + j, by_u)
-        _put(ray, _BY_V * TILE + j, by_v)
-        _put(ray, _PLANE * TILE + j, normal)
+        put(ray, _BY_U * TILE + j, by_u)
+        put(ray, _BY_V * TILE + j, by_v)
+        put(ray, _PLANE * TILE + j, normal)
         # water that stood higher for this image: the point is lowered instead
         ray[(_PLANE + 3) * TILE + j] = normal[2] * (tile[3 * TILE + j] - (p[2] - offset))
-
-
-@device
-def _put(runs: FloatArray, at: int, a: Vector) -> None:
-    """Write three numbers into runs that follow each other."""
-    runs[at], runs[at + TILE], runs[at + 2 * TILE] = a
 
 
 @device

@@ -73,7 +73,7 @@ from pcfix.refract import tiling
 from pcfix.refract.batch import Batch, Chosen, Intersection, Survey
 from pcfix.refract.choice import Rig, Rule, rig_of, rule_of
 from pcfix.refract.rays import refracted
-from pcfix.refract.tiling import TILE, inverse_of, nine, product_of, slots, three
+from pcfix.refract.tiling import TILE, inverse_of, nine, product_of, put, slots, three
 from pcfix.water.surface import Field, height_at
 
 MIN_DETERMINANT = 1e-6
@@ -244,10 +244,8 @@ def room_of(tile: FloatArray, shift: FloatArray, rows: IntArray) -> SingleArray:
     # the sums start at zero; the runs of the rays are filled in by `add_rays`
     room = np.zeros(ROOM * TILE, np.float32)
     for j in range(rows.size):
-        normal = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
-        room[_NORMAL * TILE + j] = normal[0]
-        room[(_NORMAL + 1) * TILE + j] = normal[1]
-        room[(_NORMAL + 2) * TILE + j] = normal[2]
+        normal = three(tile, 4 * TILE + j)
+        put(room, _NORMAL * TILE + j, normal)
         room[_BELOW * TILE + j] = -dot(normal, row_of(shift, rows[j]))
     return room
 
@@ -265,25 +263,20 @@ def add_rays(
     for j in range(marks.size):
         z = tile[2 * TILE + j]
         e = minus(centre, (tile[j], tile[TILE + j], z))
-        normal = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
+        normal = three(tile, 4 * TILE + j)
         height = dot(normal, e)
         h = normal[2] * (tile[3 * TILE + j] - (z - offset))
         # the camera is above the water, the ray marked and within the limit of incidence
         use = (marks[j] > 0.0) & (height > h) & (height * height >= least_cosine2 * dot(e, e))
         room[_COUNT * TILE + j] = marks[j] if use else 0.0
-        room[_AWAY * TILE + j] = e[0] if use else normal[0]
-        room[(_AWAY + 1) * TILE + j] = e[1] if use else normal[1]
-        room[(_AWAY + 2) * TILE + j] = e[2] if use else normal[2]
+        put(room, _AWAY * TILE + j, e if use else normal)
         room[_HEIGHT * TILE + j] = h
 
 
 @device(forceinline=True)
 def _seen(room: SingleArray, j: int, bend: float) -> Seen:
     """Return how often a ray counts; e, N, H, L^2, h, y and r where the light bends."""
-    at = _AWAY * TILE + j
-    e = room[at], room[at + TILE], room[at + 2 * TILE]
-    at = _NORMAL * TILE + j
-    normal = room[at], room[at + TILE], room[at + 2 * TILE]
+    e, normal = three(room, _AWAY * TILE + j), three(room, _NORMAL * TILE + j)
     h = room[_HEIGHT * TILE + j]
     # light of a point above the water goes straight
     bend = bend if h > _ZERO else _ONE
@@ -598,47 +591,35 @@ def _write(
     out: FloatArray, j: int, solved: bool, by_delta: Nine, b: Nine, sums: FloatArray,
     tile: FloatArray, level_sigma: float, budget: Budget,
 ) -> None:  # fmt: skip
-    """Write the covariance of a point: B R B' of the noise, and that of each common error."""
+    """Write the covariance of a point: B R B' of the noise, and that of each common error.
+
+    Each of these is one standard deviation times a column: of level, index and both tilts. A tilt
+    also raises the water above the point, in proportion to its distance from the pivot.
+    """
     r = _symmetric(sums, NOISE * TILE + j)
     n = _product(_product(b, r), (b[0], b[3], b[6], b[1], b[4], b[7], b[2], b[5], b[8]))
-    # each common error is one standard deviation times a column
-    level, index, u, v = _columns(by_delta, sums, tile, j, level_sigma, budget)
-    cov = plus_square((n[0], n[1], n[2], n[4], n[5], n[8]), level)
-    cov = plus_square(plus_square(plus_square(cov, index), u), v)
+    nx, ny, nz = three(tile, 4 * TILE + j)
+    # two horizontal directions of slope: u towards x, v across it
+    scale = 1.0 / np.sqrt(nx * nx + nz * nz)
+    ux, uz = nz * scale, -nx * scale
+    by_tilt = nine(sums, BY_TILT * TILE + j)
+    # the level rises along the vertical, h is along N
+    level, index = scaled(nz, three(sums, BY_LEVEL * TILE + j)), three(sums, BY_N * TILE + j)
+    away_u, away_v = tile[j] - budget.pivot_x, tile[TILE + j] - budget.pivot_y
+    # the normal leans away from where the slope rises
+    u = plus(product_of(by_tilt, (-ux, 0.0, -uz)), scaled(away_u, level))
+    v = plus(product_of(by_tilt, (-ny * uz, nx * uz - nz * ux, ny * ux)), scaled(away_v, level))
+    cov = n[0], n[1], n[2], n[4], n[5], n[8]
+    cov = plus_square(cov, scaled(level_sigma, product_of(by_delta, level)))
+    cov = plus_square(cov, scaled(budget.refractive_index, product_of(by_delta, index)))
+    cov = plus_square(cov, scaled(budget.tilt, product_of(by_delta, u)))
+    cov = plus_square(cov, scaled(budget.tilt, product_of(by_delta, v)))
     out[j] = cov[0] if solved else 0.0
     out[TILE + j] = cov[1] if solved else 0.0
     out[2 * TILE + j] = cov[2] if solved else 0.0
     out[3 * TILE + j] = cov[3] if solved else 0.0
     out[4 * TILE + j] = cov[4] if solved else 0.0
     out[5 * TILE + j] = cov[5] if solved else 0.0
-
-
-@device(forceinline=True)
-def _columns(
-    by_delta: Nine, sums: FloatArray, tile: FloatArray, j: int, level_sigma: float, budget: Budget
-) -> tuple[Vector, Vector, Vector, Vector]:
-    """Return how a point moves by one standard deviation of level, index and both tilts.
-
-    A tilt also raises the water above the point, in proportion to its distance from the pivot.
-    """
-    nx, ny, nz = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
-    # two horizontal directions of slope: u towards x, v across it
-    scale = 1.0 / np.sqrt(nx * nx + nz * nz)
-    ux, uz = nz * scale, -nx * scale
-    by_tilt = nine(sums, BY_TILT * TILE + j)
-    by_level, by_n = three(sums, BY_LEVEL * TILE + j), three(sums, BY_N * TILE + j)
-    # the level rises along the vertical, h is along N
-    level = scaled(nz, by_level)
-    away_u, away_v = tile[j] - budget.pivot_x, tile[TILE + j] - budget.pivot_y
-    # the normal leans away from where the slope rises
-    u = plus(product_of(by_tilt, (-ux, 0.0, -uz)), scaled(away_u, level))
-    v = plus(product_of(by_tilt, (-ny * uz, nx * uz - nz * ux, ny * ux)), scaled(away_v, level))
-    return (
-        scaled(level_sigma, product_of(by_delta, level)),
-        scaled(budget.refractive_index, product_of(by_delta, by_n)),
-        scaled(budget.tilt, product_of(by_delta, u)),
-        scaled(budget.tilt, product_of(by_delta, v)),
-    )
 
 
 @device(forceinline=True)
