@@ -42,7 +42,7 @@ from pcfix.port.shapes import Port
 from pcfix.refract.batch import CORRECTED, NO_CAMERA, ONE_CAMERA, PARALLEL, Intersection
 from pcfix.refract.choice import ANY_NUMBER, NOMINAL_FOCAL_PX
 from pcfix.refract.rays import NO_LINE, nearest_point, plus_line
-from pcfix.refract.tiling import TILE, cameras_around, corners_of, near_cameras, spatial_order
+from pcfix.refract.tiling import TILE, corners_of, near_cameras, spatial_order
 
 _MISS, _COSINE, _OUTCOME = 3, 4, 5
 """Columns of the result after the shift."""
@@ -192,7 +192,7 @@ def _choose(
     """
     start, chosen = found
     low, high = _box(xyz, order[span[0] * TILE : span[1] * TILE], shift)
-    around = cameras_around(frames, rig.centres, low, high)
+    around = near_cameras(np.arange(len(rig.centres)), frames, rig.centres, low, high)
     for t in range(*span):
         rows = order[t * TILE : (t + 1) * TILE]
         near = rows[:0]

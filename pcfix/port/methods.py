@@ -117,7 +117,9 @@ def intersect_through_port(
         if not rows.size:
             break
         part = _intersect_chosen(xyz[rows], seen.take(rows), cameras, port, settings)
-        found, chosen = _with_rows(found, part, rows), seen
+        others = np.setdiff1d(np.arange(len(xyz)), rows)
+        order = np.concatenate([others, rows])
+        found, chosen = joined([found.take(others), part], order, len(cameras)), seen
     return found, chosen
 
 
@@ -146,16 +148,6 @@ def _other_rows(one: Views, other: Views) -> IntArray:
     owner = np.repeat(rows, np.diff(a.start))
     same[owner[a.camera != b.camera]] = False
     return np.flatnonzero(~same)
-
-
-def _with_rows(found: Intersection, part: Intersection, rows: IntArray) -> Intersection:
-    """Return the result with some rows replaced."""
-    values = found._asdict()
-    for name in ("shift_m", "outcome", "ray_count", "ray_miss_m", "sigma_z_m", "incidence_deg"):
-        values[name] = values[name].copy()
-        values[name][rows] = getattr(part, name)
-    values["camera_used"] = found.camera_used | part.camera_used
-    return Intersection(**values)
 
 
 MAX_STEPS = 30

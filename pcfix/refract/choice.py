@@ -141,10 +141,11 @@ def _make_room(
     """Set how many entries each tile may get at most, one place on."""
     order, points = given
     low, high = tiling.corners_of(order[span[0] * TILE : span[1] * TILE], points.xyz)
-    around = tiling.cameras_around(frames, rig.centres, low, high)
+    every = np.arange(len(rig.centres))
+    around = tiling.near_cameras(every, frames, rig.centres, low, high)
     for t in range(*span):
         rows = order[t * TILE : (t + 1) * TILE]
-        low, high = tiling.gather(np.empty(7 * TILE), rows, points)
+        low, high = tiling.corners_of(rows, points.xyz)
         first[t + 1] = rows.size * tiling.near_cameras(around, frames, rig.centres, low, high).size
 
 
@@ -162,7 +163,8 @@ def _choose_all(
     (order, points), (first, begin, count, place) = given, found
     start, camera = points.start, points.camera
     low, high = tiling.corners_of(order[span[0] * TILE : span[1] * TILE], points.xyz)
-    around = camera[:0] if start.size else tiling.cameras_around(frames, rig.centres, low, high)
+    some = camera[:0] if start.size else np.arange(len(rig.centres))
+    around = tiling.near_cameras(some, frames, rig.centres, low, high)
     for t in range(*span):
         rows = order[t * TILE : (t + 1) * TILE]
         tile = np.empty(7 * TILE)

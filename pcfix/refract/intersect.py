@@ -127,7 +127,8 @@ def _intersect(
     if optics is not None:  # of all cameras; the system provides what is used
         rays, search = np.empty((len(centres), RAY_RUNS * TILE)), np.empty(POINT_RUNS * TILE)
     low, high = tiling.corners_of(order[span[0] * TILE : span[1] * TILE], points.xyz)
-    around = camera[:0] if start.size else tiling.cameras_around(frames, centres, low, high)
+    some = camera[:0] if start.size else np.arange(len(centres))
+    around = tiling.near_cameras(some, frames, centres, low, high)
     for t in range(*span):
         # a tile of neighbours, its sums, and the cameras near it
         rows = order[t * TILE : (t + 1) * TILE]

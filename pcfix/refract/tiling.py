@@ -11,7 +11,7 @@ from itertools import accumulate
 import numpy as np
 
 from pcfix.kernels import device
-from pcfix.lens.algebra import Nine, Vector
+from pcfix.lens.algebra import Nine, Vector, row_of
 from pcfix.lens.frames import NOT_DISTORTED, NOTHING, Frames, judge, may_hold
 from pcfix.model import FloatArray, IntArray, SingleArray, WaterPlane
 from pcfix.refract.batch import Batch, Chosen, normal_above
@@ -106,16 +106,12 @@ def gather(tile: FloatArray, rows: IntArray, points: Chosen) -> tuple[FloatArray
     The runs, of `TILE` numbers each, lie in one array: with one base address and fixed distances
     the compiler sees that they cannot overlap.
     """
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for j in range(rows.size):
         i = rows[j]
-        for axis in range(3):
-            value = points.xyz[i, axis]
-            tile[axis * TILE + j] = value
-            low[axis], high[axis] = min(low[axis], value), max(high[axis], value)
+        put(tile, j, row_of(points.xyz, i))
         tile[3 * TILE + j] = points.height[i]
         put(tile, 4 * TILE + j, normal_above(points, i))
-    return low, high
+    return corners_of(rows, points.xyz)
 
 
 def slots(*widths: int) -> tuple[int, ...]:
@@ -146,21 +142,6 @@ def nine(runs: FloatArray, at: int) -> Nine:
 
 
 @device(allocates=True)
-def cameras_around(
-    frames: Frames, centres: FloatArray, low: FloatArray, high: FloatArray
-) -> IntArray:
-    """Return the cameras whose pyramids may hold a point of a box around many tiles."""
-    around = np.empty(len(centres), np.int64)
-    count = 0
-    for c in range(len(centres)):
-        # the box is not wholly beyond one plane of the pyramid
-        if may_hold(frames.planes[c], centres[c], low, high):
-            around[count] = c
-            count += 1
-    return around[:count]
-
-
-@device(allocates=True)
 def corners_of(rows: IntArray, xyz: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the corners of an upright box around some points."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
@@ -175,7 +156,7 @@ def corners_of(rows: IntArray, xyz: FloatArray) -> tuple[FloatArray, FloatArray]
 def near_cameras(
     around: IntArray, frames: Frames, centres: FloatArray, low: FloatArray, high: FloatArray
 ) -> IntArray:
-    """Return those of some cameras whose frames may hold a point of the box."""
+    """Return those of some cameras whose frames may hold a point of an upright box."""
     planes, row = frames.planes, frames.row
     near = np.empty(len(around), np.int64)
     count = 0
