@@ -287,7 +287,7 @@ def mark(
         return bool(held == ALL)
     lens, r, count = frames.lenses[row], frames.rotations[c], 0
     plain = plain_lens(lens)
-    # of two loops one has rounds: with the choice within it none would be vectorised
+    # only one of the two loops runs; with the choice inside, the first would not be vectorised
     for j in range(marks.size if lens[PLAIN] != 0.0 else 0):
         way = points[j] - centre[0], points[run + j] - centre[1], points[2 * run + j] - centre[2]
         u, v, _ = plain_image(plain, times(r, way))

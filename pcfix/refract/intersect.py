@@ -165,9 +165,8 @@ def _intersect(
             uncertainty.finish_tile(covariance, rows, room, tile, level_sigma, budget)
 
 
-# Where arrays may be made, references to them are counted, at the cost of two locked operations for
-# every row of an array that is handed on. So the loops over cameras and points are functions that
-# make none.
+# A kernel that makes arrays counts references: two locked operations for each row of an array that
+# it passes to a function. So the loops over cameras and points are functions that make no arrays.
 
 
 @device

@@ -44,7 +44,7 @@ def spatial_order(xyz: FloatArray) -> IntArray:
     row = np.minimum(((y - y.min()) * (1.0 / cell_m)).astype(np.int64), rows - 1)
     # row after row to and fro, so that the next cell is always a neighbour
     within = np.where(row & 1, columns - 1 - column, column)
-    # there are fewer than 2^16 cells; numpy sorts such small numbers in two passes
+    # there are fewer than 2^16 cells, and numpy sorts numbers of 16 bits in two passes
     return np.argsort((row * columns + within).astype(np.uint16), kind="stable")
 
 
