@@ -41,8 +41,8 @@ from pcfix.refract.rays import settle
 from pcfix.refract.tiling import TILE, inverse_of, nine, product_of, put, slots, three
 from pcfix.water.surface import Field, Tin, field_of
 
-MOST_STEPS = 60
-"""Two or three are usual; under waves a point may need many."""
+STEPS, MOST_STEPS = 4, 60
+"""Two or three are usual. A point that is not found by then starts again, and may need many."""
 
 CLOSE_M = 1e-7
 """Estimated distance from the solution, from the last two steps."""
@@ -67,14 +67,16 @@ def search_tile(
     found, or lost, stays where it is, so that the others of its tile do not matter.
     """
     count = marks.shape[1]
-    room[_STEP2 * TILE : STATE * TILE] = 0.0
-    for k in range(near.size):
-        lens = optics.lenses[optics.row[near[k]]]
-        if lens[PLAIN] != 0.0:
-            _set_rays(rays[k], tile, marks[k], rig, near[k], optics, plain_lens(lens))
-        else:
-            _set_rays(rays[k], tile, marks[k], rig, near[k], optics, None)
-    for _ in range(MOST_STEPS):
+    for step in range(STEPS + MOST_STEPS):
+        # under waves a search may alternate between two planes: it starts again where it is
+        if step == 0 or step == STEPS:
+            room[_STEP2 * TILE : STATE * TILE] = 0.0
+            for k in range(near.size):
+                lens = optics.lenses[optics.row[near[k]]]
+                if lens[PLAIN] != 0.0:
+                    _set_rays(rays[k], tile, marks[k], rig, near[k], optics, plain_lens(lens))
+                else:
+                    _set_rays(rays[k], tile, marks[k], rig, near[k], optics, None)
         room[_G * TILE : _STEP2 * TILE] = 0.0
         for k in range(near.size):
             c, lens = near[k], optics.lenses[optics.row[near[k]]]
