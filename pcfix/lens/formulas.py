@@ -73,15 +73,12 @@ def largest_angle(lens: Lens) -> float:
             return RIGHT_ANGLE
 
 
+@kernel
 def largest_radius(c: FloatArray) -> float:
     """Return the radius of the largest angle; may be infinite."""
-    rho = float(_largest_radius(c))
-    return rho if rho >= 0.0 else np.inf  # a tangent or a quotient beyond its pole by rounding
-
-
-@kernel
-def _largest_radius(c: FloatArray) -> float:
-    return radius(c, c[LARGEST_ANGLE])[0]
+    rho = radius(c, c[LARGEST_ANGLE])[0]
+    # a tangent or a quotient beyond its pole by rounding
+    return rho if rho >= 0.0 else np.inf
 
 
 def first_root(polynomial: Polynomial) -> float:
@@ -185,23 +182,23 @@ Jacobian: TypeAlias = tuple[float, float, float, float]
 
 
 @device
+def _series(c: FloatArray, at: int, count: int, r2: float) -> tuple[float, float]:
+    """Return 1 + c1 r^2 + c2 r^4 + ... and its derivative by r^2 (Horner's scheme for both)."""
+    value, slope = 0.0, 0.0
+    for i in range(at + count - 1, at - 1, -1):
+        slope = slope * r2 + value
+        value = value * r2 + c[i]
+    return 1.0 + value * r2, slope * r2 + value
+
+
+@device
 def _radial(c: FloatArray, r2: float) -> tuple[float, float]:
-    """Return r' / r and its derivative by r^2 (Horner's scheme for both)."""
+    """Return r' / r and its derivative by r^2."""
     k, d = int(c[RADIALS]), int(c[DENOMINATORS])
-    above, slope = 0.0, 0.0
-    for i in range(TAIL + k - 1, TAIL - 1, -1):
-        slope = slope * r2 + above
-        above = above * r2 + c[i]
-    slope = slope * r2 + above
-    above = 1.0 + above * r2
+    above, slope = _series(c, TAIL, k, r2)
     if d == 0:
         return above, slope
-    below, below_slope = 0.0, 0.0
-    for i in range(TAIL + k + d - 1, TAIL + k - 1, -1):
-        below_slope = below_slope * r2 + below
-        below = below * r2 + c[i]
-    below_slope = below_slope * r2 + below
-    below = 1.0 + below * r2
+    below, below_slope = _series(c, TAIL + k, d, r2)
     g = above / below
     return g, (slope - g * below_slope) / below
 

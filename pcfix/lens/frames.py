@@ -23,25 +23,16 @@ import numpy as np
 
 from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import Vector, dot, minus, row_of, scaled, times
-from pcfix.lens.formulas import (
-    B2,
-    B3,
-    CENTRE_X,
-    CENTRE_Y,
-    DISC,
-    FOCAL_X,
-    FOCAL_Y,
-    HEIGHT,
-    LARGEST_ANGLE,
-    PLAIN,
-    PRINCIPAL_X,
-    PRINCIPAL_Y,
-    TAIL,
-    TANGENTIAL,
-    WIDTH,
-    angle,
+from pcfix.lens.formulas import DISC, HEIGHT, LARGEST_ANGLE, PLAIN, WIDTH, angle
+from pcfix.lens.imaging import (
+    coefficients,
+    image_of,
+    lens_table,
+    plain_image,
+    plain_lens,
+    project,
+    unproject,
 )
-from pcfix.lens.imaging import coefficients, image_of, lens_table, project, unproject
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, Views
 
 
@@ -67,7 +58,7 @@ def frame_shape(lens: Lens) -> FrameShape:
             (-lens.b3, -lens.focal, height),
         ])  # fmt: skip
         return FrameShape(inward, distorted=False, widest=np.pi, reach=(np.inf, 0.0))
-    border = unproject(lens, _border(lens))
+    border = unproject(lens, _border(lens, BORDER))
     return FrameShape(
         _planes_around(border),
         distorted=True,
@@ -83,11 +74,11 @@ STEEPEST = np.cos(np.radians(80.0))
 """A pyramid with flatter sides would be too wide to exclude anything."""
 
 
-def _border(lens: Lens) -> FloatArray:
-    """Return points around the image, the first one again at the end."""
+def _border(lens: Lens, count: int) -> FloatArray:
+    """Return points around the image, `count` a side, the first one again at the end."""
     w, h = lens.width, lens.height
     corners = np.array([(0.0, 0.0), (w, 0.0), (w, h), (0.0, h), (0.0, 0.0)])
-    share = np.linspace(0.0, 1.0, BORDER, endpoint=False)[:, None]
+    share = np.linspace(0.0, 1.0, count, endpoint=False)[:, None]
     sides = [(1.0 - share) * corners[i] + share * corners[i + 1] for i in range(4)]
     return np.vstack([*sides, corners[:1]])
 
@@ -258,15 +249,9 @@ def in_frame(g: Pyramid, e: Vector) -> bool:
 
 
 @device
-def _image(lens: FloatArray, r: FloatArray, e: Vector) -> tuple[float, float]:
-    """Return u, v of the point at C - e for a lens with rotation r."""
-    return image_of(lens, *scaled(-1.0, times(r, e)))
-
-
-@device
 def _images(lens: FloatArray, r: FloatArray, e: Vector) -> bool:
-    """Whether u, v are in the frame."""
-    u, v = _image(lens, r, e)
+    """Whether the point at C - e is in the frame of a lens with rotation r."""
+    u, v = image_of(lens, *scaled(-1.0, times(r, e)))
     return (u >= 0.0) & (u <= lens[WIDTH]) & (v >= 0.0) & (v <= lens[HEIGHT])
 
 
@@ -280,68 +265,41 @@ def holds(frames: Frames, c: int, e: Vector) -> bool:
 
 
 @device
-def mark_pyramid(
-    marks: FloatArray, x: FloatArray, y: FloatArray, z: FloatArray, centre: FloatArray, g: Pyramid
-) -> None:
-    """Set to 1 the marks of points in a frame without distortion, to 0 those of others."""
-    cx, cy, cz = centre[0], centre[1], centre[2]
-    for j in range(marks.size):
-        marks[j] = 1.0 if in_frame(g, (cx - x[j], cy - y[j], cz - z[j])) else 0.0
-
-
-@device
 def mark(
-    marks: FloatArray, x: FloatArray, y: FloatArray, z: FloatArray,
-    centre: FloatArray, frames: Frames, c: int,
-) -> int:  # fmt: skip
-    """Set to 1 the marks of points in the distorted frame of camera c, to 0 those of others.
+    marks: FloatArray, points: FloatArray, run: int, frames: Frames, c: int, centre: FloatArray,
+    low: FloatArray, high: FloatArray,
+) -> bool:  # fmt: skip
+    """Set to 1 the marks of points in the frame of camera c, to 0 those of others.
 
-    Returns their number. It is `holds` for many points.
+    The points of a box, `low` to `high`, are runs of `run` x, y and z. It is `holds` for many of
+    them; returns whether the frame may hold any.
     """
-    lens, r = frames.lenses[frames.row[c]], frames.rotations[c]
-    if lens[PLAIN] != 0.0:
-        return _mark_plain(marks, x, y, z, centre, r, lens)
-    around, count = pyramid(frames.planes[c]), 0
-    for j in range(marks.size):
-        e = centre[0] - x[j], centre[1] - y[j], centre[2] - z[j]
+    around, row = pyramid(frames.planes[c]), frames.row[c]
+    if row == NOT_DISTORTED:
+        for j in range(marks.size):
+            e = centre[0] - points[j], centre[1] - points[run + j], centre[2] - points[2 * run + j]
+            marks[j] = 1.0 if in_frame(around, e) else 0.0
+        return True
+    # many boxes lie within a distorted frame, or beside it, as a whole
+    held = judge(frames, c, centre, low, high)
+    if held != SOME:
+        marks[:] = 1.0
+        return bool(held == ALL)
+    lens, r, count = frames.lenses[row], frames.rotations[c], 0
+    plain = plain_lens(lens)
+    # only one of the two loops runs; with the choice inside, the first would not be vectorised
+    for j in range(marks.size if lens[PLAIN] != 0.0 else 0):
+        way = points[j] - centre[0], points[run + j] - centre[1], points[2 * run + j] - centre[2]
+        u, v, _ = plain_image(plain, times(r, way))
+        inside = (u >= 0.0) & (u <= lens[WIDTH]) & (v >= 0.0) & (v <= lens[HEIGHT])
+        marks[j] = 1.0 if inside else 0.0
+        count += 1 if inside else 0
+    for j in range(marks.size if lens[PLAIN] == 0.0 else 0):
+        e = centre[0] - points[j], centre[1] - points[run + j], centre[2] - points[2 * run + j]
         inside = in_frame(around, e) and _images(lens, r, e)
         marks[j] = 1.0 if inside else 0.0
         count += 1 if inside else 0
-    return count
-
-
-@device
-def _mark_plain(
-    marks: FloatArray, x: FloatArray, y: FloatArray, z: FloatArray, centre: FloatArray,
-    r: FloatArray, c: FloatArray,
-) -> int:  # fmt: skip
-    """Mark with the common lens: `image_of` without branches, which the compiler vectorizes."""
-    cx, cy, cz = centre[0], centre[1], centre[2]
-    xx, xy, xz, yx, yy, yz = r[0, 0], r[0, 1], r[0, 2], r[1, 0], r[1, 1], r[1, 2]
-    zx, zy, zz = r[2, 0], r[2, 1], r[2, 2]
-    k1, k2, k3, k4 = c[TAIL], c[TAIL + 1], c[TAIL + 2], c[TAIL + 3]
-    p1, p2, px, py = c[TANGENTIAL], c[TANGENTIAL + 1], c[CENTRE_X], c[CENTRE_Y]
-    disc2 = c[DISC] * c[DISC]
-    fx, b2, b3, fy = c[FOCAL_X], c[B2], c[B3], c[FOCAL_Y]
-    u0, v0, width, height = c[PRINCIPAL_X], c[PRINCIPAL_Y], c[WIDTH], c[HEIGHT]
-    count = 0
-    for j in range(marks.size):
-        ex, ey, ez = cx - x[j], cy - y[j], cz - z[j]
-        front = -(zx * ex + zy * ey + zz * ez)
-        a = -(xx * ex + xy * ey + xz * ez) / front - px
-        b = -(yx * ex + yy * ey + yz * ez) / front - py
-        r2 = a * a + b * b
-        # Brown: radial factor, then tangential terms and the centre of distortion
-        g = 1.0 + (((k4 * r2 + k3) * r2 + k2) * r2 + k1) * r2
-        da = g * a + (p1 * (r2 + 2.0 * a * a) + 2.0 * p2 * a * b) + px
-        db = g * b + (p2 * (r2 + 2.0 * b * b) + 2.0 * p1 * a * b) + py
-        u = u0 + fx * da + b2 * db
-        v = v0 + fy * db + b3 * da
-        inside = (u >= 0.0) & (u <= width) & (v >= 0.0) & (v <= height)
-        inside &= (front > 0.0) & (r2 <= disc2)
-        marks[j] = 1.0 if inside else 0.0
-        count += 1 if inside else 0
-    return count
+    return count > 0
 
 
 @device
@@ -378,7 +336,7 @@ def judge(frames: Frames, c: int, centre: FloatArray, low: FloatArray, high: Flo
     if np.arccos(max(-1.0, min(1.0, along))) > frames.cone[c, 3] + turn:
         return NOTHING
     lens, r = frames.lenses[frames.row[c]], frames.rotations[c]
-    u, v = _image(lens, r, e)
+    u, v = image_of(lens, *scaled(-1.0, times(r, e)))
     within = min(min(u, lens[WIDTH] - u), min(v, lens[HEIGHT] - v))
     # no ray of the ball is imaged farther than this from the image of its middle
     move, margin = turn * frames.reach[c, 0], frames.reach[c, 1]
@@ -393,42 +351,37 @@ BORDER_POINTS = 8
 
 def cameras_in_sight(xyz: FloatArray, cameras: Cameras) -> IntArray:
     """Return how many cameras have each point, (n, 3), in their frame; occlusion is ignored."""
+    none = np.zeros(0, np.int64)
+    return _count_held(xyz, cameras, frames_of(cameras), none, none)
+
+
+def beside_frames(xyz: FloatArray, views: Views, cameras: Cameras) -> IntArray:
+    """Return the number of cameras in the view list of each point, (n, 3), that cannot image it."""
+    start, camera = np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)
+    held = _count_held(xyz, cameras, listed_frames_of(cameras), start, camera)
+    return np.asarray(np.diff(start) - held)
+
+
+def _count_held(
+    xyz: FloatArray, cameras: Cameras, frames: Frames, start: IntArray, camera: IntArray
+) -> IntArray:
+    """Return how many cameras, of the lists if there are any, hold each point."""
     counts = np.zeros(len(xyz), np.int64)
-    xyz = np.ascontiguousarray(xyz)
-    in_tiles(_count, len(xyz), xyz, cameras.centres, frames_of(cameras), counts)
+    points = np.ascontiguousarray(xyz)
+    in_tiles(_count, len(xyz), points, start, camera, cameras.centres, frames, counts)
     return counts
 
 
 @kernel
 def _count(
-    span: Span, xyz: FloatArray, centres: FloatArray, frames: Frames, counts: IntArray
-) -> None:
-    for i in range(*span):
-        for c in range(len(centres)):
-            counts[i] += holds(frames, c, minus(row_of(centres, c), row_of(xyz, i)))
-
-
-def beside_frames(xyz: FloatArray, views: Views, cameras: Cameras) -> IntArray:
-    """Return the number of cameras in the view list of each point, (n, 3), that cannot image it."""
-    counts = np.zeros(len(xyz), np.int64)
-    listed = np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)
-    if cameras.rotations is not None and cameras.lenses is not None:
-        frames = listed_frames_of(cameras)
-        in_tiles(
-            _count_beside, len(xyz), np.ascontiguousarray(xyz), *listed, cameras.centres, frames,
-            counts,
-        )  # fmt: skip
-    return counts
-
-
-@kernel
-def _count_beside(
     span: Span, xyz: FloatArray, start: IntArray, camera: IntArray, centres: FloatArray,
     frames: Frames, counts: IntArray,
 ) -> None:  # fmt: skip
     for i in range(*span):
-        for c in camera[start[i] : start[i + 1]]:
-            counts[i] += not holds(frames, c, minus(row_of(centres, c), row_of(xyz, i)))
+        first, last = (start[i], start[i + 1]) if start.size else (0, len(centres))
+        for at in range(first, last):
+            c = camera[at] if start.size else at
+            counts[i] += holds(frames, c, minus(row_of(centres, c), row_of(xyz, i)))
 
 
 def footprint(cameras: Cameras, row: int, height_m: float) -> FloatArray:
@@ -436,12 +389,7 @@ def footprint(cameras: Cameras, row: int, height_m: float) -> FloatArray:
     if cameras.rotations is None or cameras.lenses is None:
         return np.zeros((0, 2))
     lens = cameras.lenses[row]
-    t = np.linspace(0.0, 1.0, BORDER_POINTS, endpoint=False)
-    zero, one = np.zeros_like(t), np.ones_like(t)
-    u = np.concatenate([t, one, 1.0 - t, zero])
-    v = np.concatenate([zero, t, one, 1.0 - t])
-    rays = unproject(lens, np.column_stack([u * lens.width, v * lens.height]))
-    rays = rays @ cameras.rotations[row]
+    rays = unproject(lens, _border(lens, BORDER_POINTS)[:-1]) @ cameras.rotations[row]
     with np.errstate(divide="ignore", invalid="ignore"):
         reach = (height_m - cameras.centres[row, 2]) / rays[:, 2]
     reach = np.where(reach > 0.0, reach, np.nan)

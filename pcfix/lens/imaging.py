@@ -14,7 +14,7 @@ import numpy as np
 
 from pcfix.kernels import device, kernel
 from pcfix.lens import formulas as places
-from pcfix.lens.algebra import Vector, times, transposed_times
+from pcfix.lens.algebra import Vector, times, transposed_times, vector
 from pcfix.lens.formulas import (
     CODES,
     angle,
@@ -108,17 +108,8 @@ def _filled(numbers: tuple[float, ...], least: int) -> tuple[float, ...]:
 
 @device
 def in_plane(c: FloatArray, x: float, y: float, z: float) -> tuple[float, float]:
-    """Return the plane coordinates of a direction, before distortion."""
-    if c[places.KIND] == places.PERSPECTIVE:
-        return (x / z, y / z) if z > 0.0 else (np.nan, np.nan)
-    across = np.sqrt(x * x + y * y)
-    theta = np.arctan2(across, z)
-    if not theta <= c[places.LARGEST_ANGLE]:
-        return np.nan, np.nan
-    if across == 0.0:
-        return (0.0, 0.0) if z > 0.0 else (np.nan, np.nan)
-    scale = radius(c, theta)[0] / across
-    return scale * x, scale * y
+    """Return the plane coordinates of a direction, before distortion; NaN where it has none."""
+    return _plane_and_gradients(c, x, y, z)[:2]
 
 
 @device
@@ -251,3 +242,49 @@ def _plane_and_gradients(
         scale * y,
         (scale + turn * x * x, cross, away * x, cross, scale + turn * y * y, away * y),
     )
+
+
+Plain: TypeAlias = tuple[
+    float, float, float, float, float, float, float, float, float, float, float, float, float,
+    float, float,
+]  # fmt: skip
+"""k1 to k4, p1, p2, the centre of distortion, the squared disc, and the interior orientation."""
+
+
+@device
+def plain_lens(c: FloatArray) -> Plain:
+    """Return the common lens (`places.PLAIN`) as numbers, which stay in registers."""
+    return (
+        *vector(c, places.TAIL), c[places.TAIL + 3],
+        c[places.TANGENTIAL], c[places.TANGENTIAL + 1], c[places.CENTRE_X], c[places.CENTRE_Y],
+        c[places.DISC] * c[places.DISC],
+        c[places.FOCAL_X], c[places.B2], c[places.B3], c[places.FOCAL_Y],
+        c[places.PRINCIPAL_X], c[places.PRINCIPAL_Y],
+    )  # fmt: skip
+
+
+@device(inline="always")
+def plain_image(c: Plain, w: Vector) -> tuple[float, float, Gradients]:
+    """Do as `image_and_gradients` for the common lens, without branches: loops vectorise."""
+    k1, k2, k3, k4, p1, p2, centre_x, centre_y, disc2, fx, b2, b3, fy, u0, v0 = c
+    inv = 1.0 / w[2]
+    flat_x, flat_y = w[0] * inv, w[1] * inv
+    x, y = flat_x - centre_x, flat_y - centre_y
+    r2 = x * x + y * y
+    # Brown: radial factor g and its derivative by r^2, then tangential terms
+    g = 1.0 + (((k4 * r2 + k3) * r2 + k2) * r2 + k1) * r2
+    twice = 2.0 * (((4.0 * k4 * r2 + 3.0 * k3) * r2 + 2.0 * k2) * r2 + k1)
+    dx = g * x + (p1 * (r2 + 2.0 * x * x) + 2.0 * p2 * x * y) + centre_x
+    dy = g * y + (p2 * (r2 + 2.0 * y * y) + 2.0 * p1 * x * y) + centre_y
+    xx = g + twice * x * x + 6.0 * p1 * x + 2.0 * p2 * y
+    xy = twice * x * y + 2.0 * (p1 * y + p2 * x)
+    yy = g + twice * y * y + 6.0 * p2 * y + 2.0 * p1 * x
+    # behind the camera and beyond the fold of the distortion there is no image
+    seen = (w[2] > 0.0) & (r2 <= disc2)
+    u = u0 + fx * dx + b2 * dy if seen else np.nan
+    v = v0 + fy * dy + b3 * dx if seen else np.nan
+    ua, ub, va, vb = fx * xx + b2 * xy, fx * xy + b2 * yy, fy * xy + b3 * xx, fy * yy + b3 * xy
+    return u, v, (
+        inv * ua, inv * ub, -inv * (ua * flat_x + ub * flat_y),
+        inv * va, inv * vb, -inv * (va * flat_x + vb * flat_y),
+    )  # fmt: skip

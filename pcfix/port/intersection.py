@@ -41,10 +41,10 @@ from pcfix.port.light import coefficients, cosine_at_port, ray_through, through_
 from pcfix.port.shapes import Port
 from pcfix.refract.batch import CORRECTED, NO_CAMERA, ONE_CAMERA, PARALLEL, Intersection
 from pcfix.refract.choice import ANY_NUMBER, NOMINAL_FOCAL_PX
-from pcfix.refract.rays import add_line, nearest_point
-from pcfix.refract.tiling import TILE, cameras_around, near_cameras, spatial_order
+from pcfix.refract.rays import NO_LINE, nearest_point, plus_line
+from pcfix.refract.tiling import TILE, corners_of, near_cameras, spatial_order
 
-_MISS, _SIGMA_Z, _COSINE, _OUTCOME = 3, 4, 5, 6
+_MISS, _COSINE, _OUTCOME = 3, 4, 5
 """Columns of the result after the shift."""
 
 
@@ -103,7 +103,7 @@ def intersect_rays(
     Intersection
         One row per point. A ray that does not meet the port is ignored.
     """
-    result = np.zeros((len(near), 7))
+    result = np.zeros((len(near), 6))
     in_tiles(
         _intersect,
         len(near),
@@ -125,7 +125,7 @@ def intersect_rays(
         outcome=outcome,
         ray_count=np.where(moved, counts, 0).astype(np.int32),
         ray_miss_m=result[:, _MISS],
-        sigma_z_m=result[:, _SIGMA_Z],
+        sigma_z_m=np.zeros(len(near)),
         incidence_deg=np.where(moved, angle, 0.0),
         camera_used=used,
     )
@@ -192,7 +192,7 @@ def _choose(
     """
     start, chosen = found
     low, high = _box(xyz, order[span[0] * TILE : span[1] * TILE], shift)
-    around = cameras_around(frames, rig.centres, low, high)
+    around = near_cameras(np.arange(len(rig.centres)), frames, rig.centres, low, high)
     for t in range(*span):
         rows = order[t * TILE : (t + 1) * TILE]
         near = rows[:0]
@@ -220,14 +220,12 @@ def _box(xyz: FloatArray, rows: IntArray, shift: FloatArray) -> tuple[FloatArray
     The straight line to a true point may miss a frame that its refracted light reaches, by at most
     the shift.
     """
-    low, high, wide = xyz[rows[0]].copy(), xyz[rows[0]].copy(), 0.0
-    for i in rows:
-        for axis in range(3):
-            moved = shift[i, axis] if shift.size else 0.0
-            low[axis] = min(low[axis], xyz[i, axis] + min(moved, 0.0))
-            high[axis] = max(high[axis], xyz[i, axis] + max(moved, 0.0))
-            wide = max(wide, abs(moved))
-    return low - wide, high + wide
+    low, high = corners_of(rows, xyz)
+    if shift.size:
+        shortest, longest = corners_of(rows, shift)
+        wide = max(-shortest.min(), longest.max())
+        low, high = low + np.minimum(shortest, 0.0) - wide, high + np.maximum(longest, 0.0) + wide
+    return low, high
 
 
 @device(allocates=True)
@@ -261,14 +259,14 @@ def _usable(
     return kept[ranked]
 
 
-@kernel(allocates=True)
+@kernel
 def _intersect(
     span: Span, near: FloatArray, directions: FloatArray, start: IntArray, camera: IntArray,
     rig: Rig, result: FloatArray,
 ) -> None:  # fmt: skip
     """Intersect the rays of each point; the place near it is the origin."""
     for i in range(*span):
-        sums, least, k = np.zeros(9), 1.0, 0
+        sums, least, k, row = NO_LINE, 1.0, 0, result[i]
         for o in range(start[i], start[i + 1]):
             r, d = rig.rotations[camera[o]], row_of(directions, o)
             ray = ray_through(rig.port, rig.n, *d)
@@ -276,21 +274,13 @@ def _intersect(
                 continue
             away = minus(row_of(rig.centres, camera[o]), row_of(near, i))
             a, t = plus(transposed_times(r, ray[:3]), away), transposed_times(r, ray[3:])
-            add_line(sums, a, t, 1.0)
+            k, sums = k + 1, plus_line(sums, a, t, 1.0)
             least = min(least, cosine_at_port(rig.port, *d))
-            k += 1
-        _solve(result[i], sums, k, least)
-
-
-@device
-def _solve(row: FloatArray, sums: FloatArray, k: int, cosine: float) -> None:
-    """Solve one point and write its row; without a solution the shift stays zero."""
-    if k < 2:
-        row[_OUTCOME] = ONE_CAMERA if k == 1 else NO_CAMERA
-        return
-    solved, q, miss, sigma_z = nearest_point(float(k), sums)
-    if not solved:
-        row[_OUTCOME] = PARALLEL
-        return
-    row[0], row[1], row[2] = q
-    row[_MISS], row[_SIGMA_Z], row[_COSINE], row[_OUTCOME] = miss, sigma_z, cosine, CORRECTED
+        solved, q, distance = nearest_point(float(k), sums)
+        if k < 2:
+            row[_OUTCOME] = ONE_CAMERA if k == 1 else NO_CAMERA
+        elif not solved:
+            row[_OUTCOME] = PARALLEL
+        else:
+            row[0], row[1], row[2] = q
+            row[_MISS], row[_COSINE], row[_OUTCOME] = distance, least, CORRECTED

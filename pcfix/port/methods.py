@@ -117,7 +117,9 @@ def intersect_through_port(
         if not rows.size:
             break
         part = _intersect_chosen(xyz[rows], seen.take(rows), cameras, port, settings)
-        found, chosen = _with_rows(found, part, rows), seen
+        others = np.setdiff1d(np.arange(len(xyz)), rows)
+        order = np.concatenate([others, rows])
+        found, chosen = joined([found.take(others), part], order, len(cameras)), seen
     return found, chosen
 
 
@@ -148,16 +150,6 @@ def _other_rows(one: Views, other: Views) -> IntArray:
     return np.flatnonzero(~same)
 
 
-def _with_rows(found: Intersection, part: Intersection, rows: IntArray) -> Intersection:
-    """Return the result with some rows replaced."""
-    values = found._asdict()
-    for name in ("shift_m", "outcome", "ray_count", "ray_miss_m", "sigma_z_m", "incidence_deg"):
-        values[name] = values[name].copy()
-        values[name][rows] = getattr(part, name)
-    values["camera_used"] = found.camera_used | part.camera_used
-    return Intersection(**values)
-
-
 MAX_STEPS = 30
 CLOSE_M = 1e-7
 """Length of the last step; as each squares the error, the next is below a nanometre."""
@@ -182,7 +174,7 @@ def consistent_through_port(
     shift, found = start.shift_m.copy(), np.zeros(len(moved), np.bool_)
     rows, rig = _rows(views), rig_of(cameras, port, settings)
     of_points = np.ascontiguousarray(xyz), *rows
-    in_tiles(_search_all, len(moved), moved, *of_points, rig, shift, found)
+    in_tiles(_search, len(moved), moved, *of_points, rig, shift, found)
     warn_of_unsolved("method consistent found no solution behind the port", found)
     return start._replace(shift_m=shift)
 
@@ -239,41 +231,33 @@ def _image_through(a: Vector, rig: Rig, c: int, out: FloatArray, image: FloatArr
 
 
 @kernel(allocates=True)
-def _search_all(
+def _search(
     span: Span, moved: IntArray, xyz: FloatArray, start: IntArray, camera: IntArray, rig: Rig,
     shift: FloatArray, found: BoolArray,
 ) -> None:  # fmt: skip
-    """Search each point; without a solution it keeps its shift."""
+    """Move each point by Newton's method to where g is zero; if that fails it keeps its shift."""
+    out, image, g, slope = np.empty((3, 5)), np.empty((2, 8)), np.empty(3), np.empty((3, 3))
     for m in range(*span):
         i = moved[m]
-        found[m] = _search(shift[i], row_of(xyz, i), camera[start[i] : start[i + 1]], rig)
-
-
-@device(allocates=True)
-def _search(shift: FloatArray, point: Vector, cameras: IntArray, rig: Rig) -> bool:
-    """Move a point by Newton's method to where g is zero; False if it is not reached."""
-    q = shift.copy()
-    out, image, g, slope = np.empty((3, 5)), np.empty((2, 8)), np.empty(3), np.empty((3, 3))
-    for _ in range(MAX_STEPS):
-        g[:], slope[:] = 0.0, 0.0
-        for c in cameras:
-            a = minus(point, row_of(rig.centres, c))
-            u, v, ju, jv = image_in_world(rig.lenses[rig.row[c]], rig.rotations[c], a)
-            _image_through(plus(a, vector(q)), rig, c, out, image)
-            du, dv = image[0, 0] - u, image[1, 0] - v
-            for i in range(3):
-                g[i] += ju[i] * du + jv[i] * dv
-                for j in range(3):
-                    slope[i, j] += ju[i] * image[0, 1 + j] + jv[i] * image[1, 1 + j]
-        if not (np.isfinite(g).all() and np.linalg.det(slope) != 0.0):
-            return False
-        step = np.linalg.solve(slope, g)
-        q -= step
-        size = np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
-        if size <= CLOSE_M:
-            shift[:] = q
-            return True
-    return False
+        point, q = row_of(xyz, i), shift[i].copy()
+        for _ in range(MAX_STEPS):
+            g[:], slope[:] = 0.0, 0.0
+            for c in camera[start[i] : start[i + 1]]:
+                a = minus(point, row_of(rig.centres, c))
+                u, v, ju, jv = image_in_world(rig.lenses[rig.row[c]], rig.rotations[c], a)
+                _image_through(plus(a, vector(q)), rig, c, out, image)
+                du, dv = image[0, 0] - u, image[1, 0] - v
+                for k in range(3):
+                    g[k] += ju[k] * du + jv[k] * dv
+                    for j in range(3):
+                        slope[k, j] += ju[k] * image[0, 1 + j] + jv[k] * image[1, 1 + j]
+            if not (np.isfinite(g).all() and np.linalg.det(slope) != 0.0):
+                break
+            step = np.linalg.solve(slope, g)
+            q -= step
+            if np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2) <= CLOSE_M:
+                shift[i], found[m] = q, True
+                break
 
 
 @kernel(allocates=True)

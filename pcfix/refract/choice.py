@@ -9,14 +9,14 @@ import numpy.typing as npt
 
 from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import dot, minus, row_of
-from pcfix.lens.frames import Frames, frames_of, holds, listed_frames_of
+from pcfix.lens.frames import Frames, frames_of, holds, listed_frames_of, mark
 from pcfix.model import Cameras, FloatArray, IntArray, Views, WaterMesh, WaterPlane, WaterRaster
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract import tiling
 from pcfix.refract.batch import Batch, Chosen, Survey
 from pcfix.refract.rays import pierce
 from pcfix.refract.tiling import TILE
-from pcfix.water.surface import Field, SurfaceAbove, Tin, build_fields, build_tin, locate
+from pcfix.water.surface import Field, SurfaceAbove, Tin, build_fields, build_tin
 
 NOMINAL_FOCAL_PX = 3700.0
 """Of cameras without a lens: a survey drone's of 20 megapixels, 0.27 mrad a pixel."""
@@ -141,10 +141,11 @@ def _make_room(
     """Set how many entries each tile may get at most, one place on."""
     order, points = given
     low, high = tiling.corners_of(order[span[0] * TILE : span[1] * TILE], points.xyz)
-    around = tiling.cameras_around(frames, rig.centres, low, high)
+    every = np.arange(len(rig.centres))
+    around = tiling.near_cameras(every, frames, rig.centres, low, high)
     for t in range(*span):
         rows = order[t * TILE : (t + 1) * TILE]
-        low, high = tiling.gather(np.empty(7 * TILE), rows, points)
+        low, high = tiling.corners_of(rows, points.xyz)
         first[t + 1] = rows.size * tiling.near_cameras(around, frames, rig.centres, low, high).size
 
 
@@ -162,27 +163,31 @@ def _choose_all(
     (order, points), (first, begin, count, place) = given, found
     start, camera = points.start, points.camera
     low, high = tiling.corners_of(order[span[0] * TILE : span[1] * TILE], points.xyz)
-    around = camera[:0] if start.size else tiling.cameras_around(frames, rig.centres, low, high)
+    some = camera[:0] if start.size else np.arange(len(rig.centres))
+    around = tiling.near_cameras(some, frames, rig.centres, low, high)
     for t in range(*span):
         rows = order[t * TILE : (t + 1) * TILE]
         tile = np.empty(7 * TILE)
         low, high = tiling.gather(tile, rows, points)
         # without lists `around` has the cameras; the frame test is vectorised over the points
-        near, marks = tiling.marks_in_frame(
-            around, tile, frames, rig.centres, low, high, rows.size
-        )  # fmt: skip
+        near = tiling.near_cameras(around, frames, rig.centres, low, high)
+        marks, seeing = np.empty((near.size, rows.size)), 0
+        for c in near:
+            if mark(marks[seeing], tile, TILE, frames, c, rig.centres[c], low, high):
+                near[seeing] = c
+                seeing += 1
+        near = near[:seeing]
         free = first[t]  # the tile has its own stretch of entries
         for j in range(rows.size):
             i = rows[j]
-            facet = -1 if tin is None else locate(tin, tile[j], tile[TILE + j])
             if start.size:  # the entries of a point stay where they are in the list
                 candidates = camera[start[i] : start[i + 1]]
-                kept = _choose(candidates, None, tile, j, rig, frames, rule, tin, fields, facet)
+                kept = _choose(candidates, None, tile, j, rig, frames, rule, tin, fields)
                 for k in range(kept.size):
                     place[begin[i] + k] = start[i] + kept[k]
             else:
                 begin[i] = free
-                kept = _choose(near, marks, tile, j, rig, frames, rule, tin, fields, facet)
+                kept = _choose(near, marks, tile, j, rig, frames, rule, tin, fields)
                 for k in range(kept.size):
                     place[free + k] = near[kept[k]]
                 free += kept.size
@@ -192,7 +197,7 @@ def _choose_all(
 @device(allocates=True)
 def _choose(
     candidates: IntArray, marks: FloatArray | None, tile: FloatArray, j: int, rig: Rig,
-    frames: Frames, rule: Rule, tin: Tin | None, fields: Field | None, facet: int,
+    frames: Frames, rule: Rule, tin: Tin | None, fields: Field | None,
 ) -> npt.NDArray[np.int32]:  # fmt: skip
     """Return the candidates that give a ray to point j of the tile, by their places, in order.
 
@@ -201,8 +206,7 @@ def _choose(
     """
     chosen, cosine2 = np.empty(candidates.size, np.int32), np.empty(candidates.size)
     is_limited = rule.least_cosine2 > 0.0 or rule.most < candidates.size
-    x, y, z = tile[j], tile[TILE + j], tile[2 * TILE + j]
-    upward = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
+    (x, y, z), upward = tiling.three(tile, j), tiling.three(tile, 4 * TILE + j)
     k = 0
     for at in range(candidates.size):
         c = candidates[at]
@@ -214,7 +218,7 @@ def _choose(
         if not (inside and height > h):  # in the frame, and the camera above the water
             continue
         if h > 0.0 and is_limited and (tin is not None or fields is not None):
-            _, normal = pierce(c, tin, fields, lowered, e, h, upward, facet)
+            _, normal = pierce(c, tin, fields, lowered, e, h, upward)
             height = max(dot(normal, e), 0.0)
         if height * height >= rule.least_cosine2 * length2:
             chosen[k], cosine2[k] = at, height * height / length2

@@ -23,7 +23,7 @@ from pcfix.lens.frames import (
     Pyramid,
     frames_of,
     in_frame,
-    may_hold,
+    mark,
     no_frames,
     pyramid,
 )
@@ -44,10 +44,10 @@ from pcfix.refract.batch import (
 )
 from pcfix.refract.choice import Rig, Rule, rig_of, rule_of, shapes_of
 from pcfix.refract.rays import line_terms, nearest_point, pierce, ray_distance, refracted
-from pcfix.refract.tiling import TILE, nine, spatial_order, three, tiles_of
+from pcfix.refract.tiling import TILE, nine, put, spatial_order, three, tiles_of
 from pcfix.refract.tracks import FOUND, LOST, POINT_RUNS, RAY_RUNS, SEARCHED, STATE, Q, search_tile
 from pcfix.refract.uncertainty import Budget, room_of
-from pcfix.water.surface import Field, Tin, locate
+from pcfix.water.surface import Field, Tin
 
 # Columns of the result: a row is one cache line, as points are written in scattered order.
 _DISTANCE, _INCIDENCE, _COUNT, _OUTCOME, _FOUND, _WIDTH = 3, 4, 5, 6, 7, 8
@@ -103,7 +103,7 @@ def _intersected(batch: Batch, optics: Optics | None) -> Intersection:
     outcome = result[:, _OUTCOME].astype(np.uint8)
     moved = outcome == CORRECTED
     warn_of_unsolved("method consistent found no solution", result[moved, _FOUND] > 0.0)
-    found = Intersection(
+    return Intersection(
         shift_m=result[:, :3],
         outcome=outcome,
         ray_count=result[:, _COUNT].astype(np.int32),
@@ -111,8 +111,8 @@ def _intersected(batch: Batch, optics: Optics | None) -> Intersection:
         sigma_z_m=np.zeros(len(batch)),
         incidence_deg=result[:, _INCIDENCE],
         camera_used=used,
+        covariance_m2=covariance if survey.settings.dimensions == "all" else None,
     )
-    return uncertainty.with_errors(found, covariance if len(covariance) == len(batch) else None)
 
 
 @kernel(allocates=True)
@@ -127,54 +127,28 @@ def _intersect(
     if optics is not None:  # of all cameras; the system provides what is used
         rays, search = np.empty((len(centres), RAY_RUNS * TILE)), np.empty(POINT_RUNS * TILE)
     low, high = tiling.corners_of(order[span[0] * TILE : span[1] * TILE], points.xyz)
-    around = camera[:0] if start.size else tiling.cameras_around(frames, centres, low, high)
-    facet = np.full(TILE, -1)
+    some = camera[:0] if start.size else np.arange(len(centres))
+    around = tiling.near_cameras(some, frames, centres, low, high)
     for t in range(*span):
         # a tile of neighbours, its sums, and the cameras near it
         rows = order[t * TILE : (t + 1) * TILE]
         tile, sums = np.empty(7 * TILE), np.zeros(11 * TILE)
         low, high = tiling.gather(tile, rows, points)
         sums[10 * TILE :] = 1.0
-        if tin is not None:  # the facet above each point, where piercing starts
-            for j in range(rows.size):
-                facet[j] = locate(tin, tile[j], tile[TILE + j])
         if start.size:
             near, marks = tiling.marks_of_lists(start, camera, rows, len(centres))
         else:
-            near = around[_may_hold(frames, around, centres, low, high)]
+            near = tiling.near_cameras(around, frames, centres, low, high)
             marks = np.empty((near.size, rows.size))
-        seeing = 0
-        for k in range(near.size):
-            c, added, some = near[k], 0, True
-            if start.size:
-                marks[seeing] = marks[k]
-            elif frames.row[c] == NOT_DISTORTED:  # the pyramid is tested on the way
-                g, some = pyramid(frames.planes[c]), False
-                added = add_camera(sums, tile, marks[seeing], g, rig, c, rule, tin, fields, facet)
-            else:
-                some = tiling.mark_camera(marks[seeing], tile, frames, c, centres[c], low, high)
-            if some:
-                on = marks[seeing]
-                added = add_camera(sums, tile, on, None, rig, c, rule, tin, fields, facet)
-            if added:
-                near[seeing] = c
-                seeing += 1
-        of_point = np.empty(11)
-        for j in range(rows.size):
-            for at in range(11):
-                of_point[at] = sums[at * TILE + j]
-            _solve(result[rows[j]], of_point[9], of_point, marks[:seeing, j])
-        for k in range(seeing):
-            if not used[near[k]]:  # threads may write it at once: always the same value
-                for j in range(rows.size):
-                    if marks[k, j] > 0.0 and result[rows[j], _OUTCOME] == CORRECTED:
-                        used[near[k]] = True
+        seeing = _add_cameras(
+            sums, tile, marks, near, start.size > 0, rig, frames, rule, tin, fields, low, high
+        )
+        _solve(result, used, rows, sums, marks[:seeing], near)
         if optics is not None:
             for j in range(rows.size):
                 row = result[rows[j]]
                 search[STATE * TILE + j] = SEARCHED if row[_OUTCOME] == CORRECTED else LOST
-                for i in range(3):
-                    search[(Q + i) * TILE + j] = row[i]
+                put(search, Q * TILE + j, vector(row))
             search_tile(
                 search, rays, tile, marks[:seeing], near[:seeing], rig, optics, points.n, tin,
                 fields,
@@ -187,26 +161,47 @@ def _intersect(
                     row[_DISTANCE] = ray_distance(sums[9 * TILE + j], nine(sums, j), vector(row))
         if len(covariance):
             room = room_of(tile, result, rows)
-            for k in range(seeing):
-                uncertainty.add_errors(room, tile, marks[k], rig, near[k], rule, budget)
+            uncertainty.add_errors(room, tile, marks[:seeing], near, rig, rule, budget)
             uncertainty.finish_tile(covariance, rows, room, tile, level_sigma, budget)
 
 
-@device(allocates=True)
-def _may_hold(
-    frames: Frames, around: IntArray, centres: FloatArray, low: FloatArray, high: FloatArray
-) -> BoolArray:
-    """Return which cameras may hold a point of a box by their pyramids."""
-    near = np.empty(around.size, np.bool_)
-    for k in range(around.size):
-        near[k] = may_hold(frames.planes[around[k]], centres[around[k]], low, high)
-    return near
+# A kernel that makes arrays counts references: two locked operations for each row of an array that
+# it passes to a function. So the loops over cameras and points are functions that make no arrays.
+
+
+@device
+def _add_cameras(
+    sums: FloatArray, tile: FloatArray, marks: FloatArray, near: IntArray, listed: bool, rig: Rig,
+    frames: Frames, rule: Rule, tin: Tin | None, fields: Field | None, low: FloatArray,
+    high: FloatArray,
+) -> int:  # fmt: skip
+    """Add the rays of the cameras `near` a tile, whose box is `low` to `high`.
+
+    The cameras that give a ray, and their marks, are moved to the front; returns how many they are.
+    """
+    seeing = 0
+    for k in range(near.size):
+        c, on, added, some = near[k], marks[seeing], 0, True
+        if listed:
+            for j in range(on.size):
+                on[j] = marks[k, j]
+        elif frames.row[c] == NOT_DISTORTED:  # the pyramid is tested on the way
+            g, some = pyramid(frames.planes[c]), False
+            added = add_camera(sums, tile, on, g, rig, c, rule, tin, fields)
+        else:
+            some = mark(on, tile, TILE, frames, c, rig.centres[c], low, high)
+        if some:
+            added = add_camera(sums, tile, on, None, rig, c, rule, tin, fields)
+        if added:
+            near[seeing] = c
+            seeing += 1
+    return seeing
 
 
 @device
 def add_camera(
     sums: FloatArray, tile: FloatArray, marks: FloatArray, g: Pyramid | None, rig: Rig, c: int,
-    rule: Rule, tin: Tin | None, fields: Field | None, facet: IntArray,
+    rule: Rule, tin: Tin | None, fields: Field | None,
 ) -> int:  # fmt: skip
     """Add one camera's rays to the sums of a tile; return how many.
 
@@ -218,10 +213,10 @@ def add_camera(
     least_cosine2, r = rule.least_cosine2, rule.bend
     rays = 0
     for j in range(marks.size):
-        x, y, z = tile[j], tile[TILE + j], tile[2 * TILE + j]
+        x, y, z = three(tile, j)
         # from the point to the centre; N, H = N.e; h, the height of the water over P
         e = minus(centre, (x, y, z))
-        normal = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
+        normal = three(tile, 4 * TILE + j)
         height = dot(normal, e)
         h = normal[2] * (tile[3 * TILE + j] - (z - offset))
         length2 = dot(e, e)
@@ -235,7 +230,7 @@ def add_camera(
         q = 1.0 / (length2 * height)
         f = h * length2 * q if use and h > 0.0 else 0.0
         if (tin is not None or fields is not None) and use and h > 0.0:
-            f, normal = pierce(c, tin, fields, (x, y, z - offset), e, h, normal, facet[j])
+            f, normal = pierce(c, tin, fields, (x, y, z - offset), e, h, normal)
             height = dot(normal, e)
             q = 1.0 / (length2 * height)
         # 1 / L^2
@@ -260,22 +255,32 @@ def add_camera(
 
 
 @device
-def _solve(row: FloatArray, k: float, sums: FloatArray, marks: FloatArray) -> None:
-    """Solve one point and write its row; a point without a solution keeps a shift of zero.
+def _solve(
+    result: FloatArray, used: BoolArray, rows: IntArray, sums: FloatArray, marks: FloatArray,
+    near: IntArray,
+) -> None:  # fmt: skip
+    """Solve the points of a tile and write their rows; without a solution the shift stays zero.
 
-    A list may name a camera several times, as its `marks` say.
+    Sets which cameras are used; `marks` has a row for each of those `near`.
     """
-    if k < 2.0:
-        row[_OUTCOME] = ONE_CAMERA if k == 1.0 else NO_CAMERA
-        return
-    solved, q, distance, _ = nearest_point(k, sums)
-    if not solved:
-        most = 0.0
-        for times in marks:
-            most = max(most, times)
-        row[_OUTCOME] = ONE_CAMERA if most == k else PARALLEL
-        return
-    row[0], row[1], row[2] = q
-    row[_DISTANCE], row[_FOUND] = distance, 1.0
-    row[_INCIDENCE] = np.degrees(np.arccos(np.sqrt(min(sums[10], 1.0))))
-    row[_COUNT], row[_OUTCOME] = k, CORRECTED
+    for j in range(rows.size):
+        row, k = result[rows[j]], sums[9 * TILE + j]
+        if k < 2.0:
+            row[_OUTCOME] = ONE_CAMERA if k == 1.0 else NO_CAMERA
+            continue
+        solved, q, distance = nearest_point(k, nine(sums, j))
+        if not solved:
+            most = 0.0  # a list may name a camera several times, as its marks say
+            for times in marks[:, j]:
+                most = max(most, times)
+            row[_OUTCOME] = ONE_CAMERA if most == k else PARALLEL
+            continue
+        row[0], row[1], row[2] = q
+        row[_DISTANCE], row[_FOUND] = distance, 1.0
+        row[_INCIDENCE] = np.degrees(np.arccos(np.sqrt(min(sums[10 * TILE + j], 1.0))))
+        row[_COUNT], row[_OUTCOME] = k, CORRECTED
+    for k in range(len(marks)):
+        if not used[near[k]]:  # threads may write it at once: always the same value
+            for j in range(rows.size):
+                if marks[k, j] > 0.0 and result[rows[j], _OUTCOME] == CORRECTED:
+                    used[near[k]] = True

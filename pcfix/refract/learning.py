@@ -273,7 +273,7 @@ def with_matcher(batch: Batch, ties: TiePoints | None) -> Survey:
 
 def _learn_bed(batch: Batch) -> Bed | None:
     """Return the bed that agrees with a sample of fused points; None if no image sees a point."""
-    from pcfix.refract.fusion import likely_beds
+    from pcfix.refract.depth_maps import likely_beds
     from pcfix.refract.matcher import bed_of
 
     order = spatial_order(batch.xyz)

@@ -22,12 +22,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from pcfix.errors import SettingError
 from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import Vector, minus, row_of
 from pcfix.model import BoolArray, FloatArray, Outcome
 from pcfix.refract.batch import Batch, Chosen, Intersection
 from pcfix.refract.rays import MIN_DETERMINANT
-from pcfix.refract.regression import raise_no_regression
 
 TOLERANCE = 1e-9
 """Of tan a between two iterations of `shan`; the depth then changes by less than 1e-9 of itself."""
@@ -128,7 +128,11 @@ def regression(batch: Batch) -> Intersection:
     """
     line = batch.survey.learned.regression
     if line is None:
-        raise_no_regression()
+        raise SettingError(
+            "regression.missing",
+            "Method regression needs a fitted line. Give check depths or the line of another"
+            " cloud.",
+        )
     apparent = apparent_depth(batch)
     return without_rays(batch, line.depth_m(apparent) - apparent)
 

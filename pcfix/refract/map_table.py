@@ -52,22 +52,22 @@ AWAY, RESIDUAL, CURVED, EACH = 0, 1, 2, 3
 ALWAYS, NEVER, SOMETIMES = 1, 0, 2
 
 
-def _powers(x: FloatArray) -> FloatArray:
-    """Return the powers of coordinates, shape (n, 3), one column for each term."""
-    u, v, w = x.T
+def _powers(u: float, v: float, w: float) -> tuple[float, ...]:
+    """Return the powers of coordinates, one for each term."""
     uu, uv, vv, ww = u * u, u * v, v * v, w * w
-    return np.column_stack(
-        [np.ones(len(x)), u, v, w, uu, uv, u * w, vv, v * w, ww,
-         uu * u, uu * v, uu * w, uv * v, uv * w, u * ww, vv * v, vv * w, v * ww]
+    return (
+        1.0, u, v, w, uu, uv, u * w, vv, v * w, ww,
+        uu * u, uu * v, uu * w, uv * v, uv * w, u * ww, vv * v, vv * w, v * ww,
     )  # fmt: skip
 
 
 _FOUR, _THREE = np.cos(np.pi / 8.0 * np.arange(1, 8, 2)), np.sqrt(0.75) * np.arange(-1.0, 2.0)
 NODES = np.array([*product(_FOUR, _FOUR, _THREE), *product((-1.0, 1.0), repeat=3)])
 INSIDE = len(NODES) - 8
-POWERS = _powers(NODES)
+POWERS = np.array([_powers(*node) for node in NODES])
 FIT = np.asarray(np.linalg.pinv(POWERS[:INSIDE]), np.float64)
 """The corners, which come last, are not fitted."""
+_powers_of = device(forceinline=True)(_powers)
 
 
 class Block(NamedTuple):
@@ -154,13 +154,13 @@ def table_of(i: int, layer: int, seeing: BoolArray, block: Block) -> Table:
     return Table(middle, half, place, terms, in_frame, ways, np.ones(seeing.size))
 
 
-@device
+@device(forceinline=True)
 def water_at(block: Block, x: float, y: float) -> float:
     """Return the height of the plane of the water at a place."""
     return block.water[0] + block.water[1] * x + block.water[2] * y
 
 
-@device
+@device(forceinline=True)
 def reads(block: Block, i: int) -> bool:
     """Whether the water above a point is that of the cells."""
     points, (_, b, c) = block.points, block.water
@@ -203,8 +203,7 @@ def _fit_image(
 ) -> bool:  # fmt: skip
     """Write the polynomials of an image; return whether they are accurate enough."""
     partners, own, near = block.matcher.matched[c], views[place[c]], True
-    images = block.images
-    centres = images.centres if len(images.centres) else block.points.centres
+    centres = block.images.centres
     for p in range(MATCHED):
         j = partners[p]
         if j < 0:
@@ -223,7 +222,7 @@ def _fit_image(
     return near
 
 
-@device
+@device(forceinline=True)
 def meet(u: Vector, a: Vector, base: Vector, focal_px: float) -> Vector:
     """Return where the ray u is nearest to the ray a, and the residual in the image of a.
 
@@ -267,14 +266,14 @@ def _is_near(terms: FloatArray, values: FloatArray, view: FloatArray, focal_px: 
     return near
 
 
-@device
+@device(forceinline=True)
 def has_terms(table: Table, c: int) -> bool:
     """Whether a table has the polynomials of an image; inaccurate ones are NaN."""
     at = table.place[c] if table.place.size else -1
     return bool(0 <= at < len(table.terms) and table.terms[at, 0] == table.terms[at, 0])
 
 
-@device
+@device(forceinline=True)
 def read_table(
     partners: FloatArray, powers: FloatArray, table: Table, c: int, place: Vector,
     usual_m: float, block: Block,
@@ -289,11 +288,7 @@ def read_table(
     w = (z - water_at(block, x, y) - table.middle[2]) / table.half[2]
     if not (abs(u) <= 1.0 and abs(v) <= 1.0 and abs(w) <= 1.0):
         return -1
-    uu, uv, vv, ww = u * u, u * v, v * v, w * w
-    terms = (  # in the order of `POWERS`
-        1.0, u, v, w, uu, uv, u * w, vv, v * w, ww,
-        uu * u, uu * v, uu * w, uv * v, uv * w, u * ww, vv * v, vv * w, v * ww,
-    )  # fmt: skip
+    terms = _powers_of(u, v, w)
     for j in range(CUBIC):
         powers[j] = terms[j]
     at, count = table.place[c], 0
@@ -312,7 +307,7 @@ def read_table(
     return count
 
 
-@device(fastmath={"reassoc", "contract"})
+@device(forceinline=True, fastmath={"reassoc", "contract"})
 def values_of(terms: FloatArray, powers: FloatArray) -> Vector:
     """Return the values of three polynomials."""
     x, y, z = 0.0, 0.0, 0.0

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -169,7 +169,12 @@ def _find_partners(
                     found = 1.0 if tracked else np.exp(-((angle / REPEATED_DEG) ** 2))
                     # full weight for images that are as near or up to FINER times farther away
                     weight = (FINER / scale) ** 2 if scale > FINER else min(scale * scale, 1.0)
-                    sums[j, TOTAL] += found * _angle_weight(angle) * weight
+                    # a Gaussian around the best angle, wider towards large ones
+                    off = (angle - BEST_ANGLE_DEG) / (
+                        NARROW_DEG if angle < BEST_ANGLE_DEG else WIDE_DEG
+                    )
+                    weight *= max(np.exp(-0.5 * off * off), LEAST_ANGLE_WEIGHT)
+                    sums[j, TOTAL] += found * weight
                     sums[j, ANGLES] += found * angle
                     sums[j, SCALES] += found * scale
                     sums[j, COMMON] += found
@@ -201,14 +206,6 @@ def _score(sums: FloatArray, covered: int) -> float:
     if not SCALE_RANGE[0] <= sums[SCALES] / common <= SCALE_RANGE[1]:
         return 0.0
     return float(sums[TOTAL] * area)
-
-
-@device
-def _angle_weight(angle_deg: float) -> float:
-    wide = NARROW_DEG if angle_deg < BEST_ANGLE_DEG else WIDE_DEG
-    # a Gaussian around the best angle, wider towards large ones
-    off = (angle_deg - BEST_ANGLE_DEG) / wide
-    return max(np.exp(-0.5 * off * off), LEAST_ANGLE_WEIGHT)
 
 
 def steepest_and_partners(
@@ -245,8 +242,8 @@ _STEPS = 2.0
 class Bed(NamedTuple):
     """The bed of the surroundings as heights on a grid; NaN where nothing is known.
 
-    It serves only to choose among the likely beds of a point (`pcfix.refract.fusion`); no point is
-    put onto it.
+    It serves only to choose among the likely beds of a point (`pcfix.refract.depth_maps`); no point
+    is put onto it.
     """
 
     height_m: FloatArray  # (rows, columns), world frame, southern row first
@@ -257,33 +254,27 @@ class Bed(NamedTuple):
 
     def height_at(self, xy: FloatArray) -> FloatArray:
         """Return the height at each place, NaN where the cell has none."""
-        x, y = (xy[:, 0] - self.left_m) / self.cell_m, (xy[:, 1] - self.bottom_m) / self.cell_m
-        own = self._at(np.floor(y).astype(int), np.floor(x).astype(int))
-        if not self.between:
-            return own
-        total, weights = np.zeros(len(xy)), np.zeros(len(xy))
-        for up, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
-            row, column = np.floor(y - 0.5).astype(int) + up, np.floor(x - 0.5).astype(int) + right
-            height = self._at(row, column)
-            weight = (1.0 - np.abs(y - row - 0.5)) * (1.0 - np.abs(x - column - 0.5))
-            weight = np.where(np.isfinite(height), weight, 0.0)
-            total, weights = total + weight * np.nan_to_num(height), weights + weight
-        known = np.isfinite(own) & (weights > 0.0)
-        return np.where(known, total / np.where(known, weights, 1.0), np.nan)
+        from scipy.ndimage import map_coordinates
 
-    def _at(self, row: IntArray, column: IntArray) -> FloatArray:
-        """Return the heights of cells, NaN beside the grid."""
-        rows, columns = self.height_m.shape
-        inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-        height = np.full(len(row), np.nan)
-        height[inside] = self.height_m[row[inside], column[inside]]
-        return height
+        place = (xy.T[::-1] - [[self.bottom_m], [self.left_m]]) / self.cell_m
+        cell: dict[str, Any] = {"mode": "grid-constant", "output": np.float64}
+        own = map_coordinates(self.height_m, np.floor(place), order=0, cval=np.nan, **cell)
+        if not self.between:
+            return np.asarray(own)
+        # the mean of the four nearest middles of cells that have a height
+        known = np.isfinite(self.height_m)
+        total, weight = (
+            map_coordinates(values, place - 0.5, order=1, **cell)
+            for values in (np.where(known, self.height_m, 0.0), known.astype(np.float64))
+        )
+        inside = np.isfinite(own) & (weight > 0.0)
+        return np.where(inside, total / np.where(inside, weight, 1.0), np.nan)
 
 
 def bed_of(xyz: FloatArray, likely_m: FloatArray) -> Bed:
     """Return the bed that agrees with most apparent points, cell by cell.
 
-    `likely_m`, shape (m, h), are the `pcfix.refract.fusion.likely_beds`.
+    `likely_m`, shape (m, h), are the `pcfix.refract.depth_maps.likely_beds`.
     """
     low, high = xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0)
     cell = _cell_m(xyz[:, :2], low, high)

@@ -17,7 +17,7 @@ from pcfix.model import FloatArray, IntArray, Outcome, WaterPlane
 from pcfix.refract.batch import Batch, Intersection, Survey
 from pcfix.refract.choice import cameras_of_pairs, chosen_views, is_bent
 from pcfix.refract.tiling import spatial_order
-from pcfix.refract.uncertainty import with_model_uncertainty, with_uncertainty
+from pcfix.refract.uncertainty import with_uncertainty
 from pcfix.water.surface import SurfaceAbove
 
 POINTS_AT_ONCE = 100_000
@@ -35,11 +35,7 @@ METHODS = {
 }
 """Module and function by the names of `pcfix.options.Method`: a new method is a function and an
 entry."""
-_FUSED, _MAPS, _PAIRS = (
-    "fusion.invert_fusion",
-    "fusion.invert_depth_maps",
-    "stereo_pairs.invert_pairs",
-)
+_MAPS, _PAIRS = "depth_maps.invert_depth_maps", "stereo_pairs.invert_pairs"
 """What `consistent` is for dense clouds."""
 _IN_FRAME = (METHODS["snell"], METHODS["consistent"])
 """Methods whose kernels choose among all cameras."""
@@ -79,7 +75,7 @@ def _corrected(batch: Batch) -> Intersection:
     if views is not None and views.kind == "pairs":
         pairs, batch = views, replace(batch, views=cameras_of_pairs(views))
     if name in _IN_FRAME and _takes_all_in_frame(batch):
-        return with_model_uncertainty(method(batch), batch)
+        return with_uncertainty(method(batch), batch)
     order = spatial_order(batch.xyz)
     parts = []
     for rows in batches(order):
@@ -91,7 +87,7 @@ def _corrected(batch: Batch) -> Intersection:
             unsure = (found.outcome == Outcome.CORRECTED) & part.seen_flat() & (batch.views is None)
             known = known._replace(unsure=unsure)
         parts.append(known)
-    return with_model_uncertainty(joined(parts, order, len(survey.cameras)), batch)
+    return joined(parts, order, len(survey.cameras))
 
 
 def _takes_all_in_frame(batch: Batch) -> bool:
@@ -114,7 +110,7 @@ def shift_of_land(batch: Batch) -> FloatArray:
     depths of some images. That is inverted as on the bed, without water. Zero for tracks.
     """
     batch = replace(batch, survey=batch.survey.learned.land or on_land(batch.survey))
-    if _method(batch) not in (_FUSED, _MAPS, _PAIRS):
+    if _method(batch) not in (_MAPS, _PAIRS):
         return np.zeros((len(batch), 3))
     at_themselves = SurfaceAbove(batch.xyz[:, 2].copy(), np.zeros((len(batch), 2)))
     return correct(replace(batch, surface=at_themselves)).shift_m
@@ -144,7 +140,7 @@ def _method(batch: Batch) -> str:
     modelled = "tracks" if batch.survey.learned.matcher is None else settings.matcher
     kind = modelled if views is None else views.kind
     if kind == "depth-maps":
-        return _FUSED if views is None else _MAPS
+        return _MAPS
     return _PAIRS if kind in ("pairs", "pair-images") else METHODS["consistent"]
 
 

@@ -262,6 +262,8 @@ class OccluderBuilder:
 
     def build(self) -> Occluder | None:
         """Return the surface; None without points. The builder is then empty."""
+        from scipy.ndimage import maximum_filter
+
         cells, self._cells = self._cells, None
         if cells is None or not self._points:
             return None
@@ -270,7 +272,12 @@ class OccluderBuilder:
             self._points < POINTS_A_CELL * np.isfinite(cells.highest).sum()
         ):
             cells = _halved(cells)
-        height = _without_spikes(cells.second)
+        # without spikes: a cell is at most as high as the highest of its eight neighbours
+        around = np.ones((3, 3), np.bool_)
+        around[1, 1] = False
+        beside = maximum_filter(cells.second, footprint=around, mode="constant", cval=-np.inf)
+        lower = np.minimum(cells.second, beside)
+        height = np.where(lower > -np.inf, lower, np.float32(np.nan))
         return Occluder(
             height=height,
             left_m=cells.first_column * cells.side_m,
@@ -336,17 +343,6 @@ def _add(cells: _Cells, xyz: FloatArray) -> None:
             cells.highest[r, c] = z
         elif z > cells.second[r, c]:
             cells.second[r, c] = z
-
-
-def _without_spikes(second: Heights) -> Heights:
-    """Lower every cell to the highest of its eight neighbours; NaN where there is no height."""
-    from scipy.ndimage import maximum_filter
-
-    around = np.ones((3, 3), np.bool_)
-    around[1, 1] = False
-    beside = maximum_filter(second, footprint=around, mode="constant", cval=-np.inf)
-    lower = np.minimum(second, beside)
-    return np.where(lower > -np.inf, lower, np.float32(np.nan))
 
 
 def _tops(height: Heights, side: int) -> Heights:

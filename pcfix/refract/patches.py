@@ -216,8 +216,3 @@ def grid_m(xyz: FloatArray) -> float | None:
             return None
         steps.append(step)
     return float(np.mean(steps))
-
-
-def is_smooth(part: Batch, place: IntArray) -> bool:
-    """Whether neighbours scatter less than images can tell: of a mesh, or filtered."""
-    return scatter_m(part, place, part.xyz[:, 2]) < SMOOTH_GSD * gsd_m(part)

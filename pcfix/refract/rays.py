@@ -48,23 +48,12 @@ from typing import TypeAlias
 import numpy as np
 
 from pcfix.kernels import device
-from pcfix.lens.algebra import (
-    Nine,
-    Vector,
-    beyond,
-    cofactors,
-    dot,
-    minus,
-    normal_of,
-    product,
-    scaled,
-    vector,
-)
+from pcfix.lens.algebra import Nine, Vector, beyond, dot, minus, normal_of, scaled, solved, vector
 from pcfix.model import FloatArray
-from pcfix.water.surface import Field, Tin, height_at, locate
+from pcfix.water.surface import Field, Tin, field_of, height_at, locate
 
 
-@device
+@device(forceinline=True)
 def refracted(e: Vector, length2: float, normal: Vector, height: float, r: float) -> Vector:
     """Return the refracted ray's direction (downward), with the length L of e.
 
@@ -79,10 +68,8 @@ def refracted(e: Vector, length2: float, normal: Vector, height: float, r: float
     return minus(scaled(k, normal), scaled(r, e))
 
 
-@device
-def line_terms(
-    a: Vector, d: Vector, inv_length2: float
-) -> tuple[float, float, float, float, float, float, float, float, float]:
+@device(forceinline=True)
+def line_terms(a: Vector, d: Vector, inv_length2: float) -> Nine:
     """Return what one line adds to the normal equations of the nearest point.
 
     The line runs through A along t = d / L. Its squared distance from Q is Q'MQ - 2 b'Q + s
@@ -99,38 +86,35 @@ def line_terms(
 
 
 @device
-def add_line(sums: FloatArray, a: Vector, d: Vector, inv_length2: float) -> None:
-    """Add the terms of one line to the first nine sums."""
-    terms = line_terms(a, d, inv_length2)
-    for i in range(9):
-        sums[i] += terms[i]
+def plus_line(sums: Nine, a: Vector, d: Vector, inv_length2: float) -> Nine:
+    """Return the sums with the terms of one more line."""
+    t = line_terms(a, d, inv_length2)
+    return (
+        sums[0] + t[0], sums[1] + t[1], sums[2] + t[2], sums[3] + t[3], sums[4] + t[4],
+        sums[5] + t[5], sums[6] + t[6], sums[7] + t[7], sums[8] + t[8],
+    )  # fmt: skip
 
 
+NO_LINE = (0.0,) * 9
 MIN_DETERMINANT = 1e-6
 """Least determinant of M / k. Two rays at an angle alpha have alpha^2 / 4: 1e-6 is a tenth of a
 degree, far below any usable base, and keeps rounding below 1e-9 m."""
 
 
 @device
-def nearest_point(k: float, sums: FloatArray) -> tuple[bool, Vector, float, float]:
+def nearest_point(k: float, sums: Nine) -> tuple[bool, Vector, float]:
     """Solve M Q = b for the point nearest to k lines, all with equal weight.
 
-    The first nine `sums` are those of `line_terms`. Returns whether it is solved (else the lines
-    are nearly parallel, and the rest is meaningless); Q relative to the apparent point; its root
-    mean square distance from the lines; and the standard error of Q_z from the scatter of the
-    lines: the a-posteriori variance s_min / (2k - 3) times (M^-1)_zz. Metres.
+    The `sums` are those of `line_terms`. Returns whether it is solved (else the lines are nearly
+    parallel, and the rest is meaningless); Q relative to the apparent point; and its root mean
+    square distance from the lines. Metres.
     """
     m00, m11 = k - sums[0], k - sums[3]
     # M = k I - sum t t', with the last diagonal element from the trace
-    det, c = cofactors((m00, -sums[1], -sums[2], m11, -sums[4], 2.0 * k - m00 - m11))
-    b = sums[5], sums[6], sums[7]
-    x, y, z = product(c, b)
-    q = x / det, y / det, z / det
+    det, q = solved((m00, -sums[1], -sums[2], m11, -sums[4], 2.0 * k - m00 - m11), sums[5:8])
     # the sum of squared distances at the minimum
-    rest = max(sums[8] - dot(b, q), 0.0)
-    # 2 k equations for 3 unknowns
-    sigma_z = np.sqrt(rest / (2.0 * k - 3.0) * c[5] / det)
-    return det >= MIN_DETERMINANT * k * k * k, q, np.sqrt(rest / k), sigma_z
+    rest = max(sums[8] - dot(sums[5:8], q), 0.0)
+    return det >= MIN_DETERMINANT * k * k * k, q, np.sqrt(rest / k)
 
 
 @device
@@ -145,71 +129,39 @@ def ray_distance(k: float, s: Nine, q: Vector) -> float:
     return np.sqrt(max(rest, 0.0) / k)
 
 
-PIERCING_STEPS = 16
-MAX_HALVINGS = 64
+PIERCING_STEPS = 64
 CLOSE_M = 1e-9
 """Along the vertical: a thousandth of any use, and above the rounding of heights (1e-12 m)."""
 
 
 @device
 def pierce(
-    c: int, tin: Tin | None, fields: Field | None, p: Vector, e: Vector, h: float, normal: Vector,
-    facet: int,
-) -> tuple[float, Vector]:  # fmt: skip
+    c: int, tin: Tin | None, fields: Field | None, p: Vector, e: Vector, h: float, normal: Vector
+) -> tuple[float, Vector]:
     """Return the fraction f of e from P to the surface, and the unit normal there.
 
     P (world frame) lies under the mesh, or under the raster of camera c, or under a plane where
     both are None; e leads to the projection centre. h is the distance of P from the tangent plane
-    above it, `normal` that plane's normal, and `facet` the facet above P on a mesh. The piercing
-    point is P + f e.
+    above it, and `normal` that plane's normal. The piercing point is P + f e.
     """
-    if tin is not None:
-        return _pierce_mesh(tin, p, e, facet)
-    if fields is not None:
-        field = Field(fields.heights, fields.shape, fields.frame, c)
-        return _pierce_raster(field, p, e, h, normal)
-    return h / dot(normal, e), normal
-
-
-@device
-def _pierce_mesh(tin: Tin, p: Vector, e: Vector, facet: int) -> tuple[float, Vector]:
-    """Walk from facet to facet until the line pierces one; on a crease the last step counts."""
-    f, b, c = 0.0, 0.0, 0.0
+    low, high, f = 0.0, 1.0, h / dot(normal, e)
+    if tin is None and fields is None:
+        return f, normal
     for _ in range(PIERCING_STEPS):
-        a, b, c = tin.planes[facet, 0], tin.planes[facet, 1], tin.planes[facet, 2]
-        # height of the plane of the facet over P
-        above = a + b * (p[0] - tin.origin_x) + c * (p[1] - tin.origin_y) - p[2]
-        f = above / (e[2] - b * e[0] - c * e[1])
-        # the facet at the piercing point
-        following = locate(tin, p[0] + f * e[0], p[1] + f * e[1])
-        if following == facet or following < 0:
-            break
-        facet = following
-    return f, normal_of(b, c)
-
-
-@device
-def _pierce_raster(
-    field: Field, p: Vector, e: Vector, h: float, normal: Vector
-) -> tuple[float, Vector]:
-    """Apply Newton's method to the tangent planes, inside a bracket."""
-    low, high = 0.0, 1.0
-    f = h / dot(normal, e)
-    for _ in range(MAX_HALVINGS):
-        z, b, c = height_at(field, p[0] + f * e[0], p[1] + f * e[1])
-        # positive while the line is below the surface
-        gap = z - (p[2] + f * e[2])
+        z, by_x, by_y = plane_at(tin, field_of(fields, c), f * e[0], f * e[1], p)
+        # positive while the line is below the surface; NaN where there is none
+        gap = z - f * e[2]
         if np.isnan(gap):
             break
-        normal = normal_of(b, c)
+        normal = normal_of(by_x, by_y)
         if abs(gap) <= CLOSE_M:
             break
         if gap > 0.0:
             low = f
         else:
             high = f
-        # Newton step on the tangent plane; else bisect
-        f += gap / (e[2] - b * e[0] - c * e[1])
+        # Newton's step on the tangent plane; else bisect
+        f += gap / (e[2] - by_x * e[0] - by_y * e[1])
         if not low < f < high:
             f = 0.5 * (low + high)
     return f, normal
@@ -334,7 +286,7 @@ HALVINGS = 36
 
 @device
 def plane_at(
-    tin: Tin | None, field: Field | None, x: float, y: float, origin: FloatArray
+    tin: Tin | None, field: Field | None, x: float, y: float, origin: FloatArray | Vector
 ) -> tuple[float, float, float]:
     """Return height, dz/dx and dz/dy of the water at a place; NaN where there is none.
 
@@ -379,19 +331,6 @@ def settle(
         # keep both slopes: on a crease the steps alternate
         before, b, c = (b, c), b_there, c_there
     _settle_on_crease(plane, tin, field, origin, before, (b, c), q, e, n)
-
-
-@device
-def settle_of(
-    c: int, plane: FloatArray, tin: Tin | None, fields: Field | None, origin: FloatArray,
-    q: Vector, e: Vector, n: float,
-) -> None:  # fmt: skip
-    """Do as `settle`, with the raster of camera c if there are rasters."""
-    if fields is None:
-        settle(plane, tin, None, origin, q, e, n)
-    else:
-        field = Field(fields.heights, fields.shape, fields.frame, c)
-        settle(plane, tin, field, origin, q, e, n)
 
 
 @device

@@ -18,7 +18,7 @@ from pcfix.options.correct import Dimensions, ScienceOptions
 from pcfix.refract import patches
 from pcfix.refract.batch import Batch, ModelUncertainty
 from pcfix.refract.methods import correct, with_rays
-from pcfix.refract.patches import Patches, shares
+from pcfix.refract.patches import SMOOTH_GSD, Patches, scatter_m, shares
 
 SURE = 3.0
 """Standard errors by which a share must differ from one half to be significant."""
@@ -344,7 +344,8 @@ def _remarks(part: Batch, place: IntArray) -> tuple[str, ...]:
             f"The points lie on a grid of {step:.3g} m, like the heights of a raster, which smooths"
             " the evidence of the reconstruction type. Give the cloud as the matcher wrote it.",
         )
-    if part.survey.cameras.lenses is not None and patches.is_smooth(part, place):
+    has_lenses, z = part.survey.cameras.lenses is not None, part.xyz[:, 2]
+    if has_lenses and scatter_m(part, place, z) < SMOOTH_GSD * patches.gsd_m(part):
         return (
             "Neighbouring points scatter less than images allow, as in a mesh or a filtered cloud:"
             " its reconstruction type is uncertain, and SigmaZ has no share of mismatches. Give the"
@@ -377,7 +378,7 @@ def _model_uncertainty(part: Batch, beds: _Beds, way: int, among: list[int]) -> 
     open_m = max((left(best, i, 1.0) for i in among if i != best), default=0.0)
     if way != best:
         open_m = math.hypot(open_m, left(way, best, 0.5 if way in among else 0.0))
-    scatter = patches.scatter_m(part, beds.place, beds.z[way])
+    scatter = scatter_m(part, beds.place, beds.z[way])
     budget = correct(_as(part, beds.ways[way], "all"))
     formal = float(np.median(budget.sigma_z_m))
     return ModelUncertainty(math.sqrt(max(scatter**2 - formal**2, 0.0)), open_m, formal)
@@ -401,7 +402,7 @@ def _heights(part: Batch, around: Batch, way: Reconstruction) -> FloatArray:
     settings, learned = part.survey.settings, part.survey.learned
     fuses = settings.method == "consistent" and settings.matcher == "depth-maps"
     if part.views is None and fuses and learned.matcher is not None:
-        from pcfix.refract.fusion import likely_beds
+        from pcfix.refract.depth_maps import likely_beds
         from pcfix.refract.matcher import bed_of
 
         # the bed identifies the images of a point: it must be that of other points

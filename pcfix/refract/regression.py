@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
-from pcfix.errors import GeometryError, SettingError
+from pcfix.errors import GeometryError
 from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.sums import MOST, Sums
 from pcfix.water.surface import SurfaceAbove, is_submerged
@@ -68,14 +68,6 @@ class DepthRegression:
             f"depth = {self.intercept_m:.3f} m + {self.slope:.3f} x apparent depth"
             f" ({self.count} check depths, r2 {self.r2:.3f})"
         )
-
-
-def raise_no_regression() -> NoReturn:
-    """Raise SettingError because the method regression has no line."""
-    raise SettingError(
-        "regression.missing",
-        "Method regression needs a fitted line. Give check depths or the line of another cloud.",
-    )
 
 
 def fit_depths(apparent_m: FloatArray, true_m: FloatArray) -> DepthRegression:

@@ -58,9 +58,8 @@ from pcfix.refract.batch import (
     Chosen,
     Images,
     Intersection,
-    Optics,
     images_of,
-    optics_of,
+    normal_above,
     to_original,
     warn_of_unsolved,
 )
@@ -68,14 +67,15 @@ from pcfix.refract.choice import cameras_of_pairs
 from pcfix.refract.intersect import check_consistent
 from pcfix.refract.rays import (
     MIN_DETERMINANT,
-    add_line,
+    NO_LINE,
     direction,
     light_path,
     nearest_point,
+    plus_line,
     ray_distance,
     refracted,
 )
-from pcfix.refract.tiling import are_same, cameras_of, cells_of
+from pcfix.refract.tiling import are_same, cells_of
 
 MAX_STEPS = 40
 ALIKE = 0.5
@@ -93,18 +93,11 @@ _DISTANCE, _OUTCOME, _FOUND, _WIDTH = 3, 4, 5, 6
 _ABOVE, _ORIGINAL, _BY_PLACE, _SQUARE, _RIGHT, _RAY_WIDTH = 3, 4, 7, 10, 16, 20
 
 
-class PairImages(NamedTuple):
-    """The images of the original model; `both` relates them to the adjusted ones; n."""
-
-    optics: Optics
-    both: Images
-    n: float
-
-
 class _Point(NamedTuple):
     """One apparent point with its rays and pairs; coordinates are relative to the point."""
 
     normal: Vector  # of the water above the point
+    n: float  # refractive index
     rays: FloatArray  # (j, ...), a row for each of its cameras
     cameras: IntArray  # (j,)
     used: BoolArray  # (j,), whether the camera is in a pair
@@ -130,15 +123,13 @@ def invert_pairs(batch: Batch, pairs: Views | None = None) -> Intersection:
     cameras, matcher = batch.survey.cameras, batch.survey.learned.matcher
     if pairs is None and matcher is None:
         raise ValueError("pairs or a model of the matcher are needed")
-    original = cameras if batch.original_model is None else batch.original_model.cameras
     none = np.zeros(0, np.int64)
     listed = (none, none)
     if pairs is not None:
         listed = np.asarray(pairs.start, np.int64), np.asarray(pairs.camera, np.int64)
     matched = np.zeros((0, 0), np.int64) if matcher is None else matcher.matched
     used, result = np.zeros(len(batch.rays.camera), np.bool_), np.zeros((len(batch), _WIDTH))
-    both = images_of(batch.original_model, cameras)
-    images = PairImages(optics_of(original), both, batch.survey.settings.refractive_index)
+    images = images_of(batch.original_model, cameras)
     order, first = cells_of(batch)
     in_tiles(
         _invert, len(first) - 1, (order, first), batch.chosen(), images, (*listed, matched), used,
@@ -155,7 +146,7 @@ def invert_pairs(batch: Batch, pairs: Views | None = None) -> Intersection:
 
 @kernel(allocates=True)
 def _invert(
-    span: Span, cells: tuple[IntArray, IntArray], points: Chosen, images: PairImages,
+    span: Span, cells: tuple[IntArray, IntArray], points: Chosen, images: Images,
     listed: tuple[IntArray, IntArray, IntArray], used: BoolArray, result: FloatArray,
 ) -> None:  # fmt: skip
     """Correct the points of each cell; without listed pairs they are those of the matcher."""
@@ -167,12 +158,12 @@ def _invert(
         most_pairs = most_between((0, len(start) - 1), listed_start) // 2
     rays, place = np.empty((most, _RAY_WIDTH)), np.full(len(points.centres), -1)
     pairs, places = np.empty((most_pairs, 2), np.int64), np.empty((3, most_pairs))
-    room = np.empty(9), np.empty((3, 3))
+    inverse = np.empty((3, 3))
     for t in range(*span):
-        before = -1
+        before, seeing_before = -1, points.camera[:0]
         for i in order[first[t] : first[t + 1]]:
             cameras = points.camera[start[i] : start[i + 1]]
-            flags, normal = used[start[i] : start[i + 1]], row_of(points.normals, i)
+            flags, normal = used[start[i] : start[i + 1]], normal_above(points, i)
             # `place` maps a camera to its ray of this point
             for j in range(cameras.size):
                 place[cameras[j]] = j
@@ -194,30 +185,30 @@ def _invert(
             # the result row first holds the start of the search, NaN without one
             near = result[i, :3]
             near[:] = np.nan
-            if before >= 0 and are_same(cameras, cameras_of(points, before)):
+            if before >= 0 and are_same(cameras, seeing_before):
                 depth = points.height[i] - points.xyz[i, 2]
                 there = points.height[before] - points.xyz[before, 2]
                 # the shift grows with the depth, unless the depths differ much
                 if there > 0.0 and ALIKE * there < depth < there / ALIKE:
                     for axis in range(3):
                         near[axis] = result[before, axis] * (depth / there)
-            point = _Point(normal, rays, cameras, flags, pairs[:wide], places[:, :wide])
-            _solve(result[i], point, images, room)
-            before = i if result[i, _FOUND] > 0.0 else -1
+            point = _Point(normal, points.n, rays, cameras, flags, pairs[:wide], places[:, :wide])
+            _solve(result[i], point, images, inverse)
+            before, seeing_before = i if result[i, _FOUND] > 0.0 else -1, cameras
 
 
 @device
-def _begin(ray: FloatArray, points: Chosen, i: int, c: int, images: PairImages) -> None:
+def _begin(ray: FloatArray, points: Chosen, i: int, c: int, images: Images) -> None:
     """Fill in where a ray comes from, and how the scale of its image changes with the place.
 
     The scale depends on the distance, relative to that of P: along the axis in a perspective
     image, from the centre in other projections.
     """
     e = minus(row_of(points.centres, c), row_of(points.xyz, i))
-    ray[_ABOVE] = points.normals[i, 2] * (points.height[i] - points.xyz[i, 2] + points.offset[c])
-    original, optics = e, images.optics
-    if len(images.both.centres):
-        original = minus(row_of(images.both.centres, c), row_of(points.original_xyz, i))
+    up = normal_above(points, i)[2]
+    ray[_ABOVE] = up * (points.height[i] - points.xyz[i, 2] + points.offset[c])
+    original = minus(row_of(images.centres, c), row_of(points.original_xyz, i))
+    optics = images.original
     axis, size2 = row_of(optics.rotations[c], 2), dot(original, original)
     ahead = -dot(axis, original)
     # behind a perspective camera the depth along the axis has no meaning
@@ -228,16 +219,16 @@ def _begin(ray: FloatArray, points: Chosen, i: int, c: int, images: PairImages) 
 
 
 @device
-def _see(ray: FloatArray, q: Vector, c: int, normal: Vector, images: PairImages) -> None:
+def _see(ray: FloatArray, q: Vector, c: int, point: _Point, images: Images) -> None:
     """Write the normal equations of the image of Q: G'G, G'G e and |G e|^2.
 
     The direction w, in the original model, is scaled to the distance of P, so that G is that there.
     """
-    path = light_path(q, vector(ray), normal, ray[_ABOVE], images.n)
-    w = to_original(images.both, c, direction(path, normal))
+    path = light_path(q, vector(ray), point.normal, ray[_ABOVE], point.n)
+    w = to_original(images, c, direction(path, point.normal))
     # g.w is the distance of w in terms of P
     w = scaled(1.0 / dot(w, vector(ray, _BY_PLACE)), w)
-    optics, e = images.optics, vector(ray, _ORIGINAL)
+    optics, e = images.original, vector(ray, _ORIGINAL)
     _, _, by_u, by_v = image_in_world(optics.lenses[optics.row[c]], optics.rotations[c], w)
     ray[_SQUARE:] = 0.0
     for g in (by_u, by_v):
@@ -349,12 +340,18 @@ def _wide_pairs(pairs: IntArray, rays: FloatArray, normal: Vector) -> int:
 
 
 @device
-def _solve(
-    out: FloatArray, point: _Point, images: PairImages, room: tuple[FloatArray, FloatArray]
-) -> None:
+def _solve(out: FloatArray, point: _Point, images: Images, inverse: FloatArray) -> None:
     """Solve one point and write its row, which has a start already or NaN."""
-    (sums, inverse), n = room, images.n
-    fixed, start, k = _snell(sums, point, n)
+    k, sums, n = 0.0, NO_LINE, point.n
+    for j in range(point.used.size):
+        if point.used[j]:
+            e, above = vector(point.rays[j]), point.rays[j, _ABOVE]
+            # where the ray through P enters the water, and its direction there
+            length2, across = dot(e, e), dot(point.normal, e)
+            f, bend = (above / across, 1.0 / n) if above > 0.0 else (0.0, 1.0)
+            d = refracted(e, length2, point.normal, across, bend)
+            k, sums = k + 1.0, plus_line(sums, scaled(f, e), d, 1.0 / length2)
+    fixed, start, _ = nearest_point(k, sums)
     if not fixed:
         out[:3], out[_OUTCOME] = 0.0, PARALLEL
         return
@@ -365,35 +362,13 @@ def _solve(
         _as_from_above(inverse, 1.0, n)
         found, q = _search(start, inverse, point, images)
     out[0], out[1], out[2] = q
-    s = vector(sums), vector(sums, 3), vector(sums, 6)
-    out[_DISTANCE] = ray_distance(k, (*s[0], *s[1], *s[2]), q)
+    out[_DISTANCE] = ray_distance(k, sums, q)
     out[_OUTCOME], out[_FOUND] = CORRECTED, 1.0 if found else 0.0
 
 
 @device
-def _snell(sums: FloatArray, point: _Point, n: float) -> tuple[bool, Vector, float]:
-    """Return whether there is a point nearest to the refracted rays, that point, and their number.
-
-    `sums` gets those of `line_terms`.
-    """
-    k = 0.0
-    sums[:] = 0.0
-    for j in range(point.used.size):
-        if point.used[j]:
-            e, above = vector(point.rays[j]), point.rays[j, _ABOVE]
-            # where the ray through P enters the water, and its direction there
-            length2, across = dot(e, e), dot(point.normal, e)
-            f, bend = (above / across, 1.0 / n) if above > 0.0 else (0.0, 1.0)
-            d = refracted(e, length2, point.normal, across, bend)
-            add_line(sums, scaled(f, e), d, 1.0 / length2)
-            k += 1.0
-    fixed, q, _, _ = nearest_point(k, sums)
-    return fixed, q, k
-
-
-@device
 def _search(
-    start: Vector, inverse: FloatArray, point: _Point, images: PairImages
+    start: Vector, inverse: FloatArray, point: _Point, images: Images
 ) -> tuple[bool, Vector]:
     """Return whether a Q was found where the median F of the pairs' places is P, and that Q.
 
@@ -401,11 +376,17 @@ def _search(
     by y, the good Broyden update is B + (s - B y) s'B / (s'B y); where it does not, B starts again
     with half the step.
     """
+    rays, pairs, places = point.rays, point.pairs, point.places
     q, nearest, at_nearest, best, share = start, start, (0.0, 0.0, 0.0), np.inf, 1.0
     for _ in range(MAX_STEPS):
-        _place_pairs(q, point, images)
+        # where the pairs would place Q; NaN where a camera has no image of it
+        for j in range(point.used.size):
+            if point.used[j]:
+                _see(rays[j], q, point.cameras[j], point, images)
+        for p in range(len(pairs)):
+            places[0, p], places[1, p], places[2, p] = _meet(rays[pairs[p, 0]], rays[pairs[p, 1]])
         # the median is relative to P, so that it is F itself
-        f = _median(point.places[0]), _median(point.places[1]), _median(point.places[2])
+        f = _median(places[0]), _median(places[1]), _median(places[2])
         size = np.sqrt(dot(f, f))
         if size <= CLOSE_M:
             return True, q
@@ -421,7 +402,7 @@ def _search(
             best, nearest, at_nearest = size, q, f
         elif best < np.inf:
             share *= 0.5
-            _as_from_above(inverse, share, images.n)
+            _as_from_above(inverse, share, point.n)
         else:  # no image of the start
             return False, start
         q = nearest
@@ -435,18 +416,6 @@ def _as_from_above(inverse: FloatArray, share: float, n: float) -> None:
     """Set B to a share of the inverse derivative for light from straight above."""
     inverse[:] = 0.0
     inverse[0, 0], inverse[1, 1], inverse[2, 2] = share, share, share * n
-
-
-@device
-def _place_pairs(q: Vector, point: _Point, images: PairImages) -> None:
-    """Set where the pairs would have placed Q; NaN where a camera has no image of it."""
-    rays, pairs, places = point.rays, point.pairs, point.places
-    for j in range(point.used.size):
-        if point.used[j]:
-            _see(rays[j], q, point.cameras[j], point.normal, images)
-    for p in range(len(pairs)):
-        place = _meet(rays[pairs[p, 0]], rays[pairs[p, 1]])
-        places[0, p], places[1, p], places[2, p] = place
 
 
 @device

@@ -11,21 +11,10 @@ from itertools import accumulate
 import numpy as np
 
 from pcfix.kernels import device
-from pcfix.lens.algebra import Nine, Vector
-from pcfix.lens.frames import (
-    ALL,
-    NOT_DISTORTED,
-    NOTHING,
-    SOME,
-    Frames,
-    judge,
-    mark,
-    mark_pyramid,
-    may_hold,
-    pyramid,
-)
-from pcfix.model import FloatArray, IntArray, WaterPlane
-from pcfix.refract.batch import Batch, Chosen
+from pcfix.lens.algebra import Nine, Vector, row_of
+from pcfix.lens.frames import NOT_DISTORTED, NOTHING, Frames, judge, may_hold
+from pcfix.model import FloatArray, IntArray, SingleArray, WaterPlane
+from pcfix.refract.batch import Batch, Chosen, normal_above
 
 TILE = 128
 """Points of a tile: its sums (11 numbers a point) stay in the processor's first cache."""
@@ -55,7 +44,8 @@ def spatial_order(xyz: FloatArray) -> IntArray:
     row = np.minimum(((y - y.min()) * (1.0 / cell_m)).astype(np.int64), rows - 1)
     # row after row to and fro, so that the next cell is always a neighbour
     within = np.where(row & 1, columns - 1 - column, column)
-    return np.argsort(row * columns + within, kind="stable")
+    # there are fewer than 2^16 cells, and numpy sorts numbers of 16 bits in two passes
+    return np.argsort((row * columns + within).astype(np.uint16), kind="stable")
 
 
 def cell_side(batch: Batch) -> float:
@@ -90,12 +80,6 @@ def cells_of(batch: Batch, layer: IntArray | None = None) -> tuple[IntArray, Int
     return order, np.concatenate([[0], new, [len(order)]])
 
 
-@device(allocates=True)
-def cameras_of(points: Chosen, i: int) -> IntArray:
-    """Return the cameras of a point."""
-    return points.camera[points.start[i] : points.start[i + 1]]
-
-
 @device
 def are_same(a: IntArray, b: IntArray) -> bool:
     """Whether two lists of cameras are the same."""
@@ -110,7 +94,7 @@ def counts_of(rows: IntArray, points: Chosen) -> IntArray:
     """Return how many of some points each camera sees, by their lists."""
     seen = np.zeros(len(points.centres), np.int64)
     for i in rows:
-        for c in cameras_of(points, i):
+        for c in points.camera[points.start[i] : points.start[i + 1]]:
             seen[c] += 1
     return seen
 
@@ -122,16 +106,12 @@ def gather(tile: FloatArray, rows: IntArray, points: Chosen) -> tuple[FloatArray
     The runs, of `TILE` numbers each, lie in one array: with one base address and fixed distances
     the compiler sees that they cannot overlap.
     """
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for j in range(rows.size):
         i = rows[j]
-        for axis in range(3):
-            value = points.xyz[i, axis]
-            tile[axis * TILE + j] = value
-            low[axis], high[axis] = min(low[axis], value), max(high[axis], value)
-            tile[(4 + axis) * TILE + j] = points.normals[i, axis]
+        put(tile, j, row_of(points.xyz, i))
         tile[3 * TILE + j] = points.height[i]
-    return low, high
+        put(tile, 4 * TILE + j, normal_above(points, i))
+    return corners_of(rows, points.xyz)
 
 
 def slots(*widths: int) -> tuple[int, ...]:
@@ -142,32 +122,23 @@ def slots(*widths: int) -> tuple[int, ...]:
     return (0, *accumulate(widths))
 
 
-@device
-def three(runs: FloatArray, at: int) -> Vector:
+@device(forceinline=True)
+def three(runs: FloatArray | SingleArray, at: int) -> Vector:
     """Return the numbers of a point from three runs that follow each other."""
     return runs[at], runs[at + TILE], runs[at + 2 * TILE]
 
 
-@device
+@device(forceinline=True)
+def put(runs: FloatArray | SingleArray, at: int, a: Vector) -> None:
+    """Write the numbers of a point into three runs that follow each other."""
+    runs[at], runs[at + TILE], runs[at + 2 * TILE] = a
+
+
+@device(forceinline=True)
 def nine(runs: FloatArray, at: int) -> Nine:
     """Return the numbers of a point from nine runs that follow each other."""
     a, b, c = three(runs, at), three(runs, at + 3 * TILE), three(runs, at + 6 * TILE)
     return a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]
-
-
-@device(allocates=True)
-def cameras_around(
-    frames: Frames, centres: FloatArray, low: FloatArray, high: FloatArray
-) -> IntArray:
-    """Return the cameras whose pyramids may hold a point of a box around many tiles."""
-    around = np.empty(len(centres), np.int64)
-    count = 0
-    for c in range(len(centres)):
-        # the box is not wholly beyond one plane of the pyramid
-        if may_hold(frames.planes[c], centres[c], low, high):
-            around[count] = c
-            count += 1
-    return around[:count]
 
 
 @device(allocates=True)
@@ -185,7 +156,7 @@ def corners_of(rows: IntArray, xyz: FloatArray) -> tuple[FloatArray, FloatArray]
 def near_cameras(
     around: IntArray, frames: Frames, centres: FloatArray, low: FloatArray, high: FloatArray
 ) -> IntArray:
-    """Return those of some cameras whose frames may hold a point of the box."""
+    """Return those of some cameras whose frames may hold a point of an upright box."""
     planes, row = frames.planes, frames.row
     near = np.empty(len(around), np.int64)
     count = 0
@@ -197,26 +168,6 @@ def near_cameras(
             near[count] = c
             count += 1
     return near[:count]
-
-
-@device
-def mark_camera(
-    marks: FloatArray, tile: FloatArray, frames: Frames, c: int, centre: FloatArray,
-    low: FloatArray, high: FloatArray,
-) -> bool:  # fmt: skip
-    """Mark the points of a tile that lie in the frame of camera c; return whether any may."""
-    m = marks.size
-    x, y, z = tile[:m], tile[TILE : TILE + m], tile[2 * TILE : 2 * TILE + m]
-    if frames.row[c] == NOT_DISTORTED:  # the frame is a pyramid of four planes
-        mark_pyramid(marks, x, y, z, centre, pyramid(frames.planes[c]))
-        return True
-    # many boxes lie within a distorted frame, or beside it, as a whole
-    held = judge(frames, c, centre, low, high)
-    if held == ALL:
-        marks[:] = 1.0
-    if held != SOME:
-        return bool(held != NOTHING)
-    return bool(mark(marks, x, y, z, centre, frames, c) > 0)
 
 
 @device(allocates=True)
@@ -243,26 +194,7 @@ def marks_of_lists(
     return named[:count], marks
 
 
-@device(allocates=True)
-def marks_in_frame(
-    around: IntArray, tile: FloatArray, frames: Frames, centres: FloatArray, low: FloatArray,
-    high: FloatArray, count: int,
-) -> tuple[IntArray, FloatArray]:  # fmt: skip
-    """Return the cameras whose frames hold points of a tile, and which points these are.
-
-    `low` and `high` are the box of its `count` points, `around` the cameras to choose from.
-    """
-    near = near_cameras(around, frames, centres, low, high)
-    marks = np.empty((near.size, count))
-    seeing = 0
-    for c in near:
-        if mark_camera(marks[seeing], tile, frames, c, centres[c], low, high):
-            near[seeing] = c
-            seeing += 1
-    return near[:seeing], marks[:seeing]
-
-
-@device
+@device(forceinline=True)
 def product_of(m: Nine, x: Vector) -> Vector:
     """Return a matrix times a vector."""
     return (
@@ -272,7 +204,7 @@ def product_of(m: Nine, x: Vector) -> Vector:
     )
 
 
-@device
+@device(forceinline=True)
 def inverse_of(m: Nine) -> tuple[float, Nine]:
     """Return the determinant of a matrix and its inverse, meaningless if that is 0."""
     a, b, c, d, e, f, g, h, i = m

@@ -23,42 +23,26 @@ is known to about a thousandth. From `snell`'s solution each step with the inver
 about three digits, and two or three steps are enough.
 
 A tile of points is processed camera by camera, as in `pcfix.refract.intersect`: the inner loops
-run over the points and are vectorised, for the usual lens and a plane of water. Points that need
-more steps, under waves for instance, are then searched one by one.
+run over the points and are vectorised, for the usual lens and a plane of water.
 """
 
 from __future__ import annotations
-
-from typing import TypeAlias
 
 import numpy as np
 
 from pcfix.kernels import device
 from pcfix.lens.algebra import Vector, beyond, dot, minus, row_of, scaled
-from pcfix.lens.formulas import (
-    B2,
-    B3,
-    CENTRE_X,
-    CENTRE_Y,
-    DISC,
-    FOCAL_X,
-    FOCAL_Y,
-    PLAIN,
-    PRINCIPAL_X,
-    PRINCIPAL_Y,
-    TAIL,
-    TANGENTIAL,
-)
-from pcfix.lens.imaging import image_and_gradients, image_of
+from pcfix.lens.formulas import PLAIN
+from pcfix.lens.imaging import Plain, image_and_gradients, image_of, plain_image, plain_lens
 from pcfix.model import FloatArray, IntArray
 from pcfix.refract.batch import Optics
 from pcfix.refract.choice import Rig
-from pcfix.refract.rays import settle_of
-from pcfix.refract.tiling import TILE, inverse_of, nine, product_of, slots, three
-from pcfix.water.surface import Field, Tin
+from pcfix.refract.rays import settle
+from pcfix.refract.tiling import TILE, inverse_of, nine, product_of, put, slots, three
+from pcfix.water.surface import Field, Tin, field_of
 
 STEPS, MOST_STEPS = 4, 60
-"""Of all points of a tile together, and of a point by itself."""
+"""Two or three are usual. A point that is not found by then starts again, and may need many."""
 
 CLOSE_M = 1e-7
 """Estimated distance from the solution, from the last two steps."""
@@ -67,58 +51,32 @@ CLOSE_M = 1e-7
 # P, and the plane of the water (N, h), which moves under waves.
 _BY_U, _BY_V, _IMAGE, _PLANE, RAY_RUNS = slots(3, 3, 2, 4)
 
-# Runs for the points: Q, g, d g / d Q, the last step squared, and the state.
-Q, _G, _BY_Q, _STEP2, STATE, POINT_RUNS = slots(3, 3, 9, 1, 1)
+# Runs for the points: Q, g, d g / d Q, the last step squared, the state, and a run for temporaries.
+Q, _G, _BY_Q, _STEP2, STATE, _TEMPORARY, POINT_RUNS = slots(3, 3, 9, 1, 1, 1)
 SEARCHED, FOUND, LOST = 0.0, 1.0, 2.0
 
-Plain: TypeAlias = tuple[
-    float, float, float, float, float, float, float, float, float, float, float, float, float,
-    float, float,
-]  # fmt: skip
-"""The usual lens as numbers, which stay in registers."""
 
-
-@device(allocates=True)
+@device
 def search_tile(
     room: FloatArray, rays: FloatArray, tile: FloatArray, marks: FloatArray, near: IntArray,
     rig: Rig, optics: Optics, n: float, tin: Tin | None, fields: Field | None,
 ) -> None:  # fmt: skip
     """Move Q from the start in `room` to where g is zero; its state says whether it was found.
 
-    `marks`, a row for each of the cameras `near`, say how often each ray counts.
+    `marks`, a row for each of the cameras `near`, say how often each ray counts. A point that is
+    found, or lost, stays where it is, so that the others of its tile do not matter.
     """
     count = marks.shape[1]
-    _search_all(room, rays, tile, marks, near, rig, optics, n, tin, fields, STEPS)
-    one, alone = np.empty(POINT_RUNS * TILE), np.empty(7 * TILE)
-    for j in range(count):
-        if room[STATE * TILE + j] != SEARCHED:
-            continue
-        # a tile of this point only
-        for run in range(7):
-            alone[run * TILE] = tile[run * TILE + j]
-        for run in range(POINT_RUNS):
-            one[run * TILE] = room[run * TILE + j]
-        mine = marks[:, j : j + 1].copy()
-        _search_all(one, rays, alone, mine, near, rig, optics, n, tin, fields, MOST_STEPS)
-        for run in range(POINT_RUNS):
-            room[run * TILE + j] = one[run * TILE]
-
-
-@device(allocates=True)
-def _search_all(
-    room: FloatArray, rays: FloatArray, tile: FloatArray, marks: FloatArray, near: IntArray,
-    rig: Rig, optics: Optics, n: float, tin: Tin | None, fields: Field | None, steps: int,
-) -> None:  # fmt: skip
-    """Take so many steps, or fewer, for the points of a tile that are searched."""
-    count = marks.shape[1]
-    room[_STEP2 * TILE : STATE * TILE] = 0.0
-    for k in range(near.size):
-        lens = optics.lenses[optics.row[near[k]]]
-        if lens[PLAIN] != 0.0:
-            _set_rays(rays[k], tile, marks[k], rig, near[k], optics, _plain(lens))
-        else:
-            _set_rays(rays[k], tile, marks[k], rig, near[k], optics, None)
-    for _ in range(steps):
+    for step in range(STEPS + MOST_STEPS):
+        # under waves a search may alternate between two planes: it starts again where it is
+        if step == 0 or step == STEPS:
+            room[_STEP2 * TILE : STATE * TILE] = 0.0
+            for k in range(near.size):
+                lens = optics.lenses[optics.row[near[k]]]
+                if lens[PLAIN] != 0.0:
+                    _set_rays(rays[k], tile, marks[k], rig, near[k], optics, plain_lens(lens))
+                else:
+                    _set_rays(rays[k], tile, marks[k], rig, near[k], optics, None)
         room[_G * TILE : _STEP2 * TILE] = 0.0
         for k in range(near.size):
             c, lens = near[k], optics.lenses[optics.row[near[k]]]
@@ -126,7 +84,7 @@ def _search_all(
                 _settle(rays[k], room, tile, marks[k], rig, c, n, tin, fields)
             # numba compiles a version of `_add` for each kind of argument
             if lens[PLAIN] != 0.0:
-                _add(room, rays[k], tile, marks[k], rig, c, optics, _plain(lens), n)
+                _add(room, rays[k], tile, marks[k], rig, c, optics, plain_lens(lens), n)
             else:
                 _add(room, rays[k], tile, marks[k], rig, c, optics, None, n)
         if not _step(room, count):
@@ -143,7 +101,7 @@ def _step(room: FloatArray, count: int) -> bool:
         _, inverse = inverse_of(nine(room, _BY_Q * TILE + j))
         t = product_of(inverse, three(room, _G * TILE + j))
         size2, before = dot(t, t), room[_STEP2 * TILE + j]
-        _put(room, Q * TILE + j, minus(three(room, Q * TILE + j), t))
+        put(room, Q * TILE + j, minus(three(room, Q * TILE + j), t))
         room[_STEP2 * TILE + j] = size2
         # NaN: some camera has no image of Q
         if not size2 < np.inf:
@@ -172,30 +130,25 @@ def _set_rays(
         if plain is None:
             u, v, g = image_and_gradients(lens, w[0], w[1], w[2])
         else:
-            u, v, g = _plain_image(plain, w)
+            u, v, g = plain_image(plain, w)
         ray[_IMAGE * TILE + j], ray[(_IMAGE + 1) * TILE + j] = u, v
         by_u = beyond(beyond(scaled(g[0], right), g[1], down), g[2], ahead)
         by_v = beyond(beyond(scaled(g[3], right), g[4], down), g[5], ahead)
-        _put(ray, _BY_U * TILE + j, by_u)
-        _put(ray, _BY_V * TILE + j, by_v)
-        _put(ray, _PLANE * TILE + j, normal)
+        put(ray, _BY_U * TILE + j, by_u)
+        put(ray, _BY_V * TILE + j, by_v)
+        put(ray, _PLANE * TILE + j, normal)
         # water that stood higher for this image: the point is lowered instead
         ray[(_PLANE + 3) * TILE + j] = normal[2] * (tile[3 * TILE + j] - (p[2] - offset))
 
 
 @device
-def _put(runs: FloatArray, at: int, a: Vector) -> None:
-    """Write three numbers into runs that follow each other."""
-    runs[at], runs[at + TILE], runs[at + 2 * TILE] = a
-
-
-@device(allocates=True)
 def _settle(
     ray: FloatArray, room: FloatArray, tile: FloatArray, marks: FloatArray, rig: Rig, c: int,
     n: float, tin: Tin | None, fields: Field | None,
 ) -> None:  # fmt: skip
     """Move the planes of the rays of one camera to where the light leaves a mesh or raster."""
-    plane, origin = np.empty(4), np.empty(3)
+    temporary = room[_TEMPORARY * TILE :]
+    plane, origin = temporary[:4], temporary[4:7]
     for j in range(marks.size):
         if not marks[j] > 0.0 or room[STATE * TILE + j] != SEARCHED:
             continue
@@ -204,7 +157,7 @@ def _settle(
         for i in range(4):
             plane[i] = ray[(_PLANE + i) * TILE + j]
         e = minus(row_of(rig.centres, c), three(tile, j))
-        settle_of(c, plane, tin, fields, origin, three(room, Q * TILE + j), e, n)
+        settle(plane, tin, field_of(fields, c), origin, three(room, Q * TILE + j), e, n)
         for i in range(4):
             ray[(_PLANE + i) * TILE + j] = plane[i]
 
@@ -226,7 +179,7 @@ def _add(
         if plain is None:
             u, v = image_of(lens, w[0], w[1], w[2])
         else:
-            u, v, _ = _plain_image(plain, w)
+            u, v, _ = plain_image(plain, w)
         # the residual in pixels; a ray that does not count may have none
         times = marks[j]
         du = times * (u - ray[_IMAGE * TILE + j]) if times > 0.0 else 0.0
@@ -285,42 +238,3 @@ def _light(
     root = np.sqrt(m2 + a * k * k)
     k += (1.0 - k * (height + depth / root)) / (height + depth * m2 / (root * root * root))
     return k, root, depth, m2, s
-
-
-@device
-def _plain(c: FloatArray) -> Plain:
-    """Return the numbers of a perspective lens with Brown's distortion."""
-    return (
-        c[TAIL], c[TAIL + 1], c[TAIL + 2], c[TAIL + 3], c[TANGENTIAL], c[TANGENTIAL + 1],
-        c[CENTRE_X], c[CENTRE_Y], c[DISC] * c[DISC], c[FOCAL_X], c[B2], c[B3], c[FOCAL_Y],
-        c[PRINCIPAL_X], c[PRINCIPAL_Y],
-    )  # fmt: skip
-
-
-@device(inline="always")
-def _plain_image(
-    c: Plain, w: Vector
-) -> tuple[float, float, tuple[float, float, float, float, float, float]]:
-    """Do as `pcfix.lens.imaging.image_and_gradients` without branches, for the usual lens."""
-    k1, k2, k3, k4, p1, p2, centre_x, centre_y, disc2, fx, b2, b3, fy, u0, v0 = c
-    inv = 1.0 / w[2]
-    flat_x, flat_y = w[0] * inv, w[1] * inv
-    x, y = flat_x - centre_x, flat_y - centre_y
-    r2 = x * x + y * y
-    # Brown: radial factor g and its derivative by r^2, then tangential terms
-    g = 1.0 + (((k4 * r2 + k3) * r2 + k2) * r2 + k1) * r2
-    twice = 2.0 * (((4.0 * k4 * r2 + 3.0 * k3) * r2 + 2.0 * k2) * r2 + k1)
-    dx = g * x + (p1 * (r2 + 2.0 * x * x) + 2.0 * p2 * x * y) + centre_x
-    dy = g * y + (p2 * (r2 + 2.0 * y * y) + 2.0 * p1 * x * y) + centre_y
-    xx = g + twice * x * x + 6.0 * p1 * x + 2.0 * p2 * y
-    xy = twice * x * y + 2.0 * (p1 * y + p2 * x)
-    yy = g + twice * y * y + 6.0 * p2 * y + 2.0 * p1 * x
-    # behind the camera and beyond the fold of the distortion there is no image
-    seen = (w[2] > 0.0) & (r2 <= disc2)
-    u = u0 + fx * dx + b2 * dy if seen else np.nan
-    v = v0 + fy * dy + b3 * dx if seen else np.nan
-    ua, ub, va, vb = fx * xx + b2 * xy, fx * xy + b2 * yy, fy * xy + b3 * xx, fy * yy + b3 * xy
-    return u, v, (
-        inv * ua, inv * ub, -inv * (ua * flat_x + ub * flat_y),
-        inv * va, inv * vb, -inv * (va * flat_x + vb * flat_y),
-    )  # fmt: skip

@@ -73,7 +73,7 @@ from pcfix.refract import tiling
 from pcfix.refract.batch import Batch, Chosen, Intersection, Survey
 from pcfix.refract.choice import Rig, Rule, rig_of, rule_of
 from pcfix.refract.rays import refracted
-from pcfix.refract.tiling import TILE, inverse_of, nine, product_of, slots, three
+from pcfix.refract.tiling import TILE, inverse_of, nine, product_of, put, slots, three
 from pcfix.water.surface import Field, height_at
 
 MIN_DETERMINANT = 1e-6
@@ -128,47 +128,37 @@ def covariances(batch: Batch, shift_m: FloatArray) -> FloatArray:
 
 
 def with_uncertainty(found: Intersection, batch: Batch) -> Intersection:
-    """Return a result with its covariances and standard errors of Z, if asked for."""
-    survey = batch.survey
-    if survey.settings.dimensions != "all" or found.covariance_m2 is not None:
-        return with_errors(found, found.covariance_m2)
-    covariance, line = covariances(batch, found.shift_m), survey.learned.regression
-    if survey.settings.method == "regression" and line is not None:
-        covariance[:, [_XZ, _YZ]] = 0.0
-        covariance[:, _ZZ] = line.sigma_m(batch.surface.height_m - batch.xyz[:, 2]) ** 2
-    if found.ambiguity_m is not None:  # of depth maps
-        cameras = survey.cameras
-        focal_px = float(np.median([lens.focal_px for lens in cameras.lenses or ()]))
-        gsd_m = (np.median(cameras.centres[:, 2]) - batch.surface.height_m) / focal_px
-        covariance[:, _ZZ] += found.ambiguity_m**2 + (MODEL_GSD * gsd_m) ** 2
-    return with_errors(found, covariance)
+    """Return a result with its covariances and standard errors of Z, if the settings ask for them.
 
-
-def with_errors(found: Intersection, covariance: FloatArray | None) -> Intersection:
-    """Return a result with covariances (modified in place) and standard errors of Z."""
+    To the errors of the budget are added those of the model of depth maps, of the reconstruction
+    type, of mismatches and of adjusted poses, where these were estimated.
+    """
+    survey, covariance, ambiguity = batch.survey, found.covariance_m2, found.ambiguity_m
     found = found._replace(ambiguity_m=None)
+    if survey.settings.dimensions != "all":
+        return found
+    learned, surface, moved = survey.learned, batch.surface, found.outcome == Outcome.CORRECTED
     if covariance is None:
-        return found._replace(sigma_z_m=np.zeros(len(found.outcome)))
-    moved = found.outcome == Outcome.CORRECTED
+        covariance, line = covariances(batch, found.shift_m), learned.regression
+        if survey.settings.method == "regression" and line is not None:
+            covariance[:, [_XZ, _YZ]] = 0.0
+            covariance[:, _ZZ] = line.sigma_m(surface.height_m - batch.xyz[:, 2]) ** 2
     if not moved.all():
         covariance[~moved] = 0.0
+    variance = covariance[moved, _ZZ]
+    if ambiguity is not None:  # of depth maps
+        cameras = survey.cameras
+        focal_px = float(np.median([lens.focal_px for lens in cameras.lenses or ()]))
+        gsd_m = (np.median(cameras.centres[:, 2]) - surface.height_m[moved]) / focal_px
+        variance += ambiguity[moved] ** 2 + (MODEL_GSD * gsd_m) ** 2
+    if learned.model_uncertainty is not None:
+        model, z = learned.model_uncertainty, batch.xyz[:, 2] + found.shift_m[:, 2]
+        depth = (surface.height_m - z)[moved]
+        variance += model.scatter_m**2 + (model.per_depth * depth) ** 2
+    if learned.poses is not None:
+        variance += learned.poses.at(batch.xyz[moved, :2]) ** 2
+    covariance[moved, _ZZ] = variance
     return found._replace(sigma_z_m=np.sqrt(covariance[:, _ZZ]), covariance_m2=covariance)
-
-
-def with_model_uncertainty(found: Intersection, batch: Batch) -> Intersection:
-    """Add the uncertainties of the model and the poses to the covariances, if there are any."""
-    model, poses = batch.survey.learned.model_uncertainty, batch.survey.learned.poses
-    if (model is None and poses is None) or found.covariance_m2 is None:
-        return found
-    moved = found.outcome == Outcome.CORRECTED
-    covariance = found.covariance_m2
-    if model is not None:
-        depth = batch.surface.height_m - (batch.xyz[:, 2] + found.shift_m[:, 2])
-        more = model.scatter_m**2 + (model.per_depth * depth) ** 2
-        covariance[:, _ZZ] += np.where(moved, more, 0.0)
-    if poses is not None:
-        covariance[moved, _ZZ] += poses.at(batch.xyz[moved, :2]) ** 2
-    return with_errors(found, covariance)
 
 
 def level_sigma_of(batch: Batch) -> FloatArray:
@@ -254,10 +244,8 @@ def room_of(tile: FloatArray, shift: FloatArray, rows: IntArray) -> SingleArray:
     # the sums start at zero; the runs of the rays are filled in by `add_rays`
     room = np.zeros(ROOM * TILE, np.float32)
     for j in range(rows.size):
-        normal = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
-        room[_NORMAL * TILE + j] = normal[0]
-        room[(_NORMAL + 1) * TILE + j] = normal[1]
-        room[(_NORMAL + 2) * TILE + j] = normal[2]
+        normal = three(tile, 4 * TILE + j)
+        put(room, _NORMAL * TILE + j, normal)
         room[_BELOW * TILE + j] = -dot(normal, row_of(shift, rows[j]))
     return room
 
@@ -275,25 +263,20 @@ def add_rays(
     for j in range(marks.size):
         z = tile[2 * TILE + j]
         e = minus(centre, (tile[j], tile[TILE + j], z))
-        normal = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
+        normal = three(tile, 4 * TILE + j)
         height = dot(normal, e)
         h = normal[2] * (tile[3 * TILE + j] - (z - offset))
         # the camera is above the water, the ray marked and within the limit of incidence
         use = (marks[j] > 0.0) & (height > h) & (height * height >= least_cosine2 * dot(e, e))
         room[_COUNT * TILE + j] = marks[j] if use else 0.0
-        room[_AWAY * TILE + j] = e[0] if use else normal[0]
-        room[(_AWAY + 1) * TILE + j] = e[1] if use else normal[1]
-        room[(_AWAY + 2) * TILE + j] = e[2] if use else normal[2]
+        put(room, _AWAY * TILE + j, e if use else normal)
         room[_HEIGHT * TILE + j] = h
 
 
-@device
+@device(forceinline=True)
 def _seen(room: SingleArray, j: int, bend: float) -> Seen:
     """Return how often a ray counts; e, N, H, L^2, h, y and r where the light bends."""
-    at = _AWAY * TILE + j
-    e = room[at], room[at + TILE], room[at + 2 * TILE]
-    at = _NORMAL * TILE + j
-    normal = room[at], room[at + TILE], room[at + 2 * TILE]
+    e, normal = three(room, _AWAY * TILE + j), three(room, _NORMAL * TILE + j)
     h = room[_HEIGHT * TILE + j]
     # light of a point above the water goes straight
     bend = bend if h > _ZERO else _ONE
@@ -302,7 +285,7 @@ def _seen(room: SingleArray, j: int, bend: float) -> Seen:
     return room[_COUNT * TILE + j], e, normal, dot(normal, e), dot(e, e), h, y, bend
 
 
-@device
+@device(forceinline=True)
 def _bent(
     height: float, length2: float, h: float, y: float, bend: float
 ) -> tuple[float, float, float, float, float, float, float]:
@@ -319,7 +302,7 @@ def _bent(
     )  # fmt: skip
 
 
-@device
+@device(forceinline=True)
 def _weight(one: float, e: Vector, length2: float, axis: Vector, square: float) -> Symmetric:
     """Return J'J of a camera whose squared focal length (px) is `square`, at P.
 
@@ -343,7 +326,7 @@ def _weight(one: float, e: Vector, length2: float, axis: Vector, square: float) 
     )  # fmt: skip
 
 
-@device
+@device(forceinline=True)
 def _add_three(sums: FloatArray, at: int, c: float, a: Vector) -> None:
     """Add c a."""
     sums[at] += c * a[0]
@@ -351,7 +334,7 @@ def _add_three(sums: FloatArray, at: int, c: float, a: Vector) -> None:
     sums[at + 2 * TILE] += c * a[2]
 
 
-@device
+@device(forceinline=True)
 def _add_six(sums: FloatArray, at: int, m: Symmetric) -> None:
     sums[at] += m[0]
     sums[at + TILE] += m[1]
@@ -361,7 +344,7 @@ def _add_six(sums: FloatArray, at: int, m: Symmetric) -> None:
     sums[at + 5 * TILE] += m[5]
 
 
-@device
+@device(forceinline=True)
 def _add_nine(sums: FloatArray, at: int, c: float, m: Symmetric, g: Vector, q: Vector) -> None:
     """Add c m + g q'."""
     sums[at] += c * m[0] + g[0] * q[0]
@@ -375,7 +358,7 @@ def _add_nine(sums: FloatArray, at: int, c: float, m: Symmetric, g: Vector, q: V
     sums[at + 8 * TILE] += c * m[5] + g[2] * q[2]
 
 
-@device
+@device(forceinline=True)
 def _in_space(
     one: float, e: Vector, normal: Vector, height: float, length2: float, bend: float,
     kappa: float, inv2: float,
@@ -440,7 +423,7 @@ def add_in_images(room: SingleArray, count: int, sight: Sight) -> None:
         _add_six(room, SIGHT * TILE + j, w)
 
 
-@device
+@device(forceinline=True)
 def _inverse(height: float, length2: float, away: float, beta: float) -> tuple[float, float]:
     """Return what D^-1 does to p across d, and along it."""
     # 1 - m + beta rho^2
@@ -534,8 +517,7 @@ def _of_lists(
         tiling.gather(tile, rows, points)
         room = room_of(tile, shift, rows)
         named, marks = tiling.marks_of_lists(start, camera, rows, len(rig.centres))
-        for at in range(named.size):
-            add_errors(room, tile, marks[at], rig, named[at], rule, budget)
+        add_errors(room, tile, marks, named, rig, rule, budget)
         finish_tile(result, rows, room, tile, level_sigma, budget)
 
 
@@ -547,24 +529,25 @@ def differ_by_ray(budget: Budget) -> bool:
 
 @device
 def add_errors(
-    room: SingleArray, tile: FloatArray, marks: FloatArray, rig: Rig, c: int, rule: Rule,
+    room: SingleArray, tile: FloatArray, marks: FloatArray, near: IntArray, rig: Rig, rule: Rule,
     budget: Budget,
 ) -> None:  # fmt: skip
-    """Add the rays of one camera to the points of a tile that have a mark."""
-    x, y, z = row_of(rig.axes, c)
-    square = _single(rig.focal_px[c] * rig.focal_px[c])
-    sight = (_single(x), _single(y), _single(z)), square, _single(rule.bend)
-    count = marks.size
-    add_rays(room, tile, marks, rig, c, rule)
-    # the derivative of consistent, or that of snell
-    if budget.in_images:
-        add_in_images(room, count, sight)
-    else:
-        add_in_space(room, count, sight)
-    if budget.tilt > 0.0:
-        add_tilt(room, count, sight, budget.in_images)
-    if differ_by_ray(budget):
-        add_noise(room, count, sight, budget)
+    """Add the rays of cameras to the points of a tile; `marks` has a row for each of `near`."""
+    for k in range(len(marks)):
+        c, count = near[k], marks.shape[1]
+        x, y, z = row_of(rig.axes, c)
+        square = _single(rig.focal_px[c] * rig.focal_px[c])
+        sight = (_single(x), _single(y), _single(z)), square, _single(rule.bend)
+        add_rays(room, tile, marks[k], rig, c, rule)
+        # the derivative of consistent, or that of snell
+        if budget.in_images:
+            add_in_images(room, count, sight)
+        else:
+            add_in_space(room, count, sight)
+        if budget.tilt > 0.0:
+            add_tilt(room, count, sight, budget.in_images)
+        if differ_by_ray(budget):
+            add_noise(room, count, sight, budget)
 
 
 @device(allocates=True)
@@ -593,8 +576,8 @@ def finish_tile(
         for j in range(rows.size):
             # Q moves by (sum M)^-1 sum M delta, and with P by (sum M)^-1 (sum M D) (sum W)^-1
             k = sums[j]
-            det, by_delta = inverse_of(_full(_six(sums, BY_Q * TILE + j)))
-            full, by_sight = inverse_of(_full(_six(sums, SIGHT * TILE + j)))
+            det, by_delta = inverse_of(_symmetric(sums, BY_Q * TILE + j))
+            full, by_sight = inverse_of(_symmetric(sums, SIGHT * TILE + j))
             by_noise = _product(_product(by_delta, nine(sums, BY_P * TILE + j)), by_sight)
             solved = (k >= 2.0) & (det >= MIN_DETERMINANT * k * k * k) & (full > 0.0)
             _write(out, j, solved, by_delta, by_noise, sums, tile, sigma[j], budget)
@@ -603,18 +586,34 @@ def finish_tile(
             result[rows[j], at] = out[at * TILE + j]
 
 
-@device
+@device(forceinline=True)
 def _write(
     out: FloatArray, j: int, solved: bool, by_delta: Nine, b: Nine, sums: FloatArray,
     tile: FloatArray, level_sigma: float, budget: Budget,
 ) -> None:  # fmt: skip
-    """Write the covariance of a point: B R B' of the noise, and that of each common error."""
-    r = _full(_six(sums, NOISE * TILE + j))
+    """Write the covariance of a point: B R B' of the noise, and that of each common error.
+
+    Each of these is one standard deviation times a column: of level, index and both tilts. A tilt
+    also raises the water above the point, in proportion to its distance from the pivot.
+    """
+    r = _symmetric(sums, NOISE * TILE + j)
     n = _product(_product(b, r), (b[0], b[3], b[6], b[1], b[4], b[7], b[2], b[5], b[8]))
-    # each common error is one standard deviation times a column
-    level, index, u, v = _columns(by_delta, sums, tile, j, level_sigma, budget)
-    cov = plus_square((n[0], n[1], n[2], n[4], n[5], n[8]), level)
-    cov = plus_square(plus_square(plus_square(cov, index), u), v)
+    nx, ny, nz = three(tile, 4 * TILE + j)
+    # two horizontal directions of slope: u towards x, v across it
+    scale = 1.0 / np.sqrt(nx * nx + nz * nz)
+    ux, uz = nz * scale, -nx * scale
+    by_tilt = nine(sums, BY_TILT * TILE + j)
+    # the level rises along the vertical, h is along N
+    level, index = scaled(nz, three(sums, BY_LEVEL * TILE + j)), three(sums, BY_N * TILE + j)
+    away_u, away_v = tile[j] - budget.pivot_x, tile[TILE + j] - budget.pivot_y
+    # the normal leans away from where the slope rises
+    u = plus(product_of(by_tilt, (-ux, 0.0, -uz)), scaled(away_u, level))
+    v = plus(product_of(by_tilt, (-ny * uz, nx * uz - nz * ux, ny * ux)), scaled(away_v, level))
+    cov = n[0], n[1], n[2], n[4], n[5], n[8]
+    cov = plus_square(cov, scaled(level_sigma, product_of(by_delta, level)))
+    cov = plus_square(cov, scaled(budget.refractive_index, product_of(by_delta, index)))
+    cov = plus_square(cov, scaled(budget.tilt, product_of(by_delta, u)))
+    cov = plus_square(cov, scaled(budget.tilt, product_of(by_delta, v)))
     out[j] = cov[0] if solved else 0.0
     out[TILE + j] = cov[1] if solved else 0.0
     out[2 * TILE + j] = cov[2] if solved else 0.0
@@ -623,48 +622,14 @@ def _write(
     out[5 * TILE + j] = cov[5] if solved else 0.0
 
 
-@device
-def _columns(
-    by_delta: Nine, sums: FloatArray, tile: FloatArray, j: int, level_sigma: float, budget: Budget
-) -> tuple[Vector, Vector, Vector, Vector]:
-    """Return how a point moves by one standard deviation of level, index and both tilts.
-
-    A tilt also raises the water above the point, in proportion to its distance from the pivot.
-    """
-    nx, ny, nz = tile[4 * TILE + j], tile[5 * TILE + j], tile[6 * TILE + j]
-    # two horizontal directions of slope: u towards x, v across it
-    scale = 1.0 / np.sqrt(nx * nx + nz * nz)
-    ux, uz = nz * scale, -nx * scale
-    by_tilt = nine(sums, BY_TILT * TILE + j)
-    by_level, by_n = three(sums, BY_LEVEL * TILE + j), three(sums, BY_N * TILE + j)
-    # the level rises along the vertical, h is along N
-    level = scaled(nz, by_level)
-    away_u, away_v = tile[j] - budget.pivot_x, tile[TILE + j] - budget.pivot_y
-    # the normal leans away from where the slope rises
-    u = plus(product_of(by_tilt, (-ux, 0.0, -uz)), scaled(away_u, level))
-    v = plus(product_of(by_tilt, (-ny * uz, nx * uz - nz * ux, ny * ux)), scaled(away_v, level))
-    return (
-        scaled(level_sigma, product_of(by_delta, level)),
-        scaled(budget.refractive_index, product_of(by_delta, by_n)),
-        scaled(budget.tilt, product_of(by_delta, u)),
-        scaled(budget.tilt, product_of(by_delta, v)),
-    )
+@device(forceinline=True)
+def _symmetric(sums: FloatArray, at: int) -> Nine:
+    """Return the matrix of which six runs hold xx, xy, xz, yy, yz and zz."""
+    (xx, xy, xz), (yy, yz, zz) = three(sums, at), three(sums, at + 3 * TILE)
+    return xx, xy, xz, xy, yy, yz, xz, yz, zz
 
 
-@device
-def _six(sums: FloatArray, at: int) -> Symmetric:
-    return (
-        sums[at], sums[at + TILE], sums[at + 2 * TILE],
-        sums[at + 3 * TILE], sums[at + 4 * TILE], sums[at + 5 * TILE],
-    )  # fmt: skip
-
-
-@device
-def _full(m: Symmetric) -> Nine:
-    return m[0], m[1], m[2], m[1], m[3], m[4], m[2], m[4], m[5]
-
-
-@device
+@device(forceinline=True)
 def _product(a: Nine, b: Nine) -> Nine:
     """Return a matrix times a matrix."""
     x = product_of(a, (b[0], b[3], b[6]))

@@ -82,7 +82,7 @@ def find_water(
         water = np.isin(labels[kept], WATER_CLASSES)
         if water.sum() >= LEAST_CLASSIFIED:
             return _from_classes(points[water], samples)
-    return _from_cues(samples)
+    return _from_cues(_looked(samples))
 
 
 APART_M, APART_SIGMAS = 0.5, 3.0
@@ -113,18 +113,17 @@ def find_elsewhere(
     tilted : Tilted or None
     """
     samples = sample_cloud(np.column_stack([xyz[:, :2], xyz[:, 2] - water_m]), rgb, None)
-    heights = search.all_heights(samples)
-    if np.ptp(heights) < LEAST_RELIEF_M:
+    try:
+        whole = _looked(samples)
+    except GeometryError:  # flat ground shows nothing
         return None, None
-    whole = search.look(samples, heights, search.NO_TILT)
-    return _elsewhere(samples, whole), find_tilt(whole)
+    return _elsewhere(whole), find_tilt(whole)
 
 
-def _elsewhere(samples: Samples, whole: Looked) -> WaterProposal | None:
+def _elsewhere(whole: Looked) -> WaterProposal | None:
     """Return the water at another height than zero, if it is certain."""
-    heights = whole.heights_m
     gain = search.gains(whole, search.NO_TILT)
-    here = gain[np.abs(heights + samples.origin[2]) <= APART_M].max(initial=0.0)
+    here = gain[np.abs(whole.heights_m + whole.samples.origin[2]) <= APART_M].max(initial=0.0)
     best = int(np.argmax(gain))
     slope = next((gain_of(sums) for cue, sums in whole.cues if cue == SLOPE), None)
     lifted = slope is not None and (
@@ -135,7 +134,7 @@ def _elsewhere(samples: Samples, whole: Looked) -> WaterProposal | None:
     if few or here > search.MOST_RIVAL_AGREED * gain[best]:
         return None
     try:
-        found = _from_cues(samples)
+        found = _from_cues(whole)
     except GeometryError:
         return None
     apart = abs(found.level_m) > max(APART_M, APART_SIGMAS * found.sigma_level_m)
@@ -146,7 +145,8 @@ def _elsewhere(samples: Samples, whole: Looked) -> WaterProposal | None:
     return found if apart and sure else None
 
 
-def _from_cues(samples: Samples) -> WaterProposal:
+def _looked(samples: Samples) -> Looked:
+    """Return the sums of the cues at all heights; GeometryError ``cloud.flat`` without relief."""
     heights = search.all_heights(samples)
     if np.ptp(heights) < LEAST_RELIEF_M:
         raise GeometryError(
@@ -155,7 +155,11 @@ def _from_cues(samples: Samples) -> WaterProposal:
             f" find the water. {INSTEAD}",
             relief_m=float(np.ptp(heights)), least=LEAST_RELIEF_M,
         )  # fmt: skip
-    whole = search.look(samples, heights, search.NO_TILT)
+    return search.look(samples, heights, search.NO_TILT)
+
+
+def _from_cues(whole: Looked) -> WaterProposal:
+    samples = whole.samples
     peak, near, sigma_m, tilt_along, sigma_tilt = _choose(samples, whole)
     confidence, evidence, reasons = judge(samples, peak, near, whole, sigma_m)
     if not peak.tilt.any() and not math.isnan(sigma_tilt):
@@ -239,6 +243,10 @@ class WaterProposal:
     curve_height_m: FloatArray  # (h,), world heights; of a tilted surface, above `centre_xy`
     curves: dict[str, FloatArray]  # (h,), gain (log likelihood ratio) of each cue at each height
     ground: FloatArray  # (c, 3), the cloud thinned to cells, metres, world frame
+
+    def sigma_at(self, xy: FloatArray) -> FloatArray:
+        """Return the standard error (m) of the height at places (m, 2), the same for all."""
+        return np.full(len(xy), self.sigma_level_m)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the figures as plain values."""

@@ -210,7 +210,11 @@ def flow_axis(xy: FloatArray) -> Axis:
         gap = float(np.quantile(np.diff(np.sort(station)), 0.9))  # one in ten is wider
         bandwidth = max(width, gap, 1e-3)
         nodes = _smoothed(places, station, bandwidth)
-    return Axis(_extended(nodes, bandwidth) + origin, _located(nodes, places)[1])
+    # longer at both ends, so that the outermost points are beside the line
+    outward = nodes[[0, -1]] - nodes[[1, -2]]
+    outward /= np.maximum(np.hypot(*outward.T), 1e-9)[:, None]
+    first, last = nodes[[0, -1]] + 2.0 * bandwidth * outward
+    return Axis(np.vstack([first, nodes, last]) + origin, _located(nodes, places)[1])
 
 
 def _located(nodes: FloatArray, places: FloatArray) -> tuple[FloatArray, float]:
@@ -277,11 +281,3 @@ def _smoothed(xy: FloatArray, station: FloatArray, bandwidth: float) -> FloatArr
     flat = size <= 1e-9 * s0**2 * bandwidth**2
     local[flat], size[flat] = weight[flat], s0[flat]
     return np.asarray(local @ xy / size[:, None])
-
-
-def _extended(nodes: FloatArray, by_m: float) -> FloatArray:
-    """Extend a line at both ends, so that the outermost points are beside it."""
-    outward = nodes[[0, -1]] - nodes[[1, -2]]
-    outward /= np.maximum(np.hypot(*outward.T), 1e-9)[:, None]
-    first, last = nodes[[0, -1]] + 2.0 * by_m * outward
-    return np.vstack([first, nodes, last])

@@ -215,7 +215,9 @@ def judge(
         name for name, g in found.items() if g >= (LEAST_LAYER if name == LAYER else LEAST_EACH)
     ]
     lift = float(gain[SLOPE].amplitude[middle]) if strong == [SLOPE.name] else None
-    least = _refuse_poor(_height(samples, peak), evidence, sigma_m, strong, lift)
+    height = peak.level_m + float(samples.xyz[:, :2].mean(axis=0) @ peak.tilt)
+    text = f"{height + float(samples.origin[2]):.2f} m"
+    least = _refuse_poor(text, evidence, sigma_m, strong, lift)
     sentences = []
     for cue in fixing:
         if found[cue.name] >= LEAST_EACH:
@@ -264,11 +266,6 @@ def _refuse_poor(
         f"No water surface was found. The best candidate is {height}, but {why}. {INSTEAD}",
         reason=reason, evidence=evidence,
     )  # fmt: skip
-
-
-def _height(samples: Samples, peak: Peak) -> str:
-    middle = samples.xyz[:, :2].mean(axis=0) @ peak.tilt
-    return f"{peak.level_m + float(middle) + float(samples.origin[2]):.2f} m"
 
 
 def _size(cue: Cue, size: float, sigma: float) -> str:

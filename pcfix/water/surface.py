@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -30,20 +30,13 @@ from pcfix.model import (
     WaterSurface,
 )
 
-if TYPE_CHECKING:
-    from pcfix.water.fit import WaterFit
-    from pcfix.water.river import RiverFit
-
-Evidence: TypeAlias = "WaterFit | RiverFit | Any"
-"""A fit, or a proposal of `pcfix.water.auto`."""
-
 
 @dataclass(frozen=True, eq=False)
 class FoundSurface:
     """A water surface and its origin."""
 
     surface: WaterSurface
-    evidence: Evidence | None = None  # None if the surface was given
+    evidence: Any = None  # a `WaterFit`, `RiverFit` or `WaterProposal`; None if it was given
     points: FloatArray | None = None  # (n, 3), fitted shoreline points, metres, the cloud's CRS
     notes: tuple[str, ...] = ()
 
@@ -53,13 +46,7 @@ class FoundSurface:
 
     def sigma_level_m(self, xy: FloatArray) -> FloatArray | None:
         """Return the standard error of the water's height at places, if its fit has one."""
-        found = self.evidence
-        if found is None:
-            return None
-        if hasattr(found, "sigma_at"):
-            return np.asarray(found.sigma_at(xy))
-        sigma = getattr(found, "sigma_level_m", None)
-        return None if sigma is None else np.full(len(xy), float(sigma))
+        return None if self.evidence is None else np.asarray(self.evidence.sigma_at(xy))
 
 
 class SurfaceAbove(NamedTuple):
@@ -117,6 +104,17 @@ class Field(NamedTuple):
     shape: IntArray  # (k, 3), first cell, rows and columns of each raster
     frame: FloatArray  # (k, 4), x and y of the upper left cell centre, cell width and height, m
     which: int  # the raster
+
+
+@device
+def field_of(fields: Field | None, which: int) -> Field | None:
+    """Return another one of the same rasters; None where there are none.
+
+    Not for functions that make arrays: those count references, and here none is counted.
+    """
+    if fields is None:
+        return None
+    return Field(fields.heights, fields.shape, fields.frame, which)
 
 
 @lru_cache(maxsize=4)

@@ -97,12 +97,11 @@ def test_depth_as_twin(c):
     q = on_bed(CAMERAS.centres[c], p, planes[c], bed, N_WATER)
     partners = [j for j in MATCHED[c] if j >= 0]
     costs = costs_of(p, u, q, CAMERAS, partners, planes, N_WATER, "angles")
-    normal = np.array([-plane[1], -plane[2], 1.0]) / np.sqrt(1 + plane[1] ** 2 + plane[2] ** 2)
     height = plane[0] + plane[1] * p[0] + plane[2] * p[1]
     nothing = np.zeros(0, np.int64)
     points = Chosen(
-        p[None], p[None], np.array([height]), np.zeros((1, 2)), normal[None], CAMERAS.centres,
-        offset, nothing, nothing, N_WATER,
+        p[None], p[None], np.array([height]), np.array([plane[1:]]), CAMERAS.centres, offset,
+        nothing, nothing, N_WATER,
     )  # fmt: skip
     block = Block(points, images_of(None, CAMERAS), matcher(), (0.0, 0.0, 0.0), 8.0)
     partners = np.empty((5, 3))
