@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -80,3 +82,24 @@ def test_old_caches_go(tmp_path, monkeypatch):
         kernels.cache_folder.cache_clear()
     assert found is not None and found.is_dir()
     assert len(list(tmp_path.iterdir())) == kernels.CACHES_KEPT
+
+
+def test_no_arrays_returned_without_references():
+    """A function that counts references must not call one that returns arrays without counting."""
+    trees = [ast.parse(path.read_text()) for path in PACKAGE.rglob("*.py")]
+    nodes = [node for tree in trees for node in ast.walk(tree)]
+    records = {node.name: ast.unparse(node) for node in nodes if isinstance(node, ast.ClassDef)}
+    holding = {name for name, text in records.items() if "NamedTuple" in text and "Array" in text}
+    counting, silent = [], set()
+    for node in nodes:
+        marks = [ast.unparse(one) for one in getattr(node, "decorator_list", [])]
+        if any(one.startswith(("kernel", "device")) for one in marks):
+            if "allocates=True" in "".join(marks):
+                counting.append(node)
+            elif re.search(rf"Array|\b({'|'.join(holding)})\b", ast.unparse(node.returns)):
+                silent.add(node.name)
+    assert counting and silent
+    for node in counting:
+        called = {one.func.id for one in ast.walk(node) if isinstance(one, ast.Call)
+                  and isinstance(one.func, ast.Name)}  # fmt: skip
+        assert not called & silent, node.name
