@@ -24,14 +24,12 @@ from pcfix.flow.inputs import (
 )
 from pcfix.flow.surfaces import CloudView, Points, first_points, own_water_of, parts_of
 from pcfix.model import NOISE_CLASSES, FloatArray, Views, WaterPlane
-from pcfix.options.correct import CorrectOptions, ScienceOptions
+from pcfix.options.correct import CorrectOptions
 from pcfix.refract.batch import FLAT_DEG, UNLISTED, Batch, Learned, Survey, stacked
 from pcfix.refract.learning import (
     CORRECTED_RATIO,
     Near,
-    check_method,
     depth_ratio,
-    for_own_water,
     learn_of_sample,
     resolved,
     submerged_of,
@@ -134,13 +132,9 @@ def plan_of(
     """
     cameras, kind = blocks.cameras, kind_of(views)
     check_above_water(cameras, found.surface, offset)
-    settings: ScienceOptions = options
     folder = options.water_per_image
-    if folder is not None:
-        settings = for_own_water(options, cameras, kind)
+    settings = resolved(options, cameras, kind, own_water=folder is not None)
     own, notes = own_water_of(folder, cameras, found.surface, view, offset)
-    settings = resolved(settings, cameras, kind)
-    check_method(settings, cameras)
     transfer = None
     if blocks.pair is not None:
         from pcfix.adjust.transfer import CloudTransfer

@@ -33,44 +33,40 @@ if TYPE_CHECKING:
     from pcfix.refract.stereo_factor import StereoFactor
 
 
-def check_method(settings: ScienceOptions, cameras: Cameras) -> None:
-    """Raise SettingError if the method needs an orientation that the cameras lack."""
+def resolved(
+    settings: ScienceOptions, cameras: Cameras, views: ViewKind | None, *, own_water: bool = False
+) -> ScienceOptions:
+    """Replace the method ``auto`` if that needs no points, and check that the cameras suffice.
+
+    With `own_water` single images have their own water surfaces, which few methods allow. Raises
+    SettingError if the method needs an orientation that the cameras lack.
+    """
+    bare, method = cameras.lenses is None or cameras.rotations is None, settings.method
+    if own_water:
+        dense = settings.camera_set == "mvs" or views not in (None, "tracks")
+        if method == "auto":
+            method = "snell" if bare or dense else "consistent"
+        if method not in ("snell", "consistent") or (method == "consistent" and dense):
+            raise SettingError(
+                "method.own_water",
+                f"Method {method} needs one water surface for all images"
+                f"{' if the cloud is dense' if dense else ''}. Use method snell, or leave out"
+                " water-per-image.",
+                method=method,
+            )
+        camera_set = "all" if settings.camera_set == "auto" else settings.camera_set
+        settings = replace(settings, method=method, camera_set=camera_set)
+    elif method == "auto" and bare:
+        settings = BARE.settings(settings)
+    elif method == "auto" and views is not None:
+        settings = replace(settings, method="consistent")
     if settings.camera_set == "mvs":
         require_orientation(cameras, "camera-set mvs")
     if settings.method == "consistent":
         require_orientation(cameras, "Method consistent", "use method snell")
     if settings.depth_factor == "auto":
         require_orientation(cameras, "depth-factor auto")
-
-
-def resolved(settings: ScienceOptions, cameras: Cameras, views: ViewKind | None) -> ScienceOptions:
-    """Replace the method ``auto`` if that needs no points."""
-    if settings.method != "auto":
-        return settings
-    if cameras.lenses is None or cameras.rotations is None:
-        return BARE.settings(settings)
-    return settings if views is None else replace(settings, method="consistent")
-
-
-def for_own_water(
-    settings: ScienceOptions, cameras: Cameras, views: ViewKind | None
-) -> ScienceOptions:
-    """Replace ``auto`` for images with their own water surfaces, if the method allows these."""
-    bare = cameras.lenses is None or cameras.rotations is None
-    dense = settings.camera_set == "mvs" or views not in (None, "tracks")
-    method = settings.method
-    if method == "auto":
-        method = "snell" if bare or dense else "consistent"
-    if method not in ("snell", "consistent") or (method == "consistent" and dense):
-        raise SettingError(
-            "method.own_water",
-            f"Method {method} needs one water surface for all images"
-            f"{' if the cloud is dense' if dense else ''}. Use method snell, or leave out"
-            " water-per-image.",
-            method=method,
-        )
-    camera_set = "all" if settings.camera_set == "auto" else settings.camera_set
-    return replace(settings, method=method, camera_set=camera_set)
+    return settings
 
 
 def wants_sample(survey: Survey, views: ViewKind | None) -> bool:
