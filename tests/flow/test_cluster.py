@@ -109,12 +109,25 @@ def test_killed_worker(scheduler, workers, cloud, tmp_path):
     assert not list((tmp_path / "out").glob(".*.part*"))
 
 
+def on_cluster(cloud, folder, scheduler):
+    """Label, clean and run on the cluster; return the folder of each cloud."""
+    given = {"scheduler": scheduler[1]}
+    pcfix.label_file(cloud, folder / "labelled", water=0.37, band=0.05, **given)
+    pcfix.clean_file(cloud, folder / "clean", **given)
+    pcfix.run(cloud, folder / "run", **given, **GIVEN)
+    return [folder / "labelled", folder / "clean", folder / "run/corrected", folder / "run/cleaned"]
+
+
 @pytest.mark.usefixtures("workers")
-def test_cleaned(scheduler, cloud, tmp_path, monkeypatch):
-    here = pcfix.clean_file(cloud[0], tmp_path / "here")
+def test_other_commands(scheduler, cloud, tmp_path, monkeypatch):
+    merged = tmp_path / "merged"
+    merged.mkdir()
+    pcfix.label_file(cloud[1], merged / "labelled.las", water=0.37, band=0.05)
+    pcfix.clean_file(cloud[1], merged / "clean.las")
+    pcfix.run(cloud[1], merged / "run", **GIVEN)
     monkeypatch.setattr("pcfix.flow.tiles.in_processes", None)  # nothing is done on this machine
-    there = pcfix.clean_file(cloud[0], tmp_path / "there", scheduler=scheduler[1])
-    assert there.noise == here.noise
-    for path in cloud[0].iterdir():
-        cleaned = [tmp_path / name / path.name for name in ("here", "there")]
-        assert cleaned[0].read_bytes() == cleaned[1].read_bytes()
+    for found in on_cluster(cloud[0], tmp_path, scheduler):
+        one = merged / found.relative_to(tmp_path)
+        suffix = ".laz" if "run" in one.parts else ".las"
+        tiles = sorted(found.glob("tile*.laz"))
+        assert np.array_equal(records(*tiles), records(one.with_suffix(suffix))), found.name
