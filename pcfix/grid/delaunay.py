@@ -51,12 +51,13 @@ def triangulated(
     ab, ac, bc = (((p - q) ** 2).sum(axis=1) for p, q in ((a, b), (a, c), (b, c)))
     circle = ab * ac * bc / (4.0 * _cross(b - a, c - a) ** 2)
     # the displaced positions choose the triangle, the true ones give the height
+    inside = (found >= 0) & (circle <= (widest / 2.0) ** 2)
+    corners, centre = corners[inside], centre[inside]
     a, b, c = np.moveaxis(position[corners], 1, 0)
     area = _cross(b - a, c - a)
     s, u = _cross(centre - a, c - a) / area, _cross(b - a, centre - a) / area
     i, j, k = z[corners].T
-    inside = (found >= 0) & (circle <= (widest / 2.0) ** 2)
-    out[inside] = (i + s * (j - i) + u * (k - i))[inside]
+    out[inside] = i + s * (j - i) + u * (k - i)
     return out.reshape(window.height, window.width)
 
 
