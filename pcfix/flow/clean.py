@@ -21,7 +21,7 @@ from pcfix.io.files import scratch_arrays
 from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import cleaning_vlr, corrected_identity, noted_header, own_settings
-from pcfix.io.tiles import Clouds, Tiles, open_cloud
+from pcfix.io.tiles import CloudFiles, Clouds, open_cloud
 from pcfix.model import LOW_NOISE, NOISE_CLASSES, BoolArray, FloatArray, WaterSurface
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import WaterOptions
@@ -199,7 +199,7 @@ class CleanPlan(NamedTuple):
 
 def _plan_file(
     options: CleanOptions, progress: Progress | None,
-    cloud: Path | Tiles, target: Path, kept: list[Chunk] | None = None,
+    cloud: CloudFiles, target: Path, kept: list[Chunk] | None = None,
 ) -> CleanPlan:  # fmt: skip
     """Find the noise of a whole cloud; large arrays are on the disk of the target."""
     with open_cloud(cloud) as source:

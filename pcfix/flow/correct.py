@@ -27,7 +27,7 @@ from pcfix.flow.tiles import run_command
 from pcfix.io.las import columns
 from pcfix.io.las.source import LasSource, centring_steps
 from pcfix.io.las.writing import corrected_header, corrected_identity
-from pcfix.io.tiles import Clouds, Tiles
+from pcfix.io.tiles import CloudFiles, Clouds, open_cloud
 from pcfix.label.labelling import Labelling
 from pcfix.model import (
     BATHYMETRIC_POINT,
@@ -92,7 +92,7 @@ def correct_file(
 
 
 def plan_file(
-    options: CorrectOptions, cloud: Path | Tiles, target: Path, kept: list[Chunk] | None = None
+    options: CorrectOptions, cloud: CloudFiles, target: Path, kept: list[Chunk] | None = None
 ) -> Plan:
     """Return the plan for a file, or for many as one cloud."""
     return plan_correction(read_inputs(options, view_of(cloud, options.jobs, kept)))
@@ -114,13 +114,15 @@ def correct_cloud(
         except columns.TooNarrowError:
             wide = True
         except columns.OutOfRangeError as axis:
-            old, steps = steps, centring_steps(task.source, task.jobs)
+            old = steps
+            with open_cloud(task.source, task.jobs) as source:
+                steps = centring_steps(source)
             if steps == old:
                 raise InputError(
                     "cloud.scale",
                     f"{task.source}: the scale of {axis} is too fine for the result in 32 bits."
                     " Write the cloud with a coarser scale first.",
-                    path=task.source,
+                    path=str(task.source),
                 ) from axis
 
 

@@ -40,7 +40,7 @@ from pcfix.io.las.part import part_report
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.las.writing import is_ours
 from pcfix.io.styles import raster_style
-from pcfix.io.tiles import Clouds, Tiles, cloud_of, inputs_of, open_cloud
+from pcfix.io.tiles import CloudFiles, Clouds, Tiles, cloud_of, inputs_of, open_cloud
 from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES, BoolArray, FloatArray, IntArray
 from pcfix.options.declare import File, taken
 from pcfix.options.steps import MIN_RESOLUTION_M, DsmOptions, DsmRules, SurfaceChoice
@@ -118,17 +118,17 @@ def grid_dsm(
         If the cells are so small that most have no point.
     """
     given = taken(DsmOptions, options, keywords, "grid_dsm")
-    rules, cloud = given.part(DsmRules), cloud_of(input)
+    rules, files = given.part(DsmRules), cloud_of(input)
     named = {"hillshade": given.hillshade, "counts": given.counts}
     more = {name: Path(path) for name, path in named.items() if path is not None}
     task = file_task(
-        cloud, output, given,
+        files, output, given,
         more=more.values(), check=rasters.check_tif, progress=progress,
     )  # fmt: skip
-    cloud = cloud if isinstance(cloud, Tiles) else task.source
+    cloud: CloudFiles = files if isinstance(files, Tiles) else task.source
     style = task.target.with_suffix(".qml")
     if given.style:
-        check_output(style, overwrite=given.overwrite, inputs=inputs_of(cloud))
+        check_output(style, overwrite=given.overwrite, inputs=inputs_of(files))
     if given.resolution is None:
         rules = replace(rules, resolution=round_resolution(point_spacing_m(cloud, rules), 0.0))
 
@@ -268,7 +268,7 @@ def _grid(
     return tally
 
 
-def point_spacing_m(cloud: Path | Tiles, settings: DsmRules) -> float:
+def point_spacing_m(cloud: CloudFiles, settings: DsmRules) -> float:
     """Return the side of the square that each point of a raster has for itself, metres."""
     with open_cloud(cloud) as source:
         near = Occupancy(_stated_area(source, MIN_RESOLUTION_M), len(source), MIN_RESOLUTION_M)
@@ -287,7 +287,7 @@ class SortedPoints:
     """
 
     def __init__(
-        self, cloud: Path | Tiles, source: LasSource, settings: DsmRules, folder: Path,
+        self, cloud: CloudFiles, source: LasSource, settings: DsmRules, folder: Path,
         report: Callable[[float], None],
     ) -> None:  # fmt: skip
         """Read a cloud, which is open as `source`, store the wanted points, and lay out the raster.
@@ -383,7 +383,7 @@ def _stated_area(source: LasSource, resolution_m: float) -> float:
     return max(area, resolution_m**2) if np.isfinite(area) else resolution_m**2
 
 
-def _bulk_of(cloud: Path | Tiles, count: int, resolution_m: float) -> FloatArray:
+def _bulk_of(cloud: CloudFiles, count: int, resolution_m: float) -> FloatArray:
     """Return the south-west and north-east corner of where nearly all points lie, shape (2, 2).
 
     The box of all but a thousandth of the points on each side grows by its own size, so that a
@@ -397,7 +397,7 @@ def _bulk_of(cloud: Path | Tiles, count: int, resolution_m: float) -> FloatArray
     return np.array([low - size, high + size])
 
 
-def _refuse_none(points: int, source: Path | Tiles, surface: SurfaceChoice) -> None:
+def _refuse_none(points: int, source: CloudFiles, surface: SurfaceChoice) -> None:
     """Raise an error if no point is left."""
     if points == 0 and surface == "bed":
         sentence = (

@@ -211,7 +211,7 @@ class _Labelling:
 
     def __init__(self, plan: LabelPlan, source: LasSource) -> None:
         self._plan, self._source = plan, source
-        water, mask, part = plan.water, plan.labelling.mask, part_report(source.path)
+        water, mask, part = plan.water, plan.labelling.mask, part_report(source.part)
         content = {
             "pcfix": __version__,
             "settings": plan.labelling.settings.as_dict(),
@@ -245,5 +245,5 @@ def _summarize(plan: LabelPlan, tally: LabelTally, findings: None, ends: Ends) -
         labelling=plan.labelling.report(tally.excluded),
         seconds=round(ends.seconds, 3),
         warnings=list(plan.labelling.notes),
-        part=None if ends.source is None else part_report(ends.source),
+        part=ends.part,
     )

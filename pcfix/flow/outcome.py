@@ -13,7 +13,6 @@ from pcfix.errors import GeometryError, PcfixWarning, coded
 from pcfix.flow.correction import CloudTally, Plan
 from pcfix.flow.plausibility import CloudSample, Plausible, plausible
 from pcfix.flow.runner import Ends
-from pcfix.io.las.part import part_report
 from pcfix.model import Cameras, FloatArray, Outcome, TiePoints, WaterDimension
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import UNLISTED
@@ -242,7 +241,7 @@ def summarize(plan: Plan, tally: CloudTally, findings: Findings, ends: Ends) -> 
         warnings=[one.as_dict() for one in notes],
         labelling=plan.labelling.report(tally.labels),
         settings={**options.part(ScienceOptions).as_dict(), **plan.settings},
-        part=None if ends.source is None else part_report(ends.source),
+        part=ends.part,
         water=water,
         water_fit=plan.found.as_dict(),
         uncertainty=uncertainty,

@@ -19,10 +19,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 from pcfix.io.files import check_input, check_output, write_bytes, write_text
-from pcfix.io.las.part import cloud_part
+from pcfix.io.las.part import CloudPart
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import check_suffix, las_writer
-from pcfix.io.tiles import Tiles, check_one_file, inputs_of
+from pcfix.io.tiles import Tiles, check_one_file, inputs_of, open_cloud, part_of
 from pcfix.options.declare import File
 from pcfix.running import running
 
@@ -84,14 +84,14 @@ class Ends:
     input: str
     output: str
     seconds: float
-    source: Path | None = None
+    part: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True)
 class FileTask:
     """A cloud to read, a cloud to write, and how."""
 
-    source: Path
+    source: Path | CloudPart
     target: Path
     summary: File | None = None  # JSON file
     overwrite: bool = False
@@ -114,7 +114,7 @@ def stream(
     `begin` returns the work on the opened file, which starts at a row of the whole cloud. Returns
     the statistics, and the findings of the check.
     """
-    with LasSource(task.source, task.jobs, kept=task.kept or None) as source:
+    with open_cloud(task.source, task.jobs, kept=task.kept or None) as source:
         work, total, done = begin(source), len(source), 0
         tally, findings = None, None
         # the index of a COPC file would be wrong
@@ -246,12 +246,10 @@ def file_task(
     started = time.perf_counter()
     check_one_file(input, options)
     source = Path(str(input)) if isinstance(input, Tiles) else check_input(input)
-    source = cloud_part(source, options)
     known = [one for one in (*inputs_of(input), *reads) if isinstance(one, str | PathLike)]
     for path in (output, *more):
         known.append(check(path, overwrite=options.overwrite, inputs=known))
     check_summary(options, known)
     summary, jobs = (getattr(options, name, None) for name in ("summary", "jobs"))
-    return FileTask(
-        source, Path(output), summary, options.overwrite, jobs, progress, started=started
-    )
+    cloud, target = part_of(source, options), Path(output)
+    return FileTask(cloud, target, summary, options.overwrite, jobs, progress, started=started)

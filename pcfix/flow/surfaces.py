@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from os import PathLike
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -17,7 +16,7 @@ from pcfix.errors import InputError, PcfixWarning, SettingError, coded
 from pcfix.flow.runner import Chunk, read_ahead
 from pcfix.io.las import source as las
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
-from pcfix.io.tiles import Tiles, open_cloud
+from pcfix.io.tiles import CloudFiles, open_cloud
 from pcfix.label.labelling import Part
 from pcfix.model import (
     Cameras,
@@ -88,7 +87,7 @@ def corners(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def view_of(
-    cloud: Path | Tiles, jobs: int | None = None, kept: list[Chunk] | None = None
+    cloud: CloudFiles, jobs: int | None = None, kept: list[Chunk] | None = None
 ) -> CloudView:
     """Return the view of a LAS or LAZ file, or of many as one cloud; `kept` as of `LasSource`."""
     with open_cloud(cloud, jobs) as source:
@@ -105,7 +104,7 @@ def view_of(
 
 
 def file_points(
-    cloud: Path | Tiles,
+    cloud: CloudFiles,
     water: WaterSurface | None = None,
     jobs: int | None = None,
     kept: list[Chunk] | None = None,

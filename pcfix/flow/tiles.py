@@ -42,6 +42,7 @@ from pcfix.flow.runner import (
 )
 from pcfix.io.atomic import all_or_none
 from pcfix.io.files import file_state, path_of, read_tally, write_tally
+from pcfix.io.las.part import part_report
 from pcfix.io.tiles import BrokenTileError, Clouds, Tiles, check_one_file, tiles_of
 from pcfix.io.vectors import LAYER_MARK
 from pcfix.libraries import optional_library
@@ -133,7 +134,7 @@ def run_command(
     with threads(task.jobs), all_or_none():
         plan = command.plan(task.source, task.target, task.kept)
         tally, findings = command.process(plan, task, 0, partial(command.check, plan))
-        ends = Ends(str(task.source), str(task.target), task.seconds, task.source)
+        ends = Ends(str(task.source), str(task.target), task.seconds, part_report(task.source))
         result = command.summarize(plan, tally, findings, ends)
         if task.summary is not None:
             write_summary(task, result.as_dict())

@@ -14,6 +14,7 @@ import shapely
 
 from pcfix.errors import InputError, PcfixWarning, SettingError, bad_file
 from pcfix.io.files import path_of, read_json
+from pcfix.io.las.part import CloudPart, asked_part
 from pcfix.io.las.source import LasSource, metric_crs
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
@@ -92,13 +93,40 @@ class TiledSource(LasSource):
                 raise BrokenTileError(path, str(error)) from error
 
 
+CloudFiles: TypeAlias = Path | CloudPart | Tiles
+
+
 def open_cloud(
-    cloud: Path | Tiles, jobs: int | None = None, *, places_only: bool = False, kept: Any = None
+    cloud: CloudFiles, jobs: int | None = None, *, places_only: bool = False, kept: Any = None
 ) -> LasSource:
-    """Return the points of a file, or of many; see `LasSource`."""
+    """Return the points of a file, of a part of one, or of many; see `LasSource`."""
     if isinstance(cloud, Tiles):
         return TiledSource(cloud, jobs, places_only=places_only)
-    return LasSource(cloud, jobs, places_only=places_only, kept=kept)
+    path, part = (cloud.path, cloud) if isinstance(cloud, CloudPart) else (cloud, None)
+    return LasSource(path, jobs, places_only=places_only, kept=kept, part=part)
+
+
+def part_of(path: Path, options: Any) -> Path | CloudPart:
+    """Return the part of a cloud that the options of a command ask for, or else its path.
+
+    The points of the part are counted, once for all readers; an `InputError` if there are none.
+    """
+    part = asked_part(options)
+    if part is None:
+        return path
+    with LasSource(path, getattr(options, "jobs", None)) as source:
+        header, count, ends = source.header, 0, list[Any]()
+        for points in source.chunks_within(part):
+            count += len(points)
+            xyz = [points.array[axis] for axis in "XYZ"]
+            ends.append([[one.min() for one in xyz], [one.max() for one in xyz]])
+    if not count:
+        reach = ",".join(f"{one:.12g}" for one in (*header.mins[:2], *header.maxs[:2]))
+        sentence = f"no point lies {part}. The cloud reaches over {reach}."
+        raise bad_file(path, "cloud.bounds", sentence)
+    low, high = np.min(ends, axis=0)[0], np.max(ends, axis=0)[1]
+    mins, maxs = (end * header.scales + header.offsets for end in (low, high))
+    return CloudPart(path, part, count, int(header.point_count), mins, maxs)
 
 
 def check_one_file(cloud: Any, options: Any) -> None:

@@ -17,13 +17,12 @@ from pcfix.io.cameras import read_tie_points
 from pcfix.io.clouds import read_cloud
 from pcfix.io.gnss_positions import read_gnss
 from pcfix.io.ground_control import read_ground_control
-from pcfix.io.las.part import cloud_part
-from pcfix.io.las.source import LasSource
 from pcfix.io.members import find_members
 from pcfix.io.photographs import read_photograph, size_of
 from pcfix.io.regressions import read_regression
 from pcfix.io.tables import read_check_depths
 from pcfix.io.tides import read_image_times, read_tide
+from pcfix.io.tiles import open_cloud, part_of
 from pcfix.io.vectors import read_shoreline, read_water_polygons
 from pcfix.io.views import ViewMatch, read_views
 from tests.fuzz import seeds
@@ -91,7 +90,7 @@ def read_points(path: Path) -> Iterator[Any]:
     part = {"bounds": (456_000.0, 5_432_000.0, 456_060.0, 5_432_090.0), "read_resolution": None}
     if "copc" in path.name:
         part["read_resolution"] = 5.0
-    with LasSource(cloud_part(path, SimpleNamespace(**part)), 1) as source:
+    with open_cloud(part_of(path, SimpleNamespace(**part)), 1) as source:
         yield sum(len(points) for points in source.chunks())
 
 

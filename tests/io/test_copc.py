@@ -11,8 +11,7 @@ import pytest
 
 import pcfix
 from pcfix.io.las import part
-from pcfix.io.las.part import cloud_part
-from pcfix.io.las.source import LasSource
+from pcfix.io.tiles import open_cloud, part_of
 from pcfix.options.shared import PartOptions
 from tests.utils.clouds import (
     EAST_M,
@@ -81,7 +80,7 @@ def test_only_nodes_within_are_unpacked(tmp_path: Path, monkeypatch: pytest.Monk
     source, unpacked = cloud(tmp_path / "tree.copc.laz"), []
     of = part._unpacked
     monkeypatch.setattr(part, "_unpacked", lambda *a: unpacked.append(len(a[1])) or of(*a))
-    with LasSource(cloud_part(source, PartOptions(bounds=BOX))) as found:
+    with open_cloud(part_of(source, PartOptions(bounds=BOX))) as found:
         points = np.concatenate([one.array for one in found.chunks()])
     assert len(points) == len(found) == inside(laspy.read(source)).sum()
     nodes = 1 + 8 + 64  # of three levels, at most

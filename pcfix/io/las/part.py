@@ -3,31 +3,25 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import laspy
 import lazrs
 import numpy as np
 from laspy.copc import Bounds, CopcReader, OctreeNode, load_octree_for_query
 
-from pcfix.errors import SettingError, bad_file
+from pcfix.errors import SettingError
 from pcfix.model import BoolArray, FloatArray
-
-if sys.platform == "win32":
-    from pathlib import WindowsPath as AnyPath
-else:
-    from pathlib import PosixPath as AnyPath
 
 Box = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
 class Part:
-    """What is asked for of a cloud."""
+    """The points of a cloud that a command reads."""
 
     bounds: Box | None = None  # west, south, east, north, metres; points on the edges belong to it
     resolution: float | None = None  # of COPC: levels down to the first with this spacing, metres
@@ -50,41 +44,39 @@ class Part:
         return np.asarray((x >= west) & (x <= east) & (y >= south) & (y <= north))
 
 
-class CloudPart(AnyPath):
-    """The path of a part of a cloud.
+class CloudPart(NamedTuple):
+    """A part of the cloud in a file, which has at least one point; see `pcfix.io.tiles.part_of`."""
 
-    Once opened it has its `extent`, the number of points and their lowest and highest coordinates,
-    and `held`, the number of all points of the cloud.
-    """
+    path: Path
+    part: Part
+    points: int
+    points_of_file: int
+    mins: FloatArray  # the lowest and highest coordinates of the part, shape (3,), metres
+    maxs: FloatArray
 
-    part: Part = Part()
-    held: int = 0
-    extent: tuple[int, FloatArray, FloatArray] | None = None
+    def __str__(self) -> str:
+        return str(self.path)
 
 
-def cloud_part(path: Path, options: Any) -> Path:
-    """Return a path of the part that the options of a command ask for, if they do."""
+def asked_part(options: Any) -> Part | None:
+    """Return the part that the options of a command ask for; None where they have or set none."""
     part = Part(getattr(options, "bounds", None), getattr(options, "read_resolution", None))
-    if part == Part():
-        return path
     west, south, east, north = part.bounds or (0.0, 0.0, 1.0, 1.0)
     if not (west < east and south < north):
         words = f"bounds {west:g},{south:g},{east:g},{north:g} must be west,south,east,north."
         raise SettingError("option.range", words, option="bounds")
-    asked = CloudPart(path)
-    asked.part = part
-    return asked
+    return None if part == Part() else part
 
 
-def part_report(path: Path) -> dict[str, Any] | None:
-    """Return what a summary says of the part that was read; None where that was all."""
-    if not isinstance(path, CloudPart) or path.extent is None:
+def part_report(cloud: object) -> dict[str, Any] | None:
+    """Return what a summary says of the part that was read; None unless the cloud is a part."""
+    if not isinstance(cloud, CloudPart):
         return None
     return {
-        "points": path.extent[0],
-        "of": path.held,
-        "bounds": None if path.part.bounds is None else list(path.part.bounds),
-        "read_resolution": path.part.resolution,
+        "points": cloud.points,
+        "of": cloud.points_of_file,
+        "bounds": None if cloud.part.bounds is None else list(cloud.part.bounds),
+        "read_resolution": cloud.part.resolution,
     }
 
 
@@ -133,27 +125,3 @@ def _unpacked(
         data, reader.laszip_vlr.record_data, rows.view(np.uint8), table, selection.to_lazrs()
     )
     return laspy.ScaleAwarePointRecord(rows, header.point_format, header.scales, header.offsets)
-
-
-def extent_of(
-    path: CloudPart, header: laspy.LasHeader, chunks: Iterator[laspy.ScaleAwarePointRecord]
-) -> tuple[int, FloatArray, FloatArray]:
-    """Return how many points a part has, and where; an `InputError` if it has none."""
-    if path.part.resolution is not None and not is_copc(header):
-        sentence = f"{path}: is not COPC and has no coarser levels to read. Omit --read-resolution."
-        raise SettingError("cloud.not_copc", sentence, path=path)
-    if path.extent is None:
-        count, ends = 0, []
-        for points in chunks:
-            count += len(points)
-            xyz = [points.array[axis] for axis in "XYZ"]
-            ends.append([[one.min() for one in xyz], [one.max() for one in xyz]])
-        if not count:
-            low, high = header.mins, header.maxs
-            reach = ",".join(f"{one:.12g}" for one in (*low[:2], *high[:2]))
-            sentence = f"no point lies {path.part}. The cloud reaches over {reach}."
-            raise bad_file(path, "cloud.bounds", sentence)
-        low, high = np.min(ends, axis=0)[0], np.max(ends, axis=0)[1]
-        mins, maxs = (end * header.scales + header.offsets for end in (low, high))
-        path.extent, path.held = (count, mins, maxs), int(header.point_count)
-    return path.extent

@@ -21,10 +21,10 @@ import numpy as np
 from laspy.vlrs.vlr import VLR
 from laspy.vlrs.vlrlist import VLRList
 
-from pcfix.errors import bad_file
+from pcfix.errors import SettingError, bad_file
 from pcfix.io.crs import METRES, shortened
 from pcfix.io.files import check_input
-from pcfix.io.las.part import CloudPart, extent_of, is_copc, nodes_in
+from pcfix.io.las.part import CloudPart, Part, is_copc, nodes_in
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
 
@@ -191,8 +191,8 @@ class LasSource:
 
     It has `path`, laspy's `header`, `vlrs` and `evlrs` from `read_records`, and `identity`: system
     identifier, generating software and date as they are in the file, where other software writes
-    what laspy would not. Of a `CloudPart` it has only the points of the part, and the header says
-    so; `held` is how many points the whole file has.
+    what laspy would not. With a `part` it has only the points of that, and the header says so;
+    `points_of_file` is how many points the file has.
     """
 
     def __init__(
@@ -202,6 +202,7 @@ class LasSource:
         *,
         places_only: bool = False,
         kept: list[laspy.ScaleAwarePointRecord] | None = None,
+        part: CloudPart | None = None,
     ) -> None:
         """Open; an `InputError` if the file is missing, damaged, empty, or its scales unusable.
 
@@ -210,7 +211,7 @@ class LasSource:
         then. The chunks of a small cloud are put into `kept`, for the next reader, and must not be
         changed.
         """
-        self.path = check_input(path)
+        self.path, self.part = check_input(path), part
         to_laz = self.path.with_suffix(".laz")
         with las_errors(self.path):
             with self.path.open("rb") as stream:
@@ -221,19 +222,18 @@ class LasSource:
                 self.identity = stream.read(_IDENTITY_SIZE)
             self._reader = laspy.open(self.path.open("rb"), laz_backend=backend(jobs))
         self.header: laspy.LasHeader = self._reader.header
-        self._selection = laspy.DecompressionSelection.all()  # also where a part is counted
+        self._selection = laspy.DecompressionSelection.all()
         try:
             with las_errors(self.path):
-                self.held = len(self)
+                self.points_of_file = len(self)
             self._check_header()
-            if isinstance(self.path, CloudPart):
-                extent = extent_of(self.path, self.header, self._chunks_of(self.path))
-                self._reader.seek(0)
-                self.header = copy(self.header)
-                self.header.point_count, self.header.mins, self.header.maxs = extent
         except BaseException:
             self._reader.close()
             raise
+        if part is not None:
+            self.header = copy(self.header)
+            self.header.point_count = part.points
+            self.header.mins, self.header.maxs = part.mins, part.maxs
         self._kept = kept if len(self) * self.header.point_format.size <= KEPT_BYTES else None
         if places_only and self._kept is None:
             self._selection = self._reader.decompression_selection = _PLACES
@@ -326,37 +326,40 @@ class LasSource:
                 yield from self._kept
                 return
             self._kept.clear()
-        some = self._chunks_of(self.path) if isinstance(self.path, CloudPart) else self._whole()
+        some = self._all_chunks() if self.part is None else self.chunks_within(self.part.part)
         for points in some:
             if self._kept is not None:
                 self._kept.append(points)
             yield points
 
-    def _whole(self) -> Iterator[laspy.ScaleAwarePointRecord]:
+    def _all_chunks(self) -> Iterator[laspy.ScaleAwarePointRecord]:
         read = 0
         most = max(1, min(CHUNK_POINTS, CHUNK_BYTES // self.header.point_format.size))
-        while read < self.held:
+        while read < self.points_of_file:
             with las_errors(self.path):
                 points = self._reader.read_points(most)
-            if len(points) < min(most, self.held - read):
-                sentence = f"it ends after {read + len(points):,} of {self.held:,} points."
-                sentence += " Copy it again."
-                raise bad_file(self.path, "cloud.count", sentence, stated=self.held)
+            if len(points) < min(most, self.points_of_file - read):
+                held = f"{read + len(points):,} of {self.points_of_file:,} points"
+                sentence = f"it ends after {held}. Copy it again."
+                raise bad_file(self.path, "cloud.count", sentence, stated=self.points_of_file)
             read += len(points)
             yield points
 
-    def _chunks_of(self, path: CloudPart) -> Iterator[laspy.ScaleAwarePointRecord]:
-        """Yield the points of a part."""
+    def chunks_within(self, part: Part) -> Iterator[laspy.ScaleAwarePointRecord]:
+        """Yield the points of a part, as they are in the file."""
+        if part.resolution is not None and not is_copc(self.header):
+            sentence = "is not COPC and has no coarser levels to read. Omit --read-resolution."
+            raise SettingError("cloud.not_copc", f"{self.path}: {sentence}", path=self.path)
         with las_errors(self.path):
-            chunks = self._whole()
+            chunks = self._all_chunks()
             if is_copc(self.header):
                 info = self.header.vlrs[0]
                 end = info.hierarchy_root_offset + info.hierarchy_root_size
-                if end > path.stat().st_size:  # laspy would take memory for all of it
+                if end > self.path.stat().st_size:  # laspy would take memory for all of it
                     raise ValueError("its octree begins or ends behind its end")
-                chunks = nodes_in(path, path.part, self._selection, CHUNK_POINTS)
+                chunks = nodes_in(self.path, part, self._selection, CHUNK_POINTS)
             for points in chunks:
-                inside = path.part.holds(points)
+                inside = part.holds(points)
                 if inside.any():
                     yield points[inside]
 
@@ -385,11 +388,10 @@ def coordinates(points: laspy.ScaleAwarePointRecord) -> FloatArray:
     return np.asarray(steps * points.scales + points.offsets)
 
 
-def centring_steps(path: File, jobs: int | None = None) -> tuple[int, ...]:
+def centring_steps(source: LasSource) -> tuple[int, ...]:
     """Return by how many steps each integer axis must be moved to have its middle at zero."""
-    with LasSource(path, jobs) as source:
-        chunks = (p.array for p in source.chunks())
-        ends = [[(p[a].min(), p[a].max()) for a in "XYZ"] for p in chunks]
+    chunks = (points.array for points in source.chunks())
+    ends = [[(rows[axis].min(), rows[axis].max()) for axis in "XYZ"] for rows in chunks]
     low, high = np.min(ends, axis=0)[:, 0], np.max(ends, axis=0)[:, 1]
     return tuple((-(low.astype(np.int64) + high) // 2).tolist())
 

@@ -88,7 +88,7 @@ def corrected_header(
         "steps": list(steps),
         **changes,
     }
-    part = part_report(source.path)
+    part = part_report(source.part)
     settings = {**content, **({} if part is None else {"part": part}), "before": before}
     note = _note(_SETTINGS, {**settings, _SEAL: _seal_of(settings)})
     _set_records(header, [*vlrs, note], described + records)
