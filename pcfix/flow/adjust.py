@@ -283,7 +283,8 @@ def _sample(
         inside = rows[(rows >= first) & (rows < first + len(seen.xyz))] - first
         xyz.append(seen.xyz[inside])
         if match is not None:
-            parts.append(match.for_chunk(seen.xyz, first).take(inside))
+            match = match if first else match.settled(seen.xyz)
+            parts.append(match.views_of(seen.xyz, first)[0].take(inside))
         first += len(seen.xyz)
     if match is None:
         return np.vstack(xyz), None

@@ -168,7 +168,7 @@ def transferred(
     """
     views, counts, step = plan.views, None, None
     if plan.match is not None:
-        views, counts = plan.match.counted(points.xyz, row)
+        views, counts = plan.match.views_of(points.xyz, row)
     elif isinstance(views, Views) and len(views.start) != len(points.xyz) + 1:
         views = views.take(np.arange(row, row + len(points.xyz)))
     listed = views if isinstance(views, Views) else None

@@ -93,7 +93,7 @@ def _view_report(plan: Plan, tally: CloudTally) -> ViewReport | None:
     """Return how the view list fitted, with the notes of reading it."""
     if tally.views is None or plan.match is None:
         return None
-    return replace(tally.views, notes=plan.match.report.notes)
+    return replace(tally.views, notes=plan.match.notes)
 
 
 def _out_of_sight(plan: Plan, figures: Tally, flat: int) -> str:

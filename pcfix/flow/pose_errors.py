@@ -79,7 +79,7 @@ def sample_of(chunks: Iterable[Points], match: ViewMatch | None, step: int) -> S
         rows = rows[~np.isin(one.classes[rows], NOISE_CLASSES)]
         points.append(one.take(rows))
         if match is not None:
-            views.append(match.counted(one.xyz, row)[0].take(rows))
+            views.append(match.views_of(one.xyz, row)[0].take(rows))
         row += len(one.xyz)
     if not views:
         return Sample(joined_points(points), None)

@@ -395,7 +395,10 @@ _NEIGHBOURS = 20_000
 
 
 class ViewMatch:
-    """A view list and a cloud whose chunks come in order; `report` counts the matches."""
+    """A view list and the cloud whose points it gives cameras; `notes` are warnings on the two.
+
+    A match by position may be off by `tolerance_m`; it is None where rows are matched by number.
+    """
 
     def __init__(
         self, views: ViewList, cameras: Cameras, *, points: int | None = None, step_m: float = 0.0
@@ -404,89 +407,77 @@ class ViewMatch:
 
         The cloud's coordinates are rounded to `step_m`, the scale of a LAS file.
         """
-        self.view_list, self._cameras = views, cameras
+        self.view_list, self._cameras, self.notes = views, cameras, list(views.notes)
+        self.tolerance_m: float | None = None
         self._tree: Any = None  # a cKDTree of the list's positions, when one is needed
-        source, weights = f"{views.what} {views.path}", views.weight is not None
-        self.report = ViewReport(source, len(views), notes=list(views.notes), weights=weights)
         if views.xyz is not None:
             # a match may be off by the rounding of both files, or by a share of the spacing
             spacing_m = views.spacing_m or 0.0
             rounding_m = _ROUNDING * (step_m / 2 + views.resolution_m)
-            self.report.tolerance_m = max(rounding_m, views.tolerance_spacings * spacing_m)
+            self.tolerance_m = max(rounding_m, views.tolerance_spacings * spacing_m)
             self._same_m = max(rounding_m, _SAME * spacing_m)
             if rounding_m > spacing_m / 2:
                 sentence = f"{views.path}: positions are rounded to {rounding_m:.2g} m, for points"
                 sentence += f" {spacing_m:.2g} m apart. Points may get lists of their neighbours."
                 values = {"rounding_m": rounding_m, "spacing_m": spacing_m}
-                self.report.notes.append(PcfixWarning("views.rounding", sentence, **values))
+                self.notes.append(PcfixWarning("views.rounding", sentence, **values))
         elif points != len(views):
             sentence = f"has {len(views):,} points, the cloud {points}. Put its PLY file beside it."
             values = {"listed": len(views), "points": points}
             raise bad_file(views.path, "views.other_points", sentence, **values)
-        self._note_order()
-
-    def _note_order(self) -> None:
-        order = self.view_list.orders[0]
-        shares = (self.report.share_seen, self.view_list.share_seen)
-        self.report.share_seen = min((s for s in shares if s is not None), default=None)
-        self.report.image_order, self.report.unposed = order.what, order.unposed
-
-    def for_chunk(self, xyz: FloatArray, first_row: int) -> Views:
-        """Return the cameras of a chunk's points; a point without a match has none.
-
-        The points, shape (n, 3), are apparent ones in the frame of the cameras, from the cloud's
-        `first_row` on. A list that is matched by row number is refused if its cameras do not see
-        them.
-        """
-        if self.view_list.xyz is None:
-            row = np.arange(first_row, first_row + len(xyz))
-            self.view_list = fitted(self.view_list, self._cameras, xyz, row)
-            self._note_order()
-            self.report.by_row += len(row)
-        else:
-            row = self._rows(xyz, first_row, self.view_list.xyz)
-        views = self._given(row)
-        apart = beside_frames(xyz, views, self._cameras)
-        self.report.beside_entries += int(apart.sum())
-        self.report.beside_points += int(np.count_nonzero(apart))
-        return views
-
-    def counted(self, xyz: FloatArray, first_row: int) -> tuple[Views, ViewReport]:
-        """Return the cameras of a chunk's points, and the counts of its matches only, no notes."""
-        one = self._restarted()
-        views = one.for_chunk(xyz, first_row)
-        self._tree = one._tree  # it takes long to build
-        return views, one.report
 
     def settled(self, xyz: FloatArray) -> ViewMatch:
-        """Return the match with the order of the images that the first points show."""
-        one = self._restarted()
-        one.for_chunk(xyz, 0)
-        one.report = replace(self.report)
-        one._note_order()
-        return one
+        """Return the match with the order of the images that the cloud's first points show.
 
-    def _restarted(self) -> ViewMatch:
-        """Return a match that counts from zero."""
+        A list that is matched by row number is refused if its cameras do not see them.
+        """
         one = copy(self)
-        none = np.zeros(_BINS + 1, np.int64)
-        one.report = replace(self.report, notes=[], _histogram=none)
+        if self.view_list.xyz is None:  # else the positions of the list decided it
+            one.view_list = fitted(self.view_list, self._cameras, xyz, np.arange(len(xyz)))
         return one
 
-    def _rows(self, xyz: FloatArray, first_row: int, listed: FloatArray) -> IntArray:
-        """Return the list's row of each point, -1 if it has none."""
+    def views_of(self, xyz: FloatArray, first_row: int) -> tuple[Views, ViewReport]:
+        """Return the cameras of a chunk's points, and the counts of the matches, without notes.
+
+        The points, shape (n, 3), are apparent ones in the frame of the cameras, from the cloud's
+        `first_row` on. One without a match has no cameras. A list that is matched by row number is
+        refused if its cameras do not see the points.
+        """
+        views = self.view_list
+        source, weights = f"{views.what} {views.path}", views.weight is not None
+        report = ViewReport(source, len(views), tolerance_m=self.tolerance_m, weights=weights)
+        shares = [views.share_seen]
+        if views.xyz is None:
+            row = np.arange(first_row, first_row + len(xyz))
+            views = fitted(views, self._cameras, xyz, row)
+            shares.append(views.share_seen)
+            report.by_row = len(row)
+        else:
+            row = self._rows(xyz, first_row, views.xyz, report)
+        report.share_seen = min((share for share in shares if share is not None), default=None)
+        report.image_order, report.unposed = views.orders[0].what, views.orders[0].unposed
+        listed = _listed(views, row, report)
+        apart = beside_frames(xyz, listed, self._cameras)
+        report.beside_entries = int(apart.sum())
+        report.beside_points = int(np.count_nonzero(apart))
+        return listed, report
+
+    def _rows(
+        self, xyz: FloatArray, first_row: int, listed: FloatArray, report: ViewReport
+    ) -> IntArray:
+        """Return the list's row of each point, -1 if it has none, and count the matches."""
         row = np.full(len(xyz), -1)
         beside = listed[first_row : first_row + len(xyz)]
         apart_m = np.linalg.norm(beside - xyz[: len(beside)], axis=1)
         near = apart_m <= self._same_m
         row[: len(beside)][near] = first_row + np.flatnonzero(near)
-        self.report.by_row += int(np.count_nonzero(near))
+        report.by_row = int(np.count_nonzero(near))
         rest = np.flatnonzero(row < 0)
         if len(rest) and self._tree is None:
             from scipy.spatial import cKDTree
 
             self._tree = cKDTree(listed, balanced_tree=False, compact_nodes=False)
-        tolerance_m = self.report.tolerance_m or 0.0
+        tolerance_m = self.tolerance_m or 0.0
         reach, step = float(np.nextafter(tolerance_m, np.inf)), tolerance_m / _BINS
         for at in range(0, len(rest), _QUERIES):
             some = rest[at : at + _QUERIES]
@@ -495,29 +486,29 @@ class ViewMatch:
             found = np.isfinite(distance)
             bins = np.ceil(distance[found] / step) if step else np.zeros(found.sum())
             bins = bins.astype(np.int64).clip(0, _BINS)
-            self.report._histogram += np.bincount(bins, minlength=_BINS + 1)
-            self.report.by_position += len(bins)
-            self.report.unmatched += int(np.count_nonzero(~found))
+            report._histogram += np.bincount(bins, minlength=_BINS + 1)
+            report.by_position += len(bins)
+            report.unmatched += int(np.count_nonzero(~found))
             row[some] = np.where(found, nearest, -1)
         return row
 
-    def _given(self, row: IntArray) -> Views:
-        """Turn the images of the given rows into cameras, without images that have no pose."""
-        views = self.view_list
-        listed = np.flatnonzero(row >= 0)
-        ends, entry = entries(views.start, row[listed])
-        camera = self.view_list.orders[0].camera[views.image[entry]].astype(np.int64)
-        weight = None if views.weight is None else views.weight[entry].copy()
-        posed = camera >= 0
-        if not posed.all():
-            ends = np.concatenate([[0], np.cumsum(posed)])[ends]
-            camera, weight = camera[posed], None if weight is None else weight[posed]
-        start = np.zeros(len(row) + 1, np.int64)
-        start[listed + 1] = np.diff(ends)
-        self.report.entries += len(camera)
-        self.report.unposed_entries += len(posed) - len(camera)
-        self.report.without_camera += int(np.count_nonzero(start[listed + 1] == 0))
-        return Views(np.cumsum(start), camera, weight, self.view_list.kind)
+
+def _listed(views: ViewList, row: IntArray, report: ViewReport) -> Views:
+    """Turn the images of the given rows into cameras, without images that have no pose."""
+    listed = np.flatnonzero(row >= 0)
+    ends, entry = entries(views.start, row[listed])
+    camera = views.orders[0].camera[views.image[entry]].astype(np.int64)
+    weight = None if views.weight is None else views.weight[entry].copy()
+    posed = camera >= 0
+    if not posed.all():
+        ends = np.concatenate([[0], np.cumsum(posed)])[ends]
+        camera, weight = camera[posed], None if weight is None else weight[posed]
+    start = np.zeros(len(row) + 1, np.int64)
+    start[listed + 1] = np.diff(ends)
+    report.entries = len(camera)
+    report.unposed_entries = len(posed) - len(camera)
+    report.without_camera = int(np.count_nonzero(start[listed + 1] == 0))
+    return Views(np.cumsum(start), camera, weight, views.kind)
 
 
 @dataclass

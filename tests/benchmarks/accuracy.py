@@ -188,7 +188,7 @@ def rendered(name: str, points: int) -> Case | None:
     xyz = np.ascontiguousarray(laspy.read(folder / "cloud.las").xyz)
     match = ViewMatch(read_views(folder / "dense.vis", cameras), cameras, points=len(xyz))
     rows = np.arange(0, len(xyz), max(1, len(xyz) // points))
-    xyz, views = xyz[rows], match.for_chunk(xyz, 0).take(rows)
+    xyz, views = xyz[rows], match.views_of(xyz, 0)[0].take(rows)
     height, water, bed = true_surface(folder / "truth_dsm.tif"), pcfix.WaterPlane(0.37), xyz.copy()
     bed[:, 2] = height(xyz)
 

@@ -72,5 +72,5 @@ def test_real_dense_cloud():
     xyz = np.ascontiguousarray(laspy.read(RENDERED / "cloud.las").xyz)
     match = ViewMatch(read_views(RENDERED / "dense.vis", cameras), cameras, points=len(xyz))
     rows = np.flatnonzero(xyz[:, 2] < 0.37)[::5]
-    views = match.for_chunk(xyz, 0).take(rows)
+    views = match.views_of(xyz, 0)[0].take(rows)
     assert kind_of(xyz[rows], cameras, WaterPlane(0.37), views).chosen.kind == "depth-maps"

@@ -52,7 +52,7 @@ def read_block(path: Path, **options: Any) -> Iterator[Any]:
 def read_lists(path: Path) -> Iterator[Any]:
     found = read_views(path, seeds.views_cameras())
     count = len(found)
-    yield ViewMatch(found, seeds.views_cameras(), points=count).for_chunk(np.zeros((count, 3)), 0)
+    yield ViewMatch(found, seeds.views_cameras(), points=count).views_of(np.zeros((count, 3)), 0)[0]
 
 
 def read_water(path: Path) -> Iterator[Any]:

@@ -1,9 +1,11 @@
 """View lists: the cameras that contributed to each point."""
 
 import contextlib
+import operator
 import shutil
 import struct
 from dataclasses import replace
+from functools import reduce
 from pathlib import Path
 
 import laspy
@@ -90,18 +92,20 @@ def rows_of(views):
 
 
 def given(match, xyz, chunk=150):
-    """Return the cameras of each point of a cloud in chunks, and their weights."""
-    parts = [match.for_chunk(xyz[i : i + chunk], i) for i in range(0, len(xyz), chunk)]
-    weights = [part.weight for part in parts if part.weight is not None]
-    return [row for p in parts for row in rows_of(p)], np.concatenate(weights) if weights else None
+    """Return the cameras of each point of a cloud in chunks, their weights, and the counts."""
+    match = match.settled(xyz[:chunk])
+    found = [match.views_of(xyz[i : i + chunk], i) for i in range(0, len(xyz), chunk)]
+    parts, report = [views for views, _ in found], reduce(operator.add, [one for _, one in found])
+    weights = np.concatenate([one.weight for one in parts]) if report.weights else None
+    return [row for p in parts for row in rows_of(p)], weights, replace(report, notes=match.notes)
 
 
 def match_of(path, cameras, points=None, **more):
     return ViewMatch(read_views(path, cameras, **more), cameras, points=points)
 
 
-def codes(match):
-    return [note.code for note in match.report.warnings()]
+def codes(report):
+    return [note.code for note in report.warnings()]
 
 
 def write_model(folder, images, frames=None):
@@ -133,8 +137,7 @@ def test_real_vis_and_ply():
     """Both kinds of list hold the same; the PLY has every third row and a local frame."""
     cameras, xyz = pcfix.read_cameras(RENDERED / "cameras.csv"), cloud(RENDERED)
     vis = match_of(RENDERED / "dense.vis", cameras, len(xyz))
-    expected, weights = given(vis, xyz, 100_000)
-    report = vis.report
+    expected, weights, report = given(vis, xyz, 100_000)
     assert (report.by_row, report.unmatched, report.share_seen) == (250_000, 0, 1.0)
     assert min(map(len, expected)) == 3 and max(map(len, expected)) == 13  # at least 3 depth maps
     assert expected[0] == [11, 12, 13, 22, 29] and weights is None
@@ -143,17 +146,16 @@ def test_real_vis_and_ply():
     offset = np.loadtxt(RENDERED / "offset.txt", comments="#")
     views = read_views(RENDERED / "dense.ply", cameras, to_cloud=lambda points: points + offset)
     ply = ViewMatch(views, cameras, step_m=0.001)
-    found, weights = given(ply, xyz, 100_000)
+    found, weights, report = given(ply, xyz, 100_000)
     assert found[::3] == expected[::3]
     strangers = sum(len(row) > 0 for i, row in enumerate(found) if i % 3)
     assert strangers < 1e-3 * len(xyz)  # points that chance brought within the tolerance
-    report = ply.report
     assert report.by_row == 1
     assert report.unmatched / len(xyz) == pytest.approx(2 / 3, abs=1e-3)
     assert report.distance_m(0.95) < 0.001  # mm in the LAS
     assert report.tolerance_m == pytest.approx(0.011, abs=0.001)
     assert len(weights) == report.entries and weights.min() > 0
-    assert codes(ply) == ["views.unmatched"]
+    assert codes(report) == ["views.unmatched"]
     with refused("views.other_images", path=RENDERED / "dense.ply", share=0.0):
         read_views(RENDERED / "dense.ply", cameras)
 
@@ -166,7 +168,7 @@ def test_cameras_in_another_order(tmp_path):
     cameras = Cameras(labels, file.centres[order], file.rotations[order], lenses)
     xyz = cloud(RENDERED)
     with refused("views.other_images") as caught:
-        match_of(RENDERED / "dense.vis", cameras, len(xyz)).for_chunk(xyz, 0)
+        match_of(RENDERED / "dense.vis", cameras, len(xyz)).views_of(xyz, 0)
     assert 0.7 < caught.value.values["share"] < 0.8
     write_model(tmp_path, list(enumerate(file.labels)))
     match = match_of(shutil.copy(RENDERED / "dense.vis", tmp_path), cameras, len(xyz))
@@ -182,10 +184,10 @@ def test_ply_layouts(tmp_path, cameras, scene, order, count):
     xyz, lists = scene
     weights = [[0.25 * (k + 1) for k in one] for one in lists]
     match = match_of(write_ply(tmp_path / "d.ply", xyz, lists, weights, order, count), cameras)
-    found, found_weights = given(match, xyz)
+    found, found_weights, report = given(match, xyz)
     assert found == lists
     assert found_weights.tolist() == [w for one in weights for w in one]
-    assert (match.report.by_row, match.report.share_seen) == (400, 1.0)
+    assert (report.by_row, report.share_seen) == (400, 1.0)
 
 
 @pytest.mark.parametrize("beside", [None, 399])
@@ -196,10 +198,11 @@ def test_vis_without_positions(tmp_path, cameras, scene, beside):
     if beside:
         write_ply(tmp_path / "fused.ply", xyz[:beside])
     match = match_of(path, cameras, 400)
-    assert given(match, xyz)[0] == lists
-    assert match.report.by_row == 400 and match.report.tolerance_m is None
-    assert match.report.without_camera == 1
-    assert codes(match) == (["views.other_points"] if beside else [])
+    found, _, report = given(match, xyz)
+    assert found == lists
+    assert report.by_row == 400 and report.tolerance_m is None
+    assert report.without_camera == 1
+    assert codes(report) == (["views.other_points"] if beside else [])
     for points in (399, None):
         with refused("views.other_points", listed=400, points=points):
             match_of(path, cameras, points)
@@ -212,9 +215,10 @@ def test_vis_with_positions(tmp_path, cameras, scene, name):
     write_ply(tmp_path / "fused.ply", xyz)
     some = np.random.default_rng(1).permutation(400)[:250]
     match = match_of(tmp_path / name, cameras)
-    assert given(match, xyz[some])[0] == [lists[i] for i in some]
-    assert match.report.by_position + match.report.by_row == 250
-    assert match.report.by_position > 240 and match.report.unmatched == 0
+    found, _, report = given(match, xyz[some])
+    assert found == [lists[i] for i in some]
+    assert report.by_position + report.by_row == 250
+    assert report.by_position > 240 and report.unmatched == 0
 
 
 def test_thinned_shuffled_and_rounded(tmp_path, cameras, scene):
@@ -222,11 +226,12 @@ def test_thinned_shuffled_and_rounded(tmp_path, cameras, scene):
     path = write_ply(tmp_path / "d.ply", xyz, lists)
     some = np.random.default_rng(2).permutation(400)[:300]
     match = ViewMatch(read_views(path, cameras), cameras, step_m=0.01)
-    assert given(match, xyz[some].round(2))[0] == [lists[i] for i in some]
-    assert match.report.unmatched == 0
-    assert 0.001 < match.report.distance_m(0.5) < match.report.distance_m(0.95) < 0.009
-    assert match.report.as_dict()["distance_95_m"] == match.report.distance_m(0.95)
-    match.report.check()
+    found, _, report = given(match, xyz[some].round(2))
+    assert found == [lists[i] for i in some]
+    assert report.unmatched == 0
+    assert 0.001 < report.distance_m(0.5) < report.distance_m(0.95) < 0.009
+    assert report.as_dict()["distance_95_m"] == report.distance_m(0.95)
+    report.check()
 
 
 def test_tolerance(tmp_path, cameras, scene):
@@ -235,20 +240,23 @@ def test_tolerance(tmp_path, cameras, scene):
     moved = xyz + np.array([0, 0, 0.3])
     strict = ViewMatch(views, cameras)
     loose = ViewMatch(replace(views, tolerance_spacings=0.3001 / views.spacing_m), cameras)
-    assert strict.report.tolerance_m < 0.3
-    assert given(strict, moved)[0] == [[]] * 400 and strict.report.unmatched == 400
+    assert strict.tolerance_m < 0.3
+    found, _, report = given(strict, moved)
+    assert found == [[]] * 400 and report.unmatched == 400
     with refused("views.no_match", points=400, listed=400):
-        strict.report.check()
-    assert sum(a == b for a, b in zip(given(loose, moved)[0], lists, strict=True)) > 390
-    assert loose.report.distance_m(0.5) == pytest.approx(0.3, abs=0.001)
+        report.check()
+    found, _, report = given(loose, moved)
+    assert sum(a == b for a, b in zip(found, lists, strict=True)) > 390
+    assert report.distance_m(0.5) == pytest.approx(0.3, abs=0.001)
 
 
 def test_a_row_is_missing(tmp_path, cameras, scene):
     xyz, lists = scene
     match = match_of(write_ply(tmp_path / "d.ply", xyz, lists), cameras)
     keep = np.delete(np.arange(400), 200)
-    assert given(match, xyz[keep])[0] == [lists[i] for i in keep]
-    assert (match.report.by_row, match.report.by_position) == (200, 199)
+    found, _, report = given(match, xyz[keep])
+    assert found == [lists[i] for i in keep]
+    assert (report.by_row, report.by_position) == (200, 199)
 
 
 # --- the order of the images -------------------------------------------------------------------
@@ -288,9 +296,10 @@ def test_images_without_a_pose(tmp_path, cameras, scene):
     path = write_vis(tmp_path / "fused.ply.vis", listed)
     write_model(tmp_path, list(enumerate(names)))
     match = match_of(path, cameras, 400)
-    assert given(match, xyz)[0] == lists
-    assert match.report.unposed_entries == 400 and match.report.unposed == ("lost.JPG",)
-    assert codes(match) == ["views.unposed"]
+    found, _, report = given(match, xyz)
+    assert found == lists
+    assert report.unposed_entries == 400 and report.unposed == ("lost.JPG",)
+    assert codes(report) == ["views.unposed"]
 
 
 def test_cameras_that_look_elsewhere(tmp_path, cameras, scene):
@@ -300,10 +309,11 @@ def test_cameras_that_look_elsewhere(tmp_path, cameras, scene):
     listed = [[*one, 6, 7] if near and i % 9 == 0 else one
               for i, (one, near) in enumerate(zip(lists, first, strict=True))]  # fmt: skip
     match = match_of(write_ply(tmp_path / "d.ply", xyz, listed), cameras)
-    assert given(match, xyz)[0] == listed
+    found, _, report = given(match, xyz)
+    assert found == listed
     points = int(np.count_nonzero(first[::9]))
-    assert (match.report.beside_entries, match.report.beside_points) == (2 * points, points)
-    assert codes(match) == ["views.not_in_frame"]
+    assert (report.beside_entries, report.beside_points) == (2 * points, points)
+    assert codes(report) == ["views.not_in_frame"]
 
 
 def test_damaged_model(tmp_path, cameras, scene):
@@ -332,8 +342,9 @@ def test_nearest_track(cameras, scene):
     views = track_views(Path("m"), tie_points(sparse, again), cameras)
     match = ViewMatch(views, cameras)
     near = np.delete(xyz, 5, axis=0) + np.array([0, 0, 0.02])
-    assert given(match, near)[0] == lists[:5] + lists[6:]
-    assert len(views) == 399 and match.report.tolerance_m == 2 * views.spacing_m
+    found, _, report = given(match, near)
+    assert found == lists[:5] + lists[6:]
+    assert len(views) == 399 and report.tolerance_m == 2 * views.spacing_m
 
 
 # --- errors ------------------------------------------------------------------------------------

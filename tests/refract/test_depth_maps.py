@@ -309,7 +309,7 @@ def rendered_cloud():
     xyz = np.ascontiguousarray(laspy.read(RENDERED / "cloud.las").xyz)
     match = ViewMatch(read_views(RENDERED / "dense.vis", cameras), cameras, points=len(xyz))
     rows = np.arange(0, len(xyz), 6)
-    return xyz[rows], cameras, match.for_chunk(xyz, 0).take(rows)
+    return xyz[rows], cameras, match.views_of(xyz, 0)[0].take(rows)
 
 
 def rendered_errors_gsd(**choices):

@@ -210,7 +210,7 @@ def test_real_views():
     xyz = np.column_stack([las.x, las.y, las.z])
     views = read_views(RENDERED / "dense.vis", cameras)
     match = ViewMatch(views, cameras, points=len(xyz))
-    found = occluded(xyz, cameras.centres, match.for_chunk(xyz, 0), occluder_of(xyz))
+    found = occluded(xyz, cameras.centres, match.views_of(xyz, 0)[0], occluder_of(xyz))
     assert found.mean() < 0.01  # of entries, all of which are of images that saw the point
 
 
