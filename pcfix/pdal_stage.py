@@ -127,7 +127,7 @@ def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> No
     outs.update(results.dimensions)
     summary = summarize(plan, tally, findings, Ends(NAME, NAME, time.perf_counter() - started))
     write_summary(options, summary.as_dict())
-    namespace["out_metadata"] = metadata_of(summary.as_dict(), cloud.flags)
+    namespace["out_metadata"] = metadata_of(summary.as_dict(), unpacked=cloud.unpacked)
 
 
 def _label(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
@@ -137,7 +137,7 @@ def _label(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
     options = _options(namespace, StageLabelOptions, needed=("water",))
     cloud = PdalCloud(ins, namespace.get("metadata"))
     plan = plan_labelling(options, _view(cloud))
-    classes, tally = cloud.flags.classes.copy(), None
+    classes, tally = cloud.classes.copy(), None
     for rows, points in _chunks(cloud, plan.water):
         classes[rows], one = label_chunk(plan, points)
         tally = one if tally is None else tally + one
@@ -145,9 +145,9 @@ def _label(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
         return
     check(plan, tally)
     outs["Classification"] = classes
-    outs.update(cloud.flags.dimensions())
+    outs.update(cloud.flags())
     found = {**tally.counts(), "labelling": plan.labelling.report(tally.excluded)}
-    namespace["out_metadata"] = metadata_of(found, cloud.flags)
+    namespace["out_metadata"] = metadata_of(found, unpacked=cloud.unpacked)
 
 
 def _clean(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
@@ -159,25 +159,25 @@ def _clean(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
     started = time.perf_counter()
     options = _options(namespace, CleanOptions)
     cloud = PdalCloud(ins, namespace.get("metadata"))
-    flags, rays = cloud.flags, cloud.columns(tuple(RAY_DIMENSIONS))
+    rays = cloud.columns(tuple(RAY_DIMENSIONS))
     check_summary(options)
 
     def chunks(water: WaterSurface | None) -> Iterator[Tested]:
         for rows, points in _chunks(cloud, water):
-            yield Tested(points, flags.withheld[rows], {name: rays[name][rows] for name in rays})
+            yield Tested(points, cloud.withheld[rows], {name: rays[name][rows] for name in rays})
 
     with threads(options.jobs):
         noise, found = find_noise(NAME, options, lambda: _view(cloud), ins, chunks, len(cloud))
     if options.drop:
         outs["Mask"] = ~noise
     else:
-        flags.withheld |= noise
-        outs["Classification"] = np.where(noise, LOW_NOISE, flags.classes).astype(np.uint8)
-        outs.update(flags.dimensions())
+        cloud.withheld |= noise
+        outs["Classification"] = np.where(noise, LOW_NOISE, cloud.classes).astype(np.uint8)
+        outs.update(cloud.flags())
     seconds = round(time.perf_counter() - started, 3)
     summary = {**found.as_dict(), "input": NAME, "output": NAME, "seconds": seconds}
     write_summary(options, summary)
-    namespace["out_metadata"] = metadata_of(summary, None if options.drop else flags)
+    namespace["out_metadata"] = metadata_of(summary, unpacked=cloud.unpacked and not options.drop)
 
 
 def _compare(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
@@ -197,7 +197,7 @@ def _survey(cloud: PdalCloud, water: WaterSurface | None) -> SurveyCloud:
     from pcfix.io.clouds import TOLD, Told, survey_cloud
     from pcfix.io.crs import parse_crs
 
-    told, withheld = cloud.columns(tuple(TOLD)), cloud.flags.withheld
+    told, withheld = cloud.columns(tuple(TOLD)), cloud.withheld
     chunks = (
         Told(points.xyz, points.classes, withheld[rows], points.heights,
              {name: told[name][rows] for name in told})
@@ -272,7 +272,7 @@ def _chunks(cloud: PdalCloud, water: WaterSurface | None) -> Iterator[tuple[slic
         rgb = tuple(ins[name][rows] for name in COLOURS if name in ins)
         colours = rgb if len(rgb) == len(COLOURS) else None
         returns = ins["NumberOfReturns"][rows] if "NumberOfReturns" in ins else None
-        yield rows, Points(xyz, heights, cloud.flags.classes[rows], sources, colours, returns)
+        yield rows, Points(xyz, heights, cloud.classes[rows], sources, colours, returns)
 
 
 def _view(cloud: PdalCloud) -> CloudView:

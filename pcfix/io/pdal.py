@@ -47,9 +47,11 @@ def add_dimension(columns: tuple[Column, ...]) -> str:
 
 
 class PdalCloud:
-    """The arrays and the metadata of a cloud; `flags` are its classes and withheld flags.
+    """The arrays and the metadata of a cloud, with copies of its `classes` and `withheld` flags.
 
     `scales`, shape (3,), and `crs`, as WKT, are those that all input files share, else None.
+    PDAL 2.2 has the flags in ClassFlags, and those of point formats 0 to 5 in the upper bits of
+    Classification, from which they are `unpacked`; later versions have a dimension Withheld.
     """
 
     def __init__(self, ins: Dimensions, metadata: Metadata | None) -> None:
@@ -60,9 +62,25 @@ class PdalCloud:
         is_one = all(len(found) == 1 for found in scales)
         self.scales = np.array([float(*found) for found in scales]) if is_one else None
         self.crs: str | None = (crs.pop() or None) if len(crs) == 1 else None
-        is_packed = any(int(form) < 6 for form in values[_FORMAT])
-        unpacked = _mentions(_children(metadata, "filters.python"), UNPACKED)
-        self.flags = Flags(ins, is_packed and not unpacked, unpacked)
+        if "Classification" not in ins:
+            raise _missing("Classification", "uint8")
+        self.classes = np.array(ins["Classification"], order="C")
+        self._class_flags = np.array(ins["ClassFlags"]) if "ClassFlags" in ins else None
+        self.unpacked = _mentions(_children(metadata, "filters.python"), UNPACKED)
+        is_packed = not self.unpacked and any(int(form) < 6 for form in values[_FORMAT])
+        if is_packed and "Withheld" not in ins:
+            bits = self.classes >> 5
+            self.classes &= 31
+            if self._class_flags is None:  # class 40 does not fit beside flags in Classification
+                raise _missing(*CLASS_FLAGS.split("="))
+            self._class_flags |= bits.astype(self._class_flags.dtype)
+            self.unpacked = True
+        if "Withheld" in ins:
+            self.withheld = ins["Withheld"] != 0
+        elif self._class_flags is not None:
+            self.withheld = (self._class_flags & _WITHHELD_FLAG) != 0
+        else:
+            self.withheld = np.zeros(len(self.classes), np.bool_)
 
     def __len__(self) -> int:
         return len(self.ins["X"])
@@ -94,6 +112,17 @@ class PdalCloud:
                 found[column.name] = values
         return found
 
+    def flags(self) -> Dimensions:
+        """Return the withheld flags as PDAL has them."""
+        out: Dimensions = {}
+        if "Withheld" in self.ins:
+            out["Withheld"] = self.withheld.astype(self.ins["Withheld"].dtype)
+        if self._class_flags is not None:
+            flags = self._class_flags
+            with_bit = np.where(self.withheld, flags | _WITHHELD_FLAG, flags)
+            out["ClassFlags"] = with_bit.astype(flags.dtype)
+        return out
+
 
 _CRS, _FORMAT = "comp_spatialreference", "dataformat_id"
 _READ = ("scale_x", "scale_y", "scale_z", _CRS, _FORMAT)
@@ -109,46 +138,6 @@ def _children(metadata: Metadata | None, kind: str) -> list[Metadata]:
 def _mentions(nodes: list[Metadata], name: str) -> bool:
     """Whether a node or one below it has a name."""
     return any(one["name"] == name or _mentions(one.get("children", []), name) for one in nodes)
-
-
-class Flags:
-    """Classes and withheld flags.
-
-    PDAL 2.2 has the flags in ClassFlags, and those of point formats 0 to 5 in the upper bits of
-    Classification (`packed`); later versions have a dimension Withheld.
-    """
-
-    def __init__(self, ins: Dimensions, packed: bool, unpacked: bool) -> None:
-        if "Classification" not in ins:
-            raise _missing("Classification", "uint8")
-        self._ins = ins
-        self.unpacked = unpacked
-        self.classes = np.array(ins["Classification"], order="C")
-        self._class_flags = np.array(ins["ClassFlags"]) if "ClassFlags" in ins else None
-        if packed and "Withheld" not in ins:
-            bits = self.classes >> 5
-            self.classes &= 31
-            if self._class_flags is None:  # class 40 does not fit beside flags in Classification
-                raise _missing(*CLASS_FLAGS.split("="))
-            self._class_flags |= bits.astype(self._class_flags.dtype)
-            self.unpacked = True
-        if "Withheld" in ins:
-            self.withheld = ins["Withheld"] != 0
-        elif self._class_flags is not None:
-            self.withheld = (self._class_flags & _WITHHELD_FLAG) != 0
-        else:
-            self.withheld = np.zeros(len(self.classes), np.bool_)
-
-    def dimensions(self) -> Dimensions:
-        """Return the flags as PDAL has them."""
-        out: Dimensions = {}
-        if "Withheld" in self._ins:
-            out["Withheld"] = self.withheld.astype(self._ins["Withheld"].dtype)
-        if self._class_flags is not None:
-            flags = self._class_flags
-            with_bit = np.where(self.withheld, flags | _WITHHELD_FLAG, flags)
-            out["ClassFlags"] = with_bit.astype(flags.dtype)
-        return out
 
 
 def _missing(dimension: str, kind: str) -> SettingError:
@@ -170,7 +159,7 @@ class Results:
             if column.scale != 1.0 and ins[column.name].dtype.kind != "f":
                 sentence = f"add_dimension: {column.name} must be float."
                 raise SettingError("cloud.dimension_type", sentence, dimension=column.name)
-        self._columns, self._flags = columns, cloud.flags
+        self._columns, self._cloud = columns, cloud
         # without one known scale, steps that are far finer than any
         self._scales = np.full(3, 2.0**-20) if cloud.scales is None else cloud.scales
         names = [*"XYZ", *(column.name for column in columns), *{OUTCOME}.intersection(ins)]
@@ -178,16 +167,16 @@ class Results:
         self._added: Dimensions = {name: np.ascontiguousarray(ins[name]) for name in names}
         for name in names[3:]:
             self._added[name].fill(0)
-        self._added["Classification"] = cloud.flags.classes.copy()
+        self._added["Classification"] = cloud.classes.copy()
 
     def add(self, rows: slice, correction: Correction, withhold: bool) -> None:
         """Add one chunk."""
-        out, classes, scales = self._added, self._flags.classes[rows], self._scales
+        out, classes, scales = self._added, self._cloud.classes[rows], self._scales
         moved = shift_steps(correction, scales)
         for i, axis in enumerate("XYZ"):
             # land keeps its bits, negative zero included
             out[axis][rows][correction.moved] += moved[correction.moved, i] * scales[i]
-        withheld = self._flags.withheld[rows]
+        withheld = self._cloud.withheld[rows]
         correction = unsure_anew(correction, withheld)
         changed = changed_rows(correction, withheld, withhold=withhold)
         for column, some, values in filled(self._columns, correction, moved, classes, changed):
@@ -195,18 +184,18 @@ class Results:
         out["Classification"][rows][correction.corrected] = BATHYMETRIC_POINT
         if OUTCOME in out:
             out[OUTCOME][rows] = correction.outcome
-        self._flags.withheld[rows] |= to_withhold(correction, withhold=withhold)
+        self._cloud.withheld[rows] |= to_withhold(correction, withhold=withhold)
 
     @property
     def dimensions(self) -> Dimensions:
         """The arrays that PDAL gets back."""
-        return self._added | self._flags.dimensions()
+        return self._added | self._cloud.flags()
 
 
-def metadata_of(figures: Metadata, flags: Flags | None = None) -> Metadata:
-    """Return a summary as PDAL's metadata, for later stages also whether `flags` were unpacked."""
+def metadata_of(figures: Metadata, *, unpacked: bool = False) -> Metadata:
+    """Return a summary as PDAL's metadata, for later stages also whether flags were unpacked."""
     values = {k: v for k, v in figures.items() if k not in ("input", "output") and v is not None}
-    if flags is not None and flags.unpacked:
+    if unpacked:
         values[UNPACKED] = True
     return node("pcfix", children=[node(name, value) for name, value in values.items()])
 
