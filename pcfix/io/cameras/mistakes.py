@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pcfix.io.crs import parse_crs, parts, unbound
+from pcfix.io.crs import parse_crs, parts
 from pcfix.model import FloatArray
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def likely_mistake(
 
 def _readings(centres: FloatArray, crs: str | CRS | None) -> Iterator[tuple[str, FloatArray]]:
     """Yield other ways to read the numbers, the simplest first; to the metre or so."""
-    from pyproj import Proj
+    from pyproj import Transformer
     from pyproj.exceptions import ProjError
 
     swapped = centres[:, [1, 0, 2]]
@@ -93,29 +93,24 @@ def _readings(centres: FloatArray, crs: str | CRS | None) -> Iterator[tuple[str,
         return
     say = "; say so with --cameras-crs"
     others = [
-        (f"longitude and latitude in degrees{say} EPSG:4326", centres[:, :2]),
-        ("degrees, latitude before longitude; exchange the columns", swapped[:, :2]),
+        (f"longitude and latitude in degrees{say} EPSG:4326", 4326, centres),
+        ("degrees, latitude before longitude; exchange the columns", 4326, swapped),
+        (f"web Mercator{say} EPSG:3857", 3857, centres),
     ]
-    maps = [("+proj=webmerc +datum=WGS84", f"web Mercator{say} EPSG:3857")]
     if plan.utm_zone is not None:  # the zones within two of the cloud's, and the other hemisphere
         zone = int(plan.utm_zone[:-1])
         for near in ((zone + step - 1) % 60 + 1 for step in (0, -1, 1, -2, 2)):
-            for side, south in (("N", ""), ("S", " +south")):
+            for side, first in (("N", 32600), ("S", 32700)):
                 if f"{near}{side}" != plan.utm_zone:
                     words = f"UTM zone {near}{side} (the cloud is in {plan.utm_zone}){say}"
-                    maps.append((f"+proj=utm +zone={near}{south} +ellps=GRS80", words))
-    for text, words in maps:
-        there = Proj(text)(centres[:, 0], centres[:, 1], inverse=True)
-        others.append((words, np.column_stack(there)))
-    try:
-        to_map = Proj(unbound(plan))
-    except ProjError:  # a CRS that is no single map, as all zones of UTM in one
-        return
-    for words, degrees in others:
-        found = np.full_like(degrees, np.inf)
-        known = (np.abs(degrees) <= [360.0, 90.0]).all(axis=1)
-        found[known] = np.column_stack(to_map(degrees[known, 0], degrees[known, 1]))
-        yield f"read as {words}", found
+                    others.append((words, first + near, centres))
+    for words, code, numbers in others:
+        try:
+            to_cloud = Transformer.from_crs(code, plan, always_xy=True)
+        except ProjError:  # a CRS that is no single map, as all zones of UTM in one
+            return
+        x, y = to_cloud.transform(numbers[:, 0], numbers[:, 1])  # infinite outside of the CRS
+        yield f"read as {words}", np.column_stack([x, y])
 
 
 def _wrong_height(middle: float, low: FloatArray, high: FloatArray) -> str | None:
