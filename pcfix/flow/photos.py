@@ -240,7 +240,7 @@ def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> PhotoBlo
         words = f"{given.dsm}: does not state whether it was corrected; it is used as {bed}."
         notes.append(PcfixWarning("dsm.origin_unknown", words, path=given.dsm))
     cameras, _ = inputs.block(crs, read)
-    row = match_labels([path.name for path in paths], cameras.labels, one_to_one=False).row
+    row = match_labels([path.name for path in paths], cameras.labels, one_to_one=False)[0]
     lost = [path.name for path, one in zip(paths, row, strict=True) if one < 0]
     if len(lost) == len(paths):
         sentence = (

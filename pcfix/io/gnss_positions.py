@@ -113,14 +113,14 @@ def _by_camera(
             sentence = f"image {label} has two positions. Give one for every image."
             raise bad_file(path, "gnss.two_positions", sentence, image=label)
     labels = list(row_of)
-    matched = match_labels(labels, cameras.labels)
-    for name in matched.ambiguous:
+    row, ambiguous = match_labels(labels, cameras.labels)
+    for name in ambiguous:
         sentence = f"image {name} could be several of the model. Use names with their folders."
         raise bad_file(path, "images.ambiguous", sentence, image=name)
-    there = matched.row >= 0
+    there = row >= 0
     rows = np.array([row_of[label] for label in labels])[there]
     xyz, sigma = np.full((2, len(cameras), 3), np.nan)
-    xyz[matched.row[there]], sigma[matched.row[there]] = listed.xyz[rows], listed.sigma_m[rows]
+    xyz[row[there]], sigma[row[there]] = listed.xyz[rows], listed.sigma_m[rows]
     unknown = [label for label, known in zip(labels, there, strict=True) if not known]
     return GnssPositions(xyz, sigma, listed.crs), unknown
 

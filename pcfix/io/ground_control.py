@@ -191,15 +191,15 @@ def _cameras_of(
 ) -> tuple[IntArray, list[PcfixWarning]]:
     """Return the camera of each mark, -1 for images without a pose, and a warning about these."""
     names = list(dict.fromkeys(mark.image for mark in marks))
-    matched = match_labels(names, cameras.labels)
-    of_name = dict(zip(names, matched.row.tolist(), strict=True))
+    row, ambiguous = match_labels(names, cameras.labels)
+    of_name = dict(zip(names, row.tolist(), strict=True))
     camera = np.array([of_name[mark.image] for mark in marks])
     lost = [name for name in names if of_name[name] < 0]
-    others = {*matched.ambiguous, *unnamed(lost, cameras.unposed)}
+    others = {*ambiguous, *unnamed(lost, cameras.unposed)}
     unknown = [name for name in lost if name in others]
     if unknown:
         mark = next(mark for mark in marks if mark.image == unknown[0])
-        if mark.image in matched.ambiguous:
+        if mark.image in ambiguous:
             words = "the name fits several images of the model. Use names with their folders."
             raise _wrong(path, "images.ambiguous", mark, words)
         words = f"{_few(unknown)} are not among the {len(cameras)} images of the model"

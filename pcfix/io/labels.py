@@ -5,26 +5,25 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import PurePosixPath
-from typing import NamedTuple
 
 import numpy as np
 
 from pcfix.model import IntArray
 
 
-class Matched(NamedTuple):
-    """The labels of n names."""
-
-    row: IntArray  # (n,), of the labels; -1 where there is none or it could be several
-    ambiguous: tuple[str, ...]  # names that could be several labels, or share one with another name
-
-
 def match_labels(
     names: Sequence[str], labels: Sequence[str], *, one_to_one: bool = True
-) -> Matched:
-    """Find each name among labels: the whole name, else without its folder or its extension.
+) -> tuple[IntArray, tuple[str, ...]]:
+    """Find each name among labels: the complete name, else without its folder or its extension.
 
     With `one_to_one` no two names may have the same label.
+
+    Returns
+    -------
+    row : array, shape (names,)
+        Of the labels; -1 where there is none or it could be several.
+    ambiguous : tuple of str
+        Names that could be several labels, or share one with another name.
     """
     row = np.full(len(names), -1, np.int64)
     unclear: set[int] = set()
@@ -37,7 +36,7 @@ def match_labels(
                 row[left] = found[0]
             elif found:
                 unclear.update(rows)
-    return Matched(row, tuple(names[i] for i in sorted(unclear) if row[i] < 0))
+    return row, tuple(names[i] for i in sorted(unclear) if row[i] < 0)
 
 
 def unnamed(names: Iterable[str], labels: Iterable[str]) -> tuple[str, ...]:

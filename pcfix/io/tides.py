@@ -122,7 +122,7 @@ def _from_json(path: Path, labels: Sequence[str]) -> ImageTimes:
 
 def _rows(names: Sequence[str], labels: Sequence[str], source: Path) -> list[int]:
     """Return for each label the row of its name."""
-    rows: list[int] = match_labels(labels, names, one_to_one=False).row.tolist()
+    rows: list[int] = match_labels(labels, names, one_to_one=False)[0].tolist()
     missing = [label for label, row in zip(labels, rows, strict=True) if row < 0]
     if missing:
         sentence = f"{len(missing)} images are missing or have ambiguous names: {missing[0]}, ..."
@@ -238,6 +238,6 @@ def read_altitudes(cameras: File, labels: Sequence[str]) -> FloatArray:
                 with image.open("rb") as stream:
                     if above := _ABOVE.search(stream.read(HEAD_BYTES)):
                         found[image.name] = float(above[1])
-        row = match_labels(list(found), labels, one_to_one=False).row
+        row = match_labels(list(found), labels, one_to_one=False)[0]
         altitudes[row[row >= 0]] = np.array(list(found.values()))[row >= 0]
     return altitudes

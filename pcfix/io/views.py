@@ -273,7 +273,7 @@ def image_orders(raw: ViewList, cameras: Cameras) -> tuple[ImageOrder, ...]:
     for place in _PLACES:
         with suppress(InputError, OSError, struct.error, ValueError, IndexError, KeyError):
             for what, names in _orders(raw.path.parent / place):  # a damaged model is skipped
-                row = match_labels(names, cameras.labels).row.astype(np.int32)
+                row = match_labels(names, cameras.labels)[0].astype(np.int32)
                 unposed = tuple(name for name, r in zip(names, row, strict=True) if r < 0)
                 found.append(ImageOrder(what, row, unposed))
     found.append(ImageOrder("the cameras as given", np.arange(len(cameras), dtype=np.int32)))
