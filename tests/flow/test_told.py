@@ -21,7 +21,6 @@ from tests.utils.shared import ROOT, needs
 
 SCENE = ROOT / "samples" / "scene"
 BENT, bent = needs("rendered_c_free")
-TRUE, rendered = needs("rendered_a")
 OFFSET_M = (318700.0, 3851200.0, 0.0)
 LEVEL_M = 0.37
 TIES = 1000

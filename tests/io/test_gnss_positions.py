@@ -15,9 +15,8 @@ from tests.utils.codes import refused
 from tests.utils.reprojection import bring_to
 from tests.utils.shared import needs
 
-pytestmark = pytest.mark.quick_but("test_camera_files", "test_rendered", "test_samples")
+pytestmark = pytest.mark.quick_but("test_camera_files", "test_samples")
 
-FREE, free = needs("rendered_a_free")
 SAMPLES, samples = needs("cameras")
 
 XYZ = np.array([[500010.0, 4000010.0, 82.5], [500030.5, 4000020.25, 81.75]])
@@ -32,18 +31,6 @@ def write(tmp_path, text, name="gnss.csv"):
     path = tmp_path / name
     path.write_text(text)
     return path
-
-
-@free
-def test_rendered():
-    cameras = read_cameras(FREE / "sparse")
-    cameras = bring_to(cameras, "EPSG:32636", offset_m=(319900.0, 3842700.0, 0.0))
-    found, reason = gnss_in_frame_of(read_gnss(FREE / "gnss.csv", cameras))
-    apart = cameras.centres - found.xyz
-    # centres are 0.17 m out, and the GNSS 3 cm along each axis
-    assert np.sqrt((apart**2).sum(axis=1).mean()) == pytest.approx(0.17, abs=0.01)
-    assert (found.sigma_m == 0.03).all()
-    assert reason == ""
 
 
 @pytest.mark.parametrize(
@@ -86,17 +73,6 @@ def test_degrees(tmp_path):
     assert found.xyz == pytest.approx(XYZ, abs=1e-6)
     assert np.isnan(found.sigma_m).all()
     assert reason == ""
-
-
-def test_geo_txt(tmp_path):
-    rows = [
-        f"{n}.jpg {x!r} {y!r} {z!r} 0 0 0 0.02 0.05"
-        for n, (x, y, z) in zip("ab", degrees().tolist(), strict=True)
-    ]
-    path = write(tmp_path, "\n".join(["EPSG:4326", *rows]), "geo.txt")
-    found, _ = gnss_in_frame_of(read_gnss(path, block()))
-    assert found.xyz == pytest.approx(XYZ, abs=1e-6)
-    assert found.sigma_m.tolist() == [[0.02, 0.02, 0.05]] * 2
 
 
 def test_images_json(tmp_path):

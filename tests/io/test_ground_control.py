@@ -2,22 +2,19 @@
 
 import numpy as np
 import pytest
-from pyproj import CRS, Transformer
+from pyproj import Transformer
 
-from pcfix.errors import InputError, PcfixWarning
+from pcfix.errors import PcfixWarning
 from pcfix.io.cameras import read_cameras
 from pcfix.io.ground_control import read_ground_control
-from pcfix.lens.imaging import project
 from pcfix.model import Cameras, Lens
 from tests.utils.codes import refused, warned
 from tests.utils.reprojection import bring_to, check_file
 from tests.utils.shared import needs
 
-pytestmark = pytest.mark.quick_but("test_markers_of_metashape", "test_rendered")
+pytestmark = pytest.mark.quick_but("test_markers_of_metashape")
 
-FREE, free = needs("rendered_a_free")
 SOROLLA, sorolla = needs("cameras", "metashape", "uclm_sorolla")
-RIG, rig = needs("cameras", "metashape", "micasense_rig")
 
 LENS = Lens(1000.0, 1600.0, 1200.0, 800.0, 600.0)
 XYZ = {"G1": (500010.0, 4000010.0, 2.5), "G2": (500030.5, 4000020.25, -1.75)}
@@ -54,26 +51,6 @@ def fails(tmp_path, rows, code, more=None, **values):
     assert "gcps.csv" in str(error.value)
 
 
-@free
-def test_rendered():
-    cameras = read_cameras(FREE / "sparse")
-    cameras = bring_to(cameras, "EPSG:32636", offset_m=(319900.0, 3842700.0, 0.0))
-    with pytest.warns(PcfixWarning, match="names no CRS"):
-        found = read_ground_control(FREE / "gcps.csv", cameras)
-    lines = (FREE / "gcps.csv").read_text().splitlines()[1:]
-    assert found.names == tuple(f"G{i}" for i in range(1, 10))
-    assert len(found.point) == len(found.camera) == len(found.sigma_px) == len(lines)
-    assert found.xyz[0] == pytest.approx([319946.934, 3842803.007, 1.656], abs=0)
-    assert found.image_xy[0] == pytest.approx([622.633, 823.400], abs=0)
-    assert cameras.labels[found.camera[0]] == "A001.JPG"
-    # the block lies 19 GSD too low, and half of it is seen obliquely from 75 m
-    assert misses_px(found, cameras).max() < 40.0
-    assert found.sigma_m == pytest.approx(0.01)
-    assert found.sigma_px == pytest.approx(0.5)
-    assert not found.is_check.any()
-    assert not found.under_water.any()
-
-
 @sorolla
 @pytest.mark.filterwarnings("ignore::pcfix.errors.PcfixWarning")
 def test_markers_of_metashape():
@@ -91,15 +68,6 @@ def test_markers_of_metashape():
     here = {(cameras.labels[camera], *uv) for camera, uv in marks}
     listed = check_file(SOROLLA)["observations"]
     assert {(o["image"], round(o["u"], 1), round(o["v"], 1)) for o in listed} <= here
-
-
-def misses_px(found, cameras):
-    """Return how far from its mark each point is imaged."""
-    misses = []
-    for point, camera, uv in zip(found.point, found.camera, found.image_xy, strict=True):
-        ray = cameras.rotations[camera] @ (found.xyz[point] - cameras.centres[camera])
-        misses.append(np.hypot(*(project(cameras.lenses[camera], ray[None])[0] - uv)))
-    return np.array(misses)
 
 
 def test_disabled_markers(tmp_path):
@@ -147,6 +115,8 @@ def test_a_table(tmp_path):
     assert found.camera.tolist() == [0, 1, 1]
     assert found.image_xy.tolist() == [[100.0, 200.0], [1600.0, 0.0], [0.5, 1199.5]]
     assert found.crs == "EPSG:32636"
+    with warned("crs.assumed"):
+        assert read(tmp_path, *ROWS, crs=None).xyz.tolist() == found.xyz.tolist()
 
 
 def test_more_columns(tmp_path):
@@ -190,13 +160,6 @@ def test_longitude_and_latitude(tmp_path):
     with pytest.warns(PcfixWarning, match="vertical datum"):
         found = read_ground_control(path, block())
     assert found.xyz[0] == pytest.approx(XYZ["G1"], abs=2e-6)
-
-
-def test_missing_grid(tmp_path):
-    ellipsoidal = block(CRS("EPSG:32636").to_3d().to_wkt())
-    more = {"crs": "EPSG:32636+5773", "cameras": ellipsoidal}
-    with pytest.raises(InputError, match=r"us_nga_egm96_15.tif"):
-        read(tmp_path, *ROWS, **more)
 
 
 @pytest.mark.parametrize(

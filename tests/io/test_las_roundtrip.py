@@ -485,14 +485,6 @@ def test_fewer_dimensions(tmp_path: Path, number: int, dimensions: str, names: l
     assert not (tmp_path / "back.las").exists()
 
 
-def test_no_dimensions(tmp_path: Path) -> None:
-    source = write_cloud(tmp_path / "cloud.laz", 1, plain=True)
-    correct(source, tmp_path / "none.laz", dimensions="none")
-    none = read_raw(tmp_path / "none.laz")
-    assert none.points.shape[1] == 30
-    assert none.extra_bytes() == b""
-
-
 @pytest.mark.parametrize("deep_rows", ["all", "last"])
 def test_wide_shifts(tmp_path: Path, deep_rows: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pcfix.io.las.source.CHUNK_POINTS", 500)

@@ -25,11 +25,10 @@ from tests.utils.codes import refused
 from tests.utils.shared import needs
 
 pytestmark = pytest.mark.quick_but(
-    "test_any_gauge_zero", "test_exif", "test_heights_in_a_metashape_project", "test_odm_project"
+    "test_any_gauge_zero", "test_exif", "test_heights_in_a_metashape_project"
 )
 
 CAMERAS, real = needs("cameras")
-ODM, odm = needs("cameras/odm/testerarm_sub0")
 
 TIDE = """time,level_m
 2026-05-01T10:00:00Z,1.00
@@ -162,16 +161,6 @@ def test_times_of_other_software(tmp_path, name, content):
     zero = path.read_text().replace(str(1000.0 * NOON_S), "0").replace(str(NOON_S), "0")
     with refused("image_times.missing", images=["a"]):
         read_image_times(table(tmp_path, zero, name), ["a"])
-
-
-@odm
-def test_odm_project():
-    labels = list(json.loads((ODM / "opensfm/reconstruction.json").read_text())[0]["shots"])
-    names = ("images.json", "opensfm/reconstruction.json")
-    one, other = (read_image_times(ODM / name, labels).time_s for name in names)
-    assert one == pytest.approx(other, abs=1.0)  # whole seconds, or fractions of them
-    with refused("image_times.missing"):
-        read_image_times(ODM / "odm_report/shots.geojson", labels)  # of that version
 
 
 def test_inputs(tmp_path):

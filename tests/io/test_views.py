@@ -20,7 +20,6 @@ from tests.utils.codes import refused
 from tests.utils.shared import needs
 
 RENDERED, rendered = needs("rendered_a")
-FREE, free = needs("rendered_a_free")
 
 K = 8
 NAMES = tuple(f"img_{i}.JPG" for i in range(K))

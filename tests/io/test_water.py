@@ -12,9 +12,6 @@ from pcfix.io.scenes import write_scene
 from pcfix.io.water import MARGIN_M
 from pcfix.water.surface import surface_above
 from tests.utils.codes import refused, warned
-from tests.utils.shared import needs
-
-RIVER, river = needs("river")
 
 
 @pytest.mark.parametrize(
@@ -80,14 +77,6 @@ def test_ply(tmp_path, layout):
     mesh = pcfix.read_water(path)
     assert np.array_equal(mesh.vertices, vertices)
     assert mesh.triangles.tolist() == [[0, 1, 2]]
-
-
-@river
-def test_river_mesh():
-    mesh = pcfix.read_water(RIVER / "water_surface.obj")
-    assert mesh.vertices.shape == (22, 3)
-    assert mesh.triangles.shape == (31, 3)
-    assert mesh.vertices[0].tolist() == [338418.55069, 272913.3172, 174.798798]
 
 
 # Rasters

@@ -6,8 +6,7 @@ import warnings
 from typing import TYPE_CHECKING, Any
 
 import pcfix
-from pcfix.io.cameras import FORMATS, read_tie_points
-from pcfix.io.cameras.checks import Source
+from pcfix.io.cameras import read_tie_points
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -28,19 +27,6 @@ def read_ties(path: Path) -> TiePoints:
 def notes(cameras: Cameras) -> list[str]:
     """Return the codes of what was noted on reading."""
     return [note.code for note in cameras.notes]
-
-
-def is_of(path: Path, reader: Any) -> bool:
-    """Whether a reader is the first of all that knows a file."""
-    found = (form.reader for form in FORMATS if _knows(form.reader, Source(path)))
-    return next(found, None) is reader
-
-
-def _knows(reader: Any, source: Source) -> bool:
-    try:
-        return bool(reader.recognises(source))
-    except Exception:  # of a damaged file, which read_cameras passes on to the next reader
-        return False
 
 
 def brown(x: float, y: float, k: Any, p: Any = (0.0, 0.0)) -> tuple[float, float]:

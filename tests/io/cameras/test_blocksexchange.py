@@ -15,7 +15,6 @@ pytestmark = pytest.mark.quick_but(
     "test_fisheye", "test_local_frame_at_a_place_and_gnss", "test_perspective_lens"
 )
 
-PARIS, paris = needs("cameras", "blocksexchange", "paris_doc_example", "Paris2012_one_photo.xml")
 ENU, enu = needs("cameras", "blocksexchange", "goodale_enu_one_photo", "AT_one_photo.xml")
 
 TURN = Rotation.from_euler("XYZ", (178.0, 3.0, 40.0), degrees=True).as_matrix().T

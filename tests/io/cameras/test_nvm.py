@@ -11,8 +11,6 @@ from tests.utils.reprojection import tie_point_residuals_px
 
 pytestmark = pytest.mark.quick_but(
     "test_bundle",
-    "test_fixed_calibration",
-    "test_images_without_focal_length_have_no_pose",
     "test_matrix_and_translation",
     "test_places_from_the_corner",
     "test_pose_and_lens",

@@ -7,16 +7,11 @@ import pytest
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
-from pcfix.io.cameras import opensfm
-from pcfix.io.cameras.checks import Source
 from tests.utils.camera_files import read, read_ties
 from tests.utils.codes import refused
 from tests.utils.pose_files.block import axes_at
-from tests.utils.shared import needs
 
-pytestmark = pytest.mark.quick_but("test_old_project_turns_by_the_meridian_convergence")
-
-TESTERARM, on_testerarm = needs("cameras", "odm", "testerarm_sub0")
+pytestmark = pytest.mark.quick
 
 UTM15 = "+proj=utm +zone=15 +datum=WGS84 +units=m +no_defs +type=crs"
 CRS, EAST, NORTH = "EPSG:32632", 680000, 5210000  # 2.4 degrees east of the meridian
@@ -91,21 +86,6 @@ def project(tmp_path, **files):
         path.parent.mkdir(exist_ok=True)
         path.write_text(content if isinstance(content, str) else json.dumps(content))
     return tmp_path
-
-
-@on_testerarm
-def test_old_project_turns_by_the_meridian_convergence():
-    path = TESTERARM / "opensfm" / "reconstruction.json"
-    projected, plain = read(path), opensfm.read(Source(path))
-    assert (projected.crs, projected.project_crs) == (UTM15, None)
-    north = np.median(
-        [
-            a.T @ b @ [0.0, 1.0, 0.0]
-            for a, b in zip(projected.rotations, plain.rotations, strict=True)
-        ],
-        axis=0,
-    )
-    assert np.degrees(np.arctan2(north[0], north[1])) == pytest.approx(-0.7339, abs=1e-3)
 
 
 def test_whole_metres_in_the_crs_that_the_project_names(tmp_path):

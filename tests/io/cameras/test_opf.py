@@ -16,11 +16,7 @@ from tests.utils.pose_files.opf import FIRST_ID, Base
 from tests.utils.pose_files.opf import opf as write
 from tests.utils.reprojection import bring_to, tie_point_residuals_px
 
-pytestmark = pytest.mark.quick_but(
-    "test_heights_of_a_crs_without_them_are_ellipsoidal",
-    "test_refused",
-    "test_tracks_fall_where_the_images_saw_them",
-)
+pytestmark = pytest.mark.quick_but("test_refused", "test_tracks_fall_where_the_images_saw_them")
 
 RADIAL, T1, T2 = (-0.05, 0.02, -0.003), 0.004, -0.002
 POLYNOMIAL, AFFINE = (0.01, 1.0, 0.02, -0.1), (1810.0, 3.0, -2.0, 1800.0)

@@ -11,17 +11,13 @@ from tests.utils.codes import refused
 from tests.utils.shared import needs
 
 pytestmark = pytest.mark.quick_but(
-    "test_a_wrong_offset_is_noticed_and_the_absolute_table_believed",
     "test_all_tie_points_of_the_oblique_block",
     "test_distortion_is_in_the_order_of_opencv",
-    "test_external_table_with_the_only_calibration",
     "test_fisheye",
     "test_what_is_missing_is_told",
 )
 
 CA502, ca502 = needs("cameras", "pix4d", "ca502_oblique5")
-LOD3, lod3 = needs("cameras", "pix4d", "lod3_amsterdam")
-EASYIDP, easyidp = needs("cameras", "pix4d", "easyidp_pix4d_origin")
 
 HEADER = """fileName imageWidth imageHeight
 camera matrix K [3x3]

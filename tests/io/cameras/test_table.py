@@ -10,15 +10,9 @@ from tests.utils.camera_files import read
 from tests.utils.codes import refused, warned
 from tests.utils.shared import needs
 
-pytestmark = pytest.mark.quick_but(
-    "test_a_projection_that_is_none_is_noted", "test_river_keeps_cameras_that_share_a_label"
-)
+pytestmark = pytest.mark.quick_but("test_river_keeps_cameras_that_share_a_label")
 
-RENDERED, rendered = needs("rendered_a")
 RIVER, river = needs("river")
-METASHAPE, metashape = needs("cameras", "metashape_opk", "sfmrefract")
-ODM, odm = needs("cameras", "odm", "orthority_odm")
-PIX4D, pix4d = needs("cameras", "pix4d", "ca502_oblique5", "params")
 
 
 def write(tmp_path, text, sensor="focal,sensor_x,sensor_y\n8.8,13.2,8.8\n"):

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pyproj import CRS, Transformer
+from pyproj import CRS
 
 from pcfix.errors import InputError, SettingError
 from pcfix.io.cameras import read_cameras, read_tie_points
@@ -17,11 +17,7 @@ from pcfix.lens.imaging import project
 from pcfix.model import Lens, TiePoints, Views
 from tests.utils.blocks import PLAIN, small_block, some_ties
 from tests.utils.codes import refused
-from tests.utils.nightly import mostly_nightly
-from tests.utils.reprojection import bring_to, tie_point_residuals_px
-from tests.utils.shared import needs
-
-FREE, free = needs("rendered_a_free")
+from tests.utils.reprojection import bring_to
 
 FRAME = (1600.0, 1200.0, 810.0, 590.0)
 CENTRED = (1600.0, 1200.0, 800.0, 600.0)
@@ -153,26 +149,6 @@ def test_table_there_and_back(tmp_path, lenses, crs):
     check_block(found, cameras, 0.0)
 
 
-@free
-@pytest.mark.parametrize(
-    ("form", "places_m", "px"),
-    mostly_nightly([("colmap", 1e-9, 0.0), ("opensfm", 1e-4, 1e-4)], ("colmap", 1e-9, 0.0)),
-)
-def test_real_block_there_and_back(tmp_path, form, places_m, px):
-    offset = (319900.0, 3842700.0, 0.0)
-    cameras = read_cameras(FREE / "sparse")
-    ties = read_tie_points(FREE / "sparse", cameras)
-    cameras = bring_to(cameras, "EPSG:32636", offset_m=offset)
-    ties = replace(ties, xyz=ties.xyz + offset)
-    read = read_cameras(write(form, tmp_path, cameras, ties))
-    way, seen = georeference(read, "EPSG:32636"), read_tie_points(tmp_path, read)
-    found, seen = way.cameras(read), replace(seen, xyz=way.points(seen.xyz))
-    check_block(found, cameras, max(places_m, 3e-9), 1e-7)
-    check_ties(seen, ties, max(places_m, 3e-9), px)
-    before, after = (tie_point_residuals_px(*each) for each in ((cameras, ties), (found, seen)))
-    assert after == pytest.approx(before, abs=2e-4)
-
-
 def test_colmap_reads_it(tmp_path):
     pycolmap = pytest.importorskip("pycolmap")
     cameras = small_block(tuple(COLMAP_LENSES.values()), k=16)
@@ -199,27 +175,6 @@ def test_colmap_reads_it(tmp_path):
         rows = slice(*ties.views.start[i : i + 2])
         assert [camera for camera, _ in views] == ties.views.camera[rows].tolist()
         assert np.array([xy for _, xy in views]) == pytest.approx(ties.image_xy[rows], abs=0)
-
-
-def test_world_of_opensfm_is_topocentric(tmp_path):
-    cameras = small_block()
-    read = read_cameras(write("opensfm", tmp_path, cameras))
-    lla = json.loads((tmp_path / "reference_lla.json").read_text())
-    step = Transformer.from_pipeline(
-        f"+proj=topocentric +ellps=WGS84 +lat_0={lla['latitude']!r} +lon_0={lla['longitude']!r}"
-        f" +h_0={lla['altitude']!r}"
-    )
-    ecef = step.transform(*read.centres.T, direction="INVERSE")
-    to_map = Transformer.from_crs("EPSG:4978", CRS("EPSG:32636").to_3d(), always_xy=True)
-    assert np.column_stack(to_map.transform(*ecef)) == pytest.approx(cameras.centres, abs=1e-6)
-    # the axes at the origin, by differences over 100 m; those at a camera 100 m away differ by
-    # the curvature of the earth between the two, 100 m / 6400 km
-    steps = np.vstack([np.zeros(3), 100.0 * np.eye(3)])
-    there = np.column_stack(to_map.transform(*step.transform(*steps.T, direction="INVERSE")))
-    turn = (there[1:] - there[0]).T / 100.0
-    assert abs(turn[0, 1]) > 0.01  # the meridian convergence
-    u, _, v = np.linalg.svd(turn)
-    assert read.rotations == pytest.approx(cameras.rotations @ (u @ v), abs=3e-5)
 
 
 ODD = (
