@@ -1,7 +1,5 @@
 """MicMac's orientation folders."""
 
-from xml.etree import ElementTree
-
 import numpy as np
 import pytest
 
@@ -9,9 +7,6 @@ import pcfix
 from pcfix.lens.imaging import project, unproject
 from tests.utils.camera_files import brown
 from tests.utils.codes import refused
-from tests.utils.shared import needs
-
-LI3DS, li3ds = needs("cameras", "micmac", "li3ds")
 
 TURN = ((0.36, 0.48, -0.8), (-0.8, 0.6, 0.0), (0.48, 0.64, 0.6))
 POSE = (
@@ -46,23 +41,6 @@ def read(tmp_path, text, name="Orientation-a.jpg.xml"):
     path = tmp_path / name
     path.write_text(text)
     return pcfix.read_cameras(path)
-
-
-def verified(name):
-    """The built-in check of an orientation: how far its own points are from where we see them."""
-    root = ElementTree.parse(LI3DS / name).getroot()
-    cameras = pcfix.read_cameras(LI3DS / name)
-    seen = np.array([[float(v) for v in e.text.split()] for e in root.iter("Im")])
-    points = np.array([[float(v) for v in e.text.split()] for e in root.iter("Ter")])
-    rays = (points - cameras.centres[0]) @ cameras.rotations[0].T
-    return np.hypot(*(project(cameras.lenses[0], rays) - seen).T), cameras
-
-
-@li3ds
-def test_sample_is_reproduced_exactly():
-    misses, cameras = verified("Orientation-00.xml")
-    assert misses.max() < 1e-6
-    assert cameras.notes == ()
 
 
 def test_matrix_is_camera_to_world(tmp_path):
