@@ -38,7 +38,7 @@ References: "Agisoft Metashape User Manual, Professional Edition", appendix "Cam
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
@@ -118,27 +118,28 @@ def read_block(chunk: Chunk) -> Block:
     path, element = chunk.path, chunk.element
     images = _images(element)
     poses = _poses(path, images)
-    place_of, has_place = _places(path, element)
-    kept, why = [], Counter[str]()
+    of_components, has_place = _places(path, element)
+    kept, places, why = list[Image](), list[FloatArray](), Counter[str]()
     for image in images:
         kind = "frame" if image.sensor is None else kind_of(image.sensor)
+        place = of_components.get(image.component, of_components[None])
         if image.id not in poses:
             continue
         if image.element.get("enabled") == "false":
             why["aligned but disabled"] += 1
         elif kind not in PROJECTIONS:
             why[f"of a {kind} sensor, for which there is no lens"] += 1
-        elif place_of(image) is None:
+        elif place is None:
             why["in a component that has no transform to the frame of the others"] += 1
         else:
             kept.append(image)
+            places.append(place)
     said = [f"{count} images are {reason}" for reason, count in why.items()]
     if not kept:
         chunk_name = element.get("label") or "without a name"
         rest = ", ".join([f"{len(images) - len(poses)} are not aligned", *said])
         raise checks.no_pose(path, f"of the {len(images)} images of chunk {chunk_name} {rest}")
     notes = [note(path, "cameras.left_out", f"{one}; left out.") for one in said]
-    places = [place for image in kept if (place := place_of(image)) is not None]
     crs, project_crs, of_world = _world(path, element) if has_place else (LOCAL, None, ())
     in_world = np.array(places) @ np.array([poses[image.id] for image in kept])
     scales = np.cbrt(np.linalg.det(in_world[:, :3, :3]))[:, None, None]
@@ -211,12 +212,13 @@ def _poses(path: Path, images: list[Image]) -> dict[str, FloatArray]:
     return poses
 
 
-def _places(path: Path, chunk: Element) -> tuple[Callable[[Image], FloatArray | None], bool]:
-    """Return the way of an image to the world (None: it has no place there), and if there is one.
+def _places(path: Path, chunk: Element) -> tuple[dict[str | None, FloatArray | None], bool]:
+    """Return the matrix of each component to the world, or None, and whether any has one.
 
-    Every component has a frame of its own. One with a transform has a place in the world; one
-    without has that of the chunk when it is the active or only one, as the chunk's transform is
-    that of its active component. Where none has a place, the world is the frame of the chunk.
+    The key None is for images in no component. Every component has its own frame. One with a
+    transform has a place in the world; one without has that of the chunk when it is the active or
+    only one, as the chunk's transform is that of its active component. Where none has a place, the
+    world is the frame of the chunk.
     """
     of_chunk = _similarity(path, chunk.find("transform"))
     components = chunk.findall("components/component")
@@ -226,13 +228,10 @@ def _places(path: Path, chunk: Element) -> tuple[Callable[[Image], FloatArray | 
     main = active if active in own else next(iter(own), None)
     has_place = of_chunk is not None or any(place is not None for place in own.values())
     of_main = of_chunk if has_place else np.eye(4)
-
-    def place_of(image: Image) -> FloatArray | None:
-        is_main = image.component in (None, main) or image.component not in own
-        component = own.get(image.component)
-        return of_main if component is None and is_main else component
-
-    return place_of, has_place
+    if own.get(main) is None:
+        own[main] = of_main
+    own[None] = of_main
+    return own, has_place
 
 
 def _similarity(path: Path, element: Element | None) -> FloatArray | None:
