@@ -98,80 +98,37 @@ Progress = Callable[[LogRow], None]
 
 @dataclass(frozen=True, eq=False)
 class Conditions:
-    """Points that lie on the water or on planes, and which planes are parallel.
+    """Points that lie on the water or on planes, and which planes are parallel."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Names of the planes.
-    on : array of int, shape (m,)
-        0 on the water, i + 1 on plane i, -1 on no surface.
-    sigma_m : array, shape (m,)
-        Standard deviation of the distance from the surface.
-    parallel : tuple of str
-        Names of parallel planes, `WATER` possibly among them.
-    """
-
-    names: tuple[str, ...]
-    on: IntArray
-    sigma_m: FloatArray
-    parallel: tuple[str, ...] = ()
+    names: tuple[str, ...]  # of the planes
+    on: IntArray  # (m,), 0 on the water, i + 1 on plane i, -1 on no surface
+    sigma_m: FloatArray  # (m,), of the distance from the surface
+    parallel: tuple[str, ...] = ()  # names of parallel planes, perhaps with `WATER`
 
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Images, points and measurements.
+    """Images, points and measurements."""
 
-    Attributes
-    ----------
-    cameras : Cameras
-        Start values of the exterior and interior orientation.
-    xyz : array, shape (m, 3)
-        Start values of the true points.
-    start : array of int, shape (m + 1,)
-        The observations of point i are ``start[i]:start[i + 1]``.
-    camera : array of int, shape (o,)
-        Row of the cameras.
-    image_xy : array, shape (o, 2)
-        Image coordinates in the unit of the lens, from the upper left corner.
-    sigma_px : array, shape (o,)
-        Standard deviation of u and v; infinite for observations without weight.
-    water : WaterPlane, WaterMesh, WaterRaster or None
-        None for a block without water.
-    refractive_index : float
-    wet : array of bool, shape (m,)
-        Points that may be under water; they are refracted while they lie below the surface.
-    surveyed_xyz, surveyed_sigma_m : array, shape (m, 3)
-        Surveyed coordinates of control points; NaN and infinite for other points.
-    gnss_xyz, gnss_sigma_m : array, shape (k, 3)
-        GNSS positions of the projection centres; NaN and infinite where there is none.
-    port : Port or None
-        A housing port as the refracting surface, instead of water.
-    control_names : tuple of str
-        Names of the surveyed points, which are the last points of `xyz`.
-    is_check : array of bool, shape (len(control_names),)
-        Check points: surveyed points that are withheld from the adjustment.
-    conditions : Conditions or None
-        Points that lie on a surface.
-    """
-
-    cameras: Cameras
-    xyz: FloatArray
-    start: IntArray
-    camera: IntArray
-    image_xy: FloatArray
-    sigma_px: FloatArray
-    water: WaterSurface | None
+    cameras: Cameras  # start values of the exterior and interior orientation
+    xyz: FloatArray  # (m, 3), start values of the true points
+    start: IntArray  # (m + 1,), the observations of point i are start[i]:start[i + 1]
+    camera: IntArray  # (o,), row of the cameras
+    image_xy: FloatArray  # (o, 2), in the unit of the lens, from the upper left corner
+    sigma_px: FloatArray  # (o,), of u and v; infinite for observations without weight
+    water: WaterSurface | None  # None for a block without water
     refractive_index: float
+    # (m,), points that may be under water; refracted while they are below the surface
     wet: BoolArray
-    surveyed_xyz: FloatArray
-    surveyed_sigma_m: FloatArray
-    gnss_xyz: FloatArray
-    gnss_sigma_m: FloatArray
-    port: Port | None = None
-    control_names: tuple[str, ...] = ()
+    surveyed_xyz: FloatArray  # (m, 3), of control points; NaN for other points
+    surveyed_sigma_m: FloatArray  # (m, 3), infinite for other points
+    gnss_xyz: FloatArray  # (k, 3), of the projection centres; NaN if unknown
+    gnss_sigma_m: FloatArray  # (k, 3), infinite if unknown
+    port: Port | None = None  # a housing port as the refracting surface, instead of water
+    control_names: tuple[str, ...] = ()  # of the surveyed points, the last ones of `xyz`
+    # of them, not used in the adjustment
     is_check: BoolArray = field(default_factory=lambda: np.zeros(0, np.bool_))
-    conditions: Conditions | None = None
+    conditions: Conditions | None = None  # points on surfaces
 
     @property
     def owner(self) -> IntArray:
@@ -202,38 +159,20 @@ def inverse_variances(values: FloatArray, sigma: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Unknowns:
-    """What may move: a standard deviation of zero fixes a parameter, infinity frees it.
+    """What may move: a standard deviation of zero fixes a parameter, infinity frees it."""
 
-    Attributes
-    ----------
-    poses : {"free", "fixed", "similarity"}
-        `similarity` shifts, turns and scales all poses together.
-    fixed_images : tuple of str
-        Labels of images whose pose is fixed.
-    lens : tuple of str
-        Free parameters of each sensor: f, cx, cy, b1, b2, k1 ... k8, p1, p2.
-    lens_sigma : dict
-        Standard deviations of some of them about their start values, in their unit.
-    level_sigma_m, tilt_sigma, index_sigma, shape_sigma : float
-        Of the water level, its slopes, the refractive index, and its curvature terms (1/m).
-    distance_sigma_m, centre_sigma_m : float
-        Of the distance of a flat port, and of the centre of a dome.
-    free_network : bool
-        Take the datum from the start values: mean position, direction and scale of the projection
-        centres stay.
-    """
-
-    poses: Poses = "free"
-    fixed_images: tuple[str, ...] = ()
-    lens: tuple[str, ...] = ("f",)
+    poses: Poses = "free"  # `similarity` shifts, turns and scales all poses together
+    fixed_images: tuple[str, ...] = ()  # labels of images whose pose is fixed
+    lens: tuple[str, ...] = ("f",)  # free of each sensor: f, cx, cy, b1, b2, k1 ... k8, p1, p2
+    # standard deviations of some of them, in their unit
     lens_sigma: dict[str, float] = field(default_factory=dict)
     level_sigma_m: float = 0.0
     tilt_sigma: float = 0.0
     index_sigma: float = 0.0
-    free_network: bool = False
-    shape_sigma: float = 0.0
-    distance_sigma_m: float = 0.0
-    centre_sigma_m: float = 0.0
+    free_network: bool = False  # mean position, direction and scale of the centres stay
+    shape_sigma: float = 0.0  # of the curvature terms, 1/m
+    distance_sigma_m: float = 0.0  # of a flat port
+    centre_sigma_m: float = 0.0  # of the centre of a dome
 
     @property
     def water_sigma(self) -> tuple[float, ...]:
@@ -368,43 +307,21 @@ def plain_block(
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """Everything a block is made of, besides its tie points.
+    """Everything a block is made of, besides its tie points."""
 
-    Attributes
-    ----------
-    name : str
-        Camera file, for messages.
-    original : Cameras
-        As they were read, with angles and lenses.
-    water, refractive_index, port
-        See `Block`.
-    gnss : GnssPositions or None
-        In the frame of the block, with standard deviations.
-    control : GroundControl or None
-        Check points among them get no weight.
-    calibrated : Lens or None
-        Replaces the lenses of the cameras.
-    inside : callable or None
-        Whether points, given x and y, may be under water; everywhere without it.
-    level_sigma_m : float
-        Standard deviation of the water level; infinite if it is free.
-    no_gnss : str
-        Why GNSS positions of the camera file are not used.
-    parallel : tuple of str
-        Parallel planes on which control points lie, possibly with the water.
-    """
-
-    name: str
-    original: Cameras
+    name: str  # camera file, for messages
+    original: Cameras  # as they were read, with angles and lenses
     water: WaterSurface | None
     refractive_index: float
-    gnss: GnssPositions | None = None
-    control: GroundControl | None = None
+    gnss: GnssPositions | None = None  # in the frame of the block
+    control: GroundControl | None = None  # with check points, which get no weight
     port: Port | None = None
-    calibrated: Lens | None = None
+    calibrated: Lens | None = None  # replaces the lenses of the cameras
+    # Whether points, by x and y, may be under water; everywhere without it.
     inside: Callable[[FloatArray, FloatArray], BoolArray] | None = None
-    level_sigma_m: float = 0.0
-    no_gnss: str = ""
+    level_sigma_m: float = 0.0  # infinite if the level is free
+    no_gnss: str = ""  # why GNSS positions of the camera file are not used
+    # parallel planes on which control points lie, perhaps with the water
     parallel: tuple[str, ...] = ()
 
 

@@ -133,29 +133,14 @@ EXPORTS = {
 
 @dataclass(frozen=True)
 class Sign:
-    """One statistic.
+    """One statistic."""
 
-    Attributes
-    ----------
-    name : str
-        A key of `SENTENCES`.
-    figures : dict
-    speaks : bool or None
-        Whether it says that refraction was absorbed; None if it says nothing.
-    size_m : float or None
-        The likely error in metres.
-    basis : str
-        Which error that is.
-    why : str
-        Why it says nothing, if its figures are unknown.
-    """
-
-    name: str
+    name: str  # a key of `SENTENCES`
     figures: dict[str, float]
-    speaks: bool | None
-    size_m: float | None = None
-    basis: str = ""
-    why: str = ""
+    speaks: bool | None  # whether it says that refraction was absorbed; None if it says nothing
+    size_m: float | None = None  # likely error
+    basis: str = ""  # which error that is
+    why: str = ""  # why it says nothing, if its figures are unknown
 
     @property
     def words(self) -> str:
@@ -466,40 +451,21 @@ def focal_sign(focal: FloatArray, calibrated: FloatArray, height_m: float) -> Si
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What the signs are looked for in.
+    """What the signs are looked for in."""
 
-    Attributes
-    ----------
-    cameras : Cameras
-        In the cloud's CRS, with the GNSS positions to compare with.
-    name : str
-        Of their file, for messages.
-    view : pcfix.flow.surfaces.CloudView or None
-        Of the cloud, for points that stand for tie points, and heights at surveyed places.
-    calibrated : dict
-        Focal length over width of the image, by the name of the sensor; "" is any.
-    reference : or None
-        A survey of land and bed, with `xyz` and `sparse` (single points instead of a surface).
-    gnss : GnssPositions or None
-        In the frame of the cameras, NaN where there is none.
-    neighbours : Sign or None
-        Of `neighbours_sign`.
-    in_passing : bool
-        Whether nobody asked, so that it must be quick.
-    """
-
-    cameras: Cameras
-    name: str
+    cameras: Cameras  # in the cloud's CRS, with the GNSS positions to compare with
+    name: str  # of their file, for messages
     water: WaterSurface
     refractive_index: float
     ties: TiePoints | None = None
-    view: Any = None
+    view: Any = None  # a `pcfix.flow.surfaces.CloudView`, for heights and in place of tie points
     control: GroundControl | None = None
+    # focal length over width of the image, by sensor; "" is any
     calibrated: dict[str, float] | None = None
-    reference: Any = None
-    gnss: GnssPositions | None = None
-    neighbours: Sign | None = None
-    in_passing: bool = False
+    reference: Any = None  # a survey of land and bed, with `xyz` and `sparse`
+    gnss: GnssPositions | None = None  # in the frame of the cameras, NaN if unknown
+    neighbours: Sign | None = None  # of `neighbours_sign`
+    in_passing: bool = False  # whether it must be quick
 
     @property
     def has_height(self) -> bool:

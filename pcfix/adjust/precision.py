@@ -71,33 +71,17 @@ class SharedUnknown(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Precision:
-    """The precision of an adjustment with k cameras, m points and g shared unknowns.
+    """The precision of an adjustment with k cameras, m points and g shared unknowns."""
 
-    Attributes
-    ----------
-    sigma0 : float
-        A-posteriori standard deviation of unit weight by which the covariances are scaled.
-    pose_covariance : array, shape (k, 6, 6)
-        Of a small rotation about the axes of the camera's frame (radians) and of the projection
-        centre in the world frame (metres). Zero if the pose is fixed.
-    shared : tuple of SharedUnknown, length g
-    correlation : array, shape (g, g)
-        Of the shared unknowns.
-    point_covariance_m2 : array, shape (m, 6), or None
-        xx, xy, xz, yy, yz, zz, world frame; NaN for points that their observations do not fix.
-        None for very large blocks.
-    notes : tuple of PcfixWarning
-    members : Members or None
-        Drawn from the joint covariance of poses, lens and water; None for very large blocks.
-    """
-
-    sigma0: float
+    sigma0: float  # a-posteriori standard deviation of unit weight, which scales the covariances
+    # (k, 6, 6), rotation in the camera frame (rad), centre in the world (m); zero if fixed
     pose_covariance: FloatArray
     shared: tuple[SharedUnknown, ...]
-    correlation: FloatArray
+    correlation: FloatArray  # (g, g), of the shared unknowns
+    # (m, 6), xx, xy, xz, yy, yz, zz; NaN if not determined, None for very large blocks
     point_covariance_m2: FloatArray | None
     notes: tuple[PcfixWarning, ...] = ()
-    members: Members | None = None
+    members: Members | None = None  # drawn from the joint covariance; None for very large blocks
 
     @property
     def centre_sigma_m(self) -> FloatArray:
@@ -346,33 +330,18 @@ SAME_M, SAME_FOCAL = 1e-3, 1e-6
 class Members:
     """Corrections of m members of an ensemble to the k cameras of a block and to its water.
 
-    Attributes
-    ----------
-    labels : tuple of str, length k
-    centres : array, shape (k, 3)
-    focal : array, shape (k,)
-        Of the adjusted block, to recognise it.
-    turn : array, shape (m, k, 3)
-        About the axes of each camera's frame, rotation vectors, radians.
-    shift_m : array, shape (m, k, 3)
-        Of the centres, along the same axes.
-    lens_names : tuple of str, length p
-    lens : array, shape (m, k, p)
-        Added to these parameters.
-    water : array, shape (m, 7), or (m, 4) for a plane
-        Added to the height of the water below the mean of the centres, to its slopes along x and
-        y, to the refractive index, and to d, e, f of d x^2 + e x y + f y^2 about there; zero for
-        what was fixed.
+    Those of the water are added to its height below the mean of the centres, its slopes along x and
+    y, the refractive index, and d, e, f of d x^2 + e x y + f y^2 about there; zero if fixed.
     """
 
-    labels: tuple[str, ...]
-    centres: FloatArray
-    focal: FloatArray
-    turn: FloatArray
-    shift_m: FloatArray
-    lens_names: tuple[str, ...]
-    lens: FloatArray
-    water: FloatArray
+    labels: tuple[str, ...]  # length k
+    centres: FloatArray  # (k, 3), of the adjusted block, to recognise it
+    focal: FloatArray  # (k,), the same
+    turn: FloatArray  # (m, k, 3), rotation vectors in the frame of each camera, radians
+    shift_m: FloatArray  # (m, k, 3), of the centres, along the same axes
+    lens_names: tuple[str, ...]  # length p
+    lens: FloatArray  # (m, k, p), added to these parameters
+    water: FloatArray  # (m, 7), or (m, 4) for a plane
 
     def __len__(self) -> int:
         return len(self.turn)

@@ -63,34 +63,16 @@ MARGIN = 0.2
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A block prepared for the solver.
-
-    Attributes
-    ----------
-    block : Block
-    unknowns : Unknowns
-    origin : array, shape (3,)
-        Of the coordinates in `given` and in states.
-    given : Given
-        What the kernels need.
-    groups : list of list of int
-        Rows of the cameras of each sensor.
-    codes : list of tuple of int
-        Free lens parameters of each sensor.
-    moves : array of bool, shape (6 k + g,)
-        Which of the poses and shared unknowns are free.
-    names : list of str
-        Names of the shared unknowns.
-    """
+    """A block prepared for the solver."""
 
     block: Block
     unknowns: Unknowns
-    origin: FloatArray
-    given: Given
-    groups: list[list[int]]
-    codes: list[tuple[int, ...]]
-    moves: BoolArray
-    names: list[str]
+    origin: FloatArray  # (3,), of the coordinates in `given` and in states
+    given: Given  # what the kernels need
+    groups: list[list[int]]  # rows of the cameras of each sensor
+    codes: list[tuple[int, ...]]  # free lens parameters of each sensor
+    moves: BoolArray  # (6 k + g,), which poses and shared unknowns are free
+    names: list[str]  # of the shared unknowns
 
     @property
     def used(self) -> BoolArray:

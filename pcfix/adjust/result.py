@@ -80,67 +80,30 @@ class OnSurface(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Adjusted:
-    """An adjusted block.
+    """An adjusted block."""
 
-    Attributes
-    ----------
-    block : Block
-        As it was given, with the original cameras.
-    unknowns : Unknowns
-        What was free.
-    cameras : Cameras
-        Adjusted, in the same order and frame.
-    water : WaterSurface or None
-    refractive_index : float
-    xyz : array, shape (m, 3)
-        Adjusted true points, metres.
-    residual_px : array, shape (o, 2)
-        Measured minus computed; NaN if a camera does not image its point.
-    used : array of bool, shape (o,)
-        Observations that are not outliers.
-    is_wet : array of bool, shape (m,)
-        Points below the water; behind a port all of them.
-    sigma0 : float
-        A-posteriori standard deviation of unit weight.
-    redundancy : int
-        Observations, including those of the unknowns, minus unknowns.
-    rounds : list of LogRow
-    source : {"tie points", "cloud"}
-        What was observed: measured tie points, or images of the apparent cloud.
-    precision : Precision or None
-    gnss_residual_m : array, shape (k, 3)
-        Adjusted projection centres minus GNSS positions; NaN where there is none.
-    control : list of ControlRow
-    notes : list of PcfixWarning
-    origin, numbers : array
-        Origin of the block's frame, and `pcfix.adjust.collinearity.State.water` there.
-    port : Port or None
-        Adjusted.
-    on_surfaces : list of OnSurface
-        Of points that lie on the water or on planes.
-    """
-
-    block: Block
-    unknowns: Unknowns
-    cameras: Cameras
+    block: Block  # as it was given, with the original cameras
+    unknowns: Unknowns  # what was free
+    cameras: Cameras  # adjusted, in the same order and frame
     water: WaterSurface | None
     refractive_index: float
-    xyz: FloatArray
+    xyz: FloatArray  # (m, 3), adjusted true points, metres
+    # (o, 2), measured minus computed; NaN if a camera does not image its point
     residual_px: FloatArray
-    used: BoolArray
-    is_wet: BoolArray
-    sigma0: float
-    redundancy: int
+    used: BoolArray  # (o,), observations that are not outliers
+    is_wet: BoolArray  # (m,), points below the water; behind a port all of them
+    sigma0: float  # a-posteriori standard deviation of unit weight
+    redundancy: int  # observations, with those of the unknowns, minus unknowns
     rounds: list[LogRow]
-    source: Source
+    source: Source  # what was observed: tie points, or images of the apparent cloud
     precision: Precision | None
-    gnss_residual_m: FloatArray
+    gnss_residual_m: FloatArray  # (k, 3), adjusted centres minus GNSS positions; NaN if unknown
     control: list[ControlRow]
     notes: list[PcfixWarning]
-    origin: FloatArray
-    numbers: FloatArray
-    port: Port | None = None
-    on_surfaces: list[OnSurface] = field(default_factory=list)
+    origin: FloatArray  # of the block's frame
+    numbers: FloatArray  # `pcfix.adjust.collinearity.State.water` there
+    port: Port | None = None  # adjusted
+    on_surfaces: list[OnSurface] = field(default_factory=list)  # points on the water or on planes
 
     @property
     def is_observed(self) -> BoolArray:

@@ -156,22 +156,12 @@ def _intersect(
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Original and adjusted cameras of the same k images, row by row.
+    """Original and adjusted cameras of the same k images, row by row."""
 
-    Attributes
-    ----------
-    original, adjusted : Cameras
-        In the cloud's CRS, with angles and lenses; both lenses of an image in one unit.
-    row : array, shape (o,)
-        The row here of each of the original cameras as read, -1 if it was not adjusted.
-    left_out : tuple of str
-        Images of the original model that were not adjusted.
-    """
-
-    original: Cameras
-    adjusted: Cameras
-    row: IntArray
-    left_out: tuple[str, ...]
+    original: Cameras  # in the cloud's CRS, with angles and lenses
+    adjusted: Cameras  # the same; both lenses of an image have one unit
+    row: IntArray  # (o,), row here of each original camera as read, -1 if it was not adjusted
+    left_out: tuple[str, ...]  # images of the original model that were not adjusted
 
 
 def pair_of(original: Cameras, adjusted: Cameras, place: IntArray) -> Pair:
