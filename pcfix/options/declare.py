@@ -45,57 +45,29 @@ Set = TypeVar("Set", bound="OptionSet")
 
 
 class Option(NamedTuple):
-    """An option of a class.
-
-    Attributes
-    ----------
-    name, type, default
-        As those of its field.
-    home : type
-        The class that declares it.
-    basic : bool
-        Whether most people need it; ``--help`` of a command with many options shows no others.
-    least, above, most : float or None
-        Limits of a number, or of each of several; `above` itself is not allowed.
-    needed, instead : str
-        ``"needed"`` if it must be given, with when not, and another option that can replace it.
-    with_cameras : bool
-        Whether it has no effect without cameras.
-    needs : str
-        Another option without which this one has no effect, or one and the value that it must have:
-        ``"method factor"``.
-    requires : tuple of str
-        Options that must be given with it; of ``"cameras or gsd"`` exactly one.
-    parse, then : callable or None
-        Returns the value, given the option's name and a text; returns what the program uses, given
-        a value of the right type.
-    metavar, panel : str
-        Placeholder of the value, and panel of the help if it is not that of the class.
-    off : bool
-        Whether ``--no-NAME`` is a flag too; a switch that is on always has one.
-    writes : bool
-        Whether it names an output.
-    """
+    """An option of a class; name, type and default are those of its field."""
 
     name: str
     type: Any
     default: Any
-    home: type
+    home: type  # the class that declares it
+    # whether most people need it; --help of a command with many options shows no others
     basic: bool = False
-    least: float | None = None
-    above: float | None = None
+    least: float | None = None  # limit of a number, or of each of several
+    above: float | None = None  # the same, but this value itself is not allowed
     most: float | None = None
-    needed: str = ""
-    instead: str = ""
-    with_cameras: bool = False
-    needs: str = ""
+    needed: str = ""  # "needed" if it must be given, with when not
+    instead: str = ""  # another option that can replace it
+    with_cameras: bool = False  # whether it has no effect without cameras
+    needs: str = ""  # option without which it has no effect, or with which value: "method factor"
+    # options that must be given with it; of "cameras or gsd" exactly one
     requires: tuple[str, ...] = ()
-    parse: Callable[[str, str], Any] | None = None
-    then: Callable[[Any], Any] | None = None
-    metavar: str = ""
-    panel: str = ""
-    off: bool = False
-    writes: bool = False
+    parse: Callable[[str, str], Any] | None = None  # the value, by the option's name and a text
+    then: Callable[[Any], Any] | None = None  # what the program uses, by a value of the right type
+    metavar: str = ""  # placeholder of the value
+    panel: str = ""  # of the help, if it is not that of the class
+    off: bool = False  # whether --no-NAME is a flag too; a switch that is on always has one
+    writes: bool = False  # whether it names an output
 
     @property
     def _text(self) -> str:
