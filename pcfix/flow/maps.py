@@ -18,8 +18,8 @@ from pcfix.flow.runner import Progress
 from pcfix.flow.shore import shoreline_layer
 from pcfix.flow.surfaces import points_of, view_of
 from pcfix.grid.colours import relief_colours
-from pcfix.grid.contours import contours, depth_interval
 from pcfix.grid.lattice import Lattice, Window, round_resolution
+from pcfix.grid.maps import contours, depth_interval
 from pcfix.grid.model import hillshade
 from pcfix.grid.shoreline import NearWater
 from pcfix.io import rasters

@@ -27,8 +27,7 @@ from pcfix.lens.imaging import unproject
 from pcfix.model import Cameras, FloatArray, Lens, WaterDimension
 from pcfix.options.declare import File, taken
 from pcfix.options.photos import PhotosOptions
-from pcfix.photos.ground import Ground, ground_of
-from pcfix.photos.mapping import Photo, Scene, exact, nodes_of, paper, resample
+from pcfix.photos.mapping import Ground, Photo, Scene, exact, ground_of, nodes_of, paper, resample
 from pcfix.running import current, threads
 from pcfix.version import __version__
 from pcfix.water.checks import check_above_water

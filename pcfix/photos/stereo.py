@@ -18,8 +18,7 @@ import numpy.typing as npt
 from pcfix.errors import GeometryError
 from pcfix.lens.imaging import project, unproject
 from pcfix.model import BoolArray, FloatArray, IntArray
-from pcfix.photos.ground import Ground
-from pcfix.photos.mapping import Photo
+from pcfix.photos.mapping import Ground, Photo
 
 PARTNERS = 4
 BASE_SHARES = (0.1, 0.3, 0.55)

@@ -12,8 +12,7 @@ import numpy as np
 
 from pcfix.adjust.result import nice_step
 from pcfix.grid.colours import HEIGHT, stops_of
-from pcfix.grid.contours import contours, depth_interval
-from pcfix.grid.maps import Maps, smoothed
+from pcfix.grid.maps import Maps, contours, depth_interval, smoothed
 from pcfix.grid.model import NO_LIGHT, hillshade
 from pcfix.model import FloatArray
 

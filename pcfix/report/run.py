@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.grid.colours import DEPTH, DIFFERENCE, HEIGHT, RAYS, UNCERTAINTY
-from pcfix.grid.contours import contours, depth_interval
-from pcfix.grid.maps import Extent, Maps
+from pcfix.grid.maps import Extent, Maps, contours, depth_interval
 from pcfix.model import Cameras, FloatArray, WaterPlane, WaterSurface
 from pcfix.refract.tally import COVERAGE_95, ORDERS, Summary, largest_tvu_m
 from pcfix.report.comparison import noise_sentence, raw_of, signed

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pcfix.grid.contours import contours, depth_interval
+from pcfix.grid.maps import contours, depth_interval
 
 pytestmark = pytest.mark.quick
 

@@ -7,8 +7,7 @@ pytest.importorskip("cv2", reason="photographs need the extra 'photos'")
 
 from pcfix.lens.rotations import from_yaw_pitch_roll
 from pcfix.model import Lens, WaterPlane
-from pcfix.photos.ground import Ground
-from pcfix.photos.mapping import Photo, Scene, exact, nodes_of, paper, resample
+from pcfix.photos.mapping import Ground, Photo, Scene, exact, nodes_of, paper, resample
 from tests.utils.renderer import Relief, Texture, rendered
 
 LENS = Lens(600.0, 480, 360, 243.0, 178.0)

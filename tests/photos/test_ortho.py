@@ -10,8 +10,7 @@ import rasterio
 
 import pcfix
 from pcfix.model import WaterPlane
-from pcfix.photos.ground import Ground
-from pcfix.photos.mapping import Photo, Scene
+from pcfix.photos.mapping import Ground, Photo, Scene
 from pcfix.photos.ortho import Picture, mosaic, picture_of, seen_at
 from tests.photos.test_mapping import GSD_M, LEVEL_M, displacement_px, photo, relief
 from tests.utils.codes import warned

@@ -15,7 +15,7 @@ import pcfix
 from pcfix.errors import SettingError
 from pcfix.flow.rebuild import round_of
 from pcfix.io.las.writing import write_points
-from pcfix.photos.ground import Ground
+from pcfix.photos.mapping import Ground
 from pcfix.photos.stereo import Grey, pairs_of, stereo_cloud
 from tests.photos.test_mapping import GSD_M, photo, relief
 from tests.utils.codes import refused, warned

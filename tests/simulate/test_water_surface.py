@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from pcfix.model import WaterPlane
-from pcfix.simulate.tracing import Water, Waves, bed_points
+from pcfix.simulate.tracing import Water, Waves
+from tests.utils.bed_rays import bed_points
 from tests.utils.twins import bend, light_path
 
 N = 1.34

@@ -11,7 +11,8 @@ from scipy.optimize import brentq, minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from pcfix.model import Cameras, Lens
-from pcfix.simulate.tracing import bed_points, piercing_points_of_planes
+from pcfix.simulate.tracing import piercing_points_of_planes
+from tests.utils.bed_rays import bed_points
 
 LENS = Lens(3600.0, 5472.0, 3648.0, 2736.0, 1824.0)
 DOWN = np.diag([1.0, -1.0, -1.0])

@@ -34,7 +34,8 @@ import numpy as np
 from pcfix.model import Cameras, FloatArray, IntArray, Lens
 from pcfix.simulate.scene import Part
 from pcfix.simulate.sight import Sight
-from pcfix.simulate.tracing import bed_points, piercing_points_of_planes, project, rotations_of
+from pcfix.simulate.tracing import piercing_points_of_planes, project, rotations_of
+from tests.utils.bed_rays import bed_points
 from tests.utils.matchers.pairs import Partners
 
 AVERAGED_WITHIN = 0.012
