@@ -120,20 +120,6 @@ def test_depth_maps():
     assert 0.3 < ratio.min() < np.median(ratio) < 1 / 1.34
 
 
-def test_neighbours():
-    scene = matched_scene(300, cloud="depth-maps", forward_overlap=0.9)
-    best = scene.neighbours[:, 0]
-    assert (best >= 0).all()
-    centres = scene.true_cameras.centres
-    base = np.linalg.norm(centres - centres[best], axis=1)
-    # to the middle of the depths, 85 m below the flight
-    assert 6.0 < np.degrees(2 * np.arctan(np.median(base) / 2 / 85.0)) < 14.0
-    for k, row in enumerate(scene.neighbours):
-        known = row[row >= 0]
-        assert k not in known
-        assert len(set(known)) == len(known)
-
-
 def test_pose_noise():
     scene = pcfix.simulate_scene(
         20, block="oblique", position_noise_m=0.2, attitude_noise_deg=0.3, lidar_per_m2=0
