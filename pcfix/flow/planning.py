@@ -323,9 +323,11 @@ def _scanned(
         squares = Squares(PATCH_WIDTH * (float(np.median(above)) if len(above) else HEIGHT_M))
 
     def every(step: int, row: int, points: Points) -> Batch:
-        rows = np.arange(-row % step, len(points.xyz), step)
-        rows = rows[~np.isin(points.classes[rows], NOISE_CLASSES)]
-        return batch_of(points.take(rows), survey, plan.original)
+        some = points.take(slice(-row % step, None, step))
+        noise = np.isin(some.classes, NOISE_CLASSES)
+        if noise.any():
+            some = some.take(np.flatnonzero(~noise))
+        return batch_of(some, survey, plan.original)
 
     taken, row = list[Batch](), 0
     for points in chunks():

@@ -52,7 +52,9 @@ class Points(NamedTuple):
     def take(self, rows: IntArray | slice) -> Points:
         """Return some of the points."""
         some: dict[str, Any] = {
-            name: one[rows] for name, one in self._asdict().items() if isinstance(one, np.ndarray)
+            name: np.ascontiguousarray(one[rows])
+            for name, one in self._asdict().items()
+            if isinstance(one, np.ndarray)
         }
         if self.colours is not None:
             some["colours"] = tuple(one[rows] for one in self.colours)
