@@ -151,27 +151,17 @@ def _intersect(
     return False
 
 
-# Pairs of models
+# Two models of the same images
 
 
-@dataclass(frozen=True, eq=False)
-class Pair:
-    """Original and adjusted cameras of the same k images, row by row."""
-
-    original: Cameras  # in the cloud's CRS, with angles and lenses
-    adjusted: Cameras  # the same; both lenses of an image have one unit
-    row: IntArray  # (o,), row here of each original camera as read, -1 if it was not adjusted
-    left_out: tuple[str, ...]  # images of the original model that were not adjusted
-
-
-def pair_of(original: Cameras, adjusted: Cameras, place: IntArray) -> Pair:
-    """Return the pair of two models, given the original row of each adjusted image."""
+def transfer_of(original: Cameras, adjusted: Cameras, place: IntArray) -> CloudTransfer:
+    """Return the transfer between two models, given the original row of each adjusted image."""
     row = np.full(len(original), -1)
     row[place] = np.arange(len(adjusted))
     left_out = tuple(label for label, at in zip(original.labels, row, strict=True) if at < 0)
     original = some_cameras(original, place)
     lenses = map(_in_unit_of, adjusted.lenses or (), original.lenses or (), original.labels)
-    return Pair(replace(original, lenses=tuple(lenses)), adjusted, row, left_out)
+    return CloudTransfer(replace(original, lenses=tuple(lenses)), adjusted, row, left_out)
 
 
 def _in_unit_of(adjusted: Lens, original: Lens, label: str) -> Lens:
@@ -258,9 +248,12 @@ class TransferCounts(Sums):
 
 @dataclass(frozen=True, eq=False)
 class CloudTransfer:
-    """The transfer of a cloud from the original to the adjusted cameras."""
+    """The transfer of a cloud from the original to the adjusted cameras of the same k images."""
 
-    pair: Pair
+    original: Cameras  # in the cloud's CRS, with angles and lenses
+    adjusted: Cameras  # the same, row by row; both lenses of an image have one unit
+    row: IntArray  # (o,), row here of each original camera as read, -1 if it was not adjusted
+    left_out: tuple[str, ...]  # images of the original model that were not adjusted
 
     def step(self, xyz: FloatArray, listed: Views | None) -> Transferred:
         """Transfer points.
@@ -272,9 +265,9 @@ class CloudTransfer:
         listed : Views or None
             Of the original cameras, as read.
         """
-        original, adjusted = self.pair.original, self.pair.adjusted
+        original, adjusted = self.original, self.adjusted
         shift, moved = np.zeros((len(xyz), 3)), np.zeros(len(xyz), np.bool_)
-        views = None if listed is None else renumbered(listed, self.pair.row)[0]
+        views = None if listed is None else renumbered(listed, self.row)[0]
         if views is not None:
             # whatever kind of list it is for the correction, these images show the point
             shift, moved = transfer(xyz, replace(views, kind="tracks"), original, adjusted)
@@ -290,14 +283,14 @@ class CloudTransfer:
         """Return tie points of the adjusted block, transferred to the original cameras."""
         known = np.flatnonzero(np.isfinite(ties.xyz).all(axis=1))
         xyz, views = ties.xyz.copy(), ties.views.take(known)
-        xyz[known] += transfer(xyz[known], views, self.pair.adjusted, self.pair.original)[0]
+        xyz[known] += transfer(xyz[known], views, self.adjusted, self.original)[0]
         return replace(ties, xyz=xyz)
 
     def check_models(self, xyz: FloatArray) -> None:
         """Refuse models in different places, given points of the cloud; warn of single images."""
         if not len(xyz):
             return
-        original, apart = self.pair.original, self._apart_m()
+        original, apart = self.original, self._apart_m()
         height = float(np.median(original.centres[:, 2]) - np.median(xyz[:, 2]))
         middle, most = float(np.median(apart)), MOST_APART * height
         if height <= 0.0 or apart.max() <= most:
@@ -324,7 +317,7 @@ class CloudTransfer:
 
     def _apart_m(self) -> FloatArray:
         """Return the distances between original and adjusted centres, shape (k,)."""
-        apart = self.pair.adjusted.centres - self.pair.original.centres
+        apart = self.adjusted.centres - self.original.centres
         return np.asarray(np.linalg.norm(apart, axis=1))
 
     def check(self, name: str, counts: TransferCounts) -> None:
@@ -351,11 +344,11 @@ class CloudTransfer:
             "not_carried_reason": REASON,
             "shift_m": {name: round(float(value), 4) for name, value in shift.items()},
             "cameras": len(apart),
-            "cameras_left_out": list(self.pair.left_out),
+            "cameras_left_out": list(self.left_out),
             "centres_m": {name: round(float(value), 4) for name, value in centres.items()},
         }
 
     def provenance(self) -> dict[str, Any]:
         """Return what the output file says about the transfer."""
-        source = self.pair.original.source
-        return {"adjusted_from": {"cameras": len(self.pair.row), "source": source}}
+        source = self.original.source
+        return {"adjusted_from": {"cameras": len(self.row), "source": source}}

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.correction import CloudTally, Plan, correct_chunk
-from pcfix.flow.inputs import CameraInputs, Inputs, paired, paths_in
+from pcfix.flow.inputs import CameraInputs, Inputs, paths_in, transfer_between
 from pcfix.flow.outcome import check, check_fit, summarize
 from pcfix.flow.planning import plan_correction, plan_of, read_inputs
 from pcfix.flow.runner import Check, Chunk, Command, FileTask, Progress, stream
@@ -272,7 +272,7 @@ def correct_points(
     view = CloudView(
         "xyz", None, *corners(*xyz[:, :2].T), len(xyz), lambda water=None: iter([points])
     )
-    pair = None if adjusted_from is None else paired(adjusted_from, cameras)
+    transfer = None if adjusted_from is None else transfer_between(adjusted_from, cameras)
     line, notes = regression, list[str]()
     if isinstance(line, str | PathLike):
         from pcfix.io.regressions import read_regression
@@ -283,7 +283,7 @@ def correct_points(
         with_index(all_options),
         Inputs(cameras=cameras, water=surface),
         view,
-        CameraInputs(cameras, None, original, pair),
+        CameraInputs(cameras, None, original, transfer),
         FoundSurface(surface),
         views,
         offset,

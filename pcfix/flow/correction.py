@@ -78,7 +78,7 @@ class Plan:
     @property
     def original(self) -> Cameras | None:
         """The cameras that made the cloud, if they were adjusted since."""
-        return None if self.transfer is None else self.transfer.pair.original
+        return None if self.transfer is None else self.transfer.original
 
     @property
     def match(self) -> ViewMatch | None:

@@ -39,7 +39,7 @@ from pcfix.water.surface import FoundSurface
 if TYPE_CHECKING:
     from pyproj import CRS
 
-    from pcfix.adjust.transfer import CloudTransfer, Pair
+    from pcfix.adjust.transfer import CloudTransfer
     from pcfix.io.cameras.georeference import Georeference
     from pcfix.io.views import ViewList
 
@@ -189,7 +189,7 @@ class CameraInputs(NamedTuple):
     cameras: Cameras  # to correct with, `NO_CAMERAS` without any
     views: ViewList | None  # of the cloud
     listed: Cameras  # the cameras that the view list counts, which made the cloud
-    pair: Pair | None  # both, if they differ
+    transfer: CloudTransfer | None  # from the original to the adjusted cameras
 
 
 def read_blocks(inputs: Inputs, cloud_crs: str | CRS | None) -> CameraInputs:
@@ -202,7 +202,7 @@ def read_blocks(inputs: Inputs, cloud_crs: str | CRS | None) -> CameraInputs:
     original, adjusted = both_models(inputs)
     cameras, _ = adjusted.block(cloud_crs)
     listed, views = original.block(cloud_crs)
-    return CameraInputs(cameras, views, listed, paired(listed, cameras))
+    return CameraInputs(cameras, views, listed, transfer_between(listed, cameras))
 
 
 def both_models(inputs: Inputs) -> tuple[Inputs, Inputs]:
@@ -268,11 +268,11 @@ def original_ties(
     if ties is None:
         ties = adjusted.tie_points(cloud_crs)
         return None if ties is None else transfer.back(ties)
-    views, entry = renumbered(ties.views, transfer.pair.row)
+    views, entry = renumbered(ties.views, transfer.row)
     return replace(ties, views=views, image_xy=ties.image_xy[entry])
 
 
-def paired(original: Cameras, adjusted: Cameras) -> Pair:
+def transfer_between(original: Cameras, adjusted: Cameras) -> CloudTransfer:
     """Match the images of two models in the cloud's CRS by their names."""
     for cameras, which in ((original, "adjusted-from"), (adjusted, "cameras")):
         if cameras.rotations is None or cameras.lenses is None:
@@ -282,9 +282,9 @@ def paired(original: Cameras, adjusted: Cameras) -> Pair:
                 " itself, or --sensor."
             )
             raise SettingError(f"cameras.no_{missing}", words, option=which)
-    from pcfix.adjust.transfer import pair_of
+    from pcfix.adjust.transfer import transfer_of
 
-    return pair_of(original, adjusted, _rows(original.labels, adjusted.labels))
+    return transfer_of(original, adjusted, _rows(original.labels, adjusted.labels))
 
 
 def _rows(original: tuple[str, ...], adjusted: tuple[str, ...]) -> IntArray:

@@ -135,17 +135,11 @@ def plan_of(
     folder = options.water_per_image
     settings = resolved(options, cameras, kind, own_water=folder is not None)
     own, notes = own_water_of(folder, cameras, found.surface, view, offset)
-    transfer = None
-    if blocks.pair is not None:
-        from pcfix.adjust.transfer import CloudTransfer
-
-        transfer = CloudTransfer(blocks.pair)
     survey = Survey(found.surface, cameras, settings, offset, Learned(line), own_water=own)
     return Plan(
-        options, inputs, view, survey, found,
-        labelling or labelling_of(options, view),
-        views, kind, transfer, settings={} if folder is None else {"water_per_image": str(folder)},
-        own_notes=notes,
+        options, inputs, view, survey, found, labelling or labelling_of(options, view), views, kind,
+        blocks.transfer, own_notes=notes,
+        settings={} if folder is None else {"water_per_image": str(folder)},
     )  # fmt: skip
 
 
@@ -200,8 +194,7 @@ def plan_correction(plan: Plan) -> Plan:
         from pcfix.flow.pose_errors import SAMPLE_POINTS, pose_errors, sample_of, with_poses
 
         sample = sample_of(view.chunks(water), match, 1 + view.points // SAMPLE_POINTS)
-        pair = None if transfer is None else transfer.pair
-        errors = pose_errors(sample, plan.survey, plan.adjustment, pair)
+        errors = pose_errors(sample, plan.survey, plan.adjustment, transfer)
         plan = replace(plan, survey=with_poses(plan.survey, errors))
     return plan if first is None or plan.views is None else _with_type_of_list(plan, first)
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from pcfix.adjust.transfer import CloudTransfer, Pair
+from pcfix.adjust.transfer import CloudTransfer
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.flow.surfaces import Points, joined_points
 from pcfix.io.members import find_members
@@ -90,7 +90,7 @@ def sample_of(chunks: Iterable[Points], match: ViewMatch | None, step: int) -> S
 
 
 def pose_errors(
-    sample: Sample, survey: Survey, adjustment: Adjustment, pair: Pair | None
+    sample: Sample, survey: Survey, adjustment: Adjustment, transfer: CloudTransfer | None
 ) -> PoseErrors | None:
     """Return the errors of the bed by those of the poses; None if no point is corrected.
 
@@ -100,28 +100,31 @@ def pose_errors(
     survey : Survey
         With everything that was estimated.
     adjustment : Adjustment
-    pair : Pair or None
+    transfer : CloudTransfer or None
         The original cameras, if those of the survey were adjusted since.
     """
-    pair = pair or Pair(survey.cameras, survey.cameras, np.arange(len(survey.cameras)), ())
-    step = CloudTransfer(pair).step(sample.points.xyz, sample.listed)
+    k = len(survey.cameras)
+    transfer = transfer or CloudTransfer(survey.cameras, survey.cameras, np.arange(k), ())
+    step = transfer.step(sample.points.xyz, sample.listed)
     above = surface_above(survey.water, step.xyz, sample.points.heights)
     wet = np.flatnonzero(is_submerged(step.xyz[:, 2], above) & step.moved)
     wet = wet[:: 1 + len(wet) // BED_POINTS]
-    variance_m2 = variances(sample.take(wet), survey, adjustment, pair)
+    variance_m2 = variances(sample.take(wet), survey, adjustment, transfer)
     known = np.flatnonzero(np.isfinite(variance_m2))
     if not len(known):
         return None
     return pose_errors_of(step.xyz[wet[known], :2], variance_m2[known])
 
 
-def variances(sample: Sample, survey: Survey, adjustment: Adjustment, pair: Pair) -> FloatArray:
+def variances(
+    sample: Sample, survey: Survey, adjustment: Adjustment, transfer: CloudTransfer
+) -> FloatArray:
     """Return the variance of the heights of a sample by the poses, shape (n,); NaN if unknown."""
     with warnings.catch_warnings():  # the correction shows them
         warnings.simplefilter("ignore", PcfixWarning)
-        nominal = _heights(sample, survey, pair)
+        nominal = _heights(sample, survey, transfer)
         off = [
-            _heights(sample, _survey_of(survey, adjustment, member), pair) - nominal
+            _heights(sample, _survey_of(survey, adjustment, member), transfer) - nominal
             for member in range(len(adjustment.members))
         ]
     return np.asarray(np.square(off).mean(axis=0))
@@ -141,14 +144,19 @@ def _survey_of(survey: Survey, adjustment: Adjustment, member: int) -> Survey:
     return replace(moved(survey), parts={key: moved(one) for key, one in survey.parts.items()})
 
 
-def _heights(sample: Sample, survey: Survey, pair: Pair) -> FloatArray:
+def _heights(sample: Sample, survey: Survey, transfer: CloudTransfer) -> FloatArray:
     """Return the corrected heights of a sample, shape (n,), NaN for uncorrected points."""
     xyz, heights, sources = sample.points.xyz, sample.points.heights, sample.points.sources
-    step = CloudTransfer(replace(pair, adjusted=survey.cameras)).step(xyz, sample.listed)
+    step = replace(transfer, adjusted=survey.cameras).step(xyz, sample.listed)
     above = surface_above(survey.water, step.xyz, heights)
     found = correct(
         Batch(
-            step.xyz, above, survey, step.views, OriginalModel(xyz, pair.original), source=sources
+            step.xyz,
+            above,
+            survey,
+            step.views,
+            OriginalModel(xyz, transfer.original),
+            source=sources,
         )
     )
     known = step.moved & (found.outcome == Outcome.CORRECTED)

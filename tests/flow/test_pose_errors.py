@@ -12,7 +12,7 @@ import pcfix
 from pcfix.adjust.block import Unknowns
 from pcfix.adjust.precision import Members, precision_of
 from pcfix.adjust.problem import solved_cameras
-from pcfix.adjust.transfer import Pair
+from pcfix.adjust.transfer import CloudTransfer
 from pcfix.flow.pose_errors import Adjustment, Sample, pose_errors, variances, with_poses
 from pcfix.flow.surfaces import Points
 from pcfix.io.members import FILE, write_members
@@ -128,7 +128,7 @@ def test_same_as_twin(moved):
     sample = Sample(Points(xyz, None, np.zeros(4, np.uint8)), views)
     survey = Survey(WaterPlane(LEVEL_M), new, replace(EXACT, index=N))
     found = variances(
-        sample, survey, Adjustment(members, np.arange(3)), Pair(old, new, np.arange(3), ())
+        sample, survey, Adjustment(members, np.arange(3)), CloudTransfer(old, new, np.arange(3), ())
     )
     assert np.sqrt(wanted).min() > 0.05
     # the twin is of first order, the members are not
