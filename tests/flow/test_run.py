@@ -29,8 +29,8 @@ from pcfix.io import vectors
 from pcfix.io.rasters import values_at
 from pcfix.refract.tally import Summary
 from pcfix.report.text import tvu_sentence
-from tests.utils.gdal import HAS_STATISTICS
 from tests.utils.program import run_pcfix
+from tests.utils.rasters import HAS_STATISTICS
 from tests.utils.tiles import finished as finished_in
 from tests.utils.tiles import records, write
 

@@ -17,9 +17,8 @@ from pcfix.flow.dsm import grid_dsm
 from pcfix.io.las import source
 from tests.grid.clouds import EAST, NORTH, awkward, scattered, write
 from tests.utils.codes import refused
-from tests.utils.gdal import HAS_STATISTICS
 from tests.utils.nightly import mostly_nightly
-from tests.utils.rasters import read_raster
+from tests.utils.rasters import HAS_STATISTICS, read_raster
 from tests.utils.shared import ROOT
 
 SCENE = ROOT / "samples" / "scene"

@@ -15,8 +15,8 @@ from pcfix.running import threads
 from pcfix.water.surface import is_submerged, surface_above
 from tests.utils.batches import batch_of
 from tests.utils.depth_map_twin import looking
+from tests.utils.matchers import simulated
 from tests.utils.nightly import mostly_nightly
-from tests.utils.simulated import simulated
 
 BLOCKS = {"nadir": {}, "half oblique": {"obliques_deg": 30.0, "area_m": (70.0, 50.0)}}
 

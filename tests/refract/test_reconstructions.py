@@ -13,9 +13,9 @@ from pcfix.refract.batch import Batch, Survey
 from pcfix.refract.learning import learn_of_sample
 from pcfix.refract.reconstructions import IN_FRAME, reconstructions_of
 from pcfix.water.surface import surface_above
+from tests.utils.matchers import simulated
 from tests.utils.nightly import mostly_nightly
 from tests.utils.shared import needs
-from tests.utils.simulated import simulated
 
 RENDERED, rendered = needs("rendered_a")
 AUTO = ScienceOptions(method="auto", index=1.34)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+import rasterio
 
 from pcfix.io.rasters import open_raster
 
@@ -21,3 +22,7 @@ class Raster(NamedTuple):
 def read_raster(path: Any) -> Raster:
     with open_raster(path) as source:
         return Raster(source.read(), source.transform, source.crs, source.nodata)
+
+
+HAS_STATISTICS = tuple(map(int, rasterio.__gdal_version__.split(".")[:2])) >= (3, 8)
+"""Whether GDAL writes statistics into cloud-optimised rasters."""

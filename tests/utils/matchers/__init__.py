@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -62,3 +63,6 @@ def matched_scene(points: int, *, cloud: str = "tracks", **keywords) -> Scene:
         return MatchedScene(**scene, neighbours=table)
     start = starts(np.concatenate(counts))
     return MatchedScene(**scene, neighbours=table, pairs=np.concatenate(pairs), pairs_start=start)
+
+
+simulated = lru_cache(maxsize=8)(matched_scene)
