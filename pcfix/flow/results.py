@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,9 +16,8 @@ from pcfix.flow.record import read_record
 from pcfix.flow.request import Files, Request
 from pcfix.flow.run import RECORD, run_all
 from pcfix.flow.runner import Bar, no_bar
-from pcfix.io import rasters
+from pcfix.io import analysis, rasters
 from pcfix.io.styles import limits_of
-from pcfix.libraries import optional_library
 from pcfix.options.declare import File, options_of, taken
 from pcfix.options.survey import RunOptions
 from pcfix.refract.tally import Summary
@@ -32,7 +31,6 @@ if TYPE_CHECKING:
 
 Plain = dict[str, Any]
 
-_library = partial(optional_library, extra="analysis", who="This")
 _WHY = {
     UNCERTAINTY: "the points have no standard errors",
     "map.gpkg": "lines need pyogrio; run: pip install 'pcfix[analysis]', then run again",
@@ -101,9 +99,7 @@ class RunResults:
         return self._raster(UNCERTAINTY)
 
     def _raster(self, name: str) -> DataArray:
-        path = self._file(name)
-        array = _library("rioxarray").open_rasterio(path, masked=True)  # read when it is used
-        return array.squeeze("band", drop=True).rename(path.stem)
+        return analysis.open_array(self._file(name))
 
     def contours(self, interval: float | None = None) -> GeoDataFrame:
         """Return lines of equal depth, ``depth_m``.
@@ -120,8 +116,7 @@ class RunResults:
                 "option.range", f"interval {interval:g} must be above 0.",
                 option="interval", value=interval, above=0,
             )  # fmt: skip
-        lines, frame = contours_layer(self.folder, interval), _library("geopandas").GeoDataFrame
-        return frame(lines.values, geometry=list(lines.geometries), crs=self.depth.rio.crs)
+        return analysis.frame_of(contours_layer(self.folder, interval), self.depth.rio.crs)
 
     @property
     def waterline(self) -> GeoDataFrame:
@@ -130,7 +125,7 @@ class RunResults:
 
     def layer(self, name: str) -> GeoDataFrame:
         """Return a layer of ``map.gpkg``: waterline, corrected_area, cross_sections, cameras ..."""
-        return _library("geopandas").read_file(self._file("map.gpkg"), layer=name)
+        return analysis.frame_of_layer(self._file("map.gpkg"), name)
 
     @property
     def tables(self) -> dict[str, DataFrame]:
@@ -143,9 +138,8 @@ class RunResults:
             return {}
         files = sorted(Files(self.folder).compare.glob("*.csv"))
         rows = [{"of": title, **figures} for title, figures in signed_statistics(self.compared)]
-        pandas = _library("pandas")
-        statistics = pandas.json_normalize(rows).set_index("of")
-        return {"statistics": statistics, **{one.stem: pandas.read_csv(one) for one in files}}
+        statistics = analysis.load_for_analysis("pandas").json_normalize(rows).set_index("of")
+        return {"statistics": statistics, **{one.stem: analysis.table_of_csv(one) for one in files}}
 
     def _repr_html_(self) -> str:
         """Return the HTML that a notebook shows."""
