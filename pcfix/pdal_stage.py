@@ -237,7 +237,7 @@ def _missing(name: str) -> SettingError:
 
 
 def _converted(one: Option, value: Any) -> Any:
-    """Return a value of JSON as the options take it: numbers may be text, one of several alone."""
+    """Return a value of JSON as the options take it; numbers may be text, and a list one value."""
     if one.repeats and not isinstance(value, list):
         return (value,)
     if isinstance(value, str) and one.parse is None and {int, float} & {*one.kinds}:

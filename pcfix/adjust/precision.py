@@ -270,8 +270,8 @@ def undetermined(precision: Precision, unknowns: Unknowns) -> list[PcfixWarning]
         elif prior < np.inf and row.sigma > NO_NEWS * prior:
             code = "adjust.not_improved"
             words = (
-                "was not improved: the images tell no more than its standard deviation of"
-                f" {prior:g}{unit}."
+                "was not improved: the images determine it no better than its given standard"
+                f" deviation of {prior:g}{unit}."
             )
         else:
             continue

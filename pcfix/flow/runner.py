@@ -146,7 +146,7 @@ def stream(
 def _reporter(
     progress: Progress | None, before: int, count: int, total: int
 ) -> Callable[[float], None]:
-    """Return what reports the points that are done of a chunk, after those `before` it."""
+    """Return the function that reports the progress of a chunk, after `before` points."""
     done = 0.0
 
     def report(points: float) -> None:
