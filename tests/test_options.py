@@ -27,7 +27,7 @@ def test_declared(kind):
         assert one.panel in list(Panel)
         assert one.help.partition(" [")[0].endswith(".")
         assert one.default is None or one.checked(one.default) == one.default
-        assert not one.needs or one.needs.split()[0] in {*names, "reference"}
+        assert not one.needs or one.needs.split()[0] in {*names, "reference", "water"}
     kind()
 
 

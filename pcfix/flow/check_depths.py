@@ -53,22 +53,14 @@ def regression_of(
     )
 
 
-def check_regression(method: str, inputs: Any) -> None:
-    """Raise SettingError unless the method regression, and no other, has check depths or a line."""
+def check_regression(inputs: Any) -> None:
+    """Raise SettingError unless the method regression has either check depths or a line."""
     given = [n for n in ("check_depths", "regression") if getattr(inputs, n) is not None]
-    if len(given) == 2:
-        raise SettingError(
-            "option.exclusive",
-            "check-depths and regression exclude each other: a line is fitted, or read from a file."
-            " Give one of the two.",
-            options=given,
-        )
-    if (method == "regression") != bool(given):
+    if len(given) != 1:
         raise SettingError(
             "option.together",
             "Method regression needs check-depths (a CSV of measured depths) or regression (the"
-            " line of another cloud), and only it uses them. Give both, or neither.",
-            method=method,
+            " line of another cloud). Give one of the two.",
             options=given,
         )
 

@@ -202,7 +202,7 @@ def correct_chunk(
     submerged, labels = plan.labelling.submerged(xyz, above, points.classes)
     if plan.inputs.port is not None:
         correction = _through_port(plan, batch, np.flatnonzero(submerged))
-        figures = Tally.of(correction, row, plan.view.points)
+        figures = Tally.of(correction)
         miss_m = float(correction.ray_miss_m[submerged].sum())
         return correction, CloudTally(figures, labels, counts, port_miss_m=miss_m)
     if step is not None:
@@ -227,7 +227,7 @@ def correct_chunk(
         correction = step.whole(correction)
         moved = TransferCounts.of(step, correction)
     return correction, CloudTally(
-        figures=Tally.of(correction, row, plan.view.points),
+        figures=Tally.of(correction),
         labels=labels,
         views=counts,
         water=WaterMeeting.of(xyz, correction, plan.found.surface),

@@ -85,9 +85,6 @@ class Inputs(MaskOption, InputOptions):
     def level_offset_m(self, cameras: Cameras) -> FloatArray | None:
         """Return how much higher than on average the water stood at each image, shape (k,)."""
         if self.tide is None:
-            if self.image_times is not None:
-                sentence = "image-times needs tide: give both, or neither."
-                raise SettingError("option.needs", sentence, options=["image_times", "tide"])
             return None
         from pcfix.io.tides import level_offsets, read_image_times, read_tide
 

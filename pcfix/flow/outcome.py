@@ -16,7 +16,6 @@ from pcfix.flow.runner import Ends
 from pcfix.model import Cameras, FloatArray, Outcome, TiePoints, WaterDimension
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import UNLISTED
-from pcfix.refract.choice import views_in_frame
 from pcfix.refract.reconstructions import CAUSES
 from pcfix.refract.tally import Summary, Tally
 from pcfix.version import __version__
@@ -194,12 +193,10 @@ def summarize(plan: Plan, tally: CloudTally, findings: Findings, ends: Ends) -> 
     not_moved = sum(uncorrected.values()) + int(figures.outcomes[Outcome.NOT_CARRIED])
     poses, transfer, moved = findings.poses, plan.transfer, plan.survey.level_offset_m
     made, detected, water = plan.made, _detected(plan, tally), str(plan.found.surface)
-    depth, left_out = figures.depth_m(), dict[str, list[str]]()
-    uncertainty, by_poses = figures.uncertainty(made), plan.survey.learned.poses
+    depth, uncertainty = figures.depth_m(), figures.uncertainty(made)
+    by_poses = plan.survey.learned.poses
     if plan.inputs.port is not None:  # no depths, and no orders by depth
         depth, uncertainty, water = {}, None, f"all around, seen through a {plan.inputs.port}"
-    else:
-        left_out = _left_out(plan, figures)
     if uncertainty is not None and by_poses is not None:
         uncertainty["poses_m"] = round(by_poses.middle_m, 4)
     if moved is not None:
@@ -235,7 +232,6 @@ def summarize(plan: Plan, tally: CloudTally, findings: Findings, ends: Ends) -> 
         cameras=len(plan.cameras),
         cameras_used=len(plan.cameras) - len(unused),
         cameras_unused=unused,
-        cameras_left_out=left_out,
         seconds=round(ends.seconds, 3),
         views=None if report is None else report.as_dict(),
         warnings=[one.as_dict() for one in notes],
@@ -252,21 +248,3 @@ def summarize(plan: Plan, tally: CloudTally, findings: Findings, ends: Ends) -> 
         shoreline=findings.shoreline,
         fit=None if findings.plausible is None else findings.plausible.as_dict(),
     )
-
-
-def _left_out(plan: Plan, figures: Tally) -> dict[str, list[str]]:
-    """Return the unused cameras whose frames hold corrected points, by the reason."""
-    unused, xyz = ~figures.camera_used, np.vstack([np.zeros((0, 3)), *figures.moved])
-    if not len(xyz) or not unused.any():
-        return {}
-    limit, cameras = plan.survey.settings.limit_deg or 90.0, plan.cameras
-    seen = views_in_frame(xyz, cameras)
-    points = np.repeat(np.arange(len(xyz)), np.diff(seen.start))
-    across, along, up = (cameras.centres[seen.camera] - xyz[points]).T
-    steepest = np.full(len(unused), np.inf)
-    np.minimum.at(steepest, seen.camera, np.degrees(np.arctan2(np.hypot(across, along), up)))
-    beyond, within = unused & np.isfinite(steepest) & (steepest > limit), steepest <= limit
-    reasons = {f"beyond {limit:g} degrees alone": beyond, "but are not chosen": unused & within}
-    return {
-        why: list(compress(cameras.labels, rows)) for why, rows in reasons.items() if rows.any()
-    }

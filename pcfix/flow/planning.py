@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, replace
 from functools import partial
+from itertools import compress
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -59,11 +60,6 @@ HEIGHT_M = 100.0
 BED_POINTS_A_M2 = 5.0
 FEWEST_BED_POINTS, MOST_BED_POINTS = 125_000, 1_000_000
 """Size of the sample of the cloud that the bed of the surroundings is estimated from."""
-_ABOUT_WATER = (
-    "tide", "water_per_image", "image_times", "check_depths", "regression", "water_crs",
-    "water_model", "connected", "adjusted_from", "unsure", "shoreline",
-)  # fmt: skip
-
 Chunks = Callable[[], Iterable[Points]]
 """The whole cloud, chunk by chunk, transferred to the adjusted cameras if there are any."""
 
@@ -106,10 +102,10 @@ def read_inputs(options: CorrectOptions, view: CloudView) -> Plan:
     plan = plan_of(options, inputs, view, blocks, found, match, offset)
     check_tilt(found.surface)
     method = plan.survey.settings.method
-    if method == "regression" or (inputs.check_depths or inputs.regression) is not None:
+    if method == "regression":
         from pcfix.flow.check_depths import check_regression
 
-        check_regression(method, inputs)
+        check_regression(inputs)
     if inputs.regression is not None:
         plan = replace(plan, settings={"regression": str(inputs.regression), **plan.settings})
     if options.dimensions == "all" and method != "regression" and len(blocks.cameras):
@@ -144,13 +140,13 @@ def plan_of(
 
 
 def _check_port(options: CorrectOptions) -> None:
-    """Refuse options that need a water surface."""
-    plain = CorrectOptions()
-    excluded = [name for name in _ABOUT_WATER if getattr(options, name) != getattr(plain, name)]
-    excluded += ["camera_set"] * (options.camera_set == "mvs")
-    excluded += ["occlusion"] * (options.occlusion == "on")
-    excluded += ["method"] * (options.method not in ("auto", "snell", "consistent"))
-    for name in excluded:
+    """Refuse values that need a water surface."""
+    excluded = {
+        "camera_set": options.camera_set == "mvs",
+        "occlusion": options.occlusion == "on",
+        "method": options.method not in ("auto", "snell", "consistent"),
+    }
+    for name in compress(excluded, excluded.values()):
         raise SettingError(
             "port.excludes",
             f"{name.replace('_', '-')} {getattr(options, name)} has no effect with a port."

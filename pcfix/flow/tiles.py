@@ -49,7 +49,7 @@ from pcfix.libraries import optional_library
 from pcfix.options.declare import File, options_of
 from pcfix.running import current, threads
 
-RECORDS, BEGUN = ".pcfix", "begun "
+RECORDS = ".pcfix"
 HOW = ("overwrite", "jobs", "scheduler", "summary")
 """Options on which no output depends."""
 WAIT_S = 10
@@ -80,7 +80,7 @@ class Tile:
 
     @property
     def record(self) -> Path:
-        """The file with its statistics, written when the output is complete."""
+        """The file with its statistics, written just before its output appears."""
         return self.target.parent / RECORDS / f"{self.target.name}.tally"
 
     @property
@@ -88,10 +88,10 @@ class Tile:
         """Whether the output exists, with the same key."""
         return self.target.is_file() and read_tally(self.record)[0] == self.key
 
-    @property
-    def is_begun(self) -> bool:
-        """Whether a run that was stopped may have written the output."""
-        return read_tally(self.record)[0] == BEGUN + self.key
+    def keep(self, tally: Any) -> None:
+        """Write the statistics; an older output must not be taken for the one that follows."""
+        self.target.unlink(missing_ok=True)
+        write_tally(self.record, self.key, tally)
 
 
 def do_tile(pickled: bytes, tile: Tile, jobs: int | None = None) -> str:
@@ -106,12 +106,9 @@ def do_tile(pickled: bytes, tile: Tile, jobs: int | None = None) -> str:
         if tile.is_finished:  # by a worker that was lost before it could say so
             return ""
         process, plan = pickle.loads(pickled)
-        # If this process dies, the mark says that the output may be replaced.
-        write_tally(tile.record, BEGUN + tile.key, None)
         with threads(jobs), warnings.catch_warnings():
             warnings.simplefilter("ignore", PcfixWarning)  # shown when the plan was made
-            tally, _ = process(plan, FileTask(tile.source, tile.target, jobs=jobs), tile.row, None)
-        write_tally(tile.record, tile.key, tally)
+            process(plan, FileTask(tile.source, tile.target, jobs=jobs), tile.row, tile.keep)
     except PcfixError as error:
         return str(error)
     return ""
@@ -157,8 +154,7 @@ def run_tiles(
     done = {tile for tile in work.values() if tile.is_finished}
     todo = [tile for tile in work.values() if tile not in done]
     for tile in todo if folder.exists() else ():
-        replaced = options.overwrite or tile.is_begun
-        check_cloud(tile.target, overwrite=replaced, inputs=tiles.paths)
+        check_cloud(tile.target, overwrite=options.overwrite, inputs=tiles.paths)
     result, points = None, sum(one.points for one in todo)
     with threads(options.jobs), machines(options.scheduler, options.jobs, points) as run:
         plan, readable = _planned(command, tiles, folder)

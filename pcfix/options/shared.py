@@ -52,10 +52,10 @@ class IndexOptions(OptionSet, panel=Panel.WATER):
 class WaterOptions(OptionSet, panel=Panel.WATER):
     """How a water surface is fitted to shoreline points."""
 
-    water_model: Literal["auto", "level", "plane", "along", "river"] = option("auto")
+    water_model: Literal["auto", "level", "plane", "along", "river"] = option("auto", needs="water")
     """Surface fitted to shoreline points: level, plane, plane tilted along the points only, or
     river; auto chooses among the first three."""
-    water_crs: str | None = option(None, metavar="CRS")
+    water_crs: str | None = option(None, metavar="CRS", needs="water")
     """CRS of the shoreline points. [default: what their file says]"""
 
 
@@ -70,7 +70,7 @@ class NeededOptions(WaterOptions, panel=Panel.NEED):
 class WaterPerImageOption(OptionSet, panel=Panel.WATER):
     """A water surface of its own for each image."""
 
-    water_per_image: File | None = option(None)
+    water_per_image: File | None = option(None, needs="water")
     """Folder of rasters of the water, named as the images; see 'pcfix calm --surface'. --water is
     used for the other images."""
 
@@ -78,7 +78,7 @@ class WaterPerImageOption(OptionSet, panel=Panel.WATER):
 class LandRules(OptionSet, panel=Panel.WATER):
     """Which points below the surface are land all the same."""
 
-    connected: bool = option(False, basic=True, off=True)
+    connected: bool = option(False, basic=True, off=True, needs="water")
     """Correct only the main water body and its connected parts; ignore separate pools."""
     least_pool: float | None = option(None, least=0.0, needs="connected")
     """Pools of at least this area are not ignored. [m2] [default: a tenth of the largest water]"""
@@ -157,16 +157,16 @@ class SurveyOptions(ViewOptions, CamerasOptions, NeededOptions, panel=Panel.CAME
         None, basic=True, metavar="PATH", panel=Panel.NEED,
         needed="needed, not with --method factor or regression",
     )  # fmt: skip
-    adjusted_from: Any = option(None, with_cameras=True, basic=True, metavar="PATH")
+    adjusted_from: Any = option(None, with_cameras=True, basic=True, metavar="PATH", needs="water")
     """Original camera file, if --cameras is the output of 'pcfix adjust'. The cloud is first
     transferred to the adjusted poses."""
-    check_depths: File | None = option(None)
+    check_depths: File | None = option(None, needs="method regression")
     """With --method regression: CSV x,y,depth of measured depths, m."""
-    regression: File | None = option(None)
+    regression: File | None = option(None, needs="method regression")
     """Line that --save-regression wrote for another cloud, instead of --check-depths."""
-    tide: File | None = option(None, with_cameras=True, panel=Panel.WATER)
+    tide: File | None = option(None, with_cameras=True, panel=Panel.WATER, needs="water")
     """CSV time,level_m: each image gets the water level of its time."""
-    image_times: File | None = option(None, with_cameras=True, panel=Panel.WATER)
+    image_times: File | None = option(None, with_cameras=True, panel=Panel.WATER, needs="tide")
     """With --tide: CSV label,time, or the folder of the images. [default: what the camera file
     says]"""
     salinity: float | None = option(None, panel=Panel.WATER)
@@ -225,5 +225,5 @@ class SummaryOption(OptionSet, panel=Panel.OUTPUT):
 class ShorelineOption(OptionSet, panel=Panel.OUTPUT):
     """The line at which the water meets the cloud."""
 
-    shoreline: File | None = option(None, writes=True, basic=True)
+    shoreline: File | None = option(None, writes=True, basic=True, needs="water")
     """GeoPackage (.gpkg) for the shoreline of the cloud, with its standard error."""

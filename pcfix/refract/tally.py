@@ -120,20 +120,13 @@ class UncertaintyTally(Sums):
         }
 
 
-SAMPLE_POINTS = 10_000
-"""Corrected points, evenly spread over the cloud, that are looked for in the frames of unused
-cameras."""
-
-
 @dataclass(frozen=True)
 class Tally(Sums):
     """Counts, extremes, and histograms of the shift and the standard error of Z."""
 
     outcomes: IntArray
     camera_used: BoolArray = field(metadata=MOST)
-    low: FloatArray = field(
-        metadata=LEAST
-    )  # south-west, lowest corner of the submerged points, shape (3,)
+    low: FloatArray = field(metadata=LEAST)  # lowest corner of the submerged points, shape (3,)
     high: FloatArray = field(metadata=MOST)
     shift: _Histogram
     errors: UncertaintyTally
@@ -146,15 +139,11 @@ class Tally(Sums):
     depth_low_m: float = field(default=np.inf, metadata=LEAST)
     depth_high_m: float = field(default=-np.inf, metadata=MOST)
     depth_sum_m: float = 0.0
-    moved: tuple[FloatArray, ...] = ()  # apparent places of some corrected points
 
     @classmethod
-    def of(cls, correction: Correction, row: int = 0, points: int = 0) -> Tally:
-        """Return the tally of a chunk that begins at a row of a cloud of so many points."""
+    def of(cls, correction: Correction) -> Tally:
+        """Return the tally of a chunk."""
         apparent, moved = correction.apparent_xyz, correction.corrected
-        step = max(1, points // SAMPLE_POINTS)
-        rows = np.arange(-row % step, len(apparent), step)
-        rows = rows[moved[rows]]
         submerged = apparent[correction.submerged]
         # axis by axis: numpy is slow along the short one
         low = np.array([values.min(initial=np.inf) for values in submerged.T])
@@ -176,7 +165,6 @@ class Tally(Sums):
             depth_low_m=float(depth.min(initial=np.inf)),
             depth_high_m=float(depth.max(initial=-np.inf)),
             depth_sum_m=float(depth.sum()),
-            moved=(apparent[rows],),
         )
 
     @property
@@ -244,7 +232,7 @@ class Summary:
     incidence_deg: float  # the largest of the rays used, in air
     cameras: int
     cameras_used: int
-    cameras_unused: list[str]  # without corrected points, or in `cameras_left_out`
+    cameras_unused: list[str]  # labels of those without corrected points
     water: str
     settings: dict[str, Any]
     seconds: float
@@ -257,7 +245,6 @@ class Summary:
     made: dict[str, Any] | None = None  # the reconstruction type, and why
     told: list[str] = field(default_factory=list)  # other notes on the cloud, also in `warnings`
     poses: dict[str, Any] | None = None  # whether they have absorbed the refraction
-    cameras_left_out: dict[str, list[str]] = field(default_factory=dict)  # by reason
     unsure: int | None = None  # corrected points that only obliques see; None if not withheld
     shoreline: dict[str, Any] | None = None
     fit: dict[str, Any] | None = None  # see `pcfix.flow.plausibility`

@@ -69,7 +69,7 @@ _CORRECTED: RowTable = (
     ("Cameras", "{cameras_used} of {cameras} used, {rays_per_point:.1f} rays per point, incidence"
      " angles up to {incidence_deg:.0f} deg", "cameras"),
     ("Cameras", "none; ray counts of 1 and incidence angles of 0 are placeholders", "no_cameras"),
-    ("Unused", "{unused}", "unused"),
+    ("Unused", "{unused_count} see no corrected point: {unused}", "unused"),
     ("Water", "{water}, refractive index {settings[index]:.6g}", "water"),
     ("", "fitted: {water_fit[model]}{fit_points}, standard error {water_fit[sigma_level_m]:.3f} m",
      "water_fit"),
@@ -194,7 +194,9 @@ def summary_rows(s: Summary) -> Rows:
         "method": method,
         "rays_per_point": s.rays / max(s.corrected, 1),
         "no_cameras": not s.cameras,
-        "unused": _unused(s),
+        "unused_count": len(s.cameras_unused),
+        "unused": ", ".join(s.cameras_unused[:SHOWN_NAMES])
+        + (", ..." if len(s.cameras_unused) > SHOWN_NAMES else ""),
         "fit_points": ", {accepted} of {points} points".format(**fit) if "points" in fit else "",
         "deeper_cm": deeper_cm,
         "no_uncertainty": s.uncertainty is None and s.settings["dimensions"] == "all"
@@ -226,19 +228,6 @@ def _part_words(part: Plain | None) -> str:
     words = "" if box is None else " within " + ",".join(f"{one:.12g}" for one in box)
     words += "" if step is None else f" at a resolution of {step:g} m"
     return f"a part of {part['of']:,} points,{words}"
-
-
-def _unused(s: Summary) -> str:
-    """Return which cameras were not used, by the reason."""
-    excluded = [name for names in s.cameras_left_out.values() for name in names]
-    groups = {f"see the bed {why}": names for why, names in s.cameras_left_out.items()}
-    groups["see no corrected point"] = [n for n in s.cameras_unused if n not in excluded]
-    return "; ".join(
-        f"{len(names)} {why}: {', '.join(names[:SHOWN_NAMES])}"
-        + (", ..." if len(names) > SHOWN_NAMES else "")
-        for why, names in groups.items()
-        if names
-    )
 
 
 def shoreline_rows(found: Plain | None) -> Rows:

@@ -224,5 +224,5 @@ def test_tide(thin, tmp_path):
     moving, summary = corrected("moving.las", 0.0, 0.4)
     assert "-0.200 to +0.200 m" in summary.water
     assert np.abs(moving.z - plain.z).max() > 0.01
-    with refused("option.needs", options=["image_times", "tide"]):
+    with refused("option.needs", option="image_times", needs="tide"):
         pcfix.correct_file(thin, tmp_path / "no.las", **options)
