@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from pcfix.errors import GeometryError, PcfixWarning
-from pcfix.lens.imaging import project, unproject
+from pcfix.lens.imaging import straight_images, unproject
 from pcfix.model import (
     BoolArray,
     Cameras,
@@ -573,16 +573,6 @@ def ties_of_cloud(
     start = np.concatenate([[0], np.cumsum(counts)])
     tracks = Views(start, np.asarray(views.camera)[seen])
     return taken(TiePoints(xyz, tracks, image[seen]), np.flatnonzero(counts >= least))
-
-
-def straight_images(xyz: FloatArray, camera: IntArray, cameras: Cameras) -> FloatArray:
-    """Return the images of points by straight rays, one camera for each point, shape (o, 2)."""
-    rotations, lenses = np.asarray(cameras.rotations), cameras.lenses or ()
-    local = np.einsum("oij,oj->oi", rotations[camera], xyz - cameras.centres[camera])
-    image_xy = np.empty((len(local), 2))
-    for c in np.unique(camera):
-        image_xy[camera == c] = project(lenses[c], local[camera == c])
-    return image_xy
 
 
 # Parts of a block

@@ -25,8 +25,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.adjust.block import deeper, plain_block, similarity_gradients, straight_images, taken
+from pcfix.adjust.block import deeper, plain_block, similarity_gradients, taken
 from pcfix.errors import GeometryError
+from pcfix.lens.imaging import straight_images
 from pcfix.model import (
     BoolArray,
     Cameras,

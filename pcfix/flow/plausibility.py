@@ -7,7 +7,6 @@ cloud; what cannot be tested is listed as not checked. None of it changes a resu
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,8 +14,8 @@ import numpy as np
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.flow.surfaces import Points
 from pcfix.lens.frames import cameras_in_sight
-from pcfix.lens.imaging import project
-from pcfix.model import BoolArray, Cameras, FloatArray, TiePoints
+from pcfix.lens.imaging import straight_images
+from pcfix.model import Cameras, FloatArray, TiePoints
 from pcfix.options.declare import File
 from pcfix.sums import SAME, Sums
 
@@ -366,17 +365,13 @@ def _median_residual(cameras: Cameras, ties: TiePoints) -> float | None:
     point = np.repeat(np.arange(len(ties.xyz)), np.diff(ties.views.start))
     rows = np.flatnonzero(np.isfinite(ties.xyz[point]).all(axis=1))
     rows = rows[:: 1 + len(rows) // (5 * TIES)]
-    camera, residuals = ties.views.camera[rows], list[FloatArray]()
-    order = np.argsort(camera, kind="stable")
-    first = np.searchsorted(camera[order], np.arange(len(cameras) + 1))
-    for k, (start, end) in enumerate(pairwise(first)):
-        if start < end and cameras.lenses is not None and cameras.rotations is not None:
-            some, lens = rows[order[start:end]], cameras.lenses[k]
-            rays = (ties.xyz[point[some]] - cameras.centres[k]) @ cameras.rotations[k].T
-            apart = np.hypot(*(project(lens, rays) - ties.image_xy[some]).T) / lens.width
-            front: BoolArray = np.asarray(rays[:, 2] > 0.0)
-            residuals.append(np.where(front & np.isfinite(apart), apart, np.inf))
-    return float(np.median(np.concatenate(residuals))) if residuals else None
+    if not len(rows):
+        return None
+    camera = ties.views.camera[rows]
+    width = np.array([lens.width for lens in cameras.lenses or ()])[camera]
+    image_xy = straight_images(ties.xyz[point[rows]], camera, cameras)
+    residual = np.hypot(*(image_xy - ties.image_xy[rows]).T) / width
+    return float(np.median(np.where(np.isfinite(residual), residual, np.inf)))
 
 
 # Cameras against what was recorded in flight: GNSS positions, heights above take-off

@@ -57,7 +57,7 @@ from pcfix.io.files import check_input
 from pcfix.io.labels import match_labels
 from pcfix.io.ply import Records, joined, list_starts, read_header
 from pcfix.lens.frames import beside_frames
-from pcfix.lens.imaging import project
+from pcfix.lens.imaging import straight_images
 from pcfix.model import Cameras, FloatArray, IntArray, TiePoints, ViewKind, Views
 from pcfix.options.declare import File
 from pcfix.sums import LEAST, SAME, Sums
@@ -369,17 +369,13 @@ def share_seen(cameras: Cameras, camera: npt.NDArray[np.int32], xyz: FloatArray)
     `camera`, shape (m,), has rows of cameras with rotations and lenses, of which negative ones do
     not count; `xyz`, shape (m, 3), the point of each.
     """
-    order = np.argsort(camera, kind="stable")
-    ends = np.searchsorted(camera[order], np.arange(len(cameras) + 1))
-    seen = 0
-    for i, lens in enumerate(cameras.lenses or ()):
-        some = xyz[order[ends[i] : ends[i + 1]]]
-        u, v = project(lens, (some - cameras.centres[i]) @ np.asarray(cameras.rotations)[i].T).T
-        wide, high = MARGIN * lens.width, MARGIN * lens.height
-        inside = (u >= -wide) & (u <= lens.width + wide) & (v >= -high) & (v <= lens.height + high)
-        seen += int(np.count_nonzero(inside))
-    count = int(ends[-1] - ends[0])
-    return seen / count if count else None
+    known = np.flatnonzero(camera >= 0)
+    if not len(known):
+        return None
+    size = np.array([(lens.width, lens.height) for lens in cameras.lenses or ()])[camera[known]]
+    image_xy = straight_images(xyz[known], camera[known].astype(np.int64), cameras)
+    inside = (image_xy >= -MARGIN * size) & (image_xy <= (1.0 + MARGIN) * size)
+    return float(np.mean(inside.all(axis=1)))
 
 
 _QUERIES = 250_000

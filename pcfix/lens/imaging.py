@@ -26,7 +26,7 @@ from pcfix.lens.formulas import (
     radius,
     undistorted,
 )
-from pcfix.model import FloatArray, IntArray, Lens
+from pcfix.model import Cameras, FloatArray, IntArray, Lens
 
 
 def project(lens: Lens, directions: FloatArray) -> FloatArray:
@@ -52,6 +52,31 @@ def unproject(lens: Lens, image_xy: FloatArray) -> FloatArray:
     """
     rows = np.ascontiguousarray(image_xy, np.float64).reshape(-1, 2)
     return _unproject(coefficients(lens), rows)
+
+
+def straight_images(xyz: FloatArray, camera: IntArray, cameras: Cameras) -> FloatArray:
+    """Return the image coordinates of points by straight rays, one camera for each point.
+
+    Parameters
+    ----------
+    xyz : array, shape (o, 3)
+        World frame, metres.
+    camera : array of int, shape (o,)
+        Rows of `cameras`, which have rotations and lenses.
+
+    Returns
+    -------
+    array, shape (o, 2)
+        See `project`.
+    """
+    lenses, rotations = cameras.lenses or (), np.asarray(cameras.rotations)
+    image_xy = np.full((len(xyz), 2), np.nan)
+    order = np.argsort(camera, kind="stable")
+    ends = np.searchsorted(camera[order], np.arange(len(lenses) + 1))
+    for k in np.flatnonzero(np.diff(ends)):
+        rows = order[ends[k] : ends[k + 1]]
+        image_xy[rows] = project(lenses[k], (xyz[rows] - cameras.centres[k]) @ rotations[k].T)
+    return image_xy
 
 
 @lru_cache(maxsize=8192)

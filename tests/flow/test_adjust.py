@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.adjust.block import straight_images
 from pcfix.flow.adjust import adjust_cameras
 from pcfix.flow.next_steps import correct_words
+from pcfix.lens.imaging import straight_images
 from pcfix.options.survey import AdjustOptions
 from pcfix.running import threads
 from tests.utils.adjust_files import IMAGE_PX, write_block
