@@ -269,10 +269,10 @@ def _chunks(cloud: PdalCloud, water: WaterSurface | None) -> Iterator[tuple[slic
         if isinstance(water, WaterDimension):
             heights = cloud.dimension(water.name)[rows]
         sources = ins["PointSourceId"][rows] if "PointSourceId" in ins else None
-        rgb = tuple(ins[name][rows] for name in COLOURS if name in ins)
-        colours = rgb if len(rgb) == len(COLOURS) else None
+        has_colours = all(name in ins for name in COLOURS)
+        rgb = np.column_stack([ins[name][rows] for name in COLOURS]) if has_colours else None
         returns = ins["NumberOfReturns"][rows] if "NumberOfReturns" in ins else None
-        yield rows, Points(xyz, heights, cloud.classes[rows], sources, colours, returns)
+        yield rows, Points(xyz, heights, cloud.classes[rows], sources, rgb, returns)
 
 
 def _view(cloud: PdalCloud) -> CloudView:

@@ -83,8 +83,7 @@ class CloudSample(Sums):
         """Return the sample of a chunk that begins at a row of a cloud of `count` points."""
         step = max(1, count // SAMPLE_POINTS)
         rows = np.arange(-row % step, len(points.xyz), step)
-        colours = points.colours
-        rgb = () if colours is None else (np.column_stack([one[rows] for one in colours]),)
+        rgb = () if points.rgb is None else (points.rgb[rows],)
         return cls((points.xyz[rows],), (water_m[rows],), rgb, float(step))
 
     @property

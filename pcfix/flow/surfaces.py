@@ -45,20 +45,14 @@ class Points(NamedTuple):
     heights: FloatArray | None  # (n,), of the water above each, if a dimension has it
     classes: npt.NDArray[np.uint8]  # (n,)
     sources: IntArray | None = None  # (n,), point source IDs
-    colours: tuple[npt.NDArray[Any], ...] | None = None  # red, green and blue, (n,) each
+    rgb: npt.NDArray[Any] | None = None  # (n, 3)
     returns: npt.NDArray[Any] | None = None  # (n,), number of returns
     original_xyz: FloatArray | None = None  # (n, 3), before the transfer to adjusted cameras
 
     def take(self, rows: IntArray | slice) -> Points:
         """Return some of the points."""
-        some: dict[str, Any] = {
-            name: np.ascontiguousarray(one[rows])
-            for name, one in self._asdict().items()
-            if isinstance(one, np.ndarray)
-        }
-        if self.colours is not None:
-            some["colours"] = tuple(one[rows] for one in self.colours)
-        return self._replace(**some)
+        some: list[Any] = [None if v is None else np.ascontiguousarray(v[rows]) for v in self]
+        return Points(*some)
 
 
 RGB = ("red", "green", "blue")
@@ -128,17 +122,21 @@ def first_points(chunks: Iterable[Points]) -> Points:
     return joined_points(parts)
 
 
-def joined_points(parts: list[Points]) -> Points:
+def every(step: int, chunks: Iterable[Points]) -> Iterator[Points]:
+    """Yield every `step`-th point of a cloud, chunk by chunk."""
+    row = 0
+    for one in chunks:
+        yield one.take(slice(-row % step, None, step))
+        row += len(one.xyz)
+
+
+def joined_points(parts: Iterable[Points]) -> Points:
     """Return consecutive points as one, with the attributes that all of them have."""
-    columns = dict[str, Any]()
-    for name, column in zip(Points._fields, zip(*parts, strict=True), strict=True):
-        if any(one is None for one in column):
-            columns[name] = None
-        elif name == "colours":
-            columns[name] = tuple(map(np.concatenate, zip(*column, strict=True)))
-        else:
-            columns[name] = np.concatenate(column)
-    return Points(**columns)
+    columns: list[Any] = [
+        None if any(v is None for v in one) else np.concatenate(one)
+        for one in zip(*parts, strict=True)
+    ]
+    return Points(*columns)
 
 
 def points_of(chunk: Chunk, source: LasSource, water: WaterSurface | None) -> Points:
@@ -152,7 +150,7 @@ def points_of(chunk: Chunk, source: LasSource, water: WaterSurface | None) -> Po
         heights,
         np.asarray(chunk["classification"]),
         np.asarray(chunk["point_source_id"]),
-        tuple(chunk.array[one] for one in RGB) if has_colours else None,
+        np.column_stack([chunk.array[one] for one in RGB]) if has_colours else None,
         np.asarray(chunk["number_of_returns"]),
     )
 
@@ -279,14 +277,9 @@ def _found(view: CloudView | None) -> FoundSurface:
     if view is None:
         text = "The water surface 'auto' is found in a cloud. Give the cloud too."
         raise SettingError("cloud.missing", text)
-    every, row, parts = max(1, view.points // SAMPLE_POINTS), 0, list[Points]()
-    for some in view.chunks():
-        parts.append(some.take(np.arange(-row % every, len(some.xyz), every)))
-        row += len(some.xyz)
-    whole = joined_points(parts)
-    rgb = None if whole.colours is None else np.column_stack(whole.colours)
+    whole = joined_points(every(max(1, view.points // SAMPLE_POINTS), view.chunks()))
     proposal = find_water(
-        whole.xyz, rgb=rgb, classes=whole.classes, number_of_returns=whole.returns
+        whole.xyz, rgb=whole.rgb, classes=whole.classes, number_of_returns=whole.returns
     )
     return FoundSurface(proposal.surface, proposal, proposal.shoreline)
 
