@@ -43,7 +43,7 @@ from pcfix.lens.algebra import (
 from pcfix.lens.formulas import distorted, jacobian, undistorted
 from pcfix.lens.imaging import image_and_gradients, image_of, in_plane
 from pcfix.model import BoolArray, FloatArray, IntArray
-from pcfix.port.light import BY_PORT, FLAT, KIND, SIZE, X, through_port
+from pcfix.port.light import BY_PORT, FLAT, KIND, SIZE, X, light_through, through_port
 from pcfix.refract.rays import direction, lay, light_and_gradients, light_path, plane_at, settle
 
 if TYPE_CHECKING:
@@ -295,8 +295,7 @@ def image(state: State, given: Given, p: int, c: int, work: Workspace) -> tuple[
     x = times(state.rotations[c], w)
     if given.port.size:
         _set_port(work.port, water, given)
-        through_port(work.port, water[INDEX], *x, work.light)
-        x = column_of(work.light, 0)
+        x = light_through(work.port, water[INDEX], *x)
     return image_of(state.lenses[given.lens_row[c]], *x)
 
 

@@ -23,21 +23,12 @@ import numpy as np
 
 from pcfix.errors import SettingError
 from pcfix.kernels import Span, device, in_tiles, kernel
-from pcfix.lens.algebra import (
-    Vector,
-    column_of,
-    minus,
-    plus,
-    row_of,
-    scaled,
-    times,
-    transposed_times,
-)
+from pcfix.lens.algebra import Vector, minus, plus, row_of, scaled, times, transposed_times
 from pcfix.lens.frames import Frames, frames_of, holds, no_frames
 from pcfix.lens.imaging import lens_table
 from pcfix.model import NOMINAL_WIDTH_PX, Cameras, FloatArray, IntArray, Lens, Outcome, Views
 from pcfix.options.correct import ScienceOptions
-from pcfix.port.light import coefficients, cosine_at_port, ray_through, through_port
+from pcfix.port.light import coefficients, cosine_at_port, light_through, ray_through
 from pcfix.port.shapes import Port
 from pcfix.refract.batch import CORRECTED, NO_CAMERA, ONE_CAMERA, PARALLEL, Intersection
 from pcfix.refract.choice import ANY_NUMBER, NOMINAL_FOCAL_PX
@@ -239,14 +230,12 @@ def _usable(
     """
     least_cosine, most = limits
     kept, cosine = np.empty(candidates.size, np.int64), np.empty(candidates.size)
-    out = np.empty((3, 5))
     k = 0
     for c in candidates:
         r, x = rig.rotations[c], minus(point, row_of(rig.centres, c))
         w = times(r, x)
         if through:
-            through_port(rig.port, rig.n, *w, out)
-            w = column_of(out, 0)
+            w = light_through(rig.port, rig.n, *w)
             x = transposed_times(r, w)
         steep = cosine_at_port(rig.port, *w)
         if steep > 0.0 and steep >= least_cosine and holds(frames, c, scaled(-1.0, x)):
