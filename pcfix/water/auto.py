@@ -124,14 +124,7 @@ def _elsewhere(whole: Looked) -> WaterProposal | None:
     """Return the water at another height than zero, if it is certain."""
     gain = search.gains(whole, search.NO_TILT)
     here = gain[np.abs(whole.heights_m + whole.samples.origin[2]) <= APART_M].max(initial=0.0)
-    best = int(np.argmax(gain))
-    slope = next((gain_of(sums) for cue, sums in whole.cues if cue == SLOPE), None)
-    lifted = slope is not None and (
-        slope.gain[best] >= search.LEAST_EACH
-        and search.LIFTS[0] <= slope.amplitude[best] <= search.LIFTS[1]
-    )
-    few = gain[best] < (search.LEAST_AGREED if lifted else LEAST_AGAINST)
-    if few or here > search.MOST_RIVAL_AGREED * gain[best]:
+    if gain.max() < search.LEAST_AGREED or here > search.MOST_RIVAL_AGREED * gain.max():
         return None
     try:
         found = _from_cues(whole)
@@ -160,13 +153,8 @@ def _looked(samples: Samples) -> Looked:
 
 def _from_cues(whole: Looked) -> WaterProposal:
     samples = whole.samples
-    peak, near, sigma_m, tilt_along, sigma_tilt = _choose(samples, whole)
-    confidence, evidence, reasons = judge(samples, peak, near, whole, sigma_m)
-    if not peak.tilt.any() and not math.isnan(sigma_tilt):
-        tilt, sigma = 100.0 * abs(tilt_along), 100.0 * sigma_tilt
-        reasons += (
-            f"a tilt of {tilt:.2f} ± {sigma:.2f} % along the shore is possible, not certain",
-        )
+    peak, near, sigma_m, sigma_tilt = _choose(samples, whole)
+    confidence, evidence, reasons = judge(peak, near, whole, sigma_m)
     shore = samples.xyz[search.near_surface(samples, peak)]
     if len(shore) == 0:
         text = f"No water surface was found: no ground crosses the best candidate. {INSTEAD}"
@@ -175,7 +163,7 @@ def _from_cues(whole: Looked) -> WaterProposal:
     centre = shore[:, :2].mean(axis=0)
     level = peak.level_m + float(centre @ peak.tilt) + float(samples.origin[2])
     x, y = centre + samples.origin[:2]
-    gain = {cue.name: gain_of(sums.shifted(peak.tilt)).gain for cue, sums in whole.cues}
+    gain = {sums.cue.name: gain_of(sums.shifted(peak.tilt)).gain for sums in whole.cues}
     gain[LAYER] = layer_gain(samples, whole.heights_m, peak.tilt)
     b, c = peak.tilt.tolist()
     return WaterProposal(
@@ -186,7 +174,7 @@ def _from_cues(whole: Looked) -> WaterProposal:
         tilt=peak.tilt,
         sigma_tilt=sigma_tilt,
         confidence=confidence,
-        evidence=evidence | {"tilt along shore": tilt_along, "sigma tilt": sigma_tilt},
+        evidence=evidence,
         reasons=reasons,
         shoreline=shore + samples.origin,
         curve_height_m=whole.heights_m + float(samples.origin[2] + centre @ peak.tilt),
@@ -195,29 +183,27 @@ def _from_cues(whole: Looked) -> WaterProposal:
     )
 
 
-def _choose(samples: Samples, whole: Looked) -> tuple[Peak, Looked, float, float, float]:
+def _choose(samples: Samples, whole: Looked) -> tuple[Peak, Looked, float, float]:
     """Return the level, or the plane if its tilt is significant and gains enough.
 
-    Then follow the sums near it, the standard error of the level, and the tilt along the shore with
-    its standard error, NaN if it was not searched.
+    Then follow the sums near it, and the standard errors of its level, and of its tilt along the
+    shore, NaN for a level.
     """
     start = search.best(whole, search.NO_TILT[None])
     level, near = search.refine(samples, start, None)
     axis, step = search.axis_of(samples, level), search.tilt_step(samples)
     steps = math.ceil(search.LARGEST_TILT / step)
     tilted = search.best(whole, search.tilts_along(axis, step, steps))
-    along, sigma_tilt = 0.0, math.nan
     if tilted.score > start.score:
         plane, near_plane = search.refine(samples, tilted, axis)
-        along = float(plane.tilt @ axis)
-        if plane.score > level.score + TILT_GAIN and abs(along) <= search.LARGEST_TILT:
+        along = abs(float(plane.tilt @ axis))
+        if plane.score > level.score + TILT_GAIN and along <= search.LARGEST_TILT:
             levels, tilts = search.drawn(near_plane, axis, step)
             # the median absolute deviation, and the rounding to steps of tilt
             sigma_tilt = math.hypot(1.4826 * float(np.median(np.abs(tilts))), step / 6.0)
-            if abs(along) > TILT_SIGMAS * sigma_tilt:
-                return plane, near_plane, _sigma(levels), along, sigma_tilt
-    levels, _ = search.drawn(near, None, step)
-    return level, near, _sigma(levels), along, sigma_tilt
+            if along > TILT_SIGMAS * sigma_tilt:
+                return plane, near_plane, _sigma(levels), sigma_tilt
+    return level, near, _sigma(search.drawn(near, None, step)[0]), math.nan
 
 
 def _sigma(levels_m: FloatArray) -> float:

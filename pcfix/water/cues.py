@@ -1,11 +1,10 @@
-"""Cues whose change with height shows the water: slope, colour, brightness, noise.
+"""Cues whose change with height shows the water: slope, colour, and points that float on it.
 
 Slope: refraction lifts the bed towards the surface, so that its slopes below the waterline are
 about 1/1.34 of the true ones (less under oblique rays), and a beach has a break of known size.
 Colour: water absorbs red light first (brown water with peat, blue), so that the ratio to green is
 constant on land and falls with depth: logarithms of light fall linearly with depth (Lyzenga 1978,
-Applied Optics 17: 379-383). Brightness and noise change too, but wet sand is dark above the water,
-and noise grows with depth: they only support the others.
+Applied Optics 17: 379-383).
 
 A broken line is tested against an unbroken one, tile by tile, for every height of the break: y =
 (smooth within each tile) + trend * height + amplitude * f(depth), where f(d) = D (1 - exp(-d / D))
@@ -22,7 +21,6 @@ heights.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,14 +34,33 @@ _TINY = 1e-12
 _STEADY_M = 0.3
 
 
-class Break(NamedTuple):
-    """The break that is tested."""
+LIFT = 0.36
+"""n - 1 and a little more for oblique rays: the apparent reduction of slopes."""
+MOST_FADING = 1.2
+"""Per metre. Clear water has about 0.3, twice the difference in attenuation over the gamma of
+images; faster changes, except in the darkest water, are of the ground: plants, or a wet edge."""
 
-    scale_m: float  # D, infinite for a straight line below
+
+class Cue(NamedTuple):
+    """A property of the ground, and its break at the waterline."""
+
+    name: str
+    meaning: str
+    colour: int | None  # column of the colours, whose ratio to green it is; None for the slope
+    tile_cells: float  # side of a tile
     window_m: float  # observations weigh less towards this distance above and below
-    sign: float  # +1 or -1, of the amplitude
+    scale_m: float = math.inf  # D; infinite for a straight line below
+    sign: float = 1.0  # +1 or -1, of the amplitude
     amplitude: float | None = None  # given by physics, or free
-    most: float = np.inf  # a larger free amplitude is unlikely, twice as much impossible
+    most: float = math.inf  # a larger free amplitude is unlikely, twice as much impossible
+
+
+SLOPE = Cue("slope", "the ground looks flatter below", None, 12.0, 0.6, amplitude=LIFT)
+RED = Cue(
+    "red/green", "red fades against green below", 0, 24.0, 0.8,
+    scale_m=0.7, sign=-1.0, most=MOST_FADING,
+)  # fmt: skip
+BLUE = RED._replace(name="blue/green", meaning="blue fades against green below", colour=2)
 
 
 class Moments(NamedTuple):
@@ -55,7 +72,7 @@ class Moments(NamedTuple):
     number: FloatArray  # (t, h), observations
     xy: FloatArray  # (t, 2), centre of each tile
     heights_m: FloatArray  # (h,), evenly spaced
-    what: Break
+    cue: Cue
 
     def shifted(self, tilt: FloatArray) -> Moments:
         """Return the sums at the heights `heights_m` + tilt . xy of each tile."""
@@ -86,13 +103,13 @@ def gain_of(moments: Moments, times: FloatArray | None = None) -> Gain:
     sse = np.maximum(yy - slope * yx, 0.0) + _TINY
     cross, own = yf - share * yx, np.maximum(ff - share * xf, _TINY)
     amplitude = cross / own
-    what = moments.what
-    if what.amplitude is None:
+    cue = moments.cue
+    if cue.amplitude is None:
         steady = np.clip(2.0 - 2.0 * np.abs(slope / (amplitude + _TINY) - share), 0.0, 1.0)
-        likely = np.clip(2.0 - np.abs(amplitude) / what.most, 0.0, 1.0)
-        saved = np.maximum(what.sign * cross, 0.0) ** 2 / own * steady * likely
+        likely = np.clip(2.0 - np.abs(amplitude) / cue.most, 0.0, 1.0)
+        saved = np.maximum(cue.sign * cross, 0.0) ** 2 / own * steady * likely
     else:
-        saved = 2.0 * what.amplitude * cross - what.amplitude**2 * own
+        saved = 2.0 * cue.amplitude * cross - cue.amplitude**2 * own
     left = np.maximum(sse - saved, 1e-3 * sse)
     n = count.sum(axis=0)
     variance = np.maximum(sse - cross**2 / own, 1e-3 * sse) / np.maximum(n, 1.0)
@@ -113,113 +130,58 @@ def gain_of(moments: Moments, times: FloatArray | None = None) -> Gain:
 
 
 def tile_moments(
-    smooth: FloatArray, y: FloatArray, at_m: FloatArray, heights_m: FloatArray, what: Break,
-    *, with_trend: bool,
-) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    smooth: FloatArray, y: FloatArray, at_m: FloatArray, heights_m: FloatArray, cue: Cue
+) -> tuple[FloatArray, FloatArray]:
     """Return the sums of one tile, shapes (h, 6) and (h,); zero at heights outside it.
 
     The observations y, shape (n,), have the heights `at_m`; `smooth`, shape (n, p), has the columns
-    of the smooth part. With a trend, y may change with height in the same way above and below.
+    of the smooth part. A colour may also change with height in the same way above and below.
     """
     reached = np.arange(*np.searchsorted(heights_m, [at_m.min(), at_m.max()]))
     depth = heights_m[reached, None] - at_m
-    weight = np.maximum(1.0 - (depth / what.window_m) ** 2, 0.0) ** 2
+    weight = np.maximum(1.0 - (depth / cue.window_m) ** 2, 0.0) ** 2
     total = weight.sum(axis=1)
     below = (weight * (depth > 0.0)).sum(axis=1)
     enough = np.minimum(below, total - below) >= LEAST_SIDE
     sums, count = np.zeros((len(heights_m), 6)), np.zeros(len(heights_m))
-    if enough.any():
-        x = (at_m - at_m.mean()) * float(with_trend)
-        rows, weight = reached[enough], weight[enough]
-        sums[rows] = _sums(smooth, y, x, depth[enough], weight, what.scale_m)
-        squares = (weight**2).sum(axis=1)
-        count[rows] = np.maximum(total[enough] ** 2 / squares - smooth.shape[1], 1.0)
-    return sums, count
-
-
-def _sums(
-    smooth: FloatArray, y: FloatArray, x: FloatArray, depth: FloatArray, weight: FloatArray,
-    scale_m: float,
-) -> FloatArray:  # fmt: skip
-    below = np.maximum(depth, 0.0)
-    f = below if np.isinf(scale_m) else -scale_m * np.expm1(-below / scale_m)
-    p = smooth.shape[1]
+    if not enough.any():
+        return sums, count
+    rows, weight, p = reached[enough], weight[enough], smooth.shape[1]
+    below = np.maximum(depth[enough], 0.0)
+    f = below if np.isinf(cue.scale_m) else -cue.scale_m * np.expm1(-below / cue.scale_m)
+    x = (at_m - at_m.mean()) * float(cue.colour is not None)
+    # the products of all columns, f last, at each height
     fixed = np.column_stack([smooth, y, x])
     products = (fixed[:, :, None] * fixed[:, None, :]).reshape(len(y), -1)
-    whole = np.zeros((len(depth), p + 3, p + 3))
+    whole = np.zeros((len(rows), p + 3, p + 3))
     whole[:, :-1, :-1] = (weight @ products).reshape(-1, p + 2, p + 2)
     whole[:, -1, :-1] = whole[:, :-1, -1] = (weight * f) @ fixed
     whole[:, -1, -1] = (weight * f * f).sum(axis=1)
+    # without the smooth part: its normal equations are eliminated
     normal, right = whole[:, :p, :p], whole[:, :p, p:]
     ridge = 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(p)
     rest = whole[:, p:, p:] - np.swapaxes(right, 1, 2) @ np.linalg.solve(normal + ridge, right)
-    return np.asarray(rest[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]])
+    sums[rows] = rest[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    count[rows] = np.maximum(total[enough] ** 2 / (weight**2).sum(axis=1) - p, 1.0)
+    return sums, count
 
 
-def gather(
+def joined_tiles(
     parts: list[tuple[FloatArray, FloatArray]], xy: list[FloatArray], heights_m: FloatArray,
-    what: Break,
+    cue: Cue,
 ) -> Moments | None:  # fmt: skip
     """Join tiles, each in units of its residual variance; None without any information."""
-    telling = [i for i, (_, count) in enumerate(parts) if count.any()]
-    if not telling:
+    known = [i for i, (_, count) in enumerate(parts) if count.any()]
+    if not known:
         return None
-    sums, count = (np.array([parts[i][k] for i in telling]) for k in (0, 1))
+    sums, count = (np.array([parts[i][k] for i in known]) for k in (0, 1))
     variance = sums[..., 0].sum(axis=1) / count.sum(axis=1)
     least = 0.3 * float(np.median(variance)) + _TINY
     sums /= np.maximum(variance, least)[:, None, None]
-    return Moments(sums, count, np.array([xy[i] for i in telling]), heights_m, what)
+    return Moments(sums, count, np.array([xy[i] for i in known]), heights_m, cue)
 
 
-LIFT = 0.36
-"""n - 1 and a little more for oblique rays: the apparent reduction of slopes."""
-MOST_FADING = 1.2
-"""Per metre. Clear water has about 0.3, twice the difference in attenuation over the gamma of
-images; faster changes, except in the darkest water, are of the ground: plants, or a wet edge."""
-SLOPE_TILE_CELLS, LIGHT_TILE_CELLS = 12.0, 24.0
 _LEAST_CELLS, _LEAST_RELIEF_M = 40, 0.1
-_ROUGHNESS_FLOOR_M = 1e-3
-
-
-class Cue(NamedTuple):
-    """A cue."""
-
-    name: str
-    meaning: str
-    what: Break
-    tile_cells: float
-    places: bool  # whether it determines the level, or only supports others
-    values: Callable[[Samples], FloatArray] | None  # (m,); None for the ground itself
-
-
-SLOPE = Cue(
-    "slope", "the ground looks flatter below",
-    Break(math.inf, 0.6, 1.0, LIFT), SLOPE_TILE_CELLS, places=True, values=None,
-)  # fmt: skip
-RED = Cue(
-    "red/green", "red fades against green below",
-    Break(0.7, 0.8, -1.0, most=MOST_FADING), LIGHT_TILE_CELLS, places=True,
-    values=lambda samples: samples.colour[:, 0] - samples.colour[:, 1],
-)  # fmt: skip
-BLUE = RED._replace(
-    name="blue/green", meaning="blue fades against green below",
-    values=lambda samples: samples.colour[:, 2] - samples.colour[:, 1],
-)  # fmt: skip
-BRIGHT = Cue(
-    "brightness", "the ground is darker below",
-    Break(0.3, 0.8, -1.0), LIGHT_TILE_CELLS, places=False,
-    values=lambda samples: samples.colour.mean(axis=1),
-)  # fmt: skip
-NOISE = Cue(
-    "noise", "heights are noisier below",
-    Break(0.7, 0.8, 1.0), LIGHT_TILE_CELLS, places=False,
-    values=lambda samples: np.log(samples.rough_m + _ROUGHNESS_FLOOR_M),
-)  # fmt: skip
-
-
-def cues_of(samples: Samples) -> tuple[Cue, ...]:
-    """Return the cues of these samples."""
-    return (SLOPE, RED, BLUE, BRIGHT, NOISE) if len(samples.colour) else (SLOPE, NOISE)
 
 
 def cue_moments(
@@ -230,11 +192,15 @@ def cue_moments(
     Heights, shape (h,), are evenly spaced above the plane of that tilt through the samples' origin.
     """
     xy, fall = samples.xyz[:, :2], samples.xyz[:, :2] @ tilt
-    values = None if cue.values is None else cue.values(samples)
+    _, tile = np.unique(square_tiles(xy, cue.tile_cells * samples.cell_m), return_inverse=True)
+    order = np.argsort(tile.reshape(-1), kind="stable")
     parts, middles = [], []
-    for rows in _rows_of_tiles(xy, cue.tile_cells * samples.cell_m):
-        if values is not None:
-            smooth, y = np.ones((len(rows), 1)), values[rows]
+    for rows in np.split(order, np.cumsum(np.bincount(tile.reshape(-1)))[:-1]):
+        if len(rows) < _LEAST_CELLS:
+            continue
+        if cue.colour is not None:
+            smooth = np.ones((len(rows), 1))
+            y = samples.colour[rows, cue.colour] - samples.colour[rows, 1]
             at = samples.smooth_m[rows] - fall[rows]
         else:
             place = xy[rows] - xy[rows].mean(axis=0)
@@ -248,19 +214,9 @@ def cue_moments(
             at = smooth @ np.linalg.lstsq(smooth, y, rcond=None)[0]
             if np.ptp(at) < _LEAST_RELIEF_M:
                 continue
-        trend = values is not None
-        parts.append(tile_moments(smooth, y, at, heights_m, cue.what, with_trend=trend))
+        parts.append(tile_moments(smooth, y, at, heights_m, cue))
         middles.append(xy[rows].mean(axis=0))
-    return gather(parts, middles, heights_m, cue.what)
-
-
-def _rows_of_tiles(xy: FloatArray, side_m: float) -> list[IntArray]:
-    """Return the rows of each square tile with enough cells; `xy` from zero up."""
-    _, tile = np.unique(square_tiles(xy, side_m), return_inverse=True)
-    tile = tile.reshape(-1)
-    order = np.argsort(tile, kind="stable")
-    parts = np.split(order, np.cumsum(np.bincount(tile))[:-1])
-    return [part for part in parts if len(part) >= _LEAST_CELLS]
+    return joined_tiles(parts, middles, heights_m, cue)
 
 
 MOST_CELLS = 100_000
@@ -280,7 +236,6 @@ class Samples(NamedTuple):
 
     xyz: FloatArray  # (m, 3), mean x and y, median z, metres from `origin`
     smooth_m: FloatArray  # (m,), height at x, y of a plane through the cells around it
-    rough_m: FloatArray  # (m,), rms distance of the cells around from that plane
     colour: FloatArray  # (m, 3), mean natural logarithms of red, green, blue; (0, 3) for none
     cell_m: float  # side of a cell
     origin: FloatArray  # (3,), world frame
@@ -320,7 +275,7 @@ def sample_cloud(
         above &= returns > 1
     floating = local[above]
     tile = square_tiles(floating, TILE_CELLS * cell_m)
-    return Samples(ground, smooth, rough, colour, cell_m, origin, floating, tile)
+    return Samples(ground, smooth, colour, cell_m, origin, floating, tile)
 
 
 def _cell_m(local: FloatArray) -> float:

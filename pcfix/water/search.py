@@ -9,17 +9,7 @@ import numpy as np
 
 from pcfix.errors import GeometryError
 from pcfix.model import BoolArray, FloatArray
-from pcfix.water.cues import (
-    BRIGHT,
-    SLOPE,
-    Cue,
-    Moments,
-    Samples,
-    cue_moments,
-    cues_of,
-    gain_of,
-    layer_gain,
-)
+from pcfix.water.cues import BLUE, RED, SLOPE, Moments, Samples, cue_moments, gain_of, layer_gain
 
 LARGEST_TILT, USUAL_TILT = 0.006, 0.002
 TILT_STEP_M, MOST_TILT_STEPS = 0.15, 9
@@ -33,7 +23,7 @@ NO_TILT = np.zeros(2)
 class Looked(NamedTuple):
     """The sums of all cues of a cloud, at heights above a tilted plane."""
 
-    cues: list[tuple[Cue, Moments]]  # those with any information
+    cues: list[Moments]  # of the slope and of the stronger colour, if they show anything
     samples: Samples
     heights_m: FloatArray  # (h,)
     tilt: FloatArray  # (2,), of the plane through the origin of the samples
@@ -49,9 +39,13 @@ class Peak(NamedTuple):
 
 def look(samples: Samples, heights_m: FloatArray, tilt: FloatArray) -> Looked:
     """Sum all cues at the given heights above a tilted plane."""
-    cues = [(cue, cue_moments(samples, cue, heights_m, tilt)) for cue in cues_of(samples)]
-    known = [(cue, sums) for cue, sums in cues if sums is not None]
-    return Looked(known, samples, heights_m, tilt)
+    slope, *light = (
+        cue_moments(samples, cue, heights_m, tilt)
+        for cue in ((SLOPE, RED, BLUE) if len(samples.colour) else (SLOPE,))
+    )
+    known = [sums for sums in light if sums is not None]
+    stronger = sorted(known, key=lambda sums: -float(gain_of(sums).gain.max()))[:1]
+    return Looked([*([slope] if slope else []), *stronger], samples, heights_m, tilt)
 
 
 def all_heights(samples: Samples) -> FloatArray:
@@ -62,27 +56,17 @@ def all_heights(samples: Samples) -> FloatArray:
 
 
 def gains(looked: Looked, tilt: FloatArray, rng: np.random.Generator | None = None) -> FloatArray:
-    """Return the total gain of the cues that determine the level, at each height, shape (h,).
+    """Return the total gain of the cues at each height, shape (h,).
 
     `tilt`, shape (2,), is added to that of `looked`. With `rng`, tiles and floating points are
     resampled with replacement (bootstrap).
     """
     total = np.zeros(len(looked.heights_m))
-    for _, sums in placing(looked):
+    for sums in looked.cues:
         times = None if rng is None else _drawn(len(sums.sums), rng)
         total += np.maximum(gain_of(sums.shifted(tilt) if tilt.any() else sums, times).gain, 0.0)
     times = None if rng is None else _drawn(len(looked.samples.tile), rng)
     return total + layer_gain(looked.samples, looked.heights_m, looked.tilt + tilt, times)
-
-
-def placing(looked: Looked) -> list[tuple[Cue, Moments]]:
-    """Return the cues that determine the level; of the two colours the stronger one."""
-    fixing = [(cue, sums) for cue, sums in looked.cues if cue.places]
-    light = [pair for pair in fixing if "/" in pair[0].name]
-    if len(light) < 2:
-        return fixing
-    weaker = min(light, key=lambda pair: float(gain_of(pair[1]).gain.max()))
-    return [pair for pair in fixing if pair is not weaker]
 
 
 def _drawn(count: int, rng: np.random.Generator) -> FloatArray:
@@ -176,102 +160,76 @@ LEAST_LAYER = 15.0
 MOST_RIVAL_AGREED, MOST_RIVAL_ALONE = 0.75, 0.5
 MOST_SIGMA_M = 0.2
 LEAST_SHARE = 0.005
-WITNESS_SIGMAS, WITNESS_REACH_M = 3.0, 0.35
 INSTEAD = "Give the water surface: a level, shoreline points, plane:a,b,c or a mesh."
 LAYER = "floating points"
 
 
 def judge(
-    samples: Samples, peak: Peak, near: Looked, whole: Looked, sigma_m: float
+    peak: Peak, near: Looked, whole: Looked, sigma_m: float
 ) -> tuple[float, dict[str, float], tuple[str, ...]]:
     """Return the confidence in a surface, the figures of its evidence, and sentences about it.
 
     `near` are the sums about it, with its tilt, and `whole` those over all heights without tilt;
-    `sigma_m` is the standard error of its level.
+    `sigma_m` is the standard error of its level. Raises GeometryError ``water.not_found``.
     """
-    middle = len(near.heights_m) // 2
-    gain = {cue: gain_of(sums) for cue, sums in near.cues}
-    fixing = [cue for cue, _ in placing(near)]
-    found = {cue.name: float(gain[cue].gain[middle]) for cue in fixing}
+    samples, middle = near.samples, len(near.heights_m) // 2
+    gain = {sums.cue: gain_of(sums) for sums in near.cues}
+    found = {cue.name: float(gain[cue].gain[middle]) for cue in gain}
     found[LAYER] = float(layer_gain(samples, near.heights_m, near.tilt)[middle])
-    evidence = {f"{name} gain": value for name, value in found.items()}
     # the rival: the best height elsewhere
-    total = gains(whole, peak.tilt)
-    total = np.where(np.abs(whole.heights_m - peak.level_m) > SAME_PLACE_M, total, 0.0)
-    row = int(np.argmax(total))
-    evidence["rival gain"] = float(total[row])
-    evidence["rival height"] = float(whole.heights_m[row]) + float(samples.origin[2])
-    witnesses = []  # cues that only show that there is water below about here
-    close = np.abs(near.heights_m - near.heights_m[middle]) <= WITNESS_REACH_M
+    elsewhere = np.abs(whole.heights_m - peak.level_m) > SAME_PLACE_M
+    rivals = np.where(elsewhere, gains(whole, peak.tilt), 0.0)
+    row = int(np.argmax(rivals))
+    total, rival = sum(max(value, 0.0) for value in found.values()), float(rivals[row])
+    rival_m = float(whole.heights_m[row]) + float(samples.origin[2])
+    wet = float(np.mean(heights_above(samples, peak) < 0.0))
+    evidence = {f"{name} gain": value for name, value in found.items()} | {
+        "rival gain": rival, "rival height": rival_m, "total gain": total, "share below": wet,
+    }  # fmt: skip
+    sentences = []
     for cue, seen in gain.items():
-        if not cue.places:
-            sigmas = float((cue.what.sign * seen.amplitude / (seen.sigma + 1e-12))[close].max())
-            evidence[f"{cue.name} sigmas"] = sigmas
-            if sigmas >= WITNESS_SIGMAS:
-                witnesses.append(f"{cue.meaning} ({sigmas:.0f} standard errors)")
-    evidence["total gain"] = sum(max(value, 0.0) for value in found.values())
-    evidence["share below"] = float(np.mean(heights_above(samples, peak) < 0.0))
+        if found[cue.name] >= LEAST_EACH:
+            size, sigma = float(seen.amplitude[middle]), float(seen.sigma[middle])
+            evidence[f"{cue.name} amplitude"], evidence[f"{cue.name} sigma"] = size, sigma
+            text = f"the logarithm of the ratio falls by {-size:.2f} ± {sigma:.2f} per metre"
+            if cue == SLOPE:
+                text = f"true slopes are {1.0 + size:.2f} ± {sigma:.2f} times the apparent ones"
+            sentences.append(f"{cue.meaning}: {text}")
+    if found[LAYER] >= LEAST_EACH:
+        sentences.append(f"points float in a thin layer (evidence {found[LAYER]:.0f})")
+    # what is needed depends on the cues that gain enough to count
     strong = [
         name for name, g in found.items() if g >= (LEAST_LAYER if name == LAYER else LEAST_EACH)
     ]
-    lift = float(gain[SLOPE].amplitude[middle]) if strong == [SLOPE.name] else None
-    height = peak.level_m + float(samples.xyz[:, :2].mean(axis=0) @ peak.tilt)
-    text = f"{height + float(samples.origin[2]):.2f} m"
-    least = _refuse_poor(text, evidence, sigma_m, strong, lift)
-    sentences = []
-    for cue in fixing:
-        if found[cue.name] >= LEAST_EACH:
-            size, sigma = float(gain[cue].amplitude[middle]), float(gain[cue].sigma[middle])
-            evidence[f"{cue.name} amplitude"], evidence[f"{cue.name} sigma"] = size, sigma
-            sentences.append(f"{cue.meaning}: {_size(cue, size, sigma)}")
-    if found[LAYER] >= LEAST_EACH:
-        sentences.append(f"points float in a thin layer (evidence {found[LAYER]:.0f})")
-    most, rival = evidence["total gain"], evidence["rival gain"]
-    confidence = float(min(1.0 - rival / most, 1.0 - math.exp(-most / (2.0 * least))))
-    return confidence, evidence, (*sentences, *witnesses)
-
-
-def _refuse_poor(
-    height: str, evidence: dict[str, float], sigma_m: float, strong: list[str], lift: float | None
-) -> float:
-    """Return the evidence that is needed, or raise GeometryError ``water.not_found``.
-
-    `strong` are the cues that gain enough to count; `lift` is the change of slope if that is the
-    only one: a break that refraction does not make is a bank.
-    """
-    total, rival, wet = (evidence[name] for name in ("total gain", "rival gain", "share below"))
-    least, most_rival = LEAST_AGREED, MOST_RIVAL_AGREED
+    least, most_rival, lift = LEAST_AGREED, MOST_RIVAL_AGREED, LIFTS[0]
     if len(strong) < 2:
-        coloured = any("/" in name or name == BRIGHT.name for name in strong)
+        coloured = any("/" in name for name in strong)
         least, most_rival = (LEAST_COLOUR_ALONE if coloured else LEAST_ALONE), MOST_RIVAL_ALONE
+    if strong == [SLOPE.name]:
+        lift = evidence["slope amplitude"]
+    reason = ""
     if not LEAST_SHARE <= wet <= 1.0 - LEAST_SHARE:
         reason, why = "no_shoreline", "nearly all of the cloud is on one side of it"
-    elif lift is not None and not LIFTS[0] <= lift <= LIFTS[1]:
+    elif not LIFTS[0] <= lift <= LIFTS[1]:  # a break that refraction does not make
         reason = "bank"
         why = f"slopes change by {1.0 + lift:.2f} times there, and refraction makes about 1.36"
     elif total < least:
         reason, why = "weak", f"its evidence is {total:.0f}, and {least:.0f} is needed"
     elif rival > most_rival * total:
         reason = "contradictory"
-        why = (
-            f"its evidence is {total:.0f}, and {evidence['rival height']:.2f} m has {rival:.0f},"
-            " nearly as much"
-        )
+        why = f"its evidence is {total:.0f}, and {rival_m:.2f} m has {rival:.0f}, nearly as much"
     elif sigma_m > MOST_SIGMA_M:
         reason, why = "inconsistent", f"parts of the cloud differ by {sigma_m:.2f} m"
-    else:
-        return least
-    raise GeometryError(
-        "water.not_found",
-        f"No water surface was found. The best candidate is {height}, but {why}. {INSTEAD}",
-        reason=reason, evidence=evidence,
-    )  # fmt: skip
-
-
-def _size(cue: Cue, size: float, sigma: float) -> str:
-    if cue == SLOPE:
-        return f"true slopes are {1.0 + size:.2f} ± {sigma:.2f} times the apparent ones"
-    return f"the logarithm of the ratio falls by {-size:.2f} ± {sigma:.2f} per metre"
+    if reason:
+        height = peak.level_m + float(samples.xyz[:, :2].mean(axis=0) @ peak.tilt)
+        raise GeometryError(
+            "water.not_found",
+            f"No water surface was found. The best candidate is"
+            f" {height + float(samples.origin[2]):.2f} m, but {why}. {INSTEAD}",
+            reason=reason, evidence=evidence,
+        )  # fmt: skip
+    confidence = float(min(1.0 - rival / total, 1.0 - math.exp(-total / (2.0 * least))))
+    return confidence, evidence, tuple(sentences)
 
 
 TILTS = (-0.02, -0.015, -0.01, -0.0075, -0.005, -0.0025, 0.0025, 0.005, 0.0075, 0.01, 0.015, 0.02)

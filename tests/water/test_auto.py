@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pcfix.water.auto import find_water
-from pcfix.water.cues import Break, gain_of, gather, tile_moments
+from pcfix.water.cues import Cue, gain_of, joined_tiles, tile_moments
 from tests.utils.codes import refused
 from tests.utils.shared import needs
 
@@ -132,15 +132,15 @@ def test_refused():
 def test_amplitude_of_break():
     rng = np.random.default_rng(5)
     heights = np.array([0.0, 0.1])
-    what = Break(np.inf, 1e6, 1.0)
+    cue = Cue("a colour", "", 0, 1.0, 1e6)
     parts = []
     everything = []
     for tile in range(3):
         at = rng.uniform(-1.0, 1.0, 200)
         y = tile + 0.1 * at + 0.5 * np.maximum(-at, 0.0) + rng.normal(0.0, 0.05, 200)
-        parts.append(tile_moments(np.ones((200, 1)), y, at, heights, what, with_trend=True))
+        parts.append(tile_moments(np.ones((200, 1)), y, at, heights, cue))
         everything.append((tile, at, y))
-    gain = gain_of(gather(parts, [np.zeros(2)] * 3, heights, what))
+    gain = gain_of(joined_tiles(parts, [np.zeros(2)] * 3, heights, cue))
     design = np.vstack(
         [np.column_stack([np.eye(3)[np.full(200, t)], at, np.maximum(-at, 0)])
          for t, at, _ in everything]
