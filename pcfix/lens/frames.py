@@ -3,11 +3,8 @@
 The frame of a central projection without distortion is a pyramid with its tip in the projection
 centre: a point is in the frame if it is on the inner side of its four planes.
 
-A distorted frame has curved sides, and the point has to be projected. Most tiles need no
-projection: those outside a pyramid around the frame (a cone, if the frame is too wide), and those
-whose middle is imaged so far from the border that no ray of the tile can cross it. The `scale` of
-the lens bounds that: turning a ray by an angle moves its image by at most `scale` times the angle,
-in the frame and within a `margin` around it.
+A distorted frame has curved sides, and the point has to be projected, except for tiles outside a
+pyramid and a cone around the frame.
 
 The border of the image is unprojected densely. If all of it has directions, what it encloses is
 the frame, as a lens is used only where it is one to one.
@@ -30,7 +27,6 @@ from pcfix.lens.imaging import (
     lens_table,
     plain_image,
     plain_lens,
-    project,
     unproject,
 )
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, Views
@@ -42,7 +38,6 @@ class FrameShape(NamedTuple):
     planes: FloatArray
     distorted: bool
     widest: float
-    reach: tuple[float, float]
 
 
 @lru_cache(maxsize=8192)
@@ -57,14 +52,9 @@ def frame_shape(lens: Lens) -> FrameShape:
             (lens.b3, lens.focal, lens.principal_y),
             (-lens.b3, -lens.focal, height),
         ])  # fmt: skip
-        return FrameShape(inward, distorted=False, widest=np.pi, reach=(np.inf, 0.0))
+        return FrameShape(inward, distorted=False, widest=np.pi)
     border = unproject(lens, _border(lens, BORDER))
-    return FrameShape(
-        _planes_around(border),
-        distorted=True,
-        widest=_widest_angle(lens, border),
-        reach=_reach(lens) if np.isfinite(border).all() else (np.inf, 0.0),
-    )
+    return FrameShape(_planes_around(border), distorted=True, widest=_widest_angle(lens, border))
 
 
 BORDER = 400
@@ -112,44 +102,9 @@ def _widest_angle(lens: Lens, border: FloatArray) -> float:
     return widest + 1e-6
 
 
-MARGIN = 0.1
-"""Of the longer side of the image."""
-
-_GRID = 41
-_SAFETY = 1.1  # the scale is smooth, and known at a grid of places
-
-
-def _reach(lens: Lens) -> tuple[float, float]:
-    """Return scale and margin; the margin is zero where part of it is beyond the fold."""
-    margin = MARGIN * max(lens.width, lens.height)
-    scale = _largest_scale(lens, margin)
-    if np.isfinite(scale):
-        return _SAFETY * scale, margin
-    return _SAFETY * _largest_scale(lens, 0.0), 0.0
-
-
-def _largest_scale(lens: Lens, margin: float) -> float:
-    """Return the largest derivative of the image by an angle; infinite if a place has none."""
-    u = np.linspace(-margin, lens.width + margin, _GRID)
-    v = np.linspace(-margin, lens.height + margin, _GRID)
-    d = unproject(lens, np.column_stack([np.repeat(u, _GRID), np.tile(v, _GRID)]))
-    side = np.cross(d, np.where(np.abs(d[:, :1]) < 0.6, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]))
-    side /= np.linalg.norm(side, axis=1, keepdims=True)
-    turn = 1e-6
-    by_side, by_other = (
-        (project(lens, d + turn * t) - project(lens, d - turn * t)) / (2.0 * turn)
-        for t in (side, np.cross(d, side))
-    )
-    squares = (by_side**2 + by_other**2).sum(axis=1)
-    det = by_side[:, 0] * by_other[:, 1] - by_side[:, 1] * by_other[:, 0]
-    longest = np.sqrt(0.5 * (squares + np.sqrt(np.maximum(squares**2 - 4.0 * det**2, 0.0))))
-    return np.inf if np.isnan(longest).any() else float(longest.max())
-
-
 Pyramid: TypeAlias = tuple[Vector, Vector, Vector, Vector]
 
 NOT_DISTORTED = -1
-NOTHING, SOME, ALL = 0, 1, 2
 
 
 class Frames(NamedTuple):
@@ -158,7 +113,6 @@ class Frames(NamedTuple):
     planes: FloatArray  # (k, 4, 3), inward normals of the pyramid that is, or encloses, the frame
     row: IntArray  # (k,), lens of each camera; `NOT_DISTORTED` if the pyramid is the frame
     cone: FloatArray  # (k, 4), an axis, and the largest angle (rad) of the frame from it
-    reach: FloatArray  # (k, 2), scale (unit per rad) and margin (unit) of the lens
     lenses: FloatArray  # (l, ...), coefficients, one row per lens
     rotations: FloatArray  # (k, 3, 3), world to camera
 
@@ -169,7 +123,6 @@ def no_frames(k: int) -> Frames:
         planes=np.zeros((k, 4, 3)),
         row=np.full(k, NOT_DISTORTED),
         cone=np.zeros((k, 4)),
-        reach=np.zeros((k, 2)),
         lenses=np.zeros((1, 1)),
         rotations=np.zeros((k, 3, 3)),
     )
@@ -193,7 +146,6 @@ def frames_of(cameras: Cameras) -> Frames:
         planes=np.ascontiguousarray(np.array([s.planes for s in shapes])[row] @ rotations),
         row=np.where(np.array([s.distorted for s in shapes])[row], row, NOT_DISTORTED),
         cone=np.column_stack([rotations[:, 2], widest[row]]),
-        reach=np.array([s.reach for s in shapes])[row],
         lenses=lenses,
         rotations=rotations,
     )
@@ -266,13 +218,12 @@ def holds(frames: Frames, c: int, e: Vector) -> bool:
 
 @device
 def mark(
-    marks: FloatArray, points: FloatArray, run: int, frames: Frames, c: int, centre: FloatArray,
-    low: FloatArray, high: FloatArray,
-) -> bool:  # fmt: skip
+    marks: FloatArray, points: FloatArray, run: int, frames: Frames, c: int, centre: FloatArray
+) -> bool:
     """Set to 1 the marks of points in the frame of camera c, to 0 those of others.
 
-    The points of a box, `low` to `high`, are runs of `run` x, y and z. It is `holds` for many of
-    them; returns whether the frame may hold any.
+    The points are runs of `run` x, y and z. It is `holds` for many of them; returns whether the
+    frame may hold any.
     """
     around, row = pyramid(frames.planes[c]), frames.row[c]
     if row == NOT_DISTORTED:
@@ -280,11 +231,6 @@ def mark(
             e = centre[0] - points[j], centre[1] - points[run + j], centre[2] - points[2 * run + j]
             marks[j] = 1.0 if in_frame(around, e) else 0.0
         return True
-    # many boxes lie within a distorted frame, or beside it, as a whole
-    held = judge(frames, c, centre, low, high)
-    if held != SOME:
-        marks[:] = 1.0
-        return bool(held == ALL)
     lens, r, count = frames.lenses[row], frames.rotations[c], 0
     plain = plain_lens(lens)
     # only one of the two loops runs; with the choice inside, the first would not be vectorised
@@ -303,25 +249,19 @@ def mark(
 
 
 @device
-def may_hold(g: FloatArray, centre: FloatArray, low: FloatArray, high: FloatArray) -> bool:
-    """Whether a pyramid may hold a point of an upright box; never wrongly False."""
+def may_hold(frames: Frames, c: int, centre: FloatArray, low: FloatArray, high: FloatArray) -> bool:
+    """Whether the frame of camera c may hold a point of an upright box; never wrongly False."""
     for p in range(4):
-        reach = 0.0
+        reach, inward = 0.0, row_of(frames.planes[c], p)
         for axis in range(3):
-            corner = high[axis] if g[p, axis] > 0.0 else low[axis]
-            reach += g[p, axis] * (corner - centre[axis])
+            corner = high[axis] if inward[axis] > 0.0 else low[axis]
+            reach += inward[axis] * (corner - centre[axis])
         if reach < 0.0:
             return False
-    return True
-
-
-@device
-def judge(frames: Frames, c: int, centre: FloatArray, low: FloatArray, high: FloatArray) -> int:
-    """Return `ALL`, `NOTHING` or `SOME`: what the distorted frame of camera c holds of a box.
-
-    `ALL` and `NOTHING` are never wrong. The upright box is replaced by the ball around it, which
-    the camera sees within the angle `turn` about its middle.
-    """
+    # a distorted frame is narrower than its pyramid; the camera sees the ball around the box
+    # within the angle `turn` about its middle
+    if frames.row[c] == NOT_DISTORTED:
+        return True
     e = (
         centre[0] - 0.5 * (low[0] + high[0]),
         centre[1] - 0.5 * (low[1] + high[1]),
@@ -330,19 +270,10 @@ def judge(frames: Frames, c: int, centre: FloatArray, low: FloatArray, high: Flo
     far2 = dot(e, e)
     size2 = (high[0] - low[0]) ** 2 + (high[1] - low[1]) ** 2 + (high[2] - low[2]) ** 2
     if not 0.25 * size2 < far2:
-        return SOME
+        return True
     turn = np.arcsin(np.sqrt(0.25 * size2 / far2)) + 1e-6
     along = -dot(row_of(frames.cone, c), e) / np.sqrt(far2)
-    if np.arccos(max(-1.0, min(1.0, along))) > frames.cone[c, 3] + turn:
-        return NOTHING
-    lens, r = frames.lenses[frames.row[c]], frames.rotations[c]
-    u, v = image_of(lens, *scaled(-1.0, times(r, e)))
-    within = min(min(u, lens[WIDTH] - u), min(v, lens[HEIGHT] - v))
-    # no ray of the ball is imaged farther than this from the image of its middle
-    move, margin = turn * frames.reach[c, 0], frames.reach[c, 1]
-    if within > move:
-        return ALL
-    return SOME if within >= -move or move >= margin else NOTHING
+    return bool(np.arccos(max(-1.0, min(1.0, along))) <= frames.cone[c, 3] + turn)
 
 
 BORDER_POINTS = 8

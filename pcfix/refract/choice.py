@@ -173,7 +173,7 @@ def _choose_all(
         near = tiling.near_cameras(around, frames, rig.centres, low, high)
         marks, seeing = np.empty((near.size, rows.size)), 0
         for c in near:
-            if mark(marks[seeing], tile, TILE, frames, c, rig.centres[c], low, high):
+            if mark(marks[seeing], tile, TILE, frames, c, rig.centres[c]):
                 near[seeing] = c
                 seeing += 1
         near = near[:seeing]

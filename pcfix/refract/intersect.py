@@ -189,7 +189,7 @@ def _add_cameras(
             g, some = pyramid(frames.planes[c]), False
             added = add_camera(sums, tile, on, g, rig, c, rule, tin, fields)
         else:
-            some = mark(on, tile, TILE, frames, c, rig.centres[c], low, high)
+            some = mark(on, tile, TILE, frames, c, rig.centres[c])
         if some:
             added = add_camera(sums, tile, on, None, rig, c, rule, tin, fields)
         if added:

@@ -12,7 +12,7 @@ import numpy as np
 
 from pcfix.kernels import device
 from pcfix.lens.algebra import Nine, Vector, row_of
-from pcfix.lens.frames import NOT_DISTORTED, NOTHING, Frames, judge, may_hold
+from pcfix.lens.frames import Frames, may_hold
 from pcfix.model import FloatArray, IntArray, SingleArray, WaterPlane
 from pcfix.refract.batch import Batch, Chosen, normal_above
 
@@ -157,14 +157,10 @@ def near_cameras(
     around: IntArray, frames: Frames, centres: FloatArray, low: FloatArray, high: FloatArray
 ) -> IntArray:
     """Return those of some cameras whose frames may hold a point of an upright box."""
-    planes, row = frames.planes, frames.row
     near = np.empty(len(around), np.int64)
     count = 0
     for c in around:
-        if not may_hold(planes[c], centres[c], low, high):
-            continue
-        # the pyramid around a distorted frame is wider than the frame
-        if row[c] == NOT_DISTORTED or judge(frames, c, centres[c], low, high) != NOTHING:
+        if may_hold(frames, c, centres[c], low, high):
             near[count] = c
             count += 1
     return near[:count]

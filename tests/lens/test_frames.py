@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import pcfix
-from pcfix.lens.frames import ALL, NOT_DISTORTED, NOTHING, frames_of, holds, judge, may_hold
+from pcfix.lens.frames import NOT_DISTORTED, frames_of, holds, may_hold
 from pcfix.lens.imaging import project
 from pcfix.refract.intersect import TILE
 from tests.refract.test_kernels import same
@@ -18,7 +18,6 @@ from tests.utils.twins import image_slowly
 
 holds = compiled(holds)
 may_hold = compiled(may_hold)
-judge = compiled(judge)
 
 pytestmark = BEYOND_FRAMES
 
@@ -116,30 +115,18 @@ def boxes(rng, count=200):
 
 
 @pytest.mark.parametrize("name", mostly_nightly(LENSES, "everything"))
-def test_judge(name):
+def test_may_hold(name):
     rng = np.random.default_rng(5)
     cameras = block(LENSES[name], k=8, seed=3)
-    frames = frames_of(cameras)
-    judged = {ALL: 0, NOTHING: 0}
+    frames, excluded = frames_of(cameras), 0
     for low, high in zip(*boxes(rng), strict=True):
         inside = rng.uniform(low, high, (20, 3))
         inside[:8] = np.where(np.indices((2, 2, 2)).reshape(3, 8).T == 0, low, high)
         for c, centre in enumerate(cameras.centres):
-            e = centre - inside
-            held = [holds(frames, c, tuple(row)) for row in e]
-            if not may_hold(frames.planes[c], centre, low, high):
-                assert not any(held)
-                continue
-            verdict = judge(frames, c, centre, low, high)
-            if verdict == ALL:
-                assert all(held)
-            if verdict == NOTHING:
-                assert not any(held)
-            if verdict in judged:
-                judged[verdict] += 1
-    # where the fold is in the image no tile is taken as a whole, but for the cone
-    assert judged[NOTHING] > 0 or name == "round fisheye"
-    assert judged[ALL] > 0 or name in ("folding", "round fisheye")
+            if not may_hold(frames, c, centre, low, high):
+                excluded += 1
+                assert not any(holds(frames, c, tuple(row)) for row in centre - inside)
+    assert excluded > 0
 
 
 @pytest.mark.parametrize("name", LENSES)
@@ -155,27 +142,6 @@ def test_pyramid_and_cone(name):
     assert angle.max() <= frames.cone[0, 3] <= np.pi + 0.1
     if lens.projection == "perspective" and name != "folding":
         assert frames.cone[0, 3] < 1.02 * angle.max() + 0.01  # and not far around
-
-
-@pytest.mark.parametrize("name", LENSES)
-def test_scale(name):
-    lens = LENSES[name]
-    frames = frames_of(pcfix.Cameras(("a",), np.zeros((1, 3)), np.eye(3)[None], (lens,)))
-    scale, margin = frames.reach[0]
-    rng = np.random.default_rng(3)
-    one = rng.normal(size=(200_000, 3))
-    one /= np.linalg.norm(one, axis=1)[:, None]
-    other = one + 1e-3 * rng.normal(size=one.shape)
-    other /= np.linalg.norm(other, axis=1)[:, None]
-    images = [project(lens, d) for d in (one, other)]
-    near = np.logical_and(*(
-        ((image >= -margin) & (image <= np.add((4000, 3000), margin))).all(axis=1)
-        for image in images
-    ))  # fmt: skip
-    angle = 2 * np.arcsin(np.linalg.norm(one - other, axis=1) / 2)
-    moved = np.linalg.norm(images[0] - images[1], axis=1)
-    assert near.sum() > 1000
-    assert (moved[near] <= scale * angle[near]).all()
 
 
 def test_different_lenses(points):
