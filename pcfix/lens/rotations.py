@@ -7,8 +7,6 @@ All angles are in degrees, one per image; Rx, Ry, Rz are right-handed rotations 
 
 from __future__ import annotations
 
-from functools import reduce
-
 import numpy as np
 
 from pcfix.model import FloatArray
@@ -61,23 +59,8 @@ def from_aircraft(yaw_deg: FloatArray, pitch_deg: FloatArray, roll_deg: FloatArr
 
 
 def _from_camera_to_world(axes: str, *angles_deg: FloatArray) -> FloatArray:
-    """Return rotations from the product of turns about axes, camera to world.
+    """Return rotations from the product of turns about axes, camera to world."""
+    from scipy.spatial.transform import Rotation  # slow to import
 
-    (scipy's ``Rotation.from_euler`` does the same, but takes a quarter of a second to import.)
-    """
-    camera_to_world = reduce(np.matmul, map(_turns, axes, angles_deg))
-    return from_photogrammetric(camera_to_world.transpose(0, 2, 1))
-
-
-def _turns(axis: str, angles_deg: FloatArray) -> FloatArray:
-    """Return the matrices of turns about one axis, shape (k, 3, 3)."""
-    i = "XYZ".index(axis)
-    j, k = (i + 1) % 3, (i + 2) % 3
-    with np.errstate(invalid="ignore"):
-        angles = np.radians(angles_deg)
-        sine, cosine = np.sin(angles), np.cos(angles)
-    turns = np.zeros((len(angles), 3, 3))
-    turns[:, i, i] = 1.0
-    turns[:, j, j] = turns[:, k, k] = cosine
-    turns[:, k, j], turns[:, j, k] = sine, -sine
-    return turns
+    camera_to_world = Rotation.from_euler(axes, np.column_stack(angles_deg), degrees=True)
+    return from_photogrammetric(camera_to_world.as_matrix().transpose(0, 2, 1))

@@ -83,13 +83,6 @@ class Streams(NamedTuple):
     poses: np.random.Generator
     waves: np.random.Generator
     detection: np.random.Generator
-    matching: np.random.Generator
-
-    @classmethod
-    def of(cls, seed: int) -> Streams:
-        """Return the streams of a seed, independent of one another."""
-        main = np.random.default_rng(seed)
-        return cls(main, *(np.random.default_rng([seed, i]) for i in range(1, 5)))
 
 
 def simulate_scene(
@@ -197,7 +190,8 @@ class Site(NamedTuple):
 
 def lay_out(chosen: SceneSettings) -> Site:
     """Return ground and block of a scene, in local coordinates."""
-    streams, extent = Streams.of(chosen.seed), chosen.area_m
+    keys: list[Any] = [chosen.seed, *([chosen.seed, i] for i in (1, 2, 3))]
+    streams, extent = Streams(*map(np.random.default_rng, keys)), chosen.area_m
     if chosen.cameras is not None:  # the area that about this number of nadir images covers
         (length, width), (base, spacing) = extent, chosen.base_and_spacing_m
         side = float(np.sqrt(chosen.cameras * base * spacing * length / width))

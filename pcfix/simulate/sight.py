@@ -68,12 +68,6 @@ class Sight:
         """Which points have pairs, shape (n,)."""
         return np.asarray(np.diff(self.start) > 0)
 
-    def rows(self) -> IntArray:
-        """Return the row of each point and camera, shape (n, k), -1 where there is none."""
-        rows = np.full((len(self.truth), len(self.rig.true)), -1)
-        rows[self.point, self.camera] = np.arange(len(self.point))
-        return rows
-
     def intersected(self, pixels: FloatArray) -> FloatArray:
         """Return where straight rays through ideal pixels, (m, 2), meet with least residuals.
 

@@ -18,8 +18,6 @@ GREATEST_DEPTH_M = 12.0
 STEPS = 6
 _ROCKS_PER_M2 = 1.0 / 150.0
 _BANK = 0.3  # of a river's depth
-_GRADIENT_STEP_M = 1e-4
-_WALL = 10.0  # a slope steeper than this is the wall of a step, beside which the bed is level
 
 
 @dataclass(frozen=True)
@@ -58,16 +56,6 @@ class Terrain:
         """Return z at plan positions, metres; never deeper than `greatest_depth_m`."""
         above = np.maximum(BEDS[self.kind].above_water(self, x, y), -self.greatest_depth_m)
         return np.asarray(self.water.a + self.water.b * x + self.water.c * y + above)
-
-    def normals(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Return unit normals, up, shape (m, 3), from differences over 0.2 mm."""
-        d = _GRADIENT_STEP_M
-        along_x = (self.height(x + d, y) - self.height(x - d, y)) / (2.0 * d)
-        along_y = (self.height(x, y + d) - self.height(x, y - d)) / (2.0 * d)
-        wall = np.hypot(along_x, along_y) > _WALL
-        slopes = np.where(wall, self.water.b, along_x), np.where(wall, self.water.c, along_y)
-        up = np.column_stack([-slopes[0], -slopes[1], np.ones(len(x))])
-        return np.asarray(up / np.linalg.norm(up, axis=1)[:, None])
 
 
 def _shore(ground: Terrain, x: FloatArray, y: FloatArray) -> FloatArray:

@@ -26,18 +26,6 @@ _NEWTON_STEPS = 60
 _CONVERGED_M = 1e-11
 
 
-def piercing_points(
-    points: FloatArray, centres: FloatArray, water_level_m: float, refractive_index: float
-) -> FloatArray:
-    """Return where the light from each point to its camera passes a level surface, (m, 3)."""
-    anchor, normal = np.array([0.0, 0.0, water_level_m]), np.array([0.0, 0.0, 1.0])
-    shape = points.shape
-    return piercing_points_of_planes(
-        points, centres, np.broadcast_to(anchor, shape), np.broadcast_to(normal, shape),
-        refractive_index,
-    )  # fmt: skip
-
-
 def piercing_points_of_planes(
     points: FloatArray,
     centres: FloatArray,

@@ -322,17 +322,9 @@ def heights_from_cloud(xy: FloatArray, cloud_xyz: FloatArray, radius_m: float) -
     On the edge of the water half of the neighbours are on land and half on the bed, so that on an
     even bank their median is the height of the edge. Places have the shape (n, 2), the cloud (m,
     3), metres, in one frame; only points within the radius count. NaN for fewer than `FEWEST`.
-    Raises SettingError ``option.range`` if the radius is not positive.
     """
     from scipy.spatial import cKDTree
 
-    if not radius_m > 0.0:
-        raise SettingError(
-            "option.range",
-            f"The radius around shoreline points is {radius_m:g} m. It must be positive.",
-            option="radius_m",
-            value=radius_m,
-        )
     height = np.full(len(xy), np.nan)
     near = cloud_xyz[is_near(xy, cloud_xyz, radius_m)] if len(xy) else cloud_xyz[:0]
     if len(near) == 0:

@@ -30,8 +30,8 @@ START_C, FINAL_C = 1.547645, 4.685061
 """Tukey's constants: for a breakdown point of one half, and for 95 % efficiency."""
 LEAST_SCALE_M = 0.005
 """Least scatter of residuals for their weights: the edge of water is no sharper."""
-SUBSETS, SAMPLE, REFINED, FINALISTS = 3000, 400, 20, 3
-_ROUNDS, _CONVERGED_M, _CONVERGED, _ROUGHLY = 200, 1e-10, 1e-7, 1e-2
+SUBSETS, SAMPLE, REFINED = 3000, 400, 20
+_ROUNDS, _CONVERGED_M, _CONVERGED = 200, 1e-10, 1e-7
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -88,12 +88,11 @@ def robust_regression(X: FloatArray, z: FloatArray) -> Regression | None:
     The columns of X, shape (n, p), are of similar size; z, shape (n,), is in metres.
     """
     rows = np.unique(np.linspace(0, len(z) - 1, min(len(z), SAMPLE)).astype(np.int64))
-    few, scale_of = (X[rows], z[rows]), itemgetter(1)
-    roughly = [_least_s_scale(*few, start, 3, _ROUGHLY) for start in _exact_fits(*few)]
-    if not roughly:
+    starts = _exact_fits(X[rows], z[rows])
+    if not len(starts):
         return None
-    finalists = sorted(roughly, key=scale_of)[:FINALISTS]
-    beta, scale = min((_least_s_scale(*few, beta) for beta, _ in finalists), key=scale_of)
+    refined = [_least_s_scale(X[rows], z[rows], start) for start in starts]
+    beta, scale = min(refined, key=itemgetter(1))
     if len(rows) < len(z):
         beta, scale = _least_s_scale(X, z, beta)
     limit = FINAL_C * max(scale, LEAST_SCALE_M)
@@ -125,7 +124,7 @@ def tukey_weight(u: FloatArray) -> FloatArray:
     return np.asarray(np.where(np.abs(u) < 1.0, (1.0 - u * u) ** 2, 0.0))
 
 
-def s_scale(residual_m: FloatArray, unknowns: int, precision: float) -> float:
+def s_scale(residual_m: FloatArray, unknowns: int) -> float:
     """Return the scale s with sum rho(r / (c s)) = (n - p) / 2; the standard deviation of normals.
 
     rho(u) = 1 - (1 - u^2)^3, and 1 beyond |u| = 1. Zero if more than half are zero.
@@ -139,7 +138,7 @@ def s_scale(residual_m: FloatArray, unknowns: int, precision: float) -> float:
         inside = 1.0 - np.minimum(square / (START_C * scale) ** 2, 1.0)
         factor = float(np.sqrt(2.0 * (1.0 - inside**3).sum() / spare))
         scale *= factor
-        if abs(factor - 1.0) < precision:
+        if abs(factor - 1.0) < _CONVERGED:
             break
     return scale
 
@@ -168,19 +167,13 @@ def _subsets(n: int, p: int) -> IntArray:
     return np.asarray(ordered[different][:SUBSETS])
 
 
-def _least_s_scale(
-    X: FloatArray,
-    z: FloatArray,
-    beta: FloatArray,
-    rounds: int = _ROUNDS,
-    precision: float = _CONVERGED,
-) -> tuple[FloatArray, float]:
+def _least_s_scale(X: FloatArray, z: FloatArray, beta: FloatArray) -> tuple[FloatArray, float]:
     """Refine beta to a local minimum of the S-scale, and return both."""
     best, least = beta, inf
-    for _ in range(rounds):
+    for _ in range(_ROUNDS):
         residual = z - X @ beta
-        scale = s_scale(residual, X.shape[1], precision)
-        if not scale < least * (1.0 - precision):
+        scale = s_scale(residual, X.shape[1])
+        if not scale < least * (1.0 - _CONVERGED):
             break
         best, least = beta, scale
         if scale == 0.0:

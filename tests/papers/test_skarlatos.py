@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.simulate.tracing import piercing_points
 from tests.papers.hsu_wang import simulate_bowl
 from tests.papers.refraction_effect import (
     FLIGHTS,
@@ -22,6 +21,7 @@ from tests.papers.refraction_effect import (
     write_all,
 )
 from tests.papers.test_equations import pierced, refracted
+from tests.utils.level_water import piercing_points
 
 PAIR = StereoPair(SWINGLETCAM, 100.0)
 PAIRS = [

@@ -12,9 +12,10 @@ from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Learned
 from pcfix.refract.methods import correct
 from pcfix.refract.occlusion import occluded, occluder_of, visible_cameras
-from pcfix.simulate.tracing import piercing_points, project, triangulate
+from pcfix.simulate.tracing import project, triangulate
 from pcfix.water.surface import SurfaceAbove
 from tests.utils.batches import batch_of
+from tests.utils.level_water import piercing_points
 from tests.utils.shared import needs
 
 RENDERED, rendered = needs("rendered_a")

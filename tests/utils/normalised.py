@@ -9,7 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pcfix.model import Cameras, Lens, Views
-from pcfix.simulate.tracing import piercing_points, project, triangulate
+from pcfix.simulate.tracing import project, triangulate
+from tests.utils.level_water import piercing_points
 
 if TYPE_CHECKING:
     from pcfix.model import FloatArray

@@ -36,7 +36,7 @@ from pcfix.simulate.scene import Part
 from pcfix.simulate.sight import Sight
 from pcfix.simulate.tracing import piercing_points_of_planes, project, rotations_of
 from tests.utils.bed_rays import bed_points
-from tests.utils.matchers.pairs import Partners
+from tests.utils.matchers.pairs import Partners, rows_of
 
 AVERAGED_WITHIN = 0.012
 AGREE = 0.01
@@ -123,7 +123,7 @@ class _Matching:
     def __init__(
         self, sight: Sight, normals: FloatArray, partners: Partners, rng: np.random.Generator
     ) -> None:
-        rig, row_of = sight.rig, sight.rows()
+        rig, row_of = sight.rig, rows_of(sight)
 
         def there(table: IntArray) -> IntArray:
             """Return the rows of the images that a table names for the image of each row."""

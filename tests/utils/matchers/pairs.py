@@ -143,6 +143,13 @@ def _lost(
     return sight.camera[gone], sight.point[gone]
 
 
+def rows_of(sight: Sight) -> IntArray:
+    """Return the row of each point and camera, shape (n, k), -1 where there is none."""
+    rows = np.full((len(sight.truth), len(sight.rig.true)), -1)
+    rows[sight.point, sight.camera] = np.arange(len(sight.point))
+    return rows
+
+
 def match_pairs(
     sight: Sight, table: IntArray, rng: np.random.Generator
 ) -> tuple[Part, IntArray, IntArray]:
@@ -152,7 +159,7 @@ def match_pairs(
     neighbours of each camera, -1 for none; `rng` makes the noise, of two image points a pair.
     """
     # the rows that are pairs, each once, sorted by point, then camera
-    k, rows = len(table), sight.rows()
+    k, rows = len(table), rows_of(sight)
     match = np.zeros((k, k + 1), bool)
     match[np.arange(k)[:, None], table] = True  # the column k, or -1, is for "none"
     match = match[:, :k]
