@@ -30,7 +30,7 @@ START_C, FINAL_C = 1.547645, 4.685061
 """Tukey's constants: for a breakdown point of one half, and for 95 % efficiency."""
 LEAST_SCALE_M = 0.005
 """Least scatter of residuals for their weights: the edge of water is no sharper."""
-SUBSETS, SAMPLE, REFINED = 3000, 400, 20
+SUBSETS, SAMPLE, REFINED = 3000, 400, 10
 _ROUNDS, _CONVERGED_M, _CONVERGED = 200, 1e-10, 1e-7
 
 
