@@ -19,6 +19,7 @@ from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.tiles import CloudFiles, open_cloud
 from pcfix.label.labelling import Part
 from pcfix.model import (
+    NOISE_CLASSES,
     Cameras,
     FloatArray,
     IntArray,
@@ -56,6 +57,8 @@ class Points(NamedTuple):
 
 
 RGB = ("red", "green", "blue")
+WATER_CLASSES = (9, 41)
+"""ASPRS: water, and water surface of the topo-bathy profile."""
 
 SAMPLE_POINTS = 2_000_000
 """Points of a cloud that are searched for water, evenly spread."""
@@ -271,16 +274,27 @@ def _bounds(low: FloatArray, high: FloatArray) -> tuple[float, float, float, flo
     return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
 
+LEAST_CLASSIFIED, MOST_CLASSIFIED = 30, 2_000
+"""Points of the classes of water to which a surface is fitted."""
+
+
 def _found(view: CloudView | None) -> FoundSurface:
+    """Fit a surface to the points that are classified as water, or find it in the others."""
     from pcfix.water.auto import find_water
+    from pcfix.water.fit import fit_water
 
     if view is None:
         text = "The water surface 'auto' is found in a cloud. Give the cloud too."
         raise SettingError("cloud.missing", text)
     whole = joined_points(every(max(1, view.points // SAMPLE_POINTS), view.chunks()))
-    proposal = find_water(
-        whole.xyz, rgb=whole.rgb, classes=whole.classes, number_of_returns=whole.returns
-    )
+    whole = whole.take(np.flatnonzero(~np.isin(whole.classes, NOISE_CLASSES)))
+    water = whole.xyz[np.isin(whole.classes, WATER_CLASSES)]
+    if len(water) >= LEAST_CLASSIFIED:
+        thinned = water[:: -(-len(water) // MOST_CLASSIFIED)]
+        fit = fit_water(thinned)
+        note = f"The surface is fitted to the {len(water):,} points that are classified as water."
+        return FoundSurface(fit.surface, fit, thinned, (note, *fit.notes))
+    proposal = find_water(whole.xyz, whole.rgb, whole.returns)
     return FoundSurface(proposal.surface, proposal, proposal.shoreline)
 
 

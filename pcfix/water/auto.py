@@ -10,11 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import GeometryError
-from pcfix.model import NOISE_CLASSES, FloatArray, WaterPlane
+from pcfix.model import FloatArray, WaterPlane
 from pcfix.water import search
-from pcfix.water.checks import checked_column
 from pcfix.water.cues import SLOPE, Samples, gain_of, layer_gain, sample_cloud
-from pcfix.water.fit import fit_water
 from pcfix.water.search import INSTEAD, LAYER, Looked, Peak, Tilted, find_tilt, judge
 
 LEAST_POINTS = 2_000
@@ -22,67 +20,37 @@ LEAST_RELIEF_M = 0.3
 LEAST_SIGMA_M = 0.015
 """Least standard error of a waterline, from waves and the thickness of the cloud."""
 TILT_SIGMAS, TILT_GAIN = 3.0, 6.0
-LEAST_CLASSIFIED = 30
-WATER_CLASSES = (9, 41)
-"""ASPRS: water, and water surface of the topo-bathy profile."""
 MOST_SHORELINE = 2_000
 
 
 def find_water(
-    xyz: npt.ArrayLike,
-    *,
-    rgb: npt.ArrayLike | None = None,
-    number_of_returns: npt.ArrayLike | None = None,
-    classes: npt.ArrayLike | None = None,
+    xyz: FloatArray, rgb: npt.NDArray[Any] | None = None, returns: npt.NDArray[Any] | None = None
 ) -> WaterProposal:
     """Find the water surface of a cloud.
 
     It is the height below which the ground gets flatter, as refraction lifts the bed, or colour
     fades with depth, or at which points float in a thin layer. Square tiles are summed separately,
-    and resampling them gives the standard error. Points classified as water are used instead.
+    and resampling them gives the standard error.
 
     Parameters
     ----------
     xyz : array, shape (n, 3)
-        Apparent points, metres, world frame.
+        Apparent points without noise, metres, world frame.
     rgb : array, shape (n, 3), optional
         In any unit from zero up. Equal colours count as none.
-    number_of_returns : array, shape (n,), optional
-        If pulses have several, only points of these may float.
-    classes : array, shape (n,), optional
-        ASPRS classes: 9 and 41 are the water surface, 7 and 18 noise, which is ignored.
-
-    Returns
-    -------
-    WaterProposal
+    returns : array, shape (n,), optional
+        Number of returns. If pulses have several, only points of these may float.
     """
-    points = np.asarray(xyz, np.float64)
-    n = len(points)
-    checked_column("xyz", points, (n, 3))
-    colours = None if rgb is None else checked_column("rgb", rgb, (n, 3))
-    labels = None if classes is None else checked_column("classes", classes, (n,))
-    returns = number_of_returns
-    if returns is not None:
-        returns = checked_column("number_of_returns", returns, (n,))
-    kept = np.isfinite(points).all(axis=1)
-    if labels is not None:
-        kept &= ~np.isin(labels, NOISE_CLASSES)
-    points = points[kept]
-    if len(points) < LEAST_POINTS:
+    known = np.isfinite(xyz).all(axis=1)
+    if known.sum() < LEAST_POINTS:
         raise GeometryError(
             "cloud.too_few_points",
-            f"{len(points)} points are too few to find the water, {LEAST_POINTS} are needed."
+            f"{known.sum()} points are too few to find the water, {LEAST_POINTS} are needed."
             f" {INSTEAD}",
-            points=len(points), least=LEAST_POINTS,
+            points=int(known.sum()), least=LEAST_POINTS,
         )  # fmt: skip
-    samples = sample_cloud(
-        points, *(None if column is None else column[kept] for column in (colours, returns))
-    )
-    if labels is not None:
-        water = np.isin(labels[kept], WATER_CLASSES)
-        if water.sum() >= LEAST_CLASSIFIED:
-            return _from_classes(points[water], samples)
-    return _from_cues(_looked(samples))
+    columns = (None if column is None else column[known] for column in (rgb, returns))
+    return _from_cues(_looked(sample_cloud(xyz[known], *columns)))
 
 
 APART_M, APART_SIGMAS = 0.5, 3.0
@@ -246,33 +214,3 @@ class WaterProposal:
             "evidence": self.evidence,
             "notes": list(self.reasons),
         }
-
-
-def _from_classes(water: FloatArray, samples: Samples) -> WaterProposal:
-    """Fit the points of the water classes, shape (w, 3), world frame."""
-    thinned = water[:: math.ceil(len(water) / MOST_SHORELINE)]
-    fit = fit_water(thinned)
-    share = float(fit.accepted.mean())
-    counts, edges = np.histogram(thinned[:, 2], 60)
-    return WaterProposal(
-        surface=fit.surface,
-        sigma_level_m=fit.sigma_level_m,
-        centre_xy=fit.centre_xy,
-        level_m=fit.level_m,
-        tilt=fit.tilt,
-        sigma_tilt=fit.sigma_tilt_percent / 100.0,
-        confidence=share,
-        evidence={
-            "classified points": float(len(water)),
-            "sigma of a point": fit.sigma_m,
-            "share accepted": share,
-        },
-        reasons=(
-            f"{len(water):,} points are classified as water and scatter by {fit.sigma_m:.3f} m",
-            *fit.notes,
-        ),
-        shoreline=thinned[fit.accepted],
-        curve_height_m=(edges[1:] + edges[:-1]) / 2.0,
-        curves={"classified points": counts + 0.0},
-        ground=samples.xyz + samples.origin,
-    )

@@ -6,6 +6,8 @@ import laspy
 import numpy as np
 import pytest
 
+from pcfix.flow.surfaces import CloudView, Points, corners, find_surface
+from pcfix.options.shared import WaterOptions
 from pcfix.water.auto import find_water
 from pcfix.water.cues import Cue, gain_of, joined_tiles, tile_moments
 from tests.utils.codes import refused
@@ -85,10 +87,12 @@ def test_water_classes():
     xyz, _ = shore(5_000)
     water = xyz[:400] * [1, 1, 0] + [0.0, 0.0, LEVEL_M + 1.0]
     water[:, 2] += np.random.default_rng(0).normal(0.0, 0.02, len(water))
-    classes = np.r_[np.full(len(xyz), 2), np.full(len(water), 9)]
-    found = find_water(np.vstack([xyz, water]), classes=classes)
-    assert found.level_m == pytest.approx(LEVEL_M + 1.0, abs=0.005)  # m: 5 standard errors
-    assert found.evidence["classified points"] == len(water)
+    xyz, classes = np.vstack([xyz, water]), np.r_[np.full(len(xyz), 2), np.full(len(water), 9)]
+    chunks = [Points(xyz[rows], None, classes[rows]) for rows in (slice(3_000), slice(3_000, None))]
+    view = CloudView("cloud", None, *corners(*xyz[:, :2].T), len(xyz), lambda: iter(chunks))
+    found = find_surface("auto", WaterOptions(), view)
+    assert found.evidence.level_m == pytest.approx(LEVEL_M + 1.0, abs=0.005)  # m: 5 standard errors
+    assert len(found.points) == len(water)
 
 
 @pytest.mark.parametrize("offset_m", [+5.0, -12.0])
@@ -113,20 +117,13 @@ def test_bank_refused():
 
 
 def test_refused():
-    """Flat ground, few points, and arrays of other lengths."""
+    """Flat ground, and few points."""
     rng = np.random.default_rng(4)
     flat = np.column_stack([rng.uniform(0.0, 60.0, (5_000, 2)), rng.normal(0.0, 0.02, 5_000)])
     with refused("cloud.flat"):
         find_water(flat)
     with refused("cloud.too_few_points", points=1_999, least=2_000):
         find_water(flat[:1_999])
-    for xyz, arrays, name in (
-        (np.zeros((4, 2)), {}, "xyz"),
-        (np.zeros((4, 3)), {"rgb": np.zeros((3, 3))}, "rgb"),
-        (np.zeros((4, 3)), {"classes": np.zeros(5)}, "classes"),
-    ):
-        with refused("option.shape", option=name):
-            find_water(xyz, **arrays)
 
 
 def test_amplitude_of_break():
