@@ -13,7 +13,6 @@ from pcfix.flow.cameras import sample_of
 from pcfix.flow.runner import check_summary, write_plot, write_summary
 from pcfix.flow.shore import check_shoreline, write_shoreline
 from pcfix.flow.surfaces import file_points, find_surface, view_of
-from pcfix.grid.colours import DIFFERENCE
 from pcfix.grid.shoreline import NearWater
 from pcfix.io.files import check_input
 from pcfix.model import FloatArray, WaterDimension
@@ -35,11 +34,6 @@ if TYPE_CHECKING:
 SAMPLE_POINTS = 200_000
 """Points of the cloud that are compared with the water, evenly spread."""
 MOST_LISTED = 10
-WITNESSES = ("brightness", "noise")
-"""Evidence that does not fix the level; it is drawn with thin lines."""
-SHOWN_CELLS = 40_000
-LINES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)))
-COLOURS = (BEFORE, AFTER, "#5b3a8c", "#2f7d4f", "#222222", "#a07c00")
 _FIT: RowTable = (
     ("Model", "{model}, {accepted} of {count} points; scatter {sigma_m:.3f} m", "count"),
     ("Level", "{level_m:.3f} m at {x:.1f}, {y:.1f}; standard error {sigma_level_m:.3f} m",
@@ -183,17 +177,40 @@ def _fit_rows(fit: WaterFit | RiverFit, points: FloatArray | None) -> Rows:
 
 
 def water_figure(report: WaterReport) -> Figure:
-    """Draw the shoreline points in plan and their residuals, or the evidence found in the cloud."""
+    """Draw cloud and shoreline in plan, and below the residuals of a fit, or the evidence."""
     found, fit = report.found, report.found.evidence
-    if isinstance(fit, WaterProposal):
-        return shoreline_figure(fit)
     figure, (plan, side) = new_figure(8.0, 7.5, nrows=2, height_ratios=[3, 2])
-    draw_cloud(figure, plan, report.sample_xyz, getattr(fit, "level_m", None))
-    if fit is not None and found.points is not None:
+    is_found = isinstance(fit, WaterProposal)
+    cloud = fit.ground if is_found else report.sample_xyz
+    draw_cloud(figure, plan, cloud, getattr(fit, "level_m", None))
+    title = str(found.surface)
+    if is_found:
+        _draw_evidence(plan, side, fit)
+        title = f"Water {fit.level_m:.3f} ± {fit.sigma_level_m:.3f} m"
+        tilt = 100.0 * float(np.hypot(*fit.tilt))
+        title += f", tilt {tilt:.2f} %" if tilt else ""
+        title += f", confidence {fit.confidence:.2f}"
+    elif fit is not None and found.points is not None:
         _draw_fit(plan, side, found.points, fit)
     label_plan(plan, 20.0)
-    plan.set_title(str(found.surface))
+    plan.set_title(title)
     return figure
+
+
+def _draw_evidence(plan: Axes, side: Axes, found: WaterProposal) -> None:
+    """Draw the shoreline that was found in plan, and the evidence for each height."""
+    name = f"shoreline, {len(found.shoreline):,} places"
+    plan.plot(*found.shoreline[:, :2].T, ".", color="#c2185b", markersize=3, label=name)
+    reach = 2.0 * found.sigma_level_m
+    for name, gain in found.curves.items():
+        side.plot(found.curve_height_m, np.maximum(gain, 0.0), label=name)
+    side.axvline(found.level_m, color=WATER, label="water")
+    side.axvspan(found.level_m - reach, found.level_m + reach, color=WATER, alpha=0.3, linewidth=0)
+    shown = max(6.0, 4.0 * reach) * np.array([-1.0, 1.0]) + found.level_m
+    side.set(xlim=np.clip(shown, *found.curve_height_m[[0, -1]]), ylim=(0.0, None))
+    side.set(xlabel="Height of the water, if there (m)", ylabel="Evidence (log likelihood ratio)")
+    for axes in (plan, side):
+        axes.legend(loc="best")
 
 
 def _draw_fit(plan: Axes, side: Axes, points: FloatArray, fit: WaterFit | RiverFit) -> None:
@@ -225,68 +242,8 @@ def _draw_fit(plan: Axes, side: Axes, points: FloatArray, fit: WaterFit | RiverF
 
 def found_picture(found: FoundSurface) -> Picture:
     """Return the evidence for a level that was found in the cloud, for the page."""
-    alt = "How the water was found: shoreline in plan, heights, and the evidence for each height."
+    alt = "How the water was found: shoreline in plan, and the evidence for each height."
     reasons = found.evidence.reasons if isinstance(found.evidence, WaterProposal) else ()
     alt += "".join(f" {reason[:1].upper()}{reason[1:].rstrip('.')}." for reason in reasons)
     figure = water_figure(WaterReport("auto", found, None, None, None, np.zeros((0, 3))))
     return Picture("water", "The water level found in the cloud", alt, figure)
-
-
-def shoreline_figure(found: WaterProposal) -> Figure:
-    """Draw the shoreline in plan, and heights and evidence beside it."""
-    figure, axes = new_figure(
-        11.0, 6.5, mosaic=[["plan", "heights"], ["plan", "evidence"]], width_ratios=[3, 2],
-        height_ratios=[2, 3],
-    )  # fmt: skip
-    heights = found.ground[:, 2] - found.level_m
-    heights -= (found.ground[:, :2] - found.centre_xy) @ found.tilt
-    _draw_shoreline(axes["plan"], figure, found, heights)
-    # heights to show: the ground, but no more than is needed to see the level
-    low, high = np.percentile(heights, [1.0, 99.0]).tolist()
-    most = 4.0 * max(1.5, 8.0 * found.sigma_level_m)
-    limits = found.level_m + min(max(low, -most), -0.2), found.level_m + max(min(high, most), 0.2)
-    axes["heights"].hist(heights + found.level_m, bins=90, range=limits, color="0.65")
-    axes["heights"].set(xlabel="Apparent height (m)", ylabel="Cells")
-    evidence = axes["evidence"]
-    shown = (found.curve_height_m >= limits[0]) & (found.curve_height_m <= limits[1])
-    for (name, gain), colour, line in zip(found.curves.items(), COLOURS, LINES, strict=False):
-        width = 0.9 if name in WITNESSES else 1.8
-        look: dict[str, Any] = {"color": colour, "linestyle": line, "linewidth": width}
-        gain = np.maximum(gain[shown], 0.0)
-        evidence.plot(found.curve_height_m[shown], gain, label=name, **look)
-    evidence.set(ylim=(0.0, None), ylabel="Evidence (log likelihood ratio)")
-    evidence.set(xlabel="Height of the water, if there (m)")
-    reach = 2.0 * found.sigma_level_m
-    for side in (axes["heights"], evidence):
-        side.axvline(found.level_m, color=WATER, label="water")
-        ends = found.level_m - reach, found.level_m + reach
-        side.axvspan(*ends, color=WATER, alpha=0.3, linewidth=0)
-        side.set_xlim(limits)
-    axes["heights"].legend(loc="best")
-    look = {"bbox_to_anchor": (0.5, -0.18), "ncols": 3, "fontsize": "small", "frameon": False}
-    evidence.legend(loc="upper center", **look)
-    tilt = 100.0 * float(np.hypot(*found.tilt))
-    kind = f", tilt {tilt:.2f} %" if tilt > 0.0 else ""
-    level = f"{found.level_m:.3f} ± {found.sigma_level_m:.3f} m"
-    figure.suptitle(f"Water {level}{kind}, confidence {found.confidence:.2f}")
-    return figure
-
-
-def _draw_shoreline(axes: Axes, figure: Figure, found: WaterProposal, above_m: FloatArray) -> None:
-    step = len(found.ground) // SHOWN_CELLS + 1
-    above_m, ground = above_m[::step], found.ground[::step]
-    reach = max(float(np.percentile(np.abs(above_m), 95.0)), 0.2)
-    corner = np.floor(found.ground[:, :2].min(axis=0))
-    x, y = (ground[:, :2] - corner).T
-    dots = axes.scatter(
-        x, y, c=above_m, s=60.0 * np.sqrt(1_000.0 / len(ground)),
-        cmap=DIFFERENCE, vmin=-reach, vmax=reach, linewidths=0, marker="s",
-    )  # fmt: skip
-    label = "Apparent height above the surface (m)"
-    figure.colorbar(dots, ax=axes, label=label, location="bottom", shrink=0.7, aspect=30)
-    shore_x, shore_y = (found.shoreline[:, :2] - corner).T
-    name = f"shoreline, {len(found.shoreline):,} places"
-    axes.plot(shore_x, shore_y, ".", color="#c2185b", markersize=3, label=name)
-    east, north = (f"(m) from {place:,.0f}" for place in corner)
-    axes.set(aspect="equal", xlabel=f"East {east}", ylabel=f"North {north}")
-    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), frameon=False, borderaxespad=0.0)
