@@ -1,11 +1,10 @@
 """Robust fits: linear regression, and a height profile along a river.
 
-Regression is MM-estimation (Yohai 1987, Annals of Statistics 15: 642-656), for nearly half of the
-observations wrong: first the solution with the smallest S-scale of its residuals, found from exact
-fits to a few points each and refined (fast-S: Salibian-Barrera & Yohai 2006, J. Comp. Graph. Stat.
-15: 414-427); then, with that scale, Tukey's weights, which are nearly as efficient as least squares
-without outliers. The samples are the same every time. (scipy's `least_squares` with a robust loss
-is only the second half; it needs a start and a scale.)
+Regression is for nearly half of the observations wrong: first the least median of residuals, found
+among exact fits to a few points each (Rousseeuw 1984, J. Am. Stat. Assoc. 79: 871-880); then, with
+that median as the scale, Tukey's weights, which are nearly as efficient as least squares without
+outliers. The samples are the same every time. (scipy's `least_squares` with a robust loss is only
+the second half; it needs a start and a scale, and gives every observation a weight.)
 
 The profile is robust, smooth, and falling: linear B-splines with a penalty on bends (P-splines:
 Eilers & Marx 1996, Statistical Science 11: 89-121). The penalty grows with the size of a bend
@@ -18,20 +17,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import combinations
-from math import comb, inf
-from operator import itemgetter
+from math import comb
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from pcfix.model import BoolArray, FloatArray, IntArray
 
-START_C, FINAL_C = 1.547645, 4.685061
-"""Tukey's constants: for a breakdown point of one half, and for 95 % efficiency."""
+FINAL_C = 4.685061
+"""Tukey's constant for 95 % efficiency."""
 LEAST_SCALE_M = 0.005
 """Least scatter of residuals for their weights: the edge of water is no sharper."""
-SUBSETS, SAMPLE, REFINED = 3000, 400, 10
-_ROUNDS, _CONVERGED_M, _CONVERGED = 200, 1e-10, 1e-7
+SUBSETS, SAMPLE = 3000, 400
+_ROUNDS, _CONVERGED_M = 200, 1e-10
+_TO_SIGMA = 1.4826  # from the median of absolute values of normal numbers
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -88,13 +87,12 @@ def robust_regression(X: FloatArray, z: FloatArray) -> Regression | None:
     The columns of X, shape (n, p), are of similar size; z, shape (n,), is in metres.
     """
     rows = np.unique(np.linspace(0, len(z) - 1, min(len(z), SAMPLE)).astype(np.int64))
-    starts = _exact_fits(X[rows], z[rows])
-    if not len(starts):
+    beta = _least_median(X[rows], z[rows])
+    if beta is None:
         return None
-    refined = [_least_s_scale(X[rows], z[rows], start) for start in starts]
-    beta, scale = min(refined, key=itemgetter(1))
-    if len(rows) < len(z):
-        beta, scale = _least_s_scale(X, z, beta)
+    # a few observations are fitted too well (Rousseeuw & Leroy 1987, p. 202)
+    few = 1.0 + 5.0 / max(len(z) - X.shape[1], 1)
+    scale = few * _TO_SIGMA * float(np.median(np.abs(z - X @ beta)))
     limit = FINAL_C * max(scale, LEAST_SCALE_M)
     for _ in range(_ROUNDS):
         before = beta
@@ -124,37 +122,17 @@ def tukey_weight(u: FloatArray) -> FloatArray:
     return np.asarray(np.where(np.abs(u) < 1.0, (1.0 - u * u) ** 2, 0.0))
 
 
-def s_scale(residual_m: FloatArray, unknowns: int) -> float:
-    """Return the scale s with sum rho(r / (c s)) = (n - p) / 2; the standard deviation of normals.
-
-    rho(u) = 1 - (1 - u^2)^3, and 1 beyond |u| = 1. Zero if more than half are zero.
-    """
-    square = residual_m**2
-    spare = max(len(square) - unknowns, 1)
-    scale = float(np.median(np.abs(residual_m))) / 0.6745 or float(np.sqrt(square.mean()))
-    for _ in range(_ROUNDS):
-        if scale < _CONVERGED_M:
-            return 0.0
-        inside = 1.0 - np.minimum(square / (START_C * scale) ** 2, 1.0)
-        factor = float(np.sqrt(2.0 * (1.0 - inside**3).sum() / spare))
-        scale *= factor
-        if abs(factor - 1.0) < _CONVERGED:
-            break
-    return scale
-
-
-def _exact_fits(X: FloatArray, z: FloatArray) -> FloatArray:
-    """Return the exact fits with the least median residuals, shape (up to `REFINED`, p)."""
+def _least_median(X: FloatArray, z: FloatArray) -> FloatArray | None:
+    """Return the exact fit to p observations with the least median residual, if there is one."""
     rows = _subsets(*X.shape)
     size = np.abs(np.linalg.det(X[rows])) if X.shape[0] >= X.shape[1] else np.empty(0)
     good = size > 1e-9
     if not good.any():
-        return np.empty((0, X.shape[1]))
+        return None
     fits = np.linalg.solve(X[rows[good]], z[rows[good]][..., None])[..., 0]
-    middle = (len(z) + X.shape[1]) // 2
-    residual = np.abs(z[:, None] - X @ fits.T)
-    median = np.partition(residual, min(middle, len(z) - 1), axis=0)[min(middle, len(z) - 1)]
-    return np.asarray(fits[np.argsort(median, kind="stable")[:REFINED]])
+    middle = min((len(z) + X.shape[1]) // 2, len(z) - 1)
+    median = np.partition(np.abs(z[:, None] - X @ fits.T), middle, axis=0)[middle]
+    return np.asarray(fits[np.argmin(median)])
 
 
 def _subsets(n: int, p: int) -> IntArray:
@@ -165,21 +143,6 @@ def _subsets(n: int, p: int) -> IntArray:
     ordered = np.sort(drawn, axis=1)
     different = (np.diff(ordered, axis=1) > 0).all(axis=1)
     return np.asarray(ordered[different][:SUBSETS])
-
-
-def _least_s_scale(X: FloatArray, z: FloatArray, beta: FloatArray) -> tuple[FloatArray, float]:
-    """Refine beta to a local minimum of the S-scale, and return both."""
-    best, least = beta, inf
-    for _ in range(_ROUNDS):
-        residual = z - X @ beta
-        scale = s_scale(residual, X.shape[1])
-        if not scale < least * (1.0 - _CONVERGED):
-            break
-        best, least = beta, scale
-        if scale == 0.0:
-            break
-        beta = _weighted(X, z, tukey_weight(residual / (START_C * scale)), beta)
-    return best, least
 
 
 def _weighted(X: FloatArray, z: FloatArray, weight: FloatArray, beta: FloatArray) -> FloatArray:
@@ -221,7 +184,6 @@ RISES_IF_WORSE = 1.25
 """The surface may rise downstream if the scatter of the points is larger by this otherwise."""
 _TURNS, _BEND_M, _HUBER_M = 12, 1e-3, 0.02
 _LEAST = 1e-12  # keeps the equations solvable without points
-_TO_SIGMA = 1.4826  # from the median of absolute values of normal numbers
 
 
 @dataclass(frozen=True, eq=False)
