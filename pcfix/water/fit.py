@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from pcfix.errors import GeometryError, SettingError
+from pcfix.errors import GeometryError
 from pcfix.model import BoolArray, FloatArray, WaterPlane
 from pcfix.water.robust import Regression, ShoreFit, of_all, robust_regression, shared, usable_rows
 
@@ -137,31 +137,20 @@ def fit_water(
     WaterFit
         One row per input point; the order of the points does not matter.
     """
-    if model not in get_args(Model):
-        raise SettingError(
-            "option.choice",
-            f"The water model '{model}' is unknown. Use {', '.join(get_args(Model))}.",
-            option="water_model",
-            value=model,
-        )
-    points = np.asarray(xyz, np.float64)
-    if points.ndim != 2 or points.shape[1] != 3:
-        text = f"The shoreline points have the shape {points.shape}. It must be (n, 3)."
-        raise SettingError("option.shape", text, option="xyz", shape=points.shape)
-    known = usable_rows(points)
+    known = usable_rows(xyz)
     if len(known) == 0:
-        text = f"None of {len(points)} shoreline points has a height. Give heights, or the cloud."
+        text = f"None of {len(xyz)} shoreline points has a height. Give heights, or the cloud."
         raise GeometryError("water.too_few_points", text, points=0, least=1)
-    plan = _plan(points[known, :2])
+    plan = _plan(xyz[known, :2])
     worth = np.ones(len(known)) if counts is None else np.asarray(counts, np.float64)[known]
-    chosen, found, notes = _choose(points[known], plan, model, worth)
+    chosen, found, notes = _choose(xyz[known], plan, model, worth)
     fit = WaterFit(
         model=chosen,
-        **_located(points[known[found.weight > 0.0], :2].mean(axis=0), chosen, plan, found),
-        residual_m=of_all(found.residual_m, known, len(points), np.nan),
-        weight=of_all(found.weight, known, len(points), 0.0),
+        **_located(xyz[known[found.weight > 0.0], :2].mean(axis=0), chosen, plan, found),
+        residual_m=of_all(found.residual_m, known, len(xyz), np.nan),
+        weight=of_all(found.weight, known, len(xyz), 0.0),
         sigma_m=found.sigma_m,
-        notes=(*notes, *_doubts(found, len(points) - len(known))),
+        notes=(*notes, *_doubts(found, len(xyz) - len(known))),
     )
     if not fit.tilt_percent <= MAX_TILT_PERCENT:
         raise GeometryError(

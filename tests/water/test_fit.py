@@ -154,8 +154,6 @@ def test_notes():
         (np.full((4, 3), np.nan), "auto", "water.too_few_points"),
         (np.empty((0, 3)), "auto", "water.too_few_points"),
         ([[x, y, 0.08 * x] for x in range(9) for y in range(9)], "auto", "water.tilt"),
-        (np.zeros((4, 3)), "curve", "option.choice"),
-        (np.zeros((4, 2)), "auto", "option.shape"),
     ],
 )
 def test_fit_refused(points, model, code):
