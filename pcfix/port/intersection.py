@@ -136,28 +136,27 @@ def port_views(
     (m, 3), to the true points and without `views`, the images of these through the port must be in
     the frame, instead of those of the apparent points along straight lines.
     """
-    limit = settings.limit_deg
-    count, none = np.zeros(len(xyz) + 1, np.int64), np.zeros(0, np.int64)
+    limit, start, camera = settings.limit_deg, np.zeros(0, np.int64), np.zeros(0, np.int64)
+    if views is not None:
+        start, camera = np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)
     common = (
         spatial_order(xyz),
-        np.ascontiguousarray(xyz),
+        np.ascontiguousarray(xyz if shift_m is None else xyz + shift_m),
+        np.zeros(0) if shift_m is None else np.abs(shift_m).max(axis=1),
         rig_of(cameras, port, settings),
         frames_of(cameras) if views is None else no_frames(len(cameras)),
-        (none, none)
-        if views is None
-        else (np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)),
+        (start, camera),
         (
             0.0 if limit is None else float(np.cos(np.radians(limit))),
             settings.max_cameras or ANY_NUMBER,
         ),
-        np.zeros((0, 3)) if shift_m is None else np.ascontiguousarray(shift_m),
     )
-    tiles = (len(xyz) + TILE - 1) // TILE
-    in_tiles(_choose, tiles, *common, (count, none))
-    start = np.cumsum(count)
-    chosen = np.empty(start[-1], np.int64)
-    in_tiles(_choose, tiles, *common, (start, chosen))
-    return Views(start, chosen)
+    tiles, count = (len(xyz) + TILE - 1) // TILE, np.zeros(len(xyz) + 1, np.int64)
+    in_tiles(_choose, tiles, *common, (count, np.zeros(0, np.int64)))
+    found = np.cumsum(count)
+    chosen = np.empty(found[-1], np.int64)
+    in_tiles(_choose, tiles, *common, (found, chosen))
+    return Views(found, chosen)
 
 
 def rotations_of(cameras: Cameras) -> FloatArray:
@@ -173,50 +172,34 @@ def rotations_of(cameras: Cameras) -> FloatArray:
 
 @kernel(allocates=True)
 def _choose(
-    span: Span, order: IntArray, xyz: FloatArray, rig: Rig, frames: Frames,
-    views: tuple[IntArray, IntArray], limits: tuple[float, int], shift: FloatArray,
-    found: tuple[IntArray, IntArray],
+    span: Span, order: IntArray, xyz: FloatArray, shift: FloatArray, rig: Rig, frames: Frames,
+    views: tuple[IntArray, IntArray], limits: tuple[float, int], found: tuple[IntArray, IntArray],
 ) -> None:  # fmt: skip
     """Write the cameras of point i from ``chosen[start[i]]``, or count them in ``start[i + 1]``.
 
     They are counted if `chosen` is empty. Views and shifts are empty if there are none.
     """
     start, chosen = found
-    low, high = _box(xyz, order[span[0] * TILE : span[1] * TILE], shift)
-    around = near_cameras(np.arange(len(rig.centres)), frames, rig.centres, low, high)
     for t in range(*span):
         rows = order[t * TILE : (t + 1) * TILE]
         near = rows[:0]
         if not views[0].size:
-            low, high = _box(xyz, rows, shift)
-            near = near_cameras(around, frames, rig.centres, low, high)
+            low, high = corners_of(rows, xyz)
+            # the straight line to a true point may miss a frame that its refracted light reaches,
+            # by at most the shift
+            wide = shift[rows].max() if shift.size else 0.0
+            near = near_cameras(
+                np.arange(len(rig.centres)), frames, rig.centres, low - wide, high + wide
+            )
         for i in rows:
             candidates = near
             if views[0].size:
                 candidates = views[1][views[0][i] : views[0][i + 1]]
-            place = row_of(xyz, i)
-            if shift.size:
-                place = plus(place, row_of(shift, i))
-            kept = _usable(candidates, place, rig, frames, limits, shift.size > 0)
+            kept = _usable(candidates, row_of(xyz, i), rig, frames, limits, shift.size > 0)
             if chosen.size:
                 chosen[start[i] : start[i] + kept.size] = kept
             else:
                 start[i + 1] = kept.size
-
-
-@device(allocates=True)
-def _box(xyz: FloatArray, rows: IntArray, shift: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the corners of an upright box around apparent and true points, widened by the shifts.
-
-    The straight line to a true point may miss a frame that its refracted light reaches, by at most
-    the shift.
-    """
-    low, high = corners_of(rows, xyz)
-    if shift.size:
-        shortest, longest = corners_of(rows, shift)
-        wide = max(-shortest.min(), longest.max())
-        low, high = low + np.minimum(shortest, 0.0) - wide, high + np.maximum(longest, 0.0) + wide
-    return low, high
 
 
 @device(allocates=True)

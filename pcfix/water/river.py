@@ -238,9 +238,13 @@ def _stations(xy: FloatArray) -> tuple[FloatArray, float]:
     """Return the distance of each place along the river, and the bandwidth of smoothing, m."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import dijkstra, minimum_spanning_tree
+    from scipy.spatial import Delaunay
 
+    corners = Delaunay(xy, qhull_options="QJ").simplices  # joggled: they may be on one line
+    pairs = np.vstack([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
     # scipy 1.11 needs indices of 32 bits
-    edges, shape = _edges(xy).astype(np.int32), (len(xy), len(xy))
+    edges = np.unique(np.sort(pairs, axis=1), axis=0).astype(np.int32)
+    shape = len(xy), len(xy)
     length = np.hypot(*(xy[edges[:, 0]] - xy[edges[:, 1]]).T)
     tree = minimum_spanning_tree(csr_array((length, edges.T), shape=shape))
     reach = REACH * float(tree.data.max())
@@ -252,20 +256,6 @@ def _stations(xy: FloatArray) -> tuple[FloatArray, float]:
     end = int(np.argmax(from_start))
     from_end = dijkstra(net, indices=np.array([end]))[0]
     return (from_start + from_start[end] - from_end) / 2.0, reach
-
-
-def _edges(xy: FloatArray) -> IntArray:
-    """Return the edges of the Delaunay triangulation, or of a chain of points on a line."""
-    from scipy.spatial import Delaunay, QhullError
-
-    try:
-        corners = Delaunay(xy).simplices
-    except QhullError:
-        direction = np.linalg.svd(xy - xy.mean(axis=0), full_matrices=False)[2][0]
-        order = np.argsort(xy @ direction, kind="stable")
-        return np.column_stack([order[:-1], order[1:]])
-    pairs = np.vstack([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
-    return np.unique(np.sort(pairs, axis=1), axis=0)
 
 
 def _smoothed(xy: FloatArray, station: FloatArray, bandwidth: float) -> FloatArray:
