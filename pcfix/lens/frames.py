@@ -32,17 +32,9 @@ from pcfix.lens.imaging import (
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, Views
 
 
-class FrameShape(NamedTuple):
-    """The frame of one lens, camera frame; see `Frames`."""
-
-    planes: FloatArray
-    distorted: bool
-    widest: float
-
-
 @lru_cache(maxsize=8192)
-def frame_shape(lens: Lens) -> FrameShape:
-    """Return the frame of a lens."""
+def frame_shape(lens: Lens) -> tuple[FloatArray, float]:
+    """Return the pyramid of `Frames`, camera frame, and the widest angle of a distorted frame."""
     brown = (*lens.radial, *lens.denominator, *lens.tangential, *lens.thin_prism)
     if lens.projection == "perspective" and not any(brown):  # straight lines stay straight
         width, height = lens.width - lens.principal_x, lens.height - lens.principal_y
@@ -52,9 +44,9 @@ def frame_shape(lens: Lens) -> FrameShape:
             (lens.b3, lens.focal, lens.principal_y),
             (-lens.b3, -lens.focal, height),
         ])  # fmt: skip
-        return FrameShape(inward, distorted=False, widest=np.pi)
+        return inward, np.nan
     border = unproject(lens, _border(lens, BORDER))
-    return FrameShape(_planes_around(border), distorted=True, widest=_widest_angle(lens, border))
+    return _planes_around(border), _widest_angle(lens, border)
 
 
 BORDER = 400
@@ -141,11 +133,11 @@ def frames_of(cameras: Cameras) -> Frames:
         return no_frames(len(cameras))._replace(planes=front)
     row, lenses = lens_table(cameras.lenses)
     shapes = [frame_shape(lens) for lens in dict.fromkeys(cameras.lenses)]
-    widest = np.array([shape.widest for shape in shapes])
+    planes, widest = (np.array(one)[row] for one in zip(*shapes, strict=True))
     return Frames(
-        planes=np.ascontiguousarray(np.array([s.planes for s in shapes])[row] @ rotations),
-        row=np.where(np.array([s.distorted for s in shapes])[row], row, NOT_DISTORTED),
-        cone=np.column_stack([rotations[:, 2], widest[row]]),
+        planes=np.ascontiguousarray(planes @ rotations),
+        row=np.where(np.isnan(widest), NOT_DISTORTED, row),
+        cone=np.column_stack([rotations[:, 2], widest]),
         lenses=lenses,
         rotations=rotations,
     )

@@ -85,25 +85,19 @@ def find_elsewhere(
         whole = _looked(samples)
     except GeometryError:  # flat ground shows nothing
         return None, None
-    return _elsewhere(whole), find_tilt(whole)
-
-
-def _elsewhere(whole: Looked) -> WaterProposal | None:
-    """Return the water at another height than zero, if it is certain."""
-    gain = search.gains(whole, search.NO_TILT)
-    here = gain[np.abs(whole.heights_m + whole.samples.origin[2]) <= APART_M].max(initial=0.0)
+    tilted, gain = find_tilt(whole), search.gains(whole, search.NO_TILT)
+    here = gain[np.abs(whole.heights_m + samples.origin[2]) <= APART_M].max(initial=0.0)
     if gain.max() < search.LEAST_AGREED or here > search.MOST_RIVAL_AGREED * gain.max():
-        return None
+        return None, tilted
     try:
         found = _from_cues(whole)
     except GeometryError:
-        return None
+        return None, tilted
     apart = abs(found.level_m) > max(APART_M, APART_SIGMAS * found.sigma_level_m)
-    alone = found.evidence["total gain"] >= LEAST_AGAINST
-    sure = alone or (
+    sure = found.evidence["total gain"] >= LEAST_AGAINST or (
         found.confidence >= SURE_AGAINST and f"{SLOPE.name} amplitude" in found.evidence
     )
-    return found if apart and sure else None
+    return found if apart and sure else None, tilted
 
 
 def _looked(samples: Samples) -> Looked:
