@@ -102,15 +102,16 @@ def find_elsewhere(
 
 def _looked(samples: Samples) -> Looked:
     """Return the sums of the cues at all heights; GeometryError ``cloud.flat`` without relief."""
-    heights = search.all_heights(samples)
-    if np.ptp(heights) < LEAST_RELIEF_M:
+    low, high = np.percentile(samples.smooth_m, [0.5, 99.5])
+    if high - low < LEAST_RELIEF_M:
         raise GeometryError(
             "cloud.flat",
-            f"The ground has {np.ptp(heights):.2f} m of relief, {LEAST_RELIEF_M:g} m are needed to"
-            f" find the water. {INSTEAD}",
-            relief_m=float(np.ptp(heights)), least=LEAST_RELIEF_M,
+            f"The ground has {high - low:.2f} m of relief, {LEAST_RELIEF_M:g} m are needed to find"
+            f" the water. {INSTEAD}",
+            relief_m=float(high - low), least=LEAST_RELIEF_M,
         )  # fmt: skip
-    return search.look(samples, heights, search.NO_TILT)
+    count = int(np.clip((high - low) / search.COARSE_M, 8, search.MOST_HEIGHTS))
+    return search.look(samples, np.linspace(low, high, count), search.NO_TILT)
 
 
 def _from_cues(whole: Looked) -> WaterProposal:

@@ -166,35 +166,20 @@ def tile_moments(
     return sums, count
 
 
-def joined_tiles(
-    parts: list[tuple[FloatArray, FloatArray]], xy: list[FloatArray], heights_m: FloatArray,
-    cue: Cue,
-) -> Moments | None:  # fmt: skip
-    """Join tiles, each in units of its residual variance; None without any information."""
-    known = [i for i, (_, count) in enumerate(parts) if count.any()]
-    if not known:
-        return None
-    sums, count = (np.array([parts[i][k] for i in known]) for k in (0, 1))
-    variance = sums[..., 0].sum(axis=1) / count.sum(axis=1)
-    least = 0.3 * float(np.median(variance)) + _TINY
-    sums /= np.maximum(variance, least)[:, None, None]
-    return Moments(sums, count, np.array([xy[i] for i in known]), heights_m, cue)
-
-
 _LEAST_CELLS, _LEAST_RELIEF_M = 40, 0.1
 
 
 def cue_moments(
     samples: Samples, cue: Cue, heights_m: FloatArray, tilt: FloatArray
 ) -> Moments | None:
-    """Return the sums of a cue over the tiles.
+    """Return the sums of a cue over the tiles that show anything; None without any.
 
     Heights, shape (h,), are evenly spaced above the plane of that tilt through the samples' origin.
     """
     xy, fall = samples.xyz[:, :2], samples.xyz[:, :2] @ tilt
     _, tile = np.unique(square_tiles(xy, cue.tile_cells * samples.cell_m), return_inverse=True)
     order = np.argsort(tile.reshape(-1), kind="stable")
-    parts, middles = [], []
+    found = []
     for rows in np.split(order, np.cumsum(np.bincount(tile.reshape(-1)))[:-1]):
         if len(rows) < _LEAST_CELLS:
             continue
@@ -214,9 +199,15 @@ def cue_moments(
             at = smooth @ np.linalg.lstsq(smooth, y, rcond=None)[0]
             if np.ptp(at) < _LEAST_RELIEF_M:
                 continue
-        parts.append(tile_moments(smooth, y, at, heights_m, cue))
-        middles.append(xy[rows].mean(axis=0))
-    return joined_tiles(parts, middles, heights_m, cue)
+        tile_sums, tile_count = tile_moments(smooth, y, at, heights_m, cue)
+        if tile_count.any():
+            found.append((tile_sums, tile_count, xy[rows].mean(axis=0)))
+    if not found:
+        return None
+    sums, count, middle = map(np.array, zip(*found, strict=True))
+    variance = sums[..., 0].sum(axis=1) / count.sum(axis=1)
+    sums /= np.maximum(variance, 0.3 * np.median(variance) + _TINY)[:, None, None]
+    return Moments(sums, count, middle, heights_m, cue)
 
 
 MOST_CELLS = 100_000

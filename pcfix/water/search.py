@@ -48,13 +48,6 @@ def look(samples: Samples, heights_m: FloatArray, tilt: FloatArray) -> Looked:
     return Looked([*([slope] if slope else []), *stronger], samples, heights_m, tilt)
 
 
-def all_heights(samples: Samples) -> FloatArray:
-    """Return heights over the range of the ground."""
-    low, high = np.percentile(samples.smooth_m, [0.5, 99.5])
-    count = int(np.clip((high - low) / COARSE_M, 8, MOST_HEIGHTS))
-    return np.linspace(low, high, count)
-
-
 def gains(looked: Looked, tilt: FloatArray, rng: np.random.Generator | None = None) -> FloatArray:
     """Return the total gain of the cues at each height, shape (h,).
 

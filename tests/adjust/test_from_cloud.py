@@ -14,8 +14,8 @@ from pcfix.adjust.from_ties import adjust_ties
 from pcfix.adjust.problem import solved_cameras
 from pcfix.model import GnssPositions
 from pcfix.simulate.tracing import project
+from tests.utils.bed_rays import piercing_points
 from tests.utils.codes import refused
-from tests.utils.level_water import piercing_points
 from tests.utils.tie_blocks import adjusted
 from tests.utils.tie_points import simulate_tie_points
 from tests.utils.unaware_blocks import unaware

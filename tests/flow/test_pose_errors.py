@@ -23,9 +23,9 @@ from pcfix.refract.methods import correct
 from pcfix.running import threads
 from pcfix.simulate.tracing import project, triangulate
 from pcfix.water.surface import surface_above
+from tests.utils.bed_rays import piercing_points
 from tests.utils.beyond_frames import BEYOND_FRAMES
 from tests.utils.clouds import WATER_M, cameras_csv, framed_block, write_cloud
-from tests.utils.level_water import piercing_points
 from tests.utils.tie_blocks import adjusted, block_of, some_ties
 from tests.utils.tie_points import simulate_tie_points
 from tests.utils.unaware_blocks import parted

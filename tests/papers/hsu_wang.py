@@ -28,7 +28,7 @@ from pcfix.lens.rotations import from_yaw_pitch_roll
 from pcfix.model import Lens, Views
 from pcfix.simulate.sight import starts_of
 from pcfix.simulate.tracing import project, triangulate
-from tests.utils.level_water import piercing_points
+from tests.utils.bed_rays import piercing_points
 
 WIDTH_M, HEIGHT_M, RIM_DEPTH_M, LEVEL_M, CAMERA_HEIGHT_M = 0.15, 0.03, 0.001, 0.2, 1.0
 LENS = Lens(60.0 / 6.1e-3, 3872, 2592, 1936.0, 1296.0)

@@ -29,7 +29,7 @@ import numpy as np
 
 from pcfix.report.page import AFTER, BEFORE, WATER, new_figure, png_of
 from tests.papers import hsu_wang
-from tests.utils.level_water import piercing_points
+from tests.utils.bed_rays import piercing_points
 
 DEPTHS_M = tuple(float(depth) for depth in range(16))
 PAPER_INDEX = 1.3405

@@ -21,7 +21,7 @@ from tests.papers.refraction_effect import (
     write_all,
 )
 from tests.papers.test_equations import pierced, refracted
-from tests.utils.level_water import piercing_points
+from tests.utils.bed_rays import piercing_points
 
 PAIR = StereoPair(SWINGLETCAM, 100.0)
 PAIRS = [

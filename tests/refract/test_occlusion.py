@@ -15,7 +15,7 @@ from pcfix.refract.occlusion import occluded, occluder_of, visible_cameras
 from pcfix.simulate.tracing import project, triangulate
 from pcfix.water.surface import SurfaceAbove
 from tests.utils.batches import batch_of
-from tests.utils.level_water import piercing_points
+from tests.utils.bed_rays import piercing_points
 from tests.utils.shared import needs
 
 RENDERED, rendered = needs("rendered_a")

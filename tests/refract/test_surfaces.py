@@ -12,7 +12,7 @@ from pcfix.simulate.block import fly_block
 from pcfix.simulate.settings import SceneSettings
 from pcfix.simulate.tracing import project, triangulate
 from pcfix.water.surface import surface_above
-from tests.utils.level_water import piercing_points
+from tests.utils.bed_rays import piercing_points
 from tests.utils.twins import correct_under
 
 UTM = np.array([512_345.0, 4_987_654.0, 0.0])

@@ -12,7 +12,7 @@ from pcfix.adjust.block import Unknowns, plain_block
 from pcfix.adjust.problem import prepare, solved_cameras
 from pcfix.adjust.solve import solve
 from pcfix.model import Cameras, GnssPositions, Lens, TiePoints, Views
-from tests.utils.level_water import piercing_points
+from tests.utils.bed_rays import piercing_points
 
 HEIGHT_M, FOCAL_PX, SIZE = 75.0, 1500.0, (1600.0, 1200.0)
 N = 1.34

@@ -8,7 +8,7 @@ triangulations, straight and refractive, are general least squares over image re
 import numpy as np
 from scipy.optimize import least_squares, root
 
-from tests.utils.level_water import piercing_points
+from tests.utils.bed_rays import piercing_points
 from tests.utils.twins import image_slowly, light_path
 
 

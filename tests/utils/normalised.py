@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from pcfix.model import Cameras, Lens, Views
 from pcfix.simulate.tracing import project, triangulate
-from tests.utils.level_water import piercing_points
+from tests.utils.bed_rays import piercing_points
 
 if TYPE_CHECKING:
     from pcfix.model import FloatArray
