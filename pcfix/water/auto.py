@@ -13,7 +13,7 @@ from pcfix.errors import GeometryError
 from pcfix.model import FloatArray, WaterPlane
 from pcfix.water import search
 from pcfix.water.cues import SLOPE, Samples, gain_of, layer_gain, sample_cloud
-from pcfix.water.search import INSTEAD, LAYER, Looked, Peak, Tilted, find_tilt, judge
+from pcfix.water.search import INSTEAD, LAYER, Peak, Scan, Tilted, find_tilt, judge
 
 LEAST_POINTS = 2_000
 LEAST_RELIEF_M = 0.3
@@ -50,10 +50,10 @@ def find_water(
             points=int(known.sum()), least=LEAST_POINTS,
         )  # fmt: skip
     columns = (None if column is None else column[known] for column in (rgb, returns))
-    return _from_cues(_looked(sample_cloud(xyz[known], *columns)))
+    return _from_cues(_scanned(sample_cloud(xyz[known], *columns)))
 
 
-APART_M, APART_SIGMAS = 0.5, 3.0
+DIFFERENT_M, DIFFERENT_SIGMAS = 0.5, 3.0
 """A level is only reported as another one if it differs by more than both."""
 LEAST_AGAINST, SURE_AGAINST = 100.0, 0.8
 """Evidence of colours only, or confidence of slope and colours together, that contradicts a given
@@ -82,25 +82,25 @@ def find_elsewhere(
     """
     samples = sample_cloud(np.column_stack([xyz[:, :2], xyz[:, 2] - water_m]), rgb, None)
     try:
-        whole = _looked(samples)
+        coarse = _scanned(samples)
     except GeometryError:  # flat ground shows nothing
         return None, None
-    tilted, gain = find_tilt(whole), search.gains(whole, search.NO_TILT)
-    here = gain[np.abs(whole.heights_m + samples.origin[2]) <= APART_M].max(initial=0.0)
+    tilted, gain = find_tilt(coarse), search.gains(coarse, search.NO_TILT)
+    here = gain[np.abs(coarse.heights_m + samples.origin[2]) <= DIFFERENT_M].max(initial=0.0)
     if gain.max() < search.LEAST_AGREED or here > search.MOST_RIVAL_AGREED * gain.max():
         return None, tilted
     try:
-        found = _from_cues(whole)
+        found = _from_cues(coarse)
     except GeometryError:
         return None, tilted
-    apart = abs(found.level_m) > max(APART_M, APART_SIGMAS * found.sigma_level_m)
+    differs = abs(found.level_m) > max(DIFFERENT_M, DIFFERENT_SIGMAS * found.sigma_level_m)
     sure = found.evidence["total gain"] >= LEAST_AGAINST or (
         found.confidence >= SURE_AGAINST and f"{SLOPE.name} amplitude" in found.evidence
     )
-    return found if apart and sure else None, tilted
+    return found if differs and sure else None, tilted
 
 
-def _looked(samples: Samples) -> Looked:
+def _scanned(samples: Samples) -> Scan:
     """Return the sums of the cues at all heights; GeometryError ``cloud.flat`` without relief."""
     low, high = np.percentile(samples.smooth_m, [0.5, 99.5])
     if high - low < LEAST_RELIEF_M:
@@ -111,13 +111,13 @@ def _looked(samples: Samples) -> Looked:
             relief_m=float(high - low), least=LEAST_RELIEF_M,
         )  # fmt: skip
     count = int(np.clip((high - low) / search.COARSE_M, 8, search.MOST_HEIGHTS))
-    return search.look(samples, np.linspace(low, high, count), search.NO_TILT)
+    return search.scan_at(samples, np.linspace(low, high, count), search.NO_TILT)
 
 
-def _from_cues(whole: Looked) -> WaterProposal:
-    samples = whole.samples
-    peak, near, sigma_m, sigma_tilt = _choose(samples, whole)
-    confidence, evidence, reasons = judge(peak, near, whole, sigma_m)
+def _from_cues(coarse: Scan) -> WaterProposal:
+    samples = coarse.samples
+    peak, near, sigma_m, sigma_tilt = _choose(samples, coarse)
+    confidence, evidence, reasons = judge(peak, near, coarse, sigma_m)
     shore = samples.xyz[search.near_surface(samples, peak)]
     if len(shore) == 0:
         text = f"No water surface was found: no ground crosses the best candidate. {INSTEAD}"
@@ -126,8 +126,8 @@ def _from_cues(whole: Looked) -> WaterProposal:
     centre = shore[:, :2].mean(axis=0)
     level = peak.level_m + float(centre @ peak.tilt) + float(samples.origin[2])
     x, y = centre + samples.origin[:2]
-    gain = {sums.cue.name: gain_of(sums.shifted(peak.tilt)).gain for sums in whole.cues}
-    gain[LAYER] = layer_gain(samples, whole.heights_m, peak.tilt)
+    gain = {sums.cue.name: gain_of(sums.shifted(peak.tilt)).gain for sums in coarse.cues}
+    gain[LAYER] = layer_gain(samples, coarse.heights_m, peak.tilt)
     b, c = peak.tilt.tolist()
     return WaterProposal(
         surface=WaterPlane(level - (b * float(x) + c * float(y)), b, c),
@@ -140,23 +140,23 @@ def _from_cues(whole: Looked) -> WaterProposal:
         evidence=evidence,
         reasons=reasons,
         shoreline=shore + samples.origin,
-        curve_height_m=whole.heights_m + float(samples.origin[2] + centre @ peak.tilt),
+        curve_height_m=coarse.heights_m + float(samples.origin[2] + centre @ peak.tilt),
         curves=gain,
         ground=samples.xyz + samples.origin,
     )
 
 
-def _choose(samples: Samples, whole: Looked) -> tuple[Peak, Looked, float, float]:
+def _choose(samples: Samples, coarse: Scan) -> tuple[Peak, Scan, float, float]:
     """Return the level, or the plane if its tilt is significant and gains enough.
 
     Then follow the sums near it, and the standard errors of its level, and of its tilt along the
     shore, NaN for a level.
     """
-    start = search.best(whole, search.NO_TILT[None])
+    start = search.best(coarse, search.NO_TILT[None])
     level, near = search.refine(samples, start, None)
     axis, step = search.axis_of(samples, level), search.tilt_step(samples)
     steps = math.ceil(search.LARGEST_TILT / step)
-    tilted = search.best(whole, search.tilts_along(axis, step, steps))
+    tilted = search.best(coarse, search.tilts_along(axis, step, steps))
     if tilted.score > start.score:
         plane, near_plane = search.refine(samples, tilted, axis)
         along = abs(float(plane.tilt @ axis))

@@ -20,7 +20,7 @@ DRAWS, TILT_DRAWS, TILT_REACH = 120, 40, 6
 NO_TILT = np.zeros(2)
 
 
-class Looked(NamedTuple):
+class Scan(NamedTuple):
     """The sums of all cues of a cloud, at heights above a tilted plane."""
 
     cues: list[Moments]  # of the slope and of the stronger colour, if they show anything
@@ -37,7 +37,7 @@ class Peak(NamedTuple):
     score: float  # total gain of its cues, reduced for unusual tilts
 
 
-def look(samples: Samples, heights_m: FloatArray, tilt: FloatArray) -> Looked:
+def scan_at(samples: Samples, heights_m: FloatArray, tilt: FloatArray) -> Scan:
     """Sum all cues at the given heights above a tilted plane."""
     slope, *light = (
         cue_moments(samples, cue, heights_m, tilt)
@@ -45,35 +45,35 @@ def look(samples: Samples, heights_m: FloatArray, tilt: FloatArray) -> Looked:
     )
     known = [sums for sums in light if sums is not None]
     stronger = sorted(known, key=lambda sums: -float(gain_of(sums).gain.max()))[:1]
-    return Looked([*([slope] if slope else []), *stronger], samples, heights_m, tilt)
+    return Scan([*([slope] if slope else []), *stronger], samples, heights_m, tilt)
 
 
-def gains(looked: Looked, tilt: FloatArray, rng: np.random.Generator | None = None) -> FloatArray:
+def gains(scan: Scan, tilt: FloatArray, rng: np.random.Generator | None = None) -> FloatArray:
     """Return the total gain of the cues at each height, shape (h,).
 
-    `tilt`, shape (2,), is added to that of `looked`. With `rng`, tiles and floating points are
+    `tilt`, shape (2,), is added to that of `scan`. With `rng`, tiles and floating points are
     resampled with replacement (bootstrap).
     """
-    total = np.zeros(len(looked.heights_m))
-    for sums in looked.cues:
+    total = np.zeros(len(scan.heights_m))
+    for sums in scan.cues:
         times = None if rng is None else _drawn(len(sums.sums), rng)
         total += np.maximum(gain_of(sums.shifted(tilt) if tilt.any() else sums, times).gain, 0.0)
-    times = None if rng is None else _drawn(len(looked.samples.tile), rng)
-    return total + layer_gain(looked.samples, looked.heights_m, looked.tilt + tilt, times)
+    times = None if rng is None else _drawn(len(scan.samples.tile), rng)
+    return total + layer_gain(scan.samples, scan.heights_m, scan.tilt + tilt, times)
 
 
 def _drawn(count: int, rng: np.random.Generator) -> FloatArray:
     return np.bincount(rng.integers(0, max(count, 1), count), minlength=count).astype(float)
 
 
-def best(looked: Looked, tilts: FloatArray) -> Peak:
+def best(scan: Scan, tilts: FloatArray) -> Peak:
     """Return the best height and tilt among tilts of shape (k, 2)."""
     found = []
     for tilt in tilts:
-        total, whole = gains(looked, tilt), looked.tilt + tilt
+        total, total_tilt = gains(scan, tilt), scan.tilt + tilt
         row = int(np.argmax(total))
-        unusual = 0.5 * float(whole @ whole) / USUAL_TILT**2
-        found.append(Peak(float(looked.heights_m[row]), whole, float(total[row]) - unusual))
+        unusual = 0.5 * float(total_tilt @ total_tilt) / USUAL_TILT**2
+        found.append(Peak(float(scan.heights_m[row]), total_tilt, float(total[row]) - unusual))
     return max(found, key=lambda peak: peak.score)
 
 
@@ -110,34 +110,34 @@ def tilt_step(samples: Samples) -> float:
     return max(TILT_STEP_M / extent, LARGEST_TILT / MOST_TILT_STEPS)
 
 
-def refine(samples: Samples, start: Peak, axis: FloatArray | None) -> tuple[Peak, Looked]:
+def refine(samples: Samples, start: Peak, axis: FloatArray | None) -> tuple[Peak, Scan]:
     """Search near a surface in fine steps of height and, along an axis, of tilt."""
     peak, step = start, tilt_step(samples)
     reach = np.arange(-FINE_REACH_M, FINE_REACH_M + FINE_M / 2.0, FINE_M)
     for _ in range(3 if axis is not None else 1):
-        looked = look(samples, peak.level_m + reach, peak.tilt)
+        scan = scan_at(samples, peak.level_m + reach, peak.tilt)
         step /= 2.0
         tilts = NO_TILT[None] if axis is None else tilts_along(axis, step, 2)
-        peak = best(looked, tilts)
-    return peak, look(samples, peak.level_m + reach, peak.tilt)
+        peak = best(scan, tilts)
+    return peak, scan_at(samples, peak.level_m + reach, peak.tilt)
 
 
-def drawn(looked: Looked, axis: FloatArray | None, step: float) -> tuple[FloatArray, FloatArray]:
+def drawn(scan: Scan, axis: FloatArray | None, step: float) -> tuple[FloatArray, FloatArray]:
     """Return bootstrap samples of the level and of the tilt, relative to the surface found.
 
     Levels have the shape (`DRAWS`,), metres, with the tilt found; tilts along the axis the shape
     (`TILT_DRAWS`,), none without an axis.
     """
     rng = np.random.default_rng(0)
-    heights = looked.heights_m - looked.heights_m[len(looked.heights_m) // 2]
+    heights = scan.heights_m - scan.heights_m[len(scan.heights_m) // 2]
     near = np.abs(heights) <= SAME_PLACE_M
-    draws = [gains(looked, NO_TILT, rng)[near] for _ in range(DRAWS)]
+    draws = [gains(scan, NO_TILT, rng)[near] for _ in range(DRAWS)]
     level = np.array([heights[near][int(np.argmax(draw))] for draw in draws])
     if axis is None:
         return level, np.empty(0)
     tilts = tilts_along(axis, step / 2.0, TILT_REACH)
     tops = [  # with the same sample for all tilts
-        [gains(looked, tilt, np.random.default_rng(seed))[near].max() for tilt in tilts]
+        [gains(scan, tilt, np.random.default_rng(seed))[near].max() for tilt in tilts]
         for seed in range(TILT_DRAWS)
     ]
     return level, tilts[np.argmax(tops, axis=1)] @ axis
@@ -146,11 +146,11 @@ def drawn(looked: Looked, axis: FloatArray | None, step: float) -> tuple[FloatAr
 LEAST_AGREED, LEAST_EACH = 12.0, 3.0
 LIFTS = 0.15, 0.75
 """Range of the change of slope by refraction, about 0.36, on rough ground."""
-LEAST_ALONE, LEAST_COLOUR_ALONE = 25.0, 40.0
+LEAST_SINGLE, LEAST_COLOUR_SINGLE = 25.0, 40.0
 """Physics gives the size of slope and layer; colours may change with height on land too."""
 LEAST_LAYER = 15.0
 """Noise forms a layer by chance more often than slopes and colours break at one height."""
-MOST_RIVAL_AGREED, MOST_RIVAL_ALONE = 0.75, 0.5
+MOST_RIVAL_AGREED, MOST_RIVAL_SINGLE = 0.75, 0.5
 MOST_SIGMA_M = 0.2
 LEAST_SHARE = 0.005
 INSTEAD = "Give the water surface: a level, shoreline points, plane:a,b,c or a mesh."
@@ -158,11 +158,11 @@ LAYER = "floating points"
 
 
 def judge(
-    peak: Peak, near: Looked, whole: Looked, sigma_m: float
+    peak: Peak, near: Scan, coarse: Scan, sigma_m: float
 ) -> tuple[float, dict[str, float], tuple[str, ...]]:
     """Return the confidence in a surface, the figures of its evidence, and sentences about it.
 
-    `near` are the sums about it, with its tilt, and `whole` those over all heights without tilt;
+    `near` are the sums about it, with its tilt, and `coarse` those over all heights without tilt;
     `sigma_m` is the standard error of its level. Raises GeometryError ``water.not_found``.
     """
     samples, middle = near.samples, len(near.heights_m) // 2
@@ -170,11 +170,11 @@ def judge(
     found = {cue.name: float(gain[cue].gain[middle]) for cue in gain}
     found[LAYER] = float(layer_gain(samples, near.heights_m, near.tilt)[middle])
     # the rival: the best height elsewhere
-    elsewhere = np.abs(whole.heights_m - peak.level_m) > SAME_PLACE_M
-    rivals = np.where(elsewhere, gains(whole, peak.tilt), 0.0)
+    elsewhere = np.abs(coarse.heights_m - peak.level_m) > SAME_PLACE_M
+    rivals = np.where(elsewhere, gains(coarse, peak.tilt), 0.0)
     row = int(np.argmax(rivals))
     total, rival = sum(max(value, 0.0) for value in found.values()), float(rivals[row])
-    rival_m = float(whole.heights_m[row]) + float(samples.origin[2])
+    rival_m = float(coarse.heights_m[row]) + float(samples.origin[2])
     wet = float(np.mean(heights_above(samples, peak) < 0.0))
     evidence = {f"{name} gain": value for name, value in found.items()} | {
         "rival gain": rival, "rival height": rival_m, "total gain": total, "share below": wet,
@@ -197,7 +197,7 @@ def judge(
     least, most_rival, lift = LEAST_AGREED, MOST_RIVAL_AGREED, LIFTS[0]
     if len(strong) < 2:
         coloured = any("/" in name for name in strong)
-        least, most_rival = (LEAST_COLOUR_ALONE if coloured else LEAST_ALONE), MOST_RIVAL_ALONE
+        least, most_rival = (LEAST_COLOUR_SINGLE if coloured else LEAST_SINGLE), MOST_RIVAL_SINGLE
     if strong == [SLOPE.name]:
         lift = evidence["slope amplitude"]
     reason = ""
@@ -244,18 +244,18 @@ class Tilted(NamedTuple):
     high_m: float
 
 
-def find_tilt(whole: Looked) -> Tilted | None:
-    """Return the tilt of a cloud's waterline, if any; `whole` has heights above the given water."""
-    samples = whole.samples
+def find_tilt(coarse: Scan) -> Tilted | None:
+    """Return the tilt of a waterline, if any; heights of `coarse` are above the given water."""
+    samples = coarse.samples
     middle = np.median(samples.xyz[:, :2], axis=0)
     angles = np.arange(DIRECTIONS) * np.pi / DIRECTIONS
     ways = np.column_stack([np.cos(angles), np.sin(angles)])
 
     def best(tilt: FloatArray) -> Peak:
-        at_middle = whole.heights_m + samples.origin[2] + middle @ tilt
-        gain = np.where(np.abs(at_middle) <= REACH_M, gains(whole, tilt), 0.0)
+        at_middle = coarse.heights_m + samples.origin[2] + middle @ tilt
+        gain = np.where(np.abs(at_middle) <= REACH_M, gains(coarse, tilt), 0.0)
         row = int(np.argmax(gain))
-        return Peak(float(whole.heights_m[row]), tilt, float(gain[row]))
+        return Peak(float(coarse.heights_m[row]), tilt, float(gain[row]))
 
     level = best(NO_TILT)
     peaks = [best(slope * way) for slope in sorted(TILTS, key=abs) for way in ways]
