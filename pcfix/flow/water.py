@@ -35,15 +35,15 @@ SAMPLE_POINTS = 200_000
 """Points of the cloud that are compared with the water, evenly spread."""
 MOST_LISTED = 10
 _FIT: RowTable = (
-    ("Model", "{model}, {accepted} of {count} points; scatter {sigma_m:.3f} m", "count"),
-    ("Level", "{level_m:.3f} m at {x:.1f}, {y:.1f}; standard error {sigma_level_m:.3f} m",
-     "is_plane"),
+    ("Model", "{model}, {accepted} of {points} points; scatter {sigma_point_m:.3f} m", "points"),
+    ("Level", "{level_m:.3f} m at {at_xy[0]:.1f}, {at_xy[1]:.1f}; standard error"
+     " {sigma_level_m:.3f} m", "at_xy"),
     ("Tilt", "{tilt_percent:.3f} %, standard error {sigma_tilt_percent:.3f} %, falls towards"
-     " {downhill_deg:.0f} deg", "is_tilted"),
+     " {downhill_deg:.0f} deg", "tilt_percent"),
     ("Length", "{length_m:.1f} m, falls {drop_m:.3f} m; standard error of the level"
-     " {sigma_height_m:.3f} m", "is_river"),
+     " {sigma_level_m:.3f} m", "length_m"),
     ("Residuals", "of the accepted points: rms {rms:.3f} m, median {median:.3f} m, largest"
-     " {largest:.3f} m", "count"),
+     " {largest:.3f} m", "points"),
 )  # fmt: skip
 
 
@@ -150,21 +150,8 @@ def _fit_rows(fit: WaterFit | RiverFit, points: FloatArray | None) -> Rows:
     """Return the rows of a fit, and its rejected points, the largest residual first."""
     residual = fit.residual_m
     good = np.abs(residual[fit.accepted])
-    values: dict[str, Any] = {
-        "accepted": int(fit.accepted.sum()), "count": len(residual), "sigma_m": fit.sigma_m,
-        "rms": np.sqrt(np.mean(good**2)), "median": np.median(good), "largest": good.max(),
-    }  # fmt: skip
-    if isinstance(fit, RiverFit):
-        sigma = fit.profile.sigma_height_m.mean()
-        values |= {"model": "river", "is_river": True, "length_m": fit.length_m,
-                   "drop_m": fit.drop_m, "sigma_height_m": sigma}  # fmt: skip
-    else:
-        x, y = fit.centre_xy
-        names = ("model", "level_m", "sigma_level_m", "tilt_percent", "sigma_tilt_percent",
-                 "downhill_deg")  # fmt: skip
-        values |= {name: getattr(fit, name) for name in names}
-        values |= {"is_plane": True, "is_tilted": bool(fit.tilt.any()), "x": x, "y": y}
-    rows = filled(_FIT, values)
+    rms, median, largest = np.sqrt(np.mean(good**2)), np.median(good), good.max()
+    rows = filled(_FIT, fit.as_dict() | {"rms": rms, "median": median, "largest": largest})
     if points is None:
         return rows
     rejected = np.flatnonzero(~fit.accepted & np.isfinite(residual))
