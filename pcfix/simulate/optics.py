@@ -23,14 +23,23 @@ class Optics:
     lens: Lens
     reach: float
 
+    @property
+    def is_ideal(self) -> bool:
+        """Whether there is no distortion."""
+        return not (any(self.lens.radial) or any(self.lens.tangential))
+
     def to_image(self, ideal: FloatArray) -> FloatArray:
         """Return image pixels of ideal pixels, shape (m, 2); NaN beyond the fold of the lens."""
+        if self.is_ideal:
+            return ideal
         principal = [self.lens.principal_x, self.lens.principal_y]
         plane = (ideal - principal) / self.lens.focal
         return project(self.lens, np.column_stack([plane, np.ones(len(plane))]))
 
     def to_ideal(self, image: FloatArray) -> FloatArray:
         """Return ideal pixels of image pixels, shape (m, 2)."""
+        if self.is_ideal:
+            return image
         rays = unproject(self.lens, image)
         principal = [self.lens.principal_x, self.lens.principal_y]
         return np.asarray(self.lens.focal * rays[:, :2] / rays[:, 2:] + principal)
@@ -51,8 +60,9 @@ def make_optics(
     width, height = sensor_px
     focal = focal_mm / sensor_mm[0] * width
     lens = Lens(focal, width, height, width / 2.0, height / 2.0)
-    if any(distortion):
-        lens = replace(lens, radial=distortion[:3], tangential=distortion[3:])
+    if not any(distortion):
+        return Optics(lens, float(np.hypot(*sensor_mm) / 2.0 / focal_mm))
+    lens = replace(lens, radial=distortion[:3], tangential=distortion[3:])
     along = np.linspace(-1.0, 1.0, 41)
     side = np.ones_like(along)
     edges = [(along, side), (along, -side), (side, along), (-side, along)]
