@@ -152,7 +152,7 @@ def light_through(port: FloatArray, n: float, x: float, y: float, z: float) -> V
     for _ in range(STEPS):
         w = beyond(scaled(1.0 - share, straight), share, foot)
         miss = _signed_miss(window, n, w, point, across)
-        if miss > 0.0:
+        if miss > 0.0:  # it passes the point on the side of the foot
             high = share
         else:
             low = share
