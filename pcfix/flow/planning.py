@@ -145,6 +145,7 @@ def _check_port(options: CorrectOptions) -> None:
         "camera_set": options.camera_set == "mvs",
         "occlusion": options.occlusion == "on",
         "method": options.method not in ("auto", "snell", "consistent"),
+        "unsure": options.unsure == "withhold",
     }
     for name in compress(excluded, excluded.values()):
         raise SettingError(
