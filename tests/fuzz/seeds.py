@@ -237,8 +237,8 @@ def camera_lines() -> list[list[object]]:
     """Return a camera of every model of COLMAP, its numbers in the order of the file."""
     numbers = {"f": 500, "fx": 500, "fy": 510, "cx": 410, "cy": 290}
     return [
-        [i + 1, model, 800, 600, *(numbers.get(name, 0.01) for name in names)]
-        for i, (model, (names, projection)) in enumerate(BY_NAME.items())
+        [i + 1, model, 800, 600, *(numbers.get(name, 0.01) for name in names.split())]
+        for i, (model, (names, projection, _)) in enumerate(BY_NAME.items())
         if projection
     ]
 

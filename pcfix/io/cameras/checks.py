@@ -21,13 +21,11 @@ import numpy as np
 
 from pcfix.errors import InputError, PcfixError, PcfixWarning, bad_file
 from pcfix.io.files import check_input, check_output, parse_json, write_bytes
-from pcfix.model import BoolArray, Cameras, FloatArray, Lens
+from pcfix.model import BoolArray, Cameras, FloatArray, GnssPositions, Lens
 
 ZIP_MAGIC = b"PK\x03\x04"
 ROUNDING = 1e-3
 """Of a rotation's elements: files with four decimals pass, a mirrored or scaled one does not."""
-SAME_LENS = 1e-12
-"""Relative difference between the numbers of equal lenses."""
 NO_LENS = "cameras.no_lens"
 DAMAGES = (
     *(ArithmeticError, AttributeError, EOFError, LookupError, MemoryError, OSError, RuntimeError),
@@ -233,15 +231,18 @@ def checked(path: Path, cameras: Cameras) -> Cameras:
     return cameras
 
 
-def terms(given: Mapping[str, float], names: str) -> tuple[float, ...]:
-    """Return coefficients by name, 0 for those that are missing, up to the last that is not 0."""
-    return without_zeros([given.get(name, 0.0) for name in names.split()])
+def measured(
+    labels: Sequence[str], places: Mapping[str, tuple[Any, Any]], crs: str | None
+) -> GnssPositions | None:
+    """Return the GNSS positions of images by label, with their standard deviations.
 
-
-def without_zeros(values: Sequence[float]) -> tuple[float, ...]:
-    """Return the values up to the last that is not zero."""
-    last = max((i for i, value in enumerate(values) if value != 0.0), default=-1)
-    return tuple(values[: last + 1])
+    Numbers that are not finite are unknown. None where no image has a position.
+    """
+    nothing = np.full(3, np.nan)
+    rows = [places.get(label, (nothing, nothing)) for label in labels]
+    xyz, sigma = (np.array([row[i] for row in rows], np.float64).reshape(-1, 3) for i in (0, 1))
+    xyz[~np.isfinite(xyz).all(axis=1)] = np.nan
+    return None if np.isnan(xyz).all() else GnssPositions(xyz, sigma, crs)
 
 
 def crs(path: Path, definition: str) -> str:
@@ -288,41 +289,6 @@ def block_to_write(
         sentence = f"the format cannot hold the image name {label!r}. Take another format."
         raise bad_file(path, "output.label", sentence, image=label)
     return cameras.rotations, cameras.lenses
-
-
-def lens_not_held(path: Path, given: Lens) -> InputError:
-    """Return the error for a lens that a format cannot hold exactly."""
-    kind = f"{given.sensor or 'of the images'} ({given.projection} in {given.unit})"
-    sentence = f"the format cannot hold the lens {kind} exactly. Take another format."
-    return bad_file(path, "output.lens", sentence, lens=given.sensor)
-
-
-def is_same_lens(one: Lens, other: Lens) -> bool:
-    """Whether two lenses take every direction to the same place, but for rounding."""
-
-    def same(a: Any, b: Any) -> bool:
-        if not isinstance(a, float | tuple):
-            return bool(a == b)
-        slack = 10.0 * SAME_LENS * one.focal if isinstance(a, float) else 0.0  # of a length
-        return np.shape(a) == np.shape(b) and np.allclose(a, b, rtol=SAME_LENS, atol=slack)
-
-    return all(map(same, astuple(_bare(one)), astuple(_bare(other))))
-
-
-def _bare(lens: Lens) -> Lens:
-    """Return a lens without names, zeros at the end of lists, and switches without effect."""
-    names = ("radial", "denominator", "tangential", "thin_prism")
-    lists: dict[str, Any] = {name: without_zeros(getattr(lens, name)) for name in names}
-    turns, bent = bool(lists["tangential"] or lists["thin_prism"]), any(lists.values())
-    return replace(
-        lens,
-        **lists,
-        distortion_centre=lens.distortion_centre if bent else (0.0, 0.0),
-        inverse=lens.inverse and bent,
-        in_turn=lens.in_turn and turns,
-        pixel_size_mm=None,
-        sensor="",
-    )
 
 
 def write_new(folder: Path, contents: Mapping[str, bytes]) -> None:

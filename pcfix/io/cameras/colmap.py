@@ -50,10 +50,11 @@ import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.cameras import checks, tracks
-from pcfix.io.cameras.checks import Source, damaged, terms
+from pcfix.io.cameras.checks import Source, damaged
+from pcfix.io.cameras.lenses import LensModel, lens_by_name, model_of
 from pcfix.io.cameras.tracks import NO_TIE_POINTS, are_seen
 from pcfix.io.crs import is_topocentric
-from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, Projection, TiePoints
+from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, TiePoints
 from pcfix.options.declare import File
 
 _PART = re.compile(r"(cameras|images|points3D|rigs|frames)\.(bin|txt)")
@@ -125,13 +126,9 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     if not len(identifiers) or not len(seen):
         raise tracks.no_tie_points(path, "the model has no points that its images saw")
     camera = np.repeat(np.arange(len(cameras)), [len(image.seen) for image in images])
-    order, rising = np.argsort(identifiers), np.argsort(seen["point"])
-    place = np.empty(len(seen), np.int64)  # a search in rising order is far quicker
-    place[rising] = np.searchsorted(identifiers[order], seen["point"][rising])
-    row = order[np.minimum(place, len(order) - 1)]
-    known = identifiers[row] == seen["point"]
     xyz = xyz + read_place(model.folder)[0]
-    return tracks.tie_points(tracks.Seen(xyz, row[known], camera[known], seen["xy"][known]))
+    row = tracks.rows_of(seen["point"], identifiers)
+    return tracks.tie_points(tracks.Seen(xyz, row, camera, seen["xy"]))
 
 
 def _model_at(path: Path) -> Model:
@@ -214,57 +211,48 @@ def read_priors(
     except sqlite3.Error as error:
         sentence = f"its pose priors cannot be read ({error}). They are skipped."
         return None, (checks.note(path, "cameras.priors_left_out", sentence),)
-    row_of = {label: i for i, label in enumerate(labels)}
-    found = [(row_of[name], *row) for name, *row in rows if name in row_of]
-    systems = {system for *_, system in found}
+    known = set(labels)
+    systems = {system for name, *_, system in rows if name in known}
     if len(systems) > 1:
         sentence = "its pose priors are in several coordinate systems. They are skipped."
         return None, (checks.note(path, "cameras.priors_left_out", sentence),)
-    xyz, sigma = np.full((2, len(labels), 3), np.nan)
-    for i, position, covariance, _ in found:
-        xyz[i] = np.frombuffer(position, "<f8")
+    is_wgs84 = systems == {_WGS84}
+    found = {}
+    for name, position, covariance, _ in rows:
+        place, sigma = np.frombuffer(position, "<f8"), np.full(3, np.nan)
         if isinstance(covariance, bytes) and len(covariance) == 9 * 8:
             variances = np.frombuffer(covariance, "<f8").reshape(3, 3).diagonal()
-            sigma[i] = np.sqrt(np.where(variances >= 0.0, variances, np.nan))
-    xyz[~np.isfinite(xyz).all(axis=1)] = np.nan
-    if np.isnan(xyz).all():
-        return None, ()
-    if systems == {_WGS84}:
-        return GnssPositions(xyz[:, [1, 0, 2]], sigma, "EPSG:4979"), ()
-    return GnssPositions(xyz, sigma, None), ()
+            sigma = np.sqrt(np.where(variances >= 0.0, variances, np.nan))
+        found[name] = place[[1, 0, 2]] if is_wgs84 else place, sigma
+    return checks.measured(labels, found, "EPSG:4979" if is_wgs84 else None), ()
 
 
 _SMALLEST_OMEGA = 1e-6
 """Below, in radians, the FOV model is a perspective one to double precision."""
-SHAPES = {"fov": ("omega",), "division": ("k",), "eucm": ("alpha", "beta")}
-"""COLMAP's names of the parameters of a projection."""
-
-
-_TWELVE = "fx fy cx cy k1 k2 k3 k4 k5 k6 p2 p1 s1 s2 s3 s4"
-_TABLE: tuple[tuple[str, str, Projection | None], ...] = (
-    ("SIMPLE_PINHOLE", "f cx cy", "perspective"),
-    ("PINHOLE", "fx fy cx cy", "perspective"),
-    ("SIMPLE_RADIAL", "f cx cy k1", "perspective"),
-    ("RADIAL", "f cx cy k1 k2", "perspective"),
-    ("OPENCV", "fx fy cx cy k1 k2 p1 p2", "perspective"),
-    ("OPENCV_FISHEYE", "fx fy cx cy k1 k2 k3 k4", "equidistant"),
-    ("FULL_OPENCV", "fx fy cx cy k1 k2 p1 p2 k3 d1 d2 d3", "perspective"),
-    ("FOV", "fx fy cx cy omega", "fov"),
-    ("SIMPLE_RADIAL_FISHEYE", "f cx cy k1", "equidistant"),
-    ("RADIAL_FISHEYE", "f cx cy k1 k2", "equidistant"),
-    ("THIN_PRISM_FISHEYE", "fx fy cx cy k1 k2 p1 p2 k3 k4 s1 s3", "equidistant"),
-    ("RAD_TAN_THIN_PRISM_FISHEYE", _TWELVE, "equidistant"),
-    ("SIMPLE_DIVISION", "f cx cy k", "division"),
-    ("DIVISION", "fx fy cx cy k", "division"),
-    ("SIMPLE_FISHEYE", "f cx cy", "equidistant"),
-    ("FISHEYE", "fx fy cx cy", "equidistant"),
-    ("EUCM", "fx fy cx cy alpha beta", "eucm"),
-    ("EQUIRECTANGULAR", "w h", None),
-)
-"""In the order of their numbers in binary files, from 0."""
-MODELS = tuple(name for name, _, _ in _TABLE)
-BY_NAME = {name: (tuple(names.split()), projection) for name, names, projection in _TABLE}
-"""The names of the parameters of each model, in the order of the file, and its projection."""
+BY_NAME = {
+    "SIMPLE_PINHOLE": LensModel("f cx cy"),
+    "PINHOLE": LensModel("fx fy cx cy"),
+    "SIMPLE_RADIAL": LensModel("f cx cy k1"),
+    "RADIAL": LensModel("f cx cy k1 k2"),
+    "OPENCV": LensModel("fx fy cx cy k1 k2 p2 p1"),
+    "OPENCV_FISHEYE": LensModel("fx fy cx cy k1 k2 k3 k4", "equidistant"),
+    "FULL_OPENCV": LensModel("fx fy cx cy k1 k2 p2 p1 k3 d1 d2 d3"),
+    "FOV": LensModel("fx fy cx cy omega", "fov"),
+    "SIMPLE_RADIAL_FISHEYE": LensModel("f cx cy k1", "equidistant"),
+    "RADIAL_FISHEYE": LensModel("f cx cy k1 k2", "equidistant"),
+    "THIN_PRISM_FISHEYE": LensModel("fx fy cx cy k1 k2 p2 p1 k3 k4 s1 s3", "equidistant"),
+    "RAD_TAN_THIN_PRISM_FISHEYE": LensModel(
+        "fx fy cx cy k1 k2 k3 k4 k5 k6 p1 p2 s1 s2 s3 s4", "equidistant", in_turn=True
+    ),
+    "SIMPLE_DIVISION": LensModel("f cx cy k", "division"),
+    "DIVISION": LensModel("fx fy cx cy k", "division"),
+    "SIMPLE_FISHEYE": LensModel("f cx cy", "equidistant"),
+    "FISHEYE": LensModel("fx fy cx cy", "equidistant"),
+    "EUCM": LensModel("fx fy cx cy alpha beta", "eucm"),
+    "EQUIRECTANGULAR": LensModel("w h", None),
+}
+"""In the order of their numbers in binary files, from 0; the names are those of `lenses`."""
+MODELS = tuple(BY_NAME)
 
 
 class Camera(NamedTuple):
@@ -278,26 +266,14 @@ class Camera(NamedTuple):
 
 def lens_of(path: Path, identifier: int, camera: Camera) -> Lens:
     """Return the lens of a camera."""
-    names, projection = BY_NAME[camera.model]
-    if projection is None:
+    model, sensor = BY_NAME[camera.model], f"{identifier} {camera.model}"
+    if model.projection is None:
         raise _no_model(path, identifier, camera.model)
-    given = dict(zip(names, camera.values, strict=True))
-    focal_x, focal = given.get("fx", given.get("f", 0.0)), given.get("fy", given.get("f", 0.0))
-    shape = SHAPES.get(projection, ())
-    if projection == "fov" and abs(given["omega"]) < _SMALLEST_OMEGA:
-        projection, shape = "perspective", ()
-    return Lens(
-        *(focal, camera.width, camera.height, given["cx"], given["cy"]),
-        b1=focal_x - focal,
-        projection=projection,
-        shape=tuple(given[name] for name in shape),
-        radial=terms(given, "k1 k2 k3 k4 k5 k6"),
-        denominator=terms(given, "d1 d2 d3"),
-        tangential=terms(given, "p2 p1"),
-        thin_prism=terms(given, "s1 s2 s3 s4"),
-        in_turn=camera.model == "RAD_TAN_THIN_PRISM_FISHEYE",
-        sensor=f"{identifier} {camera.model}",
-    )
+    given = dict(zip(model.names.split(), camera.values, strict=True))
+    is_straight = model.projection == "fov" and abs(given["omega"]) < _SMALLEST_OMEGA
+    projection = "perspective" if is_straight else model.projection
+    more = {"projection": projection, "in_turn": model.in_turn, "sensor": sensor}
+    return lens_by_name(given, camera.width, camera.height, **more)
 
 
 def _no_model(path: Path, camera: object, model: object) -> InputError:
@@ -368,14 +344,15 @@ def read_list(path: Path) -> dict[int, Camera]:
                 identifier, number, width, height = _take(file, _CAMERA)
                 if not 0 <= number < len(MODELS):
                     raise _no_model(path, identifier, number)
-                values = _take(file, struct.Struct(f"<{len(BY_NAME[MODELS[number]][0])}d"))
+                count = len(BY_NAME[MODELS[number]].names.split())
+                values = _take(file, struct.Struct(f"<{count}d"))
                 cameras[identifier] = Camera(MODELS[number], float(width), float(height), values)
             return cameras
         for name, model, *words in filter(None, map(str.split, _lines(path))):
             if model not in BY_NAME:
                 raise _no_model(path, name, model)
             width, height, *numbers = map(float, words)
-            if len(numbers) != len(BY_NAME[model][0]):
+            if len(numbers) != len(BY_NAME[model].names.split()):
                 raise damaged(path, f"camera {name}: {len(numbers)} parameters of {model}")
             cameras[int(name)] = Camera(model, width, height, tuple(numbers))
         _check_count(path, len(cameras))
@@ -439,12 +416,8 @@ def read_points(path: Path) -> tuple[IntArray, FloatArray]:
         return numbers["id"].copy(), numbers["xyz"].copy()
 
 
-PREFERRED = (
-    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"),
-    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE"),
-    *("RAD_TAN_THIN_PRISM_FISHEYE", "FOV", "SIMPLE_DIVISION", "DIVISION", "EUCM"),
-)
-"""For writing: the simplest first; those that only new versions of COLMAP know come last."""
+WRITTEN = {k: model for k, model in BY_NAME.items() if k not in ("SIMPLE_FISHEYE", "FISHEYE")}
+"""Without the two for which older versions of COLMAP have one that does the same."""
 GREY = (128, 128, 128)
 ROUND_M = 100.0
 
@@ -493,10 +466,11 @@ def write_colmap(
     seen["point"] = np.repeat(np.cumsum(kept), counts)[of_kept][order]
     start = np.concatenate([[0], np.cumsum(np.bincount(camera, minlength=len(cameras)))])
     listed = [struct.pack("<Q", len(distinct))]
-    for i, camera_of in enumerate((colmap_camera(target, one) for one in distinct), start=1):
-        size = int(camera_of.width), int(camera_of.height)
-        listed.append(struct.pack("<IiQQ", i, MODELS.index(camera_of.model), *size))
-        listed.append(np.array(camera_of.values, "<f8").tobytes())
+    for i, lens in enumerate(distinct, start=1):
+        model, values = model_of(target, lens, WRITTEN, whole=True)
+        size = int(lens.width), int(lens.height)
+        listed.append(struct.pack("<IiQQ", i, MODELS.index(model), *size))
+        listed.append(np.array([*values.values()], "<f8").tobytes())
     rotations = np.asarray(cameras.rotations)
     turns = np.roll(Rotation.from_matrix(rotations).as_quat(canonical=True), 1, axis=1)
     shifts = -np.einsum("kij,kj->ki", rotations, cameras.centres - offset)
@@ -513,32 +487,6 @@ def write_colmap(
         FILE: place_text(offset, crs or cameras.crs).encode(),
     }
     checks.write_new(target, contents)
-
-
-def colmap_camera(path: Path, given: Lens) -> Camera:
-    """Return the simplest of COLMAP's cameras that is exactly this lens."""
-    whole = float(given.width).is_integer() and float(given.height).is_integer()
-    if given.unit == "px" and whole:
-        lists = (
-            ("f", (given.focal,)),
-            ("fx fy", (given.focal + given.b1, given.focal)),
-            ("cx cy", (given.principal_x, given.principal_y)),
-            ("k1 k2 k3 k4 k5 k6", given.radial),
-            ("d1 d2 d3", given.denominator),
-            ("p2 p1", given.tangential),
-            ("s1 s2 s3 s4", given.thin_prism),
-            (" ".join(SHAPES.get(given.projection, ())), given.shape),
-        )
-        values = {key: v for keys, vs in lists for key, v in zip(keys.split(), vs, strict=False)}
-        for model in PREFERRED:
-            names, projection = BY_NAME[model]
-            numbers = tuple(values.get(name, 0.0) for name in names)
-            camera = Camera(model, given.width, given.height, numbers)
-            if projection == given.projection and checks.is_same_lens(
-                lens_of(path, 1, camera), given
-            ):
-                return camera
-    raise checks.lens_not_held(path, given)
 
 
 def _points(xyz: FloatArray, point: IntArray, image_start: IntArray) -> bytes:

@@ -39,6 +39,7 @@ from pcfix.errors import InputError, bad_file
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import Source, damaged, number, numbers, read_xml
 from pcfix.io.cameras.checks import text_of as _text
+from pcfix.io.cameras.lenses import without_zeros
 from pcfix.model import Cameras, FloatArray, Lens
 
 PREFIX, PREFIX_2, SUFFIX = "Orientation-", "Ori-PerspCentral-", ".xml"
@@ -174,8 +175,8 @@ def _lens(
     (width, height), (x, y), (cx, cy) = size.tolist(), principal.tolist(), centre.tolist()
     return Lens(
         *(focal, width, height, x + b1 * (x - cx) + b2 * (y - cy), y, b1 * focal, b2 * focal),
-        radial=checks.without_zeros(radial.tolist()),
-        tangential=checks.without_zeros([p1, p2]),
+        radial=without_zeros(radial.tolist()),
+        tangential=without_zeros([p1, p2]),
         distortion_centre=((cx - x) / focal, (cy - y) / focal),
         inverse=is_inverse,
         sensor=path.stem,

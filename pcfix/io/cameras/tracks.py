@@ -30,7 +30,7 @@ def no_tie_points(path: Path, why: str) -> NoTiePointsError:
 class Seen(NamedTuple):
     """Points, and observations of them in any order: row of the point and camera, u and v.
 
-    The camera -1 is one without a pose.
+    The camera -1 is one without a pose, the point -1 one that is not there.
     """
 
     xyz: FloatArray
@@ -39,14 +39,26 @@ class Seen(NamedTuple):
     uv: FloatArray
 
 
+def rows_of(wanted: IntArray, identifiers: IntArray) -> IntArray:
+    """Return the first row of each of the wanted in a list of identifiers, -1 where it is none."""
+    if not len(identifiers):
+        return np.full(len(wanted), -1)
+    order, rising = np.argsort(identifiers, kind="stable"), np.argsort(wanted)
+    place = np.empty(len(wanted), np.int64)  # a search in rising order is far quicker
+    place[rising] = np.searchsorted(identifiers[order], wanted[rising])
+    row = order[np.minimum(place, len(order) - 1)]
+    return np.where(identifiers[row] == wanted, row, -1)
+
+
 def tie_points(*parts: Seen) -> TiePoints:
     """Join points and gather their observations by point, without those of a camera -1."""
     before = np.cumsum([0, *(len(part.xyz) for part in parts)])
     xyz = np.concatenate([part.xyz for part in parts])
     point = np.concatenate([part.point + n for part, n in zip(parts, before, strict=False)])
+    is_there = np.concatenate([(part.camera >= 0) & (part.point >= 0) for part in parts])
     camera = np.concatenate([part.camera for part in parts])
     uv = np.concatenate([part.uv for part in parts])
-    kept = np.flatnonzero(camera >= 0)
+    kept = np.flatnonzero(is_there)
     kept = kept[np.argsort(point[kept], kind="stable")]
     start = np.concatenate([[0], np.cumsum(np.bincount(point[kept], minlength=len(xyz)))])
     return TiePoints(xyz, Views(start, camera[kept]), uv[kept])

@@ -49,10 +49,11 @@ import numpy as np
 
 from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import Source, damaged, note, number, numbers, read_xml, terms, text_of
+from pcfix.io.cameras.checks import Source, damaged, note, number, numbers, read_xml, text_of
+from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.io.cameras.metashape import documents
 from pcfix.io.cameras.metashape.documents import Chunk, Document, open_archive, recognises, unpacked
-from pcfix.io.cameras.tracks import Seen, no_tie_points
+from pcfix.io.cameras.tracks import Seen, no_tie_points, rows_of
 from pcfix.io.cameras.tracks import tie_points as gathered
 from pcfix.io.crs import LOCAL, METRES, crs_text, is_local, parse_crs, shortened, unbound
 from pcfix.io.ply import parse_header
@@ -72,8 +73,26 @@ DEFAULTS: Spreads = (
     ("accuracy_cameras_z", (2,)),
 )
 POINTS, MARKS = ("x", "y", "z", "id"), ("x", "y", "id")
-DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
-PARAMETERS = {"f", "fx", "fy", "cx", "cy", "b1", "b2", "skew", *DISTORTION}
+PARAMETERS = {
+    *[
+        "f",
+        "fx",
+        "fy",
+        "cx",
+        "cy",
+        "b1",
+        "b2",
+        "skew",
+        "k1",
+        "k2",
+        "k3",
+        "k4",
+        "p1",
+        "p2",
+        "p3",
+        "p4",
+    ]
+}
 PROJECTIONS: dict[str, Projection] = {
     "frame": "perspective",
     "fisheye": "equidistant",
@@ -311,21 +330,15 @@ def _lens_of_calibration(
     }
     if not given.keys() & {"f", "fx", "fy"}:
         raise damaged(path, f"the calibration of sensor {sensor} has no focal length")
-    width, height = size
-    value = defaultdict(float, given)
-    focal, x, y = value["f"], width / 2.0 + value["cx"], height / 2.0 + value["cy"]
-    b1, b2, tangential = value["b1"], value["b2"], "p1 p2 p3 p4"
-    if "f" not in given:
+    (width, height), value = size, defaultdict(float, given)
+    if "f" in given:
+        given |= {"fx": value["f"] + value["b1"], "fy": value["f"], "skew": value["b2"]}
+        given |= {"cx": width / 2.0 + value["cx"], "cy": height / 2.0 + value["cy"]}
+    else:  # PhotoScan's
         focal = given.get("fy", value["fx"])
-        x, y = given.get("cx", width / 2.0), given.get("cy", height / 2.0)
-        b1, b2, tangential = given.get("fx", focal) - focal, value["skew"], "p2 p1 p3 p4"
-    return Lens(
-        *(focal, width, height, x, y, b1, b2),
-        projection=PROJECTIONS[kind],
-        radial=terms(given, "k1 k2 k3 k4"),
-        tangential=terms(given, tangential),
-        sensor=sensor,
-    )
+        given |= {"fx": given.get("fx", focal), "fy": focal}
+        given |= {"p1": value["p2"], "p2": value["p1"]}
+    return lens_by_name(given, *size, projection=PROJECTIONS[kind], sensor=sensor)
 
 
 def name_of(sensor: Element) -> str:
@@ -355,12 +368,9 @@ def lens_of(path: Path, sensor: Element, image: str) -> tuple[Lens, tuple[PcfixW
             sentence = f"the additional corrections of {label} are ignored ({rms_px:.2f} px rms)."
             notes.append(note(path, "cameras.corrections", sentence, sensor=label, rms_px=rms_px))
     elif found is None and size is not None and focal_mm is not None and pixel_mm is not None:
-        lens = Lens(  # what Metashape itself starts from
-            *(focal_mm / pixel_mm, *size, size[0] / 2.0, size[1] / 2.0),
-            projection=PROJECTIONS[kind_of(sensor)],
-            pixel_size_mm=pixel_mm,
-            sensor=label,
-        )
+        given = {"f": focal_mm / pixel_mm}  # what Metashape itself starts from
+        lens = lens_by_name(given, *size, projection=PROJECTIONS[kind_of(sensor)], sensor=label)
+        lens = replace(lens, pixel_size_mm=pixel_mm)
         sentence = f"sensor {label} has no calibration; the lens of its data sheet is used."
         notes.append(note(path, "cameras.data_sheet_lens", sentence, sensor=label))
     else:
@@ -528,27 +538,22 @@ def _tie_points(frame: Document, block: Block) -> Iterator[Seen]:
             ]
             if not rows:
                 continue
-            vertices = _vertices(archive, points.get("path") or "", POINTS)
-            place = block.places[rows[0]]
-            xyz = np.column_stack([vertices[axis] for axis in "xyz"]).astype(np.float64)
-            order = np.argsort(vertices["id"], kind="stable")
-            ids = vertices["id"][order].astype(np.int64)
-            point, camera, uv = [], [], []
-            for row in rows:
-                marks = _vertices(archive, files[block.images[row].id], MARKS)
-                track = marks["id"].astype(np.int64)
-                found_at = np.searchsorted(ids, track).clip(max=max(len(ids) - 1, 0))
-                known = ids[found_at] == track if len(ids) else np.zeros(len(marks), bool)
-                point.append(order[found_at[known]])
-                camera.append(np.full(int(known.sum()), row))
-                uv.append(np.column_stack([marks["x"], marks["y"]])[known].astype(np.float64))
-            xyz = xyz @ place[:3, :3].T + place[:3, 3]
-            yield Seen(xyz, np.concatenate(point), np.concatenate(camera), np.concatenate(uv))
+            vertices, place = _vertices(archive, points.get("path"), POINTS), block.places[rows[0]]
+            xyz = _columns(vertices, "xyz") @ place[:3, :3].T + place[:3, 3]
+            marks = [_vertices(archive, files[block.images[row].id], MARKS) for row in rows]
+            tracks_of = np.concatenate([one["id"].astype(np.int64) for one in marks])
+            camera = np.repeat(rows, [len(one) for one in marks])
+            uv = np.concatenate([_columns(one, "xy") for one in marks])
+            yield Seen(xyz, rows_of(tracks_of, vertices["id"].astype(np.int64)), camera, uv)
 
 
-def _vertices(archive: ZipFile, name: str, needed: tuple[str, ...]) -> np.ndarray:
+def _columns(vertices: np.ndarray, names: str) -> FloatArray:
+    return np.column_stack([vertices[name] for name in names]).astype(np.float64)
+
+
+def _vertices(archive: ZipFile, name: str | None, needed: tuple[str, ...]) -> np.ndarray:
     """Return the vertices of a binary PLY in an archive, with the properties that are needed."""
-    where, data = f"{archive.filename}: {name}", unpacked(archive, name)
+    where, data = f"{archive.filename}: {name}", unpacked(archive, name or "")
     header = parse_header(where, data)
     kinds = [(p.name, header.order + p.item) for p in header.properties if not p.length]
     if not header.order or header.skipped or not {*needed} <= dict(kinds).keys():

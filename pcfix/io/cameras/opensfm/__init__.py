@@ -47,11 +47,12 @@ from pcfix.io import crs as systems
 from pcfix.io.cameras import checks, tracks
 from pcfix.io.cameras.checks import Source
 from pcfix.io.cameras.georeference import frame_of, georeference, is_tied
+from pcfix.io.cameras.lenses import LensModel, lens_by_name, model_of
 from pcfix.io.cameras.tracks import NO_TIE_POINTS, are_seen
 from pcfix.io.labels import unnamed
 from pcfix.io.tables import read_lines
 from pcfix.lens.rotations import from_rotation_vectors
-from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, Projection, TiePoints
+from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, TiePoints
 from pcfix.options.declare import File
 
 TOPOCENTRIC_LIMIT_M = 1e5
@@ -229,18 +230,21 @@ def read_tie_points(reconstruction: Reconstruction) -> TiePoints:
 
 PANORAMAS = frozenset({"equirectangular", "spherical"})
 
-_MODELS: dict[str, tuple[str, Projection]] = {
-    "perspective": ("focal k1 k2", "perspective"),
-    "simple_radial": ("focal_x focal_y c_x c_y k1", "perspective"),
-    "radial": ("focal_x focal_y c_x c_y k1 k2", "perspective"),
-    "brown": ("focal_x focal_y c_x c_y k1 k2 k3 p1 p2", "perspective"),
-    "fisheye": ("focal k1 k2", "equidistant"),
-    "fisheye_opencv": ("focal_x focal_y c_x c_y k1 k2 k3 k4", "equidistant"),
-    "fisheye62": ("focal_x focal_y c_x c_y k1 k2 k3 k4 k5 k6 p1 p2", "equidistant"),
-    "fisheye624": ("focal_x focal_y c_x c_y k1 k2 k3 k4 k5 k6 p1 p2 s0 s1 s2 s3", "equidistant"),
-    "dual": ("focal k1 k2 transition", "dual"),
+_MODELS = {
+    "perspective": LensModel("f k1 k2"),
+    "simple_radial": LensModel("fx fy cx cy k1"),
+    "radial": LensModel("fx fy cx cy k1 k2"),
+    "brown": LensModel("fx fy cx cy k1 k2 k3 p2 p1"),
+    "fisheye": LensModel("f k1 k2", "equidistant"),
+    "fisheye_opencv": LensModel("fx fy cx cy k1 k2 k3 k4", "equidistant"),
+    "fisheye62": LensModel("fx fy cx cy k1 k2 k3 k4 k5 k6 p2 p1", "equidistant"),
+    "fisheye624": LensModel("fx fy cx cy k1 k2 k3 k4 k5 k6 p2 p1 s1 s2 s3 s4", "equidistant"),
+    "dual": LensModel("f k1 k2 transition", "dual"),
 }
-"""The parameters of each model as files name them, and its projection; the simplest first."""
+"""By names of `lenses`; not every version of OpenSfM knows simple_radial and radial."""
+_NAMES = {"f": "focal", "fx": "focal_x", "fy": "focal_y", "cx": "c_x", "cy": "c_y"}
+_NAMES |= {"p1": "p2", "p2": "p1", "s1": "s0", "s2": "s1", "s3": "s2", "s4": "s3"}
+"""What OpenSfM calls what has another name in `lenses`."""
 _SIZE = re.compile(r" (\d{2,6}) (\d{2,6}) [a-z_]+\d* ")
 
 
@@ -267,21 +271,15 @@ def lens(path: Path, name: str, camera: dict[str, Any]) -> Lens:
     if not (width and height):
         raise checks.damaged(path, f"the width and height of camera {name} are missing")
     scale = max(width, height)
-    fx = float(camera["focal_x" if "focal_x" in camera else "focal"])
-    fy = value("focal_y", fx) if "focal_x" in camera else fx
-    names, projection = _MODELS[model]
-    there = names.split()
-    return Lens(
-        *(fy * scale, width, height),
-        *(width / 2.0 + value("c_x") * scale, height / 2.0 + value("c_y") * scale),
-        b1=(fx - fy) * scale,
-        projection=projection,
-        shape=(value("transition", 0.5),) if "transition" in there else (),
-        radial=tuple(value(key) for key in there if key[0] == "k"),
-        tangential=(value("p2"), value("p1")) if "p1" in there else (),
-        thin_prism=tuple(value(key) for key in there if key[0] == "s"),
-        sensor=name,
-    )
+    given = {one: value(_NAMES.get(one, one)) for one in _MODELS[model].names.split()}
+    if "transition" in given:
+        given["transition"] = value("transition", 0.5)
+    across = float(camera["focal_x" if "focal_x" in camera else "focal"])
+    down = value("focal_y", across) if "focal_x" in camera else across
+    given |= {"fx": across * scale, "fy": down * scale}
+    given |= {"cx": width / 2.0 + value("c_x") * scale, "cy": height / 2.0 + value("c_y") * scale}
+    projection = _MODELS[model].projection
+    return lens_by_name(given, width, height, projection=projection, sensor=name)
 
 
 TRACKS_HEADER = "OPENSFM_TRACKS_VERSION_v2"
@@ -356,30 +354,14 @@ def write_opensfm(path: File, cameras: Cameras, tie_points: TiePoints | None = N
 
 def opensfm_camera(path: Path, given: Lens) -> dict[str, Any]:
     """Return the simplest entry of `cameras` that is exactly this lens."""
-    scale = max(given.width, given.height)
-    lists = (
-        ("k1 k2 k3 k4 k5 k6", given.radial),
-        ("p2 p1", given.tangential),
-        ("s0 s1 s2 s3", given.thin_prism),
-    )
-    values = {key: v for keys, vs in lists for key, v in zip(keys.split(), vs, strict=False)}
-    values |= {
-        "focal": given.focal / scale,
-        "focal_x": (given.focal + given.b1) / scale,
-        "focal_y": given.focal / scale,
-        "c_x": (given.principal_x - given.width / 2.0) / scale,
-        "c_y": (given.principal_y - given.height / 2.0) / scale,
-        "transition": (*given.shape, 0.5)[0],
-    }
+    written = {k: model for k, model in _MODELS.items() if k not in ("simple_radial", "radial")}
+    model, values = model_of(path, given, written, whole=True)
+    scale, start = max(given.width, given.height), {"cx": given.width / 2, "cy": given.height / 2}
+    for name in values.keys() & {"f", "fx", "fy", "cx", "cy"}:
+        values[name] = (values[name] - start.get(name, 0.0)) / scale
     size = {"width": int(given.width), "height": int(given.height)}
-    for model, (names, projection) in _MODELS.items() if given.unit == "px" else ():
-        if projection != given.projection or model in ("simple_radial", "radial"):
-            continue  # not every version of OpenSfM knows these two
-        camera: dict[str, Any] = {"projection_type": model, **size}
-        camera |= {name: values.get(name, 0.0) for name in names.split()}
-        if checks.is_same_lens(lens(path, "1", camera), given):
-            return camera
-    raise checks.lens_not_held(path, given)
+    named = {_NAMES.get(name, name): value for name, value in values.items()}
+    return {"projection_type": model, **size, **named}
 
 
 def _world(

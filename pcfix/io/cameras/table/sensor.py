@@ -12,14 +12,14 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from pcfix.errors import bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import is_same_lens, write_new
+from pcfix.io.cameras.checks import write_new
+from pcfix.io.cameras.lenses import LensModel, lens_by_name, model_of
 from pcfix.io.crs import is_topocentric
 from pcfix.io.files import check_input
 from pcfix.io.tables import read_lines, read_table, split_header
@@ -28,6 +28,11 @@ from pcfix.options.declare import File
 
 MILLIMETRES = ("focal", "sensor_x", "sensor_y")
 PIXELS = ("focal_px", "width_px", "height_px")
+NAMES = {"d1": "k4", "d2": "k5", "d3": "k6", "p2": "p1", "p1": "p2"}
+"""What OpenCV calls the parameters that have another name in `lenses`."""
+OPENCV = {"OpenCV": LensModel("f cx cy k1 k2 k3 d1 d2 d3 p2 p1")}
+BROWN = {"Brown": LensModel("f cx cy k1 k2 k3 k4 p1 p2")}
+CENTRED = {"centred": LensModel("f")}
 FRAME = ("width_px", "height_px")
 DISTORTION = ("k1", "k2", "k3", "k4", "t1", "t2")
 FILM_MM = 36.0
@@ -59,26 +64,18 @@ def read_sensor(path: Path) -> Lens:
         return table.numbers(name)[0] if name in table.header else default
 
     focal, width, height = map(value, columns)
-    lens = _centred_mm(focal, width, height)
+    given = {"f": focal}
     if columns == PIXELS:
-        cx, cy = value("cx", width / 2.0), value("cy", height / 2.0)
-        k = [value(f"k{i}") for i in range(1, 7)]
-        lens = Lens(
-            *(focal, width, height, cx, cy),
-            radial=tuple(k[:3]),
-            denominator=tuple(k[3:]) if any(k[3:]) else (),
-            tangential=(value("p2"), value("p1")),
-        )
+        names = OPENCV["OpenCV"].names.split()[1:]
+        middle = {"cx": width / 2.0, "cy": height / 2.0}
+        given |= {one: value(NAMES.get(one, one), middle.get(one, 0.0)) for one in names}
+    lens = lens_by_name(given, width, height, unit="px" if columns == PIXELS else "mm")
     checks.lens(path, path.stem, lens)
     shares = lens.principal_x / width, lens.principal_y / height
     if not all(0.25 < share < 0.75 for share in shares):
         sentence = "cx, cy is far from the centre. Give pixels from the upper left corner."
         raise bad_file(path, "cameras.principal_point", sentence)
     return lens
-
-
-def _centred_mm(focal: float, width: float, height: float) -> Lens:
-    return Lens(focal, width, height, width / 2.0, height / 2.0, unit="mm")
 
 
 def is_xml(path: Path) -> bool:
@@ -115,20 +112,21 @@ def write_table(folder: File, cameras: Cameras) -> None:
         sentence = f"a table cannot hold the axes {cameras.crs}. Use a projected CRS."
         raise bad_file(target, "output.crs", sentence, crs=cameras.crs)
     distinct = list(dict.fromkeys(lenses))
-    own = None  # f, px, py, k1 ... k4, t1, t2 of each row as RealityCapture has them
-    if len(distinct) == 1:
-        sensor = _sensor(target, distinct[0])
-    else:
-        frames = {(lens.width, lens.height, lens.unit) for lens in distinct}
-        if len(frames) > 1 or distinct[0].unit != "px":
-            raise checks.lens_not_held(target, distinct[1])
-        sensor = _row({"width_px": distinct[0].width, "height_px": distinct[0].height})
-        side, own = max(distinct[0].width, distinct[0].height), []
+    given, own = distinct[0], None
+    if len(distinct) > 1:  # f, px, py, k1 ... k4, t1, t2 of each row as RealityCapture has them
+        is_one_frame = len({(lens.width, lens.height) for lens in distinct}) == 1
+        sensor, own = _row({"width_px": given.width, "height_px": given.height}), []
+        side = max(given.width, given.height)
         for lens in lenses:
-            radial, _, tangential = _brown(target, lens, (4, 0, 2))
-            x, y = lens.principal_x - lens.width / 2.0, lens.principal_y - lens.height / 2.0
-            frame = lens.focal * FILM_MM / side, x / side, y / side
-            own.append([*frame, *radial, *tangential])
+            f, cx, cy, *brown = model_of(target, lens, BROWN if is_one_frame else {})[1].values()
+            middle = (cx - lens.width / 2.0) / side, (cy - lens.height / 2.0) / side
+            own.append([f * FILM_MM / side, *middle, *brown])
+    else:
+        is_mm = given.unit == "mm"
+        _, values = model_of(target, given, CENTRED if is_mm else OPENCV, unit=given.unit)
+        frame = (values.pop("f"), given.width, given.height)
+        named = {NAMES.get(name, name): value for name, value in values.items()}
+        sensor = _row(dict(zip(MILLIMETRES if is_mm else PIXELS, frame, strict=True)) | named)
     turns = Rotation.from_matrix(np.asarray(cameras.rotations)).as_quat(canonical=True)
     numbers = np.column_stack([cameras.centres, np.roll(turns, 1, axis=1)]).tolist()
     stream = io.StringIO()
@@ -140,33 +138,6 @@ def write_table(folder: File, cameras: Cameras) -> None:
         more = [] if own is None else own[i]
         writer.writerow([label, *map(repr, [*numbers[i], *more])])
     write_new(target, {"cameras.csv": stream.getvalue().encode(), "sensor.csv": sensor.encode()})
-
-
-def _sensor(target: Path, lens: Lens) -> str:
-    """Return the one row of the lens of all images."""
-    if lens.unit == "mm":
-        sides = (lens.focal, lens.width, lens.height)
-        if not is_same_lens(lens, _centred_mm(*sides)):
-            raise checks.lens_not_held(target, lens)
-        return _row(dict(zip(MILLIMETRES, sides, strict=True)))
-    radial, denominator, tangential = _brown(target, lens, (3, 3, 2))
-    values = {"focal_px": lens.focal, "width_px": lens.width, "height_px": lens.height}
-    values |= {"cx": lens.principal_x, "cy": lens.principal_y}
-    values |= {f"k{i}": value for i, value in enumerate((*radial, *denominator), start=1)}
-    values |= {"p1": tangential[1], "p2": tangential[0]}  # OpenCV counts them the other way round
-    return _row(values)
-
-
-def _brown(target: Path, lens: Lens, counts: Sequence[int]) -> list[tuple[float, ...]]:
-    """Return `counts` radial, denominator and tangential coefficients, if they are the lens."""
-    given = (lens.radial, lens.denominator, lens.tangential)
-    lists = [(*k, *(0.0,) * n)[:n] for k, n in zip(given, counts, strict=True)]
-    frame = (lens.focal, lens.width, lens.height, lens.principal_x, lens.principal_y)
-    radial, denominator, tangential = lists
-    held = Lens(*frame, radial=radial, denominator=denominator, tangential=tangential)
-    if not is_same_lens(lens, held):
-        raise checks.lens_not_held(target, lens)
-    return lists
 
 
 def _row(values: dict[str, float]) -> str:

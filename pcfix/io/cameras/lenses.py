@@ -1,0 +1,108 @@
+"""Lenses from parameters by name, and back.
+
+All packages have the same few parameters. Here they are called ``f``, or ``fx`` across and ``fy``
+down the image; ``cx``, ``cy``, the principal point from the upper left corner of the image;
+``skew`` and ``b3``, the affine terms off the diagonal; ``k1``, ``k2``, ... radial and ``d1``, ...
+in the denominator; ``p1``, ``p2``, ... in Brown's order, so OpenCV's p1 is ``p2``; ``s1``, ... of
+thin prisms; and the parameters of a projection, see `SHAPES`. `pcfix.model.Lens` has the formulas.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pcfix.errors import bad_file
+from pcfix.model import Lens, Projection
+
+SHAPES: Mapping[Projection, str] = {
+    "fov": "omega",
+    "division": "k",
+    "eucm": "alpha beta",
+    "dual": "transition",
+}
+LETTERS = {"radial": "k", "denominator": "d", "tangential": "p", "thin_prism": "s"}
+MOST_TERMS = 9
+ROUNDING = 1e-11
+"""Of a principal point in the middle, and of equal focal lengths, in focal lengths."""
+
+
+class LensModel(NamedTuple):
+    """A model of a package: the names of its parameters, in the order of its files."""
+
+    names: str
+    projection: Projection | None = "perspective"  # None where it is no lens, but a panorama
+    in_turn: bool = False
+
+
+def lens_by_name(given: Mapping[str, float], width: float, height: float, **more: Any) -> Lens:
+    """Return the lens with the given parameters; `more` are other fields of a `Lens`.
+
+    Without ``cx`` and ``cy`` the principal point is in the middle of the frame.
+    """
+    value = defaultdict(float, given)
+    focal = given.get("fy", value["f"])
+    terms = {
+        field: without_zeros([value[f"{letter}{i}"] for i in range(1, MOST_TERMS + 1)])
+        for field, letter in LETTERS.items()
+    }
+    shape = tuple(value[name] for name in SHAPES.get(more.get("projection", ""), "").split())
+    middle = given.get("cx", width / 2.0), given.get("cy", height / 2.0)
+    affine = given.get("fx", focal) - focal, value["skew"], value["b3"]
+    return Lens(focal, width, height, *middle, *affine, **{"shape": shape} | terms | more)
+
+
+def without_zeros(values: Sequence[float]) -> tuple[float, ...]:
+    """Return the values up to the last that is not zero."""
+    last = max((i for i, value in enumerate(values) if value != 0.0), default=-1)
+    return tuple(values[: last + 1])
+
+
+def model_of(
+    path: Path,
+    lens: Lens,
+    models: Mapping[str, LensModel],
+    *,
+    unit: str = "px",
+    whole: bool = False,
+) -> tuple[str, dict[str, float]]:
+    """Return the simplest model that is exactly this lens, and its parameters in their order.
+
+    With `whole` the sides of the frame must be whole numbers.
+
+    Raises
+    ------
+    InputError
+        Where there is none; `path` is what should be written.
+    """
+    terms = {
+        f"{letter}{i}": value
+        for field, letter in LETTERS.items()
+        for i, value in enumerate(getattr(lens, field), start=1)
+    }
+    values = terms | {"f": lens.focal, "fx": lens.focal + lens.b1, "fy": lens.focal}
+    values |= {"cx": lens.principal_x, "cy": lens.principal_y, "skew": lens.b2, "b3": lens.b3}
+    values |= dict(zip(SHAPES.get(lens.projection, "").split(), lens.shape, strict=False))
+    is_bent = any(terms.values())
+    unlike_plain = {
+        "fx": abs(lens.b1) > ROUNDING * lens.focal,
+        "cx": abs(lens.principal_x - lens.width / 2.0) > ROUNDING * lens.focal,
+        "cy": abs(lens.principal_y - lens.height / 2.0) > ROUNDING * lens.focal,
+        "skew": lens.b2 != 0.0,
+        "b3": lens.b3 != 0.0,
+        "inverse": lens.inverse and is_bent,  # no model that is written has these two
+        "distortion_centre": is_bent and lens.distortion_centre != (0.0, 0.0),
+    }
+    needed = {name for name, value in (terms | unlike_plain).items() if value}
+    turns = any((*lens.tangential, *lens.thin_prism))
+    fits = lens.unit == unit and not (whole and (lens.width % 1.0 or lens.height % 1.0))
+    for name in sorted(models, key=lambda one: models[one].names.count(" ")) if fits else ():
+        model, names = models[name], models[name].names.split()
+        is_alike = model.projection == lens.projection
+        if is_alike and needed <= {*names} and (model.in_turn == lens.in_turn or not turns):
+            return name, {one: values.get(one, 0.0) for one in names}
+    kind = f"{lens.sensor or 'of the images'} ({lens.projection} in {lens.unit})"
+    sentence = f"the format cannot hold the lens {kind} exactly. Take another format."
+    raise bad_file(path, "output.lens", sentence, lens=lens.sensor)
