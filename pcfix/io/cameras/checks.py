@@ -223,12 +223,16 @@ def lens(path: Path, name: str, given: Lens) -> Lens:
 
 
 def checked(path: Path, cameras: Cameras) -> Cameras:
-    """Return cameras with proper rotations, after a look at their lenses too."""
-    for given, label in dict(zip(cameras.lenses or (), cameras.labels, strict=False)).items():
-        lens(path, given.sensor or f"of {label}", given)
+    """Return cameras with proper rotations and with one object for each different lens."""
+    same: dict[Lens, Lens] = {}
+    for given, label in zip(cameras.lenses or (), cameras.labels, strict=False):
+        if given not in same:
+            same[given] = lens(path, given.sensor or f"of {label}", given)
     if cameras.rotations is not None:
-        return replace(cameras, rotations=rotations(path, cameras.labels, cameras.rotations))
-    return cameras
+        turns = rotations(path, cameras.labels, cameras.rotations)
+        cameras = replace(cameras, rotations=turns)
+    lenses = cameras.lenses and tuple(same[given] for given in cameras.lenses)
+    return replace(cameras, lenses=lenses)
 
 
 def measured(

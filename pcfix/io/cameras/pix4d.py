@@ -6,8 +6,9 @@ its name and size, the matrix K, the distortion, the projection centre less the 
 corner of the image, and the tangential coefficients are in OpenCV's order. A fisheye lens has
 instead of K and the distortion an affine matrix and a polynomial of 2 theta / pi.
 ``calibrated_external_camera_parameters.txt`` has absolute centres and omega, phi, kappa of axes
-x right, y up, z back: R = diag(1, -1, -1) (Rx(omega) Ry(phi) Rz(kappa))^T. The two agree to
-1e-6 m where the offset is right; as an offset can be wrong, the absolute table is believed.
+x right, y up, z back: R = diag(1, -1, -1) (Rx(omega) Ry(phi) Rz(kappa))^T. Where that table is
+there the poses are taken from it, as an offset can be wrong. Of equal names those with the most
+similar rotations belong together.
 
 ``pix4d_calibrated_internal_camera_parameters.cam`` has the interior orientation in millimetres,
 ``wkt.prj`` the CRS, and the project file (.p4d) the GNSS positions.
@@ -23,27 +24,25 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePath, PureWindowsPath
-from typing import NamedTuple
-from xml.etree.ElementTree import Element
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.cameras import checks, tracks
 from pcfix.io.cameras.checks import Source, damaged, note, number, read_xml
+from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.io.tables import read_lines
 from pcfix.lens.rotations import from_omega_phi_kappa
 from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, TiePoints
 
 PARAMETERS = "calibrated_camera_parameters.txt"
-EXTERNAL = "calibrated_external_camera_parameters.txt"
-GEOGRAPHIC = "calibrated_external_camera_parameters_wgs84.txt"
 NAMES = {
     "parameters": PARAMETERS,
-    "external": EXTERNAL,
+    "external": "calibrated_external_camera_parameters.txt",
     "calibration": "pix4d_calibrated_internal_camera_parameters.cam",
     "offset": "offset.xyz",
     "wkt": "wkt.prj",
@@ -52,16 +51,16 @@ NAMES = {
     "gcps": "measured_estimated_gcps_position.txt",
 }
 """How a project calls its files, after its own name."""
+TABLE = re.compile(r"(.*_|)calibrated_(?:external_)?camera_parameters(_wgs84)?\.txt")
 HEADERS = (
     ["filename", "imagewidth", "imageheight"],
     ["imagename", "x", "y", "z", "omega", "phi", "kappa"],
     ["imagename", "longitude", "latitude", "altitude", "omega", "phi", "kappa"],
 )
-FOLDERS = ("", "params", "1_initial/params", "*/params", "*/1_initial/params")
-"""Where a project may have its """
+FOLDERS = ("params", "1_initial/params", "*/params", "*/1_initial/params")
+"""Where a project may have its files, if not in its folder itself."""
 Files = dict[str, Path]
 """The files of a project that are there, by the names in `NAMES`, and ``project``."""
-AGREE_M, AGREE_DEG = 0.01, 0.001
 FIELDS = {
     "camera matrix": "matrix",
     "radial": "radial",
@@ -74,7 +73,7 @@ FIELDS = {
 }
 SHAPE = re.compile(r"^(.*?)\s*\[\s*(\d{1,2})\s*x\s*(\d{1,2})\s*\]\s*$")
 SENSOR = re.compile(r"sensor width of\s*([-+.\deE]+)\s*x\s*([-+.\deE]+)")
-Calibrations = list[dict[str, float]]
+Unlike = Callable[[int, list[int]], Any]
 SAME_FOCAL = 1e-6
 """Relative: the two files write the same number in pixels and in millimetres."""
 
@@ -82,31 +81,47 @@ SAME_FOCAL = 1e-6
 def recognises(source: Source) -> bool:
     """Whether a file begins like one of the tables or a project, or a folder holds a table."""
     if source.path.is_dir():
-        return any(True for _ in _tables_in(source.path))
+        return bool(_tables_in(source.path))
     return b"<pix4uav" in source.head or _columns(source) in HEADERS
 
 
 def read(source: Source) -> Cameras:
     """Read poses and lenses, in the CRS of the project."""
     files = _find(source)
-    if not files.keys() & {"parameters", "external"}:
-        remedy = f"Give the params folder of the project; {GEOGRAPHIC} alone does not suffice"
-        raise checks.missing(source.path.with_name(PARAMETERS), remedy)
     calibrations = read_calibrations(files["calibration"]) if "calibration" in files else []
+    notes: tuple[PcfixWarning, ...] = ()
     if "parameters" in files:
-        images = read_parameters(files["parameters"])
-        rows, centres, rotations, unposed, notes = _poses(files, images)
-        labels = [images[row].label for row in rows]
-        own = [lens_of_image(images[row], calibrations) for row in rows]
-    else:
+        path, images = files["parameters"], read_parameters(files["parameters"])
+        labels = [image.label for image in images]
+        turns = np.array([image.fields["rotation"] for image in images]).reshape(-1, 3, 3)
+        turns = checks.rotations(path, labels, turns)
+        if "external" in files:
+            names, there, turned = read_external(files["external"])
+            rows = _rows(
+                labels, names, lambda i, rows: np.linalg.norm(turned[rows] - turns[i], axis=(1, 2))
+            )
+            if max(rows) < 0:
+                raise damaged(files["external"], f"names none of the images of {PARAMETERS}")
+            centres, rotations = there[rows], turned[rows]
+            centres[np.array(rows) < 0] = np.nan
+        else:
+            names, (centres, notes) = labels, _absolute(files, images)
+            rotations = turns
+        posed = np.flatnonzero(np.isfinite(centres).all(axis=1))
+        given = [*labels, *names]
+        labels, centres, rotations = [labels[i] for i in posed], centres[posed], rotations[posed]
+        own = [lens_of_image(images[i], calibrations) for i in posed]
+    elif "external" in files:
         labels, centres, rotations = read_external(files["external"])
         lens = lens_of_calibration(calibrations[0]) if len(calibrations) == 1 else None
-        own, unposed = [lens] * len(labels), []
+        own, given = [lens] * len(labels), labels
         why = f"there is no {PARAMETERS} beside it"
         notes = () if lens else (checks.without_lens(files["external"], why),)
-    same: dict[Lens, Lens] = {}  # images of a camera share its lens
-    lenses = tuple(same.setdefault(lens, lens) for lens in own if lens is not None)
-    gnss, others = _priors(files["project"], labels) if "project" in files else (None, [])
+    else:
+        remedy = "Give the params folder of the project; the table in WGS 84 does not suffice"
+        raise checks.missing(source.path.with_name(PARAMETERS), remedy)
+    lenses = tuple(lens for lens in own if lens is not None)
+    gnss, enabled = _priors(files["project"], labels) if "project" in files else (None, [])
     wkt = " ".join(read_lines(files["wkt"])).strip() if "wkt" in files else ""
     return Cameras(
         labels=tuple(labels),
@@ -116,7 +131,7 @@ def read(source: Source) -> Cameras:
         crs=checks.crs(files["wkt"], wkt) if wkt else None,
         notes=(*notes, *checks.repeated(source.path, labels)),
         gnss=gnss,
-        unposed=tuple(n for n in dict.fromkeys([*unposed, *others]) if n not in set(labels)),
+        unposed=tuple(n for n in dict.fromkeys([*given, *enabled]) if n not in set(labels)),
         source="Pix4D",
     )
 
@@ -134,21 +149,21 @@ def _find(source: Source) -> Files:
     path, columns = source.path, _columns(source)
     is_project = b"<pix4uav" in source.head
     if is_project or path.is_dir():
-        tables_there = list(_tables_in(path.with_suffix("") if is_project else path))
-        if not tables_there:
-            return {}
-        folder, prefix = tables_there[0]
-        prefixes = {one for where, one in tables_there if where == folder}
-        if len(prefixes) > 1:
-            sentence = f"holds several projects ({', '.join(sorted(prefixes))}). Give one file."
-            raise bad_file(folder, "cameras.several_projects", sentence, projects=len(prefixes))
+        tables_there = _tables_in(path.with_suffix("") if is_project else path)
     else:
-        folder, prefix = path.parent, _prefix(path.name, PARAMETERS, EXTERNAL, GEOGRAPHIC) or ""
+        found = TABLE.fullmatch(path.name)
+        tables_there = [(path.parent, found[1] if found else "")]
+    if not tables_there:
+        return {}
+    folder, prefix = tables_there[0]
+    prefixes = {one for where, one in tables_there if where == folder}
+    if len(prefixes) > 1:
+        sentence = f"holds several projects ({', '.join(sorted(prefixes))}). Give one file."
+        raise bad_file(folder, "cameras.several_projects", sentence, projects=len(prefixes))
     root = folder.resolve().parent.parent
     files = {kind: folder / (prefix + name) for kind, name in NAMES.items()}
-    for project in (root / f"{prefix.rstrip('_')}.p4d", root.parent / f"{root.name}.p4d"):
-        if project.is_file():
-            files["project"] = project
+    project = root / f"{prefix.rstrip('_')}.p4d"
+    files["project"] = project if project.is_file() else root.parent / f"{root.name}.p4d"
     if is_project:
         files["project"] = path
     elif columns[:1] == ["filename"]:
@@ -158,129 +173,96 @@ def _find(source: Source) -> Files:
     return {kind: file for kind, file in files.items() if file.is_file()}
 
 
-def _tables_in(root: Path) -> Iterator[tuple[Path, str]]:
-    """Yield the folders with tables of poses, and the name of the project of each table."""
-    for pattern in FOLDERS:
-        for folder in sorted(root.glob(pattern)) if pattern else [root]:
-            names = (path.name for path in folder.iterdir()) if folder.is_dir() else ()
-            for prefix in (_prefix(name, PARAMETERS, EXTERNAL) for name in names):
-                if prefix is not None:
-                    yield folder, prefix
+def _tables_in(root: Path) -> list[tuple[Path, str]]:
+    """Return folders with tables of poses, and the name of the project before that of each."""
+    folders = [root, *(folder for pattern in FOLDERS for folder in sorted(root.glob(pattern)))]
+    return [
+        (folder, found[1])
+        for folder in folders
+        for file in (folder.iterdir() if folder.is_dir() else ())
+        if (found := TABLE.fullmatch(file.name)) and not found[2]
+    ]
 
 
-def _prefix(name: str, *endings: str) -> str | None:
-    """Return what precedes one of the endings in a name, the name of the project."""
-    for ending in endings:
-        if name == ending or name.endswith("_" + ending):
-            return name.removesuffix(ending)
-    return None
+def _rows(
+    labels: Sequence[str], names: Sequence[str], unlike: Unlike = lambda i, rows: [0.0] * len(rows)
+) -> list[int]:
+    """Return the row of each label among names, -1 where there is none left of this name.
 
-
-def _poses(
-    files: Files, images: list[Image]
-) -> tuple[list[int], FloatArray, FloatArray, list[str], tuple[PcfixWarning, ...]]:
-    """Return the poses of the two tables; the absolute one is believed.
-
-    They are rows of the images with a pose, centres, rotations, names without one, and notes.
+    Of equal names it is the one that `unlike` (of the label's number and the rows) finds smallest.
     """
-    labels = [image.label for image in images]
-    turns = np.array([image.fields["rotation"] for image in images])
-    rotations = checks.rotations(files["parameters"], labels, turns)
-    centres, notes = _absolute(files, images)
-    names: list[str] = []
-    if "external" in files:
-        path = files["external"]
-        names, there, turned = read_external(path)
-        left: dict[str, list[int]] = defaultdict(list)
-        for row, name in enumerate(names):
-            left[name].append(row)
-        both, rows = [], []
-        for i, (label, rotation) in enumerate(zip(labels, rotations, strict=True)):
-            if left[label]:  # of equal names the one turned most alike
-                unlike = np.linalg.norm(turned[left[label]] - rotation, axis=(1, 2))
-                both.append(i)
-                rows.append(left[label].pop(int(np.argmin(unlike))))
-        if not both:
-            raise damaged(path, f"names none of the images of {PARAMETERS} beside it")
-        distances = np.linalg.norm(centres[both] - there[rows], axis=1)
-        apart = float(distances[np.isfinite(distances)].max(initial=0.0))
-        sines = np.linalg.norm(rotations[both] - turned[rows], axis=(1, 2)) / np.sqrt(8.0)
-        turn = float(np.degrees(2.0 * np.arcsin(np.clip(sines, 0.0, 1.0))).max())
-        notes = ()
-        if apart > AGREE_M or turn > AGREE_DEG:
-            sentence = f"its poses differ by up to {apart:.2f} m and {turn:.3f} deg from those of"
-            sentence += f" {PARAMETERS} and are used; images that only that has are skipped."
-            differ = note(path, "cameras.tables_differ", sentence, metres=apart, degrees=turn)
-            centres, notes = np.full_like(centres, np.nan), (differ,)
-        centres[both], rotations[both] = there[rows], turned[rows]
-    known = np.isfinite(centres).all(axis=1)
-    unposed = [labels[i] for i in np.flatnonzero(~known)] + sorted(set(names) - set(labels))
-    kept = np.flatnonzero(known).tolist()
-    return kept, centres[known], rotations[known], unposed, notes
+    left: dict[str, list[int]] = defaultdict(list)
+    for row, name in enumerate(names):
+        left[name].append(row)
+    return [
+        left[label].pop(int(np.argmin(unlike(i, left[label])))) if left[label] else -1
+        for i, label in enumerate(labels)
+    ]
 
 
 def _absolute(files: Files, images: list[Image]) -> tuple[FloatArray, tuple[PcfixWarning, ...]]:
     """Return the centres with the offset added; NaN where several offsets name no such image."""
     local = np.array([image.fields["centre"] for image in images])
-    if "offset" not in files and "external" in files:
-        return np.full_like(local, np.nan), ()
     if "offset" not in files:
         sentence = "there is no offset.xyz beside it. Give the offset with --cameras-offset."
         return local, (note(files["parameters"], "cameras.no_offset", sentence),)
     # one line, or one for each group of images whose names begin alike
     lines = [line.replace(",", " ").split() for line in read_lines(files["offset"])]
-    offsets = [
-        (" ".join(words[:-3]), _numbers(files["offset"], "the offset", words[-3:]))
+    offsets = {
+        " ".join(words[:-3]): _numbers(files["offset"], "the offset", words[-3:])
         for words in lines
         if words
-    ]
-    if not offsets or any(len(values) != 3 for _, values in offsets):
+    }
+    if not offsets or any(len(values) != 3 for values in offsets.values()):
         raise damaged(files["offset"], "it should have the offset x y z")
-    if len({values.tobytes() for _, values in offsets}) == 1:
-        return local + offsets[0][1], ()
-    added = np.full_like(local, np.nan)
-    for i, image in enumerate(images):
-        fitting = [values for label, values in offsets if label and image.label.startswith(label)]
-        if fitting:
-            added[i] = local[i] + fitting[0]
-    return added, ()
+    if len({values.tobytes() for values in offsets.values()}) == 1:
+        return local + next(iter(offsets.values())), ()
+    unknown = np.full(3, np.nan)
+    added = [
+        next((values for k, values in offsets.items() if k and image.label.startswith(k)), unknown)
+        for image in images
+    ]
+    return local + np.array(added), ()
 
 
 def _priors(path: Path, labels: list[str]) -> tuple[GnssPositions | None, list[str]]:
-    """Read the initial positions of images, and the names of enabled images without a pose.
+    """Read the initial positions of images, and the names of all that are enabled.
 
     The positions are those of the kind that the first image has: in WGS 84, or in a CRS.
     """
     root = read_xml(path)
-    images: dict[str, list[Element]] = defaultdict(list)
-    for image in root.iter("image"):
-        if image.get("path") and image.get("enabled", "true").lower() != "false":
-            images[PureWindowsPath(image.get("path", "")).name].append(image)
-    of_labels = [images[label].pop(0) if images.get(label) else None for label in labels]
-    others = [name for name, rest in images.items() for _ in rest]
-    kinds = [
-        next((k for k in ("xyz", "gps") if e is not None and e.find(k) is not None), None)
-        for e in of_labels
+    images = [
+        image
+        for image in root.iter("image")
+        if image.get("path") and image.get("enabled", "true").lower() != "false"
     ]
-    kind = next(filter(None, kinds), None)
-    if kind is None:
-        return None, others
+    names = [PureWindowsPath(image.get("path", "")).name for image in images]
+    rows = _rows(labels, names)
+    tags = [
+        tag
+        for row in rows
+        if row >= 0
+        for tag in ("xyz", "gps")
+        if images[row].find(tag) is not None
+    ]
+    if not tags:
+        return None, names
+    kind, axes = tags[0], ("x", "y", "z") if tags[0] == "xyz" else ("lng", "lat", "alt")
     xyz, sigma_m = np.full((2, len(labels), 3), np.nan)
-    axes = ("x", "y", "z") if kind == "xyz" else ("lng", "lat", "alt")
-    for i, element in enumerate(of_labels):
-        if element is None or kinds[i] != kind:
+    for i, row in enumerate(rows):
+        position = images[row].find(kind) if row >= 0 else None
+        if position is None:
             continue
-        position, where = element.find(kind), f"image {labels[i]}, "
-        place = {} if position is None else position.attrib
-        xyz[i] = [number(path, where + kind, place.get(axis)) for axis in axes]
-        for tag, rows in (("toleranceXY", slice(2)), ("toleranceZ", slice(2, 3))):
-            if (tolerance := element.find(tag)) is not None:
-                sigma_m[i, rows] = number(path, where + tag, tolerance.get("value"))
+        where = f"image {labels[i]}, "
+        xyz[i] = [number(path, where + kind, position.get(axis)) for axis in axes]
+        for tag, columns in (("toleranceXY", slice(2)), ("toleranceZ", slice(2, 3))):
+            if (tolerance := images[row].find(tag)) is not None:
+                sigma_m[i, columns] = number(path, where + tag, tolerance.get("value"))
     if kind == "gps":
-        return GnssPositions(xyz, sigma_m, "EPSG:4326"), others
+        return GnssPositions(xyz, sigma_m, "EPSG:4326"), names
     wkt = next((e for e in root.iter() if str(e.tag).lower() in ("wktimage", "wktimages")), None)
     text = "" if wkt is None else wkt.get("value") or wkt.text or ""
-    return GnssPositions(xyz, sigma_m, checks.crs(path, text) if text.strip() else None), others
+    return GnssPositions(xyz, sigma_m, checks.crs(path, text) if text.strip() else None), names
 
 
 class Image(NamedTuple):
@@ -339,40 +321,41 @@ def read_external(path: Path) -> tuple[list[str], FloatArray, FloatArray]:
     return [row[0].strip() for row in rows], values[:, :3], rotations
 
 
-def read_calibrations(path: Path) -> list[dict[str, float]]:
+Calibration = dict[str, float]
+
+
+def read_calibrations(path: Path) -> list[Calibration]:
     """Read the cameras of a ``pix4d_..._internal_camera_parameters.cam``.
 
     Of each come the first number of each line by its name, and `width`, `height` of the sensor, mm.
     """
-    cameras: list[dict[str, float]] = []
+    cameras: list[Calibration] = []
     for line in read_lines(path):
         words = line.split()
         if line.lower().startswith("pix4d camera calibration file"):
             cameras.append({"width": 0.0, "height": 0.0})
         elif cameras and (match := SENSOR.search(line)):
-            size = _numbers(path, "the sensor size", [match[1], match[2]]).tolist()
-            cameras[-1] |= dict(zip(("width", "height"), size, strict=True))
+            width, height = _numbers(path, "the sensor size", [match[1], match[2]]).tolist()
+            cameras[-1] |= {"width": width, "height": height}
         elif cameras and len(words) > 1 and not line.startswith("#"):
             value = number(path, f"camera {len(cameras) - 1}, {words[0]}", words[1])
             cameras[-1][words[0].lower()] = value
     return cameras
 
 
-def lens_of_image(image: Image, calibrations: Calibrations) -> Lens | None:
+def lens_of_image(image: Image, calibrations: list[Calibration]) -> Lens | None:
     """Return the lens in pixels, from the block of the image or the only calibration."""
     fields: dict[str, list[float]] = {k: v.tolist() for k, v in image.fields.items()}
-    matrix = fields.get("matrix", [])
-    if {"affine", "polynomial"} <= fields.keys() and (matrix or "principal" in fields):
-        x, y = fields["principal"][:2] if "principal" in fields else (matrix[2], matrix[5])
-        lens = _fisheye(image, (x, y), fields["affine"], fields["polynomial"])
-    elif matrix:
-        fx, skew, x, _, fy, y, *_ = matrix
-        t1, t2 = (*fields.get("tangential", ()), 0.0, 0.0)[:2]
-        lens = Lens(
-            *(fy, image.width, image.height, x, y, fx - fy, skew),
-            radial=tuple(fields.get("radial", ())),
-            tangential=(t2, t1),
-        )
+    given, frame = {}, (image.width, image.height)
+    if "matrix" in fields:
+        given = dict(zip(("fx", "skew", "cx", "b3", "fy", "cy"), fields["matrix"], strict=False))
+    given |= dict(zip(("cx", "cy"), fields.get("principal", ()), strict=False))
+    if {"affine", "polynomial"} <= fields.keys() and given:
+        lens = fisheye(given, fields["affine"], fields["polynomial"], *frame)
+    elif "matrix" in fields:
+        given |= {f"k{i}": k for i, k in enumerate(fields.get("radial", ()), start=1)}
+        given |= dict(zip(("p2", "p1"), fields.get("tangential", ()), strict=False))
+        lens = lens_by_name(given, *frame)
     else:
         return lens_of_calibration(calibrations[0], image) if len(calibrations) == 1 else None
     for calibration in calibrations:  # the pixel size is that of the one with the focal length
@@ -384,36 +367,36 @@ def lens_of_image(image: Image, calibrations: Calibrations) -> Lens | None:
     return lens
 
 
-def _fisheye(
-    image: Image, principal: Sequence[float], affine: Sequence[float], shape: Sequence[float]
+def fisheye(
+    middle: dict[str, float], affine: Sequence[float], shape: Sequence[float], *frame: float
 ) -> Lens:
-    """Return the lens (u, v) = principal + [c d; e f] rho, rho the polynomial of 2 theta / pi."""
-    c, d, e, f = affine
-    frame = (f, image.width, image.height, principal[0], principal[1])
-    return Lens(*frame, c - f, d, e, projection="polynomial", shape=tuple(shape))
+    """Return the lens (u, v) = (cx, cy) + [c d; e f] rho, rho a polynomial of 2 theta / pi."""
+    given = middle | dict(zip(("fx", "skew", "b3", "fy"), affine, strict=True))
+    return lens_by_name(given, *frame, projection="polynomial", shape=tuple(shape))
 
 
-def lens_of_calibration(calibration: dict[str, float], image: Image | None = None) -> Lens | None:
+def lens_of_calibration(calibration: Calibration, image: Image | None = None) -> Lens | None:
     """Return the lens of a calibration: in pixels where an image tells how many, else in mm.
 
     A fisheye needs the image, as its matrix is in pixels and its principal point in mm. None
     where the calibration does not say enough.
     """
     value, is_fisheye = defaultdict(float, {"p1": 1.0} | calibration), "c" in calibration
-    width_mm, height_mm = value["width"], value["height"]
-    known = {"px", "py", "f"} <= calibration.keys() and min(width_mm, height_mm) > 0.0
+    size_mm = value["width"], value["height"]
+    known = {"px", "py", "f"} <= calibration.keys() and min(size_mm) > 0.0
     if not known or (is_fisheye and image is None):
         return None
-    if is_fisheye and image is not None:
-        scale = image.width / width_mm
-        principal = (value["px"] * scale, value["py"] * scale)
+    scale, size = 1.0, size_mm
+    if image is not None:
+        scale, size = image.width / size_mm[0], (image.width, image.height)
+    given = {"cx": value["px"] * scale, "cy": value["py"] * scale}
+    if is_fisheye:
         affine, shape = ([value[n] for n in t.split()] for t in ("c d e f", "p0 p1 p2 p3 p4"))
-        return replace(_fisheye(image, principal, affine, shape), pixel_size_mm=1.0 / scale)
-    return Lens(
-        *(value["f"], width_mm, height_mm, value["px"], value["py"]),
-        radial=(value["k1"], value["k2"], value["k3"]),
-        tangential=(value["t2"], value["t1"]),
-    )
+        lens = fisheye(given, affine, shape, *size)
+    else:
+        given |= {"f": value["f"] * scale, "p1": value["t2"], "p2": value["t1"]}
+        lens = lens_by_name(given | {k: value[k] for k in ("k1", "k2", "k3")}, *size)
+    return replace(lens, unit="mm") if image is None else replace(lens, pixel_size_mm=1.0 / scale)
 
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:

@@ -50,16 +50,9 @@ from pcfix.errors import InputError, PcfixWarning, bad_file
 from pcfix.io import tables
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import Angles, Source, note
-from pcfix.io.cameras.table.sensor import (
-    DISTORTION,
-    FILM_MM,
-    FRAME,
-    column_names,
-    is_xml,
-    read_sensor,
-)
+from pcfix.io.cameras.lenses import lens_by_name
+from pcfix.io.cameras.table.sensor import DISTORTION, FILM_MM, read_frame, read_sensor
 from pcfix.io.crs import shortened
-from pcfix.io.files import check_input
 from pcfix.lens import rotations
 from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens
 
@@ -199,12 +192,11 @@ def headers(lines: Sequence[str]) -> Iterator[Header]:
     for i, line in enumerate(lines[:_FARTHEST_HEADER]):
         comment = line.lstrip("\"' ").startswith("#")
         text = line.strip().lstrip("#").strip() if comment else line.strip()
-        if not text or CRS_COMMENT.match(line):
-            continue
-        found = [_split_unit(name) for name in tables.split_header(text)[0]]
-        yield Header(i, [name for name, _ in found], [unit for _, unit in found], comment)
-        if not comment:
-            return
+        if text and not CRS_COMMENT.match(line):
+            names, units = zip(*map(_split_unit, tables.split_header(text)[0]), strict=True)
+            yield Header(i, [*names], [*units], comment)
+            if not comment:
+                return
 
 
 def axes(place: Iterable[str], suffix: str = "") -> tuple[str, str, str] | None:
@@ -444,10 +436,14 @@ def _rotations(columns: Columns, angles: Angles | None, suffix: str = "") -> Flo
         if there and missing:
             tables.check_columns(columns.path, columns.table.header, kind, missing)
     if angles is not None:
-        roles = opk if angles == "omega-phi-kappa" else ypr
+        roles, convert = {
+            "omega-phi-kappa": (opk, rotations.from_omega_phi_kappa),
+            "yaw-pitch-roll": (ypr, rotations.from_yaw_pitch_roll),
+            "aircraft": (ypr, rotations.from_aircraft),
+        }[angles]
         missing = [role for role in roles if not columns.has(role)]
         tables.check_columns(columns.path, columns.table.header, roles, missing)
-        return FROM_ANGLES[angles](*columns.of(roles).T)
+        return convert(*columns.of(roles).T)
     if columns.has(*opk):
         place = columns.place
         reality_capture = columns.after_hash and columns.name("label") == "name"
@@ -481,31 +477,16 @@ def read_lenses(columns: Columns, sensor: Path | None) -> tuple[Lens, ...]:
         raise bad_file(columns.path, "cameras.sensor_missing", sentence, columns=needed)
     if not own:
         return (read_sensor(path),) * len(columns.labels)
-    if not is_xml(check_input(path)) and column_names(path) >= set(FRAME):
-        width, height = (tables.read_table(path, FRAME).numbers(name)[0] for name in FRAME)
-    else:
-        lens = read_sensor(path)
-        width, height = lens.width, lens.height
-    largest = max(width, height)
-    brown = np.nan_to_num(columns.where_there(DISTORTION))
-    rows = [tuple(row) for row in np.hstack([columns.of(("f", "px", "py")), brown]).tolist()]
-    lenses = {
-        (focal, x, y, *k): Lens(
-            *(focal * largest / FILM_MM, width, height),
-            *(width / 2.0 + x * largest, height / 2.0 + y * largest),
-            radial=tuple(k[:4]),
-            tangential=tuple(k[4:]),
-        )
-        for focal, x, y, *k in dict.fromkeys(rows)
-    }
-    return tuple(lenses[row] for row in rows)
-
-
-FROM_ANGLES = {
-    "omega-phi-kappa": rotations.from_omega_phi_kappa,
-    "yaw-pitch-roll": rotations.from_yaw_pitch_roll,
-    "aircraft": rotations.from_aircraft,
-}
+    width, height = read_frame(path)
+    side = max(width, height)
+    roles = columns.of(("f", "px", "py")), np.nan_to_num(columns.where_there(DISTORTION))
+    lenses = []
+    for focal, x, y, *brown in np.hstack(roles).tolist():
+        given = {"f": focal * side / FILM_MM}
+        given |= {"cx": width / 2.0 + x * side, "cy": height / 2.0 + y * side}
+        given |= dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), brown, strict=True))
+        lenses.append(lens_by_name(given, width, height))
+    return tuple(lenses)
 
 
 def _from_matrix(columns: Columns) -> FloatArray:

@@ -50,11 +50,11 @@ def read_sensor(path: Path) -> Lens:
         width_px, height_px and, where known, OpenCV's cx, cy (pixels from the upper left corner
         of the image), k1 ... k6, p1, p2.
     """
-    if is_xml(check_input(path)):
+    if _is_xml(path):
         from pcfix.io.cameras.metashape import read_calibration
 
         return read_calibration(path)
-    columns = PIXELS if column_names(path) >= set(PIXELS) else MILLIMETRES
+    columns = PIXELS if _column_names(path) >= set(PIXELS) else MILLIMETRES
     table = read_table(path, columns)
     if len(table.rows) != 1:
         sentence = f"has {len(table.rows)} rows. Give one row for all images."
@@ -78,16 +78,24 @@ def read_sensor(path: Path) -> Lens:
     return lens
 
 
-def is_xml(path: Path) -> bool:
+def read_frame(path: Path) -> tuple[float, float]:
+    """Read the width and height of all images; the lens is not needed."""
+    if not _is_xml(path) and _column_names(path) >= set(FRAME):
+        width, height = (read_table(path, FRAME).numbers(name)[0] for name in FRAME)
+        return width, height
+    lens = read_sensor(path)
+    return lens.width, lens.height
+
+
+def _is_xml(path: Path) -> bool:
     """Whether a file is a calibration of Metashape, not a table."""
-    with path.open("rb") as stream:
+    with check_input(path).open("rb") as stream:
         return stream.read(64).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
 
 
-def column_names(path: Path) -> set[str]:
+def _column_names(path: Path) -> set[str]:
     """Return the names in the first line of a table."""
-    lines = read_lines(path)
-    return set(split_header(lines[0].strip())[0]) if lines else set()
+    return {*split_header("".join(read_lines(path)[:1]).strip())[0]}
 
 
 POSE = ("label", "x", "y", "z", "qw", "qx", "qy", "qz")
