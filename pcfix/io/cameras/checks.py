@@ -127,6 +127,8 @@ def reading(path: object) -> Iterator[None]:
             yield
     except PcfixError:
         raise
+    except FileNotFoundError as error:
+        raise missing(Path(error.filename or str(path))) from error
     except KeyError as error:
         raise damaged(path, f"{error} is missing") from error
     except DAMAGES as error:
@@ -236,14 +238,14 @@ def checked(path: Path, cameras: Cameras) -> Cameras:
 
 
 def measured(
-    labels: Sequence[str], places: Mapping[str, tuple[Any, Any]], crs: str | None
+    keys: Sequence[Any], places: Mapping[Any, tuple[Any, Any]], crs: str | None
 ) -> GnssPositions | None:
-    """Return the GNSS positions of images by label, with their standard deviations.
+    """Return the GNSS positions of images by their keys, with their standard deviations.
 
     Numbers that are not finite are unknown. None where no image has a position.
     """
     nothing = np.full(3, np.nan)
-    rows = [places.get(label, (nothing, nothing)) for label in labels]
+    rows = [places.get(key, (nothing, nothing)) for key in keys]
     xyz, sigma = (np.array([row[i] for row in rows], np.float64).reshape(-1, 3) for i in (0, 1))
     xyz[~np.isfinite(xyz).all(axis=1)] = np.nan
     return None if np.isnan(xyz).all() else GnssPositions(xyz, sigma, crs)

@@ -64,29 +64,16 @@ _DATABASE, _FOLDERS_ABOVE = "database.db", 3
 _WGS84 = 0
 
 
-class Model(NamedTuple):
-    """The folder of a model; `others` counts further models beside it."""
-
-    folder: Path
-    suffix: str
-    others: int = 0
-
-    def part(self, name: str) -> Path:
-        """Return the path of one of its files."""
-        return self.folder / f"{name}.{self.suffix}"
-
-
 def recognises(source: Source) -> bool:
     """Whether it is a model, one of its files, or a folder above that has one."""
-    return _find(source.path) is not None
+    return bool(_models_at(source.path))
 
 
 def read(source: Source) -> Cameras:
     """Read the poses of registered images and their lenses."""
-    model = _model_at(source.path)
-    listed, path = model.part("cameras"), model.part("images")
-    cameras = read_list(listed)
-    images = read_images(path, points=False)
+    listed, *others = _models_at(source.path)
+    path, folder = listed.with_stem("images"), listed.parent
+    cameras, images = read_list(listed), read_images(path, points=False)
     posed = [image for image in images if image.posed]
     if not posed:
         raise checks.no_pose(path)
@@ -95,12 +82,12 @@ def read(source: Source) -> Cameras:
     rotations = checks.quaternions(path, labels, poses[:, :4])
     used = dict.fromkeys(image.camera for image in posed)
     lenses = {number: lens_of(listed, number, cameras[number]) for number in used}
-    gnss, notes = read_priors(model.folder, labels)
-    offset, crs = read_place(model.folder)
+    gnss, notes = read_priors(folder, labels)
+    offset, crs = read_place(folder)
     if offset.any() and gnss is not None and gnss.crs is None:
         gnss = None  # of the model that the database found, which this one may not be
-    if model.others:
-        notes = (checks.several(model.folder, model.others + 1, len(posed)), *notes)
+    if others:
+        notes = (checks.several(folder, len(others) + 1, len(posed)), *notes)
     return Cameras(
         labels=labels,
         centres=checks.centres(rotations, poses[:, 4:]) + offset,
@@ -116,53 +103,44 @@ def read(source: Source) -> Cameras:
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """Read the points in space and where the images saw them."""
-    model = _model_at(source.path)
-    path = model.part("points3D")
+    listed = _models_at(source.path)[0]
+    path = listed.with_stem("points3D")
     if not path.is_file():
         raise tracks.no_tie_points(path, "there is no such file")
     identifiers, xyz = read_points(path)
-    images = [i for i in read_images(model.part("images"), points=True) if i.posed]
+    images = [i for i in read_images(listed.with_stem("images"), points=True) if i.posed]
     seen = np.concatenate([image.seen for image in images])
     if not len(identifiers) or not len(seen):
         raise tracks.no_tie_points(path, "the model has no points that its images saw")
     camera = np.repeat(np.arange(len(cameras)), [len(image.seen) for image in images])
-    xyz = xyz + read_place(model.folder)[0]
+    xyz = xyz + read_place(listed.parent)[0]
     row = tracks.rows_of(seen["point"], identifiers)
     return tracks.tie_points(tracks.Seen(xyz, row, camera, seen["xy"]))
 
 
-def _model_at(path: Path) -> Model:
-    found = _find(path)
-    if found is None:
-        raise checks.missing(path / "cameras.bin")
-    return found
-
-
-def _find(path: Path) -> Model | None:
-    """Return the model in a folder, in its ``sparse`` or, of several, the largest there."""
+def _models_at(path: Path) -> list[Path]:
+    """Return the camera lists of the models in a folder or its ``sparse``, the largest first."""
     if not path.is_dir():
         part = _PART.fullmatch(path.name)
-        return _in_folder(path.parent, part[2]) if part else None
+        listed = path.with_name(f"cameras.{part[2] if part else ''}")
+        return [listed] if _is_model(listed) else []
     for folder in (path, path / "sparse"):
-        found = _in_folder(folder, "bin", "txt")
-        if found or not folder.is_dir():
-            return found
-        numbered = [p for p in folder.iterdir() if p.name.isdecimal()]
-        models = [m for p in numbered if (m := _in_folder(p, "bin", "txt"))]
-        if models:
-            models.sort(key=lambda m: (-m.part("images").stat().st_size, m.folder.name))
-            return models[0]._replace(others=len(models) - 1)
-    return None
+        inside = folder.iterdir() if folder.is_dir() else ()
+        for folders in ([folder], [one for one in inside if one.name.isdecimal()]):
+            lists = ([one / "cameras.bin", one / "cameras.txt"] for one in folders)
+            found = [found for two in lists if (found := next(filter(_is_model, two), None))]
+            if found:
+                size = {one: one.with_stem("images").stat().st_size for one in found}
+                return sorted(found, key=lambda one: (-size[one], one.parent.name))
+    return []
 
 
-def _in_folder(folder: Path, *suffixes: str) -> Model | None:
-    for model in (Model(folder, suffix) for suffix in suffixes):
-        cameras = model.part("cameras")
-        if cameras.is_file() and model.part("images").is_file():
-            with cameras.open(encoding="utf-8-sig", errors="replace") as stream:
-                if model.suffix == "bin" or _CAMERA_LINE.search(stream.read(4096)):
-                    return model
-    return None
+def _is_model(listed: Path) -> bool:
+    """Whether there is a list of cameras, and one of images beside it."""
+    if not (listed.is_file() and listed.with_stem("images").is_file()):
+        return False
+    with listed.open(encoding="utf-8-sig", errors="replace") as stream:
+        return listed.suffix == ".bin" or bool(_CAMERA_LINE.search(stream.read(4096)))
 
 
 def read_place(folder: Path) -> tuple[FloatArray, str | None]:

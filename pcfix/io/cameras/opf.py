@@ -33,6 +33,8 @@ import numpy as np
 from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.cameras import checks, tracks
 from pcfix.io.cameras.checks import Source, load_json, note, triple
+from pcfix.io.cameras.lenses import lens_by_name
+from pcfix.io.cameras.pix4d import fisheye
 from pcfix.io.crs import crs_text, parse_crs, plan_unit
 from pcfix.lens.rotations import from_omega_phi_kappa
 from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, TiePoints
@@ -121,8 +123,6 @@ class Project(NamedTuple):
             return self.path, {}
         if len(found) != 1:
             raise checks.damaged(self.path, f"{len(found)} files of {form} instead of one")
-        if not found[0].is_file():
-            raise checks.missing(found[0])
         return found[0], load_json(found[0])
 
 
@@ -188,18 +188,17 @@ def _with_heights(text: str, name: str) -> tuple[str, float]:
 
 def _lens(path: Path, sensor: Part, given: Part) -> Lens:
     """Return the calibrated lens of a sensor, with the frame of the input cameras."""
-    width, height = map(float, given["image_size_px"])
-    inner, name = sensor["internals"], str(given.get("name") or f"sensor {sensor['id']}")
-    x, y = map(float, inner["principal_point_px"])
+    frame, inner = map(float, given["image_size_px"]), sensor["internals"]
+    name = str(given.get("name") or f"sensor {sensor['id']}")
+    values = dict(zip(("cx", "cy"), map(float, inner["principal_point_px"]), strict=True))
     if inner.get("type") == "perspective":
-        t1, t2 = map(float, inner["tangential_distortion"])
-        radial = tuple(triple(inner["radial_distortion"]).tolist())
-        focal = float(inner["focal_length_px"])
-        lens = Lens(focal, width, height, x, y, radial=radial, tangential=(t2, t1))
+        values["f"] = float(inner["focal_length_px"])
+        values |= dict(zip(("k1", "k2", "k3"), triple(inner["radial_distortion"]), strict=True))
+        values |= zip(("p2", "p1"), map(float, inner["tangential_distortion"]), strict=True)
+        lens = lens_by_name(values, *frame)
     elif inner.get("type") == "fisheye":
-        c, d, e, f = map(float, inner["affine"])
-        shape = tuple(map(float, inner["polynomial"]))
-        lens = Lens(f, width, height, x, y, c - f, d, e, projection="polynomial", shape=shape)
+        affine, polynomial = (tuple(map(float, inner[k])) for k in ("affine", "polynomial"))
+        lens = fisheye(values, affine, polynomial, *frame)
     else:
         what = f"the type {inner.get('type')!r:.40} of sensor {name}"
         remedy = "Leave its images out and calibrate again"
@@ -211,7 +210,7 @@ def _lens(path: Path, sensor: Part, given: Part) -> Lens:
 def _gnss(path: Path, given: Part, ids: list[int]) -> GnssPositions | None:
     """Return where captures were taken, at their reference cameras, in the CRS of the first."""
     found = {
-        ids.index(capture["reference_camera_id"]): capture["geolocation"]
+        capture["reference_camera_id"]: capture["geolocation"]
         for capture in given.get("captures", [])
         if capture.get("geolocation") and capture.get("reference_camera_id") in ids
     }
@@ -222,12 +221,12 @@ def _gnss(path: Path, given: Part, ids: list[int]) -> GnssPositions | None:
     order = [1, 0, 2] if crs.axis_info[0].direction.lower() == "north" else [0, 1, 2]
     said, up_m = _with_heights(text, str(path))
     unit_m = 1.0 if crs.is_geographic else plan_unit(crs)[1]
-    xyz, sigma_m = np.full((2, len(ids), 3), np.nan)
-    for row, place in found.items():
-        if place["crs"]["definition"] == text:
-            xyz[row] = triple(place["coordinates"])[order] * [1.0, 1.0, up_m]
-            sigma_m[row] = triple(place["sigmas"])[order] * unit_m
-    return GnssPositions(xyz, sigma_m, said)
+    places = {
+        i: (triple(p["coordinates"])[order] * [1.0, 1.0, up_m], triple(p["sigmas"])[order] * unit_m)
+        for i, p in found.items()
+        if p["crs"]["definition"] == text
+    }
+    return checks.measured(ids, places, said)
 
 
 COMPONENTS = {"5121": "u1", "5123": "<u2", "5125": "<u4", "5126": "<f4"}
@@ -250,8 +249,6 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
 
 def _nodes(path: Path, row_of: dict[int, int]) -> Iterator[tracks.Seen]:
     """Yield the points and matches of the nodes of a model."""
-    if not path.is_file():
-        raise checks.missing(path)
     with checks.reading(path):
         model = load_json(path)
         for node in model.get("nodes", []):
@@ -283,8 +280,6 @@ def _accessor(path: Path, model: Part, index: int, width: int) -> Any:
     accessor = model["accessors"][index]
     view = model["bufferViews"][accessor["bufferView"]]
     where = path.parent / unquote(model["buffers"][view["buffer"]]["uri"])
-    if not where.is_file():
-        raise checks.missing(where)
     with checks.reading(where):
         kind, count = COMPONENTS[str(accessor["componentType"])], accessor["count"]
         start = view.get("byteOffset", 0)
