@@ -36,12 +36,13 @@ import numpy as np
 from pcfix.errors import bad_file
 from pcfix.io.cameras import checks, opensfm
 from pcfix.io.cameras.checks import Source, damaged, load_json, note, triple
+from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.io.cameras.opensfm import is_panorama, lens
 from pcfix.io.crs import Topocentric
 from pcfix.io.labels import unnamed
 from pcfix.io.tables import read_lines
 from pcfix.lens.rotations import from_rotation_vectors
-from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, TiePoints
+from pcfix.model import Cameras, FloatArray, GnssPositions, TiePoints
 
 SHOTS = "shots.geojson"
 RECONSTRUCTION = "reconstruction.json"
@@ -55,27 +56,30 @@ WHOLE_M = 2e-3
 SAME_FOCAL = 1e-6
 GNSS_KEYS = ("longitude", "latitude", "altitude", "gps_xy_stddev", "gps_z_stddev")
 
-_FOLDERS = ("", "opensfm", "odm_georeferencing", "odm_georeferencing_25d", "odm_report")
+_FOLDERS = ("opensfm", "odm_georeferencing", "odm_georeferencing_25d", "odm_report")
 _OF_CRS = ("proj.txt", "coords.txt", "odm_georeferencing_model_geo.txt")
+_NAMES = (SHOTS, TRANSFORMATION, TOPOCENTRIC, "cameras.json", "images.json", *_OF_CRS)
 _SHOTS_HEAD = re.compile(
     r'\s*\{.*"features"\s*:\s*\[.*"(translation|rotation|filename)"', re.DOTALL
 )
 _REFERENCE = re.compile(rb'"(latitude|longitude)"\s*:\s*(-?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)')
+Files = dict[str, Path]
+"""The files of a project that are there, by name, and the one with the ``poses``."""
 
 
 def recognises(source: Source) -> bool:
     """Whether it is shots.geojson, or a reconstruction in a project of ODM."""
-    project = _locate(source.path)
-    if project.poses is None:
+    files = _files_of(source.path)
+    if "poses" not in files:
         return False
-    found = Source(project.poses)
+    found = Source(files["poses"])
     if _SHOTS_HEAD.match(found.text):
         return True
     if not opensfm.recognises(found):
         return False
-    if any(project.find(name) for name in (*_OF_CRS, SHOTS, TOPOCENTRIC)):
+    if files.keys() & {*_OF_CRS, SHOTS, TOPOCENTRIC}:
         return True
-    with project.poses.open("rb") as stream:
+    with files["poses"].open("rb") as stream:
         view = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
     at = view.find(b'"reference_lla"')  # the file may be large
     text = view[at : at + 400] if at >= 0 else b""
@@ -86,13 +90,12 @@ def recognises(source: Source) -> bool:
 
 def read(source: Source) -> Cameras:
     """Read the poses, of a folder rather from the reconstruction than from shots.geojson."""
-    project = _locate(source.path)
-    path = project.poses or project.root / RECONSTRUCTION
-    if not opensfm.recognises(Source(path)):
-        return _read_shots(project, path)
-    found = opensfm.read_reconstruction(path)
-    own, placed = found.cameras, _frame(project, found)
-    gnss, listed = read_images(project.find("images.json"), own.labels)
+    files = _files_of(source.path)
+    if not opensfm.recognises(Source(files["poses"])):
+        return _read_shots(files)
+    found = opensfm.read_reconstruction(files["poses"])
+    own, placed = found.cameras, _frame(files, found)
+    gnss, listed = read_images(files.get("images.json"), own.labels)
     cameras = replace(
         own,
         centres=placed.points(own.centres),
@@ -103,56 +106,46 @@ def read(source: Source) -> Cameras:
         unposed=unnamed([*own.unposed, *listed], own.labels),
         source="OpenDroneMap",
     )
-    truth, ours = _in_shots(project, cameras)
+    truth, ours = _in_shots(files, cameras)
     apart = float(np.median(np.hypot(*(ours - truth)[:, :2].T))) if len(ours) else 0.0
     if placed.project_crs or apart < ALIGNED_M:
         return cameras
     sentence = f"its cameras are {apart:.2f} m from those of shots.geojson. Give that, if the cloud"
     sentence += " was aligned to a reference."
-    moved = note(project.poses, "cameras.shots_differ", sentence, metres=apart)
+    moved = note(files["poses"], "cameras.shots_differ", sentence, metres=apart)
     return replace(cameras, notes=(*cameras.notes, moved))
 
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """Read points and tracks, in the frame of the poses."""
-    project = _locate(source.path)
-    found = opensfm.read_reconstruction(project.poses or project.root / RECONSTRUCTION)
+    files = _files_of(source.path)
+    found = opensfm.read_reconstruction(files["poses"])
     points = opensfm.read_tie_points(found)
-    return replace(points, xyz=_frame(project, found).points(points.xyz))
+    return replace(points, xyz=_frame(files, found).points(points.xyz))
 
 
-class Project(NamedTuple):
-    """A project folder and the file in it that has the poses, shots.geojson or a reconstruction."""
+def _files_of(path: Path) -> Files:
+    """Return the files of the project that a file or folder belongs to.
 
-    root: Path
-    poses: Path | None
-
-    def find(self, name: str) -> Path | None:
-        """Return a file of this name beside the poses or in the project's own folders."""
-        folders = [self.poses.parent] if self.poses else []
-        places = [folder / name for folder in (*folders, *(self.root / one for one in _FOLDERS))]
-        return next((place for place in places if place.is_file()), None)
-
-    def crs(self) -> str | None:
-        """Return the projected CRS that the project names."""
-        path = next(filter(None, map(self.find, _OF_CRS)), None)
-        return None if path is None else named_crs(path)
-
-
-def _locate(path: Path) -> Project:
-    """Return the project that a file or folder belongs to.
-
-    A file is taken as it is; of a folder its reconstruction, or else its shots.geojson.
+    A file is taken as it is; of a folder its reconstruction, or else its shots.geojson. Other files
+    are beside it, or in the project's own folders.
     """
     folder = path if path.is_dir() else path.parent
     root = folder.parent if folder.name == "undistorted" else folder
-    if root.name in _FOLDERS[1:]:
-        root = root.parent
-    if not path.is_dir():
-        return Project(root, path)
+    root = root.parent if root.name in _FOLDERS else root
     places = [folder / RECONSTRUCTION, root / "opensfm" / RECONSTRUCTION]
     places += [folder / SHOTS, root / "odm_report" / SHOTS]
-    return Project(root, next((place for place in places if place.is_file()), None))
+    poses = next(filter(Path.is_file, places if path.is_dir() else [path]), None)
+    if poses is None:
+        return {}
+    folders = (poses.parent, root, *(root / name for name in _FOLDERS))
+    found = {name: [f / name for f in folders if (f / name).is_file()] for name in _NAMES}
+    return {name: there[0] for name, there in found.items() if there} | {"poses": poses}
+
+
+def _crs_of(files: Files) -> str | None:
+    """Return the projected CRS that the project names."""
+    return next((named_crs(files[name]) for name in _OF_CRS if name in files), None)
 
 
 def named_crs(path: Path) -> str:
@@ -184,13 +177,13 @@ class Frame(NamedTuple):
         return np.asarray(u @ v)
 
 
-def _frame(project: Project, found: opensfm.Reconstruction) -> Frame:
+def _frame(files: Files, found: opensfm.Reconstruction) -> Frame:
     """Decide the frame; see the top of this module for the rules."""
-    crs, reference = project.crs(), found.reference
+    crs, reference = _crs_of(files), found.reference
     unmoved = Frame(np.eye(3), np.zeros(3), found.cameras.crs or "", crs)
     if reference is None or found.path.name == TOPOCENTRIC:
         return unmoved
-    path = project.find(TRANSFORMATION)
+    path = files.get(TRANSFORMATION)
     if path is not None:
         with checks.reading(path):
             rows = [row.split()[:4] for row in read_lines(path) if row.strip()]
@@ -209,7 +202,7 @@ def _frame(project: Project, found: opensfm.Reconstruction) -> Frame:
     moved = Frame(np.eye(3), np.array([east, north, 0.0]), crs)
     # centres of shots.geojson, else the GNSS, which stays topocentric, show whether it was moved:
     # the two readings differ by the meridian convergence and the scale
-    truth, own = _in_shots(project, found.cameras)
+    truth, own = _in_shots(files, found.cameras)
     if len(own) < 3 and found.cameras.gnss is not None:
         known = np.isfinite(found.cameras.gnss.xyz).all(axis=1)
         truth = _from_topocentric(found.cameras.gnss.xyz[known], reference, crs)
@@ -223,10 +216,9 @@ def _frame(project: Project, found: opensfm.Reconstruction) -> Frame:
     return unmoved._replace(project_crs=crs) if still_m < 0.5 * moved_m else moved
 
 
-def _in_shots(project: Project, cameras: Cameras) -> tuple[FloatArray, FloatArray]:
+def _in_shots(files: Files, cameras: Cameras) -> tuple[FloatArray, FloatArray]:
     """Return the centres in shots.geojson and ours of the images that are in both."""
-    path = project.find(SHOTS)
-    there = {} if path is None else _shots(path)
+    there = _shots(files[SHOTS]) if SHOTS in files else {}
     shared = [i for i, label in enumerate(cameras.labels) if label in there]
     truth = [triple(there[cameras.labels[i]]["translation"]) for i in shared]
     return np.array(truth).reshape(-1, 3), cameras.centres[shared]
@@ -271,22 +263,22 @@ def _projected(crs: str, lon: float | FloatArray, lat: float | FloatArray) -> Fl
     return np.array(Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(lon, lat))
 
 
-def _read_shots(project: Project, path: Path) -> Cameras:
+def _read_shots(files: Files) -> Cameras:
     """Read the cameras of shots.geojson, in the projected CRS."""
-    with checks.reading(path):
-        shots = _shots(path)
-        turns = np.array([triple(shot["rotation"]) for shot in shots.values()])
-        centres = np.array([triple(shot["translation"]) for shot in shots.values()])
-        place = (next(iter(shots.values()))["geometry"] or {}).get("coordinates")
-    labels, crs = tuple(shots), project.crs()
+    shots, crs = _shots(files["poses"]), _crs_of(files)
+    labels, each = tuple(shots), shots.values()
+    centres = np.array([triple(shot["translation"]) for shot in each])
+    if crs is None and (place := (next(iter(each))["geometry"] or {}).get("coordinates")):
+        lon, lat, _ = triple(place).tolist()  # a project without GNSS has made-up coordinates
+        crs = _crs_of_place(lon, lat, centres[0, :2], _zones(lat, lon))
     # the lens is that of the camera that the shot names, or else of the only one that is alike
-    beside, known = project.find("cameras.json"), {}
-    if beside is not None:
+    known = {}
+    if beside := files.get("cameras.json"):
         with checks.reading(beside):
             entries = load_json(beside).items()
             known = {k: lens(beside, k, entry) for k, entry in entries if not is_panorama(entry)}
     lenses, plain = [], 0
-    for shot in shots.values():
+    for shot in each:
         width, height, focal = (float(shot[key]) for key in ("width", "height", "focal"))
         scale = max(width, height)
         alike = [
@@ -297,17 +289,14 @@ def _read_shots(project: Project, path: Path) -> Cameras:
         ]
         found = known.get(str(shot.get("camera"))) or (alike[0] if len(alike) == 1 else None)
         plain += found is None
-        lenses.append(found or Lens(focal * scale, width, height, width / 2.0, height / 2.0))
+        lenses.append(found or lens_by_name({"f": focal * scale}, width, height))
     sentence = f"cameras.json has no camera of {plain} images; they get a lens without distortion."
-    said = note(path, "cameras.no_distortion", sentence, images=plain)
-    gnss, listed = read_images(project.find("images.json"), labels)
-    if crs is None and place is not None:  # a project without GNSS has made-up coordinates
-        lon, lat, _ = triple(place).tolist()
-        crs = _crs_of_place(lon, lat, centres[0, :2], _zones(lat, lon))
+    said = note(files["poses"], "cameras.no_distortion", sentence, images=plain)
+    gnss, listed = read_images(files.get("images.json"), labels)
     return Cameras(
         labels=labels,
         centres=centres,
-        rotations=from_rotation_vectors(turns),
+        rotations=from_rotation_vectors(np.array([triple(shot["rotation"]) for shot in each])),
         lenses=tuple(lenses),
         crs=crs or "local",
         notes=(said,) if plain else (),
@@ -326,19 +315,17 @@ def read_images(
     """
     if path is None:
         return None, []
-    images = load_json(path)
+    places = {}
     with checks.reading(path):
+        images = load_json(path)
         names = [str(image.get("filename")) for image in images]
-        by_name = dict(zip(names, images, strict=True))
-        values = np.full((len(labels), len(GNSS_KEYS)), np.nan)
-        for i, label in enumerate(labels):
-            image = by_name.get(label) or by_name.get(PurePath(label).stem)
-            if image is not None and image.get("latitude") is not None:
-                values[i] = [np.nan if image.get(k) is None else image[k] for k in GNSS_KEYS]
-    values[~np.isfinite(values)] = np.nan
-    if np.isnan(values[:, :3]).all():
-        return None, names
-    return GnssPositions(values[:, :3], values[:, [3, 3, 4]], "EPSG:4326"), names
+        for name, image in zip(names, images, strict=True):
+            if image.get("latitude") is not None:
+                values = [np.nan if image.get(k) is None else float(image[k]) for k in GNSS_KEYS]
+                places[name] = values[:3], np.where(np.isfinite(values), values, np.nan)[[3, 3, 4]]
+        known = {one: places.get(one) or places.get(PurePath(one).stem) for one in labels}
+    positions = {one: place for one, place in known.items() if place is not None}
+    return checks.measured(labels, positions, "EPSG:4326"), names
 
 
 def _shots(path: Path) -> dict[str, dict[str, Any]]:
