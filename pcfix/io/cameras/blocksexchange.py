@@ -33,9 +33,8 @@ import math
 import re
 import zipfile
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path, PureWindowsPath
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -43,8 +42,9 @@ import numpy as np
 from pcfix.errors import InputError, bad_file
 from pcfix.io.cameras import checks, tracks
 from pcfix.io.cameras.checks import ZIP_MAGIC, Source, damaged, note, number, read_xml, text_of
+from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.lens.rotations import from_omega_phi_kappa, from_photogrammetric
-from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, TiePoints
+from pcfix.model import Cameras, FloatArray, Lens, TiePoints
 
 COMMENT = re.compile(rb"<!--.*?-->", re.DOTALL)
 TIE_POINTS = re.compile(rb"<TiePoints>(.*?)</TiePoints>", re.DOTALL)
@@ -88,6 +88,30 @@ def _read_bytes(path: Path) -> bytes:
     return COMMENT.sub(b"", data)
 
 
+class Photogroup(NamedTuple):
+    """What the photos of a group share.
+
+    `axes` is the matrix from camera axes to x right, y down, z forward; `middle` the principal
+    point in pixels from the corner. Of `pixel_mm` and `lens` None is unknown.
+    """
+
+    name: str
+    has_poses: bool
+    axes: FloatArray
+    middle: FloatArray
+    pixel_mm: float | None
+    lens: Lens | None
+
+    def place(self, mark: Element) -> FloatArray:
+        """Return u, v in pixels from the corner, of a measurement in pixels or in mm."""
+        if mark.find("x") is not None and mark.find("y") is not None:
+            return np.array([float(text_of(mark, axis)) for axis in "xy"]) + FIRST_PIXEL
+        if self.pixel_mm is None:
+            raise ValueError("a measurement is in mm, but its photogroup has no pixel size")
+        mm = np.array([float(text_of(mark, name)) for name in ("xmm", "ymm")])
+        return self.middle + self.axes[:2, :2] @ mm / self.pixel_mm
+
+
 class Photo(NamedTuple):
     """A photo with at least a position; `key` is its block and id, `prior` its GNSS position."""
 
@@ -108,33 +132,28 @@ def _read_block(path: Path) -> tuple[Cameras, list[Photo], list[tuple[int, str, 
     """
     data = _read_bytes(path)
     root = read_xml(path, io.BytesIO(TIE_POINTS.sub(b"", data)))
-    posed: list[Photo] = []
-    outside: list[Photo] = []
-    unposed: list[str] = []
-    ignored: list[str] = []
+    main, outside = list[Photo](), list[Photo]()  # outside of the main component
+    unposed, ignored = list[str](), list[str]()
     blocks = list(root.iter("Block"))
     for i, block in enumerate(blocks):
         for element in block.iter("Photogroup"):
-            group = Photogroup(path, element)
-            is_used = group.is_used("ManualPose")
-            ignored += [] if is_used else [group.name]
+            group = _photogroup(path, element)
+            ignored += [] if group.has_poses else [group.name]
+            srs = text_of(element, "SRSId") or text_of(block, "SRSId")
             for photo in element.iterfind("Photo"):
-                if not is_used or photo.find("Pose/Center") is None:
-                    unposed.append(_label(photo))
-                    continue
-                is_main = text_of(photo, "Component") in ("", MAIN_COMPONENT)
-                srs = text_of(element, "SRSId") or text_of(block, "SRSId")
                 label, key = _label(photo), (i, text_of(photo, "Id"))
+                if not group.has_poses or photo.find("Pose/Center") is None:
+                    unposed.append(label)
+                    continue
                 centre = _numbers(path, f"image {label}", photo, CENTRE)
                 turn = _rotation(path, label, photo.find("Pose/Rotation"), group.axes)
                 prior = _prior(path, label, photo, srs)
+                is_main = text_of(photo, "Component") in ("", MAIN_COMPONENT)
                 one = Photo(key, label, group, centre, turn, srs, prior)
-                (posed if is_main else outside).append(one)
+                (main if is_main else outside).append(one)
         unposed += [_label(element) for element in block.iterfind("BulkPhotos/Photo")]
-    everything = posed + outside
-    in_block = posed or outside
-    turned = [photo for photo in in_block if photo.rotation is not None]
-    photos = turned or in_block
+    turned = [photo for photo in main or outside if photo.rotation is not None]
+    photos = turned or main or outside
     if not photos:
         why = " of the block (ManualPose is false)" if ignored else ""
         raise checks.no_pose(path, f"no photo has a pose{why}")
@@ -144,32 +163,34 @@ def _read_block(path: Path) -> tuple[Cameras, list[Photo], list[tuple[int, str, 
         why = f"image {twice[0]} is in several blocks" if twice else "it has several SRS"
         sentence = f"{why}. Export the one block that the cloud was made from, in one SRS."
         raise bad_file(path, "cameras.several_blocks", sentence)
-    lenses = [photo.group.lens for photo in photos if photo.group.lens is not None]
-    gnss, nothing = None, np.full(3, np.nan)
-    of = next((photo.prior[0] for photo in photos if photo.prior is not None), None)
-    if of is not None:  # positions in the CRS that the first of them has
-        xyz = np.array([p.prior[1] if p.prior and p.prior[0] == of else nothing for p in photos])
+    gnss = None
+    priors = {photo.key: photo.prior for photo in photos if photo.prior is not None}
+    if priors:  # positions in the CRS that the first of them has
+        of = next(iter(priors.values()))[0]
+        places = {k: (xyz, np.full(3, np.nan)) for k, (srs, xyz) in priors.items() if srs == of}
         crs = "EPSG:4326" if of == "exif" else _crs_of(path, root, of)
-        gnss = GnssPositions(xyz, np.full_like(xyz, np.nan), crs)
-    notes = []
+        gnss = checks.measured([photo.key for photo in photos], places, crs)
+    lenses = [photo.group.lens for photo in photos if photo.group.lens is not None]
+    has_lenses, notes = bool(turned) and len(lenses) == len(photos), []
     if ignored:
         sentence = f"photogroup {', '.join(ignored[:10])} is skipped (its ManualPose is false)."
         notes.append(note(path, "cameras.poses_ignored", sentence, photogroups=ignored))
     if not turned:
         notes.append(note(path, "cameras.no_rotations", "no photo has a rotation, only positions."))
-    elif (bare := next((p for p in photos if p.group.lens is None), None)) is not None:
-        why = f"the photogroup of {bare.label} has no frame or focal length"
+    elif not has_lenses:
+        bare = next(photo.label for photo in photos if photo.group.lens is None)
+        why = f"the photogroup of {bare} has no frame or focal length"
         notes.append(checks.without_lens(path, why))
     chosen = {photo.key for photo in photos}
     cameras = Cameras(
         labels=tuple(photo.label for photo in photos),
         centres=np.array([photo.centre for photo in photos]),
         rotations=np.array([photo.rotation for photo in photos]) if turned else None,
-        lenses=tuple(lenses) if turned and len(lenses) == len(photos) else None,
+        lenses=tuple(lenses) if has_lenses else None,
         crs=_crs_of(path, root, photos[0].srs),
         notes=tuple(notes),
         gnss=gnss,
-        unposed=(*unposed, *(photo.label for photo in everything if photo.key not in chosen)),
+        unposed=(*unposed, *(one.label for one in main + outside if one.key not in chosen)),
         source="BlocksExchange",
     )
     texts = []
@@ -237,102 +258,61 @@ def _label(element: Element) -> str:
     return name or f"photo {text_of(element, 'Id')}"
 
 
-class Photogroup:
-    """What the photos of a group share: camera axes, frame, pixel size and lens, None if unknown.
+def _photogroup(path: Path, element: Element) -> Photogroup:
+    """Read what the photos of a group share; without frame or focal length there is no lens."""
+    name = (element.findtext("Name") or "without a name").strip()
 
-    `axes` is the matrix from camera axes to x right, y down, z forward.
-    """
+    def value(tag: str, default: float = 0.0) -> float:
+        text = text_of(element, tag)
+        return number(path, f"photogroup {name}, {tag}", text) if text else default
 
-    def __init__(self, path: Path, element: Element) -> None:
-        self.path, self.element = path, element
-        self.name = (element.findtext("Name") or "without a name").strip()
-        orientation = text_of(element, "CameraOrientation") or "XRightYDown"
-        words = re.fullmatch("X(Right|Left|Up|Down)Y(Right|Left|Up|Down)", orientation)
-        x, y = (DIRECTIONS[word] for word in words.groups()) if words else ((0, 0, 0), (0, 0, 0))
-        self.axes = np.column_stack([x, y, np.cross(x, y)]).astype(np.float64)
-        if not self.axes[:, 2].any():
-            raise self._unsupported(f"camera orientation {orientation}")
-        self.width, self.height = self.numbers("ImageDimensions", ("Width", "Height"))
-        pixel, sensor = self.number("PixelSize"), self.number("SensorSize")
-        if pixel is None and sensor is not None and self.width > 0.0:
-            pixel = sensor / max(self.width, self.height)
-        self.pixel_size_mm = pixel if pixel is not None and pixel > 0.0 else None
-        self.lens = self._lens() if self.is_used("ManualOpticalParams") else None
+    def refused(what: str) -> InputError:
+        what, remedy = f"the {what} of photogroup {name}", "Export undistorted photos"
+        return checks.unsupported(path, what, remedy, photogroup=name)
 
-    def number(self, name: str) -> float | None:
-        """Return the number of an element, or None where the group has no such element."""
-        text = text_of(self.element, name)
-        return number(self.path, f"photogroup {self.name}, {name}", text) if text else None
-
-    def numbers(self, parent: str, names: Sequence[str]) -> list[float]:
-        """Return numbers below an element, 0 for those that are not there."""
-        return [self.number(f"{parent}/{name}") or 0.0 for name in names]
-
-    def is_used(self, name: str) -> bool:
-        """Whether software uses what the group has: `ManualPose`, `ManualOpticalParams`."""
-        return text_of(self.element, name).lower() != "false"
-
-    def principal_point(self) -> FloatArray:
-        """Return the principal point in pixels from the corner; the centre where none is given."""
-        x, y = self.number("PrincipalPoint/x"), self.number("PrincipalPoint/y")
-        if x is not None and y is not None:
-            return np.array([x, y]) + FIRST_PIXEL
-        middle = np.array([self.width, self.height]) / 2.0
-        if self.pixel_size_mm is None:
-            return middle
-        mm = self.numbers("PrincipalPoint", ("xmm", "ymm"))
-        return middle + self.axes[:2, :2] @ mm / self.pixel_size_mm
-
-    def place(self, mark: Element) -> FloatArray:
-        """Return u, v in pixels from the corner, of a measurement in pixels or in mm."""
-        if mark.find("x") is not None and mark.find("y") is not None:
-            return np.array([float(text_of(mark, axis)) for axis in "xy"]) + FIRST_PIXEL
-        if self.pixel_size_mm is None:
-            raise ValueError("a measurement is in mm, but its photogroup has no pixel size")
-        mm = np.array([float(text_of(mark, name)) for name in ("xmm", "ymm")])
-        return self.principal_point() + self.axes[:2, :2] @ mm / self.pixel_size_mm
-
-    def _unsupported(self, what: str) -> InputError:
-        what, remedy = f"the {what} of photogroup {self.name}", "Export undistorted photos"
-        return checks.unsupported(self.path, what, remedy, photogroup=self.name)
-
-    def _lens(self) -> Lens | None:
-        """Return the lens, or None where the group lacks frame or focal length."""
-        kind = text_of(self.element, "CameraModelType") or "Perspective"
-        if kind not in ("Perspective", "Fisheye"):
-            raise self._unsupported(f"camera model {kind}")
-        for tag in (str(child.tag) for child in self.element):
-            if "Distortion" in tag and tag not in ("Distortion", "FisheyeDistortion"):
-                raise self._unsupported(f"distortion {tag}")
-        focal, focal_mm = self.number("FocalLengthPixels"), self.number("FocalLength")
-        if focal is None and focal_mm is not None and self.pixel_size_mm is not None:
-            focal = focal_mm / self.pixel_size_mm
-        matrix = None  # focal lengths and skews, by rows
-        if kind == "Fisheye" and self.element.find("FisheyeFocalMatrix") is not None:
-            matrix = self.numbers("FisheyeFocalMatrix", ("M_00", "M_01", "M_10", "M_11"))
-        elif focal is not None and kind == "Fisheye":
-            matrix = [math.pi / 2.0 * focal, 0.0, 0.0, math.pi / 2.0 * focal]
-        elif focal is not None:
-            aspect = self.number("AspectRatio")
-            down = focal if aspect is None else focal * aspect
-            matrix = [focal, self.number("Skew") or 0.0, 0.0, down]
-        if matrix is None or not min(self.width, self.height) > 0.0:
-            return None
-        m00, m01, m10, m11 = matrix
-        x, y = self.principal_point().tolist()
-        lens = Lens(
-            *(m11, self.width, self.height, x, y, m00 - m11, m01, m10),
-            pixel_size_mm=self.pixel_size_mm,
-            sensor=self.name,
-        )
-        if kind == "Perspective":
-            radial = self.numbers("Distortion", ("K1", "K2", "K3"))
-            tangential = self.numbers("Distortion", ("P1", "P2"))
-            return replace(lens, radial=tuple(radial), tangential=tuple(tangential))
-        shape = [0.0, 1.0, 0.0, 0.0, 0.0]
-        if self.element.find("FisheyeDistortion") is not None:
-            shape = self.numbers("FisheyeDistortion", ("P0", "P1", "P2", "P3", "P4"))
-        return replace(lens, projection="polynomial", shape=tuple(shape))
+    orientation = text_of(element, "CameraOrientation") or "XRightYDown"
+    words = re.fullmatch("X(Right|Left|Up|Down)Y(Right|Left|Up|Down)", orientation)
+    x, y = (DIRECTIONS[word] for word in words.groups()) if words else ((0, 0, 0), (0, 0, 0))
+    axes = np.column_stack([x, y, np.cross(x, y)]).astype(np.float64)
+    if not axes[:, 2].any():
+        raise refused(f"camera orientation {orientation}")
+    width, height = (value(f"ImageDimensions/{side}") for side in ("Width", "Height"))
+    pixel_mm = value("PixelSize") or (value("SensorSize") / max(width, height) if width else 0.0)
+    middle = np.array([width, height]) / 2.0
+    if text_of(element, "PrincipalPoint/x") and text_of(element, "PrincipalPoint/y"):
+        middle = np.array([value("PrincipalPoint/x"), value("PrincipalPoint/y")]) + FIRST_PIXEL
+    elif pixel_mm > 0.0:
+        mm = [value("PrincipalPoint/xmm"), value("PrincipalPoint/ymm")]
+        middle = middle + axes[:2, :2] @ mm / pixel_mm
+    is_used = text_of(element, "ManualOpticalParams").lower() != "false"
+    kind = text_of(element, "CameraModelType") or "Perspective"
+    if is_used and kind not in ("Perspective", "Fisheye"):
+        raise refused(f"camera model {kind}")
+    for tag in (str(child.tag) for child in element) if is_used else ():
+        if "Distortion" in tag and tag not in ("Distortion", "FisheyeDistortion"):
+            raise refused(f"distortion {tag}")
+    focal, is_fisheye = value("FocalLengthPixels", math.nan), kind == "Fisheye"
+    if math.isnan(focal) and pixel_mm > 0.0:
+        focal = value("FocalLength", math.nan) / pixel_mm
+    given = {"fx": focal, "fy": focal * value("AspectRatio", 1.0), "skew": value("Skew")}
+    if is_fisheye:
+        given = {"f": math.pi / 2.0 * focal}
+        if element.find("FisheyeFocalMatrix") is not None:
+            names = {"fx": "M_00", "skew": "M_01", "b3": "M_10", "fy": "M_11"}
+            given = {key: value(f"FisheyeFocalMatrix/{one}") for key, one in names.items()}
+    else:
+        given |= {k.lower(): value(f"Distortion/{k}") for k in ("K1", "K2", "K3", "P1", "P2")}
+    given |= {"cx": middle[0], "cy": middle[1]}
+    more: dict[str, Any] = {"sensor": name, "pixel_size_mm": pixel_mm if pixel_mm > 0.0 else None}
+    if is_fisheye:
+        shape = [value(f"FisheyeDistortion/P{i}") for i in range(5)]
+        has_shape = element.find("FisheyeDistortion") is not None
+        more |= {"projection": "polynomial", "shape": tuple(shape) if has_shape else (0.0, 1.0)}
+    lens = None
+    if is_used and min(width, height) > 0.0 and not math.isnan(given.get("f", given.get("fx", 0))):
+        lens = lens_by_name(given, width, height, **more)
+    has_poses = text_of(element, "ManualPose").lower() != "false"
+    return Photogroup(name, has_poses, axes, middle, more["pixel_size_mm"], lens)
 
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
@@ -350,8 +330,6 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
             plain = other[1].decode(errors="replace").replace("\\", "/")
             places = (path.parent / plain, path.parent / PureWindowsPath(plain).name)
             where = next((place for place in places if place.is_file()), places[0])
-            if not where.is_file():
-                raise checks.missing(where, "Keep the file of the tie points beside the block")
             inside = DECLARATION.sub(b"", _read_bytes(where))
         head = SRS_OF_ALL.search(inside[: inside.find(b"<TiePoint>")])
         srs_of_all = srs_of_block if head is None else head[1].decode()
@@ -359,22 +337,18 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
             for _, element in iterparse(io.BytesIO(b"<All>" + inside + b"</All>")):
                 if element.tag != "TiePoint":
                     continue
-                seen = [
-                    (row_of[key], mark)
-                    for mark in element.iterfind("Measurement")
-                    if (key := (i, text_of(mark, "PhotoId"))) in row_of
-                ]
-                if not seen:
-                    element.clear()
-                    continue
-                for row, mark in seen:
-                    point.append(len(xyz))
-                    camera.append(row)
-                    uv.append(photos[row].group.place(mark))
-                place, srs = element.find("Position"), text_of(element, "SRSId") or srs_of_all
-                known = place is not None and srs == photos[0].srs
-                axes = [text_of(place, a) for a in "xyz"] if place is not None and known else ()
-                xyz.append([float(text) for text in axes] or [math.nan] * 3)
+                marks = element.findall("Measurement")
+                rows = [row_of.get((i, text_of(mark, "PhotoId")), -1) for mark in marks]
+                if max(rows, default=-1) >= 0:
+                    place, srs = element.find("Position"), text_of(element, "SRSId") or srs_of_all
+                    is_known = place is not None and srs == photos[0].srs
+                    for row, mark in zip(rows, marks, strict=True):
+                        if row >= 0:
+                            point.append(len(xyz))
+                            camera.append(row)
+                            uv.append(photos[row].group.place(mark))
+                    axes = [text_of(place, a) for a in "xyz"] if is_known else ["nan"] * 3
+                    xyz.append([float(text) for text in axes])
                 element.clear()
     if not xyz:
         raise tracks.no_tie_points(path, f"none was seen by one of its {len(cameras)} photos")
