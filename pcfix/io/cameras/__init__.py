@@ -67,11 +67,10 @@ _FORMATS = (
     ("COLMAP", "the model folder or workspace, text or binary", "colmap"),
     ("MicMac", "the `Ori-...` folder, of MMVII too", "micmac"),
     (
-        "Bundler, MVE",
-        "`bundle.out`, `synth_0.out`, with the images or their list beside it",
+        "Bundler, MVE, VisualSFM",
+        "`bundle.out`, `synth_0.out`, `.nvm`, with the images (and Bundler's list) beside it",
         "bundler",
     ),
-    ("VisualSFM", "`.nvm`, with the images beside it", "nvm"),
     (
         "ContextCapture, iTwin Capture, DJI Terra",
         "BlocksExchange XML, plain or zipped",
