@@ -18,8 +18,8 @@ principal point and from the principal point for measurements.
 Software ignores poses where ManualPose is false, and lenses where ManualOpticalParams is. The cloud
 was not made with these, so they are not read.
 
-GNSS positions are in Pose/Metadata, or in the GPS of ExifData. Tie
-points can be in a file of their own, and either file in a zip archive (.xmlz).
+GNSS positions are in Pose/Metadata, or in the GPS of ExifData. Tie points can be in another file,
+and either file in a zip archive (.xmlz).
 
 References: Bentley, ContextCapture User Guide, "BlocksExchange XML/XMLZ format", "Perspective
 camera model", "Fisheye camera model"; Bentley developer documentation, "CC Orientations". The

@@ -48,20 +48,19 @@ class Frame(NamedTuple):
     direct: bool = False
     topocentric: bool = False
 
-    def per_metre(self, xyz: FloatArray) -> FloatArray:
-        """Return how much each number changes per metre along its axis, at points (n, 3).
+    def metres(self, xyz: FloatArray) -> FloatArray:
+        """Return how many metres one unit of each number is, at points (n, 3).
 
         Degrees are those of a sphere, as only the directions of the steps count.
         """
+        size, up = systems.plan_unit(self.crs)[1], abs(systems.metres_up(self.crs))
         if not self.direct:
             return np.ones_like(xyz)
-        size = np.full(len(xyz), systems.plan_unit(self.crs)[1])
-        up = np.full(len(xyz), abs(systems.metres_up(self.crs)))
         if self.crs.is_projected:
-            return np.asarray(1.0 / np.column_stack([size, size, up]))
-        meridian_m = EARTH_RADIUS_M * size
-        parallel_m = meridian_m * np.maximum(np.cos(xyz[:, 1] * size), 1e-9)
-        return np.asarray(1.0 / np.column_stack([parallel_m, meridian_m, up]))
+            return np.tile([size, size, up], (len(xyz), 1))
+        parallel = np.maximum(np.cos(xyz[:, [1]] * size), 1e-9)
+        meridian_m = np.full((len(xyz), 1), EARTH_RADIUS_M * size)
+        return np.hstack([meridian_m * parallel, meridian_m, np.full_like(parallel, up)])
 
     def check(self, xyz: FloatArray, labels: Sequence[str], name: str) -> None:
         """Raise InputError for numbers that are no place on the earth."""
@@ -163,7 +162,7 @@ class Georeference:
         if self.frame is None:
             return np.broadcast_to(np.eye(3), (len(xyz), 3, 3))
         at = xyz + self.offset
-        steps = STEP_M * np.eye(3) * self.frame.per_metre(at)[:, None, :]
+        steps = STEP_M * np.eye(3) / self.frame.metres(at)[:, None, :]
         ahead, behind = (self.forward((at[:, None] + s).reshape(-1, 3)) for s in (steps, -steps))
         if not (np.isfinite(ahead).all() and np.isfinite(behind).all()):
             return np.full((len(xyz), 3, 3), np.nan)
@@ -349,7 +348,7 @@ def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> GnssDifferen
             return GnssDifferences(plain)
         frame = frame_of(crs, name)
         if frame.direct and frame.crs.is_projected:
-            return GnssDifferences(np.asarray(plain / frame.per_metre(cameras.centres)))
+            return GnssDifferences(plain * frame.metres(cameras.centres))
     if gnss.crs is None or not tied or not is_tied(gnss.crs, name):
         reason = f"{name}: the cameras or the GNSS positions name no CRS; they are not compared."
         return GnssDifferences(np.full((len(cameras), 3), np.nan), reason)

@@ -13,22 +13,17 @@ A line of tracks.csv is image, track, feature, x, y and more that differs betwee
 without a header, 1 and 2 with one): scale, colour, segmentation. x and y are image coordinates
 divided by the larger side, the origin in the image centre.
 
+Of the interior orientation, `focal`, `focal_x`, `focal_y`, `c_x` and `c_y` are in units of the
+larger side too, from the centre of the image. The tangential terms follow OpenCV (p1 with 2 x y in
+x). Distortion acts on the projected coordinates, which are angles for the fisheye models.
+
+When a block is written, cameras in a projected CRS are taken to the axes east, north, up at the
+middle of the block, at height 0, by the inverse of what `georeference` does on reading. Heights are
+taken as ellipsoidal where the CRS does not say what they are. Cameras in no CRS keep their numbers,
+and no reference is written.
+
 References: "Reconstruction file", "Coordinate Systems" and "Rig Models" in the manual,
 https://opensfm.org/docs.
-
-The camera models of OpenSfM as a Lens in pixels, and a block written with them.
-
-Image coordinates are divided by the larger side of the image, the origin is its centre, x right
-and y down; so are `focal`, `focal_x`, `focal_y`, `c_x` and `c_y`. The tangential terms follow
-OpenCV (p1 with 2 x y in x). Distortion acts on the projected coordinates, which are angles for
-the fisheye models.
-
-OpenSfM's world is topocentric. Cameras in a projected CRS are taken to the axes east, north, up at
-the middle of the block, at height 0, by the inverse of what `georeference` does on reading: centres
-and tie points through PROJ, rotations by the turn of the axes at their own centre. Heights are
-taken as ellipsoidal where the CRS does not say what they are, as the reader takes them back.
-Cameras in no CRS keep their numbers, and no reference is written. The file of tracks is of version
-2: image, track, feature, x, y, scale, red, green, blue, segmentation, instance.
 """
 
 from __future__ import annotations

@@ -19,16 +19,10 @@ Markers stand in the document of the frame, as ``location`` with x and y; only t
 measured, the others Metashape computed from the poses. Where the GNSS put the cameras is their
 ``reference``, in the CRS of the cameras or of the chunk.
 
-Calibration. With (x, y) the direction, (X, Y) / Z for a frame camera, and r its length:
-
-    x' = x (1 + k1 r^2 + ... + k4 r^8) + (p1 (r^2 + 2 x^2) + 2 p2 x y) (1 + p3 r^2 + p4 r^4)
-    u = width / 2 + cx + x' f + x' b1 + y' b2        v = height / 2 + cy + y' f
-
-y' with p1 and p2 exchanged. Pixels start at the corner of the image. A fisheye is equidistant,
-r = theta, and since version 2.3 can be equisolid, r = 2 sin(theta / 2); both get the same
-distortion. Files of PhotoScan up to 1.2 can have fx and fy instead of f; there cx and cy count
-from the corner, and p1 and p2 change places. Decisive is the element, as the version of the
-document is not.
+Calibration. The formula is that of `pcfix.model.Lens`, with cx and cy from the centre of the image.
+A fisheye is equidistant, and since version 2.3 can be equisolid. Files of PhotoScan up to 1.2 can
+have fx and fy instead of f; there cx and cy count from the corner, and p1 and p2 change places.
+The element decides this, as the version of the document does not.
 
 References: "Agisoft Metashape User Manual, Professional Edition", appendix "Camera models";
 "Metashape Python Reference", Chunk.transform, Sensor.location, CoordinateSystem.geoccs;

@@ -1,24 +1,21 @@
 """Plain tables of poses: a header line, then one image a row.
 
 Fields are separated by comma, semicolon, tab or spaces; the header may be a comment (#), and units
-may stand in it (x[m], omega[gon]). What its columns may be called is in `SPELLINGS`:
+may stand in it (x[m], omega[gon]). What its columns may be called is in `SPELLINGS`: the image, its
+projection centre (longitude and latitude in degrees of WGS 84 are EPSG:4326, or EPSG:4979 if the
+header says that the heights are ellipsoidal), and how it is turned, or nothing:
 
-- the image: label, name, image, filename, PhotoID, imageName, SourceFile, ...
-- its projection centre: x, y, z; easting, northing, height; or longitude, latitude, altitude in
-  degrees of WGS 84 (EPSG:4326; EPSG:4979 if the header says that the heights are ellipsoidal);
-- how it is turned, or nothing:
-
-  - omega, phi, kappa: photogrammetric camera axes (x right, y up, z back) go to the world by
-    Rx(omega) Ry(phi) Rz(kappa). Beside them r11 ... r33, rows of the matrix from the world to
-    those axes, must agree (Metashape's export of omega, phi, kappa).
-  - yaw, pitch, roll, 0 for a view straight down: those axes go to the world by
-    Rz(-yaw) Rx(pitch) Ry(roll). So are Metashape's reference angles, ODM's, and the heading,
-    pitch, roll of RealityCapture.
-  - yaw, pitch, roll of a gimbal, -90 for a view straight down (``angles="aircraft"``, or
-    exiftool's GimbalPitchDegree): Rz(-yaw) Rx(90 + pitch) Rz(-roll). Angles that fit this better
-    than the former are refused until the user says which they are.
-  - qw, qx, qy, qz: world to camera with axes x right, y down, z forward, as in COLMAP.
-  - only r11 ... r33: world to camera, to either of the two axes; the cameras look down.
+- omega, phi, kappa: photogrammetric camera axes (x right, y up, z back) go to the world by
+  Rx(omega) Ry(phi) Rz(kappa). Beside them r11 ... r33, rows of the matrix from the world to
+  those axes, must agree (Metashape's export of omega, phi, kappa).
+- yaw, pitch, roll, 0 for a view straight down: those axes go to the world by
+  Rz(-yaw) Rx(pitch) Ry(roll). So are Metashape's reference angles, ODM's, and the heading,
+  pitch, roll of RealityCapture.
+- yaw, pitch, roll of a gimbal, -90 for a view straight down (``angles="aircraft"``, or
+  exiftool's GimbalPitchDegree): Rz(-yaw) Rx(90 + pitch) Rz(-roll). Angles that fit this better
+  than the former are refused until the user says which they are.
+- qw, qx, qy, qz: world to camera with axes x right, y down, z forward, as in COLMAP.
+- only r11 ... r33: world to camera, to either of the two axes; the cameras look down.
 
 Axes of the world are those of the CRS of the positions: its grid north, or for degrees the east,
 north and up of the place. Values called ``_est`` are adjusted ones; the others beside them are then
