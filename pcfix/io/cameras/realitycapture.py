@@ -36,23 +36,23 @@ import numpy as np
 
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import Source, number, numbers, read_xml
+from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.io.cameras.table.sensor import read_sensor
 from pcfix.io.cameras.tracks import image_size
 from pcfix.model import Cameras, FloatArray, Lens
 
 NAMESPACE = "http://www.capturingreality.com/ns/xcr/"
 DESCRIPTION = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}Description"
-HEAD_BYTES = 65536
 FILM_MM = 36.0
 MODELS = {
-    "perspective": (0, 0),
-    "brown3": (3, 0),
-    "brown4": (4, 0),
-    "brown3t2": (3, 2),
-    "brown4t2": (4, 2),
-    "division": (1, 0),
+    "perspective": "",
+    "brown3": "k1 k2 k3",
+    "brown4": "k1 k2 k3 k4",
+    "brown3t2": "k1 k2 k3 p1 p2",
+    "brown4t2": "k1 k2 k3 k4 p1 p2",
+    "division": "k1",
 }
-"""How many radial and tangential coefficients each model has."""
+"""The coefficients of each model, of the six that its files list."""
 IMAGES = (".jpg", ".jpeg", ".tif", ".tiff", ".png", ".webp", ".bmp", ".exr", ".jp2")
 
 
@@ -76,7 +76,7 @@ def recognises(source: Source) -> bool:
     """Whether a file, or one of the .xmp files of a folder, uses RealityCapture's namespace."""
     if not source.path.is_dir():
         return NAMESPACE.encode() in source.head
-    return any(_is_ours(path) for path in _files(source.path))
+    return bool(_files(source.path))
 
 
 def read(source: Source) -> Cameras:
@@ -87,7 +87,7 @@ def read(source: Source) -> Cameras:
     images = [
         Image(file, beside.get(file.stem, file.stem), _fields(file))
         for file in _files(path)
-        if _is_ours(file) and file.stem != "_common"  # which speaks of no image
+        if file.stem != "_common"  # which speaks of no image
     ]
     posed = [image for image in images if {"Rotation", "Position"} <= image.fields.keys()]
     if not posed:
@@ -113,15 +113,11 @@ def read(source: Source) -> Cameras:
 
 
 def _files(path: Path) -> list[Path]:
-    """Return the .xmp files of a folder, or the one file."""
+    """Return the one file, or those of a folder that use RealityCapture's namespace."""
     if not path.is_dir():
         return [path]
-    return sorted(p for p in path.iterdir() if p.suffix.lower() == ".xmp" and p.is_file())
-
-
-def _is_ours(path: Path) -> bool:
-    with path.open("rb") as stream:
-        return NAMESPACE.encode() in stream.read(HEAD_BYTES)
+    listed = sorted(p for p in path.iterdir() if p.suffix.lower() == ".xmp" and p.is_file())
+    return [file for file in listed if NAMESPACE.encode() in file.read_bytes()]
 
 
 def _fields(path: Path) -> dict[str, str]:
@@ -140,25 +136,20 @@ def _lens(image: Image, frame: tuple[float, float]) -> Lens:
     width, height = frame
     scale = max(frame)
     across = image.number("FocalLength35mm", "") / FILM_MM * scale
-    u, v = (image.number(f"PrincipalPoint{axis}") * scale for axis in "UV")
     focal = across * image.number("AspectRatio", "1")
+    x, y = (image.number(f"PrincipalPoint{axis}") * scale for axis in "UV")
     model = image.fields.get("DistortionModel", "perspective")
     if model not in MODELS:
         remedy = f"Export with one of {', '.join(MODELS)}"
         what = f"the distortion model '{model}' of {image.label}"
         raise checks.unsupported(image.path, what, remedy, model=model, image=image.label)
-    radial, tangential = MODELS[model]
     name = "DistortionCoeficients"  # misspelt in the files too
     given = image.numbers(name, len(image.fields.get(name, "").split())).tolist()
-    k = [*given, *(0.0,) * 6][:6]
-    x, y = width / 2.0 + u, height / 2.0 + v
-    lens = Lens(
-        *(focal, width, height, x, y),
-        b1=across - focal,
-        b2=image.number("Skew") * scale,
-        radial=tuple(k[:radial]),
-        tangential=tuple(k[4 : 4 + tangential]),
-    )
+    k = dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), given, strict=False))
+    values = {name: k[name] for name in MODELS[model].split() if name in k}
+    values |= {"fx": across, "fy": focal, "skew": image.number("Skew") * scale}
+    values |= {"cx": width / 2.0 + x, "cy": height / 2.0 + y}
+    lens = lens_by_name(values, width, height)
     if model != "division":
         return lens
     # In plane coordinates the centre of the image is at minus the principal point over the focal
@@ -166,7 +157,7 @@ def _lens(image: Image, frame: tuple[float, float]) -> Lens:
     return replace(
         lens,
         radial=(),
-        denominator=(k[0] * (across / scale) ** 2,),
-        distortion_centre=((width / 2.0 - x) / across, (height / 2.0 - y) / focal),
+        denominator=(k.get("k1", 0.0) * (across / scale) ** 2,),
+        distortion_centre=(-x / across, -y / focal),
         inverse=True,
     )

@@ -427,8 +427,8 @@ def gnss_positions(
     Positions that the user unticked are no measurement and left out, unless all are, as is usual
     when only control points determine the block.
     """
-    path = chunk.path
-    given = [image.element.find("reference") for image in block.images]
+    path, images = chunk.path, block.images
+    given = [image.element.find("reference") for image in images]
     ticked = [None if r is None or r.get("enabled") == "false" else r for r in given]
     used = given if all(reference is None for reference in ticked) else ticked
     settings = {
@@ -437,7 +437,7 @@ def gnss_positions(
     }
     start = spreads(path, "settings of the chunk", settings, DEFAULTS, np.full(3, np.nan))
     xyz, sigma = np.full((2, len(used), 3), np.nan)
-    for i, (image, reference) in enumerate(zip(block.images, used, strict=True)):
+    for i, (image, reference) in enumerate(zip(images, used, strict=True)):
         where = f"image {image.label}, reference"
         stated = {} if reference is None else reference.attrib
         for j, axis in enumerate("xyz"):
@@ -452,16 +452,18 @@ def gnss_positions(
     crs = own or text_of(chunk.element, "reference") or "LOCAL"
     are_degrees = bool((np.nanmax(np.abs(xyz[:, :2]), axis=0) <= [180.0, 90.0]).all())
     if crs.upper() == "LOCAL" or is_local(parsed := parse_crs(crs, str(path))):
-        crs = "local"
+        crs = LOCAL
     elif are_degrees and not own and not parsed.is_geographic:
         sentence = "the camera positions are degrees in a CRS in metres; WGS 84 is assumed."
         crs, notes = "EPSG:4979", [note(path, "cameras.gnss_in_degrees", sentence)]
-    for sensor in dict.fromkeys(image.sensor for image in block.images):
-        antenna = [] if sensor is None else text_of(sensor, "antenna/location").split()
-        for shift in () if sensor is None else sensor.iterfind("antenna/reference"):
-            antenna += [shift.get(axis) or "0" for axis in "xyz"]
-            antenna += (shift.get("location") or "").split()
-        if sensor is not None and any(number(path, "GNSS antenna", one) for one in antenna):
+    for sensor in dict.fromkeys(image.sensor for image in images if image.sensor is not None):
+        antenna = text_of(sensor, "antenna/location").split()
+        for shift in sensor.iterfind("antenna/reference"):
+            antenna += [
+                *(shift.get(axis) or "0" for axis in "xyz"),
+                *shift.get("location", "").split(),
+            ]
+        if any(number(path, "GNSS antenna", one) for one in antenna):
             label = name_of(sensor)
             sentence = f"the GNSS positions are those of the antenna (sensor {label}), not offset."
             notes.append(note(path, "cameras.antenna_offset", sentence, sensor=label))

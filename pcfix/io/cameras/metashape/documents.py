@@ -13,16 +13,7 @@ from xml.etree.ElementTree import Element
 
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import (
-    ZIP_MAGIC,
-    Source,
-    damaged,
-    missing,
-    note,
-    number,
-    read_xml,
-    reading,
-)
+from pcfix.io.cameras.checks import ZIP_MAGIC, Source, damaged, note, number, read_xml, reading
 
 ROOT = re.compile(r"\s*(?:<\?.*?\?>\s*|<!--.*?-->\s*)*<(\w+)", re.DOTALL)
 OF_CHUNKS = re.compile(r"<chunks?\b|\bpath=")
@@ -159,8 +150,6 @@ def read_entry(path: Path) -> Document:
 
 def open_archive(path: Path) -> zipfile.ZipFile:
     """Open an archive."""
-    if not path.is_file():
-        raise missing(path)
     with reading(path):
         return zipfile.ZipFile(path)
 
