@@ -47,7 +47,7 @@ from pcfix.io.cameras.tracks import NO_TIE_POINTS, are_seen
 from pcfix.io.labels import unnamed
 from pcfix.io.tables import read_lines
 from pcfix.lens.rotations import from_rotation_vectors
-from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, TiePoints
+from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
 from pcfix.options.declare import File
 
 TOPOCENTRIC_LIMIT_M = 1e5
@@ -120,15 +120,17 @@ def read_reconstruction(path: Path) -> Reconstruction:
             raise checks.no_pose(path, "all images are of all-round cameras (spherical)")
         lenses = {k: lens(path, k, entries[k]) for k in {shot["camera"] for shot in shots.values()}}
         rotations, shifts = _poses(chosen, shots)
-        xyz, sigma = np.full((2, len(shots), 3), np.nan)
-        for i, shot in enumerate(shots.values()):
-            dop = shot.get("gps_dop")
-            if shot.get("gps_position") is not None and dop != NO_GNSS:
-                xyz[i] = checks.triple(shot["gps_position"])
-                sigma[i] = np.nan if dop is None else dop
+        dops = {k: shot.get("gps_dop") for k, shot in shots.items()}
+        places = {
+            k: (
+                checks.triple(shot["gps_position"]),
+                np.full(3, np.nan if dops[k] is None else dops[k]),
+            )
+            for k, shot in shots.items()
+            if shot.get("gps_position") is not None and dops[k] != NO_GNSS
+        }
         reference = _reference(path, chosen)
         crs = "local" if reference is None else "ENU:" + ",".join(map(repr, reference))
-        has_gnss = reference is not None and np.isfinite(xyz).any()
         listed = path.with_name("image_list.txt")  # the images that the project was given
         lines = read_lines(listed) if listed.is_file() else []
         given = [PurePath(line.strip().replace("\\", "/")).name for line in lines if line.strip()]
@@ -139,7 +141,7 @@ def read_reconstruction(path: Path) -> Reconstruction:
             lenses=tuple(lenses[shot["camera"]] for shot in shots.values()),
             crs=crs,
             notes=tuple(notes),
-            gnss=GnssPositions(xyz, sigma, crs) if has_gnss else None,
+            gnss=checks.measured([*shots], places, crs) if reference else None,
             unposed=unnamed([*others, *panoramas, *given], shots),
             source="OpenSfM",
         )

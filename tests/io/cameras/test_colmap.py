@@ -126,8 +126,7 @@ def test_binary_knows_the_models_by_their_numbers(tmp_path, number):
     pycolmap = pytest.importorskip("pycolmap")
     twin = pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(number), 500.0, 800, 600)
     model = MODELS[number]
-    names, projection, _ = BY_NAME[model]
-    names = names.split()
+    names, projection = BY_NAME[model].names.split(), BY_NAME[model].projection
     assert (twin.model_name, len(twin.params)) == (model, len(names))
     if projection is None:
         return

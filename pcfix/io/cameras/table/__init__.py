@@ -117,27 +117,24 @@ def read(source: Source) -> Cameras:
             raise checks.no_pose(source.path, "no image has a position")
         unposed = tuple(columns.labels[i] for i in np.flatnonzero(lost))
         columns = columns.take(np.flatnonzero(~lost))
-    xyz = centres(columns, suffix, needed=True)
+    labels, first = columns.labels, dict[tuple[str, bytes], int]()
+    for i, place in enumerate(centres(columns, suffix, needed=True)):
+        first.setdefault((labels[i], place.tobytes()), i)  # an exact copy counts once
+    columns = columns.take(np.array(list(first.values())))
     turns = _rotations(columns, source.angles, suffix)
-    lenses = None if turns is None else read_lenses(columns, source.sensor)
-    first: dict[tuple[str, bytes], int] = {}  # labels are no key, but an exact copy counts once
-    for i, label in enumerate(columns.labels):
-        first.setdefault((label, xyz[i].tobytes()), i)
-    keep = np.array(list(first.values()))
     system, notes = crs(columns)
     if by_gnss:
         sentence = "its positions are those of the GNSS, not adjusted ones."
         notes += (note(columns.path, "cameras.not_adjusted", sentence),)
-    dropped = len(columns.labels) - len(keep)
-    gnss = gnss_positions(columns) if suffix else None
+    copies = len(labels) - len(first)
     return Cameras(
-        labels=tuple(columns.labels[i] for i in keep),
-        centres=xyz[keep],
-        rotations=None if turns is None else turns[keep],
-        lenses=None if lenses is None else tuple(lenses[i] for i in keep),
+        labels=tuple(columns.labels),
+        centres=centres(columns, suffix, needed=True),
+        rotations=turns,
+        lenses=None if turns is None else read_lenses(columns, source.sensor),
         crs=system,
-        notes=(*checks.repeated(columns.path, columns.labels, dropped), *notes),
-        gnss=gnss and GnssPositions(gnss.xyz[keep], gnss.sigma_m[keep], gnss.crs),
+        notes=(*checks.repeated(columns.path, labels, copies), *notes),
+        gnss=gnss_positions(columns) if suffix else None,
         unposed=unposed,
         source="CSV table",
     )
