@@ -233,25 +233,21 @@ BY_NAME = {
 MODELS = tuple(BY_NAME)
 
 
-class Camera(NamedTuple):
-    """A row of the camera list."""
-
-    model: str
-    width: float
-    height: float
-    values: tuple[float, ...]
+Camera = tuple[str, float, float, tuple[float, ...]]
+"""A row of the camera list: model, width, height, parameters."""
 
 
 def lens_of(path: Path, identifier: int, camera: Camera) -> Lens:
     """Return the lens of a camera."""
-    model, sensor = BY_NAME[camera.model], f"{identifier} {camera.model}"
+    name, width, height, values = camera
+    model = BY_NAME[name]
     if model.projection is None:
-        raise _no_model(path, identifier, camera.model)
-    given = dict(zip(model.names.split(), camera.values, strict=True))
+        raise _no_model(path, identifier, name)
+    given = dict(zip(model.names.split(), values, strict=True))
     is_straight = model.projection == "fov" and abs(given["omega"]) < _SMALLEST_OMEGA
     projection = "perspective" if is_straight else model.projection
-    more = {"projection": projection, "in_turn": model.in_turn, "sensor": sensor}
-    return lens_by_name(given, camera.width, camera.height, **more)
+    more = {"projection": projection, "in_turn": model.in_turn, "sensor": f"{identifier} {name}"}
+    return lens_by_name(given, width, height, **more)
 
 
 def _no_model(path: Path, camera: object, model: object) -> InputError:
@@ -324,7 +320,7 @@ def read_list(path: Path) -> dict[int, Camera]:
                     raise _no_model(path, identifier, number)
                 count = len(BY_NAME[MODELS[number]].names.split())
                 values = _take(file, struct.Struct(f"<{count}d"))
-                cameras[identifier] = Camera(MODELS[number], float(width), float(height), values)
+                cameras[identifier] = MODELS[number], float(width), float(height), values
             return cameras
         for name, model, *words in filter(None, map(str.split, _lines(path))):
             if model not in BY_NAME:
@@ -332,7 +328,7 @@ def read_list(path: Path) -> dict[int, Camera]:
             width, height, *numbers = map(float, words)
             if len(numbers) != len(BY_NAME[model].names.split()):
                 raise damaged(path, f"camera {name}: {len(numbers)} parameters of {model}")
-            cameras[int(name)] = Camera(model, width, height, tuple(numbers))
+            cameras[int(name)] = model, width, height, tuple(numbers)
         _check_count(path, len(cameras))
     return cameras
 
