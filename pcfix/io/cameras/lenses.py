@@ -24,7 +24,6 @@ SHAPES: Mapping[Projection, str] = {
     "dual": "transition",
 }
 LETTERS = {"radial": "k", "denominator": "d", "tangential": "p", "thin_prism": "s"}
-MOST_TERMS = 9
 ROUNDING = 1e-11
 """Of a principal point in the middle, and of equal focal lengths, in focal lengths."""
 
@@ -44,8 +43,9 @@ def lens_by_name(given: Mapping[str, float], width: float, height: float, **more
     """
     value = defaultdict(float, given)
     focal = given.get("fy", value["f"])
+    most = max((int(name[1:]) for name in given if name[1:].isdecimal()), default=0)
     terms = {
-        field: without_zeros([value[f"{letter}{i}"] for i in range(1, MOST_TERMS + 1)])
+        field: without_zeros([given.get(f"{letter}{i}", 0.0) for i in range(1, most + 1)])
         for field, letter in LETTERS.items()
     }
     shape = tuple(value[name] for name in SHAPES.get(more.get("projection", ""), "").split())

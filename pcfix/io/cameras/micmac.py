@@ -39,7 +39,7 @@ from pcfix.errors import InputError, bad_file
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import Source, damaged, number, numbers, read_xml
 from pcfix.io.cameras.checks import text_of as _text
-from pcfix.io.cameras.lenses import without_zeros
+from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.model import Cameras, FloatArray, Lens
 
 PREFIX, PREFIX_2, SUFFIX = "Orientation-", "Ori-PerspCentral-", ".xml"
@@ -49,6 +49,7 @@ NO_DISTORTION = ("ModNoDist", "eModelePolyDeg0")
 AFFINITY_PX = 0.1
 """Largest distance in the frame that a lens with Fraser's affinity may be off."""
 
+NAMES = (*(f"k{i}" for i in range(1, 10)), "p1", "p2", "b1", "b2")
 _IS_INVERSE = {"": False, "eConvApero_DistM2C": False, "eConvApero_DistC2M": True}
 
 
@@ -131,56 +132,51 @@ def _calibration(path: Path, element: Element) -> Lens:
     models = [(name, model) for name, model in named if name not in NO_DISTORTION]
     if len(models) > 1:
         raise _not_held(path, " after ".join(name for name, _ in models))
-    centre, radial, rest = principal, np.empty(0), [0.0] * 4  # of P1, P2, b1, b2
+    centre, given = principal, dict[str, float]()
     for name, model in models:
         if name in UNIFIED:
-            given = [number(path, "Params", e.text) for e in model.findall("Params")]
-            if any(given[9:]):
-                raise damaged(path, f"{name} has {len(given)} Params instead of 9")
-            values = np.array([*given[:9], *(0.0,) * (9 - len(given))])
-            radial, rest = values[:5], values[5:].tolist()
+            values = [number(path, "Params", e.text) for e in model.findall("Params")]
+            if any(values[9:]):
+                raise damaged(path, f"{name} has {len(values)} Params instead of 9")
+            given = dict(zip((*NAMES[:5], *NAMES[-4:]), values, strict=False))
         elif name in ("ModRad", "ModPhgrStd"):
             inside = model.find("RadialePart")
             part = model if inside is None else inside
             centre = numbers(path, "CDist", part.findtext("CDist"), 2)
             terms = [number(path, "CoeffDist", e.text) for e in part.findall("CoeffDist")]
-            radial = np.array(terms)
-            if name == "ModPhgrStd":
-                tags = ("P1", "P2", "b1", "b2")
-                rest = [number(path, tag, model.findtext(tag, "0")) for tag in tags]
+            given = {f"k{i}": term for i, term in enumerate(terms, start=1)}
+            for tag in ("P1", "P2", "b1", "b2") if name == "ModPhgrStd" else ():
+                given[tag.lower()] = number(path, tag, model.findtext(tag, "0"))
         else:
             raise _not_held(path, name)
     # MicMac's coefficients are of places in pixels, those of a Lens of places over the focal length
-    radial = radial * np.float64(focal) ** (2 * np.arange(len(radial)) + 2)
-    rest = [rest[0] * focal, rest[1] * focal, *rest[2:]]
-    frame = size, principal, centre
-    return _lens(path, focal, frame, radial, rest, is_inverse=_IS_INVERSE[convention])
+    powers = {"p1": 1, "p2": 1, "b1": 0, "b2": 0}
+    given = {k: value * focal ** powers.get(k, 2 * int(k[1:])) for k, value in given.items()}
+    return _lens(path, focal, (size, principal, centre), given, is_inverse=_IS_INVERSE[convention])
 
 
 def _lens(
-    path: Path, focal: float, frame: tuple[FloatArray, FloatArray, FloatArray], radial: FloatArray,
-    rest: Sequence[float], *, is_inverse: bool = False,
+    path: Path, focal: float, frame: tuple[FloatArray, FloatArray, FloatArray],
+    given: dict[str, float], *, is_inverse: bool = False,
 ) -> Lens:  # fmt: skip
-    """Return the lens of coefficients k1, k2, ... and P1, P2, b1, b2 of places over the focal.
+    """Return the lens of coefficients k1, k2, ..., p1, p2, b1, b2 of places over the focal length.
 
     The `frame` is its size, the principal point and the centre of the distortion, pixels.
     """
-    (p1, p2, b1, b2), (size, principal, centre) = rest, frame
+    b1, b2, (size, principal, centre) = given.get("b1", 0.0), given.get("b2", 0.0), frame
+    (width, height), (x, y), (cx, cy) = size.tolist(), principal.tolist(), centre.tolist()
+    values = given | {"fx": focal + b1 * focal, "fy": focal, "skew": b2 * focal}
+    values |= {"cx": x + b1 * (x - cx) + b2 * (y - cy), "cy": y}
+    middle = ((cx - x) / focal, (cy - y) / focal)
+    more = {"distortion_centre": middle, "inverse": is_inverse, "sensor": path.stem}
+    lens = lens_by_name(values, width, height, **more)
     if b1 or b2:  # held where it makes no difference that the lens has them after the distortion
         farthest = np.hypot(*np.maximum(np.abs(centre), np.abs(size - centre))) / focal
-        r = np.linspace(0.0, farthest, 50)
+        r, radial = np.linspace(0.0, farthest, 50), lens.radial or (0.0,)
         away = focal * np.abs(r**3 * np.polynomial.polynomial.polyval(r * r, radial)).max()
         if is_inverse or not np.hypot(b1, b2) * away <= AFFINITY_PX:
             raise _not_held(path, "affinity (b1, b2)")
-    (width, height), (x, y), (cx, cy) = size.tolist(), principal.tolist(), centre.tolist()
-    return Lens(
-        *(focal, width, height, x + b1 * (x - cx) + b2 * (y - cy), y, b1 * focal, b2 * focal),
-        radial=without_zeros(radial.tolist()),
-        tangential=without_zeros([p1, p2]),
-        distortion_centre=((cx - x) / focal, (cy - y) / focal),
-        inverse=is_inverse,
-        sensor=path.stem,
-    )
+    return lens
 
 
 def _scanned(path: Path, element: Element | None, lens: Lens) -> Lens:
@@ -209,14 +205,11 @@ def _calibration_2(path: Path, root: Element) -> Lens:
     principal = numbers(path, "PP", root.findtext(".//PerfectProj/PP"), 2)
     size = numbers(path, "NbPix", root.findtext(".//PixelFrame/NbPix"), 2)
     terms = [term for part in root.iterfind(".//Distorsion/*") for term in part]
-    given = {str(term.tag): number(path, str(term.tag), term.text) for term in terms}
-    names = [f"K{i}" for i in range(1, 10)]
-    others = sorted(k for k, v in given.items() if v and k not in {*names, "p1", "p2", "b1", "b2"})
+    given = {str(term.tag).lower(): number(path, str(term.tag), term.text) for term in terms}
+    others = sorted(k for k, v in given.items() if v and k not in NAMES)
     if others:
         raise _not_held(path, f"terms {', '.join(others)}")
-    radial = np.array([given.get(name, 0.0) for name in names])
-    rest = [given.get(name, 0.0) for name in ("p1", "p2", "b1", "b2")]
-    return _lens(path, focal, (size, principal, principal), radial, rest)
+    return _lens(path, focal, (size, principal, principal), given)
 
 
 def _not_held(path: Path, what: str) -> InputError:
