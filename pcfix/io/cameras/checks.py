@@ -242,12 +242,14 @@ def measured(
 ) -> GnssPositions | None:
     """Return the GNSS positions of images by their keys, with their standard deviations.
 
-    Numbers that are not finite are unknown. None where no image has a position.
+    Numbers that are not finite are unknown; a position may lack its height only. None where no
+    image has a position.
     """
     nothing = np.full(3, np.nan)
     rows = [places.get(key, (nothing, nothing)) for key in keys]
     xyz, sigma = (np.array([row[i] for row in rows], np.float64).reshape(-1, 3) for i in (0, 1))
-    xyz[~np.isfinite(xyz).all(axis=1)] = np.nan
+    xyz[~np.isfinite(xyz)] = np.nan
+    xyz[np.isnan(xyz[:, :2]).any(axis=1)] = np.nan
     return None if np.isnan(xyz).all() else GnssPositions(xyz, sigma, crs)
 
 
