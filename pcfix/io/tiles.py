@@ -14,7 +14,7 @@ import shapely
 
 from pcfix.errors import InputError, PcfixWarning, SettingError, bad_file
 from pcfix.io.files import path_of, read_json
-from pcfix.io.las.part import CloudPart, asked_part
+from pcfix.io.las.part import CloudPart
 from pcfix.io.las.source import LasSource, metric_crs
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
@@ -111,9 +111,14 @@ def part_of(path: Path, options: Any) -> Path | CloudPart:
 
     The points of the part are counted, once for all readers; an `InputError` if there are none.
     """
-    part = asked_part(options)
-    if part is None:
+    bounds = getattr(options, "bounds", None)
+    part = CloudPart(path, bounds, getattr(options, "read_resolution", None))
+    if part.bounds is None is part.resolution:
         return path
+    west, south, east, north = bounds or (0.0, 0.0, 1.0, 1.0)
+    if not (west < east and south < north):
+        words = f"bounds {west:g},{south:g},{east:g},{north:g} must be west,south,east,north."
+        raise SettingError("option.range", words, option="bounds")
     with LasSource(path, getattr(options, "jobs", None)) as source:
         header, count, ends = source.header, 0, list[Any]()
         for points in source.chunks_within(part):
@@ -121,12 +126,16 @@ def part_of(path: Path, options: Any) -> Path | CloudPart:
             xyz = [points.array[axis] for axis in "XYZ"]
             ends.append([[one.min() for one in xyz], [one.max() for one in xyz]])
     if not count:
-        reach = ",".join(f"{one:.12g}" for one in (*header.mins[:2], *header.maxs[:2]))
-        sentence = f"no point lies {part}. The cloud reaches over {reach}."
+        asked, reach = (
+            ",".join(f"{one:.12g}" for one in box)
+            for box in (bounds or (), (*header.mins[:2], *header.maxs[:2]))
+        )
+        sentence = f"has no point within {asked}. The cloud extends over {reach}."
         raise bad_file(path, "cloud.bounds", sentence)
     low, high = np.min(ends, axis=0)[0], np.max(ends, axis=0)[1]
     mins, maxs = (end * header.scales + header.offsets for end in (low, high))
-    return CloudPart(path, part, count, int(header.point_count), mins, maxs)
+    total = int(header.point_count)
+    return replace(part, points=count, points_of_file=total, mins=mins, maxs=maxs)
 
 
 def check_one_file(cloud: Any, options: Any) -> None:

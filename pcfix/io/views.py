@@ -60,7 +60,7 @@ from pcfix.lens.frames import beside_frames
 from pcfix.lens.imaging import straight_images
 from pcfix.model import Cameras, FloatArray, IntArray, TiePoints, ViewKind, Views
 from pcfix.options.declare import File
-from pcfix.sums import LEAST, SAME, Sums
+from pcfix.sums import LEAST, MOST, SAME, Sums
 
 COLMAP_LIST = "COLMAP view list"
 _HEAD = 8
@@ -384,7 +384,6 @@ _SAME = 0.05
 """A fraction of the spacing within which two positions are those of one point."""
 _ROUNDING = 1.01 * np.sqrt(3.0)
 """Of three coordinates that are each off by half a step, relative to that half step."""
-_BINS = 1000
 _MANY = 0.1
 """A share of points without a list from which on the user is warned."""
 _NEIGHBOURS = 20_000
@@ -473,18 +472,16 @@ class ViewMatch:
             from scipy.spatial import cKDTree
 
             self._tree = cKDTree(listed, balanced_tree=False, compact_nodes=False)
-        tolerance_m = self.tolerance_m or 0.0
-        reach, step = float(np.nextafter(tolerance_m, np.inf)), tolerance_m / _BINS
+        reach = float(np.nextafter(self.tolerance_m or 0.0, np.inf))
         for at in range(0, len(rest), _QUERIES):
             some = rest[at : at + _QUERIES]
             away, nearest = self._tree.query(xyz[some], distance_upper_bound=reach, workers=-1)
-            distance = np.asarray(away)
-            found = np.isfinite(distance)
-            bins = np.ceil(distance[found] / step) if step else np.zeros(found.sum())
-            bins = bins.astype(np.int64).clip(0, _BINS)
-            report._histogram += np.bincount(bins, minlength=_BINS + 1)
-            report.by_position += len(bins)
+            found = np.isfinite(away)
+            report.by_position += int(np.count_nonzero(found))
             report.unmatched += int(np.count_nonzero(~found))
+            if found.any():
+                farthest_m = float(away[found].max())
+                report.farthest_m = max(report.farthest_m or 0.0, farthest_m)
             row[some] = np.where(found, nearest, -1)
         return row
 
@@ -518,6 +515,7 @@ class ViewReport(Sums):
     tolerance_m: float | None = field(default=None, metadata=SAME)  # of a match by position
     by_row: int = 0
     by_position: int = 0
+    farthest_m: float | None = field(default=None, metadata=MOST)  # of these, from its list
     unmatched: int = 0
     without_camera: int = 0  # matched points none of whose images has a pose
     entries: int = 0  # cameras of all lists that were matched
@@ -527,19 +525,11 @@ class ViewReport(Sums):
     unposed: tuple[str, ...] = field(default=(), metadata=SAME)  # that a list may name
     weights: bool = field(default=False, metadata=SAME)
     notes: list[PcfixWarning] = field(default_factory=list, metadata=SAME)
-    _histogram: IntArray = field(default_factory=lambda: np.zeros(_BINS + 1, np.int64), repr=False)
 
     @property
     def points(self) -> int:
         """Points of the cloud so far."""
         return self.by_row + self.by_position + self.unmatched
-
-    def distance_m(self, share: float) -> float | None:
-        """Return a quantile of the distances of matches by position, to 0.1 % of the tolerance."""
-        if not self.by_position or self.tolerance_m is None:
-            return None
-        enough = np.cumsum(self._histogram) >= share * self.by_position
-        return float(int(np.argmax(enough)) * self.tolerance_m / _BINS)
 
     def check(self) -> None:
         """Refuse a list that gave no point of the cloud a camera."""
@@ -571,11 +561,9 @@ class ViewReport(Sums):
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
-        values = {k: v for k, v in vars(self).items() if not k.startswith("_") and k != "notes"}
+        values = {k: v for k, v in vars(self).items() if k != "notes"}
         values["unposed"] = list(self.unposed)
         values["cameras_per_point"] = self.entries / max(self.by_row + self.by_position, 1)
-        values["distance_median_m"] = self.distance_m(0.5)
-        values["distance_95_m"] = self.distance_m(0.95)
         return values
 
 

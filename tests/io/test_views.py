@@ -151,7 +151,7 @@ def test_real_vis_and_ply():
     assert strangers < 1e-3 * len(xyz)  # points that chance brought within the tolerance
     assert report.by_row == 1
     assert report.unmatched / len(xyz) == pytest.approx(2 / 3, abs=1e-3)
-    assert report.distance_m(0.95) < 0.001  # mm in the LAS
+    assert report.farthest_m <= report.tolerance_m
     assert report.tolerance_m == pytest.approx(0.011, abs=0.001)
     assert len(weights) == report.entries and weights.min() > 0
     assert codes(report) == ["views.unmatched"]
@@ -228,8 +228,7 @@ def test_thinned_shuffled_and_rounded(tmp_path, cameras, scene):
     found, _, report = given(match, xyz[some].round(2))
     assert found == [lists[i] for i in some]
     assert report.unmatched == 0
-    assert 0.001 < report.distance_m(0.5) < report.distance_m(0.95) < 0.009
-    assert report.as_dict()["distance_95_m"] == report.distance_m(0.95)
+    assert 0.001 < report.farthest_m < 0.009
     report.check()
 
 
@@ -246,7 +245,7 @@ def test_tolerance(tmp_path, cameras, scene):
         report.check()
     found, _, report = given(loose, moved)
     assert sum(a == b for a, b in zip(found, lists, strict=True)) > 390
-    assert report.distance_m(0.5) == pytest.approx(0.3, abs=0.001)
+    assert report.farthest_m == pytest.approx(0.3, abs=0.001)
 
 
 def test_a_row_is_missing(tmp_path, cameras, scene):

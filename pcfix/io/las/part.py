@@ -4,35 +4,35 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import laspy
 import lazrs
 import numpy as np
-from laspy.copc import Bounds, CopcReader, OctreeNode, load_octree_for_query
+from laspy.copc import Bounds, CopcReader, load_octree_for_query
 
-from pcfix.errors import SettingError
 from pcfix.model import BoolArray, FloatArray
 
 Box = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
-class Part:
-    """The points of a cloud that a command reads."""
+class CloudPart:
+    """A part of the cloud in a file; see `pcfix.io.tiles.part_of`, which counts its points."""
 
+    path: Path
     bounds: Box | None = None  # west, south, east, north, metres; points on the edges belong to it
     resolution: float | None = None  # of COPC: levels down to the first with this spacing, metres
+    points: int = 0
+    points_of_file: int = 0
+    # the lowest and highest coordinates of the part, shape (3,), metres
+    mins: FloatArray = field(default_factory=lambda: np.zeros(3))
+    maxs: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     def __str__(self) -> str:
-        words = []
-        if self.bounds is not None:
-            words.append("within " + ",".join(f"{one:.12g}" for one in self.bounds))
-        if self.resolution is not None:
-            words.append(f"at a resolution of {self.resolution:g} m")
-        return " ".join(words)
+        return str(self.path)
 
     def holds(self, points: laspy.ScaleAwarePointRecord) -> BoolArray:
         """Return which points of a chunk are within the bounds."""
@@ -44,30 +44,6 @@ class Part:
         return np.asarray((x >= west) & (x <= east) & (y >= south) & (y <= north))
 
 
-class CloudPart(NamedTuple):
-    """A part of the cloud in a file, which has at least one point; see `pcfix.io.tiles.part_of`."""
-
-    path: Path
-    part: Part
-    points: int
-    points_of_file: int
-    mins: FloatArray  # the lowest and highest coordinates of the part, shape (3,), metres
-    maxs: FloatArray
-
-    def __str__(self) -> str:
-        return str(self.path)
-
-
-def asked_part(options: Any) -> Part | None:
-    """Return the part that the options of a command ask for; None where they have or set none."""
-    part = Part(getattr(options, "bounds", None), getattr(options, "read_resolution", None))
-    west, south, east, north = part.bounds or (0.0, 0.0, 1.0, 1.0)
-    if not (west < east and south < north):
-        words = f"bounds {west:g},{south:g},{east:g},{north:g} must be west,south,east,north."
-        raise SettingError("option.range", words, option="bounds")
-    return None if part == Part() else part
-
-
 def part_report(cloud: object) -> dict[str, Any] | None:
     """Return what a summary says of the part that was read; None unless the cloud is a part."""
     if not isinstance(cloud, CloudPart):
@@ -75,8 +51,8 @@ def part_report(cloud: object) -> dict[str, Any] | None:
     return {
         "points": cloud.points,
         "of": cloud.points_of_file,
-        "bounds": None if cloud.part.bounds is None else list(cloud.part.bounds),
-        "read_resolution": cloud.part.resolution,
+        "bounds": None if cloud.bounds is None else list(cloud.bounds),
+        "read_resolution": cloud.resolution,
     }
 
 
@@ -86,13 +62,13 @@ def is_copc(header: laspy.LasHeader) -> bool:
 
 
 def nodes_in(
-    path: Path, part: Part, selection: laspy.DecompressionSelection, most: int
+    part: CloudPart, selection: laspy.DecompressionSelection, most: int
 ) -> Iterator[laspy.ScaleAwarePointRecord]:
     """Yield points of the nodes of a COPC file that a part may touch, at most `most` at a time.
 
     They come in the order of the file; a node with more points is one batch.
     """
-    with CopcReader.open(path) as reader:
+    with CopcReader.open(part.path) as reader:
         header, info, levels, box = reader.header, reader.copc_info, None, None
         if part.resolution is not None:
             halvings = math.ceil(math.log2(info.spacing / part.resolution))
@@ -107,21 +83,17 @@ def nodes_in(
         while nodes:
             counts = np.cumsum([one.point_count for one in nodes])
             count = max(int(np.searchsorted(counts, most, side="right")), 1)
-            yield _unpacked(reader, nodes[:count], selection)
+            data = bytearray()
+            for one in nodes[:count]:
+                reader.source.seek(one.offset)
+                data += reader.source.read(one.byte_size)
+            rows = np.zeros(counts[count - 1], header.point_format.dtype())
+            table = [(one.point_count, one.byte_size) for one in nodes[:count]]
+            lazrs.decompress_points_with_chunk_table(
+                data, reader.laszip_vlr.record_data, rows.view(np.uint8), table,
+                selection.to_lazrs(),
+            )  # fmt: skip
+            yield laspy.ScaleAwarePointRecord(
+                rows, header.point_format, header.scales, header.offsets
+            )
             del nodes[:count]
-
-
-def _unpacked(
-    reader: CopcReader, nodes: list[OctreeNode], selection: laspy.DecompressionSelection
-) -> laspy.ScaleAwarePointRecord:
-    """Return the points of some nodes."""
-    header, data = reader.header, bytearray()
-    for one in nodes:
-        reader.source.seek(one.offset)
-        data += reader.source.read(one.byte_size)
-    rows = np.zeros(sum(one.point_count for one in nodes), header.point_format.dtype())
-    table = [(one.point_count, one.byte_size) for one in nodes]
-    lazrs.decompress_points_with_chunk_table(
-        data, reader.laszip_vlr.record_data, rows.view(np.uint8), table, selection.to_lazrs()
-    )
-    return laspy.ScaleAwarePointRecord(rows, header.point_format, header.scales, header.offsets)

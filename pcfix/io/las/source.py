@@ -24,7 +24,7 @@ from laspy.vlrs.vlrlist import VLRList
 from pcfix.errors import SettingError, bad_file
 from pcfix.io.crs import METRES, shortened
 from pcfix.io.files import check_input
-from pcfix.io.las.part import CloudPart, Part, is_copc, nodes_in
+from pcfix.io.las.part import CloudPart, is_copc, nodes_in
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
 
@@ -326,7 +326,7 @@ class LasSource:
                 yield from self._kept
                 return
             self._kept.clear()
-        some = self._all_chunks() if self.part is None else self.chunks_within(self.part.part)
+        some = self._all_chunks() if self.part is None else self.chunks_within(self.part)
         for points in some:
             if self._kept is not None:
                 self._kept.append(points)
@@ -345,7 +345,7 @@ class LasSource:
             read += len(points)
             yield points
 
-    def chunks_within(self, part: Part) -> Iterator[laspy.ScaleAwarePointRecord]:
+    def chunks_within(self, part: CloudPart) -> Iterator[laspy.ScaleAwarePointRecord]:
         """Yield the points of a part, as they are in the file."""
         if part.resolution is not None and not is_copc(self.header):
             sentence = "is not COPC and has no coarser levels to read. Omit --read-resolution."
@@ -357,7 +357,7 @@ class LasSource:
                 end = info.hierarchy_root_offset + info.hierarchy_root_size
                 if end > self.path.stat().st_size:  # laspy would take memory for all of it
                     raise ValueError("its octree begins or ends behind its end")
-                chunks = nodes_in(self.path, part, self._selection, CHUNK_POINTS)
+                chunks = nodes_in(part, self._selection, CHUNK_POINTS)
             for points in chunks:
                 inside = part.holds(points)
                 if inside.any():
