@@ -96,7 +96,21 @@ def survey_cloud(
     columns: list[npt.NDArray[Any]] = []
     first = count = 0
     for points in chunks:
-        parts = _part(points, water, given=given, skip=skip_classes)
+        keep = ~(np.isin(np.arange(256), skip_classes)[points.classes] | points.withheld)
+        if not given and "WaterDepth" in points.dimensions:
+            depth = points.dimensions["WaterDepth"]
+            above = np.where(depth > 0.0, points.xyz[:, 2] + depth, np.nan)
+        elif water is not None:
+            from pcfix.water.surface import surface_above  # with its compiler, not quick to load
+
+            above = surface_above(water, points.xyz, points.heights).height_m
+        else:
+            above = np.full(len(points.xyz), np.nan)
+        bathymetric = kept(keep, points.classes) == BATHYMETRIC_POINT
+        parts = [kept(keep, points.xyz), kept(keep, above), bathymetric]
+        if points.dimensions.keys() >= set(SHIFTS):
+            shift = np.column_stack([points.dimensions[name] for name in SHIFTS])
+            parts.append(shift[keep])
         columns = columns or [empty((most, *part.shape[1:]), part.dtype) for part in parts]
         for column, part in zip(columns, parts, strict=True):
             column[first : first + len(part)] = part
@@ -118,27 +132,6 @@ def survey_cloud(
         water_m,
         water if exact and not isinstance(water, WaterDimension) else None,
     )
-
-
-def _part(
-    points: Told, water: WaterSurface | None, *, given: bool, skip: Sequence[int]
-) -> list[npt.NDArray[Any]]:
-    """Return place, water and whether of the bed of the points that count; perhaps shifts."""
-    xyz, classes, withheld, heights, dimensions = points
-    keep = ~(np.isin(np.arange(256), skip)[classes] | withheld)
-    if not given and "WaterDepth" in dimensions:
-        depth = dimensions["WaterDepth"]
-        above = np.where(depth > 0.0, xyz[:, 2] + depth, np.nan)
-    elif water is not None:
-        from pcfix.water.surface import surface_above  # with its compiler, not quick to load
-
-        above = surface_above(water, xyz, heights).height_m
-    else:
-        above = np.full(len(xyz), np.nan)
-    found = [kept(keep, xyz), kept(keep, above), kept(keep, classes) == BATHYMETRIC_POINT]
-    if dimensions.keys() >= set(SHIFTS):
-        found.append(np.column_stack([dimensions[name] for name in SHIFTS])[keep])
-    return found
 
 
 def own_water(source: LasSource) -> WaterSurface | None:

@@ -26,7 +26,6 @@ from pcfix.model import FloatArray
 
 if TYPE_CHECKING:
     from pyproj import CRS, Transformer
-    from pyproj.transformer import AreaOfInterest
 
 Heights = Literal["ellipsoidal", "gravity", "unstated"]
 
@@ -84,8 +83,8 @@ def crs_words(crs: CRS | None) -> tuple[str, str]:
     if crs is None:
         return "", ""
     plan, vertical = parts(crs)
-    code = (plan.to_json_dict() or {}).get("id")
-    name = f"{plan.name} ({code['authority']}:{code['code']})" if code else plan.name
+    code = _code(plan)
+    name = f"{plan.name} ({':'.join(code)})" if code else plan.name
     if vertical is not None:
         return name, vertical.name
     return name, "above the ellipsoid" if heights_of(crs) == "ellipsoidal" else ""
@@ -225,13 +224,10 @@ class Topocentric:
 
     def to_degrees(self, enu: FloatArray) -> FloatArray:
         """Return longitudes, latitudes and ellipsoidal heights (EPSG:4979) of points (n, 3)."""
-        return self._transformed(enu, "INVERSE")
+        return self.from_degrees(enu, "INVERSE")
 
-    def from_degrees(self, degrees: FloatArray) -> FloatArray:
+    def from_degrees(self, xyz: FloatArray, direction: str = "FORWARD") -> FloatArray:
         """Return the coordinates here of longitudes, latitudes and heights, shape (n, 3)."""
-        return self._transformed(degrees, "FORWARD")
-
-    def _transformed(self, xyz: FloatArray, direction: str) -> FloatArray:
         from pyproj import Transformer
 
         at = f"+lat_0={self.latitude_deg!r} +lon_0={self.longitude_deg!r} +h_0={self.height_m!r}"
@@ -285,13 +281,20 @@ def _operation(
     source: CRS, target: CRS, at: FloatArray, name: str, *, heights: bool, instead: str = ""
 ) -> tuple[Transformer, Notes]:
     """Return PROJ's best transformation that is not a ballpark where that matters, and notes."""
+    from pyproj import Transformer
     from pyproj.exceptions import ProjError
-    from pyproj.transformer import TransformerGroup
+    from pyproj.transformer import AreaOfInterest, TransformerGroup
 
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a missing grid is named in the error or note
-            area = _area(parts(source)[0], at)
+            to_degrees = Transformer.from_crs(parts(source)[0], "EPSG:4326", always_xy=True)
+            degrees = np.column_stack(to_degrees.transform(at[:, 0], at[:, 1]))
+            west, south = degrees.min(axis=0) - _AREA_MARGIN_DEG
+            east, north = degrees.max(axis=0) + _AREA_MARGIN_DEG
+            # no area if the points are too far out or cross the antimeridian
+            known = np.isfinite(degrees).all() and east - west <= 180.0 + 2 * _AREA_MARGIN_DEG
+            area = AreaOfInterest(west, south, east, north) if known else None
             group = TransformerGroup(source, target, always_xy=True, area_of_interest=area)
     except (ProjError, IndexError) as error:  # the latter if PROJ finds no operation at all
         sentence = f"PROJ cannot transform {source.name} to {target.name}. Give another CRS."
@@ -354,22 +357,6 @@ def is_same_numbers(source: CRS, target: CRS, *, heights: bool = True) -> bool:
     """Whether points have the same numbers in both, given that the heights agree."""
     same = is_same(parts(source)[0], parts(target)[0])
     return same and not (heights and metres_up(source) != metres_up(target))
-
-
-def _area(plan: CRS, at: FloatArray) -> AreaOfInterest | None:
-    """Return the area of points; None if they are too far out or cross the antimeridian."""
-    from pyproj import Transformer
-    from pyproj.transformer import AreaOfInterest
-
-    to_degrees = Transformer.from_crs(plan, "EPSG:4326", always_xy=True)
-    longitude, latitude = to_degrees.transform(at[:, 0], at[:, 1])
-    if not (np.isfinite(longitude).all() and np.isfinite(latitude).all()):
-        return None
-    (west, south), (east, north) = ((f(longitude), f(latitude)) for f in (np.min, np.max))
-    if east - west > 180.0:
-        return None
-    margin = _AREA_MARGIN_DEG
-    return AreaOfInterest(west - margin, south - margin, east + margin, north + margin)
 
 
 def _height_words(crs: CRS) -> str:

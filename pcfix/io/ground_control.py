@@ -145,7 +145,6 @@ def read_ground_control(path: File, cameras: Cameras, *, crs: str | None = None)
     points = [mark for name, mark in first.items() if name in seen]
     row_of = {mark.point: i for i, mark in enumerate(points)}
     xyz, way_notes = _to_cameras(source, points, cameras, crs or stated_crs)
-    _check_near(source, points, cameras, xyz)
     unseen = [name for name in first if name not in seen]
     if unseen:
         words = f"{source}: no image with a pose shows {_few(unseen)}; skipped."
@@ -239,7 +238,7 @@ def _check_images(path: Path, marks: list[Mark], cameras: Cameras, camera: IntAr
 def _to_cameras(
     path: Path, points: list[Mark], cameras: Cameras, source: str | None
 ) -> tuple[FloatArray, Sequence[Any]]:
-    """Return the points in the CRS of the cameras, and notes."""
+    """Return the points in the CRS of the cameras, and notes; refuse points far from the block."""
     name, target, xyz = str(path), cameras.crs, np.array([mark.xyz for mark in points])
     if target is not None and target.strip().lower() == LOCAL:
         if source is not None and source.strip().lower() != LOCAL:
@@ -250,31 +249,26 @@ def _to_cameras(
         sentence = f"the cameras are in {target}. Transform them to the cloud's CRS first."
         raise bad_file(path, "crs.topocentric", sentence, crs=target)
     forward, notes = way_to_cloud(source, target, xyz, name, heights=True)
-    if forward is None:
-        return xyz, notes
-    moved = forward(xyz)
+    moved = xyz if forward is None else forward(xyz)
     lost = ~np.isfinite(moved).all(axis=1) & np.isfinite(xyz).all(axis=1)
     if lost.any():
         mark = points[int(np.argmax(lost))]
         place = ", ".join(f"{value:.10g}" for value in mark.xyz)
         words = f"{place} is outside the cloud's CRS. Check that of the points."
         raise _wrong(path, "crs.outside", mark, words)
-    return moved, notes
-
-
-def _check_near(path: Path, points: list[Mark], cameras: Cameras, xyz: FloatArray) -> None:
-    """Refuse points that no image of a block with a CRS can show."""
-    if cameras.crs is None or cameras.crs.strip().lower() == LOCAL:
-        return
+    if target is None:
+        return moved, notes
+    # points that no image of the block can show
     middle = np.median(cameras.centres[:, :2], axis=0)
     reach_m = FARTHEST_M + np.hypot(*(cameras.centres[:, :2] - middle).T).max()
-    apart_m = np.hypot(*(xyz[:, :2] - middle).T)
+    apart_m = np.hypot(*(moved[:, :2] - middle).T)
     if (apart_m > reach_m).any():
         i = int(np.argmax(apart_m))
-        swapped = bool(np.hypot(*(xyz[i, 1::-1] - middle)) <= reach_m)
+        swapped = bool(np.hypot(*(moved[i, 1::-1] - middle)) <= reach_m)
         hint = "Swap x and y." if swapped else "Check the CRS of the points."
         words = f"the point is {apart_m[i] / 1e3:,.0f} km from the block. {hint}"
         raise _wrong(path, "gcps.far", points[i], words, swapped=swapped)
+    return moved, notes
 
 
 # Formats

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import fields
 from pathlib import Path
-from tokenize import TokenError
 from typing import TYPE_CHECKING
-from zipfile import BadZipFile
 
 import numpy as np
 
@@ -18,10 +15,6 @@ if TYPE_CHECKING:
     from pcfix.adjust.precision import Members
 
 FILE = "ensemble.npz"
-_NOT_READ = (
-    *(OSError, ValueError, TypeError, KeyError, EOFError, BadZipFile, zlib.error),
-    *(SyntaxError, TokenError),  # of numpy, which reads the heads of arrays as Python does
-)
 
 
 def write_members(folder: Path, members: Members) -> None:
@@ -56,7 +49,7 @@ def find_members(cameras: File) -> tuple[Path, Members] | None:
                 raise ValueError(name)
         if values["water"].shape[1:] not in ((4,), (7,)):
             raise ValueError("water")
-    except (*_NOT_READ, MemoryError) as error:
+    except Exception as error:  # of any kind, as numpy reads the heads of arrays as Python does
         sentence = "is not an ensemble of an adjustment. Adjust again, or remove the file."
         raise bad_file(found, "ensemble.damaged", sentence) from error
     return found, Members(labels=labels, lens_names=lens_names, **values)

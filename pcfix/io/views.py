@@ -1,41 +1,32 @@
 """Read view lists, which say which cameras contributed to each point of a dense cloud.
 
-Read one with `read_views`, or make one of tie points with `track_views`; then `ViewMatch` gives its
-lists to the rows of a cloud, chunk by chunk.
+Read a list with `read_views`, or make one of tie points with `track_views`; then `ViewMatch` gives
+its cameras to the rows of a cloud, chunk by chunk.
 
-``fused.ply.vis``, which COLMAP's stereo fusion writes beside ``fused.ply``, is little-endian: a
-uint64 number of points; then for each point, in the order of the vertices of ``fused.ply``, a
-uint32 number of images and that many uint32 image numbers. An image number counts the registered
-images of the sparse model in the dense workspace, from 0; it is not COLMAP's IMAGE_ID. Defined by
-COLMAP's source, mvs/fusion.cc and mvs/model.cc. The images are those whose depth maps were fused at
-the point.
+COLMAP's stereo fusion writes ``fused.ply.vis`` beside ``fused.ply``. It is little-endian: a uint64
+number of points; then for each vertex of ``fused.ply`` a uint32 number of images and their uint32
+numbers, counted from 0 (COLMAP's source, mvs/fusion.cc and mvs/model.cc). The dense PLY of OpenMVS,
+and so of ODM, has two lists at each vertex: ``view_indices``, image numbers from 0, and
+``view_weights`` (OpenMVS's source, libs/MVS/PointCloud.cpp and apps/InterfaceCOLMAP). Both name the
+images whose depth maps were fused at the point, not the images that these were matched against.
 
-The dense cloud of OpenMVS (and so of ODM) is a PLY file with two lists at each vertex:
-``view_indices`` names the depth maps that were fused at the point, by the number of their image in
-the scene, from 0; ``view_weights`` are their weights. The importers number the images in their
-order: InterfaceCOLMAP in that of ``images.txt``, OpenSfM's exporter (ODM) in that of the shots of
-the undistorted reconstruction. Defined by OpenMVS's source, libs/MVS/PointCloud.cpp and
-apps/InterfaceCOLMAP. The images that a depth map was matched against are not named.
+An image number counts in the order of the dense matcher, which the list does not state:
 
-A list does not name its images. A number counts them in the order of the dense matcher:
+- COLMAP counts the registered images of its sparse model, not IMAGE_ID: in some versions in the
+  order of ``images.bin`` or ``images.txt``, in others by ascending IMAGE_ID, and with rigs by
+  ascending FRAME_ID (``Reconstruction::RegImageIds``).
+- OpenMVS uses the order of its importer: that of ``images.txt`` for InterfaceCOLMAP, that of the
+  shots of the undistorted reconstruction for OpenSfM's exporter (ODM).
 
-- COLMAP uses the registered images of its sparse model. Some versions have them in the order of
-  ``images.bin`` or ``images.txt``, which is arbitrary; others by ascending IMAGE_ID; those with
-  rigs frame by frame, by ascending FRAME_ID (``Reconstruction::RegImageIds``).
-- OpenMVS uses the order of its importer, for COLMAP that of ``images.txt``.
+So every order that a sparse model beside the list allows is a candidate, then that of the given
+cameras, and the frames decide: nearly every listed camera must have the apparent point in its
+frame. With numbers off by one, a quarter of the cameras of an ordinary block do not.
 
-So every order that a sparse model beside the list allows is a candidate, then that of the cameras
-that are given. Geometry decides: a depth map holds only what its image shows, so nearly every
-listed camera must have the apparent point in its frame. With image numbers off by one, a quarter
-of the cameras of an ordinary block do not.
-
-A row of the cloud gets the list of the same row if the list's position agrees with it to a
-fraction of the spacing, whatever the numbers of rows. Every other row gets the list of the nearest
-point within a tolerance. The default tolerance is as strict: neighbours in a dense cloud often
-have other images (on a real one, points 5 cm apart hardly have a camera in common), so a list is
-used for its own point only. A list without positions is matched by row number only; then the
-numbers of points must agree, and the listed cameras must have the points in their frames, chunk by
-chunk.
+A row of the cloud gets the list of the same row if its position agrees to a fraction of the point
+spacing. Every other row gets the list of the nearest point within a tolerance, which is as strict:
+on a real dense cloud, points 5 cm apart hardly have a camera in common. A list without positions
+is matched by row number; then the numbers of points must agree, and the listed cameras must have
+the points in their frames, chunk by chunk.
 """
 
 from __future__ import annotations

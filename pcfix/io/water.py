@@ -358,6 +358,8 @@ def _resampled(
     `from_cloud` transforms the plan only; `bounds` are in the cloud's CRS; `names` are the
     raster's for messages and its title.
     """
+    from pcfix.water.surface import Field, heights_above
+
     # where the raster is, from points all over it, and the sides of its middle cell
     high, wide = part.heights.shape
     share = np.linspace(0.0, 1.0, _EDGE_POINTS)
@@ -377,26 +379,20 @@ def _resampled(
     sides = np.maximum(np.ceil([(east - left) / cell, (top - south) / cell]), 2.0)
     _check_size(float(sides.prod()), names[0])
     columns, rows = sides.astype(np.int64).tolist()
+    size, frame = np.array([[0, high, wide]]), np.array([[0.5, -0.5, 1.0, 1.0]])
+    field = Field(part.heights.ravel(), size, frame, 0)
     heights = np.empty((rows, columns))
     x = left + (np.arange(columns) + 0.5) * cell
     for first in range(0, rows, max(1, _AT_ONCE // columns)):
         strip = heights[first : first + max(1, _AT_ONCE // columns)]
         y = top - (first + np.arange(len(strip)) + 0.5) * cell
         plan = np.column_stack([np.tile(x, len(y)), np.repeat(y, len(x)), np.zeros(strip.size)])
-        strip[:] = _heights_at(part, from_cloud(plan), to_cloud).reshape(strip.shape)
+        places = from_cloud(plan)
+        column, row = place_of(~part.transform, places[:, 0], places[:, 1])
+        height, _ = heights_above(field, np.ascontiguousarray(column), np.ascontiguousarray(-row))
+        known = np.isfinite(height)
+        height[known] = to_cloud(np.column_stack([places[known, :2], height[known]]))[:, 2]
+        height[~np.isfinite(height)] = np.nan
+        strip[:] = height.reshape(strip.shape)
     _check_known(heights, names[0])
     return WaterRaster(heights, float(left), float(top), (float(cell), float(cell)), names[1])
-
-
-def _heights_at(part: _Part, places: FloatArray, to_cloud: Points) -> FloatArray:
-    """Return heights in the cloud's CRS at places in the raster's CRS; NaN if unknown."""
-    from pcfix.water.surface import Field, heights_above
-
-    column, row = place_of(~part.transform, places[:, 0], places[:, 1])
-    shape, frame = np.array([[0, *part.heights.shape]]), np.array([[0.5, -0.5, 1.0, 1.0]])
-    cells = Field(part.heights.ravel(), shape, frame, 0)
-    height, _ = heights_above(cells, np.ascontiguousarray(column), np.ascontiguousarray(-row))
-    known = np.isfinite(height)
-    height[known] = to_cloud(np.column_stack([places[known, :2], height[known]]))[:, 2]
-    height[~np.isfinite(height)] = np.nan
-    return np.asarray(height)

@@ -91,14 +91,6 @@ class Record(VLR):  # type: ignore[misc]  # laspy is untyped
         self.head = head
         self.record_data: bytes
 
-    def to_bytes(self) -> bytes:
-        """Return the whole record."""
-        return self.head + self.record_data
-
-    def replaced(self, data: bytes) -> Record:
-        """Return a VLR with other data and the same names."""
-        return Record(self.head[:20] + struct.pack("<H", len(data)) + self.head[22:], data)
-
 
 class RecordList(VLRList):  # type: ignore[misc]
     """VLRs for a laspy header; a `Record` is written as it was read."""
@@ -110,7 +102,7 @@ class RecordList(VLRList):  # type: ignore[misc]
         written = 0
         for vlr in self:
             if isinstance(vlr, Record):
-                written += stream.write(vlr.to_bytes())
+                written += stream.write(vlr.head + vlr.record_data)
             else:
                 written += VLRList([vlr]).write_to(stream, as_extended, encoding_errors)
         return written
@@ -170,7 +162,7 @@ def append_evlrs(stream: BinaryIO, records: Sequence[Record], minor_version: int
             stream.seek(227)
             stream.write(struct.pack("<Q", start))
         stream.seek(start)
-        start += stream.write(record.to_bytes())
+        start += stream.write(record.head + record.record_data)
 
 
 @contextmanager

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import struct
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
@@ -224,7 +225,9 @@ def _set_records(header: laspy.LasHeader, vlrs: list[VLR], described: bytes) -> 
     places = [i for i, v in enumerate(vlrs) if _is_extra_bytes(v)]
     records = [v for v in vlrs if not _is_extra_bytes(v)]
     if described and places:
-        records.insert(places[0], vlrs[places[0]].replaced(described))
+        head = vlrs[places[0]].head
+        head = head[:20] + struct.pack("<H", len(described)) + head[22:]
+        records.insert(places[0], Record(head, described))
     elif described:
         records.append(VLR(*EXTRA_BYTES, "Extra Bytes Record", described))
     header._vlrs = RecordList(records)
@@ -312,29 +315,17 @@ def las_writer(
     """
     laz = check_suffix(path)
     with temporary_output(path) as temporary, temporary.open("w+b") as stream:
-        with _write_errors(path, temporary):
+        try:
             writer = laspy.LasWriter(
                 stream, header, do_compress=laz, laz_backend=backend(jobs), closefd=False
             )
-
-        def write(points: laspy.ScaleAwarePointRecord) -> None:
-            with _write_errors(path, temporary):
-                writer.write_points(points)
-
-        yield write
-        with _write_errors(path, temporary):
+            yield writer.write_points
             writer.close()
             append_evlrs(stream, evlrs, header.version.minor)
             stream.seek(IDENTITY_PLACE)
             stream.write(identity)
-
-
-@contextmanager
-def _write_errors(path: Path, temporary: Path) -> Iterator[None]:
-    try:
-        yield
-    except (LaspyException, lazrs.LazrsError, OSError) as error:
-        raise cannot_write(path, error, temporary) from error
+        except (LaspyException, lazrs.LazrsError) as error:
+            raise cannot_write(path, error, temporary) from error
 
 
 def write_points(
