@@ -194,13 +194,13 @@ def _compare(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> No
 
 def _survey(cloud: PdalCloud, water: WaterSurface | None) -> SurveyCloud:
     """Return the cloud as a comparison needs it."""
-    from pcfix.io.clouds import TOLD, Told, survey_cloud
+    from pcfix.io.clouds import DIMENSIONS, SurveyPoints, survey_cloud
     from pcfix.io.crs import parse_crs
 
-    told, withheld = cloud.columns(tuple(TOLD)), cloud.withheld
+    values, withheld = cloud.columns(tuple(DIMENSIONS)), cloud.withheld
     chunks = (
-        Told(points.xyz, points.classes, withheld[rows], points.heights,
-             {name: told[name][rows] for name in told})
+        SurveyPoints(points.xyz, points.classes, withheld[rows], points.heights,
+             {name: values[name][rows] for name in values})
         for rows, points in _chunks(cloud, water)
     )  # fmt: skip
     crs = None if cloud.crs is None else parse_crs(cloud.crs, NAME)

@@ -52,12 +52,12 @@ def read_cloud(
         own = water or own_water(source)
         extra = set(source.header.point_format.extra_dimension_names)
         chunks = (
-            Told(
+            SurveyPoints(
                 coordinates(points),
                 np.asarray(points["classification"]),
                 np.asarray(points["withheld"]).astype(bool),
                 source.dimension(points, own.name) if isinstance(own, WaterDimension) else None,
-                {name: source.dimension(points, name) for name in extra.intersection(TOLD)},
+                {name: source.dimension(points, name) for name in extra.intersection(DIMENSIONS)},
             )
             for chunk in source.chunks()
             for points in (chunk[rows] for rows in blocks(len(chunk), FEW_ROWS))
@@ -66,12 +66,12 @@ def read_cloud(
         return survey_cloud(str(path), crs, chunks, own, given, len(source), skip_classes)
 
 
-TOLD = ("WaterDepth", *SHIFTS)
+DIMENSIONS = ("WaterDepth", *SHIFTS)
 """What the dimensions of a correction say of the water, and of where the points were."""
 
 
-class Told(NamedTuple):
-    """Some points of a cloud, and by name what it says in the dimensions `TOLD`, metres."""
+class SurveyPoints(NamedTuple):
+    """Some points of a cloud; those of `DIMENSIONS` that it has are by name, in metres."""
 
     xyz: FloatArray
     classes: npt.NDArray[Any]
@@ -83,7 +83,7 @@ class Told(NamedTuple):
 def survey_cloud(
     name: str,
     crs: CRS | None,
-    chunks: Iterable[Told],
+    chunks: Iterable[SurveyPoints],
     water: WaterSurface | None,
     given: bool,
     most: int,

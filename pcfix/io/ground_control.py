@@ -47,7 +47,7 @@ from pcfix.io.cameras.table import crs as table_crs
 from pcfix.io.crs import LOCAL, is_local, is_topocentric, parse_crs, way_to_cloud
 from pcfix.io.files import check_input
 from pcfix.io.labels import match_labels, unnamed
-from pcfix.io.tables import number, places, read_lines
+from pcfix.io.tables import Table, number, places, read_lines
 from pcfix.model import BoolArray, Cameras, FloatArray, GroundControl, IntArray
 from pcfix.options.declare import File
 
@@ -379,11 +379,8 @@ def _from_odm(path: Path, rows: list[tuple[int, list[str]]]) -> tuple[list[Mark]
         if len(fields) < _LEAST_ODM:
             sentence = f"line {i} has {len(fields)} fields. Give x, y, z, u, v, image."
             raise bad_file(path, "gcps.fields", sentence, line=i)
-    values = np.array([[number(field) for field in fields[:5]] for _, fields in rows])
-    for i, k in np.argwhere(~np.isfinite(values))[:1]:
-        line, text = rows[i][0], rows[i][1][k]
-        sentence = f"line {line}: {'xyzuv'[k]} '{text}' is not a finite number."
-        raise bad_file(path, "table.number", sentence, line=line, value=text)
+    table = Table(path, [*"xyzuv"], [fields for _, fields in rows], [i for i, _ in rows])
+    values = np.column_stack([table.numbers(name) for name in table.header])
     places = [tuple(row) for row in values[:, :3].tolist()]
     by_place = {place: f"GCP {i + 1}" for i, place in enumerate(dict.fromkeys(places))}
     marks = []

@@ -3,7 +3,7 @@
 Read a list with `read_views`, or make one of tie points with `track_views`; then `ViewMatch` gives
 its cameras to the rows of a cloud, chunk by chunk.
 
-COLMAP's stereo fusion writes ``fused.ply.vis`` beside ``fused.ply``. It is little-endian: a uint64
+COLMAP's stereo fusion writes ``fused.ply.vis`` next to ``fused.ply``. It is little-endian: a uint64
 number of points; then for each vertex of ``fused.ply`` a uint32 number of images and their uint32
 numbers, counted from 0 (COLMAP's source, mvs/fusion.cc and mvs/model.cc). The dense PLY of OpenMVS,
 and so of ODM, has two lists at each vertex: ``view_indices``, image numbers from 0, and
@@ -18,7 +18,7 @@ An image number counts in the order of the dense matcher, which the list does no
 - OpenMVS uses the order of its importer: that of ``images.txt`` for InterfaceCOLMAP, that of the
   shots of the undistorted reconstruction for OpenSfM's exporter (ODM).
 
-So every order that a sparse model beside the list allows is a candidate, then that of the given
+So every order that a sparse model next to the list allows is a candidate, then that of the given
 cameras, and the frames decide: nearly every listed camera must have the apparent point in its
 frame. With numbers off by one, a quarter of the cameras of an ordinary block do not.
 

@@ -26,7 +26,7 @@ from pcfix.io.crs import Points
 from pcfix.io.files import check_input
 from pcfix.io.labels import match_labels
 from pcfix.io.ply import Records
-from pcfix.io.rasters import open_raster, place_of, read_masked
+from pcfix.io.rasters import Bounds, open_raster, place_of, read_masked
 from pcfix.io.tables import number
 from pcfix.model import (
     FloatArray,
@@ -56,9 +56,7 @@ _MOST_VERTICES = 2**31
 
 
 def read_water(
-    spec: float | File,
-    cloud_crs: str | CRS | None = None,
-    bounds: tuple[float, float, float, float] | None = None,
+    spec: float | File, cloud_crs: str | CRS | None = None, bounds: Bounds | None = None
 ) -> WaterSurface:
     """Read the water surface.
 
@@ -173,8 +171,6 @@ def _read_ply(path: Path) -> tuple[FloatArray, IntArray]:
     other = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(count) - count, count)
     return vertices.numbers(*"xyz"), corner[np.column_stack([first, other, other + 1])]
 
-
-Bounds = tuple[float, float, float, float]
 
 MARGIN_M = 100.0
 """Beyond the cloud: piercing points are at most about so far from their points."""
