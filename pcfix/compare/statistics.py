@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,23 +24,10 @@ TAIL_PERCENT = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Histogram:
-    """Counts between edges (m), and the number of values below and above them."""
+    """Counts between edges, metres."""
 
     edges_m: list[float]
     counts: list[int]
-    below: int
-    above: int
-
-
-@dataclass(frozen=True, slots=True)
-class Normal:
-    """A normal distribution fitted to a sample."""
-
-    mu_m: float  # by maximum likelihood: mean and standard deviation of the sample
-    sigma_m: float
-    histogram_mu_m: float | None  # of the histogram, robust to outliers; None without a solution
-    histogram_sigma_m: float | None
-    note: str = ""  # why something is missing
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,11 +61,10 @@ class Share:
 
 @dataclass(frozen=True, slots=True)
 class Distribution:
-    """Statistics of a sample with its histogram and the fitted normal distribution."""
+    """Statistics of a sample with its histogram."""
 
     statistics: Statistics
     histogram: Histogram
-    normal: Normal
     shares: tuple[Share, ...] = ()
 
 
@@ -109,7 +95,7 @@ def statistics_of(values: FloatArray) -> Statistics:
 
 
 def distribution_of(values: FloatArray) -> Distribution:
-    """Return statistics, histogram and fitted normal distribution of values, shape (n,), metres.
+    """Return the statistics and the histogram of values, shape (n,), metres.
 
     The histogram lies between the outer half percents.
     """
@@ -117,10 +103,7 @@ def distribution_of(values: FloatArray) -> Distribution:
     if not high > low:
         low, high = low - 0.5e-3, high + 0.5e-3
     counts, edges = np.histogram(values, BINS, (low, high))
-    outside = int((values < low).sum()), int((values > high).sum())
-    histogram = Histogram(edges.tolist(), counts.tolist(), *outside)
-    statistics = statistics_of(values)
-    return Distribution(statistics, histogram, normal_of(statistics, histogram))
+    return Distribution(statistics_of(values), Histogram(edges.tolist(), counts.tolist()))
 
 
 def distances_of(
@@ -135,30 +118,8 @@ def distances_of(
     shares = [
         Share(low, high, float(((values >= low) & (values < high)).mean())) for low, high in bands
     ]
-    histogram, plain = Histogram(edges.tolist(), counts.tolist(), 0, 0), distribution_of(values)
-    return replace(plain, histogram=histogram, shares=tuple(shares))
-
-
-def normal_of(statistics: Statistics, histogram: Histogram) -> Normal:
-    """Fit a normal distribution, by maximum likelihood and to the histogram.
-
-    The logarithm of a normal density is a parabola. It is fitted to the logarithms of the counts
-    by least squares, each weighted with its count, as the logarithm of a small count says little.
-    """
-    mu, sigma = statistics.mean_m, statistics.sd_m
-    if sigma <= abs(mu) * 1e-12:
-        return Normal(mu, 0.0, None, None, "all values are equal: no normal distribution fits")
-    edges, counts = np.array(histogram.edges_m), np.array(histogram.counts, np.float64)
-    held = counts > 0
-    if held.sum() < 3:
-        return Normal(mu, sigma, None, None, "the histogram holds too few values to fit")
-    scale = edges[-1] - edges[0]
-    x = (0.5 * (edges[:-1] + edges[1:])[held] - statistics.median_m) / scale
-    square, linear, _ = np.polyfit(x, np.log(counts[held]), 2, w=counts[held])
-    if square >= 0.0:
-        return Normal(mu, sigma, None, None, "the histogram has no peak: no normal one fits")
-    centre = statistics.median_m - scale * float(linear / (2.0 * square))
-    return Normal(mu, sigma, centre, scale * float(np.sqrt(-0.5 / square)))
+    histogram = Histogram(edges.tolist(), counts.tolist())
+    return Distribution(statistics_of(values), histogram, tuple(shares))
 
 
 @dataclass(frozen=True, slots=True)

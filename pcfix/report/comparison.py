@@ -178,11 +178,8 @@ def signed(value_m: float) -> str:
 
 def gauss(of: Plain) -> str:
     """Return the normal distribution fitted to distances, in CloudCompare's words."""
-    normal, classes = of["normal"], len(of["histogram"]["counts"])
-    return (
-        f"Gauss: mean = {normal['mu_m']:.6f} / std.dev. = {normal['sigma_m']:.6f}"
-        f" [{classes} classes]"
-    )
+    s, classes = of["statistics"], len(of["histogram"]["counts"])
+    return f"Gauss: mean = {s['mean_m']:.6f} / std.dev. = {s['sd_m']:.6f} [{classes} classes]"
 
 
 # Tables
@@ -207,8 +204,8 @@ def _tables(compared: Plain) -> list[Table]:
     header += [f"{one['low_m']:g} to {one['high_m']:g} m" for one in bands]
     rows = [
         [
-            f"{way}, {name}", f"{of['normal']['mu_m']:.6f}", f"{of['normal']['sigma_m']:.6f}",
-            str(len(of["histogram"]["counts"])),
+            f"{way}, {name}", f"{of['statistics']['mean_m']:.6f}",
+            f"{of['statistics']['sd_m']:.6f}", str(len(of["histogram"]["counts"])),
             *(f"{100 * one['share']:.1f} %" for one in of.get("shares", ())),
         ]
         for way, name, _, of in c2c
@@ -258,7 +255,7 @@ def evaluation(
         for axes, (name, colour, of) in zip(panels[:, 0], times, strict=True):
             s = of["statistics"]
             label = f"{name}: mean {s['mean_m']:.3f}, sd {s['sd_m']:.3f} m"
-            _histogram(axes, of, (s["mean_m"], s["sd_m"]), color=colour, label=label)
+            _histogram(axes, of, color=colour, label=label)
         panels[-1, 0].set_xlabel("Cloud minus reference, Z (m)")
         alt = f"Vertical error: histograms with fitted Gaussians. {_moments(times)}"
         pictures.append(Picture("histogram_vertical", "Vertical error", alt, figure))
@@ -309,8 +306,7 @@ def c2c_figure(compared: Plain) -> Figure:
     reach = 0.0
     for axes, (way, name, colour, of) in zip(panels.T.flat, rows, strict=True):
         label = f"{name}, {way}; largest {of['statistics']['max_m']:.3f} m"
-        normal = of["normal"]["mu_m"], of["normal"]["sigma_m"]
-        _histogram(axes, of, normal, color=colour, label=label)
+        _histogram(axes, of, color=colour, label=label)
         axes.set_title(gauss(of), fontsize="medium")
         # the upper edge of the class in which the last of the distances shown lies
         up_to = np.cumsum(of["histogram"]["counts"])
@@ -322,14 +318,14 @@ def c2c_figure(compared: Plain) -> Figure:
     return figure
 
 
-def _histogram(axes: Axes, of: Plain, normal: tuple[float, float], **look: Any) -> None:
-    """Draw a distribution and the normal distribution of a mean and a standard deviation."""
+def _histogram(axes: Axes, of: Plain, **look: Any) -> None:
+    """Draw a distribution, and the normal distribution of its mean and standard deviation."""
     from scipy.stats import norm
 
     edges, counts = (np.array(of["histogram"][key]) for key in ("edges_m", "counts"))
     axes.stairs(counts, edges, fill=True, alpha=0.55, **look)
-    mean, sd = normal
-    if sd > 0.0:
+    mean, sd = of["statistics"]["mean_m"], of["statistics"]["sd_m"]
+    if sd > 1e-12 * abs(mean):
         x = np.linspace(edges[0], edges[-1], 2000)
         area = of["statistics"]["count"] * (edges[1] - edges[0])
         axes.plot(x, area * norm.pdf(x, mean, sd), color="0.15")

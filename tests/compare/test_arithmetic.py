@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from pcfix.compare.match import heights_at
 from pcfix.compare.nearest import cloud_to_cloud
 from pcfix.compare.sections import parse_line, section_along
-from pcfix.compare.statistics import binned, distribution_of, fit_line, statistics_of
+from pcfix.compare.statistics import binned, fit_line, statistics_of
 
 pytestmark = pytest.mark.quick_but("test_c2c")
 
@@ -100,30 +100,6 @@ def test_statistics():
     # 5 % of 1000 steps between 1001 sorted values: the 50th from below
     assert found.percentiles_m["p5"] == pytest.approx(plain[50])
     assert found.percentiles_m["p95"] == pytest.approx(plain[950])
-
-
-def test_normal_fit():
-    count, mu, sigma = 200_000, 0.35, 0.04
-    found = distribution_of(np.random.default_rng(9).normal(mu, sigma, count))
-    # four standard errors of mean and sd, sigma / sqrt(n) and sigma / sqrt(2 n)
-    error = 4.0 * sigma / math.sqrt(count)
-    assert found.normal.mu_m == pytest.approx(mu, abs=error)
-    assert found.normal.sigma_m == pytest.approx(sigma, abs=error)
-    # the fit to the histogram is less efficient, and bins have a width: 2 % of sigma
-    assert found.normal.histogram_mu_m == pytest.approx(mu, abs=0.02 * sigma)
-    assert found.normal.histogram_sigma_m == pytest.approx(sigma, rel=0.02)
-    histogram = found.histogram
-    assert sum(histogram.counts) + histogram.below + histogram.above == count
-    assert found.statistics.nmad_m == pytest.approx(sigma, rel=0.02)
-
-
-def test_normal_fit_robust():
-    rng = np.random.default_rng(10)
-    values = np.concatenate([rng.normal(0.1, 0.03, 50_000), rng.uniform(-3.0, 3.0, 400)])
-    normal = distribution_of(values).normal
-    assert normal.sigma_m > 0.1
-    assert normal.histogram_sigma_m == pytest.approx(0.03, rel=0.1)
-    assert normal.histogram_mu_m == pytest.approx(0.1, abs=0.003)
 
 
 def test_fit_line():
