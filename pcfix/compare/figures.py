@@ -14,8 +14,7 @@ import numpy as np
 from pcfix.blocks import kept, mapped
 from pcfix.clean.neighbours import nearest_distance
 from pcfix.compare.m3c2 import M3c2, m3c2_distances
-from pcfix.compare.match import Match, heights_at
-from pcfix.compare.nearest import cloud_to_cloud, spacing_m
+from pcfix.compare.match import Match, heights_at, spacing_m
 from pcfix.compare.sections import Section, SectionLine, lines_downslope, section_along
 from pcfix.compare.statistics import (
     Bin,
@@ -263,7 +262,7 @@ def c2c_of(match: Match) -> C2c:
         return distances_of(distances_to(match, xyz), rules.classes, rules.share)
 
     def distances_back(xyz: FloatArray) -> Distribution:
-        return distances_of(cloud_to_cloud(match.places, xyz), rules.classes, rules.share)
+        return distances_of(nearest_distance(match.places, xyz, 3), rules.classes, rules.share)
 
     to = back = None
     if rules.direction != "from-reference":
@@ -276,8 +275,8 @@ def c2c_of(match: Match) -> C2c:
 def distances_to(match: Match, xyz: FloatArray) -> FloatArray:
     """Return the distance from each point of a cloud, or from each check point, shape (p,), m."""
     if match.reference.sparse:
-        return cloud_to_cloud(match.places, xyz)
-    return cloud_to_cloud(xyz, match.reference.xyz)
+        return nearest_distance(match.places, xyz, 3)
+    return nearest_distance(xyz, match.reference.xyz, 3)
 
 
 def sparse_notes(match: Match, found: C2c) -> list[PcfixWarning]:

@@ -10,13 +10,13 @@ import numpy as np
 
 from pcfix.blocks import blocks, bounds, empty, kept, mapped
 from pcfix.clean.neighbours import nearest_of
-from pcfix.compare.nearest import mean_spacing_m
 from pcfix.errors import GeometryError, SettingError, bad_file
 from pcfix.model import BoolArray, FloatArray, IntArray, WaterSurface
 from pcfix.options.steps import CompareRules
 
 GAP_SPACINGS, MIN_GAP_M = 5.0, 1.0
 """A point counts up to this distance outside the other cloud, unless the user sets it."""
+POINTS_PER_SQUARE = 3.0
 MIN_SHAPE = 1e-3
 """Points are on a line if the determinant of their covariance over its squared trace is less."""
 MAX_REACH = 3.0
@@ -152,12 +152,12 @@ def match(whole: SurveyCloud, target: Reference, settings: CompareRules, *, give
     not_submerged = int(len(whole) - chosen.sum())
     places, near = target.xyz, chosen
     if target.sparse or settings.from_reference:
-        gap = _gap(whole.xyz, settings)
+        gap = settings.max_gap or gap_m(whole.xyz)
         places = kept(near_in_plan(places, kept(chosen, whole.xyz), gap), places)
     if target.sparse:
         outside = len(target.xyz) - len(places)
     else:
-        gap = _gap(target.xyz, settings)
+        gap = settings.max_gap or gap_m(target.xyz)
         near = chosen & near_in_plan(whole.xyz, target.xyz, gap)
         outside = int(chosen.sum() - near.sum())
     if not (near.any() and len(places)):
@@ -193,8 +193,33 @@ def match(whole: SurveyCloud, target: Reference, settings: CompareRules, *, give
     return replace(found, places=kept(under, places), not_submerged=not_submerged + dry)
 
 
-def _gap(xyz: FloatArray, settings: CompareRules) -> float:
-    return settings.max_gap or max(GAP_SPACINGS * mean_spacing_m(xyz), MIN_GAP_M)
+def gap_m(xyz: FloatArray) -> float:
+    """Return up to which distance outside a cloud, (n, 3), points count, metres."""
+    return max(GAP_SPACINGS * _mean_spacing_m(xyz), MIN_GAP_M)
+
+
+def _mean_spacing_m(xyz: FloatArray) -> float:
+    """Return the mean spacing of points (n, 3) within their bounding box in plan, metres."""
+    low, high = bounds(xyz[:, :2])
+    extent = high - low
+    if extent.min() <= 0.0:
+        return float(extent.max() / len(xyz))
+    return float(np.sqrt(extent.prod() / len(xyz)))
+
+
+def spacing_m(xyz: FloatArray) -> float:
+    """Return the spacing of points (n, 3) in plan, within the area that they fill, metres.
+
+    That is the area of the squares with points, which are as large as to hold about three each.
+    """
+    low, high = bounds(xyz[:, :2])
+    side = max(np.sqrt(POINTS_PER_SQUARE) * _mean_spacing_m(xyz), 1e-9)
+    columns, rows = ((high - low) / side).astype(np.int64) + 1
+    taken = np.zeros(columns * rows, np.bool_)
+    for some in blocks(len(xyz)):
+        column, row = ((xyz[some, :2] - low) / side).astype(np.int64).T
+        taken[row * columns + column] = True
+    return float(side * np.sqrt(np.count_nonzero(taken) / len(xyz)))
 
 
 def near_in_plan(xy: FloatArray, other_xy: FloatArray, limit_m: float) -> BoolArray:

@@ -35,7 +35,7 @@ from pcfix.model import Cameras, FloatArray, Lens, TiePoints, WaterDimension, Wa
 from pcfix.options.declare import File, taken
 from pcfix.options.survey import CamerasCheckOptions
 from pcfix.report.page import AFTER, WATER, draw_cloud, label_plan, label_side, new_figure
-from pcfix.report.text import aligned
+from pcfix.report.text import Plain, Rows, RowTable, aligned, filled
 from pcfix.water.index import index_of
 from pcfix.water.surface import surface_above
 
@@ -109,7 +109,7 @@ def check_cameras(
     if view is not None:
         flight = {"file": path, "water_m": level, "every": view.points / max(len(xyz), 1)}
         fit = _fit(cameras, view, xyz, quick_ties(inputs, view.crs), flight)
-        up = None if gnss is None or inputs.cameras_crs is None else gnss.mean_m[2]
+        up = None if gnss is None or inputs.cameras_crs is None else gnss["mean_m"][2]
         if up is not None and abs(up) >= UNDULATION_M[0] and not fit.verdict:
             side = "above" if up > 0.0 else "below"
             verdict = (
@@ -122,7 +122,7 @@ def check_cameras(
         path=str(path),
         cameras=cameras,
         crs_read=read.crs,
-        sensors=_sensors(cameras, above),
+        sensors=sensors_of(cameras, above),
         height_above_water_m=range_m,
         tilt_deg=tilt_deg,
         gnss=gnss,
@@ -172,11 +172,9 @@ def sample_of(
     return np.vstack(parts), np.concatenate(heights) if heights else None
 
 
-def _sensors(cameras: Cameras, above_m: FloatArray | None) -> tuple[Sensor, ...]:
+def sensors_of(cameras: Cameras, above_m: FloatArray | None) -> list[Plain]:
     """Return the lenses of a block: each separately, or grouped by frame or kind if many."""
-    lenses = cameras.lenses
-    if lenses is None:
-        return ()
+    lenses = cameras.lenses or ()
     keys: list[Callable[[Lens], Any]] = [
         lambda lens: lens,
         lambda lens: (lens.sensor, lens.width, lens.height, lens.unit, lens.projection),
@@ -192,40 +190,45 @@ def _sensors(cameras: Cameras, above_m: FloatArray | None) -> tuple[Sensor, ...]
             break
     calibrated = any(map(_is_distorted, lenses))
     above = np.full(len(lenses), np.nan) if above_m is None else above_m
-    return tuple(
+    return [
         _sensor([lenses[row] for row in rows], float(np.mean(above[rows])), calibrated)
         for rows in groups.values()
-    )
+    ]
 
 
 def _is_distorted(lens: Lens) -> bool:
     return any((*lens.radial, *lens.denominator, *lens.tangential, *lens.thin_prism))
 
 
-def _sensor(lenses: list[Lens], above_m: float, calibrated: bool) -> Sensor:
-    """Return a sensor from the lenses of its images, `above_m` the water on average."""
+def _sensor(lenses: list[Lens], above_m: float, calibrated: bool) -> Plain:
+    """Return a sensor from the lenses of its images, `above_m` the water on average.
+
+    Values are None where not stated. ``lenses`` and ``frames`` count those that differ, ``folded``
+    is the share of the frame beyond the fold of the distortion, and ``nominal`` means not
+    calibrated, though others of the block are.
+    """
     lens, alike = lenses[0], list(dict.fromkeys(lenses))
-    pixel = lens.pixel_size_mm
+    pixel, distorted = lens.pixel_size_mm, _is_distorted(lens)
     focal_px = lens.focal if lens.unit == "px" else None if pixel is None else lens.focal / pixel
     middle = (lens.principal_x, lens.principal_y) == (lens.width / 2.0, lens.height / 2.0)
-    return Sensor(
-        name=lens.sensor if all(one.sensor == lens.sensor for one in alike) else "several",
-        images=len(lenses),
-        width=lens.width,
-        height=lens.height,
-        focal=min(one.focal for one in alike),
-        unit=lens.unit,
-        focal_mm=lens.focal if lens.unit == "mm" else None if pixel is None else lens.focal * pixel,
-        pixel_size_um=None if pixel is None else 1000.0 * pixel,
-        projection=lens.projection,
-        distorted=_is_distorted(lens),
-        gsd_m=above_m / focal_px if above_m > 0.0 and focal_px else None,
-        lenses=len(alike),
-        focal_most=max(one.focal for one in alike),
-        frames=len({(one.width, one.height) for one in alike}),
-        folded=max(_folded(one) for one in alike[:: 1 + len(alike) // 20]),
-        nominal=calibrated and middle and not _is_distorted(lens),
-    )
+    return {
+        "name": lens.sensor if all(one.sensor == lens.sensor for one in alike) else "several",
+        "images": len(lenses),
+        "width": lens.width,
+        "height": lens.height,
+        "focal": min(one.focal for one in alike),
+        "focal_most": max(one.focal for one in alike),
+        "unit": lens.unit,
+        "focal_mm": lens.focal if lens.unit == "mm" else pixel and lens.focal * pixel,
+        "pixel_size_um": pixel and 1000.0 * pixel,
+        "projection": lens.projection,
+        "distorted": distorted,
+        "gsd_m": above_m / focal_px if above_m > 0.0 and focal_px else None,
+        "lenses": len(alike),
+        "frames": len({(one.width, one.height) for one in alike}),
+        "folded": max(_folded(one) for one in alike[:: 1 + len(alike) // 20]),
+        "nominal": calibrated and middle and not distorted,
+    }
 
 
 def _folded(lens: Lens) -> float:
@@ -237,22 +240,26 @@ def _folded(lens: Lens) -> float:
     return float(np.mean(np.isnan(unproject(lens, places.reshape(-1, 2))).any(axis=1)))
 
 
-def _gnss(cameras: Cameras, name: str) -> GnssResiduals | None:
-    """Return how far the projection centres are from their GNSS positions."""
+def _gnss(cameras: Cameras, name: str) -> Plain | None:
+    """Return adjusted projection centres minus their GNSS positions: metres east, north, up."""
     if cameras.gnss is None:
         return None
     found = adjusted_minus_gnss(cameras, name)
     rows = np.flatnonzero(np.isfinite(found.enu_m[:, 0]))
-    if len(rows) == 0:
-        return GnssResiduals(0, (None,) * 3, (None,) * 3, 0.0, "", found.reason)
-    enu = found.enu_m[rows]
+    enu = found.enu_m[rows] if len(rows) else np.full((1, 3), np.nan)
     length = np.sqrt(np.nansum(enu * enu, axis=1))
-    image = cameras.labels[rows[int(np.argmax(length))]]
     mean, sd = (
-        tuple(float(one) if np.isfinite(one) else None for one in values)
+        [float(one) if np.isfinite(one) else None for one in values]
         for values in (enu.mean(axis=0), enu.std(axis=0))
     )
-    return GnssResiduals(len(rows), mean, sd, float(length.max()), image, found.reason)
+    return {
+        "images": len(rows),
+        "mean_m": mean,
+        "sd_m": sd,
+        "largest_m": float(length.max()),
+        "largest_image": cameras.labels[rows[int(np.argmax(length))]] if len(rows) else "",
+        "reason": found.reason,
+    }
 
 
 def _fit(
@@ -286,40 +293,6 @@ def _fit(
 
 
 @dataclass(frozen=True)
-class Sensor:
-    """The images of one interior orientation, or of several alike; None where not stated."""
-
-    name: str
-    images: int
-    width: float
-    height: float
-    focal: float  # the shortest of them
-    unit: str
-    focal_mm: float | None
-    pixel_size_um: float | None
-    projection: str
-    distorted: bool
-    gsd_m: float | None
-    lenses: int = 1  # that differ
-    focal_most: float | None = None
-    frames: int = 1  # sizes that differ
-    folded: float = 0.0  # share of the frame beyond the fold of the distortion
-    nominal: bool = False  # not calibrated, though others of the block are
-
-
-@dataclass(frozen=True)
-class GnssResiduals:
-    """Adjusted centres minus positions of the GNSS, metres east, north, up."""
-
-    images: int
-    mean_m: tuple[float | None, ...]
-    sd_m: tuple[float | None, ...]
-    largest_m: float
-    largest_image: str
-    reason: str
-
-
-@dataclass(frozen=True)
 class Fit:
     """How well cameras and cloud match."""
 
@@ -344,10 +317,10 @@ class CamerasReport:
     path: str
     cameras: Cameras  # in the cloud's CRS, where there is a cloud
     crs_read: str | None  # of the file
-    sensors: tuple[Sensor, ...]
+    sensors: list[Plain]  # see `_sensor`
     height_above_water_m: tuple[float, float, float] | None  # least, mean, largest
     tilt_deg: tuple[float, float] | None  # of the optical axes from nadir: median, largest
-    gnss: GnssResiduals | None
+    gnss: Plain | None  # see `_gnss`
     fit: Fit | None
     sample_xyz: FloatArray  # points of the cloud, shape (m, 3), for a picture
     level_m: float | None  # mean height of the water
@@ -365,65 +338,77 @@ class CamerasReport:
             "images_unposed": list(cameras.unposed),
             "crs_read": self.crs_read,
             "crs": cameras.crs,
-            "sensors": [asdict(sensor) for sensor in self.sensors],
+            "sensors": self.sensors,
             "height_above_water_m": self.height_above_water_m,
             "tilt_deg": self.tilt_deg,
             "problem": self.problem,
-            "gnss": self.gnss and asdict(self.gnss),
+            "gnss": self.gnss,
             "fit": fit and {**asdict(fit), "fits": fit.fits},
             "refraction": self.diagnosis and self.diagnosis.as_dict(),
             "notes": [str(note) for note in cameras.notes],
         }
 
 
+_SENSOR: RowTable = (
+    ("Sensor", "{title}: {images:,} images{different}, {frame}, focal length {focals}"
+     " {unit}{pixel}, {projection}{is_distorted}{gsd}", "images"),
+    ("", "the distortion folds within the frame: {percent:.2g} % of it is not used; check the"
+     " radial coefficients", "folded"),
+    ("", "not calibrated, unlike the others; its images likely had no tie points, so do not trust"
+     " their poses", "nominal"),
+)  # fmt: skip
+_BLOCK: RowTable = (
+    ("Sensor", "none: the frames are not known", "no_sensor"),
+    ("Angles", "none: every camera counts as visible from every point", "no_angles"),
+    ("CRS", "{crs}", "crs"),
+    ("CRS of cloud", "{crs_of_cloud}", "crs_of_cloud"),
+    ("Problem", "{problem}", "problem"),
+    ("Heights", "{z[0]:.2f} to {z[1]:.2f} m, mean {z[2]:.2f} m", "z"),
+    ("Above water", "{height_above_water_m[0]:.1f} to {height_above_water_m[2]:.1f} m, mean"
+     " {height_above_water_m[1]:.1f} m", "height_above_water_m"),
+    ("Tilt", "median {tilt_deg[0]:.1f} deg, largest {tilt_deg[1]:.1f} deg", "tilt_deg"),
+)  # fmt: skip
+_GNSS: RowTable = (
+    ("GNSS", "{images:,} images; adjusted minus GNSS east, north, up: mean {means} m, sd"
+     " {deviations} m; largest {largest_m:.3f} m ({largest_image})", "images"),
+    ("GNSS", "{reason}", "no_images"),
+    ("", "{reason}", "more"),
+)  # fmt: skip
+_FIT: RowTable = (
+    ("Cloud", "{cloud} ({points_sampled:,} points sampled)", "cloud"),
+    ("Visible", "share of points by number of cameras: {seen}", "cloud"),
+    ("Distance", "{distance_m:,.1f} m in plan between block and cloud", "distance_m"),
+    ("Below ground", "{below_ground} cameras", "below_ground"),
+    ("Check", "{check}", "cloud"),
+)  # fmt: skip
+
+
 def cameras_text(r: CamerasReport) -> str:
     """Return the summary of a camera file."""
-    cameras, missing = r.cameras, r.cameras.unposed
+    cameras, missing, z = r.cameras, r.cameras.unposed, r.cameras.centres[:, 2]
     images = f"{len(cameras):,} with a pose"
     if missing:
         more = ", ..." if len(missing) > SHOWN_NAMES else ""
         images += f", {len(missing):,} without: {', '.join(missing[:SHOWN_NAMES])}{more}"
-    rows = [("Images", images), *(row for one in r.sensors for row in sensor_rows(one))]
-    if not r.sensors:
-        rows.append(("Sensor", "none: the frames are not known"))
-    if cameras.rotations is None:
-        rows.append(("Angles", "none: every camera counts as visible from every point"))
-    rows.append(("CRS", _short(r.crs_read) or "not stated"))
-    if cameras.crs != r.crs_read:
-        rows.append(("CRS of cloud", _short(cameras.crs) or "not stated"))
-    if r.problem:
-        rows.append(("Problem", r.problem))
-    else:
-        z = cameras.centres[:, 2]
-        rows.append(("Heights", f"{z.min():.2f} to {z.max():.2f} m, mean {z.mean():.2f} m"))
-    if r.height_above_water_m is not None:
-        low, mean, high = r.height_above_water_m
-        rows.append(("Above water", f"{low:.1f} to {high:.1f} m, mean {mean:.1f} m"))
-    if r.tilt_deg is not None:
-        rows.append(("Tilt", "median {:.1f} deg, largest {:.1f} deg".format(*r.tilt_deg)))
+    values = vars(r) | {
+        "no_sensor": not r.sensors,
+        "no_angles": cameras.rotations is None,
+        "crs": _short(r.crs_read) or "not stated",
+        "crs_of_cloud": (_short(cameras.crs) or "not stated") if cameras.crs != r.crs_read else "",
+        "z": () if r.problem else (z.min(), z.max(), z.mean()),
+    }
+    rows = [("Images", images), *(row for one in r.sensors for row in _sensor_rows(one))]
+    rows += filled(_BLOCK, values)
     if (g := r.gnss) is not None:
         means, deviations = (
-            ", ".join("-" if v is None else f"{v:{sign}.3f}" for v in values)
-            for values, sign in ((g.mean_m, "+"), (g.sd_m, ""))
+            ", ".join("-" if v is None else f"{v:{sign}.3f}" for v in g[of])
+            for of, sign in (("mean_m", "+"), ("sd_m", ""))
         )
-        words = (
-            f"{g.images:,} images; adjusted minus GNSS east, north, up: mean {means} m, sd"
-            f" {deviations} m;"
-            f" largest {g.largest_m:.3f} m ({g.largest_image})"
-        )
-        rows += [("GNSS", words)] if g.images else []
-        rows += [("" if g.images else "GNSS", g.reason)] if g.reason or not g.images else []
+        some, words = g["images"] > 0, {"means": means, "deviations": deviations}
+        rows += filled(_GNSS, g | words | {"no_images": not some, "more": some and g["reason"]})
     if (fit := r.fit) is not None:
         seen = ", ".join(f"{name}: {100.0 * part:.1f} %" for name, part in fit.seen_by.items())
-        rows += [
-            ("Cloud", f"{fit.cloud} ({fit.points_sampled:,} points sampled)"),
-            ("Visible", f"share of points by number of cameras: {seen}"),
-        ]
-        if fit.distance_m > 0.0:
-            rows.append(("Distance", f"{fit.distance_m:,.1f} m in plan between block and cloud"))
-        if fit.below_ground:
-            rows.append(("Below ground", f"{fit.below_ground} cameras"))
-        rows.append(("Check", fit.verdict or fit.tested))
+        rows += filled(_FIT, vars(fit) | {"seen": seen, "check": fit.verdict or fit.tested})
     if (found := r.diagnosis) is not None:
         says = {True: "absorbed", False: "not absorbed", None: "open"}
         if found.absorbed:
@@ -437,28 +422,25 @@ def cameras_text(r: CamerasReport) -> str:
     return aligned(f"{r.path}: {cameras.source or 'cameras'}", rows, cameras.notes)
 
 
-def sensor_rows(s: Sensor) -> list[tuple[str, str]]:
+def _sensor_rows(s: Plain) -> Rows:
     """Return frame, focal length and pixel size of a sensor, and what is wrong with its lens."""
-    low, high = f"{s.focal:.6g}", f"{s.focal_most or s.focal:.6g}"
-    size = f"{s.width:g} x {s.height:g} {s.unit}"
-    parts = [
-        f"{s.images:,} images" + (f" with {s.lenses:,} different lenses" if s.lenses > 1 else ""),
-        f"{s.frames} sizes as {size}" if s.frames > 1 else size,
-        f"focal length {low if low == high else f'{low} to {high}'} {s.unit}",
-    ]
-    if s.pixel_size_um is not None and s.focal_mm is not None:
-        parts[-1] += "" if s.lenses > 1 else f" = {s.focal_mm:.3f} mm"
-        parts.append(f"pixel {s.pixel_size_um:.2f} um")
-    parts += [s.projection, *(["distorted"] if s.distorted else [])]
-    parts += [] if s.gsd_m is None else [f"GSD {100.0 * s.gsd_m:.2f} cm at the water"]
-    rows = [("Sensor", f"{s.name or 'unnamed'}: {', '.join(parts)}")]
-    if s.folded:
-        rows.append(("", f"the distortion folds within the frame: {100.0 * s.folded:.2g} % of it is"
-                     " not used; check the radial coefficients"))  # fmt: skip
-    if s.nominal:
-        rows.append(("", "not calibrated, unlike the others; its images likely had no tie points,"
-                     " so do not trust their poses"))  # fmt: skip
-    return rows
+    low, high = f"{s['focal']:.6g}", f"{s['focal_most']:.6g}"
+    frame, pixel = f"{s['width']:g} x {s['height']:g} {s['unit']}", ""
+    if s["pixel_size_um"] is not None:
+        pixel = "" if s["lenses"] > 1 else f" = {s['focal_mm']:.3f} mm"
+        pixel += f", pixel {s['pixel_size_um']:.2f} um"
+    gsd = "" if s["gsd_m"] is None else f", GSD {100.0 * s['gsd_m']:.2f} cm at the water"
+    values = s | {
+        "title": s["name"] or "unnamed",
+        "different": f" with {s['lenses']:,} different lenses" if s["lenses"] > 1 else "",
+        "frame": f"{s['frames']} sizes as {frame}" if s["frames"] > 1 else frame,
+        "focals": low if low == high else f"{low} to {high}",
+        "pixel": pixel,
+        "is_distorted": ", distorted" if s["distorted"] else "",
+        "gsd": gsd,
+        "percent": 100.0 * s["folded"],
+    }
+    return filled(_SENSOR, values)
 
 
 def _short(crs: str | None) -> str:

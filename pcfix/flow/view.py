@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pcfix.compare.match import heights_at, near_in_plan
-from pcfix.compare.nearest import mean_spacing_m
+from pcfix.compare.match import gap_m, heights_at, near_in_plan
 from pcfix.errors import InputError, SettingError
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.surfaces import find_surface, view_of
@@ -25,7 +24,7 @@ from pcfix.lens.imaging import unproject
 from pcfix.libraries import load_open3d
 from pcfix.model import Cameras, FloatArray, IntArray, WaterDimension, WaterSurface
 from pcfix.options.declare import File, taken
-from pcfix.options.steps import ViewerOptions
+from pcfix.options.steps import CompareRules, ViewerOptions
 from pcfix.refract.tally import COVERAGE_95
 from pcfix.report.page import new_figure, png_of
 from pcfix.water.surface import surface_above
@@ -34,8 +33,6 @@ if TYPE_CHECKING:
     from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
 
-NEIGHBOURS, GAP_SPACINGS, LEAST_GAP_M = 8, 5.0, 1.0
-"""The defaults of a comparison."""
 FRUSTUM_SHARE = 0.06
 """Length of a frustum, as a share of the height of its camera above the clouds."""
 WATER_CELLS = 40
@@ -168,11 +165,10 @@ def _values(colour: str, layers: list[_Layer], surface: WaterSurface | None) -> 
     for one in layers:
         found = None
         if colour == "error" and one is not layers[-1]:  # NaN away from the reference
-            gap_m = max(GAP_SPACINGS * mean_spacing_m(target[:, :2]), LEAST_GAP_M)
-            near = near_in_plan(one.xyz[:, :2], target[:, :2], gap_m)
+            near = near_in_plan(one.xyz, target, gap_m(target))
             found = np.full(len(one.xyz), np.nan)
             if near.any():
-                k = min(NEIGHBOURS, len(target))
+                k = min(CompareRules().neighbours, len(target))
                 found[near] = one.xyz[near, 2] - heights_at(one.xyz[near, :2], target, k)[0]
         elif colour == "height":
             found = one.xyz[:, 2]

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from pcfix.clean.neighbours import nearest_distance
 from pcfix.compare.match import heights_at
-from pcfix.compare.nearest import cloud_to_cloud
 from pcfix.compare.sections import parse_line, section_along
 from pcfix.compare.statistics import binned, fit_line, statistics_of
 
@@ -44,7 +44,7 @@ def test_c2c():
     clouds = [
         scattered(300, 1),
         lifted(scattered(400, 2), 2.0),
-        lifted(scattered(400, 3), 90.0),  # beyond the cells
+        lifted(scattered(400, 3), 90.0),
         rng.uniform(0.0, 1.0, (900, 3)),
         rng.normal(0.0, 1.0, (900, 3)) ** 5,  # dense in the middle, thin outside
         np.column_stack([np.arange(900.0), np.zeros(900), rng.uniform(0, 5, 900)]),
@@ -53,12 +53,12 @@ def test_c2c():
         np.array([[1.0, 2.0, 3.0]]),
     ]
     slow = [min(math.dist(p, q) for q in clouds[1].tolist()) for p in clouds[0].tolist()]
-    np.testing.assert_allclose(cloud_to_cloud(clouds[0], clouds[1]), slow, rtol=0, atol=5e-9)
+    np.testing.assert_allclose(nearest_distance(clouds[0], clouds[1], 3), slow, rtol=0, atol=5e-9)
     for reference in clouds:
         for cloud in clouds:
             tree, _ = cKDTree(reference).query(cloud)
             # coordinates of 5e6 m are known to 1e-9 m in float64
-            np.testing.assert_allclose(cloud_to_cloud(cloud, reference), tree, atol=5e-9)
+            np.testing.assert_allclose(nearest_distance(cloud, reference, 3), tree, atol=5e-9)
 
 
 def test_plane_exact():

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 import pcfix
-from pcfix.compare.nearest import spacing_m
+from pcfix.compare.match import spacing_m
 from pcfix.compare.statistics import distances_of
 from pcfix.flow.compare import compare_clouds
 from pcfix.report.comparison import comparison_text, evaluation, gauss

@@ -10,8 +10,8 @@ import pytest
 
 from pcfix import blocks
 from pcfix.clean import neighbours
-from pcfix.compare import m3c2, nearest
-from pcfix.compare.nearest import cloud_to_cloud
+from pcfix.clean.neighbours import nearest_distance
+from pcfix.compare import m3c2
 from pcfix.errors import InputError
 from pcfix.flow.compare import compare_clouds
 from pcfix.running import threads
@@ -21,10 +21,8 @@ from tests.utils.codes import refused
 
 def in_small_tiles(monkeypatch, points, rows=1_000_000, large=2_000_000):
     """Have tiles of so many points, blocks of so many rows, and larger arrays on disk."""
-    for module, name in (
-        (nearest, "TILE_POINTS"), (neighbours, "POINTS_PER_TILE"), (m3c2, "TILE_POINTS")
-    ):  # fmt: skip
-        monkeypatch.setattr(module, name, points)
+    monkeypatch.setattr(neighbours, "POINTS_PER_TILE", points)
+    monkeypatch.setattr(m3c2, "TILE_POINTS", points)
     monkeypatch.setattr(blocks, "ROWS", rows)
     monkeypatch.setattr(blocks, "LARGE", large)
 
@@ -59,12 +57,12 @@ def lattice(seed):
 def test_distances(make, monkeypatch):
     cloud, reference = make(1), make(2)
     expected = least_distances(cloud, reference)
-    whole = cloud_to_cloud(cloud, reference)
+    whole = nearest_distance(cloud, reference, 3)
     np.testing.assert_array_equal(whole, expected)
     for points, jobs in ((60, None), (200, 1), (700, 2)):
         in_small_tiles(monkeypatch, points, rows=350)
         with threads(jobs):
-            np.testing.assert_array_equal(cloud_to_cloud(cloud, reference), expected)
+            np.testing.assert_array_equal(nearest_distance(cloud, reference, 3), expected)
 
 
 def figures(folder, name):

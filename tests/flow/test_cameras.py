@@ -10,7 +10,7 @@ import pytest
 from pyproj import CRS, Transformer
 
 import pcfix
-from pcfix.flow.cameras import _sensors, cameras_text, check_cameras
+from pcfix.flow.cameras import cameras_text, check_cameras, sensors_of
 from pcfix.flow.inputs import Inputs, both_models
 from pcfix.io.cameras.colmap import write_colmap
 from pcfix.lens.imaging import project
@@ -93,10 +93,10 @@ def test_heights_above_the_water(tmp_path):
     report = check_cameras(path, sensor=SENSOR, water=0.37)
     assert report.problem
     assert report.height_above_water_m is None
-    assert [sensor.gsd_m for sensor in report.sensors] == [None]
+    assert [sensor["gsd_m"] for sensor in report.sensors] == [None]
     below = check_cameras(CAMERAS, sensor=SENSOR, water=1000.0)
     assert below.height_above_water_m[2] < 0.0
-    assert [sensor.gsd_m for sensor in below.sensors] == [None]
+    assert [sensor["gsd_m"] for sensor in below.sensors] == [None]
 
 
 @sorolla
@@ -123,13 +123,13 @@ def test_heights_off_by_the_geoid(tmp_path):
 LENS = Lens(3650.0, 5472.0, 3648.0, 2736.0, 1824.0, radial=(-0.02,), sensor="S")
 
 
-def sensors_of(lenses):
+def sensors_with(lenses):
     """Return the sensors of images that have these lenses."""
     k = len(lenses)
     cameras = Cameras(
         tuple(f"{i}.jpg" for i in range(k)), np.zeros((k, 3)), np.tile(np.eye(3), (k, 1, 1)), lenses
     )
-    return _sensors(cameras, np.full(k, 80.0))
+    return sensors_of(cameras, np.full(k, 80.0))
 
 
 SERIES = [replace(LENS, focal=3650.0 + i) for i in range(177)]
@@ -147,12 +147,12 @@ OTHER = replace(LENS, focal=3700.0, sensor="T")
     ],
 )  # fmt: skip
 def test_groups_of_lenses(lenses, images, different):
-    sensors = sensors_of(tuple(lenses))
-    assert [sensor.images for sensor in sensors] == images
-    assert [sensor.lenses for sensor in sensors] == different
-    most = [max(one.focal for one in lenses if sensor.name in (one.sensor, "several"))
+    sensors = sensors_with(tuple(lenses))
+    assert [sensor["images"] for sensor in sensors] == images
+    assert [sensor["lenses"] for sensor in sensors] == different
+    most = [max(one.focal for one in lenses if sensor["name"] in (one.sensor, "several"))
             for sensor in sensors]  # fmt: skip
-    assert [sensor.focal_most for sensor in sensors] == most
+    assert [sensor["focal_most"] for sensor in sensors] == most
 
 
 SNELL = {"water": 0.37, "method": "snell", "max_angle": None}
