@@ -11,15 +11,16 @@ import json
 import warnings
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from pcfix.errors import PcfixWarning, SettingError, bad_file
 from pcfix.flow.runner import Progress, file_task, write_summary
+from pcfix.grid.colours import NO_LIGHT, hillshade
 from pcfix.grid.delaunay import fill_holes, margin_cells
 from pcfix.grid.heights import Gridding, as_uncertainty, grid_window
 from pcfix.grid.lattice import (
@@ -31,7 +32,6 @@ from pcfix.grid.lattice import (
     refuse_size,
     round_resolution,
 )
-from pcfix.grid.model import NO_LIGHT, CellTally, DsmSummary, hillshade
 from pcfix.io import rasters
 from pcfix.io.atomic import scratch_folder, temporary_output
 from pcfix.io.crs import crs_words, parts
@@ -69,6 +69,41 @@ DIMENSIONS = {"depth": "WaterDepth", "uncertainty": SIGMA_Z}
 SPARSE = 20.0
 """Cells per point; if there are more, some points may lie far from all others."""
 BULK_SAMPLE, BEYOND_BULK = 1_000_000, 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class DsmSummary:
+    """The numbers of a DSM; the keys of ``pcfix dsm --summary`` are these names."""
+
+    input: str
+    output: str
+    hillshade: str | None
+    counts: str | None
+    what: str  # the quantity in the cells; see `DsmRules`
+    pcfix: str  # version
+    crs: str | None  # coordinate system of the cloud, and its vertical part
+    heights: str | None
+    width: int  # columns and rows
+    height: int
+    bounds_m: tuple[float, float, float, float]  # left, bottom, right, top
+    points: int  # in the cloud
+    points_used: int  # in the raster: of the surface asked for, neither noise nor withheld
+    cells: int  # with points
+    filled: int  # with a height but no points
+    empty: int  # without a height
+    points_per_cell: float  # mean over the cells with points
+    spacing_m: float  # of the points used, within the area that they fill
+    hole_m: float | None  # width of the widest hole that was bridged
+    settings: dict[str, Any]
+    seconds: float
+    values: dict[str, float]  # least, mean and largest of the cells, before holes are filled
+    resolution_is: Literal["given", "chosen"] = "given"
+    part: dict[str, Any] | None = None  # points read, of how many, and by which bounds
+    stray: int = 0  # points ignored because they lie far from all others
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, for JSON."""
+        return asdict(self)
 
 
 def grid_dsm(
@@ -156,7 +191,7 @@ def grid_dsm(
         # a cloud optimised file is a copy, with overviews of its own
         paths = {name: folder / f"{name}.tif" if given.cog else drafts[name] for name in drafts}
         tags = {"pcfix": __version__, "corrected": corrected, **asdict(rules)}
-        tally, filled = _write_rasters(points, how, rules, paths, folder, crs, tags, report)
+        counted = _write_rasters(points, how, rules, paths, folder, crs, tags, report)
         for name, path in paths.items():
             if given.cog:
                 rasters.copy_as_cog(path, drafts[name])
@@ -178,15 +213,12 @@ def grid_dsm(
         bounds_m=lattice.bounds_m,
         points=count,
         points_used=points.near.points,
-        cells=tally.cells,
-        filled=tally.filled + filled,
-        empty=lattice.width * lattice.height - tally.known - filled,
-        points_per_cell=points.near.points / tally.cells,
+        **counted,
+        points_per_cell=points.near.points / counted["cells"],
         spacing_m=spacing_m,
         hole_m=reach_m if rules.method == "tin" else rules.fill,
         settings=asdict(rules),
         seconds=round(task.seconds, 3),
-        values=tally.values(),
         resolution_is="given" if given.resolution else "chosen",
         part=part_report(task.source),
         stray=points.stray,
@@ -204,12 +236,9 @@ def _write_rasters(
     crs: Any,
     tags: dict[str, Any],
     report: Callable[[float], None],
-) -> tuple[CellTally, int]:
-    """Write the raster, and hillshade and counts where they have a path.
-
-    Returns the statistics of the cells, and how many were filled after that.
-    """
-    lattice, filled, is_height = points.lattice, 0, rules.what == "height"
+) -> dict[str, Any]:
+    """Write the raster, and hillshade and counts where they have a path; return as `_grid`."""
+    lattice, is_height = points.lattice, rules.what == "height"
     plan = None if crs is None else parts(crs)[0]
     unit = METRE if is_height or rules.what in DIMENSIONS else ""
     new = partial(rasters.new_raster, lattice=lattice, tags={"PCFIX": json.dumps(tags)})
@@ -221,19 +250,20 @@ def _write_rasters(
             bands = {"count": "", "spread": unit}
             counts = files.enter_context(new(paths["counts"], crs=plan, bands=bands))
         if how.method == "tin" or rules.fill is None:
-            tally = _grid(points, how, rules.what, dsm, counts, report)
+            found = _grid(points, how, rules.what, dsm, counts, report)
         else:
             unfilled, widest = folder / "unfilled.tif", rules.fill / rules.cell_m
             with rasters.new_raster(unfilled, lattice, None, {"height": METRE}) as heights:
-                tally = _grid(points, how, rules.what, heights, counts, report)
+                found = _grid(points, how, rules.what, heights, counts, report)
+            empty = lattice.width * lattice.height
             with rasters.open_raster(unfilled) as heights:
                 for window in lattice.window.parts(BLOCK_CELLS):
                     around = window.grown(margin_cells(widest)).clipped(lattice.window)
-                    known = rasters.read_heights(heights, around)
-                    height = fill_holes(known, window, around, widest)
+                    height = rasters.read_heights(heights, around)
+                    height = fill_holes(height, window, around, widest)
                     rasters.write_part(dsm, height, window, 1)
-                    filled += int((~np.isnan(height)).sum())
-            filled -= tally.known
+                    empty -= int((~np.isnan(height)).sum())
+            found |= {"filled": found["filled"] + found["empty"] - empty, "empty": empty}
     if "hillshade" in paths:
         shade = rasters.new_raster(
             paths["hillshade"], lattice, plan, {"hillshade": ""}, dtype="uint8", nodata=NO_LIGHT
@@ -243,15 +273,19 @@ def _write_rasters(
                 height = rasters.read_within(heights, window.grown(1), lattice.window)
                 light = hillshade(height, rules.cell_m, rules.azimuth, rules.altitude)
                 rasters.write_part(out, light, window, 1)
-    return tally, filled
+    return found
 
 
 def _grid(
     points: SortedPoints, how: Gridding, what: str, heights: DatasetWriter,
     counts: DatasetWriter | None, report: Callable[[float], None],
-) -> CellTally:  # fmt: skip
-    """Write values to one raster, numbers of points and their spread to another."""
-    tally, done, lattice = CellTally(), 0, points.lattice
+) -> dict[str, Any]:  # fmt: skip
+    """Write values to one raster, numbers of points and their spread to another.
+
+    Returns the numbers of cells and the statistics of their values, by the names of `DsmSummary`.
+    """
+    cells, filled, count, total, low, high, done = 0, 0, 0, 0.0, np.inf, -np.inf, 0
+    lattice = points.lattice
     # windows have about this number of points if points are everywhere
     side = np.sqrt(WINDOW_POINTS) * how.spacing_m / lattice.resolution_m or BLOCK_CELLS
     for window in lattice.window.parts(int(np.clip(side, 1, BLOCK_CELLS))):
@@ -262,10 +296,21 @@ def _grid(
         if counts is not None:
             for band, values in enumerate(bands[1:], start=1):
                 rasters.write_part(counts, values, window, band)
-        tally += CellTally.of(bands)
+        known = ~np.isnan(bands.height)
+        values = bands.height[known]
+        cells += int((bands.points > 0).sum())
+        filled += int((known & (bands.points == 0)).sum())
+        count, total = count + values.size, total + float(values.sum())
+        low, high = values.min(initial=low), values.max(initial=high)
         done += window.height * window.width
         report(0.5 + 0.5 * done / (lattice.height * lattice.width))
-    return tally
+    found = {"min": low, "mean": total / count, "max": high} if count else {}
+    return {
+        "cells": cells,
+        "filled": filled,
+        "empty": lattice.width * lattice.height - count,
+        "values": {name: round(float(value), 4) for name, value in found.items()},
+    }
 
 
 def point_spacing_m(cloud: CloudFiles, settings: DsmRules) -> float:

@@ -17,10 +17,9 @@ from pcfix.flow.dsm import BLOCK_CELLS, grid_dsm, point_spacing_m
 from pcfix.flow.runner import Progress
 from pcfix.flow.shore import shoreline_layer
 from pcfix.flow.surfaces import points_of, view_of
-from pcfix.grid.colours import relief_colours
+from pcfix.grid.colours import hillshade, relief_colours
 from pcfix.grid.lattice import Lattice, Window, round_resolution
 from pcfix.grid.maps import contours, depth_interval
-from pcfix.grid.model import hillshade
 from pcfix.grid.shoreline import NearWater
 from pcfix.io import rasters
 from pcfix.io.atomic import scratch_folder, temporary_output

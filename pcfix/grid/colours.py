@@ -1,6 +1,6 @@
-"""Colour ramps of maps: one for each quantity, in pictures, pages and GIS styles.
+"""Colours of maps: hillshades, and a ramp for each quantity in pictures, pages and GIS styles.
 
-All are ramps of matplotlib that keep their order for colour-blind readers and in print: shallow
+All ramps are of matplotlib and keep their order for colour-blind readers and in print: shallow
 water is light, and positive differences are red.
 """
 
@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.grid.model import NO_LIGHT
 from pcfix.model import FloatArray
 
 DEPTH = "YlGnBu"
@@ -41,7 +40,7 @@ def relief_colours(
 ) -> npt.NDArray[np.uint8]:
     """Return red, green, blue and alpha, shape (4, rows, columns), of a shaded bed and its land.
 
-    `light`, shape (rows, columns), is that of `pcfix.grid.model.hillshade`; level ground has the
+    `light`, shape (rows, columns), is that of `hillshade`; level ground has the
     share `flat` of it and keeps its colour. Depths are NaN on land; `deepest_m` has the last colour
     of the ramp.
     """
@@ -55,3 +54,41 @@ def relief_colours(
     alpha = np.where(light == NO_LIGHT, 0, 255)
     bands = [np.clip(np.rint(band * lit), 0, 255) for band in colours]
     return np.where(alpha > 0, [*bands, alpha], 0).astype(np.uint8)
+
+
+NO_LIGHT = 0
+"""Value of cells without a height."""
+
+
+def hillshade(
+    height: FloatArray, resolution_m: float, azimuth_deg: float, altitude_deg: float
+) -> npt.NDArray[np.uint8]:
+    """Return the brightness of each cell, 1 (dark) to 255; `NO_LIGHT` without a height.
+
+    The slope of a cell comes from its eight neighbours, the four nearest counting twice (B. K. P.
+    Horn, Hill shading and the reflectance map, 1981); the light is the cosine of the angle between
+    the normal and the direction of the sun, given by its azimuth clockwise from north and its
+    altitude above the horizon. A neighbour without a height gets the cell's own.
+
+    Heights have the shape (rows + 2, columns + 2), metres, NaN if unknown, with a margin of one
+    cell; the first row is the northernmost. The result has the shape (rows, columns).
+    """
+    rows, columns = height.shape[0] - 2, height.shape[1] - 2
+    own = height[1:-1, 1:-1]
+
+    def near(down: int, right: int) -> FloatArray:
+        there = height[1 + down : 1 + down + rows, 1 + right : 1 + right + columns]
+        return np.where(np.isnan(there), own, there)
+
+    east = near(-1, 1) + 2.0 * near(0, 1) + near(1, 1)
+    west = near(-1, -1) + 2.0 * near(0, -1) + near(1, -1)
+    north = near(-1, -1) + 2.0 * near(-1, 0) + near(-1, 1)
+    south = near(1, -1) + 2.0 * near(1, 0) + near(1, 1)
+    slope_x, slope_y = (east - west) / (8.0 * resolution_m), (north - south) / (8.0 * resolution_m)
+    azimuth, altitude = np.radians(azimuth_deg), np.radians(altitude_deg)
+    sun_x, sun_y = np.sin(azimuth) * np.cos(altitude), np.cos(azimuth) * np.cos(altitude)
+    cosine = (np.sin(altitude) - sun_x * slope_x - sun_y * slope_y) / np.sqrt(
+        1.0 + slope_x**2 + slope_y**2
+    )
+    light = np.rint(1.0 + 254.0 * np.clip(cosine, 0.0, 1.0))
+    return np.where(np.isnan(own), NO_LIGHT, light).astype(np.uint8)

@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 
 from pcfix.adjust.result import nice_step
-from pcfix.grid.colours import HEIGHT, stops_of
+from pcfix.grid.colours import HEIGHT, NO_LIGHT, hillshade, stops_of
 from pcfix.grid.maps import Maps, contours, depth_interval, smoothed
-from pcfix.grid.model import NO_LIGHT, hillshade
 from pcfix.model import FloatArray
 
 _NO_DATA = -32768

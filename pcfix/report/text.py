@@ -17,7 +17,6 @@ from pcfix.refract.tally import ORDERS, Summary
 
 if TYPE_CHECKING:
     from pcfix.clean.points import CleanSummary
-    from pcfix.grid.model import DsmSummary
     from pcfix.label.labelling import LabelSummary
 
 Plain = dict[str, Any]
@@ -352,7 +351,7 @@ def cleaning_text(s: CleanSummary) -> str:
     return aligned(_head("Cleaned", s), [*rows, *(("Not run", test) for test in s.not_run)])
 
 
-def dsm_text(s: DsmSummary) -> str:
+def dsm_text(s: Any) -> str:
     """Return the summary of a DSM."""
     total = s.width * s.height
     low, mean, high = (s.values.get(name, np.nan) for name in ("min", "mean", "max"))
