@@ -316,11 +316,10 @@ def _pairs(match: Match) -> AfterBefore[Pairs]:
         raise GeometryError(code, sentence, path=name, points=count, least=k)
 
     def pairs(xyz: FloatArray) -> Pairs:
-        if sparse:
-            height, by_nearest = heights_at(match.places, xyz, k)
-            return Pairs(match.places[:, :2], height, match.places[:, 2], by_nearest)
-        height, by_nearest = heights_at(xyz, match.reference.xyz, k)
-        return Pairs(xyz[:, :2], xyz[:, 2], height, by_nearest)
+        places, surface = (match.places, xyz) if sparse else (xyz, match.reference.xyz)
+        height, by_nearest = heights_at(places, surface, k)
+        heights = (height, places[:, 2]) if sparse else (places[:, 2], height)
+        return Pairs(places[:, :2], *heights, by_nearest)
 
     return both(pairs, match.cloud.xyz, match.cloud.apparent)
 

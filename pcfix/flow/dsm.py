@@ -23,15 +23,7 @@ from pcfix.flow.runner import Progress, file_task, write_summary
 from pcfix.grid.colours import NO_LIGHT, hillshade
 from pcfix.grid.delaunay import fill_holes, margin_cells
 from pcfix.grid.heights import Gridding, as_uncertainty, grid_window
-from pcfix.grid.lattice import (
-    Occupancy,
-    Window,
-    cells_of,
-    fits,
-    lattice_over,
-    refuse_size,
-    round_resolution,
-)
+from pcfix.grid.lattice import Occupancy, Window, cells_of, fits, lattice_over, round_resolution
 from pcfix.io import rasters
 from pcfix.io.atomic import scratch_folder, temporary_output
 from pcfix.io.crs import crs_words, parts
@@ -376,7 +368,7 @@ class SortedPoints:
             )
             warnings.warn(PcfixWarning("dsm.stray", sentence, points=self.stray), stacklevel=3)
         low, high, spacing_m = self.near.low, self.near.high, self.near.spacing_m
-        refuse_size(low, high, resolution, str(source.path))
+        self.lattice = lattice_over(low, high, resolution, str(source.path))
         if resolution**2 < FEWEST_A_CELL * spacing_m**2:
             density = (resolution / spacing_m) ** 2
             sentence = (
@@ -384,7 +376,6 @@ class SortedPoints:
                 f" {spacing_m:.2g} m, or {density:.2g} points a cell. Use at least that spacing."
             )
             warnings.warn(PcfixWarning("dsm.fine", sentence, spacing_m=spacing_m), stacklevel=4)
-        self.lattice = lattice_over(low, high, resolution)
 
     def points_in(self, window: Window) -> tuple[FloatArray, IntArray]:
         """Return the points of a window, and their columns and rows in the raster.

@@ -14,7 +14,7 @@ from pcfix.errors import GeometryError, InputError, PcfixWarning
 from pcfix.flow.inputs import paths_in
 from pcfix.flow.photos import CLOUDS, PhotoBlock, block_of, plain, warn_all
 from pcfix.flow.runner import Progress, check_summary, write_summary
-from pcfix.grid.lattice import Lattice, lattice_over, refuse_size
+from pcfix.grid.lattice import Lattice, lattice_over
 from pcfix.io import rasters
 from pcfix.io.atomic import scratch_folder, temporary_output
 from pcfix.io.photographs import photographs_in, read_colours
@@ -93,8 +93,7 @@ def ortho_photo(
         low = np.array([bed.left_m, bed.top_m - rows * bed.cell_m])
         high = np.array([bed.left_m + columns * bed.cell_m, bed.top_m])
         side = given.resolution or float(f"{block.gsd_m:.1e}")
-        refuse_size(low, high, side, str(given.dsm))
-        lattice = lattice_over(low, high - 1e-6 * side, side)
+        lattice = lattice_over(low, high - 1e-6 * side, side, str(given.dsm))
         covered, ground = _write(block, lattice, given, folder / "plain.tif", progress)
         if not covered:
             raise GeometryError(

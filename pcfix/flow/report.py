@@ -27,7 +27,7 @@ from pcfix.refract.tally import Summary
 from pcfix.report.adjustment import adjustment_tables
 from pcfix.report.comparison import evaluation, in_a_sentence
 from pcfix.report.page import Picture, Report, Table, render
-from pcfix.report.run import RunResults, in_short, is_found, run_report
+from pcfix.report.run import RunResults, in_short, run_report
 from pcfix.report.text import uncertainty_sentence
 
 Plain = dict[str, Any]
@@ -76,7 +76,7 @@ def report_run(
         tables += adjustment_tables(figures_of(files.folder), f"{FOLDER}/report.html")
     summary, again = Summary(**corrected), inputs_of_run(request)
     cameras = cameras_of(request, files)
-    if is_found(summary):
+    if (summary.water_fit or {}).get("model") == "auto":  # the water was sought in the cloud
         pictures.append(found_picture(again.surface(view_of(request.source))))
     page = write_report(
         files.cleaned_cloud, files.folder, summary=summary, cameras=cameras,

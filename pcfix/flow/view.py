@@ -37,13 +37,6 @@ FRUSTUM_SHARE = 0.06
 """Length of a frustum, as a share of the height of its camera above the clouds."""
 WATER_CELLS = 40
 SHOWN = ("WaterDepth", "SigmaZ", *SHIFTS)
-_REMEDY = {
-    "depth": "Give --water, or a cloud from 'pcfix correct'.",
-    "shift": "Give a cloud from 'pcfix correct'.",
-    "uncertainty": "Give a cloud from 'pcfix correct --dimensions all'.",
-    "error": "Cloud and reference do not overlap.",
-    "height": "Its heights are not numbers.",
-}
 WATER_COLOUR = (0.29, 0.64, 0.78, 0.25)
 CAMERA_COLOUR = (0.04, 0.37, 0.54)
 AZIMUTH_DEG, ELEVATION_DEG = -119.0, 29.0
@@ -52,13 +45,18 @@ MOST_DOTS = 30_000
 GREY = 0.72
 """Of points without a value, such as land where depths are shown."""
 MOST_PERCENT = 98.0
-RAMPS = {
-    "depth": (colours.DEPTH, "Depth below the water (m)"),
-    "shift": (colours.HEIGHT, "Lowered by the correction (m)"),
-    "error": (colours.DIFFERENCE, "Height above the reference (m)"),
-    "uncertainty": (colours.UNCERTAINTY, "Uncertainty of Z at 95 % (m)"),
-    "height": (colours.HEIGHT, "Height (m)"),
-}
+COLOURS = {
+    "depth": (colours.DEPTH, "Depth below the water (m)",
+              "Give --water, or a cloud from 'pcfix correct'."),
+    "shift": (colours.HEIGHT, "Lowered by the correction (m)",
+              "Give a cloud from 'pcfix correct'."),
+    "error": (colours.DIFFERENCE, "Height above the reference (m)",
+              "Cloud and reference do not overlap."),
+    "uncertainty": (colours.UNCERTAINTY, "Uncertainty of Z at 95 % (m)",
+                    "Give a cloud from 'pcfix correct --dimensions all'."),
+    "height": (colours.HEIGHT, "Height (m)", "Its heights are not numbers."),
+}  # fmt: skip
+"""Their ramp, their name, and what to do where no cloud has values."""
 
 
 class _Layer(NamedTuple):
@@ -161,29 +159,30 @@ def _read(path: Path, most: int) -> tuple[list[_Layer], Any]:
 
 def _values(colour: str, layers: list[_Layer], surface: WaterSurface | None) -> list[FloatArray]:
     """Return the values for the colours of each layer, NaN where unknown."""
-    values, target = [], layers[-1].xyz
+    values = []
     for one in layers:
-        found = None
-        if colour == "error" and one is not layers[-1]:  # NaN away from the reference
+        found = np.full(len(one.xyz), np.nan)
+        if colour == "height":
+            found = one.xyz[:, 2]
+        elif colour == "error" and one is not layers[-1]:
+            target = layers[-1].xyz
             near = near_in_plan(one.xyz, target, gap_m(target))
-            found = np.full(len(one.xyz), np.nan)
             if near.any():
                 k = min(CompareRules().neighbours, len(target))
-                found[near] = one.xyz[near, 2] - heights_at(one.xyz[near, :2], target, k)[0]
-        elif colour == "height":
-            found = one.xyz[:, 2]
+                found[near] = one.xyz[near, 2] - heights_at(one.xyz[near], target, k)[0]
         elif colour == "depth":
-            found = one.known.get("WaterDepth")
-            if found is None and surface is not None and not isinstance(surface, WaterDimension):
+            if "WaterDepth" in one.known:
+                found = one.known["WaterDepth"]
+            elif surface is not None and not isinstance(surface, WaterDimension):
                 found = surface_above(surface, one.xyz).height_m - one.xyz[:, 2]
-            found = None if found is None else np.where(found > 0.0, found, np.nan)
-        elif colour != "error":
-            name, sign = {"shift": ("ShiftZ", -1.0), "uncertainty": ("SigmaZ", COVERAGE_95)}[colour]
-            if name in one.known:
-                found = np.where(one.known[name] != 0.0, sign * one.known[name], np.nan)
-        values.append(np.full(len(one.xyz), np.nan) if found is None else found)
+            found = np.where(found > 0.0, found, np.nan)
+        elif colour == "shift" and "ShiftZ" in one.known:
+            found = np.where(one.known["ShiftZ"] != 0.0, -one.known["ShiftZ"], np.nan)
+        elif colour == "uncertainty" and "SigmaZ" in one.known:
+            found = np.where(one.known["SigmaZ"] > 0.0, COVERAGE_95 * one.known["SigmaZ"], np.nan)
+        values.append(found)
     if not any(np.isfinite(one).any() for one in values):
-        sentence = f"No cloud has values for --colour {colour}. {_REMEDY[colour]}"
+        sentence = f"No cloud has values for --colour {colour}. {COLOURS[colour][2]}"
         raise SettingError("view.no_values", sentence, colour=colour)
     return values
 
@@ -255,7 +254,7 @@ def scale_of(what: str, values: FloatArray) -> ScalarMappable:
     else:
         low = float(np.percentile(known, 100.0 - MOST_PERCENT)) if what == "height" else 0.0
         high = max(float(np.percentile(known, MOST_PERCENT)), low + 1e-3)
-    ramp = colormaps[RAMPS[what][0]].with_extremes(bad=(GREY, GREY, GREY))
+    ramp = colormaps[COLOURS[what][0]].with_extremes(bad=(GREY, GREY, GREY))
     return ScalarMappable(Normalize(low, high), ramp)
 
 
@@ -312,6 +311,6 @@ def view_figure(scene: Scene3d, scale: ScalarMappable, what: str) -> Figure:
         panel.view_init(ELEVATION_DEG, AZIMUTH_DEG)
         panel.set_aspect("equal")
         panel.set(xlabel="East (m)", ylabel="North (m)", zlabel="Height (m)")
-    label = RAMPS[what][1]
+    label = COLOURS[what][1]
     figure.colorbar(scale, ax=list(axes[0]), label=label, shrink=0.8, extend="both")
     return figure

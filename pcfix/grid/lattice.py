@@ -128,8 +128,22 @@ def cells_of(xyz: FloatArray, resolution_m: float) -> IntArray:
     return cells
 
 
-def lattice_over(low: FloatArray, high: FloatArray, resolution_m: float) -> Lattice:
-    """Return the cells that cover a rectangle between two corners, metres; see `fits`."""
+def lattice_over(low: FloatArray, high: FloatArray, resolution_m: float, name: str) -> Lattice:
+    """Return the cells that cover a rectangle between two corners, metres.
+
+    Raises SettingError ``option.resolution`` with the name of the input if it does not fit.
+    """
+    if not fits(low, high, resolution_m):
+        finest = MIN_RESOLUTION_M  # rounded up to three digits
+        while not fits(low, high, finest):
+            step = 10.0 ** (math.floor(math.log10(finest * 1.0000001)) - 2)
+            finest = round(finest / step + 1.0) * step
+        columns, rows = _size(low, high, resolution_m)
+        sentence = (
+            f"{name}: a resolution of {resolution_m:g} m makes {columns:,.0f} x {rows:,.0f} cells,"
+            f" more than {MAX_CELLS:,}. Use {finest:g} m or more."
+        )
+        raise SettingError("option.resolution", sentence, value=resolution_m, finest=finest)
     (west, south), (east, north) = cells_of(np.array([low, high]), resolution_m).tolist()
     return Lattice(resolution_m, west, north, east - west + 1, south - north + 1)
 
@@ -137,22 +151,6 @@ def lattice_over(low: FloatArray, high: FloatArray, resolution_m: float) -> Latt
 def fits(low: FloatArray, high: FloatArray, resolution_m: float) -> bool:
     """Return whether a raster over the rectangle has at most `MAX_CELLS`."""
     return bool(np.prod(_size(low, high, resolution_m)) <= MAX_CELLS)
-
-
-def refuse_size(low: FloatArray, high: FloatArray, resolution_m: float, name: str) -> None:
-    """Raise SettingError ``option.resolution`` for a raster with more than `MAX_CELLS`."""
-    if fits(low, high, resolution_m):
-        return
-    columns, rows = _size(low, high, resolution_m)
-    finest = MIN_RESOLUTION_M  # rounded up to three digits
-    while not fits(low, high, finest):
-        step = 10.0 ** (math.floor(math.log10(finest * 1.0000001)) - 2)
-        finest = round(finest / step + 1.0) * step
-    sentence = (
-        f"{name}: a resolution of {resolution_m:g} m makes {columns:,.0f} x {rows:,.0f} cells, more"
-        f" than {MAX_CELLS:,}. Use {finest:g} m or more."
-    )
-    raise SettingError("option.resolution", sentence, value=resolution_m, finest=finest)
 
 
 def _size(low: FloatArray, high: FloatArray, resolution_m: float) -> FloatArray:

@@ -234,10 +234,8 @@ def shift_histogram(values: FloatArray) -> Figure:
     """Draw the distribution of shifts in Z, metres, without half a percent at each end."""
     figure, axes = new_figure()
     low, high = np.percentile(values, [0.5, 99.5])
-    if high <= low:
-        low, high = low - 0.5, high + 0.5
+    edges = np.linspace(low, high, 81) if high > low else np.linspace(low - 0.5, low + 0.5, 81)
     text = f"shift in Z: mean {values.mean():.3f}, sd {values.std():.3f}"
-    edges = np.linspace(low, high, 81)
     axes.hist(values, edges, density=True, color=BEFORE, alpha=0.55, label=text)
     axes.set(xlabel=SHIFT, ylabel="Density")
     axes.legend(loc="best")
@@ -318,11 +316,6 @@ def _orders(s: Summary, measured: Plain | None) -> list[Table]:
     limit = "within sqrt(a^2 + (b depth)^2)"
     header = ["order", "a", "b", *(f"points with {name} {limit}" for name in known)]
     return [Table("Orders of IHO S-44, vertical", header, rows)] if known else []
-
-
-def is_found(s: Summary) -> bool:
-    """Whether the water was sought in the cloud."""
-    return s.water_fit is not None and s.water_fit["model"] == "auto"
 
 
 def in_short(tiles: Sequence[Tile]) -> str:
