@@ -1,8 +1,8 @@
 """Grid a LAS or LAZ cloud to a raster of heights, depths or another quantity, in bounded memory.
 
-The points are sorted once into files for squares of the plan; then the raster is made window by
-window. All points that decide on a cell are read with its window, so that the raster does not
-depend on the size of chunks, squares and windows.
+The points are sorted once by squares of the plan; then the raster is made window by window. All
+points that decide on a cell are read with its window, so that the raster does not depend on the
+size of chunks, squares and windows.
 """
 
 from __future__ import annotations
@@ -18,28 +18,28 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from pcfix.blocks import bounds, empty, kept, mapped, release
 from pcfix.errors import PcfixWarning, SettingError, bad_file
 from pcfix.flow.runner import Progress, file_task, write_summary
 from pcfix.grid.colours import NO_LIGHT, hillshade
 from pcfix.grid.delaunay import fill_holes, margin_cells
 from pcfix.grid.heights import Gridding, as_uncertainty, grid_window
-from pcfix.grid.lattice import Occupancy, Window, cells_of, fits, lattice_over, round_resolution
+from pcfix.grid.lattice import SortedPoints, lattice_over, round_resolution, spacing_m, square_m
 from pcfix.io import rasters
 from pcfix.io.atomic import scratch_folder, temporary_output
 from pcfix.io.crs import crs_words, parts
-from pcfix.io.files import Bins, check_output, write_text
+from pcfix.io.files import check_output, scratch_arrays, write_text
 from pcfix.io.las.part import part_report
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.las.writing import is_ours
 from pcfix.io.styles import raster_style
 from pcfix.io.tiles import CloudFiles, Clouds, Tiles, cloud_of, inputs_of, open_cloud
-from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES, BoolArray, FloatArray, IntArray
+from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES, FloatArray
 from pcfix.options.declare import File, taken
-from pcfix.options.steps import MIN_RESOLUTION_M, DsmOptions, DsmRules, SurfaceChoice
+from pcfix.options.steps import MIN_RESOLUTION_M, DsmOptions, DsmRules
 from pcfix.version import __version__
 
 if TYPE_CHECKING:
-    import laspy
     from rasterio.io import DatasetWriter
 
 WINDOW_POINTS = 400_000
@@ -52,7 +52,7 @@ METRE = "metre"
 BLOCK_CELLS = 1024
 """Longest side of a window."""
 BIN_POINTS = 200_000
-"""Points in a square of the store, on average."""
+"""Points in a square by which they are sorted, on average."""
 SIGMA_Z = "SigmaZ"
 FEWEST_A_CELL = 0.9
 """Points per cell, on average where there are any; fewer give a warning."""
@@ -156,8 +156,6 @@ def grid_dsm(
     style = task.target.with_suffix(".qml")
     if given.style:
         check_output(style, overwrite=given.overwrite, inputs=inputs_of(files))
-    if given.resolution is None:
-        rules = replace(rules, resolution=round_resolution(point_spacing_m(cloud, rules), 0.0))
 
     def report(share: float) -> None:
         """Report the progress, in points."""
@@ -170,16 +168,25 @@ def grid_dsm(
             name: stack.enter_context(temporary_output(path)) for name, path in targets.items()
         }
         folder = stack.enter_context(scratch_folder(task.target))
+        stack.enter_context(scratch_arrays(task.target))
         with open_cloud(cloud) as source:
             crs, count = metric_crs(source), len(source)
             corrected = any(is_ours(vlr) for vlr in source.vlrs)
-            points = SortedPoints(cloud, source, rules, folder, report)
-        lattice, spacing_m = points.lattice, points.near.spacing_m
+            read = _points_of(source, rules, report)
+            if given.resolution is None:
+                cell_m = round_resolution(_spacing_m(source, read), 0.0)
+                rules = replace(rules, resolution=cell_m)
+            used = _without_stray(source, read, rules.cell_m)
+            apart_m = _spacing_m(source, used, rules.cell_m)
+            side = np.sqrt(BIN_POINTS * _stated_area(source, rules.cell_m) / count) / rules.cell_m
+        lattice = lattice_over(*bounds(used[:, :2]), rules.cell_m, str(task.source))
+        _warn_if_fine(rules.cell_m, apart_m)
+        points = SortedPoints.of(used, lattice, int(np.clip(side, 1, BLOCK_CELLS)))
         # the widest circle around a triangle
         reach_m = max(
-            TIN_REACH_SPACINGS * spacing_m, TIN_REACH_CELLS * rules.cell_m, rules.fill or 0.0
+            TIN_REACH_SPACINGS * apart_m, TIN_REACH_CELLS * rules.cell_m, rules.fill or 0.0
         )
-        how = Gridding(lattice, rules.method, reach_m, spacing_m)
+        how = Gridding(lattice, rules.method, reach_m, apart_m)
         # a cloud optimised file is a copy, with overviews of its own
         paths = {name: folder / f"{name}.tif" if given.cog else drafts[name] for name in drafts}
         tags = {"pcfix": __version__, "corrected": corrected, **asdict(rules)}
@@ -204,16 +211,16 @@ def grid_dsm(
         height=lattice.height,
         bounds_m=lattice.bounds_m,
         points=count,
-        points_used=points.near.points,
+        points_used=len(used),
         **counted,
-        points_per_cell=points.near.points / counted["cells"],
-        spacing_m=spacing_m,
+        points_per_cell=len(used) / counted["cells"],
+        spacing_m=apart_m,
         hole_m=reach_m if rules.method == "tin" else rules.fill,
         settings=asdict(rules),
         seconds=round(task.seconds, 3),
         resolution_is="given" if given.resolution else "chosen",
         part=part_report(task.source),
-        stray=points.stray,
+        stray=len(read) - len(used),
     )
     write_summary(task, result.as_dict())
     return result
@@ -281,7 +288,7 @@ def _grid(
     # windows have about this number of points if points are everywhere
     side = np.sqrt(WINDOW_POINTS) * how.spacing_m / lattice.resolution_m or BLOCK_CELLS
     for window in lattice.window.parts(int(np.clip(side, 1, BLOCK_CELLS))):
-        bands = grid_window(*points.points_in(window.grown(how.margin_cells)), window, how)
+        bands = grid_window(*points.within(window.grown(how.margin_cells)), window, how)
         if what == "uncertainty":
             bands = as_uncertainty(bands)
         rasters.write_part(heights, bands[0], window, 1)
@@ -305,89 +312,83 @@ def _grid(
     }
 
 
-def point_spacing_m(cloud: CloudFiles, settings: DsmRules) -> float:
-    """Return the side of the square that each point of a raster has for itself, metres."""
-    with open_cloud(cloud) as source:
-        near = Occupancy(_stated_area(source, MIN_RESOLUTION_M), len(source), MIN_RESOLUTION_M)
-        for points in source.chunks():
-            near.add(coordinates(points)[_wanted(points, settings.surface)])
-    _refuse_none(near.points, cloud, settings.surface)
-    return near.spacing_m
+def point_spacing_m(cloud: CloudFiles, near: Path) -> float:
+    """Return the side of the square that each point has for itself, metres.
 
-
-class SortedPoints:
-    """The points of a raster, in a file in a folder, and the raster's `lattice`.
-
-    `near` has the number and spacing of the points; `stray` counts those that are ignored because
-    they lie far from all others. Raises PcfixError if no points are left, or the raster would be
-    too large.
+    The points of a large cloud are on the disk of the path `near` meanwhile.
     """
+    with scratch_arrays(near), open_cloud(cloud) as source:
+        return _spacing_m(source, _points_of(source, DsmRules(), lambda done: None))
 
-    def __init__(
-        self, cloud: CloudFiles, source: LasSource, settings: DsmRules, folder: Path,
-        report: Callable[[float], None],
-    ) -> None:  # fmt: skip
-        """Read a cloud, which is open as `source`, store the wanted points, and lay out the raster.
 
-        If the extent is too large for the number of points, the cloud is read once before.
-        """
-        resolution = settings.cell_m
-        self._resolution_m = resolution
-        area, dimension = _stated_area(source, resolution), _dimension_of(source, settings.what)
-        cells = np.sqrt(BIN_POINTS / (len(source) / area)) / resolution
-        self._bins = Bins(folder, int(np.clip(cells, 1, BLOCK_CELLS)))
-        self.near = Occupancy(area, len(source), resolution)
-        sparse = area > SPARSE * len(source) * resolution**2
-        bulk = _bulk_of(cloud, len(source), resolution) if sparse else None
-        self.stray, first, done = 0, None, 0
-        for points in source.chunks():
-            xyz = coordinates(points)
-            if dimension is not None:
-                xyz[:, 2] = source.dimension(points, dimension)
-            wanted = _wanted(points, settings.surface) & np.isfinite(xyz[:, 2])
-            if dimension == SIGMA_Z:
-                wanted &= xyz[:, 2] > 0.0  # others have none
-            xyz = xyz[wanted]
-            if bulk is not None:
-                inside = ((xyz[:, :2] >= bulk[0]) & (xyz[:, :2] <= bulk[1])).all(axis=1)
-                self.stray += int((~inside).sum())
-                first = xyz[~inside][0] if first is None and not inside.all() else first
-                xyz = xyz[inside]
-            self.near.add(xyz)
-            if len(xyz) and fits(self.near.low, self.near.high, resolution):
-                self._bins.add(cells_of(xyz, resolution), xyz)
-            # too large a raster is refused below, when the whole extent is known
-            done += len(points)
-            report(0.5 * done / len(source))
-        _refuse_none(self.near.points, source.path, settings.surface)
-        if first is not None:
-            place = ", ".join(f"{value:,.2f}" for value in first)
-            sentence = (
-                f"{source.path}: {self.stray:,} points far from all others are not gridded, the"
-                f" first at {place}. Remove them, or grid their part of the cloud separately."
-            )
-            warnings.warn(PcfixWarning("dsm.stray", sentence, points=self.stray), stacklevel=3)
-        low, high, spacing_m = self.near.low, self.near.high, self.near.spacing_m
-        self.lattice = lattice_over(low, high, resolution, str(source.path))
-        if resolution**2 < FEWEST_A_CELL * spacing_m**2:
-            density = (resolution / spacing_m) ** 2
-            sentence = (
-                f"The resolution {resolution:g} m is finer than the points allow: their spacing is"
-                f" {spacing_m:.2g} m, or {density:.2g} points a cell. Use at least that spacing."
-            )
-            warnings.warn(PcfixWarning("dsm.fine", sentence, spacing_m=spacing_m), stacklevel=4)
+def _spacing_m(source: LasSource, xyz: FloatArray, finest_m: float = MIN_RESOLUTION_M) -> float:
+    return spacing_m(xyz, square_m(_stated_area(source, finest_m), len(source), finest_m))
 
-    def points_in(self, window: Window) -> tuple[FloatArray, IntArray]:
-        """Return the points of a window, and their columns and rows in the raster.
 
-        The first are metres in the world frame, shape (n, 3), with the gridded values in the place
-        of z; the second have shape (n, 2).
-        """
-        row, column = self.lattice.first_row, self.lattice.first_column
-        xyz = self._bins.read(window.moved(row, column))
-        cell = cells_of(xyz, self._resolution_m) - np.array([column, row])
-        rows = window.holds(cell)
-        return xyz[rows], cell[rows]
+def _points_of(source: LasSource, rules: DsmRules, report: Callable[[float], None]) -> FloatArray:
+    """Read the points to grid, shape (n, 3), the gridded values in the place of z."""
+    dimension = _dimension_of(source, rules.what)
+    result, count, done = empty((len(source), 3)), 0, 0
+    for points in source.chunks():
+        xyz = coordinates(points)
+        if dimension is not None:
+            xyz[:, 2] = source.dimension(points, dimension)
+        classes = np.asarray(points["classification"])
+        is_bed = classes == BATHYMETRIC_POINT
+        wanted = is_bed if rules.surface == "bed" else ~np.isin(classes, NOISE_CLASSES)
+        wanted &= ~np.asarray(points["withheld"]).astype(bool) & np.isfinite(xyz[:, 2])
+        if dimension == SIGMA_Z:
+            wanted &= xyz[:, 2] > 0.0  # others have none
+        xyz = xyz[wanted]
+        result[count : count + len(xyz)] = xyz
+        count, done = count + len(xyz), done + len(points)
+        release()
+        report(0.5 * done / len(source))
+    if count == 0 and rules.surface == "bed":
+        sentence = (
+            f"has no point of class {BATHYMETRIC_POINT} (bed) that is not withheld. Correct the"
+            " cloud first, or use --surface all."
+        )
+        raise bad_file(source.path, "dsm.no_bed", sentence)
+    if count == 0:
+        sentence = "all points are noise (classes 7 and 18) or withheld. Classify it again."
+        raise bad_file(source.path, "cloud.all_withheld", sentence)
+    return result[:count]
+
+
+def _without_stray(source: LasSource, xyz: FloatArray, resolution_m: float) -> FloatArray:
+    """Return the points without those far from all others, where the extent is too large for all.
+
+    The box of all but a thousandth of the points on each side grows by its own size, so that a
+    cloud of two places is inside it.
+    """
+    if _stated_area(source, resolution_m) <= SPARSE * len(source) * resolution_m**2:
+        return xyz
+    some = xyz[:: 1 + len(xyz) // BULK_SAMPLE, :2]
+    low, high = np.quantile(some, (BEYOND_BULK, 1.0 - BEYOND_BULK), axis=0)
+    size = np.maximum(high - low, resolution_m)
+    low, high = low - size, high + size
+    inside = mapped(lambda p: ((p[:, :2] >= low) & (p[:, :2] <= high)).all(axis=1), xyz)
+    if not inside.all():
+        stray = int((~inside).sum())
+        place = ", ".join(f"{value:,.2f}" for value in xyz[np.argmin(inside)])
+        sentence = (
+            f"{source.path}: {stray:,} points far from all others are not gridded, the first at"
+            f" {place}. Remove them, or grid their part of the cloud separately."
+        )
+        warnings.warn(PcfixWarning("dsm.stray", sentence, points=stray), stacklevel=3)
+    return kept(inside, xyz)
+
+
+def _warn_if_fine(resolution_m: float, spacing_m: float) -> None:
+    """Warn of cells without points."""
+    if resolution_m**2 < FEWEST_A_CELL * spacing_m**2:
+        density = (resolution_m / spacing_m) ** 2
+        sentence = (
+            f"The resolution {resolution_m:g} m is finer than the points allow: their spacing is"
+            f" {spacing_m:.2g} m, or {density:.2g} points a cell. Use at least that spacing."
+        )
+        warnings.warn(PcfixWarning("dsm.fine", sentence, spacing_m=spacing_m), stacklevel=3)
 
 
 def _dimension_of(source: LasSource, what: str) -> str | None:
@@ -407,40 +408,7 @@ def _dimension_of(source: LasSource, what: str) -> str | None:
     raise SettingError("option.choice", sentence, option="what", value=what)
 
 
-def _wanted(points: laspy.ScaleAwarePointRecord, surface: SurfaceChoice) -> BoolArray:
-    classes = np.asarray(points["classification"])
-    wanted = classes == BATHYMETRIC_POINT if surface == "bed" else ~np.isin(classes, NOISE_CLASSES)
-    return np.asarray(wanted & ~np.asarray(points["withheld"]).astype(bool))
-
-
 def _stated_area(source: LasSource, resolution_m: float) -> float:
     """Return the area of a cloud as its header states it, which need not be right, m2."""
     area = float(np.prod(source.header.maxs[:2] - source.header.mins[:2]))
     return max(area, resolution_m**2) if np.isfinite(area) else resolution_m**2
-
-
-def _bulk_of(cloud: CloudFiles, count: int, resolution_m: float) -> FloatArray:
-    """Return the south-west and north-east corner of where nearly all points lie, shape (2, 2).
-
-    The box of all but a thousandth of the points on each side grows by its own size, so that a
-    cloud of two places is inside it.
-    """
-    step = 1 + count // BULK_SAMPLE
-    with open_cloud(cloud, places_only=True) as source:
-        some = [coordinates(points)[::step, :2] for points in source.chunks()]
-    low, high = np.quantile(np.vstack(some), (BEYOND_BULK, 1.0 - BEYOND_BULK), axis=0)
-    size = np.maximum(high - low, resolution_m)
-    return np.array([low - size, high + size])
-
-
-def _refuse_none(points: int, source: CloudFiles, surface: SurfaceChoice) -> None:
-    """Raise an error if no point is left."""
-    if points == 0 and surface == "bed":
-        sentence = (
-            f"has no point of class {BATHYMETRIC_POINT} (bed) that is not withheld. Correct the"
-            " cloud first, or use --surface all."
-        )
-        raise bad_file(source, "dsm.no_bed", sentence)
-    if points == 0:
-        sentence = "all points are noise (classes 7 and 18) or withheld. Classify it again."
-        raise bad_file(source, "cloud.all_withheld", sentence)

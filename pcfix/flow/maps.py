@@ -30,7 +30,7 @@ from pcfix.io.vectors import Layer, write_layers
 from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES, Cameras, FloatArray, WaterSurface
 from pcfix.options.correct import LEVEL_M
 from pcfix.options.declare import File
-from pcfix.options.steps import DsmOptions, DsmRules
+from pcfix.options.steps import DsmOptions
 from pcfix.water.surface import surface_above
 
 SURFACE, BED, DEPTH, UNCERTAINTY = "surface.tif", "bed.tif", "depth.tif", "uncertainty.tif"
@@ -67,7 +67,7 @@ def write_rasters(
             middle = float(source.header.mins[2] + source.header.maxs[2]) / 2.0
         focal = np.array([lens.focal_px for lens in cameras.lenses])
         gsd_m = float(np.median((cameras.centres[:, 2] - middle) / focal))
-    spacing_m = point_spacing_m(cloud, DsmRules())
+    spacing_m = point_spacing_m(cloud, folder / SURFACE)
     cell_m = resolution or round_resolution(spacing_m, gsd_m or 0.0)
     plain = DsmOptions(resolution=cell_m, cog=True, style=True, overwrite=True)
     filled = replace(plain, fill=HOLE_CELLS * cell_m)

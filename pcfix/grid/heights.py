@@ -21,7 +21,7 @@ class Gridding(NamedTuple):
     lattice: Lattice
     method: DsmMethod
     reach_m: float  # diameter of the widest circle around a triangle of the TIN
-    spacing_m: float  # of the points; see `pcfix.grid.lattice.Occupancy`
+    spacing_m: float  # of the points; see `pcfix.grid.lattice.spacing_m`
 
     @property
     def margin_cells(self) -> int:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pcfix.blocks import blocks, bounds, grouped, mapped, release
 from pcfix.errors import SettingError
 from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.options.steps import MIN_RESOLUTION_M
@@ -116,6 +117,11 @@ class Lattice:
         away = np.column_stack([xyz[:, 0] - self.left_m, self.top_m - xyz[:, 1]])
         return np.asarray(away / self.resolution_m)
 
+    def cells(self, xyz: FloatArray) -> IntArray:
+        """Return the column and row of points, shape (n, 2), counted from the top left corner."""
+        first = np.array([self.first_column, self.first_row])
+        return cells_of(xyz, self.resolution_m) - first
+
 
 def cells_of(xyz: FloatArray, resolution_m: float) -> IntArray:
     """Return columns eastwards and rows southwards of points, counted from x = 0 and y = 0.
@@ -131,14 +137,21 @@ def cells_of(xyz: FloatArray, resolution_m: float) -> IntArray:
 def lattice_over(low: FloatArray, high: FloatArray, resolution_m: float, name: str) -> Lattice:
     """Return the cells that cover a rectangle between two corners, metres.
 
-    Raises SettingError ``option.resolution`` with the name of the input if it does not fit.
+    Raises SettingError ``option.resolution``, with the `name` of the input, if there are more than
+    `MAX_CELLS`.
     """
-    if not fits(low, high, resolution_m):
+
+    def size(side_m: float) -> FloatArray:
+        """Return columns and rows, as floats, which cannot overflow."""
+        first, last = (np.floor((corner + EDGE_M) / side_m) for corner in (low, high))
+        return np.asarray(last - first + 1.0)
+
+    if size(resolution_m).prod() > MAX_CELLS:
         finest = MIN_RESOLUTION_M  # rounded up to three digits
-        while not fits(low, high, finest):
+        while size(finest).prod() > MAX_CELLS:
             step = 10.0 ** (math.floor(math.log10(finest * 1.0000001)) - 2)
             finest = round(finest / step + 1.0) * step
-        columns, rows = _size(low, high, resolution_m)
+        columns, rows = size(resolution_m)
         sentence = (
             f"{name}: a resolution of {resolution_m:g} m makes {columns:,.0f} x {rows:,.0f} cells,"
             f" more than {MAX_CELLS:,}. Use {finest:g} m or more."
@@ -146,17 +159,6 @@ def lattice_over(low: FloatArray, high: FloatArray, resolution_m: float, name: s
         raise SettingError("option.resolution", sentence, value=resolution_m, finest=finest)
     (west, south), (east, north) = cells_of(np.array([low, high]), resolution_m).tolist()
     return Lattice(resolution_m, west, north, east - west + 1, south - north + 1)
-
-
-def fits(low: FloatArray, high: FloatArray, resolution_m: float) -> bool:
-    """Return whether a raster over the rectangle has at most `MAX_CELLS`."""
-    return bool(np.prod(_size(low, high, resolution_m)) <= MAX_CELLS)
-
-
-def _size(low: FloatArray, high: FloatArray, resolution_m: float) -> FloatArray:
-    """Return columns and rows, as floats, which cannot overflow."""
-    first, last = (np.floor((corner + EDGE_M) / resolution_m) for corner in (low, high))
-    return np.asarray(last - first + 1.0)
 
 
 POINTS_A_CELL = 2.0, 4.0
@@ -181,35 +183,54 @@ POINTS_A_SQUARE = 6.0
 MOST_SQUARES = 4_000_000
 
 
-class Occupancy:
-    """The extent of a cloud, and the squares of the plan with points, accumulated over chunks.
+def spacing_m(xyz: FloatArray, side_m: float) -> float:
+    """Return the spacing of points (n, 3) within the squares of the plan with any; 0 on a line."""
+    squares: IntArray = np.empty(0, np.int64)
+    for rows in blocks(len(xyz)):
+        column, row = np.floor(xyz[rows, :2] / side_m).astype(np.int64).T
+        squares = np.union1d(squares, (row << 32) + column)
+    low, high = bounds(xyz[:, :2])
+    row = squares >> 32
+    corner = np.column_stack([squares - (row << 32), row]) * side_m
+    sides = np.minimum(corner + side_m, high) - np.maximum(corner, low)
+    return float(np.sqrt(np.maximum(sides, 0.0).prod(axis=1).sum() / len(xyz)))
 
-    `points` is their number; `low` and `high`, shape (2,), are the south-west and north-east corner
-    of their extent, metres, world frame.
-    """
 
-    def __init__(self, area_m2: float, points: int, finest_m: float) -> None:
-        """Choose squares by area and number of all points, not smaller than `finest_m`."""
-        wanted = max(POINTS_A_SQUARE / points, 1.0 / MOST_SQUARES) * area_m2
-        self.side_m = max(float(np.sqrt(wanted)), finest_m)
-        self.points = 0
-        self.low, self.high = np.full(2, np.inf), np.full(2, -np.inf)
-        self._squares: IntArray = np.empty(0, np.int64)
+def square_m(area_m2: float, points: int, finest_m: float) -> float:
+    """Return the side of squares for `spacing_m`, not smaller than `finest_m`."""
+    wanted = max(POINTS_A_SQUARE / points, 1.0 / MOST_SQUARES) * area_m2
+    return max(float(np.sqrt(wanted)), finest_m)
 
-    def add(self, xyz: FloatArray) -> None:
-        """Count points, shape (n, 3), metres, world frame."""
-        if not len(xyz):
-            return
-        self.points += len(xyz)
-        self.low = np.minimum(self.low, xyz[:, :2].min(axis=0))
-        self.high = np.maximum(self.high, xyz[:, :2].max(axis=0))
-        column, row = np.floor(xyz[:, :2] / self.side_m).astype(np.int64).T
-        self._squares = np.union1d(self._squares, (row << 32) + column)
 
-    @property
-    def spacing_m(self) -> float:
-        """Spacing of the points within the area that they fill; 0 if all are on one line."""
-        row = self._squares >> 32
-        corner = np.column_stack([self._squares - (row << 32), row]) * self.side_m
-        sides = np.minimum(corner + self.side_m, self.high) - np.maximum(corner, self.low)
-        return float(np.sqrt(np.maximum(sides, 0.0).prod(axis=1).sum() / self.points))
+@dataclass(frozen=True, eq=False)
+class SortedPoints:
+    """The points of a raster by squares of `side` cells; they may be on disk, see `blocks`."""
+
+    lattice: Lattice
+    side: int
+    xyz: FloatArray  # (n, 3), metres, world frame; the gridded values in the place of z
+    start: IntArray  # square i, row by row, has the points start[i] to start[i + 1]
+
+    @classmethod
+    def of(cls, xyz: FloatArray, lattice: Lattice, side: int) -> SortedPoints:
+        """Sort the points of a raster."""
+        columns, rows = -(-lattice.width // side), -(-lattice.height // side)
+
+        def square(some: FloatArray) -> IntArray:
+            column, row = (lattice.cells(some) // side).T
+            return np.asarray(row * columns + column)
+
+        start, (xyz,) = grouped(mapped(square, xyz), columns * rows, xyz)
+        return cls(lattice, side, xyz, start)
+
+    def within(self, window: Window) -> tuple[FloatArray, IntArray]:
+        """Return the points of a window, shape (n, 3), and their columns and rows, (n, 2)."""
+        near, columns = window.clipped(self.lattice.window), -(-self.lattice.width // self.side)
+        first, last = near.column // self.side, (near.column_stop - 1) // self.side
+        squares = range(near.row // self.side, (near.row_stop - 1) // self.side + 1)
+        ends = [self.start[[row * columns + first, row * columns + last + 1]] for row in squares]
+        xyz = np.vstack([self.xyz[start:stop] for start, stop in ends])
+        release()
+        cell = self.lattice.cells(xyz)
+        rows = window.holds(cell)
+        return xyz[rows], cell[rows]

@@ -24,9 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import InputError, SettingError, bad_file, refusal
-from pcfix.grid.lattice import Window
 from pcfix.io.atomic import temporary_output
-from pcfix.model import FloatArray, IntArray
 from pcfix.options.declare import File
 from pcfix.running import Empty, running
 from pcfix.sums import Sums
@@ -247,40 +245,3 @@ def scratch_arrays(target: Path) -> Iterator[Empty]:
 
     with running(empty=empty, release=release):
         yield empty
-
-
-class Bins:
-    """Points sorted by place into one file without a name, on the disk of a folder.
-
-    The plane is divided into squares of `side` cells. Each point has three float64 values: x, y and
-    height or another quantity.
-    """
-
-    def __init__(self, folder: Path, side: int) -> None:
-        self.side = side
-        self._stream = TemporaryFile(dir=folder)  # noqa: SIM115  # closed with this object
-        # offset in the file and number of points, for the pieces of each square
-        self._pieces: dict[tuple[int, int], list[tuple[int, int]]] = {}
-
-    def add(self, cell: IntArray, xyz: FloatArray) -> None:
-        """Store points, shape (n, 3), by columns and rows of their cells, shape (n, 2)."""
-        square = cell // self.side
-        order = np.lexsort((square[:, 0], square[:, 1]))
-        square, xyz = square[order], xyz[order]
-        first = np.flatnonzero((np.diff(square, axis=0, prepend=square[:1] - 1) != 0).any(axis=1))
-        offset = self._stream.seek(0, os.SEEK_END)
-        for start, stop in zip(first, [*first[1:], len(xyz)], strict=True):
-            place = (int(square[start, 0]), int(square[start, 1]))
-            self._pieces.setdefault(place, []).append((offset, int(stop - start)))
-            offset += self._stream.write(xyz[start:stop].tobytes())
-
-    def read(self, cells: Window) -> FloatArray:
-        """Return the points, shape (n, 3), of all squares that touch a window."""
-        rows = range(cells.row // self.side, (cells.row_stop - 1) // self.side + 1)
-        columns = range(cells.column // self.side, (cells.column_stop - 1) // self.side + 1)
-        data = bytearray()
-        for square in ((column, row) for row in rows for column in columns):
-            for offset, points in self._pieces.get(square, ()):
-                self._stream.seek(offset)
-                data += self._stream.read(points * 3 * 8)
-        return np.frombuffer(data).reshape(-1, 3)
