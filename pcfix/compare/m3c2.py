@@ -46,11 +46,9 @@ def load_py4dgeo() -> Any:
 
 def point_spacing_m(xyz: FloatArray, tiles: Tiles) -> float:
     """Return the median distance to the nearest other point of a sample of the cloud (n, 3)."""
-    near, rows = Neighbours(tiles, 3), sample_rows(len(xyz), SPACING_SAMPLE)
-    sample = make_tiles(xyz[rows])
-    pieces = (sample.xyz[piece] for piece in sample.pieces(SPACING_SAMPLE))
-    found = [near.nearest(some, min(2, len(xyz)))[0][:, -1] for some in pieces]
-    return float(np.median(np.concatenate(found)))
+    sample = xyz[sample_rows(len(xyz), SPACING_SAMPLE)]
+    distance, _ = Neighbours(tiles, 3).nearest(sample, min(2, len(xyz)))
+    return float(np.median(distance[:, -1]))
 
 
 def sample_rows(count: int, most: int) -> IntArray:

@@ -232,16 +232,3 @@ def binned(
         )
         for number, first, last in zip(numbers, start, start[1:], strict=False)
     )
-
-
-def errors_against_truth(xyz: FloatArray, true_xyz: FloatArray) -> tuple[float, float, float]:
-    """Return mean and rms error of Z, and in plan, of points (n, 3), metres, same frame.
-
-    The error in plan is the root mean square length of the horizontal difference.
-    """
-    error = xyz - true_xyz
-    return (
-        float(error[:, 2].mean()),
-        float(np.sqrt((error[:, 2] ** 2).mean())),
-        float(np.sqrt((error[:, :2] ** 2).sum(axis=1).mean())),
-    )

@@ -331,18 +331,12 @@ class CamerasReport:
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
         cameras, fit = self.cameras, self.fit
-        return {
-            "path": self.path,
+        apart = ("cameras", "fit", "sample_xyz", "level_m", "diagnosis", "remedy")
+        return {name: value for name, value in vars(self).items() if name not in apart} | {
             "source": cameras.source,
             "images_posed": len(cameras),
             "images_unposed": list(cameras.unposed),
-            "crs_read": self.crs_read,
             "crs": cameras.crs,
-            "sensors": self.sensors,
-            "height_above_water_m": self.height_above_water_m,
-            "tilt_deg": self.tilt_deg,
-            "problem": self.problem,
-            "gnss": self.gnss,
             "fit": fit and {**asdict(fit), "fits": fit.fits},
             "refraction": self.diagnosis and self.diagnosis.as_dict(),
             "notes": [str(note) for note in cameras.notes],

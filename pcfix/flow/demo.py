@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pcfix.compare.statistics import errors_against_truth
+import numpy as np
+
 from pcfix.flow.correct import correct_points
 from pcfix.flow.request import Request
 from pcfix.flow.run import run_all
@@ -65,7 +66,10 @@ def _table(scene: Scene, corrected: FloatArray) -> str:
     head = f"error of {deep.sum():,} bed points"
     lines = [f"{head:<30}{'mean Z':>20}{'RMSE Z':>20}{'RMSE XY':>20}"]
     for name, xyz in rows.items():
-        errors = errors_against_truth(xyz[deep], scene.true_xyz[deep])
+        error = xyz[deep] - scene.true_xyz[deep]
+        squares = error**2
+        plan = np.sqrt(squares[:, :2].sum(axis=1).mean())
+        errors = error[:, 2].mean(), np.sqrt(squares[:, 2].mean()), plan
         cells = (f"{100 * e:.1f} cm {e / scene.gsd_m:6.1f} GSD" for e in errors)
         lines.append(f"{name:<30}" + "".join(f"{cell:>20}" for cell in cells))
     return "\n".join(lines)

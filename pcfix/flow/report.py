@@ -81,7 +81,7 @@ def report_run(
     page = write_report(
         files.cleaned_cloud, files.folder, summary=summary, cameras=cameras,
         water=water_of(request, files), inputs=inputs, resolution_m=files.resolution_m,
-        overwrite=True, project=request.project or "", date=request.date or again.dates(cameras),
+        project=request.project or "", date=request.date or again.dates(cameras),
         pictures=pictures, tables=tables, verdict=verdict, compared=compared.get("figures", {}),
         difference=dod,
     )  # fmt: skip
@@ -103,7 +103,6 @@ def write_report(
     water: WaterSurface,
     inputs: Sequence[Path],
     resolution_m: float | None = None,
-    overwrite: bool = False,
     **more: Any,
 ) -> Report:
     """Write ``report.html`` and ``figures/*.png`` about a corrected cloud, into an existing folder.
@@ -120,8 +119,8 @@ def write_report(
     figures = out_dir / "figures"
     figures.mkdir(exist_ok=True)
     for picture in report.pictures:
-        write_bytes(figures / f"{picture.name}.png", picture.png, overwrite=overwrite)
-    write_text(out_dir / PAGE, render(report), overwrite=overwrite)
+        write_bytes(figures / f"{picture.name}.png", picture.png, overwrite=True)
+    write_text(out_dir / PAGE, render(report), overwrite=True)
     return report
 
 

@@ -93,6 +93,7 @@ class Algorithm(QgsProcessingAlgorithm):
     def __init__(self, command: dict[str, Any]) -> None:
         super().__init__()
         self.command = command
+        self.fields = [*command["places"], *command["options"]]
 
     def createInstance(self) -> Algorithm:  # noqa: N802
         """Return a copy."""
@@ -112,7 +113,7 @@ class Algorithm(QgsProcessingAlgorithm):
 
     def initAlgorithm(self, configuration: dict[str, Any] | None = None) -> None:  # noqa: N802
         """Declare arguments and options."""
-        for one in (*self.command["places"], *self.command["options"]):
+        for one in self.fields:
             parameter = _parameter(one)
             parameter.setHelp(one["help"])
             if not one["needed"]:
@@ -125,10 +126,7 @@ class Algorithm(QgsProcessingAlgorithm):
         self, parameters: dict[str, Any], context: Any, feedback: Any
     ) -> dict[str, Any]:
         """Run pcfix and load its output."""
-        values = {
-            one["name"]: self._value(one, parameters, context)
-            for one in (*self.command["places"], *self.command["options"])
-        }
+        values = {one["name"]: self._value(one, parameters, context) for one in self.fields}
         said: list[str] = []
 
         def say(line: str) -> None:
@@ -144,7 +142,7 @@ class Algorithm(QgsProcessingAlgorithm):
             raise QgsProcessingException(str(error)) from error
         written = {
             one["name"]: values[one["name"]]
-            for one in (*self.command["places"], *self.command["options"])
+            for one in self.fields
             if one["kind"] in ("written", "folder written") and values[one["name"]]
         }
         for path in written.values():
