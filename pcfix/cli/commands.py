@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,6 +23,17 @@ TILED = "LAS or LAZ cloud; a folder, glob, list (.txt) or index (.vpc) of tiles.
 CLOUD = "LAS or LAZ to write; a folder for tiles."
 
 
+def _summarized(
+    title: str, work: Callable[..., Any], text: str, quiet: bool, unit: str = "points"
+) -> None:
+    """Do the work with a progress bar, and print its summary by a function of `pcfix.report`."""
+    from pcfix.report import text as texts
+
+    with progress_bar(title, quiet, unit=unit) as progress:
+        result = work(progress=progress)
+    say(getattr(texts, text)(result), quiet)
+
+
 @command(
     "pcfix run cloud.laz out --cameras cameras.xml --water 0.37 --reference lidar.laz",
     input=TILED,
@@ -28,22 +41,14 @@ CLOUD = "LAS or LAZ to write; a folder for tiles."
     config="Repeat the run of this run.json.",
 )
 def run(
-    input: str | None = None,
-    out_dir: Path | None = None,
-    /,
-    *,
-    options: RunOptions,
-    config: Path | None = None,
-    quiet: bool,
-) -> None:
+    input: str | None = None, out_dir: Path | None = None, /, *, options: RunOptions,
+    config: Path | None = None, quiet: bool,
+) -> None:  # fmt: skip
     """Adjust, correct, clean, grid, compare and report; resumes where it stopped.
 
     With --config give only the folder: pcfix run OUT_DIR --config run.json.
     """
-    shown: dict[str, Any] = {
-        "say": partial(say, quiet=quiet),
-        "bar": partial(progress_bar, quiet=quiet),
-    }
+    shown: Any = {"say": partial(say, quiet=quiet), "bar": partial(progress_bar, quiet=quiet)}
     if config is None:
         if input is None or out_dir is None:
             raise UsageError("INPUT and OUT_DIR are needed")
@@ -55,9 +60,8 @@ def run(
     folder = out_dir or input
     if folder is None or options.cameras is not None or options.water is not None:
         raise UsageError("with --config give OUT_DIR alone")
-    run_all(
-        request_of(config), Path(folder), overwrite=options.overwrite, jobs=options.jobs, **shown
-    )
+    request = replace(request_of(config), overwrite=options.overwrite, jobs=options.jobs)
+    run_all(request, Path(folder), **shown)
 
 
 @command(
@@ -67,11 +71,8 @@ def run(
 )
 def correct(input: str, output: Path, /, *, options: CorrectOptions, quiet: bool) -> None:
     """Correct a point cloud for refraction at the water surface."""
-    from pcfix.report.text import summary_text
-
-    with progress_bar("Correcting", quiet) as progress:
-        result = pcfix.correct_file(input, output, options=options, progress=progress)
-    say(summary_text(result), quiet)
+    work = partial(pcfix.correct_file, input, output, options=options)
+    _summarized("Correcting", work, "summary_text", quiet)
 
 
 @command(
@@ -98,21 +99,15 @@ def adjust(
 @command("pcfix label cloud.laz labelled.laz --water shore.csv", input=TILED, output=CLOUD)
 def label(input: str, output: Path, /, *, options: LabelOptions, quiet: bool) -> None:
     """Classify points below the water surface (class 40)."""
-    from pcfix.report.text import labelling_text
-
-    with progress_bar("Labelling", quiet) as progress:
-        result = pcfix.label_file(input, output, options=options, progress=progress)
-    say(labelling_text(result), quiet)
+    work = partial(pcfix.label_file, input, output, options=options)
+    _summarized("Labelling", work, "labelling_text", quiet)
 
 
 @command("pcfix clean corrected.laz cleaned.laz", input=TILED, output=CLOUD)
 def clean(input: str, output: Path, /, *, options: CleanOptions, quiet: bool) -> None:
     """Flag noise: outliers, weak intersections, points far from the bed."""
-    from pcfix.report.text import cleaning_text
-
-    with progress_bar("Cleaning", quiet) as progress:
-        result = pcfix.clean_file(input, output, options=options, progress=progress)
-    say(cleaning_text(result), quiet)
+    work = partial(pcfix.clean_file, input, output, options=options)
+    _summarized("Cleaning", work, "cleaning_text", quiet)
 
 
 @command(
@@ -122,11 +117,8 @@ def clean(input: str, output: Path, /, *, options: CleanOptions, quiet: bool) ->
 )
 def dsm(input: str, output: Path, /, *, options: DsmOptions, quiet: bool) -> None:
     """Grid a cloud to a GeoTIFF: height, count and spread."""
-    from pcfix.report.text import dsm_text
-
-    with progress_bar("Gridding", quiet) as progress:
-        result = pcfix.grid_dsm(input, output, options=options, progress=progress)
-    say(dsm_text(result), quiet)
+    work = partial(pcfix.grid_dsm, input, output, options=options)
+    _summarized("Gridding", work, "dsm_text", quiet)
 
 
 @command(
@@ -136,11 +128,8 @@ def dsm(input: str, output: Path, /, *, options: DsmOptions, quiet: bool) -> Non
 )
 def ortho(images: Path, output: Path, /, *, options: OrthoOptions, quiet: bool) -> None:
     """Make an orthophoto of land and bed from photographs and the corrected DSM."""
-    from pcfix.report.text import ortho_text
-
-    with progress_bar("Laying out", quiet, unit="cells") as progress:
-        result = pcfix.ortho_photo(images, output, options=options, progress=progress)
-    say(ortho_text(result), quiet)
+    work = partial(pcfix.ortho_photo, images, output, options=options)
+    _summarized("Laying out", work, "ortho_text", quiet, unit="cells")
 
 
 @command(
@@ -182,11 +171,8 @@ def photos(images: Path, out_dir: Path, /, *, options: PhotosOptions, quiet: boo
 )
 def calm(frames: Path, out: Path, /, *, options: CalmOptions, quiet: bool) -> None:
     """Combine a burst of frames into one image as seen through calm water."""
-    from pcfix.report.text import calm_text
-
-    with progress_bar("Calming", quiet) as progress:
-        result = pcfix.calm_frames(frames, out, options=options, progress=progress)
-    say(calm_text(result), quiet)
+    work = partial(pcfix.calm_frames, frames, out, options=options)
+    _summarized("Calming", work, "calm_text", quiet)
 
 
 @command(

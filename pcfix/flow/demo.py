@@ -42,8 +42,9 @@ def run_demo(
             views=str(folder / "fused.ply.vis"),
             views_are="tracks",
             project=f"pcfix demo, {kind} block",
+            overwrite=overwrite,
         )
-        page = run_all(request, folder / REPORT, overwrite=overwrite, bar=bar)
+        page = run_all(request, folder / REPORT, bar=bar)
         table = _table(scene, read_xyz(folder / REPORT / "corrected.laz"))
         sections.append(f"{folder}\n{scene.description}\n{table}\nreport: {page}")
     return "\n\n".join(sections)

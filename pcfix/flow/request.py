@@ -1,10 +1,13 @@
-"""What a run is asked for, the files that it reads, and those that it writes."""
+"""What a run is asked for, the files that it reads and writes, and which of its steps are done."""
 
 from __future__ import annotations
 
+import json
 import warnings
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +15,11 @@ from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.inputs import Inputs, paths_in, read_blocks
 from pcfix.flow.maps import SURFACE
 from pcfix.flow.next_steps import FOLDER
-from pcfix.flow.record import VERSION, belonging, read_record
+from pcfix.flow.runner import json_text
 from pcfix.flow.surfaces import view_of
 from pcfix.flow.tiles import HOW, RECORDS
 from pcfix.io.clouds import is_cloud, own_water, reference_of
-from pcfix.io.files import files_in
+from pcfix.io.files import belonging, file_state, files_in, read_json, write_text
 from pcfix.io.rasters import open_raster
 from pcfix.io.tiles import Tiles, cloud_of, inputs_of, open_cloud, tiles_from, tiles_of
 from pcfix.model import Cameras, WaterSurface
@@ -27,7 +30,10 @@ from pcfix.options.survey import RunOptions
 from pcfix.version import __version__
 from pcfix.water.index import Water, with_index
 
-CLOUDS = ("corrected", "cleaned")
+VERSION = "pcfix"
+"""Of a request: which version of pcfix did it."""
+STEPS = ("adjust", "correct", "clean", "dsm", "compare", "map", "report")
+"""In their order; each depends on those before it."""
 
 
 class Request(RunOptions):
@@ -41,16 +47,16 @@ class Request(RunOptions):
         """The cloud, in one file or many."""
         return tiles_of(self.input) or Path(str(self.input))
 
+    @cached_property
+    def surveyed(self) -> Path | Tiles:
+        """The reference, in one file or many."""
+        return reference_of(self.reference or "")
+
     @property
     def has_surface(self) -> bool:
         """Whether the reference has heights everywhere: not check points."""
         suffix = Path(str(self.reference)).suffix.lower()
         return is_cloud(self.surveyed) or suffix in (".tif", ".tiff")
-
-    @cached_property
-    def surveyed(self) -> Path | Tiles:
-        """The reference, in one file or many."""
-        return reference_of(self.reference or "")
 
     def check(self) -> None:
         """Refuse options that exclude each other."""
@@ -94,14 +100,8 @@ class Request(RunOptions):
 
     def record(self) -> dict[str, Any]:
         """Return plain values, without what the results do not depend on."""
-        values = self.as_dict()
-        kept = {name: values[name] for name in values if name not in HOW}
-        return {**kept, VERSION: __version__}
-
-    @property
-    def _named(self) -> list[Path]:
-        """The files of the first step, but for the cloud and the water."""
-        return paths_in(self, but=("water", "reference"))
+        values = {name: value for name, value in self.as_dict().items() if name not in HOW}
+        return {**values, VERSION: __version__}
 
     def files(self) -> dict[str, list[Path]]:
         """Return the input files, each of which exists, by the first step that reads them."""
@@ -113,11 +113,15 @@ class Request(RunOptions):
 
     def watched(self, results: Path) -> dict[str, list[Path]]:
         """Return the input files with those that belong to them, but none in the results."""
-        read = self.files()
-        own = results.resolve()
+        read, own = self.files(), results.resolve()
         more = {one for path in self._named for one in belonging(path)}
-        more = {one for one in more if own not in one.resolve().parents}
-        return {**read, "adjust": list(dict.fromkeys([*read["adjust"], *sorted(more)]))}
+        outside = sorted(one for one in more if own not in one.resolve().parents)
+        return {**read, "adjust": list(dict.fromkeys([*read["adjust"], *outside]))}
+
+    @property
+    def _named(self) -> list[Path]:
+        """The files of the first step, but for the cloud and the water."""
+        return paths_in(self, but=("water", "reference"))
 
 
 def _files_of(cloud: Path | Tiles) -> list[Path]:
@@ -125,8 +129,10 @@ def _files_of(cloud: Path | Tiles) -> list[Path]:
 
 
 _CORRECTION = {one.name for one in options_of(CorrectOptions)}.difference(
-    ("input", "adjust", "index_formula"), Water._fields, (one.name for one in options_of(Inputs))
-) - {"index"}
+    ("input", "adjust", "index", "index_formula"),
+    Water._fields,
+    (one.name for one in options_of(Inputs)),
+)
 _LATER = {
     **{one.name: "compare" for one in options_of(DistanceOptions)},
     "reference": "compare", "resolution": "dsm", "project": "report", "date": "report",
@@ -135,9 +141,84 @@ _LATER = {
 
 def since(name: str) -> str:
     """Return the first step that an option of a request matters to."""
-    if name in _CORRECTION:
-        return "correct"
-    return _LATER.get(name, "adjust")
+    return "correct" if name in _CORRECTION else _LATER.get(name, "adjust")
+
+
+class Record:
+    """The file run.json: what was asked for, from which files, and which steps are done.
+
+    Each step has a key: a hash of its options, its input files and the key of the step before it.
+    A step is done if the record has it with the same key, its outputs are as it left them, and no
+    step before it had to be done. The file is written after each step.
+
+    Parameters
+    ----------
+    path : Path
+    request : dict
+        Everything that the results depend on.
+    inputs : dict
+        Input files, by the first step that reads them.
+    """
+
+    def __init__(
+        self, path: Path, request: dict[str, Any], inputs: Mapping[str, Sequence[Path]]
+    ) -> None:
+        self._path = path
+        states = {step: [file_state(one) for one in some] for step, some in inputs.items()}
+        self._content: dict[str, Any] = {
+            "request": request,
+            "inputs": [{**one, "step": step} for step, some in states.items() for one in some],
+            "steps": {},
+        }
+        self._keys: dict[str, str] = {}
+        key = ""
+        # A chain: the key of a step changes with those of all steps before it.
+        for step in STEPS:
+            options = {name: value for name, value in request.items() if since(name) == step}
+            depends = json.dumps([key, options, states.get(step)], sort_keys=True)
+            key = self._keys[step] = sha256(depends.encode()).hexdigest()
+        earlier = read_record(path) if path.exists() else {"request": request, "steps": {}}
+        self._earlier: dict[str, Any] = earlier["steps"]
+        self.resumes = self._has("correct" if "correct" in self._earlier else "adjust")
+        """Whether there is an earlier run whose corrected cloud is not replaced."""
+        plain = json.loads(json.dumps(request))
+        self.changed = [one for one in plain if plain[one] != earlier["request"].get(one)]
+        """The options that the earlier run had otherwise."""
+
+    def _has(self, step: str) -> bool:
+        return bool(self._earlier.get(step, {}).get("key") == self._keys[step])
+
+    def step(self, name: str, outputs: Sequence[Path], work: Callable[[], Any]) -> tuple[Any, bool]:
+        """Do a step unless it is done; return its result and whether it was done.
+
+        `outputs` are all files that `work` leaves; it returns what later steps need, as JSON can
+        hold it.
+        """
+        done = self._earlier.get(name, {})
+        was_done = self._has(name) and done["outputs"] == [file_state(one) for one in outputs]
+        if not was_done:
+            self._earlier = {}  # the later steps read other files now
+            result = json.loads(json.dumps(work()))
+            states = [file_state(one) for one in outputs]
+            done = {"key": self._keys[name], "outputs": states, "result": result}
+        self._content["steps"][name] = done
+        write_text(self._path, json_text(self._content), overwrite=True)
+        return done["result"], was_done
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """Return the content of a record."""
+    try:
+        content: dict[str, Any] = read_json(path)
+        _ = content["request"], content["inputs"], content["steps"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            "run.record",
+            f"{path}: is not the record of a run ({error}). Give the run.json of an earlier run, or"
+            " remove it.",
+            path=path,
+        ) from error
+    return content
 
 
 def request_of(record: Path) -> Request:
@@ -162,7 +243,7 @@ class Files:
         self.folder = folder
         self._many = source.paths if isinstance(source, Tiles) else None
         ending = ".laz" if self._many is None else ""
-        self.corrected, self.cleaned = (folder / f"{one}{ending}" for one in CLOUDS)
+        self.corrected, self.cleaned = folder / f"corrected{ending}", folder / f"cleaned{ending}"
         self.surface, self.map = folder / SURFACE, folder / "map.gpkg"
         self.compare, self.report = folder / "compare", folder / "report.html"
         self.regression, self.dod = folder / "regression.json", self.compare / "dod.tif"
@@ -188,19 +269,18 @@ class Files:
         return self._cloud(self.cleaned)
 
     def _cloud(self, target: Path) -> Path | Tiles:
-        with warnings.catch_warnings():  # they were shown for the inputs
-            warnings.simplefilter("ignore", PcfixWarning)
+        with warnings.catch_warnings(action="ignore", category=PcfixWarning):  # shown for inputs
             return target if self._many is None else tiles_from(str(target), self.parts(target))
 
     def remove_others(self) -> None:
         """Remove the clouds that an earlier run made of other files."""
-        kept = {*self.parts(self.corrected), *self.parts(self.cleaned)}
-        for one in CLOUDS:
-            records = (self.folder / one / RECORDS).glob("*.la[sz].tally")
-            made = {self.folder / one / path.stem: path for path in records}
-            for path in {self.folder / f"{one}.laz", *made} - kept:
+        current = {*self.parts(self.corrected), *self.parts(self.cleaned)}
+        for name in ("corrected", "cleaned"):
+            cloud = self.folder / name
+            records = {cloud / one.stem: one for one in (cloud / RECORDS).glob("*.la[sz].tally")}
+            for path in {cloud.with_suffix(".laz"), *records} - current:
                 path.unlink(missing_ok=True)
-                made.get(path, path).unlink(missing_ok=True)
+                records.get(path, path).unlink(missing_ok=True)
 
 
 def inputs_of_run(request: Request) -> Inputs:
@@ -210,16 +290,14 @@ def inputs_of_run(request: Request) -> Inputs:
 
 def cameras_of(request: Request, files: Files) -> Cameras:
     """Return the cameras in the CRS of the cloud; notes were shown when it was corrected."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", PcfixWarning)
+    with warnings.catch_warnings(action="ignore", category=PcfixWarning):
         return read_blocks(inputs_of_run(request), view_of(files.corrected_cloud).crs).cameras
 
 
 def water_of(request: Request, files: Files) -> WaterSurface:
     """Return the surface as the corrected cloud states it, else as it was asked for."""
     cloud = files.corrected_cloud
-    with warnings.catch_warnings():  # they were shown when the cloud was corrected
-        warnings.simplefilter("ignore", PcfixWarning)
+    with warnings.catch_warnings(action="ignore", category=PcfixWarning):  # shown at correction
         with open_cloud(cloud) as source:
             stated = own_water(source)
         return stated or inputs_of_run(request).surface(view_of(cloud)).surface

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from pcfix.errors import InputError, SettingError
 from pcfix.flow.maps import BED, DEPTH, SHADED, SURFACE, UNCERTAINTY, contours_layer
-from pcfix.flow.record import read_record
-from pcfix.flow.request import Files, Request
+from pcfix.flow.request import Files, Request, read_record
 from pcfix.flow.run import RECORD, run_all
 from pcfix.flow.runner import Bar, no_bar
 from pcfix.io import analysis, rasters
@@ -199,11 +198,10 @@ def run(
     >>> float(result.depth.max())  # doctest: +SKIP
     12.25
     """
-    given = taken(RunOptions, options, keywords, "run")
-    values = {one.name: getattr(given, one.name) for one in options_of(RunOptions)}
+    given, values = taken(RunOptions, options, keywords, "run"), {}
     for one in options_of(RunOptions):
-        value = values[one.name]
-        if one.type is Any and value is not None and not isinstance(value, tuple):
+        value = getattr(given, one.name)
+        if one.type is Any and value is not None:
             if not isinstance(value, str | os.PathLike | Real):
                 raise SettingError(
                     "option.type",
@@ -211,11 +209,11 @@ def run(
                     " run.json can keep, or use correct_file.",
                     option=one.name,
                 )
-            values[one.name] = str(value)
+            value = str(value)
+        values[one.name] = value
     cloud = str(input) if isinstance(input, str | os.PathLike) else tuple(map(str, input))
-    request, folder = Request(input=cloud, **values), Path(out_dir)
-    run_all(request, folder, overwrite=given.overwrite, jobs=given.jobs, say=say, bar=bar)
-    return RunResults(folder)
+    run_all(Request(input=cloud, **values), Path(out_dir), say=say, bar=bar)
+    return RunResults(Path(out_dir))
 
 
 def open_run(folder: File) -> RunResults:

@@ -19,9 +19,8 @@ from pcfix.flow.compare import compare_clouds
 from pcfix.flow.correct import correct_file
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.maps import SECTIONS, raster_files, resolution_sentence, write_map, write_rasters
-from pcfix.flow.record import Record
 from pcfix.flow.report import report_run
-from pcfix.flow.request import Files, Request, cameras_of, since, water_of
+from pcfix.flow.request import Files, Record, Request, cameras_of, water_of
 from pcfix.flow.run_adjust import adjust_first, figures_of, outputs_of
 from pcfix.flow.runner import Bar, Progress, no_bar
 from pcfix.flow.shore import check_shoreline
@@ -46,17 +45,15 @@ def run_all(
     request: Request,
     out_dir: Path,
     *,
-    overwrite: bool = False,
-    jobs: int | None = None,
     say: Callable[[str], None] = lambda text: None,
     bar: Bar = no_bar,
 ) -> Path:
     """Do every step that is not done yet, and return the path of the report.
 
     A run with the same request resumes in its folder; if only options of later steps changed, such
-    as the reference, only these steps are done again. `overwrite` replaces a cloud that was
-    corrected in another way, and what else is in the folder. `say` gets a line for each step, `bar`
-    shows its progress.
+    as the reference, only these steps are done again. The option `overwrite` replaces a cloud that
+    was corrected in another way, and what else is in the folder. `say` gets a line for each step,
+    `bar` shows its progress.
     """
     inputs = [path for some in request.files().values() for path in some]
     files, asked = Files(out_dir, request.source), request
@@ -65,8 +62,8 @@ def run_all(
     check_one_file(request.source, request)
     if isinstance(request.source, Tiles):
         check_folder(files.corrected, request.source)
-    record = _opened(request, out_dir, overwrite)
-    check_shoreline(request.shoreline, overwrite=overwrite or record.resumes, inputs=inputs)
+    record = _opened(request, out_dir)
+    check_shoreline(request.shoreline, overwrite=asked.overwrite or record.resumes, inputs=inputs)
 
     def step(
         name: str, title: str, outputs: list[Path], work: Callable[[Progress | None], Any]
@@ -78,7 +75,7 @@ def run_all(
 
     outputs = outputs_of(out_dir)
     first, done = step(
-        "adjust", "Adjusting", outputs, lambda _: adjust_first(asked, out_dir, inputs, jobs)
+        "adjust", "Adjusting", outputs, lambda _: adjust_first(asked, out_dir, inputs)
     )
     if first["adjusted"]:
         figures = figures_of(out_dir)
@@ -92,21 +89,19 @@ def run_all(
     outputs = files.parts(files.corrected)
     outputs += [] if request.check_depths is None else [files.regression]
     outputs += [] if request.shoreline is None else [Path(request.shoreline)]
-    corrected, done = step(
-        "correct", "Correcting", outputs, partial(_correct, request, files, jobs)
-    )
+    corrected, done = step("correct", "Correcting", outputs, partial(_correct, request, files))
     poses = corrected["poses"]
     if first["is_fine"] and poses is not None and poses["absorbed"] is None:
         # the first step has surveys that the correction has not
         words = "did not absorb the refraction, as the first step found"
         corrected = {**corrected, "poses": {**poses, "absorbed": False, "words": words}}
-    if not first["is_said"] and first["why"] and (corrected["poses"] or {}).get("absorbed"):
+    if not first["is_said"] and first["why"] and (poses or {}).get("absorbed"):
         first = {**first, "is_said": True}
         say(f"{'adjust':<9} not done: {first['why']}")
     say(f"{done}{files.corrected}")
 
     # the corrected cloud marks which points are below the water
-    how = CleanOptions(overwrite=True, jobs=jobs, scheduler=asked.scheduler)
+    how = CleanOptions(overwrite=True, jobs=asked.jobs, scheduler=asked.scheduler)
     _, done = step(
         "clean", "Cleaning", files.parts(files.cleaned),
         lambda progress: clean_file(
@@ -152,7 +147,7 @@ def run_all(
     return files.report
 
 
-def _opened(request: Request, out_dir: Path, overwrite: bool) -> Record:
+def _opened(request: Request, out_dir: Path) -> Record:
     """Return the record of a folder, made where it is missing; refuse one of another run."""
     if not out_dir.parent.is_dir():
         raise SettingError(
@@ -161,8 +156,8 @@ def _opened(request: Request, out_dir: Path, overwrite: bool) -> Record:
             path=out_dir,
         )
     out_dir.mkdir(exist_ok=True)
-    record = Record(out_dir / RECORD, request.record(), request.watched(out_dir), since)
-    if not (overwrite or record.resumes) and any(out_dir.iterdir()):
+    record = Record(out_dir / RECORD, request.record(), request.watched(out_dir))
+    if not (request.overwrite or record.resumes) and any(out_dir.iterdir()):
         changed = ", ".join(record.changed) or "input file, or other files"
         raise SettingError(
             "run.other",
@@ -174,9 +169,9 @@ def _opened(request: Request, out_dir: Path, overwrite: bool) -> Record:
     return record
 
 
-def _correct(request: Request, files: Files, jobs: int | None, progress: Progress | None) -> Plain:
+def _correct(request: Request, files: Files, progress: Progress | None) -> Plain:
     """Correct the cloud."""
-    options = replace(request, overwrite=True, jobs=jobs).part(CorrectOptions)
+    options = replace(request, overwrite=True).part(CorrectOptions)
     if request.check_depths is not None:
         options = replace(options, save_regression=files.regression)
     files.remove_others()
@@ -194,8 +189,8 @@ def _compare(request: Request, files: Files) -> Plain:
         heights = Path(str(reference))
         if is_cloud(reference):
             heights = files.compare / REFERENCE_DSM
-            with warnings.catch_warnings():  # the cells are those of the cloud
-                warnings.simplefilter("ignore", PcfixWarning)
+            # the cells are those of the cloud, whatever a warning says
+            with warnings.catch_warnings(action="ignore", category=PcfixWarning):
                 grid_dsm(reference, heights, resolution=files.resolution_m, overwrite=True)
         write_dod(files.surface, heights, files.dod, overwrite=True)
     sections = [

@@ -39,9 +39,7 @@ def figures_of(folder: Path) -> dict[str, Any]:
     return dict(read_json(folder / FOLDER / SUMMARY))
 
 
-def adjust_first(
-    request: Request, folder: Path, files: list[Path], jobs: int | None = None
-) -> dict[str, Any]:
+def adjust_first(request: Request, folder: Path, files: list[Path]) -> dict[str, Any]:
     """Adjust the cameras of a run into its folder if asked, or if they need it.
 
     The files are inputs of the run, which the adjustment must not replace.
@@ -57,7 +55,7 @@ def adjust_first(
     try:
         found |= _decide(request)
         if found["adjusted"]:
-            found["model"] = _adjust(request, folder / FOLDER, files, jobs)
+            found["model"] = _adjust(request, folder / FOLDER, files)
     except PcfixError as error:
         if request.adjust == "yes" or request.only_to_adjust:
             raise
@@ -81,8 +79,8 @@ def _decide(request: Request) -> dict[str, Any]:
     if request.why_not_adjust:
         return {"why": request.why_not_adjust, "is_said": is_said}
     view = view_of(request.source)
-    with warnings.catch_warnings():  # the correction shows them
-        warnings.simplefilter("ignore", PcfixWarning)
+    # the correction shows the warnings
+    with warnings.catch_warnings(action="ignore", category=PcfixWarning):
         cameras = inputs.block(view.crs)[0]
         if request.gnss is not None:
             cameras = read_gnss(request.gnss, cameras)
@@ -114,7 +112,7 @@ def _decide(request: Request) -> dict[str, Any]:
     return {"adjusted": sign.speaks, "why": why, "is_said": True, "is_fine": not sign.speaks}
 
 
-def _adjust(request: Request, target: Path, files: list[Path], jobs: int | None) -> str:
+def _adjust(request: Request, target: Path, files: list[Path]) -> str:
     """Adjust, and return which of `MODELS` has the cameras."""
     inside = next((path for path in files if target.resolve() in path.resolve().parents), None)
     if inside is not None:
@@ -127,6 +125,6 @@ def _adjust(request: Request, target: Path, files: list[Path], jobs: int | None)
         gcps=request.gcps, gnss=request.gnss, lens=request.lens,
         index=with_index(request).refractive_index, overwrite=True,
     )  # fmt: skip
-    with threads(jobs):
+    with threads(request.jobs):
         adjust_into(target, request.part(Inputs), given, request.source)
     return next(name for name in MODELS if (target / name).exists())

@@ -29,7 +29,6 @@ from typing import Any, cast
 
 from pcfix import version
 from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError
-from pcfix.flow.record import belonging
 from pcfix.flow.runner import (
     Command,
     Ends,
@@ -41,7 +40,7 @@ from pcfix.flow.runner import (
     write_summary,
 )
 from pcfix.io.atomic import all_or_none
-from pcfix.io.files import file_state, path_of, read_tally, write_tally
+from pcfix.io.files import belonging, file_state, path_of, read_tally, write_tally
 from pcfix.io.las.part import part_report
 from pcfix.io.tiles import BrokenTileError, Clouds, Tiles, check_one_file, tiles_of
 from pcfix.io.vectors import LAYER_MARK

@@ -5,6 +5,7 @@ What is written is whole or not at all, and never over another's work.
 
 from __future__ import annotations
 
+import glob
 import hashlib
 import json
 import mmap
@@ -101,6 +102,13 @@ def files_around(path: File) -> list[Path]:
     folder = None if ending is None else found.with_suffix(ending)
     inside_of = files_around(folder) if folder is not None and folder.is_dir() else []
     return [check_input(found), *(found.with_name(name) for name in BESIDE), *inside_of]
+
+
+def belonging(path: File) -> list[Path]:
+    """Return what may be read with a file or folder: `files_around` it, and files of its stem."""
+    found, stem = Path(path), glob.escape(Path(path).stem)
+    alike = [] if found.is_dir() else found.parent.glob(f"{stem}.*")
+    return sorted({*files_around(path), *(one for one in alike if one.is_file())})
 
 
 def check_output(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) -> Path:

@@ -62,7 +62,8 @@ class Option(NamedTuple):
     needs: str = ""  # option without which it has no effect, or with which value: "method factor"
     # options that must be given with it; of "cameras or gsd" exactly one
     requires: tuple[str, ...] = ()
-    parse: Callable[[str, str], Any] | None = None  # the value, by the option's name and a text
+    # the value of a text; ValueError says what is wrong with it
+    parse: Callable[[str], Any] | None = None
     then: Callable[[Any], Any] | None = None  # what the program uses, by a value of the right type
     metavar: str = ""  # placeholder of the value
     panel: str = ""  # of the help, if it is not that of the class
@@ -122,7 +123,10 @@ class Option(NamedTuple):
     def checked(self, value: Any) -> Any:
         """Return a value as its type, or refuse it."""
         if isinstance(value, str) and self.parse is not None:
-            value = self.parse(self.flag[2:], value)
+            try:
+                value = self.parse(value)
+            except ValueError as error:
+                raise self._wrong("type", value, str(error)) from None
         if value is None and (self.default is None or type(None) in get_args(self.type)):
             return None
         several = next((get_args(kind) for kind in self.kinds if get_origin(kind) is tuple), None)
@@ -337,38 +341,28 @@ def named(given: Mapping[str, Any], known: Iterable[Option], where: str) -> dict
     return dict(given)
 
 
-def words(option: str, text: str) -> tuple[str, ...]:
+def words(text: str) -> tuple[str, ...]:
     """Parse words with commas between."""
     return tuple(word.strip() for word in text.split(",") if word.strip())
 
 
-def numbers(option: str, text: str) -> tuple[float, ...]:
+def numbers(text: str) -> tuple[float, ...]:
     """Parse numbers with commas between."""
     try:
-        return tuple(float(word) for word in words(option, text))
+        return tuple(map(float, words(text)))
     except ValueError:
-        raise SettingError(
-            "option.type",
-            f"{option} '{text}' must be numbers with commas between.",
-            option=option.replace("-", "_"),
-            value=text,
-        ) from None
+        raise ValueError("must be numbers with commas between") from None
 
 
-def number_or(*names: str) -> Callable[[str, str], float | str | None]:
+def number_or(*names: str) -> Callable[[str], float | str | None]:
     """Return the parser of a number or one of some words, any if none are named; none is None."""
 
-    def parse(option: str, text: str) -> float | str | None:
+    def parse(text: str) -> float | str | None:
         try:
             return float(text)
         except ValueError:
             if names and text not in names:
-                raise SettingError(
-                    "option.type",
-                    f"{option} '{text}' is neither a number nor {' nor '.join(names)}.",
-                    option=option.replace("-", "_"),
-                    value=text,
-                ) from None
+                raise ValueError(f"is neither a number nor {' nor '.join(names)}") from None
         return None if text == "none" else text
 
     return parse

@@ -6,7 +6,6 @@ import math
 from contextlib import suppress
 from typing import Literal
 
-from pcfix.errors import SettingError
 from pcfix.options.correct import BudgetOptions
 from pcfix.options.declare import File, OptionSet, numbers, option
 from pcfix.options.shared import IndexOptions, OverwriteOption, Panel, SummaryOption
@@ -111,7 +110,7 @@ class DemoOptions(OverwriteOption, panel=Panel.OUTPUT):
     """Points of each scene."""
 
 
-def _depths(option: str, text: str) -> tuple[float, ...]:
+def _depths(text: str) -> tuple[float, ...]:
     """Return the depths of a list, or of FROM:TO:STEP; a single one is the greatest of five."""
     if ":" in text:
         first = last = step = math.nan
@@ -119,16 +118,10 @@ def _depths(option: str, text: str) -> tuple[float, ...]:
             first, last, step = (float(word) for word in text.split(":"))
         count = (last - first) / step + 1.0 + 1e-9 if step > 0.0 else math.nan
         if not (first <= last and 1.0 <= count < _MOST_DEPTHS + 1):
-            raise SettingError(
-                "option.type",
-                f"{option} {text} must be FROM:TO:STEP upwards, with at most {_MOST_DEPTHS}"
-                " depths.",
-                option=option.replace("-", "_"),
-                value=text,
-            )
+            raise ValueError(f"must be FROM:TO:STEP upwards, with at most {_MOST_DEPTHS} depths")
         found = tuple(round(first + i * step, 9) for i in range(int(count)))
     else:
-        found = numbers(option, text)
+        found = numbers(text)
     if len(found) == 1:
         found = tuple(found[0] * share for share in (0.2, 0.4, 0.6, 0.8, 1.0))
     return found

@@ -6,6 +6,7 @@ import math
 import os
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any, Literal
 
 from pcfix.errors import SettingError
@@ -179,19 +180,19 @@ SIGMA_REFERENCE_M = {"cloud": 0.03, "raster": 0.03, "table of check points": 0.0
 
 def _bands(given: Any) -> tuple[tuple[float, ...], ...]:
     """Return the bounds of shares, each of which may be a text."""
-    bands = []
+    bands = list[tuple[float, ...]]()
     # a stage of PDAL may give one text in the place of several
     for one in (given,) if isinstance(given, str) else given:
-        band = numbers("share", one) if isinstance(one, str) else tuple(map(float, one))
+        band: tuple[float, ...] = ()
+        with suppress(ValueError):
+            band = numbers(one) if isinstance(one, str) else tuple(map(float, one))
         if len(band) != 2 or not 0.0 <= band[0] < band[1] < math.inf:
             text = one if isinstance(one, str) else ",".join(map(str, one))
             raise SettingError(
                 "option.type",
                 f"share '{text}' must be LOW,HIGH: two distances in metres, not negative, the lower"
-                " one first.",
-                option="share",
-                value=text,
-            )
+                " one first.", option="share", value=text,
+            )  # fmt: skip
         bands.append(band)
     return tuple(bands)
 
@@ -207,9 +208,8 @@ def _named_clouds(given: Any) -> tuple[tuple[str, str], ...]:
             raise SettingError(
                 "option.type",
                 f"also '{text}' must be NAME=CLOUD. A name has letters, digits, spaces and . + - _",
-                option="also",
-                value=text,
-            )
+                option="also", value=text,
+            )  # fmt: skip
         if name in LAYERS or name in found:
             sentence = f"also '{text}': the name {name} is taken. Give another one."
             raise SettingError("option.name_taken", sentence, option="also", value=name)

@@ -86,8 +86,8 @@ class RunOptions(
     there are GNSS positions or --gcps."""
 
 
-def _lens_names(option: str, text: str) -> tuple[str, ...]:
-    names = words(option, text)
+def _lens_names(text: str) -> tuple[str, ...]:
+    names = words(text)
     return () if names == ("none",) else names
 
 

@@ -22,8 +22,7 @@ import shapely
 
 import pcfix
 from pcfix.errors import SettingError
-from pcfix.flow.record import STEPS, Record
-from pcfix.flow.request import Request, request_of, since
+from pcfix.flow.request import STEPS, Record, Request, request_of
 from pcfix.flow.run import run_all
 from pcfix.io import vectors
 from pcfix.io.rasters import values_at
@@ -300,7 +299,7 @@ def test_files_and_version(finished, tmp_path, monkeypatch):
 
     def record():
         watched = request.watched(tmp_path / "out")
-        return Record(tmp_path / "run.json", request.record(), watched, since)
+        return Record(tmp_path / "run.json", request.record(), watched)
 
     assert done_again(record()) == list(STEPS)
     assert record().resumes and done_again(record()) == []
@@ -323,7 +322,7 @@ def test_reference_added(finished, tmp_path):
     def record(**other):
         later = {"reference": str(touched), **other}
         read = {**files, "compare": [touched] if later["reference"] else []}
-        return Record(tmp_path / "run.json", {**request.record(), **later}, read, since)
+        return Record(tmp_path / "run.json", {**request.record(), **later}, read)
 
     before = record(reference=None)
     for name in ("adjust", "correct", "clean", "dsm", "map", "report"):
