@@ -1,12 +1,11 @@
 """Arrays that are larger than memory: they are in files, and are processed in blocks of rows.
 
-Operations on single rows, and sums, go through blocks of `ROWS` rows in the order of the file. So a
-result depends neither on tiles nor on threads. An array of one block is plain numpy.
+Operations on single rows go through blocks of `ROWS` rows in the order of the file. So a result
+depends neither on tiles nor on threads. An array of one block is plain numpy.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from typing import Any, TypeAlias
 
@@ -65,13 +64,6 @@ def kept(mask: Array, array: Array) -> Array:
         result[done : done + len(part)] = part
         done += len(part)
     return result
-
-
-def total(function: Callable[..., Any], *arrays: Array) -> float:
-    """Return the sum over all blocks of a number that a function has of each, exactly rounded."""
-    return math.fsum(
-        float(function(*(one[rows] for one in arrays))) for rows in blocks(len(arrays[0]))
-    )
 
 
 def bounds(points: Array) -> tuple[Array, Array]:

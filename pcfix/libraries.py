@@ -9,24 +9,19 @@ from typing import Any
 from pcfix.errors import InputError
 
 
-def installing(extra: str) -> str:
-    """Return the command that installs an extra, from a checkout too."""
-    root = Path(__file__).parents[1]
-    what = f"-e '{root}[{extra}]'" if (root / "pyproject.toml").is_file() else f"'pcfix[{extra}]'"
-    return f"{sys.executable} -m pip install {what}"
-
-
 def optional_library(name: str, extra: str, who: str) -> Any:
-    """Import a library of an extra."""
+    """Import a library of an extra; an error has the command that installs it."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
+        root = Path(__file__).parents[1]
+        is_checkout = (root / "pyproject.toml").is_file()
+        what = f"-e '{root}[{extra}]'" if is_checkout else f"'pcfix[{extra}]'"
         raise InputError(
             "library.missing",
-            f"{who} needs {name}, which is not installed. Run: {installing(extra)}",
-            library=name,
-            extra=extra,
-        ) from error
+            f"{who} needs {name}, which is not installed. Run: {sys.executable} -m pip install"
+            f" {what}", library=name, extra=extra,
+        ) from error  # fmt: skip
 
 
 def photo_library(name: str) -> Any:

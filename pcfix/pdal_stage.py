@@ -103,9 +103,7 @@ def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> No
     from pcfix.running import threads
 
     started = time.perf_counter()
-    options = _options(namespace, CorrectOptions, needed=("water",))
-    if options.cameras is None and options.needs_cameras:
-        raise _missing("cameras")
+    options = _options(namespace, CorrectOptions)
     if options.uncorrected == "drop":
         sentence = (
             f"uncorrected 'drop' is not for PDAL. Use withhold, add \"{OUTCOME}=uint8\" to"
@@ -134,7 +132,7 @@ def _label(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
     from pcfix.flow.label import check, label_chunk, plan_labelling
     from pcfix.options.correct import StageLabelOptions
 
-    options = _options(namespace, StageLabelOptions, needed=("water",))
+    options = _options(namespace, StageLabelOptions)
     cloud = PdalCloud(ins, namespace.get("metadata"))
     plan = plan_labelling(options, _view(cloud))
     classes, tally = cloud.classes.copy(), None
@@ -185,7 +183,7 @@ def _compare(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> No
     from pcfix.flow.compare import Held, compare_clouds
     from pcfix.options.steps import StageCompareOptions
 
-    options = _options(namespace, StageCompareOptions, needed=("reference",))
+    options = _options(namespace, StageCompareOptions)
     cloud = PdalCloud(ins, namespace.get("metadata"))
     held = Held(lambda: _view(cloud), lambda water: _survey(cloud, water))
     found = compare_clouds(held, options.reference or "", options=options)
@@ -207,7 +205,7 @@ def _survey(cloud: PdalCloud, water: WaterSurface | None) -> SurveyCloud:
     return survey_cloud(NAME, crs, chunks, water, water is not None, len(cloud))
 
 
-def _options(namespace: dict[str, Any], kind: type[Set], needed: tuple[str, ...] = ()) -> Set:
+def _options(namespace: dict[str, Any], kind: type[Set]) -> Set:
     """Return the stage's options, of the right types."""
     given = namespace.get("pdalargs") or {}
     if not isinstance(given, dict):
@@ -225,15 +223,11 @@ def _options(namespace: dict[str, Any], kind: type[Set], needed: tuple[str, ...]
         for name, value in named(given, known.values(), "pdalargs").items()
         if value is not None
     }
-    for name in needed:
-        if name not in values:
-            raise _missing(name)
-    return kind(**values)
-
-
-def _missing(name: str) -> SettingError:
-    sentence = f"pdalargs: the option '{name}' is needed."
-    return SettingError("option.missing", sentence, option=name)
+    options = kind(**values)
+    if missing := options.missing():
+        sentence = f"pdalargs: the option '{missing.name}' is needed."
+        raise SettingError("option.missing", sentence, option=missing.name)
+    return options
 
 
 def _converted(one: Option, value: Any) -> Any:
@@ -251,19 +245,15 @@ def _converted(one: Option, value: Any) -> Any:
     return value
 
 
-def _slices(n: int) -> Iterator[slice]:
-    from pcfix.io.las.source import CHUNK_POINTS
-
-    return (slice(start, start + CHUNK_POINTS) for start in range(0, n, CHUNK_POINTS))
-
-
 def _chunks(cloud: PdalCloud, water: WaterSurface | None) -> Iterator[tuple[slice, Points]]:
     """Yield the rows of each chunk, and its points."""
     from pcfix.flow.surfaces import Points
+    from pcfix.io.las.source import CHUNK_POINTS
     from pcfix.water.checks import checked_points
 
     ins = cloud.ins
-    for rows in _slices(len(cloud)):
+    for first in range(0, len(cloud), CHUNK_POINTS):
+        rows = slice(first, first + CHUNK_POINTS)
         xyz = checked_points(cloud.xyz(rows))
         heights = None
         if isinstance(water, WaterDimension):

@@ -65,8 +65,10 @@ class Command(NamedTuple):
         def call(*places: Any, **given: Any) -> None:
             names = [one.name for one in options if one.name in given]
             asked = self.kind(**{name: given.pop(name) for name in names})
-            if given.get("config") is None:  # an earlier run says the rest
-                check_needed(asked)
+            missing = asked.missing()
+            if missing and given.get("config") is None:  # an earlier run says the rest
+                other = f", or --{missing.instead}" if hasattr(asked, missing.instead) else ""
+                raise UsageError(f"{missing.flag} is needed{other}")
             quiet = {"quiet": given.pop("quiet", False)} if "quiet" in hints else {}
             self.call(*places, options=asked, **quiet, **given)
 
@@ -87,17 +89,6 @@ def command(example: str, **helps: str) -> Callable[[Callable[..., None]], Calla
         return call
 
     return add
-
-
-def check_needed(options: OptionSet) -> None:
-    """Refuse a command without the options that it needs."""
-    for one in options_of(type(options)):
-        wanted = one.needed and (one.name != "cameras" or getattr(options, "needs_cameras", True))
-        if wanted and getattr(options, one.name) is None:
-            if not one.instead or not hasattr(options, one.instead):
-                raise UsageError(f"{one.flag} is needed")
-            if getattr(options, one.instead) is None:
-                raise UsageError(f"{one.flag} is needed, or --{one.instead}")
 
 
 def _keyword(one: Option, is_shown: bool) -> inspect.Parameter:

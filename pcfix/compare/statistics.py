@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pcfix.blocks import blocks, grouped, mapped, total
+from pcfix.blocks import blocks, grouped, mapped
 from pcfix.errors import GeometryError, SettingError
 from pcfix.model import FloatArray
 from pcfix.options.steps import SIGMA_REFERENCE_M
@@ -84,7 +84,7 @@ def statistics_of(values: FloatArray) -> Statistics:
         count=count,
         mean_m=mean,
         sd_m=float(values.std()),
-        rmse_m=math.sqrt(total(np.dot, values, values) / count),
+        rmse_m=math.sqrt(np.einsum("i,i", values, values) / count),  # one thread, unlike np.dot
         nmad_m=float(NMAD_FACTOR * np.median(np.abs(values - median))),
         median_m=median,
         min_m=float(marks[-2]),

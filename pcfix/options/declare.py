@@ -236,6 +236,15 @@ class OptionSet:
     def check(self) -> None:
         """Check what the options of a class say together; called for each class of a command."""
 
+    def missing(self) -> Option | None:
+        """Return the first option that is needed and was not given, nor another instead."""
+        for one in options_of(type(self)):
+            is_optional = one.name == "cameras" and not getattr(self, "needs_cameras", True)
+            given = [getattr(self, name, None) for name in (one.name, one.instead)]
+            if one.needed and not is_optional and given == [None, None]:
+                return one
+        return None
+
     def part(self, kind: type[Set]) -> Set:
         """Return those options that another class has too."""
         names = [one.name for one in fields(kind) if hasattr(self, one.name)]

@@ -72,14 +72,12 @@ class CleanRules(OptionSet, panel=Panel.TESTS):
 
     def check(self) -> None:
         """Switch off what is not asked for; something must be left."""
-        if not self.statistical:
-            object.__setattr__(self, "deviations", None)
-        if not self.weak:
-            for name in ("min_rays", "max_ray_miss", "max_incidence"):
+        weak = ("min_rays", "max_ray_miss", "max_incidence")
+        for switch, limits in {"statistical": ("deviations",), "weak": weak}.items():
+            for name in () if getattr(self, switch) else limits:
                 object.__setattr__(self, name, None)
-        limits = (self.min_rays, self.max_ray_miss, self.max_incidence)
-        object.__setattr__(self, "statistical", self.deviations is not None)
-        object.__setattr__(self, "weak", any(limit is not None for limit in limits))
+            is_on = any(getattr(self, name) is not None for name in limits)
+            object.__setattr__(self, switch, is_on)
         if not (self.statistical or self.radius is not None or self.weak or self.below_or_floating):
             raise SettingError("option.no_test", "All tests are off. Leave at least one on.")
 
@@ -298,6 +296,8 @@ class CompareOptions(OverwriteOption, SummaryOption, CompareRules, panel=Panel.O
 
 class StageCompareOptions(ReferenceOption, CompareOptions):
     """The options of the stage ``compare`` of PDAL, whose cloud is in no file."""
+
+    reference: File | None = option(None, basic=True, needed="needed")
 
 
 class ViewerOptions(OverwriteOption, CameraFileOptions, WaterOptions, panel=Panel.OUTPUT):
