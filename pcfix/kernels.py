@@ -8,12 +8,10 @@ import shutil
 import tempfile
 import time
 import warnings
-from collections import deque
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
 from itertools import pairwise
-from operator import length_hint
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar, cast, overload
 
@@ -146,32 +144,24 @@ def in_tiles(run: Callable[..., Any], rows: int, *given: Any, points: int = 0) -
     edges = [rows * i // tiles for i in range(tiles + 1)]
     if tiles > 1 and edges[1] > 1:
         edges.insert(1, -(-edges[1] // TILES_A_THREAD))  # a small one shows how long others take
-    left, done, reported = iter([*pairwise(edges)]), [0], 0
-    helpers = list[Future[None]]()
+    spans = iter(pairwise(edges))
 
-    def work(then: Callable[[], None] = lambda: None) -> None:
-        try:
-            for span in left:
-                run(span, *given)
-                done.append(span[1] - span[0])
-                then()
-        finally:
-            deque(left, 0)  # after an error the other threads stop
+    def report(span: Span) -> None:
+        how.report(points * (span[1] - span[0]) / rows)
 
-    def report_and_ask_for_help() -> None:
-        nonlocal reported
-        before, reported = reported, sum(done)
-        how.report(points * (reported - before) / rows)
-        if length_hint(left) and not helpers and time.perf_counter() > busy_from:
-            helpers.extend(pool.submit(work) for _ in range(count - 1))
-
-    busy_from = time.perf_counter() + ALONE_S if tiles < rows else 0.0
-    with ThreadPoolExecutor(count) as pool:
-        report_and_ask_for_help()
-        work(report_and_ask_for_help)
-        for helper in helpers:
-            helper.result()
-    report_and_ask_for_help()
+    busy_from = time.perf_counter() + ALONE_S
+    if tiles < rows or count == 1:
+        for span in spans:
+            run(span, *given)
+            report(span)
+            if count > 1 and time.perf_counter() > busy_from:
+                break
+    rest = [*spans]
+    if rest:
+        with ThreadPoolExecutor(count) as pool:  # after an error no further tile begins
+            done = pool.map(lambda span: run(span, *given), rest)
+            for span, _ in zip(rest, done, strict=True):
+                report(span)
 
 
 @device
