@@ -109,8 +109,7 @@ def file_points(
     kept: list[Chunk] | None = None,
 ) -> Iterator[Points]:
     """Yield all points of a LAS or LAZ file, or of many, chunk by chunk; see `LasSource`."""
-    places = not isinstance(water, WaterDimension)
-    with open_cloud(cloud, jobs, places_only=places, kept=kept) as source:
+    with open_cloud(cloud, jobs, kept=kept) as source:
         yield from read_ahead((points_of(one, source, water) for one in source.chunks()), jobs)
 
 

@@ -74,11 +74,10 @@ class Tiles:
 class TiledSource(LasSource):
     """Many open files, one after another; see `LasSource`. What is not of points is the first's."""
 
-    def __init__(self, tiles: Tiles, jobs: int | None = None, *, places_only: bool = False) -> None:
+    def __init__(self, tiles: Tiles, jobs: int | None = None) -> None:
         """Open the first."""
         super().__init__(tiles.paths[0], jobs)
         self._tiles, self._jobs, self.path = tiles, jobs, Path(tiles.name)
-        self._places_only = places_only
         self.header.mins, self.header.maxs = tiles.lows.min(axis=0), tiles.highs.max(axis=0)
         self.header.scales = np.full(3, tiles.step_m)
         self.header.point_count = len(tiles)
@@ -87,7 +86,7 @@ class TiledSource(LasSource):
         """Yield all points; a `BrokenTileError` if a file cannot be read to its end."""
         for path in self._tiles.paths:
             try:
-                with LasSource(path, self._jobs, places_only=self._places_only) as source:
+                with LasSource(path, self._jobs) as source:
                     yield from source.chunks()
             except InputError as error:
                 raise BrokenTileError(path, str(error)) from error
@@ -96,14 +95,12 @@ class TiledSource(LasSource):
 CloudFiles: TypeAlias = Path | CloudPart | Tiles
 
 
-def open_cloud(
-    cloud: CloudFiles, jobs: int | None = None, *, places_only: bool = False, kept: Any = None
-) -> LasSource:
+def open_cloud(cloud: CloudFiles, jobs: int | None = None, *, kept: Any = None) -> LasSource:
     """Return the points of a file, of a part of one, or of many; see `LasSource`."""
     if isinstance(cloud, Tiles):
-        return TiledSource(cloud, jobs, places_only=places_only)
+        return TiledSource(cloud, jobs)
     path, part = (cloud.path, cloud) if isinstance(cloud, CloudPart) else (cloud, None)
-    return LasSource(path, jobs, places_only=places_only, kept=kept, part=part)
+    return LasSource(path, jobs, kept=kept, part=part)
 
 
 def part_of(path: Path, options: Any) -> Path | CloudPart:

@@ -61,9 +61,7 @@ def is_copc(header: laspy.LasHeader) -> bool:
     return bool(len(header.vlrs) and isinstance(header.vlrs[0], laspy.copc.CopcInfoVlr))
 
 
-def nodes_in(
-    part: CloudPart, selection: laspy.DecompressionSelection, most: int
-) -> Iterator[laspy.ScaleAwarePointRecord]:
+def nodes_in(part: CloudPart, most: int) -> Iterator[laspy.ScaleAwarePointRecord]:
     """Yield points of the nodes of a COPC file that a part may touch, at most `most` at a time.
 
     They come in the order of the file; a node with more points is one batch.
@@ -91,7 +89,7 @@ def nodes_in(
             table = [(one.point_count, one.byte_size) for one in nodes[:count]]
             lazrs.decompress_points_with_chunk_table(
                 data, reader.laszip_vlr.record_data, rows.view(np.uint8), table,
-                selection.to_lazrs(),
+                laspy.DecompressionSelection.all().to_lazrs(),
             )  # fmt: skip
             yield laspy.ScaleAwarePointRecord(
                 rows, header.point_format, header.scales, header.offsets

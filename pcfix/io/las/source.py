@@ -49,14 +49,6 @@ _VARIABLE_CHUNKS = 2**32 - 1
 _PANIC = "PanicException"
 """What lazrs raises, too, where the packed points make no sense; it is under no name to import."""
 
-_PLACES = (
-    laspy.DecompressionSelection.base()
-    .decompress_z()
-    .decompress_classification()
-    .decompress_point_source_id()
-    .decompress_rgb()
-)
-
 _PLY = (
     "is a PLY file; pcfix reads LAS and LAZ. Convert it with: pdal translate {} {}"
     " --writers.las.scale_x=0.001 --writers.las.scale_y=0.001 --writers.las.scale_z=0.001"
@@ -192,15 +184,12 @@ class LasSource:
         path: File,
         jobs: int | None = None,
         *,
-        places_only: bool = False,
         kept: list[laspy.ScaleAwarePointRecord] | None = None,
         part: CloudPart | None = None,
     ) -> None:
         """Open; an `InputError` if the file is missing, damaged, empty, or its scales unusable.
 
-        With `places_only` nothing is unpacked but coordinates, classes, sources and colours, where
-        the file stores its dimensions separately (LAZ of format 6 and up); the others may be zero
-        then. The chunks of a small cloud are put into `kept`, for the next reader, and must not be
+        The chunks of a small cloud are put into `kept`, for the next reader, and must not be
         changed.
         """
         self.path, self.part = check_input(path), part
@@ -214,7 +203,6 @@ class LasSource:
                 self.identity = stream.read(_IDENTITY_SIZE)
             self._reader = laspy.open(self.path.open("rb"), laz_backend=backend(jobs))
         self.header: laspy.LasHeader = self._reader.header
-        self._selection = laspy.DecompressionSelection.all()
         try:
             with las_errors(self.path):
                 self.points_of_file = len(self)
@@ -227,8 +215,6 @@ class LasSource:
             self.header.point_count = part.points
             self.header.mins, self.header.maxs = part.mins, part.maxs
         self._kept = kept if len(self) * self.header.point_format.size <= KEPT_BYTES else None
-        if places_only and self._kept is None:
-            self._selection = self._reader.decompression_selection = _PLACES
 
     def __enter__(self) -> LasSource:
         return self
@@ -349,7 +335,7 @@ class LasSource:
                 end = info.hierarchy_root_offset + info.hierarchy_root_size
                 if end > self.path.stat().st_size:  # laspy would take memory for all of it
                     raise ValueError("its octree begins or ends behind its end")
-                chunks = nodes_in(part, self._selection, CHUNK_POINTS)
+                chunks = nodes_in(part, CHUNK_POINTS)
             for points in chunks:
                 inside = part.holds(points)
                 if inside.any():
