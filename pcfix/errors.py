@@ -5,10 +5,12 @@ is wrong with the value, what to do), and the values that a program may want.
 """
 
 import errno
+import math
 import re
 import sys
 import warnings
 from collections.abc import Callable, Iterable
+from dataclasses import asdict, is_dataclass
 from typing import Any, TypeVar
 
 _Found = TypeVar("_Found")
@@ -35,7 +37,7 @@ class CodedError(Exception):
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, as the JSON of a summary holds them."""
-        values = {name: _plain(value) for name, value in self.values.items()}
+        values = {name: plain(value) for name, value in self.values.items()}
         return {"code": self.code, "message": str(self), **values}
 
 
@@ -73,15 +75,21 @@ def coded(code: str, notes: Iterable[object]) -> list[PcfixWarning]:
     return [one if isinstance(one, PcfixWarning) else PcfixWarning(code, one) for one in notes]
 
 
-def _plain(value: Any) -> Any:
-    """Return a value as JSON can hold it."""
-    if isinstance(value, str | int | float | bool | None):
-        return value
+def plain(value: Any) -> Any:
+    """Return a value as JSON can hold it: arrays as lists, None for numbers that are not finite."""
+    if isinstance(value, PcfixWarning):
+        return value.as_dict()
+    if is_dataclass(value) and not isinstance(value, type):
+        value = asdict(value)
     if isinstance(value, dict):
-        return {str(key): _plain(one) for key, one in value.items()}
+        return {str(key): plain(one) for key, one in value.items()}
+    if hasattr(value, "tolist"):  # of numpy
+        value = value.tolist()
     if isinstance(value, list | tuple | set):
-        return [_plain(one) for one in value]
-    return value.tolist() if hasattr(value, "tolist") else str(value)
+        return [plain(one) for one in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value if isinstance(value, str | int | float | None) else str(value)
 
 
 MOST_LETTERS = 800

@@ -31,7 +31,7 @@ from pcfix.compare.statistics import (
     statistics_of,
     tvu_of,
 )
-from pcfix.errors import GeometryError, PcfixWarning
+from pcfix.errors import GeometryError, PcfixWarning, plain
 from pcfix.model import BoolArray, FloatArray
 from pcfix.options.steps import CompareRules
 
@@ -117,26 +117,12 @@ class Comparison:
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON; a section by its line, its heights are CSV."""
         names = [name for name in self.__slots__ if name not in ("sections", "check_points")]
-        plain = {name: _plain(getattr(self, name)) for name in names}
-        plain["sections"] = [
+        found = {name: plain(getattr(self, name)) for name in names}
+        found["sections"] = [
             {**asdict(s.line), "half_width_m": s.half_width_m, "stations": len(s.distance_m)}
             for s in self.sections
         ]
-        return plain
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, PcfixWarning):
-        return value.as_dict()
-    if hasattr(value, "__dataclass_fields__"):
-        return _plain(asdict(value))
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, tuple | list):
-        return [_plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+        return found
 
 
 _BIN_COLUMNS = {

@@ -21,7 +21,7 @@ import os
 import sys
 import types
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from functools import cache
 from itertools import pairwise
 from typing import (
@@ -38,7 +38,7 @@ from typing import (
     get_type_hints,
 )
 
-from pcfix.errors import SettingError
+from pcfix.errors import SettingError, plain
 
 File: TypeAlias = str | os.PathLike[str]
 Set = TypeVar("Set", bound="OptionSet")
@@ -260,7 +260,7 @@ class OptionSet:
 
     def as_dict(self) -> dict[str, Any]:
         """Return all values, as JSON holds them."""
-        return {name: _plain(value) for name, value in asdict(self).items()}
+        return dict(plain(self))
 
 
 def _as_text(one: Option, value: Any) -> Any:
@@ -269,13 +269,7 @@ def _as_text(one: Option, value: Any) -> Any:
         return "none"  # null would be the default
     if isinstance(value, tuple) and one.parse is not None:
         return ",".join(f"{v:.15g}" if isinstance(v, float) else str(v) for v in value)
-    return _plain(value)
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, os.PathLike):
-        return os.fspath(value)
-    return list(value) if isinstance(value, tuple) else value
+    return plain(value)
 
 
 _KNOWN: dict[type, tuple[Option, ...]] = {}
