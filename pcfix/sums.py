@@ -1,4 +1,4 @@
-"""Statistics that are added up with ``+``: over chunks, and over files in several processes."""
+"""Statistics that are added up with ``+``, over chunks and files, and steps of their bins."""
 
 from __future__ import annotations
 
@@ -30,3 +30,11 @@ class Sums:
                 mine = one.metadata.get("join", operator.add)(mine, theirs)
             joined[one.name] = theirs if mine is None else mine
         return replace(self, **joined)  # type: ignore[type-var]
+
+
+def nice_step(least: float) -> float:
+    """Return the smallest of 1, 2, 5 times a power of ten that is not below a number."""
+    if not least > 0.0:
+        return 1.0
+    power = 10.0 ** np.floor(np.log10(least))
+    return float(next(f * power for f in (1, 2, 5, 10) if f * power >= least * (1.0 - 1e-9)))

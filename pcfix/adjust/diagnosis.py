@@ -2,7 +2,7 @@ r"""Diagnosis of refraction that an adjustment without water absorbed in its len
 
 Software that does not know of the water fits the images of a bed all the same: it bends lens and
 block until straight rays intersect. The land is then at a wrong height, and correcting the cloud
-alone makes it worse. Seven signs show it, in order of how much they tell:
+alone makes it worse. The signs, in order of how much they tell:
 
 tie points : intersected with refraction, points under water fit their images worse than with
     straight rays. With true poses it is the other way round.
@@ -20,7 +20,7 @@ The first sign that says something decides.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,7 +34,6 @@ from pcfix.model import (
     FloatArray,
     GnssPositions,
     GroundControl,
-    IntArray,
     TiePoints,
     WaterDimension,
     WaterSurface,
@@ -45,6 +44,11 @@ from pcfix.water.surface import is_submerged, surface_above
 if TYPE_CHECKING:  # not quick to load
     from pcfix.adjust.from_cloud import Mended
     from pcfix.adjust.problem import Intersected
+
+ORDER = ("tie points", "GNSS", "bed", "land", "control points", "neighbours", "focal length")
+"""The signs in the order in which they decide."""
+SIZES = ("land", "GNSS", "tie points", "control points", "bed", "focal length")
+"""Signs by how well they know the likely error: measured on land before predicted."""
 
 LEAST_POINTS = 30
 """Tie points under water that are needed."""
@@ -68,56 +72,18 @@ CONTROL_PX = 2.0
 FOCAL_SHARE = 1.5e-3
 """Of a calibrated focal length: factory calibrations of a five-lens camera over land differ from
 the adjusted ones by up to 0.7e-3, and consumer cameras as much with temperature."""
-LEAST_DEPTH_M = 1.0
+LEAST_DEPTH_M, LAND_M = 1.0, 0.3
+"""Depth of a bed, and height above the water of land, that are compared with a survey."""
 MOST_STATED_M = 0.5
 """A larger standard deviation of the GNSS is a default of the software, as Metashape's 10 m."""
 
 TIE_POINTS, LEAST_TIE_VIEWS = 3000, 3
-CLOUD_POINTS, POINTS_PER_IMAGE, SAMPLE_POINTS = 1500, 10, 50_000
+CLOUD_POINTS, POINTS_PER_IMAGE, REFERENCE_POINTS = 1500, 10, 20_000
 LEAST_COORDINATES = 24
 """Of GNSS positions."""
 MOST_IMAGES, QUICK_IMAGES = 600, 200
 """For which the pattern of absorbed refraction is computed, and when it must be quick; the cost
-grows with their cube."""
-LAND_M = 0.3
-"""Height above the water of land."""
-NEAREST = 3
-"""Points of a reference that give its height at a point of the cloud."""
-
-SENTENCES = {
-    "tie points": (
-        "tie points under water have residuals of {wet_straight_px:.2f} px with straight rays and"
-        " {wet_refracted_px:.2f} px with refraction; share of refraction absorbed {share:.2f},"
-        f" standard error {{sigma_share:.2f}} (limit {SHARE:g})"
-    ),
-    "GNSS": (
-        "projection centres differ from the GNSS by {rms_m:.3f} m RMS; share of refraction absorbed"
-        f" by their pattern {{share:.2f}}, standard error {{sigma_share:.2f}} (limit {SHARE:g})"
-    ),
-    "bed": (
-        "the bed of the cloud has {share:.2f} of its measured depth before any correction, standard"
-        " error {sigma_share:.2f} (limit {limit:.2f})"
-    ),
-    "land": (
-        "land of the cloud is {bias_m:+.3f} m too high ({places:,.0f} places, spread {spread_m:.3f}"
-        " m, limit {limit_m:.3f} m)"
-    ),
-    "control points": (
-        "control points on land have residuals of {rms_px:.2f} px in the images (limit"
-        " {limit_px:.2f} px)"
-    ),
-    "neighbours": (
-        "discontinuities between image footprints: a share of {share:.2f} is left in the corrected"
-        " bed, standard error {sigma_share:.2f} (limit 0.50; filtering and meshing also leave some)"
-    ),
-    "focal length": (
-        "the focal length differs by {difference:+.3%} from the calibrated one, {error_m:.2f} m at"
-        f" the ground (limit {FOCAL_SHARE:.2%})"
-    ),
-}
-"""What each sign found, in the order in which they decide."""
-SIZES = ("land", "GNSS", "tie points", "control points", "bed", "focal length")
-"""Signs by how well they know the likely error: measured on land before predicted."""
+grows with their cube, and is a second for the latter."""
 
 EXPORTS = {
     "metashape": "give the project (.psx) or its BlocksExchange export with tie points",
@@ -136,17 +102,12 @@ EXPORTS = {
 class Sign:
     """One statistic."""
 
-    name: str  # a key of `SENTENCES`
-    figures: dict[str, float]
+    name: str  # one of `ORDER`
     speaks: bool | None  # whether it says that refraction was absorbed; None if it says nothing
+    words: str  # what was found, or why it says nothing
+    figures: dict[str, float] = field(default_factory=dict)
     size_m: float | None = None  # likely error
     basis: str = ""  # which error that is
-    why: str = ""  # why it says nothing, if its figures are unknown
-
-    @property
-    def words(self) -> str:
-        """What was found."""
-        return self.why or SENTENCES[self.name].format(**self.figures)
 
 
 @dataclass(frozen=True)
@@ -167,10 +128,10 @@ class Diagnosis:
 
     @property
     def size(self) -> tuple[float, str] | None:
-        """The likely error in metres, and which error that is."""
+        """The likely error in metres, and which error that is; None if nothing was absorbed."""
         known = {sign.name: sign for sign in self.signs if sign.size_m is not None and sign.speaks}
         best = next((known[name] for name in SIZES if name in known), None)
-        return None if best is None else (float(best.size_m or 0.0), best.basis)
+        return None if best is None or not self.absorbed else (float(best.size_m or 0), best.basis)
 
     def sentence(self, command: str, because: str = "") -> str:
         """Return a warning with the command that helps; empty if the poses seem right.
@@ -189,10 +150,9 @@ class Diagnosis:
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
-        size = self.size
         return {
             "absorbed": self.absorbed,
-            "likely_error_m": None if size is None or not self.absorbed else size[0],
+            "likely_error_m": None if self.size is None else self.size[0],
             "signs": [
                 {"name": s.name, "absorbed": s.speaks, "words": s.words, **s.figures}
                 for s in self.signs
@@ -202,7 +162,7 @@ class Diagnosis:
 
 def diagnosis_of(signs: list[Sign]) -> Diagnosis:
     """Return the signs in the order in which they decide."""
-    return Diagnosis(tuple(sorted(signs, key=lambda sign: [*SENTENCES].index(sign.name))))
+    return Diagnosis(tuple(sorted(signs, key=lambda sign: ORDER.index(sign.name))))
 
 
 def export_of(cameras: Cameras) -> str:
@@ -211,6 +171,11 @@ def export_of(cameras: Cameras) -> str:
     other = "export a model with tie points (COLMAP or Bundler)"
     found = next((words for name, words in EXPORTS.items() if name in source), other)
     return f"{found}, or run 'pcfix cameras FILE --gnss GNSS.csv'"
+
+
+def _exceeds(value: float, sigma: float, limit: float) -> bool | None:
+    """Return whether a value exceeds its limit; None if that is not significant."""
+    return value > limit if abs(value - limit) > SIGMAS * sigma else None
 
 
 # Tie points
@@ -233,60 +198,42 @@ def tie_point_sign(straight: Intersected, refracted: Intersected, depth_m: Float
     is noise. So b = -(r . d) / (d . d) is 0 or 1, whatever the noise. Its standard error is that of
     a jackknife over parts of the area, as errors of a pose are common to neighbours.
     """
-    redundancy = straight.redundancy
+    name, redundancy = "tie points", straight.redundancy
     worst = np.maximum(straight.squares, refracted.squares) / np.maximum(redundancy, 1)
     good = np.isfinite(worst) & (redundancy > 0) & np.isfinite(depth_m)
     if good.any():
         good &= worst <= np.quantile(worst[good], 1.0 - OUTLIERS)
-    wet, land = good & (depth_m > 0.0), good & (depth_m < 0.0)
-    count = {"wet_points": float(wet.sum())}
+    wet = good & (depth_m > 0.0)
     if wet.sum() < LEAST_POINTS:
-        return Sign("tie points", count, None, why=f"only {wet.sum()} tie points under water")
+        return Sign(name, None, f"only {wet.sum()} tie points under water")
     d = straight.residual_px - refracted.residual_px
     over = straight.sums(-(refracted.residual_px * d).sum(axis=1))[wet]
     under = straight.sums((d * d).sum(axis=1))[wet]
     if under.sum() < LEAST_BEND * straight.squares[wet].sum():
         why = "straight rays fit as well as refracted ones: too shallow, or only nadir rays"
-        return Sign("tie points", count, None, why=why)
-    # as many points in each part of the area along x and along y
-    rank = np.argsort(
-        np.argsort(straight.xyz[wet, :2], axis=0, kind="stable"), axis=0, kind="stable"
+        return Sign(name, None, why)
+    # as many points in each part of the area along x and along y; each is left out in turn
+    ranks = np.argsort(np.argsort(straight.xyz[wet, :2], axis=0, kind="stable"), axis=0)
+    x, y = (ranks * PARTS // len(ranks)).T
+    part = np.unique(x * PARTS + y, return_inverse=True)[1].ravel()
+    a, b = np.bincount(part, over), np.bincount(part, under)
+    without, g = (a.sum() - a) / np.maximum(b.sum() - b, 1e-300), len(a)
+    share, sigma = float(a.sum() / b.sum()), np.inf
+    if g > 1:
+        sigma = float(np.sqrt((g - 1) / g * ((without - without.mean()) ** 2).sum()))
+    # standard deviations of an image coordinate
+    free = redundancy[wet].sum()
+    s_px, r_px = (float(np.sqrt(one.squares[wet].sum() / free)) for one in (straight, refracted))
+    figures = {
+        "share": share, "sigma_share": sigma, "wet_straight_px": s_px, "wet_refracted_px": r_px,
+    }  # fmt: skip
+    words = (
+        f"tie points under water have residuals of {s_px:.2f} px with straight rays and"
+        f" {r_px:.2f} px with refraction; share of refraction absorbed {share:.2f}, standard error"
+        f" {sigma:.2f} (limit {SHARE:g})"
     )
-    cell = rank * PARTS // len(rank)
-    share, sigma = _jackknifed(over, under, cell[:, 0] * PARTS + cell[:, 1])
-    figures = {"share": share, "sigma_share": sigma}
-    for name, found in (("straight", straight), ("refracted", refracted)):
-        figures[f"wet_{name}_px"] = _rms(found, wet)
-        size = np.sqrt(found.squares[wet] / redundancy[wet])
-        is_flat = not np.ptp(depth_m[wet]) > 0.0
-        growth = 0.0 if is_flat else float(np.polyfit(depth_m[wet], size, 1)[0])
-        figures[f"{name}_px_per_m"] = growth
-    if land.sum() >= LEAST_POINTS:
-        figures["land_px"] = _rms(straight, land)
-    return Sign("tie points", figures, _side(share, sigma))
-
-
-def _jackknifed(over: FloatArray, under: FloatArray, part: IntArray) -> tuple[float, float]:
-    """Return the ratio of two sums, and its standard error by leaving out each part in turn."""
-    number = np.unique(part, return_inverse=True)[1].ravel()
-    a, b = np.bincount(number, over), np.bincount(number, under)
-    total = max(b.sum(), 1e-300)
-    without = (a.sum() - a) / np.maximum(total - b, 1e-300)
-    g = len(a)
-    sigma = np.sqrt((g - 1) / g * ((without - without.mean()) ** 2).sum()) if g > 1 else np.inf
-    return float(a.sum() / total), float(sigma)
-
-
-def _side(share: float, sigma: float) -> bool | None:
-    """Return whether a share exceeds the limit; None if that is not significant."""
-    if not abs(share - SHARE) > SIGMAS * sigma or sigma > MOST_SIGMA:
-        return None
-    return bool(share > SHARE)
-
-
-def _rms(found: Intersected, rows: BoolArray) -> float:
-    """Return the standard deviation of an image coordinate from points, px."""
-    return float(np.sqrt(found.squares[rows].sum() / max(found.redundancy[rows].sum(), 1)))
+    speaks = None if sigma > MOST_SIGMA else _exceeds(share, sigma, SHARE)
+    return Sign(name, speaks, words, figures)
 
 
 def sized(sign: Sign, mended: Mended) -> Sign:
@@ -303,43 +250,16 @@ def sized(sign: Sign, mended: Mended) -> Sign:
 # GNSS
 
 
-def gnss_is_suspicious(centres: FloatArray, off_m: FloatArray, sigma_m: FloatArray) -> bool:
-    """Return whether adjusted centres differ from the GNSS by too much, or in a curved pattern.
-
-    `off_m` is adjusted minus GNSS, NaN where there is none; `sigma_m` is stated, NaN if not.
-    """
-    rows = np.isfinite(off_m)
-    y, base = off_m[rows], similarity_gradients(centres - centres.mean(axis=0))[rows]
-    if len(y) < 3 * base.shape[1]:
-        return False
-    left = _rest(y, base)
-    sigma = sigma_m[rows]
-    stated = np.isfinite(sigma)
-    if stated.any() and np.sqrt(np.mean((left[stated] / sigma[stated]) ** 2)) > 1.5:
-        return True
-    # domes, saddles and twists of the three coordinates
-    size = max(float(np.ptp(centres, axis=0).max()), 1e-9)
-    px, py = ((centres - centres.mean(axis=0)) / size)[:, :2].T
-    terms = np.column_stack([px * px, px * py, py * py])
-    bends = np.einsum("ab,kc->kabc", np.eye(3), terms).reshape(len(centres), 3, 9)
-    bent = np.hstack([base, bends[rows]])
-    rest = _rest(y, bent)
-    more, free = bent.shape[1] - base.shape[1], len(y) - bent.shape[1]
-    if free < more:
-        return False
-    gain = ((left @ left) - (rest @ rest)) / more / max((rest @ rest) / free, 1e-300)
-    return bool(gain > 3.0)  # F of 9 and some dozens: 1 %
-
-
-def _rest(y: FloatArray, columns: FloatArray) -> FloatArray:
-    """Return the residuals of a least squares fit."""
-    return np.asarray(y - columns @ np.linalg.lstsq(columns, y, rcond=None)[0])
-
-
 def gnss_sign(centres: FloatArray, off_m: FloatArray, sigma_m: FloatArray, mended: Mended) -> Sign:
     """Look for the pattern in which this water bends the block in adjusted minus GNSS positions.
 
     The pattern is the centres minus those that an adjustment with water finds without the GNSS.
+
+    Parameters
+    ----------
+    centres, off_m, sigma_m : array, shape (k, 3)
+        Adjusted centres, adjusted minus GNSS (NaN where there is none), and the stated standard
+        deviations of the GNSS (NaN if not).
 
     Notes
     -----
@@ -357,11 +277,20 @@ def gnss_sign(centres: FloatArray, off_m: FloatArray, sigma_m: FloatArray, mende
     if np.isfinite(stated).any() and np.nanmedian(stated) < MOST_STATED_M:
         noise = max(noise, float(np.nanmedian(stated)))
     sigma = noise / max(float(np.linalg.norm(clear)), 1e-150)
-    figures = {
-        "share": share, "sigma_share": sigma, "rms_m": float(np.sqrt(np.mean(y * y))),
-        "predicted_rms_m": float(np.sqrt(np.mean(clear * clear))),
-    }  # fmt: skip
-    return sized(Sign("GNSS", figures, None if share > MOST_SHARE else _side(share, sigma)), mended)
+    rms = float(np.sqrt(np.mean(y * y)))
+    words = (
+        f"projection centres differ from the GNSS by {rms:.3f} m RMS; share of refraction absorbed"
+        f" by their pattern {share:.2f}, standard error {sigma:.2f} (limit {SHARE:g})"
+    )
+    is_useful = share <= MOST_SHARE and sigma <= MOST_SIGMA
+    speaks = _exceeds(share, sigma, SHARE) if is_useful else None
+    figures = {"share": share, "sigma_share": sigma, "rms_m": rms}
+    return sized(Sign("GNSS", speaks, words, figures), mended)
+
+
+def _rest(y: FloatArray, columns: FloatArray) -> FloatArray:
+    """Return the residuals of a least squares fit."""
+    return np.asarray(y - columns @ np.linalg.lstsq(columns, y, rcond=None)[0])
 
 
 # Surveys, calibrations and the cloud itself
@@ -374,12 +303,18 @@ def land_sign(higher_m: FloatArray, gsd_m: float, against: str) -> Sign:
     """
     found = higher_m[np.isfinite(higher_m)]
     if len(found) < 3:
-        return Sign("land", {}, None, why=f"only {len(found)} places of {against} on land")
+        return Sign("land", None, f"only {len(found)} places of {against} on land")
     bias, spread, sigma = _median_of(found)
     limit = max(SIGMAS * sigma, LAND_GSD * gsd_m)
-    figures = {"bias_m": bias, "spread_m": spread, "limit_m": limit, "places": float(len(found))}
-    basis = f"height of the land against {against}"
-    return Sign("land", figures, True if abs(bias) > limit else None, abs(bias), basis)
+    words = (
+        f"land of the cloud is {bias:+.3f} m too high ({len(found):,} places, spread {spread:.3f}"
+        f" m, limit {limit:.3f} m)"
+    )
+    return Sign(
+        "land", True if abs(bias) > limit else None, words,
+        {"bias_m": bias, "spread_m": spread, "limit_m": limit, "places": float(len(found))},
+        abs(bias), f"height of the land against {against}",
+    )  # fmt: skip
 
 
 def _median_of(values: FloatArray) -> tuple[float, float, float]:
@@ -394,14 +329,17 @@ def bed_sign(apparent_m: FloatArray, true_m: FloatArray, refractive_index: float
     """Compare depths of the cloud with measured ones, both below the water, shape (m,), metres."""
     deep = np.isfinite(apparent_m) & (true_m > LEAST_DEPTH_M) & (apparent_m > 0.0)
     if deep.sum() < 3:
-        return Sign("bed", {}, None, why=f"only {deep.sum()} measured depths")
+        return Sign("bed", None, f"only {deep.sum()} measured depths")
     share, _, sigma = _median_of(apparent_m[deep] / true_m[deep])
     limit = (1.0 + 1.0 / refractive_index) / 2.0  # between straight and refracted rays
-    is_sure = abs(share - limit) > SIGMAS * sigma
     after = true_m[deep] - refractive_index * apparent_m[deep]
+    words = (
+        f"the bed of the cloud has {share:.2f} of its measured depth before any correction,"
+        f" standard error {sigma:.2f} (limit {limit:.2f})"
+    )
     return Sign(
-        "bed", {"share": share, "sigma_share": sigma, "limit": limit},
-        share > limit if is_sure else None,
+        "bed", _exceeds(share, sigma, limit), words,
+        {"share": share, "sigma_share": sigma, "limit": limit},
         float(np.sqrt(np.mean(after**2))), "RMS, corrected depths against measured ones",
     )  # fmt: skip
 
@@ -410,12 +348,17 @@ def control_sign(residual_px: FloatArray, sigma_px: FloatArray, gsd_m: float) ->
     """Look at the residuals of control points on land: measured minus computed, shape (o, 2)."""
     seen = np.isfinite(residual_px).all(axis=1)
     if seen.sum() < 3:
-        return Sign("control points", {}, None, why="fewer than three marks in images")
+        return Sign("control points", None, "fewer than three marks in images")
     rms = float(np.sqrt(np.mean(residual_px[seen] ** 2)))
     limit = max(CONTROL_PX, SIGMAS * float(np.median(sigma_px[seen])))
+    words = (
+        f"control points on land have residuals of {rms:.2f} px in the images (limit {limit:.2f}"
+        " px)"
+    )
     return Sign(
-        "control points", {"rms_px": rms, "limit_px": limit}, True if rms > limit else None,
-        rms * gsd_m, "residuals of control points times the GSD",
+        "control points", True if rms > limit else None, words,
+        {"rms_px": rms, "limit_px": limit}, rms * gsd_m,
+        "residuals of control points times the GSD",
     )  # fmt: skip
 
 
@@ -430,9 +373,12 @@ def neighbours_sign(share: float, sigma: float, *, is_fused: bool) -> Sign:
     is_fused : bool
         Whether the cloud is of fused depth maps; others can have discontinuities all the same.
     """
-    speaks = abs(share - 0.5) > SIGMAS * sigma and (is_fused or share < 0.5)
-    figures = {"share": share, "sigma_share": sigma}
-    return Sign("neighbours", figures, share > 0.5 if speaks else None)
+    words = (
+        f"discontinuities between image footprints: a share of {share:.2f} is left in the corrected"
+        f" bed, standard error {sigma:.2f} (limit 0.50; filtering and meshing also leave some)"
+    )
+    speaks = _exceeds(share, sigma, 0.5) if is_fused or share < 0.5 else None
+    return Sign("neighbours", speaks, words, {"share": share, "sigma_share": sigma})
 
 
 def focal_sign(focal: FloatArray, calibrated: FloatArray, height_m: float) -> Sign:
@@ -440,9 +386,13 @@ def focal_sign(focal: FloatArray, calibrated: FloatArray, height_m: float) -> Si
     off = focal / calibrated - 1.0
     worst = float(off[np.argmax(np.abs(off))])
     error = abs(worst) * height_m
+    words = (
+        f"the focal length differs by {worst:+.3%} from the calibrated one, {error:.2f} m at the"
+        f" ground (limit {FOCAL_SHARE:.2%})"
+    )
     return Sign(
-        "focal length", {"difference": worst, "error_m": error},
-        True if abs(worst) > FOCAL_SHARE else None, error,
+        "focal length", True if abs(worst) > FOCAL_SHARE else None, words,
+        {"difference": worst, "error_m": error}, error,
         "difference of the focal length times the flying height",
     )  # fmt: skip
 
@@ -463,7 +413,7 @@ class Evidence:
     control: GroundControl | None = None
     # focal length over width of the image, by sensor; "" is any
     calibrated: dict[str, float] | None = None
-    reference: Any = None  # a survey of land and bed, with `xyz` and `sparse`
+    reference: Any = None  # a survey of land and bed, with `xyz`
     gnss: GnssPositions | None = None  # in the frame of the cameras, NaN if unknown
     neighbours: Sign | None = None  # of `neighbours_sign`
     in_passing: bool = False  # whether it must be quick
@@ -482,15 +432,23 @@ class Evidence:
         return self.has_height and all(lens.unit == "px" for lens in cameras.lenses)
 
     @property
+    def above_m(self) -> FloatArray:
+        """Heights of the projection centres above the water, shape (k,); zero if unknown."""
+        centres = self.cameras.centres
+        if not self.has_height:
+            return np.zeros(len(centres))
+        level = surface_above(self.water, centres).height_m
+        known = np.isfinite(level)
+        if not known.any():
+            return np.zeros(len(centres))
+        return np.asarray(centres[:, 2] - np.where(known, level, np.mean(level[known])))
+
+    @property
     def gsd_m(self) -> float:
         """Approximate size of a pixel at the water; zero if unknown."""
-        lenses, centres = self.cameras.lenses, self.cameras.centres
-        if lenses is None or not self.has_height:
-            return 0.0
-        level = surface_above(self.water, centres).height_m
-        above = centres[:, 2] - np.where(np.isfinite(level), level, np.nanmean(level))
+        lenses = self.cameras.lenses or ()
         focal = [lens.focal if lens.unit == "px" else np.inf for lens in lenses]
-        return float(np.mean(above / focal))
+        return float(np.mean(self.above_m / focal)) if lenses else 0.0
 
 
 def diagnosed(evidence: Evidence) -> Diagnosis:
@@ -508,26 +466,22 @@ def diagnosed(evidence: Evidence) -> Diagnosis:
 
 
 def _signs_of_rays(evidence: Evidence) -> list[Sign]:
-    """Look at tie points, and at the GNSS."""
-    cameras, nothing = evidence.cameras, np.full((len(evidence.cameras), 3), np.nan)
-    gnss = evidence.gnss or GnssPositions(nothing, nothing, None)
+    """Look at tie points; and at the GNSS, which in passing must decide only if they do not."""
+    cameras, gnss = evidence.cameras, evidence.gnss
     signs, apparent = _signs_of_ties(evidence)
-    off = cameras.centres - gnss.xyz
-    known = int(np.isfinite(off).sum()) >= LEAST_COORDINATES
-    suspicious = gnss_is_suspicious(cameras.centres, off, gnss.sigma_m)
-    why = "without a pattern"
-    if any(sign.speaks for sign in signs) or suspicious or (known and not evidence.in_passing):
-        try:
-            mended = _mended(evidence, apparent)
-        except GeometryError as error:
-            why = f"the cause of the pattern is unknown ({error})"
-        else:
-            signs = [sized(sign, mended) for sign in signs]
-            return signs + [gnss_sign(cameras.centres, off, gnss.sigma_m, mended)] * known
-    if known:
-        rms = float(np.sqrt(np.nanmean(off**2)))
-        words = f"projection centres differ from the GNSS by {rms:.3f} m RMS, {why}"
-        signs.append(Sign("GNSS", {"rms_m": rms}, None, why=words))
+    off = np.full((len(cameras), 3), np.nan) if gnss is None else cameras.centres - gnss.xyz
+    is_known = int(np.isfinite(off).sum()) >= LEAST_COORDINATES
+    is_open = not evidence.in_passing or all(sign.speaks is None for sign in signs)
+    if not any(sign.speaks for sign in signs) and not (is_known and is_open):
+        return signs
+    try:
+        mended = _mended(evidence, apparent)
+    except GeometryError as error:
+        words = f"the pattern of absorbed refraction is unknown ({error})"
+        return signs + [Sign("GNSS", None, words)] * is_known
+    signs = [sized(sign, mended) for sign in signs]
+    if gnss is not None and is_known:
+        signs.append(gnss_sign(cameras.centres, off, gnss.sigma_m, mended))
     return signs
 
 
@@ -559,19 +513,15 @@ def _mended(evidence: Evidence, apparent: FloatArray | None) -> Mended:
     if count > most or (apparent is None and evidence.view is None):
         why = f"{count} images (limit {most})" if count > most else "no cloud"
         raise GeometryError("adjust.no_pattern", why)
-    wanted = max(CLOUD_POINTS, POINTS_PER_IMAGE * count)
-    if apparent is None:
-        apparent = sample_of(evidence.view, wanted)
     from pcfix.adjust.from_cloud import mended  # not quick to load
 
+    wanted = max(CLOUD_POINTS, POINTS_PER_IMAGE * count)
+    if apparent is None:
+        every = max(1, evidence.view.points // wanted)
+        parts = [seen.xyz[::every] for seen in evidence.view.chunks()]
+        apparent = np.vstack([np.zeros((0, 3)), *parts])
     some = apparent[:: max(1, len(apparent) // wanted)]
     return mended(some, evidence.cameras, evidence.water, evidence.refractive_index)
-
-
-def sample_of(view: Any, wanted: int) -> FloatArray:
-    """Return about so many points of a cloud, evenly spread over it, shape (m, 3)."""
-    every = max(1, view.points // wanted)
-    return np.vstack([np.zeros((0, 3)), *(seen.xyz[::every] for seen in view.chunks())])
 
 
 def _signs_of_calibration(evidence: Evidence, known: dict[str, float]) -> list[Sign]:
@@ -583,14 +533,8 @@ def _signs_of_calibration(evidence: Evidence, known: dict[str, float]) -> list[S
         (float(np.mean(focal)), known.get(name, known.get("", np.nan)))
         for name, focal in by_sensor.items()
     ]
-    pairs = [pair for pair in pairs if np.isfinite(pair[1])]
-    if not pairs:
-        return []
-    centres = evidence.cameras.centres
-    level = surface_above(evidence.water, centres).height_m if evidence.has_height else np.nan
-    height = float(np.nanmedian(centres[:, 2] - level)) if np.isfinite(level).any() else 0.0
-    focal, calibrated = np.array(pairs).T
-    return [focal_sign(focal, calibrated, height)]
+    focal, calibrated = np.array([pair for pair in pairs if np.isfinite(pair[1])]).reshape(-1, 2).T
+    return [focal_sign(focal, calibrated, np.median(evidence.above_m))] if len(focal) else []
 
 
 def _signs_of_control(evidence: Evidence, control: GroundControl) -> list[Sign]:
@@ -611,15 +555,13 @@ def _signs_of_control(evidence: Evidence, control: GroundControl) -> list[Sign]:
 def _signs_of_reference(evidence: Evidence) -> list[Sign]:
     """Compare land and bed of the cloud with a survey of both."""
     gsd, surveyed = evidence.gsd_m, evidence.reference.xyz
-    if evidence.reference.sparse:
-        cloud_z = _cloud_heights(evidence.view, surveyed, gsd)
-    else:
-        cloud, surveyed = _at_points_of_cloud(evidence.view, surveyed)
-        cloud_z = cloud[:, 2]
+    surveyed = surveyed[:: max(1, len(surveyed) // REFERENCE_POINTS)]
     if not len(surveyed):
         return []
+    cloud_z = _cloud_heights(evidence.view, surveyed, gsd)
     level = surface_above(evidence.water, surveyed).height_m
-    land, bed = surveyed[:, 2] > level + LAND_M, surveyed[:, 2] < level
+    land: BoolArray = surveyed[:, 2] > level + LAND_M
+    bed = surveyed[:, 2] < level
     signs = []
     if land.any():
         signs.append(land_sign(cloud_z[land] - surveyed[land, 2], gsd, "the reference"))
@@ -637,19 +579,3 @@ def _cloud_heights(view: Any, xyz: FloatArray, gsd_m: float) -> FloatArray:
         return np.zeros(0)
     near = [seen.xyz[is_near(xy, seen.xyz, radius)] for seen in view.chunks()]
     return heights_from_cloud(xy, np.vstack([np.zeros((0, 3)), *near]), radius)
-
-
-def _at_points_of_cloud(view: Any, reference: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return points of a cloud, and the reference at their places."""
-    from scipy.spatial import cKDTree
-
-    cloud = sample_of(view, SAMPLE_POINTS)
-    if len(reference) < NEAREST or not len(cloud):
-        return cloud[:0], reference[:0]
-    size = np.ptp(reference[:, :2], axis=0)
-    spacing = float(np.sqrt(max(size.prod(), 1e-9) / len(reference)))
-    found = cKDTree(reference[:, :2]).query(cloud[:, :2], k=NEAREST)
-    distance, row = np.asarray(found[0]), np.asarray(found[1])
-    near = distance[:, -1] < 3.0 * spacing
-    z = reference[row[near], 2].mean(axis=1)
-    return cloud[near], np.column_stack([cloud[near, :2], z])

@@ -42,6 +42,7 @@ from pcfix.adjust.solve import solve
 from pcfix.errors import PcfixWarning
 from pcfix.model import BoolArray, Cameras, FloatArray, WaterPlane, WaterSurface
 from pcfix.port.shapes import Port, spec_of
+from pcfix.sums import nice_step
 from pcfix.water.surface import surface_above
 
 Source = Literal["tie points", "cloud"]
@@ -251,8 +252,9 @@ def adjustment_dict(adjusted: Adjusted, before: Intersected | None = None) -> Pl
     """
     a, block, u = adjusted, adjusted.block, adjusted.unknowns
     kept = len(block.cameras) if u.poses == "fixed" else 0
-    known, lenses = a.precision, block.cameras.lenses or ()
-    notes = {str(one): one for one in [*a.notes, *(known.notes if known is not None else ())]}
+    known, lenses, notes = a.precision, block.cameras.lenses or (), [*a.notes]
+    if known is not None:
+        notes += [*known.notes, *undetermined(known, u), *correlated(known)]
     found = {
         "source": a.source,
         "engine": "unaware" if a.source == "cloud" else "direct",
@@ -281,7 +283,7 @@ def adjustment_dict(adjusted: Adjusted, before: Intersected | None = None) -> Pl
         "port_found": _port(a),
         "on_surfaces": [row._asdict() for row in a.on_surfaces],
         "poses": _poses(a),
-        "precision": None if known is None else _precision(known, u),
+        "precision": None if known is None else _precision(known),
         "gnss": _gnss(a),
         "control": _surveyed([row for row in a.control if row.role == "control"]),
         "check": _surveyed([row for row in a.control if row.role == "check"]),
@@ -295,7 +297,7 @@ def adjustment_dict(adjusted: Adjusted, before: Intersected | None = None) -> Pl
             }
             for row in {row.round: row for row in a.rounds}.values()
         ],
-        "notes": [one.as_dict() for one in notes.values()],
+        "notes": [one.as_dict() for one in {str(one): one for one in notes}.values()],
     }
     return dict(_plain(found))
 
@@ -322,14 +324,6 @@ def mean(values: FloatArray) -> FloatArray:
 def rms(values: FloatArray) -> FloatArray:
     """Return the root mean square of the finite values, of each column; NaN if there is none."""
     return np.asarray(np.sqrt(mean(values * values)))
-
-
-def nice_step(least: float) -> float:
-    """Return the smallest of 1, 2, 5 times a power of ten that is not below a number."""
-    if not least > 0.0:
-        return 1.0
-    power = 10.0 ** np.floor(np.log10(least))
-    return float(next(f * power for f in (1, 2, 5, 10) if f * power >= least * (1.0 - 1e-9)))
 
 
 def _counts(a: Adjusted) -> Plain:
@@ -472,7 +466,7 @@ def _poses(a: Adjusted) -> Plain:
     }
 
 
-def _precision(p: Precision, unknowns: Unknowns) -> Plain:
+def _precision(p: Precision) -> Plain:
     centre, angle = p.centre_sigma_m, p.angle_sigma_deg
     moves = (centre > 0.0).any(axis=1) | (angle > 0.0).any(axis=1)
     found: Plain = {"images": moves.sum()}
@@ -482,7 +476,6 @@ def _precision(p: Precision, unknowns: Unknowns) -> Plain:
         found[name.format("largest")] = values.max(axis=0) if known else None
     found["shared"] = [row._asdict() for row in p.shared]
     found["correlation"] = p.correlation
-    found["doubts"] = [one.as_dict() for one in [*undetermined(p, unknowns), *correlated(p)]]
     return found
 
 

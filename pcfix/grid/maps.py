@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.adjust.result import nice_step
 from pcfix.model import BoolArray, FloatArray, IntArray
+from pcfix.sums import nice_step
 
 LONG_SIDE_CELLS = 360
 MOST_CELLS = 500_000

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from pcfix.adjust.block import MOTIONS
 from pcfix.adjust.problem import Intersected
 from pcfix.adjust.result import Adjusted, Plain, adjustment_dict, before_of
 from pcfix.grid.colours import DEPTH, DIFFERENCE, RAYS, UNCERTAINTY
@@ -32,6 +33,11 @@ _WATER = {
     "shape_yy": ("shape y^2", "/m"), "distance": ("port distance", "m"),
     "centre_x": ("dome centre x", "m"), "centre_y": ("dome centre y", "m"),
     "centre_z": ("dome centre z", "m"),
+}  # fmt: skip
+_SIGMAS = {
+    "water level": "level_sigma_m", "water tilt": "tilt_sigma", "refractive index": "index_sigma",
+    "water shape": "shape_sigma", "distance of the port": "distance_sigma_m",
+    "centre of the dome": "centre_sigma_m",
 }  # fmt: skip
 _COUNTS = (
     ("images", "{images:,}, {poses_words}", "images"),
@@ -77,10 +83,8 @@ def short(value: float, sigma: float | None, sign: str = "") -> str:
 
 
 def all_notes(d: Plain) -> list[str]:
-    """Return the messages of all warnings, each once."""
-    doubts = d["precision"]["doubts"] if d["precision"] is not None else []
-    notes = [one["message"] for one in [*d["notes"], *doubts]]
-    return list(dict.fromkeys(note[:1].upper() + note[1:] for note in notes))
+    """Return the messages of all warnings."""
+    return [note["message"][:1].upper() + note["message"][1:] for note in d["notes"]]
 
 
 def _residuals(d: Plain) -> str:
@@ -97,7 +101,7 @@ def adjustment_sentence(d: Plain) -> str:
     row = next((one for one in d["lens"][:1] if one["name"] == "f"), None)
     parts = [f"centres moved {fixed(d['poses']['moved_rms_m'], 3)} m (rms)"]
     if row is not None:
-        before, after, *_ = _change(row)
+        before, after, _ = _change(row)
         parts.insert(0, f"focal length {before} -> {after} {d['image_unit']}")
     residuals = _residuals(d)
     return ", ".join([*parts, *([f"residuals {residuals}"] if residuals else [])])
@@ -188,9 +192,15 @@ def _facts(d: Plain) -> Rows:
     })  # fmt: skip
     rows += [] if d["lens"] else [("lens", "fixed")]
     for label, row, unit in _unknowns(d):
-        before, after, change, error = _change(row)
-        error = "" if row["sigma"] is None else f", standard error {error}"
-        rows.append((label, f"{before} -> {after}{f' {unit}' if unit else ''} ({change}{error})"))
+        unit = f" {unit}" if unit else ""
+        error = "" if row["sigma"] is None else f"standard error {row['sigma']:.2g}"
+        if "added" in row:
+            rows.append((label, f"{short(row['added'], row['sigma'], '+')}{unit} ({error})"))
+            continue
+        before, after, change = _change(row)
+        rows.append(
+            (label, f"{before} -> {after}{unit} ({', '.join(filter(None, (change, error)))})")
+        )
     if d["water"] is None:
         rows.append(("water", "none, a housing port refracts" if d["port"] else "none"))
         if len(d["port_found"] or {}) > 1:
@@ -248,14 +258,13 @@ def _fact_table(d: Plain) -> Table:
 
 
 def _change(row: Plain) -> list[str]:
-    """Return a value before and after, the difference, and its standard error."""
+    """Return a value before and after, and the difference."""
     before, after, sigma = row["before"], row["after"], row["sigma"]
-    error = "-" if sigma is None else f"{sigma:.2g}"
-    return [short(before, sigma), short(after, sigma), short(after - before, sigma, "+"), error]
+    return [short(before, sigma), short(after, sigma), short(after - before, sigma, "+")]
 
 
 def _unknowns(d: Plain) -> list[tuple[str, Plain, str]]:
-    """Return label, values and unit of what was free of lens, water and port."""
+    """Return label, values and unit of what was free of lens, water, port and similarity."""
     several = len({row["sensor"] for row in d["lens"]}) > 1
     rows = []
     for row in d["lens"]:
@@ -268,6 +277,10 @@ def _unknowns(d: Plain) -> list[tuple[str, Plain, str]]:
     for key, (label, unit) in _WATER.items():
         if (value := found.get(key)) is not None and value["free"]:
             rows.append((label, value, unit))
+    if d["poses_are"] == "similarity" and d["precision"] is not None:
+        shared = {row["name"]: row for row in d["precision"]["shared"]}
+        units = {"shift": "m", "turn": "rad", "scale": ""}
+        rows += [(name, shared[name], units[name.partition(" ")[0]]) for name in MOTIONS]
     return rows
 
 
@@ -311,19 +324,7 @@ def _means(a: Adjusted, values: FloatArray) -> Maps:
 def _tables(d: Plain) -> list[Table]:
     """Return the tables that have rows, residuals first."""
     unit, p = d["image_unit"], d["precision"]
-    # lens and water before and after, as far as they were free
-    rows = [[label, *_change(row), of] for label, row, of in _unknowns(d)]
-    if d["poses_are"] == "similarity" and p is not None:
-        units = {"shift": "m", "turn": "rad", "scale": ""}
-        for row in p["shared"]:
-            if (kind := row["name"].partition(" ")[0]) in units:
-                sigma = row["sigma"]
-                error = "-" if sigma is None else f"{sigma:.2g}"
-                added = short(row["added"], sigma, "+")
-                rows.append([row["name"], "", "", added, error, units[kind]])
-    header = ["", "before", "after", "change", "standard error", "unit"]
-    tables = [_residual_table(d), Table("Lens and water", header, rows)]
-
+    tables = [_residual_table(d)]
     shared = [] if p is None else [row["name"].replace("_", " ") for row in p["shared"]]
     if len(shared) > 1:
         rows = [
@@ -378,26 +379,13 @@ def _residual_table(d: Plain) -> Table:
 def _what_was_free(d: Plain) -> Table:
     """Return what was free, and with which standard deviations."""
     u = d["unknowns"]
-
-    def how(sigma: float | None, unit: str = "") -> str:
-        if sigma is None:
-            return "free"
-        return f"free, standard deviation {sigma:g}{unit}" if sigma else "fixed"
-
-    held = [f"{name} {how(sigma)}" for name, sigma in u["lens_sigma"].items() if name in u["lens"]]
-    lens = ", ".join(u["lens"]) + (f" ({'; '.join(held)})" if held else "")
     datum = "free network" if u["free_network"] else "of GNSS, control points or fixed poses"
     rows: list[list[Any]] = [
-        ["poses", _poses_are(d).removeprefix("poses ")],
-        ["datum", datum],
-        ["lens", lens or "fixed"],
-        ["water level", how(u["level_sigma_m"], " m")],
-        ["water tilt", how(u["tilt_sigma"])],
-        ["refractive index", how(u["index_sigma"])],
-    ]
-    more = {
-        "water shape": "shape_sigma", "distance of the port": "distance_sigma_m",
-        "centre of the dome": "centre_sigma_m",
-    }  # fmt: skip
-    rows += [[name, "free"] for name, key in more.items() if u[key] is None]
+        ["poses", _poses_are(d).removeprefix("poses ")], ["datum", datum],
+        ["lens", ", ".join(u["lens"]) or "fixed"],
+    ]  # fmt: skip
+    given = {f"lens {name}": sigma for name, sigma in u["lens_sigma"].items() if name in u["lens"]}
+    for name, sigma in (given | {name: u[key] for name, key in _SIGMAS.items()}).items():
+        how = "free" if sigma is None else f"free, standard deviation {sigma:g}"
+        rows.append([name, how if sigma is None or sigma else "fixed"])
     return Table("What was free", ["unknown", ""], rows)

@@ -1,4 +1,4 @@
-"""The pictures of an adjustment: the block, its residuals, a section and the rounds."""
+"""The pictures of an adjustment: the block, its residuals, and a section."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ import numpy as np
 
 from pcfix.adjust.block import sensor_groups
 from pcfix.adjust.problem import Intersected
-from pcfix.adjust.result import Adjusted, Plain, nice_step, rms
+from pcfix.adjust.result import Adjusted, Plain, rms
 from pcfix.grid.colours import DIFFERENCE
 from pcfix.model import BoolArray, FloatArray
 from pcfix.report.page import AFTER, BEFORE, WATER, Picture, label_plan, new_figure
+from pcfix.sums import nice_step
 from pcfix.water.surface import surface_above
 
 MOST_POINTS = 6000
@@ -27,7 +28,7 @@ def pictures_of(d: Plain, adjusted: Adjusted, before: Intersected | None) -> lis
     """Return the pictures of an adjustment."""
     drawn = (
         _block(d, adjusted), _by_depth(d, before), _vectors(adjusted, before),
-        _section(adjusted, before), _rounds(d, adjusted),
+        _section(adjusted, before),
     )  # fmt: skip
     return [picture for picture in drawn if picture is not None]
 
@@ -198,30 +199,3 @@ def _section(a: Adjusted, before: Intersected | None) -> Picture | None:
         + (" Before: intersected with the original poses and lens." if before else "")
     )
     return Picture("section", "Section", alt, figure)
-
-
-def _rounds(d: Plain, a: Adjusted) -> Picture | None:
-    """Draw cost and residuals step by step."""
-    if len(a.rounds) < 2:
-        return None
-    figure, panels = new_figure(8.0, 4.6, nrows=2, sharex=True)
-    number, _, cost, _, _, rms_px = np.array(a.rounds).T
-    step = np.arange(1, len(number) + 1)
-    labels = "Cost", f"RMS residual ({d['image_unit']})"
-    for axes, values, label in zip(panels, (cost, rms_px), labels, strict=True):
-        for one in np.unique(number):
-            axes.plot(step[number == one], values[number == one], "o-", color=AFTER, markersize=3)
-        # over several powers of ten, as poor starts have
-        if values.min() > 0.0 and values.max() > 20.0 * values.min():
-            axes.set_yscale("log")
-        for first in np.flatnonzero(np.diff(number)) + 1.5:
-            axes.axvline(first, color="0.6", linewidth=0.8, linestyle="--")
-        axes.grid(visible=True, axis="y", color="0.9", linewidth=0.6)
-        axes.set_ylabel(label)
-    panels[1].set_xlabel("Step")
-    panels[1].xaxis.get_major_locator().set_params(integer=True)
-    alt = (
-        "Cost (sum of weighted squares) and RMS residual after each step. Dashed lines separate"
-        " the rounds, whose costs cannot be compared, as outliers are excluded between them."
-    )
-    return Picture("rounds", "Convergence", alt, figure)

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.adjust.result import nice_step
 from pcfix.grid.colours import HEIGHT, NO_LIGHT, hillshade, stops_of
 from pcfix.grid.maps import Maps, contours, depth_interval, smoothed
 from pcfix.model import FloatArray
+from pcfix.sums import nice_step
 
 _NO_DATA = -32768
 _STEPS = 32_000

@@ -202,7 +202,7 @@ def test_page(adjusted, kind):
     names = [picture.name for picture in pictures]
     assert len(elements.all("img")) == len(names)
     if kind == "whole":
-        assert names == ["block", "residuals_by_depth", "residual_vectors", "section", "rounds"]
+        assert names == ["block", "residuals_by_depth", "residual_vectors", "section"]
         assert "Something <decided>" in said
 
 
