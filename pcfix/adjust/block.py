@@ -164,8 +164,6 @@ class Unknowns:
     poses: Poses = "free"  # `similarity` shifts, turns and scales all poses together
     fixed_images: tuple[str, ...] = ()  # labels of images whose pose is fixed
     lens: tuple[str, ...] = ("f",)  # free of each sensor: f, cx, cy, b1, b2, k1 ... k8, p1, p2
-    # standard deviations of some of them, in their unit
-    lens_sigma: dict[str, float] = field(default_factory=dict)
     level_sigma_m: float = 0.0
     tilt_sigma: float = 0.0
     index_sigma: float = 0.0
@@ -339,61 +337,59 @@ def block_of(material: Material, ties: TiePoints, sigma_px: float) -> Block:
     water, n, cameras = material.water, material.refractive_index, material.original
     if material.calibrated is not None:
         cameras = replace(cameras, lenses=(material.calibrated,) * len(cameras))
-    inside = material.inside
-    wet = np.ones(len(ties.xyz), np.bool_) if inside is None else inside(*ties.xyz[:, :2].T)
+    inside, control, m = material.inside, material.control, len(ties.xyz)
+    wet = np.ones(m, np.bool_) if inside is None else inside(*ties.xyz[:, :2].T)
     ties = replace(ties, xyz=true_start(ties.xyz, water, n, wet))
-    block = replace(
-        plain_block(cameras, ties, water, n, wet),
-        sigma_px=np.full(len(ties.views.camera), sigma_px),
-        port=material.port,
-    )
-    if material.gnss is not None:
-        known = material.gnss
-        block = replace(block, gnss_xyz=known.xyz, gnss_sigma_m=known.sigma_m)
-    control = material.control
-    if control is None:
-        return block
-    _check_under_water(control, water, material.level_sigma_m)
-    marks, sigma = marks_of(control)
-    conditions, under_water, xyz = None, control.under_water.copy(), control.xyz
-    if any(control.on):
-        on = np.array(control.on)
-        names = tuple(dict.fromkeys(name for name in control.on if name and name != WATER))
-        number = {"": -1, WATER: 0} | {name: i for i, name in enumerate(names, start=1)}
-        conditions = Conditions(
-            names,
-            np.array([-1] * len(block.xyz) + [number[name] for name in control.on]),
-            np.concatenate([np.ones(len(block.xyz)), control.on_sigma_m]),
-            material.parallel,
+    sigma, more = np.full(len(ties.views.camera), sigma_px), dict[str, Any]()
+    if control is not None:
+        _check_under_water(control, water, material.level_sigma_m)
+        marks, of_marks = marks_of(control)
+        conditions, under_water, xyz = _on_surfaces(material, control, marks, m)
+        views = Views(
+            np.concatenate([ties.views.start, marks.views.start[1:] + ties.views.start[-1]]),
+            np.concatenate([ties.views.camera, marks.views.camera]),
         )
-        # points without coordinates start where their rays meet
-        bare = np.asarray(np.isnan(xyz).any(axis=1))
-        under_water[bare] = on[bare] != WATER
-        places = with_places(marks, material.original).xyz
-        xyz = np.where(bare[:, None], true_start(places, water, n, under_water), xyz)
-        if np.isnan(xyz).any():
-            name = control.names[int(np.argmax(np.isnan(xyz).any(axis=1)))]
-            words = (
-                f"Point {name} has no coordinates and its image rays do not intersect."
-                " Mark it in at least two images from different directions."
-            )
-            raise GeometryError("gcps.no_coordinates", words, point=name)
-    return replace(
-        block,
-        xyz=np.vstack([block.xyz, xyz]),
-        conditions=conditions,
-        start=np.concatenate([block.start, marks.views.start[1:] + block.start[-1]]),
-        camera=np.concatenate([block.camera, marks.views.camera]),
-        image_xy=np.vstack([block.image_xy, marks.image_xy]),
-        sigma_px=np.concatenate([block.sigma_px, sigma]),
-        wet=np.concatenate([block.wet, under_water]),
-        surveyed_xyz=np.vstack([block.surveyed_xyz, control.xyz]),
-        surveyed_sigma_m=np.vstack(
-            [block.surveyed_sigma_m, np.where(control.is_check[:, None], np.inf, control.sigma_m)]
-        ),
-        control_names=control.names,
-        is_check=control.is_check,
-    )
+        ties = TiePoints(
+            np.vstack([ties.xyz, xyz]), views, np.vstack([ties.image_xy, marks.image_xy])
+        )
+        sigma, wet = np.concatenate([sigma, of_marks]), np.concatenate([wet, under_water])
+        sigma_m = np.where(control.is_check[:, None], np.inf, control.sigma_m)
+        more = {
+            "surveyed_xyz": np.vstack([np.full((m, 3), np.nan), control.xyz]),
+            "surveyed_sigma_m": np.vstack([np.full((m, 3), np.inf), sigma_m]),
+            "control_names": control.names, "is_check": control.is_check, "conditions": conditions,
+        }  # fmt: skip
+    if material.gnss is not None:
+        more |= {"gnss_xyz": material.gnss.xyz, "gnss_sigma_m": material.gnss.sigma_m}
+    block = plain_block(cameras, ties, water, n, wet)
+    return replace(block, sigma_px=sigma, port=material.port, **more)
+
+
+def _on_surfaces(
+    material: Material, control: GroundControl, marks: TiePoints, ties: int
+) -> tuple[Conditions | None, BoolArray, FloatArray]:
+    """Return conditions of surveyed points, which are under water, and their start values."""
+    under_water, xyz, on = control.under_water.copy(), control.xyz, np.array(control.on)
+    if not any(control.on):
+        return None, under_water, xyz
+    names = tuple(dict.fromkeys(name for name in control.on if name and name != WATER))
+    number = {"": -1, WATER: 0} | {name: i for i, name in enumerate(names, start=1)}
+    rows = np.array([-1] * ties + [number[name] for name in control.on])
+    sigma_m = np.concatenate([np.ones(ties), control.on_sigma_m])
+    # points without coordinates start where their rays meet
+    bare = np.asarray(np.isnan(xyz).any(axis=1))
+    under_water[bare] = on[bare] != WATER
+    places = with_places(marks, material.original).xyz
+    start = true_start(places, material.water, material.refractive_index, under_water)
+    xyz = np.where(bare[:, None], start, xyz)
+    if np.isnan(xyz).any():
+        name = control.names[int(np.argmax(np.isnan(xyz).any(axis=1)))]
+        words = (
+            f"Point {name} has no coordinates and its image rays do not intersect."
+            " Mark it in at least two images from different directions."
+        )
+        raise GeometryError("gcps.no_coordinates", words, point=name)
+    return Conditions(names, rows, sigma_m, material.parallel), under_water, xyz
 
 
 def _check_under_water(

@@ -10,8 +10,8 @@ GNSS : projection centres differ from it in the pattern in which this water woul
     block (`pcfix.adjust.from_cloud`).
 bed : depths of the cloud are nearly true before any correction; refraction leaves 1/n of them or
     less.
-land, control points, focal length : they are wrong. They can be so for other reasons, and they are
-    right if ground control held them.
+land : it is wrong, at control points or against a survey. It can be so for other reasons, and it is
+    right if ground control held it.
 neighbours : neighbouring points of a dense cloud that come from different images fit each other
     with straight rays, and not with refracted ones.
 
@@ -27,9 +27,7 @@ import numpy as np
 
 from pcfix.adjust.block import deeper, plain_block, similarity_gradients, taken
 from pcfix.errors import GeometryError
-from pcfix.lens.imaging import straight_images
 from pcfix.model import (
-    BoolArray,
     Cameras,
     FloatArray,
     GnssPositions,
@@ -45,9 +43,9 @@ if TYPE_CHECKING:  # not quick to load
     from pcfix.adjust.from_cloud import Mended
     from pcfix.adjust.problem import Intersected
 
-ORDER = ("tie points", "GNSS", "bed", "land", "control points", "neighbours", "focal length")
+ORDER = ("tie points", "GNSS", "bed", "land", "neighbours")
 """The signs in the order in which they decide."""
-SIZES = ("land", "GNSS", "tie points", "control points", "bed", "focal length")
+SIZES = ("land", "GNSS", "tie points", "bed")
 """Signs by how well they know the likely error: measured on land before predicted."""
 
 LEAST_POINTS = 30
@@ -67,11 +65,6 @@ SIGMAS = 3.0
 """Standard errors that are not chance."""
 LAND_GSD = 2.0
 """Error of land against a survey that dense matching and smoothing leave."""
-CONTROL_PX = 2.0
-"""RMS residual of control points in the images."""
-FOCAL_SHARE = 1.5e-3
-"""Of a calibrated focal length: factory calibrations of a five-lens camera over land differ from
-the adjusted ones by up to 0.7e-3, and consumer cameras as much with temperature."""
 LEAST_DEPTH_M, LAND_M = 1.0, 0.3
 """Depth of a bed, and height above the water of land, that are compared with a survey."""
 MOST_STATED_M = 0.5
@@ -293,7 +286,7 @@ def _rest(y: FloatArray, columns: FloatArray) -> FloatArray:
     return np.asarray(y - columns @ np.linalg.lstsq(columns, y, rcond=None)[0])
 
 
-# Surveys, calibrations and the cloud itself
+# Surveys, and the cloud itself
 
 
 def land_sign(higher_m: FloatArray, gsd_m: float, against: str) -> Sign:
@@ -344,24 +337,6 @@ def bed_sign(apparent_m: FloatArray, true_m: FloatArray, refractive_index: float
     )  # fmt: skip
 
 
-def control_sign(residual_px: FloatArray, sigma_px: FloatArray, gsd_m: float) -> Sign:
-    """Look at the residuals of control points on land: measured minus computed, shape (o, 2)."""
-    seen = np.isfinite(residual_px).all(axis=1)
-    if seen.sum() < 3:
-        return Sign("control points", None, "fewer than three marks in images")
-    rms = float(np.sqrt(np.mean(residual_px[seen] ** 2)))
-    limit = max(CONTROL_PX, SIGMAS * float(np.median(sigma_px[seen])))
-    words = (
-        f"control points on land have residuals of {rms:.2f} px in the images (limit {limit:.2f}"
-        " px)"
-    )
-    return Sign(
-        "control points", True if rms > limit else None, words,
-        {"rms_px": rms, "limit_px": limit}, rms * gsd_m,
-        "residuals of control points times the GSD",
-    )  # fmt: skip
-
-
 def neighbours_sign(share: float, sigma: float, *, is_fused: bool) -> Sign:
     """Look at the discontinuities between image footprints that the corrected bed still has.
 
@@ -381,22 +356,6 @@ def neighbours_sign(share: float, sigma: float, *, is_fused: bool) -> Sign:
     return Sign("neighbours", speaks, words, {"share": share, "sigma_share": sigma})
 
 
-def focal_sign(focal: FloatArray, calibrated: FloatArray, height_m: float) -> Sign:
-    """Compare focal lengths of the sensors, shape (s,), each in its unit, with calibrated ones."""
-    off = focal / calibrated - 1.0
-    worst = float(off[np.argmax(np.abs(off))])
-    error = abs(worst) * height_m
-    words = (
-        f"the focal length differs by {worst:+.3%} from the calibrated one, {error:.2f} m at the"
-        f" ground (limit {FOCAL_SHARE:.2%})"
-    )
-    return Sign(
-        "focal length", True if abs(worst) > FOCAL_SHARE else None, words,
-        {"difference": worst, "error_m": error}, error,
-        "difference of the focal length times the flying height",
-    )  # fmt: skip
-
-
 # Evidence
 
 
@@ -411,8 +370,6 @@ class Evidence:
     ties: TiePoints | None = None
     view: Any = None  # a `pcfix.flow.surfaces.CloudView`, for heights and in place of tie points
     control: GroundControl | None = None
-    # focal length over width of the image, by sensor; "" is any
-    calibrated: dict[str, float] | None = None
     reference: Any = None  # a survey of land and bed, with `xyz`
     gnss: GnssPositions | None = None  # in the frame of the cameras, NaN if unknown
     neighbours: Sign | None = None  # of `neighbours_sign`
@@ -432,23 +389,15 @@ class Evidence:
         return self.has_height and all(lens.unit == "px" for lens in cameras.lenses)
 
     @property
-    def above_m(self) -> FloatArray:
-        """Heights of the projection centres above the water, shape (k,); zero if unknown."""
-        centres = self.cameras.centres
-        if not self.has_height:
-            return np.zeros(len(centres))
-        level = surface_above(self.water, centres).height_m
-        known = np.isfinite(level)
-        if not known.any():
-            return np.zeros(len(centres))
-        return np.asarray(centres[:, 2] - np.where(known, level, np.mean(level[known])))
-
-    @property
     def gsd_m(self) -> float:
         """Approximate size of a pixel at the water; zero if unknown."""
-        lenses = self.cameras.lenses or ()
+        lenses, centres = self.cameras.lenses, self.cameras.centres
+        if lenses is None or not self.has_height:
+            return 0.0
+        level = surface_above(self.water, centres).height_m
+        above = centres[:, 2] - np.where(np.isfinite(level), level, np.nanmean(level))
         focal = [lens.focal if lens.unit == "px" else np.inf for lens in lenses]
-        return float(np.mean(self.above_m / focal)) if lenses else 0.0
+        return float(np.mean(above / focal))
 
 
 def diagnosed(evidence: Evidence) -> Diagnosis:
@@ -456,12 +405,8 @@ def diagnosed(evidence: Evidence) -> Diagnosis:
     signs = [] if evidence.neighbours is None else [evidence.neighbours]
     if evidence.has_rays:
         signs += _signs_of_rays(evidence)
-    if evidence.calibrated:
-        signs += _signs_of_calibration(evidence, evidence.calibrated)
-    if evidence.control is not None:
-        signs += _signs_of_control(evidence, evidence.control)
-    if evidence.reference is not None and evidence.view is not None and evidence.has_height:
-        signs += _signs_of_reference(evidence)
+    if evidence.view is not None and evidence.has_height:
+        signs += _signs_of_surveys(evidence)
     return diagnosis_of(signs)
 
 
@@ -524,45 +469,20 @@ def _mended(evidence: Evidence, apparent: FloatArray | None) -> Mended:
     return mended(some, evidence.cameras, evidence.water, evidence.refractive_index)
 
 
-def _signs_of_calibration(evidence: Evidence, known: dict[str, float]) -> list[Sign]:
-    """Compare each sensor with its calibration."""
-    by_sensor: dict[str, list[float]] = {}
-    for lens in evidence.cameras.lenses or ():
-        by_sensor.setdefault(lens.sensor, []).append(lens.focal / lens.width)
-    pairs = [
-        (float(np.mean(focal)), known.get(name, known.get("", np.nan)))
-        for name, focal in by_sensor.items()
-    ]
-    focal, calibrated = np.array([pair for pair in pairs if np.isfinite(pair[1])]).reshape(-1, 2).T
-    return [focal_sign(focal, calibrated, np.median(evidence.above_m))] if len(focal) else []
-
-
-def _signs_of_control(evidence: Evidence, control: GroundControl) -> list[Sign]:
-    """Compare control points on land with the cloud and in the images."""
-    level = surface_above(evidence.water, control.xyz).height_m
-    land = ~control.under_water & ~(control.xyz[:, 2] < level)
-    gsd, cameras, signs = evidence.gsd_m, evidence.cameras, []
-    if evidence.view is not None:
-        higher = _cloud_heights(evidence.view, control.xyz[land], gsd) - control.xyz[land, 2]
-        signs.append(land_sign(higher, gsd, "the control points"))
-    if cameras.rotations is not None and cameras.lenses is not None:
-        rows = np.flatnonzero(land[control.point])
-        at = straight_images(control.xyz[control.point[rows]], control.camera[rows], cameras)
-        signs.append(control_sign(control.image_xy[rows] - at, control.sigma_px[rows], gsd))
-    return signs
-
-
-def _signs_of_reference(evidence: Evidence) -> list[Sign]:
-    """Compare land and bed of the cloud with a survey of both."""
-    gsd, surveyed = evidence.gsd_m, evidence.reference.xyz
-    surveyed = surveyed[:: max(1, len(surveyed) // REFERENCE_POINTS)]
-    if not len(surveyed):
-        return []
-    cloud_z = _cloud_heights(evidence.view, surveyed, gsd)
-    level = surface_above(evidence.water, surveyed).height_m
-    land: BoolArray = surveyed[:, 2] > level + LAND_M
-    bed = surveyed[:, 2] < level
+def _signs_of_surveys(evidence: Evidence) -> list[Sign]:
+    """Compare the cloud with control points on land, and with a survey of land and bed."""
+    gsd, view, control = evidence.gsd_m, evidence.view, evidence.control
     signs = []
+    if control is not None:
+        level = surface_above(evidence.water, control.xyz).height_m
+        dry = control.xyz[~control.under_water & ~(control.xyz[:, 2] < level)]
+        higher = _cloud_heights(view, dry, gsd) - dry[:, 2]
+        signs.append(land_sign(higher, gsd, "the control points"))
+    surveyed = np.zeros((0, 3)) if evidence.reference is None else evidence.reference.xyz
+    surveyed = surveyed[:: max(1, len(surveyed) // REFERENCE_POINTS)]
+    cloud_z = _cloud_heights(view, surveyed, gsd)
+    level = surface_above(evidence.water, surveyed).height_m
+    land, bed = surveyed[:, 2] > level + LAND_M, surveyed[:, 2] < level
     if land.any():
         signs.append(land_sign(cloud_z[land] - surveyed[land, 2], gsd, "the reference"))
     if bed.any():

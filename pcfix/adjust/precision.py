@@ -256,11 +256,10 @@ def correlated(precision: Precision) -> list[PcfixWarning]:
 
 def undetermined(precision: Precision, unknowns: Unknowns) -> list[PcfixWarning]:
     """Return a warning for each unknown whose standard error is too large to be useful."""
-    given = dict(zip(WATER_NAMES, unknowns.water_sigma, strict=True)) | unknowns.lens_sigma
-    notes = []
+    given, notes = dict(zip(WATER_NAMES, unknowns.water_sigma, strict=True)), []
     for row in precision.shared:
         limit, unit, _ = LIMITS.get(row.name, (np.inf, "", ""))
-        prior = given.get(row.name.partition(" of sensor ")[0], np.inf)
+        prior = given.get(row.name, np.inf)
         if row.sigma > limit:
             code = "adjust.undetermined"
             words = (

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pcfix.adjust.block import (
-    CODES,
     INDEX,
     MOTIONS,
     NAMES,
@@ -336,7 +335,10 @@ def priors_at(problem: Problem, found: Solution) -> tuple[float, csc_array, Floa
     diagonal, right = np.zeros(size), np.zeros(size)
     weight = block.gnss_weights
     off = np.where(weight > 0.0, block.gnss_xyz - problem.origin - found.state.centres, 0.0)
-    shared = inverse_variances(found.shared, _shared_sigma(problem))
+    sigma = np.full(given.shared, np.inf)  # of the shared unknowns about their start
+    free = given.column[: len(WATER_NAMES)]
+    sigma[free[free >= 0]] = [one for one in problem.unknowns.water_sigma if one]
+    shared = inverse_variances(found.shared, sigma)
     cost = float((weight * off * off).sum() + (shared * found.shared**2).sum())
     diagonal[6 * k :], right[6 * k :] = shared, -shared * found.shared
     # weighted observations of several unknowns at once: their derivatives and residuals
@@ -384,16 +386,6 @@ def _undetermined_motions(problem: Problem) -> list[int]:
     level = [2] if np.isinf(unknowns.level_sigma_m) else []
     tilt = [3, 4] if np.isinf(unknowns.tilt_sigma) else []
     return [0, 1, *level, *tilt, 5, 6]
-
-
-def _shared_sigma(problem: Problem) -> FloatArray:
-    """Return the standard deviations of the shared unknowns about their start."""
-    unknowns = problem.unknowns
-    given = {CODES[name]: value for name, value in unknowns.lens_sigma.items()}
-    lens = [given.get(int(code), np.inf) for code in problem.given.code]
-    water = [sigma for sigma in unknowns.water_sigma if sigma]
-    rest = problem.given.shared - len(lens) - len(water)
-    return np.array([*lens, *water, *([np.inf] * rest)], np.float64)
 
 
 def cost_at(problem: Problem, found: Solution, rule: Rule) -> float:

@@ -131,8 +131,7 @@ def redundancy_of(problem: Problem) -> int:
     block, given, used = problem.block, problem.given, problem.used
     points = len(np.unique(block.owner[used]))
     priors = int((block.gnss_weights > 0.0).sum() + (given.surveyed_weight > 0.0).sum())
-    sigma = [*problem.unknowns.lens_sigma.values(), *problem.unknowns.water_sigma]
-    priors += sum(0.0 < value < np.inf for value in sigma)
+    priors += sum(0.0 < value < np.inf for value in problem.unknowns.water_sigma)
     priors += len(np.intersect1d(np.flatnonzero(given.on >= 0), block.owner[used]))
     datum = 7 if problem.unknowns.free_network else 0
     return int(2 * used.sum() + priors + datum - 3 * points - problem.moves.sum())
@@ -265,7 +264,6 @@ def adjustment_dict(adjusted: Adjusted, before: Intersected | None = None) -> Pl
         "port": block.port is not None,
         "unknowns": {
             "lens": u.lens,
-            "lens_sigma": u.lens_sigma,
             **{name: getattr(u, name) for name in WATER_SIGMAS},
             "free_network": u.free_network,
             "parallel": () if block.conditions is None else block.conditions.parallel,

@@ -20,7 +20,7 @@ that fields too small to be found count too. The unknowns move by A^-1 B e.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 from scipy.special import fdtri
@@ -29,7 +29,7 @@ from pcfix.adjust.block import CX, CY, FOCAL, effect_at_corner
 from pcfix.adjust.normal import UNDAMPED, residuals, sparse_matrix, sparse_rows_of
 from pcfix.adjust.precision import Precision
 from pcfix.adjust.problem import Problem, Solution, water_of
-from pcfix.adjust.solve import Reduced, reduced_at, solver
+from pcfix.adjust.solve import reduced_at, solver
 from pcfix.errors import PcfixWarning
 from pcfix.model import FloatArray, IntArray
 from pcfix.water.surface import surface_above
@@ -75,39 +75,32 @@ def disagreement_of(
     """
     groups, added = _groups_by_sharing(problem, found), np.zeros(6 + problem.given.shared)
     counts = {words: len(np.unique(group)) for words, group in groups.items()}
-    if counts[ALONE] < LEAST_GROUPS:
-        return 1.0 + added, []
     reduced = reduced_at(problem, found)
     solve_for = solver(reduced)
-    if solve_for is None:
+    if counts[ALONE] < LEAST_GROUPS or solve_for is None:
         return 1.0 + added, []
     drawn = np.random.default_rng(1).normal(0.0, formal.sigma0, problem.given.image_xy.shape)
-    shared = []
-
-    def share_of(pulls: FloatArray) -> FloatArray:
-        moved = solve_for(pulls[:, reduced.active].T)
-        return _share_of(formal, reduced.active, (moved**2).sum(axis=1))
-
-    many = [words for words in groups if counts[words] >= LEAST_GROUPS]
-    own = [words for words in many if words != FRAME]
-    pulls = pulls_of(problem, found, [groups[words] for words in (ALONE, *own)], drawn)
-    by_chance, *shares = map(share_of, pulls)
-    for words in many:
-        if words == FRAME:
-            field = _pulls_of_field(
-                problem, found, groups[words], formal.sigma0, reduced, solve_for
-            )
-            more = share_of(field)
-            is_more = more > NOTED
-        else:
-            together = shares[own.index(words)]
-            is_more = together > fdtri(counts[words] - 1, counts[ALONE] - 1, SURE) * by_chance
-            more = np.where(is_more, together - by_chance, 0.0)
-        added += more
-        if is_more.any():
-            shared.append(words)
+    *pulls, field, rest = _pulls_of(problem, found, groups, drawn)
+    # the first group is that of drawn residuals, whose variances are by chance
+    by_chance, *shares = (
+        _share_of(formal, reduced.active, solve_for(pull[:, reduced.active].T)) for pull in pulls
+    )
+    shared = list[str]()
+    for words, share in zip(groups, shares, strict=False):
+        is_more = share > fdtri(counts[words] - 1, counts[ALONE] - 1, SURE) * by_chance
+        if counts[words] < LEAST_GROUPS or not is_more.any():
+            continue
+        more = np.where(is_more, share - by_chance, 0.0)
+        added, shared = added + more, [*shared, words]
         if words == ALONE:
             by_chance = by_chance + more
+    if counts[FRAME] >= LEAST_GROUPS:
+        active = field[:, reduced.active]
+        rest -= active @ solve_for(np.column_stack([active.T, reduced.right]))
+        likely = _likely_field(problem, groups[FRAME], formal.sigma0, rest) @ active
+        more = _share_of(formal, reduced.active, solve_for(likely.T))
+        added = added + more
+        shared += [FRAME] if (more > NOTED).any() else []
     factor = np.sqrt(1.0 + added)
     if not shared:
         return factor, []
@@ -164,39 +157,49 @@ def _tiles(xy: FloatArray, count: int) -> IntArray:
     return np.asarray(place[:, 0] * int(last[1] + 1.0) + place[:, 1])
 
 
-def _share_of(formal: Precision, active: IntArray, moved2: FloatArray) -> FloatArray:
-    """Return variances over the formal ones, (6 + g,), for poses their mean."""
+def _share_of(formal: Precision, active: IntArray, moved: FloatArray) -> FloatArray:
+    """Return variances over the formal ones, (6 + g,), for poses their mean.
+
+    `moved`, shape (a, n), are the movements of the active unknowns by each of n groups.
+    """
     k, poses = len(formal.pose_covariance), np.einsum("kii->ki", formal.pose_covariance)
     variance = np.concatenate([poses.ravel(), [row.sigma**2 for row in formal.shared]])
     share = np.zeros(len(variance))
-    share[active] = moved2
+    share[active] = (moved**2).sum(axis=1)
     share = np.divide(share, variance, out=np.zeros(len(variance)), where=variance > 0.0)
     free = max(int((poses > 0.0).any(axis=1).sum()), 1)
     return np.concatenate([share[: 6 * k].reshape(k, 6).sum(axis=0) / free, share[6 * k :]])
 
 
-def pulls_of(
-    problem: Problem, found: Solution, groups: list[IntArray], drawn: FloatArray
+def _pulls_of(
+    problem: Problem, found: Solution, groups: dict[str, IntArray], drawn: FloatArray
 ) -> list[FloatArray]:
     """Return the right side of the reduced equations by groups, each of shape (groups, 6 k + g).
 
-    Parameters
-    ----------
-    groups : list of array of int, shape (o,)
-        Several groupings of the observations, from zero.
-    drawn : array, shape (o, 2)
-        Weighted residuals to use instead in the first grouping.
+    The first is that of `ALONE` with the weighted residuals `drawn`, shape (o, 2), instead of those
+    found; the others of all groups but the frame. Then, for shifts along u and v of the t tiles of
+    the frame: B', shape (2 t, 6 k + g), and C beside their right sides, shape (2 t, 2 t + 1).
     """
-    counts = [int(group.max(initial=0)) + 1 for group in groups]
-    pulls = [np.zeros((count, len(problem.moves))) for count in counts]
+    tile, size = groups[FRAME], len(problem.moves)
+    each = [groups[ALONE], *(group for words, group in groups.items() if words != FRAME)]
+    pulls = [np.zeros((int(group.max(initial=0)) + 1, size)) for group in each]
+    count = 2 * (int(tile.max(initial=0)) + 1)
+    field, rest = np.zeros((count, size)), np.zeros((count, count + 1))
     for part in sparse_rows_of(found.state, problem.given, UNDAMPED):
-        at, own = part.rows.observation, part.rows.r
-        r = np.where(part.rows.is_image[:, None], drawn[at], own)
-        for group, count, total in zip(groups, counts, pulls, strict=True):
-            grouped = sparse_matrix(r, np.repeat(group[at], 2)[:, None], count)
+        at, is_image = part.rows.observation, part.rows.is_image
+        r = np.where(is_image[:, None], drawn[at], part.rows.r)
+        for group, total in zip(each, pulls, strict=True):
+            grouped = sparse_matrix(r, np.repeat(group[at], 2)[:, None], len(total))
             total += part.product(grouped).toarray()
-            r = own
-    return pulls
+            r = part.rows.r
+        weight = np.repeat(np.where(is_image, problem.given.weight[at], 0.0), 2)
+        column = (2 * tile[at][:, None] + np.arange(2)).reshape(-1, 1)
+        shifts = sparse_matrix(weight, column, count)
+        field += part.product(shifts).toarray()
+        by_points = shifts.T @ part.points
+        rest[:, :-1] += (shifts.T @ shifts - by_points @ part.inverse @ by_points.T).toarray()
+        rest[:, -1] += shifts.T @ part.left_over()
+    return [*pulls, field, rest]
 
 
 # A smooth field over the frame
@@ -212,35 +215,18 @@ NO_FIELD = 1e-9
 """Share of the largest eigenvalue below which a field leaves nothing in the residuals."""
 
 
-def _pulls_of_field(
-    problem: Problem, found: Solution, tile: IntArray, sigma0: float, reduced: Reduced,
-    solve_for: Callable[[FloatArray], FloatArray],
-) -> FloatArray:  # fmt: skip
-    """Return right sides of likely fields, shape (2 t, u).
-
-    The sum of the squares of the movements that they cause is the variance by the field.
+def _likely_field(problem: Problem, tile: IntArray, sigma0: float, rest: FloatArray) -> FloatArray:
+    """Return the transposed root of the covariance of the likely field, shape (2 t, 2 t).
 
     `tile` numbers the parts of the frame, none without observations; each sensor has its own.
+    `rest` are R and the right sides c of their shifts, shape (2 t, 2 t + 1).
     """
-    # B', C and right sides of shifts along u and v of each tile, 2 t candidates
-    count = int(tile.max()) + 1
-    pulls, rest = np.zeros((2 * count, len(problem.moves))), np.zeros((2 * count, 2 * count + 1))
-    for part in sparse_rows_of(found.state, problem.given, UNDAMPED):
-        at, is_image = part.rows.observation, part.rows.is_image
-        weight = np.repeat(np.where(is_image, problem.given.weight[at], 0.0), 2)
-        column = (2 * tile[at][:, None] + np.arange(2)).reshape(-1, 1)
-        shifts = sparse_matrix(weight, column, 2 * count)
-        pulls += part.product(shifts).toarray()
-        taken_up = part.inverse @ (part.points.T @ shifts)
-        rest[:, :-1] += (shifts.T @ shifts - (shifts.T @ part.points) @ taken_up).toarray()
-        rest[:, -1] += shifts.T @ part.left_over()
-    active = pulls[:, reduced.active]
-    rest -= active @ solve_for(np.column_stack([active.T, reduced.right]))
+    one = np.eye(len(rest))
     # in the eigenvectors of K R K' the pulls are independent, so that the likelihood is a product
     likely, halves = np.zeros((len(RANGES), len(STEPS))), []
     square = (LARGEST_PX * STEPS**3) ** 2  # dense where s is small
     for i, common in enumerate(_covariances_of_tiles(problem, tile)):
-        half = np.linalg.cholesky(common + 1e-9 * np.eye(2 * count))
+        half = np.linalg.cholesky(common + 1e-9 * one)
         halves.append(half)
         value, vector = np.linalg.eigh(half.T @ rest[:, :-1] @ half)
         shows = value > NO_FIELD * value[-1]
@@ -250,8 +236,7 @@ def _pulls_of_field(
     weight = np.exp(likely - likely.max()) * STEPS**2  # a uniform prior of s
     s2_of = (weight * square).sum(axis=1) / weight.sum()
     of_all = np.sum([s2 * half @ half.T for s2, half in zip(s2_of, halves, strict=True)], axis=0)
-    whole = np.linalg.cholesky(of_all + 1e-12 * np.eye(2 * count))
-    return np.asarray(whole.T @ pulls)
+    return np.asarray(np.linalg.cholesky(of_all + 1e-12 * one).T)
 
 
 def _covariances_of_tiles(problem: Problem, tile: IntArray) -> list[FloatArray]:

@@ -11,13 +11,7 @@ import numpy as np
 
 from pcfix.adjust.diagnosis import Diagnosis, Evidence, export_of
 from pcfix.errors import InputError, SettingError, shown_once
-from pcfix.flow.diagnosis import (
-    diagnose,
-    focal_length_of,
-    given_focal_lengths,
-    has_datum,
-    quick_ties,
-)
+from pcfix.flow.diagnosis import diagnose, has_datum, quick_ties
 from pcfix.flow.inputs import Inputs, ties_of
 from pcfix.flow.next_steps import adjust_words
 from pcfix.flow.plausibility import plausible
@@ -144,7 +138,7 @@ def _diagnosed(
     surface: WaterSurface,
 ) -> Diagnosis:  # fmt: skip
     """Test whether the poses have absorbed refraction."""
-    path, lens = str(inputs.cameras), given.lens
+    path = str(inputs.cameras)
     reference = None if given.reference is None else read_reference(given.reference)
     if reference is not None:
         crs = None if isinstance(view.crs, str) else view.crs
@@ -153,7 +147,6 @@ def _diagnosed(
         cameras, path, surface, index_of(given.index, given.index_formula)[0], view=view,
         reference=reference,
         control=None if given.gcps is None else read_ground_control(given.gcps, cameras).surveyed,
-        calibrated=given_focal_lengths(path) if lens is None else focal_length_of(lens),
         ties=ties_of(inputs, view.crs),
     )  # fmt: skip
     return diagnose(evidence)

@@ -20,11 +20,8 @@ from pcfix.adjust.diagnosis import (
 from pcfix.errors import InputError, PcfixError, PcfixWarning
 from pcfix.flow.inputs import Inputs, ties_of
 from pcfix.flow.next_steps import adjust_words
-from pcfix.io.cameras.metashape import given_lenses
-from pcfix.io.cameras.table.sensor import read_sensor
 from pcfix.io.gnss_positions import gnss_in_frame_of
 from pcfix.model import Cameras, TiePoints
-from pcfix.options.declare import File
 from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
 
 if TYPE_CHECKING:
@@ -90,8 +87,7 @@ def diagnose_in_passing(plan: Plan, ties: TiePoints | None) -> Poses:
         if path is not None and _size_of(Path(path)) > QUICK_BYTES:
             why = f"the file is larger than {QUICK_BYTES / 1e6:g} MB; use 'pcfix cameras'"
         elif path is not None:
-            ties = evidence.ties if evidence.has_rays else None
-            evidence = replace(evidence, ties=ties, calibrated=given_focal_lengths(path))
+            evidence = replace(evidence, ties=evidence.ties if evidence.has_rays else None)
         diagnosis = diagnose(evidence)
     except (PcfixError, OSError) as error:  # this check stops no correction
         return Poses(None, f"not checked for absorbed refraction: {error}")
@@ -150,15 +146,3 @@ def has_datum(cameras: Cameras, name: str) -> bool:
     spread = 1.4826 * np.median(np.abs(off - np.median(off, axis=0)))
     stated = found.sigma_m[known]
     return bool(np.median(np.where(np.isfinite(stated), stated, spread)) <= MOST_STATED_M)
-
-
-def given_focal_lengths(path: File) -> dict[str, float]:
-    """Return focal length by width of the calibrations that a camera file was given."""
-    found = given_lenses(Path(path))
-    return {name: lens.focal / lens.width for name, lens in found.items()}
-
-
-def focal_length_of(path: File) -> dict[str, float]:
-    """Return focal length by width of a calibration file, for any sensor."""
-    lens = read_sensor(Path(path))
-    return {"": lens.focal / lens.width}

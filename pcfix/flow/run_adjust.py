@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from pcfix.adjust.diagnosis import MOST_STATED_M, Evidence
 from pcfix.errors import PcfixError, PcfixWarning, SettingError
 from pcfix.flow.adjust import SUMMARY, adjust_into
-from pcfix.flow.diagnosis import diagnose, focal_length_of, given_focal_lengths, has_datum
+from pcfix.flow.diagnosis import diagnose, has_datum
 from pcfix.flow.inputs import Inputs, ties_of
 from pcfix.flow.next_steps import FOLDER, MODELS
 from pcfix.flow.surfaces import view_of
@@ -74,7 +74,7 @@ def _decide(request: Request) -> dict[str, Any]:
         return {"adjusted": True, "why": "that was asked for", "is_said": True}
     if request.adjust == "no":
         return {}
-    inputs, lens, model = request.part(Inputs), request.lens, str(request.cameras)
+    inputs, model = request.part(Inputs), str(request.cameras)
     is_said = bool(request.only_to_adjust)
     if request.why_not_adjust:
         return {"why": request.why_not_adjust, "is_said": is_said}
@@ -98,7 +98,6 @@ def _decide(request: Request) -> dict[str, Any]:
         evidence = Evidence(
             cameras, model, water, with_index(request).refractive_index, view=view,
             control=None if gcps is None else gcps.surveyed,
-            calibrated=given_focal_lengths(model) if lens is None else focal_length_of(lens),
             in_passing=not is_said,
         )  # fmt: skip
         if evidence.has_rays:

@@ -198,9 +198,8 @@ def _facts(d: Plain) -> Rows:
             rows.append((label, f"{short(row['added'], row['sigma'], '+')}{unit} ({error})"))
             continue
         before, after, change = _change(row)
-        rows.append(
-            (label, f"{before} -> {after}{unit} ({', '.join(filter(None, (change, error)))})")
-        )
+        change += f", {error}" if error else ""
+        rows.append((label, f"{before} -> {after}{unit} ({change})"))
     if d["water"] is None:
         rows.append(("water", "none, a housing port refracts" if d["port"] else "none"))
         if len(d["port_found"] or {}) > 1:
@@ -384,8 +383,7 @@ def _what_was_free(d: Plain) -> Table:
         ["poses", _poses_are(d).removeprefix("poses ")], ["datum", datum],
         ["lens", ", ".join(u["lens"]) or "fixed"],
     ]  # fmt: skip
-    given = {f"lens {name}": sigma for name, sigma in u["lens_sigma"].items() if name in u["lens"]}
-    for name, sigma in (given | {name: u[key] for name, key in _SIGMAS.items()}).items():
-        how = "free" if sigma is None else f"free, standard deviation {sigma:g}"
-        rows.append([name, how if sigma is None or sigma else "fixed"])
+    for name, key in _SIGMAS.items():
+        how = "free" if u[key] is None else f"free, standard deviation {u[key]:g}"
+        rows.append([name, "fixed" if u[key] == 0.0 else how])
     return Table("What was free", ["unknown", ""], rows)

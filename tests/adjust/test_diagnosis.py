@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pcfix.adjust.block import deeper
-from pcfix.adjust.diagnosis import bed_sign, control_sign, focal_sign, gnss_sign, tie_point_sign
+from pcfix.adjust.diagnosis import bed_sign, gnss_sign, tie_point_sign
 from pcfix.adjust.from_cloud import mended
 from pcfix.adjust.problem import intersect_fixed
 from pcfix.model import WaterPlane
@@ -77,15 +77,3 @@ def test_bed():
     assert bed_sign(true / 1.4, true, N).speaks is False
     assert bed_sign(0.97 * true, true, N).speaks is True
     assert bed_sign(0.97 * true[:2], true[:2], N).speaks is None
-
-
-def test_control_and_focal_length():
-    rng = np.random.default_rng(0)
-    assert control_sign(rng.normal(0, 0.5, (30, 2)), np.full(30, 0.5), 0.05).speaks is None
-    off = control_sign(rng.normal(0, 12.0, (30, 2)), np.full(30, 0.5), 0.05)
-    assert off.speaks is True
-    assert off.size_m == pytest.approx(0.6, rel=0.3)  # 12 px of 5 cm, 30 marks
-    short = focal_sign(np.array([1496.5, 1500.0]), np.array([1500.0, 1500.0]), 75.0)
-    assert short.speaks is True
-    assert short.size_m == pytest.approx(75.0 * 3.5 / 1500.0)
-    assert focal_sign(np.array([1501.0]), np.array([1500.0]), 75.0).speaks is None

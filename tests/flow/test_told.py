@@ -12,7 +12,7 @@ import pytest
 
 import pcfix
 from pcfix.adjust.block import usable_ties
-from pcfix.adjust.diagnosis import diagnosis_of, focal_sign, neighbours_sign
+from pcfix.adjust.diagnosis import diagnosis_of, land_sign, neighbours_sign
 from pcfix.model import Cameras, Lens, Outcome
 from tests.utils.crops import middle_of
 from tests.utils.nightly import mostly_nightly
@@ -119,10 +119,10 @@ def test_neighbours_sign(share, sigma, is_fused, absorbed):
     assert neighbours_sign(share, sigma, is_fused=is_fused).speaks is absorbed
 
 
-def test_neighbours_first():
-    off = focal_sign(np.array([1.01]), np.array([1.0]), 80.0)
-    found = diagnosis_of([off, neighbours_sign(0.1, 0.01, is_fused=True)])
-    assert found.absorbed is False
+def test_neighbours_last():
+    off = land_sign(np.ones(9), 0.05, "the reference")
+    found = diagnosis_of([neighbours_sign(0.1, 0.01, is_fused=True), off])
+    assert found.absorbed is True
     bent = diagnosis_of([neighbours_sign(0.9, 0.01, is_fused=True)])
     assert bent.sentence("pcfix adjust").startswith("The poses seem to have absorbed")
 

@@ -53,7 +53,7 @@ from pcfix.io.crs import LOCAL, METRES, crs_text, is_local, parse_crs, shortened
 from pcfix.io.ply import parse_header
 from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, Projection, TiePoints
 
-__all__ = ["given_lenses", "read", "read_calibration", "recognises", "tie_points"]
+__all__ = ["read", "read_calibration", "recognises", "tie_points"]
 
 Spreads: TypeAlias = "tuple[tuple[str, tuple[int, ...]], ...]"
 """Names of stated standard deviations and the axes that they are of."""
@@ -397,26 +397,6 @@ def _property(path: Path, sensor: Element, name: str) -> float | None:
     text = next((p.get("value") for p in sensor.iterfind("property") if p.get("name") == name), "0")
     value = number(path, f"sensor {name_of(sensor)}, {name}", text)
     return value if value > 0.0 else None
-
-
-def given_lenses(path: Path) -> dict[str, Lens]:
-    """Return the calibrations that were given, by the name of the sensor; none of other software.
-
-    The calibration of class ``initial`` counts if it has distortion. Without, it is the focal
-    length that the images' EXIF states, which says little.
-    """
-    if not documents.recognises(Source(path)):
-        return {}
-    found: dict[str, Lens] = {}
-    for sensor in documents.open_chunk(path).element.iterfind("sensors/sensor"):
-        label, kind = name_of(sensor), kind_of(sensor)
-        given = [one for one in sensor.findall("calibration") if one.get("class") == "initial"]
-        size = _resolution(path, label, given[-1]) if given else None
-        if size is not None and kind in PROJECTIONS:
-            lens = _lens_of_calibration(path, label, kind, given[-1], size)
-            if lens.radial or lens.tangential:
-                found[label] = checks.lens(path, label, lens)
-    return found
 
 
 def gnss_positions(
