@@ -475,20 +475,16 @@ def marks_of(control: GroundControl) -> tuple[TiePoints, FloatArray]:
 def true_start(
     xyz: FloatArray, water: WaterSurface | None, n: float, allowed: BoolArray | None = None
 ) -> FloatArray:
-    """Return apparent points with their depths times n, as start values of the true points."""
+    """Return apparent points with their depths times n, as start values of the true points.
+
+    That is where they are seen vertically; only those `allowed` may be under water.
+    """
+    true = xyz.copy()
     if water is None:
-        return xyz.copy()
+        return true
     level = surface_above(water, xyz).height_m
-    below = level > xyz[:, 2]
-    return deeper(xyz, level, below if allowed is None else below & allowed, n)
-
-
-def deeper(
-    apparent: FloatArray, level_m: FloatArray, wet: BoolArray, refractive_index: float
-) -> FloatArray:
-    """Return approximate true points: seen vertically, the depth grows by the index."""
-    true = apparent.copy()
-    true[wet, 2] = level_m[wet] - refractive_index * (level_m - apparent[:, 2])[wet]
+    wet = level > xyz[:, 2] if allowed is None else (level > xyz[:, 2]) & allowed
+    true[wet, 2] = level[wet] - n * (level - xyz[:, 2])[wet]
     return true
 
 

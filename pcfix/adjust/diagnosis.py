@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.adjust.block import deeper, plain_block, similarity_gradients, taken
+from pcfix.adjust.block import plain_block, similarity_gradients, taken, true_start
 from pcfix.errors import GeometryError
 from pcfix.model import (
     Cameras,
@@ -446,7 +446,7 @@ def _signs_of_ties(evidence: Evidence) -> tuple[list[Sign], FloatArray | None]:
     straight = intersect_fixed(block)
     above = surface_above(evidence.water, straight.xyz)
     wet = is_submerged(straight.xyz[:, 2], above)
-    begin = deeper(straight.xyz, above.height_m, wet, n)
+    begin = true_start(straight.xyz, evidence.water, n, wet)
     refracted = intersect_fixed(replace(block, xyz=begin, wet=wet, water=evidence.water))
     sign = tie_point_sign(straight, refracted, above.height_m - straight.xyz[:, 2])
     return [sign], straight.xyz[np.isfinite(straight.squares)]

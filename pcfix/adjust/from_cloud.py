@@ -37,10 +37,10 @@ from pcfix.adjust.block import (
     Progress,
     Unknowns,
     check_datum,
-    deeper,
     plain_block,
     some_cameras,
     ties_of_cloud,
+    true_start,
 )
 from pcfix.adjust.collinearity import SHARED
 from pcfix.adjust.normal import PLAIN, TESTED, linearised, point_steps, residuals
@@ -129,23 +129,23 @@ def adjust_cloud(
     check_datum(first, unknowns)
     has_gnss = bool((first.gnss_weights > 0.0).any())
     if (unknowns.free_network and not has_gnss) or unknowns.poses != "free":
-        raise GeometryError(
-            "adjust.cloud_needs_datum",
+        words = (
             "Without tie points the poses must be free, and need GNSS positions or control points."
-            " Give --gnss or --gcps, or a model with tie points.",
+            " Give --gnss or --gcps, or a model with tie points."
         )
+        raise GeometryError("adjust.cloud_needs_datum", words)
     if any(unknowns.water_sigma):
-        raise GeometryError(
-            "adjust.cloud_needs_water",
+        words = (
             "Level, tilt and refractive index can be free with measured tie points only. Give a"
-            " model with tie points, or fix the water.",
+            " model with tie points, or fix the water."
         )
+        raise GeometryError("adjust.cloud_needs_water", words)
     if first.conditions is not None:
-        raise GeometryError(
-            "adjust.cloud_has_conditions",
+        words = (
             "Points on the water or on a plane need measured tie points. Give a model with tie"
-            " points, or remove the roles waterline and on:NAME from --gcps.",
+            " points, or remove the roles waterline and on:NAME from --gcps."
         )
+        raise GeometryError("adjust.cloud_has_conditions", words)
     best = min(
         (_fitting(one, replace(unknowns, lens=lens_sets[0]), progress) for one in candidates),
         key=lambda trial: (trial.sigma_px, trial.misfit),
@@ -168,13 +168,8 @@ def adjust_cloud(
         known = precision_of(chosen.problem, chosen.found, max(sigma0, 1.0))
     except GeometryError as error:
         known = None
-        notes.append(
-            PcfixWarning(
-                "adjust.no_precision",
-                f"The precision of the poses is unknown, and SigmaZ will not include it: {error}",
-                reason=error.code,
-            )
-        )
+        words = f"The precision of the poses is unknown, and SigmaZ will not include it: {error}"
+        notes.append(PcfixWarning("adjust.no_precision", words, reason=error.code))
     found = adjusted_of(chosen.problem, chosen.found, known, notes, "cloud")
     return replace(found, sigma0=sigma0, redundancy=free)
 
@@ -349,11 +344,10 @@ def mended(
         raise _unsolved(f"only {len(row)} images have {LEAST_POINTS} points of the cloud")
     cameras = some_cameras(cameras, row)
     ties = ties_of_cloud(xyz, views_in_frame(xyz, cameras), cameras, least)
-    above = surface_above(water, ties.xyz)
-    wet = is_submerged(ties.xyz[:, 2], above)
+    wet = is_submerged(ties.xyz[:, 2], surface_above(water, ties.xyz))
     if not wet.any():
         raise _unsolved("no point under water lies in three images")
-    true = deeper(ties.xyz, above.height_m, wet, refractive_index)
+    true = true_start(ties.xyz, water, refractive_index, wet)
     block = replace(
         plain_block(cameras, replace(ties, xyz=true), water, refractive_index, wet),
         sigma_px=np.full(len(ties.image_xy), SIGMA_PX),

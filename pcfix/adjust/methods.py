@@ -109,13 +109,7 @@ def by_ties(
         outliers=rules.outliers,
         choose_lens=rules.lens_unknowns is None and material.calibrated is None,
     )  # fmt: skip
-    notes = [*left_out, *_check_dry(material.water, found), *found.notes]
-    if found.precision is not None:
-        notes += undetermined(found.precision, unknowns)
-        notes += correlated(found.precision)
-        wet = found.is_wet & np.isfinite(found.xyz).all(axis=1)
-        notes += shape_notes(found.precision, (found.xyz - found.origin)[wet, :2])
-    return replace(found, notes=[*notes, *datum_notes(found), *bed_notes(found)])
+    return _checked(material, found, left_out)
 
 
 def by_cloud(
@@ -156,7 +150,16 @@ def by_cloud(
     if rules.lens_unknowns is None and material.calibrated is None:
         sets = list(dict.fromkeys([("f",), ("f", "cx", "cy"), *sets]))
     found = adjust_cloud(candidates, unknowns_of(rules, sets[0]), sets, progress)
-    notes += [*_check_dry(material.water, found), *found.notes]
+    return _checked(material, found, notes)
+
+
+def _checked(material: Material, found: Adjusted, notes: list[PcfixWarning]) -> Adjusted:
+    """Return a result with all warnings, those on its input first."""
+    notes = [*notes, *_check_dry(material.water, found), *found.notes]
+    if found.precision is not None:
+        notes += [*undetermined(found.precision, found.unknowns), *correlated(found.precision)]
+        wet = found.is_wet & np.isfinite(found.xyz).all(axis=1)
+        notes += shape_notes(found.precision, (found.xyz - found.origin)[wet, :2])
     return replace(found, notes=[*notes, *datum_notes(found), *bed_notes(found)])
 
 

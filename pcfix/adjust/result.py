@@ -25,7 +25,7 @@ from pcfix.adjust.block import (
     usable_codes,
 )
 from pcfix.adjust.normal import residuals
-from pcfix.adjust.precision import Precision, correlated, undetermined
+from pcfix.adjust.precision import Precision
 from pcfix.adjust.problem import (
     Intersected,
     Problem,
@@ -252,8 +252,7 @@ def adjustment_dict(adjusted: Adjusted, before: Intersected | None = None) -> Pl
     a, block, u = adjusted, adjusted.block, adjusted.unknowns
     kept = len(block.cameras) if u.poses == "fixed" else 0
     known, lenses, notes = a.precision, block.cameras.lenses or (), [*a.notes]
-    if known is not None:
-        notes += [*known.notes, *undetermined(known, u), *correlated(known)]
+    notes += [] if known is None else known.notes
     found = {
         "source": a.source,
         "engine": "unaware" if a.source == "cloud" else "direct",

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pcfix.adjust.block import deeper
+from pcfix.adjust.block import true_start
 from pcfix.adjust.diagnosis import bed_sign, gnss_sign, tie_point_sign
 from pcfix.adjust.from_cloud import mended
 from pcfix.adjust.problem import intersect_fixed
@@ -19,7 +19,7 @@ def tie_sign(true, cameras, n=N):
     straight = intersect_fixed(true.block(cameras, None))
     depth = LEVEL_M - straight.xyz[:, 2]
     wet = depth > 0
-    begin = deeper(straight.xyz, np.full(len(depth), LEVEL_M), wet, n)
+    begin = true_start(straight.xyz, WATER, n, wet)
     block = replace(true.block(cameras, WATER, wet), xyz=begin, refractive_index=n)
     return tie_point_sign(straight, intersect_fixed(block), depth), straight.xyz
 
