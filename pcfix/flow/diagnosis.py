@@ -21,7 +21,7 @@ from pcfix.errors import InputError, PcfixError, PcfixWarning
 from pcfix.flow.inputs import Inputs, ties_of
 from pcfix.flow.next_steps import adjust_words
 from pcfix.io.gnss_positions import gnss_in_frame_of
-from pcfix.model import Cameras, TiePoints
+from pcfix.model import Cameras, GnssPositions, TiePoints
 from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
 
 if TYPE_CHECKING:
@@ -36,13 +36,15 @@ QUICK_BYTES = 25_000_000
 
 def diagnose(evidence: Evidence) -> Diagnosis:
     """Look for every sign that the evidence allows, with the GNSS positions of the cameras."""
-    if evidence.has_rays and evidence.cameras.gnss is not None:
-        try:
-            gnss = gnss_in_frame_of(evidence.cameras, evidence.name)[0]
-            evidence = replace(evidence, gnss=gnss)
-        except InputError:  # positions that cannot be compared say nothing
-            pass
-    return diagnosed(evidence)
+    return diagnosed(replace(evidence, gnss=_gnss_of(evidence.cameras, evidence.name)))
+
+
+def _gnss_of(cameras: Cameras, name: str) -> GnssPositions | None:
+    """Return the GNSS positions in the frame of the cameras; None if they cannot be compared."""
+    try:
+        return None if cameras.gnss is None else gnss_in_frame_of(cameras, name)[0]
+    except InputError:
+        return None
 
 
 class Poses(NamedTuple):
@@ -77,17 +79,14 @@ def diagnose_in_passing(plan: Plan, ties: TiePoints | None) -> Poses:
         return ADJUSTED
     path = None if isinstance(inputs.cameras, Cameras) else inputs.cameras
     found = [(one.straight, one.is_fused) for one in plan.verdicts if one.straight is not None]
-    n, why = plan.options.refractive_index, ""
+    n = plan.options.refractive_index
     evidence = Evidence(
         cameras, "cameras" if path is None else str(path), plan.found.surface, n, ties=ties,
         view=plan.view, in_passing=True,
         neighbours=neighbours_sign(*found[-1][0], is_fused=found[-1][1]) if found else None,
     )  # fmt: skip
     try:
-        if path is not None and _size_of(Path(path)) > QUICK_BYTES:
-            why = f"the file is larger than {QUICK_BYTES / 1e6:g} MB; use 'pcfix cameras'"
-        elif path is not None:
-            evidence = replace(evidence, ties=evidence.ties if evidence.has_rays else None)
+        is_large = path is not None and _size_of(Path(path)) > QUICK_BYTES
         diagnosis = diagnose(evidence)
     except (PcfixError, OSError) as error:  # this check stops no correction
         return Poses(None, f"not checked for absorbed refraction: {error}")
@@ -101,11 +100,13 @@ def diagnose_in_passing(plan: Plan, ties: TiePoints | None) -> Poses:
         did = "absorbed" if diagnosis.absorbed else "did not absorb"
         words = f"{did} the refraction, by {decided.name}{'; see the warning' * bool(sentence)}"
     else:
+        why = f"no tie points and no GNSS positions; {export_of(evidence.cameras)}"
         silent = [one.name for one in diagnosis.signs if one.name in ("tie points", "GNSS")]
-        if not why and silent:
+        if is_large:
+            why = f"the file is larger than {QUICK_BYTES / 1e6:g} MB; use 'pcfix cameras'"
+        elif silent:
             why = f"{' and '.join(silent)} of the file tell too little (see 'pcfix cameras')"
-        none = f"no tie points and no GNSS positions; {export_of(evidence.cameras)}"
-        words = f"not checked for absorbed refraction: {why or none}"
+        words = f"not checked for absorbed refraction: {why}"
     warning = None
     if sentence:
         values = {} if diagnosis.size is None else {"likely_error_m": diagnosis.size[0]}
@@ -133,14 +134,9 @@ def _size_of(path: Path) -> int:
 
 def has_datum(cameras: Cameras, name: str) -> bool:
     """Return whether the camera file has GNSS positions that are good enough as a datum."""
-    if cameras.gnss is None:
-        return False
-    try:
-        found = gnss_in_frame_of(cameras, name)[0]
-    except InputError:
-        return False
-    known = np.isfinite(found.xyz).all(axis=1)
-    if known.sum() < LEAST_POSITIONS:
+    found = _gnss_of(cameras, name)
+    known = np.zeros(0) if found is None else np.isfinite(found.xyz).all(axis=1)
+    if found is None or known.sum() < LEAST_POSITIONS:
         return False
     off = (cameras.centres - found.xyz)[known]
     spread = 1.4826 * np.median(np.abs(off - np.median(off, axis=0)))

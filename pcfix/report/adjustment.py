@@ -6,7 +6,6 @@ All words are made of the plain values of `adjustment_dict`, so that a resumed r
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -33,11 +32,6 @@ _WATER = {
     "shape_yy": ("shape y^2", "/m"), "distance": ("port distance", "m"),
     "centre_x": ("dome centre x", "m"), "centre_y": ("dome centre y", "m"),
     "centre_z": ("dome centre z", "m"),
-}  # fmt: skip
-_SIGMAS = {
-    "water level": "level_sigma_m", "water tilt": "tilt_sigma", "refractive index": "index_sigma",
-    "water shape": "shape_sigma", "distance of the port": "distance_sigma_m",
-    "centre of the dome": "centre_sigma_m",
 }  # fmt: skip
 _COUNTS = (
     ("images", "{images:,}, {poses_words}", "images"),
@@ -148,7 +142,6 @@ def adjustment_page(adjusted: Adjusted, before: Intersected | None = None) -> st
         layers=layers,
         pictures=pictures_of(d, adjusted, before),
         tables=_tables(d),
-        provenance=[_what_was_free(d)],
     )
     return render(report)
 
@@ -169,8 +162,9 @@ def adjustment_tables(d: Plain, page: str) -> list[Table]:
 
 def _poses_are(d: Plain) -> str:
     held = f", {d['images_fixed']:,} of them fixed" if d["images_fixed"] else ""
+    network = ", a free network" if d["unknowns"]["free_network"] else ""
     return {
-        "free": f"poses free{held}", "fixed": "poses fixed",
+        "free": f"poses free{held}{network}", "fixed": "poses fixed",
         "similarity": "shifted, turned and scaled together",
     }[d["poses_are"]]  # fmt: skip
 
@@ -373,17 +367,3 @@ def _residual_table(d: Plain) -> Table:
         if (r := d["residuals"][key])["points"]
     ]  # fmt: skip
     return Table("Residuals and precision on land and under water", header, rows)
-
-
-def _what_was_free(d: Plain) -> Table:
-    """Return what was free, and with which standard deviations."""
-    u = d["unknowns"]
-    datum = "free network" if u["free_network"] else "of GNSS, control points or fixed poses"
-    rows: list[list[Any]] = [
-        ["poses", _poses_are(d).removeprefix("poses ")], ["datum", datum],
-        ["lens", ", ".join(u["lens"]) or "fixed"],
-    ]  # fmt: skip
-    for name, key in _SIGMAS.items():
-        how = "free" if u[key] is None else f"free, standard deviation {u[key]:g}"
-        rows.append([name, "fixed" if u[key] == 0.0 else how])
-    return Table("What was free", ["unknown", ""], rows)
