@@ -82,7 +82,7 @@ LARGE_STEP_M = 1e4
 class Trial(NamedTuple):
     """One choice, and how GNSS and control points fit it."""
 
-    name: str
+    of: Candidate
     problem: Problem
     found: Solution
     sigma_px: float
@@ -151,10 +151,9 @@ def adjust_cloud(
         key=lambda trial: (trial.sigma_px, trial.misfit),
     )
     chosen = best
-    one = next(c for c in candidates if c.name == best.name)
     for names in lens_sets[1:]:
         try:
-            more = _trial(one, replace(unknowns, lens=names), best.sigma_px, progress)
+            more = _trial(best.of, replace(unknowns, lens=names), best.sigma_px, progress)
         except GeometryError:
             continue
         extra = len(names) - len(chosen.problem.unknowns.lens)
@@ -179,12 +178,12 @@ def _notes(chosen: Trial, lens_sets: list[tuple[str, ...]]) -> list[PcfixWarning
     count, free = int(chosen.problem.block.start[-1]), chosen.problem.unknowns.lens
     fixed = dict.fromkeys(name for names in lens_sets for name in names if name not in free)
     words = (
-        f"No tie points: {count:,} images of points of the cloud ({chosen.name}) were used with a"
-        f" standard deviation of {chosen.sigma_px:g} px. Lens parameters free:"
+        f"No tie points: {count:,} images of points of the cloud ({chosen.of.name}) were used with"
+        f" a standard deviation of {chosen.sigma_px:g} px. Lens parameters free:"
         f" {', '.join(free) or 'none'}"
         + (f" (undetermined and fixed: {', '.join(fixed)})." if fixed else ".")
     )
-    values = {"sigma_px": chosen.sigma_px, "images": chosen.name}
+    values = {"sigma_px": chosen.sigma_px, "images": chosen.of.name}
     notes = [PcfixWarning("adjust.by_cloud", words, free=list(free), fixed=list(fixed), **values)]
     if chosen.sigma_px >= POOR_PX:
         words = (
@@ -224,7 +223,7 @@ def _trial(one: Candidate, unknowns: Unknowns, sigma_px: float, progress: Progre
     surveyed = problem.given.surveyed_weight > 0.0
     count = int((block.gnss_weights > 0.0).sum()) + 2 * int(marks.sum()) + int(surveyed.sum())
     count -= 3 * int(surveyed.any(axis=1).sum())
-    return Trial(one.name, problem, found, sigma_px, found.cost + in_images, count)
+    return Trial(one, problem, found, sigma_px, found.cost + in_images, count)
 
 
 # The equations

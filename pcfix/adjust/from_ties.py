@@ -27,7 +27,6 @@ from pcfix.adjust.block import (
     Robust,
     Unknowns,
     check_datum,
-    effect_at_corner,
     usable_codes,
 )
 from pcfix.adjust.normal import residuals
@@ -257,13 +256,9 @@ def weak_lens_parameters(problem: Problem, found: Solution, precision: Precision
 
     None are returned if all of them moved further together than chance allows.
     """
-    lenses = problem.block.cameras.lenses or ()
-    names, effects = [], []
-    for images, codes in zip(problem.groups, problem.codes, strict=True):
-        names += [NAMES[code] for code in codes]
-        effects += [effect_at_corner(lenses[images[0]], code) for code in codes]
+    names = [NAMES[code] for code in problem.given.code.tolist()]
     sigma = np.array([row.sigma for row in precision.shared[: len(names)]])
-    by_px = zip(names, sigma * effects, strict=True)
+    by_px = zip(names, sigma * problem.lens_effects, strict=True)
     weak = list(dict.fromkeys(name for name, by in by_px if name != "f" and by > WEAK_PX))
     rows = np.flatnonzero(np.isin(names, weak))
     went = found.shared[rows] / sigma[rows]
@@ -313,9 +308,8 @@ def _candidates(
 
     None if there are none, or the equations are singular.
     """
-    lenses = problem.block.cameras.lenses or ()
     names = problem.unknowns.lens
-    if any(lens.projection != "perspective" for lens in lenses):
+    if any(lens.projection != "perspective" for lens in problem.block.cameras.lenses or ()):
         return None  # other projections have terms of their own with the same effect
     more = tuple(name for name in TRIED if name not in names)
     wide, start = prepare(problem.block, replace(problem.unknowns, lens=names + more))
@@ -335,12 +329,8 @@ def _candidates(
     if not isinstance(matrix, np.ndarray):
         border, own = border.toarray(), own.toarray()
     taken = solve_for(np.column_stack([border, reduced.right[~mine]]))
-    effect = np.concatenate([
-        [effect_at_corner(lenses[images[0]], code) for code in codes]
-        for images, codes in zip(wide.groups, wide.codes, strict=True)
-    ])  # fmt: skip
     rows = np.flatnonzero(is_tried)
     return (
-        given.code[rows], effect[rows], own - border.T @ taken[:, :-1],
+        given.code[rows], wide.lens_effects[rows], own - border.T @ taken[:, :-1],
         reduced.right[mine] - border.T @ taken[:, -1],
     )  # fmt: skip

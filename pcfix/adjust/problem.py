@@ -23,6 +23,7 @@ from pcfix.adjust.block import (
     Block,
     LogRow,
     Unknowns,
+    effect_at_corner,
     inverse_variances,
     sensor_groups,
     similarity_gradients,
@@ -82,6 +83,15 @@ class Problem:
     def of_ties(self) -> BoolArray:
         """Observations of tie points, shape (o,)."""
         return np.asarray(self.block.owner < self.block.tie_points)
+
+    @property
+    def lens_effects(self) -> FloatArray:
+        """Image movement at the corner of the frame per unit of each lens unknown."""
+        lenses = self.block.cameras.lenses or ()
+        pairs = zip(self.groups, self.codes, strict=True)
+        return np.array([
+            effect_at_corner(lenses[images[0]], code) for images, codes in pairs for code in codes
+        ])  # fmt: skip
 
     def weighted(self, weight: FloatArray) -> Problem:
         """Return the problem with other weights of its observations."""

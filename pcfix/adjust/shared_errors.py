@@ -25,7 +25,7 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.special import fdtri
 
-from pcfix.adjust.block import CX, CY, FOCAL, effect_at_corner
+from pcfix.adjust.block import CX, CY, FOCAL
 from pcfix.adjust.normal import UNDAMPED, residuals, sparse_matrix, sparse_rows_of
 from pcfix.adjust.precision import Precision
 from pcfix.adjust.problem import Problem, Solution, water_of
@@ -120,14 +120,9 @@ def common_errors(problem: Problem, formal: Precision) -> FloatArray:
     """Return factors of the standard errors for an error that all images share, (6 + g,)."""
     factor = np.ones(6 + len(formal.shared))
     noise_px = formal.sigma0 / float(np.median(problem.given.weight[problem.used]))
-    at = 6
-    for rows, codes in zip(problem.groups, problem.codes, strict=True):
-        lens = (problem.block.cameras.lenses or ())[rows[0]]
-        for code in codes:
-            if code in (FOCAL, CX, CY):
-                common = COMMON_SHARE * noise_px / effect_at_corner(lens, code)
-                factor[at] = np.hypot(1.0, common / formal.shared[at - 6].sigma)
-            at += 1
+    rows = np.flatnonzero(np.isin(problem.given.code, (FOCAL, CX, CY)))
+    sigma = np.array([formal.shared[i].sigma for i in rows])
+    factor[6 + rows] = np.hypot(1.0, COMMON_SHARE * noise_px / problem.lens_effects[rows] / sigma)
     return factor
 
 

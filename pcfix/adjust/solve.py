@@ -38,7 +38,7 @@ from pcfix.adjust.problem import Problem, Solution, cost_at, counts_of, priors_a
 from pcfix.errors import GeometryError
 from pcfix.lens.imaging import lens_table
 from pcfix.model import FloatArray, IntArray
-from pcfix.port.shapes import DomePort, FlatPort, Port
+from pcfix.port.shapes import DomePort, FlatPort
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
@@ -147,7 +147,13 @@ def moved_by(
         rotations = rotations @ turn.T
     water, free = state.water.copy(), given.column >= 0
     water[free] += shared[given.column[free]]
-    if not 1.0 <= water[INDEX] < 3.0 or not _is_port(problem.block.port, water[PORT:PLANES]):
+    is_port = True
+    match problem.block.port:
+        case FlatPort():
+            is_port = bool(water[PORT] >= 0.0)
+        case DomePort(radius_m=radius):
+            is_port = bool(np.linalg.norm(water[PORT + 1 : PLANES]) < radius)
+    if not 1.0 <= water[INDEX] < 3.0 or not is_port:
         return None
     lenses, table = list(now.lenses), state.lenses
     if given.first_lens[-1]:
@@ -170,16 +176,6 @@ def moved_by(
         lenses=tuple(lenses),
         shared=now.shared + shared,
     )  # fmt: skip
-
-
-def _is_port(port: Port | None, numbers: FloatArray) -> bool:
-    """Return whether a port may have this distance, or this centre."""
-    match port:
-        case FlatPort():
-            return bool(numbers[0] >= 0.0)
-        case DomePort():
-            return bool(np.linalg.norm(numbers[1:]) < port.radius_m)
-    return True
 
 
 # The reduced equations
