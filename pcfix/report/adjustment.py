@@ -107,15 +107,9 @@ def adjustment_text(adjusted: Adjusted, before: Intersected | None = None) -> st
     `before` is of `before_of`, for the residuals before.
     """
     d = adjustment_dict(adjusted, before)
+    surveyed = _survey_table(d)
     lines = [f"{label:<14} {words}" for label, words in _facts(d)] + _residual_table(d).lines()
-    for role in ("control", "check"):
-        points = (d[role] or {"points": []})["points"]
-        for row in points[:MOST_LISTED]:
-            off = listed([row[key] for key in ("dx_m", "dy_m", "dz_m")], 3, "+")
-            pixels = f"{fixed(row['rms_px'], 2)} {d['image_unit']}"
-            lines.append(f"  {row['name']:<12} {off} m, {pixels}, {row['images']} images")
-        more = len(points) - MOST_LISTED
-        lines += [f"  and {more} more"] if more > 0 else []
+    lines += surveyed.lines()[: 1 + MOST_LISTED] if surveyed.rows else []
     return "\n".join([*lines, *(f"Note: {note}" for note in all_notes(d))])
 
 
@@ -317,7 +311,7 @@ def _means(a: Adjusted, values: FloatArray) -> Maps:
 def _tables(d: Plain) -> list[Table]:
     """Return the tables that have rows, residuals first."""
     unit, p = d["image_unit"], d["precision"]
-    tables = [_residual_table(d)]
+    tables = [_residual_table(d), _survey_table(d)]
     shared = [] if p is None else [row["name"].replace("_", " ") for row in p["shared"]]
     if len(shared) > 1:
         rows = [
@@ -325,18 +319,6 @@ def _tables(d: Plain) -> list[Table]:
             for name, row in zip(shared, p["correlation"], strict=True)
         ]
         tables.append(Table("Correlations of the shared unknowns", ["", *shared], rows))
-
-    rows = []
-    for role in ("control", "check"):
-        one = d[role] or {"points": []}
-        for row in one["points"]:
-            off = [fixed(row[key], 3, "+") for key in ("dx_m", "dy_m", "dz_m")]
-            rows.append([row["name"], role, *off, fixed(row["rms_px"], 2), str(row["images"])])
-        if one["points"]:
-            off = [fixed(value, 3) for value in one["rms_m"]]
-            rows.append([f"RMS, {role}", role, *off, fixed(one["rms_px"], 2), ""])
-    header = ["", "role", "dX (m)", "dY (m)", "dZ (m)", f"RMS ({unit})", "images"]
-    tables.append(Table("Control and check points, adjusted minus surveyed", header, rows))
 
     rows = [
         [
@@ -347,6 +329,20 @@ def _tables(d: Plain) -> list[Table]:
     ]  # fmt: skip
     header = ["round", "steps", "observations", "cost", f"RMS ({unit})"]
     return [table for table in [*tables, Table("Rounds", header, rows)] if table.rows]
+
+
+def _survey_table(d: Plain) -> Table:
+    """Return surveyed points, adjusted minus surveyed."""
+    header = ["surveyed points", "role", "dX (m)", "dY (m)", "dZ (m)", f"RMS ({d['image_unit']})"]
+    rows = [
+        [
+            row["name"], role, *(fixed(row[key], 3, "+") for key in ("dx_m", "dy_m", "dz_m")),
+            fixed(row["rms_px"], 2), str(row["images"]),
+        ]
+        for role in ("control", "check")
+        for row in (d[role] or {"points": []})["points"]
+    ]  # fmt: skip
+    return Table("Control and check points", [*header, "images"], rows)
 
 
 def _residual_table(d: Plain) -> Table:

@@ -134,10 +134,11 @@ def test_text(adjusted):
         "RMS 0.036, 0.020, 0.067 m, largest 0.105 m (b.jpg)",
         # RMS of (0.03, 0.05) in height: sqrt(0.0017) = 0.0412
         "RMS 0.010, 0.020, 0.041 m, 0.61 px",
-        "C1           -0.040, +0.000, +0.060 m, 0.80 px, 3 images",
         "Note: Something <decided>",
     ):
         assert words in text, text
+    (surveyed,) = (line.split() for line in text.splitlines() if line.startswith("  C1 "))
+    assert surveyed == ["C1", "check", "-0.040", "+0.000", "+0.060", "0.80", "3"]
     assert "nan" not in text.lower() and "none" not in text.lower()
 
 
