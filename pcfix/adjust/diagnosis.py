@@ -71,9 +71,11 @@ MOST_STATED_M = 0.5
 """A larger standard deviation of the GNSS is a default of the software, as Metashape's 10 m."""
 
 TIE_POINTS, LEAST_TIE_VIEWS = 3000, 3
-CLOUD_POINTS, POINTS_PER_IMAGE, REFERENCE_POINTS = 1500, 10, 20_000
+CLOUD_POINTS, POINTS_PER_IMAGE, SAMPLE_POINTS = 1500, 10, 50_000
 LEAST_COORDINATES = 24
 """Of GNSS positions."""
+NEAREST = 3
+"""Points of a reference that give its height at a point of the cloud."""
 MOST_IMAGES, QUICK_IMAGES = 600, 200
 """For which the pattern of absorbed refraction is computed, and when it must be quick; the cost
 grows with their cube, and is a second for the latter."""
@@ -370,7 +372,7 @@ class Evidence:
     ties: TiePoints | None = None
     view: Any = None  # a `pcfix.flow.surfaces.CloudView`, for heights and in place of tie points
     control: GroundControl | None = None
-    reference: Any = None  # a survey of land and bed, with `xyz`
+    reference: Any = None  # a survey of land and bed, with `xyz` and `sparse`
     gnss: GnssPositions | None = None  # in the frame of the cameras, NaN if unknown
     neighbours: Sign | None = None  # of `neighbours_sign`
     in_passing: bool = False  # whether it must be quick
@@ -462,11 +464,15 @@ def _mended(evidence: Evidence, apparent: FloatArray | None) -> Mended:
 
     wanted = max(CLOUD_POINTS, POINTS_PER_IMAGE * count)
     if apparent is None:
-        every = max(1, evidence.view.points // wanted)
-        parts = [seen.xyz[::every] for seen in evidence.view.chunks()]
-        apparent = np.vstack([np.zeros((0, 3)), *parts])
+        apparent = _sample_of(evidence.view, wanted)
     some = apparent[:: max(1, len(apparent) // wanted)]
     return mended(some, evidence.cameras, evidence.water, evidence.refractive_index)
+
+
+def _sample_of(view: Any, wanted: int) -> FloatArray:
+    """Return about so many points of a cloud, evenly spread over it, shape (m, 3)."""
+    every = max(1, view.points // wanted)
+    return np.vstack([np.zeros((0, 3)), *(seen.xyz[::every] for seen in view.chunks())])
 
 
 def _signs_of_surveys(evidence: Evidence) -> list[Sign]:
@@ -479,8 +485,11 @@ def _signs_of_surveys(evidence: Evidence) -> list[Sign]:
         higher = _cloud_heights(view, dry, gsd) - dry[:, 2]
         signs.append(land_sign(higher, gsd, "the control points"))
     surveyed = np.zeros((0, 3)) if evidence.reference is None else evidence.reference.xyz
-    surveyed = surveyed[:: max(1, len(surveyed) // REFERENCE_POINTS)]
-    cloud_z = _cloud_heights(view, surveyed, gsd)
+    if evidence.reference is None or evidence.reference.sparse:
+        cloud_z = _cloud_heights(view, surveyed, gsd)
+    else:
+        cloud, surveyed = _at_points_of_cloud(view, surveyed)
+        cloud_z = cloud[:, 2]
     level = surface_above(evidence.water, surveyed).height_m
     land, bed = surveyed[:, 2] > level + LAND_M, surveyed[:, 2] < level
     if land.any():
@@ -499,3 +508,19 @@ def _cloud_heights(view: Any, xyz: FloatArray, gsd_m: float) -> FloatArray:
         return np.zeros(0)
     near = [seen.xyz[is_near(xy, seen.xyz, radius)] for seen in view.chunks()]
     return heights_from_cloud(xy, np.vstack([np.zeros((0, 3)), *near]), radius)
+
+
+def _at_points_of_cloud(view: Any, reference: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return points of a cloud, and the reference at their places."""
+    from scipy.spatial import cKDTree
+
+    cloud = _sample_of(view, SAMPLE_POINTS)
+    if len(reference) < NEAREST or not len(cloud):
+        return cloud[:0], reference[:0]
+    size = np.ptp(reference[:, :2], axis=0)
+    spacing = float(np.sqrt(max(size.prod(), 1e-9) / len(reference)))
+    found = cKDTree(reference[:, :2]).query(cloud[:, :2], k=NEAREST)
+    distance, row = np.asarray(found[0]), np.asarray(found[1])
+    near = distance[:, -1] < 3.0 * spacing
+    z = reference[row[near], 2].mean(axis=1)
+    return cloud[near], np.column_stack([cloud[near, :2], z])
