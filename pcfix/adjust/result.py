@@ -39,7 +39,7 @@ from pcfix.adjust.problem import (
     water_of,
 )
 from pcfix.adjust.solve import solve
-from pcfix.errors import PcfixWarning
+from pcfix.errors import PcfixWarning, plain
 from pcfix.model import BoolArray, Cameras, FloatArray, WaterPlane, WaterSurface
 from pcfix.port.shapes import Port, spec_of
 from pcfix.sums import nice_step
@@ -296,18 +296,7 @@ def adjustment_dict(adjusted: Adjusted, before: Intersected | None = None) -> Pl
         ],
         "notes": [one.as_dict() for one in {str(one): one for one in notes}.values()],
     }
-    return dict(_plain(found))
-
-
-def _plain(value: Any) -> Any:
-    """Return a value as JSON can hold it: arrays as lists, None for numbers that are not finite."""
-    if isinstance(value, dict):
-        return {name: _plain(one) for name, one in value.items()}
-    if isinstance(value, np.ndarray | np.generic):
-        value = value.tolist()
-    if isinstance(value, list | tuple):
-        return [_plain(one) for one in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+    return dict(plain(found))
 
 
 def mean(values: FloatArray) -> FloatArray:
