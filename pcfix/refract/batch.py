@@ -47,7 +47,6 @@ class Learned(NamedTuple):
     occluder: Occluder | None = None  # the surface of the cloud
     matcher: Matcher | None = None  # which images were matched with each other
     bed: Bed | None = None  # the bed that agrees with most fused points
-    dense: bool | None = None  # whether the cells of the cloud have enough points for polynomials
     model_uncertainty: ModelUncertainty | None = None
     land: Survey | None = None  # for land transferred to adjusted cameras, if it differs
     poses: PoseErrors | None = None  # errors of Z from the adjusted poses

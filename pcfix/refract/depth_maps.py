@@ -42,7 +42,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.kernels import Span, device, in_tiles, kernel
-from pcfix.lens.algebra import Vector, beyond, dot, minus, normal_of, plus, row_of, scaled, unit
+from pcfix.lens.algebra import Vector, beyond, cross, dot, minus, row_of, scaled
 from pcfix.lens.frames import holds
 from pcfix.model import FloatArray, IntArray
 from pcfix.refract.batch import (
@@ -51,52 +51,29 @@ from pcfix.refract.batch import (
     ONE_CAMERA,
     Batch,
     Chosen,
+    Images,
     Intersection,
+    images_of,
     normal_above,
     to_adjusted,
     to_original,
 )
-from pcfix.refract.map_table import (
-    CUBIC,
-    LAYER,
-    LEAST_POINTS,
-    SHALLOWEST_M,
-    USUAL,
-    Block,
-    Table,
-    block_of,
-    has_terms,
-    layers_of,
-    meet,
-    no_table,
-    read_table,
-    reads,
-    table_of,
-    water_at,
-)
 from pcfix.refract.matcher import MATCHED, WIDTH_M, Matcher
-from pcfix.refract.rays import direction, light_path, refracted
-from pcfix.refract.tiling import are_same, cells_of, counts_of
+from pcfix.refract.rays import light_near, refracted
+from pcfix.refract.tiling import are_same, cells_of
 
 MAX_LOOKS = 5
 CLOSE_M = 0.002
 """Step of the bed below which the rest is linear."""
 
-NEAR_PX = 2.0
-"""The same with polynomials, which have the change of the depths, in ground pixels."""
-
 LIKELY, LEAST_DEPTH_M = 1.1, 0.005
 """Likely height of the bed, in terms of (n - 1) times the depth; the least depth."""
-
-RISE, STEEP = 0.1, 0.3
-"""Relative height of the second look; the largest relative change of a depth on the way there
-beyond the usual one. A larger change comes from other images."""
 
 LEAST_CHANGE, MOST_CHANGE = 0.35, 1.5
 """Range of the change of the apparent depth with that of the bed along a ray."""
 
-NOTHING = 20.0
-"""exp(-NOTHING) is neglected."""
+NOTHING = 14.0
+"""exp(-NOTHING), a millionth, is neglected."""
 
 AVERAGED_WITHIN = 0.012
 """Depths of neighbouring maps that differ by less, relative, are averaged before the fusion."""
@@ -106,10 +83,18 @@ COLUMNS = 7
 """Columns that the kernels write: the shift, and these."""
 
 DEPTH, BY_HEIGHT, _X, _Y, _X_BY_HEIGHT, _Y_BY_HEIGHT = range(6)
-"""Columns of `Room.looks`: the depth of a bed in a map beyond P, by the distance of P from the
+"""Rows of `Room.looks`: the depth of a bed in a map beyond P, by the distance of P from the
 camera, and its change with the height of the bed (1/m); the place on the bed, and its change."""
 
 ABSENT = -1
+
+
+class Block(NamedTuple):
+    """All points and cameras, the images of the original model, and the matcher, for kernels."""
+
+    points: Chosen
+    images: Images
+    matcher: Matcher
 
 
 class Sight(NamedTuple):
@@ -124,14 +109,10 @@ class Sight(NamedTuple):
 class Room(NamedTuple):
     """Temporary arrays for one point and the k images."""
 
-    t: FloatArray  # (k,), of `Lines`
-    slope: FloatArray
     weight: FloatArray  # (k,), of each map, with what is averaged into it
-    again: FloatArray  # (k,), whether a map is looked at twice
-    looks: FloatArray  # (k, 6), of `_look`
+    looks: FloatArray  # (6, k), of `_look`
     partners: FloatArray  # (partners, 3), of `_compare`
     pairs: FloatArray  # (pairs of partners, 2), of `best_pairs`
-    powers: FloatArray  # of the polynomials of a cell
 
 
 @device
@@ -158,60 +139,20 @@ class Lines(NamedTuple):
 
 @device
 def look(
-    maps: IntArray, weight: FloatArray, bed: float, sight: Sight, block: Block, table: Table,
-    room: Room,
-) -> None:  # fmt: skip
+    maps: IntArray, weight: FloatArray, bed: float, sight: Sight, block: Block, room: Room
+) -> None:
     """Compute the depths of a bed in the maps of those images that have a weight; see `_look`."""
     for q in range(maps.size):
         if weight[q] > 0.0:
-            _look(room.looks[q], maps[q], bed, sight, block, table, room)
+            _look(room.looks[:, q], maps[q], bed, sight, block, room)
 
 
 @device
-def find_lines(
-    lines: Lines, maps: IntArray, sight: Sight, block: Block, table: Table, room: Room
-) -> None:
-    """Fill in the lines of the depth maps of some images.
-
-    The slope of a line comes from a second bed, or from the middle of a cell with polynomials.
-    """
-    again, rise = room.again[: maps.size], min(RISE * lines.bed, -LEAST_DEPTH_M)
-    for q in range(maps.size):
-        fitted = has_terms(table, maps[q])
-        again[q] = 0.0 if fitted and block.images.same else 1.0
-    look(maps, again, lines.bed + rise, sight, block, table, room)
-    for q in range(maps.size):
-        lines.slope[q] = room.looks[q, DEPTH]
+def lines_at(bed: float, maps: IntArray, sight: Sight, block: Block, room: Room) -> Lines:
+    """Return the lines of the depth maps of some images about a bed."""
     room.weight[: maps.size] = 1.0
-    look(maps, room.weight, lines.bed, sight, block, table, room)
-    for q in range(maps.size):
-        usual, lines.t[q] = room.looks[q, BY_HEIGHT], room.looks[q, DEPTH]
-        if again[q] > 0.0:
-            steep = (lines.slope[q] - lines.t[q]) / (rise * usual)
-            # beyond that range other images agree best at the second bed
-            steep = steep if abs(steep - 1.0) < STEEP else 1.0
-            room.looks[q, BY_HEIGHT] *= steep
-        lines.slope[q] = room.looks[q, BY_HEIGHT]
-
-
-@device
-def set_steep(table: Table, layer: int, block: Block, room: Room) -> None:
-    """Set how the depths in the maps of a cell change with the bed, from a point in its middle."""
-    if not block.images.same:  # the middle has no place in the original model
-        return
-    (x, y), (_, b, c) = (table.middle[0], table.middle[1]), block.water
-    normal, depth = normal_of(b, c), SHALLOWEST_M * LAYER ** (layer - 0.5)
-    now = x, y, water_at(block, x, y) - depth
-    sight, out = Sight(now, now, normal[2] * depth, normal), room.looks[0]
-    bed = likely_bed(sight, block)
-    rise = min(RISE * bed, -LEAST_DEPTH_M)
-    for image in range(table.place.size):
-        if has_terms(table, image):
-            _look(out, image, bed + rise, sight, block, table, room)
-            further = out[DEPTH]
-            _look(out, image, bed, sight, block, table, room)
-            steep = (further - out[DEPTH]) / (rise * out[BY_HEIGHT])
-            table.steep[image] = steep if abs(steep - 1.0) < STEEP else 1.0
+    look(maps, room.weight, bed, sight, block, room)
+    return Lines(bed, room.looks[DEPTH, : maps.size], room.looks[BY_HEIGHT, : maps.size])
 
 
 @device
@@ -238,33 +179,30 @@ def balance(t: FloatArray, slope: FloatArray, weight: FloatArray) -> float:
 @device
 def settle_bed(
     row: FloatArray, maps: IntArray, weight: FloatArray, depths: Lines, sight: Sight,
-    block: Block, table: Table, room: Room,
+    block: Block, room: Room,
 ) -> None:  # fmt: skip
     """Find the height of the bed at which the fused depths give the apparent point; write the row.
 
     Starts from the lines that were computed last and repeats until the steps are small.
     """
     row[OUTCOME] = NO_CAMERA if maps.size == 0 else ONE_CAMERA
-    bed, looks, near = depths.bed, room.looks[: maps.size], CLOSE_M
+    bed, looks = depths.bed, room.looks
     step = balance(depths.t, depths.slope, weight)
-    if table.place.size and maps.size and block.images.same:
-        c = maps[0]
-        near = max(near, NEAR_PX * _length(sight, block, c) / block.matcher.focal_px[c])
     for _ in range(MAX_LOOKS):
         # no image with a weight sees the bed
         if not np.isfinite(step):
             return
-        if abs(step) <= near:
+        if abs(step) <= CLOSE_M:
             break
         bed += step
-        look(maps, weight, bed, sight, block, table, room)
-        step = balance(looks[:, DEPTH], looks[:, BY_HEIGHT], weight)
+        look(maps, weight, bed, sight, block, room)
+        step = balance(depths.t, depths.slope, weight)
     # the true point is the weighted mean of the Q_i, moved by the rest of the step
     total, x, y, squares, count = 0.0, 0.0, 0.0, 0.0, 0.0
     for q in range(maps.size):
-        if weight[q] > 0.0 and looks[q, BY_HEIGHT] == looks[q, BY_HEIGHT]:
-            w, px = weight[q], looks[q, _X] + step * looks[q, _X_BY_HEIGHT]
-            py = looks[q, _Y] + step * looks[q, _Y_BY_HEIGHT]
+        if weight[q] > 0.0 and looks[BY_HEIGHT, q] == looks[BY_HEIGHT, q]:
+            w, px = weight[q], looks[_X, q] + step * looks[_X_BY_HEIGHT, q]
+            py = looks[_Y, q] + step * looks[_Y_BY_HEIGHT, q]
             total, x, y = total + w, x + w * px, y + w * py
             squares, count = squares + w * (px * px + py * py), count + 1.0
     if not (np.isfinite(step) and np.isfinite(squares)):
@@ -275,9 +213,7 @@ def settle_bed(
 
 
 @device(forceinline=True)
-def _look(
-    out: FloatArray, c: int, bed: float, sight: Sight, block: Block, table: Table, room: Room
-) -> None:
+def _look(out: FloatArray, c: int, bed: float, sight: Sight, block: Block, room: Room) -> None:
     """Compute the depth of a bed, at a height relative to the apparent point P, in one depth map.
 
     Its change with the height is approximate. NaN where no partner of image c sees the bed there.
@@ -286,7 +222,7 @@ def _look(
     a, e, above = _ray(c, sight, block)
     # H and L^2; f leads to the piercing point, as in `rays`
     across, length2 = dot(normal, e), dot(e, e)
-    per_across, length = 1.0 / across, np.sqrt(length2)
+    per_across = 1.0 / across
     f, bend = (above * per_across, 1.0 / n) if above > 0.0 else (0.0, 1.0)
     d = refracted(e, length2, normal, across, bend)
     a, down = beyond(a, f, e), 1.0 / d[2]
@@ -294,28 +230,17 @@ def _look(
     q = a[0] + s * d[0], a[1] + s * d[1], bed
     out[_X], out[_Y] = q[0], q[1]
     out[_X_BY_HEIGHT], out[_Y_BY_HEIGHT] = d[0] * down, d[1] * down
-    depth, under, count = dot(normal, minus(a, q)), f * length, -1
-    away, per_depth, length = length, length * per_across, _length(sight, block, c)
-    # from the polynomials, or exactly where these do not reach
-    if has_terms(table, c):
-        usual = away - under + USUAL * depth * per_depth - length
-        count = read_table(room.partners, room.powers, table, c, plus(sight.now, q), usual, block)
-    if count < 0:
-        count = _compare(room.partners, c, q, length, sight, block)
+    up = original_up(sight, block, c)
+    length = np.sqrt(dot(up, up))
+    count = _compare(room.partners, c, q, length, sight, block)
     t = best_pairs(room.partners[:count], room.pairs, block.matcher.tolerance_px2)
     out[DEPTH] = t / length
     # the change of the depth with the bed is nearly that of the whole water column
-    change = (t + under) / depth if depth > LEAST_DEPTH_M else per_depth / n
+    away, depth = np.sqrt(length2), dot(normal, minus(a, q))
+    per_depth = away * per_across
+    change = (t + f * away) / depth if depth > LEAST_DEPTH_M else per_depth / n
     change = min(max(change, LEAST_CHANGE * per_depth), MOST_CHANGE * per_depth)
-    steep = table.steep[c] if table.place.size else 1.0
-    out[BY_HEIGHT] = -steep * change / length if t == t else np.nan
-
-
-@device(forceinline=True)
-def _length(sight: Sight, block: Block, c: int) -> float:
-    """Return the distance of the point from the projection centre in the original model, metres."""
-    up = original_up(sight, block, c)
-    return np.sqrt(dot(up, up))
+    out[BY_HEIGHT] = -change / length if t == t else np.nan
 
 
 @device(forceinline=True)
@@ -353,14 +278,20 @@ def _compare(
             break
         up = minus(row_of(points.centres, j), sight.now)
         above = sight.above + sight.normal[2] * points.offset[j]
-        path = light_path(q, up, sight.normal, above, points.n)
-        a = to_original(block.images, j, direction(path, sight.normal))
-        if not (path[0] == path[0] and holds(matcher.inner, j, scaled(-1.0, a))):
+        k, _, _, _, s = light_near(q, up, sight.normal, above, points.n)
+        w = to_original(block.images, j, minus(scaled(k, s), sight.normal))
+        sees = dot(sight.normal, up) > above and holds(matcher.inner, j, scaled(-1.0, w))
+        if not sees:
             continue
-        base = minus(original, original_up(sight, block, j))
-        # where the ray of j, as the original model has it, is nearest to that of c
-        away, residual, partners[count, 2] = meet(u, unit(a), base, matcher.focal_px[j])
-        partners[count, 0], partners[count, 1] = away - length, residual * residual
+        # where the ray w of j is nearest to u; it has any length
+        base, across = minus(original, original_up(sight, block, j)), cross(u, w)
+        sine2, along, w2 = dot(across, across), dot(u, w), dot(w, w)
+        away = (dot(base, w) * along - dot(base, u) * w2) / sine2
+        # pixels per metre at that place, by the length of w, as the image of j sees it
+        scale = matcher.focal_px[j] / (dot(base, w) + away * along)
+        off = scale * dot(base, across)
+        partners[count, 0], partners[count, 1] = away - length, off * off * w2 / sine2
+        partners[count, 2] = scale * scale * sine2
         count += 1
     return count
 
@@ -444,13 +375,14 @@ def likely_beds(batch: Batch) -> FloatArray:
 def _in_cells(
     batch: Batch, listed: bool, given: FloatArray, result: FloatArray, likely: FloatArray
 ) -> None:
-    layer, dense = layers_of(batch), batch.survey.learned.dense
-    order, first = cells_of(batch, layer)
-    # which cells have polynomials is one decision for the whole cloud
-    least = LEAST_POINTS if dense is None else 1 if dense else len(batch) + 1
+    matcher = batch.survey.learned.matcher
+    if matcher is None:
+        raise ValueError("a model of the matcher is needed")
+    images = images_of(batch.original_model, batch.survey.cameras)
+    order, first = cells_of(batch)
     in_tiles(
-        _invert_cells, len(first) - 1, (order, first, layer), block_of(batch), least, listed,
-        given, result, likely, points=len(batch),
+        _invert_cells, len(first) - 1, (order, first), Block(batch.chosen(), images, matcher),
+        listed, given, result, likely, points=len(batch),
     )  # fmt: skip
 
 
@@ -493,56 +425,44 @@ def _place(members: IntArray, q: int, others: IntArray, place: IntArray) -> None
 
 @kernel(allocates=True)
 def _invert_cells(
-    span: Span, cells: tuple[IntArray, IntArray, IntArray], block: Block, least: int, listed: bool,
-    given: FloatArray, result: FloatArray, likely: FloatArray,
+    span: Span, cells: tuple[IntArray, IntArray], block: Block, listed: bool, given: FloatArray,
+    result: FloatArray, likely: FloatArray,
 ) -> None:  # fmt: skip
-    """Invert the fusion of the points of each cell or, where `likely` has rows, fill these in.
+    """Invert the fusion of the points of some cells or, where `likely` has rows, fill these in.
 
     With lists `given` are the weights of their entries, if there are any; without, the heights of
     the bed of the surroundings.
     """
-    points, (order, first, layer), matcher = block.points, cells, block.matcher
-    k, none = len(points.centres), no_table()
+    (order, first), matcher, k = cells, block.matcher, len(block.points.centres)
     room = Room(
-        np.empty(k), np.empty(k), np.empty(k), np.empty(k), np.empty((k, 6)),
-        np.empty((MATCHED, 3)), np.empty((MATCHED * MATCHED, 2)), np.empty(CUBIC),
-    )  # fmt: skip
+        np.empty(k), np.empty((6, k)), np.empty((MATCHED, 3)), np.empty((MATCHED * MATCHED, 2))
+    )
     groups = Groups(
         np.full((k, matcher.averaged.shape[1] + 1), ABSENT),
         np.full((k, matcher.fused.shape[1] + 1), ABSENT),
         np.full(k, ABSENT), np.empty(k, np.int64), np.empty(k), np.empty(k), np.empty(k),
         np.empty(k), np.empty(k), np.empty(k),
     )  # fmt: skip
-    for cell in range(*span):
-        rows = order[first[cell] : first[cell + 1]]
-        fitted = none
-        if rows.size >= least and reads(block, rows[0]):
-            seeing = counts_of(rows, points) > 0
-            for c in np.flatnonzero(seeing) if listed else rows[:0]:
-                for a in matcher.averaged[c]:  # maps that were averaged into those of the lists
-                    seeing[a] = seeing[a] or a >= 0
-            fitted = table_of(rows[0], layer[rows[0]], seeing, block)
-            set_steep(fitted, layer[rows[0]], block, room)
-        _invert_points(rows, listed, given, result, likely, groups, block, fitted, none, room)
+    rows = order[first[span[0]] : first[span[1]]]
+    _invert_points(rows, listed, given, result, likely, groups, block, room)
 
 
 @device
 def _invert_points(
     rows: IntArray, listed: bool, given: FloatArray, result: FloatArray, likely: FloatArray,
-    groups: Groups, block: Block, fitted: Table, none: Table, room: Room,
+    groups: Groups, block: Block, room: Room,
 ) -> None:  # fmt: skip
-    """Do as `_invert_cells` for the points of one cell, with its polynomials.
+    """Do as `_invert_cells` for some points.
 
     It makes no arrays, so that references to the many that it reads are not counted.
     """
     points, before = block.points, rows[:0]
     for i in rows:
         first, last = points.start[i], points.start[i + 1]
-        cameras, table = points.camera[first:last], fitted if reads(block, i) else none
-        sight = sight_of(points, i)
+        cameras, sight = points.camera[first:last], sight_of(points, i)
         if listed:
             weight = given[first:last] if given.size else given
-            _invert_listed(result[i], cameras, weight, groups, sight, block, table, room)
+            _invert_listed(result[i], cameras, weight, groups, sight, block, room)
             continue
         # points with the same cameras share their groups
         if not are_same(cameras, before):
@@ -550,24 +470,24 @@ def _invert_points(
         before = cameras
         if len(likely):
             bed = likely_bed(sight, block)
-            depths = _rises_of(bed, cameras, groups, sight, block, table, room)
+            depths = _rises_of(bed, cameras, groups, sight, block, room)
             for seed in range(cameras.size):
                 if depths.slope[seed] == depths.slope[seed]:
                     likely[i, seed] = bed + groups.rise[seed]
         else:
-            _invert_one(result[i], cameras, given[i], groups, sight, block, table, room)
+            _invert_one(result[i], cameras, given[i], groups, sight, block, room)
 
 
 @device
 def _invert_one(
     row: FloatArray, maps: IntArray, around: float, groups: Groups, sight: Sight, block: Block,
-    table: Table, room: Room,
+    room: Room,
 ) -> None:  # fmt: skip
     """Find the group that made a point, and invert the fusion of its maps."""
     wanted, bed = around - sight.now[2], likely_bed(sight, block)
     if wanted == wanted:  # the bed of the surroundings is known
         bed = max(min(wanted, SHALLOW * bed), DEEP * bed)
-    depths = _rises_of(bed, maps, groups, sight, block, table, room)
+    depths = _rises_of(bed, maps, groups, sight, block, room)
     seed, rise, row[AMBIGUITY] = _best_seed(groups, depths, wanted - bed)
     weight = room.weight[: maps.size]
     weight[:] = 0.0
@@ -579,7 +499,7 @@ def _invert_one(
                 break
             if abs(groups.depth[q] - groups.depth[seed]) < AGREE:
                 _share(weight, q, groups.share[q], groups)
-    settle_bed(row, maps, weight, depths, sight, block, table, room)
+    settle_bed(row, maps, weight, depths, sight, block, room)
 
 
 @device
@@ -595,12 +515,10 @@ def _share(weight: FloatArray, q: int, share: float, groups: Groups) -> None:
 
 @device
 def _rises_of(
-    bed: float, maps: IntArray, groups: Groups, sight: Sight, block: Block, table: Table,
-    room: Room,
-) -> Lines:  # fmt: skip
+    bed: float, maps: IntArray, groups: Groups, sight: Sight, block: Block, room: Room
+) -> Lines:
     """Set the weights of the depth maps and the rises of their groups; return their lines."""
-    depths = Lines(bed, room.t[: maps.size], room.slope[: maps.size])
-    find_lines(depths, maps, sight, block, table, room)
+    depths = lines_at(bed, maps, sight, block, room)
     for q in range(maps.size):
         # the pixel on the ground grows with the distance
         up = original_up(sight, block, maps[q])
@@ -701,29 +619,28 @@ def _fuse(seed: int, groups: Groups) -> tuple[float, float]:
 @device
 def _invert_listed(
     row: FloatArray, listed: IntArray, given: FloatArray, groups: Groups, sight: Sight,
-    block: Block, table: Table, room: Room,
+    block: Block, room: Room,
 ) -> None:  # fmt: skip
     """Invert the fusion of the maps in the list of a point, with their weights."""
     maps = groups.found[: _with_neighbours(groups, listed, sight, block)]
     _group(groups, maps, block.matcher)
-    t, slope, weight = room.t[: maps.size], room.slope[: maps.size], room.weight[: maps.size]
-    bed, step = likely_bed(sight, block), 0.0
+    bed, step, weight = likely_bed(sight, block), 0.0, room.weight[: maps.size]
     for _ in range(_BEDS):
         bed += step
         # which depths agree depends on the bed, and the bed on which agree
-        find_lines(Lines(bed, t, slope), maps, sight, block, table, room)
+        depths = lines_at(bed, maps, sight, block, room)
         step = 0.0
         for _ in range(_ROUNDS):
             for q in range(maps.size):
-                groups.own[q], weight[q] = t[q] + slope[q] * step, 0.0
+                groups.own[q], weight[q] = depths.t[q] + depths.slope[q] * step, 0.0
             for k in range(listed.size):
                 up = original_up(sight, block, listed[k])
                 share = given[k] if given.size else 1.0 / dot(up, up)
                 _share(weight, groups.place[listed[k]], share, groups)
-            step = balance(t, slope, weight)
+            step = balance(depths.t, depths.slope, weight)
         if not abs(step) > FAR * abs(bed):
             break
-    settle_bed(row, maps, weight, Lines(bed, t, slope), sight, block, table, room)
+    settle_bed(row, maps, weight, depths, sight, block, room)
 
 
 @device

@@ -25,7 +25,7 @@ from pcfix.refract.reconstructions import (
     type_given,
     weigh,
 )
-from pcfix.refract.tiling import cell_side, spatial_order
+from pcfix.refract.tiling import spatial_order
 from pcfix.water.surface import is_submerged
 
 if TYPE_CHECKING:
@@ -154,8 +154,7 @@ def learn_of_sample(
     sample = replace(submerged_of(batch), survey=survey)
     if batch.views is not None:
         verdict = weigh_lists(sample, is_open=False)
-        learned = survey.learned._replace(dense=_is_dense(sample, points / max(len(batch), 1)))
-        survey = with_verdict(replace(survey, learned=learned), verdict)
+        survey = with_verdict(survey, verdict)
         return survey, () if verdict is None else (verdict,)
     near = near or Near(sample, points / max(len(batch), 1))
     survey, verdicts = _weighed(replace(near.batch, survey=survey), near.step, hint)
@@ -174,17 +173,7 @@ def learn_of_sample(
         learned = learned._replace(matcher=None)
     elif settings.method == "consistent" and settings.matcher == "depth-maps" and len(sample):
         learned = learned._replace(bed=_learn_bed(replace(sample, survey=survey)))
-        learned = learned._replace(dense=_is_dense(sample, points / max(len(batch), 1)))
     return replace(survey, learned=learned), verdicts
-
-
-def _is_dense(sample: Batch, step: float) -> bool:
-    """Whether the cells of depth maps have enough points, `step` for each of the sample."""
-    from pcfix.refract.map_table import LEAST_POINTS, layers_of
-
-    cell = np.floor(sample.xyz[:, :2] / cell_side(sample))
-    cells = len(np.unique(np.column_stack([cell, layers_of(sample)]), axis=0))
-    return len(sample) * step >= LEAST_POINTS * max(cells, 1)
 
 
 def submerged_of(batch: Batch) -> Batch:

@@ -207,6 +207,30 @@ def light_path(q: Vector, e: Vector, normal: Vector, h: float, n: float) -> Path
     return k, root, height, depth, s
 
 
+@device(inline="always")
+def light_near(
+    q: Vector, e: Vector, normal: Vector, h: float, n: float
+) -> tuple[float, float, float, float, Vector]:
+    """Return k, S, the depth of Q, n^2 (1 above the water), and s, as `light_path` for a near Q.
+
+    The light of the apparent point has the tangent of the incidence angle as a start, from which
+    Newton's method needs two steps: without a condition to end, loops over it are vectorised. The
+    projection centre must be above the plane.
+    """
+    across, depth = dot(normal, e), h - dot(normal, q)
+    height = across - h
+    s = beyond(minus(q, e), height + depth, normal)
+    m2 = n * n if depth > 0.0 else 1.0
+    a = (m2 - 1.0) * dot(s, s)
+    root = np.sqrt(m2 + (m2 - 1.0) * (dot(e, e) / (across * across) - 1.0))
+    k = 1.0 / (height + depth / root)
+    root = np.sqrt(m2 + a * k * k)
+    k += (1.0 - k * (height + depth / root)) / (height + depth * m2 / (root * root * root))
+    root = np.sqrt(m2 + a * k * k)
+    k += (1.0 - k * (height + depth / root)) / (height + depth * m2 / (root * root * root))
+    return k, root, depth, m2, s
+
+
 @device
 def direction(path: Path, normal: Vector) -> Vector:
     """Return w = k s - N, from the camera to where the light leaves the water."""

@@ -255,8 +255,7 @@ def weigh(
     if sample is None:
         return None
     part = batch.take(sample.rows)
-    learned = part.survey.learned._replace(dense=None)
-    survey = replace(part.survey, level_offset_m=None, learned=learned)
+    survey = replace(part.survey, level_offset_m=None)
     part = replace(part, survey=survey, level_sigma_m=None)
     beds = _beds(part, replace(batch, survey=part.survey), sample, ways)
     if beds is None or (told is not None and told not in beds.ways):

@@ -59,19 +59,16 @@ def cell_side(batch: Batch) -> float:
     return float(2.0 ** np.rint(np.log2(max(z - level, 0.01) / CELLS_A_HEIGHT)))
 
 
-def cells_of(batch: Batch, layer: IntArray | None = None) -> tuple[IntArray, IntArray]:
+def cells_of(batch: Batch) -> tuple[IntArray, IntArray]:
     """Return the order of the points cell by cell, and the first of each cell.
 
-    Cells are squares fixed in the world, by layers if these are given. Within a cell, points with
-    the same cameras follow each other.
+    Within a cell, points with the same cameras follow each other.
     """
     if not len(batch):
         return np.zeros(0, np.int64), np.zeros(1, np.int64)
     cell = np.floor(batch.xyz[:, :2] / cell_side(batch)).astype(np.int64)
     cell -= cell.min(axis=0)
     key = cell[:, 1] * (cell[:, 0].max() + 1) + cell[:, 0]
-    if layer is not None:
-        key = key * (layer.max() + 1) + layer
     # a random number stands for each camera, so that a sum stands for a list of cameras
     names = np.random.default_rng(0).integers(2**40, size=len(batch.survey.cameras))
     total = np.concatenate([[0], np.cumsum(names[batch.rays.camera])])
@@ -87,16 +84,6 @@ def are_same(a: IntArray, b: IntArray) -> bool:
     for j in range(min(a.size, b.size)):
         same = same and a[j] == b[j]
     return same
-
-
-@device(allocates=True)
-def counts_of(rows: IntArray, points: Chosen) -> IntArray:
-    """Return how many of some points each camera sees, by their lists."""
-    seen = np.zeros(len(points.centres), np.int64)
-    for i in rows:
-        for c in points.camera[points.start[i] : points.start[i + 1]]:
-            seen[c] += 1
-    return seen
 
 
 @device(allocates=True)

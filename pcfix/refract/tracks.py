@@ -37,7 +37,7 @@ from pcfix.lens.imaging import Plain, image_and_gradients, image_of, plain_image
 from pcfix.model import FloatArray, IntArray
 from pcfix.refract.batch import Optics
 from pcfix.refract.choice import Rig
-from pcfix.refract.rays import settle
+from pcfix.refract.rays import light_near, settle
 from pcfix.refract.tiling import TILE, inverse_of, nine, product_of, put, slots, three
 from pcfix.water.surface import Field, Tin, field_of
 
@@ -173,7 +173,7 @@ def _add(
     for j in range(marks.size):
         e, q = minus(centre, three(tile, j)), three(room, Q * TILE + j)
         normal, h = three(ray, _PLANE * TILE + j), ray[(_PLANE + 3) * TILE + j]
-        k, root, depth, m2, s = _light(q, e, normal, h, n)
+        k, root, depth, m2, s = light_near(q, e, normal, h, n)
         w = minus(scaled(k, s), normal)
         w = dot(right, w), dot(down, w), dot(ahead, w)
         if plain is None:
@@ -215,26 +215,3 @@ def _add_products(room: FloatArray, j: int, a: Vector, b: Vector) -> None:
     room[at + 6 * TILE] += a[2] * b[0]
     room[at + 7 * TILE] += a[2] * b[1]
     room[at + 8 * TILE] += a[2] * b[2]
-
-
-@device(inline="always")
-def _light(
-    q: Vector, e: Vector, normal: Vector, h: float, n: float
-) -> tuple[float, float, float, float, Vector]:
-    """Return k, S, the depth of Q, n^2 (1 above the water), and s; see `rays.light_path`.
-
-    The light of P has the tangent of the incidence angle as a start, from which Newton's method
-    needs two steps: without a condition to end the loop is vectorised.
-    """
-    across, depth = dot(normal, e), h - dot(normal, q)
-    height = across - h
-    s = beyond(minus(q, e), height + depth, normal)
-    m2 = n * n if depth > 0.0 else 1.0
-    a = (m2 - 1.0) * dot(s, s)
-    root = np.sqrt(m2 + (m2 - 1.0) * (dot(e, e) / (across * across) - 1.0))
-    k = 1.0 / (height + depth / root)
-    root = np.sqrt(m2 + a * k * k)
-    k += (1.0 - k * (height + depth / root)) / (height + depth * m2 / (root * root * root))
-    root = np.sqrt(m2 + a * k * k)
-    k += (1.0 - k * (height + depth / root)) / (height + depth * m2 / (root * root * root))
-    return k, root, depth, m2, s

@@ -11,12 +11,13 @@ from pcfix.io.views import ViewMatch, read_views
 from pcfix.lens.frames import frames_of
 from pcfix.model import Outcome, Views, WaterPlane
 from pcfix.options.correct import ScienceOptions
-from pcfix.refract.batch import Chosen, Learned, images_of
-from pcfix.refract.depth_maps import _compare, best_pairs, sight_of
-from pcfix.refract.map_table import Block
+from pcfix.refract.batch import FLAT_DEG, Batch, Chosen, Learned, Survey, images_of
+from pcfix.refract.depth_maps import Block, _compare, best_pairs, sight_of
+from pcfix.refract.learning import learn_of_sample
 from pcfix.refract.matcher import WIDTH_M, Bed, Matcher, bed_of
-from pcfix.refract.methods import correct
-from pcfix.water.surface import surface_above
+from pcfix.refract.methods import correct, with_rays
+from pcfix.running import threads
+from pcfix.water.surface import is_submerged, surface_above
 from tests.utils.batches import batch_of
 from tests.utils.compiled import compiled
 from tests.utils.depth_map_twin import LENS, costs_of, fused_slowly, looking, on_bed, slow_depth
@@ -103,7 +104,7 @@ def test_depth_as_twin(c):
         p[None], p[None], np.array([height]), np.array([plane[1:]]), CAMERAS.centres, offset,
         nothing, nothing, N_WATER,
     )  # fmt: skip
-    block = Block(points, images_of(None, CAMERAS), matcher(), (0.0, 0.0, 0.0), 8.0)
+    block = Block(points, images_of(None, CAMERAS), matcher())
     partners = np.empty((5, 3))
     length, sight = np.linalg.norm(p - CAMERAS.centres[c]), sight_of(points, 0)
     count = _compare(partners, c, tuple(q - p), length, sight, block)
@@ -295,6 +296,34 @@ def test_no_bed():
     assert np.array_equal(
         run(xyz, WaterPlane(0.3), None, one).shift_m, run(xyz, WaterPlane(0.3), None, far).shift_m
     )
+
+
+def test_any_chunk():
+    """The result of a point does not depend on the others, nor on the number of threads."""
+    scene = scene_of("nadir")
+    settings = ScienceOptions(method="consistent", camera_set="mvs", dimensions="none")
+    above = surface_above(scene.water, scene.xyz)
+    whole = Batch(scene.xyz, above, Survey(scene.water, scene.cameras, settings))
+    survey, _ = learn_of_sample(whole, len(whole))
+    part = replace(whole, survey=survey).take(np.flatnonzero(is_submerged(scene.xyz[:, 2], above)))
+    listed = replace(scene.views.take(np.arange(len(part))), kind="depth-maps")
+    for one in (part, replace(part, views=listed)):
+        rows = np.random.default_rng(2).permutation(len(part))[:300]
+        with threads(3):
+            some = correct(one.take(rows)).shift_m
+        np.testing.assert_array_equal(some, correct(one).shift_m[rows])
+
+
+def test_seen_flat():
+    cameras = looking(
+        [[0, 0, 70], [10, 0, 70], [160, 0, 70], [165, 5, 70]], [0, 0, 50, 50], [0, 0, 180, 180]
+    )
+    xyz = np.array([[5.0, 0.0, -2.0], [80.0, 0.0, -2.0], [900.0, 0.0, -2.0]])
+    above = surface_above(WaterPlane(0.0), xyz)
+    settings = ScienceOptions(method="consistent", camera_set="all")
+    flat = with_rays(batch_of(xyz, above, WaterPlane(0.0), cameras, settings)).seen_flat()
+    assert flat.tolist() == [False, True, False]  # from above; at 48 degrees; not at all
+    assert FLAT_DEG < 48.0
 
 
 # a real cloud
