@@ -60,7 +60,7 @@ from pcfix.refract.batch import (
 )
 from pcfix.refract.matcher import MATCHED, WIDTH_M, Matcher
 from pcfix.refract.rays import light_near, refracted
-from pcfix.refract.tiling import are_same, cells_of
+from pcfix.refract.tiling import are_same
 
 MAX_LOOKS = 5
 CLOSE_M = 0.002
@@ -352,7 +352,7 @@ def invert_depth_maps(batch: Batch) -> Intersection:
     else:
         given = np.full(len(batch), np.nan) if bed is None else bed.height_at(batch.xyz[:, :2])
     result = np.zeros((len(batch), COLUMNS))
-    _in_cells(batch, listed, given, result, np.zeros((0, 0), np.float32))
+    _invert_all(batch, listed, given, result, np.zeros((0, 0), np.float32))
     outcome = result[:, OUTCOME].astype(np.uint8)
     found = batch.result(result[:, :3], outcome=outcome, ray_miss_m=result[:, _DISTANCE])
     moved = outcome == CORRECTED
@@ -368,21 +368,20 @@ def likely_beds(batch: Batch) -> FloatArray:
     Relative to each apparent point, metres, float32, shape (m, most views); NaN if there is none.
     """
     likely = np.full((len(batch.xyz), max(1, batch.counts.max(initial=0))), np.nan, np.float32)
-    _in_cells(batch, False, np.zeros(0), np.zeros((0, 0)), likely)
+    _invert_all(batch, False, np.zeros(0), np.zeros((0, 0)), likely)
     return likely
 
 
-def _in_cells(
+def _invert_all(
     batch: Batch, listed: bool, given: FloatArray, result: FloatArray, likely: FloatArray
 ) -> None:
     matcher = batch.survey.learned.matcher
     if matcher is None:
         raise ValueError("a model of the matcher is needed")
     images = images_of(batch.original_model, batch.survey.cameras)
-    order, first = cells_of(batch)
+    block = Block(batch.chosen(), images, matcher)
     in_tiles(
-        _invert_cells, len(first) - 1, (order, first), Block(batch.chosen(), images, matcher),
-        listed, given, result, likely, points=len(batch),
+        _invert_tile, len(batch), block, listed, given, result, likely, points=len(batch)
     )  # fmt: skip
 
 
@@ -424,16 +423,16 @@ def _place(members: IntArray, q: int, others: IntArray, place: IntArray) -> None
 
 
 @kernel(allocates=True)
-def _invert_cells(
-    span: Span, cells: tuple[IntArray, IntArray], block: Block, listed: bool, given: FloatArray,
-    result: FloatArray, likely: FloatArray,
+def _invert_tile(
+    span: Span, block: Block, listed: bool, given: FloatArray, result: FloatArray,
+    likely: FloatArray,
 ) -> None:  # fmt: skip
-    """Invert the fusion of the points of some cells or, where `likely` has rows, fill these in.
+    """Invert the fusion of some points or, where `likely` has rows, fill these in.
 
     With lists `given` are the weights of their entries, if there are any; without, the heights of
     the bed of the surroundings.
     """
-    (order, first), matcher, k = cells, block.matcher, len(block.points.centres)
+    matcher, k = block.matcher, len(block.points.centres)
     room = Room(
         np.empty(k), np.empty((6, k)), np.empty((MATCHED, 3)), np.empty((MATCHED * MATCHED, 2))
     )
@@ -443,21 +442,20 @@ def _invert_cells(
         np.full(k, ABSENT), np.empty(k, np.int64), np.empty(k), np.empty(k), np.empty(k),
         np.empty(k), np.empty(k), np.empty(k),
     )  # fmt: skip
-    rows = order[first[span[0]] : first[span[1]]]
-    _invert_points(rows, listed, given, result, likely, groups, block, room)
+    _invert_points(span, listed, given, result, likely, groups, block, room)
 
 
 @device
 def _invert_points(
-    rows: IntArray, listed: bool, given: FloatArray, result: FloatArray, likely: FloatArray,
+    span: Span, listed: bool, given: FloatArray, result: FloatArray, likely: FloatArray,
     groups: Groups, block: Block, room: Room,
 ) -> None:  # fmt: skip
-    """Do as `_invert_cells` for some points.
+    """Do as `_invert_tile` with room for one point.
 
     It makes no arrays, so that references to the many that it reads are not counted.
     """
-    points, before = block.points, rows[:0]
-    for i in rows:
+    points, before = block.points, block.points.camera[:0]
+    for i in range(*span):
         first, last = points.start[i], points.start[i + 1]
         cameras, sight = points.camera[first:last], sight_of(points, i)
         if listed:

@@ -21,8 +21,7 @@ The model, for an apparent point P and its pairs (a, b), all of which show one t
 Q is found where that median is P: three equations for three unknowns. The median of smooth
 functions is continuous, with kinks where it changes from one pair to another. Broyden's method
 starts at `snell`'s solution with the derivative diag(1, 1, 1/n), as if all light came from straight
-above, and goes back to half such a step wherever it does not come nearer. A point with the cameras
-of the one before it starts from its solution.
+above, and goes back to half such a step wherever it does not come nearer.
 """
 
 from __future__ import annotations
@@ -68,21 +67,16 @@ from pcfix.refract.intersect import check_consistent
 from pcfix.refract.rays import (
     MIN_DETERMINANT,
     NO_LINE,
-    direction,
-    light_path,
+    light_near,
     nearest_point,
     plus_line,
     ray_distance,
     refracted,
 )
-from pcfix.refract.tiling import are_same, cells_of
 
 MAX_STEPS = 40
-ALIKE = 0.5
-"""Least ratio of two depths at which a point starts from the one before."""
-
-CLOSE_M = 1e-6
-"""Largest distance of the median from P; the error of Q is two or three times as much."""
+CLOSE_M = 5e-5
+"""Largest distance of the median from P before the last step, which leaves about a millionth."""
 
 
 # Columns of the result.
@@ -123,17 +117,16 @@ def invert_pairs(batch: Batch, pairs: Views | None = None) -> Intersection:
     cameras, matcher = batch.survey.cameras, batch.survey.learned.matcher
     if pairs is None and matcher is None:
         raise ValueError("pairs or a model of the matcher are needed")
-    none = np.zeros(0, np.int64)
-    listed = (none, none)
+    start, camera, partners = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 0), int)
     if pairs is not None:
-        listed = np.asarray(pairs.start, np.int64), np.asarray(pairs.camera, np.int64)
-    matched = np.zeros((0, 0), np.int64) if matcher is None else matcher.matched
+        start, camera = np.asarray(pairs.start, np.int64), np.asarray(pairs.camera, np.int64)
+    elif matcher is not None:
+        partners = _each_once(matcher.matched)
     used, result = np.zeros(len(batch.rays.camera), np.bool_), np.zeros((len(batch), _WIDTH))
     images = images_of(batch.original_model, cameras)
-    order, first = cells_of(batch)
     in_tiles(
-        _invert, len(first) - 1, (order, first), batch.chosen(), images, (*listed, matched), used,
-        result, points=len(batch),
+        _invert, len(batch), batch.chosen(), images, (start, camera, partners), used, result,
+        points=len(batch),
     )  # fmt: skip
     outcome = result[:, _OUTCOME].astype(np.uint8)
     moved = outcome == Outcome.CORRECTED
@@ -144,57 +137,59 @@ def invert_pairs(batch: Batch, pairs: Views | None = None) -> Intersection:
     return found.result(result[:, :3], outcome=outcome, ray_miss_m=result[:, _DISTANCE])
 
 
+def _each_once(matched: IntArray) -> IntArray:
+    """Return the images that each was matched with, -1 for a pair that the other one has too."""
+    image, at = np.nonzero(matched >= 0)
+    partner = matched[image, at]
+    again = (matched[partner] == image[:, None]).any(axis=1) & (partner < image)
+    once = matched.copy()
+    once[image[again], at[again]] = -1
+    return once
+
+
 @kernel(allocates=True)
 def _invert(
-    span: Span, cells: tuple[IntArray, IntArray], points: Chosen, images: Images,
-    listed: tuple[IntArray, IntArray, IntArray], used: BoolArray, result: FloatArray,
+    span: Span, points: Chosen, images: Images, listed: tuple[IntArray, IntArray, IntArray],
+    used: BoolArray, result: FloatArray,
 ) -> None:  # fmt: skip
-    """Correct the points of each cell; without listed pairs they are those of the matcher."""
-    (order, first), (listed_start, listed_camera, matched) = cells, listed
-    start = points.start
-    most = most_between((0, len(start) - 1), start)
-    most_pairs = most * matched.shape[1]
+    """Correct some points; without listed pairs they are those of the matcher."""
+    (listed_start, listed_camera, partners), start = listed, points.start
+    most = most_between(span, start)
+    most_pairs = most * partners.shape[1]
     if listed_start.size:
-        most_pairs = most_between((0, len(start) - 1), listed_start) // 2
+        most_pairs = most_between(span, listed_start) // 2
     rays, place = np.empty((most, _RAY_WIDTH)), np.full(len(points.centres), -1)
     pairs, places = np.empty((most_pairs, 2), np.int64), np.empty((3, most_pairs))
     inverse = np.empty((3, 3))
-    for t in range(*span):
-        before, seeing_before = -1, points.camera[:0]
-        for i in order[first[t] : first[t + 1]]:
-            cameras = points.camera[start[i] : start[i + 1]]
-            flags, normal = used[start[i] : start[i + 1]], normal_above(points, i)
-            # `place` maps a camera to its ray of this point
-            for j in range(cameras.size):
-                place[cameras[j]] = j
-                _begin(rays[j], points, i, cameras[j], images)
-            if listed_start.size:
-                entries = listed_camera[listed_start[i] : listed_start[i + 1]]
-                count = _listed_pairs(pairs, entries, place)
-            else:
-                count = _matched_pairs(pairs, cameras, matched, place)
-            for c in cameras:
-                place[c] = -1
-            wide = _wide_pairs(pairs[:count], rays, normal)
-            if wide == 0:
-                few = ONE_CAMERA if cameras.size else NO_CAMERA
-                result[i, _OUTCOME] = PARALLEL if count else few
-                continue
-            for p in range(wide):
-                flags[pairs[p, 0]], flags[pairs[p, 1]] = True, True
-            # the result row first holds the start of the search, NaN without one
-            near = result[i, :3]
-            near[:] = np.nan
-            if before >= 0 and are_same(cameras, seeing_before):
-                depth = points.height[i] - points.xyz[i, 2]
-                there = points.height[before] - points.xyz[before, 2]
-                # the shift grows with the depth, unless the depths differ much
-                if there > 0.0 and ALIKE * there < depth < there / ALIKE:
-                    for axis in range(3):
-                        near[axis] = result[before, axis] * (depth / there)
-            point = _Point(normal, points.n, rays, cameras, flags, pairs[:wide], places[:, :wide])
-            _solve(result[i], point, images, inverse)
-            before, seeing_before = i if result[i, _FOUND] > 0.0 else -1, cameras
+    for i in range(*span):
+        cameras, normal = points.camera[start[i] : start[i + 1]], normal_above(points, i)
+        flags = used[start[i] : start[i + 1]]
+        # `place` maps a camera to its ray of this point
+        for j in range(cameras.size):
+            place[cameras[j]] = j
+            _begin(rays[j], points, i, cameras[j], images)
+        count = 0
+        if listed_start.size:
+            for at in range(listed_start[i], listed_start[i + 1], 2):
+                a, b = place[listed_camera[at]], place[listed_camera[at + 1]]
+                if a >= 0 and b >= 0 and a != b:
+                    pairs[count, 0], pairs[count, 1], count = a, b, count + 1
+        else:
+            for a in range(cameras.size):
+                for partner in partners[cameras[a]]:
+                    if partner >= 0 and place[partner] >= 0:
+                        pairs[count, 0], pairs[count, 1], count = a, place[partner], count + 1
+        for c in cameras:
+            place[c] = -1
+        wide = _wide_pairs(pairs[:count], rays, normal)
+        if wide == 0:
+            few = ONE_CAMERA if cameras.size else NO_CAMERA
+            result[i, _OUTCOME] = PARALLEL if count else few
+            continue
+        for p in range(wide):
+            flags[pairs[p, 0]], flags[pairs[p, 1]] = True, True
+        point = _Point(normal, points.n, rays, cameras, flags, pairs[:wide], places[:, :wide])
+        _solve(result[i], point, images, inverse)
 
 
 @device
@@ -224,8 +219,8 @@ def _see(ray: FloatArray, q: Vector, c: int, point: _Point, images: Images) -> N
 
     The direction w, in the original model, is scaled to the distance of P, so that G is that there.
     """
-    path = light_path(q, vector(ray), point.normal, ray[_ABOVE], point.n)
-    w = to_original(images, c, direction(path, point.normal))
+    k, _, _, _, s = light_near(q, vector(ray), point.normal, ray[_ABOVE], point.n)
+    w = to_original(images, c, minus(scaled(k, s), point.normal))
     # g.w is the distance of w in terms of P
     w = scaled(1.0 / dot(w, vector(ray, _BY_PLACE)), w)
     optics, e = images.original, vector(ray, _ORIGINAL)
@@ -286,38 +281,6 @@ def _sum(a: FloatArray, b: FloatArray, of_a: float, of_b: float, at: int) -> Vec
 
 
 @device
-def _listed_pairs(pairs: IntArray, entries: IntArray, place: IntArray) -> int:
-    """Write the pairs of a list whose cameras both have a place; return how many."""
-    count = 0
-    for p in range(entries.size // 2):
-        a, b = place[entries[2 * p]], place[entries[2 * p + 1]]
-        if a >= 0 and b >= 0 and a != b:
-            pairs[count, 0], pairs[count, 1] = a, b
-            count += 1
-    return count
-
-
-@device
-def _matched_pairs(pairs: IntArray, cameras: IntArray, matched: IntArray, place: IntArray) -> int:
-    """Write the pairs of cameras of which either was matched with the other; return how many."""
-    count = 0
-    for a in range(cameras.size):
-        for partner in matched[cameras[a]]:
-            if partner < 0:
-                break
-            b = place[partner]
-            # a pair that each image has in its list counts once
-            both = False
-            for one in matched[partner]:
-                both = both or one == cameras[a]
-            if b < 0 or (b < a and both):
-                continue
-            pairs[count, 0], pairs[count, 1] = a, b
-            count += 1
-    return count
-
-
-@device
 def _wide_pairs(pairs: IntArray, rays: FloatArray, normal: Vector) -> int:
     """Bring the pairs that have a base, as seen from P, to the front; return how many there are.
 
@@ -341,7 +304,7 @@ def _wide_pairs(pairs: IntArray, rays: FloatArray, normal: Vector) -> int:
 
 @device
 def _solve(out: FloatArray, point: _Point, images: Images, inverse: FloatArray) -> None:
-    """Solve one point and write its row, which has a start already or NaN."""
+    """Solve one point and write its row."""
     k, sums, n = 0.0, NO_LINE, point.n
     for j in range(point.used.size):
         if point.used[j]:
@@ -353,14 +316,9 @@ def _solve(out: FloatArray, point: _Point, images: Images, inverse: FloatArray) 
             k, sums = k + 1.0, plus_line(sums, scaled(f, e), d, 1.0 / length2)
     fixed, start, _ = nearest_point(k, sums)
     if not fixed:
-        out[:3], out[_OUTCOME] = 0.0, PARALLEL
+        out[_OUTCOME] = PARALLEL
         return
-    found, q = False, vector(out)
-    if q[0] == q[0]:  # B is still that of the point before
-        found, q = _search(q, inverse, point, images)
-    if not found:
-        _as_from_above(inverse, 1.0, n)
-        found, q = _search(start, inverse, point, images)
+    found, q = _search(start, inverse, point, images)
     out[0], out[1], out[2] = q
     out[_DISTANCE] = ray_distance(k, sums, q)
     out[_OUTCOME], out[_FOUND] = CORRECTED, 1.0 if found else 0.0
@@ -372,11 +330,12 @@ def _search(
 ) -> tuple[bool, Vector]:
     """Return whether a Q was found where the median F of the pairs' places is P, and that Q.
 
-    From the nearest Q so far goes a step s = -B F, at first with the given B. Where F comes nearer,
+    From the nearest Q so far goes a step s = -B F, at first as from above. Where F comes nearer,
     by y, the good Broyden update is B + (s - B y) s'B / (s'B y); where it does not, B starts again
     with half the step.
     """
     rays, pairs, places = point.rays, point.pairs, point.places
+    _as_from_above(inverse, 1.0, point.n)
     q, nearest, at_nearest, best, share = start, start, (0.0, 0.0, 0.0), np.inf, 1.0
     for _ in range(MAX_STEPS):
         # where the pairs would place Q; NaN where a camera has no image of it
@@ -389,7 +348,7 @@ def _search(
         f = _median(places[0]), _median(places[1]), _median(places[2])
         size = np.sqrt(dot(f, f))
         if size <= CLOSE_M:
-            return True, q
+            return True, _onward(q, inverse, f)
         if size < best:
             if best < np.inf:
                 step, change = minus(q, nearest), minus(f, at_nearest)
@@ -405,10 +364,14 @@ def _search(
             _as_from_above(inverse, share, point.n)
         else:  # no image of the start
             return False, start
-        q = nearest
-        for j in range(3):
-            q = minus(q, scaled(at_nearest[j], algebra.column_of(inverse, j)))
+        q = _onward(nearest, inverse, at_nearest)
     return False, start
+
+
+@device
+def _onward(q: Vector, inverse: FloatArray, f: Vector) -> Vector:
+    """Return Q after a step -B F."""
+    return minus(q, algebra.times(inverse, f))
 
 
 @device

@@ -1,4 +1,4 @@
-"""Tiles and cells of neighbouring points, and the cameras whose frames may hold one of them.
+"""Tiles of neighbouring points, and the cameras whose frames may hold one of them.
 
 Kernels process points tile by tile: a tile of neighbours needs few cameras, and inner loops over
 its points are vectorised.
@@ -13,14 +13,11 @@ import numpy as np
 from pcfix.kernels import device
 from pcfix.lens.algebra import Nine, Vector, row_of
 from pcfix.lens.frames import Frames, may_hold
-from pcfix.model import FloatArray, IntArray, SingleArray, WaterPlane
+from pcfix.model import FloatArray, IntArray, SingleArray
 from pcfix.refract.batch import Batch, Chosen, normal_above
 
 TILE = 128
 """Points of a tile: its sums (11 numbers a point) stay in the processor's first cache."""
-
-CELLS_A_HEIGHT = 8.0
-"""Flying height by the side of a cell."""
 
 
 def tiles_of(batch: Batch) -> int:
@@ -46,35 +43,6 @@ def spatial_order(xyz: FloatArray) -> IntArray:
     within = np.where(row & 1, columns - 1 - column, column)
     # there are fewer than 2^16 cells, and numpy sorts numbers of 16 bits in two passes
     return np.argsort((row * columns + within).astype(np.uint16), kind="stable")
-
-
-def cell_side(batch: Batch) -> float:
-    """Return the side of the cells, metres: a power of two."""
-    x, y, z = np.median(batch.survey.cameras.centres, axis=0)
-    water = batch.survey.water
-    if isinstance(water, WaterPlane):
-        level = water.a + water.b * x + water.c * y
-    else:
-        level = np.median(batch.surface.height_m)
-    return float(2.0 ** np.rint(np.log2(max(z - level, 0.01) / CELLS_A_HEIGHT)))
-
-
-def cells_of(batch: Batch) -> tuple[IntArray, IntArray]:
-    """Return the order of the points cell by cell, and the first of each cell.
-
-    Within a cell, points with the same cameras follow each other.
-    """
-    if not len(batch):
-        return np.zeros(0, np.int64), np.zeros(1, np.int64)
-    cell = np.floor(batch.xyz[:, :2] / cell_side(batch)).astype(np.int64)
-    cell -= cell.min(axis=0)
-    key = cell[:, 1] * (cell[:, 0].max() + 1) + cell[:, 0]
-    # a random number stands for each camera, so that a sum stands for a list of cameras
-    names = np.random.default_rng(0).integers(2**40, size=len(batch.survey.cameras))
-    total = np.concatenate([[0], np.cumsum(names[batch.rays.camera])])
-    order = np.lexsort((np.diff(total[batch.rays.start]), key))
-    new = np.flatnonzero(np.diff(key[order])) + 1
-    return order, np.concatenate([[0], new, [len(order)]])
 
 
 @device
