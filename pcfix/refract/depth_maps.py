@@ -95,6 +95,7 @@ class Block(NamedTuple):
     points: Chosen
     images: Images
     matcher: Matcher
+    offset_m: float  # how much higher the water stood, mean over all images
 
 
 class Sight(NamedTuple):
@@ -158,12 +159,8 @@ def lines_at(bed: float, maps: IntArray, sight: Sight, block: Block, room: Room)
 @device
 def likely_bed(sight: Sight, block: Block) -> float:
     """Return a likely height of the bed, relative to the apparent point."""
-    points, above = block.points, 0.0
-    for c in range(len(points.offset)):
-        above += points.offset[c]
-    # the mean water level of all images
-    above = sight.above + sight.normal[2] * above / len(points.offset)
-    return -LIKELY * max(above, LEAST_DEPTH_M) / sight.normal[2] * (points.n - 1.0)
+    above = sight.above + sight.normal[2] * block.offset_m
+    return -LIKELY * max(above, LEAST_DEPTH_M) / sight.normal[2] * (block.points.n - 1.0)
 
 
 @device
@@ -379,7 +376,8 @@ def _invert_all(
     if matcher is None:
         raise ValueError("a model of the matcher is needed")
     images = images_of(batch.original_model, batch.survey.cameras)
-    block = Block(batch.chosen(), images, matcher)
+    points = batch.chosen()
+    block = Block(points, images, matcher, float(points.offset.mean()))
     in_tiles(
         _invert_tile, len(batch), block, listed, given, result, likely, points=len(batch)
     )  # fmt: skip

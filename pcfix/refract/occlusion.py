@@ -375,12 +375,3 @@ def wants_occlusion(cameras: Cameras, settings: ScienceOptions) -> bool:
         return settings.occlusion == "on"
     # the third row of a rotation is the axis in the world frame; straight down it is (0, 0, -1)
     return bool((-cameras.rotations[:, 2, 2] < np.cos(np.radians(OBLIQUE_DEG))).any())
-
-
-def occluder_of(xyz: FloatArray, classes: npt.NDArray[np.uint8] | None = None) -> Occluder | None:
-    """Return the surface of points that are the whole cloud; see `OccluderBuilder.add`."""
-    if not len(xyz):
-        return None
-    builder = OccluderBuilder(xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0), len(xyz))
-    builder.add(xyz, classes)
-    return builder.build()

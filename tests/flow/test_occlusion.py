@@ -5,7 +5,8 @@ import pytest
 
 from pcfix import Cameras
 from pcfix.options.correct import ScienceOptions
-from pcfix.refract.occlusion import OccluderBuilder, occluder_of, wants_occlusion
+from pcfix.refract.occlusion import OccluderBuilder, wants_occlusion
+from tests.utils.clouds import occluder_of
 
 UTM = np.array([512_345.678, 4_987_654.321, 0.0])
 NAMES = ("height", "margin", "block_top", "large_block_top")

@@ -104,7 +104,7 @@ def test_depth_as_twin(c):
         p[None], p[None], np.array([height]), np.array([plane[1:]]), CAMERAS.centres, offset,
         nothing, nothing, N_WATER,
     )  # fmt: skip
-    block = Block(points, images_of(None, CAMERAS), matcher())
+    block = Block(points, images_of(None, CAMERAS), matcher(), offset.mean())
     partners = np.empty((5, 3))
     length, sight = np.linalg.norm(p - CAMERAS.centres[c]), sight_of(points, 0)
     count = _compare(partners, c, tuple(q - p), length, sight, block)

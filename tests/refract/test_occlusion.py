@@ -11,11 +11,12 @@ from pcfix.model import Views, WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Learned
 from pcfix.refract.methods import correct
-from pcfix.refract.occlusion import occluded, occluder_of, visible_cameras
+from pcfix.refract.occlusion import occluded, visible_cameras
 from pcfix.simulate.tracing import project, triangulate
 from pcfix.water.surface import SurfaceAbove
 from tests.utils.batches import batch_of
 from tests.utils.bed_rays import piercing_points
+from tests.utils.clouds import occluder_of
 from tests.utils.shared import needs
 
 RENDERED, rendered = needs("rendered_a")

@@ -306,3 +306,12 @@ def add_waveforms(path: Path, packets: bytes) -> Path:
     data += struct.pack("<2x16sHQ32s", b"LASF_Spec", 65535, len(packets), b"waves") + packets
     path.write_bytes(bytes(data))
     return path
+
+
+def occluder_of(xyz, classes=None):
+    """Return the surface of points that are the whole cloud; see `OccluderBuilder.add`."""
+    from pcfix.refract.occlusion import OccluderBuilder
+
+    builder = OccluderBuilder(xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0), len(xyz))
+    builder.add(xyz, classes)
+    return builder.build()
