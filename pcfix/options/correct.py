@@ -61,8 +61,7 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
     occlusion: Literal["auto", "on", "off"] = option("auto", with_cameras=True)
     """Skip cameras from which the cloud occludes the point; auto: if there are oblique images."""
     exact: bool = option(False)
-    """Solve every point exactly. Otherwise depth maps are interpolated where that is within 0.05
-    ground pixels."""
+    """Solve every point exactly; this is always done, and the option is for older scripts."""
     depth_factor: float | str | None = option(
         None, least=1, most=3, needs="method factor", parse=number_or("auto"), metavar="N"
     )
