@@ -14,7 +14,7 @@ import numpy.typing as npt
 from pcfix.blocks import empty, release
 from pcfix.clean.points import CleanSummary, Cloud, Reason, flag_neighbours, flag_weak
 from pcfix.errors import InputError
-from pcfix.flow.runner import Chunk, Command, Progress, streaming
+from pcfix.flow.runner import Chunk, Command, Progress, stream
 from pcfix.flow.surfaces import CloudView, Points, find_surface, points_of, view_of
 from pcfix.flow.tiles import run_command
 from pcfix.io.files import scratch_arrays
@@ -71,7 +71,7 @@ def clean_file(
     command = Command(
         "clean",
         plan=partial(_plan_file, given, progress),
-        process=partial(streaming, _Cleaning),
+        process=partial(stream, _Cleaning),
         check=lambda plan, tally: None,
         summarize=lambda plan, tally, findings, ends: replace(
             plan.summary, input=ends.input, output=ends.output, seconds=round(ends.seconds, 3)

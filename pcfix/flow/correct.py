@@ -109,8 +109,8 @@ def correct_cloud(
     wide, steps = False, tuple[int, ...]((0, 0, 0))
     while True:
         try:
-            begin = partial(Correcting, plan, wide=wide, steps=steps)
-            return stream(task, begin, row, check)
+            work = partial(Correcting, wide=wide, steps=steps)
+            return stream(work, plan, task, row, check)
         except columns.TooNarrowError:
             wide = True
         except columns.OutOfRangeError as axis:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from pcfix.errors import SettingError
 from pcfix.flow.inputs import labelling_of, mask_of, paths_in
-from pcfix.flow.runner import Chunk, Command, Ends, Progress, streaming
+from pcfix.flow.runner import Chunk, Command, Ends, Progress, stream
 from pcfix.flow.surfaces import (
     CloudView,
     Points,
@@ -138,7 +138,7 @@ def label_file(
     command = Command(
         "label",
         lambda cloud, target, kept: plan_labelling(given, view_of(cloud, given.jobs)),
-        partial(streaming, _Labelling),
+        partial(stream, _Labelling),
         check,
         _summarize,
     )

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from pcfix.errors import InputError
-from pcfix.flow.runner import Chunk, Command, streaming
+from pcfix.flow.runner import Chunk, Command, stream
 from pcfix.flow.tiles import run_command
 from pcfix.io.las.columns import SHIFTS, UNSURE, columns_for, convert, move
 from pcfix.io.las.source import LasSource
@@ -55,7 +55,7 @@ def restore_file(
     command = Command(
         "restore",
         plan=lambda cloud, target, kept: None,
-        process=partial(streaming, _Restoring),
+        process=partial(stream, _Restoring),
         check=lambda plan, points: None,
         summarize=lambda plan, points, findings, ends: points,
     )

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
-from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
@@ -65,7 +64,7 @@ class Command:
     `plan` takes a cloud, the path of the output, and chunks to keep in memory (`FileTask.kept`),
     and returns all that the points have in common, which can be pickled. `process` takes one file
     through a plan (plan, task, first row of the cloud, check or None), and returns the statistics
-    and the findings of the check; see `streaming`. `check` refuses, by plan and statistics of the
+    and the findings of the check; see `stream`. `check` refuses, by plan and statistics of the
     whole cloud, what cannot be right. `summarize` makes the result of plan, statistics, findings
     and `Ends`.
     """
@@ -107,29 +106,33 @@ class FileTask:
 
 
 def stream(
-    task: FileTask, begin: Callable[[LasSource], FileWork], row: int = 0, check: Check | None = None
+    work: Callable[[Any, LasSource], FileWork],
+    plan: Any,
+    task: FileTask,
+    row: int = 0,
+    check: Check | None = None,
 ) -> tuple[Any, Any]:
     """Take every chunk of a file through a command; the target appears when all went well.
 
-    `begin` returns the work on the opened file, which starts at a row of the whole cloud. Returns
-    the statistics, and the findings of the check.
+    `work` returns what is done to the opened file by the plan; the file begins at a row of the
+    whole cloud. Returns the statistics, and the findings of the check.
     """
     with open_cloud(task.source, task.jobs, kept=task.kept or None) as source:
-        work, total, done = begin(source), len(source), 0
+        own, total, done = work(plan, source), len(source), 0
         tally, findings = None, None
         # the index of a COPC file would be wrong
         evlrs = [one for one in source.evlrs if one.user_id != "copc"]
-        last = evlrs, work.identity, task.jobs
-        with las_writer(task.target, work.header, *last) as append, _thread(task.jobs) as writer:
+        last = evlrs, own.identity, task.jobs
+        with las_writer(task.target, own.header, *last) as append, _thread(task.jobs) as writer:
 
             def write(points: Chunk, result: Any) -> None:
-                append(work.apply(points, result))
+                append(own.apply(points, result))
 
             written: Future[None] | None = None
             for points in read_ahead(source.chunks(), task.jobs):
                 report = _reporter(task.progress, done, len(points), total)
                 with running(report=report):
-                    result, one = work.compute(points, row + done)
+                    result, one = own.compute(points, row + done)
                 if written is not None:
                     written.result()  # at most one chunk waits, which bounds the memory
                 written = writer.submit(write, points, result)
@@ -158,17 +161,6 @@ def _reporter(
     return report
 
 
-def streaming(
-    work: Callable[[Any, LasSource], FileWork],
-    plan: Any,
-    task: FileTask,
-    row: int = 0,
-    check: Check | None = None,
-) -> tuple[Any, Any]:
-    """Take a file through a command whose `work` on an opened file needs its plan alone."""
-    return stream(task, partial(work, plan), row, check)
-
-
 def read_ahead(chunks: Iterator[Any], jobs: int | None) -> Iterator[Any]:
     """Yield chunks while the next one is read; with one job without a thread."""
     with _thread(jobs) as reader:
@@ -184,7 +176,7 @@ def _thread(jobs: int | None) -> Executor:
 
 
 class _ThisThread(Executor):
-    """Runs each call at once."""
+    """Runs each call at once, so that Ctrl-C ends a process of many without other threads."""
 
     def submit(self, call: Any, /, *given: Any, **keywords: Any) -> Future[Any]:
         """Return what a call gave."""
