@@ -13,7 +13,6 @@ from dataclasses import replace
 import numpy as np
 
 from pcfix.adjust.block import (
-    CODES,
     FIRST_SIGMA_PX,
     Block,
     Material,
@@ -58,14 +57,6 @@ _REMEDY = (
 
 def unknowns_of(rules: AdjustRules, lens: tuple[str, ...]) -> Unknowns:
     """Return what is free, with these lens parameters."""
-    for name in rules.lens_unknowns or ():
-        if name not in CODES:
-            raise SettingError(
-                "option.choice",
-                f"Lens parameter '{name}' is unknown. Use {', '.join(CODES)} or none.",
-                option="lens_unknowns",
-                value=name,
-            )
 
     def sigma_of(name: str, stated: float | None = None) -> float:
         """Return a standard deviation: zero fixes a parameter, infinity frees it."""

@@ -25,6 +25,9 @@ from pcfix.options.shared import (
 from pcfix.options.steps import DistanceOptions, ReferenceOption
 
 WaterUnknown = Literal["level", "tilt", "index", "shape", "distance", "centre"]
+LensUnknown = Literal[
+    "f", "cx", "cy", "b1", "b2", "p1", "p2", "k1", "k2", "k3", "k4", "k5", "k6", "k7", "k8"
+]
 WATER_UNKNOWNS: tuple[str, ...] = get_args(WaterUnknown)
 
 
@@ -105,7 +108,7 @@ class AdjustRules(IndexOptions, panel=Panel.UNKNOWNS):
     """Let the tilt move, with this standard deviation. [deg]"""
     sigma_index: float | None = option(None, above=0)
     """Let the refractive index move, with this standard deviation."""
-    lens_unknowns: tuple[str, ...] | None = option(None, parse=_lens_names, metavar="NAMES")
+    lens_unknowns: tuple[LensUnknown, ...] | None = option(None, parse=_lens_names, metavar="NAMES")
     """Unknowns of the lens: none, or some of f,cx,cy,k1...,p1,p2,b1,b2. [default: those that the
     block determines]"""
     poses: Literal["free", "fixed", "similarity"] = option("free")
