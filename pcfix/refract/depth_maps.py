@@ -58,7 +58,7 @@ from pcfix.refract.batch import (
     to_adjusted,
     to_original,
 )
-from pcfix.refract.matcher import MATCHED, WIDTH_M, Matcher
+from pcfix.refract.matcher import MATCHED, Matcher
 from pcfix.refract.rays import light_near, refracted
 from pcfix.refract.tiling import are_same
 
@@ -71,6 +71,9 @@ LIKELY, LEAST_DEPTH_M = 1.1, 0.005
 
 LEAST_CHANGE, MOST_CHANGE = 0.35, 1.5
 """Range of the change of the apparent depth with that of the bed along a ray."""
+
+WIDTH_M = 0.2
+"""Standard deviation of the beds of groups that may have made a point."""
 
 NOTHING = 14.0
 """exp(-NOTHING), a millionth, is neglected."""

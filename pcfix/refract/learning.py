@@ -12,7 +12,7 @@ from pcfix.model import Cameras, TiePoints, ViewKind
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Batch, Survey, require_orientation
 from pcfix.refract.methods import batches, on_land, with_rays
-from pcfix.refract.patches import FEWEST_WITHOUT_LIST
+from pcfix.refract.patches import FEWEST_WITHOUT_LIST, gsd_m
 from pcfix.refract.reconstructions import (
     ALIKE,
     BARE,
@@ -256,17 +256,22 @@ def with_matcher(batch: Batch, ties: TiePoints | None) -> Survey:
     return replace(survey, learned=survey.learned._replace(matcher=matcher))
 
 
+BED_POINTS = 100_000
+"""Every second point of a larger sample is enough for the bed, which most of its time goes into."""
+
+
 def _learn_bed(batch: Batch) -> Bed | None:
     """Return the bed that agrees with a sample of fused points; None if no image sees a point."""
     from pcfix.refract.depth_maps import likely_beds
     from pcfix.refract.matcher import bed_of
 
+    batch = batch.take(np.arange(0, len(batch), 2 if len(batch) > BED_POINTS else 1))
     order = spatial_order(batch.xyz)
     likely = [likely_beds(with_rays(batch.take(rows))) for rows in batches(order)]
     table = np.full((len(batch), max(part.shape[1] for part in likely)), np.nan, np.float32)
     for rows, part in zip(batches(np.arange(len(batch))), likely, strict=True):
         table[rows, : part.shape[1]] = part
-    return bed_of(batch.xyz[order], table) if np.isfinite(table).any() else None
+    return bed_of(batch.xyz[order], table, gsd_m(batch)) if np.isfinite(table).any() else None
 
 
 LEAST_TIES, LEAST_DEPTH_M = 50, 0.3

@@ -229,9 +229,11 @@ def steepest_and_partners(
     return Views(start, np.asarray(views.camera)[kept])
 
 
-POINTS_A_CELL = 20.0
-WIDTH_M = 0.2
+POINTS_A_CELL = 12.0
+WIDTH_GSD = 2.0
 """Standard deviation of the likely beds of one place: relief within a cell, and noise."""
+OUTLIER = 0.01
+"""Likelihood of a point none of whose likely beds is near, relative to one that has one there."""
 
 FAR_OFF_M = 0.4
 REACH = 2
@@ -271,10 +273,11 @@ class Bed(NamedTuple):
         return np.where(inside, total / np.where(inside, weight, 1.0), np.nan)
 
 
-def bed_of(xyz: FloatArray, likely_m: FloatArray) -> Bed:
-    """Return the bed that agrees with most apparent points, cell by cell.
+def bed_of(xyz: FloatArray, likely_m: FloatArray, gsd_m: float) -> Bed:
+    """Return the most likely bed of apparent points, cell by cell.
 
-    `likely_m`, shape (m, h), are the `pcfix.refract.depth_maps.likely_beds`.
+    `likely_m`, shape (m, h), are the `pcfix.refract.depth_maps.likely_beds`, and `gsd_m` is the
+    ground size of a pixel.
     """
     low, high = xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0)
     cell = _cell_m(xyz[:, :2], low, high)
@@ -285,7 +288,8 @@ def bed_of(xyz: FloatArray, likely_m: FloatArray) -> Bed:
     filled, counts = np.unique(key, return_counts=True)
     start = np.concatenate([[0], np.cumsum(counts)])
     found = np.empty(len(filled))
-    in_tiles(_vote, len(found), order, start, np.ascontiguousarray(xyz[:, 2]), likely_m, found)
+    z, width_m = np.ascontiguousarray(xyz[:, 2]), WIDTH_GSD * gsd_m
+    in_tiles(_most_likely, len(found), order, start, z, likely_m, width_m, found)
     height = np.full(rows * columns, np.nan)
     height[filled] = found
     grid = _without_outliers(height.reshape(rows, columns))
@@ -295,7 +299,7 @@ def bed_of(xyz: FloatArray, likely_m: FloatArray) -> Bed:
 def _without_outliers(height: FloatArray) -> FloatArray:
     """Replace a cell far from the median of its 5 x 5 surroundings by that median.
 
-    Where only one group of images sees the bed, several heights have all votes.
+    Where only one group of images sees the bed, several heights are equally likely.
     """
     row, column = np.nonzero(np.isfinite(height))
     padded, smooth = np.pad(height, REACH, constant_values=np.nan), height.copy()
@@ -319,11 +323,15 @@ def _cell_m(xy: FloatArray, low: FloatArray, high: FloatArray) -> float:
 
 
 @kernel(allocates=True)
-def _vote(
+def _most_likely(
     span: Span, order: IntArray, start: IntArray, z: FloatArray, likely: FloatArray,
-    found: FloatArray,
+    width_m: float, found: FloatArray,
 ) -> None:  # fmt: skip
-    """Find the height with most votes in each cell; a point votes for all its likely beds."""
+    """Find the most likely height of the bed in each cell.
+
+    A point comes from one of its likely beds b, all equally probable, so that the log likelihood of
+    a height z is the sum of log(OUTLIER + sum_b exp(-((b - z) / width_m)^2 / 2)) over the points.
+    """
     reach = int(3.0 * _STEPS)  # three standard deviations to both sides
     for c in range(*span):
         rows = order[start[c] : start[c + 1]]
@@ -338,17 +346,16 @@ def _vote(
         if not high >= low:
             continue
         # a histogram with bins of half a standard deviation
-        step = max(WIDTH_M / _STEPS, (high - low) / 2000.0)
-        votes = np.zeros(int((high - low) / step) + 2)
-        vote = np.empty(votes.size)
+        step = max(width_m / _STEPS, (high - low) / 2000.0)
+        total = np.zeros(int((high - low) / step) + 2)
+        own = np.empty(total.size)
         for i in rows:
-            vote[:] = 0.0
+            own[:] = OUTLIER
             for h in range(likely.shape[1]):
                 at = (likely[i, h] + z[i] - low) / step
                 if at == at:
-                    # several likely beds of a point count once
-                    for k in range(max(0, int(at) - reach), min(vote.size, int(at) + reach + 2)):
+                    for k in range(max(0, int(at) - reach), min(own.size, int(at) + reach + 2)):
                         off = (k - at) / _STEPS
-                        vote[k] = max(vote[k], np.exp(-0.5 * off * off))
-            votes += vote
-        found[c] = low + np.argmax(votes) * step
+                        own[k] += np.exp(-0.5 * off * off)
+            total += np.log(own)
+        found[c] = low + np.argmax(total) * step

@@ -406,7 +406,9 @@ def _heights(part: Batch, around: Batch, way: Reconstruction) -> FloatArray:
 
         # the bed identifies the images of a point: it must be that of other points
         likely = likely_beds(with_rays(_as(around, way)))
-        bed = bed_of(around.xyz, likely) if np.isfinite(likely).any() else None
+        bed = (
+            bed_of(around.xyz, likely, patches.gsd_m(around)) if np.isfinite(likely).any() else None
+        )
         # not interpolated, as a smooth bed would make any choice look smooth
         bed = None if bed is None else bed._replace(between=False)
         part = replace(part, survey=replace(part.survey, learned=learned._replace(bed=bed)))

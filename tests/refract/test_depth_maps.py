@@ -14,7 +14,7 @@ from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import FLAT_DEG, Batch, Chosen, Learned, Survey, images_of
 from pcfix.refract.depth_maps import Block, _compare, best_pairs, sight_of
 from pcfix.refract.learning import learn_of_sample
-from pcfix.refract.matcher import WIDTH_M, Bed, Matcher, bed_of
+from pcfix.refract.matcher import Bed, Matcher, bed_of
 from pcfix.refract.methods import correct, with_rays
 from pcfix.running import threads
 from pcfix.water.surface import is_submerged, surface_above
@@ -268,10 +268,10 @@ def test_bed_of_groups():
     right = rng.integers(0, 6, 60_000)
     likely[np.arange(60_000), right] = bed - xyz[:, 2]
     likely[rng.uniform(0, 1, likely.shape) < 0.1] = np.nan  # also some of the right ones
-    found = bed_of(xyz, likely)
-    assert 15 < 60_000 / 30**2 * found.cell_m**2 < 25  # points a cell
-    # votes are counted at every half of `WIDTH_M`, and cells fall by 1 cm
-    close = np.abs(found.height_at(xyz[:, :2]) - bed) < WIDTH_M
+    found = bed_of(xyz, likely, 0.05)
+    assert 9 < 60_000 / 30**2 * found.cell_m**2 < 15  # points a cell
+    # heights are tried at every GSD, and cells fall by 1 cm
+    close = np.abs(found.height_at(xyz[:, :2]) - bed) < 0.1
     assert close.mean() > 0.97
 
 
@@ -285,7 +285,7 @@ def test_unknown_bed():
     assert np.isnan(found.height_at(xy)[[1, 4, 5, 6]]).all()
     xyz = np.repeat([[0.0, 0, 0], [50, 0, 0]], 40, axis=0)
     likely = np.repeat([[-1.0], [np.nan]], 40, axis=0).astype(np.float32)
-    heights = bed_of(xyz, likely).height_at(xyz[:, :2])
+    heights = bed_of(xyz, likely, 0.05).height_at(xyz[:, :2])
     assert (heights[:40] == -1.0).all() and np.isnan(heights[40:]).all()
 
 
