@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from pcfix.flow.inputs import Inputs, ties_of
 from pcfix.flow.next_steps import adjust_words
 from pcfix.flow.plausibility import plausible
 from pcfix.flow.runner import check_summary, write_plot, write_summary
-from pcfix.flow.surfaces import CloudView, file_points, view_of
+from pcfix.flow.surfaces import CloudView, sample_of, view_of
 from pcfix.io.cameras.georeference import adjusted_minus_gnss
 from pcfix.io.cameras.mistakes import UNDULATION_M, likely_mistake
 from pcfix.io.clouds import check_same_crs, read_reference
@@ -74,7 +73,8 @@ def check_cameras(
     surface = None if given.water is None else inputs.surface(view).surface
     xyz, heights, problem = np.zeros((0, 3)), None, ""
     if view is not None:
-        xyz, heights = sample_of(view, SAMPLE_POINTS, surface)
+        sample = sample_of(view, SAMPLE_POINTS, surface)
+        xyz, heights = sample.xyz, sample.heights
         cameras = inputs.block(view.crs, read)[0]
     else:
         try:
@@ -150,19 +150,6 @@ def _diagnosed(
         ties=ties_of(inputs, view.crs),
     )  # fmt: skip
     return diagnose(evidence)
-
-
-def sample_of(
-    view: CloudView, most: int, water: WaterSurface | None = None
-) -> tuple[FloatArray, FloatArray | None]:
-    """Return points evenly spread over the file, and their water heights if it has any."""
-    every = max(1, view.points // most)
-    parts, heights = [], []
-    for xyz, height, *_ in file_points(Path(view.name), water):
-        parts.append(xyz[::every])
-        if height is not None:
-            heights.append(height[::every])
-    return np.vstack(parts), np.concatenate(heights) if heights else None
 
 
 def sensors_of(cameras: Cameras, above_m: FloatArray | None) -> list[Plain]:

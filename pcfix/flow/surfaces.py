@@ -141,6 +141,11 @@ def joined_points(parts: Iterable[Points]) -> Points:
     return Points(*columns)
 
 
+def sample_of(view: CloudView, most: int, water: WaterSurface | None = None) -> Points:
+    """Return about `most` points, evenly spread over a cloud."""
+    return joined_points(every(max(1, view.points // most), view.chunks(water)))
+
+
 def points_of(chunk: Chunk, source: LasSource, water: WaterSurface | None) -> Points:
     """Return the n points of a chunk."""
     heights = None
@@ -285,7 +290,7 @@ def _found(view: CloudView | None) -> FoundSurface:
     if view is None:
         text = "The water surface 'auto' is found in a cloud. Give the cloud too."
         raise SettingError("cloud.missing", text)
-    whole = joined_points(every(max(1, view.points // SAMPLE_POINTS), view.chunks()))
+    whole = sample_of(view, SAMPLE_POINTS)
     whole = whole.take(np.flatnonzero(~np.isin(whole.classes, NOISE_CLASSES)))
     water = whole.xyz[np.isin(whole.classes, WATER_CLASSES)]
     if len(water) >= LEAST_CLASSIFIED:

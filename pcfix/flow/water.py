@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.errors import shown_once
-from pcfix.flow.cameras import sample_of
 from pcfix.flow.runner import check_summary, write_plot, write_summary
 from pcfix.flow.shore import check_shoreline, write_shoreline
-from pcfix.flow.surfaces import file_points, find_surface, view_of
+from pcfix.flow.surfaces import file_points, find_surface, sample_of, view_of
 from pcfix.grid.shoreline import NearWater
 from pcfix.io.files import check_input
 from pcfix.model import FloatArray, WaterDimension
@@ -68,7 +67,7 @@ def check_water(
     found = shown_once(lambda: find_surface(spec, given, view), lambda found: found.notes)
     sample, below, unknown, shoreline = np.zeros((0, 3)), None, None, None
     if view is not None:
-        sample, _ = sample_of(view, SAMPLE_POINTS)
+        sample = sample_of(view, SAMPLE_POINTS).xyz
         if not isinstance(found.surface, WaterDimension):
             height = surface_above(found.surface, sample, None).height_m
             unknown = float(np.mean(~np.isfinite(height)))
