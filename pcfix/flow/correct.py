@@ -233,7 +233,10 @@ def correct_points(
     [[0.0, 0.0, -2.703]]
     """
     given = taken(PointsOptions, options, keywords, "correct_points")
-    all_options = CorrectOptions(**{one.name: getattr(given, one.name) for one in fields(given)})
+    xyz = checked_points(xyz)
+    surface, heights = as_surface(water, len(xyz))
+    values = {one.name: getattr(given, one.name) for one in fields(given)}
+    all_options = CorrectOptions(water=surface, **values)
     if not cameras:
         all_options.check_no_cameras()
         if not (views is None and level_offset_m is None and adjusted_from is None):
@@ -244,8 +247,6 @@ def correct_points(
                 needs="cameras",
             )
     cameras = cameras or NO_CAMERAS
-    xyz = checked_points(xyz)
-    surface, heights = as_surface(water, len(xyz))
     offset: FloatArray | None = None
     if level_offset_m is not None:
         offset = np.ascontiguousarray(level_offset_m, dtype=np.float64)

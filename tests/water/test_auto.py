@@ -89,7 +89,7 @@ def test_water_classes():
     water[:, 2] += np.random.default_rng(0).normal(0.0, 0.02, len(water))
     xyz, classes = np.vstack([xyz, water]), np.r_[np.full(len(xyz), 2), np.full(len(water), 9)]
     chunks = [Points(xyz[rows], None, classes[rows]) for rows in (slice(3_000), slice(3_000, None))]
-    view = CloudView("cloud", None, *corners(*xyz[:, :2].T), len(xyz), lambda: iter(chunks))
+    view = CloudView("cloud", None, *corners(*xyz[:, :2].T), len(xyz), lambda _: iter(chunks))
     found = find_surface("auto", WaterOptions(), view)
     assert found.evidence.level_m == pytest.approx(LEVEL_M + 1.0, abs=0.005)  # m: 5 standard errors
     assert len(found.points) == len(water)
