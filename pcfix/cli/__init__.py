@@ -43,8 +43,9 @@ def app_for(arguments: Sequence[str], *, everything: bool = False) -> App:
 def main(tokens: Sequence[str] | None = None) -> None:
     """Run the command line; a user's mistake is one line on stderr and exit code 1."""
     arguments = list(sys.argv[1:] if tokens is None else tokens)
+    ended = list[int]()
     try:
-        _end_by_signals()
+        _end_by_signals(ended)
         # Modules and kernels are hundreds of thousands of objects that stay: searching them for
         # garbage, often and at the end, took a fifth of a start.
         gc.set_threshold(50_000, 20, 50)
@@ -54,6 +55,8 @@ def main(tokens: Sequence[str] | None = None) -> None:
         words = ["pcfix", *(one for one in arguments[:1] if one in COMMANDS), "--help"]
         _stop(f"{printable(str(error))}\nTry '{' '.join(words)}'.", 2)
     except PcfixError as error:
+        if ended:  # a library that writes took the interrupt for an error of the file
+            _stop("stopped.", 128 + ended[0])
         _stop(str(error), 1)
     except UnicodeEncodeError as error:
         if error.encoding != "utf-8" or "\n" in error.object:
@@ -86,14 +89,19 @@ class _EndedError(KeyboardInterrupt):
     """Another process ends this one, which cleans up as after Ctrl-C."""
 
 
-def _end_by_signals() -> None:
-    """Let SIGTERM and SIGHUP end the process as Ctrl-C does, unless they are ignored."""
+def _end_by_signals(ended: list[int]) -> None:
+    """Let SIGTERM and SIGHUP end the process as Ctrl-C does, unless they are ignored.
+
+    The number of a signal that comes is added to `ended`.
+    """
 
     def end(number: int, frame: Any) -> None:
+        ended.append(number)
         raise _EndedError(number)
 
-    for number in (getattr(signal, one, None) for one in ("SIGTERM", "SIGHUP")):
-        if number is not None and signal.getsignal(number) is signal.SIG_DFL:
+    usual = (signal.SIG_DFL, signal.default_int_handler)
+    for number in (getattr(signal, one, None) for one in ("SIGINT", "SIGTERM", "SIGHUP")):
+        if number is not None and signal.getsignal(number) in usual:
             signal.signal(number, end)
 
 
