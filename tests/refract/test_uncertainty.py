@@ -197,7 +197,7 @@ def test_common_errors_snell(plane):
         bed, base.shift_m, surface_above(plane, bed), cameras, ScienceOptions(**vars(errors))
     )
     # in units of slope; near the middle of the block, where little is left, the mean counts
-    assert np.sqrt(cov[moved, 5].mean()) == pytest.approx(np.sqrt(both.mean()), rel=0.02)
+    assert np.sqrt(cov[moved, 5].mean()) == pytest.approx(np.sqrt(both.mean()), rel=0.03)
 
 
 def test_positive():
