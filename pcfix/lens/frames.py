@@ -210,7 +210,12 @@ def holds(frames: Frames, c: int, e: Vector) -> bool:
 
 @device
 def mark(
-    marks: FloatArray, points: FloatArray, run: int, frames: Frames, c: int, centre: FloatArray
+    marks: FloatArray,
+    points: FloatArray,
+    run: int,
+    frames: Frames,
+    c: int,
+    centre: FloatArray | Vector,
 ) -> bool:
     """Set to 1 the marks of points in the frame of camera c, to 0 those of others.
 

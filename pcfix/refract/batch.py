@@ -338,8 +338,7 @@ class Images(NamedTuple):
 
     centres: FloatArray  # (k, 3), of the original cameras, metres, world frame
     original: Optics
-    adjusted: Optics
-    same: bool  # whether both are the same: then no direction is rounded by two lenses
+    adjusted: Optics | None  # None for the same: then no direction is rounded by two lenses
 
 
 def images_of(original_model: OriginalModel | None, now: Cameras) -> Images:
@@ -353,7 +352,7 @@ def images_of(original_model: OriginalModel | None, now: Cameras) -> Images:
         and np.array_equal(np.asarray(original.rotations), np.asarray(now.rotations))
     )
     centres = np.ascontiguousarray(original.centres, np.float64)
-    return Images(centres, optics_of(original), optics_of(now), same)
+    return Images(centres, optics_of(original), None if same else optics_of(now))
 
 
 @device
@@ -362,18 +361,20 @@ def to_original(images: Images, c: int, a: Vector) -> Vector:
 
     Both in the world frame, of any length; NaN where there is no image.
     """
-    return a if images.same else _between(images.adjusted, images.original, c, a)
+    return _between(images.adjusted, images.original, c, a)
 
 
 @device
 def to_adjusted(images: Images, c: int, a: Vector) -> Vector:
     """Convert a direction of original camera c to the adjusted camera."""
-    return a if images.same else _between(images.original, images.adjusted, c, a)
+    return _between(images.original, images.adjusted, c, a)
 
 
 @device
-def _between(one: Optics, other: Optics, c: int, a: Vector) -> Vector:
+def _between(one: Optics | None, other: Optics | None, c: int, a: Vector) -> Vector:
     """Return the direction of the same place in the image for another pose and lens."""
+    if one is None or other is None:
+        return a
     u, v = image_of(one.lenses[one.row[c]], *times(one.rotations[c], a))
     seen = direction_of(other.lenses[other.row[c]], u, v)
     return transposed_times(other.rotations[c], seen)

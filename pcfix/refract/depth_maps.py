@@ -33,18 +33,24 @@ it as the seed, and computes the height of the bed if that group had made the po
 beds. Neighbouring points come from different groups, and only the true bed is among the likely ones
 of all. So the height that most points around can have come from, the bed of the surroundings
 (`pcfix.refract.matcher`), identifies the group of each point.
+
+**Speed.** A point needs some 80 light paths for each bed that is tried. A tile of points is
+processed image by image and partner by partner, so that the inner loops run over the points and are
+vectorised, in single precision, which works on twice as many at once. All places are relative to
+the apparent point: what is rounded are vectors of some 100 m, to some hundredths of a millimetre.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from pcfix.kernels import Span, device, in_tiles, kernel
-from pcfix.lens.algebra import Vector, beyond, cross, dot, minus, row_of, scaled
-from pcfix.lens.frames import holds
-from pcfix.model import FloatArray, IntArray
+from pcfix.lens.algebra import ONE, ZERO, beyond, dot, minus, row_of, scaled
+from pcfix.lens.frames import holds, mark
+from pcfix.model import BoolArray, FloatArray, IntArray, SingleArray
+from pcfix.refract import tiling
 from pcfix.refract.batch import (
     CORRECTED,
     NO_CAMERA,
@@ -54,13 +60,12 @@ from pcfix.refract.batch import (
     Images,
     Intersection,
     images_of,
-    normal_above,
     to_adjusted,
     to_original,
 )
-from pcfix.refract.matcher import MATCHED, Matcher
+from pcfix.refract.matcher import Matcher
 from pcfix.refract.rays import light_near, refracted
-from pcfix.refract.tiling import are_same
+from pcfix.refract.tiling import TILE, are_same, put, slots, three
 
 MAX_LOOKS = 5
 CLOSE_M = 0.002
@@ -81,15 +86,44 @@ NOTHING = 14.0
 AVERAGED_WITHIN = 0.012
 """Depths of neighbouring maps that differ by less, relative, are averaged before the fusion."""
 
+AGREE = 0.01
+"""Depths that differ by less, relative, are fused."""
+
+SHALLOW, DEEP = 0.3, 3.5
+"""Range of the bed of the surroundings, in likely heights; outliers have it elsewhere."""
+
+_ROUNDS, _BEDS = 4, 3
+FAR = 0.1
+"""Of the way to the bed: farther off, it is decided anew which depths were averaged."""
+
+ABSENT, _OUTSIDE = -1, -2
+_single: Any = np.float32
+_INFINITE, _NAN, _NOTHING = _single(np.inf), _single(np.nan), _single(NOTHING)
+
 _DISTANCE, AMBIGUITY, OUTCOME, _COUNT = 3, 4, 5, 6
 COLUMNS = 7
 """Columns that the kernels write: the shift, and these."""
 
-DEPTH, BY_HEIGHT, _X, _Y, _X_BY_HEIGHT, _Y_BY_HEIGHT = range(6)
-"""Rows of `Room.looks`: the depth of a bed in a map beyond P, by the distance of P from the
-camera, and its change with the height of the bed (1/m); the place on the bed, and its change."""
-
-ABSENT = -1
+# Runs of `TILE` numbers. Of the look of a bed in one depth map: the depth of that bed beyond P, by
+# the distance of P from the camera, and its change with the height of the bed (1/m); the place on
+# the bed (2), and its change (2).
+DEPTH, BY_HEIGHT, _PLACE, _PLACE_BY_HEIGHT, LOOK = slots(1, 1, 2, 2)
+# Of the points: N, the height of the water over P along N, and the height of the bed. Of one map:
+# the vector to its projection centre, the ray u and its length, Q, what the change of the depth
+# with the bed depends on (3). Of one partner: the direction w, whether it sees Q; the only depth,
+# how many partners see Q, the least cost, and the sums of the mean.
+(
+    _NORMAL, _ABOVE, BED, _UP, _RAY, _LENGTH, _Q, _AWAY, _WATER, _STEEP, _W, _SEES, _SOLE, _SEEN,
+    _LEAST, _TOTAL, BEST, ROOM,
+) = slots(3, 1, 1, 3, 3, 1, 3, 1, 1, 1, 3, 1, 1, 1, 1, 1, 1)  # fmt: skip
+# Of a partner: the depth beyond P along the ray (m), its squared residual (px^2), and half the
+# curvature of that (px^2/m^2). Of a pair: its squared residual, and its depth.
+_AT, _SQUARES, _CURVATURE, PARTNER = slots(1, 1, 1)
+_COST, _PAIR_AT, PAIR = slots(1, 1)
+# Of the points in double precision, after those of `tiling.gather`: P in the original model.
+_ORIGINAL, _POINT = 7, 10
+# Of the search: the step of the bed, and sums over the maps.
+_STEP, _WEIGHT, _CHANGE, _X, _Y, _SQUARE, _MAPS, SEARCH = slots(1, 1, 1, 1, 1, 1, 1)
 
 
 class Block(NamedTuple):
@@ -101,240 +135,27 @@ class Block(NamedTuple):
     offset_m: float  # how much higher the water stood, mean over all images
 
 
-class Sight(NamedTuple):
-    """One apparent point, for kernels."""
+class Tile(NamedTuple):
+    """Arrays of a tile of points, for kernels; runs of `TILE` numbers, see above."""
 
-    now: Vector  # its place, world frame
-    original: Vector  # the same in the original model
-    above: float  # height of the water over it, along the normal, metres
-    normal: Vector  # of the water, upward
-
-
-class Room(NamedTuple):
-    """Temporary arrays for one point and the k images."""
-
-    weight: FloatArray  # (k,), of each map, with what is averaged into it
-    looks: FloatArray  # (6, k), of `_look`
-    partners: FloatArray  # (partners, 3), of `_compare`
-    pairs: FloatArray  # (pairs of partners, 2), of `best_pairs`
-
-
-@device
-def sight_of(points: Chosen, i: int) -> Sight:
-    """Return point i."""
-    normal = normal_above(points, i)
-    above = normal[2] * (points.height[i] - points.xyz[i, 2])
-    return Sight(row_of(points.xyz, i), row_of(points.original_xyz, i), above, normal)
-
-
-@device(forceinline=True)
-def original_up(sight: Sight, block: Block, c: int) -> Vector:
-    """Return the vector from the point to the projection centre, both of the original model."""
-    return minus(row_of(block.images.centres, c), sight.original)
+    points: FloatArray  # (`_POINT`,)
+    room: SingleArray  # (`ROOM`,)
+    partners: SingleArray  # (p, `PARTNER`)
+    pairs: SingleArray  # (p (p - 1) / 2, `PAIR`)
+    looks: SingleArray  # (k, `LOOK`), of the images near the tile
+    search: FloatArray  # (`SEARCH`,)
+    going: BoolArray  # (`TILE`,), whether the bed is searched
+    row: IntArray  # (k,), of each image in `looks`
 
 
 class Lines(NamedTuple):
-    """The depth of each map as a linear function of the height of the bed; NaN without one."""
+    """The depths of the maps of one point as linear functions of the height of the bed.
 
-    bed: float  # a height of the bed, relative to the apparent point, metres
-    t: FloatArray  # (maps,), the depth of that bed; see `DEPTH`
+    NaN where there is none.
+    """
+
+    t: FloatArray  # (maps,), the depth of a bed; see `DEPTH`
     slope: FloatArray  # its change with the height, 1/m
-
-
-@device
-def look(
-    maps: IntArray, weight: FloatArray, bed: float, sight: Sight, block: Block, room: Room
-) -> None:
-    """Compute the depths of a bed in the maps of those images that have a weight; see `_look`."""
-    for q in range(maps.size):
-        if weight[q] > 0.0:
-            _look(room.looks[:, q], maps[q], bed, sight, block, room)
-
-
-@device
-def lines_at(bed: float, maps: IntArray, sight: Sight, block: Block, room: Room) -> Lines:
-    """Return the lines of the depth maps of some images about a bed."""
-    room.weight[: maps.size] = 1.0
-    look(maps, room.weight, bed, sight, block, room)
-    return Lines(bed, room.looks[DEPTH, : maps.size], room.looks[BY_HEIGHT, : maps.size])
-
-
-@device
-def likely_bed(sight: Sight, block: Block) -> float:
-    """Return a likely height of the bed, relative to the apparent point."""
-    above = sight.above + sight.normal[2] * block.offset_m
-    return -LIKELY * max(above, LEAST_DEPTH_M) / sight.normal[2] * (block.points.n - 1.0)
-
-
-@device
-def balance(t: FloatArray, slope: FloatArray, weight: FloatArray) -> float:
-    """Return how far up the bed is at which the weighted mean of the depths is zero."""
-    total, change = 0.0, 0.0
-    for q in range(t.size):
-        if weight[q] > 0.0 and slope[q] == slope[q]:
-            total, change = total + weight[q] * t[q], change + weight[q] * slope[q]
-    return -total / change
-
-
-@device
-def settle_bed(
-    row: FloatArray, maps: IntArray, weight: FloatArray, depths: Lines, sight: Sight,
-    block: Block, room: Room,
-) -> None:  # fmt: skip
-    """Find the height of the bed at which the fused depths give the apparent point; write the row.
-
-    Starts from the lines that were computed last and repeats until the steps are small.
-    """
-    row[OUTCOME] = NO_CAMERA if maps.size == 0 else ONE_CAMERA
-    bed, looks = depths.bed, room.looks
-    step = balance(depths.t, depths.slope, weight)
-    for _ in range(MAX_LOOKS):
-        # no image with a weight sees the bed
-        if not np.isfinite(step):
-            return
-        if abs(step) <= CLOSE_M:
-            break
-        bed += step
-        look(maps, weight, bed, sight, block, room)
-        step = balance(depths.t, depths.slope, weight)
-    # the true point is the weighted mean of the Q_i, moved by the rest of the step
-    total, x, y, squares, count = 0.0, 0.0, 0.0, 0.0, 0.0
-    for q in range(maps.size):
-        if weight[q] > 0.0 and looks[BY_HEIGHT, q] == looks[BY_HEIGHT, q]:
-            w, px = weight[q], looks[_X, q] + step * looks[_X_BY_HEIGHT, q]
-            py = looks[_Y, q] + step * looks[_Y_BY_HEIGHT, q]
-            total, x, y = total + w, x + w * px, y + w * py
-            squares, count = squares + w * (px * px + py * py), count + 1.0
-    if not (np.isfinite(step) and np.isfinite(squares)):
-        return
-    row[0], row[1], row[2] = x / total, y / total, bed + step
-    row[_DISTANCE] = np.sqrt(max(squares / total - row[0] ** 2 - row[1] ** 2, 0.0))
-    row[OUTCOME], row[_COUNT] = CORRECTED, count
-
-
-@device(forceinline=True)
-def _look(out: FloatArray, c: int, bed: float, sight: Sight, block: Block, room: Room) -> None:
-    """Compute the depth of a bed, at a height relative to the apparent point P, in one depth map.
-
-    Its change with the height is approximate. NaN where no partner of image c sees the bed there.
-    """
-    n, normal = block.points.n, sight.normal
-    a, e, above = _ray(c, sight, block)
-    # H and L^2; f leads to the piercing point, as in `rays`
-    across, length2 = dot(normal, e), dot(e, e)
-    per_across = 1.0 / across
-    f, bend = (above * per_across, 1.0 / n) if above > 0.0 else (0.0, 1.0)
-    d = refracted(e, length2, normal, across, bend)
-    a, down = beyond(a, f, e), 1.0 / d[2]
-    s = (bed - a[2]) * down  # along the refracted ray from the water to the bed
-    q = a[0] + s * d[0], a[1] + s * d[1], bed
-    out[_X], out[_Y] = q[0], q[1]
-    out[_X_BY_HEIGHT], out[_Y_BY_HEIGHT] = d[0] * down, d[1] * down
-    up = original_up(sight, block, c)
-    length = np.sqrt(dot(up, up))
-    count = _compare(room.partners, c, q, length, sight, block)
-    t = best_pairs(room.partners[:count], room.pairs, block.matcher.tolerance_px2)
-    out[DEPTH] = t / length
-    # the change of the depth with the bed is nearly that of the whole water column
-    away, depth = np.sqrt(length2), dot(normal, minus(a, q))
-    per_depth = away * per_across
-    change = (t + f * away) / depth if depth > LEAST_DEPTH_M else per_depth / n
-    change = min(max(change, LEAST_CHANGE * per_depth), MOST_CHANGE * per_depth)
-    out[BY_HEIGHT] = -change / length if t == t else np.nan
-
-
-@device(forceinline=True)
-def _ray(c: int, sight: Sight, block: Block) -> tuple[Vector, Vector, float]:
-    """Return the ray on which image c shows the point.
-
-    Its nearest place to the point, relative to the point; the vector from there to the projection
-    centre; and the height of the water over that place, metres.
-    """
-    up = minus(row_of(block.points.centres, c), sight.now)
-    above = sight.above + sight.normal[2] * block.points.offset[c]
-    if block.images.same:
-        return (0.0, 0.0, 0.0), up, above
-    # the ray of the original image, in the adjusted camera
-    d = to_adjusted(block.images, c, scaled(-1.0, original_up(sight, block, c)))
-    e = scaled(dot(up, d) / dot(d, d), d)
-    a = minus(up, e)
-    return a, e, above - dot(sight.normal, a)
-
-
-@device
-def _compare(
-    partners: FloatArray, c: int, q: Vector, length: float, sight: Sight, block: Block
-) -> int:
-    """Write what the partners of image c see of a bed at Q; return how many see it.
-
-    The depth beyond P along the ray of c (m), its squared residual (px^2) and half the curvature of
-    that (px^2/m^2). The light path is the true one; its direction in the image, P and the ray are
-    those of the original model.
-    """
-    points, matcher, original = block.points, block.matcher, original_up(sight, block, c)
-    u, count = scaled(-1.0 / length, original), 0
-    for j in matcher.matched[c]:
-        if j < 0:
-            break
-        up = minus(row_of(points.centres, j), sight.now)
-        above = sight.above + sight.normal[2] * points.offset[j]
-        k, _, _, _, s = light_near(q, up, sight.normal, above, points.n)
-        w = to_original(block.images, j, minus(scaled(k, s), sight.normal))
-        sees = dot(sight.normal, up) > above and holds(matcher.inner, j, scaled(-1.0, w))
-        if not sees:
-            continue
-        # where the ray w of j is nearest to u; it has any length
-        base, across = minus(original, original_up(sight, block, j)), cross(u, w)
-        sine2, along, w2 = dot(across, across), dot(u, w), dot(w, w)
-        away = (dot(base, w) * along - dot(base, u) * w2) / sine2
-        # pixels per metre at that place, by the length of w, as the image of j sees it
-        scale = matcher.focal_px[j] / (dot(base, w) + away * along)
-        off = scale * dot(base, across)
-        partners[count, 0], partners[count, 1] = away - length, off * off * w2 / sine2
-        partners[count, 2] = scale * scale * sine2
-        count += 1
-    return count
-
-
-@device
-def best_pairs(partners: FloatArray, pairs: FloatArray, tolerance: float) -> float:
-    """Return the depth at which two images agree best, as a weighted mean over the pairs.
-
-    See `_compare`. NaN without a partner; of a single partner its own depth. `pairs` gets the
-    squared residuals of two images at their common depth, and that depth.
-    """
-    count, least = 0, np.inf
-    if len(partners) < 2:
-        return partners[0, 0] if len(partners) else np.nan
-    for p in range(len(partners)):
-        for q in range(p + 1, len(partners)):
-            a, b = partners[p, 2], partners[q, 2]
-            # the minimum of the sum of two parabolas
-            off, share = partners[q, 0] - partners[p, 0], b / (a + b)
-            cost = partners[p, 1] + partners[q, 1] + a * share * off * off
-            pairs[count, 0], pairs[count, 1] = cost, partners[p, 0] + share * off
-            least, count = min(least, cost), count + 1
-    total, sum_t = 0.0, 0.0
-    for p in range(count):
-        # the weights fall off by e for each `tolerance` of squared residuals
-        worse = (pairs[p, 0] - least) / tolerance
-        if worse < NOTHING:
-            w = np.exp(-worse)
-            total, sum_t = total + w, sum_t + w * pairs[p, 1]
-    return sum_t / total
-
-
-AGREE = 0.01
-"""Depths that differ by less, relative, are fused."""
-
-SHALLOW, DEEP = 0.3, 3.5
-"""Range of the bed of the surroundings, in likely heights; outliers have it elsewhere."""
-
-_ROUNDS, _BEDS = 4, 3
-FAR = 0.1
-"""Of the way to the bed: farther off, it is decided anew which depths were averaged."""
-
-_OUTSIDE = -2
 
 
 def invert_depth_maps(batch: Batch) -> Intersection:
@@ -382,8 +203,352 @@ def _invert_all(
     points = batch.chosen()
     block = Block(points, images, matcher, float(points.offset.mean()))
     in_tiles(
-        _invert_tile, len(batch), block, listed, given, result, likely, points=len(batch)
+        _invert_tiles, tiling.tiles_of(batch), tiling.spatial_order(batch.xyz), block, listed,
+        given, result, likely, points=len(batch),
     )  # fmt: skip
+
+
+@kernel(allocates=True)
+def _invert_tiles(
+    span: Span, order: IntArray, block: Block, listed: bool, given: FloatArray,
+    result: FloatArray, likely: FloatArray,
+) -> None:  # fmt: skip
+    """Invert the fusion of the points of some tiles or, where `likely` has rows, fill these in.
+
+    With lists `given` are the weights of their entries, if there are any; without, the heights of
+    the bed of the surroundings.
+    """
+    points, matcher = block.points, block.matcher
+    k, most = matcher.matched.shape
+    tile = room_of_tile(k, most)
+    groups = Groups(
+        np.full((k, matcher.averaged.shape[1] + 1), ABSENT),
+        np.full((k, matcher.fused.shape[1] + 1), ABSENT),
+        np.full(k, ABSENT), np.empty(k), np.empty(k), np.empty(k), np.empty(k), np.empty(k),
+        np.empty(k), np.empty(k), np.empty(k), np.empty(k),
+    )  # fmt: skip
+    for t in range(*span):
+        rows = order[t * TILE : (t + 1) * TILE]
+        start_tile(tile, rows, given[:0] if listed or len(likely) else given, block)
+        # the maps of each point, and the images near the tile with what each counts for each point
+        start, camera, each = points.start, points.camera, rows
+        if listed:
+            start, camera = _with_neighbours(rows, groups.place, tile, block)
+            each = np.arange(rows.size)
+        near, weights = tiling.marks_of_lists(start, camera, each, k)
+        for q in range(near.size):
+            tile.row[near[q]] = q
+        maps = Maps(rows, each, start, camera, near, weights)
+        if listed:
+            _weigh_listed(maps, given, groups, tile, block)
+        else:
+            look(tile, near, weights, block)
+            _weigh_groups(maps, given, result, likely, groups, tile, block)
+        if not len(likely):
+            _settle(tile, near, weights, block)
+            _finish(result, maps, tile)
+
+
+class Maps(NamedTuple):
+    """The depth maps of the points of a tile, for kernels."""
+
+    rows: IntArray  # (m,), the rows of the points
+    each: IntArray  # (m,), the maps of a point are camera[start[each[j]] : start[each[j] + 1]]
+    start: IntArray
+    camera: IntArray
+    near: IntArray  # (k,), the images of all these maps
+    weights: FloatArray  # (k, m), what each map counts for each point
+
+
+@device(allocates=True)
+def room_of_tile(k: int, partners: int) -> Tile:
+    """Return arrays for a tile of points and k images with so many partners at most."""
+    return Tile(
+        np.empty(_POINT * TILE),
+        np.empty(ROOM * TILE, np.float32),
+        np.empty((partners, PARTNER * TILE), np.float32),
+        np.empty((partners * (partners - 1) // 2, PAIR * TILE), np.float32),
+        np.empty((k, LOOK * TILE), np.float32),
+        np.empty(SEARCH * TILE),
+        np.empty(TILE, np.bool_),
+        np.full(k, ABSENT),
+    )
+
+
+@device(allocates=True)
+def start_tile(tile: Tile, rows: IntArray, around: FloatArray, block: Block) -> None:
+    """Fill in the points of a tile, with a likely bed or, where it is known, that around them."""
+    points, room = block.points, tile.room
+    tiling.gather(tile.points, rows, points)
+    for j in range(rows.size):
+        normal, z = three(tile.points, 4 * TILE + j), tile.points[2 * TILE + j]
+        above = normal[2] * (tile.points[3 * TILE + j] - z)
+        put(tile.points, _ORIGINAL * TILE + j, row_of(points.original_xyz, rows[j]))
+        put(room, _NORMAL * TILE + j, normal)
+        room[_ABOVE * TILE + j] = above
+        depth = max(above + normal[2] * block.offset_m, LEAST_DEPTH_M) / normal[2]
+        bed = -LIKELY * depth * (points.n - 1.0)
+        if around.size and around[rows[j]] == around[rows[j]]:
+            bed = max(min(around[rows[j]] - z, SHALLOW * bed), DEEP * bed)
+        room[BED * TILE + j], tile.going[j] = bed, True
+
+
+@device
+def look(tile: Tile, near: IntArray, weights: FloatArray, block: Block) -> None:
+    """Compute the depths of the beds of a tile in the maps of images; see `LOOK`.
+
+    Of those maps, one row of the weights each, that count for a point whose bed is searched.
+    """
+    for k in range(near.size):
+        counts = False
+        for j in range(weights.shape[1]):
+            counts |= (weights[k, j] > 0.0) & tile.going[j]
+        if counts:
+            _look(tile.looks[k], near[k], weights.shape[1], tile, block)
+
+
+@device
+def _look(out: SingleArray, c: int, count: int, tile: Tile, block: Block) -> None:
+    """Compute the depths of the beds of all points of a tile in one depth map.
+
+    Their change with the height is approximate. NaN where no partner of image c sees the bed.
+    """
+    room, partners, matched = tile.room, 0, block.matcher.matched[c]
+    _aim(out, c, count, tile, block)
+    for partner in matched:
+        if partner >= 0:
+            _compare(tile.partners[partners], c, partner, count, tile, block)
+            partners += 1
+    best_pairs(room, tile.partners[:partners], tile.pairs, count, block.matcher.tolerance_px2)
+    for j in range(count):
+        # the change of the depth with the bed is nearly that of the whole water column
+        t, per_depth, depth = (
+            room[BEST * TILE + j],
+            room[_STEEP * TILE + j],
+            room[_WATER * TILE + j],
+        )
+        change = (t + room[_AWAY * TILE + j]) / depth
+        change = change if depth > LEAST_DEPTH_M else per_depth / block.points.n
+        change = min(max(change, LEAST_CHANGE * per_depth), MOST_CHANGE * per_depth)
+        per_length = 1.0 / room[_LENGTH * TILE + j]
+        out[DEPTH * TILE + j] = t * per_length
+        out[BY_HEIGHT * TILE + j] = -change * per_length if t == t else np.nan
+
+
+@device
+def _aim(out: SingleArray, c: int, count: int, tile: Tile, block: Block) -> None:
+    """Follow the ray on which one image shows each point to the bed."""
+    points, images, room = block.points, block.images, tile.room
+    centre, original, n = row_of(points.centres, c), row_of(images.centres, c), points.n
+    for j in range(count):
+        normal, bed = three(tile.points, 4 * TILE + j), room[BED * TILE + j]
+        p = three(tile.points, j)
+        up, way = minus(centre, p), minus(original, three(tile.points, _ORIGINAL * TILE + j))
+        above = normal[2] * (tile.points[3 * TILE + j] - (p[2] - points.offset[c]))
+        # the ray of the original image in the adjusted camera, from where it passes the point
+        d = to_adjusted(images, c, scaled(-1.0, way))
+        e = scaled(dot(up, d) / dot(d, d), d)
+        a = minus(up, e)
+        above -= dot(normal, a)
+        # H and L^2; f leads to the piercing point, as in `rays`
+        across, length2 = dot(normal, e), dot(e, e)
+        per_across, length = 1.0 / across, np.sqrt(dot(way, way))
+        f = above * per_across if above > 0.0 else 0.0
+        d = refracted(e, length2, normal, across, 1.0 / n if above > 0.0 else 1.0)
+        a, down = beyond(a, f, e), 1.0 / d[2]
+        s = (bed - a[2]) * down  # along the refracted ray from the water to the bed
+        q = a[0] + s * d[0], a[1] + s * d[1], bed
+        out[_PLACE * TILE + j], out[(_PLACE + 1) * TILE + j] = q[0], q[1]
+        out[_PLACE_BY_HEIGHT * TILE + j] = d[0] * down
+        out[(_PLACE_BY_HEIGHT + 1) * TILE + j] = d[1] * down
+        put(room, _UP * TILE + j, up)
+        put(room, _RAY * TILE + j, scaled(-1.0 / length, way))
+        put(room, _Q * TILE + j, q)
+        away = np.sqrt(length2)
+        room[_LENGTH * TILE + j], room[_AWAY * TILE + j] = length, f * away
+        room[_WATER * TILE + j] = dot(normal, minus(a, q))
+        room[_STEEP * TILE + j] = away * per_across
+
+
+@device
+def _compare(
+    partner: SingleArray, c: int, other: int, count: int, tile: Tile, block: Block
+) -> None:
+    """Set what another image than c sees of the bed at Q; see `PARTNER`.
+
+    The light path is the true one; its direction in the image, P and the ray of image c are those
+    of the original model.
+    """
+    points, images, matcher, room = block.points, block.images, block.matcher, tile.room
+    x, y, z = minus(row_of(points.centres, c), row_of(points.centres, other))
+    base = _single(x), _single(y), _single(z)
+    n, offset = _single(points.n), _single(points.offset[other])
+    for j in range(count):
+        normal = three(room, _NORMAL * TILE + j)
+        up = minus(three(room, _UP * TILE + j), base)
+        above = room[_ABOVE * TILE + j] + normal[2] * offset
+        k, _, _, _, s = light_near(three(room, _Q * TILE + j), up, normal, above, n)
+        # a camera under the water sees nothing
+        k = k if dot(normal, up) > above else _NAN
+        put(room, _W * TILE + j, to_original(images, other, minus(scaled(k, s), normal)))
+    # frames hold places relative to the camera, here w
+    sees = room[_SEES * TILE : _SEES * TILE + count]
+    mark(sees, room[_W * TILE :], TILE, matcher.inner, other, (0.0, 0.0, 0.0))
+    x, y, z = minus(row_of(images.centres, c), row_of(images.centres, other))
+    base, focal_px = (_single(x), _single(y), _single(z)), _single(matcher.focal_px[other])
+    for j in range(count):
+        u, w = three(room, _RAY * TILE + j), three(room, _W * TILE + j)
+        # from P to the other centre, both of the original model
+        up = minus(scaled(-room[_LENGTH * TILE + j], u), base)
+        per_w2, along, back = ONE / dot(w, w), dot(u, w), dot(up, w)
+        # from P to the nearest place on the ray w, and u across that
+        r, across = beyond(up, -back * per_w2, w), beyond(u, -along * per_w2, w)
+        sine2 = dot(across, across)
+        # the depth t at which u is nearest to the ray, how far they pass each other, and the
+        # pixels for a metre there
+        t = dot(r, across) / sine2
+        miss, away = beyond(r, -t, across), t * along - back
+        scale2 = focal_px * focal_px / (away * away * per_w2)
+        partner[_AT * TILE + j] = t if sees[j] > ZERO else ZERO
+        partner[_SQUARES * TILE + j] = scale2 * dot(miss, miss) if sees[j] > ZERO else _INFINITE
+        partner[_CURVATURE * TILE + j] = scale2 * sine2 if sees[j] > ZERO else ONE
+
+
+@device
+def best_pairs(
+    room: SingleArray, partners: SingleArray, pairs: SingleArray, count: int, tolerance: float
+) -> None:
+    """Set the depths at which two images agree best, as weighted means over the pairs.
+
+    NaN without a partner that sees the bed; of a single one its own depth.
+    """
+    room[_SOLE * TILE : ROOM * TILE] = ZERO
+    room[_LEAST * TILE : _TOTAL * TILE] = _INFINITE
+    for p in range(len(partners)):
+        _count_partner(room, partners[p], count)
+    at = 0
+    for p in range(len(partners)):
+        for q in range(p + 1, len(partners)):
+            _agree_best(pairs[at], partners[p], partners[q], room, count)
+            at += 1
+    for p in range(at):
+        _add_pair(room, pairs[p], count, _single(tolerance))
+    for j in range(count):
+        seen = room[_SEEN * TILE + j]
+        mean = room[BEST * TILE + j] / room[_TOTAL * TILE + j]
+        sole = room[_SOLE * TILE + j] if seen > ZERO else _NAN
+        room[BEST * TILE + j] = mean if seen > ONE else sole
+
+
+@device
+def _count_partner(room: SingleArray, partner: SingleArray, count: int) -> None:
+    """Count a partner that sees the bed, and note its depth."""
+    for j in range(count):
+        sees = partner[_SQUARES * TILE + j] < _INFINITE
+        room[_SEEN * TILE + j] += ONE if sees else ZERO
+        room[_SOLE * TILE + j] += partner[_AT * TILE + j]
+
+
+@device
+def _agree_best(
+    pair: SingleArray, a: SingleArray, b: SingleArray, room: SingleArray, count: int
+) -> None:
+    """Find the depth at which two partners agree best: the minimum of the sum of two parabolas."""
+    for j in range(count):
+        bow_a, bow_b = a[_CURVATURE * TILE + j], b[_CURVATURE * TILE + j]
+        off, share = b[_AT * TILE + j] - a[_AT * TILE + j], bow_b / (bow_a + bow_b)
+        cost = a[_SQUARES * TILE + j] + b[_SQUARES * TILE + j] + bow_a * share * off * off
+        pair[_COST * TILE + j], pair[_PAIR_AT * TILE + j] = cost, a[_AT * TILE + j] + share * off
+        room[_LEAST * TILE + j] = min(room[_LEAST * TILE + j], cost)
+
+
+_HALF, _THIRD, _FOURTH, _FIFTH, _SIXTH, _SIXTEENTH = (_single(1.0 / n) for n in (2, 3, 4, 5, 6, 16))
+
+
+@device
+def _add_pair(room: SingleArray, pair: SingleArray, count: int, tolerance: float) -> None:
+    """Add the depth of a pair with its weight, which falls by e for each `tolerance`."""
+    for j in range(count):
+        worse = (pair[_COST * TILE + j] - room[_LEAST * TILE + j]) / tolerance
+        # exp(-x) as the sixteenth power of the Taylor series of exp(-x / 16), which vectorises
+        x = worse * _SIXTEENTH
+        w = ONE - x * _FIFTH * (ONE - x * _SIXTH)
+        w = ONE - x * (ONE - x * _HALF * (ONE - x * _THIRD * (ONE - x * _FOURTH * w)))
+        w *= w
+        w *= w
+        w *= w
+        w *= w
+        w = w if worse < _NOTHING else ZERO
+        room[_TOTAL * TILE + j] += w
+        room[BEST * TILE + j] += w * pair[_PAIR_AT * TILE + j]
+
+
+@device
+def _sum_lines(search: FloatArray, looks: SingleArray, weights: FloatArray) -> None:
+    """Set how far up the bed of each point is at which the weighted mean of the depths is zero."""
+    search[: _X * TILE] = 0.0
+    for k in range(len(weights)):
+        depth, change, weight = looks[k, DEPTH * TILE :], looks[k, BY_HEIGHT * TILE :], weights[k]
+        for j in range(weight.size):
+            counts = (weight[j] > 0.0) & (change[j] == change[j])
+            search[_STEP * TILE + j] -= weight[j] * depth[j] if counts else 0.0
+            search[_CHANGE * TILE + j] += weight[j] * change[j] if counts else 0.0
+    for j in range(weights.shape[1]):
+        search[_STEP * TILE + j] /= search[_CHANGE * TILE + j]
+
+
+@device
+def _settle(tile: Tile, near: IntArray, weights: FloatArray, block: Block) -> None:
+    """Find the height of the bed at which the fused depths give the apparent point.
+
+    Starts from the looks at hand and repeats until the steps are small.
+    """
+    room, step = tile.room, tile.search[_STEP * TILE :]
+    _sum_lines(tile.search, tile.looks, weights)
+    for _ in range(MAX_LOOKS):
+        searched = False
+        for j in range(weights.shape[1]):
+            # NaN where no image with a weight sees the bed
+            tile.going[j] = np.isfinite(step[j]) and abs(step[j]) > CLOSE_M
+            if tile.going[j]:
+                room[BED * TILE + j] += step[j]
+                searched = True
+        if not searched:
+            break
+        look(tile, near, weights, block)
+        _sum_lines(tile.search, tile.looks, weights)
+
+
+@device
+def _finish(result: FloatArray, maps: Maps, tile: Tile) -> None:
+    """Write the rows: the weighted mean of the Q, moved by the rest of the step."""
+    search, weights = tile.search, maps.weights
+    search[_WEIGHT * TILE : _CHANGE * TILE] = 0.0
+    search[_X * TILE :] = 0.0
+    for k in range(len(weights)):
+        look, weight = tile.looks[k], weights[k]
+        for j in range(weight.size):
+            change = look[BY_HEIGHT * TILE + j]
+            counts = (weight[j] > 0.0) & (change == change)
+            w, step = weight[j] if counts else 0.0, search[_STEP * TILE + j]
+            x = look[_PLACE * TILE + j] + step * look[_PLACE_BY_HEIGHT * TILE + j]
+            y = look[(_PLACE + 1) * TILE + j] + step * look[(_PLACE_BY_HEIGHT + 1) * TILE + j]
+            x, y = (x, y) if counts else (0.0, 0.0)
+            search[_WEIGHT * TILE + j] += w
+            search[_X * TILE + j] += w * x
+            search[_Y * TILE + j] += w * y
+            search[_SQUARE * TILE + j] += w * (x * x + y * y)
+            search[_MAPS * TILE + j] += 1.0 if counts else 0.0
+    for j in range(weights.shape[1]):
+        row, at, step = result[maps.rows[j]], maps.each[j], search[_STEP * TILE + j]
+        row[OUTCOME] = ONE_CAMERA if maps.start[at + 1] > maps.start[at] else NO_CAMERA
+        per_weight = 1.0 / search[_WEIGHT * TILE + j]
+        square = search[_SQUARE * TILE + j] * per_weight
+        if np.isfinite(step) and np.isfinite(square):
+            x, y = search[_X * TILE + j] * per_weight, search[_Y * TILE + j] * per_weight
+            row[0], row[1], row[2] = x, y, tile.room[BED * TILE + j] + step
+            row[_DISTANCE] = np.sqrt(max(square - x * x - y * y, 0.0))
+            row[OUTCOME], row[_COUNT] = CORRECTED, search[_MAPS * TILE + j]
 
 
 class Groups(NamedTuple):
@@ -392,13 +557,74 @@ class Groups(NamedTuple):
     averaged: IntArray  # (k, 9), each map and its partners by their places; -1 after the last
     fused: IntArray  # (k, 13), likewise
     place: IntArray  # (k,), of each image among those of the point, or `ABSENT`
-    found: IntArray  # (k,), the images of a point with a list
-    share: FloatArray  # (k,), the weight of each map
+    t: FloatArray  # (k,), of `Lines`
+    slope: FloatArray  # (k,)
+    weight: FloatArray  # (k,), of each map, with what is averaged into it
+    share: FloatArray  # (k,), the weight of each map by itself
     depth: FloatArray  # (k,), the averaged depth of each map, relative
     change: FloatArray  # (k,), its change with the height of the bed, 1/m
     rise: FloatArray  # (k,), how far up the bed is if the group of a seed made the point, metres
     size: FloatArray  # (k,), the number of maps in the group
     own: FloatArray  # (k,), the depth of each map before it is averaged
+
+
+@device
+def _weigh_groups(
+    maps: Maps, around: FloatArray, result: FloatArray, likely: FloatArray, groups: Groups,
+    tile: Tile, block: Block,
+) -> None:  # fmt: skip
+    """Set the weights of the maps of the group that made each point, or its likely beds.
+
+    `around` are the heights of the bed of the surroundings.
+    """
+    before = maps.camera[:0]
+    for j in range(maps.rows.size):
+        i, at, bed = maps.rows[j], maps.each[j], tile.room[BED * TILE + j]
+        cameras = maps.camera[maps.start[at] : maps.start[at + 1]]
+        # points with the same cameras share their groups
+        if not are_same(cameras, before):
+            _group(groups, cameras, block.matcher)
+        before = cameras
+        depths = _lines_of(groups, cameras, j, tile)
+        for q in range(cameras.size):
+            # the pixel on the ground grows with the distance
+            groups.share[q] = _per_square(cameras[q], j, tile, block)
+        _set_rises(groups, depths)
+        if len(likely):
+            for seed in range(cameras.size):
+                if depths.slope[seed] == depths.slope[seed]:
+                    likely[i, seed] = bed + groups.rise[seed]
+            continue
+        wanted = around[i] - tile.points[2 * TILE + j] - bed
+        seed, rise, result[i, AMBIGUITY] = _best_seed(groups, depths, wanted)
+        groups.weight[: cameras.size] = 0.0
+        if seed >= 0:
+            # a map that agrees shares its weight with the maps it was averaged with
+            _move(groups, depths, rise)
+            _average_around(seed, groups, depths)
+            for q in groups.fused[seed]:
+                if q >= 0 and abs(groups.depth[q] - groups.depth[seed]) < AGREE:
+                    _share(q, groups.share[q], groups)
+        for q in range(cameras.size):
+            maps.weights[tile.row[cameras[q]], j] = groups.weight[q]
+
+
+@device
+def _per_square(c: int, j: int, tile: Tile, block: Block) -> float:
+    """Return the weight of the map of image c: one by the squared distance of the point."""
+    p = three(tile.points, _ORIGINAL * TILE + j)
+    up = minus(row_of(block.images.centres, c), p)
+    return 1.0 / dot(up, up)
+
+
+@device
+def _lines_of(groups: Groups, maps: IntArray, j: int, tile: Tile) -> Lines:
+    """Return the lines of the maps of a point about the bed of the last look."""
+    for q in range(maps.size):
+        k = tile.row[maps[q]]
+        groups.t[q] = tile.looks[k, DEPTH * TILE + j]
+        groups.slope[q] = tile.looks[k, BY_HEIGHT * TILE + j]
+    return Lines(groups.t[: maps.size], groups.slope[: maps.size])
 
 
 @device
@@ -423,107 +649,15 @@ def _place(members: IntArray, q: int, others: IntArray, place: IntArray) -> None
     members[count:] = ABSENT
 
 
-@kernel(allocates=True)
-def _invert_tile(
-    span: Span, block: Block, listed: bool, given: FloatArray, result: FloatArray,
-    likely: FloatArray,
-) -> None:  # fmt: skip
-    """Invert the fusion of some points or, where `likely` has rows, fill these in.
-
-    With lists `given` are the weights of their entries, if there are any; without, the heights of
-    the bed of the surroundings.
-    """
-    matcher, k = block.matcher, len(block.points.centres)
-    room = Room(
-        np.empty(k), np.empty((6, k)), np.empty((MATCHED, 3)), np.empty((MATCHED * MATCHED, 2))
-    )
-    groups = Groups(
-        np.full((k, matcher.averaged.shape[1] + 1), ABSENT),
-        np.full((k, matcher.fused.shape[1] + 1), ABSENT),
-        np.full(k, ABSENT), np.empty(k, np.int64), np.empty(k), np.empty(k), np.empty(k),
-        np.empty(k), np.empty(k), np.empty(k),
-    )  # fmt: skip
-    _invert_points(span, listed, given, result, likely, groups, block, room)
-
-
 @device
-def _invert_points(
-    span: Span, listed: bool, given: FloatArray, result: FloatArray, likely: FloatArray,
-    groups: Groups, block: Block, room: Room,
-) -> None:  # fmt: skip
-    """Do as `_invert_tile` with room for one point.
-
-    It makes no arrays, so that references to the many that it reads are not counted.
-    """
-    points, before = block.points, block.points.camera[:0]
-    for i in range(*span):
-        first, last = points.start[i], points.start[i + 1]
-        cameras, sight = points.camera[first:last], sight_of(points, i)
-        if listed:
-            weight = given[first:last] if given.size else given
-            _invert_listed(result[i], cameras, weight, groups, sight, block, room)
-            continue
-        # points with the same cameras share their groups
-        if not are_same(cameras, before):
-            _group(groups, cameras, block.matcher)
-        before = cameras
-        if len(likely):
-            bed = likely_bed(sight, block)
-            depths = _rises_of(bed, cameras, groups, sight, block, room)
-            for seed in range(cameras.size):
-                if depths.slope[seed] == depths.slope[seed]:
-                    likely[i, seed] = bed + groups.rise[seed]
-        else:
-            _invert_one(result[i], cameras, given[i], groups, sight, block, room)
-
-
-@device
-def _invert_one(
-    row: FloatArray, maps: IntArray, around: float, groups: Groups, sight: Sight, block: Block,
-    room: Room,
-) -> None:  # fmt: skip
-    """Find the group that made a point, and invert the fusion of its maps."""
-    wanted, bed = around - sight.now[2], likely_bed(sight, block)
-    if wanted == wanted:  # the bed of the surroundings is known
-        bed = max(min(wanted, SHALLOW * bed), DEEP * bed)
-    depths = _rises_of(bed, maps, groups, sight, block, room)
-    seed, rise, row[AMBIGUITY] = _best_seed(groups, depths, wanted - bed)
-    weight = room.weight[: maps.size]
-    weight[:] = 0.0
-    if seed >= 0:
-        # a map that agrees shares its weight with the maps it was averaged with
-        _average_around(seed, groups, depths, rise)
-        for q in groups.fused[seed]:
-            if q < 0:
-                break
-            if abs(groups.depth[q] - groups.depth[seed]) < AGREE:
-                _share(weight, q, groups.share[q], groups)
-    settle_bed(row, maps, weight, depths, sight, block, room)
-
-
-@device
-def _share(weight: FloatArray, q: int, share: float, groups: Groups) -> None:
+def _share(q: int, share: float, groups: Groups) -> None:
     """Add the weight of a depth map evenly to the maps that were averaged into it."""
     count = 0.0
     for a in groups.averaged[q]:
         count += a >= 0 and abs(groups.own[a] - groups.own[q]) < AVERAGED_WITHIN
     for a in groups.averaged[q]:
         if a >= 0 and abs(groups.own[a] - groups.own[q]) < AVERAGED_WITHIN:
-            weight[a] += share / count
-
-
-@device
-def _rises_of(
-    bed: float, maps: IntArray, groups: Groups, sight: Sight, block: Block, room: Room
-) -> Lines:
-    """Set the weights of the depth maps and the rises of their groups; return their lines."""
-    depths = lines_at(bed, maps, sight, block, room)
-    for q in range(maps.size):
-        # the pixel on the ground grows with the distance
-        up = original_up(sight, block, maps[q])
-        groups.share[q] = 1.0 / dot(up, up)
-    _set_rises(groups, depths)
-    return depths
+            groups.weight[a] += share / count
 
 
 @device
@@ -561,23 +695,34 @@ def _set_rises(groups: Groups, depths: Lines) -> None:
     Which maps agree is decided for the bed of the lines, and again for that of each group.
     """
     k = depths.t.size
-    for q in range(k):
-        groups.own[q] = depths.t[q]
+    spread = _move(groups, depths, 0.0)
     for q in range(k):
         _average(q, groups, depths)
     for seed in range(k):
         groups.rise[seed], groups.size[seed] = _fuse(seed, groups)
     for seed in range(k):
-        _average_around(seed, groups, depths, groups.rise[seed])
-        step, groups.size[seed] = _fuse(seed, groups)
-        groups.rise[seed] += step
+        # where all depths agree, for both beds, so do the groups
+        if max(spread, _move(groups, depths, groups.rise[seed])) >= AGREE:
+            _average_around(seed, groups, depths)
+            step, groups.size[seed] = _fuse(seed, groups)
+            groups.rise[seed] += step
 
 
 @device
-def _average_around(seed: int, groups: Groups, depths: Lines, rise: float) -> None:
-    """Average the depths that may be fused with that of a seed, for a bed higher by `rise`."""
+def _move(groups: Groups, depths: Lines, rise: float) -> float:
+    """Set the depths of all maps for a bed higher by `rise`; return their range."""
+    low, high = np.inf, -np.inf
     for q in range(depths.t.size):
-        groups.own[q] = depths.t[q] + depths.slope[q] * rise
+        own = depths.t[q] + depths.slope[q] * rise
+        # NaN is neither lower nor higher
+        low, high = own if own < low else low, own if own > high else high
+        groups.own[q] = own
+    return high - low
+
+
+@device
+def _average_around(seed: int, groups: Groups, depths: Lines) -> None:
+    """Average the depths that may be fused with that of a seed."""
     for q in groups.fused[seed]:
         if q < 0:
             break
@@ -616,48 +761,79 @@ def _fuse(seed: int, groups: Groups) -> tuple[float, float]:
 
 
 @device
-def _invert_listed(
-    row: FloatArray, listed: IntArray, given: FloatArray, groups: Groups, sight: Sight,
-    block: Block, room: Room,
-) -> None:  # fmt: skip
-    """Invert the fusion of the maps in the list of a point, with their weights."""
-    maps = groups.found[: _with_neighbours(groups, listed, sight, block)]
-    _group(groups, maps, block.matcher)
-    bed, step, weight = likely_bed(sight, block), 0.0, room.weight[: maps.size]
-    for _ in range(_BEDS):
-        bed += step
-        # which depths agree depends on the bed, and the bed on which agree
-        depths = lines_at(bed, maps, sight, block, room)
-        step = 0.0
-        for _ in range(_ROUNDS):
-            for q in range(maps.size):
-                groups.own[q], weight[q] = depths.t[q] + depths.slope[q] * step, 0.0
-            for k in range(listed.size):
-                up = original_up(sight, block, listed[k])
-                share = given[k] if given.size else 1.0 / dot(up, up)
-                _share(weight, groups.place[listed[k]], share, groups)
-            step = balance(depths.t, depths.slope, weight)
-        if not abs(step) > FAR * abs(bed):
+def _weigh_listed(maps: Maps, given: FloatArray, groups: Groups, tile: Tile, block: Block) -> None:
+    """Set the weights of the maps of points with lists; `given` are those of the entries, if any.
+
+    Which depths agree depends on the bed, and the bed on which agree.
+    """
+    step = tile.search[_STEP * TILE :]
+    step[:TILE] = 0.0
+    for beds in range(1, _BEDS + 1):
+        searched = False
+        for j in range(maps.rows.size):
+            if tile.going[j]:
+                tile.room[BED * TILE + j] += step[j]
+        look(tile, maps.near, maps.weights, block)
+        for j in range(maps.rows.size):
+            if not tile.going[j]:
+                continue
+            at, bed = maps.each[j], tile.room[BED * TILE + j]
+            cameras = maps.camera[maps.start[at] : maps.start[at + 1]]
+            _group(groups, cameras, block.matcher)
+            step[j] = _weigh_list(maps.rows[j], j, cameras, given, groups, tile, block)
+            tile.going[j] = beds < _BEDS and abs(step[j]) > FAR * abs(bed)
+            searched = searched or tile.going[j]
+            if not tile.going[j]:
+                for q in range(cameras.size):
+                    maps.weights[tile.row[cameras[q]], j] = groups.weight[q]
+        if not searched:
             break
-    settle_bed(row, maps, weight, depths, sight, block, room)
 
 
 @device
-def _with_neighbours(groups: Groups, listed: IntArray, sight: Sight, block: Block) -> int:
-    """Gather the listed images, and their partners whose frames hold the point; return how many."""
-    count, matcher, place = 0, block.matcher, groups.place
-    place[:] = ABSENT
-    for c in listed:
-        if place[c] < 0:
-            place[c], groups.found[count] = count, c
-            count += 1
-        for a in matcher.averaged[c]:
-            if a < 0:
-                break
-            # a partner that was not looked at yet
-            if place[a] == ABSENT:
-                place[a] = _OUTSIDE
-                if holds(matcher.inner, a, original_up(sight, block, a)):
-                    place[a], groups.found[count] = count, a
-                    count += 1
-    return count
+def _weigh_list(
+    i: int, j: int, cameras: IntArray, given: FloatArray, groups: Groups, tile: Tile, block: Block
+) -> float:
+    """Set the weights of the maps of point i, the j-th of its tile; return the step of its bed."""
+    points, depths, step = block.points, _lines_of(groups, cameras, j, tile), 0.0
+    for _ in range(_ROUNDS):
+        _move(groups, depths, step)
+        groups.weight[: cameras.size] = 0.0
+        for at in range(points.start[i], points.start[i + 1]):
+            c = points.camera[at]
+            share = given[at] if given.size else _per_square(c, j, tile, block)
+            _share(groups.place[c], share, groups)
+        total, change = 0.0, 0.0
+        for q in range(cameras.size):
+            if groups.weight[q] > 0.0 and depths.slope[q] == depths.slope[q]:
+                total += groups.weight[q] * depths.t[q]
+                change += groups.weight[q] * depths.slope[q]
+        step = -total / change
+    return step
+
+
+@device(allocates=True)
+def _with_neighbours(
+    rows: IntArray, place: IntArray, tile: Tile, block: Block
+) -> tuple[IntArray, IntArray]:
+    """Return the listed images of each point, and their partners whose frames hold the point."""
+    points, matcher = block.points, block.matcher
+    most = 0
+    for i in rows:
+        most += points.start[i + 1] - points.start[i]
+    start = np.zeros(rows.size + 1, np.int64)
+    found, count = np.empty(most * (matcher.averaged.shape[1] + 1), np.int64), 0
+    for j in range(rows.size):
+        place[:] = ABSENT
+        p = three(tile.points, _ORIGINAL * TILE + j)
+        for c in points.camera[points.start[rows[j]] : points.start[rows[j] + 1]]:
+            if place[c] < 0:
+                place[c], found[count], count = 0, c, count + 1
+            for a in matcher.averaged[c]:
+                # a partner that was not looked at yet
+                if a >= 0 and place[a] == ABSENT:
+                    place[a] = _OUTSIDE
+                    if holds(matcher.inner, a, minus(row_of(block.images.centres, a), p)):
+                        place[a], found[count], count = 0, a, count + 1
+        start[j + 1] = count
+    return start, found[:count]

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import lru_cache
 
+import numba
 import numpy as np
 import pytest
 
@@ -12,22 +13,27 @@ from pcfix.lens.frames import frames_of
 from pcfix.model import Outcome, Views, WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import FLAT_DEG, Batch, Chosen, Learned, Survey, images_of
-from pcfix.refract.depth_maps import Block, _compare, best_pairs, sight_of
+from pcfix.refract.depth_maps import (
+    BED,
+    BEST,
+    DEPTH,
+    Block,
+    best_pairs,
+    look,
+    room_of_tile,
+    start_tile,
+)
 from pcfix.refract.learning import learn_of_sample
 from pcfix.refract.matcher import Bed, Matcher, bed_of
 from pcfix.refract.methods import correct, with_rays
+from pcfix.refract.tiling import TILE
 from pcfix.running import threads
 from pcfix.water.surface import is_submerged, surface_above
 from tests.utils.batches import batch_of
-from tests.utils.compiled import compiled
 from tests.utils.depth_map_twin import LENS, costs_of, fused_slowly, looking, on_bed, slow_depth
 from tests.utils.matchers import matched_scene
 from tests.utils.nightly import mostly_nightly
 from tests.utils.shared import needs
-
-best_pairs = compiled(best_pairs)
-sight_of = compiled(sight_of)
-_compare = compiled(_compare)
 
 RENDERED, rendered = needs("rendered_a")
 N_WATER, TOLERANCE = 1.34, 0.1
@@ -72,20 +78,41 @@ def listed(lists, weights=None):
 # one depth
 
 
-def best(partners, tolerance):
-    return best_pairs(partners, np.empty((25, 2)), tolerance)
-
-
 def test_best_pairs():
     rng = np.random.default_rng(1)
-    for count in (2, 3, 5):
-        for _ in range(20):
-            partners = np.column_stack(
-                [rng.normal(0, 0.3, count), rng.uniform(0, 1, count), rng.uniform(4, 40, count)]
-            )
-            costs = [lambda t, p=p: float(p[1] + p[2] * (t - p[0]) ** 2) for p in partners]
+    for count in (1, 2, 3, 5):
+        places, squares = rng.normal(0, 0.3, (count, 20)), rng.uniform(0, 1, (count, 20))
+        curvatures = rng.uniform(4, 40, (count, 20))
+        found = best_depths(places, squares, curvatures, 0.1)
+        for i, t in enumerate(found):
+            columns = zip(places[:, i], squares[:, i], curvatures[:, i], strict=True)
+            costs = [lambda t, p=p: float(p[1] + p[2] * (t - p[0]) ** 2) for p in columns]
             # scipy knows the place of a least value to about the root of its precision
-            assert best(partners, 0.1) == pytest.approx(slow_depth(costs, 0.1), abs=1e-6)
+            assert t == pytest.approx(
+                slow_depth(costs, 0.1) if count > 1 else places[0, i], abs=1e-6
+            )
+
+
+@numba.njit(error_model="numpy")
+def best_depths(places, squares, curvatures, tolerance):
+    """Return the depths of best agreement at places, of partners by row and points by column."""
+    tile = room_of_tile(1, len(places))
+    for p in range(len(places)):
+        for i in range(places.shape[1]):
+            tile.partners[p, i], tile.partners[p, TILE + i] = places[p, i], squares[p, i]
+            tile.partners[p, 2 * TILE + i] = curvatures[p, i]
+    best_pairs(tile.room, tile.partners, tile.pairs, places.shape[1], tolerance)
+    return tile.room[BEST * TILE : BEST * TILE + places.shape[1]].copy()
+
+
+@numba.njit(error_model="numpy")
+def depth_of(block, c, bed):
+    """Return the depth of a bed, at a height over the one point of a block, in the map of c."""
+    tile = room_of_tile(1, block.matcher.matched.shape[1])
+    start_tile(tile, np.zeros(1, np.int64), np.zeros(0), block)
+    tile.room[BED * TILE] = bed
+    look(tile, np.full(1, c), np.ones((1, 1)), block)
+    return tile.looks[0, DEPTH * TILE]
 
 
 @pytest.mark.parametrize("c", [0, 2, 4, 5, 7])
@@ -94,7 +121,8 @@ def test_depth_as_twin(c):
     p, plane, bed = np.array([3.0, 4.0, -4.5]), (0.3, 0.004, -0.003), (-6.5, 0.0, 0.0)
     offset = np.array([0.0, 0.05, -0.03, 0.02, 0.0, 0.04, 0.0, -0.05])
     planes = [(plane[0] + up, *plane[1:]) for up in offset]
-    u = (p - CAMERAS.centres[c]) / np.linalg.norm(p - CAMERAS.centres[c])
+    length = np.linalg.norm(p - CAMERAS.centres[c])
+    u = (p - CAMERAS.centres[c]) / length
     q = on_bed(CAMERAS.centres[c], p, planes[c], bed, N_WATER)
     partners = [j for j in MATCHED[c] if j >= 0]
     costs = costs_of(p, u, q, CAMERAS, partners, planes, N_WATER, "angles")
@@ -105,12 +133,9 @@ def test_depth_as_twin(c):
         nothing, nothing, N_WATER,
     )  # fmt: skip
     block = Block(points, images_of(None, CAMERAS), matcher(), offset.mean())
-    partners = np.empty((5, 3))
-    length, sight = np.linalg.norm(p - CAMERAS.centres[c]), sight_of(points, 0)
-    count = _compare(partners, c, tuple(q - p), length, sight, block)
-    # 0.3 to 1 m; scipy's least values are flat within 1e-6 m
-    assert best(partners[:count], TOLERANCE) == pytest.approx(
-        slow_depth(costs, TOLERANCE), abs=5e-6
+    # 0.3 to 1 m, in single precision; scipy's least values are flat within 1e-6 m
+    assert length * depth_of(block, c, q[2] - p[2]) == pytest.approx(
+        slow_depth(costs, TOLERANCE), abs=2e-5
     )
 
 
