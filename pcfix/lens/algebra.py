@@ -5,7 +5,7 @@ Sums are always formed from left to right, so that equal operands give equal res
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
@@ -17,11 +17,6 @@ Symmetric: TypeAlias = tuple[float, float, float, float, float, float]
 """A symmetric matrix: xx, xy, xz, yy, yz, zz."""
 Nine: TypeAlias = tuple[float, float, float, float, float, float, float, float, float]
 """A matrix, row by row."""
-
-_single: Any = np.float32
-ZERO, HALF, ONE, TWO = _single(0.0), _single(0.5), _single(1.0), _single(2.0)
-"""A number of a program has double precision, and would make doubles of what it is combined with.
-These do not, so that one function serves both precisions."""
 
 
 @device

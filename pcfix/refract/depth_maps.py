@@ -36,20 +36,19 @@ of all. So the height that most points around can have come from, the bed of the
 
 **Speed.** A point needs some 80 light paths for each bed that is tried. A tile of points is
 processed image by image and partner by partner, so that the inner loops run over the points and are
-vectorised, in single precision, which works on twice as many at once. All places are relative to
-the apparent point: what is rounded are vectors of some 100 m, to some hundredths of a millimetre.
+vectorised.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from pcfix.kernels import Span, device, in_tiles, kernel
-from pcfix.lens.algebra import ONE, ZERO, beyond, dot, minus, row_of, scaled
+from pcfix.lens.algebra import beyond, dot, minus, row_of, scaled
 from pcfix.lens.frames import holds, mark
-from pcfix.model import BoolArray, FloatArray, IntArray, SingleArray
+from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.refract import tiling
 from pcfix.refract.batch import (
     CORRECTED,
@@ -97,8 +96,6 @@ FAR = 0.1
 """Of the way to the bed: farther off, it is decided anew which depths were averaged."""
 
 ABSENT, _OUTSIDE = -1, -2
-_single: Any = np.float32
-_INFINITE, _NAN, _NOTHING = _single(np.inf), _single(np.nan), _single(NOTHING)
 
 _DISTANCE, AMBIGUITY, OUTCOME, _COUNT = 3, 4, 5, 6
 COLUMNS = 7
@@ -108,14 +105,14 @@ COLUMNS = 7
 # the distance of P from the camera, and its change with the height of the bed (1/m); the place on
 # the bed (2), and its change (2).
 DEPTH, BY_HEIGHT, _PLACE, _PLACE_BY_HEIGHT, LOOK = slots(1, 1, 2, 2)
-# Of the points: N, the height of the water over P along N, and the height of the bed. Of one map:
-# the vector to its projection centre, the ray u and its length, Q, what the change of the depth
-# with the bed depends on (3). Of one partner: the direction w, whether it sees Q; the only depth,
-# how many partners see Q, the least cost, and the sums of the mean.
+# Of the points: the height of the bed. Of one map: the ray u and the distance of its projection
+# centre, Q, what the change of the depth with the bed depends on (3). Of one partner: the direction
+# w, whether it sees Q; the only depth, how many partners see Q, the least cost, and the sums of the
+# mean, which is in the last in the end.
 (
-    _NORMAL, _ABOVE, BED, _UP, _RAY, _LENGTH, _Q, _AWAY, _WATER, _STEEP, _W, _SEES, _SOLE, _SEEN,
-    _LEAST, _TOTAL, BEST, ROOM,
-) = slots(3, 1, 1, 3, 3, 1, 3, 1, 1, 1, 3, 1, 1, 1, 1, 1, 1)  # fmt: skip
+    BED, _RAY, _LENGTH, _Q, _AWAY, _WATER, _STEEP, _W, _SEES, _SOLE, _SEEN, _LEAST, _TOTAL, BEST,
+    ROOM,
+) = slots(1, 3, 1, 3, 1, 1, 1, 3, 1, 1, 1, 1, 1, 1)  # fmt: skip
 # Of a partner: the depth beyond P along the ray (m), its squared residual (px^2), and half the
 # curvature of that (px^2/m^2). Of a pair: its squared residual, and its depth.
 _AT, _SQUARES, _CURVATURE, PARTNER = slots(1, 1, 1)
@@ -139,10 +136,10 @@ class Tile(NamedTuple):
     """Arrays of a tile of points, for kernels; runs of `TILE` numbers, see above."""
 
     points: FloatArray  # (`_POINT`,)
-    room: SingleArray  # (`ROOM`,)
-    partners: SingleArray  # (p, `PARTNER`)
-    pairs: SingleArray  # (p (p - 1) / 2, `PAIR`)
-    looks: SingleArray  # (k, `LOOK`), of the images near the tile
+    room: FloatArray  # (`ROOM`,)
+    partners: FloatArray  # (p, `PARTNER`)
+    pairs: FloatArray  # (p (p - 1) / 2, `PAIR`)
+    looks: FloatArray  # (k, `LOOK`), of the images near the tile
     search: FloatArray  # (`SEARCH`,)
     going: BoolArray  # (`TILE`,), whether the bed is searched
     row: IntArray  # (k,), of each image in `looks`
@@ -265,10 +262,10 @@ def room_of_tile(k: int, partners: int) -> Tile:
     """Return arrays for a tile of points and k images with so many partners at most."""
     return Tile(
         np.empty(_POINT * TILE),
-        np.empty(ROOM * TILE, np.float32),
-        np.empty((partners, PARTNER * TILE), np.float32),
-        np.empty((partners * (partners - 1) // 2, PAIR * TILE), np.float32),
-        np.empty((k, LOOK * TILE), np.float32),
+        np.empty(ROOM * TILE),
+        np.empty((partners, PARTNER * TILE)),
+        np.empty((partners * (partners - 1) // 2, PAIR * TILE)),
+        np.empty((k, LOOK * TILE)),
         np.empty(SEARCH * TILE),
         np.empty(TILE, np.bool_),
         np.full(k, ABSENT),
@@ -284,8 +281,6 @@ def start_tile(tile: Tile, rows: IntArray, around: FloatArray, block: Block) -> 
         normal, z = three(tile.points, 4 * TILE + j), tile.points[2 * TILE + j]
         above = normal[2] * (tile.points[3 * TILE + j] - z)
         put(tile.points, _ORIGINAL * TILE + j, row_of(points.original_xyz, rows[j]))
-        put(room, _NORMAL * TILE + j, normal)
-        room[_ABOVE * TILE + j] = above
         depth = max(above + normal[2] * block.offset_m, LEAST_DEPTH_M) / normal[2]
         bed = -LIKELY * depth * (points.n - 1.0)
         if around.size and around[rows[j]] == around[rows[j]]:
@@ -308,7 +303,7 @@ def look(tile: Tile, near: IntArray, weights: FloatArray, block: Block) -> None:
 
 
 @device
-def _look(out: SingleArray, c: int, count: int, tile: Tile, block: Block) -> None:
+def _look(out: FloatArray, c: int, count: int, tile: Tile, block: Block) -> None:
     """Compute the depths of the beds of all points of a tile in one depth map.
 
     Their change with the height is approximate. NaN where no partner of image c sees the bed.
@@ -336,7 +331,7 @@ def _look(out: SingleArray, c: int, count: int, tile: Tile, block: Block) -> Non
 
 
 @device
-def _aim(out: SingleArray, c: int, count: int, tile: Tile, block: Block) -> None:
+def _aim(out: FloatArray, c: int, count: int, tile: Tile, block: Block) -> None:
     """Follow the ray on which one image shows each point to the bed."""
     points, images, room = block.points, block.images, tile.room
     centre, original, n = row_of(points.centres, c), row_of(images.centres, c), points.n
@@ -361,7 +356,6 @@ def _aim(out: SingleArray, c: int, count: int, tile: Tile, block: Block) -> None
         out[_PLACE * TILE + j], out[(_PLACE + 1) * TILE + j] = q[0], q[1]
         out[_PLACE_BY_HEIGHT * TILE + j] = d[0] * down
         out[(_PLACE_BY_HEIGHT + 1) * TILE + j] = d[1] * down
-        put(room, _UP * TILE + j, up)
         put(room, _RAY * TILE + j, scaled(-1.0 / length, way))
         put(room, _Q * TILE + j, q)
         away = np.sqrt(length2)
@@ -371,36 +365,31 @@ def _aim(out: SingleArray, c: int, count: int, tile: Tile, block: Block) -> None
 
 
 @device
-def _compare(
-    partner: SingleArray, c: int, other: int, count: int, tile: Tile, block: Block
-) -> None:
+def _compare(partner: FloatArray, c: int, other: int, count: int, tile: Tile, block: Block) -> None:
     """Set what another image than c sees of the bed at Q; see `PARTNER`.
 
     The light path is the true one; its direction in the image, P and the ray of image c are those
     of the original model.
     """
     points, images, matcher, room = block.points, block.images, block.matcher, tile.room
-    x, y, z = minus(row_of(points.centres, c), row_of(points.centres, other))
-    base = _single(x), _single(y), _single(z)
-    n, offset = _single(points.n), _single(points.offset[other])
+    centre, offset, n = row_of(points.centres, other), points.offset[other], points.n
     for j in range(count):
-        normal = three(room, _NORMAL * TILE + j)
-        up = minus(three(room, _UP * TILE + j), base)
-        above = room[_ABOVE * TILE + j] + normal[2] * offset
+        p, normal = three(tile.points, j), three(tile.points, 4 * TILE + j)
+        up = minus(centre, p)
+        above = normal[2] * (tile.points[3 * TILE + j] - (p[2] - offset))
         k, _, _, _, s = light_near(three(room, _Q * TILE + j), up, normal, above, n)
         # a camera under the water sees nothing
-        k = k if dot(normal, up) > above else _NAN
+        k = k if dot(normal, up) > above else np.nan
         put(room, _W * TILE + j, to_original(images, other, minus(scaled(k, s), normal)))
     # frames hold places relative to the camera, here w
     sees = room[_SEES * TILE : _SEES * TILE + count]
     mark(sees, room[_W * TILE :], TILE, matcher.inner, other, (0.0, 0.0, 0.0))
-    x, y, z = minus(row_of(images.centres, c), row_of(images.centres, other))
-    base, focal_px = (_single(x), _single(y), _single(z)), _single(matcher.focal_px[other])
+    centre, focal_px = row_of(images.centres, other), matcher.focal_px[other]
     for j in range(count):
         u, w = three(room, _RAY * TILE + j), three(room, _W * TILE + j)
         # from P to the other centre, both of the original model
-        up = minus(scaled(-room[_LENGTH * TILE + j], u), base)
-        per_w2, along, back = ONE / dot(w, w), dot(u, w), dot(up, w)
+        up = minus(centre, three(tile.points, _ORIGINAL * TILE + j))
+        per_w2, along, back = 1.0 / dot(w, w), dot(u, w), dot(up, w)
         # from P to the nearest place on the ray w, and u across that
         r, across = beyond(up, -back * per_w2, w), beyond(u, -along * per_w2, w)
         sine2 = dot(across, across)
@@ -409,21 +398,21 @@ def _compare(
         t = dot(r, across) / sine2
         miss, away = beyond(r, -t, across), t * along - back
         scale2 = focal_px * focal_px / (away * away * per_w2)
-        partner[_AT * TILE + j] = t if sees[j] > ZERO else ZERO
-        partner[_SQUARES * TILE + j] = scale2 * dot(miss, miss) if sees[j] > ZERO else _INFINITE
-        partner[_CURVATURE * TILE + j] = scale2 * sine2 if sees[j] > ZERO else ONE
+        partner[_AT * TILE + j] = t if sees[j] > 0.0 else 0.0
+        partner[_SQUARES * TILE + j] = scale2 * dot(miss, miss) if sees[j] > 0.0 else np.inf
+        partner[_CURVATURE * TILE + j] = scale2 * sine2 if sees[j] > 0.0 else 1.0
 
 
 @device
 def best_pairs(
-    room: SingleArray, partners: SingleArray, pairs: SingleArray, count: int, tolerance: float
+    room: FloatArray, partners: FloatArray, pairs: FloatArray, count: int, tolerance: float
 ) -> None:
     """Set the depths at which two images agree best, as weighted means over the pairs.
 
     NaN without a partner that sees the bed; of a single one its own depth.
     """
-    room[_SOLE * TILE : ROOM * TILE] = ZERO
-    room[_LEAST * TILE : _TOTAL * TILE] = _INFINITE
+    room[_SOLE * TILE : ROOM * TILE] = 0.0
+    room[_LEAST * TILE : _TOTAL * TILE] = np.inf
     for p in range(len(partners)):
         _count_partner(room, partners[p], count)
     at = 0
@@ -432,26 +421,26 @@ def best_pairs(
             _agree_best(pairs[at], partners[p], partners[q], room, count)
             at += 1
     for p in range(at):
-        _add_pair(room, pairs[p], count, _single(tolerance))
+        _add_pair(room, pairs[p], count, tolerance)
     for j in range(count):
         seen = room[_SEEN * TILE + j]
         mean = room[BEST * TILE + j] / room[_TOTAL * TILE + j]
-        sole = room[_SOLE * TILE + j] if seen > ZERO else _NAN
-        room[BEST * TILE + j] = mean if seen > ONE else sole
+        sole = room[_SOLE * TILE + j] if seen > 0.0 else np.nan
+        room[BEST * TILE + j] = mean if seen > 1.0 else sole
 
 
 @device
-def _count_partner(room: SingleArray, partner: SingleArray, count: int) -> None:
+def _count_partner(room: FloatArray, partner: FloatArray, count: int) -> None:
     """Count a partner that sees the bed, and note its depth."""
     for j in range(count):
-        sees = partner[_SQUARES * TILE + j] < _INFINITE
-        room[_SEEN * TILE + j] += ONE if sees else ZERO
+        sees = partner[_SQUARES * TILE + j] < np.inf
+        room[_SEEN * TILE + j] += 1.0 if sees else 0.0
         room[_SOLE * TILE + j] += partner[_AT * TILE + j]
 
 
 @device
 def _agree_best(
-    pair: SingleArray, a: SingleArray, b: SingleArray, room: SingleArray, count: int
+    pair: FloatArray, a: FloatArray, b: FloatArray, room: FloatArray, count: int
 ) -> None:
     """Find the depth at which two partners agree best: the minimum of the sum of two parabolas."""
     for j in range(count):
@@ -462,29 +451,26 @@ def _agree_best(
         room[_LEAST * TILE + j] = min(room[_LEAST * TILE + j], cost)
 
 
-_HALF, _THIRD, _FOURTH, _FIFTH, _SIXTH, _SIXTEENTH = (_single(1.0 / n) for n in (2, 3, 4, 5, 6, 16))
-
-
 @device
-def _add_pair(room: SingleArray, pair: SingleArray, count: int, tolerance: float) -> None:
+def _add_pair(room: FloatArray, pair: FloatArray, count: int, tolerance: float) -> None:
     """Add the depth of a pair with its weight, which falls by e for each `tolerance`."""
     for j in range(count):
         worse = (pair[_COST * TILE + j] - room[_LEAST * TILE + j]) / tolerance
         # exp(-x) as the sixteenth power of the Taylor series of exp(-x / 16), which vectorises
-        x = worse * _SIXTEENTH
-        w = ONE - x * _FIFTH * (ONE - x * _SIXTH)
-        w = ONE - x * (ONE - x * _HALF * (ONE - x * _THIRD * (ONE - x * _FOURTH * w)))
+        x = worse / 16.0
+        w = 1.0 - x / 4.0 * (1.0 - x / 5.0 * (1.0 - x / 6.0))
+        w = 1.0 - x * (1.0 - x / 2.0 * (1.0 - x / 3.0 * w))
         w *= w
         w *= w
         w *= w
         w *= w
-        w = w if worse < _NOTHING else ZERO
+        w = w if worse < NOTHING else 0.0
         room[_TOTAL * TILE + j] += w
         room[BEST * TILE + j] += w * pair[_PAIR_AT * TILE + j]
 
 
 @device
-def _sum_lines(search: FloatArray, looks: SingleArray, weights: FloatArray) -> None:
+def _sum_lines(search: FloatArray, looks: FloatArray, weights: FloatArray) -> None:
     """Set how far up the bed of each point is at which the weighted mean of the depths is zero."""
     search[: _X * TILE] = 0.0
     for k in range(len(weights)):

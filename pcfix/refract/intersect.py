@@ -161,7 +161,7 @@ def _intersect(
                     row[_DISTANCE] = ray_distance(sums[9 * TILE + j], nine(sums, j), vector(row))
         if len(covariance):
             room = room_of(tile, result, rows)
-            uncertainty.add_errors(room, tile, marks[:seeing], near, rig, rule, budget)
+            uncertainty.add_errors(room, tile, marks[:seeing], near, rig, rule.bend, budget)
             uncertainty.finish_tile(covariance, rows, room, tile, level_sigma, budget)
 
 

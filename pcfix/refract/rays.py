@@ -48,19 +48,7 @@ from typing import TypeAlias
 import numpy as np
 
 from pcfix.kernels import device
-from pcfix.lens.algebra import (
-    ONE,
-    ZERO,
-    Nine,
-    Vector,
-    beyond,
-    dot,
-    minus,
-    normal_of,
-    scaled,
-    solved,
-    vector,
-)
+from pcfix.lens.algebra import Nine, Vector, beyond, dot, minus, normal_of, scaled, solved, vector
 from pcfix.model import FloatArray
 from pcfix.water.surface import Field, Tin, field_of, height_at, locate
 
@@ -227,19 +215,19 @@ def light_near(
 
     The light of the apparent point has the tangent of the incidence angle as a start, from which
     Newton's method needs two steps: without a condition to end, loops over it are vectorised. The
-    projection centre must be above the plane. In single precision for arguments of that.
+    projection centre must be above the plane.
     """
     across, depth = dot(normal, e), h - dot(normal, q)
     height = across - h
     s = beyond(minus(q, e), height + depth, normal)
-    m2 = n * n if depth > ZERO else ONE
-    a = (m2 - ONE) * dot(s, s)
-    root = np.sqrt(m2 + (m2 - ONE) * (dot(e, e) / (across * across) - ONE))
-    k = ONE / (height + depth / root)
+    m2 = n * n if depth > 0.0 else 1.0
+    a = (m2 - 1.0) * dot(s, s)
+    root = np.sqrt(m2 + (m2 - 1.0) * (dot(e, e) / (across * across) - 1.0))
+    k = 1.0 / (height + depth / root)
     root = np.sqrt(m2 + a * k * k)
-    k += (ONE - k * (height + depth / root)) / (height + depth * m2 / (root * root * root))
+    k += (1.0 - k * (height + depth / root)) / (height + depth * m2 / (root * root * root))
     root = np.sqrt(m2 + a * k * k)
-    k += (ONE - k * (height + depth / root)) / (height + depth * m2 / (root * root * root))
+    k += (1.0 - k * (height + depth / root)) / (height + depth * m2 / (root * root * root))
     return k, root, depth, m2, s
 
 

@@ -22,6 +22,9 @@ Q is found where that median is P: three equations for three unknowns. The media
 functions is continuous, with kinks where it changes from one pair to another. Broyden's method
 starts at `snell`'s solution with the derivative diag(1, 1, 1/n), as if all light came from straight
 above, and goes back to half such a step wherever it does not come nearer.
+
+A tile of points is processed camera by camera and pair by pair, so that the inner loops run over
+the points and are vectorised. Points that need more than a few steps form new tiles.
 """
 
 from __future__ import annotations
@@ -31,23 +34,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.kernels import Span, device, in_tiles, kernel, most_between
-from pcfix.lens import algebra
-from pcfix.lens.algebra import (
-    Vector,
-    beyond,
-    cross,
-    dot,
-    minus,
-    plus,
-    row_of,
-    scaled,
-    solved,
-    vector,
-)
-from pcfix.lens.formulas import KIND, PERSPECTIVE
-from pcfix.lens.imaging import image_in_world
+from pcfix.kernels import Span, device, in_tiles, kernel
+from pcfix.lens.algebra import Vector, beyond, cross, dot, minus, row_of, scaled, solved, vector
+from pcfix.lens.formulas import KIND, PERSPECTIVE, PLAIN
+from pcfix.lens.imaging import Plain, image_in_world, plain_image, plain_lens
 from pcfix.model import BoolArray, FloatArray, IntArray, Outcome, Views
+from pcfix.refract import tiling
 from pcfix.refract.batch import (
     CORRECTED,
     NO_CAMERA,
@@ -58,45 +50,51 @@ from pcfix.refract.batch import (
     Images,
     Intersection,
     images_of,
-    normal_above,
     to_original,
     warn_of_unsolved,
 )
-from pcfix.refract.choice import cameras_of_pairs
-from pcfix.refract.intersect import check_consistent
-from pcfix.refract.rays import (
-    MIN_DETERMINANT,
-    NO_LINE,
-    light_near,
-    nearest_point,
-    plus_line,
-    ray_distance,
-    refracted,
-)
+from pcfix.refract.choice import Rig, Rule, cameras_of_pairs, rig_of, rule_of
+from pcfix.refract.intersect import add_camera, check_consistent
+from pcfix.refract.rays import MIN_DETERMINANT, light_near, nearest_point, ray_distance
+from pcfix.refract.tiling import TILE, nine, put, slots, three
 
-MAX_STEPS = 40
+STEPS, MAX_STEPS = 5, 40
+"""Steps of a tile, after which the points that are not found yet form new ones; most steps."""
 CLOSE_M = 5e-5
 """Largest distance of the median from P before the last step, which leaves about a millionth."""
-
+ABSENT = -1
 
 # Columns of the result.
 _DISTANCE, _OUTCOME, _FOUND, _WIDTH = 3, 4, 5, 6
 
-# Columns of a ray: e, the height of its water over P, e of the original model, the gradient of its
-# scale (g of `_meet`), and of the image of Q G'G (xx, xy, xz, yy, yz, zz), G'G e, |G e|^2.
-_ABOVE, _ORIGINAL, _BY_PLACE, _SQUARE, _RIGHT, _RAY_WIDTH = 3, 4, 7, 10, 16, 20
+# Columns of a search: Q, the nearest Q so far, F there and its size, the share of a step, B row by
+# row, and whether it goes on.
+_NEAREST, _AT_NEAREST, _BEST, _SHARE, _INVERSE, _GOES_ON, _SEARCH = 3, 6, 9, 10, 11, 20, 21
+
+# Runs of `TILE` numbers of a ray: the gradient of the scale of its image by place, and of the image
+# of Q G'G, G'G e and |G e|^2.
+_BY_PLACE, _SQUARE, _RIGHT, _REST, RAY = slots(3, 6, 3, 1)
 
 
-class _Point(NamedTuple):
-    """One apparent point with its rays and pairs; coordinates are relative to the point."""
+class Block(NamedTuple):
+    """All points and cameras, and the pairs, for kernels."""
 
-    normal: Vector  # of the water above the point
-    n: float  # refractive index
-    rays: FloatArray  # (j, ...), a row for each of its cameras
-    cameras: IntArray  # (j,)
-    used: BoolArray  # (j,), whether the camera is in a pair
-    pairs: IntArray  # (p, 2), the rays of each pair
-    places: FloatArray  # (3, p), temporary: where the pairs place a true point
+    points: Chosen
+    images: Images
+    rig: Rig
+    rule: Rule
+    listed_start: IntArray  # the pairs of each point, if there are lists
+    listed_camera: IntArray
+    partners: IntArray  # (k, ...), otherwise the partners of each image, each pair once
+
+
+class Pairs(NamedTuple):
+    """The pairs of a tile of m points, for kernels."""
+
+    rays: IntArray  # (p, 2), the rays of each pair: rows of the images near the tile
+    own: IntArray  # (3, m, most), the pairs of each point in the order of their x, y and z
+    wide: IntArray  # (m,), how many these are
+    narrow: IntArray  # (m,), and how many more without a base
 
 
 def invert_pairs(batch: Batch, pairs: Views | None = None) -> Intersection:
@@ -114,7 +112,7 @@ def invert_pairs(batch: Batch, pairs: Views | None = None) -> Intersection:
     check_consistent(batch.survey.cameras)
     if batch.rays.kind == "pairs":
         pairs, batch = batch.rays, replace(batch, views=cameras_of_pairs(batch.rays))
-    cameras, matcher = batch.survey.cameras, batch.survey.learned.matcher
+    survey, matcher = batch.survey, batch.survey.learned.matcher
     if pairs is None and matcher is None:
         raise ValueError("pairs or a model of the matcher are needed")
     start, camera, partners = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 0), int)
@@ -122,12 +120,19 @@ def invert_pairs(batch: Batch, pairs: Views | None = None) -> Intersection:
         start, camera = np.asarray(pairs.start, np.int64), np.asarray(pairs.camera, np.int64)
     elif matcher is not None:
         partners = _each_once(matcher.matched)
-    used, result = np.zeros(len(batch.rays.camera), np.bool_), np.zeros((len(batch), _WIDTH))
-    images = images_of(batch.original_model, cameras)
-    in_tiles(
-        _invert, len(batch), batch.chosen(), images, (start, camera, partners), used, result,
-        points=len(batch),
+    images, rule = images_of(batch.original_model, survey.cameras), rule_of(survey)
+    block = Block(
+        batch.chosen(), images, rig_of(survey), rule._replace(least_cosine2=0.0), start, camera,
+        partners,
     )  # fmt: skip
+    used, result = np.zeros(len(batch.rays.camera), np.bool_), np.zeros((len(batch), _WIDTH))
+    search, rows = np.zeros((len(batch), _SEARCH)), tiling.spatial_order(batch.xyz)
+    for steps in range(0, MAX_STEPS, STEPS):
+        in_tiles(
+            _search, -(-len(rows) // TILE), rows, block, steps == 0, search, used, result,
+            points=0 if steps else len(batch),
+        )  # fmt: skip
+        rows = rows[search[rows, _GOES_ON] > 0.0]
     outcome = result[:, _OUTCOME].astype(np.uint8)
     moved = outcome == Outcome.CORRECTED
     warn_of_unsolved("stereo pairs: no solution", result[moved, _FOUND] > 0.0)
@@ -148,95 +153,209 @@ def _each_once(matched: IntArray) -> IntArray:
 
 
 @kernel(allocates=True)
-def _invert(
-    span: Span, points: Chosen, images: Images, listed: tuple[IntArray, IntArray, IntArray],
-    used: BoolArray, result: FloatArray,
+def _search(
+    span: Span, order: IntArray, block: Block, first: bool, search: FloatArray, used: BoolArray,
+    result: FloatArray,
 ) -> None:  # fmt: skip
-    """Correct some points; without listed pairs they are those of the matcher."""
-    (listed_start, listed_camera, partners), start = listed, points.start
-    most = most_between(span, start)
-    most_pairs = most * partners.shape[1]
-    if listed_start.size:
-        most_pairs = most_between(span, listed_start) // 2
-    rays, place = np.empty((most, _RAY_WIDTH)), np.full(len(points.centres), -1)
-    pairs, places = np.empty((most_pairs, 2), np.int64), np.empty((3, most_pairs))
-    inverse = np.empty((3, 3))
-    for i in range(*span):
-        cameras, normal = points.camera[start[i] : start[i + 1]], normal_above(points, i)
-        flags = used[start[i] : start[i + 1]]
-        # `place` maps a camera to its ray of this point
-        for j in range(cameras.size):
-            place[cameras[j]] = j
-            _begin(rays[j], points, i, cameras[j], images)
-        count = 0
-        if listed_start.size:
-            for at in range(listed_start[i], listed_start[i + 1], 2):
-                a, b = place[listed_camera[at]], place[listed_camera[at + 1]]
-                if a >= 0 and b >= 0 and a != b:
-                    pairs[count, 0], pairs[count, 1], count = a, b, count + 1
-        else:
-            for a in range(cameras.size):
-                for partner in partners[cameras[a]]:
-                    if partner >= 0 and place[partner] >= 0:
-                        pairs[count, 0], pairs[count, 1], count = a, place[partner], count + 1
-        for c in cameras:
-            place[c] = -1
-        wide = _wide_pairs(pairs[:count], rays, normal)
-        if wide == 0:
-            few = ONE_CAMERA if cameras.size else NO_CAMERA
-            result[i, _OUTCOME] = PARALLEL if count else few
-            continue
-        for p in range(wide):
-            flags[pairs[p, 0]], flags[pairs[p, 1]] = True, True
-        point = _Point(normal, points.n, rays, cameras, flags, pairs[:wide], places[:, :wide])
-        _solve(result[i], point, images, inverse)
+    """Search the points of some tiles, the first time from `snell`'s solution, by a few steps."""
+    points, k = block.points, len(block.rig.centres)
+    row, now = np.full(k, ABSENT), np.empty(3 * TILE)
+    for t in range(*span):
+        rows = order[t * TILE : (t + 1) * TILE]
+        tile, sums = np.empty(10 * TILE), np.zeros(11 * TILE)
+        tiling.gather(tile, rows, points)
+        for j in range(rows.size):
+            put(tile, 7 * TILE + j, row_of(points.original_xyz, rows[j]))
+        near, marks = tiling.marks_of_lists(points.start, points.camera, rows, k)
+        row[:] = ABSENT
+        for q in range(near.size):
+            row[near[q]] = q
+        # the pairs of the tile; the marks become those of cameras in a pair
+        pairs = _pairs_of(rows, marks, row, tile, block)
+        for q in range(near.size):
+            add_camera(sums, tile, marks[q], None, block.rig, near[q], block.rule, None, None)
+        if first:
+            _start(rows, marks, row, sums, pairs, block.points, search, used, result)
+        rays = np.empty((near.size, RAY * TILE))
+        places = np.empty((len(pairs.rays), 3 * TILE))
+        values = np.empty(pairs.own.shape[2])
+        for _ in range(STEPS):
+            if not _step(rows, rays, places, values, now, tile, near, marks, pairs, block, search):
+                break
+        _write(rows, sums, search, result)
 
 
-@device
-def _begin(ray: FloatArray, points: Chosen, i: int, c: int, images: Images) -> None:
-    """Fill in where a ray comes from, and how the scale of its image changes with the place.
+@device(allocates=True)
+def _pairs_of(
+    rows: IntArray, marks: FloatArray, row: IntArray, tile: FloatArray, block: Block
+) -> Pairs:
+    """Return the pairs of the points of a tile, and mark the cameras that are in one.
 
-    The scale depends on the distance, relative to that of P: along the axis in a perspective
-    image, from the centre in other projections.
+    `marks`, a row for each of the images near the tile, say which cameras each point has; `row`,
+    which row is that of a camera.
     """
-    e = minus(row_of(points.centres, c), row_of(points.xyz, i))
-    up = normal_above(points, i)[2]
-    ray[_ABOVE] = up * (points.height[i] - points.xyz[i, 2] + points.offset[c])
-    original = minus(row_of(images.centres, c), row_of(points.original_xyz, i))
-    optics = images.original
-    axis, size2 = row_of(optics.rotations[c], 2), dot(original, original)
-    ahead = -dot(axis, original)
-    # behind a perspective camera the depth along the axis has no meaning
-    flat = optics.lenses[optics.row[c], KIND] == PERSPECTIVE and ahead > 0.0
-    for j in range(3):
-        ray[j], ray[_ORIGINAL + j] = e[j], original[j]
-        ray[_BY_PLACE + j] = axis[j] / ahead if flat else -original[j] / size2
+    points, listed, most, k = block.points, block.listed_start, 0, len(marks)
+    for i in rows:
+        if listed.size:
+            most = max(most, (listed[i + 1] - listed[i]) // 2)
+        else:
+            most = max(most, (points.start[i + 1] - points.start[i]) * block.partners.shape[1])
+    number, total = np.full((k, k), ABSENT), 0
+    rays = np.empty((min(k * k, rows.size * most), 2), np.int64)
+    own = np.empty((3, rows.size, most), np.int64)
+    count, narrow = np.zeros(rows.size, np.int64), np.zeros(rows.size, np.int64)
+    in_pair = np.zeros(marks.shape)
+    for j in range(rows.size):
+        i = rows[j]
+        first, last = points.start[i], points.start[i + 1]
+        step = block.partners.shape[1]
+        candidates = (last - first) * step
+        if listed.size:
+            candidates = (listed[i + 1] - listed[i]) // 2
+        for one in range(candidates):
+            if listed.size:
+                at = listed[i] + 2 * one
+                a, b = block.listed_camera[at], block.listed_camera[at + 1]
+            else:
+                a = points.camera[first + one // step]
+                b = block.partners[a, one % step]
+            if a < 0 or b < 0 or a == b or row[a] < 0 or row[b] < 0:
+                continue
+            ray_a, ray_b = row[a], row[b]
+            if not (marks[ray_a, j] > 0.0 and marks[ray_b, j] > 0.0):
+                continue
+            if not _is_wide(a, b, j, tile, points):
+                narrow[j] += 1
+                continue
+            if number[ray_a, ray_b] < 0:
+                number[ray_a, ray_b], rays[total, 0], rays[total, 1] = total, ray_a, ray_b
+                total += 1
+            for axis in range(3):
+                own[axis, j, count[j]] = number[ray_a, ray_b]
+            count[j] += 1
+            in_pair[ray_a, j], in_pair[ray_b, j] = 1.0, 1.0
+    marks[:] = in_pair
+    return Pairs(rays[:total], own, count, narrow)
 
 
 @device
-def _see(ray: FloatArray, q: Vector, c: int, point: _Point, images: Images) -> None:
-    """Write the normal equations of the image of Q: G'G, G'G e and |G e|^2.
+def _is_wide(a: int, b: int, j: int, tile: FloatArray, points: Chosen) -> bool:
+    """Whether a pair has a base, as seen from P, and both cameras are above P and the water.
+
+    The limit is that of `pcfix.refract.rays.nearest_point` for two rays.
+    """
+    p, normal = three(tile, j), three(tile, 4 * TILE + j)
+    e_a, e_b = minus(row_of(points.centres, a), p), minus(row_of(points.centres, b), p)
+    # sin^2 of the angle between the rays against that of parallel ones
+    across, depth = cross(e_a, e_b), tile[3 * TILE + j] - p[2]
+    above = dot(normal, e_a) > max(normal[2] * (depth + points.offset[a]), 0.0)
+    above = above and dot(normal, e_b) > max(normal[2] * (depth + points.offset[b]), 0.0)
+    return above and dot(across, across) >= 4.0 * MIN_DETERMINANT * dot(e_a, e_a) * dot(e_b, e_b)
+
+
+@device
+def _start(
+    rows: IntArray, marks: FloatArray, row: IntArray, sums: FloatArray, pairs: Pairs,
+    points: Chosen, search: FloatArray, used: BoolArray, result: FloatArray,
+) -> None:  # fmt: skip
+    """Set the start of each search, the outcome, and which cameras are used."""
+    for j in range(rows.size):
+        i = rows[j]
+        first, last = points.start[i], points.start[i + 1]
+        if pairs.wide[j] == 0:
+            few = ONE_CAMERA if last > first else NO_CAMERA
+            result[i, _OUTCOME] = PARALLEL if pairs.narrow[j] else few
+            continue
+        for at in range(first, last):
+            used[at] = marks[row[points.camera[at]], j] > 0.0
+        fixed, q, distance = nearest_point(sums[9 * TILE + j], nine(sums, j))
+        result[i, _OUTCOME] = CORRECTED if fixed else PARALLEL
+        if fixed:
+            result[i, 0], result[i, 1], result[i, 2] = q
+            result[i, _DISTANCE] = distance
+            search[i, 0], search[i, 1], search[i, 2] = q
+            search[i, _BEST], search[i, _SHARE], search[i, _GOES_ON] = np.inf, 1.0, 1.0
+            _as_from_above(search[i], points.n)
+
+
+@device
+def _step(
+    rows: IntArray, rays: FloatArray, places: FloatArray, values: FloatArray, now: FloatArray,
+    tile: FloatArray, near: IntArray, marks: FloatArray, pairs: Pairs, block: Block,
+    search: FloatArray,
+) -> bool:  # fmt: skip
+    """Do one step of all searches of a tile; return whether any goes on."""
+    optics, goes_on = block.images.original, False
+    for j in range(rows.size):
+        put(now, j, vector(search[rows[j]]))
+    for q in range(near.size):
+        lens = optics.lenses[optics.row[near[q]]]
+        # numba compiles a version of `_see` for each kind of argument
+        if lens[PLAIN] != 0.0:
+            _see(rays[q], now, tile, rows.size, near[q], block, plain_lens(lens))
+        else:
+            _see(rays[q], now, tile, rows.size, near[q], block, None)
+    for p in range(len(pairs.rays)):
+        _meet(places[p], rays[pairs.rays[p, 0]], rays[pairs.rays[p, 1]], rows.size)
+    for j in range(rows.size):
+        if search[rows[j], _GOES_ON] > 0.0:
+            # the median is relative to P, so that it is F itself
+            x = _median(places, values, pairs.own[0, j, : pairs.wide[j]], j)
+            y = _median(places, values, pairs.own[1, j, : pairs.wide[j]], TILE + j)
+            z = _median(places, values, pairs.own[2, j, : pairs.wide[j]], 2 * TILE + j)
+            _advance(search[rows[j]], (x, y, z), block.points.n)
+            goes_on = goes_on or search[rows[j], _GOES_ON] > 0.0
+    return goes_on
+
+
+@device
+def _see(
+    ray: FloatArray, now: FloatArray, tile: FloatArray, count: int, c: int, block: Block,
+    plain: Plain | None,
+) -> None:  # fmt: skip
+    """Write the normal equations of the images of Q: G'G, G'G e and |G e|^2; see `RAY`.
 
     The direction w, in the original model, is scaled to the distance of P, so that G is that there.
+    The scale of an image depends on the distance, relative to that of P: along the axis in a
+    perspective image, from the centre in other projections.
     """
-    k, _, _, _, s = light_near(q, vector(ray), point.normal, ray[_ABOVE], point.n)
-    w = to_original(images, c, minus(scaled(k, s), point.normal))
-    # g.w is the distance of w in terms of P
-    w = scaled(1.0 / dot(w, vector(ray, _BY_PLACE)), w)
-    optics, e = images.original, vector(ray, _ORIGINAL)
-    _, _, by_u, by_v = image_in_world(optics.lenses[optics.row[c]], optics.rotations[c], w)
-    ray[_SQUARE:] = 0.0
-    for g in (by_u, by_v):
-        (x, y, z), off = g, dot(g, e)
-        # one row g of G: g g', (g.e) g and (g.e)^2
-        terms = (x * x, x * y, x * z, y * y, y * z, z * z, off * x, off * y, off * z, off * off)
-        for i in range(10):
-            ray[_SQUARE + i] += terms[i]
+    points, images = block.points, block.images
+    centre, original, optics = row_of(points.centres, c), row_of(images.centres, c), images.original
+    r, lens, offset = optics.rotations[c], optics.lenses[optics.row[c]], points.offset[c]
+    right, down, axis = row_of(r, 0), row_of(r, 1), row_of(r, 2)
+    is_flat = lens[KIND] == PERSPECTIVE
+    for j in range(count):
+        p, normal = three(tile, j), three(tile, 4 * TILE + j)
+        above = normal[2] * (tile[3 * TILE + j] - p[2] + offset)
+        k, _, _, _, s = light_near(three(now, j), minus(centre, p), normal, above, points.n)
+        w = to_original(images, c, minus(scaled(k, s), normal))
+        e = minus(original, three(tile, 7 * TILE + j))
+        size2, ahead = dot(e, e), -dot(axis, e)
+        # behind a perspective camera the depth along the axis has no meaning
+        flat = is_flat and ahead > 0.0
+        scale = 1.0 / ahead if flat else -1.0 / size2
+        by_place = scaled(scale, axis if flat else e)
+        # g.w is the distance of w in terms of P
+        w = scaled(1.0 / dot(w, by_place), w)
+        if plain is None:
+            u, _, by_u, by_v = image_in_world(lens, r, w)
+        else:
+            u, _, g = plain_image(plain, (dot(right, w), dot(down, w), dot(axis, w)))
+            by_u = beyond(beyond(scaled(g[0], right), g[1], down), g[2], axis)
+            by_v = beyond(beyond(scaled(g[3], right), g[4], down), g[5], axis)
+        # NaN where there is no image
+        off_u, off_v = dot(by_u, e) + 0.0 * u, dot(by_v, e)
+        put(ray, _BY_PLACE * TILE + j, by_place)
+        (a, b, c_), (x, y, z) = by_u, by_v
+        put(ray, _SQUARE * TILE + j, (a * a + x * x, a * b + x * y, a * c_ + x * z))
+        put(ray, (_SQUARE + 3) * TILE + j, (b * b + y * y, b * c_ + y * z, c_ * c_ + z * z))
+        put(ray, _RIGHT * TILE + j, beyond(scaled(off_u, by_u), off_v, by_v))
+        ray[_REST * TILE + j] = off_u * off_u + off_v * off_v
 
 
 @device
-def _meet(a: FloatArray, b: FloatArray) -> Vector:
-    """Return where two straight rays have the least squared residuals in their images.
+def _meet(place: FloatArray, a: FloatArray, b: FloatArray, count: int) -> None:
+    """Write where the straight rays of a pair have the least squared residuals in their images.
 
     At X the residual of a camera is G (X - e) / t, with t = 1 + g.X the distance of X relative to
     that of P. The first round takes t = 1. The second has t, and its change with X: at the minimum
@@ -245,152 +364,131 @@ def _meet(a: FloatArray, b: FloatArray) -> Vector:
 
     That matters for narrow pairs whose rays pass each other.
     """
-    # first t = 1, then with the t and r^2 of that place
-    place = _solve_two(a, b, 1.0, 1.0, 0.0, 0.0)
-    t, r2 = _residual(place, a)
-    t_b, r2_b = _residual(place, b)
-    return _solve_two(a, b, 1.0 / (t * t), 1.0 / (t_b * t_b), r2 / t**3, r2_b / t_b**3)
+    for j in range(count):
+        # first t = 1, then with the t and r^2 of that place
+        x = _solve_two(a, b, j, 1.0, 1.0, 0.0, 0.0)
+        t, r2 = _residual(x, a, j)
+        t_b, r2_b = _residual(x, b, j)
+        of_a, of_b = 1.0 / (t * t), 1.0 / (t_b * t_b)
+        put(place, j, _solve_two(a, b, j, of_a, of_b, r2 * of_a / t, r2_b * of_b / t_b))
 
 
 @device
-def _residual(place: Vector, ray: FloatArray) -> tuple[float, float]:
+def _residual(place: Vector, ray: FloatArray, j: int) -> tuple[float, float]:
     """Return t and r^2 of a place."""
-    (x, y, z), s = place, ray[_SQUARE:]
-    t = 1.0 + x * ray[_BY_PLACE] + y * ray[_BY_PLACE + 1] + z * ray[_BY_PLACE + 2]
+    x, y, z = place
+    xx, xy, xz = three(ray, _SQUARE * TILE + j)
+    yy, yz, zz = three(ray, (_SQUARE + 3) * TILE + j)
     # |G (X - e)|^2 from the sums
-    twice = x * (s[1] * y + s[2] * z) + s[4] * y * z - (s[6] * x + s[7] * y + s[8] * z)
-    return t, s[0] * x * x + s[3] * y * y + s[5] * z * z + 2.0 * twice + s[9]
+    twice = x * (xy * y + xz * z) + yz * y * z - dot(place, three(ray, _RIGHT * TILE + j))
+    r2 = xx * x * x + yy * y * y + zz * z * z + 2.0 * twice + ray[_REST * TILE + j]
+    return 1.0 + dot(place, three(ray, _BY_PLACE * TILE + j)), r2
 
 
 @device
 def _solve_two(
-    a: FloatArray, b: FloatArray, of_a: float, of_b: float, g_a: float, g_b: float
+    a: FloatArray, b: FloatArray, j: int, of_a: float, of_b: float, g_a: float, g_b: float
 ) -> Vector:
     """Solve the normal equations of two rays, with the weights and gradients of each."""
-    right = beyond(_sum(a, b, of_a, of_b, _RIGHT), g_a, vector(a, _BY_PLACE))
-    right = beyond(right, g_b, vector(b, _BY_PLACE))
-    xx, xy, xz = _sum(a, b, of_a, of_b, _SQUARE)
-    yy, yz, zz = _sum(a, b, of_a, of_b, _SQUARE + 3)
+    right = _sum(a, b, _RIGHT * TILE + j, of_a, of_b)
+    right = beyond(right, g_a, three(a, _BY_PLACE * TILE + j))
+    right = beyond(right, g_b, three(b, _BY_PLACE * TILE + j))
+    xx, xy, xz = _sum(a, b, _SQUARE * TILE + j, of_a, of_b)
+    yy, yz, zz = _sum(a, b, (_SQUARE + 3) * TILE + j, of_a, of_b)
     return solved((xx, xy, xz, yy, yz, zz), right)[1]
 
 
 @device
-def _sum(a: FloatArray, b: FloatArray, of_a: float, of_b: float, at: int) -> Vector:
-    """Return a weighted sum of three columns of two rays."""
-    return plus(scaled(of_a, vector(a, at)), scaled(of_b, vector(b, at)))
+def _sum(a: FloatArray, b: FloatArray, at: int, of_a: float, of_b: float) -> Vector:
+    """Return a weighted sum of three numbers of two rays."""
+    return beyond(scaled(of_a, three(a, at)), of_b, three(b, at))
 
 
 @device
-def _wide_pairs(pairs: IntArray, rays: FloatArray, normal: Vector) -> int:
-    """Bring the pairs that have a base, as seen from P, to the front; return how many there are.
+def _median(places: FloatArray, values: FloatArray, own: IntArray, at: int) -> float:
+    """Return the median of one coordinate of the places of some pairs, NaN if one is.
 
-    The limit is that of `pcfix.refract.rays.nearest_point` for two rays. Cameras below the water
-    or the point have no ray.
+    The pairs are sorted in place by insertion: from step to step their order changes little.
     """
-    count = 0
-    for p in range(len(pairs)):
-        first, second = rays[pairs[p, 0]], rays[pairs[p, 1]]
-        a, b = vector(first), vector(second)
-        # sin^2 of the angle between the rays against that of parallel ones
-        across = cross(a, b)
-        above = dot(normal, a) > max(first[_ABOVE], 0.0)
-        above = above and dot(normal, b) > max(second[_ABOVE], 0.0)
-        wide = dot(across, across) >= 4.0 * MIN_DETERMINANT * (dot(a, a) * dot(b, b))
-        if above and wide:
-            pairs[count, 0], pairs[count, 1] = pairs[p, 0], pairs[p, 1]
-            count += 1
-    return count
+    for i in range(own.size):
+        pair, to = own[i], i
+        value = places[pair, at]
+        if value != value:
+            return np.nan
+        while to > 0 and values[to - 1] > value:
+            values[to], own[to] = values[to - 1], own[to - 1]
+            to -= 1
+        values[to], own[to] = value, pair
+    half = own.size // 2
+    return values[half] if own.size % 2 else 0.5 * (values[half - 1] + values[half])
 
 
 @device
-def _solve(out: FloatArray, point: _Point, images: Images, inverse: FloatArray) -> None:
-    """Solve one point and write its row."""
-    k, sums, n = 0.0, NO_LINE, point.n
-    for j in range(point.used.size):
-        if point.used[j]:
-            e, above = vector(point.rays[j]), point.rays[j, _ABOVE]
-            # where the ray through P enters the water, and its direction there
-            length2, across = dot(e, e), dot(point.normal, e)
-            f, bend = (above / across, 1.0 / n) if above > 0.0 else (0.0, 1.0)
-            d = refracted(e, length2, point.normal, across, bend)
-            k, sums = k + 1.0, plus_line(sums, scaled(f, e), d, 1.0 / length2)
-    fixed, start, _ = nearest_point(k, sums)
-    if not fixed:
-        out[_OUTCOME] = PARALLEL
-        return
-    found, q = _search(start, inverse, point, images)
-    out[0], out[1], out[2] = q
-    out[_DISTANCE] = ray_distance(k, sums, q)
-    out[_OUTCOME], out[_FOUND] = CORRECTED, 1.0 if found else 0.0
-
-
-@device
-def _search(
-    start: Vector, inverse: FloatArray, point: _Point, images: Images
-) -> tuple[bool, Vector]:
-    """Return whether a Q was found where the median F of the pairs' places is P, and that Q.
+def _advance(one: FloatArray, f: Vector, n: float) -> None:
+    """Move the Q of a search to where the median F of the pairs' places is P.
 
     From the nearest Q so far goes a step s = -B F, at first as from above. Where F comes nearer,
     by y, the good Broyden update is B + (s - B y) s'B / (s'B y); where it does not, B starts again
     with half the step.
     """
-    rays, pairs, places = point.rays, point.pairs, point.places
-    _as_from_above(inverse, 1.0, point.n)
-    q, nearest, at_nearest, best, share = start, start, (0.0, 0.0, 0.0), np.inf, 1.0
-    for _ in range(MAX_STEPS):
-        # where the pairs would place Q; NaN where a camera has no image of it
-        for j in range(point.used.size):
-            if point.used[j]:
-                _see(rays[j], q, point.cameras[j], point, images)
-        for p in range(len(pairs)):
-            places[0, p], places[1, p], places[2, p] = _meet(rays[pairs[p, 0]], rays[pairs[p, 1]])
-        # the median is relative to P, so that it is F itself
-        f = _median(places[0]), _median(places[1]), _median(places[2])
-        size = np.sqrt(dot(f, f))
-        if size <= CLOSE_M:
-            return True, _onward(q, inverse, f)
-        if size < best:
-            if best < np.inf:
-                step, change = minus(q, nearest), minus(f, at_nearest)
-                missing = minus(step, algebra.times(inverse, change))
-                left = algebra.transposed_times(inverse, step)
-                along = dot(left, change)
-                for i in range(3 if along != 0.0 else 0):
-                    for j in range(3):
-                        inverse[i, j] += missing[i] * left[j] / along
-            best, nearest, at_nearest = size, q, f
-        elif best < np.inf:
-            share *= 0.5
-            _as_from_above(inverse, share, point.n)
-        else:  # no image of the start
-            return False, start
-        q = _onward(nearest, inverse, at_nearest)
-    return False, start
+    size = np.sqrt(dot(f, f))
+    if size <= CLOSE_M:
+        _go(one, vector(one), f)
+        one[_GOES_ON] = 0.0
+        one[_BEST] = 0.0
+        return
+    if size < one[_BEST]:
+        if one[_BEST] < np.inf:
+            s, y = minus(vector(one), vector(one, _NEAREST)), minus(f, vector(one, _AT_NEAREST))
+            missing = minus(s, _times(one, y))
+            x, y_, z = s
+            left = beyond(
+                beyond(scaled(x, vector(one, _INVERSE)), y_, vector(one, _INVERSE + 3)),
+                z, vector(one, _INVERSE + 6),
+            )  # fmt: skip
+            along = dot(left, y)
+            for i in range(3 if along != 0.0 else 0):
+                for j in range(3):
+                    one[_INVERSE + 3 * i + j] += missing[i] * left[j] / along
+        for i in range(3):
+            one[_NEAREST + i], one[_AT_NEAREST + i] = one[i], f[i]
+        one[_BEST] = size
+    elif one[_BEST] < np.inf:
+        one[_SHARE] *= 0.5
+        _as_from_above(one, n)
+    else:  # no image of the start
+        one[_GOES_ON] = 0.0
+        return
+    _go(one, vector(one, _NEAREST), vector(one, _AT_NEAREST))
 
 
 @device
-def _onward(q: Vector, inverse: FloatArray, f: Vector) -> Vector:
-    """Return Q after a step -B F."""
-    return minus(q, algebra.times(inverse, f))
+def _go(one: FloatArray, q: Vector, f: Vector) -> None:
+    """Set Q to a step -B F from q."""
+    one[0], one[1], one[2] = minus(q, _times(one, f))
 
 
 @device
-def _as_from_above(inverse: FloatArray, share: float, n: float) -> None:
+def _times(one: FloatArray, a: Vector) -> Vector:
+    """Return B a."""
+    at = _INVERSE
+    return dot(vector(one, at), a), dot(vector(one, at + 3), a), dot(vector(one, at + 6), a)
+
+
+@device
+def _as_from_above(one: FloatArray, n: float) -> None:
     """Set B to a share of the inverse derivative for light from straight above."""
-    inverse[:] = 0.0
-    inverse[0, 0], inverse[1, 1], inverse[2, 2] = share, share, share * n
+    one[_INVERSE:_GOES_ON] = 0.0
+    one[_INVERSE], one[_INVERSE + 4] = one[_SHARE], one[_SHARE]
+    one[_INVERSE + 8] = one[_SHARE] * n
 
 
 @device
-def _median(values: FloatArray) -> float:
-    """Return the median, NaN if a value is; sorts the values in place by insertion."""
-    for i in range(values.size):
-        value, place = values[i], i
-        if value != value:
-            return np.nan
-        while place > 0 and values[place - 1] > value:
-            values[place] = values[place - 1]
-            place -= 1
-        values[place] = value
-    half = values.size // 2
-    return values[half] if values.size % 2 else 0.5 * (values[half - 1] + values[half])
+def _write(rows: IntArray, sums: FloatArray, search: FloatArray, result: FloatArray) -> None:
+    """Write the points that are found."""
+    for j in range(rows.size):
+        row, one = result[rows[j]], search[rows[j]]
+        if row[_OUTCOME] == CORRECTED and one[_BEST] == 0.0:
+            row[0], row[1], row[2] = vector(one)
+            row[_DISTANCE] = ray_distance(sums[9 * TILE + j], nine(sums, j), vector(one))
+            row[_FOUND] = 1.0

@@ -13,7 +13,7 @@ import numpy as np
 from pcfix.kernels import device
 from pcfix.lens.algebra import Nine, Vector, row_of
 from pcfix.lens.frames import Frames, may_hold
-from pcfix.model import FloatArray, IntArray, SingleArray
+from pcfix.model import FloatArray, IntArray
 from pcfix.refract.batch import Batch, Chosen, normal_above
 
 TILE = 128
@@ -78,13 +78,13 @@ def slots(*widths: int) -> tuple[int, ...]:
 
 
 @device(forceinline=True)
-def three(runs: FloatArray | SingleArray, at: int) -> Vector:
+def three(runs: FloatArray, at: int) -> Vector:
     """Return the numbers of a point from three runs that follow each other."""
     return runs[at], runs[at + TILE], runs[at + 2 * TILE]
 
 
 @device(forceinline=True)
-def put(runs: FloatArray | SingleArray, at: int, a: Vector) -> None:
+def put(runs: FloatArray, at: int, a: Vector) -> None:
     """Write the numbers of a point into three runs that follow each other."""
     runs[at], runs[at + TILE], runs[at + 2 * TILE] = a
 

@@ -45,7 +45,7 @@ times the residual, which is of second order.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -63,11 +63,11 @@ from pcfix.lens.algebra import (
     row_of,
     scaled,
 )
-from pcfix.model import FloatArray, IntArray, Outcome, SingleArray
+from pcfix.model import FloatArray, IntArray, Outcome
 from pcfix.options.correct import LEVEL_M
 from pcfix.refract import tiling
 from pcfix.refract.batch import Batch, Chosen, Intersection, Survey
-from pcfix.refract.choice import Rig, Rule, rig_of, rule_of
+from pcfix.refract.choice import Rig, rig_of
 from pcfix.refract.tiling import TILE, inverse_of, nine, product_of, put, slots, three
 from pcfix.water.surface import Field, height_at
 
@@ -104,12 +104,10 @@ def covariances(batch: Batch, shift_m: FloatArray) -> FloatArray:
     survey, result = batch.survey, np.zeros((len(batch), 6))
     if not len(survey.cameras):
         return result
-    # the rays are chosen: on a mesh some may be beyond the limit for the plane above the point
-    every_ray = rule_of(survey)._replace(least_cosine2=0.0)
     in_tiles(
         _of_lists, tiling.tiles_of(batch), tiling.spatial_order(batch.xyz), batch.chosen(),
-        np.ascontiguousarray(shift_m), rig_of(survey), every_ray, budget_of(survey),
-        level_sigma_of(batch), result,
+        np.ascontiguousarray(shift_m), rig_of(survey), budget_of(survey), level_sigma_of(batch),
+        result,
     )  # fmt: skip
     return result
 
@@ -202,72 +200,46 @@ def budget_of(survey: Survey) -> Budget:
     )
 
 
-# Runs of `TILE` numbers in the room of a tile, for the points: the number of rays; S delta by level
-# (3) and n (3); W (6); S T (9); S delta by the slope tau, to be multiplied by it (9); noise (6).
-# For the rays of one camera: N and y - h of the points (4), how often each counts, e (3) and h.
-(
-    RAYS, BY_LEVEL, BY_N, SIGHT, BY_Q, BY_TILT, NOISE, _NORMAL, _BELOW, _COUNT, _AWAY, _HEIGHT,
-    ROOM,
-) = slots(1, 3, 3, 6, 9, 9, 6, 3, 1, 1, 3, 1)  # fmt: skip
+# Runs of `TILE` numbers for the points of a tile: how far above the true point P is, along N; the
+# number of rays; S delta by level (3) and n (3); W (6); S T (9); S delta by the slope tau, to be
+# multiplied by it (9); noise (6).
+_ABOVE, RAYS, BY_LEVEL, BY_N, SIGHT, BY_Q, BY_TILT, NOISE, ROOM = slots(1, 1, 3, 3, 6, 9, 9, 6)
 
-# A number of a program has double precision, and would make doubles of what it is added to.
-_ZERO, _HALF, _ONE, _TWO = np.array([0.0, 0.5, 1.0, 2.0], np.float32)
-_single: Any = np.float32
-
-Sight: TypeAlias = tuple[Vector, float, float]
-"""Optical axis, squared focal length (px), 1 / n: plain numbers, which stay in registers."""
 Seen: TypeAlias = tuple[float, Vector, Vector, float, float, float, float, float]
 
 
-@device(allocates=True)
-def room_of(tile: FloatArray, shift: FloatArray, rows: IntArray) -> SingleArray:
-    """Return room for the sums of a tile, and how far below P the true points lie, along N.
+class Sight(NamedTuple):
+    """One camera, for kernels: plain numbers, which stay in registers."""
 
-    Single precision works on twice as many rays at once. A standard error is off by 5e-6 of it
-    where the cameras are 0.4 heights apart, and by 4 % at 0.003, below which rays are parallel.
-    """
-    # the sums start at zero; the runs of the rays are filled in by `add_rays`
-    room = np.zeros(ROOM * TILE, np.float32)
+    centre: Vector
+    offset: float  # how much higher the water stood
+    axis: Vector  # optical axis; zeros for images of nearly equal angles
+    square: float  # squared focal length, px^2
+    bend: float  # 1 / n
+
+
+@device(allocates=True)
+def room_of(tile: FloatArray, shift: FloatArray, rows: IntArray) -> FloatArray:
+    """Return room for the sums of a tile, which start at zero."""
+    room = np.zeros(ROOM * TILE)
     for j in range(rows.size):
-        normal = three(tile, 4 * TILE + j)
-        put(room, _NORMAL * TILE + j, normal)
-        room[_BELOW * TILE + j] = -dot(normal, row_of(shift, rows[j]))
+        room[_ABOVE * TILE + j] = -dot(three(tile, 4 * TILE + j), row_of(shift, rows[j]))
     return room
 
 
-@device
-def add_rays(
-    room: SingleArray, tile: FloatArray, marks: FloatArray, rig: Rig, c: int, rule: Rule
-) -> None:
-    """Set what the rays of one camera have: how often they count, as their marks say, e and h.
-
-    Double precision makes this the same to the bit in any tile. A ray that is not used goes
-    straight up.
-    """
-    centre, offset, least_cosine2 = row_of(rig.centres, c), rig.offset[c], rule.least_cosine2
-    for j in range(marks.size):
-        z = tile[2 * TILE + j]
-        e = minus(centre, (tile[j], tile[TILE + j], z))
-        normal = three(tile, 4 * TILE + j)
-        height = dot(normal, e)
-        h = normal[2] * (tile[3 * TILE + j] - (z - offset))
-        # the camera is above the water, the ray marked and within the limit of incidence
-        use = (marks[j] > 0.0) & (height > h) & (height * height >= least_cosine2 * dot(e, e))
-        room[_COUNT * TILE + j] = marks[j] if use else 0.0
-        put(room, _AWAY * TILE + j, e if use else normal)
-        room[_HEIGHT * TILE + j] = h
-
-
 @device(forceinline=True)
-def _seen(room: SingleArray, j: int, bend: float) -> Seen:
-    """Return how often a ray counts; e, N, H, L^2, h, y and r where the light bends."""
-    e, normal = three(room, _AWAY * TILE + j), three(room, _NORMAL * TILE + j)
-    h = room[_HEIGHT * TILE + j]
+def _seen(room: FloatArray, tile: FloatArray, marks: FloatArray, j: int, sight: Sight) -> Seen:
+    """Return how often a ray counts; e, N, H, L^2, h, y and r where the light bends.
+
+    A ray that does not count goes straight up.
+    """
+    p, normal = three(tile, j), three(tile, 4 * TILE + j)
+    e = minus(sight.centre, p) if marks[j] > 0.0 else normal
+    h = normal[2] * (tile[3 * TILE + j] - (p[2] - sight.offset))
     # light of a point above the water goes straight
-    bend = bend if h > _ZERO else _ONE
+    bend = sight.bend if h > 0.0 else 1.0
     # y: depth of the true point below the surface
-    y = h + room[_BELOW * TILE + j]
-    return room[_COUNT * TILE + j], e, normal, dot(normal, e), dot(e, e), h, y, bend
+    return marks[j], e, normal, dot(normal, e), dot(e, e), h, h + room[_ABOVE * TILE + j], bend
 
 
 @device(forceinline=True)
@@ -276,36 +248,37 @@ def _bent(
 ) -> tuple[float, float, float, float, float, float]:
     """Return kappa, 1 / H, r / kappa, 1 - m, beta, and delta by n over d."""
     kappa = np.sqrt(length2 - bend * bend * (length2 - height * height))
-    share = _ONE / (height * kappa)  # one division for two
+    share = 1.0 / (height * kappa)  # one division for two
     inv_k, inv_h = share * height, share * kappa
     # r / kappa, the tangent in water for each metre across in air
     lean = bend * inv_k
     fall = y * lean * inv_k * inv_k
-    by_n = fall * bend * length2 if bend < _ONE else _ZERO
-    return kappa, inv_h, lean, _ONE - h * inv_h + y * lean, fall * (bend * bend - _ONE), by_n
+    by_n = fall * bend * length2 if bend < 1.0 else 0.0
+    return kappa, inv_h, lean, 1.0 - h * inv_h + y * lean, fall * (bend * bend - 1.0), by_n
 
 
 @device(forceinline=True)
-def _weight(one: float, e: Vector, length2: float, axis: Vector, square: float) -> Symmetric:
-    """Return J'J of a camera whose squared focal length (px) is `square`, at P.
+def _weight(one: float, e: Vector, length2: float, sight: Sight) -> Symmetric:
+    """Return J'J of a camera at P.
 
     With the optical axis z and Z = -z.e it is (f / Z)^2 (I + x z' + z x'), x = e / Z +
     L^2 / (2 Z^2) z; without an axis (zeros), of angles, (f / L)^2 (I - e e' / L^2).
     """
+    axis = sight.axis
     # cameras without an axis, such as fisheyes, have equal angles per pixel
-    flat = axis[0] != _ZERO or axis[1] != _ZERO or axis[2] != _ZERO
+    flat = axis[0] != 0.0 or axis[1] != 0.0 or axis[2] != 0.0
     # depth along the axis, or the squared distance
     deep = -dot(axis, e) if flat else length2
-    inv = _ONE / deep if one > _ZERO else _ZERO
+    inv = 1.0 / deep if one > 0.0 else 0.0
     # (f / Z)^2 or (f / L)^2; 0 for rays that do not count
-    w = one * square * (inv * inv if flat else inv)
-    a = inv if flat else -_HALF * inv
-    b = _HALF * length2 * inv * inv if flat else _ZERO
+    w = one * sight.square * (inv * inv if flat else inv)
+    a = inv if flat else -0.5 * inv
+    b = 0.5 * length2 * inv * inv if flat else 0.0
     zx, zy, zz = axis[0] if flat else e[0], axis[1] if flat else e[1], axis[2] if flat else e[2]
     x, y, z = scaled(w, beyond(scaled(a, e), b, (zx, zy, zz)))
     return (
-        w + _TWO * x * zx, x * zy + zx * y, x * zz + zx * z,
-        w + _TWO * y * zy, y * zz + zy * z, w + _TWO * z * zz,
+        w + 2.0 * x * zx, x * zy + zx * y, x * zz + zx * z,
+        w + 2.0 * y * zy, y * zz + zy * z, w + 2.0 * z * zz,
     )  # fmt: skip
 
 
@@ -318,13 +291,10 @@ def _add_three(sums: FloatArray, at: int, c: float, a: Vector) -> None:
 
 
 @device(forceinline=True)
-def _add_six(sums: FloatArray, at: int, m: Symmetric) -> None:
-    sums[at] += m[0]
-    sums[at + TILE] += m[1]
-    sums[at + 2 * TILE] += m[2]
-    sums[at + 3 * TILE] += m[3]
-    sums[at + 4 * TILE] += m[4]
-    sums[at + 5 * TILE] += m[5]
+def _add_six(sums: FloatArray, at: int, c: float, m: Symmetric) -> None:
+    """Add c m."""
+    _add_three(sums, at, c, (m[0], m[1], m[2]))
+    _add_three(sums, at + 3 * TILE, c, (m[3], m[4], m[5]))
 
 
 @device(forceinline=True)
@@ -342,17 +312,16 @@ def _add_nine(sums: FloatArray, at: int, c: float, m: Symmetric, g: Vector, q: V
 
 
 @device
-def add_rays_of_camera(room: SingleArray, count: int, sight: Sight) -> None:
-    """Add one camera's rays to the sums of a tile's points, of so many.
+def add_rays(room: FloatArray, tile: FloatArray, marks: FloatArray, sight: Sight) -> None:
+    """Add one camera's rays to the sums of a tile's points.
 
     S T = W / (1 - m) + W N (u N + v e)', with c = 1 - m + beta rho^2, v = H beta / ((1 - m) c) and
     u = (r H / kappa) / c - 1 / (1 - m) - H v.
     """
-    axis, square, bend_of = sight
-    for j in range(count):
-        one, e, normal, height, length2, h, y, bend = _seen(room, j, bend_of)
+    for j in range(marks.size):
+        one, e, normal, height, length2, h, y, bend = _seen(room, tile, marks, j, sight)
         _, inv_h, lean, away, beta, by_n = _bent(height, length2, h, y, bend)
-        w = _weight(one, e, length2, axis, square)
+        w = _weight(one, e, length2, sight)
         g = product(w, normal)
         # D^-1 across d and along it; see the docstring for u and v
         inner, outer = _inverse(height, length2, away, beta)
@@ -365,7 +334,7 @@ def add_rays_of_camera(room: SingleArray, count: int, sight: Sight) -> None:
         scale = -height * outer
         _add_three(room, BY_LEVEL * TILE + j, scale * (inv_h - lean), g)
         _add_three(room, BY_N * TILE + j, scale * by_n, g)
-        _add_six(room, SIGHT * TILE + j, w)
+        _add_six(room, SIGHT * TILE + j, 1.0, w)
 
 
 @device(forceinline=True)
@@ -373,26 +342,25 @@ def _inverse(height: float, length2: float, away: float, beta: float) -> tuple[f
     """Return what D^-1 does to p across d, and along it."""
     # 1 - m + beta rho^2
     outer = away + beta * (length2 - height * height)
-    share = _ONE / (away * outer)
+    share = 1.0 / (away * outer)
     return share * outer, share * away
 
 
 @device
-def add_tilt(room: SingleArray, count: int, sight: Sight) -> None:
+def add_tilt(room: FloatArray, tile: FloatArray, marks: FloatArray, sight: Sight) -> None:
     """Add how the slope of the water moves each of one camera's rays, S delta.
 
     S delta = (a W + (a beta - (1 - m) b) H / c W N d') / (1 - m) tau, c as above, for delta =
     a tau + b (d.tau) d; d.tau = e.tau.
     """
-    axis, square, bend_of = sight
-    for j in range(count):
-        one, e, normal, height, length2, h, y, bend = _seen(room, j, bend_of)
+    for j in range(marks.size):
+        one, e, normal, height, length2, h, y, bend = _seen(room, tile, marks, j, sight)
         kappa, inv_h, lean, away, beta, _ = _bent(height, length2, h, y, bend)
         # delta by the slope is turn (tau) + along (d.tau) d, along = gamma + m r / kappa
-        inv_k, turn = _ONE / kappa, -y * (_ONE - height * lean)
+        inv_k, turn = 1.0 / kappa, -y * (1.0 - height * lean)
         along = y * bend * bend * lean * height * inv_k * inv_k
         along += (h * inv_h - y * lean) * lean - h * inv_h * inv_h
-        w = _weight(one, e, length2, axis, square)
+        w = _weight(one, e, length2, sight)
         inner, outer = _inverse(height, length2, away, beta)
         # both parts through D^-1
         along = (turn * beta * inner - along) * height * outer
@@ -400,7 +368,9 @@ def add_tilt(room: SingleArray, count: int, sight: Sight) -> None:
 
 
 @device
-def add_noise(room: SingleArray, count: int, sight: Sight, budget: Budget) -> None:
+def add_noise(
+    room: FloatArray, tile: FloatArray, marks: FloatArray, sight: Sight, budget: Budget
+) -> None:
     """Add the noise of one camera's rays to the normal equations of the straight rays.
 
     An error that moves the straight ray at P by z, of covariance C, moves its image by J z and
@@ -409,55 +379,48 @@ def add_noise(room: SingleArray, count: int, sight: Sight, budget: Budget) -> No
     -y (1 - r H / kappa) (tau + r^2 / kappa^2 d (d.tau)); D^-1 of that is what moves P, by c_t
     across d and c_r along.
     """
-    axis, square, bend_of = sight
-    image_px, centre_m = _single(budget.image_px), _single(budget.centre_m)
-    attitude, waves = _single(budget.attitude), _single(budget.waves)
-    for j in range(count):
-        one, e, normal, height, length2, h, y, bend = _seen(room, j, bend_of)
+    image_px, centre_m = budget.image_px, budget.centre_m
+    attitude, waves = budget.attitude, budget.waves
+    for j in range(marks.size):
+        one, e, normal, height, length2, h, y, bend = _seen(room, tile, marks, j, sight)
         kappa, _, lean, away, beta, _ = _bent(height, length2, h, y, bend)
-        w = _weight(one, e, length2, axis, square)
+        w = _weight(one, e, length2, sight)
         g = product(w, normal)
         inner, outer = _inverse(height, length2, away, beta)
         # a slope of the wave moves the refracted ray by this across d
-        across = waves * y * (_ONE - height * lean)
+        across = waves * y * (1.0 - height * lean)
         # and by the factor 1 + bow rho^2 along d
         bow = bend * bend / (kappa * kappa)
         c_t = across * inner
-        c_r = across * outer * (_ONE + bow * (length2 - height * height))
+        c_r = across * outer * (1.0 + bow * (length2 - height * height))
         # (c_r^2 - c_t^2) / rho^2, also straight down; W d = -H W N
         more = across * outer * (bow - beta * inner) * (c_r + c_t)
         # variance of the place of P from attitude, centre and waves, with C isotropic
         by_place = attitude * attitude * length2 + centre_m * centre_m + c_t * c_t
         by_normal = more * height * height - c_t * c_t
-        # W C W for an isotropic C is a multiple of W^2, whose elements are products of its rows
-        by_image = image_px * image_px
-        row_x, row_y, row_z = (w[0], w[1], w[2]), (w[1], w[3], w[4]), (w[2], w[4], w[5])
-        noise = (
-            by_image * w[0] + by_place * dot(row_x, row_x) + by_normal * g[0] * g[0],
-            by_image * w[1] + by_place * dot(row_x, row_y) + by_normal * g[0] * g[1],
-            by_image * w[2] + by_place * dot(row_x, row_z) + by_normal * g[0] * g[2],
-            by_image * w[3] + by_place * dot(row_y, row_y) + by_normal * g[1] * g[1],
-            by_image * w[4] + by_place * dot(row_y, row_z) + by_normal * g[1] * g[2],
-            by_image * w[5] + by_place * dot(row_z, row_z) + by_normal * g[2] * g[2],
-        )
-        _add_six(room, NOISE * TILE + j, noise)
+        noise = plus_square((0.0, 0.0, 0.0, 0.0, 0.0, 0.0), (w[0], w[1], w[2]))
+        # W W, as W is symmetric: the sum of the squares of its rows
+        square = plus_square(plus_square(noise, (w[1], w[3], w[4])), (w[2], w[4], w[5]))
+        at = NOISE * TILE + j
+        _add_six(room, at, image_px * image_px, w)
+        _add_six(room, at, by_place, square)
+        _add_six(room, at, by_normal, plus_square((0.0, 0.0, 0.0, 0.0, 0.0, 0.0), g))
 
 
 @kernel(allocates=True)
 def _of_lists(
-    span: Span, order: IntArray, points: Chosen, shift: FloatArray, rig: Rig, rule: Rule,
-    budget: Budget, level_sigma: FloatArray, result: FloatArray,
+    span: Span, order: IntArray, points: Chosen, shift: FloatArray, rig: Rig, budget: Budget,
+    level_sigma: FloatArray, result: FloatArray,
 ) -> None:  # fmt: skip
     """Compute the covariances of points with view lists, a tile at a time."""
     start, camera = points.start, points.camera
     for t in range(*span):
         rows = order[t * TILE : (t + 1) * TILE]
         tile = np.empty(7 * TILE)
-        # the runs of the tile, then those of its rays, then one camera after the other
         tiling.gather(tile, rows, points)
         room = room_of(tile, shift, rows)
         named, marks = tiling.marks_of_lists(start, camera, rows, len(rig.centres))
-        add_errors(room, tile, marks, named, rig, rule, budget)
+        add_errors(room, tile, marks, named, rig, 1.0 / points.n, budget)
         finish_tile(result, rows, room, tile, level_sigma, budget)
 
 
@@ -469,26 +432,28 @@ def differ_by_ray(budget: Budget) -> bool:
 
 @device
 def add_errors(
-    room: SingleArray, tile: FloatArray, marks: FloatArray, near: IntArray, rig: Rig, rule: Rule,
+    room: FloatArray, tile: FloatArray, marks: FloatArray, near: IntArray, rig: Rig, bend: float,
     budget: Budget,
 ) -> None:  # fmt: skip
-    """Add the rays of cameras to the points of a tile; `marks` has a row for each of `near`."""
+    """Add the rays of cameras to the points of a tile.
+
+    `marks`, a row for each of the cameras `near`, say how often each ray counts.
+    """
     for k in range(len(marks)):
-        c, count = near[k], marks.shape[1]
-        x, y, z = row_of(rig.axes, c)
-        square = _single(rig.focal_px[c] * rig.focal_px[c])
-        sight = (_single(x), _single(y), _single(z)), square, _single(rule.bend)
-        add_rays(room, tile, marks[k], rig, c, rule)
-        add_rays_of_camera(room, count, sight)
+        c = near[k]
+        sight = Sight(
+            row_of(rig.centres, c), rig.offset[c], row_of(rig.axes, c), rig.focal_px[c] ** 2, bend
+        )
+        add_rays(room, tile, marks[k], sight)
         if budget.tilt > 0.0:
-            add_tilt(room, count, sight)
+            add_tilt(room, tile, marks[k], sight)
         if differ_by_ray(budget):
-            add_noise(room, count, sight, budget)
+            add_noise(room, tile, marks[k], sight, budget)
 
 
 @device(allocates=True)
 def finish_tile(
-    result: FloatArray, rows: IntArray, room: SingleArray, tile: FloatArray,
+    result: FloatArray, rows: IntArray, room: FloatArray, tile: FloatArray,
     level_sigma: FloatArray, budget: Budget,
 ) -> None:  # fmt: skip
     """Turn the sums of a tile into covariances: B R B' of the noise, and that of common errors.
@@ -497,7 +462,7 @@ def finish_tile(
     level, index and both tilts. A tilt also raises the water above the point, in proportion to its
     distance from the pivot. LLVM inlines what the loop calls; otherwise it would not be vectorised.
     """
-    out, sigma, sums = np.empty(6 * TILE), level_sigma[rows], room.astype(np.float64)
+    out, sigma, sums = np.empty(6 * TILE), level_sigma[rows], room
     # R = sigma^2 K if all rays have the same image noise
     if not differ_by_ray(budget):
         for at in range(6 * TILE):
