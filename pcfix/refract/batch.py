@@ -34,7 +34,7 @@ PARALLEL, CORRECTED = int(Outcome.PARALLEL_RAYS), int(Outcome.CORRECTED)
 """Of `Outcome`, for kernels."""
 
 FLAT_DEG = 35.0
-"""Incidence angle beyond which methods differ most; see `reconstructions.LIMITS`."""
+"""Incidence angle beyond which methods differ most."""
 
 UNLISTED, MAIN = -1, -2
 """Points in no view list, and points of all other sources; see `Survey.parts`."""

@@ -14,10 +14,8 @@ from pcfix.refract.batch import Batch, Survey, require_orientation
 from pcfix.refract.methods import batches, on_land, with_rays
 from pcfix.refract.patches import FEWEST_WITHOUT_LIST, gsd_m
 from pcfix.refract.reconstructions import (
-    ALIKE,
     BARE,
     IN_FRAME,
-    LIMITS,
     Hint,
     Reconstruction,
     Verdict,
@@ -71,8 +69,7 @@ def resolved(
 
 def wants_sample(survey: Survey, views: ViewKind | None) -> bool:
     """Return whether a sample of the whole cloud is needed."""
-    known = survey.settings.depth_factor != "auto"
-    return wants_matcher(survey, views) or _wants_limit(survey.settings, views) or not known
+    return wants_matcher(survey, views) or survey.settings.depth_factor == "auto"
 
 
 def with_factor(batch: Batch) -> tuple[Batch, StereoFactor | None]:
@@ -89,11 +86,6 @@ def with_factor(batch: Batch) -> tuple[Batch, StereoFactor | None]:
         found = stereo_factor(survey.cameras, float(np.median(known)), n)
     settings = replace(survey.settings, depth_factor=None if found is None else found.factor)
     return replace(batch, survey=replace(survey, settings=settings)), found
-
-
-def _wants_limit(settings: ScienceOptions, views: ViewKind | None) -> bool:
-    """Whether the largest incidence angle is to be estimated from the cloud."""
-    return views is None and settings.max_angle == "auto" and settings.method in ALIKE
 
 
 def _wants_comparison(survey: Survey) -> bool:
@@ -212,23 +204,18 @@ def _learn_of_sources(
 
 def _weighed(sample: Batch, step: float, hint: Hint | None) -> tuple[Survey, tuple[Verdict, ...]]:
     """Resolve ``auto`` and set the model uncertainty, for submerged points without lists."""
-    survey = sample.survey
-    reconstructions = reconstructions_of(sample)
-    if survey.settings.method == "auto" and len(reconstructions) > 1:
+    survey, verdict = sample.survey, None
+    if survey.settings.method == "auto":
+        reconstructions = reconstructions_of(sample)
         verdict = weigh(sample, reconstructions, step, hint=hint)
         survey = with_verdict(survey, verdict, reconstructions[0])
-        return survey, () if verdict is None else (verdict,)
-    if survey.settings.method == "auto":
-        survey = with_verdict(survey, None, reconstructions[0])
-    verdicts = list[Verdict | None]()
-    if _wants_limit(survey.settings, None):
-        verdicts.append(weigh(replace(sample, survey=survey), LIMITS, step))
-        survey = with_verdict(survey, verdicts[0], LIMITS[0])
+        if len(reconstructions) > 1:
+            return survey, () if verdict is None else (verdict,)
     if _wants_comparison(survey):
         told = type_given(replace(sample, survey=survey))
-        verdicts.append(weigh(sample, IN_FRAME, step, told=told))
-        survey = with_verdict(survey, verdicts[-1])
-    return survey, tuple(one for one in verdicts if one is not None)
+        verdict = weigh(sample, IN_FRAME, step, told=told)
+        survey = with_verdict(survey, verdict)
+    return survey, () if verdict is None else (verdict,)
 
 
 def with_verdict(

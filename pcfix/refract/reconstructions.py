@@ -70,17 +70,6 @@ LISTED = (
 BARE = Reconstruction(_TRACKS, {"method": "snell", "camera_set": "all"})
 """The only type without lenses or angles."""
 
-LIMITS = (
-    Reconstruction("all rays", {"max_angle": None}),
-    *(
-        Reconstruction(f"rays within {limit:g} degrees of the surface normal", {"max_angle": limit})
-        for limit in (60.0, 50.0, 40.0, 35.0)
-    ),
-)
-"""Possible largest angles of the rays that made the points, for methods with equal weights."""
-
-ALIKE = ("snell", "shan", "butler", "murase", "dietrich")
-
 SOFTWARE = {
     "metashape": _MAPS, "photoscan": _MAPS, "openmvs": _MAPS, "colmap": _MAPS, "odm": _MAPS,
     "opendronemap": _MAPS, "opensfm": _MAPS, "realitycapture": _MAPS, "realityscan": _MAPS,
@@ -147,10 +136,9 @@ class Verdict(NamedTuple):
         """Return what the user must know, a sentence each."""
         differs = self.is_against and abs(self.deeper_m) > self.model_uncertainty.formal_m
         unsure = differs if self.is_given else not self.is_sure
-        is_type = "method" in self.chosen.changes and not self.is_given
         poor = not self.is_sure and self.share > FITS
         absurd = self.share < min(MOST_BEYOND, -SURE * self.sigma)
-        none_fits = is_type and self.patches > 0 and (poor or absurd)
+        none_fits = not self.is_given and self.patches > 0 and (poor or absurd)
         return (*self.remarks, *[str(self)] * unsure, *[CAUSES] * none_fits)
 
     def as_dict(self) -> dict[str, Any]:
@@ -208,7 +196,7 @@ def reconstructions_of(batch: Batch) -> tuple[Reconstruction, ...]:
 def type_given(batch: Batch) -> Reconstruction:
     """Return the type that the options set, with limits of angles resolved."""
     settings, views = batch.survey.settings, batch.views
-    changes: dict[str, Any] = {"method": settings.method, "max_angle": settings.max_angle}
+    changes: dict[str, Any] = {"method": settings.method}
     if views is None:
         changes["camera_set"] = "mvs" if settings.models_matcher else "all"
         changes["matcher"] = settings.matcher
