@@ -212,8 +212,8 @@ def _weighed(sample: Batch, step: float, hint: Hint | None) -> tuple[Survey, tup
         if len(reconstructions) > 1:
             return survey, () if verdict is None else (verdict,)
     if _wants_comparison(survey):
-        told = type_given(replace(sample, survey=survey))
-        verdict = weigh(sample, IN_FRAME, step, told=told)
+        given = type_given(replace(sample, survey=survey))
+        verdict = weigh(sample, IN_FRAME, step, given=given)
         survey = with_verdict(survey, verdict)
     return survey, () if verdict is None else (verdict,)
 
@@ -296,4 +296,4 @@ def weigh_lists(batch: Batch, *, is_open: bool) -> Verdict | None:
         return weigh(batch, reconstructions_of(batch), 1.0)
     if not _wants_comparison(batch.survey):
         return None
-    return weigh(batch, reconstructions_of(batch), 1.0, told=type_given(batch))
+    return weigh(batch, reconstructions_of(batch), 1.0, given=type_given(batch))

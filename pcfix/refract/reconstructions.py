@@ -98,9 +98,9 @@ class Verdict(NamedTuple):
     """The reconstruction type of a cloud, and the evidence.
 
     `share` and `runner_up_share` are the shares of the discontinuities, by which the two types
-    differ, that are left in the bed of each: 0 where right. `straight` is that share between the
-    chosen type and straight rays, near 1 if the poses have absorbed the refraction, and its
-    standard error.
+    differ, that are left in the bed of each: 0 where right. `candidates` are the shares that other
+    types leave, against the chosen one. `straight` is that share between the chosen type and
+    straight rays, near 1 if the poses have absorbed the refraction, and its standard error.
     """
 
     chosen: Reconstruction
@@ -116,6 +116,15 @@ class Verdict(NamedTuple):
     remarks: tuple[str, ...] = ()  # what makes the evidence weak
     of: str = ""  # the points it is about; empty for all
     straight: tuple[float, float] | None = None
+    candidates: tuple[tuple[str, float], ...] = ()
+
+    @property
+    def confidence(self) -> float:
+        """Probability, 0 to 1, that the bed has fewer discontinuities than with the runner-up."""
+        if not self.patches:
+            return 0.5
+        errors = (0.5 - self.share) / max(self.sigma, 1e-9)
+        return 0.5 * (1.0 + math.erf(errors / math.sqrt(2.0)))
 
     @property
     def is_fused(self) -> bool:
@@ -146,7 +155,9 @@ class Verdict(NamedTuple):
         return {
             "made_of": self.chosen.words,
             "sure": self.is_sure,
+            "confidence": round(self.confidence, 4),
             "share": round(self.share, 3),
+            "candidates": {name: round(share, 3) for name, share in self.candidates},
             "runner_up": self.runner_up.words,
             "runner_up_share": round(self.runner_up_share, 3),
             "sigma": round(self.sigma, 3),
@@ -210,7 +221,7 @@ def type_given(batch: Batch) -> Reconstruction:
 class _Beds(NamedTuple):
     """The points of patches as corrected for each type; see `pcfix.refract.patches.shares`."""
 
-    ways: tuple[Reconstruction, ...]
+    types: tuple[Reconstruction, ...]
     z: FloatArray
     place: IntArray
     patches: int
@@ -229,31 +240,33 @@ def weigh(
     reconstructions: tuple[Reconstruction, ...],
     step: float,
     *,
-    told: Reconstruction | None = None,
+    given: Reconstruction | None = None,
     hint: Hint | None = None,
 ) -> Verdict | None:
     """Choose the reconstruction that best explains the points, or test the one set by the user.
 
     The submerged points are evenly spread over the cloud, and each represents `step` of its points;
-    `batch.survey.learned` has the matcher. `told` is set by the user, `hint` decides if the points
+    `batch.survey.learned` has the matcher. `given` is set by the user, `hint` decides if the points
     do not. None with a single type, or too few points for patches.
     """
-    ways = reconstructions if told is None or told in reconstructions else (*reconstructions, told)
-    sample = patches.patches_of(batch) if len(ways) > 1 else None
+    types = reconstructions
+    if given is not None and given not in types:
+        types = *types, given
+    sample = patches.patches_of(batch) if len(types) > 1 else None
     if sample is None:
         return None
     part = batch.take(sample.rows)
     survey = replace(part.survey, level_offset_m=None)
     part = replace(part, survey=survey, level_sigma_m=None)
-    beds = _beds(part, replace(batch, survey=part.survey), sample, ways)
-    if beds is None or (told is not None and told not in beds.ways):
+    beds = _beds(part, replace(batch, survey=part.survey), sample, types)
+    if beds is None or (given is not None and given not in beds.types):
         return None
-    remarks, among = _remarks(part, sample.place), list(range(len(beds.ways)))
-    if told is None:
+    remarks, among = _remarks(part, sample.place), list(range(len(beds.types)))
+    if given is None:
         best, other, by = _decided(part, beds, sample, step, hint, weak=bool(remarks))
     else:
-        best, by = beds.ways.index(told), ""
-        among = [i for i in among if beds.ways[i] in reconstructions]
+        best, by = beds.types.index(given), ""
+        among = [i for i in among if beds.types[i] in reconstructions]
         first, second = beds.rank(among)
         other = second if first == best else first
     deeper_m = float(np.nanmean((beds.z[best] - beds.z[other])[beds.place]))
@@ -262,8 +275,8 @@ def weigh(
         share, sigma = shares(part, beds.place, np.array([beds.z[best], part.xyz[:, 2]]))
         straight = float(share[0, 1]), float(sigma[0, 1])
     return Verdict(
-        chosen=beds.ways[best],
-        runner_up=beds.ways[other],
+        chosen=beds.types[best],
+        runner_up=beds.types[other],
         share=float(beds.share[best, other]),
         runner_up_share=float(beds.share[other, best]),
         sigma=float(beds.sigma[best, other]),
@@ -271,18 +284,21 @@ def weigh(
         patches=beds.patches,
         model_uncertainty=_model_uncertainty(part, beds, best, among),
         by=by,
-        is_given=told is not None,
+        is_given=given is not None,
         remarks=remarks,
         straight=straight,
+        candidates=tuple(
+            (one.words, float(beds.share[i, best])) for i, one in enumerate(beds.types) if i != best
+        ),
     )
 
 
 def _beds(
-    part: Batch, batch: Batch, sample: Patches, ways: tuple[Reconstruction, ...]
+    part: Batch, batch: Batch, sample: Patches, types: tuple[Reconstruction, ...]
 ) -> _Beds | None:
     """Correct the points of the patches for each type; None if fewer than two can."""
     around = patches.others_around(batch, sample.rows)
-    z = np.array([_heights(part, around, way) for way in ways])
+    z = np.array([_heights(part, around, one) for one in types])
     covered = np.isfinite(z).sum(axis=1)
     kept = np.flatnonzero(covered >= COVERED * covered.max())
     if len(kept) < 2 or not covered.max():
@@ -291,12 +307,12 @@ def _beds(
     place = sample.place[np.isfinite(z[:, sample.place]).all(axis=(0, 2))]
     if len(place) >= LEAST_PATCHES:
         share, sigma = shares(part, place, z)
-        told = len(place)
+        tested = len(place)
     else:
         share, sigma = np.full((2, len(z), len(z)), 0.5)
-        place, told = sample.place, 0
+        place, tested = sample.place, 0
     np.fill_diagonal(share, -np.inf)
-    return _Beds(tuple(ways[i] for i in kept), z, place, told, share, sigma)
+    return _Beds(tuple(types[i] for i in kept), z, place, tested, share, sigma)
 
 
 def _decided(
@@ -307,11 +323,11 @@ def _decided(
     If the discontinuities are not significant, a dense cloud is what its software makes, and not
     tracks; a sparse one is tracks.
     """
-    best, other = beds.rank(list(range(len(beds.ways))))
+    best, other = beds.rank(list(range(len(beds.types))))
     errors = SURE if weak else 1.0
     if 0.5 - beds.share[best, other] > errors * beds.sigma[best, other] or part.views is not None:
         return best, other, ""
-    words = [one.words for one in beds.ways]
+    words = [one.words for one in beds.types]
     dense = patches.is_dense(part, sample.place, step * sample.step)
     if dense and hint is not None and hint.words in words:
         known = words.index(hint.words)
@@ -341,14 +357,14 @@ def _remarks(part: Batch, place: IntArray) -> tuple[str, ...]:
     return ()
 
 
-def _model_uncertainty(part: Batch, beds: _Beds, way: int, among: list[int]) -> ModelUncertainty:
+def _model_uncertainty(part: Batch, beds: _Beds, at: int, among: list[int]) -> ModelUncertainty:
     """Return the model uncertainty of a type, among types that may be right.
 
     Of the best type it is, for each other one, the share of the difference to it that is left in
     the bed; of another type, the difference to the best in addition. Of a formula, which is no
     reconstruction type, it is the whole difference: a bed can be smooth and too shallow.
     """
-    depth = np.maximum(part.surface.height_m - beds.z[way], 1e-3)[beds.place]
+    depth = np.maximum(part.surface.height_m - beds.z[at], 1e-3)[beds.place]
     deep = depth > LEAST_DEPTH_M
 
     def left(a: int, b: int, most: float) -> float:
@@ -363,29 +379,29 @@ def _model_uncertainty(part: Batch, beds: _Beds, way: int, among: list[int]) -> 
 
     best, _ = beds.rank(among)
     open_m = max((left(best, i, 1.0) for i in among if i != best), default=0.0)
-    if way != best:
-        open_m = math.hypot(open_m, left(way, best, 0.5 if way in among else 0.0))
-    scatter = scatter_m(part, beds.place, beds.z[way])
-    budget = correct(_as(part, beds.ways[way], "all"))
+    if at != best:
+        open_m = math.hypot(open_m, left(at, best, 0.5 if at in among else 0.0))
+    scatter = scatter_m(part, beds.place, beds.z[at])
+    budget = correct(_as(part, beds.types[at], "all"))
     formal = float(np.median(budget.sigma_z_m))
     return ModelUncertainty(math.sqrt(max(scatter**2 - formal**2, 0.0)), open_m, formal)
 
 
-def _as(part: Batch, way: Reconstruction, dimensions: Dimensions = "none") -> Batch:
+def _as(part: Batch, one: Reconstruction, dimensions: Dimensions = "none") -> Batch:
     """Return the points with the settings of a type."""
     survey = part.survey
-    settings = replace(way.settings(survey.settings), dimensions=dimensions)
+    settings = replace(one.settings(survey.settings), dimensions=dimensions)
     learned, views = survey.learned, part.views
     if views is None and not settings.models_matcher:
         learned = learned._replace(matcher=None)
-    if views is not None and way.kind is not None:
-        views = replace(views, kind=way.kind)
+    if views is not None and one.kind is not None:
+        views = replace(views, kind=one.kind)
     return replace(part, views=views, survey=replace(survey, settings=settings, learned=learned))
 
 
-def _heights(part: Batch, around: Batch, way: Reconstruction) -> FloatArray:
+def _heights(part: Batch, around: Batch, one: Reconstruction) -> FloatArray:
     """Return the heights corrected for a type, NaN where a point is not corrected."""
-    part = _as(part, way)
+    part = _as(part, one)
     settings, learned = part.survey.settings, part.survey.learned
     fuses = settings.method == "consistent" and settings.matcher == "depth-maps"
     if part.views is None and fuses and learned.matcher is not None:
@@ -393,7 +409,7 @@ def _heights(part: Batch, around: Batch, way: Reconstruction) -> FloatArray:
         from pcfix.refract.matcher import bed_of
 
         # the bed identifies the images of a point: it must be that of other points
-        likely = likely_beds(with_rays(_as(around, way)))
+        likely = likely_beds(with_rays(_as(around, one)))
         bed = (
             bed_of(around.xyz, likely, patches.gsd_m(around)) if np.isfinite(likely).any() else None
         )
