@@ -27,7 +27,7 @@ from pcfix.lens.imaging import unproject
 from pcfix.model import Cameras, FloatArray, Lens, WaterDimension
 from pcfix.options.declare import File, taken
 from pcfix.options.photos import PhotosOptions
-from pcfix.photos.mapping import Ground, Photo, Scene, exact, ground_of, nodes_of, paper, resample
+from pcfix.photos.mapping import Ground, Photo, Scene, exact, nodes_of, paper, resample
 from pcfix.running import current, threads
 from pcfix.version import __version__
 from pcfix.water.checks import check_above_water
@@ -100,7 +100,11 @@ def map_photos(
     mapped = exact if given.mapping == "exact" else paper
     with threads(given.jobs), TemporaryDirectory() as scratch:
         block = block_of(given, paths, Path(scratch))
-        old = _written_before(target, given, block)
+        target.mkdir(parents=True, exist_ok=True)
+        results = () if given.overwrite else (target / path.name for path in block.paths)
+        old = {path.name: path for path in results if path.exists()}
+        ignored, waters = ("overwrite", "jobs", "summary"), block.waters.values()
+        open_record(target / RECORD, given, ignored, old.values(), waters)
         both = zip(block.paths, block.photos, strict=True)
         todo = {path: photo for path, photo in both if path.name not in old}
 
@@ -146,40 +150,33 @@ def map_photos(
     return summary
 
 
-def _written_before(target: Path, given: PhotosOptions, block: PhotoBlock) -> set[str]:
-    """Return the names that an equal call has written, and record this call in the folder."""
-    target.mkdir(parents=True, exist_ok=True)
-    record = call_record(given, ("overwrite", "jobs", "summary"), block.waters.values())
-    place = target / RECORD
-    there = {path.name for path in block.paths if (target / path.name).exists()}
-    if there and not given.overwrite:
-        if not place.exists() or read_json(place) != record:
-            raise SettingError(
-                "output.exists",
-                f"{target / min(there)}: exists, and was not written by an equal call. Add"
-                " --overwrite to replace it, or give another folder.",
-                path=target / min(there),
-            )
-        return there
-    write_text(place, json_text(record), overwrite=True)
-    return set()
+def open_record(
+    place: Path, given: PhotosOptions, ignored: Collection[str], written: Collection[Path],
+    more: Iterable[Path] = (),
+) -> dict[str, Any]:  # fmt: skip
+    """Return the record of an equal call that wrote to a folder; without results, write it.
 
-
-def call_record(
-    given: PhotosOptions, ignored: Collection[str], more: Iterable[Path] = ()
-) -> dict[str, Any]:
-    """Return what identifies an equal call: options, and size and time of the input files.
-
-    The values are those of a JSON file. Some options are ignored; `more` are further files.
+    A record has the options that are not `ignored`, and size and time of the input files and of
+    `more`. `written` are the results in the folder, which another call must not mix with its own.
     """
     asked = {name: value for name, value in given.as_dict().items() if name not in ignored}
     files = [given.cameras, given.dsm, given.sensor, given.water]
     paths = [Path(one) for one in files if one is not None and Path(str(one)).exists()]
     states = [file_state(path) for path in (*paths, *more)]
-    found: dict[str, Any] = json.loads(
-        json.dumps({"pcfix": __version__, "asked": asked, "files": states})
-    )
-    return found
+    # as a JSON file has it, with lists for tuples
+    record = json.loads(json.dumps({"pcfix": __version__, "asked": asked, "files": states}))
+    if written:
+        old: dict[str, Any] = read_json(place) if place.exists() else {}
+        if {name: old.get(name) for name in record} != record:
+            raise SettingError(
+                "output.exists",
+                f"{min(written)}: exists, and was not written by an equal call. Add"
+                " --overwrite to replace it, or give another folder.",
+                path=min(written),
+            )
+        return old
+    write_text(place, json_text(record), overwrite=True)
+    return dict(record)
 
 
 def warn_all(notes: Iterable[PcfixWarning]) -> None:
@@ -260,7 +257,7 @@ def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> PhotoBlo
         sentence = "--water dim:NAME is for clouds. Give a level, plane, mesh or raster."
         raise SettingError("water.dimension", sentence, water=str(given.water))
     check_above_water(cameras, surface)
-    ground, waters = ground_of(heights, *origin), dict[str, Path]()
+    ground, waters = Ground(heights, *origin), dict[str, Path]()
     if given.water_per_image is not None:
         found, few = rasters_of_images(given.water_per_image, [path.name for path in paths])
         waters = {paths[at].stem: path for at, path in found.items()}

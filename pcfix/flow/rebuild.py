@@ -24,17 +24,16 @@ import numpy as np
 from pcfix.errors import GeometryError, InputError, PcfixError, PcfixWarning, SettingError
 from pcfix.flow.compare import compare_clouds
 from pcfix.flow.dsm import grid_dsm
-from pcfix.flow.photos import CLOUDS, PhotoBlock, block_of, call_record, map_photos, plain
+from pcfix.flow.photos import CLOUDS, PhotoBlock, block_of, map_photos, open_record, plain
 from pcfix.flow.runner import Progress, check_summary, json_text, write_summary
-from pcfix.io.files import check_input, file_state, read_json, run_logged, write_text
+from pcfix.io.files import check_input, file_state, run_logged, write_text
 from pcfix.io.las.writing import write_points
 from pcfix.io.photographs import photographs_in, read_colours
 from pcfix.io.rasters import open_raster, place_of, read_masked, write_dod
-from pcfix.model import BoolArray, FloatArray
 from pcfix.options.declare import File, taken
 from pcfix.options.photos import PhotosOptions, RebuildOptions
-from pcfix.photos.ortho import blank_in
-from pcfix.photos.stereo import Grey, stereo_cloud
+from pcfix.photos.ortho import Picture, blank_in
+from pcfix.photos.stereo import stereo_cloud
 from pcfix.running import threads
 from pcfix.water.surface import surface_above
 
@@ -117,7 +116,11 @@ def rebuild_rounds(
     if given.reference is not None:
         check_input(given.reference)
     target.mkdir(parents=True, exist_ok=True)
-    record = _opened(target, given)
+    folders = list(target.glob("round[0-9]*"))
+    while given.overwrite and folders:
+        shutil.rmtree(folders.pop())
+    record = open_record(target / RECORD, given, COMMAND_ONLY, folders)
+    record.setdefault("rounds", [])
     finished = sum("mean_m" in one for one in record["rounds"])
     start = str(given.dsm) if Path(given.dsm).suffix.lower() in CLOUDS else None
     if start is not None:  # a cloud is gridded to the folder
@@ -184,28 +187,6 @@ def rebuild_rounds(
     return summary
 
 
-def _opened(target: Path, given: PhotosOptions) -> dict[str, Any]:
-    """Return the record of a folder: the options and inputs, and the rounds that it has."""
-    path, new = target / RECORD, call_record(given, COMMAND_ONLY)
-    sentence = ""
-    if path.exists() and not given.overwrite:
-        old: dict[str, Any] = read_json(path)
-        if {name: old.get(name) for name in new} == new:
-            return old
-        sentence = f"{target}: has the rounds of another call."
-    for folder in target.glob("round[0-9]*"):
-        if given.overwrite:
-            shutil.rmtree(folder)
-        else:
-            sentence = sentence or f"{folder}: exists."
-    if sentence:
-        sentence += " Add --overwrite to replace them, or give another folder."
-        raise SettingError("output.exists", sentence, path=target)
-    new["rounds"] = []
-    write_text(path, json_text(new), overwrite=True)
-    return new
-
-
 def _note(target: Path, record: dict[str, Any], number: int, noted: dict[str, Any]) -> None:
     """Record a round, for a later call to resume."""
     record["rounds"][number - 1 :] = [noted]
@@ -221,14 +202,14 @@ def _reconstruct(
         import cv2
 
         @lru_cache(maxsize=CACHED_PHOTOGRAPHS)
-        def picture(row: int) -> Grey:
+        def picture(row: int) -> Picture:
             pixels = read_colours(images / block.paths[row].name)
             grey = pixels[..., 0]
             if pixels.shape[2] >= 3:
                 grey = cv2.cvtColor(np.ascontiguousarray(pixels[..., :3]), cv2.COLOR_RGB2GRAY)
             if grey.dtype == np.uint16:
                 grey = (grey >> 8).astype(np.uint8)
-            return Grey(np.ascontiguousarray(grey), blank_in(pixels))
+            return Picture(np.ascontiguousarray(grey), blank=blank_in(pixels))
 
         side = STEREO_CELL_PIXELS * block.gsd_m
         xyz = stereo_cloud(block.photos, block.scene.ground, side, picture, progress)
@@ -256,32 +237,19 @@ def _difference(block: PhotoBlock, cloud: Path, dsm: Path, before: Path) -> Roun
     raster = dsm.with_name("difference.tif")
     write_dod(dsm, before, raster, overwrite=True)
     with open_raster(raster) as source, open_raster(dsm) as heights:
-        moved, z, transform = read_masked(source), read_masked(heights), source.transform
-    row, column = np.nonzero(np.isfinite(moved))
+        change, z, transform = read_masked(source), read_masked(heights), source.transform
+    row, column = np.nonzero(np.isfinite(change))
+    if not len(row):
+        sentence = f"{cloud}: does not overlap the DSM of the round before. Check its CRS."
+        raise GeometryError("cloud.no_overlap", sentence, path=cloud)
+    moved, z = change[row, column], z[row, column]
     x, y = place_of(transform, column + 0.5, row + 0.5)
-    xyz = np.column_stack([x, y, z[row, column]])
-    wet = np.zeros(moved.shape, bool)
-    water = surface_above(block.scene.water, xyz).height_m
-    wet[row, column] = np.nan_to_num(water - xyz[:, 2], nan=0.0) > 0.0
-    return round_of((str(cloud), str(dsm)), moved, wet, block.gsd_m)
-
-
-def round_of(
-    files: tuple[str, str], difference_m: FloatArray, wet: BoolArray, gsd_m: float
-) -> Round:
-    """Return the change in a round, of whose files cloud and DSM are named.
-
-    `difference_m`, shape (rows, columns), is the DSM minus the one before, NaN where either has no
-    height; `wet`, of the same shape, is what lies under water.
-    """
-    known = np.isfinite(difference_m)
-    moved = difference_m[known & wet] if (known & wet).any() else difference_m[known]
-    if not len(moved):
-        sentence = f"{files[0]}: does not overlap the DSM of the round before. Check its CRS."
-        raise GeometryError("cloud.no_overlap", sentence, path=files[0])
-    within = float((np.abs(moved) <= gsd_m).mean())
-    mean, sd = float(moved.mean()), float(moved.std())
-    return Round(*files, len(moved), round(mean, 5), round(sd, 5), round(within, 5))
+    wet = surface_above(block.scene.water, np.column_stack([x, y, z])).height_m > z
+    moved = moved[wet] if wet.any() else moved
+    return Round(
+        str(cloud), str(dsm), len(moved), round(float(moved.mean()), 5),
+        round(float(moved.std()), 5), round(float((np.abs(moved) <= block.gsd_m).mean()), 5),
+    )  # fmt: skip
 
 
 def _compared(

@@ -51,8 +51,14 @@ class Ground:
     def __init__(self, height_m: FloatArray, left_m: float, top_m: float, cell_m: float) -> None:
         """Build triangles from heights, shape (rows, columns), world frame, NaN where unknown.
 
-        The first row is the northern one; the corner is that of the upper left cell.
+        The first row is the northern one; the corner is that of the upper left cell. Cells of
+        rasters with more than `MOST_CELLS` are averaged.
         """
+        step = int(np.ceil(np.sqrt(height_m.size / MOST_CELLS)))
+        if step > 1:
+            rows, columns = (side // step * step for side in height_m.shape)
+            blocks = height_m[:rows, :columns].reshape(rows // step, step, columns // step, step)
+            height_m, cell_m = blocks.mean(axis=(1, 3)), cell_m * step
         self.height_m, self.left_m, self.top_m, self.cell_m = height_m, left_m, top_m, cell_m
         rows, columns = height_m.shape
         known = np.isfinite(height_m)
@@ -96,16 +102,6 @@ class Ground:
         return np.asarray(
             map_coordinates(self.height_m, [row, column], order=1, mode="constant", cval=np.nan)
         )
-
-
-def ground_of(height_m: FloatArray, left_m: float, top_m: float, cell_m: float) -> Ground:
-    """Return a ground of at most `MOST_CELLS` cells, each the mean of cells of the raster."""
-    step = int(np.ceil(np.sqrt(height_m.size / MOST_CELLS)))
-    if step > 1:
-        rows, columns = (side // step * step for side in height_m.shape)
-        blocks = height_m[:rows, :columns].reshape(rows // step, step, columns // step, step)
-        height_m, cell_m = blocks.mean(axis=(1, 3)), cell_m * step
-    return Ground(height_m, left_m, top_m, cell_m)
 
 
 class Photo(NamedTuple):
@@ -159,7 +155,7 @@ def exact(photo: Photo, scene: Scene, step_px: int) -> Shifts:
     free[free] = ~hidden(scene.ground, path.piercing_xyz[free], xyz[wet[free]])
     shift[wet[free]] = place[free] - nodes[wet[free]]
     known[wet[~free]] = False
-    return _as_grid(step_px, shift, known, shape)
+    return Shifts(step_px, shift.reshape(*shape, 2).astype(np.float32), known.reshape(shape))
 
 
 def paper(photo: Photo, scene: Scene, step_px: int) -> Shifts:
@@ -178,7 +174,7 @@ def paper(photo: Photo, scene: Scene, step_px: int) -> Shifts:
     shift[wet] = project(photo.lens, camera) - nodes[wet]
     known &= np.isfinite(shift).all(axis=1)
     shift[~known] = 0.0
-    forward = _as_grid(step_px, shift, known, shape)
+    forward = Shifts(step_px, shift.reshape(*shape, 2).astype(np.float32), known.reshape(shape))
     # the inverse: p - q for each node q, where p + shift(p) = q
     cv2 = photo_library("cv2")
     rows, columns = shape
@@ -215,10 +211,6 @@ def hidden(ground: Ground, start: FloatArray, end: FloatArray) -> BoolArray:
     hit = ground.hit(start[apart], way[apart] / length[apart, None])
     found[apart] = hit < length[apart] - OCCLUSION_CELLS * ground.cell_m
     return found
-
-
-def _as_grid(step_px: int, shift: FloatArray, known: BoolArray, shape: tuple[int, int]) -> Shifts:
-    return Shifts(step_px, shift.reshape(*shape, 2).astype(np.float32), known.reshape(shape))
 
 
 class Resampled(NamedTuple):

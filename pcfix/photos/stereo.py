@@ -13,12 +13,12 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from pcfix.errors import GeometryError
 from pcfix.lens.imaging import project, unproject
 from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.photos.mapping import Ground, Photo
+from pcfix.photos.ortho import Picture
 
 PARTNERS = 4
 BASE_SHARES = (0.1, 0.3, 0.55)
@@ -33,13 +33,6 @@ FEWEST_PAIRS = 2
 """Pairs, and half of its own, that a cell needs within a pixel of parallax of the median."""
 HALF = 1 << 31
 """Added to columns, so that those west of x = 0 do not run into the row of their number."""
-
-
-class Grey(NamedTuple):
-    """An image for matching: uint8, shape (rows, columns), and where it has no picture."""
-
-    pixels: npt.NDArray[np.uint8]
-    blank: BoolArray
 
 
 class Rectified(NamedTuple):
@@ -64,13 +57,14 @@ def stereo_cloud(
     photos: Sequence[Photo],
     ground: Ground,
     cell_m: float,
-    picture: Callable[[int], Grey],
+    picture: Callable[[int], Picture],
     progress: Callable[[int, int], None] | None = None,
 ) -> FloatArray:
     """Return a point, shape (n, 3), for each cell of land and bed in two or more pairs of images.
 
     The ground, which need only be approximate, gives the range of depths and the flying height;
-    `picture` returns the pixels of an image by its place in `photos`.
+    `picture` returns the grey pixels, uint8, shape (rows, columns), of an image by its place in
+    `photos`, and where it has no picture.
     """
     low, high = np.nanquantile(ground.height_m, [0.001, 0.999])
     heights = float(low - SPARE_RELIEF * (high - low) - 1.0), float(high + 1.0)
@@ -152,7 +146,7 @@ def rectified(left: Photo, right: Photo, heights: tuple[float, float]) -> Rectif
 
 
 def pair_points(
-    left: Photo, right: Photo, one: Grey, other: Grey, heights: tuple[float, float]
+    left: Photo, right: Photo, one: Picture, other: Picture, heights: tuple[float, float]
 ) -> FloatArray:
     """Intersect what both images of a pair see, shape (n, 3), metres, world frame."""
     import cv2
@@ -181,7 +175,9 @@ def pair_points(
     return np.asarray(left.centre + ahead @ frame.rotation)
 
 
-def _turned(photo: Photo, grey: Grey, frame: Rectified, least_px: int) -> tuple[Any, BoolArray]:
+def _turned(
+    photo: Photo, picture: Picture, frame: Rectified, least_px: int
+) -> tuple[Any, BoolArray]:
     """Rectify an image to the frame of a pair, and return where it has no picture there."""
     import cv2
 
@@ -192,9 +188,9 @@ def _turned(photo: Photo, grey: Grey, frame: Rectified, least_px: int) -> tuple[
     directions = ahead.reshape(-1, 3) @ (photo.rotation @ frame.rotation.T).T
     place = (project(photo.lens, directions) - 0.5).astype(np.float32)
     at = np.nan_to_num(place, nan=-9.0).reshape(frame.height, frame.width, 2)
-    turned = cv2.remap(grey.pixels, at, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
+    turned = cv2.remap(picture.pixels, at, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
     blank = cv2.remap(
-        grey.blank.astype(np.uint8), at, None, cv2.INTER_NEAREST,
+        np.asarray(picture.blank, np.uint8), at, None, cv2.INTER_NEAREST,
         borderMode=cv2.BORDER_CONSTANT, borderValue=1,
     )  # fmt: skip
     return turned, np.asarray(blank > 0)

@@ -13,10 +13,10 @@ import cv2
 
 import pcfix
 from pcfix.errors import SettingError
-from pcfix.flow.rebuild import round_of
 from pcfix.io.las.writing import write_points
 from pcfix.photos.mapping import Ground
-from pcfix.photos.stereo import Grey, pairs_of, stereo_cloud
+from pcfix.photos.ortho import Picture
+from pcfix.photos.stereo import pairs_of, stereo_cloud
 from tests.photos.test_mapping import GSD_M, photo, relief
 from tests.utils.codes import refused, warned
 from tests.utils.renderer import Texture, rendered
@@ -35,14 +35,14 @@ done = calls.read_text() if calls.exists() else ""
 depth = {depths}[len(done)]
 calls.write_text(done + "x")
 first = laspy.read(notes / "apparent.laz")
-first.z = np.full(len(first.points), -depth)
+first.z = np.where(np.asarray(first.z) > 0.0, first.z, -depth)
 first.write(cloud)
 """
 
 
 @pytest.fixture
 def block(tmp_path):
-    """Two photographs of a flat bed, a command that deepens it, and how to call it."""
+    """Two photographs of land and flat bed, a command that deepens it, and how to call it."""
     images = tmp_path / "images with space"
     images.mkdir()
     for name in ("P0.png", "P1.png"):
@@ -52,7 +52,7 @@ def block(tmp_path):
     )
     (tmp_path / "sensor.csv").write_text("focal,sensor_x,sensor_y\n10,8,6\n")
     x, y = (one.ravel() for one in np.meshgrid(np.arange(-29.5, 30), np.arange(-29.5, 30)))
-    xyz = np.column_stack([x, y, np.full(len(x), -2.0)])
+    xyz = np.column_stack([x, y, np.where(x < -20.0, 1.0, -2.0)])
     write_points(tmp_path / "apparent.laz", xyz, ("EPSG:32636", 0.001))
     (tmp_path / "command.py").write_text(COMMAND.format(depths=DEPTHS_M))
     words = [sys.executable, tmp_path / "command.py", "{images}", "{cameras}", "{cloud}", tmp_path]
@@ -132,21 +132,13 @@ def test_bad_options(block, more):
         rounds(block, **more)
 
 
-def test_round_of_bed():
-    difference = np.array([[0.0, 0.0, -0.2], [0.0, np.nan, -0.4]])
-    wet = np.array([[False, False, True], [False, True, True]])
-    found = round_of(("c", "d"), difference, wet, 0.25)
-    assert (found.cells, found.mean_m, found.within_gsd) == (2, -0.3, 0.5)
-    assert found.sd_m == pytest.approx(0.1)
-
-
 @pytest.mark.nightly
 def test_stereo():
     photos = [photo(x, tilt) for x, tilt in ((-8, (2, 1)), (0, (-1, 2)), (8, (1, -2)))]
     assert pairs_of(photos, 0.0) == [(0, 1), (0, 2), (1, 2)]
     texture = Texture(3.0 * GSD_M, 3.0)
     seen = [rendered(one, relief(), texture)[0] for one in photos]
-    pictures = [Grey(one, np.zeros(one.shape, bool)) for one in seen]
+    pictures = [Picture(one, blank=np.zeros(one.shape, bool)) for one in seen]
     ground = relief()
     xyz = stereo_cloud(photos, Ground(*ground), 2.0 * GSD_M, lambda k: pictures[k])
     off = xyz[:, 2] - ground.at(xyz[:, :2])
