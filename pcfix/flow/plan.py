@@ -162,7 +162,7 @@ def _scene(given: PlanOptions, depth_m: float) -> SceneSettings:
 
 def _flown(given: PlanOptions) -> Cameras:
     """Return the images of the whole flight."""
-    return lay_out(_scene(given, max(given.depth))).flown.cameras
+    return lay_out(_scene(given, max(given.depth))).true
 
 
 def _bed(given: PlanOptions, depth_m: float) -> _Bed:
@@ -171,8 +171,7 @@ def _bed(given: PlanOptions, depth_m: float) -> _Bed:
     most = (MOST_BASES, MOST_SPACINGS) * np.array(scene.base_and_spacing_m)
     scene = replace(scene, area_m=tuple(np.minimum(scene.area_m, most).tolist()))
     site = lay_out(scene)
-    rng = site.streams.main
-    sight = see(points_on(site.terrain, POINTS, rng), site.rig, rng)
+    sight = see(points_on(site.terrain, POINTS, site.rng), site, site.rng)
     seen = np.flatnonzero(sight.paired)
     if len(seen) < FEWEST_SEEN:
         share = len(seen) / POINTS
@@ -184,7 +183,7 @@ def _bed(given: PlanOptions, depth_m: float) -> _Bed:
         )  # fmt: skip
     views = Views(sight.start, sight.camera).take(seen)
     apparent = sight.intersected(sight.ideal)[seen]
-    block = plain_block(site.flown.cameras, TiePoints(sight.truth[seen], views, sight.ideal))
+    block = plain_block(site.true, TiePoints(sight.truth[seen], views, sight.ideal))
     block = restricted(block, well_seen(block))  # without images that hardly see the bed
     views = Views(block.start, block.camera)
     return _Bed(block.xyz, apparent, views, block.image_xy, block.cameras)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -17,17 +16,13 @@ PLACE_SD_M, USUAL_HEIGHT_M = 0.5, 80.0  # of a drone; below the usual height it 
 _RING_BASES, _RING_SPACINGS = 2.0, 1.5  # steps of a ring of obliques in those of the nadir images
 
 
-class Block(NamedTuple):
-    """Cameras with the angles that they were made from, degrees, shape (k, 3)."""
-
-    cameras: Cameras
-    yaw_pitch_roll_deg: FloatArray
-
-
 def fly_block(
     extent_m: tuple[float, float], chosen: SceneSettings, rng: np.random.Generator
-) -> Block:
-    """Cover a rectangle from the origin with images; strips run along x."""
+) -> tuple[Cameras, FloatArray]:
+    """Cover a rectangle from the origin with images; strips run along x.
+
+    Returns the cameras, and yaw, pitch and roll of each, degrees, shape (k, 3).
+    """
     plan, attitude = _plan(extent_m, chosen)
     attitude = attitude + rng.normal(0.0, ATTITUDE_SD_DEG, attitude.shape)
     sd = PLACE_SD_M * min(1.0, chosen.flying_height_m / USUAL_HEIGHT_M)
@@ -39,21 +34,18 @@ def fly_block(
         rotations=from_yaw_pitch_roll(*attitude.T),
         lenses=(chosen.optics.lens,) * len(centres),
     )
-    return Block(cameras, attitude)
+    return cameras, attitude
 
 
-def misplaced(block: Block, chosen: SceneSettings, rng: np.random.Generator) -> Block:
-    """Return the block with noise on every coordinate, and on yaw, pitch and roll."""
+def misplaced(
+    cameras: Cameras, attitude: FloatArray, chosen: SceneSettings, rng: np.random.Generator
+) -> tuple[Cameras, FloatArray]:
+    """Return cameras and angles with noise on every coordinate, and on yaw, pitch and roll."""
     if chosen.position_noise_m == chosen.attitude_noise_deg == 0.0:
-        return block
-    shape = block.cameras.centres.shape
-    angles = block.yaw_pitch_roll_deg + rng.normal(0.0, chosen.attitude_noise_deg, shape)
-    cameras = replace(
-        block.cameras,
-        centres=block.cameras.centres + rng.normal(0.0, chosen.position_noise_m, shape),
-        rotations=from_yaw_pitch_roll(*angles.T),
-    )
-    return Block(cameras, angles)
+        return cameras, attitude
+    angles = attitude + rng.normal(0.0, chosen.attitude_noise_deg, attitude.shape)
+    centres = cameras.centres + rng.normal(0.0, chosen.position_noise_m, attitude.shape)
+    return replace(cameras, centres=centres, rotations=from_yaw_pitch_roll(*angles.T)), angles
 
 
 def _plan(extent_m: tuple[float, float], chosen: SceneSettings) -> tuple[FloatArray, FloatArray]:

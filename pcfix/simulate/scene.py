@@ -11,9 +11,9 @@ import numpy as np
 from pcfix.model import Cameras, FloatArray, IntArray, Views, WaterPlane
 from pcfix.options.declare import taken
 from pcfix.options.scenes import SceneOptions
-from pcfix.simulate.block import Block, fly_block, misplaced
+from pcfix.simulate.block import fly_block, misplaced
 from pcfix.simulate.settings import SceneSettings
-from pcfix.simulate.sight import Rig, see, starts
+from pcfix.simulate.sight import Site, see, starts
 from pcfix.simulate.terrain import Terrain
 from pcfix.simulate.tracing import Water, Waves
 
@@ -55,8 +55,6 @@ class Scene:
 
     def depth_m(self, xyz: FloatArray) -> FloatArray:
         """Return the vertical distance of points below the mean water plane, metres."""
-        if self.water.b == self.water.c == 0.0:
-            return np.asarray(self.water.a - xyz[:, 2])
         # about the scene, as the plane's height at the origin of the coordinates is a large number
         near = xyz - ORIGIN_M
         level = self.water.a + self.water.b * ORIGIN_M[0] + self.water.c * ORIGIN_M[1]
@@ -74,15 +72,6 @@ class Scene:
             f" each, GSD {gsd}, water level {self.water_level_m:g} m{tilted},"
             f" refractive index {self.refractive_index:g}"
         )
-
-
-class Streams(NamedTuple):
-    """Random numbers: `main`, and independent streams for what can be switched on."""
-
-    main: np.random.Generator
-    poses: np.random.Generator
-    waves: np.random.Generator
-    detection: np.random.Generator
 
 
 def simulate_scene(
@@ -118,7 +107,7 @@ def simulate_scene(
         keywords["points"] = points
     chosen = taken(SceneOptions, options, keywords, "simulate_scene").part(SceneSettings)
     site = lay_out(chosen)
-    truth = points_on(site.terrain, chosen.points, site.streams.main)
+    truth = points_on(site.terrain, chosen.points, site.rng)
     return scene_of(chosen, site, truth, observe_tracks, PAIRS_AT_ONCE, progress)
 
 
@@ -144,9 +133,9 @@ def scene_of(
     progress: Callable[[int, int], None] | None = None,
 ) -> Scene:
     """Return the scene of a site; `observe` reconstructs the cloud of some true points, (n, 3)."""
-    terrain, flown, given, rng = site.terrain, site.flown, site.given, site.streams.main
+    terrain, rng = site.terrain, site.rng
     parts = list[Part]()
-    at_once = max(1, pairs_at_once // len(flown.cameras))
+    at_once = max(1, pairs_at_once // len(site.true))
     for first in range(0, len(truth), at_once):
         parts.append(observe(truth[first : first + at_once], site))
         if progress is not None:
@@ -154,7 +143,7 @@ def scene_of(
     area_m2 = terrain.length_m * terrain.width_m
     lidar = points_on(terrain, round(area_m2 * chosen.lidar_per_m2), rng)
     lidar[:, 2] += rng.normal(0.0, chosen.lidar_noise_m, len(lidar))
-    cameras = cameras_in_world(given.cameras)
+    cameras = cameras_in_world(site.given)
     columns: list[Any] = [
         None if one[0] is None else np.concatenate(one) for one in zip(*parts, strict=True)
     ]
@@ -164,7 +153,7 @@ def scene_of(
         true_xyz=whole.true_xyz + ORIGIN_M,
         views=Views(starts(whole.counts), whole.camera, whole.weight),
         cameras=cameras,
-        yaw_pitch_roll_deg=given.yaw_pitch_roll_deg,
+        yaw_pitch_roll_deg=site.given_angles,
         lidar_xyz=lidar + ORIGIN_M,
         water_level_m=chosen.water,
         refractive_index=chosen.refractive_index,
@@ -173,45 +162,34 @@ def scene_of(
         epsg=EPSG,
         settings=chosen.as_dict(),
         water=plane_in_world(terrain.water),
-        true_cameras=cameras if given is flown else cameras_in_world(flown.cameras),
-        true_yaw_pitch_roll_deg=flown.yaw_pitch_roll_deg,
+        true_cameras=cameras if site.given is site.true else cameras_in_world(site.true),
+        true_yaw_pitch_roll_deg=site.true_angles,
     )
-
-
-class Site(NamedTuple):
-    """Ground, flown and given block, rig, and random numbers of a scene."""
-
-    terrain: Terrain
-    flown: Block
-    given: Block
-    rig: Rig
-    streams: Streams
 
 
 def lay_out(chosen: SceneSettings) -> Site:
     """Return ground and block of a scene, in local coordinates."""
-    keys: list[Any] = [chosen.seed, *([chosen.seed, i] for i in (1, 2, 3))]
-    streams, extent = Streams(*map(np.random.default_rng, keys)), chosen.area_m
+    # poses, waves and detection have their own random numbers, as they can be switched on
+    rng, extent = np.random.default_rng(chosen.seed), chosen.area_m
+    of_poses, of_waves, luck = (np.random.default_rng([chosen.seed, i]) for i in (1, 2, 3))
     if chosen.cameras is not None:  # the area that about this number of nadir images covers
         (length, width), (base, spacing) = extent, chosen.base_and_spacing_m
         side = float(np.sqrt(chosen.cameras * base * spacing * length / width))
         across = chosen.cameras * base * spacing / side - 1.5 * spacing
         extent = max(side - 1.5 * base, base), max(across, spacing / 2.0)
     plane = chosen.water_plane(extent)
-    terrain = Terrain.random(chosen.bed, extent, plane, chosen.depth_m, streams.main)
-    flown = fly_block(extent, chosen, streams.main)
-    given = misplaced(flown, chosen, streams.poses)
+    terrain = Terrain.random(chosen.bed, extent, plane, chosen.depth_m, rng)
+    true, true_angles = fly_block(extent, chosen, rng)
+    given, given_angles = misplaced(true, true_angles, chosen, of_poses)
     waves = None
     if chosen.wave_slope_deg > 0.0:
-        count = len(flown.cameras)
-        waves = Waves.random(count, chosen.wave_slope_deg, chosen.wave_length_m, streams.waves)
+        waves = Waves.random(len(true), chosen.wave_slope_deg, chosen.wave_length_m, of_waves)
     fall_m = chosen.water_tilt * float(np.hypot(*extent)) / 2.0
-    water, lowest_m = Water(plane, chosen.refractive_index, waves), chosen.water - chosen.depth_m
-    rig = Rig(
-        flown.cameras, given.cameras, chosen.optics, water, lowest_m - fall_m, chosen.image_noise,
-        chosen.detection,
+    return Site(
+        terrain, true, true_angles, given, given_angles, chosen.optics,
+        Water(plane, chosen.refractive_index, waves), chosen.water - chosen.depth_m - fall_m,
+        chosen.image_noise, chosen.detection, rng, luck,
     )  # fmt: skip
-    return Site(terrain, flown, given, rig, streams)
 
 
 def points_on(terrain: Terrain, count: int, rng: np.random.Generator) -> FloatArray:
@@ -223,8 +201,8 @@ def points_on(terrain: Terrain, count: int, rng: np.random.Generator) -> FloatAr
 
 def observe_tracks(truth: FloatArray, site: Site) -> Part:
     """Intersect each point from all images that show it."""
-    sight = see(truth, site.rig, site.streams.detection)
-    apparent = sight.intersected(site.rig.observed(sight.ideal, site.streams.main))
+    sight = see(truth, site, site.luck)
+    apparent = sight.intersected(site.observed(sight.ideal, site.rng))
     return Part(apparent, truth, sight.camera, np.diff(sight.start))
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from pcfix.model import Cameras, FloatArray, IntArray
 from pcfix.simulate.optics import Optics
+from pcfix.simulate.terrain import Terrain
 from pcfix.simulate.tracing import Water, project, rotations_of, triangulate
 
 LEAST_VIEWS = 3
@@ -18,26 +19,27 @@ def starts(counts: IntArray) -> IntArray:
     return np.concatenate([[0], np.cumsum(counts)])
 
 
-def starts_of(point: IntArray, count: int) -> IntArray:
-    """Return the same from the point of each row, sorted; there are `count` points."""
-    return starts(np.bincount(point, minlength=count))
-
-
 @dataclass(frozen=True, eq=False)
-class Rig:
-    """True and given poses, optics, water and noise of the images.
+class Site:
+    """Ground, water and images of a scene in local coordinates, and its random numbers.
 
-    `true` are the poses of the images, `given` those for the intersection. Nothing is below
-    `lowest_m`.
+    `true` are the poses of the images, `given` those for the intersection, and the angles are yaw,
+    pitch and roll, degrees, shape (k, 3). Nothing is below `lowest_m`. What is detected has random
+    numbers of its own, `luck`.
     """
 
+    terrain: Terrain
     true: Cameras
+    true_angles: FloatArray
     given: Cameras
+    given_angles: FloatArray
     optics: Optics
     water: Water
     lowest_m: float
     image_noise_px: float
     detection: float
+    rng: np.random.Generator
+    luck: np.random.Generator
 
     def observed(self, ideal: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Return ideal pixels as measured: noise is on the image, which is then undistorted.
@@ -56,7 +58,7 @@ class Sight:
     shape (m, 2), are ideal pixels without noise.
     """
 
-    rig: Rig
+    site: Site
     truth: FloatArray
     start: IntArray
     point: IntArray
@@ -77,33 +79,40 @@ class Sight:
         if paired.any():
             starts = np.concatenate([self.start[:-1][paired], self.start[-1:]])
             apparent[paired] = triangulate(
-                pixels, self.rig.given, self.camera, starts, self.rig.optics.lens, apparent[paired]
+                pixels,
+                self.site.given,
+                self.camera,
+                starts,
+                self.site.optics.lens,
+                apparent[paired],
             )
         return apparent
 
 
-def see(truth: FloatArray, rig: Rig, rng: np.random.Generator) -> Sight:
+def see(truth: FloatArray, site: Site, rng: np.random.Generator) -> Sight:
     """Trace every point, shape (n, 3), into every image; those in fewer than three have no pairs.
 
     `rng` says what is detected; the luckiest three images of a point always are.
     """
-    cameras = rig.true
+    cameras = site.true
     # how far from below each camera it can see anything: the most oblique ray of the frame's
     # corner, prolonged as if there were no refraction
     off_nadir = np.arccos(np.clip(-rotations_of(cameras)[:, 2, 2], -1.0, 1.0))
-    widest = np.minimum(np.arctan(rig.optics.reach) + off_nadir, np.radians(80.0))
-    reach = (cameras.centres[:, 2] - rig.lowest_m) * np.tan(widest)
+    widest = np.minimum(np.arctan(site.optics.reach) + off_nadir, np.radians(80.0))
+    reach = (cameras.centres[:, 2] - site.lowest_m) * np.tan(widest)
     across = truth[:, None, 0] - cameras.centres[:, 0], truth[:, None, 1] - cameras.centres[:, 1]
     point, camera = np.nonzero(np.hypot(*across) < reach)
-    surface = rig.water.piercing_points(truth[point], cameras.centres[camera], camera)
-    ideal, z = project(surface, cameras, camera, rig.optics.lens)
-    inside = (z > 0) & rig.optics.frames(rig.optics.to_image(ideal))
+    surface = site.water.piercing_points(truth[point], cameras.centres[camera], camera)
+    ideal, z = project(surface, cameras, camera, site.optics.lens)
+    inside = (z > 0) & site.optics.frames(site.optics.to_image(ideal))
     point, camera, ideal = point[inside], camera[inside], ideal[inside]
     taken = np.bincount(point, minlength=len(truth))[point] >= LEAST_VIEWS
-    if rig.detection < 1.0:
+    if site.detection < 1.0:
         luck = rng.uniform(0.0, 1.0, len(point))
         rank = np.empty(len(point), np.int64)
         rank[np.lexsort((luck, point))] = np.arange(len(point)) - np.searchsorted(point, point)
-        taken &= (luck < rig.detection) | (rank < LEAST_VIEWS)
+        taken &= (luck < site.detection) | (rank < LEAST_VIEWS)
     point, camera, ideal = point[taken], camera[taken], ideal[taken]
-    return Sight(rig, truth, starts_of(point, len(truth)), point, camera, ideal)
+    return Sight(
+        site, truth, starts(np.bincount(point, minlength=len(truth))), point, camera, ideal
+    )

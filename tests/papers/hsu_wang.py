@@ -26,7 +26,7 @@ from scipy.stats import linregress
 import pcfix
 from pcfix.lens.rotations import from_yaw_pitch_roll
 from pcfix.model import Lens, Views
-from pcfix.simulate.sight import starts_of
+from pcfix.simulate.sight import starts
 from pcfix.simulate.tracing import project, triangulate
 from tests.utils.bed_rays import piercing_points
 
@@ -66,7 +66,7 @@ def simulate_bowl(spacing_m=5e-4, *, refractive_index=1.34, image_noise_px=0.2, 
     inside = ((pixels >= 0.0) & (pixels < [LENS.width, LENS.height])).all(axis=1)
     point, camera, pixels = point[inside], camera[inside], pixels[inside]
     pixels = pixels + rng.normal(0.0, image_noise_px, pixels.shape)
-    start = starts_of(point, len(bed))
+    start = starts(np.bincount(point, minlength=len(bed)))
     apparent = triangulate(pixels, cameras, camera, start, LENS, bed)
     return Bowl(apparent, bed, cameras, Views(start, camera), refractive_index)
 

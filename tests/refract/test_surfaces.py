@@ -254,7 +254,7 @@ def traced(truth, block, levels):
 def test_two_flights():
     """Traced forwards by other code: the south flown at low water, the north 1 m higher."""
     rng = np.random.default_rng(11)
-    flown = fly_block((120.0, 200.0), SceneSettings(), rng).cameras
+    flown = fly_block((120.0, 200.0), SceneSettings(), rng)[0]
     levels = np.where(flown.centres[:, 1] < 100.0, -0.5, 0.5)
     low, high = np.array([0.0, 0, -9]), np.array([120.0, 200, -2])
     truth = rng.uniform(low, high, (600, 3))

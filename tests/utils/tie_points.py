@@ -13,21 +13,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.model import Cameras, GnssPositions, GroundControl, TiePoints, Views
-from pcfix.simulate.block import Block
-from pcfix.simulate.scene import (
-    ORIGIN_M,
-    Streams,
-    cameras_in_world,
-    lay_out,
-    plane_in_world,
-    points_on,
-)
+from pcfix.simulate.scene import ORIGIN_M, cameras_in_world, lay_out, plane_in_world, points_on
 from pcfix.simulate.settings import SceneSettings
 from pcfix.simulate.sight import see
 
 if TYPE_CHECKING:
     from pcfix.model import BoolArray, FloatArray, WaterPlane
-    from pcfix.simulate.sight import Rig, Sight
+    from pcfix.simulate.sight import Sight, Site
 
 _CANDIDATES = 4000
 _LEAST_TIES = 8
@@ -148,25 +140,24 @@ def simulate_tie_points(
         If an argument is outside its rule.
     """
     chosen = SceneSettings(points=points, **settings)
-    terrain, flown, given, rig, streams = lay_out(chosen)
-    plane = terrain.water
-    truth, ties = _seen(points_on(terrain, points, streams.main), rig, streams)
-    enough = np.bincount(ties.camera, minlength=len(rig.true)) >= _LEAST_TIES
+    site = lay_out(chosen)
+    terrain, plane = site.terrain, site.terrain.water
+    truth, ties = _seen(points_on(terrain, points, site.rng), site)
+    enough = np.bincount(ties.camera, minlength=len(site.true)) >= _LEAST_TIES
     if not enough.all():
-        flown, given = _only(flown, enough), _only(given, enough)
-        rig = replace(rig, true=flown.cameras, given=given.cameras)
-        truth, ties = _seen(truth, rig, streams)
-    places = points_on(terrain, _CANDIDATES, streams.main)
+        site = replace(site, true=_only(site.true, enough), given=_only(site.given, enough))
+        truth, ties = _seen(truth, site)
+    places = points_on(terrain, _CANDIDATES, site.rng)
     places = places[_spread(places, _above(places, plane), control, checks)]
-    surveyed, marks = _seen(places, rig, streams)
+    surveyed, marks = _seen(places, site)
     made = TieScene(
-        true_cameras=cameras_in_world(flown.cameras), cameras=cameras_in_world(given.cameras),
+        true_cameras=cameras_in_world(site.true), cameras=cameras_in_world(site.given),
         truth=truth + ORIGIN_M, views=Views(ties.start, ties.camera),
-        exact_xy=rig.optics.to_image(ties.ideal),
+        exact_xy=site.optics.to_image(ties.ideal),
         ties=TiePoints(truth, Views(ties.start, ties.camera), ties.ideal),
         is_wet=_above(truth, plane) < 0.0,
         control=_control(surveyed, marks, _above(surveyed, plane) < 0.0, control, chosen),
-        control_truth=surveyed + ORIGIN_M, control_exact_xy=rig.optics.to_image(marks.ideal),
+        control_truth=surveyed + ORIGIN_M, control_exact_xy=site.optics.to_image(marks.ideal),
         water=plane_in_world(plane), refractive_index=chosen.refractive_index,
         noise=TieNoise(chosen.image_noise, gnss_noise_m, survey_noise_m),
         settings=chosen.as_dict(),
@@ -176,16 +167,15 @@ def simulate_tie_points(
     return made.measured(np.random.default_rng([chosen.seed, 9]))
 
 
-def _only(block: Block, keep: BoolArray) -> Block:
-    """Return a block without some of its images; obliques may look beside the area."""
-    cameras, rows = block.cameras, np.flatnonzero(keep)
+def _only(cameras: Cameras, keep: BoolArray) -> Cameras:
+    """Return some of the images; obliques may look beside the area."""
+    rows = np.flatnonzero(keep)
     if cameras.rotations is None or cameras.lenses is None:
         raise ValueError("a simulated block has angles and lenses")
-    fewer = Cameras(
+    return Cameras(
         tuple(cameras.labels[i] for i in rows), cameras.centres[rows], cameras.rotations[rows],
         tuple(cameras.lenses[i] for i in rows),
     )  # fmt: skip
-    return Block(fewer, block.yaw_pitch_roll_deg[rows])
 
 
 def _above(xyz: FloatArray, plane: WaterPlane) -> FloatArray:
@@ -193,9 +183,9 @@ def _above(xyz: FloatArray, plane: WaterPlane) -> FloatArray:
     return np.asarray(xyz[:, 2] - (plane.a + xyz[:, :2] @ [plane.b, plane.c]))
 
 
-def _seen(xyz: FloatArray, rig: Rig, streams: Streams) -> tuple[FloatArray, Sight]:
+def _seen(xyz: FloatArray, site: Site) -> tuple[FloatArray, Sight]:
     """Return those points that enough images show, and where."""
-    sight = see(xyz, rig, streams.detection)
+    sight = see(xyz, site, site.luck)
     made = sight.paired
     start = np.concatenate([sight.start[:-1][made], sight.start[-1:]])
     point = np.repeat(np.arange(int(made.sum())), np.diff(start))

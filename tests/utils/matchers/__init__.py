@@ -37,20 +37,20 @@ def matched_scene(points: int, *, cloud: str = "tracks", **keywords) -> Scene:
         return MatchedScene(**vars(simulate_scene(points, **keywords)))
     chosen = SceneSettings(points=points, **keywords)
     site, count = lay_out(chosen), NEIGHBOURS[cloud]
-    truth = points_on(site.terrain, points, site.streams.main)
-    rig, rng, matching = site.rig, *map(np.random.default_rng, (0, [chosen.seed, 4]))
-    sure, pairs, counts = replace(rig, detection=1.0), [], []
+    truth = points_on(site.terrain, points, site.rng)
+    rng, matching = map(np.random.default_rng, (0, [chosen.seed, 4]))
+    sure, pairs, counts = replace(site, detection=1.0), [], []
     if cloud == "pairs":
         sample = truth[:: max(1, len(truth) // SAMPLE)][:SAMPLE]
         table = neighbour_table(see(sample, sure, rng), count)
     else:
-        sample = points_on(site.terrain, max(TIES, 10 * len(rig.true)), rng)
+        sample = points_on(site.terrain, max(TIES, 10 * len(site.true)), rng)
         every = see(sample, sure, rng)
         partners = openmvs_partners(every.intersected(every.ideal), every, count, rng)
         table = partners.matched
 
     def observe(some, site) -> Part:
-        sight = see(some, rig, site.streams.detection)
+        sight = see(some, site, site.luck)
         if cloud == "depth-maps":
             normals = normals_of(site.terrain, *some[:, :2].T)
             return fuse_depth_maps(sight, normals, partners, matching)

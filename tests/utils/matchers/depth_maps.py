@@ -91,7 +91,7 @@ def fuse_depth_maps(
     A place with fewer than three matching depth maps is not moved and has no cameras. `normals`,
     shape (n, 3), are unit normals of the true surface; `rng` makes noise and selects points.
     """
-    rig, matching = sight.rig, _Matching(sight, normals, partners, rng)
+    site, matching = sight.site, _Matching(sight, normals, partners, rng)
     luck = rng.uniform(0.0, 1.0, len(sight.point))
     place = sight.intersected(sight.ideal)
     maps = matching.maps(place)
@@ -101,7 +101,7 @@ def fuse_depth_maps(
     maps = matching.maps(place)
     rows = np.flatnonzero((group >= 0) & (group == seed[sight.point]))
     # without those whose depth is not that of their point's place
-    _, z = project(place[sight.point[rows]], rig.given, sight.camera[rows], rig.optics.lens)
+    _, z = project(place[sight.point[rows]], site.given, sight.camera[rows], site.optics.lens)
     rows = rows[np.abs(maps.averaged[rows] - z) < AGREE * z]
     count = np.bincount(sight.point[rows], minlength=len(seed))
     rows = rows[count[sight.point[rows]] >= LEAST_FUSED]
@@ -123,7 +123,7 @@ class _Matching:
     def __init__(
         self, sight: Sight, normals: FloatArray, partners: Partners, rng: np.random.Generator
     ) -> None:
-        rig, row_of = sight.rig, rows_of(sight)
+        site, row_of = sight.site, rows_of(sight)
 
         def there(table: IntArray) -> IntArray:
             """Return the rows of the images that a table names for the image of each row."""
@@ -131,28 +131,28 @@ class _Matching:
             return np.where(others >= 0, row_of[sight.point[:, None], others], -1)
 
         self.sight, self.normals, self.known = sight, normals, partners.known
-        points, centres = sight.truth[sight.point], rig.true.centres[sight.camera]
-        self.water = rig.water.tangent_planes(points, centres, sight.camera)
+        points, centres = sight.truth[sight.point], site.true.centres[sight.camera]
+        self.water = site.water.tangent_planes(points, centres, sight.camera)
         self.partner = there(partners.matched)
         self.partner[(self.partner >= 0).sum(axis=1) < LEAST_PARTNERS] = -1
         self.averaged, self.fused = there(partners.averaged), there(partners.fused)
         shape = self.partner.shape
-        self.noise_px = rng.normal(0.0, rig.image_noise_px, (*shape, 2))
-        self.cost_px2 = rng.gumbel(0.0, COST_NOISE * rig.image_noise_px**2, shape)
+        self.noise_px = rng.normal(0.0, site.image_noise_px, (*shape, 2))
+        self.cost_px2 = rng.gumbel(0.0, COST_NOISE * site.image_noise_px**2, shape)
 
     def maps(self, place: FloatArray) -> Maps:
         """Return the depths of all references along their rays through a place of each point."""
-        sight, rig = self.sight, self.sight.rig
-        point, camera, lens = sight.point, sight.camera, rig.optics.lens
-        pixels, depth = project(place[point], rig.given, camera, lens)
+        sight, site = self.sight, self.sight.site
+        point, camera, lens = sight.point, sight.camera, site.optics.lens
+        pixels, depth = project(place[point], site.given, camera, lens)
         seen = bed_points(
-            rig.true.centres[camera],
-            _rays(pixels, rig.true, camera, lens),
+            site.true.centres[camera],
+            _rays(pixels, site.true, camera, lens),
             self.water,
             (sight.truth[point], self.normals[point]),
-            rig.water.refractive_index,
+            site.water.refractive_index,
         )
-        origin, ray = rig.given.centres[camera], _rays(pixels, rig.given, camera, lens)
+        origin, ray = site.given.centres[camera], _rays(pixels, site.given, camera, lens)
         depth = self._depths((origin, ray, depth), seen)
         maps = Maps(origin, ray, depth, depth, seen, seen)
         averaged, shown = self._averaged(maps)
@@ -162,11 +162,11 @@ class _Matching:
         self, rays: tuple[FloatArray, FloatArray, FloatArray], seen: FloatArray
     ) -> FloatArray:
         """Return the depth of the best pair of partners along each ray, from a first depth."""
-        rig, (reference, slot) = self.sight.rig, np.nonzero(self.partner >= 0)
+        site, (reference, slot) = self.sight.site, np.nonzero(self.partner >= 0)
         row = self.partner[reference, slot]
         measured = self._measured(row, seen[reference], self.noise_px[reference, slot])
         origin, ray, first = rays
-        camera, given, lens = self.sight.camera[row], rig.given, rig.optics.lens
+        camera, given, lens = self.sight.camera[row], site.given, site.optics.lens
         turn = rotations_of(given)[camera]
         sightings = Sightings(
             reference,
@@ -195,12 +195,12 @@ class _Matching:
 
     def _measured(self, row: IntArray, seen: FloatArray, noise_px: FloatArray) -> FloatArray:
         """Return where the images of some rows of `sight` show places of the bed, ideal pixels."""
-        rig, camera = self.sight.rig, self.sight.camera[row]
+        site, camera = self.sight.site, self.sight.camera[row]
         anchors, normals = (part[row] for part in self.water)
-        centres, n = rig.true.centres[camera], rig.water.refractive_index
+        centres, n = site.true.centres[camera], site.water.refractive_index
         surface = piercing_points_of_planes(seen, centres, anchors, normals, n)
-        ideal, _ = project(surface, rig.true, camera, rig.optics.lens)
-        return rig.optics.to_ideal(rig.optics.to_image(ideal) + noise_px)
+        ideal, _ = project(surface, site.true, camera, site.optics.lens)
+        return site.optics.to_ideal(site.optics.to_image(ideal) + noise_px)
 
     def _averaged(self, maps: Maps) -> tuple[FloatArray, FloatArray]:
         """Return the mean depths of each and its neighbouring maps, and the mean places of the bed.

@@ -13,7 +13,7 @@ import numpy as np
 
 from pcfix.model import FloatArray, IntArray
 from pcfix.simulate.scene import Part
-from pcfix.simulate.sight import Sight, starts_of
+from pcfix.simulate.sight import Sight, starts
 from pcfix.simulate.tracing import rotations_of, triangulate
 
 SAMPLE = 1000
@@ -53,7 +53,7 @@ def neighbour_table(sight: Sight, count: int) -> IntArray:
     An image scores for every common point, by a bell about an angle of 10 degrees between the rays,
     wider above: in the manner of OpenMVS.
     """
-    centres = sight.rig.true.centres
+    centres = sight.site.true.centres
     k = len(centres)
     score = np.zeros((k, k))
     for i, place in enumerate(sight.truth):
@@ -80,7 +80,7 @@ def openmvs_partners(
     the least score are not modelled. `ties`, shape (p, 3), are the reconstructed tie points,
     `count` the partners of a depth map; `rng` selects which features are found.
     """
-    cameras, optics = sight.rig.given, sight.rig.optics
+    cameras, optics = sight.site.given, sight.site.optics
     k = len(cameras)
     # the cell of each image in which each tie point is found, shape (k, p), -1 for none
     cell = np.full((k, len(ties)), -1)
@@ -145,7 +145,7 @@ def _lost(
 
 def rows_of(sight: Sight) -> IntArray:
     """Return the row of each point and camera, shape (n, k), -1 where there is none."""
-    rows = np.full((len(sight.truth), len(sight.rig.true)), -1)
+    rows = np.full((len(sight.truth), len(sight.site.true)), -1)
     rows[sight.point, sight.camera] = np.arange(len(sight.point))
     return rows
 
@@ -166,17 +166,17 @@ def match_pairs(
     first, second = np.nonzero(np.triu(match | match.T, 1))
     owner, pair = np.nonzero((rows[:, first] >= 0) & (rows[:, second] >= 0))
     one, other = rows[owner, first[pair]], rows[owner, second[pair]]
-    rig, truth, point = sight.rig, sight.truth, sight.point[one]
+    site, truth, point = sight.site, sight.truth, sight.point[one]
     both = np.column_stack([one, other]).ravel()
     places = triangulate(
-        rig.observed(sight.ideal[both], rng),
-        rig.given,
+        site.observed(sight.ideal[both], rng),
+        site.given,
         sight.camera[both],
         np.arange(0, len(both) + 1, 2),
-        rig.optics.lens,
+        site.optics.lens,
         truth[point],
     )
-    start = starts_of(point, len(truth))
+    start = starts(np.bincount(point, minlength=len(truth)))
     xyz, paired = truth.copy(), np.diff(start) > 0
     low, high = (start[:-1] + (np.diff(start) + i) // 2 for i in (-1, 0))
     for axis in range(3):
