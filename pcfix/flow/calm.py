@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +18,7 @@ from pcfix.flow.inputs import Inputs
 from pcfix.flow.photos import photo_of, plain, read_heights, warn_all
 from pcfix.flow.runner import Progress, check_summary, write_summary
 from pcfix.grid.lattice import Lattice
-from pcfix.io.atomic import temporary_folder, temporary_output
+from pcfix.io.atomic import temporary_folder
 from pcfix.io.crs import parse_crs
 from pcfix.io.files import scratch_arrays
 from pcfix.io.photographs import Frames, check_calm, read_frames, write_calm, write_spread
@@ -61,7 +61,8 @@ LEAST_EXPLAINED = 0.5
 """Share of the slopes; if waves explain less, there is a warning."""
 
 
-class WaterFound(NamedTuple):
+@dataclass(frozen=True)
+class WaterFound:
     """The water of a sequence: number of waves, rms values, share of the slopes explained."""
 
     folder: str
@@ -149,7 +150,7 @@ def calm_frames(
             weights[:, still(shifts, weights)] = 0.0
             waters, water = _water(view, nodes, shifts, weights, interval, str(folder))
             with temporary_folder(folder) as draft:
-                _write_waters(draft, found.names, view.level_m, nodes, waters, crs)
+                _write_waters(draft, found.names, view.level_m, nodes.lattice, waters, crs)
             if interval is None:
                 words = "The times are unknown, so frames are fitted separately. Give --interval."
                 notes.append(PcfixWarning("frames.no_interval", words))
@@ -172,7 +173,7 @@ def calm_frames(
         spread=round(float(np.nanmedian(spread)), 2),
         seconds=round(time.perf_counter() - started, 3), water=water, notes=tuple(notes),
     )  # fmt: skip
-    write_summary(given, plain(summary) | {"water": water and water._asdict()})
+    write_summary(given, plain(summary))
     return summary
 
 
@@ -300,7 +301,7 @@ def _water(
             )
         data = Slopes(
             np.nan_to_num(slope), np.where(known, weights, 0.0), times,
-            nodes.xy - middle, nodes.shape, nodes.cell_m,
+            nodes.xy - middle, nodes.lattice,
         )  # fmt: skip
         if interval is not None:  # time ties the frames together
             waves = [fit_waves(data, depth)] * len(times)
@@ -324,22 +325,16 @@ def _water(
 
 
 def _write_waters(
-    folder: Path, names: tuple[str, ...], level_m: float, nodes: Nodes, waters: Any, crs: str | None
-) -> None:
+    folder: Path, names: tuple[str, ...], level_m: float, lattice: Lattice, waters: Any,
+    crs: str | None,
+) -> None:  # fmt: skip
     """Write a raster of the water of each frame, and its standard error in a folder of those."""
     (folder / "sigma").mkdir()
-    size = nodes.cell_m
-    lattice = Lattice(
-        size, round(nodes.left_m / size), -round(nodes.top_m / size), *nodes.shape[::-1]
-    )
     parsed = None if crs is None else parse_crs(crs, "the bed")
     for name, (height, sigma) in zip(names, waters, strict=True):
         for path, band, values in (
             (folder / f"{name}.tif", "height", level_m + height),
             (folder / "sigma" / f"{name}.tif", "standard error", sigma),
         ):
-            with (
-                temporary_output(path) as draft,
-                new_raster(draft, lattice, parsed, {band: "m"}) as target,
-            ):
-                write_part(target, values.reshape(nodes.shape), lattice.window, 1)
+            with new_raster(path, lattice, parsed, {band: "m"}) as target:
+                write_part(target, values.reshape(lattice.height, -1), lattice.window, 1)

@@ -131,17 +131,15 @@ def plan_flight(
             step()
         for words, other in others:
             sigma_m = _sigma(other, _bed(other, deepest))[1]
-            tried.append(Alternative(words, len(_flown(other)), sigma_m))
+            images = len(lay_out(_scene(other, deepest)).true)
+            tried.append(Alternative(words, images, sigma_m))
             step()
-    scene, flown = _scene(given, deepest), _flown(given)
+    scene = _scene(given, deepest)
+    base_m, spacing_m = scene.base_and_spacing_m
     off_nadir = float(np.degrees(np.arctan(scene.optics.reach))) + (given.obliques or 0.0)
     plan = Plan(
-        cameras=flown, area_m=given.area, height_m=given.height,
-        gsd_m=scene.gsd_m, base_m=scene.base_and_spacing_m[0],
-        spacing_m=scene.base_and_spacing_m[1], obliques_deg=given.obliques,
-        overlap=given.overlap, sidelap=given.sidelap, flattest_deg=off_nadir,
-        index=scene.refractive_index, gnss_sigma_m=given.gnss_sigma,
-        budget=given.part(BudgetOptions).as_dict(), depths=tuple(beds), alternatives=tuple(tried),
+        given, lay_out(scene).true, scene.gsd_m, base_m, spacing_m, off_nadir,
+        scene.refractive_index, tuple(beds), tuple(tried),
     )  # fmt: skip
     if given.plot is not None:
         write_plot(given, plan_figure(plan))
@@ -158,11 +156,6 @@ def _scene(given: PlanOptions, depth_m: float) -> SceneSettings:
         sensor_px=(round(pixels), round(pixels * height / width)), image_noise=0.0, water=0.0,
         index=index_of(given.index, given.index_formula)[0], bed="flat", greatest_depth_m=depth_m,
     )  # fmt: skip
-
-
-def _flown(given: PlanOptions) -> Cameras:
-    """Return the images of the whole flight."""
-    return lay_out(_scene(given, max(given.depth))).true
 
 
 def _bed(given: PlanOptions, depth_m: float) -> _Bed:
@@ -300,19 +293,13 @@ class Alternative:
 class Plan:
     """A planned flight and its prediction."""
 
+    options: PlanOptions
     cameras: Cameras  # as a drone would fly them: strips along x from the origin, water at 0
-    area_m: tuple[float, float]
-    height_m: float  # above the water
     gsd_m: float  # at the water
     base_m: float  # between images
     spacing_m: float  # between strips
-    obliques_deg: float | None
-    overlap: float
-    sidelap: float
     flattest_deg: float  # largest incidence angle of the rays in the corners of the frames
     index: float
-    gnss_sigma_m: float
-    budget: dict[str, float | None]  # the standard deviations by the names of their options
     depths: tuple[DepthPlan, ...]
     alternatives: tuple[Alternative, ...]
 
@@ -324,21 +311,22 @@ class Plan:
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
         plain = {name: value for name, value in vars(self).items() if name != "cameras"}
+        plain["options"] = self.options.as_dict()
         plain["alternatives"] = [vars(one) for one in self.alternatives]
-        depths = [vars(one) | {"s44": one.order} for one in self.depths]
-        return {**plain, "images": len(self.cameras), "depths": depths, "advice": advice_of(self)}
+        plain["depths"] = [vars(one) | {"s44": one.order} for one in self.depths]
+        return {**plain, "images": len(self.cameras), "advice": advice_of(self)}
 
 
 def plan_text(plan: Plan) -> str:
     """Return the plan as the terminal shows it."""
-    obliques = "" if plan.obliques_deg is None else f", with obliques of {plan.obliques_deg:g} deg"
-    deepest = plan.deepest
+    given, deepest = plan.options, plan.deepest
+    obliques = "" if given.obliques is None else f", with obliques of {given.obliques:g} deg"
     flight = [
         ("Images", f"{len(plan.cameras):,}, every {plan.base_m:.1f} m in strips"
          f" {plan.spacing_m:.1f} m apart{obliques}"),
         ("GSD", f"{100.0 * plan.gsd_m:.2f} cm at the water"),
     ]  # fmt: skip
-    head = "Planned {:g} m above the water over {:g} x {:g} m".format(plan.height_m, *plan.area_m)
+    head = "Planned {:g} m above the water over {:g} x {:g} m".format(given.height, *given.area)
     header = ["depth", "apparent", "rays", *deepest.parts_m, "total", "95 %", "S-44 order",
               "absorbed", "bias"]  # fmt: skip
     errors = [
@@ -353,7 +341,7 @@ def plan_text(plan: Plan) -> str:
     title = f"Standard errors of the corrected bed in cm (refractive index {plan.index:g}):"
     table = ["", title, *Table(title, header, errors).lines()]
     rows = [
-        ("poses", f"after 'pcfix adjust' with GNSS of {plan.gnss_sigma_m:g} m and a calibrated"
+        ("poses", f"after 'pcfix adjust' with GNSS of {given.gnss_sigma:g} m and a calibrated"
          " lens, unless --sigma-centre or --sigma-attitude are given"),
         ("absorbed", "the share of the refraction that an ordinary bundle adjustment absorbs, at"
          " worst: no land, no control points"),
@@ -372,7 +360,7 @@ def advice_of(plan: Plan) -> list[str]:
     Skarlatos & Agrafiotis 2018, section 3.3, for sun, wind, water and bed; overlaps after Mulsow.
     """
     deepest, found = plan.deepest, list[str]()
-    if plan.overlap < USUAL_OVERLAP or plan.sidelap < USUAL_SIDELAP:
+    if plan.options.overlap < USUAL_OVERLAP or plan.options.sidelap < USUAL_SIDELAP:
         found.append(
             f"Overlap: fly {USUAL_OVERLAP:.0%} along and {USUAL_SIDELAP:.0%} across or more. Only"
             f" {deepest.rays:.0f} images see a point of the bed."
@@ -397,7 +385,7 @@ def advice_of(plan: Plan) -> list[str]:
     )
     wind = (
         "'pcfix calm' combines frames taken through waves"
-        if plan.budget["sigma_waves"]
+        if plan.options.sigma_waves
         else "see what --sigma-waves 1 adds"
     )
     found.append(f"Wind: wait for a calm day; {wind}. The water must be clear, the bed textured.")
@@ -410,7 +398,7 @@ def plan_figure(plan: Plan) -> Figure:
     cameras = plan.cameras
     draw_footprints(block, cameras, 0.0, linewidth=0.5, alpha=0.5)
     block.plot(*cameras.centres[:, :2].T, "^", color=AFTER, markersize=4, label="images")
-    x, y = plan.area_m
+    x, y = plan.options.area
     block.plot([0, x, x, 0, 0], [0, 0, y, y, 0], color=REFERENCE, label="area")
     block.plot([], [], color=WATER, label="footprints at the water")
     label_plan(block)

@@ -106,17 +106,16 @@ def view_clouds(
         check_same_crs(str(paths[0]), crs, target.name, target.crs)
         step = 1 + len(target.xyz) // given.points
         layers.append(_Layer(f"reference {Path(target.name).name}", target.xyz[::step], {}))
-    cameras = None
-    if given.cameras is not None:
-        inputs = replace(given, water=0.0 if given.water is None else given.water).part(Inputs)
-        cameras, _ = inputs.block(first.crs)
     values = _values(given.colour, layers, surface)
     scale = scale_of(given.colour, np.concatenate(values))
     rgb = [scale.to_rgba(np.ma.masked_invalid(one))[:, :3] for one in values]
     # all about their common centre
     low = np.min([one.xyz.min(axis=0) for one in layers], axis=0)
     high = np.max([one.xyz.max(axis=0) for one in layers], axis=0)
-    lines = np.zeros((0, 2, 3)) if cameras is None else _frusta(cameras, float(high[2]))
+    lines = np.zeros((0, 2, 3))
+    if given.cameras is not None:
+        inputs = replace(given, water=0.0 if given.water is None else given.water).part(Inputs)
+        lines = _frusta(inputs.block(first.crs)[0], float(high[2]))
     water, triangles = _sheet(surface, low, high)
     ends = np.vstack([low, high, lines.reshape(-1, 3)])
     origin = (ends.min(axis=0) + ends.max(axis=0)) / 2.0

@@ -43,6 +43,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import GeometryError
+from pcfix.grid.lattice import Lattice
 from pcfix.lens.imaging import project, unproject
 from pcfix.libraries import photo_library
 from pcfix.model import BoolArray, FloatArray
@@ -79,15 +80,12 @@ class View(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Nodes:
-    """The cells of the rasters, row by row from the north, and whether the first frame sees them.
+    """The cells of the rasters, their centres, and whether the first frame sees them.
 
-    `shape` has rows and columns, `xy` the centres in the world frame, shape (n, 2).
+    `xy`, shape (n, 2), world frame, are the centres row by row from the north.
     """
 
-    left_m: float
-    top_m: float
-    cell_m: float
-    shape: tuple[int, int]
+    lattice: Lattice
     xy: FloatArray
     seen: BoolArray
 
@@ -129,14 +127,16 @@ def nodes_of(view: View, cell_m: float | None) -> Nodes:
     depth = float(np.nanmedian(view.level_m - view.bed(outline)))
     low, high = outline.min(axis=0), outline.max(axis=0)
     beyond = max(cell, MARGIN * depth)
-    west, north = np.floor((low[0] - beyond) / cell), np.ceil((high[1] + beyond) / cell)
-    left, top = west * cell, north * cell
     columns, rows = (int(n) for n in np.ceil((high - low + 2.0 * beyond) / cell) + 1)
-    x, y = left + (np.arange(columns) + 0.5) * cell, top - (np.arange(rows) + 0.5) * cell
+    west = int(np.floor((low[0] - beyond) / cell))
+    north = int(np.ceil((high[1] + beyond) / cell))
+    lattice = Lattice(cell, west, -north, columns, rows)
+    x = lattice.left_m + (np.arange(columns) + 0.5) * cell
+    y = lattice.top_m - (np.arange(rows) + 0.5) * cell
     xy = np.column_stack([np.tile(x, rows), np.repeat(y, columns)])
     pixel = _pixels(view, np.column_stack([xy, np.full(len(xy), view.level_m)]))
     inside = ((pixel > 0.0) & (pixel < [lens.width, lens.height])).all(axis=1)
-    return Nodes(float(left), float(top), cell, (rows, columns), xy, np.asarray(inside))
+    return Nodes(lattice, xy, np.asarray(inside))
 
 
 def _pixels(view: View, xyz: FloatArray) -> FloatArray:
@@ -153,7 +153,7 @@ class Displacements:
         weight = texture / (texture + np.median(texture[texture > 0.0]) + 1e-30)
         self._weight = weight.astype(np.float32)
         centre = np.append(nodes.xy[len(nodes.xy) // 2], view.level_m)
-        ends = centre + np.array([[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0]]) * nodes.cell_m
+        ends = centre + np.array([[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0]]) * nodes.lattice.resolution_m
         side = int(np.hypot(*np.diff(_pixels(view, ends), axis=0)[0]))
         self._side = (side | 1, side | 1)
         self._flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
@@ -218,15 +218,14 @@ class Waves:
 class Slopes(NamedTuple):
     """Slopes of all frames, shape (f, n, 2), their weights, shape (f, n), and times.
 
-    `xy`, shape (n, 2), is the lattice of `shape` and `cell_m`, relative to any point.
+    `xy`, shape (n, 2), are the centres of the lattice, relative to any point.
     """
 
     slope: FloatArray
     weight: FloatArray
     time_s: FloatArray
     xy: FloatArray
-    shape: tuple[int, int]
-    cell_m: float
+    lattice: Lattice
 
 
 def fit_waves(given: Slopes, depth_m: float) -> Waves:
@@ -308,14 +307,14 @@ class _Spectrum:
     """The possible wave numbers, and the energy of slopes at each of them on the shell."""
 
     def __init__(self, given: Slopes, depth_m: float) -> None:
-        self._given = given
-        rows, columns = (2 * side for side in given.shape)
-        x = 2.0 * np.pi * np.fft.fftfreq(columns, given.cell_m)
-        y = -2.0 * np.pi * np.fft.fftfreq(rows, given.cell_m)  # rows go south
+        self._given, cell_m = given, given.lattice.resolution_m
+        rows, columns = 2 * given.lattice.height, 2 * given.lattice.width
+        x = 2.0 * np.pi * np.fft.fftfreq(columns, cell_m)
+        y = -2.0 * np.pi * np.fft.fftfreq(rows, cell_m)  # rows go south
         every = np.stack(np.meshgrid(x, y), axis=2).reshape(-1, 2)
         size = np.hypot(*every.T)
-        longest = 2.0 * given.cell_m * max(given.shape)
-        least, most = 2.0 * np.pi / longest, 2.0 * np.pi / (SHORTEST_CELLS * given.cell_m)
+        longest = cell_m * max(rows, columns)
+        least, most = 2.0 * np.pi / longest, 2.0 * np.pi / (SHORTEST_CELLS * cell_m)
         may = (size >= least) & (size <= most)
         if len(given.time_s) == 1:  # a wave and its opposite look the same
             may &= (every[:, 0] > 0.0) | ((every[:, 0] == 0.0) & (every[:, 1] > 0.0))
@@ -325,7 +324,7 @@ class _Spectrum:
 
     def _transformed(self, slope: FloatArray, weight: FloatArray) -> npt.NDArray[np.complex128]:
         """Return the slope along each wave number of a frame, as its Fourier coefficient."""
-        planes = (slope * weight[:, None]).T.reshape(2, *self._given.shape)
+        planes = (slope * weight[:, None]).T.reshape(2, self._given.lattice.height, -1)
         whole = np.fft.fft2(planes, s=self._shape).reshape(2, -1)[:, self._rows]
         return np.asarray((self.number.T * whole).sum(axis=0) / self._size)
 
