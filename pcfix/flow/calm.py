@@ -26,15 +26,7 @@ from pcfix.io.rasters import new_raster, write_part
 from pcfix.model import FloatArray, Lens, WaterRaster
 from pcfix.options.declare import File, taken
 from pcfix.options.photos import CalmOptions
-from pcfix.photos.calm import (
-    LEAST_CORNERS,
-    Follower,
-    Registration,
-    covered,
-    laid,
-    median_of,
-    register,
-)
+from pcfix.photos.calm import LEAST_CORNERS, Follower, covered, laid, median_of, register
 from pcfix.photos.mapping import Photo
 from pcfix.photos.waves import (
     Displacements,
@@ -138,8 +130,8 @@ def calm_frames(
 
     with threads(given.jobs), scratch_arrays(target) as empty:
         view, crs = _view(given, found) if given.surface else (None, None)
-        way = _registered(found, count(found), still=given.still)
-        median, spread, stack = _median(found, way, empty, count(found))
+        ways, scatter = _registered(found, count(found), still=given.still)
+        median, spread, stack = _median(found, ways, empty, count(found))
         notes, water = list[PcfixWarning](), None
         if view is not None:
             interval = given.interval * given.every if given.interval else found.interval_s
@@ -163,12 +155,12 @@ def calm_frames(
     write_calm(target, found, median)
     write_spread(beside, spread)
     middle = np.array([0.5 * found.columns, 0.5 * found.rows, 1.0])
-    moved = way.homography @ middle
+    moved = ways @ middle
     warn_all(notes)
     summary = CalmSummary(
         input=str(frames), output=str(out), spread_file=str(beside), frames=len(found.names),
-        columns=found.columns, rows=found.rows, corners=len(way.scatter_px),
-        scatter_px=round(float(np.median(way.scatter_px)) if len(way.scatter_px) else 0.0, 3),
+        columns=found.columns, rows=found.rows, corners=len(scatter),
+        scatter_px=round(float(np.median(scatter)) if len(scatter) else 0.0, 3),
         moved_px=round(float(np.hypot(*(moved[:, :2] / moved[:, 2:] - middle[:2]).T).max()), 2),
         spread=round(float(np.nanmedian(spread)), 2),
         seconds=round(time.perf_counter() - started, 3), water=water, notes=tuple(notes),
@@ -177,17 +169,19 @@ def calm_frames(
     return summary
 
 
-def _registered(frames: Frames, images: Iterable[Any], *, still: bool) -> Registration:
-    """Register all frames to the first, unless the camera stood still."""
+def _registered(
+    frames: Frames, images: Iterable[Any], *, still: bool
+) -> tuple[FloatArray, FloatArray]:
+    """Register all frames to the first as `register`, unless the camera stood still."""
     if still:
-        return Registration(np.tile(np.eye(3), (len(frames.names), 1, 1)), np.empty(0))
+        return np.tile(np.eye(3), (len(frames.names), 1, 1)), np.empty(0)
     follower: Follower | None = None
     places: list[FloatArray] = []
     for frame in images:
         follower = follower or Follower(frame)
         places.append(follower.follow(frame) if places else follower.full(follower.at))
-    way = register(np.stack(places))
-    lost = np.flatnonzero(~np.isfinite(way.homography).all(axis=(1, 2)))
+    ways, scatter = register(np.stack(places))
+    lost = np.flatnonzero(~np.isfinite(ways).all(axis=(1, 2)))
     if len(lost):
         names = [frames.names[row] for row in lost]
         raise InputError(
@@ -196,11 +190,11 @@ def _registered(frames: Frames, images: Iterable[Any], *, still: bool) -> Regist
             f" first, such as {names[0]}. Leave them out, or begin with another.",
             frames=names,
         )
-    return way
+    return ways, scatter
 
 
 def _median(
-    frames: Frames, way: Registration, empty: Callable[..., Any], images: Iterable[Any]
+    frames: Frames, ways: FloatArray, empty: Callable[..., Any], images: Iterable[Any]
 ) -> tuple[npt.NDArray[Any], FloatArray, Any]:
     """Return the median, its spread, and the registered frames, which are on disk."""
     stack: Any = None
@@ -215,15 +209,15 @@ def _median(
                 frame=frames.names[number],
                 bands=frame.shape[2],
             )
-        same = np.array_equal(way.homography[number], np.eye(3))
-        stack[number] = frame if same else laid(frame, way.homography[number])
+        same = np.array_equal(ways[number], np.eye(3))
+        stack[number] = frame if same else laid(frame, ways[number])
     shape = stack.shape[1:3]
     median = np.empty(stack.shape[1:], stack.dtype)
     spread = np.empty(shape, np.float32)
     at_once = max(1, SORTED_BYTES // (4 * stack[:, 0].size))
     for top in range(0, shape[0], at_once):
         bottom = min(top + at_once, shape[0])
-        known = np.stack([covered(one, shape, top, bottom) for one in way.homography])
+        known = np.stack([covered(one, shape, top, bottom) for one in ways])
         median[top:bottom], spread[top:bottom] = median_of(stack[:, top:bottom], known)
         release()
     return median, spread, stack

@@ -23,11 +23,10 @@ from pcfix.io.labels import match_labels
 from pcfix.io.photographs import photographs_in, read_photograph, size_of, write_photograph
 from pcfix.io.rasters import filled_heights, open_raster
 from pcfix.io.water import rasters_of_images, read_water_raster
-from pcfix.lens.imaging import unproject
 from pcfix.model import Cameras, FloatArray, Lens, WaterDimension
 from pcfix.options.declare import File, taken
 from pcfix.options.photos import PhotosOptions
-from pcfix.photos.mapping import Ground, Photo, Scene, exact, nodes_of, paper, resample
+from pcfix.photos.mapping import Ground, Photo, Scene, exact, ground_seen, nodes_of, paper, resample
 from pcfix.running import current, threads
 from pcfix.version import __version__
 from pcfix.water.checks import check_above_water
@@ -112,11 +111,9 @@ def map_photos(
             """Write a photograph; return its name, pixels, black pixels, and largest shift."""
             with threads(1):  # each photograph has a thread
                 shifts = mapped(photo, block.scene_of(path), block.step_px)
-            new = resample(read_photograph(path), shifts)
-            write_photograph(path, target / path.name, new.image, new.touched)
-            pixels = new.touched.size
-            largest = float(np.abs(shifts.shift_px).max())
-            return path.name, pixels, round(new.black_share * pixels), largest
+            image, touched, black = resample(read_photograph(path), shifts)
+            write_photograph(path, target / path.name, image, touched)
+            return path.name, touched.size, black, float(np.abs(shifts.shift_px).max())
 
         found: list[tuple[str, int, int, float]] = []
         with ThreadPoolExecutor(max(1, min(current().threads, len(todo)))) as pool:
@@ -271,7 +268,9 @@ def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> PhotoBlo
             " and vertical datum.",
             path=name, lowest_m=low,
         )  # fmt: skip
-    if not any(_sees(photo, ground) for photo in photos):
+    scene = Scene(ground, surface, index_of(given.index, given.index_formula)[0])
+    coarse = ((photo, nodes_of(photo.lens, COARSE_STEP_PX)[0]) for photo in photos)
+    if not any(ground_seen(photo, scene, nodes)[2].any() for photo, nodes in coarse):
         raise GeometryError(
             "cameras.no_overlap",
             f"{given.dsm}: none of the {len(photos)} photographs sees it. Check its CRS and that of"
@@ -280,16 +279,7 @@ def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> PhotoBlo
         )
     gsd = float(np.median(sizes))
     step = given.spacing or max(LEAST_STEP_PX, int(np.ceil(ground.cell_m / gsd)))
-    scene = Scene(ground, surface, index_of(given.index, given.index_formula)[0])
     return PhotoBlock(tuple(paths), tuple(photos), scene, step, tuple(notes), crs, gsd, waters)
-
-
-def _sees(photo: Photo, ground: Ground) -> bool:
-    """Whether an image sees any of the ground."""
-    nodes, _ = nodes_of(photo.lens, COARSE_STEP_PX)
-    rays = unproject(photo.lens, nodes) @ photo.rotation
-    rays = rays[np.isfinite(rays).all(axis=1)]
-    return bool(np.isfinite(ground.hit(photo.centre, rays)).any())
 
 
 def read_heights(

@@ -12,7 +12,7 @@ land decides where there is some, and elsewhere many corners, each about its mea
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -112,18 +112,13 @@ def _coarse(one: tuple[FloatArray, Any], other: tuple[FloatArray, Any]) -> Any:
     return None if found is None or kept.sum() < LEAST_CORNERS else found
 
 
-class Registration(NamedTuple):
-    """The homographies from frames to the first, and the scatter of the corners.
+def register(places: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Register frames to the first by the pixels of corners, shape (f, k, 2); NaN where lost.
 
-    Homographies are in pixels, with the centre of the first pixel at (0, 0).
+    Returns the homographies to the first frame, shape (f, 3, 3), NaN where a frame has none, with
+    the centre of the first pixel at (0, 0); and the standard deviations of the corners along an
+    axis, shape (k,), pixels.
     """
-
-    homography: FloatArray  # (f, 3, 3), NaN where a frame has none
-    scatter_px: FloatArray  # (k,), standard deviation of each corner along an axis
-
-
-def register(places: FloatArray) -> Registration:
-    """Register frames to the first by the pixels of corners, shape (f, k, 2); NaN where lost."""
     cv2 = photo_library("cv2")
     found = np.isfinite(places[..., 0])
     often = found & (found.sum(axis=0) >= max(2, len(places) // 2))
@@ -147,7 +142,7 @@ def register(places: FloatArray) -> Registration:
                 way[:] = _fitted(there[known], mean[known], each[known])
     ways = np.linalg.inv(ways[0]) @ ways
     ways[0] = np.eye(3)  # to the last bit
-    return Registration(ways, scatter)
+    return ways, scatter
 
 
 def _moved(way: FloatArray, places: FloatArray) -> FloatArray:

@@ -146,7 +146,7 @@ def nodes_of(lens: Lens, step_px: int) -> tuple[FloatArray, tuple[int, int]]:
 def exact(photo: Photo, scene: Scene, step_px: int) -> Shifts:
     """Map by the true bed in `scene`: straight out through the lens, back as the light came."""
     nodes, shape = nodes_of(photo.lens, step_px)
-    xyz, depth, known = _ground_seen(photo, scene, nodes)
+    xyz, depth, known = ground_seen(photo, scene, nodes)
     shift = np.zeros((len(nodes), 2))
     wet = np.flatnonzero(depth > 0.0)
     path = trace(photo.centre, xyz[wet], scene.water, refractive_index=scene.refractive_index)
@@ -165,7 +165,7 @@ def paper(photo: Photo, scene: Scene, step_px: int) -> Shifts:
     repeated substitution.
     """
     nodes, shape = nodes_of(photo.lens, step_px)
-    xyz, depth, known = _ground_seen(photo, scene, nodes)
+    xyz, depth, known = ground_seen(photo, scene, nodes)
     shift = np.zeros((len(nodes), 2))
     wet = np.flatnonzero(depth > 0.0)
     share = depth[wet] / (photo.centre[2] - xyz[wet, 2])  # P_w of a straight path
@@ -187,7 +187,7 @@ def paper(photo: Photo, scene: Scene, step_px: int) -> Shifts:
     return forward._replace(shift_px=back)
 
 
-def _ground_seen(
+def ground_seen(
     photo: Photo, scene: Scene, nodes: FloatArray
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Return where straight rays meet the ground, its depth (0 on land), and whether they do."""
@@ -213,24 +213,17 @@ def hidden(ground: Ground, start: FloatArray, end: FloatArray) -> BoolArray:
     return found
 
 
-class Resampled(NamedTuple):
-    """An image without water, shape (rows, columns, bands), and the pixels that changed."""
-
-    image: npt.NDArray[Any]
-    touched: BoolArray
-    black_share: float
-
-
-def resample(image: npt.NDArray[Any], shifts: Shifts) -> Resampled:
+def resample(image: npt.NDArray[Any], shifts: Shifts) -> tuple[npt.NDArray[Any], BoolArray, int]:
     """Resample an image, shape (rows, columns, bands), by bicubic interpolation.
 
     Pixels without a shift are copied bit by bit; pixels whose source is not known become black.
+    Returns the image, the pixels that changed, shape (rows, columns), and how many are black.
     """
     cv2 = photo_library("cv2")
     rows, columns, bands = image.shape
     groups = [slice(k, min(k + CHANNELS_AT_ONCE, bands)) for k in range(0, bands, CHANNELS_AT_ONCE)]
     sources = [np.ascontiguousarray(image[..., some]) for some in groups]
-    out = np.empty_like(image)
+    out = image.copy()
     touched = np.empty((rows, columns), bool)
     black = 0
     for top in range(0, rows, STRIP_ROWS):
@@ -238,8 +231,6 @@ def resample(image: npt.NDArray[Any], shifts: Shifts) -> Resampled:
         shift, lost = _strip(shifts, top, bottom, columns)
         moved = (shift[..., 0] != 0.0) | (shift[..., 1] != 0.0)
         part = out[top:bottom]
-        if not moved.all():
-            part[...] = image[top:bottom]
         if moved.any():
             u = np.arange(columns, dtype=np.float32)[None, :] + shift[..., 0]
             v = np.arange(top, bottom, dtype=np.float32)[:, None] + shift[..., 1]
@@ -255,7 +246,7 @@ def resample(image: npt.NDArray[Any], shifts: Shifts) -> Resampled:
             part[lost] = 0
         touched[top:bottom] = moved | lost
         black += int(np.count_nonzero(lost))
-    return Resampled(out, touched, black / (rows * columns))
+    return out, touched, black
 
 
 def _strip(shifts: Shifts, top: int, bottom: int, columns: int) -> tuple[Any, BoolArray]:

@@ -69,8 +69,8 @@ def against_rendering(numbers, corrected):
         dry, place = seen(photo, relief, texture)
         for name, block in blocks:
             shifts = exact(photo, block.scene, block.step_px)
-            image = resample(wet[..., None], shifts).image[..., 0]
-            found = resample(wet_place[..., :2].astype(np.float32), shifts).image
+            image = resample(wet[..., None], shifts)[0][..., 0]
+            found = resample(wet_place[..., :2].astype(np.float32), shifts)[0]
             known = np.abs(found).min(axis=2) > 0.0
             off = np.hypot(*np.moveaxis(found - place[..., :2], 2, 0)) / block.gsd_m
             flow = np.hypot(*np.moveaxis(cv2.DISOpticalFlow_create(2).calc(image, dry, None), 2, 0))

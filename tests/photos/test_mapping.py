@@ -59,24 +59,24 @@ def displacement_px(one, other, every=6):
 
 def test_exact(scene, views):
     wet, _, dry, place = views
-    found = resample(wet[..., None], exact(photo(), scene, 4))
-    lost = found.touched & (found.image[..., 0] == 0)
+    image, touched, _ = resample(wet[..., None], exact(photo(), scene, 4))
+    lost = touched & (image[..., 0] == 0)
     before = np.hypot(*displacement_px(wet, dry).T)
-    after = np.hypot(*displacement_px(np.where(lost, dry, found.image[..., 0]), dry).T)
+    after = np.hypot(*displacement_px(np.where(lost, dry, image[..., 0]), dry).T)
     assert np.quantile(before, 0.95) > 3.0  # px: there is something to undo
     # px: 0.03 is what OpenCV's bicubic kernel moves ramps by; windows over hidden places go astray
     assert np.quantile(after, 0.5) < 0.04
     assert np.quantile(after, 0.95) < 0.1
     land = place[..., 2] > LEVEL_M + 0.1
     assert land.mean() > 0.1
-    assert (found.image[..., 0] == wet)[land & ~found.touched].all()
-    assert found.touched[land].mean() < 0.05
+    assert (image[..., 0] == wet)[land & ~touched].all()
+    assert touched[land].mean() < 0.05
 
 
 @pytest.mark.parametrize("step_px", [1, 4, 8])
 def test_exact_places(scene, views, step_px):
     _, seen, _, straight = views
-    mapped = resample(seen[..., :2].astype(np.float32), exact(photo(), scene, step_px)).image
+    mapped = resample(seen[..., :2].astype(np.float32), exact(photo(), scene, step_px))[0]
     known = (np.abs(mapped).max(axis=2) > 0.0)[10:-10, 10:-10]
     off = np.hypot(*(mapped - straight[..., :2])[10:-10, 10:-10][known].T) / GSD_M
     # px: the kernel again; 1 % is ground behind an edge
