@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from pcfix.model import Cameras, FloatArray, IntArray, Views, WaterPlane
+from pcfix.model import Cameras, FloatArray, Views, WaterPlane
 from pcfix.options.declare import taken
 from pcfix.options.scenes import SceneOptions
 from pcfix.simulate.block import fly_block, misplaced
@@ -108,50 +108,31 @@ def simulate_scene(
     chosen = taken(SceneOptions, options, keywords, "simulate_scene").part(SceneSettings)
     site = lay_out(chosen)
     truth = points_on(site.terrain, chosen.points, site.rng)
-    return scene_of(chosen, site, truth, observe_tracks, PAIRS_AT_ONCE, progress)
-
-
-class Part(NamedTuple):
-    """Some points of a cloud, and the images of each.
-
-    `camera` lists the images of all points in turn.
-    """
-
-    xyz: FloatArray  # (n, 3)
-    true_xyz: FloatArray  # (n, 3)
-    camera: IntArray  # (m,)
-    counts: IntArray  # (n,), images of each point
-    weight: Any = None  # (m,), of each image
+    parts = []
+    at_once = max(1, PAIRS_AT_ONCE // len(site.true))
+    for first in range(0, len(truth), at_once):
+        sight = see(truth[first : first + at_once], site, site.luck)
+        apparent = sight.intersected(site.observed(sight.ideal, site.rng))
+        parts.append((apparent, sight.camera, np.diff(sight.start)))
+        if progress is not None:
+            progress(min(first + at_once, len(truth)), len(truth))
+    xyz, camera, counts = (np.concatenate(one) for one in zip(*parts, strict=True))
+    return scene_of(chosen, site, xyz, truth, Views(starts(counts), camera))
 
 
 def scene_of(
-    chosen: SceneSettings,
-    site: Site,
-    truth: FloatArray,
-    observe: Callable[[FloatArray, Site], Part],
-    pairs_at_once: int,
-    progress: Callable[[int, int], None] | None = None,
+    chosen: SceneSettings, site: Site, xyz: FloatArray, truth: FloatArray, views: Views
 ) -> Scene:
-    """Return the scene of a site; `observe` reconstructs the cloud of some true points, (n, 3)."""
+    """Return the scene of a site, with a cloud and its true points, both of shape (n, 3)."""
     terrain, rng = site.terrain, site.rng
-    parts = list[Part]()
-    at_once = max(1, pairs_at_once // len(site.true))
-    for first in range(0, len(truth), at_once):
-        parts.append(observe(truth[first : first + at_once], site))
-        if progress is not None:
-            progress(min(first + at_once, len(truth)), len(truth))
     area_m2 = terrain.length_m * terrain.width_m
     lidar = points_on(terrain, round(area_m2 * chosen.lidar_per_m2), rng)
     lidar[:, 2] += rng.normal(0.0, chosen.lidar_noise_m, len(lidar))
     cameras = cameras_in_world(site.given)
-    columns: list[Any] = [
-        None if one[0] is None else np.concatenate(one) for one in zip(*parts, strict=True)
-    ]
-    whole = Part(*columns)
     return Scene(
-        apparent_xyz=whole.xyz + ORIGIN_M,
-        true_xyz=whole.true_xyz + ORIGIN_M,
-        views=Views(starts(whole.counts), whole.camera, whole.weight),
+        apparent_xyz=xyz + ORIGIN_M,
+        true_xyz=truth + ORIGIN_M,
+        views=views,
         cameras=cameras,
         yaw_pitch_roll_deg=site.given_angles,
         lidar_xyz=lidar + ORIGIN_M,
@@ -197,13 +178,6 @@ def points_on(terrain: Terrain, count: int, rng: np.random.Generator) -> FloatAr
     plan = rng.uniform(0.0, 1.0, (count, 2)) * [terrain.length_m, terrain.width_m]
     plan = plan[np.lexsort((plan[:, 0], np.floor(plan[:, 1])))]
     return np.column_stack([plan, terrain.height(*plan.T)])
-
-
-def observe_tracks(truth: FloatArray, site: Site) -> Part:
-    """Intersect each point from all images that show it."""
-    sight = see(truth, site, site.luck)
-    apparent = sight.intersected(site.observed(sight.ideal, site.rng))
-    return Part(apparent, truth, sight.camera, np.diff(sight.start))
 
 
 def cameras_in_world(cameras: Cameras) -> Cameras:

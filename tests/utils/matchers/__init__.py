@@ -7,7 +7,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from pcfix.simulate.scene import Part, Scene, lay_out, points_on, scene_of, simulate_scene
+from pcfix.model import Views
+from pcfix.simulate.scene import Scene, lay_out, points_on, scene_of, simulate_scene
 from pcfix.simulate.settings import SceneSettings
 from pcfix.simulate.sight import see, starts
 from pcfix.simulate.terrain import Terrain
@@ -39,7 +40,7 @@ def matched_scene(points: int, *, cloud: str = "tracks", **keywords) -> Scene:
     site, count = lay_out(chosen), NEIGHBOURS[cloud]
     truth = points_on(site.terrain, points, site.rng)
     rng, matching = map(np.random.default_rng, (0, [chosen.seed, 4]))
-    sure, pairs, counts = replace(site, detection=1.0), [], []
+    sure, parts, pairs = replace(site, detection=1.0), [], []
     if cloud == "pairs":
         sample = truth[:: max(1, len(truth) // SAMPLE)][:SAMPLE]
         table = neighbour_table(see(sample, sure, rng), count)
@@ -49,21 +50,22 @@ def matched_scene(points: int, *, cloud: str = "tracks", **keywords) -> Scene:
         partners = openmvs_partners(every.intersected(every.ideal), every, count, rng)
         table = partners.matched
 
-    def observe(some, site) -> Part:
+    at_once = max(1, PAIRS_AT_ONCE // len(site.true))
+    for some in np.split(truth, range(at_once, len(truth), at_once)):
         sight = see(some, site, site.luck)
         if cloud == "depth-maps":
             normals = normals_of(site.terrain, *some[:, :2].T)
-            return fuse_depth_maps(sight, normals, partners, matching)
-        part, of_part, count_of = match_pairs(sight, table, matching)
-        pairs.append(of_part)
-        counts.append(count_of)
-        return part
-
-    scene = vars(scene_of(chosen, site, truth, observe, PAIRS_AT_ONCE))
+            parts.append(fuse_depth_maps(sight, normals, partners, matching))
+        else:
+            part, *of_part = match_pairs(sight, table, matching)
+            parts.append(part)
+            pairs.append(of_part)
+    xyz, true, camera, counts, *weight = map(np.concatenate, zip(*parts, strict=True))
+    scene = vars(scene_of(chosen, site, xyz, true, Views(starts(counts), camera, *weight)))
     if cloud == "depth-maps":
         return MatchedScene(**scene, neighbours=table)
-    start = starts(np.concatenate(counts))
-    return MatchedScene(**scene, neighbours=table, pairs=np.concatenate(pairs), pairs_start=start)
+    pairs, counts = map(np.concatenate, zip(*pairs, strict=True))
+    return MatchedScene(**scene, neighbours=table, pairs=pairs, pairs_start=starts(counts))
 
 
 def normals_of(ground: Terrain, x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -32,7 +32,6 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.model import Cameras, FloatArray, IntArray, Lens
-from pcfix.simulate.scene import Part
 from pcfix.simulate.sight import Sight
 from pcfix.simulate.tracing import piercing_points_of_planes, project, rotations_of
 from tests.utils.bed_rays import bed_points
@@ -85,8 +84,8 @@ class Maps(NamedTuple):
 
 def fuse_depth_maps(
     sight: Sight, normals: FloatArray, partners: Partners, rng: np.random.Generator
-) -> Part:
-    """Return a fused point for each place of the bed.
+) -> tuple[np.ndarray, ...]:
+    """Return a fused point for each place of the bed, its truth, images, their number and weight.
 
     A place with fewer than three matching depth maps is not moved and has no cameras. `normals`,
     shape (n, 3), are unit normals of the true surface; `rng` makes noise and selects points.
@@ -109,7 +108,7 @@ def fuse_depth_maps(
     xyz = maps.points(rows, maps.averaged[rows])
     fused, true = (_means(v, weight, point, sight.truth) for v in (xyz, maps.shown[rows]))
     count = np.bincount(point, minlength=len(fused))
-    return Part(fused, true, sight.camera[rows], count, weight.astype(np.float32))
+    return fused, true, sight.camera[rows], count, weight.astype(np.float32)
 
 
 class _Matching:

@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.model import FloatArray, IntArray
-from pcfix.simulate.scene import Part
 from pcfix.simulate.sight import Sight, starts
 from pcfix.simulate.tracing import rotations_of, triangulate
 
@@ -152,7 +151,7 @@ def rows_of(sight: Sight) -> IntArray:
 
 def match_pairs(
     sight: Sight, table: IntArray, rng: np.random.Generator
-) -> tuple[Part, IntArray, IntArray]:
+) -> tuple[tuple[np.ndarray, ...], IntArray, IntArray]:
     """Return the medians of the pairs of each point, the pairs, (p, 2), and their numbers, (n,).
 
     A point without a pair stays where it is and has no cameras. `table`, shape (k, c), has the
@@ -186,4 +185,4 @@ def match_pairs(
     used[both] = True
     count = np.bincount(sight.point[used], minlength=len(truth))
     pairs = np.column_stack([sight.camera[one], sight.camera[other]])
-    return Part(xyz, truth, sight.camera[used], count), pairs, np.diff(start)
+    return (xyz, truth, sight.camera[used], count), pairs, np.diff(start)
