@@ -101,6 +101,7 @@ def plan_flight(
     0.0164
     """
     given = taken(PlanOptions, options, keywords, "plan_flight")
+    given = replace(given, index=index_of(given.index, given.index_formula)[0])
     check_summary(given)
     deepest = max(given.depth)
     # other flights, each with its changed option
@@ -138,8 +139,8 @@ def plan_flight(
     base_m, spacing_m = scene.base_and_spacing_m
     off_nadir = float(np.degrees(np.arctan(scene.optics.reach))) + (given.obliques or 0.0)
     plan = Plan(
-        given, lay_out(scene).true, scene.gsd_m, base_m, spacing_m, off_nadir,
-        scene.refractive_index, tuple(beds), tuple(tried),
+        given, lay_out(scene).true, scene.gsd_m, base_m, spacing_m, off_nadir, tuple(beds),
+        tuple(tried),
     )  # fmt: skip
     if given.plot is not None:
         write_plot(given, plan_figure(plan))
@@ -154,7 +155,7 @@ def _scene(given: PlanOptions, depth_m: float) -> SceneSettings:
         flying_height_m=given.height, forward_overlap=given.overlap, side_overlap=given.sidelap,
         obliques_deg=given.obliques, area_m=given.area, focal_mm=focal, sensor_mm=(width, height),
         sensor_px=(round(pixels), round(pixels * height / width)), image_noise=0.0, water=0.0,
-        index=index_of(given.index, given.index_formula)[0], bed="flat", greatest_depth_m=depth_m,
+        index=given.refractive_index, bed="flat", greatest_depth_m=depth_m,
     )  # fmt: skip
 
 
@@ -196,9 +197,7 @@ def _budget(given: PlanOptions, bed: _Bed, part: str = "") -> Correction:
 
 
 def _refraction(given: PlanOptions) -> RefractionOptions:
-    budget: dict[str, Any] = given.part(BudgetOptions).as_dict()
-    index = index_of(given.index, given.index_formula)[0]
-    return RefractionOptions(method="consistent", index=index, occlusion="off", **budget)
+    return replace(given.part(RefractionOptions), method="consistent", occlusion="off")
 
 
 def _rms(values: FloatArray) -> float:
@@ -299,7 +298,6 @@ class Plan:
     base_m: float  # between images
     spacing_m: float  # between strips
     flattest_deg: float  # largest incidence angle of the rays in the corners of the frames
-    index: float
     depths: tuple[DepthPlan, ...]
     alternatives: tuple[Alternative, ...]
 
@@ -338,7 +336,7 @@ def plan_text(plan: Plan) -> str:
         ]
         for one in plan.depths
     ]  # fmt: skip
-    title = f"Standard errors of the corrected bed in cm (refractive index {plan.index:g}):"
+    title = f"Standard errors of the corrected bed in cm (refractive index {given.index:g}):"
     table = ["", title, *Table(title, header, errors).lines()]
     rows = [
         ("poses", f"after 'pcfix adjust' with GNSS of {given.gnss_sigma:g} m and a calibrated"
