@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 
 from pcfix.errors import SettingError
-from pcfix.model import WaterPlane
+from pcfix.lens.imaging import unproject
+from pcfix.model import Lens, WaterPlane
 from pcfix.options.scenes import SceneOptions
-from pcfix.simulate.optics import Optics, make_optics
+from pcfix.simulate.optics import Optics
 from pcfix.simulate.terrain import BEDS
 from pcfix.water.index import index_of
 
 RIVER_TILT_PERCENT = 0.3
+MARGIN = 1.02
+"""Of the frame, in which a lens must not fold."""
 
 
 class SceneSettings(SceneOptions):
@@ -75,8 +79,26 @@ class SceneSettings(SceneOptions):
 
     @cached_property
     def optics(self) -> Optics:
-        """The camera's."""
-        return make_optics(self.focal_mm, self.sensor_mm, self.sensor_px, self.distortion)
+        """The camera's; a lens that folds the image inside the frame is refused."""
+        width, height = self.sensor_px
+        middle = np.array([width / 2.0, height / 2.0])
+        lens = Lens(self.focal_mm / self.sensor_mm[0] * width, width, height, *middle.tolist())
+        if not any(self.distortion):
+            return Optics(lens, float(np.hypot(*self.sensor_mm) / 2.0 / self.focal_mm))
+        lens = replace(lens, radial=self.distortion[:3], tangential=self.distortion[3:])
+        along = np.linspace(-1.0, 1.0, 41)
+        side = np.ones_like(along)
+        edges = [(along, side), (along, -side), (side, along), (-side, along)]
+        border = np.hstack(edges).T * middle
+        rays, wider = (unproject(lens, border * margin + middle) for margin in (1.0, MARGIN))
+        if not np.isfinite(wider).all():
+            raise SettingError(
+                "scene.distortion",
+                f"The distortion {', '.join(f'{v:g}' for v in self.distortion)} folds the image"
+                " inside the frame. Give smaller values.",
+                distortion=self.distortion,
+            )
+        return Optics(lens, float(np.hypot(*(rays[:, :2] / rays[:, 2:]).T).max()))
 
     @property
     def base_and_spacing_m(self) -> tuple[float, float]:

@@ -175,12 +175,6 @@ class Water:
     refractive_index: float
     waves: Waves | None = None
 
-    @property
-    def normal(self) -> FloatArray:
-        """Unit normal of the mean surface, up."""
-        up = np.array([-self.plane.b, -self.plane.c, 1.0])
-        return np.asarray(up / np.linalg.norm(up))
-
     def piercing_points(
         self, points: FloatArray, centres: FloatArray, camera: IntArray
     ) -> FloatArray:
@@ -197,16 +191,18 @@ class Water:
         """
         shape = points.shape
         anchor = np.array([0.0, 0.0, self.plane.a])
-        anchors, normals = np.broadcast_to(anchor, shape), np.broadcast_to(self.normal, shape)
+        up = np.array([-self.plane.b, -self.plane.c, 1.0])  # normal of the mean surface
+        up /= np.linalg.norm(up)
+        anchors, normals = np.broadcast_to(anchor, shape), np.broadcast_to(up, shape)
         if self.waves is None:
             return anchors, normals
         at = piercing_points_of_planes(points, centres, anchors, normals, self.refractive_index)
-        wet = (points - anchor) @ self.normal < 0.0
+        wet = (points - anchor) @ up < 0.0
         east = np.array([1.0, 0.0, self.plane.b])
         east /= np.linalg.norm(east)
-        north = np.cross(self.normal, east)
+        north = np.cross(up, east)
         places = (at - anchor) @ np.column_stack([east, north])
         slopes = self.waves.slopes(camera, places)
-        rough = self.normal - slopes[:, :1] * east - slopes[:, 1:] * north
+        rough = up - slopes[:, :1] * east - slopes[:, 1:] * north
         rough /= np.linalg.norm(rough, axis=1)[:, None]
         return np.where(wet[:, None], at, anchors), np.where(wet[:, None], rough, normals)

@@ -3,15 +3,14 @@
 import numpy as np
 import pytest
 
-from pcfix.simulate.optics import make_optics
+from pcfix.simulate.settings import SceneSettings
 from tests.utils.twins import image_slowly
 
-CAMERA = (8.8, (13.2, 8.8), (5472, 3648))
 REAL = (-0.08, 0.03, -0.006, 0.0007, -0.0005)
 
 
 def test_brown():
-    optics = make_optics(*CAMERA, REAL)
+    optics = SceneSettings(distortion=REAL).optics
     rng = np.random.default_rng(0)
     ideal = rng.uniform(0, 1, (200, 2)) * [5472, 3648]
     image = optics.to_image(ideal)
@@ -24,7 +23,7 @@ def test_brown():
 
 
 def test_frame():
-    optics = make_optics(*CAMERA, REAL)
+    optics = SceneSettings(distortion=REAL).optics
     assert optics.frames(np.array([[0.0, 0.0], [5471.0, 3647.0]])).all()
     far = np.array([[2736.0 + 9 * 3648.0, 1824.0]])  # nine focal lengths aside
     assert not optics.frames(optics.to_image(far)).any()
