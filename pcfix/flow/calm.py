@@ -26,13 +26,13 @@ from pcfix.io.rasters import new_raster, write_part
 from pcfix.model import FloatArray, Lens, WaterRaster
 from pcfix.options.declare import File, taken
 from pcfix.options.photos import CalmOptions
-from pcfix.photos.calm import LEAST_CORNERS, Follower, covered, laid, median_of, register
+from pcfix.photos.calm import LEAST_CORNERS, corners_in, covered, laid, median_of, register
 from pcfix.photos.mapping import Photo
 from pcfix.photos.waves import (
-    Displacements,
     Nodes,
     Slopes,
     View,
+    displacements,
     fit_waves,
     nodes_of,
     slopes_of,
@@ -136,8 +136,7 @@ def calm_frames(
         if view is not None:
             interval = given.interval * given.every if given.interval else found.interval_s
             nodes = nodes_of(view, given.resolution)
-            measure = Displacements(median, view, nodes)
-            measured = [measure.of(frame) for frame in count(stack)]
+            measured = displacements(median, view, nodes, count(stack))
             shifts, weights = (np.stack(one) for one in zip(*measured, strict=True))
             weights[:, still(shifts, weights)] = 0.0
             waters, water = _water(view, nodes, shifts, weights, interval, str(folder))
@@ -175,12 +174,7 @@ def _registered(
     """Register all frames to the first as `register`, unless the camera stood still."""
     if still:
         return np.tile(np.eye(3), (len(frames.names), 1, 1)), np.empty(0)
-    follower: Follower | None = None
-    places: list[FloatArray] = []
-    for frame in images:
-        follower = follower or Follower(frame)
-        places.append(follower.follow(frame) if places else follower.full(follower.at))
-    ways, scatter = register(np.stack(places))
+    ways, scatter = register(np.stack(list(corners_in(images))))
     lost = np.flatnonzero(~np.isfinite(ways).all(axis=(1, 2)))
     if len(lost):
         names = [frames.names[row] for row in lost]

@@ -12,6 +12,7 @@ land decides where there is some, and elsewhere many corners, each about its mea
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -52,40 +53,34 @@ def grey8(image: npt.NDArray[Any], longest_px: int | None = None) -> npt.NDArray
     return np.asarray(np.clip(np.rint(grey), 0, 255).astype(np.uint8))
 
 
-class Follower:
-    """Track the corners of a first frame, shape (rows, columns, bands), in other frames."""
+def corners_in(frames: Iterable[npt.NDArray[Any]]) -> Iterator[FloatArray]:
+    """Yield the corners of the first frame in each frame, shape (k, 2), pixels; NaN where lost.
 
-    def __init__(self, first: npt.NDArray[Any]) -> None:
-        cv2 = photo_library("cv2")
-        self._grey = grey8(first, FOLLOWED_PX)
-        self._scale = first.shape[1] / self._grey.shape[1]
-        apart = max(self._grey.shape) / 80.0
-        found = cv2.goodFeaturesToTrack(self._grey, CORNERS, 0.01, apart)
-        self.at = np.empty((0, 2)) if found is None else found[:, 0].astype(np.float64)
-        self._features = _features(self._grey)
-
-    def follow(self, frame: npt.NDArray[Any]) -> FloatArray:
-        """Return the corners in another frame, in its pixels, shape (k, 2); NaN where lost."""
-        cv2 = photo_library("cv2")
-        lost = np.full(self.at.shape, np.nan)
+    Frames have the shape (rows, columns, bands); the centre of the first pixel is (0, 0).
+    """
+    cv2 = photo_library("cv2")
+    how: dict[str, Any] = {
+        "winSize": (21, 21), "maxLevel": 2, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
+    }  # fmt: skip
+    others = iter(frames)
+    whole = next(others)
+    first = grey8(whole, FOLLOWED_PX)
+    scale, features = whole.shape[1] / first.shape[1], _features(first)
+    found = cv2.goodFeaturesToTrack(first, CORNERS, 0.01, max(first.shape) / 80.0)
+    start = np.empty((0, 1, 2), np.float32) if found is None else found
+    yield (start[:, 0].astype(np.float64) + 0.5) * scale - 0.5  # pixels of the whole image
+    for frame in others:
         grey = grey8(frame, FOLLOWED_PX)
-        coarse = _coarse(self._features, _features(grey))
-        if coarse is None or len(self.at) < LEAST_CORNERS:
-            return lost
-        start = self.at.astype(np.float32)[:, None]
+        coarse = _coarse(features, _features(grey))
+        if coarse is None or len(start) < LEAST_CORNERS:
+            yield np.full((len(start), 2), np.nan)
+            continue
         guess = cv2.perspectiveTransform(start, coarse)
-        how: dict[str, Any] = {
-            "winSize": (21, 21), "maxLevel": 2, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
-        }  # fmt: skip
-        there, found, _ = cv2.calcOpticalFlowPyrLK(self._grey, grey, start, guess, **how)
-        back, again, _ = cv2.calcOpticalFlowPyrLK(grey, self._grey, there, start.copy(), **how)
+        there, found, _ = cv2.calcOpticalFlowPyrLK(first, grey, start, guess, **how)
+        back, again, _ = cv2.calcOpticalFlowPyrLK(grey, first, there, start.copy(), **how)
         back[(found & again).ravel() == 0] = np.inf
-        away = np.hypot(*(back - start)[:, 0].T)
-        return np.where((away < RETURN_PX)[:, None], self.full(there[:, 0]), lost)
-
-    def full(self, places: FloatArray) -> FloatArray:
-        """Convert pixels of the reduced image to those of the whole one; centres are integers."""
-        return np.asarray((places + 0.5) * self._scale - 0.5, np.float64)
+        returned = np.hypot(*(back - start)[:, 0].T) < RETURN_PX
+        yield np.where(returned[:, None], (there[:, 0] + 0.5) * scale - 0.5, np.nan)
 
 
 def _features(grey: Any) -> tuple[FloatArray, Any]:

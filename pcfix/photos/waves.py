@@ -35,7 +35,7 @@ and, without land, the part of the waves that looks like a movement of the camer
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -143,34 +143,34 @@ def _pixels(view: View, xyz: FloatArray) -> FloatArray:
     return project(view.photo.lens, (xyz - view.photo.centre) @ view.photo.rotation.T)
 
 
-class Displacements:
-    """Measure the displacement of the bed in each frame from the median image, at the nodes."""
+def displacements(
+    median: npt.NDArray[Any], view: View, nodes: Nodes, frames: Iterable[npt.NDArray[Any]]
+) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Yield the displacement of the bed in each frame from the median image, at the nodes.
 
-    def __init__(self, median: npt.NDArray[Any], view: View, nodes: Nodes) -> None:
-        cv2 = photo_library("cv2")
-        self._median, self._seen = grey8(median), nodes.seen
-        texture = cv2.cornerMinEigenVal(self._median, 7).astype(np.float64)
-        weight = texture / (texture + np.median(texture[texture > 0.0]) + 1e-30)
-        self._weight = weight.astype(np.float32)
-        centre = np.append(nodes.xy[len(nodes.xy) // 2], view.level_m)
-        ends = centre + np.array([[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0]]) * nodes.lattice.resolution_m
-        side = int(np.hypot(*np.diff(_pixels(view, ends), axis=0)[0]))
-        self._side = (side | 1, side | 1)
-        self._flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-        self._flow.setFinestScale(0)  # waves are short, and patches of 8 px smooth enough
-        self._base = cv2.blur(self._weight, self._side)
-        level = np.full(len(nodes.xy), view.level_m)
-        self._at = (_pixels(view, np.column_stack([nodes.xy, level])) - 0.5).astype(np.float32)
-
-    def of(self, frame: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:
-        """Return displacements, shape (n, 2), pixels, and weights, shape (n,), at the level."""
-        cv2 = photo_library("cv2")
-        flow = self._flow.calc(grey8(frame), self._median, None)
-        mean = cv2.blur(flow * self._weight[..., None], self._side) / (self._base[..., None] + 1e-9)
-        at = self._at
+    Displacements, shape (n, 2), are in pixels, and come with their weights, shape (n,).
+    """
+    cv2 = photo_library("cv2")
+    calm = grey8(median)
+    texture = cv2.cornerMinEigenVal(calm, 7).astype(np.float64)
+    weight = texture / (texture + np.median(texture[texture > 0.0]) + 1e-30)
+    weight = weight.astype(np.float32)
+    level = np.full(len(nodes.xy), view.level_m)
+    at = (_pixels(view, np.column_stack([nodes.xy, level])) - 0.5).astype(np.float32)
+    # means over a cell, as seen in the middle of the raster
+    centre = np.append(nodes.xy[len(nodes.xy) // 2], view.level_m)
+    ends = centre + np.array([[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0]]) * nodes.lattice.resolution_m
+    side = int(np.hypot(*np.diff(_pixels(view, ends), axis=0)[0])) | 1
+    base = cv2.blur(weight, (side, side))
+    weight_at = cv2.remap(base, at[:, :1], at[:, 1:], cv2.INTER_LINEAR)[:, 0]
+    weight_at = np.where(nodes.seen, weight_at, 0.0).astype(np.float64)
+    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    flow.setFinestScale(0)  # waves are short, and patches of 8 px smooth enough
+    for frame in frames:
+        moved = flow.calc(grey8(frame), calm, None)
+        mean = cv2.blur(moved * weight[..., None], (side, side)) / (base[..., None] + 1e-9)
         shift = cv2.remap(mean, at[:, :1], at[:, 1:], cv2.INTER_LINEAR)[:, 0]
-        weight = cv2.remap(self._base, at[:, :1], at[:, 1:], cv2.INTER_LINEAR)[:, 0]
-        return shift.astype(np.float64), np.where(self._seen, weight, 0.0).astype(np.float64)
+        yield shift.astype(np.float64), weight_at
 
 
 def slopes_of(view: View, xy: FloatArray, height_m: FloatArray, shift_px: FloatArray) -> FloatArray:
