@@ -121,7 +121,6 @@ def rebuild_rounds(
         shutil.rmtree(folders.pop())
     record = open_record(target / RECORD, given, COMMAND_ONLY, folders)
     record.setdefault("rounds", [])
-    finished = sum("mean_m" in one for one in record["rounds"])
     start = str(given.dsm) if Path(given.dsm).suffix.lower() in CLOUDS else None
     if start is not None:  # a cloud is gridded to the folder
         raster = target / "dsm.tif"
@@ -132,7 +131,7 @@ def rebuild_rounds(
     with threads(given.jobs), TemporaryDirectory() as scratch:
         block = block_of(given, paths, Path(scratch))
     threshold_m = round(given.until_gsd * block.gsd_m, 5)
-    rounds: list[Round] = []
+    rounds, done_before = list[Round](), 0
     notes: list[PcfixWarning] = []
     while len(rounds) < given.most_rounds and not (rounds and abs(rounds[-1].mean_m) < threshold_m):
         number = len(rounds) + 1
@@ -143,8 +142,8 @@ def rebuild_rounds(
         has_cloud = cloud.exists() and noted.get("state") == file_state(cloud)
         if has_cloud and "mean_m" in noted and dsm.exists():
             one = Round(**{name: noted[name] for name in Round.__dataclass_fields__})
+            done_before += 1
         else:
-            finished = min(finished, number - 1)
             with warnings.catch_warnings():
                 if number > 1:  # the DSM is pcfix's own
                     warnings.filterwarnings("ignore", ".*does not state whether", PcfixWarning)
@@ -177,7 +176,7 @@ def rebuild_rounds(
             notes.append(PcfixWarning("photos.paper_limit", words, excess=excess))
             warnings.warn(notes[-1], stacklevel=2)
     summary = RebuildSummary(
-        rounds=tuple(rounds), done_before=min(finished, len(rounds)),
+        rounds=tuple(rounds), done_before=done_before,
         settled=abs(rounds[-1].mean_m) < threshold_m, gsd_m=round(block.gsd_m, 5),
         threshold_m=threshold_m, seconds=round(time.perf_counter() - started, 3),
         mapping=given.mapping, rebuild=str(given.rebuild),

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pcfix.model import Cameras, FloatArray, IntArray
-from pcfix.simulate.optics import Optics
+from pcfix.simulate.settings import Optics
 from pcfix.simulate.terrain import Terrain
 from pcfix.simulate.tracing import Water, project, rotations_of, triangulate
 

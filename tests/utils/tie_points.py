@@ -1,6 +1,6 @@
 """A block of images as it goes into a bundle adjustment: tie points, GNSS and control, with truth.
 
-The light is traced by `pcfix.simulate.tracing`, the lens is that of `pcfix.simulate.optics`:
+The light is traced by `pcfix.simulate.tracing`, the lens is that of `pcfix.simulate.settings`:
 nothing here is shared with the adjustment. Everything measured is there twice, exact and with
 noise, and `TieScene.measured` draws the noise anew.
 """
