@@ -22,7 +22,7 @@ from pcfix.io.las.columns import SHIFTS
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.lens.imaging import unproject
 from pcfix.libraries import load_open3d
-from pcfix.model import Cameras, FloatArray, IntArray, WaterDimension, WaterSurface
+from pcfix.model import Cameras, FloatArray, WaterDimension, WaterSurface
 from pcfix.options.declare import File, taken
 from pcfix.options.steps import CompareRules, ViewerOptions
 from pcfix.refract.tally import COVERAGE_95
@@ -116,12 +116,11 @@ def view_clouds(
     if given.cameras is not None:
         inputs = replace(given, water=0.0 if given.water is None else given.water).part(Inputs)
         lines = _frusta(inputs.block(first.crs)[0], float(high[2]))
-    water, triangles = _sheet(surface, low, high)
     ends = np.vstack([low, high, lines.reshape(-1, 3)])
     origin = (ends.min(axis=0) + ends.max(axis=0)) / 2.0
     scene = Scene3d(
         [one.name for one in layers], [one.xyz - origin for one in layers], rgb,
-        lines - origin, water - origin, triangles,
+        lines - origin, _sheet(surface, low, high) - origin,
     )  # fmt: skip
     if given.image is None:
         show(scene, f"pcfix view: {given.colour}")
@@ -204,29 +203,26 @@ def _frusta(cameras: Cameras, ground_m: float) -> FloatArray:
     return np.asarray(found[np.isfinite(found).all(axis=(1, 2))])
 
 
-def _sheet(
-    surface: WaterSurface | None, low: FloatArray, high: FloatArray
-) -> tuple[FloatArray, IntArray]:
-    """Return the water over the clouds as a mesh; a dimension has no surface beside its points."""
+def _sheet(surface: WaterSurface | None, low: FloatArray, high: FloatArray) -> FloatArray:
+    """Return the water over the clouds as triangles, shape (m, 3, 3).
+
+    A dimension has no surface between its points.
+    """
     if surface is None or isinstance(surface, WaterDimension):
-        return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+        return np.zeros((0, 3, 3))
     sides = [np.linspace(low[axis], high[axis], WATER_CELLS + 1) for axis in (0, 1)]
-    x, y = (side.ravel() for side in np.meshgrid(*sides))
-    xyz = np.column_stack([x, y, np.zeros(len(x))])
-    xyz[:, 2] = surface_above(surface, xyz).height_m
-    at = np.arange(len(x)).reshape(WATER_CELLS + 1, -1)
-    a, b, c, d = at[:-1, :-1], at[:-1, 1:], at[1:, 1:], at[1:, :-1]
-    triangles = np.stack([[a, b, c], [a, c, d]]).transpose(0, 2, 3, 1).reshape(-1, 3)
-    known = np.isfinite(xyz[:, 2])
-    xyz = np.where(known[:, None], xyz, (low + high) / 2.0)
-    return xyz, triangles[known[triangles].all(axis=1)]
+    xyz = np.dstack([*np.meshgrid(*sides), np.zeros((WATER_CELLS + 1, WATER_CELLS + 1))])
+    xyz[..., 2] = surface_above(surface, xyz.reshape(-1, 3)).height_m.reshape(xyz.shape[:2])
+    a, b, c, d = xyz[:-1, :-1], xyz[:-1, 1:], xyz[1:, 1:], xyz[1:, :-1]
+    triangles = np.moveaxis(np.stack([[a, b, c], [a, c, d]]), 1, 3).reshape(-1, 3, 3)
+    return np.asarray(triangles[np.isfinite(triangles).all(axis=(1, 2))])
 
 
 @dataclass(frozen=True, eq=False)
 class Scene3d:
     """Named clouds with their colours, frusta of cameras, and the water, metres from an origin.
 
-    `lines` has the shape (m, 2, 3); `triangles` are rows of `water`.
+    `lines` has the shape (k, 2, 3), and the triangles of `water` (m, 3, 3).
     """
 
     names: list[str]
@@ -234,7 +230,6 @@ class Scene3d:
     rgb: list[FloatArray]
     lines: FloatArray
     water: FloatArray
-    triangles: IntArray
 
 
 def scale_of(what: str, values: FloatArray) -> ScalarMappable:
@@ -284,9 +279,9 @@ def show(scene: Scene3d, title: str) -> None:
         lines = o3d.geometry.LineSet(points(scene.lines.reshape(-1, 3)), pairs)
         lines.paint_uniform_color(CAMERA_COLOUR)
         add("cameras", lines, "unlitLine", line_width=1.0)
-    if len(scene.triangles):
-        triangles = o3d.utility.Vector3iVector(scene.triangles)
-        mesh = o3d.geometry.TriangleMesh(points(scene.water), triangles)
+    if len(scene.water):
+        rows = o3d.utility.Vector3iVector(np.arange(3 * len(scene.water)).reshape(-1, 3))
+        mesh = o3d.geometry.TriangleMesh(points(scene.water.reshape(-1, 3)), rows)
         mesh.compute_vertex_normals()  # without them, and with other shaders, open3d 0.20 crashes
         add("water", mesh, "defaultLitTransparency", base_color=WATER_COLOUR)
     o3d.visualization.draw(things, title=title, show_ui=True, bg_color=(1.0, 1.0, 1.0, 1.0))
@@ -304,9 +299,10 @@ def view_figure(scene: Scene3d, scale: ScalarMappable, what: str) -> Figure:
         panel.scatter(*xyz[::step].T, c=rgb[::step], s=1, depthshade=False)
         for line in scene.lines:
             panel.plot(*line.T, color=CAMERA_COLOUR, linewidth=0.5)
-        if len(scene.triangles):
-            x, y, z = scene.water.T
-            panel.plot_trisurf(x, y, scene.triangles, z, color=WATER_COLOUR, linewidth=0)
+        if len(scene.water):
+            x, y, z = scene.water.reshape(-1, 3).T
+            rows = np.arange(len(x)).reshape(-1, 3)
+            panel.plot_trisurf(x, y, rows, z, color=WATER_COLOUR, linewidth=0)
         panel.view_init(ELEVATION_DEG, AZIMUTH_DEG)
         panel.set_aspect("equal")
         panel.set(xlabel="East (m)", ylabel="North (m)", zlabel="Height (m)")

@@ -36,8 +36,8 @@ def test_scene(folder, tmp_path, monkeypatch):
     before, after, _ = scene.xyz
     grey = (scene.rgb[1] == GREY).all(axis=1)
     assert np.abs(before[grey] - after[grey]).max() < 1e-6
-    level = scene.water[0, 2]
-    assert np.ptp(scene.water[:, 2]) == 0.0
+    level = scene.water[0, 0, 2]
+    assert np.ptp(scene.water[..., 2]) == 0.0
     assert (grey == (after[:, 2] >= level - 1e-3)).mean() > 0.999
     cameras = pcfix.read_cameras(folder / "cameras.csv")
     assert len(scene.lines) == 8 * len(cameras)
