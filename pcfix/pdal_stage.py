@@ -261,8 +261,7 @@ def _chunks(cloud: PdalCloud, water: WaterSurface | None) -> Iterator[tuple[slic
         sources = ins["PointSourceId"][rows] if "PointSourceId" in ins else None
         has_colours = all(name in ins for name in COLOURS)
         rgb = np.column_stack([ins[name][rows] for name in COLOURS]) if has_colours else None
-        returns = ins["NumberOfReturns"][rows] if "NumberOfReturns" in ins else None
-        yield rows, Points(xyz, heights, cloud.classes[rows], sources, rgb, returns)
+        yield rows, Points(xyz, heights, cloud.classes[rows], sources, rgb)
 
 
 def _view(cloud: PdalCloud) -> CloudView:

@@ -47,7 +47,6 @@ class Points(NamedTuple):
     classes: npt.NDArray[np.uint8]  # (n,)
     sources: IntArray | None = None  # (n,), point source IDs
     rgb: npt.NDArray[Any] | None = None  # (n, 3)
-    returns: npt.NDArray[Any] | None = None  # (n,), number of returns
     original_xyz: FloatArray | None = None  # (n, 3), before the transfer to adjusted cameras
 
     def take(self, rows: IntArray | slice) -> Points:
@@ -158,7 +157,6 @@ def points_of(chunk: Chunk, source: LasSource, water: WaterSurface | None) -> Po
         np.asarray(chunk["classification"]),
         np.asarray(chunk["point_source_id"]),
         np.column_stack([chunk.array[one] for one in RGB]) if has_colours else None,
-        np.asarray(chunk["number_of_returns"]),
     )
 
 
@@ -298,7 +296,7 @@ def _found(view: CloudView | None) -> FoundSurface:
         fit = fit_water(thinned)
         note = f"The surface is fitted to the {len(water):,} points that are classified as water."
         return FoundSurface(fit.surface, fit, thinned, (note, *fit.notes))
-    proposal = find_water(whole.xyz, whole.rgb, whole.returns)
+    proposal = find_water(whole.xyz, whole.rgb)
     return FoundSurface(proposal.surface, proposal, proposal.shoreline)
 
 

@@ -1,176 +1,34 @@
-"""Find the water surface in the cloud itself."""
+"""Find the water surface in the cloud itself: the level, or plane, that the cues agree on best."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import GeometryError
-from pcfix.model import FloatArray, WaterPlane
-from pcfix.water import search
-from pcfix.water.cues import SLOPE, Samples, gain_of, layer_gain, sample_cloud
-from pcfix.water.search import INSTEAD, LAYER, Peak, Scan, Tilted, find_tilt, judge
+from pcfix.model import BoolArray, FloatArray, WaterPlane
+from pcfix.water.cues import (
+    BLUE,
+    RED,
+    SLOPE,
+    Cue,
+    Moments,
+    Samples,
+    cue_moments,
+    gain_of,
+    sample_cloud,
+)
 
 LEAST_POINTS = 2_000
 LEAST_RELIEF_M = 0.3
 LEAST_SIGMA_M = 0.015
 """Least standard error of a waterline, from waves and the thickness of the cloud."""
-TILT_SIGMAS, TILT_GAIN = 3.0, 6.0
 MOST_SHORELINE = 2_000
-
-
-def find_water(
-    xyz: FloatArray, rgb: npt.NDArray[Any] | None = None, returns: npt.NDArray[Any] | None = None
-) -> WaterProposal:
-    """Find the water surface of a cloud.
-
-    It is the height below which the ground gets flatter, as refraction lifts the bed, or colour
-    fades with depth, or at which points float in a thin layer. Square tiles are summed separately,
-    and resampling them gives the standard error.
-
-    Parameters
-    ----------
-    xyz : array, shape (n, 3)
-        Apparent points without noise, metres, world frame.
-    rgb : array, shape (n, 3), optional
-        In any unit from zero up. Equal colours count as none.
-    returns : array, shape (n,), optional
-        Number of returns. If pulses have several, only points of these may float.
-    """
-    known = np.isfinite(xyz).all(axis=1)
-    if known.sum() < LEAST_POINTS:
-        raise GeometryError(
-            "cloud.too_few_points",
-            f"{known.sum()} points are too few to find the water, {LEAST_POINTS} are needed."
-            f" {INSTEAD}",
-            points=int(known.sum()), least=LEAST_POINTS,
-        )  # fmt: skip
-    columns = (None if column is None else column[known] for column in (rgb, returns))
-    return _from_cues(_scanned(sample_cloud(xyz[known], *columns)))
-
-
-DIFFERENT_M, DIFFERENT_SIGMAS = 0.5, 3.0
-"""A level is only reported as another one if it differs by more than both."""
-LEAST_AGAINST, SURE_AGAINST = 100.0, 0.8
-"""Evidence of colours only, or confidence of slope and colours together, that contradicts a given
-level. They are higher than for `find_water`, to avoid false alarms."""
-
-
-def find_elsewhere(
-    xyz: FloatArray, water_m: FloatArray, rgb: npt.NDArray[Any] | None
-) -> tuple[WaterProposal | None, Tilted | None]:
-    """Return water that a cloud shows elsewhere than the given water surface.
-
-    Parameters
-    ----------
-    xyz : array, shape (n, 3)
-        Apparent points, metres, world frame.
-    water_m : array, shape (n,)
-        Height of the given water surface above each.
-    rgb : array, shape (n, 3), or None
-
-    Returns
-    -------
-    level : WaterProposal or None
-        With heights above the given surface; None if the cloud shows it there, or nothing. The full
-        search of `find_water` runs only if another height gains most.
-    tilted : Tilted or None
-    """
-    samples = sample_cloud(np.column_stack([xyz[:, :2], xyz[:, 2] - water_m]), rgb, None)
-    try:
-        coarse = _scanned(samples)
-    except GeometryError:  # flat ground shows nothing
-        return None, None
-    tilted, gain = find_tilt(coarse), search.gains(coarse, search.NO_TILT)
-    here = gain[np.abs(coarse.heights_m + samples.origin[2]) <= DIFFERENT_M].max(initial=0.0)
-    if gain.max() < search.LEAST_AGREED or here > search.MOST_RIVAL_AGREED * gain.max():
-        return None, tilted
-    try:
-        found = _from_cues(coarse)
-    except GeometryError:
-        return None, tilted
-    differs = abs(found.level_m) > max(DIFFERENT_M, DIFFERENT_SIGMAS * found.sigma_level_m)
-    sure = found.evidence["total gain"] >= LEAST_AGAINST or (
-        found.confidence >= SURE_AGAINST and f"{SLOPE.name} amplitude" in found.evidence
-    )
-    return found if differs and sure else None, tilted
-
-
-def _scanned(samples: Samples) -> Scan:
-    """Return the sums of the cues at all heights; GeometryError ``cloud.flat`` without relief."""
-    low, high = np.percentile(samples.smooth_m, [0.5, 99.5])
-    if high - low < LEAST_RELIEF_M:
-        raise GeometryError(
-            "cloud.flat",
-            f"The ground has {high - low:.2f} m of relief, {LEAST_RELIEF_M:g} m are needed to find"
-            f" the water. {INSTEAD}",
-            relief_m=float(high - low), least=LEAST_RELIEF_M,
-        )  # fmt: skip
-    count = int(np.clip((high - low) / search.COARSE_M, 8, search.MOST_HEIGHTS))
-    return search.scan_at(samples, np.linspace(low, high, count), search.NO_TILT)
-
-
-def _from_cues(coarse: Scan) -> WaterProposal:
-    samples = coarse.samples
-    peak, near, sigma_m, sigma_tilt = _choose(samples, coarse)
-    confidence, evidence, reasons = judge(peak, near, coarse, sigma_m)
-    shore = samples.xyz[search.near_surface(samples, peak)]
-    if len(shore) == 0:
-        text = f"No water surface was found: no ground crosses the best candidate. {INSTEAD}"
-        raise GeometryError("water.not_found", text, reason="no_shoreline")
-    shore = shore[:: math.ceil(len(shore) / MOST_SHORELINE)]
-    centre = shore[:, :2].mean(axis=0)
-    level = peak.level_m + float(centre @ peak.tilt) + float(samples.origin[2])
-    x, y = centre + samples.origin[:2]
-    gain = {sums.cue.name: gain_of(sums.shifted(peak.tilt)).gain for sums in coarse.cues}
-    gain[LAYER] = layer_gain(samples, coarse.heights_m, peak.tilt)
-    b, c = peak.tilt.tolist()
-    return WaterProposal(
-        surface=WaterPlane(level - (b * float(x) + c * float(y)), b, c),
-        sigma_level_m=sigma_m,
-        centre_xy=np.array([x, y]),
-        level_m=level,
-        tilt=peak.tilt,
-        sigma_tilt=sigma_tilt,
-        confidence=confidence,
-        evidence=evidence,
-        reasons=reasons,
-        shoreline=shore + samples.origin,
-        curve_height_m=coarse.heights_m + float(samples.origin[2] + centre @ peak.tilt),
-        curves=gain,
-        ground=samples.xyz + samples.origin,
-    )
-
-
-def _choose(samples: Samples, coarse: Scan) -> tuple[Peak, Scan, float, float]:
-    """Return the level, or the plane if its tilt is significant and gains enough.
-
-    Then follow the sums near it, and the standard errors of its level, and of its tilt along the
-    shore, NaN for a level.
-    """
-    start = search.best(coarse, search.NO_TILT[None])
-    level, near = search.refine(samples, start, None)
-    axis, step = search.axis_of(samples, level), search.tilt_step(samples)
-    steps = math.ceil(search.LARGEST_TILT / step)
-    tilted = search.best(coarse, search.tilts_along(axis, step, steps))
-    if tilted.score > start.score:
-        plane, near_plane = search.refine(samples, tilted, axis)
-        along = abs(float(plane.tilt @ axis))
-        if plane.score > level.score + TILT_GAIN and along <= search.LARGEST_TILT:
-            levels, tilts = search.drawn(near_plane, axis, step)
-            # the median absolute deviation, and the rounding to steps of tilt
-            sigma_tilt = math.hypot(1.4826 * float(np.median(np.abs(tilts))), step / 6.0)
-            if along > TILT_SIGMAS * sigma_tilt:
-                return plane, near_plane, _sigma(levels), sigma_tilt
-    return level, near, _sigma(search.drawn(near, None, step)[0]), math.nan
-
-
-def _sigma(levels_m: FloatArray) -> float:
-    return math.hypot(float(np.sqrt(np.mean(levels_m**2))), LEAST_SIGMA_M)
+INSTEAD = "Give the water surface: a level, shoreline points, plane:a,b,c or a mesh."
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,3 +67,365 @@ class WaterProposal:
             "evidence": self.evidence,
             "notes": list(self.reasons),
         }
+
+
+def find_water(xyz: FloatArray, rgb: npt.NDArray[Any] | None = None) -> WaterProposal:
+    """Find the water surface of a cloud.
+
+    It is the height below which the ground gets flatter, as refraction lifts the bed, or colour
+    fades with depth. Square tiles are summed separately, and resampling them gives the standard
+    error.
+
+    Parameters
+    ----------
+    xyz : array, shape (n, 3)
+        Apparent points without noise, metres, world frame.
+    rgb : array, shape (n, 3), optional
+        In any unit from zero up. Equal colours count as none.
+    """
+    known = np.isfinite(xyz).all(axis=1)
+    if known.sum() < LEAST_POINTS:
+        raise GeometryError(
+            "cloud.too_few_points",
+            f"{known.sum()} points are too few to find the water, {LEAST_POINTS} are needed."
+            f" {INSTEAD}",
+            points=int(known.sum()), least=LEAST_POINTS,
+        )  # fmt: skip
+    return _judged(_scanned(sample_cloud(xyz[known], None if rgb is None else rgb[known])))
+
+
+DIFFERENT_M, DIFFERENT_SIGMAS = 0.5, 3.0
+"""A level is only reported as another one if it differs by more than both."""
+LEAST_AGAINST, SURE_AGAINST = 100.0, 0.8
+"""Evidence of colours only, or confidence of slope and colours together, that contradicts a given
+level. They are higher than for `find_water`, to avoid false alarms."""
+
+
+def find_elsewhere(
+    xyz: FloatArray, water_m: FloatArray, rgb: npt.NDArray[Any] | None
+) -> tuple[WaterProposal | None, Tilted | None]:
+    """Return water that a cloud shows elsewhere than the given water surface.
+
+    Parameters
+    ----------
+    xyz : array, shape (n, 3)
+        Apparent points, metres, world frame.
+    water_m : array, shape (n,)
+        Height of the given water surface above each.
+    rgb : array, shape (n, 3), or None
+
+    Returns
+    -------
+    level : WaterProposal or None
+        With heights above the given surface; None if the cloud shows it there, or nothing. The full
+        search of `find_water` runs only if another height gains most.
+    tilted : Tilted or None
+    """
+    samples = sample_cloud(np.column_stack([xyz[:, :2], xyz[:, 2] - water_m]), rgb)
+    try:
+        coarse = _scanned(samples)
+    except GeometryError:  # flat ground shows nothing
+        return None, None
+    tilted, gain = _find_tilt(coarse), _gains(coarse, NO_TILT)
+    here = gain[np.abs(coarse.heights_m + samples.origin[2]) <= DIFFERENT_M].max(initial=0.0)
+    if gain.max() < LEAST_AGREED or here > MOST_RIVAL_AGREED * gain.max():
+        return None, tilted
+    try:
+        found = _judged(coarse)
+    except GeometryError:
+        return None, tilted
+    differs = abs(found.level_m) > max(DIFFERENT_M, DIFFERENT_SIGMAS * found.sigma_level_m)
+    sure = found.evidence["total gain"] >= LEAST_AGAINST or (
+        found.confidence >= SURE_AGAINST and f"{SLOPE.name} amplitude" in found.evidence
+    )
+    return found if differs and sure else None, tilted
+
+
+LARGEST_TILT, USUAL_TILT = 0.006, 0.002
+TILT_STEP_M, MOST_TILT_STEPS = 0.15, 9
+TILT_SIGMAS, TILT_GAIN = 3.0, 6.0
+COARSE_M, FINE_M, MOST_HEIGHTS = 0.04, 0.01, 800
+FINE_REACH_M, SAME_PLACE_M = 0.6, 0.3
+WATERLINE_M = 0.05
+DRAWS, TILT_DRAWS, TILT_REACH = 120, 40, 6
+NO_TILT = np.zeros(2)
+
+
+class Scan(NamedTuple):
+    """The sums of all cues of a cloud, at heights above a tilted plane."""
+
+    cues: list[Moments]  # of the slope and of the stronger colour, if they show anything
+    samples: Samples
+    heights_m: FloatArray  # (h,)
+    tilt: FloatArray  # (2,), of the plane through the origin of the samples
+
+
+class Peak(NamedTuple):
+    """The best surface: level_m + tilt . xy from the origin of the samples."""
+
+    level_m: float
+    tilt: FloatArray
+    score: float  # total gain of its cues, reduced for unusual tilts
+
+    def below(self, samples: Samples) -> FloatArray:
+        """Return the depth of the smooth ground of the cells below the surface, shape (m,)."""
+        return np.asarray(self.level_m + samples.xyz[:, :2] @ self.tilt - samples.smooth_m)
+
+    def shore(self, samples: Samples) -> BoolArray:
+        """Return the cells at the height of the surface, shape (m,)."""
+        return np.asarray(np.abs(self.below(samples)) <= WATERLINE_M)
+
+
+def _scanned(samples: Samples) -> Scan:
+    """Return the sums of the cues at all heights; GeometryError ``cloud.flat`` without relief."""
+    low, high = np.percentile(samples.smooth_m, [0.5, 99.5])
+    if high - low < LEAST_RELIEF_M:
+        raise GeometryError(
+            "cloud.flat",
+            f"The ground has {high - low:.2f} m of relief, {LEAST_RELIEF_M:g} m are needed to find"
+            f" the water. {INSTEAD}",
+            relief_m=float(high - low), least=LEAST_RELIEF_M,
+        )  # fmt: skip
+    count = int(np.clip((high - low) / COARSE_M, 8, MOST_HEIGHTS))
+    return _scan_at(samples, np.linspace(low, high, count), NO_TILT)
+
+
+def _scan_at(samples: Samples, heights_m: FloatArray, tilt: FloatArray) -> Scan:
+    """Sum all cues at the given heights above a tilted plane."""
+    slope, *light = (
+        cue_moments(samples, cue, heights_m, tilt)
+        for cue in ((SLOPE, RED, BLUE) if len(samples.colour) else (SLOPE,))
+    )
+    known = [sums for sums in light if sums is not None]
+    stronger = sorted(known, key=lambda sums: -float(gain_of(sums).gain.max()))[:1]
+    return Scan([*([slope] if slope else []), *stronger], samples, heights_m, tilt)
+
+
+def _gains(scan: Scan, tilt: FloatArray, rng: np.random.Generator | None = None) -> FloatArray:
+    """Return the total gain of the cues at each height, shape (h,).
+
+    `tilt`, shape (2,), is added to that of `scan`. With `rng`, tiles are resampled with replacement
+    (bootstrap).
+    """
+    total = np.zeros(len(scan.heights_m))
+    for sums in scan.cues:
+        count, times = len(sums.sums), None
+        if rng is not None:
+            times = np.bincount(rng.integers(0, count, count), minlength=count).astype(float)
+        total += np.maximum(gain_of(sums.shifted(tilt) if tilt.any() else sums, times).gain, 0.0)
+    return total
+
+
+def _best(scan: Scan, tilts: FloatArray) -> Peak:
+    """Return the best height and tilt among tilts of shape (k, 2)."""
+    found = []
+    for tilt in tilts:
+        total, total_tilt = _gains(scan, tilt), scan.tilt + tilt
+        row = int(np.argmax(total))
+        unusual = 0.5 * float(total_tilt @ total_tilt) / USUAL_TILT**2
+        found.append(Peak(float(scan.heights_m[row]), total_tilt, float(total[row]) - unusual))
+    return max(found, key=lambda peak: peak.score)
+
+
+def _tilts_along(step: FloatArray, steps: int) -> FloatArray:
+    """Return multiples of a tilt, the level one first, shape (2 steps + 1, 2)."""
+    up_and_down = np.arange(-steps, steps + 1)
+    return up_and_down[np.argsort(np.abs(up_and_down), kind="stable")][:, None] * step
+
+
+def _refine(samples: Samples, start: Peak, step: FloatArray) -> tuple[Peak, Scan]:
+    """Search near a surface in fine steps of height and of tilt; a step of zero keeps it level."""
+    peak = start
+    reach = np.arange(-FINE_REACH_M, FINE_REACH_M + FINE_M / 2.0, FINE_M)
+    for halvings in range(1, 4 if step.any() else 2):
+        scan = _scan_at(samples, peak.level_m + reach, peak.tilt)
+        peak = _best(scan, _tilts_along(step / 2.0**halvings, 2 if step.any() else 0))
+    return peak, _scan_at(samples, peak.level_m + reach, peak.tilt)
+
+
+def _choose(coarse: Scan) -> tuple[Peak, Scan, float]:
+    """Return the level, or the plane if its tilt is significant and gains enough.
+
+    Then follow the sums near it, and the standard error of its tilt along the shore, NaN for a
+    level. Standing water is level, and flowing water is level across: it may only fall along the
+    line of the shore.
+    """
+    samples = coarse.samples
+    start = _best(coarse, NO_TILT[None])
+    level, near = _refine(samples, start, NO_TILT)
+    shore = samples.xyz[level.shore(samples), :2]
+    if len(shore) < 3:
+        shore = samples.xyz[:, :2]
+    axis = np.linalg.svd(shore - shore.mean(axis=0), full_matrices=False)[2][0]
+    extent = float(np.ptp(samples.xyz[:, :2], axis=0).max())
+    step = max(TILT_STEP_M / extent, LARGEST_TILT / MOST_TILT_STEPS)
+    tilted = _best(coarse, _tilts_along(step * axis, math.ceil(LARGEST_TILT / step)))
+    if tilted.score > start.score:
+        plane, near_plane = _refine(samples, tilted, step * axis)
+        along = abs(float(plane.tilt @ axis))
+        if plane.score > level.score + TILT_GAIN and along <= LARGEST_TILT:
+            sigma_tilt = _sigma_tilt(near_plane, axis, step)
+            if along > TILT_SIGMAS * sigma_tilt:
+                return plane, near_plane, sigma_tilt
+    return level, near, math.nan
+
+
+def _around(near: Scan) -> tuple[FloatArray, BoolArray]:
+    """Return heights relative to the surface found, and which of them are at the same place."""
+    heights = near.heights_m - near.heights_m[len(near.heights_m) // 2]
+    return heights, np.asarray(np.abs(heights) <= SAME_PLACE_M)
+
+
+def _sigma_level(near: Scan) -> float:
+    """Return the standard error of the level by bootstrap, with the tilt found."""
+    rng = np.random.default_rng(0)
+    heights, same = _around(near)
+    draws = [_gains(near, NO_TILT, rng)[same] for _ in range(DRAWS)]
+    levels = np.array([heights[same][int(np.argmax(draw))] for draw in draws])
+    return math.hypot(float(np.sqrt(np.mean(levels**2))), LEAST_SIGMA_M)
+
+
+def _sigma_tilt(near: Scan, axis: FloatArray, step: float) -> float:
+    """Return the standard error of the tilt along an axis by bootstrap."""
+    same, tilts = _around(near)[1], _tilts_along(step / 2.0 * axis, TILT_REACH)
+    tops = [  # with the same sample for all tilts
+        [_gains(near, tilt, np.random.default_rng(seed))[same].max() for tilt in tilts]
+        for seed in range(TILT_DRAWS)
+    ]
+    drawn = tilts[np.argmax(tops, axis=1)] @ axis
+    # the median absolute deviation, and the rounding to steps of tilt
+    return math.hypot(1.4826 * float(np.median(np.abs(drawn))), step / 6.0)
+
+
+LEAST_AGREED, LEAST_EACH = 12.0, 3.0
+LIFTS = 0.15, 0.75
+"""Range of the change of slope by refraction, about 0.36, on rough ground."""
+LEAST_SINGLE, LEAST_COLOUR_SINGLE = 25.0, 40.0
+"""Physics gives the size of the change of slope; colours may change with height on land too."""
+MOST_RIVAL_AGREED, MOST_RIVAL_SINGLE = 0.75, 0.5
+MOST_SIGMA_M = 0.2
+LEAST_SHARE = 0.005
+
+
+def _judged(coarse: Scan) -> WaterProposal:
+    """Return the best surface; GeometryError ``water.not_found`` if its evidence is not enough."""
+    samples, origin = coarse.samples, coarse.samples.origin
+    peak, near, sigma_tilt = _choose(coarse)
+    sigma_m = _sigma_level(near)
+    total, evidence, sentences, strong = 0.0, dict[str, float](), list[str](), list[Cue]()
+    for sums in near.cues:
+        cue, middle = sums.cue, len(near.heights_m) // 2
+        gain, size, sigma = (float(figure[middle]) for figure in gain_of(sums))
+        evidence[f"{cue.name} gain"] = gain
+        total += max(gain, 0.0)
+        if gain >= LEAST_EACH:
+            strong.append(cue)
+            evidence[f"{cue.name} amplitude"], evidence[f"{cue.name} sigma"] = size, sigma
+            text = f"the logarithm of the ratio falls by {-size:.2f} ± {sigma:.2f} per metre"
+            if cue == SLOPE:
+                text = f"true slopes are {1.0 + size:.2f} ± {sigma:.2f} times the apparent ones"
+            sentences.append(f"{cue.meaning}: {text}")
+    # the rival: the best height elsewhere
+    elsewhere = np.abs(coarse.heights_m - peak.level_m) > SAME_PLACE_M
+    rivals = np.where(elsewhere, _gains(coarse, peak.tilt), 0.0)
+    row = int(np.argmax(rivals))
+    rival, rival_m = float(rivals[row]), float(coarse.heights_m[row] + origin[2])
+    wet = float(np.mean(peak.below(samples) > 0.0))
+    evidence |= {
+        "rival gain": rival, "rival height": rival_m, "total gain": total, "share below": wet,
+    }  # fmt: skip
+    # what is needed depends on the cues that gain enough to count
+    least, most_rival, lift = LEAST_AGREED, MOST_RIVAL_AGREED, LIFTS[0]
+    if len(strong) < 2:
+        coloured = any(cue.colour is not None for cue in strong)
+        least, most_rival = (LEAST_COLOUR_SINGLE if coloured else LEAST_SINGLE), MOST_RIVAL_SINGLE
+    if strong == [SLOPE]:
+        lift = evidence["slope amplitude"]
+    shore = samples.xyz[peak.shore(samples)]
+    reason = ""
+    if not LEAST_SHARE <= wet <= 1.0 - LEAST_SHARE:
+        reason, why = "no_shoreline", "nearly all of the cloud is on one side of it"
+    elif not LIFTS[0] <= lift <= LIFTS[1]:  # a break that refraction does not make
+        reason = "bank"
+        why = f"slopes change by {1.0 + lift:.2f} times there, and refraction makes about 1.36"
+    elif total < least:
+        reason, why = "weak", f"its evidence is {total:.0f}, and {least:.0f} is needed"
+    elif rival > most_rival * total:
+        reason = "contradictory"
+        why = f"its evidence is {total:.0f}, and {rival_m:.2f} m has {rival:.0f}, nearly as much"
+    elif sigma_m > MOST_SIGMA_M:
+        reason, why = "inconsistent", f"parts of the cloud differ by {sigma_m:.2f} m"
+    elif len(shore) == 0:
+        reason, why = "no_shoreline", "no ground crosses it"
+    if reason:
+        height = peak.level_m + float(samples.xyz[:, :2].mean(axis=0) @ peak.tilt + origin[2])
+        raise GeometryError(
+            "water.not_found",
+            f"No water surface was found. The best candidate is {height:.2f} m, but {why}."
+            f" {INSTEAD}",
+            reason=reason, evidence=evidence,
+        )  # fmt: skip
+    shore = shore[:: math.ceil(len(shore) / MOST_SHORELINE)] + origin
+    centre = shore[:, :2].mean(axis=0)
+    rise = float((centre - origin[:2]) @ peak.tilt + origin[2])
+    level, (b, c) = peak.level_m + rise, peak.tilt.tolist()
+    return WaterProposal(
+        surface=WaterPlane(level - float(centre @ peak.tilt), b, c),
+        sigma_level_m=sigma_m,
+        centre_xy=centre,
+        level_m=level,
+        tilt=peak.tilt,
+        sigma_tilt=sigma_tilt,
+        confidence=float(min(1.0 - rival / total, 1.0 - math.exp(-total / (2.0 * least)))),
+        evidence=evidence,
+        reasons=tuple(sentences),
+        shoreline=shore,
+        curve_height_m=coarse.heights_m + rise,
+        curves={sums.cue.name: gain_of(sums.shifted(peak.tilt)).gain for sums in coarse.cues},
+        ground=samples.xyz + origin,
+    )
+
+
+TILTS = (-0.02, -0.015, -0.01, -0.0075, -0.005, -0.0025, 0.0025, 0.005, 0.0075, 0.01, 0.015, 0.02)
+DIRECTIONS = 4
+REACH_M, LEAST_APART_M = 2.0, 0.3
+"""Largest distance from the given water in the middle of the cloud; least one from end to end."""
+LEAST_GAIN, MOST_LEFT, ABOUT_AS_GOOD = 100.0, 0.4, 0.9
+"""Least evidence of a tilted waterline; the largest share of it for the level one; and the share
+from which another tilt is as likely, as the tilt across a straight shore is unknown."""
+_WINDS = ("east", "north-east", "north", "north-west", "west", "south-west", "south", "south-east")
+
+
+class Tilted(NamedTuple):
+    """A waterline that is tilted against the given water."""
+
+    to: str  # the direction in which it rises
+    slope: float  # rise per metre
+    low_m: float  # lowest and highest place in the cloud, above the given water
+    high_m: float
+
+
+def _find_tilt(coarse: Scan) -> Tilted | None:
+    """Return the tilt of a waterline, if any; heights of `coarse` are above the given water."""
+    samples = coarse.samples
+    middle = np.median(samples.xyz[:, :2], axis=0)
+    angles = np.arange(DIRECTIONS) * np.pi / DIRECTIONS
+    directions = np.column_stack([np.cos(angles), np.sin(angles)])
+    tilts = [slope * one for slope in sorted(TILTS, key=abs) for one in directions]
+    peaks = list[Peak]()
+    for tilt in (NO_TILT, *tilts):
+        at_middle = coarse.heights_m + samples.origin[2] + middle @ tilt
+        gain = np.where(np.abs(at_middle) <= REACH_M, _gains(coarse, tilt), 0.0)
+        row = int(np.argmax(gain))
+        peaks.append(Peak(float(coarse.heights_m[row]), tilt, float(gain[row])))
+    level, *peaks = peaks
+    least = ABOUT_AS_GOOD * max(one.score for one in peaks)
+    peak = next(one for one in peaks if one.score >= least)  # the least tilt
+    if peak.score < LEAST_GAIN or level.score > MOST_LEFT * peak.score:
+        return None
+    heights = samples.xyz[peak.shore(samples), :2] @ peak.tilt + peak.level_m + samples.origin[2]
+    if len(heights) < 2 or np.ptp(heights) < LEAST_APART_M:
+        return None
+    slope = float(np.hypot(*peak.tilt))
+    wind = round(float(np.arctan2(peak.tilt[1], peak.tilt[0])) / (np.pi / 4.0)) % len(_WINDS)
+    return Tilted(_WINDS[wind], slope, float(heights.min()), float(heights.max()))

@@ -64,17 +64,6 @@ def test_tilt():
     assert np.abs(error - LEVEL_M - 0.004 * along).max() < 0.08  # m, at the ends too
 
 
-def test_floating_points():
-    xyz, _ = shore(bumps_m=0.01, seed=1)
-    rng = np.random.default_rng(2)
-    deep = np.flatnonzero(xyz[:, 2] < LEVEL_M - 0.5)
-    afloat = rng.choice(deep, 250, replace=False)
-    xyz[afloat, 2] = LEVEL_M + rng.normal(0.0, 0.02, 250)
-    found = find_water(xyz)
-    assert found.level_m == pytest.approx(LEVEL_M, abs=0.03)  # m, the thickness of the layer
-    assert found.evidence["floating points gain"] > 15.0
-
-
 def test_repeated_and_shifted():
     xyz, rgb = shore()
     first, again = found_of(), find_water(xyz, rgb=rgb)
