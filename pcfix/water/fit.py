@@ -90,28 +90,6 @@ class WaterFit(ShoreFit):
         }
 
 
-class _Plan(NamedTuple):
-    """The points in plan: centre, axes along and across (rows), spread (rms) along each, m."""
-
-    centre: FloatArray
-    axes: FloatArray
-    spread_m: FloatArray
-
-    def columns(self, xy: FloatArray, model: Model) -> FloatArray:
-        """Return the design matrix of a model."""
-        p = _UNKNOWNS[model]
-        place = (xy - self.centre) @ self.axes[: p - 1].T / self.spread_m[: p - 1]
-        return np.column_stack([np.ones(len(xy)), place])
-
-    def to_world(self, model: Model) -> FloatArray:
-        """Return the matrix from the unknowns of a model to level and tilt, shape (3, p)."""
-        p = _UNKNOWNS[model]
-        matrix = np.zeros((3, p))
-        matrix[0, 0] = 1.0
-        matrix[1:, 1:] = (self.axes[: p - 1] / self.spread_m[: p - 1, None]).T
-        return matrix
-
-
 _UNKNOWNS: dict[Model, int] = {"level": 1, "along": 2, "plane": 3}
 
 
@@ -141,16 +119,43 @@ def fit_water(
     if len(known) == 0:
         text = f"None of {len(xyz)} shoreline points has a height. Give heights, or the cloud."
         raise GeometryError("water.too_few_points", text, points=0, least=1)
-    plan = _plan(xyz[known, :2])
     worth = np.ones(len(known)) if counts is None else np.asarray(counts, np.float64)[known]
-    chosen, found, notes = _choose(xyz[known], plan, model, worth)
+    shore = _shore(xyz[known], worth)
+    if model == "auto":
+        model, found, notes = _choose(shore)
+    else:
+        found, notes = _regression(shore, model), []
+    accepted = found.weight > 0.0
+    centre = shore.xyz[accepted, :2].mean(axis=0)
+    moved = np.eye(3)
+    moved[0, 1:] = centre - shore.centre
+    level, *tilt = (moved @ found.beta).tolist()
+    missing = len(xyz) - len(known)
+    if missing:
+        notes.append(f"{missing} points have no height and are ignored.")
+    if math.isnan(found.sigma_m):
+        notes.append("There is no redundancy, so the accuracy of the surface is unknown.")
+    if accepted.sum() < _MOSTLY * len(known):
+        notes.append(
+            f"Only {accepted.sum()} of {len(known)} points agree with the surface. Check the"
+            " others."
+        )
+    if found.sigma_m > WIDE_SCATTER_M:
+        notes.append(
+            f"The points scatter by {found.sigma_m:.2f} m. They may not be of one surface, or not"
+            " on the edge of the water."
+        )
     fit = WaterFit(
-        model=chosen,
-        **_located(xyz[known[found.weight > 0.0], :2].mean(axis=0), chosen, plan, found),
+        model=model,
+        surface=WaterPlane(level - float(centre @ tilt), *tilt),
+        centre_xy=centre,
+        level_m=level,
+        tilt=np.array(tilt),
+        covariance=moved @ found.covariance @ moved.T,
         residual_m=of_all(found.residual_m, known, len(xyz), np.nan),
         weight=of_all(found.weight, known, len(xyz), 0.0),
         sigma_m=found.sigma_m,
-        notes=(*notes, *_doubts(found, len(xyz) - len(known))),
+        notes=tuple(notes),
     )
     if not fit.tilt_percent <= MAX_TILT_PERCENT:
         raise GeometryError(
@@ -163,126 +168,88 @@ def fit_water(
     return fit
 
 
-def _plan(xy: FloatArray) -> _Plan:
-    """Return the principal axes of places, along first."""
-    centre = xy.mean(axis=0)
-    variance, vectors = np.linalg.eigh(np.cov((xy - centre).T, bias=True).reshape(2, 2))
-    return _Plan(centre, vectors.T[::-1], np.sqrt(np.maximum(variance[::-1], 0.0)))
+class _Shore(NamedTuple):
+    """Shoreline points with heights, and their principal axes in plan."""
+
+    xyz: FloatArray
+    worth: FloatArray  # independent observations that each is worth
+    centre: FloatArray
+    axes: FloatArray  # unit vectors along and across, rows
+    spread_m: FloatArray  # rms distance from the centre along and across
 
 
-def _choose(
-    xyz: FloatArray, plan: _Plan, model: Model, worth: FloatArray
-) -> tuple[Model, Regression, tuple[str, ...]]:
-    """Return the model, its fit, and why."""
-    if model != "auto":
-        _check_enough(len(xyz), plan, model)
-        return model, _regression(xyz, plan, model, worth), ()
-    if len(xyz) <= _FEWEST_FOR_PLANE or plan.spread_m[0] < _SAME_PLACE_M:
-        note = f"{len(xyz)} points are too few or too close together for a tilt: a level is fitted."
-        return "level", _regression(xyz, plan, "level", worth), (note,)
-    along, across = plan.spread_m
-    tilted: Model = "along" if across < LINE_RATIO * along else "plane"
-    found = _regression(xyz, plan, tilted, worth)
-    chance = _chance_of_tilt(found, worth)
+def _shore(xyz: FloatArray, worth: FloatArray) -> _Shore:
+    """Find the principal axes of points."""
+    centre = xyz[:, :2].mean(axis=0)
+    local = xyz[:, :2] - centre
+    variance, vectors = np.linalg.eigh(local.T @ local / len(xyz))
+    return _Shore(xyz, worth, centre, vectors.T[::-1], np.sqrt(np.maximum(variance[::-1], 0.0)))
+
+
+def _choose(shore: _Shore) -> tuple[Model, Regression, list[str]]:
+    """Return the model with significant tilts only, its fit, and why."""
+    (along, across), count = shore.spread_m, len(shore.xyz)
+    if count <= _FEWEST_FOR_PLANE or along < _SAME_PLACE_M:
+        note = f"{count} points are too few or too close together for a tilt: a level is fitted."
+        return "level", _regression(shore, "level"), [note]
+    model: Model = "along" if across < LINE_RATIO * along else "plane"
+    found = _regression(shore, model)
+    chance = _chance_of_tilt(shore, found, _UNKNOWNS[model])
     if not chance < SIGNIFICANCE:
         note = f"The tilt of the points is not significant (p = {chance:.2f}): a level is fitted."
-        return "level", _regression(xyz, plan, "level", worth), (note,)
-    significant = f"The tilt of the points is significant (p = {chance:.2g})."
-    if tilted == "along":
-        note = (
+        return "level", _regression(shore, "level"), [note]
+    notes = [f"The tilt of the points is significant (p = {chance:.2g})."]
+    axis, covariance = shore.axes[1], found.covariance[1:, 1:]
+    is_level_across = (axis @ found.beta[1:]) ** 2 < 4.0 * (axis @ covariance @ axis)  # 2 sigma
+    if model == "along":
+        notes.append(
             f"The points are nearly on one line (rms {across:.1f} m across, {along:.1f} m along):"
             " the surface is level across it."
         )
-        return tilted, found, (significant, note)
-    is_level_across = abs(found.beta[2]) < 2.0 * math.sqrt(found.covariance[2, 2])
-    if across < LONG_RATIO * along and is_level_across:
-        note = (
+    elif across < LONG_RATIO * along and is_level_across:
+        notes.append(
             "There is no tilt across the direction of the points: the surface is level across it."
         )
-        return "along", _regression(xyz, plan, "along", worth), (significant, note)
-    return tilted, found, (significant,)
+        model, found = "along", _regression(shore, "along")
+    return model, found, notes
 
 
-def _check_enough(n: int, plan: _Plan, model: Model) -> None:
-    """Raise GeometryError if the points do not determine a model."""
-    if n < _UNKNOWNS[model]:
-        raise GeometryError(
-            "water.too_few_points",
-            f"The water model '{model}' needs at least {_UNKNOWNS[model]} shoreline points with"
-            f" heights, and there are {n}. Fit a level.",
-            points=n, least=_UNKNOWNS[model],
-        )  # fmt: skip
-    along, across = plan.spread_m
-    if model != "level" and along < _SAME_PLACE_M:
-        text = f"The {n} shoreline points are at one place. Fit a level."
-        raise GeometryError("water.on_line", text, points=n)
-    if model == "plane" and across < _ON_LINE * along:
-        raise GeometryError(
-            "water.on_line",
-            f"The {n} shoreline points are on one line (rms {across:.2g} m across, {along:.4g} m"
-            " along). Fit a level, or a tilt along them.",
-            points=n,
-        )
-
-
-def _regression(xyz: FloatArray, plan: _Plan, model: Model, worth: FloatArray) -> Regression:
-    found = robust_regression(plan.columns(xyz[:, :2], model), xyz[:, 2])
+def _regression(shore: _Shore, model: Model) -> Regression:
+    """Fit level and tilt about the centre of the points; zero for what the model does not have."""
+    p, n, (along, across) = _UNKNOWNS[model], len(shore.xyz), shore.spread_m
+    on_line = (p > 1 and along < _SAME_PLACE_M) or (p > 2 and across < _ON_LINE * along)
+    found = None
+    if n >= p and not on_line:
+        # in units of the spread, so that all columns are of similar size
+        units = (shore.axes[: p - 1] / shore.spread_m[: p - 1, None]).T
+        local = shore.xyz[:, :2] - shore.centre
+        found = robust_regression(np.column_stack([np.ones(n), local @ units]), shore.xyz[:, 2])
     if found is None:
         raise GeometryError(
-            "water.on_line",
-            f"Too many of the {len(xyz)} shoreline points are on one line for the water model"
-            f" '{model}'. Fit a level.",
-            points=len(xyz),
-        )
-    return found._replace(
-        covariance=found.covariance * shared(found.weight, worth, len(found.beta))
-    )
+            "water.on_line" if n >= p else "water.too_few_points",
+            f"The water model '{model}' needs at least {p} shoreline points with heights, not at"
+            f" one place or on one line, and there are {n} (rms {along:.4g} m along their line,"
+            f" {across:.2g} m across). Fit a level, or a tilt along them.",
+            points=n, least=p,
+        )  # fmt: skip
+    to_world = np.zeros((3, p))
+    to_world[0, 0], to_world[1:, 1:] = 1.0, units
+    grown = shared(found.weight, shore.worth, p) * found.covariance
+    return found._replace(beta=to_world @ found.beta, covariance=to_world @ grown @ to_world.T)
 
 
-def _chance_of_tilt(fit: Regression, worth: FloatArray) -> float:
+def _chance_of_tilt(shore: _Shore, fit: Regression, unknowns: int) -> float:
     """Return the p-value of a tilt, if the surface is level (Wald's test, F distribution)."""
     from scipy.stats import f
 
-    tilt, spare = fit.beta[1:], float(worth[fit.weight > 0.0].sum()) - len(fit.beta)
+    tilts, spare = unknowns - 1, float(shore.worth[fit.weight > 0.0].sum()) - unknowns
     if spare <= 0.0:
         return 1.0
     if fit.sigma_m < _NO_SCATTER_M:
-        return float(np.abs(tilt).max() < _NO_SCATTER_M)
-    value = float(tilt @ np.linalg.solve(fit.covariance[1:, 1:], tilt)) / len(tilt)
-    return float(f.sf(value, len(tilt), spare))
-
-
-def _located(centre: FloatArray, model: Model, plan: _Plan, fit: Regression) -> dict[str, Any]:
-    """Return the surface, and level and tilt about a place with their covariance."""
-    moved = np.eye(3)
-    moved[0, 1:] = centre - plan.centre
-    to_world = moved @ plan.to_world(model)
-    level, *tilt = to_world @ fit.beta
-    return {
-        "surface": WaterPlane(float(level - centre @ tilt), float(tilt[0]), float(tilt[1])),
-        "centre_xy": centre,
-        "level_m": float(level),
-        "tilt": np.array(tilt),
-        "covariance": to_world @ fit.covariance @ to_world.T,
-    }
-
-
-def _doubts(fit: Regression, without_height: int) -> tuple[str, ...]:
-    """Return notes on points that should be checked."""
-    n, kept = len(fit.weight), int((fit.weight > 0.0).sum())
-    notes = []
-    if without_height:
-        notes.append(f"{without_height} points have no height and are ignored.")
-    if kept <= len(fit.beta):
-        notes.append("There is no redundancy, so the accuracy of the surface is unknown.")
-    if kept < _MOSTLY * n:
-        notes.append(f"Only {kept} of {n} points agree with the surface. Check the others.")
-    if fit.sigma_m > WIDE_SCATTER_M:
-        notes.append(
-            f"The points scatter by {fit.sigma_m:.2f} m. They may not be of one surface, or not on"
-            " the edge of the water."
-        )
-    return tuple(notes)
+        return float(np.abs(shore.axes @ fit.beta[1:] * shore.spread_m).max() < _NO_SCATTER_M)
+    axes = shore.axes[:tilts]
+    tilt, covariance = axes @ fit.beta[1:], axes @ fit.covariance[1:, 1:] @ axes.T
+    return float(f.sf(tilt @ np.linalg.solve(covariance, tilt) / tilts, tilts, spare))
 
 
 NEIGHBOURS = 25

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.errors import GeometryError
-from pcfix.model import FloatArray, IntArray, WaterMesh
+from pcfix.model import FloatArray, WaterMesh
 from pcfix.water.robust import Profile, ShoreFit, fit_profile, of_all, usable_rows
 
 if TYPE_CHECKING:
@@ -34,16 +34,6 @@ class RiverFit(ShoreFit):
     axis: Axis  # downstream
     profile: Profile  # height along the axis, by its station
 
-    @property
-    def drop_m(self) -> float:
-        """Fall from the first point to the last."""
-        return float(self.profile.height_m[0] - self.profile.height_m[-1])
-
-    @property
-    def length_m(self) -> float:
-        """Length along the axis from the first point to the last."""
-        return float(np.ptp(self.profile.station_m))
-
     def height_at(self, xy: FloatArray) -> FloatArray:
         """Return the height (m) of the surface at places (m, 2)."""
         return self.profile.height_at(self.axis.locate(xy)[0])
@@ -54,12 +44,13 @@ class RiverFit(ShoreFit):
 
     def as_dict(self) -> dict[str, Any]:
         """Return the figures as plain values."""
+        heights = self.profile.height_m
         return {
             "model": "river",
-            "length_m": self.length_m,
+            "length_m": float(np.ptp(self.profile.station_m)),
             "width_m": self.axis.width_m,
-            "upper_level_m": float(self.profile.height_m[0]),
-            "drop_m": self.drop_m,
+            "upper_level_m": float(heights[0]),
+            "drop_m": float(heights[0] - heights[-1]),
             "sigma_level_m": float(self.profile.sigma_height_m.mean()),
             "falls": self.profile.falls,
             **self.figures(),
@@ -87,14 +78,14 @@ def fit_river(
     """
     points = np.asarray(xyz, np.float64)
     known = usable_rows(points)
-    if len(known) < FEWEST:
+    used = points[known]
+    if len(known) < FEWEST or not np.ptp(used[:, :2], axis=0).any():
         raise GeometryError(
             "water.too_few_points",
-            f"A surface along a river needs at least {FEWEST} shoreline points with heights, and"
-            f" there are {len(known)}. Fit a plane or a level.",
+            f"A surface along a river needs at least {FEWEST} shoreline points with heights, at"
+            f" different places, and there are {len(known)}. Fit a plane or a level.",
             points=len(known), least=FEWEST,
         )  # fmt: skip
-    used = points[known]
     axis = flow_axis(used[:, :2])
     station, _ = axis.locate(used[:, :2])
     upper = station <= np.median(station)
@@ -145,9 +136,6 @@ def _mesh(axis: Axis, profile: Profile, bounds: Bounds, name: str) -> WaterMesh:
     return WaterMesh(vertices, triangles.astype(np.int64), name)
 
 
-FEWEST_ON_AXIS = 6
-NET_POINTS = 1500
-"""Points of the network; of more, the mean of each cell is used."""
 REACH = 2.0
 """Longest edge of the network, relative to the longest that keeps it connected."""
 _ROUNDS, _NODES = 10, 300
@@ -161,50 +149,38 @@ class Axis:
     width_m: float  # twice the rms distance of the points from it
 
     @cached_property
-    def station_m(self) -> FloatArray:
-        """Distance along the line to each vertex, shape (m,)."""
-        steps = np.hypot(*np.diff(self.xy, axis=0).T)
-        return np.concatenate([[0.0], np.cumsum(steps)])
-
-    @cached_property
     def _tree(self) -> cKDTree:
         from scipy.spatial import cKDTree
 
         return cKDTree(self.xy)
 
     def locate(self, xy: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the distance along the line of places (n, 2), and their distance from it, m."""
-        nearest = np.asarray(self._tree.query(xy)[1], np.int64)
-        sides = [np.clip(nearest + k, 0, len(self.xy) - 2) for k in (-1, 0)]
-        (one, far_one), (other, far_other) = (self._on_segment(xy, side) for side in sides)
-        first = far_one <= far_other
-        return np.where(first, one, other), np.where(first, far_one, far_other)
+        """Return the distance along the line of places (n, 2), and their distance from it, m.
 
-    def _on_segment(self, xy: FloatArray, i: IntArray) -> tuple[FloatArray, FloatArray]:
-        start, edge = self.xy[i], self.xy[i + 1] - self.xy[i]
-        length2 = np.maximum((edge**2).sum(axis=1), 1e-12)
-        share = np.clip(((xy - start) * edge).sum(axis=1) / length2, 0.0, 1.0)
-        away = np.hypot(*(xy - start - share[:, None] * edge).T)
-        return self.station_m[i] + share * np.sqrt(length2), away
+        Each place is projected onto the segments on both sides of the nearest vertex.
+        """
+        edges = np.diff(self.xy, axis=0)
+        lengths = np.hypot(*edges.T)
+        stations = np.concatenate([[0.0], np.cumsum(lengths)])
+        nearest = np.asarray(self._tree.query(xy)[1], np.int64)
+        along, away = np.empty((2, len(xy))), np.empty((2, len(xy)))
+        for side in (0, 1):
+            i = np.clip(nearest + side - 1, 0, len(edges) - 1)
+            local, edge = xy - self.xy[i], edges[i]
+            share = (local * edge).sum(axis=1) / np.maximum(lengths[i] ** 2, 1e-12)
+            share = np.clip(share, 0.0, 1.0)
+            along[side] = stations[i] + share * lengths[i]
+            away[side] = np.hypot(*(local - share[:, None] * edge).T)
+        first = away[0] <= away[1]
+        return np.where(first, along[0], along[1]), away.min(axis=0)
 
 
 def flow_axis(xy: FloatArray) -> Axis:
-    """Return the axis of a river from points (n, 2) on its banks, metres.
-
-    Raises GeometryError ``water.too_few_points`` for fewer than `FEWEST_ON_AXIS`, or at one place.
-    """
-    if len(xy) < FEWEST_ON_AXIS or not np.ptp(xy, axis=0).any():
-        raise GeometryError(
-            "water.too_few_points",
-            f"The axis of a river needs at least {FEWEST_ON_AXIS} shoreline points at different"
-            f" places, and there are {len(xy)}. Fit a plane.",
-            points=len(xy), least=FEWEST_ON_AXIS,
-        )  # fmt: skip
+    """Return the axis of a river from points (n, 2) on its banks, metres."""
     origin = xy.mean(axis=0)
     places = xy - origin
-    net = _thinned(places)
-    station, bandwidth = _stations(net)
-    nodes = _smoothed(net, station, bandwidth)
+    net = np.unique(places, axis=0)
+    nodes = _smoothed(net, *_stations(net))
     for _ in range(_ROUNDS):
         station, width = _located(nodes, places)
         gap = float(np.quantile(np.diff(np.sort(station)), 0.9))  # one in ten is wider
@@ -223,17 +199,6 @@ def _located(nodes: FloatArray, places: FloatArray) -> tuple[FloatArray, float]:
     return station, 2.0 * float(np.sqrt(np.mean(away**2)))
 
 
-def _thinned(xy: FloatArray) -> FloatArray:
-    """Return places, or of many the mean of each cell."""
-    if len(xy) <= NET_POINTS:
-        return np.unique(xy, axis=0)
-    cell_m = float(np.sqrt(np.prod(np.maximum(np.ptp(xy, axis=0), 1e-3)) / NET_POINTS))
-    _, cell = np.unique(np.floor(xy / cell_m), axis=0, return_inverse=True)
-    cell = cell.ravel()
-    count = np.bincount(cell)
-    return np.column_stack([np.bincount(cell, xy[:, k]) / count for k in (0, 1)])
-
-
 def _stations(xy: FloatArray) -> tuple[FloatArray, float]:
     """Return the distance of each place along the river, and the bandwidth of smoothing, m."""
     from scipy.sparse import csr_array
@@ -241,20 +206,18 @@ def _stations(xy: FloatArray) -> tuple[FloatArray, float]:
     from scipy.spatial import Delaunay
 
     corners = Delaunay(xy, qhull_options="QJ").simplices  # joggled: they may be on one line
-    pairs = np.vstack([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
+    pairs = corners[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     # scipy 1.11 needs indices of 32 bits
-    edges = np.unique(np.sort(pairs, axis=1), axis=0).astype(np.int32)
-    shape = len(xy), len(xy)
-    length = np.hypot(*(xy[edges[:, 0]] - xy[edges[:, 1]]).T)
-    tree = minimum_spanning_tree(csr_array((length, edges.T), shape=shape))
+    edges = np.unique(np.sort(pairs, axis=1), axis=0).T.astype(np.int32)
+    length, shape = np.hypot(*(xy[edges[0]] - xy[edges[1]]).T), (len(xy), len(xy))
+    tree = minimum_spanning_tree(csr_array((length, edges), shape=shape))
     reach = REACH * float(tree.data.max())
-    kept = length <= reach
-    both = np.vstack([edges[kept], edges[kept][:, ::-1]])
-    net = csr_array((np.tile(length[kept], 2), both.T), shape=shape)
-    start = np.argmax(dijkstra(net, indices=np.array([0])), axis=1)
-    from_start = dijkstra(net, indices=start)[0]
-    end = int(np.argmax(from_start))
-    from_end = dijkstra(net, indices=np.array([end]))[0]
+    near = length <= reach
+    net = csr_array((length[near], edges[:, near]), shape=shape)
+    start = np.argmax(dijkstra(net, directed=False, indices=np.array([0])), axis=1)
+    from_start = dijkstra(net, directed=False, indices=start)[0]
+    end = np.array([np.argmax(from_start)])
+    from_end = dijkstra(net, directed=False, indices=end)[0]
     return (from_start + from_start[end] - from_end) / 2.0, reach
 
 

@@ -207,38 +207,17 @@ class Profile:
         return np.interp(station_m, self.station_m, self.sigma_height_m)
 
 
-class _Data(NamedTuple):
-    """Points between nodes of the spline."""
-
-    node: IntArray  # the node before each point
-    share: FloatArray  # weight of the next one
-    z: FloatArray
-    nodes: int  # their number
-
-    def take(self, rows: BoolArray) -> _Data:
-        return self._replace(node=self.node[rows], share=self.share[rows], z=self.z[rows])
-
-    def stiff(self) -> BoolArray:
-        """Return the bends with too few points on one side, shape (nodes - 2,)."""
-        before = np.cumsum(np.bincount(self.node, minlength=self.nodes))[: self.nodes - 2]
-        return np.asarray(np.minimum(before, len(self.z) - before) < END_POINTS)
-
-    def fitted(self, height: FloatArray) -> FloatArray:
-        return (1.0 - self.share) * height[self.node] + self.share * height[self.node + 1]
-
-
 def fit_profile(station_m: FloatArray, z: FloatArray, worth: FloatArray | None = None) -> Profile:
     """Fit the height of the water, shape (n,), which falls with the station, downstream.
 
     Each point is `worth` a number of independent observations, 1 by default; see `shared`.
     """
     order = np.lexsort((z, station_m))
-    nodes = int(np.clip(NODES_A_POINT * len(z), 20, MOST_NODES))
-    at = np.linspace(station_m.min(), station_m.max(), nodes)
-    position = (station_m[order] - at[0]) / (at[1] - at[0])
-    node = np.clip(np.floor(position).astype(np.int64), 0, len(at) - 2)
-    data = _Data(node, position - node, z[order], len(at))
-    falling, free = (_fit(data, at, falls=falls) for falls in (True, False))
+    count = int(np.clip(NODES_A_POINT * len(z), 20, MOST_NODES))
+    nodes = np.linspace(station_m.min(), station_m.max(), count)
+    falling, free = (
+        _fit(station_m[order], z[order], nodes, falls=falls) for falls in (True, False)
+    )
     held = falling.sigma_m <= RISES_IF_WORSE * max(free.sigma_m, LEAST_SCALE_M)
     fit, back = falling if held else free, np.argsort(order)
     fit = replace(fit, weight=fit.weight[back], residual_m=fit.residual_m[back])
@@ -248,82 +227,70 @@ def fit_profile(station_m: FloatArray, z: FloatArray, worth: FloatArray | None =
     return replace(fit, sigma_height_m=fit.sigma_height_m * grown)
 
 
-def _best_penalty(data: _Data, *, falls: bool) -> float:
-    """Return the penalty with the smallest error of cross-validation, robust to outliers."""
-    fold = np.arange(len(data.z)) % FOLDS
-    missed = np.empty((len(PENALTIES), len(data.z)))
-    for row, penalty in enumerate(PENALTIES):
-        for k in range(FOLDS):
-            height = _solve(data.take(fold != k), penalty, falls=falls)[0]
-            out = data.take(fold == k)
-            missed[row, fold == k] = np.abs(out.z - out.fitted(height))
-    limit = FINAL_C * max(_TO_SIGMA * float(np.median(missed, axis=1).min()), LEAST_SCALE_M)
-    return PENALTIES[int(np.argmin((np.minimum(missed, limit) ** 2).mean(axis=1)))]
-
-
-def _fit(data: _Data, station_m: FloatArray, *, falls: bool) -> Profile:
-    """Fit heights with their standard errors; the points keep the order of the data."""
+def _fit(station: FloatArray, z: FloatArray, nodes: FloatArray, *, falls: bool) -> Profile:
+    """Fit heights, with the penalty that cross-validation prefers, and their standard errors."""
     from scipy.linalg import solveh_banded
 
-    height, weight, band = _solve(data, _best_penalty(data, falls=falls), falls=falls)
-    inverse = solveh_banded(band, np.eye(data.nodes), lower=True)
-    i, j, share = data.node, data.node + 1, data.share
-    variance = (
-        (1.0 - share) ** 2 * inverse[i, i]
-        + 2.0 * share * (1.0 - share) * inverse[i, j]
-        + share**2 * inverse[j, j]
-    )
-    kept, residual = weight > 0.0, data.z - data.fitted(height)
-    spare = kept.sum() - float((weight * variance).sum())
-    sigma = float(np.sqrt((residual[kept] ** 2).sum() / max(spare, 1.0)))
+    # each fold is predicted from the others; its errors count up to a limit, for the outliers
+    fold = np.arange(len(z)) % FOLDS
+    missed = np.empty((len(PENALTIES), len(z)))
+    for row, penalty in enumerate(PENALTIES):
+        for k in range(FOLDS):
+            rest, out = fold != k, fold == k
+            height = _solve(station[rest], z[rest], nodes, penalty, falls=falls)[0]
+            missed[row, out] = np.abs(z[out] - np.interp(station[out], nodes, height))
+    limit = FINAL_C * max(_TO_SIGMA * float(np.median(missed, axis=1).min()), LEAST_SCALE_M)
+    best = PENALTIES[int(np.argmin((np.minimum(missed, limit) ** 2).mean(axis=1)))]
+    height, weight, band = _solve(station, z, nodes, best, falls=falls)
+    inverse = solveh_banded(band, np.eye(len(nodes)), lower=True)
+    splines = _splines(station, nodes)
+    variance = splines.multiply(splines @ inverse).sum(axis=1)
+    residual, accepted = z - np.interp(station, nodes, height), weight > 0.0
+    spare = accepted.sum() - float((weight * np.asarray(variance).ravel()).sum())
+    sigma = float(np.sqrt((residual[accepted] ** 2).sum() / max(spare, 1.0)))
     sigma_height = sigma * np.sqrt(np.diag(inverse))
-    return Profile(station_m, height, sigma_height, weight, residual, sigma, falls)
+    return Profile(nodes, height, sigma_height, weight, residual, sigma, falls)
+
+
+def _splines(station: FloatArray, nodes: FloatArray) -> Any:
+    """Return the linear B-splines of the nodes at stations, a sparse matrix (n, nodes)."""
+    from scipy.interpolate import BSpline
+
+    return BSpline.design_matrix(station, np.pad(nodes, 1, "edge"), 1)
 
 
 def _solve(
-    data: _Data, penalty: float, *, falls: bool
+    station: FloatArray, z: FloatArray, nodes: FloatArray, penalty: float, *, falls: bool
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return heights, the points' weights, and the band of the normal equations.
+    """Return heights, the points' weights, and the lower band of the normal equations.
 
     Iteratively reweighted least squares: bends weigh 1 / |bend|, rises 1 or 0, points first by
     Huber, then by Tukey with the scale of the Huber solution.
     """
     from scipy.linalg import solveh_banded
 
-    weight: FloatArray = np.ones(len(data.z))
-    bend: FloatArray = np.ones(data.nodes - 2)
-    rise: FloatArray = np.zeros(data.nodes - 1)
-    stiff, limit = data.stiff(), np.inf
+    splines = _splines(station, nodes)
+    squares, products = splines.power(2).T, splines[:, :-1].multiply(splines[:, 1:]).T
+    before = np.searchsorted(station, nodes[1:-1])
+    stiff = np.minimum(before, len(z) - before) < END_POINTS
+    weight: FloatArray = np.ones(len(z))
+    bend: FloatArray = np.ones(len(nodes) - 2)
+    rise: FloatArray = np.zeros(len(nodes) - 1)
+    limit, band = np.inf, np.zeros((3, len(nodes)))
     for turn in range(2 * _TURNS):
         bends = np.where(stiff, STIFF_PENALTY, penalty * bend)
-        band, right = _normal_equations(data, weight, bends, STIFF_PENALTY * rise)
-        height = solveh_banded(band, right, lower=True)
+        # the squares of second differences (1, -2, 1) and of first ones (-1, 1)
+        band[0] = squares @ weight + np.convolve(bends, [1.0, 4.0, 1.0]) + _LEAST
+        band[0] += np.convolve(STIFF_PENALTY * rise, [1.0, 1.0])
+        band[1, :-1] = products @ weight - np.convolve(bends, [2.0, 2.0]) - STIFF_PENALTY * rise
+        band[2, :-2] = bends
+        height = solveh_banded(band, splines.T @ (weight * z), lower=True)
         bend = 1.0 / np.maximum(np.abs(np.diff(height, 2)), _BEND_M)
         rise = np.where(np.diff(height) > 0.0, float(falls), 0.0)
-        residual = np.abs(data.z - data.fitted(height))
+        residual = np.abs(z - np.interp(station, nodes, height))
         if turn < _TURNS:
             weight = np.minimum(_HUBER_M / np.maximum(residual, 1e-9), 1.0)
             limit = FINAL_C * max(_TO_SIGMA * float(np.median(residual)), LEAST_SCALE_M)
         else:
             weight = tukey_weight(residual / limit)
     return height, weight, band
-
-
-def _normal_equations(
-    data: _Data, weight: FloatArray, bend: FloatArray, rise: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the lower band, shape (3, nodes), and the right side."""
-    n, i, s = data.nodes, data.node, data.share
-    band, right = np.zeros((3, n)), np.zeros(n)
-    for at, part in ((i, 1.0 - s), (i + 1, s)):
-        band[0] += np.bincount(at, weight * part**2, n)
-        right += np.bincount(at, weight * part * data.z, n)
-    band[1] += np.bincount(i, weight * s * (1.0 - s), n)
-    for k, (one, two, three) in enumerate(((1.0, 4.0, 1.0), (-2.0, -2.0, 0.0), (1.0, 0.0, 0.0))):
-        for shift, factor in enumerate((one, two, three)):
-            band[k, shift : shift + n - 2] += factor * bend
-    band[0, :-1] += rise
-    band[0, 1:] += rise
-    band[1, :-1] -= rise
-    band[0] += _LEAST
-    return band, right
