@@ -241,7 +241,7 @@ def correct_chunk(
 def _through_water(plan: Plan, batch: Batch, rows: IntArray, *, covariances: bool) -> Correction:
     """Correct the submerged points of a batch; return the result for all of its points."""
     wet = batch.take(rows)
-    wet = replace(wet, level_sigma_m=plan.found.sigma_level_m(wet.xyz[:, :2]))
+    wet = replace(wet, level_sigma_m=plan.found.sigma_at(wet.xyz[:, :2]))
     found = correct(wet)
     if not covariances:
         found = found._replace(covariance_m2=None)

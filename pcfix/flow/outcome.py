@@ -143,7 +143,7 @@ def _write_shoreline(plan: Plan, tally: CloudTally) -> dict[str, Any] | None:
     from pcfix.flow.shore import write_shoreline
 
     def sigma(xy: FloatArray) -> FloatArray | None:
-        return plan.found.sigma_level_m(xy) if stated is None else np.full(len(xy), stated)
+        return plan.found.sigma_at(xy) if stated is None else np.full(len(xy), stated)
 
     overwrite = plan.options.overwrite
     return write_shoreline(path, tally.shore, sigma, plan.view.crs, overwrite=overwrite)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from os import PathLike
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -35,8 +35,7 @@ from pcfix.water.surface import FoundSurface, OwnWater, build_fields, surface_ab
 if TYPE_CHECKING:
     from pyproj import CRS
 
-    from pcfix.water.fit import WaterFit
-    from pcfix.water.river import RiverFit
+    from pcfix.water.fit import ShoreFit
 
 
 class Points(NamedTuple):
@@ -292,12 +291,10 @@ def _found(view: CloudView | None) -> FoundSurface:
     whole = whole.take(np.flatnonzero(~np.isin(whole.classes, NOISE_CLASSES)))
     water = whole.xyz[np.isin(whole.classes, WATER_CLASSES)]
     if len(water) >= LEAST_CLASSIFIED:
-        thinned = water[:: -(-len(water) // MOST_CLASSIFIED)]
-        fit = fit_water(thinned)
+        fit = fit_water(water[:: -(-len(water) // MOST_CLASSIFIED)])
         note = f"The surface is fitted to the {len(water):,} points that are classified as water."
-        return FoundSurface(fit.surface, fit, thinned, (note, *fit.notes))
-    proposal = find_water(whole.xyz, whole.rgb)
-    return FoundSurface(proposal.surface, proposal, proposal.shoreline)
+        return replace(fit, notes=(note, *fit.notes))
+    return find_water(whole.xyz, whole.rgb)
 
 
 def _fitted(options: WaterOptions, path: File, view: CloudView | None) -> FoundSurface:
@@ -323,7 +320,7 @@ def _fitted(options: WaterOptions, path: File, view: CloudView | None) -> FoundS
         )
         xyz = xyz.copy()
         xyz[lacking, 2] = heights
-    found: WaterFit | RiverFit
+    found: ShoreFit
     if options.water_model == "river":
         corners = (xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0))
         low, high = corners if view is None else (view.low, view.high)
@@ -337,4 +334,4 @@ def _fitted(options: WaterOptions, path: File, view: CloudView | None) -> FoundS
             f"{shore.name}: {len(xyz):,} points along drawn lines count as"
             f" {shore.counts.sum():.0f} independent ones."
         )
-    return FoundSurface(found.surface, found, xyz, (*map(str, notes), *found.notes))
+    return replace(found, notes=(*map(str, notes), *found.notes))

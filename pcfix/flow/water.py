@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.errors import shown_once
+from pcfix.errors import plain, shown_once
 from pcfix.flow.runner import check_summary, write_plot, write_summary
 from pcfix.flow.shore import check_shoreline, write_shoreline
 from pcfix.flow.surfaces import file_points, find_surface, sample_of, view_of
@@ -20,15 +20,13 @@ from pcfix.options.survey import WaterCheckOptions
 from pcfix.report.page import AFTER, BEFORE, WATER, Picture, draw_cloud, label_plan, new_figure
 from pcfix.report.text import Rows, RowTable, aligned, filled, shoreline_rows
 from pcfix.water.auto import WaterProposal
-from pcfix.water.fit import WaterFit
+from pcfix.water.fit import ShoreFit, WaterFit
 from pcfix.water.river import RiverFit
-from pcfix.water.surface import surface_above
+from pcfix.water.surface import FoundSurface, surface_above
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from pcfix.water.surface import FoundSurface
 
 SAMPLE_POINTS = 200_000
 """Points of the cloud that are compared with the water, evenly spread."""
@@ -78,12 +76,12 @@ def check_water(
             above = surface_above(found.surface, one.xyz, one.heights)
             points += NearWater.of(one.xyz, one.xyz[:, 2] - above.height_m)
         shoreline = write_shoreline(
-            given.shoreline, points, found.sigma_level_m, view.crs, overwrite=given.overwrite
+            given.shoreline, points, found.sigma_at, view.crs, overwrite=given.overwrite
         )
     name = None if view is None else view.name
-    report = WaterReport(str(spec), found, name, below, unknown, sample, shoreline)
+    report = WaterReport(str(spec), found, name, below, unknown, shoreline)
     if given.plot is not None:
-        write_plot(given, water_figure(report))
+        write_plot(given, water_figure(found, sample))
     write_summary(given, report.as_dict())
     return report
 
@@ -97,24 +95,18 @@ class WaterReport:
     cloud: str | None
     below: float | None  # share of the cloud's points below the surface
     unknown: float | None  # share of those without a surface above them
-    sample_xyz: FloatArray  # points of the cloud, shape (m, 3), for a picture
     shoreline: dict[str, Any] | None = None  # file, lines and length of the one that was written
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
-        found, fit, points = self.found, self.found.evidence, None
-        if found.points is not None and isinstance(fit, WaterFit | RiverFit):
+        found, points = self.found, None
+        if isinstance(found, ShoreFit):
+            columns = found.points, found.residual_m, found.accepted
             points = [
-                {
-                    "xyz": [float(v) if np.isfinite(v) else None for v in xyz],
-                    "residual_m": float(residual) if np.isfinite(residual) else None,
-                    "accepted": bool(accepted),
-                }
-                for xyz, residual, accepted in zip(
-                    found.points, fit.residual_m, fit.accepted, strict=True
-                )
+                {"xyz": xyz, "residual_m": residual, "accepted": accepted}
+                for xyz, residual, accepted in zip(*columns, strict=True)
             ]
-        return {
+        values: dict[str, Any] = plain({
             "water": self.spec,
             "surface": str(found.surface),
             "fit": found.as_dict(),
@@ -124,19 +116,20 @@ class WaterReport:
             "share_unknown": self.unknown,
             "shoreline": self.shoreline,
             "notes": list(map(str, found.notes)),
-        }
+        })  # fmt: skip
+        return values
 
 
 def water_text(report: WaterReport) -> str:
     """Return the summary of a water surface."""
-    found, fit, rows = report.found, report.found.evidence, list[tuple[str, str]]()
-    if isinstance(fit, WaterFit | RiverFit):
-        rows = _fit_rows(fit, found.points)
-    elif isinstance(fit, WaterProposal):
+    found, rows = report.found, list[tuple[str, str]]()
+    if isinstance(found, ShoreFit):
+        rows = _fit_rows(found)
+    elif isinstance(found, WaterProposal):
         rows = [
-            ("Level", f"{fit.level_m:.3f} m, standard error {fit.sigma_level_m:.3f} m, confidence"
-             f" {fit.confidence:.2f}"),
-            *(("Evidence", reason) for reason in fit.reasons),
+            ("Level", f"{found.level_m:.3f} m, standard error {found.sigma_level_m:.3f} m,"
+             f" confidence {found.confidence:.2f}"),
+            *(("Evidence", reason) for reason in found.reasons),
         ]  # fmt: skip
     if report.below is not None and report.unknown is not None:
         rows.append(("Cloud", f"{100.0 * report.below:.1f} % of {report.cloud} are below the"
@@ -145,39 +138,37 @@ def water_text(report: WaterReport) -> str:
     return aligned(f"{report.spec}: {found.surface}", rows, found.notes)
 
 
-def _fit_rows(fit: WaterFit | RiverFit, points: FloatArray | None) -> Rows:
+def _fit_rows(fit: ShoreFit) -> Rows:
     """Return the rows of a fit, and its rejected points, the largest residual first."""
     residual = fit.residual_m
     good = np.abs(residual[fit.accepted])
     rms, median, largest = np.sqrt(np.mean(good**2)), np.median(good), good.max()
-    rows = filled(_FIT, fit.as_dict() | {"rms": rms, "median": median, "largest": largest})
-    if points is None:
-        return rows
+    spread = {"rms": rms, "median": median, "largest": largest}
+    rows = filled(_FIT, fit.as_dict() | spread)
     rejected = np.flatnonzero(~fit.accepted & np.isfinite(residual))
     rejected = rejected[np.argsort(-np.abs(residual[rejected]), kind="stable")]
     for i in rejected[:MOST_LISTED]:
-        x, y, z = points[i]
+        x, y, z = fit.points[i]
         rows.append(("Rejected", f"{x:.2f}, {y:.2f}, {z:.2f}: {residual[i]:+.3f} m"))
     more = len(rejected) - MOST_LISTED
     return [*rows, ("", f"and {more} more")] if more > 0 else rows
 
 
-def water_figure(report: WaterReport) -> Figure:
+def water_figure(found: FoundSurface, cloud_xyz: FloatArray) -> Figure:
     """Draw cloud and shoreline in plan, and below the residuals of a fit, or the evidence."""
-    found, fit = report.found, report.found.evidence
     figure, (plan, side) = new_figure(8.0, 7.5, nrows=2, height_ratios=[3, 2])
-    is_found = isinstance(fit, WaterProposal)
-    cloud = fit.ground if is_found else report.sample_xyz
-    draw_cloud(figure, plan, cloud, getattr(fit, "level_m", None))
-    title = str(found.surface)
-    if is_found:
-        _draw_evidence(plan, side, fit)
-        title = f"Water {fit.level_m:.3f} ± {fit.sigma_level_m:.3f} m"
-        tilt = 100.0 * float(np.hypot(*fit.tilt))
+    title, shown = str(found.surface), cloud_xyz
+    if isinstance(found, WaterProposal):
+        shown = found.ground
+        title = f"Water {found.level_m:.3f} ± {found.sigma_level_m:.3f} m"
+        tilt = 100.0 * float(np.hypot(*found.tilt))
         title += f", tilt {tilt:.2f} %" if tilt else ""
-        title += f", confidence {fit.confidence:.2f}"
-    elif fit is not None and found.points is not None:
-        _draw_fit(plan, side, found.points, fit)
+        title += f", confidence {found.confidence:.2f}"
+    draw_cloud(figure, plan, shown, getattr(found, "level_m", None))
+    if isinstance(found, WaterProposal):
+        _draw_evidence(plan, side, found)
+    elif isinstance(found, WaterFit | RiverFit):
+        _draw_fit(plan, side, found)
     label_plan(plan, 20.0)
     plan.set_title(title)
     return figure
@@ -185,8 +176,8 @@ def water_figure(report: WaterReport) -> Figure:
 
 def _draw_evidence(plan: Axes, side: Axes, found: WaterProposal) -> None:
     """Draw the shoreline that was found in plan, and the evidence for each height."""
-    name = f"shoreline, {len(found.shoreline):,} places"
-    plan.plot(*found.shoreline[:, :2].T, ".", color="#c2185b", markersize=3, label=name)
+    name = f"shoreline, {len(found.points):,} places"
+    plan.plot(*found.points[:, :2].T, ".", color="#c2185b", markersize=3, label=name)
     reach = 2.0 * found.sigma_level_m
     for name, gain in found.curves.items():
         side.plot(found.curve_height_m, np.maximum(gain, 0.0), label=name)
@@ -199,8 +190,9 @@ def _draw_evidence(plan: Axes, side: Axes, found: WaterProposal) -> None:
         axes.legend(loc="best")
 
 
-def _draw_fit(plan: Axes, side: Axes, points: FloatArray, fit: WaterFit | RiverFit) -> None:
+def _draw_fit(plan: Axes, side: Axes, fit: WaterFit | RiverFit) -> None:
     """Draw the points of a fit in plan, and their heights along the river or the tilt."""
+    points = fit.points
     if isinstance(fit, RiverFit):
         station, label = np.asarray(fit.axis.locate(points[:, :2])[0]), "Down the flow (m)"
     else:
@@ -229,7 +221,7 @@ def _draw_fit(plan: Axes, side: Axes, points: FloatArray, fit: WaterFit | RiverF
 def found_picture(found: FoundSurface) -> Picture:
     """Return the evidence for a level that was found in the cloud, for the page."""
     alt = "How the water was found: shoreline in plan, and the evidence for each height."
-    reasons = found.evidence.reasons if isinstance(found.evidence, WaterProposal) else ()
+    reasons = found.reasons if isinstance(found, WaterProposal) else ()
     alt += "".join(f" {reason[:1].upper()}{reason[1:].rstrip('.')}." for reason in reasons)
-    figure = water_figure(WaterReport("auto", found, None, None, None, np.zeros((0, 3))))
+    figure = water_figure(found, np.zeros((0, 3)))
     return Picture("water", "The water level found in the cloud", alt, figure)

@@ -22,6 +22,7 @@ from pcfix.water.cues import (
     gain_of,
     sample_cloud,
 )
+from pcfix.water.surface import FoundSurface
 
 LEAST_POINTS = 2_000
 LEAST_RELIEF_M = 0.3
@@ -31,11 +32,11 @@ MOST_SHORELINE = 2_000
 INSTEAD = "Give the water surface: a level, shoreline points, plane:a,b,c or a mesh."
 
 
-@dataclass(frozen=True, eq=False)
-class WaterProposal:
-    """A water surface found in a cloud."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class WaterProposal(FoundSurface):
+    """A water surface found in a cloud; its points are where the ground crosses it."""
 
-    surface: WaterPlane
+    points: FloatArray  # (n, 3), metres, world frame
     sigma_level_m: float
     """Standard error of its height at `centre_xy`, by resampling tiles of the cloud. It does not
     include errors that all of the shore shares, such as a bank that stops at the water."""
@@ -46,7 +47,6 @@ class WaterProposal:
     confidence: float  # 0 to 1, by how much the evidence exceeds what is refused
     evidence: dict[str, float]  # figures by name
     reasons: tuple[str, ...]  # the same in sentences
-    shoreline: FloatArray  # (m, 3), where the ground crosses the surface, metres, world frame
     curve_height_m: FloatArray  # (h,), world heights; of a tilted surface, above `centre_xy`
     curves: dict[str, FloatArray]  # (h,), gain (log likelihood ratio) of each cue at each height
     ground: FloatArray  # (c, 3), the cloud thinned to cells, metres, world frame
@@ -371,6 +371,7 @@ def _judged(coarse: Scan) -> WaterProposal:
     level, (b, c) = peak.level_m + rise, peak.tilt.tolist()
     return WaterProposal(
         surface=WaterPlane(level - float(centre @ peak.tilt), b, c),
+        points=shore,
         sigma_level_m=sigma_m,
         centre_xy=centre,
         level_m=level,
@@ -379,7 +380,6 @@ def _judged(coarse: Scan) -> WaterProposal:
         confidence=float(min(1.0 - rival / total, 1.0 - math.exp(-total / (2.0 * least)))),
         evidence=evidence,
         reasons=tuple(sentences),
-        shoreline=shore,
         curve_height_m=coarse.heights_m + rise,
         curves={sums.cue.name: gain_of(sums.shifted(peak.tilt)).gain for sums in coarse.cues},
         ground=samples.xyz + origin,

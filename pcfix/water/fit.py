@@ -1,16 +1,24 @@
-"""Fit a water surface to shoreline points, and take their heights from the cloud."""
+"""Fit a water surface to shoreline points, and take their heights from the cloud.
+
+The regression is for nearly half of the observations wrong: first the least median of residuals,
+found among exact fits to a few points each (Rousseeuw 1984, J. Am. Stat. Assoc. 79: 871-880); then,
+with that median as the scale, Tukey's weights, which are nearly as efficient as least squares
+without outliers. The samples are the same every time. (scipy's `least_squares` with a robust loss
+is only the second half; it needs a start and a scale, and gives every observation a weight.)
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from pcfix.errors import GeometryError
-from pcfix.model import BoolArray, FloatArray, WaterPlane
-from pcfix.water.robust import Regression, ShoreFit, of_all, robust_regression, shared, usable_rows
+from pcfix.model import BoolArray, FloatArray, IntArray, WaterPlane
+from pcfix.water.surface import FoundSurface
 
 Model = Literal["auto", "level", "plane", "along"]
 MAX_TILT_PERCENT = 5.0
@@ -29,11 +37,34 @@ _MOSTLY = 0.6
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class ShoreFit(FoundSurface):
+    """The fit of a water surface to its n shoreline points."""
+
+    points: FloatArray  # (n, 3), metres, world frame
+    residual_m: FloatArray  # (n,), point minus surface; NaN for points without a height
+    weight: FloatArray  # (n,), 0 (rejected) to 1
+    sigma_m: float  # standard deviation of one accepted point; NaN without redundancy
+
+    @property
+    def accepted(self) -> BoolArray:
+        """Which points have a weight, shape (n,)."""
+        return np.asarray(self.weight > 0.0)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the figures of the points as plain values."""
+        return {
+            "sigma_point_m": self.sigma_m,
+            "points": len(self.weight),
+            "accepted": int(self.accepted.sum()),
+            "without_height": int(np.isnan(self.residual_m).sum()),
+        }
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class WaterFit(ShoreFit):
     """A level or a plane, and its accuracy."""
 
     model: Model  # "along" is tilted in the direction of the points, and level across it
-    surface: WaterPlane
     centre_xy: FloatArray  # (2,), centre of the points, metres, world frame
     level_m: float  # height of the surface there
     tilt: FloatArray  # (2,), dz/dx and dz/dy
@@ -86,7 +117,7 @@ class WaterFit(ShoreFit):
             "tilt_percent": self.tilt_percent,
             "sigma_tilt_percent": self.sigma_tilt_percent,
             "downhill_deg": self.downhill_deg,
-            **self.figures(),
+            **super().as_dict(),
         }
 
 
@@ -145,17 +176,20 @@ def fit_water(
             f"The points scatter by {found.sigma_m:.2f} m. They may not be of one surface, or not"
             " on the edge of the water."
         )
+    residual, weight = np.full(len(xyz), np.nan), np.zeros(len(xyz))
+    residual[known], weight[known] = found.residual_m, found.weight
     fit = WaterFit(
-        model=model,
         surface=WaterPlane(level - float(centre @ tilt), *tilt),
+        points=xyz,
+        notes=tuple(notes),
+        model=model,
         centre_xy=centre,
         level_m=level,
         tilt=np.array(tilt),
         covariance=moved @ found.covariance @ moved.T,
-        residual_m=of_all(found.residual_m, known, len(xyz), np.nan),
-        weight=of_all(found.weight, known, len(xyz), 0.0),
+        residual_m=residual,
+        weight=weight,
         sigma_m=found.sigma_m,
-        notes=tuple(notes),
     )
     if not fit.tilt_percent <= MAX_TILT_PERCENT:
         raise GeometryError(
@@ -250,6 +284,123 @@ def _chance_of_tilt(shore: _Shore, fit: Regression, unknowns: int) -> float:
     axes = shore.axes[:tilts]
     tilt, covariance = axes @ fit.beta[1:], axes @ fit.covariance[1:, 1:] @ axes.T
     return float(f.sf(tilt @ np.linalg.solve(covariance, tilt) / tilts, tilts, spare))
+
+
+TUKEY = 4.685061
+"""Tukey's constant for 95 % efficiency."""
+LEAST_SCALE_M = 0.005
+"""Least scatter of residuals for their weights: the edge of water is no sharper."""
+SUBSETS, SAMPLE = 3000, 400
+_ROUNDS, _CONVERGED_M = 200, 1e-10
+TO_SIGMA = 1.4826  # from the median of absolute values of normal numbers
+
+
+def usable_rows(xyz: FloatArray) -> IntArray:
+    """Return the rows of finite points, sorted, so that the order of the points does not matter."""
+    known = np.flatnonzero(np.isfinite(xyz).all(axis=1))
+    return known[np.lexsort(xyz[known].T)]
+
+
+class Regression(NamedTuple):
+    """The fit of z = X beta."""
+
+    beta: FloatArray  # (p,)
+    covariance: FloatArray  # (p, p), of beta; NaN without redundancy
+    sigma_m: float  # standard deviation of one accepted observation; NaN without redundancy
+    residual_m: FloatArray  # (n,), observed minus fitted
+    weight: FloatArray  # (n,), 0 (rejected) to 1
+
+
+def robust_regression(X: FloatArray, z: FloatArray) -> Regression | None:
+    """Fit z = X beta; None if no p observations determine beta.
+
+    The columns of X, shape (n, p), are of similar size; z, shape (n,), is in metres.
+    """
+    rows = np.unique(np.linspace(0, len(z) - 1, min(len(z), SAMPLE)).astype(np.int64))
+    beta = _least_median(X[rows], z[rows])
+    if beta is None:
+        return None
+    # a few observations are fitted too well (Rousseeuw & Leroy 1987, p. 202)
+    few = 1.0 + 5.0 / max(len(z) - X.shape[1], 1)
+    scale = few * TO_SIGMA * float(np.median(np.abs(z - X @ beta)))
+    limit = TUKEY * max(scale, LEAST_SCALE_M)
+    for _ in range(_ROUNDS):
+        before = beta
+        beta = _weighted(X, z, tukey_weight((z - X @ beta) / limit), beta)
+        if float(np.abs(X @ (beta - before)).max()) < _CONVERGED_M:
+            break
+    residual = z - X @ beta
+    covariance, sigma = _spread(X, residual, limit)
+    return Regression(beta, covariance, sigma, residual, tukey_weight(residual / limit))
+
+
+def shared(weight: FloatArray, worth: FloatArray, unknowns: float) -> float:
+    """Return the factor of a covariance for points that depend on their neighbours.
+
+    If the k accepted ones are `worth` m independent observations, the covariance of p unknowns is
+    (k - p) / (m - p) times as large; NaN if m does not exceed p.
+    """
+    accepted = weight > 0.0
+    k, m = float(accepted.sum()), float(worth[accepted].sum())
+    if m >= k:
+        return 1.0
+    return (k - unknowns) / (m - unknowns) if m > unknowns else np.nan
+
+
+def tukey_weight(u: FloatArray) -> FloatArray:
+    """Return Tukey's biweight (1 - u^2)^2, zero beyond |u| = 1."""
+    return np.asarray(np.where(np.abs(u) < 1.0, (1.0 - u * u) ** 2, 0.0))
+
+
+def _least_median(X: FloatArray, z: FloatArray) -> FloatArray | None:
+    """Return the exact fit to p observations with the least median residual, if there is one."""
+    rows = _subsets(*X.shape)
+    size = np.abs(np.linalg.det(X[rows])) if X.shape[0] >= X.shape[1] else np.empty(0)
+    good = size > 1e-9
+    if not good.any():
+        return None
+    fits = np.linalg.solve(X[rows[good]], z[rows[good]][..., None])[..., 0]
+    middle = min((len(z) + X.shape[1]) // 2, len(z) - 1)
+    median = np.partition(np.abs(z[:, None] - X @ fits.T), middle, axis=0)[middle]
+    return np.asarray(fits[np.argmin(median)])
+
+
+def _subsets(n: int, p: int) -> IntArray:
+    """Return subsets of p of n row numbers: all, or `SUBSETS` random ones."""
+    if math.comb(n, p) <= SUBSETS:
+        return np.array(list(combinations(range(n), p)), np.int64).reshape(-1, p)
+    drawn = np.random.default_rng(0).integers(0, n, (2 * SUBSETS, p))
+    ordered = np.sort(drawn, axis=1)
+    different = (np.diff(ordered, axis=1) > 0).all(axis=1)
+    return np.asarray(ordered[different][:SUBSETS])
+
+
+def _weighted(X: FloatArray, z: FloatArray, weight: FloatArray, beta: FloatArray) -> FloatArray:
+    """Return the weighted least squares solution, or beta if there is none."""
+    root = np.sqrt(weight)
+    solution, _, rank, _ = np.linalg.lstsq(X * root[:, None], z * root, rcond=1e-10)
+    return np.asarray(solution) if rank == X.shape[1] else beta
+
+
+def _spread(X: FloatArray, residual: FloatArray, limit: float) -> tuple[FloatArray, float]:
+    """Return the covariance of an M-estimate, and the standard deviation of one observation.
+
+    K^2 sum psi^2 / (m - p) / mean(psi')^2 (X' X)^-1 over the m accepted, with
+    K = 1 + p / m var(psi') / mean(psi')^2 (Huber & Ronchetti 2009, Robust Statistics, eq 7.81).
+    """
+    inside = np.abs(residual) < limit
+    X, residual = X[inside], residual[inside]
+    spare = len(residual) - X.shape[1]
+    if spare <= 0:
+        return np.full((X.shape[1],) * 2, np.nan), np.nan
+    u2 = (residual / limit) ** 2
+    psi = residual * (1.0 - u2) ** 2
+    slopes = (1.0 - u2) * (1.0 - 5.0 * u2)
+    slope = float(slopes.mean())
+    k = 1.0 + X.shape[1] / len(residual) * float(slopes.var()) / slope**2
+    inverse = np.linalg.pinv(X.T @ X)
+    sigma = float(np.sqrt((residual**2).sum() / spare))
+    return np.asarray(k**2 * (psi**2).sum() / spare / slope**2 * inverse), sigma
 
 
 NEIGHBOURS = 25

@@ -4,11 +4,17 @@ The order of the points along the river is that of their shortest paths through 
 two ends, as in Isomap (Tenenbaum et al. 2000, Science 290: 2319-2323). The axis is a principal
 curve (Hastie & Stuetzle 1989, J. Am. Stat. Assoc. 84: 502-516): smoothed over about the width of
 the river, with the points projected onto it, several times.
+
+The profile is robust, smooth, and falling: linear B-splines with a penalty on bends (P-splines:
+Eilers & Marx 1996, Statistical Science 11: 89-121). The penalty grows with the size of a bend
+instead of its square (trend filtering: Kim et al. 2009, SIAM Review 51: 339-360), so that pools,
+riffles and weirs keep their edges; its weight comes from cross-validation. Rises have a penalty of
+their own (Bollaerts et al. 2006, Statistics in Medicine 25: 1189-1206).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +22,15 @@ import numpy as np
 
 from pcfix.errors import GeometryError
 from pcfix.model import FloatArray, WaterMesh
-from pcfix.water.robust import Profile, ShoreFit, fit_profile, of_all, usable_rows
+from pcfix.water.fit import (
+    LEAST_SCALE_M,
+    TO_SIGMA,
+    TUKEY,
+    ShoreFit,
+    shared,
+    tukey_weight,
+    usable_rows,
+)
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -30,7 +44,6 @@ Bounds = tuple[float, float, float, float]
 class RiverFit(ShoreFit):
     """A water surface along a river, and its accuracy."""
 
-    surface: WaterMesh  # over the given bounds
     axis: Axis  # downstream
     profile: Profile  # height along the axis, by its station
 
@@ -53,7 +66,7 @@ class RiverFit(ShoreFit):
             "drop_m": float(heights[0] - heights[-1]),
             "sigma_level_m": float(self.profile.sigma_height_m.mean()),
             "falls": self.profile.falls,
-            **self.figures(),
+            **super().as_dict(),
         }
 
 
@@ -104,14 +117,17 @@ def fit_river(
         )
     if len(known) < len(points):
         notes.append(f"{len(points) - len(known)} points have no height and are ignored.")
+    residual, weight = np.full(len(points), np.nan), np.zeros(len(points))
+    residual[known], weight[known] = profile.residual_m, profile.weight
     return RiverFit(
         surface=_mesh(axis, profile, bounds, name),
+        points=points,
+        notes=tuple(notes),
         axis=axis,
         profile=profile,
-        residual_m=of_all(profile.residual_m, known, len(points), np.nan),
-        weight=of_all(profile.weight, known, len(points), 0.0),
+        residual_m=residual,
+        weight=weight,
         sigma_m=profile.sigma_m,
-        notes=tuple(notes),
     )
 
 
@@ -234,3 +250,126 @@ def _smoothed(xy: FloatArray, station: FloatArray, bandwidth: float) -> FloatArr
     flat = size <= 1e-9 * s0**2 * bandwidth**2
     local[flat], size[flat] = weight[flat], s0[flat]
     return np.asarray(local @ xy / size[:, None])
+
+
+FOLDS = 5
+PENALTIES = tuple(10.0 ** np.arange(-4.0, 3.5, 0.5))
+MOST_NODES, NODES_A_POINT = 400, 2
+STIFF_PENALTY = 1e3
+"""Penalty on rises, and on bends near the ends."""
+END_POINTS = 7
+"""The outermost points are on one straight piece, so that a single one cannot bend it."""
+RISES_IF_WORSE = 1.25
+"""The surface may rise downstream if the scatter of the points is larger by this otherwise."""
+_TURNS, _BEND_M, _HUBER_M = 12, 1e-3, 0.02
+_LEAST = 1e-12  # keeps the equations solvable without points
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """Heights along a river."""
+
+    station_m: FloatArray  # (m,), evenly spaced, from the first point to the last
+    height_m: FloatArray  # (m,)
+    sigma_height_m: FloatArray  # (m,), standard errors
+    weight: FloatArray  # (n,), of the points, 0 to 1
+    residual_m: FloatArray  # (n,)
+    sigma_m: float  # standard deviation of one accepted point
+    falls: bool  # whether it was forced to fall
+
+    def height_at(self, station_m: FloatArray) -> FloatArray:
+        """Return heights at stations, constant beyond the ends."""
+        return np.interp(station_m, self.station_m, self.height_m)
+
+    def sigma_at(self, station_m: FloatArray) -> FloatArray:
+        """Return standard errors of heights, constant beyond the ends."""
+        return np.interp(station_m, self.station_m, self.sigma_height_m)
+
+
+def fit_profile(station_m: FloatArray, z: FloatArray, worth: FloatArray | None = None) -> Profile:
+    """Fit the height of the water, shape (n,), which falls with the station, downstream.
+
+    Each point is `worth` a number of independent observations, 1 by default; see `shared`.
+    """
+    order = np.lexsort((z, station_m))
+    count = int(np.clip(NODES_A_POINT * len(z), 20, MOST_NODES))
+    nodes = np.linspace(station_m.min(), station_m.max(), count)
+    falling, free = (
+        _fit(station_m[order], z[order], nodes, falls=falls) for falls in (True, False)
+    )
+    held = falling.sigma_m <= RISES_IF_WORSE * max(free.sigma_m, LEAST_SCALE_M)
+    fit, back = falling if held else free, np.argsort(order)
+    fit = replace(fit, weight=fit.weight[back], residual_m=fit.residual_m[back])
+    if worth is None:
+        return fit
+    grown = np.sqrt(shared(fit.weight, worth, 0.0))
+    return replace(fit, sigma_height_m=fit.sigma_height_m * grown)
+
+
+def _fit(station: FloatArray, z: FloatArray, nodes: FloatArray, *, falls: bool) -> Profile:
+    """Fit heights, with the penalty that cross-validation prefers, and their standard errors."""
+    from scipy.linalg import solveh_banded
+
+    # each fold is predicted from the others; its errors count up to a limit, for the outliers
+    fold = np.arange(len(z)) % FOLDS
+    missed = np.empty((len(PENALTIES), len(z)))
+    for row, penalty in enumerate(PENALTIES):
+        for k in range(FOLDS):
+            rest, out = fold != k, fold == k
+            height = _solve(station[rest], z[rest], nodes, penalty, falls=falls)[0]
+            missed[row, out] = np.abs(z[out] - np.interp(station[out], nodes, height))
+    limit = TUKEY * max(TO_SIGMA * float(np.median(missed, axis=1).min()), LEAST_SCALE_M)
+    best = PENALTIES[int(np.argmin((np.minimum(missed, limit) ** 2).mean(axis=1)))]
+    height, weight, band = _solve(station, z, nodes, best, falls=falls)
+    inverse = solveh_banded(band, np.eye(len(nodes)), lower=True)
+    splines = _splines(station, nodes)
+    variance = splines.multiply(splines @ inverse).sum(axis=1)
+    residual, accepted = z - np.interp(station, nodes, height), weight > 0.0
+    spare = accepted.sum() - float((weight * np.asarray(variance).ravel()).sum())
+    sigma = float(np.sqrt((residual[accepted] ** 2).sum() / max(spare, 1.0)))
+    sigma_height = sigma * np.sqrt(np.diag(inverse))
+    return Profile(nodes, height, sigma_height, weight, residual, sigma, falls)
+
+
+def _splines(station: FloatArray, nodes: FloatArray) -> Any:
+    """Return the linear B-splines of the nodes at stations, a sparse matrix (n, nodes)."""
+    from scipy.interpolate import BSpline
+
+    return BSpline.design_matrix(station, np.pad(nodes, 1, "edge"), 1)
+
+
+def _solve(
+    station: FloatArray, z: FloatArray, nodes: FloatArray, penalty: float, *, falls: bool
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return heights, the points' weights, and the lower band of the normal equations.
+
+    Iteratively reweighted least squares: bends weigh 1 / |bend|, rises 1 or 0, points first by
+    Huber, then by Tukey with the scale of the Huber solution.
+    """
+    from scipy.linalg import solveh_banded
+
+    splines = _splines(station, nodes)
+    squares, products = splines.power(2).T, splines[:, :-1].multiply(splines[:, 1:]).T
+    before = np.searchsorted(station, nodes[1:-1])
+    stiff = np.minimum(before, len(z) - before) < END_POINTS
+    weight: FloatArray = np.ones(len(z))
+    bend: FloatArray = np.ones(len(nodes) - 2)
+    rise: FloatArray = np.zeros(len(nodes) - 1)
+    limit, band = np.inf, np.zeros((3, len(nodes)))
+    for turn in range(2 * _TURNS):
+        bends = np.where(stiff, STIFF_PENALTY, penalty * bend)
+        # the squares of second differences (1, -2, 1) and of first ones (-1, 1)
+        band[0] = squares @ weight + np.convolve(bends, [1.0, 4.0, 1.0]) + _LEAST
+        band[0] += np.convolve(STIFF_PENALTY * rise, [1.0, 1.0])
+        band[1, :-1] = products @ weight - np.convolve(bends, [2.0, 2.0]) - STIFF_PENALTY * rise
+        band[2, :-2] = bends
+        height = solveh_banded(band, splines.T @ (weight * z), lower=True)
+        bend = 1.0 / np.maximum(np.abs(np.diff(height, 2)), _BEND_M)
+        rise = np.where(np.diff(height) > 0.0, float(falls), 0.0)
+        residual = np.abs(z - np.interp(station, nodes, height))
+        if turn < _TURNS:
+            weight = np.minimum(_HUBER_M / np.maximum(residual, 1e-9), 1.0)
+            limit = TUKEY * max(TO_SIGMA * float(np.median(residual)), LEAST_SCALE_M)
+        else:
+            weight = tukey_weight(residual / limit)
+    return height, weight, band

@@ -33,20 +33,19 @@ from pcfix.model import (
 
 @dataclass(frozen=True, eq=False)
 class FoundSurface:
-    """A water surface and its origin."""
+    """A water surface that was given; its subclasses are fitted, or found in a cloud."""
 
     surface: WaterSurface
-    evidence: Any = None  # a `WaterFit`, `RiverFit` or `WaterProposal`; None if it was given
-    points: FloatArray | None = None  # (n, 3), fitted shoreline points, metres, the cloud's CRS
+    points: FloatArray | None = None  # (n, 3), shoreline points, metres, the cloud's CRS
     notes: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any] | None:
         """Return the figures of a fit as plain values; None without a fit."""
-        return None if self.evidence is None else dict(self.evidence.as_dict())
+        return None
 
-    def sigma_level_m(self, xy: FloatArray) -> FloatArray | None:
-        """Return the standard error of the water's height at places, if its fit has one."""
-        return None if self.evidence is None else np.asarray(self.evidence.sigma_at(xy))
+    def sigma_at(self, xy: FloatArray) -> FloatArray | None:
+        """Return the standard error (m) of the height at places (m, 2), if there is a fit."""
+        return None
 
 
 class SurfaceAbove(NamedTuple):

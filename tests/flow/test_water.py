@@ -85,7 +85,7 @@ def test_tilted_river(river, tmp_path):
     points, wrong = river.shoreline(seed=5)
     path = write_points(tmp_path / "shore.csv", points)
     report = check_water(path)
-    fit = report.found.evidence
+    fit = report.found
     corners = np.array([[x, y] for x in (0, 1) for y in (0, 1)]) * (river.high - river.low)
     corners = corners + river.low
     miss = fit.height_at(corners) - river.height_at(corners)
@@ -168,7 +168,7 @@ def test_points_without_heights(tmp_path):
     path = write_points(tmp_path / "shore.csv", near[:, :2], names="x,y")
     report = check_water(path, water_model="level", water_crs=CRS, cloud=CLOUD)
     # the bank is 3 % steep and rough by some centimetres
-    assert report.found.evidence.level_m == pytest.approx(LEVEL_M, abs=0.1)
+    assert report.found.level_m == pytest.approx(LEVEL_M, abs=0.1)
     with pytest.raises(pcfix.InputError):
         check_water(path)
 

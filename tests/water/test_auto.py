@@ -58,8 +58,8 @@ def test_slope_only():
 
 def test_tilt():
     found = found_of(0.004)
-    along = found.shoreline[:, 1] - NORTH_M
-    error = found.level_m + (found.shoreline[:, :2] - found.centre_xy) @ found.tilt
+    along = found.points[:, 1] - NORTH_M
+    error = found.level_m + (found.points[:, :2] - found.centre_xy) @ found.tilt
     assert found.tilt[1] == pytest.approx(0.004, abs=4.0 * found.sigma_tilt)
     assert np.abs(error - LEVEL_M - 0.004 * along).max() < 0.08  # m, at the ends too
 
@@ -80,7 +80,7 @@ def test_water_classes():
     chunks = [Points(xyz[rows], None, classes[rows]) for rows in (slice(3_000), slice(3_000, None))]
     view = CloudView("cloud", None, *corners(*xyz[:, :2].T), len(xyz), lambda _: iter(chunks))
     found = find_surface("auto", WaterOptions(), view)
-    assert found.evidence.level_m == pytest.approx(LEVEL_M + 1.0, abs=0.005)  # m: 5 standard errors
+    assert found.level_m == pytest.approx(LEVEL_M + 1.0, abs=0.005)  # m: 5 standard errors
     assert len(found.points) == len(water)
 
 
