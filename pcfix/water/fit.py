@@ -72,32 +72,6 @@ class WaterFit(ShoreFit):
     """Of `level_m` and `tilt`, shape (3, 3): zero for what the model does not have, NaN without
     redundancy. It does not include errors that all points share, as of a wrong datum."""
 
-    @property
-    def sigma_level_m(self) -> float:
-        """Standard error of the level at the centre of the points."""
-        return math.sqrt(self.covariance[0, 0])
-
-    @property
-    def tilt_percent(self) -> float:
-        """The steepest slope."""
-        return 100.0 * math.hypot(*self.tilt)
-
-    @property
-    def sigma_tilt_percent(self) -> float:
-        """Standard error of the slope in its own direction."""
-        steepest = math.hypot(*self.tilt)
-        if steepest == 0.0:
-            return 100.0 * float(np.hypot(*np.sqrt(np.diag(self.covariance)[1:])))
-        along = self.tilt / steepest
-        return 100.0 * math.sqrt(float(along @ self.covariance[1:, 1:] @ along))
-
-    @property
-    def downhill_deg(self) -> float:
-        """Direction in which the surface falls, clockwise from the y axis; NaN for a level."""
-        if not self.tilt.any():
-            return math.nan
-        return math.degrees(math.atan2(-self.tilt[0], -self.tilt[1])) % 360.0
-
     def height_at(self, xy: FloatArray) -> FloatArray:
         """Return the height (m) of the surface at places (m, 2)."""
         return np.asarray(self.level_m + (xy - self.centre_xy) @ self.tilt)
@@ -108,15 +82,19 @@ class WaterFit(ShoreFit):
         return np.sqrt(np.einsum("ij,jk,ik->i", row, self.covariance, row))
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the figures as plain values."""
+        """Return the figures as plain values; a level has no downhill direction."""
+        east, north = self.tilt.tolist()
+        steepest = math.hypot(east, north)
+        along = self.tilt / steepest if steepest else np.zeros(2)
         return {
             "model": self.model,
             "level_m": self.level_m,
-            "sigma_level_m": self.sigma_level_m,
+            "sigma_level_m": math.sqrt(self.covariance[0, 0]),
             "at_xy": self.centre_xy.tolist(),
-            "tilt_percent": self.tilt_percent,
-            "sigma_tilt_percent": self.sigma_tilt_percent,
-            "downhill_deg": self.downhill_deg,
+            "tilt_percent": 100.0 * steepest,
+            "sigma_tilt_percent": 100.0 * math.sqrt(along @ self.covariance[1:, 1:] @ along),
+            # clockwise from the y axis
+            "downhill_deg": math.degrees(math.atan2(-east, -north)) % 360.0 if steepest else None,
             **super().as_dict(),
         }
 
@@ -191,13 +169,14 @@ def fit_water(
         weight=weight,
         sigma_m=found.sigma_m,
     )
-    if not fit.tilt_percent <= MAX_TILT_PERCENT:
+    figures = fit.as_dict()
+    if not figures["tilt_percent"] <= MAX_TILT_PERCENT:
         raise GeometryError(
             "water.tilt",
-            f"The shoreline points are tilted by {fit.tilt_percent:.1f} % (standard error"
-            f" {fit.sigma_tilt_percent:.1f} %), more than {MAX_TILT_PERCENT:g} %. Check their"
-            " heights and units, or fit a level.",
-            tilt=fit.tilt_percent / 100.0,
+            f"The shoreline points are tilted by {figures['tilt_percent']:.1f} % (standard error"
+            f" {figures['sigma_tilt_percent']:.1f} %), more than {MAX_TILT_PERCENT:g} %. Check"
+            " their heights and units, or fit a level.",
+            tilt=figures["tilt_percent"] / 100.0,
         )
     return fit
 

@@ -92,7 +92,7 @@ def test_tilted_river(river, tmp_path):
     # noise of 1 cm on 24 good points: standard error 4 mm at a corner, so that 2 cm are 4 of them
     assert np.abs(miss).max() < 0.02
     assert set(np.flatnonzero(~fit.accepted)) == set(wrong)
-    assert fit.tilt_percent == pytest.approx(0.3, abs=0.03)
+    assert fit.as_dict()["tilt_percent"] == pytest.approx(0.3, abs=0.03)
     found = pcfix.correct_points(
         river.apparent, river.cameras, report.found.surface, views=river.views
     )
