@@ -144,7 +144,7 @@ def _label(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
     check(plan, tally)
     outs["Classification"] = classes
     outs.update(cloud.flags())
-    found = {**tally.counts(), "labelling": plan.labelling.report(tally.excluded)}
+    found = {**tally.of_classes(), "labelling": plan.labelling.report(tally)}
     namespace["out_metadata"] = metadata_of(found, unpacked=cloud.unpacked)
 
 

@@ -29,11 +29,10 @@ from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import corrected_identity, labelling_vlr, noted_header
 from pcfix.io.tiles import Clouds
 from pcfix.label.areas import WaterMask
-from pcfix.label.labelling import LabelCounts, Labelling, LabelSummary, Part, sets_class
+from pcfix.label.labelling import LabelCounts, Labelling, LabelSummary, Part
 from pcfix.model import WaterPlane, WaterSurface
 from pcfix.options.correct import LabelOptions, LabelRules, StageLabelOptions
 from pcfix.options.declare import File, taken
-from pcfix.sums import Sums
 from pcfix.version import __version__
 from pcfix.water.checks import as_surface, check_submerged, check_tilt, checked_points
 from pcfix.water.surface import surface_above
@@ -98,7 +97,7 @@ def label_points(
         water_mask = mask_of(water_mask, crs)
     part = Part(points, surface_above(surface, points, heights), given)
     labelling = Labelling(rules, water_mask).scanned(lambda: [part], *corners(*points[:, :2].T))
-    return labelling.labels(part).classes
+    return labelling.labels(part)[0]
 
 
 def label_file(
@@ -157,22 +156,6 @@ class LabelPlan:
     labelling: Labelling
 
 
-@dataclass(frozen=True)
-class LabelTally(Sums):
-    """Counts of points, by the names of `LabelSummary`."""
-
-    submerged: int
-    water_surface: int
-    stale: int
-    water_unknown: int
-    points: int
-    excluded: LabelCounts
-
-    def counts(self) -> dict[str, int]:
-        """Return the counts without those of the excluded points."""
-        return {name: value for name, value in vars(self).items() if name != "excluded"}
-
-
 def plan_labelling(options: StageLabelOptions, view: CloudView) -> LabelPlan:
     """Read water and mask, and scan the surroundings of all points if the rules need them."""
     water = find_surface(options.water, options, view).surface
@@ -183,26 +166,16 @@ def plan_labelling(options: StageLabelOptions, view: CloudView) -> LabelPlan:
     return LabelPlan(view.name, water, labelling)
 
 
-def label_chunk(plan: LabelPlan, points: Points) -> tuple[Classes, LabelTally]:
+def label_chunk(plan: LabelPlan, points: Points) -> tuple[Classes, LabelCounts]:
     """Return the classes of some points, and their counts."""
     (part,) = parts_of([points], plan.water)
-    labels = plan.labelling.labels(part)
-    stale = sets_class(part.classes) & ~(labels.submerged | labels.at_surface)
-    unknown = np.isnan(part.surface.height_m)
-    return labels.classes, LabelTally(
-        submerged=int(labels.submerged.sum()),
-        water_surface=int(labels.at_surface.sum()),
-        stale=int(stale.sum()),
-        water_unknown=int(unknown.sum()),
-        points=len(unknown),
-        excluded=labels.counts,
-    )
+    return plan.labelling.labels(part)
 
 
-def check(plan: LabelPlan, tally: LabelTally) -> None:
+def check(plan: LabelPlan, counts: LabelCounts) -> None:
     """Raise GeometryError if no point lies below the water, or inside the mask."""
-    below = tally.submerged + tally.water_surface
-    plan.labelling.check(plan.name, tally.excluded, below)
+    below = counts.submerged + counts.water_surface
+    plan.labelling.check(plan.name, counts, below)
     check_submerged(below, plan.name, plan.water)
 
 
@@ -223,7 +196,7 @@ class _Labelling:
         self.header = noted_header(source, labelling_vlr(content))
         self.identity = corrected_identity(source)
 
-    def compute(self, points: Chunk, row: int) -> tuple[Classes, LabelTally]:
+    def compute(self, points: Chunk, row: int) -> tuple[Classes, LabelCounts]:
         """Return the classes of the points of a chunk."""
         return label_chunk(self._plan, points_of(points, self._source, self._plan.water))
 
@@ -234,15 +207,15 @@ class _Labelling:
         return new
 
 
-def _summarize(plan: LabelPlan, tally: LabelTally, findings: None, ends: Ends) -> LabelSummary:
+def _summarize(plan: LabelPlan, counts: LabelCounts, findings: None, ends: Ends) -> LabelSummary:
     return LabelSummary(
         input=ends.input,
         output=ends.output,
         pcfix=__version__,
-        **tally.counts(),
+        **counts.of_classes(),
         water=str(plan.water),
         settings=plan.labelling.settings.as_dict(),
-        labelling=plan.labelling.report(tally.excluded),
+        labelling=plan.labelling.report(counts),
         seconds=round(ends.seconds, 3),
         warnings=list(plan.labelling.notes),
         part=ends.part,

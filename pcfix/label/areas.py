@@ -103,7 +103,7 @@ class Grid:
         self._dead_m, self._water_points = dead_band_m, 0
         shape = self.lattice.rows, self.lattice.columns
         self._flags: Flags = np.zeros(shape, np.uint8)
-        self._votes: IntArray = np.zeros(shape if dead_band_m else (1, 1), np.int64)
+        self._votes: IntArray = np.zeros(shape, np.int64)
 
     def add(self, x: FloatArray, y: FloatArray, height_m: FloatArray, counts: BoolArray) -> None:
         """Add n points with their heights above the water surface, NaN if unknown.
@@ -173,17 +173,11 @@ class Grid:
 
 
 def _halved(lattice: Lattice, flags: Flags, votes: IntArray) -> tuple[Lattice, Flags, IntArray]:
-    """Return the same in cells of twice the side."""
+    """Return the same in cells of twice the side, which begin at even columns and rows."""
     _, column, row, columns, rows = lattice
-    west, south = column % 2, row % 2  # the cells to add, for pairs that begin with an even one
-    pad = (south, (south + rows) % 2), (west, (west + columns) % 2)
-
-    def quads(cells: npt.NDArray[Any]) -> list[npt.NDArray[Any]]:
-        full = np.pad(cells, pad) if np.any(pad) else cells
-        return [full[i::2, j::2] for i in (0, 1) for j in (0, 1)]
-
-    if votes.size == flags.size:
-        votes = np.add.reduce(quads(votes))
-    flags = np.bitwise_or.reduce(quads(flags))
+    for axis, (first, count) in enumerate(((row, rows), (column, columns))):
+        pairs = np.maximum(np.arange(-(first % 2), count, 2), 0)
+        flags = np.bitwise_or.reduceat(flags, pairs, axis)
+        votes = np.add.reduceat(votes, pairs, axis)
     rows, columns = flags.shape
     return Lattice(lattice.side_m * 2.0, column // 2, row // 2, columns, rows), flags, votes

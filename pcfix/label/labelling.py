@@ -42,25 +42,27 @@ class Part(NamedTuple):
     classes: Classes  # (n,)
 
 
-class Labels(NamedTuple):
-    """The new classes of n points, which of them were set to 40 and 41, and what was excluded."""
-
-    classes: Classes
-    submerged: BoolArray
-    at_surface: BoolArray
-    counts: LabelCounts
-
-
 @dataclass(frozen=True)
 class LabelCounts(Sums):
-    """Counts of the points below the water that the rules exclude, and the corners of these."""
+    """Counts of points by their new classes, and of those that the rules exclude."""
 
+    points: int = 0
+    submerged: int = 0  # of class 40 now because they are submerged
+    water_surface: int = 0  # of class 41 now because they are in the band
+    stale: int = 0  # class 40 or 41 in the input and neither now; set to 1 with `reset`
+    water_unknown: int = 0  # without a known height of the water
+    # points below the water, how many of them are excluded, and their corners
     below: int = 0
     outside_mask: int = 0
     respected: int = 0
     low: FloatArray = field(default_factory=lambda: np.full(2, np.inf), metadata=LEAST)
     high: FloatArray = field(default_factory=lambda: np.full(2, -np.inf), metadata=MOST)
     in_pool: IntArray | None = None  # points of each separate pool
+
+    def of_classes(self) -> dict[str, int]:
+        """Return the counts by new classes, by the names of `LabelSummary`."""
+        names = ("submerged", "water_surface", "stale", "water_unknown", "points")
+        return {name: getattr(self, name) for name in names}
 
 
 @dataclass(frozen=True)
@@ -125,16 +127,17 @@ class Labelling:
         wet[rows], counts = self._decided(xyz[rows], height[rows], classes[rows])
         return wet, counts
 
-    def labels(self, part: Part) -> Labels:
-        """Return the new classes of points; those of land do not change."""
+    def labels(self, part: Part) -> tuple[Classes, LabelCounts]:
+        """Return the new classes of points, and their counts; those of land do not change."""
         wet, counts = self.submerged(*part)
-        new = part.classes.copy()
+        new, respected = part.classes.copy(), self._is_respected(part.classes)
+        before = sets_class(part.classes)
         if self.settings.reset:
-            new[sets_class(part.classes) & ~self._is_respected(part.classes)] = UNCLASSIFIED
+            new[before & ~respected] = UNCLASSIFIED
         at_surface = np.zeros(len(wet), np.bool_)
         if self.settings.band > 0.0:
             near = _within(part.xyz[:, 2] - part.surface.height_m, self.settings.band)
-            rows = np.flatnonzero(near & ~self._is_respected(part.classes))
+            rows = np.flatnonzero(near & ~respected)
             x, y = np.ascontiguousarray(part.xyz[rows, :2].T)
             keep = self._is_inside(x, y)
             if self.around is not None and self.around.joined is not None:
@@ -142,7 +145,14 @@ class Labelling:
             at_surface[rows[keep]] = True
         wet &= ~at_surface
         new[wet], new[at_surface] = BATHYMETRIC_POINT, WATER_SURFACE
-        return Labels(new, wet, at_surface, counts)
+        return new, replace(
+            counts,
+            points=len(wet),
+            submerged=int(wet.sum()),
+            water_surface=int(at_surface.sum()),
+            stale=int((before & ~(wet | at_surface)).sum()),
+            water_unknown=int(np.isnan(part.surface.height_m).sum()),
+        )
 
     def _is_respected(self, classes: Classes) -> BoolArray:
         return np.isin(classes, self.settings.respect_classes)
@@ -167,12 +177,12 @@ class Labelling:
                 in_pool = np.bincount(pool[wet & ~stays[pool]], minlength=len(stays))
                 wet &= stays[pool]
         return wet, LabelCounts(
-            int(below.sum()),
-            int((below & ~inside).sum()),
-            int((below & inside & respected).sum()),
-            xyz[below, :2].min(axis=0, initial=np.inf),
-            xyz[below, :2].max(axis=0, initial=-np.inf),
-            in_pool,
+            below=int(below.sum()),
+            outside_mask=int((below & ~inside).sum()),
+            respected=int((below & inside & respected).sum()),
+            low=xyz[below, :2].min(axis=0, initial=np.inf),
+            high=xyz[below, :2].max(axis=0, initial=-np.inf),
+            in_pool=in_pool,
         )
 
     def check(self, name: str, counts: LabelCounts, submerged: int | None = None) -> None:
@@ -254,10 +264,10 @@ class LabelSummary:
     output: str
     pcfix: str
     points: int
-    submerged: int  # of class 40 now because they are submerged
-    water_surface: int  # of class 41 now because they are in the band
-    stale: int  # class 40 or 41 in the input and neither now; set to 1 with `reset`
-    water_unknown: int  # without a known height of the water
+    submerged: int  # this and the next three: see `LabelCounts`
+    water_surface: int
+    stale: int
+    water_unknown: int
     water: str
     settings: dict[str, Any]
     labelling: dict[str, Any] | None  # excluded points, by rule

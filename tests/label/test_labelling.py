@@ -36,12 +36,12 @@ def labelled(part, mask=None, pieces=1, corners=None, **choices):
     low, high = part.xyz[:, :2].min(axis=0), part.xyz[:, :2].max(axis=0)
     labelling = Labelling(LabelRules(**choices), mask).scanned(parts, *(corners or (low, high)))
     labels = [labelling.labels(p) for p in parts()]
-    counts = reduce(add, [one.counts for one in labels])
+    counts = reduce(add, [one for _, one in labels])
     counted = SimpleNamespace(
         report=lambda: labelling.report(counts),
         check=lambda name, submerged=None: labelling.check(name, counts, submerged),
     )
-    return np.concatenate([one.classes for one in labels]), counted
+    return np.concatenate([classes for classes, _ in labels]), counted
 
 
 def beach(count=60_000, noise_m=0.03, seed=1):
