@@ -95,19 +95,10 @@ def check_above_water(
 
     `level_offset_m`, shape (k,), is the height of the water at each image above the surface.
     """
-    match water:
-        case WaterPlane(a, b, c):
-            level = a + b * cameras.centres[:, 0] + c * cameras.centres[:, 1]
-        case WaterMesh(vertices):
-            from scipy.spatial import cKDTree
-
-            nearest = cKDTree(vertices[:, :2]).query(cameras.centres[:, :2])[1]
-            level = vertices[nearest, 2]
-        case WaterRaster():
-            height = surface_above(water, cameras.centres).height_m
-            level = np.where(np.isnan(height), np.nanmin(water.height_m), height)
-        case WaterDimension():
-            return  # known with the points only; see `correct_file`
+    if isinstance(water, WaterDimension):
+        return  # known with the points only; see `correct_file`
+    height = surface_above(water, cameras.centres).height_m
+    level = np.where(np.isnan(height), _heights_of(water).min(initial=np.inf), height)
     offset = 0.0 if level_offset_m is None else level_offset_m
     refuse_under_water(cameras, level + offset, str(water))
 
@@ -198,7 +189,7 @@ class WaterMeeting(Sums):
             points=len(z),
             submerged=len(depth),
             uncovered=int(unknown.sum()),
-            uncovered_low=int((z[unknown] < _highest(water)).sum()),
+            uncovered_low=int((z[unknown] < _heights_of(water).max(initial=-np.inf)).sum()),
             doubtful=int((depth > DOUBTFUL_M).sum()),
             too_deep=int((depth > TOO_DEEP_M).sum()),
             low_m=float(z.min(initial=np.inf)),
@@ -229,25 +220,23 @@ class WaterMeeting(Sums):
             )  # fmt: skip
         few = DEEP_SHARE * self.submerged
         land = "" if self.submerged < self.points else "; no point is left as land"
-        why = f"the deepest {self.most_depth_m:.0f} m {where}{land}{self._heights()}"
+
+        def deeper(points: int, limit_m: float) -> str:
+            return (
+                f"{name}: {points:,} of {self.submerged:,} submerged points lie deeper than"
+                f" {limit_m:g} m, the deepest {self.most_depth_m:.0f} m {where}{land}"
+                f"{self._heights()}. Check the height of the water and its vertical datum"
+            )
+
         if self.too_deep > few and not deep:
             raise GeometryError(
                 "water.too_deep",
-                f"{name}: {self.too_deep:,} of {self.submerged:,} submerged points lie deeper"
-                f" than {TOO_DEEP_M:g} m, {why}. Check the height of the water and its vertical"
-                " datum, or use --deep if the depths are right.",
+                f"{deeper(self.too_deep, TOO_DEEP_M)}, or use --deep if the depths are right.",
                 path=name, points=self.too_deep, depth_m=self.most_depth_m,
             )  # fmt: skip
         if self.doubtful > few:
-            found.append(
-                PcfixWarning(
-                    "water.deep",
-                    f"{name}: {self.doubtful:,} of {self.submerged:,} submerged points lie deeper"
-                    f" than {DOUBTFUL_M:g} m, {why}. Check the height of the water and its vertical"
-                    " datum.",
-                    points=self.doubtful,
-                )
-            )
+            text = f"{deeper(self.doubtful, DOUBTFUL_M)}."
+            found.append(PcfixWarning("water.deep", text, points=self.doubtful))
         if self.uncovered_low:
             found.append(
                 PcfixWarning(
@@ -277,12 +266,12 @@ class WaterMeeting(Sums):
         return text
 
 
-def _highest(water: WaterSurface) -> float:
-    """Return the greatest height of a surface that may not cover all points."""
+def _heights_of(water: WaterSurface) -> FloatArray:
+    """Return the heights of a surface that may not cover all points; none of the others."""
     match water:
         case WaterMesh(vertices):
-            return float(vertices[:, 2].max())
+            return vertices[:, 2]
         case WaterRaster(height_m):
-            return float(np.nanmax(height_m))
+            return height_m[np.isfinite(height_m)]
         case _:
-            return -np.inf
+            return np.zeros(0)
