@@ -131,7 +131,7 @@ class Labelling:
         """Return the new classes of points, and their counts; those of land do not change."""
         wet, counts = self.submerged(*part)
         new, respected = part.classes.copy(), self._is_respected(part.classes)
-        before = sets_class(part.classes)
+        before = np.isin(part.classes, (BATHYMETRIC_POINT, WATER_SURFACE))
         if self.settings.reset:
             new[before & ~respected] = UNCLASSIFIED
         at_surface = np.zeros(len(wet), np.bool_)
@@ -249,11 +249,6 @@ class Labelling:
 
 def _within(height: FloatArray, reach_m: float) -> BoolArray:
     return np.asarray(np.abs(height) <= reach_m) if reach_m else np.zeros(len(height), np.bool_)
-
-
-def sets_class(classes: Classes) -> BoolArray:
-    """Return which classes are among those that a labelling sets."""
-    return np.asarray((classes == BATHYMETRIC_POINT) | (classes == WATER_SURFACE))
 
 
 @dataclass(frozen=True)

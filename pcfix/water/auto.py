@@ -43,7 +43,6 @@ class WaterProposal(FoundSurface):
     centre_xy: FloatArray  # (2,), centre of the shoreline, metres, world frame
     level_m: float  # height of the surface there
     tilt: FloatArray  # (2,), dz/dx and dz/dy
-    sigma_tilt: float  # standard error of the tilt along the shore; NaN if it was not searched
     confidence: float  # 0 to 1, by how much the evidence exceeds what is refused
     evidence: dict[str, float]  # figures by name
     reasons: tuple[str, ...]  # the same in sentences
@@ -243,12 +242,11 @@ def _refine(samples: Samples, start: Peak, step: FloatArray) -> tuple[Peak, Scan
     return peak, _scan_at(samples, peak.level_m + reach, peak.tilt)
 
 
-def _choose(coarse: Scan) -> tuple[Peak, Scan, float]:
-    """Return the level, or the plane if its tilt is significant and gains enough.
+def _choose(coarse: Scan) -> tuple[Peak, Scan]:
+    """Return the level, or the plane if its tilt is significant and gains enough, and its sums.
 
-    Then follow the sums near it, and the standard error of its tilt along the shore, NaN for a
-    level. Standing water is level, and flowing water is level across: it may only fall along the
-    line of the shore.
+    Standing water is level, and flowing water is level across: it may only fall along the line of
+    the shore.
     """
     samples = coarse.samples
     start = _best(coarse, NO_TILT[None])
@@ -263,11 +261,10 @@ def _choose(coarse: Scan) -> tuple[Peak, Scan, float]:
     if tilted.score > start.score:
         plane, near_plane = _refine(samples, tilted, step * axis)
         along = abs(float(plane.tilt @ axis))
-        if plane.score > level.score + TILT_GAIN and along <= LARGEST_TILT:
-            sigma_tilt = _sigma_tilt(near_plane, axis, step)
-            if along > TILT_SIGMAS * sigma_tilt:
-                return plane, near_plane, sigma_tilt
-    return level, near, math.nan
+        gains = plane.score > level.score + TILT_GAIN and along <= LARGEST_TILT
+        if gains and along > TILT_SIGMAS * _sigma_tilt(near_plane, axis, step):
+            return plane, near_plane
+    return level, near
 
 
 def _around(near: Scan) -> tuple[FloatArray, BoolArray]:
@@ -310,7 +307,7 @@ LEAST_SHARE = 0.005
 def _judged(coarse: Scan) -> WaterProposal:
     """Return the best surface; GeometryError ``water.not_found`` if its evidence is not enough."""
     samples, origin = coarse.samples, coarse.samples.origin
-    peak, near, sigma_tilt = _choose(coarse)
+    peak, near = _choose(coarse)
     sigma_m = _sigma_level(near)
     total, evidence, sentences, strong = 0.0, dict[str, float](), list[str](), list[Cue]()
     for sums in near.cues:
@@ -376,7 +373,6 @@ def _judged(coarse: Scan) -> WaterProposal:
         centre_xy=centre,
         level_m=level,
         tilt=peak.tilt,
-        sigma_tilt=sigma_tilt,
         confidence=float(min(1.0 - rival / total, 1.0 - math.exp(-total / (2.0 * least)))),
         evidence=evidence,
         reasons=tuple(sentences),
@@ -386,14 +382,13 @@ def _judged(coarse: Scan) -> WaterProposal:
     )
 
 
-TILTS = (-0.02, -0.015, -0.01, -0.0075, -0.005, -0.0025, 0.0025, 0.005, 0.0075, 0.01, 0.015, 0.02)
-DIRECTIONS = 4
+TILTS = (0.0025, 0.005, 0.0075, 0.01, 0.015, 0.02)
 REACH_M, LEAST_APART_M = 2.0, 0.3
 """Largest distance from the given water in the middle of the cloud; least one from end to end."""
 LEAST_GAIN, MOST_LEFT, ABOUT_AS_GOOD = 100.0, 0.4, 0.9
 """Least evidence of a tilted waterline; the largest share of it for the level one; and the share
 from which another tilt is as likely, as the tilt across a straight shore is unknown."""
-_WINDS = ("east", "north-east", "north", "north-west", "west", "south-west", "south", "south-east")
+_WINDS = ("west", "south-west", "south", "south-east", "east", "north-east", "north", "north-west")
 
 
 class Tilted(NamedTuple):
@@ -409,23 +404,21 @@ def _find_tilt(coarse: Scan) -> Tilted | None:
     """Return the tilt of a waterline, if any; heights of `coarse` are above the given water."""
     samples = coarse.samples
     middle = np.median(samples.xyz[:, :2], axis=0)
-    angles = np.arange(DIRECTIONS) * np.pi / DIRECTIONS
+    angles = np.pi + np.arange(len(_WINDS)) * np.pi / 4.0
     directions = np.column_stack([np.cos(angles), np.sin(angles)])
-    tilts = [slope * one for slope in sorted(TILTS, key=abs) for one in directions]
     peaks = list[Peak]()
-    for tilt in (NO_TILT, *tilts):
+    for tilt in (NO_TILT, *(slope * one for slope in TILTS for one in directions)):
         at_middle = coarse.heights_m + samples.origin[2] + middle @ tilt
         gain = np.where(np.abs(at_middle) <= REACH_M, _gains(coarse, tilt), 0.0)
         row = int(np.argmax(gain))
         peaks.append(Peak(float(coarse.heights_m[row]), tilt, float(gain[row])))
     level, *peaks = peaks
     least = ABOUT_AS_GOOD * max(one.score for one in peaks)
-    peak = next(one for one in peaks if one.score >= least)  # the least tilt
+    best = next(i for i, one in enumerate(peaks) if one.score >= least)  # the least tilt
+    peak, wind = peaks[best], _WINDS[best % len(_WINDS)]
     if peak.score < LEAST_GAIN or level.score > MOST_LEFT * peak.score:
         return None
     heights = samples.xyz[peak.shore(samples), :2] @ peak.tilt + peak.level_m + samples.origin[2]
     if len(heights) < 2 or np.ptp(heights) < LEAST_APART_M:
         return None
-    slope = float(np.hypot(*peak.tilt))
-    wind = round(float(np.arctan2(peak.tilt[1], peak.tilt[0])) / (np.pi / 4.0)) % len(_WINDS)
-    return Tilted(_WINDS[wind], slope, float(heights.min()), float(heights.max()))
+    return Tilted(wind, float(np.hypot(*peak.tilt)), float(heights.min()), float(heights.max()))

@@ -92,8 +92,8 @@ class Gain(NamedTuple):
 
 def gain_of(moments: Moments, times: FloatArray | None = None) -> Gain:
     """Add the tiles, each `times` times, and return the gain of the break."""
-    sums = moments.sums if times is None else moments.sums * times[:, None, None]
-    count = moments.number if times is None else moments.number * times[:, None]
+    times = np.ones(len(moments.sums)) if times is None else times
+    sums, count = moments.sums * times[:, None, None], moments.number * times[:, None]
     yy, yx, yf, xx, xf, ff = np.moveaxis(sums.sum(axis=0), -1, 0)
     slope, share = yx / (xx + _TINY), xf / (xx + _TINY)
     sse = np.maximum(yy - slope * yx, 0.0) + _TINY
@@ -114,7 +114,7 @@ def gain_of(moments: Moments, times: FloatArray | None = None) -> Gain:
         sums[..., 2] - trend * sums[..., 4] - amplitude * sums[..., 5]
         - share * (sums[..., 1] - trend * sums[..., 3] - amplitude * sums[..., 4])
     )  # fmt: skip
-    scatter = (scores**2 if times is None else scores**2 / np.maximum(times, 1.0)[:, None]).sum(0)
+    scatter = (scores**2 / np.maximum(times, 1.0)[:, None]).sum(axis=0)
     held = np.maximum(variance * own, scatter)
     sigma = np.sqrt(held) / own
     temper = variance * own / (held + _TINY)

@@ -304,9 +304,12 @@ def robust_regression(X: FloatArray, z: FloatArray) -> Regression | None:
     scale = few * TO_SIGMA * float(np.median(np.abs(z - X @ beta)))
     limit = TUKEY * max(scale, LEAST_SCALE_M)
     for _ in range(_ROUNDS):
-        before = beta
-        beta = _weighted(X, z, tukey_weight((z - X @ beta) / limit), beta)
-        if float(np.abs(X @ (beta - before)).max()) < _CONVERGED_M:
+        root = np.sqrt(tukey_weight((z - X @ beta) / limit))
+        better, _, rank, _ = np.linalg.lstsq(X * root[:, None], z * root, rcond=1e-10)
+        if rank < X.shape[1]:
+            break
+        change, beta = np.abs(X @ (better - beta)).max(), np.asarray(better, np.float64)
+        if change < _CONVERGED_M:
             break
     residual = z - X @ beta
     covariance, sigma = _spread(X, residual, limit)
@@ -333,32 +336,20 @@ def tukey_weight(u: FloatArray) -> FloatArray:
 
 def _least_median(X: FloatArray, z: FloatArray) -> FloatArray | None:
     """Return the exact fit to p observations with the least median residual, if there is one."""
-    rows = _subsets(*X.shape)
-    size = np.abs(np.linalg.det(X[rows])) if X.shape[0] >= X.shape[1] else np.empty(0)
-    good = size > 1e-9
-    if not good.any():
+    n, p = X.shape
+    if math.comb(n, p) <= SUBSETS:
+        rows = np.array(list(combinations(range(n), p)), np.int64).reshape(-1, p)
+    else:
+        drawn = np.random.default_rng(0).integers(0, n, (2 * SUBSETS, p))
+        ordered = np.sort(drawn, axis=1)
+        rows = ordered[(np.diff(ordered, axis=1) > 0).all(axis=1)][:SUBSETS]
+    good = rows[np.abs(np.linalg.det(X[rows])) > 1e-9]
+    if not len(good):
         return None
-    fits = np.linalg.solve(X[rows[good]], z[rows[good]][..., None])[..., 0]
-    middle = min((len(z) + X.shape[1]) // 2, len(z) - 1)
+    fits = np.linalg.solve(X[good], z[good][..., None])[..., 0]
+    middle = min((n + p) // 2, n - 1)
     median = np.partition(np.abs(z[:, None] - X @ fits.T), middle, axis=0)[middle]
     return np.asarray(fits[np.argmin(median)])
-
-
-def _subsets(n: int, p: int) -> IntArray:
-    """Return subsets of p of n row numbers: all, or `SUBSETS` random ones."""
-    if math.comb(n, p) <= SUBSETS:
-        return np.array(list(combinations(range(n), p)), np.int64).reshape(-1, p)
-    drawn = np.random.default_rng(0).integers(0, n, (2 * SUBSETS, p))
-    ordered = np.sort(drawn, axis=1)
-    different = (np.diff(ordered, axis=1) > 0).all(axis=1)
-    return np.asarray(ordered[different][:SUBSETS])
-
-
-def _weighted(X: FloatArray, z: FloatArray, weight: FloatArray, beta: FloatArray) -> FloatArray:
-    """Return the weighted least squares solution, or beta if there is none."""
-    root = np.sqrt(weight)
-    solution, _, rank, _ = np.linalg.lstsq(X * root[:, None], z * root, rcond=1e-10)
-    return np.asarray(solution) if rank == X.shape[1] else beta
 
 
 def _spread(X: FloatArray, residual: FloatArray, limit: float) -> tuple[FloatArray, float]:

@@ -14,7 +14,7 @@ their own (Bollaerts et al. 2006, Statistics in Medicine 25: 1189-1206).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -53,7 +53,8 @@ class RiverFit(ShoreFit):
 
     def sigma_at(self, xy: FloatArray) -> FloatArray:
         """Return the standard error (m) of that height."""
-        return self.profile.sigma_at(self.axis.locate(xy)[0])
+        station, sigma = self.profile.station_m, self.profile.sigma_height_m
+        return np.interp(self.axis.locate(xy)[0], station, sigma)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the figures as plain values."""
@@ -104,8 +105,13 @@ def fit_river(
     upper = station <= np.median(station)
     if not upper.all() and np.median(used[upper, 2]) < np.median(used[~upper, 2]):
         axis = Axis(axis.xy[::-1].copy(), axis.width_m)  # downstream
-    worth = None if counts is None else counts[known]
-    profile = fit_profile(axis.locate(used[:, :2])[0], used[:, 2], worth)
+        station, _ = axis.locate(used[:, :2])
+    order = np.lexsort((used[:, 2], station))
+    known, station, z = known[order], station[order], used[order, 2]
+    worth = np.ones(len(known)) if counts is None else np.asarray(counts, np.float64)[known]
+    falling, free = (_fit_profile(station, z, worth, falls=falls) for falls in (True, False))
+    held = falling.sigma_m <= RISES_IF_WORSE * max(free.sigma_m, LEAST_SCALE_M)
+    profile = falling if held else free
     notes = [
         f"Beyond the outermost points the surface is constant: {profile.height_m[0]:.2f} m upstream"
         f" and {profile.height_m[-1]:.2f} m downstream."
@@ -281,35 +287,17 @@ class Profile:
         """Return heights at stations, constant beyond the ends."""
         return np.interp(station_m, self.station_m, self.height_m)
 
-    def sigma_at(self, station_m: FloatArray) -> FloatArray:
-        """Return standard errors of heights, constant beyond the ends."""
-        return np.interp(station_m, self.station_m, self.sigma_height_m)
 
-
-def fit_profile(station_m: FloatArray, z: FloatArray, worth: FloatArray | None = None) -> Profile:
+def _fit_profile(station: FloatArray, z: FloatArray, worth: FloatArray, *, falls: bool) -> Profile:
     """Fit the height of the water, shape (n,), which falls with the station, downstream.
 
-    Each point is `worth` a number of independent observations, 1 by default; see `shared`.
+    The stations are sorted. Each point is `worth` a number of independent observations; see
+    `shared`. Cross-validation chooses the penalty.
     """
-    order = np.lexsort((z, station_m))
-    count = int(np.clip(NODES_A_POINT * len(z), 20, MOST_NODES))
-    nodes = np.linspace(station_m.min(), station_m.max(), count)
-    falling, free = (
-        _fit(station_m[order], z[order], nodes, falls=falls) for falls in (True, False)
-    )
-    held = falling.sigma_m <= RISES_IF_WORSE * max(free.sigma_m, LEAST_SCALE_M)
-    fit, back = falling if held else free, np.argsort(order)
-    fit = replace(fit, weight=fit.weight[back], residual_m=fit.residual_m[back])
-    if worth is None:
-        return fit
-    grown = np.sqrt(shared(fit.weight, worth, 0.0))
-    return replace(fit, sigma_height_m=fit.sigma_height_m * grown)
-
-
-def _fit(station: FloatArray, z: FloatArray, nodes: FloatArray, *, falls: bool) -> Profile:
-    """Fit heights, with the penalty that cross-validation prefers, and their standard errors."""
     from scipy.linalg import solveh_banded
 
+    count = int(np.clip(NODES_A_POINT * len(z), 20, MOST_NODES))
+    nodes = np.linspace(station[0], station[-1], count)
     # each fold is predicted from the others; its errors count up to a limit, for the outliers
     fold = np.arange(len(z)) % FOLDS
     missed = np.empty((len(PENALTIES), len(z)))
@@ -327,7 +315,7 @@ def _fit(station: FloatArray, z: FloatArray, nodes: FloatArray, *, falls: bool) 
     residual, accepted = z - np.interp(station, nodes, height), weight > 0.0
     spare = accepted.sum() - float((weight * np.asarray(variance).ravel()).sum())
     sigma = float(np.sqrt((residual[accepted] ** 2).sum() / max(spare, 1.0)))
-    sigma_height = sigma * np.sqrt(np.diag(inverse))
+    sigma_height = sigma * np.sqrt(np.diag(inverse) * shared(weight, worth, 0.0))
     return Profile(nodes, height, sigma_height, weight, residual, sigma, falls)
 
 

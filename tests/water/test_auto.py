@@ -60,7 +60,7 @@ def test_tilt():
     found = found_of(0.004)
     along = found.points[:, 1] - NORTH_M
     error = found.level_m + (found.points[:, :2] - found.centre_xy) @ found.tilt
-    assert found.tilt[1] == pytest.approx(0.004, abs=4.0 * found.sigma_tilt)
+    assert found.tilt[1] == pytest.approx(0.004, abs=0.00125)  # 4 standard errors
     assert np.abs(error - LEVEL_M - 0.004 * along).max() < 0.08  # m, at the ends too
 
 
