@@ -100,7 +100,7 @@ class Grid:
     def __init__(self, low: FloatArray, high: FloatArray, dead_band_m: float) -> None:
         self.lattice = lattice_over(low, high)
         self.low, self.high = np.full(2, np.inf), np.full(2, -np.inf)
-        self._dead_m, self._water_points = dead_band_m, 0
+        self._dead_m, self._water_points, self._overflows = dead_band_m, 0, False
         shape = self.lattice.rows, self.lattice.columns
         self._flags: Flags = np.zeros(shape, np.uint8)
         self._votes: IntArray = np.zeros(shape, np.int64)
@@ -117,7 +117,8 @@ class Grid:
         row, column = self.lattice.cells(x, y)
         rows, columns = self._flags.shape
         if row.min() < 0 or row.max() >= rows or column.min() < 0 or column.max() >= columns:
-            return  # the grid does not fit
+            self._overflows = True
+            return
         cell = row * self.lattice.columns + column
         counts = counts & ~np.isnan(height_m)
         below = counts & (height_m < -self._dead_m)
@@ -133,12 +134,8 @@ class Grid:
     @property
     def fits(self) -> bool:
         """Whether the points so far would have the same grid."""
-        own, fitting = self.lattice, lattice_over(self.low, self.high)
-        across, up = fitting.first_column - own.first_column, fitting.first_row - own.first_row
         return (
-            own.side_m == fitting.side_m
-            and 0 <= across <= own.columns - fitting.columns
-            and 0 <= up <= own.rows - fitting.rows
+            not self._overflows and lattice_over(self.low, self.high).side_m == self.lattice.side_m
         )
 
     def surroundings(self, *, connected: bool, least_pool_m2: float | None) -> Surroundings:

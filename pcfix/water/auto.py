@@ -11,17 +11,7 @@ import numpy.typing as npt
 
 from pcfix.errors import GeometryError
 from pcfix.model import BoolArray, FloatArray, WaterPlane
-from pcfix.water.cues import (
-    BLUE,
-    RED,
-    SLOPE,
-    Cue,
-    Moments,
-    Samples,
-    cue_moments,
-    gain_of,
-    sample_cloud,
-)
+from pcfix.water.cues import BLUE, RED, SLOPE, Moments, Samples, cue_moments, gain_of, sample_cloud
 from pcfix.water.surface import FoundSurface
 
 LEAST_POINTS = 2_000
@@ -309,14 +299,14 @@ def _judged(coarse: Scan) -> WaterProposal:
     samples, origin = coarse.samples, coarse.samples.origin
     peak, near = _choose(coarse)
     sigma_m = _sigma_level(near)
-    total, evidence, sentences, strong = 0.0, dict[str, float](), list[str](), list[Cue]()
+    total, evidence, sentences, strong = 0.0, dict[str, float](), list[str](), list[str]()
     for sums in near.cues:
         cue, middle = sums.cue, len(near.heights_m) // 2
         gain, size, sigma = (float(figure[middle]) for figure in gain_of(sums))
         evidence[f"{cue.name} gain"] = gain
         total += max(gain, 0.0)
         if gain >= LEAST_EACH:
-            strong.append(cue)
+            strong.append(cue.name)
             evidence[f"{cue.name} amplitude"], evidence[f"{cue.name} sigma"] = size, sigma
             text = f"the logarithm of the ratio falls by {-size:.2f} ± {sigma:.2f} per metre"
             if cue == SLOPE:
@@ -334,9 +324,9 @@ def _judged(coarse: Scan) -> WaterProposal:
     # what is needed depends on the cues that gain enough to count
     least, most_rival, lift = LEAST_AGREED, MOST_RIVAL_AGREED, LIFTS[0]
     if len(strong) < 2:
-        coloured = any(cue.colour is not None for cue in strong)
+        coloured = any(name != SLOPE.name for name in strong)
         least, most_rival = (LEAST_COLOUR_SINGLE if coloured else LEAST_SINGLE), MOST_RIVAL_SINGLE
-    if strong == [SLOPE]:
+    if strong == [SLOPE.name]:
         lift = evidence["slope amplitude"]
     shore = samples.xyz[peak.shore(samples)]
     reason = ""

@@ -133,24 +133,11 @@ def check_submerged(count: int, name: str, water: WaterSurface, heights: str = "
 
 def check_tilt(water: WaterSurface) -> None:
     """Raise GeometryError ``water.tilt`` if a surface is steeper than `MOST_TILT` as a whole."""
-    tilt = overall_tilt(water)
-    if tilt > MOST_TILT:
-        raise GeometryError(
-            "water.tilt",
-            f"The water surface ({water}) is tilted by {100.0 * tilt:.1f} %, more than"
-            f" {100 * MOST_TILT:g} %. Check its units, the order of the numbers, and that it"
-            " contains only water.",
-            tilt=tilt,
-        )
-
-
-def overall_tilt(water: WaterSurface) -> float:
-    """Return the rise per metre of a surface, or of the plane that fits it best."""
     match water:
         case WaterPlane(_, b, c):
-            return float(np.hypot(b, c))
+            xyz = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, b], [0.0, 1.0, c]])
         case WaterDimension():
-            return 0.0
+            return
         case WaterMesh():
             xyz = water.vertices[np.unique(water.triangles)]
         case WaterRaster():
@@ -161,7 +148,15 @@ def overall_tilt(water: WaterSurface) -> float:
             xyz = np.column_stack([column * width, -row * height, water.height_m[row, column]])
     local = xyz - xyz.mean(axis=0)
     slope = np.linalg.lstsq(local[:, :2], local[:, 2], rcond=1e-6)[0]  # of a line, along it
-    return float(np.hypot(*slope))
+    tilt = float(np.hypot(*slope))
+    if tilt > MOST_TILT:
+        raise GeometryError(
+            "water.tilt",
+            f"The water surface ({water}) is tilted by {100.0 * tilt:.1f} %, more than"
+            f" {100 * MOST_TILT:g} %. Check its units, the order of the numbers, and that it"
+            " contains only water.",
+            tilt=tilt,
+        )
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,8 @@ LIFT = 0.36
 """n - 1 and a little more for oblique rays: the apparent reduction of slopes."""
 MOST_FADING = 1.2
 """Per metre. Clear water has about 0.3, twice the difference in attenuation over the gamma of
-images; faster changes, except in the darkest water, are of the ground: plants, or a wet edge."""
+images; faster changes, except in the darkest water, are of the ground: plants, or a wet edge. They
+count less, and not at all from twice as much."""
 
 
 class Cue(NamedTuple):
@@ -46,16 +47,11 @@ class Cue(NamedTuple):
     tile_cells: float  # side of a tile
     window_m: float  # observations weigh less towards this distance above and below
     scale_m: float = math.inf  # D; infinite for a straight line below
-    sign: float = 1.0  # +1 or -1, of the amplitude
-    amplitude: float | None = None  # given by physics, or free
-    most: float = math.inf  # a larger free amplitude is unlikely, twice as much impossible
+    amplitude: float | None = None  # given by physics, or negative and free
 
 
 SLOPE = Cue("slope", "the ground looks flatter below", None, 12.0, 0.6, amplitude=LIFT)
-RED = Cue(
-    "red/green", "red fades against green below", 0, 24.0, 0.8,
-    scale_m=0.7, sign=-1.0, most=MOST_FADING,
-)  # fmt: skip
+RED = Cue("red/green", "red fades against green below", 0, 24.0, 0.8, scale_m=0.7)
 BLUE = RED._replace(name="blue/green", meaning="blue fades against green below", colour=2)
 
 
@@ -102,8 +98,8 @@ def gain_of(moments: Moments, times: FloatArray | None = None) -> Gain:
     cue = moments.cue
     if cue.amplitude is None:
         steady = np.clip(2.0 - 2.0 * np.abs(slope / (amplitude + _TINY) - share), 0.0, 1.0)
-        likely = np.clip(2.0 - np.abs(amplitude) / cue.most, 0.0, 1.0)
-        saved = np.maximum(cue.sign * cross, 0.0) ** 2 / own * steady * likely
+        likely = np.clip(2.0 - np.abs(amplitude) / MOST_FADING, 0.0, 1.0)
+        saved = np.minimum(cross, 0.0) ** 2 / own * steady * likely
     else:
         saved = 2.0 * cue.amplitude * cross - cue.amplitude**2 * own
     left = np.maximum(sse - saved, 1e-3 * sse)

@@ -398,18 +398,18 @@ def heights_from_cloud(xy: FloatArray, cloud_xyz: FloatArray, radius_m: float) -
 
     On the edge of the water half of the neighbours are on land and half on the bed, so that on an
     even bank their median is the height of the edge. Places have the shape (n, 2), the cloud (m,
-    3), metres, in one frame; only points within the radius count. NaN for fewer than `FEWEST`.
+    3), metres, in one frame, thinned by `is_near`; only points within the radius count. NaN for
+    fewer than `FEWEST`.
     """
     from scipy.spatial import cKDTree
 
     height = np.full(len(xy), np.nan)
-    near = cloud_xyz[is_near(xy, cloud_xyz, radius_m)] if len(xy) else cloud_xyz[:0]
-    if len(near) == 0:
+    if not len(xy) or not len(cloud_xyz):
         return height
     beyond = np.nextafter(radius_m, np.inf)
-    away, row = cKDTree(near[:, :2]).query(xy, NEIGHBOURS, distance_upper_bound=beyond)
+    away, row = cKDTree(cloud_xyz[:, :2]).query(xy, NEIGHBOURS, distance_upper_bound=beyond)
     found = np.isfinite(away)
-    z = np.where(found, near[np.where(found, row, 0), 2], np.nan)
+    z = np.where(found, cloud_xyz[np.where(found, row, 0), 2], np.nan)
     enough = found.sum(axis=1) >= FEWEST
     height[enough] = np.nanmedian(z[enough], axis=1)
     return height

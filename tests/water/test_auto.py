@@ -123,7 +123,7 @@ def test_amplitude_of_break():
     everything = []
     for tile in range(3):
         at = rng.uniform(-1.0, 1.0, 200)
-        y = tile + 0.1 * at + 0.5 * np.maximum(-at, 0.0) + rng.normal(0.0, 0.05, 200)
+        y = tile + 0.1 * at + 0.5 * np.minimum(at, 0.0) + rng.normal(0.0, 0.05, 200)
         parts.append(tile_moments(np.ones((200, 1)), y, at, heights, cue))
         everything.append((tile, at, y))
     gain = gain_of(Moments(*map(np.array, zip(*parts, strict=True)), None, heights, cue))
