@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -111,17 +112,14 @@ def find_elsewhere(
     tilted : Tilted or None
     """
     samples = sample_cloud(np.column_stack([xyz[:, :2], xyz[:, 2] - water_m]), rgb)
-    try:
+    found, tilted = None, None
+    with suppress(GeometryError):  # flat ground, or too little evidence
         coarse = _scanned(samples)
-    except GeometryError:  # flat ground shows nothing
-        return None, None
-    tilted, gain = _find_tilt(coarse), _gains(coarse, NO_TILT)
-    here = gain[np.abs(coarse.heights_m + samples.origin[2]) <= DIFFERENT_M].max(initial=0.0)
-    if gain.max() < LEAST_AGREED or here > MOST_RIVAL_AGREED * gain.max():
-        return None, tilted
-    try:
-        found = _judged(coarse)
-    except GeometryError:
+        tilted, gain = _find_tilt(coarse), _gains(coarse, NO_TILT)
+        here = gain[np.abs(coarse.heights_m + samples.origin[2]) <= DIFFERENT_M].max(initial=0.0)
+        if gain.max() >= LEAST_AGREED and here <= MOST_RIVAL_AGREED * gain.max():
+            found = _judged(coarse)
+    if found is None:
         return None, tilted
     differs = abs(found.level_m) > max(DIFFERENT_M, DIFFERENT_SIGMAS * found.sigma_level_m)
     sure = found.evidence["total gain"] >= LEAST_AGAINST or (

@@ -145,14 +145,14 @@ def tile_moments(
     # the products of all columns, f last, at each height
     fixed = np.column_stack([smooth, y, x])
     products = (fixed[:, :, None] * fixed[:, None, :]).reshape(len(y), -1)
-    whole = np.zeros((len(rows), p + 3, p + 3))
-    whole[:, :-1, :-1] = (weight @ products).reshape(-1, p + 2, p + 2)
-    whole[:, -1, :-1] = whole[:, :-1, -1] = (weight * f) @ fixed
-    whole[:, -1, -1] = (weight * f * f).sum(axis=1)
+    normal = np.zeros((len(rows), p + 3, p + 3))
+    normal[:, :-1, :-1] = (weight @ products).reshape(-1, p + 2, p + 2)
+    normal[:, -1, :-1] = normal[:, :-1, -1] = (weight * f) @ fixed
+    normal[:, -1, -1] = (weight * f * f).sum(axis=1)
     # without the smooth part: its normal equations are eliminated
-    normal, right = whole[:, :p, :p], whole[:, :p, p:]
-    ridge = 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(p)
-    rest = whole[:, p:, p:] - np.swapaxes(right, 1, 2) @ np.linalg.solve(normal + ridge, right)
+    inner, right = normal[:, :p, :p], normal[:, :p, p:]
+    ridge = 1e-9 * np.trace(inner, axis1=1, axis2=2)[:, None, None] * np.eye(p)
+    rest = normal[:, p:, p:] - np.swapaxes(right, 1, 2) @ np.linalg.solve(inner + ridge, right)
     sums[rows] = rest[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
     count[rows] = np.maximum(total[enough] ** 2 / (weight**2).sum(axis=1) - p, 1.0)
     return sums, count

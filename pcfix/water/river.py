@@ -118,7 +118,7 @@ def fit_river(
     ]
     if not profile.falls:
         notes.append(
-            "The points do not fall along the whole river, so the surface may rise. Check the"
+            "The points do not fall all along the river, so the surface may rise. Check the"
             " direction of the line along the river, and the points."
         )
     if len(known) < len(points):
@@ -208,7 +208,7 @@ def flow_axis(xy: FloatArray) -> Axis:
         gap = float(np.quantile(np.diff(np.sort(station)), 0.9))  # one in ten is wider
         bandwidth = max(width, gap, 1e-3)
         nodes = _smoothed(places, station, bandwidth)
-    # longer at both ends, so that the outermost points are beside the line
+    # longer at both ends, so that the outermost points have feet on the line
     outward = nodes[[0, -1]] - nodes[[1, -2]]
     outward /= np.maximum(np.hypot(*outward.T), 1e-9)[:, None]
     first, last = nodes[[0, -1]] + 2.0 * bandwidth * outward
