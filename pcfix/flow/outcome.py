@@ -19,7 +19,7 @@ from pcfix.refract.batch import UNLISTED
 from pcfix.refract.reconstructions import CAUSES
 from pcfix.refract.tally import Summary, Tally
 from pcfix.version import __version__
-from pcfix.water.checks import refuse_under_water
+from pcfix.water.checks import check_submerged, refuse_under_water
 
 if TYPE_CHECKING:
     from pcfix.flow.diagnosis import Poses
@@ -53,7 +53,7 @@ def check(plan: Plan, tally: CloudTally) -> Findings:
     plan.labelling.check(name, tally.labels)
     water_notes, water = list[str](), plan.found.surface
     if tally.water is not None:
-        tally.water.check_submerged(name, water)
+        check_submerged(tally.water.submerged, name, water, tally.water.heights())
         if isinstance(water, WaterDimension):
             refuse_under_water(plan.cameras, figures.lowest_water_m, str(water))
         water_notes = tally.water.check_reach(name, water, deep=plan.options.deep)

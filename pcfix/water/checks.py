@@ -194,10 +194,6 @@ class WaterMeeting(Sums):
             most_depth_m=float(depth.max(initial=0.0)),
         )
 
-    def check_submerged(self, name: str, water: WaterSurface) -> None:
-        """Raise GeometryError if no point lies below the water."""
-        check_submerged(self.submerged, name, water, self._heights())
-
     def check_reach(self, name: str, water: WaterSurface, *, deep: bool = False) -> list[str]:
         """Check for water far above the cloud; warn of points that it does not cover.
 
@@ -209,7 +205,7 @@ class WaterMeeting(Sums):
             raise GeometryError(
                 "water.above_cloud",
                 f"{name}: all points lie more than {DEEPEST_M:g} m {where}, the highest"
-                f" {self.least_depth_m:.0f} m{self._heights()}. Check the height of the water and"
+                f" {self.least_depth_m:.0f} m{self.heights()}. Check the height of the water and"
                 " its vertical datum.",
                 path=name, depth_m=self.least_depth_m,
             )  # fmt: skip
@@ -220,7 +216,7 @@ class WaterMeeting(Sums):
             return (
                 f"{name}: {points:,} of {self.submerged:,} submerged points lie deeper than"
                 f" {limit_m:g} m, the deepest {self.most_depth_m:.0f} m {where}{land}"
-                f"{self._heights()}. Check the height of the water and its vertical datum"
+                f"{self.heights()}. Check the height of the water and its vertical datum"
             )
 
         if self.too_deep > few and not deep:
@@ -247,7 +243,7 @@ class WaterMeeting(Sums):
             warnings.warn(one, stacklevel=2)
         return [str(one) for one in found]
 
-    def _heights(self) -> str:
+    def heights(self) -> str:
         """Return the range of the cloud's heights, and whether cloud or water may be in feet."""
         low, high, level = self.low_m, self.high_m, self.lowest_water_m
         if not np.isfinite([low, high]).all():
