@@ -40,7 +40,6 @@ from pcfix.errors import InputError, PcfixWarning, bad_file
 from pcfix.io.cameras.checks import Source
 from pcfix.io.cameras.checks import number as xml_number
 from pcfix.io.cameras.metashape import SPREADS, documents, spreads
-from pcfix.io.cameras.metashape.documents import Chunk
 from pcfix.io.cameras.odm import named_crs
 from pcfix.io.cameras.table import Columns, centres, headers, is_header, read_columns
 from pcfix.io.cameras.table import crs as table_crs
@@ -395,7 +394,10 @@ def _from_metashape(path: Path) -> tuple[list[Mark], str | None]:
     chunk = documents.open_chunk(path)
     frame = chunk.frame
     names = {c.get("id"): _label(c) for c in chunk.element.iterfind("cameras//camera")}
-    default, pixels = _setting(chunk, "accuracy_markers"), _setting(chunk, "accuracy_projections")
+    default, pixels = (
+        xml_number(path, f"setting {name}", chunk.settings.get(name, "0"))
+        for name in ("accuracy_markers", "accuracy_projections")
+    )
     surveyed: dict[str, Mark] = {}
     for marker in chunk.element.iterfind("markers//marker"):
         found, label = marker.find("reference"), _label(marker)
@@ -406,7 +408,7 @@ def _from_metashape(path: Path) -> tuple[list[Mark], str | None]:
             sigma = spreads(path, f"marker {label}", stated, SPREADS, np.full(3, default))
             surveyed[marker.get("id") or ""] = Mark(
                 f"marker {label}", label, "", np.full(2, np.nan), xyz,
-                np.where(sigma > 0.0, sigma, np.nan), pixels,
+                np.where(sigma > 0.0, sigma, np.nan), pixels if pixels > 0.0 else np.nan,
                 stated.get("enabled") in ("false", "0"),
             )  # fmt: skip
     marks = []
@@ -426,12 +428,3 @@ def _from_metashape(path: Path) -> tuple[list[Mark], str | None]:
 
 def _label(element: Element) -> str:
     return element.get("label") or f"number {element.get('id')}"
-
-
-def _setting(chunk: Chunk, name: str) -> float:
-    """Return a positive number of the chunk's settings, NaN if there is none."""
-    for entry in chunk.element.iterfind("settings/property"):
-        if entry.get("name") == name:
-            value = xml_number(chunk.path, f"setting {name}", entry.get("value"))
-            return value if value > 0.0 else np.nan
-    return np.nan

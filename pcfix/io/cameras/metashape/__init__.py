@@ -349,32 +349,37 @@ def kind_of(sensor: Element) -> str:
 def lens_of(path: Path, sensor: Element, image: str) -> tuple[Lens, tuple[PcfixWarning, ...]]:
     """Return the adjusted calibration, else the initial one, else the data sheet; and notes."""
     label, found = name_of(sensor), _calibration(sensor)
-    size = None if found is None else _resolution(path, label, found)
-    size = size or _resolution(path, label, sensor)
-    pixel_mm, focal_mm = (_property(path, sensor, n) for n in ("pixel_width", "focal_length"))
+    sizes = [one.find("resolution") for one in (found, sensor) if one is not None]
+    resolution = next((one for one in sizes if one is not None), None)
+    stated = {entry.get("name"): entry.get("value") for entry in sensor.iterfind("property")}
+    pixel_mm, focal_mm = (
+        number(path, f"sensor {label}, {name}", stated.get(name, "0"))
+        for name in ("pixel_width", "focal_length")
+    )
     notes = []
-    if found is not None and size is not None:
-        lens = _lens_of_calibration(path, label, kind_of(sensor), found, size)
-        lens = replace(lens, pixel_size_mm=pixel_mm)
+    if resolution is not None and (found is not None or min(pixel_mm, focal_mm) > 0.0):
+        sides = (resolution.get(side) for side in ("width", "height"))
+        width, height = (number(path, f"sensor {label}, resolution", side) for side in sides)
+    else:
+        sentence = f"sensor {label} of {image} has no calibration or no size. Align the images."
+        raise bad_file(path, "cameras.no_calibration", sentence, sensor=label)
+    if found is not None:
+        lens = _lens_of_calibration(path, label, kind_of(sensor), found, (width, height))
         if coefficients := found.findtext("corrections/coeffs"):
             where, count = f"sensor {label}, corrections", len(coefficients.split())
             rms_px = float(np.linalg.norm(numbers(path, where, coefficients, count)) / 2.0**0.5)
             sentence = f"the additional corrections of {label} are ignored ({rms_px:.2f} px rms)."
             notes.append(note(path, "cameras.corrections", sentence, sensor=label, rms_px=rms_px))
-    elif found is None and size is not None and focal_mm is not None and pixel_mm is not None:
+    else:
         given = {"f": focal_mm / pixel_mm}  # what Metashape itself starts from
-        lens = lens_by_name(given, *size, projection=PROJECTIONS[kind_of(sensor)], sensor=label)
-        lens = replace(lens, pixel_size_mm=pixel_mm)
+        projection = PROJECTIONS[kind_of(sensor)]
+        lens = lens_by_name(given, width, height, projection=projection, sensor=label)
         sentence = f"sensor {label} has no calibration; the lens of its data sheet is used."
         notes.append(note(path, "cameras.data_sheet_lens", sentence, sensor=label))
-    else:
-        sentence = f"sensor {label} of {image} has no calibration or no size. Align the images."
-        raise bad_file(path, "cameras.no_calibration", sentence, sensor=label)
-    shutter = [p for p in sensor.iterfind("property") if p.get("name") == "rolling_shutter"]
-    if any((p.get("value") or "0").lower() not in ("0", "false", "disabled") for p in shutter):
+    if (stated.get("rolling_shutter") or "0").lower() not in ("0", "false", "disabled"):
         sentence = f"the rolling shutter of sensor {label} is ignored; each image has one pose."
         notes.append(note(path, "cameras.rolling_shutter", sentence, sensor=label))
-    return lens, tuple(notes)
+    return replace(lens, pixel_size_mm=pixel_mm if pixel_mm > 0.0 else None), tuple(notes)
 
 
 def _calibration(sensor: Element) -> Element | None:
@@ -382,21 +387,6 @@ def _calibration(sensor: Element) -> Element | None:
     found = sensor.findall("calibration")
     chosen = [one for one in found if one.get("class") == "adjusted"] or found
     return chosen[-1] if chosen else None
-
-
-def _resolution(path: Path, label: str, element: Element) -> tuple[float, float] | None:
-    found = element.find("resolution")
-    if found is None:
-        return None
-    where = f"sensor {label}, resolution"
-    return number(path, where, found.get("width")), number(path, where, found.get("height"))
-
-
-def _property(path: Path, sensor: Element, name: str) -> float | None:
-    """Return a positive property of a sensor, or None."""
-    text = next((p.get("value") for p in sensor.iterfind("property") if p.get("name") == name), "0")
-    value = number(path, f"sensor {name_of(sensor)}, {name}", text)
-    return value if value > 0.0 else None
 
 
 def gnss_positions(
@@ -411,10 +401,7 @@ def gnss_positions(
     given = [image.element.find("reference") for image in images]
     ticked = [None if r is None or r.get("enabled") == "false" else r for r in given]
     used = given if all(reference is None for reference in ticked) else ticked
-    settings = {
-        (entry.get("name") or "").replace("/", "_"): entry.get("value") or ""
-        for entry in chunk.element.iterfind("settings/property")
-    }
+    settings = {name.replace("/", "_"): value for name, value in chunk.settings.items()}
     start = spreads(path, "settings of the chunk", settings, DEFAULTS, np.full(3, np.nan))
     xyz, sigma = np.full((2, len(used), 3), np.nan)
     for i, (image, reference) in enumerate(zip(images, used, strict=True)):
@@ -439,10 +426,8 @@ def gnss_positions(
     for sensor in dict.fromkeys(image.sensor for image in images if image.sensor is not None):
         antenna = text_of(sensor, "antenna/location").split()
         for shift in sensor.iterfind("antenna/reference"):
-            antenna += [
-                *(shift.get(axis) or "0" for axis in "xyz"),
-                *shift.get("location", "").split(),
-            ]
+            antenna += [shift.get(axis) or "0" for axis in "xyz"]
+            antenna += shift.get("location", "").split()
         if any(number(path, "GNSS antenna", one) for one in antenna):
             label = name_of(sensor)
             sentence = f"the GNSS positions are those of the antenna (sensor {label}), not offset."

@@ -54,6 +54,12 @@ class Chunk(NamedTuple):
         return self.document.root
 
     @property
+    def settings(self) -> dict[str, str]:
+        """The settings of the chunk by their names."""
+        entries = self.element.iterfind("settings/property")
+        return {entry.get("name") or "": entry.get("value") or "" for entry in entries}
+
+    @property
     def frame(self) -> Document | None:
         """The first frame, which has the images of every marker and the tie points."""
         first = self.element.find("frames/frame")
