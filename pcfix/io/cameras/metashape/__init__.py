@@ -68,24 +68,8 @@ DEFAULTS: Spreads = (
 )
 POINTS, MARKS = ("x", "y", "z", "id"), ("x", "y", "id")
 PARAMETERS = {
-    *[
-        "f",
-        "fx",
-        "fy",
-        "cx",
-        "cy",
-        "b1",
-        "b2",
-        "skew",
-        "k1",
-        "k2",
-        "k3",
-        "k4",
-        "p1",
-        "p2",
-        "p3",
-        "p4",
-    ]
+    *("f", "fx", "fy", "cx", "cy", "b1", "b2", "skew"),
+    *("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4"),
 }
 PROJECTIONS: dict[str, Projection] = {
     "frame": "perspective",
