@@ -369,8 +369,6 @@ def share_seen(cameras: Cameras, camera: npt.NDArray[np.int32], xyz: FloatArray)
     return float(np.mean(inside.all(axis=1)))
 
 
-_QUERIES = 250_000
-"""Points looked up at a time, which bounds the memory."""
 _SAME = 0.05
 """A fraction of the spacing within which two positions are those of one point."""
 _ROUNDING = 1.01 * np.sqrt(3.0)
@@ -459,21 +457,19 @@ class ViewMatch:
         row[: len(beside)][near] = first_row + np.flatnonzero(near)
         report.by_row = int(np.count_nonzero(near))
         rest = np.flatnonzero(row < 0)
-        if len(rest) and self._tree is None:
+        if not len(rest):
+            return row
+        if self._tree is None:
             from scipy.spatial import cKDTree
 
             self._tree = cKDTree(listed, balanced_tree=False, compact_nodes=False)
         reach = float(np.nextafter(self.tolerance_m or 0.0, np.inf))
-        for at in range(0, len(rest), _QUERIES):
-            some = rest[at : at + _QUERIES]
-            away, nearest = self._tree.query(xyz[some], distance_upper_bound=reach, workers=-1)
-            found = np.isfinite(away)
-            report.by_position += int(np.count_nonzero(found))
-            report.unmatched += int(np.count_nonzero(~found))
-            if found.any():
-                farthest_m = float(away[found].max())
-                report.farthest_m = max(report.farthest_m or 0.0, farthest_m)
-            row[some] = np.where(found, nearest, -1)
+        away, nearest = self._tree.query(xyz[rest], distance_upper_bound=reach, workers=-1)
+        found = np.isfinite(away)
+        row[rest] = np.where(found, nearest, -1)
+        report.by_position = int(np.count_nonzero(found))
+        report.unmatched = len(rest) - report.by_position
+        report.farthest_m = float(away[found].max()) if found.any() else None
         return row
 
 

@@ -19,16 +19,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pcfix.errors import InputError, SettingError, bad_file
-from pcfix.io.cameras.checks import (
-    DAMAGES,
-    NO_LENS,
-    Angles,
-    Source,
-    checked,
-    damaged,
-    no_pose,
-    reading,
-)
+from pcfix.io.cameras import checks
+from pcfix.io.cameras.checks import Angles, Source, reading
 from pcfix.io.files import check_input
 from pcfix.model import Cameras, TiePoints
 from pcfix.options.declare import File
@@ -149,11 +141,11 @@ def read_cameras(
             cameras = form.reader.read(source)
             if source.sensor is not None and len(cameras):
                 cameras = _with_sensor(source, cameras, form.module in TAKE_SENSOR)
-            cameras = checked(source.path, cameras)
+            cameras = checks.checked(source.path, cameras)
     except SettingError as error:  # numbers that are finite in the file and not in the world
-        raise damaged(path, str(error).rstrip(".")) from error
+        raise checks.damaged(path, str(error).rstrip(".")) from error
     if not len(cameras):
-        raise no_pose(source.path)
+        raise checks.no_pose(source.path)
     for note in cameras.notes:
         warnings.warn(note, stacklevel=2)
     return cameras
@@ -169,7 +161,7 @@ def _with_sensor(source: Source, cameras: Cameras, has_read_it: bool) -> Cameras
         return cameras
     from pcfix.io.cameras.table.sensor import read_sensor
 
-    notes = tuple(note for note in cameras.notes if note.code != NO_LENS)
+    notes = tuple(note for note in cameras.notes if note.code != checks.NO_LENS)
     return replace(cameras, lenses=(read_sensor(source.sensor),) * len(cameras), notes=notes)
 
 
@@ -193,13 +185,11 @@ def read_tie_points(path: File, cameras: Cameras) -> TiePoints:
         When numbers are not finite: such observations, and points with such a coordinate, are
         left out.
     """
-    from pcfix.io.cameras.tracks import finite, no_tie_points
-
     source, form = _recognised(path, None, None)
     if not hasattr(form.reader, "tie_points"):
-        raise no_tie_points(source.path, f"the format ({form.software}) has none")
+        raise checks.no_tie_points(source.path, f"the format ({form.software}) has none")
     with reading(path):
-        ties, note = finite(source.path, form.reader.tie_points(source, cameras))
+        ties, note = checks.finite(source.path, form.reader.tie_points(source, cameras))
     if note is not None:
         warnings.warn(note, stacklevel=2)
     return ties
@@ -241,10 +231,13 @@ def takes_sensor(path: File) -> bool:
 
 
 def _format_of(source: Source) -> CameraFormat | None:
-    """Return the first format that knows the content; standard errors look like poses."""
+    """Return the first format that knows the content; one that damage hides is passed over.
+
+    Files of standard errors look like poses, so the refused parts of exports are asked first.
+    """
     is_part = UNSUPPORTED.reader.is_part(source)
     for form in FORMATS[-1:] if is_part else FORMATS:
-        with suppress(InputError, *DAMAGES), np.errstate(all="ignore"):  # too damaged to tell
+        with suppress(InputError, *checks.DAMAGES), np.errstate(all="ignore"):
             if form.reader.recognises(source):
                 return form
     return None

@@ -40,7 +40,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from pcfix.errors import InputError, bad_file
-from pcfix.io.cameras import checks, tracks
+from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import ZIP_MAGIC, Source, damaged, note, number, read_xml, text_of
 from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.lens.rotations import from_omega_phi_kappa, from_photogrammetric
@@ -351,6 +351,6 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
                     xyz.append([float(text) for text in axes])
                 element.clear()
     if not xyz:
-        raise tracks.no_tie_points(path, f"none was seen by one of its {len(cameras)} photos")
-    seen_all = tracks.Seen(np.array(xyz), np.array(point), np.array(camera), np.array(uv))
-    return tracks.tie_points(seen_all)
+        raise checks.no_tie_points(path, f"none was seen by one of its {len(cameras)} photos")
+    seen_all = checks.Seen(np.array(xyz), np.array(point), np.array(camera), np.array(uv))
+    return checks.tie_points(seen_all)

@@ -42,7 +42,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.errors import PcfixWarning
-from pcfix.io.cameras import checks, tracks
+from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import Source, damaged, note
 from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.io.tables import read_lines
@@ -131,14 +131,14 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """Read the points of the largest model and where the images saw them."""
     model = _read(source)
     if model.software == "MVE":
-        raise tracks.no_tie_points(source.path, "MVE writes no image coordinates")
+        raise checks.no_tie_points(source.path, "MVE writes no image coordinates")
     if not len(model.points.image) or cameras.lenses is None:
-        raise tracks.no_tie_points(source.path, "it lists no points")
+        raise checks.no_tie_points(source.path, "it lists no points")
     xyz, point, image, xy = model.points
     row = np.full(len(model.names), -1)
     row[model.posed] = np.arange(len(cameras))
     middle = np.array([(lens.principal_x, lens.principal_y) for lens in cameras.lenses])
-    return tracks.tie_points(tracks.Seen(xyz, point, row[image], middle[row[image]] + xy))
+    return checks.tie_points(checks.Seen(xyz, point, row[image], middle[row[image]] + xy))
 
 
 def _read(source: Source) -> Model:
@@ -309,7 +309,7 @@ def _frame_sizes(
     images of about the same focal length have, about the middle of the frame. Where neither is
     known there are no sizes.
     """
-    sizes = np.array([tracks.image_size(path.parent, one) or (0, 0) for one in labels], float)
+    sizes = np.array([checks.image_size(path.parent, one) or (0, 0) for one in labels], float)
     missing = sizes[:, 0] == 0
     if not missing.any():
         return sizes, ()

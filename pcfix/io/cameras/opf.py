@@ -31,7 +31,7 @@ from urllib.parse import unquote
 import numpy as np
 
 from pcfix.errors import PcfixWarning, bad_file
-from pcfix.io.cameras import checks, tracks
+from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import Source, load_json, note, triple
 from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.io.cameras.pix4d import fisheye
@@ -242,12 +242,12 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     models = project.files("calibration", "model/gltf+json")
     found = [node for model in models for node in _nodes(model, row_of)]
     if not any((node.camera >= 0).any() for node in found):
-        raise tracks.no_tie_points(project.path, "its calibration has no tracks in its images")
+        raise checks.no_tie_points(project.path, "its calibration has no tracks in its images")
     frame = _frame_of(project)
-    return tracks.tie_points(*(node._replace(xyz=frame.enter(node.xyz)) for node in found))
+    return checks.tie_points(*(node._replace(xyz=frame.enter(node.xyz)) for node in found))
 
 
-def _nodes(path: Path, row_of: dict[int, int]) -> Iterator[tracks.Seen]:
+def _nodes(path: Path, row_of: dict[int, int]) -> Iterator[checks.Seen]:
     """Yield the points and matches of the nodes of a model."""
     with checks.reading(path):
         model = load_json(path)
@@ -272,7 +272,7 @@ def _nodes(path: Path, row_of: dict[int, int]) -> Iterator[tracks.Seen]:
                     matrix = np.array(node.get("matrix", np.eye(4).ravel()), float).reshape(4, 4).T
                     x, y, z = (xyz.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]).T
                     z_up = np.column_stack([x, -z, y])  # the model itself has y up
-                    yield tracks.Seen(z_up, point, rows[index[at]], uv[at].astype(np.float64))
+                    yield checks.Seen(z_up, point, rows[index[at]], uv[at].astype(np.float64))
 
 
 def _accessor(path: Path, model: Part, index: int, width: int) -> Any:

@@ -32,7 +32,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pcfix.errors import PcfixWarning, bad_file
-from pcfix.io.cameras import checks, tracks
+from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import Source, damaged, note, number, read_xml
 from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.io.tables import read_lines
@@ -404,9 +404,9 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     files = _find(source)
     path = files.get("bingo") or files.get("ties")
     if path is None:
-        raise tracks.no_tie_points(source.path, "no tp_bingo.txt or tp_pix4d.txt is beside it")
+        raise checks.no_tie_points(source.path, "no tp_bingo.txt or tp_pix4d.txt is beside it")
     if cameras.lenses is None:
-        raise tracks.no_tie_points(path, "the cameras have no lenses, which it needs")
+        raise checks.no_tie_points(path, "the cameras have no lenses, which it needs")
     labels = list(enumerate(cameras.labels))[::-1]  # of equal names the first counts
     rows = {PurePath(label).stem: i for i, label in labels} | {label: i for i, label in labels}
     with checks.reading(path):
@@ -415,7 +415,7 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
         numbers = np.array([words for *_, words in measured], dtype=float).reshape(-1, 4)
         posed = camera >= 0
         if not posed.any():
-            raise tracks.no_tie_points(path, "it measures nothing in the images that are posed")
+            raise checks.no_tie_points(path, "it measures nothing in the images that are posed")
         xy, sensor = np.split(numbers, 2, axis=1)
         if path == files.get("bingo"):
             if not (sensor[posed] > 0.0).all():
@@ -431,7 +431,7 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
             known = {row[0].strip(): checks.triple(row[4:7]) for row in lines if len(row) > 1}
         unknown = np.full(3, np.nan)
         xyz = np.array([known.get(name.partition("_")[2], unknown) for name in names.tolist()])
-        return tracks.tie_points(tracks.Seen(xyz, point, camera[posed], xy[posed]))
+        return checks.tie_points(checks.Seen(xyz, point, camera[posed], xy[posed]))
 
 
 def _measured(path: Path, rows: dict[str, int]) -> list[tuple[str, int, list[str]]]:

@@ -47,8 +47,6 @@ from pcfix.io.cameras.checks import Source, damaged, note, number, numbers, read
 from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.io.cameras.metashape import documents
 from pcfix.io.cameras.metashape.documents import Chunk, Document, open_archive, recognises, unpacked
-from pcfix.io.cameras.tracks import Seen, no_tie_points, rows_of
-from pcfix.io.cameras.tracks import tie_points as gathered
 from pcfix.io.crs import LOCAL, METRES, crs_text, is_local, parse_crs, shortened, unbound
 from pcfix.io.ply import parse_header
 from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, Projection, TiePoints
@@ -447,7 +445,7 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
         row_of = {image.id: i for i, image in enumerate(block.images)}
         marks = [mark for mark in documents.measured_marks(frame) if mark[1] in row_of]
         names = {name: i for i, name in enumerate(dict.fromkeys(name for name, _, _ in marks))}
-        markers = Seen(
+        markers = checks.Seen(
             np.full((len(names), 3), np.nan),
             np.array([names[name] for name, _, _ in marks], np.int64),
             np.array([row_of[camera] for _, camera, _ in marks], np.int64),
@@ -455,11 +453,12 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
         )
         seen = [*_tie_points(frame, block), markers]
     if not any(len(part.point) for part in seen):
-        raise no_tie_points(chunk.path, "only a project (.psx with its folder) or markers have any")
-    return gathered(*seen)
+        why = "only a project (.psx with its folder) or markers have any"
+        raise checks.no_tie_points(chunk.path, why)
+    return checks.tie_points(*seen)
 
 
-def _tie_points(frame: Document, block: Block) -> Iterator[Seen]:
+def _tie_points(frame: Document, block: Block) -> Iterator[checks.Seen]:
     """Yield the points of every component that has a place; their archive may be left out."""
     clouds = (*frame.root.iterfind("point_cloud"), *frame.root.iterfind("tie_points"))
     found = [
@@ -486,10 +485,11 @@ def _tie_points(frame: Document, block: Block) -> Iterator[Seen]:
             vertices, place = _vertices(archive, points.get("path"), POINTS), block.places[rows[0]]
             xyz = _columns(vertices, "xyz") @ place[:3, :3].T + place[:3, 3]
             marks = [_vertices(archive, files[block.images[row].id], MARKS) for row in rows]
-            tracks_of = np.concatenate([one["id"].astype(np.int64) for one in marks])
+            tracks = np.concatenate([one["id"].astype(np.int64) for one in marks])
+            point = checks.rows_of(tracks, vertices["id"].astype(np.int64))
             camera = np.repeat(rows, [len(one) for one in marks])
             uv = np.concatenate([_columns(one, "xy") for one in marks])
-            yield Seen(xyz, rows_of(tracks_of, vertices["id"].astype(np.int64)), camera, uv)
+            yield checks.Seen(xyz, point, camera, uv)
 
 
 def _columns(vertices: np.ndarray, names: str) -> FloatArray:
