@@ -149,15 +149,15 @@ class Correcting:
         for rows, part in correction.parts():
             some = new[rows]
             # whole steps of the file's own scale, so that 'pcfix restore' gets back every bit
-            moved = columns.shift_steps(part, some.scales)
-            columns.move(some, moved + self._steps)
+            classes = np.array(some["classification"])
             withheld = np.asarray(some["withheld"]).astype(bool)
-            part = columns.unsure_anew(part, withheld)
-            changed = columns.changed_rows(part, withheld, withhold=withhold)
-            columns.fill(some, self._columns, part, moved, changed)
+            changes = columns.changes_of(
+                self._columns, part, classes, withheld, some.scales, withhold=withhold
+            )
+            columns.move(some, changes.steps + self._steps)
+            columns.fill(some, changes)
             some.array["classification"][part.corrected] = BATHYMETRIC_POINT
-            flagged = withheld | columns.to_withhold(part, withhold=withhold)
-            some["withheld"][:] = flagged.astype(np.uint8)
+            some["withheld"][:] = (withheld | changes.flagged).astype(np.uint8)
         drops = self._plan.options.uncorrected == "drop"
         return new[~correction.uncorrected] if drops else new
 

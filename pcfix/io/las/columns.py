@@ -8,9 +8,8 @@ PDAL's stage take name, type and unit from them, and a test holds the documentat
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -107,47 +106,56 @@ def column_scale(column: Column, scales: FloatArray) -> float:
     return float(scales[SHIFTS.index(column.name)]) if column.scale == 0.0 else column.scale
 
 
-def shift_steps(correction: Correction, scales: FloatArray) -> npt.NDArray[np.int64]:
-    """Return the shift in steps of the file's own scale, shape (n, 3)."""
-    return np.rint(correction.shift_m / scales).astype(np.int64)
+class Changes(NamedTuple):
+    """What a correction changes in n points of a file."""
+
+    steps: npt.NDArray[np.int64]  # (n, 3), the shift in steps of the file's own scale
+    flagged: BoolArray  # (n,), to be withheld
+    values: list[tuple[Column, BoolArray, npt.NDArray[Any]]]  # whole numbers of some rows
 
 
-def filled(
+def changes_of(
     columns: tuple[Column, ...],
     correction: Correction,
-    moved: npt.NDArray[np.int64],
     classes: npt.NDArray[Any],
-    changed: BoolArray,
-) -> Iterator[tuple[Column, BoolArray, npt.NDArray[Any]]]:
-    """Yield each column, the rows that get values, and these as whole numbers of its scale.
+    withheld: BoolArray,
+    scales: FloatArray,
+    *,
+    withhold: bool,
+) -> Changes:
+    """Return the changes by a correction; with `withhold` also flags for uncorrected points.
 
-    The rows are the `changed` ones, and for shifts all that moved. `moved` is from `shift_steps`,
-    shape (n, 3); `classes`, shape (n,), are those before.
+    Classes and flags, shape (n,), are those before. What is withheld in the input is neither unsure
+    nor uncorrected here, so that `restore` can distinguish it from what pcfix withheld. Points that
+    are withheld because they could not be transferred have the same mark, a depth.
     """
+    steps = np.rint(correction.shift_m / scales).astype(np.int64)
+    if correction.unsure is not None:
+        correction = replace(correction, unsure=correction.unsure & ~withheld)
+    marked = correction.uncorrected if withhold else correction.submerged
+    changed = correction.corrected | (marked & ~withheld)
+    values: list[tuple[Column, BoolArray, npt.NDArray[Any]]] = []
     for column in columns:
-        rows = changed | correction.moved if column.name in SHIFTS else changed
         if column.scale == 0.0:
-            yield column, rows, moved[rows, SHIFTS.index(column.name)]
+            rows = changed | correction.moved
+            values.append((column, rows, steps[rows, SHIFTS.index(column.name)]))
             continue
-        value = (getattr(correction, column.of) if column.of else classes)[rows]
+        value = (getattr(correction, column.of) if column.of else classes)[changed]
         if column.scale != 1.0:
             value = np.rint(value / column.scale)
-        yield column, rows, value if column.least is None else np.maximum(value, column.least)
+        value = value if column.least is None else np.maximum(value, column.least)
+        values.append((column, changed, value))
+    flagged = correction.uncorrected if withhold else np.zeros(len(changed), np.bool_)
+    flagged = flagged if correction.unsure is None else flagged | correction.unsure
+    return Changes(steps, flagged, values)
 
 
-def fill(
-    points: laspy.ScaleAwarePointRecord,
-    columns: tuple[Column, ...],
-    correction: Correction,
-    moved: npt.NDArray[np.int64],
-    rows: BoolArray,
-) -> None:
-    """Write the columns of the given rows, and the shift of all; the others keep zero.
+def fill(points: laspy.ScaleAwarePointRecord, changes: Changes) -> None:
+    """Write the columns of the rows that change; the others keep zero.
 
     A `TooNarrowError` if a value does not fit its type and the type may be widened.
     """
-    classes = np.array(points["classification"])
-    for column, some, value in filled(columns, correction, moved, classes, rows):
+    for column, some, value in changes.values:
         target = points.array[column.name]
         limits = np.iinfo(target.dtype)
         if column.saturates:
@@ -160,33 +168,6 @@ def fill(
             sentence = f"{column.name} reaches {reach:g} m. Remove points far below the water."
             raise InputError("cloud.too_deep", sentence, dimension=column.name, value=reach)
         target[some] = value
-
-
-def changed_rows(correction: Correction, withheld: BoolArray, *, withhold: bool) -> BoolArray:
-    """Return the rows that get values: corrected ones, and uncorrected ones not yet withheld.
-
-    An uncorrected point that is withheld in the input stays as it is, so that `restore` can
-    distinguish it from one that pcfix withheld. Points that are withheld because they could not be
-    transferred have the same mark, a depth.
-    """
-    marked = correction.uncorrected if withhold else correction.submerged
-    return correction.corrected | (marked & ~withheld)
-
-
-def unsure_anew(correction: Correction, withheld: BoolArray) -> Correction:
-    """Return a correction in which no point that is withheld in the input is unsure.
-
-    So `restore` can distinguish these from the unsure ones, which are withheld by pcfix.
-    """
-    if correction.unsure is None:
-        return correction
-    return replace(correction, unsure=correction.unsure & ~withheld)
-
-
-def to_withhold(correction: Correction, *, withhold: bool) -> BoolArray:
-    """Return the rows to be flagged: the unsure, and the uncorrected where these are withheld."""
-    rows = correction.uncorrected if withhold else np.zeros(len(correction.outcome), np.bool_)
-    return rows if correction.unsure is None else rows | correction.unsure
 
 
 def convert(
