@@ -84,8 +84,14 @@ def read_table(path: Path, required: Sequence[str]) -> Table:
 
 
 _LONGEST_NAME = 80
-METRES = ("", "m", "metre", "metres", "meter", "meters")
-DEGREES = ("", "deg", "degree", "degrees", "°")
+METRES = dict.fromkeys(("", "m", "metre", "metres", "meter", "meters"), 1.0)
+DEGREES = dict.fromkeys(("", "deg", "degree", "degrees", "°"), 1.0)
+ANGLES = {
+    **DEGREES,
+    **dict.fromkeys(("gon", "gons", "grad", "grads"), 0.9),
+    **dict.fromkeys(("rad", "radian", "radians"), 180.0 / math.pi),
+}
+"""Units by their names, in metres and degrees."""
 
 
 def split_unit(name: str, endings: str = "m|cm|mm|ft|deg") -> tuple[str, str]:
@@ -98,7 +104,7 @@ def split_unit(name: str, endings: str = "m|cm|mm|ft|deg") -> tuple[str, str]:
 
 
 def columns_of(
-    path: Path, header: Sequence[str], spellings: Sequence[str], units: Sequence[str]
+    path: Path, header: Sequence[str], spellings: Sequence[str], units: Container[str]
 ) -> list[str]:
     """Return the columns with one of some names, as in depth_m, Depth (m), x [m], in their order.
 

@@ -222,12 +222,6 @@ def _split_unit(name: str) -> tuple[str, str]:
 _PLAIN = {spelling for spellings in SPELLINGS.values() for spelling in spellings}
 
 
-DEGREES = {
-    **dict.fromkeys(("", "deg", "degree", "degrees", "°"), 1.0),
-    **dict.fromkeys(("gon", "gons", "grad", "grads"), 0.9),
-    **dict.fromkeys(("rad", "radian", "radians"), 180.0 / np.pi),
-}
-METRES = dict.fromkeys(("", "m", "metre", "metres", "meter", "meters"), 1.0)
 LENGTHS = ("x", "y", "z", "sigma_x", "sigma_y", "sigma_z")
 
 
@@ -304,7 +298,8 @@ class Columns:
         base, unit = role.removesuffix("_est"), self.unit[self.place[role]]
         if base not in (*LENGTHS, *POSE):
             return values
-        known, wanted = (METRES, "metres") if base in LENGTHS else (DEGREES, "degrees")
+        is_length = base in LENGTHS
+        known, wanted = (tables.METRES, "metres") if is_length else (tables.ANGLES, "degrees")
         if unit not in known:
             sentence = f"column {self.name(role)} is in '{unit}'. Give {wanted}."
             raise bad_file(self.path, "table.unit", sentence, value=unit)
