@@ -34,7 +34,7 @@ _WITHHELD_FLAG = 4
 
 def add_dimension(columns: tuple[Column, ...]) -> str:
     """Return the value of a stage's ``add_dimension`` for these columns."""
-    return ",".join(f"{c.name}={c.narrow if c.scale == 1.0 else 'float'}" for c in columns)
+    return ",".join(f"{c.name}={c.dtype if c.scale == 1.0 else 'float'}" for c in columns)
 
 
 class PdalCloud:

@@ -1,9 +1,8 @@
 """What a point record holds: LAS point formats, and the extra dimensions of a correction.
 
-The extra dimensions are integers with a scale, so that LAZ packs them well. Each has a narrow type,
-which nearly every cloud fits, and a wide one; a cloud with a value outside the narrow range is
-written again with the wide types. `COLUMNS` and `UNSURE` are all that is said of them: files and
-PDAL's stage take name, type and unit from them, and a test holds the documentation to them.
+The extra dimensions are integers with a scale, so that LAZ packs them well. `COLUMNS` and `UNSURE`
+are all that is said of them: files and PDAL's stage take name, type and unit from them, and a test
+holds the documentation to them.
 """
 
 from __future__ import annotations
@@ -44,50 +43,32 @@ class OutOfRangeError(Exception):
     """A coordinate leaves the 32 bits that LAS has; move the offsets and write again."""
 
 
-class TooNarrowError(Exception):
-    """A value does not fit the narrow types; write the file again with the wide ones."""
-
-
 @dataclass(frozen=True, slots=True)
 class Column:
     """One extra dimension."""
 
     name: str
     of: str  # the attribute of `pcfix.Correction` that it holds; empty for the class before
-    narrow: str  # types
-    wide: str
+    dtype: str
     scale: float  # 0 means the file's own scale of that axis; 1 means a count
     description: str  # in the file, at most 31 letters
     saturates: bool = False  # the largest value means "or more"
     least: int | None = None  # in steps of the scale
 
-    def dtype(self, *, wide: bool) -> np.dtype[Any]:
-        """Return the numpy type."""
-        return np.dtype(self.wide if wide else self.narrow)
-
 
 COLUMNS = (
-    *(
-        Column(f"Shift{axis}", "shift_m", "int16", "int32", 0.0, f"true minus apparent {axis}")
-        for axis in "XYZ"
-    ),
-    Column(
-        *("WaterDepth", "depth_m", "uint16", "uint32", 0.001, "below the water surface, m"),
-        least=1,  # a submerged point is never at zero depth
-    ),
-    Column(
-        *("RayMiss", "ray_miss_m", "uint16", "uint32", 0.0001, "rms distance from the rays, m"),
-        saturates=True,
-    ),
-    Column(
-        *("SigmaZ", "sigma_z_m", "uint16", "uint32", 0.0001, "formal standard error of Z, m"),
-        saturates=True,
-    ),
-    Column("Incidence", "incidence_deg", "uint16", "uint16", 0.1, "largest angle in air, deg"),
-    Column("RayCount", "ray_count", "uint16", "uint16", 1.0, "rays intersected", saturates=True),
-    Column("SourceClass", "", "uint8", "uint8", 1.0, "class before the correction"),
+    Column("ShiftX", "shift_m", "int32", 0.0, "true minus apparent X"),
+    Column("ShiftY", "shift_m", "int32", 0.0, "true minus apparent Y"),
+    Column("ShiftZ", "shift_m", "int32", 0.0, "true minus apparent Z"),
+    # a submerged point is never at zero depth
+    Column("WaterDepth", "depth_m", "uint32", 0.001, "below the water surface, m", least=1),
+    Column("RayMiss", "ray_miss_m", "uint16", 0.0001, "rms distance from the rays, m", True),
+    Column("SigmaZ", "sigma_z_m", "uint16", 0.0001, "formal standard error of Z, m", True),
+    Column("Incidence", "incidence_deg", "uint16", 0.1, "largest angle in air, deg"),
+    Column("RayCount", "ray_count", "uint16", 1.0, "rays intersected", True),
+    Column("SourceClass", "", "uint8", 1.0, "class before the correction"),
 )
-UNSURE = Column("Unsure", "unsure", "uint8", "uint8", 1.0, "withheld: only flat rays see it")
+UNSURE = Column("Unsure", "unsure", "uint8", 1.0, "withheld: only flat rays see it")
 """Written where such points are withheld."""
 SHIFTS = ("ShiftX", "ShiftY", "ShiftZ")
 MINIMAL = ("ShiftZ", "RayCount")
@@ -151,18 +132,13 @@ def changes_of(
 
 
 def fill(points: laspy.ScaleAwarePointRecord, changes: Changes) -> None:
-    """Write the columns of the rows that change; the others keep zero.
-
-    A `TooNarrowError` if a value does not fit its type and the type may be widened.
-    """
+    """Write the columns of the rows that change; the others keep zero."""
     for column, some, value in changes.values:
         target = points.array[column.name]
         limits = np.iinfo(target.dtype)
         if column.saturates:
             value = np.minimum(value, limits.max)
         if value.size and (value.min() < limits.min or value.max() > limits.max):
-            if target.dtype != column.dtype(wide=True):
-                raise TooNarrowError
             step = column_scale(column, points.scales)
             reach = float(value.max() * step)
             sentence = f"{column.name} reaches {reach:g} m. Remove points far below the water."
