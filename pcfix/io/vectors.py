@@ -19,11 +19,12 @@ from pcfix.io import tables
 from pcfix.io.atomic import cannot_write, temporary_output
 from pcfix.io.crs import LOCAL, parse_crs, way_to_cloud
 from pcfix.io.files import check_input, check_output
-from pcfix.libraries import optional_library
+from pcfix.libraries import analysis_library, optional_library
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
 
 if TYPE_CHECKING:
+    from geopandas import GeoDataFrame
     from pyproj import CRS
 
 Geometries = npt.NDArray[Any]
@@ -432,3 +433,14 @@ def _styles(layers: Sequence[Layer]) -> tuple[list[Any], list[str]]:
     fields["useAsDefault"] = np.ones(len(layers), bool)
     fields["update_time"] = np.full(len(layers), "2020-01-01", "datetime64[ms]")
     return [*fields.values()], [*fields]
+
+
+def read_frame(path: Path, layer: str) -> GeoDataFrame:
+    """Read a layer of a GeoPackage with GeoPandas."""
+    return analysis_library("geopandas").read_file(check_input(path), layer=layer)
+
+
+def frame_of(layer: Layer, crs: Any) -> GeoDataFrame:
+    """Return a layer that has not been written yet for GeoPandas."""
+    frame = analysis_library("geopandas").GeoDataFrame
+    return frame(layer.values, geometry=list(layer.geometries), crs=crs)
