@@ -177,8 +177,7 @@ def read_reference(reference: Clouds) -> Reference:
         return Reference(cloud.name, cloud.xyz, cloud.crs, cloud.left_out)
     suffix = found.suffix.lower()
     if suffix in TABLES:
-        table = read_table(found, ("x", "y", "z"))
-        xyz = np.column_stack([table.numbers(name) for name in "xyz"])
+        xyz = read_table(found, ("x", "y", "z")).of("xyz")
         return Reference(str(found), xyz, None, sparse=True)
     if suffix not in (".tif", ".tiff"):
         raise bad_file(found, "reference.unknown", f"is not a reference. Give {KINDS}.")

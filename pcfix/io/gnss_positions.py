@@ -63,7 +63,7 @@ def read_gnss(path: File, cameras: Cameras, *, crs: str | None = None) -> Camera
             names, listed = list(read.labels), read.gnss
         else:
             columns = open_table(source)
-            place = places(columns.table.header, SIGMAS) | columns.place
+            place = places(columns.header, SIGMAS) | dict(columns.place)
             columns = replace(columns, place=place)
             names, listed = columns.labels, gnss_positions(columns)
         if listed is None:

@@ -41,7 +41,7 @@ from pcfix.io.cameras.checks import Source
 from pcfix.io.cameras.checks import number as xml_number
 from pcfix.io.cameras.metashape import SPREADS, documents, spreads
 from pcfix.io.cameras.odm import named_crs
-from pcfix.io.cameras.table import Columns, centres, headers, is_header, read_columns
+from pcfix.io.cameras.table import centres, headers, is_header, read_columns
 from pcfix.io.cameras.table import crs as table_crs
 from pcfix.io.crs import LOCAL, is_local, is_topocentric, parse_crs, way_to_cloud
 from pcfix.io.files import check_input
@@ -309,16 +309,16 @@ def _from_table(path: Path) -> tuple[list[Mark], str | None]:
     for i, k in np.argwhere(every <= 0.0)[:1]:
         words = f"the standard deviation {every[i, k]:g} must be positive."
         raise columns.error(int(i), "gcps.sigma", words, value=float(every[i, k]))
-    names = [row[columns.place["point"]] for row in columns.table.rows]
+    names = columns.column("point")
     if "" in names:
-        line = columns.table.line[names.index("")]
+        line = columns.line[names.index("")]
         raise bad_file(path, "gcps.no_name", f"line {line}: the point has no name.", line=line)
     xyz, uv = centres(columns, needed=not any(on)), columns.of(("u", "v"))
     for i in np.flatnonzero(np.isnan(xyz).any(axis=1)):
         if not on[i]:
             words = "the point has no x, y, z. Only those with role waterline or on:NAME need none."
             raise columns.error(int(i), "gcps.no_coordinates", words)
-    where = [f"line {line}" for line in columns.table.line]
+    where = [f"line {line}" for line in columns.line]
     sigma_px = np.sqrt((sigma_uv**2).mean(axis=1)).tolist()
     rows = zip(
         *(where, names, columns.labels, uv, xyz, sigma_m, sigma_px, is_check, under_water),
@@ -328,9 +328,9 @@ def _from_table(path: Path) -> tuple[list[Mark], str | None]:
     return [Mark(*row) for row in rows], system
 
 
-def _with_roles(columns: Columns) -> Columns:
+def _with_roles(columns: Table) -> Table:
     """Return columns with the places that they have in a table of marks."""
-    header, path = columns.table.header, columns.path
+    header, path = columns.header, columns.path
     place = {role: i for role, i in columns.place.items() if role in _POSITION}
     place |= places(header, SPELLINGS)
     missing = [_PLAIN.get(role, role) for role in ("point", "label", "u", "v") if role not in place]
@@ -345,23 +345,22 @@ def _with_roles(columns: Columns) -> Columns:
     found = replace(columns, place=place)
     if "crs" not in place:
         return found
-    stated = sorted({row[place["crs"]] for row in columns.table.rows} - {""})
+    stated = sorted({*found.column("crs")} - {""})
     if len(stated) > 1:
         sentence = f"has points in several CRS ({', '.join(stated[:3])}). Transform all to one."
         raise bad_file(path, "gcps.several_crs", sentence, crs=stated)
     return replace(found, crs=stated[0] if stated else columns.crs)
 
 
-def _texts(columns: Columns, role: str) -> list[str]:
+def _texts(columns: Table, role: str) -> list[str]:
     """Return the entries of a column in lower case; empty ones if it does not exist."""
-    if role not in columns.place:
-        return [""] * len(columns.table.rows)
-    rows = columns.table.rows
-    return [row[columns.place[role]].strip().lower().replace(" ", "_") for row in rows]
+    if not columns.has(role):
+        return [""] * len(columns.rows)
+    return [text.strip().lower().replace(" ", "_") for text in columns.column(role)]
 
 
 def _flags(
-    columns: Columns, role: str, true: tuple[str, ...], false: tuple[str, ...], words: str,
+    columns: Table, role: str, true: tuple[str, ...], false: tuple[str, ...], words: str,
     others: Sequence[str] = (),
 ) -> BoolArray:  # fmt: skip
     """Return which rows have an entry of `true`; refuse those that have neither, nor `others`."""
@@ -378,8 +377,9 @@ def _from_odm(path: Path, rows: list[tuple[int, list[str]]]) -> tuple[list[Mark]
         if len(fields) < _LEAST_ODM:
             sentence = f"line {i} has {len(fields)} fields. Give x, y, z, u, v, image."
             raise bad_file(path, "gcps.fields", sentence, line=i)
-    table = Table(path, [*"xyzuv"], [fields for _, fields in rows], [i for i, _ in rows])
-    values = np.column_stack([table.numbers(name) for name in table.header])
+    texts, lines = [fields for _, fields in rows], [i for i, _ in rows]
+    roles = {role: i for i, role in enumerate("xyzuv")}
+    values = Table(path, [*roles], texts, lines, roles, [""] * len(roles)).of(roles)
     places = [tuple(row) for row in values[:, :3].tolist()]
     by_place = {place: f"GCP {i + 1}" for i, place in enumerate(dict.fromkeys(places))}
     marks = []

@@ -156,7 +156,7 @@ def read_tide(path: File) -> TideTable:
     """Read a table with the columns ``time`` (ISO 8601) and ``level_m``."""
     source = check_input(path)
     table = read_table(source, ["time", "level_m"])
-    level = table.numbers("level_m")
+    level = table.of(("level_m",))[:, 0]
     times = _times(source, [f"line {line}" for line in table.line], table.column("time"))
     late = np.flatnonzero(np.diff(times.time_s) <= 0.0)
     if late.size:
@@ -165,7 +165,7 @@ def read_tide(path: File) -> TideTable:
         raise bad_file(source, "tide.order", sentence, line=line)
     if len(level) < 2:
         raise bad_file(source, "tide.one_row", "has one row. Give at least two.")
-    return TideTable(times.time_s, np.array(level), times.zoned, times.name)
+    return TideTable(times.time_s, level, times.zoned, times.name)
 
 
 def level_offsets(

@@ -48,7 +48,6 @@ _WKT = re.compile(
 )
 _SRID = re.compile(r"\s*SRID\s*=\s*(\d+)\s*;", re.IGNORECASE)
 _CRS = re.compile(r"#\s*crs\s*[:=]\s*(.+)$", re.IGNORECASE)
-_NO_HEIGHT = ("", "nan", "na", "null", "none")
 
 LAYER_MARK = "|"
 WGS84, WGS84_3D = "EPSG:4326", "EPSG:4979"
@@ -237,26 +236,22 @@ def _from_table(path: Path, lines: list[str], at: int) -> tuple[Geometries, str 
 
     A point whose height is empty has none.
     """
-    names, delimiter = tables.split_header(lines[at])
-    table = tables.table_below(path, lines, names, delimiter, at=at, comments=True)
-    units = (*tables.METRES, *tables.DEGREES)
-    column = {
-        role: next(iter(tables.columns_of(path, names, spellings, units)), None)
-        for role, spellings in COLUMNS.items()
-    }
-    if column["wkt"] is not None:
-        return _from_wkt(path, list(zip(table.line, table.column(column["wkt"]), strict=True)))
-    x, y, crs = column["x"], column["y"], None
-    if x is None or y is None:
-        x, y, crs = column["longitude"], column["latitude"], WGS84
-    if x is None or y is None:
-        tables.check_columns(
-            path, names, ("x and y", "or longitude and latitude", "or wkt"), ("x, y",)
-        )
-    plan = np.column_stack([table.numbers(str(x)), table.numbers(str(y))])
-    if column["z"] is None:
+    texts, delimiter = tables.split_header(lines[at])
+    names, units = map(list, zip(*map(tables.split_unit, texts), strict=True))
+    # degrees of x and y are those of the CRS
+    units = ["" if unit in tables.DEGREES else unit for unit in units]
+    table = tables.table_below(
+        path, lines, names, delimiter, COLUMNS, units=units, at=at, comments=True
+    )
+    if table.has("wkt"):
+        return _from_wkt(path, list(zip(table.line, table.column("wkt"), strict=True)))
+    axes, crs = (("x", "y"), None) if table.has("x", "y") else (("longitude", "latitude"), WGS84)
+    if not table.has(*axes):
+        needed = ("x and y", "or longitude and latitude", "or wkt")
+        tables.check_columns(path, names, needed, ("x, y",))
+    plan, z = table.of(axes), table.where_there(("z",))[:, 0]
+    if not table.has("z"):
         return np.asarray(shapely.points(plan)), crs
-    z = np.array(table.numbers(column["z"], _NO_HEIGHT))
     points = np.asarray(shapely.points(np.column_stack([plan, z])))
     return np.where(np.isfinite(z), points, shapely.force_2d(points)), crs
 

@@ -61,7 +61,7 @@ def read_sensor(path: Path) -> Lens:
         raise bad_file(path, "cameras.sensor_rows", sentence, rows=len(table.rows))
 
     def value(name: str, default: float = 0.0) -> float:
-        return table.numbers(name)[0] if name in table.header else default
+        return float(table.of((name,))[0, 0]) if table.has(name) else default
 
     focal, width, height = map(value, columns)
     given = {"f": focal}
@@ -81,7 +81,7 @@ def read_sensor(path: Path) -> Lens:
 def read_frame(path: Path) -> tuple[float, float]:
     """Read the width and height of all images; the lens is not needed."""
     if not _is_xml(path) and _column_names(path) >= set(FRAME):
-        width, height = (read_table(path, FRAME).numbers(name)[0] for name in FRAME)
+        width, height = read_table(path, FRAME).of(FRAME)[0].tolist()
         return width, height
     lens = read_sensor(path)
     return lens.width, lens.height
