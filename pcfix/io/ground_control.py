@@ -46,8 +46,8 @@ from pcfix.io.cameras.table import crs as table_crs
 from pcfix.io.crs import LOCAL, is_local, is_topocentric, parse_crs, way_to_cloud
 from pcfix.io.files import check_input
 from pcfix.io.labels import match_labels, unnamed
-from pcfix.io.tables import Table, number, places, read_lines
-from pcfix.model import BoolArray, Cameras, FloatArray, GroundControl, IntArray
+from pcfix.io.tables import Table, check_columns, number, places, read_lines
+from pcfix.model import Cameras, FloatArray, GroundControl, IntArray
 from pcfix.options.declare import File
 
 SIGMA_M, SIGMA_PX = 0.01, 0.5
@@ -82,7 +82,6 @@ CHECK = ("check", "check_point", "checkpoint", "cp", "chk")
 CONTROL = ("", "control", "control_point", "controlpoint", "gcp", "3d_gcp", "ground_control_point")
 ON, WATERLINE = "on:", ("waterline", "water_line", "shoreline", "on:water")
 YES, NO = ("yes", "y", "true", "1"), ("", "no", "n", "false", "0")
-PIXELS = ("", "px", "pixel", "pixels", "pix")
 _LEAST_ODM = 6
 _POSITION = ("x", "y", "z", "longitude", "latitude")
 _PLAIN = {"point": "name", "label": "image"}
@@ -296,12 +295,19 @@ def _from_table(path: Path) -> tuple[list[Mark], str | None]:
     if unknown:
         sentence = f"PROJ does not know its CRS '{columns.crs}'. Give an EPSG code."
         raise bad_file(path, "crs.unknown", sentence, crs=columns.crs)
-    on = []
-    for text in _texts(columns, "role"):
-        is_on = text.startswith(ON) and text != ON
-        on.append("water" if text in WATERLINE else text.removeprefix(ON) if is_on else "")
-    is_check = _flags(columns, "role", CHECK, CONTROL, "control, check, waterline or on:NAME", on)
-    under_water = _flags(columns, "under_water", YES, NO, "yes or no")
+    roles, wet = (_texts(columns, role) for role in ("role", "under_water"))
+    surfaces = ["on:water" if text in WATERLINE else text for text in roles]
+    on = [text.removeprefix(ON) if text.startswith(ON) else "" for text in surfaces]
+    is_role = [text in CHECK + CONTROL or on[i] != "" for i, text in enumerate(roles)]
+    for role, texts, known, words in (
+        ("role", roles, is_role, "control, check, waterline or on:NAME"),
+        ("under_water", wet, [text in YES + NO for text in wet], "yes or no"),
+    ):
+        if not all(known):
+            row = known.index(False)
+            sentence = f"column {columns.name(role)}: '{texts[row]}' is not {words}."
+            raise columns.error(row, "table.choice", sentence, value=texts[row])
+    is_check, under_water = ([t in CHECK for t in roles], [t in YES for t in wet])
     sigma_m = columns.where_there(("sigma_x", "sigma_y", "sigma_z"))
     sigma_uv = columns.where_there(("sigma_u", "sigma_v"))
     sigma_on = columns.where_there(("sigma_on",))[:, 0]
@@ -334,14 +340,7 @@ def _with_roles(columns: Table) -> Table:
     place = {role: i for role, i in columns.place.items() if role in _POSITION}
     place |= places(header, SPELLINGS)
     missing = [_PLAIN.get(role, role) for role in ("point", "label", "u", "v") if role not in place]
-    if missing:
-        sentence = f"lacks the columns {', '.join(missing)}. Give name, x, y, z, image, u, v."
-        raise bad_file(path, "table.column_missing", sentence, columns=missing)
-    for role in "uv":
-        unit = columns.unit[place[role]]
-        if unit not in PIXELS:
-            sentence = f"column {header[place[role]]} is in '{unit}'. Give pixels."
-            raise bad_file(path, "table.unit", sentence, unit=unit)
+    check_columns(path, header, ("name", "x", "y", "z", "image", "u", "v"), missing)
     found = replace(columns, place=place)
     if "crs" not in place:
         return found
@@ -357,19 +356,6 @@ def _texts(columns: Table, role: str) -> list[str]:
     if not columns.has(role):
         return [""] * len(columns.rows)
     return [text.strip().lower().replace(" ", "_") for text in columns.column(role)]
-
-
-def _flags(
-    columns: Table, role: str, true: tuple[str, ...], false: tuple[str, ...], words: str,
-    others: Sequence[str] = (),
-) -> BoolArray:  # fmt: skip
-    """Return which rows have an entry of `true`; refuse those that have neither, nor `others`."""
-    found = _texts(columns, role)
-    for i, text in enumerate(found):
-        if text not in true and text not in false and not (others and others[i]):
-            sentence = f"column {columns.name(role)}: '{text}' is not {words}."
-            raise columns.error(i, "table.choice", sentence, value=text)
-    return np.array([text in true for text in found])
 
 
 def _from_odm(path: Path, rows: list[tuple[int, list[str]]]) -> tuple[list[Mark], str | None]:

@@ -29,9 +29,15 @@ ANGLES = {
     **dict.fromkeys(("gon", "gons", "grad", "grads"), 0.9),
     **dict.fromkeys(("rad", "radian", "radians"), 180.0 / math.pi),
 }
-"""Units by their names, in metres and degrees."""
-LENGTHS = {"x", "y", "z", "depth", "sigma_x", "sigma_y", "sigma_z"}
-IN_DEGREES = {"longitude", "latitude", "yaw", "pitch", "roll", "omega", "phi", "kappa"}
+"""Units by their names: sizes in metres and degrees."""
+PIXELS = dict.fromkeys(("", "px", "pixel", "pixels", "pix"), 1.0)
+UNITS = {
+    **dict.fromkeys(("x", "y", "z", "depth", "sigma_x", "sigma_y", "sigma_z"), ("metres", METRES)),
+    **dict.fromkeys(("longitude", "latitude", "yaw", "pitch", "roll"), ("degrees", ANGLES)),
+    **dict.fromkeys(("omega", "phi", "kappa"), ("degrees", ANGLES)),
+    **dict.fromkeys(("u", "v"), ("pixels", PIXELS)),
+}
+"""What numbers are in, by the role of their column; those of others have any unit."""
 EXIF = ("gpslongitude", "gpslatitude", "gpsaltitude")
 UNKNOWN = ("", "nan", "na", "null", "none")
 
@@ -108,14 +114,20 @@ class Table:
                 sentence = f"column {name}: '{texts[i]}' is {why}. Correct it."
                 where = {"line": self.line[i], "column": name, "value": texts[i]}
                 raise self.error(int(i), "table.number", sentence, **where)
-        base, unit = role.removesuffix("_est"), self.unit[self.place[role]]
-        if base not in LENGTHS | IN_DEGREES:
-            return values
-        known, wanted = (METRES, "metres") if base in LENGTHS else (ANGLES, "degrees")
+        unit = self.unit[self.place[role]]
+        wanted, known = UNITS.get(role.removesuffix("_est"), ("", {unit: 1.0}))
         if unit not in known:
             sentence = f"column {name} is in '{unit}'. Give {wanted}."
             raise bad_file(self.path, "table.unit", sentence, column=name, value=unit)
         return values * known[unit]
+
+
+CRS_COMMENT = re.compile(r"^\s*#\s*(?:coordinatesystem|crs)\s*[:=]\s*(.+)$", re.IGNORECASE)
+
+
+def stated_crs(lines: Iterable[str]) -> str | None:
+    """Return the CRS that a comment states."""
+    return next((found[1].strip() for one in lines if (found := CRS_COMMENT.match(one))), None)
 
 
 def number(text: str) -> float:

@@ -47,7 +47,6 @@ _WKT = re.compile(
     re.IGNORECASE,
 )
 _SRID = re.compile(r"\s*SRID\s*=\s*(\d+)\s*;", re.IGNORECASE)
-_CRS = re.compile(r"#\s*crs\s*[:=]\s*(.+)$", re.IGNORECASE)
 
 LAYER_MARK = "|"
 WGS84, WGS84_3D = "EPSG:4326", "EPSG:4979"
@@ -203,14 +202,13 @@ def _read_text(path: Path) -> tuple[Geometries, str | None]:
     for longitude and latitude it is WGS 84.
     """
     lines = tables.read_lines(path)
-    stated = [found[1].strip() for line in lines[:20] if (found := _CRS.match(line.strip()))]
     numbered = enumerate(lines, start=1)
     used = [(n, line) for n, line in numbered if line.strip() and line.lstrip()[0] != "#"]
     if not used:
         raise bad_file(path, "vector.empty", "is empty.")
     is_wkt = _WKT.match(used[0][1])
     geometries, crs = _from_wkt(path, used) if is_wkt else _from_table(path, lines, used[0][0] - 1)
-    return geometries, stated[0] if stated else crs
+    return geometries, tables.stated_crs(lines[:20]) or crs
 
 
 def _from_wkt(path: Path, lines: list[tuple[int, str]]) -> tuple[Geometries, str | None]:

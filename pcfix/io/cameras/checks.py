@@ -291,6 +291,24 @@ def utm_as_code(text: str) -> str:
     return f"EPSG:{(32600 if utm[2].upper() == 'N' else 32700) + int(utm[1])}" if utm else text
 
 
+class AffineFrame(NamedTuple):
+    """The affine map from the frame of a file to `crs`: p -> matrix p + shift."""
+
+    matrix: FloatArray
+    shift: FloatArray
+    crs: str
+    project_crs: str | None = None
+
+    def points(self, xyz: FloatArray) -> FloatArray:
+        """Return points in `crs`."""
+        return np.asarray(xyz @ self.matrix.T + self.shift)
+
+    def rotations(self, rotations: FloatArray) -> FloatArray:
+        """Return world to camera rotations in `crs`: the nearest ones, as the map scales a bit."""
+        u, _, v = np.linalg.svd(rotations @ np.linalg.inv(self.matrix))
+        return np.asarray(u @ v)
+
+
 # ---- tie points ----
 
 

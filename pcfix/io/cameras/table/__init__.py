@@ -87,7 +87,6 @@ POSITION = {"label", "x", "y", "z", "longitude", "latitude", "tx", "ty", "tz"}
 POSITION |= {"x_est", "y_est", "z_est"}
 MANY = ("label", *(f"sigma_{axis}" for axis in "xyz"))  # the first spelling counts
 
-CRS_COMMENT = re.compile(r"^#\s*(?:coordinatesystem|crs)\s*[:=]\s*(.+)$", re.IGNORECASE)
 _FARTHEST_HEADER = 20
 
 
@@ -184,7 +183,7 @@ def headers(lines: Sequence[str]) -> Iterator[Header]:
     for i, line in enumerate(lines[:_FARTHEST_HEADER]):
         comment = line.lstrip("\"' ").startswith("#")
         text = line.strip().lstrip("#").strip() if comment else line.strip()
-        if text and not CRS_COMMENT.match(line):
+        if text and not tables.CRS_COMMENT.match(line):
             names, units = zip(*map(_split_unit, tables.split_header(text)[0]), strict=True)
             yield Header(i, [*names], [*units], comment)
             if not comment:
@@ -247,10 +246,7 @@ def read_columns(path: Path) -> Table:
     table = tables.table_below(
         path, lines, names, delimiter, SPELLINGS, units=unit, at=at, comments=comments
     )
-    crs = next(
-        (match[1].strip() for line in lines[:at] if (match := CRS_COMMENT.match(line))), None
-    )
-    return replace(table, after_hash=comment, crs=crs)
+    return replace(table, after_hash=comment, crs=tables.stated_crs(lines[:at]))
 
 
 def centres(columns: Table, suffix: str = "", *, needed: bool = False) -> FloatArray:
