@@ -41,7 +41,7 @@ from pcfix.io.cameras.checks import Source
 from pcfix.io.cameras.checks import number as xml_number
 from pcfix.io.cameras.metashape import SPREADS, documents, spreads
 from pcfix.io.cameras.odm import named_crs
-from pcfix.io.cameras.table import centres, headers, is_header, read_columns
+from pcfix.io.cameras.table import centres, find_header, read_columns
 from pcfix.io.cameras.table import crs as table_crs
 from pcfix.io.crs import LOCAL, is_local, is_topocentric, parse_crs, way_to_cloud
 from pcfix.io.files import check_input
@@ -282,7 +282,7 @@ def read_marks(path: Path) -> tuple[list[Mark], str | None]:
     first = [number(field) for field in rows[0][1][:5]] if rows else []
     if len(first) == 5 and not np.isnan([*first[:2], *first[3:]]).any():  # z may be NaN
         return _from_odm(path, rows)
-    if not any(is_header(header.names) for header in headers(lines)):
+    if find_header(lines) is None:
         sentence = "is neither a table of marks nor OpenDroneMap's gcp_list.txt. Line 1 must name"
         sentence += " the columns name, x, y, z, image, u, v, or be a CRS."
         raise bad_file(path, "gcps.format", sentence)

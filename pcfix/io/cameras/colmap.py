@@ -421,7 +421,7 @@ def write_colmap(
     from scipy.spatial.transform import Rotation
 
     target = Path(folder)
-    _, lenses = checks.block_to_write(  # a file would cut off other names
+    rotations, lenses = checks.block_to_write(  # a file would cut off other names
         target, cameras, lambda name: name == name.strip() != "" and not {"\0", "\n"} & {*name}
     )
     middle = np.median(cameras.centres, axis=0)
@@ -444,7 +444,6 @@ def write_colmap(
         size = int(lens.width), int(lens.height)
         listed.append(struct.pack("<IiQQ", i, MODELS.index(model), *size))
         listed.append(np.array([*values.values()], "<f8").tobytes())
-    rotations = np.asarray(cameras.rotations)
     turns = np.roll(Rotation.from_matrix(rotations).as_quat(canonical=True), 1, axis=1)
     shifts = -np.einsum("kij,kj->ki", rotations, cameras.centres - offset)
     images = [struct.pack("<Q", len(cameras))]

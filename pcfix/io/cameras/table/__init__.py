@@ -34,10 +34,9 @@ its f, px, py and the order of t1, t2 are those of AliceVision's reader of the s
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -98,7 +97,7 @@ def recognises(source: Source) -> bool:
     lines = text.splitlines()
     if lines[0].lower().startswith("# coordinatesystem:"):  # it may fill the head
         return True
-    return is_geo(lines) or any(is_header(header.names) for header in headers(lines))
+    return is_geo(lines) or find_header(lines) is not None
 
 
 def read(source: Source) -> Cameras:
@@ -169,25 +168,23 @@ def gnss_positions(columns: Table) -> GnssPositions | None:
     return GnssPositions(xyz, sigma, crs(columns)[0])
 
 
-class Header(NamedTuple):
-    """A line that may be a header: its number from 0, names, their units, whether a comment."""
+def find_header(lines: Sequence[str]) -> tuple[int, list[str], list[str], bool] | None:
+    """Return the number of the header from 0, its names and units, and whether it is a comment.
 
-    at: int
-    names: list[str]
-    units: list[str]
-    comment: bool
-
-
-def headers(lines: Sequence[str]) -> Iterator[Header]:
-    """Yield the lines that may be a header."""
+    It has at least two of the names that every table of cameras has, and is the last such comment,
+    or the first line that is none.
+    """
+    found = None
     for i, line in enumerate(lines[:_FARTHEST_HEADER]):
-        comment = line.lstrip("\"' ").startswith("#")
-        text = line.strip().lstrip("#").strip() if comment else line.strip()
+        is_comment = line.lstrip("\"' ").startswith("#")
+        text = line.strip().lstrip("#").strip() if is_comment else line.strip()
         if text and not tables.CRS_COMMENT.match(line):
             names, units = zip(*map(_split_unit, tables.split_header(text)[0]), strict=True)
-            yield Header(i, [*names], [*units], comment)
-            if not comment:
-                return
+            if len(POSITION & tables.places(names, SPELLINGS).keys()) >= 2:
+                found = i, [*names], [*units], is_comment
+            if not is_comment:
+                break
+    return found
 
 
 def axes(place: Iterable[str], suffix: str = "") -> tuple[str, str, str] | None:
@@ -197,11 +194,6 @@ def axes(place: Iterable[str], suffix: str = "") -> tuple[str, str, str] | None:
         if {*three} <= {*place}:
             return three
     return None
-
-
-def is_header(names: Sequence[str]) -> bool:
-    """Whether at least two of the names that every table of cameras has are among these."""
-    return len(POSITION & tables.places(names, SPELLINGS).keys()) >= 2
 
 
 def _split_unit(name: str) -> tuple[str, str]:
@@ -222,11 +214,11 @@ _PLAIN = {spelling for spellings in SPELLINGS.values() for spelling in spellings
 def read_columns(path: Path) -> Table:
     """Read a table with a header line, which may be a comment."""
     lines = tables.read_lines(path)
-    found = [header for header in headers(lines) if is_header(header.names)]
-    if not found:
+    found = find_header(lines)
+    if found is None:
         sentence = "no line names the columns, for example label,x,y,z,omega,phi,kappa."
         raise bad_file(path, "table.no_header", sentence)
-    at, names, unit, comment = found[-1]
+    at, names, unit, comment = found
     place = tables.places(names, SPELLINGS)
     for role, spellings in SPELLINGS.items():  # a column with the role's own name counts
         alike = [name for name in names if name in spellings]

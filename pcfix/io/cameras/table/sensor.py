@@ -115,7 +115,7 @@ def write_table(folder: File, cameras: Cameras) -> None:
     from scipy.spatial.transform import Rotation
 
     target = Path(folder)
-    _, lenses = checks.block_to_write(target, cameras, lambda _: True)
+    rotations, lenses = checks.block_to_write(target, cameras, lambda _: True)
     if cameras.crs is not None and is_topocentric(cameras.crs):
         sentence = f"a table cannot hold the axes {cameras.crs}. Use a projected CRS."
         raise bad_file(target, "output.crs", sentence, crs=cameras.crs)
@@ -135,7 +135,7 @@ def write_table(folder: File, cameras: Cameras) -> None:
         frame = (values.pop("f"), given.width, given.height)
         named = {NAMES.get(name, name): value for name, value in values.items()}
         sensor = _row(dict(zip(MILLIMETRES if is_mm else PIXELS, frame, strict=True)) | named)
-    turns = Rotation.from_matrix(np.asarray(cameras.rotations)).as_quat(canonical=True)
+    turns = Rotation.from_matrix(rotations).as_quat(canonical=True)
     numbers = np.column_stack([cameras.centres, np.roll(turns, 1, axis=1)]).tolist()
     stream = io.StringIO()
     if cameras.crs is not None and cameras.crs.strip().lower() != "local":
