@@ -430,15 +430,13 @@ class ViewMatch:
         views = self.view_list
         source, weights = f"{views.what} {views.path}", views.weight is not None
         report = ViewReport(source, len(views), tolerance_m=self.tolerance_m, weights=weights)
-        shares = [views.share_seen]
         if views.xyz is None:
             row = np.arange(first_row, first_row + len(xyz))
             views = fitted(views, self._cameras, xyz, row)
-            shares.append(views.share_seen)
             report.by_row = len(row)
         else:
             row = self._rows(xyz, first_row, views.xyz, report)
-        report.share_seen = min((share for share in shares if share is not None), default=None)
+        report.share_seen = views.share_seen
         report.image_order, report.unposed = views.orders[0].what, views.orders[0].unposed
         listed = _listed(views, row, report)
         apart = beside_frames(xyz, listed, self._cameras)

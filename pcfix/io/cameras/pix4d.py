@@ -7,8 +7,8 @@ corner of the image, and the tangential coefficients are in OpenCV's order. A fi
 instead of K and the distortion an affine matrix and a polynomial of 2 theta / pi.
 ``calibrated_external_camera_parameters.txt`` has absolute centres and omega, phi, kappa of axes
 x right, y up, z back: R = diag(1, -1, -1) (Rx(omega) Ry(phi) Rz(kappa))^T. Where that table is
-there the poses are taken from it, as an offset can be wrong. Of equal names those with the most
-similar rotations belong together.
+there the poses are taken from it, as an offset can be wrong. Images of one name are in the same
+order in both.
 
 ``pix4d_calibrated_internal_camera_parameters.cam`` has the interior orientation in millimetres,
 ``wkt.prj`` the CRS, and the project file (.p4d) the GNSS positions.
@@ -24,10 +24,10 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PurePath, PureWindowsPath
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -73,7 +73,8 @@ FIELDS = {
 }
 SHAPE = re.compile(r"^(.*?)\s*\[\s*(\d{1,2})\s*x\s*(\d{1,2})\s*\]\s*$")
 SENSOR = re.compile(r"sensor width of\s*([-+.\deE]+)\s*x\s*([-+.\deE]+)")
-Unlike = Callable[[int, list[int]], Any]
+PRIORS = {"xyz": ("x", "y", "z"), "gps": ("lng", "lat", "alt")}
+"""Elements with the initial position of an image, and their attributes."""
 SAME_FOCAL = 1e-6
 """Relative: the two files write the same number in pixels and in millimetres."""
 
@@ -93,20 +94,17 @@ def read(source: Source) -> Cameras:
     if "parameters" in files:
         path, images = files["parameters"], read_parameters(files["parameters"])
         labels = [image.label for image in images]
-        turns = np.array([image.fields["rotation"] for image in images]).reshape(-1, 3, 3)
-        turns = checks.rotations(path, labels, turns)
         if "external" in files:
             names, there, turned = read_external(files["external"])
-            rows = _rows(
-                labels, names, lambda i, rows: np.linalg.norm(turned[rows] - turns[i], axis=(1, 2))
-            )
+            rows = _rows(labels, names)
             if max(rows) < 0:
                 raise damaged(files["external"], f"names none of the images of {PARAMETERS}")
             centres, rotations = there[rows], turned[rows]
             centres[np.array(rows) < 0] = np.nan
         else:
             names, (centres, notes) = labels, _absolute(files, images)
-            rotations = turns
+            turns = np.array([image.fields["rotation"] for image in images]).reshape(-1, 3, 3)
+            rotations = checks.rotations(path, labels, turns)
         posed = np.flatnonzero(np.isfinite(centres).all(axis=1))
         given = [*labels, *names]
         labels, centres, rotations = [labels[i] for i in posed], centres[posed], rotations[posed]
@@ -184,20 +182,12 @@ def _tables_in(root: Path) -> list[tuple[Path, str]]:
     ]
 
 
-def _rows(
-    labels: Sequence[str], names: Sequence[str], unlike: Unlike = lambda i, rows: [0.0] * len(rows)
-) -> list[int]:
-    """Return the row of each label among names, -1 where there is none left of this name.
-
-    Of equal names it is the one that `unlike` (of the label's number and the rows) finds smallest.
-    """
+def _rows(labels: Sequence[str], names: Sequence[str]) -> list[int]:
+    """Return the row of each label among names, each once, -1 where there is none left of it."""
     left: dict[str, list[int]] = defaultdict(list)
     for row, name in enumerate(names):
         left[name].append(row)
-    return [
-        left[label].pop(int(np.argmin(unlike(i, left[label])))) if left[label] else -1
-        for i, label in enumerate(labels)
-    ]
+    return [left[label].pop(0) if left[label] else -1 for label in labels]
 
 
 def _absolute(files: Files, images: list[Image]) -> tuple[FloatArray, tuple[PcfixWarning, ...]]:
@@ -238,16 +228,11 @@ def _priors(path: Path, labels: list[str]) -> tuple[GnssPositions | None, list[s
     ]
     names = [PureWindowsPath(image.get("path", "")).name for image in images]
     rows = _rows(labels, names)
-    tags = [
-        tag
-        for row in rows
-        if row >= 0
-        for tag in ("xyz", "gps")
-        if images[row].find(tag) is not None
-    ]
-    if not tags:
+    known = [images[row] for row in rows if row >= 0]
+    kinds = [kind for image in known for kind in PRIORS if image.find(kind) is not None]
+    if not kinds:
         return None, names
-    kind, axes = tags[0], ("x", "y", "z") if tags[0] == "xyz" else ("lng", "lat", "alt")
+    kind, axes = kinds[0], PRIORS[kinds[0]]
     xyz, sigma_m = np.full((2, len(labels), 3), np.nan)
     for i, row in enumerate(rows):
         position = images[row].find(kind) if row >= 0 else None
