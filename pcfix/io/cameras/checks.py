@@ -33,6 +33,8 @@ from pcfix.model import (
 )
 
 ZIP_MAGIC = b"PK\x03\x04"
+LARGEST_RATIO = 200
+"""Of an archive: XML packs 10 to 30 times smaller, a bomb a thousand times."""
 ROUNDING = 1e-3
 """Of a rotation's elements: files with four decimals pass, a mirrored or scaled one does not."""
 NO_LENS = "cameras.no_lens"
@@ -142,6 +144,21 @@ def reading(path: object) -> Iterator[None]:
         raise damaged(path, f"{error} is missing") from error
     except DAMAGES as error:
         raise damaged(path, error or type(error).__name__) from error
+
+
+def open_archive(path: Path) -> zipfile.ZipFile:
+    """Open an archive."""
+    with reading(path):
+        return zipfile.ZipFile(path)
+
+
+def unpacked(archive: zipfile.ZipFile, name: str) -> bytes:
+    """Return the content of an entry."""
+    with reading(archive.filename):
+        entry = archive.getinfo(name)
+        if entry.file_size > LARGEST_RATIO * (entry.compress_size + 1):
+            raise damaged(archive.filename, f"{name} unpacks to far too much")
+        return archive.read(entry)
 
 
 def read_xml(path: Path, stream: IO[bytes] | None = None) -> Element:

@@ -46,7 +46,7 @@ from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import Source, damaged, note, number, numbers, read_xml, text_of
 from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.io.cameras.metashape import documents
-from pcfix.io.cameras.metashape.documents import Chunk, Document, open_archive, recognises, unpacked
+from pcfix.io.cameras.metashape.documents import Chunk, Document, recognises
 from pcfix.io.crs import LOCAL, METRES, crs_text, is_local, parse_crs, shortened, unbound
 from pcfix.io.ply import parse_header
 from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, Projection, TiePoints
@@ -471,7 +471,7 @@ def _tie_points(frame: Document, block: Block) -> Iterator[checks.Seen]:
         return
     listed = document.root.iterfind("projections")
     files = {entry.get("camera_id") or "": entry.get("path") or "" for entry in listed}
-    with open_archive(document.path) as archive:
+    with checks.open_archive(document.path) as archive:
         for points in document.root.iterfind("points"):
             component = points.get("component_id")
             rows = [
@@ -498,7 +498,7 @@ def _columns(vertices: np.ndarray, names: str) -> FloatArray:
 
 def _vertices(archive: ZipFile, name: str | None, needed: tuple[str, ...]) -> np.ndarray:
     """Return the vertices of a binary PLY in an archive, with the properties that are needed."""
-    where, data = f"{archive.filename}: {name}", unpacked(archive, name or "")
+    where, data = f"{archive.filename}: {name}", checks.unpacked(archive, name or "")
     header = parse_header(where, data)
     kinds = [(p.name, header.order + p.item) for p in header.properties if not p.length]
     if not header.order or header.skipped or not {*needed} <= dict(kinds).keys():
