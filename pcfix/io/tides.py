@@ -221,15 +221,15 @@ def read_altitudes(cameras: File, labels: Sequence[str]) -> FloatArray:
     altitudes, path, found = np.full(len(labels), np.nan), Path(cameras), {}
     with suppress(OSError, InputError):  # no correction needs them
         if path.suffix.lower() == ".psx":
-            chunk = open_chunk(path).document
-            names = {camera.get("id"): camera.get("label") for camera in chunk.root.iter("camera")}
-            for frame in chunk.root.iterfind("frames/frame"):
-                for camera in chunk.follow(frame).root.iter("camera"):
-                    for entry in camera.iter("property"):
-                        label = names.get(camera.get("camera_id"))
-                        if entry.get("name") == "DJI/RelativeAltitude" and label:
-                            with suppress(ValueError):
-                                found[label] = float(entry.get("value", ""))
+            chunk = open_chunk(path)
+            frame, listed = chunk.frame, chunk.element.iter("camera")
+            names = {camera.get("id"): camera.get("label") for camera in listed}
+            for camera in () if frame is None else frame.root.iter("camera"):
+                for entry in camera.iter("property"):
+                    label = names.get(camera.get("camera_id"))
+                    if entry.get("name") == "DJI/RelativeAltitude" and label:
+                        with suppress(ValueError):
+                            found[label] = float(entry.get("value", ""))
         else:
             root = path if path.is_dir() else path.parent
             inside = [one for name in FOLDERS for one in sorted(root.joinpath(name).glob("*"))]

@@ -79,10 +79,6 @@ class Vectors:
         """All vertices, shape (n, 3); z is NaN where a geometry has none."""
         return np.asarray(shapely.get_coordinates(self.geometries, include_z=True), np.float64)
 
-    def noted(self, code: str, sentence: str, **values: Any) -> tuple[PcfixWarning, ...]:
-        """Return the notes with one more."""
-        return (*self.notes, PcfixWarning(code, f"{self.name}: {sentence}", **values))
-
 
 def is_vector_file(path: File) -> bool:
     """Whether the name of a file, with or without a layer, is one that `read_vectors` reads."""
@@ -304,8 +300,8 @@ def read_shoreline(
     known, notes = xyz[np.isfinite(xyz[:, 2]), 2], vectors.notes
     if len(known) >= FEW and not known.any():  # a flat drawing
         xyz[:, 2] = np.nan
-        sentence = f"all {len(known)} heights are exactly 0; they are ignored."
-        notes = vectors.noted("water.zero_heights", sentence, count=len(known))
+        sentence = f"{vectors.name}: all {len(known)} heights are exactly 0; they are ignored."
+        notes = (*notes, PcfixWarning("water.zero_heights", sentence, count=len(known)))
     return Shoreline(xyz, vectors.name, notes, counts)
 
 
@@ -350,9 +346,9 @@ def read_water_polygons(path: File, cloud_crs: str | CRS | None = None) -> Water
             polygons[crossed], method="structure", keep_collapsed=False
         )
         count, area_m2 = int(crossed.sum()), float(shapely.area(polygons[crossed]).sum())
-        sentence = f"{count} of {len(polygons)} polygons crossed themselves. Repaired,"
-        sentence += f" they cover {area_m2:.1f} m2."
-        notes = vectors.noted("mask.repaired", sentence, count=count, area_m2=area_m2)
+        sentence = f"{vectors.name}: {count} of {len(polygons)} polygons crossed themselves."
+        sentence += f" Repaired, they cover {area_m2:.1f} m2."
+        notes = (*notes, PcfixWarning("mask.repaired", sentence, count=count, area_m2=area_m2))
     area = shapely.union_all(polygons)
     if not area.area > 0.0:
         kinds = sorted({geometry.geom_type for geometry in vectors.geometries})

@@ -22,7 +22,7 @@ from pcfix.io.cameras.checks import write_new
 from pcfix.io.cameras.lenses import LensModel, lens_by_name, model_of
 from pcfix.io.crs import is_topocentric
 from pcfix.io.files import check_input
-from pcfix.io.tables import read_lines, read_table, split_header
+from pcfix.io.tables import Table, check_columns, read_table
 from pcfix.model import Cameras, Lens
 from pcfix.options.declare import File
 
@@ -50,12 +50,13 @@ def read_sensor(path: Path) -> Lens:
         width_px, height_px and, where known, OpenCV's cx, cy (pixels from the upper left corner
         of the image), k1 ... k6, p1, p2.
     """
-    if _is_xml(path):
+    table = _table(path)
+    if table is None:
         from pcfix.io.cameras.metashape import read_calibration
 
         return read_calibration(path)
-    columns = PIXELS if _column_names(path) >= set(PIXELS) else MILLIMETRES
-    table = read_table(path, columns)
+    columns = PIXELS if table.has(*PIXELS) else MILLIMETRES
+    check_columns(path, table.header, columns, [one for one in columns if not table.has(one)])
     if len(table.rows) != 1:
         sentence = f"has {len(table.rows)} rows. Give one row for all images."
         raise bad_file(path, "cameras.sensor_rows", sentence, rows=len(table.rows))
@@ -80,22 +81,19 @@ def read_sensor(path: Path) -> Lens:
 
 def read_frame(path: Path) -> tuple[float, float]:
     """Read the width and height of all images; the lens is not needed."""
-    if not _is_xml(path) and _column_names(path) >= set(FRAME):
-        width, height = read_table(path, FRAME).of(FRAME)[0].tolist()
+    table = _table(path)
+    if table is not None and table.has(*FRAME):
+        width, height = table.of(FRAME)[0].tolist()
         return width, height
     lens = read_sensor(path)
     return lens.width, lens.height
 
 
-def _is_xml(path: Path) -> bool:
-    """Whether a file is a calibration of Metashape, not a table."""
+def _table(path: Path) -> Table | None:
+    """Return a table of a sensor; None where a file is a calibration of Metashape (XML)."""
     with check_input(path).open("rb") as stream:
-        return stream.read(64).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
-
-
-def _column_names(path: Path) -> set[str]:
-    """Return the names in the first line of a table."""
-    return {*split_header("".join(read_lines(path)[:1]).strip())[0]}
+        is_xml = stream.read(64).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
+    return None if is_xml else read_table(path, ())
 
 
 POSE = ("label", "x", "y", "z", "qw", "qx", "qy", "qz")
