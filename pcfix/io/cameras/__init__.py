@@ -3,8 +3,8 @@
 A format module has ``recognises(source)``, which is cheap, ``read(source)`` and, where the format
 has tie points, ``tie_points(source, cameras)``. `read_cameras` turns what damaged contents raise
 into an `InputError`, and checks rotations and lenses; a module raises an `InputError` itself where
-it can say more than "damaged". To add a format, write its module and an entry of `FORMATS`, from
-which its line in README.md of this folder follows. A module is loaded when its turn comes.
+it can say more than "damaged". To add a format, write its module, an entry of `FORMATS` and a line
+in README.md of this folder. A module is loaded when its turn comes.
 """
 
 from __future__ import annotations
@@ -32,52 +32,32 @@ LISTS = (
 
 
 class CameraFormat(NamedTuple):
-    """A format: its software, what to give ``--cameras`` (for the documentation), its module."""
+    """A format: its software, and its module of this folder."""
 
     software: str
-    give: str
     module: str
 
     @property
     def reader(self) -> Any:
-        """The module of this folder."""
+        """The module."""
         return import_module(f"{__name__}.{self.module}")
 
 
-UNSUPPORTED = CameraFormat("a format that pcfix does not read", "", "unsupported")
-_FORMATS = (
-    (
-        "Agisoft Metashape, PhotoScan",
-        "cameras or markers XML, `.psx`, `.psz`; omega-phi-kappa text or reference table with"
-        " `--sensor calibration.xml`",
-        "metashape",
-    ),
-    ("Pix4D", "the `params` folder, the project folder or one of its tables", "pix4d"),
-    ("OPF: PIX4Dmatic, PIX4Dcatch", "the project (`.opf`) or its folder", "opf"),
-    ("OpenDroneMap", "the project folder, `reconstruction.json`, `shots.geojson`", "odm"),
-    ("OpenSfM", "`reconstruction.json` or its folder", "opensfm"),
-    ("COLMAP", "the model folder or workspace, text or binary", "colmap"),
-    ("MicMac", "the `Ori-...` folder, of MMVII too", "micmac"),
-    (
-        "Bundler, MVE, VisualSFM",
-        "`bundle.out`, `synth_0.out`, `.nvm`, with the images (and Bundler's list) beside it",
-        "bundler",
-    ),
-    (
-        "ContextCapture, iTwin Capture, DJI Terra",
-        "BlocksExchange XML, plain or zipped",
-        "blocksexchange",
-    ),
-    ("RealityCapture (XMP)", "the folder of XMP files", "realitycapture"),
-    (
-        "CSV table",
-        "a table with a header: `label,x,y,z` and, if known, `omega,phi,kappa`, `yaw,pitch,roll`,"
-        " `qw,qx,qy,qz` (world to camera) or `r11..r33`; RealityCapture's internal and external"
-        " parameters, Metashape's and ODM's lists among them",
-        "table",
-    ),
+UNSUPPORTED = CameraFormat("a format that pcfix does not read", "unsupported")
+FORMATS = (
+    CameraFormat("Agisoft Metashape, PhotoScan", "metashape"),
+    CameraFormat("Pix4D", "pix4d"),
+    CameraFormat("OPF: PIX4Dmatic, PIX4Dcatch", "opf"),
+    CameraFormat("OpenDroneMap", "odm"),
+    CameraFormat("OpenSfM", "opensfm"),
+    CameraFormat("COLMAP", "colmap"),
+    CameraFormat("MicMac", "micmac"),
+    CameraFormat("Bundler, MVE, VisualSFM", "bundler"),
+    CameraFormat("ContextCapture, iTwin Capture, DJI Terra", "blocksexchange"),
+    CameraFormat("RealityCapture (XMP)", "realitycapture"),
+    CameraFormat("CSV table", "table"),
+    UNSUPPORTED,
 )
-FORMATS = (*(CameraFormat(*each) for each in _FORMATS), UNSUPPORTED)
 """In the order in which they are asked: ODM knows more of an OpenSfM file than OpenSfM, and a plain
 table says least of all."""
 TAKE_SENSOR = ("table", "realitycapture")
