@@ -28,7 +28,6 @@ from pcfix.errors import SettingError, bad_file
 from pcfix.io.atomic import cannot_write, temporary_output
 from pcfix.io.files import parse_json
 from pcfix.io.las.columns import UPGRADE, Column, column_scale
-from pcfix.io.las.part import part_report
 from pcfix.io.las.source import (
     IDENTITY_PLACE,
     LasSource,
@@ -37,6 +36,7 @@ from pcfix.io.las.source import (
     append_evlrs,
     backend,
     las_errors,
+    part_report,
 )
 from pcfix.model import FloatArray
 from pcfix.version import __version__
