@@ -206,7 +206,6 @@ def level_offsets(
     return level - level.mean(), tuple(notes)
 
 
-_WITH_XMP = (".jpg", ".jpeg", ".dng", ".tif", ".tiff")
 FOLDERS = ("", "images")
 """Where images lie, relative to the folder of the camera file."""
 MOST_IMAGES, HEAD_BYTES = 30, 2**17
@@ -233,7 +232,7 @@ def read_altitudes(cameras: File, labels: Sequence[str]) -> FloatArray:
         else:
             root = path if path.is_dir() else path.parent
             inside = [one for name in FOLDERS for one in sorted(root.joinpath(name).glob("*"))]
-            images = [one for one in inside if one.suffix.lower() in _WITH_XMP and one.is_file()]
+            images = [one for one in inside if one.suffix.lower() in IMAGES and one.is_file()]
             for image in images[:: 1 + len(images) // MOST_IMAGES]:
                 with image.open("rb") as stream:
                     if above := _ABOVE.search(stream.read(HEAD_BYTES)):

@@ -251,9 +251,6 @@ MARGIN = 0.02
 
 SAMPLE_POINTS = 20_000
 
-_ENOUGH = 1000
-"""Entries that are enough to choose the order of the images; with fewer, later chunks decide."""
-
 _PLACES = (".", "sparse", "sparse/0")
 _FRAME_HEAD, _DATA = struct.Struct("<II7dI"), struct.Struct("<iIQ")
 
@@ -341,8 +338,7 @@ def fitted(views: ViewList, cameras: Cameras, xyz: FloatArray, rows: IntArray) -
         sentence = f"only {100 * share:.0f} % of the listed cameras have their point in the frame."
         sentence += " Put the sparse model beside the list, or give its offset (--cameras-offset)."
         raise bad_file(views.path, "views.other_images", sentence, share=share)
-    others = () if len(image) >= _ENOUGH else views.orders[:best] + views.orders[best + 1 :]
-    return replace(views, orders=(views.orders[best], *others), share_seen=share)
+    return replace(views, orders=(views.orders[best],), share_seen=share)
 
 
 def entries(start: IntArray, rows: IntArray) -> tuple[IntArray, slice | IntArray]:

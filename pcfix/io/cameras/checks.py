@@ -20,6 +20,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from pcfix.errors import InputError, NoTiePointsError, PcfixError, PcfixWarning, bad_file
+from pcfix.io import tables
 from pcfix.io.files import check_input, check_output, parse_json, write_bytes
 from pcfix.model import (
     BoolArray,
@@ -183,10 +184,7 @@ def load_json(path: Path) -> Any:
 
 def number(path: Path, where: str, text: str | None) -> float:
     """Return the number in a text; `where` is the image and element, for the message."""
-    try:
-        value = float(text or "")
-    except ValueError:
-        value = np.nan
+    value = tables.number(text or "")
     if not np.isfinite(value):
         shown = (text or "").strip()
         sentence = f"{where}: '{shown}' is not a number. Export it again."
