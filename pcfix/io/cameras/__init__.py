@@ -198,10 +198,8 @@ def _recognised(
         raise bad_file(where, "cameras.folder", sentence, files=[name for name, _ in inside[:3]])
     if known is not None:
         return source, known
-    sentence = (
-        "is not a camera file that pcfix knows. Give a CSV table with the columns label, x, y, z"
-        " and, if you have them, yaw, pitch, roll."
-    )
+    sentence = "is not a camera file that pcfix knows. Give a CSV table with the columns label, x,"
+    sentence += " y, z and, if you have them, yaw, pitch, roll."
     raise bad_file(where, "cameras.unknown", sentence)
 
 

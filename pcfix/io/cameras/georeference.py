@@ -226,10 +226,8 @@ def georeference(
             raise bad_file(name, "cameras.local", sentence, cloud_crs=cloud.name)
         return Georeference(_same, None, offset, systems.crs_text(cloud), (), name)
     if cloud is not None and systems.is_local(cloud):
-        sentence = (
-            f"is in {systems.shortened(crs)}, the cloud in a local frame. Set the cloud's CRS, or"
-        )
-        sentence += " give --cameras-crs local to use the numbers as they are."
+        sentence = f"is in {systems.shortened(crs)}, the cloud in a local frame. Set the cloud's"
+        sentence += " CRS, or give --cameras-crs local to use the numbers as they are."
         raise bad_file(name, "cloud.local", sentence, crs=crs, cloud_crs=cloud.name)
     frame = frame_of(crs, name)
     if cloud is not None:

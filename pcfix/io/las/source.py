@@ -249,7 +249,7 @@ class LasSource:
         try:
             with las_errors(self.path):
                 self.points_of_file = len(self)
-            self._check_header()
+                self._check_header()
         except BaseException:
             self._reader.close()
             raise
@@ -274,18 +274,15 @@ class LasSource:
         usable = (scales > 0.0) & (scales <= MOST_SCALE_M)
         # steps below the last digit of the offsets would be lost in coordinates
         if not (usable & (np.abs(offsets) * _LAST_DIGIT <= scales)).all():
-            sentence = (
-                f"the scales {scales.tolist()} of its header are not between 0 and"
-                f" {MOST_SCALE_M:,.0f}, or too small for its offsets {offsets.tolist()}."
-            )
+            sentence = f"the scales {scales.tolist()} of its header are not between 0 and"
+            sentence += f" {MOST_SCALE_M:,.0f}, or too small for its offsets {offsets.tolist()}."
             raise bad_file(self.path, "cloud.scales", f"{sentence} Export the cloud again.")
         stated = len(self)
         if stated == 0:
             raise bad_file(self.path, "cloud.empty", "contains no points.")
         # points that the header does not count would be lost
         packed = self.header.are_points_compressed
-        with las_errors(self.path):
-            least, most = self._points_of_chunks() if packed else self._points_of_records()
+        least, most = self._points_of_chunks() if packed else self._points_of_records()
         if not least <= stated <= most:
             held = f"{least:,}" if least == most else f"{least:,} to {most:,}"
             sentence = f"its header counts {stated:,} points, but it holds {held}. Export it again."
