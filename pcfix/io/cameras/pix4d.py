@@ -7,8 +7,8 @@ corner of the image, and the tangential coefficients are in OpenCV's order. A fi
 instead of K and the distortion an affine matrix and a polynomial of 2 theta / pi.
 ``calibrated_external_camera_parameters.txt`` has absolute centres and omega, phi, kappa of axes
 x right, y up, z back: R = diag(1, -1, -1) (Rx(omega) Ry(phi) Rz(kappa))^T. Where that table is
-there the poses are taken from it, as an offset can be wrong. Images of one name are in the same
-order in both.
+there the poses are taken from it, as an offset can be wrong. Of equal names those with the most
+similar rotations belong together.
 
 ``pix4d_calibrated_internal_camera_parameters.cam`` has the interior orientation in millimetres,
 ``wkt.prj`` the CRS, and the project file (.p4d) the GNSS positions.
@@ -94,17 +94,18 @@ def read(source: Source) -> Cameras:
     if "parameters" in files:
         path, images = files["parameters"], read_parameters(files["parameters"])
         labels = [image.label for image in images]
+        turns = np.array([image.fields["rotation"] for image in images]).reshape(-1, 3, 3)
+        turns = checks.rotations(path, labels, turns)
         if "external" in files:
             names, there, turned = read_external(files["external"])
-            rows = _rows(labels, names)
+            rows = _rows(labels, names, (turns, turned))
             if max(rows) < 0:
                 raise damaged(files["external"], f"names none of the images of {PARAMETERS}")
             centres, rotations = there[rows], turned[rows]
             centres[np.array(rows) < 0] = np.nan
         else:
             names, (centres, notes) = labels, _absolute(files, images)
-            turns = np.array([image.fields["rotation"] for image in images]).reshape(-1, 3, 3)
-            rotations = checks.rotations(path, labels, turns)
+            rotations = turns
         posed = np.flatnonzero(np.isfinite(centres).all(axis=1))
         given = [*labels, *names]
         labels, centres, rotations = [labels[i] for i in posed], centres[posed], rotations[posed]
@@ -182,12 +183,24 @@ def _tables_in(root: Path) -> list[tuple[Path, str]]:
     ]
 
 
-def _rows(labels: Sequence[str], names: Sequence[str]) -> list[int]:
-    """Return the row of each label among names, each once, -1 where there is none left of it."""
+def _rows(
+    labels: Sequence[str], names: Sequence[str], turns: tuple[FloatArray, FloatArray] | None = None
+) -> list[int]:
+    """Return the row of each label among names, each once, -1 where there is none left of it.
+
+    Of equal names it is the first, or that with the most similar rotation of `turns`.
+    """
     left: dict[str, list[int]] = defaultdict(list)
     for row, name in enumerate(names):
         left[name].append(row)
-    return [left[label].pop(0) if left[label] else -1 for label in labels]
+    found = []
+    for i, label in enumerate(labels):
+        rows, nearest = left[label], 0
+        if turns and len(rows) > 1:
+            apart = np.linalg.norm(turns[1][rows] - turns[0][i], axis=(1, 2))
+            nearest = int(np.argmin(apart))
+        found.append(rows.pop(nearest) if rows else -1)
+    return found
 
 
 def _absolute(files: Files, images: list[Image]) -> tuple[FloatArray, tuple[PcfixWarning, ...]]:
