@@ -24,6 +24,11 @@ def optional_library(name: str, extra: str, who: str) -> Any:
         ) from error  # fmt: skip
 
 
+def analysis_library(name: str) -> Any:
+    """Import a library of the extra ``analysis``."""
+    return optional_library(name, "analysis", "This")
+
+
 def photo_library(name: str) -> Any:
     """Import a library of the extra ``photos``."""
     return optional_library(name, "photos", "Work on photographs")

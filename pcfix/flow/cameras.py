@@ -224,9 +224,9 @@ def _gnss(cameras: Cameras, name: str) -> Plain | None:
     """Return adjusted projection centres minus their GNSS positions: metres east, north, up."""
     if cameras.gnss is None:
         return None
-    found = adjusted_minus_gnss(cameras, name)
-    rows = np.flatnonzero(np.isfinite(found.enu_m[:, 0]))
-    enu = found.enu_m[rows] if len(rows) else np.full((1, 3), np.nan)
+    enu_m, reason = adjusted_minus_gnss(cameras, name)
+    rows = np.flatnonzero(np.isfinite(enu_m[:, 0]))
+    enu = enu_m[rows] if len(rows) else np.full((1, 3), np.nan)
     length = np.sqrt(np.nansum(enu * enu, axis=1))
     mean, sd = (
         [float(one) if np.isfinite(one) else None for one in values]
@@ -238,7 +238,7 @@ def _gnss(cameras: Cameras, name: str) -> Plain | None:
         "sd_m": sd,
         "largest_m": float(length.max()),
         "largest_image": cameras.labels[rows[int(np.argmax(length))]] if len(rows) else "",
-        "reason": found.reason,
+        "reason": reason,
     }
 
 

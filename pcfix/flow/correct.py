@@ -103,16 +103,13 @@ def correct_cloud(
 ) -> tuple[Any, Any]:
     """Correct a file from a row of the cloud on; return statistics, and what a check finds.
 
-    It is written with narrow integers and the offsets of the input, and again if a value does not
-    fit: with wide integers, or with offsets in the middle of the cloud.
+    It is written with the offsets of the input, and again if a coordinate does not fit: with
+    offsets in the middle of the cloud.
     """
-    wide, steps = False, tuple[int, ...]((0, 0, 0))
+    steps = tuple[int, ...]((0, 0, 0))
     while True:
         try:
-            work = partial(Correcting, wide=wide, steps=steps)
-            return stream(work, plan, task, row, check)
-        except columns.TooNarrowError:
-            wide = True
+            return stream(partial(Correcting, steps=steps), plan, task, row, check)
         except columns.OutOfRangeError as axis:
             old = steps
             with open_cloud(task.source, task.jobs) as source:
@@ -129,11 +126,11 @@ def correct_cloud(
 class Correcting:
     """The correction of one file: its header, and each chunk."""
 
-    def __init__(self, plan: Plan, source: LasSource, wide: bool, steps: tuple[int, ...]) -> None:
+    def __init__(self, plan: Plan, source: LasSource, steps: tuple[int, ...]) -> None:
         self._plan, self._source, self._steps = plan, source, np.array(steps)
         self._columns = columns.columns_for(plan.options.dimensions, plan.options.unsure)
         record = plan.provenance()
-        self.header = corrected_header(source, self._columns, record, wide=wide, steps=steps)
+        self.header = corrected_header(source, self._columns, record, steps)
         self.identity = corrected_identity(source)
 
     def compute(self, points: Chunk, row: int) -> tuple[Correction, CloudTally]:
@@ -149,15 +146,15 @@ class Correcting:
         for rows, part in correction.parts():
             some = new[rows]
             # whole steps of the file's own scale, so that 'pcfix restore' gets back every bit
-            moved = columns.shift_steps(part, some.scales)
-            columns.move(some, moved + self._steps)
+            classes = np.array(some["classification"])
             withheld = np.asarray(some["withheld"]).astype(bool)
-            part = columns.unsure_anew(part, withheld)
-            changed = columns.changed_rows(part, withheld, withhold=withhold)
-            columns.fill(some, self._columns, part, moved, changed)
+            changes = columns.changes_of(
+                self._columns, part, classes, withheld, some.scales, withhold=withhold
+            )
+            columns.move(some, changes.steps + self._steps)
+            columns.fill(some, changes)
             some.array["classification"][part.corrected] = BATHYMETRIC_POINT
-            flagged = withheld | columns.to_withhold(part, withhold=withhold)
-            some["withheld"][:] = flagged.astype(np.uint8)
+            some["withheld"][:] = (withheld | changes.flagged).astype(np.uint8)
         drops = self._plan.options.uncorrected == "drop"
         return new[~correction.uncorrected] if drops else new
 

@@ -29,8 +29,7 @@ from pcfix.io import rasters
 from pcfix.io.atomic import scratch_folder, temporary_output
 from pcfix.io.crs import crs_words, parts
 from pcfix.io.files import check_output, scratch_arrays, write_text
-from pcfix.io.las.part import part_report
-from pcfix.io.las.source import LasSource, coordinates, metric_crs
+from pcfix.io.las.source import LasSource, coordinates, metric_crs, part_report
 from pcfix.io.las.writing import is_ours
 from pcfix.io.styles import raster_style
 from pcfix.io.tiles import CloudFiles, Clouds, Tiles, cloud_of, inputs_of, open_cloud

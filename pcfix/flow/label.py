@@ -24,8 +24,7 @@ from pcfix.flow.surfaces import (
 )
 from pcfix.flow.tiles import run_command
 from pcfix.io.las.columns import convert
-from pcfix.io.las.part import part_report
-from pcfix.io.las.source import LasSource
+from pcfix.io.las.source import LasSource, part_report
 from pcfix.io.las.writing import corrected_identity, labelling_vlr, noted_header
 from pcfix.io.tiles import Clouds
 from pcfix.label.areas import WaterMask

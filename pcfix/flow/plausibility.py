@@ -388,7 +388,7 @@ def positions(cameras: Cameras, name: str) -> Result:
     from pcfix.io.cameras.georeference import adjusted_minus_gnss
 
     try:
-        found = adjusted_minus_gnss(cameras, name).enu_m[:, :2]
+        found = adjusted_minus_gnss(cameras, name)[0][:, :2]
     except InputError:
         return Result()
     apart = np.hypot(*found[np.isfinite(found).all(axis=1)].T)

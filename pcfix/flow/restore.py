@@ -108,13 +108,10 @@ def _ours(source: LasSource, settings: dict[str, Any]) -> set[str]:
         wrong = f"has lost the dimensions {', '.join(sorted(missing))} since it was corrected"
     else:
         for column in columns:  # another program may have changed a type
-            found, known = (
-                header.dimension_by_name(column.name).dtype,
-                [column.dtype(wide=wide) for wide in (False, True)],
-            )
-            if found not in known:
-                words = " or ".join(dict.fromkeys(map(str, known)))
-                wrong = f"has a dimension {column.name} of type {found}, not {words}"
+            found = header.dimension_by_name(column.name).dtype
+            known = column.dtype, column.dtype.replace("32", "16")  # that of earlier versions
+            if str(found) not in known:
+                wrong = f"has a dimension {column.name} of type {found}, not {column.dtype}"
     if wrong:
         raise InputError(
             "cloud.cannot_restore",

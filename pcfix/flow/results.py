@@ -15,8 +15,9 @@ from pcfix.flow.maps import BED, DEPTH, SHADED, SURFACE, UNCERTAINTY, contours_l
 from pcfix.flow.request import Files, Request, read_record
 from pcfix.flow.run import RECORD, run_all
 from pcfix.flow.runner import Bar, no_bar
-from pcfix.io import analysis, rasters
+from pcfix.io import rasters, vectors
 from pcfix.io.styles import limits_of
+from pcfix.libraries import analysis_library
 from pcfix.options.declare import File, options_of, taken
 from pcfix.options.survey import RunOptions
 from pcfix.refract.tally import Summary
@@ -98,7 +99,7 @@ class RunResults:
         return self._raster(UNCERTAINTY)
 
     def _raster(self, name: str) -> DataArray:
-        return analysis.open_array(self._file(name))
+        return rasters.open_array(self._file(name))
 
     def contours(self, interval: float | None = None) -> GeoDataFrame:
         """Return lines of equal depth, ``depth_m``.
@@ -115,7 +116,7 @@ class RunResults:
                 "option.range", f"interval {interval:g} must be above 0.",
                 option="interval", value=interval, above=0,
             )  # fmt: skip
-        return analysis.frame_of(contours_layer(self.folder, interval), self.depth.rio.crs)
+        return vectors.frame_of(contours_layer(self.folder, interval), self.depth.rio.crs)
 
     @property
     def waterline(self) -> GeoDataFrame:
@@ -124,7 +125,7 @@ class RunResults:
 
     def layer(self, name: str) -> GeoDataFrame:
         """Return a layer of ``map.gpkg``: waterline, corrected_area, cross_sections, cameras ..."""
-        return analysis.frame_of_layer(self._file("map.gpkg"), name)
+        return vectors.read_frame(self._file("map.gpkg"), name)
 
     @property
     def tables(self) -> dict[str, DataFrame]:
@@ -137,8 +138,9 @@ class RunResults:
             return {}
         files = sorted(Files(self.folder).compare.glob("*.csv"))
         rows = [{"of": title, **figures} for title, figures in signed_statistics(self.compared)]
-        statistics = analysis.load_for_analysis("pandas").json_normalize(rows).set_index("of")
-        return {"statistics": statistics, **{one.stem: analysis.table_of_csv(one) for one in files}}
+        pandas = analysis_library("pandas")
+        statistics = pandas.json_normalize(rows).set_index("of")
+        return {"statistics": statistics, **{one.stem: pandas.read_csv(one) for one in files}}
 
     def _repr_html_(self) -> str:
         """Return the HTML that a notebook shows."""

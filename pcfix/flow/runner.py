@@ -18,8 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 from pcfix.io.files import check_input, check_output, write_bytes, write_text
-from pcfix.io.las.part import CloudPart
-from pcfix.io.las.source import LasSource
+from pcfix.io.las.source import CloudPart, LasSource
 from pcfix.io.las.writing import check_suffix, las_writer
 from pcfix.io.tiles import Tiles, check_one_file, inputs_of, open_cloud, part_of
 from pcfix.options.declare import File

@@ -41,7 +41,7 @@ from pcfix.flow.runner import (
 )
 from pcfix.io.atomic import all_or_none
 from pcfix.io.files import belonging, file_state, path_of, read_tally, write_tally
-from pcfix.io.las.part import part_report
+from pcfix.io.las.source import part_report
 from pcfix.io.tiles import BrokenTileError, Clouds, Tiles, check_one_file, tiles_of
 from pcfix.io.vectors import LAYER_MARK
 from pcfix.libraries import optional_library

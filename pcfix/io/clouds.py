@@ -18,7 +18,7 @@ from pcfix.io.crs import is_same, parts
 from pcfix.io.files import check_input, path_of
 from pcfix.io.las.columns import SHIFTS
 from pcfix.io.las.source import LasSource, coordinates, stated_crs
-from pcfix.io.las.writing import own_settings
+from pcfix.io.las.writing import own_settings, record_errors
 from pcfix.io.rasters import open_raster, place_of, read_masked
 from pcfix.io.tables import read_table
 from pcfix.io.tiles import SUFFIXES, Clouds, Tiles, cloud_of, open_cloud
@@ -136,13 +136,10 @@ def survey_cloud(
 
 def own_water(source: LasSource) -> WaterSurface | None:
     """Return the plane of the water surface that the cloud's own VLR names, if any."""
-    try:
+    with record_errors(source.path):
         ours = own_settings(source.vlrs)
         plane = None if ours is None else ours["water_plane"]
         return None if plane is None else WaterPlane(*map(float, plane))
-    except (ValueError, TypeError, KeyError) as error:
-        sentence = f"the record of its correction is damaged ({error}). Correct the original again."
-        raise bad_file(source.path, "cloud.vlr_damaged", sentence) from error
 
 
 WATER_CLASSES = (9, 41, 42, 45)
@@ -177,8 +174,7 @@ def read_reference(reference: Clouds) -> Reference:
         return Reference(cloud.name, cloud.xyz, cloud.crs, cloud.left_out)
     suffix = found.suffix.lower()
     if suffix in TABLES:
-        table = read_table(found, ("x", "y", "z"))
-        xyz = np.column_stack([table.numbers(name) for name in "xyz"])
+        xyz = read_table(found, ("x", "y", "z")).of("xyz")
         return Reference(str(found), xyz, None, sparse=True)
     if suffix not in (".tif", ".tiff"):
         raise bad_file(found, "reference.unknown", f"is not a reference. Give {KINDS}.")

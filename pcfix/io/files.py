@@ -37,9 +37,7 @@ LAST_LINES = 3
 def path_of(path: Any) -> Path:
     """Return a path as an object; the address of an object store is refused."""
     if re.match(r"\w{2,}:/", str(path)):  # of s3:// a Path leaves s3:/
-        sentence = (
-            "is not a local file. Copy it first, or use 'pcfix pipeline', as PDAL can read it."
-        )
+        sentence = "is not a local file. Copy it first, or use 'pcfix pipeline' (PDAL can read it)."
         raise bad_file(path, "input.remote", sentence)
     return path if isinstance(path, Path) else Path(path)
 
@@ -80,35 +78,28 @@ def files_in(path: File) -> list[Path]:
     return [check_input(found)]
 
 
-BESIDE = ("sensor.csv",)
-"""What readers look for beside a file that is named; it may be missing."""
 PROJECTS = {".psx": ".files", ".p4d": ""}
 """What the folder of a project ends with, by the suffix of its file."""
 
 
-def files_around(path: File) -> list[Path]:
+def belonging(path: File) -> list[Path]:
     """Return what may be read where a file or folder is named.
 
-    Of a folder all that it and its folders hold, but hidden ones; of a project the same of its
-    folder; and the files that are looked for beside a file.
+    Of a folder that is all that it and its folders hold, but hidden files; of a project the same of
+    its folder. With a file go those of its stem, and the sensor beside it, which may be missing.
     """
     found = Path(path)
-    if found.is_dir():
-        inside = (one for one in found.rglob("*") if one.is_file())
-        return sorted(
-            one for one in inside if not any(p[0] == "." for p in one.relative_to(found).parts)
-        )
-    ending = PROJECTS.get(found.suffix.lower())
-    folder = None if ending is None else found.with_suffix(ending)
-    inside_of = files_around(folder) if folder is not None and folder.is_dir() else []
-    return [check_input(found), *(found.with_name(name) for name in BESIDE), *inside_of]
-
-
-def belonging(path: File) -> list[Path]:
-    """Return what may be read with a file or folder: `files_around` it, and files of its stem."""
-    found, stem = Path(path), glob.escape(Path(path).stem)
-    alike = [] if found.is_dir() else found.parent.glob(f"{stem}.*")
-    return sorted({*files_around(path), *(one for one in alike if one.is_file())})
+    folder, chosen = found, set[Path]()
+    if not found.is_dir():
+        folder = found.with_suffix(PROJECTS.get(found.suffix.lower(), found.suffix))
+        alike = found.parent.glob(f"{glob.escape(found.stem)}.*")
+        chosen = {check_input(found), found.with_name("sensor.csv")}
+        chosen |= {one for one in alike if one.is_file()}
+    inside = folder.rglob("*") if folder.is_dir() else ()
+    for one in inside:
+        if one.is_file() and not any(p[0] == "." for p in one.relative_to(folder).parts):
+            chosen.add(one)
+    return sorted(chosen)
 
 
 def check_output(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) -> Path:

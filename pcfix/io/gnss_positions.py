@@ -63,7 +63,7 @@ def read_gnss(path: File, cameras: Cameras, *, crs: str | None = None) -> Camera
             names, listed = list(read.labels), read.gnss
         else:
             columns = open_table(source)
-            place = places(columns.table.header, SIGMAS) | columns.place
+            place = places(columns.header, SIGMAS) | dict(columns.place)
             columns = replace(columns, place=place)
             names, listed = columns.labels, gnss_positions(columns)
         if listed is None:
@@ -78,7 +78,7 @@ def read_gnss(path: File, cameras: Cameras, *, crs: str | None = None) -> Camera
         found = replace(found, crs=crs)
     cameras = replace(cameras, gnss=found)
     if is_tied(cameras.crs, str(source)) and _differences_are_of_the_frame(cameras, str(source)):
-        enu_m = adjusted_minus_gnss(cameras, str(source)).enu_m[:, :2]
+        enu_m = adjusted_minus_gnss(cameras, str(source))[0][:, :2]
         both = enu_m[np.isfinite(enu_m).all(axis=1)]
         apart_m = float(np.median(np.hypot(*both.T))) if len(both) else 0.0
         if apart_m > FARTHEST_M:
@@ -145,10 +145,10 @@ def gnss_in_frame_of(cameras: Cameras, name: str = "cameras") -> tuple[GnssPosit
     if not _differences_are_of_the_frame(cameras, name):
         reason = f"{name}: {cameras.crs} is no map in metres, so the GNSS cannot be compared."
         return GnssPositions(nothing, nothing, None), reason
-    found = adjusted_minus_gnss(cameras, name)
-    xyz = cameras.centres - found.enu_m
+    enu_m, reason = adjusted_minus_gnss(cameras, name)
+    xyz = cameras.centres - enu_m
     sigma = np.where(np.isnan(xyz), np.nan, cameras.gnss.sigma_m)
-    return GnssPositions(xyz, sigma, None), found.reason
+    return GnssPositions(xyz, sigma, None), reason
 
 
 def _differences_are_of_the_frame(cameras: Cameras, name: str) -> bool:

@@ -40,15 +40,14 @@ from pcfix.errors import InputError, PcfixWarning, bad_file
 from pcfix.io.cameras.checks import Source
 from pcfix.io.cameras.checks import number as xml_number
 from pcfix.io.cameras.metashape import SPREADS, documents, spreads
-from pcfix.io.cameras.metashape.documents import Chunk
 from pcfix.io.cameras.odm import named_crs
-from pcfix.io.cameras.table import Columns, centres, headers, is_header, read_columns
+from pcfix.io.cameras.table import centres, find_header, read_columns
 from pcfix.io.cameras.table import crs as table_crs
 from pcfix.io.crs import LOCAL, is_local, is_topocentric, parse_crs, way_to_cloud
 from pcfix.io.files import check_input
 from pcfix.io.labels import match_labels, unnamed
-from pcfix.io.tables import Table, number, places, read_lines
-from pcfix.model import BoolArray, Cameras, FloatArray, GroundControl, IntArray
+from pcfix.io.tables import Table, check_columns, number, places, read_lines
+from pcfix.model import Cameras, FloatArray, GroundControl, IntArray
 from pcfix.options.declare import File
 
 SIGMA_M, SIGMA_PX = 0.01, 0.5
@@ -83,7 +82,6 @@ CHECK = ("check", "check_point", "checkpoint", "cp", "chk")
 CONTROL = ("", "control", "control_point", "controlpoint", "gcp", "3d_gcp", "ground_control_point")
 ON, WATERLINE = "on:", ("waterline", "water_line", "shoreline", "on:water")
 YES, NO = ("yes", "y", "true", "1"), ("", "no", "n", "false", "0")
-PIXELS = ("", "px", "pixel", "pixels", "pix")
 _LEAST_ODM = 6
 _POSITION = ("x", "y", "z", "longitude", "latitude")
 _PLAIN = {"point": "name", "label": "image"}
@@ -284,7 +282,7 @@ def read_marks(path: Path) -> tuple[list[Mark], str | None]:
     first = [number(field) for field in rows[0][1][:5]] if rows else []
     if len(first) == 5 and not np.isnan([*first[:2], *first[3:]]).any():  # z may be NaN
         return _from_odm(path, rows)
-    if not any(is_header(header.names) for header in headers(lines)):
+    if find_header(lines) is None:
         sentence = "is neither a table of marks nor OpenDroneMap's gcp_list.txt. Line 1 must name"
         sentence += " the columns name, x, y, z, image, u, v, or be a CRS."
         raise bad_file(path, "gcps.format", sentence)
@@ -297,12 +295,19 @@ def _from_table(path: Path) -> tuple[list[Mark], str | None]:
     if unknown:
         sentence = f"PROJ does not know its CRS '{columns.crs}'. Give an EPSG code."
         raise bad_file(path, "crs.unknown", sentence, crs=columns.crs)
-    on = []
-    for text in _texts(columns, "role"):
-        is_on = text.startswith(ON) and text != ON
-        on.append("water" if text in WATERLINE else text.removeprefix(ON) if is_on else "")
-    is_check = _flags(columns, "role", CHECK, CONTROL, "control, check, waterline or on:NAME", on)
-    under_water = _flags(columns, "under_water", YES, NO, "yes or no")
+    roles, wet = (_texts(columns, role) for role in ("role", "under_water"))
+    surfaces = ["on:water" if text in WATERLINE else text for text in roles]
+    on = [text.removeprefix(ON) if text.startswith(ON) else "" for text in surfaces]
+    is_role = [text in CHECK + CONTROL or on[i] != "" for i, text in enumerate(roles)]
+    for role, texts, known, words in (
+        ("role", roles, is_role, "control, check, waterline or on:NAME"),
+        ("under_water", wet, [text in YES + NO for text in wet], "yes or no"),
+    ):
+        if not all(known):
+            row = known.index(False)
+            sentence = f"column {columns.name(role)}: '{texts[row]}' is not {words}."
+            raise columns.error(row, "table.choice", sentence, value=texts[row])
+    is_check, under_water = ([t in CHECK for t in roles], [t in YES for t in wet])
     sigma_m = columns.where_there(("sigma_x", "sigma_y", "sigma_z"))
     sigma_uv = columns.where_there(("sigma_u", "sigma_v"))
     sigma_on = columns.where_there(("sigma_on",))[:, 0]
@@ -310,16 +315,16 @@ def _from_table(path: Path) -> tuple[list[Mark], str | None]:
     for i, k in np.argwhere(every <= 0.0)[:1]:
         words = f"the standard deviation {every[i, k]:g} must be positive."
         raise columns.error(int(i), "gcps.sigma", words, value=float(every[i, k]))
-    names = [row[columns.place["point"]] for row in columns.table.rows]
+    names = columns.column("point")
     if "" in names:
-        line = columns.table.line[names.index("")]
+        line = columns.line[names.index("")]
         raise bad_file(path, "gcps.no_name", f"line {line}: the point has no name.", line=line)
     xyz, uv = centres(columns, needed=not any(on)), columns.of(("u", "v"))
     for i in np.flatnonzero(np.isnan(xyz).any(axis=1)):
         if not on[i]:
             words = "the point has no x, y, z. Only those with role waterline or on:NAME need none."
             raise columns.error(int(i), "gcps.no_coordinates", words)
-    where = [f"line {line}" for line in columns.table.line]
+    where = [f"line {line}" for line in columns.line]
     sigma_px = np.sqrt((sigma_uv**2).mean(axis=1)).tolist()
     rows = zip(
         *(where, names, columns.labels, uv, xyz, sigma_m, sigma_px, is_check, under_water),
@@ -329,49 +334,28 @@ def _from_table(path: Path) -> tuple[list[Mark], str | None]:
     return [Mark(*row) for row in rows], system
 
 
-def _with_roles(columns: Columns) -> Columns:
+def _with_roles(columns: Table) -> Table:
     """Return columns with the places that they have in a table of marks."""
-    header, path = columns.table.header, columns.path
+    header, path = columns.header, columns.path
     place = {role: i for role, i in columns.place.items() if role in _POSITION}
     place |= places(header, SPELLINGS)
     missing = [_PLAIN.get(role, role) for role in ("point", "label", "u", "v") if role not in place]
-    if missing:
-        sentence = f"lacks the columns {', '.join(missing)}. Give name, x, y, z, image, u, v."
-        raise bad_file(path, "table.column_missing", sentence, columns=missing)
-    for role in "uv":
-        unit = columns.unit[place[role]]
-        if unit not in PIXELS:
-            sentence = f"column {header[place[role]]} is in '{unit}'. Give pixels."
-            raise bad_file(path, "table.unit", sentence, unit=unit)
+    check_columns(path, header, ("name", "x", "y", "z", "image", "u", "v"), missing)
     found = replace(columns, place=place)
     if "crs" not in place:
         return found
-    stated = sorted({row[place["crs"]] for row in columns.table.rows} - {""})
+    stated = sorted({*found.column("crs")} - {""})
     if len(stated) > 1:
         sentence = f"has points in several CRS ({', '.join(stated[:3])}). Transform all to one."
         raise bad_file(path, "gcps.several_crs", sentence, crs=stated)
     return replace(found, crs=stated[0] if stated else columns.crs)
 
 
-def _texts(columns: Columns, role: str) -> list[str]:
+def _texts(columns: Table, role: str) -> list[str]:
     """Return the entries of a column in lower case; empty ones if it does not exist."""
-    if role not in columns.place:
-        return [""] * len(columns.table.rows)
-    rows = columns.table.rows
-    return [row[columns.place[role]].strip().lower().replace(" ", "_") for row in rows]
-
-
-def _flags(
-    columns: Columns, role: str, true: tuple[str, ...], false: tuple[str, ...], words: str,
-    others: Sequence[str] = (),
-) -> BoolArray:  # fmt: skip
-    """Return which rows have an entry of `true`; refuse those that have neither, nor `others`."""
-    found = _texts(columns, role)
-    for i, text in enumerate(found):
-        if text not in true and text not in false and not (others and others[i]):
-            sentence = f"column {columns.name(role)}: '{text}' is not {words}."
-            raise columns.error(i, "table.choice", sentence, value=text)
-    return np.array([text in true for text in found])
+    if not columns.has(role):
+        return [""] * len(columns.rows)
+    return [text.strip().lower().replace(" ", "_") for text in columns.column(role)]
 
 
 def _from_odm(path: Path, rows: list[tuple[int, list[str]]]) -> tuple[list[Mark], str | None]:
@@ -379,8 +363,9 @@ def _from_odm(path: Path, rows: list[tuple[int, list[str]]]) -> tuple[list[Mark]
         if len(fields) < _LEAST_ODM:
             sentence = f"line {i} has {len(fields)} fields. Give x, y, z, u, v, image."
             raise bad_file(path, "gcps.fields", sentence, line=i)
-    table = Table(path, [*"xyzuv"], [fields for _, fields in rows], [i for i, _ in rows])
-    values = np.column_stack([table.numbers(name) for name in table.header])
+    texts, lines = [fields for _, fields in rows], [i for i, _ in rows]
+    roles = {role: i for i, role in enumerate("xyzuv")}
+    values = Table(path, [*roles], texts, lines, roles, [""] * len(roles)).of(roles)
     places = [tuple(row) for row in values[:, :3].tolist()]
     by_place = {place: f"GCP {i + 1}" for i, place in enumerate(dict.fromkeys(places))}
     marks = []
@@ -395,7 +380,10 @@ def _from_metashape(path: Path) -> tuple[list[Mark], str | None]:
     chunk = documents.open_chunk(path)
     frame = chunk.frame
     names = {c.get("id"): _label(c) for c in chunk.element.iterfind("cameras//camera")}
-    default, pixels = _setting(chunk, "accuracy_markers"), _setting(chunk, "accuracy_projections")
+    default, pixels = (
+        xml_number(path, f"setting {name}", chunk.settings.get(name, "0"))
+        for name in ("accuracy_markers", "accuracy_projections")
+    )
     surveyed: dict[str, Mark] = {}
     for marker in chunk.element.iterfind("markers//marker"):
         found, label = marker.find("reference"), _label(marker)
@@ -406,7 +394,7 @@ def _from_metashape(path: Path) -> tuple[list[Mark], str | None]:
             sigma = spreads(path, f"marker {label}", stated, SPREADS, np.full(3, default))
             surveyed[marker.get("id") or ""] = Mark(
                 f"marker {label}", label, "", np.full(2, np.nan), xyz,
-                np.where(sigma > 0.0, sigma, np.nan), pixels,
+                np.where(sigma > 0.0, sigma, np.nan), pixels if pixels > 0.0 else np.nan,
                 stated.get("enabled") in ("false", "0"),
             )  # fmt: skip
     marks = []
@@ -426,12 +414,3 @@ def _from_metashape(path: Path) -> tuple[list[Mark], str | None]:
 
 def _label(element: Element) -> str:
     return element.get("label") or f"number {element.get('id')}"
-
-
-def _setting(chunk: Chunk, name: str) -> float:
-    """Return a positive number of the chunk's settings, NaN if there is none."""
-    for entry in chunk.element.iterfind("settings/property"):
-        if entry.get("name") == name:
-            value = xml_number(chunk.path, f"setting {name}", entry.get("value"))
-            return value if value > 0.0 else np.nan
-    return np.nan

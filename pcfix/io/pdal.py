@@ -13,16 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import SettingError
-from pcfix.io.las.columns import (
-    COLUMNS,
-    Column,
-    changed_rows,
-    column_scale,
-    filled,
-    shift_steps,
-    to_withhold,
-    unsure_anew,
-)
+from pcfix.io.las.columns import COLUMNS, Column, changes_of, column_scale
 from pcfix.model import BATHYMETRIC_POINT, Correction, FloatArray
 
 Dimensions: TypeAlias = "dict[str, npt.NDArray[Any]]"
@@ -43,7 +34,7 @@ _WITHHELD_FLAG = 4
 
 def add_dimension(columns: tuple[Column, ...]) -> str:
     """Return the value of a stage's ``add_dimension`` for these columns."""
-    return ",".join(f"{c.name}={c.narrow if c.scale == 1.0 else 'float'}" for c in columns)
+    return ",".join(f"{c.name}={c.dtype if c.scale == 1.0 else 'float'}" for c in columns)
 
 
 class PdalCloud:
@@ -171,20 +162,20 @@ class Results:
 
     def add(self, rows: slice, correction: Correction, withhold: bool) -> None:
         """Add one chunk."""
-        out, classes, scales = self._added, self._cloud.classes[rows], self._scales
-        moved = shift_steps(correction, scales)
+        out, cloud, scales, moved = self._added, self._cloud, self._scales, correction.moved
+        changes = changes_of(
+            self._columns, correction, cloud.classes[rows], cloud.withheld[rows], scales,
+            withhold=withhold,
+        )  # fmt: skip
         for i, axis in enumerate("XYZ"):
             # land keeps its bits, negative zero included
-            out[axis][rows][correction.moved] += moved[correction.moved, i] * scales[i]
-        withheld = self._cloud.withheld[rows]
-        correction = unsure_anew(correction, withheld)
-        changed = changed_rows(correction, withheld, withhold=withhold)
-        for column, some, values in filled(self._columns, correction, moved, classes, changed):
+            out[axis][rows][moved] += changes.steps[moved, i] * scales[i]
+        for column, some, values in changes.values:
             out[column.name][rows][some] = values * column_scale(column, scales)
         out["Classification"][rows][correction.corrected] = BATHYMETRIC_POINT
         if OUTCOME in out:
             out[OUTCOME][rows] = correction.outcome
-        self._cloud.withheld[rows] |= to_withhold(correction, withhold=withhold)
+        cloud.withheld[rows] |= changes.flagged
 
     @property
     def dimensions(self) -> Dimensions:

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import bad_file
-from pcfix.kernels import device, kernel
+from pcfix.kernels import kernel
 from pcfix.model import FloatArray, IntArray
 
 _TYPES = {
@@ -193,15 +193,6 @@ def _units(path: Path, header: Header) -> npt.NDArray[Any]:
         raise bad_file(path, "ply.text", "not all of its text is numbers. Export again.") from error
 
 
-@device
-def _length(units: npt.NDArray[Any], at: int, size: int, big: bool) -> int:
-    """Return a list's count from its bytes, or from its one number in a text."""
-    count = 0
-    for j in range(size):
-        count = count * 256 + int(units[at + (j if big else size - 1 - j)])
-    return count
-
-
 @kernel
 def list_starts(
     units: npt.NDArray[Any], item: IntArray, prefix: IntArray, big: bool, start: IntArray,
@@ -220,7 +211,9 @@ def list_starts(
             if prefix[f]:
                 if prefix[f] > units.size - at:
                     return i, at
-                length = _length(units, at, prefix[f], big)
+                length = 0  # from the bytes of the count, or its one number in a text
+                for j in range(prefix[f]):
+                    length = length * 256 + int(units[at + (j if big else prefix[f] - 1 - j)])
                 at += prefix[f]
             # divided, not multiplied: a damaged count times the item would overflow
             if length < 0 or length > (units.size - at) // item[f]:

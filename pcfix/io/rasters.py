@@ -17,6 +17,7 @@ from pcfix.errors import GeometryError, SettingError, bad_file
 from pcfix.grid.lattice import Lattice, Window
 from pcfix.io.atomic import is_full_disk, temporary_output
 from pcfix.io.files import check_input, check_output
+from pcfix.libraries import analysis_library
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
 
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from pyproj import CRS
     from rasterio.io import DatasetReader, DatasetWriter
     from rasterio.transform import Affine
+    from xarray import DataArray
 
 
 NO_HEIGHT = -9999.0
@@ -241,6 +243,13 @@ def write_dod(dsm: Path, reference: Path, output: Path, *, overwrite: bool = Fal
                 raise GeometryError("raster.no_overlap", sentence, dsm=dsm, reference=reference)
             add_overviews(temporary)
     return known
+
+
+def open_array(path: Path) -> DataArray:
+    """Open a raster of one band, NaN where it has no data; values are read when they are used."""
+    found = check_input(path)
+    array = analysis_library("rioxarray").open_rasterio(found, masked=True)
+    return array.squeeze("band", drop=True).rename(found.stem)
 
 
 Bounds = tuple[float, float, float, float]

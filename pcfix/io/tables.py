@@ -5,45 +5,129 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Container, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
-from pcfix.errors import bad_file
+from pcfix.errors import InputError, bad_file
 from pcfix.io.files import check_input
-from pcfix.model import FloatArray
+from pcfix.model import FloatArray, IntArray
 from pcfix.options.declare import File
 
 TOO_LARGE = 1e15
 """No coordinate, in whatever unit, and no time is as large; its square is still a number."""
 
 
-class Table(NamedTuple):
-    """A header and its rows, all text; `line` is each row's line number in the file."""
+METRES = dict.fromkeys(("", "m", "metre", "metres", "meter", "meters"), 1.0)
+DEGREES = dict.fromkeys(("", "deg", "degree", "degrees", "°"), 1.0)
+ANGLES = {
+    **DEGREES,
+    **dict.fromkeys(("gon", "gons", "grad", "grads"), 0.9),
+    **dict.fromkeys(("rad", "radian", "radians"), 180.0 / math.pi),
+}
+"""Units by their names: sizes in metres and degrees."""
+PIXELS = dict.fromkeys(("", "px", "pixel", "pixels", "pix"), 1.0)
+UNITS = {
+    **dict.fromkeys(("x", "y", "z", "depth", "sigma_x", "sigma_y", "sigma_z"), ("metres", METRES)),
+    **dict.fromkeys(("longitude", "latitude", "yaw", "pitch", "roll"), ("degrees", ANGLES)),
+    **dict.fromkeys(("omega", "phi", "kappa"), ("degrees", ANGLES)),
+    **dict.fromkeys(("u", "v"), ("pixels", PIXELS)),
+}
+"""What numbers are in, by the role of their column; those of others have any unit."""
+EXIF = ("gpslongitude", "gpslatitude", "gpsaltitude")
+UNKNOWN = ("", "nan", "na", "null", "none")
+
+
+@dataclass(frozen=True)
+class Table:
+    """The columns of a table and its rows, all text.
+
+    The `header` has the names of the columns, lower case, without units, and `line` each row's line
+    number. `place` leads from the role of a column to its number; `unit` is that of each column,
+    `crs` what a comment says, and the header is a comment where `after_hash`.
+    """
 
     path: Path
     header: list[str]
     rows: list[list[str]]
     line: list[int]
+    place: Mapping[str, int]
+    unit: Sequence[str]
+    after_hash: bool = False
+    crs: str | None = None
 
-    def column(self, name: str) -> list[str]:
+    @cached_property
+    def labels(self) -> list[str]:
+        """The names of the images, none empty."""
+        labels = self.column("label")
+        if "" in labels:
+            line = self.line[labels.index("")]
+            sentence = f"line {line}: the image has no name. Give it one."
+            raise bad_file(self.path, "table.no_label", sentence, line=line)
+        if self.name("label") == "sourcefile":
+            return [re.split(r"[\\/]", label)[-1] for label in labels]
+        return labels
+
+    def take(self, rows: IntArray) -> Table:
+        """Return the table with some of its rows."""
+        chosen, lines = [self.rows[i] for i in rows], [self.line[i] for i in rows]
+        return replace(self, rows=chosen, line=lines)
+
+    def has(self, *roles: str) -> bool:
+        """Whether all these are there."""
+        return all(role in self.place for role in roles)
+
+    def name(self, role: str) -> str:
+        """Return what the file calls it."""
+        return self.header[self.place[role]]
+
+    def column(self, role: str) -> list[str]:
         """Return one column as text."""
-        return [row[self.header.index(name)] for row in self.rows]
+        return [row[self.place[role]] for row in self.rows]
 
-    def numbers(self, name: str, unknown: Container[str] = ()) -> list[float]:
-        """Return one column as finite numbers, NaN where its text, in lower case, is `unknown`."""
-        texts = self.column(name)
-        values = [number(text) for text in texts]
-        for line, text, value in zip(self.line, texts, values, strict=True):
-            if not abs(value) < TOO_LARGE and text.lower() not in unknown:
-                why = "too large" if math.isfinite(value) else "not a finite number"
-                sentence = f"line {line}, column {name}: '{text}' is {why}."
-                where = {"line": line, "column": name, "value": text}
-                raise bad_file(self.path, "table.number", sentence, **where)
-        return values
+    def of(self, roles: Iterable[str]) -> FloatArray:
+        """Return columns of finite numbers, metres and degrees, shape (k, number of roles)."""
+        return np.column_stack([self._numbers(role, needed=True) for role in roles])
+
+    def where_there(self, roles: Iterable[str]) -> FloatArray:
+        """Return the same with NaN for empty fields and for columns that are not there."""
+        return np.column_stack([self._numbers(role, needed=False) for role in roles])
+
+    def error(self, row: int, code: str, sentence: str, **values: Any) -> InputError:
+        """Return an error that names file, line and image."""
+        where = f"line {self.line[row]}"
+        where += f" (image {self.labels[row]})" if self.has("label") else ""
+        return bad_file(self.path, code, f"{where}: {sentence}", **values)
+
+    def _numbers(self, role: str, *, needed: bool) -> FloatArray:
+        if role not in self.place:
+            return np.full(len(self.rows), np.nan)
+        name, texts = self.name(role), self.column(role)
+        values = np.array([(exif_number if name in EXIF else number)(text) for text in texts])
+        for i in np.flatnonzero(~(np.abs(values) < TOO_LARGE)):
+            if needed or texts[i].lower() not in UNKNOWN:
+                why = "too large" if math.isfinite(values[i]) else "not a finite number"
+                sentence = f"column {name}: '{texts[i]}' is {why}. Correct it."
+                where = {"line": self.line[i], "column": name, "value": texts[i]}
+                raise self.error(int(i), "table.number", sentence, **where)
+        unit = self.unit[self.place[role]]
+        wanted, known = UNITS.get(role.removesuffix("_est"), ("", {unit: 1.0}))
+        if unit not in known:
+            sentence = f"column {name} is in '{unit}'. Give {wanted}."
+            raise bad_file(self.path, "table.unit", sentence, column=name, value=unit)
+        return values * known[unit]
+
+
+CRS_COMMENT = re.compile(r"^\s*#\s*(?:coordinatesystem|crs)\s*[:=]\s*(.+)$", re.IGNORECASE)
+
+
+def stated_crs(lines: Iterable[str]) -> str | None:
+    """Return the CRS that a comment states."""
+    return next((found[1].strip() for one in lines if (found := CRS_COMMENT.match(one))), None)
 
 
 def number(text: str) -> float:
@@ -52,6 +136,17 @@ def number(text: str) -> float:
         return float(text)
     except ValueError:
         return math.nan
+
+
+def exif_number(text: str) -> float:
+    """Return the number in what exiftool writes: 24 deg 40' 48.5" S, 86.5 m Below Sea Level."""
+    parts = [number(part) for part in re.findall(r"[\d.]+", text)]
+    if "deg" not in text and "Sea Level" not in text:
+        return number(text)
+    if not 1 <= len(parts) <= 3:
+        return np.nan
+    value = math.fsum(part / 60.0**i for i, part in enumerate(parts))
+    return -value if text.endswith(("S", "W")) or "Below" in text else value
 
 
 def split_header(line: str) -> tuple[list[str], str]:
@@ -76,16 +171,14 @@ def read_lines(path: Path) -> list[str]:
 
 
 def read_table(path: Path, required: Sequence[str]) -> Table:
-    """Read a table; comma, semicolon, tab or space, with or without a byte order mark."""
+    """Read a table whose columns have their roles as names, and no units."""
     lines = read_lines(path)
     header, delimiter = split_header(lines[0] if lines else "")
     check_columns(path, header, required, [name for name in required if name not in header])
-    return table_below(path, lines, header, delimiter)
+    return table_below(path, lines, header, delimiter, {name: (name,) for name in header})
 
 
 _LONGEST_NAME = 80
-METRES = ("", "m", "metre", "metres", "meter", "meters")
-DEGREES = ("", "deg", "degree", "degrees", "°")
 
 
 def split_unit(name: str, endings: str = "m|cm|mm|ft|deg") -> tuple[str, str]:
@@ -95,24 +188,6 @@ def split_unit(name: str, endings: str = "m|cm|mm|ft|deg") -> tuple[str, str]:
     match = re.match(rf"^(.*?)[ _]*[\[(]([^\])]*)[\])]$|^(.*)_({endings})$", name)
     bare, unit = (match[1] or match[3], match[2] or match[4]) if match else (name, "")
     return (bare or "").strip().replace(" ", "_"), (unit or "").strip()
-
-
-def columns_of(
-    path: Path, header: Sequence[str], spellings: Sequence[str], units: Sequence[str]
-) -> list[str]:
-    """Return the columns with one of some names, as in depth_m, Depth (m), x [m], in their order.
-
-    A unit other than these `units` is refused.
-    """
-    found = []
-    for name in header:
-        bare, unit = split_unit(name)
-        if bare in spellings:
-            found.append((spellings.index(bare), name))
-            if unit not in units:
-                sentence = f"column {name} is in '{unit}'. Give metres."
-                raise bad_file(path, "table.unit", sentence, column=name, value=unit)
-    return [name for _, name in sorted(found)]
 
 
 def places(header: Sequence[str], spellings: Mapping[str, Sequence[str]]) -> dict[str, int]:
@@ -136,11 +211,13 @@ def table_below(
     lines: list[str],
     header: list[str],
     delimiter: str,
+    spellings: Mapping[str, Sequence[str]],
     *,
+    units: Sequence[str] = (),
     at: int = 0,
     comments: bool = False,
 ) -> Table:
-    """Return the rows below the header, which is ``lines[at]``.
+    """Return the rows below the header, which is ``lines[at]``, with columns for some roles.
 
     Empty lines are skipped and, with `comments`, also those that begin with #.
     """
@@ -165,7 +242,8 @@ def table_below(
         raise bad_file(path, "table.not_csv", sentence) from error
     if not rows:
         raise bad_file(path, "table.empty", "has a header but no rows.")
-    return Table(path, header, rows, numbers)
+    units = units or [""] * len(header)
+    return Table(path, header, rows, numbers, places(header, spellings), units)
 
 
 DEPTH_SPELLINGS = {
@@ -207,24 +285,20 @@ def read_check_depths(path: File) -> CheckDepths:
         standard error too: all check depths have the same weight.
     """
     source = check_input(path)
-    table = read_table(source, ())
-    column: dict[str, str] = {}
-    for role in ("x", "y", "depth", "z"):
-        if role == "z" and "depth" in column:  # then heights are not looked at
-            break
-        there = columns_of(source, table.header, DEPTH_SPELLINGS[role], METRES)
+    lines = read_lines(source)
+    texts, delimiter = split_header(lines[0] if lines else "")
+    header, units = map(list, zip(*map(split_unit, texts), strict=True)) if texts else ([], [])
+    table = table_below(source, lines, header, delimiter, DEPTH_SPELLINGS, units=units)
+    what = "depth" if table.has("depth") else "z"
+    for role in ("x", "y", what):
+        there = [name for name in header if name in DEPTH_SPELLINGS[role]]
         if len(there) > 1:
             sentence = f"the columns {', '.join(there)} may all be {role}. Remove all but one."
             raise bad_file(source, "table.column_twice", sentence, columns=there)
-        if there:
-            column[role] = there[0]
-    what = "depth" if "depth" in column else "z"
-    missing = ["depth or z" if r == "z" else r for r in ("x", "y", what) if r not in column]
-    check_columns(source, table.header, ("x", "y", "depth or z"), missing)
-    values = [np.array(table.numbers(column[role])) for role in ("x", "y", what)]
-    found = CheckDepths(
-        str(source), np.column_stack(values[:2]), values[2], what == "z", table.line
-    )
+    missing = ["depth or z" if r == "z" else r for r in ("x", "y", what) if not table.has(r)]
+    check_columns(source, header, ("x", "y", "depth or z"), missing)
+    values = table.of(("x", "y", what))
+    found = CheckDepths(str(source), values[:, :2], values[:, 2], what == "z", table.line)
     negative = np.flatnonzero(found.value_m < 0.0)
     if len(negative) and not found.are_heights:
         line, count = found.line[negative[0]], len(negative)

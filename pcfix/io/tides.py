@@ -156,7 +156,7 @@ def read_tide(path: File) -> TideTable:
     """Read a table with the columns ``time`` (ISO 8601) and ``level_m``."""
     source = check_input(path)
     table = read_table(source, ["time", "level_m"])
-    level = table.numbers("level_m")
+    level = table.of(("level_m",))[:, 0]
     times = _times(source, [f"line {line}" for line in table.line], table.column("time"))
     late = np.flatnonzero(np.diff(times.time_s) <= 0.0)
     if late.size:
@@ -165,7 +165,7 @@ def read_tide(path: File) -> TideTable:
         raise bad_file(source, "tide.order", sentence, line=line)
     if len(level) < 2:
         raise bad_file(source, "tide.one_row", "has one row. Give at least two.")
-    return TideTable(times.time_s, np.array(level), times.zoned, times.name)
+    return TideTable(times.time_s, level, times.zoned, times.name)
 
 
 def level_offsets(
@@ -206,7 +206,6 @@ def level_offsets(
     return level - level.mean(), tuple(notes)
 
 
-_WITH_XMP = (".jpg", ".jpeg", ".dng", ".tif", ".tiff")
 FOLDERS = ("", "images")
 """Where images lie, relative to the folder of the camera file."""
 MOST_IMAGES, HEAD_BYTES = 30, 2**17
@@ -221,19 +220,19 @@ def read_altitudes(cameras: File, labels: Sequence[str]) -> FloatArray:
     altitudes, path, found = np.full(len(labels), np.nan), Path(cameras), {}
     with suppress(OSError, InputError):  # no correction needs them
         if path.suffix.lower() == ".psx":
-            chunk = open_chunk(path).document
-            names = {camera.get("id"): camera.get("label") for camera in chunk.root.iter("camera")}
-            for frame in chunk.root.iterfind("frames/frame"):
-                for camera in chunk.follow(frame).root.iter("camera"):
-                    for entry in camera.iter("property"):
-                        label = names.get(camera.get("camera_id"))
-                        if entry.get("name") == "DJI/RelativeAltitude" and label:
-                            with suppress(ValueError):
-                                found[label] = float(entry.get("value", ""))
+            chunk = open_chunk(path)
+            frame, listed = chunk.frame, chunk.element.iter("camera")
+            names = {camera.get("id"): camera.get("label") for camera in listed}
+            for camera in () if frame is None else frame.root.iter("camera"):
+                for entry in camera.iter("property"):
+                    label = names.get(camera.get("camera_id"))
+                    if entry.get("name") == "DJI/RelativeAltitude" and label:
+                        with suppress(ValueError):
+                            found[label] = float(entry.get("value", ""))
         else:
             root = path if path.is_dir() else path.parent
             inside = [one for name in FOLDERS for one in sorted(root.joinpath(name).glob("*"))]
-            images = [one for one in inside if one.suffix.lower() in _WITH_XMP and one.is_file()]
+            images = [one for one in inside if one.suffix.lower() in IMAGES and one.is_file()]
             for image in images[:: 1 + len(images) // MOST_IMAGES]:
                 with image.open("rb") as stream:
                     if above := _ABOVE.search(stream.read(HEAD_BYTES)):

@@ -14,8 +14,7 @@ import shapely
 
 from pcfix.errors import InputError, PcfixWarning, SettingError, bad_file
 from pcfix.io.files import path_of, read_json
-from pcfix.io.las.part import CloudPart
-from pcfix.io.las.source import LasSource, metric_crs
+from pcfix.io.las.source import CloudPart, LasSource, metric_crs
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
 

@@ -19,11 +19,12 @@ from pcfix.io import tables
 from pcfix.io.atomic import cannot_write, temporary_output
 from pcfix.io.crs import LOCAL, parse_crs, way_to_cloud
 from pcfix.io.files import check_input, check_output
-from pcfix.libraries import optional_library
+from pcfix.libraries import analysis_library, optional_library
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
 
 if TYPE_CHECKING:
+    from geopandas import GeoDataFrame
     from pyproj import CRS
 
 Geometries = npt.NDArray[Any]
@@ -46,8 +47,6 @@ _WKT = re.compile(
     re.IGNORECASE,
 )
 _SRID = re.compile(r"\s*SRID\s*=\s*(\d+)\s*;", re.IGNORECASE)
-_CRS = re.compile(r"#\s*crs\s*[:=]\s*(.+)$", re.IGNORECASE)
-_NO_HEIGHT = ("", "nan", "na", "null", "none")
 
 LAYER_MARK = "|"
 WGS84, WGS84_3D = "EPSG:4326", "EPSG:4979"
@@ -79,10 +78,6 @@ class Vectors:
     def coordinates(self) -> FloatArray:
         """All vertices, shape (n, 3); z is NaN where a geometry has none."""
         return np.asarray(shapely.get_coordinates(self.geometries, include_z=True), np.float64)
-
-    def noted(self, code: str, sentence: str, **values: Any) -> tuple[PcfixWarning, ...]:
-        """Return the notes with one more."""
-        return (*self.notes, PcfixWarning(code, f"{self.name}: {sentence}", **values))
 
 
 def is_vector_file(path: File) -> bool:
@@ -203,14 +198,13 @@ def _read_text(path: Path) -> tuple[Geometries, str | None]:
     for longitude and latitude it is WGS 84.
     """
     lines = tables.read_lines(path)
-    stated = [found[1].strip() for line in lines[:20] if (found := _CRS.match(line.strip()))]
     numbered = enumerate(lines, start=1)
     used = [(n, line) for n, line in numbered if line.strip() and line.lstrip()[0] != "#"]
     if not used:
         raise bad_file(path, "vector.empty", "is empty.")
     is_wkt = _WKT.match(used[0][1])
     geometries, crs = _from_wkt(path, used) if is_wkt else _from_table(path, lines, used[0][0] - 1)
-    return geometries, stated[0] if stated else crs
+    return geometries, tables.stated_crs(lines[:20]) or crs
 
 
 def _from_wkt(path: Path, lines: list[tuple[int, str]]) -> tuple[Geometries, str | None]:
@@ -236,26 +230,22 @@ def _from_table(path: Path, lines: list[str], at: int) -> tuple[Geometries, str 
 
     A point whose height is empty has none.
     """
-    names, delimiter = tables.split_header(lines[at])
-    table = tables.table_below(path, lines, names, delimiter, at=at, comments=True)
-    units = (*tables.METRES, *tables.DEGREES)
-    column = {
-        role: next(iter(tables.columns_of(path, names, spellings, units)), None)
-        for role, spellings in COLUMNS.items()
-    }
-    if column["wkt"] is not None:
-        return _from_wkt(path, list(zip(table.line, table.column(column["wkt"]), strict=True)))
-    x, y, crs = column["x"], column["y"], None
-    if x is None or y is None:
-        x, y, crs = column["longitude"], column["latitude"], WGS84
-    if x is None or y is None:
-        tables.check_columns(
-            path, names, ("x and y", "or longitude and latitude", "or wkt"), ("x, y",)
-        )
-    plan = np.column_stack([table.numbers(str(x)), table.numbers(str(y))])
-    if column["z"] is None:
+    texts, delimiter = tables.split_header(lines[at])
+    names, units = map(list, zip(*map(tables.split_unit, texts), strict=True))
+    # degrees of x and y are those of the CRS
+    units = ["" if unit in tables.DEGREES else unit for unit in units]
+    table = tables.table_below(
+        path, lines, names, delimiter, COLUMNS, units=units, at=at, comments=True
+    )
+    if table.has("wkt"):
+        return _from_wkt(path, list(zip(table.line, table.column("wkt"), strict=True)))
+    axes, crs = (("x", "y"), None) if table.has("x", "y") else (("longitude", "latitude"), WGS84)
+    if not table.has(*axes):
+        needed = ("x and y", "or longitude and latitude", "or wkt")
+        tables.check_columns(path, names, needed, ("x, y",))
+    plan, z = table.of(axes), table.where_there(("z",))[:, 0]
+    if not table.has("z"):
         return np.asarray(shapely.points(plan)), crs
-    z = np.array(table.numbers(column["z"], _NO_HEIGHT))
     points = np.asarray(shapely.points(np.column_stack([plan, z])))
     return np.where(np.isfinite(z), points, shapely.force_2d(points)), crs
 
@@ -310,8 +300,8 @@ def read_shoreline(
     known, notes = xyz[np.isfinite(xyz[:, 2]), 2], vectors.notes
     if len(known) >= FEW and not known.any():  # a flat drawing
         xyz[:, 2] = np.nan
-        sentence = f"all {len(known)} heights are exactly 0; they are ignored."
-        notes = vectors.noted("water.zero_heights", sentence, count=len(known))
+        sentence = f"{vectors.name}: all {len(known)} heights are exactly 0; they are ignored."
+        notes = (*notes, PcfixWarning("water.zero_heights", sentence, count=len(known)))
     return Shoreline(xyz, vectors.name, notes, counts)
 
 
@@ -356,9 +346,9 @@ def read_water_polygons(path: File, cloud_crs: str | CRS | None = None) -> Water
             polygons[crossed], method="structure", keep_collapsed=False
         )
         count, area_m2 = int(crossed.sum()), float(shapely.area(polygons[crossed]).sum())
-        sentence = f"{count} of {len(polygons)} polygons crossed themselves. Repaired,"
-        sentence += f" they cover {area_m2:.1f} m2."
-        notes = vectors.noted("mask.repaired", sentence, count=count, area_m2=area_m2)
+        sentence = f"{vectors.name}: {count} of {len(polygons)} polygons crossed themselves."
+        sentence += f" Repaired, they cover {area_m2:.1f} m2."
+        notes = (*notes, PcfixWarning("mask.repaired", sentence, count=count, area_m2=area_m2))
     area = shapely.union_all(polygons)
     if not area.area > 0.0:
         kinds = sorted({geometry.geom_type for geometry in vectors.geometries})
@@ -432,3 +422,14 @@ def _styles(layers: Sequence[Layer]) -> tuple[list[Any], list[str]]:
     fields["useAsDefault"] = np.ones(len(layers), bool)
     fields["update_time"] = np.full(len(layers), "2020-01-01", "datetime64[ms]")
     return [*fields.values()], [*fields]
+
+
+def read_frame(path: Path, layer: str) -> GeoDataFrame:
+    """Read a layer of a GeoPackage with GeoPandas."""
+    return analysis_library("geopandas").read_file(check_input(path), layer=layer)
+
+
+def frame_of(layer: Layer, crs: Any) -> GeoDataFrame:
+    """Return a layer that has not been written yet for GeoPandas."""
+    frame = analysis_library("geopandas").GeoDataFrame
+    return frame(layer.values, geometry=list(layer.geometries), crs=crs)

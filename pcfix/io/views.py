@@ -251,9 +251,6 @@ MARGIN = 0.02
 
 SAMPLE_POINTS = 20_000
 
-_ENOUGH = 1000
-"""Entries that are enough to choose the order of the images; with fewer, later chunks decide."""
-
 _PLACES = (".", "sparse", "sparse/0")
 _FRAME_HEAD, _DATA = struct.Struct("<II7dI"), struct.Struct("<iIQ")
 
@@ -341,8 +338,7 @@ def fitted(views: ViewList, cameras: Cameras, xyz: FloatArray, rows: IntArray) -
         sentence = f"only {100 * share:.0f} % of the listed cameras have their point in the frame."
         sentence += " Put the sparse model beside the list, or give its offset (--cameras-offset)."
         raise bad_file(views.path, "views.other_images", sentence, share=share)
-    others = () if len(image) >= _ENOUGH else views.orders[:best] + views.orders[best + 1 :]
-    return replace(views, orders=(views.orders[best], *others), share_seen=share)
+    return replace(views, orders=(views.orders[best],), share_seen=share)
 
 
 def entries(start: IntArray, rows: IntArray) -> tuple[IntArray, slice | IntArray]:
@@ -369,8 +365,6 @@ def share_seen(cameras: Cameras, camera: npt.NDArray[np.int32], xyz: FloatArray)
     return float(np.mean(inside.all(axis=1)))
 
 
-_QUERIES = 250_000
-"""Points looked up at a time, which bounds the memory."""
 _SAME = 0.05
 """A fraction of the spacing within which two positions are those of one point."""
 _ROUNDING = 1.01 * np.sqrt(3.0)
@@ -432,15 +426,13 @@ class ViewMatch:
         views = self.view_list
         source, weights = f"{views.what} {views.path}", views.weight is not None
         report = ViewReport(source, len(views), tolerance_m=self.tolerance_m, weights=weights)
-        shares = [views.share_seen]
         if views.xyz is None:
             row = np.arange(first_row, first_row + len(xyz))
             views = fitted(views, self._cameras, xyz, row)
-            shares.append(views.share_seen)
             report.by_row = len(row)
         else:
             row = self._rows(xyz, first_row, views.xyz, report)
-        report.share_seen = min((share for share in shares if share is not None), default=None)
+        report.share_seen = views.share_seen
         report.image_order, report.unposed = views.orders[0].what, views.orders[0].unposed
         listed = _listed(views, row, report)
         apart = beside_frames(xyz, listed, self._cameras)
@@ -459,21 +451,19 @@ class ViewMatch:
         row[: len(beside)][near] = first_row + np.flatnonzero(near)
         report.by_row = int(np.count_nonzero(near))
         rest = np.flatnonzero(row < 0)
-        if len(rest) and self._tree is None:
+        if not len(rest):
+            return row
+        if self._tree is None:
             from scipy.spatial import cKDTree
 
             self._tree = cKDTree(listed, balanced_tree=False, compact_nodes=False)
         reach = float(np.nextafter(self.tolerance_m or 0.0, np.inf))
-        for at in range(0, len(rest), _QUERIES):
-            some = rest[at : at + _QUERIES]
-            away, nearest = self._tree.query(xyz[some], distance_upper_bound=reach, workers=-1)
-            found = np.isfinite(away)
-            report.by_position += int(np.count_nonzero(found))
-            report.unmatched += int(np.count_nonzero(~found))
-            if found.any():
-                farthest_m = float(away[found].max())
-                report.farthest_m = max(report.farthest_m or 0.0, farthest_m)
-            row[some] = np.where(found, nearest, -1)
+        away, nearest = self._tree.query(xyz[rest], distance_upper_bound=reach, workers=-1)
+        found = np.isfinite(away)
+        row[rest] = np.where(found, nearest, -1)
+        report.by_position = int(np.count_nonzero(found))
+        report.unmatched = len(rest) - report.by_position
+        report.farthest_m = float(away[found].max()) if found.any() else None
         return row
 
 

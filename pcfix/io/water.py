@@ -15,7 +15,7 @@ import os
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
@@ -204,8 +204,8 @@ def read_water_raster(
     """
     if bounds is not None:
         west, south, east, north = bounds
-        about = west - MARGIN_M, south - MARGIN_M, east + MARGIN_M, north + MARGIN_M
-        bounds = about if np.isfinite(bounds).all() else None
+        wider = west - MARGIN_M, south - MARGIN_M, east + MARGIN_M, north + MARGIN_M
+        bounds = wider if np.isfinite(bounds).all() else None
     name = str(path)
     with open_raster(path) as source:
         if source.count != 1:
@@ -223,18 +223,19 @@ def read_water_raster(
         from_cloud: Points = np.asarray  # in plan
         if to_cloud is not None and stated is not None and cloud_crs is not None:
             cloud, crs = systems.parse_crs(cloud_crs, "the cloud"), systems.parse_crs(stated, name)
-            near = to_cloud(at) if bounds is None else _edge(bounds)
-            from_cloud, _ = systems.transformation(cloud, crs, near, name, heights=False)
+            about = to_cloud(at) if bounds is None else _edge(bounds)
+            from_cloud, _ = systems.transformation(cloud, crs, about, name, heights=False)
             forward, unit = to_cloud, [1.0, 1.0, systems.metres_up(crs)]
             to_cloud = lambda xyz: forward(xyz / unit)  # noqa: E731
-        part = _read(source, name, None if bounds is None else from_cloud(_edge(bounds)))
+        near = None if bounds is None else from_cloud(_edge(bounds))
+        heights, t, more = _read(source, name, near)
     title = name.replace("\\", "/").rpartition("/")[2]
-    for note in notes + part.notes:
+    for note in notes + more:
         warnings.warn(note, stacklevel=3)
-    t = part.transform
     if to_cloud is None and t.b == t.d == 0.0 and t.a > 0.0 > t.e:  # north-up in the cloud's CRS
-        return WaterRaster(part.heights, float(t.c), float(t.f), (float(t.a), float(-t.e)), title)
-    return _resampled(part, to_cloud or (lambda xyz: xyz), from_cloud, bounds, (name, title))
+        return WaterRaster(heights, float(t.c), float(t.f), (float(t.a), float(-t.e)), title)
+    ways = to_cloud or (lambda xyz: xyz), from_cloud
+    return _resampled(heights, t, *ways, bounds, (name, title))
 
 
 def rasters_of_images(
@@ -286,16 +287,13 @@ def _edge(bounds: Bounds) -> FloatArray:
     return np.column_stack([xy, np.zeros(len(xy))])
 
 
-class _Part(NamedTuple):
-    """Part of a raster: heights, the transform from (column, row) of it to its CRS, and notes."""
+def _read(
+    source: DatasetReader, name: str, near: FloatArray | None
+) -> tuple[FloatArray, Affine, systems.Notes]:
+    """Read the heights around some places, shape (n, 3), or all, in metres.
 
-    heights: FloatArray
-    transform: Affine
-    notes: systems.Notes
-
-
-def _read(source: DatasetReader, name: str, near: FloatArray | None) -> _Part:
-    """Read the heights around some places, shape (n, 3), or all; metres of the raster's CRS."""
+    Also return the transform from their (column, row) to the raster's CRS, and notes.
+    """
     from rasterio.windows import Window
 
     left, top, right, bottom = 0, 0, source.width, source.height
@@ -331,7 +329,7 @@ def _read(source: DatasetReader, name: str, near: FloatArray | None) -> _Part:
         sentence = f"{name}: has no nodata value. {unknown:,} impossible heights are ignored."
         notes.insert(0, PcfixWarning("water.raster_nodata", sentence, count=unknown))
     _check_known(heights, name)
-    return _Part(heights, source.window_transform(window), tuple(notes))
+    return heights, source.window_transform(window), tuple(notes)
 
 
 def _check_known(heights: FloatArray, name: str) -> None:
@@ -347,8 +345,9 @@ def _check_size(cells: float, name: str) -> None:
 
 
 def _resampled(
-    part: _Part, to_cloud: Points, from_cloud: Points, bounds: Bounds | None, names: tuple[str, str]
-) -> WaterRaster:
+    given: FloatArray, transform: Affine, to_cloud: Points, from_cloud: Points,
+    bounds: Bounds | None, names: tuple[str, str],
+) -> WaterRaster:  # fmt: skip
     """Resample to a grid in the cloud's CRS with square cells as small as the raster's smallest.
 
     `from_cloud` transforms the plan only; `bounds` are in the cloud's CRS; `names` are the
@@ -357,12 +356,12 @@ def _resampled(
     from pcfix.water.surface import Field, heights_above
 
     # where the raster is, from points all over it, and the sides of its middle cell
-    high, wide = part.heights.shape
+    high, wide = given.shape
     share = np.linspace(0.0, 1.0, _EDGE_POINTS)
     c, r = (grid.ravel() for grid in np.meshgrid(share * wide, share * high))
     amid = wide / 2.0 + np.array([0.0, 1.0, 0.0]), high / 2.0 + np.array([0.0, 0.0, 1.0])
-    x, y = place_of(part.transform, np.append(c, amid[0]), np.append(r, amid[1]))
-    placed = to_cloud(np.column_stack([x, y, np.full(len(x), np.nanmean(part.heights))]))
+    x, y = place_of(transform, np.append(c, amid[0]), np.append(r, amid[1]))
+    placed = to_cloud(np.column_stack([x, y, np.full(len(x), np.nanmean(given))]))
     if not np.isfinite(placed).all():
         sentence = "extends beyond the area of use of the cloud's CRS. Clip it."
         raise bad_file(names[0], "water.raster_place", sentence)
@@ -376,7 +375,7 @@ def _resampled(
     _check_size(float(sides.prod()), names[0])
     columns, rows = sides.astype(np.int64).tolist()
     size, frame = np.array([[0, high, wide]]), np.array([[0.5, -0.5, 1.0, 1.0]])
-    field = Field(part.heights.ravel(), size, frame, 0)
+    field = Field(given.ravel(), size, frame, 0)
     heights = np.empty((rows, columns))
     x = left + (np.arange(columns) + 0.5) * cell
     for first in range(0, rows, max(1, _AT_ONCE // columns)):
@@ -384,7 +383,7 @@ def _resampled(
         y = top - (first + np.arange(len(strip)) + 0.5) * cell
         plan = np.column_stack([np.tile(x, len(y)), np.repeat(y, len(x)), np.zeros(strip.size)])
         places = from_cloud(plan)
-        column, row = place_of(~part.transform, places[:, 0], places[:, 1])
+        column, row = place_of(~transform, places[:, 0], places[:, 1])
         height, _ = heights_above(field, np.ascontiguousarray(column), np.ascontiguousarray(-row))
         known = np.isfinite(height)
         height[known] = to_cloud(np.column_stack([places[known, :2], height[known]]))[:, 2]

@@ -182,7 +182,7 @@ class InputOptions(SurveyOptions, PortOptions):
 
 
 class PartOptions(OptionSet, panel=Panel.INPUT):
-    """Which points of a cloud are read; see `pcfix.io.las.part`."""
+    """Which points of a cloud are read; see `pcfix.io.las.source`."""
 
     bounds: tuple[float, float, float, float] | None = option(
         None, parse=numbers, metavar="X,Y,X,Y"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.io.las import part
+from pcfix.io.las import source as las_source
 from pcfix.io.tiles import open_cloud, part_of
 from pcfix.options.shared import PartOptions
 from tests.utils.clouds import (
@@ -79,8 +79,8 @@ def test_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, chun
 def test_only_nodes_within_are_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source, unpacked = cloud(tmp_path / "tree.copc.laz"), []
     name = "decompress_points_with_chunk_table"
-    of = getattr(part.lazrs, name)
-    monkeypatch.setattr(part.lazrs, name, lambda *a: unpacked.append(len(a[3])) or of(*a))
+    of = getattr(las_source.lazrs, name)
+    monkeypatch.setattr(las_source.lazrs, name, lambda *a: unpacked.append(len(a[3])) or of(*a))
     with open_cloud(part_of(source, PartOptions(bounds=BOX))) as found:
         points = np.concatenate([one.array for one in found.chunks()])
     assert len(points) == len(found) == inside(laspy.read(source)).sum()

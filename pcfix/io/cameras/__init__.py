@@ -3,8 +3,8 @@
 A format module has ``recognises(source)``, which is cheap, ``read(source)`` and, where the format
 has tie points, ``tie_points(source, cameras)``. `read_cameras` turns what damaged contents raise
 into an `InputError`, and checks rotations and lenses; a module raises an `InputError` itself where
-it can say more than "damaged". To add a format, write its module and an entry of `FORMATS`, from
-which its line in README.md of this folder follows. A module is loaded when its turn comes.
+it can say more than "damaged". To add a format, write its module, an entry of `FORMATS` and a line
+in README.md of this folder. A module is loaded when its turn comes.
 """
 
 from __future__ import annotations
@@ -19,16 +19,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pcfix.errors import InputError, SettingError, bad_file
-from pcfix.io.cameras.checks import (
-    DAMAGES,
-    NO_LENS,
-    Angles,
-    Source,
-    checked,
-    damaged,
-    no_pose,
-    reading,
-)
+from pcfix.io.cameras import checks
+from pcfix.io.cameras.checks import Angles, Source, reading
 from pcfix.io.files import check_input
 from pcfix.model import Cameras, TiePoints
 from pcfix.options.declare import File
@@ -40,52 +32,32 @@ LISTS = (
 
 
 class CameraFormat(NamedTuple):
-    """A format: its software, what to give ``--cameras`` (for the documentation), its module."""
+    """A format: its software, and its module of this folder."""
 
     software: str
-    give: str
     module: str
 
     @property
     def reader(self) -> Any:
-        """The module of this folder."""
+        """The module."""
         return import_module(f"{__name__}.{self.module}")
 
 
-UNSUPPORTED = CameraFormat("a format that pcfix does not read", "", "unsupported")
-_FORMATS = (
-    (
-        "Agisoft Metashape, PhotoScan",
-        "cameras or markers XML, `.psx`, `.psz`; omega-phi-kappa text or reference table with"
-        " `--sensor calibration.xml`",
-        "metashape",
-    ),
-    ("Pix4D", "the `params` folder, the project folder or one of its tables", "pix4d"),
-    ("OPF: PIX4Dmatic, PIX4Dcatch", "the project (`.opf`) or its folder", "opf"),
-    ("OpenDroneMap", "the project folder, `reconstruction.json`, `shots.geojson`", "odm"),
-    ("OpenSfM", "`reconstruction.json` or its folder", "opensfm"),
-    ("COLMAP", "the model folder or workspace, text or binary", "colmap"),
-    ("MicMac", "the `Ori-...` folder, of MMVII too", "micmac"),
-    (
-        "Bundler, MVE, VisualSFM",
-        "`bundle.out`, `synth_0.out`, `.nvm`, with the images (and Bundler's list) beside it",
-        "bundler",
-    ),
-    (
-        "ContextCapture, iTwin Capture, DJI Terra",
-        "BlocksExchange XML, plain or zipped",
-        "blocksexchange",
-    ),
-    ("RealityCapture (XMP)", "the folder of XMP files", "realitycapture"),
-    (
-        "CSV table",
-        "a table with a header: `label,x,y,z` and, if known, `omega,phi,kappa`, `yaw,pitch,roll`,"
-        " `qw,qx,qy,qz` (world to camera) or `r11..r33`; RealityCapture's internal and external"
-        " parameters, Metashape's and ODM's lists among them",
-        "table",
-    ),
+UNSUPPORTED = CameraFormat("a format that pcfix does not read", "unsupported")
+FORMATS = (
+    CameraFormat("Agisoft Metashape, PhotoScan", "metashape"),
+    CameraFormat("Pix4D", "pix4d"),
+    CameraFormat("OPF: PIX4Dmatic, PIX4Dcatch", "opf"),
+    CameraFormat("OpenDroneMap", "odm"),
+    CameraFormat("OpenSfM", "opensfm"),
+    CameraFormat("COLMAP", "colmap"),
+    CameraFormat("MicMac", "micmac"),
+    CameraFormat("Bundler, MVE, VisualSFM", "bundler"),
+    CameraFormat("ContextCapture, iTwin Capture, DJI Terra", "blocksexchange"),
+    CameraFormat("RealityCapture (XMP)", "realitycapture"),
+    CameraFormat("CSV table", "table"),
+    UNSUPPORTED,
 )
-FORMATS = (*(CameraFormat(*each) for each in _FORMATS), UNSUPPORTED)
 """In the order in which they are asked: ODM knows more of an OpenSfM file than OpenSfM, and a plain
 table says least of all."""
 TAKE_SENSOR = ("table", "realitycapture")
@@ -149,11 +121,11 @@ def read_cameras(
             cameras = form.reader.read(source)
             if source.sensor is not None and len(cameras):
                 cameras = _with_sensor(source, cameras, form.module in TAKE_SENSOR)
-            cameras = checked(source.path, cameras)
+            cameras = checks.checked(source.path, cameras)
     except SettingError as error:  # numbers that are finite in the file and not in the world
-        raise damaged(path, str(error).rstrip(".")) from error
+        raise checks.damaged(path, str(error).rstrip(".")) from error
     if not len(cameras):
-        raise no_pose(source.path)
+        raise checks.no_pose(source.path)
     for note in cameras.notes:
         warnings.warn(note, stacklevel=2)
     return cameras
@@ -169,7 +141,7 @@ def _with_sensor(source: Source, cameras: Cameras, has_read_it: bool) -> Cameras
         return cameras
     from pcfix.io.cameras.table.sensor import read_sensor
 
-    notes = tuple(note for note in cameras.notes if note.code != NO_LENS)
+    notes = tuple(note for note in cameras.notes if note.code != checks.NO_LENS)
     return replace(cameras, lenses=(read_sensor(source.sensor),) * len(cameras), notes=notes)
 
 
@@ -193,13 +165,11 @@ def read_tie_points(path: File, cameras: Cameras) -> TiePoints:
         When numbers are not finite: such observations, and points with such a coordinate, are
         left out.
     """
-    from pcfix.io.cameras.tracks import finite, no_tie_points
-
     source, form = _recognised(path, None, None)
     if not hasattr(form.reader, "tie_points"):
-        raise no_tie_points(source.path, f"the format ({form.software}) has none")
+        raise checks.no_tie_points(source.path, f"the format ({form.software}) has none")
     with reading(path):
-        ties, note = finite(source.path, form.reader.tie_points(source, cameras))
+        ties, note = checks.finite(source.path, form.reader.tie_points(source, cameras))
     if note is not None:
         warnings.warn(note, stacklevel=2)
     return ties
@@ -228,10 +198,8 @@ def _recognised(
         raise bad_file(where, "cameras.folder", sentence, files=[name for name, _ in inside[:3]])
     if known is not None:
         return source, known
-    sentence = (
-        "is not a camera file that pcfix knows. Give a CSV table with the columns label, x, y, z"
-        " and, if you have them, yaw, pitch, roll."
-    )
+    sentence = "is not a camera file that pcfix knows. Give a CSV table with the columns label, x,"
+    sentence += " y, z and, if you have them, yaw, pitch, roll."
     raise bad_file(where, "cameras.unknown", sentence)
 
 
@@ -241,10 +209,13 @@ def takes_sensor(path: File) -> bool:
 
 
 def _format_of(source: Source) -> CameraFormat | None:
-    """Return the first format that knows the content; standard errors look like poses."""
+    """Return the first format that knows the content; one that damage hides is passed over.
+
+    Files of standard errors look like poses, so the refused parts of exports are asked first.
+    """
     is_part = UNSUPPORTED.reader.is_part(source)
     for form in FORMATS[-1:] if is_part else FORMATS:
-        with suppress(InputError, *DAMAGES), np.errstate(all="ignore"):  # too damaged to tell
+        with suppress(InputError, *checks.DAMAGES), np.errstate(all="ignore"):
             if form.reader.recognises(source):
                 return form
     return None

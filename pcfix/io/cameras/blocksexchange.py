@@ -31,7 +31,6 @@ from __future__ import annotations
 import io
 import math
 import re
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path, PureWindowsPath
 from typing import Any, NamedTuple
@@ -40,7 +39,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from pcfix.errors import InputError, bad_file
-from pcfix.io.cameras import checks, tracks
+from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import ZIP_MAGIC, Source, damaged, note, number, read_xml, text_of
 from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.lens.rotations import from_omega_phi_kappa, from_photogrammetric
@@ -51,8 +50,6 @@ TIE_POINTS = re.compile(rb"<TiePoints>(.*?)</TiePoints>", re.DOTALL)
 EXTERNAL = re.compile(rb"<Path>\s*([^<]*?)\s*</Path>")
 DECLARATION = re.compile(rb"<\?xml.*?\?>")
 SRS_OF_ALL = re.compile(rb"<SRSId>\s*([^<]*?)\s*</SRSId>")
-LARGEST_RATIO = 200
-"""Of an archive: XML packs 10 to 30 times smaller, a bomb a thousand times."""
 MAIN_COMPONENT = "1"
 CENTRE = [f"Pose/Center/{axis}" for axis in "xyz"]
 DEGREES = ["Longitude", "Latitude", "Altitude"]
@@ -77,14 +74,9 @@ def _read_bytes(path: Path) -> bytes:
     """Return a file, or the XML document in a zip archive, without comments."""
     data = path.read_bytes()
     if data.startswith(ZIP_MAGIC):
-        with checks.reading(path), zipfile.ZipFile(path) as archive:
-            found = [e for e in archive.infolist() if e.filename.lower().endswith(".xml")]
-            if not found:
-                raise damaged(path, "the archive has no XML document")
-            entry = found[0]
-            if entry.file_size > LARGEST_RATIO * (entry.compress_size + 1):
-                raise damaged(path, "the archive unpacks to far too much")
-            data = archive.read(entry)
+        with checks.open_archive(path) as archive:
+            found = [name for name in archive.namelist() if name.lower().endswith(".xml")]
+            data = checks.unpacked(archive, found[0] if found else "XML document")
     return COMMENT.sub(b"", data)
 
 
@@ -351,6 +343,6 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
                     xyz.append([float(text) for text in axes])
                 element.clear()
     if not xyz:
-        raise tracks.no_tie_points(path, f"none was seen by one of its {len(cameras)} photos")
-    seen_all = tracks.Seen(np.array(xyz), np.array(point), np.array(camera), np.array(uv))
-    return tracks.tie_points(seen_all)
+        raise checks.no_tie_points(path, f"none was seen by one of its {len(cameras)} photos")
+    seen_all = checks.Seen(np.array(xyz), np.array(point), np.array(camera), np.array(uv))
+    return checks.tie_points(seen_all)

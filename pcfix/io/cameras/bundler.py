@@ -42,8 +42,8 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.errors import PcfixWarning
-from pcfix.io.cameras import checks, tracks
-from pcfix.io.cameras.checks import Source, damaged, note
+from pcfix.io.cameras import checks
+from pcfix.io.cameras.checks import Seen, Source, damaged, note
 from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.io.tables import read_lines
 from pcfix.lens.rotations import from_photogrammetric
@@ -66,24 +66,13 @@ _SAME_CAMERA = 1.1
 """Largest ratio between the focal lengths of neighbours among images of one camera."""
 
 
-class Points(NamedTuple):
-    """Points in space, shape (n, 3), and one row per view: its point and image, x and y.
-
-    Images are counted from 0, x and y from the principal point, x right, y down.
-    """
-
-    xyz: FloatArray
-    point: IntArray
-    image: IntArray
-    xy: FloatArray
-
-
 class Model(NamedTuple):
     """A model of a file.
 
     `names` are those of all images, `posed` the rows of those with a pose, which the other arrays
     are of: `lenses` has f, k1, k2, where f is of the longer side of the frame in files of MVE, and
-    `least_px` the width and height that hold the tie points, 0 where there are none.
+    `least_px` the width and height that hold the tie points, 0 where there are none. The views of
+    the `points` have rows of all images for cameras, and u, v from the principal point, v down.
     """
 
     software: str
@@ -93,7 +82,7 @@ class Model(NamedTuple):
     centres: FloatArray
     lenses: FloatArray
     least_px: FloatArray
-    points: Points
+    points: Seen
     held: dict[str, float]  # FixedK
     elsewhere: tuple[str, ...] = ()  # images of other models
     notes: tuple[PcfixWarning, ...] = ()
@@ -131,14 +120,15 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """Read the points of the largest model and where the images saw them."""
     model = _read(source)
     if model.software == "MVE":
-        raise tracks.no_tie_points(source.path, "MVE writes no image coordinates")
-    if not len(model.points.image) or cameras.lenses is None:
-        raise tracks.no_tie_points(source.path, "it lists no points")
-    xyz, point, image, xy = model.points
+        raise checks.no_tie_points(source.path, "MVE writes no image coordinates")
+    if not len(model.points.camera) or cameras.lenses is None:
+        raise checks.no_tie_points(source.path, "it lists no points")
     row = np.full(len(model.names), -1)
     row[model.posed] = np.arange(len(cameras))
+    camera = row[model.points.camera]
     middle = np.array([(lens.principal_x, lens.principal_y) for lens in cameras.lenses])
-    return tracks.tie_points(tracks.Seen(xyz, point, row[image], middle[row[image]] + xy))
+    uv = middle[camera] + model.points.uv
+    return checks.tie_points(model.points._replace(camera=camera, uv=uv))
 
 
 def _read(source: Source) -> Model:
@@ -174,8 +164,8 @@ def _read_bundler(path: Path) -> Model:
     centres, least = checks.centres(rotations, rows[:, 12:]), np.zeros((count, 2))
     if version:
         rotations = from_photogrammetric(rotations)
-        points = points._replace(xy=points.xy * (1.0, -1.0))
-        np.maximum.at(least, points.image, 2.0 * np.abs(points.xy))
+        points = points._replace(uv=points.uv * (1.0, -1.0))
+        np.maximum.at(least, points.camera, 2.0 * np.abs(points.uv))
     software = f"Bundler v{_VERSION}" if version else "MVE"
     lenses = rows[:, :3]
     return Model(software, names, posed, rotations, centres, lenses, least[posed], points, {})
@@ -188,7 +178,7 @@ def _read_nvm(path: Path) -> Model:
     matrix, held = found.groups() if found else (None, None)
     width = _MATRIX_NUMBERS if matrix else _QUATERNION_NUMBERS
     fixed = dict(zip(("fx", "cx", "fy", "cy"), map(float, (held or "").split()), strict=False))
-    models: list[tuple[list[str], FloatArray, Points]] = []
+    models: list[tuple[list[str], FloatArray, Seen]] = []
     at = 0
     while at < len(lines) and (count := int(lines[at])) > 0:
         cameras = [line.rsplit(None, width) for line in lines[at + 1 : at + 1 + count]]
@@ -220,14 +210,14 @@ def _read_nvm(path: Path) -> Model:
     else:
         points, least = _from_the_middle(points, rows[:, 0], posed, rotations, centres)
     lenses = np.column_stack([own[:, 0], own[:, -2], np.zeros(len(own))])
-    elsewhere = tuple(name for model in models for name in model[0])
-    model = Model(
-        "VisualSFM", names, posed, rotations, centres, lenses, least[posed], points, fixed
-    )
-    return model._replace(elsewhere=elsewhere, notes=notes)
+    listed = tuple(name for model in models for name in model[0])
+    return Model(
+        "VisualSFM", names, posed, rotations, centres, lenses, least[posed], points, fixed, listed,
+        notes,
+    )  # fmt: skip
 
 
-def _points(path: Path, body: FloatArray, count: int, images: int, width: int) -> Points:
+def _points(path: Path, body: FloatArray, count: int, images: int, width: int) -> Seen:
     """Take apart a list of x y z, red green blue, n, and n views of `width` numbers.
 
     `count` is the number of points that the file announces, `images` that of its images, which the
@@ -249,15 +239,15 @@ def _points(path: Path, body: FloatArray, count: int, images: int, width: int) -
     bad = ~((image >= 0) & (image < images))
     if bad.any():
         raise damaged(path, f"point {point[np.argmax(bad)]} is in image {image[np.argmax(bad)]:g}")
-    xy = body[at_view[:, None] + np.arange(width - 2, width)]
-    return Points(body[first[:, None] + np.arange(3)], point, image.astype(np.int64), xy)
+    uv = body[at_view[:, None] + np.arange(width - 2, width)]
+    return Seen(body[first[:, None] + np.arange(3)], point, image.astype(np.int64), uv)
 
 
 def _from_the_middle(
-    points: Points, focal: FloatArray, posed: IntArray, rotations: FloatArray, centres: FloatArray
-) -> tuple[Points, FloatArray]:
+    points: Seen, focal: FloatArray, posed: IntArray, rotations: FloatArray, centres: FloatArray
+) -> tuple[Seen, FloatArray]:
     """Return views from the principal point, and the least frame of each of the images."""
-    image, seen, least = points.image, points.xy.copy(), np.zeros((len(focal), 2))
+    image, seen, least = points.camera, points.uv.copy(), np.zeros((len(focal), 2))
     expected = np.full_like(seen, np.nan)  # where points project without distortion
     if len(seen) and ((seen >= 0.0) & (seen < _LARGEST_PX)).all():
         row_of = np.full(len(focal), -1)
@@ -277,7 +267,7 @@ def _from_the_middle(
             squeeze, frame = _squeeze_and_frame(expected[rows], seen[rows])
             seen[rows] = (seen[rows] - frame / 2.0) / squeeze
             least[focal == f] = frame
-    return points._replace(xy=seen), least
+    return points._replace(uv=seen), least
 
 
 def _squeeze_and_frame(expected: FloatArray, seen: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -309,7 +299,7 @@ def _frame_sizes(
     images of about the same focal length have, about the middle of the frame. Where neither is
     known there are no sizes.
     """
-    sizes = np.array([tracks.image_size(path.parent, one) or (0, 0) for one in labels], float)
+    sizes = np.array([checks.image_size(path.parent, one) or (0, 0) for one in labels], float)
     missing = sizes[:, 0] == 0
     if not missing.any():
         return sizes, ()

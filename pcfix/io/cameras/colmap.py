@@ -49,10 +49,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning
-from pcfix.io.cameras import checks, tracks
-from pcfix.io.cameras.checks import Source, damaged
+from pcfix.io.cameras import checks
+from pcfix.io.cameras.checks import NO_TIE_POINTS, Source, are_seen, damaged
 from pcfix.io.cameras.lenses import LensModel, lens_by_name, model_of
-from pcfix.io.cameras.tracks import NO_TIE_POINTS, are_seen
 from pcfix.io.crs import is_topocentric
 from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, TiePoints
 from pcfix.options.declare import File
@@ -106,16 +105,16 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     listed = _models_at(source.path)[0]
     path = listed.with_stem("points3D")
     if not path.is_file():
-        raise tracks.no_tie_points(path, "there is no such file")
+        raise checks.no_tie_points(path, "there is no such file")
     identifiers, xyz = read_points(path)
     images = [i for i in read_images(listed.with_stem("images"), points=True) if i.posed]
     seen = np.concatenate([image.seen for image in images])
     if not len(identifiers) or not len(seen):
-        raise tracks.no_tie_points(path, "the model has no points that its images saw")
+        raise checks.no_tie_points(path, "the model has no points that its images saw")
     camera = np.repeat(np.arange(len(cameras)), [len(image.seen) for image in images])
     xyz = xyz + read_place(listed.parent)[0]
-    row = tracks.rows_of(seen["point"], identifiers)
-    return tracks.tie_points(tracks.Seen(xyz, row, camera, seen["xy"]))
+    row = checks.rows_of(seen["point"], identifiers)
+    return checks.tie_points(checks.Seen(xyz, row, camera, seen["xy"]))
 
 
 def _models_at(path: Path) -> list[Path]:
@@ -422,7 +421,7 @@ def write_colmap(
     from scipy.spatial.transform import Rotation
 
     target = Path(folder)
-    _, lenses = checks.block_to_write(  # a file would cut off other names
+    rotations, lenses = checks.block_to_write(  # a file would cut off other names
         target, cameras, lambda name: name == name.strip() != "" and not {"\0", "\n"} & {*name}
     )
     middle = np.median(cameras.centres, axis=0)
@@ -445,7 +444,6 @@ def write_colmap(
         size = int(lens.width), int(lens.height)
         listed.append(struct.pack("<IiQQ", i, MODELS.index(model), *size))
         listed.append(np.array([*values.values()], "<f8").tobytes())
-    rotations = np.asarray(cameras.rotations)
     turns = np.roll(Rotation.from_matrix(rotations).as_quat(canonical=True), 1, axis=1)
     shifts = -np.einsum("kij,kj->ki", rotations, cameras.centres - offset)
     images = [struct.pack("<Q", len(cameras))]

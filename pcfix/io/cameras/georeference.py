@@ -226,10 +226,8 @@ def georeference(
             raise bad_file(name, "cameras.local", sentence, cloud_crs=cloud.name)
         return Georeference(_same, None, offset, systems.crs_text(cloud), (), name)
     if cloud is not None and systems.is_local(cloud):
-        sentence = (
-            f"is in {systems.shortened(crs)}, the cloud in a local frame. Set the cloud's CRS, or"
-        )
-        sentence += " give --cameras-crs local to use the numbers as they are."
+        sentence = f"is in {systems.shortened(crs)}, the cloud in a local frame. Set the cloud's"
+        sentence += " CRS, or give --cameras-crs local to use the numbers as they are."
         raise bad_file(name, "cloud.local", sentence, crs=crs, cloud_crs=cloud.name)
     frame = frame_of(crs, name)
     if cloud is not None:
@@ -286,7 +284,7 @@ def _into(
     gnss = cameras.gnss
     testable = systems.heights_of(target) == "gravity" and gnss is not None and gnss.crs is not None
     if by_user and not frame.topocentric and testable:
-        up = adjusted_minus_gnss(found.cameras(cameras), name).enu_m[:, 2]
+        up = adjusted_minus_gnss(found.cameras(cameras), name)[0][:, 2]
         off = float(np.median(up[np.isfinite(up)])) if np.isfinite(up).any() else 0.0
         if abs(off) >= UNDULATION_M[0]:
             side = "above" if off > 0.0 else "below"
@@ -313,22 +311,12 @@ def _assumed_heights(frame: Frame, target: CRS, project: CRS | None, trusted: bo
     return ""
 
 
-class GnssDifferences(NamedTuple):
-    """Adjusted centres minus positions of the GNSS.
-
-    `enu_m`, shape (k, 3), is east, north, up in metres, in the axes of the cameras' map where they
-    are in one; NaN where a camera has no position, or where the two cannot be compared, and
-    `reason` says why.
-    """
-
-    enu_m: FloatArray
-    reason: str = ""
-
-
-def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> GnssDifferences:
+def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> tuple[FloatArray, str]:
     """Return how far the adjusted centres are from where the GNSS stated that they were.
 
-    Without `up` where the heights of the two belong to systems that cannot be compared.
+    That is east, north, up in metres, shape (k, 3), in the axes of the cameras' map where they are
+    in one; NaN where a camera has no position, and where the two cannot be compared, which is often
+    so of heights. The text says why they cannot.
 
     Parameters
     ----------
@@ -339,30 +327,29 @@ def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> GnssDifferen
     """
     gnss, crs = cameras.gnss, cameras.crs or ""
     if gnss is None:
-        nothing = np.full((len(cameras), 3), np.nan)
-        return GnssDifferences(nothing, f"{name}: has no positions of the GNSS.")
+        return np.full((len(cameras), 3), np.nan), f"{name}: has no positions of the GNSS."
     tied = is_tied(cameras.crs, name)
     if gnss.crs in (None, cameras.crs):
         plain, gnss = cameras.centres - gnss.xyz, replace(gnss, crs=crs)
         if not tied or systems.is_topocentric(crs):
-            return GnssDifferences(plain)
+            return plain, ""
         frame = frame_of(crs, name)
         if frame.direct and frame.crs.is_projected:
-            return GnssDifferences(plain * frame.metres(cameras.centres))
+            return plain * frame.metres(cameras.centres), ""
     if gnss.crs is None or not tied or not is_tied(gnss.crs, name):
         reason = f"{name}: the cameras or the GNSS positions name no CRS; they are not compared."
-        return GnssDifferences(np.full((len(cameras), 3), np.nan), reason)
+        return np.full((len(cameras), 3), np.nan), reason
     kinds = [systems.heights_of(frame_of(each, name).crs) for each in (crs, gnss.crs)]
     who = "cameras" if kinds[0] == "unstated" else "GNSS"
     reason = f"{name}: the CRS of the {who} names no vertical datum; only plan is compared."
     if not {"gravity", "unstated"} <= {*kinds}:
         try:
-            return GnssDifferences(_differences(cameras, gnss, name))
+            return _differences(cameras, gnss, name), ""
         except systems.HeightsError as error:
             reason = str(error).partition("; or, if")[0] + "; only plan is compared."
     flat = replace(cameras, crs=_in_plan(crs, name))
     found = _differences(flat, replace(gnss, crs=_in_plan(gnss.crs, name)), name)
-    return GnssDifferences(found * [1.0, 1.0, np.nan], reason)
+    return found * [1.0, 1.0, np.nan], reason
 
 
 def _in_plan(crs: str, name: str) -> str:

@@ -10,9 +10,11 @@ thin prisms; and the parameters of a projection, see `SHAPES`. `pcfix.model.Lens
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from pcfix.errors import bad_file
 from pcfix.model import Lens, Projection
@@ -44,20 +46,15 @@ def lens_by_name(given: Mapping[str, float], width: float, height: float, **more
     value = defaultdict(float, given)
     focal = given.get("fy", value["f"])
     most = max((int(name[1:]) for name in given if name[1:].isdecimal()), default=0)
+    numbers = range(1, most + 1)
     terms = {
-        field: without_zeros([given.get(f"{letter}{i}", 0.0) for i in range(1, most + 1)])
+        field: tuple(np.trim_zeros([given.get(f"{letter}{i}", 0.0) for i in numbers], "b"))
         for field, letter in LETTERS.items()
     }
     shape = tuple(value[name] for name in SHAPES.get(more.get("projection", ""), "").split())
     middle = given.get("cx", width / 2.0), given.get("cy", height / 2.0)
     affine = given.get("fx", focal) - focal, value["skew"], value["b3"]
     return Lens(focal, width, height, *middle, *affine, **{"shape": shape} | terms | more)
-
-
-def without_zeros(values: Sequence[float]) -> tuple[float, ...]:
-    """Return the values up to the last that is not zero."""
-    last = max((i for i, value in enumerate(values) if value != 0.0), default=-1)
-    return tuple(values[: last + 1])
 
 
 def model_of(

@@ -29,13 +29,13 @@ import mmap
 import re
 from dataclasses import replace
 from pathlib import Path, PurePath
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from pcfix.errors import bad_file
 from pcfix.io.cameras import checks, opensfm
-from pcfix.io.cameras.checks import Source, damaged, load_json, note, triple
+from pcfix.io.cameras.checks import AffineFrame, Source, damaged, load_json, note, triple
 from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.io.cameras.opensfm import is_panorama, lens
 from pcfix.io.crs import Topocentric
@@ -159,28 +159,10 @@ def named_crs(path: Path) -> str:
     return crs
 
 
-class Frame(NamedTuple):
-    """The affine map from a reconstruction to `crs`: p -> matrix p + shift, metres."""
-
-    matrix: FloatArray
-    shift: FloatArray
-    crs: str
-    project_crs: str | None = None
-
-    def points(self, xyz: FloatArray) -> FloatArray:
-        """Return points in `crs`."""
-        return np.asarray(xyz @ self.matrix.T + self.shift)
-
-    def rotations(self, rotations: FloatArray) -> FloatArray:
-        """Return world to camera rotations in `crs`: the nearest ones, as the map scales a bit."""
-        u, _, v = np.linalg.svd(rotations @ np.linalg.inv(self.matrix))
-        return np.asarray(u @ v)
-
-
-def _frame(files: Files, found: opensfm.Reconstruction) -> Frame:
+def _frame(files: Files, found: opensfm.Reconstruction) -> AffineFrame:
     """Decide the frame; see the top of this module for the rules."""
     crs, reference = _crs_of(files), found.reference
-    unmoved = Frame(np.eye(3), np.zeros(3), found.cameras.crs or "", crs)
+    unmoved = AffineFrame(np.eye(3), np.zeros(3), found.cameras.crs or "", crs)
     if reference is None or found.path.name == TOPOCENTRIC:
         return unmoved
     path = files.get(TRANSFORMATION)
@@ -194,12 +176,12 @@ def _frame(files: Files, found: opensfm.Reconstruction) -> Frame:
         lat, lon, _ = reference
         named = _crs_of_place(lon, lat, shift[:2], [crs] if crs else _zones(lat, lon))
         if named is not None:  # else the file is of another origin
-            return Frame(turn, shift, named)
+            return AffineFrame(turn, shift, named)
     whole = _whole_metres(*reference[:2], crs)
     if whole is None:
         return unmoved
     crs, east, north = whole
-    moved = Frame(np.eye(3), np.array([east, north, 0.0]), crs)
+    moved = AffineFrame(np.eye(3), np.array([east, north, 0.0]), crs)
     # centres of shots.geojson, else the GNSS, which stays topocentric, show whether it was moved:
     # the two readings differ by the meridian convergence and the scale
     truth, own = _in_shots(files, found.cameras)

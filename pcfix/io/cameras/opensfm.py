@@ -39,11 +39,10 @@ import numpy as np
 
 from pcfix.errors import bad_file
 from pcfix.io import crs as systems
-from pcfix.io.cameras import checks, tracks
-from pcfix.io.cameras.checks import Source
+from pcfix.io.cameras import checks
+from pcfix.io.cameras.checks import NO_TIE_POINTS, Source, are_seen
 from pcfix.io.cameras.georeference import frame_of, georeference, is_tied
 from pcfix.io.cameras.lenses import LensModel, lens_by_name, model_of
-from pcfix.io.cameras.tracks import NO_TIE_POINTS, are_seen
 from pcfix.io.labels import unnamed
 from pcfix.io.tables import read_lines
 from pcfix.lens.rotations import from_rotation_vectors
@@ -200,7 +199,7 @@ def read_tie_points(reconstruction: Reconstruction) -> TiePoints:
     beside = path.with_name("tracks.csv")
     if not points or not beside.is_file():
         why = "it has no points" if not points else "tracks.csv is not beside it"
-        raise tracks.no_tie_points(path, why)
+        raise checks.no_tie_points(path, why)
     xyz = np.array([point["coordinates"] for point in points.values()], float).reshape(-1, 3)
     camera_of, point_of = (
         {name.encode(errors="replace"): i for i, name in enumerate(names)}
@@ -222,7 +221,7 @@ def read_tie_points(reconstruction: Reconstruction) -> TiePoints:
     order = np.lexsort((camera, point))
     size = np.array([(lens.width, lens.height) for lens in cameras.lenses or ()])[camera]
     uv = xy * size.max(axis=1, initial=0.0)[:, None] + size / 2.0
-    return tracks.tie_points(tracks.Seen(xyz, point[order], camera[order], uv[order]))
+    return checks.tie_points(checks.Seen(xyz, point[order], camera[order], uv[order]))
 
 
 PANORAMAS = frozenset({"equirectangular", "spherical"})

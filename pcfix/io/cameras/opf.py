@@ -31,13 +31,13 @@ from urllib.parse import unquote
 import numpy as np
 
 from pcfix.errors import PcfixWarning, bad_file
-from pcfix.io.cameras import checks, tracks
-from pcfix.io.cameras.checks import Source, load_json, note, triple
+from pcfix.io.cameras import checks
+from pcfix.io.cameras.checks import AffineFrame, Source, load_json, note, triple
 from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.io.cameras.pix4d import fisheye
 from pcfix.io.crs import crs_text, parse_crs, plan_unit
 from pcfix.lens.rotations import from_omega_phi_kappa
-from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, TiePoints
+from pcfix.model import Cameras, GnssPositions, Lens, TiePoints
 
 FORMAT = "application/opf-{}+json"
 PROJECT = FORMAT.format("project")
@@ -59,7 +59,7 @@ def read(source: Source) -> Cameras:
     project = _open_project(source.path)
     path, calibrated = project.part("calibration", "calibrated-cameras")
     _, given = project.part("input_cameras", "input-cameras", needed=False)
-    frame, names = _frame_of(project), dict[int, str]()
+    (frame, of_frame), names = _frame_of(project), dict[int, str]()
     for listed in project.files("camera_list", FORMAT.format("camera-list")):
         for camera in load_json(listed)["cameras"] if listed.is_file() else []:
             name = camera["uri"].replace("\\", "/").rpartition("/")[2]
@@ -87,12 +87,12 @@ def read(source: Source) -> Cameras:
         notes.append(note(path, "cameras.rolling_shutter", sentence))
     return Cameras(
         labels=labels,
-        centres=frame.enter(xyz),
+        centres=frame.points(xyz),
         rotations=from_omega_phi_kappa(*angles.T) if len(shots) else None,
         lenses=None if lost else tuple(known[i] for i in used) or None,
         crs=frame.crs,
         project_crs=frame.project_crs,
-        notes=(*frame.notes, *notes, *checks.repeated(path, labels)),
+        notes=(*of_frame, *notes, *checks.repeated(path, labels)),
         gnss=_gnss(path, given, list(shots)),
         unposed=tuple(names.get(i, f"camera {i}") for i in captured if i not in shots),
         source=" ".join(["OPF", *project.generator]),
@@ -144,25 +144,11 @@ def _open_project(path: Path) -> Project:
     return _open_project(found[0])
 
 
-class Frame(NamedTuple):
-    """The processing CRS: coordinates east, north, up of `crs` times `scale`, plus `shift`."""
-
-    crs: str
-    project_crs: str | None
-    shift: FloatArray
-    scale: FloatArray
-    notes: tuple[PcfixWarning, ...] = ()
-
-    def enter(self, xyz: FloatArray) -> FloatArray:
-        """Return points (n, 3) in the CRS of the project."""
-        return np.asarray((xyz - self.shift) / self.scale)
-
-
-def _frame_of(project: Project) -> Frame:
-    """Read the scene reference frame."""
+def _frame_of(project: Project) -> tuple[AffineFrame, tuple[PcfixWarning, ...]]:
+    """Return the frame of the processing, east, north, up, and notes on it."""
     path, scene = project.part("scene_reference_frame", "scene-reference-frame", needed=False)
     if not scene:  # the frame of the processing is arbitrary
-        return Frame("local", None, np.zeros(3), np.ones(3))
+        return AffineFrame(np.eye(3), np.zeros(3), "local"), ()
     way = scene["base_to_canonical"]
     shift, scale = triple(way["shift"]), triple(way["scale"])
     if not (scale > 0.0).all():
@@ -174,8 +160,9 @@ def _frame_of(project: Project) -> Frame:
     geoid_m = float(scene["crs"].get("geoid_height") or 0.0)
     sentence = f"its heights are above a constant geoid, {geoid_m:g} m, taken for its CRS."
     geoid = note(path, "cameras.constant_geoid", sentence, geoid_m=geoid_m)
-    project_crs = None if crs == said else said
-    return Frame(crs, project_crs, shift, scale / [1.0, 1.0, unit], (geoid,) if geoid_m else ())
+    size = [1.0, 1.0, unit] / scale
+    frame = AffineFrame(np.diag(size), -shift * size, crs, None if crs == said else said)
+    return frame, (geoid,) if geoid_m else ()
 
 
 def _with_heights(text: str, name: str) -> tuple[str, float]:
@@ -242,12 +229,12 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     models = project.files("calibration", "model/gltf+json")
     found = [node for model in models for node in _nodes(model, row_of)]
     if not any((node.camera >= 0).any() for node in found):
-        raise tracks.no_tie_points(project.path, "its calibration has no tracks in its images")
-    frame = _frame_of(project)
-    return tracks.tie_points(*(node._replace(xyz=frame.enter(node.xyz)) for node in found))
+        raise checks.no_tie_points(project.path, "its calibration has no tracks in its images")
+    frame, _ = _frame_of(project)
+    return checks.tie_points(*(node._replace(xyz=frame.points(node.xyz)) for node in found))
 
 
-def _nodes(path: Path, row_of: dict[int, int]) -> Iterator[tracks.Seen]:
+def _nodes(path: Path, row_of: dict[int, int]) -> Iterator[checks.Seen]:
     """Yield the points and matches of the nodes of a model."""
     with checks.reading(path):
         model = load_json(path)
@@ -272,7 +259,7 @@ def _nodes(path: Path, row_of: dict[int, int]) -> Iterator[tracks.Seen]:
                     matrix = np.array(node.get("matrix", np.eye(4).ravel()), float).reshape(4, 4).T
                     x, y, z = (xyz.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]).T
                     z_up = np.column_stack([x, -z, y])  # the model itself has y up
-                    yield tracks.Seen(z_up, point, rows[index[at]], uv[at].astype(np.float64))
+                    yield checks.Seen(z_up, point, rows[index[at]], uv[at].astype(np.float64))
 
 
 def _accessor(path: Path, model: Part, index: int, width: int) -> Any:

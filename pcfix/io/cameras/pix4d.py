@@ -24,15 +24,15 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PurePath, PureWindowsPath
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from pcfix.errors import PcfixWarning, bad_file
-from pcfix.io.cameras import checks, tracks
+from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import Source, damaged, note, number, read_xml
 from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.io.tables import read_lines
@@ -73,7 +73,8 @@ FIELDS = {
 }
 SHAPE = re.compile(r"^(.*?)\s*\[\s*(\d{1,2})\s*x\s*(\d{1,2})\s*\]\s*$")
 SENSOR = re.compile(r"sensor width of\s*([-+.\deE]+)\s*x\s*([-+.\deE]+)")
-Unlike = Callable[[int, list[int]], Any]
+PRIORS = {"xyz": ("x", "y", "z"), "gps": ("lng", "lat", "alt")}
+"""Elements with the initial position of an image, and their attributes."""
 SAME_FOCAL = 1e-6
 """Relative: the two files write the same number in pixels and in millimetres."""
 
@@ -97,9 +98,7 @@ def read(source: Source) -> Cameras:
         turns = checks.rotations(path, labels, turns)
         if "external" in files:
             names, there, turned = read_external(files["external"])
-            rows = _rows(
-                labels, names, lambda i, rows: np.linalg.norm(turned[rows] - turns[i], axis=(1, 2))
-            )
+            rows = _rows(labels, names, (turns, turned))
             if max(rows) < 0:
                 raise damaged(files["external"], f"names none of the images of {PARAMETERS}")
             centres, rotations = there[rows], turned[rows]
@@ -185,19 +184,23 @@ def _tables_in(root: Path) -> list[tuple[Path, str]]:
 
 
 def _rows(
-    labels: Sequence[str], names: Sequence[str], unlike: Unlike = lambda i, rows: [0.0] * len(rows)
+    labels: Sequence[str], names: Sequence[str], turns: tuple[FloatArray, FloatArray] | None = None
 ) -> list[int]:
-    """Return the row of each label among names, -1 where there is none left of this name.
+    """Return the row of each label among names, each once, -1 where there is none left of it.
 
-    Of equal names it is the one that `unlike` (of the label's number and the rows) finds smallest.
+    Of equal names it is the first, or that with the most similar rotation of `turns`.
     """
     left: dict[str, list[int]] = defaultdict(list)
     for row, name in enumerate(names):
         left[name].append(row)
-    return [
-        left[label].pop(int(np.argmin(unlike(i, left[label])))) if left[label] else -1
-        for i, label in enumerate(labels)
-    ]
+    found = []
+    for i, label in enumerate(labels):
+        rows, nearest = left[label], 0
+        if turns and len(rows) > 1:
+            apart = np.linalg.norm(turns[1][rows] - turns[0][i], axis=(1, 2))
+            nearest = int(np.argmin(apart))
+        found.append(rows.pop(nearest) if rows else -1)
+    return found
 
 
 def _absolute(files: Files, images: list[Image]) -> tuple[FloatArray, tuple[PcfixWarning, ...]]:
@@ -238,16 +241,11 @@ def _priors(path: Path, labels: list[str]) -> tuple[GnssPositions | None, list[s
     ]
     names = [PureWindowsPath(image.get("path", "")).name for image in images]
     rows = _rows(labels, names)
-    tags = [
-        tag
-        for row in rows
-        if row >= 0
-        for tag in ("xyz", "gps")
-        if images[row].find(tag) is not None
-    ]
-    if not tags:
+    known = [images[row] for row in rows if row >= 0]
+    kinds = [kind for image in known for kind in PRIORS if image.find(kind) is not None]
+    if not kinds:
         return None, names
-    kind, axes = tags[0], ("x", "y", "z") if tags[0] == "xyz" else ("lng", "lat", "alt")
+    kind, axes = kinds[0], PRIORS[kinds[0]]
     xyz, sigma_m = np.full((2, len(labels), 3), np.nan)
     for i, row in enumerate(rows):
         position = images[row].find(kind) if row >= 0 else None
@@ -404,9 +402,9 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     files = _find(source)
     path = files.get("bingo") or files.get("ties")
     if path is None:
-        raise tracks.no_tie_points(source.path, "no tp_bingo.txt or tp_pix4d.txt is beside it")
+        raise checks.no_tie_points(source.path, "no tp_bingo.txt or tp_pix4d.txt is beside it")
     if cameras.lenses is None:
-        raise tracks.no_tie_points(path, "the cameras have no lenses, which it needs")
+        raise checks.no_tie_points(path, "the cameras have no lenses, which it needs")
     labels = list(enumerate(cameras.labels))[::-1]  # of equal names the first counts
     rows = {PurePath(label).stem: i for i, label in labels} | {label: i for i, label in labels}
     with checks.reading(path):
@@ -415,7 +413,7 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
         numbers = np.array([words for *_, words in measured], dtype=float).reshape(-1, 4)
         posed = camera >= 0
         if not posed.any():
-            raise tracks.no_tie_points(path, "it measures nothing in the images that are posed")
+            raise checks.no_tie_points(path, "it measures nothing in the images that are posed")
         xy, sensor = np.split(numbers, 2, axis=1)
         if path == files.get("bingo"):
             if not (sensor[posed] > 0.0).all():
@@ -431,7 +429,7 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
             known = {row[0].strip(): checks.triple(row[4:7]) for row in lines if len(row) > 1}
         unknown = np.full(3, np.nan)
         xyz = np.array([known.get(name.partition("_")[2], unknown) for name in names.tolist()])
-        return tracks.tie_points(tracks.Seen(xyz, point, camera[posed], xy[posed]))
+        return checks.tie_points(checks.Seen(xyz, point, camera[posed], xy[posed]))
 
 
 def _measured(path: Path, rows: dict[str, int]) -> list[tuple[str, int, list[str]]]:

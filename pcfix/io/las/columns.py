@@ -1,16 +1,14 @@
 """What a point record holds: LAS point formats, and the extra dimensions of a correction.
 
-The extra dimensions are integers with a scale, so that LAZ packs them well. Each has a narrow type,
-which nearly every cloud fits, and a wide one; a cloud with a value outside the narrow range is
-written again with the wide types. `COLUMNS` and `UNSURE` are all that is said of them: files and
-PDAL's stage take name, type and unit from them, and a test holds the documentation to them.
+The extra dimensions are integers with a scale, so that LAZ packs them well. `COLUMNS` and `UNSURE`
+are all that is said of them: files and PDAL's stage take name, type and unit from them, and a test
+holds the documentation to them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -45,50 +43,32 @@ class OutOfRangeError(Exception):
     """A coordinate leaves the 32 bits that LAS has; move the offsets and write again."""
 
 
-class TooNarrowError(Exception):
-    """A value does not fit the narrow types; write the file again with the wide ones."""
-
-
 @dataclass(frozen=True, slots=True)
 class Column:
     """One extra dimension."""
 
     name: str
     of: str  # the attribute of `pcfix.Correction` that it holds; empty for the class before
-    narrow: str  # types
-    wide: str
+    dtype: str
     scale: float  # 0 means the file's own scale of that axis; 1 means a count
     description: str  # in the file, at most 31 letters
     saturates: bool = False  # the largest value means "or more"
     least: int | None = None  # in steps of the scale
 
-    def dtype(self, *, wide: bool) -> np.dtype[Any]:
-        """Return the numpy type."""
-        return np.dtype(self.wide if wide else self.narrow)
-
 
 COLUMNS = (
-    *(
-        Column(f"Shift{axis}", "shift_m", "int16", "int32", 0.0, f"true minus apparent {axis}")
-        for axis in "XYZ"
-    ),
-    Column(
-        *("WaterDepth", "depth_m", "uint16", "uint32", 0.001, "below the water surface, m"),
-        least=1,  # a submerged point is never at zero depth
-    ),
-    Column(
-        *("RayMiss", "ray_miss_m", "uint16", "uint32", 0.0001, "rms distance from the rays, m"),
-        saturates=True,
-    ),
-    Column(
-        *("SigmaZ", "sigma_z_m", "uint16", "uint32", 0.0001, "formal standard error of Z, m"),
-        saturates=True,
-    ),
-    Column("Incidence", "incidence_deg", "uint16", "uint16", 0.1, "largest angle in air, deg"),
-    Column("RayCount", "ray_count", "uint16", "uint16", 1.0, "rays intersected", saturates=True),
-    Column("SourceClass", "", "uint8", "uint8", 1.0, "class before the correction"),
+    Column("ShiftX", "shift_m", "int32", 0.0, "true minus apparent X"),
+    Column("ShiftY", "shift_m", "int32", 0.0, "true minus apparent Y"),
+    Column("ShiftZ", "shift_m", "int32", 0.0, "true minus apparent Z"),
+    # a submerged point is never at zero depth
+    Column("WaterDepth", "depth_m", "uint32", 0.001, "below the water surface, m", least=1),
+    Column("RayMiss", "ray_miss_m", "uint16", 0.0001, "rms distance from the rays, m", True),
+    Column("SigmaZ", "sigma_z_m", "uint16", 0.0001, "formal standard error of Z, m", True),
+    Column("Incidence", "incidence_deg", "uint16", 0.1, "largest angle in air, deg"),
+    Column("RayCount", "ray_count", "uint16", 1.0, "rays intersected", True),
+    Column("SourceClass", "", "uint8", 1.0, "class before the correction"),
 )
-UNSURE = Column("Unsure", "unsure", "uint8", "uint8", 1.0, "withheld: only flat rays see it")
+UNSURE = Column("Unsure", "unsure", "uint8", 1.0, "withheld: only flat rays see it")
 """Written where such points are withheld."""
 SHIFTS = ("ShiftX", "ShiftY", "ShiftZ")
 MINIMAL = ("ShiftZ", "RayCount")
@@ -107,86 +87,63 @@ def column_scale(column: Column, scales: FloatArray) -> float:
     return float(scales[SHIFTS.index(column.name)]) if column.scale == 0.0 else column.scale
 
 
-def shift_steps(correction: Correction, scales: FloatArray) -> npt.NDArray[np.int64]:
-    """Return the shift in steps of the file's own scale, shape (n, 3)."""
-    return np.rint(correction.shift_m / scales).astype(np.int64)
+class Changes(NamedTuple):
+    """What a correction changes in n points of a file."""
+
+    steps: npt.NDArray[np.int64]  # (n, 3), the shift in steps of the file's own scale
+    flagged: BoolArray  # (n,), to be withheld
+    values: list[tuple[Column, BoolArray, npt.NDArray[Any]]]  # whole numbers of some rows
 
 
-def filled(
+def changes_of(
     columns: tuple[Column, ...],
     correction: Correction,
-    moved: npt.NDArray[np.int64],
     classes: npt.NDArray[Any],
-    changed: BoolArray,
-) -> Iterator[tuple[Column, BoolArray, npt.NDArray[Any]]]:
-    """Yield each column, the rows that get values, and these as whole numbers of its scale.
+    withheld: BoolArray,
+    scales: FloatArray,
+    *,
+    withhold: bool,
+) -> Changes:
+    """Return the changes by a correction; with `withhold` also flags for uncorrected points.
 
-    The rows are the `changed` ones, and for shifts all that moved. `moved` is from `shift_steps`,
-    shape (n, 3); `classes`, shape (n,), are those before.
+    Classes and flags, shape (n,), are those before. What is withheld in the input is neither unsure
+    nor uncorrected here, so that `restore` can distinguish it from what pcfix withheld. Points that
+    are withheld because they could not be transferred have the same mark, a depth.
     """
+    steps = np.rint(correction.shift_m / scales).astype(np.int64)
+    if correction.unsure is not None:
+        correction = replace(correction, unsure=correction.unsure & ~withheld)
+    marked = correction.uncorrected if withhold else correction.submerged
+    changed = correction.corrected | (marked & ~withheld)
+    values: list[tuple[Column, BoolArray, npt.NDArray[Any]]] = []
     for column in columns:
-        rows = changed | correction.moved if column.name in SHIFTS else changed
         if column.scale == 0.0:
-            yield column, rows, moved[rows, SHIFTS.index(column.name)]
+            rows = changed | correction.moved
+            values.append((column, rows, steps[rows, SHIFTS.index(column.name)]))
             continue
-        value = (getattr(correction, column.of) if column.of else classes)[rows]
+        value = (getattr(correction, column.of) if column.of else classes)[changed]
         if column.scale != 1.0:
             value = np.rint(value / column.scale)
-        yield column, rows, value if column.least is None else np.maximum(value, column.least)
+        value = value if column.least is None else np.maximum(value, column.least)
+        values.append((column, changed, value))
+    flagged = correction.uncorrected if withhold else np.zeros(len(changed), np.bool_)
+    flagged = flagged if correction.unsure is None else flagged | correction.unsure
+    return Changes(steps, flagged, values)
 
 
-def fill(
-    points: laspy.ScaleAwarePointRecord,
-    columns: tuple[Column, ...],
-    correction: Correction,
-    moved: npt.NDArray[np.int64],
-    rows: BoolArray,
-) -> None:
-    """Write the columns of the given rows, and the shift of all; the others keep zero.
-
-    A `TooNarrowError` if a value does not fit its type and the type may be widened.
-    """
-    classes = np.array(points["classification"])
-    for column, some, value in filled(columns, correction, moved, classes, rows):
+def fill(points: laspy.ScaleAwarePointRecord, changes: Changes) -> None:
+    """Write the columns of the rows that change; the others keep zero."""
+    for column, some, value in changes.values:
         target = points.array[column.name]
         limits = np.iinfo(target.dtype)
         if column.saturates:
             value = np.minimum(value, limits.max)
         if value.size and (value.min() < limits.min or value.max() > limits.max):
-            if target.dtype != column.dtype(wide=True):
-                raise TooNarrowError
             step = column_scale(column, points.scales)
             reach = float(value.max() * step)
             sentence = f"{column.name} reaches {reach:g} m. Remove points far below the water."
             raise InputError("cloud.too_deep", sentence, dimension=column.name, value=reach)
         target[some] = value
-
-
-def changed_rows(correction: Correction, withheld: BoolArray, *, withhold: bool) -> BoolArray:
-    """Return the rows that get values: corrected ones, and uncorrected ones not yet withheld.
-
-    An uncorrected point that is withheld in the input stays as it is, so that `restore` can
-    distinguish it from one that pcfix withheld. Points that are withheld because they could not be
-    transferred have the same mark, a depth.
-    """
-    marked = correction.uncorrected if withhold else correction.submerged
-    return correction.corrected | (marked & ~withheld)
-
-
-def unsure_anew(correction: Correction, withheld: BoolArray) -> Correction:
-    """Return a correction in which no point that is withheld in the input is unsure.
-
-    So `restore` can distinguish these from the unsure ones, which are withheld by pcfix.
-    """
-    if correction.unsure is None:
-        return correction
-    return replace(correction, unsure=correction.unsure & ~withheld)
-
-
-def to_withhold(correction: Correction, *, withhold: bool) -> BoolArray:
-    """Return the rows to be flagged: the unsure, and the uncorrected where these are withheld."""
-    rows = correction.uncorrected if withhold else np.zeros(len(correction.outcome), np.bool_)
-    return rows if correction.unsure is None else rows | correction.unsure
 
 
 def convert(

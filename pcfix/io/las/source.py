@@ -1,4 +1,4 @@
-"""Read a LAS or LAZ file chunk by chunk, and keep what laspy would rewrite.
+"""Read a LAS or LAZ file, or a part of it, chunk by chunk, and keep what laspy would rewrite.
 
 Variable length records stay with their bytes as they are in the file. laspy has classes of its own
 for many of them, which lose some bytes when they write; it cuts names that fill their field; and it
@@ -7,25 +7,27 @@ believes any number of records that a damaged header states.
 
 from __future__ import annotations
 
+import math
 import os
 import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from copy import copy
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import laspy
 import lazrs
 import numpy as np
+from laspy.copc import Bounds, CopcReader, load_octree_for_query
 from laspy.vlrs.vlr import VLR
 from laspy.vlrs.vlrlist import VLRList
 
 from pcfix.errors import SettingError, bad_file
 from pcfix.io.crs import METRES, shortened
 from pcfix.io.files import check_input
-from pcfix.io.las.part import CloudPart, is_copc, nodes_in
-from pcfix.model import FloatArray
+from pcfix.model import BoolArray, FloatArray
 from pcfix.options.declare import File
 
 if TYPE_CHECKING:
@@ -70,6 +72,47 @@ CHUNK_BYTES = 500_000_000
 
 KEPT_BYTES = 200_000_000
 """Point records of a cloud that are kept when it is gone through more than once."""
+
+
+Box = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class CloudPart:
+    """A part of the cloud in a file; see `pcfix.io.tiles.part_of`, which counts its points."""
+
+    path: Path
+    bounds: Box | None = None  # west, south, east, north, metres; points on the edges belong to it
+    resolution: float | None = None  # of COPC: levels down to the first with this spacing, metres
+    points: int = 0
+    points_of_file: int = 0
+    # the lowest and highest coordinates of the part, shape (3,), metres
+    mins: FloatArray = field(default_factory=lambda: np.zeros(3))
+    maxs: FloatArray = field(default_factory=lambda: np.zeros(3))
+
+    def __str__(self) -> str:
+        return str(self.path)
+
+    def holds(self, points: laspy.ScaleAwarePointRecord) -> BoolArray:
+        """Return which points of a chunk are within the bounds."""
+        if self.bounds is None:
+            return np.ones(len(points), np.bool_)
+        steps = (np.reshape(self.bounds, (2, 2)) - points.offsets[:2]) / points.scales[:2]
+        (west, south), (east, north) = np.ceil(steps[0] - 1e-4), np.floor(steps[1] + 1e-4)
+        x, y = points.array["X"], points.array["Y"]
+        return np.asarray((x >= west) & (x <= east) & (y >= south) & (y <= north))
+
+
+def part_report(cloud: object) -> dict[str, Any] | None:
+    """Return what a summary says of the part that was read; None unless the cloud is a part."""
+    if not isinstance(cloud, CloudPart):
+        return None
+    return {
+        "points": cloud.points,
+        "of": cloud.points_of_file,
+        "bounds": None if cloud.bounds is None else list(cloud.bounds),
+        "read_resolution": cloud.resolution,
+    }
 
 
 class Record(VLR):  # type: ignore[misc]  # laspy is untyped
@@ -206,7 +249,7 @@ class LasSource:
         try:
             with las_errors(self.path):
                 self.points_of_file = len(self)
-            self._check_header()
+                self._check_header()
         except BaseException:
             self._reader.close()
             raise
@@ -231,18 +274,15 @@ class LasSource:
         usable = (scales > 0.0) & (scales <= MOST_SCALE_M)
         # steps below the last digit of the offsets would be lost in coordinates
         if not (usable & (np.abs(offsets) * _LAST_DIGIT <= scales)).all():
-            sentence = (
-                f"the scales {scales.tolist()} of its header are not between 0 and"
-                f" {MOST_SCALE_M:,.0f}, or too small for its offsets {offsets.tolist()}."
-            )
+            sentence = f"the scales {scales.tolist()} of its header are not between 0 and"
+            sentence += f" {MOST_SCALE_M:,.0f}, or too small for its offsets {offsets.tolist()}."
             raise bad_file(self.path, "cloud.scales", f"{sentence} Export the cloud again.")
         stated = len(self)
         if stated == 0:
             raise bad_file(self.path, "cloud.empty", "contains no points.")
         # points that the header does not count would be lost
         packed = self.header.are_points_compressed
-        with las_errors(self.path):
-            least, most = self._points_of_chunks() if packed else self._points_of_records()
+        least, most = self._points_of_chunks() if packed else self._points_of_records()
         if not least <= stated <= most:
             held = f"{least:,}" if least == most else f"{least:,} to {most:,}"
             sentence = f"its header counts {stated:,} points, but it holds {held}. Export it again."
@@ -353,6 +393,47 @@ class LasSource:
             sentence = f"has no dimension {name}; {listing}."
             raise bad_file(self.path, "cloud.no_dimension", sentence, dimension=name)
         return np.asarray(points[name], dtype=np.float64)
+
+
+def is_copc(header: laspy.LasHeader) -> bool:
+    """Whether a cloud that is read is COPC."""
+    return bool(len(header.vlrs) and isinstance(header.vlrs[0], laspy.copc.CopcInfoVlr))
+
+
+def nodes_in(part: CloudPart, most: int) -> Iterator[laspy.ScaleAwarePointRecord]:
+    """Yield points of the nodes of a COPC file that a part may touch, at most `most` at a time.
+
+    They come in the order of the file; a node with more points is one batch.
+    """
+    with CopcReader.open(part.path) as reader:
+        header, info, levels, box = reader.header, reader.copc_info, None, None
+        if part.resolution is not None:
+            halvings = math.ceil(math.log2(info.spacing / part.resolution))
+            levels = range(max(halvings, 0) + 1)
+        if part.bounds is not None:
+            corners = np.array(part.bounds).reshape(2, 2)
+            box = Bounds(*corners).ensure_3d(header.mins, header.maxs)
+        found = load_octree_for_query(reader.source, info, reader.root_page, box, levels)
+        nodes = sorted((one for one in found if one.point_count), key=lambda one: one.offset)
+        if sum(one.point_count for one in nodes) > header.point_count:
+            raise ValueError("its octree has more points than its header")
+        while nodes:
+            counts = np.cumsum([one.point_count for one in nodes])
+            count = max(int(np.searchsorted(counts, most, side="right")), 1)
+            data = bytearray()
+            for one in nodes[:count]:
+                reader.source.seek(one.offset)
+                data += reader.source.read(one.byte_size)
+            rows = np.zeros(counts[count - 1], header.point_format.dtype())
+            table = [(one.point_count, one.byte_size) for one in nodes[:count]]
+            lazrs.decompress_points_with_chunk_table(
+                data, reader.laszip_vlr.record_data, rows.view(np.uint8), table,
+                laspy.DecompressionSelection.all().to_lazrs(),
+            )  # fmt: skip
+            yield laspy.ScaleAwarePointRecord(
+                rows, header.point_format, header.scales, header.offsets
+            )
+            del nodes[:count]
 
 
 def backend(jobs: int | None) -> laspy.LazBackend:

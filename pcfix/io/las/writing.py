@@ -28,7 +28,6 @@ from pcfix.errors import SettingError, bad_file
 from pcfix.io.atomic import cannot_write, temporary_output
 from pcfix.io.files import parse_json
 from pcfix.io.las.columns import UPGRADE, Column, column_scale
-from pcfix.io.las.part import part_report
 from pcfix.io.las.source import (
     IDENTITY_PLACE,
     LasSource,
@@ -37,6 +36,7 @@ from pcfix.io.las.source import (
     append_evlrs,
     backend,
     las_errors,
+    part_report,
 )
 from pcfix.model import FloatArray
 from pcfix.version import __version__
@@ -57,16 +57,14 @@ def corrected_header(
     source: LasSource,
     columns: tuple[Column, ...],
     content: dict[str, Any],
-    *,
-    wide: bool,
     steps: tuple[int, ...] = (0, 0, 0),
 ) -> laspy.LasHeader:
     """Return the header of a corrected file: LAS 1.4, the input's records, and pcfix's own.
 
-    The `columns` are added as extra dimensions, of their `wide` types or the narrow ones, and a VLR
-    with `content` and what the file was before. Each integer axis will be moved by its `steps`,
-    for which the offsets make up. An `InputError` if the cloud already has a dimension of one of
-    these names, or was corrected before.
+    The `columns` are added as extra dimensions, and a VLR with `content` and what the file was
+    before. Each integer axis will be moved by its `steps`, for which the offsets make up. An
+    `InputError` if the cloud already has a dimension of one of these names, or was corrected
+    before.
     """
     old = source.header
     if any(is_ours(v) for v in source.vlrs):
@@ -77,7 +75,7 @@ def corrected_header(
     if twice is not None:
         sentence = f"already has a dimension {twice}. Rename it, or use --dimensions none."
         raise bad_file(source.path, "cloud.dimension_exists", sentence, dimension=twice)
-    params, records = _extra_bytes(columns, old.scales, wide=wide)
+    params, records = _extra_bytes(columns, old.scales)
     header, vlrs, described, changes = _upgraded(source, params)
     header.offsets = old.offsets - np.array(steps) * old.scales
     before = {
@@ -171,7 +169,7 @@ def restored_header(source: LasSource, before: dict[str, Any], drop: set[str]) -
 
 
 def _extra_bytes(
-    columns: tuple[Column, ...], scales: FloatArray, *, wide: bool
+    columns: tuple[Column, ...], scales: FloatArray
 ) -> tuple[list[laspy.ExtraBytesParams], bytes]:
     """Return the dimensions for laspy's point format and the bytes of their VLR records."""
     params, records = [], b""
@@ -179,7 +177,7 @@ def _extra_bytes(
         scale = column_scale(column, scales)
         scaled = None if scale == 1.0 else np.array([scale])
         offset = None if scale == 1.0 else np.zeros(1)
-        dtype = column.dtype(wide=wide)
+        dtype = np.dtype(column.dtype)
         params.append(
             laspy.ExtraBytesParams(column.name, dtype, column.description, offset, scaled)
         )

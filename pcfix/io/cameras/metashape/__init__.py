@@ -46,9 +46,7 @@ from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import Source, damaged, note, number, numbers, read_xml, text_of
 from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.io.cameras.metashape import documents
-from pcfix.io.cameras.metashape.documents import Chunk, Document, open_archive, recognises, unpacked
-from pcfix.io.cameras.tracks import Seen, no_tie_points, rows_of
-from pcfix.io.cameras.tracks import tie_points as gathered
+from pcfix.io.cameras.metashape.documents import Chunk, Document, recognises
 from pcfix.io.crs import LOCAL, METRES, crs_text, is_local, parse_crs, shortened, unbound
 from pcfix.io.ply import parse_header
 from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, Projection, TiePoints
@@ -68,24 +66,8 @@ DEFAULTS: Spreads = (
 )
 POINTS, MARKS = ("x", "y", "z", "id"), ("x", "y", "id")
 PARAMETERS = {
-    *[
-        "f",
-        "fx",
-        "fy",
-        "cx",
-        "cy",
-        "b1",
-        "b2",
-        "skew",
-        "k1",
-        "k2",
-        "k3",
-        "k4",
-        "p1",
-        "p2",
-        "p3",
-        "p4",
-    ]
+    *("f", "fx", "fy", "cx", "cy", "b1", "b2", "skew"),
+    *("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4"),
 }
 PROJECTIONS: dict[str, Projection] = {
     "frame": "perspective",
@@ -349,32 +331,37 @@ def kind_of(sensor: Element) -> str:
 def lens_of(path: Path, sensor: Element, image: str) -> tuple[Lens, tuple[PcfixWarning, ...]]:
     """Return the adjusted calibration, else the initial one, else the data sheet; and notes."""
     label, found = name_of(sensor), _calibration(sensor)
-    size = None if found is None else _resolution(path, label, found)
-    size = size or _resolution(path, label, sensor)
-    pixel_mm, focal_mm = (_property(path, sensor, n) for n in ("pixel_width", "focal_length"))
+    sizes = [one.find("resolution") for one in (found, sensor) if one is not None]
+    resolution = next((one for one in sizes if one is not None), None)
+    stated = {entry.get("name"): entry.get("value") for entry in sensor.iterfind("property")}
+    pixel_mm, focal_mm = (
+        number(path, f"sensor {label}, {name}", stated.get(name, "0"))
+        for name in ("pixel_width", "focal_length")
+    )
     notes = []
-    if found is not None and size is not None:
-        lens = _lens_of_calibration(path, label, kind_of(sensor), found, size)
-        lens = replace(lens, pixel_size_mm=pixel_mm)
+    if resolution is not None and (found is not None or min(pixel_mm, focal_mm) > 0.0):
+        sides = (resolution.get(side) for side in ("width", "height"))
+        width, height = (number(path, f"sensor {label}, resolution", side) for side in sides)
+    else:
+        sentence = f"sensor {label} of {image} has no calibration or no size. Align the images."
+        raise bad_file(path, "cameras.no_calibration", sentence, sensor=label)
+    if found is not None:
+        lens = _lens_of_calibration(path, label, kind_of(sensor), found, (width, height))
         if coefficients := found.findtext("corrections/coeffs"):
             where, count = f"sensor {label}, corrections", len(coefficients.split())
             rms_px = float(np.linalg.norm(numbers(path, where, coefficients, count)) / 2.0**0.5)
             sentence = f"the additional corrections of {label} are ignored ({rms_px:.2f} px rms)."
             notes.append(note(path, "cameras.corrections", sentence, sensor=label, rms_px=rms_px))
-    elif found is None and size is not None and focal_mm is not None and pixel_mm is not None:
+    else:
         given = {"f": focal_mm / pixel_mm}  # what Metashape itself starts from
-        lens = lens_by_name(given, *size, projection=PROJECTIONS[kind_of(sensor)], sensor=label)
-        lens = replace(lens, pixel_size_mm=pixel_mm)
+        projection = PROJECTIONS[kind_of(sensor)]
+        lens = lens_by_name(given, width, height, projection=projection, sensor=label)
         sentence = f"sensor {label} has no calibration; the lens of its data sheet is used."
         notes.append(note(path, "cameras.data_sheet_lens", sentence, sensor=label))
-    else:
-        sentence = f"sensor {label} of {image} has no calibration or no size. Align the images."
-        raise bad_file(path, "cameras.no_calibration", sentence, sensor=label)
-    shutter = [p for p in sensor.iterfind("property") if p.get("name") == "rolling_shutter"]
-    if any((p.get("value") or "0").lower() not in ("0", "false", "disabled") for p in shutter):
+    if (stated.get("rolling_shutter") or "0").lower() not in ("0", "false", "disabled"):
         sentence = f"the rolling shutter of sensor {label} is ignored; each image has one pose."
         notes.append(note(path, "cameras.rolling_shutter", sentence, sensor=label))
-    return lens, tuple(notes)
+    return replace(lens, pixel_size_mm=pixel_mm if pixel_mm > 0.0 else None), tuple(notes)
 
 
 def _calibration(sensor: Element) -> Element | None:
@@ -382,21 +369,6 @@ def _calibration(sensor: Element) -> Element | None:
     found = sensor.findall("calibration")
     chosen = [one for one in found if one.get("class") == "adjusted"] or found
     return chosen[-1] if chosen else None
-
-
-def _resolution(path: Path, label: str, element: Element) -> tuple[float, float] | None:
-    found = element.find("resolution")
-    if found is None:
-        return None
-    where = f"sensor {label}, resolution"
-    return number(path, where, found.get("width")), number(path, where, found.get("height"))
-
-
-def _property(path: Path, sensor: Element, name: str) -> float | None:
-    """Return a positive property of a sensor, or None."""
-    text = next((p.get("value") for p in sensor.iterfind("property") if p.get("name") == name), "0")
-    value = number(path, f"sensor {name_of(sensor)}, {name}", text)
-    return value if value > 0.0 else None
 
 
 def gnss_positions(
@@ -411,10 +383,7 @@ def gnss_positions(
     given = [image.element.find("reference") for image in images]
     ticked = [None if r is None or r.get("enabled") == "false" else r for r in given]
     used = given if all(reference is None for reference in ticked) else ticked
-    settings = {
-        (entry.get("name") or "").replace("/", "_"): entry.get("value") or ""
-        for entry in chunk.element.iterfind("settings/property")
-    }
+    settings = {name.replace("/", "_"): value for name, value in chunk.settings.items()}
     start = spreads(path, "settings of the chunk", settings, DEFAULTS, np.full(3, np.nan))
     xyz, sigma = np.full((2, len(used), 3), np.nan)
     for i, (image, reference) in enumerate(zip(images, used, strict=True)):
@@ -439,10 +408,8 @@ def gnss_positions(
     for sensor in dict.fromkeys(image.sensor for image in images if image.sensor is not None):
         antenna = text_of(sensor, "antenna/location").split()
         for shift in sensor.iterfind("antenna/reference"):
-            antenna += [
-                *(shift.get(axis) or "0" for axis in "xyz"),
-                *shift.get("location", "").split(),
-            ]
+            antenna += [shift.get(axis) or "0" for axis in "xyz"]
+            antenna += shift.get("location", "").split()
         if any(number(path, "GNSS antenna", one) for one in antenna):
             label = name_of(sensor)
             sentence = f"the GNSS positions are those of the antenna (sensor {label}), not offset."
@@ -478,7 +445,7 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
         row_of = {image.id: i for i, image in enumerate(block.images)}
         marks = [mark for mark in documents.measured_marks(frame) if mark[1] in row_of]
         names = {name: i for i, name in enumerate(dict.fromkeys(name for name, _, _ in marks))}
-        markers = Seen(
+        markers = checks.Seen(
             np.full((len(names), 3), np.nan),
             np.array([names[name] for name, _, _ in marks], np.int64),
             np.array([row_of[camera] for _, camera, _ in marks], np.int64),
@@ -486,11 +453,12 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
         )
         seen = [*_tie_points(frame, block), markers]
     if not any(len(part.point) for part in seen):
-        raise no_tie_points(chunk.path, "only a project (.psx with its folder) or markers have any")
-    return gathered(*seen)
+        why = "only a project (.psx with its folder) or markers have any"
+        raise checks.no_tie_points(chunk.path, why)
+    return checks.tie_points(*seen)
 
 
-def _tie_points(frame: Document, block: Block) -> Iterator[Seen]:
+def _tie_points(frame: Document, block: Block) -> Iterator[checks.Seen]:
     """Yield the points of every component that has a place; their archive may be left out."""
     clouds = (*frame.root.iterfind("point_cloud"), *frame.root.iterfind("tie_points"))
     found = [
@@ -503,7 +471,7 @@ def _tie_points(frame: Document, block: Block) -> Iterator[Seen]:
         return
     listed = document.root.iterfind("projections")
     files = {entry.get("camera_id") or "": entry.get("path") or "" for entry in listed}
-    with open_archive(document.path) as archive:
+    with checks.open_archive(document.path) as archive:
         for points in document.root.iterfind("points"):
             component = points.get("component_id")
             rows = [
@@ -517,10 +485,11 @@ def _tie_points(frame: Document, block: Block) -> Iterator[Seen]:
             vertices, place = _vertices(archive, points.get("path"), POINTS), block.places[rows[0]]
             xyz = _columns(vertices, "xyz") @ place[:3, :3].T + place[:3, 3]
             marks = [_vertices(archive, files[block.images[row].id], MARKS) for row in rows]
-            tracks_of = np.concatenate([one["id"].astype(np.int64) for one in marks])
+            tracks = np.concatenate([one["id"].astype(np.int64) for one in marks])
+            point = checks.rows_of(tracks, vertices["id"].astype(np.int64))
             camera = np.repeat(rows, [len(one) for one in marks])
             uv = np.concatenate([_columns(one, "xy") for one in marks])
-            yield Seen(xyz, rows_of(tracks_of, vertices["id"].astype(np.int64)), camera, uv)
+            yield checks.Seen(xyz, point, camera, uv)
 
 
 def _columns(vertices: np.ndarray, names: str) -> FloatArray:
@@ -529,7 +498,7 @@ def _columns(vertices: np.ndarray, names: str) -> FloatArray:
 
 def _vertices(archive: ZipFile, name: str | None, needed: tuple[str, ...]) -> np.ndarray:
     """Return the vertices of a binary PLY in an archive, with the properties that are needed."""
-    where, data = f"{archive.filename}: {name}", unpacked(archive, name or "")
+    where, data = f"{archive.filename}: {name}", checks.unpacked(archive, name or "")
     header = parse_header(where, data)
     kinds = [(p.name, header.order + p.item) for p in header.properties if not p.length]
     if not header.order or header.skipped or not {*needed} <= dict(kinds).keys():

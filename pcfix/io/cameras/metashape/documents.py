@@ -13,13 +13,11 @@ from xml.etree.ElementTree import Element
 
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import ZIP_MAGIC, Source, damaged, note, number, read_xml, reading
+from pcfix.io.cameras.checks import ZIP_MAGIC, Source, damaged, note, number, read_xml
 
 ROOT = re.compile(r"\s*(?:<\?.*?\?>\s*|<!--.*?-->\s*)*<(\w+)", re.DOTALL)
 OF_CHUNKS = re.compile(r"<chunks?\b|\bpath=")
 INSIDE = {"document": OF_CHUNKS, "collection": OF_CHUNKS, "chunk": re.compile(r"<sensors\b")}
-MOST_BYTES = 2**30
-"""Largest document or table of points that is unpacked from an archive."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +50,12 @@ class Chunk(NamedTuple):
     def element(self) -> Element:
         """The ``chunk`` element."""
         return self.document.root
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """The settings of the chunk by their names."""
+        entries = self.element.iterfind("settings/property")
+        return {entry.get("name") or "": entry.get("value") or "" for entry in entries}
 
     @property
     def frame(self) -> Document | None:
@@ -144,19 +148,5 @@ def _software(chunk: Element, top: Element) -> str:
 
 def read_entry(path: Path) -> Document:
     """Return the document in an archive."""
-    with open_archive(path) as archive:
-        return Document(read_xml(path, io.BytesIO(unpacked(archive, "doc.xml"))), path)
-
-
-def open_archive(path: Path) -> zipfile.ZipFile:
-    """Open an archive."""
-    with reading(path):
-        return zipfile.ZipFile(path)
-
-
-def unpacked(archive: zipfile.ZipFile, name: str) -> bytes:
-    """Return the content of an entry."""
-    with reading(archive.filename):
-        if archive.getinfo(name).file_size > MOST_BYTES:
-            raise damaged(archive.filename, f"{name} unpacks to more than 1 GB")
-        return archive.read(name)
+    with checks.open_archive(path) as archive:
+        return Document(read_xml(path, io.BytesIO(checks.unpacked(archive, "doc.xml"))), path)

@@ -33,25 +33,23 @@ its f, px, py and the order of t1, t2 are those of AliceVision's reader of the s
 
 from __future__ import annotations
 
-import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.errors import InputError, PcfixWarning, bad_file
+from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io import tables
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import Angles, Source, note
 from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.io.cameras.table.sensor import DISTORTION, FILM_MM, read_frame, read_sensor
 from pcfix.io.crs import shortened
+from pcfix.io.tables import Table
 from pcfix.lens import rotations
-from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens
+from pcfix.model import Cameras, FloatArray, GnssPositions, Lens
 
 SPELLINGS: dict[str, tuple[str, ...]] = {
     "label": (
@@ -86,10 +84,8 @@ _OWN_NAMES = (
 SPELLINGS |= {name: (name,) for name in _OWN_NAMES}
 POSITION = {"label", "x", "y", "z", "longitude", "latitude", "tx", "ty", "tz"}
 POSITION |= {"x_est", "y_est", "z_est"}
-EXIF = ("gpslongitude", "gpslatitude", "gpsaltitude")
 MANY = ("label", *(f"sigma_{axis}" for axis in "xyz"))  # the first spelling counts
 
-CRS_COMMENT = re.compile(r"^#\s*(?:coordinatesystem|crs)\s*[:=]\s*(.+)$", re.IGNORECASE)
 _FARTHEST_HEADER = 20
 
 
@@ -101,14 +97,14 @@ def recognises(source: Source) -> bool:
     lines = text.splitlines()
     if lines[0].lower().startswith("# coordinatesystem:"):  # it may fill the head
         return True
-    return is_geo(lines) or any(is_header(header.names) for header in headers(lines))
+    return is_geo(lines) or find_header(lines) is not None
 
 
 def read(source: Source) -> Cameras:
     """Read a table; see `pcfix.read_cameras`."""
     columns = open_table(source.path)
     suffix = "_est" if axes(columns.place, "_est") else ""
-    by_gnss = any(name in EXIF for name in columns.table.header)  # measured, not adjusted
+    by_gnss = any(name in tables.EXIF for name in columns.header)  # measured, not adjusted
     by_gnss |= columns.has("sigma_x") and not suffix
     unposed = tuple[str, ...]()
     if suffix or by_gnss:  # else a position that is not there is a mistake
@@ -146,51 +142,49 @@ GEO = ("label", "x", "y", "z", "yaw", "pitch", "roll", "accuracy_horz", "accurac
 _GEO_CRS = re.compile(r"(EPSG:\d+|\+proj=.+|WGS84 UTM \d\d?\s*[NS])\s*", re.IGNORECASE)
 
 
-def open_table(path: Path) -> Columns:
+def open_table(path: Path) -> Table:
     """Read a table with a header, or ODM's geo.txt, which has none."""
     lines = tables.read_lines(path)
     if not is_geo(lines):
         return read_columns(path)
     split = [(i, line.split()) for i, line in enumerate(lines[1:], start=2)]
     rows = [[*fields, *[""] * len(GEO)][: len(GEO)] for _, fields in split if fields]
-    table = tables.Table(path, list(GEO), rows, [i for i, fields in split if fields])
+    lines_of = [i for i, fields in split if fields]
     place = {name: GEO.index(name) for name in ("label", "x", "y", "z")}
     place |= {"sigma_x": 7, "sigma_y": 7, "sigma_z": 8}  # its angles may be 0 for unknown
     crs = checks.utm_as_code(lines[0].strip())
-    return Columns(table, place, [""] * len(GEO), after_hash=False, crs=crs)
+    return Table(path, list(GEO), rows, lines_of, place, [""] * len(GEO), crs=crs)
 
 
-def gnss_positions(columns: Columns) -> GnssPositions | None:
+def gnss_positions(columns: Table) -> GnssPositions | None:
     """Return the positions by GNSS, or None where only adjusted ones are there."""
     if axes(columns.place) is None:
         return None
     xyz = centres(columns)
     if columns.has("enable"):
-        off = [text == "0" for text in columns.table.column(columns.name("enable"))]
+        off = [text == "0" for text in columns.column("enable")]
         xyz[off] = np.nan
     sigma = columns.where_there(("sigma_x", "sigma_y", "sigma_z"))
     return GnssPositions(xyz, sigma, crs(columns)[0])
 
 
-class Header(NamedTuple):
-    """A line that may be a header: its number from 0, names, their units, whether a comment."""
+def find_header(lines: Sequence[str]) -> tuple[int, list[str], list[str], bool] | None:
+    """Return the number of the header from 0, its names and units, and whether it is a comment.
 
-    at: int
-    names: list[str]
-    units: list[str]
-    comment: bool
-
-
-def headers(lines: Sequence[str]) -> Iterator[Header]:
-    """Yield the lines that may be a header."""
+    It has at least two of the names that every table of cameras has, and is the last such comment,
+    or the first line that is none.
+    """
+    found = None
     for i, line in enumerate(lines[:_FARTHEST_HEADER]):
-        comment = line.lstrip("\"' ").startswith("#")
-        text = line.strip().lstrip("#").strip() if comment else line.strip()
-        if text and not CRS_COMMENT.match(line):
+        is_comment = line.lstrip("\"' ").startswith("#")
+        text = line.strip().lstrip("#").strip() if is_comment else line.strip()
+        if text and not tables.CRS_COMMENT.match(line):
             names, units = zip(*map(_split_unit, tables.split_header(text)[0]), strict=True)
-            yield Header(i, [*names], [*units], comment)
-            if not comment:
-                return
+            if len(POSITION & tables.places(names, SPELLINGS).keys()) >= 2:
+                found = i, [*names], [*units], is_comment
+            if not is_comment:
+                break
+    return found
 
 
 def axes(place: Iterable[str], suffix: str = "") -> tuple[str, str, str] | None:
@@ -200,11 +194,6 @@ def axes(place: Iterable[str], suffix: str = "") -> tuple[str, str, str] | None:
         if {*three} <= {*place}:
             return three
     return None
-
-
-def is_header(names: Sequence[str]) -> bool:
-    """Whether at least two of the names that every table of cameras has are among these."""
-    return len(POSITION & tables.places(names, SPELLINGS).keys()) >= 2
 
 
 def _split_unit(name: str) -> tuple[str, str]:
@@ -222,103 +211,14 @@ def _split_unit(name: str) -> tuple[str, str]:
 _PLAIN = {spelling for spellings in SPELLINGS.values() for spelling in spellings}
 
 
-DEGREES = {
-    **dict.fromkeys(("", "deg", "degree", "degrees", "°"), 1.0),
-    **dict.fromkeys(("gon", "gons", "grad", "grads"), 0.9),
-    **dict.fromkeys(("rad", "radian", "radians"), 180.0 / np.pi),
-}
-METRES = dict.fromkeys(("", "m", "metre", "metres", "meter", "meters"), 1.0)
-LENGTHS = ("x", "y", "z", "sigma_x", "sigma_y", "sigma_z")
-
-
-@dataclass(frozen=True)
-class Columns:
-    """A table whose columns are known; its header has their names, lower case, without units.
-
-    `place` leads from what a column is, a key of `SPELLINGS`, to its number; `unit` is that of each
-    column as the header has it; the header is a comment where `after_hash`; `crs` is what a comment
-    says.
-    """
-
-    table: tables.Table
-    place: dict[str, int]
-    unit: list[str]
-    after_hash: bool
-    crs: str | None
-
-    @property
-    def path(self) -> Path:
-        """The file."""
-        return self.table.path
-
-    @cached_property
-    def labels(self) -> list[str]:
-        """The names of the images, none empty."""
-        labels = self.table.column(self.name("label"))
-        if "" in labels:
-            line = self.table.line[labels.index("")]
-            sentence = f"line {line}: the image has no name. Give it one."
-            raise bad_file(self.path, "table.no_label", sentence, line=line)
-        if self.name("label") == "sourcefile":
-            return [re.split(r"[\\/]", label)[-1] for label in labels]
-        return labels
-
-    def take(self, rows: IntArray) -> Columns:
-        """Return the columns with some of their rows."""
-        lines = [self.table.line[i] for i in rows]
-        table = self.table._replace(rows=[self.table.rows[i] for i in rows], line=lines)
-        return replace(self, table=table)
-
-    def has(self, *roles: str) -> bool:
-        """Whether all these are there."""
-        return all(role in self.place for role in roles)
-
-    def name(self, role: str) -> str:
-        """Return what the file calls it."""
-        return self.table.header[self.place[role]]
-
-    def of(self, roles: Iterable[str]) -> FloatArray:
-        """Return columns of finite numbers, metres and degrees, shape (k, number of roles)."""
-        return np.column_stack([self._numbers(role, needed=True) for role in roles])
-
-    def where_there(self, roles: Iterable[str]) -> FloatArray:
-        """Return the same with NaN for empty fields and for columns that are not there."""
-        return np.column_stack([self._numbers(role, needed=False) for role in roles])
-
-    def error(self, row: int, code: str, sentence: str, **values: Any) -> InputError:
-        """Return an error that names file, line and image."""
-        where = f"line {self.table.line[row]} (image {self.labels[row]})"
-        return bad_file(self.path, code, f"{where}: {sentence}", **values)
-
-    def _numbers(self, role: str, *, needed: bool) -> FloatArray:
-        if role not in self.place:
-            return np.full(len(self.table.rows), np.nan)
-        texts = [row[self.place[role]] for row in self.table.rows]
-        read = exif_number if self.name(role) in EXIF else tables.number
-        values = np.array([read(text) for text in texts])
-        for i in np.flatnonzero(~np.isfinite(values)):
-            if needed or texts[i]:
-                name, line = self.name(role), self.table.line[i]
-                sentence = f"column {name}: '{texts[i]}' is not a finite number. Correct it."
-                raise self.error(int(i), "table.number", sentence, line=line, value=texts[i])
-        base, unit = role.removesuffix("_est"), self.unit[self.place[role]]
-        if base not in (*LENGTHS, *POSE):
-            return values
-        known, wanted = (METRES, "metres") if base in LENGTHS else (DEGREES, "degrees")
-        if unit not in known:
-            sentence = f"column {self.name(role)} is in '{unit}'. Give {wanted}."
-            raise bad_file(self.path, "table.unit", sentence, value=unit)
-        return values * known[unit]
-
-
-def read_columns(path: Path) -> Columns:
+def read_columns(path: Path) -> Table:
     """Read a table with a header line, which may be a comment."""
     lines = tables.read_lines(path)
-    found = [header for header in headers(lines) if is_header(header.names)]
-    if not found:
+    found = find_header(lines)
+    if found is None:
         sentence = "no line names the columns, for example label,x,y,z,omega,phi,kappa."
         raise bad_file(path, "table.no_header", sentence)
-    at, names, unit, comment = found[-1]
+    at, names, unit, comment = found
     place = tables.places(names, SPELLINGS)
     for role, spellings in SPELLINGS.items():  # a column with the role's own name counts
         alike = [name for name in names if name in spellings]
@@ -335,25 +235,13 @@ def read_columns(path: Path) -> Columns:
     comments = comment or any(line.startswith("#") for line in lines[:at])
     below = next((line for line in lines[at + 1 :] if line.strip() and line[0] != "#"), "")
     delimiter = tables.split_header((below if comment else lines[at]).strip())[1]
-    table = tables.table_below(path, lines, names, delimiter, at=at, comments=comments)
-    crs = next(
-        (match[1].strip() for line in lines[:at] if (match := CRS_COMMENT.match(line))), None
+    table = tables.table_below(
+        path, lines, names, delimiter, SPELLINGS, units=unit, at=at, comments=comments
     )
-    return Columns(table, place, unit, comment, crs)
+    return replace(table, after_hash=comment, crs=tables.stated_crs(lines[:at]))
 
 
-def exif_number(text: str) -> float:
-    """Return the number in what exiftool writes: 24 deg 40' 48.5" S, 86.5 m Below Sea Level."""
-    parts = [tables.number(part) for part in re.findall(r"[\d.]+", text)]
-    if "deg" not in text and "Sea Level" not in text:
-        return tables.number(text)
-    if not 1 <= len(parts) <= 3:
-        return np.nan
-    value = math.fsum(part / 60.0**i for i, part in enumerate(parts))
-    return -value if text.endswith(("S", "W")) or "Below" in text else value
-
-
-def centres(columns: Columns, suffix: str = "", *, needed: bool = False) -> FloatArray:
+def centres(columns: Table, suffix: str = "", *, needed: bool = False) -> FloatArray:
     """Return positions, shape (k, 3), NaN for rows without when they are not `needed`."""
     from pyproj import CRS
 
@@ -363,7 +251,7 @@ def centres(columns: Columns, suffix: str = "", *, needed: bool = False) -> Floa
     xyz = columns.of(three) if needed else columns.where_there(three)
     for i, side in enumerate(("longitude_ref", "latitude_ref")):
         if columns.has(side):
-            texts = columns.table.column(columns.name(side))
+            texts = columns.column(side)
             beyond = [text[:1].upper() in ("S", "W") for text in texts]
             xyz[beyond, i] = -np.abs(xyz[beyond, i])
     system = crs(columns)[0] or "local"
@@ -377,7 +265,7 @@ def centres(columns: Columns, suffix: str = "", *, needed: bool = False) -> Floa
     return xyz
 
 
-def crs(columns: Columns) -> tuple[str | None, tuple[PcfixWarning, ...]]:
+def crs(columns: Table) -> tuple[str | None, tuple[PcfixWarning, ...]]:
     """Return the CRS that a table states or implies, and notes on it.
 
     Longitude and latitude without more are those of WGS 84. Heights then are ellipsoidal only
@@ -418,7 +306,7 @@ LOOKS_DOWN_DEG = 80.0
 """Largest tilt from the vertical of a camera that looks at the ground."""
 
 
-def _rotations(columns: Columns, angles: Angles | None, suffix: str = "") -> FloatArray | None:
+def _rotations(columns: Table, angles: Angles | None, suffix: str = "") -> FloatArray | None:
     """Return world to camera rotations, or None where the table has nothing that turns.
 
     `angles` is what the user says that they are, `suffix` is ``_est`` for adjusted values.
@@ -428,7 +316,7 @@ def _rotations(columns: Columns, angles: Angles | None, suffix: str = "") -> Flo
         there = [role for role in kind if columns.has(role)]
         missing = [role for role in kind if not columns.has(role)]
         if there and missing:
-            tables.check_columns(columns.path, columns.table.header, kind, missing)
+            tables.check_columns(columns.path, columns.header, kind, missing)
     if angles is not None:
         roles, convert = {
             "omega-phi-kappa": (opk, rotations.from_omega_phi_kappa),
@@ -436,7 +324,7 @@ def _rotations(columns: Columns, angles: Angles | None, suffix: str = "") -> Flo
             "aircraft": (ypr, rotations.from_aircraft),
         }[angles]
         missing = [role for role in roles if not columns.has(role)]
-        tables.check_columns(columns.path, columns.table.header, roles, missing)
+        tables.check_columns(columns.path, columns.header, roles, missing)
         return convert(*columns.of(roles).T)
     if columns.has(*opk):
         place = columns.place
@@ -461,7 +349,7 @@ def _rotations(columns: Columns, angles: Angles | None, suffix: str = "") -> Flo
     return _from_yaw_pitch_roll(columns, ypr) if columns.has(*ypr) else None
 
 
-def read_lenses(columns: Columns, sensor: Path | None) -> tuple[Lens, ...]:
+def read_lenses(columns: Table, sensor: Path | None) -> tuple[Lens, ...]:
     """Return the lens of each row: that of the sensor, or RealityCapture's own columns."""
     own = columns.has("f", "px", "py")
     path = sensor or columns.path.with_name("sensor.csv")
@@ -483,7 +371,7 @@ def read_lenses(columns: Columns, sensor: Path | None) -> tuple[Lens, ...]:
     return tuple(lenses)
 
 
-def _from_matrix(columns: Columns) -> FloatArray:
+def _from_matrix(columns: Table) -> FloatArray:
     """Return rotations from r11 ... r33, to axes either y up, z back or y down, z forward.
 
     Both turn world to camera. Which one it is shows where the cameras look: at the ground.
@@ -497,7 +385,7 @@ def _from_matrix(columns: Columns) -> FloatArray:
     return rotations.from_photogrammetric(found) if back_is_up.all() else found
 
 
-def _from_yaw_pitch_roll(columns: Columns, ypr: Sequence[str]) -> FloatArray:
+def _from_yaw_pitch_roll(columns: Table, ypr: Sequence[str]) -> FloatArray:
     """Return rotations from angles of the view; what the header cannot say, the view must.
 
     Refused are angles that are more likely those of a gimbal, which are -90 straight down.

@@ -22,7 +22,7 @@ from pcfix.io.cameras.checks import write_new
 from pcfix.io.cameras.lenses import LensModel, lens_by_name, model_of
 from pcfix.io.crs import is_topocentric
 from pcfix.io.files import check_input
-from pcfix.io.tables import read_lines, read_table, split_header
+from pcfix.io.tables import Table, check_columns, read_lines, read_table, split_header
 from pcfix.model import Cameras, Lens
 from pcfix.options.declare import File
 
@@ -50,18 +50,19 @@ def read_sensor(path: Path) -> Lens:
         width_px, height_px and, where known, OpenCV's cx, cy (pixels from the upper left corner
         of the image), k1 ... k6, p1, p2.
     """
-    if _is_xml(path):
+    table = _table(path)
+    if table is None:
         from pcfix.io.cameras.metashape import read_calibration
 
         return read_calibration(path)
-    columns = PIXELS if _column_names(path) >= set(PIXELS) else MILLIMETRES
-    table = read_table(path, columns)
+    columns = PIXELS if table.has(*PIXELS) else MILLIMETRES
+    check_columns(path, table.header, columns, [one for one in columns if not table.has(one)])
     if len(table.rows) != 1:
         sentence = f"has {len(table.rows)} rows. Give one row for all images."
         raise bad_file(path, "cameras.sensor_rows", sentence, rows=len(table.rows))
 
     def value(name: str, default: float = 0.0) -> float:
-        return table.numbers(name)[0] if name in table.header else default
+        return float(table.of((name,))[0, 0]) if table.has(name) else default
 
     focal, width, height = map(value, columns)
     given = {"f": focal}
@@ -80,22 +81,23 @@ def read_sensor(path: Path) -> Lens:
 
 def read_frame(path: Path) -> tuple[float, float]:
     """Read the width and height of all images; the lens is not needed."""
-    if not _is_xml(path) and _column_names(path) >= set(FRAME):
-        width, height = (read_table(path, FRAME).numbers(name)[0] for name in FRAME)
+    table = _table(path)
+    if table is not None and table.has(*FRAME):
+        width, height = table.of(FRAME)[0].tolist()
         return width, height
     lens = read_sensor(path)
     return lens.width, lens.height
 
 
-def _is_xml(path: Path) -> bool:
-    """Whether a file is a calibration of Metashape, not a table."""
+def _table(path: Path) -> Table | None:
+    """Return a table of a sensor; None where a file is a calibration of Metashape (XML)."""
     with check_input(path).open("rb") as stream:
-        return stream.read(64).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
-
-
-def _column_names(path: Path) -> set[str]:
-    """Return the names in the first line of a table."""
-    return {*split_header("".join(read_lines(path)[:1]).strip())[0]}
+        is_xml = stream.read(64).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
+    if is_xml:
+        return None
+    names = {*split_header("".join(read_lines(path)[:1]).strip())[0]}
+    known = (columns for columns in (PIXELS, FRAME) if names.issuperset(columns))
+    return read_table(path, next(known, MILLIMETRES))
 
 
 POSE = ("label", "x", "y", "z", "qw", "qx", "qy", "qz")
@@ -115,7 +117,7 @@ def write_table(folder: File, cameras: Cameras) -> None:
     from scipy.spatial.transform import Rotation
 
     target = Path(folder)
-    _, lenses = checks.block_to_write(target, cameras, lambda _: True)
+    rotations, lenses = checks.block_to_write(target, cameras, lambda _: True)
     if cameras.crs is not None and is_topocentric(cameras.crs):
         sentence = f"a table cannot hold the axes {cameras.crs}. Use a projected CRS."
         raise bad_file(target, "output.crs", sentence, crs=cameras.crs)
@@ -135,7 +137,7 @@ def write_table(folder: File, cameras: Cameras) -> None:
         frame = (values.pop("f"), given.width, given.height)
         named = {NAMES.get(name, name): value for name, value in values.items()}
         sensor = _row(dict(zip(MILLIMETRES if is_mm else PIXELS, frame, strict=True)) | named)
-    turns = Rotation.from_matrix(np.asarray(cameras.rotations)).as_quat(canonical=True)
+    turns = Rotation.from_matrix(rotations).as_quat(canonical=True)
     numbers = np.column_stack([cameras.centres, np.roll(turns, 1, axis=1)]).tolist()
     stream = io.StringIO()
     if cameras.crs is not None and cameras.crs.strip().lower() != "local":
