@@ -32,7 +32,6 @@ from pcfix.lens.algebra import (
     column_of,
     cross,
     dot,
-    minus,
     normal_of,
     plus,
     scaled,
@@ -41,9 +40,9 @@ from pcfix.lens.algebra import (
     vector,
 )
 from pcfix.lens.formulas import distorted, jacobian, undistorted
-from pcfix.lens.imaging import image_and_gradients, image_of, in_plane
+from pcfix.lens.imaging import image_and_gradients, in_plane
 from pcfix.model import BoolArray, FloatArray, IntArray
-from pcfix.port.light import BY_PORT, FLAT, KIND, SIZE, X, light_through, through_port
+from pcfix.port.light import BY_PORT, FLAT, KIND, SIZE, X, through_port
 from pcfix.refract.rays import direction, lay, light_and_gradients, light_path, plane_at, settle
 
 if TYPE_CHECKING:
@@ -284,26 +283,10 @@ def _set_port(port: FloatArray, water: FloatArray, given: Given) -> None:
 
 
 @device
-def image(state: State, given: Given, p: int, c: int, work: Workspace) -> tuple[float, float]:
-    """Return the image of point p in camera c; NaN if there is none."""
-    q, centre, water = vector(state.xyz[p]), vector(state.centres[c]), state.water
-    w = minus(q, centre)
-    may_refract = given.port.size == 0 and given.wet[p] and given.has_water
-    if may_refract and _set_plane(work, water, given, q, centre):
-        normal = vector(work.plane)
-        w = direction(light_path(q, centre, normal, work.plane[3], water[INDEX]), normal)
-    x = times(state.rotations[c], w)
-    if given.port.size:
-        _set_port(work.port, water, given)
-        x = light_through(work.port, water[INDEX], *x)
-    return image_of(state.lenses[given.lens_row[c]], *x)
-
-
-@device
 def image_and_all_gradients(
     state: State, given: Given, p: int, c: int, work: Workspace, out: FloatArray
 ) -> tuple[float, float]:
-    """Return the image of point p in camera c, and fill in its derivatives.
+    """Return the image of point p in camera c, NaN if there is none, and fill in its derivatives.
 
     `out`, shape (2, `WIDTH`), has the derivatives of u and v by omega, C, Q, and a, b, c, n; by
     d, e, f if the water is curved, and by the parameters of a port if there is one.

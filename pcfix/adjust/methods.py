@@ -57,24 +57,15 @@ _REMEDY = (
 
 def unknowns_of(rules: AdjustRules, lens: tuple[str, ...]) -> Unknowns:
     """Return what is free, with these lens parameters."""
-
-    def sigma_of(name: str, stated: float | None = None) -> float:
-        """Return a standard deviation: zero fixes a parameter, infinity frees it."""
-        if stated is None:
-            return np.inf if name in rules.free else 0.0
-        return stated
-
     tilt = None if rules.sigma_tilt is None else float(np.tan(np.radians(rules.sigma_tilt)))
+    stated = {"level": rules.sigma_level, "tilt": tilt, "index": rules.sigma_index}
+    surface = dict.fromkeys(rules.free, np.inf)
+    surface |= {name: sigma for name, sigma in stated.items() if sigma is not None}
     return Unknowns(
         poses=rules.poses,
         fixed_images=rules.fixed_images,
         lens=lens,
-        level_sigma_m=sigma_of("level", rules.sigma_level),
-        tilt_sigma=sigma_of("tilt", tilt),
-        index_sigma=sigma_of("index", rules.sigma_index),
-        shape_sigma=sigma_of("shape"),
-        distance_sigma_m=sigma_of("distance"),
-        centre_sigma_m=sigma_of("centre"),
+        surface=surface,
         free_network=rules.datum == "free",
     )
 

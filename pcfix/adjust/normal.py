@@ -32,7 +32,6 @@ from pcfix.adjust.collinearity import (
     State,
     Workspace,
     condition,
-    image,
     image_and_all_gradients,
     lens_gradients,
     workspace,
@@ -226,7 +225,7 @@ def residuals(state: State, given: Given) -> FloatArray:
 def _residuals(span: Span, state: State, given: Given, found: FloatArray, work: Workspace) -> None:
     for p in range(*span):
         for o in range(given.start[p], given.start[p + 1]):
-            u, v = image(state, given, p, given.camera[o], work)
+            u, v = image_and_all_gradients(state, given, p, given.camera[o], work, work.own)
             found[o, 0], found[o, 1] = given.image_xy[o, 0] - u, given.image_xy[o, 1] - v
 
 

@@ -49,10 +49,6 @@ from pcfix.model import Cameras, FloatArray, IntArray, WaterPlane, WaterRaster, 
 DENSE_UP_TO = 12_000
 """Unknowns up to which the whole inverse is computed (1.2 GB)."""
 
-QUICK = 1000
-"""Unknowns up to which LAPACK's dpotri takes longer than a plain inverse: on busy cores its threads
-wait for one another for a third of a second."""
-
 SINGULAR = 1e-13
 """Reciprocal condition of the scaled matrix below which its inverse is meaningless."""
 
@@ -189,7 +185,7 @@ def _pose_blocks(k: int, active: IntArray, columns: Callable[[IntArray], FloatAr
 
 def _inverse(reduced: Reduced) -> FloatArray | None:
     """Return the whole inverse, by Cholesky's method with a unit diagonal; None if singular."""
-    from scipy.linalg import lapack
+    from scipy.linalg import cho_factor, cho_solve
 
     matrix = reduced.matrix
     if matrix.shape[0] == 0:
@@ -201,22 +197,17 @@ def _inverse(reduced: Reduced) -> FloatArray | None:
     scale = 1.0 / np.sqrt(diagonal)
     a *= scale
     a *= scale[:, None]
-    norm = lapack.dlange("1", a)  # type: ignore[call-arg]
-    factor, failed = lapack.dpotrf(a, lower=1, overwrite_a=len(a) > QUICK)
-    if failed:
+    norm = np.linalg.norm(a, 1)
+    try:  # in place where possible, as memory matters
+        factor = cho_factor(a, lower=True, overwrite_a=True)
+    except np.linalg.LinAlgError:
         return None
-    if len(a) <= QUICK:
-        a = np.linalg.inv(a)
-        a = 0.5 * (a + a.T)
-    else:  # in place of the factor, as memory matters
-        a, _ = lapack.dpotri(factor, lower=1, overwrite_c=1)
-        for i in range(1, len(a)):
-            a[:i, i] = a[i, :i]
-    if not norm * lapack.dlange("1", a) * SINGULAR < 1.0:  # type: ignore[call-arg]
+    inverse = np.asarray(cho_solve(factor, np.eye(len(a), order="F"), overwrite_b=True))
+    if not norm * np.linalg.norm(inverse, 1) * SINGULAR < 1.0:
         return None
-    a *= scale
-    a *= scale[:, None]
-    return np.asarray(a)
+    inverse *= scale
+    inverse *= scale[:, None]
+    return inverse
 
 
 # What is known poorly

@@ -126,13 +126,13 @@ def prepare(
     origin = np.round(cameras.centres.mean(axis=0)) if origin is None else origin
     group, groups = sensor_groups(cameras.lenses)
     codes = [usable_codes(cameras.lenses[images[0]], unknowns.lens) for images in groups]
-    if (unknowns.tilt_sigma or unknowns.shape_sigma) and isinstance(water, WaterMesh | WaterRaster):
-        what = "tilt" if unknowns.tilt_sigma else "shape"
-        words = (
-            f"The {what} of the water can be free for a level or plane only, not for a mesh or"
-            " raster."
-        )
-        raise GeometryError("adjust.fixed_surface", words, unknown=what)
+    for what in ("tilt", "shape"):
+        if unknowns.surface.get(what) and isinstance(water, WaterMesh | WaterRaster):
+            words = (
+                f"The {what} of the water can be free for a level or plane only, not for a mesh or"
+                " raster."
+            )
+            raise GeometryError("adjust.fixed_surface", words, unknown=what)
     numbers = surface_numbers(block, origin)
     planes, plane_names, axis, alike = _planes(block, origin, numbers)
     # columns of the shared unknowns: lenses, then surface and planes, then a similarity
@@ -171,7 +171,7 @@ def prepare(
         field=build_field(water) if isinstance(water, WaterRaster) else None,
         origin=origin,
         port=np.zeros(0) if block.port is None else port_coefficients(block.port),
-        curved=unknowns.shape_sigma != 0.0,
+        curved=bool(unknowns.surface.get("shape")),
         first_lens=first_lens,
         code=np.array([code for of_sensor in codes for code in of_sensor], np.int64),
         column=column,
@@ -389,12 +389,12 @@ def _undetermined_motions(problem: Problem) -> list[int]:
 
     A water surface whose level or tilt is not free determines height or tilt of the block.
     """
-    unknowns = problem.unknowns
-    refracts = problem.block.refractive_index != 1.0 or unknowns.index_sigma > 0.0
+    sigma = problem.unknowns.surface
+    refracts = problem.block.refractive_index != 1.0 or sigma.get("index", 0.0) > 0.0
     if not (problem.given.has_water and refracts and problem.block.wet.any()):
         return list(range(7))
-    level = [2] if np.isinf(unknowns.level_sigma_m) else []
-    tilt = [3, 4] if np.isinf(unknowns.tilt_sigma) else []
+    level = [2] if sigma.get("level") == np.inf else []
+    tilt = [3, 4] if sigma.get("tilt") == np.inf else []
     return [0, 1, *level, *tilt, 5, 6]
 
 

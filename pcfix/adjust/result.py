@@ -49,11 +49,11 @@ Source = Literal["tie points", "cloud"]
 Plain = dict[str, Any]
 
 MOST_DEPTH_BINS = 8
-WATER_SIGMAS = (
-    "level_sigma_m", "tilt_sigma", "index_sigma", "shape_sigma", "distance_sigma_m",
-    "centre_sigma_m",
-)  # fmt: skip
-"""Standard deviations among `Unknowns`."""
+SIGMAS = {
+    "level_sigma_m": "level", "tilt_sigma": "tilt", "index_sigma": "index", "shape_sigma": "shape",
+    "distance_sigma_m": "distance", "centre_sigma_m": "centre",
+}  # fmt: skip
+"""Keys of the standard deviations of `Unknowns.surface`."""
 
 
 class ControlRow(NamedTuple):
@@ -263,7 +263,7 @@ def adjustment_dict(adjusted: Adjusted, before: Intersected | None = None) -> Pl
         "port": block.port is not None,
         "unknowns": {
             "lens": u.lens,
-            **{name: getattr(u, name) for name in WATER_SIGMAS},
+            **{key: u.surface.get(name, 0.0) for key, name in SIGMAS.items()},
             "free_network": u.free_network,
             "parallel": () if block.conditions is None else block.conditions.parallel,
         },
@@ -409,7 +409,7 @@ def _water(a: Adjusted) -> Plain | None:
         heights = surface_above(original, a.xyz).height_m
         height_m = float(mean(heights))
         names = names if np.isfinite(heights).any() else ["index"]
-    names += WATER_NAMES[SHAPE:PORT] if a.unknowns.shape_sigma else []
+    names += WATER_NAMES[SHAPE:PORT] if a.unknowns.surface.get("shape") else []
     return {"surface": str(adjusted), **_numbers(a, names, height_m)}
 
 

@@ -11,7 +11,6 @@ from pcfix.adjust.collinearity import (
     SURFACE,
     WIDTH,
     State,
-    image,
     image_and_all_gradients,
     lens_gradients,
     workspace,
@@ -25,7 +24,6 @@ from pcfix.port.shapes import DomePort, FlatPort
 from pcfix.water.surface import build_field
 from tests.utils.compiled import compiled
 
-image = compiled(image)
 image_and_all_gradients = compiled(image_and_all_gradients)
 lens_gradients = compiled(lens_gradients)
 linearise = compiled(linearise)
@@ -82,7 +80,8 @@ def state_of(q, centre, rotation, lens, water):
 
 def at(q, centre, rotation, lens, water, given):
     state = state_of(q, centre, rotation, lens, water)
-    return np.array(image(state, given, 0, 0, workspace(given)))
+    work = workspace(given)
+    return np.array(image_and_all_gradients(state, given, 0, 0, work, work.own))
 
 
 def gradients(q, centre, rotation, lens, water, given):

@@ -91,7 +91,7 @@ def adjusted():
     origin = np.round(before.centres.mean(axis=0))
     gnss = np.array([[0.01, 0.02, 0.03], [0.05, -0.02, 0.09], [np.nan] * 3])
     return Adjusted(
-        make_block(xyz, pinhole(xyz, before), before), Unknowns(level_sigma_m=0.1), after,
+        make_block(xyz, pinhole(xyz, before), before), Unknowns(surface={"level": 0.1}), after,
         WaterPlane(LEVEL + 0.02), 1.34, xyz, residual, used, is_wet, 1.234, 60, rounds,
         "tie points", make_precision(len(xyz)), gnss, control,
         [PcfixWarning("adjust.lens", "something <decided>")], origin,
