@@ -59,7 +59,7 @@ def unknowns_of(rules: AdjustRules, lens: tuple[str, ...]) -> Unknowns:
     """Return what is free, with these lens parameters."""
     tilt = None if rules.sigma_tilt is None else float(np.tan(np.radians(rules.sigma_tilt)))
     stated = {"level": rules.sigma_level, "tilt": tilt, "index": rules.sigma_index}
-    surface = dict.fromkeys(rules.free, np.inf)
+    surface: dict[str, float] = dict.fromkeys(rules.free, np.inf)
     surface |= {name: sigma for name, sigma in stated.items() if sigma is not None}
     return Unknowns(
         poses=rules.poses,
