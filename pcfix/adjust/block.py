@@ -76,18 +76,17 @@ FEW_IMAGES = 5.0
 
 
 class LogRow(NamedTuple):
-    """One step of an adjustment."""
+    """An adjustment after some steps of a round."""
 
     round: int
-    step: int
+    steps: int
     cost: float
-    damping: float
     observations: int
     rms_px: float
 
     def __str__(self) -> str:
         return (
-            f"round {self.round}, step {self.step}, {self.observations:,} observations,"
+            f"round {self.round}, step {self.steps}, {self.observations:,} observations,"
             f" {self.rms_px:.3f} px"
         )
 

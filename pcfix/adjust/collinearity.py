@@ -7,14 +7,7 @@ d x = omega x x. So an image gradient g with respect to x becomes x x g with res
 
 Water of the second order, z = a + b x + c y + d x^2 + e x y + f y^2, refracts at the piercing point
 P as its tangent plane does. As anything changes, P moves along the surface and the tangent plane
-turns with it. With w the direction at the projection centre C, H the height of C above the plane,
-m = (-z_x, -z_y, 1), K the 2 x 2 matrix of second derivatives and G the 3 x 2 derivatives of w by
-the slopes of a plane about P:
-
-    dw = L + G K dp,    dp = H E dw + E dC + w_xy dz / (m.w),    E = (I - w m' / (m.w))_xy
-
-L is dw for a plane that does not turn, dp the horizontal movement of P, and dz the rise of the
-surface at P. Substituted into each other these are two equations for dp.
+turns with it; the derivatives are central differences.
 """
 
 from __future__ import annotations
@@ -32,9 +25,6 @@ from pcfix.lens.algebra import (
     column_of,
     cross,
     dot,
-    normal_of,
-    plus,
-    scaled,
     times,
     transposed_times,
     vector,
@@ -74,7 +64,7 @@ class Given(NamedTuple):
         deviation, zero for observations that do not count; wet : shape (m,), whether a point may
         be under water; lens_row, group : shape (k,), row of the lens table and sensor of cameras.
     Refracting surface
-        has_water; tin, field : a mesh or raster instead of the plane in `State.water`;
+        tin, field : a mesh or raster instead of the plane in `State.water`;
         origin : shape (3,), of the block; port : coefficients of a housing port, empty without
         one; curved : whether d, e, f count.
     Unknowns that many points share, counted from the first of them
@@ -99,7 +89,6 @@ class Given(NamedTuple):
     wet: BoolArray
     lens_row: IntArray
     group: IntArray
-    has_water: bool
     tin: Tin | None
     field: Field | None
     origin: FloatArray
@@ -133,7 +122,7 @@ class Workspace(NamedTuple):
     ahead : shape (3,), the direction that the lens images, camera frame.
     behind_port : shape (3, 8), that direction behind a port, with its derivatives.
     origin : shape (3,), the block's origin, seen from the water level.
-    by_shape : shape (3, 3), derivatives of the light by d, e, f.
+    by_shape : shape (3, 3), derivatives of the light by d, e, f; moved : shape (7,), other water.
     port : shape (7,), the port with its estimated parameters.
     own : shape (2, `WIDTH`), derivatives of an image.
     right, left : shape (most, 2, 9 + g), the weighted rows of a point, and what tests them: the
@@ -148,6 +137,7 @@ class Workspace(NamedTuple):
     behind_port: FloatArray
     origin: FloatArray
     by_shape: FloatArray
+    moved: FloatArray
     port: FloatArray
     own: FloatArray
     right: FloatArray
@@ -161,7 +151,7 @@ class Workspace(NamedTuple):
 def workspace(given: Given) -> Workspace:
     """Return a new workspace."""
     most = int(np.diff(given.start).max(initial=0)) + 1  # one more for a `condition`
-    scratch = [np.zeros(shape) for shape in ((3, 12), 4, 3, (3, 8), 3, (3, 3), 7, (2, WIDTH))]
+    scratch = [np.zeros(shape) for shape in ((3, 12), 4, 3, (3, 8), 3, (3, 3), 7, 7, (2, WIDTH))]
     right = np.zeros((most, 2, SHARED + given.shared))
     left = np.zeros_like(right) if len(given.tests) else right
     r, row, v, rhs = np.zeros((most, 2)), np.zeros(most, np.int64), np.zeros((3, 3)), np.zeros(3)
@@ -176,26 +166,35 @@ STEPS, CLOSE_M = 30, 1e-12
 
 
 @device
-def height_of(water: FloatArray, x: float, y: float) -> Vector:
-    """Return height, dz/dx and dz/dy of the water at x, y."""
+def surface_at(water: FloatArray, given: Given, x: float, y: float) -> Vector:
+    """Return height, dz/dx and dz/dy of the water at x, y; NaN where there is none."""
+    if given.field is not None or given.tin is not None:
+        z, b, c = plane_at(given.tin, given.field, x, y, given.origin)
+        return z + water[0], b, c
     d, e, f = water[SHAPE], water[SHAPE + 1], water[SHAPE + 2]
     z = water[0] + (water[1] + d * x + e * y) * x + (water[2] + f * y) * y
     return z, water[1] + 2.0 * d * x + e * y, water[2] + e * x + 2.0 * f * y
 
 
 @device
-def _curved_plane(plane: FloatArray, water: FloatArray, q: Vector, centre: Vector) -> bool:
-    """Set the plane (N, h) tangent to the water at the piercing point; return if Q is below it."""
-    z, b, c = height_of(water, q[0], q[1])
+def _set_plane(work: Workspace, water: FloatArray, given: Given, q: Vector, centre: Vector) -> bool:
+    """Set the refracting plane (N, h) for light from Q to C; return if Q is below the water."""
+    plane, origin = work.plane, work.origin
+    z, b, c = surface_at(water, given, q[0], q[1])
     if not z > q[2]:
         return False
     lay(plane, q[0], q[1], z, b, c)
-    for _ in range(STEPS):
+    if given.field is not None or given.tin is not None:
+        # a level added to a mesh or raster is an origin that lies lower
+        origin[0], origin[1], origin[2] = vector(given.origin)
+        origin[2] -= water[0]
+        settle(plane, given.tin, given.field, origin, q, centre, water[INDEX])
+    for _ in range(STEPS if given.curved else 0):
         # refract at the tangent plane, then move the plane to where the light pierces it
         normal = vector(plane)
         path = light_path(q, centre, normal, plane[3], water[INDEX])
         x, y, z_plane = beyond(centre, path[2], direction(path, normal))
-        z, b_there, c_there = height_of(water, x, y)
+        z, b_there, c_there = surface_at(water, given, x, y)
         change = abs(z - z_plane) + abs(path[3]) * (abs(b_there - b) + abs(c_there - c))
         lay(plane, x, y, z, b_there, c_there)
         if not change > CLOSE_M:
@@ -204,67 +203,33 @@ def _curved_plane(plane: FloatArray, water: FloatArray, q: Vector, centre: Vecto
     return True
 
 
+DIFFERENCES = (1e-4,) * 7 + (1e-5,) * 3 + (1e-6,) * 3
+"""Steps of Q, C and a in metres, of b, c and n, and of d, e and f in 1/m: the piercing point is
+known to 1e-12 m, so derivatives are good to 1e-7."""
+
+
 @device
 def _curved_gradients(
-    plane: FloatArray, water: FloatArray, centre: Vector, light: FloatArray, shape: FloatArray
+    work: Workspace, water: FloatArray, given: Given, q: Vector, centre: Vector
 ) -> None:
-    """Turn derivatives of light through the tangent plane into those through the curved water.
-
-    `light` is as of `light_and_gradients`; `shape`, (3, 3), is filled with those by d, e, f.
-    """
-    w = column_of(light, 0)
-    up = dot(vector(plane), centre) - plane[3]
-    x, y = centre[0] + up * w[0], centre[1] + up * w[1]  # the piercing point P
-    m = plane[0] / plane[2], plane[1] / plane[2], 1.0
-    steep = dot(m, w)
-    # G: slopes of a plane about P instead of about the origin
-    by_height = column_of(light, 7)
-    by_x = beyond(column_of(light, 8), -x, by_height)
-    by_y = beyond(column_of(light, 9), -y, by_height)
-    for i in range(3):
-        shape[i, 0] = x * x * by_height[i] + 2.0 * x * by_x[i]
-        shape[i, 1] = x * y * by_height[i] + y * by_x[i] + x * by_y[i]
-        shape[i, 2] = y * y * by_height[i] + 2.0 * y * by_y[i]
-    d, e, f = water[SHAPE], water[SHAPE + 1], water[SHAPE + 2]
-    turn_x = plus(scaled(2.0 * d, by_x), scaled(e, by_y))  # G K
-    turn_y = plus(scaled(e, by_x), scaled(2.0 * f, by_y))
-    along_x = beyond((1.0, 0.0, 0.0), -w[0] / steep, m)  # E
-    along_y = beyond((0.0, 1.0, 0.0), -w[1] / steep, m)
-    xx, xy = 1.0 - up * dot(along_x, turn_x), -up * dot(along_x, turn_y)
-    yx, yy = -up * dot(along_y, turn_x), 1.0 - up * dot(along_y, turn_y)
-    det = xx * yy - xy * yx
-    rises = (1.0, x, y, 0.0, x * x, x * y, y * y)  # dz at P, by a, b, c, n, d, e, f
+    """Replace the derivatives of the light through the tangent plane by those of curved water."""
+    moved, plane = work.moved, work.plane
     for column in range(13):
-        block, at = (light, column + 1) if column < 10 else (shape, column - 10)
-        plain = column_of(block, at)
-        rise = 0.0 if column < 6 else rises[column - 6] / steep
-        px, py = up * dot(along_x, plain) + w[0] * rise, up * dot(along_y, plain) + w[1] * rise
-        if 3 <= column < 6:
-            px, py = px + along_x[column - 3], py + along_y[column - 3]
-        dx, dy = (yy * px - xy * py) / det, (xx * py - yx * px) / det
-        for i in range(3):
-            block[i, at] += turn_x[i] * dx + turn_y[i] * dy
-
-
-@device
-def _set_plane(work: Workspace, water: FloatArray, given: Given, q: Vector, centre: Vector) -> bool:
-    """Set the refracting plane (N, h) for light from Q to C; return if Q is below the water."""
-    plane, origin = work.plane, work.origin
-    if given.field is None and given.tin is None:
-        if given.curved:
-            return _curved_plane(plane, water, q, centre)
-        plane[0], plane[1], plane[2] = normal_of(water[1], water[2])
-        plane[3] = plane[2] * water[0]
-        return bool(water[0] + water[1] * q[0] + water[2] * q[1] > q[2])
-    # a level added to a mesh or raster is an origin that lies lower
-    origin[0], origin[1], origin[2] = vector(given.origin)
-    origin[2] -= water[0]
-    z, b, c = plane_at(given.tin, given.field, q[0], q[1], origin)
-    if not z > q[2]:
-        return False
-    lay(plane, q[0], q[1], z, b, c)
-    settle(plane, given.tin, given.field, origin, q, centre, water[INDEX])
-    return True
+        block, at = (work.light, column + 1) if column < 10 else (work.by_shape, column - 10)
+        block[0, at], block[1, at], block[2, at] = 0.0, 0.0, 0.0
+        for sign in (1.0, -1.0):
+            step, by = sign * DIFFERENCES[column], column % 3
+            axis = (1.0 if by == 0 else 0.0, 1.0 if by == 1 else 0.0, 1.0 if by == 2 else 0.0)
+            q_there = beyond(q, step if column < 3 else 0.0, axis)
+            c_there = beyond(centre, step if 3 <= column < 6 else 0.0, axis)
+            for i in range(PORT):  # a, b, c, n, d, e, f
+                moved[i] = water[i] + (step if column == 6 + i else 0.0)
+            _set_plane(work, moved, given, q_there, c_there)
+            normal = vector(plane)
+            path = light_path(q_there, c_there, normal, plane[3], moved[INDEX])
+            light = direction(path, normal)
+            for i in range(3):
+                block[i, at] += 0.5 * light[i] / step
 
 
 @device
@@ -294,13 +259,10 @@ def image_and_all_gradients(
     q, centre = vector(state.xyz[p]), vector(state.centres[c])
     r, water = state.rotations[c], state.water
     light, plane, ahead = work.light, work.plane, work.ahead
-    refracted = given.port.size == 0 and given.wet[p] and given.has_water
-    if refracted:
-        refracted = _set_plane(work, water, given, q, centre)
-    if refracted:
+    if given.wet[p] and _set_plane(work, water, given, q, centre):
         light_and_gradients(q, centre, vector(plane), plane[3], water[INDEX], light)
         if given.curved:
-            _curved_gradients(plane, water, centre, light, work.by_shape)
+            _curved_gradients(work, water, given, q, centre)
     else:
         light[:], work.by_shape[:] = 0.0, 0.0
         for i in range(3):
@@ -421,11 +383,8 @@ def condition(state: State, given: Given, p: int, work: Workspace, at: int) -> b
     if number > 0:
         b, c = numbers[first + 1], numbers[first + 2]
         z = numbers[first] + b * x + c * y
-    elif given.field is None and given.tin is None:
-        z, b, c = height_of(numbers, x, y)
     else:
-        z, b, c = plane_at(given.tin, given.field, x, y, given.origin)
-        z += numbers[0]
+        z, b, c = surface_at(numbers, given, x, y)
     if np.isnan(z):
         return False
     row[:], r[1] = 0.0, 0.0

@@ -121,16 +121,9 @@ def precision_of(
     times = np.ones(6 + g) if factor is None else factor
     variance, u = sigma0 * sigma0, len(active)
     notes: list[PcfixWarning] = []
-    is_fixed = np.isfinite(point_covariances(state, given, active[:0], np.zeros((0, 0)))[:, 0])
-    if not is_fixed.all():
-        loose = int((~is_fixed).sum())
-        words = f"{loose:,} points are not determined by their images and have no covariance."
-        notes.append(PcfixWarning("adjust.loose_points", words, points=loose))
-    inverse, solve_for = None, None
-    if u <= DENSE_UP_TO:
-        inverse = _inverse(reduced)
-    else:
-        solve_for = solver(reduced)
+    inverse = _inverse(reduced) if u <= DENSE_UP_TO else None
+    solve_for = solver(reduced) if u > DENSE_UP_TO else None
+    if u > DENSE_UP_TO:
         words = (
             f"The block has {u:,} unknowns (limit {DENSE_UP_TO:,}), so its points have no"
             " covariances, and the correction cannot use the errors of the poses."
@@ -162,6 +155,10 @@ def precision_of(
         inverse *= each
         inverse *= each[:, None]
         points = variance * point_covariances(state, given, active, inverse)
+        loose = int(np.isnan(points[:, 0]).sum())
+        if loose:
+            words = f"{loose:,} points are not determined by their images and have no covariance."
+            notes.append(PcfixWarning("adjust.loose_points", words, points=loose))
         members = members_of(problem, solution, active, sigma0 * drawn(inverse))
     sigma = np.sqrt(np.diag(of_shared))
     correlation = of_shared / sigma / sigma[:, None]
@@ -331,13 +328,13 @@ class Members:
     shift_m: FloatArray  # (m, k, 3), of the centres, along the same axes
     lens_names: tuple[str, ...]  # length p
     lens: FloatArray  # (m, k, p), added to these parameters
-    water: FloatArray  # (m, 7), or (m, 4) for a plane
+    water: FloatArray  # (m, 7)
 
     def __len__(self) -> int:
         return len(self.turn)
 
-    def rows_of(self, cameras: Cameras) -> IntArray | None:
-        """Return the row of each of some cameras, in any CRS; None for another block."""
+    def aligned(self, cameras: Cameras) -> Members | None:
+        """Return the members in the order of their cameras, in any CRS; None for other cameras."""
         row = {label: i for i, label in enumerate(self.labels)}
         if len(row) < len(self.labels) or sorted(cameras.labels) != sorted(self.labels):
             return None
@@ -352,18 +349,22 @@ class Members:
         # maps differ in scale
         there = there * (here.mean() / max(float(there.mean()), SAME_M))
         is_same = np.abs(focal / self.focal[rows] - 1.0).max() < SAME_FOCAL
-        return rows if is_same and np.abs(there - here).max() < SAME_M else None
+        if not is_same or np.abs(there - here).max() >= SAME_M:
+            return None
+        return Members(
+            cameras.labels, self.centres[rows], self.focal[rows], self.turn[:, rows],
+            self.shift_m[:, rows], self.lens_names, self.lens[:, rows], self.water,
+        )  # fmt: skip
 
-    def cameras(self, member: int, nominal: Cameras, rows: IntArray) -> Cameras:
-        """Return the cameras of a member; `rows` is `rows_of` the nominal ones."""
+    def cameras(self, member: int, nominal: Cameras) -> Cameras:
+        """Return the cameras of a member, given the adjusted ones in the same order."""
         rotations = np.asarray(nominal.rotations)
-        turn, shift = self.turn[member, rows], self.shift_m[member, rows]
-        codes, by = tuple(CODES[name] for name in self.lens_names), self.lens[member, rows]
-        lenses = zip(nominal.lenses or (), by, strict=True)
+        codes = tuple(CODES[name] for name in self.lens_names)
+        lenses = zip(nominal.lenses or (), self.lens[member], strict=True)
         return replace(
             nominal,
-            centres=nominal.centres + np.einsum("kji,kj->ki", rotations, shift),
-            rotations=Rotation.from_rotvec(turn).as_matrix() @ rotations,
+            centres=nominal.centres + np.einsum("kji,kj->ki", rotations, self.shift_m[member]),
+            rotations=Rotation.from_rotvec(self.turn[member]).as_matrix() @ rotations,
             lenses=tuple(moved_lens(lens, codes, add) for lens, add in lenses),
         )
 

@@ -30,7 +30,7 @@ from pcfix.adjust.block import (
     usable_codes,
 )
 from pcfix.adjust.collinearity import SHARED, Given, State, Workspace, condition
-from pcfix.adjust.normal import PLAIN, Rule, cost_of, in_parts, point_steps, residuals
+from pcfix.adjust.normal import UNDAMPED, Rule, cost_of, in_parts, point_steps, residuals
 from pcfix.errors import GeometryError
 from pcfix.kernels import Span, kernel
 from pcfix.lens.imaging import lens_table
@@ -163,10 +163,9 @@ def prepare(
         camera=np.ascontiguousarray(block.camera, np.int64),
         image_xy=np.ascontiguousarray(block.image_xy, np.float64),
         weight=1.0 / np.asarray(block.sigma_px, np.float64),
-        wet=np.ascontiguousarray(block.wet, np.bool_),
+        wet=np.ascontiguousarray(block.wet & (water is not None), np.bool_),
         lens_row=row.astype(np.int64),
         group=group,
-        has_water=water is not None,
         tin=build_tin(water) if isinstance(water, WaterMesh) else None,
         field=build_field(water) if isinstance(water, WaterRaster) else None,
         origin=origin,
@@ -322,7 +321,7 @@ def _curved_raster(problem: Problem, state: State) -> WaterRaster:
 
 def polynomial(water: FloatArray, x: FloatArray | float, y: FloatArray | float) -> FloatArray:
     """Return the height of the water at x, y, block frame."""
-    (a, b, c), (d, e, f) = water[:3], water[SHAPE:PORT] if len(water) > SHAPE else (0.0, 0.0, 0.0)
+    (a, b, c), (d, e, f) = water[:3], water[SHAPE:PORT]
     return np.asarray(a + b * x + c * y + d * x * x + e * x * y + f * y * y)
 
 
@@ -391,7 +390,7 @@ def _undetermined_motions(problem: Problem) -> list[int]:
     """
     sigma = problem.unknowns.surface
     refracts = problem.block.refractive_index != 1.0 or sigma.get("index", 0.0) > 0.0
-    if not (problem.given.has_water and refracts and problem.block.wet.any()):
+    if not (refracts and problem.given.wet.any()):
         return list(range(7))
     level = [2] if sigma.get("level") == np.inf else []
     tilt = [3, 4] if sigma.get("tilt") == np.inf else []
@@ -482,7 +481,7 @@ def intersect_fixed(block: Block) -> Intersected:
     nothing = np.zeros(len(problem.moves))
     state, step = now.state, np.full((len(block.xyz), 3), np.inf)
     for _ in range(STEPS):
-        step = point_steps(state, problem.given, PLAIN, nothing)
+        step = point_steps(state, problem.given, UNDAMPED, nothing)
         state = state._replace(xyz=state.xyz + step)
         if np.nanmax(np.abs(step), initial=0.0) < CLOSE_M:
             break

@@ -32,13 +32,11 @@ from pcfix.adjust.problem import (
     Solution,
     intersect_fixed,
     port_of,
-    prepare,
     solved_cameras,
     surface_distances,
     surface_numbers,
     water_of,
 )
-from pcfix.adjust.solve import solve
 from pcfix.errors import PcfixWarning, plain
 from pcfix.model import BoolArray, Cameras, FloatArray, WaterPlane, WaterSurface
 from pcfix.port.shapes import Port, spec_of
@@ -188,8 +186,7 @@ def _with_check_points(problem: Problem, now: Solution) -> FloatArray:
         refractive_index=float(now.state.water[INDEX]),
         sigma_px=np.where(np.isin(block.owner, rows), 1.0, np.inf),
     )  # fmt: skip
-    part, start = prepare(whole, Unknowns(poses="fixed", lens=()))
-    xyz[rows] = solve(part, start).state.xyz[rows] + part.origin
+    xyz[rows] = intersect_fixed(whole).xyz[rows]
     return xyz
 
 
@@ -284,16 +281,7 @@ def adjustment_dict(adjusted: Adjusted, before: Intersected | None = None) -> Pl
         "gnss": _gnss(a),
         "control": _surveyed([row for row in a.control if row.role == "control"]),
         "check": _surveyed([row for row in a.control if row.role == "check"]),
-        "rounds": [
-            {
-                "round": row.round,
-                "steps": row.step,
-                "cost": row.cost,
-                "observations": row.observations,
-                "rms_px": row.rms_px,
-            }
-            for row in {row.round: row for row in a.rounds}.values()
-        ],
+        "rounds": [row._asdict() for row in {row.round: row for row in a.rounds}.values()],
         "notes": [one.as_dict() for one in {str(one): one for one in notes}.values()],
     }
     return dict(plain(found))

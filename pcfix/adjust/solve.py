@@ -108,7 +108,7 @@ def solve(
         gain = (now.cost - trial.cost) / max(now.cost, least_cost)
         now, up = trial, 2.0
         damping = max(damping / 10.0, LEAST_DAMPING)
-        row = LogRow(number, step + 1, now.cost, damping, *counts_of(problem, now))
+        row = LogRow(number, step + 1, now.cost, *counts_of(problem, now))
         log.append(row)
         if progress is not None:
             progress(row)
