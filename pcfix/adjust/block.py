@@ -6,7 +6,7 @@ cloud. Everything is in one frame, metres, Z up.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
@@ -227,13 +227,10 @@ def sensor_groups(lenses: tuple[Lens, ...]) -> tuple[IntArray, list[list[int]]]:
     distinct = len(set(lenses))
     # several lenses of one sensor, each with enough images for corrections of its own
     is_own = distinct > len(set(sensors)) and len(lenses) / distinct >= FEW_IMAGES
-    rows: dict[object, list[int]] = {}
-    for i, key in enumerate(lenses if is_own else sensors):
-        rows.setdefault(key, []).append(i)
-    group = np.zeros(len(lenses), np.int64)
-    for number, members in enumerate(rows.values()):
-        group[members] = number
-    return group, list(rows.values())
+    keys: Sequence[object] = lenses if is_own else sensors
+    number = {key: i for i, key in enumerate(dict.fromkeys(keys))}
+    group = np.array([number[key] for key in keys], np.int64)
+    return group, [np.flatnonzero(group == i).tolist() for i in range(len(number))]
 
 
 def usable_codes(lens: Lens, names: tuple[str, ...]) -> tuple[int, ...]:

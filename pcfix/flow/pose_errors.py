@@ -33,7 +33,7 @@ SAMPLE_POINTS, BED_POINTS = 20_000, 1000
 
 
 def members_of(path: File | Cameras, cameras: Cameras) -> tuple[Members | None, str]:
-    """Return the members of the adjustment of cameras, if its file is in their folder, and a note."""
+    """Return the members of the adjustment in the folder of its cameras, and a note if unusable."""
     if isinstance(path, Cameras):
         return None, ""
     try:
