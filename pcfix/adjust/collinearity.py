@@ -32,7 +32,7 @@ from pcfix.lens.algebra import (
 from pcfix.lens.formulas import distorted, jacobian, undistorted
 from pcfix.lens.imaging import image_and_gradients, in_plane
 from pcfix.model import BoolArray, FloatArray, IntArray
-from pcfix.port.light import BY_PORT, FLAT, KIND, SIZE, X, through_port
+from pcfix.port.light import BY_PORT, through_port
 from pcfix.refract.rays import direction, lay, light_and_gradients, light_path, plane_at, settle
 
 if TYPE_CHECKING:
@@ -47,6 +47,7 @@ class State(NamedTuple):
     xyz : shape (m, 3), true points.
     water : shape (11 + 3 p,), the parameters of `WATER_NAMES`, then height and two slopes of each
     of p planes.
+    port : shape (7,), coefficients of a housing port with these parameters; empty without one.
     """
 
     centres: FloatArray
@@ -54,6 +55,7 @@ class State(NamedTuple):
     lenses: FloatArray
     xyz: FloatArray
     water: FloatArray
+    port: FloatArray
 
 
 class Given(NamedTuple):
@@ -65,8 +67,7 @@ class Given(NamedTuple):
         be under water; lens_row, group : shape (k,), row of the lens table and sensor of cameras.
     Refracting surface
         tin, field : a mesh or raster instead of the plane in `State.water`;
-        origin : shape (3,), of the block; port : coefficients of a housing port, empty without
-        one; curved : whether d, e, f count.
+        origin : shape (3,), of the block; curved : whether d, e, f count.
     Unknowns that many points share, counted from the first of them
         first_lens : shape (groups + 1,), where the parameters of each sensor begin;
         code : shape (first_lens[-1],), which parameters these are; column : for each number of
@@ -92,7 +93,6 @@ class Given(NamedTuple):
     tin: Tin | None
     field: Field | None
     origin: FloatArray
-    port: FloatArray
     curved: bool
     first_lens: IntArray
     code: IntArray
@@ -123,7 +123,6 @@ class Workspace(NamedTuple):
     behind_port : shape (3, 8), that direction behind a port, with its derivatives.
     origin : shape (3,), the block's origin, seen from the water level.
     by_shape : shape (3, 3), derivatives of the light by d, e, f; moved : shape (7,), other water.
-    port : shape (7,), the port with its estimated parameters.
     own : shape (2, `WIDTH`), derivatives of an image.
     right, left : shape (most, 2, 9 + g), the weighted rows of a point, and what tests them: the
     same array in a least squares adjustment.
@@ -138,7 +137,6 @@ class Workspace(NamedTuple):
     origin: FloatArray
     by_shape: FloatArray
     moved: FloatArray
-    port: FloatArray
     own: FloatArray
     right: FloatArray
     left: FloatArray
@@ -151,7 +149,7 @@ class Workspace(NamedTuple):
 def workspace(given: Given) -> Workspace:
     """Return a new workspace."""
     most = int(np.diff(given.start).max(initial=0)) + 1  # one more for a `condition`
-    scratch = [np.zeros(shape) for shape in ((3, 12), 4, 3, (3, 8), 3, (3, 3), 7, 7, (2, WIDTH))]
+    scratch = [np.zeros(shape) for shape in ((3, 12), 4, 3, (3, 8), 3, (3, 3), 7, (2, WIDTH))]
     right = np.zeros((most, 2, SHARED + given.shared))
     left = np.zeros_like(right) if len(given.tests) else right
     r, row, v, rhs = np.zeros((most, 2)), np.zeros(most, np.int64), np.zeros((3, 3)), np.zeros(3)
@@ -232,18 +230,6 @@ def _curved_gradients(
                 block[i, at] += 0.5 * light[i] / step
 
 
-@device
-def _set_port(port: FloatArray, water: FloatArray, given: Given) -> None:
-    """Set the port with its estimated distance or centre."""
-    for i in range(port.size):
-        port[i] = given.port[i]
-    if port[KIND] == FLAT:
-        port[SIZE] = water[PORT]
-    else:
-        for i in range(3):
-            port[X + i] = water[PORT + 1 + i]
-
-
 # Images
 
 
@@ -271,15 +257,14 @@ def image_and_all_gradients(
     x = times(r, column_of(light, 0))
     ahead[0], ahead[1], ahead[2] = x
     behind = work.behind_port
-    if given.port.size:
-        _set_port(work.port, water, given)
-        through_port(work.port, water[INDEX], *x, behind)
+    if state.port.size:
+        through_port(state.port, water[INDEX], *x, behind)
         ahead[0], ahead[1], ahead[2] = column_of(behind, 0)
     u, v, both = image_and_gradients(state.lenses[given.lens_row[c]], ahead[0], ahead[1], ahead[2])
     for row in range(2):
         g = both[3 * row], both[3 * row + 1], both[3 * row + 2]
         by_index = 0.0
-        if given.port.size:
+        if state.port.size:
             # chain rule through the port: its own parameters first, then g by the direction before
             by_index = dot(g, column_of(behind, 4))
             out[row, SURFACE + PORT] = dot(g, column_of(behind, BY_PORT))

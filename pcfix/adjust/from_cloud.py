@@ -26,7 +26,7 @@ several choices the one under which these fit best is taken.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
@@ -269,12 +269,12 @@ def solve_unaware(
     tested = replace(problem, given=given)
     now, log, size = start, list(start.log), np.inf
     for number in range(1, MAX_STEPS + 1):
-        reduced, step = reduced_at(tested, now), np.zeros(len(problem.moves))
-        matrix: Any = reduced.matrix  # not symmetric
+        # the matrix is not symmetric
+        (matrix, right), step = reduced_at(tested, now), np.zeros(len(problem.moves))
         scale = 1.0 / np.sqrt(np.maximum(np.abs(matrix.diagonal()), 1e-300))
         try:
-            step[reduced.active] = scale * np.linalg.solve(
-                matrix * scale * scale[:, None], scale * reduced.right
+            step[problem.active] = scale * np.linalg.solve(
+                matrix * scale * scale[:, None], scale * right
             )
         except np.linalg.LinAlgError:
             raise _unsolved("the equations are singular") from None

@@ -13,7 +13,6 @@ R = C - B' A^-1 B, and lower the squares by c' R^-1 c.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from scipy.special import chdtri
@@ -286,18 +285,18 @@ def missing_lens_parameters(problem: Problem, now: Solution, sigma0: float) -> l
     is_tried[: len(given.code)] = np.isin(given.code, [CODES[name] for name in more])
     shared = np.zeros(given.shared)
     shared[~is_tried] = now.shared
-    reduced = reduced_at(wide, replace(start, state=now.state, lenses=now.lenses, shared=shared))
-    matrix: Any = reduced.matrix
-    mine = np.append(np.zeros(len(wide.moves) - len(shared), np.bool_), is_tried)[reduced.active]
-    solve_for = solver(reduced._replace(matrix=matrix[~mine][:, ~mine]))
+    start = replace(start, state=now.state, lenses=now.lenses, shared=shared)
+    matrix, right = reduced_at(wide, start)
+    mine = np.append(np.zeros(len(wide.moves) - len(shared), np.bool_), is_tried)[wide.active]
+    solve_for = solver(matrix[~mine][:, ~mine])
     if not mine.any() or solve_for is None:
         return []
     border, own = matrix[~mine][:, mine], matrix[mine][:, mine]
     if not isinstance(matrix, np.ndarray):
         border, own = border.toarray(), own.toarray()
-    taken = solve_for(np.column_stack([border, reduced.right[~mine]]))
+    taken = solve_for(np.column_stack([border, right[~mine]]))
     left = own - border.T @ taken[:, :-1]
-    pull = reduced.right[mine] - border.T @ taken[:, -1]
+    pull = right[mine] - border.T @ taken[:, -1]
     tried = np.flatnonzero(is_tried)
     code, effect = given.code[tried], wide.lens_effects[tried]
 

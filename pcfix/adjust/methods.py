@@ -352,15 +352,15 @@ def offset_of(found: Adjusted) -> tuple[FloatArray, FloatArray] | None:
     with_centres = np.zeros((len(weight), 6, 3))
     with_centres[:, 3:] = weight[:, :, None] * axes.transpose(0, 2, 1)
     shared = np.zeros((problem.given.shared, 3))
-    reduced = reduced_at(problem, now)
-    taken_up = np.vstack([with_centres.reshape(-1, 3), shared])[reduced.active]
-    solve_for = solver(reduced)
+    matrix, right_side = reduced_at(problem, now)
+    taken_up = np.vstack([with_centres.reshape(-1, 3), shared])[problem.active]
+    solve_for = solver(matrix)
     if solve_for is None or not taken_up.any():
         return None
     own = np.einsum("kij,kj,klj->il", axes, weight, axes) + np.eye(3) / UNKNOWN_M**2
     covariance = np.linalg.inv(own - taken_up.T @ solve_for(taken_up))
     side = -np.einsum("kij,kj->i", axes, weight * np.nan_to_num(found.gnss_residual_m))
-    step = covariance @ (side - taken_up.T @ solve_for(reduced.right))
+    step = covariance @ (side - taken_up.T @ solve_for(right_side))
     return step, max(found.sigma0, 1.0) * np.sqrt(np.diag(covariance))
 
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -33,16 +33,7 @@ from pcfix.adjust.block import (
 )
 from pcfix.adjust.normal import point_covariances
 from pcfix.adjust.problem import Problem, Solution, polynomial, pose_gradients
-from pcfix.adjust.solve import (
-    BED,
-    LIMITS,
-    Reduced,
-    moved_by,
-    reduced_at,
-    singular,
-    solver,
-    words_of,
-)
+from pcfix.adjust.solve import BED, LIMITS, moved_by, reduced_at, singular, solver, words_of
 from pcfix.errors import PcfixWarning
 from pcfix.model import Cameras, FloatArray, IntArray, WaterPlane, WaterRaster, WaterSurface
 
@@ -116,13 +107,13 @@ def precision_of(
         Further factors of standard errors: of angles and centres of all poses, and of the shared
         unknowns; see `pcfix.adjust.shared_errors`.
     """
-    reduced, state, given = reduced_at(problem, solution), solution.state, problem.given
-    active, k, g = reduced.active, len(state.centres), given.shared
+    matrix, state, given = reduced_at(problem, solution)[0], solution.state, problem.given
+    active, k, g = problem.active, len(state.centres), given.shared
     times = np.ones(6 + g) if factor is None else factor
     variance, u = sigma0 * sigma0, len(active)
     notes: list[PcfixWarning] = []
-    inverse = _inverse(reduced) if u <= DENSE_UP_TO else None
-    solve_for = solver(reduced) if u > DENSE_UP_TO else None
+    inverse = _inverse(matrix) if u <= DENSE_UP_TO else None
+    solve_for = solver(matrix) if u > DENSE_UP_TO else None
     if u > DENSE_UP_TO:
         words = (
             f"The block has {u:,} unknowns (limit {DENSE_UP_TO:,}), so its points have no"
@@ -180,11 +171,10 @@ def _pose_blocks(k: int, active: IntArray, columns: Callable[[IntArray], FloatAr
     return poses
 
 
-def _inverse(reduced: Reduced) -> FloatArray | None:
+def _inverse(matrix: Any) -> FloatArray | None:
     """Return the whole inverse, by Cholesky's method with a unit diagonal; None if singular."""
     from scipy.linalg import cho_factor, cho_solve
 
-    matrix = reduced.matrix
     if matrix.shape[0] == 0:
         return np.zeros((0, 0))
     a = np.array(matrix if isinstance(matrix, np.ndarray) else matrix.toarray(), order="F")

@@ -75,6 +75,11 @@ class Problem:
     names: list[str]  # of the shared unknowns
 
     @property
+    def active(self) -> IntArray:
+        """The free poses and shared unknowns, those of the reduced equations, shape (a,)."""
+        return np.flatnonzero(self.moves)
+
+    @property
     def used(self) -> BoolArray:
         """Observations that count, shape (o,)."""
         return np.asarray(self.given.weight > 0.0)
@@ -169,7 +174,6 @@ def prepare(
         tin=build_tin(water) if isinstance(water, WaterMesh) else None,
         field=build_field(water) if isinstance(water, WaterRaster) else None,
         origin=origin,
-        port=np.zeros(0) if block.port is None else port_coefficients(block.port),
         curved=bool(unknowns.surface.get("shape")),
         first_lens=first_lens,
         code=np.array([code for of_sensor in codes for code in of_sensor], np.int64),
@@ -195,7 +199,7 @@ def prepare(
     )  # fmt: skip
     state = State(
         centres, np.ascontiguousarray(cameras.rotations, np.float64), table, block.xyz - origin,
-        np.concatenate([numbers, planes]),
+        np.concatenate([numbers, planes]), port_row(block.port),
     )  # fmt: skip
     return problem, Solution(state, cameras.lenses, np.zeros(len(names)), np.inf, [])
 
@@ -286,6 +290,11 @@ def port_of(block: Block, numbers: FloatArray) -> Port | None:
             x, y, z = numbers[PORT + 1 : PORT + 4].tolist()
             return replace(block.port, centre_m=(x, y, z))
     return None
+
+
+def port_row(port: Port | None) -> FloatArray:
+    """Return the coefficients of a port for kernels; none without a port."""
+    return np.zeros(0) if port is None else port_coefficients(port)
 
 
 def water_of(problem: Problem, state: State) -> WaterSurface | None:

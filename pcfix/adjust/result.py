@@ -66,17 +66,6 @@ class ControlRow(NamedTuple):
     images: int
 
 
-class OnSurface(NamedTuple):
-    """Marked points on a surface: how many, their stated and found distances in metres."""
-
-    surface: str
-    points: int
-    sigma_m: float
-    rms_m: float
-    largest_m: float
-    largest_point: str
-
-
 @dataclass(frozen=True, eq=False)
 class Adjusted:
     """An adjusted block."""
@@ -102,7 +91,7 @@ class Adjusted:
     origin: FloatArray  # of the block's frame
     numbers: FloatArray  # `pcfix.adjust.collinearity.State.water` there
     port: Port | None = None  # adjusted
-    on_surfaces: list[OnSurface] = field(default_factory=list)  # points on the water or on planes
+    on_surfaces: list[Plain] = field(default_factory=list)  # of points on the water or on planes
 
     @property
     def is_observed(self) -> BoolArray:
@@ -204,8 +193,9 @@ def _control_rows(block: Block, xyz: FloatArray, r: FloatArray) -> list[ControlR
     return rows
 
 
-def _on_surfaces(problem: Problem, now: Solution) -> list[OnSurface]:
-    given, block, found = problem.block.conditions, problem.block, []
+def _on_surfaces(problem: Problem, now: Solution) -> list[Plain]:
+    """Return the stated and found distances of marked points from each surface, metres."""
+    given, block, found = problem.block.conditions, problem.block, list[Plain]()
     if given is None:
         return []
     off = np.where(np.diff(block.start) > 0, surface_distances(problem, now), np.nan)
@@ -213,9 +203,14 @@ def _on_surfaces(problem: Problem, now: Solution) -> list[OnSurface]:
         rows = np.flatnonzero((given.on == number) & np.isfinite(off))
         if len(rows):
             worst = rows[np.argmax(np.abs(off[rows]))]
-            rms, sigma = (float(np.sqrt(np.mean(v[rows] ** 2))) for v in (off, given.sigma_m))
-            label = block.control_names[worst - block.tie_points]
-            found.append(OnSurface(name, len(rows), sigma, rms, float(abs(off[worst])), label))
+            found.append({
+                "surface": name,
+                "points": len(rows),
+                "sigma_m": rms(given.sigma_m[rows]),
+                "rms_m": rms(off[rows]),
+                "largest_m": abs(off[worst]),
+                "largest_point": block.control_names[worst - block.tie_points],
+            })  # fmt: skip
     return found
 
 
@@ -275,7 +270,7 @@ def adjustment_dict(adjusted: Adjusted, before: Intersected | None = None) -> Pl
         "lens": _lens(a),
         "water": _water(a),
         "port_found": _port(a),
-        "on_surfaces": [row._asdict() for row in a.on_surfaces],
+        "on_surfaces": a.on_surfaces,
         "poses": _poses(a),
         "precision": None if known is None else _precision(known),
         "gnss": _gnss(a),

@@ -75,16 +75,14 @@ def disagreement_of(
     """
     groups, added = _groups_by_sharing(problem, found), np.zeros(6 + problem.given.shared)
     counts = {words: len(np.unique(group)) for words, group in groups.items()}
-    reduced = reduced_at(problem, found)
-    solve_for = solver(reduced)
+    matrix, right = reduced_at(problem, found)
+    solve_for, active = solver(matrix), problem.active
     if counts[ALONE] < LEAST_GROUPS or solve_for is None:
         return 1.0 + added, []
     drawn = np.random.default_rng(1).normal(0.0, formal.sigma0, problem.given.image_xy.shape)
     *pulls, field, rest = _pulls_of(problem, found, groups, drawn)
     # the first group is that of drawn residuals, whose variances are by chance
-    by_chance, *shares = (
-        _share_of(formal, reduced.active, solve_for(pull[:, reduced.active].T)) for pull in pulls
-    )
+    by_chance, *shares = (_share_of(formal, active, solve_for(pull[:, active].T)) for pull in pulls)
     shared = list[str]()
     for words, share in zip(groups, shares, strict=False):
         is_more = share > fdtri(counts[words] - 1, counts[ALONE] - 1, SURE) * by_chance
@@ -95,10 +93,10 @@ def disagreement_of(
         if words == ALONE:
             by_chance = by_chance + more
     if counts[FRAME] >= LEAST_GROUPS:
-        active = field[:, reduced.active]
-        rest -= active @ solve_for(np.column_stack([active.T, reduced.right]))
-        likely = _likely_field(problem, groups[FRAME], formal.sigma0, rest) @ active
-        more = _share_of(formal, reduced.active, solve_for(likely.T))
+        field = field[:, active]
+        rest -= field @ solve_for(np.column_stack([field.T, right]))
+        likely = _likely_field(problem, groups[FRAME], formal.sigma0, rest) @ field
+        more = _share_of(formal, active, solve_for(likely.T))
         added = added + more
         shared += [FRAME] if (more > NOTED).any() else []
     factor = np.sqrt(1.0 + added)
