@@ -118,11 +118,11 @@ instead, from `SHARED` on."""
 class Workspace(NamedTuple):
     """Arrays that one thread reuses for all points; g unknowns are shared, `most` rows in a point.
 
-    light, plane : shapes (3, 12) and (4,), refracted light with its derivatives, and its plane.
+    light, plane : shapes (3, 14) and (4,), refracted light with its derivatives by Q, C and the
+    first seven of `WATER_NAMES`, and its plane; moved : shape (7,), other values of these seven.
     ahead : shape (3,), the direction that the lens images, camera frame.
     behind_port : shape (3, 8), that direction behind a port, with its derivatives.
     origin : shape (3,), the block's origin, seen from the water level.
-    by_shape : shape (3, 3), derivatives of the light by d, e, f; moved : shape (7,), other water.
     own : shape (2, `WIDTH`), derivatives of an image.
     right, left : shape (most, 2, 9 + g), the weighted rows of a point, and what tests them: the
     same array in a least squares adjustment.
@@ -135,7 +135,6 @@ class Workspace(NamedTuple):
     ahead: FloatArray
     behind_port: FloatArray
     origin: FloatArray
-    by_shape: FloatArray
     moved: FloatArray
     own: FloatArray
     right: FloatArray
@@ -149,7 +148,7 @@ class Workspace(NamedTuple):
 def workspace(given: Given) -> Workspace:
     """Return a new workspace."""
     most = int(np.diff(given.start).max(initial=0)) + 1  # one more for a `condition`
-    scratch = [np.zeros(shape) for shape in ((3, 12), 4, 3, (3, 8), 3, (3, 3), 7, (2, WIDTH))]
+    scratch = [np.zeros(shape) for shape in ((3, 14), 4, 3, (3, 8), 3, 7, (2, WIDTH))]
     right = np.zeros((most, 2, SHARED + given.shared))
     left = np.zeros_like(right) if len(given.tests) else right
     r, row, v, rhs = np.zeros((most, 2)), np.zeros(most, np.int64), np.zeros((3, 3)), np.zeros(3)
@@ -211,10 +210,9 @@ def _curved_gradients(
     work: Workspace, water: FloatArray, given: Given, q: Vector, centre: Vector
 ) -> None:
     """Replace the derivatives of the light through the tangent plane by those of curved water."""
-    moved, plane = work.moved, work.plane
+    moved, plane, out = work.moved, work.plane, work.light
     for column in range(13):
-        block, at = (work.light, column + 1) if column < 10 else (work.by_shape, column - 10)
-        block[0, at], block[1, at], block[2, at] = 0.0, 0.0, 0.0
+        out[:, column + 1] = 0.0
         for sign in (1.0, -1.0):
             step, by = sign * DIFFERENCES[column], column % 3
             axis = (1.0 if by == 0 else 0.0, 1.0 if by == 1 else 0.0, 1.0 if by == 2 else 0.0)
@@ -227,7 +225,7 @@ def _curved_gradients(
             path = light_path(q_there, c_there, normal, plane[3], moved[INDEX])
             light = direction(path, normal)
             for i in range(3):
-                block[i, at] += 0.5 * light[i] / step
+                out[i, column + 1] += 0.5 * light[i] / step
 
 
 # Images
@@ -250,7 +248,7 @@ def image_and_all_gradients(
         if given.curved:
             _curved_gradients(work, water, given, q, centre)
     else:
-        light[:], work.by_shape[:] = 0.0, 0.0
+        light[:] = 0.0
         for i in range(3):
             light[i, 0] = q[i] - centre[i]
             light[i, 1 + i], light[i, 4 + i] = 1.0, -1.0
@@ -280,12 +278,9 @@ def image_and_all_gradients(
         for i in range(3):
             out[row, POINT + i] = dot(w, column_of(light, 1 + i))
             out[row, 3 + i] = dot(w, column_of(light, 4 + i))
-        for i in range(4):
+        for i in range(PORT):
             out[row, SURFACE + i] = dot(w, column_of(light, 7 + i))
         out[row, SURFACE + INDEX] += by_index
-        if given.curved:
-            for i in range(3):
-                out[row, SURFACE + SHAPE + i] = dot(w, column_of(work.by_shape, i))
     return u, v
 
 
