@@ -6,7 +6,7 @@ cloud. Everything is in one frame, metres, Z up.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
@@ -76,18 +76,17 @@ FEW_IMAGES = 5.0
 
 
 class LogRow(NamedTuple):
-    """One step of an adjustment."""
+    """An adjustment after some steps of a round."""
 
     round: int
-    step: int
+    steps: int
     cost: float
-    damping: float
     observations: int
     rms_px: float
 
     def __str__(self) -> str:
         return (
-            f"round {self.round}, step {self.step}, {self.observations:,} observations,"
+            f"round {self.round}, step {self.steps}, {self.observations:,} observations,"
             f" {self.rms_px:.3f} px"
         )
 
@@ -164,22 +163,14 @@ class Unknowns:
     poses: Poses = "free"  # `similarity` shifts, turns and scales all poses together
     fixed_images: tuple[str, ...] = ()  # labels of images whose pose is fixed
     lens: tuple[str, ...] = ("f",)  # free of each sensor: f, cx, cy, b1, b2, k1 ... k8, p1, p2
-    level_sigma_m: float = 0.0
-    tilt_sigma: float = 0.0
-    index_sigma: float = 0.0
+    # of level (m), tilt, index, shape (1/m), distance (m) and centre (m); others are fixed
+    surface: Mapping[str, float] = field(default_factory=dict)
     free_network: bool = False  # mean position, direction and scale of the centres stay
-    shape_sigma: float = 0.0  # of the curvature terms, 1/m
-    distance_sigma_m: float = 0.0  # of a flat port
-    centre_sigma_m: float = 0.0  # of the centre of a dome
 
     @property
     def water_sigma(self) -> tuple[float, ...]:
         """Standard deviations in the order of `WATER_NAMES`."""
-        return (
-            *(self.level_sigma_m, self.tilt_sigma, self.tilt_sigma, self.index_sigma),
-            *(self.shape_sigma,) * 3,
-            *(self.distance_sigma_m, *(self.centre_sigma_m,) * 3),
-        )
+        return tuple(self.surface.get(name.partition("_")[0], 0.0) for name in WATER_NAMES)
 
 
 def similarity_gradients(d: FloatArray) -> FloatArray:
@@ -236,13 +227,10 @@ def sensor_groups(lenses: tuple[Lens, ...]) -> tuple[IntArray, list[list[int]]]:
     distinct = len(set(lenses))
     # several lenses of one sensor, each with enough images for corrections of its own
     is_own = distinct > len(set(sensors)) and len(lenses) / distinct >= FEW_IMAGES
-    rows: dict[object, list[int]] = {}
-    for i, key in enumerate(lenses if is_own else sensors):
-        rows.setdefault(key, []).append(i)
-    group = np.zeros(len(lenses), np.int64)
-    for number, members in enumerate(rows.values()):
-        group[members] = number
-    return group, list(rows.values())
+    keys: Sequence[object] = lenses if is_own else sensors
+    number = {key: i for i, key in enumerate(dict.fromkeys(keys))}
+    group = np.array([number[key] for key in keys], np.int64)
+    return group, [np.flatnonzero(group == i).tolist() for i in range(len(number))]
 
 
 def usable_codes(lens: Lens, names: tuple[str, ...]) -> tuple[int, ...]:

@@ -7,14 +7,7 @@ d x = omega x x. So an image gradient g with respect to x becomes x x g with res
 
 Water of the second order, z = a + b x + c y + d x^2 + e x y + f y^2, refracts at the piercing point
 P as its tangent plane does. As anything changes, P moves along the surface and the tangent plane
-turns with it. With w the direction at the projection centre C, H the height of C above the plane,
-m = (-z_x, -z_y, 1), K the 2 x 2 matrix of second derivatives and G the 3 x 2 derivatives of w by
-the slopes of a plane about P:
-
-    dw = L + G K dp,    dp = H E dw + E dC + w_xy dz / (m.w),    E = (I - w m' / (m.w))_xy
-
-L is dw for a plane that does not turn, dp the horizontal movement of P, and dz the rise of the
-surface at P. Substituted into each other these are two equations for dp.
+turns with it; the derivatives are central differences.
 """
 
 from __future__ import annotations
@@ -32,18 +25,14 @@ from pcfix.lens.algebra import (
     column_of,
     cross,
     dot,
-    minus,
-    normal_of,
-    plus,
-    scaled,
     times,
     transposed_times,
     vector,
 )
 from pcfix.lens.formulas import distorted, jacobian, undistorted
-from pcfix.lens.imaging import image_and_gradients, image_of, in_plane
+from pcfix.lens.imaging import image_and_gradients, in_plane
 from pcfix.model import BoolArray, FloatArray, IntArray
-from pcfix.port.light import BY_PORT, FLAT, KIND, SIZE, X, light_through, through_port
+from pcfix.port.light import BY_PORT, through_port
 from pcfix.refract.rays import direction, lay, light_and_gradients, light_path, plane_at, settle
 
 if TYPE_CHECKING:
@@ -58,6 +47,7 @@ class State(NamedTuple):
     xyz : shape (m, 3), true points.
     water : shape (11 + 3 p,), the parameters of `WATER_NAMES`, then height and two slopes of each
     of p planes.
+    port : shape (7,), coefficients of a housing port with these parameters; empty without one.
     """
 
     centres: FloatArray
@@ -65,6 +55,7 @@ class State(NamedTuple):
     lenses: FloatArray
     xyz: FloatArray
     water: FloatArray
+    port: FloatArray
 
 
 class Given(NamedTuple):
@@ -75,9 +66,8 @@ class Given(NamedTuple):
         deviation, zero for observations that do not count; wet : shape (m,), whether a point may
         be under water; lens_row, group : shape (k,), row of the lens table and sensor of cameras.
     Refracting surface
-        has_water; tin, field : a mesh or raster instead of the plane in `State.water`;
-        origin : shape (3,), of the block; port : coefficients of a housing port, empty without
-        one; curved : whether d, e, f count.
+        tin, field : a mesh or raster instead of the plane in `State.water`;
+        origin : shape (3,), of the block; curved : whether d, e, f count.
     Unknowns that many points share, counted from the first of them
         first_lens : shape (groups + 1,), where the parameters of each sensor begin;
         code : shape (first_lens[-1],), which parameters these are; column : for each number of
@@ -100,11 +90,9 @@ class Given(NamedTuple):
     wet: BoolArray
     lens_row: IntArray
     group: IntArray
-    has_water: bool
     tin: Tin | None
     field: Field | None
     origin: FloatArray
-    port: FloatArray
     curved: bool
     first_lens: IntArray
     code: IntArray
@@ -130,12 +118,11 @@ instead, from `SHARED` on."""
 class Workspace(NamedTuple):
     """Arrays that one thread reuses for all points; g unknowns are shared, `most` rows in a point.
 
-    light, plane : shapes (3, 12) and (4,), refracted light with its derivatives, and its plane.
+    light, plane : shapes (3, 14) and (4,), refracted light with its derivatives by Q, C and the
+    first seven of `WATER_NAMES`, and its plane; moved : shape (7,), other values of these seven.
     ahead : shape (3,), the direction that the lens images, camera frame.
     behind_port : shape (3, 8), that direction behind a port, with its derivatives.
     origin : shape (3,), the block's origin, seen from the water level.
-    by_shape : shape (3, 3), derivatives of the light by d, e, f.
-    port : shape (7,), the port with its estimated parameters.
     own : shape (2, `WIDTH`), derivatives of an image.
     right, left : shape (most, 2, 9 + g), the weighted rows of a point, and what tests them: the
     same array in a least squares adjustment.
@@ -148,8 +135,7 @@ class Workspace(NamedTuple):
     ahead: FloatArray
     behind_port: FloatArray
     origin: FloatArray
-    by_shape: FloatArray
-    port: FloatArray
+    moved: FloatArray
     own: FloatArray
     right: FloatArray
     left: FloatArray
@@ -162,7 +148,7 @@ class Workspace(NamedTuple):
 def workspace(given: Given) -> Workspace:
     """Return a new workspace."""
     most = int(np.diff(given.start).max(initial=0)) + 1  # one more for a `condition`
-    scratch = [np.zeros(shape) for shape in ((3, 12), 4, 3, (3, 8), 3, (3, 3), 7, (2, WIDTH))]
+    scratch = [np.zeros(shape) for shape in ((3, 14), 4, 3, (3, 8), 3, 7, (2, WIDTH))]
     right = np.zeros((most, 2, SHARED + given.shared))
     left = np.zeros_like(right) if len(given.tests) else right
     r, row, v, rhs = np.zeros((most, 2)), np.zeros(most, np.int64), np.zeros((3, 3)), np.zeros(3)
@@ -177,26 +163,35 @@ STEPS, CLOSE_M = 30, 1e-12
 
 
 @device
-def height_of(water: FloatArray, x: float, y: float) -> Vector:
-    """Return height, dz/dx and dz/dy of the water at x, y."""
+def surface_at(water: FloatArray, given: Given, x: float, y: float) -> Vector:
+    """Return height, dz/dx and dz/dy of the water at x, y; NaN where there is none."""
+    if given.field is not None or given.tin is not None:
+        z, b, c = plane_at(given.tin, given.field, x, y, given.origin)
+        return z + water[0], b, c
     d, e, f = water[SHAPE], water[SHAPE + 1], water[SHAPE + 2]
     z = water[0] + (water[1] + d * x + e * y) * x + (water[2] + f * y) * y
     return z, water[1] + 2.0 * d * x + e * y, water[2] + e * x + 2.0 * f * y
 
 
 @device
-def _curved_plane(plane: FloatArray, water: FloatArray, q: Vector, centre: Vector) -> bool:
-    """Set the plane (N, h) tangent to the water at the piercing point; return if Q is below it."""
-    z, b, c = height_of(water, q[0], q[1])
+def _set_plane(work: Workspace, water: FloatArray, given: Given, q: Vector, centre: Vector) -> bool:
+    """Set the refracting plane (N, h) for light from Q to C; return if Q is below the water."""
+    plane, origin = work.plane, work.origin
+    z, b, c = surface_at(water, given, q[0], q[1])
     if not z > q[2]:
         return False
     lay(plane, q[0], q[1], z, b, c)
-    for _ in range(STEPS):
+    if given.field is not None or given.tin is not None:
+        # a level added to a mesh or raster is an origin that lies lower
+        origin[0], origin[1], origin[2] = vector(given.origin)
+        origin[2] -= water[0]
+        settle(plane, given.tin, given.field, origin, q, centre, water[INDEX])
+    for _ in range(STEPS if given.curved else 0):
         # refract at the tangent plane, then move the plane to where the light pierces it
         normal = vector(plane)
         path = light_path(q, centre, normal, plane[3], water[INDEX])
         x, y, z_plane = beyond(centre, path[2], direction(path, normal))
-        z, b_there, c_there = height_of(water, x, y)
+        z, b_there, c_there = surface_at(water, given, x, y)
         change = abs(z - z_plane) + abs(path[3]) * (abs(b_there - b) + abs(c_there - c))
         lay(plane, x, y, z, b_there, c_there)
         if not change > CLOSE_M:
@@ -205,105 +200,42 @@ def _curved_plane(plane: FloatArray, water: FloatArray, q: Vector, centre: Vecto
     return True
 
 
+DIFFERENCES = (1e-4,) * 7 + (1e-5,) * 3 + (1e-6,) * 3
+"""Steps of Q, C and a in metres, of b, c and n, and of d, e and f in 1/m: the piercing point is
+known to 1e-12 m, so derivatives are good to 1e-7."""
+
+
 @device
 def _curved_gradients(
-    plane: FloatArray, water: FloatArray, centre: Vector, light: FloatArray, shape: FloatArray
+    work: Workspace, water: FloatArray, given: Given, q: Vector, centre: Vector
 ) -> None:
-    """Turn derivatives of light through the tangent plane into those through the curved water.
-
-    `light` is as of `light_and_gradients`; `shape`, (3, 3), is filled with those by d, e, f.
-    """
-    w = column_of(light, 0)
-    up = dot(vector(plane), centre) - plane[3]
-    x, y = centre[0] + up * w[0], centre[1] + up * w[1]  # the piercing point P
-    m = plane[0] / plane[2], plane[1] / plane[2], 1.0
-    steep = dot(m, w)
-    # G: slopes of a plane about P instead of about the origin
-    by_height = column_of(light, 7)
-    by_x = beyond(column_of(light, 8), -x, by_height)
-    by_y = beyond(column_of(light, 9), -y, by_height)
-    for i in range(3):
-        shape[i, 0] = x * x * by_height[i] + 2.0 * x * by_x[i]
-        shape[i, 1] = x * y * by_height[i] + y * by_x[i] + x * by_y[i]
-        shape[i, 2] = y * y * by_height[i] + 2.0 * y * by_y[i]
-    d, e, f = water[SHAPE], water[SHAPE + 1], water[SHAPE + 2]
-    turn_x = plus(scaled(2.0 * d, by_x), scaled(e, by_y))  # G K
-    turn_y = plus(scaled(e, by_x), scaled(2.0 * f, by_y))
-    along_x = beyond((1.0, 0.0, 0.0), -w[0] / steep, m)  # E
-    along_y = beyond((0.0, 1.0, 0.0), -w[1] / steep, m)
-    xx, xy = 1.0 - up * dot(along_x, turn_x), -up * dot(along_x, turn_y)
-    yx, yy = -up * dot(along_y, turn_x), 1.0 - up * dot(along_y, turn_y)
-    det = xx * yy - xy * yx
-    rises = (1.0, x, y, 0.0, x * x, x * y, y * y)  # dz at P, by a, b, c, n, d, e, f
+    """Replace the derivatives of the light through the tangent plane by those of curved water."""
+    moved, plane, out = work.moved, work.plane, work.light
     for column in range(13):
-        block, at = (light, column + 1) if column < 10 else (shape, column - 10)
-        plain = column_of(block, at)
-        rise = 0.0 if column < 6 else rises[column - 6] / steep
-        px, py = up * dot(along_x, plain) + w[0] * rise, up * dot(along_y, plain) + w[1] * rise
-        if 3 <= column < 6:
-            px, py = px + along_x[column - 3], py + along_y[column - 3]
-        dx, dy = (yy * px - xy * py) / det, (xx * py - yx * px) / det
-        for i in range(3):
-            block[i, at] += turn_x[i] * dx + turn_y[i] * dy
-
-
-@device
-def _set_plane(work: Workspace, water: FloatArray, given: Given, q: Vector, centre: Vector) -> bool:
-    """Set the refracting plane (N, h) for light from Q to C; return if Q is below the water."""
-    plane, origin = work.plane, work.origin
-    if given.field is None and given.tin is None:
-        if given.curved:
-            return _curved_plane(plane, water, q, centre)
-        plane[0], plane[1], plane[2] = normal_of(water[1], water[2])
-        plane[3] = plane[2] * water[0]
-        return bool(water[0] + water[1] * q[0] + water[2] * q[1] > q[2])
-    # a level added to a mesh or raster is an origin that lies lower
-    origin[0], origin[1], origin[2] = vector(given.origin)
-    origin[2] -= water[0]
-    z, b, c = plane_at(given.tin, given.field, q[0], q[1], origin)
-    if not z > q[2]:
-        return False
-    lay(plane, q[0], q[1], z, b, c)
-    settle(plane, given.tin, given.field, origin, q, centre, water[INDEX])
-    return True
-
-
-@device
-def _set_port(port: FloatArray, water: FloatArray, given: Given) -> None:
-    """Set the port with its estimated distance or centre."""
-    for i in range(port.size):
-        port[i] = given.port[i]
-    if port[KIND] == FLAT:
-        port[SIZE] = water[PORT]
-    else:
-        for i in range(3):
-            port[X + i] = water[PORT + 1 + i]
+        out[:, column + 1] = 0.0
+        for sign in (1.0, -1.0):
+            step, by = sign * DIFFERENCES[column], column % 3
+            axis = (1.0 if by == 0 else 0.0, 1.0 if by == 1 else 0.0, 1.0 if by == 2 else 0.0)
+            q_there = beyond(q, step if column < 3 else 0.0, axis)
+            c_there = beyond(centre, step if 3 <= column < 6 else 0.0, axis)
+            for i in range(PORT):  # a, b, c, n, d, e, f
+                moved[i] = water[i] + (step if column == 6 + i else 0.0)
+            _set_plane(work, moved, given, q_there, c_there)
+            normal = vector(plane)
+            path = light_path(q_there, c_there, normal, plane[3], moved[INDEX])
+            light = direction(path, normal)
+            for i in range(3):
+                out[i, column + 1] += 0.5 * light[i] / step
 
 
 # Images
 
 
 @device
-def image(state: State, given: Given, p: int, c: int, work: Workspace) -> tuple[float, float]:
-    """Return the image of point p in camera c; NaN if there is none."""
-    q, centre, water = vector(state.xyz[p]), vector(state.centres[c]), state.water
-    w = minus(q, centre)
-    may_refract = given.port.size == 0 and given.wet[p] and given.has_water
-    if may_refract and _set_plane(work, water, given, q, centre):
-        normal = vector(work.plane)
-        w = direction(light_path(q, centre, normal, work.plane[3], water[INDEX]), normal)
-    x = times(state.rotations[c], w)
-    if given.port.size:
-        _set_port(work.port, water, given)
-        x = light_through(work.port, water[INDEX], *x)
-    return image_of(state.lenses[given.lens_row[c]], *x)
-
-
-@device
 def image_and_all_gradients(
     state: State, given: Given, p: int, c: int, work: Workspace, out: FloatArray
 ) -> tuple[float, float]:
-    """Return the image of point p in camera c, and fill in its derivatives.
+    """Return the image of point p in camera c, NaN if there is none, and fill in its derivatives.
 
     `out`, shape (2, `WIDTH`), has the derivatives of u and v by omega, C, Q, and a, b, c, n; by
     d, e, f if the water is curved, and by the parameters of a port if there is one.
@@ -311,30 +243,26 @@ def image_and_all_gradients(
     q, centre = vector(state.xyz[p]), vector(state.centres[c])
     r, water = state.rotations[c], state.water
     light, plane, ahead = work.light, work.plane, work.ahead
-    refracted = given.port.size == 0 and given.wet[p] and given.has_water
-    if refracted:
-        refracted = _set_plane(work, water, given, q, centre)
-    if refracted:
+    if given.wet[p] and _set_plane(work, water, given, q, centre):
         light_and_gradients(q, centre, vector(plane), plane[3], water[INDEX], light)
         if given.curved:
-            _curved_gradients(plane, water, centre, light, work.by_shape)
+            _curved_gradients(work, water, given, q, centre)
     else:
-        light[:], work.by_shape[:] = 0.0, 0.0
+        light[:] = 0.0
         for i in range(3):
             light[i, 0] = q[i] - centre[i]
             light[i, 1 + i], light[i, 4 + i] = 1.0, -1.0
     x = times(r, column_of(light, 0))
     ahead[0], ahead[1], ahead[2] = x
     behind = work.behind_port
-    if given.port.size:
-        _set_port(work.port, water, given)
-        through_port(work.port, water[INDEX], *x, behind)
+    if state.port.size:
+        through_port(state.port, water[INDEX], *x, behind)
         ahead[0], ahead[1], ahead[2] = column_of(behind, 0)
     u, v, both = image_and_gradients(state.lenses[given.lens_row[c]], ahead[0], ahead[1], ahead[2])
     for row in range(2):
         g = both[3 * row], both[3 * row + 1], both[3 * row + 2]
         by_index = 0.0
-        if given.port.size:
+        if state.port.size:
             # chain rule through the port: its own parameters first, then g by the direction before
             by_index = dot(g, column_of(behind, 4))
             out[row, SURFACE + PORT] = dot(g, column_of(behind, BY_PORT))
@@ -350,12 +278,9 @@ def image_and_all_gradients(
         for i in range(3):
             out[row, POINT + i] = dot(w, column_of(light, 1 + i))
             out[row, 3 + i] = dot(w, column_of(light, 4 + i))
-        for i in range(4):
+        for i in range(PORT):
             out[row, SURFACE + i] = dot(w, column_of(light, 7 + i))
         out[row, SURFACE + INDEX] += by_index
-        if given.curved:
-            for i in range(3):
-                out[row, SURFACE + SHAPE + i] = dot(w, column_of(work.by_shape, i))
     return u, v
 
 
@@ -438,11 +363,8 @@ def condition(state: State, given: Given, p: int, work: Workspace, at: int) -> b
     if number > 0:
         b, c = numbers[first + 1], numbers[first + 2]
         z = numbers[first] + b * x + c * y
-    elif given.field is None and given.tin is None:
-        z, b, c = height_of(numbers, x, y)
     else:
-        z, b, c = plane_at(given.tin, given.field, x, y, given.origin)
-        z += numbers[0]
+        z, b, c = surface_at(numbers, given, x, y)
     if np.isnan(z):
         return False
     row[:], r[1] = 0.0, 0.0

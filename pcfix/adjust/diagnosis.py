@@ -421,14 +421,23 @@ def _signs_of_rays(evidence: Evidence) -> list[Sign]:
     is_open = not evidence.in_passing or all(sign.speaks is None for sign in signs)
     if not any(sign.speaks for sign in signs) and not (is_known and is_open):
         return signs
+    from pcfix.adjust.from_cloud import mended  # not quick to load
+
+    count, most = len(cameras), QUICK_IMAGES if evidence.in_passing else MOST_IMAGES
+    wanted = max(CLOUD_POINTS, POINTS_PER_IMAGE * count)
     try:
-        mended = _mended(evidence, apparent)
+        if count > most or (apparent is None and evidence.view is None):
+            why = f"{count} images (limit {most})" if count > most else "no cloud"
+            raise GeometryError("adjust.no_pattern", why)
+        some = _sample_of(evidence.view, wanted) if apparent is None else apparent
+        some = some[:: max(1, len(some) // wanted)]
+        true = mended(some, cameras, evidence.water, evidence.refractive_index)
     except GeometryError as error:
         words = f"the pattern of absorbed refraction is unknown ({error})"
         return signs + [Sign("GNSS", None, words)] * is_known
-    signs = [sized(sign, mended) for sign in signs]
+    signs = [sized(sign, true) for sign in signs]
     if gnss is not None and is_known:
-        signs.append(gnss_sign(cameras.centres, off, gnss.sigma_m, mended))
+        signs.append(gnss_sign(cameras.centres, off, gnss.sigma_m, true))
     return signs
 
 
@@ -452,21 +461,6 @@ def _signs_of_ties(evidence: Evidence) -> tuple[list[Sign], FloatArray | None]:
     refracted = intersect_fixed(replace(block, xyz=begin, wet=wet, water=evidence.water))
     sign = tie_point_sign(straight, refracted, above.height_m - straight.xyz[:, 2])
     return [sign], straight.xyz[np.isfinite(straight.squares)]
-
-
-def _mended(evidence: Evidence, apparent: FloatArray | None) -> Mended:
-    """Return the poses that an adjustment with water would have found."""
-    count, most = len(evidence.cameras), QUICK_IMAGES if evidence.in_passing else MOST_IMAGES
-    if count > most or (apparent is None and evidence.view is None):
-        why = f"{count} images (limit {most})" if count > most else "no cloud"
-        raise GeometryError("adjust.no_pattern", why)
-    from pcfix.adjust.from_cloud import mended  # not quick to load
-
-    wanted = max(CLOUD_POINTS, POINTS_PER_IMAGE * count)
-    if apparent is None:
-        apparent = _sample_of(evidence.view, wanted)
-    some = apparent[:: max(1, len(apparent) // wanted)]
-    return mended(some, evidence.cameras, evidence.water, evidence.refractive_index)
 
 
 def _sample_of(view: Any, wanted: int) -> FloatArray:

@@ -26,7 +26,7 @@ several choices the one under which these fit best is taken.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
@@ -43,7 +43,7 @@ from pcfix.adjust.block import (
     true_start,
 )
 from pcfix.adjust.collinearity import SHARED
-from pcfix.adjust.normal import PLAIN, TESTED, linearised, point_steps, residuals
+from pcfix.adjust.normal import UNDAMPED, linearised, point_steps, residuals
 from pcfix.adjust.precision import precision_of
 from pcfix.adjust.problem import (
     Problem,
@@ -245,7 +245,7 @@ def straight_columns(problem: Problem, start: Solution, apparent_xyz: FloatArray
     o = len(problem.given.camera)
     dry = problem.given._replace(wet=np.zeros(len(problem.given.wet), np.bool_), weight=np.ones(o))
     state = start.state._replace(xyz=np.ascontiguousarray(apparent_xyz))
-    rows = linearised(state, dry, PLAIN, 0, len(apparent_xyz))
+    rows = linearised(state, dry, UNDAMPED, 0, len(apparent_xyz))
     tests = np.zeros((o, 2, SHARED + problem.given.shared))
     tests[rows.observation[rows.is_image]] = rows.columns[rows.is_image]
     return tests
@@ -269,23 +269,23 @@ def solve_unaware(
     tested = replace(problem, given=given)
     now, log, size = start, list(start.log), np.inf
     for number in range(1, MAX_STEPS + 1):
-        reduced, step = reduced_at(tested, now, TESTED), np.zeros(len(problem.moves))
-        matrix: Any = reduced.matrix  # not symmetric
+        # the matrix is not symmetric
+        (matrix, right), step = reduced_at(tested, now), np.zeros(len(problem.moves))
         scale = 1.0 / np.sqrt(np.maximum(np.abs(matrix.diagonal()), 1e-300))
         try:
-            step[reduced.active] = scale * np.linalg.solve(
-                matrix * scale * scale[:, None], scale * reduced.right
+            step[problem.active] = scale * np.linalg.solve(
+                matrix * scale * scale[:, None], scale * right
             )
         except np.linalg.LinAlgError:
             raise _unsolved("the equations are singular") from None
-        points = point_steps(now.state, given, TESTED, step)
+        points = point_steps(now.state, given, UNDAMPED, step)
         moved = moved_by(problem, now, step, points)
         size = float(np.abs(points).max(initial=0.0)) if np.isfinite(points).all() else np.inf
         if moved is None or not size < LARGE_STEP_M:
             break
         now = moved
         cost = survey_cost(problem, now) + priors_at(problem, now)[0]
-        row = LogRow(1, number, cost, 0.0, *counts_of(problem, now))
+        row = LogRow(1, number, cost, *counts_of(problem, now))
         log.append(row)
         if progress is not None:
             progress(row)

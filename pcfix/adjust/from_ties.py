@@ -13,7 +13,6 @@ R = C - B' A^-1 B, and lower the squares by c' R^-1 c.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from scipy.special import chdtri
@@ -36,7 +35,7 @@ from pcfix.adjust.result import Adjusted, adjusted_of, sigma0_of
 from pcfix.adjust.shared_errors import common_errors, disagreement_of, weighed
 from pcfix.adjust.solve import reduced_at, solve, solver
 from pcfix.errors import GeometryError, PcfixWarning
-from pcfix.model import BoolArray, FloatArray, IntArray, Lens
+from pcfix.model import BoolArray, FloatArray, Lens
 
 ROUGHLY = 1e-4
 """Relative gain of a step that ends the first, robust rounds."""
@@ -276,15 +275,35 @@ def missing_lens_parameters(problem: Problem, now: Solution, sigma0: float) -> l
     sigma0 : float
         A-posteriori standard deviation of unit weight.
     """
-    found = _candidates(problem, now)
-    if found is None:
+    names = problem.unknowns.lens
+    if any(lens.projection != "perspective" for lens in problem.block.cameras.lenses or ()):
+        return []  # other projections have terms of their own with the same effect
+    more = tuple(name for name in TRIED if name not in names)
+    wide, start = prepare(problem.block, replace(problem.unknowns, lens=names + more))
+    wide, given = wide.weighted(problem.given.weight), wide.given
+    is_tried = np.zeros(given.shared, np.bool_)
+    is_tried[: len(given.code)] = np.isin(given.code, [CODES[name] for name in more])
+    shared = np.zeros(given.shared)
+    shared[~is_tried] = now.shared
+    start = replace(start, state=now.state, lenses=now.lenses, shared=shared)
+    matrix, right = reduced_at(wide, start)
+    mine = np.append(np.zeros(len(wide.moves) - len(shared), np.bool_), is_tried)[wide.active]
+    solve_for = solver(matrix[~mine][:, ~mine])
+    if not mine.any() or solve_for is None:
         return []
-    code, effect, matrix, pull = found
+    border, own = matrix[~mine][:, mine], matrix[mine][:, mine]
+    if not isinstance(matrix, np.ndarray):
+        border, own = border.toarray(), own.toarray()
+    taken = solve_for(np.column_stack([border, right[~mine]]))
+    left = own - border.T @ taken[:, :-1]
+    pull = right[mine] - border.T @ taken[:, -1]
+    tried = np.flatnonzero(is_tried)
+    code, effect = given.code[tried], wide.lens_effects[tried]
 
     def squares(codes: list[int]) -> tuple[float, FloatArray]:
         """Return by how much these lower the squares, and their effects' standard errors."""
         rows = np.isin(code, codes)
-        covariance = np.linalg.inv(matrix[np.ix_(rows, rows)])
+        covariance = np.linalg.inv(left[np.ix_(rows, rows)])
         gain = float(pull[rows] @ covariance @ pull[rows]) / max(sigma0, 1.0) ** 2
         return gain, sigma0 * np.sqrt(covariance.diagonal()) * effect[rows]
 
@@ -299,38 +318,3 @@ def missing_lens_parameters(problem: Problem, now: Solution, sigma0: float) -> l
         if not gains:
             return [NAMES[one] for one in chosen]
         chosen.append(max(gains, key=gains.__getitem__))
-
-
-def _candidates(
-    problem: Problem, now: Solution
-) -> tuple[IntArray, FloatArray, FloatArray, FloatArray] | None:
-    """Return codes of lens parameters to test, their effects at the corner of the frame, R and c.
-
-    None if there are none, or the equations are singular.
-    """
-    names = problem.unknowns.lens
-    if any(lens.projection != "perspective" for lens in problem.block.cameras.lenses or ()):
-        return None  # other projections have terms of their own with the same effect
-    more = tuple(name for name in TRIED if name not in names)
-    wide, start = prepare(problem.block, replace(problem.unknowns, lens=names + more))
-    wide, given = wide.weighted(problem.given.weight), wide.given
-    is_tried = np.zeros(given.shared, np.bool_)
-    is_tried[: len(given.code)] = np.isin(given.code, [CODES[name] for name in more])
-    shared = np.zeros(given.shared)
-    shared[~is_tried] = now.shared
-    reduced = reduced_at(wide, replace(start, state=now.state, lenses=now.lenses, shared=shared))
-    matrix: Any = reduced.matrix
-    poses = np.zeros(len(wide.moves) - len(shared), np.bool_)
-    mine = np.concatenate([poses, is_tried])[reduced.active]
-    solve_for = solver(reduced._replace(matrix=matrix[~mine][:, ~mine]))
-    if not mine.any() or solve_for is None:
-        return None
-    border, own = matrix[~mine][:, mine], matrix[mine][:, mine]
-    if not isinstance(matrix, np.ndarray):
-        border, own = border.toarray(), own.toarray()
-    taken = solve_for(np.column_stack([border, reduced.right[~mine]]))
-    rows = np.flatnonzero(is_tried)
-    return (
-        given.code[rows], wide.lens_effects[rows], own - border.T @ taken[:, :-1],
-        reduced.right[mine] - border.T @ taken[:, -1],
-    )  # fmt: skip

@@ -57,24 +57,15 @@ _REMEDY = (
 
 def unknowns_of(rules: AdjustRules, lens: tuple[str, ...]) -> Unknowns:
     """Return what is free, with these lens parameters."""
-
-    def sigma_of(name: str, stated: float | None = None) -> float:
-        """Return a standard deviation: zero fixes a parameter, infinity frees it."""
-        if stated is None:
-            return np.inf if name in rules.free else 0.0
-        return stated
-
     tilt = None if rules.sigma_tilt is None else float(np.tan(np.radians(rules.sigma_tilt)))
+    stated = {"level": rules.sigma_level, "tilt": tilt, "index": rules.sigma_index}
+    surface: dict[str, float] = dict.fromkeys(rules.free, np.inf)
+    surface |= {name: sigma for name, sigma in stated.items() if sigma is not None}
     return Unknowns(
         poses=rules.poses,
         fixed_images=rules.fixed_images,
         lens=lens,
-        level_sigma_m=sigma_of("level", rules.sigma_level),
-        tilt_sigma=sigma_of("tilt", tilt),
-        index_sigma=sigma_of("index", rules.sigma_index),
-        shape_sigma=sigma_of("shape"),
-        distance_sigma_m=sigma_of("distance"),
-        centre_sigma_m=sigma_of("centre"),
+        surface=surface,
         free_network=rules.datum == "free",
     )
 
@@ -289,39 +280,30 @@ def check_control(found: Adjusted, name: str) -> None:
     both count: the coordinates as they appear in the images.
     """
     block = found.block
-    rows = block.tie_points + np.flatnonzero(block.is_surveyed[block.tie_points :])
-    px, sigmas = np.array([_error_of(found, int(i)) for i in rows]).reshape(-1, 2).T
+    known, fits = np.isfinite(block.surveyed_sigma_m), np.isfinite(found.residual_px).all(axis=1)
+    fits &= np.isfinite(block.sigma_px)
+    marks = np.flatnonzero(fits & block.is_surveyed[block.owner])
+    point, camera = block.owner[marks], block.camera[marks]
+    off_m = np.where(known, found.xyz - block.surveyed_xyz, 0.0)[point]
+    off_px = np.linalg.norm(found.residual_px[marks], axis=1)
+    away = np.linalg.norm(found.cameras.centres[camera] - found.xyz[point], axis=1)
+    focal = np.array([lens.focal for lens in found.cameras.lenses or ()])[camera]
+    px = off_px + np.linalg.norm(off_m, axis=1) * focal / away
+    of_place = (np.abs(off_m) / block.surveyed_sigma_m[point]).max(axis=1)
+    sigmas = np.maximum(off_px / block.sigma_px[marks], of_place)
     gross = (px > GROSS_PX) & (sigmas > GROSS_SIGMAS)
     if not gross.any():
         return
     worst = int(np.argmax(np.where(gross, px, 0.0)))
-    others = int(gross.sum()) - 1
-    point = block.control_names[rows[worst] - block.tie_points]
+    others = len(np.unique(point[gross])) - 1
+    name_of_worst = block.control_names[point[worst] - block.tie_points]
     words = (
-        f"{name}: control point {point} does not fit: its error is {px[worst]:.0f} px or"
+        f"{name}: control point {name_of_worst} does not fit: its error is {px[worst]:.0f} px or"
         f" {sigmas[worst]:.0f} standard deviations{f' ({others} more do not)' if others else ''}."
         f" {_REMEDY}"
     )
-    raise GeometryError("gcps.gross_error", words, path=name, point=point, off_px=float(px[worst]))
-
-
-def _error_of(found: Adjusted, point: int) -> tuple[float, float]:
-    """Return the error of a control point in the images, and in standard deviations."""
-    block = found.block
-    marks = slice(block.start[point], block.start[point + 1])
-    sigma_px, residual = block.sigma_px[marks], found.residual_px[marks]
-    seen = np.isfinite(residual).all(axis=1) & np.isfinite(sigma_px)
-    if not seen.any():
-        return 0.0, 0.0
-    off = np.linalg.norm(residual[seen], axis=1)
-    known = np.isfinite(block.surveyed_sigma_m[point])
-    place = np.where(known, found.xyz[point] - block.surveyed_xyz[point], 0.0)
-    camera = block.camera[marks][seen]
-    away = np.linalg.norm(found.cameras.centres[camera] - found.xyz[point], axis=1)
-    focal = np.array([lens.focal for lens in found.cameras.lenses or ()])[camera]
-    px = float(off.max() + np.linalg.norm(place) * float(np.median(focal / away)))
-    of_place = np.abs(place[known] / block.surveyed_sigma_m[point][known]).max(initial=0.0)
-    return px, float(max((off / sigma_px[seen]).max(), of_place))
+    values = {"point": name_of_worst, "off_px": float(px[worst])}
+    raise GeometryError("gcps.gross_error", words, path=name, **values)
 
 
 # Datum and heights of the bed
@@ -370,15 +352,15 @@ def offset_of(found: Adjusted) -> tuple[FloatArray, FloatArray] | None:
     with_centres = np.zeros((len(weight), 6, 3))
     with_centres[:, 3:] = weight[:, :, None] * axes.transpose(0, 2, 1)
     shared = np.zeros((problem.given.shared, 3))
-    reduced = reduced_at(problem, now)
-    taken_up = np.vstack([with_centres.reshape(-1, 3), shared])[reduced.active]
-    solve_for = solver(reduced)
+    matrix, right_side = reduced_at(problem, now)
+    taken_up = np.vstack([with_centres.reshape(-1, 3), shared])[problem.active]
+    solve_for = solver(matrix)
     if solve_for is None or not taken_up.any():
         return None
     own = np.einsum("kij,kj,klj->il", axes, weight, axes) + np.eye(3) / UNKNOWN_M**2
     covariance = np.linalg.inv(own - taken_up.T @ solve_for(taken_up))
     side = -np.einsum("kij,kj->i", axes, weight * np.nan_to_num(found.gnss_residual_m))
-    step = covariance @ (side - taken_up.T @ solve_for(reduced.right))
+    step = covariance @ (side - taken_up.T @ solve_for(right_side))
     return step, max(found.sigma0, 1.0) * np.sqrt(np.diag(covariance))
 
 

@@ -32,13 +32,22 @@ from pcfix.adjust.collinearity import (
     State,
     Workspace,
     condition,
-    image,
     image_and_all_gradients,
     lens_gradients,
     workspace,
 )
 from pcfix.kernels import Span, device, in_tiles, kernel
-from pcfix.lens.algebra import inverted
+from pcfix.lens.algebra import (
+    beyond,
+    cross,
+    dot,
+    inverted,
+    minus,
+    row_of,
+    times,
+    transposed_times,
+    vector,
+)
 from pcfix.model import BoolArray, FloatArray, IntArray
 
 PARTS, PARTS_BYTES = 8, 100_000_000
@@ -57,20 +66,17 @@ class Rule(NamedTuple):
 
     kind : loss function; scale : where it departs from least squares, in standard deviations.
     damping : Levenberg-Marquardt's factor on the diagonal of V (that of the poses is added later).
-    singular : determinant of V over the product of its diagonal, below which a point is left out.
     """
 
     kind: int = SQUARES
     scale: float = 1.0
     damping: float = 0.0
-    singular: float = 1e-14
 
 
-PLAIN = Rule()
-TESTED = Rule(singular=1e-12)
-UNDAMPED = Rule(singular=1e-11)
-"""Leaves out points whose rays meet at less than about 1e-5 rad, which have no finite covariance.
-"""
+UNDAMPED = Rule()
+SINGULAR = 1e-11
+"""Determinant of V over the product of its diagonal, below which a point does not count: its rays
+meet at less than about 1e-5 rad, so that it has no finite covariance."""
 
 
 def in_parts(
@@ -130,33 +136,20 @@ def linearise(
             if given.column[i] >= 0:
                 shared[axis, given.column[i]] = own[axis, SURFACE + i]
     if given.similarity >= 0:
-        _similarity_gradients(state, given, c, row)
+        # all poses move together: with t, phi, s and d = C - pivot, C by t + phi x d + s d and R by
+        # exp(-R phi) R; single ones do not move
+        d = minus(row_of(state.centres, c), vector(given.pivot))
+        for axis in range(2):
+            at, by_centre = given.similarity, vector(row[axis], 3)
+            turn = cross(d, by_centre)
+            rolled = transposed_times(state.rotations[c], vector(row[axis]))
+            for i in range(3):
+                shared[axis, at + i], shared[axis, at + 3 + i] = by_centre[i], turn[i] - rolled[i]
+            shared[axis, at + 6] = dot(d, by_centre)
+            row[axis, :POINT] = 0.0
     r *= w
     row *= w
     return True
-
-
-@device
-def _similarity_gradients(state: State, given: Given, c: int, row: FloatArray) -> None:
-    """Fill in the derivatives by a shift t, a turn phi and a scale s of all poses together.
-
-    C moves by t + phi x d + s d with d = C - pivot, and R by exp(-R phi) R. Single poses do not
-    move then.
-    """
-    r, pivot, at = state.rotations[c], given.pivot, SHARED + given.similarity
-    dx = state.centres[c, 0] - pivot[0]
-    dy = state.centres[c, 1] - pivot[1]
-    dz = state.centres[c, 2] - pivot[2]
-    for axis in range(2):
-        cx, cy, cz = row[axis, 3], row[axis, 4], row[axis, 5]
-        row[axis, at], row[axis, at + 1], row[axis, at + 2] = cx, cy, cz
-        turn = (dy * cz - dz * cy, dz * cx - dx * cz, dx * cy - dy * cx)
-        for i in range(3):
-            rolled = r[0, i] * row[axis, 0] + r[1, i] * row[axis, 1] + r[2, i] * row[axis, 2]
-            row[axis, at + 3 + i] = turn[i] - rolled
-        row[axis, at + 6] = dx * cx + dy * cy + dz * cz
-        for i in range(POINT):
-            row[axis, i] = 0.0
 
 
 @device
@@ -187,7 +180,7 @@ def linearise_point(
             rhs[i] += weight * (given.surveyed_xyz[p, i] - state.xyz[p, i])
     for i in range(3):
         v[i, i] += rule.damping * v[i, i]
-    if count == 0 or not inverted(v, rule.singular):
+    if count == 0 or not inverted(v, SINGULAR):
         return 0, 0
     return count, images
 
@@ -226,7 +219,7 @@ def residuals(state: State, given: Given) -> FloatArray:
 def _residuals(span: Span, state: State, given: Given, found: FloatArray, work: Workspace) -> None:
     for p in range(*span):
         for o in range(given.start[p], given.start[p + 1]):
-            u, v = image(state, given, p, given.camera[o], work)
+            u, v = image_and_all_gradients(state, given, p, given.camera[o], work, work.own)
             found[o, 0], found[o, 1] = given.image_xy[o, 0] - u, given.image_xy[o, 1] - v
 
 
@@ -278,8 +271,8 @@ def _sum_up(
     span: Span, state: State, given: Given, rule: Rule, sums: Equations, work: Workspace
 ) -> None:
     """Add up the reduced normal equations of some points: the lower triangle if symmetric."""
-    g, poses, rhs, is_tested = given.shared, 6 * len(state.centres), work.rhs, len(given.tests) > 0
-    most, y = 6 * len(work.row) + g, np.empty(3)
+    g, poses, is_tested = given.shared, 6 * len(state.centres), len(given.tests) > 0
+    most = 6 * len(work.row) + g
     w, w_right, unknown = np.empty((most, 3)), np.empty((most, 3)), np.empty(most, np.int64)
     for p in range(*span):
         count, _ = linearise_point(state, given, rule, p, work)
@@ -303,9 +296,8 @@ def _sum_up(
         # minus W V^-1 W' and W V^-1 B'r
         used = _couple(given, poses, work, count, w, w_right, unknown)
         for i in range(used):
-            _times_inverse(w[i], work.v, y)
-            line = sums.matrix[unknown[i]]
-            sums.right[unknown[i]] -= y[0] * rhs[0] + y[1] * rhs[1] + y[2] * rhs[2]
+            y, line = transposed_times(work.v, vector(w[i])), sums.matrix[unknown[i]]
+            sums.right[unknown[i]] -= dot(y, vector(work.rhs))
             for b in range(count + 1):
                 # the six columns of a camera, or all shared ones; if S is symmetric, those of the
                 # lower triangle
@@ -313,11 +305,7 @@ def _sum_up(
                 first = unknown[at] if width else 0
                 if first <= unknown[i] or is_tested:
                     for j in range(width):
-                        line[first + j] -= (
-                            y[0] * w_right[at + j, 0]
-                            + y[1] * w_right[at + j, 1]
-                            + y[2] * w_right[at + j, 2]
-                        )
+                        line[first + j] -= dot(y, row_of(w_right, at + j))
 
 
 @device
@@ -348,13 +336,6 @@ def _couple(
     return used
 
 
-@device
-def _times_inverse(w: FloatArray, v: FloatArray, y: FloatArray) -> None:
-    """Fill in y = w V^-1."""
-    for j in range(3):
-        y[j] = w[0] * v[0, j] + w[1] * v[1, j] + w[2] * v[2, j]
-
-
 def point_steps(state: State, given: Given, rule: Rule, moved: FloatArray) -> FloatArray:
     """Return the steps of the points, shape (m, 3), given those of all others, (6 k + g,)."""
     steps = np.zeros((len(state.xyz), 3))
@@ -381,8 +362,8 @@ def _point_steps(
                     change += row[SHARED + i] * moved[first + i]
                 for i in range(3):
                     rhs[i] -= work.left[a, axis, POINT + i] * change
-        for i in range(3 if count else 0):
-            steps[p, i] = v[i, 0] * rhs[0] + v[i, 1] * rhs[1] + v[i, 2] * rhs[2]
+        if count:
+            steps[p, 0], steps[p, 1], steps[p, 2] = times(v, vector(rhs))
 
 
 # The equations of single observations, and covariances
@@ -420,7 +401,7 @@ def linearised(state: State, given: Given, rule: Rule, first: int, last: int) ->
     return rows
 
 
-@kernel
+@kernel(allocates=True)
 def _linearised(
     span: Span, state: State, given: Given, rule: Rule, rows: LinearisedRows, work: Workspace
 ) -> None:
@@ -431,14 +412,9 @@ def _linearised(
         for a in range(count):
             at = first + a
             rows.observation[at], rows.is_image[at] = work.row[a], a < images
-            for axis in range(2):
-                rows.r[at, axis] = work.r[a, axis]
-                for i in range(rows.columns.shape[2]):
-                    rows.columns[at, axis, i] = work.right[a, axis, i]
-        for i in range(3 if count else 0):
-            rows.rhs[point, i] = work.rhs[i]
-            for j in range(3):
-                rows.inverse[point, i, j] = work.v[i, j]
+            rows.r[at], rows.columns[at] = work.r[a], work.right[a]
+        if count:
+            rows.rhs[point], rows.inverse[point] = work.rhs, work.v
 
 
 class SparseRows(NamedTuple):
@@ -525,7 +501,6 @@ def _point_covariances(
 ) -> None:  # fmt: skip
     most, poses = 6 * len(work.row) + given.shared, 6 * len(state.centres)
     w, y, unknown = np.empty((most, 3)), np.empty((most, 3)), np.empty(most, np.int64)
-    total = np.empty((3, 3))
     for p in range(*span):
         count, _ = linearise_point(state, given, UNDAMPED, p, work)
         if count == 0:
@@ -535,17 +510,14 @@ def _point_covariances(
         for i in range(_couple(given, poses, work, count, w, y, unknown)):
             at = place[unknown[i]]
             if at >= 0:
-                _times_inverse(w[i], work.v, y[used])
+                y[used, 0], y[used, 1], y[used, 2] = transposed_times(work.v, vector(w[i]))
                 unknown[used], used = at, used + 1
-        total[:] = work.v
+        total = work.v
         for i in range(used):
-            s0, s1, s2 = 0.0, 0.0, 0.0
+            s = (0.0, 0.0, 0.0)
             for j in range(used):
-                q = inverse[unknown[i], unknown[j]]
-                s0, s1, s2 = s0 + q * y[j, 0], s1 + q * y[j, 1], s2 + q * y[j, 2]
+                s = beyond(s, inverse[unknown[i], unknown[j]], row_of(y, j))
             for j in range(3):
-                total[j, 0] += y[i, j] * s0
-                total[j, 1] += y[i, j] * s1
-                total[j, 2] += y[i, j] * s2
-        out[p, 0], out[p, 1], out[p, 2] = total[0, 0], total[0, 1], total[0, 2]
-        out[p, 3], out[p, 4], out[p, 5] = total[1, 1], total[1, 2], total[2, 2]
+                for k in range(3):
+                    total[j, k] += y[i, j] * s[k]
+        out[p, :3], out[p, 3:5], out[p, 5] = total[0], total[1, 1:], total[2, 2]

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -33,25 +33,12 @@ from pcfix.adjust.block import (
 )
 from pcfix.adjust.normal import point_covariances
 from pcfix.adjust.problem import Problem, Solution, polynomial, pose_gradients
-from pcfix.adjust.solve import (
-    BED,
-    LIMITS,
-    Reduced,
-    moved_by,
-    reduced_at,
-    singular,
-    solver,
-    words_of,
-)
+from pcfix.adjust.solve import BED, LIMITS, moved_by, reduced_at, singular, solver, words_of
 from pcfix.errors import PcfixWarning
 from pcfix.model import Cameras, FloatArray, IntArray, WaterPlane, WaterRaster, WaterSurface
 
 DENSE_UP_TO = 12_000
 """Unknowns up to which the whole inverse is computed (1.2 GB)."""
-
-QUICK = 1000
-"""Unknowns up to which LAPACK's dpotri takes longer than a plain inverse: on busy cores its threads
-wait for one another for a third of a second."""
 
 SINGULAR = 1e-13
 """Reciprocal condition of the scaled matrix below which its inverse is meaningless."""
@@ -120,21 +107,14 @@ def precision_of(
         Further factors of standard errors: of angles and centres of all poses, and of the shared
         unknowns; see `pcfix.adjust.shared_errors`.
     """
-    reduced, state, given = reduced_at(problem, solution), solution.state, problem.given
-    active, k, g = reduced.active, len(state.centres), given.shared
+    matrix, state, given = reduced_at(problem, solution)[0], solution.state, problem.given
+    active, k, g = problem.active, len(state.centres), given.shared
     times = np.ones(6 + g) if factor is None else factor
     variance, u = sigma0 * sigma0, len(active)
     notes: list[PcfixWarning] = []
-    is_fixed = np.isfinite(point_covariances(state, given, active[:0], np.zeros((0, 0)))[:, 0])
-    if not is_fixed.all():
-        loose = int((~is_fixed).sum())
-        words = f"{loose:,} points are not determined by their images and have no covariance."
-        notes.append(PcfixWarning("adjust.loose_points", words, points=loose))
-    inverse, solve_for = None, None
-    if u <= DENSE_UP_TO:
-        inverse = _inverse(reduced)
-    else:
-        solve_for = solver(reduced)
+    inverse = _inverse(matrix) if u <= DENSE_UP_TO else None
+    solve_for = solver(matrix) if u > DENSE_UP_TO else None
+    if u > DENSE_UP_TO:
         words = (
             f"The block has {u:,} unknowns (limit {DENSE_UP_TO:,}), so its points have no"
             " covariances, and the correction cannot use the errors of the poses."
@@ -166,6 +146,10 @@ def precision_of(
         inverse *= each
         inverse *= each[:, None]
         points = variance * point_covariances(state, given, active, inverse)
+        loose = int(np.isnan(points[:, 0]).sum())
+        if loose:
+            words = f"{loose:,} points are not determined by their images and have no covariance."
+            notes.append(PcfixWarning("adjust.loose_points", words, points=loose))
         members = members_of(problem, solution, active, sigma0 * drawn(inverse))
     sigma = np.sqrt(np.diag(of_shared))
     correlation = of_shared / sigma / sigma[:, None]
@@ -187,11 +171,10 @@ def _pose_blocks(k: int, active: IntArray, columns: Callable[[IntArray], FloatAr
     return poses
 
 
-def _inverse(reduced: Reduced) -> FloatArray | None:
+def _inverse(matrix: Any) -> FloatArray | None:
     """Return the whole inverse, by Cholesky's method with a unit diagonal; None if singular."""
-    from scipy.linalg import lapack
+    from scipy.linalg import cho_factor, cho_solve
 
-    matrix = reduced.matrix
     if matrix.shape[0] == 0:
         return np.zeros((0, 0))
     a = np.array(matrix if isinstance(matrix, np.ndarray) else matrix.toarray(), order="F")
@@ -201,22 +184,17 @@ def _inverse(reduced: Reduced) -> FloatArray | None:
     scale = 1.0 / np.sqrt(diagonal)
     a *= scale
     a *= scale[:, None]
-    norm = lapack.dlange("1", a)  # type: ignore[call-arg]
-    factor, failed = lapack.dpotrf(a, lower=1, overwrite_a=len(a) > QUICK)
-    if failed:
+    norm = np.linalg.norm(a, 1)
+    try:  # in place where possible, as memory matters
+        factor = cho_factor(a, lower=True, overwrite_a=True)
+    except np.linalg.LinAlgError:
         return None
-    if len(a) <= QUICK:
-        a = np.linalg.inv(a)
-        a = 0.5 * (a + a.T)
-    else:  # in place of the factor, as memory matters
-        a, _ = lapack.dpotri(factor, lower=1, overwrite_c=1)
-        for i in range(1, len(a)):
-            a[:i, i] = a[i, :i]
-    if not norm * lapack.dlange("1", a) * SINGULAR < 1.0:  # type: ignore[call-arg]
+    inverse = np.asarray(cho_solve(factor, np.eye(len(a), order="F"), overwrite_b=True))
+    if not norm * np.linalg.norm(inverse, 1) * SINGULAR < 1.0:
         return None
-    a *= scale
-    a *= scale[:, None]
-    return np.asarray(a)
+    inverse *= scale
+    inverse *= scale[:, None]
+    return inverse
 
 
 # What is known poorly
@@ -340,13 +318,13 @@ class Members:
     shift_m: FloatArray  # (m, k, 3), of the centres, along the same axes
     lens_names: tuple[str, ...]  # length p
     lens: FloatArray  # (m, k, p), added to these parameters
-    water: FloatArray  # (m, 7), or (m, 4) for a plane
+    water: FloatArray  # (m, 7)
 
     def __len__(self) -> int:
         return len(self.turn)
 
-    def rows_of(self, cameras: Cameras) -> IntArray | None:
-        """Return the row of each of some cameras, in any CRS; None for another block."""
+    def aligned(self, cameras: Cameras) -> Members | None:
+        """Return the members in the order of their cameras, in any CRS; None for other cameras."""
         row = {label: i for i, label in enumerate(self.labels)}
         if len(row) < len(self.labels) or sorted(cameras.labels) != sorted(self.labels):
             return None
@@ -361,18 +339,22 @@ class Members:
         # maps differ in scale
         there = there * (here.mean() / max(float(there.mean()), SAME_M))
         is_same = np.abs(focal / self.focal[rows] - 1.0).max() < SAME_FOCAL
-        return rows if is_same and np.abs(there - here).max() < SAME_M else None
+        if not is_same or np.abs(there - here).max() >= SAME_M:
+            return None
+        return Members(
+            cameras.labels, self.centres[rows], self.focal[rows], self.turn[:, rows],
+            self.shift_m[:, rows], self.lens_names, self.lens[:, rows], self.water,
+        )  # fmt: skip
 
-    def cameras(self, member: int, nominal: Cameras, rows: IntArray) -> Cameras:
-        """Return the cameras of a member; `rows` is `rows_of` the nominal ones."""
+    def cameras(self, member: int, nominal: Cameras) -> Cameras:
+        """Return the cameras of a member, given the adjusted ones in the same order."""
         rotations = np.asarray(nominal.rotations)
-        turn, shift = self.turn[member, rows], self.shift_m[member, rows]
-        codes, by = tuple(CODES[name] for name in self.lens_names), self.lens[member, rows]
-        lenses = zip(nominal.lenses or (), by, strict=True)
+        codes = tuple(CODES[name] for name in self.lens_names)
+        lenses = zip(nominal.lenses or (), self.lens[member], strict=True)
         return replace(
             nominal,
-            centres=nominal.centres + np.einsum("kji,kj->ki", rotations, shift),
-            rotations=Rotation.from_rotvec(turn).as_matrix() @ rotations,
+            centres=nominal.centres + np.einsum("kji,kj->ki", rotations, self.shift_m[member]),
+            rotations=Rotation.from_rotvec(self.turn[member]).as_matrix() @ rotations,
             lenses=tuple(moved_lens(lens, codes, add) for lens, add in lenses),
         )
 

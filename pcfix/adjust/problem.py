@@ -30,7 +30,7 @@ from pcfix.adjust.block import (
     usable_codes,
 )
 from pcfix.adjust.collinearity import SHARED, Given, State, Workspace, condition
-from pcfix.adjust.normal import PLAIN, Rule, cost_of, in_parts, point_steps, residuals
+from pcfix.adjust.normal import UNDAMPED, Rule, cost_of, in_parts, point_steps, residuals
 from pcfix.errors import GeometryError
 from pcfix.kernels import Span, kernel
 from pcfix.lens.imaging import lens_table
@@ -73,6 +73,11 @@ class Problem:
     codes: list[tuple[int, ...]]  # free lens parameters of each sensor
     moves: BoolArray  # (6 k + g,), which poses and shared unknowns are free
     names: list[str]  # of the shared unknowns
+
+    @property
+    def active(self) -> IntArray:
+        """The free poses and shared unknowns, those of the reduced equations, shape (a,)."""
+        return np.flatnonzero(self.moves)
 
     @property
     def used(self) -> BoolArray:
@@ -126,13 +131,13 @@ def prepare(
     origin = np.round(cameras.centres.mean(axis=0)) if origin is None else origin
     group, groups = sensor_groups(cameras.lenses)
     codes = [usable_codes(cameras.lenses[images[0]], unknowns.lens) for images in groups]
-    if (unknowns.tilt_sigma or unknowns.shape_sigma) and isinstance(water, WaterMesh | WaterRaster):
-        what = "tilt" if unknowns.tilt_sigma else "shape"
-        words = (
-            f"The {what} of the water can be free for a level or plane only, not for a mesh or"
-            " raster."
-        )
-        raise GeometryError("adjust.fixed_surface", words, unknown=what)
+    for what in ("tilt", "shape"):
+        if unknowns.surface.get(what) and isinstance(water, WaterMesh | WaterRaster):
+            words = (
+                f"The {what} of the water can be free for a level or plane only, not for a mesh or"
+                " raster."
+            )
+            raise GeometryError("adjust.fixed_surface", words, unknown=what)
     numbers = surface_numbers(block, origin)
     planes, plane_names, axis, alike = _planes(block, origin, numbers)
     # columns of the shared unknowns: lenses, then surface and planes, then a similarity
@@ -163,15 +168,13 @@ def prepare(
         camera=np.ascontiguousarray(block.camera, np.int64),
         image_xy=np.ascontiguousarray(block.image_xy, np.float64),
         weight=1.0 / np.asarray(block.sigma_px, np.float64),
-        wet=np.ascontiguousarray(block.wet, np.bool_),
+        wet=np.ascontiguousarray(block.wet & (water is not None), np.bool_),
         lens_row=row.astype(np.int64),
         group=group,
-        has_water=water is not None,
         tin=build_tin(water) if isinstance(water, WaterMesh) else None,
         field=build_field(water) if isinstance(water, WaterRaster) else None,
         origin=origin,
-        port=np.zeros(0) if block.port is None else port_coefficients(block.port),
-        curved=unknowns.shape_sigma != 0.0,
+        curved=bool(unknowns.surface.get("shape")),
         first_lens=first_lens,
         code=np.array([code for of_sensor in codes for code in of_sensor], np.int64),
         column=column,
@@ -196,7 +199,7 @@ def prepare(
     )  # fmt: skip
     state = State(
         centres, np.ascontiguousarray(cameras.rotations, np.float64), table, block.xyz - origin,
-        np.concatenate([numbers, planes]),
+        np.concatenate([numbers, planes]), port_row(block.port),
     )  # fmt: skip
     return problem, Solution(state, cameras.lenses, np.zeros(len(names)), np.inf, [])
 
@@ -289,6 +292,11 @@ def port_of(block: Block, numbers: FloatArray) -> Port | None:
     return None
 
 
+def port_row(port: Port | None) -> FloatArray:
+    """Return the coefficients of a port for kernels; none without a port."""
+    return np.zeros(0) if port is None else port_coefficients(port)
+
+
 def water_of(problem: Problem, state: State) -> WaterSurface | None:
     """Return the water surface of a state, world frame."""
     water, origin = problem.block.water, problem.origin
@@ -322,7 +330,7 @@ def _curved_raster(problem: Problem, state: State) -> WaterRaster:
 
 def polynomial(water: FloatArray, x: FloatArray | float, y: FloatArray | float) -> FloatArray:
     """Return the height of the water at x, y, block frame."""
-    (a, b, c), (d, e, f) = water[:3], water[SHAPE:PORT] if len(water) > SHAPE else (0.0, 0.0, 0.0)
+    (a, b, c), (d, e, f) = water[:3], water[SHAPE:PORT]
     return np.asarray(a + b * x + c * y + d * x * x + e * x * y + f * y * y)
 
 
@@ -389,12 +397,12 @@ def _undetermined_motions(problem: Problem) -> list[int]:
 
     A water surface whose level or tilt is not free determines height or tilt of the block.
     """
-    unknowns = problem.unknowns
-    refracts = problem.block.refractive_index != 1.0 or unknowns.index_sigma > 0.0
-    if not (problem.given.has_water and refracts and problem.block.wet.any()):
+    sigma = problem.unknowns.surface
+    refracts = problem.block.refractive_index != 1.0 or sigma.get("index", 0.0) > 0.0
+    if not (refracts and problem.given.wet.any()):
         return list(range(7))
-    level = [2] if np.isinf(unknowns.level_sigma_m) else []
-    tilt = [3, 4] if np.isinf(unknowns.tilt_sigma) else []
+    level = [2] if sigma.get("level") == np.inf else []
+    tilt = [3, 4] if sigma.get("tilt") == np.inf else []
     return [0, 1, *level, *tilt, 5, 6]
 
 
@@ -482,7 +490,7 @@ def intersect_fixed(block: Block) -> Intersected:
     nothing = np.zeros(len(problem.moves))
     state, step = now.state, np.full((len(block.xyz), 3), np.inf)
     for _ in range(STEPS):
-        step = point_steps(state, problem.given, PLAIN, nothing)
+        step = point_steps(state, problem.given, UNDAMPED, nothing)
         state = state._replace(xyz=state.xyz + step)
         if np.nanmax(np.abs(step), initial=0.0) < CLOSE_M:
             break

@@ -32,13 +32,11 @@ from pcfix.adjust.problem import (
     Solution,
     intersect_fixed,
     port_of,
-    prepare,
     solved_cameras,
     surface_distances,
     surface_numbers,
     water_of,
 )
-from pcfix.adjust.solve import solve
 from pcfix.errors import PcfixWarning, plain
 from pcfix.model import BoolArray, Cameras, FloatArray, WaterPlane, WaterSurface
 from pcfix.port.shapes import Port, spec_of
@@ -49,11 +47,11 @@ Source = Literal["tie points", "cloud"]
 Plain = dict[str, Any]
 
 MOST_DEPTH_BINS = 8
-WATER_SIGMAS = (
-    "level_sigma_m", "tilt_sigma", "index_sigma", "shape_sigma", "distance_sigma_m",
-    "centre_sigma_m",
-)  # fmt: skip
-"""Standard deviations among `Unknowns`."""
+SIGMAS = {
+    "level_sigma_m": "level", "tilt_sigma": "tilt", "index_sigma": "index", "shape_sigma": "shape",
+    "distance_sigma_m": "distance", "centre_sigma_m": "centre",
+}  # fmt: skip
+"""Keys of the standard deviations of `Unknowns.surface`."""
 
 
 class ControlRow(NamedTuple):
@@ -66,17 +64,6 @@ class ControlRow(NamedTuple):
     dz_m: float
     rms_px: float
     images: int
-
-
-class OnSurface(NamedTuple):
-    """Marked points on a surface: how many, their stated and found distances in metres."""
-
-    surface: str
-    points: int
-    sigma_m: float
-    rms_m: float
-    largest_m: float
-    largest_point: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +91,7 @@ class Adjusted:
     origin: FloatArray  # of the block's frame
     numbers: FloatArray  # `pcfix.adjust.collinearity.State.water` there
     port: Port | None = None  # adjusted
-    on_surfaces: list[OnSurface] = field(default_factory=list)  # points on the water or on planes
+    on_surfaces: list[Plain] = field(default_factory=list)  # of points on the water or on planes
 
     @property
     def is_observed(self) -> BoolArray:
@@ -188,8 +175,7 @@ def _with_check_points(problem: Problem, now: Solution) -> FloatArray:
         refractive_index=float(now.state.water[INDEX]),
         sigma_px=np.where(np.isin(block.owner, rows), 1.0, np.inf),
     )  # fmt: skip
-    part, start = prepare(whole, Unknowns(poses="fixed", lens=()))
-    xyz[rows] = solve(part, start).state.xyz[rows] + part.origin
+    xyz[rows] = intersect_fixed(whole).xyz[rows]
     return xyz
 
 
@@ -207,8 +193,9 @@ def _control_rows(block: Block, xyz: FloatArray, r: FloatArray) -> list[ControlR
     return rows
 
 
-def _on_surfaces(problem: Problem, now: Solution) -> list[OnSurface]:
-    given, block, found = problem.block.conditions, problem.block, []
+def _on_surfaces(problem: Problem, now: Solution) -> list[Plain]:
+    """Return the stated and found distances of marked points from each surface, metres."""
+    given, block, found = problem.block.conditions, problem.block, list[Plain]()
     if given is None:
         return []
     off = np.where(np.diff(block.start) > 0, surface_distances(problem, now), np.nan)
@@ -216,9 +203,14 @@ def _on_surfaces(problem: Problem, now: Solution) -> list[OnSurface]:
         rows = np.flatnonzero((given.on == number) & np.isfinite(off))
         if len(rows):
             worst = rows[np.argmax(np.abs(off[rows]))]
-            rms, sigma = (float(np.sqrt(np.mean(v[rows] ** 2))) for v in (off, given.sigma_m))
-            label = block.control_names[worst - block.tie_points]
-            found.append(OnSurface(name, len(rows), sigma, rms, float(abs(off[worst])), label))
+            found.append({
+                "surface": name,
+                "points": len(rows),
+                "sigma_m": rms(given.sigma_m[rows]),
+                "rms_m": rms(off[rows]),
+                "largest_m": abs(off[worst]),
+                "largest_point": block.control_names[worst - block.tie_points],
+            })  # fmt: skip
     return found
 
 
@@ -263,7 +255,7 @@ def adjustment_dict(adjusted: Adjusted, before: Intersected | None = None) -> Pl
         "port": block.port is not None,
         "unknowns": {
             "lens": u.lens,
-            **{name: getattr(u, name) for name in WATER_SIGMAS},
+            **{key: u.surface.get(name, 0.0) for key, name in SIGMAS.items()},
             "free_network": u.free_network,
             "parallel": () if block.conditions is None else block.conditions.parallel,
         },
@@ -278,22 +270,13 @@ def adjustment_dict(adjusted: Adjusted, before: Intersected | None = None) -> Pl
         "lens": _lens(a),
         "water": _water(a),
         "port_found": _port(a),
-        "on_surfaces": [row._asdict() for row in a.on_surfaces],
+        "on_surfaces": a.on_surfaces,
         "poses": _poses(a),
         "precision": None if known is None else _precision(known),
         "gnss": _gnss(a),
         "control": _surveyed([row for row in a.control if row.role == "control"]),
         "check": _surveyed([row for row in a.control if row.role == "check"]),
-        "rounds": [
-            {
-                "round": row.round,
-                "steps": row.step,
-                "cost": row.cost,
-                "observations": row.observations,
-                "rms_px": row.rms_px,
-            }
-            for row in {row.round: row for row in a.rounds}.values()
-        ],
+        "rounds": [row._asdict() for row in {row.round: row for row in a.rounds}.values()],
         "notes": [one.as_dict() for one in {str(one): one for one in notes}.values()],
     }
     return dict(plain(found))
@@ -409,7 +392,7 @@ def _water(a: Adjusted) -> Plain | None:
         heights = surface_above(original, a.xyz).height_m
         height_m = float(mean(heights))
         names = names if np.isfinite(heights).any() else ["index"]
-    names += WATER_NAMES[SHAPE:PORT] if a.unknowns.shape_sigma else []
+    names += WATER_NAMES[SHAPE:PORT] if a.unknowns.surface.get("shape") else []
     return {"surface": str(adjusted), **_numbers(a, names, height_m)}
 
 

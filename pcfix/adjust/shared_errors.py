@@ -75,16 +75,14 @@ def disagreement_of(
     """
     groups, added = _groups_by_sharing(problem, found), np.zeros(6 + problem.given.shared)
     counts = {words: len(np.unique(group)) for words, group in groups.items()}
-    reduced = reduced_at(problem, found)
-    solve_for = solver(reduced)
+    matrix, right = reduced_at(problem, found)
+    solve_for, active = solver(matrix), problem.active
     if counts[ALONE] < LEAST_GROUPS or solve_for is None:
         return 1.0 + added, []
     drawn = np.random.default_rng(1).normal(0.0, formal.sigma0, problem.given.image_xy.shape)
     *pulls, field, rest = _pulls_of(problem, found, groups, drawn)
     # the first group is that of drawn residuals, whose variances are by chance
-    by_chance, *shares = (
-        _share_of(formal, reduced.active, solve_for(pull[:, reduced.active].T)) for pull in pulls
-    )
+    by_chance, *shares = (_share_of(formal, active, solve_for(pull[:, active].T)) for pull in pulls)
     shared = list[str]()
     for words, share in zip(groups, shares, strict=False):
         is_more = share > fdtri(counts[words] - 1, counts[ALONE] - 1, SURE) * by_chance
@@ -95,10 +93,10 @@ def disagreement_of(
         if words == ALONE:
             by_chance = by_chance + more
     if counts[FRAME] >= LEAST_GROUPS:
-        active = field[:, reduced.active]
-        rest -= active @ solve_for(np.column_stack([active.T, reduced.right]))
-        likely = _likely_field(problem, groups[FRAME], formal.sigma0, rest) @ active
-        more = _share_of(formal, reduced.active, solve_for(likely.T))
+        field = field[:, active]
+        rest -= field @ solve_for(np.column_stack([field.T, right]))
+        likely = _likely_field(problem, groups[FRAME], formal.sigma0, rest) @ field
+        more = _share_of(formal, active, solve_for(likely.T))
         added = added + more
         shared += [FRAME] if (more > NOTED).any() else []
     factor = np.sqrt(1.0 + added)
@@ -216,12 +214,19 @@ def _likely_field(problem: Problem, tile: IntArray, sigma0: float, rest: FloatAr
     `tile` numbers the parts of the frame, none without observations; each sensor has its own.
     `rest` are R and the right sides c of their shifts, shape (2 t, 2 t + 1).
     """
-    one = np.eye(len(rest))
+    given, lenses, one = problem.given, problem.block.cameras.lenses or (), np.eye(len(rest))
+    half_px = 0.5 * np.array([np.hypot(lens.width, lens.height) for lens in lenses])[given.camera]
+    count = np.bincount(tile)
+    middle = [np.bincount(tile, given.image_xy[:, i] / half_px) / count for i in range(2)]
+    sensor = np.bincount(tile, given.group[given.camera]) / count
+    apart = np.sum([(axis - axis[:, None]) ** 2 for axis in middle], axis=0)
+    is_same_sensor = sensor == sensor[:, None]
     # in the eigenvectors of K R K' the pulls are independent, so that the likelihood is a product
     likely, halves = np.zeros((len(RANGES), len(STEPS))), []
     square = (LARGEST_PX * STEPS**3) ** 2  # dense where s is small
-    for i, common in enumerate(_covariances_of_tiles(problem, tile)):
-        half = np.linalg.cholesky(common + 1e-9 * one)
+    for i, length in enumerate(RANGES):
+        common = np.where(is_same_sensor, np.exp(-0.5 * apart / length**2), 0.0)
+        half = np.linalg.cholesky(np.kron(common, np.eye(2)) + 1e-9 * one)
         halves.append(half)
         value, vector = np.linalg.eigh(half.T @ rest[:, :-1] @ half)
         shows = value > NO_FIELD * value[-1]
@@ -232,21 +237,6 @@ def _likely_field(problem: Problem, tile: IntArray, sigma0: float, rest: FloatAr
     s2_of = (weight * square).sum(axis=1) / weight.sum()
     of_all = np.sum([s2 * half @ half.T for s2, half in zip(s2_of, halves, strict=True)], axis=0)
     return np.asarray(np.linalg.cholesky(of_all + 1e-12 * one).T)
-
-
-def _covariances_of_tiles(problem: Problem, tile: IntArray) -> list[FloatArray]:
-    """Return K for each range, shape (2 t, 2 t)."""
-    given, lenses = problem.given, problem.block.cameras.lenses or ()
-    half = 0.5 * np.array([np.hypot(lens.width, lens.height) for lens in lenses])[given.camera]
-    count = np.bincount(tile)
-    middle = [np.bincount(tile, given.image_xy[:, i] / half) / count for i in range(2)]
-    sensor = np.bincount(tile, given.group[given.camera]) / count
-    apart = np.sum([(axis - axis[:, None]) ** 2 for axis in middle], axis=0)
-    alike = sensor == sensor[:, None]
-    return [
-        np.asarray(np.kron(np.where(alike, np.exp(-0.5 * apart / length**2), 0.0), np.eye(2)))
-        for length in RANGES
-    ]
 
 
 # Observations of different quality

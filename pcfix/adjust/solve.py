@@ -8,22 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pcfix.adjust.block import (
-    CODES,
-    INDEX,
-    MOTIONS,
-    PLANES,
-    PORT,
-    LogRow,
-    Progress,
-    Robust,
-    moved_lens,
-)
+from pcfix.adjust.block import CODES, INDEX, MOTIONS, LogRow, Progress, Robust, moved_lens
 from pcfix.adjust.collinearity import State
 from pcfix.adjust.normal import (
     CAUCHY,
@@ -34,14 +24,10 @@ from pcfix.adjust.normal import (
     normal_equations,
     point_steps,
 )
-from pcfix.adjust.problem import Problem, Solution, cost_at, counts_of, priors_at
-from pcfix.errors import GeometryError
+from pcfix.adjust.problem import Problem, Solution, cost_at, counts_of, port_of, port_row, priors_at
+from pcfix.errors import GeometryError, PcfixError
 from pcfix.lens.imaging import lens_table
-from pcfix.model import FloatArray, IntArray
-from pcfix.port.shapes import DomePort, FlatPort
-
-if TYPE_CHECKING:
-    from scipy.sparse import csc_array
+from pcfix.model import FloatArray
 
 LOSSES = {"squares": SQUARES, "huber": HUBER, "cauchy": CAUCHY}
 LOSS_SCALE = 2.0
@@ -108,7 +94,7 @@ def solve(
         gain = (now.cost - trial.cost) / max(now.cost, least_cost)
         now, up = trial, 2.0
         damping = max(damping / 10.0, LEAST_DAMPING)
-        row = LogRow(number, step + 1, now.cost, damping, *counts_of(problem, now))
+        row = LogRow(number, step + 1, now.cost, *counts_of(problem, now))
         log.append(row)
         if progress is not None:
             progress(row)
@@ -120,12 +106,12 @@ def solve(
 
 def _trial(problem: Problem, now: Solution, rule: Rule) -> Solution | None:
     """Return the solution one step further; None if the equations are singular."""
-    reduced = reduced_at(problem, now, rule)
-    solve_for = solver(reduced)
+    matrix, right = reduced_at(problem, now, rule)
+    solve_for = solver(matrix)
     if solve_for is None:
         return None
     step = np.zeros(len(problem.moves))
-    step[reduced.active] = solve_for(reduced.right)
+    step[problem.active] = solve_for(right)
     if not np.isfinite(step).all():
         return None
     moved = moved_by(problem, now, step, point_steps(now.state, problem.given, rule, step))
@@ -147,13 +133,11 @@ def moved_by(
         rotations = rotations @ turn.T
     water, free = state.water.copy(), given.column >= 0
     water[free] += shared[given.column[free]]
-    is_port = True
-    match problem.block.port:
-        case FlatPort():
-            is_port = bool(water[PORT] >= 0.0)
-        case DomePort(radius_m=radius):
-            is_port = bool(np.linalg.norm(water[PORT + 1 : PLANES]) < radius)
-    if not 1.0 <= water[INDEX] < 3.0 or not is_port:
+    if not 1.0 <= water[INDEX] < 3.0:
+        return None
+    try:
+        port = port_of(problem.block, water)
+    except PcfixError:  # a distance below zero, or a dome that does not contain the camera
         return None
     lenses, table = list(now.lenses), state.lenses
     if given.first_lens[-1]:
@@ -171,7 +155,7 @@ def moved_by(
         now,
         state=State(
             centres, np.ascontiguousarray(rotations), np.ascontiguousarray(table),
-            state.xyz + points, water,
+            state.xyz + points, water, port_row(port),
         ),
         lenses=tuple(lenses),
         shared=now.shared + shared,
@@ -181,22 +165,12 @@ def moved_by(
 # The reduced equations
 
 
-class Reduced(NamedTuple):
-    """The equations of the unknowns that are not points.
+def reduced_at(problem: Problem, found: Solution, rule: Rule = UNDAMPED) -> tuple[Any, FloatArray]:
+    """Return the equations of the active unknowns at a solution, with prior knowledge.
 
-    matrix : dense array or scipy's sparse one, shape (a, a), of the active unknowns.
-    right : shape (a,).
-    active : the unknowns, poses and then shared ones, that are free.
+    The matrix, shape (a, a), is dense or scipy's sparse one; the right side has the shape (a,).
     """
-
-    matrix: FloatArray | csc_array
-    right: FloatArray
-    active: IntArray
-
-
-def reduced_at(problem: Problem, found: Solution, rule: Rule = UNDAMPED) -> Reduced:
-    """Return the reduced normal equations at a solution, with prior knowledge."""
-    active = np.flatnonzero(problem.moves)
+    active = problem.active
     total, right, diagonal = normal_equations(found.state, problem.given, rule)
     _, extra, extra_right = priors_at(problem, found)
     right = right + extra_right
@@ -205,16 +179,15 @@ def reduced_at(problem: Problem, found: Solution, rule: Rule = UNDAMPED) -> Redu
     if isinstance(total, np.ndarray):
         total += extra.toarray()
         total[np.diag_indices(len(total))] += damped
-        return Reduced(total[np.ix_(active, active)], right[active], active)
+        return total[np.ix_(active, active)], right[active]
     from scipy.sparse import diags_array
 
     total = (total + extra + diags_array(damped)).tocsc()
-    return Reduced(total[active][:, active], right[active], active)
+    return total[active][:, active], right[active]
 
 
-def solver(reduced: Reduced) -> Callable[[FloatArray], FloatArray] | None:
+def solver(matrix: Any) -> Callable[[FloatArray], FloatArray] | None:
     """Return a function that solves for a right side; None if the matrix is not definite."""
-    matrix = reduced.matrix
     if matrix.shape[0] == 0:
         return lambda right: right
     diagonal = matrix.diagonal()
@@ -281,17 +254,17 @@ def singular(problem: Problem, solution: Solution) -> GeometryError:
     These have no observation at all, or a component in an eigenvector of an eigenvalue of zero of
     the reduced matrix with unit diagonal: 1e-4 makes a variance a thousand times larger.
     """
-    reduced, k = reduced_at(problem, solution), len(problem.block.cameras)
-    diagonal = reduced.matrix.diagonal()
-    unseen = reduced.active[~(diagonal > 0.0)]
+    matrix, k = reduced_at(problem, solution)[0], len(problem.block.cameras)
+    diagonal = matrix.diagonal()
+    unseen = problem.active[~(diagonal > 0.0)]
     if len(unseen):
         weak, why = np.zeros(len(problem.moves), np.bool_), "no observation depends on them"
         weak[unseen] = True
     else:
-        values, vectors = _smallest(reduced.matrix, 1.0 / np.sqrt(diagonal))
+        values, vectors = _smallest(matrix, 1.0 / np.sqrt(diagonal))
         vectors = vectors[:, values < max(WEAK, 10.0 * float(values[0]))]
         weak = np.zeros(len(problem.moves), np.bool_)
-        weak[reduced.active] = np.linalg.norm(vectors, axis=1) > 1e-4
+        weak[problem.active] = np.linalg.norm(vectors, axis=1) > 1e-4
         why = "the observations do not separate them"
     images = np.flatnonzero(weak[: 6 * k].reshape(k, 6).any(axis=1))
     labels = [problem.block.cameras.labels[i] for i in images]
@@ -313,7 +286,7 @@ def singular(problem: Problem, solution: Solution) -> GeometryError:
     )
 
 
-def _smallest(matrix: FloatArray | csc_array, scale: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _smallest(matrix: Any, scale: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the smallest eigenvalues of the scaled matrix, and their vectors."""
     if isinstance(matrix, np.ndarray):
         return np.linalg.eigh(matrix * scale * scale[:, None])

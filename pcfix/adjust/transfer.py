@@ -23,7 +23,7 @@ from pcfix.adjust.block import some_cameras
 from pcfix.errors import GeometryError, PcfixWarning
 from pcfix.kernels import Span, device, in_tiles, kernel, most_between
 from pcfix.lens.algebra import dot, minus, plus, plus_square, row_of, scaled, solved, times, vector
-from pcfix.lens.imaging import image_in_world, image_of, lens_table
+from pcfix.lens.imaging import image_in_world, image_of
 from pcfix.model import (
     BoolArray,
     Cameras,
@@ -35,6 +35,7 @@ from pcfix.model import (
     TiePoints,
     Views,
 )
+from pcfix.refract.batch import Optics, optics_of
 from pcfix.refract.choice import views_in_frame
 from pcfix.refract.tiling import spatial_order
 from pcfix.sums import MOST, Sums
@@ -61,15 +62,6 @@ REASON = "fewer than two original cameras image them"
 # Points
 
 
-class _Side(NamedTuple):
-    """Cameras for the kernels: poses, the row of each in the lens table, and the table."""
-
-    centres: FloatArray
-    rotations: FloatArray
-    row: IntArray
-    lenses: FloatArray
-
-
 def transfer(
     xyz: FloatArray, views: Views, original: Cameras, adjusted: Cameras
 ) -> tuple[FloatArray, BoolArray]:
@@ -93,22 +85,18 @@ def transfer(
     """
     shift, moved = np.zeros((len(xyz), 3)), np.zeros(len(xyz), np.bool_)
     start, camera = np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)
-    sides = (
-        _Side(
-            np.ascontiguousarray(cameras.centres),
-            np.ascontiguousarray(cameras.rotations, np.float64),
-            *lens_table(cameras.lenses or ()),
-        )
-        for cameras in (original, adjusted)
-    )
-    in_tiles(_transfer, len(xyz), np.ascontiguousarray(xyz), start, camera, *sides, shift, moved)
+    in_tiles(
+        _transfer, len(xyz), np.ascontiguousarray(xyz), start, camera,
+        np.ascontiguousarray(original.centres), optics_of(original),
+        np.ascontiguousarray(adjusted.centres), optics_of(adjusted), shift, moved,
+    )  # fmt: skip
     return shift, moved
 
 
 @kernel(allocates=True)
 def _transfer(
-    span: Span, xyz: FloatArray, start: IntArray, camera: IntArray, original: _Side,
-    adjusted: _Side, shift: FloatArray, moved: BoolArray,
+    span: Span, xyz: FloatArray, start: IntArray, camera: IntArray, original_centres: FloatArray,
+    original: Optics, centres: FloatArray, adjusted: Optics, shift: FloatArray, moved: BoolArray,
 ) -> None:  # fmt: skip
     most = most_between(span, start)
     image, who = np.empty((most, 2)), np.empty(most, np.int64)
@@ -116,19 +104,20 @@ def _transfer(
         count = 0
         for j in range(start[i], start[i + 1]):
             c = camera[j]
-            ahead = times(original.rotations[c], minus(row_of(xyz, i), row_of(original.centres, c)))
+            ahead = times(original.rotations[c], minus(row_of(xyz, i), row_of(original_centres, c)))
             u, v = image_of(original.lenses[original.row[c]], *ahead)
             if u == u and v == v:  # not NaN
                 image[count, 0], image[count, 1], who[count] = u, v, c
                 count += 1
         if count >= 2:
-            moved[i] = _intersect(shift[i], xyz[i], image[:count], who[:count], adjusted)
+            moved[i] = _intersect(shift[i], xyz[i], image[:count], who[:count], centres, adjusted)
 
 
 @device
 def _intersect(
-    shift: FloatArray, xyz: FloatArray, image: FloatArray, who: IntArray, cameras: _Side
-) -> bool:
+    shift: FloatArray, xyz: FloatArray, image: FloatArray, who: IntArray, centres: FloatArray,
+    cameras: Optics,
+) -> bool:  # fmt: skip
     """Find the shift of a point that minimises its residuals; return whether that converges."""
     moved, point = (0.0, 0.0, 0.0), vector(xyz)
     for _ in range(MAX_STEPS):
@@ -136,7 +125,7 @@ def _intersect(
         m, b = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
         for j in range(who.size):
             c = who[j]
-            ahead = minus(plus(point, moved), row_of(cameras.centres, c))
+            ahead = minus(plus(point, moved), row_of(centres, c))
             lens = cameras.lenses[cameras.row[c]]
             u, v, by_u, by_v = image_in_world(lens, cameras.rotations[c], ahead)
             m, b = plus_square(m, by_u), plus(b, scaled(image[j, 0] - u, by_u))

@@ -164,7 +164,7 @@ def adjust_into(
     material = Material(
         name, original, water, index_of(given.index, given.index_formula)[0], gnss, control,
         inputs.port, None if given.lens is None else _calibration(given.lens, original),
-        None if mask is None else mask.inside, water_unknowns.level_sigma_m, reason,
+        None if mask is None else mask.inside, water_unknowns.surface.get("level", 0.0), reason,
         given.parallel,
     )  # fmt: skip
 
@@ -320,7 +320,8 @@ def _write(folder: Path, found: Adjusted, model: str) -> None:
     before = before_of(found)
     with temporary_folder(folder) as draft:
         _write_models(draft, found)
-        moved = found.unknowns.level_sigma_m or found.unknowns.shape_sigma
+        sigma = found.unknowns.surface
+        moved = sigma.get("level") or sigma.get("shape")
         if moved and isinstance(found.water, WaterRaster):
             write_water_raster(draft / WATER_FILE, found.water, found.cameras.crs)
         if found.precision is not None and found.precision.members is not None:

@@ -40,8 +40,8 @@ from pcfix.water.checks import WaterMeeting
 from pcfix.water.surface import FoundSurface, surface_above
 
 if TYPE_CHECKING:
+    from pcfix.adjust.precision import Members
     from pcfix.adjust.transfer import CloudTransfer, TransferCounts, Transferred
-    from pcfix.flow.pose_errors import Adjustment
     from pcfix.grid.shoreline import NearWater
     from pcfix.io.views import ViewMatch, ViewReport
     from pcfix.refract.regression import BeyondRange, DepthRegression
@@ -62,7 +62,7 @@ class Plan:
     views: ViewMatch | Views | None = None  # the view list; `Views` are of all points, in order
     kind: ViewKind | None = None  # its type
     transfer: CloudTransfer | None = None  # from the original to the adjusted cameras
-    adjustment: Adjustment | None = None  # what the errors of the poses come from
+    members: Members | None = None  # of an adjustment, for the errors of the poses
     settings: dict[str, Any] = field(default_factory=dict)  # more settings for the summary
     verdicts: tuple[Verdict, ...] = ()  # on the reconstruction type
     of_unlisted: tuple[Verdict, ...] = ()  # the same for points in no view list

@@ -109,10 +109,10 @@ def read_inputs(options: CorrectOptions, view: CloudView) -> Plan:
     if inputs.regression is not None:
         plan = replace(plan, settings={"regression": str(inputs.regression), **plan.settings})
     if options.dimensions == "all" and method != "regression" and len(blocks.cameras):
-        from pcfix.flow.pose_errors import adjustment_of
+        from pcfix.flow.pose_errors import members_of
 
-        adjustment, no_poses = adjustment_of(inputs.cameras, blocks.cameras)
-        plan = replace(plan, adjustment=adjustment, no_poses=no_poses)
+        members, no_poses = members_of(inputs.cameras, blocks.cameras)
+        plan = replace(plan, members=members, no_poses=no_poses)
     return plan
 
 
@@ -187,11 +187,11 @@ def plan_correction(plan: Plan) -> Plan:
     if plan.options.depth_factor == "auto":
         found = {"depth_factor": plan.survey.settings.depth_factor}
         plan = replace(plan, settings={**plan.settings, **found})
-    if plan.adjustment is not None:
+    if plan.members is not None:
         from pcfix.flow.pose_errors import SAMPLE_POINTS, pose_errors, sample_of, with_poses
 
         sample = sample_of(view.chunks(water), match, 1 + view.points // SAMPLE_POINTS)
-        errors = pose_errors(sample, plan.survey, plan.adjustment, transfer)
+        errors = pose_errors(sample, plan.survey, plan.members, transfer)
         plan = replace(plan, survey=with_poses(plan.survey, errors))
     return plan if first is None or plan.views is None else _with_type_of_list(plan, first)
 

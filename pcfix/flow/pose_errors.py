@@ -32,15 +32,8 @@ SAMPLE_POINTS, BED_POINTS = 20_000, 1000
 """Of the cloud, and of its points under water; a thousand is enough, as the errors are smooth."""
 
 
-class Adjustment(NamedTuple):
-    """The members of an adjustment, and the row of each camera in them."""
-
-    members: Members
-    row: IntArray
-
-
-def adjustment_of(path: File | Cameras, cameras: Cameras) -> tuple[Adjustment | None, str]:
-    """Return the adjustment of cameras, if its file is in their folder, and a note."""
+def members_of(path: File | Cameras, cameras: Cameras) -> tuple[Members | None, str]:
+    """Return the members of the adjustment in the folder of its cameras, and a note if unusable."""
     if isinstance(path, Cameras):
         return None, ""
     try:
@@ -50,13 +43,13 @@ def adjustment_of(path: File | Cameras, cameras: Cameras) -> tuple[Adjustment | 
     if found is None:
         return None, ""
     where, members = found
-    row = members.rows_of(cameras)
-    if row is None:
+    aligned = members.aligned(cameras)
+    if aligned is None:
         return None, (
             f"{where}: belongs to other cameras, so SigmaZ does not include errors of the poses."
             " Use the cameras that the adjustment wrote, or remove the file."
         )
-    return Adjustment(members, row), ""
+    return aligned, ""
 
 
 class Sample(NamedTuple):
@@ -90,7 +83,7 @@ def sample_of(chunks: Iterable[Points], match: ViewMatch | None, step: int) -> S
 
 
 def pose_errors(
-    sample: Sample, survey: Survey, adjustment: Adjustment, transfer: CloudTransfer | None
+    sample: Sample, survey: Survey, members: Members, transfer: CloudTransfer | None
 ) -> PoseErrors | None:
     """Return the errors of the bed by those of the poses; None if no point is corrected.
 
@@ -99,7 +92,8 @@ def pose_errors(
     sample : Sample
     survey : Survey
         With everything that was estimated.
-    adjustment : Adjustment
+    members : Members
+        Of the adjustment of the survey's cameras, in their order.
     transfer : CloudTransfer or None
         The original cameras, if those of the survey were adjusted since.
     """
@@ -109,7 +103,7 @@ def pose_errors(
     above = surface_above(survey.water, step.xyz, sample.points.heights)
     wet = np.flatnonzero(is_submerged(step.xyz[:, 2], above) & step.moved)
     wet = wet[:: 1 + len(wet) // BED_POINTS]
-    variance_m2 = variances(sample.take(wet), survey, adjustment, transfer)
+    variance_m2 = variances(sample.take(wet), survey, members, transfer)
     known = np.flatnonzero(np.isfinite(variance_m2))
     if not len(known):
         return None
@@ -117,23 +111,22 @@ def pose_errors(
 
 
 def variances(
-    sample: Sample, survey: Survey, adjustment: Adjustment, transfer: CloudTransfer
+    sample: Sample, survey: Survey, members: Members, transfer: CloudTransfer
 ) -> FloatArray:
     """Return the variance of the heights of a sample by the poses, shape (n,); NaN if unknown."""
     with warnings.catch_warnings():  # the correction shows them
         warnings.simplefilter("ignore", PcfixWarning)
         nominal = _heights(sample, survey, transfer)
         off = [
-            _heights(sample, _survey_of(survey, adjustment, member), transfer) - nominal
-            for member in range(len(adjustment.members))
+            _heights(sample, _survey_of(survey, members, member), transfer) - nominal
+            for member in range(len(members))
         ]
     return np.asarray(np.square(off).mean(axis=0))
 
 
-def _survey_of(survey: Survey, adjustment: Adjustment, member: int) -> Survey:
+def _survey_of(survey: Survey, members: Members, member: int) -> Survey:
     """Return a survey with cameras and water of a member."""
-    members, row = adjustment
-    cameras = members.cameras(member, survey.cameras, row)
+    cameras = members.cameras(member, survey.cameras)
     water = members.surface(member, survey.water, survey.cameras)
     index = survey.settings.refractive_index + float(members.water[member, 3])
 

@@ -42,13 +42,11 @@ def find_members(cameras: File) -> tuple[Path, Members] | None:
         m, k, p = len(values["turn"]), len(labels), len(lens_names)
         shapes = {
             **{"centres": (k, 3), "focal": (k,), "turn": (m, k, 3), "shift_m": (m, k, 3)},
-            **{"lens": (m, k, p), "water": (m, *values["water"].shape[1:])},
+            **{"lens": (m, k, p), "water": (m, 7)},
         }
         for name, shape in shapes.items():
             if values[name].shape != shape or not np.isfinite(values[name]).all():
                 raise ValueError(name)
-        if values["water"].shape[1:] not in ((4,), (7,)):
-            raise ValueError("water")
     except Exception as error:  # of any kind, as numpy reads the heads of arrays as Python does
         sentence = "is not an ensemble of an adjustment. Adjust again, or remove the file."
         raise bad_file(found, "ensemble.damaged", sentence) from error

@@ -20,7 +20,7 @@ from tests.utils.tie_blocks import block_of
 from tests.utils.tie_points import simulate_tie_points
 
 FREE = np.inf
-LEVEL = Unknowns(lens=(), level_sigma_m=FREE)
+LEVEL = Unknowns(lens=(), surface={"level": FREE})
 HOME_M = 1e-6
 SIGMA_M = 0.01
 
@@ -120,7 +120,7 @@ def test_parallel(parallel):
         "floor": (np.arange(8), at_level(made, b, c, 2.0)),
         "deck": (np.arange(8, 12), at_level(made, b, c, -0.5)),
     })  # fmt: skip
-    unknowns = Unknowns(lens=(), tilt_sigma=FREE)
+    unknowns = Unknowns(lens=(), surface={"tilt": FREE})
     apart = adjusted(block_with(made, conditions, control=True), unknowns)[2]
     conditions = replace(conditions, parallel=parallel)
     problem, found, precision = adjusted(block_with(made, conditions, control=True), unknowns)
@@ -154,7 +154,7 @@ def test_same_as_scipy():
         block = replace(block_with(made, given, cameras=made.true_cameras), **nowhere)
         # the twin has no word for points that are never wet: a waterline that it meets from above
         block = replace(block, wet=np.ones(len(block.wet), bool))
-        unknowns = Unknowns(poses="fixed", lens=(), level_sigma_m=FREE, tilt_sigma=FREE)
+        unknowns = Unknowns(poses="fixed", lens=(), surface={"level": FREE, "tilt": FREE})
         problem, found, precision = adjusted(block, unknowns)
         twin = Twin(block, tuple(problem.names), free_poses=False)
         x = twin.solve()

@@ -141,11 +141,11 @@ def test_noise():
     [
         (Unknowns(free_network=True), "adjust.cloud_needs_datum"),
         (Unknowns(poses="similarity"), "adjust.cloud_needs_datum"),
-        (Unknowns(level_sigma_m=np.inf), "adjust.cloud_needs_water"),
+        (Unknowns(surface={"level": np.inf}), "adjust.cloud_needs_water"),
         (Unknowns(), "adjust.no_datum"),
     ],
 )
 def test_refused(unknowns, code):
-    one = candidate(block(40), gnss=unknowns.poses == "similarity" or bool(unknowns.level_sigma_m))
+    one = candidate(block(40), gnss=unknowns.poses == "similarity" or bool(unknowns.surface))
     with refused(code):
         adjust_cloud([one], unknowns, FOCAL)

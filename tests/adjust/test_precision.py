@@ -51,7 +51,7 @@ def test_same_as_twin(poses, tilt):
         nothing = np.full(block.gnss_xyz.shape, np.nan)
         block = replace(block, gnss_xyz=nothing, gnss_sigma_m=np.full(nothing.shape, np.inf))
     unknowns = Unknowns(
-        poses=poses, lens=("f",), level_sigma_m=FREE, tilt_sigma=FREE, index_sigma=0.01
+        poses=poses, lens=("f",), surface={"level": FREE, "tilt": FREE, "index": 0.01}
     )
     problem, found = adjusted(block, unknowns)
     precision = precision_of(problem, found, sigma0=2.0)
@@ -93,7 +93,7 @@ def repeats():
         obliques_deg=30, oblique_directions=2, oblique_share=0.4,
     )  # fmt: skip
     made = clear_of_the_waterline(made, 0.3)
-    unknowns = Unknowns(lens=("f",), level_sigma_m=FREE, index_sigma=FREE)
+    unknowns = Unknowns(lens=("f",), surface={"level": FREE, "index": FREE})
     rng, rows, m = np.random.default_rng(11), [], len(made.truth)
     for _ in range(REPEATS):
         problem, found = adjusted(block_of(made.measured(rng), control=True), unknowns)
@@ -155,16 +155,16 @@ def dry(block):
     [
         (None, {"gnss": False}, Unknowns(lens=()), {"unknowns": []}),
         (
-            None, {"gnss": False}, Unknowns(lens=(), level_sigma_m=FREE, tilt_sigma=FREE),
+            None, {"gnss": False}, Unknowns(lens=(), surface={"level": FREE, "tilt": FREE}),
             {"unknowns": ["level", "tilt_x", "tilt_y"]},
         ),
         (
             dry, {"control": True},
-            Unknowns(lens=("f",), level_sigma_m=FREE, index_sigma=FREE),
+            Unknowns(lens=("f",), surface={"level": FREE, "index": FREE}),
             {"unknowns": ["level", "index"], "images": []},
         ),
         (
-            dry, {"control": True}, Unknowns(lens=(), shape_sigma=FREE),
+            dry, {"control": True}, Unknowns(lens=(), surface={"shape": FREE}),
             {"unknowns": ["shape_xx", "shape_xy", "shape_yy"]},
         ),
         (without_image, {}, Unknowns(lens=()), {"unknowns": [], "images": ["2"]}),
@@ -191,11 +191,9 @@ def test_sloping_bed():
     )  # fmt: skip
     block, sigma = block_of(made, control=True), {}
     for name, free in (
-        ("level", {"level_sigma_m": FREE}),
-        ("index", {"index_sigma": FREE}),
-        ("all", {"level_sigma_m": FREE, "tilt_sigma": FREE, "index_sigma": FREE}),
-    ):
-        unknowns = Unknowns(lens=("f",), **free)
+        ("level", ("level",)), ("index", ("index",)), ("all", ("level", "tilt", "index")),
+    ):  # fmt: skip
+        unknowns = Unknowns(lens=("f",), surface=dict.fromkeys(free, FREE))
         precision = precision_of(*adjusted(block, unknowns))
         sigma[name] = precision
     every = sigma["all"]
@@ -211,7 +209,7 @@ def test_sloping_bed():
 def test_large_block(monkeypatch):
     made = tiny()
     block = block_of(made, control=True)
-    fixed = Unknowns(lens=("f",), level_sigma_m=FREE, fixed_images=made.cameras.labels[1:3])
+    fixed = Unknowns(lens=("f",), surface={"level": FREE}, fixed_images=made.cameras.labels[1:3])
     problem, found = adjusted(block, fixed)
     whole = precision_of(problem, found)
     monkeypatch.setattr("pcfix.adjust.precision.DENSE_UP_TO", 0)
@@ -226,7 +224,7 @@ def test_large_block(monkeypatch):
 
 @pytest.mark.parametrize("poses", ["free", "similarity"])
 def test_member(poses):
-    unknowns = Unknowns(poses=poses, lens=("f", "k1"), level_sigma_m=0.1, tilt_sigma=0.01)
+    unknowns = Unknowns(poses=poses, lens=("f", "k1"), surface={"level": 0.1, "tilt": 0.01})
     problem, found = adjusted(block_of(tiny(), control=True), unknowns)
     size = len(problem.moves)
     active = np.flatnonzero(problem.moves)
@@ -238,13 +236,12 @@ def test_member(poses):
         nominal, labels=nominal.labels[::-1], centres=nominal.centres[order],
         rotations=nominal.rotations[order], lenses=nominal.lenses[::-1],
     )  # fmt: skip
-    rows = members.rows_of(shuffled)
-    assert rows.tolist() == order.tolist()
+    members = members.aligned(shuffled)
     for i, one in enumerate(steps):
         step = np.zeros(size)
         step[active] = one
         moved = moved_by(problem, found, step, np.zeros_like(found.state.xyz))
-        wanted, got = solved_cameras(problem, moved), members.cameras(i, shuffled, rows)
+        wanted, got = solved_cameras(problem, moved), members.cameras(i, shuffled)
         np.testing.assert_allclose(got.centres[order], wanted.centres, atol=1e-8)
         np.testing.assert_allclose(got.rotations[order], wanted.rotations, atol=1e-12)
         assert got.lenses[0].focal == pytest.approx(wanted.lenses[-1].focal, rel=1e-12)

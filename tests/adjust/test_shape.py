@@ -20,7 +20,7 @@ from tests.utils.tie_blocks import block_of, clear_of_the_waterline
 from tests.utils.tie_points import simulate_tie_points
 
 FREE = np.inf
-SHAPED = Unknowns(lens=(), level_sigma_m=FREE, tilt_sigma=FREE, shape_sigma=FREE)
+SHAPED = Unknowns(lens=(), surface={"level": FREE, "tilt": FREE, "shape": FREE})
 BEND = np.array([1.2e-4, -6e-5, -9e-5])
 """1/m: 6 cm at 25 m from the middle, as before a weir."""
 SCENE = {

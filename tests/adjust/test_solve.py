@@ -77,7 +77,7 @@ def test_lens_and_water_come_home():
         water=WaterPlane(made.water.a + 0.3), index=1.33,
     )  # fmt: skip
     unknowns = Unknowns(
-        lens=("f", "cx", "cy"), level_sigma_m=FREE, tilt_sigma=FREE, index_sigma=FREE
+        lens=("f", "cx", "cy"), surface={"level": FREE, "tilt": FREE, "index": FREE}
     )
     problem, found = adjusted(block, unknowns)
     assert max(misses(made, problem, found)) < HOME_M
@@ -133,7 +133,7 @@ def test_level():
     assert 0.1 < made.is_wet.mean() < 0.9
     start = WaterPlane(made.water.a + 0.25)
     block = block_of(made, control=True, water=start)
-    problem, found = adjusted(block, Unknowns(lens=("f",), level_sigma_m=FREE))
+    problem, found = adjusted(block, Unknowns(lens=("f",), surface={"level": FREE}))
     precision = precision_of(problem, found)
     level = water_of(problem, found.state).a
     assert abs(level - made.water.a) < 0.02  # m, what is asked for
@@ -145,7 +145,7 @@ def test_level():
 def test_index(points):
     made = scene(points, **(WIDE if points > 100 else {}))
     block = block_of(made, control=True, index=1.33)
-    problem, found = adjusted(block, Unknowns(lens=(), index_sigma=FREE))
+    problem, found = adjusted(block, Unknowns(lens=(), surface={"index": FREE}))
     precision = precision_of(problem, found)
     notes = undetermined(precision, problem.unknowns)
     miss = abs(found.state.water[3] - made.refractive_index)
@@ -178,7 +178,7 @@ def test_level_surface(kind):
         "raster": WaterRaster(np.full((40, 40), level), x - 100.0, y + 100.0, (5.0, 5.0)),
         "mesh": WaterMesh(np.array(corners), np.array([[0, 1, 2], [0, 2, 3]])),
     }[kind]
-    unknowns = Unknowns(lens=("f",), level_sigma_m=0.1)
+    unknowns = Unknowns(lens=("f",), surface={"level": 0.1})
     _, found = adjusted(block_of(made, water=water), unknowns)
     problem, wanted = adjusted(block_of(made), unknowns)
     # m: the last steps of both
@@ -196,7 +196,7 @@ def test_same_as_scipy(tilt):
         oblique_directions=2, oblique_share=0.3, tilt_percent=tilt,
     )  # fmt: skip
     block = block_of(made, control=True)
-    problem, found = adjusted(block, Unknowns(lens=("f",), level_sigma_m=FREE, index_sigma=0.005))
+    problem, found = adjusted(block, Unknowns(lens=("f",), surface={"level": FREE, "index": 0.005}))
     twin = Twin(block, ("f", "level", "index"), index_sigma=0.005)
     x = twin.solve()
     centres, rotations, added, xyz = twin.parts(x)

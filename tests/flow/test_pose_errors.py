@@ -13,7 +13,7 @@ from pcfix.adjust.block import Unknowns
 from pcfix.adjust.precision import Members, precision_of
 from pcfix.adjust.problem import solved_cameras
 from pcfix.adjust.transfer import CloudTransfer
-from pcfix.flow.pose_errors import Adjustment, Sample, pose_errors, variances, with_poses
+from pcfix.flow.pose_errors import Sample, pose_errors, variances, with_poses
 from pcfix.flow.surfaces import Points
 from pcfix.io.members import FILE, write_members
 from pcfix.model import Cameras, Lens, Views, WaterPlane
@@ -97,7 +97,7 @@ def members_with(covariance, cameras):
     return Members(
         cameras.labels, cameras.centres, np.full(3, LENS.focal), poses[:, :, :3],
         np.einsum("kij,mkj->mki", cameras.rotations, poses[:, :, 3:]), ("f",), lens,
-        np.column_stack([steps[:, 19], nothing, nothing, steps[:, 20]]),
+        np.column_stack([steps[:, 19], nothing, nothing, steps[:, 20], *[nothing] * 3]),
     )  # fmt: skip
 
 
@@ -128,9 +128,7 @@ def test_same_as_twin(moved):
     views = Views(np.arange(0, 13, 3), np.arange(12) % 3)
     sample = Sample(Points(xyz, None, np.zeros(4, np.uint8)), views)
     survey = Survey(WaterPlane(LEVEL_M), new, replace(EXACT, index=N))
-    found = variances(
-        sample, survey, Adjustment(members, np.arange(3)), CloudTransfer(old, new, np.arange(3), ())
-    )
+    found = variances(sample, survey, members, CloudTransfer(old, new, np.arange(3), ()))
     assert np.sqrt(wanted).min() > 0.05
     # the twin is of first order, the members are not
     np.testing.assert_allclose(np.sqrt(found), np.sqrt(wanted), rtol=0.01)
@@ -158,7 +156,7 @@ def test_coverage():
         if poses is None:  # the covariance hardly changes
             members = precision_of(problem, found).members
             sample = Sample(Points(xyz, None, np.zeros(len(xyz), np.uint8)), views)
-            poses = pose_errors(sample, survey, Adjustment(members, np.arange(len(cameras))), None)
+            poses = pose_errors(sample, survey, members, None)
         for one, into in ((with_poses(survey, poses), known), (survey, bare)):
             result = correct(Batch(xyz, surface_above(scene.water, xyz), one, views))
             into.append((xyz[:, 2] + result.shift_m[:, 2] - truth[:, 2]) / result.sigma_z_m)
@@ -174,7 +172,7 @@ def members_of(cameras, sigma_m):
     nothing = np.zeros((2, len(cameras), 3))
     return Members(
         cameras.labels, cameras.centres, np.array([lens.focal for lens in cameras.lenses]),
-        nothing, nothing + up @ cameras.rotations[0].T, (), nothing[:, :, :0], np.zeros((2, 4)),
+        nothing, nothing + up @ cameras.rotations[0].T, (), nothing[:, :, :0], np.zeros((2, 7)),
     )  # fmt: skip
 
 

@@ -72,8 +72,7 @@ def test_port_from_exact_images(port):
     """Light by Fermat's principle; the start is off by millimetres."""
     made, is_flat = simulate_port(port, points=200, seed=4), isinstance(port, FlatPort)
     start = replace(port, distance_m=0.03) if is_flat else replace(port, centre_m=(0.0, 0.0, 0.0))
-    free = {"distance_sigma_m": np.inf} if is_flat else {"centre_sigma_m": np.inf}
-    unknowns = Unknowns(lens=(), **free)
+    unknowns = Unknowns(lens=(), surface={"distance" if is_flat else "centre": np.inf})
     ties = TiePoints(made.truth, made.views, made.image_xy)
     block = replace(
         plain_block(made.cameras, ties, None, made.refractive_index), port=start,

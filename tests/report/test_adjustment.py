@@ -81,8 +81,8 @@ def adjusted():
     used = np.ones(72, bool)
     used[[1, 40]] = False
     residual[~used] = 30.0
-    rounds = [LogRow(1, 1, 900.0, 1e-4, 72, 2.5), LogRow(1, 2, 400.0, 1e-5, 72, 0.9),
-              LogRow(2, 1, 100.0, 1e-4, 70, 0.37)]  # fmt: skip
+    rounds = [LogRow(1, 1, 900.0, 72, 2.5), LogRow(1, 2, 400.0, 72, 0.9),
+              LogRow(2, 1, 100.0, 70, 0.37)]  # fmt: skip
     control = [
         ControlRow("G1", "control", 0.010, -0.020, 0.030, 0.5, 3),
         ControlRow("G2", "control", 0.010, 0.020, -0.050, 0.7, 2),
@@ -91,7 +91,7 @@ def adjusted():
     origin = np.round(before.centres.mean(axis=0))
     gnss = np.array([[0.01, 0.02, 0.03], [0.05, -0.02, 0.09], [np.nan] * 3])
     return Adjusted(
-        make_block(xyz, pinhole(xyz, before), before), Unknowns(level_sigma_m=0.1), after,
+        make_block(xyz, pinhole(xyz, before), before), Unknowns(surface={"level": 0.1}), after,
         WaterPlane(LEVEL + 0.02), 1.34, xyz, residual, used, is_wet, 1.234, 60, rounds,
         "tie points", make_precision(len(xyz)), gnss, control,
         [PcfixWarning("adjust.lens", "something <decided>")], origin,
