@@ -190,7 +190,7 @@ def grid_dsm(
         # a cloud optimised file is a copy, with overviews of its own
         paths = {name: folder / f"{name}.tif" if given.cog else drafts[name] for name in drafts}
         tags = {"pcfix": __version__, "corrected": corrected, **asdict(rules)}
-        counted = _write_rasters(points, how, rules, paths, folder, crs, tags, report)
+        counted = _write_rasters(points, how, rules, paths, crs, tags, report)
         for name, path in paths.items():
             if given.cog:
                 rasters.copy_as_cog(path, drafts[name])
@@ -231,7 +231,6 @@ def _write_rasters(
     how: Gridding,
     rules: DsmRules,
     paths: dict[str, Path],
-    folder: Path,
     crs: Any,
     tags: dict[str, Any],
     report: Callable[[float], None],
@@ -248,21 +247,7 @@ def _write_rasters(
         if "counts" in paths:
             bands = {"count": "", "spread": unit}
             counts = files.enter_context(new(paths["counts"], crs=plan, bands=bands))
-        if how.method == "tin" or rules.fill is None:
-            found = _grid(points, how, rules.what, dsm, counts, report)
-        else:
-            unfilled, widest = folder / "unfilled.tif", rules.fill / rules.cell_m
-            with rasters.new_raster(unfilled, lattice, None, {"height": METRE}) as heights:
-                found = _grid(points, how, rules.what, heights, counts, report)
-            empty = lattice.width * lattice.height
-            with rasters.open_raster(unfilled) as heights:
-                for window in lattice.window.parts(BLOCK_CELLS):
-                    around = window.grown(margin_cells(widest)).clipped(lattice.window)
-                    height = rasters.read_heights(heights, around)
-                    height = fill_holes(height, window, around, widest)
-                    rasters.write_part(dsm, height, window, 1)
-                    empty -= int((~np.isnan(height)).sum())
-            found |= {"filled": found["filled"] + found["empty"] - empty, "empty": empty}
+        found = _grid(points, how, rules, dsm, counts, report)
     if "hillshade" in paths:
         shade = rasters.new_raster(
             paths["hillshade"], lattice, plan, {"hillshade": ""}, dtype="uint8", nodata=NO_LIGHT
@@ -276,38 +261,45 @@ def _write_rasters(
 
 
 def _grid(
-    points: SortedPoints, how: Gridding, what: str, heights: DatasetWriter,
+    points: SortedPoints, how: Gridding, rules: DsmRules, heights: DatasetWriter,
     counts: DatasetWriter | None, report: Callable[[float], None],
 ) -> dict[str, Any]:  # fmt: skip
     """Write values to one raster, numbers of points and their spread to another.
 
     Returns the numbers of cells and the statistics of their values, by the names of `DsmSummary`.
     """
-    cells, filled, count, total, low, high, done = 0, 0, 0, 0.0, np.inf, -np.inf, 0
+    cells, filled, known, count, total, low, high, done = 0, 0, 0, 0, 0.0, np.inf, -np.inf, 0
     lattice = points.lattice
-    # windows have about this number of points if points are everywhere
+    # the width of holes to fill, in cells; a TIN has filled its own
+    widest = 0.0 if how.method == "tin" else (rules.fill or 0.0) / rules.cell_m
+    margin = margin_cells(widest) if widest else 0
+    # windows have about this number of points if points are everywhere, and are wide for a margin
     side = np.sqrt(WINDOW_POINTS) * how.spacing_m / lattice.resolution_m or BLOCK_CELLS
-    for window in lattice.window.parts(int(np.clip(side, 1, BLOCK_CELLS))):
-        bands = grid_window(*points.within(window.grown(how.margin_cells)), window, how)
-        if what == "uncertainty":
+    for window in lattice.window.parts(int(np.clip(side, 4 * margin + 1, BLOCK_CELLS))):
+        around = window.grown(margin).clipped(lattice.window)
+        bands = grid_window(*points.within(around.grown(how.margin_cells)), around, how)
+        if rules.what == "uncertainty":
             bands = as_uncertainty(bands)
-        rasters.write_part(heights, bands[0], window, 1)
+        height, number, spread = (band[window.within(around)] for band in bands)
+        values = height[~np.isnan(height)]
+        if widest:
+            height = fill_holes(bands.height, window, around, widest)
+        rasters.write_part(heights, height, window, 1)
         if counts is not None:
-            for band, values in enumerate(bands[1:], start=1):
-                rasters.write_part(counts, values, window, band)
-        known = ~np.isnan(bands.height)
-        values = bands.height[known]
-        cells += int((bands.points > 0).sum())
-        filled += int((known & (bands.points == 0)).sum())
+            rasters.write_part(counts, number, window, 1)
+            rasters.write_part(counts, spread, window, 2)
+        cells += int((number > 0).sum())
+        filled += int((~np.isnan(height) & (number == 0)).sum())
+        known += int((~np.isnan(height)).sum())
         count, total = count + values.size, total + float(values.sum())
         low, high = values.min(initial=low), values.max(initial=high)
-        done += window.height * window.width
+        done += height.size
         report(0.5 + 0.5 * done / (lattice.height * lattice.width))
     found = {"min": low, "mean": total / count, "max": high} if count else {}
     return {
         "cells": cells,
         "filled": filled,
-        "empty": lattice.width * lattice.height - count,
+        "empty": lattice.width * lattice.height - known,
         "values": {name: round(float(value), 4) for name, value in found.items()},
     }
 
