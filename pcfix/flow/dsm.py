@@ -24,7 +24,7 @@ from pcfix.flow.runner import Progress, file_task, write_summary
 from pcfix.grid.colours import NO_LIGHT, hillshade
 from pcfix.grid.delaunay import fill_holes, margin_cells
 from pcfix.grid.heights import Gridding, as_uncertainty, grid_window
-from pcfix.grid.lattice import SortedPoints, lattice_over, round_resolution, spacing_m, square_m
+from pcfix.grid.lattice import SortedPoints, lattice_over, round_resolution, spacing_m
 from pcfix.io import rasters
 from pcfix.io.atomic import scratch_folder, temporary_output
 from pcfix.io.crs import crs_words, parts
@@ -58,6 +58,8 @@ FEWEST_A_CELL = 0.9
 """Points per cell, on average where there are any; fewer give a warning."""
 DIMENSIONS = {"depth": "WaterDepth", "uncertainty": SIGMA_Z}
 """Dimensions of these quantities; any other quantity is the dimension of its name."""
+POINTS_A_SQUARE, MOST_SQUARES = 6.0, 4_000_000
+"""Points of a square, if these fill the area, and squares to measure the spacing of points."""
 SPARSE = 20.0
 """Cells per point; if there are more, some points may lie far from all others."""
 BULK_SAMPLE, BEYOND_BULK = 1_000_000, 1e-3
@@ -158,14 +160,13 @@ def grid_dsm(
         check_output(style, overwrite=given.overwrite, inputs=inputs_of(files))
 
     def report(share: float) -> None:
-        """Report the progress, in points."""
         if progress is not None:
             progress(round(share * count), count)
 
     with ExitStack() as stack:
-        targets = {"dsm": task.target, **more}
         drafts = {
-            name: stack.enter_context(temporary_output(path)) for name, path in targets.items()
+            name: stack.enter_context(temporary_output(path))
+            for name, path in {"dsm": task.target, **more}.items()
         }
         folder = stack.enter_context(scratch_folder(task.target))
         stack.enter_context(scratch_arrays(task.target))
@@ -180,7 +181,12 @@ def grid_dsm(
             apart_m = _spacing_m(source, used, rules.cell_m)
             side = np.sqrt(BIN_POINTS * _stated_area(source, rules.cell_m) / count) / rules.cell_m
         lattice = lattice_over(*bounds(used[:, :2]), rules.cell_m, str(task.source))
-        _warn_if_fine(rules.cell_m, apart_m)
+        if (density := (rules.cell_m / apart_m) ** 2 if apart_m else np.inf) < FEWEST_A_CELL:
+            sentence = (
+                f"The resolution {rules.cell_m:g} m is finer than the points allow: their spacing"
+                f" is {apart_m:.2g} m, or {density:.2g} points a cell. Use at least that spacing."
+            )
+            warnings.warn(PcfixWarning("dsm.fine", sentence, spacing_m=apart_m), stacklevel=2)
         points = SortedPoints.of(used, lattice, int(np.clip(side, 1, BLOCK_CELLS)))
         # the widest circle around a triangle
         reach_m = max(
@@ -201,8 +207,8 @@ def grid_dsm(
     result = DsmSummary(
         input=str(task.source),
         output=str(task.target),
-        hillshade=str(more["hillshade"]) if "hillshade" in more else None,
-        counts=str(more["counts"]) if "counts" in more else None,
+        hillshade=None if given.hillshade is None else str(given.hillshade),
+        counts=None if given.counts is None else str(given.counts),
         what=rules.what,
         pcfix=__version__,
         crs=None if crs is None else crs.name,
@@ -314,7 +320,9 @@ def point_spacing_m(cloud: CloudFiles, near: Path) -> float:
 
 
 def _spacing_m(source: LasSource, xyz: FloatArray, finest_m: float = MIN_RESOLUTION_M) -> float:
-    return spacing_m(xyz, square_m(_stated_area(source, finest_m), len(source), finest_m))
+    """Return the spacing of points of a cloud by squares of at least a size; see `spacing_m`."""
+    share = max(POINTS_A_SQUARE / len(source), 1.0 / MOST_SQUARES)
+    return spacing_m(xyz, max(np.sqrt(share * _stated_area(source, finest_m)), finest_m))
 
 
 def _points_of(source: LasSource, rules: DsmRules, report: Callable[[float], None]) -> FloatArray:
@@ -370,17 +378,6 @@ def _without_stray(source: LasSource, xyz: FloatArray, resolution_m: float) -> F
         )
         warnings.warn(PcfixWarning("dsm.stray", sentence, points=stray), stacklevel=3)
     return kept(inside, xyz)
-
-
-def _warn_if_fine(resolution_m: float, spacing_m: float) -> None:
-    """Warn of cells without points."""
-    if resolution_m**2 < FEWEST_A_CELL * spacing_m**2:
-        density = (resolution_m / spacing_m) ** 2
-        sentence = (
-            f"The resolution {resolution_m:g} m is finer than the points allow: their spacing is"
-            f" {spacing_m:.2g} m, or {density:.2g} points a cell. Use at least that spacing."
-        )
-        warnings.warn(PcfixWarning("dsm.fine", sentence, spacing_m=spacing_m), stacklevel=3)
 
 
 def _dimension_of(source: LasSource, what: str) -> str | None:

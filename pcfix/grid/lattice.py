@@ -179,10 +179,6 @@ def round_resolution(spacing_m: float, finest_m: float) -> float:
     return next(float(f"{side:.6g}") for side in sides if least * 0.999 <= side <= most * 1.001)
 
 
-POINTS_A_SQUARE = 6.0
-MOST_SQUARES = 4_000_000
-
-
 def spacing_m(xyz: FloatArray, side_m: float) -> float:
     """Return the spacing of points (n, 3) within the squares of the plan with any; 0 on a line."""
     squares: IntArray = np.empty(0, np.int64)
@@ -194,12 +190,6 @@ def spacing_m(xyz: FloatArray, side_m: float) -> float:
     corner = np.column_stack([squares - (row << 32), row]) * side_m
     sides = np.minimum(corner + side_m, high) - np.maximum(corner, low)
     return float(np.sqrt(np.maximum(sides, 0.0).prod(axis=1).sum() / len(xyz)))
-
-
-def square_m(area_m2: float, points: int, finest_m: float) -> float:
-    """Return the side of squares for `spacing_m`, not smaller than `finest_m`."""
-    wanted = max(POINTS_A_SQUARE / points, 1.0 / MOST_SQUARES) * area_m2
-    return max(float(np.sqrt(wanted)), finest_m)
 
 
 @dataclass(frozen=True, eq=False)
