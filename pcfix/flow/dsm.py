@@ -1,8 +1,8 @@
 """Grid a LAS or LAZ cloud to a raster of heights, depths or another quantity, in bounded memory.
 
-The points are sorted once by squares of the plan; then the raster is made window by window. All
+The points are sorted once by tiles of the plan; then the raster is made window by window. All
 points that decide on a cell are read with its window, so that the raster does not depend on the
-size of chunks, squares and windows.
+size of chunks, tiles and windows.
 """
 
 from __future__ import annotations
@@ -14,17 +14,19 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from pcfix.blocks import bounds, empty, kept, mapped, release
+from pcfix.clean.neighbours import Tiles as PointTiles
+from pcfix.clean.neighbours import make_tiles
 from pcfix.errors import PcfixWarning, SettingError, bad_file
 from pcfix.flow.runner import Progress, file_task, write_summary
 from pcfix.grid.colours import NO_LIGHT, hillshade
 from pcfix.grid.delaunay import fill_holes, margin_cells
 from pcfix.grid.heights import Gridding, as_uncertainty, grid_window
-from pcfix.grid.lattice import SortedPoints, lattice_over, round_resolution, spacing_m
+from pcfix.grid.lattice import lattice_over, round_resolution, spacing_m
 from pcfix.io import rasters
 from pcfix.io.atomic import scratch_folder, temporary_output
 from pcfix.io.crs import crs_words, parts
@@ -39,9 +41,6 @@ from pcfix.options.declare import File, taken
 from pcfix.options.steps import MIN_RESOLUTION_M, DsmOptions, DsmRules
 from pcfix.version import __version__
 
-if TYPE_CHECKING:
-    from rasterio.io import DatasetWriter
-
 WINDOW_POINTS = 400_000
 """Points that are gridded at once, about."""
 TIN_REACH_SPACINGS = 5.0
@@ -52,7 +51,7 @@ METRE = "metre"
 BLOCK_CELLS = 1024
 """Longest side of a window."""
 BIN_POINTS = 200_000
-"""Points in a square by which they are sorted, on average."""
+"""Points of a tile by which they are sorted, on average."""
 SIGMA_Z = "SigmaZ"
 FEWEST_A_CELL = 0.9
 """Points per cell, on average where there are any; fewer give a warning."""
@@ -179,7 +178,6 @@ def grid_dsm(
                 rules = replace(rules, resolution=cell_m)
             used = _without_stray(source, read, rules.cell_m)
             apart_m = _spacing_m(source, used, rules.cell_m)
-            side = np.sqrt(BIN_POINTS * _stated_area(source, rules.cell_m) / count) / rules.cell_m
         lattice = lattice_over(*bounds(used[:, :2]), rules.cell_m, str(task.source))
         if (density := (rules.cell_m / apart_m) ** 2 if apart_m else np.inf) < FEWEST_A_CELL:
             sentence = (
@@ -187,7 +185,7 @@ def grid_dsm(
                 f" is {apart_m:.2g} m, or {density:.2g} points a cell. Use at least that spacing."
             )
             warnings.warn(PcfixWarning("dsm.fine", sentence, spacing_m=apart_m), stacklevel=2)
-        points = SortedPoints.of(used, lattice, int(np.clip(side, 1, BLOCK_CELLS)))
+        tiles = make_tiles(used, points=BIN_POINTS)
         # the widest circle around a triangle
         reach_m = max(
             TIN_REACH_SPACINGS * apart_m, TIN_REACH_CELLS * rules.cell_m, rules.fill or 0.0
@@ -196,7 +194,7 @@ def grid_dsm(
         # a cloud optimised file is a copy, with overviews of its own
         paths = {name: folder / f"{name}.tif" if given.cog else drafts[name] for name in drafts}
         tags = {"pcfix": __version__, "corrected": corrected, **asdict(rules)}
-        counted = _write_rasters(points, how, rules, paths, crs, tags, report)
+        counted = _write_rasters(tiles, how, rules, paths, crs, tags, report)
         for name, path in paths.items():
             if given.cog:
                 rasters.copy_as_cog(path, drafts[name])
@@ -233,7 +231,7 @@ def grid_dsm(
 
 
 def _write_rasters(
-    points: SortedPoints,
+    tiles: PointTiles,
     how: Gridding,
     rules: DsmRules,
     paths: dict[str, Path],
@@ -241,19 +239,49 @@ def _write_rasters(
     tags: dict[str, Any],
     report: Callable[[float], None],
 ) -> dict[str, Any]:
-    """Write the raster, and hillshade and counts where they have a path; return as `_grid`."""
-    lattice, is_height = points.lattice, rules.what == "height"
+    """Write the raster, and hillshade and counts where they have a path.
+
+    Returns the numbers of cells and the statistics of their values, by the names of `DsmSummary`.
+    """
+    lattice, size_m = how.lattice, rules.cell_m
     plan = None if crs is None else parts(crs)[0]
-    unit = METRE if is_height or rules.what in DIMENSIONS else ""
+    unit = METRE if rules.what == "height" or rules.what in DIMENSIONS else ""
     new = partial(rasters.new_raster, lattice=lattice, tags={"PCFIX": json.dumps(tags)})
+    # the width of holes to fill, in cells; a TIN has filled its own
+    widest = 0.0 if how.method == "tin" else (rules.fill or 0.0) / size_m
+    margin = margin_cells(widest) if widest else 0
+    # windows have about this number of points if points are everywhere, and are wide for a margin
+    side = np.sqrt(WINDOW_POINTS) * how.spacing_m / size_m or BLOCK_CELLS
+    cells, filled, known, count, total, low, high, done = 0, 0, 0, 0, 0.0, np.inf, -np.inf, 0
     with ExitStack() as files:
         bands = {rules.what: unit}
-        dsm = files.enter_context(new(paths["dsm"], crs=crs if is_height else plan, bands=bands))
-        counts = None
+        system = crs if rules.what == "height" else plan
+        dsm = files.enter_context(new(paths["dsm"], crs=system, bands=bands))
         if "counts" in paths:
             bands = {"count": "", "spread": unit}
             counts = files.enter_context(new(paths["counts"], crs=plan, bands=bands))
-        found = _grid(points, how, rules, dsm, counts, report)
+        for window in lattice.window.parts(int(np.clip(side, 4 * margin + 1, BLOCK_CELLS))):
+            around = window.grown(margin).clipped(lattice.window)
+            xyz = tiles.xyz[tiles.within(*lattice.box(around.grown(how.margin_cells)))]
+            release()
+            gridded = grid_window(xyz, around, how)
+            if rules.what == "uncertainty":
+                gridded = as_uncertainty(gridded)
+            height, number, spread = (band[window.within(around)] for band in gridded)
+            values = height[~np.isnan(height)]
+            if widest:
+                height = fill_holes(gridded.height, window, around, widest)
+            rasters.write_part(dsm, height, window, 1)
+            if "counts" in paths:
+                rasters.write_part(counts, number, window, 1)
+                rasters.write_part(counts, spread, window, 2)
+            cells += int((number > 0).sum())
+            filled += int((~np.isnan(height) & (number == 0)).sum())
+            known += int((~np.isnan(height)).sum())
+            count, total = count + values.size, total + float(values.sum())
+            low, high = values.min(initial=low), values.max(initial=high)
+            done += height.size
+            report(0.5 + 0.5 * done / (lattice.height * lattice.width))
     if "hillshade" in paths:
         shade = rasters.new_raster(
             paths["hillshade"], lattice, plan, {"hillshade": ""}, dtype="uint8", nodata=NO_LIGHT
@@ -261,46 +289,8 @@ def _write_rasters(
         with rasters.open_raster(paths["dsm"]) as heights, shade as out:
             for window in lattice.window.parts(BLOCK_CELLS):
                 height = rasters.read_within(heights, window.grown(1), lattice.window)
-                light = hillshade(height, rules.cell_m, rules.azimuth, rules.altitude)
+                light = hillshade(height, size_m, rules.azimuth, rules.altitude)
                 rasters.write_part(out, light, window, 1)
-    return found
-
-
-def _grid(
-    points: SortedPoints, how: Gridding, rules: DsmRules, heights: DatasetWriter,
-    counts: DatasetWriter | None, report: Callable[[float], None],
-) -> dict[str, Any]:  # fmt: skip
-    """Write values to one raster, numbers of points and their spread to another.
-
-    Returns the numbers of cells and the statistics of their values, by the names of `DsmSummary`.
-    """
-    cells, filled, known, count, total, low, high, done = 0, 0, 0, 0, 0.0, np.inf, -np.inf, 0
-    lattice = points.lattice
-    # the width of holes to fill, in cells; a TIN has filled its own
-    widest = 0.0 if how.method == "tin" else (rules.fill or 0.0) / rules.cell_m
-    margin = margin_cells(widest) if widest else 0
-    # windows have about this number of points if points are everywhere, and are wide for a margin
-    side = np.sqrt(WINDOW_POINTS) * how.spacing_m / lattice.resolution_m or BLOCK_CELLS
-    for window in lattice.window.parts(int(np.clip(side, 4 * margin + 1, BLOCK_CELLS))):
-        around = window.grown(margin).clipped(lattice.window)
-        bands = grid_window(*points.within(around.grown(how.margin_cells)), around, how)
-        if rules.what == "uncertainty":
-            bands = as_uncertainty(bands)
-        height, number, spread = (band[window.within(around)] for band in bands)
-        values = height[~np.isnan(height)]
-        if widest:
-            height = fill_holes(bands.height, window, around, widest)
-        rasters.write_part(heights, height, window, 1)
-        if counts is not None:
-            rasters.write_part(counts, number, window, 1)
-            rasters.write_part(counts, spread, window, 2)
-        cells += int((number > 0).sum())
-        filled += int((~np.isnan(height) & (number == 0)).sum())
-        known += int((~np.isnan(height)).sum())
-        count, total = count + values.size, total + float(values.sum())
-        low, high = values.min(initial=low), values.max(initial=high)
-        done += height.size
-        report(0.5 + 0.5 * done / (lattice.height * lattice.width))
     found = {"min": low, "mean": total / count, "max": high} if count else {}
     return {
         "cells": cells,
