@@ -111,29 +111,23 @@ class CloudSample(Sums):
         doubts = []
         if found is not None:
             off, level = found.level_m, float(np.median(water[known])) + found.level_m
-            doubts.append(
-                PcfixWarning(
-                    "water.shoreline_level",
-                    f"The cloud's shoreline is {abs(off):.2f} m {'above' if off > 0.0 else 'below'}"
-                    f" the given water, at about {level:.2f} m (standard error"
-                    f" {found.sigma_level_m:.2f} m: {'; '.join(found.reasons)}). Check the level"
-                    " and its vertical datum, or try --water auto.",
-                    off_m=off,
-                    level_m=level,
-                )
+            sentence = (
+                f"The cloud's shoreline is {abs(off):.2f} m {'above' if off > 0.0 else 'below'} the"
+                f" given water, at about {level:.2f} m (standard error {found.sigma_level_m:.2f} m:"
+                f" {'; '.join(found.reasons)}). Check the level and its vertical datum, or try"
+                " --water auto."
             )
+            code = "water.shoreline_level"
+            doubts.append(PcfixWarning(code, sentence, off_m=off, level_m=level))
         if tilted is not None:
-            doubts.append(
-                PcfixWarning(
-                    "water.shoreline_tilt",
-                    f"The cloud's shoreline rises to the {tilted.to} against the given water by"
-                    f" {100.0 * tilted.slope:.2g} %, from {tilted.low_m:+.2f} to"
-                    f" {tilted.high_m:+.2f} m. The water flows or one of the two is tilted; measure"
-                    " shoreline points all round and give them as --water.",
-                    to=tilted.to,
-                    slope=tilted.slope,
-                )
+            sentence = (
+                f"The cloud's shoreline rises to the {tilted.to} against the given water by"
+                f" {100.0 * tilted.slope:.2g} %, from {tilted.low_m:+.2f} to {tilted.high_m:+.2f}"
+                " m. The water flows or one of the two is tilted; measure shoreline points all"
+                " round and give them as --water."
             )
+            code = "water.shoreline_tilt"
+            doubts.append(PcfixWarning(code, sentence, to=tilted.to, slope=tilted.slope))
         return tuple(doubts)
 
 

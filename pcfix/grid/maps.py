@@ -49,18 +49,17 @@ class Maps:
         return self.west_m, east, self.north_m - rows * self.cell_m, self.north_m
 
     def sampled(self, values: FloatArray, extent_m: Extent) -> FloatArray:
-        """Sample a raster of any resolution at the centres of the cells."""
+        """Sample a raster of any resolution at the centres of the cells, NaN outside of it."""
+        from scipy.ndimage import map_coordinates
+
         west, east, south, north = extent_m
         rows, columns = self.height_m.shape
         x = self.west_m + (np.arange(columns) + 0.5) * self.cell_m
         y = self.north_m - (np.arange(rows) + 0.5) * self.cell_m
-        column = np.floor((x - west) / (east - west) * values.shape[1]).astype(np.int64)
-        row = np.floor((north - y) / (north - south) * values.shape[0]).astype(np.int64)
-        inside = np.ix_((row >= 0) & (row < values.shape[0]),
-                        (column >= 0) & (column < values.shape[1]))  # fmt: skip
-        found = np.full((rows, columns), np.nan)
-        found[inside] = values[np.ix_(row[inside[0].ravel()], column[inside[1].ravel()])]
-        return found
+        column = np.floor((x - west) / (east - west) * values.shape[1])
+        row = np.floor((north - y) / (north - south) * values.shape[0])
+        places = np.meshgrid(row, column, indexing="ij")
+        return np.asarray(map_coordinates(values, places, order=0, cval=np.nan))
 
 
 class MapsBuilder:
