@@ -23,13 +23,11 @@ class Plugin:
         self.provider: Any = None
 
     def initProcessing(self) -> None:  # noqa: N802
-        """Add the algorithms; ``qgis_process`` calls only this."""
+        """Add the algorithms to the toolbox; ``qgis_process`` calls only this."""
         self.provider = Provider()
         core.QgsApplication.processingRegistry().addProvider(self.provider)
 
-    def initGui(self) -> None:  # noqa: N802
-        """Add the algorithms to the window's toolbox."""
-        self.initProcessing()
+    initGui = initProcessing  # noqa: N815 (QGIS with a window calls this)
 
     def unload(self) -> None:
         """Remove the algorithms."""
