@@ -341,8 +341,7 @@ def _heights(cameras: Cameras, cloud: FloatArray, ties: TiePoints | None) -> Res
     if near.sum() < LEAST_STEPS:
         return Result(unchecked="heights (no tie points on the cloud)")
     off = float(np.median((placed[:, 2] - cloud[row, 2])[near]))
-    above = float(np.median(cameras.centres[:, 2]) - np.median(cloud[:, 2]))
-    if abs(off) > MOST_HEIGHT * abs(above):
+    if abs(off) > MOST_HEIGHT * _above(cameras, cloud):
         return _doubt(
             "cameras.height",
             f"The tie points are {abs(off):.1f} m {'above' if off > 0.0 else 'below'} the cloud"
