@@ -63,9 +63,6 @@ class Neighbours:
         distance = np.full((len(points), k), np.inf)
         place = np.zeros((len(points), k), np.int64)
         rest = np.arange(len(points))
-        if len(self.tiles) == 1:
-            self._add(0, points, rest, distance, place)
-            return distance, place
         low, high = bounds(points)
         gaps = _gap(low, high, self._low, self._high)
         middle = (low + high - self._low - self._high) / 2.0

@@ -6,8 +6,8 @@ import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import cached_property
-from typing import Any, Generic, Literal, TypeAlias, TypeVar
+from functools import partial
+from typing import Any, Generic, Literal, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -47,19 +47,13 @@ class AfterBefore(Generic[Figure]):
     before: Figure | None
 
 
-@dataclass(frozen=True, eq=False)
-class Pairs:
-    """Two heights at each of n places, world Z."""
+class Pairs(NamedTuple):
+    """The heights of cloud and reference at n places, world Z, metres."""
 
-    xy: FloatArray  # (n, 2), metres, world frame
-    measured_m: FloatArray  # (n,), of the cloud
+    xy: FloatArray  # (n, 2), world frame
     reference_m: FloatArray  # (n,)
+    error_m: FloatArray  # (n,), cloud minus reference: positive where the cloud is too high
     by_nearest: BoolArray  # (n,), one of the two heights is that of a single point
-
-    @cached_property
-    def error_m(self) -> FloatArray:
-        """Measured minus reference, shape (n,): positive where the cloud is too high."""
-        return mapped(np.subtract, self.measured_m, self.reference_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,10 +184,10 @@ def figures_of(
         bed, stated = by_depth.get("bed"), match.settings.sigma_reference
         errors = vertical.after.statistics if bed is None else bed.after
         own = own_of(errors, "all" if bed is None else "bed", stated, reference.kind)
-    also = []
-    for name, other in others.items():
-        ways = (None if way is None else way.after for way in c2c_of(other))
-        also.append(Further(name, other.whole.name, *ways))
+    also = [
+        Further(name, other.whole.name, *(w if w is None else w.after for w in c2c_of(other)))
+        for name, other in others.items()
+    ]
     counts = Counts(
         cloud=len(whole) + whole.left_out,
         cloud_left_out=whole.left_out,
@@ -244,17 +238,16 @@ def c2c_of(match: Match) -> C2c:
     """
     rules = match.settings
 
-    def distances(xyz: FloatArray) -> Distribution:
-        return distances_of(distances_to(match, xyz), rules.classes, rules.share)
-
-    def distances_back(xyz: FloatArray) -> Distribution:
-        return distances_of(nearest_distance(match.places, xyz, 3), rules.classes, rules.share)
+    def distribution(values: FloatArray) -> Distribution:
+        return distances_of(values, rules.classes, rules.share)
 
     to = back = None
     if rules.direction != "from-reference":
-        to = both(distances, match.cloud.xyz, match.cloud.apparent)
+        cloud = match.cloud
+        to = both(lambda p: distribution(distances_to(match, p)), cloud.xyz, cloud.apparent)
     if rules.from_reference:
-        back = both(distances_back, match.asked.xyz, match.asked.apparent)
+        near, asked = partial(nearest_distance, match.places, axes=3), match.asked
+        back = both(lambda p: distribution(near(p)), asked.xyz, asked.apparent)
     return to, back
 
 
@@ -304,15 +297,15 @@ def _pairs(match: Match) -> AfterBefore[Pairs]:
     def pairs(xyz: FloatArray) -> Pairs:
         places, surface = (match.places, xyz) if sparse else (xyz, match.reference.xyz)
         height, by_nearest = heights_at(places, surface, k)
-        heights = (height, places[:, 2]) if sparse else (places[:, 2], height)
-        return Pairs(places[:, :2], *heights, by_nearest)
+        measured, known = (height, places[:, 2]) if sparse else (places[:, 2], height)
+        return Pairs(places[:, :2], known, mapped(np.subtract, measured, known), by_nearest)
 
     return both(pairs, match.cloud.xyz, match.cloud.apparent)
 
 
 def _by_depth(match: Match, pairs: AfterBefore[Pairs], notes: list[PcfixWarning]) -> dict[str, Any]:
     """Return the figures of submerged places, and of the others, by the names of `Comparison`."""
-    after, before = pairs.after, pairs.before
+    after = pairs.after
     surface = match.water_at(after.xy)
     if surface is None:
         text = "The water surface is not known, so there are no figures by depth. Give --water."
@@ -324,15 +317,17 @@ def _by_depth(match: Match, pairs: AfterBefore[Pairs], notes: list[PcfixWarning]
         text = "No compared point is under water, so there are no figures by depth."
         notes.append(PcfixWarning("cloud.not_submerged", text))
         return {}
-    depth, error = _at(wet, np.subtract, surface, after.reference_m), kept(wet, after.error_m)
-    line, line_before, error_before = fit_line(depth, mapped(np.subtract, depth, error)), None, None
-    if before is not None:
-        above = match.water_at(before.xy)
-        above = surface if above is None else above
-        depth_before = _at(wet, np.subtract, above, before.reference_m)
-        error_before = kept(wet, before.error_m)
-        line_before = fit_line(depth_before, mapped(np.subtract, depth_before, error_before))
-        corrected, apparent = _ratio(depth, error), _ratio(depth_before, error_before)
+
+    def submerged(p: Pairs) -> tuple[FloatArray, FloatArray]:
+        """Return reference depths and errors of the submerged places."""
+        above = surface if p is after else np.asarray(match.water_at(p.xy))
+        return _at(wet, np.subtract, above, p.reference_m), kept(wet, p.error_m)
+
+    found = both(submerged, after, pairs.before)
+    (depth, error), error_before = found.after, None
+    if found.before is not None:
+        error_before = found.before[1]
+        corrected, apparent = _ratio(*found.after), _ratio(*found.before)
         if abs(apparent - 1.0) <= AS_DEEP and corrected > 1.0 + TOO_DEEP:
             text = (
                 "The input cloud had the depths of the reference already: it was likely corrected"
@@ -349,7 +344,7 @@ def _by_depth(match: Match, pairs: AfterBefore[Pairs], notes: list[PcfixWarning]
         text = "The cloud has no dry point, so there are no figures by distance from the shore."
         notes.append(PcfixWarning("cloud.no_land", text))
     return {
-        "depth": AfterBefore(line, line_before),
+        "depth": both(lambda f: fit_line(f[0], mapped(np.subtract, *f)), found.after, found.before),
         "depth_bins": binned(depth, error, error_before, rules.bin_width),
         "shore_bins": shore_bins,
         "tvu": tvu_of(error, depth),

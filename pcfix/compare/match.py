@@ -162,13 +162,13 @@ def match(whole: SurveyCloud, target: Reference, settings: CompareRules, *, give
         outside = int(chosen.sum() - near.sum())
     if not (near.any() and len(places)):
         boxes = [bounds(xyz[:, :2]) for xyz in (kept(chosen, whole.xyz), target.xyz)]
-        (x0, y0), (x1, y1) = boxes[0]
-        (u0, v0), (u1, v1) = boxes[1]
+        places_of = [
+            f"{name} (x {low[0]:.1f} to {high[0]:.1f}, y {low[1]:.1f} to {high[1]:.1f})"
+            for name, (low, high) in zip((whole.name, target.name), boxes, strict=True)
+        ]
         raise GeometryError(
             "reference.no_overlap",
-            f"{whole.name} (x {x0:.1f} to {x1:.1f}, y {y0:.1f} to {y1:.1f}) and {target.name}"
-            f" (x {u0:.1f} to {u1:.1f}, y {v0:.1f} to {v1:.1f}) do not overlap in plan. Check the"
-            " CRS of both.",
+            f"{' and '.join(places_of)} do not overlap in plan. Check the CRS of both.",
             cloud=whole.name, reference=target.name, bounds=boxes,
         )  # fmt: skip
     cloud, by_place = whole.take(near), target.sparse or settings.from_reference

@@ -173,10 +173,10 @@ class Own:
 def own_of(s: Statistics, of: str, stated_m: float | None, kind: str) -> Own:
     """Return errors without the noise of the reference: variances of independent errors add up."""
     sigma = SIGMA_REFERENCE_M[kind] if stated_m is None else stated_m
-    if 0.0 < s.sd_m <= sigma:
-        return Own(of, sigma, stated_m is None, s.mean_m, None, None)
-    rmse = math.sqrt(s.rmse_m**2 - min(sigma, s.sd_m) ** 2)
-    within = s.within_95_m * (rmse / s.rmse_m if s.rmse_m else 1.0)
+    rmse = within = None
+    if not 0.0 < s.sd_m <= sigma:
+        rmse = math.sqrt(s.rmse_m**2 - min(sigma, s.sd_m) ** 2)
+        within = s.within_95_m * (rmse / s.rmse_m if s.rmse_m else 1.0)
     return Own(of, sigma, stated_m is None, s.mean_m, rmse, within)
 
 

@@ -114,9 +114,8 @@ def _check_outputs(given: CompareOptions, inputs: list[File]) -> None:
         if folder.exists() and not folder.is_dir():
             sentence = f"{folder} is a file. Give a folder."
             raise SettingError("output.no_folder", sentence, path=folder)
-        if not folder.parent.is_dir():
-            sentence = f"{folder}: the folder {folder.parent} does not exist. Make it."
-            raise SettingError("output.no_folder", sentence, path=folder.parent)
+        if not folder.exists():
+            check_output(folder, overwrite=False)
         names = ["compare.json", "depth_bins.csv", "shore_bins.csv"]
         if folder.is_dir():
             for path in [*(folder / name for name in names), *folder.glob("section_*.csv")]:

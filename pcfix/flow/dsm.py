@@ -1,8 +1,8 @@
 """Grid a LAS or LAZ cloud to a raster of heights, depths or another quantity, in bounded memory.
 
-The points are sorted once by squares of the plan; then the raster is made window by window. All
+The points are sorted once by tiles of the plan; then the raster is made window by window. All
 points that decide on a cell are read with its window, so that the raster does not depend on the
-size of chunks, squares and windows.
+size of chunks, tiles and windows.
 """
 
 from __future__ import annotations
@@ -14,17 +14,19 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from pcfix.blocks import bounds, empty, kept, mapped, release
+from pcfix.clean.neighbours import Tiles as PointTiles
+from pcfix.clean.neighbours import make_tiles
 from pcfix.errors import PcfixWarning, SettingError, bad_file
 from pcfix.flow.runner import Progress, file_task, write_summary
 from pcfix.grid.colours import NO_LIGHT, hillshade
 from pcfix.grid.delaunay import fill_holes, margin_cells
 from pcfix.grid.heights import Gridding, as_uncertainty, grid_window
-from pcfix.grid.lattice import SortedPoints, lattice_over, round_resolution, spacing_m, square_m
+from pcfix.grid.lattice import lattice_over, round_resolution, spacing_m
 from pcfix.io import rasters
 from pcfix.io.atomic import scratch_folder, temporary_output
 from pcfix.io.crs import crs_words, parts
@@ -38,9 +40,6 @@ from pcfix.options.declare import File, taken
 from pcfix.options.steps import MIN_RESOLUTION_M, DsmOptions, DsmRules
 from pcfix.version import __version__
 
-if TYPE_CHECKING:
-    from rasterio.io import DatasetWriter
-
 WINDOW_POINTS = 400_000
 """Points that are gridded at once, about."""
 TIN_REACH_SPACINGS = 5.0
@@ -51,12 +50,14 @@ METRE = "metre"
 BLOCK_CELLS = 1024
 """Longest side of a window."""
 BIN_POINTS = 200_000
-"""Points in a square by which they are sorted, on average."""
+"""Points of a tile by which they are sorted, on average."""
 SIGMA_Z = "SigmaZ"
 FEWEST_A_CELL = 0.9
 """Points per cell, on average where there are any; fewer give a warning."""
 DIMENSIONS = {"depth": "WaterDepth", "uncertainty": SIGMA_Z}
 """Dimensions of these quantities; any other quantity is the dimension of its name."""
+POINTS_A_SQUARE, MOST_SQUARES = 6.0, 4_000_000
+"""Points of a square, if these fill the area, and squares to measure the spacing of points."""
 SPARSE = 20.0
 """Cells per point; if there are more, some points may lie far from all others."""
 BULK_SAMPLE, BEYOND_BULK = 1_000_000, 1e-3
@@ -157,14 +158,13 @@ def grid_dsm(
         check_output(style, overwrite=given.overwrite, inputs=inputs_of(files))
 
     def report(share: float) -> None:
-        """Report the progress, in points."""
         if progress is not None:
             progress(round(share * count), count)
 
     with ExitStack() as stack:
-        targets = {"dsm": task.target, **more}
         drafts = {
-            name: stack.enter_context(temporary_output(path)) for name, path in targets.items()
+            name: stack.enter_context(temporary_output(path))
+            for name, path in {"dsm": task.target, **more}.items()
         }
         folder = stack.enter_context(scratch_folder(task.target))
         stack.enter_context(scratch_arrays(task.target))
@@ -177,10 +177,14 @@ def grid_dsm(
                 rules = replace(rules, resolution=cell_m)
             used = _without_stray(source, read, rules.cell_m)
             apart_m = _spacing_m(source, used, rules.cell_m)
-            side = np.sqrt(BIN_POINTS * _stated_area(source, rules.cell_m) / count) / rules.cell_m
         lattice = lattice_over(*bounds(used[:, :2]), rules.cell_m, str(task.source))
-        _warn_if_fine(rules.cell_m, apart_m)
-        points = SortedPoints.of(used, lattice, int(np.clip(side, 1, BLOCK_CELLS)))
+        if (density := (rules.cell_m / apart_m) ** 2 if apart_m else np.inf) < FEWEST_A_CELL:
+            sentence = (
+                f"The resolution {rules.cell_m:g} m is finer than the points allow: their spacing"
+                f" is {apart_m:.2g} m, or {density:.2g} points a cell. Use at least that spacing."
+            )
+            warnings.warn(PcfixWarning("dsm.fine", sentence, spacing_m=apart_m), stacklevel=2)
+        tiles = make_tiles(used, points=BIN_POINTS)
         # the widest circle around a triangle
         reach_m = max(
             TIN_REACH_SPACINGS * apart_m, TIN_REACH_CELLS * rules.cell_m, rules.fill or 0.0
@@ -189,7 +193,7 @@ def grid_dsm(
         # a cloud optimised file is a copy, with overviews of its own
         paths = {name: folder / f"{name}.tif" if given.cog else drafts[name] for name in drafts}
         tags = {"pcfix": __version__, "corrected": corrected, **asdict(rules)}
-        counted = _write_rasters(points, how, rules, paths, folder, crs, tags, report)
+        counted = _write_rasters(tiles, how, rules, paths, crs, tags, report)
         for name, path in paths.items():
             if given.cog:
                 rasters.copy_as_cog(path, drafts[name])
@@ -200,8 +204,8 @@ def grid_dsm(
     result = DsmSummary(
         input=str(task.source),
         output=str(task.target),
-        hillshade=str(more["hillshade"]) if "hillshade" in more else None,
-        counts=str(more["counts"]) if "counts" in more else None,
+        hillshade=None if given.hillshade is None else str(given.hillshade),
+        counts=None if given.counts is None else str(given.counts),
         what=rules.what,
         pcfix=__version__,
         crs=None if crs is None else crs.name,
@@ -226,42 +230,57 @@ def grid_dsm(
 
 
 def _write_rasters(
-    points: SortedPoints,
+    tiles: PointTiles,
     how: Gridding,
     rules: DsmRules,
     paths: dict[str, Path],
-    folder: Path,
     crs: Any,
     tags: dict[str, Any],
     report: Callable[[float], None],
 ) -> dict[str, Any]:
-    """Write the raster, and hillshade and counts where they have a path; return as `_grid`."""
-    lattice, is_height = points.lattice, rules.what == "height"
+    """Write the raster, and hillshade and counts where they have a path.
+
+    Returns the numbers of cells and the statistics of their values, by the names of `DsmSummary`.
+    """
+    lattice, size_m = how.lattice, rules.cell_m
     plan = None if crs is None else parts(crs)[0]
-    unit = METRE if is_height or rules.what in DIMENSIONS else ""
+    unit = METRE if rules.what == "height" or rules.what in DIMENSIONS else ""
     new = partial(rasters.new_raster, lattice=lattice, tags={"PCFIX": json.dumps(tags)})
+    # the width of holes to fill, in cells; a TIN has filled its own
+    widest = 0.0 if how.method == "tin" else (rules.fill or 0.0) / size_m
+    margin = margin_cells(widest) if widest else 0
+    # windows have about this number of points if points are everywhere, and are wide for a margin
+    side = np.sqrt(WINDOW_POINTS) * how.spacing_m / size_m or BLOCK_CELLS
+    cells, filled, known, count, total, low, high, done = 0, 0, 0, 0, 0.0, np.inf, -np.inf, 0
     with ExitStack() as files:
         bands = {rules.what: unit}
-        dsm = files.enter_context(new(paths["dsm"], crs=crs if is_height else plan, bands=bands))
-        counts = None
+        system = crs if rules.what == "height" else plan
+        dsm = files.enter_context(new(paths["dsm"], crs=system, bands=bands))
         if "counts" in paths:
             bands = {"count": "", "spread": unit}
             counts = files.enter_context(new(paths["counts"], crs=plan, bands=bands))
-        if how.method == "tin" or rules.fill is None:
-            found = _grid(points, how, rules.what, dsm, counts, report)
-        else:
-            unfilled, widest = folder / "unfilled.tif", rules.fill / rules.cell_m
-            with rasters.new_raster(unfilled, lattice, None, {"height": METRE}) as heights:
-                found = _grid(points, how, rules.what, heights, counts, report)
-            empty = lattice.width * lattice.height
-            with rasters.open_raster(unfilled) as heights:
-                for window in lattice.window.parts(BLOCK_CELLS):
-                    around = window.grown(margin_cells(widest)).clipped(lattice.window)
-                    height = rasters.read_heights(heights, around)
-                    height = fill_holes(height, window, around, widest)
-                    rasters.write_part(dsm, height, window, 1)
-                    empty -= int((~np.isnan(height)).sum())
-            found |= {"filled": found["filled"] + found["empty"] - empty, "empty": empty}
+        for window in lattice.window.parts(int(np.clip(side, 4 * margin + 1, BLOCK_CELLS))):
+            around = window.grown(margin).clipped(lattice.window)
+            xyz = tiles.xyz[tiles.within(*lattice.box(around.grown(how.margin_cells)))]
+            release()
+            gridded = grid_window(xyz, around, how)
+            if rules.what == "uncertainty":
+                gridded = as_uncertainty(gridded)
+            height, number, spread = (band[window.within(around)] for band in gridded)
+            values = height[~np.isnan(height)]
+            if widest:
+                height = fill_holes(gridded.height, window, around, widest)
+            rasters.write_part(dsm, height, window, 1)
+            if "counts" in paths:
+                rasters.write_part(counts, number, window, 1)
+                rasters.write_part(counts, spread, window, 2)
+            cells += int((number > 0).sum())
+            filled += int((~np.isnan(height) & (number == 0)).sum())
+            known += int((~np.isnan(height)).sum())
+            count, total = count + values.size, total + float(values.sum())
+            low, high = values.min(initial=low), values.max(initial=high)
+            done += height.size
+            report(0.5 + 0.5 * done / (lattice.height * lattice.width))
     if "hillshade" in paths:
         shade = rasters.new_raster(
             paths["hillshade"], lattice, plan, {"hillshade": ""}, dtype="uint8", nodata=NO_LIGHT
@@ -269,44 +288,13 @@ def _write_rasters(
         with rasters.open_raster(paths["dsm"]) as heights, shade as out:
             for window in lattice.window.parts(BLOCK_CELLS):
                 height = rasters.read_within(heights, window.grown(1), lattice.window)
-                light = hillshade(height, rules.cell_m, rules.azimuth, rules.altitude)
+                light = hillshade(height, size_m, rules.azimuth, rules.altitude)
                 rasters.write_part(out, light, window, 1)
-    return found
-
-
-def _grid(
-    points: SortedPoints, how: Gridding, what: str, heights: DatasetWriter,
-    counts: DatasetWriter | None, report: Callable[[float], None],
-) -> dict[str, Any]:  # fmt: skip
-    """Write values to one raster, numbers of points and their spread to another.
-
-    Returns the numbers of cells and the statistics of their values, by the names of `DsmSummary`.
-    """
-    cells, filled, count, total, low, high, done = 0, 0, 0, 0.0, np.inf, -np.inf, 0
-    lattice = points.lattice
-    # windows have about this number of points if points are everywhere
-    side = np.sqrt(WINDOW_POINTS) * how.spacing_m / lattice.resolution_m or BLOCK_CELLS
-    for window in lattice.window.parts(int(np.clip(side, 1, BLOCK_CELLS))):
-        bands = grid_window(*points.within(window.grown(how.margin_cells)), window, how)
-        if what == "uncertainty":
-            bands = as_uncertainty(bands)
-        rasters.write_part(heights, bands[0], window, 1)
-        if counts is not None:
-            for band, values in enumerate(bands[1:], start=1):
-                rasters.write_part(counts, values, window, band)
-        known = ~np.isnan(bands.height)
-        values = bands.height[known]
-        cells += int((bands.points > 0).sum())
-        filled += int((known & (bands.points == 0)).sum())
-        count, total = count + values.size, total + float(values.sum())
-        low, high = values.min(initial=low), values.max(initial=high)
-        done += window.height * window.width
-        report(0.5 + 0.5 * done / (lattice.height * lattice.width))
     found = {"min": low, "mean": total / count, "max": high} if count else {}
     return {
         "cells": cells,
         "filled": filled,
-        "empty": lattice.width * lattice.height - count,
+        "empty": lattice.width * lattice.height - known,
         "values": {name: round(float(value), 4) for name, value in found.items()},
     }
 
@@ -321,7 +309,9 @@ def point_spacing_m(cloud: CloudFiles, near: Path) -> float:
 
 
 def _spacing_m(source: LasSource, xyz: FloatArray, finest_m: float = MIN_RESOLUTION_M) -> float:
-    return spacing_m(xyz, square_m(_stated_area(source, finest_m), len(source), finest_m))
+    """Return the spacing of points of a cloud by squares of at least a size; see `spacing_m`."""
+    share = max(POINTS_A_SQUARE / len(source), 1.0 / MOST_SQUARES)
+    return spacing_m(xyz, max(np.sqrt(share * _stated_area(source, finest_m)), finest_m))
 
 
 def _points_of(source: LasSource, rules: DsmRules, report: Callable[[float], None]) -> FloatArray:
@@ -377,17 +367,6 @@ def _without_stray(source: LasSource, xyz: FloatArray, resolution_m: float) -> F
         )
         warnings.warn(PcfixWarning("dsm.stray", sentence, points=stray), stacklevel=3)
     return kept(inside, xyz)
-
-
-def _warn_if_fine(resolution_m: float, spacing_m: float) -> None:
-    """Warn of cells without points."""
-    if resolution_m**2 < FEWEST_A_CELL * spacing_m**2:
-        density = (resolution_m / spacing_m) ** 2
-        sentence = (
-            f"The resolution {resolution_m:g} m is finer than the points allow: their spacing is"
-            f" {spacing_m:.2g} m, or {density:.2g} points a cell. Use at least that spacing."
-        )
-        warnings.warn(PcfixWarning("dsm.fine", sentence, spacing_m=spacing_m), stacklevel=3)
 
 
 def _dimension_of(source: LasSource, what: str) -> str | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +18,7 @@ from pcfix.flow.runner import Progress
 from pcfix.flow.shore import shoreline_layer
 from pcfix.flow.surfaces import points_of, view_of
 from pcfix.grid.colours import hillshade, relief_colours
-from pcfix.grid.lattice import Lattice, Window, round_resolution
+from pcfix.grid.lattice import round_resolution
 from pcfix.grid.maps import contours, depth_interval
 from pcfix.grid.shoreline import NearWater
 from pcfix.io import rasters
@@ -105,46 +105,38 @@ def resolution_sentence(facts: dict[str, Any], *, given: bool) -> str:
 
 
 def _write_shaded(folder: Path) -> None:
-    """Write the picture: the bed in the colours of its depth, the land grey."""
-    target = folder / SHADED
-    high = limits_of(rasters.preview(folder / DEPTH)[0], "depth")[1]
-    with ExitStack() as stack:
-        draft = stack.enter_context(temporary_output(target))
-        plain = stack.enter_context(scratch_folder(target)) / SHADED
-        surface = stack.enter_context(rasters.open_raster(folder / SURFACE))
-        depth = stack.enter_context(rasters.open_raster(folder / DEPTH))
-        lattice = rasters.lattice_of(surface)
-        bands = dict.fromkeys(("red", "green", "blue", "alpha"), "")
-        plan = None if depth.crs is None else depth.crs.to_wkt()
-        with rasters.new_raster(plain, lattice, plan, bands, dtype="uint8", nodata=None) as out:
-            for window, height, deep in _parts(surface, depth, lattice):
-                light = hillshade(height, lattice.resolution_m, *SUN_DEG)
-                colours = relief_colours(light, deep, high, flat=np.sin(np.radians(SUN_DEG[1])))
-                for number, band in enumerate(colours, start=1):
-                    rasters.write_part(out, band, window, number)
-        rasters.copy_as_cog(plain, draft)
-
-
-def _parts(
-    surface: Any, depth: Any, lattice: Lattice
-) -> Iterator[tuple[Window, FloatArray, FloatArray]]:
-    """Yield windows with their heights, one cell wider all around, and their depths.
+    """Write the picture: the bed in the colours of its depth, the land grey.
 
     Holes of the surface are filled between land and bed, so some cells are under water that have
     no depth: it follows from the water next to them.
     """
     from scipy.ndimage import minimum_filter
 
-    below, edge = rasters.lattice_of(depth), int(HOLE_CELLS)
-    row, column = below.first_row - lattice.first_row, below.first_column - lattice.first_column
-    for window in lattice.window.parts(BLOCK_CELLS):
-        wide = window.grown(edge)
-        height = rasters.read_within(surface, wide, lattice.window)
-        deep = rasters.read_within(depth, wide.moved(-row, -column), below.window)
-        level = minimum_filter(np.nan_to_num(height + deep, nan=np.inf), 2 * edge + 1)
-        is_wet = np.isnan(deep) & (height < level) & np.isfinite(level)
-        deep = np.where(is_wet, level - height, deep)
-        yield window, height[edge - 1 : 1 - edge, edge - 1 : 1 - edge], deep[edge:-edge, edge:-edge]
+    target, edge = folder / SHADED, int(HOLE_CELLS)
+    high = limits_of(rasters.preview(folder / DEPTH)[0], "depth")[1]
+    with ExitStack() as stack:
+        draft = stack.enter_context(temporary_output(target))
+        plain = stack.enter_context(scratch_folder(target)) / SHADED
+        surface = stack.enter_context(rasters.open_raster(folder / SURFACE))
+        depth = stack.enter_context(rasters.open_raster(folder / DEPTH))
+        lattice, below = rasters.lattice_of(surface), rasters.lattice_of(depth)
+        down, right = lattice.first_row - below.first_row, lattice.first_column - below.first_column
+        bands = dict.fromkeys(("red", "green", "blue", "alpha"), "")
+        plan = None if depth.crs is None else depth.crs.to_wkt()
+        with rasters.new_raster(plain, lattice, plan, bands, dtype="uint8", nodata=None) as out:
+            for window in lattice.window.parts(BLOCK_CELLS):
+                wide = window.grown(edge)
+                height = rasters.read_within(surface, wide, lattice.window)
+                deep = rasters.read_within(depth, wide.moved(down, right), below.window)
+                level = minimum_filter(np.nan_to_num(height + deep, nan=np.inf), 2 * edge + 1)
+                is_wet = np.isnan(deep) & (height < level) & np.isfinite(level)
+                deep = np.where(is_wet, level - height, deep)[edge:-edge, edge:-edge]
+                around = height[edge - 1 : 1 - edge, edge - 1 : 1 - edge]
+                light = hillshade(around, lattice.resolution_m, *SUN_DEG)
+                colours = relief_colours(light, deep, high, flat=np.sin(np.radians(SUN_DEG[1])))
+                for number, band in enumerate(colours, start=1):
+                    rasters.write_part(out, band, window, number)
+        rasters.copy_as_cog(plain, draft)
 
 
 def write_map(

@@ -111,29 +111,23 @@ class CloudSample(Sums):
         doubts = []
         if found is not None:
             off, level = found.level_m, float(np.median(water[known])) + found.level_m
-            doubts.append(
-                PcfixWarning(
-                    "water.shoreline_level",
-                    f"The cloud's shoreline is {abs(off):.2f} m {'above' if off > 0.0 else 'below'}"
-                    f" the given water, at about {level:.2f} m (standard error"
-                    f" {found.sigma_level_m:.2f} m: {'; '.join(found.reasons)}). Check the level"
-                    " and its vertical datum, or try --water auto.",
-                    off_m=off,
-                    level_m=level,
-                )
+            sentence = (
+                f"The cloud's shoreline is {abs(off):.2f} m {'above' if off > 0.0 else 'below'} the"
+                f" given water, at about {level:.2f} m (standard error {found.sigma_level_m:.2f} m:"
+                f" {'; '.join(found.reasons)}). Check the level and its vertical datum, or try"
+                " --water auto."
             )
+            code = "water.shoreline_level"
+            doubts.append(PcfixWarning(code, sentence, off_m=off, level_m=level))
         if tilted is not None:
-            doubts.append(
-                PcfixWarning(
-                    "water.shoreline_tilt",
-                    f"The cloud's shoreline rises to the {tilted.to} against the given water by"
-                    f" {100.0 * tilted.slope:.2g} %, from {tilted.low_m:+.2f} to"
-                    f" {tilted.high_m:+.2f} m. The water flows or one of the two is tilted; measure"
-                    " shoreline points all round and give them as --water.",
-                    to=tilted.to,
-                    slope=tilted.slope,
-                )
+            sentence = (
+                f"The cloud's shoreline rises to the {tilted.to} against the given water by"
+                f" {100.0 * tilted.slope:.2g} %, from {tilted.low_m:+.2f} to {tilted.high_m:+.2f}"
+                " m. The water flows or one of the two is tilted; measure shoreline points all"
+                " round and give them as --water."
             )
+            code = "water.shoreline_tilt"
+            doubts.append(PcfixWarning(code, sentence, to=tilted.to, slope=tilted.slope))
         return tuple(doubts)
 
 
@@ -347,8 +341,7 @@ def _heights(cameras: Cameras, cloud: FloatArray, ties: TiePoints | None) -> Res
     if near.sum() < LEAST_STEPS:
         return Result(unchecked="heights (no tie points on the cloud)")
     off = float(np.median((placed[:, 2] - cloud[row, 2])[near]))
-    above = float(np.median(cameras.centres[:, 2]) - np.median(cloud[:, 2]))
-    if abs(off) > MOST_HEIGHT * abs(above):
+    if abs(off) > MOST_HEIGHT * _above(cameras, cloud):
         return _doubt(
             "cameras.height",
             f"The tie points are {abs(off):.1f} m {'above' if off > 0.0 else 'below'} the cloud"

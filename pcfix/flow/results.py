@@ -81,25 +81,22 @@ class RunResults:
     @property
     def depth(self) -> DataArray:
         """Depth of the bed, shape (y, x), metres below the water, positive down; NaN on land."""
-        return self._raster(DEPTH)
+        return rasters.open_array(self._file(DEPTH))
 
     @property
     def bed(self) -> DataArray:
         """Heights of the bed, shape (y, x), metres; NaN on land."""
-        return self._raster(BED)
+        return rasters.open_array(self._file(BED))
 
     @property
     def surface(self) -> DataArray:
         """Heights of land and bed, shape (y, x), metres."""
-        return self._raster(SURFACE)
+        return rasters.open_array(self._file(SURFACE))
 
     @property
     def uncertainty(self) -> DataArray:
         """Vertical uncertainty of the bed at 95 %, shape (y, x), metres, predicted."""
-        return self._raster(UNCERTAINTY)
-
-    def _raster(self, name: str) -> DataArray:
-        return rasters.open_array(self._file(name))
+        return rasters.open_array(self._file(UNCERTAINTY))
 
     def contours(self, interval: float | None = None) -> GeoDataFrame:
         """Return lines of equal depth, ``depth_m``.
@@ -137,7 +134,7 @@ class RunResults:
         if not self.compared:
             return {}
         files = sorted(Files(self.folder).compare.glob("*.csv"))
-        rows = [{"of": title, **figures} for title, figures in signed_statistics(self.compared)]
+        rows = [{"of": name, **figures} for name, _, figures in signed_statistics(self.compared)]
         pandas = analysis_library("pandas")
         statistics = pandas.json_normalize(rows).set_index("of")
         return {"statistics": statistics, **{one.stem: pandas.read_csv(one) for one in files}}

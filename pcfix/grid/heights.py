@@ -38,12 +38,12 @@ class Gridded(NamedTuple):
     spread: FloatArray
 
 
-def grid_window(points: FloatArray, cell: IntArray, window: Window, how: Gridding) -> Gridded:
-    """Return the bands of a part of a raster.
+def grid_window(points: FloatArray, window: Window, how: Gridding) -> Gridded:
+    """Return the bands of a part of a raster, from all points that decide on it, or more.
 
-    Points, shape (n, 3), are x and y, world frame, metres, and the height or another quantity;
-    `cell`, shape (n, 2), is the column and row of each point.
+    Points, shape (n, 3), are x and y, world frame, metres, and the height or another quantity.
     """
+    cell = how.lattice.cells(points)
     inner, shape = window.holds(cell), (window.height, window.width)
     code = (cell[inner, 1] - window.row) * window.width + cell[inner, 0] - window.column
     cells = cell_statistics(code, points[inner, 2], window.height * window.width)

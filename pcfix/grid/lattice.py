@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.blocks import blocks, bounds, grouped, mapped, release
+from pcfix.blocks import blocks, bounds
 from pcfix.errors import SettingError
 from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.options.steps import MIN_RESOLUTION_M
@@ -112,6 +112,13 @@ class Lattice:
         """The whole raster."""
         return Window(0, self.height, 0, self.width)
 
+    def box(self, window: Window) -> tuple[FloatArray, FloatArray]:
+        """Return the least and largest x, y and z of a window, and of a cell more on each side."""
+        first = np.array([window.column - 1, -window.row_stop - 1, -np.inf])
+        last = np.array([window.column_stop + 1, -window.row + 1, np.inf])
+        corner = np.array([self.left_m, self.top_m, 0.0])
+        return corner + first * self.resolution_m, corner + last * self.resolution_m
+
     def positions(self, xyz: FloatArray) -> FloatArray:
         """Return columns and rows of points, shape (n, 2), cells from the top left corner."""
         away = np.column_stack([xyz[:, 0] - self.left_m, self.top_m - xyz[:, 1]])
@@ -179,10 +186,6 @@ def round_resolution(spacing_m: float, finest_m: float) -> float:
     return next(float(f"{side:.6g}") for side in sides if least * 0.999 <= side <= most * 1.001)
 
 
-POINTS_A_SQUARE = 6.0
-MOST_SQUARES = 4_000_000
-
-
 def spacing_m(xyz: FloatArray, side_m: float) -> float:
     """Return the spacing of points (n, 3) within the squares of the plan with any; 0 on a line."""
     squares: IntArray = np.empty(0, np.int64)
@@ -194,43 +197,3 @@ def spacing_m(xyz: FloatArray, side_m: float) -> float:
     corner = np.column_stack([squares - (row << 32), row]) * side_m
     sides = np.minimum(corner + side_m, high) - np.maximum(corner, low)
     return float(np.sqrt(np.maximum(sides, 0.0).prod(axis=1).sum() / len(xyz)))
-
-
-def square_m(area_m2: float, points: int, finest_m: float) -> float:
-    """Return the side of squares for `spacing_m`, not smaller than `finest_m`."""
-    wanted = max(POINTS_A_SQUARE / points, 1.0 / MOST_SQUARES) * area_m2
-    return max(float(np.sqrt(wanted)), finest_m)
-
-
-@dataclass(frozen=True, eq=False)
-class SortedPoints:
-    """The points of a raster by squares of `side` cells; they may be on disk, see `blocks`."""
-
-    lattice: Lattice
-    side: int
-    xyz: FloatArray  # (n, 3), metres, world frame; the gridded values in the place of z
-    start: IntArray  # square i, row by row, has the points start[i] to start[i + 1]
-
-    @classmethod
-    def of(cls, xyz: FloatArray, lattice: Lattice, side: int) -> SortedPoints:
-        """Sort the points of a raster."""
-        columns, rows = -(-lattice.width // side), -(-lattice.height // side)
-
-        def square(some: FloatArray) -> IntArray:
-            column, row = (lattice.cells(some) // side).T
-            return np.asarray(row * columns + column)
-
-        start, (xyz,) = grouped(mapped(square, xyz), columns * rows, xyz)
-        return cls(lattice, side, xyz, start)
-
-    def within(self, window: Window) -> tuple[FloatArray, IntArray]:
-        """Return the points of a window, shape (n, 3), and their columns and rows, (n, 2)."""
-        near, columns = window.clipped(self.lattice.window), -(-self.lattice.width // self.side)
-        first, last = near.column // self.side, (near.column_stop - 1) // self.side
-        squares = range(near.row // self.side, (near.row_stop - 1) // self.side + 1)
-        ends = [self.start[[row * columns + first, row * columns + last + 1]] for row in squares]
-        xyz = np.vstack([self.xyz[start:stop] for start, stop in ends])
-        release()
-        cell = self.lattice.cells(xyz)
-        rows = window.holds(cell)
-        return xyz[rows], cell[rows]

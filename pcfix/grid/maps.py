@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.model import BoolArray, FloatArray, IntArray
+from pcfix.model import BoolArray, FloatArray
 from pcfix.sums import nice_step
 
 LONG_SIDE_CELLS = 360
@@ -49,18 +49,17 @@ class Maps:
         return self.west_m, east, self.north_m - rows * self.cell_m, self.north_m
 
     def sampled(self, values: FloatArray, extent_m: Extent) -> FloatArray:
-        """Sample a raster of any resolution at the centres of the cells."""
+        """Sample a raster of any resolution at the centres of the cells, NaN outside of it."""
+        from scipy.ndimage import map_coordinates
+
         west, east, south, north = extent_m
         rows, columns = self.height_m.shape
         x = self.west_m + (np.arange(columns) + 0.5) * self.cell_m
         y = self.north_m - (np.arange(rows) + 0.5) * self.cell_m
-        column = np.floor((x - west) / (east - west) * values.shape[1]).astype(np.int64)
-        row = np.floor((north - y) / (north - south) * values.shape[0]).astype(np.int64)
-        inside = np.ix_((row >= 0) & (row < values.shape[0]),
-                        (column >= 0) & (column < values.shape[1]))  # fmt: skip
-        found = np.full((rows, columns), np.nan)
-        found[inside] = values[np.ix_(row[inside[0].ravel()], column[inside[1].ravel()])]
-        return found
+        column = np.floor((x - west) / (east - west) * values.shape[1])
+        row = np.floor((north - y) / (north - south) * values.shape[0])
+        places = np.meshgrid(row, column, indexing="ij")
+        return np.asarray(map_coordinates(values, places, order=0, cval=np.nan))
 
 
 class MapsBuilder:
@@ -85,9 +84,8 @@ class MapsBuilder:
             first, last = (np.floor(corner / self._cell_m) for corner in (low, high))
             self._low = first * self._cell_m
             self._columns, self._rows = (last - first + 1.0).astype(np.int64).tolist()
-        cells = self._rows * self._columns
-        self._all = np.zeros((2, cells))
-        self._moved = np.zeros((5, cells))
+        # of all points their number and heights; of those that moved also their number and values
+        self._sums = np.zeros((7, self._rows * self._columns))
 
     def add(
         self, xyz: FloatArray, moved: BoolArray | None = None, values: FloatArray | None = None
@@ -96,27 +94,22 @@ class MapsBuilder:
 
         These are depth, shift in Z, number of rays and standard error of Z.
         """
-        column, row = ((xyz[:, :2] - self._low) / self._cell_m).astype(np.int64).T
-        column = np.clip(column, 0, self._columns - 1)
-        row = np.clip(row, 0, self._rows - 1)
+        place = ((xyz[:, :2] - self._low) / self._cell_m).astype(np.int64)
+        column, row = np.clip(place, 0, (self._columns - 1, self._rows - 1)).T
         cell = (self._rows - 1 - row) * self._columns + column
-        self._sum(self._all, cell, xyz[:, 2])
+        added = [(cell, np.ones(len(cell))), (cell, xyz[:, 2])]
         if moved is not None and values is not None:
             depth, shift, rays, sigma = values.T
-            self._sum(self._moved, cell[moved], depth, shift, rays, sigma**2)
-
-    @staticmethod
-    def _sum(sums: FloatArray, cell: IntArray, *values: FloatArray) -> None:
-        cells = sums.shape[1]
-        sums[0] += np.bincount(cell, minlength=cells)
-        for i, value in enumerate(values, start=1):
-            np.add.at(sums[i], cell, value)  # one by one: the same bits for any chunks
+            columns = (np.ones(len(depth)), depth, shift, rays, sigma**2)
+            added += [(cell[moved], column) for column in columns]
+        for sums, (cells, summands) in zip(self._sums, added, strict=False):
+            np.add.at(sums, cells, summands)  # one by one: the same bits for any chunks
 
     def maps(self) -> Maps:
         """Return the means."""
         shape = self._rows, self._columns
         with np.errstate(invalid="ignore"):
-            means = [self._all[1] / self._all[0], *(self._moved[1:] / self._moved[0])]
+            means = [self._sums[1] / self._sums[0], *(self._sums[3:] / self._sums[2])]
         heights, depth, shift, rays, variance = (_filled(one.reshape(shape)) for one in means)
         uncertainty = np.where(variance > 0.0, 1.96 * np.sqrt(variance), np.nan)
         known = np.argwhere(np.isfinite(heights))

@@ -7,26 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from processing.core.ProcessingConfig import ProcessingConfig, Setting
-from qgis.core import (
-    QgsApplication,
-    QgsPointCloudLayer,
-    QgsProcessingAlgorithm,
-    QgsProcessingContext,
-    QgsProcessingException,
-    QgsProcessingOutputString,
-    QgsProcessingParameterBoolean,
-    QgsProcessingParameterDefinition,
-    QgsProcessingParameterEnum,
-    QgsProcessingParameterFile,
-    QgsProcessingParameterFileDestination,
-    QgsProcessingParameterFolderDestination,
-    QgsProcessingParameterNumber,
-    QgsProcessingParameterString,
-    QgsProcessingProvider,
-    QgsProviderRegistry,
-    QgsRasterLayer,
-    QgsVectorLayer,
-)
+from qgis import core
 
 from .command import CommandError, program_of, run, words_of
 
@@ -42,21 +23,19 @@ class Plugin:
         self.provider: Any = None
 
     def initProcessing(self) -> None:  # noqa: N802
-        """Add the algorithms; ``qgis_process`` calls only this."""
+        """Add the algorithms to the toolbox; ``qgis_process`` calls only this."""
         self.provider = Provider()
-        QgsApplication.processingRegistry().addProvider(self.provider)
+        core.QgsApplication.processingRegistry().addProvider(self.provider)
 
-    def initGui(self) -> None:  # noqa: N802
-        """Add the algorithms to the window's toolbox."""
-        self.initProcessing()
+    initGui = initProcessing  # noqa: N815 (QGIS with a window calls this)
 
     def unload(self) -> None:
         """Remove the algorithms."""
         if self.provider is not None:
-            QgsApplication.processingRegistry().removeProvider(self.provider)
+            core.QgsApplication.processingRegistry().removeProvider(self.provider)
 
 
-class Provider(QgsProcessingProvider):
+class Provider(core.QgsProcessingProvider):
     """The commands in ``commands.json``."""
 
     def id(self) -> str:
@@ -87,7 +66,7 @@ class Provider(QgsProcessingProvider):
             self.addAlgorithm(Algorithm(command))
 
 
-class Algorithm(QgsProcessingAlgorithm):
+class Algorithm(core.QgsProcessingAlgorithm):
     """One command of pcfix."""
 
     def __init__(self, command: dict[str, Any]) -> None:
@@ -117,10 +96,10 @@ class Algorithm(QgsProcessingAlgorithm):
             parameter = _parameter(one)
             parameter.setHelp(one["help"])
             if not one["needed"]:
-                flag = QgsProcessingParameterDefinition.FlagAdvanced
+                flag = core.QgsProcessingParameterDefinition.FlagAdvanced
                 parameter.setFlags(parameter.flags() | flag)
             self.addParameter(parameter, createOutput=True)
-        self.addOutput(QgsProcessingOutputString(SAID, "Messages of pcfix"))
+        self.addOutput(core.QgsProcessingOutputString(SAID, "Messages of pcfix"))
 
     def processAlgorithm(  # noqa: N802
         self, parameters: dict[str, Any], context: Any, feedback: Any
@@ -139,7 +118,7 @@ class Algorithm(QgsProcessingAlgorithm):
             feedback.pushCommandInfo(" ".join(["pcfix", *words]))
             run(program, words, feedback.isCanceled, feedback.setProgress, say)
         except CommandError as error:
-            raise QgsProcessingException(str(error)) from error
+            raise core.QgsProcessingException(str(error)) from error
         written = {
             one["name"]: values[one["name"]]
             for one in self.fields
@@ -169,14 +148,14 @@ def _parameter(one: dict[str, Any]) -> Any:
     name, kind, default = one["name"], one["kind"], one["default"]
     label = name.replace("_", " ").capitalize() + (f" [{one['unit']}]" if one["unit"] else "")
     optional = not one["needed"]
-    file, number = QgsProcessingParameterFile, QgsProcessingParameterNumber
+    file, number = core.QgsProcessingParameterFile, core.QgsProcessingParameterNumber
     if kind == "bool":
-        return QgsProcessingParameterBoolean(name, label, default, optional)
+        return core.QgsProcessingParameterBoolean(name, label, default, optional)
     if kind in ("int", "float"):
         type_ = number.Integer if kind == "int" else number.Double
         return number(name, label, type_, default, optional)
     if kind == "choice":
-        return QgsProcessingParameterEnum(
+        return core.QgsProcessingParameterEnum(
             name, label, one["choices"], False, default, optional, usesStaticStrings=True
         )
     if kind in ("file", "cloud", "folder"):
@@ -184,13 +163,15 @@ def _parameter(one: dict[str, Any]) -> Any:
         clouds = {"fileFilter": CLOUDS} if kind == "cloud" else {}
         return file(name, label, behaviour, optional=optional, **clouds)
     if kind == "folder written":
-        return QgsProcessingParameterFolderDestination(name, label, None, optional, not optional)
+        return core.QgsProcessingParameterFolderDestination(
+            name, label, None, optional, not optional
+        )
     if kind == "written":
         filters = "LAZ (*.laz);;LAS (*.las)" if one["needed"] else "All files (*.*)"
-        return QgsProcessingParameterFileDestination(
+        return core.QgsProcessingParameterFileDestination(
             name, label, filters, None, optional, not optional
         )
-    return QgsProcessingParameterString(name, label, default, False, optional)
+    return core.QgsProcessingParameterString(name, label, default, False, optional)
 
 
 def _load(path: Path, context: Any) -> None:
@@ -201,18 +182,20 @@ def _load(path: Path, context: Any) -> None:
             if layer.isValid():
                 layer.loadDefaultStyle()
                 context.temporaryLayerStore().addMapLayer(layer)
-                details = QgsProcessingContext.LayerDetails(layer.name(), context.project(), "")
+                details = core.QgsProcessingContext.LayerDetails(
+                    layer.name(), context.project(), ""
+                )
                 context.addLayerToLoadOnCompletion(layer.id(), details)
 
 
 def _layers(path: Path) -> list[Any]:
     suffix = path.suffix.lower()
     if suffix == ".tif":
-        return [QgsRasterLayer(str(path), path.stem)]
-    if suffix in (".las", ".laz") and "pdal" in QgsProviderRegistry.instance().providerList():
-        return [QgsPointCloudLayer(str(path), path.stem, "pdal")]
+        return [core.QgsRasterLayer(str(path), path.stem)]
+    if suffix in (".las", ".laz") and "pdal" in core.QgsProviderRegistry.instance().providerList():
+        return [core.QgsPointCloudLayer(str(path), path.stem, "pdal")]
     if suffix == ".gpkg":
-        found = QgsVectorLayer(str(path), path.stem, "ogr").dataProvider()
+        found = core.QgsVectorLayer(str(path), path.stem, "ogr").dataProvider()
         names = [word.split("!!::!!")[1] for word in found.subLayers()] if found else []
-        return [QgsVectorLayer(f"{path}|layername={name}", name, "ogr") for name in names]
+        return [core.QgsVectorLayer(f"{path}|layername={name}", name, "ogr") for name in names]
     return []

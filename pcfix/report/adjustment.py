@@ -5,8 +5,6 @@ All words are made of the plain values of `adjustment_dict`, so that a resumed r
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from pcfix.adjust.block import MOTIONS
@@ -39,16 +37,25 @@ _COUNTS = (
      "points"),
     ("observations", "{o[used]:,} {kind} used, {o[left_out]:,} left out ({o_share}){outside}", "o"),
     ("sigma0", "{sigma0_words}, redundancy {redundancy:,}, {rounds_count} rounds, {steps}"
-     " steps{undone}", "rounds"),
+     " steps{undone}", "images"),
     ("water", "{water[surface]}", "has_shape"),
 )  # fmt: skip
-_POSES = (
-    ("poses", "RMS movement of the centres {moved_rms_m:.3f} m", "moved_rms_m"),
-    ("", "mean east, north, up {mean} m, largest {moved_largest_m:.3f} m ({moved_largest_image});"
-     " RMS rotation {turned_rms_deg:.4f} deg", "moved_rms_m"),
-    ("precision", "standard errors of centres X, Y, Z: mean {centre_mean} m, largest"
-     " {centre_largest} m; of angles: mean {angle_mean} deg, largest {angle_largest} deg",
-     "centre_mean"),
+_ACCURACY = (
+    ("on {surface}", "{points:,} marked points, distance RMS {rms_m:z.4f} m (given {sigma_m:g} m),"
+     " largest {largest_m:z.4f} m ({largest_point}){parallel_to}", "*on_surfaces"),
+    ("poses", "RMS movement of the centres {poses[moved_rms_m]:.3f} m", "moved"),
+    ("", "mean east, north, up {poses[moved_mean_m]:+z.3f} m, largest"
+     " {poses[moved_largest_m]:.3f} m ({poses[moved_largest_image]}); RMS rotation"
+     " {poses[turned_rms_deg]:.4f} deg", "moved"),
+    ("precision", "standard errors of centres X, Y, Z: mean {precision[centre_mean_m]:z.4f} m,"
+     " largest {precision[centre_largest_m]:z.4f} m; of angles: mean"
+     " {precision[angle_mean_deg]:z.4f} deg, largest {precision[angle_largest_deg]:z.4f} deg",
+     "is_precise"),
+    ("GNSS", "{gnss[images]:,} images. Centres minus GNSS east, north, up: mean"
+     " {gnss[mean_m]:+z.3f} m, RMS {gnss[rms_m]:z.3f} m, largest {gnss[largest_m]:z.3f} m"
+     " ({gnss[largest_image]}); RMS before {gnss[rms_before_m]:z.3f} m", "gnss"),
+    ("{role} points", "{count}, adjusted minus surveyed X, Y, Z: mean {mean_m:+z.3f} m, RMS"
+     " {rms_m:z.3f} m, {rms_px:z.2f} {image_unit}", "*surveyed"),
 )  # fmt: skip
 
 
@@ -57,15 +64,7 @@ _POSES = (
 
 def fixed(value: float | None, digits: int, sign: str = "") -> str:
     """Return a number with a fixed number of digits; a dash if it is unknown."""
-    if value is None:
-        return "-"
-    # a zero has no minus sign
-    return f"{value if abs(value) >= 0.5 * 10.0**-digits else 0.0:{sign}.{digits}f}"
-
-
-def listed(values: Sequence[float | None] | None, digits: int = 3, sign: str = "") -> str:
-    """Return numbers separated by commas; a dash if they are unknown."""
-    return "-" if values is None else ", ".join(fixed(value, digits, sign) for value in values)
+    return "-" if value is None else f"{value:{sign}z.{digits}f}"  # z: a zero has no minus sign
 
 
 def short(value: float, sigma: float | None, sign: str = "") -> str:
@@ -196,43 +195,20 @@ def _facts(d: Plain) -> Rows:
         v = (d["water"] or d["port_found"] or {}).get(key)
         if v is not None and not v["free"] and not (key.startswith("tilt") and v["after"] == 0.0):
             rows.append((label, f"{v['after']:.6g}{f' {unit}' if unit else ''}, fixed"))
-    parallel = d["unknowns"]["parallel"]
-    for one in d["on_surfaces"]:
-        name = one["surface"]
-        others = [other for other in parallel if other != name and name in parallel]
-        words = (
-            f"{one['points']:,} marked points, distance RMS {fixed(one['rms_m'], 4)} m (given"
-            f" {one['sigma_m']:g} m), largest {fixed(one['largest_m'], 4)} m"
-            f" ({one['largest_point']})"
-        )
-        rows.append(
-            (f"on {name}", words + (f"; parallel to {', '.join(others)}" if others else ""))
-        )
-    if d["poses_are"] != "fixed":
-        errors = {
-            f"{what}_{which}": listed(precision[f"{what}_{which}_{unit}"], 4)
-            for what, unit in (("centre", "m"), ("angle", "deg"))
-            for which in ("mean", "largest")
-        } if precision is not None and precision["images"] else {}  # fmt: skip
-        mean = listed(d["poses"]["moved_mean_m"], 3, "+")
-        rows += filled(_POSES, d["poses"] | errors | {"mean": mean})
-    if (g := d["gnss"]) is not None:
-        words = (
-            f"{g['images']:,} images. Centres minus GNSS east, north, up: mean"
-            f" {listed(g['mean_m'], 3, '+')} m, RMS {listed(g['rms_m'])} m, largest"
-            f" {fixed(g['largest_m'], 3)} m ({g['largest_image']}); RMS before"
-            f" {listed(g.get('rms_before_m'))} m"
-        )
-        rows.append(("GNSS", words))
-    for role in ("control", "check"):
-        if (one := d[role]) is not None:
-            words = (
-                f"{len(one['points'])}, adjusted minus surveyed X, Y, Z: mean"
-                f" {listed(one['mean_m'], 3, '+')} m, RMS {listed(one['rms_m'])} m,"
-                f" {fixed(one['rms_px'], 2)} {d['image_unit']}"
-            )
-            rows.append((f"{role} points", words))
-    return rows
+    parallel, is_free = d["unknowns"]["parallel"], d["poses_are"] != "fixed"
+    others = {name: ", ".join(one for one in parallel if one != name) for name in parallel}
+    return rows + filled(_ACCURACY, d | {
+        "on_surfaces": [
+            one | {"parallel_to": f"; parallel to {others[name]}" if others.get(name) else ""}
+            for one in d["on_surfaces"] for name in [one["surface"]]
+        ],
+        "moved": is_free and d["poses"]["moved_rms_m"],
+        "is_precise": is_free and precision is not None and precision["images"],
+        "surveyed": [
+            {"role": role, "count": len(d[role]["points"]), **d[role]}
+            for role in ("control", "check") if d[role] is not None
+        ],
+    })  # fmt: skip
 
 
 def _fact_table(d: Plain) -> Table:

@@ -6,7 +6,6 @@ earlier one measured. The terminal and the page show the same tables.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -60,20 +59,15 @@ _SHOWN = 0.995
 # Numbers
 
 
-def _signed(compared: Plain) -> Iterator[tuple[str, str, Plain]]:
-    """Yield key, time and statistics of every error that has a sign."""
-    for key in SIGNED:
-        for when, _, _ in TIMES:
+def signed_statistics(compared: Plain) -> list[tuple[str, str, Plain]]:
+    """Return every error that has a sign: its titles in Python and on the page, and statistics."""
+    found = []
+    for key, (short, title) in SIGNED.items():
+        for when, name, _ in TIMES:
             if (one := (compared.get(key) or {}).get(when)) is not None:
-                yield key, when, one.get("statistics", one)
-
-
-def signed_statistics(compared: Plain) -> list[tuple[str, Plain]]:
-    """Return title and statistics of every error that has a sign, for tables in Python."""
-    return [
-        (f"{SIGNED[key][0]} {when}" if compared[key]["before"] else SIGNED[key][0], statistics)
-        for key, when, statistics in _signed(compared)
-    ]
+                label = f"{short} {when}" if compared[key]["before"] else short
+                found.append((label, f"{title}, {name}", one.get("statistics", one)))
+    return found
 
 
 def c2c_rows(compared: Plain) -> list[tuple[str, str, str, Plain]]:
@@ -151,8 +145,7 @@ def in_a_sentence(compared: Plain) -> str:
     if pair is None or pair["before"] is None:
         return ""
     bed, land = compared.get("bed"), compared.get("land")
-    before, after = ((bed or pair)[when] for when, _, _ in TIMES)
-    before, after = (one.get("statistics", one) for one in (before, after))
+    before, after = (raw_of(compared)[when] for when, _, _ in TIMES)
     way = "fell" if after["rmse_m"] <= before["rmse_m"] else "grew"
     of_land = "" if not bed or land is None else (
         f" Land: {land['before']['rmse_m']:.3f} to {land['after']['rmse_m']:.3f} m."
@@ -189,7 +182,7 @@ def _tables(compared: Plain) -> list[Table]:
     """Return the tables for terminal and page; those without rows are omitted."""
     names = {when: name for when, name, _ in TIMES}
     c2c = c2c_rows(compared)
-    found = [(f"{SIGNED[key][1]}, {names[when]}", s) for key, when, s in _signed(compared)]
+    found = [(title, s) for _, title, s in signed_statistics(compared)]
     found += [(f"C2C {way}, {name}", of["statistics"]) for way, name, _, of in c2c]
     rows = []
     for title, s in found:

@@ -41,11 +41,9 @@ def new_figure(
     width_in: float = 8.0, height_in: float = 4.5, mosaic: Any = None, **grid: Any
 ) -> tuple[Figure, Any]:
     """Return a figure, drawn without a screen, and its axes: a grid, or a mosaic by name."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width_in, height_in), layout="constrained")
-    FigureCanvasAgg(figure)
     if mosaic is not None:
         return figure, figure.subplot_mosaic(mosaic, **grid)
     return figure, figure.subplots(**grid)

@@ -72,11 +72,6 @@ class RunResults:
     compared: Plain = field(default_factory=dict)  # `Comparison.as_dict`
     difference: tuple[FloatArray, Extent] | None = None  # cloud minus reference, metres
 
-    @property
-    def tvu(self) -> Plain | None:
-        """The measured uncertainty of the bed, if there was a reference."""
-        return self.compared.get("tvu")
-
 
 def run_report(run: RunResults, inputs: Table, files: Sequence[Pair]) -> Report:
     """Return the page of a run; `inputs` lists the files read, `files` those beside the page."""
@@ -115,7 +110,7 @@ def run_report(run: RunResults, inputs: Table, files: Sequence[Pair]) -> Report:
     # the rows of the terminal, with the detected reconstruction type in words
     facts = {"Cloud": name_of(s.input), "Points": f"{s.points:,}", **dict(rows)}
     facts |= {"Method": f"{s.made['method']}. {s.made['because']}"} if s.made else {}
-    facts |= {"Uncertainty": uncertainty_sentence(s, run.tvu)}
+    facts |= {"Uncertainty": uncertainty_sentence(s, run.compared.get("tvu"))}
     settings = [
         [name.replace("_", " "), _worded(value)]
         for name, value in s.settings.items()
@@ -137,7 +132,7 @@ def run_report(run: RunResults, inputs: Table, files: Sequence[Pair]) -> Report:
         pictures=sorted(
             [*_pictures(run), *run.pictures], key=lambda one: order.get(one.name, len(order))
         ),
-        tables=[*run.tables, *_orders(s, run.tvu)],
+        tables=[*run.tables, *_orders(s, run.compared.get("tvu"))],
         files=files,
         provenance=[
             Table("In short", [], [[label, words] for label, words in facts.items() if words]),
@@ -214,7 +209,7 @@ def _pictures(run: RunResults) -> list[Picture]:
         pictures.append(Picture("cameras", "Cameras", alt, cameras_figure(run)))
     known = run.sample[:, 2] > 0.0
     if s.uncertainty is not None and known.any():
-        bins = run.compared["depth_bins"] if run.tvu else []
+        bins = run.compared["depth_bins"] if run.compared.get("tvu") else []
         dots = (
             " Dots: the limit that 95 % of the differences to the reference keep, its noise"
             " included."

@@ -1,12 +1,14 @@
 """The summaries of the commands, as tables of rows.
 
-A row is (label, format, needs): the format takes values by name, and the row is omitted if the
-value that it needs is missing or zero. Terminal and report page use the same rows.
+A row is (label, format, needs): label and format take values by name, and the row is omitted if the
+value that it needs is missing or zero. With a star before it, the value is a list, and the row is
+repeated with the values by name of each. Terminal and report page use the same rows.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
+from string import Formatter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,11 +29,6 @@ FEWEST = 59
 """Differences of which all keep an order before 95 % of all are likely to: 0.95^59 is 0.05."""
 SHOWN_NAMES = 5
 
-_DEPTH = (
-    "Depth",
-    "{depth_m[min]:.2f} to {depth_m[max]:.2f} m, mean {depth_m[mean]:.2f} m",
-    "depth_m",
-)
 _PART = ("Read", "{part_words}", "part_words")
 _NO_SURFACE = (
     "No surface",
@@ -58,10 +55,11 @@ _CORRECTED: RowTable = (
      " {carried[shift_m][mean_z]:+.3f} m", "carried"),
     ("", "{carried_not:,} not: {carried[not_carried_reason]} ({fate})", "carried_not"),
     ("Submerged", "{submerged:,} points ({submerged_share}), {corrected_words}", "points"),
+    ("", "{count:,} not corrected: {reason} ({fate})", "*not_corrected"),
     _NO_SURFACE,
     ("Withheld", "{unsure:,} corrected points ({unsure_share}) are seen at large incidence angles"
      " only", "unsure"),
-    _DEPTH,
+    ("Depth", "{depth_m[min]:.2f} to {depth_m[max]:.2f} m, mean {depth_m[mean]:.2f} m", "depth_m"),
     ("Z shift", "mean {shift_z_m[mean]:.3f} m (5th to 95th percentile {shift_z_m[p5]:.3f} to"
      " {shift_z_m[p95]:.3f} m)", "shift_z_m"),
     ("Method", "{method}", "method"),
@@ -91,10 +89,12 @@ _LABELLED: RowTable = (
 )  # fmt: skip
 _CLEANED: RowTable = (
     ("Noise", "{noise:,} points ({noise_share}), {fate}", "points"),
+    ("", "{count:,} {reason}", "*flagged"),
     ("Ignored", "{set_aside:,} points were withheld or noise before", "set_aside"),
     ("Bed", "{submerged:,} submerged points tested against it", "submerged"),
     ("Neighbours", "mean distance {near[mean]:.3f} m, standard deviation {near[sd]:.3f} m, limit"
      " {near[limit]:.3f} m", "near"),
+    ("Not run", "{test}", "*tests_not_run"),
 )  # fmt: skip
 _GRIDDED: RowTable = (
     _PART,
@@ -149,13 +149,26 @@ def aligned(head: str, rows: Iterable[tuple[str, str]], notes: Iterable[object] 
     return "\n".join([*lines, *(f"Note: {note}" for note in notes)])
 
 
-def filled(table: RowTable, values: Mapping[str, Any]) -> Rows:
+class _Numbers(Formatter):
+    """Formats None as a dash, and the numbers of a list one by one."""
+
+    def format_field(self, value: Any, format_spec: str) -> str:
+        """Return a value as text."""
+        if isinstance(value, list):
+            return ", ".join(self.format_field(one, format_spec) for one in value)
+        return "-" if value is None else str(format(value, format_spec))
+
+
+def filled(table: RowTable, values: Plain) -> Rows:
     """Return labels and texts of the rows of a table whose values are known."""
-    return [
-        (label, text.format_map(values))
-        for label, text, needs in table
-        if values.get(needs) not in (None, 0, "", {}, ())
-    ]
+    rows: Rows = []
+    for label, text, needs in table:
+        needed = values.get(needs)
+        once: list[Plain] = [{}] if needed not in (None, 0, "", {}, ()) else []
+        for one in values[needs[1:]] if needs.startswith("*") else once:
+            row = (_Numbers().vformat(words, (), values | one) for words in (label, text))
+            rows.append((next(row), next(row)))
+    return rows
 
 
 def summary_text(summary: Summary) -> str:
@@ -189,6 +202,7 @@ def summary_rows(s: Summary) -> Rows:
         "submerged_share": share(s.submerged, s.points),
         "corrected_words": "all corrected" if s.corrected == s.submerged
         else f"{s.corrected:,} corrected ({share(s.corrected, s.submerged)})",
+        "not_corrected": [{"reason": why, "count": n} for why, n in s.uncorrected.items() if n],
         "unsure_share": share(s.unsure or 0, s.corrected),
         "method": method,
         "rays_per_point": s.rays / max(s.corrected, 1),
@@ -203,14 +217,7 @@ def summary_rows(s: Summary) -> Rows:
         "order": order_sentence(s),
         "check": check,
     }  # fmt: skip
-    rows = filled(_CORRECTED, values)
-    place = 1 + next((i for i, (label, _) in enumerate(rows) if label == "Submerged"), 0)
-    rows[place:place] = [
-        ("", f"{count:,} not corrected: {reason} ({values['fate']})")
-        for reason, count in s.uncorrected.items()
-        if count
-    ]
-    rows += shoreline_rows(s.shoreline)
+    rows = filled(_CORRECTED, values) + shoreline_rows(s.shoreline)
     return [*rows, *filled(_UNCERTAINTY, values), *_labelling_rows(s.labelling)]
 
 
@@ -344,11 +351,10 @@ def cleaning_text(s: CleanSummary) -> str:
         "noise_share": share(s.noise, s.points),
         "fate": "dropped" if s.dropped else "class 7, withheld",
         "near": s.neighbour_distance_m,
+        "flagged": [{"reason": k.replace("_", " "), "count": n} for k, n in s.reasons.items() if n],
+        "tests_not_run": [{"test": test} for test in s.not_run],
     }
-    rows = filled(_CLEANED, values)
-    reasons = {name.replace("_", " "): n for name, n in s.reasons.items() if n}
-    rows[1:1] = [("", f"{count:,} {reason}") for reason, count in reasons.items()]
-    return aligned(_head("Cleaned", s), [*rows, *(("Not run", test) for test in s.not_run)])
+    return aligned(_head("Cleaned", s), filled(_CLEANED, values))
 
 
 def dsm_text(s: Any) -> str:
