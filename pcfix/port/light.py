@@ -16,6 +16,7 @@ from pcfix.kernels import device
 from pcfix.lens.algebra import Vector, beyond, cross, dot, minus, plus, scaled, unit, vector
 from pcfix.model import FloatArray
 from pcfix.port.shapes import DomePort, FlatPort, Port
+from pcfix.refract.rays import refracted
 
 KIND, X, Y, Z, SIZE, THICK, GLASS = range(7)
 FLAT, DOME = 0.0, 1.0
@@ -67,16 +68,12 @@ def _at_face(window: Window, depth: float, start: Vector, s: Vector) -> tuple[Ve
 
 
 @device
-def bent(s: Vector, normal: Vector, r: float) -> Vector:
-    """Return the unit direction behind a face: Snell's law in vector form.
+def _behind(s: Vector, normal: Vector, r: float) -> Vector:
+    """Return the unit direction behind a face, whose normal goes with the light.
 
-    Skarlatos & Agrafiotis 2018, eq 10, with the normal along the light instead of against it:
-    t = r s + (sqrt(1 - r^2 (1 - c^2)) - r c) N, c = N.s, with r the refractive index before the
-    face over that behind it. NaN for total reflection.
+    r is the refractive index before the face over that behind it. NaN for total reflection.
     """
-    c = dot(normal, s)
-    k = np.sqrt(1.0 - r * r * (1.0 - c * c)) - r * c
-    return plus(scaled(r, s), scaled(k, normal))
+    return refracted(scaled(-1.0, s), 1.0, scaled(-1.0, normal), dot(normal, s), r)
 
 
 @device
@@ -84,9 +81,9 @@ def _ray(window: Window, n: float, direction: Vector) -> tuple[Vector, Vector]:
     """Return the place and the unit direction of `ray_through`."""
     s, thickness, glass = unit(direction), window[3], window[4]
     inner, normal = _at_face(window, 0.0, (0.0, 0.0, 0.0), s)
-    inside = bent(s, normal, 1.0 / glass)
+    inside = _behind(s, normal, 1.0 / glass)
     outer, normal = _at_face(window, thickness, inner, inside)
-    return outer, bent(inside, normal, glass / n)
+    return outer, _behind(inside, normal, glass / n)
 
 
 @device
