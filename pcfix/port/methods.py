@@ -61,7 +61,14 @@ from pcfix.lens.frames import Frames, frames_of, holds, no_frames
 from pcfix.lens.imaging import image_and_gradients, image_in_world, lens_table
 from pcfix.model import NOMINAL_WIDTH_PX, BoolArray, Cameras, FloatArray, IntArray, Lens, Views
 from pcfix.options.correct import ScienceOptions
-from pcfix.port.light import coefficients, cosine_at_port, light_through, ray_through, through_port
+from pcfix.port.light import (
+    coefficients,
+    cosine_at_port,
+    light_through,
+    ray_through,
+    through_port,
+    window_of,
+)
 from pcfix.port.shapes import Port
 from pcfix.refract.batch import (
     CORRECTED,
@@ -260,14 +267,14 @@ def _usable(
     The point is imaged along a straight line, or `through` the port.
     """
     usable, cosine = np.empty(candidates.size, np.int64), np.empty(candidates.size)
-    k = 0
+    window, k = window_of(rig.port), 0
     for c in candidates:
         r, x = rig.rotations[c], minus(point, row_of(rig.centres, c))
         w = times(r, x)
         if through:
             w = light_through(rig.port, rig.n, *w)
             x = transposed_times(r, w)
-        steep = cosine_at_port(rig.port, *w)
+        steep = cosine_at_port(window, w)
         if steep > 0.0 and steep >= rule.least_cosine and holds(frames, c, scaled(-1.0, x)):
             usable[k], cosine[k] = c, steep
             k += 1
@@ -281,16 +288,16 @@ def _usable(
 @device(allocates=True)
 def _solve(row: FloatArray, point: Vector, chosen: IntArray, rig: Rig, is_consistent: bool) -> None:
     """Intersect the rays of a point and search the true point; fill in a row of the result."""
-    sums, least, k = NO_LINE, 1.0, 0
+    window, sums, least, k = window_of(rig.port), NO_LINE, 1.0, 0
     for c in chosen:
         r, away = rig.rotations[c], minus(row_of(rig.centres, c), point)
         d = times(r, scaled(-1.0, away))
-        ray = ray_through(rig.port, rig.n, *d)
-        if np.isnan(ray[0] + ray[3]):
+        leaves, t = ray_through(window, rig.n, d)
+        if np.isnan(leaves[0] + t[0]):
             continue
-        a, t = plus(transposed_times(r, ray[:3]), away), transposed_times(r, ray[3:])
-        k, sums = k + 1, plus_line(sums, a, t, 1.0)
-        least = min(least, cosine_at_port(rig.port, *d))
+        a = plus(transposed_times(r, leaves), away)
+        k, sums = k + 1, plus_line(sums, a, transposed_times(r, t), 1.0)
+        least = min(least, cosine_at_port(window, d))
     solved, q, distance = nearest_point(float(k), sums)
     row[:] = 0.0
     if k < 2:

@@ -246,11 +246,8 @@ def _path(out: FloatArray, water: Water, e: Vector, n: float, method: int, narro
     mx, my = _offset(water, e, x, y, n)
     if mx * mx + my * my <= CREASE_M * CREASE_M:
         return
-    # on a crease Snell's law gives the normal: u - n v, with the unit vectors u to A and v from A
-    a = x, y, z
-    u = minus(a, e)
-    air, wet = 1.0 / np.sqrt(dot(u, u)), n / np.sqrt(dot(a, a))
-    gx, gy, gz = plus(scaled(air, u), scaled(wet, a))
+    # on a crease Snell's law gives the normal
+    gx, gy, gz = _snell_normal(e, (x, y, z), n)
     out[_SLOPE], out[_SLOPE + 1], out[_STATE] = -gx / gz, -gy / gz, _CREASE
 
 
@@ -319,6 +316,13 @@ def _offset(water: Water, e: Vector, x: float, y: float, n: float) -> tuple[floa
 
 
 @device
+def _snell_normal(e: Vector, a: Vector, n: float) -> Vector:
+    """Return u - n v, with the unit vectors u from the camera to A and v from A to the point."""
+    u = minus(a, e)
+    return plus(scaled(1.0 / np.sqrt(dot(u, u)), u), scaled(n / np.sqrt(dot(a, a)), a))
+
+
+@device
 def _residual(
     water: Water, e: Vector, x: float, y: float, n: float, method: int
 ) -> tuple[float, float]:
@@ -341,9 +345,7 @@ def _residual(
     """
     if method == _KOTOWSKI:
         z, b, c = height_of(water, x, y)
-        a = x, y, z
-        u = minus(a, e)
-        g = plus(scaled(1.0 / np.sqrt(dot(u, u)), u), scaled(n / np.sqrt(dot(a, a)), a))
+        g = _snell_normal(e, (x, y, z), n)
         return g[0] + b * g[2], g[1] + c * g[2]
     if method == _AFRT:
         return _offset(water, e, x, y, n)

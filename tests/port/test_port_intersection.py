@@ -10,7 +10,7 @@ from pcfix import Cameras
 from pcfix.errors import SettingError
 from pcfix.model import Outcome
 from pcfix.options.correct import BudgetOptions, ScienceOptions
-from pcfix.port.light import coefficients, ray_through
+from pcfix.port.light import coefficients, ray_through, window_of
 from pcfix.port.methods import correct_through_port
 from pcfix.port.shapes import DomePort, FlatPort
 from tests.utils.codes import refused
@@ -18,7 +18,7 @@ from tests.utils.compiled import compiled
 from tests.utils.port_scenes import images_of, simulate_port
 from tests.utils.twins import stacked_intersection
 
-ray_through = compiled(ray_through)
+ray_through, window_of = compiled(ray_through), compiled(window_of)
 
 FLAT = FlatPort(0.02, 0.008, 1.49, (0.02, -0.01, 1.0))
 DOME = DomePort(0.05, 0.004, 1.49, (0.001, -0.002, -0.01))
@@ -79,14 +79,14 @@ def test_snell(scene):
     before, after = rms(scene.apparent - scene.truth)[2], rms(errors_of(scene, found))[2]
     assert 0.01 < after < 0.5 * before
     # the rays one by one, intersected in numpy about the apparent point
-    port, start = coefficients(scene.port), scene.views.start
+    window, start = window_of(coefficients(scene.port)), scene.views.start
     for i in range(0, len(scene.apparent), 50):
         places, rays, point = [], [], scene.apparent[i]
         for c in scene.views.camera[start[i] : start[i + 1]]:
             centre, turn = scene.cameras.centres[c], scene.cameras.rotations[c]
-            ray = np.array(ray_through(port, 1.34, *(turn @ (point - centre))))
-            places.append(turn.T @ ray[:3] + (centre - point))
-            rays.append(turn.T @ ray[3:])
+            place, ray = ray_through(window, 1.34, tuple(turn @ (point - centre)))
+            places.append(turn.T @ place + (centre - point))
+            rays.append(turn.T @ ray)
         truth = stacked_intersection(np.array(places), rays)
         assert found.shift_m[i] == pytest.approx(truth, abs=5e-9)
         misses = np.linalg.norm(np.cross(truth - places, rays), axis=1)
