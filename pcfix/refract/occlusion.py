@@ -197,10 +197,10 @@ class _Cells(NamedTuple):
 
 
 class OccluderBuilder:
-    """Builds the surface of a cloud of so many points from its chunks.
+    """Builds the surface of a cloud from its chunks.
 
-    `low` and `high`, shape (2,), are the corners of the cloud in metres, if they are known; the
-    grid grows where points lie outside.
+    `points` is their number; `low` and `high`, shape (2,), are the corners of the cloud in metres,
+    if they are known. The grid grows where points lie outside.
     """
 
     def __init__(self, low: FloatArray, high: FloatArray, points: int) -> None:

@@ -54,7 +54,7 @@ SHORT = 0.1
 broken surface to the next."""
 SEARCH_STEPS, HALVINGS = 60, 24
 """Most steps of a search, and most halvings of a step."""
-APART_M = 1e-6
+DIFFERENCE_M = 1e-6
 """Distance of the places for differences; with less, rounding exceeds what differences neglect."""
 HIGHEST_START = 0.95
 """Of the straight line: the search starts below the camera even where a tilted water is higher
@@ -63,7 +63,7 @@ KNOTS = 10
 """To each side of the middle of the first grid of `scattershot`."""
 SHOTS = 200
 BLUNT_M = 1e-7
-"""Half the grid at which lengths no longer tell the rays apart."""
+"""Half the grid below which the lengths of neighbouring paths are the same by rounding."""
 NEIGHBOUR_M = 1e-4
 CREASE_M = 1e-7
 """A path by which the ray misses the point by more goes through a crease."""
@@ -231,7 +231,7 @@ def _path(out: FloatArray, water: Water, e: Vector, n: float, method: int, narro
     if method == _SCATTERSHOT:
         x, y, steps, found = _scattershot(water, e, start, level, n)
     else:
-        x, y, steps, found = _searched(water, e, start, level, n, method)
+        x, y, steps, found = _search(water, e, start, level, n, method)
         if not found and narrow:
             if np.isnan(height_of(water, x, y)[0]):
                 x, y = start * e[0], start * e[1]
@@ -355,7 +355,7 @@ def _residual(
 
 
 @device
-def _searched(water: Water, e: Vector, start: float, level: float, n: float, method: int) -> Found:
+def _search(water: Water, e: Vector, start: float, level: float, n: float, method: int) -> Found:
     """Find where the residual of a method vanishes, from the straight line on.
 
     `start` is the share of the straight line at which it pierces the water, whose height over the
@@ -376,13 +376,13 @@ def _searched(water: Water, e: Vector, start: float, level: float, n: float, met
         x, y = 0.0, 0.0
         rx, ry = _residual(water, e, x, y, n, method)
     bxx, bxy, byx, byy = 1.0 - start, 0.0, 0.0, 1.0 - start
-    apart = min(APART_M, 0.05 * level)
+    aside = min(DIFFERENCE_M, 0.05 * level)
     for step in range(1, SEARCH_STEPS + 1):
         if method != _AFRT:
-            east_x, east_y = _residual(water, e, x + apart, y, n, method)
-            north_x, north_y = _residual(water, e, x, y + apart, n, method)
+            east_x, east_y = _residual(water, e, x + aside, y, n, method)
+            north_x, north_y = _residual(water, e, x, y + aside, n, method)
             jxx, jyx, jxy, jyy = east_x - rx, east_y - ry, north_x - rx, north_y - ry
-            share = apart / (jxx * jyy - jxy * jyx)
+            share = aside / (jxx * jyy - jxy * jyx)
             bxx, bxy, byx, byy = share * jyy, -share * jxy, -share * jyx, share * jxx
         dx, dy = -bxx * rx - bxy * ry, -byx * rx - byy * ry
         before, size, share = rx * rx + ry * ry, np.sqrt(dx * dx + dy * dy), 1.0
@@ -397,7 +397,8 @@ def _searched(water: Water, e: Vector, start: float, level: float, n: float, met
         dx, dy = share * dx, share * dy
         x, y = x + dx, y + dy
         if size <= CLOSE_M:
-            return x, y, step, True
+            mx, my = _offset(water, e, x, y, n)
+            return x, y, step, bool(mx * mx + my * my <= CREASE_M * CREASE_M)
         # Broyden's update; Newton's method replaces it
         along_x, along_y = dx * bxx + dy * byx, dx * bxy + dy * byy
         change_x, change_y = new_x - rx, new_y - ry
@@ -472,19 +473,19 @@ def _best_knot(
     water: Water, e: Vector, x: float, y: float, half: float, knots: int, n: float,
     by_offset: bool,
 ) -> tuple[float, float, float, bool]:  # fmt: skip
-    """Return the least badness on a grid about x, y, with so many knots to each side of it.
+    """Return the least badness on a grid about x, y, its place, and whether that is on the rim.
 
-    Then its place, and whether that is on the rim of the grid.
+    The grid has `knots` knots to each side of its middle, within `half`.
     """
     best, best_i, best_j = _badness(water, e, x, y, n, by_offset), 0, 0
-    apart = half / knots
+    spacing = half / knots
     for i in range(-knots, knots + 1):
         for j in range(-knots, knots + 1):
-            bad = _badness(water, e, x + i * apart, y + j * apart, n, by_offset)
+            bad = _badness(water, e, x + i * spacing, y + j * spacing, n, by_offset)
             if bad < best:
                 best, best_i, best_j = bad, i, j
     on_rim = max(abs(best_i), abs(best_j)) == knots
-    return best, x + best_i * apart, y + best_j * apart, on_rim
+    return best, x + best_i * spacing, y + best_j * spacing, on_rim
 
 
 @device
