@@ -29,7 +29,7 @@ from pcfix.lens.algebra import (
     transposed_times,
     vector,
 )
-from pcfix.lens.formulas import distorted, jacobian, undistorted
+from pcfix.lens.formulas import distorted, undistorted
 from pcfix.lens.imaging import image_and_gradients, in_plane
 from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.port.light import BY_PORT, through_port
@@ -298,11 +298,11 @@ def lens_gradients(c: FloatArray, ahead: FloatArray, codes: IntArray, out: Float
     if inverse:
         ax, ay = undistorted(c, px, py)
         dx, dy = ax, ay
-        xx, xy, yx, yy = jacobian(c, ax, ay)
+        _, _, (xx, xy, yx, yy) = distorted(c, ax, ay)
         det = xx * yy - xy * yx
     else:
         ax, ay = px, py
-        dx, dy = distorted(c, px, py)
+        dx, dy, _ = distorted(c, px, py)
     fx, fy, b2, b3 = c[formulas.FOCAL_X], c[formulas.FOCAL_Y], c[formulas.B2], c[formulas.B3]
     for i in range(codes.size):
         code = codes[i]

@@ -204,34 +204,8 @@ def _radial(c: FloatArray, r2: float) -> tuple[float, float]:
 
 
 @device
-def _sideways(c: FloatArray, x: float, y: float) -> tuple[float, float]:
-    """Return the tangential and thin prism terms."""
-    p1, p2, p3, p4 = c[TANGENTIAL], c[TANGENTIAL + 1], c[TANGENTIAL + 2], c[TANGENTIAL + 3]
-    s1, s2, s3, s4 = c[THIN_PRISM], c[THIN_PRISM + 1], c[THIN_PRISM + 2], c[THIN_PRISM + 3]
-    r2 = x * x + y * y
-    more = 1.0 + (p3 + p4 * r2) * r2
-    tx = (p1 * (r2 + 2.0 * x * x) + 2.0 * p2 * x * y) * more
-    ty = (p2 * (r2 + 2.0 * y * y) + 2.0 * p1 * x * y) * more
-    return tx + (s1 + s2 * r2) * r2, ty + (s3 + s4 * r2) * r2
-
-
-@device
-def distorted(c: FloatArray, x: float, y: float) -> tuple[float, float]:
-    """Return Brown's formula at a place; NaN outside the disc where it is one to one."""
-    r2 = x * x + y * y
-    if not r2 <= c[DISC] * c[DISC]:
-        return np.nan, np.nan
-    g, _ = _radial(c, r2)
-    fx, fy = g * x, g * y
-    if c[IN_TURN] != 0.0:
-        tx, ty = _sideways(c, fx, fy)
-    else:
-        tx, ty = _sideways(c, x, y)
-    return fx + tx, fy + ty
-
-
-@device
-def _sideways_jacobian(c: FloatArray, x: float, y: float) -> Jacobian:
+def _sideways(c: FloatArray, x: float, y: float) -> tuple[float, float, Jacobian]:
+    """Return the tangential and thin prism terms, and their Jacobian."""
     p1, p2, p3, p4 = c[TANGENTIAL], c[TANGENTIAL + 1], c[TANGENTIAL + 2], c[TANGENTIAL + 3]
     s1, s2, s3, s4 = c[THIN_PRISM], c[THIN_PRISM + 1], c[THIN_PRISM + 2], c[THIN_PRISM + 3]
     r2 = x * x + y * y
@@ -239,81 +213,65 @@ def _sideways_jacobian(c: FloatArray, x: float, y: float) -> Jacobian:
     ty = p2 * (r2 + 2.0 * y * y) + 2.0 * p1 * x * y
     more, slope = 1.0 + (p3 + p4 * r2) * r2, 2.0 * (p3 + 2.0 * p4 * r2)
     across = 2.0 * (p1 * y + p2 * x) * more
-    sx, sy = 2.0 * (s1 + 2.0 * s2 * r2), 2.0 * (s3 + 2.0 * s4 * r2)
-    return (
-        (6.0 * p1 * x + 2.0 * p2 * y) * more + (tx * slope + sx) * x,
-        across + (tx * slope + sx) * y,
-        across + (ty * slope + sy) * x,
-        (6.0 * p2 * y + 2.0 * p1 * x) * more + (ty * slope + sy) * y,
-    )
+    # derivatives by r^2, which has the gradient 2 (x, y)
+    sx, sy = tx * slope + 2.0 * (s1 + 2.0 * s2 * r2), ty * slope + 2.0 * (s3 + 2.0 * s4 * r2)
+    return tx * more + (s1 + s2 * r2) * r2, ty * more + (s3 + s4 * r2) * r2, (
+        (6.0 * p1 * x + 2.0 * p2 * y) * more + sx * x, across + sx * y,
+        across + sy * x, (6.0 * p2 * y + 2.0 * p1 * x) * more + sy * y,
+    )  # fmt: skip
 
 
 @device
-def jacobian(c: FloatArray, x: float, y: float) -> Jacobian:
-    """Return d x'/d x, d x'/d y, d y'/d x, d y'/d y of `distorted`."""
-    g, slope = _radial(c, x * x + y * y)
+def distorted(c: FloatArray, x: float, y: float) -> tuple[float, float, Jacobian]:
+    """Return Brown's formula at a place, and d x'/d x, d x'/d y, d y'/d x, d y'/d y.
+
+    The place is NaN outside the disc where the formula is one to one.
+    """
+    r2 = x * x + y * y
+    g, slope = _radial(c, r2)
     twice = 2.0 * slope
     xx, xy, yy = g + twice * x * x, twice * x * y, g + twice * y * y
+    fx, fy = (g * x, g * y) if r2 <= c[DISC] * c[DISC] else (np.nan, np.nan)
     if c[IN_TURN] == 0.0:
-        a, b, d, e = _sideways_jacobian(c, x, y)
-        return xx + a, xy + b, xy + d, yy + e
-    a, b, d, e = _sideways_jacobian(c, g * x, g * y)
+        tx, ty, (a, b, d, e) = _sideways(c, x, y)
+        return fx + tx, fy + ty, (xx + a, xy + b, xy + d, yy + e)
+    tx, ty, (a, b, d, e) = _sideways(c, g * x, g * y)
     a, e = a + 1.0, e + 1.0
-    return a * xx + b * xy, a * xy + b * yy, d * xx + e * xy, d * xy + e * yy
-
-
-@device
-def _start(c: FloatArray, rho: float) -> float:
-    """Return the radius that the radial terms map to `rho`, or one near the fold."""
-    low, high = 0.0, min(c[DISC], 1e6)
-    r = min(rho, 0.9 * high)
-    for _ in range(100):
-        g, slope = _radial(c, r * r)
-        miss = r * g - rho
-        if miss < 0.0:
-            low = r
-        else:
-            high = r
-        then = r - miss / (g + 2.0 * r * r * slope)
-        if not low <= then <= high:
-            then = 0.5 * (low + high)
-        if abs(then - r) <= 1e-9 * r:
-            break
-        r = then
-    return r
+    return fx + tx, fy + ty, (
+        a * xx + b * xy, a * xy + b * yy, d * xx + e * xy, d * xy + e * yy
+    )  # fmt: skip
 
 
 @device
 def undistorted(c: FloatArray, u: float, v: float) -> tuple[float, float]:
     """Return the place in the disc that `distorted` maps to (u, v), or NaN.
 
-    Newton's method from the solution without tangential terms; each step is halved until it stays
-    in the disc and reduces the residual.
+    Newton's method from (u, v) or, if that is outside, from a place in the disc in that direction;
+    each step is halved until it stays in the disc and reduces the residual.
     """
     rho = np.sqrt(u * u + v * v)
     if rho == 0.0 or not rho < np.inf:
         return u * 1.0, v * 1.0
-    scale = _start(c, rho) / rho
+    scale = min(1.0, 0.9 * c[DISC] / rho)
     x, y = scale * u, scale * v
-    fx, fy = distorted(c, x, y)
+    fx, fy, (a, b, d, e) = distorted(c, x, y)
     fx, fy = fx - u, fy - v
-    for _ in range(60):
+    for _ in range(100):
         if fx * fx + fy * fy <= (2e-16 * (1.0 + rho)) ** 2:
             break
-        a, b, d, e = jacobian(c, x, y)
         det = a * e - b * d
         dx, dy = (e * fx - b * fy) / det, (a * fy - d * fx) / det
         nearer = False
         for _ in range(40):
-            gx, gy = distorted(c, x - dx, y - dy)
+            gx, gy, there = distorted(c, x - dx, y - dy)
             gx, gy = gx - u, gy - v
-            if gx * gx + gy * gy < fx * fx + fy * fy:
-                nearer = True
+            nearer = gx * gx + gy * gy < fx * fx + fy * fy
+            if nearer:
                 break
             dx, dy = 0.5 * dx, 0.5 * dy
         if not nearer:
             break
-        x, y, fx, fy = x - dx, y - dy, gx, gy
+        x, y, fx, fy, (a, b, d, e) = x - dx, y - dy, gx, gy, there
     if fx * fx + fy * fy <= (1e-12 * (1.0 + rho)) ** 2:
         return x, y
     return np.nan, np.nan
@@ -339,7 +297,7 @@ def _bends(c: FloatArray, r: float) -> bool:
     """Whether the symmetric part of the Jacobian is anywhere not positive definite on a circle."""
     for i in range(_DIRECTIONS):
         turn = 2.0 * np.pi * i / _DIRECTIONS
-        a, b, d, e = jacobian(c, r * np.cos(turn), r * np.sin(turn))
+        _, _, (a, b, d, e) = distorted(c, r * np.cos(turn), r * np.sin(turn))
         if not (a + e > 0.0 and a * e > 0.25 * (b + d) * (b + d)):
             return True
     return False

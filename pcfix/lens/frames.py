@@ -37,14 +37,8 @@ def frame_shape(lens: Lens) -> tuple[FloatArray, float]:
     """Return the pyramid of `Frames`, camera frame, and the widest angle of a distorted frame."""
     brown = (*lens.radial, *lens.denominator, *lens.tangential, *lens.thin_prism)
     if lens.projection == "perspective" and not any(brown):  # straight lines stay straight
-        width, height = lens.width - lens.principal_x, lens.height - lens.principal_y
-        inward = np.array([
-            (lens.focal + lens.b1, lens.b2, lens.principal_x),
-            (-(lens.focal + lens.b1), -lens.b2, width),
-            (lens.b3, lens.focal, lens.principal_y),
-            (-lens.b3, -lens.focal, height),
-        ])  # fmt: skip
-        return inward, np.nan
+        corners = unproject(lens, _border(lens, 1))
+        return np.cross(corners[:-1], corners[1:]), np.nan
     border = unproject(lens, _border(lens, BORDER))
     return _planes_around(border), _widest_angle(lens, border)
 

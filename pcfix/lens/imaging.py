@@ -19,7 +19,6 @@ from pcfix.lens.formulas import (
     CODES,
     angle,
     distorted,
-    jacobian,
     largest_angle,
     largest_disc,
     largest_radius,
@@ -145,7 +144,7 @@ def image_of(c: FloatArray, x: float, y: float, z: float) -> tuple[float, float]
     if c[places.INVERSE] != 0.0:
         dx, dy = undistorted(c, px - cx, py - cy)
     else:
-        dx, dy = distorted(c, px - cx, py - cy)
+        dx, dy, _ = distorted(c, px - cx, py - cy)
     dx, dy = dx + cx, dy + cy
     u = c[places.PRINCIPAL_X] + c[places.FOCAL_X] * dx + c[places.B2] * dy
     return u, c[places.PRINCIPAL_Y] + c[places.FOCAL_Y] * dy + c[places.B3] * dx
@@ -160,7 +159,7 @@ def direction_of(c: FloatArray, u: float, v: float) -> tuple[float, float, float
     dx = (c[places.FOCAL_Y] * u - c[places.B2] * v) / det - cx
     dy = (c[places.FOCAL_X] * v - c[places.B3] * u) / det - cy
     if c[places.INVERSE] != 0.0:
-        px, py = distorted(c, dx, dy)
+        px, py, _ = distorted(c, dx, dy)
     else:
         px, py = undistorted(c, dx, dy)
     px, py = px + cx, py + cy
@@ -200,18 +199,18 @@ def image_and_gradients(
 ) -> tuple[float, float, Gradients]:
     """Return u, v of a direction (x, y, z), camera frame, and their derivatives by it.
 
-    The three steps are those of `image_of`, joined by the chain rule. NaN where there is no image.
+    Projection, distortion and interior orientation are joined by the chain rule. NaN where there is
+    no image.
     """
     px, py, (ax, ay, az, bx, by, bz) = _plane_and_gradients(c, x, y, z)
     px, py = px - c[places.CENTRE_X], py - c[places.CENTRE_Y]
     if c[places.INVERSE] != 0.0:
         dx, dy = undistorted(c, px, py)
-        xx, xy, yx, yy = jacobian(c, dx, dy)
+        _, _, (xx, xy, yx, yy) = distorted(c, dx, dy)
         det = xx * yy - xy * yx
         xx, xy, yx, yy = yy / det, -xy / det, -yx / det, xx / det
     else:
-        dx, dy = distorted(c, px, py)
-        xx, xy, yx, yy = jacobian(c, px, py)
+        dx, dy, (xx, xy, yx, yy) = distorted(c, px, py)
     dx, dy = dx + c[places.CENTRE_X], dy + c[places.CENTRE_Y]
     fx, fy, b2, b3 = c[places.FOCAL_X], c[places.FOCAL_Y], c[places.B2], c[places.B3]
     ua, ub = fx * xx + b2 * yx, fx * xy + b2 * yy

@@ -16,14 +16,13 @@ from pcfix.kernels import device
 from pcfix.lens.algebra import Vector, beyond, cross, dot, minus, plus, scaled, unit, vector
 from pcfix.model import FloatArray
 from pcfix.port.shapes import DomePort, FlatPort, Port
+from pcfix.refract.rays import refracted
 
 KIND, X, Y, Z, SIZE, THICK, GLASS = range(7)
 FLAT, DOME = 0.0, 1.0
 
 Window: TypeAlias = tuple[float, Vector, float, float, float]
 """Kind; normal or centre; distance or radius; thickness; refractive index of the glass."""
-Ray: TypeAlias = tuple[float, float, float, float, float, float]
-"""A place and a unit direction."""
 
 NOWHERE: Vector = (np.nan, np.nan, np.nan)
 
@@ -42,7 +41,7 @@ def coefficients(port: Port) -> FloatArray:
 
 
 @device
-def _window(port: FloatArray) -> Window:
+def window_of(port: FloatArray) -> Window:
     """Return the same as numbers, which stay in registers."""
     return port[KIND], vector(port, X), port[SIZE], port[THICK], port[GLASS]
 
@@ -57,8 +56,9 @@ def _at_face(window: Window, depth: float, start: Vector, s: Vector) -> tuple[Ve
     size += depth
     if kind == FLAT:
         steep = dot(where, s)
-        f = (size - dot(where, start)) / (steep if steep > 0.0 else np.nan)
-        return beyond(start, f, s), where
+        if not steep > 0.0:
+            return NOWHERE, NOWHERE
+        return beyond(start, (size - dot(where, start)) / steep, s), where
     start = minus(start, where)
     along = dot(start, s)
     f = -along + np.sqrt(along * along + max(size * size - dot(start, start), 0.0))
@@ -67,51 +67,33 @@ def _at_face(window: Window, depth: float, start: Vector, s: Vector) -> tuple[Ve
 
 
 @device
-def bent(s: Vector, normal: Vector, r: float) -> Vector:
-    """Return the unit direction behind a face: Snell's law in vector form.
+def _behind(s: Vector, normal: Vector, r: float) -> Vector:
+    """Return the unit direction behind a face, whose normal goes with the light.
 
-    Skarlatos & Agrafiotis 2018, eq 10, with the normal along the light instead of against it:
-    t = r s + (sqrt(1 - r^2 (1 - c^2)) - r c) N, c = N.s, with r the refractive index before the
-    face over that behind it. NaN for total reflection.
+    r is the refractive index before the face over that behind it. NaN for total reflection.
     """
-    c = dot(normal, s)
-    k = np.sqrt(1.0 - r * r * (1.0 - c * c)) - r * c
-    return plus(scaled(r, s), scaled(k, normal))
+    return refracted(scaled(-1.0, s), 1.0, scaled(-1.0, normal), dot(normal, s), r)
 
 
 @device
-def _ray(window: Window, n: float, direction: Vector) -> tuple[Vector, Vector]:
-    """Return the place and the unit direction of `ray_through`."""
+def ray_through(window: Window, n: float, direction: Vector) -> tuple[Vector, Vector]:
+    """Return where a ray from the projection centre leaves the port, and its unit direction there.
+
+    The direction in air may have any length; n is the refractive index of the water relative to
+    air, at least 1. NaN is returned if the ray misses the port.
+    """
     s, thickness, glass = unit(direction), window[3], window[4]
     inner, normal = _at_face(window, 0.0, (0.0, 0.0, 0.0), s)
-    inside = bent(s, normal, 1.0 / glass)
+    inside = _behind(s, normal, 1.0 / glass)
     outer, normal = _at_face(window, thickness, inner, inside)
-    return outer, bent(inside, normal, glass / n)
+    return outer, _behind(inside, normal, glass / n)
 
 
 @device
-def ray_through(port: FloatArray, n: float, dx: float, dy: float, dz: float) -> Ray:
-    """Return where a ray from the projection centre leaves the port, and its unit direction.
-
-    Parameters
-    ----------
-    port : array, shape (7,)
-        See `coefficients`.
-    n : float
-        Refractive index of the water relative to air, at least 1.
-    dx, dy, dz : float
-        Its direction in air, of any length. NaN is returned if it misses the port.
-    """
-    place, t = _ray(_window(port), n, (dx, dy, dz))
-    # a ray that misses has no place, nor a direction
-    return place + scaled(1.0 + 0.0 * place[0], t)
-
-
-@device
-def cosine_at_port(port: FloatArray, dx: float, dy: float, dz: float) -> float:
+def cosine_at_port(window: Window, direction: Vector) -> float:
     """Return the cosine of the incidence angle in air at the inner face; see `ray_through`."""
-    s = unit((dx, dy, dz))
-    return dot(s, _at_face(_window(port), 0.0, (0.0, 0.0, 0.0), s)[1])
+    s = unit(direction)
+    return dot(s, _at_face(window, 0.0, (0.0, 0.0, 0.0), s)[1])
 
 
 STEPS, CLOSE = 100, 1e-13
@@ -129,12 +111,14 @@ def light_through(port: FloatArray, n: float, x: float, y: float, z: float) -> V
 
     Parameters
     ----------
-    port, n
-        See `ray_through`.
+    port : array, shape (7,)
+        See `coefficients`.
+    n : float
+        Refractive index of the water relative to air, at least 1.
     x, y, z : float
         The point, camera frame, metres. NaN is returned if it is not in the water.
     """
-    window, point = _window(port), (x, y, z)
+    window, point = window_of(port), (x, y, z)
     kind, where, size, thickness, _ = window
     if kind == FLAT:
         depth = dot(where, point) - size
@@ -168,7 +152,7 @@ def light_through(port: FloatArray, n: float, x: float, y: float, z: float) -> V
 @device
 def _signed_miss(window: Window, n: float, w: Vector, point: Vector, across: Vector) -> float:
     """Return how far a ray passes a point on the side of the foot, in any unit."""
-    place, t = _ray(window, n, w)
+    place, t = ray_through(window, n, w)
     return dot(across, cross(minus(point, place), t))
 
 
@@ -196,8 +180,8 @@ def through_port(port: FloatArray, n: float, x: float, y: float, z: float, out: 
         by n. Of eight columns, 5 gets that by the distance of a flat port, or 5 to 7 those by the
         centre of a dome. NaN if no light comes from the point.
     """
-    window, point, w = _window(port), (x, y, z), light_through(port, n, x, y, z)
-    t = _ray(window, n, w)[1]
+    window, point, w = window_of(port), (x, y, z), light_through(port, n, x, y, z)
+    t = ray_through(window, n, w)[1]
     (e1, e2), (p1, p2) = _two_across(w), _two_across(t)
     by_1 = _difference(window, n, window, n, e1, w, point, t, BY_DIRECTION)
     by_2 = _difference(window, n, window, n, e2, w, point, t, BY_DIRECTION)
@@ -245,9 +229,9 @@ def _difference(
 
     The plane of the spot goes through the point, across t; w turns by `turn` times the step.
     """
-    place, ray = _ray(more, more_n, beyond(w, step, turn))
+    place, ray = ray_through(more, more_n, beyond(w, step, turn))
     further = beyond(place, dot(minus(point, place), t) / dot(ray, t), ray)
-    place, ray = _ray(less, less_n, beyond(w, -step, turn))
+    place, ray = ray_through(less, less_n, beyond(w, -step, turn))
     back = beyond(place, dot(minus(point, place), t) / dot(ray, t), ray)
     return scaled(0.5 / step, minus(further, back))
 

@@ -1,52 +1,124 @@
 r"""Correct a cloud taken through a housing port: choose cameras, intersect, invert.
 
-The inversion finds the true point that straight rays would reconstruct at the apparent one.
+The lens gives the direction of an image place; the port refracts that ray at its faces; behind the
+outer face it goes straight through the water. The rays of several images meet at the true point.
+There is no water surface between camera and point, and the direction of up does not matter.
 
-As `pcfix.refract.tracks` at a water surface: software without a port model reconstructs from
-the image points x_i of a true point Q the point P with the least squared residuals in the images,
-over straight rays. There the derivative by P is zero,
+A dense cloud has no image places, but its points stand for them: software without a port model puts
+the point P where straight lines from the projection centres meet best. So the line from a centre C
+to P has the direction of the image place, except for the residual of that adjustment. `snell`
+ignores it. Through a flat port it is large, a hundred pixels and more if many images of a camera
+calibrated in air see a point. `consistent` uses it, as `pcfix.refract.tracks` at a water surface:
+the software reconstructs from the image points x_i of a true point Q the point P with the least
+squared residuals in the images, over straight rays. There the derivative by P is zero,
 
     g(Q) = sum_i J_i' (x_i(Q) - pi_i(P)) = 0,    J_i = d pi_i / d P
 
 with pi_i the projection of camera i: three equations for the three unknowns of Q. Here x_i(Q) is
 the image of the direction in which the light of Q comes through the port. Newton's method uses
 
-    d g / d Q = sum_i J_i' K_i R_i,    K_i = d x_i / d w  d w / d X
+    d g / d Q = sum_i J_i' L_i,    L_i = d x_i / d Q
 
 from `pcfix.port.light.through_port`. The covariance of Q is that of an adjustment of the images
 through the port,
 
-    Cov Q = H^-1 (sum_i L_i' Cov(x_i) L_i) H^-1,    L_i = K_i R_i,  H = sum_i L_i' L_i
+    Cov Q = H^-1 (sum_i L_i' Cov(x_i) L_i) H^-1,    H = sum_i L_i' L_i
 
 and a column for the refractive index, whose error all rays have in common.
+
+Which images contributed to P matters as much. Without a view list it is a set of images whose
+frames hold the image of the true point that they lead to. There may be several such sets; then the
+point may be wrong.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple, TypeAlias
+
 import numpy as np
 
+from pcfix.errors import SettingError
 from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import (
+    Symmetric,
     Vector,
+    beyond,
+    cofactors,
+    column_of,
     cross,
     dot,
     minus,
     plus,
+    plus_square,
+    product,
     row_of,
+    scaled,
     times,
     transposed_times,
     vector,
 )
-from pcfix.lens.imaging import image_and_gradients, image_in_world
-from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Outcome, Views
+from pcfix.lens.frames import Frames, frames_of, holds, no_frames
+from pcfix.lens.imaging import image_and_gradients, image_in_world, lens_table
+from pcfix.model import NOMINAL_WIDTH_PX, BoolArray, Cameras, FloatArray, IntArray, Lens, Views
 from pcfix.options.correct import ScienceOptions
-from pcfix.port.intersection import Rig, intersect_rays, lenses_of, port_views, rig_of, rotations_of
-from pcfix.port.light import through_port
+from pcfix.port.light import (
+    coefficients,
+    cosine_at_port,
+    light_through,
+    ray_through,
+    through_port,
+    window_of,
+)
 from pcfix.port.shapes import Port
-from pcfix.refract.batch import Intersection, warn_of_unsolved
+from pcfix.refract.batch import (
+    CORRECTED,
+    NO_CAMERA,
+    ONE_CAMERA,
+    PARALLEL,
+    Intersection,
+    warn_of_unsolved,
+)
+from pcfix.refract.choice import ANY_NUMBER, NOMINAL_FOCAL_PX
 from pcfix.refract.intersect import check_consistent
-from pcfix.refract.methods import batches, joined
-from pcfix.refract.tiling import spatial_order
+from pcfix.refract.rays import NO_LINE, nearest_point, plus_line
+from pcfix.refract.tiling import TILE, are_same, corners_of, near_cameras, spatial_order
+
+MAX_STEPS = 30
+CLOSE_M = 1e-7
+"""Length of the last step; as each squares the error, the next is below a nanometre."""
+ROUNDS = 6
+"""At the border of an image a point may alternate in and out; after so many rounds it stays."""
+
+_DISTANCE, _COSINE, _OUTCOME, _COUNT, _FOUND, _WIDTH = range(3, 9)
+"""Columns of the result after the shift."""
+
+
+class Rig(NamedTuple):
+    """The k cameras and the port before each of them, for kernels."""
+
+    centres: FloatArray  # (k, 3), metres, world frame
+    rotations: FloatArray  # (k, 3, 3), world to camera
+    row: IntArray  # lens of each camera, see `pcfix.lens.imaging.lens_table`
+    lenses: FloatArray
+    port: FloatArray  # see `pcfix.port.light.coefficients`
+    n: float  # refractive index of the water
+
+
+class Rule(NamedTuple):
+    """Which rays count, and what is computed of them."""
+
+    least_cosine: float  # of the largest incidence angle, in air at the inner face
+    most: int  # rays per point
+    is_consistent: bool
+
+
+class Sigmas(NamedTuple):
+    """Standard deviations: of an image place of each camera in the unit of its lens, and others."""
+
+    image: FloatArray
+    refractive_index: float
+    centre_m: float
+    attitude: float  # radians
 
 
 def correct_through_port(
@@ -58,39 +130,16 @@ def correct_through_port(
 ) -> Intersection:
     """Correct points reconstructed with straight rays under water, with their uncertainty.
 
-    As `intersect_through_port`, with `sigma_z_m` and `covariance_m2` of
-    `port_covariances`.
-    """
-    parts, order = [], spatial_order(xyz)
-    for rows in batches(order):
-        own_views = None if views is None else views.take(rows)
-        found, chosen = intersect_through_port(xyz[rows], cameras, port, settings, own_views)
-        covariance = port_covariances(xyz[rows] + found.shift_m, chosen, cameras, port, settings)
-        covariance[found.outcome != Outcome.CORRECTED] = 0.0
-        sigma_z = np.sqrt(covariance[:, 5])
-        parts.append(found._replace(covariance_m2=covariance, sigma_z_m=sigma_z))
-    return joined(parts, order, len(cameras))
-
-
-def intersect_through_port(
-    xyz: FloatArray,
-    cameras: Cameras,
-    port: Port,
-    settings: ScienceOptions,
-    views: Views | None = None,
-) -> tuple[Intersection, Views]:
-    """Correct points reconstructed with straight rays under water.
-
     Snell's law at each face (Skarlatos & Agrafiotis 2018, eq 10), then the point nearest to all
-    rays (eq 11).
+    rays (eq 11), and with the method consistent the point that has the images of the apparent one.
 
     Parameters
     ----------
     xyz : array, shape (m, 3)
         Apparent points, metres, world frame; all of them under water.
     cameras : Cameras
-        Correct poses, world frame, and lenses. (If the lens absorbed the port, run `pcfix adjust`
-        first.)
+        Correct poses, world frame, and lenses; without a lens that of a survey drone. (If the lens
+        absorbed the port, run `pcfix adjust` first.)
     port : Port
         The same for all cameras.
     settings : ScienceOptions
@@ -102,216 +151,244 @@ def intersect_through_port(
 
     Returns
     -------
-    found : Intersection
-        One row per input point. The ray distance is that of the rays through the apparent point.
-    chosen : Views
-        The cameras that were used.
+    Intersection
+        One row per input point. The ray distance is that of the rays through the apparent point; a
+        ray that does not meet the port is ignored. Points without a solution of `consistent` keep
+        that of `snell`, with a warning. Covariances are zero if fewer than two rays meet.
+
+    Raises
+    ------
+    SettingError
+        If the cameras have no angles, or for the method consistent no lenses.
     """
-    chosen = port_views(xyz, cameras, port, settings, views)
-    found = _intersect_chosen(xyz, chosen, cameras, port, settings)
-    if views is not None or settings.method != "consistent":
-        return found, chosen
-    for _ in range(ROUNDS):
-        seen = port_views(xyz, cameras, port, settings, shift_m=found.shift_m)
-        rows = _other_rows(chosen, seen)
-        if not rows.size:
-            break
-        part = _intersect_chosen(xyz[rows], seen.take(rows), cameras, port, settings)
-        others = np.setdiff1d(np.arange(len(xyz)), rows)
-        order = np.concatenate([others, rows])
-        found, chosen = joined([found.take(others), part], order, len(cameras)), seen
-    return found, chosen
-
-
-ROUNDS = 6
-"""At the border of an image a point may alternate in and out; after so many rounds it stays."""
-
-
-def _intersect_chosen(
-    xyz: FloatArray, chosen: Views, cameras: Cameras, port: Port, settings: ScienceOptions
-) -> Intersection:
-    """Intersect the rays through apparent points, shape (m, 3), of known cameras."""
-    owner = np.repeat(np.arange(len(xyz)), np.diff(chosen.start))
-    ray = xyz[owner] - cameras.centres[chosen.camera]
-    looking = np.einsum("oij,oj->oi", rotations_of(cameras)[chosen.camera], ray)
-    found = intersect_rays(xyz, looking, chosen, cameras, port, settings)
-    if settings.method != "consistent":
-        return found
-    return consistent_through_port(xyz, chosen, cameras, port, settings, found)
-
-
-def _other_rows(one: Views, other: Views) -> IntArray:
-    """Return the points whose cameras differ between two lists."""
-    same = np.diff(one.start) == np.diff(other.start)
-    rows = np.flatnonzero(same)
-    a, b = one.take(rows), other.take(rows)
-    owner = np.repeat(rows, np.diff(a.start))
-    same[owner[a.camera != b.camera]] = False
-    return np.flatnonzero(~same)
-
-
-MAX_STEPS = 30
-CLOSE_M = 1e-7
-"""Length of the last step; as each squares the error, the next is below a nanometre."""
-
-
-def consistent_through_port(
-    xyz: FloatArray,
-    views: Views,
-    cameras: Cameras,
-    port: Port,
-    settings: ScienceOptions,
-    start: Intersection,
-) -> Intersection:
-    """Return `start` with the shifts of the true points that lead to the apparent points.
-
-    `start`, the solution of `snell`, is the first approximation; the rest is as for
-    `intersect_through_port`. Points without a solution keep that of `snell`,
-    with a warning. Raises SettingError if the cameras have no angles or no lenses.
-    """
-    check_consistent(cameras)
-    moved = np.flatnonzero(start.outcome == Outcome.CORRECTED)
-    shift, found = start.shift_m.copy(), np.zeros(len(moved), np.bool_)
-    rows, rig = _rows(views), rig_of(cameras, port, settings)
-    of_points = np.ascontiguousarray(xyz), *rows
-    in_tiles(_search, len(moved), moved, *of_points, rig, shift, found)
-    warn_of_unsolved("method consistent found no solution behind the port", found)
-    return start._replace(shift_m=shift)
-
-
-def port_covariances(
-    true_xyz: FloatArray, views: Views, cameras: Cameras, port: Port, settings: ScienceOptions
-) -> FloatArray:
-    """Return the covariance of points behind a port, true_xyz, shape (m, 3), metres, world frame.
-
-    The standard deviations of images, refractive index, projection centres and attitudes are used.
-
-    Returns
-    -------
-    array, shape (m, 6)
-        xx, xy, xz, yy, yz, zz in metres squared, world frame; zeros if fewer than two rays meet.
-        Cameras without a lens have that of a survey drone.
-    """
-    result = np.zeros((len(true_xyz), 6))
-    in_tiles(
-        _covariances,
-        len(true_xyz),
-        np.ascontiguousarray(true_xyz),
-        *_rows(views),
-        rig_of(cameras, port, settings),
-        settings.sigma_image * np.array([lens.pixel_size for lens in lenses_of(cameras)]),
-        (settings.sigma_index, settings.sigma_centre, np.radians(settings.sigma_attitude)),
-        result,
+    if cameras.rotations is None:
+        raise SettingError(
+            "cameras.no_angles",
+            "A port is fixed to the camera, and the cameras have no angles. Give a camera file with"
+            " angles.",
+        )
+    if settings.method == "consistent":
+        check_consistent(cameras)
+    nominal = Lens(NOMINAL_FOCAL_PX, NOMINAL_WIDTH_PX, NOMINAL_WIDTH_PX, 0.0, 0.0)
+    lenses = cameras.lenses or (nominal,) * len(cameras)
+    lists, frames = (np.zeros(0, np.int64), np.zeros(0, np.int64)), frames_of(cameras)
+    if views is not None:
+        lists = np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)
+        frames = no_frames(len(cameras))
+    rig = Rig(
+        np.ascontiguousarray(cameras.centres),
+        np.ascontiguousarray(cameras.rotations, np.float64),
+        *lens_table(lenses),
+        coefficients(port),
+        settings.refractive_index,
     )
-    return result
+    limit = settings.limit_deg
+    rule = Rule(
+        least_cosine=0.0 if limit is None else float(np.cos(np.radians(limit))),
+        most=settings.max_cameras or ANY_NUMBER,
+        is_consistent=settings.method == "consistent",
+    )
+    sigmas = Sigmas(
+        settings.sigma_image * np.array([lens.pixel_size for lens in lenses]),
+        settings.sigma_index,
+        settings.sigma_centre,
+        float(np.radians(settings.sigma_attitude)),
+    )
+    m = len(xyz)
+    result, covariance = np.zeros((m, _WIDTH)), np.zeros((m, 6))
+    used = np.zeros(len(cameras), np.bool_)
+    in_tiles(
+        _correct, -(-m // TILE), spatial_order(xyz), np.ascontiguousarray(xyz), lists, rig, frames,
+        rule, sigmas, (result, covariance, used),
+    )  # fmt: skip
+    outcome = result[:, _OUTCOME].astype(np.uint8)
+    moved = outcome == CORRECTED
+    warn_of_unsolved(
+        "method consistent found no solution behind the port", result[moved, _FOUND] > 0.0
+    )
+    return Intersection(
+        shift_m=result[:, :3],
+        outcome=outcome,
+        ray_count=result[:, _COUNT].astype(np.int32),
+        ray_miss_m=result[:, _DISTANCE],
+        sigma_z_m=np.sqrt(covariance[:, 5]),
+        incidence_deg=np.where(moved, np.degrees(np.arccos(result[:, _COSINE])), 0.0),
+        camera_used=used,
+        covariance_m2=covariance,
+    )
 
 
-def _rows(views: Views) -> tuple[IntArray, IntArray]:
-    start = np.ascontiguousarray(views.start, np.int64)
-    return start, np.ascontiguousarray(views.camera, np.int64)
+@kernel(allocates=True)
+def _correct(
+    span: Span, order: IntArray, xyz: FloatArray, lists: tuple[IntArray, IntArray], rig: Rig,
+    frames: Frames, rule: Rule, sigmas: Sigmas, found: tuple[FloatArray, FloatArray, BoolArray],
+) -> None:  # fmt: skip
+    """Correct the points of each tile, by the cameras of their lists or, if empty, in the frame."""
+    (start, camera), (result, covariance, used) = lists, found
+    every = np.arange(len(rig.centres))
+    for t in range(*span):
+        rows = order[t * TILE : (t + 1) * TILE]
+        low, high = corners_of(rows, xyz)
+        wide, near = 0.0, near_cameras(every, frames, rig.centres, low, high)
+        for i in rows:
+            point, row = row_of(xyz, i), result[i]
+            some = camera[start[i] : start[i + 1]] if start.size else near
+            chosen = _usable(some, point, rig, frames, rule, False)
+            _solve(row, point, chosen, rig, rule.is_consistent)
+            # without a list: the cameras that image the true point, which depends on them
+            for _ in range(ROUNDS if rule.is_consistent and not start.size else 0):
+                shift = vector(row)
+                # the straight line to a true point may miss a frame that its refracted light
+                # reaches, by at most the shift
+                reach = max(abs(shift[0]), abs(shift[1]), abs(shift[2]))
+                if reach > wide:
+                    wide = 2.0 * reach
+                    near = near_cameras(every, frames, rig.centres, low - wide, high + wide)
+                imaging = _usable(near, plus(point, shift), rig, frames, rule, True)
+                if are_same(imaging, chosen):
+                    break
+                chosen = imaging
+                _solve(row, point, chosen, rig, rule.is_consistent)
+            if row[_OUTCOME] == CORRECTED:
+                row[_COUNT] = chosen.size
+                _set_covariance(
+                    covariance[i], plus(point, vector(row)), chosen, rig, sigmas
+                )  # fmt: skip
+                for c in chosen:
+                    used[c] = True
+
+
+@device(allocates=True)
+def _usable(
+    candidates: IntArray, point: Vector, rig: Rig, frames: Frames, rule: Rule, through: bool
+) -> IntArray:
+    """Return the cameras that give a ray, in their order: at most `most`, the steepest.
+
+    The point is imaged along a straight line, or `through` the port.
+    """
+    usable, cosine = np.empty(candidates.size, np.int64), np.empty(candidates.size)
+    window, k = window_of(rig.port), 0
+    for c in candidates:
+        r, x = rig.rotations[c], minus(point, row_of(rig.centres, c))
+        w = times(r, x)
+        if through:
+            w = light_through(rig.port, rig.n, *w)
+            x = transposed_times(r, w)
+        steep = cosine_at_port(window, w)
+        if steep > 0.0 and steep >= rule.least_cosine and holds(frames, c, scaled(-1.0, x)):
+            usable[k], cosine[k] = c, steep
+            k += 1
+    if k <= rule.most:
+        return usable[:k]
+    ranked = np.argsort(-cosine[:k], kind="mergesort")[: rule.most]
+    ranked.sort()
+    return usable[ranked]
+
+
+@device(allocates=True)
+def _solve(row: FloatArray, point: Vector, chosen: IntArray, rig: Rig, is_consistent: bool) -> None:
+    """Intersect the rays of a point and search the true point; fill in a row of the result."""
+    window, sums, least, k = window_of(rig.port), NO_LINE, 1.0, 0
+    for c in chosen:
+        r, away = rig.rotations[c], minus(row_of(rig.centres, c), point)
+        d = times(r, scaled(-1.0, away))
+        leaves, t = ray_through(window, rig.n, d)
+        if np.isnan(leaves[0] + t[0]):
+            continue
+        a = plus(transposed_times(r, leaves), away)
+        k, sums = k + 1, plus_line(sums, a, transposed_times(r, t), 1.0)
+        least = min(least, cosine_at_port(window, d))
+    solved, q, distance = nearest_point(float(k), sums)
+    row[:] = 0.0
+    if k < 2:
+        row[_OUTCOME] = ONE_CAMERA if k == 1 else NO_CAMERA
+    elif not solved:
+        row[_OUTCOME] = PARALLEL
+    else:
+        is_found = True
+        if is_consistent:
+            q, is_found = _search(q, point, chosen, rig)
+        row[0], row[1], row[2] = q
+        row[_DISTANCE], row[_COSINE], row[_OUTCOME] = distance, least, CORRECTED
+        row[_FOUND] = is_found
+
+
+Image: TypeAlias = tuple[float, float, Vector, Vector, float, float]
+"""u and v, their gradients by the point in the world frame, and their derivatives by n."""
 
 
 @device
-def _image_through(a: Vector, rig: Rig, c: int, out: FloatArray, image: FloatArray) -> None:
-    """Project the point at C + a through the port of a camera.
-
-    `image`, shape (2, 8), gets u and v, their derivatives by the point in the world frame and in
-    the camera frame, and by n.
-    """
+def _image_through(a: Vector, rig: Rig, c: int, out: FloatArray) -> Image:
+    """Project the point at C + a through the port of a camera; `out`, shape (3, 5), is for this."""
     r = rig.rotations[c]
     through_port(rig.port, rig.n, *times(r, a), out)
-    u, v, g = image_and_gradients(rig.lenses[rig.row[c]], out[0, 0], out[1, 0], out[2, 0])
-    image[0, 0], image[1, 0] = u, v
-    for axis in range(2):
-        gx, gy, gz = g[3 * axis], g[3 * axis + 1], g[3 * axis + 2]
-        for j in range(1, 5):
-            image[axis, 3 + j] = gx * out[0, j] + gy * out[1, j] + gz * out[2, j]
-        x, y, z = transposed_times(r, vector(image[axis], 4))
-        image[axis, 1], image[axis, 2], image[axis, 3] = x, y, z
+    u, v, g = image_and_gradients(rig.lenses[rig.row[c]], *column_of(out, 0))
+    x, y, z, by_n = column_of(out, 1), column_of(out, 2), column_of(out, 3), column_of(out, 4)
+    gu, gv = g[:3], g[3:]
+    by_u = transposed_times(r, (dot(gu, x), dot(gu, y), dot(gu, z)))
+    by_v = transposed_times(r, (dot(gv, x), dot(gv, y), dot(gv, z)))
+    return u, v, by_u, by_v, dot(gu, by_n), dot(gv, by_n)
 
 
-@kernel(allocates=True)
-def _search(
-    span: Span, moved: IntArray, xyz: FloatArray, start: IntArray, camera: IntArray, rig: Rig,
-    shift: FloatArray, found: BoolArray,
-) -> None:  # fmt: skip
-    """Move each point by Newton's method to where g is zero; if that fails it keeps its shift."""
-    out, image, g, slope = np.empty((3, 5)), np.empty((2, 8)), np.empty(3), np.empty((3, 3))
-    for m in range(*span):
-        i = moved[m]
-        point, q = row_of(xyz, i), shift[i].copy()
-        for _ in range(MAX_STEPS):
-            g[:], slope[:] = 0.0, 0.0
-            for c in camera[start[i] : start[i + 1]]:
-                a = minus(point, row_of(rig.centres, c))
-                u, v, ju, jv = image_in_world(rig.lenses[rig.row[c]], rig.rotations[c], a)
-                _image_through(plus(a, vector(q)), rig, c, out, image)
-                du, dv = image[0, 0] - u, image[1, 0] - v
-                for k in range(3):
-                    g[k] += ju[k] * du + jv[k] * dv
-                    for j in range(3):
-                        slope[k, j] += ju[k] * image[0, 1 + j] + jv[k] * image[1, 1 + j]
-            if not (np.isfinite(g).all() and np.linalg.det(slope) != 0.0):
-                break
-            step = np.linalg.solve(slope, g)
-            q -= step
-            if np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2) <= CLOSE_M:
-                shift[i], found[m] = q, True
-                break
+@device(allocates=True)
+def _search(start: Vector, point: Vector, chosen: IntArray, rig: Rig) -> tuple[Vector, bool]:
+    """Return the shift where g is zero, by Newton's method, and True; else the start and False."""
+    out, g, slope = np.empty((3, 5)), np.empty(3), np.empty((3, 3))
+    q = start
+    for _ in range(MAX_STEPS):
+        g[:], slope[:] = 0.0, 0.0
+        for c in chosen:
+            a = minus(point, row_of(rig.centres, c))
+            u, v, ju, jv = image_in_world(rig.lenses[rig.row[c]], rig.rotations[c], a)
+            u_true, v_true, lu, lv, _, _ = _image_through(plus(a, q), rig, c, out)
+            for k in range(3):
+                g[k] += ju[k] * (u_true - u) + jv[k] * (v_true - v)
+                for j in range(3):
+                    slope[k, j] += ju[k] * lu[j] + jv[k] * lv[j]
+        if not (np.isfinite(g).all() and np.linalg.det(slope) != 0.0):
+            break
+        step = vector(np.asarray(np.linalg.solve(slope, g)))
+        q = minus(q, step)
+        if dot(step, step) <= CLOSE_M * CLOSE_M:
+            return q, True
+    return start, False
 
 
-@kernel(allocates=True)
-def _covariances(
-    span: Span, xyz: FloatArray, start: IntArray, camera: IntArray, rig: Rig,
-    sigma_image: FloatArray, sigmas: tuple[float, float, float], result: FloatArray,
-) -> None:  # fmt: skip
-    """Sum H, the noise and the column of n over the rays of each point, and solve.
+@device(allocates=True)
+def _set_covariance(
+    out: FloatArray, point: Vector, chosen: IntArray, rig: Rig, sigmas: Sigmas
+) -> None:
+    """Write xx, xy, xz, yy, yz, zz of a true point; zeros stay where its rays do not meet.
 
-    `sigmas` are those of index, projection centre and attitude.
+    If a camera moves, the point moves the other way; if it turns about its centre with its port,
+    the point at C + a moves by a x omega, and its image by (L x a).omega.
     """
-    for i in range(*span):
-        cameras = camera[start[i] : start[i + 1]]
-        out, image, w = np.empty((3, 5)), np.empty((2, 8)), np.empty((2, 2))
-        h, noise, by_n = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
-        for c in cameras:
-            ahead = minus(row_of(xyz, i), row_of(rig.centres, c))
-            _image_through(ahead, rig, c, out, image)
-            seen = times(rig.rotations[c], ahead)
-            _image_noise(w, image, seen, sigma_image[c], sigmas[1], sigmas[2])
-            for a in range(3):
-                ju, jv = image[0, 1 + a], image[1, 1 + a]
-                by_n[a] += ju * image[0, 7] + jv * image[1, 7]
-                for b in range(3):
-                    u, v = image[0, 1 + b], image[1, 1 + b]
-                    h[a, b] += ju * u + jv * v
-                    noise[a, b] += ju * (w[0, 0] * u + w[0, 1] * v) + jv * (
-                        w[1, 0] * u + w[1, 1] * v
-                    )
-        if cameras.size < 2 or not (np.isfinite(h).all() and np.linalg.det(h) > 0.0):
-            continue
-        inverse = np.linalg.inv(h)
-        column = sigmas[0] * (inverse @ by_n)
-        full = inverse @ noise @ inverse
-        at = 0
-        for a in range(3):
-            for b in range(a, 3):
-                result[i, at] = full[a, b] + column[a] * column[b]
-                at += 1
-
-
-@device
-def _image_noise(
-    w: FloatArray, image: FloatArray, seen: Vector, sigma_image: float, sigma_centre: float,
-    sigma_attitude: float,
-) -> None:  # fmt: skip
-    """Write the covariance of one image place: its own, and that of the errors of the pose.
-
-    If a camera moves, the point moves the other way in its frame; if it turns about its centre with
-    its port, the point X moves by X x omega.
-    """
-    for a in range(2):
-        for b in range(2):
-            g, k = vector(image[a], 4), vector(image[b], 4)
-            turning = dot(cross(g, seen), cross(k, seen))
-            w[a, b] = sigma_centre**2 * dot(g, k) + sigma_attitude**2 * turning
-        w[a, a] += sigma_image**2
+    no_sum: Symmetric = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    light, h, noise, by_n = np.empty((3, 5)), no_sum, no_sum, (0.0, 0.0, 0.0)
+    for c in chosen:
+        a = minus(point, row_of(rig.centres, c))
+        _, _, u, v, u_by_n, v_by_n = _image_through(a, rig, c, light)
+        h = plus_square(plus_square(h, u), v)
+        by_n = beyond(beyond(by_n, u_by_n, u), v_by_n, v)
+        # each independent error adds the square of what it does to L' x
+        noise = plus_square(noise, scaled(sigmas.image[c], u))
+        noise = plus_square(noise, scaled(sigmas.image[c], v))
+        u_turned, v_turned = cross(u, a), cross(v, a)
+        for axis in range(3):
+            moved = beyond(scaled(u[axis], u), v[axis], v)
+            turned = beyond(scaled(u_turned[axis], u), v_turned[axis], v)
+            noise = plus_square(noise, scaled(sigmas.centre_m, moved))
+            noise = plus_square(noise, scaled(sigmas.attitude, turned))
+    det, (xx, xy, xz, yy, yz, zz) = cofactors(h)
+    if not det > 0.0:
+        return
+    inverse = (
+        scaled(1.0 / det, (xx, xy, xz)), scaled(1.0 / det, (xy, yy, yz)),
+        scaled(1.0 / det, (xz, yz, zz)),
+    )  # fmt: skip
+    at = 0
+    for i in range(3):
+        for j in range(i, 3):
+            common = sigmas.refractive_index**2 * dot(inverse[i], by_n) * dot(inverse[j], by_n)
+            out[at] = dot(inverse[i], product(noise, inverse[j])) + common
+            at += 1

@@ -96,8 +96,10 @@ def spec_of(port: Port) -> str:
     return f"dome:radius={port.radius_m:.7g},{glass},x={x:.7f},y={y:.7f},z={z:.7f}"
 
 
-_FLAT = ("distance", "thickness", "glass", "nx", "ny")
-_DOME = ("radius", "thickness", "glass", "x", "y", "z")
+_NUMBERS = {
+    "flat": ("distance", "thickness", "glass", "nx", "ny"),
+    "dome": ("radius", "thickness", "glass", "x", "y", "z"),
+}
 _EXAMPLES = {
     "flat": "flat:distance=0.02,thickness=0.008,glass=1.49",
     "dome": "dome:radius=0.05,thickness=0.004,glass=1.49,z=-0.01",
@@ -116,8 +118,7 @@ def port_of(text: str) -> Port:
     kind = kind.strip().lower()
     if kind not in _EXAMPLES:
         raise _bad(text, f"the kind '{kind}' is not flat or dome", _EXAMPLES["flat"])
-    known = _FLAT if kind == "flat" else _DOME
-    values: dict[str, float] = {}
+    known, values = _NUMBERS[kind], dict[str, float]()
     for part in rest.split(",") if rest.strip() else []:
         word, _, number = (piece.strip() for piece in part.partition("="))
         if word not in known or word in values:
@@ -131,13 +132,12 @@ def port_of(text: str) -> Port:
             raise _bad(text, f"{word} is not a number: '{number}'", _EXAMPLES[kind])
     if known[0] not in values:
         raise _bad(text, f"{known[0]} is missing", _EXAMPLES[kind])
-    glass = values.get("thickness", 0.0), values.get("glass", ACRYLIC_INDEX)
+    size, thickness, _, x, y, *z = (values.get(name, 0.0) for name in known)
+    glass = values.get("glass", ACRYLIC_INDEX)
     if kind == "dome":
-        centre = values.get("x", 0.0), values.get("y", 0.0), values.get("z", 0.0)
-        return DomePort(values["radius"], *glass, centre)
-    nx, ny = values.get("nx", 0.0), values.get("ny", 0.0)
-    _check("normal", (nx, ny), nx * nx + ny * ny < 1.0, "is longer than a unit vector.")
-    return FlatPort(values["distance"], *glass, (nx, ny, math.sqrt(1.0 - nx * nx - ny * ny)))
+        return DomePort(size, thickness, glass, (x, y, z[0]))
+    _check("normal", (x, y), x * x + y * y < 1.0, "is longer than a unit vector.")
+    return FlatPort(size, thickness, glass, (x, y, math.sqrt(1.0 - x * x - y * y)))
 
 
 def _bad(text: str, why: str, example: str) -> SettingError:

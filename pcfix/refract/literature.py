@@ -8,7 +8,7 @@ where the straight line of sight crosses it; the refracted ray crosses it deeper
     d tan a / tan b = d sqrt(n^2 + (n^2 - 1) tan^2 a)
 
 as tan b = sin a / sqrt(n^2 - sin^2 a). Straight below the camera the left side is 0/0; the right
-side is its limit n d.
+side is its limit n d. The methods differ in what they make of the crossings of several rays.
 
 Over a tilted surface or a mesh the water is taken as level at its height above the apparent point.
 Each camera may have its own water level; where that is below the apparent point, its ray goes
@@ -17,14 +17,13 @@ straight.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
 from pcfix.errors import SettingError
 from pcfix.kernels import Span, device, in_tiles, kernel
-from pcfix.lens.algebra import Vector, minus, row_of
+from pcfix.lens.algebra import Vector, row_of
 from pcfix.model import BoolArray, FloatArray, Outcome
 from pcfix.refract.batch import Batch, Chosen, Intersection
 from pcfix.refract.rays import MIN_DETERMINANT
@@ -33,71 +32,13 @@ TOLERANCE = 1e-9
 """Of tan a between two iterations of `shan`; the depth then changes by less than 1e-9 of itself."""
 MOST_ITERATIONS = 50
 
-
-def apparent_depth(batch: Batch) -> FloatArray:
-    """Return the depth of the apparent points below the water above them, metres, shape (m,)."""
-    return np.asarray(batch.surface.height_m - batch.xyz[:, 2])
-
-
-def down(shift_m: FloatArray) -> FloatArray:
-    """Return downward shifts, shape (m, 3), of some metres, shape (m,)."""
-    none = np.zeros(len(shift_m))
-    return np.column_stack([none, none, -shift_m])
-
-
-@device
-def depth_ratio(tan2: float, n: float) -> float:
-    """Return tan a / tan b of a ray with tan^2 a = `tan2`: true by apparent depth along it."""
-    return np.sqrt(n * n + (n * n - 1.0) * tan2)
-
-
-@kernel(allocates=True)
-def _mean_crossings(points: Chosen) -> FloatArray:
-    """Return the mean depth below P at which the refracted rays of a point cross its plumb line."""
-    lowered = np.zeros(len(points.xyz))
-    for i in range(len(points.xyz)):
-        rays = points.camera[points.start[i] : points.start[i + 1]]
-        for c in rays:
-            lowered[i] += _crossing(points, i, c)[0] / rays.size
-    return lowered
-
-
-@kernel(allocates=True)
-def _distances(points: Chosen, shift: FloatArray) -> FloatArray:
-    """Return the root mean square distance of the true points from their refracted rays, metres."""
-    distance = np.zeros(len(points.xyz))
-    for i in range(len(points.xyz)):
-        rays, squares = points.camera[points.start[i] : points.start[i + 1]], 0.0
-        for c in rays:
-            below, u, v = _crossing(points, i, c)
-            # how far aside of the ray the point is at its own depth
-            x = shift[i, 0] - u * (-shift[i, 2] - below)
-            y = shift[i, 1] - v * (-shift[i, 2] - below)
-            # the part of the offset along the ray does not count
-            along = x * u + y * v
-            square = x * x + y * y - along * along / (1.0 + u * u + v * v)
-            squares += max(square, 0.0)
-        distance[i] = np.sqrt(squares / max(rays.size, 1))
-    return distance
-
-
-@device
-def _crossing(points: Chosen, i: int, c: int) -> Vector:
-    """Return how far below P a refracted ray crosses its plumb line, and how it leans.
-
-    The latter is how far it goes aside per metre down, in x and y.
-    """
-    ex, ey, ez = minus(row_of(points.centres, c), row_of(points.xyz, i))
-    tan2 = (ex * ex + ey * ey) / (ez * ez)
-    depth = max(points.height[i] - points.xyz[i, 2] + points.offset[c], 0.0)
-    s = depth_ratio(tan2, points.n) if depth > 0.0 else 1.0
-    return depth * (s - 1.0), -ex / (ez * s), -ey / (ez * s)
+Crossing: TypeAlias = tuple[float, float, float, float]
 
 
 def factor(batch: Batch) -> Intersection:
     """Multiply the apparent depth by `depth_factor`, else by the refractive index; only Z moves.
 
-    Every point is corrected, as no ray is needed; see `without_rays`.
+    Every point is corrected, as no ray is needed; see `_without_rays`.
 
     Notes
     -----
@@ -109,13 +50,14 @@ def factor(batch: Batch) -> Intersection:
     settings = batch.survey.settings
     given = settings.depth_factor
     ratio = settings.refractive_index if given is None else float(given)
-    return without_rays(batch, (ratio - 1.0) * apparent_depth(batch))
+    apparent = batch.surface.height_m - batch.xyz[:, 2]
+    return _without_rays(batch, (ratio - 1.0) * apparent)
 
 
 def regression(batch: Batch) -> Intersection:
     """Apply the fitted regression to the apparent depths; only Z moves.
 
-    Every point is corrected, as no ray is needed; see `without_rays`. Raises SettingError if there
+    Every point is corrected, as no ray is needed; see `_without_rays`. Raises SettingError if there
     is no regression.
 
     Notes
@@ -133,24 +75,89 @@ def regression(batch: Batch) -> Intersection:
             "Method regression needs a fitted line. Give check depths or the line of another"
             " cloud.",
         )
-    apparent = apparent_depth(batch)
-    return without_rays(batch, line.depth_m(apparent) - apparent)
+    apparent = batch.surface.height_m - batch.xyz[:, 2]
+    return _without_rays(batch, line.depth_m(apparent) - apparent)
 
 
-def without_rays(batch: Batch, lowered_m: FloatArray) -> Intersection:
+def _without_rays(batch: Batch, lowered_m: FloatArray) -> Intersection:
     """Return the result of a method that lowers points, shape (m,), and needs no cameras.
 
     All points are corrected. `ray_count` is that of the chosen cameras, but at least 1: in files a
     count of 0 marks a point that was not corrected.
     """
-    outcome = np.full(len(batch.xyz), Outcome.CORRECTED, np.uint8)
-    found = batch.result(down(lowered_m), outcome=outcome)
+    shift = np.zeros((len(batch), 3))
+    shift[:, 2] = -lowered_m
+    found = batch.result(shift, outcome=np.full(len(batch), Outcome.CORRECTED, np.uint8))
     return found._replace(ray_count=np.maximum(found.ray_count, 1))
 
 
-def _with_distances(batch: Batch, shift: FloatArray, outcome: npt.NDArray[Any]) -> Intersection:
-    distance = _distances(batch.chosen(), shift)
+def _by_rays(batch: Batch, method: int) -> Intersection:
+    """Return the result of a method by the refracted rays of the chosen cameras."""
+    m = len(batch)
+    shift, distance, failed = np.zeros((m, 3)), np.zeros(m), np.zeros(m, np.bool_)
+    in_tiles(_solve, m, batch.chosen(), method, shift, distance, failed, points=m)
+    outcome = np.where(failed, Outcome.PARALLEL_RAYS, batch.outcome())
+    if method == _MEAN:
+        outcome = np.where(batch.counts > 0, Outcome.CORRECTED, Outcome.NO_CAMERA)
     return batch.result(shift, outcome=outcome.astype(np.uint8), ray_miss_m=distance)
+
+
+_MEAN, _PAIRS, _S_MODEL = range(3)
+
+
+@kernel(allocates=True)
+def _solve(
+    span: Span, points: Chosen, method: int, shift: FloatArray, distance: FloatArray,
+    failed: BoolArray,
+) -> None:  # fmt: skip
+    """Fill in the shift of each point, or that it has none, and its distance from the rays."""
+    for i in range(*span):
+        cameras = points.camera[points.start[i] : points.start[i + 1]]
+        k = cameras.size
+        e, d, tangent, rays = np.empty((k, 3)), np.empty(k), np.empty(k), np.empty((k, 4))
+        for j in range(k):
+            e[j] = points.centres[cameras[j]] - points.xyz[i]
+            # the depth under the water of this camera; 0 above it
+            d[j] = max(points.height[i] - points.xyz[i, 2] + points.offset[cameras[j]], 0.0)
+            tangent[j] = np.hypot(e[j, 0], e[j, 1]) / e[j, 2]
+            rays[j] = _crossing(row_of(e, j), d[j], tangent[j], points.n)
+        if method == _MEAN:
+            x, y, down_m, solved = 0.0, 0.0, rays[:, 0].sum() / max(k, 1), True
+        elif k < 2:
+            x, y, down_m, solved = 0.0, 0.0, 0.0, True
+        elif method == _PAIRS:
+            x, y, (down_m, solved) = 0.0, 0.0, _equal_x(e, rays)
+        else:
+            x, y, down_m, solved = _s_model(e, d, tangent, rays.copy(), points.n)
+        failed[i] = not solved
+        if solved:
+            shift[i] = x, y, -down_m
+        distance[i] = _distance(rays, shift[i])
+
+
+@device
+def _crossing(e: Vector, depth: float, tangent: float, n: float) -> Crossing:
+    """Return how far below P a refracted ray crosses its plumb line, how it leans, and s.
+
+    How it leans is how far it goes aside per metre down, in x and y; s = tan a / tan b is the true
+    by the apparent depth along it, 1 in air.
+    """
+    s = np.sqrt(n * n + (n * n - 1.0) * tangent * tangent) if depth > 0.0 else 1.0
+    return depth * (s - 1.0), -e[0] / (e[2] * s), -e[1] / (e[2] * s), s
+
+
+@device
+def _distance(rays: FloatArray, shift: FloatArray) -> float:
+    """Return the root mean square distance of the true point from refracted rays, metres."""
+    squares = 0.0
+    for below, u, v, _ in rays:
+        # how far aside of the ray the point is at its own depth
+        x = shift[0] - u * (-shift[2] - below)
+        y = shift[1] - v * (-shift[2] - below)
+        # the part of the offset along the ray does not count
+        along = x * u + y * v
+        squares += max(x * x + y * y - along * along / (1.0 + u * u + v * v), 0.0)
+    return np.sqrt(squares / max(len(rays), 1))
 
 
 def butler(batch: Batch) -> Intersection:
@@ -182,9 +189,7 @@ def butler(batch: Batch) -> Intersection:
     Processes and Landforms 42, 355-364, over all cameras, as his program pyBathySfM computes it.
     The program excludes a camera exactly above the point, as tan i is 0 there.
     """
-    lowered = _mean_crossings(batch.chosen())
-    outcome = np.where(batch.counts > 0, Outcome.CORRECTED, Outcome.NO_CAMERA)
-    return _with_distances(batch, down(lowered), outcome)
+    return _by_rays(batch, _MEAN)
 
 
 def murase(batch: Batch) -> Intersection:
@@ -212,49 +217,32 @@ def murase(batch: Batch) -> Intersection:
     Exact where both rays have the same incidence, and where cameras and point are in one vertical
     plane. Elsewhere the rays of a pair differ in Y too, which the formula ignores.
     """
-    lowered = _equal_x(batch.chosen())
-    outcome = np.where(lowered < 0.0, Outcome.PARALLEL_RAYS, batch.outcome())
-    return _with_distances(batch, down(np.maximum(lowered, 0.0)), outcome)
-
-
-@kernel(allocates=True)
-def _equal_x(points: Chosen) -> FloatArray:
-    """Return how far each point sinks by its pairs; negative where these leave the depth open."""
-    lowered = np.zeros(len(points.xyz))
-    for i in range(len(points.xyz)):
-        rays = points.camera[points.start[i] : points.start[i + 1]]
-        if rays.size < 2:
-            continue
-        # weighted mean over all pairs
-        products = squares = 0.0
-        for a in range(rays.size):
-            for b in range(a + 1, rays.size):
-                parallax, shift = _pair(points, i, rays[a], rays[b])
-                products += parallax * shift
-                squares += parallax * parallax
-        pairs = rays.size * (rays.size - 1) // 2
-        lowered[i] = -products / squares if squares > 4.0 * pairs * MIN_DETERMINANT else -np.inf
-    return lowered
+    return _by_rays(batch, _PAIRS)
 
 
 @device
-def _pair(points: Chosen, i: int, first: int, second: int) -> tuple[float, float]:
-    """Return the X-parallax of two refracted rays per metre of depth, and at the apparent point.
+def _equal_x(e: FloatArray, rays: FloatArray) -> tuple[float, bool]:
+    """Return how far a point sinks by its pairs, and whether these determine it.
 
-    With the slope q of a ray along the base and its crossing `below` the apparent point, the ray is
-    q (z - below) from the plumb line at the depth z; both are equal at -shift / parallax.
+    With its slope q along the base and its crossing `below` the apparent point, a ray is
+    q (z - below) from the plumb line at the depth z.
     """
-    x, y, _ = minus(row_of(points.centres, second), row_of(points.centres, first))
-    # X is along the base of the pair
-    base = np.hypot(x, y)
-    if base == 0.0:
-        return 0.0, 0.0
-    parallax = shift = 0.0
-    for c, sign in ((first, 1.0), (second, -1.0)):
-        below, u, v = _crossing(points, i, c)
-        q = sign * (u * x + v * y) / base
-        parallax, shift = parallax + q, shift - q * below
-    return parallax, shift
+    products = squares = 0.0
+    for a in range(len(rays)):
+        for b in range(a + 1, len(rays)):
+            # X is along the base of the pair
+            x, y = e[b, 0] - e[a, 0], e[b, 1] - e[a, 1]
+            base = np.hypot(x, y)
+            if base == 0.0:
+                continue
+            q = (rays[a, 1] * x + rays[a, 2] * y) / base
+            q_other = (rays[b, 1] * x + rays[b, 2] * y) / base
+            parallax = q - q_other
+            products += parallax * (q * rays[a, 0] - q_other * rays[b, 0])
+            squares += parallax * parallax
+    pairs = len(rays) * (len(rays) - 1) // 2
+    sunk = products / squares
+    return sunk, squares > 4.0 * pairs * MIN_DETERMINANT and sunk >= 0.0
 
 
 def shan(batch: Batch) -> Intersection:
@@ -293,68 +281,55 @@ def shan(batch: Batch) -> Intersection:
     or in one vertical plane with the point. The image ray determines s, so that the iteration only
     accounts for rays that pass each other; a few iterations are enough.
     """
-    shift = np.zeros((len(batch.xyz), 3))
-    failed = np.zeros(len(batch.xyz), np.bool_)
-    in_tiles(_iterate, len(batch), batch.chosen(), shift, failed, points=len(batch))
-    outcome = np.where(failed, Outcome.PARALLEL_RAYS, batch.outcome())
-    return _with_distances(batch, shift, outcome)
-
-
-@kernel(allocates=True)
-def _iterate(span: Span, points: Chosen, shift: FloatArray, failed: BoolArray) -> None:
-    """Fill in the shift of each point with two rays or more, or that it has no solution."""
-    for i in range(*span):
-        rays = points.camera[points.start[i] : points.start[i + 1]]
-        if rays.size < 2:
-            continue
-        e, d, s = np.empty((rays.size, 3)), np.empty(rays.size), np.ones(rays.size)
-        for j in range(rays.size):
-            e[j] = points.centres[rays[j]] - points.xyz[i]
-            # the depth under the water of this camera; 0 above it
-            d[j] = max(points.height[i] - points.xyz[i, 2] + points.offset[rays[j]], 0.0)
-        tangent = np.hypot(e[:, 0], e[:, 1]) / e[:, 2]
-        for _ in range(MOST_ITERATIONS):
-            for j in range(rays.size):
-                s[j] = depth_ratio(tangent[j] ** 2, points.n) if d[j] > 0.0 else 1.0
-            solved, x, y, sunk = _intersected(e, d, s)
-            failed[i] = not (solved and sunk + d.min() >= 0.0)
-            if failed[i]:
-                break
-            # tan a from the height of the camera over the point at the depth D / s
-            following = np.hypot(x - e[:, 0], y - e[:, 1]) / (e[:, 2] - d + (d + sunk) / s)
-            change, tangent = np.abs(following - tangent).max(), following
-            if change <= TOLERANCE:
-                break
-        if not failed[i]:
-            shift[i, 0], shift[i, 1], shift[i, 2] = x, y, -sunk
+    return _by_rays(batch, _S_MODEL)
 
 
 @device(allocates=True)
-def _intersected(e: FloatArray, d: FloatArray, s: FloatArray) -> tuple[bool, float, float, float]:
+def _s_model(
+    e: FloatArray, d: FloatArray, tangent: FloatArray, rays: FloatArray, n: float
+) -> tuple[float, float, float, bool]:
+    """Return how far a point moves and sinks, and whether the iteration ends under the water."""
+    x = y = sunk = 0.0
+    for _ in range(MOST_ITERATIONS):
+        x, y, sunk, solved = _nearest_vertical(rays)
+        if not (solved and sunk + d.min() >= 0.0):
+            return x, y, sunk, False
+        change = 0.0
+        for j in range(len(rays)):
+            # tan a from the height of the camera over the point at the depth D / s
+            height = e[j, 2] - d[j] + (d[j] + sunk) / rays[j, 3]
+            following = np.hypot(x - e[j, 0], y - e[j, 1]) / height
+            change, tangent[j] = max(change, abs(following - tangent[j])), following
+            rays[j] = _crossing(row_of(e, j), d[j], following, n)
+        if change <= TOLERANCE:
+            break
+    return x, y, sunk, True
+
+
+@device(allocates=True)
+def _nearest_vertical(rays: FloatArray) -> tuple[float, float, float, bool]:
     """Solve the collinearity equations with s known.
 
-    In plan, a camera's image ray is u = -e / e_z metres aside per metre down, and in the water
-    v = u / s. It meets the vertical of the true point, x aside and `sunk` below the apparent one,
-    where
+    A refracted ray goes v metres aside per metre down. It meets the vertical of the true point, x
+    aside and `sunk` below the apparent one, where
 
-        x = v sunk + r,    r = -(u - v) d
+        x = v (sunk - below)
 
-    for each of the two axes: a straight line through the places (v, r), of which `sunk` is the
-    slope with its sign changed.
+    for each of the two axes: a straight line through the places (v, -v below), of which `sunk` is
+    the slope with its sign changed.
     """
-    k, means = float(d.size), np.zeros((2, 2))
-    spread = product = 0.0
+    k, means, spread, product = len(rays), np.zeros((2, 2)), 0.0, 0.0
     for axis in range(2):
-        u = -e[:, axis] / e[:, 2]
-        v = u / s
-        r = -(u - v) * d
-        means[axis, 0], means[axis, 1] = v.mean(), r.mean()
+        v = rays[:, 1 + axis]
+        r = -v * rays[:, 0]
+        means[axis] = v.mean(), r.mean()
         # least squares of a line through the places (v, r)
         away = v - means[axis, 0]
         spread += (away * away).sum()
         product += (away * (r - means[axis, 1])).sum()
     # of two rays at a small angle alpha the spread is alpha^2 / 2
     if not spread >= 2.0 * k * MIN_DETERMINANT:
-        return False, 0.0, 0.0, 0.0
+        return 0.0, 0.0, 0.0, False
     sunk = -product / spread
-    return True, means[0, 1] + sunk * means[0, 0], means[1, 1] + sunk * means[1, 0], sunk
+    x, y = means[:, 1] + sunk * means[:, 0]
+    return x, y, sunk, True

@@ -32,7 +32,8 @@ Heights = npt.NDArray[np.float32]
 NEAR_CELLS = 2.0
 """Distance from the point, in plan, within which nothing occludes it."""
 BLOCK, LARGE_BLOCK = 8, 64
-"""Cells along the side of the blocks whose highest cell is known, to pass them at once."""
+"""Cells along the side of the blocks whose highest cell is known, to pass them at once. Without
+the larger ones rays take half as long again."""
 MARGIN_BLOCK = 16
 ROOF_MARGINS = 2.0
 """Least height of a roof over the point, in margins; else it may be a low point of an even bed."""
@@ -65,9 +66,10 @@ class Occluder(NamedTuple):
     bottom_m: float  # south-west corner of the grid
     cell_m: float
     highest_m: float  # of all heights; minus infinity where none is known
-    margin: Heights  # of each `MARGIN_BLOCK`: a ray must pass below the surface by more (noise)
+    margin: Heights  # of each `BLOCK`: a ray must pass below the surface by more (noise)
     block_top: Heights  # the highest of each `BLOCK`; minus infinity where none is known
     large_block_top: Heights
+    roof: Heights  # the lowest within `NEAR_CELLS`; minus infinity where one is not known
 
 
 def occluded(xyz: FloatArray, centres: FloatArray, views: Views, occluder: Occluder) -> BoolArray:
@@ -116,7 +118,7 @@ def _occlude(
         # nothing in the cloud is higher
         if z + slack >= o.highest_m:
             continue
-        roofed = _is_roofed(o.height, int(v), int(u), z + ROOF_MARGINS * slack)
+        roofed = o.roof[int(v), int(u)] > z + ROOF_MARGINS * slack
         for entry in range(start[i], start[i + 1]):
             c = camera[entry]
             du, dv = (centres[c, 0] - xyz[i, 0]) / o.cell_m, (centres[c, 1] - xyz[i, 1]) / o.cell_m
@@ -129,31 +131,12 @@ def _occlude(
                 continue
             # unit steps in plan, and the rise of the ray for each
             du, dv, rise = du / run, dv / run, up / run
-            first, pierces = NEAR_CELLS, False
-            if roofed:
-                first, pierces = _through_roof(o, u, v, z, du, dv, rise, run, slack)
-            found[entry] = pierces or _meets(o, u, v, z + slack, du, dv, rise, run, first)
+            found[entry] = _meets(o, u, v, z, du, dv, rise, run, slack, roofed)
 
 
 @device
 def _inside(height: Heights, u: float, v: float) -> bool:
     return 0.0 <= u < height.shape[1] and 0.0 <= v < height.shape[0]
-
-
-@device
-def _is_roofed(height: Heights, row: int, column: int, z: float) -> bool:
-    """Whether all cells within `NEAR_CELLS` are higher than z."""
-    if not height[row, column] > z:
-        return False
-    # roofs are not looked for at the edge of the grid
-    reach = int(NEAR_CELLS)
-    if not (reach <= row < height.shape[0] - reach and reach <= column < height.shape[1] - reach):
-        return False
-    for r in range(row - reach, row + reach + 1):
-        for c in range(column - reach, column + reach + 1):
-            if not height[r, c] > z:  # nor where it is not known
-                return False
-    return True
 
 
 @device
@@ -168,70 +151,56 @@ def _to_edge(x: float, dx: float, side: int) -> float:
 @device
 def _meets(
     o: Occluder, u: float, v: float, z: float, du: float, dv: float, rise: float, run: float,
-    first: float,
+    slack: float, roofed: bool,
 ) -> bool:  # fmt: skip
-    """Whether the ray leaves a cell below the height of that cell, from `first` cells on."""
-    t = first
+    """Whether the ray pierces the roof over its point, or later leaves a cell below its height.
+
+    It pierces the roof where it rises above the surface within a cell, or where the surface falls
+    below the ray from one cell to the next by less than the margin `slack`; at the edge of the
+    roof it falls by more.
+    """
+    t = 0.0 if roofed else NEAR_CELLS
     while t < run:
         x, y, low = u + t * du, v + t * dv, z + t * rise
-        if low >= o.highest_m or not _inside(o.height, x, y):
+        if not _inside(o.height, x, y):
             return False
-        row, column = int(y), int(x)
-        # pass blocks whose highest cell is below the ray
-        side = 1
-        if low >= o.large_block_top[row // LARGE_BLOCK, column // LARGE_BLOCK]:
-            side = LARGE_BLOCK
-        elif low >= o.block_top[row // BLOCK, column // BLOCK]:
-            side = BLOCK
+        row, column, side = int(y), int(x), 1
+        top = o.height[row, column]
+        # the roof ends between two cells
+        if roofed and top <= low:
+            if low - top < slack:
+                return True
+            roofed = False
+        if not roofed:
+            if low + slack >= o.highest_m:
+                return False
+            # pass a block whose highest cell is below the ray
+            if low + slack >= o.large_block_top[row // LARGE_BLOCK, column // LARGE_BLOCK]:
+                side = LARGE_BLOCK
+            elif low + slack >= o.block_top[row // BLOCK, column // BLOCK]:
+                side = BLOCK
         # on to the edge of the cell or block
         t = min(t + min(_to_edge(x, du, side), _to_edge(y, dv, side)), run)
-        if side == 1 and z + t * rise < o.height[row, column]:
+        low = z + t * rise
+        if (roofed and top <= low) or (not roofed and side == 1 and low + slack < top):
             return True
         t += _ONWARD
     return False
 
 
-@device
-def _through_roof(
-    o: Occluder, u: float, v: float, z: float, du: float, dv: float, rise: float, run: float,
-    slack: float,
-) -> tuple[float, bool]:  # fmt: skip
-    """Return how far the ray goes below a roof, and whether it pierces the roof.
-
-    It does where it rises above the surface within a cell, or where the surface falls below the ray
-    from one cell to the next by less than the margin; at the edge of the roof it falls by more.
-    """
-    t = 0.0
-    while t < run:
-        x, y, low = u + t * du, v + t * dv, z + t * rise
-        if not _inside(o.height, x, y):
-            break
-        # the roof over this cell
-        top = o.height[int(y), int(x)]
-        if top <= low:
-            return t, low - top < slack
-        t = min(t + min(_to_edge(x, du, 1), _to_edge(y, dv, 1)), run)
-        if top <= z + t * rise:
-            return t, True
-        t += _ONWARD
-    return t, False
-
-
 class _Cells(NamedTuple):
-    """Cells from a first row and column on; heights are minus infinity where there is no point."""
+    """A grid of cells; heights are minus infinity where there is no point."""
 
     side_m: float
-    first_row: int
-    first_column: int
-    highest: Heights
-    second: Heights
+    first: IntArray  # (2,), row and column of the first cell, counted from the origin of the world
+    top: Heights  # (2, rows, columns), of the highest point and the second highest
 
 
 class OccluderBuilder:
-    """Builds the surface of a cloud of so many points from its chunks.
+    """Builds the surface of a cloud from its chunks.
 
-    `low` and `high`, shape (2,), are the corners of the cloud in metres, if they are known; the
-    grid grows where points lie outside.
+    `points` is their number; `low` and `high`, shape (2,), are the corners of the cloud in metres,
+    if they are known. The grid grows where points lie outside.
     """
 
     def __init__(self, low: FloatArray, high: FloatArray, points: int) -> None:
@@ -240,7 +209,7 @@ class OccluderBuilder:
         self._cells: _Cells | None = None
         self._points = 0
         if np.isfinite([low, high]).all() and (low <= high).all():
-            self._reach(low, high)
+            self._low, self._high = low, high
 
     def add(self, xyz: FloatArray, classes: npt.NDArray[np.uint8] | None = None) -> None:
         """Add a chunk of apparent points, shape (n, 3); noise (classes 7 and 18) is ignored."""
@@ -249,106 +218,86 @@ class OccluderBuilder:
         if not len(xyz):
             return
         self._points += len(xyz)
-        self._reach(xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0))
-        if self._cells is not None:
-            _add(self._cells, np.ascontiguousarray(xyz))
-
-    def _reach(self, low: FloatArray, high: FloatArray) -> None:
-        """Extend the grid to a rectangle."""
-        low, high = np.minimum(self._low, low), np.maximum(self._high, high)
-        if (low < self._low).any() or (high > self._high).any():
-            self._low, self._high = low, high
-            self._cells = _over(low, high, self._most, self._cells)
+        low, high = xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0)
+        if self._cells is None or (low < self._low).any() or (high > self._high).any():
+            self._low, self._high = np.minimum(self._low, low), np.maximum(self._high, high)
+            self._cells = _over(self._low, self._high, self._most, self._cells)
+        _add(*self._cells, np.ascontiguousarray(xyz))
 
     def build(self) -> Occluder | None:
         """Return the surface; None without points. The builder is then empty."""
-        from scipy.ndimage import maximum_filter
+        from scipy.ndimage import maximum_filter, minimum_filter
 
         cells, self._cells = self._cells, None
-        if cells is None or not self._points:
+        if cells is None:
             return None
         # until the cells with points have enough of them on average
-        while max(cells.highest.shape) > 2 and (
-            self._points < POINTS_A_CELL * np.isfinite(cells.highest).sum()
+        while max(cells.top.shape[1:]) > 2 and (
+            self._points < POINTS_A_CELL * np.isfinite(cells.top[0]).sum()
         ):
             cells = _halved(cells)
         # without spikes: a cell is at most as high as the highest of its eight neighbours
         around = np.ones((3, 3), np.bool_)
         around[1, 1] = False
-        beside = maximum_filter(cells.second, footprint=around, mode="constant", cval=-np.inf)
-        lower = np.minimum(cells.second, beside)
-        height = np.where(lower > -np.inf, lower, np.float32(np.nan))
+        beside = maximum_filter(cells.top[1], footprint=around, mode="constant", cval=-np.inf)
+        known = np.minimum(cells.top[1], beside)
+        corner = cells.first * cells.side_m
         return Occluder(
-            height=height,
-            left_m=cells.first_column * cells.side_m,
-            bottom_m=cells.first_row * cells.side_m,
+            height=np.where(known > -np.inf, known, np.float32(np.nan)),
+            left_m=float(corner[1]),
+            bottom_m=float(corner[0]),
             cell_m=cells.side_m,
-            highest_m=float(np.nanmax(height, initial=-np.inf)),
-            margin=_margins(cells.highest, cells.second),
-            block_top=_tops(height, BLOCK),
-            large_block_top=_tops(height, LARGE_BLOCK),
+            highest_m=float(known.max()),
+            margin=_margins(*cells.top),
+            block_top=_tops(known, BLOCK),
+            large_block_top=_tops(known, LARGE_BLOCK),
+            roof=minimum_filter(known, 2 * int(NEAR_CELLS) + 1, mode="constant", cval=-np.inf),
         )
-
-
-def _shape(low: FloatArray, high: FloatArray, side: float) -> tuple[FloatArray, FloatArray]:
-    """Return the first row and column, and how many there are."""
-    first, last = np.floor(low[::-1] / side), np.floor(high[::-1] / side)
-    return first, last - first + 1.0
 
 
 def _over(low: FloatArray, high: FloatArray, most: int, old: _Cells | None) -> _Cells:
     """Return the finest cells over a rectangle, with what is in the old ones."""
     side = FINEST_M if old is None else old.side_m
-    while _shape(low, high, side)[1].prod() > most:
+    while np.prod(np.floor(high / side) - np.floor(low / side) + 1.0) > most:
         side *= 2.0
-    while old is not None and old.side_m < side:
-        old = _halved(old)
-    first, shape = _shape(low, high, side)
-    rows, columns = int(shape[0]), int(shape[1])
-    values = [np.full((rows, columns), -np.inf, np.float32) for _ in range(2)]
-    new = _Cells(side, int(first[0]), int(first[1]), *values)
+        old = None if old is None else _halved(old)
+    first, last = (np.floor(corner[::-1] / side).astype(np.int64) for corner in (low, high))
+    top = np.full((2, *(last - first + 1)), -np.inf, np.float32)
     if old is not None:
-        row, column = old.first_row - new.first_row, old.first_column - new.first_column
-        rows, columns = old.highest.shape
-        for target, source in zip(new[3:], old[3:], strict=True):
-            target[row : row + rows, column : column + columns] = source
-    return new
+        (row, column), (rows, columns) = old.first - first, old.top.shape[1:]
+        top[:, row : row + rows, column : column + columns] = old.top
+    return _Cells(side, first, top)
 
 
 def _halved(cells: _Cells) -> _Cells:
     """Return the same in cells of twice the side."""
-    (rows, columns), south, west = cells.highest.shape, cells.first_row % 2, cells.first_column % 2
-    pad = (south, (south + rows) % 2), (west, (west + columns) % 2)
-    highest, second = (
-        np.pad(values, pad, constant_values=-np.inf) if np.any(pad) else values
-        for values in (cells.highest, cells.second)
-    )
-    first, runner_up = highest[::2, ::2], second[::2, ::2]
+    (south, west), (rows, columns) = cells.first % 2, cells.top.shape[1:]
+    pad = (0, 0), (south, (south + rows) % 2), (west, (west + columns) % 2)
+    top = np.pad(cells.top, pad, constant_values=-np.inf) if np.any(pad) else cells.top
+    highest, second = top[:, ::2, ::2]
     for r, c in ((0, 1), (1, 0), (1, 1)):  # the other three of each four cells
-        one, other = highest[r::2, c::2], second[r::2, c::2]
-        runner_up = np.maximum(np.minimum(first, one), np.maximum(runner_up, other))
-        first = np.maximum(first, one)
-    corner = cells.first_row // 2, cells.first_column // 2
-    return _Cells(cells.side_m * 2.0, *corner, first, runner_up)
+        one, other = top[:, r::2, c::2]
+        second = np.maximum(np.minimum(highest, one), np.maximum(second, other))
+        highest = np.maximum(highest, one)
+    return _Cells(cells.side_m * 2.0, cells.first // 2, np.stack([highest, second]))
 
 
 @kernel
-def _add(cells: _Cells, xyz: FloatArray) -> None:
+def _add(side_m: float, first: IntArray, top: Heights, xyz: FloatArray) -> None:
+    """Raise the highest and the second highest of the cells by points."""
     for i in range(len(xyz)):
-        c = int(np.floor(xyz[i, 0] / cells.side_m)) - cells.first_column
-        r = int(np.floor(xyz[i, 1] / cells.side_m)) - cells.first_row
+        c = int(np.floor(xyz[i, 0] / side_m)) - first[1]
+        r = int(np.floor(xyz[i, 1] / side_m)) - first[0]
         z = np.float32(xyz[i, 2])
-        if z > cells.highest[r, c]:
-            cells.second[r, c] = cells.highest[r, c]
-            cells.highest[r, c] = z
-        elif z > cells.second[r, c]:
-            cells.second[r, c] = z
+        if z > top[0, r, c]:
+            top[1, r, c], top[0, r, c] = top[0, r, c], z
+        elif z > top[1, r, c]:
+            top[1, r, c] = z
 
 
-def _tops(height: Heights, side: int) -> Heights:
-    """Return the highest of each block, minus infinity where no height is known."""
-    known = np.where(np.isnan(height), np.float32(-np.inf), height)
-    rows, columns = (np.arange(0, n, side) for n in height.shape)
+def _tops(known: Heights, side: int) -> Heights:
+    """Return the highest of each block."""
+    rows, columns = (np.arange(0, n, side) for n in known.shape)
     return np.maximum.reduceat(np.maximum.reduceat(known, rows, axis=0), columns, axis=1)
 
 

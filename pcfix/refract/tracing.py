@@ -5,8 +5,8 @@ piercing point. Four methods find it; they agree where all of them converge:
 
 =============  ====================================================================================
 kotowski       Newton's method on Snell's law at the piercing point (Kotowski 1987)
-afrt           rays traced forward, their aim moved by a secant (Broyden) update
-mdfrt          rays traced forward, Newton's method on their distance from the point (differences)
+afrt           rays traced forward, their piercing point moved by a secant (Broyden) update
+mdfrt          minimum distance forward ray tracing: Newton's method on the ray's distance
 scattershot    grids of paths narrowed to the shortest optical length (Fermat)
 =============  ====================================================================================
 
@@ -15,10 +15,10 @@ patches of a raster, there may be none: through a crease that is a trough comes 
 Fermat, but not the normal of any facet. There `trace` narrows the grids of `scattershot` from the
 end of the method to the path of least optical length nearby.
 
-In kernels the object point is the local origin. A ray is named by its aim: the place where it
-would cross the level of the water above the point. It pierces the surface at A, is refracted there,
-and comes down to the height of the point at the offset (mx, my). Where there is no surface, and
-where it faces away from the camera, all is NaN. The ray is taken to cross the surface once.
+In kernels the object point is the local origin. A ray is named by its plan place (x, y) on the
+surface. It pierces the surface at A, is refracted there, and comes down to the height of the point
+at the offset (mx, my). Where there is no surface, and where it faces away from the camera, all is
+NaN. The ray is taken to cross the surface once.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ import numpy.typing as npt
 
 from pcfix.errors import SettingError
 from pcfix.kernels import Span, device, in_tiles, kernel
-from pcfix.lens.algebra import Vector, cross, dot, minus, normal_of, plus, row_of, scaled, vector
+from pcfix.lens.algebra import Vector, dot, minus, normal_of, plus, row_of, scaled, vector
 from pcfix.model import BoolArray, FloatArray, IntArray, WaterMesh, WaterPlane, WaterRaster
 from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
 from pcfix.refract.rays import plane_at, refracted
-from pcfix.water.surface import Field, Tin, build_field, build_tin, patch_at
+from pcfix.water.surface import Field, Tin, build_field, build_tin
 
 Surface: TypeAlias = WaterPlane | WaterRaster | WaterMesh
 
@@ -52,11 +52,19 @@ CLOSE_M = 1e-9
 SHORT = 0.1
 """In depths: a step that is taken although it seems to lead away, as it may from one patch of a
 broken surface to the next."""
-HALVINGS = 24
-"""Most halvings of a step."""
-HIGHEST_AIM = 0.95
-"""In heights of the camera over the point: rays are aimed below the camera even where a tilted
-water is higher above the point than the camera."""
+SEARCH_STEPS, HALVINGS = 60, 24
+"""Most steps of a search, and most halvings of a step."""
+DIFFERENCE_M = 1e-6
+"""Distance of the places for differences; with less, rounding exceeds what differences neglect."""
+HIGHEST_START = 0.95
+"""Of the straight line: the search starts below the camera even where a tilted water is higher
+above the point than the camera."""
+KNOTS = 10
+"""To each side of the middle of the first grid of `scattershot`."""
+SHOTS = 200
+BLUNT_M = 1e-7
+"""Half the grid below which the lengths of neighbouring paths are the same by rounding."""
+NEIGHBOUR_M = 1e-4
 CREASE_M = 1e-7
 """A path by which the ray misses the point by more goes through a crease."""
 NEAR = 0.25
@@ -219,21 +227,16 @@ def _path(out: FloatArray, water: Water, e: Vector, n: float, method: int, narro
         return
     if not e[2] > 0.0:
         return
-    # the height at which rays are aimed
-    aim = min(level, HIGHEST_AIM * e[2])
-    if method == _KOTOWSKI:
-        x, y, steps, found = kotowski(water, aim, e, n)
-    elif method == _AFRT:
-        x, y, steps, found = afrt(water, aim, e, n)
-    elif method == _MDFRT:
-        x, y, steps, found = mdfrt(water, aim, e, n)
+    start = min(level / e[2], HIGHEST_START)
+    if method == _SCATTERSHOT:
+        x, y, steps, found = _scattershot(water, e, start, level, n)
     else:
-        x, y, steps, found = scattershot(water, aim, e, n)
-    if not found and narrow and method != _SCATTERSHOT:
-        if np.isnan(height_of(water, x, y)[0]):
-            x, y = aim / e[2] * e[0], aim / e[2] * e[1]
-        x, y, more, found = _narrowed(water, e, x, y, NEAR * level, n)
-        steps += more
+        x, y, steps, found = _search(water, e, start, level, n, method)
+        if not found and narrow:
+            if np.isnan(height_of(water, x, y)[0]):
+                x, y = start * e[0], start * e[1]
+            x, y, more, found = _narrowed(water, e, x, y, NEAR * level, n)
+            steps += more
     out[_STEPS] = steps
     if not found:
         return
@@ -243,11 +246,8 @@ def _path(out: FloatArray, water: Water, e: Vector, n: float, method: int, narro
     mx, my = _offset(water, e, x, y, n)
     if mx * mx + my * my <= CREASE_M * CREASE_M:
         return
-    # on a crease Snell's law gives the normal: u - n v, with the unit vectors u to A and v from A
-    a = x, y, z
-    u = minus(a, e)
-    air, wet = 1.0 / np.sqrt(dot(u, u)), n / np.sqrt(dot(a, a))
-    gx, gy, gz = plus(scaled(air, u), scaled(wet, a))
+    # on a crease Snell's law gives the normal
+    gx, gy, gz = _snell_normal(e, (x, y, z), n)
     out[_SLOPE], out[_SLOPE + 1], out[_STATE] = -gx / gz, -gy / gz, _CREASE
 
 
@@ -288,38 +288,9 @@ def _height_of(
     return plane_at(tin, field, x, y, origin)
 
 
-PIERCING_STEPS = 64
-
-
-@device
-def _pierce(water: Water, e: Vector, d: Vector) -> tuple[float, float]:
-    """Return the plan place where the ray from e along d pierces the surface.
-
-    Newton's method on the tangent plane, inside a bracket. Unlike `pcfix.refract.rays.pierce` it
-    starts at e + d, as the point itself may lie beyond the edge of the water.
-    """
-    low, high, f = 0.0, np.inf, 1.0
-    for _ in range(PIERCING_STEPS):
-        x, y = e[0] + f * d[0], e[1] + f * d[1]
-        z, b, c = height_of(water, x, y)
-        # positive once the ray is below the water
-        gap = z - (e[2] + f * d[2])
-        if not abs(gap) > 0.1 * CLOSE_M:
-            break
-        if gap > 0.0:
-            high = f
-        else:
-            low = f
-        # Newton step on the tangent plane; out of the bracket, bisect or double
-        f += gap / (d[2] - b * d[0] - c * d[1])
-        if not low < f < high:
-            f = 2.0 * low if high == np.inf else 0.5 * (low + high)
-    return (x, y) if abs(gap) <= CLOSE_M else (np.nan, np.nan)
-
-
 @device
 def _refracted_at(water: Water, e: Vector, x: float, y: float, n: float) -> tuple[Vector, Vector]:
-    """Return piercing point and refracted ray of the ray through a plan place of the surface.
+    """Return the place of the surface at x, y, and the refracted ray from the camera through it.
 
     The ray, not of unit length and NaN where it does not go down, is that of Mulsow 2024 after
     Glassner 1989, which is eq 10 of Skarlatos & Agrafiotis 2018. The n_t that is printed with it,
@@ -344,228 +315,117 @@ def _offset(water: Water, e: Vector, x: float, y: float, n: float) -> tuple[floa
     return x - t[0] * a[2] / t[2], y - t[1] * a[2] / t[2]
 
 
-KOTOWSKI_STEPS = 40
+@device
+def _snell_normal(e: Vector, a: Vector, n: float) -> Vector:
+    """Return u - n v, with the unit vectors u from the camera to A and v from A to the point."""
+    u = minus(a, e)
+    return plus(scaled(1.0 / np.sqrt(dot(u, u)), u), scaled(n / np.sqrt(dot(a, a)), a))
 
 
 @device
-def kotowski(water: Water, level: float, e: Vector, n: float) -> Found:
-    """Return where light from the origin leaves the water towards e, (x, y, steps, found).
+def _residual(
+    water: Water, e: Vector, x: float, y: float, n: float, method: int
+) -> tuple[float, float]:
+    r"""Return the two numbers that vanish where light pierces the surface at the plan place x, y.
 
-    With the unit vectors u from the camera to A and v from A to the point, Snell's law says that
-    u - n v is normal to the surface, hence to its tangents (1, 0, b) and (0, 1, c):
+    kotowski: with the unit vectors u from the camera to A and v from A to the point, Snell's law
+    says that u - n v is normal to the surface, hence to its tangents (1, 0, b) and (0, 1, c):
 
         g = (u_x - n v_x + b (u_z - n v_z), u_y - n v_y + c (u_z - n v_z)) = 0
 
-    g is also the gradient of the optical length by the place of A (Fermat); z is that of the
-    surface. Mulsow 2024 does not tell how Kotowski iterates: here it is Newton's method from the
-    straight line. A step that makes g grow, or leaves the water, is halved until it is short.
-    """
-    f = level / e[2]
-    x, y = f * e[0], f * e[1]
-    gx, gy, hxx, hxy, hyy = _snell_at(water, e, x, y, n)
-    # beyond the edge of the water: start above the point
-    if np.isnan(gx):
-        x, y = 0.0, 0.0
-        gx, gy, hxx, hxy, hyy = _snell_at(water, e, x, y, n)
-    for step in range(1, KOTOWSKI_STEPS + 1):
-        # Newton step -H^-1 g
-        det = hxx * hyy - hxy * hxy
-        dx, dy = (hxy * gy - hyy * gx) / det, (hxy * gx - hxx * gy) / det
-        before, size, share = gx * gx + gy * gy, np.sqrt(dx * dx + dy * dy), 1.0
-        for _ in range(HALVINGS):
-            gx, gy, hxx, hxy, hyy = _snell_at(water, e, x + share * dx, y + share * dy, n)
-            if gx * gx + gy * gy < before or (share * size < SHORT * level and not np.isnan(gx)):
-                break
-            share *= 0.5
-        if np.isnan(gx):
-            return x, y, step, False
-        x, y = x + share * dx, y + share * dy
-        if size <= CLOSE_M:
-            return x, y, step, True
-    return x, y, KOTOWSKI_STEPS, False
+    g is also the gradient of the optical length by the place of A (Fermat).
 
+    afrt: the offset of the refracted ray t at the height of the object point P.
 
-@device
-def _snell_at(
-    water: Water, e: Vector, x: float, y: float, n: float
-) -> tuple[float, float, float, float, float]:
-    r"""Return g at a plan place, and its derivatives by x and y: xx, xy and yy.
-
-    The unit vectors turn with A by (I - u u') / \|A - C\| and -(I - v v') / \|A\|. A raster has the
-    second derivative z_xy only; planes and facets have none.
-    """
-    z, b, c = height_of(water, x, y)
-    twist = _twist_at(water.field, water.origin[0] + x, water.origin[1] + y)
-    ux, uy, uz = minus((x, y, z), e)
-    air, wet = 1.0 / np.sqrt(ux * ux + uy * uy + uz * uz), 1.0 / np.sqrt(x * x + y * y + z * z)
-    ux, uy, uz, vx, vy, vz = air * ux, air * uy, air * uz, -wet * x, -wet * y, -wet * z
-    along_ux, along_uy = ux + b * uz, uy + c * uz
-    along_vx, along_vy = vx + b * vz, vy + c * vz
-    up = uz - n * vz
-    # second derivatives of the optical length on the tangent plane
-    both = air + n * wet
-    return (
-        along_ux - n * along_vx,
-        along_uy - n * along_vy,
-        both * (1.0 + b * b) - air * along_ux * along_ux - n * wet * along_vx * along_vx,
-        both * b * c - air * along_ux * along_uy - n * wet * along_vx * along_vy + up * twist,
-        both * (1.0 + c * c) - air * along_uy * along_uy - n * wet * along_vy * along_vy,
-    )
-
-
-@device
-def _twist_at(field: Field | None, x: float, y: float) -> float:
-    """Return the second derivative z_xy of a raster's patch at a place (world frame), 1 / m."""
-    if field is not None:
-        twist = patch_at(field, x, y)[5]
-        return -twist / (field.frame[field.which, 2] * field.frame[field.which, 3])
-    return 0.0
-
-
-AFRT_STEPS = 60
-
-
-@device
-def afrt(water: Water, level: float, e: Vector, n: float) -> Found:
-    """Return where light from the origin leaves the water towards e, (x, y, steps, found).
-
-    Mulsow 2024 gives only the name. As implemented, the straight ray to an apparent point P, at
-    the height of the object point, is traced forward; P is moved by its offset the other way, and
-    so on. From the second step on the good Broyden update of the inverse B,
-    B + t (s'B) / (s'(s - t)), s = -B m the last step and t = -B m of the new offset, speeds it up.
-    A step is at most the depth or, where that is more, what the straight line goes sideways in the
-    water. One ray per step, and no derivative of the surface.
-    """
-    f = level / e[2]
-    px, py, sx, sy = 0.0, 0.0, 0.0, 0.0
-    bxx, bxy, byx, byy = 1.0, 0.0, 0.0, 1.0
-    x, y = f * e[0], f * e[1]
-    longest = max(level, np.sqrt(x * x + y * y))
-    for step in range(1, AFRT_STEPS + 1):
-        # trace the ray aimed at P
-        aim = px + f * (e[0] - px), py + f * (e[1] - py), level
-        ax, ay = _pierce(water, e, minus(aim, e))
-        mx, my = _offset(water, e, ax, ay, n)
-        if np.isnan(mx):
-            return x, y, step, False
-        x, y = ax, ay
-        if mx * mx + my * my <= CLOSE_M * CLOSE_M:
-            return x, y, step, True
-        tx, ty = -bxx * mx - bxy * my, -byx * mx - byy * my
-        if step > 1:
-            share = 1.0 / (sx * (sx - tx) + sy * (sy - ty))
-            along_x, along_y = sx * bxx + sy * byx, sx * bxy + sy * byy
-            bxx, bxy = bxx + share * tx * along_x, bxy + share * tx * along_y
-            byx, byy = byx + share * ty * along_x, byy + share * ty * along_y
-            tx, ty = -bxx * mx - bxy * my, -byx * mx - byy * my
-        size = np.sqrt(tx * tx + ty * ty)
-        if not size < np.inf:
-            return x, y, step, False
-        # limit the step
-        if size > longest:
-            tx, ty = tx * longest / size, ty * longest / size
-        px, py, sx, sy = px + tx, py + ty, tx, ty
-    return x, y, AFRT_STEPS, False
-
-
-MDFRT_STEPS = 30
-NARROW_M = 1e-6
-"""Least distance of the aims: below it, rounding exceeds what differences neglect."""
-
-
-@device
-def _distance(
-    water: Water, level: float, e: Vector, x: float, y: float, n: float
-) -> tuple[float, float, Vector, Vector]:
-    """Return piercing place (x, y), distance d and direction t of the ray aimed at x, y.
-
-    d leads from the refracted ray at right angles to the object point P:
+    mdfrt: x and y of the perpendicular from the refracted ray to P,
 
         d = P - A - (t.(P - A) / t.t) t
 
     Mulsow 2024 prints P_0 for the first P, and the last term with A - P but the same sign.
     """
-    ax, ay = _pierce(water, e, minus((x, y, level), e))
-    a, t = _refracted_at(water, e, ax, ay, n)
-    return ax, ay, minus(scaled(dot(t, a) / dot(t, t), t), a), t
+    if method == _KOTOWSKI:
+        z, b, c = height_of(water, x, y)
+        g = _snell_normal(e, (x, y, z), n)
+        return g[0] + b * g[2], g[1] + c * g[2]
+    if method == _AFRT:
+        return _offset(water, e, x, y, n)
+    a, t = _refracted_at(water, e, x, y, n)
+    d = minus(scaled(dot(t, a) / dot(t, t), t), a)
+    return d[0], d[1]
 
 
 @device
-def mdfrt(water: Water, level: float, e: Vector, n: float) -> Found:
-    """Return where light from the origin leaves the water towards e, (x, y, steps, found).
+def _search(water: Water, e: Vector, start: float, level: float, n: float, method: int) -> Found:
+    """Find where the residual of a method vanishes, from the straight line on.
 
-    Minimum distance forward ray tracing of Mulsow 2024: the aim, that of the straight line at
-    first, is changed until the distance d of the refracted ray from the object point is 0. He does
-    not tell how: here it is Newton's method on the two components of d across the ray, with
-    differences of two neighbouring aims, three rays per step. A step that makes d grow, or leaves
-    the water, is halved until it is short.
+    `start` is the share of the straight line at which it pierces the water, whose height over the
+    point is `level`. Mulsow 2024 does not say how the residual is brought to zero. Here it is
+    Newton's method with differences of neighbouring places, two more rays per step. afrt
+    does without: the good Broyden update
+
+        B + (s - B y) s'B / (s' B y)
+
+    improves the inverse B of the derivative after a step s that changes the residual by y, from
+    that of water without refraction on. A step that makes the residual grow, or leaves the water,
+    is halved until it is short.
     """
-    f = level / e[2]
-    x, y = f * e[0], f * e[1]
-    ax, ay, d, t = _distance(water, level, e, x, y, n)
-    if np.isnan(d[0]):
+    x, y = start * e[0], start * e[1]
+    rx, ry = _residual(water, e, x, y, n, method)
+    # beyond the edge of the water: start above the point
+    if np.isnan(rx):
         x, y = 0.0, 0.0
-        ax, ay, d, t = _distance(water, level, e, x, y, n)
-    for step in range(1, MDFRT_STEPS + 1):
-        before = dot(d, d)
-        if not before > CLOSE_M * CLOSE_M:
-            return ax, ay, step, not np.isnan(before)
-        # distance of the two neighbouring aims
-        apart = min(max(0.01 * np.sqrt(before), NARROW_M), 0.05 * level)
-        by_x = minus(_distance(water, level, e, x + apart, y, n)[2], d)
-        by_y = minus(_distance(water, level, e, x, y + apart, n)[2], d)
-        # solve for the aim across the ray (Cramer)
-        det = dot(t, cross(by_x, by_y)) / apart
-        dx, dy = dot(t, cross(by_y, d)) / det, dot(t, cross(d, by_x)) / det
-        size, share = np.sqrt(dx * dx + dy * dy), 1.0
-        if not size < np.inf:
-            return ax, ay, step, False
+        rx, ry = _residual(water, e, x, y, n, method)
+    bxx, bxy, byx, byy = 1.0 - start, 0.0, 0.0, 1.0 - start
+    aside = min(DIFFERENCE_M, 0.05 * level)
+    for step in range(1, SEARCH_STEPS + 1):
+        if method != _AFRT:
+            east_x, east_y = _residual(water, e, x + aside, y, n, method)
+            north_x, north_y = _residual(water, e, x, y + aside, n, method)
+            jxx, jyx, jxy, jyy = east_x - rx, east_y - ry, north_x - rx, north_y - ry
+            share = aside / (jxx * jyy - jxy * jyx)
+            bxx, bxy, byx, byy = share * jyy, -share * jxy, -share * jyx, share * jxx
+        dx, dy = -bxx * rx - bxy * ry, -byx * rx - byy * ry
+        before, size, share = rx * rx + ry * ry, np.sqrt(dx * dx + dy * dy), 1.0
         for _ in range(HALVINGS):
-            there = _distance(water, level, e, x + share * dx, y + share * dy, n)
-            after = dot(there[2], there[2])
-            if after < before or (share * size < SHORT * level and not np.isnan(after)):
+            new_x, new_y = _residual(water, e, x + share * dx, y + share * dy, n, method)
+            is_nearer = new_x * new_x + new_y * new_y < before
+            if is_nearer or (share * size < SHORT * level and not np.isnan(new_x)):
                 break
             share *= 0.5
-        if np.isnan(after):
-            return ax, ay, step, False
-        x, y = x + share * dx, y + share * dy
-        ax, ay, d, t = there
-    return ax, ay, MDFRT_STEPS, dot(d, d) <= CLOSE_M * CLOSE_M
-
-
-KNOTS = 21
-"""Of the first shot, each way."""
-SHOTS = 200
-BLUNT_M = 1e-7
-"""Half the grid at which lengths no longer tell the rays apart."""
-NEIGHBOUR_M = 1e-4
+        if np.isnan(new_x):
+            return x, y, step, False
+        dx, dy = share * dx, share * dy
+        x, y = x + dx, y + dy
+        if size <= CLOSE_M:
+            mx, my = _offset(water, e, x, y, n)
+            return x, y, step, bool(mx * mx + my * my <= CREASE_M * CREASE_M)
+        # Broyden's update; Newton's method replaces it
+        along_x, along_y = dx * bxx + dy * byx, dx * bxy + dy * byy
+        change_x, change_y = new_x - rx, new_y - ry
+        share = 1.0 / (along_x * change_x + along_y * change_y)
+        tx = share * (dx - bxx * change_x - bxy * change_y)
+        ty = share * (dy - byx * change_x - byy * change_y)
+        bxx, bxy = bxx + tx * along_x, bxy + tx * along_y
+        byx, byy = byx + ty * along_x, byy + ty * along_y
+        rx, ry = new_x, new_y
+    return x, y, SEARCH_STEPS, False
 
 
 @device
-def scattershot(water: Water, level: float, e: Vector, n: float) -> Found:
-    """Return where light from the origin leaves the water towards e, (x, y, shots, found).
+def _scattershot(water: Water, e: Vector, start: float, level: float, n: float) -> Found:
+    """Narrow a grid of places on the surface about that of the least optical length (Fermat).
 
-    Mulsow 2024 gives only the name ("brute force"). As implemented, a grid of places on the surface
-    is narrowed about that of the least optical length (Fermat): no start value, no derivative, no
+    Mulsow 2024 gives only the name ("brute force"). There is no start value, no derivative, no
     law of refraction. Where a broken surface sends light along several paths the shortest is taken,
-    and a path may leave through a crease. A length changes with the square of the distance and is
-    too blunt in the end; there the offsets of refracted rays are compared.
+    and a path may leave through a crease.
 
     On calm water the place is between the point and the straight line; the first grid covers these
     and as much as the point is deep all around.
     """
-    f = level / e[2]
-    middle_x, middle_y = 0.5 * f * e[0], 0.5 * f * e[1]
-    half = level + max(abs(middle_x), abs(middle_y))
-    best, x, y = np.inf, middle_x, middle_y
-    apart = 2.0 * half / (KNOTS - 1)
-    for i in range(KNOTS):
-        for j in range(KNOTS):
-            knot_x, knot_y = middle_x - half + i * apart, middle_y - half + j * apart
-            length = _badness(water, e, knot_x, knot_y, n, False)
-            if length < best:
-                best, x, y = length, knot_x, knot_y
-    x, y, shots, found = _narrowed(water, e, x, y, 2.0 * apart, n)
+    x, y = 0.5 * start * e[0], 0.5 * start * e[1]
+    half = level + max(abs(x), abs(y))
+    _, x, y, _ = _best_knot(water, e, x, y, half, KNOTS, n, False)
+    x, y, shots, found = _narrowed(water, e, x, y, 2.0 * half / KNOTS, n)
     return x, y, shots + 1, found
 
 
@@ -573,7 +433,9 @@ def scattershot(water: Water, level: float, e: Vector, n: float) -> Found:
 def _narrowed(water: Water, e: Vector, x: float, y: float, half: float, n: float) -> Found:
     """Return the nearest place of least optical length, from a place and half a grid's size on.
 
-    Found is a path that hits the point, or one through a crease, known to about 1e-6 m along it.
+    Found is a path that hits the point, or one through a crease, known to about 1e-6 m along it. A
+    length changes with the square of the distance and is too blunt in the end; there the offsets of
+    refracted rays are compared.
     """
     x, y, first, _ = _shrink(water, e, x, y, half, BLUNT_M, n, False)
     px, py, second, offset = _shrink(water, e, x, y, NEIGHBOUR_M, 0.1 * CLOSE_M, n, True)
@@ -597,20 +459,33 @@ def _shrink(
 
     While the best knot is on the rim the grid moves and keeps its size.
     """
-    best, shots = _badness(water, e, x, y, n, by_offset), 0
+    best, shots = np.inf, 0
     while shots < SHOTS and half > end and not (by_offset and best <= CLOSE_M):
         shots += 1
-        best_i, best_j = 0, 0
-        for i in range(-2, 3):
-            for j in range(-2, 3):
-                bad = _badness(water, e, x + 0.5 * half * i, y + 0.5 * half * j, n, by_offset)
-                if bad < best:
-                    best, best_i, best_j = bad, i, j
-        x, y = x + 0.5 * half * best_i, y + 0.5 * half * best_j
-        # the best knot is inside: halve the grid
-        if max(abs(best_i), abs(best_j)) < 2:
+        best, x, y, on_rim = _best_knot(water, e, x, y, half, 2, n, by_offset)
+        if not on_rim:
             half *= 0.5
     return x, y, shots, best
+
+
+@device
+def _best_knot(
+    water: Water, e: Vector, x: float, y: float, half: float, knots: int, n: float,
+    by_offset: bool,
+) -> tuple[float, float, float, bool]:  # fmt: skip
+    """Return the least badness on a grid about x, y, its place, and whether that is on the rim.
+
+    The grid has `knots` knots to each side of its middle, within `half`.
+    """
+    best, best_i, best_j = _badness(water, e, x, y, n, by_offset), 0, 0
+    spacing = half / knots
+    for i in range(-knots, knots + 1):
+        for j in range(-knots, knots + 1):
+            bad = _badness(water, e, x + i * spacing, y + j * spacing, n, by_offset)
+            if bad < best:
+                best, best_i, best_j = bad, i, j
+    on_rim = max(abs(best_i), abs(best_j)) == knots
+    return best, x + best_i * spacing, y + best_j * spacing, on_rim
 
 
 @device

@@ -9,7 +9,7 @@ from pcfix.refract.occlusion import OccluderBuilder, wants_occlusion
 from tests.utils.clouds import occluder_of
 
 UTM = np.array([512_345.678, 4_987_654.321, 0.0])
-NAMES = ("height", "margin", "block_top", "large_block_top")
+NAMES = ("height", "margin", "block_top")
 
 
 def hills(n=50_000, seed=1):

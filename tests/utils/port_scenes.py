@@ -96,7 +96,7 @@ def simulate_port(
     reach = spacing_m * np.array([columns, rows]) / 2.0
     plan = rng.uniform(-reach, reach, (points, 2))
     truth = np.column_stack([plan, rng.normal(-range_m, relief_m, points)]) + _ORIGIN
-    image, seen = _images(truth, cameras, port, refractive_index)
+    image, seen = images_of(truth, cameras, port, refractive_index)
     several = seen.sum(axis=1) >= 2
     truth, image, seen = truth[several], image[several], seen[several]
     point, camera = np.nonzero(seen)
@@ -133,7 +133,7 @@ def _rig(
     )
 
 
-def _images(
+def images_of(
     truth: FloatArray, cameras: Cameras, port: Port, n: float
 ) -> tuple[FloatArray, np.ndarray]:
     """Return where each camera images each point, shape (n, k, 2), and whether in its frame."""
