@@ -97,7 +97,7 @@ def _view_report(plan: Plan, tally: CloudTally) -> ViewReport | None:
 
 def _out_of_sight(plan: Plan, figures: Tally, flat: int) -> str:
     """Return the sentence for a cloud of which no camera sees a submerged point."""
-    limit = plan.survey.settings.limit_deg
+    limit = plan.survey.limit_deg
     if flat:
         return (
             f"no submerged point has two rays within {limit or 90.0:g} deg of the surface"

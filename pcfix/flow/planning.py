@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, replace
 from functools import partial
 from itertools import compress
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -184,9 +184,13 @@ def plan_correction(plan: Plan) -> Plan:
         survey = replace(plan.survey, learned=plan.survey.learned._replace(regression=line))
         plan = replace(plan, survey=survey, notes=tuple(coded("regression.fit", notes)))
     plan = _estimated_from_cloud(plan, chunks)
-    if plan.options.depth_factor == "auto":
-        found = {"depth_factor": plan.survey.settings.depth_factor}
-        plan = replace(plan, settings={**plan.settings, **found})
+    options, survey = plan.options, plan.survey
+    found = dict[str, Any]()
+    if options.depth_factor == "auto":
+        found["depth_factor"] = survey.settings.depth_factor
+    if options.max_angle == "auto":
+        found["max_angle"] = survey.limit_deg
+    plan = replace(plan, settings={**plan.settings, **found})
     if plan.members is not None:
         from pcfix.flow.pose_errors import SAMPLE_POINTS, pose_errors, sample_of, with_poses
 

@@ -45,7 +45,7 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
     """Dense matcher of --camera-set mvs: fused depth maps (OpenMVS, COLMAP), or the median of
     stereo pairs (MicMac, SURE)."""
     max_angle: float | str | None = option(
-        None,
+        "auto",
         with_cameras=True,
         basic=True,
         above=0,
@@ -53,8 +53,9 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
         parse=number_or("auto", "none"),
         metavar="DEG",
     )
-    """Maximum incidence angle of a ray, from the surface normal. [deg] [default: none; 80 without
-    lenses]"""
+    """Maximum incidence angle of a ray, from the surface normal; none for no limit. auto: none, but
+    35 for methods that weigh all rays alike if the cloud shows clearly that flatter rays did not
+    make it. [deg] [default: auto; 80 without lenses]"""
     max_cameras: int | None = option(None, with_cameras=True, least=1)
     """Maximum number of rays per point; those closest to nadir are used. [default: no limit]"""
     occlusion: Literal["auto", "on", "off"] = option("auto", with_cameras=True)
@@ -108,7 +109,7 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
 
     @property
     def limit_deg(self) -> float | None:
-        """The maximum incidence angle; None for no limit."""
+        """The maximum incidence angle; None for no limit, or if it is not known yet."""
         return None if self.max_angle in (None, "auto") else float(self.max_angle)
 
     @property

@@ -34,7 +34,10 @@ PARALLEL, CORRECTED = int(Outcome.PARALLEL_RAYS), int(Outcome.CORRECTED)
 """Of `Outcome`, for kernels."""
 
 FLAT_DEG = 35.0
-"""Incidence angle beyond which methods differ most."""
+"""Incidence angle beyond which methods differ most; see `reconstructions.LIMITS`."""
+
+ALIKE = ("snell", "shan", "butler", "murase", "dietrich")
+"""Methods that weigh all rays of a point alike."""
 
 UNLISTED, MAIN = -1, -2
 """Points in no view list, and points of all other sources; see `Survey.parts`."""
@@ -50,6 +53,7 @@ class Learned(NamedTuple):
     model_uncertainty: ModelUncertainty | None = None
     land: Survey | None = None  # for land transferred to adjusted cameras, if it differs
     poses: PoseErrors | None = None  # errors of Z from the adjusted poses
+    limit_deg: float | None = None  # largest incidence angle of the rays that made the points
 
 
 class ModelUncertainty(NamedTuple):
@@ -83,6 +87,12 @@ class Survey:
     learned: Learned = field(default_factory=Learned)
     parts: Mapping[int, Survey] = field(default_factory=dict)
     own_water: OwnWater | None = None
+
+    @property
+    def limit_deg(self) -> float | None:
+        """The largest incidence angle of a ray, as set or as learned; None for no limit."""
+        learned = self.learned.limit_deg if self.settings.method in ALIKE else None
+        return learned if self.settings.limit_deg is None else self.settings.limit_deg
 
     @property
     def offset_m(self) -> FloatArray:

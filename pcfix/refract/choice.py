@@ -60,7 +60,7 @@ def rig_of(survey: Survey) -> Rig:
 def rule_of(survey: Survey) -> Rule:
     """Return the rule for kernels."""
     settings = survey.settings
-    limit = settings.limit_deg
+    limit = survey.limit_deg
     if limit is None and survey.cameras.lenses is None:
         limit = MAX_ANGLE_WITHOUT_FRAMES_DEG
     least = 0.0 if limit is None else float(np.cos(np.radians(limit)) ** 2)

@@ -10,12 +10,13 @@ import numpy as np
 from pcfix.errors import SettingError
 from pcfix.model import Cameras, TiePoints, ViewKind
 from pcfix.options.correct import ScienceOptions
-from pcfix.refract.batch import Batch, Survey, require_orientation
+from pcfix.refract.batch import ALIKE, FLAT_DEG, Batch, Survey, require_orientation
 from pcfix.refract.methods import batches, on_land, with_rays
 from pcfix.refract.patches import FEWEST_WITHOUT_LIST, gsd_m
 from pcfix.refract.reconstructions import (
     BARE,
     IN_FRAME,
+    LIMITS,
     Hint,
     Reconstruction,
     Verdict,
@@ -69,7 +70,8 @@ def resolved(
 
 def wants_sample(survey: Survey, views: ViewKind | None) -> bool:
     """Return whether a sample of the whole cloud is needed."""
-    return wants_matcher(survey, views) or survey.settings.depth_factor == "auto"
+    known = survey.settings.depth_factor != "auto"
+    return wants_matcher(survey, views) or _wants_limit(survey.settings, views) or not known
 
 
 def with_factor(batch: Batch) -> tuple[Batch, StereoFactor | None]:
@@ -86,6 +88,11 @@ def with_factor(batch: Batch) -> tuple[Batch, StereoFactor | None]:
         found = stereo_factor(survey.cameras, float(np.median(known)), n)
     settings = replace(survey.settings, depth_factor=None if found is None else found.factor)
     return replace(batch, survey=replace(survey, settings=settings)), found
+
+
+def _wants_limit(settings: ScienceOptions, views: ViewKind | None) -> bool:
+    """Whether the largest incidence angle is to be estimated from the cloud."""
+    return views is None and settings.max_angle == "auto" and settings.method in ALIKE
 
 
 def _wants_comparison(survey: Survey) -> bool:
@@ -204,18 +211,24 @@ def _learn_of_sources(
 
 def _weighed(sample: Batch, step: float, hint: Hint | None) -> tuple[Survey, tuple[Verdict, ...]]:
     """Resolve ``auto`` and set the model uncertainty, for submerged points without lists."""
-    survey, verdict = sample.survey, None
+    survey, verdicts = sample.survey, list[Verdict | None]()
     if survey.settings.method == "auto":
         reconstructions = reconstructions_of(sample)
-        verdict = weigh(sample, reconstructions, step, hint=hint)
-        survey = with_verdict(survey, verdict, reconstructions[0])
+        verdicts.append(weigh(sample, reconstructions, step, hint=hint))
+        survey = with_verdict(survey, verdicts[0], reconstructions[0])
         if len(reconstructions) > 1:
-            return survey, () if verdict is None else (verdict,)
+            return survey, tuple(filter(None, verdicts))
+    if _wants_limit(survey.settings, None):
+        # which rays made the points does not depend on the formula
+        limit = weigh(replace(sample, survey=survey), LIMITS, step)
+        if limit is not None and limit.chosen == LIMITS[1] and limit.is_strong:
+            survey = replace(survey, learned=survey.learned._replace(limit_deg=FLAT_DEG))
+            verdicts.append(limit)
     if _wants_comparison(survey):
-        given = type_given(replace(sample, survey=survey))
-        verdict = weigh(sample, IN_FRAME, step, given=given)
-        survey = with_verdict(survey, verdict)
-    return survey, () if verdict is None else (verdict,)
+        sample = replace(sample, survey=survey)
+        verdicts.append(weigh(sample, IN_FRAME, step, given=type_given(sample)))
+        survey = with_verdict(survey, verdicts[-1])
+    return survey, tuple(filter(None, verdicts))
 
 
 def with_verdict(

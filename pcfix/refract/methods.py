@@ -44,20 +44,29 @@ _IN_FRAME = (METHODS["snell"], METHODS["consistent"])
 def correct(batch: Batch) -> Intersection:
     """Correct submerged points by the method that the settings name; one row per point."""
     parts = batch.parts()
-    found = [_named_by_limit(_corrected(part), part) for _, part in parts]
+    found = [_without_limit(_corrected(part), part) for _, part in parts]
     if len(found) == 1:
         return found[0]
     return joined(found, np.concatenate([rows for rows, _ in parts]), len(batch.survey.cameras))
 
 
-def _named_by_limit(found: Intersection, batch: Batch) -> Intersection:
-    """Give points that lack rays only because of the largest angle an outcome of their own."""
+def _without_limit(found: Intersection, batch: Batch) -> Intersection:
+    """Treat points that lack rays only because of the largest angle.
+
+    If that was set, they have an outcome of their own; if it was learned from the cloud, they are
+    corrected with all rays.
+    """
     survey = batch.survey
     few = np.flatnonzero(np.isin(found.outcome, (Outcome.NO_CAMERA, Outcome.ONE_CAMERA)))
-    if survey.settings.limit_deg is None or not len(few):
+    if survey.limit_deg is None or not len(few):
         return found
-    free = replace(survey, settings=replace(survey.settings, max_angle=None))
+    settings = replace(survey.settings, max_angle=None)
+    free = replace(survey, settings=settings, learned=survey.learned._replace(limit_deg=None))
     part = replace(batch.take(few), survey=free)
+    if survey.settings.limit_deg is None:
+        rest = np.setdiff1d(np.arange(len(batch)), few)
+        both = [found.take(rest), _corrected(part)]
+        return joined(both, np.concatenate([rest, few]), len(survey.cameras))
     if part.views is not None and part.views.kind == "pairs":
         part = replace(part, views=cameras_of_pairs(part.views))
     flat = few[with_rays(part).counts >= 2]

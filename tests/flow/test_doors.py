@@ -154,3 +154,24 @@ def test_river(tmp_path):
     ratio = (np.asarray(source.w_surf) - cloud.z)[deep] / reference["h_a"][deep]
     # the intersection of rays up to 35 degrees deepens more than the mean of depths over them
     assert np.median(ratio) == pytest.approx(1.3873, rel=0.05)
+
+
+@river
+@pytest.mark.filterwarnings("ignore::pcfix.PcfixWarning")
+def test_limit_of_snell(tmp_path):
+    """Seven obliques see the river at up to 74 degrees, and cannot have made the cloud."""
+    found = {}
+    for limit in ("auto", "none"):
+        summary = pcfix.correct_file(
+            RIVER / "points.las", tmp_path / f"{limit}.laz", cameras=RIVER / "cameras.csv",
+            sensor=RIVER / "sensor.csv", water="dim:w_surf", method="snell",
+            max_angle=None if limit == "none" else limit,
+        )  # fmt: skip
+        cloud = laspy.read(tmp_path / f"{limit}.laz")
+        depth, moved = np.asarray(cloud.WaterDepth), -np.asarray(cloud.ShiftZ)
+        found[limit] = np.median((depth / (depth - moved))[depth > 0.3])
+        # no point is withheld that has rays without a limit
+        assert sum(summary.uncorrected.values()) == 0
+        assert summary.settings["max_angle"] == (35.0 if limit == "auto" else None)
+    # of water it is 1.34 straight below the camera; all rays make it absurd
+    assert 1.37 < found["auto"] < 1.47 and found["none"] > 2.0

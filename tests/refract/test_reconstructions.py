@@ -46,7 +46,21 @@ def test_simulated_cloud(name):
     assert settings.method == "consistent"
     assert verdict.share < verdict.runner_up_share
     assert verdict.is_sure or name == "pairs"
+    assert (verdict.confidence > 0.99) == verdict.is_sure
+    assert {one.words for one in IN_FRAME} == {verdict.chosen.words, *dict(verdict.candidates)}
     assert verdict.runner_up.words in str(verdict)
+
+
+def test_no_limit_of_snell():
+    """On tracks with obliques a limit would make snell twice as bad."""
+    scene = simulated(12_000, seed=1, lidar_per_m2=0.0, obliques_deg=35.0)
+    points, given = scene.apparent_xyz, (scene.cameras, scene.water)
+    found, free = (
+        pcfix.correct_points(points, *given, method="snell", max_angle=limit)
+        for limit in ("auto", None)
+    )
+    np.testing.assert_array_equal(found.xyz, free.xyz)
+    assert found.incidence_deg.max() > 60.0
 
 
 def test_auto():
