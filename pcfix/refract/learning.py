@@ -220,10 +220,16 @@ def _weighed(sample: Batch, step: float, hint: Hint | None) -> tuple[Survey, tup
             return survey, tuple(filter(None, verdicts))
     if _wants_limit(survey.settings, None):
         # which rays made the points does not depend on the formula
-        limit = weigh(replace(sample, survey=survey), LIMITS, step)
+        sample = replace(sample, survey=survey)
+        limit = weigh(sample, LIMITS, step)
         if limit is not None and limit.chosen == LIMITS[1] and limit.is_strong:
             survey = replace(survey, learned=survey.learned._replace(limit_deg=FLAT_DEG))
             verdicts.append(limit)
+        elif not _wants_comparison(survey):  # without angles the rays are all the doubt there is
+            doubt = weigh(sample, LIMITS, step, given=LIMITS[0])
+            if doubt is not None:
+                learned = survey.learned._replace(model_uncertainty=doubt.model_uncertainty)
+                survey = replace(survey, learned=learned)
     if _wants_comparison(survey):
         sample = replace(sample, survey=survey)
         verdicts.append(weigh(sample, IN_FRAME, step, given=type_given(sample)))

@@ -28,18 +28,23 @@ slope, N + tau         -y (1 - r H / kappa) tau + (gamma + m r / kappa) (d.tau) 
                        gamma = y r^3 H / kappa^3 - h / H^2 (about the place above P)
 =====================  ========================================================================
 
-Q is where the residuals at P are least in the images, sum J' (x(Q) - pi(P)) = 0, as `consistent`
-has it. A Q that is off its ray, by T Q = Q - (N.Q) (N + (r / kappa) d) at its own depth, is seen
-where P would be after a move of D^-1 T Q. With W = J'J and S = W D^-1, D^-1 across as in the table,
+What a delta of each ray does to Q depends on what Q is the least of.
+
+*In space* (`snell` and most others) that is the squared distances from the refracted rays, eq 11 of
+Skarlatos & Agrafiotis 2018. With M = I - t t'
+
+    dQ = (sum M)^-1 sum M delta,    M d = E = (kappa^2 d - r kappa rho^2 N) / L^2.
+
+*In images* (`consistent`) the residuals are those at P: sum J' (x(Q) - pi(P)) = 0. A Q that is off
+its ray, by T Q = Q - (N.Q) (N + (r / kappa) d) at its own depth, is seen where P would be after a
+move of D^-1 T Q. With W = J'J and S = W D^-1, D^-1 across as in the table,
 
     dQ = (sum S T)^-1 sum S delta,    S d = -H W N / (1 - m + beta rho^2)
 
-as W e = 0. Q depends on P only through pi(P): dQ / dP = (sum S T)^-1 sum W, and K cancels out.
+as W e = 0. Q depends on P only through pi(P): dQ / dP = (sum S T)^-1 sum W, and K cancels out. Up
+to 45 degrees the two differ by less than 2 %; of rays at 73 degrees the first is twice as large.
 
-`snell` weights the rays in space, and formulas move points along the vertical only: theirs are the
-same to 2 % on blocks with obliques, and to 0.3 % on nadir blocks. Where `consistent` inverts a
-dense matcher, it is the covariance of one adjustment of all its images. Neglected is the turn of J
-times the residual, which is of second order.
+Neglected is the turn of M, and of J, times the residual, which is of second order.
 """
 
 from __future__ import annotations
@@ -68,11 +73,12 @@ from pcfix.options.correct import LEVEL_M
 from pcfix.refract import tiling
 from pcfix.refract.batch import Batch, Chosen, Intersection, Survey
 from pcfix.refract.choice import Rig, rig_of
+from pcfix.refract.rays import refracted
 from pcfix.refract.tiling import TILE, inverse_of, nine, product_of, put, slots, three
 from pcfix.water.surface import Field, height_at
 
 MIN_DETERMINANT = 1e-6
-"""As of `pcfix.refract.rays.nearest_point`, of half the trace cubed (there the trace is 2 k)."""
+"""As of `pcfix.refract.rays.nearest_point`, of half the trace cubed: k^3 for k rays in space."""
 
 MODEL_GSD = 0.8
 """Standard error of the model of depth maps, common to a block: the bias of blocks with known truth
@@ -82,7 +88,10 @@ _XZ, _YZ, _ZZ = 2, 4, 5
 
 
 class Budget(NamedTuple):
-    """Standard deviations, angles in radians; the place about which the water tilts."""
+    """Standard deviations, angles in radians; the place about which the water tilts.
+
+    `in_images` says which residuals the correction makes least.
+    """
 
     image_px: float
     refractive_index: float
@@ -92,6 +101,7 @@ class Budget(NamedTuple):
     attitude: float
     pivot_x: float
     pivot_y: float
+    in_images: bool
 
 
 def covariances(batch: Batch, shift_m: FloatArray) -> FloatArray:
@@ -100,6 +110,10 @@ def covariances(batch: Batch, shift_m: FloatArray) -> FloatArray:
     Zeros if fewer than two rays meet, or nearly parallel ones. `shift_m`, shape (m, 3), is true
     minus apparent, by any method. A mesh or raster is taken as its plane above the point. A tilt
     turns the water about the middle of the projection centres.
+
+    It is an approximation for methods that move points along the vertical only (they get that of
+    `snell`), and where `consistent` inverts a dense matcher, which gets that of one adjustment of
+    all its images.
     """
     survey, result = batch.survey, np.zeros((len(batch), 6))
     if not len(survey.cameras):
@@ -197,13 +211,16 @@ def budget_of(survey: Survey) -> Budget:
         attitude=math.radians(settings.sigma_attitude),
         pivot_x=x,
         pivot_y=y,
+        in_images=settings.method == "consistent",
     )
 
 
 # Runs of `TILE` numbers for the points of a tile: how far above the true point P is, along N; the
-# number of rays; S delta by level (3) and n (3); W (6); S T (9); S delta by the slope tau, to be
-# multiplied by it (9); noise (6).
-_ABOVE, RAYS, BY_LEVEL, BY_N, SIGHT, BY_Q, BY_TILT, NOISE, ROOM = slots(1, 1, 3, 3, 6, 9, 9, 6)
+# number of rays; what level (3) and n (3) add to M delta or S delta; W (6); M or S T (9); M D (9);
+# what slopes add, to be multiplied by tau (9); noise (6).
+_ABOVE, RAYS, BY_LEVEL, BY_N, SIGHT, BY_Q, BY_P, BY_TILT, NOISE, ROOM = slots(
+    1, 1, 3, 3, 6, 9, 9, 9, 6
+)
 
 Seen: TypeAlias = tuple[float, Vector, Vector, float, float, float, float, float]
 
@@ -311,9 +328,40 @@ def _add_nine(sums: FloatArray, at: int, c: float, m: Symmetric, g: Vector, q: V
     sums[at + 8 * TILE] += c * m[5] + g[2] * q[2]
 
 
+@device(forceinline=True)
+def _in_space(
+    one: float, e: Vector, normal: Vector, height: float, length2: float, bend: float, kappa: float
+) -> tuple[Symmetric, Vector]:
+    """Return M and E."""
+    d, per = refracted(e, length2, normal, height, bend), one / length2
+    # M = I - t t', with d of the length L; E = (kappa^2 d - r kappa rho^2 N) / L^2, d = e - H N
+    m = plus_square((0.0, 0.0, 0.0, 0.0, 0.0, 0.0), d)
+    m = one - per * m[0], -per * m[1], -per * m[2], one - per * m[3], -per * m[4], one - per * m[5]
+    along = kappa * kappa * per
+    up = along * height + bend * kappa * (length2 - height * height) * per
+    return m, minus(scaled(along, e), scaled(up, normal))
+
+
 @device
-def add_rays(room: FloatArray, tile: FloatArray, marks: FloatArray, sight: Sight) -> None:
-    """Add one camera's rays to the sums of a tile's points.
+def add_in_space(room: FloatArray, tile: FloatArray, marks: FloatArray, sight: Sight) -> None:
+    """Add one camera's rays to the sums of a tile's points, for residuals in space."""
+    for j in range(marks.size):
+        one, e, normal, height, length2, h, y, bend = _seen(room, tile, marks, j, sight)
+        kappa, inv_h, lean, away, beta, by_n = _bent(height, length2, h, y, bend)
+        m, g = _in_space(one, e, normal, height, length2, bend, kappa)
+        # M D (p - (N.p) e / H), where M e = (1 - r H / kappa) E
+        up = (away * (lean * height - 1.0) - beta * length2) * inv_h
+        room[RAYS * TILE + j] += one
+        _add_nine(room, BY_Q * TILE + j, 1.0, m, (0.0, 0.0, 0.0), g)
+        _add_nine(room, BY_P * TILE + j, away, m, g, plus(scaled(up, normal), scaled(beta, e)))
+        _add_three(room, BY_LEVEL * TILE + j, inv_h - lean, g)
+        _add_three(room, BY_N * TILE + j, by_n, g)
+        _add_six(room, SIGHT * TILE + j, 1.0, _weight(one, e, length2, sight))
+
+
+@device
+def add_in_images(room: FloatArray, tile: FloatArray, marks: FloatArray, sight: Sight) -> None:
+    """Add one camera's rays to the sums of a tile's points, for residuals in images.
 
     S T = W / (1 - m) + W N (u N + v e)', with c = 1 - m + beta rho^2, v = H beta / ((1 - m) c) and
     u = (r H / kappa) / c - 1 / (1 - m) - H v.
@@ -347,8 +395,10 @@ def _inverse(height: float, length2: float, away: float, beta: float) -> tuple[f
 
 
 @device
-def add_tilt(room: FloatArray, tile: FloatArray, marks: FloatArray, sight: Sight) -> None:
-    """Add how the slope of the water moves each of one camera's rays, S delta.
+def add_tilt(
+    room: FloatArray, tile: FloatArray, marks: FloatArray, sight: Sight, in_images: bool
+) -> None:
+    """Add how the slope of the water moves each of one camera's rays, M delta or S delta.
 
     S delta = (a W + (a beta - (1 - m) b) H / c W N d') / (1 - m) tau, c as above, for delta =
     a tau + b (d.tau) d; d.tau = e.tau.
@@ -360,11 +410,16 @@ def add_tilt(room: FloatArray, tile: FloatArray, marks: FloatArray, sight: Sight
         inv_k, turn = 1.0 / kappa, -y * (1.0 - height * lean)
         along = y * bend * bend * lean * height * inv_k * inv_k
         along += (h * inv_h - y * lean) * lean - h * inv_h * inv_h
-        w = _weight(one, e, length2, sight)
-        inner, outer = _inverse(height, length2, away, beta)
-        # both parts through D^-1
-        along = (turn * beta * inner - along) * height * outer
-        _add_nine(room, BY_TILT * TILE + j, turn * inner, w, product(w, normal), scaled(along, e))
+        if in_images:
+            w = _weight(one, e, length2, sight)
+            g = product(w, normal)
+            inner, outer = _inverse(height, length2, away, beta)
+            # both parts through D^-1
+            along = (turn * beta * inner - along) * height * outer
+            turn *= inner
+        else:
+            w, g = _in_space(one, e, normal, height, length2, bend, kappa)
+        _add_nine(room, BY_TILT * TILE + j, turn, w, g, scaled(along, e))
 
 
 @device
@@ -444,9 +499,13 @@ def add_errors(
         sight = Sight(
             row_of(rig.centres, c), rig.offset[c], row_of(rig.axes, c), rig.focal_px[c] ** 2, bend
         )
-        add_rays(room, tile, marks[k], sight)
+        # the derivative of consistent, or that of snell
+        if budget.in_images:
+            add_in_images(room, tile, marks[k], sight)
+        else:
+            add_in_space(room, tile, marks[k], sight)
         if budget.tilt > 0.0:
-            add_tilt(room, tile, marks[k], sight)
+            add_tilt(room, tile, marks[k], sight, budget.in_images)
         if differ_by_ray(budget):
             add_noise(room, tile, marks[k], sight, budget)
 
@@ -458,9 +517,9 @@ def finish_tile(
 ) -> None:  # fmt: skip
     """Turn the sums of a tile into covariances: B R B' of the noise, and that of common errors.
 
-    With B = (sum S T)^-1. Each common error is one standard deviation times B times a column: of
-    level, index and both tilts. A tilt also raises the water above the point, in proportion to its
-    distance from the pivot. LLVM inlines what the loop calls; otherwise it would not be vectorised.
+    Each common error is one standard deviation times a column: of level, index and both tilts. A
+    tilt also raises the water above the point, in proportion to its distance from the pivot. LLVM
+    inlines what the loop calls; otherwise it would not be vectorised.
     """
     out, sigma, sums = np.empty(6 * TILE), level_sigma[rows], room
     # R = sigma^2 K if all rays have the same image noise
@@ -472,7 +531,14 @@ def finish_tile(
         det, b = inverse_of(m)
         half = 0.5 * (m[0] + m[4] + m[8])
         solved = (k >= 2.0) & (det >= MIN_DETERMINANT * half * half * half)
-        n = _product(_product(b, _symmetric(sums, NOISE * TILE + j)), _transposed(b))
+        by_noise = b
+        if not budget.in_images:
+            # Q moves with P by (sum M)^-1 (sum M D), and P by (sum W)^-1
+            full, by_sight = inverse_of(_symmetric(sums, SIGHT * TILE + j))
+            by_noise = _product(_product(b, nine(sums, BY_P * TILE + j)), by_sight)
+            solved &= full > 0.0
+        noise = _product(by_noise, _symmetric(sums, NOISE * TILE + j))
+        n = _product(noise, _transposed(by_noise))
         nx, ny, nz = three(tile, 4 * TILE + j)
         # two horizontal directions of slope: u towards x, v across it
         scale = 1.0 / np.sqrt(nx * nx + nz * nz)

@@ -160,8 +160,8 @@ def test_common_errors_consistent(tilt_deg):
 
 @pytest.mark.parametrize("plane", [WaterPlane(0.0), WaterPlane(0.1, 0.004, -0.006)])
 def test_common_errors_snell(plane):
-    # finite differences of the intersection itself, every camera in frame; 2 % in z as the standard
-    # errors are of rays that are weighted in the images
+    # finite differences of the intersection itself, every camera in frame; 1 % in z as the turn of
+    # M times the distance of a ray from the point is left out
     bed, cameras, _ = scene(35.0, points=300)
     step = 1e-4
 
@@ -187,7 +187,7 @@ def test_common_errors_snell(plane):
         cov = covariances(
             bed, base.shift_m, surface_above(plane, bed), cameras, ScienceOptions(**vars(errors))
         )
-        np.testing.assert_allclose(np.sqrt(cov[moved, 5]), np.abs(slope), rtol=0.02)
+        np.testing.assert_allclose(np.sqrt(cov[moved, 5]), np.abs(slope), rtol=0.01)
     both = 0.0
     for direction in ((1.0, 0.0), (0.0, 1.0)):
         up, down = (tilted(*(s * np.array(direction))) for s in (step, -step))
@@ -197,7 +197,7 @@ def test_common_errors_snell(plane):
         bed, base.shift_m, surface_above(plane, bed), cameras, ScienceOptions(**vars(errors))
     )
     # in units of slope; near the middle of the block, where little is left, the mean counts
-    assert np.sqrt(cov[moved, 5].mean()) == pytest.approx(np.sqrt(both.mean()), rel=0.03)
+    assert np.sqrt(cov[moved, 5].mean()) == pytest.approx(np.sqrt(both.mean()), rel=0.02)
 
 
 def test_positive():
