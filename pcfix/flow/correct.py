@@ -40,7 +40,7 @@ from pcfix.model import (
 )
 from pcfix.options.correct import CorrectOptions, LabelRules, PointsOptions, RefractionOptions
 from pcfix.options.declare import File, taken
-from pcfix.refract.tally import Summary
+from pcfix.report.summary import Summary
 from pcfix.water.checks import as_surface, checked_points
 from pcfix.water.index import with_index
 from pcfix.water.surface import FoundSurface

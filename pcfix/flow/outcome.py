@@ -17,7 +17,8 @@ from pcfix.model import Cameras, FloatArray, Outcome, TiePoints, WaterDimension
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import UNLISTED
 from pcfix.refract.reconstructions import CAUSES
-from pcfix.refract.tally import Summary, Tally
+from pcfix.refract.tally import Tally
+from pcfix.report.summary import Summary
 from pcfix.version import __version__
 from pcfix.water.checks import check_submerged, refuse_under_water
 

@@ -23,11 +23,11 @@ from pcfix.io.las.source import coordinates, stated_crs
 from pcfix.io.rasters import preview
 from pcfix.io.tiles import Tiles, open_cloud
 from pcfix.model import NOISE_CLASSES, Cameras, WaterSurface
-from pcfix.refract.tally import Summary
 from pcfix.report.adjustment import adjustment_tables
 from pcfix.report.comparison import evaluation, in_a_sentence
 from pcfix.report.page import Picture, Report, Table, render
 from pcfix.report.run import RunResults, in_short, run_report
+from pcfix.report.summary import Summary
 from pcfix.report.text import uncertainty_sentence
 
 Plain = dict[str, Any]

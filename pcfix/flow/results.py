@@ -20,9 +20,9 @@ from pcfix.io.styles import limits_of
 from pcfix.libraries import analysis_library
 from pcfix.options.declare import File, options_of, taken
 from pcfix.options.survey import RunOptions
-from pcfix.refract.tally import Summary
 from pcfix.report.comparison import signed_statistics
 from pcfix.report.page import Tile, overview, run_html
+from pcfix.report.summary import Summary
 
 if TYPE_CHECKING:
     from geopandas import GeoDataFrame

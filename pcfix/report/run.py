@@ -15,7 +15,7 @@ import numpy as np
 from pcfix.grid.colours import DEPTH, DIFFERENCE, HEIGHT, RAYS, UNCERTAINTY
 from pcfix.grid.maps import Extent, Maps, contours, depth_interval
 from pcfix.model import Cameras, FloatArray, WaterPlane, WaterSurface
-from pcfix.refract.tally import COVERAGE_95, ORDERS, Summary, largest_tvu_m
+from pcfix.refract.tally import COVERAGE_95, ORDERS, largest_tvu_m
 from pcfix.report.comparison import noise_sentence, raw_of, signed
 from pcfix.report.map_data import Layer, relief
 from pcfix.report.page import (
@@ -33,6 +33,7 @@ from pcfix.report.page import (
     name_of,
     new_figure,
 )
+from pcfix.report.summary import Summary
 from pcfix.report.text import FEWEST, formal_words, summary_rows, uncertainty_sentence
 from pcfix.version import __version__
 

@@ -15,7 +15,8 @@ import numpy as np
 
 from pcfix.options.correct import LEVEL_M
 from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
-from pcfix.refract.tally import ORDERS, Summary
+from pcfix.refract.tally import ORDERS
+from pcfix.report.summary import Summary
 
 if TYPE_CHECKING:
     from pcfix.clean.points import CleanSummary
