@@ -190,14 +190,17 @@ def summarize(plan: Plan, tally: CloudTally, findings: Findings, ends: Ends) -> 
         write_regression(path, line, overwrite=options.overwrite)
     figures, report = tally.figures, _view_report(plan, tally)
     unused = list(compress(plan.cameras.labels, np.logical_not(figures.camera_used)))
-    uncorrected = figures.uncorrected()
-    not_moved = sum(uncorrected.values()) + int(figures.outcomes[Outcome.NOT_CARRIED])
+    counts = figures.as_dict()
+    if options.unsure != "withhold":
+        counts["unsure"] = None
+    not_moved = sum(counts["uncorrected"].values()) + int(figures.outcomes[Outcome.NOT_CARRIED])
     poses, transfer, moved = findings.poses, plan.transfer, plan.survey.level_offset_m
     made, detected, water = plan.made, _detected(plan, tally), str(plan.found.surface)
-    depth, uncertainty = figures.depth_m(), figures.uncertainty(made)
+    uncertainty = figures.uncertainty(made)
     by_poses = plan.survey.learned.poses
     if plan.inputs.port is not None:  # no depths, and no orders by depth
-        depth, uncertainty, water = {}, None, f"all around, seen through a {plan.inputs.port}"
+        counts["depth_m"], uncertainty = {}, None
+        water = f"all around, seen through a {plan.inputs.port}"
     if uncertainty is not None and by_poses is not None:
         uncertainty["poses_m"] = round(by_poses.middle_m, 4)
     if moved is not None:
@@ -219,17 +222,8 @@ def summarize(plan: Plan, tally: CloudTally, findings: Findings, ends: Ends) -> 
         input=ends.input,
         output=ends.output,
         pcfix=__version__,
-        points=figures.points,
-        submerged=figures.submerged,
-        corrected=figures.corrected,
-        uncorrected=uncorrected,
+        **counts,
         dropped=not_moved if options.uncorrected == "drop" else 0,
-        water_unknown=figures.water_unknown,
-        unsure=figures.unsure if options.unsure == "withhold" else None,
-        depth_m=depth,
-        shift_z_m=figures.shift_z_m(),
-        rays=figures.rays,
-        incidence_deg=round(figures.incidence_deg, 2),
         cameras=len(plan.cameras),
         cameras_used=len(plan.cameras) - len(unused),
         cameras_unused=unused,

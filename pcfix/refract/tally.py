@@ -196,6 +196,21 @@ class Tally(Sums):
         p5, p95 = (self.shift.percentile_m(percent) for percent in (5, 95))
         return _rounded(mean=self.shift.mean_m(), p5=p5, p95=p95)
 
+    def as_dict(self) -> dict[str, Any]:
+        """Return the counts and figures by the names of `pcfix.report.summary.Summary`."""
+        return {
+            "points": self.points,
+            "submerged": self.submerged,
+            "corrected": self.corrected,
+            "uncorrected": self.uncorrected(),
+            "water_unknown": self.water_unknown,
+            "unsure": self.unsure,
+            "depth_m": self.depth_m(),
+            "shift_z_m": self.shift_z_m(),
+            "rays": self.rays,
+            "incidence_deg": round(self.incidence_deg, 2),
+        }
+
     def uncertainty(self, made: dict[str, Any] | None = None) -> dict[str, Any] | None:
         """Return standard error of Z, TVU and orders; see `UncertaintyTally.as_dict`.
 
