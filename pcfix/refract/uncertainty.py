@@ -222,7 +222,7 @@ _ABOVE, RAYS, BY_LEVEL, BY_N, SIGHT, BY_Q, BY_P, BY_TILT, NOISE, ROOM = slots(
     1, 1, 3, 3, 6, 9, 9, 9, 6
 )
 
-Seen: TypeAlias = tuple[float, Vector, Vector, float, float, float, float, float]
+RayTerms: TypeAlias = tuple[float, Vector, Vector, float, float, float, float, float]
 
 
 class Sight(NamedTuple):
@@ -245,7 +245,9 @@ def room_of(tile: FloatArray, shift: FloatArray, rows: IntArray) -> FloatArray:
 
 
 @device(forceinline=True)
-def _seen(room: FloatArray, tile: FloatArray, marks: FloatArray, j: int, sight: Sight) -> Seen:
+def _ray_terms(
+    room: FloatArray, tile: FloatArray, marks: FloatArray, j: int, sight: Sight
+) -> RayTerms:
     """Return how often a ray counts; e, N, H, L^2, h, y and r where the light bends.
 
     A ray that does not count goes straight up.
@@ -346,7 +348,7 @@ def _in_space(
 def add_in_space(room: FloatArray, tile: FloatArray, marks: FloatArray, sight: Sight) -> None:
     """Add one camera's rays to the sums of a tile's points, for residuals in space."""
     for j in range(marks.size):
-        one, e, normal, height, length2, h, y, bend = _seen(room, tile, marks, j, sight)
+        one, e, normal, height, length2, h, y, bend = _ray_terms(room, tile, marks, j, sight)
         kappa, inv_h, lean, away, beta, by_n = _bent(height, length2, h, y, bend)
         m, g = _in_space(one, e, normal, height, length2, bend, kappa)
         # M D (p - (N.p) e / H), where M e = (1 - r H / kappa) E
@@ -367,7 +369,7 @@ def add_in_images(room: FloatArray, tile: FloatArray, marks: FloatArray, sight: 
     u = (r H / kappa) / c - 1 / (1 - m) - H v.
     """
     for j in range(marks.size):
-        one, e, normal, height, length2, h, y, bend = _seen(room, tile, marks, j, sight)
+        one, e, normal, height, length2, h, y, bend = _ray_terms(room, tile, marks, j, sight)
         _, inv_h, lean, away, beta, by_n = _bent(height, length2, h, y, bend)
         w = _weight(one, e, length2, sight)
         g = product(w, normal)
@@ -404,7 +406,7 @@ def add_tilt(
     a tau + b (d.tau) d; d.tau = e.tau.
     """
     for j in range(marks.size):
-        one, e, normal, height, length2, h, y, bend = _seen(room, tile, marks, j, sight)
+        one, e, normal, height, length2, h, y, bend = _ray_terms(room, tile, marks, j, sight)
         kappa, inv_h, lean, away, beta, _ = _bent(height, length2, h, y, bend)
         # delta by the slope is turn (tau) + along (d.tau) d, along = gamma + m r / kappa
         inv_k, turn = 1.0 / kappa, -y * (1.0 - height * lean)
@@ -437,7 +439,7 @@ def add_noise(
     image_px, centre_m = budget.image_px, budget.centre_m
     attitude, waves = budget.attitude, budget.waves
     for j in range(marks.size):
-        one, e, normal, height, length2, h, y, bend = _seen(room, tile, marks, j, sight)
+        one, e, normal, height, length2, h, y, bend = _ray_terms(room, tile, marks, j, sight)
         kappa, _, lean, away, beta, _ = _bent(height, length2, h, y, bend)
         w = _weight(one, e, length2, sight)
         g = product(w, normal)
