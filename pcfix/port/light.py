@@ -21,7 +21,7 @@ from pcfix.refract.rays import refracted
 KIND, X, Y, Z, SIZE, THICK, GLASS = range(7)
 FLAT, DOME = 0.0, 1.0
 
-Window: TypeAlias = tuple[float, Vector, float, float, float]
+PortShape: TypeAlias = tuple[float, Vector, float, float, float]
 """Kind; normal or centre; distance or radius; thickness; refractive index of the glass."""
 
 NOWHERE: Vector = (np.nan, np.nan, np.nan)
@@ -41,13 +41,13 @@ def coefficients(port: Port) -> FloatArray:
 
 
 @device
-def window_of(port: FloatArray) -> Window:
+def window_of(port: FloatArray) -> PortShape:
     """Return the same as numbers, which stay in registers."""
     return port[KIND], vector(port, X), port[SIZE], port[THICK], port[GLASS]
 
 
 @device
-def _at_face(window: Window, depth: float, start: Vector, s: Vector) -> tuple[Vector, Vector]:
+def _at_face(window: PortShape, depth: float, start: Vector, s: Vector) -> tuple[Vector, Vector]:
     """Return where a ray leaves a face, and the normal there, towards the water.
 
     The face lies `depth` behind the inner one. NaN if the ray does not meet it.
@@ -76,7 +76,7 @@ def _behind(s: Vector, normal: Vector, r: float) -> Vector:
 
 
 @device
-def ray_through(window: Window, n: float, direction: Vector) -> tuple[Vector, Vector]:
+def ray_through(window: PortShape, n: float, direction: Vector) -> tuple[Vector, Vector]:
     """Return where a ray from the projection centre leaves the port, and its unit direction there.
 
     The direction in air may have any length; n is the refractive index of the water relative to
@@ -90,7 +90,7 @@ def ray_through(window: Window, n: float, direction: Vector) -> tuple[Vector, Ve
 
 
 @device
-def cosine_at_port(window: Window, direction: Vector) -> float:
+def cosine_at_port(window: PortShape, direction: Vector) -> float:
     """Return the cosine of the incidence angle in air at the inner face; see `ray_through`."""
     s = unit(direction)
     return dot(s, _at_face(window, 0.0, (0.0, 0.0, 0.0), s)[1])
@@ -150,7 +150,7 @@ def light_through(port: FloatArray, n: float, x: float, y: float, z: float) -> V
 
 
 @device
-def _signed_miss(window: Window, n: float, w: Vector, point: Vector, across: Vector) -> float:
+def _signed_miss(window: PortShape, n: float, w: Vector, point: Vector, across: Vector) -> float:
     """Return how far a ray passes a point on the side of the foot, in any unit."""
     place, t = ray_through(window, n, w)
     return dot(across, cross(minus(point, place), t))
@@ -203,8 +203,8 @@ def through_port(port: FloatArray, n: float, x: float, y: float, z: float, out: 
     step = BY_PLACE * max(size, LEAST_SIZE_M)
     for i in range(1 if kind == FLAT else 3):
         if kind == FLAT:
-            more: Window = (kind, where, size + step, thickness, glass)
-            less: Window = (kind, where, size - step, thickness, glass)
+            more: PortShape = (kind, where, size + step, thickness, glass)
+            less: PortShape = (kind, where, size - step, thickness, glass)
         else:
             move = (step * (i == 0), step * (i == 1), step * (i == 2))
             more = (kind, plus(where, move), size, thickness, glass)
@@ -222,7 +222,7 @@ def _two_across(v: Vector) -> tuple[Vector, Vector]:
 
 @device
 def _difference(
-    more: Window, more_n: float, less: Window, less_n: float, turn: Vector, w: Vector,
+    more: PortShape, more_n: float, less: PortShape, less_n: float, turn: Vector, w: Vector,
     point: Vector, t: Vector, step: float,
 ) -> Vector:  # fmt: skip
     """Return the derivative of the spot, from its places a step further and a step back.
