@@ -20,8 +20,8 @@ The model, for an apparent point P and its pairs (a, b), all of which show one t
 
 Q is found where that median is P: three equations for three unknowns. The median of smooth
 functions is continuous, with kinks where it changes from one pair to another. Broyden's method
-starts at `snell`'s solution with the derivative diag(1, 1, 1/n), as if all light came from straight
-above, and goes back to half such a step wherever it does not come nearer.
+starts at `snell`'s solution with the derivative diag(1, 1, apparent by true depth), and goes back to
+half such a step wherever it does not come nearer.
 
 A tile of points is processed camera by camera and pair by pair, so that the inner loops run over
 the points and are vectorised. Points that need more than a few steps form new tiles.
@@ -58,18 +58,27 @@ from pcfix.refract.intersect import add_camera, check_consistent
 from pcfix.refract.rays import MIN_DETERMINANT, light_near, nearest_point, ray_distance
 from pcfix.refract.tiling import TILE, nine, put, slots, three
 
-STEPS, MAX_STEPS = 5, 40
+STEPS, MAX_STEPS = 3, 40
 """Steps of a tile, after which the points that are not found yet form new ones; most steps."""
-CLOSE_M = 5e-5
-"""Largest distance of the median from P before the last step, which leaves about a millionth."""
+CLOSE_M = 2e-4
+"""Largest distance of the median from P before the last step, which leaves some millionths."""
 ABSENT = -1
 
 # Columns of the result.
 _DISTANCE, _OUTCOME, _FOUND, _WIDTH = 3, 4, 5, 6
 
 # Columns of a search: Q, the nearest Q so far, F there and its size, the share of a step, B row by
-# row, and whether it goes on.
-_NEAREST, _AT_NEAREST, _BEST, _SHARE, _INVERSE, _GOES_ON, _SEARCH = 3, 6, 9, 10, 11, 20, 21
+# row, whether it goes on, and the ratio of true to apparent depth at the start.
+_NEAREST, _AT_NEAREST, _BEST, _SHARE, _INVERSE, _GOES_ON, _RATIO, _SEARCH = (
+    3,
+    6,
+    9,
+    10,
+    11,
+    20,
+    21,
+    22,
+)
 
 # Runs of `TILE` numbers of a ray: the gradient of the scale of its image by place, and of the image
 # of Q G'G, G'G e and |G e|^2.
@@ -175,12 +184,12 @@ def _search(
         for q in range(near.size):
             add_camera(sums, tile, marks[q], None, block.rig, near[q], block.rule, None, None)
         if first:
-            _start(rows, marks, row, sums, pairs, block.points, search, used, result)
+            _start(rows, tile, marks, row, sums, pairs, block.points, search, used, result)
         rays = np.empty((near.size, RAY * TILE))
         places = np.empty((len(pairs.rays), 3 * TILE))
         values = np.empty(pairs.own.shape[2])
         for _ in range(STEPS):
-            if not _step(rows, rays, places, values, now, tile, near, marks, pairs, block, search):
+            if not _step(rows, rays, places, values, now, tile, near, pairs, block, search):
                 break
         _write(rows, sums, search, result)
 
@@ -255,8 +264,8 @@ def _is_wide(a: int, b: int, j: int, tile: FloatArray, points: Chosen) -> bool:
 
 @device
 def _start(
-    rows: IntArray, marks: FloatArray, row: IntArray, sums: FloatArray, pairs: Pairs,
-    points: Chosen, search: FloatArray, used: BoolArray, result: FloatArray,
+    rows: IntArray, tile: FloatArray, marks: FloatArray, row: IntArray, sums: FloatArray,
+    pairs: Pairs, points: Chosen, search: FloatArray, used: BoolArray, result: FloatArray,
 ) -> None:  # fmt: skip
     """Set the start of each search, the outcome, and which cameras are used."""
     for j in range(rows.size):
@@ -275,14 +284,16 @@ def _start(
             result[i, _DISTANCE] = distance
             search[i, 0], search[i, 1], search[i, 2] = q
             search[i, _BEST], search[i, _SHARE], search[i, _GOES_ON] = np.inf, 1.0, 1.0
-            _as_from_above(search[i], points.n)
+            # a place sinks as the true point does, times the ratio of their depths
+            depth = tile[3 * TILE + j] - tile[2 * TILE + j]
+            search[i, _RATIO] = 1.0 - q[2] / depth if depth > 0.0 else 1.0
+            _start_inverse(search[i])
 
 
 @device
 def _step(
     rows: IntArray, rays: FloatArray, places: FloatArray, values: FloatArray, now: FloatArray,
-    tile: FloatArray, near: IntArray, marks: FloatArray, pairs: Pairs, block: Block,
-    search: FloatArray,
+    tile: FloatArray, near: IntArray, pairs: Pairs, block: Block, search: FloatArray,
 ) -> bool:  # fmt: skip
     """Do one step of all searches of a tile; return whether any goes on."""
     optics, goes_on = block.images.original, False
@@ -303,7 +314,7 @@ def _step(
             x = _median(places, values, pairs.own[0, j, : pairs.wide[j]], j)
             y = _median(places, values, pairs.own[1, j, : pairs.wide[j]], TILE + j)
             z = _median(places, values, pairs.own[2, j, : pairs.wide[j]], 2 * TILE + j)
-            _advance(search[rows[j]], (x, y, z), block.points.n)
+            _advance(search[rows[j]], (x, y, z))
             goes_on = goes_on or search[rows[j], _GOES_ON] > 0.0
     return goes_on
 
@@ -364,16 +375,18 @@ def _meet(place: FloatArray, a: FloatArray, b: FloatArray, count: int) -> None:
 
     That matters for narrow pairs whose rays pass each other.
     """
+    # first t = 1, then with the t and r^2 of that place
     for j in range(count):
-        # first t = 1, then with the t and r^2 of that place
-        x = _solve_two(a, b, j, 1.0, 1.0, 0.0, 0.0)
+        put(place, j, _solve_two(a, b, j, 1.0, 1.0, 0.0, 0.0))
+    for j in range(count):
+        x = three(place, j)
         t, r2 = _residual(x, a, j)
         t_b, r2_b = _residual(x, b, j)
         of_a, of_b = 1.0 / (t * t), 1.0 / (t_b * t_b)
         put(place, j, _solve_two(a, b, j, of_a, of_b, r2 * of_a / t, r2_b * of_b / t_b))
 
 
-@device
+@device(forceinline=True)
 def _residual(place: Vector, ray: FloatArray, j: int) -> tuple[float, float]:
     """Return t and r^2 of a place."""
     x, y, z = place
@@ -385,7 +398,7 @@ def _residual(place: Vector, ray: FloatArray, j: int) -> tuple[float, float]:
     return 1.0 + dot(place, three(ray, _BY_PLACE * TILE + j)), r2
 
 
-@device
+@device(forceinline=True)
 def _solve_two(
     a: FloatArray, b: FloatArray, j: int, of_a: float, of_b: float, g_a: float, g_b: float
 ) -> Vector:
@@ -398,7 +411,7 @@ def _solve_two(
     return solved((xx, xy, xz, yy, yz, zz), right)[1]
 
 
-@device
+@device(forceinline=True)
 def _sum(a: FloatArray, b: FloatArray, at: int, of_a: float, of_b: float) -> Vector:
     """Return a weighted sum of three numbers of two rays."""
     return beyond(scaled(of_a, three(a, at)), of_b, three(b, at))
@@ -424,10 +437,10 @@ def _median(places: FloatArray, values: FloatArray, own: IntArray, at: int) -> f
 
 
 @device
-def _advance(one: FloatArray, f: Vector, n: float) -> None:
+def _advance(one: FloatArray, f: Vector) -> None:
     """Move the Q of a search to where the median F of the pairs' places is P.
 
-    From the nearest Q so far goes a step s = -B F, at first as from above. Where F comes nearer,
+    From the nearest Q so far goes a step s = -B F. Where F comes nearer,
     by y, the good Broyden update is B + (s - B y) s'B / (s'B y); where it does not, B starts again
     with half the step.
     """
@@ -455,7 +468,7 @@ def _advance(one: FloatArray, f: Vector, n: float) -> None:
         one[_BEST] = size
     elif one[_BEST] < np.inf:
         one[_SHARE] *= 0.5
-        _as_from_above(one, n)
+        _start_inverse(one)
     else:  # no image of the start
         one[_GOES_ON] = 0.0
         return
@@ -476,11 +489,11 @@ def _times(one: FloatArray, a: Vector) -> Vector:
 
 
 @device
-def _as_from_above(one: FloatArray, n: float) -> None:
-    """Set B to a share of the inverse derivative for light from straight above."""
+def _start_inverse(one: FloatArray) -> None:
+    """Set B to a share of diag(1, 1, true by apparent depth)."""
     one[_INVERSE:_GOES_ON] = 0.0
     one[_INVERSE], one[_INVERSE + 4] = one[_SHARE], one[_SHARE]
-    one[_INVERSE + 8] = one[_SHARE] * n
+    one[_INVERSE + 8] = one[_SHARE] * one[_RATIO]
 
 
 @device
