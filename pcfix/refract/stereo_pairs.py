@@ -20,8 +20,8 @@ The model, for an apparent point P and its pairs (a, b), all of which show one t
 
 Q is found where that median is P: three equations for three unknowns. The median of smooth
 functions is continuous, with kinks where it changes from one pair to another. Broyden's method
-starts at `snell`'s solution with the derivative diag(1, 1, apparent by true depth), and goes back to
-half such a step wherever it does not come nearer.
+starts at `snell`'s solution with the derivative diag(1, 1, apparent by true depth), and goes back
+to half such a step wherever it does not come nearer.
 
 A tile of points is processed camera by camera and pair by pair, so that the inner loops run over
 the points and are vectorised. Points that need more than a few steps form new tiles.
