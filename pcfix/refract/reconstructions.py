@@ -151,8 +151,8 @@ class Verdict(NamedTuple):
 
     @property
     def is_strong(self) -> bool:
-        """Whether the type is sure and leaves hardly any discontinuities."""
-        return self.is_sure and self.share <= STRONG
+        """Whether the type leaves hardly any discontinuities, at two standard errors from half."""
+        return self.patches > 0 and self.share <= min(STRONG, 0.5 - 2.0 * self.sigma)
 
     @property
     def is_against(self) -> bool:
