@@ -19,27 +19,13 @@ if TYPE_CHECKING:
     from pcfix.simulate.scene import Scene
 
 GROUND = 2
-FILES = {
-    "cloud.laz": "the apparent cloud, as from SfM software",
-    "truth.laz": "the true position of each of its points, row by row",
-    "lidar.laz": "a reference cloud with noise, as from bathymetric LiDAR; 2 land, 40 bed",
-    "cameras.csv": "label, x, y, z, yaw, pitch, roll of each image",
-    "sensor.csv": "focal length and sensor size, mm; of a distorted lens pixels and OpenCV's k, p",
-    "scene.json": "water, refractive index, GSD, and the arguments that made the scene",
-}
-"""Files of every scene."""
-
-OTHERS = {
-    "fused.ply.vis": "the cameras of each point of the cloud, row by row, in COLMAP's layout",
-    "true_cameras.csv": "the true poses of the images",
-}
-"""Files of some scenes."""
-
+CLOUDS = ("cloud.laz", "truth.laz", "lidar.laz")
+"""The apparent cloud, the true position of each of its points, a reference with noise."""
 _FINE_GSD_M = 0.005  # clouds of finer images get steps of 0.1 mm
 
 
 def write_scene(scene: Scene, out_dir: File, *, overwrite: bool) -> None:
-    """Write `FILES`, and those of `OTHERS` that the scene has, into a folder."""
+    """Write `CLOUDS`, the cameras, their sensor, view lists and ``scene.json`` into a folder."""
     folder = Path(out_dir)
     contents = {
         "sensor.csv": _sensor_csv(scene),
@@ -49,7 +35,6 @@ def write_scene(scene: Scene, out_dir: File, *, overwrite: bool) -> None:
     if scene.true_cameras is not scene.cameras:
         true = _cameras_csv(scene.true_cameras, scene.true_yaw_pitch_roll_deg)
         contents["true_cameras.csv"] = true
-    files = FILES | {name: text for name, text in OTHERS.items() if name in contents}
     plane = scene.water
     tilted = f"plane:{plane.a!r},{plane.b!r},{plane.c!r}"
     facts = {
@@ -60,11 +45,10 @@ def write_scene(scene: Scene, out_dir: File, *, overwrite: bool) -> None:
         "refractive_index": scene.refractive_index,
         "gsd_m": scene.gsd_m,
         "arguments": scene.settings,
-        "files": files,
     }
     contents["scene.json"] = (json.dumps(facts, indent=2) + "\n").encode()
     folder.mkdir(parents=True, exist_ok=True)
-    for name in files:
+    for name in (*CLOUDS, *contents):
         check_output(folder / name, overwrite=overwrite)
     wet = scene.depth_m(scene.lidar_xyz) > 0.0
     classes = np.where(wet, BATHYMETRIC_POINT, GROUND).astype(np.uint8)

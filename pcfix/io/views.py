@@ -341,12 +341,10 @@ def fitted(views: ViewList, cameras: Cameras, xyz: FloatArray, rows: IntArray) -
     return replace(views, orders=(views.orders[best],), share_seen=share)
 
 
-def entries(start: IntArray, rows: IntArray) -> tuple[IntArray, slice | IntArray]:
+def entries(start: IntArray, rows: IntArray) -> tuple[IntArray, IntArray]:
     """Return where the lists of some rows start in a copy, and which entries these are."""
     counts = start[rows + 1] - start[rows]
     ends = np.concatenate([[0], np.cumsum(counts)])
-    if len(rows) and rows[-1] - rows[0] == len(rows) - 1 and (np.diff(rows) == 1).all():
-        return ends, slice(int(start[rows[0]]), int(start[rows[-1] + 1]))  # without a copy
     return ends, np.repeat(start[rows] - ends[:-1], counts) + np.arange(ends[-1])
 
 
@@ -424,20 +422,28 @@ class ViewMatch:
         refused if its cameras do not see the points.
         """
         views = self.view_list
-        source, weights = f"{views.what} {views.path}", views.weight is not None
-        report = ViewReport(source, len(views), tolerance_m=self.tolerance_m, weights=weights)
+        report = ViewReport(f"{views.what} {views.path}", len(views), tolerance_m=self.tolerance_m)
         if views.xyz is None:
             row = np.arange(first_row, first_row + len(xyz))
             views = fitted(views, self._cameras, xyz, row)
             report.by_row = len(row)
         else:
             row = self._rows(xyz, first_row, views.xyz, report)
+        order, matched = views.orders[0], np.flatnonzero(row >= 0)
+        ends, entry = entries(views.start, row[matched])
+        camera = order.camera[views.image[entry]].astype(np.int64)
+        posed = camera >= 0
+        start = np.zeros(len(row) + 1, np.int64)
+        start[matched + 1] = np.diff(np.concatenate([[0], np.cumsum(posed)])[ends])
+        weight = None if views.weight is None else views.weight[entry][posed]
+        listed = Views(np.cumsum(start), camera[posed], weight, views.kind)
+        outside = beside_frames(xyz, listed, self._cameras)
         report.share_seen = views.share_seen
-        report.image_order, report.unposed = views.orders[0].what, views.orders[0].unposed
-        listed = _listed(views, row, report)
-        apart = beside_frames(xyz, listed, self._cameras)
-        report.beside_entries = int(apart.sum())
-        report.beside_points = int(np.count_nonzero(apart))
+        report.image_order, report.unposed = order.what, order.unposed
+        report.entries, report.unposed_entries = int(posed.sum()), int((~posed).sum())
+        report.without_camera = int(np.count_nonzero(start[matched + 1] == 0))
+        report.beside_entries = int(outside.sum())
+        report.beside_points = int(np.count_nonzero(outside))
         return listed, report
 
     def _rows(
@@ -467,24 +473,6 @@ class ViewMatch:
         return row
 
 
-def _listed(views: ViewList, row: IntArray, report: ViewReport) -> Views:
-    """Turn the images of the given rows into cameras, without images that have no pose."""
-    listed = np.flatnonzero(row >= 0)
-    ends, entry = entries(views.start, row[listed])
-    camera = views.orders[0].camera[views.image[entry]].astype(np.int64)
-    weight = None if views.weight is None else views.weight[entry].copy()
-    posed = camera >= 0
-    if not posed.all():
-        ends = np.concatenate([[0], np.cumsum(posed)])[ends]
-        camera, weight = camera[posed], None if weight is None else weight[posed]
-    start = np.zeros(len(row) + 1, np.int64)
-    start[listed + 1] = np.diff(ends)
-    report.entries = len(camera)
-    report.unposed_entries = len(posed) - len(camera)
-    report.without_camera = int(np.count_nonzero(start[listed + 1] == 0))
-    return Views(np.cumsum(start), camera, weight, views.kind)
-
-
 @dataclass
 class ViewReport(Sums):
     """Counts of the matches so far; by row, by position and unmatched are points of the cloud."""
@@ -504,7 +492,6 @@ class ViewReport(Sums):
     beside_entries: int = 0  # cameras that cannot have imaged their point, which are ignored
     beside_points: int = 0  # points that these are listed for
     unposed: tuple[str, ...] = field(default=(), metadata=SAME)  # that a list may name
-    weights: bool = field(default=False, metadata=SAME)
     notes: list[PcfixWarning] = field(default_factory=list, metadata=SAME)
 
     @property

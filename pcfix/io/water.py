@@ -280,10 +280,9 @@ def write_water_raster(path: Path, water: WaterRaster, crs: str | None) -> None:
 
 def _edge(bounds: Bounds) -> FloatArray:
     """Return points along bounds, z = 0."""
-    edge = shapely.box(*bounds).exterior
-    share = np.linspace(0, 1, 4 * _EDGE_POINTS)
-    places = shapely.line_interpolate_point(edge, share, normalized=True)
-    xy = np.vstack([shapely.get_coordinates(places), shapely.get_coordinates(edge)])
+    west, south, east, north = bounds
+    longest = max(east - west, north - south, 1.0) / _EDGE_POINTS
+    xy = shapely.get_coordinates(shapely.segmentize(shapely.box(*bounds), longest))
     return np.column_stack([xy, np.zeros(len(xy))])
 
 

@@ -95,7 +95,7 @@ def given(match, xyz, chunk=150):
     match = match.settled(xyz[:chunk])
     found = [match.views_of(xyz[i : i + chunk], i) for i in range(0, len(xyz), chunk)]
     parts, report = [views for views, _ in found], reduce(operator.add, [one for _, one in found])
-    weights = np.concatenate([one.weight for one in parts]) if report.weights else None
+    weights = None if parts[0].weight is None else np.concatenate([one.weight for one in parts])
     return [row for p in parts for row in rows_of(p)], weights, replace(report, notes=match.notes)
 
 
