@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from pcfix.adjust.diagnosis import Diagnosis, Evidence, export_of
 from pcfix.errors import InputError, SettingError, shown_once
 from pcfix.flow.diagnosis import diagnose, has_datum, quick_ties
-from pcfix.flow.inputs import Inputs, ties_of
+from pcfix.flow.inputs import Inputs, paths_in, ties_of
 from pcfix.flow.next_steps import adjust_words
 from pcfix.flow.plausibility import plausible
 from pcfix.flow.runner import check_summary, write_plot, write_summary
@@ -59,8 +59,7 @@ def check_cameras(
     """
     given = taken(CamerasCheckOptions, options, keywords, "check_cameras")
     cloud = given.cloud
-    files = [path, cloud, given.gnss, given.gcps, given.lens, given.reference]
-    check_summary(given, [file for file in files if file is not None])
+    check_summary(given, [path, *paths_in(given)])
     if cloud is None or given.water is None:
         for name in ("gcps", "lens", "reference"):
             if getattr(given, name) is not None:
@@ -88,49 +87,55 @@ def check_cameras(
         diagnosis = _diagnosed(given, inputs, cameras, view, surface)
         surveys = {name: getattr(given, name) for name in ("gnss", "gcps", "lens", "index")}
         remedy = adjust_words(inputs, view.name, has_datum=has_datum(cameras, str(path)), **surveys)
-    level = above = range_m = tilt_deg = None
+    level = above = range_m = tilt_deg = fit = None
     if surface is not None and not (isinstance(surface, WaterDimension) and heights is None):
         at = cameras.centres if heights is None else xyz
         known_m = surface_above(surface, at, heights).height_m
         level = float(np.nanmean(known_m)) if np.isfinite(known_m).any() else None
     if level is not None and not problem:  # geocentric cameras have no heights
         above = cameras.centres[:, 2] - level
-        range_m = float(above.min()), float(above.mean()), float(above.max())
+        range_m = [float(above.min()), float(above.mean()), float(above.max())]
     if cameras.rotations is not None and not problem:
         tilt = np.degrees(np.arccos(np.clip(-cameras.rotations[:, 2, 2], -1.0, 1.0)))
-        tilt_deg = float(np.median(tilt)), float(tilt.max())
-    gnss, fit = _gnss(cameras, str(path)), None
+        tilt_deg = [float(np.median(tilt)), float(tilt.max())]
+    gnss = _gnss(cameras, str(path))
     if view is not None:
+        up = 0.0 if gnss is None or inputs.cameras_crs is None else gnss["mean_m"][2] or 0.0
         flight = {"file": path, "water_m": level, "every": view.points / max(len(xyz), 1)}
-        fit = _fit(cameras, view, xyz, quick_ties(inputs, view.crs), flight)
-        up = None if gnss is None or inputs.cameras_crs is None else gnss["mean_m"][2]
-        if up is not None and abs(up) >= UNDULATION_M[0] and not fit.verdict:
-            side = "above" if up > 0.0 else "below"
-            verdict = (
-                f"With --cameras-crs the cameras are {abs(up):.1f} m {side} their GNSS heights. One"
-                " of them is likely above the ellipsoid and the other above the geoid; check the"
-                " vertical CRS."
-            )
-            fit = replace(fit, verdict=verdict)
-    report = CamerasReport(
-        path=str(path),
-        cameras=cameras,
-        crs_read=read.crs,
-        sensors=sensors_of(cameras, above),
-        height_above_water_m=range_m,
-        tilt_deg=tilt_deg,
-        gnss=gnss,
-        fit=fit,
-        sample_xyz=xyz,
-        level_m=level,
-        problem=problem,
-        diagnosis=diagnosis,
-        remedy=remedy,
-    )
+        fit = _fit(cameras, view, xyz, quick_ties(inputs, view.crs), up, flight)
+    figures = {
+        "path": str(path),
+        "crs_read": read.crs,
+        "sensors": sensors_of(cameras, above),
+        "height_above_water_m": range_m,  # least, mean, largest
+        "tilt_deg": tilt_deg,  # of the optical axes from nadir: median, largest
+        "gnss": gnss,
+        "problem": problem,  # why the cameras are not in a map and have no heights
+        "source": cameras.source,
+        "images_posed": len(cameras),
+        "images_unposed": list(cameras.unposed),
+        "crs": cameras.crs,
+        "fit": fit,
+        "refraction": diagnosis and diagnosis.as_dict(),
+        "notes": [str(note) for note in cameras.notes],
+    }
+    report = CamerasReport(figures, cameras, xyz, level, diagnosis, remedy)
     if given.plot is not None:
         write_plot(given, block_figure(report))
-    write_summary(given, report.as_dict())
+    write_summary(given, figures)
     return report
+
+
+@dataclass(frozen=True, eq=False)
+class CamerasReport:
+    """The report of ``pcfix cameras``."""
+
+    figures: Plain  # as JSON holds them
+    cameras: Cameras  # in the cloud's CRS, where there is a cloud
+    sample_xyz: FloatArray  # points of the cloud, shape (m, 3), for a picture
+    level_m: float | None  # mean height of the water
+    diagnosis: Diagnosis | None  # whether the poses have absorbed the refraction
+    remedy: tuple[str, str]  # the command that corrects the poses, and a remark
 
 
 def _diagnosed(
@@ -243,13 +248,15 @@ def _gnss(cameras: Cameras, name: str) -> Plain | None:
 
 
 def _fit(
-    cameras: Cameras,
-    view: CloudView,
-    xyz: FloatArray,
-    ties: TiePoints | None,
+    cameras: Cameras, view: CloudView, xyz: FloatArray, ties: TiePoints | None, up_m: float,
     flight: dict[str, Any],
-) -> Fit:
-    """Test cameras against a sample of the cloud."""
+) -> Plain:  # fmt: skip
+    """Test cameras against a sample of the cloud; `up_m` are they above their GNSS positions.
+
+    ``seen_by`` are the shares of the points that 0, 1, 2, 3 or more frames hold, ``distance_m`` is
+    between the boxes around block and cloud in plan, ``below_ground`` counts cameras lower than the
+    nearest point in plan. The verdict is what is likely wrong, empty where cameras and cloud match.
+    """
     from scipy.spatial import cKDTree
 
     visible = cameras_in_sight(xyz, cameras)
@@ -257,70 +264,34 @@ def _fit(
     shares["3 or more"] = float(np.mean(visible >= 3))
     low, high, centres = xyz.min(axis=0), xyz.max(axis=0), cameras.centres
     apart = np.maximum(np.maximum(low - centres.max(axis=0), centres.min(axis=0) - high), 0.0)[:2]
-    # cameras lower than the nearest point of the cloud in plan
     reach = float(np.hypot(*np.ptp(xyz[:, :2], axis=0))) * 0.1 + 1.0
     distance, row = (np.asarray(one) for one in cKDTree(xyz[:, :2]).query(centres[:, :2]))
     below = int(np.count_nonzero((distance < reach) & (centres[:, 2] <= xyz[row, 2])))
+    found = plausible(cameras, xyz, ties, **flight)
     verdict = likely_mistake(centres, low, high, view.crs) or ""
     if not verdict and below:
         verdict = (
             f"{below} of {len(cameras)} cameras are below the ground. Check the vertical datum and"
             " the order of the axes."
         )
-    found = plausible(cameras, xyz, ties, **flight)
     verdict = verdict or " ".join(map(str, found.doubts))
-    return Fit(view.name, len(xyz), shares, float(np.hypot(*apart)), below, verdict, str(found))
-
-
-@dataclass(frozen=True)
-class Fit:
-    """How well cameras and cloud match."""
-
-    cloud: str
-    points_sampled: int
-    seen_by: dict[str, float]  # share of the points that 0, 1, 2, 3 or more frames hold
-    distance_m: float  # in plan, between the boxes around block and cloud
-    below_ground: int  # cameras lower than the cloud's highest point within their reach in plan
-    verdict: str  # what is likely wrong; empty where they match
-    tested: str = "not checked"  # what was tested, and what was not
-
-    @property
-    def fits(self) -> bool:
-        """Whether nothing looks wrong."""
-        return not self.verdict
-
-
-@dataclass(frozen=True, eq=False)
-class CamerasReport:
-    """The report of ``pcfix cameras``."""
-
-    path: str
-    cameras: Cameras  # in the cloud's CRS, where there is a cloud
-    crs_read: str | None  # of the file
-    sensors: list[Plain]  # see `_sensor`
-    height_above_water_m: tuple[float, float, float] | None  # least, mean, largest
-    tilt_deg: tuple[float, float] | None  # of the optical axes from nadir: median, largest
-    gnss: Plain | None  # see `_gnss`
-    fit: Fit | None
-    sample_xyz: FloatArray  # points of the cloud, shape (m, 3), for a picture
-    level_m: float | None  # mean height of the water
-    problem: str = ""  # why the cameras are not in a map and have no heights
-    diagnosis: Diagnosis | None = None  # whether the poses have absorbed the refraction
-    remedy: tuple[str, str] = ("", "")  # the command that corrects the poses, and a remark
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values, ready for JSON."""
-        cameras, fit = self.cameras, self.fit
-        apart = ("cameras", "fit", "sample_xyz", "level_m", "diagnosis", "remedy")
-        return {name: value for name, value in vars(self).items() if name not in apart} | {
-            "source": cameras.source,
-            "images_posed": len(cameras),
-            "images_unposed": list(cameras.unposed),
-            "crs": cameras.crs,
-            "fit": fit and {**asdict(fit), "fits": fit.fits},
-            "refraction": self.diagnosis and self.diagnosis.as_dict(),
-            "notes": [str(note) for note in cameras.notes],
-        }
+    if not verdict and abs(up_m) >= UNDULATION_M[0]:
+        side = "above" if up_m > 0.0 else "below"
+        verdict = (
+            f"With --cameras-crs the cameras are {abs(up_m):.1f} m {side} their GNSS heights. One"
+            " of them is likely above the ellipsoid and the other above the geoid; check the"
+            " vertical CRS."
+        )
+    return {
+        "cloud": view.name,
+        "points_sampled": len(xyz),
+        "seen_by": shares,
+        "distance_m": float(np.hypot(*apart)),
+        "below_ground": below,
+        "verdict": verdict,
+        "tested": str(found),
+        "fits": not verdict,
+    }
 
 
 _SENSOR: RowTable = (
@@ -341,59 +312,54 @@ _BLOCK: RowTable = (
     ("Above water", "{height_above_water_m[0]:.1f} to {height_above_water_m[2]:.1f} m, mean"
      " {height_above_water_m[1]:.1f} m", "height_above_water_m"),
     ("Tilt", "median {tilt_deg[0]:.1f} deg, largest {tilt_deg[1]:.1f} deg", "tilt_deg"),
-)  # fmt: skip
-_GNSS: RowTable = (
-    ("GNSS", "{images:,} images; adjusted minus GNSS east, north, up: mean {means} m, sd"
-     " {deviations} m; largest {largest_m:.3f} m ({largest_image})", "images"),
-    ("GNSS", "{reason}", "no_images"),
-    ("", "{reason}", "more"),
-)  # fmt: skip
-_FIT: RowTable = (
-    ("Cloud", "{cloud} ({points_sampled:,} points sampled)", "cloud"),
-    ("Visible", "share of points by number of cameras: {seen}", "cloud"),
-    ("Distance", "{distance_m:,.1f} m in plan between block and cloud", "distance_m"),
-    ("Below ground", "{below_ground} cameras", "below_ground"),
-    ("Check", "{check}", "cloud"),
+    ("GNSS", "{gnss[images]:,} images; adjusted minus GNSS east, north, up: mean"
+     " {gnss[mean_m]:+.3f} m, sd {gnss[sd_m]:.3f} m; largest {gnss[largest_m]:.3f} m"
+     " ({gnss[largest_image]})", "some_gnss"),
+    ("{gnss_label}", "{gnss[reason]}", "gnss_reason"),
+    ("Cloud", "{fit[cloud]} ({fit[points_sampled]:,} points sampled)", "fit"),
+    ("Visible", "share of points by number of cameras: {seen}", "fit"),
+    ("Distance", "{fit[distance_m]:,.1f} m in plan between block and cloud", "distance"),
+    ("Below ground", "{fit[below_ground]} cameras", "below_ground"),
+    ("Check", "{check}", "fit"),
 )  # fmt: skip
 
 
-def cameras_text(r: CamerasReport) -> str:
+def cameras_text(report: CamerasReport) -> str:
     """Return the summary of a camera file."""
-    cameras, missing, z = r.cameras, r.cameras.unposed, r.cameras.centres[:, 2]
+    r, cameras, z = report.figures, report.cameras, report.cameras.centres[:, 2]
+    missing, fit, gnss = cameras.unposed, r["fit"] or {}, r["gnss"] or {}
     images = f"{len(cameras):,} with a pose"
     if missing:
         more = ", ..." if len(missing) > SHOWN_NAMES else ""
         images += f", {len(missing):,} without: {', '.join(missing[:SHOWN_NAMES])}{more}"
-    values = vars(r) | {
-        "no_sensor": not r.sensors,
+    seen = [f"{name}: {100.0 * part:.1f} %" for name, part in fit.get("seen_by", {}).items()]
+    values = r | {
+        "no_sensor": not r["sensors"],
         "no_angles": cameras.rotations is None,
-        "crs": _short(r.crs_read) or "not stated",
-        "crs_of_cloud": (_short(cameras.crs) or "not stated") if cameras.crs != r.crs_read else "",
-        "z": () if r.problem else (z.min(), z.max(), z.mean()),
+        "crs": _short(r["crs_read"]) or "not stated",
+        "crs_of_cloud": (_short(r["crs"]) or "not stated") if r["crs"] != r["crs_read"] else "",
+        "z": () if r["problem"] else (z.min(), z.max(), z.mean()),
+        "some_gnss": gnss.get("images"),
+        "gnss_reason": gnss.get("reason"),
+        "gnss_label": "" if gnss.get("images") else "GNSS",
+        "seen": ", ".join(seen),
+        "distance": fit.get("distance_m"),
+        "below_ground": fit.get("below_ground"),
+        "check": fit.get("verdict") or fit.get("tested"),
     }
-    rows = [("Images", images), *(row for one in r.sensors for row in _sensor_rows(one))]
+    rows = [("Images", images), *(row for one in r["sensors"] for row in _sensor_rows(one))]
     rows += filled(_BLOCK, values)
-    if (g := r.gnss) is not None:
-        means, deviations = (
-            ", ".join("-" if v is None else f"{v:{sign}.3f}" for v in g[of])
-            for of, sign in (("mean_m", "+"), ("sd_m", ""))
-        )
-        some, words = g["images"] > 0, {"means": means, "deviations": deviations}
-        rows += filled(_GNSS, g | words | {"no_images": not some, "more": some and g["reason"]})
-    if (fit := r.fit) is not None:
-        seen = ", ".join(f"{name}: {100.0 * part:.1f} %" for name, part in fit.seen_by.items())
-        rows += filled(_FIT, vars(fit) | {"seen": seen, "check": fit.verdict or fit.tested})
-    if (found := r.diagnosis) is not None:
+    if (found := report.diagnosis) is not None:
         says = {True: "absorbed", False: "not absorbed", None: "open"}
         if found.absorbed:
-            verdict = found.sentence(*r.remedy)
+            verdict = found.sentence(*report.remedy)
         elif found.absorbed is False and found.decided_by is not None:
             verdict = f"the poses have not absorbed the refraction, by {found.decided_by.name}"
         else:
             verdict = f"not known; give control points (--gcps), or {export_of(cameras)}"
         rows.append(("Refraction", verdict))
         rows += [("", f"{s.name}: {says[s.speaks]}. {s.words}") for s in found.signs]
-    return aligned(f"{r.path}: {cameras.source or 'cameras'}", rows, cameras.notes)
+    return aligned(f"{r['path']}: {cameras.source or 'cameras'}", rows, cameras.notes)
 
 
 def _sensor_rows(s: Plain) -> Rows:

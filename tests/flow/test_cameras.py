@@ -67,9 +67,9 @@ def test_good_block(tmp_path):
 def test_likely_mistakes(tmp_path, change, said):
     path = table(tmp_path / "cameras.csv", change)
     report = check_cameras(path, cloud=CLOUD, sensor=SENSOR)
-    assert not report.fit.fits
-    assert said in report.fit.verdict
-    assert report.fit.verdict in cameras_text(report)
+    assert not report.figures["fit"]["fits"]
+    assert said in report.figures["fit"]["verdict"]
+    assert report.figures["fit"]["verdict"] in cameras_text(report)
 
 
 def test_wrong_angles(tmp_path):
@@ -78,8 +78,8 @@ def test_wrong_angles(tmp_path):
     text = [lines[0], *(",".join([*r[:4], r[4], "60", r[6]]) for r in rows)]
     (tmp_path / "cameras.csv").write_text("\n".join(text) + "\n")
     report = check_cameras(tmp_path / "cameras.csv", cloud=CLOUD, sensor=SENSOR)
-    assert "angles" in report.fit.verdict
-    assert report.tilt_deg[0] > 50.0
+    assert "angles" in report.figures["fit"]["verdict"]
+    assert report.figures["tilt_deg"][0] > 50.0
 
 
 def test_heights_above_the_water(tmp_path):
@@ -91,12 +91,12 @@ def test_heights_above_the_water(tmp_path):
 
     path = table(tmp_path / "cameras.csv", geocentric, "EPSG:4978")
     report = check_cameras(path, sensor=SENSOR, water=0.37)
-    assert report.problem
-    assert report.height_above_water_m is None
-    assert [sensor["gsd_m"] for sensor in report.sensors] == [None]
+    assert report.figures["problem"]
+    assert report.figures["height_above_water_m"] is None
+    assert [sensor["gsd_m"] for sensor in report.figures["sensors"]] == [None]
     below = check_cameras(CAMERAS, sensor=SENSOR, water=1000.0)
-    assert below.height_above_water_m[2] < 0.0
-    assert [sensor["gsd_m"] for sensor in below.sensors] == [None]
+    assert below.figures["height_above_water_m"][2] < 0.0
+    assert [sensor["gsd_m"] for sensor in below.figures["sensors"]] == [None]
 
 
 @sorolla
@@ -116,8 +116,8 @@ def test_heights_off_by_the_geoid(tmp_path):
         report = check_cameras(
             SOROLLA / "markers.xml", cloud=tmp_path / "cloud.las", cameras_crs="EPSG:25830"
         )
-    assert not report.fit.fits
-    assert "51.5 m above" in report.fit.verdict
+    assert not report.figures["fit"]["fits"]
+    assert "51.5 m above" in report.figures["fit"]["verdict"]
 
 
 LENS = Lens(3650.0, 5472.0, 3648.0, 2736.0, 1824.0, radial=(-0.02,), sensor="S")
