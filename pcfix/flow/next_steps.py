@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 from pcfix.flow.inputs import Inputs
 from pcfix.model import Cameras, WaterPlane
-from pcfix.options.declare import File, options_of
+from pcfix.options.declare import File, OptionSet
+from pcfix.options.shared import CameraFileOptions, ViewOptions, WaterOptions
 from pcfix.options.survey import AdjustOptions
 from pcfix.port.shapes import spec_of
 
@@ -26,11 +27,6 @@ FOLDER = "adjusted"
 """The folder of an adjustment in that of a run."""
 WATER = "water.tif"
 """The water of an adjustment, where it is not a plane and was adjusted."""
-READ_ALIKE = (
-    "sensor", "angles", "cameras_crs", "cameras_offset", "views", "views_are", "water_model",
-    "water_crs",
-)  # fmt: skip
-"""Options that `pcfix correct` and `pcfix adjust` have in common."""
 NO_DATUM = " (GNSS.csv has the positions of the images; control points, --gcps, serve as well)"
 
 
@@ -88,12 +84,10 @@ def _water(given: Any) -> str:
     return f"{given}" if known and not str(given).startswith("dim:") else "SPEC"
 
 
-def _flags(given: Any) -> list[str]:
-    """Return the common options that were given."""
+def _flags(given: OptionSet) -> list[str]:
+    """Return the options that `pcfix correct` and `pcfix adjust` have in common, as given."""
     words = []
-    for one in options_of(type(given)):
-        value = getattr(given, one.name)
-        if one.name in READ_ALIKE and value not in (None, one.default):
-            is_offset = one.name == "cameras_offset"
-            words += [one.flag, ",".join(f"{v:.12g}" for v in value) if is_offset else str(value)]
+    for kind in (WaterOptions, CameraFileOptions, ViewOptions):
+        for name, text in given.part(kind).plain().items():
+            words += [f"--{name.replace('_', '-')}", str(text)]
     return words

@@ -49,22 +49,20 @@ MOST_BASES, MOST_SPACINGS = 8, 4
 """Limits of the simulated block: farther inside, the geometry repeats."""
 FEWEST_SEEN, NOTHING_PX = 50, 1e-6
 PARTS = {
-    "image": ("sigma_image",), "level": ("sigma_level", "sigma_tilt"), "waves": ("sigma_waves",),
-    "index": ("sigma_index",), "poses": ("sigma_centre", "sigma_attitude"),
+    "image": (("sigma_image",), BEFORE,
+              "noise in the images: fly lower, or with more overlap or obliques"),
+    "level": (("sigma_level", "sigma_tilt"), WATER,
+              "the water level: measure it better, at the time of the flight"),
+    "waves": (("sigma_waves",), "#7a5195", "waves: wait for calmer water"),
+    "index": (("sigma_index",), "#8a8a8a",
+              "the refractive index: measure salinity and temperature"),
+    "poses": (("sigma_centre", "sigma_attitude"), "#58a55c",
+              "poses: use RTK or more control points"),
 }  # fmt: skip
-_COLOURS = {
-    "image": BEFORE, "level": WATER, "waves": "#7a5195", "index": "#8a8a8a", "poses": "#58a55c",
-}  # fmt: skip
+"""Parts of the error budget: their options, the colour in the figure, and the remedy."""
 USUAL_OVERLAP, USUAL_SIDELAP = 0.75, 0.65
 """Of Mulsow's flights over lakes (2024)."""
 LARGE_SHARE = 0.5
-_REMEDY = {
-    "image": "noise in the images: fly lower, or with more overlap or obliques",
-    "level": "the water level: measure it better, at the time of the flight",
-    "waves": "waves: wait for calmer water",
-    "index": "the refractive index: measure salinity and temperature",
-    "poses": "poses: use RTK or more control points",
-}
 
 
 class _Bed(NamedTuple):
@@ -188,7 +186,7 @@ def _budget(given: PlanOptions, bed: _Bed, part: str = "") -> Correction:
     options = _refraction(given)
     if part:
         off: dict[str, Any] = {
-            one.name: 0.0 for one in options_of(BudgetOptions) if one.name not in PARTS[part]
+            one.name: 0.0 for one in options_of(BudgetOptions) if one.name not in PARTS[part][0]
         }
         options = replace(options, **off)
     with warnings.catch_warnings():
@@ -365,7 +363,7 @@ def advice_of(plan: Plan) -> list[str]:
         )
     most = max(deepest.parts_m, key=lambda part: deepest.parts_m[part])
     if deepest.parts_m[most] ** 2 > LARGE_SHARE * deepest.sigma_m**2:
-        found.append(f"Most of the error at {deepest.depth_m:g} m is {_REMEDY[most]}.")
+        found.append(f"Most of the error at {deepest.depth_m:g} m is {PARTS[most][2]}.")
     found.append(
         "Poses: keep land and control points in the block, and run 'pcfix adjust'. Without them an"
         f" ordinary bundle adjustment absorbs {deepest.absorbed:.0%} of the refraction, and the bed"
@@ -404,7 +402,7 @@ def plan_figure(plan: Plan) -> Figure:
     block.set_title(f"{len(cameras):,} images, GSD {100.0 * plan.gsd_m:.2f} cm")
     beds = sorted(plan.depths, key=lambda one: one.depth_m)
     depth = [one.depth_m for one in beds]
-    for part, colour in _COLOURS.items():
+    for part, (_, colour, _) in PARTS.items():
         values = [100.0 * one.parts_m[part] for one in beds]
         errors.plot(depth, values, ".-", color=colour, label=part)
     total = [100.0 * one.sigma_m for one in beds]
