@@ -30,7 +30,7 @@ from pcfix.adjust.methods import (
     unknowns_of,
 )
 from pcfix.adjust.result import Adjusted
-from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError
+from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError, bad_file
 from pcfix.flow.inputs import Inputs, mask_of, paths_in
 from pcfix.flow.next_steps import WATER as WATER_FILE
 from pcfix.flow.surfaces import CloudView, view_of
@@ -219,11 +219,8 @@ def _check_surfaces(
     """Refuse points on water that does not exist, and unknown planes."""
     on = () if control is None else control.on
     if WATER in on and water is None:
-        raise InputError(
-            "gcps.no_water",
-            f"{name}: points have the role waterline, but there is no --water.",
-            path=name,
-        )
+        sentence = "points have the role waterline, but there is no --water."
+        raise bad_file(name, "gcps.no_water", sentence)
     known = list(dict.fromkeys(one for one in on if one and one != WATER))
     known += [WATER] if isinstance(water, WaterPlane) else []
     if parallel and (len(parallel) < 2 or not set(parallel) <= set(known)):

@@ -14,7 +14,7 @@ from pcfix.flow.diagnosis import diagnose, has_datum, quick_ties
 from pcfix.flow.inputs import Inputs, paths_in, ties_of
 from pcfix.flow.next_steps import adjust_words
 from pcfix.flow.plausibility import plausible
-from pcfix.flow.runner import check_summary, write_plot, write_summary
+from pcfix.flow.runner import check_summary, write_summary
 from pcfix.flow.surfaces import CloudView, sample_of, view_of
 from pcfix.io.cameras.georeference import adjusted_minus_gnss
 from pcfix.io.cameras.mistakes import UNDULATION_M, likely_mistake
@@ -120,9 +120,7 @@ def check_cameras(
         "notes": [str(note) for note in cameras.notes],
     }
     report = CamerasReport(figures, cameras, xyz, level, diagnosis, remedy)
-    if given.plot is not None:
-        write_plot(given, block_figure(report))
-    write_summary(given, figures)
+    write_summary(given, figures, lambda: block_figure(report))
     return report
 
 

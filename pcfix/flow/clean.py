@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from pcfix.blocks import empty, release
 from pcfix.clean.points import CleanSummary, Cloud, Reason, flag_neighbours, flag_weak
-from pcfix.errors import InputError
+from pcfix.errors import bad_file
 from pcfix.flow.runner import Chunk, Command, Progress, stream
 from pcfix.flow.surfaces import CloudView, Points, find_surface, points_of, view_of
 from pcfix.flow.tiles import run_command
@@ -155,12 +155,11 @@ def find_noise(
         if progress is not None:
             progress(count)
     if not used.any():
-        raise InputError(
-            "cloud.all_withheld",
-            f"{name}: all {n:,} points are withheld or noise (class 7 or 18). There is nothing left"
-            " to clean.",
-            path=name, points=n,
-        )  # fmt: skip
+        sentence = (
+            f"all {n:,} points are withheld or noise (class 7 or 18). There is nothing left to"
+            " clean."
+        )
+        raise bad_file(name, "cloud.all_withheld", sentence, points=n)
     if not rules.below_or_floating:
         submerged[:] = False
     elif water is not None:
@@ -234,12 +233,10 @@ def _plan_file(
             count, has_rays=has_rays,
         )  # fmt: skip
     if options.drop and noise.all():
-        raise InputError(
-            "cloud.all_noise",
-            f"{cloud}: every point is noise by these thresholds. Use wider thresholds, or leave"
-            " out --drop.",
-            path=cloud, points=points,
-        )  # fmt: skip
+        sentence = (
+            "every point is noise by these thresholds. Use wider thresholds, or leave out --drop."
+        )
+        raise bad_file(cloud, "cloud.all_noise", sentence, points=points)
     return CleanPlan(np.packbits(noise), options.drop, summary)
 
 

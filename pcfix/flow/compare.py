@@ -18,7 +18,7 @@ from pcfix.compare.m3c2 import load_py4dgeo
 from pcfix.compare.match import SurveyCloud, match
 from pcfix.compare.sections import parse_line
 from pcfix.errors import SettingError
-from pcfix.flow.runner import check_summary, json_text, write_plot, write_summary
+from pcfix.flow.runner import check_summary, json_text, write_summary
 from pcfix.io.atomic import all_or_none, output_folder
 from pcfix.io.clouds import check_same_crs, read_cloud, read_reference, reference_of
 from pcfix.io.files import check_output, scratch_arrays, write_text
@@ -29,6 +29,8 @@ from pcfix.options.shared import WaterOptions
 from pcfix.options.steps import CompareOptions, CompareRules
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from pcfix.flow.surfaces import CloudView
 
 
@@ -136,11 +138,13 @@ def _write(result: Comparison, given: CompareOptions) -> None:
             files |= {f"section_{n:02d}.csv": s.table() for n, s in sections}
             for name, content in files.items():
                 write_text(folder / name, content, overwrite=given.overwrite)
-        if given.plot is not None:
+
+        def figure() -> Figure:
             from pcfix.report.comparison import c2c_figure
 
-            write_plot(given, c2c_figure(result.as_dict()))
-        write_summary(given, result.as_dict())
+            return c2c_figure(result.as_dict())
+
+        write_summary(given, result.as_dict(), figure)
     if folder is not None:
         for path in folder.glob("section_*.csv"):
             if path.name not in files:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.errors import GeometryError, InputError, PcfixWarning
+from pcfix.errors import GeometryError, PcfixWarning, bad_file
 from pcfix.flow.inputs import paths_in
 from pcfix.flow.photos import CLOUDS, PhotoBlock, block_of, plain, warn_all
 from pcfix.flow.runner import Progress, check_summary, write_summary
@@ -123,13 +123,11 @@ def _write(
     def picture(row: int) -> Picture:
         pixels = read_colours(block.paths[row])
         if pixels.shape[2] != bands or pixels.dtype != dtype:
-            raise InputError(
-                "photos.kind",
-                f"{block.paths[row]}: has {pixels.shape[2]} bands of {pixels.dtype}, but"
-                f" {block.paths[0].name} {bands} of {dtype}. Give photographs of one kind.",
-                path=block.paths[row],
-                bands=pixels.shape[2],
+            sentence = (
+                f"has {pixels.shape[2]} bands of {pixels.dtype}, but {block.paths[0].name} {bands}"
+                f" of {dtype}. Give photographs of one kind."
             )
+            raise bad_file(block.paths[row], "photos.kind", sentence, bands=pixels.shape[2])
         return picture_of(pixels, shrunk, blanks=given.water is None)
 
     side = lattice.resolution_m

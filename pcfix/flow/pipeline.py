@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pcfix.errors import InputError, SettingError
+from pcfix.errors import SettingError, bad_file
 from pcfix.flow.planning import read_inputs
 from pcfix.flow.surfaces import view_of
 from pcfix.io.las.columns import UPGRADE, Column, columns_for
@@ -40,13 +40,11 @@ def pipeline_for(input: Path, output: Path, options: CorrectOptions) -> dict[str
     with LasSource(input) as source:
         point_format = source.header.point_format
     if UPGRADE[point_format.id] in (9, 10):
-        raise InputError(
-            "cloud.waveforms",
-            f"{input}: has waveforms (point format {point_format.id}), which PDAL does not write."
-            " Use 'pcfix correct'.",
-            path=input,
-            point_format=point_format.id,
+        sentence = (
+            f"has waveforms (point format {point_format.id}), which PDAL does not write. Use 'pcfix"
+            " correct'."
         )
+        raise bad_file(input, "cloud.waveforms", sentence, point_format=point_format.id)
     drop = options.uncorrected == "drop"
     dropping = {"type": "filters.range", "limits": f"{OUTCOME}[0:1]"}
     writer = {

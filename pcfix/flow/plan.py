@@ -24,7 +24,7 @@ from pcfix.errors import PcfixWarning, SettingError
 from pcfix.flow.cameras import draw_footprints
 from pcfix.flow.correct import correct_points
 from pcfix.flow.pose_errors import Sample, pose_errors
-from pcfix.flow.runner import check_summary, write_plot, write_summary
+from pcfix.flow.runner import check_summary, write_summary
 from pcfix.flow.surfaces import Points
 from pcfix.model import Cameras, Correction, FloatArray, TiePoints, Views, WaterPlane
 from pcfix.options.correct import BudgetOptions, RefractionOptions, ScienceOptions
@@ -140,9 +140,7 @@ def plan_flight(
         given, lay_out(scene).true, scene.gsd_m, base_m, spacing_m, off_nadir, tuple(beds),
         tuple(tried),
     )  # fmt: skip
-    if given.plot is not None:
-        write_plot(given, plan_figure(plan))
-    write_summary(given, plan.as_dict())
+    write_summary(given, plan.as_dict(), lambda: plan_figure(plan))
     return plan
 
 

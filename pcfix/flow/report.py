@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.errors import InputError
+from pcfix.errors import bad_file
 from pcfix.flow.next_steps import FOLDER
 from pcfix.flow.request import Files, Request, cameras_of, inputs_of_run, water_of
 from pcfix.flow.run_adjust import figures_of
@@ -145,13 +145,10 @@ def _read(path: Path | Tiles, resolution_m: float | None) -> Plain:
     with open_cloud(path) as source:
         dimensions = set(source.header.point_format.dimension_names)
         if missing := set(NEEDED) - dimensions:
-            raise InputError(
-                "cloud.dimension_missing",
-                f"{path}: has no dimensions {', '.join(sorted(missing))}. Correct it with"
-                " --dimensions all.",
-                path=path,
-                dimensions=sorted(missing),
+            sentence = (
+                f"has no dimensions {', '.join(sorted(missing))}. Correct it with --dimensions all."
             )
+            raise bad_file(path, "cloud.dimension_missing", sentence, dimensions=sorted(missing))
         builder = MapsBuilder(
             source.header.mins[:2], source.header.maxs[:2], len(source), resolution_m
         )

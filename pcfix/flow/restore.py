@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.errors import InputError
+from pcfix.errors import bad_file
 from pcfix.flow.runner import Chunk, Command, stream
 from pcfix.flow.tiles import run_command
 from pcfix.io.las.columns import SHIFTS, UNSURE, columns_for, convert, move
@@ -113,9 +113,5 @@ def _ours(source: LasSource, settings: dict[str, Any]) -> set[str]:
             if str(found) not in known:
                 wrong = f"has a dimension {column.name} of type {found}, not {column.dtype}"
     if wrong:
-        raise InputError(
-            "cloud.cannot_restore",
-            f"{source.path}: {wrong}. Use the original cloud.",
-            path=source.path,
-        )
+        raise bad_file(source.path, "cloud.cannot_restore", f"{wrong}. Use the original cloud.")
     return names

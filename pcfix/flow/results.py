@@ -10,7 +10,7 @@ from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pcfix.errors import InputError, SettingError
+from pcfix.errors import SettingError, bad_file
 from pcfix.flow.maps import BED, DEPTH, SHADED, SURFACE, UNCERTAINTY, contours_layer
 from pcfix.flow.request import Files, Request, read_record
 from pcfix.flow.run import RECORD, run_all
@@ -56,11 +56,8 @@ class RunResults:
         """The result of each step, from ``run.json``."""
         steps = read_record(self._file(RECORD))["steps"]
         if "report" not in steps:
-            raise InputError(
-                "run.unfinished",
-                f"{self.folder}: the run did not finish. Run it again; it resumes.",
-                path=self.folder,
-            )
+            sentence = "the run did not finish. Run it again; it resumes."
+            raise bad_file(self.folder, "run.unfinished", sentence)
         return {name: step["result"] for name, step in steps.items()}
 
     @property
@@ -151,7 +148,7 @@ class RunResults:
         path = self.folder / name
         if not path.is_file():
             why = f": {_WHY[name]}" if name in _WHY else ""
-            raise InputError("run.no_file", f"{path}: the run has not written it{why}.", path=path)
+            raise bad_file(path, "run.no_file", f"the run has not written it{why}.")
         return path
 
 

@@ -117,8 +117,9 @@ def stream(
     whole cloud. Returns the statistics, and the findings of the check.
     """
     with open_cloud(task.source, task.jobs, kept=task.kept or None) as source:
-        own, total, done = work(plan, source), len(source), 0
+        own, total = work(plan, source), len(source)
         tally, findings = None, None
+        done, end, reached = 0, 0, 0.0  # points before and after the chunk, and those reported
         # the index of a COPC file would be wrong
         evlrs = [one for one in source.evlrs if one.user_id != "copc"]
         last = evlrs, own.identity, task.jobs
@@ -127,37 +128,28 @@ def stream(
             def write(points: Chunk, result: Any) -> None:
                 append(own.apply(points, result))
 
+            def report(points: float) -> None:
+                nonlocal reached
+                reached = min(reached + points, end)
+                if task.progress is not None:
+                    task.progress(round(reached), total)
+
             written: Future[None] | None = None
             for points in read_ahead(source.chunks(), task.jobs):
-                report = _reporter(task.progress, done, len(points), total)
+                end = done + len(points)
                 with running(report=report):
                     result, one = own.compute(points, row + done)
                 if written is not None:
                     written.result()  # at most one chunk waits, which bounds the memory
                 written = writer.submit(write, points, result)
                 tally = one if tally is None else tally + one
-                done += len(points)
+                done = end
                 report(len(points))
             if written is not None:
                 written.result()
             if check is not None:  # before the temporary file is renamed
                 findings = check(tally)
     return tally, findings
-
-
-def _reporter(
-    progress: Progress | None, before: int, count: int, total: int
-) -> Callable[[float], None]:
-    """Return the function that reports the progress of a chunk, after `before` points."""
-    done = 0.0
-
-    def report(points: float) -> None:
-        nonlocal done
-        done = min(done + points, float(count))
-        if progress is not None:
-            progress(before + round(done), total)
-
-    return report
 
 
 def read_ahead(chunks: Iterator[Any], jobs: int | None) -> Iterator[Any]:
@@ -198,17 +190,16 @@ def check_summary(options: Any, inputs: Iterable[File] = ()) -> None:
             known.append(check_output(path, overwrite=options.overwrite, inputs=known))
 
 
-def write_summary(options: Any, summary: dict[str, Any]) -> None:
-    """Write a summary as JSON if the options, with overwrite, name a file for it."""
+def write_summary(
+    options: Any, summary: dict[str, Any], figure: Callable[[], Figure] | None = None
+) -> None:
+    """Write a summary as JSON and its figure as PNG, if the options name files for them."""
+    if figure is not None and options.plot is not None:
+        from pcfix.report.page import png_of
+
+        write_bytes(options.plot, png_of(figure()), overwrite=options.overwrite)
     if options.summary is not None:
         write_text(options.summary, json_text(summary), overwrite=options.overwrite)
-
-
-def write_plot(options: Any, figure: Figure) -> None:
-    """Write a figure to the PNG file that the options, with overwrite, name."""
-    from pcfix.report.page import png_of
-
-    write_bytes(options.plot, png_of(figure), overwrite=options.overwrite)
 
 
 def check_cloud(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) -> Path:

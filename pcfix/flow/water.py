@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.errors import plain, shown_once
-from pcfix.flow.runner import check_summary, write_plot, write_summary
+from pcfix.flow.runner import check_summary, write_summary
 from pcfix.flow.shore import check_shoreline, write_shoreline
 from pcfix.flow.surfaces import file_points, find_surface, sample_of, view_of
 from pcfix.grid.shoreline import NearWater
@@ -80,9 +80,7 @@ def check_water(
         )
     name = None if view is None else view.name
     report = WaterReport(str(spec), found, name, below, unknown, shoreline)
-    if given.plot is not None:
-        write_plot(given, water_figure(found, sample))
-    write_summary(given, report.as_dict())
+    write_summary(given, report.as_dict(), lambda: water_figure(found, sample))
     return report
 
 
