@@ -33,7 +33,7 @@ from pcfix.options.scenes import PlanOptions
 from pcfix.refract.batch import Survey
 from pcfix.refract.tally import COVERAGE_95, ORDERS, largest_tvu_m
 from pcfix.report.page import AFTER, BEFORE, REFERENCE, WATER, Table, label_plan, new_figure
-from pcfix.report.text import aligned
+from pcfix.report.text import RowTable, aligned, filled
 from pcfix.running import threads
 from pcfix.simulate.scene import lay_out, points_on
 from pcfix.simulate.settings import SceneSettings
@@ -348,42 +348,38 @@ def plan_text(plan: Plan) -> str:
     return "\n".join([aligned(head, flight), *table, *notes, "", *advice_of(plan)])
 
 
-def advice_of(plan: Plan) -> list[str]:
-    """Return advice on the flight and the day, a sentence or two each.
+_ADVICE: RowTable = (
+    ("", f"Overlap: fly {USUAL_OVERLAP:.0%} along and {USUAL_SIDELAP:.0%} across or more. Only"
+     " {rays:.0f} images see a point of the bed.", "is_sparse"),
+    ("", "Most of the error at {depth_m:g} m is {remedy}.", "is_one_part"),
+    ("", "Poses: keep land and control points in the block, and run 'pcfix adjust'. Without them an"
+     " ordinary bundle adjustment absorbs {absorbed:.0%} of the refraction, and the bed is"
+     " {off_m:.2f} m off.", "depth_m"),
+    ("", "Sun: fly under an overcast sky, or within 60 minutes of dawn or dusk (90 in winter)."
+     " {mirror}", "depth_m"),
+    ("", "Wind: wait for a calm day; {wind}. The water must be clear, the bed textured.",
+     "depth_m"),
+)  # fmt: skip
+"""Skarlatos & Agrafiotis 2018, section 3.3, for sun, wind, water and bed; overlaps after Mulsow."""
 
-    Skarlatos & Agrafiotis 2018, section 3.3, for sun, wind, water and bed; overlaps after Mulsow.
-    """
-    deepest, found = plan.deepest, list[str]()
-    if plan.options.overlap < USUAL_OVERLAP or plan.options.sidelap < USUAL_SIDELAP:
-        found.append(
-            f"Overlap: fly {USUAL_OVERLAP:.0%} along and {USUAL_SIDELAP:.0%} across or more. Only"
-            f" {deepest.rays:.0f} images see a point of the bed."
-        )
+
+def advice_of(plan: Plan) -> list[str]:
+    """Return advice on the flight and the day, a sentence or two each."""
+    given, deepest, sun = plan.options, plan.deepest, 90.0 - plan.flattest_deg
     most = max(deepest.parts_m, key=lambda part: deepest.parts_m[part])
-    if deepest.parts_m[most] ** 2 > LARGE_SHARE * deepest.sigma_m**2:
-        found.append(f"Most of the error at {deepest.depth_m:g} m is {PARTS[most][2]}.")
-    found.append(
-        "Poses: keep land and control points in the block, and run 'pcfix adjust'. Without them an"
-        f" ordinary bundle adjustment absorbs {deepest.absorbed:.0%} of the refraction, and the bed"
-        f" is {abs(deepest.left_m):.2f} m off."
-    )
-    sun = 90.0 - plan.flattest_deg
-    mirror = (
-        f"Below {sun:.0f} deg, no frame shows its reflection in calm water."
-        if sun > 0.0
-        else "Frames can show its reflection at any height of the sun."
-    )
-    found.append(
-        "Sun: fly under an overcast sky, or within 60 minutes of dawn or dusk (90 in winter)."
-        f" {mirror}"
-    )
-    wind = (
-        "'pcfix calm' combines frames taken through waves"
-        if plan.options.sigma_waves
-        else "see what --sigma-waves 1 adds"
-    )
-    found.append(f"Wind: wait for a calm day; {wind}. The water must be clear, the bed textured.")
-    return found
+    mirror = "Frames can show its reflection at any height of the sun."
+    if sun > 0.0:
+        mirror = f"Below {sun:.0f} deg, no frame shows its reflection in calm water."
+    waves = "'pcfix calm' combines frames taken through waves"
+    values = vars(deepest) | {
+        "is_sparse": given.overlap < USUAL_OVERLAP or given.sidelap < USUAL_SIDELAP,
+        "is_one_part": deepest.parts_m[most] ** 2 > LARGE_SHARE * deepest.sigma_m**2,
+        "remedy": PARTS[most][2],
+        "off_m": abs(deepest.left_m),
+        "mirror": mirror,
+        "wind": waves if given.sigma_waves else "see what --sigma-waves 1 adds",
+    }
+    return [text for _, text in filled(_ADVICE, values)]
 
 
 def plan_figure(plan: Plan) -> Figure:
