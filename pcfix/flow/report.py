@@ -22,7 +22,7 @@ from pcfix.io.las.columns import SHIFTS
 from pcfix.io.las.source import coordinates, stated_crs
 from pcfix.io.rasters import preview
 from pcfix.io.tiles import Tiles, open_cloud
-from pcfix.model import NOISE_CLASSES, Cameras, WaterSurface
+from pcfix.model import NOISE_CLASSES
 from pcfix.report.adjustment import adjustment_tables
 from pcfix.report.comparison import evaluation, in_a_sentence
 from pcfix.report.page import Picture, Report, Table, render
@@ -78,13 +78,14 @@ def report_run(
     cameras = cameras_of(request, files)
     if (summary.water_fit or {}).get("model") == "auto":  # the water was sought in the cloud
         pictures.append(found_picture(again.surface(view_of(request.source))))
-    page = write_report(
-        files.cleaned_cloud, files.folder, summary=summary, cameras=cameras,
-        water=water_of(request, files), inputs=inputs, resolution_m=files.resolution_m,
+    run = RunResults(
+        summary, cameras, water_of(request, files),
+        **read_cloud(files.cleaned_cloud, files.resolution_m),
         project=request.project or "", date=request.date or again.dates(cameras),
         pictures=pictures, tables=tables, verdict=verdict, compared=compared.get("figures", {}),
         difference=dod,
     )  # fmt: skip
+    page = write_report(run, inputs, files.folder)
     return {
         "in_short": in_short(page.tiles),
         "uncertainty": uncertainty_sentence(summary, compared.get("figures", {}).get("tvu")),
@@ -94,26 +95,12 @@ def report_run(
     }
 
 
-def write_report(
-    corrected: Path | Tiles,
-    out_dir: Path,
-    *,
-    summary: Summary,
-    cameras: Cameras,
-    water: WaterSurface,
-    inputs: Sequence[Path],
-    resolution_m: float | None = None,
-    **more: Any,
-) -> Report:
-    """Write ``report.html`` and ``figures/*.png`` about a corrected cloud, into an existing folder.
+def write_report(run: RunResults, inputs: Sequence[Path], out_dir: Path) -> Report:
+    """Write ``report.html`` and ``figures/*.png`` of a run, into an existing folder.
 
-    `corrected` is from `correct_file` with all dimensions, cleaned or not; `summary`, `cameras` and
-    `water` are its result and its inputs. The page lists size and checksum of the files `inputs`.
-    `resolution_m` is that of the rasters; `more` are the results of other steps of a run, see
-    `pcfix.report.run.RunResults`.
+    The page lists size and checksum of the files `inputs`.
     """
     rows = [[path.name, f"{path.stat().st_size:,}", sha256(path)] for path in inputs]
-    run = RunResults(summary, cameras, water, **_read(corrected, resolution_m), **more)
     table = Table("Input files", ["file", "bytes", "SHA-256"], rows)
     report = run_report(run, table, _beside(out_dir))
     figures = out_dir / "figures"
@@ -137,10 +124,11 @@ def _beside(folder: Path) -> list[tuple[str, str]]:
     ]
 
 
-def _read(path: Path | Tiles, resolution_m: float | None) -> Plain:
+def read_cloud(path: Path | Tiles, resolution_m: float | None = None) -> Plain:
     """Return maps, depths, a sample, CRS and vertical datum of a cloud, without noise.
 
-    The names are those of `RunResults`.
+    The cloud is from `correct_file` with all dimensions, cleaned or not. The names are those of
+    `RunResults`; `resolution_m` is that of the rasters.
     """
     with open_cloud(path) as source:
         dimensions = set(source.header.point_format.dimension_names)

@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.flow.report import write_report
+from pcfix.flow.report import read_cloud, write_report
 from pcfix.grid.maps import MapsBuilder
 from pcfix.report.map_data import Layer
 from pcfix.report.page import Report, Table, Tile, render
+from pcfix.report.run import RunResults
 from tests.utils.browser import needs_browser, open_page
 
 SCENE = Path(__file__).parents[2] / "samples" / "scene"
@@ -31,10 +32,9 @@ def report(tmp_path_factory):
     summary = pcfix.correct_file(
         cloud, folder / "corrected.laz", cameras=cameras, water=0.37, method="snell", max_angle=None
     )
-    write_report(
-        folder / "corrected.laz", folder, summary=summary,
-        cameras=pcfix.read_cameras(cameras), water=pcfix.read_water(0.37), inputs=[cloud, cameras],
-    )  # fmt: skip
+    water, found = pcfix.read_water(0.37), read_cloud(folder / "corrected.laz")
+    run = RunResults(summary, pcfix.read_cameras(cameras), water, **found)
+    write_report(run, [cloud, cameras], folder)
     return folder, summary
 
 
