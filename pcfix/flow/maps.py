@@ -14,6 +14,7 @@ import shapely
 from pcfix.compare.sections import SectionLine, lines_downslope
 from pcfix.errors import GeometryError
 from pcfix.flow.dsm import BLOCK_CELLS, grid_dsm, point_spacing_m
+from pcfix.flow.request import SURFACE, Files, Request, cameras_of, water_of
 from pcfix.flow.runner import Progress
 from pcfix.flow.shore import shoreline_layer
 from pcfix.flow.surfaces import points_of, view_of
@@ -33,7 +34,8 @@ from pcfix.options.declare import File
 from pcfix.options.steps import DsmOptions
 from pcfix.water.surface import surface_above
 
-SURFACE, BED, DEPTH, UNCERTAINTY = "surface.tif", "bed.tif", "depth.tif", "uncertainty.tif"
+Plain = dict[str, Any]
+BED, DEPTH, UNCERTAINTY = "bed.tif", "depth.tif", "uncertainty.tif"
 COUNTS, SHADED = "surface_counts.tif", "shaded.tif"
 HOLE_CELLS = 3.0
 """Width of holes that are filled: of cells with random points, one in twenty is empty."""
@@ -53,14 +55,14 @@ def raster_files(folder: Path, *, errors: bool) -> list[Path]:
 
 
 def write_rasters(
-    cloud: Path | Tiles, folder: Path, *, resolution: float | None, cameras: Cameras, errors: bool,
-    progress: Progress | None = None,
-) -> dict[str, Any]:  # fmt: skip
+    request: Request, files: Files, *, errors: bool, progress: Progress | None = None
+) -> Plain:
     """Write all rasters of a corrected cloud as cloud optimised GeoTIFF, with styles for QGIS.
 
     By default the cells have 2 to 4 points, and are no smaller than a pixel on the ground. Returns
     the facts for ``run.json``.
     """
+    folder, cloud, cameras = files.folder, files.cleaned_cloud, cameras_of(request, files)
     gsd_m = None  # a pixel on the ground at nadir, median
     if cameras.lenses:
         with open_cloud(cloud) as source:
@@ -68,7 +70,7 @@ def write_rasters(
         focal = np.array([lens.focal_px for lens in cameras.lenses])
         gsd_m = float(np.median((cameras.centres[:, 2] - middle) / focal))
     spacing_m = point_spacing_m(cloud, folder / SURFACE)
-    cell_m = resolution or round_resolution(spacing_m, gsd_m or 0.0)
+    cell_m = request.resolution or round_resolution(spacing_m, gsd_m or 0.0)
     plain = DsmOptions(resolution=cell_m, cog=True, style=True, overwrite=True)
     filled = replace(plain, fill=HOLE_CELLS * cell_m)
     asked = {
@@ -95,7 +97,7 @@ def write_rasters(
     }
 
 
-def resolution_sentence(facts: dict[str, Any], *, given: bool) -> str:
+def resolution_sentence(facts: Plain, *, given: bool) -> str:
     """Return the size of the cells of the rasters, and its reason."""
     density, gsd_m = facts["points_per_cell"], facts["gsd_m"]
     parts = [] if density is None else [f"{density:.1f} points each"]
@@ -139,37 +141,29 @@ def _write_shaded(folder: Path) -> None:
         rasters.copy_as_cog(plain, draft)
 
 
-def write_map(
-    path: Path,
-    cloud: Path | Tiles,
-    folder: Path,
-    *,
-    water: WaterSurface,
-    sigma_level_m: float | None,
-    cameras: Cameras,
-    unused: Sequence[str],
-    sections: Sequence[Mapping[str, float]],
-    check_points: FloatArray,
-    check_depths: File | None,
-) -> dict[str, int]:
-    """Write all layers of a run in a folder; return how many features each has.
+def write_map(request: Request, files: Files, corrected: Plain, compared: Plain) -> dict[str, int]:
+    """Write all layers of a run; return how many features each has.
 
-    `sigma_level_m` is the standard error of the water level, None where unknown; `sections` are the
-    lines of the comparison; `check_points`, shape (n, 4), are x, y, reference height, and cloud
-    minus reference.
+    `corrected` and `compared` are the results of these steps. The height of the water has one
+    standard error for all places.
     """
+    folder, cloud = files.folder, files.cleaned_cloud
     shapes = rasters.outlines(folder / DEPTH, MOST_CELLS)
     area = shapely.area(np.array(shapes, object)) if shapes else np.zeros(0)
     style = vector_style({"area": Symbol("fill", DARK, 0.5)})
+    known = request.sigma_level, (corrected["water_fit"] or {}).get("sigma_level_m"), LEVEL_M
+    sigma_m = next(one for one in known if one is not None)
+    # x, y, reference height, and cloud minus reference
+    points = np.array(compared.get("check_points", [])).reshape(-1, 4)
     layers = [
         Layer("corrected_area", "Polygon", shapes, {"area_m2": area}, style),
         contours_layer(folder),
-        _waterline(cloud, water, LEVEL_M if sigma_level_m is None else sigma_level_m),
-        _sections(sections, folder),
-        _cameras(cameras, unused),
-        *_checks(folder, check_points, check_depths),
+        _waterline(cloud, water_of(request, files), sigma_m),
+        _sections(compared.get("figures", {}).get("sections", []), folder),
+        _cameras(cameras_of(request, files), corrected["cameras_unused"]),
+        *_checks(folder, points, request.check_depths),
     ]
-    write_layers(path, layers, view_of(cloud).crs, overwrite=True)
+    write_layers(files.map, layers, view_of(cloud).crs, overwrite=True)
     return {one.name: len(one.geometries) for one in layers}
 
 

@@ -13,7 +13,6 @@ from typing import Any
 
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.inputs import Inputs, paths_in, read_blocks
-from pcfix.flow.maps import SURFACE
 from pcfix.flow.next_steps import FOLDER
 from pcfix.flow.runner import json_text
 from pcfix.flow.surfaces import view_of
@@ -30,6 +29,7 @@ from pcfix.options.survey import RunOptions
 from pcfix.version import __version__
 from pcfix.water.index import Water, with_index
 
+SURFACE = "surface.tif"
 VERSION = "pcfix"
 """Of a request: which version of pcfix did it."""
 STEPS = ("adjust", "correct", "clean", "dsm", "compare", "map", "report")

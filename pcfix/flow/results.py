@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pcfix.errors import SettingError, bad_file
-from pcfix.flow.maps import BED, DEPTH, SHADED, SURFACE, UNCERTAINTY, contours_layer
-from pcfix.flow.request import Files, Request, read_record
+from pcfix.flow.maps import BED, DEPTH, SHADED, UNCERTAINTY, contours_layer
+from pcfix.flow.request import SURFACE, Files, Request, read_record
 from pcfix.flow.run import RECORD, run_all
 from pcfix.flow.runner import Bar, no_bar
 from pcfix.io import rasters, vectors

@@ -10,8 +10,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from pcfix.compare.m3c2 import load_py4dgeo
 from pcfix.errors import PcfixWarning, SettingError
 from pcfix.flow.clean import clean_file
@@ -20,7 +18,7 @@ from pcfix.flow.correct import correct_file
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.maps import SECTIONS, raster_files, resolution_sentence, write_map, write_rasters
 from pcfix.flow.report import report_run
-from pcfix.flow.request import Files, Record, Request, cameras_of, water_of
+from pcfix.flow.request import Files, Record, Request
 from pcfix.flow.run_adjust import adjust_first, figures_of, outputs_of
 from pcfix.flow.runner import Bar, Progress, no_bar
 from pcfix.flow.shore import check_shoreline
@@ -114,10 +112,7 @@ def run_all(
     outputs = raster_files(out_dir, errors=errors)
     made, done = step(
         "dsm", "Gridding", outputs,
-        lambda progress: write_rasters(
-            files.cleaned_cloud, out_dir, resolution=request.resolution,
-            cameras=cameras_of(request, files), errors=errors, progress=progress,
-        ),
+        lambda progress: write_rasters(request, files, errors=errors, progress=progress),
     )  # fmt: skip
     given = request.resolution is not None
     say(f"{done}{outputs[0]}{resolution_sentence(made, given=given)}")
@@ -135,7 +130,7 @@ def run_all(
     else:
         _, done = step(
             "map", "Drawing the map", [files.map],
-            lambda _: _draw_map(request, files, corrected, compared),
+            lambda _: write_map(request, files, corrected, compared),
         )  # fmt: skip
         say(f"{done}{files.map}")
 
@@ -205,18 +200,3 @@ def _compare(request: Request, files: Files) -> Plain:
     ]
     points = [] if result.check_points is None else result.check_points.tolist()
     return {"figures": result.as_dict(), "sections": sections, "check_points": points}
-
-
-def _draw_map(request: Request, files: Files, corrected: Plain, compared: Plain) -> dict[str, int]:
-    """Write the vector layers; the water's height has one standard error for all places."""
-    fitted = (corrected["water_fit"] or {}).get("sigma_level_m")
-    return write_map(
-        files.map, files.cleaned_cloud, files.folder,
-        water=water_of(request, files),
-        sigma_level_m=fitted if request.sigma_level is None else request.sigma_level,
-        cameras=cameras_of(request, files),
-        unused=corrected["cameras_unused"],
-        sections=compared.get("figures", {}).get("sections", []),
-        check_points=np.array(compared.get("check_points", [])).reshape(-1, 4),
-        check_depths=request.check_depths,
-    )  # fmt: skip
