@@ -13,7 +13,7 @@ from pcfix.errors import GeometryError, PcfixWarning, coded
 from pcfix.flow.correction import CloudTally, Plan
 from pcfix.flow.plausibility import CloudSample, Plausible, plausible
 from pcfix.flow.runner import Ends
-from pcfix.model import Cameras, FloatArray, Outcome, TiePoints, WaterDimension
+from pcfix.model import Cameras, Outcome, TiePoints, WaterDimension
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import UNLISTED
 from pcfix.refract.reconstructions import CAUSES
@@ -86,7 +86,15 @@ def check(plan: Plan, tally: CloudTally) -> Findings:
     ties = quick_ties(plan.inputs, plan.view.crs) if len(plan.cameras) else None
     tested = check_fit(plan, tally, ties)
     poses = diagnose_in_passing(plan, ties)
-    return Findings(tested, poses, _write_shoreline(plan, tally), tuple(water_notes))
+    shoreline, options = None, plan.options
+    if tally.shore is not None and options.shoreline is not None:
+        from pcfix.flow.shore import write_shoreline
+
+        shoreline = write_shoreline(
+            options.shoreline, tally.shore, plan.found, plan.view.crs,
+            overwrite=options.overwrite, sigma_level_m=options.sigma_level,
+        )  # fmt: skip
+    return Findings(tested, poses, shoreline, tuple(water_notes))
 
 
 def _view_report(plan: Plan, tally: CloudTally) -> ViewReport | None:
@@ -134,20 +142,6 @@ def check_fit(plan: Plan, tally: CloudTally, ties: TiePoints | None = None) -> P
     for doubt in tested.doubts:
         warnings.warn(doubt, stacklevel=3)
     return tested
-
-
-def _write_shoreline(plan: Plan, tally: CloudTally) -> dict[str, Any] | None:
-    """Write the shoreline if it is asked for; return its figures."""
-    path, stated = plan.options.shoreline, plan.options.sigma_level
-    if tally.shore is None or path is None:
-        return None
-    from pcfix.flow.shore import write_shoreline
-
-    def sigma(xy: FloatArray) -> FloatArray | None:
-        return plan.found.sigma_at(xy) if stated is None else np.full(len(xy), stated)
-
-    overwrite = plan.options.overwrite
-    return write_shoreline(path, tally.shore, sigma, plan.view.crs, overwrite=overwrite)
 
 
 def _detected(plan: Plan, tally: CloudTally) -> list[PcfixWarning]:

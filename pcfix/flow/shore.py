@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from pcfix.io.vectors import Layer, check_layers, write_layers
 from pcfix.model import FloatArray
 from pcfix.options.correct import LEVEL_M
 from pcfix.options.declare import File
+from pcfix.water.surface import FoundSurface
 
 LAYER = "shoreline"
 
@@ -25,21 +26,18 @@ def check_shoreline(path: File | None, *, overwrite: bool, inputs: Iterable[File
 
 
 def write_shoreline(
-    path: File,
-    points: NearWater,
-    sigma_level_m: Callable[[FloatArray], FloatArray | None],
-    crs: Any,
-    *,
-    overwrite: bool,
-) -> dict[str, Any]:
+    path: File, points: NearWater, water: FoundSurface, crs: Any, *, overwrite: bool,
+    sigma_level_m: float | None = None,
+) -> dict[str, Any]:  # fmt: skip
     """Write the lines of a cloud in its CRS, and return their figures for the summary.
 
-    The standard error of the water's height is `LEVEL_M` if `sigma_level_m` returns none.
+    The standard error of the water's height is `sigma_level_m`, else that of a fit, else `LEVEL_M`.
     """
+    stated = LEVEL_M if sigma_level_m is None else sigma_level_m
 
     def sigma(xy: FloatArray) -> FloatArray:
-        known = sigma_level_m(xy)
-        return np.full(len(xy), LEVEL_M) if known is None else known
+        fitted = water.sigma_at(xy) if sigma_level_m is None else None
+        return np.full(len(xy), stated) if fitted is None else fitted
 
     lines = points.lines(sigma)
     layer = shoreline_layer(LAYER, lines)

@@ -76,7 +76,7 @@ def check_water(
             above = surface_above(found.surface, one.xyz, one.heights)
             points += NearWater.of(one.xyz, one.xyz[:, 2] - above.height_m)
         shoreline = write_shoreline(
-            given.shoreline, points, found.sigma_at, view.crs, overwrite=given.overwrite
+            given.shoreline, points, found, view.crs, overwrite=given.overwrite
         )
     name = None if view is None else view.name
     report = WaterReport(str(spec), found, name, below, unknown, shoreline)
