@@ -122,14 +122,6 @@ def first_points(chunks: Iterable[Points]) -> Points:
     return joined_points(parts)
 
 
-def every(step: int, chunks: Iterable[Points]) -> Iterator[Points]:
-    """Yield every `step`-th point of a cloud, chunk by chunk."""
-    row = 0
-    for one in chunks:
-        yield one.take(slice(-row % step, None, step))
-        row += len(one.xyz)
-
-
 def joined_points(parts: Iterable[Points]) -> Points:
     """Return consecutive points as one, with the attributes that all of them have."""
     columns: list[Any] = [
@@ -141,7 +133,11 @@ def joined_points(parts: Iterable[Points]) -> Points:
 
 def sample_of(view: CloudView, most: int, water: WaterSurface | None = None) -> Points:
     """Return about `most` points, evenly spread over a cloud."""
-    return joined_points(every(max(1, view.points // most), view.chunks(water)))
+    step, row, parts = max(1, view.points // most), 0, list[Points]()
+    for one in view.chunks(water):
+        parts.append(one.take(slice(-row % step, None, step)))
+        row += len(one.xyz)
+    return joined_points(parts)
 
 
 def points_of(chunk: Chunk, source: LasSource, water: WaterSurface | None) -> Points:
