@@ -61,11 +61,11 @@ def test_every_sign():
         BENT / "sparse", cloud=BENT / "cloud.las", water=LEVEL_M, cameras_offset=OFFSET_M,
         gnss=BENT / "gnss.csv", gcps=BENT / "gcps.csv", reference=TRUE / "lidar.laz",
     )  # fmt: skip
-    signs = report.as_dict()["refraction"]["signs"]
+    signs = report.figures["refraction"]["signs"]
     assert {sign["name"] for sign in signs} == {"tie points", "GNSS", "bed", "land"}
     assert all(sign["absorbed"] for sign in signs)
     # the README of the data: the land is 0.96 m too low
-    assert report.as_dict()["refraction"]["likely_error_m"] == pytest.approx(0.96, abs=0.05)
+    assert report.figures["refraction"]["likely_error_m"] == pytest.approx(0.96, abs=0.05)
     text = cameras_text(report)
     assert "The poses have absorbed the refraction" in text
     assert "--gcps" in text
@@ -89,7 +89,7 @@ def test_no_sign():
     )  # fmt: skip
     assert report.diagnosis.absorbed is False
     assert not any(sign.speaks for sign in report.diagnosis.signs)
-    assert report.as_dict()["refraction"]["likely_error_m"] is None
+    assert report.figures["refraction"]["likely_error_m"] is None
 
 
 def test_command():
