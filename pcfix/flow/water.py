@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from pcfix.model import FloatArray, WaterDimension
 from pcfix.options.declare import taken
 from pcfix.options.survey import WaterCheckOptions
 from pcfix.report.page import AFTER, BEFORE, WATER, Picture, draw_cloud, label_plan, new_figure
-from pcfix.report.text import Rows, RowTable, aligned, filled, shoreline_rows
+from pcfix.report.text import Plain, Rows, RowTable, aligned, filled, shoreline_rows
 from pcfix.water.auto import WaterProposal
 from pcfix.water.fit import ShoreFit, WaterFit
 from pcfix.water.river import RiverFit
@@ -71,56 +70,45 @@ def check_water(
             unknown = float(np.mean(~np.isfinite(height)))
             below = float(np.mean(sample[:, 2] < height))
     if view is not None and given.shoreline is not None:
-        points = NearWater()
+        near = NearWater()
         for one in file_points(Path(view.name), found.surface):
             above = surface_above(found.surface, one.xyz, one.heights)
-            points += NearWater.of(one.xyz, one.xyz[:, 2] - above.height_m)
+            near += NearWater.of(one.xyz, one.xyz[:, 2] - above.height_m)
         shoreline = write_shoreline(
-            given.shoreline, points, found, view.crs, overwrite=given.overwrite
+            given.shoreline, near, found, view.crs, overwrite=given.overwrite
         )
-    name = None if view is None else view.name
-    report = WaterReport(str(spec), found, name, below, unknown, shoreline)
-    write_summary(given, report.as_dict(), lambda: water_figure(found, sample))
-    return report
+    points = None
+    if isinstance(found, ShoreFit):
+        columns = found.points, found.residual_m, found.accepted
+        points = [
+            {"xyz": xyz, "residual_m": residual, "accepted": accepted}
+            for xyz, residual, accepted in zip(*columns, strict=True)
+        ]
+    figures = plain({
+        "water": str(spec),
+        "surface": str(found.surface),
+        "fit": found.as_dict(),
+        "points": points,
+        "cloud": None if view is None else view.name,
+        "share_below": below,  # of the points of the cloud
+        "share_unknown": unknown,  # of those without a surface above them
+        "shoreline": shoreline,
+        "notes": list(map(str, found.notes)),
+    })  # fmt: skip
+    write_summary(given, figures, lambda: water_figure(found, sample))
+    return WaterReport(found, figures)
 
 
-@dataclass(frozen=True, eq=False)
-class WaterReport:
+class WaterReport(NamedTuple):
     """The report of ``pcfix water``."""
 
-    spec: str
     found: FoundSurface
-    cloud: str | None
-    below: float | None  # share of the cloud's points below the surface
-    unknown: float | None  # share of those without a surface above them
-    shoreline: dict[str, Any] | None = None  # file, lines and length of the one that was written
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values, ready for JSON."""
-        found, points = self.found, None
-        if isinstance(found, ShoreFit):
-            columns = found.points, found.residual_m, found.accepted
-            points = [
-                {"xyz": xyz, "residual_m": residual, "accepted": accepted}
-                for xyz, residual, accepted in zip(*columns, strict=True)
-            ]
-        values: dict[str, Any] = plain({
-            "water": self.spec,
-            "surface": str(found.surface),
-            "fit": found.as_dict(),
-            "points": points,
-            "cloud": self.cloud,
-            "share_below": self.below,
-            "share_unknown": self.unknown,
-            "shoreline": self.shoreline,
-            "notes": list(map(str, found.notes)),
-        })  # fmt: skip
-        return values
+    figures: Plain  # as JSON holds them
 
 
 def water_text(report: WaterReport) -> str:
     """Return the summary of a water surface."""
-    found, rows = report.found, list[tuple[str, str]]()
+    (found, r), rows = report, list[tuple[str, str]]()
     if isinstance(found, ShoreFit):
         rows = _fit_rows(found)
     elif isinstance(found, WaterProposal):
@@ -129,11 +117,12 @@ def water_text(report: WaterReport) -> str:
              f" confidence {found.confidence:.2f}"),
             *(("Evidence", reason) for reason in found.reasons),
         ]  # fmt: skip
-    if report.below is not None and report.unknown is not None:
-        rows.append(("Cloud", f"{100.0 * report.below:.1f} % of {report.cloud} are below the"
-                     f" surface, {100.0 * report.unknown:.1f} % have none above them"))  # fmt: skip
-    rows += shoreline_rows(report.shoreline)
-    return aligned(f"{report.spec}: {found.surface}", rows, found.notes)
+    if r["share_below"] is not None:
+        below, unknown = 100.0 * r["share_below"], 100.0 * r["share_unknown"]
+        words = f"{below:.1f} % of {r['cloud']} are below the surface, {unknown:.1f} % have none"
+        rows.append(("Cloud", f"{words} above them"))
+    rows += shoreline_rows(r["shoreline"])
+    return aligned(f"{r['water']}: {r['surface']}", rows, found.notes)
 
 
 def _fit_rows(fit: ShoreFit) -> Rows:
