@@ -130,8 +130,8 @@ def calm_frames(
 
     with threads(given.jobs), scratch_arrays(target) as empty:
         view, crs = _view(given, found) if given.surface else (None, None)
-        ways, scatter = _registered(found, count(found), still=given.still)
-        median, spread, stack = _median(found, ways, empty, count(found))
+        homographies, scatter = _registered(found, count(found), still=given.still)
+        median, spread, stack = _median(found, homographies, empty, count(found))
         notes, water = list[PcfixWarning](), None
         if view is not None:
             interval = given.interval * given.every if given.interval else found.interval_s
@@ -154,7 +154,7 @@ def calm_frames(
     write_calm(target, found, median)
     write_spread(beside, spread)
     middle = np.array([0.5 * found.columns, 0.5 * found.rows, 1.0])
-    moved = ways @ middle
+    moved = homographies @ middle
     warn_all(notes)
     summary = CalmSummary(
         input=str(frames), output=str(out), spread_file=str(beside), frames=len(found.names),
@@ -174,8 +174,8 @@ def _registered(
     """Register all frames to the first as `register`, unless the camera stood still."""
     if still:
         return np.tile(np.eye(3), (len(frames.names), 1, 1)), np.empty(0)
-    ways, scatter = register(np.stack(list(corners_in(images))))
-    lost = np.flatnonzero(~np.isfinite(ways).all(axis=(1, 2)))
+    homographies, scatter = register(np.stack(list(corners_in(images))))
+    lost = np.flatnonzero(~np.isfinite(homographies).all(axis=(1, 2)))
     if len(lost):
         names = [frames.names[row] for row in lost]
         raise InputError(
@@ -184,11 +184,11 @@ def _registered(
             f" first, such as {names[0]}. Leave them out, or begin with another.",
             frames=names,
         )
-    return ways, scatter
+    return homographies, scatter
 
 
 def _median(
-    frames: Frames, ways: FloatArray, empty: Callable[..., Any], images: Iterable[Any]
+    frames: Frames, homographies: FloatArray, empty: Callable[..., Any], images: Iterable[Any]
 ) -> tuple[npt.NDArray[Any], FloatArray, Any]:
     """Return the median, its spread, and the registered frames, which are on disk."""
     stack: Any = None
@@ -203,15 +203,15 @@ def _median(
                 frame=frames.names[number],
                 bands=frame.shape[2],
             )
-        same = np.array_equal(ways[number], np.eye(3))
-        stack[number] = frame if same else laid(frame, ways[number])
+        same = np.array_equal(homographies[number], np.eye(3))
+        stack[number] = frame if same else laid(frame, homographies[number])
     shape = stack.shape[1:3]
     median = np.empty(stack.shape[1:], stack.dtype)
     spread = np.empty(shape, np.float32)
     at_once = max(1, SORTED_BYTES // (4 * stack[:, 0].size))
     for top in range(0, shape[0], at_once):
         bottom = min(top + at_once, shape[0])
-        known = np.stack([covered(one, shape, top, bottom) for one in ways])
+        known = np.stack([covered(one, shape, top, bottom) for one in homographies])
         median[top:bottom], spread[top:bottom] = median_of(stack[:, top:bottom], known)
         release()
     return median, spread, stack

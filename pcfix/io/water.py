@@ -234,8 +234,8 @@ def read_water_raster(
         warnings.warn(note, stacklevel=3)
     if to_cloud is None and t.b == t.d == 0.0 and t.a > 0.0 > t.e:  # north-up in the cloud's CRS
         return WaterRaster(heights, float(t.c), float(t.f), (float(t.a), float(-t.e)), title)
-    ways = to_cloud or (lambda xyz: xyz), from_cloud
-    return _resampled(heights, t, *ways, bounds, (name, title))
+    transforms = to_cloud or (lambda xyz: xyz), from_cloud
+    return _resampled(heights, t, *transforms, bounds, (name, title))
 
 
 def rasters_of_images(

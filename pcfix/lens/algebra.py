@@ -106,6 +106,10 @@ def normal_of(b: float, c: float) -> Vector:
     return -b * up, -c * up, up
 
 
+NO_SQUARES: Symmetric = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+"""Where a sum of `plus_square` begins."""
+
+
 @device
 def plus_square(m: Symmetric, a: Vector) -> Symmetric:
     """Return m + a a'."""

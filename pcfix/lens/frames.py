@@ -204,13 +204,9 @@ def holds(frames: Frames, c: int, e: Vector) -> bool:
 
 @device
 def mark(
-    marks: FloatArray,
-    points: FloatArray,
-    run: int,
-    frames: Frames,
-    c: int,
+    marks: FloatArray, points: FloatArray, run: int, frames: Frames, c: int,
     centre: FloatArray | Vector,
-) -> bool:
+) -> bool:  # fmt: skip
     """Set to 1 the marks of points in the frame of camera c, to 0 those of others.
 
     The points are runs of `run` x, y and z. It is `holds` for many of them; returns whether the

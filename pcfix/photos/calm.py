@@ -117,27 +117,27 @@ def register(places: FloatArray) -> tuple[FloatArray, FloatArray]:
     cv2 = photo_library("cv2")
     found = np.isfinite(places[..., 0])
     often = found & (found.sum(axis=0) >= max(2, len(places) // 2))
-    ways = np.full((len(places), 3, 3), np.nan)
-    for way, there, known in zip(ways, places, often & often[0], strict=True):
+    homographies = np.full((len(places), 3, 3), np.nan)
+    for one, there, known in zip(homographies, places, often & often[0], strict=True):
         if known.sum() >= LEAST_CORNERS:
             first = cv2.findHomography(there[known], places[0][known], cv2.RANSAC, OUTLIER_PX)[0]
-            way[:] = np.nan if first is None else first
+            one[:] = np.nan if first is None else first
     scatter = np.empty(0)
     for _ in range(ROUNDS):
-        on = np.stack([_moved(way, there) for way, there in zip(ways, places, strict=True)])
+        on = np.stack([_moved(one, there) for one, there in zip(homographies, places, strict=True)])
         on[~often] = np.nan
         counted = np.flatnonzero(np.isfinite(on[..., 0]).sum(axis=0) >= 2)
         mean = np.nanmedian(on[:, counted], axis=0)
         off = np.hypot(*np.moveaxis(on[:, counted] - mean, 2, 0))
         scatter = np.maximum(np.nanmedian(off, axis=0) / 1.1774, STILL_PX)  # Rayleigh's median
         weight = np.minimum(1.0, 2.0 * scatter / np.maximum(off, 1e-9)) / scatter**2
-        for way, there, each in zip(ways, places[:, counted], weight, strict=True):
+        for one, there, each in zip(homographies, places[:, counted], weight, strict=True):
             known = np.isfinite(each)
             if known.sum() >= LEAST_CORNERS:
-                way[:] = _fitted(there[known], mean[known], each[known])
-    ways = np.linalg.inv(ways[0]) @ ways
-    ways[0] = np.eye(3)  # to the last bit
-    return ways, scatter
+                one[:] = _fitted(there[known], mean[known], each[known])
+    homographies = np.linalg.inv(homographies[0]) @ homographies
+    homographies[0] = np.eye(3)  # to the last bit
+    return homographies, scatter
 
 
 def _moved(way: FloatArray, places: FloatArray) -> FloatArray:

@@ -40,7 +40,7 @@ import numpy as np
 from pcfix.errors import SettingError
 from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import (
-    Symmetric,
+    NO_SQUARES,
     Vector,
     beyond,
     cofactors,
@@ -363,8 +363,7 @@ def _set_covariance(
     If a camera moves, the point moves the other way; if it turns about its centre with its port,
     the point at C + a moves by a x omega, and its image by (L x a).omega.
     """
-    no_sum: Symmetric = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    light, h, noise, by_n = np.empty((3, 5)), no_sum, no_sum, (0.0, 0.0, 0.0)
+    light, h, noise, by_n = np.empty((3, 5)), NO_SQUARES, NO_SQUARES, (0.0, 0.0, 0.0)
     for c in chosen:
         a = minus(point, row_of(rig.centres, c))
         _, _, u, v, u_by_n, v_by_n = _image_through(a, rig, c, light)

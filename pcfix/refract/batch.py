@@ -37,7 +37,7 @@ FLAT_DEG = 35.0
 """Incidence angle beyond which methods differ most; see `reconstructions.LIMITS`."""
 
 ALIKE = ("snell", "shan", "butler", "murase", "dietrich")
-"""Methods that weigh all rays of a point alike."""
+"""Methods that give all rays of a point the same weight."""
 
 UNLISTED, MAIN = -1, -2
 """Points in no view list, and points of all other sources; see `Survey.parts`."""

@@ -117,7 +117,7 @@ DEPTH, BY_HEIGHT, _PLACE, _PLACE_BY_HEIGHT, LOOK = slots(1, 1, 2, 2)
 # curvature of that (px^2/m^2). Of a pair: its squared residual, and its depth.
 _AT, _SQUARES, _CURVATURE, PARTNER = slots(1, 1, 1)
 _COST, _PAIR_AT, PAIR = slots(1, 1)
-# Of the points in double precision, after those of `tiling.gather`: P in the original model.
+# Of the points, after the runs of `tiling.gather`: P in the original model.
 _ORIGINAL, _POINT = 7, 10
 # Of the search: the step of the bed, and sums over the maps.
 _STEP, _WEIGHT, _CHANGE, _X, _Y, _SQUARE, _MAPS, SEARCH = slots(1, 1, 1, 1, 1, 1, 1)
@@ -317,11 +317,8 @@ def _look(out: FloatArray, c: int, count: int, tile: Tile, block: Block) -> None
     best_pairs(room, tile.partners[:partners], tile.pairs, count, block.matcher.tolerance_px2)
     for j in range(count):
         # the change of the depth with the bed is nearly that of the whole water column
-        t, per_depth, depth = (
-            room[BEST * TILE + j],
-            room[_STEEP * TILE + j],
-            room[_WATER * TILE + j],
-        )
+        t, depth = room[BEST * TILE + j], room[_WATER * TILE + j]
+        per_depth = room[_STEEP * TILE + j]
         change = (t + room[_AWAY * TILE + j]) / depth
         change = change if depth > LEAST_DEPTH_M else per_depth / block.points.n
         change = min(max(change, LEAST_CHANGE * per_depth), MOST_CHANGE * per_depth)
@@ -456,7 +453,8 @@ def _add_pair(room: FloatArray, pair: FloatArray, count: int, tolerance: float) 
     """Add the depth of a pair with its weight, which falls by e for each `tolerance`."""
     for j in range(count):
         worse = (pair[_COST * TILE + j] - room[_LEAST * TILE + j]) / tolerance
-        # exp(-x) as the sixteenth power of the Taylor series of exp(-x / 16), which vectorises
+        # exp(-worse) as the sixteenth power of the Taylor series of exp(-worse / 16): a loop that
+        # calls exp would not be vectorised
         x = worse / 16.0
         w = 1.0 - x / 4.0 * (1.0 - x / 5.0 * (1.0 - x / 6.0))
         w = 1.0 - x * (1.0 - x / 2.0 * (1.0 - x / 3.0 * w))

@@ -219,16 +219,17 @@ def _weighed(sample: Batch, step: float, hint: Hint | None) -> tuple[Survey, tup
         if len(reconstructions) > 1:
             return survey, tuple(filter(None, verdicts))
     if _wants_limit(survey.settings, None):
-        # which rays made the points does not depend on the formula
+        # which rays were used in the reconstruction does not depend on the formula: test by snell
         sample = replace(sample, survey=survey)
         limit = weigh(sample, LIMITS, step)
         if limit is not None and limit.chosen == LIMITS[1] and limit.is_strong:
             survey = replace(survey, learned=survey.learned._replace(limit_deg=FLAT_DEG))
             verdicts.append(limit)
-        elif not _wants_comparison(survey):  # without angles the rays are all the doubt there is
-            doubt = weigh(sample, LIMITS, step, given=LIMITS[0])
-            if doubt is not None:
-                learned = survey.learned._replace(model_uncertainty=doubt.model_uncertainty)
+        elif survey.settings.dimensions == "all" and not _wants_comparison(survey):
+            # no reconstruction types are compared: the uncertainty is that of the rays
+            free = weigh(sample, LIMITS, step, given=LIMITS[0])
+            if free is not None:
+                learned = survey.learned._replace(model_uncertainty=free.model_uncertainty)
                 survey = replace(survey, learned=learned)
     if _wants_comparison(survey):
         sample = replace(sample, survey=survey)

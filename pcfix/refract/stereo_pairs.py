@@ -35,7 +35,19 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.kernels import Span, device, in_tiles, kernel
-from pcfix.lens.algebra import Vector, beyond, cross, dot, minus, row_of, scaled, solved, vector
+from pcfix.lens.algebra import (
+    Vector,
+    beyond,
+    cross,
+    dot,
+    minus,
+    row_of,
+    scaled,
+    solved,
+    times,
+    transposed_times,
+    vector,
+)
 from pcfix.lens.formulas import KIND, PERSPECTIVE, PLAIN
 from pcfix.lens.imaging import Plain, image_in_world, plain_image, plain_lens
 from pcfix.model import BoolArray, FloatArray, IntArray, Outcome, Views
@@ -333,7 +345,7 @@ def _see(
     points, images = block.points, block.images
     centre, original, optics = row_of(points.centres, c), row_of(images.centres, c), images.original
     r, lens, offset = optics.rotations[c], optics.lenses[optics.row[c]], points.offset[c]
-    right, down, axis = row_of(r, 0), row_of(r, 1), row_of(r, 2)
+    axis = row_of(r, 2)
     is_flat = lens[KIND] == PERSPECTIVE
     for j in range(count):
         p, normal = three(tile, j), three(tile, 4 * TILE + j)
@@ -351,9 +363,8 @@ def _see(
         if plain is None:
             u, _, by_u, by_v = image_in_world(lens, r, w)
         else:
-            u, _, g = plain_image(plain, (dot(right, w), dot(down, w), dot(axis, w)))
-            by_u = beyond(beyond(scaled(g[0], right), g[1], down), g[2], axis)
-            by_v = beyond(beyond(scaled(g[3], right), g[4], down), g[5], axis)
+            u, _, g = plain_image(plain, times(r, w))
+            by_u, by_v = transposed_times(r, g[:3]), transposed_times(r, g[3:])
         # NaN where there is no image
         off_u, off_v = dot(by_u, e) + 0.0 * u, dot(by_v, e)
         put(ray, _BY_PLACE * TILE + j, by_place)

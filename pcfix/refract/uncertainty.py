@@ -56,6 +56,7 @@ import numpy as np
 
 from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import (
+    NO_SQUARES,
     Nine,
     Symmetric,
     Vector,
@@ -337,7 +338,7 @@ def _in_space(
     """Return M and E."""
     d, per = refracted(e, length2, normal, height, bend), one / length2
     # M = I - t t', with d of the length L; E = (kappa^2 d - r kappa rho^2 N) / L^2, d = e - H N
-    m = plus_square((0.0, 0.0, 0.0, 0.0, 0.0, 0.0), d)
+    m = plus_square(NO_SQUARES, d)
     m = one - per * m[0], -per * m[1], -per * m[2], one - per * m[3], -per * m[4], one - per * m[5]
     along = kappa * kappa * per
     up = along * height + bend * kappa * (length2 - height * height) * per
@@ -455,13 +456,13 @@ def add_noise(
         # variance of the place of P from attitude, centre and waves, with C isotropic
         by_place = attitude * attitude * length2 + centre_m * centre_m + c_t * c_t
         by_normal = more * height * height - c_t * c_t
-        noise = plus_square((0.0, 0.0, 0.0, 0.0, 0.0, 0.0), (w[0], w[1], w[2]))
+        noise = plus_square(NO_SQUARES, (w[0], w[1], w[2]))
         # W W, as W is symmetric: the sum of the squares of its rows
         square = plus_square(plus_square(noise, (w[1], w[3], w[4])), (w[2], w[4], w[5]))
         at = NOISE * TILE + j
         _add_six(room, at, image_px * image_px, w)
         _add_six(room, at, by_place, square)
-        _add_six(room, at, by_normal, plus_square((0.0, 0.0, 0.0, 0.0, 0.0, 0.0), g))
+        _add_six(room, at, by_normal, plus_square(NO_SQUARES, g))
 
 
 @kernel(allocates=True)
