@@ -41,12 +41,13 @@ from pcfix.io.cameras.checks import Source
 from pcfix.io.cameras.checks import number as xml_number
 from pcfix.io.cameras.metashape import SPREADS, documents, spreads
 from pcfix.io.cameras.odm import named_crs
-from pcfix.io.cameras.table import centres, find_header, read_columns
+from pcfix.io.cameras.table import SPELLINGS as POSITIONS
+from pcfix.io.cameras.table import axes, centres, has_header
 from pcfix.io.cameras.table import crs as table_crs
 from pcfix.io.crs import LOCAL, is_local, is_topocentric, parse_crs, way_to_cloud
 from pcfix.io.files import check_input
 from pcfix.io.labels import match_labels, unnamed
-from pcfix.io.tables import Table, check_columns, number, places, read_lines
+from pcfix.io.tables import Table, check_columns, number, read_lines, read_table
 from pcfix.model import Cameras, FloatArray, GroundControl, IntArray
 from pcfix.options.declare import File
 
@@ -57,6 +58,7 @@ FARTHEST_M = 50e3
 _NAMED = 5
 
 SPELLINGS: dict[str, tuple[str, ...]] = {
+    **{role: POSITIONS[role] for role in ("x", "y", "z", "longitude", "latitude")},
     "point": (
         *("point", "name", "gcp", "gcp_name", "gcp_id", "gcp_label", "marker", "point_name"),
         *("point_id", "pointid", "id", "label"),
@@ -83,7 +85,6 @@ CONTROL = ("", "control", "control_point", "controlpoint", "gcp", "3d_gcp", "gro
 ON, WATERLINE = "on:", ("waterline", "water_line", "shoreline", "on:water")
 YES, NO = ("yes", "y", "true", "1"), ("", "no", "n", "false", "0")
 _LEAST_ODM = 6
-_POSITION = ("x", "y", "z", "longitude", "latitude")
 _PLAIN = {"point": "name", "label": "image"}
 
 
@@ -282,7 +283,7 @@ def read_marks(path: Path) -> tuple[list[Mark], str | None]:
     first = [number(field) for field in rows[0][1][:5]] if rows else []
     if len(first) == 5 and not np.isnan([*first[:2], *first[3:]]).any():  # z may be NaN
         return _from_odm(path, rows)
-    if find_header(lines) is None:
+    if not has_header(lines):
         sentence = "is neither a table of marks nor OpenDroneMap's gcp_list.txt. Line 1 must name"
         sentence += " the columns name, x, y, z, image, u, v, or be a CRS."
         raise bad_file(path, "gcps.format", sentence)
@@ -290,7 +291,16 @@ def read_marks(path: Path) -> tuple[list[Mark], str | None]:
 
 
 def _from_table(path: Path) -> tuple[list[Mark], str | None]:
-    columns = _with_roles(read_columns(path))
+    columns = read_table(path, (), SPELLINGS)
+    missing = [_PLAIN.get(r, r) for r in ("point", "label", "u", "v") if not columns.has(r)]
+    if not axes(columns.place):
+        missing += [axis for axis in "xyz" if not columns.has(axis)]
+    check_columns(path, columns.header, ("name", "x", "y", "z", "image", "u", "v"), missing)
+    stated = sorted({*columns.column("crs")} - {""}) if columns.has("crs") else []
+    if len(stated) > 1:
+        sentence = f"has points in several CRS ({', '.join(stated[:3])}). Transform all to one."
+        raise bad_file(path, "gcps.several_crs", sentence, crs=stated)
+    columns = replace(columns, crs=stated[0] if stated else columns.crs)
     system, unknown = table_crs(columns)
     if unknown:
         sentence = f"PROJ does not know its CRS '{columns.crs}'. Give an EPSG code."
@@ -332,23 +342,6 @@ def _from_table(path: Path) -> tuple[list[Mark], str | None]:
         strict=True,
     )
     return [Mark(*row) for row in rows], system
-
-
-def _with_roles(columns: Table) -> Table:
-    """Return columns with the places that they have in a table of marks."""
-    header, path = columns.header, columns.path
-    place = {role: i for role, i in columns.place.items() if role in _POSITION}
-    place |= places(header, SPELLINGS)
-    missing = [_PLAIN.get(role, role) for role in ("point", "label", "u", "v") if role not in place]
-    check_columns(path, header, ("name", "x", "y", "z", "image", "u", "v"), missing)
-    found = replace(columns, place=place)
-    if "crs" not in place:
-        return found
-    stated = sorted({*found.column("crs")} - {""})
-    if len(stated) > 1:
-        sentence = f"has points in several CRS ({', '.join(stated[:3])}). Transform all to one."
-        raise bad_file(path, "gcps.several_crs", sentence, crs=stated)
-    return replace(found, crs=stated[0] if stated else columns.crs)
 
 
 def _texts(columns: Table, role: str) -> list[str]:

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -38,6 +38,8 @@ UNITS = {
     **dict.fromkeys(("u", "v"), ("pixels", PIXELS)),
 }
 """What numbers are in, by the role of their column; those of others have any unit."""
+Spellings: TypeAlias = Mapping[str, Sequence[str]]
+"""What columns are called, by their roles."""
 EXIF = ("gpslongitude", "gpslatitude", "gpsaltitude")
 UNKNOWN = ("", "nan", "na", "null", "none")
 
@@ -115,7 +117,7 @@ class Table:
                 where = {"line": self.line[i], "column": name, "value": texts[i]}
                 raise self.error(int(i), "table.number", sentence, **where)
         unit = self.unit[self.place[role]]
-        wanted, known = UNITS.get(role.removesuffix("_est"), ("", {unit: 1.0}))
+        wanted, known = UNITS.get(role, ("", {unit: 1.0}))
         if unit not in known:
             sentence = f"column {name} is in '{unit}'. Give {wanted}."
             raise bad_file(self.path, "table.unit", sentence, column=name, value=unit)
@@ -123,6 +125,8 @@ class Table:
 
 
 CRS_COMMENT = re.compile(r"^\s*#\s*(?:coordinatesystem|crs)\s*[:=]\s*(.+)$", re.IGNORECASE)
+_LONGEST_NAME = 80
+_FARTHEST_HEADER = 20
 
 
 def stated_crs(lines: Iterable[str]) -> str | None:
@@ -149,17 +153,6 @@ def exif_number(text: str) -> float:
     return -value if text.endswith(("S", "W")) or "Below" in text else value
 
 
-def split_header(line: str) -> tuple[list[str], str]:
-    """Return the names of a header line, lower case, and the delimiter between them.
-
-    It is the tab, semicolon or comma between the fields, else the space.
-    """
-    delimiter = max(",;\t", key=line.count)
-    delimiter = delimiter if delimiter in line else " "
-    names = line.split(None if delimiter == " " else delimiter)
-    return [name.strip().strip("\"'").lower() for name in names], delimiter
-
-
 def read_lines(path: Path) -> list[str]:
     """Read a text file, with or without a byte order mark."""
     data = path.read_bytes()
@@ -170,27 +163,56 @@ def read_lines(path: Path) -> list[str]:
     return text.splitlines()
 
 
-def read_table(path: Path, required: Sequence[str]) -> Table:
-    """Read a table whose columns have their roles as names, and no units."""
-    lines = read_lines(path)
-    header, delimiter = split_header(lines[0] if lines else "")
-    check_columns(path, header, required, [name for name in required if name not in header])
-    return table_below(path, lines, header, delimiter, {name: (name,) for name in header})
+class Header(NamedTuple):
+    """The line that names the columns, from 0: their names without units, lower case."""
+
+    line: int
+    names: list[str]
+    units: list[str]
+    is_comment: bool
 
 
-_LONGEST_NAME = 80
+def find_header(lines: Sequence[str], spellings: Spellings) -> Header | None:
+    """Return the header: the last comment above the rows that names two columns, or the first line.
+
+    None where a text has no line that is not a comment, and no such comment.
+    """
+    plain = {spelling for names in spellings.values() for spelling in names}
+    found = None
+    for i, line in enumerate(lines[:_FARTHEST_HEADER]):
+        is_comment = line.lstrip("\"' ").startswith("#")
+        text = line.strip().lstrip("#").strip() if is_comment else line.strip()
+        if text and not CRS_COMMENT.match(line):
+            fields = text.split(_delimiter(text))
+            names, units = zip(*(_split_unit(one, plain) for one in fields), strict=True)
+            if len(places(names, spellings)) >= 2 or not (is_comment or found):
+                found = Header(i, [*names], [*units], is_comment)
+            if not is_comment:
+                break
+    return found
 
 
-def split_unit(name: str, endings: str = "m|cm|mm|ft|deg") -> tuple[str, str]:
-    """Return the name of a column and its unit: depth_m, Depth (m), x [m]."""
-    if len(name) >= _LONGEST_NAME:  # the expression takes long on a long name
-        return name, ""
-    match = re.match(rf"^(.*?)[ _]*[\[(]([^\])]*)[\])]$|^(.*)_({endings})$", name)
-    bare, unit = (match[1] or match[3], match[2] or match[4]) if match else (name, "")
-    return (bare or "").strip().replace(" ", "_"), (unit or "").strip()
+def _delimiter(line: str) -> str | None:
+    """Return the tab, semicolon or comma between the fields of a line, else None: spaces."""
+    most = max(",;\t", key=line.count)
+    return most if most in line else None
 
 
-def places(header: Sequence[str], spellings: Mapping[str, Sequence[str]]) -> dict[str, int]:
+def _split_unit(text: str, plain: set[str]) -> tuple[str, str]:
+    """Return the name of a column and its unit: depth_m, Depth (m), x [m]; `plain` are names.
+
+    Of X/Longitude it is the name that says more.
+    """
+    name, unit = text.strip("# \t\"'").lower(), ""
+    if name not in plain and len(name) < _LONGEST_NAME:  # long names take the expression long
+        match = re.match(r"^(.*?)[ _]*[\[(]([^\])]*)[\])]$|^(.*)_(m|cm|mm|ft|deg|gon|rad)$", name)
+        name, unit = (match[1] or match[3], match[2] or match[4]) if match else (name, "")
+        name, unit = (name or "").strip().replace(" ", "_"), (unit or "").strip()
+    axis, _, kind = name.partition("/")
+    return kind if axis in ("x", "y", "z") and kind in plain else name, unit
+
+
+def places(header: Sequence[str], spellings: Spellings) -> dict[str, int]:
     """Return the number of the column of each role: the first of its spellings that is there."""
     found = {role: [name for name in names if name in header] for role, names in spellings.items()}
     return {role: header.index(names[0]) for role, names in found.items() if names}
@@ -206,27 +228,25 @@ def check_columns(
         raise bad_file(path, "table.column_missing", sentence, missing=list(missing))
 
 
-def table_below(
-    path: Path,
-    lines: list[str],
-    header: list[str],
-    delimiter: str,
-    spellings: Mapping[str, Sequence[str]],
-    *,
-    units: Sequence[str] = (),
-    at: int = 0,
-    comments: bool = False,
-) -> Table:
-    """Return the rows below the header, which is ``lines[at]``, with columns for some roles.
+def read_table(path: Path, required: Sequence[str], spellings: Spellings | None = None) -> Table:
+    """Read a table; without `spellings` the columns are called by their roles.
 
-    Empty lines are skipped and, with `comments`, also those that begin with #.
+    The header may be a comment (#). Empty lines and comments below it are skipped.
     """
-    spaced = delimiter == " "
-    below = ["" if comments and line.startswith("#") else line for line in lines[at + 1 :]]
-    if spaced:
+    spellings = spellings or {role: (role,) for role in required}
+    lines = read_lines(path)
+    at, header, units, is_comment = find_header(lines, spellings) or Header(0, [], [], False)
+    place = places(header, spellings)
+    check_columns(path, header, required, [role for role in required if role not in place])
+    below = ["" if line.startswith("#") else line for line in lines[at + 1 :]]
+    first = next(filter(str.strip, below), "") if is_comment else lines[at]
+    delimiter = _delimiter(first.strip())
+    if delimiter is None:
         below = [" ".join(line.split("\t")).strip() for line in below]
-    quote = "'" if spaced and any(line.startswith("'") for line in below[:1]) else '"'
-    reader = csv.reader(below, delimiter=delimiter, quotechar=quote, skipinitialspace=spaced)
+    quote = "'" if delimiter is None and any(line.startswith("'") for line in below[:1]) else '"'
+    reader = csv.reader(
+        below, delimiter=delimiter or " ", quotechar=quote, skipinitialspace=delimiter is None
+    )
     rows, numbers = [], []
     try:
         for line, fields in enumerate(reader, start=at + 2):
@@ -242,8 +262,7 @@ def table_below(
         raise bad_file(path, "table.not_csv", sentence) from error
     if not rows:
         raise bad_file(path, "table.empty", "has a header but no rows.")
-    units = units or [""] * len(header)
-    return Table(path, header, rows, numbers, places(header, spellings), units)
+    return Table(path, header, rows, numbers, place, units, is_comment, stated_crs(lines[:at]))
 
 
 DEPTH_SPELLINGS = {
@@ -285,18 +304,15 @@ def read_check_depths(path: File) -> CheckDepths:
         standard error too: all check depths have the same weight.
     """
     source = check_input(path)
-    lines = read_lines(source)
-    texts, delimiter = split_header(lines[0] if lines else "")
-    header, units = map(list, zip(*map(split_unit, texts), strict=True)) if texts else ([], [])
-    table = table_below(source, lines, header, delimiter, DEPTH_SPELLINGS, units=units)
+    table = read_table(source, (), DEPTH_SPELLINGS)
     what = "depth" if table.has("depth") else "z"
     for role in ("x", "y", what):
-        there = [name for name in header if name in DEPTH_SPELLINGS[role]]
+        there = [name for name in table.header if name in DEPTH_SPELLINGS[role]]
         if len(there) > 1:
             sentence = f"the columns {', '.join(there)} may all be {role}. Remove all but one."
             raise bad_file(source, "table.column_twice", sentence, columns=there)
     missing = ["depth or z" if r == "z" else r for r in ("x", "y", what) if not table.has(r)]
-    check_columns(source, header, ("x", "y", "depth or z"), missing)
+    check_columns(source, table.header, ("x", "y", "depth or z"), missing)
     values = table.of(("x", "y", what))
     found = CheckDepths(str(source), values[:, :2], values[:, 2], what == "z", table.line)
     negative = np.flatnonzero(found.value_m < 0.0)

@@ -203,7 +203,7 @@ def _read_text(path: Path) -> tuple[Geometries, str | None]:
     if not used:
         raise bad_file(path, "vector.empty", "is empty.")
     is_wkt = _WKT.match(used[0][1])
-    geometries, crs = _from_wkt(path, used) if is_wkt else _from_table(path, lines, used[0][0] - 1)
+    geometries, crs = _from_wkt(path, used) if is_wkt else _from_table(path)
     return geometries, tables.stated_crs(lines[:20]) or crs
 
 
@@ -225,24 +225,17 @@ def _from_wkt(path: Path, lines: list[tuple[int, str]]) -> tuple[Geometries, str
     return geometries, f"EPSG:{srid}" if srid else None
 
 
-def _from_table(path: Path, lines: list[str], at: int) -> tuple[Geometries, str | None]:
-    """Return the points, or the geometries, of a table whose header is ``lines[at]``.
-
-    A point whose height is empty has none.
-    """
-    texts, delimiter = tables.split_header(lines[at])
-    names, units = map(list, zip(*map(tables.split_unit, texts), strict=True))
+def _from_table(path: Path) -> tuple[Geometries, str | None]:
+    """Return the points, or the geometries, of a table; a point whose height is empty has none."""
+    table = tables.read_table(path, (), COLUMNS)
     # degrees of x and y are those of the CRS
-    units = ["" if unit in tables.DEGREES else unit for unit in units]
-    table = tables.table_below(
-        path, lines, names, delimiter, COLUMNS, units=units, at=at, comments=True
-    )
+    table = replace(table, unit=["" if one in tables.DEGREES else one for one in table.unit])
     if table.has("wkt"):
         return _from_wkt(path, list(zip(table.line, table.column("wkt"), strict=True)))
     axes, crs = (("x", "y"), None) if table.has("x", "y") else (("longitude", "latitude"), WGS84)
     if not table.has(*axes):
         needed = ("x and y", "or longitude and latitude", "or wkt")
-        tables.check_columns(path, names, needed, ("x, y",))
+        tables.check_columns(path, table.header, needed, ("x, y",))
     plan, z = table.of(axes), table.where_there(("z",))[:, 0]
     if not table.has("z"):
         return np.asarray(shapely.points(plan)), crs

@@ -228,8 +228,6 @@ def markers(folder: Path) -> Path:
 def colmap_text_folder(folder: Path) -> Path:
     made = colmap.folder(folder / "sparse")
     (made / FILE_OF_PLACE).write_text(place_text(np.array([1.0, 2.0, 3.0]), "EPSG:32636"))
-    rows = [(0, (47.5, 8.25, 440), np.diag([0.04, 0.09, 1.0]).tolist(), 0)]
-    colmap.database(folder / "database.db", rows)
     return made
 
 

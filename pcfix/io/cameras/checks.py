@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import lzma
 import re
-import sqlite3
 import struct
 import zipfile
 import zlib
@@ -41,7 +40,7 @@ ROUNDING = 1e-3
 NO_LENS = "cameras.no_lens"
 DAMAGES = (
     *(ArithmeticError, AttributeError, EOFError, LookupError, MemoryError, OSError, RuntimeError),
-    *(SyntaxError, TypeError, ValueError, lzma.LZMAError, sqlite3.Error, struct.error),
+    *(SyntaxError, TypeError, ValueError, lzma.LZMAError, struct.error),
     *(zipfile.BadZipFile, zlib.error),
 )
 """What readers run into where a file is cut off, or holds something else than it should."""

@@ -21,13 +21,6 @@ they are in Brown's, and where the tangential and prism terms are of the radiall
 Images keep the order of the file. An image point belongs to the point in space whose identifier it
 has, -1 for none; ``points3D`` lists the same as tracks.
 
-Where the GNSS said the cameras were is in ``database.db`` (SQLite). Table ``pose_priors`` has a row
-for an image (``image_id``; from COLMAP 4 on ``corr_data_id`` with the type of the sensor, 0 a
-camera), the position as three doubles, its covariance as nine, and the coordinate system: 0 is
-WGS84 with latitude, longitude, height, 1 is Cartesian, -1 not defined. The covariance is of metres
-east, north, up, or of the Cartesian axes (https://colmap.github.io/database.html and
-``src/colmap/geometry/pose_prior.h``).
-
 Models are written in binary, without ``rigs`` and ``frames``, which COLMAP makes itself. Images
 and cameras are numbered from 1 in the order of the block, points in the order of the tie points.
 Positions are written minus an offset, which ``georeference.json`` keeps.
@@ -39,28 +32,24 @@ import json
 import mmap
 import os
 import re
-import sqlite3
 import struct
-from collections.abc import Iterator, Sequence
-from contextlib import closing
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.errors import InputError, PcfixWarning
+from pcfix.errors import InputError
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import NO_TIE_POINTS, Source, are_seen, damaged
 from pcfix.io.cameras.lenses import LensModel, lens_by_name, model_of
 from pcfix.io.crs import is_topocentric
-from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, TiePoints
+from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
 from pcfix.options.declare import File
 
 _PART = re.compile(r"(cameras|images|points3D|rigs|frames)\.(bin|txt)")
 _CAMERA_LINE = re.compile(r"^\s*\d+\s+[A-Z][A-Z_0-9]+(\s+\S+){2}", re.MULTILINE)
 FILE, WRITER = "georeference.json", "pcfix"
-_DATABASE, _FOLDERS_ABOVE = "database.db", 3
-_WGS84 = 0
 
 
 def recognises(source: Source) -> bool:
@@ -81,20 +70,14 @@ def read(source: Source) -> Cameras:
     rotations = checks.quaternions(path, labels, poses[:, :4])
     used = dict.fromkeys(image.camera for image in posed)
     lenses = {number: lens_of(listed, number, cameras[number]) for number in used}
-    gnss, notes = read_priors(folder, labels)
     offset, crs = read_place(folder)
-    if offset.any() and gnss is not None and gnss.crs is None:
-        gnss = None  # of the model that the database found, which this one may not be
-    if others:
-        notes = (checks.several(folder, len(others) + 1, len(posed)), *notes)
     return Cameras(
         labels=labels,
         centres=checks.centres(rotations, poses[:, 4:]) + offset,
         rotations=rotations,
         lenses=tuple(lenses[image.camera] for image in posed),
         crs=crs,
-        notes=notes,
-        gnss=gnss,
+        notes=(checks.several(folder, len(others) + 1, len(posed)),) if others else (),
         unposed=tuple(image.name for image in images if not image.posed),
         source="COLMAP",
     )
@@ -159,49 +142,6 @@ def place_text(offset_m: FloatArray, crs: str | None) -> str:
     """Return the content of the file."""
     place = {"crs": crs, "offset_m": [float(value) for value in offset_m], "written_by": WRITER}
     return json.dumps(place, indent=2) + "\n"
-
-
-def read_priors(
-    model: Path, labels: Sequence[str]
-) -> tuple[GnssPositions | None, tuple[PcfixWarning, ...]]:
-    """Return the priors of images from the database beside or above a model, and notes on it."""
-    places = (model, *model.resolve().parents[:_FOLDERS_ABOVE])
-    path = next((p / _DATABASE for p in places if (p / _DATABASE).is_file()), None)
-    if path is None:
-        return None, ()
-    # nothing is written or locked: a database without a log of changes cannot change meanwhile
-    unchanging = not path.with_name(path.name + "-wal").exists()
-    uri = path.resolve().as_uri() + ("?immutable=1" if unchanging else "?mode=ro")
-    try:
-        with closing(sqlite3.connect(uri, uri=True, timeout=1.0)) as database:
-            columns = {row[1] for row in database.execute("PRAGMA table_info(pose_priors)")}
-            if not columns:
-                return None, ()
-            image = "corr_data_id" if "corr_data_id" in columns else "image_id"
-            camera = "corr_sensor_type = 0" if "corr_sensor_type" in columns else "1"
-            rows = database.execute(
-                "SELECT images.name, position, position_covariance, coordinate_system"
-                f" FROM pose_priors JOIN images ON images.image_id = pose_priors.{image}"
-                f" WHERE {camera} AND typeof(position) = 'blob' AND length(position) = 24"
-                " AND typeof(images.name) = 'text'"
-            ).fetchall()
-    except sqlite3.Error as error:
-        sentence = f"its pose priors cannot be read ({error}). They are skipped."
-        return None, (checks.note(path, "cameras.priors_left_out", sentence),)
-    known = set(labels)
-    systems = {system for name, *_, system in rows if name in known}
-    if len(systems) > 1:
-        sentence = "its pose priors are in several coordinate systems. They are skipped."
-        return None, (checks.note(path, "cameras.priors_left_out", sentence),)
-    is_wgs84 = systems == {_WGS84}
-    found = {}
-    for name, position, covariance, _ in rows:
-        place, sigma = np.frombuffer(position, "<f8"), np.full(3, np.nan)
-        if isinstance(covariance, bytes) and len(covariance) == 9 * 8:
-            variances = np.frombuffer(covariance, "<f8").reshape(3, 3).diagonal()
-            sigma = np.sqrt(np.where(variances >= 0.0, variances, np.nan))
-        found[name] = place[[1, 0, 2]] if is_wgs84 else place, sigma
-    return checks.measured(labels, found, "EPSG:4979" if is_wgs84 else None), ()
 
 
 _SMALLEST_OMEGA = 1e-6

@@ -19,8 +19,6 @@ MARGIN_M = 100.0
 """With half the cloud's sides: how far outside the cloud a block may stand."""
 UNDULATION_M = (15.0, 110.0)
 """Of the geoid, where it is worth a word."""
-LOCAL_M, MAP_M = 2e4, 1e5
-"""Coordinates below the first are likely local, beyond the second those of a map."""
 ABSURD_HEIGHTS = 3.0
 """Largest height of cameras above the cloud, in widths of the cloud."""
 _SAMPLE = 200
@@ -46,7 +44,7 @@ def likely_mistake(
     """
     centres = np.asarray(centres, np.float64)[:: max(1, len(centres) // _SAMPLE)]
     low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
-    margin = 0.5 * (high - low)[:2] + MARGIN_M
+    size, margin = high - low, 0.5 * (high - low)[:2] + MARGIN_M
 
     def is_over(moved: FloatArray) -> bool:
         """Whether the middle of a block is over the cloud, or not far beside it."""
@@ -58,23 +56,14 @@ def likely_mistake(
     for words, moved in _readings(centres, cloud_crs):
         if is_over(moved):
             return f"The cameras would lie over the cloud {words}."
-    # no other reading of the numbers fits
-    middle, span = np.median(centres[:, :2], axis=0), np.ptp(centres[:, :2], axis=0).max()
-    centre, size = (low + high)[:2] / 2.0, max((high - low)[:2].max(), 1e-9)
-    cameras, cloud = np.abs(middle).max(), np.abs(centre).max()
-    inside = (np.abs(centres[:, :2]) <= 360.0).all() and np.abs(low[:2]).max() > LOCAL_M
-    if inside and span < 1e-3 * size and np.abs(np.median(centres[:, :2])) > 10.0 * span:
+    span, wide = np.ptp(centres[:, :2], axis=0).max(), max(size[:2].max(), 1e-9)
+    if (np.abs(centres[:, :2]) <= 360.0).all() and 10.0 * span < 1e-2 * wide:
         return "The cameras look like degrees, the cloud like metres; give --cameras-crs EPSG:4326."
-    if min(cameras, cloud) < LOCAL_M and max(cameras, cloud) > MAP_M:
-        local, other = ("cameras", "cloud") if cameras < cloud else ("cloud", "cameras")
-        verb = "has" if local == "cloud" else "have"
-        advice = "use the same CRS, or give the shift with --cameras-offset."
-        return f"The {local} {verb} local or shifted coordinates, the {other} not; {advice}"
-    x, y = centre - middle
+    x, y = (low + high)[:2] / 2.0 - np.median(centres[:, :2], axis=0)
     apart = np.hypot(x, y)
     far = f"{apart / 1000.0:,.1f} km" if apart >= 1e4 else f"{apart:.0f} m"
     advice = "check the CRS of both."
-    if 0.2 < span / size < 5.0:
+    if 0.2 < span / wide < 5.0:
         advice = f"perhaps by an offset of {x:.0f}, {y:.0f} m; see --cameras-offset."
     return f"The cameras are {far} from the cloud in plan; {advice}"
 
@@ -101,9 +90,8 @@ def _readings(centres: FloatArray, crs: str | CRS | None) -> Iterator[tuple[str,
         zone = int(plan.utm_zone[:-1])
         for near in ((zone + step - 1) % 60 + 1 for step in (0, -1, 1, -2, 2)):
             for side, first in (("N", 32600), ("S", 32700)):
-                if f"{near}{side}" != plan.utm_zone:
-                    words = f"UTM zone {near}{side} (the cloud is in {plan.utm_zone}){say}"
-                    others.append((words, first + near, centres))
+                words = f"UTM zone {near}{side} (the cloud is in {plan.utm_zone}){say}"
+                others.append((words, first + near, centres))
     for words, code, numbers in others:
         try:
             to_cloud = Transformer.from_crs(code, plan, always_xy=True)

@@ -1,6 +1,5 @@
 """COLMAP models, text and binary."""
 
-import sqlite3
 import struct
 
 import numpy as np
@@ -136,39 +135,6 @@ def test_binary_knows_the_models_by_their_numbers(tmp_path, number):
     rays = np.random.default_rng(1).uniform((-0.4, -0.4, 1), (0.4, 0.4, 1), (100, 3))
     made = lens_of(tmp_path, 1, (model, 800.0, 600.0, tuple(values)))
     assert project(made, rays) == pytest.approx(np.array(twin.img_from_cam(rays)), abs=1e-8)
-
-
-def database(path, rows, *, rigs=True, names=("a.jpg", "c.jpg", "other.jpg")):
-    """Write a database with pose priors (row of `names`, position, covariance, system)."""
-    with sqlite3.connect(path) as sql:
-        sql.execute("CREATE TABLE images (image_id INTEGER PRIMARY KEY, name TEXT, camera_id)")
-        keys = "corr_data_id, corr_sensor_id, corr_sensor_type" if rigs else "image_id"
-        sql.execute(
-            f"CREATE TABLE pose_priors ({keys}, position, position_covariance, coordinate_system)"
-        )
-        sql.executemany("INSERT INTO images VALUES (?, ?, 1)", enumerate(names, start=40))
-        for row, position, covariance, system in rows:
-            key = (40 + row, 1, 0) if rigs else (40 + row,)
-            blobs = [
-                None if v is None else np.array(v, "<f8").tobytes() for v in (position, covariance)
-            ]
-            marks = ", ".join("?" * (len(key) + 3))
-            sql.execute(f"INSERT INTO pose_priors VALUES ({marks})", (*key, *blobs, system))
-    sql.close()
-
-
-@pytest.mark.parametrize("rigs", [True, False])
-def test_pose_priors_of_wgs84(tmp_path, rigs):
-    path = folder(tmp_path / "sparse" / "0")
-    sigma = np.diag([0.04, 0.09, np.nan]).tolist()
-    rows = [(0, (47.5, 8.25, 440), sigma, 0), (2, (1, 2, 3), None, 0)]
-    database(tmp_path / "database.db", rows, rigs=rigs)
-    cameras = read(path)
-    assert cameras.gnss.crs == "EPSG:4979"
-    assert cameras.gnss.xyz[1].tolist() == [8.25, 47.5, 440]
-    assert cameras.gnss.sigma_m[1] == pytest.approx([0.2, 0.3, np.nan], nan_ok=True)
-    assert np.isnan(cameras.gnss.xyz[[0, 2]]).all()
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["database.db", "sparse"]
 
 
 @pytest.mark.parametrize(

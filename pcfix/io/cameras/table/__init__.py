@@ -79,14 +79,12 @@ _OWN_NAMES = (
     *("omega", "phi", "kappa", "qw", "qx", "qy", "qz", "enable", "tx", "ty", "tz"),
     *(f"r{i}{j}" for i in "123" for j in "123"),
     *("f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2"),
-    *(f"{role}_est" for role in POSE),
 )
 SPELLINGS |= {name: (name,) for name in _OWN_NAMES}
+SPELLINGS |= {f"{role}_est": (f"{role}_est",) for role in POSE}
 POSITION = {"label", "x", "y", "z", "longitude", "latitude", "tx", "ty", "tz"}
 POSITION |= {"x_est", "y_est", "z_est"}
 MANY = ("label", *(f"sigma_{axis}" for axis in "xyz"))  # the first spelling counts
-
-_FARTHEST_HEADER = 20
 
 
 def recognises(source: Source) -> bool:
@@ -97,40 +95,52 @@ def recognises(source: Source) -> bool:
     lines = text.splitlines()
     if lines[0].lower().startswith("# coordinatesystem:"):  # it may fill the head
         return True
-    return is_geo(lines) or find_header(lines) is not None
+    return is_geo(lines) or has_header(lines)
+
+
+def has_header(lines: list[str]) -> bool:
+    """Whether a line names at least two of the columns that every table of cameras has."""
+    found = tables.find_header(lines, SPELLINGS)
+    return found is not None and len(POSITION & tables.places(found.names, SPELLINGS).keys()) >= 2
 
 
 def read(source: Source) -> Cameras:
     """Read a table; see `pcfix.read_cameras`."""
-    columns = open_table(source.path)
-    suffix = "_est" if axes(columns.place, "_est") else ""
+    columns = measured = open_table(source.path)
+    place = columns.place
+    adjusted = {role[:-4]: i for role, i in place.items() if role.endswith("_est")}
+    has_both = axes(adjusted) is not None
+    if has_both:
+        columns = replace(columns, place=adjusted | {"label": place["label"]})
     by_gnss = any(name in tables.EXIF for name in columns.header)  # measured, not adjusted
-    by_gnss |= columns.has("sigma_x") and not suffix
+    by_gnss |= columns.has("sigma_x")
+    xyz, rows = centres(columns), np.arange(len(columns.rows))
     unposed = tuple[str, ...]()
-    if suffix or by_gnss:  # else a position that is not there is a mistake
-        lost = np.isnan(centres(columns, suffix)).any(axis=1)
+    if has_both or by_gnss:  # else a position that is not there is a mistake
+        lost = np.isnan(xyz).any(axis=1)
         if lost.all():
             raise checks.no_pose(source.path, "no image has a position")
         unposed = tuple(columns.labels[i] for i in np.flatnonzero(lost))
-        columns = columns.take(np.flatnonzero(~lost))
-    labels, first = columns.labels, dict[tuple[str, bytes], int]()
-    for i, place in enumerate(centres(columns, suffix, needed=True)):
-        first.setdefault((labels[i], place.tobytes()), i)  # an exact copy counts once
-    columns = columns.take(np.array(list(first.values())))
-    turns = _rotations(columns, source.angles, suffix)
-    system, notes = crs(columns)
+        rows = np.flatnonzero(~lost)
+    labels, first = [columns.labels[i] for i in rows], dict[tuple[str, bytes], int]()
+    for i in rows.tolist():
+        first.setdefault((columns.labels[i], xyz[i].tobytes()), i)  # an exact copy counts once
+    rows = np.array(list(first.values()))
+    columns, measured = columns.take(rows), measured.take(rows)
+    turns = _rotations(columns, source.angles)
+    system, notes = crs(measured)
     if by_gnss:
         sentence = "its positions are those of the GNSS, not adjusted ones."
         notes += (note(columns.path, "cameras.not_adjusted", sentence),)
     copies = len(labels) - len(first)
     return Cameras(
         labels=tuple(columns.labels),
-        centres=centres(columns, suffix, needed=True),
+        centres=centres(columns, needed=True),
         rotations=turns,
         lenses=None if turns is None else read_lenses(columns, source.sensor),
         crs=system,
         notes=(*checks.repeated(columns.path, labels, copies), *notes),
-        gnss=gnss_positions(columns) if suffix else None,
+        gnss=gnss_positions(measured) if has_both else None,
         unposed=unposed,
         source="CSV table",
     )
@@ -168,86 +178,39 @@ def gnss_positions(columns: Table) -> GnssPositions | None:
     return GnssPositions(xyz, sigma, crs(columns)[0])
 
 
-def find_header(lines: Sequence[str]) -> tuple[int, list[str], list[str], bool] | None:
-    """Return the number of the header from 0, its names and units, and whether it is a comment.
-
-    It has at least two of the names that every table of cameras has, and is the last such comment,
-    or the first line that is none.
-    """
-    found = None
-    for i, line in enumerate(lines[:_FARTHEST_HEADER]):
-        is_comment = line.lstrip("\"' ").startswith("#")
-        text = line.strip().lstrip("#").strip() if is_comment else line.strip()
-        if text and not tables.CRS_COMMENT.match(line):
-            names, units = zip(*map(_split_unit, tables.split_header(text)[0]), strict=True)
-            if len(POSITION & tables.places(names, SPELLINGS).keys()) >= 2:
-                found = i, [*names], [*units], is_comment
-            if not is_comment:
-                break
-    return found
-
-
-def axes(place: Iterable[str], suffix: str = "") -> tuple[str, str, str] | None:
+def axes(place: Iterable[str]) -> tuple[str, str, str] | None:
     """Return the three columns of a position: x, y, z or longitude, latitude, z."""
-    for first, second in (("x", "y"), ("longitude", "latitude")):
-        three = (first + suffix, second + suffix, "z" + suffix)
-        if {*three} <= {*place}:
-            return three
-    return None
-
-
-def _split_unit(name: str) -> tuple[str, str]:
-    """Return the name of a column and its unit: omega[deg], accuracy_x_(m).
-
-    Of X/Longitude it is the name that says more.
-    """
-    plain = name.lstrip("# \"'").lower()
-    name, unit = (plain, "") if plain in _PLAIN else tables.split_unit(plain, "m|deg|gon|rad")
-    axis, slash, kind = name.partition("/")
-    more = slash and axis in ("x", "y", "z") and kind in _PLAIN
-    return kind if more else name, unit
-
-
-_PLAIN = {spelling for spellings in SPELLINGS.values() for spelling in spellings}
+    both = (("x", "y", "z"), ("longitude", "latitude", "z"))
+    return next((three for three in both if {*three} <= {*place}), None)
 
 
 def read_columns(path: Path) -> Table:
     """Read a table with a header line, which may be a comment."""
-    lines = tables.read_lines(path)
-    found = find_header(lines)
-    if found is None:
-        sentence = "no line names the columns, for example label,x,y,z,omega,phi,kappa."
-        raise bad_file(path, "table.no_header", sentence)
-    at, names, unit, comment = found
-    place = tables.places(names, SPELLINGS)
+    table = tables.read_table(path, (), SPELLINGS)
+    place, names = table.place, table.header
     for role, spellings in SPELLINGS.items():  # a column with the role's own name counts
         alike = [name for name in names if name in spellings]
         if len(alike) > 1 and role not in MANY and (role not in alike or alike.count(role) > 1):
             sentence = f"the columns {', '.join(alike)} may all be {role}. Take out all but one."
             raise bad_file(path, "table.columns_alike", sentence, columns=alike)
+    adjusted = {"x_est", "y_est", "z_est"} <= place.keys()
     if {"tx", "ty", "tz"} <= place.keys() and axes(place) is None:
         sentence = "tx, ty, tz may be translations. Give the projection centres as x, y, z."
         raise bad_file(path, "table.translations", sentence)
-    if "label" not in place or not (axes(place) or axes(place, "_est")):
+    if "label" not in place or not (axes(place) or adjusted):
         position = ("longitude", "latitude", "z") if "longitude" in place else ("x", "y", "z")
         lacking = [role for role in ("label", *position) if role not in place]
         tables.check_columns(path, names, ("label", *position), lacking)
-    comments = comment or any(line.startswith("#") for line in lines[:at])
-    below = next((line for line in lines[at + 1 :] if line.strip() and line[0] != "#"), "")
-    delimiter = tables.split_header((below if comment else lines[at]).strip())[1]
-    table = tables.table_below(
-        path, lines, names, delimiter, SPELLINGS, units=unit, at=at, comments=comments
-    )
-    return replace(table, after_hash=comment, crs=tables.stated_crs(lines[:at]))
+    return table
 
 
-def centres(columns: Table, suffix: str = "", *, needed: bool = False) -> FloatArray:
+def centres(columns: Table, *, needed: bool = False) -> FloatArray:
     """Return positions, shape (k, 3), NaN for rows without when they are not `needed`."""
     from pyproj import CRS
 
-    three = axes(columns.place, suffix)
+    three = axes(columns.place)
     if three is None:
-        return np.full((len(columns.labels), 3), np.nan)
+        return np.full((len(columns.rows), 3), np.nan)
     xyz = columns.of(three) if needed else columns.where_there(three)
     for i, side in enumerate(("longitude_ref", "latitude_ref")):
         if columns.has(side):
@@ -255,7 +218,7 @@ def centres(columns: Table, suffix: str = "", *, needed: bool = False) -> FloatA
             beyond = [text[:1].upper() in ("S", "W") for text in texts]
             xyz[beyond, i] = -np.abs(xyz[beyond, i])
     system = crs(columns)[0] or "local"
-    if three[0].startswith("longitude") or (system != "local" and CRS(system).is_geographic):
+    if three[0] == "longitude" or (system != "local" and CRS(system).is_geographic):
         bad = (np.abs(xyz[:, :2]) > [360.0, 90.0]).any(axis=1)
         if bad.any():
             i = int(np.argmax(bad))
@@ -306,12 +269,12 @@ LOOKS_DOWN_DEG = 80.0
 """Largest tilt from the vertical of a camera that looks at the ground."""
 
 
-def _rotations(columns: Table, angles: Angles | None, suffix: str = "") -> FloatArray | None:
+def _rotations(columns: Table, angles: Angles | None) -> FloatArray | None:
     """Return world to camera rotations, or None where the table has nothing that turns.
 
-    `angles` is what the user says that they are, `suffix` is ``_est`` for adjusted values.
+    `angles` is what the user says that they are.
     """
-    opk, ypr = (tuple(a + suffix for a in kind) for kind in (OMEGA_PHI_KAPPA, YAW_PITCH_ROLL))
+    opk, ypr = OMEGA_PHI_KAPPA, YAW_PITCH_ROLL
     for kind in (opk, ypr, QUATERNION, MATRIX):
         there = [role for role in kind if columns.has(role)]
         missing = [role for role in kind if not columns.has(role)]
@@ -334,7 +297,7 @@ def _rotations(columns: Table, angles: Angles | None, suffix: str = "") -> Float
             sentence += " pitch, roll, or give --angles omega-phi-kappa."
             raise bad_file(columns.path, "cameras.angles", sentence)
         found = rotations.from_omega_phi_kappa(*columns.of(opk).T)
-        if columns.has(*MATRIX) and opk == OMEGA_PHI_KAPPA:  # they must be the same turn
+        if columns.has(*MATRIX):  # they must be the same turn
             half_chord = np.linalg.norm(found - _from_matrix(columns), axis=(1, 2)) / np.sqrt(8.0)
             apart_deg = np.degrees(2.0 * np.arcsin(np.minimum(half_chord, 1.0)))
             worst, apart = int(np.argmax(apart_deg)), float(apart_deg.max())
@@ -346,7 +309,7 @@ def _rotations(columns: Table, angles: Angles | None, suffix: str = "") -> Float
         return checks.quaternions(columns.path, columns.labels, columns.of(QUATERNION))
     if columns.has(*MATRIX):
         return _from_matrix(columns)
-    return _from_yaw_pitch_roll(columns, ypr) if columns.has(*ypr) else None
+    return _from_yaw_pitch_roll(columns) if columns.has(*ypr) else None
 
 
 def read_lenses(columns: Table, sensor: Path | None) -> tuple[Lens, ...]:
@@ -385,16 +348,16 @@ def _from_matrix(columns: Table) -> FloatArray:
     return rotations.from_photogrammetric(found) if back_is_up.all() else found
 
 
-def _from_yaw_pitch_roll(columns: Table, ypr: Sequence[str]) -> FloatArray:
+def _from_yaw_pitch_roll(columns: Table) -> FloatArray:
     """Return rotations from angles of the view; what the header cannot say, the view must.
 
     Refused are angles that are more likely those of a gimbal, which are -90 straight down.
     """
-    values = columns.of(ypr).T
+    values = columns.of(YAW_PITCH_ROLL).T
     found, aircraft = rotations.from_yaw_pitch_roll(*values), rotations.from_aircraft(*values)
-    if columns.name(ypr[0]).startswith("gimbal"):
+    if columns.name("yaw").startswith("gimbal"):
         return aircraft
-    if columns.after_hash and columns.name(ypr[0]) == "heading":  # RealityCapture's
+    if columns.after_hash and columns.name("yaw") == "heading":  # RealityCapture's
         return found
     tilt, other = (  # the angles between the views and straight down
         np.degrees(np.arctan2(np.hypot(each[:, 2, 0], each[:, 2, 1]), -each[:, 2, 2]))

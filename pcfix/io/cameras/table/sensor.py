@@ -22,7 +22,7 @@ from pcfix.io.cameras.checks import write_new
 from pcfix.io.cameras.lenses import LensModel, lens_by_name, model_of
 from pcfix.io.crs import is_topocentric
 from pcfix.io.files import check_input
-from pcfix.io.tables import Table, check_columns, read_lines, read_table, split_header
+from pcfix.io.tables import Table, check_columns, read_table
 from pcfix.model import Cameras, Lens
 from pcfix.options.declare import File
 
@@ -95,9 +95,8 @@ def _table(path: Path) -> Table | None:
         is_xml = stream.read(64).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
     if is_xml:
         return None
-    names = {*split_header("".join(read_lines(path)[:1]).strip())[0]}
-    known = (columns for columns in (PIXELS, FRAME) if names.issuperset(columns))
-    return read_table(path, next(known, MILLIMETRES))
+    names = (*MILLIMETRES, *PIXELS, *(NAMES.get(n, n) for n in OPENCV["OpenCV"].names.split()))
+    return read_table(path, (), {name: (name,) for name in names})
 
 
 POSE = ("label", "x", "y", "z", "qw", "qx", "qy", "qz")
