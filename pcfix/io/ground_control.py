@@ -84,7 +84,8 @@ CHECK = ("check", "check_point", "checkpoint", "cp", "chk")
 CONTROL = ("", "control", "control_point", "controlpoint", "gcp", "3d_gcp", "ground_control_point")
 ON, WATERLINE = "on:", ("waterline", "water_line", "shoreline", "on:water")
 YES, NO = ("yes", "y", "true", "1"), ("", "no", "n", "false", "0")
-_LEAST_ODM = 6
+ODM = ("x", "y", "z", "u", "v", "label", "point")
+"""Fields of ODM's list, the last one optional."""
 _PLAIN = {"point": "name", "label": "image"}
 
 
@@ -282,16 +283,16 @@ def read_marks(path: Path) -> tuple[list[Mark], str | None]:
     rows = [(i, fields) for i, fields in numbered[1:] if not fields[0].startswith("#")]
     first = [number(field) for field in rows[0][1][:5]] if rows else []
     if len(first) == 5 and not np.isnan([*first[:2], *first[3:]]).any():  # z may be NaN
-        return _from_odm(path, rows)
+        return _from_table(_odm_table(path, rows))
     if not has_header(lines):
         sentence = "is neither a table of marks nor OpenDroneMap's gcp_list.txt. Line 1 must name"
         sentence += " the columns name, x, y, z, image, u, v, or be a CRS."
         raise bad_file(path, "gcps.format", sentence)
-    return _from_table(path)
+    return _from_table(read_table(path, (), SPELLINGS))
 
 
-def _from_table(path: Path) -> tuple[list[Mark], str | None]:
-    columns = read_table(path, (), SPELLINGS)
+def _from_table(columns: Table) -> tuple[list[Mark], str | None]:
+    path = columns.path
     missing = [_PLAIN.get(r, r) for r in ("point", "label", "u", "v") if not columns.has(r)]
     if not axes(columns.place):
         missing += [axis for axis in "xyz" if not columns.has(axis)]
@@ -351,21 +352,18 @@ def _texts(columns: Table, role: str) -> list[str]:
     return [text.strip().lower().replace(" ", "_") for text in columns.column(role)]
 
 
-def _from_odm(path: Path, rows: list[tuple[int, list[str]]]) -> tuple[list[Mark], str | None]:
+def _odm_table(path: Path, rows: list[tuple[int, list[str]]]) -> Table:
+    """Return ODM's list as a table; points without a name are named by their coordinates."""
     for i, fields in rows:
-        if len(fields) < _LEAST_ODM:
+        if len(fields) < len(ODM) - 1:
             sentence = f"line {i} has {len(fields)} fields. Give x, y, z, u, v, image."
             raise bad_file(path, "gcps.fields", sentence, line=i)
-    texts, lines = [fields for _, fields in rows], [i for i, _ in rows]
-    roles = {role: i for i, role in enumerate("xyzuv")}
-    values = Table(path, [*roles], texts, lines, roles, [""] * len(roles)).of(roles)
-    places = [tuple(row) for row in values[:, :3].tolist()]
-    by_place = {place: f"GCP {i + 1}" for i, place in enumerate(dict.fromkeys(places))}
-    marks = []
-    for (line, fields), place, numbers in zip(rows, places, values, strict=True):
-        name = fields[_LEAST_ODM] if len(fields) > _LEAST_ODM else by_place[place]
-        marks.append(Mark(f"line {line}", name, fields[5], numbers[3:], numbers[:3]))
-    return marks, named_crs(path)
+    places = dict.fromkeys(tuple(map(number, fields[:3])) for _, fields in rows)
+    names = {place: f"GCP {i}" for i, place in enumerate(places, start=1)}
+    texts = [[*fields, names[tuple(map(number, fields[:3]))]][: len(ODM)] for _, fields in rows]
+    place = {role: i for i, role in enumerate(ODM)}
+    lines = [i for i, _ in rows]
+    return Table(path, [*ODM], texts, lines, place, [""] * len(ODM), crs=named_crs(path))
 
 
 def _from_metashape(path: Path) -> tuple[list[Mark], str | None]:

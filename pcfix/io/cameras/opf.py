@@ -82,9 +82,6 @@ def read(source: Source) -> Cameras:
     captured = [
         shot["id"] for capture in given.get("captures", []) for shot in capture.get("cameras", [])
     ]
-    if any(shot.get("rolling_shutter") for shot in shots.values()):
-        sentence = "its rolling shutter is ignored, each image has one pose."
-        notes.append(note(path, "cameras.rolling_shutter", sentence))
     return Cameras(
         labels=labels,
         centres=frame.points(xyz),

@@ -29,8 +29,7 @@ OPENMVG = "a scene of OpenMVG", COLMAP
 ALICEVISION = "a scene of AliceVision (Meshroom)", COLMAP
 NERF = "a scene of nerfstudio or instant-ngp", "Give the model from which it was converted"
 RC = "a project of RealityCapture", "Export Internal/External camera parameters or XMP files"
-PATB = "a text like PATB's .ori, with rotation matrices", OPK
-BARE = "a table without a header", "Write one, for example label,x,y,z,omega,phi,kappa"
+BARE = "a table without a header, or with several lines an image", OPK
 SOCET = "a support file of SOCET SET", OPK
 GCPS = "a list of ground control points (ODM)", POSES
 CONTENTS: tuple[tuple[bytes, Refusal], ...] = (
@@ -115,10 +114,5 @@ def _bare_numbers(text: str) -> Refusal | None:
         if line.strip() and not line.startswith("#"):
             values = [number(word) for word in re.split(r"[,;\s]+", line.strip())]
             values = values[1:] if np.isnan(values[0]) else values  # after at most one name
-            rows.append([] if np.isnan(values).any() else values)
-    for three in zip(rows, rows[1:], rows[2:], strict=False):
-        if [len(row) for row in three] == [3, 3, 3]:
-            with np.errstate(all="ignore"):
-                if np.abs(np.array(three) @ np.array(three).T - np.eye(3)).max() < 1e-3:
-                    return PATB
-    return BARE if rows and all(len(row) >= 3 for row in rows[:20]) else None
+            rows.append(0 if np.isnan(values).any() else len(values))
+    return BARE if rows and min(rows[:20]) >= 2 else None

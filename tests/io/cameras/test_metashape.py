@@ -311,14 +311,8 @@ def test_fisheyes_have_the_distortion_of_a_frame_camera(tmp_path, kind, radius):
 
 def test_what_a_lens_here_has_not_is_told(tmp_path):
     corrections = '<corrections type="fourier"><coeffs>3 4 0 0</coeffs></corrections>'
-    cameras = read_chunk(
-        tmp_path,
-        sensors=sensor(
-            calibration("<f>9</f>" + corrections)
-            + '<property name="rolling_shutter" value="true"/>'
-        ),
-    )
-    assert notes(cameras) == ["cameras.corrections", "cameras.rolling_shutter"]
+    cameras = read_chunk(tmp_path, sensors=sensor(calibration("<f>9</f>" + corrections)))
+    assert notes(cameras) == ["cameras.corrections"]
     assert cameras.notes[0].values["rms_px"] == pytest.approx(12.5**0.5)
 
 

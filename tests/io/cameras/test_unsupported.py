@@ -22,7 +22,7 @@ FILES = {
     "a.p4d": (b'<?xml version="1.0"?>\n<!DOCTYPE Pix4D>\n', "a project of Pix4D"),
     "a.rcproj": (b"<RealityCaptureProject>", "a project of RealityCapture"),
     "a.prj": (b"$PROJECT 15.0.0\n  $ANGULAR_UNITS : deg\n$END\n", "Inpho"),
-    "a.ori": (PATB.encode(), "PATB"),
+    "a.ori": (PATB.encode(), "a table without a header"),
     "a.sfm": (json.dumps(SFM).encode(), "AliceVision"),
     "gcp_list.txt": (b"EPSG:32632\n500 5000 10 120 80 a.jpg\n", "ground control points"),
     "sensor.csv": (b"focal,sensor_x,sensor_y\n8.8,13.2,8.8\n", "a table of the sensor"),

@@ -358,9 +358,6 @@ def lens_of(path: Path, sensor: Element, image: str) -> tuple[Lens, tuple[PcfixW
         lens = lens_by_name(given, width, height, projection=projection, sensor=label)
         sentence = f"sensor {label} has no calibration; the lens of its data sheet is used."
         notes.append(note(path, "cameras.data_sheet_lens", sentence, sensor=label))
-    if (stated.get("rolling_shutter") or "0").lower() not in ("0", "false", "disabled"):
-        sentence = f"the rolling shutter of sensor {label} is ignored; each image has one pose."
-        notes.append(note(path, "cameras.rolling_shutter", sentence, sensor=label))
     return replace(lens, pixel_size_mm=pixel_mm if pixel_mm > 0.0 else None), tuple(notes)
 
 
@@ -405,15 +402,6 @@ def gnss_positions(
     elif are_degrees and not own and not parsed.is_geographic:
         sentence = "the camera positions are degrees in a CRS in metres; WGS 84 is assumed."
         crs, notes = "EPSG:4979", [note(path, "cameras.gnss_in_degrees", sentence)]
-    for sensor in dict.fromkeys(image.sensor for image in images if image.sensor is not None):
-        antenna = text_of(sensor, "antenna/location").split()
-        for shift in sensor.iterfind("antenna/reference"):
-            antenna += [shift.get(axis) or "0" for axis in "xyz"]
-            antenna += shift.get("location", "").split()
-        if any(number(path, "GNSS antenna", one) for one in antenna):
-            label = name_of(sensor)
-            sentence = f"the GNSS positions are those of the antenna (sensor {label}), not offset."
-            notes.append(note(path, "cameras.antenna_offset", sentence, sensor=label))
     return GnssPositions(xyz, sigma, crs), tuple(notes)
 
 

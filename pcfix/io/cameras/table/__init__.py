@@ -34,7 +34,7 @@ its f, px, py and the order of t1, t2 are those of AliceVision's reader of the s
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 

@@ -3,9 +3,8 @@
 The lens is that of a table beside it, a calibration, or the table's own columns. Written are
 ``cameras.csv``, with label, x, y, z, qw, qx, qy, qz: projection centre and rotation from the world
 to the camera (x right, y down, z forward), after a comment with the CRS where there is one; and
-``sensor.csv``, with the lens in pixels with OpenCV's names or, of an undistorted lens in mm, as
-focal, sensor_x, sensor_y. Where the images have several lenses of one frame, each row of
-``cameras.csv`` has its own (f, px, py, k1 ... k4, t1, t2) and ``sensor.csv`` has only the frame.
+``sensor.csv``, with the one lens of all images, in pixels with OpenCV's names or, of an undistorted
+lens in mm, as focal, sensor_x, sensor_y.
 """
 
 from __future__ import annotations
@@ -31,7 +30,6 @@ PIXELS = ("focal_px", "width_px", "height_px")
 NAMES = {"d1": "k4", "d2": "k5", "d3": "k6", "p2": "p1", "p1": "p2"}
 """What OpenCV calls the parameters that have another name in `lenses`."""
 OPENCV = {"OpenCV": LensModel("f cx cy k1 k2 k3 d1 d2 d3 p2 p1")}
-BROWN = {"Brown": LensModel("f cx cy k1 k2 k3 k4 p1 p2")}
 CENTRED = {"centred": LensModel("f")}
 FRAME = ("width_px", "height_px")
 DISTORTION = ("k1", "k2", "k3", "k4", "t1", "t2")
@@ -100,7 +98,6 @@ def _table(path: Path) -> Table | None:
 
 
 POSE = ("label", "x", "y", "z", "qw", "qx", "qy", "qz")
-OWN = ("f", "px", "py", *DISTORTION)
 
 
 def write_table(folder: File, cameras: Cameras) -> None:
@@ -120,34 +117,27 @@ def write_table(folder: File, cameras: Cameras) -> None:
     if cameras.crs is not None and is_topocentric(cameras.crs):
         sentence = f"a table cannot hold the axes {cameras.crs}. Use a projected CRS."
         raise bad_file(target, "output.crs", sentence, crs=cameras.crs)
-    distinct = list(dict.fromkeys(lenses))
-    given, own = distinct[0], None
-    if len(distinct) > 1:  # f, px, py, k1 ... k4, t1, t2 of each row as RealityCapture has them
-        is_one_frame = len({(lens.width, lens.height) for lens in distinct}) == 1
-        sensor, own = _row({"width_px": given.width, "height_px": given.height}), []
-        side = max(given.width, given.height)
-        for lens in lenses:
-            f, cx, cy, *brown = model_of(target, lens, BROWN if is_one_frame else {})[1].values()
-            middle = (cx - lens.width / 2.0) / side, (cy - lens.height / 2.0) / side
-            own.append([f * FILM_MM / side, *middle, *brown])
-    else:
-        is_mm = given.unit == "mm"
-        _, values = model_of(target, given, CENTRED if is_mm else OPENCV, unit=given.unit)
-        frame = (values.pop("f"), given.width, given.height)
-        named = {NAMES.get(name, name): value for name, value in values.items()}
-        sensor = _row(dict(zip(MILLIMETRES if is_mm else PIXELS, frame, strict=True)) | named)
+    given, *others = dict.fromkeys(lenses)
+    if others:
+        sentence = (
+            f"a table holds one lens, the images have {1 + len(others)}. Take another format."
+        )
+        raise bad_file(target, "output.lens", sentence)
+    is_mm = given.unit == "mm"
+    _, values = model_of(target, given, CENTRED if is_mm else OPENCV, unit=given.unit)
+    frame = (values.pop("f"), given.width, given.height)
+    sensor = dict(zip(MILLIMETRES if is_mm else PIXELS, frame, strict=True))
+    sensor |= {NAMES.get(name, name): value for name, value in values.items()}
+    lines = [",".join(sensor), ",".join(repr(float(value)) for value in sensor.values())]
     turns = Rotation.from_matrix(rotations).as_quat(canonical=True)
     numbers = np.column_stack([cameras.centres, np.roll(turns, 1, axis=1)]).tolist()
     stream = io.StringIO()
     if cameras.crs is not None and cameras.crs.strip().lower() != "local":
         stream.write(f"# CoordinateSystem: {' '.join(cameras.crs.split())}\n")
     writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(POSE if own is None else POSE + OWN)
-    for i, label in enumerate(cameras.labels):
-        more = [] if own is None else own[i]
-        writer.writerow([label, *map(repr, [*numbers[i], *more])])
-    write_new(target, {"cameras.csv": stream.getvalue().encode(), "sensor.csv": sensor.encode()})
-
-
-def _row(values: dict[str, float]) -> str:
-    return ",".join(values) + "\n" + ",".join(repr(float(v)) for v in values.values()) + "\n"
+    writer.writerow(POSE)
+    writer.writerows(
+        [label, *map(repr, row)] for label, row in zip(cameras.labels, numbers, strict=True)
+    )
+    written = "\n".join([*lines, ""]).encode()
+    write_new(target, {"cameras.csv": stream.getvalue().encode(), "sensor.csv": written})
