@@ -48,8 +48,7 @@ FORMATS = (
     CameraFormat("Agisoft Metashape, PhotoScan", "metashape"),
     CameraFormat("Pix4D", "pix4d"),
     CameraFormat("OPF: PIX4Dmatic, PIX4Dcatch", "opf"),
-    CameraFormat("OpenDroneMap", "odm"),
-    CameraFormat("OpenSfM", "opensfm"),
+    CameraFormat("OpenDroneMap, OpenSfM", "odm"),
     CameraFormat("COLMAP", "colmap"),
     CameraFormat("MicMac", "micmac"),
     CameraFormat("Bundler, MVE, VisualSFM", "bundler"),
@@ -58,8 +57,7 @@ FORMATS = (
     CameraFormat("CSV table", "table"),
     UNSUPPORTED,
 )
-"""In the order in which they are asked: ODM knows more of an OpenSfM file than OpenSfM, and a plain
-table says least of all."""
+"""In the order in which they are asked: a plain table says least of all."""
 TAKE_SENSOR = ("table", "realitycapture")
 """Modules that look for the sensor themselves."""
 

@@ -25,7 +25,6 @@ References: "Outputs" in the ODM manual, https://docs.opendronemap.org/outputs; 
 
 from __future__ import annotations
 
-import mmap
 import re
 from dataclasses import replace
 from pathlib import Path, PurePath
@@ -49,6 +48,7 @@ RECONSTRUCTION = "reconstruction.json"
 TRANSFORMATION = "geocoords_transformation.txt"
 TOPOCENTRIC = "reconstruction.topocentric.json"
 ALIGNED_M = 0.1
+TOPOCENTRIC_LIMIT_M = 1e5
 SCALE_TOLERANCE = 0.1
 """Of the squared scale of a map projection; feet, or a matrix of nonsense, are outside."""
 WHOLE_M = 2e-3
@@ -62,39 +62,27 @@ _NAMES = (SHOTS, TRANSFORMATION, TOPOCENTRIC, "cameras.json", "images.json", *_O
 _SHOTS_HEAD = re.compile(
     r'\s*\{.*"features"\s*:\s*\[.*"(translation|rotation|filename)"', re.DOTALL
 )
-_REFERENCE = re.compile(rb'"(latitude|longitude)"\s*:\s*(-?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)')
 Files = dict[str, Path]
 """The files of a project that are there, by name, and the one with the ``poses``."""
 
 
 def recognises(source: Source) -> bool:
-    """Whether it is shots.geojson, or a reconstruction in a project of ODM."""
+    """Whether it is shots.geojson or a reconstruction, or a folder that holds one."""
     files = _files_of(source.path)
-    if "poses" not in files:
-        return False
-    found = Source(files["poses"])
-    if _SHOTS_HEAD.match(found.text):
-        return True
-    if not opensfm.recognises(found):
-        return False
-    if files.keys() & {*_OF_CRS, SHOTS, TOPOCENTRIC}:
-        return True
-    with files["poses"].open("rb") as stream:
-        view = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
-    at = view.find(b'"reference_lla"')  # the file may be large
-    text = view[at : at + 400] if at >= 0 else b""
-    values = {key: float(value) for key, value in _REFERENCE.findall(text)[:2]}
-    reference = (values[b"latitude"], values[b"longitude"]) if len(values) == 2 else None
-    return reference is not None and _whole_metres(*reference, None) is not None
+    text = Source(files["poses"]).text.lstrip() if "poses" in files else ""
+    return bool(_SHOTS_HEAD.match(text) or opensfm.HEAD.match(text))
 
 
 def read(source: Source) -> Cameras:
     """Read the poses, of a folder rather from the reconstruction than from shots.geojson."""
     files = _files_of(source.path)
-    if not opensfm.recognises(Source(files["poses"])):
+    if _SHOTS_HEAD.match(Source(files["poses"]).text):
         return _read_shots(files)
     found = opensfm.read_reconstruction(files["poses"])
     own, placed = found.cameras, _frame(files, found)
+    if placed is None:
+        middle = np.median(own.centres[:, :2], axis=0)
+        return own if np.abs(middle).max() <= TOPOCENTRIC_LIMIT_M else replace(own, crs=None)
     gnss, listed = read_images(files.get("images.json"), own.labels)
     cameras = replace(
         own,
@@ -120,8 +108,8 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """Read points and tracks, in the frame of the poses."""
     files = _files_of(source.path)
     found = opensfm.read_reconstruction(files["poses"])
-    points = opensfm.read_tie_points(found)
-    return replace(points, xyz=_frame(files, found).points(points.xyz))
+    points, placed = opensfm.read_tie_points(found), _frame(files, found)
+    return points if placed is None else replace(points, xyz=placed.points(points.xyz))
 
 
 def _files_of(path: Path) -> Files:
@@ -159,9 +147,12 @@ def named_crs(path: Path) -> str:
     return crs
 
 
-def _frame(files: Files, found: opensfm.Reconstruction) -> AffineFrame:
-    """Decide the frame; see the top of this module for the rules."""
+def _frame(files: Files, found: opensfm.Reconstruction) -> AffineFrame | None:
+    """Decide the frame, see the top of this module for the rules; None for OpenSfM's own."""
     crs, reference = _crs_of(files), found.reference
+    whole = None if reference is None else _whole_metres(*reference[:2], crs)
+    if not (whole or files.keys() & {*_OF_CRS, SHOTS, TOPOCENTRIC}):
+        return None
     unmoved = AffineFrame(np.eye(3), np.zeros(3), found.cameras.crs or "", crs)
     if reference is None or found.path.name == TOPOCENTRIC:
         return unmoved
@@ -177,7 +168,6 @@ def _frame(files: Files, found: opensfm.Reconstruction) -> AffineFrame:
         named = _crs_of_place(lon, lat, shift[:2], [crs] if crs else _zones(lat, lon))
         if named is not None:  # else the file is of another origin
             return AffineFrame(turn, shift, named)
-    whole = _whole_metres(*reference[:2], crs)
     if whole is None:
         return unmoved
     crs, east, north = whole

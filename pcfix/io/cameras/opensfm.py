@@ -40,7 +40,7 @@ import numpy as np
 from pcfix.errors import bad_file
 from pcfix.io import crs as systems
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import NO_TIE_POINTS, Source, are_seen
+from pcfix.io.cameras.checks import NO_TIE_POINTS, are_seen
 from pcfix.io.cameras.georeference import frame_of, georeference, is_tied
 from pcfix.io.cameras.lenses import LensModel, lens_by_name, model_of
 from pcfix.io.labels import unnamed
@@ -49,35 +49,8 @@ from pcfix.lens.rotations import from_rotation_vectors
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
 from pcfix.options.declare import File
 
-TOPOCENTRIC_LIMIT_M = 1e5
-
 _KEYS = "cameras|shots|points|pano_shots|reference_lla|biases|rig_cameras|rig_instances"
-_HEAD = re.compile(rf'\[\s*\{{\s*"({_KEYS})"\s*:\s*\{{')
-
-
-def recognises(source: Source) -> bool:
-    """Whether a file begins as a list of reconstructions, or a folder holds one by name."""
-    if source.path.is_dir():
-        return "reconstruction.json" in source.names
-    return _HEAD.match(source.text.lstrip()) is not None
-
-
-def read(source: Source) -> Cameras:
-    """Read the poses of the largest reconstruction."""
-    cameras = read_reconstruction(_file(source)).cameras
-    absolute = np.abs(np.median(cameras.centres[:, :2], axis=0)).max() > TOPOCENTRIC_LIMIT_M
-    return replace(cameras, crs=None) if absolute else cameras
-
-
-def tie_points(source: Source, cameras: Cameras) -> TiePoints:
-    """Read points and tracks."""
-    return read_tie_points(read_reconstruction(_file(source)))
-
-
-def _file(source: Source) -> Path:
-    return source.path / "reconstruction.json" if source.path.is_dir() else source.path
-
-
+HEAD = re.compile(rf'\[\s*\{{\s*"({_KEYS})"\s*:\s*\{{')
 NO_GNSS = 999999.0
 """The gps_dop that OpenSfM writes for an image without a position."""
 
