@@ -32,14 +32,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
-from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning, bad_file
+from pcfix.io.cameras import metashape
 from pcfix.io.cameras.checks import Source
 from pcfix.io.cameras.checks import number as xml_number
-from pcfix.io.cameras.metashape import SPREADS, documents, spreads
 from pcfix.io.cameras.odm import named_crs
 from pcfix.io.cameras.table import SPELLINGS as POSITIONS
 from pcfix.io.cameras.table import axes, centres, has_header
@@ -276,7 +275,7 @@ def _to_cameras(
 
 def read_marks(path: Path) -> tuple[list[Mark], str | None]:
     """Read the marks of a file, and the CRS that it states."""
-    if documents.recognises(Source(path)):
+    if metashape.recognises(Source(path)):
         return _from_metashape(path)
     lines = read_lines(path)
     numbered = [(i, line.split()) for i, line in enumerate(lines, start=1) if line.strip()]
@@ -368,31 +367,31 @@ def _odm_table(path: Path, rows: list[tuple[int, list[str]]]) -> Table:
 
 def _from_metashape(path: Path) -> tuple[list[Mark], str | None]:
     """Read the markers that have surveyed coordinates, where they were measured in the images."""
-    chunk = documents.open_chunk(path)
+    chunk = metashape.open_chunk(path)
     frame = chunk.frame
-    names = {c.get("id"): _label(c) for c in chunk.element.iterfind("cameras//camera")}
+    names = {c.get("id"): metashape.name_of(c) for c in chunk.element.iterfind("cameras//camera")}
     default, pixels = (
         xml_number(path, f"setting {name}", chunk.settings.get(name, "0"))
         for name in ("accuracy_markers", "accuracy_projections")
     )
     surveyed: dict[str, Mark] = {}
     for marker in chunk.element.iterfind("markers//marker"):
-        found, label = marker.find("reference"), _label(marker)
+        found, label = marker.find("reference"), metashape.name_of(marker)
         stated = (marker if found is None else found).attrib
         if all(stated.get(axis) for axis in "xyz"):
             where = f"marker {label}, reference"
             xyz = np.array([xml_number(path, where, stated[axis]) for axis in "xyz"])
-            sigma = spreads(path, f"marker {label}", stated, SPREADS, np.full(3, default))
+            sigma = metashape.spreads(path, where, stated, metashape.SPREADS, np.full(3, default))
             surveyed[marker.get("id") or ""] = Mark(
                 f"marker {label}", label, "", np.full(2, np.nan), xyz,
                 np.where(sigma > 0.0, sigma, np.nan), pixels if pixels > 0.0 else np.nan,
                 stated.get("enabled") in ("false", "0"),
             )  # fmt: skip
     marks = []
-    for name, camera, uv in [] if frame is None else documents.measured_marks(frame):
+    for name, camera, uv in [] if frame is None else metashape.measured_marks(frame):
         if name in surveyed:
             image = names.get(camera, f"camera {camera}")
-            marks.append(surveyed[name]._replace(image=image, uv=np.array(uv)))
+            marks.append(surveyed[name]._replace(image=image, uv=uv))
     if not marks:
         sentence = "has no marker with surveyed coordinates and a mark in an image. Export them."
         raise bad_file(path, "gcps.none", sentence)
@@ -401,7 +400,3 @@ def _from_metashape(path: Path) -> tuple[list[Mark], str | None]:
     if crs.lower() == LOCAL or is_local(parse_crs(crs, str(chunk.path))):
         crs = LOCAL
     return marks, crs
-
-
-def _label(element: Element) -> str:
-    return element.get("label") or f"number {element.get('id')}"

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning, bad_file
-from pcfix.io.cameras.metashape.documents import open_chunk
+from pcfix.io.cameras.metashape import open_chunk
 from pcfix.io.files import check_input, read_json
 from pcfix.io.labels import match_labels
 from pcfix.io.tables import read_table

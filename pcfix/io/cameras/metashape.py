@@ -1,0 +1,632 @@
+"""Agisoft Metashape and PhotoScan: exported cameras or markers, and whole projects.
+
+Read are the XML of *Export Cameras* and *Export Markers*, projects of one file (.psz, a zip) and
+projects with a folder (.psx, whose documents lie in zips in ``<name>.files``).
+
+Convention. ``camera/transform`` is a 4x4 matrix from the camera (x right, y down, z forward) to the
+chunk, whose origin, axes and scale mean nothing. The ``transform`` of the camera's component, or of
+the chunk, leads on to the world as s R X + t. With a CRS in ``reference`` the world is geocentric,
+on the datum of that CRS, whatever its kind; heights there are ellipsoidal, and only the export to
+that CRS brings a geoid in. With ``LOCAL_CS``, or no transform, the world is local. The image of a
+slave camera (``master_id``) has the pose T_master [R, t], with the rotation and location of its
+sensor in the master's frame, t in the unit of the chunk. EXIF orientations turn only what is
+displayed: matrices and pixels are those of the image as stored.
+
+The tie points of a frame are PLY files in one archive: ``points`` has x, y, z in the frame of the
+component and the id of the track, ``projections`` of each camera have x and y in pixels from the
+corner of the image and the id of the track. A project of one file has them beside its document.
+Markers stand in the document of the frame, as ``location`` with x and y; only the pinned ones were
+measured, the others Metashape computed from the poses. Where the GNSS put the cameras is their
+``reference``, in the CRS of the cameras or of the chunk.
+
+Calibration. The formula is that of `pcfix.model.Lens`, with cx and cy from the centre of the image.
+A fisheye is equidistant, and since version 2.3 can be equisolid. Files of PhotoScan up to 1.2 can
+have fx and fy instead of f; there cx and cy count from the corner, and p1 and p2 change places.
+The element decides this, as the version of the document does not.
+
+References: "Agisoft Metashape User Manual, Professional Edition", appendix "Camera models";
+"Metashape Python Reference", Chunk.transform, Sensor.location, CoordinateSystem.geoccs;
+``save_estimated_reference.py`` in github.com/agisoft-llc/metashape-scripts.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import zipfile
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple, TypeAlias
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from pcfix.errors import InputError, PcfixWarning, bad_file
+from pcfix.io.cameras import checks
+from pcfix.io.cameras.checks import (
+    ZIP_MAGIC,
+    Source,
+    damaged,
+    note,
+    number,
+    numbers,
+    read_xml,
+    text_of,
+)
+from pcfix.io.cameras.lenses import lens_by_name
+from pcfix.io.crs import LOCAL, METRES, crs_text, is_local, parse_crs, shortened, unbound
+from pcfix.io.ply import parse_header
+from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, Projection, TiePoints
+
+Spreads: TypeAlias = "tuple[tuple[str, tuple[int, ...]], ...]"
+"""Names of stated standard deviations and the axes that they are of."""
+SPREADS: Spreads = (
+    *(("sxyz", (0, 1, 2)), ("sxy", (0, 1))),
+    *(("sx", (0,)), ("sy", (1,)), ("sz", (2,))),
+)
+DEFAULTS: Spreads = (
+    ("accuracy_cameras", (0, 1, 2)),
+    ("accuracy_cameras_xy", (0, 1)),
+    ("accuracy_cameras_z", (2,)),
+)
+POINTS, MARKS = ("x", "y", "z", "id"), ("x", "y", "id")
+PARAMETERS = {
+    *("f", "fx", "fy", "cx", "cy", "b1", "b2", "skew"),
+    *("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4"),
+}
+PROJECTIONS: dict[str, Projection] = {
+    "frame": "perspective",
+    "fisheye": "equidistant",
+    "equidistant_fisheye": "equidistant",
+    "equisolid_fisheye": "equisolid",
+}
+"""Kinds of sensors that a lens can describe: not spherical, cylindrical or RPC."""
+ROOT = re.compile(r"\s*(?:<\?.*?\?>\s*|<!--.*?-->\s*)*<(\w+)", re.DOTALL)
+OF_CHUNKS = re.compile(r"<chunks?\b|\bpath=")
+INSIDE = {"document": OF_CHUNKS, "collection": OF_CHUNKS, "chunk": re.compile(r"<sensors\b")}
+
+
+def recognises(source: Source) -> bool:
+    """Whether the content is a project, a chunk, or an archive of one."""
+    if source.path.is_dir():
+        return "project.zip" in source.names
+    text = source.text
+    if source.head.startswith(ZIP_MAGIC):
+        with suppress(*checks.DAMAGES), zipfile.ZipFile(source.path) as archive:
+            text = archive.open("doc.xml").read(len(source.head)).decode("utf-8", "replace")
+    root = ROOT.match(text)
+    inside = INSIDE.get(root[1]) if root else None
+    return bool(root and inside and inside.search(text, root.end()))
+
+
+def read(source: Source) -> Cameras:
+    """Read the aligned images of a chunk: geocentric, or in a ``local`` frame."""
+    chunk = open_chunk(source.path)
+    images, unposed, notes = aligned_images(chunk)
+    path, (crs, project_crs, of_world) = chunk.path, _world(chunk)
+    notes += of_world
+    in_world = np.array([image.place @ image.pose for image in images])
+    scales = np.cbrt(np.linalg.det(in_world[:, :3, :3]))[:, None, None]
+    lenses: dict[Element, Lens] = {}
+    for image in images:
+        if image.sensor not in lenses:
+            lenses[image.sensor], of_lens = _lens(path, image.sensor, image.label)
+            notes += of_lens
+    gnss, of_gnss = _gnss_positions(chunk, images)
+    return Cameras(
+        labels=tuple(image.label for image in images),
+        centres=in_world[:, :3, 3],
+        rotations=np.ascontiguousarray((in_world[:, :3, :3] / scales).transpose(0, 2, 1)),
+        lenses=tuple(lenses[image.sensor] for image in images),
+        crs=crs,
+        project_crs=project_crs,
+        gnss=gnss,
+        unposed=unposed,
+        notes=(*chunk.notes, *notes, *of_gnss),
+        source=chunk.software,
+    )
+
+
+# ---- documents ----
+
+
+class Document(NamedTuple):
+    """An element, and the file or archive that contains it."""
+
+    root: Element
+    path: Path
+
+    def follow(self, element: Element) -> Document:
+        """Return the document that an element refers to by its path, or the element itself."""
+        path = self.leads_to(element)
+        return Document(element, self.path) if path is None else _unpacked(path)
+
+    def leads_to(self, element: Element) -> Path | None:
+        """Return the file that an element refers to; None if it has no path."""
+        relative = element.get("path")
+        return None if relative is None else self.path.parent / relative.replace("\\", "/")
+
+
+class Chunk(NamedTuple):
+    """The chunk that is read; `path` is what the user named, for messages."""
+
+    path: Path
+    document: Document
+    software: str
+    notes: list[PcfixWarning]
+
+    @property
+    def element(self) -> Element:
+        """The ``chunk`` element."""
+        return self.document.root
+
+    @property
+    def frame(self) -> Document | None:
+        """The first frame, which has the images of every marker and the tie points."""
+        first = self.element.find("frames/frame")
+        return None if first is None else self.document.follow(first)
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """The settings of the chunk by their names."""
+        entries = self.element.iterfind("settings/property")
+        return {entry.get("name") or "": entry.get("value") or "" for entry in entries}
+
+
+def open_chunk(path: Path) -> Chunk:
+    """Return the active chunk, or the first that has aligned images where that one has none."""
+    top, notes = _top(path), list[PcfixWarning]()
+    chosen = top
+    if top.root.tag != "chunk":
+        candidates = top.root.findall("chunk") or top.root.findall("chunks/chunk")
+        chunks = top.root.find("chunks")
+        active = None if chunks is None else chunks.get("active_id")
+        candidates.sort(key=lambda chunk: chunk.get("id") != active)
+        found, lost = [], []
+        for candidate in candidates:
+            try:
+                found.append(top.follow(candidate))
+            except InputError as error:
+                lost.append(error)
+        posed = [one for one in found if one.root.find("cameras//camera/transform") is not None]
+        if not posed and lost:
+            raise lost[0]
+        if not found:
+            raise checks.no_pose(path, "has no chunk")
+        chosen, *others = posed or found[:1]
+        if others:
+            names = [one.root.get("label") or "without a name" for one in (chosen, *others)]
+            sentence = f"several chunks have aligned images; {names[0]} is read. Activate another"
+            values = {"chunk": names[0], "others": names[1:]}
+            notes = [note(path, "cameras.several_chunks", f"{sentence} for that.", **values)]
+    entries = (*top.root.iterfind("meta/property"), *chosen.root.iterfind("meta/property"))
+    about = {entry.get("name"): entry.get("value", "") for entry in entries}
+    last, first = (about.get(f"Info/{one}SoftwareVersion") for one in ("LastSaved", "Original"))
+    document = top.root.get("version") or chosen.root.get("version")
+    software = f"Agisoft Metashape, document {document}" if document else "Agisoft Metashape"
+    if last or first:
+        program = about.get("Info/OriginalSoftwareName") or "Agisoft Metashape"
+        software = f"{program} {last or first}"
+    return Chunk(path, chosen, software, notes)
+
+
+def _top(path: Path) -> Document:
+    """Return the outermost document; that of a .psx is in the folder beside it."""
+    if path.is_dir():
+        return _unpacked(path / "project.zip")
+    with path.open("rb") as stream:
+        if stream.read(len(ZIP_MAGIC)) == ZIP_MAGIC:
+            return _unpacked(path)
+    root = read_xml(path)
+    inside = root.get("path")
+    if root.tag == "document" and inside is not None:
+        archive = Path(inside.replace("{projectname}", path.stem))
+        if archive.is_absolute():
+            raise damaged(path, f"its path '{inside}' leads out of its folder")
+        return _unpacked(path.parent / archive)
+    return Document(root, path)
+
+
+def _unpacked(path: Path) -> Document:
+    """Return the document in an archive."""
+    with checks.open_archive(path) as archive:
+        return Document(read_xml(path, io.BytesIO(checks.unpacked(archive, "doc.xml"))), path)
+
+
+# ---- images and their places ----
+
+
+class Image(NamedTuple):
+    """An aligned image: its `pose` in the frame of the chunk, and the `place` of that in the world.
+
+    Both are 4x4 matrices, from the camera and to the world.
+    """
+
+    id: str
+    label: str
+    element: Element
+    sensor: Element
+    component: str | None
+    pose: FloatArray
+    place: FloatArray
+
+
+def aligned_images(chunk: Chunk) -> tuple[list[Image], tuple[str, ...], list[PcfixWarning]]:
+    """Return the images of a chunk that are read, the names of all others, and notes.
+
+    The others are not aligned, disabled (they took no part in the dense cloud), not of a central
+    projection, or in a component without a place in the frame of the others. Photos may be in
+    groups; keyframes of animations are none.
+    """
+    path, element = chunk.path, chunk.element
+    places, _ = _places(path, element)
+    sensors = {sensor.get("id"): sensor for sensor in element.iterfind("sensors/sensor")}
+    homes: dict[str, str | None] = {
+        number: component.get("id")
+        for component in element.iterfind("components/component")
+        for ids in component.iter("camera_ids")
+        for number in (ids.text or "").split()
+    }
+    photos = [
+        (camera.get("id") or f"#{i}", camera)
+        for i, camera in enumerate(
+            one
+            for one in element.iterfind("cameras//camera")
+            if one.get("type", "regular") == "regular"
+        )
+    ]
+    own = {name: _matrix(path, camera) for name, camera in photos if text_of(camera, "transform")}
+    images, why, others = list[Image](), Counter[str](), list[str]()
+    for name, camera in photos:
+        label = camera.get("label") or f"number {name}"
+        others.append(label)
+        master = camera.get("master_id") or ""
+        homes[name] = camera.get("component_id") or homes.get(name) or homes.get(master)
+        sensor, pose = sensors.get(camera.get("sensor_id")), own.get(name)
+        if pose is None and master in own and sensor is not None:  # a slave
+            pose = own[master] @ _offset(path, sensor)
+        place = places.get(homes[name], places[None])
+        kind = "frame" if sensor is None else _kind(sensor)
+        if pose is None:
+            why["not aligned"] += 1
+        elif camera.get("enabled") == "false":
+            why["aligned but disabled"] += 1
+        elif kind not in PROJECTIONS:
+            why[f"of a {kind} sensor, for which there is no lens"] += 1
+        elif place is None:
+            why["in a component that has no transform to the frame of the others"] += 1
+        elif sensor is None:
+            raise damaged(path, f"sensor {camera.get('sensor_id')} is missing")
+        else:
+            images.append(Image(name, others.pop(), camera, sensor, homes[name], pose, place))
+    lacking = [f"{why.pop('not aligned', 0)} are not aligned"]
+    lost = [f"{count} images are {reason}" for reason, count in why.items()]
+    if not images:
+        reasons = ", ".join(lacking + lost)
+        named = element.get("label") or "without a name"
+        raise checks.no_pose(path, f"of the {len(photos)} images of chunk {named} {reasons}")
+    notes = [note(path, "cameras.left_out", f"{one}; left out.") for one in lost]
+    return images, tuple(others), notes
+
+
+def _matrix(path: Path, camera: Element) -> FloatArray:
+    """Return camera to chunk, 4x4."""
+    where = f"image {camera.get('label')}"
+    matrix = numbers(path, f"{where}, transform", camera.findtext("transform"), 16).reshape(4, 4)
+    matrix[:3, :3] = checks.rotations(path, [where], matrix[:3, :3])[0]
+    return matrix
+
+
+def _offset(path: Path, sensor: Element) -> FloatArray:
+    """Return the matrix from a slave's sensor to its master, in the unit of the chunk."""
+    where, offset = f"sensor {name_of(sensor)}", np.eye(4)
+    if rotation := text_of(sensor, "rotation"):
+        offset[:3, :3] = checks.rotations(path, [where], numbers(path, where, rotation, 9))[0]
+    if location := text_of(sensor, "location"):
+        offset[:3, 3] = numbers(path, where, location, 3)
+    return offset
+
+
+def _places(path: Path, chunk: Element) -> tuple[dict[str | None, FloatArray | None], bool]:
+    """Return the matrix of each component to the world, or None, and whether any has one.
+
+    The key None is for images in no component. Every component has its own frame. One with a
+    transform has a place in the world; one without has that of the chunk when it is the active or
+    only one, as the chunk's transform is that of its active component. Where none has a place, the
+    world is the frame of the chunk.
+    """
+    of_chunk = _similarity(path, chunk.find("transform"))
+    components, parent = chunk.findall("components/component"), chunk.find("components")
+    places = {one.get("id"): _similarity(path, one.find("transform")) for one in components}
+    active = None if parent is None else parent.get("active_id")
+    main = active if active in places else next(iter(places), None)
+    has_place = of_chunk is not None or any(place is not None for place in places.values())
+    of_main = of_chunk if has_place else np.eye(4)
+    if places.get(main) is None:
+        places[main] = of_main
+    places[None] = of_main
+    return places, has_place
+
+
+def _similarity(path: Path, element: Element | None) -> FloatArray | None:
+    """Return the 4x4 matrix of a transform that is one matrix, or has up to three parts."""
+    if element is None:
+        return None
+    where, matrix = "transform of the chunk", np.eye(4)
+    scale, rotation, translation = map(element.findtext, ("scale", "rotation", "translation"))
+    if (element.text or "").strip():
+        matrix = numbers(path, where, element.text, 16).reshape(4, 4)
+    elif scale is None and rotation is None and translation is None:
+        return None
+    if rotation is not None:
+        matrix[:3, :3] = numbers(path, where, rotation, 9).reshape(3, 3)
+    if translation is not None:
+        matrix[:3, 3] = numbers(path, where, translation, 3)
+    inside = float(np.cbrt(np.linalg.det(matrix[:3, :3]))) if scale is None else 1.0
+    size = inside if scale is None else number(path, where, scale)
+    if not size > 0.0:
+        raise damaged(path, f"{where}: the scale {size:g} is not positive")
+    matrix[:3, :3] = size * checks.rotations(path, [where], matrix[:3, :3] / inside)[0]
+    return matrix
+
+
+def _world(chunk: Chunk) -> tuple[str, str | None, list[PcfixWarning]]:
+    """Return the frame that a chunk's transforms lead to, its CRS if another, and notes on them."""
+    text, name = text_of(chunk.element, "reference"), str(chunk.path)
+    if not text or text.upper() == "LOCAL" or not _places(chunk.path, chunk.element)[1]:
+        return LOCAL, None, []
+    crs = parse_crs(text, name)
+    if is_local(crs):
+        unit = crs.axis_info[0].unit_name
+        sentence = f"the local coordinates of the chunk are in {unit}, its transform in metres."
+        foreign = note(chunk.path, "cameras.local_unit", sentence, unit=unit)
+        return LOCAL, None, [] if unit in METRES else [foreign]
+    if crs.geodetic_crs is None:
+        remedy = "Set it again in Metashape's reference settings"
+        what = f"the CRS {shortened(text)}, which has no datum,"
+        raise checks.unsupported(chunk.path, what, remedy)
+    base = unbound(crs.geodetic_crs).to_json_dict()
+    axes = [
+        {"name": f"Geocentric {a}", "abbreviation": a, "direction": f"geocentric{a}"}
+        | {"unit": "metre"}
+        for a in "XYZ"
+    ]
+    geocentric = {  # on the datum of the CRS, as PROJJSON
+        **{key: base[key] for key in ("$schema", "name", "datum", "datum_ensemble") if key in base},
+        "type": "GeodeticCRS",
+        "coordinate_system": {"subtype": "Cartesian", "axis": axes},
+    }
+    frame = crs_text(type(crs).from_json_dict(geocentric))
+    return frame, frame if crs.is_geocentric else text, []
+
+
+# ---- lenses ----
+
+
+def read_calibration(path: Path) -> Lens:
+    """Read a calibration that Metashape saved on its own (root element ``calibration``), pixels."""
+    root = read_xml(path)
+    if root.tag != "calibration":
+        sentence = f"is not a calibration of Metashape ({root.tag}). Save one from its Tools menu."
+        raise bad_file(path, "cameras.no_calibration", sentence)
+    kind = (root.findtext("projection") or "frame").strip()
+    if kind not in PROJECTIONS:
+        remedy = f"Use a lens of type {', '.join(PROJECTIONS)}"
+        raise checks.unsupported(path, f"the projection '{kind}'", remedy, model=kind)
+    size = [number(path, side, root.findtext(side)) for side in ("width", "height")]
+    return checks.lens(path, path.stem, _calibrated(path, path.stem, kind, root, size))
+
+
+def _calibrated(
+    path: Path, sensor: str, kind: str, calibration: Element, size: list[float]
+) -> Lens:
+    """Return the lens of a calibration of a known kind, for an image of a size in pixels."""
+    given = {
+        entry.tag: number(path, f"sensor {sensor}, {entry.tag}", entry.text)
+        for entry in calibration
+        if entry.tag in PARAMETERS
+    }
+    if not given.keys() & {"f", "fx", "fy"}:
+        raise damaged(path, f"the calibration of sensor {sensor} has no focal length")
+    (width, height), value = size, defaultdict(float, given)
+    if "f" in given:
+        given |= {"fx": value["f"] + value["b1"], "fy": value["f"], "skew": value["b2"]}
+        given |= {"cx": width / 2.0 + value["cx"], "cy": height / 2.0 + value["cy"]}
+    else:  # PhotoScan's
+        focal = given.get("fy", value["fx"])
+        given |= {"fx": given.get("fx", focal), "fy": focal}
+        given |= {"p1": value["p2"], "p2": value["p1"]}
+    return lens_by_name(given, width, height, projection=PROJECTIONS[kind], sensor=sensor)
+
+
+def name_of(element: Element) -> str:
+    """Return the label of a sensor or marker, or its number."""
+    return element.get("label") or f"number {element.get('id')}"
+
+
+def _kind(sensor: Element) -> str:
+    """Return the type of a sensor, which may be none of `PROJECTIONS`."""
+    found = _calibration(sensor)
+    return (found is not None and found.get("type")) or sensor.get("type") or "frame"
+
+
+def _calibration(sensor: Element) -> Element | None:
+    """Return the last adjusted calibration, else the last one."""
+    found = sensor.findall("calibration")
+    chosen = [one for one in found if one.get("class") == "adjusted"] or found
+    return chosen[-1] if chosen else None
+
+
+def _lens(path: Path, sensor: Element, image: str) -> tuple[Lens, list[PcfixWarning]]:
+    """Return the adjusted calibration, else the initial one, else the data sheet; and notes."""
+    label, found, notes = name_of(sensor), _calibration(sensor), list[PcfixWarning]()
+    sizes = [one.find("resolution") for one in (found, sensor) if one is not None]
+    resolution = next((one for one in sizes if one is not None), None)
+    stated = {entry.get("name"): entry.get("value") for entry in sensor.iterfind("property")}
+    pixel_mm, focal_mm = (
+        number(path, f"sensor {label}, {name}", stated.get(name, "0"))
+        for name in ("pixel_width", "focal_length")
+    )
+    if resolution is None or (found is None and not min(pixel_mm, focal_mm) > 0.0):
+        sentence = f"sensor {label} of {image} has no calibration or no size. Align the images."
+        raise bad_file(path, "cameras.no_calibration", sentence, sensor=label)
+    sides = (resolution.get(side) for side in ("width", "height"))
+    size = [number(path, f"sensor {label}, resolution", side) for side in sides]
+    if found is not None:
+        lens = _calibrated(path, label, _kind(sensor), found, size)
+        if coefficients := found.findtext("corrections/coeffs"):
+            where, count = f"sensor {label}, corrections", len(coefficients.split())
+            rms_px = float(np.linalg.norm(numbers(path, where, coefficients, count)) / 2.0**0.5)
+            sentence = f"the additional corrections of {label} are ignored ({rms_px:.2f} px rms)."
+            notes.append(note(path, "cameras.corrections", sentence, sensor=label, rms_px=rms_px))
+    else:
+        given = {"f": focal_mm / pixel_mm}  # what Metashape itself starts from
+        lens = lens_by_name(given, *size, projection=PROJECTIONS[_kind(sensor)], sensor=label)
+        sentence = f"sensor {label} has no calibration; the lens of its data sheet is used."
+        notes.append(note(path, "cameras.data_sheet_lens", sentence, sensor=label))
+    return replace(lens, pixel_size_mm=pixel_mm if pixel_mm > 0.0 else None), notes
+
+
+# ---- what was measured ----
+
+
+def _gnss_positions(
+    chunk: Chunk, images: list[Image]
+) -> tuple[GnssPositions | None, list[PcfixWarning]]:
+    """Return the reference positions of images, and notes on them.
+
+    Positions that the user unticked are no measurement and left out, unless all are, as is usual
+    when only control points determine the block.
+    """
+    path, given = chunk.path, [image.element.find("reference") for image in images]
+    ticked = [None if r is None or r.get("enabled") == "false" else r for r in given]
+    used = given if all(reference is None for reference in ticked) else ticked
+    settings = {name.replace("/", "_"): value for name, value in chunk.settings.items()}
+    start = spreads(path, "settings of the chunk", settings, DEFAULTS, np.full(3, np.nan))
+    xyz, sigma = np.full((2, len(used), 3), np.nan)
+    for i, reference in enumerate(used):
+        where = f"image {images[i].label}, reference"
+        stated = {} if reference is None else reference.attrib
+        for j, axis in enumerate("xyz"):
+            if axis in stated:
+                xyz[i, j] = number(path, where, stated[axis])
+        sigma[i] = spreads(path, where, stated, SPREADS, start)
+    if not np.isfinite(xyz[:, :2]).all(axis=1).any():
+        return None, []
+    sigma = np.where(np.isfinite(xyz) & (sigma > 0.0), sigma, np.nan)
+    # the CRS of the cameras may differ from that of the chunk
+    own, notes = text_of(chunk.element, "camera_reference"), list[PcfixWarning]()
+    crs = own or text_of(chunk.element, "reference") or "LOCAL"
+    are_degrees = bool((np.nanmax(np.abs(xyz[:, :2]), axis=0) <= [180.0, 90.0]).all())
+    if crs.upper() == "LOCAL" or is_local(parsed := parse_crs(crs, str(path))):
+        crs = LOCAL
+    elif are_degrees and not own and not parsed.is_geographic:
+        sentence = "the camera positions are degrees in a CRS in metres; WGS 84 is assumed."
+        crs, notes = "EPSG:4979", [note(path, "cameras.gnss_in_degrees", sentence)]
+    return GnssPositions(xyz, sigma, crs), notes
+
+
+def spreads(
+    path: Path, where: str, stated: dict[str, str], names: Spreads, start: FloatArray
+) -> FloatArray:
+    """Return `start` with what is stated, the widest first: one number for its axes, or each."""
+    sigma = start.copy()
+    for name, axes in names:
+        if text := stated.get(name):
+            count = 1 if len(text.split()) == 1 else len(axes)
+            sigma[list(axes)] = numbers(path, f"{where}, {name}", text, count)
+    return sigma
+
+
+def measured_marks(frame: Document) -> Iterator[tuple[str, str, FloatArray]]:
+    """Yield marker, camera and image coordinates of what was measured, not computed."""
+    for marker in frame.root.iterfind("markers//marker"):
+        for mark in marker.iterfind("location"):
+            if "false" not in (mark.get("pinned"), mark.get("valid")):
+                name, camera = marker.get("marker_id") or "", mark.get("camera_id") or ""
+                where = f"marker {name}, camera {camera}"
+                uv = [number(frame.path, where, mark.get(axis)) for axis in "xy"]
+                yield name, camera, np.array(uv)
+
+
+def tie_points(source: Source, cameras: Cameras) -> TiePoints:
+    """Read the tie points of a project, then the markers, with what was measured of them.
+
+    A marker has no position (NaN), as the file has only its surveyed coordinates. Projections
+    that Metashape itself computed are left out.
+    """
+    chunk = open_chunk(source.path)
+    images, frame, seen = aligned_images(chunk)[0], chunk.frame, list[checks.Seen]()
+    if len(images) != len(cameras):
+        raise damaged(chunk.path, f"{len(images)} aligned images, {len(cameras)} cameras")
+    if frame is not None:
+        row_of = {image.id: i for i, image in enumerate(images)}
+        marks = [mark for mark in measured_marks(frame) if mark[1] in row_of]
+        names = {name: i for i, name in enumerate(dict.fromkeys(name for name, _, _ in marks))}
+        point, camera = (
+            np.array([(names[name], row_of[one]) for name, one, _ in marks], np.int64)
+            .reshape(-1, 2)
+            .T
+        )
+        uv = np.array([uv for _, _, uv in marks]).reshape(-1, 2)
+        markers = checks.Seen(np.full((len(names), 3), np.nan), point, camera, uv)
+        seen = [*_tie_points(frame, images), markers]
+    if not any(len(part.point) for part in seen):
+        why = "only a project (.psx with its folder) or markers have any"
+        raise checks.no_tie_points(chunk.path, why)
+    return checks.tie_points(*seen)
+
+
+def _tie_points(frame: Document, images: list[Image]) -> Iterator[checks.Seen]:
+    """Yield the points of every component that has a place; their archive may be left out."""
+    clouds = (*frame.root.iterfind("point_cloud"), *frame.root.iterfind("tie_points"))
+    found = [
+        frame.follow(cloud)
+        for cloud in clouds
+        if (path := frame.leads_to(cloud)) is None or path.is_file()
+    ]
+    document = next((d for d in found if d.root.find("projections") is not None), None)
+    if document is None:
+        return
+    listed = document.root.iterfind("projections")
+    files = {entry.get("camera_id") or "": entry.get("path") or "" for entry in listed}
+    with checks.open_archive(document.path) as archive:
+        for points in document.root.iterfind("points"):
+            component = points.get("component_id")
+            rows = [
+                i
+                for i, image in enumerate(images)
+                if image.id in files
+                and (component == image.component or None in (component, image.component))
+            ]
+            if not rows:
+                continue
+            vertices, place = _vertices(archive, points.get("path"), POINTS), images[rows[0]].place
+            xyz = _columns(vertices, "xyz") @ place[:3, :3].T + place[:3, 3]
+            marks = [_vertices(archive, files[images[row].id], MARKS) for row in rows]
+            tracks = np.concatenate([one["id"].astype(np.int64) for one in marks])
+            point = checks.rows_of(tracks, vertices["id"].astype(np.int64))
+            camera = np.repeat(rows, [len(one) for one in marks])
+            uv = np.concatenate([_columns(one, "xy") for one in marks])
+            yield checks.Seen(xyz, point, camera, uv)
+
+
+def _columns(vertices: np.ndarray, names: str) -> FloatArray:
+    return np.column_stack([vertices[name] for name in names]).astype(np.float64)
+
+
+def _vertices(archive: zipfile.ZipFile, name: str | None, needed: tuple[str, ...]) -> np.ndarray:
+    """Return the vertices of a binary PLY in an archive, with the properties that are needed."""
+    where, data = f"{archive.filename}: {name}", checks.unpacked(archive, name or "")
+    header = parse_header(where, data)
+    kinds = [(p.name, header.order + p.item) for p in header.properties if not p.length]
+    if not header.order or header.skipped or not {*needed} <= dict(kinds).keys():
+        raise damaged(where, f"it is not a binary PLY of vertices with {', '.join(needed)}")
+    with checks.reading(where):
+        vertices = np.frombuffer(data, np.dtype(kinds), header.records, header.end)
+        if vertices["id"].dtype.kind not in "iu":
+            raise damaged(where, "the id is not a whole number")
+    return vertices
