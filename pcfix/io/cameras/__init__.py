@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -31,33 +31,22 @@ LISTS = (
 """Endings of files that may hold cameras."""
 
 
-class CameraFormat(NamedTuple):
-    """A format: its software, and its module of this folder."""
-
-    software: str
-    module: str
-
-    @property
-    def reader(self) -> Any:
-        """The module."""
-        return import_module(f"{__name__}.{self.module}")
-
-
-UNSUPPORTED = CameraFormat("a format that pcfix does not read", "unsupported")
-FORMATS = (
-    CameraFormat("Agisoft Metashape, PhotoScan", "metashape"),
-    CameraFormat("Pix4D", "pix4d"),
-    CameraFormat("OPF: PIX4Dmatic, PIX4Dcatch", "opf"),
-    CameraFormat("OpenDroneMap, OpenSfM", "odm"),
-    CameraFormat("COLMAP", "colmap"),
-    CameraFormat("MicMac", "micmac"),
-    CameraFormat("Bundler, MVE, VisualSFM", "bundler"),
-    CameraFormat("ContextCapture, iTwin Capture, DJI Terra", "blocksexchange"),
-    CameraFormat("RealityCapture (XMP)", "realitycapture"),
-    CameraFormat("CSV table", "table"),
-    UNSUPPORTED,
-)
-"""In the order in which they are asked: a plain table says least of all."""
+UNSUPPORTED = "unsupported"
+FORMATS = {
+    "metashape": "Agisoft Metashape, PhotoScan",
+    "pix4d": "Pix4D",
+    "opf": "OPF: PIX4Dmatic, PIX4Dcatch",
+    "odm": "OpenDroneMap, OpenSfM",
+    "colmap": "COLMAP",
+    "micmac": "MicMac",
+    "bundler": "Bundler, MVE, VisualSFM",
+    "blocksexchange": "ContextCapture, iTwin Capture, DJI Terra",
+    "realitycapture": "RealityCapture (XMP)",
+    "table": "CSV table",
+    UNSUPPORTED: "a format that pcfix does not read",
+}
+"""The modules of this folder and their software, in the order in which they are asked: a plain
+table says least of all."""
 TAKE_SENSOR = ("table", "realitycapture")
 """Modules that look for the sensor themselves."""
 
@@ -116,9 +105,19 @@ def read_cameras(
     source, form = _recognised(path, sensor, angles)
     try:
         with reading(path):
-            cameras = form.reader.read(source)
+            cameras: Cameras = reader_of(form).read(source)
             if source.sensor is not None and len(cameras):
-                cameras = _with_sensor(source, cameras, form.module in TAKE_SENSOR)
+                has_read_it = form in TAKE_SENSOR
+                if cameras.rotations is None or not (has_read_it or cameras.lenses is None):
+                    why = "no angles" if cameras.lenses is None else "its own lenses"
+                    sentence = f"has {why}, so --sensor {sensor} has no use. Leave it out."
+                    raise bad_file(source.path, "cameras.sensor_unused", sentence, sensor=sensor)
+                if not has_read_it:
+                    from pcfix.io.cameras.table.sensor import read_sensor
+
+                    notes = tuple(one for one in cameras.notes if one.code != checks.NO_LENS)
+                    lenses = (read_sensor(source.sensor),) * len(cameras)
+                    cameras = replace(cameras, lenses=lenses, notes=notes)
             cameras = checks.checked(source.path, cameras)
     except SettingError as error:  # numbers that are finite in the file and not in the world
         raise checks.damaged(path, str(error).rstrip(".")) from error
@@ -127,20 +126,6 @@ def read_cameras(
     for note in cameras.notes:
         warnings.warn(note, stacklevel=2)
     return cameras
-
-
-def _with_sensor(source: Source, cameras: Cameras, has_read_it: bool) -> Cameras:
-    """Return cameras with the lens of the sensor, unless their reader has used it already."""
-    if cameras.rotations is None or not (has_read_it or cameras.lenses is None):
-        why = "no angles" if cameras.lenses is None else "its own lenses"
-        sentence = f"has {why}, so --sensor {source.sensor} has no use. Leave it out."
-        raise bad_file(source.path, "cameras.sensor_unused", sentence, sensor=source.sensor)
-    if has_read_it or source.sensor is None:
-        return cameras
-    from pcfix.io.cameras.table.sensor import read_sensor
-
-    notes = tuple(note for note in cameras.notes if note.code != checks.NO_LENS)
-    return replace(cameras, lenses=(read_sensor(source.sensor),) * len(cameras), notes=notes)
 
 
 def read_tie_points(path: File, cameras: Cameras) -> TiePoints:
@@ -164,18 +149,17 @@ def read_tie_points(path: File, cameras: Cameras) -> TiePoints:
         left out.
     """
     source, form = _recognised(path, None, None)
-    if not hasattr(form.reader, "tie_points"):
-        raise checks.no_tie_points(source.path, f"the format ({form.software}) has none")
+    if not hasattr(reader_of(form), "tie_points"):
+        raise checks.no_tie_points(source.path, f"the format ({FORMATS[form]}) has none")
     with reading(path):
-        ties, note = checks.finite(source.path, form.reader.tie_points(source, cameras))
+        ties, note = checks.finite(source.path, reader_of(form).tie_points(source, cameras))
     if note is not None:
         warnings.warn(note, stacklevel=2)
     return ties
 
 
-def _recognised(
-    path: File, sensor: File | None, angles: Angles | None
-) -> tuple[Source, CameraFormat]:
+def _recognised(path: File, sensor: File | None, angles: Angles | None) -> tuple[Source, str]:
+    """Return the input and the module that reads it."""
     where = Path(path)
     source = Source(
         where if where.is_dir() else check_input(where),
@@ -189,7 +173,7 @@ def _recognised(
     for file in sorted(p for p in where.glob("*") if p.suffix.lower() in LISTS and p.is_file()):
         form = _format_of(Source(file))
         if form not in (None, UNSUPPORTED):
-            inside.append((file.name, form.software))
+            inside.append((file.name, FORMATS[form]))
     if inside:
         listed = " and ".join(f"{name} ({software})" for name, software in inside[:3])
         sentence = f"is a folder that holds {listed}. Give {where / inside[0][0]} itself."
@@ -203,17 +187,22 @@ def _recognised(
 
 def takes_sensor(path: File) -> bool:
     """Whether the format of a file keeps the lens in a file of its own."""
-    return _recognised(path, None, None)[1].module in TAKE_SENSOR
+    return _recognised(path, None, None)[1] in TAKE_SENSOR
 
 
-def _format_of(source: Source) -> CameraFormat | None:
+def reader_of(form: str) -> Any:
+    """Return the module of a format."""
+    return import_module(f"{__name__}.{form}")
+
+
+def _format_of(source: Source) -> str | None:
     """Return the first format that knows the content; one that damage hides is passed over.
 
     Files of standard errors look like poses, so the refused parts of exports are asked first.
     """
-    is_part = UNSUPPORTED.reader.is_part(source)
-    for form in FORMATS[-1:] if is_part else FORMATS:
+    is_part = reader_of(UNSUPPORTED).is_part(source)
+    for form in [UNSUPPORTED] if is_part else FORMATS:
         with suppress(InputError, *checks.DAMAGES), np.errstate(all="ignore"):
-            if form.reader.recognises(source):
+            if reader_of(form).recognises(source):
                 return form
     return None

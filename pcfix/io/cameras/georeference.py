@@ -23,7 +23,7 @@ import numpy as np
 from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io import crs as systems
 from pcfix.io.cameras.checks import note
-from pcfix.model import Cameras, FloatArray, GnssPositions
+from pcfix.model import Cameras, FloatArray
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -298,9 +298,9 @@ def _assumed_heights(frame: Frame, target: CRS, project: CRS | None, trusted: bo
 def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> tuple[FloatArray, str]:
     """Return how far the adjusted centres are from where the GNSS stated that they were.
 
-    That is east, north, up in metres, shape (k, 3), in the axes of the cameras' map where they are
-    in one; NaN where a camera has no position, and where the two cannot be compared, which is often
-    so of heights. The text says why they cannot.
+    That is metres along the axes of the cameras' map, or east, north, up where they are in none,
+    shape (k, 3); NaN where a camera has no position, and where the two cannot be compared, which is
+    often so of heights. The text says why they cannot.
 
     Parameters
     ----------
@@ -309,77 +309,39 @@ def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> tuple[FloatA
     name : str
         Of their file, for messages.
     """
-    gnss, crs = cameras.gnss, cameras.crs or ""
-    if gnss is None:
-        return np.full((len(cameras), 3), np.nan), f"{name}: has no positions of the GNSS."
-    tied = is_tied(cameras.crs, name)
-    if gnss.crs in (None, cameras.crs):
-        plain, gnss = cameras.centres - gnss.xyz, replace(gnss, crs=crs)
-        if not tied or systems.is_topocentric(crs):
-            return plain, ""
-        frame = frame_of(crs, name)
-        if frame.direct and frame.crs.is_projected:
-            return plain * frame.metres(cameras.centres), ""
-    if gnss.crs is None or not tied or not is_tied(gnss.crs, name):
-        reason = f"{name}: the cameras or the GNSS positions name no CRS; they are not compared."
-        return np.full((len(cameras), 3), np.nan), reason
-    kinds = [systems.heights_of(frame_of(each, name).crs) for each in (crs, gnss.crs)]
-    who = "cameras" if kinds[0] == "unstated" else "GNSS"
-    reason = f"{name}: the CRS of the {who} names no vertical datum; only plan is compared."
-    if not {"gravity", "unstated"} <= {*kinds}:
-        try:
-            return _differences(cameras, gnss, name), ""
-        except systems.HeightsError as error:
-            reason = str(error).partition("; or, if")[0] + "; only plan is compared."
-    flat = replace(cameras, crs=_in_plan(crs, name))
-    found = _differences(flat, replace(gnss, crs=_in_plan(gnss.crs, name)), name)
-    return found * [1.0, 1.0, np.nan], reason
-
-
-def _in_plan(crs: str, name: str) -> str:
-    """Return a CRS without its vertical part; ellipsoidal heights may stay, no grid needs them."""
-    if systems.is_topocentric(crs):
-        return crs
-    parsed = systems.parse_crs(crs, name)
-    return crs if parsed.is_geocentric else systems.crs_text(systems.parts(parsed)[0])
-
-
-def _differences(cameras: Cameras, gnss: GnssPositions, name: str) -> FloatArray:
-    """Return the differences in the map of the cameras, or in a map in metres about the block."""
-    rows = np.flatnonzero(np.isfinite(gnss.xyz).all(axis=1))
     found = np.full((len(cameras), 3), np.nan)
+    if cameras.gnss is None:
+        return found, f"{name}: has no positions of the GNSS."
+    crs, stated = cameras.crs or "", cameras.gnss.crs or cameras.crs
+    is_plain = not is_tied(cameras.crs, name) or systems.is_topocentric(crs)
+    if is_plain and stated == cameras.crs:  # metres of one frame
+        return cameras.centres - cameras.gnss.xyz, ""
+    if stated is None or not (is_tied(cameras.crs, name) and is_tied(stated, name)):
+        reason = f"{name}: the cameras or the GNSS positions name no CRS; they are not compared."
+        return found, reason
+    rows = np.flatnonzero(np.isfinite(cameras.gnss.xyz).all(axis=1))
     if len(rows) == 0:
-        return found
-    labels = tuple(cameras.labels[i] for i in rows)
-    common = _common(cameras, name)
-    adjusted, measured = (
-        georeference(Cameras(labels, xyz, crs=crs), common, name=name).points(xyz)
-        for xyz, crs in ((cameras.centres[rows], cameras.crs), (gnss.xyz[rows], gnss.crs))
-    )
-    found[rows] = adjusted - measured
-    return found
-
-
-def _common(cameras: Cameras, name: str) -> CRS:
-    """Return the map of the cameras, or a map in metres about the block where they are in none."""
-    from pyproj import CRS, Transformer
-    from pyproj.crs import ProjectedCRS
-    from pyproj.crs.coordinate_operation import TransverseMercatorConversion
-
-    frame = frame_of(cameras.crs or "", name)
-    if frame.crs.is_projected and {a.unit_name for a in frame.crs.axis_info}.issubset(
-        systems.METRES
-    ):
-        return frame.crs
-    flat, vertical = systems.parts(frame.crs)
-    base = systems.parts(systems.unbound(frame.crs))[0].geodetic_crs
-    if base is None:
-        raise bad_file(name, "cameras.crs", f"{frame.crs.name} has no datum.")
-    to_degrees = Transformer.from_crs(flat, "EPSG:4326", always_xy=True)
-    middle = np.median(frame.enter(cameras.centres), axis=0)
-    longitude, latitude = to_degrees.transform(middle[0], middle[1])
-    mercator = TransverseMercatorConversion(latitude, longitude)
-    plan = CRS(ProjectedCRS(mercator, geodetic_crs=systems.unbound(base).to_2d()))
-    if vertical is not None:
-        return systems.with_heights(plan, vertical)
-    return plan.to_3d() if systems.heights_of(frame.crs) == "ellipsoidal" else plan
+        return found, ""
+    own, other = frame_of(crs, name), frame_of(stated, name)
+    other.check(cameras.gnss.xyz[rows], [cameras.labels[i] for i in rows], name)
+    adjusted, measured = own.enter(cameras.centres[rows]), other.enter(cameras.gnss.xyz[rows])
+    kinds, reason = [systems.heights_of(one.crs) for one in (own, other)], ""
+    if stated != crs and {"gravity", "unstated"} <= {*kinds}:
+        who = "cameras" if kinds[0] == "unstated" else "GNSS"
+        reason = f"{name}: the CRS of the {who} names no vertical datum; only plan is compared."
+    heights = not (reason or stated == crs or systems.heights_agree(other.crs, own.crs))
+    try:
+        forward, _ = systems.transformation(other.crs, own.crs, measured, name, heights=heights)
+    except systems.HeightsError as error:
+        reason = str(error).partition("; or, if")[0].rstrip(".") + "; only plan is compared."
+        forward, _ = systems.transformation(other.crs, own.crs, measured, name, heights=False)
+    measured = forward(measured)
+    unit, up = systems.plan_unit(own.crs)[1], abs(systems.metres_up(own.crs))
+    off = (adjusted - measured) * [unit, unit, up]
+    if own.crs.is_geographic and (geod := own.crs.get_geod()) is not None:
+        ends = (np.degrees(unit * one[:, :2]).T for one in (measured, adjusted))
+        geodesic, _, distance = geod.inv(*(x for end in ends for x in end))
+        azimuth = np.radians(geodesic)
+        off[:, :2] = np.column_stack([distance * np.sin(azimuth), distance * np.cos(azimuth)])
+    found[rows] = off if not reason else off * [1.0, 1.0, np.nan]
+    return found, reason

@@ -100,7 +100,7 @@ def test_the_table_of_the_readme_has_the_formats():
     found = PART.search(README.read_text())
     assert found is not None
     rows = [line.split(" | ") for line in found[1].splitlines()[2:]]
-    assert [row[0].removeprefix("| ") for row in rows] == [each.software for each in FORMATS[:-1]]
+    assert [row[0].removeprefix("| ") for row in rows] == [*FORMATS.values()][:-1]
     assert all(len(row) == 2 for row in rows)
 
 
