@@ -23,6 +23,7 @@ import numpy as np
 from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io import crs as systems
 from pcfix.io.cameras.checks import note
+from pcfix.io.cameras.mistakes import UNDULATION_M
 from pcfix.model import Cameras, FloatArray
 
 if TYPE_CHECKING:
@@ -276,7 +277,18 @@ def _into(
         frame.crs, target, frame.enter(at), name, heights=heights, instead=instead
     )
     notes = (*(PcfixWarning("crs.transformation", str(one), path=name) for one in of_step), *notes)
-    return Georeference(lambda xyz: forward(frame.enter(xyz)), frame, offset, crs, notes, name)
+    found = Georeference(lambda xyz: forward(frame.enter(xyz)), frame, offset, crs, notes, name)
+    # heights that --cameras-crs declares can be tested if the GNSS heights are above the geoid too
+    if by_user and not frame.topocentric and systems.heights_of(target) == "gravity":
+        up = adjusted_minus_gnss(found.cameras(cameras), name)[0][:, 2]
+        off = float(np.median(up[np.isfinite(up)])) if np.isfinite(up).any() else 0.0
+        if abs(off) >= UNDULATION_M[0]:
+            side = "above" if off > 0.0 else "below"
+            sentence = f"with the heights of --cameras-crs the cameras are {abs(off):.1f} m {side}"
+            sentence += " their GNSS positions. Install the grid of the geoid instead."
+            differ = note(name, "cameras.heights_differ", sentence, metres=off)
+            return replace(found, notes=(*found.notes, differ))
+    return found
 
 
 def _assumed_heights(frame: Frame, target: CRS, project: CRS | None, trusted: bool) -> str:

@@ -213,6 +213,22 @@ def test_a_missing_geoid_is_refused_and_named():
         assert message.endswith("agree, give --cameras-crs EPSG:25830.")
 
 
+@pytest.mark.parametrize(("undulation_m", "agree"), [(51.5, False), (0.2, True)])
+def test_heights_that_were_vouched_for_are_compared_with_the_gnss(undulation_m, agree):
+    """The GNSS is in the cloud's heights; those of the cameras are above it by the undulation."""
+    ecef = geocentric(*VALENCIA_LON_LAT)
+    read = cameras(ecef, "EPSG:4936", project_crs=UTM30_ALICANTE)
+    east, north, up = bring_to(read, UTM30_ALICANTE, cameras_crs=UTM30).centres[0]
+    stated = np.array([[east, north, up - undulation_m]])
+    gnss = GnssPositions(stated, np.full((1, 3), 0.02), UTM30_ALICANTE)
+    found = bring_to(replace(read, gnss=gnss), UTM30_ALICANTE, cameras_crs=UTM30, name="a.xml")
+    if agree:
+        assert found.notes == ()
+    else:
+        assert found.notes[0].code == "cameras.heights_differ"
+        assert found.notes[0].values["metres"] == pytest.approx(51.5, abs=1e-3)
+
+
 GEOID = """
 import sys, numpy as np, pyproj, rasterio
 from rasterio.transform import from_origin
