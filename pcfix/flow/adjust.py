@@ -37,7 +37,7 @@ from pcfix.flow.surfaces import CloudView, view_of
 from pcfix.io.atomic import temporary_folder
 from pcfix.io.cameras.colmap import write_colmap
 from pcfix.io.cameras.opensfm import write_opensfm
-from pcfix.io.cameras.table.sensor import read_sensor, write_table
+from pcfix.io.cameras.sensor import read_sensor, write_table
 from pcfix.io.crs import is_topocentric, parse_crs
 from pcfix.io.files import write_text
 from pcfix.io.gnss_positions import gnss_in_frame_of, read_gnss

@@ -113,7 +113,7 @@ def read_cameras(
                     sentence = f"has {why}, so --sensor {sensor} has no use. Leave it out."
                     raise bad_file(source.path, "cameras.sensor_unused", sentence, sensor=sensor)
                 if not has_read_it:
-                    from pcfix.io.cameras.table.sensor import read_sensor
+                    from pcfix.io.cameras.sensor import read_sensor
 
                     notes = tuple(one for one in cameras.notes if one.code != checks.NO_LENS)
                     lenses = (read_sensor(source.sensor),) * len(cameras)

@@ -37,7 +37,7 @@ import numpy as np
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import Source, image_size, number, numbers, read_xml
 from pcfix.io.cameras.lenses import lens_by_name
-from pcfix.io.cameras.table.sensor import read_sensor
+from pcfix.io.cameras.sensor import read_sensor
 from pcfix.model import Cameras, FloatArray, Lens
 
 NAMESPACE = "http://www.capturingreality.com/ns/xcr/"

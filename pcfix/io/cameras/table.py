@@ -45,7 +45,7 @@ from pcfix.io import tables
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import Angles, Source, note
 from pcfix.io.cameras.lenses import lens_by_name
-from pcfix.io.cameras.table.sensor import DISTORTION, FILM_MM, read_frame, read_sensor
+from pcfix.io.cameras.sensor import DISTORTION, FILM_MM, read_frame, read_sensor
 from pcfix.io.crs import shortened
 from pcfix.io.tables import Table
 from pcfix.lens import rotations
