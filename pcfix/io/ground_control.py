@@ -128,16 +128,10 @@ def read_ground_control(path: File, cameras: Cameras, *, crs: str | None = None)
     first: dict[str, Mark] = {}
     for mark in marks:
         one = first.setdefault(mark.point, mark)
-        same = {
-            "coordinates": np.array_equal(mark.xyz, one.xyz, equal_nan=True),
-            "standard deviations": np.array_equal(mark.sigma_m, one.sigma_m, equal_nan=True),
-            "roles": mark.is_check == one.is_check,
-            "entries under water": mark.under_water == one.under_water,
-            "surfaces": mark.on == one.on,
-        }
-        for what in (what for what, is_same in same.items() if not is_same):
-            words = f"the {what} of this point differ from those at {one.where}. Use other names."
-            raise _wrong(source, "gcps.contradiction", mark, words, what=what)
+        alike = [np.hstack([m.xyz, m.sigma_m, m.is_check, m.under_water]) for m in (mark, one)]
+        if mark.on != one.on or not np.array_equal(*alike, equal_nan=True):
+            words = f"this point is described differently at {one.where}. Use other names."
+            raise _wrong(source, "gcps.contradiction", mark, words)
     _check_images(source, marks, cameras, camera)
     posed = np.flatnonzero(camera >= 0)
     seen = {marks[i].point for i in posed}

@@ -162,12 +162,7 @@ def convert(
     array: Records = np.zeros(len(points), point_format.dtype())
     new = laspy.ScaleAwarePointRecord(array, point_format, points.scales, points.offsets)
     same = points.point_format.id == point_format.id
-    before = points.array.dtype
-    if before.descr == array.dtype.descr[: len(before)]:  # new dimensions are last: copy whole rows
-        new_rows, rows = (a.view((np.uint8, a.itemsize)) for a in (array, points.array))
-        new_rows[:, : before.itemsize] = rows
-        return new
-    for name in before.names:
+    for name in points.array.dtype.names:
         if name in array.dtype.names and (same or name != "bit_fields"):
             array[name] = points.array[name]
     if same:

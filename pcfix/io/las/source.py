@@ -51,13 +51,6 @@ _VARIABLE_CHUNKS = 2**32 - 1
 _PANIC = "PanicException"
 """What lazrs raises, too, where the packed points make no sense; it is under no name to import."""
 
-_PLY = (
-    "is a PLY file; pcfix reads LAS and LAZ. Convert it with: pdal translate {} {}"
-    " --writers.las.scale_x=0.001 --writers.las.scale_y=0.001 --writers.las.scale_z=0.001"
-    " --writers.las.offset_x=auto --writers.las.offset_y=auto --writers.las.offset_z=auto"
-    " --writers.las.a_srs=EPSG:CODE (CODE is that of its CRS)"
-)
-
 MOST_SCALE_M = 1000.0
 """Largest step of coordinates that a header may state."""
 
@@ -236,11 +229,11 @@ class LasSource:
         changed.
         """
         self.path, self.part = check_input(path), part
-        to_laz = self.path.with_suffix(".laz")
         with las_errors(self.path):
             with self.path.open("rb") as stream:
                 if stream.read(4) in (b"ply\n", b"ply\r"):
-                    raise bad_file(self.path, "cloud.ply", _PLY.format(self.path, to_laz))
+                    sentence = "is a PLY file. Convert it to LAZ with CloudCompare or PDAL."
+                    raise bad_file(self.path, "cloud.ply", sentence)
                 self.vlrs, self.evlrs = read_records(stream)
                 stream.seek(IDENTITY_PLACE)
                 self.identity = stream.read(_IDENTITY_SIZE)
