@@ -111,7 +111,7 @@ def folder(tmp_path_factory):
     for kind, texts in (("t_{}.csv", TABLES), ("s_{}.csv", SENSORS), ("{}", MESHES)):
         for name, text in texts.items():
             (at / kind.format(name)).write_text(text, "latin-1")
-    (at / "shore.txt").write_text("1 2 3\n")
+    (at / "shore.txt").write_text("x y z\n")
     (at / "sensor.las").write_text(SENSOR + "24,360,240\n")
     corners = [(x, y) for y in (NORTH_M - 50, NORTH_M + 200) for x in (EAST_M - 50, EAST_M + 200)]
     for name, height in (("high.obj", 500), ("lake.obj", 12)):

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import InputError, SettingError, bad_file, refusal
+from pcfix.errors import InputError, PcfixError, SettingError, bad_file, refusal
 from pcfix.io.atomic import temporary_output
 from pcfix.options.declare import File
 from pcfix.running import Empty, running
@@ -170,6 +170,20 @@ def file_state(path: Path) -> dict[str, Any]:
         return {"path": str(path), "bytes": None}
     found = path.stat()
     return {"path": str(path), "bytes": found.st_size, "changed_ns": found.st_mtime_ns}
+
+
+@contextmanager
+def refusing(
+    path: object, code: str, sentence: str, kinds: tuple[type[Exception], ...] = (Exception,)
+) -> Iterator[None]:
+    """Turn what the contents of a file raise into its error; {} in the sentence is the reason."""
+    try:
+        yield
+    except PcfixError:
+        raise
+    except kinds as error:
+        reason = str(error).strip().rstrip(".") or type(error).__name__
+        raise bad_file(path, code, sentence.replace("{}", reason)) from error
 
 
 def parse_json(text: str | bytes) -> Any:

@@ -40,13 +40,13 @@ from pcfix.io.cameras import metashape
 from pcfix.io.cameras.checks import Source
 from pcfix.io.cameras.checks import number as xml_number
 from pcfix.io.cameras.odm import named_crs
+from pcfix.io.cameras.table import AXES, centres, has_header
 from pcfix.io.cameras.table import SPELLINGS as POSITIONS
-from pcfix.io.cameras.table import axes, centres, has_header
 from pcfix.io.cameras.table import crs as table_crs
 from pcfix.io.crs import LOCAL, is_local, is_topocentric, parse_crs, way_to_cloud
 from pcfix.io.files import check_input
 from pcfix.io.labels import match_labels, unnamed
-from pcfix.io.tables import Table, check_columns, number, read_lines, read_table
+from pcfix.io.tables import Table, number, read_lines, read_table
 from pcfix.model import Cameras, FloatArray, GroundControl, IntArray
 from pcfix.options.declare import File
 
@@ -85,7 +85,6 @@ ON, WATERLINE = "on:", ("waterline", "water_line", "shoreline", "on:water")
 YES, NO = ("yes", "y", "true", "1"), ("", "no", "n", "false", "0")
 ODM = ("x", "y", "z", "u", "v", "label", "point")
 """Fields of ODM's list, the last one optional."""
-_PLAIN = {"point": "name", "label": "image"}
 
 
 class Mark(NamedTuple):
@@ -128,8 +127,8 @@ def read_ground_control(path: File, cameras: Cameras, *, crs: str | None = None)
     first: dict[str, Mark] = {}
     for mark in marks:
         one = first.setdefault(mark.point, mark)
-        alike = [np.hstack([m.xyz, m.sigma_m, m.is_check, m.under_water]) for m in (mark, one)]
-        if mark.on != one.on or not np.array_equal(*alike, equal_nan=True):
+        mine, its = (np.hstack([m.xyz, m.sigma_m, m.is_check, m.under_water]) for m in (mark, one))
+        if mark.on != one.on or not np.array_equal(mine, its, equal_nan=True):
             words = f"this point is described differently at {one.where}. Use other names."
             raise _wrong(source, "gcps.contradiction", mark, words)
     _check_images(source, marks, cameras, camera)
@@ -281,15 +280,12 @@ def read_marks(path: Path) -> tuple[list[Mark], str | None]:
         sentence = "is neither a table of marks nor OpenDroneMap's gcp_list.txt. Line 1 must name"
         sentence += " the columns name, x, y, z, image, u, v, or be a CRS."
         raise bad_file(path, "gcps.format", sentence)
-    return _from_table(read_table(path, (), SPELLINGS))
+    kinds = [("point", *three, "label", "u", "v") for three in AXES]
+    return _from_table(read_table(path, *kinds, spellings=SPELLINGS))
 
 
 def _from_table(columns: Table) -> tuple[list[Mark], str | None]:
     path = columns.path
-    missing = [_PLAIN.get(r, r) for r in ("point", "label", "u", "v") if not columns.has(r)]
-    if not axes(columns.place):
-        missing += [axis for axis in "xyz" if not columns.has(axis)]
-    check_columns(path, columns.header, ("name", "x", "y", "z", "image", "u", "v"), missing)
     stated = sorted({*columns.column("crs")} - {""}) if columns.has("crs") else []
     if len(stated) > 1:
         sentence = f"has points in several CRS ({', '.join(stated[:3])}). Transform all to one."

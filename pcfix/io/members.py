@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pcfix.errors import bad_file
+from pcfix.io.files import refusing
 from pcfix.options.declare import File
 
 if TYPE_CHECKING:
@@ -35,7 +35,8 @@ def find_members(cameras: File) -> tuple[Path, Members] | None:
         return None
     from pcfix.adjust.precision import Members  # not quick to load
 
-    try:
+    sentence = "is not an ensemble of an adjustment. Adjust again, or remove the file."
+    with refusing(found, "ensemble.damaged", sentence):
         with np.load(found) as arrays:
             values = {one.name: np.asarray(arrays[one.name]) for one in fields(Members)}
         labels, lens_names = (tuple(values.pop(n).tolist()) for n in ("labels", "lens_names"))
@@ -47,7 +48,4 @@ def find_members(cameras: File) -> tuple[Path, Members] | None:
         for name, shape in shapes.items():
             if values[name].shape != shape or not np.isfinite(values[name]).all():
                 raise ValueError(name)
-    except Exception as error:  # of any kind, as numpy reads the heads of arrays as Python does
-        sentence = "is not an ensemble of an adjustment. Adjust again, or remove the file."
-        raise bad_file(found, "ensemble.damaged", sentence) from error
     return found, Members(labels=labels, lens_names=lens_names, **values)

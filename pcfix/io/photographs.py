@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import PcfixError, SettingError, bad_file
+from pcfix.errors import SettingError, bad_file
 from pcfix.io.atomic import temporary_output
-from pcfix.io.files import check_output
+from pcfix.io.files import check_output, refusing
 from pcfix.libraries import photo_library
 from pcfix.model import BoolArray, FloatArray
 from pcfix.options.declare import File
@@ -26,6 +26,7 @@ from pcfix.options.declare import File
 JPEG, TIFF, PNG = (".jpg", ".jpeg"), (".tif", ".tiff"), (".png",)
 SUFFIXES = (*JPEG, *TIFF, *PNG)
 _PNG_PIXELS = {b"IHDR", b"PLTE", b"IDAT", b"tRNS", b"IEND"}
+DAMAGED = ("photos.damaged", "is damaged, or not a photograph ({}). Copy it from the camera again.")
 LEAST_FRAMES = 3
 Pixels = npt.NDArray[Any]
 
@@ -42,7 +43,7 @@ def photographs_in(folder: Path) -> list[Path]:
 
 def size_of(path: Path) -> tuple[int, int]:
     """Return columns and rows of a photograph, from its header."""
-    with _readable(path):
+    with refusing(path, *DAMAGED):
         if path.suffix.lower() in TIFF:
             with photo_library("tifffile").TiffFile(path) as file:
                 return int(file.pages[0].imagewidth), int(file.pages[0].imagelength)
@@ -55,7 +56,7 @@ def size_of(path: Path) -> tuple[int, int]:
 def read_photograph(path: Path) -> Pixels:
     """Return the pixels as stored, shape (rows, columns, bands), not rotated by EXIF."""
     suffix = path.suffix.lower()
-    with _readable(path):
+    with refusing(path, *DAMAGED):
         if suffix in TIFF:
             with photo_library("tifffile").TiffFile(path) as file:
                 page = file.pages[0]
@@ -85,18 +86,6 @@ def read_colours(path: Path) -> Pixels:
     if pixels.shape[2] == 3 and path.suffix.lower() in PNG:
         pixels = pixels[..., ::-1]
     return np.ascontiguousarray(pixels)
-
-
-@contextmanager
-def _readable(path: Path) -> Iterator[None]:
-    """Refuse a damaged file, whatever its library raises."""
-    try:
-        yield
-    except PcfixError:
-        raise
-    except Exception as error:  # of any kind, where a tag has another type than it should
-        sentence = f"is damaged, or not a photograph ({error}). Copy it from the camera again."
-        raise bad_file(path, "photos.damaged", sentence) from error
 
 
 def write_photograph(source: Path, target: Path, pixels: Pixels, touched: BoolArray) -> None:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from pcfix.errors import GeometryError, SettingError, bad_file
 from pcfix.grid.lattice import Lattice, Window
 from pcfix.io.atomic import is_full_disk, temporary_output
-from pcfix.io.files import check_input, check_output
+from pcfix.io.files import check_input, check_output, refusing
 from pcfix.libraries import analysis_library
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
@@ -41,12 +41,10 @@ def open_raster(path: File) -> Iterator[DatasetReader]:
     from rasterio import errors
 
     found = check_input(path)
-    try:
-        with rasterio.open(found) as source:
-            yield source
-    except (errors.RasterioError, errors.RasterioIOError, UnicodeDecodeError) as error:
-        sentence = f"is damaged, or is not a raster ({error.__cause__ or error}). Export a GeoTIFF."
-        raise bad_file(found, "raster.damaged", sentence) from error
+    kinds = (errors.RasterioError, errors.RasterioIOError, UnicodeDecodeError)
+    sentence = "is damaged, or is not a raster ({}). Export a GeoTIFF."
+    with refusing(found, "raster.damaged", sentence, kinds), rasterio.open(found) as source:
+        yield source
 
 
 def place_of(transform: Affine, column: Any, row: Any) -> tuple[Any, Any]:

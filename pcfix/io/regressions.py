@@ -13,7 +13,7 @@ import math
 from typing import Any
 
 from pcfix.errors import bad_file
-from pcfix.io.files import check_input, read_json, write_text
+from pcfix.io.files import check_input, read_json, refusing, write_text
 from pcfix.options.declare import File
 from pcfix.refract.regression import LEAST_COUNT, DepthRegression, notes_of
 from pcfix.version import __version__
@@ -40,13 +40,10 @@ def write_regression(path: File, line: DepthRegression, *, overwrite: bool) -> N
 def read_regression(path: File) -> DepthRegression:
     """Read a line that `write_regression` wrote, with every digit."""
     found = check_input(path)
-    try:
+    with refusing(found, "regression.not_one", f"is not a depth regression ({{}}). {_REMEDY}"):
         content = read_json(found)
         if not isinstance(content, dict) or content.get("format") != HEADER["format"]:
             raise ValueError(f"its format is not {HEADER['format']}")
-    except (OSError, ValueError) as error:
-        sentence = f"is not a depth regression ({error}). {_REMEDY}"
-        raise bad_file(found, "regression.not_one", sentence) from error
     for name in ("version", "unit"):
         if content.get(name) != HEADER[name]:
             sentence = f"its {name} is {content.get(name)!r}, not {HEADER[name]!r}. Fit it again."

@@ -228,16 +228,21 @@ def check_columns(
         raise bad_file(path, "table.column_missing", sentence, missing=list(missing))
 
 
-def read_table(path: Path, required: Sequence[str], spellings: Spellings | None = None) -> Table:
-    """Read a table; without `spellings` the columns are called by their roles.
+def read_table(path: Path, *needed: Sequence[str], spellings: Spellings | None = None) -> Table:
+    """Read a table with the needed columns, of which several sets may be given: one suffices.
 
-    The header may be a comment (#). Empty lines and comments below it are skipped.
+    Without `spellings` the columns are called by their roles. The header may be a comment (#).
+    Empty lines and comments below it are skipped.
     """
-    spellings = spellings or {role: (role,) for role in required}
+    spellings = spellings or {role: (role,) for role in needed[0]}
     lines = read_lines(path)
     at, header, units, is_comment = find_header(lines, spellings) or Header(0, [], [], False)
     place = places(header, spellings)
-    check_columns(path, header, required, [role for role in required if role not in place])
+    if not any({*some} <= place.keys() for some in needed):
+        called = [[spellings[role][0] for role in some] for some in needed]
+        most = max(needed, key=lambda some: len(place.keys() & {*some}))
+        missing = [spellings[role][0] for role in most if role not in place]
+        check_columns(path, header, [" or ".join(map(", ".join, called))], missing)
     below = ["" if line.startswith("#") else line for line in lines[at + 1 :]]
     first = next(filter(str.strip, below), "") if is_comment else lines[at]
     delimiter = _delimiter(first.strip())
@@ -304,15 +309,13 @@ def read_check_depths(path: File) -> CheckDepths:
         standard error too: all check depths have the same weight.
     """
     source = check_input(path)
-    table = read_table(source, (), DEPTH_SPELLINGS)
+    table = read_table(source, ("x", "y", "depth"), ("x", "y", "z"), spellings=DEPTH_SPELLINGS)
     what = "depth" if table.has("depth") else "z"
     for role in ("x", "y", what):
         there = [name for name in table.header if name in DEPTH_SPELLINGS[role]]
         if len(there) > 1:
             sentence = f"the columns {', '.join(there)} may all be {role}. Remove all but one."
             raise bad_file(source, "table.column_twice", sentence, columns=there)
-    missing = ["depth or z" if r == "z" else r for r in ("x", "y", what) if not table.has(r)]
-    check_columns(source, table.header, ("x", "y", "depth or z"), missing)
     values = table.of(("x", "y", what))
     found = CheckDepths(str(source), values[:, :2], values[:, 2], what == "z", table.line)
     negative = np.flatnonzero(found.value_m < 0.0)

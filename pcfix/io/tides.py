@@ -21,7 +21,7 @@ import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning, bad_file
 from pcfix.io.cameras.metashape import open_chunk
-from pcfix.io.files import check_input, read_json
+from pcfix.io.files import check_input, read_json, refusing
 from pcfix.io.labels import match_labels
 from pcfix.io.tables import read_table
 from pcfix.model import FloatArray
@@ -71,7 +71,7 @@ def read_image_times(path: File, labels: Sequence[str]) -> ImageTimes:
         return _from_exif(found, labels)
     if check_input(found).suffix.lower() in (".json", ".geojson"):
         return _from_json(found, labels)
-    table = read_table(found, ["label", "time"])
+    table = read_table(found, ("label", "time"))
     rows = _rows(table.column("label"), labels, found)
     texts = table.column("time")
     where = [f"line {table.line[row]}" for row in rows]
@@ -85,12 +85,9 @@ def _from_exif(folder: Path, labels: Sequence[str]) -> ImageTimes:
     chosen = [files[row] for row in _rows([str(p) for p in files], labels, folder)]
     texts = []
     for file in chosen:
-        try:
-            with Image.open(file) as image:
-                tags = image.getexif().get_ifd(_EXIF)
-        except Exception as error:  # of any kind, if a tag has another type than it should
-            sentence = f"is not a readable image ({error})."
-            raise bad_file(file, "photos.unreadable", sentence) from error
+        sentence = "is not a readable image ({})."
+        with refusing(file, "photos.unreadable", sentence), Image.open(file) as image:
+            tags = image.getexif().get_ifd(_EXIF)
         codes = (_DATE_TIME_ORIGINAL, _SUBSECONDS, _OFFSET_ORIGINAL)
         text, fraction, zone = (str(tags.get(code, "")).strip("\0 ") for code in codes)
         if not text:
@@ -101,7 +98,8 @@ def _from_exif(folder: Path, labels: Sequence[str]) -> ImageTimes:
 
 
 def _from_json(path: Path, labels: Sequence[str]) -> ImageTimes:
-    try:
+    sentence = f"is not a file of OpenDroneMap or OpenSfM ({{}}). {_USE_TABLE}"
+    with refusing(path, "image_times.not_one", sentence):
         content = read_json(path)
         if isinstance(content, dict):  # shots.geojson
             shots = [one["properties"] for one in content.get("features", ())]
@@ -112,9 +110,6 @@ def _from_json(path: Path, labels: Sequence[str]) -> ImageTimes:
         else:  # images.json, milliseconds
             pairs = [(one["filename"], float(one.get("utc_time") or 0.0) / 1e3) for one in content]
         times = {str(name): float(time_s or 0.0) for name, time_s in pairs}
-    except (OSError, ValueError, TypeError, AttributeError, LookupError) as error:
-        sentence = f"is not a file of OpenDroneMap or OpenSfM ({error}). {_USE_TABLE}"
-        raise bad_file(path, "image_times.not_one", sentence) from error
     known = [name for name, time_s in times.items() if 0.0 < time_s < np.inf]
     chosen = [known[row] for row in _rows(known, labels, path)]
     return ImageTimes(np.array([times[name] for name in chosen]), True, str(path))
@@ -155,7 +150,7 @@ def _times(source: Path, where: Sequence[str], texts: Sequence[str]) -> ImageTim
 def read_tide(path: File) -> TideTable:
     """Read a table with the columns ``time`` (ISO 8601) and ``level_m``."""
     source = check_input(path)
-    table = read_table(source, ["time", "level_m"])
+    table = read_table(source, ("time", "level_m"))
     level = table.of(("level_m",))[:, 0]
     times = _times(source, [f"line {line}" for line in table.line], table.column("time"))
     late = np.flatnonzero(np.diff(times.time_s) <= 0.0)

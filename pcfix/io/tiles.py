@@ -13,7 +13,7 @@ import numpy as np
 import shapely
 
 from pcfix.errors import InputError, PcfixWarning, SettingError, bad_file
-from pcfix.io.files import path_of, read_json
+from pcfix.io.files import path_of, read_json, refusing
 from pcfix.io.las.source import CloudPart, LasSource, metric_crs
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
@@ -204,12 +204,10 @@ def _listed(path: Path) -> list[Path] | None:
     if path.is_dir():
         return sorted(one for one in path.iterdir() if one.suffix.lower() in SUFFIXES)
     if suffix == ".vpc":  # a STAC feature collection with an item for each file
-        try:
+        sentence = "is not a virtual point cloud. Give what 'pdal_wrench build_vpc' writes."
+        with refusing(path, "cloud.index", sentence):
             assets = [one["assets"] for one in read_json(path)["features"]]
             names = [next(iter(one.values()))["href"].removeprefix("file://") for one in assets]
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, StopIteration) as error:
-            sentence = "is not a virtual point cloud. Give what 'pdal_wrench build_vpc' writes."
-            raise bad_file(path, "cloud.index", sentence) from error
     elif suffix in LISTS and path.is_file():
         lines = [one.strip() for one in path.read_text("utf-8", errors="replace").splitlines()]
         names = [line for line in lines if line and not line.startswith("#")]

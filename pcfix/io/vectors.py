@@ -227,15 +227,13 @@ def _from_wkt(path: Path, lines: list[tuple[int, str]]) -> tuple[Geometries, str
 
 def _from_table(path: Path) -> tuple[Geometries, str | None]:
     """Return the points, or the geometries, of a table; a point whose height is empty has none."""
-    table = tables.read_table(path, (), COLUMNS)
+    kinds = ("x", "y"), ("longitude", "latitude"), ("wkt",)
+    table = tables.read_table(path, *kinds, spellings=COLUMNS)
     # degrees of x and y are those of the CRS
     table = replace(table, unit=["" if one in tables.DEGREES else one for one in table.unit])
     if table.has("wkt"):
         return _from_wkt(path, list(zip(table.line, table.column("wkt"), strict=True)))
     axes, crs = (("x", "y"), None) if table.has("x", "y") else (("longitude", "latitude"), WGS84)
-    if not table.has(*axes):
-        needed = ("x and y", "or longitude and latitude", "or wkt")
-        tables.check_columns(path, table.header, needed, ("x, y",))
     plan, z = table.of(axes), table.where_there(("z",))[:, 0]
     if not table.has("z"):
         return np.asarray(shapely.points(plan)), crs

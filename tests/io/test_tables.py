@@ -50,7 +50,7 @@ def test_check_heights(tmp_path, name):
 
 
 BAD = [
-    ("x,y\n1,2\n", "table.column_missing", {"missing": ["depth or z"]}),
+    ("x,y\n1,2\n", "table.column_missing", {"missing": ["depth"]}),
     ("longitude,latitude,depth\n1,2,3\n", "table.column_missing", {"missing": ["x", "y"]}),
     ("x,y,depth\n", "table.empty", {}),
     ("x,y,depth\n1,2,deep\n", "table.number", {"line": 2, "column": "depth"}),

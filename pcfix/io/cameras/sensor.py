@@ -21,7 +21,7 @@ from pcfix.io.cameras.checks import write_new
 from pcfix.io.cameras.lenses import LensModel, lens_by_name, model_of
 from pcfix.io.crs import is_topocentric
 from pcfix.io.files import check_input
-from pcfix.io.tables import Table, check_columns, read_table
+from pcfix.io.tables import Table, read_table
 from pcfix.model import Cameras, Lens
 from pcfix.options.declare import File
 
@@ -48,13 +48,12 @@ def read_sensor(path: Path) -> Lens:
         width_px, height_px and, where known, OpenCV's cx, cy (pixels from the upper left corner
         of the image), k1 ... k6, p1, p2.
     """
-    table = _table(path)
+    table = _table(path, MILLIMETRES, PIXELS)
     if table is None:
         from pcfix.io.cameras.metashape import read_calibration
 
         return read_calibration(path)
     columns = PIXELS if table.has(*PIXELS) else MILLIMETRES
-    check_columns(path, table.header, columns, [one for one in columns if not table.has(one)])
     if len(table.rows) != 1:
         sentence = f"has {len(table.rows)} rows. Give one row for all images."
         raise bad_file(path, "cameras.sensor_rows", sentence, rows=len(table.rows))
@@ -79,7 +78,7 @@ def read_sensor(path: Path) -> Lens:
 
 def read_frame(path: Path) -> tuple[float, float]:
     """Read the width and height of all images; the lens is not needed."""
-    table = _table(path)
+    table = _table(path, FRAME, MILLIMETRES)
     if table is not None and table.has(*FRAME):
         width, height = table.of(FRAME)[0].tolist()
         return width, height
@@ -87,14 +86,14 @@ def read_frame(path: Path) -> tuple[float, float]:
     return lens.width, lens.height
 
 
-def _table(path: Path) -> Table | None:
-    """Return a table of a sensor; None where a file is a calibration of Metashape (XML)."""
+def _table(path: Path, *needed: tuple[str, ...]) -> Table | None:
+    """Return a table with the needed columns; None of a calibration of Metashape (XML)."""
     with check_input(path).open("rb") as stream:
         is_xml = stream.read(64).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
     if is_xml:
         return None
     names = (*MILLIMETRES, *PIXELS, *(NAMES.get(n, n) for n in OPENCV["OpenCV"].names.split()))
-    return read_table(path, (), {name: (name,) for name in names})
+    return read_table(path, *needed, spellings={name: (name,) for name in names})
 
 
 POSE = ("label", "x", "y", "z", "qw", "qx", "qy", "qz")

@@ -82,6 +82,7 @@ _OWN_NAMES = (
 )
 SPELLINGS |= {name: (name,) for name in _OWN_NAMES}
 SPELLINGS |= {f"{role}_est": (f"{role}_est",) for role in POSE}
+AXES, TRANSLATION = (("x", "y", "z"), ("longitude", "latitude", "z")), ("tx", "ty", "tz")
 POSITION = {"label", "x", "y", "z", "longitude", "latitude", "tx", "ty", "tz"}
 POSITION |= {"x_est", "y_est", "z_est"}
 MANY = ("label", *(f"sigma_{axis}" for axis in "xyz"))  # the first spelling counts
@@ -180,27 +181,22 @@ def gnss_positions(columns: Table) -> GnssPositions | None:
 
 def axes(place: Iterable[str]) -> tuple[str, str, str] | None:
     """Return the three columns of a position: x, y, z or longitude, latitude, z."""
-    both = (("x", "y", "z"), ("longitude", "latitude", "z"))
-    return next((three for three in both if {*three} <= {*place}), None)
+    return next((three for three in AXES if {*three} <= {*place}), None)
 
 
 def read_columns(path: Path) -> Table:
     """Read a table with a header line, which may be a comment."""
-    table = tables.read_table(path, (), SPELLINGS)
-    place, names = table.place, table.header
+    kinds = [("label", *three) for three in (*AXES, ("x_est", "y_est", "z_est"), TRANSLATION)]
+    table = tables.read_table(path, *kinds, spellings=SPELLINGS)
+    names = table.header
     for role, spellings in SPELLINGS.items():  # a column with the role's own name counts
         alike = [name for name in names if name in spellings]
         if len(alike) > 1 and role not in MANY and (role not in alike or alike.count(role) > 1):
             sentence = f"the columns {', '.join(alike)} may all be {role}. Take out all but one."
             raise bad_file(path, "table.columns_alike", sentence, columns=alike)
-    adjusted = {"x_est", "y_est", "z_est"} <= place.keys()
-    if {"tx", "ty", "tz"} <= place.keys() and axes(place) is None:
+    if table.has(*TRANSLATION) and axes(table.place) is None:
         sentence = "tx, ty, tz may be translations. Give the projection centres as x, y, z."
         raise bad_file(path, "table.translations", sentence)
-    if "label" not in place or not (axes(place) or adjusted):
-        position = ("longitude", "latitude", "z") if "longitude" in place else ("x", "y", "z")
-        lacking = [role for role in ("label", *position) if role not in place]
-        tables.check_columns(path, names, ("label", *position), lacking)
     return table
 
 

@@ -10,7 +10,7 @@ import hashlib
 import json
 import struct
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from copy import deepcopy
 from functools import partial
 from pathlib import Path
@@ -26,7 +26,7 @@ from pyproj import CRS
 
 from pcfix.errors import SettingError, bad_file
 from pcfix.io.atomic import cannot_write, temporary_output
-from pcfix.io.files import parse_json
+from pcfix.io.files import parse_json, refusing
 from pcfix.io.las.columns import UPGRADE, Column, column_scale
 from pcfix.io.las.source import (
     IDENTITY_PLACE,
@@ -276,14 +276,11 @@ def read_settings(vlrs: Iterable[VLR], path: Path) -> dict[str, Any]:
     return content
 
 
-@contextmanager
-def record_errors(path: Path) -> Iterator[None]:
+def record_errors(path: Path) -> AbstractContextManager[None]:
     """Turn what a damaged VLR of a correction raises when it is used into one sentence."""
-    try:
-        yield
-    except (ValueError, TypeError, LookupError, AttributeError, LaspyException) as error:
-        sentence = f"the record of its correction is damaged ({error}). Use the original cloud."
-        raise bad_file(path, "cloud.vlr_damaged", sentence) from error
+    sentence = "the record of its correction is damaged ({}). Use the original cloud."
+    kinds = (ValueError, TypeError, LookupError, AttributeError, LaspyException)
+    return refusing(path, "cloud.vlr_damaged", sentence, kinds)
 
 
 def check_suffix(path: Path) -> bool:
