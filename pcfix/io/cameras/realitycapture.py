@@ -30,7 +30,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -38,7 +37,7 @@ from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import Source, image_size, number, numbers, read_xml
 from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.io.cameras.sensor import read_sensor
-from pcfix.model import Cameras, FloatArray, Lens
+from pcfix.model import Cameras, Lens
 
 NAMESPACE = "http://www.capturingreality.com/ns/xcr/"
 DESCRIPTION = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}Description"
@@ -55,22 +54,6 @@ MODELS = {
 IMAGES = (".jpg", ".jpeg", ".tif", ".tiff", ".png", ".webp", ".bmp", ".exr", ".jp2")
 
 
-class Image(NamedTuple):
-    """One file: the name of its image and its fields."""
-
-    path: Path
-    label: str
-    fields: dict[str, str]
-
-    def numbers(self, name: str, count: int) -> FloatArray:
-        """Return the numbers of a field, `count` of them."""
-        return numbers(self.path, f"image {self.label}, xcr:{name}", self.fields.get(name), count)
-
-    def number(self, name: str, default: str = "0") -> float:
-        """Return the number of a field."""
-        return number(self.path, f"image {self.label}, xcr:{name}", self.fields.get(name, default))
-
-
 def recognises(source: Source) -> bool:
     """Whether a file, or one of the .xmp files of a folder, uses RealityCapture's namespace."""
     if not source.path.is_dir():
@@ -83,30 +66,33 @@ def read(source: Source) -> Cameras:
     path = source.path
     folder = path if path.is_dir() else path.parent
     beside = {p.stem: p.name for p in folder.iterdir() if p.suffix.lower() in IMAGES}
-    images = [
-        Image(file, beside.get(file.stem, file.stem), _fields(file))
-        for file in _files(path)
-        if file.stem != "_common"  # which speaks of no image
-    ]
-    posed = [image for image in images if {"Rotation", "Position"} <= image.fields.keys()]
+    images = {  # a file _common speaks of no image
+        file: _fields(file) for file in _files(path) if file.stem != "_common"
+    }
+    names = {file: beside.get(file.stem, file.stem) for file in images}
+    posed = {f: of for f, of in images.items() if {"Rotation", "Position"} <= of.keys()}
     if not posed:
         raise checks.no_pose(path, "has no xcr:Rotation and xcr:Position")
     sensor = source.sensor or folder / "sensor.csv"
-    lens = read_sensor(sensor) if source.sensor or sensor.is_file() else None
-    given = None if lens is None else (lens.width, lens.height)
-    found = [image_size(folder, image.label) or given for image in posed]
-    frames = [frame for frame in found if frame is not None]
-    known = len(frames) == len(posed)
+    given = read_sensor(sensor) if source.sensor or sensor.is_file() else None
+    lenses = []
+    for file, of in posed.items():
+        frame = image_size(folder, names[file]) or (given and (given.width, given.height))
+        lenses += [_lens(file, of, *frame)] if frame else []
+    known = len(lenses) == len(posed)
     why = "the size of the images is not in XMP files; put the images beside them or give --sensor"
-    relative = any(image.fields.get("Coordinates", "absolute") != "absolute" for image in posed)
+    relative = any(of.get("Coordinates", "absolute") != "absolute" for of in posed.values())
+    rotations = [numbers(f, "xcr:Rotation", of["Rotation"], 9) for f, of in posed.items()]
     return Cameras(
-        labels=tuple(image.label for image in posed),
-        centres=np.array([image.numbers("Position", 3) for image in posed]),
-        rotations=np.array([image.numbers("Rotation", 9).reshape(3, 3) for image in posed]),
-        lenses=tuple(map(_lens, posed, frames)) if known else None,
+        labels=tuple(names[file] for file in posed),
+        centres=np.array(
+            [numbers(f, "xcr:Position", of["Position"], 3) for f, of in posed.items()]
+        ),
+        rotations=np.array(rotations).reshape(-1, 3, 3),
+        lenses=tuple(lenses) if known else None,
         crs="local" if relative else None,
         notes=() if known else (checks.without_lens(path, why),),
-        unposed=tuple(image.label for image in images if image not in posed),
+        unposed=tuple(names[file] for file in images if file not in posed),
         source="RealityCapture",
     )
 
@@ -130,23 +116,25 @@ def _fields(path: Path) -> dict[str, str]:
     return fields
 
 
-def _lens(image: Image, frame: tuple[float, float]) -> Lens:
-    """Return the lens, in the unit of the frame."""
-    width, height = frame
-    scale = max(frame)
-    across = image.number("FocalLength35mm", "") / FILM_MM * scale
-    focal = across * image.number("AspectRatio", "1")
-    x, y = (image.number(f"PrincipalPoint{axis}") * scale for axis in "UV")
-    model = image.fields.get("DistortionModel", "perspective")
+def _lens(path: Path, fields: dict[str, str], width: float, height: float) -> Lens:
+    """Return the lens of an image, in the unit of its frame."""
+
+    def value(name: str, default: str = "0") -> float:
+        return number(path, f"xcr:{name}", fields.get(name, default))
+
+    scale = max(width, height)
+    across = value("FocalLength35mm", "") / FILM_MM * scale
+    focal = across * value("AspectRatio", "1")
+    x, y = (value(f"PrincipalPoint{axis}") * scale for axis in "UV")
+    model = fields.get("DistortionModel", "perspective")
     if model not in MODELS:
-        remedy = f"Export with one of {', '.join(MODELS)}"
-        what = f"the distortion model '{model}' of {image.label}"
-        raise checks.unsupported(image.path, what, remedy, model=model, image=image.label)
-    name = "DistortionCoeficients"  # misspelt in the files too
-    given = image.numbers(name, len(image.fields.get(name, "").split())).tolist()
-    k = dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), given, strict=False))
+        what = f"the distortion model '{model}'"
+        raise checks.unsupported(path, what, f"Export with one of {', '.join(MODELS)}", model=model)
+    words = fields.get("DistortionCoeficients", "")  # misspelt in the files too
+    found = numbers(path, "xcr:DistortionCoeficients", words, len(words.split())).tolist()
+    k = dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), found, strict=False))
     values = {name: k[name] for name in MODELS[model].split() if name in k}
-    values |= {"fx": across, "fy": focal, "skew": image.number("Skew") * scale}
+    values |= {"fx": across, "fy": focal, "skew": value("Skew") * scale}
     values |= {"cx": width / 2.0 + x, "cy": height / 2.0 + y}
     lens = lens_by_name(values, width, height)
     if model != "division":
