@@ -101,10 +101,10 @@ def read_header(path: Path, element: str = "vertex") -> Header:
 
 
 class Records:
-    """The records of the vertices or faces; it is checked that all are there."""
+    """The records of a file; it is checked that all are there."""
 
-    def __init__(self, path: Path, element: str = "vertex") -> None:
-        self.header = header = read_header(path, element)
+    def __init__(self, path: Path, header: Header) -> None:
+        self.header = header
         self._units = _units(path, header)
         # neighbouring numbers are one field, whose count is 1: units of an item and of a count
         fields: list[tuple[int, int]] = []
@@ -122,7 +122,7 @@ class Records:
         if header.records <= complete:
             shape = header.records, len(fields)
             self._start, self._count = np.empty(shape, np.int64), np.empty(shape, np.int64)
-            complete, _ = list_starts(
+            complete, self.end = _list_starts(
                 self._units, self._item, prefix, header.order == ">", self._start, self._count
             )
         if complete < header.records:
@@ -136,18 +136,18 @@ class Records:
             field, offset = self._place[name, False]
             item = self.header.item(name, is_list=False)
             columns.append(
-                items_at(self._units, self.header.order, item)[self._start[:, field] + offset]
+                _items_at(self._units, self.header.order, item)[self._start[:, field] + offset]
             )
         return np.column_stack(columns).astype(np.float64)
 
     def lists(self, name: str) -> tuple[IntArray, npt.NDArray[Any]]:
         """Return where the lists of a property start, shape (n + 1,), and their items."""
         field, _ = self._place[name, True]
-        units = items_at(self._units, self.header.order, self.header.item(name, is_list=True))
-        return joined(units, self._start[:, field], self._count[:, field], int(self._item[field]))
+        units = _items_at(self._units, self.header.order, self.header.item(name, is_list=True))
+        return _joined(units, self._start[:, field], self._count[:, field], int(self._item[field]))
 
 
-def items_at(units: npt.NDArray[Any], order: str, item: str | None) -> npt.NDArray[Any]:
+def _items_at(units: npt.NDArray[Any], order: str, item: str | None) -> npt.NDArray[Any]:
     """View units as the item of a type that begins at each of them; text has numbers as units."""
     if not order:
         return units
@@ -155,7 +155,7 @@ def items_at(units: npt.NDArray[Any], order: str, item: str | None) -> npt.NDArr
     return np.ndarray(max(len(units) - kind.itemsize + 1, 0), kind, units, strides=(1,))
 
 
-def joined(
+def _joined(
     items: npt.NDArray[Any], first: IntArray, count: IntArray, size: int
 ) -> tuple[IntArray, npt.NDArray[Any]]:
     """Copy lists, each of `count` items of `size` units from `first` on, one after another.
@@ -181,7 +181,7 @@ def _units(path: Path, header: Header) -> npt.NDArray[Any]:
             raise bad_file(path, "ply.order", sentence)
         skip += count * sum(header.size(p.item) for p in properties)
     if header.order:
-        if path.stat().st_size == header.end:  # an empty map is not allowed
+        if path.stat().st_size <= header.end:  # an empty map is not allowed
             return np.zeros(0, np.uint8)
         return np.memmap(path, np.uint8, "r", offset=header.end)[skip:]
     text = path.read_bytes()[header.end :].decode("latin-1")
@@ -194,7 +194,7 @@ def _units(path: Path, header: Header) -> npt.NDArray[Any]:
 
 
 @kernel
-def list_starts(
+def _list_starts(
     units: npt.NDArray[Any], item: IntArray, prefix: IntArray, big: bool, start: IntArray,
     count: IntArray,
 ) -> tuple[int, int]:  # fmt: skip

@@ -46,7 +46,7 @@ from pcfix.io.cameras.colmap import read_images
 from pcfix.io.crs import Points
 from pcfix.io.files import check_input
 from pcfix.io.labels import match_labels
-from pcfix.io.ply import Records, joined, list_starts, read_header
+from pcfix.io.ply import Header, Property, Records, read_header
 from pcfix.lens.frames import beside_frames
 from pcfix.lens.imaging import straight_images
 from pcfix.model import Cameras, FloatArray, IntArray, TiePoints, ViewKind, Views
@@ -169,20 +169,16 @@ def _placed(views: ViewList, cameras: Cameras, to_cloud: Points | None) -> ViewL
 
 def _colmap(path: Path) -> ViewList:
     """Read ``fused.ply.vis``, and the positions from the PLY file beside it, if there is one."""
-    size = path.stat().st_size
     with path.open("rb") as stream:
         count = int.from_bytes(stream.read(_HEAD), "little")
-    complete, used, words = 0, 0, np.zeros(1, np.uint32)
-    if size % 4 == 0 and 0 < count <= (size - _HEAD) // 4:
-        words = np.memmap(path, "<u4", "r", offset=_HEAD)
-        one = np.ones(1, np.int64)
-        first, length = np.empty((2, count, 1), np.int64)
-        complete, used = list_starts(words, one, one, False, first, length)
-    if complete < count or used < len(words):
-        sentence = f"is no complete COLMAP view list: {complete:,} of {count:,} can be read."
-        values = {"points": count, "complete": complete}
-        raise bad_file(path, "views.damaged", f"{sentence} {_REMEDY}", **values)
-    start, number = joined(words, first[:, 0], length[:, 0], 1)
+    lists = Header(str(path), "<", "lists", count, (Property(_IMAGES, "u4", "u4"),), (), _HEAD)
+    records = None
+    with suppress(InputError):
+        records = Records(path, lists)
+    if not count or records is None or _HEAD + records.end < path.stat().st_size:
+        sentence = f"is no complete COLMAP view list of {count:,} points. {_REMEDY}"
+        raise bad_file(path, "views.damaged", sentence, points=count)
+    start, number = records.lists(_IMAGES)
     raw = ViewList(path, COLMAP_LIST, start, _checked_images(path, number))
     bare = path.with_suffix("")
     ply = bare if bare.suffix.lower() == ".ply" else bare.with_suffix(".ply")
@@ -190,7 +186,7 @@ def _colmap(path: Path) -> ViewList:
         return raw
     vertices = read_header(ply).records
     if vertices == count:
-        return replace(raw, **_positions(Records(ply)))
+        return replace(raw, **_positions(Records(ply, read_header(ply))))
     sentence = f"{ply}: has {vertices:,} points, the list {count:,}. Its positions are not used."
     return replace(raw, notes=(PcfixWarning("views.other_points", sentence, path=ply),))
 
@@ -200,7 +196,7 @@ def _openmvs(path: Path) -> ViewList:
     header = read_header(path)
     if header.item(_IMAGES, is_list=True) is None:
         raise bad_file(path, "views.no_lists", f"its points have no {_IMAGES}. {_REMEDY}")
-    vertices = Records(path)
+    vertices = Records(path, header)
     start, number = vertices.lists(_IMAGES)
     raw = ViewList(path, "OpenMVS point cloud", start, _checked_images(path, number))
     raw = replace(raw, **_positions(vertices))

@@ -25,7 +25,7 @@ from pcfix.io import crs as systems
 from pcfix.io.crs import Points
 from pcfix.io.files import check_input
 from pcfix.io.labels import match_labels
-from pcfix.io.ply import Records
+from pcfix.io.ply import Records, read_header
 from pcfix.io.rasters import Bounds, open_raster, place_of, read_masked
 from pcfix.io.tables import number
 from pcfix.model import (
@@ -155,7 +155,7 @@ def _read_obj(path: Path) -> tuple[FloatArray, IntArray]:
 
 def _read_ply(path: Path) -> tuple[FloatArray, IntArray]:
     """Return vertices and triangles as `_read_obj` does."""
-    vertices, faces = Records(path), Records(path, "face")
+    vertices, faces = (Records(path, read_header(path, one)) for one in ("vertex", "face"))
     named = [n for n in _CORNERS if faces.header.item(n, is_list=True)]
     if not named or None in (vertices.header.item(axis, is_list=False) for axis in "xyz"):
         sentence = f"needs vertices with x, y, z and faces with {_CORNERS[0]}. Export a mesh."

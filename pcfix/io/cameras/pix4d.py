@@ -204,28 +204,17 @@ def _rows(
 
 
 def _absolute(files: Files, images: list[Image]) -> tuple[FloatArray, tuple[PcfixWarning, ...]]:
-    """Return the centres with the offset added; NaN where several offsets name no such image."""
+    """Return the centres with the offset added."""
     local = np.array([image.fields["centre"] for image in images])
     if "offset" not in files:
         sentence = "there is no offset.xyz beside it. Give the offset with --cameras-offset."
         return local, (note(files["parameters"], "cameras.no_offset", sentence),)
-    # one line, or one for each group of images whose names begin alike
-    lines = [line.replace(",", " ").split() for line in read_lines(files["offset"])]
-    offsets = {
-        " ".join(words[:-3]): _numbers(files["offset"], "the offset", words[-3:])
-        for words in lines
-        if words
-    }
-    if not offsets or any(len(values) != 3 for values in offsets.values()):
-        raise damaged(files["offset"], "it should have the offset x y z")
-    if len({values.tobytes() for values in offsets.values()}) == 1:
-        return local + next(iter(offsets.values())), ()
-    unknown = np.full(3, np.nan)
-    added = [
-        next((values for k, values in offsets.items() if k and image.label.startswith(k)), unknown)
-        for image in images
-    ]
-    return local + np.array(added), ()
+    # one line, or one for each group of images
+    lines = [line.replace(",", " ").split()[-3:] for line in read_lines(files["offset"])]
+    offsets = {tuple(_numbers(files["offset"], "the offset", line)) for line in lines if line}
+    if len(offsets) != 1 or len(offset := offsets.pop()) != 3:
+        raise damaged(files["offset"], "it should have one offset x y z")
+    return local + offset, ()
 
 
 def _priors(path: Path, labels: list[str]) -> tuple[GnssPositions | None, list[str]]:
