@@ -141,20 +141,13 @@ def read_tie_points(path: File, cameras: Cameras) -> TiePoints:
     Returns
     -------
     TiePoints
-
-    Warns
-    -----
-    PcfixWarning
-        When numbers are not finite: such observations, and points with such a coordinate, are
-        left out.
+        Without observations that are not finite; such a position is unknown (NaN).
     """
     source, form = _recognised(path, None, None)
     if not hasattr(reader_of(form), "tie_points"):
         raise checks.no_tie_points(source.path, f"the format ({FORMATS[form]}) has none")
     with reading(path):
-        ties, note = checks.finite(source.path, reader_of(form).tie_points(source, cameras))
-    if note is not None:
-        warnings.warn(note, stacklevel=2)
+        ties: TiePoints = reader_of(form).tie_points(source, cameras)
     return ties
 
 

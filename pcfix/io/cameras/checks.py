@@ -361,36 +361,21 @@ def rows_of(wanted: IntArray, identifiers: IntArray) -> IntArray:
 
 
 def tie_points(*parts: Seen) -> TiePoints:
-    """Join points and gather their observations by point, without those of a camera -1."""
+    """Join points and gather their observations by point, without those of a camera -1.
+
+    An observation that is not finite is left out, and such a position is unknown.
+    """
     before = np.cumsum([0, *(len(part.xyz) for part in parts)])
     xyz = np.concatenate([part.xyz for part in parts])
+    xyz[~np.isfinite(xyz).all(axis=1)] = np.nan
     point = np.concatenate([part.point + n for part, n in zip(parts, before, strict=False)])
     is_there = np.concatenate([(part.camera >= 0) & (part.point >= 0) for part in parts])
     camera = np.concatenate([part.camera for part in parts])
     uv = np.concatenate([part.uv for part in parts])
-    kept = np.flatnonzero(is_there)
+    kept = np.flatnonzero(is_there & np.isfinite(uv).all(axis=1))
     kept = kept[np.argsort(point[kept], kind="stable")]
     start = np.concatenate([[0], np.cumsum(np.bincount(point[kept], minlength=len(xyz)))])
     return TiePoints(xyz, Views(start, camera[kept]), uv[kept])
-
-
-def finite(path: Path, ties: TiePoints) -> tuple[TiePoints, PcfixWarning | None]:
-    """Return tie points without those that are not finite, and a note on how many these were.
-
-    A point without any coordinate is one that the source has not placed, and stays.
-    """
-    kept = np.asarray(np.isfinite(ties.xyz).all(axis=1) | np.isnan(ties.xyz).all(axis=1))
-    seen = np.isfinite(ties.image_xy).all(axis=1)
-    if kept.all() and seen.all():
-        return ties, None
-    point = np.repeat(np.arange(len(ties.xyz)), np.diff(ties.views.start))
-    rows = np.flatnonzero(seen & kept[point])
-    number = np.cumsum(kept) - 1
-    left = Seen(ties.xyz[kept], number[point[rows]], ties.views.camera[rows], ties.image_xy[rows])
-    points, observations = int((~kept).sum()), int((~seen).sum())
-    sentence = f"{points:,} tie points and {observations:,} observations are not finite; ignored."
-    code = "cameras.tie_points_not_finite"
-    return tie_points(left), note(path, code, sentence, points=points, observations=observations)
 
 
 def are_seen(tie_points: TiePoints) -> BoolArray:

@@ -10,7 +10,7 @@ from pcfix.io.cameras import read_tie_points
 from pcfix.io.cameras.colmap import BY_NAME, MODELS, lens_of
 from pcfix.lens.imaging import project
 from tests.utils.camera_files import read, read_ties
-from tests.utils.codes import refused, warned
+from tests.utils.codes import refused
 
 pytestmark = pytest.mark.quick_but("test_binary_knows_the_models_by_their_numbers")
 
@@ -112,12 +112,11 @@ def test_largest_of_several_models(tmp_path):
 def test_tie_points_that_are_not_finite(tmp_path):
     points = POINTS.replace("6 1.5", "6 nan") + "10 1 2 3 0 0 0 0\n"
     path = folder(tmp_path, images=IMAGES.replace("50 60 6", "inf 60 10"), points=points)
-    with warned("cameras.tie_points_not_finite", points=1, observations=1):
-        ties = read_tie_points(path, read(path))
-    assert np.isfinite(ties.xyz).all()
-    assert len(ties.xyz) == 3
-    assert ties.image_xy.tolist() == [[10.0, 20.0]]
-    assert ties.views.start.tolist() == [0, 1, 1, 1]
+    ties = read_tie_points(path, read(path))
+    assert np.isfinite(ties.xyz).all(axis=1).tolist() == [False, True, True, True]
+    assert np.isnan(ties.xyz[0]).all()
+    assert ties.image_xy.tolist() == [[7.0, 8.0], [10.0, 20.0]]
+    assert ties.views.start.tolist() == [0, 1, 2, 2, 2]
 
 
 @pytest.mark.parametrize("number", range(len(MODELS)))
