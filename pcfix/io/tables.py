@@ -239,10 +239,9 @@ def read_table(path: Path, *needed: Sequence[str], spellings: Spellings | None =
     at, header, units, is_comment = find_header(lines, spellings) or Header(0, [], [], False)
     place = places(header, spellings)
     if not any({*some} <= place.keys() for some in needed):
-        called = [[spellings[role][0] for role in some] for some in needed]
         most = max(needed, key=lambda some: len(place.keys() & {*some}))
         missing = [spellings[role][0] for role in most if role not in place]
-        check_columns(path, header, [" or ".join(map(", ".join, called))], missing)
+        check_columns(path, header, [spellings[role][0] for role in most], missing)
     below = ["" if line.startswith("#") else line for line in lines[at + 1 :]]
     first = next(filter(str.strip, below), "") if is_comment else lines[at]
     delimiter = _delimiter(first.strip())

@@ -47,7 +47,6 @@ SHOTS = "shots.geojson"
 RECONSTRUCTION = "reconstruction.json"
 TRANSFORMATION = "geocoords_transformation.txt"
 TOPOCENTRIC = "reconstruction.topocentric.json"
-ALIGNED_M = 0.1
 TOPOCENTRIC_LIMIT_M = 1e5
 SCALE_TOLERANCE = 0.1
 """Of the squared scale of a map projection; feet, or a matrix of nonsense, are outside."""
@@ -84,7 +83,7 @@ def read(source: Source) -> Cameras:
         middle = np.median(own.centres[:, :2], axis=0)
         return own if np.abs(middle).max() <= TOPOCENTRIC_LIMIT_M else replace(own, crs=None)
     gnss, listed = read_images(files.get("images.json"), own.labels)
-    cameras = replace(
+    return replace(
         own,
         centres=placed.points(own.centres),
         rotations=placed.rotations(np.asarray(own.rotations)),
@@ -94,14 +93,6 @@ def read(source: Source) -> Cameras:
         unposed=unnamed([*own.unposed, *listed], own.labels),
         source="OpenDroneMap",
     )
-    truth, ours = _in_shots(files, cameras)
-    apart = float(np.median(np.hypot(*(ours - truth)[:, :2].T))) if len(ours) else 0.0
-    if placed.project_crs or apart < ALIGNED_M:
-        return cameras
-    sentence = f"its cameras are {apart:.2f} m from those of shots.geojson. Give that, if the cloud"
-    sentence += " was aligned to a reference."
-    moved = note(files["poses"], "cameras.shots_differ", sentence, metres=apart)
-    return replace(cameras, notes=(*cameras.notes, moved))
 
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
@@ -174,7 +165,10 @@ def _frame(files: Files, found: opensfm.Reconstruction) -> AffineFrame | None:
     moved = AffineFrame(np.eye(3), np.array([east, north, 0.0]), crs)
     # centres of shots.geojson, else the GNSS, which stays topocentric, show whether it was moved:
     # the two readings differ by the meridian convergence and the scale
-    truth, own = _in_shots(files, found.cameras)
+    labels, there = found.cameras.labels, _shots(files[SHOTS]) if SHOTS in files else {}
+    shared = [i for i, label in enumerate(labels) if label in there]
+    places = [triple(there[labels[i]]["translation"]) for i in shared]
+    truth, own = np.array(places).reshape(-1, 3), found.cameras.centres[shared]
     if len(own) < 3 and found.cameras.gnss is not None:
         known = np.isfinite(found.cameras.gnss.xyz).all(axis=1)
         truth = _from_topocentric(found.cameras.gnss.xyz[known], reference, crs)
@@ -186,14 +180,6 @@ def _frame(files: Files, found: opensfm.Reconstruction) -> AffineFrame | None:
         for guess in (_from_topocentric(own, reference, crs), moved.points(own))
     )
     return unmoved._replace(project_crs=crs) if still_m < 0.5 * moved_m else moved
-
-
-def _in_shots(files: Files, cameras: Cameras) -> tuple[FloatArray, FloatArray]:
-    """Return the centres in shots.geojson and ours of the images that are in both."""
-    there = _shots(files[SHOTS]) if SHOTS in files else {}
-    shared = [i for i, label in enumerate(cameras.labels) if label in there]
-    truth = [triple(there[cameras.labels[i]]["translation"]) for i in shared]
-    return np.array(truth).reshape(-1, 3), cameras.centres[shared]
 
 
 def _whole_metres(lat: float, lon: float, crs: str | None) -> tuple[str, float, float] | None:
