@@ -53,23 +53,19 @@ def read_gnss(path: File, cameras: Cameras, *, crs: str | None = None) -> Camera
     if crs is not None and crs.strip().lower() != "local":
         parse_crs(crs, str(source))
     if source.name == "images.json":
-        nothing = np.full((len(cameras), 3), np.nan)
-        stated, names = read_images(source, cameras.labels)
-        found = GnssPositions(nothing, nothing, None) if stated is None else stated
-        unknown = list(unnamed(names, cameras.labels))
+        _, names = read_images(source, ())
+        listed, _ = read_images(source, tuple(names))
+    elif source.is_dir() or not table.recognises(Source(source)):
+        read = read_cameras(source)
+        names, listed = list(read.labels), read.gnss
     else:
-        if source.is_dir() or not table.recognises(Source(source)):
-            read = read_cameras(source)
-            names, listed = list(read.labels), read.gnss
-        else:
-            columns = open_table(source)
-            place = places(columns.header, SIGMAS) | dict(columns.place)
-            columns = replace(columns, place=place)
-            names, listed = columns.labels, gnss_positions(columns)
-        if listed is None:
-            sentence = "has no measured positions. Give a table with the columns image, x, y, z."
-            raise bad_file(source, "gnss.none", sentence)
-        found, unknown = _by_camera(source, cameras, names, listed)
+        columns = open_table(source)
+        place = places(columns.header, SIGMAS) | dict(columns.place)
+        names, listed = columns.labels, gnss_positions(replace(columns, place=place))
+    if listed is None:
+        sentence = "has no measured positions. Give a table with the columns image, x, y, z."
+        raise bad_file(source, "gnss.none", sentence)
+    found, unknown = _by_camera(source, cameras, names, listed)
     known = int(np.isfinite(found.xyz).all(axis=1).sum())
     if not known:
         sentence = f"no position belongs to an image such as {cameras.labels[0]}. Give those of"
@@ -77,7 +73,7 @@ def read_gnss(path: File, cameras: Cameras, *, crs: str | None = None) -> Camera
     if crs is not None:
         found = replace(found, crs=crs)
     cameras = replace(cameras, gnss=found)
-    if is_tied(cameras.crs, str(source)) and _differences_are_of_the_frame(cameras, str(source)):
+    if is_tied(cameras.crs, str(source)):
         enu_m = adjusted_minus_gnss(cameras, str(source))[0][:, :2]
         both = enu_m[np.isfinite(enu_m).all(axis=1)]
         apart_m = float(np.median(np.hypot(*both.T))) if len(both) else 0.0
@@ -142,20 +138,16 @@ def gnss_in_frame_of(cameras: Cameras, name: str = "cameras") -> tuple[GnssPosit
     nothing = np.full((len(cameras), 3), np.nan)
     if cameras.gnss is None:
         return GnssPositions(nothing, nothing, None), f"{name}: has no GNSS positions."
-    if not _differences_are_of_the_frame(cameras, name):
+    crs, is_frame = cameras.crs or "", True  # whether the differences are of coordinates in it
+    if is_topocentric(crs):
+        is_frame = cameras.gnss.crs in (None, crs)
+    elif is_tied(cameras.crs, name):
+        found = parse_crs(crs, name)
+        is_frame = found.is_projected and {a.unit_name for a in found.axis_info}.issubset(METRES)
+    if not is_frame:
         reason = f"{name}: {cameras.crs} is no map in metres, so the GNSS cannot be compared."
         return GnssPositions(nothing, nothing, None), reason
     enu_m, reason = adjusted_minus_gnss(cameras, name)
     xyz = cameras.centres - enu_m
     sigma = np.where(np.isnan(xyz), np.nan, cameras.gnss.sigma_m)
     return GnssPositions(xyz, sigma, None), reason
-
-
-def _differences_are_of_the_frame(cameras: Cameras, name: str) -> bool:
-    """Return whether adjusted minus GNSS is a difference of coordinates in the cameras' frame."""
-    if not is_tied(cameras.crs, name) or cameras.crs is None:
-        return True
-    if is_topocentric(cameras.crs):
-        return cameras.gnss is not None and cameras.gnss.crs in (None, cameras.crs)
-    crs = parse_crs(cameras.crs, name)
-    return crs.is_projected and {axis.unit_name for axis in crs.axis_info}.issubset(METRES)
