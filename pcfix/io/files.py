@@ -136,8 +136,7 @@ def sha256(path: Path) -> str:
 
 def write_tally(path: Path, key: str, tally: Any) -> None:
     """Write the statistics of a file under a key, completely or not at all."""
-    with temporary_output(path) as draft:
-        draft.write_bytes(pickle.dumps((key, tally)))
+    write_bytes(path, pickle.dumps((key, tally)), overwrite=True)
 
 
 def read_tally(path: Path) -> tuple[str, Any]:

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from pcfix.errors import SettingError, bad_file
 from pcfix.io.atomic import temporary_output
-from pcfix.io.files import check_output, refusing
+from pcfix.io.files import check_output, refusing, write_bytes
 from pcfix.libraries import photo_library
 from pcfix.model import BoolArray, FloatArray
 from pcfix.options.declare import File
@@ -276,9 +276,7 @@ def write_calm(target: Path, frames: Frames, pixels: Pixels) -> None:
         everywhere = np.ones(pixels.shape[:2], bool)
         write_photograph(frames.photographs[0], target, pixels, everywhere)
         return
-    _, data = photo_library("cv2").imencode(".png", pixels)
-    with temporary_output(target) as path:
-        path.write_bytes(data.tobytes())
+    write_bytes(target, photo_library("cv2").imencode(".png", pixels)[1].tobytes(), overwrite=True)
 
 
 def write_spread(target: Path, spread: FloatArray) -> None:
