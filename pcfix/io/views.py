@@ -272,10 +272,7 @@ def image_orders(raw: ViewList, cameras: Cameras) -> tuple[ImageOrder, ...]:
     if not known:
         sentence = f"no image of {fitting[0].what} is among the cameras. Give those of this block."
         raise bad_file(raw.path, "views.other_block", sentence)
-    distinct: dict[bytes, ImageOrder] = {}
-    for order in known:
-        distinct.setdefault(order.camera.tobytes(), order)
-    return tuple(distinct.values())
+    return tuple(known)
 
 
 def _orders(model: Path) -> list[tuple[str, list[str]]]:
@@ -286,7 +283,7 @@ def _orders(model: Path) -> list[tuple[str, list[str]]]:
         return []
     images = read_images(path, points=False)
     name = {image.identifier: image.name for image in images}
-    by_frame = [name[i] for ids in _frames(model) for i in ids if i in name]
+    by_frame = [name[i] for i in _by_frame(model) if i in name]
     orders = [
         (f"the frames of {model}", by_frame if len(by_frame) == len(images) else []),
         (f"the images of {model}", [image.name for image in images]),
@@ -295,8 +292,8 @@ def _orders(model: Path) -> list[tuple[str, list[str]]]:
     return [(what, names) for what, names in orders if names]
 
 
-def _frames(model: Path) -> list[list[int]]:
-    """Return the image ids of each frame of a model with rigs, in the order of COLMAP.
+def _by_frame(model: Path) -> list[int]:
+    """Return the image ids of a model with rigs by their frames, in the order of COLMAP.
 
     See https://colmap.github.io/format.html for ``frames.bin``.
     """
@@ -311,7 +308,7 @@ def _frames(model: Path) -> list[list[int]]:
         entries = [_DATA.unpack_from(data, place) for place in range(at, end, _DATA.size)]
         frames[frame_id] = sorted((sensor, image) for kind, sensor, image in entries if kind == 0)
         at = end
-    return [[image for _, image in frames[i]] for i in sorted(frames)]
+    return [image for i in sorted(frames) for _, image in frames[i]]
 
 
 def fitted(views: ViewList, cameras: Cameras, xyz: FloatArray, rows: IntArray) -> ViewList:
@@ -437,7 +434,6 @@ class ViewMatch:
         report.share_seen = views.share_seen
         report.image_order, report.unposed = order.what, order.unposed
         report.entries, report.unposed_entries = int(posed.sum()), int((~posed).sum())
-        report.without_camera = int(np.count_nonzero(start[matched + 1] == 0))
         report.beside_entries = int(outside.sum())
         report.beside_points = int(np.count_nonzero(outside))
         return listed, report
@@ -482,7 +478,6 @@ class ViewReport(Sums):
     by_position: int = 0
     farthest_m: float | None = field(default=None, metadata=MOST)  # of these, from its list
     unmatched: int = 0
-    without_camera: int = 0  # matched points none of whose images has a pose
     entries: int = 0  # cameras of all lists that were matched
     unposed_entries: int = 0  # images without a pose, which are ignored
     beside_entries: int = 0  # cameras that cannot have imaged their point, which are ignored

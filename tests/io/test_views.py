@@ -200,7 +200,6 @@ def test_vis_without_positions(tmp_path, cameras, scene, beside):
     found, _, report = given(match, xyz)
     assert found == lists
     assert report.by_row == 400 and report.tolerance_m is None
-    assert report.without_camera == 1
     assert codes(report) == (["views.other_points"] if beside else [])
     for points in (399, None):
         with refused("views.other_points", listed=400, points=points):
