@@ -42,11 +42,10 @@ COLUMNS = {
 }
 """Names of a column; the first that the header has is used."""
 _WKT = re.compile(
-    r"\s*(SRID\s*=\s*\d+\s*;)?\s*((MULTI)?(POINT|LINESTRING|POLYGON)|LINEARRING|GEOMETRYCOLLECTION)"
+    r"\s*((MULTI)?(POINT|LINESTRING|POLYGON)|LINEARRING|GEOMETRYCOLLECTION)"
     r"\s*(ZM|Z|M)?\s*(\(|EMPTY)",
     re.IGNORECASE,
 )
-_SRID = re.compile(r"\s*SRID\s*=\s*(\d+)\s*;", re.IGNORECASE)
 
 LAYER_MARK = "|"
 WGS84, WGS84_3D = "EPSG:4326", "EPSG:4979"
@@ -194,8 +193,8 @@ def _read_gdal(path: Path, layer: str | None) -> tuple[Geometries, str | None, s
 def _read_text(path: Path) -> tuple[Geometries, str | None]:
     """Return the geometries of a text file, and the CRS that it names.
 
-    A comment ``# crs: EPSG:25830`` above the rest names it, or ``SRID=25830;`` before a WKT;
-    for longitude and latitude it is WGS 84.
+    A comment ``# crs: EPSG:25830`` above the rest names it; for longitude and latitude it is
+    WGS 84.
     """
     lines = tables.read_lines(path)
     numbered = enumerate(lines, start=1)
@@ -203,26 +202,21 @@ def _read_text(path: Path) -> tuple[Geometries, str | None]:
     if not used:
         raise bad_file(path, "vector.empty", "is empty.")
     is_wkt = _WKT.match(used[0][1])
-    geometries, crs = _from_wkt(path, used) if is_wkt else _from_table(path)
+    geometries, crs = (_from_wkt(path, used), None) if is_wkt else _from_table(path)
     return geometries, tables.stated_crs(lines[:20]) or crs
 
 
-def _from_wkt(path: Path, lines: list[tuple[int, str]]) -> tuple[Geometries, str | None]:
-    """Return the geometry of each numbered line, and the CRS that they name."""
+def _from_wkt(path: Path, lines: list[tuple[int, str]]) -> Geometries:
+    """Return the geometry of each numbered line."""
     geometries = np.empty(len(lines), dtype=object)
     for row, (line, text) in enumerate(lines):
         try:
-            geometries[row] = shapely.from_wkt(_SRID.sub("", text).strip())
+            geometries[row] = shapely.from_wkt(text.strip())
         except (shapely.errors.ShapelyError, ValueError) as error:
             why = str(error).split(":", 1)[-1].strip()
             sentence = f"line {line} is not WKT ({why}). Write one complete geometry a line."
             raise bad_file(path, "vector.wkt", sentence, line=line) from error
-    srids = {named[1] if (named := _SRID.match(text)) else None for _, text in lines}
-    if len(srids) > 1:
-        sentence = "its lines name different SRIDs. Write one CRS a file."
-        raise bad_file(path, "vector.srids", sentence)
-    srid = srids.pop()
-    return geometries, f"EPSG:{srid}" if srid else None
+    return geometries
 
 
 def _from_table(path: Path) -> tuple[Geometries, str | None]:
@@ -232,11 +226,9 @@ def _from_table(path: Path) -> tuple[Geometries, str | None]:
     # degrees of x and y are those of the CRS
     table = replace(table, unit=["" if one in tables.DEGREES else one for one in table.unit])
     if table.has("wkt"):
-        return _from_wkt(path, list(zip(table.line, table.column("wkt"), strict=True)))
+        return _from_wkt(path, list(zip(table.line, table.column("wkt"), strict=True))), None
     axes, crs = (("x", "y"), None) if table.has("x", "y") else (("longitude", "latitude"), WGS84)
     plan, z = table.of(axes), table.where_there(("z",))[:, 0]
-    if not table.has("z"):
-        return np.asarray(shapely.points(plan)), crs
     points = np.asarray(shapely.points(np.column_stack([plan, z])))
     return np.where(np.isfinite(z), points, shapely.force_2d(points)), crs
 

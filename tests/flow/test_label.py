@@ -42,7 +42,7 @@ def mask(tmp_path):
 
 
 def wkt(path, area, srid=32633):
-    path.write_text(f"SRID={srid};{area.wkt}\n")
+    path.write_text(f"# crs: EPSG:{srid}\n{area.wkt}\n")
     return path
 
 
