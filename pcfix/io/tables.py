@@ -126,7 +126,6 @@ class Table:
 
 CRS_COMMENT = re.compile(r"^\s*#\s*(?:coordinatesystem|crs)\s*[:=]\s*(.+)$", re.IGNORECASE)
 _LONGEST_NAME = 80
-_FARTHEST_HEADER = 20
 
 
 def stated_crs(lines: Iterable[str]) -> str | None:
@@ -179,7 +178,7 @@ def find_header(lines: Sequence[str], spellings: Spellings) -> Header | None:
     """
     plain = {spelling for names in spellings.values() for spelling in names}
     found = None
-    for i, line in enumerate(lines[:_FARTHEST_HEADER]):
+    for i, line in enumerate(lines):
         is_comment = line.lstrip("\"' ").startswith("#")
         text = line.strip().lstrip("#").strip() if is_comment else line.strip()
         if text and not CRS_COMMENT.match(line):
