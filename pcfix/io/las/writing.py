@@ -20,7 +20,7 @@ import laspy
 import lazrs
 import numpy as np
 from laspy.errors import LaspyException
-from laspy.vlrs.known import ExtraBytesStruct, WktCoordinateSystemVlr
+from laspy.vlrs.known import WktCoordinateSystemVlr
 from laspy.vlrs.vlr import VLR
 from pyproj import CRS
 
@@ -42,6 +42,8 @@ from pcfix.model import FloatArray
 from pcfix.version import __version__
 
 EXTRA_BYTES = ("LASF_Spec", 4)
+_EXTRA, _SCALED = struct.Struct("<2xBB32s76xd16xd16x32s"), 0b11000
+"""An extra dimension: type, options, name, scale, offset and description; both are given."""
 USER_ID = "pcfix"
 _SETTINGS = (1, "pcfix settings (JSON)")
 BEFORE = (
@@ -130,7 +132,8 @@ def _upgraded(
         header.global_encoding.wkt = True
     described, undescribed = _extra_bytes_of(source)
     for dimension in undescribed:
-        described += bytes(ExtraBytesStruct(dimension.name.encode(), (0, dimension.num_bits // 8)))
+        size = dimension.num_bits // 8
+        described += _EXTRA.pack(0, size, dimension.name.encode(), 0.0, 0.0, b"")
     names = [dimension.name for dimension in undescribed]
     return header, vlrs, described, {"added_wkt": crs is not None, "undescribed": names}
 
@@ -159,7 +162,7 @@ def restored_header(source: LasSource, before: dict[str, Any], drop: set[str]) -
     if before["added_wkt"]:
         last = max(i for i, v in enumerate(vlrs) if v.user_id == "LASF_Projection")
         del vlrs[last]
-    size = ExtraBytesStruct.size()
+    size = _EXTRA.size
     records, _ = _extra_bytes_of(source)
     described = [records[i : i + size] for i in range(0, len(records), size)]
     gone = drop.union(before["undescribed"])
@@ -177,17 +180,13 @@ def _extra_bytes(
         scale = column_scale(column, scales)
         scaled = None if scale == 1.0 else np.array([scale])
         offset = None if scale == 1.0 else np.zeros(1)
-        dtype = np.dtype(column.dtype)
         params.append(
-            laspy.ExtraBytesParams(column.name, dtype, column.description, offset, scaled)
+            laspy.ExtraBytesParams(column.name, column.dtype, column.description, offset, scaled)
         )
-        number = ["uint8", "int8", "uint16", "int16", "uint32", "int32"].index(dtype.name) + 1
-        record = ExtraBytesStruct(
-            column.name.encode(), number, column.description.encode(), scaled, offset
-        )
-        record.options &= ~(record.MIN_BIT_MASK | record.MAX_BIT_MASK)
-        record._min[:], record._max[:] = type(record._min)(), type(record._max)()
-        records += bytes(record)
+        number = ["uint8", "int8", "uint16", "int16", "uint32", "int32"].index(column.dtype) + 1
+        texts = column.name.encode(), column.description.encode()
+        options, step = (0, 0.0) if scaled is None else (_SCALED, scale)
+        records += _EXTRA.pack(number, options, texts[0], step, 0.0, texts[1])
     return params, records
 
 
@@ -211,8 +210,8 @@ def _extra_bytes_of(source: LasSource) -> tuple[bytes, list[Any]]:
     """Return the description of the input's extra dimensions, and those that it leaves out."""
     dimensions = list(source.header.point_format.extra_dimensions)
     records = b"".join(v.record_data for v in source.vlrs if _is_extra_bytes(v))
-    count = len(records) // ExtraBytesStruct.size() if dimensions else 0
-    return records[: count * ExtraBytesStruct.size()], dimensions[count:]
+    count = len(records) // _EXTRA.size if dimensions else 0
+    return records[: count * _EXTRA.size], dimensions[count:]
 
 
 def _set_records(header: laspy.LasHeader, vlrs: list[VLR], described: bytes) -> None:
