@@ -156,7 +156,7 @@ def kind_of(views: ViewMatch | Views | None) -> ViewKind | None:
     """Return the type of a view list."""
     if views is None or isinstance(views, Views):
         return None if views is None else views.kind
-    return views.view_list.kind
+    return views.view_list.listed.kind
 
 
 def transferred(

@@ -144,7 +144,7 @@ class Inputs(MaskOption, InputOptions):
         if self.views_are == "auto":
             return cameras, views
         kind: ViewKind = "pair-images" if self.views_are == "pairs" else self.views_are
-        return cameras, replace(views, kind=kind)
+        return cameras, replace(views, listed=replace(views.listed, kind=kind))
 
     def _georeferenced(self, read: Cameras, cloud_crs: str | CRS | None) -> Georeference:
         """Return the transformation from the frame of the camera file to the cloud's CRS."""

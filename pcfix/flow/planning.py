@@ -226,7 +226,7 @@ def _estimated_from_cloud(plan: Plan, chunks: Chunks) -> Plan:
     given = survey.settings if survey.own_water is not None else plan.options
     some_listed = False
     if views is not None:
-        start = views.start if isinstance(views, Views) else views.view_list.start
+        start = views.start if isinstance(views, Views) else views.view_list.listed.start
         some_listed = len(start) <= view.points or not bool((np.diff(start) > 0).all())
     # listed cameras saw their points, so that nothing hides them
     may_hide = views is None or survey.settings.occlusion != "auto"

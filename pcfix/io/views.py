@@ -49,7 +49,7 @@ from pcfix.io.labels import match_labels
 from pcfix.io.ply import Header, Property, Records, read_header
 from pcfix.lens.frames import beside_frames
 from pcfix.lens.imaging import straight_images
-from pcfix.model import Cameras, FloatArray, IntArray, TiePoints, ViewKind, Views
+from pcfix.model import Cameras, FloatArray, IntArray, TiePoints, Views
 from pcfix.options.declare import File
 from pcfix.sums import LEAST, MOST, SAME, Sums
 
@@ -82,9 +82,7 @@ class ViewList:
 
     path: Path
     what: str  # the kind of file
-    start: IntArray  # (n + 1,)
-    image: npt.NDArray[np.int32]  # (start[-1],), the file's number of the image
-    weight: npt.NDArray[np.float32] | None = None  # (start[-1],)
+    listed: Views  # of n points; a camera is an int32, the file's number of the image
     xyz: FloatArray | None = None  # (n, 3), frame of the file, then of the cameras
     resolution_m: float = 0.0  # how far off a position can be, from the type of its numbers
     notes: tuple[PcfixWarning, ...] = ()
@@ -92,10 +90,9 @@ class ViewList:
     share_seen: float | None = None
     spacing_m: float | None = None  # between neighbouring points, if there are positions
     tolerance_spacings: float = 0.05
-    kind: ViewKind = "depth-maps"  # see `pcfix.model.Views`
 
     def __len__(self) -> int:
-        return len(self.start) - 1
+        return len(self.listed.start) - 1
 
 
 def read_views(path: File, cameras: Cameras, *, to_cloud: Points | None = None) -> ViewList:
@@ -144,8 +141,8 @@ def track_views(
     start = np.concatenate([[0], np.cumsum(np.bincount(pairs[:, 0], minlength=len(rows)))])
     order = ImageOrder("the cameras of the tie points", np.arange(len(cameras), dtype=np.int32))
     views = ViewList(
-        path, "tie points", start, pairs[:, 1].astype(np.int32), xyz=tie_points.xyz[rows],
-        orders=(order,), tolerance_spacings=2.0, kind="tracks",
+        path, "tie points", Views(start, pairs[:, 1]), xyz=tie_points.xyz[rows], orders=(order,),
+        tolerance_spacings=2.0,
     )  # fmt: skip
     return _placed(views, cameras, to_cloud)
 
@@ -178,8 +175,7 @@ def _colmap(path: Path) -> ViewList:
     if not count or records is None or _HEAD + records.end < path.stat().st_size:
         sentence = f"is no complete COLMAP view list of {count:,} points. {_REMEDY}"
         raise bad_file(path, "views.damaged", sentence, points=count)
-    start, number = records.lists(_IMAGES)
-    raw = ViewList(path, COLMAP_LIST, start, _checked_images(path, number))
+    raw = ViewList(path, COLMAP_LIST, _listed(path, records))
     bare = path.with_suffix("")
     ply = bare if bare.suffix.lower() == ".ply" else bare.with_suffix(".ply")
     if not ply.is_file():
@@ -197,16 +193,15 @@ def _openmvs(path: Path) -> ViewList:
     if header.item(_IMAGES, is_list=True) is None:
         raise bad_file(path, "views.no_lists", f"its points have no {_IMAGES}. {_REMEDY}")
     vertices = Records(path, header)
-    start, number = vertices.lists(_IMAGES)
-    raw = ViewList(path, "OpenMVS point cloud", start, _checked_images(path, number))
-    raw = replace(raw, **_positions(vertices))
-    if header.item(_WEIGHTS, is_list=True) is None:
-        return raw
-    weight_start, weight = vertices.lists(_WEIGHTS)
-    if not np.array_equal(weight_start, start) or not ((weight >= 0.0) & (weight < np.inf)).all():
-        sentence = f"its {_WEIGHTS} are not one positive number for each image. {_REMEDY}"
-        raise bad_file(path, "views.weights", sentence)
-    return replace(raw, weight=weight.astype(np.float32))
+    listed, positions = _listed(path, vertices), _positions(vertices)
+    if header.item(_WEIGHTS, is_list=True) is not None:
+        start, weight = vertices.lists(_WEIGHTS)
+        is_positive = ((weight >= 0.0) & (weight < np.inf)).all()
+        if not (np.array_equal(start, listed.start) and is_positive):
+            sentence = f"its {_WEIGHTS} are not one positive number for each image. {_REMEDY}"
+            raise bad_file(path, "views.weights", sentence)
+        listed = replace(listed, weight=weight.astype(np.float32))
+    return ViewList(path, "OpenMVS point cloud", listed, **positions)
 
 
 def _positions(vertices: Records) -> dict[str, Any]:
@@ -226,16 +221,17 @@ def _positions(vertices: Records) -> dict[str, Any]:
     return {"xyz": xyz, "resolution_m": step}
 
 
-def _checked_images(path: Path, number: npt.NDArray[Any]) -> npt.NDArray[np.int32]:
-    """Return image numbers as int32, if they are whole and not negative."""
+def _listed(path: Path, records: Records) -> Views:
+    """Return the image numbers of each point as int32, if they are whole and not negative."""
+    start, number = records.lists(_IMAGES)
     with np.errstate(invalid="ignore"):  # NaN and infinity of a text
-        image = number.astype(np.int32)
+        image: npt.NDArray[Any] = number.astype(np.int32)
     wrong = np.flatnonzero((image < 0) | (image != number))
     if wrong.size:
         value = number[wrong[0]].item()
         sentence = f"names image {value}, which is not a whole number from 0 on. {_REMEDY}"
         raise bad_file(path, "views.image_number", sentence, value=value)
-    return image
+    return Views(start, image, kind="depth-maps")
 
 
 LEAST_SHARE = 0.95
@@ -261,7 +257,7 @@ def image_orders(raw: ViewList, cameras: Cameras) -> tuple[ImageOrder, ...]:
                 unposed = tuple(name for name, r in zip(names, row, strict=True) if r < 0)
                 found.append(ImageOrder(what, row, unposed))
     found.append(ImageOrder("the cameras as given", np.arange(len(cameras), dtype=np.int32)))
-    most = int(raw.image.max()) if raw.image.size else -1
+    most = int(raw.listed.camera.max(initial=-1))
     fitting = [order for order in found if most < len(order.camera)]
     if not fitting:
         largest = max(found, key=lambda order: len(order.camera))
@@ -320,9 +316,9 @@ def fitted(views: ViewList, cameras: Cameras, xyz: FloatArray, rows: IntArray) -
     if cameras.rotations is None or cameras.lenses is None:
         return replace(views, orders=views.orders[:1])
     step = max(1, len(rows) // SAMPLE_POINTS)
-    ends, entry = entries(views.start, rows[::step])
-    image, seen_xyz = views.image[entry], np.repeat(xyz[::step], np.diff(ends), axis=0)
-    shares = [share_seen(cameras, order.camera[image], seen_xyz) for order in views.orders]
+    some = views.listed.take(rows[::step])
+    seen_xyz = np.repeat(xyz[::step], np.diff(some.start), axis=0)
+    shares = [share_seen(cameras, order.camera[some.camera], seen_xyz) for order in views.orders]
     known = [(share, i) for i, share in enumerate(shares) if share is not None]
     if not known:
         return views
@@ -332,13 +328,6 @@ def fitted(views: ViewList, cameras: Cameras, xyz: FloatArray, rows: IntArray) -
         sentence += " Put the sparse model beside the list, or give its offset (--cameras-offset)."
         raise bad_file(views.path, "views.other_images", sentence, share=share)
     return replace(views, orders=(views.orders[best],), share_seen=share)
-
-
-def entries(start: IntArray, rows: IntArray) -> tuple[IntArray, IntArray]:
-    """Return where the lists of some rows start in a copy, and which entries these are."""
-    counts = start[rows + 1] - start[rows]
-    ends = np.concatenate([[0], np.cumsum(counts)])
-    return ends, np.repeat(start[rows] - ends[:-1], counts) + np.arange(ends[-1])
 
 
 def share_seen(cameras: Cameras, camera: npt.NDArray[np.int32], xyz: FloatArray) -> float | None:
@@ -423,13 +412,13 @@ class ViewMatch:
         else:
             row = self._rows(xyz, first_row, views.xyz, report)
         order, matched = views.orders[0], np.flatnonzero(row >= 0)
-        ends, entry = entries(views.start, row[matched])
-        camera = order.camera[views.image[entry]].astype(np.int64)
+        some = views.listed.take(row[matched])
+        camera = order.camera[some.camera].astype(np.int64)
         posed = camera >= 0
         start = np.zeros(len(row) + 1, np.int64)
-        start[matched + 1] = np.diff(np.concatenate([[0], np.cumsum(posed)])[ends])
-        weight = None if views.weight is None else views.weight[entry][posed]
-        listed = Views(np.cumsum(start), camera[posed], weight, views.kind)
+        start[matched + 1] = np.diff(np.concatenate([[0], np.cumsum(posed)])[some.start])
+        weight = None if some.weight is None else some.weight[posed]
+        listed = Views(np.cumsum(start), camera[posed], weight, some.kind)
         outside = beside_frames(xyz, listed, self._cameras)
         report.share_seen = views.share_seen
         report.image_order, report.unposed = order.what, order.unposed

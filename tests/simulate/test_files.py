@@ -55,8 +55,8 @@ def test_view_lists(tmp_path):
     cameras = pcfix.Cameras(tuple(map(str, range(300))), np.zeros((300, 3)))
     (tmp_path / "other.vis").write_bytes(colmap_vis(views))
     raw = read_views(tmp_path / "other.vis", cameras)
-    assert np.array_equal(raw.start, views.start)
-    assert np.array_equal(raw.image, camera)
+    assert np.array_equal(raw.listed.start, views.start)
+    assert np.array_equal(raw.listed.camera, camera)
 
 
 def test_flume_step(tmp_path):
