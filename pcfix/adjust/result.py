@@ -247,7 +247,6 @@ def adjustment_dict(adjusted: Adjusted, before: Intersected | None = None) -> Pl
     notes += [] if known is None else known.notes
     found = {
         "source": a.source,
-        "engine": "unaware" if a.source == "cloud" else "direct",
         "image_unit": lenses[0].unit,
         "images": len(block.cameras),
         "images_fixed": kept or sum(label in u.fixed_images for label in block.cameras.labels),
@@ -276,7 +275,8 @@ def adjustment_dict(adjusted: Adjusted, before: Intersected | None = None) -> Pl
         "gnss": _gnss(a),
         "control": _surveyed([row for row in a.control if row.role == "control"]),
         "check": _surveyed([row for row in a.control if row.role == "check"]),
-        "rounds": [row._asdict() for row in {row.round: row for row in a.rounds}.values()],
+        "rounds": len({row.round: row for row in a.rounds}),
+        "steps": len(a.rounds),
         "notes": [one.as_dict() for one in {str(one): one for one in notes}.values()],
     }
     return dict(plain(found))
@@ -385,15 +385,17 @@ def _water(a: Adjusted) -> Plain | None:
     original, adjusted = a.block.water, a.water
     if original is None or adjusted is None:
         return None
-    names, height_m = ["level", "index"], float(a.origin[2])
     if isinstance(original, WaterPlane):
-        names[1:1] = ["tilt_x", "tilt_y"]
+        names, height_m = ["level", "tilt_x", "tilt_y", "index"], float(a.origin[2])
     else:  # the number is what is added to a mesh or raster
         heights = surface_above(original, a.xyz).height_m
-        height_m = float(mean(heights))
+        names, height_m = ["level", "index"], float(mean(heights))
         names = names if np.isfinite(heights).any() else ["index"]
     names += WATER_NAMES[SHAPE:PORT] if a.unknowns.surface.get("shape") else []
-    return {"surface": str(adjusted), **_numbers(a, names, height_m)}
+    found: Plain = {"surface": str(adjusted), **_numbers(a, names)}
+    for key in ("before", "after") if "level" in found else ():
+        found["level"][key] += height_m
+    return found
 
 
 def _port(a: Adjusted) -> Plain | None:
@@ -405,19 +407,19 @@ def _port(a: Adjusted) -> Plain | None:
     return {"port": spec_of(a.port), **_numbers(a, names)}
 
 
-def _numbers(a: Adjusted, names: Sequence[str], height_m: float = 0.0) -> dict[str, Plain]:
-    """Return parameters of the refracting surface; the level is about a height."""
+def _numbers(a: Adjusted, names: Sequence[str]) -> dict[str, Plain]:
+    """Return parameters of the refracting surface, block frame."""
     start = surface_numbers(a.block, a.origin)
-    rows = {}
-    for name in names:
-        i, base = WATER_NAMES.index(name), height_m if name == "level" else 0.0
-        rows[name] = {
-            "before": base + start[i],
-            "after": base + a.numbers[i],
+    return {
+        name: {
+            "before": start[i],
+            "after": a.numbers[i],
             "sigma": None if a.precision is None else a.precision.sigma_of(name),
             "free": bool(a.unknowns.water_sigma[i]),
         }
-    return rows
+        for name in names
+        for i in [WATER_NAMES.index(name)]
+    }
 
 
 def _poses(a: Adjusted) -> Plain:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from pcfix.adjust.block import MOTIONS
 from pcfix.adjust.problem import Intersected
 from pcfix.adjust.result import Adjusted, Plain, adjustment_dict, before_of
 from pcfix.grid.colours import DEPTH, DIFFERENCE, RAYS, UNCERTAINTY
@@ -16,31 +15,37 @@ from pcfix.model import FloatArray
 from pcfix.report.adjustment_figures import pictures_of
 from pcfix.report.map_data import Layer
 from pcfix.report.page import Report, Table, render
-from pcfix.report.text import Rows, filled, share
+from pcfix.report.text import Rows, RowTable, filled, share
 
 __all__ = ["adjustment_dict", "adjustment_page", "adjustment_text", "before_of"]
 
 WHERE = (("land", "on land"), ("water", "under water"))
 MOST_LISTED = 12
 """Surveyed points in the text; the page has all of them."""
-_LENS = {"f": "focal length", "cx": "principal x", "cy": "principal y"}
-_WATER = {
-    "level": ("water level", "m"), "tilt_x": ("tilt east", ""), "tilt_y": ("tilt north", ""),
-    "index": ("index", ""), "shape_xx": ("shape x^2", "/m"), "shape_xy": ("shape x y", "/m"),
-    "shape_yy": ("shape y^2", "/m"), "distance": ("port distance", "m"),
-    "centre_x": ("dome centre x", "m"), "centre_y": ("dome centre y", "m"),
-    "centre_z": ("dome centre z", "m"),
+_NAMES = {
+    "f": "focal length", "cx": "principal x", "cy": "principal y", "level": "water level",
+    "tilt_x": "tilt east", "tilt_y": "tilt north", "index": "index", "shape_xx": "shape x^2",
+    "shape_xy": "shape x y", "shape_yy": "shape y^2", "distance": "port distance",
+    "centre_x": "dome centre x", "centre_y": "dome centre y", "centre_z": "dome centre z",
 }  # fmt: skip
-_COUNTS = (
+_UNITS = {"level": " m", "distance": " m", "shape": " /m", "centre": " m", "shift": " m",
+          "turn": " rad"}  # fmt: skip
+"""By the beginning of a name."""
+_FACTS: RowTable = (
     ("images", "{images:,}, {poses_words}", "images"),
     ("points", "{points[all]:,}: {points[land]:,} on land, {points[water]:,} under water{counted}",
      "points"),
     ("observations", "{o[used]:,} {kind} used, {o[left_out]:,} left out ({o_share}){outside}", "o"),
-    ("sigma0", "{sigma0_words}, redundancy {redundancy:,}, {rounds_count} rounds, {steps}"
-     " steps{undone}", "images"),
+    ("sigma0", "{sigma0:.3f}, redundancy {redundancy:,}, {rounds} rounds, {steps} steps{undone}",
+     "images"),
     ("water", "{water[surface]}", "has_shape"),
-)  # fmt: skip
-_ACCURACY = (
+    ("lens", "fixed", "lens_is_fixed"),
+    ("{label}", "{before:.6g} -> {after:.6g}{unit} ({added:+.3g}, standard error {sigma:.2g})",
+     "*unknowns"),
+    ("{label}", "{added:+.3g}{unit} (standard error {sigma:.2g})", "*motions"),
+    ("water", "none{refracts}", "no_water"),
+    ("port", "--port {port_found[port]}", "has_port_unknowns"),
+    ("{label}", "{after:.6g}{unit}, fixed", "*held"),
     ("on {surface}", "{points:,} marked points, distance RMS {rms_m:z.4f} m (given {sigma_m:g} m),"
      " largest {largest_m:z.4f} m ({largest_point}){parallel_to}", "*on_surfaces"),
     ("poses", "RMS movement of the centres {poses[moved_rms_m]:.3f} m", "moved"),
@@ -59,20 +64,9 @@ _ACCURACY = (
 )  # fmt: skip
 
 
-# Numbers and words
-
-
 def fixed(value: float | None, digits: int, sign: str = "") -> str:
     """Return a number with a fixed number of digits; a dash if it is unknown."""
     return "-" if value is None else f"{value:{sign}z.{digits}f}"  # z: a zero has no minus sign
-
-
-def short(value: float, sigma: float | None, sign: str = "") -> str:
-    """Return a number with the digits that its standard error justifies, two at least."""
-    if sigma is None or not sigma > 0.0:
-        return f"{value:{sign}.6g}"
-    digits = int(np.clip(np.ceil(np.log10(2.0 / sigma)), 2, 9))
-    return f"{value:{sign}.{digits}f}"
 
 
 def all_notes(d: Plain) -> list[str]:
@@ -84,20 +78,19 @@ def _residuals(d: Plain) -> str:
     """Return the RMS residuals on land and under water; empty without any."""
     known = [(where, d["residuals"][key]["rms_px"]) for key, where in WHERE]
     unit = d["image_unit"]
-    return " and ".join(
-        f"{fixed(rms, 2)} {unit} {where}" for where, rms in known if rms is not None
-    )
+    return " and ".join(f"{rms:.2f} {unit} {where}" for where, rms in known if rms is not None)
 
 
 def adjustment_sentence(d: Plain) -> str:
     """Return an adjustment in half a line."""
-    row = next((one for one in d["lens"][:1] if one["name"] == "f"), None)
-    parts = [f"centres moved {fixed(d['poses']['moved_rms_m'], 3)} m (rms)"]
-    if row is not None:
-        before, after, _ = _change(row)
-        parts.insert(0, f"focal length {before} -> {after} {d['image_unit']}")
     residuals = _residuals(d)
-    return ", ".join([*parts, *([f"residuals {residuals}"] if residuals else [])])
+    parts = [f"centres moved {fixed(d['poses']['moved_rms_m'], 3)} m (rms)"]
+    parts += [f"residuals {residuals}"] if residuals else []
+    for row in d["lens"][:1]:
+        if row["name"] == "f":
+            words = f"focal length {row['before']:.6g} -> {row['after']:.6g} {d['image_unit']}"
+            parts.insert(0, words)
+    return ", ".join(parts)
 
 
 def adjustment_text(adjusted: Adjusted, before: Intersected | None = None) -> str:
@@ -126,6 +119,7 @@ def adjustment_page(adjusted: Adjusted, before: Intersected | None = None) -> st
         f" {d['observations']['used']:,} observations fit within {_residuals(d)} (RMS of a"
         " coordinate)."
     )
+    tables = [_residual_table(d), _survey_table(d), _correlation_table(d)]
     report = Report(
         title="Refractive bundle adjustment",
         lead=lead,
@@ -134,7 +128,7 @@ def adjustment_page(adjusted: Adjusted, before: Intersected | None = None) -> st
         maps=maps,
         layers=layers,
         pictures=pictures_of(d, adjusted, before),
-        tables=_tables(d),
+        tables=[table for table in tables if table.rows],
     )
     return render(report)
 
@@ -153,7 +147,50 @@ def adjustment_tables(d: Plain, page: str) -> list[Table]:
 # Facts
 
 
-def _poses_are(d: Plain) -> str:
+def _facts(d: Plain) -> Rows:
+    """Return labels and values of the summary."""
+    n, o, water, port = d["points"], d["observations"], d["water"], d["port_found"] or {}
+    counts = [(n[key], key.replace("_", " ")) for key in ("left_out", "control", "check")]
+    kinds = {"tie points": "measured tie points", "cloud": "points of the cloud in original images"}
+    outside = f", {o['out_of_sight']:,} outside their image" if o["out_of_sight"] else ""
+    unknowns, held = [_lens_row(d, row) for row in d["lens"]], []
+    for name, row in (water or port).items():
+        if isinstance(row, dict):
+            named = _named(name) | row | {"added": row["after"] - row["before"]}
+            # a level surface has no tilt to show
+            if row["free"]:
+                unknowns.append(named)
+            elif not (name.startswith("tilt") and row["after"] == 0.0):
+                held.append(named)
+    motions = []
+    if d["poses_are"] == "similarity" and d["precision"] is not None:
+        motions = [_named(row["name"]) | row for row in d["precision"]["shared"][-7:]]
+    parallel, is_free = d["unknowns"]["parallel"], d["poses_are"] != "fixed"
+    surfaces = []
+    for one in d["on_surfaces"]:
+        others = ", ".join(name for name in parallel if name != one["surface"])
+        is_parallel = one["surface"] in parallel
+        surfaces.append(one | {"parallel_to": f"; parallel to {others}" if is_parallel else ""})
+    return filled(_FACTS, d | {
+        "poses_words": _poses_words(d), "o": o, "kind": kinds[d["source"]], "outside": outside,
+        "counted": "".join(f", {count:,} {key}" for count, key in counts if count),
+        "o_share": share(o["left_out"], o["used"] + o["left_out"]),
+        "undone": "; adjustment without water undone" if d["source"] == "cloud" else "",
+        "has_shape": water is not None and not water["surface"].startswith("level"),
+        "lens_is_fixed": not d["lens"], "unknowns": unknowns, "motions": motions, "held": held,
+        "no_water": water is None, "has_port_unknowns": len(port) > 1,
+        "refracts": ", a housing port refracts" if d["port"] else "",
+        "on_surfaces": surfaces,
+        "moved": is_free and d["poses"]["moved_rms_m"],
+        "is_precise": is_free and d["precision"] is not None and d["precision"]["images"],
+        "surveyed": [
+            {"role": role, "count": len(d[role]["points"]), **d[role]}
+            for role in ("control", "check") if d[role] is not None
+        ],
+    })  # fmt: skip
+
+
+def _poses_words(d: Plain) -> str:
     held = f", {d['images_fixed']:,} of them fixed" if d["images_fixed"] else ""
     network = ", a free network" if d["unknowns"]["free_network"] else ""
     return {
@@ -162,53 +199,23 @@ def _poses_are(d: Plain) -> str:
     }[d["poses_are"]]  # fmt: skip
 
 
-def _facts(d: Plain) -> Rows:
-    """Return labels and values of the summary."""
-    n, o, rounds, precision = d["points"], d["observations"], d["rounds"], d["precision"]
-    counts = [(n[key], key.replace("_", " ")) for key in ("left_out", "control", "check")]
-    kinds = {"tie points": "measured tie points", "cloud": "points of the cloud in original images"}
-    outside = f", {o['out_of_sight']:,} outside their image" if o["out_of_sight"] else ""
-    has_shape = d["water"] is not None and not d["water"]["surface"].startswith("level")
-    rows = filled(_COUNTS, d | {
-        "poses_words": _poses_are(d), "o": o, "kind": kinds[d["source"]], "outside": outside,
-        "counted": "".join(f", {count:,} {key}" for count, key in counts if count),
-        "o_share": share(o["left_out"], o["used"] + o["left_out"]),
-        "sigma0_words": fixed(d["sigma0"], 3), "rounds_count": len(rounds),
-        "steps": sum(row["steps"] for row in rounds), "has_shape": has_shape,
-        "undone": "; adjustment without water undone" if d["source"] == "cloud" else "",
-    })  # fmt: skip
-    rows += [] if d["lens"] else [("lens", "fixed")]
-    for label, row, unit in _unknowns(d):
-        unit = f" {unit}" if unit else ""
-        error = "" if row["sigma"] is None else f"standard error {row['sigma']:.2g}"
-        if "added" in row:
-            rows.append((label, f"{short(row['added'], row['sigma'], '+')}{unit} ({error})"))
-            continue
-        before, after, change = _change(row)
-        change += f", {error}" if error else ""
-        rows.append((label, f"{before} -> {after}{unit} ({change})"))
-    if d["water"] is None:
-        rows.append(("water", "none, a housing port refracts" if d["port"] else "none"))
-        if len(d["port_found"] or {}) > 1:
-            rows.append(("port", f"--port {d['port_found']['port']}"))
-    for key, (label, unit) in _WATER.items():  # a level surface has no tilt to show
-        v = (d["water"] or d["port_found"] or {}).get(key)
-        if v is not None and not v["free"] and not (key.startswith("tilt") and v["after"] == 0.0):
-            rows.append((label, f"{v['after']:.6g}{f' {unit}' if unit else ''}, fixed"))
-    parallel, is_free = d["unknowns"]["parallel"], d["poses_are"] != "fixed"
-    others = {name: ", ".join(one for one in parallel if one != name) for name in parallel}
-    return rows + filled(_ACCURACY, d | {
-        "on_surfaces": [
-            one | {"parallel_to": f"; parallel to {others[name]}" if others.get(name) else ""}
-            for one in d["on_surfaces"] for name in [one["surface"]]
-        ],
-        "moved": is_free and d["poses"]["moved_rms_m"],
-        "is_precise": is_free and precision is not None and precision["images"],
-        "surveyed": [
-            {"role": role, "count": len(d[role]["points"]), **d[role]}
-            for role in ("control", "check") if d[role] is not None
-        ],
-    })  # fmt: skip
+def _named(name: str) -> Plain:
+    """Return label and unit of a parameter of water, port or similarity."""
+    return {
+        "label": _NAMES.get(name, name),
+        "unit": _UNITS.get(name.replace("_", " ").split()[0], ""),
+    }
+
+
+def _lens_row(d: Plain, row: Plain) -> Plain:
+    """Return a free parameter of a lens with its label and unit."""
+    label = _NAMES.get(row["name"], row["name"])
+    if len({one["sensor"] for one in d["lens"]}) > 1:
+        label += f", {row['sensor']}, {row['images']:,} images"
+    label += f", first of {row['lenses']} lenses" if row["lenses"] > 1 else ""
+    is_in_pixels = row["name"] in ("f", "cx", "cy", "b1", "b2")
+    unit = f" {d['image_unit']}" if is_in_pixels else ""
+    return row | {"label": label, "unit": unit, "added": row["after"] - row["before"]}
 
 
 def _fact_table(d: Plain) -> Table:
@@ -218,33 +225,6 @@ def _fact_table(d: Plain) -> Table:
         for label, words in _facts(d)
     ]
     return Table("In short", [], rows)
-
-
-def _change(row: Plain) -> list[str]:
-    """Return a value before and after, and the difference."""
-    before, after, sigma = row["before"], row["after"], row["sigma"]
-    return [short(before, sigma), short(after, sigma), short(after - before, sigma, "+")]
-
-
-def _unknowns(d: Plain) -> list[tuple[str, Plain, str]]:
-    """Return label, values and unit of what was free of lens, water, port and similarity."""
-    several = len({row["sensor"] for row in d["lens"]}) > 1
-    rows = []
-    for row in d["lens"]:
-        label = str(_LENS.get(row["name"], row["name"]))
-        label += f", {row['sensor']}, {row['images']:,} images" if several else ""
-        label += f", first of {row['lenses']} lenses" if row["lenses"] > 1 else ""
-        in_pixels = row["name"] in ("f", "cx", "cy", "b1", "b2")
-        rows.append((label, row, str(d["image_unit"]) if in_pixels else ""))
-    found = d["water"] or d["port_found"] or {}
-    for key, (label, unit) in _WATER.items():
-        if (value := found.get(key)) is not None and value["free"]:
-            rows.append((label, value, unit))
-    if d["poses_are"] == "similarity" and d["precision"] is not None:
-        shared = {row["name"]: row for row in d["precision"]["shared"]}
-        units = {"shift": "m", "turn": "rad", "scale": ""}
-        rows += [(name, shared[name], units[name.partition(" ")[0]]) for name in MOTIONS]
-    return rows
 
 
 # Maps
@@ -284,27 +264,14 @@ def _means(a: Adjusted, values: FloatArray) -> Maps:
 # Tables
 
 
-def _tables(d: Plain) -> list[Table]:
-    """Return the tables that have rows, residuals first."""
-    unit, p = d["image_unit"], d["precision"]
-    tables = [_residual_table(d), _survey_table(d)]
-    shared = [] if p is None else [row["name"].replace("_", " ") for row in p["shared"]]
-    if len(shared) > 1:
-        rows = [
-            [name, *(fixed(value, 3, "+") for value in row)]
-            for name, row in zip(shared, p["correlation"], strict=True)
-        ]
-        tables.append(Table("Correlations of the shared unknowns", ["", *shared], rows))
-
+def _correlation_table(d: Plain) -> Table:
+    p = d["precision"] or {"shared": [], "correlation": []}
+    names = [row["name"].replace("_", " ") for row in p["shared"]]
     rows = [
-        [
-            str(row["round"]), str(row["steps"]), f"{row['observations']:,}",
-            fixed(row["cost"], 1), fixed(row["rms_px"], 4),
-        ]
-        for row in d["rounds"]
-    ]  # fmt: skip
-    header = ["round", "steps", "observations", "cost", f"RMS ({unit})"]
-    return [table for table in [*tables, Table("Rounds", header, rows)] if table.rows]
+        [name, *(fixed(value, 3, "+") for value in row)]
+        for name, row in zip(names, p["correlation"], strict=True)
+    ]
+    return Table("Correlations of the shared unknowns", ["", *names], rows if len(rows) > 1 else [])
 
 
 def _survey_table(d: Plain) -> Table:

@@ -1,4 +1,4 @@
-"""The pictures of an adjustment: the block, its residuals, and a section."""
+"""The pictures of an adjustment: the block and its residuals."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ from pcfix.adjust.problem import Intersected
 from pcfix.adjust.result import Adjusted, Plain, rms
 from pcfix.grid.colours import DIFFERENCE
 from pcfix.model import BoolArray, FloatArray
-from pcfix.report.page import AFTER, BEFORE, WATER, Picture, label_plan, new_figure
+from pcfix.report.page import AFTER, BEFORE, Picture, label_plan, new_figure
 from pcfix.sums import nice_step
-from pcfix.water.surface import surface_above
 
 MOST_POINTS = 6000
 COLUMNS = 14
@@ -26,10 +25,7 @@ ARROW_LOOK: Plain = {"angles": "xy", "scale_units": "xy", "zorder": 3}
 
 def pictures_of(d: Plain, adjusted: Adjusted, before: Intersected | None) -> list[Picture]:
     """Return the pictures of an adjustment."""
-    drawn = (
-        _block(d, adjusted), _by_depth(d, before), _vectors(adjusted, before),
-        _section(adjusted, before),
-    )  # fmt: skip
+    drawn = _block(d, adjusted), _by_depth(d, before), _vectors(adjusted, before)
     return [picture for picture in drawn if picture is not None]
 
 
@@ -161,41 +157,3 @@ def _cell_means(
     column, row = np.nonzero(count >= LEAST_IN_CELL)
     u, v = (column + 0.5) * width / bins[0], (row + 0.5) * height / bins[1]
     return u, v, du[column, row], dv[column, row]
-
-
-def _section(a: Adjusted, before: Intersected | None) -> Picture | None:
-    """Draw the points in a strip along the longest extent of the block, with the water."""
-    middle = a.xyz.mean(axis=0)
-    plan = a.xyz[:, :2] - middle[:2]
-    along, aside = np.linalg.svd(plan, full_matrices=False)[2]
-    along = along if along[0] >= 0.0 else -along
-    station, across = plan @ along, plan @ aside
-    inside = np.abs(across - np.median(across)) < 0.15 * float(np.ptp(across)) + 1e-9
-    rows = np.flatnonzero(inside & a.is_observed)
-    rows = rows[:: max(1, len(rows) // MOST_POINTS)]
-    if len(rows) < 2:
-        return None
-    figure, axes = new_figure(8.0, 4.0)
-    first, dots = station.min(), {"linestyle": "none", "marker": ".", "markersize": 2.5}
-    if before is not None:
-        axes.plot(station[rows] - first, before.xyz[rows, 2], color=BEFORE, label="before", **dots)
-    for wet, colour, name in ((False, "0.35", "after, land"), (True, AFTER, "after, under water")):
-        some = rows[a.is_wet[rows] == wet]
-        if len(some):
-            axes.plot(station[some] - first, a.xyz[some, 2], color=colour, label=name, **dots)
-    if a.water is not None:
-        places = np.linspace(first, station.max(), 200)
-        line = middle[:2] + places[:, None] * along + np.median(across) * aside
-        height = surface_above(a.water, np.column_stack([line, np.zeros(200)])).height_m
-        axes.plot(places - first, height, color=WATER, label="water")
-    low, high = np.percentile(a.xyz[rows, 2], [0.2, 99.8])
-    margin = 0.15 * (high - low) + 0.05
-    axes.set(ylim=(low - margin, high + margin), xlabel="Along the block (m)", ylabel="Height (m)")
-    axes.ticklabel_format(style="plain", useOffset=False)
-    axes.legend(loc="best", markerscale=3.0)
-    alt = (
-        f"Points of a strip along the middle of the block, {len(rows):,} of them, in section,"
-        " and the water."
-        + (" Before: intersected with the original poses and lens." if before else "")
-    )
-    return Picture("section", "Section", alt, figure)
