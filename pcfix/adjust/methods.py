@@ -27,14 +27,14 @@ from pcfix.adjust.block import (
     ties_of_cloud,
     well_seen,
 )
-from pcfix.adjust.from_cloud import Candidate, adjust_cloud
+from pcfix.adjust.from_cloud import CloudBlock, adjust_cloud
 from pcfix.adjust.from_ties import adjust_ties, default_lens, noise_px, with_sigma
 from pcfix.adjust.precision import correlated, shape_notes, undetermined
 from pcfix.adjust.problem import intersect_fixed, prepare
 from pcfix.adjust.result import Adjusted
 from pcfix.adjust.solve import reduced_at, solver
 from pcfix.errors import GeometryError, PcfixWarning, SettingError
-from pcfix.model import Cameras, FloatArray, GroundControl, IntArray, TiePoints, Views, WaterSurface
+from pcfix.model import Cameras, FloatArray, GroundControl, IntArray, TiePoints, WaterSurface
 from pcfix.options.survey import AdjustRules
 from pcfix.refract.choice import views_in_frame
 from pcfix.water.surface import surface_above
@@ -95,43 +95,27 @@ def by_ties(
 
 
 def by_cloud(
-    material: Material, xyz: FloatArray, listed: Views | None, rules: AdjustRules,
-    progress: Progress | None = None,
-) -> Adjusted:  # fmt: skip
-    """Adjust a block by points, shape (m, 3), of the apparent cloud that it made.
-
-    The view list, if there is one, says which images contributed to them; so may all in frame.
-    """
-    guesses = {"all images in frame": views_in_frame(xyz, material.original)}
-    if listed is not None:
-        guesses["the images of the view list"] = listed
-    candidates: list[Candidate] = []
-    notes: list[PcfixWarning] = []
-    for name, views in guesses.items():
-        ties = ties_of_cloud(xyz, views, material.original)
-        if len(ties.xyz) < LEAST_TIES:
-            continue
-        block = block_of(material, ties, FIRST_SIGMA_PX)
-        check_datum(block, unknowns_of(rules, ()), material.no_gnss)
-        surveyed = [] if material.control is None else [material.control.xyz]
-        apparent = np.vstack([ties.xyz, *surveyed])
-        kept = well_seen(block)
-        if len(guesses) == 1:
-            kept, notes = _well_seen(material.name, block)
-        if len(kept) >= 2:
-            original = some_cameras(material.original, kept)
-            candidates.append(Candidate(name, restricted(block, kept), original, apparent))
-    if not candidates:
+    material: Material, xyz: FloatArray, rules: AdjustRules, progress: Progress | None = None
+) -> Adjusted:
+    """Adjust a block by points, shape (m, 3), of the apparent cloud that it made."""
+    ties = ties_of_cloud(xyz, views_in_frame(xyz, material.original), material.original)
+    if len(ties.xyz) < LEAST_TIES:
         words = (
             f"{material.name}: the images do not see the cloud. Check the poses with 'pcfix cameras"
             " --cloud'."
         )
         raise GeometryError("cameras.no_overlap", words, path=material.name)
-    _check_wet(material.water, candidates[0].block.xyz)
+    block = block_of(material, ties, FIRST_SIGMA_PX)
+    check_datum(block, unknowns_of(rules, ()), material.no_gnss)
+    surveyed = [] if material.control is None else [material.control.xyz]
+    kept, notes = _well_seen(material.name, block)
+    block, original = restricted(block, kept), some_cameras(material.original, kept)
+    _check_wet(material.water, block.xyz)
     sets = [_lens_of(material, rules)]
     if rules.lens_unknowns is None and material.calibrated is None:
         sets = list(dict.fromkeys([("f",), ("f", "cx", "cy"), *sets]))
-    found = adjust_cloud(candidates, unknowns_of(rules, sets[0]), sets, progress)
+    given = CloudBlock(block, original, np.vstack([ties.xyz, *surveyed]))
+    found = adjust_cloud(given, unknowns_of(rules, sets[0]), sets, progress)
     return _checked(material, found, notes)
 
 

@@ -209,7 +209,7 @@ def _named(name: str) -> Plain:
 
 def _lens_row(d: Plain, row: Plain) -> Plain:
     """Return a free parameter of a lens with its label and unit."""
-    label = _NAMES.get(row["name"], row["name"])
+    label = _named(str(row["name"]))["label"]
     if len({one["sensor"] for one in d["lens"]}) > 1:
         label += f", {row['sensor']}, {row['images']:,} images"
     label += f", first of {row['lenses']} lenses" if row["lenses"] > 1 else ""
