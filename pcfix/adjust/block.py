@@ -44,6 +44,29 @@ INDEX, SHAPE, PORT, PLANES = 3, 4, 7, 11
 MOTIONS = ("shift x", "shift y", "shift z", "turn x", "turn y", "turn z", "scale")
 """Parameters of a similarity transformation of all poses."""
 
+WORDS = {
+    "f": "focal length", "cx": "principal point x", "cy": "principal point y", "b1": "affinity b1",
+    "b2": "skew b2", "level": "water level", "tilt_x": "water tilt along x",
+    "tilt_y": "water tilt along y", "index": "refractive index", "shape_xx": "water shape x^2",
+    "shape_xy": "water shape x y", "shape_yy": "water shape y^2", "distance": "port distance",
+    "centre_x": "dome centre x", "centre_y": "dome centre y", "centre_z": "dome centre z",
+}  # fmt: skip
+"""What a surveyor calls the shared unknowns."""
+WORDS |= {f"k{i}": f"distortion k{i}" for i in range(1, 9)}
+WORDS |= {"p1": "distortion p1", "p2": "distortion p2"} | {one: f"block {one}" for one in MOTIONS}
+
+UNITS = {"level": " m", "tilt": " m/m", "shape": " /m", "distance": " m", "centre": " m",
+         "shift": " m", "turn": " rad"}  # fmt: skip
+"""By the first word of a name."""
+
+
+def words_of(name: str) -> tuple[str, str]:
+    """Return what a surveyor calls a shared unknown, and its unit; that of a lens is not known."""
+    base, of, sensor = name.partition(" of sensor ")
+    first = name.replace("_", " ").split()[0]
+    return WORDS.get(base, base) + of + sensor, UNITS.get(first, "")
+
+
 Poses = Literal["free", "fixed", "similarity"]
 Robust = Literal["squares", "huber", "cauchy"]
 

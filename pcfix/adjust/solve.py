@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pcfix.adjust.block import CODES, INDEX, MOTIONS, LogRow, Progress, Robust, moved_lens
+from pcfix.adjust.block import INDEX, LogRow, Progress, Robust, moved_lens, words_of
 from pcfix.adjust.collinearity import State
 from pcfix.adjust.normal import (
     CAUCHY,
@@ -218,34 +218,7 @@ def solver(matrix: Any) -> Callable[[FloatArray], FloatArray] | None:
 # What is undetermined
 
 
-LIMITS = {
-    "level": (0.02, " m", "the water level"),
-    "tilt_x": (0.0005, " m/m", "the tilt of the water along x"),
-    "tilt_y": (0.0005, " m/m", "the tilt of the water along y"),
-    "index": (0.005, "", "the refractive index"),
-    "scale": (0.001, "", "the scale of the block"),
-    "distance": (0.002, " m", "the distance of the port"),
-    "centre_x": (0.002, " m", "the dome's centre along x"),
-    "centre_y": (0.002, " m", "the dome's centre along y"),
-    "centre_z": (0.002, " m", "the dome's centre along z"),
-}
-"""Standard errors beyond which an unknown counts as undetermined, its unit and its name."""
-
-_WORDS = {name: words for name, (_, _, words) in LIMITS.items()} | {
-    "f": "the focal length", "cx": "the principal point's x", "cy": "the principal point's y",
-    "b1": "the affinity b1", "b2": "the skew b2",
-}  # fmt: skip
-_WORDS |= {f"shape_{which}": f"the shape of the water {which}" for which in ("xx", "xy", "yy")}
-_WORDS |= {name: f"the distortion {name}" for name in CODES if name[0] in "kp"}
-_WORDS |= {name: f"the {name} of the block" for name in MOTIONS[:-1]}
-
 BED = {"level", "index", "tilt_x", "tilt_y", "shape_xx", "shape_xy", "shape_yy"}
-
-
-def words_of(name: str) -> str:
-    """Return what a surveyor calls a shared unknown."""
-    base, of, sensor = name.partition(" of sensor ")
-    return _WORDS.get(base, base) + of + sensor
 
 
 def singular(problem: Problem, solution: Solution) -> GeometryError:
@@ -269,7 +242,7 @@ def singular(problem: Problem, solution: Solution) -> GeometryError:
     images = np.flatnonzero(weak[: 6 * k].reshape(k, 6).any(axis=1))
     labels = [problem.block.cameras.labels[i] for i in images]
     names = [name for name, is_weak in zip(problem.names, weak[6 * k :], strict=True) if is_weak]
-    words = [words_of(name) for name in names]
+    words = [f"the {words_of(name)[0]}" for name in names]
     if labels:
         some = f"of {', '.join(labels[:3])}" if len(labels) <= 3 else f"of {len(labels)} images"
         words.append(f"the poses {some}")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from pcfix.adjust.block import words_of
 from pcfix.adjust.problem import Intersected
 from pcfix.adjust.result import Adjusted, Plain, adjustment_dict, before_of
 from pcfix.grid.colours import DEPTH, DIFFERENCE, RAYS, UNCERTAINTY
@@ -22,15 +23,6 @@ __all__ = ["adjustment_dict", "adjustment_page", "adjustment_text", "before_of"]
 WHERE = (("land", "on land"), ("water", "under water"))
 MOST_LISTED = 12
 """Surveyed points in the text; the page has all of them."""
-_NAMES = {
-    "f": "focal length", "cx": "principal x", "cy": "principal y", "level": "water level",
-    "tilt_x": "tilt east", "tilt_y": "tilt north", "index": "index", "shape_xx": "shape x^2",
-    "shape_xy": "shape x y", "shape_yy": "shape y^2", "distance": "port distance",
-    "centre_x": "dome centre x", "centre_y": "dome centre y", "centre_z": "dome centre z",
-}  # fmt: skip
-_UNITS = {"level": " m", "distance": " m", "shape": " /m", "centre": " m", "shift": " m",
-          "turn": " rad"}  # fmt: skip
-"""By the beginning of a name."""
 _FACTS: RowTable = (
     ("images", "{images:,}, {poses_words}", "images"),
     ("points", "{points[all]:,}: {points[land]:,} on land, {points[water]:,} under water{counted}",
@@ -100,7 +92,7 @@ def adjustment_text(adjusted: Adjusted, before: Intersected | None = None) -> st
     """
     d = adjustment_dict(adjusted, before)
     surveyed = _survey_table(d)
-    lines = [f"{label:<14} {words}" for label, words in _facts(d)] + _residual_table(d).lines()
+    lines = [f"{label:<18} {words}" for label, words in _facts(d)] + _residual_table(d).lines()
     lines += surveyed.lines()[: 1 + MOST_LISTED] if surveyed.rows else []
     return "\n".join([*lines, *(f"Note: {note}" for note in all_notes(d))])
 
@@ -200,16 +192,13 @@ def _poses_words(d: Plain) -> str:
 
 
 def _named(name: str) -> Plain:
-    """Return label and unit of a parameter of water, port or similarity."""
-    return {
-        "label": _NAMES.get(name, name),
-        "unit": _UNITS.get(name.replace("_", " ").split()[0], ""),
-    }
+    """Return label and unit of a shared unknown."""
+    return dict(zip(("label", "unit"), words_of(name), strict=True))
 
 
 def _lens_row(d: Plain, row: Plain) -> Plain:
     """Return a free parameter of a lens with its label and unit."""
-    label = _named(str(row["name"]))["label"]
+    label, _ = words_of(row["name"])
     if len({one["sensor"] for one in d["lens"]}) > 1:
         label += f", {row['sensor']}, {row['images']:,} images"
     label += f", first of {row['lenses']} lenses" if row["lenses"] > 1 else ""
@@ -219,11 +208,7 @@ def _lens_row(d: Plain, row: Plain) -> Plain:
 
 
 def _fact_table(d: Plain) -> Table:
-    rows = [
-        # k1 and the other coefficients keep their small letters
-        [label if label[1:].isdigit() else label[:1].upper() + label[1:], words]
-        for label, words in _facts(d)
-    ]
+    rows = [[label[:1].upper() + label[1:], words] for label, words in _facts(d)]
     return Table("In short", [], rows)
 
 

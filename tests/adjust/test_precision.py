@@ -198,7 +198,7 @@ def test_sloping_bed():
         sigma[name] = precision
     every = sigma["all"]
     pairs = [set(one.values["unknowns"]) for one in correlated(every)]
-    assert pairs[0] == {"the water level", "the tilt of the water along x"}
+    assert pairs[0] == {"the water level", "the water tilt along x"}
     assert {"the water level", "the refractive index"} in pairs
     for name in ("level", "index"):
         assert every.sigma_of(name) > 2.0 * sigma[name].sigma_of(name)

@@ -125,10 +125,10 @@ def test_text(adjusted):
     assert wet[2:9] == ["16", "47", "2.400", "0.632", "0.400", "/", "0.800"]
     for words in (
         "70 measured tie points used, 2 left out (2.8 %)",
-        "sigma0         1.234, redundancy 60, 2 rounds, 3 steps",
-        "focal length   1000 -> 1002 px (+2, standard error 0.25)",
-        "water level    0.5 -> 0.52 m (+0.02, standard error 0.004)",
-        "index          1.34, fixed",
+        "sigma0             1.234, redundancy 60, 2 rounds, 3 steps",
+        "focal length       1000 -> 1002 px (+2, standard error 0.25)",
+        "water level        0.5 -> 0.52 m (+0.02, standard error 0.004)",
+        "refractive index   1.34, fixed",
         "0.0100       0.0200       0.0300",  # standard errors of the points
         # RMS of (0.01, 0.05), (0.02, 0.02), (0.03, 0.09); the longest is that of b.jpg
         "RMS 0.036, 0.020, 0.067 m, largest 0.105 m (b.jpg)",
