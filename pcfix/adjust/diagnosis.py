@@ -71,26 +71,15 @@ MOST_STATED_M = 0.5
 """A larger standard deviation of the GNSS is a default of the software, as Metashape's 10 m."""
 
 TIE_POINTS, LEAST_TIE_VIEWS = 3000, 3
-CLOUD_POINTS, POINTS_PER_IMAGE, SAMPLE_POINTS = 1500, 10, 50_000
+CLOUD_POINTS, POINTS_PER_IMAGE, SURVEY_POINTS = 1500, 10, 5000
 LEAST_COORDINATES = 24
 """Of GNSS positions."""
-NEAREST = 3
-"""Points of a reference that give its height at a point of the cloud."""
 MOST_IMAGES, QUICK_IMAGES = 600, 200
 """For which the pattern of absorbed refraction is computed, and when it must be quick; the cost
 grows with their cube, and is a second for the latter."""
 
-EXPORTS = {
-    "metashape": "give the project (.psx) or its BlocksExchange export with tie points",
-    "photoscan": "give the project (.psz) or its BlocksExchange export with tie points",
-    "pix4d": "give the params folder with its tp_ file",
-    "opendronemap": "give the project's opensfm folder with tracks.csv",
-    "opensfm": "keep tracks.csv beside the reconstruction",
-    "colmap": "keep points3D beside the images",
-    "blocksexchange": "export it with tie points",
-    "bundler": "export the .out file with its points",
-}
-"""How to give tie points, by a word in the source of the cameras."""
+EXPORT = "export tie points, or run 'pcfix cameras FILE --gnss GNSS.csv'"
+"""What to do if a camera file has neither tie points nor GNSS positions."""
 
 
 @dataclass(frozen=True)
@@ -158,14 +147,6 @@ class Diagnosis:
 def diagnosis_of(signs: list[Sign]) -> Diagnosis:
     """Return the signs in the order in which they decide."""
     return Diagnosis(tuple(sorted(signs, key=lambda sign: ORDER.index(sign.name))))
-
-
-def export_of(cameras: Cameras) -> str:
-    """Return what the user has to give so that the poses can be checked."""
-    source = cameras.source.lower()
-    other = "export a model with tie points (COLMAP or Bundler)"
-    found = next((words for name, words in EXPORTS.items() if name in source), other)
-    return f"{found}, or run 'pcfix cameras FILE --gnss GNSS.csv'"
 
 
 def _exceeds(value: float, sigma: float, limit: float) -> bool | None:
@@ -372,7 +353,7 @@ class Evidence:
     ties: TiePoints | None = None
     view: Any = None  # a `pcfix.flow.surfaces.CloudView`, for heights and in place of tie points
     control: GroundControl | None = None
-    reference: Any = None  # a survey of land and bed, with `xyz` and `sparse`
+    reference: Any = None  # a survey of land and bed, with `xyz`
     gnss: GnssPositions | None = None  # in the frame of the cameras, NaN if unknown
     neighbours: Sign | None = None  # of `neighbours_sign`
     in_passing: bool = False  # whether it must be quick
@@ -429,8 +410,10 @@ def _signs_of_rays(evidence: Evidence) -> list[Sign]:
         if count > most or (apparent is None and evidence.view is None):
             why = f"{count} images (limit {most})" if count > most else "no cloud"
             raise GeometryError("adjust.no_pattern", why)
-        some = _sample_of(evidence.view, wanted) if apparent is None else apparent
-        some = some[:: max(1, len(some) // wanted)]
+        if apparent is None:
+            every = max(1, evidence.view.points // wanted)
+            apparent = np.vstack([seen.xyz[::every] for seen in evidence.view.chunks()])
+        some = apparent[:: max(1, len(apparent) // wanted)]
         true = mended(some, cameras, evidence.water, evidence.refractive_index)
     except GeometryError as error:
         words = f"the pattern of absorbed refraction is unknown ({error})"
@@ -463,12 +446,6 @@ def _signs_of_ties(evidence: Evidence) -> tuple[list[Sign], FloatArray | None]:
     return [sign], straight.xyz[np.isfinite(straight.squares)]
 
 
-def _sample_of(view: Any, wanted: int) -> FloatArray:
-    """Return about so many points of a cloud, evenly spread over it, shape (m, 3)."""
-    every = max(1, view.points // wanted)
-    return np.vstack([np.zeros((0, 3)), *(seen.xyz[::every] for seen in view.chunks())])
-
-
 def _signs_of_surveys(evidence: Evidence) -> list[Sign]:
     """Compare the cloud with control points on land, and with a survey of land and bed."""
     gsd, view, control = evidence.gsd_m, evidence.view, evidence.control
@@ -479,11 +456,8 @@ def _signs_of_surveys(evidence: Evidence) -> list[Sign]:
         higher = _cloud_heights(view, dry, gsd) - dry[:, 2]
         signs.append(land_sign(higher, gsd, "the control points"))
     surveyed = np.zeros((0, 3)) if evidence.reference is None else evidence.reference.xyz
-    if evidence.reference is None or evidence.reference.sparse:
-        cloud_z = _cloud_heights(view, surveyed, gsd)
-    else:
-        cloud, surveyed = _at_points_of_cloud(view, surveyed)
-        cloud_z = cloud[:, 2]
+    surveyed = surveyed[:: max(1, len(surveyed) // SURVEY_POINTS)]
+    cloud_z = _cloud_heights(view, surveyed, gsd)
     level = surface_above(evidence.water, surveyed).height_m
     land, bed = surveyed[:, 2] > level + LAND_M, surveyed[:, 2] < level
     if land.any():
@@ -502,19 +476,3 @@ def _cloud_heights(view: Any, xyz: FloatArray, gsd_m: float) -> FloatArray:
         return np.zeros(0)
     near = [seen.xyz[is_near(xy, seen.xyz, radius)] for seen in view.chunks()]
     return heights_from_cloud(xy, np.vstack([np.zeros((0, 3)), *near]), radius)
-
-
-def _at_points_of_cloud(view: Any, reference: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return points of a cloud, and the reference at their places."""
-    from scipy.spatial import cKDTree
-
-    cloud = _sample_of(view, SAMPLE_POINTS)
-    if len(reference) < NEAREST or not len(cloud):
-        return cloud[:0], reference[:0]
-    size = np.ptp(reference[:, :2], axis=0)
-    spacing = float(np.sqrt(max(size.prod(), 1e-9) / len(reference)))
-    found = cKDTree(reference[:, :2]).query(cloud[:, :2], k=NEAREST)
-    distance, row = np.asarray(found[0]), np.asarray(found[1])
-    near = distance[:, -1] < 3.0 * spacing
-    z = reference[row[near], 2].mean(axis=1)
-    return cloud[near], np.column_stack([cloud[near, :2], z])
