@@ -300,17 +300,12 @@ LEAST_IMAGES_OF_POINT, LEAST_POINTS, LEAST_IMAGES = 3, 10, 5
 
 
 class Mended(NamedTuple):
-    """The poses if they had absorbed the refraction, and the errors that this implies.
+    """The poses if they had absorbed the refraction, and the errors that this implies."""
 
-    cameras : those with enough points; row : shape (k,), their rows among all cameras.
-    land_m, bed_m : shape (m,) and (w,), by how much land and bed are too low now, the bed after
-    its correction with the present poses.
-    """
-
-    cameras: Cameras
-    row: IntArray
-    land_m: FloatArray
-    bed_m: FloatArray
+    cameras: Cameras  # those with enough points
+    row: IntArray  # (k,), their rows among all cameras
+    land_m: FloatArray  # (m,), by how much land is too low now
+    bed_m: FloatArray  # (w,), the same of the bed after its correction with the present poses
 
 
 def mended(

@@ -62,14 +62,11 @@ SQUARES, HUBER, CAUCHY = range(3)
 
 
 class Rule(NamedTuple):
-    """How normal equations are summed.
+    """How normal equations are summed."""
 
-    kind : loss function; scale : where it departs from least squares, in standard deviations.
-    damping : Levenberg-Marquardt's factor on the diagonal of V (that of the poses is added later).
-    """
-
-    kind: int = SQUARES
-    scale: float = 1.0
+    kind: int = SQUARES  # loss function
+    scale: float = 1.0  # where it departs from least squares, in standard deviations
+    # Levenberg-Marquardt's factor on the diagonal of V; that of the poses is added later
     damping: float = 0.0
 
 
@@ -238,15 +235,11 @@ def cost_of(squares: FloatArray, rule: Rule) -> float:
 
 
 class Equations(NamedTuple):
-    """The reduced normal equations of poses and shared unknowns, u = 6 k + g.
+    """The reduced normal equations of poses and shared unknowns, u = 6 k + g."""
 
-    matrix : shape (u, u), dense or scipy's sparse one; right : shape (u,).
-    diagonal : shape (u,), that of U and U_gg, for the damping.
-    """
-
-    matrix: Any
-    right: FloatArray
-    diagonal: FloatArray
+    matrix: Any  # (u, u), dense or scipy's sparse one
+    right: FloatArray  # (u,)
+    diagonal: FloatArray  # (u,), that of U and U_gg, for the damping
 
 
 def normal_equations(state: State, given: Given, rule: Rule) -> Equations:
@@ -373,20 +366,14 @@ class LinearisedRows(NamedTuple):
     """Observations of m points, weighted and linearised; rows that do not count are zero.
 
     Each point has a row for each observation, and one more for a condition.
-
-    columns : shape (n, 2, 9 + g), derivatives by pose, point and shared unknowns.
-    r : shape (n, 2), residuals.
-    observation : shape (n,), of a condition any observation of its point.
-    is_image : shape (n,), whether the row is an image, not a condition.
-    inverse, rhs : shapes (m, 3, 3) and (m, 3), V^-1 and the right side of each point.
     """
 
-    columns: FloatArray
-    r: FloatArray
-    observation: IntArray
-    is_image: BoolArray
-    inverse: FloatArray
-    rhs: FloatArray
+    columns: FloatArray  # (n, 2, 9 + g), derivatives by pose, point and shared unknowns
+    r: FloatArray  # (n, 2), residuals
+    observation: IntArray  # (n,), of a condition any observation of its point
+    is_image: BoolArray  # (n,), whether the row is an image, not a condition
+    inverse: FloatArray  # (m, 3, 3), V^-1 of each point
+    rhs: FloatArray  # (m, 3), and its right side
 
 
 def linearised(state: State, given: Given, rule: Rule, first: int, last: int) -> LinearisedRows:
@@ -418,17 +405,13 @@ def _linearised(
 
 
 class SparseRows(NamedTuple):
-    """Linearised observations of some points: u and v of each row, as sparse matrices.
-
-    others, points : columns A of poses and shared unknowns, and B of the points.
-    inverse : V^-1 of all points, a block diagonal matrix; coupling : V^-1 B'A.
-    """
+    """Linearised observations of some points: u and v of each row, as sparse matrices."""
 
     rows: LinearisedRows
-    others: Any
-    points: Any
-    inverse: Any
-    coupling: Any
+    others: Any  # columns A of poses and shared unknowns
+    points: Any  # columns B of the points
+    inverse: Any  # V^-1 of all points, a block diagonal matrix
+    coupling: Any  # V^-1 B'A
 
     def product(self, x: Any) -> Any:
         """Return X'A with the points eliminated, X'A - X'B V^-1 B'A."""

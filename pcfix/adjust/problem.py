@@ -105,17 +105,12 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """State of a problem after some steps.
-
-    state : relative to `Problem.origin`; lenses : of the k cameras.
-    shared : shape (g,), corrections of the shared unknowns.
-    cost : sum of weighted squares, including prior knowledge.
-    """
+    """State of a problem after some steps."""
 
     state: State
-    lenses: tuple[Lens, ...]
-    shared: FloatArray
-    cost: float
+    lenses: tuple[Lens, ...]  # of the k cameras
+    shared: FloatArray  # (g,), corrections of the shared unknowns
+    cost: float  # sum of weighted squares, including prior knowledge
     log: list[LogRow]
 
 
@@ -454,16 +449,11 @@ CLOSE_M = 1e-4
 
 
 class Intersected(NamedTuple):
-    """Points and how well they fit their images.
+    """Points and how well they fit their images."""
 
-    xyz : shape (m, 3), metres, world frame.
-    residual_px : shape (o, 2), measured minus computed; NaN if the intersection failed.
-    start : shape (m + 1,), the residuals of point i are ``start[i]:start[i + 1]``.
-    """
-
-    xyz: FloatArray
-    residual_px: FloatArray
-    start: IntArray
+    xyz: FloatArray  # (m, 3), metres, world frame
+    residual_px: FloatArray  # (o, 2), measured minus computed; NaN if the intersection failed
+    start: IntArray  # (m + 1,), the residuals of point i are start[i]:start[i + 1]
 
     @property
     def redundancy(self) -> IntArray:
