@@ -151,7 +151,7 @@ def read_cloud(path: Path | Tiles, resolution_m: float | None = None) -> Plain:
             for i, name in enumerate(columns):
                 values[:, i] = np.asarray(points[name])[moved]
             builder.add(coordinates(points), moved, values)
-            sample.append(values[-count % every :: every, [1, 0, 3]])
+            sample.append(values[-count % every :: every, [0, 3]])
             depth = values[:, 0]
             low, high = depth.min(initial=low), depth.max(initial=high)
             total, count = total + float(depth.sum()), count + len(depth)

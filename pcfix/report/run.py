@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.grid.colours import DEPTH, DIFFERENCE, HEIGHT, RAYS, UNCERTAINTY
+from pcfix.grid.colours import DEPTH, DIFFERENCE, RAYS, UNCERTAINTY
 from pcfix.grid.maps import Extent, Maps, contours, depth_interval
 from pcfix.model import Cameras, FloatArray, WaterPlane, WaterSurface
 from pcfix.refract.tally import COVERAGE_95, ORDERS, largest_tvu_m
@@ -42,8 +42,7 @@ if TYPE_CHECKING:
 
 Plain = dict[str, Any]
 Pair = tuple[str, str]
-SHIFT = "True minus apparent Z (m)"
-FIRST_FIGURES = ("water", "section_1", "depth_bins", "uncertainty", "cameras", "shift")
+FIRST_FIGURES = ("water", "section_1", "depth_bins", "uncertainty", "cameras")
 """Those that are shown where they are there, the first four of them."""
 CONTRADICTS = 1.5
 """Measured and predicted errors that differ by a larger factor contradict each other."""
@@ -62,7 +61,7 @@ class RunResults:
     water: WaterSurface
     maps: Maps
     depth_m: dict[str, float]  # min, mean and max of the bed's points that are not noise
-    sample: FloatArray  # shape (m, 3): Z shift, depth and standard error of Z, zero where unknown
+    sample: FloatArray  # shape (m, 2): depth and standard error of Z, zero where unknown
     crs: str = ""  # of the cloud, and its vertical datum; empty if not known
     heights: str = ""
     project: str = ""
@@ -173,7 +172,7 @@ def _worded(value: Any) -> str:
 
 
 def _pictures(run: RunResults) -> list[Picture]:
-    """Return maps, a histogram, the cameras, and TVU over depth where there are standard errors."""
+    """Return the map of depths, the cameras, and TVU over depth where there are standard errors."""
     s, maps, depth = run.summary, run.maps, run.depth_m
     interval = depth_interval(maps.depth_m, maps.uncertainty_m)
     shade = relief(maps.height_m, maps.cell_m)
@@ -181,25 +180,12 @@ def _pictures(run: RunResults) -> list[Picture]:
     for _, place in contours(maps.depth_m, interval):
         x, y = (place + 0.5).T * maps.cell_m  # from the corner of the map
         depths.axes[0].plot(maps.west_m + x, maps.north_m - y, color=REFERENCE, linewidth=0.5)
-    shifts = map_figure(maps.shift_z_m, maps.extent_m, SHIFT, shade, cmap=HEIGHT)
-    cause = "growing with depth and incidence angle" if s.carried is None else (
-        "including the change by the adjustment"
-    )  # fmt: skip
     pictures = [
         Picture(
             "depth", "Depth",
             f"Map of the corrected depth over the shaded relief; {depth['min']:.2f} to"
             f" {depth['max']:.2f} m, mean {depth['mean']:.2f} m; contours every {interval:g} m.",
             depths,
-        ),
-        Picture(
-            "shift", "Shift in Z",
-            f"Map of how far the bed moved; mean {s.shift_z_m['mean']:.2f} m, {cause}.", shifts,
-        ),
-        Picture(
-            "shift_histogram", "How far the points moved",
-            "Histogram of the shift in Z of the corrected points.",
-            shift_histogram(run.sample[:, 0]),
         ),
     ]  # fmt: skip
     if s.cameras:
@@ -208,7 +194,7 @@ def _pictures(run: RunResults) -> list[Picture]:
             f" {s.cameras_used} of {s.cameras} see corrected points."
         )
         pictures.append(Picture("cameras", "Cameras", alt, cameras_figure(run)))
-    known = run.sample[:, 2] > 0.0
+    known = run.sample[:, 1] > 0.0
     if s.uncertainty is not None and known.any():
         bins = run.compared["depth_bins"] if run.compared.get("tvu") else []
         dots = (
@@ -220,22 +206,9 @@ def _pictures(run: RunResults) -> list[Picture]:
             f" limits of the orders of IHO S-44. {formal_words(s)}.{dots if bins else ''}"
             " S-44 has requirements other than the TVU: position, features and coverage."
         )
-        _, depth_m, sigma_z_m = run.sample[known].T
-        figure = tvu_figure(depth_m, sigma_z_m, bins)
+        figure = tvu_figure(*run.sample[known].T, bins)
         pictures.append(Picture("uncertainty", "Vertical uncertainty", alt, figure))
     return pictures
-
-
-def shift_histogram(values: FloatArray) -> Figure:
-    """Draw the distribution of shifts in Z, metres, without half a percent at each end."""
-    figure, axes = new_figure()
-    low, high = np.percentile(values, [0.5, 99.5])
-    edges = np.linspace(low, high, 81) if high > low else np.linspace(low - 0.5, low + 0.5, 81)
-    text = f"shift in Z: mean {values.mean():.3f}, sd {values.std():.3f}"
-    axes.hist(values, edges, density=True, color=BEFORE, alpha=0.55, label=text)
-    axes.set(xlabel=SHIFT, ylabel="Density")
-    axes.legend(loc="best")
-    return figure
 
 
 def cameras_figure(run: RunResults) -> Figure:

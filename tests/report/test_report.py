@@ -74,7 +74,7 @@ def test_self_contained(report):
     assert not re.search(r"https?://|@import|url\((?!data:)", text)
     pictures = elements.all("img")
     files = sorted((folder / "figures").glob("*.png"))
-    assert len(pictures) == len(files) == 5
+    assert len(pictures) == len(files) == 3
     assert all(len(picture["alt"]) > 20 for picture in pictures)
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in files)
     assert str(folder) not in text and str(SCENE) not in text
