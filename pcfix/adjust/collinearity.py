@@ -71,9 +71,7 @@ class Given(NamedTuple):
     first_lens: IntArray  # (groups + 1,), where the parameters of each sensor begin
     code: IntArray  # (first_lens[-1],), which parameters these are
     column: IntArray  # of each number of `State.water`; -1 if fixed; parallel planes share theirs
-    similarity: int  # the first of seven, -1 without
     shared: int  # how many there are
-    pivot: FloatArray  # (3,), of a similarity
     # prior knowledge of points
     surveyed_xyz: FloatArray  # (m, 3)
     surveyed_weight: FloatArray  # (m, 3), inverse variances; zero for points that are not surveyed

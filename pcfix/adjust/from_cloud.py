@@ -257,15 +257,13 @@ def solve_unaware(
     now, log, size = start, list(start.log), np.inf
     for number in range(1, MAX_STEPS + 1):
         # the matrix is not symmetric
-        (matrix, right), step = reduced_at(tested, now), np.zeros(len(problem.moves))
+        matrix, right = reduced_at(tested, now)
         scale = 1.0 / np.sqrt(np.maximum(np.abs(matrix.diagonal()), 1e-300))
         try:
-            step[problem.active] = scale * np.linalg.solve(
-                matrix * scale * scale[:, None], scale * right
-            )
+            step = scale * np.linalg.solve(matrix * scale * scale[:, None], scale * right)
         except np.linalg.LinAlgError:
             raise _unsolved("the equations are singular") from None
-        points = point_steps(now.state, given, UNDAMPED, step)
+        points = point_steps(now.state, given, UNDAMPED, problem.spread(now.state) @ step)
         moved = moved_by(problem, now, step, points)
         size = float(np.abs(points).max(initial=0.0)) if np.isfinite(points).all() else np.inf
         if moved is None or not size < LARGE_STEP_M:

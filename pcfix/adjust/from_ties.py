@@ -281,13 +281,13 @@ def missing_lens_parameters(problem: Problem, now: Solution, sigma0: float) -> l
     more = tuple(name for name in TRIED if name not in names)
     wide, start = prepare(problem.block, replace(problem.unknowns, lens=names + more))
     wide, given = wide.weighted(problem.given.weight), wide.given
-    is_tried = np.zeros(given.shared, np.bool_)
+    is_tried = np.zeros(len(wide.names), np.bool_)
     is_tried[: len(given.code)] = np.isin(given.code, [CODES[name] for name in more])
-    shared = np.zeros(given.shared)
+    shared = np.zeros(len(wide.names))
     shared[~is_tried] = now.shared
     start = replace(start, state=now.state, lenses=now.lenses, shared=shared)
     matrix, right = reduced_at(wide, start)
-    mine = np.append(np.zeros(len(wide.moves) - len(shared), np.bool_), is_tried)[wide.active]
+    mine = np.append(np.zeros(len(right) - len(shared), np.bool_), is_tried)
     solve_for = solver(matrix[~mine][:, ~mine])
     if not mine.any() or solve_for is None:
         return []

@@ -335,9 +335,9 @@ def offset_of(found: Adjusted) -> tuple[FloatArray, FloatArray] | None:
     axes = np.stack([right, np.cross(up, right), up], axis=1)
     with_centres = np.zeros((len(weight), 6, 3))
     with_centres[:, 3:] = weight[:, :, None] * axes.transpose(0, 2, 1)
-    shared = np.zeros((problem.given.shared, 3))
     matrix, right_side = reduced_at(problem, now)
-    taken_up = np.vstack([with_centres.reshape(-1, 3), shared])[problem.active]
+    others = np.zeros((problem.given.shared, 3))
+    taken_up = problem.spread(now.state).T @ np.vstack([with_centres.reshape(-1, 3), others])
     solve_for = solver(matrix)
     if solve_for is None or not taken_up.any():
         return None

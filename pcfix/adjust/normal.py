@@ -37,17 +37,7 @@ from pcfix.adjust.collinearity import (
     workspace,
 )
 from pcfix.kernels import Span, device, in_tiles, kernel
-from pcfix.lens.algebra import (
-    beyond,
-    cross,
-    dot,
-    inverted,
-    minus,
-    row_of,
-    times,
-    transposed_times,
-    vector,
-)
+from pcfix.lens.algebra import beyond, dot, inverted, row_of, times, transposed_times, vector
 from pcfix.model import BoolArray, FloatArray, IntArray
 
 PARTS, PARTS_BYTES = 8, 100_000_000
@@ -132,18 +122,6 @@ def linearise(
         for i in range(min(PLANES, given.column.size)):
             if given.column[i] >= 0:
                 shared[axis, given.column[i]] = own[axis, SURFACE + i]
-    if given.similarity >= 0:
-        # all poses move together: with t, phi, s and d = C - pivot, C by t + phi x d + s d and R by
-        # exp(-R phi) R; single ones do not move
-        d = minus(row_of(state.centres, c), vector(given.pivot))
-        for axis in range(2):
-            at, by_centre = given.similarity, vector(row[axis], 3)
-            turn = cross(d, by_centre)
-            rolled = transposed_times(state.rotations[c], vector(row[axis]))
-            for i in range(3):
-                shared[axis, at + i], shared[axis, at + 3 + i] = by_centre[i], turn[i] - rolled[i]
-            shared[axis, at + 6] = dot(d, by_centre)
-            row[axis, :POINT] = 0.0
     r *= w
     row *= w
     return True
@@ -462,39 +440,31 @@ def _sparse_equations(state: State, given: Given, rule: Rule) -> Equations:
     return Equations(matrix, right, diagonal)
 
 
-def point_covariances(
-    state: State, given: Given, active: IntArray, inverse: FloatArray
-) -> FloatArray:
+def point_covariances(state: State, given: Given, inverse: FloatArray) -> FloatArray:
     """Return the covariances of the points: V^-1 + V^-1 W' S^-1 W V^-1, shape (m, 6).
 
     They are xx, xy, xz, yy, yz, zz in square metres for observations of unit weight, NaN for points
-    that are not fixed. The inverse S^-1, shape (a, a), is that of the active unknowns.
+    that are not fixed. The inverse S^-1 has the shape (6 k + g, 6 k + g), zero where poses are
+    fixed.
     """
-    place = np.full(6 * len(state.centres) + given.shared, -1, np.int64)
-    place[active] = np.arange(len(active))
     out = np.full((len(state.xyz), 6), np.nan)
-    in_parts(_point_covariances, state, given, place, inverse, out)
+    in_parts(_point_covariances, state, given, inverse, out)
     return out
 
 
 @kernel(allocates=True)
 def _point_covariances(
-    span: Span, state: State, given: Given, place: IntArray, inverse: FloatArray, out: FloatArray,
-    work: Workspace,
-) -> None:  # fmt: skip
+    span: Span, state: State, given: Given, inverse: FloatArray, out: FloatArray, work: Workspace
+) -> None:
     most, poses = 6 * len(work.row) + given.shared, 6 * len(state.centres)
     w, y, unknown = np.empty((most, 3)), np.empty((most, 3)), np.empty(most, np.int64)
     for p in range(*span):
         count, _ = linearise_point(state, given, UNDAMPED, p, work)
         if count == 0:
             continue
-        # y: rows of W V^-1, of the unknowns that move; then their places in the inverse
-        used = 0
-        for i in range(_couple(given, poses, work, count, w, y, unknown)):
-            at = place[unknown[i]]
-            if at >= 0:
-                y[used, 0], y[used, 1], y[used, 2] = transposed_times(work.v, vector(w[i]))
-                unknown[used], used = at, used + 1
+        used = _couple(given, poses, work, count, w, y, unknown)
+        for i in range(used):  # y: rows of W V^-1
+            y[i, 0], y[i, 1], y[i, 2] = transposed_times(work.v, vector(w[i]))
         total = work.v
         for i in range(used):
             s = (0.0, 0.0, 0.0)

@@ -32,10 +32,10 @@ from pcfix.adjust.block import (
     words_of,
 )
 from pcfix.adjust.normal import point_covariances
-from pcfix.adjust.problem import Problem, Solution, polynomial, pose_gradients
+from pcfix.adjust.problem import Problem, Solution, polynomial
 from pcfix.adjust.solve import BED, moved_by, reduced_at, singular, solver
 from pcfix.errors import PcfixWarning
-from pcfix.model import Cameras, FloatArray, IntArray, WaterPlane, WaterRaster, WaterSurface
+from pcfix.model import Cameras, FloatArray, WaterPlane, WaterRaster, WaterSurface
 
 DENSE_UP_TO = 12_000
 """Unknowns up to which the whole inverse is computed (1.2 GB)."""
@@ -108,9 +108,9 @@ def precision_of(
         unknowns; see `pcfix.adjust.shared_errors`.
     """
     matrix, state, given = reduced_at(problem, solution)[0], solution.state, problem.given
-    active, k, g = problem.active, len(state.centres), given.shared
+    k, g, free = len(problem.moves), len(problem.names), np.flatnonzero(problem.moves)
     times = np.ones(6 + g) if factor is None else factor
-    variance, u = sigma0 * sigma0, len(active)
+    variance, u = sigma0 * sigma0, len(matrix.diagonal())
     solve_for = solver(matrix)
     if solve_for is None:
         raise singular(problem, solution)
@@ -126,16 +126,16 @@ def precision_of(
             inverse[:, rows] = columns
         if part is not None:
             of_part = columns[rows].reshape(len(part), 6, len(part), 6)
-            poses[active[part] // 6] = np.einsum("kikj->kij", of_part)
+            poses[free[part // 6]] = np.einsum("kikj->kij", of_part)
     of_shared = columns[last]
-    diagonal = np.append(np.einsum("kii->ki", poses)[active[first] // 6], of_shared.diagonal())
+    diagonal = np.append(np.einsum("kii->ki", poses)[free], of_shared.diagonal())
     if not ((diagonal > 0.0) & (diagonal * matrix.diagonal() * SINGULAR < 1.0)).all():
         raise singular(problem, solution)
     of_shared = of_shared * times[6:] * times[6:, None]
     poses = poses * times[:6] * times[:6, None]
-    if given.similarity >= 0:
-        by, at = pose_gradients(state, given.pivot), given.similarity
-        poses = by @ of_shared[at:, at:] @ by.transpose(0, 2, 1)
+    if problem.unknowns.poses == "similarity":
+        by = problem.pose_gradients(state)
+        poses = by @ of_shared[-7:, -7:] @ by.transpose(0, 2, 1)
     points: FloatArray | None = None
     members: Members | None = None
     if inverse is None:
@@ -145,14 +145,15 @@ def precision_of(
         )
         notes = [PcfixWarning("adjust.too_large", words, unknowns=u)]
     else:
-        each = np.concatenate([np.tile(times[:6], k), times[6:]])[active]
+        each = np.append(np.tile(times[:6], len(free)), times[6:])
         inverse *= each
         inverse *= each[:, None]
-        points = variance * point_covariances(state, given, active, inverse)
+        spread = problem.spread(state)
+        points = variance * point_covariances(state, given, spread @ inverse @ spread.T)
         loose = int(np.isnan(points[:, 0]).sum())
         words = f"{loose:,} points are not determined by their images and have no covariance."
         notes = [PcfixWarning("adjust.loose_points", words, points=loose)] if loose else []
-        members = members_of(problem, solution, active, sigma0 * drawn(inverse))
+        members = members_of(problem, solution, sigma0 * drawn(inverse))
     sigma = np.sqrt(np.diag(of_shared))
     correlation = of_shared / sigma / sigma[:, None]
     rows_of = zip(problem.names, solution.shared.tolist(), (sigma * sigma0).tolist(), strict=True)
@@ -369,8 +370,8 @@ def drawn(covariance: FloatArray, count: int = MEMBERS) -> FloatArray:
     return np.asarray(draws * sigma)
 
 
-def members_of(problem: Problem, found: Solution, active: IntArray, steps: FloatArray) -> Members:
-    """Return the members that differ from a solution by steps, shape (m, a), of active unknowns.
+def members_of(problem: Problem, found: Solution, steps: FloatArray) -> Members:
+    """Return the members that differ from a solution by steps, shape (m, u), of free unknowns.
 
     Steps that take a lens or an index out of its range are skipped.
     """
@@ -378,9 +379,7 @@ def members_of(problem: Problem, found: Solution, active: IntArray, steps: Float
     codes = [CODES[name] for name in names]
     before = [[lens_parameter(lens, code) for code in codes] for lens in found.lenses]
     turn, shift, lens, water = [], [], [], []
-    for one in steps:
-        step = np.zeros(len(problem.moves))
-        step[active] = one
+    for step in steps:
         moved = moved_by(problem, found, step, np.zeros_like(state.xyz))
         if moved is None:
             continue

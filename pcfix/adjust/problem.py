@@ -71,13 +71,36 @@ class Problem:
     given: Given  # what the kernels need
     groups: list[list[int]]  # rows of the cameras of each sensor
     codes: list[tuple[int, ...]]  # free lens parameters of each sensor
-    moves: BoolArray  # (6 k + g,), which poses and shared unknowns are free
-    names: list[str]  # of the shared unknowns
+    moves: BoolArray  # (k,), poses that move one by one
+    # of the g shared unknowns, and of the seven motions if all poses move together
+    names: list[str]
+
+    def spread(self, state: State) -> csc_array:
+        """Return how poses and shared unknowns move with the free unknowns, shape (6 k + g, u).
+
+        Those are the poses that move, and what has names.
+        """
+        from scipy import sparse
+
+        k, g = len(self.moves), self.given.shared
+        free = np.append(np.repeat(self.moves, 6), np.ones(g, np.bool_))
+        one_by_one = sparse.eye_array(6 * k + g, format="csc")[:, np.flatnonzero(free)]
+        if self.unknowns.poses != "similarity":
+            return one_by_one
+        together = np.vstack([self.pose_gradients(state).reshape(-1, 7), np.zeros((g, 7))])
+        return sparse.hstack([one_by_one, sparse.csc_array(together)], format="csc")
 
     @property
-    def active(self) -> IntArray:
-        """The free poses and shared unknowns, those of the reduced equations, shape (a,)."""
-        return np.flatnonzero(self.moves)
+    def pivot(self) -> FloatArray:
+        """The point about which a similarity turns and scales the poses, shape (3,)."""
+        return np.asarray(self.block.cameras.centres.mean(axis=0) - self.origin)
+
+    def pose_gradients(self, state: State) -> FloatArray:
+        """Return how poses, turn and centre, move with a similarity of all, shape (k, 6, 7)."""
+        by = np.zeros((len(self.moves), 6, 7))
+        by[:, :3, 3:6] = -state.rotations
+        by[:, 3:] = similarity_gradients(state.centres - self.pivot)
+        return by
 
     @property
     def used(self) -> BoolArray:
@@ -135,7 +158,7 @@ def prepare(
             raise GeometryError("adjust.fixed_surface", words, unknown=what)
     numbers = surface_numbers(block, origin)
     planes, plane_names, axis, alike = _planes(block, origin, numbers)
-    # columns of the shared unknowns: lenses, then surface and planes, then a similarity
+    # columns of the shared unknowns: lenses, then surface and planes
     first_lens = np.concatenate([[0], np.cumsum([len(one) for one in codes])]).astype(np.int64)
     free = [sigma != 0.0 for sigma in unknowns.water_sigma]
     free += [len(WATER_NAMES) + i not in alike for i in range(len(planes))]
@@ -151,9 +174,8 @@ def prepare(
     names += [
         name for name, is_free in zip((*WATER_NAMES, *plane_names), free, strict=True) if is_free
     ]
-    is_similarity = unknowns.poses == "similarity"
-    similarity = len(names) if is_similarity else -1
-    names += list(MOTIONS) if is_similarity else []
+    shared = len(names)
+    names += MOTIONS if unknowns.poses == "similarity" else ()
     row, table = lens_table(cameras.lenses)
     centres = cameras.centres - origin
     weight = inverse_variances(block.surveyed_xyz, block.surveyed_sigma_m)
@@ -173,9 +195,7 @@ def prepare(
         first_lens=first_lens,
         code=np.array([code for of_sensor in codes for code in of_sensor], np.int64),
         column=column,
-        similarity=similarity,
-        shared=len(names),
-        pivot=centres.mean(axis=0),
+        shared=shared,
         surveyed_xyz=np.where(weight > 0.0, block.surveyed_xyz - origin, 0.0),
         surveyed_weight=weight,
         on=np.asarray([] if conditions is None else conditions.on, np.int64),
@@ -183,15 +203,14 @@ def prepare(
         if conditions is None
         else np.where(conditions.on >= 0, 1.0 / conditions.sigma_m, 0.0),
         axis=axis,
-        tests=np.zeros((0, 2, SHARED + len(names))),
+        tests=np.zeros((0, 2, SHARED + shared)),
     )
     poses = [
         unknowns.poses == "free" and label not in unknowns.fixed_images for label in cameras.labels
     ]
     problem = Problem(
-        block, unknowns, origin, given, groups, codes,
-        np.concatenate([np.repeat(poses, 6), np.ones(len(names), bool)]), names,
-    )  # fmt: skip
+        block, unknowns, origin, given, groups, codes, np.array(poses, np.bool_), names
+    )
     state = State(
         centres, np.ascontiguousarray(cameras.rotations, np.float64), table, block.xyz - origin,
         np.concatenate([numbers, planes]), port_row(block.port),
@@ -344,28 +363,22 @@ def priors_at(problem: Problem, found: Solution) -> tuple[float, csc_array, Floa
     from scipy import sparse
 
     given, block = problem.given, problem.block
-    k, size = len(block.cameras), len(problem.moves)
+    k, size = len(block.cameras), 6 * len(block.cameras) + given.shared
     diagonal, right = np.zeros(size), np.zeros(size)
     weight = block.gnss_weights
     off = np.where(weight > 0.0, block.gnss_xyz - problem.origin - found.state.centres, 0.0)
     sigma = np.full(given.shared, np.inf)  # of the shared unknowns about their start
     free = given.column[: len(WATER_NAMES)]
     sigma[free[free >= 0]] = [one for one in problem.unknowns.water_sigma if one]
-    shared = inverse_variances(found.shared, sigma)
-    cost = float((weight * off * off).sum() + (shared * found.shared**2).sum())
-    diagonal[6 * k :], right[6 * k :] = shared, -shared * found.shared
-    # weighted observations of several unknowns at once: their derivatives and residuals
+    added = found.shared[: given.shared]
+    shared = inverse_variances(added, sigma)
+    cost = float((weight * off * off).sum() + (shared * added**2).sum())
+    diagonal[6 * k :], right[6 * k :] = shared, -shared * added
+    diagonal[: 6 * k].reshape(k, 6)[:, 3:] = weight
+    right[: 6 * k].reshape(k, 6)[:, 3:] = weight * off
+    # seven observations hold mean, direction and scale of the centres of a free network
     rows, left = np.zeros((0, size)), np.zeros(0)
-    if given.similarity >= 0:
-        by = np.sqrt(weight)[:, :, None] * similarity_gradients(found.state.centres - given.pivot)
-        rows = np.zeros((3 * k, size))
-        rows[:, 6 * k + given.similarity :] = by.reshape(3 * k, 7)
-        left = (np.sqrt(weight) * off).ravel()
-    else:
-        diagonal[: 6 * k].reshape(k, 6)[:, 3:] = weight
-        right[: 6 * k].reshape(k, 6)[:, 3:] = weight * off
-    if problem.unknowns.free_network and given.similarity < 0:
-        # seven observations hold mean, direction and scale of the centres
+    if problem.unknowns.free_network and problem.unknowns.poses != "similarity":
         start = block.cameras.centres - problem.origin
         d = start - start.mean(axis=0)
         by = similarity_gradients(d) / np.array([1.0] * 3 + [np.sqrt((d * d).sum() / k)] * 4)
@@ -374,17 +387,9 @@ def priors_at(problem: Problem, found: Solution) -> tuple[float, csc_array, Floa
         rows[:, : 6 * k].reshape(-1, k, 6)[:, :, 3:] = by.transpose(2, 0, 1)
         left = -np.einsum("kja,kj->a", by, found.state.centres - start)
         cost += float((left * left).sum())
-    several = sparse.csc_array(rows)
-    matrix = sparse.diags_array(diagonal) + several.T @ several
+    held = sparse.csc_array(rows)
+    matrix = sparse.diags_array(diagonal) + held.T @ held
     return cost, matrix.tocsc(), right + rows.T @ left
-
-
-def pose_gradients(state: State, pivot: FloatArray) -> FloatArray:
-    """Return how poses, turn and centre, move with the same, shape (k, 6, 7)."""
-    by = np.zeros((len(state.centres), 6, 7))
-    by[:, :3, 3:6] = -state.rotations
-    by[:, 3:] = similarity_gradients(state.centres - pivot)
-    return by
 
 
 def _undetermined_motions(problem: Problem) -> list[int]:
@@ -477,7 +482,7 @@ def intersect_fixed(block: Block) -> Intersected:
     It fails for a point that needs more than `STEPS` Gauss-Newton steps.
     """
     problem, now = prepare(replace(block, conditions=None), Unknowns(poses="fixed", lens=()))
-    nothing = np.zeros(len(problem.moves))
+    nothing = np.zeros(6 * len(problem.moves))
     state, step = now.state, np.full((len(block.xyz), 3), np.inf)
     for _ in range(STEPS):
         step = point_steps(state, problem.given, UNDAMPED, nothing)

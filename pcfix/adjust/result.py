@@ -121,7 +121,9 @@ def redundancy_of(problem: Problem) -> int:
     priors += sum(0.0 < value < np.inf for value in problem.unknowns.water_sigma)
     priors += len(np.intersect1d(np.flatnonzero(given.on >= 0), block.owner[used]))
     datum = 7 if problem.unknowns.free_network else 0
-    return int(2 * used.sum() + priors + datum - 3 * points - problem.moves.sum())
+    return int(
+        2 * used.sum() + priors + datum - 3 * points - 6 * problem.moves.sum() - len(problem.names)
+    )
 
 
 def adjusted_of(

@@ -73,16 +73,16 @@ def disagreement_of(
         For the parameters of `POSE` and the shared unknowns.
     notes : list of PcfixWarning
     """
-    groups, added = _groups_by_sharing(problem, found), np.zeros(6 + problem.given.shared)
+    groups, added = _groups_by_sharing(problem, found), np.zeros(6 + len(problem.names))
     counts = {words: len(np.unique(group)) for words, group in groups.items()}
     matrix, right = reduced_at(problem, found)
-    solve_for, active = solver(matrix), problem.active
+    solve_for, spread = solver(matrix), problem.spread(found.state)
     if counts[ALONE] < LEAST_GROUPS or solve_for is None:
         return 1.0 + added, []
     drawn = np.random.default_rng(1).normal(0.0, formal.sigma0, problem.given.image_xy.shape)
     *pulls, field, rest = _pulls_of(problem, found, groups, drawn)
     # the first group is that of drawn residuals, whose variances are by chance
-    by_chance, *shares = (_share_of(formal, active, solve_for(pull[:, active].T)) for pull in pulls)
+    by_chance, *shares = (_share_of(problem, formal, solve_for(spread.T @ p.T)) for p in pulls)
     shared = list[str]()
     for words, share in zip(groups, shares, strict=False):
         is_more = share > fdtri(counts[words] - 1, counts[ALONE] - 1, SURE) * by_chance
@@ -93,10 +93,10 @@ def disagreement_of(
         if words == ALONE:
             by_chance = by_chance + more
     if counts[FRAME] >= LEAST_GROUPS:
-        field = field[:, active]
+        field = field @ spread
         rest -= field @ solve_for(np.column_stack([field.T, right]))
         likely = _likely_field(problem, groups[FRAME], formal.sigma0, rest) @ field
-        more = _share_of(formal, active, solve_for(likely.T))
+        more = _share_of(problem, formal, solve_for(likely.T))
         added = added + more
         shared += [FRAME] if (more > NOTED).any() else []
     factor = np.sqrt(1.0 + added)
@@ -150,18 +150,17 @@ def _tiles(xy: FloatArray, count: int) -> IntArray:
     return np.asarray(place[:, 0] * int(last[1] + 1.0) + place[:, 1])
 
 
-def _share_of(formal: Precision, active: IntArray, moved: FloatArray) -> FloatArray:
+def _share_of(problem: Problem, formal: Precision, moved: FloatArray) -> FloatArray:
     """Return variances over the formal ones, (6 + g,), for poses their mean.
 
-    `moved`, shape (a, n), are the movements of the active unknowns by each of n groups.
+    `moved`, shape (u, n), are the movements of the free unknowns by each of n groups.
     """
-    k, poses = len(formal.pose_covariance), np.einsum("kii->ki", formal.pose_covariance)
-    variance = np.concatenate([poses.ravel(), [row.sigma**2 for row in formal.shared]])
-    share = np.zeros(len(variance))
-    share[active] = (moved**2).sum(axis=1)
-    share = np.divide(share, variance, out=np.zeros(len(variance)), where=variance > 0.0)
-    free = max(int((poses > 0.0).any(axis=1).sum()), 1)
-    return np.concatenate([share[: 6 * k].reshape(k, 6).sum(axis=0) / free, share[6 * k :]])
+    poses = np.einsum("kii->ki", formal.pose_covariance)[problem.moves]
+    variance = np.append(poses.ravel(), [row.sigma**2 for row in formal.shared])
+    share = (moved**2).sum(axis=1) / variance
+    of_poses, of_shared = np.split(share, [poses.size])
+    mean = of_poses.reshape(-1, 6).mean(axis=0) if poses.size else np.zeros(6)
+    return np.append(mean, of_shared)
 
 
 def _pulls_of(
@@ -173,7 +172,7 @@ def _pulls_of(
     found; the others of all groups but the frame. Then, for shifts along u and v of the t tiles of
     the frame: B', shape (2 t, 6 k + g), and C beside their right sides, shape (2 t, 2 t + 1).
     """
-    tile, size = groups[FRAME], len(problem.moves)
+    tile, size = groups[FRAME], 6 * len(problem.moves) + problem.given.shared
     each = [groups[ALONE], *(group for words, group in groups.items() if words != FRAME)]
     pulls = [np.zeros((int(group.max(initial=0)) + 1, size)) for group in each]
     count = 2 * (int(tile.max(initial=0)) + 1)

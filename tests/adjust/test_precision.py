@@ -226,10 +226,9 @@ def test_large_block(monkeypatch):
 def test_member(poses):
     unknowns = Unknowns(poses=poses, lens=("f", "k1"), surface={"level": 0.1, "tilt": 0.01})
     problem, found = adjusted(block_of(tiny(), control=True), unknowns)
-    size = len(problem.moves)
-    active = np.flatnonzero(problem.moves)
-    steps = np.random.default_rng(2).normal(0.0, 1e-3, (3, len(active)))
-    members = members_of(problem, found, active, steps)
+    free = 6 * int(problem.moves.sum()) + len(problem.names)
+    steps = np.random.default_rng(2).normal(0.0, 1e-3, (3, free))
+    members = members_of(problem, found, steps)
     nominal = solved_cameras(problem, found)
     order = np.arange(len(nominal))[::-1]
     shuffled = replace(
@@ -238,9 +237,7 @@ def test_member(poses):
     )  # fmt: skip
     members = members.aligned(shuffled)
     for i, one in enumerate(steps):
-        step = np.zeros(size)
-        step[active] = one
-        moved = moved_by(problem, found, step, np.zeros_like(found.state.xyz))
+        moved = moved_by(problem, found, one, np.zeros_like(found.state.xyz))
         wanted, got = solved_cameras(problem, moved), members.cameras(i, shuffled)
         np.testing.assert_allclose(got.centres[order], wanted.centres, atol=1e-8)
         np.testing.assert_allclose(got.rotations[order], wanted.rotations, atol=1e-12)
