@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -89,9 +88,6 @@ def report_run(
     return {
         "in_short": in_short(page.tiles),
         "uncertainty": uncertainty_sentence(summary, compared.get("figures", {}).get("tvu")),
-        "title": page.title,
-        "tiles": [asdict(tile) for tile in page.tiles],
-        "place": page.place,
     }
 
 

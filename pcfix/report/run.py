@@ -206,7 +206,8 @@ def _pictures(run: RunResults) -> list[Picture]:
             f" limits of the orders of IHO S-44. {formal_words(s)}.{dots if bins else ''}"
             " S-44 has requirements other than the TVU: position, features and coverage."
         )
-        figure = tvu_figure(*run.sample[known].T, bins)
+        depth_m, sigma_z_m = run.sample[known].T
+        figure = tvu_figure(depth_m, sigma_z_m, bins)
         pictures.append(Picture("uncertainty", "Vertical uncertainty", alt, figure))
     return pictures
 
