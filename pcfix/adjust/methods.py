@@ -349,7 +349,7 @@ def offset_of(found: Adjusted) -> tuple[FloatArray, FloatArray] | None:
 
 
 def datum_notes(found: Adjusted) -> list[PcfixWarning]:
-    """Return a warning if GNSS positions are a weak datum, and one if they have an offset."""
+    """Return warnings if GNSS positions are a weak datum, or have a significant offset."""
     known = np.isfinite(found.gnss_residual_m)
     if not known.any() or found.unknowns.poses != "free" or found.unknowns.free_network:
         return []
@@ -374,35 +374,26 @@ def datum_notes(found: Adjusted) -> list[PcfixWarning]:
         )
         more = {"sigma_m": float(sigma.max()), "image": image, "in_line": line is not None}
         notes.append(PcfixWarning("gnss.weak", words, **values, **more))
-    offset = offset_of(found)
-    return notes if offset is None else [*notes, *_offset_notes(found, *offset, stated_m)]
-
-
-def _offset_notes(
-    found: Adjusted, offset_m: FloatArray, sigma_m: FloatArray, stated_m: float
-) -> list[PcfixWarning]:
-    """Return a warning if GNSS positions have a significant offset."""
-    least = np.maximum(SIGMAS * sigma_m, OF_GNSS * stated_m)
-    is_off = np.abs(offset_m) > least
-    if not is_off.any():
-        return []
-    parts = [
-        f"{abs(m):.2f} m {side[int(m < 0.0)]} the projection centres (standard error {sigma:.2f} m)"
-        for m, sigma, side, off in zip(offset_m, sigma_m, SIDES, is_off, strict=True)
-        if off
-    ]
-    level = ""
-    if is_off[2] and found.water is not None:
-        level = f", or a water level that is too {'low' if offset_m[2] > 0.0 else 'high'}"
-    words = (
-        f"The GNSS positions lie {' and '.join(parts)}: an antenna lever arm, another datum{level}."
-        " The block followed them. Correct them, or omit them if there are control points."
-    )
-    return [
-        PcfixWarning(
-            "gnss.offset_found", words, offset_m=offset_m.tolist(), sigma_m=sigma_m.tolist()
+    offset_m, sigma_m = offset_of(found) or (np.zeros(3), np.zeros(3))
+    is_off = np.abs(offset_m) > np.maximum(SIGMAS * sigma_m, OF_GNSS * stated_m)
+    if is_off.any():
+        parts = [
+            f"{abs(m):.2f} m {side[int(m < 0.0)]} the projection centres (standard error"
+            f" {sigma:.2f} m)"
+            for m, sigma, side, off in zip(offset_m, sigma_m, SIDES, is_off, strict=True)
+            if off
+        ]
+        level = ""
+        if is_off[2] and found.water is not None:
+            level = f", or a water level that is too {'low' if offset_m[2] > 0.0 else 'high'}"
+        words = (
+            f"The GNSS positions lie {' and '.join(parts)}: an antenna lever arm, another"
+            f" datum{level}. The block followed them. Correct them, or omit them if there are"
+            " control points."
         )
-    ]
+        more = {"offset_m": offset_m.tolist(), "sigma_m": sigma_m.tolist()}
+        notes.append(PcfixWarning("gnss.offset_found", words, **more))
+    return notes
 
 
 def _line(found: Adjusted) -> tuple[FloatArray, FloatArray | None]:

@@ -138,28 +138,26 @@ def precision_of(
         poses = by @ of_shared[-7:, -7:] @ by.transpose(0, 2, 1)
     points: FloatArray | None = None
     members: Members | None = None
+    notes: tuple[PcfixWarning, ...] = ()
     if inverse is None:
         words = (
             f"The block has {u:,} unknowns (limit {DENSE_UP_TO:,}), so its points have no"
             " covariances, and the correction cannot use the errors of the poses."
         )
-        notes = [PcfixWarning("adjust.too_large", words, unknowns=u)]
+        notes = (PcfixWarning("adjust.too_large", words, unknowns=u),)
     else:
         each = np.append(np.tile(times[:6], len(free)), times[6:])
         inverse *= each
         inverse *= each[:, None]
         spread = problem.spread(state)
         points = variance * point_covariances(state, given, spread @ inverse @ spread.T)
-        loose = int(np.isnan(points[:, 0]).sum())
-        words = f"{loose:,} points are not determined by their images and have no covariance."
-        notes = [PcfixWarning("adjust.loose_points", words, points=loose)] if loose else []
         members = members_of(problem, solution, sigma0 * drawn(inverse))
     sigma = np.sqrt(np.diag(of_shared))
     correlation = of_shared / sigma / sigma[:, None]
     rows_of = zip(problem.names, solution.shared.tolist(), (sigma * sigma0).tolist(), strict=True)
     return Precision(
         sigma0, variance * poses, tuple(SharedUnknown(*row) for row in rows_of), correlation,
-        points, tuple(notes), members,
+        points, notes, members,
     )  # fmt: skip
 
 

@@ -29,10 +29,9 @@ from pcfix.adjust.block import (
     similarity_gradients,
     usable_codes,
 )
-from pcfix.adjust.collinearity import SHARED, Given, State, Workspace, condition
-from pcfix.adjust.normal import UNDAMPED, Rule, cost_of, in_parts, point_steps, residuals
+from pcfix.adjust.collinearity import SHARED, Given, State
+from pcfix.adjust.normal import UNDAMPED, Rule, cost_of, point_steps, residuals
 from pcfix.errors import GeometryError
-from pcfix.kernels import Span, kernel
 from pcfix.lens.imaging import lens_table
 from pcfix.model import (
     BoolArray,
@@ -47,7 +46,7 @@ from pcfix.model import (
 )
 from pcfix.port.light import coefficients as port_coefficients
 from pcfix.port.shapes import DomePort, FlatPort, Port
-from pcfix.water.surface import build_field, build_tin
+from pcfix.water.surface import build_field, build_tin, surface_above
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
@@ -426,18 +425,19 @@ def survey_cost(problem: Problem, found: Solution) -> float:
 
 def surface_distances(problem: Problem, found: Solution) -> FloatArray:
     """Return surface minus point, shape (m,), metres along its axis; NaN for points on none."""
-    off, given, state = np.full(len(found.state.xyz), np.nan), problem.given, found.state
-    in_parts(_surface_distances, state, given, off)
+    given, state, off = problem.given, found.state, np.full(len(found.state.xyz), np.nan)
+    for number in np.unique(given.on[given.on >= 0]):
+        rows, up = np.flatnonzero(given.on == number), int(given.axis[number])
+        q, z = state.xyz[rows], np.full(len(rows), np.nan)
+        if number > 0:
+            a, b, c = state.water[PLANES + 3 * number - 3 :][:3]
+            z = a + b * q[:, (up + 1) % 3] + c * q[:, (up + 2) % 3]
+        elif isinstance(problem.block.water, WaterPlane):
+            z = polynomial(state.water, q[:, 0], q[:, 1])
+        elif (surface := water_of(problem, state)) is not None:
+            z = surface_above(surface, q + problem.origin).height_m - problem.origin[2]
+        off[rows] = z - q[:, up]
     return off
-
-
-@kernel
-def _surface_distances(
-    span: Span, state: State, given: Given, off: FloatArray, work: Workspace
-) -> None:
-    for p in range(*span):
-        if condition(state, given, p, work, 0):
-            off[p] = work.r[0, 0] / given.on_weight[p]
 
 
 def counts_of(problem: Problem, found: Solution) -> tuple[int, float]:

@@ -47,11 +47,6 @@ Source = Literal["tie points", "cloud"]
 Plain = dict[str, Any]
 
 MOST_DEPTH_BINS = 8
-SIGMAS = {
-    "level_sigma_m": "level", "tilt_sigma": "tilt", "index_sigma": "index", "shape_sigma": "shape",
-    "distance_sigma_m": "distance", "centre_sigma_m": "centre",
-}  # fmt: skip
-"""Keys of the standard deviations of `Unknowns.surface`."""
 
 
 class ControlRow(NamedTuple):
@@ -256,7 +251,7 @@ def adjustment_dict(adjusted: Adjusted, before: Intersected | None = None) -> Pl
         "port": block.port is not None,
         "unknowns": {
             "lens": u.lens,
-            **{key: u.surface.get(name, 0.0) for key, name in SIGMAS.items()},
+            "surface": dict(u.surface),
             "free_network": u.free_network,
             "parallel": () if block.conditions is None else block.conditions.parallel,
         },
