@@ -71,9 +71,11 @@ MOST_STATED_M = 0.5
 """A larger standard deviation of the GNSS is a default of the software, as Metashape's 10 m."""
 
 TIE_POINTS, LEAST_TIE_VIEWS = 3000, 3
-CLOUD_POINTS, POINTS_PER_IMAGE, SURVEY_POINTS = 1500, 10, 5000
+CLOUD_POINTS, POINTS_PER_IMAGE, SAMPLE_POINTS = 1500, 10, 50_000
 LEAST_COORDINATES = 24
 """Of GNSS positions."""
+NEAREST = 3
+"""Points of a reference that give its height at a point of the cloud."""
 MOST_IMAGES, QUICK_IMAGES = 600, 200
 """For which the pattern of absorbed refraction is computed, and when it must be quick; the cost
 grows with their cube, and is a second for the latter."""
@@ -142,11 +144,6 @@ class Diagnosis:
                 for s in self.signs
             ],
         }
-
-
-def diagnosis_of(signs: list[Sign]) -> Diagnosis:
-    """Return the signs in the order in which they decide."""
-    return Diagnosis(tuple(sorted(signs, key=lambda sign: ORDER.index(sign.name))))
 
 
 def _exceeds(value: float, sigma: float, limit: float) -> bool | None:
@@ -353,44 +350,22 @@ class Evidence:
     ties: TiePoints | None = None
     view: Any = None  # a `pcfix.flow.surfaces.CloudView`, for heights and in place of tie points
     control: GroundControl | None = None
-    reference: Any = None  # a survey of land and bed, with `xyz`
+    reference: Any = None  # a survey of land and bed, with `xyz` and `sparse`
     gnss: GnssPositions | None = None  # in the frame of the cameras, NaN if unknown
     neighbours: Sign | None = None  # of `neighbours_sign`
     in_passing: bool = False  # whether it must be quick
-
-    @property
-    def has_height(self) -> bool:
-        """Whether the water has a height everywhere, not only at points of the cloud."""
-        return not isinstance(self.water, WaterDimension)
-
-    @property
-    def has_rays(self) -> bool:
-        """Whether straight and refracted rays can be computed."""
-        cameras = self.cameras
-        if cameras.rotations is None or cameras.lenses is None:
-            return False
-        return self.has_height and all(lens.unit == "px" for lens in cameras.lenses)
-
-    @property
-    def gsd_m(self) -> float:
-        """Approximate size of a pixel at the water; zero if unknown."""
-        lenses, centres = self.cameras.lenses, self.cameras.centres
-        if lenses is None or not self.has_height:
-            return 0.0
-        level = surface_above(self.water, centres).height_m
-        above = centres[:, 2] - np.where(np.isfinite(level), level, np.nanmean(level))
-        focal = [lens.focal if lens.unit == "px" else np.inf for lens in lenses]
-        return float(np.mean(above / focal))
 
 
 def diagnosed(evidence: Evidence) -> Diagnosis:
     """Look for every sign that the evidence allows."""
     signs = [] if evidence.neighbours is None else [evidence.neighbours]
-    if evidence.has_rays:
-        signs += _signs_of_rays(evidence)
-    if evidence.view is not None and evidence.has_height:
-        signs += _signs_of_surveys(evidence)
-    return diagnosis_of(signs)
+    cameras, lenses = evidence.cameras, evidence.cameras.lenses
+    if not isinstance(evidence.water, WaterDimension):  # which has heights at points of the cloud
+        if cameras.rotations is not None and lenses and all(one.unit == "px" for one in lenses):
+            signs += _signs_of_rays(evidence)
+        if evidence.view is not None:
+            signs += _signs_of_surveys(evidence)
+    return Diagnosis(tuple(sorted(signs, key=lambda sign: ORDER.index(sign.name))))
 
 
 def _signs_of_rays(evidence: Evidence) -> list[Sign]:
@@ -411,8 +386,7 @@ def _signs_of_rays(evidence: Evidence) -> list[Sign]:
             why = f"{count} images (limit {most})" if count > most else "no cloud"
             raise GeometryError("adjust.no_pattern", why)
         if apparent is None:
-            every = max(1, evidence.view.points // wanted)
-            apparent = np.vstack([seen.xyz[::every] for seen in evidence.view.chunks()])
+            apparent = _sample_of(evidence.view, wanted)
         some = apparent[:: max(1, len(apparent) // wanted)]
         true = mended(some, cameras, evidence.water, evidence.refractive_index)
     except GeometryError as error:
@@ -446,18 +420,31 @@ def _signs_of_ties(evidence: Evidence) -> tuple[list[Sign], FloatArray | None]:
     return [sign], straight.xyz[np.isfinite(straight.squares)]
 
 
+def _sample_of(view: Any, wanted: int) -> FloatArray:
+    """Return about so many points of a cloud, evenly spread over it, shape (m, 3)."""
+    every = max(1, view.points // wanted)
+    return np.vstack([np.zeros((0, 3)), *(seen.xyz[::every] for seen in view.chunks())])
+
+
 def _signs_of_surveys(evidence: Evidence) -> list[Sign]:
     """Compare the cloud with control points on land, and with a survey of land and bed."""
-    gsd, view, control = evidence.gsd_m, evidence.view, evidence.control
-    signs = []
+    view, control, centres = evidence.view, evidence.control, evidence.cameras.centres
+    # about the size of a pixel at the water
+    level = surface_above(evidence.water, centres).height_m
+    above = centres[:, 2] - np.where(np.isfinite(level), level, np.nanmean(level))
+    focal = [one.focal if one.unit == "px" else np.inf for one in evidence.cameras.lenses or ()]
+    gsd, signs = float(np.mean(above / focal)) if focal else 0.0, list[Sign]()
     if control is not None:
         level = surface_above(evidence.water, control.xyz).height_m
         dry = control.xyz[~control.under_water & ~(control.xyz[:, 2] < level)]
         higher = _cloud_heights(view, dry, gsd) - dry[:, 2]
         signs.append(land_sign(higher, gsd, "the control points"))
     surveyed = np.zeros((0, 3)) if evidence.reference is None else evidence.reference.xyz
-    surveyed = surveyed[:: max(1, len(surveyed) // SURVEY_POINTS)]
-    cloud_z = _cloud_heights(view, surveyed, gsd)
+    if evidence.reference is None or evidence.reference.sparse:
+        cloud_z = _cloud_heights(view, surveyed, gsd)
+    else:
+        cloud, surveyed = _at_points_of_cloud(view, surveyed)
+        cloud_z = cloud[:, 2]
     level = surface_above(evidence.water, surveyed).height_m
     land, bed = surveyed[:, 2] > level + LAND_M, surveyed[:, 2] < level
     if land.any():
@@ -476,3 +463,19 @@ def _cloud_heights(view: Any, xyz: FloatArray, gsd_m: float) -> FloatArray:
         return np.zeros(0)
     near = [seen.xyz[is_near(xy, seen.xyz, radius)] for seen in view.chunks()]
     return heights_from_cloud(xy, np.vstack([np.zeros((0, 3)), *near]), radius)
+
+
+def _at_points_of_cloud(view: Any, reference: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return points of a cloud, and the reference at their places."""
+    from scipy.spatial import cKDTree
+
+    cloud = _sample_of(view, SAMPLE_POINTS)
+    if len(reference) < NEAREST or not len(cloud):
+        return cloud[:0], reference[:0]
+    size = np.ptp(reference[:, :2], axis=0)
+    spacing = float(np.sqrt(max(size.prod(), 1e-9) / len(reference)))
+    found = cKDTree(reference[:, :2]).query(cloud[:, :2], k=NEAREST)
+    distance, row = np.asarray(found[0]), np.asarray(found[1])
+    near = distance[:, -1] < 3.0 * spacing
+    z = reference[row[near], 2].mean(axis=1)
+    return cloud[near], np.column_stack([cloud[near, :2], z])
