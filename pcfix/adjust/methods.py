@@ -1,4 +1,4 @@
-"""The two ways to adjust a block, by tie points or by the cloud, and the checks of their results.
+"""The adjustment of a block by tie points or by the cloud, and the checks of its result.
 
 An antenna's lever arm, another height datum or a wrong water level offset all GNSS positions from
 the projection centres alike. The block follows them, focal length and heights absorb the offset,
@@ -70,58 +70,53 @@ def unknowns_of(rules: AdjustRules, lens: tuple[str, ...]) -> Unknowns:
     )
 
 
-def _lens_of(material: Material, rules: AdjustRules) -> tuple[str, ...]:
-    """Return the free lens parameters: those named, none of a calibration, or the default."""
+def adjust_block(
+    material: Material,
+    rules: AdjustRules,
+    *,
+    ties: TiePoints | None = None,
+    cloud_xyz: FloatArray | None = None,
+    progress: Progress | None = None,
+) -> Adjusted:
+    """Adjust a block by measured tie points, or by the apparent cloud that it made.
+
+    Parameters
+    ----------
+    cloud_xyz : array, shape (m, 3)
+        Points of the cloud, in place of tie points.
+    """
+    original, chooses_lens = material.original, False
+    lens: tuple[str, ...] = ()
     if rules.lens_unknowns is not None:
-        return rules.lens_unknowns
-    return () if material.calibrated is not None else default_lens(material.original.lenses or ())
-
-
-def by_ties(
-    material: Material, ties: TiePoints, rules: AdjustRules, progress: Progress | None = None
-) -> Adjusted:
-    """Adjust a block by measured tie points."""
-    block = block_of(material, ties, rules.sigma_image or FIRST_SIGMA_PX)
-    unknowns = unknowns_of(rules, _lens_of(material, rules))
-    check_datum(block, unknowns, material.no_gnss)
-    _check_wet(material.water, block.xyz[: len(ties.xyz)])
-    kept, left_out = _well_seen(material.name, block)
-    found = adjust_ties(
-        restricted(block, kept), unknowns, progress, sigma_px=rules.sigma_image,
-        outliers=rules.outliers,
-        choose_lens=rules.lens_unknowns is None and material.calibrated is None,
-    )  # fmt: skip
-    return _checked(material, found, left_out)
-
-
-def by_cloud(
-    material: Material, xyz: FloatArray, rules: AdjustRules, progress: Progress | None = None
-) -> Adjusted:
-    """Adjust a block by points, shape (m, 3), of the apparent cloud that it made."""
-    ties = ties_of_cloud(xyz, views_in_frame(xyz, material.original), material.original)
-    if len(ties.xyz) < LEAST_TIES:
+        lens = rules.lens_unknowns
+    elif material.calibrated is None:
+        lens, chooses_lens = default_lens(original.lenses or ()), True
+    if cloud_xyz is not None:
+        ties = ties_of_cloud(cloud_xyz, views_in_frame(cloud_xyz, original), original)
+    if ties is None or len(ties.xyz) < LEAST_TIES:
         words = (
             f"{material.name}: the images do not see the cloud. Check the poses with 'pcfix cameras"
             " --cloud'."
         )
         raise GeometryError("cameras.no_overlap", words, path=material.name)
-    block = block_of(material, ties, FIRST_SIGMA_PX)
-    check_datum(block, unknowns_of(rules, ()), material.no_gnss)
-    surveyed = [] if material.control is None else [material.control.xyz]
+    block = block_of(material, ties, rules.sigma_image or FIRST_SIGMA_PX)
+    unknowns = unknowns_of(rules, lens)
+    check_datum(block, unknowns, material.no_gnss)
+    _check_wet(material.water, block.xyz[: len(ties.xyz)])
     kept, notes = _well_seen(material.name, block)
-    block, original = restricted(block, kept), some_cameras(material.original, kept)
-    _check_wet(material.water, block.xyz)
-    sets = [_lens_of(material, rules)]
-    if rules.lens_unknowns is None and material.calibrated is None:
-        sets = list(dict.fromkeys([("f",), ("f", "cx", "cy"), *sets]))
-    given = CloudBlock(block, original, np.vstack([ties.xyz, *surveyed]))
-    found = adjust_cloud(given, unknowns_of(rules, sets[0]), sets, progress)
-    return _checked(material, found, notes)
-
-
-def _checked(material: Material, found: Adjusted, notes: list[PcfixWarning]) -> Adjusted:
-    """Return a result with all warnings, those on its input first."""
-    notes = [*notes, *_check_dry(material.water, found), *found.notes]
+    block = restricted(block, kept)
+    if cloud_xyz is None:
+        found = adjust_ties(
+            block, unknowns, progress, sigma_px=rules.sigma_image, outliers=rules.outliers,
+            choose_lens=chooses_lens,
+        )  # fmt: skip
+    else:
+        surveyed = [] if material.control is None else [material.control.xyz]
+        apparent = np.vstack([ties.xyz, *surveyed])
+        sets = list(dict.fromkeys([*([("f",), ("f", "cx", "cy")] if chooses_lens else []), lens]))
+        given = CloudBlock(block, some_cameras(original, kept), apparent)
+        found = adjust_cloud(given, unknowns, sets, progress)
+    notes += [*_check_dry(material.water, found), *found.notes]
     if found.precision is not None:
         notes += [*undetermined(found.precision, found.unknowns), *correlated(found.precision)]
         wet = found.is_wet & np.isfinite(found.xyz).all(axis=1)

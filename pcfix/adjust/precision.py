@@ -45,15 +45,14 @@ SINGULAR = 1e-12
 
 
 class SharedUnknown(NamedTuple):
-    """A shared unknown: its name, the correction to its start value, and its standard error.
+    """A shared unknown; units are pixels, metres, slopes, radians.
 
-    Units are pixels, metres, slopes, radians. The level is that at the origin of the block, below
-    the mean of the projection centres.
+    The level is that at the origin of the block, below the mean of the projection centres.
     """
 
     name: str
-    added: float
-    sigma: float
+    added: float  # correction to its start value
+    sigma: float  # its standard error
 
 
 @dataclass(frozen=True, eq=False)

@@ -186,17 +186,12 @@ def renumbered(views: Views, row: IntArray) -> tuple[Views, IntArray]:
 
 
 class Transferred(NamedTuple):
-    """Points after their transfer.
+    """Points after their transfer."""
 
-    original_xyz, xyz : shape (n, 3), metres, with the original and the adjusted cameras.
-    moved : shape (n,), whether a point could be transferred.
-    views : their view list with the adjusted cameras, if there is one.
-    """
-
-    original_xyz: FloatArray
-    xyz: FloatArray
-    moved: BoolArray
-    views: Views | None
+    original_xyz: FloatArray  # (n, 3), metres, with the original cameras
+    xyz: FloatArray  # (n, 3), with the adjusted ones
+    moved: BoolArray  # (n,), whether a point could be transferred
+    views: Views | None  # their view list with the adjusted cameras, if there is one
 
     def whole(self, correction: Correction) -> Correction:
         """Return the correction of `xyz` as one of the original points.

@@ -22,8 +22,7 @@ from pcfix.adjust.block import (
 from pcfix.adjust.block import taken as taken_ties
 from pcfix.adjust.methods import (
     LEAST_TIES,
-    by_cloud,
-    by_ties,
+    adjust_block,
     check_control,
     check_images,
     check_marks,
@@ -173,7 +172,7 @@ def adjust_into(
         ties = usable_ties(with_places(ties, original), original)
     count = 0 if ties is None else len(ties.xyz)
     if ties is not None and count >= LEAST_TIES:
-        found = by_ties(material, ties, given, progress)
+        found = adjust_block(material, given, ties=ties, progress=progress)
     elif view is None or given.ties == "measured":
         cloud_too = "" if given.ties == "measured" else ", and there is no --cloud"
         words = (
@@ -182,7 +181,7 @@ def adjust_into(
         )
         raise InputError("cameras.no_ties", words, path=name, ties=count, least=LEAST_TIES)
     else:
-        found = by_cloud(material, _sample(view), given, progress)
+        found = adjust_block(material, given, cloud_xyz=_sample(view), progress=progress)
 
     # 3. The result
     if control is not None:

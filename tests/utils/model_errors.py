@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pcfix.adjust.block import Material, usable_ties
-from pcfix.adjust.methods import by_ties
+from pcfix.adjust.methods import adjust_block
 from pcfix.adjust.problem import intersect_fixed
 from pcfix.model import TiePoints, WaterPlane
 from pcfix.options.survey import AdjustRules
@@ -67,7 +67,7 @@ def run(kind: str, seed: int, **settings: object) -> Run:
     gnss = scene.cameras.gnss
     material = Material("block", made.cameras, water, scene.refractive_index, gnss)
     rules = AdjustRules(sigma_level=SIGMA_LEVEL_M if kind == "level" else None)
-    found = by_ties(material, usable_ties(made.ties, made.cameras), rules)
+    found = adjust_block(material, rules, ties=usable_ties(made.ties, made.cameras))
     bed = tuple(
         bed_rms_m(scene, cameras, surface) / (80.0 / cameras.lenses[0].focal)
         for cameras, surface in ((made.cameras, water), (found.cameras, found.water))
