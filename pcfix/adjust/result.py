@@ -40,13 +40,10 @@ from pcfix.adjust.problem import (
 from pcfix.errors import PcfixWarning, plain
 from pcfix.model import BoolArray, Cameras, FloatArray, WaterPlane, WaterSurface
 from pcfix.port.shapes import Port, spec_of
-from pcfix.sums import nice_step
 from pcfix.water.surface import surface_above
 
 Source = Literal["tie points", "cloud"]
 Plain = dict[str, Any]
-
-MOST_DEPTH_BINS = 8
 
 
 class ControlRow(NamedTuple):
@@ -92,15 +89,6 @@ class Adjusted:
     def is_observed(self) -> BoolArray:
         """Points with observations that were used, shape (m,)."""
         return np.bincount(self.block.owner[self.used], minlength=len(self.xyz)) > 0
-
-    def depth_m(self) -> FloatArray | None:
-        """Return the depths of the points below the water, shape (m,); None without water.
-
-        Negative above it, NaN where the surface is unknown.
-        """
-        if self.water is None:
-            return None
-        return np.asarray(surface_above(self.water, self.xyz).height_m - self.xyz[:, 2])
 
 
 def sigma0_of(problem: Problem, now: Solution) -> float:
@@ -262,7 +250,6 @@ def adjustment_dict(adjusted: Adjusted, before: Intersected | None = None) -> Pl
             "land": _residuals(a, before, ~a.is_wet),
             "water": _residuals(a, before, a.is_wet),
         },
-        "depth_bins": _depth_bins(a, before),
         "lens": _lens(a),
         "water": _water(a),
         "port_found": _port(a),
@@ -326,36 +313,13 @@ def _residuals(a: Adjusted, before: Intersected | None, points: BoolArray) -> Pl
     focal = np.array([lens.focal for lens in a.cameras.lenses or ()])[camera]
     return {
         "points": points.sum(),
-        **_fit(a, before, rows),
+        "observations": rows.sum(),
+        "rms_before_px": None if before is None else rms(before.residual_px[rows].ravel()),
+        "rms_px": rms(a.residual_px[rows].ravel()),
         "rms_xy_px": rms(a.residual_px[rows]),
         "rms_m": rms((a.residual_px[rows] * (away / focal)[:, None]).ravel()),
         "sigma_xyz_m": None if sigma is None else rms(sigma[points]),
     }
-
-
-def _fit(a: Adjusted, before: Intersected | None, rows: BoolArray) -> Plain:
-    """Return the number of some observations, and their residuals."""
-    return {
-        "observations": rows.sum(),
-        "rms_before_px": None if before is None else rms(before.residual_px[rows].ravel()),
-        "rms_px": rms(a.residual_px[rows].ravel()),
-    }
-
-
-def _depth_bins(a: Adjusted, before: Intersected | None) -> list[Plain]:
-    depth = a.depth_m()
-    if depth is None or not a.is_wet.any():
-        return []
-    depth = np.where(a.is_wet & a.is_observed, depth, np.nan)
-    deepest = float(np.nanmax(depth, initial=0.0))
-    step = nice_step(deepest / MOST_DEPTH_BINS)
-    of_point = np.where(np.isfinite(depth), depth // step, -1)
-    bins = []
-    for i in range(int(deepest // step) + 1):
-        rows = a.used & (of_point == i)[a.block.owner]
-        if rows.any():
-            bins.append({"from_m": i * step, "to_m": (i + 1) * step, **_fit(a, before, rows)})
-    return bins
 
 
 def _lens(a: Adjusted) -> list[Plain]:

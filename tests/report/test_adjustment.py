@@ -15,8 +15,7 @@ from pcfix.adjust.problem import Intersected
 from pcfix.adjust.result import Adjusted, ControlRow, adjustment_dict, before_of
 from pcfix.errors import PcfixWarning
 from pcfix.model import Cameras, Lens, WaterPlane
-from pcfix.report.adjustment import adjustment_page, adjustment_text
-from pcfix.report.adjustment_figures import pictures_of
+from pcfix.report.adjustment import adjustment_page, adjustment_text, pictures_of
 from tests.report.test_report import Elements
 from tests.utils.shared import ROOT
 
@@ -171,15 +170,6 @@ def test_values(adjusted):
     assert values["poses"]["turned_largest_deg"] == 0.0
 
 
-def test_depth_bins(adjusted):
-    bins = adjustment_dict(adjusted)["depth_bins"]
-    assert sum(b["observations"] for b in bins) == 47
-    assert bins[0]["from_m"] == 0.0
-    # the deepest point is 3.52 m below the water
-    assert bins[-1]["from_m"] <= 3.52 < bins[-1]["to_m"]
-    assert all(b["rms_px"] == pytest.approx(0.4) for b in bins)
-
-
 def bare(adjusted):
     """Return what is least: no water, nothing beside the images, one step."""
     block = replace(adjusted.block, water=None)
@@ -203,7 +193,7 @@ def test_page(adjusted, kind):
     names = [picture.name for picture in pictures]
     assert len(elements.all("img")) == len(names)
     if kind == "whole":
-        assert names == ["block", "residuals_by_depth", "residual_vectors"]
+        assert names == ["block", "residual_vectors"]
         assert "Something <decided>" in said
 
 
