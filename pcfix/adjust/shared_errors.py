@@ -20,8 +20,6 @@ that fields too small to be found count too. The unknowns move by A^-1 B e.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 from scipy.special import fdtri
 
@@ -247,27 +245,27 @@ LEAST_POINTS = 30
 LEAST_RATIO = 1.2
 """Of standard deviations; below it other weights would gain a fiftieth of a standard error."""
 
-OBLIQUE_DEG = 15.0
-"""From nadir."""
-
-LEAST_GAP = 0.2
-"""Between two flying heights, as a share of the lower."""
-
 
 def weighed(problem: Problem, now: Solution) -> tuple[Problem, list[PcfixWarning]]:
     """Weight tie points by the noise of their group, and return a warning if groups differ.
 
-    Each side of the water and each kind of image has its own variance of unit weight: weighted
-    squares over its share of the redundancy, of which each point takes three. Groups whose
-    variances differ (F-test), and by enough to matter, are weighted by their own (Foerstner 1979,
-    one step).
+    Each side of the water and each sensor has its own variance of unit weight: weighted squares
+    over its share of the redundancy, of which each point takes three. Groups whose variances differ
+    (F-test), and by enough to matter, are weighted by their own (Foerstner 1979, one step).
     """
-    weight, owner, noise = problem.given.weight, problem.block.owner, dict[str, float]()
-    r = residuals(now.state, problem.given)
+    given, block, noise = problem.given, problem.block, dict[str, float]()
+    weight, owner, water = given.weight, block.owner, water_of(problem, now.state)
+    sensors = [f"of sensor {i}" for i in range(1, int(given.group.max()) + 2)]
+    groupings = [(sensors, given.group[given.camera])]
+    if water is not None:
+        xyz = now.state.xyz + problem.origin
+        wet = block.wet & (surface_above(water, xyz).height_m > xyz[:, 2])
+        groupings.insert(0, (["on land", "under water"], wet[owner].astype(np.int64)))
+    r = residuals(now.state, given)
     used = problem.of_ties & problem.used & np.isfinite(r).all(axis=1)
     square = (np.where(used[:, None], r, 0.0) ** 2).sum(axis=1)
     redundancy = 2.0 - 3.0 / np.maximum(np.bincount(owner, used)[owner], 2.0)
-    for names, group in _groups_by_quality(problem, now):
+    for names, group in groupings:
         rows = [used & (group == i) for i in range(len(names))]
         points = np.array([len(np.unique(owner[row])) for row in rows])
         if len(names) < 2 or points.min() < LEAST_POINTS:
@@ -292,23 +290,3 @@ def weighed(problem: Problem, now: Solution) -> tuple[Problem, list[PcfixWarning
         noise_px=noise,
     )
     return problem.weighted(weight), [note]
-
-
-def _groups_by_quality(problem: Problem, now: Solution) -> Iterator[tuple[list[str], IntArray]]:
-    """Yield groupings of the observations: names, and the group of each observation."""
-    block, given, state = problem.block, problem.given, now.state
-    water = water_of(problem, state)
-    if water is not None:
-        xyz = state.xyz + problem.origin
-        wet = block.wet & (surface_above(water, xyz).height_m > xyz[:, 2])
-        yield ["on land", "under water"], wet[block.owner].astype(np.int64)
-    sensors = int(given.group.max()) + 1
-    yield [f"of sensor {i}" for i in range(1, sensors + 1)], given.group[given.camera]
-    oblique = -state.rotations[:, 2, 2] < np.cos(np.radians(OBLIQUE_DEG))
-    yield ["in nadir images", "in oblique images"], oblique[given.camera].astype(np.int64)
-    height = state.centres[:, 2] - np.median(state.xyz[:, 2])
-    order = np.sort(height)
-    gap = np.diff(order, prepend=order[:1])
-    if gap.max() > LEAST_GAP * np.median(height):
-        high = height >= order[int(np.argmax(gap))]
-        yield ["of the lower flight", "of the higher flight"], high[given.camera].astype(np.int64)
