@@ -221,10 +221,10 @@ def before_of(adjusted: Adjusted) -> Intersected:
     return Intersected(np.where(met, found.xyz, np.nan), residual_px, found.start)
 
 
-def adjustment_dict(adjusted: Adjusted, before: Intersected | None = None) -> Plain:
+def adjustment_dict(adjusted: Adjusted, before: Intersected) -> Plain:
     """Return the content of adjustment.json; pcfix/cli/README.md lists its keys.
 
-    Residuals before the adjustment need `before`, of `before_of`; without it they are None.
+    `before` are the residuals before the adjustment, of `before_of`.
     """
     a, block, u = adjusted, adjusted.block, adjusted.unknowns
     kept = len(block.cameras) if u.poses == "fixed" else 0
@@ -303,7 +303,7 @@ def _counts(a: Adjusted) -> Plain:
     }
 
 
-def _residuals(a: Adjusted, before: Intersected | None, points: BoolArray) -> Plain:
+def _residuals(a: Adjusted, before: Intersected, points: BoolArray) -> Plain:
     points = points & a.is_observed
     rows = a.used & points[a.block.owner]
     sigma = None if a.precision is None else a.precision.point_sigma_m
@@ -314,7 +314,7 @@ def _residuals(a: Adjusted, before: Intersected | None, points: BoolArray) -> Pl
     return {
         "points": points.sum(),
         "observations": rows.sum(),
-        "rms_before_px": None if before is None else rms(before.residual_px[rows].ravel()),
+        "rms_before_px": rms(before.residual_px[rows].ravel()),
         "rms_px": rms(a.residual_px[rows].ravel()),
         "rms_xy_px": rms(a.residual_px[rows]),
         "rms_m": rms((a.residual_px[rows] * (away / focal)[:, None]).ravel()),

@@ -299,7 +299,8 @@ def _check_folder(folder: Path, overwrite: bool, inputs: list[Any]) -> None:
 
 def _write(folder: Path, found: Adjusted, model: str) -> None:
     """Write an adjusted block: model, camera files, summary, report; all or nothing."""
-    from pcfix.report.adjustment import adjustment_dict, adjustment_page, before_of
+    from pcfix.adjust.result import adjustment_dict, before_of
+    from pcfix.report.adjustment import adjustment_page
 
     before = before_of(found)
     with temporary_folder(folder) as draft:

@@ -11,7 +11,7 @@ import numpy as np
 
 from pcfix.adjust.block import sensor_groups, words_of
 from pcfix.adjust.problem import Intersected
-from pcfix.adjust.result import Adjusted, Plain, adjustment_dict, before_of, rms
+from pcfix.adjust.result import Adjusted, Plain, adjustment_dict, rms
 from pcfix.grid.colours import DEPTH, DIFFERENCE, RAYS, UNCERTAINTY
 from pcfix.grid.maps import Maps, MapsBuilder
 from pcfix.model import BoolArray, FloatArray
@@ -20,8 +20,6 @@ from pcfix.report.page import AFTER, BEFORE, Picture, Report, Table, label_plan,
 from pcfix.report.text import Rows, RowTable, filled, share
 from pcfix.sums import nice_step
 from pcfix.water.surface import surface_above
-
-__all__ = ["adjustment_dict", "adjustment_page", "adjustment_text", "before_of"]
 
 MOST_POINTS = 6000
 COLUMNS = 14
@@ -96,22 +94,18 @@ def adjustment_sentence(d: Plain) -> str:
     return ", ".join(parts)
 
 
-def adjustment_text(adjusted: Adjusted, before: Intersected | None = None) -> str:
-    """Return the summary of an adjustment as text.
-
-    `before` is of `before_of`, for the residuals before.
-    """
-    d = adjustment_dict(adjusted, before)
+def adjustment_text(d: Plain) -> str:
+    """Return the summary of an adjustment as text."""
     surveyed = _survey_table(d)
     lines = [f"{label:<18} {words}" for label, words in _facts(d)] + _residual_table(d).lines()
     lines += surveyed.lines()[: 1 + MOST_LISTED] if surveyed.rows else []
     return "\n".join([*lines, *(f"Note: {note}" for note in all_notes(d))])
 
 
-def adjustment_page(adjusted: Adjusted, before: Intersected | None = None) -> str:
+def adjustment_page(adjusted: Adjusted, before: Intersected) -> str:
     """Return the report of an adjustment as one self-contained HTML page.
 
-    With `before`, of `before_of`, residuals and points before are shown too.
+    `before` are residuals and points before, of `before_of`.
     """
     d = adjustment_dict(adjusted, before)
     maps, layers = _map(adjusted, before)
@@ -226,7 +220,7 @@ def _fact_table(d: Plain) -> Table:
 # Maps
 
 
-def _map(a: Adjusted, before: Intersected | None) -> tuple[Maps, list[Layer]]:
+def _map(a: Adjusted, before: Intersected) -> tuple[Maps, list[Layer]]:
     """Return maps of the points, averaged in cells."""
     unit = (a.block.cameras.lenses or ())[0].unit
     heights = _means(a, a.xyz[:, 2])
@@ -235,9 +229,8 @@ def _map(a: Adjusted, before: Intersected | None) -> tuple[Maps, list[Layer]]:
         depth = surface_above(a.water, a.xyz).height_m - a.xyz[:, 2]
         under = np.where(a.is_wet, depth, np.nan)
         layers.append(Layer("Depth", "m", _means(a, under).height_m, DEPTH))
-    if before is not None:
-        higher = _means(a, a.xyz[:, 2] - before.xyz[:, 2]).height_m
-        layers.append(Layer("Change in height", "m", higher, DIFFERENCE, is_centred=True))
+    higher = _means(a, a.xyz[:, 2] - before.xyz[:, 2]).height_m
+    layers.append(Layer("Change in height", "m", higher, DIFFERENCE, is_centred=True))
     # mean squared residual of a coordinate of each point
     rows = a.used & np.isfinite(a.residual_px).all(axis=1)
     owner, m = a.block.owner[rows], len(a.xyz)
@@ -308,7 +301,7 @@ def _residual_table(d: Plain) -> Table:
 # Pictures
 
 
-def pictures_of(d: Plain, adjusted: Adjusted, before: Intersected | None) -> list[Picture]:
+def pictures_of(d: Plain, adjusted: Adjusted, before: Intersected) -> list[Picture]:
     """Return the pictures of an adjustment."""
     drawn = _block(d, adjusted), _vectors(adjusted, before)
     return [picture for picture in drawn if picture is not None]
@@ -358,7 +351,7 @@ def _block(d: Plain, a: Adjusted) -> Picture | None:
     return Picture("block", "Projection centres", alt, figure)
 
 
-def _vectors(a: Adjusted, before: Intersected | None) -> Picture | None:
+def _vectors(a: Adjusted, before: Intersected) -> Picture | None:
     """Draw mean residual vectors over the image, of the sensor with most observations."""
     lenses = a.block.cameras.lenses or ()
     group, _ = sensor_groups(lenses)
@@ -366,8 +359,7 @@ def _vectors(a: Adjusted, before: Intersected | None) -> Picture | None:
     main = int(np.bincount(of_group[a.used], minlength=1).argmax())
     lens = lenses[int(np.flatnonzero(group == main)[0])]
     rows = a.used & (of_group == main)
-    sets = [("before", before.residual_px, BEFORE)] if before is not None else []
-    sets.append(("after", a.residual_px, AFTER))
+    sets = [("before", before.residual_px, BEFORE), ("after", a.residual_px, AFTER)]
     cells = [(name, _cell_means(a, r, rows, lens.width, lens.height), c) for name, r, c in sets]
     largest = max((float(np.hypot(*m[2:]).max(initial=0.0)) for _, m, _ in cells), default=0.0)
     if not largest > 0.0:

@@ -117,7 +117,7 @@ def before_px(adjusted):
 
 def test_text(adjusted):
     adjusted.residual_px[:, 1] *= 2.0
-    text = adjustment_text(adjusted, before_px(adjusted))
+    text = adjustment_text(adjustment_dict(adjusted, before_px(adjusted)))
     land, wet = (re.search(rf"  {name} .*", text)[0].split() for name in ("on land", "under water"))
     # the RMS of a coordinate: every x is 0.3 px on land and 0.4 px under water, y twice that
     assert land[2:9] == ["8", "23", "1.200", "0.474", "0.300", "/", "0.600"]
@@ -142,7 +142,7 @@ def test_text(adjusted):
 
 
 def test_residuals_on_the_ground(adjusted):
-    found = adjustment_dict(adjusted)["residuals"]["land"]["rms_m"]
+    found = adjustment_dict(adjusted, before_px(adjusted))["residuals"]["land"]["rms_m"]
     total = count = 0.0
     for p in np.flatnonzero(~adjusted.is_wet):
         for c in range(3):
@@ -182,8 +182,7 @@ def bare(adjusted):
 
 @pytest.mark.parametrize("kind", ["whole", "bare"])
 def test_page(adjusted, kind):
-    before = before_px(adjusted) if kind == "whole" else None
-    it = adjusted if kind == "whole" else bare(adjusted)
+    before, it = before_px(adjusted), adjusted if kind == "whole" else bare(adjusted)
     pictures = pictures_of(adjustment_dict(it, before), it, before)
     elements = Elements(adjustment_page(it, before))
     said = " ".join(elements.said)
@@ -203,7 +202,8 @@ def test_check_points(adjusted):
     used[-3:] = False
     used[3:6] = False  # a tie point that is left out wholly
     block = replace(adjusted.block, control_names=("G1", "C1"), is_check=np.array([False, True]))
-    values = adjustment_dict(replace(adjusted, block=block, used=used))
+    found = replace(adjusted, block=block, used=used)
+    values = adjustment_dict(found, before_px(found))
     assert values["points"] | {"control": 0, "check": 0} == {
         "all": 22, "land": 8, "water": 14, "left_out": 1, "control": 0, "check": 0,
     }  # fmt: skip
