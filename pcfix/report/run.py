@@ -34,7 +34,7 @@ from pcfix.report.page import (
     new_figure,
 )
 from pcfix.report.summary import Summary
-from pcfix.report.text import FEWEST, formal_words, summary_rows, uncertainty_sentence
+from pcfix.report.text import formal_words, summary_rows, uncertainty_sentence
 from pcfix.version import __version__
 
 if TYPE_CHECKING:
@@ -44,8 +44,6 @@ Plain = dict[str, Any]
 Pair = tuple[str, str]
 FIRST_FIGURES = ("water", "section_1", "depth_bins", "uncertainty", "cameras")
 """Those that are shown where they are there, the first four of them."""
-CONTRADICTS = 1.5
-"""Measured and predicted errors that differ by a larger factor contradict each other."""
 SHOWN_NOTES = 3
 BESIDE_MAP = ("Submerged", "Cameras", "Water", "")
 """Labels of the rows that are also shown beside the map."""
@@ -339,9 +337,18 @@ def accuracy_tile(s: Summary, compared: Plain) -> Tile:
 
 def notes_of(s: Summary, heights: str, compared: Plain) -> list[str]:
     """Return what to check, the most important first; `heights` is the vertical datum."""
-    notes = [] if not compared.get("own") else _contradictions(s, compared)
+    notes = []
     if not compared.get("own"):
         notes.append("No reference: the accuracy is predicted. Check points on the bed measure it.")
+    elif compared.get("bed"):
+        after = compared["bed"]["after"]
+        bias = after["mean_m"]
+        if abs(bias) > max(after["sd_m"], compared["own"]["sigma_reference_m"]):
+            notes.append(
+                f"The bed is too {'high' if bias > 0.0 else 'low'} by {abs(bias):.3f} m on average,"
+                " more than it scatters. Check water level, refractive index, vertical datum and"
+                " poses."
+            )
     if s.poses is not None and s.poses["absorbed"] is None and s.cameras:
         notes.append(f"Poses: {s.poses['words']}.")
     if not heights:
@@ -360,29 +367,3 @@ def notes_of(s: Summary, heights: str, compared: Plain) -> list[str]:
     notes += [one["message"] for one in s.warnings]
     notes += [one["message"] for one in compared.get("notes", ())]
     return [note[:1].upper() + note[1:] for note in notes]
-
-
-def _contradictions(s: Summary, compared: Plain) -> list[str]:
-    """Return notes where measured errors are not the predicted ones, or the bed has a bias."""
-    own, bed = compared["own"], compared.get("bed")
-    if not bed:
-        return []
-    notes, after, noise = [], bed["after"], own["sigma_reference_m"]
-    if s.uncertainty is not None and after["count"] >= FEWEST:
-        sigma, measured = s.uncertainty["sigma_z_m"]["mean"], after["rmse_m"]
-        expected = (sigma**2 + noise**2) ** 0.5
-        if not 1.0 / CONTRADICTS <= measured / expected <= CONTRADICTS:
-            is_larger = measured > expected
-            notes.append(
-                f"The measured errors of the bed are {'larger' if is_larger else 'smaller'} than"
-                f" the predicted ones (RMSE {measured:.3f} m, predicted {expected:.3f} m with the"
-                f" reference's noise; 95 % predicted {COVERAGE_95 * sigma:.3f} m without): "
-                f"{'use the measured ones' if is_larger else 'the predicted ones are cautious'}."
-            )
-    bias = after["mean_m"]
-    if abs(bias) > max(after["sd_m"], noise):
-        notes.append(
-            f"The bed is too {'high' if bias > 0.0 else 'low'} by {abs(bias):.3f} m on average,"
-            " more than it scatters. Check water level, refractive index, vertical datum and poses."
-        )
-    return notes
