@@ -118,7 +118,7 @@ def adjust_block(
         found = adjust_cloud(given, unknowns, sets, progress)
     notes += [*_check_dry(material.water, found), *found.notes]
     if found.precision is not None:
-        notes += [*undetermined(found.precision, found.unknowns), *correlated(found.precision)]
+        notes += [*undetermined(found.precision), *correlated(found.precision)]
         wet = found.is_wet & np.isfinite(found.xyz).all(axis=1)
         notes += shape_notes(found.precision, (found.xyz - found.origin)[wet, :2])
     return replace(found, notes=[*notes, *datum_notes(found), *bed_notes(found)])

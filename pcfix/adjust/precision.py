@@ -20,17 +20,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
-from pcfix.adjust.block import (
-    CODES,
-    INDEX,
-    PORT,
-    SHAPE,
-    WATER_NAMES,
-    Unknowns,
-    lens_parameter,
-    moved_lens,
-    words_of,
-)
+from pcfix.adjust.block import CODES, INDEX, PORT, SHAPE, lens_parameter, moved_lens, words_of
 from pcfix.adjust.normal import point_covariances
 from pcfix.adjust.problem import Problem, Solution, polynomial
 from pcfix.adjust.solve import BED, moved_by, reduced_at, singular, solver
@@ -166,9 +156,6 @@ def precision_of(
 STRONG = 0.95
 """Correlation of two unknowns that are hardly separated."""
 
-NO_NEWS = 0.9
-"""Share of a given standard deviation above which the images did not improve an unknown."""
-
 LIMITS = {
     "level": 0.02, "tilt_x": 0.0005, "tilt_y": 0.0005, "index": 0.005, "scale": 0.001,
     "distance": 0.002, "centre_x": 0.002, "centre_y": 0.002, "centre_z": 0.002,
@@ -201,28 +188,18 @@ def correlated(precision: Precision) -> list[PcfixWarning]:
     return sorted(notes, key=lambda note: -abs(note.values["correlation"]))
 
 
-def undetermined(precision: Precision, unknowns: Unknowns) -> list[PcfixWarning]:
+def undetermined(precision: Precision) -> list[PcfixWarning]:
     """Return a warning for each unknown whose standard error is too large to be useful."""
-    given, notes = dict(zip(WATER_NAMES, unknowns.water_sigma, strict=True)), []
+    notes = []
     for row in precision.shared:
         (what, unit), limit = words_of(row.name), LIMITS.get(row.name, np.inf)
-        prior = given.get(row.name, np.inf)
         if row.sigma > limit:
-            code = "adjust.undetermined"
             words = (
-                f"is undetermined: standard error {row.sigma:.2g}{unit} (limit {limit:g}{unit})."
-                " Fix it to a measured value."
+                f"the {what} is undetermined: standard error {row.sigma:.2g}{unit} (limit"
+                f" {limit:g}{unit}). Fix it to a measured value."
             )
-        elif prior < np.inf and row.sigma > NO_NEWS * prior:
-            code = "adjust.not_improved"
-            words = (
-                "was not improved: the images determine it no better than its given standard"
-                f" deviation of {prior:g}{unit}."
-            )
-        else:
-            continue
-        words = f"the {what} {words}"
-        notes.append(PcfixWarning(code, words, unknown=row.name, sigma=row.sigma))
+            values = {"unknown": row.name, "sigma": row.sigma}
+            notes.append(PcfixWarning("adjust.undetermined", words, **values))
     return notes
 
 

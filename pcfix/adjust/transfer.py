@@ -13,14 +13,13 @@ may sink or lift whole beaches.
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from pcfix.adjust.block import some_cameras
-from pcfix.errors import GeometryError, PcfixWarning
+from pcfix.errors import GeometryError
 from pcfix.kernels import Span, device, in_tiles, kernel, most_between
 from pcfix.lens.algebra import dot, minus, plus, plus_square, row_of, scaled, solved, times, vector
 from pcfix.lens.imaging import image_in_world, image_of
@@ -271,33 +270,18 @@ class CloudTransfer:
         return replace(ties, xyz=xyz)
 
     def check_models(self, xyz: FloatArray) -> None:
-        """Refuse models in different places, given points of the cloud; warn of single images."""
+        """Refuse models in different places, given points of the cloud."""
         if not len(xyz):
             return
-        original, apart = self.original, self._apart_m()
-        height = float(np.median(original.centres[:, 2]) - np.median(xyz[:, 2]))
-        middle, most = float(np.median(apart)), MOST_APART * height
-        if height <= 0.0 or apart.max() <= most:
-            return
-        if middle > most:
+        height = float(np.median(self.original.centres[:, 2]) - np.median(xyz[:, 2]))
+        apart = float(np.median(self._apart_m()))
+        if apart > MOST_APART * height > 0.0:
             words = (
-                f"--adjusted-from: its cameras are {middle:,.0f} m from the adjusted ones (median;"
+                f"--adjusted-from: its cameras are {apart:,.0f} m from the adjusted ones (median;"
                 f" flying height {height:,.0f} m). Check both files, --cameras-crs and"
                 " --cameras-offset, which count for the file that has no CRS."
             )
-            raise GeometryError("adjusted_from.apart", words, apart_m=middle, height_m=height)
-        worst = int(np.argmax(apart))
-        warnings.warn(
-            PcfixWarning(
-                "adjusted_from.images_apart",
-                f"{int((apart > most).sum())} of {len(apart)} images moved by more than a tenth of"
-                f" the flying height in the adjustment (most: {original.labels[worst]},"
-                f" {apart[worst]:,.0f} m). Check their poses.",
-                image=original.labels[worst],
-                moved_m=float(apart[worst]),
-            ),
-            stacklevel=3,
-        )
+            raise GeometryError("adjusted_from.apart", words, apart_m=apart, height_m=height)
 
     def _apart_m(self) -> FloatArray:
         """Return the distances between original and adjusted centres, shape (k,)."""

@@ -203,7 +203,7 @@ def test_sloping_bed():
     for name in ("level", "index"):
         assert every.sigma_of(name) > 2.0 * sigma[name].sigma_of(name)
     assert correlated(sigma["level"]) == []
-    assert undetermined(every, unknowns)[0].values["unknown"] == "level"
+    assert undetermined(every)[0].values["unknown"] == "level"
 
 
 def test_large_block(monkeypatch):
