@@ -119,6 +119,12 @@ def adjust_block(
     notes += [*_check_dry(material.water, found), *found.notes]
     if found.precision is not None:
         notes += [*undetermined(found.precision), *correlated(found.precision)]
+        if found.precision.members is None:
+            words = (
+                f"The block is too large ({len(block.cameras):,} images) for covariances of its"
+                " points, and the correction cannot use the errors of the poses."
+            )
+            notes.append(PcfixWarning("adjust.too_large", words, images=len(block.cameras)))
         wet = found.is_wet & np.isfinite(found.xyz).all(axis=1)
         notes += shape_notes(found.precision, (found.xyz - found.origin)[wet, :2])
     return replace(found, notes=[*notes, *datum_notes(found), *bed_notes(found)])

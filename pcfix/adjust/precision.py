@@ -56,7 +56,6 @@ class Precision:
     correlation: FloatArray  # (g, g), of the shared unknowns
     # (m, 6), xx, xy, xz, yy, yz, zz; NaN if not determined, None for very large blocks
     point_covariance_m2: FloatArray | None
-    notes: tuple[PcfixWarning, ...] = ()
     members: Members | None = None  # drawn from the joint covariance; None for very large blocks
 
     @property
@@ -127,14 +126,7 @@ def precision_of(
         poses = by @ of_shared[-7:, -7:] @ by.transpose(0, 2, 1)
     points: FloatArray | None = None
     members: Members | None = None
-    notes: tuple[PcfixWarning, ...] = ()
-    if inverse is None:
-        words = (
-            f"The block has {u:,} unknowns (limit {DENSE_UP_TO:,}), so its points have no"
-            " covariances, and the correction cannot use the errors of the poses."
-        )
-        notes = (PcfixWarning("adjust.too_large", words, unknowns=u),)
-    else:
+    if inverse is not None:
         each = np.append(np.tile(times[:6], len(free)), times[6:])
         inverse *= each
         inverse *= each[:, None]
@@ -146,7 +138,7 @@ def precision_of(
     rows_of = zip(problem.names, solution.shared.tolist(), (sigma * sigma0).tolist(), strict=True)
     return Precision(
         sigma0, variance * poses, tuple(SharedUnknown(*row) for row in rows_of), correlation,
-        points, notes, members,
+        points, members,
     )  # fmt: skip
 
 

@@ -228,8 +228,7 @@ def adjustment_dict(adjusted: Adjusted, before: Intersected) -> Plain:
     """
     a, block, u = adjusted, adjusted.block, adjusted.unknowns
     kept = len(block.cameras) if u.poses == "fixed" else 0
-    known, lenses, notes = a.precision, block.cameras.lenses or (), [*a.notes]
-    notes += [] if known is None else known.notes
+    known, lenses = a.precision, block.cameras.lenses or ()
     found = {
         "source": a.source,
         "image_unit": lenses[0].unit,
@@ -261,7 +260,7 @@ def adjustment_dict(adjusted: Adjusted, before: Intersected) -> Plain:
         "check": _surveyed([row for row in a.control if row.role == "check"]),
         "rounds": len({row.round: row for row in a.rounds}),
         "steps": len(a.rounds),
-        "notes": [one.as_dict() for one in {str(one): one for one in notes}.values()],
+        "notes": [one.as_dict() for one in {str(one): one for one in a.notes}.values()],
     }
     return dict(plain(found))
 
