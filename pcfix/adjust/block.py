@@ -68,7 +68,6 @@ def words_of(name: str) -> tuple[str, str]:
 
 
 Poses = Literal["free", "fixed", "similarity"]
-Robust = Literal["squares", "huber", "cauchy"]
 
 WATER = "water"
 """The name of the water among planes."""
@@ -103,7 +102,6 @@ class LogRow(NamedTuple):
 
     round: int
     steps: int
-    cost: float
     observations: int
     rms_px: float
 

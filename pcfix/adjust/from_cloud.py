@@ -270,7 +270,7 @@ def solve_unaware(
             break
         now = moved
         cost = survey_cost(problem, now) + priors_at(problem, now)[0]
-        row = LogRow(1, number, cost, *counts_of(problem, now))
+        row = LogRow(1, number, *counts_of(problem, now))
         log.append(row)
         if progress is not None:
             progress(row)

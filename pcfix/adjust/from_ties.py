@@ -23,12 +23,11 @@ from pcfix.adjust.block import (
     NAMES,
     Block,
     Progress,
-    Robust,
     Unknowns,
     check_datum,
     usable_codes,
 )
-from pcfix.adjust.normal import residuals
+from pcfix.adjust.normal import CAUCHY, HUBER, SQUARES, residuals
 from pcfix.adjust.precision import Precision, precision_of
 from pcfix.adjust.problem import Problem, Solution, prepare
 from pcfix.adjust.result import Adjusted, adjusted_of, sigma0_of
@@ -123,14 +122,14 @@ def _cleaned(
     """Return the problem with the noise of its tie points estimated and outliers excluded."""
     estimate = sigma_px is None
     if outliers or estimate:
-        now = solve(problem, now, "huber", number=1, progress=progress, close=ROUGHLY)
+        now = solve(problem, now, HUBER, number=1, progress=progress, close=ROUGHLY)
     if estimate:
         problem = with_sigma(problem, noise_px(problem, now))
     if not outliers:
         return problem, now
     for number in range(OUTLIER_ROUNDS):
-        robust: Robust = "cauchy" if number == 0 else "squares"
-        now = solve(problem, now, robust, number=2 + number, progress=progress, close=ROUGHLY)
+        loss = CAUCHY if number == 0 else SQUARES
+        now = solve(problem, now, loss, number=2 + number, progress=progress, close=ROUGHLY)
         before = problem.used
         problem = without_outliers(problem, now)
         _check_most(
@@ -164,7 +163,7 @@ def _settled(
     if estimate:
         problem = with_sigma(problem, noise_px(problem, now, robust=False))
         problem = weighed(problem, now)[0]
-    now = solve(problem, now, "squares", number=number, progress=progress)
+    now = solve(problem, now, number=number, progress=progress)
     return problem, now, precision_of(problem, now, sigma0_of(problem, now))
 
 
@@ -211,7 +210,7 @@ def _with_lens(
     wide, start = prepare(problem.block, replace(problem.unknowns, lens=lens))
     wide = wide.weighted(problem.given.weight)
     start = replace(start, state=start.state._replace(xyz=now.state.xyz), log=now.log)
-    start = solve(wide, start, "squares", number=LAST_ROUND + 1, progress=progress, close=ROUGHLY)
+    start = solve(wide, start, number=LAST_ROUND + 1, progress=progress, close=ROUGHLY)
     if not outliers:
         return wide, start
     used = problem.given.weight[problem.of_ties].max(initial=0.0)

@@ -13,23 +13,14 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pcfix.adjust.block import INDEX, LogRow, Progress, Robust, moved_lens, words_of
+from pcfix.adjust.block import INDEX, LogRow, Progress, moved_lens, words_of
 from pcfix.adjust.collinearity import State
-from pcfix.adjust.normal import (
-    CAUCHY,
-    HUBER,
-    SQUARES,
-    UNDAMPED,
-    Rule,
-    normal_equations,
-    point_steps,
-)
+from pcfix.adjust.normal import SQUARES, UNDAMPED, Rule, normal_equations, point_steps
 from pcfix.adjust.problem import Problem, Solution, cost_at, counts_of, port_of, port_row, priors_at
 from pcfix.errors import GeometryError, PcfixError
 from pcfix.lens.imaging import lens_table
 from pcfix.model import FloatArray
 
-LOSSES = {"squares": SQUARES, "huber": HUBER, "cauchy": CAUCHY}
 LOSS_SCALE = 2.0
 """Where a robust loss departs from least squares, in standard deviations."""
 
@@ -53,7 +44,7 @@ WEAK = 1e-11
 def solve(
     problem: Problem,
     start: Solution,
-    robust: Robust = "squares",
+    loss: int = SQUARES,
     number: int = 1,
     progress: Progress | None = None,
     close: float = CLOSE,
@@ -62,14 +53,14 @@ def solve(
 
     Parameters
     ----------
-    robust : {"squares", "huber", "cauchy"}
-        The loss function.
+    loss : int
+        `SQUARES`, `HUBER` or `CAUCHY` of `pcfix.adjust.normal`.
     number : int
         Of the round, for the log.
     close : float
         Two steps in a row that lower the cost by less than this share end the round.
     """
-    rule = Rule(LOSSES[robust], LOSS_SCALE)
+    rule = Rule(loss, LOSS_SCALE)
     now = replace(start, cost=cost_at(problem, start, rule))
     if not np.isfinite(now.cost):
         raise GeometryError(
@@ -94,7 +85,7 @@ def solve(
         gain = (now.cost - trial.cost) / max(now.cost, least_cost)
         now, up = trial, 2.0
         damping = max(damping / 10.0, LEAST_DAMPING)
-        row = LogRow(number, step + 1, now.cost, *counts_of(problem, now))
+        row = LogRow(number, step + 1, *counts_of(problem, now))
         log.append(row)
         if progress is not None:
             progress(row)

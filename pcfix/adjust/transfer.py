@@ -274,7 +274,8 @@ class CloudTransfer:
         if not len(xyz):
             return
         height = float(np.median(self.original.centres[:, 2]) - np.median(xyz[:, 2]))
-        apart = float(np.median(self._apart_m()))
+        way = self.adjusted.centres - self.original.centres
+        apart = float(np.median(np.linalg.norm(way, axis=1)))
         if apart > MOST_APART * height > 0.0:
             words = (
                 f"--adjusted-from: its cameras are {apart:,.0f} m from the adjusted ones (median;"
@@ -282,11 +283,6 @@ class CloudTransfer:
                 " --cameras-offset, which count for the file that has no CRS."
             )
             raise GeometryError("adjusted_from.apart", words, apart_m=apart, height_m=height)
-
-    def _apart_m(self) -> FloatArray:
-        """Return the distances between original and adjusted centres, shape (k,)."""
-        apart = self.adjusted.centres - self.original.centres
-        return np.asarray(np.linalg.norm(apart, axis=1))
 
     def check(self, name: str, counts: TransferCounts) -> None:
         """Refuse a cloud that the original cameras do not see."""
@@ -299,21 +295,18 @@ class CloudTransfer:
 
     def as_dict(self, counts: TransferCounts) -> dict[str, Any]:
         """Return the statistics as plain values, metres."""
-        apart, mean = self._apart_m(), counts.sum_m / max(counts.points, 1)
+        mean = counts.sum_m / max(counts.points, 1)
         shift = {
             "mean_x": mean[0], "mean_y": mean[1], "mean_z": mean[2], "rms": np.sqrt(mean[3]),
             "max": counts.most_m,
         }  # fmt: skip
-        centres = {"rms": np.sqrt((apart**2).mean()), "max": apart.max()}
         return {
             "points": counts.points,
             "land": counts.land,
             "not_carried": counts.not_moved,
             "not_carried_reason": REASON,
             "shift_m": {name: round(float(value), 4) for name, value in shift.items()},
-            "cameras": len(apart),
             "cameras_left_out": list(self.left_out),
-            "centres_m": {name: round(float(value), 4) for name, value in centres.items()},
         }
 
     def provenance(self) -> dict[str, Any]:

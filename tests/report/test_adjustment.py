@@ -80,8 +80,8 @@ def adjusted():
     used = np.ones(72, bool)
     used[[1, 40]] = False
     residual[~used] = 30.0
-    rounds = [LogRow(1, 1, 900.0, 72, 2.5), LogRow(1, 2, 400.0, 72, 0.9),
-              LogRow(2, 1, 100.0, 70, 0.37)]  # fmt: skip
+    rounds = [LogRow(1, 1, 72, 2.5), LogRow(1, 2, 72, 0.9),
+              LogRow(2, 1, 70, 0.37)]  # fmt: skip
     control = [
         ControlRow("G1", "control", 0.010, -0.020, 0.030, 0.5, 3),
         ControlRow("G2", "control", 0.010, 0.020, -0.050, 0.7, 2),
