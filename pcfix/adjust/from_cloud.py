@@ -329,13 +329,11 @@ def mended(
     true = true_start(ties.xyz, water, refractive_index, wet)
     block = replace(
         plain_block(cameras, replace(ties, xyz=true), water, refractive_index, wet),
-        sigma_px=np.full(len(ties.image_xy), SIGMA_PX),
         gnss_xyz=cameras.centres,
         gnss_sigma_m=np.full((len(cameras), 3), OWN_SIGMA_M),
     )
-    problem, begin = prepare(block, Unknowns(lens=("f",)))
-    tests = straight_columns(problem, begin, ties.xyz - problem.origin)
-    found = solve_unaware(problem, begin, tests)
+    trial = _trial(CloudBlock(block, cameras, ties.xyz), Unknowns(lens=("f",)), SIGMA_PX, None)
+    problem, found = trial.problem, trial.found
     higher = found.state.xyz[:, 2] + problem.origin[2] - intersect_fixed(block).xyz[:, 2]
     known = np.isfinite(higher)
     return Mended(solved_cameras(problem, found), row, higher[~wet & known], higher[wet & known])

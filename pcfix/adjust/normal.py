@@ -88,46 +88,6 @@ def in_parts(
 
 
 @device
-def linearise(
-    state: State, given: Given, rule: Rule, p: int, o: int, work: Workspace, at: int
-) -> bool:
-    """Fill a row of the workspace with an observation's weighted residual and derivatives.
-
-    Returns whether the observation counts.
-    """
-    own, row, r = work.own, work.right[at], work.r[at]
-    c, w = given.camera[o], given.weight[o]
-    if w == 0.0:
-        return False
-    u, v = image_and_all_gradients(state, given, p, c, work, own)
-    r[0], r[1] = given.image_xy[o, 0] - u, given.image_xy[o, 1] - v
-    square = w * w * (r[0] * r[0] + r[1] * r[1])
-    if not square < np.inf:
-        return False
-    # a robust loss is least squares with the derivative of the loss as weight
-    if rule.kind == HUBER and square > rule.scale * rule.scale:
-        w *= np.sqrt(rule.scale / np.sqrt(square))
-    elif rule.kind == CAUCHY:
-        w *= np.sqrt(1.0 / (1.0 + square / (rule.scale * rule.scale)))
-    group = given.group[c]
-    first, last = given.first_lens[group], given.first_lens[group + 1]
-    shared = row[:, SHARED:]
-    shared[:] = 0.0
-    if last > first:
-        lens, codes = state.lenses[given.lens_row[c]], given.code[first:last]
-        lens_gradients(lens, work.ahead, codes, shared[:, first:last])
-    for axis in range(2):
-        for i in range(SURFACE):
-            row[axis, i] = own[axis, i]
-        for i in range(min(PLANES, given.column.size)):
-            if given.column[i] >= 0:
-                shared[axis, given.column[i]] = own[axis, SURFACE + i]
-    r *= w
-    row *= w
-    return True
-
-
-@device
 def linearise_point(
     state: State, given: Given, rule: Rule, p: int, work: Workspace
 ) -> tuple[int, int]:
@@ -136,13 +96,40 @@ def linearise_point(
     Returns how many rows of the workspace count, and how many of them are images (the other one is
     a condition). Zero if the rays do not fix the point: then it tells nothing about the cameras.
     """
-    v, rhs, count = work.v, work.rhs, 0
+    v, rhs, own, count = work.v, work.rhs, work.own, 0
     v[:], rhs[:] = 0.0, 0.0
     for o in range(given.start[p], given.start[p + 1]):
-        if linearise(state, given, rule, p, o, work, count):
-            work.row[count] = o
-            _add_point(given, work, count)
-            count += 1
+        c, w, row, r = given.camera[o], given.weight[o], work.right[count], work.r[count]
+        if w == 0.0:
+            continue
+        u_found, v_found = image_and_all_gradients(state, given, p, c, work, own)
+        r[0], r[1] = given.image_xy[o, 0] - u_found, given.image_xy[o, 1] - v_found
+        square = w * w * (r[0] * r[0] + r[1] * r[1])
+        if not square < np.inf:
+            continue
+        # a robust loss is least squares with the derivative of the loss as weight
+        if rule.kind == HUBER and square > rule.scale * rule.scale:
+            w *= np.sqrt(rule.scale / np.sqrt(square))
+        elif rule.kind == CAUCHY:
+            w *= np.sqrt(1.0 / (1.0 + square / (rule.scale * rule.scale)))
+        # derivatives by pose and point, then by shared unknowns: lens, water and port
+        first, last = given.first_lens[given.group[c]], given.first_lens[given.group[c] + 1]
+        shared = row[:, SHARED:]
+        shared[:] = 0.0
+        if last > first:
+            lens, codes = state.lenses[given.lens_row[c]], given.code[first:last]
+            lens_gradients(lens, work.ahead, codes, shared[:, first:last])
+        for axis in range(2):
+            for i in range(SURFACE):
+                row[axis, i] = own[axis, i]
+            for i in range(min(PLANES, given.column.size)):
+                if given.column[i] >= 0:
+                    shared[axis, given.column[i]] = own[axis, SURFACE + i]
+        r *= w
+        row *= w
+        work.row[count] = o
+        _add_point(given, work, count)
+        count += 1
     images = count
     if count and condition(state, given, p, work, count):
         work.row[count] = work.row[0]  # any camera will do: the derivatives by its pose are zero

@@ -355,13 +355,6 @@ def notes_of(s: Summary, heights: str, compared: Plain) -> list[str]:
         notes.append(
             "The vertical datum is not known: water level, cloud and reference must have the same."
         )
-    fate = {"withhold": "withheld", "keep": "kept", "drop": "dropped"}[s.settings["uncorrected"]]
-    notes += [
-        f"{count:,} points under water could not be corrected ({reason}). They were not moved and"
-        f" are {fate}."
-        for reason, count in s.uncorrected.items()
-        if count
-    ]
     if s.water_unknown:
         notes.append(f"{s.water_unknown:,} points have no known water surface above them.")
     notes += [one["message"] for one in s.warnings]
