@@ -49,13 +49,14 @@ LOST = 1e6
 """Cost of an observation whose point has left its image, as a weighted square."""
 
 SQUARES, HUBER, CAUCHY = range(3)
+LOSS_SCALE = 2.0
+"""Where a robust loss departs from least squares, in standard deviations."""
 
 
 class Rule(NamedTuple):
     """How normal equations are summed."""
 
-    kind: int = SQUARES  # loss function
-    scale: float = 1.0  # where it departs from least squares, in standard deviations
+    loss: int = SQUARES
     # Levenberg-Marquardt's factor on the diagonal of V; that of the poses is added later
     damping: float = 0.0
 
@@ -108,10 +109,10 @@ def linearise_point(
         if not square < np.inf:
             continue
         # a robust loss is least squares with the derivative of the loss as weight
-        if rule.kind == HUBER and square > rule.scale * rule.scale:
-            w *= np.sqrt(rule.scale / np.sqrt(square))
-        elif rule.kind == CAUCHY:
-            w *= np.sqrt(1.0 / (1.0 + square / (rule.scale * rule.scale)))
+        if rule.loss == HUBER and square > LOSS_SCALE * LOSS_SCALE:
+            w *= np.sqrt(LOSS_SCALE / np.sqrt(square))
+        elif rule.loss == CAUCHY:
+            w *= np.sqrt(1.0 / (1.0 + square / (LOSS_SCALE * LOSS_SCALE)))
         # derivatives by pose and point, then by shared unknowns: lens, water and port
         first, last = given.first_lens[given.group[c]], given.first_lens[given.group[c] + 1]
         shared = row[:, SHARED:]
@@ -185,13 +186,13 @@ def _residuals(span: Span, state: State, given: Given, found: FloatArray, work: 
             found[o, 0], found[o, 1] = given.image_xy[o, 0] - u, given.image_xy[o, 1] - v
 
 
-def cost_of(squares: FloatArray, rule: Rule) -> float:
+def cost_of(squares: FloatArray, loss: int) -> float:
     """Return the sum of the loss of weighted squared residuals; NaN ones cost `LOST`."""
     lost = np.isnan(squares)
-    s, c2 = np.where(lost, 0.0, squares), rule.scale * rule.scale
-    if rule.kind == HUBER:
-        s = np.where(s <= c2, s, 2.0 * rule.scale * np.sqrt(s) - c2)
-    elif rule.kind == CAUCHY:
+    s, c2 = np.where(lost, 0.0, squares), LOSS_SCALE * LOSS_SCALE
+    if loss == HUBER:
+        s = np.where(s <= c2, s, 2.0 * LOSS_SCALE * np.sqrt(s) - c2)
+    elif loss == CAUCHY:
         s = c2 * np.log1p(s / c2)
     return float(s.sum() + LOST * lost.sum())
 

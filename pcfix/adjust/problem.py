@@ -409,7 +409,7 @@ def cost_at(problem: Problem, found: Solution, rule: Rule) -> float:
     """Return the cost of a solution: images, surveyed points and all prior knowledge."""
     used, weight = problem.used, problem.given.weight
     r = residuals(found.state, problem.given)[used]
-    images = cost_of((r**2).sum(axis=1) * weight[used] ** 2, rule)
+    images = cost_of((r**2).sum(axis=1) * weight[used] ** 2, rule.loss)
     return images + survey_cost(problem, found) + priors_at(problem, found)[0]
 
 

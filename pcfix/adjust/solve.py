@@ -21,9 +21,6 @@ from pcfix.errors import GeometryError, PcfixError
 from pcfix.lens.imaging import lens_table
 from pcfix.model import FloatArray
 
-LOSS_SCALE = 2.0
-"""Where a robust loss departs from least squares, in standard deviations."""
-
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-12, 1e8
 MOST_STEPS = 60
 CLOSE = 1e-10
@@ -60,7 +57,7 @@ def solve(
     close : float
         Two steps in a row that lower the cost by less than this share end the round.
     """
-    rule = Rule(loss, LOSS_SCALE)
+    rule = Rule(loss)
     now = replace(start, cost=cost_at(problem, start, rule))
     if not np.isfinite(now.cost):
         raise GeometryError(
