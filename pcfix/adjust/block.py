@@ -126,6 +126,9 @@ class Conditions:
     parallel: tuple[str, ...] = ()  # names of parallel planes, perhaps with `WATER`
 
 
+NO_CONDITIONS = Conditions((), np.zeros(0, np.int64), np.zeros(0))
+
+
 @dataclass(frozen=True, eq=False)
 class Block:
     """Images, points and measurements."""
@@ -148,7 +151,7 @@ class Block:
     control_names: tuple[str, ...] = ()  # of the surveyed points, the last ones of `xyz`
     # of them, not used in the adjustment
     is_check: BoolArray = field(default_factory=lambda: np.zeros(0, np.bool_))
-    conditions: Conditions | None = None  # points on surfaces
+    conditions: Conditions = NO_CONDITIONS  # points on surfaces
 
     @property
     def owner(self) -> IntArray:
@@ -376,11 +379,11 @@ def block_of(material: Material, ties: TiePoints, sigma_px: float) -> Block:
 
 def _on_surfaces(
     material: Material, control: GroundControl, marks: TiePoints, ties: int
-) -> tuple[Conditions | None, BoolArray, FloatArray]:
+) -> tuple[Conditions, BoolArray, FloatArray]:
     """Return conditions of surveyed points, which are under water, and their start values."""
     under_water, xyz, on = control.under_water.copy(), control.xyz, np.array(control.on)
     if not any(control.on):
-        return None, under_water, xyz
+        return NO_CONDITIONS, under_water, xyz
     names = tuple(dict.fromkeys(name for name in control.on if name and name != WATER))
     number = {"": -1, WATER: 0} | {name: i for i, name in enumerate(names, start=1)}
     rows = np.array([-1] * ties + [number[name] for name in control.on])

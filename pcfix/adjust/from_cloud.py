@@ -166,7 +166,7 @@ def _check(block: Block, unknowns: Unknowns) -> None:
             " model with tie points, or fix the water."
         )
         raise GeometryError("adjust.cloud_needs_water", words)
-    if block.conditions is not None:
+    if len(block.conditions.on):
         words = (
             "Points on the water or on a plane need measured tie points. Give a model with tie"
             " points, or remove the roles waterline and on:NAME from --gcps."

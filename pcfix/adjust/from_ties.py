@@ -17,16 +17,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import chdtri
 
-from pcfix.adjust.block import (
-    CODES,
-    LEAST_VIEWS,
-    NAMES,
-    Block,
-    Progress,
-    Unknowns,
-    check_datum,
-    usable_codes,
-)
+from pcfix.adjust.block import CODES, LEAST_VIEWS, NAMES, Block, Progress, Unknowns, usable_codes
 from pcfix.adjust.normal import CAUCHY, HUBER, SQUARES, residuals
 from pcfix.adjust.precision import Precision, precision_of
 from pcfix.adjust.problem import Problem, Solution, prepare
@@ -73,7 +64,6 @@ def adjust_ties(
         Whether lens parameters that the block does not determine are fixed, and those that lower
         the residuals freed; else exactly those of the unknowns are free.
     """
-    check_datum(block, unknowns)
     problem, now = prepare(block, unknowns)
     in_front = np.asarray(np.isfinite(residuals(now.state, problem.given)).all(axis=1))
     _check_most(

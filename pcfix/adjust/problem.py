@@ -15,6 +15,7 @@ from pcfix.adjust.block import (
     INDEX,
     MOTIONS,
     NAMES,
+    NO_CONDITIONS,
     PLANES,
     PORT,
     SHAPE,
@@ -197,10 +198,8 @@ def prepare(
         shared=shared,
         surveyed_xyz=np.where(weight > 0.0, block.surveyed_xyz - origin, 0.0),
         surveyed_weight=weight,
-        on=np.asarray([] if conditions is None else conditions.on, np.int64),
-        on_weight=np.zeros(0)
-        if conditions is None
-        else np.where(conditions.on >= 0, 1.0 / conditions.sigma_m, 0.0),
+        on=np.asarray(conditions.on, np.int64),
+        on_weight=np.where(conditions.on >= 0, 1.0 / conditions.sigma_m, 0.0),
         axis=axis,
         tests=np.zeros((0, 2, SHARED + shared)),
     )
@@ -243,8 +242,6 @@ def _planes(
     unknown as another one, counted from the first of `WATER_NAMES`.
     """
     given = block.conditions
-    if given is None:
-        return [], [], np.zeros(0, np.int64), {}
     xyz, counts = block.xyz - origin, np.diff(block.start) > 0
     bundles = [tuple(given.parallel)] if given.parallel else []
     bundles += [(name,) for name in given.names if name not in given.parallel]
@@ -481,7 +478,9 @@ def intersect_fixed(block: Block) -> Intersected:
 
     It fails for a point that needs more than `STEPS` Gauss-Newton steps.
     """
-    problem, now = prepare(replace(block, conditions=None), Unknowns(poses="fixed", lens=()))
+    problem, now = prepare(
+        replace(block, conditions=NO_CONDITIONS), Unknowns(poses="fixed", lens=())
+    )
     nothing = np.zeros(6 * len(problem.moves))
     state, step = now.state, np.full((len(block.xyz), 3), np.inf)
     for _ in range(STEPS):

@@ -13,6 +13,7 @@ from pcfix.adjust.block import (
     INDEX,
     LEAST_VIEWS,
     NAMES,
+    NO_CONDITIONS,
     PORT,
     SHAPE,
     WATER,
@@ -156,7 +157,7 @@ def _with_check_points(problem: Problem, now: Solution) -> FloatArray:
         return xyz
     whole = replace(
         block, cameras=solved_cameras(problem, now), xyz=xyz, water=water_of(problem, now.state),
-        conditions=None, port=port_of(block, now.state.water),
+        conditions=NO_CONDITIONS, port=port_of(block, now.state.water),
         refractive_index=float(now.state.water[INDEX]),
         sigma_px=np.where(np.isin(block.owner, rows), 1.0, np.inf),
     )  # fmt: skip
@@ -181,7 +182,7 @@ def _control_rows(block: Block, xyz: FloatArray, r: FloatArray) -> list[ControlR
 def _on_surfaces(problem: Problem, now: Solution) -> list[Plain]:
     """Return the stated and found distances of marked points from each surface, metres."""
     given, block, found = problem.block.conditions, problem.block, list[Plain]()
-    if given is None:
+    if not len(given.on):
         return []
     off = np.where(np.diff(block.start) > 0, surface_distances(problem, now), np.nan)
     for number, name in enumerate((WATER, *given.names)):
@@ -240,7 +241,7 @@ def adjustment_dict(adjusted: Adjusted, before: Intersected) -> Plain:
             "lens": u.lens,
             "surface": dict(u.surface),
             "free_network": u.free_network,
-            "parallel": () if block.conditions is None else block.conditions.parallel,
+            "parallel": block.conditions.parallel,
         },
         **_counts(a),
         "sigma0": a.sigma0,

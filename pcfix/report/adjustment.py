@@ -83,15 +83,9 @@ def _residuals(d: Plain) -> str:
 
 
 def adjustment_sentence(d: Plain) -> str:
-    """Return an adjustment in half a line."""
-    residuals = _residuals(d)
-    parts = [f"centres moved {fixed(d['poses']['moved_rms_m'], 3)} m (rms)"]
-    parts += [f"residuals {residuals}"] if residuals else []
-    for row in d["lens"][:1]:
-        if row["name"] == "f":
-            words = f"focal length {row['before']:.6g} -> {row['after']:.6g} {d['image_unit']}"
-            parts.insert(0, words)
-    return ", ".join(parts)
+    """Return an adjustment in a line."""
+    facts = [f"{label}: {text}" for label, text in _facts(d) if label in ("focal length", "poses")]
+    return "; ".join([*facts, f"residuals: {_residuals(d)}"])
 
 
 def adjustment_text(d: Plain) -> str:
