@@ -10,7 +10,7 @@ import numpy as np
 
 from pcfix.errors import bad_file
 from pcfix.flow.next_steps import FOLDER
-from pcfix.flow.request import Files, Request, cameras_of, inputs_of_run, water_of
+from pcfix.flow.request import Files, Request, cameras_of, inputs_of_run
 from pcfix.flow.run_adjust import figures_of
 from pcfix.flow.surfaces import view_of
 from pcfix.flow.water import found_picture
@@ -78,8 +78,7 @@ def report_run(
     if (summary.water_fit or {}).get("model") == "auto":  # the water was sought in the cloud
         pictures.append(found_picture(again.surface(view_of(request.source))))
     run = RunResults(
-        summary, cameras, water_of(request, files),
-        **read_cloud(files.cleaned_cloud, files.resolution_m),
+        summary, cameras, **read_cloud(files.cleaned_cloud, files.resolution_m),
         project=request.project or "", date=request.date or again.dates(cameras),
         pictures=pictures, tables=tables, verdict=verdict, compared=compared.get("figures", {}),
         difference=dod,

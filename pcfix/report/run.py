@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import platform
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -14,7 +13,7 @@ import numpy as np
 
 from pcfix.grid.colours import DEPTH, DIFFERENCE, RAYS, UNCERTAINTY
 from pcfix.grid.maps import Extent, Maps, contours, depth_interval
-from pcfix.model import Cameras, FloatArray, WaterPlane, WaterSurface
+from pcfix.model import Cameras, FloatArray
 from pcfix.refract.tally import COVERAGE_95, ORDERS, largest_tvu_m
 from pcfix.report.comparison import noise_sentence, raw_of, signed
 from pcfix.report.map_data import Layer, relief
@@ -28,7 +27,6 @@ from pcfix.report.page import (
     Table,
     Tile,
     label_plan,
-    label_side,
     map_figure,
     name_of,
     new_figure,
@@ -56,7 +54,6 @@ class RunResults:
 
     summary: Summary
     cameras: Cameras
-    water: WaterSurface
     maps: Maps
     depth_m: dict[str, float]  # min, mean and max of the bed's points that are not noise
     sample: FloatArray  # shape (m, 2): depth and standard error of Z, zero where unknown
@@ -188,8 +185,8 @@ def _pictures(run: RunResults) -> list[Picture]:
     ]  # fmt: skip
     if s.cameras:
         alt = (
-            "Projection centres over the cloud, in plan and seen from the south;"
-            f" {s.cameras_used} of {s.cameras} see corrected points."
+            f"Projection centres over the cloud; {s.cameras_used} of {s.cameras} see corrected"
+            " points."
         )
         pictures.append(Picture("cameras", "Cameras", alt, cameras_figure(run)))
     known = run.sample[:, 1] > 0.0
@@ -211,30 +208,20 @@ def _pictures(run: RunResults) -> list[Picture]:
 
 
 def cameras_figure(run: RunResults) -> Figure:
-    """Draw the projection centres in plan and in profile over the cloud."""
-    maps, cameras, water = run.maps, run.cameras, run.water
+    """Draw the projection centres in plan over the cloud."""
+    maps, cameras = run.maps, run.cameras
     used = ~np.isin(np.array(cameras.labels), run.summary.cameras_unused)
-    figure, (plan, profile) = new_figure(8.0, 7.0, nrows=2, height_ratios=[3, 2])
+    figure, plan = new_figure(8.0, 5.0)
     plan.imshow(maps.height_m, extent=maps.extent_m, cmap="Greys_r", alpha=0.6)
     depth = plan.imshow(maps.depth_m, extent=maps.extent_m, cmap=DEPTH)
     figure.colorbar(depth, ax=plan, label="Depth (m)", shrink=0.8)
     for chosen, mark, colour, name in (used, "o", AFTER, "used"), (~used, "x", BEFORE, "not used"):
         if chosen.any():
-            x, y, z = cameras.centres[chosen].T
+            x, y, _ = cameras.centres[chosen].T
             plan.plot(x, y, mark, color=colour, label=name, markersize=4)
-            profile.plot(x, z, mark, color=colour, markersize=4)
     label_plan(plan)
     # above the axes, where it covers no camera
     plan.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, frameon=False)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # columns without heights
-        low, high = np.nanpercentile(maps.height_m, (5, 95), axis=0)
-    columns = np.linspace(*maps.extent_m[:2], len(low))
-    profile.fill_between(columns, low, high, color="0.6", label="cloud, 5 to 95 %")
-    if isinstance(water, WaterPlane) and water.b == water.c == 0.0:
-        profile.axhline(water.a, color=WATER, label="water")
-    label_side(profile)
-    profile.legend(loc="best")
     return figure
 
 

@@ -32,8 +32,8 @@ def report(tmp_path_factory):
     summary = pcfix.correct_file(
         cloud, folder / "corrected.laz", cameras=cameras, water=0.37, method="snell", max_angle=None
     )
-    water, found = pcfix.read_water(0.37), read_cloud(folder / "corrected.laz")
-    run = RunResults(summary, pcfix.read_cameras(cameras), water, **found)
+    found = read_cloud(folder / "corrected.laz")
+    run = RunResults(summary, pcfix.read_cameras(cameras), **found)
     write_report(run, [cloud, cameras], folder)
     return folder, summary
 
