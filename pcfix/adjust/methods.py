@@ -28,9 +28,9 @@ from pcfix.adjust.block import (
     well_seen,
 )
 from pcfix.adjust.from_cloud import CloudBlock, adjust_cloud
-from pcfix.adjust.from_ties import adjust_ties, default_lens, noise_px, with_sigma
+from pcfix.adjust.from_ties import adjust_ties, default_lens
 from pcfix.adjust.precision import correlated, shape_notes, undetermined
-from pcfix.adjust.problem import intersect_fixed, prepare
+from pcfix.adjust.problem import intersect_fixed
 from pcfix.adjust.result import Adjusted
 from pcfix.adjust.solve import reduced_at, solver
 from pcfix.errors import GeometryError, PcfixWarning, SettingError
@@ -126,7 +126,7 @@ def adjust_block(
             )
             notes.append(PcfixWarning("adjust.too_large", words, images=len(block.cameras)))
         wet = found.is_wet & np.isfinite(found.xyz).all(axis=1)
-        notes += shape_notes(found.precision, (found.xyz - found.origin)[wet, :2])
+        notes += shape_notes(found.precision, (found.xyz - found.problem.origin)[wet, :2])
     return replace(found, notes=[*notes, *datum_notes(found), *bed_notes(found)])
 
 
@@ -321,14 +321,7 @@ def offset_of(found: Adjusted) -> tuple[FloatArray, FloatArray] | None:
     Both are to the right, ahead and up, shape (3,), metres. It is one more unknown of all
     positions, estimated by one step from the solution. None if nothing is free.
     """
-    block = replace(
-        found.block, cameras=found.cameras, xyz=found.xyz,
-        sigma_px=np.where(found.used, found.block.sigma_px, np.inf),
-    )  # fmt: skip
-    problem, now = prepare(block, found.unknowns, found.origin)
-    now = replace(now, state=now.state._replace(water=found.numbers))
-    problem = with_sigma(problem, noise_px(problem, now))
-    weight = block.gnss_weights
+    problem, now, weight = found.problem, found.solution, found.block.gnss_weights
     # axes of each image in the world: right, ahead, up
     right = np.asarray(found.cameras.rotations)[:, 0] * [1.0, 1.0, 0.0]
     right /= np.maximum(np.linalg.norm(right, axis=1), 1e-9)[:, None]

@@ -81,8 +81,8 @@ class Adjusted:
     gnss_residual_m: FloatArray  # (k, 3), adjusted centres minus GNSS positions; NaN if unknown
     control: list[ControlRow]
     notes: list[PcfixWarning]
-    origin: FloatArray  # of the block's frame
-    numbers: FloatArray  # `pcfix.adjust.collinearity.State.water` there
+    problem: Problem  # with the weights of the last round
+    solution: Solution
     port: Port | None = None  # adjusted
     on_surfaces: list[Plain] = field(default_factory=list)  # of points on the water or on planes
 
@@ -143,8 +143,8 @@ def adjusted_of(
         notes=notes,
         port=port_of(block, state.water),
         on_surfaces=_on_surfaces(problem, now),
-        origin=problem.origin,
-        numbers=state.water,
+        problem=problem,
+        solution=now,
     )
 
 
@@ -347,7 +347,7 @@ def _water(a: Adjusted) -> Plain | None:
     if original is None or adjusted is None:
         return None
     if isinstance(original, WaterPlane):
-        names, height_m = ["level", "tilt_x", "tilt_y", "index"], float(a.origin[2])
+        names, height_m = ["level", "tilt_x", "tilt_y", "index"], float(a.problem.origin[2])
     else:  # the number is what is added to a mesh or raster
         heights = surface_above(original, a.xyz).height_m
         names, height_m = ["level", "index"], float(mean(heights))
@@ -370,11 +370,11 @@ def _port(a: Adjusted) -> Plain | None:
 
 def _numbers(a: Adjusted, names: Sequence[str]) -> dict[str, Plain]:
     """Return parameters of the refracting surface, block frame."""
-    start = surface_numbers(a.block, a.origin)
+    start = surface_numbers(a.block, a.problem.origin)
     return {
         name: {
             "before": start[i],
-            "after": a.numbers[i],
+            "after": a.solution.state.water[i],
             "sigma": None if a.precision is None else a.precision.sigma_of(name),
             "free": bool(a.unknowns.water_sigma[i]),
         }

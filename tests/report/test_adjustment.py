@@ -11,7 +11,7 @@ import pytest
 
 from pcfix.adjust.block import Block, LogRow, Unknowns
 from pcfix.adjust.precision import Precision, SharedUnknown
-from pcfix.adjust.problem import Intersected
+from pcfix.adjust.problem import Intersected, prepare
 from pcfix.adjust.result import Adjusted, ControlRow, adjustment_dict, before_of
 from pcfix.errors import PcfixWarning
 from pcfix.model import Cameras, Lens, WaterPlane
@@ -89,12 +89,17 @@ def adjusted():
     ]
     origin = np.round(before.centres.mean(axis=0))
     gnss = np.array([[0.01, 0.02, 0.03], [0.05, -0.02, 0.09], [np.nan] * 3])
+    block, unknowns = (
+        make_block(xyz, pinhole(xyz, before), before),
+        Unknowns(surface={"level": 0.1}),
+    )
+    problem, start = prepare(block, unknowns, origin)
+    numbers = np.array([LEVEL + 0.02 - origin[2], 0.0, 0.0, 1.34, *[0.0] * 7])
     return Adjusted(
-        make_block(xyz, pinhole(xyz, before), before), Unknowns(surface={"level": 0.1}), after,
-        WaterPlane(LEVEL + 0.02), 1.34, xyz, residual, used, is_wet, 1.234, 60, rounds,
-        "tie points", make_precision(len(xyz)), gnss, control,
-        [PcfixWarning("adjust.lens", "something <decided>")], origin,
-        np.array([LEVEL + 0.02 - origin[2], 0.0, 0.0, 1.34, *[0.0] * 7]),
+        block, unknowns, after, WaterPlane(LEVEL + 0.02), 1.34, xyz, residual, used, is_wet, 1.234,
+        60, rounds, "tie points", make_precision(len(xyz)), gnss, control,
+        [PcfixWarning("adjust.lens", "something <decided>")], problem,
+        replace(start, state=start.state._replace(water=numbers)),
     )  # fmt: skip
 
 
