@@ -113,7 +113,9 @@ def adjust_block(
     else:
         surveyed = [] if material.control is None else [material.control.xyz]
         apparent = np.vstack([ties.xyz, *surveyed])
-        sets = list(dict.fromkeys([*([("f",), ("f", "cx", "cy")] if chooses_lens else []), lens]))
+        sets = [lens]
+        if chooses_lens:
+            sets = list(dict.fromkeys([("f",), ("f", "cx", "cy"), lens]))
         given = CloudBlock(block, some_cameras(original, kept), apparent)
         found = adjust_cloud(given, unknowns, sets, progress)
     notes += [*_check_dry(material.water, found), *found.notes]
