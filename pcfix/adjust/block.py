@@ -44,8 +44,30 @@ INDEX, SHAPE, PORT, PLANES = 3, 4, 7, 11
 MOTIONS = ("shift x", "shift y", "shift z", "turn x", "turn y", "turn z", "scale")
 """Parameters of a similarity transformation of all poses."""
 
+WORDS = {
+    "f": "focal length", "cx": "principal point x", "cy": "principal point y", "b1": "affinity b1",
+    "b2": "skew b2", "level": "water level", "tilt_x": "water tilt along x",
+    "tilt_y": "water tilt along y", "index": "refractive index", "shape_xx": "water shape x^2",
+    "shape_xy": "water shape x y", "shape_yy": "water shape y^2", "distance": "port distance",
+    "centre_x": "dome centre x", "centre_y": "dome centre y", "centre_z": "dome centre z",
+}  # fmt: skip
+"""What a surveyor calls the shared unknowns."""
+WORDS |= {f"k{i}": f"distortion k{i}" for i in range(1, 9)}
+WORDS |= {"p1": "distortion p1", "p2": "distortion p2"} | {one: f"block {one}" for one in MOTIONS}
+
+UNITS = {"level": " m", "tilt": " m/m", "shape": " /m", "distance": " m", "centre": " m",
+         "shift": " m", "turn": " rad"}  # fmt: skip
+"""By the first word of a name."""
+
+
+def words_of(name: str) -> tuple[str, str]:
+    """Return what a surveyor calls a shared unknown, and its unit; that of a lens is not known."""
+    base, of, sensor = name.partition(" of sensor ")
+    first = name.replace("_", " ").split()[0]
+    return WORDS.get(base, base) + of + sensor, UNITS.get(first, "")
+
+
 Poses = Literal["free", "fixed", "similarity"]
-Robust = Literal["squares", "huber", "cauchy"]
 
 WATER = "water"
 """The name of the water among planes."""
@@ -80,7 +102,6 @@ class LogRow(NamedTuple):
 
     round: int
     steps: int
-    cost: float
     observations: int
     rms_px: float
 
@@ -105,6 +126,9 @@ class Conditions:
     parallel: tuple[str, ...] = ()  # names of parallel planes, perhaps with `WATER`
 
 
+NO_CONDITIONS = Conditions((), np.zeros(0, np.int64), np.zeros(0))
+
+
 @dataclass(frozen=True, eq=False)
 class Block:
     """Images, points and measurements."""
@@ -127,7 +151,7 @@ class Block:
     control_names: tuple[str, ...] = ()  # of the surveyed points, the last ones of `xyz`
     # of them, not used in the adjustment
     is_check: BoolArray = field(default_factory=lambda: np.zeros(0, np.bool_))
-    conditions: Conditions | None = None  # points on surfaces
+    conditions: Conditions = NO_CONDITIONS  # points on surfaces
 
     @property
     def owner(self) -> IntArray:
@@ -355,11 +379,11 @@ def block_of(material: Material, ties: TiePoints, sigma_px: float) -> Block:
 
 def _on_surfaces(
     material: Material, control: GroundControl, marks: TiePoints, ties: int
-) -> tuple[Conditions | None, BoolArray, FloatArray]:
+) -> tuple[Conditions, BoolArray, FloatArray]:
     """Return conditions of surveyed points, which are under water, and their start values."""
     under_water, xyz, on = control.under_water.copy(), control.xyz, np.array(control.on)
     if not any(control.on):
-        return None, under_water, xyz
+        return NO_CONDITIONS, under_water, xyz
     names = tuple(dict.fromkeys(name for name in control.on if name and name != WATER))
     number = {"": -1, WATER: 0} | {name: i for i, name in enumerate(names, start=1)}
     rows = np.array([-1] * ties + [number[name] for name in control.on])

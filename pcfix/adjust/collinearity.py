@@ -40,71 +40,46 @@ if TYPE_CHECKING:
 
 
 class State(NamedTuple):
-    """What is estimated, relative to the origin of the block.
+    """What is estimated, relative to the origin of the block."""
 
-    centres : shape (k, 3); rotations : shape (k, 3, 3), world to camera.
-    lenses : shape (l, ...), coefficients of `pcfix.lens.imaging.lens_table`.
-    xyz : shape (m, 3), true points.
-    water : shape (11 + 3 p,), the parameters of `WATER_NAMES`, then height and two slopes of each
-    of p planes.
-    port : shape (7,), coefficients of a housing port with these parameters; empty without one.
-    """
-
-    centres: FloatArray
-    rotations: FloatArray
-    lenses: FloatArray
-    xyz: FloatArray
+    centres: FloatArray  # (k, 3)
+    rotations: FloatArray  # (k, 3, 3), world to camera
+    lenses: FloatArray  # (l, ...), coefficients of `pcfix.lens.imaging.lens_table`
+    xyz: FloatArray  # (m, 3), true points
+    # (11 + 3 p,), the parameters of `WATER_NAMES`, then height and two slopes of each of p planes
     water: FloatArray
-    port: FloatArray
+    port: FloatArray  # (7,), coefficients of a housing port with these; empty without one
 
 
 class Given(NamedTuple):
-    """What stays fixed during an adjustment: observations, surface, unknowns, prior knowledge.
+    """What stays fixed during an adjustment."""
 
-    Observations, sorted by point
-        start : shape (m + 1,); camera, image_xy, weight : o rows, with weight = 1 / standard
-        deviation, zero for observations that do not count; wet : shape (m,), whether a point may
-        be under water; lens_row, group : shape (k,), row of the lens table and sensor of cameras.
-    Refracting surface
-        tin, field : a mesh or raster instead of the plane in `State.water`;
-        origin : shape (3,), of the block; curved : whether d, e, f count.
-    Unknowns that many points share, counted from the first of them
-        first_lens : shape (groups + 1,), where the parameters of each sensor begin;
-        code : shape (first_lens[-1],), which parameters these are; column : for each number of
-        `State.water`, -1 if it is fixed (parallel planes share theirs); similarity : the first of
-        seven, -1 without; shared : how many there are; pivot : shape (3,), of a similarity.
-    Prior knowledge
-        surveyed_xyz, surveyed_weight : shape (m, 3), with inverse variances, zero for other
-        points; on, on_weight, axis : points on surfaces: 0 water, 1, 2, ... planes, -1 none (on has
-        length 0 if there is no such point), 1 / standard deviation of the distance, and for each
-        surface the axis along which it has its height: 2 is up.
-    Petrov-Galerkin (`pcfix.adjust.from_cloud`)
-        tests : shape (t, 2, 9 + g), columns to which the residuals of the first t observations are
-        orthogonal; t = 0 in a least squares adjustment, whose own Jacobian has that role.
-    """
-
-    start: IntArray
-    camera: IntArray
-    image_xy: FloatArray
-    weight: FloatArray
-    wet: BoolArray
-    lens_row: IntArray
-    group: IntArray
-    tin: Tin | None
+    # observations, sorted by point
+    start: IntArray  # (m + 1,)
+    camera: IntArray  # (o,)
+    image_xy: FloatArray  # (o, 2)
+    weight: FloatArray  # (o,), 1 / standard deviation; zero for those that do not count
+    wet: BoolArray  # (m,), points that may be under water
+    lens_row: IntArray  # (k,), of the lens table
+    group: IntArray  # (k,), sensor of each camera
+    # refracting surface
+    tin: Tin | None  # a mesh or a raster, instead of the plane in `State.water`
     field: Field | None
-    origin: FloatArray
-    curved: bool
-    first_lens: IntArray
-    code: IntArray
-    column: IntArray
-    similarity: int
-    shared: int
-    pivot: FloatArray
-    surveyed_xyz: FloatArray
-    surveyed_weight: FloatArray
-    on: IntArray
-    on_weight: FloatArray
-    axis: IntArray
+    origin: FloatArray  # (3,), of the block
+    curved: bool  # whether d, e, f count
+    # unknowns that many points share, counted from the first of them
+    first_lens: IntArray  # (groups + 1,), where the parameters of each sensor begin
+    code: IntArray  # (first_lens[-1],), which parameters these are
+    column: IntArray  # of each number of `State.water`; -1 if fixed; parallel planes share theirs
+    shared: int  # how many there are
+    # prior knowledge of points
+    surveyed_xyz: FloatArray  # (m, 3)
+    surveyed_weight: FloatArray  # (m, 3), inverse variances; zero for points that are not surveyed
+    on: IntArray  # (m,): 0 water, 1, 2, ... planes, -1 none; empty if no point is on a surface
+    on_weight: FloatArray  # (m,), 1 / standard deviation of the distance from the surface
+    axis: IntArray  # of each surface, along which it has its height: 2 is up
+    # (t, 2, 9 + g), columns to which the residuals of the first t observations are orthogonal (see
+    # `pcfix.adjust.from_cloud`); t = 0 in least squares, whose own Jacobian has that role
     tests: FloatArray
 
 
@@ -118,31 +93,23 @@ instead, from `SHARED` on."""
 class Workspace(NamedTuple):
     """Arrays that one thread reuses for all points; g unknowns are shared, `most` rows in a point.
 
-    light, plane : shapes (3, 14) and (4,), refracted light with its derivatives by Q, C and the
-    first seven of `WATER_NAMES`, and its plane; moved : shape (7,), other values of these seven.
-    ahead : shape (3,), the direction that the lens images, camera frame.
-    behind_port : shape (3, 8), that direction behind a port, with its derivatives.
-    origin : shape (3,), the block's origin, seen from the water level.
-    own : shape (2, `WIDTH`), derivatives of an image.
-    right, left : shape (most, 2, 9 + g), the weighted rows of a point, and what tests them: the
-    same array in a least squares adjustment.
-    r : shape (most, 2), weighted residuals; row : shape (most,), which observation each of them is.
-    v, rhs : shapes (3, 3) and (3,), normal equations of the point.
+    `left` is the same array as `right` in a least squares adjustment.
     """
 
+    # (3, 14), refracted light, its derivatives by Q, C and the first seven of `WATER_NAMES`
     light: FloatArray
-    plane: FloatArray
-    ahead: FloatArray
-    behind_port: FloatArray
-    origin: FloatArray
-    moved: FloatArray
-    own: FloatArray
-    right: FloatArray
-    left: FloatArray
-    r: FloatArray
-    row: IntArray
-    v: FloatArray
-    rhs: FloatArray
+    plane: FloatArray  # (4,), at which it is refracted
+    ahead: FloatArray  # (3,), the direction that the lens images, camera frame
+    behind_port: FloatArray  # (3, 8), that direction behind a port, with its derivatives
+    origin: FloatArray  # (3,), the block's origin, seen from the water level
+    moved: FloatArray  # (7,), other values of the first seven of `WATER_NAMES`
+    own: FloatArray  # (2, WIDTH), derivatives of an image
+    right: FloatArray  # (most, 2, 9 + g), the weighted rows of a point
+    left: FloatArray  # (most, 2, 9 + g), what tests them
+    r: FloatArray  # (most, 2), weighted residuals
+    row: IntArray  # (most,), which observation each of them is
+    v: FloatArray  # (3, 3), normal equations of the point, and
+    rhs: FloatArray  # (3,), their right side
 
 
 def workspace(given: Given) -> Workspace:

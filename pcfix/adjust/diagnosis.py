@@ -80,17 +80,8 @@ MOST_IMAGES, QUICK_IMAGES = 600, 200
 """For which the pattern of absorbed refraction is computed, and when it must be quick; the cost
 grows with their cube, and is a second for the latter."""
 
-EXPORTS = {
-    "metashape": "give the project (.psx) or its BlocksExchange export with tie points",
-    "photoscan": "give the project (.psz) or its BlocksExchange export with tie points",
-    "pix4d": "give the params folder with its tp_ file",
-    "opendronemap": "give the project's opensfm folder with tracks.csv",
-    "opensfm": "keep tracks.csv beside the reconstruction",
-    "colmap": "keep points3D beside the images",
-    "blocksexchange": "export it with tie points",
-    "bundler": "export the .out file with its points",
-}
-"""How to give tie points, by a word in the source of the cameras."""
+EXPORT = "export tie points, or run 'pcfix cameras FILE --gnss GNSS.csv'"
+"""What to do if a camera file has neither tie points nor GNSS positions."""
 
 
 @dataclass(frozen=True)
@@ -153,19 +144,6 @@ class Diagnosis:
                 for s in self.signs
             ],
         }
-
-
-def diagnosis_of(signs: list[Sign]) -> Diagnosis:
-    """Return the signs in the order in which they decide."""
-    return Diagnosis(tuple(sorted(signs, key=lambda sign: ORDER.index(sign.name))))
-
-
-def export_of(cameras: Cameras) -> str:
-    """Return what the user has to give so that the poses can be checked."""
-    source = cameras.source.lower()
-    other = "export a model with tie points (COLMAP or Bundler)"
-    found = next((words for name, words in EXPORTS.items() if name in source), other)
-    return f"{found}, or run 'pcfix cameras FILE --gnss GNSS.csv'"
 
 
 def _exceeds(value: float, sigma: float, limit: float) -> bool | None:
@@ -377,39 +355,17 @@ class Evidence:
     neighbours: Sign | None = None  # of `neighbours_sign`
     in_passing: bool = False  # whether it must be quick
 
-    @property
-    def has_height(self) -> bool:
-        """Whether the water has a height everywhere, not only at points of the cloud."""
-        return not isinstance(self.water, WaterDimension)
-
-    @property
-    def has_rays(self) -> bool:
-        """Whether straight and refracted rays can be computed."""
-        cameras = self.cameras
-        if cameras.rotations is None or cameras.lenses is None:
-            return False
-        return self.has_height and all(lens.unit == "px" for lens in cameras.lenses)
-
-    @property
-    def gsd_m(self) -> float:
-        """Approximate size of a pixel at the water; zero if unknown."""
-        lenses, centres = self.cameras.lenses, self.cameras.centres
-        if lenses is None or not self.has_height:
-            return 0.0
-        level = surface_above(self.water, centres).height_m
-        above = centres[:, 2] - np.where(np.isfinite(level), level, np.nanmean(level))
-        focal = [lens.focal if lens.unit == "px" else np.inf for lens in lenses]
-        return float(np.mean(above / focal))
-
 
 def diagnosed(evidence: Evidence) -> Diagnosis:
     """Look for every sign that the evidence allows."""
     signs = [] if evidence.neighbours is None else [evidence.neighbours]
-    if evidence.has_rays:
-        signs += _signs_of_rays(evidence)
-    if evidence.view is not None and evidence.has_height:
-        signs += _signs_of_surveys(evidence)
-    return diagnosis_of(signs)
+    cameras, lenses = evidence.cameras, evidence.cameras.lenses
+    if not isinstance(evidence.water, WaterDimension):  # which has heights at points of the cloud
+        if cameras.rotations is not None and lenses and all(one.unit == "px" for one in lenses):
+            signs += _signs_of_rays(evidence)
+        if evidence.view is not None:
+            signs += _signs_of_surveys(evidence)
+    return Diagnosis(tuple(sorted(signs, key=lambda sign: ORDER.index(sign.name))))
 
 
 def _signs_of_rays(evidence: Evidence) -> list[Sign]:
@@ -429,8 +385,9 @@ def _signs_of_rays(evidence: Evidence) -> list[Sign]:
         if count > most or (apparent is None and evidence.view is None):
             why = f"{count} images (limit {most})" if count > most else "no cloud"
             raise GeometryError("adjust.no_pattern", why)
-        some = _sample_of(evidence.view, wanted) if apparent is None else apparent
-        some = some[:: max(1, len(some) // wanted)]
+        if apparent is None:
+            apparent = _sample_of(evidence.view, wanted)
+        some = apparent[:: max(1, len(apparent) // wanted)]
         true = mended(some, cameras, evidence.water, evidence.refractive_index)
     except GeometryError as error:
         words = f"the pattern of absorbed refraction is unknown ({error})"
@@ -471,8 +428,12 @@ def _sample_of(view: Any, wanted: int) -> FloatArray:
 
 def _signs_of_surveys(evidence: Evidence) -> list[Sign]:
     """Compare the cloud with control points on land, and with a survey of land and bed."""
-    gsd, view, control = evidence.gsd_m, evidence.view, evidence.control
-    signs = []
+    view, control, centres = evidence.view, evidence.control, evidence.cameras.centres
+    # about the size of a pixel at the water
+    level = surface_above(evidence.water, centres).height_m
+    above = centres[:, 2] - np.where(np.isfinite(level), level, np.nanmean(level))
+    focal = [one.focal if one.unit == "px" else np.inf for one in evidence.cameras.lenses or ()]
+    gsd, signs = float(np.mean(above / focal)) if focal else 0.0, list[Sign]()
     if control is not None:
         level = surface_above(evidence.water, control.xyz).height_m
         dry = control.xyz[~control.under_water & ~(control.xyz[:, 2] < level)]

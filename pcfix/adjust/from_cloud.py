@@ -19,8 +19,8 @@ solution back to the original one instead.
 
 Points of the apparent cloud stand for the tie points of that adjustment, which were spread in much
 the same way. They have no noise; their weight is how well they stand for the tie points. It is the
-largest with which GNSS positions and control points fit within their standard deviations, and of
-several choices the one under which these fit best is taken.
+largest with which GNSS positions and control points fit within their standard deviations. They
+count in every image in whose frame they lie, as the software matched features in all of these.
 """
 
 from __future__ import annotations
@@ -79,55 +79,81 @@ CLOSE_M = 1e-7
 LARGE_STEP_M = 1e4
 
 
-class Trial(NamedTuple):
-    """One choice, and how GNSS and control points fit it."""
-
-    of: Candidate
-    problem: Problem
-    found: Solution
-    sigma_px: float
-    misfit: float
-    observations: int
-
-    @property
-    def mean(self) -> float:
-        """Misfit per redundant observation."""
-        return self.misfit / max(self.observations - 7, 1)
-
-
-class Candidate(NamedTuple):
+class CloudBlock(NamedTuple):
     """A block whose tie points are points of the cloud.
 
     `original` are the cameras that made the cloud; those of the block are the start. `apparent_xyz`
     has a row per point of the block, control points included.
     """
 
-    name: str
     block: Block
     original: Cameras
     apparent_xyz: FloatArray
 
 
+class Trial(NamedTuple):
+    """The adjustment with one weight of the cloud, and how GNSS and control points fit it.
+
+    The misfit is the weighted sum of squares of their observations, of which seven are the datum.
+    """
+
+    problem: Problem
+    found: Solution
+    sigma_px: float
+    misfit: float
+    redundancy: int
+
+
 def adjust_cloud(
-    candidates: list[Candidate],
+    given: CloudBlock,
     unknowns: Unknowns,
     lens_sets: list[tuple[str, ...]],
     progress: Progress | None = None,
 ) -> Adjusted:
     """Adjust a block by the cloud that its original poses made.
 
-    Parameters
-    ----------
-    candidates : list of Candidate
-        The same cloud with different guesses which images contributed to each point.
-    unknowns : Unknowns
-        Its lens parameters are replaced by one of `lens_sets`.
-    lens_sets : list of tuple of str
-        Each contains the one before it.
+    The lens parameters of the unknowns are replaced by one of `lens_sets`, each of which contains
+    the one before it.
     """
-    first = candidates[0].block
-    check_datum(first, unknowns)
-    has_gnss = bool((first.gnss_weights > 0.0).any())
+    _check(given.block, unknowns)
+    unknowns = replace(unknowns, lens=lens_sets[0])
+    trials: list[Trial] = []
+    for sigma in SIGMAS_PX:
+        try:
+            trials.append(_trial(given, unknowns, sigma, progress))
+        except GeometryError:
+            if not trials and sigma == SIGMAS_PX[-1]:
+                raise
+        else:
+            if trials[-1].misfit / trials[-1].redundancy <= FITS:
+                break
+    chosen = trials[-1]
+    for names in lens_sets[1:]:
+        try:
+            more = _trial(given, replace(unknowns, lens=names), chosen.sigma_px, progress)
+        except GeometryError:
+            continue
+        extra = len(names) - len(chosen.problem.unknowns.lens)
+        gain = (chosen.misfit - more.misfit) / max(chosen.misfit / chosen.redundancy, 1.0)
+        if gain > chdtri(extra * len(chosen.problem.groups), SURE):
+            chosen = more
+    notes = _notes(chosen, lens_sets)
+    # only GNSS and control points have noise
+    sigma0 = float(np.sqrt(chosen.misfit / chosen.redundancy))
+    try:  # about as precise as with tie points of this standard deviation
+        known = precision_of(chosen.problem, chosen.found, max(sigma0, 1.0))
+    except GeometryError as error:
+        known = None
+        words = f"The precision of the poses is unknown, and SigmaZ will not include it: {error}"
+        notes.append(PcfixWarning("adjust.no_precision", words, reason=error.code))
+    found = adjusted_of(chosen.problem, chosen.found, known, notes, "cloud")
+    return replace(found, sigma0=sigma0, redundancy=chosen.redundancy)
+
+
+def _check(block: Block, unknowns: Unknowns) -> None:
+    """Refuse what needs measured tie points."""
+    check_datum(block, unknowns)
+    has_gnss = bool((block.gnss_weights > 0.0).any())
     if (unknowns.free_network and not has_gnss) or unknowns.poses != "free":
         words = (
             "Without tie points the poses must be free, and need GNSS positions or control points."
@@ -140,37 +166,12 @@ def adjust_cloud(
             " model with tie points, or fix the water."
         )
         raise GeometryError("adjust.cloud_needs_water", words)
-    if first.conditions is not None:
+    if len(block.conditions.on):
         words = (
             "Points on the water or on a plane need measured tie points. Give a model with tie"
             " points, or remove the roles waterline and on:NAME from --gcps."
         )
         raise GeometryError("adjust.cloud_has_conditions", words)
-    best = min(
-        (_fitting(one, replace(unknowns, lens=lens_sets[0]), progress) for one in candidates),
-        key=lambda trial: (trial.sigma_px, trial.misfit),
-    )
-    chosen = best
-    for names in lens_sets[1:]:
-        try:
-            more = _trial(best.of, replace(unknowns, lens=names), best.sigma_px, progress)
-        except GeometryError:
-            continue
-        extra = len(names) - len(chosen.problem.unknowns.lens)
-        gain = (chosen.misfit - more.misfit) / max(chosen.mean, 1.0)
-        if gain > chdtri(extra * len(chosen.problem.groups), SURE):
-            chosen = more
-    notes = _notes(chosen, lens_sets)
-    # only GNSS and control points have noise
-    free, sigma0 = max(chosen.observations - 7, 1), float(np.sqrt(chosen.mean))
-    try:  # about as precise as with tie points of this standard deviation
-        known = precision_of(chosen.problem, chosen.found, max(sigma0, 1.0))
-    except GeometryError as error:
-        known = None
-        words = f"The precision of the poses is unknown, and SigmaZ will not include it: {error}"
-        notes.append(PcfixWarning("adjust.no_precision", words, reason=error.code))
-    found = adjusted_of(chosen.problem, chosen.found, known, notes, "cloud")
-    return replace(found, sigma0=sigma0, redundancy=free)
 
 
 def _notes(chosen: Trial, lens_sets: list[tuple[str, ...]]) -> list[PcfixWarning]:
@@ -178,44 +179,30 @@ def _notes(chosen: Trial, lens_sets: list[tuple[str, ...]]) -> list[PcfixWarning
     count, free = int(chosen.problem.block.start[-1]), chosen.problem.unknowns.lens
     fixed = dict.fromkeys(name for names in lens_sets for name in names if name not in free)
     words = (
-        f"No tie points: {count:,} images of points of the cloud ({chosen.of.name}) were used with"
-        f" a standard deviation of {chosen.sigma_px:g} px. Lens parameters free:"
-        f" {', '.join(free) or 'none'}"
+        f"No tie points: {count:,} images of points of the cloud were used with a standard"
+        f" deviation of {chosen.sigma_px:g} px. Lens parameters free: {', '.join(free) or 'none'}"
         + (f" (undetermined and fixed: {', '.join(fixed)})." if fixed else ".")
     )
-    values = {"sigma_px": chosen.sigma_px, "images": chosen.of.name}
-    notes = [PcfixWarning("adjust.by_cloud", words, free=list(free), fixed=list(fixed), **values)]
+    sigma = {"sigma_px": chosen.sigma_px}
+    notes = [PcfixWarning("adjust.by_cloud", words, free=list(free), fixed=list(fixed), **sigma)]
     if chosen.sigma_px >= POOR_PX:
         words = (
             f"Points of the cloud fit GNSS and control points only with {chosen.sigma_px:g} px, so"
             " bed and focal length may be wrong by more than all figures say. Give tie points,"
             " control points or a calibrated lens."
         )
-        notes.append(PcfixWarning("adjust.poor_cloud", words, **values))
+        notes.append(PcfixWarning("adjust.poor_cloud", words, **sigma))
     return notes
 
 
-def _fitting(one: Candidate, unknowns: Unknowns, progress: Progress | None) -> Trial:
-    """Return the trial with the smallest standard deviation that fits GNSS and control points."""
-    trials: list[Trial] = []
-    for sigma in SIGMAS_PX:
-        try:
-            trials.append(_trial(one, unknowns, sigma, progress))
-        except GeometryError:
-            if not trials and sigma == SIGMAS_PX[-1]:
-                raise
-        else:
-            if trials[-1].mean <= FITS:
-                break
-    return trials[-1]
-
-
-def _trial(one: Candidate, unknowns: Unknowns, sigma_px: float, progress: Progress | None) -> Trial:
-    m, owner = one.block.tie_points, one.block.owner
-    block = replace(one.block, sigma_px=np.where(owner < m, sigma_px, one.block.sigma_px))
+def _trial(
+    given: CloudBlock, unknowns: Unknowns, sigma_px: float, progress: Progress | None
+) -> Trial:
+    m, owner = given.block.tie_points, given.block.owner
+    block = replace(given.block, sigma_px=np.where(owner < m, sigma_px, given.block.sigma_px))
     problem, start = prepare(block, unknowns)
-    before, at_rest = prepare(replace(block, cameras=one.original), unknowns)
-    tests = straight_columns(before, at_rest, one.apparent_xyz - before.origin)
+    before, at_rest = prepare(replace(block, cameras=given.original), unknowns)
+    tests = straight_columns(before, at_rest, given.apparent_xyz - before.origin)
     found = solve_unaware(problem, start, tests[: block.start[m]], progress)
     marks, weight = problem.used & (owner >= m), problem.given.weight
     r = residuals(found.state, problem.given)[marks]
@@ -223,7 +210,7 @@ def _trial(one: Candidate, unknowns: Unknowns, sigma_px: float, progress: Progre
     surveyed = problem.given.surveyed_weight > 0.0
     count = int((block.gnss_weights > 0.0).sum()) + 2 * int(marks.sum()) + int(surveyed.sum())
     count -= 3 * int(surveyed.any(axis=1).sum())
-    return Trial(one, problem, found, sigma_px, found.cost + in_images, count)
+    return Trial(problem, found, sigma_px, found.cost + in_images, max(count - 7, 1))
 
 
 # The equations
@@ -270,22 +257,20 @@ def solve_unaware(
     now, log, size = start, list(start.log), np.inf
     for number in range(1, MAX_STEPS + 1):
         # the matrix is not symmetric
-        (matrix, right), step = reduced_at(tested, now), np.zeros(len(problem.moves))
+        matrix, right = reduced_at(tested, now)
         scale = 1.0 / np.sqrt(np.maximum(np.abs(matrix.diagonal()), 1e-300))
         try:
-            step[problem.active] = scale * np.linalg.solve(
-                matrix * scale * scale[:, None], scale * right
-            )
+            step = scale * np.linalg.solve(matrix * scale * scale[:, None], scale * right)
         except np.linalg.LinAlgError:
             raise _unsolved("the equations are singular") from None
-        points = point_steps(now.state, given, UNDAMPED, step)
+        points = point_steps(now.state, given, UNDAMPED, problem.spread(now.state) @ step)
         moved = moved_by(problem, now, step, points)
         size = float(np.abs(points).max(initial=0.0)) if np.isfinite(points).all() else np.inf
         if moved is None or not size < LARGE_STEP_M:
             break
         now = moved
         cost = survey_cost(problem, now) + priors_at(problem, now)[0]
-        row = LogRow(1, number, cost, *counts_of(problem, now))
+        row = LogRow(1, number, *counts_of(problem, now))
         log.append(row)
         if progress is not None:
             progress(row)
@@ -313,17 +298,12 @@ LEAST_IMAGES_OF_POINT, LEAST_POINTS, LEAST_IMAGES = 3, 10, 5
 
 
 class Mended(NamedTuple):
-    """The poses if they had absorbed the refraction, and the errors that this implies.
+    """The poses if they had absorbed the refraction, and the errors that this implies."""
 
-    cameras : those with enough points; row : shape (k,), their rows among all cameras.
-    land_m, bed_m : shape (m,) and (w,), by how much land and bed are too low now, the bed after
-    its correction with the present poses.
-    """
-
-    cameras: Cameras
-    row: IntArray
-    land_m: FloatArray
-    bed_m: FloatArray
+    cameras: Cameras  # those with enough points
+    row: IntArray  # (k,), their rows among all cameras
+    land_m: FloatArray  # (m,), by how much land is too low now
+    bed_m: FloatArray  # (w,), the same of the bed after its correction with the present poses
 
 
 def mended(
@@ -349,13 +329,11 @@ def mended(
     true = true_start(ties.xyz, water, refractive_index, wet)
     block = replace(
         plain_block(cameras, replace(ties, xyz=true), water, refractive_index, wet),
-        sigma_px=np.full(len(ties.image_xy), SIGMA_PX),
         gnss_xyz=cameras.centres,
         gnss_sigma_m=np.full((len(cameras), 3), OWN_SIGMA_M),
     )
-    problem, begin = prepare(block, Unknowns(lens=("f",)))
-    tests = straight_columns(problem, begin, ties.xyz - problem.origin)
-    found = solve_unaware(problem, begin, tests)
+    trial = _trial(CloudBlock(block, cameras, ties.xyz), Unknowns(lens=("f",)), SIGMA_PX, None)
+    problem, found = trial.problem, trial.found
     higher = found.state.xyz[:, 2] + problem.origin[2] - intersect_fixed(block).xyz[:, 2]
     known = np.isfinite(higher)
     return Mended(solved_cameras(problem, found), row, higher[~wet & known], higher[wet & known])

@@ -17,18 +17,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import chdtri
 
-from pcfix.adjust.block import (
-    CODES,
-    LEAST_VIEWS,
-    NAMES,
-    Block,
-    Progress,
-    Robust,
-    Unknowns,
-    check_datum,
-    usable_codes,
-)
-from pcfix.adjust.normal import residuals
+from pcfix.adjust.block import CODES, LEAST_VIEWS, NAMES, Block, Progress, Unknowns, usable_codes
+from pcfix.adjust.normal import CAUCHY, HUBER, SQUARES, residuals
 from pcfix.adjust.precision import Precision, precision_of
 from pcfix.adjust.problem import Problem, Solution, prepare
 from pcfix.adjust.result import Adjusted, adjusted_of, sigma0_of
@@ -74,7 +64,6 @@ def adjust_ties(
         Whether lens parameters that the block does not determine are fixed, and those that lower
         the residuals freed; else exactly those of the unknowns are free.
     """
-    check_datum(block, unknowns)
     problem, now = prepare(block, unknowns)
     in_front = np.asarray(np.isfinite(residuals(now.state, problem.given)).all(axis=1))
     _check_most(
@@ -123,14 +112,14 @@ def _cleaned(
     """Return the problem with the noise of its tie points estimated and outliers excluded."""
     estimate = sigma_px is None
     if outliers or estimate:
-        now = solve(problem, now, "huber", number=1, progress=progress, close=ROUGHLY)
+        now = solve(problem, now, HUBER, number=1, progress=progress, close=ROUGHLY)
     if estimate:
         problem = with_sigma(problem, noise_px(problem, now))
     if not outliers:
         return problem, now
     for number in range(OUTLIER_ROUNDS):
-        robust: Robust = "cauchy" if number == 0 else "squares"
-        now = solve(problem, now, robust, number=2 + number, progress=progress, close=ROUGHLY)
+        loss = CAUCHY if number == 0 else SQUARES
+        now = solve(problem, now, loss, number=2 + number, progress=progress, close=ROUGHLY)
         before = problem.used
         problem = without_outliers(problem, now)
         _check_most(
@@ -164,7 +153,7 @@ def _settled(
     if estimate:
         problem = with_sigma(problem, noise_px(problem, now, robust=False))
         problem = weighed(problem, now)[0]
-    now = solve(problem, now, "squares", number=number, progress=progress)
+    now = solve(problem, now, number=number, progress=progress)
     return problem, now, precision_of(problem, now, sigma0_of(problem, now))
 
 
@@ -211,7 +200,7 @@ def _with_lens(
     wide, start = prepare(problem.block, replace(problem.unknowns, lens=lens))
     wide = wide.weighted(problem.given.weight)
     start = replace(start, state=start.state._replace(xyz=now.state.xyz), log=now.log)
-    start = solve(wide, start, "squares", number=LAST_ROUND + 1, progress=progress, close=ROUGHLY)
+    start = solve(wide, start, number=LAST_ROUND + 1, progress=progress, close=ROUGHLY)
     if not outliers:
         return wide, start
     used = problem.given.weight[problem.of_ties].max(initial=0.0)
@@ -281,13 +270,13 @@ def missing_lens_parameters(problem: Problem, now: Solution, sigma0: float) -> l
     more = tuple(name for name in TRIED if name not in names)
     wide, start = prepare(problem.block, replace(problem.unknowns, lens=names + more))
     wide, given = wide.weighted(problem.given.weight), wide.given
-    is_tried = np.zeros(given.shared, np.bool_)
+    is_tried = np.zeros(len(wide.names), np.bool_)
     is_tried[: len(given.code)] = np.isin(given.code, [CODES[name] for name in more])
-    shared = np.zeros(given.shared)
+    shared = np.zeros(len(wide.names))
     shared[~is_tried] = now.shared
     start = replace(start, state=now.state, lenses=now.lenses, shared=shared)
     matrix, right = reduced_at(wide, start)
-    mine = np.append(np.zeros(len(wide.moves) - len(shared), np.bool_), is_tried)[wide.active]
+    mine = np.append(np.zeros(len(right) - len(shared), np.bool_), is_tried)
     solve_for = solver(matrix[~mine][:, ~mine])
     if not mine.any() or solve_for is None:
         return []

@@ -1,4 +1,4 @@
-"""The two ways to adjust a block, by tie points or by the cloud, and the checks of their results.
+"""The adjustment of a block by tie points or by the cloud, and the checks of its result.
 
 An antenna's lever arm, another height datum or a wrong water level offset all GNSS positions from
 the projection centres alike. The block follows them, focal length and heights absorb the offset,
@@ -27,14 +27,14 @@ from pcfix.adjust.block import (
     ties_of_cloud,
     well_seen,
 )
-from pcfix.adjust.from_cloud import Candidate, adjust_cloud
-from pcfix.adjust.from_ties import adjust_ties, default_lens, noise_px, with_sigma
+from pcfix.adjust.from_cloud import CloudBlock, adjust_cloud
+from pcfix.adjust.from_ties import adjust_ties, default_lens
 from pcfix.adjust.precision import correlated, shape_notes, undetermined
-from pcfix.adjust.problem import intersect_fixed, prepare
+from pcfix.adjust.problem import intersect_fixed
 from pcfix.adjust.result import Adjusted
 from pcfix.adjust.solve import reduced_at, solver
 from pcfix.errors import GeometryError, PcfixWarning, SettingError
-from pcfix.model import Cameras, FloatArray, GroundControl, IntArray, TiePoints, Views, WaterSurface
+from pcfix.model import Cameras, FloatArray, GroundControl, IntArray, TiePoints, WaterSurface
 from pcfix.options.survey import AdjustRules
 from pcfix.refract.choice import views_in_frame
 from pcfix.water.surface import surface_above
@@ -70,78 +70,65 @@ def unknowns_of(rules: AdjustRules, lens: tuple[str, ...]) -> Unknowns:
     )
 
 
-def _lens_of(material: Material, rules: AdjustRules) -> tuple[str, ...]:
-    """Return the free lens parameters: those named, none of a calibration, or the default."""
-    if rules.lens_unknowns is not None:
-        return rules.lens_unknowns
-    return () if material.calibrated is not None else default_lens(material.original.lenses or ())
-
-
-def by_ties(
-    material: Material, ties: TiePoints, rules: AdjustRules, progress: Progress | None = None
-) -> Adjusted:
-    """Adjust a block by measured tie points."""
-    block = block_of(material, ties, rules.sigma_image or FIRST_SIGMA_PX)
-    unknowns = unknowns_of(rules, _lens_of(material, rules))
-    check_datum(block, unknowns, material.no_gnss)
-    _check_wet(material.water, block.xyz[: len(ties.xyz)])
-    kept, left_out = _well_seen(material.name, block)
-    found = adjust_ties(
-        restricted(block, kept), unknowns, progress, sigma_px=rules.sigma_image,
-        outliers=rules.outliers,
-        choose_lens=rules.lens_unknowns is None and material.calibrated is None,
-    )  # fmt: skip
-    return _checked(material, found, left_out)
-
-
-def by_cloud(
-    material: Material, xyz: FloatArray, listed: Views | None, rules: AdjustRules,
+def adjust_block(
+    material: Material,
+    rules: AdjustRules,
+    *,
+    ties: TiePoints | None = None,
+    cloud_xyz: FloatArray | None = None,
     progress: Progress | None = None,
-) -> Adjusted:  # fmt: skip
-    """Adjust a block by points, shape (m, 3), of the apparent cloud that it made.
+) -> Adjusted:
+    """Adjust a block by measured tie points, or by the apparent cloud that it made.
 
-    The view list, if there is one, says which images contributed to them; so may all in frame.
+    Parameters
+    ----------
+    cloud_xyz : array, shape (m, 3)
+        Points of the cloud, in place of tie points.
     """
-    guesses = {"all images in frame": views_in_frame(xyz, material.original)}
-    if listed is not None:
-        guesses["the images of the view list"] = listed
-    candidates: list[Candidate] = []
-    notes: list[PcfixWarning] = []
-    for name, views in guesses.items():
-        ties = ties_of_cloud(xyz, views, material.original)
-        if len(ties.xyz) < LEAST_TIES:
-            continue
-        block = block_of(material, ties, FIRST_SIGMA_PX)
-        check_datum(block, unknowns_of(rules, ()), material.no_gnss)
-        surveyed = [] if material.control is None else [material.control.xyz]
-        apparent = np.vstack([ties.xyz, *surveyed])
-        kept = well_seen(block)
-        if len(guesses) == 1:
-            kept, notes = _well_seen(material.name, block)
-        if len(kept) >= 2:
-            original = some_cameras(material.original, kept)
-            candidates.append(Candidate(name, restricted(block, kept), original, apparent))
-    if not candidates:
+    original, chooses_lens = material.original, False
+    lens: tuple[str, ...] = ()
+    if rules.lens_unknowns is not None:
+        lens = rules.lens_unknowns
+    elif material.calibrated is None:
+        lens, chooses_lens = default_lens(original.lenses or ()), True
+    if cloud_xyz is not None:
+        ties = ties_of_cloud(cloud_xyz, views_in_frame(cloud_xyz, original), original)
+    if ties is None or len(ties.xyz) < LEAST_TIES:
         words = (
             f"{material.name}: the images do not see the cloud. Check the poses with 'pcfix cameras"
             " --cloud'."
         )
         raise GeometryError("cameras.no_overlap", words, path=material.name)
-    _check_wet(material.water, candidates[0].block.xyz)
-    sets = [_lens_of(material, rules)]
-    if rules.lens_unknowns is None and material.calibrated is None:
-        sets = list(dict.fromkeys([("f",), ("f", "cx", "cy"), *sets]))
-    found = adjust_cloud(candidates, unknowns_of(rules, sets[0]), sets, progress)
-    return _checked(material, found, notes)
-
-
-def _checked(material: Material, found: Adjusted, notes: list[PcfixWarning]) -> Adjusted:
-    """Return a result with all warnings, those on its input first."""
-    notes = [*notes, *_check_dry(material.water, found), *found.notes]
+    block = block_of(material, ties, rules.sigma_image or FIRST_SIGMA_PX)
+    unknowns = unknowns_of(rules, lens)
+    check_datum(block, unknowns, material.no_gnss)
+    _check_wet(material.water, block.xyz[: len(ties.xyz)])
+    kept, notes = _well_seen(material.name, block)
+    block = restricted(block, kept)
+    if cloud_xyz is None:
+        found = adjust_ties(
+            block, unknowns, progress, sigma_px=rules.sigma_image, outliers=rules.outliers,
+            choose_lens=chooses_lens,
+        )  # fmt: skip
+    else:
+        surveyed = [] if material.control is None else [material.control.xyz]
+        apparent = np.vstack([ties.xyz, *surveyed])
+        sets = [lens]
+        if chooses_lens:
+            sets = list(dict.fromkeys([("f",), ("f", "cx", "cy"), lens]))
+        given = CloudBlock(block, some_cameras(original, kept), apparent)
+        found = adjust_cloud(given, unknowns, sets, progress)
+    notes += [*_check_dry(material.water, found), *found.notes]
     if found.precision is not None:
-        notes += [*undetermined(found.precision, found.unknowns), *correlated(found.precision)]
+        notes += [*undetermined(found.precision), *correlated(found.precision)]
+        if found.precision.members is None:
+            words = (
+                f"The block is too large ({len(block.cameras):,} images) for covariances of its"
+                " points, and the correction cannot use the errors of the poses."
+            )
+            notes.append(PcfixWarning("adjust.too_large", words, images=len(block.cameras)))
         wet = found.is_wet & np.isfinite(found.xyz).all(axis=1)
-        notes += shape_notes(found.precision, (found.xyz - found.origin)[wet, :2])
+        notes += shape_notes(found.precision, (found.xyz - found.problem.origin)[wet, :2])
     return replace(found, notes=[*notes, *datum_notes(found), *bed_notes(found)])
 
 
@@ -336,14 +323,7 @@ def offset_of(found: Adjusted) -> tuple[FloatArray, FloatArray] | None:
     Both are to the right, ahead and up, shape (3,), metres. It is one more unknown of all
     positions, estimated by one step from the solution. None if nothing is free.
     """
-    block = replace(
-        found.block, cameras=found.cameras, xyz=found.xyz,
-        sigma_px=np.where(found.used, found.block.sigma_px, np.inf),
-    )  # fmt: skip
-    problem, now = prepare(block, found.unknowns, found.origin)
-    now = replace(now, state=now.state._replace(water=found.numbers))
-    problem = with_sigma(problem, noise_px(problem, now))
-    weight = block.gnss_weights
+    problem, now, weight = found.problem, found.solution, found.block.gnss_weights
     # axes of each image in the world: right, ahead, up
     right = np.asarray(found.cameras.rotations)[:, 0] * [1.0, 1.0, 0.0]
     right /= np.maximum(np.linalg.norm(right, axis=1), 1e-9)[:, None]
@@ -351,9 +331,9 @@ def offset_of(found: Adjusted) -> tuple[FloatArray, FloatArray] | None:
     axes = np.stack([right, np.cross(up, right), up], axis=1)
     with_centres = np.zeros((len(weight), 6, 3))
     with_centres[:, 3:] = weight[:, :, None] * axes.transpose(0, 2, 1)
-    shared = np.zeros((problem.given.shared, 3))
     matrix, right_side = reduced_at(problem, now)
-    taken_up = np.vstack([with_centres.reshape(-1, 3), shared])[problem.active]
+    others = np.zeros((problem.given.shared, 3))
+    taken_up = problem.spread(now.state).T @ np.vstack([with_centres.reshape(-1, 3), others])
     solve_for = solver(matrix)
     if solve_for is None or not taken_up.any():
         return None
@@ -365,7 +345,7 @@ def offset_of(found: Adjusted) -> tuple[FloatArray, FloatArray] | None:
 
 
 def datum_notes(found: Adjusted) -> list[PcfixWarning]:
-    """Return a warning if GNSS positions are a weak datum, and one if they have an offset."""
+    """Return warnings if GNSS positions are a weak datum, or have a significant offset."""
     known = np.isfinite(found.gnss_residual_m)
     if not known.any() or found.unknowns.poses != "free" or found.unknowns.free_network:
         return []
@@ -390,35 +370,26 @@ def datum_notes(found: Adjusted) -> list[PcfixWarning]:
         )
         more = {"sigma_m": float(sigma.max()), "image": image, "in_line": line is not None}
         notes.append(PcfixWarning("gnss.weak", words, **values, **more))
-    offset = offset_of(found)
-    return notes if offset is None else [*notes, *_offset_notes(found, *offset, stated_m)]
-
-
-def _offset_notes(
-    found: Adjusted, offset_m: FloatArray, sigma_m: FloatArray, stated_m: float
-) -> list[PcfixWarning]:
-    """Return a warning if GNSS positions have a significant offset."""
-    least = np.maximum(SIGMAS * sigma_m, OF_GNSS * stated_m)
-    is_off = np.abs(offset_m) > least
-    if not is_off.any():
-        return []
-    parts = [
-        f"{abs(m):.2f} m {side[int(m < 0.0)]} the projection centres (standard error {sigma:.2f} m)"
-        for m, sigma, side, off in zip(offset_m, sigma_m, SIDES, is_off, strict=True)
-        if off
-    ]
-    level = ""
-    if is_off[2] and found.water is not None:
-        level = f", or a water level that is too {'low' if offset_m[2] > 0.0 else 'high'}"
-    words = (
-        f"The GNSS positions lie {' and '.join(parts)}: an antenna lever arm, another datum{level}."
-        " The block followed them. Correct them, or omit them if there are control points."
-    )
-    return [
-        PcfixWarning(
-            "gnss.offset_found", words, offset_m=offset_m.tolist(), sigma_m=sigma_m.tolist()
+    offset_m, sigma_m = offset_of(found) or (np.zeros(3), np.zeros(3))
+    is_off = np.abs(offset_m) > np.maximum(SIGMAS * sigma_m, OF_GNSS * stated_m)
+    if is_off.any():
+        parts = [
+            f"{abs(m):.2f} m {side[int(m < 0.0)]} the projection centres (standard error"
+            f" {sigma:.2f} m)"
+            for m, sigma, side, off in zip(offset_m, sigma_m, SIDES, is_off, strict=True)
+            if off
+        ]
+        level = ""
+        if is_off[2] and found.water is not None:
+            level = f", or a water level that is too {'low' if offset_m[2] > 0.0 else 'high'}"
+        words = (
+            f"The GNSS positions lie {' and '.join(parts)}: an antenna lever arm, another"
+            f" datum{level}. The block followed them. Correct them, or omit them if there are"
+            " control points."
         )
-    ]
+        more = {"offset_m": offset_m.tolist(), "sigma_m": sigma_m.tolist()}
+        notes.append(PcfixWarning("gnss.offset_found", words, **more))
+    return notes
 
 
 def _line(found: Adjusted) -> tuple[FloatArray, FloatArray | None]:

@@ -37,17 +37,7 @@ from pcfix.adjust.collinearity import (
     workspace,
 )
 from pcfix.kernels import Span, device, in_tiles, kernel
-from pcfix.lens.algebra import (
-    beyond,
-    cross,
-    dot,
-    inverted,
-    minus,
-    row_of,
-    times,
-    transposed_times,
-    vector,
-)
+from pcfix.lens.algebra import beyond, dot, inverted, row_of, times, transposed_times, vector
 from pcfix.model import BoolArray, FloatArray, IntArray
 
 PARTS, PARTS_BYTES = 8, 100_000_000
@@ -59,17 +49,15 @@ LOST = 1e6
 """Cost of an observation whose point has left its image, as a weighted square."""
 
 SQUARES, HUBER, CAUCHY = range(3)
+LOSS_SCALE = 2.0
+"""Where a robust loss departs from least squares, in standard deviations."""
 
 
 class Rule(NamedTuple):
-    """How normal equations are summed.
+    """How normal equations are summed."""
 
-    kind : loss function; scale : where it departs from least squares, in standard deviations.
-    damping : Levenberg-Marquardt's factor on the diagonal of V (that of the poses is added later).
-    """
-
-    kind: int = SQUARES
-    scale: float = 1.0
+    loss: int = SQUARES
+    # Levenberg-Marquardt's factor on the diagonal of V; that of the poses is added later
     damping: float = 0.0
 
 
@@ -101,58 +89,6 @@ def in_parts(
 
 
 @device
-def linearise(
-    state: State, given: Given, rule: Rule, p: int, o: int, work: Workspace, at: int
-) -> bool:
-    """Fill a row of the workspace with an observation's weighted residual and derivatives.
-
-    Returns whether the observation counts.
-    """
-    own, row, r = work.own, work.right[at], work.r[at]
-    c, w = given.camera[o], given.weight[o]
-    if w == 0.0:
-        return False
-    u, v = image_and_all_gradients(state, given, p, c, work, own)
-    r[0], r[1] = given.image_xy[o, 0] - u, given.image_xy[o, 1] - v
-    square = w * w * (r[0] * r[0] + r[1] * r[1])
-    if not square < np.inf:
-        return False
-    # a robust loss is least squares with the derivative of the loss as weight
-    if rule.kind == HUBER and square > rule.scale * rule.scale:
-        w *= np.sqrt(rule.scale / np.sqrt(square))
-    elif rule.kind == CAUCHY:
-        w *= np.sqrt(1.0 / (1.0 + square / (rule.scale * rule.scale)))
-    group = given.group[c]
-    first, last = given.first_lens[group], given.first_lens[group + 1]
-    shared = row[:, SHARED:]
-    shared[:] = 0.0
-    if last > first:
-        lens, codes = state.lenses[given.lens_row[c]], given.code[first:last]
-        lens_gradients(lens, work.ahead, codes, shared[:, first:last])
-    for axis in range(2):
-        for i in range(SURFACE):
-            row[axis, i] = own[axis, i]
-        for i in range(min(PLANES, given.column.size)):
-            if given.column[i] >= 0:
-                shared[axis, given.column[i]] = own[axis, SURFACE + i]
-    if given.similarity >= 0:
-        # all poses move together: with t, phi, s and d = C - pivot, C by t + phi x d + s d and R by
-        # exp(-R phi) R; single ones do not move
-        d = minus(row_of(state.centres, c), vector(given.pivot))
-        for axis in range(2):
-            at, by_centre = given.similarity, vector(row[axis], 3)
-            turn = cross(d, by_centre)
-            rolled = transposed_times(state.rotations[c], vector(row[axis]))
-            for i in range(3):
-                shared[axis, at + i], shared[axis, at + 3 + i] = by_centre[i], turn[i] - rolled[i]
-            shared[axis, at + 6] = dot(d, by_centre)
-            row[axis, :POINT] = 0.0
-    r *= w
-    row *= w
-    return True
-
-
-@device
 def linearise_point(
     state: State, given: Given, rule: Rule, p: int, work: Workspace
 ) -> tuple[int, int]:
@@ -161,13 +97,40 @@ def linearise_point(
     Returns how many rows of the workspace count, and how many of them are images (the other one is
     a condition). Zero if the rays do not fix the point: then it tells nothing about the cameras.
     """
-    v, rhs, count = work.v, work.rhs, 0
+    v, rhs, own, count = work.v, work.rhs, work.own, 0
     v[:], rhs[:] = 0.0, 0.0
     for o in range(given.start[p], given.start[p + 1]):
-        if linearise(state, given, rule, p, o, work, count):
-            work.row[count] = o
-            _add_point(given, work, count)
-            count += 1
+        c, w, row, r = given.camera[o], given.weight[o], work.right[count], work.r[count]
+        if w == 0.0:
+            continue
+        u_found, v_found = image_and_all_gradients(state, given, p, c, work, own)
+        r[0], r[1] = given.image_xy[o, 0] - u_found, given.image_xy[o, 1] - v_found
+        square = w * w * (r[0] * r[0] + r[1] * r[1])
+        if not square < np.inf:
+            continue
+        # a robust loss is least squares with the derivative of the loss as weight
+        if rule.loss == HUBER and square > LOSS_SCALE * LOSS_SCALE:
+            w *= np.sqrt(LOSS_SCALE / np.sqrt(square))
+        elif rule.loss == CAUCHY:
+            w *= np.sqrt(1.0 / (1.0 + square / (LOSS_SCALE * LOSS_SCALE)))
+        # derivatives by pose and point, then by shared unknowns: lens, water and port
+        first, last = given.first_lens[given.group[c]], given.first_lens[given.group[c] + 1]
+        shared = row[:, SHARED:]
+        shared[:] = 0.0
+        if last > first:
+            lens, codes = state.lenses[given.lens_row[c]], given.code[first:last]
+            lens_gradients(lens, work.ahead, codes, shared[:, first:last])
+        for axis in range(2):
+            for i in range(SURFACE):
+                row[axis, i] = own[axis, i]
+            for i in range(min(PLANES, given.column.size)):
+                if given.column[i] >= 0:
+                    shared[axis, given.column[i]] = own[axis, SURFACE + i]
+        r *= w
+        row *= w
+        work.row[count] = o
+        _add_point(given, work, count)
+        count += 1
     images = count
     if count and condition(state, given, p, work, count):
         work.row[count] = work.row[0]  # any camera will do: the derivatives by its pose are zero
@@ -223,13 +186,13 @@ def _residuals(span: Span, state: State, given: Given, found: FloatArray, work: 
             found[o, 0], found[o, 1] = given.image_xy[o, 0] - u, given.image_xy[o, 1] - v
 
 
-def cost_of(squares: FloatArray, rule: Rule) -> float:
+def cost_of(squares: FloatArray, loss: int) -> float:
     """Return the sum of the loss of weighted squared residuals; NaN ones cost `LOST`."""
     lost = np.isnan(squares)
-    s, c2 = np.where(lost, 0.0, squares), rule.scale * rule.scale
-    if rule.kind == HUBER:
-        s = np.where(s <= c2, s, 2.0 * rule.scale * np.sqrt(s) - c2)
-    elif rule.kind == CAUCHY:
+    s, c2 = np.where(lost, 0.0, squares), LOSS_SCALE * LOSS_SCALE
+    if loss == HUBER:
+        s = np.where(s <= c2, s, 2.0 * LOSS_SCALE * np.sqrt(s) - c2)
+    elif loss == CAUCHY:
         s = c2 * np.log1p(s / c2)
     return float(s.sum() + LOST * lost.sum())
 
@@ -238,15 +201,11 @@ def cost_of(squares: FloatArray, rule: Rule) -> float:
 
 
 class Equations(NamedTuple):
-    """The reduced normal equations of poses and shared unknowns, u = 6 k + g.
+    """The reduced normal equations of poses and shared unknowns, u = 6 k + g."""
 
-    matrix : shape (u, u), dense or scipy's sparse one; right : shape (u,).
-    diagonal : shape (u,), that of U and U_gg, for the damping.
-    """
-
-    matrix: Any
-    right: FloatArray
-    diagonal: FloatArray
+    matrix: Any  # (u, u), dense or scipy's sparse one
+    right: FloatArray  # (u,)
+    diagonal: FloatArray  # (u,), that of U and U_gg, for the damping
 
 
 def normal_equations(state: State, given: Given, rule: Rule) -> Equations:
@@ -373,20 +332,14 @@ class LinearisedRows(NamedTuple):
     """Observations of m points, weighted and linearised; rows that do not count are zero.
 
     Each point has a row for each observation, and one more for a condition.
-
-    columns : shape (n, 2, 9 + g), derivatives by pose, point and shared unknowns.
-    r : shape (n, 2), residuals.
-    observation : shape (n,), of a condition any observation of its point.
-    is_image : shape (n,), whether the row is an image, not a condition.
-    inverse, rhs : shapes (m, 3, 3) and (m, 3), V^-1 and the right side of each point.
     """
 
-    columns: FloatArray
-    r: FloatArray
-    observation: IntArray
-    is_image: BoolArray
-    inverse: FloatArray
-    rhs: FloatArray
+    columns: FloatArray  # (n, 2, 9 + g), derivatives by pose, point and shared unknowns
+    r: FloatArray  # (n, 2), residuals
+    observation: IntArray  # (n,), of a condition any observation of its point
+    is_image: BoolArray  # (n,), whether the row is an image, not a condition
+    inverse: FloatArray  # (m, 3, 3), V^-1 of each point
+    rhs: FloatArray  # (m, 3), and its right side
 
 
 def linearised(state: State, given: Given, rule: Rule, first: int, last: int) -> LinearisedRows:
@@ -418,17 +371,13 @@ def _linearised(
 
 
 class SparseRows(NamedTuple):
-    """Linearised observations of some points: u and v of each row, as sparse matrices.
-
-    others, points : columns A of poses and shared unknowns, and B of the points.
-    inverse : V^-1 of all points, a block diagonal matrix; coupling : V^-1 B'A.
-    """
+    """Linearised observations of some points: u and v of each row, as sparse matrices."""
 
     rows: LinearisedRows
-    others: Any
-    points: Any
-    inverse: Any
-    coupling: Any
+    others: Any  # columns A of poses and shared unknowns
+    points: Any  # columns B of the points
+    inverse: Any  # V^-1 of all points, a block diagonal matrix
+    coupling: Any  # V^-1 B'A
 
     def product(self, x: Any) -> Any:
         """Return X'A with the points eliminated, X'A - X'B V^-1 B'A."""
@@ -479,39 +428,31 @@ def _sparse_equations(state: State, given: Given, rule: Rule) -> Equations:
     return Equations(matrix, right, diagonal)
 
 
-def point_covariances(
-    state: State, given: Given, active: IntArray, inverse: FloatArray
-) -> FloatArray:
+def point_covariances(state: State, given: Given, inverse: FloatArray) -> FloatArray:
     """Return the covariances of the points: V^-1 + V^-1 W' S^-1 W V^-1, shape (m, 6).
 
     They are xx, xy, xz, yy, yz, zz in square metres for observations of unit weight, NaN for points
-    that are not fixed. The inverse S^-1, shape (a, a), is that of the active unknowns.
+    that are not fixed. The inverse S^-1 has the shape (6 k + g, 6 k + g), zero where poses are
+    fixed.
     """
-    place = np.full(6 * len(state.centres) + given.shared, -1, np.int64)
-    place[active] = np.arange(len(active))
     out = np.full((len(state.xyz), 6), np.nan)
-    in_parts(_point_covariances, state, given, place, inverse, out)
+    in_parts(_point_covariances, state, given, inverse, out)
     return out
 
 
 @kernel(allocates=True)
 def _point_covariances(
-    span: Span, state: State, given: Given, place: IntArray, inverse: FloatArray, out: FloatArray,
-    work: Workspace,
-) -> None:  # fmt: skip
+    span: Span, state: State, given: Given, inverse: FloatArray, out: FloatArray, work: Workspace
+) -> None:
     most, poses = 6 * len(work.row) + given.shared, 6 * len(state.centres)
     w, y, unknown = np.empty((most, 3)), np.empty((most, 3)), np.empty(most, np.int64)
     for p in range(*span):
         count, _ = linearise_point(state, given, UNDAMPED, p, work)
         if count == 0:
             continue
-        # y: rows of W V^-1, of the unknowns that move; then their places in the inverse
-        used = 0
-        for i in range(_couple(given, poses, work, count, w, y, unknown)):
-            at = place[unknown[i]]
-            if at >= 0:
-                y[used, 0], y[used, 1], y[used, 2] = transposed_times(work.v, vector(w[i]))
-                unknown[used], used = at, used + 1
+        used = _couple(given, poses, work, count, w, y, unknown)
+        for i in range(used):  # y: rows of W V^-1
+            y[i, 0], y[i, 1], y[i, 2] = transposed_times(work.v, vector(w[i]))
         total = work.v
         for i in range(used):
             s = (0.0, 0.0, 0.0)

@@ -13,47 +13,36 @@ covariance. Whatever is computed with each of them in turn scatters by all error
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
-from pcfix.adjust.block import (
-    CODES,
-    INDEX,
-    PORT,
-    SHAPE,
-    WATER_NAMES,
-    Unknowns,
-    lens_parameter,
-    moved_lens,
-)
+from pcfix.adjust.block import CODES, INDEX, PORT, SHAPE, lens_parameter, moved_lens, words_of
 from pcfix.adjust.normal import point_covariances
-from pcfix.adjust.problem import Problem, Solution, polynomial, pose_gradients
-from pcfix.adjust.solve import BED, LIMITS, moved_by, reduced_at, singular, solver, words_of
+from pcfix.adjust.problem import Problem, Solution, polynomial
+from pcfix.adjust.solve import BED, moved_by, reduced_at, singular, solver
 from pcfix.errors import PcfixWarning
-from pcfix.model import Cameras, FloatArray, IntArray, WaterPlane, WaterRaster, WaterSurface
+from pcfix.model import Cameras, FloatArray, WaterPlane, WaterRaster, WaterSurface
 
 DENSE_UP_TO = 12_000
 """Unknowns up to which the whole inverse is computed (1.2 GB)."""
 
-SINGULAR = 1e-13
-"""Reciprocal condition of the scaled matrix below which its inverse is meaningless."""
+SINGULAR = 1e-12
+"""Share of the variance of an unknown, if all others were known, below which none is meaningful."""
 
 
 class SharedUnknown(NamedTuple):
-    """A shared unknown: its name, the correction to its start value, and its standard error.
+    """A shared unknown; units are pixels, metres, slopes, radians.
 
-    Units are pixels, metres, slopes, radians. The level is that at the origin of the block, below
-    the mean of the projection centres.
+    The level is that at the origin of the block, below the mean of the projection centres.
     """
 
     name: str
-    added: float
-    sigma: float
+    added: float  # correction to its start value
+    sigma: float  # its standard error
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +56,6 @@ class Precision:
     correlation: FloatArray  # (g, g), of the shared unknowns
     # (m, 6), xx, xy, xz, yy, yz, zz; NaN if not determined, None for very large blocks
     point_covariance_m2: FloatArray | None
-    notes: tuple[PcfixWarning, ...] = ()
     members: Members | None = None  # drawn from the joint covariance; None for very large blocks
 
     @property
@@ -108,93 +96,50 @@ def precision_of(
         unknowns; see `pcfix.adjust.shared_errors`.
     """
     matrix, state, given = reduced_at(problem, solution)[0], solution.state, problem.given
-    active, k, g = problem.active, len(state.centres), given.shared
+    k, g, free = len(problem.moves), len(problem.names), np.flatnonzero(problem.moves)
     times = np.ones(6 + g) if factor is None else factor
-    variance, u = sigma0 * sigma0, len(active)
-    notes: list[PcfixWarning] = []
-    inverse = _inverse(matrix) if u <= DENSE_UP_TO else None
-    solve_for = solver(matrix) if u > DENSE_UP_TO else None
-    if u > DENSE_UP_TO:
-        words = (
-            f"The block has {u:,} unknowns (limit {DENSE_UP_TO:,}), so its points have no"
-            " covariances, and the correction cannot use the errors of the poses."
-        )
-        notes.append(PcfixWarning("adjust.too_large", words, unknowns=u))
-    if inverse is None and solve_for is None:
+    variance, u = sigma0 * sigma0, len(matrix.diagonal())
+    solve_for = solver(matrix)
+    if solve_for is None:
         raise singular(problem, solution)
-
-    def columns(rows: IntArray) -> FloatArray:
-        """Return some columns of the inverse."""
-        if inverse is not None:
-            return inverse[:, rows]
+    # columns of the inverse, some at a time: those of 32 poses, then those of the shared unknowns
+    poses, inverse = np.zeros((k, 6, 6)), np.empty((u, u)) if u <= DENSE_UP_TO else None
+    first, last = np.arange(0, u - g, 6), np.arange(u - g, u)
+    for part in (*np.array_split(first, -(-len(first) // 32) or 1), None):
+        rows = last if part is None else (part[:, None] + np.arange(6)).ravel()
         unit = np.zeros((u, len(rows)))
         unit[rows, np.arange(len(rows))] = 1.0
-        return np.zeros(0) if solve_for is None else solve_for(unit)
-
-    last = np.arange(u - g, u)
-    of_shared = columns(last)[last] * times[6:] * times[6:, None]
-    poses = _pose_blocks(k, active, columns) * times[:6] * times[:6, None]
-    if given.similarity >= 0:
-        by, at = pose_gradients(state, given.pivot), given.similarity
-        poses = by @ of_shared[at:, at:] @ by.transpose(0, 2, 1)
-    if (np.diag(of_shared) < 0.0).any() or (np.einsum("kii->ki", poses) < 0.0).any():
+        columns = solve_for(unit)
+        if inverse is not None:
+            inverse[:, rows] = columns
+        if part is not None:
+            of_part = columns[rows].reshape(len(part), 6, len(part), 6)
+            poses[free[part // 6]] = np.einsum("kikj->kij", of_part)
+    of_shared = columns[last]
+    diagonal = np.append(np.einsum("kii->ki", poses)[free], of_shared.diagonal())
+    if not ((diagonal > 0.0) & (diagonal * matrix.diagonal() * SINGULAR < 1.0)).all():
         raise singular(problem, solution)
+    of_shared = of_shared * times[6:] * times[6:, None]
+    poses = poses * times[:6] * times[:6, None]
+    if problem.unknowns.poses == "similarity":
+        by = problem.pose_gradients(state)
+        poses = by @ of_shared[-7:, -7:] @ by.transpose(0, 2, 1)
     points: FloatArray | None = None
     members: Members | None = None
     if inverse is not None:
-        each = np.concatenate([np.tile(times[:6], k), times[6:]])[active]
+        each = np.append(np.tile(times[:6], len(free)), times[6:])
         inverse *= each
         inverse *= each[:, None]
-        points = variance * point_covariances(state, given, active, inverse)
-        loose = int(np.isnan(points[:, 0]).sum())
-        if loose:
-            words = f"{loose:,} points are not determined by their images and have no covariance."
-            notes.append(PcfixWarning("adjust.loose_points", words, points=loose))
-        members = members_of(problem, solution, active, sigma0 * drawn(inverse))
+        spread = problem.spread(state)
+        points = variance * point_covariances(state, given, spread @ inverse @ spread.T)
+        members = members_of(problem, solution, sigma0 * drawn(inverse))
     sigma = np.sqrt(np.diag(of_shared))
     correlation = of_shared / sigma / sigma[:, None]
-    rows = zip(problem.names, solution.shared.tolist(), (sigma * sigma0).tolist(), strict=True)
+    rows_of = zip(problem.names, solution.shared.tolist(), (sigma * sigma0).tolist(), strict=True)
     return Precision(
-        sigma0, variance * poses.reshape(k, 6, 6), tuple(SharedUnknown(*row) for row in rows),
-        correlation, points, tuple(notes), members,
+        sigma0, variance * poses, tuple(SharedUnknown(*row) for row in rows_of), correlation,
+        points, members,
     )  # fmt: skip
-
-
-def _pose_blocks(k: int, active: IntArray, columns: Callable[[IntArray], FloatArray]) -> FloatArray:
-    """Return the covariance of each pose, shape (k, 6, 6), from columns of the inverse."""
-    poses = np.zeros((k, 6, 6))
-    first = np.flatnonzero(np.isin(active, 6 * np.arange(k)))  # six in a row belong to a pose
-    for part in np.array_split(first, max(1, len(first) // 32)):
-        rows = part[:, None] + np.arange(6)
-        found = columns(rows.ravel()).reshape(len(active), len(part), 6)
-        poses[active[part] // 6] = found[rows, np.arange(len(part))[:, None]]
-    return poses
-
-
-def _inverse(matrix: Any) -> FloatArray | None:
-    """Return the whole inverse, by Cholesky's method with a unit diagonal; None if singular."""
-    from scipy.linalg import cho_factor, cho_solve
-
-    if matrix.shape[0] == 0:
-        return np.zeros((0, 0))
-    a = np.array(matrix if isinstance(matrix, np.ndarray) else matrix.toarray(), order="F")
-    diagonal = a.diagonal()
-    if not (diagonal > 0.0).all():
-        return None
-    scale = 1.0 / np.sqrt(diagonal)
-    a *= scale
-    a *= scale[:, None]
-    norm = np.linalg.norm(a, 1)
-    try:  # in place where possible, as memory matters
-        factor = cho_factor(a, lower=True, overwrite_a=True)
-    except np.linalg.LinAlgError:
-        return None
-    inverse = np.asarray(cho_solve(factor, np.eye(len(a), order="F"), overwrite_b=True))
-    if not norm * np.linalg.norm(inverse, 1) * SINGULAR < 1.0:
-        return None
-    inverse *= scale
-    inverse *= scale[:, None]
-    return inverse
 
 
 # What is known poorly
@@ -203,8 +148,11 @@ def _inverse(matrix: Any) -> FloatArray | None:
 STRONG = 0.95
 """Correlation of two unknowns that are hardly separated."""
 
-NO_NEWS = 0.9
-"""Share of a given standard deviation above which the images did not improve an unknown."""
+LIMITS = {
+    "level": 0.02, "tilt_x": 0.0005, "tilt_y": 0.0005, "index": 0.005, "scale": 0.001,
+    "distance": 0.002, "centre_x": 0.002, "centre_y": 0.002, "centre_z": 0.002,
+}  # fmt: skip
+"""Standard errors beyond which an unknown counts as undetermined."""
 
 LEAST_BEND_M = 0.02
 """Standard error of the curvature of the water from which it is undetermined, as the level's."""
@@ -226,34 +174,24 @@ def correlated(precision: Precision) -> list[PcfixWarning]:
             continue
         is_bed = [name in BED for name in pair]
         remedy = ", or give control points at several heights" if sum(is_bed) == 1 else ""
-        one, other = map(words_of, pair)
+        one, other = (f"the {words_of(name)[0]}" for name in pair)
         words = f"{one} and {other} are strongly correlated (r = {r:.3f}). Fix one of them{remedy}."
         notes.append(PcfixWarning("adjust.correlated", words, unknowns=[one, other], correlation=r))
     return sorted(notes, key=lambda note: -abs(note.values["correlation"]))
 
 
-def undetermined(precision: Precision, unknowns: Unknowns) -> list[PcfixWarning]:
+def undetermined(precision: Precision) -> list[PcfixWarning]:
     """Return a warning for each unknown whose standard error is too large to be useful."""
-    given, notes = dict(zip(WATER_NAMES, unknowns.water_sigma, strict=True)), []
+    notes = []
     for row in precision.shared:
-        limit, unit, _ = LIMITS.get(row.name, (np.inf, "", ""))
-        prior = given.get(row.name, np.inf)
+        (what, unit), limit = words_of(row.name), LIMITS.get(row.name, np.inf)
         if row.sigma > limit:
-            code = "adjust.undetermined"
             words = (
-                f"is undetermined: standard error {row.sigma:.2g}{unit} (limit {limit:g}{unit})."
-                " Fix it to a measured value."
+                f"the {what} is undetermined: standard error {row.sigma:.2g}{unit} (limit"
+                f" {limit:g}{unit}). Fix it to a measured value."
             )
-        elif prior < np.inf and row.sigma > NO_NEWS * prior:
-            code = "adjust.not_improved"
-            words = (
-                "was not improved: the images determine it no better than its given standard"
-                f" deviation of {prior:g}{unit}."
-            )
-        else:
-            continue
-        words = f"{words_of(row.name)} {words}"
-        notes.append(PcfixWarning(code, words, unknown=row.name, sigma=row.sigma))
+            values = {"unknown": row.name, "sigma": row.sigma}
+            notes.append(PcfixWarning("adjust.undetermined", words, **values))
     return notes
 
 
@@ -398,8 +336,8 @@ def drawn(covariance: FloatArray, count: int = MEMBERS) -> FloatArray:
     return np.asarray(draws * sigma)
 
 
-def members_of(problem: Problem, found: Solution, active: IntArray, steps: FloatArray) -> Members:
-    """Return the members that differ from a solution by steps, shape (m, a), of active unknowns.
+def members_of(problem: Problem, found: Solution, steps: FloatArray) -> Members:
+    """Return the members that differ from a solution by steps, shape (m, u), of free unknowns.
 
     Steps that take a lens or an index out of its range are skipped.
     """
@@ -407,9 +345,7 @@ def members_of(problem: Problem, found: Solution, active: IntArray, steps: Float
     codes = [CODES[name] for name in names]
     before = [[lens_parameter(lens, code) for code in codes] for lens in found.lenses]
     turn, shift, lens, water = [], [], [], []
-    for one in steps:
-        step = np.zeros(len(problem.moves))
-        step[active] = one
+    for step in steps:
         moved = moved_by(problem, found, step, np.zeros_like(state.xyz))
         if moved is None:
             continue

@@ -15,6 +15,7 @@ from pcfix.adjust.block import (
     INDEX,
     MOTIONS,
     NAMES,
+    NO_CONDITIONS,
     PLANES,
     PORT,
     SHAPE,
@@ -29,10 +30,9 @@ from pcfix.adjust.block import (
     similarity_gradients,
     usable_codes,
 )
-from pcfix.adjust.collinearity import SHARED, Given, State, Workspace, condition
-from pcfix.adjust.normal import UNDAMPED, Rule, cost_of, in_parts, point_steps, residuals
+from pcfix.adjust.collinearity import SHARED, Given, State
+from pcfix.adjust.normal import UNDAMPED, Rule, cost_of, point_steps, residuals
 from pcfix.errors import GeometryError
-from pcfix.kernels import Span, kernel
 from pcfix.lens.imaging import lens_table
 from pcfix.model import (
     BoolArray,
@@ -47,7 +47,7 @@ from pcfix.model import (
 )
 from pcfix.port.light import coefficients as port_coefficients
 from pcfix.port.shapes import DomePort, FlatPort, Port
-from pcfix.water.surface import build_field, build_tin
+from pcfix.water.surface import build_field, build_tin, surface_above
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
@@ -71,13 +71,36 @@ class Problem:
     given: Given  # what the kernels need
     groups: list[list[int]]  # rows of the cameras of each sensor
     codes: list[tuple[int, ...]]  # free lens parameters of each sensor
-    moves: BoolArray  # (6 k + g,), which poses and shared unknowns are free
-    names: list[str]  # of the shared unknowns
+    moves: BoolArray  # (k,), poses that move one by one
+    # of the g shared unknowns, and of the seven motions if all poses move together
+    names: list[str]
+
+    def spread(self, state: State) -> csc_array:
+        """Return how poses and shared unknowns move with the free unknowns, shape (6 k + g, u).
+
+        Those are the poses that move, and what has names.
+        """
+        from scipy import sparse
+
+        k, g = len(self.moves), self.given.shared
+        free = np.append(np.repeat(self.moves, 6), np.ones(g, np.bool_))
+        one_by_one = sparse.eye_array(6 * k + g, format="csc")[:, np.flatnonzero(free)]
+        if self.unknowns.poses != "similarity":
+            return one_by_one
+        together = np.vstack([self.pose_gradients(state).reshape(-1, 7), np.zeros((g, 7))])
+        return sparse.hstack([one_by_one, sparse.csc_array(together)], format="csc")
 
     @property
-    def active(self) -> IntArray:
-        """The free poses and shared unknowns, those of the reduced equations, shape (a,)."""
-        return np.flatnonzero(self.moves)
+    def pivot(self) -> FloatArray:
+        """The point about which a similarity turns and scales the poses, shape (3,)."""
+        return np.asarray(self.block.cameras.centres.mean(axis=0) - self.origin)
+
+    def pose_gradients(self, state: State) -> FloatArray:
+        """Return how poses, turn and centre, move with a similarity of all, shape (k, 6, 7)."""
+        by = np.zeros((len(self.moves), 6, 7))
+        by[:, :3, 3:6] = -state.rotations
+        by[:, 3:] = similarity_gradients(state.centres - self.pivot)
+        return by
 
     @property
     def used(self) -> BoolArray:
@@ -105,17 +128,12 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """State of a problem after some steps.
-
-    state : relative to `Problem.origin`; lenses : of the k cameras.
-    shared : shape (g,), corrections of the shared unknowns.
-    cost : sum of weighted squares, including prior knowledge.
-    """
+    """State of a problem after some steps."""
 
     state: State
-    lenses: tuple[Lens, ...]
-    shared: FloatArray
-    cost: float
+    lenses: tuple[Lens, ...]  # of the k cameras
+    shared: FloatArray  # (g,), corrections of the shared unknowns
+    cost: float  # sum of weighted squares, including prior knowledge
     log: list[LogRow]
 
 
@@ -140,7 +158,7 @@ def prepare(
             raise GeometryError("adjust.fixed_surface", words, unknown=what)
     numbers = surface_numbers(block, origin)
     planes, plane_names, axis, alike = _planes(block, origin, numbers)
-    # columns of the shared unknowns: lenses, then surface and planes, then a similarity
+    # columns of the shared unknowns: lenses, then surface and planes
     first_lens = np.concatenate([[0], np.cumsum([len(one) for one in codes])]).astype(np.int64)
     free = [sigma != 0.0 for sigma in unknowns.water_sigma]
     free += [len(WATER_NAMES) + i not in alike for i in range(len(planes))]
@@ -156,9 +174,8 @@ def prepare(
     names += [
         name for name, is_free in zip((*WATER_NAMES, *plane_names), free, strict=True) if is_free
     ]
-    is_similarity = unknowns.poses == "similarity"
-    similarity = len(names) if is_similarity else -1
-    names += list(MOTIONS) if is_similarity else []
+    shared = len(names)
+    names += MOTIONS if unknowns.poses == "similarity" else ()
     row, table = lens_table(cameras.lenses)
     centres = cameras.centres - origin
     weight = inverse_variances(block.surveyed_xyz, block.surveyed_sigma_m)
@@ -178,25 +195,20 @@ def prepare(
         first_lens=first_lens,
         code=np.array([code for of_sensor in codes for code in of_sensor], np.int64),
         column=column,
-        similarity=similarity,
-        shared=len(names),
-        pivot=centres.mean(axis=0),
+        shared=shared,
         surveyed_xyz=np.where(weight > 0.0, block.surveyed_xyz - origin, 0.0),
         surveyed_weight=weight,
-        on=np.asarray([] if conditions is None else conditions.on, np.int64),
-        on_weight=np.zeros(0)
-        if conditions is None
-        else np.where(conditions.on >= 0, 1.0 / conditions.sigma_m, 0.0),
+        on=np.asarray(conditions.on, np.int64),
+        on_weight=np.where(conditions.on >= 0, 1.0 / conditions.sigma_m, 0.0),
         axis=axis,
-        tests=np.zeros((0, 2, SHARED + len(names))),
+        tests=np.zeros((0, 2, SHARED + shared)),
     )
     poses = [
         unknowns.poses == "free" and label not in unknowns.fixed_images for label in cameras.labels
     ]
     problem = Problem(
-        block, unknowns, origin, given, groups, codes,
-        np.concatenate([np.repeat(poses, 6), np.ones(len(names), bool)]), names,
-    )  # fmt: skip
+        block, unknowns, origin, given, groups, codes, np.array(poses, np.bool_), names
+    )
     state = State(
         centres, np.ascontiguousarray(cameras.rotations, np.float64), table, block.xyz - origin,
         np.concatenate([numbers, planes]), port_row(block.port),
@@ -230,8 +242,6 @@ def _planes(
     unknown as another one, counted from the first of `WATER_NAMES`.
     """
     given = block.conditions
-    if given is None:
-        return [], [], np.zeros(0, np.int64), {}
     xyz, counts = block.xyz - origin, np.diff(block.start) > 0
     bundles = [tuple(given.parallel)] if given.parallel else []
     bundles += [(name,) for name in given.names if name not in given.parallel]
@@ -349,28 +359,22 @@ def priors_at(problem: Problem, found: Solution) -> tuple[float, csc_array, Floa
     from scipy import sparse
 
     given, block = problem.given, problem.block
-    k, size = len(block.cameras), len(problem.moves)
+    k, size = len(block.cameras), 6 * len(block.cameras) + given.shared
     diagonal, right = np.zeros(size), np.zeros(size)
     weight = block.gnss_weights
     off = np.where(weight > 0.0, block.gnss_xyz - problem.origin - found.state.centres, 0.0)
     sigma = np.full(given.shared, np.inf)  # of the shared unknowns about their start
     free = given.column[: len(WATER_NAMES)]
     sigma[free[free >= 0]] = [one for one in problem.unknowns.water_sigma if one]
-    shared = inverse_variances(found.shared, sigma)
-    cost = float((weight * off * off).sum() + (shared * found.shared**2).sum())
-    diagonal[6 * k :], right[6 * k :] = shared, -shared * found.shared
-    # weighted observations of several unknowns at once: their derivatives and residuals
+    added = found.shared[: given.shared]
+    shared = inverse_variances(added, sigma)
+    cost = float((weight * off * off).sum() + (shared * added**2).sum())
+    diagonal[6 * k :], right[6 * k :] = shared, -shared * added
+    diagonal[: 6 * k].reshape(k, 6)[:, 3:] = weight
+    right[: 6 * k].reshape(k, 6)[:, 3:] = weight * off
+    # seven observations hold mean, direction and scale of the centres of a free network
     rows, left = np.zeros((0, size)), np.zeros(0)
-    if given.similarity >= 0:
-        by = np.sqrt(weight)[:, :, None] * similarity_gradients(found.state.centres - given.pivot)
-        rows = np.zeros((3 * k, size))
-        rows[:, 6 * k + given.similarity :] = by.reshape(3 * k, 7)
-        left = (np.sqrt(weight) * off).ravel()
-    else:
-        diagonal[: 6 * k].reshape(k, 6)[:, 3:] = weight
-        right[: 6 * k].reshape(k, 6)[:, 3:] = weight * off
-    if problem.unknowns.free_network and given.similarity < 0:
-        # seven observations hold mean, direction and scale of the centres
+    if problem.unknowns.free_network and problem.unknowns.poses != "similarity":
         start = block.cameras.centres - problem.origin
         d = start - start.mean(axis=0)
         by = similarity_gradients(d) / np.array([1.0] * 3 + [np.sqrt((d * d).sum() / k)] * 4)
@@ -379,17 +383,9 @@ def priors_at(problem: Problem, found: Solution) -> tuple[float, csc_array, Floa
         rows[:, : 6 * k].reshape(-1, k, 6)[:, :, 3:] = by.transpose(2, 0, 1)
         left = -np.einsum("kja,kj->a", by, found.state.centres - start)
         cost += float((left * left).sum())
-    several = sparse.csc_array(rows)
-    matrix = sparse.diags_array(diagonal) + several.T @ several
+    held = sparse.csc_array(rows)
+    matrix = sparse.diags_array(diagonal) + held.T @ held
     return cost, matrix.tocsc(), right + rows.T @ left
-
-
-def pose_gradients(state: State, pivot: FloatArray) -> FloatArray:
-    """Return how poses, turn and centre, move with the same, shape (k, 6, 7)."""
-    by = np.zeros((len(state.centres), 6, 7))
-    by[:, :3, 3:6] = -state.rotations
-    by[:, 3:] = similarity_gradients(state.centres - pivot)
-    return by
 
 
 def _undetermined_motions(problem: Problem) -> list[int]:
@@ -410,7 +406,7 @@ def cost_at(problem: Problem, found: Solution, rule: Rule) -> float:
     """Return the cost of a solution: images, surveyed points and all prior knowledge."""
     used, weight = problem.used, problem.given.weight
     r = residuals(found.state, problem.given)[used]
-    images = cost_of((r**2).sum(axis=1) * weight[used] ** 2, rule)
+    images = cost_of((r**2).sum(axis=1) * weight[used] ** 2, rule.loss)
     return images + survey_cost(problem, found) + priors_at(problem, found)[0]
 
 
@@ -426,18 +422,19 @@ def survey_cost(problem: Problem, found: Solution) -> float:
 
 def surface_distances(problem: Problem, found: Solution) -> FloatArray:
     """Return surface minus point, shape (m,), metres along its axis; NaN for points on none."""
-    off, given, state = np.full(len(found.state.xyz), np.nan), problem.given, found.state
-    in_parts(_surface_distances, state, given, off)
+    given, state, off = problem.given, found.state, np.full(len(found.state.xyz), np.nan)
+    for number in np.unique(given.on[given.on >= 0]):
+        rows, up = np.flatnonzero(given.on == number), int(given.axis[number])
+        q, z = state.xyz[rows], np.full(len(rows), np.nan)
+        if number > 0:
+            a, b, c = state.water[PLANES + 3 * number - 3 :][:3]
+            z = a + b * q[:, (up + 1) % 3] + c * q[:, (up + 2) % 3]
+        elif isinstance(problem.block.water, WaterPlane):
+            z = polynomial(state.water, q[:, 0], q[:, 1])
+        elif (surface := water_of(problem, state)) is not None:
+            z = surface_above(surface, q + problem.origin).height_m - problem.origin[2]
+        off[rows] = z - q[:, up]
     return off
-
-
-@kernel
-def _surface_distances(
-    span: Span, state: State, given: Given, off: FloatArray, work: Workspace
-) -> None:
-    for p in range(*span):
-        if condition(state, given, p, work, 0):
-            off[p] = work.r[0, 0] / given.on_weight[p]
 
 
 def counts_of(problem: Problem, found: Solution) -> tuple[int, float]:
@@ -454,16 +451,11 @@ CLOSE_M = 1e-4
 
 
 class Intersected(NamedTuple):
-    """Points and how well they fit their images.
+    """Points and how well they fit their images."""
 
-    xyz : shape (m, 3), metres, world frame.
-    residual_px : shape (o, 2), measured minus computed; NaN if the intersection failed.
-    start : shape (m + 1,), the residuals of point i are ``start[i]:start[i + 1]``.
-    """
-
-    xyz: FloatArray
-    residual_px: FloatArray
-    start: IntArray
+    xyz: FloatArray  # (m, 3), metres, world frame
+    residual_px: FloatArray  # (o, 2), measured minus computed; NaN if the intersection failed
+    start: IntArray  # (m + 1,), the residuals of point i are start[i]:start[i + 1]
 
     @property
     def redundancy(self) -> IntArray:
@@ -486,8 +478,10 @@ def intersect_fixed(block: Block) -> Intersected:
 
     It fails for a point that needs more than `STEPS` Gauss-Newton steps.
     """
-    problem, now = prepare(replace(block, conditions=None), Unknowns(poses="fixed", lens=()))
-    nothing = np.zeros(len(problem.moves))
+    problem, now = prepare(
+        replace(block, conditions=NO_CONDITIONS), Unknowns(poses="fixed", lens=())
+    )
+    nothing = np.zeros(6 * len(problem.moves))
     state, step = now.state, np.full((len(block.xyz), 3), np.inf)
     for _ in range(STEPS):
         step = point_steps(state, problem.given, UNDAMPED, nothing)

@@ -13,6 +13,7 @@ from pcfix.adjust.block import (
     INDEX,
     LEAST_VIEWS,
     NAMES,
+    NO_CONDITIONS,
     PORT,
     SHAPE,
     WATER,
@@ -40,18 +41,10 @@ from pcfix.adjust.problem import (
 from pcfix.errors import PcfixWarning, plain
 from pcfix.model import BoolArray, Cameras, FloatArray, WaterPlane, WaterSurface
 from pcfix.port.shapes import Port, spec_of
-from pcfix.sums import nice_step
 from pcfix.water.surface import surface_above
 
 Source = Literal["tie points", "cloud"]
 Plain = dict[str, Any]
-
-MOST_DEPTH_BINS = 8
-SIGMAS = {
-    "level_sigma_m": "level", "tilt_sigma": "tilt", "index_sigma": "index", "shape_sigma": "shape",
-    "distance_sigma_m": "distance", "centre_sigma_m": "centre",
-}  # fmt: skip
-"""Keys of the standard deviations of `Unknowns.surface`."""
 
 
 class ControlRow(NamedTuple):
@@ -88,8 +81,8 @@ class Adjusted:
     gnss_residual_m: FloatArray  # (k, 3), adjusted centres minus GNSS positions; NaN if unknown
     control: list[ControlRow]
     notes: list[PcfixWarning]
-    origin: FloatArray  # of the block's frame
-    numbers: FloatArray  # `pcfix.adjust.collinearity.State.water` there
+    problem: Problem  # with the weights of the last round
+    solution: Solution
     port: Port | None = None  # adjusted
     on_surfaces: list[Plain] = field(default_factory=list)  # of points on the water or on planes
 
@@ -97,15 +90,6 @@ class Adjusted:
     def is_observed(self) -> BoolArray:
         """Points with observations that were used, shape (m,)."""
         return np.bincount(self.block.owner[self.used], minlength=len(self.xyz)) > 0
-
-    def depth_m(self) -> FloatArray | None:
-        """Return the depths of the points below the water, shape (m,); None without water.
-
-        Negative above it, NaN where the surface is unknown.
-        """
-        if self.water is None:
-            return None
-        return np.asarray(surface_above(self.water, self.xyz).height_m - self.xyz[:, 2])
 
 
 def sigma0_of(problem: Problem, now: Solution) -> float:
@@ -121,7 +105,9 @@ def redundancy_of(problem: Problem) -> int:
     priors += sum(0.0 < value < np.inf for value in problem.unknowns.water_sigma)
     priors += len(np.intersect1d(np.flatnonzero(given.on >= 0), block.owner[used]))
     datum = 7 if problem.unknowns.free_network else 0
-    return int(2 * used.sum() + priors + datum - 3 * points - problem.moves.sum())
+    return int(
+        2 * used.sum() + priors + datum - 3 * points - 6 * problem.moves.sum() - len(problem.names)
+    )
 
 
 def adjusted_of(
@@ -157,8 +143,8 @@ def adjusted_of(
         notes=notes,
         port=port_of(block, state.water),
         on_surfaces=_on_surfaces(problem, now),
-        origin=problem.origin,
-        numbers=state.water,
+        problem=problem,
+        solution=now,
     )
 
 
@@ -171,7 +157,7 @@ def _with_check_points(problem: Problem, now: Solution) -> FloatArray:
         return xyz
     whole = replace(
         block, cameras=solved_cameras(problem, now), xyz=xyz, water=water_of(problem, now.state),
-        conditions=None, port=port_of(block, now.state.water),
+        conditions=NO_CONDITIONS, port=port_of(block, now.state.water),
         refractive_index=float(now.state.water[INDEX]),
         sigma_px=np.where(np.isin(block.owner, rows), 1.0, np.inf),
     )  # fmt: skip
@@ -196,7 +182,7 @@ def _control_rows(block: Block, xyz: FloatArray, r: FloatArray) -> list[ControlR
 def _on_surfaces(problem: Problem, now: Solution) -> list[Plain]:
     """Return the stated and found distances of marked points from each surface, metres."""
     given, block, found = problem.block.conditions, problem.block, list[Plain]()
-    if given is None:
+    if not len(given.on):
         return []
     off = np.where(np.diff(block.start) > 0, surface_distances(problem, now), np.nan)
     for number, name in enumerate((WATER, *given.names)):
@@ -236,18 +222,16 @@ def before_of(adjusted: Adjusted) -> Intersected:
     return Intersected(np.where(met, found.xyz, np.nan), residual_px, found.start)
 
 
-def adjustment_dict(adjusted: Adjusted, before: Intersected | None = None) -> Plain:
+def adjustment_dict(adjusted: Adjusted, before: Intersected) -> Plain:
     """Return the content of adjustment.json; pcfix/cli/README.md lists its keys.
 
-    Residuals before the adjustment need `before`, of `before_of`; without it they are None.
+    `before` are the residuals before the adjustment, of `before_of`.
     """
     a, block, u = adjusted, adjusted.block, adjusted.unknowns
     kept = len(block.cameras) if u.poses == "fixed" else 0
-    known, lenses, notes = a.precision, block.cameras.lenses or (), [*a.notes]
-    notes += [] if known is None else known.notes
+    known, lenses = a.precision, block.cameras.lenses or ()
     found = {
         "source": a.source,
-        "engine": "unaware" if a.source == "cloud" else "direct",
         "image_unit": lenses[0].unit,
         "images": len(block.cameras),
         "images_fixed": kept or sum(label in u.fixed_images for label in block.cameras.labels),
@@ -255,9 +239,9 @@ def adjustment_dict(adjusted: Adjusted, before: Intersected | None = None) -> Pl
         "port": block.port is not None,
         "unknowns": {
             "lens": u.lens,
-            **{key: u.surface.get(name, 0.0) for key, name in SIGMAS.items()},
+            "surface": dict(u.surface),
             "free_network": u.free_network,
-            "parallel": () if block.conditions is None else block.conditions.parallel,
+            "parallel": block.conditions.parallel,
         },
         **_counts(a),
         "sigma0": a.sigma0,
@@ -266,7 +250,6 @@ def adjustment_dict(adjusted: Adjusted, before: Intersected | None = None) -> Pl
             "land": _residuals(a, before, ~a.is_wet),
             "water": _residuals(a, before, a.is_wet),
         },
-        "depth_bins": _depth_bins(a, before),
         "lens": _lens(a),
         "water": _water(a),
         "port_found": _port(a),
@@ -276,8 +259,9 @@ def adjustment_dict(adjusted: Adjusted, before: Intersected | None = None) -> Pl
         "gnss": _gnss(a),
         "control": _surveyed([row for row in a.control if row.role == "control"]),
         "check": _surveyed([row for row in a.control if row.role == "check"]),
-        "rounds": [row._asdict() for row in {row.round: row for row in a.rounds}.values()],
-        "notes": [one.as_dict() for one in {str(one): one for one in notes}.values()],
+        "rounds": len({row.round: row for row in a.rounds}),
+        "steps": len(a.rounds),
+        "notes": [one.as_dict() for one in {str(one): one for one in a.notes}.values()],
     }
     return dict(plain(found))
 
@@ -319,7 +303,7 @@ def _counts(a: Adjusted) -> Plain:
     }
 
 
-def _residuals(a: Adjusted, before: Intersected | None, points: BoolArray) -> Plain:
+def _residuals(a: Adjusted, before: Intersected, points: BoolArray) -> Plain:
     points = points & a.is_observed
     rows = a.used & points[a.block.owner]
     sigma = None if a.precision is None else a.precision.point_sigma_m
@@ -329,36 +313,13 @@ def _residuals(a: Adjusted, before: Intersected | None, points: BoolArray) -> Pl
     focal = np.array([lens.focal for lens in a.cameras.lenses or ()])[camera]
     return {
         "points": points.sum(),
-        **_fit(a, before, rows),
+        "observations": rows.sum(),
+        "rms_before_px": rms(before.residual_px[rows].ravel()),
+        "rms_px": rms(a.residual_px[rows].ravel()),
         "rms_xy_px": rms(a.residual_px[rows]),
         "rms_m": rms((a.residual_px[rows] * (away / focal)[:, None]).ravel()),
         "sigma_xyz_m": None if sigma is None else rms(sigma[points]),
     }
-
-
-def _fit(a: Adjusted, before: Intersected | None, rows: BoolArray) -> Plain:
-    """Return the number of some observations, and their residuals."""
-    return {
-        "observations": rows.sum(),
-        "rms_before_px": None if before is None else rms(before.residual_px[rows].ravel()),
-        "rms_px": rms(a.residual_px[rows].ravel()),
-    }
-
-
-def _depth_bins(a: Adjusted, before: Intersected | None) -> list[Plain]:
-    depth = a.depth_m()
-    if depth is None or not a.is_wet.any():
-        return []
-    depth = np.where(a.is_wet & a.is_observed, depth, np.nan)
-    deepest = float(np.nanmax(depth, initial=0.0))
-    step = nice_step(deepest / MOST_DEPTH_BINS)
-    of_point = np.where(np.isfinite(depth), depth // step, -1)
-    bins = []
-    for i in range(int(deepest // step) + 1):
-        rows = a.used & (of_point == i)[a.block.owner]
-        if rows.any():
-            bins.append({"from_m": i * step, "to_m": (i + 1) * step, **_fit(a, before, rows)})
-    return bins
 
 
 def _lens(a: Adjusted) -> list[Plain]:
@@ -385,15 +346,17 @@ def _water(a: Adjusted) -> Plain | None:
     original, adjusted = a.block.water, a.water
     if original is None or adjusted is None:
         return None
-    names, height_m = ["level", "index"], float(a.origin[2])
     if isinstance(original, WaterPlane):
-        names[1:1] = ["tilt_x", "tilt_y"]
+        names, height_m = ["level", "tilt_x", "tilt_y", "index"], float(a.problem.origin[2])
     else:  # the number is what is added to a mesh or raster
         heights = surface_above(original, a.xyz).height_m
-        height_m = float(mean(heights))
+        names, height_m = ["level", "index"], float(mean(heights))
         names = names if np.isfinite(heights).any() else ["index"]
     names += WATER_NAMES[SHAPE:PORT] if a.unknowns.surface.get("shape") else []
-    return {"surface": str(adjusted), **_numbers(a, names, height_m)}
+    found: Plain = {"surface": str(adjusted), **_numbers(a, names)}
+    for key in ("before", "after") if "level" in found else ():
+        found["level"][key] += height_m
+    return found
 
 
 def _port(a: Adjusted) -> Plain | None:
@@ -405,19 +368,19 @@ def _port(a: Adjusted) -> Plain | None:
     return {"port": spec_of(a.port), **_numbers(a, names)}
 
 
-def _numbers(a: Adjusted, names: Sequence[str], height_m: float = 0.0) -> dict[str, Plain]:
-    """Return parameters of the refracting surface; the level is about a height."""
-    start = surface_numbers(a.block, a.origin)
-    rows = {}
-    for name in names:
-        i, base = WATER_NAMES.index(name), height_m if name == "level" else 0.0
-        rows[name] = {
-            "before": base + start[i],
-            "after": base + a.numbers[i],
+def _numbers(a: Adjusted, names: Sequence[str]) -> dict[str, Plain]:
+    """Return parameters of the refracting surface, block frame."""
+    start = surface_numbers(a.block, a.problem.origin)
+    return {
+        name: {
+            "before": start[i],
+            "after": a.solution.state.water[i],
             "sigma": None if a.precision is None else a.precision.sigma_of(name),
             "free": bool(a.unknowns.water_sigma[i]),
         }
-    return rows
+        for name in names
+        for i in [WATER_NAMES.index(name)]
+    }
 
 
 def _poses(a: Adjusted) -> Plain:

@@ -20,8 +20,6 @@ that fields too small to be found count too. The unknowns move by A^-1 B e.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 from scipy.special import fdtri
 
@@ -73,16 +71,16 @@ def disagreement_of(
         For the parameters of `POSE` and the shared unknowns.
     notes : list of PcfixWarning
     """
-    groups, added = _groups_by_sharing(problem, found), np.zeros(6 + problem.given.shared)
+    groups, added = _groups_by_sharing(problem, found), np.zeros(6 + len(problem.names))
     counts = {words: len(np.unique(group)) for words, group in groups.items()}
     matrix, right = reduced_at(problem, found)
-    solve_for, active = solver(matrix), problem.active
+    solve_for, spread = solver(matrix), problem.spread(found.state)
     if counts[ALONE] < LEAST_GROUPS or solve_for is None:
         return 1.0 + added, []
     drawn = np.random.default_rng(1).normal(0.0, formal.sigma0, problem.given.image_xy.shape)
     *pulls, field, rest = _pulls_of(problem, found, groups, drawn)
     # the first group is that of drawn residuals, whose variances are by chance
-    by_chance, *shares = (_share_of(formal, active, solve_for(pull[:, active].T)) for pull in pulls)
+    by_chance, *shares = (_share_of(problem, formal, solve_for(spread.T @ p.T)) for p in pulls)
     shared = list[str]()
     for words, share in zip(groups, shares, strict=False):
         is_more = share > fdtri(counts[words] - 1, counts[ALONE] - 1, SURE) * by_chance
@@ -93,10 +91,10 @@ def disagreement_of(
         if words == ALONE:
             by_chance = by_chance + more
     if counts[FRAME] >= LEAST_GROUPS:
-        field = field[:, active]
+        field = field @ spread
         rest -= field @ solve_for(np.column_stack([field.T, right]))
         likely = _likely_field(problem, groups[FRAME], formal.sigma0, rest) @ field
-        more = _share_of(formal, active, solve_for(likely.T))
+        more = _share_of(problem, formal, solve_for(likely.T))
         added = added + more
         shared += [FRAME] if (more > NOTED).any() else []
     factor = np.sqrt(1.0 + added)
@@ -150,18 +148,17 @@ def _tiles(xy: FloatArray, count: int) -> IntArray:
     return np.asarray(place[:, 0] * int(last[1] + 1.0) + place[:, 1])
 
 
-def _share_of(formal: Precision, active: IntArray, moved: FloatArray) -> FloatArray:
+def _share_of(problem: Problem, formal: Precision, moved: FloatArray) -> FloatArray:
     """Return variances over the formal ones, (6 + g,), for poses their mean.
 
-    `moved`, shape (a, n), are the movements of the active unknowns by each of n groups.
+    `moved`, shape (u, n), are the movements of the free unknowns by each of n groups.
     """
-    k, poses = len(formal.pose_covariance), np.einsum("kii->ki", formal.pose_covariance)
-    variance = np.concatenate([poses.ravel(), [row.sigma**2 for row in formal.shared]])
-    share = np.zeros(len(variance))
-    share[active] = (moved**2).sum(axis=1)
-    share = np.divide(share, variance, out=np.zeros(len(variance)), where=variance > 0.0)
-    free = max(int((poses > 0.0).any(axis=1).sum()), 1)
-    return np.concatenate([share[: 6 * k].reshape(k, 6).sum(axis=0) / free, share[6 * k :]])
+    poses = np.einsum("kii->ki", formal.pose_covariance)[problem.moves]
+    variance = np.append(poses.ravel(), [row.sigma**2 for row in formal.shared])
+    share = (moved**2).sum(axis=1) / variance
+    of_poses, of_shared = np.split(share, [poses.size])
+    mean = of_poses.reshape(-1, 6).mean(axis=0) if poses.size else np.zeros(6)
+    return np.append(mean, of_shared)
 
 
 def _pulls_of(
@@ -173,7 +170,7 @@ def _pulls_of(
     found; the others of all groups but the frame. Then, for shifts along u and v of the t tiles of
     the frame: B', shape (2 t, 6 k + g), and C beside their right sides, shape (2 t, 2 t + 1).
     """
-    tile, size = groups[FRAME], len(problem.moves)
+    tile, size = groups[FRAME], 6 * len(problem.moves) + problem.given.shared
     each = [groups[ALONE], *(group for words, group in groups.items() if words != FRAME)]
     pulls = [np.zeros((int(group.max(initial=0)) + 1, size)) for group in each]
     count = 2 * (int(tile.max(initial=0)) + 1)
@@ -248,27 +245,27 @@ LEAST_POINTS = 30
 LEAST_RATIO = 1.2
 """Of standard deviations; below it other weights would gain a fiftieth of a standard error."""
 
-OBLIQUE_DEG = 15.0
-"""From nadir."""
-
-LEAST_GAP = 0.2
-"""Between two flying heights, as a share of the lower."""
-
 
 def weighed(problem: Problem, now: Solution) -> tuple[Problem, list[PcfixWarning]]:
     """Weight tie points by the noise of their group, and return a warning if groups differ.
 
-    Each side of the water and each kind of image has its own variance of unit weight: weighted
-    squares over its share of the redundancy, of which each point takes three. Groups whose
-    variances differ (F-test), and by enough to matter, are weighted by their own (Foerstner 1979,
-    one step).
+    Each side of the water and each sensor has its own variance of unit weight: weighted squares
+    over its share of the redundancy, of which each point takes three. Groups whose variances differ
+    (F-test), and by enough to matter, are weighted by their own (Foerstner 1979, one step).
     """
-    weight, owner, noise = problem.given.weight, problem.block.owner, dict[str, float]()
-    r = residuals(now.state, problem.given)
+    given, block, noise = problem.given, problem.block, dict[str, float]()
+    weight, owner, water = given.weight, block.owner, water_of(problem, now.state)
+    sensors = [f"of sensor {i}" for i in range(1, int(given.group.max()) + 2)]
+    groupings = [(sensors, given.group[given.camera])]
+    if water is not None:
+        xyz = now.state.xyz + problem.origin
+        wet = block.wet & (surface_above(water, xyz).height_m > xyz[:, 2])
+        groupings.insert(0, (["on land", "under water"], wet[owner].astype(np.int64)))
+    r = residuals(now.state, given)
     used = problem.of_ties & problem.used & np.isfinite(r).all(axis=1)
     square = (np.where(used[:, None], r, 0.0) ** 2).sum(axis=1)
     redundancy = 2.0 - 3.0 / np.maximum(np.bincount(owner, used)[owner], 2.0)
-    for names, group in _groups_by_quality(problem, now):
+    for names, group in groupings:
         rows = [used & (group == i) for i in range(len(names))]
         points = np.array([len(np.unique(owner[row])) for row in rows])
         if len(names) < 2 or points.min() < LEAST_POINTS:
@@ -293,23 +290,3 @@ def weighed(problem: Problem, now: Solution) -> tuple[Problem, list[PcfixWarning
         noise_px=noise,
     )
     return problem.weighted(weight), [note]
-
-
-def _groups_by_quality(problem: Problem, now: Solution) -> Iterator[tuple[list[str], IntArray]]:
-    """Yield groupings of the observations: names, and the group of each observation."""
-    block, given, state = problem.block, problem.given, now.state
-    water = water_of(problem, state)
-    if water is not None:
-        xyz = state.xyz + problem.origin
-        wet = block.wet & (surface_above(water, xyz).height_m > xyz[:, 2])
-        yield ["on land", "under water"], wet[block.owner].astype(np.int64)
-    sensors = int(given.group.max()) + 1
-    yield [f"of sensor {i}" for i in range(1, sensors + 1)], given.group[given.camera]
-    oblique = -state.rotations[:, 2, 2] < np.cos(np.radians(OBLIQUE_DEG))
-    yield ["in nadir images", "in oblique images"], oblique[given.camera].astype(np.int64)
-    height = state.centres[:, 2] - np.median(state.xyz[:, 2])
-    order = np.sort(height)
-    gap = np.diff(order, prepend=order[:1])
-    if gap.max() > LEAST_GAP * np.median(height):
-        high = height >= order[int(np.argmax(gap))]
-        yield ["of the lower flight", "of the higher flight"], high[given.camera].astype(np.int64)

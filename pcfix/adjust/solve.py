@@ -13,25 +13,13 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pcfix.adjust.block import CODES, INDEX, MOTIONS, LogRow, Progress, Robust, moved_lens
+from pcfix.adjust.block import INDEX, LogRow, Progress, moved_lens, words_of
 from pcfix.adjust.collinearity import State
-from pcfix.adjust.normal import (
-    CAUCHY,
-    HUBER,
-    SQUARES,
-    UNDAMPED,
-    Rule,
-    normal_equations,
-    point_steps,
-)
+from pcfix.adjust.normal import SQUARES, UNDAMPED, Rule, normal_equations, point_steps
 from pcfix.adjust.problem import Problem, Solution, cost_at, counts_of, port_of, port_row, priors_at
 from pcfix.errors import GeometryError, PcfixError
 from pcfix.lens.imaging import lens_table
 from pcfix.model import FloatArray
-
-LOSSES = {"squares": SQUARES, "huber": HUBER, "cauchy": CAUCHY}
-LOSS_SCALE = 2.0
-"""Where a robust loss departs from least squares, in standard deviations."""
 
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-12, 1e8
 MOST_STEPS = 60
@@ -53,7 +41,7 @@ WEAK = 1e-11
 def solve(
     problem: Problem,
     start: Solution,
-    robust: Robust = "squares",
+    loss: int = SQUARES,
     number: int = 1,
     progress: Progress | None = None,
     close: float = CLOSE,
@@ -62,14 +50,14 @@ def solve(
 
     Parameters
     ----------
-    robust : {"squares", "huber", "cauchy"}
-        The loss function.
+    loss : int
+        `SQUARES`, `HUBER` or `CAUCHY` of `pcfix.adjust.normal`.
     number : int
         Of the round, for the log.
     close : float
         Two steps in a row that lower the cost by less than this share end the round.
     """
-    rule = Rule(LOSSES[robust], LOSS_SCALE)
+    rule = Rule(loss)
     now = replace(start, cost=cost_at(problem, start, rule))
     if not np.isfinite(now.cost):
         raise GeometryError(
@@ -94,7 +82,7 @@ def solve(
         gain = (now.cost - trial.cost) / max(now.cost, least_cost)
         now, up = trial, 2.0
         damping = max(damping / 10.0, LEAST_DAMPING)
-        row = LogRow(number, step + 1, now.cost, *counts_of(problem, now))
+        row = LogRow(number, step + 1, *counts_of(problem, now))
         log.append(row)
         if progress is not None:
             progress(row)
@@ -110,26 +98,30 @@ def _trial(problem: Problem, now: Solution, rule: Rule) -> Solution | None:
     solve_for = solver(matrix)
     if solve_for is None:
         return None
-    step = np.zeros(len(problem.moves))
-    step[problem.active] = solve_for(right)
+    step = solve_for(right)
     if not np.isfinite(step).all():
         return None
-    moved = moved_by(problem, now, step, point_steps(now.state, problem.given, rule, step))
+    points = point_steps(now.state, problem.given, rule, problem.spread(now.state) @ step)
+    moved = moved_by(problem, now, step, points)
     return None if moved is None else replace(moved, cost=cost_at(problem, moved, rule))
 
 
 def moved_by(
     problem: Problem, now: Solution, step: FloatArray, points: FloatArray
 ) -> Solution | None:
-    """Return a solution with steps added; None if a parameter leaves its range."""
-    state, given, k = now.state, problem.given, len(now.state.centres)
-    poses, shared = step[: 6 * k].reshape(k, 6), step[6 * k :]
+    """Return a solution with steps of the free unknowns and of the points added.
+
+    None if a parameter leaves its range.
+    """
+    state, given, count = now.state, problem.given, 6 * int(problem.moves.sum())
+    poses, shared = np.zeros((len(problem.moves), 6)), step[count:]
+    poses[problem.moves] = step[:count].reshape(-1, 6)
     centres = state.centres + poses[:, 3:]
     rotations = Rotation.from_rotvec(poses[:, :3]).as_matrix() @ state.rotations
-    if given.similarity >= 0:
-        t, phi, s = np.split(shared[given.similarity :], [3, 6])
+    if problem.unknowns.poses == "similarity":
+        t, phi, s = np.split(shared[given.shared :], [3, 6])
         turn = Rotation.from_rotvec(phi).as_matrix()
-        centres = given.pivot + t + (1.0 + s[0]) * (centres - given.pivot) @ turn.T
+        centres = problem.pivot + t + (1.0 + s[0]) * (centres - problem.pivot) @ turn.T
         rotations = rotations @ turn.T
     water, free = state.water.copy(), given.column >= 0
     water[free] += shared[given.column[free]]
@@ -166,24 +158,18 @@ def moved_by(
 
 
 def reduced_at(problem: Problem, found: Solution, rule: Rule = UNDAMPED) -> tuple[Any, FloatArray]:
-    """Return the equations of the active unknowns at a solution, with prior knowledge.
+    """Return the equations of the free unknowns at a solution, with prior knowledge.
 
-    The matrix, shape (a, a), is dense or scipy's sparse one; the right side has the shape (a,).
+    The matrix, shape (u, u), is dense or scipy's sparse one; the right side has the shape (u,).
     """
-    active = problem.active
-    total, right, diagonal = normal_equations(found.state, problem.given, rule)
-    _, extra, extra_right = priors_at(problem, found)
-    right = right + extra_right
-    # the damping is a factor on the diagonal before the points were eliminated
-    damped = rule.damping * (diagonal + extra.diagonal())
-    if isinstance(total, np.ndarray):
-        total += extra.toarray()
-        total[np.diag_indices(len(total))] += damped
-        return total[np.ix_(active, active)], right[active]
     from scipy.sparse import diags_array
 
-    total = (total + extra + diags_array(damped)).tocsc()
-    return total[active][:, active], right[active]
+    total, right, diagonal = normal_equations(found.state, problem.given, rule)
+    _, extra, extra_right = priors_at(problem, found)
+    # the damping is a factor on the diagonal before the points were eliminated
+    extra = extra + diags_array(rule.damping * (diagonal + extra.diagonal()))
+    spread = problem.spread(found.state)
+    return spread.T @ (total + extra) @ spread, spread.T @ (right + extra_right)
 
 
 def solver(matrix: Any) -> Callable[[FloatArray], FloatArray] | None:
@@ -218,34 +204,7 @@ def solver(matrix: Any) -> Callable[[FloatArray], FloatArray] | None:
 # What is undetermined
 
 
-LIMITS = {
-    "level": (0.02, " m", "the water level"),
-    "tilt_x": (0.0005, " m/m", "the tilt of the water along x"),
-    "tilt_y": (0.0005, " m/m", "the tilt of the water along y"),
-    "index": (0.005, "", "the refractive index"),
-    "scale": (0.001, "", "the scale of the block"),
-    "distance": (0.002, " m", "the distance of the port"),
-    "centre_x": (0.002, " m", "the dome's centre along x"),
-    "centre_y": (0.002, " m", "the dome's centre along y"),
-    "centre_z": (0.002, " m", "the dome's centre along z"),
-}
-"""Standard errors beyond which an unknown counts as undetermined, its unit and its name."""
-
-_WORDS = {name: words for name, (_, _, words) in LIMITS.items()} | {
-    "f": "the focal length", "cx": "the principal point's x", "cy": "the principal point's y",
-    "b1": "the affinity b1", "b2": "the skew b2",
-}  # fmt: skip
-_WORDS |= {f"shape_{which}": f"the shape of the water {which}" for which in ("xx", "xy", "yy")}
-_WORDS |= {name: f"the distortion {name}" for name in CODES if name[0] in "kp"}
-_WORDS |= {name: f"the {name} of the block" for name in MOTIONS[:-1]}
-
 BED = {"level", "index", "tilt_x", "tilt_y", "shape_xx", "shape_xy", "shape_yy"}
-
-
-def words_of(name: str) -> str:
-    """Return what a surveyor calls a shared unknown."""
-    base, of, sensor = name.partition(" of sensor ")
-    return _WORDS.get(base, base) + of + sensor
 
 
 def singular(problem: Problem, solution: Solution) -> GeometryError:
@@ -254,22 +213,19 @@ def singular(problem: Problem, solution: Solution) -> GeometryError:
     These have no observation at all, or a component in an eigenvector of an eigenvalue of zero of
     the reduced matrix with unit diagonal: 1e-4 makes a variance a thousand times larger.
     """
-    matrix, k = reduced_at(problem, solution)[0], len(problem.block.cameras)
+    matrix, poses = reduced_at(problem, solution)[0], np.flatnonzero(problem.moves)
     diagonal = matrix.diagonal()
-    unseen = problem.active[~(diagonal > 0.0)]
-    if len(unseen):
-        weak, why = np.zeros(len(problem.moves), np.bool_), "no observation depends on them"
-        weak[unseen] = True
-    else:
+    weak, why = ~(diagonal > 0.0), "no observation depends on them"
+    if not weak.any():
         values, vectors = _smallest(matrix, 1.0 / np.sqrt(diagonal))
         vectors = vectors[:, values < max(WEAK, 10.0 * float(values[0]))]
-        weak = np.zeros(len(problem.moves), np.bool_)
-        weak[problem.active] = np.linalg.norm(vectors, axis=1) > 1e-4
+        weak = np.linalg.norm(vectors, axis=1) > 1e-4
         why = "the observations do not separate them"
-    images = np.flatnonzero(weak[: 6 * k].reshape(k, 6).any(axis=1))
+    of_poses, of_names = np.split(weak, [6 * len(poses)])
+    images = poses[of_poses.reshape(-1, 6).any(axis=1)]
     labels = [problem.block.cameras.labels[i] for i in images]
-    names = [name for name, is_weak in zip(problem.names, weak[6 * k :], strict=True) if is_weak]
-    words = [words_of(name) for name in names]
+    names = [name for name, is_weak in zip(problem.names, of_names, strict=True) if is_weak]
+    words = [f"the {words_of(name)[0]}" for name in names]
     if labels:
         some = f"of {', '.join(labels[:3])}" if len(labels) <= 3 else f"of {len(labels)} images"
         words.append(f"the poses {some}")

@@ -13,14 +13,13 @@ may sink or lift whole beaches.
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from pcfix.adjust.block import some_cameras
-from pcfix.errors import GeometryError, PcfixWarning
+from pcfix.errors import GeometryError
 from pcfix.kernels import Span, device, in_tiles, kernel, most_between
 from pcfix.lens.algebra import dot, minus, plus, plus_square, row_of, scaled, solved, times, vector
 from pcfix.lens.imaging import image_in_world, image_of
@@ -186,17 +185,12 @@ def renumbered(views: Views, row: IntArray) -> tuple[Views, IntArray]:
 
 
 class Transferred(NamedTuple):
-    """Points after their transfer.
+    """Points after their transfer."""
 
-    original_xyz, xyz : shape (n, 3), metres, with the original and the adjusted cameras.
-    moved : shape (n,), whether a point could be transferred.
-    views : their view list with the adjusted cameras, if there is one.
-    """
-
-    original_xyz: FloatArray
-    xyz: FloatArray
-    moved: BoolArray
-    views: Views | None
+    original_xyz: FloatArray  # (n, 3), metres, with the original cameras
+    xyz: FloatArray  # (n, 3), with the adjusted ones
+    moved: BoolArray  # (n,), whether a point could be transferred
+    views: Views | None  # their view list with the adjusted cameras, if there is one
 
     def whole(self, correction: Correction) -> Correction:
         """Return the correction of `xyz` as one of the original points.
@@ -276,38 +270,19 @@ class CloudTransfer:
         return replace(ties, xyz=xyz)
 
     def check_models(self, xyz: FloatArray) -> None:
-        """Refuse models in different places, given points of the cloud; warn of single images."""
+        """Refuse models in different places, given points of the cloud."""
         if not len(xyz):
             return
-        original, apart = self.original, self._apart_m()
-        height = float(np.median(original.centres[:, 2]) - np.median(xyz[:, 2]))
-        middle, most = float(np.median(apart)), MOST_APART * height
-        if height <= 0.0 or apart.max() <= most:
-            return
-        if middle > most:
+        height = float(np.median(self.original.centres[:, 2]) - np.median(xyz[:, 2]))
+        way = self.adjusted.centres - self.original.centres
+        apart = float(np.median(np.linalg.norm(way, axis=1)))
+        if apart > MOST_APART * height > 0.0:
             words = (
-                f"--adjusted-from: its cameras are {middle:,.0f} m from the adjusted ones (median;"
+                f"--adjusted-from: its cameras are {apart:,.0f} m from the adjusted ones (median;"
                 f" flying height {height:,.0f} m). Check both files, --cameras-crs and"
                 " --cameras-offset, which count for the file that has no CRS."
             )
-            raise GeometryError("adjusted_from.apart", words, apart_m=middle, height_m=height)
-        worst = int(np.argmax(apart))
-        warnings.warn(
-            PcfixWarning(
-                "adjusted_from.images_apart",
-                f"{int((apart > most).sum())} of {len(apart)} images moved by more than a tenth of"
-                f" the flying height in the adjustment (most: {original.labels[worst]},"
-                f" {apart[worst]:,.0f} m). Check their poses.",
-                image=original.labels[worst],
-                moved_m=float(apart[worst]),
-            ),
-            stacklevel=3,
-        )
-
-    def _apart_m(self) -> FloatArray:
-        """Return the distances between original and adjusted centres, shape (k,)."""
-        apart = self.adjusted.centres - self.original.centres
-        return np.asarray(np.linalg.norm(apart, axis=1))
+            raise GeometryError("adjusted_from.apart", words, apart_m=apart, height_m=height)
 
     def check(self, name: str, counts: TransferCounts) -> None:
         """Refuse a cloud that the original cameras do not see."""
@@ -320,21 +295,18 @@ class CloudTransfer:
 
     def as_dict(self, counts: TransferCounts) -> dict[str, Any]:
         """Return the statistics as plain values, metres."""
-        apart, mean = self._apart_m(), counts.sum_m / max(counts.points, 1)
+        mean = counts.sum_m / max(counts.points, 1)
         shift = {
             "mean_x": mean[0], "mean_y": mean[1], "mean_z": mean[2], "rms": np.sqrt(mean[3]),
             "max": counts.most_m,
         }  # fmt: skip
-        centres = {"rms": np.sqrt((apart**2).mean()), "max": apart.max()}
         return {
             "points": counts.points,
             "land": counts.land,
             "not_carried": counts.not_moved,
             "not_carried_reason": REASON,
             "shift_m": {name: round(float(value), 4) for name, value in shift.items()},
-            "cameras": len(apart),
             "cameras_left_out": list(self.left_out),
-            "centres_m": {name: round(float(value), 4) for name, value in centres.items()},
         }
 
     def provenance(self) -> dict[str, Any]:

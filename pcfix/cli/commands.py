@@ -85,13 +85,14 @@ def adjust(
     model: Path, out: Path, /, *, options: AdjustOptions, quiet: bool, jobs: int | None = None
 ) -> None:
     """Refine camera poses and lens by a refractive bundle adjustment."""
+    from pcfix.adjust.result import adjustment_dict, before_of
     from pcfix.flow.next_steps import correct_words
-    from pcfix.report.adjustment import adjustment_text, before_of
+    from pcfix.report.adjustment import adjustment_text
     from pcfix.running import threads
 
     with threads(jobs), status_line("Adjusting", quiet) as progress:
         found = pcfix.adjust_cameras(model, out, options=options, progress=progress)
-    say(adjustment_text(found, before_of(found)), quiet)
+    say(adjustment_text(adjustment_dict(found, before_of(found))), quiet)
     cloud = "" if options.cloud else " (CLOUD.laz is the cloud of the original cameras)"
     say(f"Next{cloud}: {correct_words(found, model, out, options)}", quiet)
 

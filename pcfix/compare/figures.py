@@ -163,15 +163,8 @@ def figures_of(
     are too few points for planes, or M3C2 finds nothing.
     """
     whole, reference = match.whole, match.reference
-    notes = []
-    if match.cloud.shift_m is None:
-        text = (
-            "The cloud has no dimensions ShiftX, ShiftY and ShiftZ, so its apparent points are not"
-            " compared."
-        )
-        notes.append(PcfixWarning("cloud.no_shifts", text))
     c2c, c2c_from_reference = found = c2c_of(match)
-    notes += sparse_notes(match, found)
+    notes = sparse_notes(match, found)
     pairs = vertical = residuals = None
     if match.settings.vertical:
         pairs = _pairs(match)
@@ -340,9 +333,6 @@ def _by_depth(match: Match, pairs: AfterBefore[Pairs], notes: list[PcfixWarning]
         dry = kept(match.dry, match.whole.xyz)[:, :2]
         shore = nearest_distance(kept(wet, after.xy), dry)
         shore_bins = binned(shore, error, error_before, rules.shore_bin_width)
-    else:
-        text = "The cloud has no dry point, so there are no figures by distance from the shore."
-        notes.append(PcfixWarning("cloud.no_land", text))
     return {
         "depth": both(lambda f: fit_line(f[0], mapped(np.subtract, *f)), found.after, found.before),
         "depth_bins": binned(depth, error, error_before, rules.bin_width),

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pcfix.blocks import blocks, grouped, mapped
-from pcfix.errors import GeometryError, SettingError
+from pcfix.errors import SettingError
 from pcfix.model import FloatArray
 from pcfix.options.steps import SIGMA_REFERENCE_M
 from pcfix.refract.tally import share_of_orders, within_orders
@@ -69,15 +69,8 @@ class Distribution:
 
 
 def statistics_of(values: FloatArray) -> Statistics:
-    """Return the statistics of values, shape (n,), metres, finite.
-
-    Raises GeometryError ``reference.nothing_compared`` if there are none.
-    """
+    """Return the statistics of one value or more, shape (n,), metres, finite."""
     count = len(values)
-    if count == 0:
-        raise GeometryError(
-            "reference.nothing_compared", "No point is left to compare: there are no differences."
-        )
     marks = np.percentile(values, (*PERCENTILES, 0, 100))
     median, mean = float(marks[PERCENTILES.index(50)]), float(values.mean())
     return Statistics(

@@ -22,8 +22,7 @@ from pcfix.adjust.block import (
 from pcfix.adjust.block import taken as taken_ties
 from pcfix.adjust.methods import (
     LEAST_TIES,
-    by_cloud,
-    by_ties,
+    adjust_block,
     check_control,
     check_images,
     check_marks,
@@ -44,7 +43,6 @@ from pcfix.io.gnss_positions import gnss_in_frame_of, read_gnss
 from pcfix.io.ground_control import read_ground_control
 from pcfix.io.members import write_members
 from pcfix.io.tiles import Clouds, cloud_of
-from pcfix.io.views import ViewList, ViewMatch
 from pcfix.io.water import write_water_raster
 from pcfix.model import (
     Cameras,
@@ -136,7 +134,7 @@ def adjust_into(
     crs: str | CRS | None = None if view is None else view.crs
     if view is None and read.crs is not None and not is_topocentric(read.crs):
         crs = read.crs if parse_crs(read.crs, "cameras").is_projected else None
-    original, views = inputs.block(crs, read)
+    original, _ = replace(inputs, views=None).block(crs, read)
     if original.rotations is None or original.lenses is None:
         words = (
             f"{name}: an adjustment needs angles and a lens of every image. Give the project or"
@@ -174,7 +172,7 @@ def adjust_into(
         ties = usable_ties(with_places(ties, original), original)
     count = 0 if ties is None else len(ties.xyz)
     if ties is not None and count >= LEAST_TIES:
-        found = by_ties(material, ties, given, progress)
+        found = adjust_block(material, given, ties=ties, progress=progress)
     elif view is None or given.ties == "measured":
         cloud_too = "" if given.ties == "measured" else ", and there is no --cloud"
         words = (
@@ -183,8 +181,7 @@ def adjust_into(
         )
         raise InputError("cameras.no_ties", words, path=name, ties=count, least=LEAST_TIES)
     else:
-        xyz, listed = _sample(view, views, original)
-        found = by_cloud(material, xyz, listed, given, progress)
+        found = adjust_block(material, given, cloud_xyz=_sample(view), progress=progress)
 
     # 3. The result
     if control is not None:
@@ -267,26 +264,16 @@ def _calibration(path: File, cameras: Cameras) -> Lens:
     return one
 
 
-def _sample(
-    view: CloudView, views: ViewList | None, cameras: Cameras
-) -> tuple[FloatArray, Views | None]:
-    """Return random points of the cloud, and their part of the view list."""
+def _sample(view: CloudView) -> FloatArray:
+    """Return random points of the cloud."""
     count = min(CLOUD_POINTS, view.points)
     rows = np.sort(np.random.default_rng(0).choice(view.points, count, replace=False))
-    match = None if views is None else ViewMatch(views, cameras, points=view.points)
-    parts: list[Views] = []
     xyz, first = [], 0
     for seen in view.chunks():
         inside = rows[(rows >= first) & (rows < first + len(seen.xyz))] - first
         xyz.append(seen.xyz[inside])
-        if match is not None:
-            match = match if first else match.settled(seen.xyz)
-            parts.append(match.views_of(seen.xyz, first)[0].take(inside))
         first += len(seen.xyz)
-    if match is None:
-        return np.vstack(xyz), None
-    start = np.cumsum(np.concatenate([[0], *(np.diff(part.start) for part in parts)]))
-    return np.vstack(xyz), Views(start, np.concatenate([part.camera for part in parts]))
+    return np.vstack(xyz)
 
 
 # Writing
@@ -312,7 +299,8 @@ def _check_folder(folder: Path, overwrite: bool, inputs: list[Any]) -> None:
 
 def _write(folder: Path, found: Adjusted, model: str) -> None:
     """Write an adjusted block: model, camera files, summary, report; all or nothing."""
-    from pcfix.report.adjustment import adjustment_dict, adjustment_page, before_of
+    from pcfix.adjust.result import adjustment_dict, before_of
+    from pcfix.report.adjustment import adjustment_page
 
     before = before_of(found)
     with temporary_folder(folder) as draft:

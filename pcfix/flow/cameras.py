@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.adjust.diagnosis import Diagnosis, Evidence, export_of
+from pcfix.adjust.diagnosis import EXPORT, Diagnosis, Evidence
 from pcfix.errors import InputError, SettingError, shown_once
 from pcfix.flow.diagnosis import diagnose, has_datum, quick_ties
 from pcfix.flow.inputs import Inputs, paths_in, ties_of
@@ -354,7 +354,7 @@ def cameras_text(report: CamerasReport) -> str:
         elif found.absorbed is False and found.decided_by is not None:
             verdict = f"the poses have not absorbed the refraction, by {found.decided_by.name}"
         else:
-            verdict = f"not known; give control points (--gcps), or {export_of(cameras)}"
+            verdict = f"not known; give control points (--gcps), or {EXPORT}"
         rows.append(("Refraction", verdict))
         rows += [("", f"{s.name}: {says[s.speaks]}. {s.words}") for s in found.signs]
     return aligned(f"{r['path']}: {cameras.source or 'cameras'}", rows, cameras.notes)

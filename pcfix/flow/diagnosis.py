@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from pcfix.adjust.diagnosis import (
+    EXPORT,
     MOST_STATED_M,
     Diagnosis,
     Evidence,
     diagnosed,
-    export_of,
     neighbours_sign,
 )
 from pcfix.errors import InputError, PcfixError, PcfixWarning
@@ -100,7 +100,7 @@ def diagnose_in_passing(plan: Plan, ties: TiePoints | None) -> Poses:
         did = "absorbed" if diagnosis.absorbed else "did not absorb"
         words = f"{did} the refraction, by {decided.name}{'; see the warning' * bool(sentence)}"
     else:
-        why = f"no tie points and no GNSS positions; {export_of(evidence.cameras)}"
+        why = f"no tie points and no GNSS positions; {EXPORT}"
         silent = [one.name for one in diagnosis.signs if one.name in ("tie points", "GNSS")]
         if is_large:
             why = f"the file is larger than {QUICK_BYTES / 1e6:g} MB; use 'pcfix cameras'"

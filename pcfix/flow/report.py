@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import numpy as np
 
 from pcfix.errors import bad_file
 from pcfix.flow.next_steps import FOLDER
-from pcfix.flow.request import Files, Request, cameras_of, inputs_of_run, water_of
+from pcfix.flow.request import Files, Request, cameras_of, inputs_of_run
 from pcfix.flow.run_adjust import figures_of
 from pcfix.flow.surfaces import view_of
 from pcfix.flow.water import found_picture
@@ -79,8 +78,7 @@ def report_run(
     if (summary.water_fit or {}).get("model") == "auto":  # the water was sought in the cloud
         pictures.append(found_picture(again.surface(view_of(request.source))))
     run = RunResults(
-        summary, cameras, water_of(request, files),
-        **read_cloud(files.cleaned_cloud, files.resolution_m),
+        summary, cameras, **read_cloud(files.cleaned_cloud, files.resolution_m),
         project=request.project or "", date=request.date or again.dates(cameras),
         pictures=pictures, tables=tables, verdict=verdict, compared=compared.get("figures", {}),
         difference=dod,
@@ -89,9 +87,6 @@ def report_run(
     return {
         "in_short": in_short(page.tiles),
         "uncertainty": uncertainty_sentence(summary, compared.get("figures", {}).get("tvu")),
-        "title": page.title,
-        "tiles": [asdict(tile) for tile in page.tiles],
-        "place": page.place,
     }
 
 
@@ -151,7 +146,7 @@ def read_cloud(path: Path | Tiles, resolution_m: float | None = None) -> Plain:
             for i, name in enumerate(columns):
                 values[:, i] = np.asarray(points[name])[moved]
             builder.add(coordinates(points), moved, values)
-            sample.append(values[-count % every :: every, [1, 0, 3]])
+            sample.append(values[-count % every :: every, [0, 3]])
             depth = values[:, 0]
             low, high = depth.min(initial=low), depth.max(initial=high)
             total, count = total + float(depth.sum()), count + len(depth)

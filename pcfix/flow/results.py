@@ -11,17 +11,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pcfix.errors import SettingError, bad_file
-from pcfix.flow.maps import BED, DEPTH, SHADED, UNCERTAINTY, contours_layer
+from pcfix.flow.maps import BED, DEPTH, UNCERTAINTY, contours_layer
 from pcfix.flow.request import SURFACE, Files, Request, read_record
 from pcfix.flow.run import RECORD, run_all
 from pcfix.flow.runner import Bar, no_bar
 from pcfix.io import rasters, vectors
-from pcfix.io.styles import limits_of
 from pcfix.libraries import analysis_library
 from pcfix.options.declare import File, options_of, taken
 from pcfix.options.survey import RunOptions
 from pcfix.report.comparison import signed_statistics
-from pcfix.report.page import Tile, overview, run_html
 from pcfix.report.summary import Summary
 
 if TYPE_CHECKING:
@@ -39,7 +37,7 @@ _WHY = {
 
 @dataclass(frozen=True)
 class RunResults:
-    """The results of a run in its folder; a notebook shows its tiles and a map.
+    """The results of a run in its folder.
 
     Rasters and lines are in the CRS of the cloud, metres. They need the extra ``analysis``, and are
     read from the files each time they are asked for.
@@ -135,14 +133,6 @@ class RunResults:
         pandas = analysis_library("pandas")
         statistics = pandas.json_normalize(rows).set_index("of")
         return {"statistics": statistics, **{one.stem: pandas.read_csv(one) for one in files}}
-
-    def _repr_html_(self) -> str:
-        """Return the HTML that a notebook shows."""
-        first = self._steps["report"]
-        colours, bounds = rasters.picture(self._file(SHADED))
-        deepest = limits_of(rasters.preview(self._file(DEPTH))[0], "depth")[1]
-        tiles = [Tile(**one) for one in first["tiles"]]
-        return run_html(first["title"], tiles, first["place"], overview(colours, bounds, deepest))
 
     def _file(self, name: str) -> Path:
         path = self.folder / name

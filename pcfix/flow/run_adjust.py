@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -98,10 +97,8 @@ def _decide(request: Request) -> dict[str, Any]:
         evidence = Evidence(
             cameras, model, water, with_index(request).refractive_index, view=view,
             control=None if gcps is None else gcps.surveyed,
-            in_passing=not is_said,
+            in_passing=not is_said, ties=ties_of(inputs, view.crs),
         )  # fmt: skip
-        if evidence.has_rays:
-            evidence = replace(evidence, ties=ties_of(inputs, view.crs))
         sign = diagnose(evidence).decided_by
     if sign is None:
         why = "nothing shows whether the poses absorbed the refraction; --adjust yes adjusts anyway"

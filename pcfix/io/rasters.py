@@ -261,13 +261,6 @@ def preview(path: Path, cells: int = PREVIEW_CELLS) -> tuple[FloatArray, Bounds]
         return read_masked(source, out_shape=shape), bounds
 
 
-def picture(path: Path, cells: int = PREVIEW_CELLS) -> tuple[npt.NDArray[np.uint8], Bounds]:
-    """Return a coloured raster as `preview` does, shape (rows, columns, bands)."""
-    with open_raster(path) as source:
-        shape, bounds = _small(source, cells)
-        return np.moveaxis(source.read(out_shape=(source.count, *shape)), 0, -1), bounds
-
-
 def _small(source: DatasetReader, cells: int) -> tuple[tuple[int, int], Bounds]:
     scale = max(1.0, math.sqrt(source.height * source.width / cells))
     west, south, east, north = source.bounds

@@ -36,20 +36,16 @@ HALF = 1 << 31
 
 
 class Rectified(NamedTuple):
-    """The common frame of a pair, x along the base: its rotation from the world, and its window.
+    """The common frame of a pair, x along the base, and its window."""
 
-    `left_px` and `top_px` are the corner of the window in the left image, from the foot of the
-    axis; disparities begin at `least_px`.
-    """
-
-    rotation: FloatArray
+    rotation: FloatArray  # from the world
     base_m: float
     focal_px: float
-    left_px: float
+    left_px: float  # the corner of the window in the left image, from the foot of the axis
     top_px: float
     width: int
     height: int
-    least_px: int
+    least_px: int  # at which disparities begin
     disparities: int
 
 

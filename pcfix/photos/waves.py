@@ -67,27 +67,22 @@ STILL = 0.15
 
 
 class View(NamedTuple):
-    """The first frame's camera, calm water, and the true bed.
-
-    `bed` takes places in plan, shape (n, 2), and gives heights, shape (n,); NaN where unknown.
-    """
+    """The first frame's camera, calm water, and the true bed."""
 
     photo: Photo
     level_m: float
     refractive_index: float
+    # heights, shape (n,), at places in plan, shape (n, 2); NaN where unknown
     bed: Callable[[FloatArray], FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
 class Nodes:
-    """The cells of the rasters, their centres, and whether the first frame sees them.
-
-    `xy`, shape (n, 2), world frame, are the centres row by row from the north.
-    """
+    """The cells of the rasters."""
 
     lattice: Lattice
-    xy: FloatArray
-    seen: BoolArray
+    xy: FloatArray  # (n, 2), world frame, their centres row by row from the north
+    seen: BoolArray  # (n,), whether the first frame sees them
 
 
 def on_level(view: View, pixels: FloatArray) -> FloatArray:
@@ -216,15 +211,12 @@ class Waves:
 
 
 class Slopes(NamedTuple):
-    """Slopes of all frames, shape (f, n, 2), their weights, shape (f, n), and times.
+    """Slopes of the surface in all frames."""
 
-    `xy`, shape (n, 2), are the centres of the lattice, relative to any point.
-    """
-
-    slope: FloatArray
-    weight: FloatArray
-    time_s: FloatArray
-    xy: FloatArray
+    slope: FloatArray  # (f, n, 2)
+    weight: FloatArray  # (f, n)
+    time_s: FloatArray  # (f,)
+    xy: FloatArray  # (n, 2), centres of the lattice, relative to any point
     lattice: Lattice
 
 

@@ -5,42 +5,48 @@ All words are made of the plain values of `adjustment_dict`, so that a resumed r
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from pcfix.adjust.block import MOTIONS
+from pcfix.adjust.block import sensor_groups, words_of
 from pcfix.adjust.problem import Intersected
-from pcfix.adjust.result import Adjusted, Plain, adjustment_dict, before_of
+from pcfix.adjust.result import Adjusted, Plain, adjustment_dict, rms
 from pcfix.grid.colours import DEPTH, DIFFERENCE, RAYS, UNCERTAINTY
 from pcfix.grid.maps import Maps, MapsBuilder
-from pcfix.model import FloatArray
-from pcfix.report.adjustment_figures import pictures_of
+from pcfix.model import BoolArray, FloatArray
 from pcfix.report.map_data import Layer
-from pcfix.report.page import Report, Table, render
-from pcfix.report.text import Rows, filled, share
+from pcfix.report.page import AFTER, BEFORE, Picture, Report, Table, label_plan, new_figure, render
+from pcfix.report.text import Rows, RowTable, filled, share
+from pcfix.sums import nice_step
+from pcfix.water.surface import surface_above
 
-__all__ = ["adjustment_dict", "adjustment_page", "adjustment_text", "before_of"]
+MOST_POINTS = 6000
+COLUMNS = 14
+"""Cells over the width of an image, for mean residual vectors."""
+LEAST_IN_CELL = 4
+ARROW = 0.07
+"""Length of a large arrow, as a share of the longer side of the block."""
+ARROW_LOOK: Plain = {"angles": "xy", "scale_units": "xy", "zorder": 3}
 
 WHERE = (("land", "on land"), ("water", "under water"))
 MOST_LISTED = 12
 """Surveyed points in the text; the page has all of them."""
-_LENS = {"f": "focal length", "cx": "principal x", "cy": "principal y"}
-_WATER = {
-    "level": ("water level", "m"), "tilt_x": ("tilt east", ""), "tilt_y": ("tilt north", ""),
-    "index": ("index", ""), "shape_xx": ("shape x^2", "/m"), "shape_xy": ("shape x y", "/m"),
-    "shape_yy": ("shape y^2", "/m"), "distance": ("port distance", "m"),
-    "centre_x": ("dome centre x", "m"), "centre_y": ("dome centre y", "m"),
-    "centre_z": ("dome centre z", "m"),
-}  # fmt: skip
-_COUNTS = (
+_FACTS: RowTable = (
     ("images", "{images:,}, {poses_words}", "images"),
     ("points", "{points[all]:,}: {points[land]:,} on land, {points[water]:,} under water{counted}",
      "points"),
     ("observations", "{o[used]:,} {kind} used, {o[left_out]:,} left out ({o_share}){outside}", "o"),
-    ("sigma0", "{sigma0_words}, redundancy {redundancy:,}, {rounds_count} rounds, {steps}"
-     " steps{undone}", "images"),
+    ("sigma0", "{sigma0:.3f}, redundancy {redundancy:,}, {rounds} rounds, {steps} steps{undone}",
+     "images"),
     ("water", "{water[surface]}", "has_shape"),
-)  # fmt: skip
-_ACCURACY = (
+    ("lens", "fixed", "lens_is_fixed"),
+    ("{label}", "{before:.6g} -> {after:.6g}{unit} ({added:+.3g}, standard error {sigma:.2g})",
+     "*unknowns"),
+    ("{label}", "{added:+.3g}{unit} (standard error {sigma:.2g})", "*motions"),
+    ("water", "none{refracts}", "no_water"),
+    ("port", "--port {port_found[port]}", "has_port_unknowns"),
+    ("{label}", "{after:.6g}{unit}, fixed", "*held"),
     ("on {surface}", "{points:,} marked points, distance RMS {rms_m:z.4f} m (given {sigma_m:g} m),"
      " largest {largest_m:z.4f} m ({largest_point}){parallel_to}", "*on_surfaces"),
     ("poses", "RMS movement of the centres {poses[moved_rms_m]:.3f} m", "moved"),
@@ -59,20 +65,9 @@ _ACCURACY = (
 )  # fmt: skip
 
 
-# Numbers and words
-
-
 def fixed(value: float | None, digits: int, sign: str = "") -> str:
     """Return a number with a fixed number of digits; a dash if it is unknown."""
     return "-" if value is None else f"{value:{sign}z.{digits}f}"  # z: a zero has no minus sign
-
-
-def short(value: float, sigma: float | None, sign: str = "") -> str:
-    """Return a number with the digits that its standard error justifies, two at least."""
-    if sigma is None or not sigma > 0.0:
-        return f"{value:{sign}.6g}"
-    digits = int(np.clip(np.ceil(np.log10(2.0 / sigma)), 2, 9))
-    return f"{value:{sign}.{digits}f}"
 
 
 def all_notes(d: Plain) -> list[str]:
@@ -84,38 +79,27 @@ def _residuals(d: Plain) -> str:
     """Return the RMS residuals on land and under water; empty without any."""
     known = [(where, d["residuals"][key]["rms_px"]) for key, where in WHERE]
     unit = d["image_unit"]
-    return " and ".join(
-        f"{fixed(rms, 2)} {unit} {where}" for where, rms in known if rms is not None
-    )
+    return " and ".join(f"{rms:.2f} {unit} {where}" for where, rms in known if rms is not None)
 
 
 def adjustment_sentence(d: Plain) -> str:
-    """Return an adjustment in half a line."""
-    row = next((one for one in d["lens"][:1] if one["name"] == "f"), None)
-    parts = [f"centres moved {fixed(d['poses']['moved_rms_m'], 3)} m (rms)"]
-    if row is not None:
-        before, after, _ = _change(row)
-        parts.insert(0, f"focal length {before} -> {after} {d['image_unit']}")
-    residuals = _residuals(d)
-    return ", ".join([*parts, *([f"residuals {residuals}"] if residuals else [])])
+    """Return an adjustment in a line."""
+    facts = [f"{label}: {text}" for label, text in _facts(d) if label in ("focal length", "poses")]
+    return "; ".join([*facts, f"residuals: {_residuals(d)}"])
 
 
-def adjustment_text(adjusted: Adjusted, before: Intersected | None = None) -> str:
-    """Return the summary of an adjustment as text.
-
-    `before` is of `before_of`, for the residuals before.
-    """
-    d = adjustment_dict(adjusted, before)
+def adjustment_text(d: Plain) -> str:
+    """Return the summary of an adjustment as text."""
     surveyed = _survey_table(d)
-    lines = [f"{label:<14} {words}" for label, words in _facts(d)] + _residual_table(d).lines()
+    lines = [f"{label:<18} {words}" for label, words in _facts(d)] + _residual_table(d).lines()
     lines += surveyed.lines()[: 1 + MOST_LISTED] if surveyed.rows else []
     return "\n".join([*lines, *(f"Note: {note}" for note in all_notes(d))])
 
 
-def adjustment_page(adjusted: Adjusted, before: Intersected | None = None) -> str:
+def adjustment_page(adjusted: Adjusted, before: Intersected) -> str:
     """Return the report of an adjustment as one self-contained HTML page.
 
-    With `before`, of `before_of`, residuals and points before are shown too.
+    `before` are residuals and points before, of `before_of`.
     """
     d = adjustment_dict(adjusted, before)
     maps, layers = _map(adjusted, before)
@@ -126,6 +110,7 @@ def adjustment_page(adjusted: Adjusted, before: Intersected | None = None) -> st
         f" {d['observations']['used']:,} observations fit within {_residuals(d)} (RMS of a"
         " coordinate)."
     )
+    tables = [_residual_table(d), _survey_table(d), _correlation_table(d)]
     report = Report(
         title="Refractive bundle adjustment",
         lead=lead,
@@ -134,7 +119,7 @@ def adjustment_page(adjusted: Adjusted, before: Intersected | None = None) -> st
         maps=maps,
         layers=layers,
         pictures=pictures_of(d, adjusted, before),
-        tables=_tables(d),
+        tables=[table for table in tables if table.rows],
     )
     return render(report)
 
@@ -153,7 +138,50 @@ def adjustment_tables(d: Plain, page: str) -> list[Table]:
 # Facts
 
 
-def _poses_are(d: Plain) -> str:
+def _facts(d: Plain) -> Rows:
+    """Return labels and values of the summary."""
+    n, o, water, port = d["points"], d["observations"], d["water"], d["port_found"] or {}
+    counts = [(n[key], key.replace("_", " ")) for key in ("left_out", "control", "check")]
+    kinds = {"tie points": "measured tie points", "cloud": "points of the cloud in original images"}
+    outside = f", {o['out_of_sight']:,} outside their image" if o["out_of_sight"] else ""
+    unknowns, held = [_lens_row(d, row) for row in d["lens"]], []
+    for name, row in (water or port).items():
+        if isinstance(row, dict):
+            named = _named(name) | row | {"added": row["after"] - row["before"]}
+            # a level surface has no tilt to show
+            if row["free"]:
+                unknowns.append(named)
+            elif not (name.startswith("tilt") and row["after"] == 0.0):
+                held.append(named)
+    motions = []
+    if d["poses_are"] == "similarity" and d["precision"] is not None:
+        motions = [_named(row["name"]) | row for row in d["precision"]["shared"][-7:]]
+    parallel, is_free = d["unknowns"]["parallel"], d["poses_are"] != "fixed"
+    surfaces = []
+    for one in d["on_surfaces"]:
+        others = ", ".join(name for name in parallel if name != one["surface"])
+        is_parallel = one["surface"] in parallel
+        surfaces.append(one | {"parallel_to": f"; parallel to {others}" if is_parallel else ""})
+    return filled(_FACTS, d | {
+        "poses_words": _poses_words(d), "o": o, "kind": kinds[d["source"]], "outside": outside,
+        "counted": "".join(f", {count:,} {key}" for count, key in counts if count),
+        "o_share": share(o["left_out"], o["used"] + o["left_out"]),
+        "undone": "; adjustment without water undone" if d["source"] == "cloud" else "",
+        "has_shape": water is not None and not water["surface"].startswith("level"),
+        "lens_is_fixed": not d["lens"], "unknowns": unknowns, "motions": motions, "held": held,
+        "no_water": water is None, "has_port_unknowns": len(port) > 1,
+        "refracts": ", a housing port refracts" if d["port"] else "",
+        "on_surfaces": surfaces,
+        "moved": is_free and d["poses"]["moved_rms_m"],
+        "is_precise": is_free and d["precision"] is not None and d["precision"]["images"],
+        "surveyed": [
+            {"role": role, "count": len(d[role]["points"]), **d[role]}
+            for role in ("control", "check") if d[role] is not None
+        ],
+    })  # fmt: skip
+
+
+def _poses_words(d: Plain) -> str:
     held = f", {d['images_fixed']:,} of them fixed" if d["images_fixed"] else ""
     network = ", a free network" if d["unknowns"]["free_network"] else ""
     return {
@@ -162,105 +190,41 @@ def _poses_are(d: Plain) -> str:
     }[d["poses_are"]]  # fmt: skip
 
 
-def _facts(d: Plain) -> Rows:
-    """Return labels and values of the summary."""
-    n, o, rounds, precision = d["points"], d["observations"], d["rounds"], d["precision"]
-    counts = [(n[key], key.replace("_", " ")) for key in ("left_out", "control", "check")]
-    kinds = {"tie points": "measured tie points", "cloud": "points of the cloud in original images"}
-    outside = f", {o['out_of_sight']:,} outside their image" if o["out_of_sight"] else ""
-    has_shape = d["water"] is not None and not d["water"]["surface"].startswith("level")
-    rows = filled(_COUNTS, d | {
-        "poses_words": _poses_are(d), "o": o, "kind": kinds[d["source"]], "outside": outside,
-        "counted": "".join(f", {count:,} {key}" for count, key in counts if count),
-        "o_share": share(o["left_out"], o["used"] + o["left_out"]),
-        "sigma0_words": fixed(d["sigma0"], 3), "rounds_count": len(rounds),
-        "steps": sum(row["steps"] for row in rounds), "has_shape": has_shape,
-        "undone": "; adjustment without water undone" if d["source"] == "cloud" else "",
-    })  # fmt: skip
-    rows += [] if d["lens"] else [("lens", "fixed")]
-    for label, row, unit in _unknowns(d):
-        unit = f" {unit}" if unit else ""
-        error = "" if row["sigma"] is None else f"standard error {row['sigma']:.2g}"
-        if "added" in row:
-            rows.append((label, f"{short(row['added'], row['sigma'], '+')}{unit} ({error})"))
-            continue
-        before, after, change = _change(row)
-        change += f", {error}" if error else ""
-        rows.append((label, f"{before} -> {after}{unit} ({change})"))
-    if d["water"] is None:
-        rows.append(("water", "none, a housing port refracts" if d["port"] else "none"))
-        if len(d["port_found"] or {}) > 1:
-            rows.append(("port", f"--port {d['port_found']['port']}"))
-    for key, (label, unit) in _WATER.items():  # a level surface has no tilt to show
-        v = (d["water"] or d["port_found"] or {}).get(key)
-        if v is not None and not v["free"] and not (key.startswith("tilt") and v["after"] == 0.0):
-            rows.append((label, f"{v['after']:.6g}{f' {unit}' if unit else ''}, fixed"))
-    parallel, is_free = d["unknowns"]["parallel"], d["poses_are"] != "fixed"
-    others = {name: ", ".join(one for one in parallel if one != name) for name in parallel}
-    return rows + filled(_ACCURACY, d | {
-        "on_surfaces": [
-            one | {"parallel_to": f"; parallel to {others[name]}" if others.get(name) else ""}
-            for one in d["on_surfaces"] for name in [one["surface"]]
-        ],
-        "moved": is_free and d["poses"]["moved_rms_m"],
-        "is_precise": is_free and precision is not None and precision["images"],
-        "surveyed": [
-            {"role": role, "count": len(d[role]["points"]), **d[role]}
-            for role in ("control", "check") if d[role] is not None
-        ],
-    })  # fmt: skip
+def _named(name: str) -> Plain:
+    """Return label and unit of a shared unknown."""
+    return dict(zip(("label", "unit"), words_of(name), strict=True))
+
+
+def _lens_row(d: Plain, row: Plain) -> Plain:
+    """Return a free parameter of a lens with its label and unit."""
+    label, _ = words_of(row["name"])
+    if len({one["sensor"] for one in d["lens"]}) > 1:
+        label += f", {row['sensor']}, {row['images']:,} images"
+    label += f", first of {row['lenses']} lenses" if row["lenses"] > 1 else ""
+    is_in_pixels = row["name"] in ("f", "cx", "cy", "b1", "b2")
+    unit = f" {d['image_unit']}" if is_in_pixels else ""
+    return row | {"label": label, "unit": unit, "added": row["after"] - row["before"]}
 
 
 def _fact_table(d: Plain) -> Table:
-    rows = [
-        # k1 and the other coefficients keep their small letters
-        [label if label[1:].isdigit() else label[:1].upper() + label[1:], words]
-        for label, words in _facts(d)
-    ]
+    rows = [[label[:1].upper() + label[1:], words] for label, words in _facts(d)]
     return Table("In short", [], rows)
-
-
-def _change(row: Plain) -> list[str]:
-    """Return a value before and after, and the difference."""
-    before, after, sigma = row["before"], row["after"], row["sigma"]
-    return [short(before, sigma), short(after, sigma), short(after - before, sigma, "+")]
-
-
-def _unknowns(d: Plain) -> list[tuple[str, Plain, str]]:
-    """Return label, values and unit of what was free of lens, water, port and similarity."""
-    several = len({row["sensor"] for row in d["lens"]}) > 1
-    rows = []
-    for row in d["lens"]:
-        label = str(_LENS.get(row["name"], row["name"]))
-        label += f", {row['sensor']}, {row['images']:,} images" if several else ""
-        label += f", first of {row['lenses']} lenses" if row["lenses"] > 1 else ""
-        in_pixels = row["name"] in ("f", "cx", "cy", "b1", "b2")
-        rows.append((label, row, str(d["image_unit"]) if in_pixels else ""))
-    found = d["water"] or d["port_found"] or {}
-    for key, (label, unit) in _WATER.items():
-        if (value := found.get(key)) is not None and value["free"]:
-            rows.append((label, value, unit))
-    if d["poses_are"] == "similarity" and d["precision"] is not None:
-        shared = {row["name"]: row for row in d["precision"]["shared"]}
-        units = {"shift": "m", "turn": "rad", "scale": ""}
-        rows += [(name, shared[name], units[name.partition(" ")[0]]) for name in MOTIONS]
-    return rows
 
 
 # Maps
 
 
-def _map(a: Adjusted, before: Intersected | None) -> tuple[Maps, list[Layer]]:
+def _map(a: Adjusted, before: Intersected) -> tuple[Maps, list[Layer]]:
     """Return maps of the points, averaged in cells."""
     unit = (a.block.cameras.lenses or ())[0].unit
-    heights, depth = _means(a, a.xyz[:, 2]), a.depth_m()
+    heights = _means(a, a.xyz[:, 2])
     layers = [Layer("Height", "m", heights.height_m)]
-    if depth is not None and a.is_wet.any():
+    if a.water is not None and a.is_wet.any():
+        depth = surface_above(a.water, a.xyz).height_m - a.xyz[:, 2]
         under = np.where(a.is_wet, depth, np.nan)
         layers.append(Layer("Depth", "m", _means(a, under).height_m, DEPTH))
-    if before is not None:
-        higher = _means(a, a.xyz[:, 2] - before.xyz[:, 2]).height_m
-        layers.append(Layer("Change in height", "m", higher, DIFFERENCE, is_centred=True))
+    higher = _means(a, a.xyz[:, 2] - before.xyz[:, 2]).height_m
+    layers.append(Layer("Change in height", "m", higher, DIFFERENCE, is_centred=True))
     # mean squared residual of a coordinate of each point
     rows = a.used & np.isfinite(a.residual_px).all(axis=1)
     owner, m = a.block.owner[rows], len(a.xyz)
@@ -284,27 +248,14 @@ def _means(a: Adjusted, values: FloatArray) -> Maps:
 # Tables
 
 
-def _tables(d: Plain) -> list[Table]:
-    """Return the tables that have rows, residuals first."""
-    unit, p = d["image_unit"], d["precision"]
-    tables = [_residual_table(d), _survey_table(d)]
-    shared = [] if p is None else [row["name"].replace("_", " ") for row in p["shared"]]
-    if len(shared) > 1:
-        rows = [
-            [name, *(fixed(value, 3, "+") for value in row)]
-            for name, row in zip(shared, p["correlation"], strict=True)
-        ]
-        tables.append(Table("Correlations of the shared unknowns", ["", *shared], rows))
-
+def _correlation_table(d: Plain) -> Table:
+    p = d["precision"] or {"shared": [], "correlation": []}
+    names = [row["name"].replace("_", " ") for row in p["shared"]]
     rows = [
-        [
-            str(row["round"]), str(row["steps"]), f"{row['observations']:,}",
-            fixed(row["cost"], 1), fixed(row["rms_px"], 4),
-        ]
-        for row in d["rounds"]
-    ]  # fmt: skip
-    header = ["round", "steps", "observations", "cost", f"RMS ({unit})"]
-    return [table for table in [*tables, Table("Rounds", header, rows)] if table.rows]
+        [name, *(fixed(value, 3, "+") for value in row)]
+        for name, row in zip(names, p["correlation"], strict=True)
+    ]
+    return Table("Correlations of the shared unknowns", ["", *names], rows if len(rows) > 1 else [])
 
 
 def _survey_table(d: Plain) -> Table:
@@ -339,3 +290,108 @@ def _residual_table(d: Plain) -> Table:
         if (r := d["residuals"][key])["points"]
     ]  # fmt: skip
     return Table("Residuals and precision on land and under water", header, rows)
+
+
+# Pictures
+
+
+def pictures_of(d: Plain, adjusted: Adjusted, before: Intersected) -> list[Picture]:
+    """Return the pictures of an adjustment."""
+    drawn = _block(d, adjusted), _vectors(adjusted, before)
+    return [picture for picture in drawn if picture is not None]
+
+
+def _block(d: Plain, a: Adjusted) -> Picture | None:
+    """Draw how far the projection centres moved, and their differences from GNSS, as arrows."""
+    moved = a.cameras.centres - a.block.cameras.centres
+    known = np.asarray(np.isfinite(a.gnss_residual_m).any(axis=1))
+    shown: list[tuple[str, FloatArray, BoolArray]] = []
+    if d["poses_are"] != "fixed":
+        shown.append(("Movement of the projection centres", moved, np.ones(len(moved), bool)))
+    if known.any():
+        shown.append(("Adjusted minus GNSS", a.gnss_residual_m, known))
+    if not shown:
+        return None
+    size = np.ptp(a.block.cameras.centres[:, :2], axis=0)
+    share = float(np.clip(size[1] / max(size[0], 1e-9), 0.25, 1.2))
+    n = len(shown)
+    figure, panels = new_figure(8.0, n * (5.2 * share + 1.4), nrows=n, squeeze=False)
+    xyz = a.xyz[a.is_observed]
+    xyz = xyz[:: max(1, len(xyz) // MOST_POINTS)]
+    side = float(max(np.ptp(a.cameras.centres[:, :2], axis=0).max(), 1e-3))
+    for axes, (title, vectors, rows) in zip(panels.ravel(), shown, strict=True):
+        # in plan as arrows, in height as colour
+        axes.plot(*xyz[:, :2].T, ".", color="0.85", markersize=1.5, zorder=1)
+        (x, y, _), (dx, dy, up) = a.cameras.centres[rows].T, np.nan_to_num(vectors[rows]).T
+        key = nice_step(max(float(np.percentile(np.hypot(dx, dy), 95.0)), 1e-6) / 2.0)
+        longer, reach = ARROW * side / key, max(float(np.abs(up).max()), 1e-6)
+        arrows = axes.quiver(
+            x, y, dx, dy, up, cmap=DIFFERENCE, scale=1.0 / longer, clim=(-reach, reach),
+            edgecolor="0.3", linewidth=0.5, width=0.007, **ARROW_LOOK,
+        )  # fmt: skip
+        axes.plot(x, y, "o", color="0.2", markersize=1.5, zorder=2)
+        figure.colorbar(arrows, ax=axes, label="Up (m)", shrink=0.8)
+        axes.quiverkey(arrows, 0.85, 1.05, key, f"{key:g} m", labelpos="E")
+        axes.update_datalim(np.column_stack([x + longer * dx, y + longer * dy]))
+        axes.margins(0.05)
+        axes.autoscale_view()
+        label_plan(axes)
+        axes.set_title(title, loc="left", pad=12.0)
+    alt = (
+        "The block in plan. Enlarged arrows show how far each projection centre moved, and its"
+        " difference from the GNSS position; their colour shows the vertical part."
+        f" The centres moved by {d['poses']['moved_rms_m']:.3f} m (rms)."
+    )
+    return Picture("block", "Projection centres", alt, figure)
+
+
+def _vectors(a: Adjusted, before: Intersected) -> Picture | None:
+    """Draw mean residual vectors over the image, of the sensor with most observations."""
+    lenses = a.block.cameras.lenses or ()
+    group, _ = sensor_groups(lenses)
+    of_group = group[a.block.camera]
+    main = int(np.bincount(of_group[a.used], minlength=1).argmax())
+    lens = lenses[int(np.flatnonzero(group == main)[0])]
+    rows = a.used & (of_group == main)
+    sets = [("before", before.residual_px, BEFORE), ("after", a.residual_px, AFTER)]
+    cells = [(name, _cell_means(a, r, rows, lens.width, lens.height), c) for name, r, c in sets]
+    largest = max((float(np.hypot(*m[2:]).max(initial=0.0)) for _, m, _ in cells), default=0.0)
+    if not largest > 0.0:
+        return None
+    key, scale = nice_step(largest / 2.0), largest * COLUMNS / (1.6 * lens.width)
+    height_in = 8.0 / len(cells) * lens.height / lens.width + 0.7
+    figure, panels = new_figure(8.0, height_in, ncols=len(cells), squeeze=False, sharey=True)
+    for axes, (name, means, colour) in zip(panels.ravel(), cells, strict=True):
+        arrows = axes.quiver(*means, color=colour, scale=scale, width=0.004, **ARROW_LOOK)
+        axes.quiverkey(arrows, 0.85, 1.04, key, f"{key:g} {lens.unit}", labelpos="E")
+        axes.set(title=name, xlim=(0.0, lens.width), ylim=(lens.height, 0.0), aspect="equal")
+        axes.locator_params(nbins=5)
+        axes.set_xlabel(f"u ({lens.unit})")
+    panels[0, 0].set_ylabel(f"v ({lens.unit})")
+    rest = {name: float(rms(np.concatenate(m[2:]))) for name, m, _ in cells if len(m[2])}
+    alt = (
+        f"Mean residuals (measured minus computed) by place in the image, enlarged alike; sensor"
+        f" {lens.sensor or main + 1}. Lens and poses did not absorb these: "
+        + ", ".join(
+            f"{name} {value:.3f} {lens.unit} rms" for name, value in rest.items() if value > 0.0
+        )
+        + "."
+    )
+    return Picture("residual_vectors", "Residuals over the image", alt, figure)
+
+
+def _cell_means(
+    a: Adjusted, residual: FloatArray, rows: BoolArray, width: float, height: float
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return centres of cells of the image and mean residuals there."""
+    from scipy.stats import binned_statistic_2d
+
+    rows = rows & np.asarray(np.isfinite(residual).all(axis=1))
+    bins = [COLUMNS, max(1, round(height * COLUMNS / width))]
+    (u, v), limits = a.block.image_xy[rows].T, [[0.0, width], [0.0, height]]
+    found: Any = binned_statistic_2d
+    count = found(u, v, u, "count", bins, limits).statistic
+    du, dv = found(u, v, residual[rows].T, "mean", bins, limits).statistic
+    column, row = np.nonzero(count >= LEAST_IN_CELL)
+    u, v = (column + 0.5) * width / bins[0], (row + 0.5) * height / bins[1]
+    return u, v, du[column, row], dv[column, row]

@@ -16,14 +16,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
 from pcfix.grid.colours import DEPTH, HEIGHT
 from pcfix.grid.maps import Maps
 from pcfix.model import FloatArray
 
 if TYPE_CHECKING:
-    from jinja2 import Template
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -61,7 +59,7 @@ def png_of(figure: Figure) -> bytes:
 
 
 def map_figure(
-    values: npt.NDArray[Any],
+    values: FloatArray,
     extent_m: tuple[float, float, float, float],
     label: str,
     shade: FloatArray | None = None,
@@ -69,11 +67,8 @@ def map_figure(
 ) -> Figure:
     """Draw a map of values over west, east, south and north, metres; `shade` is its relief.
 
-    Values are numbers, shape (rows, columns), or colours of shape (rows, columns, 4); for those
-    `look` gives the colour ramp and its `norm`.
+    Values have the shape (rows, columns).
     """
-    from matplotlib.cm import ScalarMappable
-
     west, east, south, north = extent_m
     height_in = float(np.clip(6.5 * (north - south) / (east - west) + 0.8, 2.8, 9.0))
     figure, axes = new_figure(8.0, height_in)
@@ -82,8 +77,7 @@ def map_figure(
         axes.imshow(shade, extent=extent_m, cmap="gray", vmin=0.0, vmax=1.0)
         look["alpha"] = 0.75
     image = axes.imshow(values, extent=extent_m, **look)
-    ramp = image if values.ndim == 2 else ScalarMappable(look["norm"], look["cmap"])
-    figure.colorbar(ramp, ax=axes, label=label, shrink=0.9)
+    figure.colorbar(image, ax=axes, label=label, shrink=0.9)
     return figure
 
 
@@ -210,39 +204,16 @@ def _as_read(value: Any) -> Any:
     return "-" if value is None else value
 
 
-def _template(name: str) -> Template:
-    """Return a template; values are escaped."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-    return Environment(
-        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True, finalize=_as_read,
-    ).get_template(name)  # fmt: skip
-
-
 def render(report: Report) -> str:
     """Return the page; it uses no address outside itself, and works without scripts."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
 
     from pcfix.report.map_data import map_json  # not quick to load, and texts do without
 
+    template = Environment(
+        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True, finalize=_as_read,
+    ).get_template("page.html.j2")  # fmt: skip
     data = Markup(map_json(report.maps, report.layers))
-    return _template("page.html.j2").render(report=report, figures=FIGURES, map_data=data)
-
-
-def run_html(title: str, tiles: Sequence[Tile], place: str, picture: Picture) -> str:
-    """Return what a notebook shows of a run, HTML without scripts: tiles and a small map."""
-    template = _template("notebook.html.j2")
-    return template.render(title=title, tiles=tiles, place=place, picture=picture)
-
-
-def overview(
-    colours: npt.NDArray[np.uint8], extent_m: tuple[float, float, float, float], deepest_m: float
-) -> Picture:
-    """Return a map of the shaded bed, from colours of shape (rows, columns, 4) with alpha."""
-    from matplotlib.colors import Normalize
-
-    norm = Normalize(0.0, deepest_m)
-    figure = map_figure(colours, extent_m, "Depth (m)", norm=norm, cmap=DEPTH)
-    alt = f"Map of the bed, shaded and in the colours of its depth, 0 to {deepest_m:.1f} m."
-    return Picture("overview", "Depth", alt, figure)
+    return template.render(report=report, figures=FIGURES, map_data=data)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import platform
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -12,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.grid.colours import DEPTH, DIFFERENCE, HEIGHT, RAYS, UNCERTAINTY
+from pcfix.grid.colours import DEPTH, DIFFERENCE, RAYS, UNCERTAINTY
 from pcfix.grid.maps import Extent, Maps, contours, depth_interval
-from pcfix.model import Cameras, FloatArray, WaterPlane, WaterSurface
+from pcfix.model import Cameras, FloatArray
 from pcfix.refract.tally import COVERAGE_95, ORDERS, largest_tvu_m
 from pcfix.report.comparison import noise_sentence, raw_of, signed
 from pcfix.report.map_data import Layer, relief
@@ -28,13 +27,12 @@ from pcfix.report.page import (
     Table,
     Tile,
     label_plan,
-    label_side,
     map_figure,
     name_of,
     new_figure,
 )
 from pcfix.report.summary import Summary
-from pcfix.report.text import FEWEST, formal_words, summary_rows, uncertainty_sentence
+from pcfix.report.text import formal_words, summary_rows, uncertainty_sentence
 from pcfix.version import __version__
 
 if TYPE_CHECKING:
@@ -42,11 +40,8 @@ if TYPE_CHECKING:
 
 Plain = dict[str, Any]
 Pair = tuple[str, str]
-SHIFT = "True minus apparent Z (m)"
-FIRST_FIGURES = ("water", "section_1", "depth_bins", "uncertainty", "cameras", "shift")
+FIRST_FIGURES = ("water", "section_1", "depth_bins", "uncertainty", "cameras")
 """Those that are shown where they are there, the first four of them."""
-CONTRADICTS = 1.5
-"""Measured and predicted errors that differ by a larger factor contradict each other."""
 SHOWN_NOTES = 3
 BESIDE_MAP = ("Submerged", "Cameras", "Water", "")
 """Labels of the rows that are also shown beside the map."""
@@ -59,10 +54,9 @@ class RunResults:
 
     summary: Summary
     cameras: Cameras
-    water: WaterSurface
     maps: Maps
     depth_m: dict[str, float]  # min, mean and max of the bed's points that are not noise
-    sample: FloatArray  # shape (m, 3): Z shift, depth and standard error of Z, zero where unknown
+    sample: FloatArray  # shape (m, 2): depth and standard error of Z, zero where unknown
     crs: str = ""  # of the cloud, and its vertical datum; empty if not known
     heights: str = ""
     project: str = ""
@@ -173,7 +167,7 @@ def _worded(value: Any) -> str:
 
 
 def _pictures(run: RunResults) -> list[Picture]:
-    """Return maps, a histogram, the cameras, and TVU over depth where there are standard errors."""
+    """Return the map of depths, the cameras, and TVU over depth where there are standard errors."""
     s, maps, depth = run.summary, run.maps, run.depth_m
     interval = depth_interval(maps.depth_m, maps.uncertainty_m)
     shade = relief(maps.height_m, maps.cell_m)
@@ -181,10 +175,6 @@ def _pictures(run: RunResults) -> list[Picture]:
     for _, place in contours(maps.depth_m, interval):
         x, y = (place + 0.5).T * maps.cell_m  # from the corner of the map
         depths.axes[0].plot(maps.west_m + x, maps.north_m - y, color=REFERENCE, linewidth=0.5)
-    shifts = map_figure(maps.shift_z_m, maps.extent_m, SHIFT, shade, cmap=HEIGHT)
-    cause = "growing with depth and incidence angle" if s.carried is None else (
-        "including the change by the adjustment"
-    )  # fmt: skip
     pictures = [
         Picture(
             "depth", "Depth",
@@ -192,23 +182,14 @@ def _pictures(run: RunResults) -> list[Picture]:
             f" {depth['max']:.2f} m, mean {depth['mean']:.2f} m; contours every {interval:g} m.",
             depths,
         ),
-        Picture(
-            "shift", "Shift in Z",
-            f"Map of how far the bed moved; mean {s.shift_z_m['mean']:.2f} m, {cause}.", shifts,
-        ),
-        Picture(
-            "shift_histogram", "How far the points moved",
-            "Histogram of the shift in Z of the corrected points.",
-            shift_histogram(run.sample[:, 0]),
-        ),
     ]  # fmt: skip
     if s.cameras:
         alt = (
-            "Projection centres over the cloud, in plan and seen from the south;"
-            f" {s.cameras_used} of {s.cameras} see corrected points."
+            f"Projection centres over the cloud; {s.cameras_used} of {s.cameras} see corrected"
+            " points."
         )
         pictures.append(Picture("cameras", "Cameras", alt, cameras_figure(run)))
-    known = run.sample[:, 2] > 0.0
+    known = run.sample[:, 1] > 0.0
     if s.uncertainty is not None and known.any():
         bins = run.compared["depth_bins"] if run.compared.get("tvu") else []
         dots = (
@@ -220,49 +201,27 @@ def _pictures(run: RunResults) -> list[Picture]:
             f" limits of the orders of IHO S-44. {formal_words(s)}.{dots if bins else ''}"
             " S-44 has requirements other than the TVU: position, features and coverage."
         )
-        _, depth_m, sigma_z_m = run.sample[known].T
+        depth_m, sigma_z_m = run.sample[known].T
         figure = tvu_figure(depth_m, sigma_z_m, bins)
         pictures.append(Picture("uncertainty", "Vertical uncertainty", alt, figure))
     return pictures
 
 
-def shift_histogram(values: FloatArray) -> Figure:
-    """Draw the distribution of shifts in Z, metres, without half a percent at each end."""
-    figure, axes = new_figure()
-    low, high = np.percentile(values, [0.5, 99.5])
-    edges = np.linspace(low, high, 81) if high > low else np.linspace(low - 0.5, low + 0.5, 81)
-    text = f"shift in Z: mean {values.mean():.3f}, sd {values.std():.3f}"
-    axes.hist(values, edges, density=True, color=BEFORE, alpha=0.55, label=text)
-    axes.set(xlabel=SHIFT, ylabel="Density")
-    axes.legend(loc="best")
-    return figure
-
-
 def cameras_figure(run: RunResults) -> Figure:
-    """Draw the projection centres in plan and in profile over the cloud."""
-    maps, cameras, water = run.maps, run.cameras, run.water
+    """Draw the projection centres in plan over the cloud."""
+    maps, cameras = run.maps, run.cameras
     used = ~np.isin(np.array(cameras.labels), run.summary.cameras_unused)
-    figure, (plan, profile) = new_figure(8.0, 7.0, nrows=2, height_ratios=[3, 2])
+    figure, plan = new_figure(8.0, 5.0)
     plan.imshow(maps.height_m, extent=maps.extent_m, cmap="Greys_r", alpha=0.6)
     depth = plan.imshow(maps.depth_m, extent=maps.extent_m, cmap=DEPTH)
     figure.colorbar(depth, ax=plan, label="Depth (m)", shrink=0.8)
     for chosen, mark, colour, name in (used, "o", AFTER, "used"), (~used, "x", BEFORE, "not used"):
         if chosen.any():
-            x, y, z = cameras.centres[chosen].T
+            x, y, _ = cameras.centres[chosen].T
             plan.plot(x, y, mark, color=colour, label=name, markersize=4)
-            profile.plot(x, z, mark, color=colour, markersize=4)
     label_plan(plan)
     # above the axes, where it covers no camera
     plan.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, frameon=False)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # columns without heights
-        low, high = np.nanpercentile(maps.height_m, (5, 95), axis=0)
-    columns = np.linspace(*maps.extent_m[:2], len(low))
-    profile.fill_between(columns, low, high, color="0.6", label="cloud, 5 to 95 %")
-    if isinstance(water, WaterPlane) and water.b == water.c == 0.0:
-        profile.axhline(water.a, color=WATER, label="water")
-    label_side(profile)
-    profile.legend(loc="best")
     return figure
 
 
@@ -365,50 +324,26 @@ def accuracy_tile(s: Summary, compared: Plain) -> Tile:
 
 def notes_of(s: Summary, heights: str, compared: Plain) -> list[str]:
     """Return what to check, the most important first; `heights` is the vertical datum."""
-    notes = [] if not compared.get("own") else _contradictions(s, compared)
+    notes = []
     if not compared.get("own"):
         notes.append("No reference: the accuracy is predicted. Check points on the bed measure it.")
+    elif compared.get("bed"):
+        after = compared["bed"]["after"]
+        bias = after["mean_m"]
+        if abs(bias) > max(after["sd_m"], compared["own"]["sigma_reference_m"]):
+            notes.append(
+                f"The bed is too {'high' if bias > 0.0 else 'low'} by {abs(bias):.3f} m on average,"
+                " more than it scatters. Check water level, refractive index, vertical datum and"
+                " poses."
+            )
     if s.poses is not None and s.poses["absorbed"] is None and s.cameras:
         notes.append(f"Poses: {s.poses['words']}.")
     if not heights:
         notes.append(
             "The vertical datum is not known: water level, cloud and reference must have the same."
         )
-    fate = {"withhold": "withheld", "keep": "kept", "drop": "dropped"}[s.settings["uncorrected"]]
-    notes += [
-        f"{count:,} points under water could not be corrected ({reason}). They were not moved and"
-        f" are {fate}."
-        for reason, count in s.uncorrected.items()
-        if count
-    ]
     if s.water_unknown:
         notes.append(f"{s.water_unknown:,} points have no known water surface above them.")
     notes += [one["message"] for one in s.warnings]
     notes += [one["message"] for one in compared.get("notes", ())]
     return [note[:1].upper() + note[1:] for note in notes]
-
-
-def _contradictions(s: Summary, compared: Plain) -> list[str]:
-    """Return notes where measured errors are not the predicted ones, or the bed has a bias."""
-    own, bed = compared["own"], compared.get("bed")
-    if not bed:
-        return []
-    notes, after, noise = [], bed["after"], own["sigma_reference_m"]
-    if s.uncertainty is not None and after["count"] >= FEWEST:
-        sigma, measured = s.uncertainty["sigma_z_m"]["mean"], after["rmse_m"]
-        expected = (sigma**2 + noise**2) ** 0.5
-        if not 1.0 / CONTRADICTS <= measured / expected <= CONTRADICTS:
-            is_larger = measured > expected
-            notes.append(
-                f"The measured errors of the bed are {'larger' if is_larger else 'smaller'} than"
-                f" the predicted ones (RMSE {measured:.3f} m, predicted {expected:.3f} m with the"
-                f" reference's noise; 95 % predicted {COVERAGE_95 * sigma:.3f} m without): "
-                f"{'use the measured ones' if is_larger else 'the predicted ones are cautious'}."
-            )
-    bias = after["mean_m"]
-    if abs(bias) > max(after["sd_m"], noise):
-        notes.append(
-            f"The bed is too {'high' if bias > 0.0 else 'low'} by {abs(bias):.3f} m on average,"
-            " more than it scatters. Check water level, refractive index, vertical datum and poses."
-        )
-    return notes

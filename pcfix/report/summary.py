@@ -62,11 +62,6 @@ class Summary:
             False: "",
         }[self.absorbed]
 
-    @property
-    def points_per_s(self) -> float:
-        """Points read per second, files included."""
-        return self.points / max(self.seconds, 1e-9)
-
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON; optional parts only if there are any."""
         optional = ("labelling", "carried", "unsure", "poses", "shoreline", "fit", "part")
@@ -77,4 +72,4 @@ class Summary:
         if self.uncertainty is not None and self.why_no_order:
             no_order = {"s44": None, "why_no_order": self.why_no_order}
             values["uncertainty"] = {**self.uncertainty, **no_order}
-        return {**values, "points_per_s": round(self.points_per_s)}
+        return values

@@ -17,7 +17,6 @@ from pcfix.adjust.collinearity import (
     lens_gradients,
     workspace,
 )
-from pcfix.adjust.normal import Rule, linearise
 from pcfix.adjust.problem import port_of, port_row, prepare
 from pcfix.lens.imaging import coefficients
 from pcfix.model import Cameras, Lens, TiePoints, Views, WaterPlane, WaterRaster
@@ -27,7 +26,6 @@ from tests.utils.compiled import compiled
 
 image_and_all_gradients = compiled(image_and_all_gradients)
 lens_gradients = compiled(lens_gradients)
-linearise = compiled(linearise)
 
 DOWN = np.diag([1.0, -1.0, -1.0])
 PLAIN = Lens(3600.0, 5472.0, 3648.0, 2730.0, 1830.0)
@@ -213,26 +211,3 @@ def test_lens(name):
     wanted = np.column_stack(wanted)
     # px per unit of the parameter; rounding of u (4000 px) over the step
     np.testing.assert_allclose(out, wanted, rtol=1e-6, atol=2e-5)
-
-
-def test_similarity():
-    """A shift, turn and scale of all poses together, about a pivot."""
-    centre, rotation = pose(9)
-    lens, water, q = coefficients(BROWN), np.array(WATERS["tilted"]), np.array([6.0, 5.0, -65.0])
-    pivot = np.array([3.0, -14.0, 2.0])
-    given = given_of(similarity=0, shared=7, pivot=pivot)
-    work = workspace(given)
-    assert linearise(state_of(q, centre, rotation, lens, water), given, Rule(), 0, 0, work, 0)
-    assert not work.right[0, :, :6].any()  # the poses do not move on their own
-    wanted = []
-    for i in range(7):
-        ends = []
-        step = 1e-4 if i < 3 else 1e-6
-        for sign in (1.0, -1.0):
-            by = np.zeros(7)
-            by[i] = sign * step
-            turn = Rotation.from_rotvec(by[3:6]).as_matrix()
-            moved = pivot + by[:3] + (1.0 + by[6]) * turn @ (centre - pivot)
-            ends.append(at(q, moved, rotation @ turn.T, lens, water, given))
-        wanted.append((ends[0] - ends[1]) / (2.0 * step))
-    close(work.right[0, :, 9:], np.column_stack(wanted))

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pcfix.adjust.block import PLANES, Conditions, Unknowns
+from pcfix.adjust.block import NO_CONDITIONS, PLANES, Conditions, Unknowns
 from pcfix.adjust.precision import precision_of
 from pcfix.adjust.problem import prepare
 from pcfix.adjust.result import redundancy_of
@@ -105,10 +105,10 @@ def test_waterline():
     _, found, precision = adjusted(block, LEVEL)
     sigma = precision.sigma_of("level")
     assert abs(found.shared[0] + 0.2) < 3.5 * sigma
-    without = adjusted(replace(block, conditions=None), LEVEL)[2].sigma_of("level")
+    without = adjusted(replace(block, conditions=NO_CONDITIONS), LEVEL)[2].sigma_of("level")
     assert sigma < 0.9 * without
     assert redundancy_of(prepare(block, LEVEL)[0]) == 10 + redundancy_of(
-        prepare(replace(block, conditions=None), LEVEL)[0]
+        prepare(replace(block, conditions=NO_CONDITIONS), LEVEL)[0]
     )
 
 

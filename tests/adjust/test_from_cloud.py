@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pcfix.adjust.block import Material, Unknowns, block_of, ties_of_cloud
-from pcfix.adjust.from_cloud import Candidate, adjust_cloud
+from pcfix.adjust.from_cloud import CloudBlock, adjust_cloud
 from pcfix.adjust.from_ties import adjust_ties
 from pcfix.adjust.problem import solved_cameras
 from pcfix.model import GnssPositions
@@ -36,7 +36,7 @@ def block(points=150, exact=True, **settings):
     return unaware(simulate_tie_points(points, **(SMALL | settings)), exact=exact)
 
 
-def candidate(made, *, gnss=True, control=None, exact=True):
+def cloud_block(made, *, gnss=True, control=None, exact=True):
     """Return the apparent points as the only thing that is known of the images."""
     scene, old = made.scene, made.cameras
     ties = ties_of_cloud(made.ties.xyz, made.ties.views, old)
@@ -47,7 +47,7 @@ def candidate(made, *, gnss=True, control=None, exact=True):
     material = Material("model", old, scene.water, scene.refractive_index, datum, control)
     whole = block_of(material, ties, 1.0)
     apparent = ties.xyz if control is None else np.vstack([ties.xyz, control.xyz])
-    return Candidate("all", whole, old, apparent)
+    return CloudBlock(whole, old, apparent)
 
 
 def centre_error_m(made, cameras):
@@ -69,7 +69,7 @@ def test_original_adjustment():
 def test_comes_home(settings):
     made = block(**settings)
     assert centre_error_m(made, made.cameras) > 0.1
-    found = adjust_cloud([candidate(made)], Unknowns(), FOCAL)
+    found = adjust_cloud(cloud_block(made), Unknowns(), FOCAL)
     assert centre_error_m(made, found.cameras) < HOME_M
     # px; a micrometre of 50 m is that of 3648 px in the focal length
     assert abs(found.cameras.lenses[0].focal - made.scene.true_cameras.lenses[0].focal) < 1e-4
@@ -82,7 +82,7 @@ def test_control_points():
     control = replace(
         made.scene.control, xyz=made.scene.control_truth, image_xy=made.scene.control_exact_xy
     )
-    found = adjust_cloud([candidate(made, gnss=False, control=control)], Unknowns(), FOCAL)
+    found = adjust_cloud(cloud_block(made, gnss=False, control=control), Unknowns(), FOCAL)
     assert centre_error_m(made, found.cameras) < 10 * HOME_M  # four points hold six strips
     assert {row.role for row in found.control} == {"control", "check"}
     for row in found.control:
@@ -94,7 +94,7 @@ def test_control_points():
 def test_least_squares_does_not(sigma_px):
     """Their residuals are those of the old adjustment taken away, which pulls back to it."""
     made = block()
-    one = candidate(made).block
+    one = cloud_block(made).block
     one = replace(one, sigma_px=np.full(len(one.camera), sigma_px))
     found = solved_cameras(*adjusted(one, Unknowns(lens=("f",))))
     # exact GNSS positions hold the centres, so that the focal length takes it
@@ -106,7 +106,7 @@ def test_orthogonal_residuals():
     """Those of light through the water, by the simulator, at what was found."""
     made = block(40)
     scene = made.scene
-    found = adjust_cloud([candidate(made)], Unknowns(), FOCAL)
+    found = adjust_cloud(cloud_block(made), Unknowns(), FOCAL)
     owner = np.repeat(np.arange(len(scene.truth)), np.diff(scene.views.start))
     camera, new, old = scene.views.camera, found.cameras, made.cameras
     surface = piercing_points(
@@ -123,7 +123,7 @@ def test_noise():
     """As the old columns are nearly those of light through the water, so are the estimates."""
     made = block(400, exact=False)
     scene = made.scene
-    mended = adjust_cloud([candidate(made, exact=False)], Unknowns(), FOCAL)
+    mended = adjust_cloud(cloud_block(made, exact=False), Unknowns(), FOCAL)
     gnss = scene.cameras.gnss
     material = Material("model", scene.cameras, scene.water, scene.refractive_index, gnss)
     whole = block_of(material, scene.ties, scene.noise.image_px)
@@ -146,6 +146,6 @@ def test_noise():
     ],
 )
 def test_refused(unknowns, code):
-    one = candidate(block(40), gnss=unknowns.poses == "similarity" or bool(unknowns.surface))
+    one = cloud_block(block(40), gnss=unknowns.poses == "similarity" or bool(unknowns.surface))
     with refused(code):
-        adjust_cloud([one], unknowns, FOCAL)
+        adjust_cloud(one, unknowns, FOCAL)

@@ -128,7 +128,7 @@ def test_no_datum(gnss, unknowns):
     few = whole.gnss_xyz.copy()
     few[gnss:] = np.nan
     with refused("adjust.no_datum", gnss=gnss, control=0):
-        adjust_ties(replace(whole, gnss_xyz=few), unknowns)
+        check_datum(replace(whole, gnss_xyz=few), unknowns)
 
 
 def test_datum():

@@ -113,10 +113,9 @@ def test_same_as_scipy():
 def test_members():
     made = scene(60)
     problem, found, precision = adjusted(block_of(made, control=True))
-    step = np.zeros((1, len(problem.moves)))
+    step = np.zeros((1, 6 * int(problem.moves.sum()) + len(problem.names)))
     step[0, -6:] = [0.02, 1e-3, -2e-3, 1e-5, 2e-5, -3e-5]
-    active = np.arange(len(problem.moves))
-    member = members_of(problem, found, active, step)
+    member = members_of(problem, found, step)
     raster, cameras = water_of(problem, found.state), made.true_cameras
     cameras = replace(cameras, centres=found.state.centres + problem.origin)
     moved = member.surface(0, raster, cameras)

@@ -138,7 +138,7 @@ def test_level():
     level = water_of(problem, found.state).a
     assert abs(level - made.water.a) < 0.02  # m, what is asked for
     assert precision.sigma_of("level") < 0.02
-    assert undetermined(precision, problem.unknowns) == []
+    assert undetermined(precision) == []
 
 
 @pytest.mark.parametrize("points", [100, 1500])
@@ -147,7 +147,7 @@ def test_index(points):
     block = block_of(made, control=True, index=1.33)
     problem, found = adjusted(block, Unknowns(lens=(), surface={"index": FREE}))
     precision = precision_of(problem, found)
-    notes = undetermined(precision, problem.unknowns)
+    notes = undetermined(precision)
     miss = abs(found.state.water[3] - made.refractive_index)
     if points > 100:
         assert miss < 0.005

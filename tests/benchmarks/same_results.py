@@ -38,16 +38,7 @@ from same_results_commands import pdal_table, table, write_inputs
 ROOT = Path(__file__).parents[2]
 SHARED = Path(os.environ.get("PCFIX_SHARED", ROOT.parent / "shared")).absolute() / "data"
 OUTCOME = "outcome.json"
-NOT_COMPARED = {
-    "seconds",
-    "points_per_s",
-    "pcfix",
-    "made_by",
-    "changed_ns",
-    "bytes",
-    "identity",
-    "sha256",
-}
+NOT_COMPARED = {"seconds", "pcfix", "made_by", "changed_ns", "bytes", "identity", "sha256"}
 """Keys of JSON that hold times, versions, or sizes and checksums of texts that contain them."""
 ZERO = 1e-9
 """Numbers closer to each other than this are equal, whatever their relative difference."""

@@ -28,7 +28,7 @@ WORDS = ("--cameras", CAMERAS, "--water", "0.37")
 PLAIN = {"method": "snell", "dimensions": "minimal"}
 """A correction that weighs nothing: for tests of files."""
 PLAIN_WORDS = [word for name, value in PLAIN.items() for word in (f"--{name}", value)]
-OWN = ("input", "output", "seconds", "points_per_s")
+OWN = ("input", "output", "seconds")
 """Figures of a summary that are those of a call."""
 
 

@@ -12,7 +12,7 @@ import pytest
 
 import pcfix
 from pcfix.adjust.block import usable_ties
-from pcfix.adjust.diagnosis import diagnosis_of, land_sign, neighbours_sign
+from pcfix.adjust.diagnosis import Diagnosis, land_sign, neighbours_sign
 from pcfix.model import Cameras, Lens, Outcome
 from tests.utils.crops import middle_of
 from tests.utils.nightly import mostly_nightly
@@ -121,9 +121,9 @@ def test_neighbours_sign(share, sigma, is_fused, absorbed):
 
 def test_neighbours_last():
     off = land_sign(np.ones(9), 0.05, "the reference")
-    found = diagnosis_of([neighbours_sign(0.1, 0.01, is_fused=True), off])
+    found = Diagnosis((off, neighbours_sign(0.1, 0.01, is_fused=True)))
     assert found.absorbed is True
-    bent = diagnosis_of([neighbours_sign(0.9, 0.01, is_fused=True)])
+    bent = Diagnosis((neighbours_sign(0.9, 0.01, is_fused=True),))
     assert bent.sentence("pcfix adjust").startswith("The poses seem to have absorbed")
 
 

@@ -102,7 +102,8 @@ def test_port_from_noisy_images(tmp_path, port, free):
             tmp_path / "model", tmp_path / "out", water=None, port=start, free=(free,),
             gnss=tmp_path / "gnss.csv", index=made.refractive_index, lens_unknowns=(),
         )  # fmt: skip
-    told = json.loads((tmp_path / "out" / "adjustment.json").read_text())["port_found"]
+    summary = json.loads((tmp_path / "out" / "adjustment.json").read_text())
+    told = summary["port_found"]
     again = port_of_text(told["port"])  # to 0.1 um
     np.testing.assert_allclose(coefficients(again), coefficients(found.port), atol=1e-7)
     names = ("distance",) if is_flat else ("centre_x", "centre_y", "centre_z")
@@ -111,7 +112,7 @@ def test_port_from_noisy_images(tmp_path, port, free):
         row = told[name]
         assert abs(row["after"] - value) < 3.5 * row["sigma"]
         assert abs(row["before"] - value) > 0.0 or value == 0.0
-    assert f"--port {told['port']}" in adjustment_text(found)
+    assert f"--port {told['port']}" in adjustment_text(summary)
     options = AdjustOptions(port=port, free=(free,))
     words = correct_words(found, "model", tmp_path / "out", options)
     assert words.endswith(f"--port {told['port']}")

@@ -11,12 +11,11 @@ import pytest
 
 from pcfix.adjust.block import Block, LogRow, Unknowns
 from pcfix.adjust.precision import Precision, SharedUnknown
-from pcfix.adjust.problem import Intersected
+from pcfix.adjust.problem import Intersected, prepare
 from pcfix.adjust.result import Adjusted, ControlRow, adjustment_dict, before_of
 from pcfix.errors import PcfixWarning
 from pcfix.model import Cameras, Lens, WaterPlane
-from pcfix.report.adjustment import adjustment_page, adjustment_text
-from pcfix.report.adjustment_figures import pictures_of
+from pcfix.report.adjustment import adjustment_page, adjustment_text, pictures_of
 from tests.report.test_report import Elements
 from tests.utils.shared import ROOT
 
@@ -81,8 +80,8 @@ def adjusted():
     used = np.ones(72, bool)
     used[[1, 40]] = False
     residual[~used] = 30.0
-    rounds = [LogRow(1, 1, 900.0, 72, 2.5), LogRow(1, 2, 400.0, 72, 0.9),
-              LogRow(2, 1, 100.0, 70, 0.37)]  # fmt: skip
+    rounds = [LogRow(1, 1, 72, 2.5), LogRow(1, 2, 72, 0.9),
+              LogRow(2, 1, 70, 0.37)]  # fmt: skip
     control = [
         ControlRow("G1", "control", 0.010, -0.020, 0.030, 0.5, 3),
         ControlRow("G2", "control", 0.010, 0.020, -0.050, 0.7, 2),
@@ -90,12 +89,17 @@ def adjusted():
     ]
     origin = np.round(before.centres.mean(axis=0))
     gnss = np.array([[0.01, 0.02, 0.03], [0.05, -0.02, 0.09], [np.nan] * 3])
+    block, unknowns = (
+        make_block(xyz, pinhole(xyz, before), before),
+        Unknowns(surface={"level": 0.1}),
+    )
+    problem, start = prepare(block, unknowns, origin)
+    numbers = np.array([LEVEL + 0.02 - origin[2], 0.0, 0.0, 1.34, *[0.0] * 7])
     return Adjusted(
-        make_block(xyz, pinhole(xyz, before), before), Unknowns(surface={"level": 0.1}), after,
-        WaterPlane(LEVEL + 0.02), 1.34, xyz, residual, used, is_wet, 1.234, 60, rounds,
-        "tie points", make_precision(len(xyz)), gnss, control,
-        [PcfixWarning("adjust.lens", "something <decided>")], origin,
-        np.array([LEVEL + 0.02 - origin[2], 0.0, 0.0, 1.34, *[0.0] * 7]),
+        block, unknowns, after, WaterPlane(LEVEL + 0.02), 1.34, xyz, residual, used, is_wet, 1.234,
+        60, rounds, "tie points", make_precision(len(xyz)), gnss, control,
+        [PcfixWarning("adjust.lens", "something <decided>")], problem,
+        replace(start, state=start.state._replace(water=numbers)),
     )  # fmt: skip
 
 
@@ -118,17 +122,17 @@ def before_px(adjusted):
 
 def test_text(adjusted):
     adjusted.residual_px[:, 1] *= 2.0
-    text = adjustment_text(adjusted, before_px(adjusted))
+    text = adjustment_text(adjustment_dict(adjusted, before_px(adjusted)))
     land, wet = (re.search(rf"  {name} .*", text)[0].split() for name in ("on land", "under water"))
     # the RMS of a coordinate: every x is 0.3 px on land and 0.4 px under water, y twice that
     assert land[2:9] == ["8", "23", "1.200", "0.474", "0.300", "/", "0.600"]
     assert wet[2:9] == ["16", "47", "2.400", "0.632", "0.400", "/", "0.800"]
     for words in (
         "70 measured tie points used, 2 left out (2.8 %)",
-        "sigma0         1.234, redundancy 60, 2 rounds, 3 steps",
-        "focal length   1000.00 -> 1002.00 px (+2.00, standard error 0.25)",
-        "water level    0.500 -> 0.520 m (+0.020, standard error 0.004)",
-        "index          1.34, fixed",
+        "sigma0             1.234, redundancy 60, 2 rounds, 3 steps",
+        "focal length       1000 -> 1002 px (+2, standard error 0.25)",
+        "water level        0.5 -> 0.52 m (+0.02, standard error 0.004)",
+        "refractive index   1.34, fixed",
         "0.0100       0.0200       0.0300",  # standard errors of the points
         # RMS of (0.01, 0.05), (0.02, 0.02), (0.03, 0.09); the longest is that of b.jpg
         "RMS 0.036, 0.020, 0.067 m, largest 0.105 m (b.jpg)",
@@ -143,7 +147,7 @@ def test_text(adjusted):
 
 
 def test_residuals_on_the_ground(adjusted):
-    found = adjustment_dict(adjusted)["residuals"]["land"]["rms_m"]
+    found = adjustment_dict(adjusted, before_px(adjusted))["residuals"]["land"]["rms_m"]
     total = count = 0.0
     for p in np.flatnonzero(~adjusted.is_wet):
         for c in range(3):
@@ -171,15 +175,6 @@ def test_values(adjusted):
     assert values["poses"]["turned_largest_deg"] == 0.0
 
 
-def test_depth_bins(adjusted):
-    bins = adjustment_dict(adjusted)["depth_bins"]
-    assert sum(b["observations"] for b in bins) == 47
-    assert bins[0]["from_m"] == 0.0
-    # the deepest point is 3.52 m below the water
-    assert bins[-1]["from_m"] <= 3.52 < bins[-1]["to_m"]
-    assert all(b["rms_px"] == pytest.approx(0.4) for b in bins)
-
-
 def bare(adjusted):
     """Return what is least: no water, nothing beside the images, one step."""
     block = replace(adjusted.block, water=None)
@@ -192,8 +187,7 @@ def bare(adjusted):
 
 @pytest.mark.parametrize("kind", ["whole", "bare"])
 def test_page(adjusted, kind):
-    before = before_px(adjusted) if kind == "whole" else None
-    it = adjusted if kind == "whole" else bare(adjusted)
+    before, it = before_px(adjusted), adjusted if kind == "whole" else bare(adjusted)
     pictures = pictures_of(adjustment_dict(it, before), it, before)
     elements = Elements(adjustment_page(it, before))
     said = " ".join(elements.said)
@@ -203,7 +197,7 @@ def test_page(adjusted, kind):
     names = [picture.name for picture in pictures]
     assert len(elements.all("img")) == len(names)
     if kind == "whole":
-        assert names == ["block", "residuals_by_depth", "residual_vectors", "section"]
+        assert names == ["block", "residual_vectors"]
         assert "Something <decided>" in said
 
 
@@ -213,7 +207,8 @@ def test_check_points(adjusted):
     used[-3:] = False
     used[3:6] = False  # a tie point that is left out wholly
     block = replace(adjusted.block, control_names=("G1", "C1"), is_check=np.array([False, True]))
-    values = adjustment_dict(replace(adjusted, block=block, used=used))
+    found = replace(adjusted, block=block, used=used)
+    values = adjustment_dict(found, before_px(found))
     assert values["points"] | {"control": 0, "check": 0} == {
         "all": 22, "land": 8, "water": 14, "left_out": 1, "control": 0, "check": 0,
     }  # fmt: skip

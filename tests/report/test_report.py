@@ -32,8 +32,8 @@ def report(tmp_path_factory):
     summary = pcfix.correct_file(
         cloud, folder / "corrected.laz", cameras=cameras, water=0.37, method="snell", max_angle=None
     )
-    water, found = pcfix.read_water(0.37), read_cloud(folder / "corrected.laz")
-    run = RunResults(summary, pcfix.read_cameras(cameras), water, **found)
+    found = read_cloud(folder / "corrected.laz")
+    run = RunResults(summary, pcfix.read_cameras(cameras), **found)
     write_report(run, [cloud, cameras], folder)
     return folder, summary
 
@@ -74,7 +74,7 @@ def test_self_contained(report):
     assert not re.search(r"https?://|@import|url\((?!data:)", text)
     pictures = elements.all("img")
     files = sorted((folder / "figures").glob("*.png"))
-    assert len(pictures) == len(files) == 5
+    assert len(pictures) == len(files) == 3
     assert all(len(picture["alt"]) > 20 for picture in pictures)
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in files)
     assert str(folder) not in text and str(SCENE) not in text

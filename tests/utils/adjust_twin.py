@@ -90,7 +90,7 @@ class Twin(NamedTuple):
             known = np.isfinite(sigma)
             parts.append((found[known] - (given - self.origin)[known]) / sigma[known])
         given = block.conditions
-        for number, name in enumerate(() if given is None else ("water", *given.names)):
+        for number, name in enumerate(("water", *given.names) if len(given.on) else ()):
             on = given.on == number
             plane = [added.get(f"{word} of {name}", 0.0) for word in ("level", "tilt_x", "tilt_y")]
             if name in given.parallel:  # slopes are those of the water

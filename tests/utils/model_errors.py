@@ -13,7 +13,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pcfix.adjust.block import Material, usable_ties
-from pcfix.adjust.methods import by_ties
+from pcfix.adjust.methods import adjust_block
+from pcfix.adjust.normal import CAUCHY, SQUARES
 from pcfix.adjust.problem import intersect_fixed
 from pcfix.model import TiePoints, WaterPlane
 from pcfix.options.survey import AdjustRules
@@ -63,11 +64,11 @@ def run(kind: str, seed: int, **settings: object) -> Run:
         scene = with_mismatches(scene, rng)
     off_m = rng.normal(0.0, SIGMA_LEVEL_M) if kind == "level" else 0.0
     water = WaterPlane(scene.water.a + off_m, scene.water.b, scene.water.c)
-    made = unaware(scene, robust="cauchy" if kind == "mismatches" else "squares")
+    made = unaware(scene, loss=CAUCHY if kind == "mismatches" else SQUARES)
     gnss = scene.cameras.gnss
     material = Material("block", made.cameras, water, scene.refractive_index, gnss)
     rules = AdjustRules(sigma_level=SIGMA_LEVEL_M if kind == "level" else None)
-    found = by_ties(material, usable_ties(made.ties, made.cameras), rules)
+    found = adjust_block(material, rules, ties=usable_ties(made.ties, made.cameras))
     bed = tuple(
         bed_rms_m(scene, cameras, surface) / (80.0 / cameras.lenses[0].focal)
         for cameras, surface in ((made.cameras, water), (found.cameras, found.water))

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.optimize._numdiff import approx_derivative
 
 from pcfix.adjust.block import Unknowns
+from pcfix.adjust.normal import SQUARES
 from pcfix.adjust.problem import prepare, solved_cameras
 from pcfix.adjust.solve import solve
 from pcfix.model import TiePoints, WaterPlane
@@ -21,7 +22,6 @@ from tests.utils.adjust_twin import Twin
 from tests.utils.tie_blocks import block_of, some_ties
 
 if TYPE_CHECKING:
-    from pcfix.adjust.block import Robust
     from pcfix.model import Cameras, FloatArray
     from tests.utils.tie_points import TieScene
 
@@ -53,12 +53,12 @@ class Unaware:
         return jacobian.T @ r, np.linalg.norm(jacobian, axis=0) * np.linalg.norm(r)
 
 
-def unaware(scene: TieScene, *, exact: bool = False, robust: Robust = "squares") -> Unaware:
+def unaware(scene: TieScene, *, exact: bool = False, loss: int = SQUARES) -> Unaware:
     """Adjust a scene with straight rays."""
     block = block_of(scene, exact=exact, gnss=False)
     dry = replace(block, water=None, wet=np.zeros(len(block.xyz), bool))
     problem, start = prepare(dry, Unknowns(lens=("f",), free_network=True))
-    found = solve(problem, start, robust)
+    found = solve(problem, start, loss)
     cameras, xyz = solved_cameras(problem, found), found.state.xyz + problem.origin
     target = scene.true_cameras.centres if exact else scene.cameras.gnss.xyz
     scale, turn, shift = similarity(cameras.centres, target)
