@@ -175,7 +175,7 @@ def plan_correction(plan: Plan) -> Plan:
         if transfer is not None:
             transfer.check_models(first.xyz)
     chunks = partial(_whole_cloud, plan)
-    labelling = plan.labelling.scanned(lambda: parts_of(chunks(), water), view.low, view.high)
+    labelling = plan.labelling.scanned(parts_of(chunks(), water), view.low, view.high)
     plan = replace(plan, labelling=labelling)
     if (inputs.check_depths or inputs.regression) is not None and plan.regression is None:
         from pcfix.flow.check_depths import regression_of

@@ -10,7 +10,7 @@ negative number.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -84,33 +84,24 @@ class Labelling:
         s = self.settings
         return self.mask is None and not (s.respect_classes or s.connected or s.dead_band)
 
-    def scanned(
-        self, parts: Callable[[], Iterable[Part]], low: FloatArray, high: FloatArray
-    ) -> Labelling:
+    def scanned(self, parts: Iterable[Part], low: FloatArray, high: FloatArray) -> Labelling:
         """Return the rules with the surroundings of all points, if they need them.
 
-        `parts` returns the whole cloud in chunks, and is called again if its south-west and
-        north-east corner, `low` and `high`, were wrong.
+        `parts` are the whole cloud in chunks, and `low` and `high` its corners, if they are known.
         """
         settings = self.settings
         if not (settings.connected or settings.dead_band > 0.0):
             return self
-        if not (np.isfinite([low, high]).all() and (low <= high).all()):
-            low = high = np.zeros(2)
-        while True:
-            grid = Grid(low, high, settings.dead_band)
-            for part in parts():
-                x, y, z = np.ascontiguousarray(part.xyz.T)
-                height = z - part.surface.height_m
-                # high points have no vote without a dead band
-                counts = np.ones(len(x), np.bool_) if settings.dead_band else height < 0.0
-                counts &= ~self._is_respected(part.classes)
-                rows = np.flatnonzero(counts)
-                counts[rows] = self._is_inside(x[rows], y[rows])
-                grid.add(x, y, height, counts)
-            if grid.fits:
-                break
-            low, high = grid.low, grid.high
+        grid = Grid(low, high, settings.dead_band)
+        for part in parts:
+            x, y, z = np.ascontiguousarray(part.xyz.T)
+            height = z - part.surface.height_m
+            # high points have no vote without a dead band
+            counts = np.ones(len(x), np.bool_) if settings.dead_band else height < 0.0
+            counts &= ~self._is_respected(part.classes)
+            rows = np.flatnonzero(counts)
+            counts[rows] = self._is_inside(x[rows], y[rows])
+            grid.add(x, y, height, counts)
         around = grid.surroundings(connected=settings.connected, least_pool_m2=settings.least_pool)
         return replace(self, around=around)
 
