@@ -15,8 +15,7 @@ their own (Bollaerts et al. 2006, Statistics in Medicine 25: 1189-1206).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -31,9 +30,6 @@ from pcfix.water.fit import (
     tukey_weight,
     usable_rows,
 )
-
-if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
 
 FEWEST = 10
 MOST_CELLS = 200_000
@@ -170,31 +166,12 @@ class Axis:
     xy: FloatArray  # (m, 2), its vertices, metres, world frame
     width_m: float  # twice the rms distance of the points from it
 
-    @cached_property
-    def _tree(self) -> cKDTree:
-        from scipy.spatial import cKDTree
-
-        return cKDTree(self.xy)
-
     def locate(self, xy: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the distance along the line of places (n, 2), and their distance from it, m.
+        """Return the distance along the line of places (n, 2), and their distance from it, m."""
+        import shapely
 
-        Each place is projected onto the segments on both sides of the nearest vertex.
-        """
-        edges = np.diff(self.xy, axis=0)
-        lengths = np.hypot(*edges.T)
-        stations = np.concatenate([[0.0], np.cumsum(lengths)])
-        nearest = np.asarray(self._tree.query(xy)[1], np.int64)
-        along, away = np.empty((2, len(xy))), np.empty((2, len(xy)))
-        for side in (0, 1):
-            i = np.clip(nearest + side - 1, 0, len(edges) - 1)
-            local, edge = xy - self.xy[i], edges[i]
-            share = (local * edge).sum(axis=1) / np.maximum(lengths[i] ** 2, 1e-12)
-            share = np.clip(share, 0.0, 1.0)
-            along[side] = stations[i] + share * lengths[i]
-            away[side] = np.hypot(*(local - share[:, None] * edge).T)
-        first = away[0] <= away[1]
-        return np.where(first, along[0], along[1]), away.min(axis=0)
+        line, places = shapely.linestrings(self.xy), shapely.points(xy)
+        return shapely.line_locate_point(line, places), shapely.distance(line, places)
 
 
 def flow_axis(xy: FloatArray) -> Axis:
