@@ -378,16 +378,13 @@ def _set_covariance(
             turned = beyond(scaled(u_turned[axis], u), v_turned[axis], v)
             noise = plus_square(noise, scaled(sigmas.centre_m, moved))
             noise = plus_square(noise, scaled(sigmas.attitude, turned))
+    # the error of the refractive index is common to all images
+    noise = plus_square(noise, scaled(sigmas.refractive_index, by_n))
     det, (xx, xy, xz, yy, yz, zz) = cofactors(h)
-    if not det > 0.0:
-        return
-    inverse = (
-        scaled(1.0 / det, (xx, xy, xz)), scaled(1.0 / det, (xy, yy, yz)),
-        scaled(1.0 / det, (xz, yz, zz)),
-    )  # fmt: skip
-    at = 0
-    for i in range(3):
-        for j in range(i, 3):
-            common = sigmas.refractive_index**2 * dot(inverse[i], by_n) * dot(inverse[j], by_n)
-            out[at] = dot(inverse[i], product(noise, inverse[j])) + common
-            at += 1
+    if det > 0.0:
+        rows = (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
+        at = 0
+        for i in range(3):
+            for j in range(i, 3):
+                out[at] = dot(rows[i], product(noise, rows[j])) / (det * det)
+                at += 1
