@@ -304,3 +304,14 @@ def plain_image(c: Plain, w: Vector) -> tuple[float, float, Gradients]:
         inv * ua, inv * ub, -inv * (ua * flat_x + ub * flat_y),
         inv * va, inv * vb, -inv * (va * flat_x + vb * flat_y),
     )  # fmt: skip
+
+
+@device(inline="always")
+def image_and_slopes(
+    lens: FloatArray, plain: Plain | None, r: FloatArray, direction: Vector
+) -> tuple[float, float, Vector, Vector]:
+    """Do as `image_in_world`, by the numbers of the common lens if there are any."""
+    if plain is None:
+        return image_in_world(lens, r, direction)
+    u, v, g = plain_image(plain, times(r, direction))
+    return u, v, transposed_times(r, g[:3]), transposed_times(r, g[3:])

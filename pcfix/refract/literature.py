@@ -318,18 +318,12 @@ def _nearest_vertical(rays: FloatArray) -> tuple[float, float, float, bool]:
     for each of the two axes: a straight line through the places (v, -v below), of which `sunk` is
     the slope with its sign changed.
     """
-    k, means, spread, product = len(rays), np.zeros((2, 2)), 0.0, 0.0
-    for axis in range(2):
-        v = rays[:, 1 + axis]
-        r = -v * rays[:, 0]
-        means[axis] = v.mean(), r.mean()
-        # least squares of a line through the places (v, r)
-        away = v - means[axis, 0]
-        spread += (away * away).sum()
-        product += (away * (r - means[axis, 1])).sum()
+    below, u, v = rays[:, 0], rays[:, 1], rays[:, 2]
+    # least squares of one line through the places of both axes
+    from_u, from_v = u - u.mean(), v - v.mean()
+    spread = (from_u * from_u + from_v * from_v).sum()
     # of two rays at a small angle alpha the spread is alpha^2 / 2
-    if not spread >= 2.0 * k * MIN_DETERMINANT:
+    if not spread >= 2.0 * len(rays) * MIN_DETERMINANT:
         return 0.0, 0.0, 0.0, False
-    sunk = -product / spread
-    x, y = means[:, 1] + sunk * means[:, 0]
-    return x, y, sunk, True
+    sunk = (below * (u * from_u + v * from_v)).sum() / spread
+    return (u * (sunk - below)).mean(), (v * (sunk - below)).mean(), sunk, True

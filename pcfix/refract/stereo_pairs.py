@@ -35,21 +35,9 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.kernels import Span, device, in_tiles, kernel
-from pcfix.lens.algebra import (
-    Vector,
-    beyond,
-    cross,
-    dot,
-    minus,
-    row_of,
-    scaled,
-    solved,
-    times,
-    transposed_times,
-    vector,
-)
+from pcfix.lens.algebra import Vector, beyond, cross, dot, minus, row_of, scaled, solved, vector
 from pcfix.lens.formulas import KIND, PERSPECTIVE, PLAIN
-from pcfix.lens.imaging import Plain, image_in_world, plain_image, plain_lens
+from pcfix.lens.imaging import Plain, image_and_slopes, plain_lens
 from pcfix.model import BoolArray, FloatArray, IntArray, Outcome, Views
 from pcfix.refract import tiling
 from pcfix.refract.batch import (
@@ -353,11 +341,7 @@ def _see(
         by_place = scaled(scale, axis if flat else e)
         # g.w is the distance of w in terms of P
         w = scaled(1.0 / dot(w, by_place), w)
-        if plain is None:
-            u, _, by_u, by_v = image_in_world(lens, r, w)
-        else:
-            u, _, g = plain_image(plain, times(r, w))
-            by_u, by_v = transposed_times(r, g[:3]), transposed_times(r, g[3:])
+        u, _, by_u, by_v = image_and_slopes(lens, plain, r, w)
         # NaN where there is no image
         off_u, off_v = dot(by_u, e) + 0.0 * u, dot(by_v, e)
         put(ray, _BY_PLACE * TILE + j, by_place)

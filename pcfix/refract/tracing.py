@@ -5,7 +5,7 @@ piercing point. Four methods find it; they agree where all of them converge:
 
 =============  ====================================================================================
 kotowski       Newton's method on Snell's law at the piercing point (Kotowski 1987)
-afrt           rays traced forward, their piercing point moved by a secant (Broyden) update
+afrt           rays traced forward: Newton's method on their offset at the height of the point
 mdfrt          minimum distance forward ray tracing: Newton's method on the ray's distance
 scattershot    grids of paths narrowed to the shortest optical length (Fermat)
 =============  ====================================================================================
@@ -319,33 +319,23 @@ def _search(pairs: Pairs, start: FloatArray, level: FloatArray, method: str) -> 
     """Find where the residual of a method vanishes, from places on the straight lines on.
 
     `level` are the heights of the water over the points. Mulsow 2024 does not say how the residual
-    is brought to zero. Here it is Newton's method with differences of neighbouring places, two more
-    rays per step. afrt does without: the good Broyden update
-
-        B + (s - B y) s'B / (s' B y)
-
-    improves the inverse B of the derivative after a step s that changes the residual by y, from
-    that of water without refraction on. A step that makes the residual grow, or leaves the water,
-    is halved until it is short.
+    is brought to zero. Here it is Newton's method with differences of neighbouring places. A step
+    that makes the residual grow, or leaves the water, is halved until it is short.
     """
     xy, rest = start.copy(), pairs.residual(start, method)
     # beyond the edge of the water: start above the point
     off = np.isnan(rest[0])
     xy[:, off], rest[:, off] = 0.0, pairs.of(off).residual(np.zeros((2, off.sum())), method)
-    inverse = np.eye(2)[:, :, None] * (1.0 - np.minimum(level / pairs.e[2], HIGHEST_START))
     steps, found = np.zeros(len(level), np.int64), np.zeros(len(level), np.bool_)
     rows, some = np.arange(len(level)), pairs
     for step in range(1, SEARCH_STEPS + 1):
         place, r, depth = xy[:, rows], rest[:, rows], level[rows]
-        if method == "afrt":
-            b = inverse[:, :, rows]
-        else:
-            aside = np.minimum(DIFFERENCE_M, 0.05 * depth)
-            by_x = some.residual(np.stack([place[0] + aside, place[1]]), method) - r
-            by_y = some.residual(np.stack([place[0], place[1] + aside]), method) - r
-            b = np.array([[by_y[1], -by_y[0]], [-by_x[1], by_x[0]]])
-            b *= aside / (by_x[0] * by_y[1] - by_y[0] * by_x[1])
-        s = -(b * r).sum(axis=1)
+        aside = np.minimum(DIFFERENCE_M, 0.05 * depth)
+        by_x = some.residual(np.stack([place[0] + aside, place[1]]), method) - r
+        by_y = some.residual(np.stack([place[0], place[1] + aside]), method) - r
+        inverse = np.array([[by_y[1], -by_y[0]], [-by_x[1], by_x[0]]])
+        inverse *= aside / (by_x[0] * by_y[1] - by_y[0] * by_x[1])
+        s = -(inverse * r).sum(axis=1)
         size, new = np.hypot(*s), some.residual(place + s, method)
         for _ in range(HALVINGS):
             is_short = (np.hypot(*s) < SHORT * depth) & ~np.isnan(new[0])
@@ -354,9 +344,6 @@ def _search(pairs: Pairs, start: FloatArray, level: FloatArray, method: str) -> 
                 break
             s[:, far] *= 0.5
             new[:, far] = some.of(far).residual(place[:, far] + s[:, far], method)
-        if method == "afrt":
-            y, left = new - r, (s[:, None] * b).sum(axis=0)
-            inverse[:, :, rows] += (s - (b * y).sum(axis=1))[:, None] * left / _dot(left, y)
         steps[rows], rest[:, rows] = step, new
         goes_on = ~np.isnan(new[0])
         xy[:, rows[goes_on]] += s[:, goes_on]
