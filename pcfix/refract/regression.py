@@ -172,27 +172,23 @@ class BeyondRange(Sums):
     """Counts of apparent depths beyond those that a line was fitted to."""
 
     count: int
-    shallower: int
-    deeper: int
+    beyond: int
     deepest_m: float = field(metadata=MOST)
 
     @classmethod
     def of(cls, apparent_m: FloatArray, line: DepthRegression) -> BeyondRange:
         """Return the counts of submerged points, shape (m,)."""
-        shallower = int((apparent_m < line.shallowest_m).sum())
-        deeper = int((apparent_m > line.deepest_m).sum())
-        return cls(len(apparent_m), shallower, deeper, float(apparent_m.max(initial=0.0)))
+        beyond = (apparent_m < line.shallowest_m) | (apparent_m > line.deepest_m)
+        return cls(len(apparent_m), int(beyond.sum()), float(apparent_m.max(initial=0.0)))
 
     def notes(self, line: DepthRegression, least: float = 0.0) -> list[str]:
         """Return a sentence on them if their share is above `least`."""
-        if self.shallower + self.deeper <= least * self.count:
+        if self.beyond <= least * self.count:
             return []
-        of = 100.0 / self.count
         return [
             f"The regression was fitted to apparent depths of {line.shallowest_m:.2f} to"
             f" {line.deepest_m:.2f} m and is extrapolated for"
-            f" {of * (self.shallower + self.deeper):.1f} % of the submerged points"
-            f" ({of * self.shallower:.1f} % shallower, {of * self.deeper:.1f} % deeper, down to"
+            f" {100.0 * self.beyond / self.count:.1f} % of the submerged points (down to"
             f" {self.deepest_m:.2f} m), where SigmaZ grows."
         ]
 

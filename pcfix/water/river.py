@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from pcfix.errors import GeometryError
-from pcfix.model import FloatArray, WaterMesh
+from pcfix.model import FloatArray, WaterRaster
 from pcfix.water.fit import (
     LEAST_SCALE_M,
     TO_SIGMA,
@@ -80,9 +80,9 @@ def fit_river(
     xyz : array, shape (n, 3)
         Metres, world frame, of both banks or one; rows that are not finite are ignored.
     bounds : tuple of 4 float
-        Least x, least y, greatest x, greatest y of the cloud, which the mesh has to cover.
+        Least x, least y, greatest x, greatest y of the cloud, which the raster has to cover.
     name : str
-        Name of the mesh.
+        Name of the raster.
     counts : array, shape (n,), optional
         See `pcfix.water.fit.fit_water`.
     """
@@ -122,7 +122,7 @@ def fit_river(
     residual, weight = np.full(len(points), np.nan), np.zeros(len(points))
     residual[known], weight[known] = profile.residual_m, profile.weight
     return RiverFit(
-        surface=_mesh(axis, profile, bounds, name),
+        surface=_raster(axis, profile, bounds, name),
         points=points,
         notes=tuple(notes),
         axis=axis,
@@ -133,10 +133,10 @@ def fit_river(
     )
 
 
-def _mesh(axis: Axis, profile: Profile, bounds: Bounds, name: str) -> WaterMesh:
-    """Return the surface over the bounds as a grid of triangles.
+def _raster(axis: Axis, profile: Profile, bounds: Bounds, name: str) -> WaterRaster:
+    """Return the surface over the bounds, whose corners are centres of cells.
 
-    Cross-sections would intersect on the inside of a bend; a grid does not fold.
+    Cross-sections would intersect on the inside of a bend; a raster does not fold.
     """
     left, bottom, right, top = bounds
     if not (np.isfinite(bounds).all() and right > left and top > bottom):
@@ -145,13 +145,10 @@ def _mesh(axis: Axis, profile: Profile, bounds: Bounds, name: str) -> WaterMesh:
     size = float(np.sqrt((right - left) * (top - bottom) / MOST_CELLS))
     cell = max(size, float(profile.station_m[1] - profile.station_m[0]) / 2.0)
     columns, rows = (int(np.ceil(side / cell)) + 1 for side in (right - left, top - bottom))
-    x, y = np.linspace(left, right, columns), np.linspace(bottom, top, rows)
+    x, y = left + cell * np.arange(columns), bottom + cell * np.arange(rows)[::-1]
     xy = np.column_stack([np.tile(x, rows), np.repeat(y, columns)])
-    vertices = np.column_stack([xy, profile.height_at(axis.locate(xy)[0])])
-    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
-    halves = (0, 1, columns), (1, columns + 1, columns)  # counter-clockwise from above
-    triangles = np.vstack([corner[:, None] + np.array(half) for half in halves])
-    return WaterMesh(vertices, triangles.astype(np.int64), name)
+    height = profile.height_at(axis.locate(xy)[0]).reshape(rows, columns)
+    return WaterRaster(height, left - cell / 2.0, y[0] + cell / 2.0, (cell, cell), name)
 
 
 REACH = 2.0

@@ -226,7 +226,7 @@ def test_weir():
         assert np.mean((fit.height_at(places) - true)[near]) == pytest.approx(0.0, abs=0.03)
 
 
-def test_mesh_of_river():
+def test_raster_of_river():
     points, places, _, asked, _ = winding(2, 200)
     fit = fit_river(points, bounds_of(places))
     seen = surface_above(fit.surface, np.column_stack([places, np.zeros(len(places))])).height_m
