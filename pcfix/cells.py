@@ -23,8 +23,8 @@ FINEST_M = 2.0**-10
 Values = npt.NDArray[Any]
 
 
-class Lattice(NamedTuple):
-    """The side of the cells, and the first of them."""
+class CellFrame(NamedTuple):
+    """The side of square cells, and which is the first."""
 
     side_m: float
     first_row: int  # northwards from the origin of the world frame
@@ -57,7 +57,7 @@ class Cells:
         self._low, self._high = np.full(2, np.inf), np.full(2, -np.inf)
         if np.isfinite([low, high]).all() and (low <= high).all():
             self._low, self._high = low, high
-        self.lattice = Lattice(FINEST_M, 0, 0)
+        self.frame = CellFrame(FINEST_M, 0, 0)
         self.values = [np.empty((*layer.empty.shape, 0, 0), layer.empty.dtype) for layer in layers]
 
     def cover(self, low: FloatArray, high: FloatArray) -> None:
@@ -67,16 +67,16 @@ class Cells:
             return
         self._low, self._high = np.minimum(self._low, low), np.maximum(self._high, high)
         while True:
-            side, *first = self.lattice
+            side, *first = self.frame
             (west, south), (east, north) = (
                 np.floor(corner / side) for corner in (self._low, self._high)
             )
             if (north - south + 1.0) * (east - west + 1.0) <= self._most:
                 break
             self.halve()
-        self.lattice = Lattice(side, int(south), int(west))
+        self.frame = CellFrame(side, int(south), int(west))
         shape = int(north - south) + 1, int(east - west) + 1
-        row, column = first[0] - self.lattice.first_row, first[1] - self.lattice.first_column
+        row, column = first[0] - self.frame.first_row, first[1] - self.frame.first_column
         for i, (layer, old) in enumerate(zip(self._layers, self.values, strict=True)):
             rows, columns = old.shape[-2:]
             new = np.full((*old.shape[:-2], *shape), layer.empty[..., None, None])
@@ -85,7 +85,7 @@ class Cells:
 
     def halve(self) -> None:
         """Merge each four cells into one of twice the side."""
-        side, row, column = self.lattice
+        side, row, column = self.frame
         for i, (layer, values) in enumerate(zip(self._layers, self.values, strict=True)):
             for first in (column, row):
                 # the first cell of a pair has an even number
@@ -94,7 +94,7 @@ class Cells:
                 values = np.pad(values, pad, constant_values=layer.empty.flat[0])
                 values = layer.merged(values[..., ::2], values[..., 1::2]).swapaxes(-1, -2)
             self.values[i] = np.ascontiguousarray(values)
-        self.lattice = Lattice(2.0 * side, row // 2, column // 2)
+        self.frame = CellFrame(2.0 * side, row // 2, column // 2)
 
     def coarsen(self, points: int, occupied: Callable[[Values], BoolArray]) -> None:
         """Merge cells until those that are occupied have enough of some points on average.

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.cells import Cells, Lattice, Layer
+from pcfix.cells import CellFrame, Cells, Layer
 from pcfix.model import BoolArray, FloatArray
 
 
@@ -47,7 +47,7 @@ PRESENT, BELOW, UNDECIDED = 1, 2, 4
 class Surroundings(NamedTuple):
     """What a grid knows about the cells of points; the rest is None without connected water."""
 
-    lattice: Lattice
+    frame: CellFrame
     is_wet: BoolArray  # (rows, columns), whether an undecided point in the cell is submerged
     pool: npt.NDArray[np.int32] | None = None  # (rows, columns), 0 for none, else an index below
     area_m2: FloatArray | None = None  # of the cells with submerged points of each pool
@@ -76,7 +76,7 @@ class Grid:
         if not x.size:
             return
         self._cells.cover(np.array([x.min(), y.min()]), np.array([x.max(), y.max()]))
-        row, column = self._cells.lattice.cells(x, y)
+        row, column = self._cells.frame.cells(x, y)
         flags, votes = self._cells.values
         cell = row * flags.shape[1] + column
         counts = counts & ~np.isnan(height_m)
@@ -101,19 +101,19 @@ class Grid:
         if not cells.values[0].size:  # no points
             cells.cover(np.zeros(2), np.zeros(2))
         cells.coarsen(self._water_points, lambda flags: (flags & (BELOW | UNDECIDED)) > 0)
-        lattice, (flags, votes) = cells.lattice, cells.values
+        frame, (flags, votes) = cells.frame, cells.values
         # the votes of a cell and its eight neighbours together
         is_wet = convolve(votes, np.ones((3, 3)), mode="constant") < 0
         if not connected:
-            return Surroundings(lattice, is_wet)
+            return Surroundings(frame, is_wet)
         water = (flags & BELOW) > 0
         if self._dead_m:
             water |= ((flags & UNDECIDED) > 0) & is_wet
         found, count = label(water | (binary_dilation(water, _AROUND) & (flags == 0)), _AROUND)
         pool = np.where(water, found, 0).astype(np.int32)
-        area = lattice.side_m**2 * np.bincount(pool[water], minlength=count + 1).astype(np.float64)
+        area = frame.side_m**2 * np.bincount(pool[water], minlength=count + 1).astype(np.float64)
         least = SHARE_OF_LARGEST * area.max() if least_pool_m2 is None else least_pool_m2
         stays = (area >= least) | (area == area.max())
         stays[0] = False
         joined = binary_dilation(stays[pool], _AROUND)
-        return Surroundings(lattice, is_wet, pool, area, stays, joined)
+        return Surroundings(frame, is_wet, pool, area, stays, joined)

@@ -132,7 +132,7 @@ class Labelling:
             x, y = np.ascontiguousarray(part.xyz[rows, :2].T)
             keep = self._is_inside(x, y)
             if self.around is not None and self.around.joined is not None:
-                keep &= self.around.joined[self.around.lattice.cells(x, y)]
+                keep &= self.around.joined[self.around.frame.cells(x, y)]
             at_surface[rows[keep]] = True
         wet &= ~at_surface
         new[wet], new[at_surface] = BATHYMETRIC_POINT, WATER_SURFACE
@@ -159,7 +159,7 @@ class Labelling:
         below, inside, respected = height < 0.0, self._is_inside(x, y), self._is_respected(classes)
         wet, in_pool = inside & ~respected, None
         if self.around is not None:
-            cells = self.around.lattice.cells(x, y)
+            cells = self.around.frame.cells(x, y)
             unsure = _within(height, self.settings.dead_band)
             if unsure.any():
                 wet &= ~unsure | self.around.is_wet[cells]
@@ -216,14 +216,14 @@ class Labelling:
             in_pool = np.zeros_like(around.area_m2) if counts.in_pool is None else counts.in_pool
             area, largest = np.where(in_pool > 0, around.area_m2, 0.0), None
             if area.any():
-                pool, side = int(np.argmax(area)), around.lattice.side_m
+                pool, side = int(np.argmax(area)), around.frame.side_m
                 cells = np.argwhere(around.pool == pool)
                 row, column = cells[len(cells) // 2]  # a place inside it
                 largest = {
                     "area_m2": round(float(area[pool]), 2),
                     "points": int(in_pool[pool]),
-                    "x": float((around.lattice.first_column + column + 0.5) * side),
-                    "y": float((around.lattice.first_row + row + 0.5) * side),
+                    "x": float((around.frame.first_column + column + 0.5) * side),
+                    "y": float((around.frame.first_row + row + 0.5) * side),
                 }
             pools, points = int((area > 0.0).sum()), int(in_pool.sum())
             separate = {"pools": pools, "points": points, "largest": largest}
@@ -233,7 +233,7 @@ class Labelling:
             "below": counts.below,
             "outside_mask": counts.outside_mask,
             "respected": counts.respected,
-            "cell_m": None if around is None else around.lattice.side_m,
+            "cell_m": None if around is None else around.frame.side_m,
             "separate": separate,
         }
 
