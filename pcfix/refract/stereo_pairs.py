@@ -175,7 +175,7 @@ def _search(
         # the pairs of the tile; the marks become those of cameras in a pair
         pairs = _pairs_of(rows, marks, row, tile, block)
         for q in range(near.size):
-            add_camera(sums, tile, marks[q], None, block.rig, near[q], block.rule, None, None)
+            add_camera(sums, tile, marks[q], block.rig, near[q], block.rule, None, None)
         if first:
             _start(rows, tile, marks, row, sums, pairs, block.points, search, used, result)
         rays = np.empty((near.size, RAY * TILE))
