@@ -43,7 +43,7 @@ Surface: TypeAlias = WaterPlane | WaterRaster | WaterMesh
 METHODS = ("kotowski", "afrt", "mdfrt", "scattershot")
 
 BLOCK = 32_768
-"""Pairs traced at once."""
+"""Endpoints traced at once."""
 CLOSE_M = 1e-9
 """A step that ends a search: no finer than UTM northings allow in doubles."""
 SHORT = 0.1
@@ -73,13 +73,11 @@ class Tracing:
     """Paths of n pairs of an object point and a projection centre.
 
     Where light goes straight the piercing point is the object point; NaN where no path was found.
-    A path through a crease is the shortest nearby, but no refracted ray; its slope is that of the
-    plane that refracts light as the crease does.
+    A path through a crease is the shortest nearby, but no refracted ray.
     """
 
     piercing_xyz: FloatArray  # (n, 3), where the light leaves the water, metres, world frame
     direction: FloatArray  # (n, 3), unit vectors from the projection centre to there
-    slope: FloatArray  # (n, 2), dz/dx and dz/dy of the surface there
     iterations: IntArray  # (n,), steps of the method; shots of grids
     converged: BoolArray  # (n,), whether a path was found
     on_crease: BoolArray  # (n,), whether it leaves through a crease
@@ -159,8 +157,8 @@ def trace(
             f"Light cannot be traced through {surface}. Give a plane, raster or mesh.",
         )
     point, centre = (np.array(a, float).T for a in np.broadcast_arrays(xyz, seen_from))
-    pairs, count = Pairs(surface, point, centre - point, n), point.shape[1]
-    pierced, slope = np.full((3, count), np.nan), np.full((2, count), np.nan)
+    pairs, count = Endpoints(surface, point, centre - point, n), point.shape[1]
+    pierced = np.full((3, count), np.nan)
     steps = np.zeros(count, np.int64)
     on_crease = np.zeros(count, np.bool_)
 
@@ -169,29 +167,28 @@ def trace(
             for block in range(*span):
                 rows = np.arange(block * BLOCK, min((block + 1) * BLOCK, count))
                 path = _path(pairs.of(rows), method, narrow)
-                pierced[:, rows], slope[:, rows], steps[rows], on_crease[rows] = path
+                pierced[:, rows], steps[rows], on_crease[rows] = path
 
     in_tiles(run, -(-count // BLOCK))
     way = pairs.e - pierced
     return Tracing(
         piercing_xyz=(point + pierced).T,
         direction=-(way / np.sqrt(_dot(way, way))).T,
-        slope=slope.T,
         iterations=steps,
         converged=np.isfinite(pierced[0]),
         on_crease=on_crease,
     )
 
 
-class Pairs(NamedTuple):
-    """Pairs of an object point and a projection centre, and the surface between them."""
+class Endpoints(NamedTuple):
+    """Endpoints of an object point and a projection centre, and the surface between them."""
 
     surface: Surface
     point: FloatArray  # (3, m), object points, world frame, metres
     e: FloatArray  # (3, m), projection centres relative to them
     n: float
 
-    def of(self, rows: IntArray | BoolArray) -> Pairs:
+    def of(self, rows: IntArray | BoolArray) -> Endpoints:
         """Return some of the pairs."""
         return self._replace(point=self.point[:, rows], e=self.e[:, rows])
 
@@ -269,20 +266,17 @@ def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray((a * b).sum(axis=0))
 
 
-Path: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, BoolArray]
-
-
-def _path(pairs: Pairs, method: str, narrow: bool) -> Path:
-    """Return where the light of pairs pierces the surface, its slopes, the steps, and creases."""
+def _path(pairs: Endpoints, method: str, narrow: bool) -> Found:
+    """Return where the light of pairs pierces the surface, the steps, and whether on a crease."""
     e, m = pairs.e, pairs.e.shape[1]
-    found, slope = np.full((3, m), np.nan), np.full((2, m), np.nan)
-    steps, on_crease = np.zeros(m), np.zeros(m, np.bool_)
+    found, steps = np.full((3, m), np.nan), np.zeros(m, np.int64)
+    on_crease = np.zeros(m, np.bool_)
     level, over = (pairs.pierced(xy)[0][2] for xy in (np.zeros((2, m)), e[:2]))
     # not where the camera is under the water, or somewhere infinite
     is_above = ~(e[2] <= over) & (np.abs(e).sum(axis=0) < np.inf)
     # a point above the water is seen straight
     straight = is_above & ~(level > 0.0)
-    found[:, straight], slope[:, straight] = 0.0, 0.0
+    found[:, straight] = 0.0
     rows = np.flatnonzero(is_above & ~straight & (e[2] > 0.0))
     wet, level = pairs.of(rows), level[rows]
     # the straight line pierces the surface about here
@@ -303,19 +297,16 @@ def _path(pairs: Pairs, method: str, narrow: bool) -> Path:
             xy[:, lost], more, is_found[lost] = _narrowed(wet.of(lost), near, NEAR * level[lost])
             steps[rows[lost]] += more
     rows, wet, xy = rows[is_found], wet.of(is_found), xy[:, is_found]
-    found[:, rows], slope[:, rows] = wet.pierced(xy)
+    found[:, rows] = wet.pierced(xy)[0]
     on_crease[rows] = ~(np.hypot(*wet.offset(xy)) <= CREASE_M)
-    # on a crease Snell's law gives the normal
-    g = pairs.of(on_crease).snell_normal(found[:, on_crease])
-    slope[:, on_crease] = -g[:2] / g[2]
-    return found, slope, steps, on_crease
+    return found, steps, on_crease
 
 
 Found: TypeAlias = tuple[FloatArray, IntArray, BoolArray]
 """Plan places (2, m) where a tracer ended, its numbers of steps, and whether it found a path."""
 
 
-def _search(pairs: Pairs, start: FloatArray, level: FloatArray, method: str) -> Found:
+def _search(pairs: Endpoints, start: FloatArray, level: FloatArray, method: str) -> Found:
     """Find where the residual of a method vanishes, from places on the straight lines on.
 
     `level` are the heights of the water over the points. Mulsow 2024 does not say how the residual
@@ -356,7 +347,7 @@ def _search(pairs: Pairs, start: FloatArray, level: FloatArray, method: str) -> 
     return xy, steps, found & (np.hypot(*pairs.offset(xy)) <= CREASE_M)
 
 
-def _narrowed(pairs: Pairs, xy: FloatArray, half: FloatArray) -> Found:
+def _narrowed(pairs: Endpoints, xy: FloatArray, half: FloatArray) -> Found:
     """Return the nearest places of least optical length (Fermat), from half the size of grids on.
 
     Mulsow 2024 names scattershot only ("brute force"). There is no start value, no derivative, no
@@ -385,7 +376,7 @@ def _narrowed(pairs: Pairs, xy: FloatArray, half: FloatArray) -> Found:
 
 
 def _best_knot(
-    pairs: Pairs, xy: FloatArray, half: FloatArray, knots: int
+    pairs: Endpoints, xy: FloatArray, half: FloatArray, knots: int
 ) -> tuple[FloatArray, BoolArray]:
     """Return the places of the shortest paths on grids about x, y, and whether they are on the rim.
 
