@@ -28,6 +28,7 @@ FLOORS = (
     ("kernels",),
     ("options",),
     ("model", "sums"),
+    ("cells",),
     ("lens",),
     ("water",),
     ("label",),

@@ -36,7 +36,7 @@ from pcfix.model import (
     WaterDimension,
     WaterSurface,
 )
-from pcfix.water.fit import heights_from_cloud, is_near
+from pcfix.water.fit import heights_from_cloud
 from pcfix.water.surface import is_submerged, surface_above
 
 if TYPE_CHECKING:  # not quick to load
@@ -461,8 +461,7 @@ def _cloud_heights(view: Any, xyz: FloatArray, gsd_m: float) -> FloatArray:
     xy = np.ascontiguousarray(xyz[:, :2])
     if not len(xy):
         return np.zeros(0)
-    near = [seen.xyz[is_near(xy, seen.xyz, radius)] for seen in view.chunks()]
-    return heights_from_cloud(xy, np.vstack([np.zeros((0, 3)), *near]), radius)
+    return heights_from_cloud(xy, (seen.xyz for seen in view.chunks()), radius)
 
 
 def _at_points_of_cloud(view: Any, reference: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -14,19 +14,11 @@ from pcfix.flow.surfaces import CloudView, Points, parts_of
 from pcfix.io.regressions import read_regression
 from pcfix.io.tables import read_check_depths
 from pcfix.label.labelling import Part
-from pcfix.model import NOISE_CLASSES
 from pcfix.options.correct import ScienceOptions
 from pcfix.options.declare import File
 from pcfix.refract.batch import Survey
-from pcfix.refract.regression import (
-    LEAST_COUNT,
-    LEAST_NEIGHBOURS,
-    REACH,
-    ApparentDepths,
-    DepthRegression,
-    fit_depths,
-)
-from pcfix.water.surface import SurfaceAbove
+from pcfix.refract.regression import LEAST_COUNT, DepthRegression, apparent_depths, fit_depths
+from pcfix.water.fit import FEWEST
 
 
 def regression_of(
@@ -80,19 +72,14 @@ def learn_regression(
     excluded, with a note; an outlier is noted too, but used.
     """
     checks, notes = read_check_depths(path), list[str]()
-    around = ApparentDepths(checks.xy)
-    for part in parts:
-        rows = np.flatnonzero(~np.isin(part.classes, NOISE_CLASSES))
-        surface = SurfaceAbove(part.surface.height_m[rows], part.surface.slope[rows])
-        around.add(part.xyz[rows], surface)
-    radius = REACH * around.spacing_m
-    apparent, level, covered = around.medians(radius)
+    apparent, level, nearest_m, radius = apparent_depths(checks.xy, parts)
+    covered = ~np.isnan(apparent)
     if not covered.all():
         first = int(np.argmin(covered))
-        nearest, there = around.distance_m[first, 0], "the cloud has no submerged point"
+        nearest, there = nearest_m[first], "the cloud has no submerged point"
         if np.isfinite(nearest):
             there = (
-                f"the nearest submerged point is {nearest:,.2f} m away, and {LEAST_NEIGHBOURS}"
+                f"the nearest submerged point is {nearest:,.2f} m away, and {FEWEST}"
                 f" are needed within {radius:.2f} m"
             )
         notes.append(

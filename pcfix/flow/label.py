@@ -95,7 +95,7 @@ def label_points(
     if water_mask is None or isinstance(water_mask, str | PathLike):
         water_mask = mask_of(water_mask, crs)
     part = Part(points, surface_above(surface, points, heights), given)
-    labelling = Labelling(rules, water_mask).scanned(lambda: [part], *corners(*points[:, :2].T))
+    labelling = Labelling(rules, water_mask).scanned([part], *corners(*points[:, :2].T))
     return labelling.labels(part)[0]
 
 
@@ -160,7 +160,7 @@ def plan_labelling(options: StageLabelOptions, view: CloudView) -> LabelPlan:
     water = find_surface(options.water, options, view).surface
     check_tilt(water)
     labelling = labelling_of(options, view).scanned(
-        lambda: parts_of(view.chunks(water), water), view.low, view.high
+        parts_of(view.chunks(water), water), view.low, view.high
     )
     return LabelPlan(view.name, water, labelling)
 

@@ -26,7 +26,15 @@ from pcfix.flow.inputs import (
 from pcfix.flow.surfaces import CloudView, Points, first_points, own_water_of, parts_of
 from pcfix.model import NOISE_CLASSES, FloatArray, Views, WaterPlane
 from pcfix.options.correct import CorrectOptions
-from pcfix.refract.batch import FLAT_DEG, UNLISTED, Batch, Learned, Survey, stacked
+from pcfix.refract.batch import (
+    FLAT_DEG,
+    UNLISTED,
+    Batch,
+    Learned,
+    Survey,
+    require_orientation,
+    stacked,
+)
 from pcfix.refract.learning import (
     CORRECTED_RATIO,
     Near,
@@ -79,15 +87,9 @@ def read_inputs(options: CorrectOptions, view: CloudView) -> Plan:
         match = ViewMatch(blocks.views, blocks.listed, points=view.points, step_m=view.step_m)
     if inputs.port is not None:
         cameras, settings = blocks.cameras, options
-        if cameras.rotations is None:
-            raise SettingError(
-                "cameras.no_angles",
-                "port: it is fixed to the camera, and these cameras have no angles. Give a camera"
-                " file with angles.",
-            )
+        require_orientation(cameras, "A port")
         if options.method == "auto":
-            known = cameras.lenses is not None
-            settings = replace(options, method="consistent" if known else "snell")
+            settings = replace(options, method="consistent")
         survey, port = Survey(WaterPlane(np.inf), cameras, settings), {"port": asdict(inputs.port)}
         found = FoundSurface(survey.water)
         return Plan(options, inputs, view, survey, found, labelling_of(options, view), match,
@@ -175,7 +177,7 @@ def plan_correction(plan: Plan) -> Plan:
         if transfer is not None:
             transfer.check_models(first.xyz)
     chunks = partial(_whole_cloud, plan)
-    labelling = plan.labelling.scanned(lambda: parts_of(chunks(), water), view.low, view.high)
+    labelling = plan.labelling.scanned(parts_of(chunks(), water), view.low, view.high)
     plan = replace(plan, labelling=labelling)
     if (inputs.check_depths or inputs.regression) is not None and plan.regression is None:
         from pcfix.flow.check_depths import regression_of

@@ -296,7 +296,7 @@ def _found(view: CloudView | None) -> FoundSurface:
 def _fitted(options: WaterOptions, path: File, view: CloudView | None) -> FoundSurface:
     """Return the surface fitted to shoreline points."""
     from pcfix.io.vectors import SHORE_RADIUS_M, read_shoreline
-    from pcfix.water.fit import fit_water, heights_from_cloud, is_near
+    from pcfix.water.fit import fit_water, heights_from_cloud
     from pcfix.water.river import fit_river
 
     shore = read_shoreline(path, None if view is None else view.crs, crs=options.water_crs)
@@ -306,9 +306,8 @@ def _fitted(options: WaterOptions, path: File, view: CloudView | None) -> FoundS
         if view is None:
             text = f"{shore.name} has points without a height. Give the cloud too."
             raise InputError("cloud.missing", text, path=shore.name)
-        places = xyz[lacking, :2]
-        near = [seen.xyz[is_near(places, seen.xyz, SHORE_RADIUS_M)] for seen in view.chunks()]
-        heights = heights_from_cloud(places, np.vstack(near), SHORE_RADIUS_M)
+        chunks = (one.xyz for one in view.chunks())
+        heights = heights_from_cloud(xyz[lacking, :2], chunks, SHORE_RADIUS_M)
         notes.append(
             f"{shore.name}: {int(lacking.sum()):,} points have no height and get that of the cloud"
             f" within {SHORE_RADIUS_M:g} m; {int(np.isnan(heights).sum()):,} have none and are"

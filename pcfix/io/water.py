@@ -383,7 +383,9 @@ def _resampled(
         plan = np.column_stack([np.tile(x, len(y)), np.repeat(y, len(x)), np.zeros(strip.size)])
         places = from_cloud(plan)
         column, row = place_of(~transform, places[:, 0], places[:, 1])
-        height, _ = heights_above(field, np.ascontiguousarray(column), np.ascontiguousarray(-row))
+        height, _ = heights_above(
+            None, field, np.ascontiguousarray(column), np.ascontiguousarray(-row)
+        )
         known = np.isfinite(height)
         height[known] = to_cloud(np.column_stack([places[known, :2], height[known]]))[:, 2]
         height[~np.isfinite(height)] = np.nan

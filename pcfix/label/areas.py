@@ -1,8 +1,7 @@
 """Areas in plan: the polygons of a mask, and connected water bodies.
 
-Connected water is found in a grid over the cloud, filled chunk by chunk. Its cells have sides of a
-power of two, in metres, and count from the origin of the world frame, so that the cell of a point
-does not depend on other points. All sums are of whole numbers, for the same reason.
+Connected water is found in a grid over the cloud, filled chunk by chunk. All sums are of whole
+numbers, so that they do not depend on the order of the points.
 """
 
 from __future__ import annotations
@@ -13,9 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.model import BoolArray, FloatArray, IntArray
-
-Flags = npt.NDArray[np.uint8]
+from pcfix.cells import CellFrame, Cells, Layer
+from pcfix.model import BoolArray, FloatArray
 
 
 @dataclass(frozen=True)
@@ -37,11 +35,6 @@ class WaterMask:
         return np.asarray(shapely.intersects_xy(self.area, x, y))
 
 
-MOST_CELLS = 2**24
-"""Limits the memory; a larger cloud has larger cells."""
-POINTS_A_CELL = 4.0
-"""Least mean number of points per water cell; cells are the smallest that have it."""
-FINEST_M = 2.0**-10
 SHARE_OF_LARGEST = 0.1
 """Pools of at least this share of the area of the largest water body count as water."""
 _VOTE = 1000
@@ -51,37 +44,10 @@ PRESENT, BELOW, UNDECIDED = 1, 2, 4
 """A cell has points; points below the surface; points within the dead band."""
 
 
-class Lattice(NamedTuple):
-    """Square cells; the first column and row count from the origin of the world frame."""
-
-    side_m: float
-    first_column: int
-    first_row: int
-    columns: int
-    rows: int
-
-    def cells(self, x: FloatArray, y: FloatArray) -> tuple[IntArray, IntArray]:
-        """Return row and column of n plan positions."""
-        column = np.floor(x / self.side_m).astype(np.int64) - self.first_column
-        row = np.floor(y / self.side_m).astype(np.int64) - self.first_row
-        return row, column
-
-
-def lattice_over(low: FloatArray, high: FloatArray) -> Lattice:
-    """Return the finest lattice with at most `MOST_CELLS` over a rectangle, shapes (2,), metres."""
-    side = FINEST_M
-    while True:
-        first, last = np.floor(low / side), np.floor(high / side)
-        columns, rows = last - first + 1.0
-        if columns * rows <= MOST_CELLS:
-            return Lattice(side, int(first[0]), int(first[1]), int(columns), int(rows))
-        side *= 2.0
-
-
 class Surroundings(NamedTuple):
     """What a grid knows about the cells of points; the rest is None without connected water."""
 
-    lattice: Lattice
+    frame: CellFrame
     is_wet: BoolArray  # (rows, columns), whether an undecided point in the cell is submerged
     pool: npt.NDArray[np.int32] | None = None  # (rows, columns), 0 for none, else an index below
     area_m2: FloatArray | None = None  # of the cells with submerged points of each pool
@@ -92,18 +58,15 @@ class Surroundings(NamedTuple):
 class Grid:
     """Points per cell, added chunk by chunk.
 
-    It is made with the south-west and north-east corner of the cloud, metres, shape (2,). If these
-    turn out to be wrong, `fits` is False, `low` and `high` are those of the points so far, and the
-    points must be added again. Points within the dead band of the surface are undecided.
+    It is made with the south-west and north-east corner of the cloud, metres, shape (2,), if they
+    are known. Points within the dead band of the surface are undecided.
     """
 
     def __init__(self, low: FloatArray, high: FloatArray, dead_band_m: float) -> None:
-        self.lattice = lattice_over(low, high)
-        self.low, self.high = np.full(2, np.inf), np.full(2, -np.inf)
-        self._dead_m, self._water_points, self._overflows = dead_band_m, 0, False
-        shape = self.lattice.rows, self.lattice.columns
-        self._flags: Flags = np.zeros(shape, np.uint8)
-        self._votes: IntArray = np.zeros(shape, np.int64)
+        flags = Layer(np.zeros((), np.uint8), np.bitwise_or)
+        votes = Layer(np.zeros((), np.int64), np.add)
+        self._cells = Cells(low, high, flags, votes)
+        self._dead_m, self._water_points = dead_band_m, 0
 
     def add(self, x: FloatArray, y: FloatArray, height_m: FloatArray, counts: BoolArray) -> None:
         """Add n points with their heights above the water surface, NaN if unknown.
@@ -112,31 +75,20 @@ class Grid:
         """
         if not x.size:
             return
-        self.low = np.minimum(self.low, [x.min(), y.min()])
-        self.high = np.maximum(self.high, [x.max(), y.max()])
-        row, column = self.lattice.cells(x, y)
-        rows, columns = self._flags.shape
-        if row.min() < 0 or row.max() >= rows or column.min() < 0 or column.max() >= columns:
-            self._overflows = True
-            return
-        cell = row * self.lattice.columns + column
+        self._cells.cover(np.array([x.min(), y.min()]), np.array([x.max(), y.max()]))
+        row, column = self._cells.frame.cells(x, y)
+        flags, votes = self._cells.values
+        cell = row * flags.shape[1] + column
         counts = counts & ~np.isnan(height_m)
         below = counts & (height_m < -self._dead_m)
         unsure = counts & ~below & (height_m <= self._dead_m) & (self._dead_m > 0.0)
         self._water_points += int(np.count_nonzero(below | unsure))
         bits = PRESENT + BELOW * below + UNDECIDED * unsure
-        np.bitwise_or.at(self._flags.reshape(-1), cell, bits.astype(np.uint8))
+        np.bitwise_or.at(flags.reshape(-1), cell, bits.astype(np.uint8))
         if self._dead_m:
             vote = np.clip(height_m[counts] / self._dead_m, -1.0, 1.0)
             vote = np.rint(_VOTE * vote).astype(np.int64)
-            np.add.at(self._votes.reshape(-1), cell[counts], vote)
-
-    @property
-    def fits(self) -> bool:
-        """Whether the points so far would have the same grid."""
-        return (
-            not self._overflows and lattice_over(self.low, self.high).side_m == self.lattice.side_m
-        )
+            np.add.at(votes.reshape(-1), cell[counts], vote)
 
     def surroundings(self, *, connected: bool, least_pool_m2: float | None) -> Surroundings:
         """Coarsen the grid until its cells have enough points, and find the water bodies.
@@ -145,36 +97,23 @@ class Grid:
         """
         from scipy.ndimage import binary_dilation, convolve, label
 
-        lattice, flags, votes = self.lattice, self._flags, self._votes
-        while max(flags.shape) > 2:
-            water_cells = np.count_nonzero(flags & (BELOW | UNDECIDED))
-            if self._water_points >= POINTS_A_CELL * water_cells:
-                break
-            lattice, flags, votes = _halved(lattice, flags, votes)
+        cells = self._cells
+        if not cells.values[0].size:  # no points
+            cells.cover(np.zeros(2), np.zeros(2))
+        cells.coarsen(self._water_points, lambda flags: (flags & (BELOW | UNDECIDED)) > 0)
+        frame, (flags, votes) = cells.frame, cells.values
         # the votes of a cell and its eight neighbours together
         is_wet = convolve(votes, np.ones((3, 3)), mode="constant") < 0
         if not connected:
-            return Surroundings(lattice, is_wet)
+            return Surroundings(frame, is_wet)
         water = (flags & BELOW) > 0
         if self._dead_m:
             water |= ((flags & UNDECIDED) > 0) & is_wet
         found, count = label(water | (binary_dilation(water, _AROUND) & (flags == 0)), _AROUND)
         pool = np.where(water, found, 0).astype(np.int32)
-        cells = np.bincount(pool[water], minlength=count + 1)
-        area = cells.astype(np.float64) * lattice.side_m**2
+        area = frame.side_m**2 * np.bincount(pool[water], minlength=count + 1).astype(np.float64)
         least = SHARE_OF_LARGEST * area.max() if least_pool_m2 is None else least_pool_m2
         stays = (area >= least) | (area == area.max())
         stays[0] = False
         joined = binary_dilation(stays[pool], _AROUND)
-        return Surroundings(lattice, is_wet, pool, area, stays, joined)
-
-
-def _halved(lattice: Lattice, flags: Flags, votes: IntArray) -> tuple[Lattice, Flags, IntArray]:
-    """Return the same in cells of twice the side, which begin at even columns and rows."""
-    _, column, row, columns, rows = lattice
-    for axis, (first, count) in enumerate(((row, rows), (column, columns))):
-        pairs = np.maximum(np.arange(-(first % 2), count, 2), 0)
-        flags = np.bitwise_or.reduceat(flags, pairs, axis)
-        votes = np.add.reduceat(votes, pairs, axis)
-    rows, columns = flags.shape
-    return Lattice(lattice.side_m * 2.0, column // 2, row // 2, columns, rows), flags, votes
+        return Surroundings(frame, is_wet, pool, area, stays, joined)

@@ -10,7 +10,7 @@ negative number.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -84,33 +84,24 @@ class Labelling:
         s = self.settings
         return self.mask is None and not (s.respect_classes or s.connected or s.dead_band)
 
-    def scanned(
-        self, parts: Callable[[], Iterable[Part]], low: FloatArray, high: FloatArray
-    ) -> Labelling:
+    def scanned(self, parts: Iterable[Part], low: FloatArray, high: FloatArray) -> Labelling:
         """Return the rules with the surroundings of all points, if they need them.
 
-        `parts` returns the whole cloud in chunks, and is called again if its south-west and
-        north-east corner, `low` and `high`, were wrong.
+        `parts` are the whole cloud in chunks, and `low` and `high` its corners, if they are known.
         """
         settings = self.settings
         if not (settings.connected or settings.dead_band > 0.0):
             return self
-        if not (np.isfinite([low, high]).all() and (low <= high).all()):
-            low = high = np.zeros(2)
-        while True:
-            grid = Grid(low, high, settings.dead_band)
-            for part in parts():
-                x, y, z = np.ascontiguousarray(part.xyz.T)
-                height = z - part.surface.height_m
-                # high points have no vote without a dead band
-                counts = np.ones(len(x), np.bool_) if settings.dead_band else height < 0.0
-                counts &= ~self._is_respected(part.classes)
-                rows = np.flatnonzero(counts)
-                counts[rows] = self._is_inside(x[rows], y[rows])
-                grid.add(x, y, height, counts)
-            if grid.fits:
-                break
-            low, high = grid.low, grid.high
+        grid = Grid(low, high, settings.dead_band)
+        for part in parts:
+            x, y, z = np.ascontiguousarray(part.xyz.T)
+            height = z - part.surface.height_m
+            # high points have no vote without a dead band
+            counts = np.ones(len(x), np.bool_) if settings.dead_band else height < 0.0
+            counts &= ~self._is_respected(part.classes)
+            rows = np.flatnonzero(counts)
+            counts[rows] = self._is_inside(x[rows], y[rows])
+            grid.add(x, y, height, counts)
         around = grid.surroundings(connected=settings.connected, least_pool_m2=settings.least_pool)
         return replace(self, around=around)
 
@@ -141,7 +132,7 @@ class Labelling:
             x, y = np.ascontiguousarray(part.xyz[rows, :2].T)
             keep = self._is_inside(x, y)
             if self.around is not None and self.around.joined is not None:
-                keep &= self.around.joined[self.around.lattice.cells(x, y)]
+                keep &= self.around.joined[self.around.frame.cells(x, y)]
             at_surface[rows[keep]] = True
         wet &= ~at_surface
         new[wet], new[at_surface] = BATHYMETRIC_POINT, WATER_SURFACE
@@ -168,7 +159,7 @@ class Labelling:
         below, inside, respected = height < 0.0, self._is_inside(x, y), self._is_respected(classes)
         wet, in_pool = inside & ~respected, None
         if self.around is not None:
-            cells = self.around.lattice.cells(x, y)
+            cells = self.around.frame.cells(x, y)
             unsure = _within(height, self.settings.dead_band)
             if unsure.any():
                 wet &= ~unsure | self.around.is_wet[cells]
@@ -225,14 +216,14 @@ class Labelling:
             in_pool = np.zeros_like(around.area_m2) if counts.in_pool is None else counts.in_pool
             area, largest = np.where(in_pool > 0, around.area_m2, 0.0), None
             if area.any():
-                pool, side = int(np.argmax(area)), around.lattice.side_m
+                pool, side = int(np.argmax(area)), around.frame.side_m
                 cells = np.argwhere(around.pool == pool)
                 row, column = cells[len(cells) // 2]  # a place inside it
                 largest = {
                     "area_m2": round(float(area[pool]), 2),
                     "points": int(in_pool[pool]),
-                    "x": float((around.lattice.first_column + column + 0.5) * side),
-                    "y": float((around.lattice.first_row + row + 0.5) * side),
+                    "x": float((around.frame.first_column + column + 0.5) * side),
+                    "y": float((around.frame.first_row + row + 0.5) * side),
                 }
             pools, points = int((area > 0.0).sum()), int(in_pool.sum())
             separate = {"pools": pools, "points": points, "largest": largest}
@@ -242,7 +233,7 @@ class Labelling:
             "below": counts.below,
             "outside_mask": counts.outside_mask,
             "respected": counts.respected,
-            "cell_m": None if around is None else around.lattice.side_m,
+            "cell_m": None if around is None else around.frame.side_m,
             "separate": separate,
         }
 

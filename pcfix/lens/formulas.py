@@ -137,28 +137,9 @@ def angle(c: FloatArray, rho: float) -> float:
     """Return the angle from the axis of a radius in the plane: the inverse of `radius`."""
     if not rho <= c[LARGEST_RADIUS]:
         return np.nan
-    kind, s0, s1 = int(c[KIND]), _shape(c, 0), _shape(c, 1)
-    if kind == EQUIDISTANT:
-        return rho
-    if kind == EQUISOLID:
-        return 2.0 * np.arcsin(0.5 * rho)
-    if kind in (POLYNOMIAL, DUAL):
-        return _search(c, rho)
-    if kind == FOV and s0 != 0.0:
-        return np.arctan(np.tan(rho * s0) / (2.0 * np.tan(0.5 * s0)))
-    if kind == DIVISION:
-        return np.arctan2(rho, 1.0 + s0 * rho * rho)
-    if kind == EUCM:
-        q = s1 * rho * rho
-        root = np.sqrt(max(1.0 - (2.0 * s0 - 1.0) * q, 0.0))
-        up = (1.0 - s0 * s0 * q) / (s0 * root + 1.0 - s0)
-        return np.arctan2(rho, up)
-    return np.arctan(rho)
-
-
-@device
-def _search(c: FloatArray, rho: float) -> float:
-    """Solve radius(theta) = rho by Newton's method, with bisection if a step leaves the bracket."""
+    if int(c[KIND]) == PERSPECTIVE:
+        return np.arctan(rho)
+    # Newton's method, with bisection if a step leaves the bracket
     low, high = 0.0, c[LARGEST_ANGLE]
     if rho < radius(c, low)[0]:
         return np.nan

@@ -139,15 +139,7 @@ def in_plane(c: FloatArray, x: float, y: float, z: float) -> tuple[float, float]
 @device
 def image_of(c: FloatArray, x: float, y: float, z: float) -> tuple[float, float]:
     """Return u, v of one direction: projection, distortion, interior orientation."""
-    px, py = in_plane(c, x, y, z)
-    cx, cy = c[places.CENTRE_X], c[places.CENTRE_Y]
-    if c[places.INVERSE] != 0.0:
-        dx, dy = undistorted(c, px - cx, py - cy)
-    else:
-        dx, dy, _ = distorted(c, px - cx, py - cy)
-    dx, dy = dx + cx, dy + cy
-    u = c[places.PRINCIPAL_X] + c[places.FOCAL_X] * dx + c[places.B2] * dy
-    return u, c[places.PRINCIPAL_Y] + c[places.FOCAL_Y] * dy + c[places.B3] * dx
+    return image_and_gradients(c, x, y, z)[:2]
 
 
 @device
@@ -312,3 +304,14 @@ def plain_image(c: Plain, w: Vector) -> tuple[float, float, Gradients]:
         inv * ua, inv * ub, -inv * (ua * flat_x + ub * flat_y),
         inv * va, inv * vb, -inv * (va * flat_x + vb * flat_y),
     )  # fmt: skip
+
+
+@device(inline="always")
+def image_and_slopes(
+    lens: FloatArray, plain: Plain | None, r: FloatArray, direction: Vector
+) -> tuple[float, float, Vector, Vector]:
+    """Do as `image_in_world`, by the numbers of the common lens if there are any."""
+    if plain is None:
+        return image_in_world(lens, r, direction)
+    u, v, g = plain_image(plain, times(r, direction))
+    return u, v, transposed_times(r, g[:3]), transposed_times(r, g[3:])

@@ -37,7 +37,6 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from pcfix.errors import SettingError
 from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import (
     NO_SQUARES,
@@ -59,7 +58,7 @@ from pcfix.lens.algebra import (
 )
 from pcfix.lens.frames import Frames, frames_of, holds, no_frames
 from pcfix.lens.imaging import image_and_gradients, image_in_world, lens_table
-from pcfix.model import NOMINAL_WIDTH_PX, BoolArray, Cameras, FloatArray, IntArray, Lens, Views
+from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Views
 from pcfix.options.correct import ScienceOptions
 from pcfix.port.light import (
     coefficients,
@@ -76,10 +75,10 @@ from pcfix.refract.batch import (
     ONE_CAMERA,
     PARALLEL,
     Intersection,
+    require_orientation,
     warn_of_unsolved,
 )
-from pcfix.refract.choice import ANY_NUMBER, NOMINAL_FOCAL_PX
-from pcfix.refract.intersect import check_consistent
+from pcfix.refract.choice import ANY_NUMBER
 from pcfix.refract.rays import NO_LINE, nearest_point, plus_line
 from pcfix.refract.tiling import TILE, are_same, corners_of, near_cameras, spatial_order
 
@@ -138,8 +137,8 @@ def correct_through_port(
     xyz : array, shape (m, 3)
         Apparent points, metres, world frame; all of them under water.
     cameras : Cameras
-        Correct poses, world frame, and lenses; without a lens that of a survey drone. (If the lens
-        absorbed the port, run `pcfix adjust` first.)
+        Correct poses, world frame, and lenses. (If the lens absorbed the port, run `pcfix adjust`
+        first.)
     port : Port
         The same for all cameras.
     settings : ScienceOptions
@@ -159,18 +158,10 @@ def correct_through_port(
     Raises
     ------
     SettingError
-        If the cameras have no angles, or for the method consistent no lenses.
+        If the cameras have no angles or no lenses.
     """
-    if cameras.rotations is None:
-        raise SettingError(
-            "cameras.no_angles",
-            "A port is fixed to the camera, and the cameras have no angles. Give a camera file with"
-            " angles.",
-        )
-    if settings.method == "consistent":
-        check_consistent(cameras)
-    nominal = Lens(NOMINAL_FOCAL_PX, NOMINAL_WIDTH_PX, NOMINAL_WIDTH_PX, 0.0, 0.0)
-    lenses = cameras.lenses or (nominal,) * len(cameras)
+    require_orientation(cameras, "A port")
+    lenses = cameras.lenses or ()
     lists, frames = (np.zeros(0, np.int64), np.zeros(0, np.int64)), frames_of(cameras)
     if views is not None:
         lists = np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)
@@ -378,16 +369,13 @@ def _set_covariance(
             turned = beyond(scaled(u_turned[axis], u), v_turned[axis], v)
             noise = plus_square(noise, scaled(sigmas.centre_m, moved))
             noise = plus_square(noise, scaled(sigmas.attitude, turned))
+    # the error of the refractive index is common to all images
+    noise = plus_square(noise, scaled(sigmas.refractive_index, by_n))
     det, (xx, xy, xz, yy, yz, zz) = cofactors(h)
-    if not det > 0.0:
-        return
-    inverse = (
-        scaled(1.0 / det, (xx, xy, xz)), scaled(1.0 / det, (xy, yy, yz)),
-        scaled(1.0 / det, (xz, yz, zz)),
-    )  # fmt: skip
-    at = 0
-    for i in range(3):
-        for j in range(i, 3):
-            common = sigmas.refractive_index**2 * dot(inverse[i], by_n) * dot(inverse[j], by_n)
-            out[at] = dot(inverse[i], product(noise, inverse[j])) + common
-            at += 1
+    if det > 0.0:
+        rows = (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
+        at = 0
+        for i in range(3):
+            for j in range(i, 3):
+                out[at] = dot(rows[i], product(noise, rows[j])) / (det * det)
+                at += 1

@@ -17,16 +17,7 @@ import numpy as np
 
 from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import dot, minus, row_of, scaled, vector
-from pcfix.lens.frames import (
-    NOT_DISTORTED,
-    Frames,
-    Pyramid,
-    frames_of,
-    in_frame,
-    mark,
-    no_frames,
-    pyramid,
-)
+from pcfix.lens.frames import Frames, frames_of, mark, no_frames
 from pcfix.model import BoolArray, Cameras, FloatArray, IntArray
 from pcfix.refract import tiling, uncertainty
 from pcfix.refract.batch import (
@@ -181,18 +172,13 @@ def _add_cameras(
     """
     seeing = 0
     for k in range(near.size):
-        c, on, added, some = near[k], marks[seeing], 0, True
+        c, on, some = near[k], marks[seeing], True
         if listed:
             for j in range(on.size):
                 on[j] = marks[k, j]
-        elif frames.row[c] == NOT_DISTORTED:  # the pyramid is tested on the way
-            g, some = pyramid(frames.planes[c]), False
-            added = add_camera(sums, tile, on, g, rig, c, rule, tin, fields)
         else:
             some = mark(on, tile, TILE, frames, c, rig.centres[c])
-        if some:
-            added = add_camera(sums, tile, on, None, rig, c, rule, tin, fields)
-        if added:
+        if some and add_camera(sums, tile, on, rig, c, rule, tin, fields):
             near[seeing] = c
             seeing += 1
     return seeing
@@ -200,14 +186,14 @@ def _add_cameras(
 
 @device
 def add_camera(
-    sums: FloatArray, tile: FloatArray, marks: FloatArray, g: Pyramid | None, rig: Rig, c: int,
-    rule: Rule, tin: Tin | None, fields: Field | None,
+    sums: FloatArray, tile: FloatArray, marks: FloatArray, rig: Rig, c: int, rule: Rule,
+    tin: Tin | None, fields: Field | None,
 ) -> int:  # fmt: skip
     """Add one camera's rays to the sums of a tile; return how many.
 
-    The frame is the pyramid `g`, or the marks say how often each ray counts. Afterwards the marks
-    are those of the rays that count. The sums are those of `line_terms`, the number of rays, and
-    the least squared cosine of the incidence angles.
+    The marks say how often each ray counts; afterwards they are zero for those that do not. The
+    sums are those of `line_terms`, the number of rays, and the least squared cosine of the
+    incidence angles.
     """
     centre, offset = row_of(rig.centres, c), rig.offset[c]
     least_cosine2, r = rule.least_cosine2, rule.bend
@@ -221,10 +207,8 @@ def add_camera(
         h = normal[2] * (tile[3 * TILE + j] - (z - offset))
         length2 = dot(e, e)
         steep = (height > h) & (height * height >= least_cosine2 * length2)
-        held = marks[j] > 0.0 if g is None else in_frame(g, e)
-        use = held & steep
-        times = marks[j] if g is None else 1.0
-        times = times if use else 0.0
+        use = (marks[j] > 0.0) & steep
+        times = marks[j] if use else 0.0
         marks[j] = times
         # one division for two; a ray that is not used adds zeros, as a branch would not vectorise
         q = 1.0 / (length2 * height)

@@ -23,7 +23,6 @@ import numpy as np
 
 from pcfix.errors import SettingError
 from pcfix.kernels import Span, device, in_tiles, kernel
-from pcfix.lens.algebra import Vector, row_of
 from pcfix.model import BoolArray, FloatArray, Outcome
 from pcfix.refract.batch import Batch, Chosen, Intersection
 from pcfix.refract.rays import MIN_DETERMINANT
@@ -32,7 +31,7 @@ TOLERANCE = 1e-9
 """Of tan a between two iterations of `shan`; the depth then changes by less than 1e-9 of itself."""
 MOST_ITERATIONS = 50
 
-Crossing: TypeAlias = tuple[float, float, float, float]
+Crossings: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 
 
 def factor(batch: Batch) -> Intersection:
@@ -114,50 +113,44 @@ def _solve(
     for i in range(*span):
         cameras = points.camera[points.start[i] : points.start[i + 1]]
         k = cameras.size
-        e, d, tangent, rays = np.empty((k, 3)), np.empty(k), np.empty(k), np.empty((k, 4))
-        for j in range(k):
-            e[j] = points.centres[cameras[j]] - points.xyz[i]
-            # the depth under the water of this camera; 0 above it
-            d[j] = max(points.height[i] - points.xyz[i, 2] + points.offset[cameras[j]], 0.0)
-            tangent[j] = np.hypot(e[j, 0], e[j, 1]) / e[j, 2]
-            rays[j] = _crossing(row_of(e, j), d[j], tangent[j], points.n)
+        e = points.centres[cameras] - points.xyz[i]
+        # the depth under the water of each camera; 0 above it
+        d = np.maximum(points.height[i] - points.xyz[i, 2] + points.offset[cameras], 0.0)
+        rays = _crossings(e, d, np.hypot(e[:, 0], e[:, 1]) / e[:, 2], points.n)
+        x, y, down_m, solved = 0.0, 0.0, 0.0, True
         if method == _MEAN:
-            x, y, down_m, solved = 0.0, 0.0, rays[:, 0].sum() / max(k, 1), True
-        elif k < 2:
-            x, y, down_m, solved = 0.0, 0.0, 0.0, True
-        elif method == _PAIRS:
-            x, y, (down_m, solved) = 0.0, 0.0, _equal_x(e, rays)
-        else:
-            x, y, down_m, solved = _s_model(e, d, tangent, rays.copy(), points.n)
+            down_m = rays[0].sum() / max(k, 1)
+        elif k >= 2 and method == _PAIRS:
+            down_m, solved = _equal_x(e, rays)
+        elif k >= 2:
+            x, y, down_m, solved = _s_model(e, d, rays, points.n)
         failed[i] = not solved
         if solved:
             shift[i] = x, y, -down_m
         distance[i] = _distance(rays, shift[i])
 
 
-@device
-def _crossing(e: Vector, depth: float, tangent: float, n: float) -> Crossing:
-    """Return how far below P a refracted ray crosses its plumb line, how it leans, and s.
+@device(allocates=True)
+def _crossings(e: FloatArray, depth: FloatArray, tangent: FloatArray, n: float) -> Crossings:
+    """Return how far below P refracted rays cross its plumb line, how they lean, and s.
 
-    How it leans is how far it goes aside per metre down, in x and y; s = tan a / tan b is the true
-    by the apparent depth along it, 1 in air.
+    How a ray leans is how far it goes aside per metre down, in x and y; s = tan a / tan b is the
+    true by the apparent depth along it, 1 in air.
     """
-    s = np.sqrt(n * n + (n * n - 1.0) * tangent * tangent) if depth > 0.0 else 1.0
-    return depth * (s - 1.0), -e[0] / (e[2] * s), -e[1] / (e[2] * s), s
+    s = np.where(depth > 0.0, np.sqrt(n * n + (n * n - 1.0) * tangent * tangent), 1.0)
+    return depth * (s - 1.0), -e[:, 0] / (e[:, 2] * s), -e[:, 1] / (e[:, 2] * s), s
 
 
-@device
-def _distance(rays: FloatArray, shift: FloatArray) -> float:
+@device(allocates=True)
+def _distance(rays: Crossings, shift: FloatArray) -> float:
     """Return the root mean square distance of the true point from refracted rays, metres."""
-    squares = 0.0
-    for below, u, v, _ in rays:
-        # how far aside of the ray the point is at its own depth
-        x = shift[0] - u * (-shift[2] - below)
-        y = shift[1] - v * (-shift[2] - below)
-        # the part of the offset along the ray does not count
-        along = x * u + y * v
-        squares += max(x * x + y * y - along * along / (1.0 + u * u + v * v), 0.0)
-    return np.sqrt(squares / max(len(rays), 1))
+    below, u, v, _ = rays
+    # how far aside of the rays the point is at its own depth
+    x, y = shift[0] + u * (shift[2] + below), shift[1] + v * (shift[2] + below)
+    # the part of the offset along a ray does not count
+    along = x * u + y * v
+    squares = np.maximum(x * x + y * y - along * along / (1.0 + u * u + v * v), 0.0)
+    return np.sqrt(squares.sum() / max(below.size, 1))
 
 
 def butler(batch: Batch) -> Intersection:
@@ -221,26 +214,26 @@ def murase(batch: Batch) -> Intersection:
 
 
 @device
-def _equal_x(e: FloatArray, rays: FloatArray) -> tuple[float, bool]:
+def _equal_x(e: FloatArray, rays: Crossings) -> tuple[float, bool]:
     """Return how far a point sinks by its pairs, and whether these determine it.
 
     With its slope q along the base and its crossing `below` the apparent point, a ray is
     q (z - below) from the plumb line at the depth z.
     """
+    below, u, v, _ = rays
     products = squares = 0.0
-    for a in range(len(rays)):
-        for b in range(a + 1, len(rays)):
+    for a in range(below.size):
+        for b in range(a + 1, below.size):
             # X is along the base of the pair
             x, y = e[b, 0] - e[a, 0], e[b, 1] - e[a, 1]
             base = np.hypot(x, y)
             if base == 0.0:
                 continue
-            q = (rays[a, 1] * x + rays[a, 2] * y) / base
-            q_other = (rays[b, 1] * x + rays[b, 2] * y) / base
+            q, q_other = (u[a] * x + v[a] * y) / base, (u[b] * x + v[b] * y) / base
             parallax = q - q_other
-            products += parallax * (q * rays[a, 0] - q_other * rays[b, 0])
+            products += parallax * (q * below[a] - q_other * below[b])
             squares += parallax * parallax
-    pairs = len(rays) * (len(rays) - 1) // 2
+    pairs = below.size * (below.size - 1) // 2
     sunk = products / squares
     return sunk, squares > 4.0 * pairs * MIN_DETERMINANT and sunk >= 0.0
 
@@ -286,50 +279,33 @@ def shan(batch: Batch) -> Intersection:
 
 @device(allocates=True)
 def _s_model(
-    e: FloatArray, d: FloatArray, tangent: FloatArray, rays: FloatArray, n: float
+    e: FloatArray, d: FloatArray, rays: Crossings, n: float
 ) -> tuple[float, float, float, bool]:
-    """Return how far a point moves and sinks, and whether the iteration ends under the water."""
+    """Return how far a point moves and sinks, and whether the iteration ends under the water.
+
+    A refracted ray goes u and v metres aside per metre down. With s known, it meets the vertical of
+    the true point, x aside and `sunk` below the apparent one, where
+
+        x = u (sunk - below)
+
+    and likewise for y and v: a straight line through the places (u, -u below) and (v, -v below), of
+    which `sunk` is the slope with its sign changed.
+    """
     x = y = sunk = 0.0
+    tangent = np.hypot(e[:, 0], e[:, 1]) / e[:, 2]
     for _ in range(MOST_ITERATIONS):
-        x, y, sunk, solved = _nearest_vertical(rays)
-        if not (solved and sunk + d.min() >= 0.0):
+        below, u, v, s = rays
+        from_u, from_v = u - u.mean(), v - v.mean()
+        spread = (from_u * from_u + from_v * from_v).sum()
+        sunk = (below * (u * from_u + v * from_v)).sum() / spread
+        # of two rays at a small angle alpha the spread is alpha^2 / 2
+        if not (spread >= 2.0 * d.size * MIN_DETERMINANT and sunk + d.min() >= 0.0):
             return x, y, sunk, False
-        change = 0.0
-        for j in range(len(rays)):
-            # tan a from the height of the camera over the point at the depth D / s
-            height = e[j, 2] - d[j] + (d[j] + sunk) / rays[j, 3]
-            following = np.hypot(x - e[j, 0], y - e[j, 1]) / height
-            change, tangent[j] = max(change, abs(following - tangent[j])), following
-            rays[j] = _crossing(row_of(e, j), d[j], following, n)
+        x, y = (u * (sunk - below)).mean(), (v * (sunk - below)).mean()
+        # tan a from the height of the camera over the point at the depth D / s
+        following = np.hypot(x - e[:, 0], y - e[:, 1]) / (e[:, 2] - d + (d + sunk) / s)
+        change, tangent = np.abs(following - tangent).max(), following
+        rays = _crossings(e, d, tangent, n)
         if change <= TOLERANCE:
             break
-    return x, y, sunk, True
-
-
-@device(allocates=True)
-def _nearest_vertical(rays: FloatArray) -> tuple[float, float, float, bool]:
-    """Solve the collinearity equations with s known.
-
-    A refracted ray goes v metres aside per metre down. It meets the vertical of the true point, x
-    aside and `sunk` below the apparent one, where
-
-        x = v (sunk - below)
-
-    for each of the two axes: a straight line through the places (v, -v below), of which `sunk` is
-    the slope with its sign changed.
-    """
-    k, means, spread, product = len(rays), np.zeros((2, 2)), 0.0, 0.0
-    for axis in range(2):
-        v = rays[:, 1 + axis]
-        r = -v * rays[:, 0]
-        means[axis] = v.mean(), r.mean()
-        # least squares of a line through the places (v, r)
-        away = v - means[axis, 0]
-        spread += (away * away).sum()
-        product += (away * (r - means[axis, 1])).sum()
-    # of two rays at a small angle alpha the spread is alpha^2 / 2
-    if not spread >= 2.0 * k * MIN_DETERMINANT:
-        return 0.0, 0.0, 0.0, False
-    sunk = -product / spread
-    x, y = means[:, 1] + sunk * means[:, 0]
     return x, y, sunk, True

@@ -11,9 +11,7 @@ one height, which on a cliff is the upper edge. Only under a roof, where all cel
 higher, it matters whether the ray goes through it.
 
 A cell has the height of its second highest point, and at most that of the highest of its eight
-neighbours, so that neither a single flying point nor a single cell counts. The sides of cells are
-powers of two, in metres, from the origin of the world frame: the surface does not depend on the
-order of the points.
+neighbours, so that neither a single flying point nor a single cell counts.
 """
 
 from __future__ import annotations
@@ -23,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from pcfix.cells import MOST_CELLS, Cells, Layer
 from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.model import NOISE_CLASSES, BoolArray, Cameras, FloatArray, IntArray, Views
 from pcfix.options.correct import ScienceOptions
@@ -40,13 +39,8 @@ ROOF_MARGINS = 2.0
 _ONWARD = 1e-6
 """Step past the edge of a cell into the next one, in cells."""
 
-MOST_CELLS = 2**24
-"""Bounds the memory, 8 bytes a cell; where a cloud needs more, its cells are larger."""
 CELLS_A_POINT = 16
 """Most cells per point at first, so that a cloud may fill a sixteenth of its rectangle."""
-POINTS_A_CELL = 4.0
-"""Least points per cell with points, on average: cells are two to four point spacings wide."""
-FINEST_M = 2.0**-10
 WIDE_GAP = 0.75
 GAPS_TO_MARGIN = 4.5
 """The margin is 4.5 times the upper quartile, over the cells of a block, of the gap between the
@@ -188,106 +182,66 @@ def _meets(
     return False
 
 
-class _Cells(NamedTuple):
-    """A grid of cells; heights are minus infinity where there is no point."""
-
-    side_m: float
-    first: IntArray  # (2,), row and column of the first cell, counted from the origin of the world
-    top: Heights  # (2, rows, columns), of the highest point and the second highest
+def _highest_two(one: Heights, other: Heights) -> Heights:
+    """Return the highest and the second highest point of two cells, shape (2, ...)."""
+    second = np.maximum(np.minimum(one[0], other[0]), np.maximum(one[1], other[1]))
+    return np.stack([np.maximum(one[0], other[0]), second])
 
 
 class OccluderBuilder:
     """Builds the surface of a cloud from its chunks.
 
     `points` is their number; `low` and `high`, shape (2,), are the corners of the cloud in metres,
-    if they are known. The grid grows where points lie outside.
+    if they are known.
     """
 
     def __init__(self, low: FloatArray, high: FloatArray, points: int) -> None:
-        self._most = min(MOST_CELLS, CELLS_A_POINT * max(points, 1))
-        self._low, self._high = np.full(2, np.inf), np.full(2, -np.inf)
-        self._cells: _Cells | None = None
-        self._points = 0
-        if np.isfinite([low, high]).all() and (low <= high).all():
-            self._low, self._high = low, high
+        top = Layer(np.full(2, -np.inf, np.float32), _highest_two)
+        most = min(MOST_CELLS, CELLS_A_POINT * max(points, 1))
+        self._cells, self._points = Cells(low, high, top, most=most), 0
 
     def add(self, xyz: FloatArray, classes: npt.NDArray[np.uint8] | None = None) -> None:
         """Add a chunk of apparent points, shape (n, 3); noise (classes 7 and 18) is ignored."""
         if classes is not None:
             xyz = xyz[~np.isin(classes, NOISE_CLASSES)]
-        if not len(xyz):
-            return
-        self._points += len(xyz)
-        low, high = xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0)
-        if self._cells is None or (low < self._low).any() or (high > self._high).any():
-            self._low, self._high = np.minimum(self._low, low), np.maximum(self._high, high)
-            self._cells = _over(self._low, self._high, self._most, self._cells)
-        _add(*self._cells, np.ascontiguousarray(xyz))
+        if len(xyz):
+            self._points += len(xyz)
+            self._cells.cover(xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0))
+            _add(*self._cells.frame, self._cells.values[0], np.ascontiguousarray(xyz))
 
     def build(self) -> Occluder | None:
-        """Return the surface; None without points. The builder is then empty."""
+        """Return the surface; None without points."""
         from scipy.ndimage import maximum_filter, minimum_filter
 
-        cells, self._cells = self._cells, None
-        if cells is None:
+        cells = self._cells
+        if not self._points:
             return None
-        # until the cells with points have enough of them on average
-        while max(cells.top.shape[1:]) > 2 and (
-            self._points < POINTS_A_CELL * np.isfinite(cells.top[0]).sum()
-        ):
-            cells = _halved(cells)
+        cells.coarsen(self._points, lambda top: np.isfinite(top[0]))
+        (highest, second), (side, row, column) = cells.values[0], cells.frame
         # without spikes: a cell is at most as high as the highest of its eight neighbours
         around = np.ones((3, 3), np.bool_)
         around[1, 1] = False
-        beside = maximum_filter(cells.top[1], footprint=around, mode="constant", cval=-np.inf)
-        known = np.minimum(cells.top[1], beside)
-        corner = cells.first * cells.side_m
+        neighbour = maximum_filter(second, footprint=around, mode="constant", cval=-np.inf)
+        known = np.minimum(second, neighbour)
         return Occluder(
             height=np.where(known > -np.inf, known, np.float32(np.nan)),
-            left_m=float(corner[1]),
-            bottom_m=float(corner[0]),
-            cell_m=cells.side_m,
+            left_m=column * side,
+            bottom_m=row * side,
+            cell_m=side,
             highest_m=float(known.max()),
-            margin=_margins(*cells.top),
+            margin=_margins(highest, second),
             block_top=_tops(known, BLOCK),
             large_block_top=_tops(known, LARGE_BLOCK),
             roof=minimum_filter(known, 2 * int(NEAR_CELLS) + 1, mode="constant", cval=-np.inf),
         )
 
 
-def _over(low: FloatArray, high: FloatArray, most: int, old: _Cells | None) -> _Cells:
-    """Return the finest cells over a rectangle, with what is in the old ones."""
-    side = FINEST_M if old is None else old.side_m
-    while np.prod(np.floor(high / side) - np.floor(low / side) + 1.0) > most:
-        side *= 2.0
-        old = None if old is None else _halved(old)
-    first, last = (np.floor(corner[::-1] / side).astype(np.int64) for corner in (low, high))
-    top = np.full((2, *(last - first + 1)), -np.inf, np.float32)
-    if old is not None:
-        (row, column), (rows, columns) = old.first - first, old.top.shape[1:]
-        top[:, row : row + rows, column : column + columns] = old.top
-    return _Cells(side, first, top)
-
-
-def _halved(cells: _Cells) -> _Cells:
-    """Return the same in cells of twice the side."""
-    (south, west), (rows, columns) = cells.first % 2, cells.top.shape[1:]
-    pad = (0, 0), (south, (south + rows) % 2), (west, (west + columns) % 2)
-    top = np.pad(cells.top, pad, constant_values=-np.inf) if np.any(pad) else cells.top
-    highest, second = top[:, ::2, ::2]
-    for r, c in ((0, 1), (1, 0), (1, 1)):  # the other three of each four cells
-        one, other = top[:, r::2, c::2]
-        second = np.maximum(np.minimum(highest, one), np.maximum(second, other))
-        highest = np.maximum(highest, one)
-    return _Cells(cells.side_m * 2.0, cells.first // 2, np.stack([highest, second]))
-
-
 @kernel
-def _add(side_m: float, first: IntArray, top: Heights, xyz: FloatArray) -> None:
+def _add(side_m: float, first_row: int, first_column: int, top: Heights, xyz: FloatArray) -> None:
     """Raise the highest and the second highest of the cells by points."""
     for i in range(len(xyz)):
-        c = int(np.floor(xyz[i, 0] / side_m)) - first[1]
-        r = int(np.floor(xyz[i, 1] / side_m)) - first[0]
+        c = int(np.floor(xyz[i, 0] / side_m)) - first_column
+        r = int(np.floor(xyz[i, 1] / side_m)) - first_row
         z = np.float32(xyz[i, 2])
         if z > top[0, r, c]:
             top[1, r, c], top[0, r, c] = top[0, r, c], z

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -35,20 +36,18 @@ def pose_errors_of(xy: FloatArray, variance_m2: FloatArray) -> PoseErrors:
     leaves it. One of too few points has that of the nearest which has enough.
     """
     from scipy.ndimage import distance_transform_edt
+    from scipy.stats import binned_statistic_2d
 
     low = xy.min(axis=0)
     size = np.maximum(np.ptp(xy, axis=0), 1e-3)
     cell_m = float(np.sqrt(size.prod() * POINTS_A_CELL / len(xy)))
     shape = np.ceil(size / cell_m).astype(int)
     place = np.minimum(((xy - low) / cell_m).astype(int), shape - 1)
-    cell = place[:, 0] * shape[1] + place[:, 1]
-    order = np.argsort(cell, kind="stable")
-    cells, first, counts = np.unique(cell[order], return_index=True, return_counts=True)
-    medians = np.array([np.median(part) for part in np.split(variance_m2[order], first[1:])])
-    enough = counts >= min(FEWEST, counts.max())
-    variance = np.full(shape.prod(), np.nan)
-    variance[cells[enough]] = medians[enough]
-    variance = variance.reshape(shape)
+    bins: Any = [np.arange(count + 1) for count in shape]
+    x, y = place.T
+    variance = binned_statistic_2d(x, y, variance_m2, "median", bins).statistic
+    count = binned_statistic_2d(x, y, variance_m2, "count", bins).statistic
+    variance[count < min(FEWEST, count.max())] = np.nan
     nearest = distance_transform_edt(
         np.isnan(variance), return_distances=False, return_indices=True
     )

@@ -50,7 +50,7 @@ import numpy as np
 from pcfix.kernels import device
 from pcfix.lens.algebra import Nine, Vector, beyond, dot, minus, normal_of, scaled, solved, vector
 from pcfix.model import FloatArray
-from pcfix.water.surface import Field, Tin, field_of, height_at, locate
+from pcfix.water.surface import Field, Tin, field_of, surface_at
 
 
 @device(forceinline=True)
@@ -316,18 +316,8 @@ def plane_at(
 
     Relative to the apparent point `origin` (world frame, lowered if the water stood higher).
     """
-    if field is not None:
-        z, b, c = height_at(field, origin[0] + x, origin[1] + y)
-        return z - origin[2], b, c
-    # on a mesh: the plane of the facet there
-    if tin is not None:
-        px, py = origin[0] + x, origin[1] + y
-        facet = locate(tin, px, py)
-        if facet >= 0:
-            b, c = tin.planes[facet, 1], tin.planes[facet, 2]
-            z = tin.planes[facet, 0] + b * (px - tin.origin_x) + c * (py - tin.origin_y)
-            return z - origin[2], b, c
-    return np.nan, 0.0, 0.0
+    z, b, c = surface_at(tin, field, origin[0] + x, origin[1] + y)
+    return z - origin[2], b, c
 
 
 @device

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from pcfix.errors import GeometryError
-from pcfix.model import BoolArray, FloatArray, IntArray
+from pcfix.label.labelling import Part
+from pcfix.model import NOISE_CLASSES, FloatArray, IntArray
 from pcfix.sums import MOST, Sums
-from pcfix.water.surface import SurfaceAbove, is_submerged
+from pcfix.water.fit import NearestPoints
+from pcfix.water.surface import is_submerged
 
 LEAST_COUNT, FEW = 3, 10
 """A line through two check depths fits whatever they are; a third is the first that can disagree.
@@ -169,32 +172,28 @@ class BeyondRange(Sums):
     """Counts of apparent depths beyond those that a line was fitted to."""
 
     count: int
-    shallower: int
-    deeper: int
+    beyond: int
     deepest_m: float = field(metadata=MOST)
 
     @classmethod
     def of(cls, apparent_m: FloatArray, line: DepthRegression) -> BeyondRange:
         """Return the counts of submerged points, shape (m,)."""
-        shallower = int((apparent_m < line.shallowest_m).sum())
-        deeper = int((apparent_m > line.deepest_m).sum())
-        return cls(len(apparent_m), shallower, deeper, float(apparent_m.max(initial=0.0)))
+        beyond = (apparent_m < line.shallowest_m) | (apparent_m > line.deepest_m)
+        return cls(len(apparent_m), int(beyond.sum()), float(apparent_m.max(initial=0.0)))
 
     def notes(self, line: DepthRegression, least: float = 0.0) -> list[str]:
         """Return a sentence on them if their share is above `least`."""
-        if self.shallower + self.deeper <= least * self.count:
+        if self.beyond <= least * self.count:
             return []
-        of = 100.0 / self.count
         return [
             f"The regression was fitted to apparent depths of {line.shallowest_m:.2f} to"
             f" {line.deepest_m:.2f} m and is extrapolated for"
-            f" {of * (self.shallower + self.deeper):.1f} % of the submerged points"
-            f" ({of * self.shallower:.1f} % shallower, {of * self.deeper:.1f} % deeper, down to"
+            f" {100.0 * self.beyond / self.count:.1f} % of the submerged points (down to"
             f" {self.deepest_m:.2f} m), where SigmaZ grows."
         ]
 
 
-NEIGHBOURS, LEAST_NEIGHBOURS = 16, 3
+NEIGHBOURS = 16
 MOST_PLACES = 1000
 """That the distance between neighbours is taken at."""
 REACH = 4.0
@@ -202,59 +201,32 @@ REACH = 4.0
 the nearest neighbour is closer than on a grid, 10."""
 
 
-class ApparentDepths:
-    """The nearest submerged points of some places, shape (p, 2), gathered chunk by chunk.
+class ApparentDepths(NamedTuple):
+    """Apparent depths and water levels at places, shape (p,); NaN without a bed around them."""
 
-    `distance_m`, shape (p, NEIGHBOURS), is in plan and rising; infinite for missing points.
+    depth_m: FloatArray
+    level_m: FloatArray
+    nearest_m: FloatArray  # (p,), distance of the nearest submerged point; infinite without any
+    radius_m: float  # within which points count
+
+
+def apparent_depths(places: FloatArray, parts: Iterable[Part]) -> ApparentDepths:
+    """Return the medians of the submerged points nearest to places, shape (p, 2), in plan.
+
+    They are 3 to `NEIGHBOURS`, within `REACH` times the distance between neighbouring points there.
+    Points of noise (classes 7 and 18) do not count. The parts are read once, in bounded memory.
     """
-
-    def __init__(self, places: FloatArray) -> None:
-        self._places = places
-        self.distance_m = np.full((len(places), NEIGHBOURS), np.inf)
-        self._near = np.full((len(places), NEIGHBOURS, 4), np.nan)  # depth, level, x, y
-
-    def add(self, xyz: FloatArray, surface: SurfaceAbove) -> None:
-        """Add n points, shape (n, 3), metres, world frame, with the water above them."""
-        from scipy.spatial import cKDTree
-
-        rows = np.flatnonzero(is_submerged(xyz[:, 2], surface))
-        if not (len(rows) and len(self._places)):
-            return
-        # built faster, as it has few queries
-        tree = cKDTree(xyz[rows, :2], balanced_tree=False, compact_nodes=False)
-        distance, near = tree.query(self._places, k=range(1, NEIGHBOURS + 1))
-        near = rows[np.where(np.isfinite(distance), near, 0)]
-        aside = self._places[:, None, :] - xyz[near, :2]
-        # the height of the water over the place itself, where the surface is tilted
-        level = surface.height_m[near] + np.einsum("pka,pka->pk", surface.slope[near], aside)
-        depth = surface.height_m[near] - xyz[near, 2]
-        new = np.dstack([depth, level, xyz[near, 0], xyz[near, 1]])
-        both = np.concatenate([self._near, new], axis=1)
-        distance = np.hstack([self.distance_m, np.asarray(distance)])
-        order = np.lexsort((both[..., 0], distance), axis=-1)[:, :NEIGHBOURS]
-        self.distance_m = np.take_along_axis(distance, order, axis=1)
-        self._near = np.take_along_axis(both, order[:, :, None], axis=1)
-
-    @property
-    def spacing_m(self) -> float:
-        """Median distance of a point from its nearest neighbour; 0 if no place has two points."""
-        some = slice(None, None, -(-len(self._near) // MOST_PLACES) or 1)
-        found, xy = np.isfinite(self.distance_m[some]), self._near[some, :, 2:]
-        away = xy[:, :, None, :] - xy[:, None, :, :]
-        apart = np.hypot(away[..., 0], away[..., 1])
-        apart[~(found[:, :, None] & found[:, None, :]) | (apart == 0.0)] = np.inf
-        nearest = apart.min(axis=2)
-        known = nearest[np.isfinite(nearest)]
-        return float(np.median(known)) if len(known) else 0.0
-
-    def medians(self, radius_m: float) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Return the median apparent depth and water level of the points within a radius.
-
-        Then whether each place has `LEAST_NEIGHBOURS` points. If not, the others are NaN.
-        """
-        near = self.distance_m <= radius_m
-        covered = near.sum(axis=1) >= LEAST_NEIGHBOURS
-        medians = np.full((2, len(near)), np.nan)
-        for place in np.flatnonzero(covered):
-            medians[:, place] = np.median(self._near[place, near[place], :2], axis=0)
-        return medians[0], medians[1], covered
+    near = NearestPoints(places, NEIGHBOURS, columns=6)
+    for xyz, surface, classes in parts:
+        wet = is_submerged(xyz[:, 2], surface) & ~np.isin(classes, NOISE_CLASSES)
+        near.add(np.column_stack([xyz, surface.height_m, surface.slope])[wet])
+    xy, height, slope = near.rows[..., :2], near.rows[..., 3], near.rows[..., 4:]
+    some = xy[:: -(-len(xy) // MOST_PLACES) or 1]
+    away = np.hypot(*np.moveaxis(some[:, :, None] - some[:, None], -1, 0))
+    nearest = np.where(away > 0.0, away, np.inf).min(axis=2)  # not NaN: missing points
+    known = nearest[np.isfinite(nearest)]
+    radius = REACH * (float(np.median(known)) if len(known) else 0.0)
+    # the height of the water over the place itself, where the surface is tilted
+    level = height + (slope * (places[:, None] - xy)).sum(axis=2)
+    depth = near.medians(height - near.rows[..., 2], radius)
+    return ApparentDepths(depth, near.medians(level, radius), near.distance_m[:, 0], radius)

@@ -45,18 +45,13 @@ class StereoFactor:
     factor: float  # ratio of true to apparent depth
     height_m: float  # flying height above the water, median
     base_m: float  # distance between neighbouring images in plan, median
-    frame: tuple[float, float, float]  # focal length, sides along the base and across it, in `unit`
-    unit: str
     images: int  # nadir images
     aside: int  # images that look aside, which do not count
 
     def __str__(self) -> str:
-        focal, along, across = self.frame
         text = (
             f"Depth factor {self.factor:.4f}, from a flying height of {self.height_m:.2f} m above"
-            f" the water, a focal length of {focal:.6g} {self.unit}, a frame of {along:g} (along"
-            f" the base) by {across:g} {self.unit}, and a base of {self.base_m:.2f} m (medians of"
-            f" {self.images} images)."
+            f" the water and a base of {self.base_m:.2f} m (medians of {self.images} images)."
         )
         if self.aside:
             text += (
@@ -99,10 +94,7 @@ def stereo_factor(cameras: Cameras, level_m: float, n: float) -> StereoFactor:
             height_m=height_m,
         )
     factor = float(ratios(relative, along, across, n).mean())
-    focal, width, height = np.median(frames, axis=0).tolist()
-    frame = (focal, height, width) if is_upright else (focal, width, height)
-    unit, aside = lenses[rows[0]].unit, len(cameras) - len(rows)
-    return StereoFactor(factor, height_m, base_m, frame, unit, len(rows), aside)
+    return StereoFactor(factor, height_m, base_m, len(rows), len(cameras) - len(rows))
 
 
 def _bases(centres: FloatArray, rotations: FloatArray) -> tuple[FloatArray, FloatArray]:

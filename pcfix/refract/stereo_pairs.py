@@ -35,21 +35,9 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.kernels import Span, device, in_tiles, kernel
-from pcfix.lens.algebra import (
-    Vector,
-    beyond,
-    cross,
-    dot,
-    minus,
-    row_of,
-    scaled,
-    solved,
-    times,
-    transposed_times,
-    vector,
-)
+from pcfix.lens.algebra import Vector, beyond, cross, dot, minus, row_of, scaled, solved, vector
 from pcfix.lens.formulas import KIND, PERSPECTIVE, PLAIN
-from pcfix.lens.imaging import Plain, image_in_world, plain_image, plain_lens
+from pcfix.lens.imaging import Plain, image_and_slopes, plain_lens
 from pcfix.model import BoolArray, FloatArray, IntArray, Outcome, Views
 from pcfix.refract import tiling
 from pcfix.refract.batch import (
@@ -81,16 +69,9 @@ _DISTANCE, _OUTCOME, _FOUND, _WIDTH = 3, 4, 5, 6
 
 # Columns of a search: Q, the nearest Q so far, F there and its size, the share of a step, B row by
 # row, whether it goes on, and the ratio of true to apparent depth at the start.
-_NEAREST, _AT_NEAREST, _BEST, _SHARE, _INVERSE, _GOES_ON, _RATIO, _SEARCH = (
-    3,
-    6,
-    9,
-    10,
-    11,
-    20,
-    21,
-    22,
-)
+_, _NEAREST, _AT_NEAREST, _BEST, _SHARE, _B, _GOES_ON, _RATIO, _SEARCH = slots(
+    3, 3, 3, 1, 1, 9, 1, 1
+)  # fmt: skip
 
 # Runs of `TILE` numbers of a ray: the gradient of the scale of its image by place, and of the image
 # of Q G'G, G'G e and |G e|^2.
@@ -194,7 +175,7 @@ def _search(
         # the pairs of the tile; the marks become those of cameras in a pair
         pairs = _pairs_of(rows, marks, row, tile, block)
         for q in range(near.size):
-            add_camera(sums, tile, marks[q], None, block.rig, near[q], block.rule, None, None)
+            add_camera(sums, tile, marks[q], block.rig, near[q], block.rule, None, None)
         if first:
             _start(rows, tile, marks, row, sums, pairs, block.points, search, used, result)
         rays = np.empty((near.size, RAY * TILE))
@@ -299,7 +280,7 @@ def _start(
             # a place sinks as the true point does, times the ratio of their depths
             depth = tile[3 * TILE + j] - tile[2 * TILE + j]
             search[i, _RATIO] = 1.0 - q[2] / depth if depth > 0.0 else 1.0
-            _start_inverse(search[i])
+            _start_b(search[i])
 
 
 @device
@@ -360,11 +341,7 @@ def _see(
         by_place = scaled(scale, axis if flat else e)
         # g.w is the distance of w in terms of P
         w = scaled(1.0 / dot(w, by_place), w)
-        if plain is None:
-            u, _, by_u, by_v = image_in_world(lens, r, w)
-        else:
-            u, _, g = plain_image(plain, times(r, w))
-            by_u, by_v = transposed_times(r, g[:3]), transposed_times(r, g[3:])
+        u, _, by_u, by_v = image_and_slopes(lens, plain, r, w)
         # NaN where there is no image
         off_u, off_v = dot(by_u, e) + 0.0 * u, dot(by_v, e)
         put(ray, _BY_PLACE * TILE + j, by_place)
@@ -451,60 +428,54 @@ def _median(places: FloatArray, values: FloatArray, own: IntArray, at: int) -> f
 def _advance(one: FloatArray, f: Vector) -> None:
     """Move the Q of a search to where the median F of the pairs' places is P.
 
-    From the nearest Q so far goes a step s = -B F. Where F comes nearer,
-    by y, the good Broyden update is B + (s - B y) s'B / (s'B y); where it does not, B starts again
-    with half the step.
+    From the nearest Q so far goes a step s = -B F. Where F comes nearer, by y, the good Broyden
+    update is B + (s - B y) s'B / (s'B y); where it does not, B starts again with half the step.
     """
     size = np.sqrt(dot(f, f))
-    if size <= CLOSE_M:
-        _go(one, vector(one), f)
-        one[_GOES_ON] = 0.0
-        one[_BEST] = 0.0
-        return
     if size < one[_BEST]:
-        if one[_BEST] < np.inf:
+        if one[_BEST] < np.inf and size > CLOSE_M:
             s, y = minus(vector(one), vector(one, _NEAREST)), minus(f, vector(one, _AT_NEAREST))
-            missing = minus(s, _times(one, y))
-            x, y_, z = s
-            left = beyond(
-                beyond(scaled(x, vector(one, _INVERSE)), y_, vector(one, _INVERSE + 3)),
-                z, vector(one, _INVERSE + 6),
-            )  # fmt: skip
+            missing, left = minus(s, _b_times(one, y)), _times_b(s, one)
             along = dot(left, y)
             for i in range(3 if along != 0.0 else 0):
                 for j in range(3):
-                    one[_INVERSE + 3 * i + j] += missing[i] * left[j] / along
+                    one[_B + 3 * i + j] += missing[i] * left[j] / along
         for i in range(3):
             one[_NEAREST + i], one[_AT_NEAREST + i] = one[i], f[i]
         one[_BEST] = size
     elif one[_BEST] < np.inf:
         one[_SHARE] *= 0.5
-        _start_inverse(one)
+        _start_b(one)
     else:  # no image of the start
         one[_GOES_ON] = 0.0
         return
-    _go(one, vector(one, _NEAREST), vector(one, _AT_NEAREST))
+    step = _b_times(one, vector(one, _AT_NEAREST))
+    one[0], one[1], one[2] = minus(vector(one, _NEAREST), step)
+    # the last step is small enough for the B so far
+    one[_GOES_ON] = 1.0 if one[_BEST] > CLOSE_M else 0.0
 
 
 @device
-def _go(one: FloatArray, q: Vector, f: Vector) -> None:
-    """Set Q to a step -B F from q."""
-    one[0], one[1], one[2] = minus(q, _times(one, f))
-
-
-@device
-def _times(one: FloatArray, a: Vector) -> Vector:
+def _b_times(one: FloatArray, a: Vector) -> Vector:
     """Return B a."""
-    at = _INVERSE
-    return dot(vector(one, at), a), dot(vector(one, at + 3), a), dot(vector(one, at + 6), a)
+    return (
+        dot(vector(one, _B), a), dot(vector(one, _B + 3), a), dot(vector(one, _B + 6), a)
+    )  # fmt: skip
 
 
 @device
-def _start_inverse(one: FloatArray) -> None:
+def _times_b(a: Vector, one: FloatArray) -> Vector:
+    """Return a'B."""
+    x = beyond(scaled(a[0], vector(one, _B)), a[1], vector(one, _B + 3))
+    return beyond(x, a[2], vector(one, _B + 6))
+
+
+@device
+def _start_b(one: FloatArray) -> None:
     """Set B to a share of diag(1, 1, true by apparent depth)."""
-    one[_INVERSE:_GOES_ON] = 0.0
-    one[_INVERSE], one[_INVERSE + 4] = one[_SHARE], one[_SHARE]
-    one[_INVERSE + 8] = one[_SHARE] * one[_RATIO]
+    one[_B:_GOES_ON] = 0.0
+    share = one[_SHARE]
+    one[_B], one[_B + 4], one[_B + 8] = share, share, share * one[_RATIO]
 
 
 @device
@@ -512,7 +483,7 @@ def _write(rows: IntArray, sums: FloatArray, search: FloatArray, result: FloatAr
     """Write the points that are found."""
     for j in range(rows.size):
         row, one = result[rows[j]], search[rows[j]]
-        if row[_OUTCOME] == CORRECTED and one[_BEST] == 0.0:
+        if row[_OUTCOME] == CORRECTED and one[_BEST] <= CLOSE_M:
             row[0], row[1], row[2] = vector(one)
             row[_DISTANCE] = ray_distance(sums[9 * TILE + j], nine(sums, j), vector(one))
             row[_FOUND] = 1.0

@@ -62,46 +62,52 @@ def share_of_orders(within: IntArray, count: int) -> dict[str, float]:
 
 
 @dataclass(frozen=True)
-class _Histogram(Sums):
-    """Sum and percentiles, to a millimetre, of values.
+class _Figures(Sums):
+    """Mean, extremes, and percentiles to a millimetre, of values.
 
     Values beyond the limits share the last bins, which only percentiles would notice.
     """
 
     low_m: float = field(metadata=SAME)
     bins: IntArray
-    count: int = 0
-    sum_m: float = 0.0
+    count: int
+    sum_m: float
+    least_m: float = field(metadata=LEAST)
+    most_m: float = field(metadata=MOST)
 
     @classmethod
-    def of(cls, values_m: FloatArray, low_m: float, high_m: float) -> _Histogram:
-        """Return the histogram of some values."""
+    def of(cls, values_m: FloatArray, low_m: float = 0.0, high_m: float = 0.0) -> _Figures:
+        """Return the figures of some values; between equal limits there are no percentiles."""
         places = np.rint((np.clip(values_m, low_m, high_m) - low_m) / _BIN_M).astype(np.int64)
         bins = np.bincount(places, minlength=round((high_m - low_m) / _BIN_M) + 1)
-        return cls(low_m, bins, len(values_m), float(values_m.sum()))
+        least, most = values_m.min(initial=np.inf), values_m.max(initial=-np.inf)
+        return cls(low_m, bins, len(values_m), float(values_m.sum()), float(least), float(most))
 
-    def mean_m(self) -> float:
-        return self.sum_m / self.count
-
-    def percentile_m(self, percent: float) -> float:
-        place = int(np.searchsorted(np.cumsum(self.bins), percent / 100.0 * self.count))
-        return place * _BIN_M + self.low_m
+    def by_name(self, *names: str, times: float = 1.0) -> dict[str, float]:
+        """Return figures by name, min, mean, max, or such as p95; empty without values."""
+        if not self.count:
+            return {}
+        found = {"min": self.least_m, "mean": self.sum_m / self.count, "max": self.most_m}
+        for name in names:
+            if name not in found:
+                rank = float(name[1:]) / 100.0 * self.count
+                place = int(np.searchsorted(np.cumsum(self.bins), rank))
+                found[name] = place * _BIN_M + self.low_m
+        return {name: round(float(times * found[name]), 4) for name in names}
 
 
 @dataclass(frozen=True)
 class UncertaintyTally(Sums):
     """Standard errors of Z of corrected points."""
 
-    sigma: _Histogram
+    sigma: _Figures
     within: IntArray  # points within the TVU of each order
-    most_m: float = field(default=0.0, metadata=MOST)
 
     @classmethod
     def of(cls, sigma_z_m: FloatArray, depth_m: FloatArray) -> UncertaintyTally:
         """Return the tally of standard errors of Z and depths, metres, shape (m,)."""
         within = within_orders(COVERAGE_95 * sigma_z_m, depth_m)
-        largest = float(sigma_z_m.max(initial=0.0))
-        return cls(_Histogram.of(sigma_z_m, 0.0, 10.0), within, largest)
+        return cls(_Figures.of(sigma_z_m, 0.0, 10.0), within)
 
     def as_dict(self) -> dict[str, Any] | None:
         """Return the figures as plain values; None where no point has a standard error.
@@ -109,13 +115,12 @@ class UncertaintyTally(Sums):
         `sigma_z_m` holds mean, percentiles (to a millimetre) and largest; `tvu_95_m` is 1.96 times
         these; `s44` the share of the points, 0 to 1, within the TVU of each order.
         """
-        if self.most_m == 0.0:
+        if not self.sigma.most_m > 0.0:
             return None
-        percentiles = {f"p{p}": self.sigma.percentile_m(p) for p in (5, 50, 95)}
-        sigma = {"mean": self.sigma.mean_m(), **percentiles, "max": self.most_m}
+        names = "mean", "p5", "p50", "p95", "max"
         return {
-            "sigma_z_m": _rounded(**sigma),
-            "tvu_95_m": _rounded(**{name: COVERAGE_95 * value for name, value in sigma.items()}),
+            "sigma_z_m": self.sigma.by_name(*names),
+            "tvu_95_m": self.sigma.by_name(*names, times=COVERAGE_95),
             "s44": share_of_orders(self.within, self.sigma.count),
         }
 
@@ -128,7 +133,8 @@ class Tally(Sums):
     camera_used: BoolArray = field(metadata=MOST)
     low: FloatArray = field(metadata=LEAST)  # lowest corner of the submerged points, shape (3,)
     high: FloatArray = field(metadata=MOST)
-    shift: _Histogram
+    shift: _Figures
+    depth: _Figures
     errors: UncertaintyTally
     points: int = 0
     water_unknown: int = 0
@@ -136,9 +142,6 @@ class Tally(Sums):
     rays: int = 0
     lowest_water_m: float = field(default=np.inf, metadata=LEAST)
     incidence_deg: float = field(default=0.0, metadata=MOST)
-    depth_low_m: float = field(default=np.inf, metadata=LEAST)
-    depth_high_m: float = field(default=-np.inf, metadata=MOST)
-    depth_sum_m: float = 0.0
 
     @classmethod
     def of(cls, correction: Correction) -> Tally:
@@ -154,7 +157,8 @@ class Tally(Sums):
             camera_used=correction.camera_used,
             low=low,
             high=high,
-            shift=_Histogram.of(correction.shift_m[moved, 2], -100.0, 100.0),
+            shift=_Figures.of(correction.shift_m[moved, 2], -100.0, 100.0),
+            depth=_Figures.of(depth),
             errors=UncertaintyTally.of(correction.sigma_z_m[moved], depth),
             points=len(apparent),
             water_unknown=int((~correction.water_known).sum()),
@@ -162,9 +166,6 @@ class Tally(Sums):
             rays=int(correction.ray_count.sum()),
             lowest_water_m=correction.lowest_water_m,
             incidence_deg=float(correction.incidence_deg.max(initial=0.0, where=moved)),
-            depth_low_m=float(depth.min(initial=np.inf)),
-            depth_high_m=float(depth.max(initial=-np.inf)),
-            depth_sum_m=float(depth.sum()),
         )
 
     @property
@@ -182,20 +183,6 @@ class Tally(Sums):
         """Return how many submerged points were not moved, by reason."""
         return {text: int(self.outcomes[reason]) for reason, text in REASONS.items()}
 
-    def depth_m(self) -> dict[str, float]:
-        """Return the range and mean of the corrected depth."""
-        if not self.corrected:
-            return {}
-        mean = self.depth_sum_m / self.corrected
-        return _rounded(min=self.depth_low_m, mean=mean, max=self.depth_high_m)
-
-    def shift_z_m(self) -> dict[str, float]:
-        """Return mean and 5 and 95 % points of the shift in Z; percentiles to a millimetre."""
-        if not self.corrected:
-            return {}
-        p5, p95 = (self.shift.percentile_m(percent) for percent in (5, 95))
-        return _rounded(mean=self.shift.mean_m(), p5=p5, p95=p95)
-
     def as_dict(self) -> dict[str, Any]:
         """Return the counts and figures by the names of `pcfix.report.summary.Summary`."""
         return {
@@ -205,8 +192,8 @@ class Tally(Sums):
             "uncorrected": self.uncorrected(),
             "water_unknown": self.water_unknown,
             "unsure": self.unsure,
-            "depth_m": self.depth_m(),
-            "shift_z_m": self.shift_z_m(),
+            "depth_m": self.depth.by_name("min", "mean", "max"),
+            "shift_z_m": self.shift.by_name("mean", "p5", "p95"),
             "rays": self.rays,
             "incidence_deg": round(self.incidence_deg, 2),
         }
@@ -222,7 +209,3 @@ class Tally(Sums):
                 "scatter_m": made["scatter_m"], "per_depth": made["doubt_per_depth"]
             }  # fmt: skip
         return found
-
-
-def _rounded(**values: float) -> dict[str, float]:
-    return {name: round(float(value), 4) for name, value in values.items()}

@@ -5,7 +5,7 @@ piercing point. Four methods find it; they agree where all of them converge:
 
 =============  ====================================================================================
 kotowski       Newton's method on Snell's law at the piercing point (Kotowski 1987)
-afrt           rays traced forward, their piercing point moved by a secant (Broyden) update
+afrt           rays traced forward: Newton's method on their offset at the height of the point
 mdfrt          minimum distance forward ray tracing: Newton's method on the ray's distance
 scattershot    grids of paths narrowed to the shortest optical length (Fermat)
 =============  ====================================================================================
@@ -15,40 +15,37 @@ patches of a raster, there may be none: through a crease that is a trough comes 
 Fermat, but not the normal of any facet. There `trace` narrows the grids of `scattershot` from the
 end of the method to the path of least optical length nearby.
 
-In kernels the object point is the local origin. A ray is named by its plan place (x, y) on the
-surface. It pierces the surface at A, is refracted there, and comes down to the height of the point
-at the offset (mx, my). Where there is no surface, and where it faces away from the camera, all is
-NaN. The ray is taken to cross the surface once.
+Coordinates are relative to the object point. A ray is named by its plan place (x, y) on the
+surface. It pierces the surface at A and is refracted there. Where there is no surface, and where it
+faces away from the camera, all is NaN. The ray is taken to cross the surface once.
+
+All is numpy: blocks of pairs are traced at once, and the pairs that are not found yet go on.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import SettingError
-from pcfix.kernels import Span, device, in_tiles, kernel
-from pcfix.lens.algebra import Vector, dot, minus, normal_of, plus, row_of, scaled, vector
+from pcfix.kernels import Span, in_tiles
 from pcfix.model import BoolArray, FloatArray, IntArray, WaterMesh, WaterPlane, WaterRaster
 from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
-from pcfix.refract.rays import plane_at, refracted
-from pcfix.water.surface import Field, Tin, build_field, build_tin
+from pcfix.running import threads
+from pcfix.water.surface import surface_above
 
 Surface: TypeAlias = WaterPlane | WaterRaster | WaterMesh
 
 METHODS = ("kotowski", "afrt", "mdfrt", "scattershot")
-_KOTOWSKI, _AFRT, _MDFRT, _SCATTERSHOT = range(4)
-_LOST, _HIT, _CREASE = 0, 1, 2
 
-# Columns of the result.
-_SLOPE, _STEPS, _STATE, _WIDTH = 3, 5, 6, 7
-
+BLOCK = 32_768
+"""Endpoints traced at once."""
 CLOSE_M = 1e-9
-"""An offset that counts as a hit: no finer than UTM northings allow in doubles."""
+"""A step that ends a search: no finer than UTM northings allow in doubles."""
 SHORT = 0.1
 """In depths: a step that is taken although it seems to lead away, as it may from one patch of a
 broken surface to the next."""
@@ -76,13 +73,11 @@ class Tracing:
     """Paths of n pairs of an object point and a projection centre.
 
     Where light goes straight the piercing point is the object point; NaN where no path was found.
-    A path through a crease is the shortest nearby, but no refracted ray; its slope is that of the
-    plane that refracts light as the crease does.
+    A path through a crease is the shortest nearby, but no refracted ray.
     """
 
     piercing_xyz: FloatArray  # (n, 3), where the light leaves the water, metres, world frame
     direction: FloatArray  # (n, 3), unit vectors from the projection centre to there
-    slope: FloatArray  # (n, 2), dz/dx and dz/dy of the surface there
     iterations: IntArray  # (n,), steps of the method; shots of grids
     converged: BoolArray  # (n,), whether a path was found
     on_crease: BoolArray  # (n,), whether it leaves through a crease
@@ -91,7 +86,7 @@ class Tracing:
 def trace(
     origin: npt.ArrayLike,
     target: npt.ArrayLike,
-    surfaces: Surface | float | Sequence[Surface | float],
+    water: Surface | float,
     *,
     refractive_index: float = DEFAULT_REFRACTIVE_INDEX,
     method: str = "kotowski",
@@ -106,7 +101,7 @@ def trace(
     target : array, shape (n, 3) or (3,)
         The true object points, metres, world frame. A point above the water, or without water
         above it, is seen straight.
-    surfaces : WaterPlane, WaterRaster, WaterMesh or float, or a sequence with one of them
+    water : WaterPlane, WaterRaster, WaterMesh or float
         The water surface, or its level in metres.
     refractive_index : float, default 1.34
         Of the water against air, at least 1.
@@ -142,7 +137,6 @@ def trace(
             f"An origin of shape {np.shape(origin)} and a target of shape {np.shape(target)} do not"
             " form pairs. Give both as (n, 3), or one of them as (3,).",
         )
-    xyz, seen_from = (np.ascontiguousarray(a, float) for a in np.broadcast_arrays(xyz, seen_from))
     n = float(refractive_index)
     if method not in METHODS:
         raise SettingError(
@@ -156,348 +150,243 @@ def trace(
             f"The refractive index {n:g} is below 1. Give that of the water, about 1.34.",
             value=n,
         )
-    result = np.empty((len(xyz), _WIDTH))
-    how = n, METHODS.index(method), narrow
-    in_tiles(_trace, len(xyz), xyz, seen_from, *_as_kernels_take(surfaces), how, result)
-    to_point = xyz - seen_from
-    way = to_point + result[:, :_SLOPE]
+    surface = WaterPlane(float(water)) if isinstance(water, int | float) else water
+    if not isinstance(surface, Surface):
+        raise SettingError(
+            "trace.surface",
+            f"Light cannot be traced through {surface}. Give a plane, raster or mesh.",
+        )
+    point, centre = (np.array(a, float).T for a in np.broadcast_arrays(xyz, seen_from))
+    pairs, count = Endpoints(surface, point, centre - point, n), point.shape[1]
+    pierced = np.full((3, count), np.nan)
+    steps = np.zeros(count, np.int64)
+    on_crease = np.zeros(count, np.bool_)
+
+    def run(span: Span) -> None:
+        with threads(1), np.errstate(all="ignore"):
+            for block in range(*span):
+                rows = np.arange(block * BLOCK, min((block + 1) * BLOCK, count))
+                path = _path(pairs.of(rows), method, narrow)
+                pierced[:, rows], steps[rows], on_crease[rows] = path
+
+    in_tiles(run, -(-count // BLOCK))
+    way = pairs.e - pierced
     return Tracing(
-        piercing_xyz=xyz + result[:, :_SLOPE],
-        direction=way / np.linalg.norm(way, axis=1)[:, None],
-        slope=result[:, _SLOPE:_STEPS].copy(),
-        iterations=result[:, _STEPS].astype(np.int64),
-        converged=result[:, _STATE] != _LOST,
-        on_crease=result[:, _STATE] == _CREASE,
+        piercing_xyz=(point + pierced).T,
+        direction=-(way / np.sqrt(_dot(way, way))).T,
+        iterations=steps,
+        converged=np.isfinite(pierced[0]),
+        on_crease=on_crease,
     )
 
 
-def _as_kernels_take(
-    surfaces: Surface | float | Sequence[Surface | float],
-) -> tuple[FloatArray, Tin | None, Field | None]:
-    """Return plane, mesh and raster of a surface; zeros or None for the two that it is not."""
-    if isinstance(surfaces, list | tuple):
-        if len(surfaces) != 1:
-            raise SettingError(
-                "trace.surfaces",
-                f"Light is traced through one surface, not {len(surfaces)}. Give the water's.",
-                count=len(surfaces),
-            )
-        surfaces = surfaces[0]
-    surface = WaterPlane(float(surfaces)) if isinstance(surfaces, int | float) else surfaces
-    if isinstance(surface, WaterPlane):
-        return np.array([surface.a, surface.b, surface.c]), None, None
-    if isinstance(surface, WaterMesh):
-        return np.zeros(3), build_tin(surface), None
-    if isinstance(surface, WaterRaster):
-        return np.zeros(3), None, build_field(surface)
-    raise SettingError(
-        "trace.surface", f"Light cannot be traced through {surface}. Give a plane, raster or mesh."
-    )
+class Endpoints(NamedTuple):
+    """Endpoints of an object point and a projection centre, and the surface between them."""
+
+    surface: Surface
+    point: FloatArray  # (3, m), object points, world frame, metres
+    e: FloatArray  # (3, m), projection centres relative to them
+    n: float
+
+    def of(self, rows: IntArray | BoolArray) -> Endpoints:
+        """Return some of the pairs."""
+        return self._replace(point=self.point[:, rows], e=self.e[:, rows])
+
+    def pierced(self, xy: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the places A of the surface, (3, m), and dz/dx and dz/dy there; NaN if none."""
+        place = np.vstack([self.point[:2] + xy, self.point[2:]])
+        height, slope = surface_above(self.surface, place.T)
+        return np.vstack([xy, height - self.point[2]]), slope.T
+
+    def refracted(self, xy: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the places A, and the refracted rays from the camera through them.
+
+        The ray, not of unit length and NaN where it does not go down, is that of Mulsow 2024 after
+        Glassner 1989, which is eq 10 of Skarlatos & Agrafiotis 2018. The n_t that is printed with
+        it, n_t / n_(t+1), is the inverse of that which the formula takes.
+        """
+        a, (b, c) = self.pierced(xy)
+        up = 1.0 / np.sqrt(1.0 + b * b + c * c)
+        normal, u = np.stack([-b * up, -c * up, up]), self.e - a
+        facing, r = _dot(normal, u), 1.0 / self.n
+        bend = r * facing - np.sqrt(_dot(u, u) * (1.0 - r * r) + r * r * facing * facing)
+        t = bend * normal - r * u
+        # light reaches only faces that look towards the camera
+        return a, np.where((facing > 0.0) & (t[2] < 0.0), t, np.nan)
+
+    def offset(self, xy: FloatArray) -> FloatArray:
+        """Return by how much the refracted rays miss the points, (2, m), at their height."""
+        a, t = self.refracted(xy)
+        return xy - t[:2] * (a[2] / t[2])
+
+    def snell_normal(self, a: FloatArray) -> FloatArray:
+        """Return u - n v, with the unit vectors u from the cameras to A and v from A to the points.
+
+        By Snell's law it is normal to the surface.
+        """
+        u = a - self.e
+        return u / np.sqrt(_dot(u, u)) + a * (self.n / np.sqrt(_dot(a, a)))
+
+    def length(self, xy: FloatArray) -> FloatArray:
+        """Return the optical lengths of paths, metres, (m,); infinite where there is none."""
+        a, slope = self.pierced(xy)
+        u = self.e - a
+        # the surface has to face the camera
+        faces = u[2] - _dot(slope, u[:2]) > 0.0
+        return np.where(faces, np.sqrt(_dot(u, u)) + self.n * np.sqrt(_dot(a, a)), np.inf)
+
+    def residual(self, xy: FloatArray, method: str) -> FloatArray:
+        r"""Return the two numbers, (2, m), that vanish where light pierces the surface at x, y.
+
+        kotowski: u - n v is normal to the surface, hence to its tangents (1, 0, b) and (0, 1, c):
+
+            g = (u_x - n v_x + b (u_z - n v_z), u_y - n v_y + c (u_z - n v_z)) = 0
+
+        g is also the gradient of the optical length by the place of A (Fermat).
+
+        afrt: the offset of the refracted ray t at the height of the object point P.
+
+        mdfrt: x and y of the perpendicular from the refracted ray to P,
+
+            d = P - A - (t.(P - A) / t.t) t
+
+        Mulsow 2024 prints P_0 for the first P, and the last term with A - P but the same sign.
+        """
+        if method == "kotowski":
+            a, slope = self.pierced(xy)
+            g = self.snell_normal(a)
+            return np.asarray(g[:2] + slope * g[2])
+        if method == "afrt":
+            return self.offset(xy)
+        a, t = self.refracted(xy)
+        return np.asarray((_dot(t, a) / _dot(t, t) * t - a)[:2])
 
 
-@kernel(allocates=True)
-def _trace(
-    span: Span, points: FloatArray, centres: FloatArray, plane: FloatArray, tin: Tin | None,
-    field: Field | None, how: tuple[float, int, bool], result: FloatArray,
-) -> None:  # fmt: skip
-    """Trace every pair on its own, in coordinates about the object point."""
-    n, method, narrow = how
-    for i in range(*span):
-        p = points[i]
-        local = np.empty(3)
-        local[0] = plane[0] + plane[1] * p[0] + plane[2] * p[1] - p[2]
-        local[1], local[2] = plane[1], plane[2]
-        water = Water(local, tin, field, p)
-        e = minus(row_of(centres, i), vector(p))
-        _path(result[i], water, e, n, method, narrow)
+def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
+    return np.asarray((a * b).sum(axis=0))
 
 
-@device
-def _path(out: FloatArray, water: Water, e: Vector, n: float, method: int, narrow: bool) -> None:
-    """Trace one pair and write its row."""
-    out[:] = np.nan
-    out[_STEPS], out[_STATE] = 0.0, _LOST
-    level, over = height_of(water, 0.0, 0.0)[0], height_of(water, e[0], e[1])[0]
-    # the camera is under the water, or somewhere infinite
-    if e[2] <= over or not abs(e[0]) + abs(e[1]) + abs(e[2]) < np.inf:
-        return
-    # the point is above the water: straight
-    if not level > 0.0:
-        out[:_STEPS], out[_STATE] = 0.0, _HIT
-        return
-    if not e[2] > 0.0:
-        return
-    start = min(level / e[2], HIGHEST_START)
-    if method == _SCATTERSHOT:
-        x, y, steps, found = _scattershot(water, e, start, level, n)
+def _path(pairs: Endpoints, method: str, narrow: bool) -> Found:
+    """Return where the light of pairs pierces the surface, the steps, and whether on a crease."""
+    e, m = pairs.e, pairs.e.shape[1]
+    found, steps = np.full((3, m), np.nan), np.zeros(m, np.int64)
+    on_crease = np.zeros(m, np.bool_)
+    level, over = (pairs.pierced(xy)[0][2] for xy in (np.zeros((2, m)), e[:2]))
+    # not where the camera is under the water, or somewhere infinite
+    is_above = ~(e[2] <= over) & (np.abs(e).sum(axis=0) < np.inf)
+    # a point above the water is seen straight
+    straight = is_above & ~(level > 0.0)
+    found[:, straight] = 0.0
+    rows = np.flatnonzero(is_above & ~straight & (e[2] > 0.0))
+    wet, level = pairs.of(rows), level[rows]
+    # the straight line pierces the surface about here
+    share = np.minimum(level / wet.e[2], HIGHEST_START)
+    xy = share * wet.e[:2]
+    if method == "scattershot":
+        # on calm water the place is between the point and the straight line; the first grid covers
+        # these and as much as the point is deep all around
+        half = level + 0.5 * np.abs(xy).max(axis=0)
+        xy = _best_knot(wet, 0.5 * xy, half, KNOTS)[0]
+        xy, steps[rows], is_found = _narrowed(wet, xy, 2.0 * half / KNOTS)
     else:
-        x, y, steps, found = _search(water, e, start, level, n, method)
-        if not found and narrow:
-            if np.isnan(height_of(water, x, y)[0]):
-                x, y = start * e[0], start * e[1]
-            x, y, more, found = _narrowed(water, e, x, y, NEAR * level, n)
-            steps += more
-    out[_STEPS] = steps
-    if not found:
-        return
-    z, b, c = height_of(water, x, y)
-    out[0], out[1], out[2], out[_SLOPE], out[_SLOPE + 1] = x, y, z, b, c
-    out[_STATE] = _HIT
-    mx, my = _offset(water, e, x, y, n)
-    if mx * mx + my * my <= CREASE_M * CREASE_M:
-        return
-    # on a crease Snell's law gives the normal
-    gx, gy, gz = _snell_normal(e, (x, y, z), n)
-    out[_SLOPE], out[_SLOPE + 1], out[_STATE] = -gx / gz, -gy / gz, _CREASE
+        start = xy
+        xy, steps[rows], is_found = _search(wet, start, level, method)
+        lost = np.flatnonzero(~is_found)
+        if narrow and len(lost):
+            near = np.where(np.isnan(wet.pierced(xy)[0][2]), start, xy)[:, lost]
+            xy[:, lost], more, is_found[lost] = _narrowed(wet.of(lost), near, NEAR * level[lost])
+            steps[rows[lost]] += more
+    rows, wet, xy = rows[is_found], wet.of(is_found), xy[:, is_found]
+    found[:, rows] = wet.pierced(xy)[0]
+    on_crease[rows] = ~(np.hypot(*wet.offset(xy)) <= CREASE_M)
+    return found, steps, on_crease
 
 
-Found: TypeAlias = tuple[float, float, int, bool]
-"""Plan place (x, y) where a tracer ended, its number of steps, and whether it hit the point."""
+Found: TypeAlias = tuple[FloatArray, IntArray, BoolArray]
+"""Plan places (2, m) where a tracer ended, its numbers of steps, and whether it found a path."""
 
 
-class Water(NamedTuple):
-    """A surface for kernels, about the object point.
+def _search(pairs: Endpoints, start: FloatArray, level: FloatArray, method: str) -> Found:
+    """Find where the residual of a method vanishes, from places on the straight lines on.
 
-    Numba compiles a kernel for each kind: one for all, with empty fields, is four times slower on
-    planes.
-
-    plane : array, shape (3,), a, b, c of z = a + b x + c y; used if the others are None.
-    tin, field : the mesh or the raster.
-    origin : array, shape (3,), the object point, world frame, metres.
+    `level` are the heights of the water over the points. Mulsow 2024 does not say how the residual
+    is brought to zero. Here it is Newton's method with differences of neighbouring places. A step
+    that makes the residual grow, or leaves the water, is halved until it is short.
     """
-
-    plane: FloatArray
-    tin: Tin | None
-    field: Field | None
-    origin: FloatArray
-
-
-@device
-def height_of(water: Water, x: float, y: float) -> tuple[float, float, float]:
-    """Return height over the point, dz/dx and dz/dy of the water at a plan place; NaN if none."""
-    return _height_of(water.plane, water.tin, water.field, water.origin, x, y)
-
-
-@device
-def _height_of(
-    plane: FloatArray, tin: Tin | None, field: Field | None, origin: FloatArray, x: float, y: float
-) -> tuple[float, float, float]:
-    # numba drops the branch of what is None only where that is an argument of its own
-    if tin is None and field is None:
-        return plane[0] + plane[1] * x + plane[2] * y, plane[1], plane[2]
-    return plane_at(tin, field, x, y, origin)
-
-
-@device
-def _refracted_at(water: Water, e: Vector, x: float, y: float, n: float) -> tuple[Vector, Vector]:
-    """Return the place of the surface at x, y, and the refracted ray from the camera through it.
-
-    The ray, not of unit length and NaN where it does not go down, is that of Mulsow 2024 after
-    Glassner 1989, which is eq 10 of Skarlatos & Agrafiotis 2018. The n_t that is printed with it,
-    n_t / n_(t+1), is the inverse of that which the formula takes.
-    """
-    z, b, c = height_of(water, x, y)
-    a = x, y, z
-    normal, u = normal_of(b, c), minus(e, a)
-    # light reaches only faces that look towards the camera
-    facing = dot(normal, u)
-    if facing > 0.0:
-        t = refracted(u, dot(u, u), normal, facing, 1.0 / n)
-        if t[2] < 0.0:
-            return a, t
-    return a, (np.nan, np.nan, np.nan)
-
-
-@device
-def _offset(water: Water, e: Vector, x: float, y: float, n: float) -> tuple[float, float]:
-    """Return the offset of the ray that pierces the surface at the plan place x, y."""
-    a, t = _refracted_at(water, e, x, y, n)
-    return x - t[0] * a[2] / t[2], y - t[1] * a[2] / t[2]
-
-
-@device
-def _snell_normal(e: Vector, a: Vector, n: float) -> Vector:
-    """Return u - n v, with the unit vectors u from the camera to A and v from A to the point."""
-    u = minus(a, e)
-    return plus(scaled(1.0 / np.sqrt(dot(u, u)), u), scaled(n / np.sqrt(dot(a, a)), a))
-
-
-@device
-def _residual(
-    water: Water, e: Vector, x: float, y: float, n: float, method: int
-) -> tuple[float, float]:
-    r"""Return the two numbers that vanish where light pierces the surface at the plan place x, y.
-
-    kotowski: with the unit vectors u from the camera to A and v from A to the point, Snell's law
-    says that u - n v is normal to the surface, hence to its tangents (1, 0, b) and (0, 1, c):
-
-        g = (u_x - n v_x + b (u_z - n v_z), u_y - n v_y + c (u_z - n v_z)) = 0
-
-    g is also the gradient of the optical length by the place of A (Fermat).
-
-    afrt: the offset of the refracted ray t at the height of the object point P.
-
-    mdfrt: x and y of the perpendicular from the refracted ray to P,
-
-        d = P - A - (t.(P - A) / t.t) t
-
-    Mulsow 2024 prints P_0 for the first P, and the last term with A - P but the same sign.
-    """
-    if method == _KOTOWSKI:
-        z, b, c = height_of(water, x, y)
-        g = _snell_normal(e, (x, y, z), n)
-        return g[0] + b * g[2], g[1] + c * g[2]
-    if method == _AFRT:
-        return _offset(water, e, x, y, n)
-    a, t = _refracted_at(water, e, x, y, n)
-    d = minus(scaled(dot(t, a) / dot(t, t), t), a)
-    return d[0], d[1]
-
-
-@device
-def _search(water: Water, e: Vector, start: float, level: float, n: float, method: int) -> Found:
-    """Find where the residual of a method vanishes, from the straight line on.
-
-    `start` is the share of the straight line at which it pierces the water, whose height over the
-    point is `level`. Mulsow 2024 does not say how the residual is brought to zero. Here it is
-    Newton's method with differences of neighbouring places, two more rays per step. afrt
-    does without: the good Broyden update
-
-        B + (s - B y) s'B / (s' B y)
-
-    improves the inverse B of the derivative after a step s that changes the residual by y, from
-    that of water without refraction on. A step that makes the residual grow, or leaves the water,
-    is halved until it is short.
-    """
-    x, y = start * e[0], start * e[1]
-    rx, ry = _residual(water, e, x, y, n, method)
+    xy, rest = start.copy(), pairs.residual(start, method)
     # beyond the edge of the water: start above the point
-    if np.isnan(rx):
-        x, y = 0.0, 0.0
-        rx, ry = _residual(water, e, x, y, n, method)
-    bxx, bxy, byx, byy = 1.0 - start, 0.0, 0.0, 1.0 - start
-    aside = min(DIFFERENCE_M, 0.05 * level)
+    off = np.isnan(rest[0])
+    xy[:, off], rest[:, off] = 0.0, pairs.of(off).residual(np.zeros((2, off.sum())), method)
+    steps, found = np.zeros(len(level), np.int64), np.zeros(len(level), np.bool_)
+    rows, some = np.arange(len(level)), pairs
     for step in range(1, SEARCH_STEPS + 1):
-        if method != _AFRT:
-            east_x, east_y = _residual(water, e, x + aside, y, n, method)
-            north_x, north_y = _residual(water, e, x, y + aside, n, method)
-            jxx, jyx, jxy, jyy = east_x - rx, east_y - ry, north_x - rx, north_y - ry
-            share = aside / (jxx * jyy - jxy * jyx)
-            bxx, bxy, byx, byy = share * jyy, -share * jxy, -share * jyx, share * jxx
-        dx, dy = -bxx * rx - bxy * ry, -byx * rx - byy * ry
-        before, size, share = rx * rx + ry * ry, np.sqrt(dx * dx + dy * dy), 1.0
+        place, r, depth = xy[:, rows], rest[:, rows], level[rows]
+        aside = np.minimum(DIFFERENCE_M, 0.05 * depth)
+        by_x = some.residual(np.stack([place[0] + aside, place[1]]), method) - r
+        by_y = some.residual(np.stack([place[0], place[1] + aside]), method) - r
+        inverse = np.array([[by_y[1], -by_y[0]], [-by_x[1], by_x[0]]])
+        inverse *= aside / (by_x[0] * by_y[1] - by_y[0] * by_x[1])
+        s = -(inverse * r).sum(axis=1)
+        size, new = np.hypot(*s), some.residual(place + s, method)
         for _ in range(HALVINGS):
-            new_x, new_y = _residual(water, e, x + share * dx, y + share * dy, n, method)
-            is_nearer = new_x * new_x + new_y * new_y < before
-            if is_nearer or (share * size < SHORT * level and not np.isnan(new_x)):
+            is_short = (np.hypot(*s) < SHORT * depth) & ~np.isnan(new[0])
+            far = np.flatnonzero(~((_dot(new, new) < _dot(r, r)) | is_short))
+            if not len(far):
                 break
-            share *= 0.5
-        if np.isnan(new_x):
-            return x, y, step, False
-        dx, dy = share * dx, share * dy
-        x, y = x + dx, y + dy
-        if size <= CLOSE_M:
-            mx, my = _offset(water, e, x, y, n)
-            return x, y, step, bool(mx * mx + my * my <= CREASE_M * CREASE_M)
-        # Broyden's update; Newton's method replaces it
-        along_x, along_y = dx * bxx + dy * byx, dx * bxy + dy * byy
-        change_x, change_y = new_x - rx, new_y - ry
-        share = 1.0 / (along_x * change_x + along_y * change_y)
-        tx = share * (dx - bxx * change_x - bxy * change_y)
-        ty = share * (dy - byx * change_x - byy * change_y)
-        bxx, bxy = bxx + tx * along_x, bxy + tx * along_y
-        byx, byy = byx + ty * along_x, byy + ty * along_y
-        rx, ry = new_x, new_y
-    return x, y, SEARCH_STEPS, False
+            s[:, far] *= 0.5
+            new[:, far] = some.of(far).residual(place[:, far] + s[:, far], method)
+        steps[rows], rest[:, rows] = step, new
+        goes_on = ~np.isnan(new[0])
+        xy[:, rows[goes_on]] += s[:, goes_on]
+        found[rows] = goes_on & (size <= CLOSE_M)
+        goes_on &= size > CLOSE_M
+        if not goes_on.any():
+            break
+        if not goes_on.all():
+            rows, some = rows[goes_on], some.of(goes_on)
+    return xy, steps, found & (np.hypot(*pairs.offset(xy)) <= CREASE_M)
 
 
-@device
-def _scattershot(water: Water, e: Vector, start: float, level: float, n: float) -> Found:
-    """Narrow a grid of places on the surface about that of the least optical length (Fermat).
+def _narrowed(pairs: Endpoints, xy: FloatArray, half: FloatArray) -> Found:
+    """Return the nearest places of least optical length (Fermat), from half the size of grids on.
 
-    Mulsow 2024 gives only the name ("brute force"). There is no start value, no derivative, no
+    Mulsow 2024 names scattershot only ("brute force"). There is no start value, no derivative, no
     law of refraction. Where a broken surface sends light along several paths the shortest is taken,
     and a path may leave through a crease.
 
-    On calm water the place is between the point and the straight line; the first grid covers these
-    and as much as the point is deep all around.
+    A grid of 5 x 5 about its best knot is halved until it is small enough; while the best knot is
+    on the rim it moves and keeps its size. A length changes with the square of the distance and is
+    too blunt in the end: a ray nearby is searched by its distance from the point. Without one the
+    path goes through a crease, known to about 1e-6 m along it.
     """
-    x, y = 0.5 * start * e[0], 0.5 * start * e[1]
-    half = level + max(abs(x), abs(y))
-    _, x, y, _ = _best_knot(water, e, x, y, half, KNOTS, n, False)
-    x, y, shots, found = _narrowed(water, e, x, y, 2.0 * half / KNOTS, n)
-    return x, y, shots + 1, found
-
-
-@device
-def _narrowed(water: Water, e: Vector, x: float, y: float, half: float, n: float) -> Found:
-    """Return the nearest place of least optical length, from a place and half a grid's size on.
-
-    Found is a path that hits the point, or one through a crease, known to about 1e-6 m along it. A
-    length changes with the square of the distance and is too blunt in the end; there the offsets of
-    refracted rays are compared.
-    """
-    x, y, first, _ = _shrink(water, e, x, y, half, BLUNT_M, n, False)
-    px, py, second, offset = _shrink(water, e, x, y, NEIGHBOUR_M, 0.1 * CLOSE_M, n, True)
-    if offset <= CLOSE_M:
-        return px, py, first + second, True
+    xy, half, shots = xy.copy(), half.copy(), np.zeros(len(half), np.int64)
+    for _ in range(SHOTS):
+        rows = np.flatnonzero(half > BLUNT_M)
+        if not len(rows):
+            break
+        xy[:, rows], on_rim = _best_knot(pairs.of(rows), xy[:, rows], half[rows], 2)
+        half[rows] *= np.where(on_rim, 1.0, 0.5)
+        shots[rows] += 1
+    near, steps, is_ray = _search(pairs, xy, np.full(len(half), NEIGHBOUR_M), "mdfrt")
+    is_ray &= np.hypot(*(near - xy)) <= NEIGHBOUR_M
     # at an edge of the water the shortest path means nothing
-    inside = True
-    for i in (-1.0, 1.0):
-        for j in (-1.0, 1.0):
-            z = height_of(water, x + i * NEIGHBOUR_M, y + j * NEIGHBOUR_M)[0]
-            inside = inside and not np.isnan(z)
-    return x, y, first + second, inside
+    around = [np.array([[i], [j]]) * NEIGHBOUR_M for i, j in product((-1.0, 1.0), repeat=2)]
+    inside = np.all([~np.isnan(pairs.pierced(xy + corner)[0][2]) for corner in around], axis=0)
+    return np.where(is_ray, near, xy), shots + steps, is_ray | inside
 
 
-@device
-def _shrink(
-    water: Water, e: Vector, x: float, y: float, half: float, end: float, n: float,
-    by_offset: bool,
-) -> tuple[float, float, int, float]:  # fmt: skip
-    """Halve a grid of 5 x 5 about its best knot until it is small enough.
-
-    While the best knot is on the rim the grid moves and keeps its size.
-    """
-    best, shots = np.inf, 0
-    while shots < SHOTS and half > end and not (by_offset and best <= CLOSE_M):
-        shots += 1
-        best, x, y, on_rim = _best_knot(water, e, x, y, half, 2, n, by_offset)
-        if not on_rim:
-            half *= 0.5
-    return x, y, shots, best
-
-
-@device
 def _best_knot(
-    water: Water, e: Vector, x: float, y: float, half: float, knots: int, n: float,
-    by_offset: bool,
-) -> tuple[float, float, float, bool]:  # fmt: skip
-    """Return the least badness on a grid about x, y, its place, and whether that is on the rim.
+    pairs: Endpoints, xy: FloatArray, half: FloatArray, knots: int
+) -> tuple[FloatArray, BoolArray]:
+    """Return the places of the shortest paths on grids about x, y, and whether they are on the rim.
 
-    The grid has `knots` knots to each side of its middle, within `half`.
+    The grids have `knots` knots to each side of their middle, within `half`.
     """
-    best, best_i, best_j = _badness(water, e, x, y, n, by_offset), 0, 0
-    spacing = half / knots
-    for i in range(-knots, knots + 1):
-        for j in range(-knots, knots + 1):
-            bad = _badness(water, e, x + i * spacing, y + j * spacing, n, by_offset)
-            if bad < best:
-                best, best_i, best_j = bad, i, j
-    on_rim = max(abs(best_i), abs(best_j)) == knots
-    return best, x + best_i * spacing, y + best_j * spacing, on_rim
-
-
-@device
-def _badness(water: Water, e: Vector, x: float, y: float, n: float, by_offset: bool) -> float:
-    """Return the offset of a ray or the optical length of a path, metres; infinite without any."""
-    if by_offset:
-        mx, my = _offset(water, e, x, y, n)
-        return np.inf if np.isnan(mx) else float(np.sqrt(mx * mx + my * my))
-    z, b, c = height_of(water, x, y)
-    a = x, y, z
-    u = minus(e, a)
-    # the surface faces away from the camera
-    if not u[2] - b * u[0] - c * u[1] > 0.0:
-        return np.inf
-    return float(np.sqrt(dot(u, u)) + n * np.sqrt(dot(a, a)))
+    best, place, on_rim = pairs.length(xy), xy, np.zeros(len(half), np.bool_)
+    for knot in product(range(-knots, knots + 1), repeat=2):
+        there = xy + np.array(knot)[:, None] * (half / knots)
+        length = pairs.length(there)
+        is_shorter = length < best
+        best, place = np.where(is_shorter, length, best), np.where(is_shorter, there, place)
+        on_rim = np.where(is_shorter, max(map(abs, knot)) == knots, on_rim)
+    return place, on_rim

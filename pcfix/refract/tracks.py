@@ -33,7 +33,7 @@ import numpy as np
 from pcfix.kernels import device
 from pcfix.lens.algebra import Vector, beyond, dot, minus, row_of, scaled
 from pcfix.lens.formulas import PLAIN
-from pcfix.lens.imaging import Plain, image_and_gradients, image_of, plain_image, plain_lens
+from pcfix.lens.imaging import Plain, image_and_slopes, image_of, plain_image, plain_lens
 from pcfix.model import FloatArray, IntArray
 from pcfix.refract.batch import Optics
 from pcfix.refract.choice import Rig
@@ -121,19 +121,10 @@ def _set_rays(
 ) -> None:  # fmt: skip
     """Set the image of each point in a camera, its gradients by P (world frame), and the plane."""
     centre, offset, lens = row_of(rig.centres, c), rig.offset[c], optics.lenses[optics.row[c]]
-    r = optics.rotations[c]
-    right, down, ahead = row_of(r, 0), row_of(r, 1), row_of(r, 2)
     for j in range(marks.size):
-        p = three(tile, j)
-        way, normal = minus(p, centre), three(tile, 4 * TILE + j)
-        w = dot(right, way), dot(down, way), dot(ahead, way)
-        if plain is None:
-            u, v, g = image_and_gradients(lens, w[0], w[1], w[2])
-        else:
-            u, v, g = plain_image(plain, w)
+        p, normal = three(tile, j), three(tile, 4 * TILE + j)
+        u, v, by_u, by_v = image_and_slopes(lens, plain, optics.rotations[c], minus(p, centre))
         ray[_IMAGE * TILE + j], ray[(_IMAGE + 1) * TILE + j] = u, v
-        by_u = beyond(beyond(scaled(g[0], right), g[1], down), g[2], ahead)
-        by_v = beyond(beyond(scaled(g[3], right), g[4], down), g[5], ahead)
         put(ray, _BY_U * TILE + j, by_u)
         put(ray, _BY_V * TILE + j, by_v)
         put(ray, _PLANE * TILE + j, normal)

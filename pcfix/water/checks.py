@@ -26,8 +26,6 @@ from pcfix.water.surface import surface_above
 
 MOST_TILT = 0.05
 """Largest rise per metre of a surface. Rapids reach 2 %; a weir is steeper, but only a part."""
-DEEPEST_M = 100.0
-"""No photograph shows a bed at this depth."""
 DOUBTFUL_M, TOO_DEEP_M, DEEP_SHARE = 30.0, 60.0, 0.05
 """In clear water photographs show a bed down to the first depth; the second was never reported.
 A smaller share of deep points may be mismatches."""
@@ -172,7 +170,6 @@ class WaterMeeting(Sums):
     low_m: float = field(metadata=LEAST)
     high_m: float = field(metadata=MOST)
     lowest_water_m: float = field(metadata=LEAST)
-    least_depth_m: float = field(metadata=LEAST)
     most_depth_m: float = field(metadata=MOST)
 
     @classmethod
@@ -190,7 +187,6 @@ class WaterMeeting(Sums):
             low_m=float(z.min(initial=np.inf)),
             high_m=float(z.max(initial=-np.inf)),
             lowest_water_m=correction.lowest_water_m,
-            least_depth_m=float(depth.min(initial=np.inf)),
             most_depth_m=float(depth.max(initial=0.0)),
         )
 
@@ -199,35 +195,26 @@ class WaterMeeting(Sums):
 
         `deep` allows depths of more than `TOO_DEEP_M`. Returns the warnings as sentences.
         """
-        found = []
-        where = f"below the water ({water})"
-        if self.submerged == self.points and self.least_depth_m > DEEPEST_M:
-            raise GeometryError(
-                "water.above_cloud",
-                f"{name}: all points lie more than {DEEPEST_M:g} m {where}, the highest"
-                f" {self.least_depth_m:.0f} m{self.heights()}. Check the height of the water and"
-                " its vertical datum.",
-                path=name, depth_m=self.least_depth_m,
-            )  # fmt: skip
-        few = DEEP_SHARE * self.submerged
-        land = "" if self.submerged < self.points else "; no point is left as land"
-
-        def deeper(points: int, limit_m: float) -> str:
-            return (
+        found, few = [], DEEP_SHARE * self.submerged
+        is_refused = self.too_deep > few and not deep
+        points, limit_m = self.doubtful, DOUBTFUL_M
+        if is_refused:
+            points, limit_m = self.too_deep, TOO_DEEP_M
+        if points > few:
+            land = "" if self.submerged < self.points else "; no point is left as land"
+            words = (
                 f"{name}: {points:,} of {self.submerged:,} submerged points lie deeper than"
-                f" {limit_m:g} m, the deepest {self.most_depth_m:.0f} m {where}{land}"
-                f"{self.heights()}. Check the height of the water and its vertical datum"
+                f" {limit_m:g} m, the deepest {self.most_depth_m:.0f} m below the water"
+                f" ({water}){land}{self.heights()}. Check the height of the water and its vertical"
+                " datum"
             )
-
-        if self.too_deep > few and not deep:
-            raise GeometryError(
-                "water.too_deep",
-                f"{deeper(self.too_deep, TOO_DEEP_M)}, or use --deep if the depths are right.",
-                path=name, points=self.too_deep, depth_m=self.most_depth_m,
-            )  # fmt: skip
-        if self.doubtful > few:
-            text = f"{deeper(self.doubtful, DOUBTFUL_M)}."
-            found.append(PcfixWarning("water.deep", text, points=self.doubtful))
+            if is_refused:
+                words += ", or use --deep if the depths are right."
+                depth = self.most_depth_m
+                raise GeometryError(
+                    "water.too_deep", words, path=name, points=points, depth_m=depth
+                )
+            found.append(PcfixWarning("water.deep", f"{words}.", points=points))
         if self.uncovered_low:
             found.append(
                 PcfixWarning(

@@ -10,6 +10,7 @@ is only the second half; it needs a start and a scale, and gives every observati
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any, Literal, NamedTuple
@@ -373,43 +374,62 @@ def _spread(X: FloatArray, residual: FloatArray, limit: float) -> tuple[FloatArr
     return np.asarray(k**2 * (psi**2).sum() / spare / slope**2 * inverse), sigma
 
 
-NEIGHBOURS = 25
-FEWEST = 3
+NEIGHBOURS, FEWEST = 25, 3
+"""Points whose median is the height of a place, at most and at least."""
 
 
-def is_near(xy: FloatArray, cloud_xyz: FloatArray, radius_m: float) -> BoolArray:
-    """Return which points of a cloud lie within a radius of a place, in plan.
+class NearestPoints:
+    """The k points nearest to some places in plan, (p, 2), gathered from a cloud chunk by chunk.
 
-    Chunks of a cloud are thinned with it for `heights_from_cloud`.
+    `rows`, shape (p, k, c), are their coordinates and whatever else was added with them, the
+    nearest first; `distance_m`, shape (p, k), is infinite where there is none. Only those within a
+    radius, if there is one, are complete.
     """
-    from scipy.spatial import cKDTree
 
-    low, high = xy.min(axis=0) - radius_m, xy.max(axis=0) + radius_m
-    plan = cloud_xyz[:, :2]
-    near = ((plan >= low) & (plan <= high)).all(axis=1)
-    rows = np.flatnonzero(near)
-    beyond = np.nextafter(radius_m, np.inf)
-    near[rows] = np.isfinite(cKDTree(xy).query(plan[rows], distance_upper_bound=beyond)[0])
-    return near
+    def __init__(self, places: FloatArray, k: int, radius_m: float = np.inf, columns: int = 3):
+        self._places, self._radius_m = places, radius_m
+        self.distance_m = np.full((len(places), k), np.inf)
+        self.rows = np.full((len(places), k, columns), np.nan)
+
+    def add(self, points: FloatArray) -> None:
+        """Add n points, shape (n, c), that begin with x, y and z, metres, world frame."""
+        from scipy.spatial import cKDTree
+
+        if not len(self._places):
+            return
+        low, high = self._places.min(axis=0), self._places.max(axis=0)
+        away = np.maximum(low - points[:, :2], points[:, :2] - high).max(axis=1, initial=-np.inf)
+        points = points[away <= self._radius_m]
+        if not len(points):
+            return
+        # built faster, as it has few queries
+        tree, k = (
+            cKDTree(points[:, :2], balanced_tree=False, compact_nodes=False),
+            self.rows.shape[1],
+        )
+        distance, at = map(np.asarray, tree.query(self._places, k=range(1, k + 1)))
+        rows = np.concatenate([self.rows, points[np.where(np.isfinite(distance), at, 0)]], axis=1)
+        distance = np.hstack([self.distance_m, distance])
+        order = np.lexsort((rows[..., 2], distance), axis=-1)[:, :k]
+        self.distance_m = np.take_along_axis(distance, order, axis=1)
+        self.rows = np.take_along_axis(rows, order[..., None], axis=1)
+
+    def medians(self, values: FloatArray, radius_m: float) -> FloatArray:
+        """Return the median of values (p, k) of the points within a radius, shape (p,).
+
+        NaN for places with fewer than `FEWEST`. On the edge of the water half of the neighbours are
+        on land and half on the bed, so that on an even bank the median of their heights is that of
+        the edge.
+        """
+        near = self.distance_m <= radius_m
+        found, enough = np.full(len(near), np.nan), near.sum(axis=1) >= FEWEST
+        found[enough] = np.nanmedian(np.where(near, values, np.nan)[enough], axis=1)
+        return found
 
 
-def heights_from_cloud(xy: FloatArray, cloud_xyz: FloatArray, radius_m: float) -> FloatArray:
-    """Return the height of the cloud at places: the median of the nearest points.
-
-    On the edge of the water half of the neighbours are on land and half on the bed, so that on an
-    even bank their median is the height of the edge. Places have the shape (n, 2), the cloud (m,
-    3), metres, in one frame, thinned by `is_near`; only points within the radius count. NaN for
-    fewer than `FEWEST`.
-    """
-    from scipy.spatial import cKDTree
-
-    height = np.full(len(xy), np.nan)
-    if not len(xy) or not len(cloud_xyz):
-        return height
-    beyond = np.nextafter(radius_m, np.inf)
-    away, row = cKDTree(cloud_xyz[:, :2]).query(xy, NEIGHBOURS, distance_upper_bound=beyond)
-    found = np.isfinite(away)
-    z = np.where(found, cloud_xyz[np.where(found, row, 0), 2], np.nan)
-    enough = found.sum(axis=1) >= FEWEST
-    height[enough] = np.nanmedian(z[enough], axis=1)
-    return height
+def heights_from_cloud(xy: FloatArray, chunks: Iterable[FloatArray], radius_m: float) -> FloatArray:
+    """Return the heights of a cloud at places (n, 2); see `NearestPoints.medians`."""
+    near = NearestPoints(xy, NEIGHBOURS, radius_m)
+    for xyz in chunks:
+        near.add(xyz)
+    return near.medians(near.rows[..., 2], radius_m)

@@ -15,13 +15,12 @@ their own (Bollaerts et al. 2006, Statistics in Medicine 25: 1189-1206).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from pcfix.errors import GeometryError
-from pcfix.model import FloatArray, WaterMesh
+from pcfix.model import FloatArray, WaterRaster
 from pcfix.water.fit import (
     LEAST_SCALE_M,
     TO_SIGMA,
@@ -31,9 +30,6 @@ from pcfix.water.fit import (
     tukey_weight,
     usable_rows,
 )
-
-if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
 
 FEWEST = 10
 MOST_CELLS = 200_000
@@ -84,9 +80,9 @@ def fit_river(
     xyz : array, shape (n, 3)
         Metres, world frame, of both banks or one; rows that are not finite are ignored.
     bounds : tuple of 4 float
-        Least x, least y, greatest x, greatest y of the cloud, which the mesh has to cover.
+        Least x, least y, greatest x, greatest y of the cloud, which the raster has to cover.
     name : str
-        Name of the mesh.
+        Name of the raster.
     counts : array, shape (n,), optional
         See `pcfix.water.fit.fit_water`.
     """
@@ -126,7 +122,7 @@ def fit_river(
     residual, weight = np.full(len(points), np.nan), np.zeros(len(points))
     residual[known], weight[known] = profile.residual_m, profile.weight
     return RiverFit(
-        surface=_mesh(axis, profile, bounds, name),
+        surface=_raster(axis, profile, bounds, name),
         points=points,
         notes=tuple(notes),
         axis=axis,
@@ -137,10 +133,10 @@ def fit_river(
     )
 
 
-def _mesh(axis: Axis, profile: Profile, bounds: Bounds, name: str) -> WaterMesh:
-    """Return the surface over the bounds as a grid of triangles.
+def _raster(axis: Axis, profile: Profile, bounds: Bounds, name: str) -> WaterRaster:
+    """Return the surface over the bounds, whose corners are centres of cells.
 
-    Cross-sections would intersect on the inside of a bend; a grid does not fold.
+    Cross-sections would intersect on the inside of a bend; a raster does not fold.
     """
     left, bottom, right, top = bounds
     if not (np.isfinite(bounds).all() and right > left and top > bottom):
@@ -149,13 +145,10 @@ def _mesh(axis: Axis, profile: Profile, bounds: Bounds, name: str) -> WaterMesh:
     size = float(np.sqrt((right - left) * (top - bottom) / MOST_CELLS))
     cell = max(size, float(profile.station_m[1] - profile.station_m[0]) / 2.0)
     columns, rows = (int(np.ceil(side / cell)) + 1 for side in (right - left, top - bottom))
-    x, y = np.linspace(left, right, columns), np.linspace(bottom, top, rows)
+    x, y = left + cell * np.arange(columns), bottom + cell * np.arange(rows)[::-1]
     xy = np.column_stack([np.tile(x, rows), np.repeat(y, columns)])
-    vertices = np.column_stack([xy, profile.height_at(axis.locate(xy)[0])])
-    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
-    halves = (0, 1, columns), (1, columns + 1, columns)  # counter-clockwise from above
-    triangles = np.vstack([corner[:, None] + np.array(half) for half in halves])
-    return WaterMesh(vertices, triangles.astype(np.int64), name)
+    height = profile.height_at(axis.locate(xy)[0]).reshape(rows, columns)
+    return WaterRaster(height, left - cell / 2.0, y[0] + cell / 2.0, (cell, cell), name)
 
 
 REACH = 2.0
@@ -170,31 +163,12 @@ class Axis:
     xy: FloatArray  # (m, 2), its vertices, metres, world frame
     width_m: float  # twice the rms distance of the points from it
 
-    @cached_property
-    def _tree(self) -> cKDTree:
-        from scipy.spatial import cKDTree
-
-        return cKDTree(self.xy)
-
     def locate(self, xy: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the distance along the line of places (n, 2), and their distance from it, m.
+        """Return the distance along the line of places (n, 2), and their distance from it, m."""
+        import shapely
 
-        Each place is projected onto the segments on both sides of the nearest vertex.
-        """
-        edges = np.diff(self.xy, axis=0)
-        lengths = np.hypot(*edges.T)
-        stations = np.concatenate([[0.0], np.cumsum(lengths)])
-        nearest = np.asarray(self._tree.query(xy)[1], np.int64)
-        along, away = np.empty((2, len(xy))), np.empty((2, len(xy)))
-        for side in (0, 1):
-            i = np.clip(nearest + side - 1, 0, len(edges) - 1)
-            local, edge = xy - self.xy[i], edges[i]
-            share = (local * edge).sum(axis=1) / np.maximum(lengths[i] ** 2, 1e-12)
-            share = np.clip(share, 0.0, 1.0)
-            along[side] = stations[i] + share * lengths[i]
-            away[side] = np.hypot(*(local - share[:, None] * edge).T)
-        first = away[0] <= away[1]
-        return np.where(first, along[0], along[1]), away.min(axis=0)
+        line, places = shapely.linestrings(self.xy), shapely.points(xy)
+        return shapely.line_locate_point(line, places), shapely.distance(line, places)
 
 
 def flow_axis(xy: FloatArray) -> Axis:

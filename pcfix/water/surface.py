@@ -79,16 +79,11 @@ def surface_above(
             return SurfaceAbove(
                 np.where(np.isfinite(height), height, np.nan), np.zeros((len(xyz), 2))
             )
-        case WaterMesh():
-            tin, (x, y) = build_tin(water), np.ascontiguousarray(xyz[:, :2].T)
-            facet = np.empty(len(xyz), np.int64)
-            in_tiles(_set_facets, len(xyz), tin, x, y, facet)
-            a, b, c = tin.planes[facet].T
-            height = a + b * (x - tin.origin_x) + c * (y - tin.origin_y)
-            return SurfaceAbove(np.where(facet >= 0, height, np.nan), np.column_stack([b, c]))
-        case WaterRaster():
+        case WaterMesh() | WaterRaster():
             x, y = np.ascontiguousarray(xyz[:, :2].T)
-            return SurfaceAbove(*heights_above(build_field(water), x, y))
+            tin = build_tin(water) if isinstance(water, WaterMesh) else None
+            field = build_field(water) if isinstance(water, WaterRaster) else None
+            return SurfaceAbove(*heights_above(tin, field, x, y))
 
 
 def is_submerged(z: FloatArray, surface: SurfaceAbove) -> BoolArray:
@@ -145,8 +140,8 @@ def build_fields(
 
 
 @device
-def patch_at(field: Field, x: float, y: float) -> tuple[float, float, float, float, float, float]:
-    """Return z00, s, t, both differences and k at a plan position (world frame); NaN if unknown.
+def height_at(field: Field, x: float, y: float) -> tuple[float, float, float]:
+    """Return height, dz/dx and dz/dy at a plan position (world frame); NaN if unknown.
 
     The outermost patch is extended over the outer half of the cells at the edge.
     """
@@ -154,39 +149,15 @@ def patch_at(field: Field, x: float, y: float) -> tuple[float, float, float, flo
     first, rows, columns = shape[k, 0], shape[k, 1], shape[k, 2]
     u, v = (x - frame[k, 0]) / frame[k, 2], (frame[k, 1] - y) / frame[k, 3]
     if not (-0.5 <= u <= columns - 0.5 and -0.5 <= v <= rows - 0.5):
-        return np.nan, 0.0, 0.0, 0.0, 0.0, 0.0
+        return np.nan, 0.0, 0.0
     column = min(max(int(np.floor(u)), 0), columns - 2)
     row = min(max(int(np.floor(v)), 0), rows - 2)
-    at = first + row * columns + column
+    at, s, t = first + row * columns + column, u - column, v - row
     z = field.heights[at]
-    east = field.heights[at + 1] - z
-    south = field.heights[at + columns] - z
+    east, south = field.heights[at + 1] - z, field.heights[at + columns] - z
     twist = field.heights[at + columns + 1] - z - east - south
-    return z, u - column, v - row, east, south, twist
-
-
-@device
-def height_at(field: Field, x: float, y: float) -> tuple[float, float, float]:
-    """Return height, dz/dx and dz/dy at a plan position (world frame); NaN if unknown."""
-    z, s, t, east, south, twist = patch_at(field, x, y)
     height = z + s * east + t * south + s * t * twist
-    cell_x, cell_y = field.frame[field.which, 2], field.frame[field.which, 3]
-    return height, (east + t * twist) / cell_x, -(south + s * twist) / cell_y
-
-
-def heights_above(field: Field, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return `height_at` for n positions: heights, shape (n,), and slopes, shape (n, 2)."""
-    height, slope = np.empty(x.size), np.empty((x.size, 2))
-    in_tiles(_set_heights, x.size, field, x, y, height, slope)
-    return height, slope
-
-
-@kernel
-def _set_heights(
-    span: Span, field: Field, x: FloatArray, y: FloatArray, height: FloatArray, slope: FloatArray
-) -> None:
-    for i in range(*span):
-        height[i], slope[i, 0], slope[i, 1] = height_at(field, x[i], y[i])
+    return height, (east + t * twist) / frame[k, 2], -(south + s * twist) / frame[k, 3]
 
 
 class OwnWater(NamedTuple):
@@ -290,13 +261,37 @@ def _inside(corners: FloatArray, u: float, v: float) -> bool:
     return bool(s >= -EDGE_TOLERANCE and t >= -EDGE_TOLERANCE and s + t <= 1.0 + EDGE_TOLERANCE)
 
 
+@device
+def surface_at(
+    tin: Tin | None, field: Field | None, x: float, y: float
+) -> tuple[float, float, float]:
+    """Return height, dz/dx and dz/dy of a mesh or raster at a plan position; NaN if unknown."""
+    if field is not None:
+        return height_at(field, x, y)
+    if tin is not None:
+        facet = locate(tin, x, y)
+        if facet >= 0:
+            b, c = tin.planes[facet, 1], tin.planes[facet, 2]
+            return tin.planes[facet, 0] + b * (x - tin.origin_x) + c * (y - tin.origin_y), b, c
+    return np.nan, 0.0, 0.0
+
+
+def heights_above(
+    tin: Tin | None, field: Field | None, x: FloatArray, y: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return `surface_at` for n positions: heights, shape (n,), and slopes, shape (n, 2)."""
+    height, slope = np.empty(x.size), np.empty((x.size, 2))
+    in_tiles(_set_heights, x.size, tin, field, x, y, height, slope)
+    return height, slope
+
+
 @kernel
-def _set_facets(
-    span: Span, tin: Tin, x: FloatArray, y: FloatArray, facet: npt.NDArray[np.int64]
-) -> None:
-    """Set `locate` for n positions."""
+def _set_heights(
+    span: Span, tin: Tin | None, field: Field | None, x: FloatArray, y: FloatArray,
+    height: FloatArray, slope: FloatArray,
+) -> None:  # fmt: skip
     for i in range(*span):
-        facet[i] = locate(tin, x[i], y[i])
+        height[i], slope[i, 0], slope[i, 1] = surface_at(tin, field, x[i], y[i])
 
 
 APART_M = 0.01

@@ -20,6 +20,7 @@ import numpy as np
 from pcfix.model import WaterMesh, WaterPlane, WaterRaster
 from pcfix.refract.tracing import METHODS, trace
 from pcfix.running import threads
+from pcfix.water.surface import surface_above
 
 INDEX = 1.34
 HEAD = (
@@ -99,7 +100,7 @@ def compare(points, centres, water):
             seconds.append(time.process_time() - started)
         alone = trace(centres, points, water, refractive_index=INDEX, method=method, narrow=False)
         ray = alone.converged & ~alone.on_crease
-        miss = misses(points, alone)[ray].max()
+        miss = misses(points, alone, water)[ray].max()
         apart = np.linalg.norm(found.piercing_xyz - truth.piercing_xyz, axis=1)
         other = apart[apart > 1e-4]
         print(
@@ -111,9 +112,9 @@ def compare(points, centres, water):
         )
 
 
-def misses(points, found):
+def misses(points, found, water):
     """Return how far from the points the rays pass that Snell's law bends where they pierce."""
-    b, c = found.slope.T
+    b, c = surface_above(water, found.piercing_xyz).slope.T
     normal = np.column_stack([-b, -c, np.ones(len(b))]) / np.sqrt(1 + b * b + c * c)[:, None]
     down = (found.direction * normal).sum(axis=1)[:, None]
     along = (found.direction - down * normal) / INDEX

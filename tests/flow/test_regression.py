@@ -13,13 +13,8 @@ from pcfix.model import Outcome, WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Learned
 from pcfix.refract.methods import correct
-from pcfix.refract.regression import (
-    LEAST_NEIGHBOURS,
-    NEIGHBOURS,
-    ApparentDepths,
-    DepthRegression,
-    fit_depths,
-)
+from pcfix.refract.regression import NEIGHBOURS, DepthRegression, apparent_depths, fit_depths
+from pcfix.water.fit import FEWEST
 from pcfix.water.surface import surface_above
 from tests.utils.batches import batch_of
 from tests.utils.codes import refused
@@ -146,16 +141,13 @@ def test_noise_and_land(tmp_path):
 
 def test_nearest_points():
     xyz, xy = cloud(3000, noise_m=0.1), places(8)
-    around = ApparentDepths(xy)
-    for part in parts(xyz, 7):
-        around.add(part.xyz, part.surface)
-    depth, level, covered = around.medians(1.5)
+    depth, level, _, radius = apparent_depths(xy, parts(xyz, 7))
     for i, place in enumerate(xy):
         distance = np.hypot(*(xyz[:, :2] - place).T)
         wet = xyz[:, 2] < 12.0
         rows = np.argsort(np.where(wet, distance, np.inf))[:NEIGHBOURS]
-        rows = rows[distance[rows] <= 1.5]
-        assert covered[i] == (len(rows) >= LEAST_NEIGHBOURS)
+        rows = rows[distance[rows] <= radius]
+        assert len(rows) >= FEWEST
         assert depth[i] == pytest.approx(np.median(12.0 - xyz[rows, 2]), abs=1e-12)
         assert level[i] == 12.0
 

@@ -34,7 +34,7 @@ def labelled(part, mask=None, pieces=1, corners=None, **choices):
             yield Part(part.xyz[r], above, part.classes[r])
 
     low, high = part.xyz[:, :2].min(axis=0), part.xyz[:, :2].max(axis=0)
-    labelling = Labelling(LabelRules(**choices), mask).scanned(parts, *(corners or (low, high)))
+    labelling = Labelling(LabelRules(**choices), mask).scanned(parts(), *(corners or (low, high)))
     labels = [labelling.labels(p) for p in parts()]
     counts = reduce(add, [one for _, one in labels])
     counted = SimpleNamespace(

@@ -215,15 +215,14 @@ def test_lost(method):
         ({"refractive_index": math.nan}, "option.range"),
         ({"target": np.zeros((4, 3))}, "trace.shapes"),
         ({"target": np.zeros((2, 2))}, "trace.shapes"),
-        ({"surfaces": WaterDimension("w_surf")}, "trace.surface"),
-        ({"surfaces": [0.0, WaterPlane(-1.0)]}, "trace.surfaces"),
+        ({"water": WaterDimension("w_surf")}, "trace.surface"),
     ],
 )
 def test_refused(change, code):
     given = {
         "target": np.zeros((3, 3)),
         "origin": np.ones((3, 3)),
-        "surfaces": WaterPlane(0.0),
+        "water": WaterPlane(0.0),
         "refractive_index": INDEX,
     }
     with refused(code, SettingError):
