@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import asdict, replace
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,14 +13,14 @@ import numpy.typing as npt
 from pcfix.blocks import empty, release
 from pcfix.clean.points import CleanSummary, Cloud, Reason, flag_neighbours, flag_weak
 from pcfix.errors import bad_file
-from pcfix.flow.runner import Chunk, Command, Progress, stream
+from pcfix.flow.runner import Chunk, Command, FileTask, FileWork, Progress, stream
 from pcfix.flow.surfaces import CloudView, Points, find_surface, points_of, view_of
 from pcfix.flow.tiles import run_command
 from pcfix.io.files import scratch_arrays
 from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource
-from pcfix.io.las.writing import cleaning_vlr, corrected_identity, noted_header, own_settings
-from pcfix.io.tiles import CloudFiles, Clouds, open_cloud
+from pcfix.io.las.writing import cleaning_vlr, noted_header, own_settings
+from pcfix.io.tiles import Clouds, open_cloud
 from pcfix.model import LOW_NOISE, NOISE_CLASSES, BoolArray, FloatArray, WaterSurface
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import WaterOptions
@@ -70,11 +69,10 @@ def clean_file(
     given = taken(CleanOptions, options, keywords, "clean_file")
     command = Command(
         "clean",
-        plan=partial(_plan_file, given, progress),
-        process=partial(stream, _Cleaning),
-        check=lambda plan, tally: None,
-        summarize=lambda plan, tally, findings, ends: replace(
-            plan.summary, input=ends.input, output=ends.output, seconds=round(ends.seconds, 3)
+        partial(_plan_file, given, progress),
+        partial(stream, _cleaning),
+        lambda plan, task, count: replace(
+            plan.summary, input=str(task.source), output=str(task.target), seconds=task.seconds
         ),
     )
     last = None
@@ -196,11 +194,9 @@ class CleanPlan(NamedTuple):
     summary: CleanSummary
 
 
-def _plan_file(
-    options: CleanOptions, progress: Progress | None,
-    cloud: CloudFiles, target: Path, kept: list[Chunk] | None = None,
-) -> CleanPlan:  # fmt: skip
+def _plan_file(options: CleanOptions, progress: Progress | None, task: FileTask) -> CleanPlan:
     """Find the noise of a whole cloud; large arrays are on the disk of the target."""
+    cloud = task.source
     with open_cloud(cloud) as source:
         names, points = set(source.header.point_format.dimension_names), len(source)
         try:
@@ -224,9 +220,9 @@ def _plan_file(
                 withheld = np.asarray(chunk["withheld"]).astype(np.bool_)
                 yield Tested(points_of(chunk, source, water), withheld, rays)
 
-    beside = target.absolute()
+    beside = task.target.absolute()
     if not beside.parent.is_dir():  # the folder of many files is made later
-        beside = next(one for one in beside.parents if one.is_dir()) / target.name
+        beside = next(one for one in beside.parents if one.is_dir()) / beside.name
     with scratch_arrays(beside):
         noise, summary = find_noise(
             str(cloud), options, lambda: view_of(cloud), names, chunks, points,
@@ -240,27 +236,25 @@ def _plan_file(
     return CleanPlan(np.packbits(noise), options.drop, summary)
 
 
-class _Cleaning:
-    """The cleaning of one file: its header with a record of it, and each chunk."""
+def _cleaning(plan: CleanPlan, source: LasSource) -> FileWork:
+    """Return the cleaning of one file: its header with a record of it, and each chunk."""
+    found = plan.summary.as_dict()
+    content = {name: found[name] for name in ("pcfix", "settings", "water", "reasons")}
+    header = noted_header(source, cleaning_vlr({**content, "drop": plan.drop}))
 
-    def __init__(self, plan: CleanPlan, source: LasSource) -> None:
-        self._plan = plan
-        found = plan.summary.as_dict()
-        content = {name: found[name] for name in ("pcfix", "settings", "water", "reasons")}
-        self.header = noted_header(source, cleaning_vlr({**content, "drop": plan.drop}))
-        self.identity = corrected_identity(source)
-
-    def compute(self, points: Chunk, row: int) -> tuple[BoolArray, int]:
+    def compute(points: Chunk, row: int) -> tuple[BoolArray, int]:
         """Return which points of a chunk are noise, and their number."""
         end, byte = row + len(points), row // 8
-        bits = np.unpackbits(self._plan.noise[byte : (end + 7) // 8])
+        bits = np.unpackbits(plan.noise[byte : (end + 7) // 8])
         return bits[row - 8 * byte : end - 8 * byte].astype(np.bool_), len(points)
 
-    def apply(self, points: Chunk, noise: BoolArray) -> Chunk:
+    def apply(points: Chunk, noise: BoolArray) -> Chunk:
         """Flag or drop the noise."""
-        new = convert(points, self.header.point_format)
-        if self._plan.drop:
+        new = convert(points, header.point_format)
+        if plan.drop:
             return new[~noise]
         new.array["classification"][noise] = LOW_NOISE
         new["withheld"][:] = np.asarray(new["withheld"]) | noise
         return new
+
+    return FileWork(header, compute, apply)

@@ -2,7 +2,7 @@
 
 A `Plan` holds what all points of a cloud have in common; `pcfix.flow.planning` makes it.
 `correct_chunk` depends on nothing else, and returns statistics (`CloudTally`) with the points.
-These are added up, and go through `pcfix.flow.outcome`. A housing port is a medium like a water
+These are added up, and `pcfix.flow.correct.finish` makes the summary of them. A housing port is a medium like a water
 surface: all points are below it, whatever their height, and have no depth.
 """
 

@@ -34,7 +34,7 @@ from pcfix.io.files import check_output, scratch_arrays, write_text
 from pcfix.io.las.source import LasSource, coordinates, metric_crs, part_report
 from pcfix.io.las.writing import is_ours
 from pcfix.io.styles import raster_style
-from pcfix.io.tiles import CloudFiles, Clouds, Tiles, cloud_of, inputs_of, open_cloud
+from pcfix.io.tiles import CloudFiles, Clouds, cloud_of, inputs_of, open_cloud
 from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES, FloatArray
 from pcfix.options.declare import File, taken
 from pcfix.options.steps import MIN_RESOLUTION_M, DsmOptions, DsmRules
@@ -152,7 +152,6 @@ def grid_dsm(
         files, output, given,
         more=more.values(), check=rasters.check_tif, progress=progress,
     )  # fmt: skip
-    cloud: CloudFiles = files if isinstance(files, Tiles) else task.source
     style = task.target.with_suffix(".qml")
     if given.style:
         check_output(style, overwrite=given.overwrite, inputs=inputs_of(files))
@@ -168,7 +167,7 @@ def grid_dsm(
         }
         folder = stack.enter_context(scratch_folder(task.target))
         stack.enter_context(scratch_arrays(task.target))
-        with open_cloud(cloud) as source:
+        with open_cloud(task.source) as source:
             crs, count = metric_crs(source), len(source)
             corrected = any(is_ours(vlr) for vlr in source.vlrs)
             read = _points_of(source, rules, report)
@@ -220,12 +219,12 @@ def grid_dsm(
         spacing_m=apart_m,
         hole_m=reach_m if rules.method == "tin" else rules.fill,
         settings=asdict(rules),
-        seconds=round(task.seconds, 3),
+        seconds=task.seconds,
         resolution_is="given" if given.resolution else "chosen",
         part=part_report(task.source),
         stray=len(read) - len(used),
     )
-    write_summary(task, result.as_dict())
+    write_summary(given, result.as_dict())
     return result
 
 

@@ -1,8 +1,8 @@
 """The loop of every command that rewrites a cloud: read a chunk, compute, write, add up.
 
 A `Command` plans once for a whole cloud; then each file goes through `stream`, chunk by chunk, with
-the next chunk being read and the last one written meanwhile. `run_command` does that for one file,
-`pcfix.flow.tiles` for many.
+the next chunk being read and the last one written meanwhile. `pcfix.flow.tiles` does that for one
+file or many.
 """
 
 from __future__ import annotations
@@ -10,16 +10,16 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from pcfix.io.files import check_input, check_output, write_bytes, write_text
-from pcfix.io.las.source import CloudPart, LasSource
-from pcfix.io.las.writing import check_suffix, las_writer
+from pcfix.io.las.source import LasSource
+from pcfix.io.las.writing import check_suffix, corrected_identity, las_writer
 from pcfix.io.tiles import Tiles, check_one_file, inputs_of, open_cloud, part_of
 from pcfix.options.declare import File
 from pcfix.running import running
@@ -29,12 +29,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Chunk: TypeAlias = "laspy.ScaleAwarePointRecord"
-Header: TypeAlias = "laspy.LasHeader"
 Progress: TypeAlias = Callable[[int, int], None]
 Bar: TypeAlias = Callable[[str], AbstractContextManager[Progress | None]]
 """Shows the progress of a step, given its title."""
-Check: TypeAlias = Callable[[Any], Any]
-"""Refuses the statistics of a whole cloud that cannot be right, else returns its findings."""
+Finish: TypeAlias = Callable[[Any], Any]
+"""Takes the statistics of a whole cloud; refuses what cannot be right, else returns the result."""
 
 
 def no_bar(title: str) -> AbstractContextManager[None]:
@@ -42,57 +41,26 @@ def no_bar(title: str) -> AbstractContextManager[None]:
     return nullcontext()
 
 
-class FileWork(Protocol):
-    """What a command does to one file."""
+class FileWork(NamedTuple):
+    """What a command does to one file.
 
-    header: Header
-    identity: bytes
-    """The bytes of the header that name the software of the output."""
-
-    def compute(self, points: Chunk, row: int) -> tuple[Any, Any]:
-        """Return the result for a chunk that begins at a row of the cloud, and its statistics."""
-
-    def apply(self, points: Chunk, result: Any) -> Chunk:
-        """Return the points of the output; runs while the next chunk is computed."""
-
-
-@dataclass(frozen=True)
-class Command:
-    """A command that rewrites clouds, as functions.
-
-    `plan` takes a cloud, the path of the output, and chunks to keep in memory (`FileTask.kept`),
-    and returns all that the points have in common, which can be pickled. `process` takes one file
-    through a plan (plan, task, first row of the cloud, check or None), and returns the statistics
-    and the findings of the check; see `stream`. `check` refuses, by plan and statistics of the
-    whole cloud, what cannot be right. `summarize` makes the result of plan, statistics, findings
-    and `Ends`.
+    `compute` takes a chunk and the row of the cloud at which it begins, and returns a result and
+    statistics. `apply` takes the chunk and the result, and returns the points of the output; it
+    runs while the next chunk is computed.
     """
 
-    name: str
-    plan: Callable[[Any, Path, list[Chunk] | None], Any]
-    process: Callable[[Any, FileTask, int, Check | None], tuple[Any, Any]]
-    check: Callable[[Any, Any], Any]
-    summarize: Callable[[Any, Any, Any, Ends], Any]
-
-
-@dataclass(frozen=True)
-class Ends:
-    """The names of input and output for a summary, the part that was read, and the time so far."""
-
-    input: str
-    output: str
-    seconds: float
-    part: dict[str, Any] | None = None
+    header: laspy.LasHeader
+    compute: Callable[[Chunk, int], tuple[Any, Any]]
+    apply: Callable[[Chunk, Any], Chunk]
+    identity: bytes = b""  # of the software in the header; by default that of pcfix
 
 
 @dataclass(frozen=True)
 class FileTask:
     """A cloud to read, a cloud to write, and how."""
 
-    source: Path | CloudPart
+    source: Any  # path, part, or many files; a name in a pipeline of PDAL
     target: Path
-    summary: File | None = None  # JSON file
-    overwrite: bool = False
     jobs: int | None = None
     progress: Progress | None = None  # called with (points done, points in all)
     started: float = field(default_factory=time.perf_counter)
@@ -101,29 +69,40 @@ class FileTask:
     @property
     def seconds(self) -> float:
         """Time since the start."""
-        return time.perf_counter() - self.started
+        return round(time.perf_counter() - self.started, 3)
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command that rewrites clouds, as functions.
+
+    `plan` takes a task for the whole cloud, and returns all that its points have in common, which
+    can be pickled. `process` takes one file through a plan, and returns statistics and result; see
+    `stream`. `finish` takes the plan, the task and the statistics of the whole cloud; it refuses
+    what cannot be right, and returns the result of the command.
+    """
+
+    name: str
+    plan: Callable[[FileTask], Any]
+    process: Callable[[Any, FileTask, int, Finish], tuple[Any, Any]]
+    finish: Callable[[Any, FileTask, Any], Any]
 
 
 def stream(
-    work: Callable[[Any, LasSource], FileWork],
-    plan: Any,
-    task: FileTask,
-    row: int = 0,
-    check: Check | None = None,
+    work: Callable[[Any, LasSource], FileWork], plan: Any, task: FileTask, row: int, finish: Finish
 ) -> tuple[Any, Any]:
     """Take every chunk of a file through a command; the target appears when all went well.
 
     `work` returns what is done to the opened file by the plan; the file begins at a row of the
-    whole cloud. Returns the statistics, and the findings of the check.
+    whole cloud. Returns the statistics, and what `finish` makes of them.
     """
     with open_cloud(task.source, task.jobs, kept=task.kept or None) as source:
         own, total = work(plan, source), len(source)
-        tally, findings = None, None
-        done, end, reached = 0, 0, 0.0  # points before and after the chunk, and those reported
+        tally, done, end, reached = None, 0, 0, 0.0  # points before and after, and those reported
         # the index of a COPC file would be wrong
         evlrs = [one for one in source.evlrs if one.user_id != "copc"]
-        last = evlrs, own.identity, task.jobs
-        with las_writer(task.target, own.header, *last) as append, _thread(task.jobs) as writer:
+        last = evlrs, own.identity or corrected_identity(source), task.jobs
+        with las_writer(task.target, own.header, *last) as append, ThreadPoolExecutor(1) as writer:
 
             def write(points: Chunk, result: Any) -> None:
                 append(own.apply(points, result))
@@ -135,7 +114,7 @@ def stream(
                     task.progress(round(reached), total)
 
             written: Future[None] | None = None
-            for points in read_ahead(source.chunks(), task.jobs):
+            for points in read_ahead(source.chunks()):
                 end = done + len(points)
                 with running(report=report):
                     result, one = own.compute(points, row + done)
@@ -147,33 +126,16 @@ def stream(
                 report(len(points))
             if written is not None:
                 written.result()
-            if check is not None:  # before the temporary file is renamed
-                findings = check(tally)
-    return tally, findings
+            return tally, finish(tally)  # before the temporary file is renamed
 
 
-def read_ahead(chunks: Iterator[Any], jobs: int | None) -> Iterator[Any]:
-    """Yield chunks while the next one is read; with one job without a thread."""
-    with _thread(jobs) as reader:
+def read_ahead(chunks: Iterator[Any]) -> Iterator[Any]:
+    """Yield chunks while the next one is read."""
+    with ThreadPoolExecutor(1) as reader:
         following = reader.submit(next, chunks, None)
         while (one := following.result()) is not None:
             following = reader.submit(next, chunks, None)
             yield one
-
-
-def _thread(jobs: int | None) -> Executor:
-    """Return another thread, or this one for a single job."""
-    return _ThisThread() if jobs == 1 else ThreadPoolExecutor(1)
-
-
-class _ThisThread(Executor):
-    """Runs each call at once, so that Ctrl-C ends a process of many without other threads."""
-
-    def submit(self, call: Any, /, *given: Any, **keywords: Any) -> Future[Any]:
-        """Return what a call gave."""
-        future: Future[Any] = Future()
-        future.set_result(call(*given, **keywords))
-        return future
 
 
 def json_text(content: dict[str, Any]) -> str:
@@ -227,11 +189,12 @@ def file_task(
     """
     started = time.perf_counter()
     check_one_file(input, options)
-    source = Path(str(input)) if isinstance(input, Tiles) else check_input(input)
+    source: Any = input if isinstance(input, Tiles) else check_input(input)
     known = [one for one in (*inputs_of(input), *reads) if isinstance(one, str | PathLike)]
     for path in (output, *more):
         known.append(check(path, overwrite=options.overwrite, inputs=known))
     check_summary(options, known)
-    summary, jobs = (getattr(options, name, None) for name in ("summary", "jobs"))
-    cloud, target = part_of(source, options), Path(output)
-    return FileTask(cloud, target, summary, options.overwrite, jobs, progress, started=started)
+    if not isinstance(source, Tiles):
+        source = part_of(source, options)
+    jobs = getattr(options, "jobs", None)
+    return FileTask(source, Path(output), jobs, progress, started)

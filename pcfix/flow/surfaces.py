@@ -108,7 +108,7 @@ def file_points(
 ) -> Iterator[Points]:
     """Yield all points of a LAS or LAZ file, or of many, chunk by chunk; see `LasSource`."""
     with open_cloud(cloud, jobs, kept=kept) as source:
-        yield from read_ahead((points_of(one, source, water) for one in source.chunks()), jobs)
+        yield from read_ahead(points_of(one, source, water) for one in source.chunks())
 
 
 def first_points(chunks: Iterable[Points]) -> Points:

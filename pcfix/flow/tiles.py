@@ -23,7 +23,6 @@ from functools import partial, reduce
 from hashlib import sha256
 from operator import add
 from pathlib import Path
-from time import perf_counter
 from types import ModuleType
 from typing import Any, cast
 
@@ -31,7 +30,6 @@ from pcfix import version
 from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError
 from pcfix.flow.runner import (
     Command,
-    Ends,
     FileTask,
     Progress,
     check_cloud,
@@ -41,7 +39,6 @@ from pcfix.flow.runner import (
 )
 from pcfix.io.atomic import all_or_none
 from pcfix.io.files import belonging, file_state, path_of, read_tally, write_tally
-from pcfix.io.las.source import part_report
 from pcfix.io.tiles import BrokenTileError, Clouds, Tiles, check_one_file, tiles_of
 from pcfix.io.vectors import LAYER_MARK
 from pcfix.libraries import optional_library
@@ -107,7 +104,7 @@ def do_tile(pickled: bytes, tile: Tile, jobs: int | None = None) -> str:
         process, plan = pickle.loads(pickled)
         with threads(jobs), warnings.catch_warnings():
             warnings.simplefilter("ignore", PcfixWarning)  # shown when the plan was made
-            process(plan, FileTask(tile.source, tile.target, jobs=jobs), tile.row, tile.keep)
+            process(plan, FileTask(tile.source, tile.target, jobs), tile.row, tile.keep)
     except PcfixError as error:
         return str(error)
     return ""
@@ -122,29 +119,33 @@ def run_command(
     reads: Iterable[Any] = (),
     progress: Progress | None = None,
 ) -> Any:
-    """Run a command over one file or many; `reads` are further inputs. Returns its result."""
+    """Run a command over one file or many; `reads` are further inputs. Returns its result.
+
+    With many files, `progress` is called with (points done, points in all) after each.
+    """
     tiles = tiles_of(input)
     if tiles is not None:
-        return run_tiles(command, tiles, output, options, progress)
+        return _run_tiles(command, tiles, output, options, progress)
     task = file_task(cast("File", input), output, options, reads=reads, progress=progress)
     with threads(task.jobs), all_or_none():
-        plan = command.plan(task.source, task.target, task.kept)
-        tally, findings = command.process(plan, task, 0, partial(command.check, plan))
-        ends = Ends(str(task.source), str(task.target), task.seconds, part_report(task.source))
-        result = command.summarize(plan, tally, findings, ends)
-        if task.summary is not None:
-            write_summary(task, result.as_dict())
+        plan = command.plan(task)
+        _, result = command.process(plan, task, 0, partial(command.finish, plan, task))
+        _write_summary(options, result)
     return result
 
 
-def run_tiles(
-    command: Command, tiles: Tiles, output: File, options: Any, progress: Progress | None = None
-) -> Any:
-    """Run a command over all files that are not finished yet, and return its result.
+def _write_summary(options: Any, result: Any) -> None:
+    """Write the summary of a command, if it has one and its options name a file."""
+    if getattr(options, "summary", None) is not None:
+        write_summary(options, result.as_dict())
 
-    `progress` is called with (points done, points in all) after each file.
-    """
-    started, folder = perf_counter(), path_of(output)
+
+def _run_tiles(
+    command: Command, tiles: Tiles, output: File, options: Any, progress: Progress | None
+) -> Any:
+    """Run a command over all files that are not finished yet, and return its result."""
+    folder = path_of(output)
+    task = FileTask(tiles, folder)
     check_one_file(tiles, options)
     check_folder(folder, tiles)
     check_summary(options, tiles.paths)
@@ -178,16 +179,13 @@ def run_tiles(
             tally = reduce(add, tallies) if tallies[0] is not None else None
             # Only the statistics of the whole cloud show whether cameras and water fit.
             try:
-                findings = command.check(plan, tally)
+                result = command.finish(plan, task, tally)
             except PcfixError:
                 for tile in todo:
                     tile.record.unlink(missing_ok=True)
                     tile.target.unlink(missing_ok=True)
                 raise
-            ends = Ends(str(tiles), str(output), perf_counter() - started)
-            result = command.summarize(plan, tally, findings, ends)
-            if getattr(options, "summary", None) is not None:
-                write_summary(options, result.as_dict())
+            _write_summary(options, result)
     if failed:
         count = len(work) + len(readable.broken)
         raise InputError(
@@ -246,7 +244,7 @@ def _planned(command: Command, tiles: Tiles, folder: Path) -> tuple[Any, Tiles]:
     """Return the plan, and the tiles that could be read for it."""
     while True:
         try:
-            return command.plan(tiles, folder, None), tiles
+            return command.plan(FileTask(tiles, folder)), tiles
         except BrokenTileError as error:
             tiles = tiles.without(error.path, str(error))
 
@@ -261,37 +259,40 @@ def in_processes(
     process: so only those whose process dies again have an error.
     """
     jobs = jobs or current().threads
-    count = min(most, jobs, len(tasks))
-    if count <= 1:
+    most = min(most, jobs, len(tasks))
+    if most <= 1:
         for task in tasks:
             yield task, work(shared, task, jobs)
         return
-    lost = []
-    with _processes(count) as pool:
-        with _without_main():
-            given = shared, max(1, jobs // count)
-            futures = {pool.submit(_interruptible, work, given, task): task for task in tasks}
-        for future in as_completed(futures):
-            try:
-                yield futures[future], future.result()
-            except BrokenProcessPool:
-                lost.append(futures[future])
-    for task in lost:
-        with _processes(1) as pool:
-            with _without_main():
-                future = pool.submit(_interruptible, work, (shared, jobs), task)
-            try:
-                why = future.result()
-            except BrokenProcessPool:
-                why = f"{task}: its process ended suddenly, probably for lack of memory."
-        yield task, why
+    groups = [list(tasks)]
+    for group in groups:
+        count = min(most, len(group))
+        with _processes(count) as pool:
+            given = work, shared, max(1, jobs // count)
+            futures = {pool.submit(_interruptible, *given, task): task for task in group}
+            for future in as_completed(futures):
+                task = futures[future]
+                try:
+                    yield task, future.result()
+                except BrokenProcessPool:
+                    if len(group) > 1:
+                        groups.append([task])
+                    else:
+                        words = "its process ended suddenly, probably for lack of memory."
+                        yield task, f"{task}: {words}"
 
 
 @contextmanager
 def _processes(count: int) -> Iterator[Executor]:
     """Give an executor of new processes, which Ctrl-C interrupts in their tasks."""
-    context = multiprocessing.get_context("spawn")
+    context, main = multiprocessing.get_context("spawn"), sys.modules["__main__"]
     with ProcessPoolExecutor(count, context, initializer=_ignore_interrupts) as pool:
+        # without the user's script, which each process would run again
+        sys.modules["__main__"] = ModuleType("__main__")
+        try:
+            pool.submit(int)  # starts all processes
+        finally:
+            sys.modules["__main__"] = main
         try:
             yield pool
         except BaseException:
@@ -306,24 +307,13 @@ def _ignore_interrupts() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _interruptible(work: Work, given: tuple[bytes, int], task: Any) -> str:
+def _interruptible(work: Work, shared: bytes, jobs: int, task: Any) -> str:
     """Do a task that Ctrl-C ends; between tasks a process waits for its parent to end it."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        return work(given[0], task, given[1])
+        return work(shared, task, jobs)
     finally:
         _ignore_interrupts()
-
-
-@contextmanager
-def _without_main() -> Iterator[None]:
-    """Let processes start without the user's script, which each would run again."""
-    main = sys.modules["__main__"]
-    sys.modules["__main__"] = ModuleType("__main__")
-    try:
-        yield
-    finally:
-        sys.modules["__main__"] = main
 
 
 def on_cluster(
