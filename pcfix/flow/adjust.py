@@ -33,7 +33,7 @@ from pcfix.adjust.result import Adjusted
 from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError, bad_file
 from pcfix.flow.inputs import Inputs, mask_of, paths_in
 from pcfix.flow.next_steps import WATER as WATER_FILE
-from pcfix.flow.surfaces import CloudView, view_of
+from pcfix.flow.surfaces import sample_of, view_of
 from pcfix.io.atomic import temporary_folder
 from pcfix.io.cameras.colmap import write_colmap
 from pcfix.io.cameras.opensfm import write_opensfm
@@ -44,11 +44,10 @@ from pcfix.io.gnss_positions import gnss_in_frame_of, read_gnss
 from pcfix.io.ground_control import read_ground_control
 from pcfix.io.members import write_members
 from pcfix.io.tiles import Clouds, cloud_of
-from pcfix.io.views import ViewList, ViewMatch
+from pcfix.io.views import ViewMatch
 from pcfix.io.water import write_water_raster
 from pcfix.model import (
     Cameras,
-    FloatArray,
     GnssPositions,
     GroundControl,
     Lens,
@@ -183,8 +182,11 @@ def adjust_into(
         )
         raise InputError("cameras.no_ties", words, path=name, ties=count, least=LEAST_TIES)
     else:
-        xyz, listed = _sample(view, views, original)
-        found = by_cloud(material, xyz, listed, given, progress)
+        count = min(CLOUD_POINTS, view.points)  # random points of the cloud
+        rows = np.sort(np.random.default_rng(0).choice(view.points, count, replace=False))
+        match = None if views is None else ViewMatch(views, original, points=view.points)
+        some = sample_of(view, rows, match=match)
+        found = by_cloud(material, some.xyz, some.views, given, progress)
 
     # 3. The result
     if control is not None:
@@ -265,28 +267,6 @@ def _calibration(path: File, cameras: Cameras) -> Lens:
             )
             raise InputError("sensor.size", words, path=path)
     return one
-
-
-def _sample(
-    view: CloudView, views: ViewList | None, cameras: Cameras
-) -> tuple[FloatArray, Views | None]:
-    """Return random points of the cloud, and their part of the view list."""
-    count = min(CLOUD_POINTS, view.points)
-    rows = np.sort(np.random.default_rng(0).choice(view.points, count, replace=False))
-    match = None if views is None else ViewMatch(views, cameras, points=view.points)
-    parts: list[Views] = []
-    xyz, first = [], 0
-    for seen in view.chunks():
-        inside = rows[(rows >= first) & (rows < first + len(seen.xyz))] - first
-        xyz.append(seen.xyz[inside])
-        if match is not None:
-            match = match if first else match.settled(seen.xyz)
-            parts.append(match.views_of(seen.xyz, first)[0].take(inside))
-        first += len(seen.xyz)
-    if match is None:
-        return np.vstack(xyz), None
-    start = np.cumsum(np.concatenate([[0], *(np.diff(part.start) for part in parts)]))
-    return np.vstack(xyz), Views(start, np.concatenate([part.camera for part in parts]))
 
 
 # Writing

@@ -2,8 +2,8 @@
 
 A `Plan` holds what all points of a cloud have in common; `pcfix.flow.planning` makes it.
 `correct_chunk` depends on nothing else, and returns statistics (`CloudTally`) with the points.
-These are added up, and `pcfix.flow.correct.finish` makes the summary of them. A housing port is a medium like a water
-surface: all points are below it, whatever their height, and have no depth.
+These are added up, and `pcfix.flow.correct.finish` summarizes them. A housing port is a medium like
+a water surface: all points are below it, whatever their height, and have no depth.
 """
 
 from __future__ import annotations

@@ -20,8 +20,10 @@ from pcfix.adjust.diagnosis import (
 from pcfix.errors import InputError, PcfixError, PcfixWarning
 from pcfix.flow.inputs import Inputs, ties_of
 from pcfix.flow.next_steps import adjust_words
+from pcfix.flow.surfaces import CloudView
 from pcfix.io.gnss_positions import gnss_in_frame_of
-from pcfix.model import Cameras, GnssPositions, TiePoints
+from pcfix.io.ground_control import read_ground_control
+from pcfix.model import Cameras, GnssPositions, TiePoints, WaterSurface
 from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
 
 if TYPE_CHECKING:
@@ -37,6 +39,19 @@ QUICK_BYTES = 25_000_000
 def diagnose(evidence: Evidence) -> Diagnosis:
     """Look for every sign that the evidence allows, with the GNSS positions of the cameras."""
     return diagnosed(replace(evidence, gnss=_gnss_of(evidence.cameras, evidence.name)))
+
+
+def diagnose_inputs(
+    inputs: Inputs, cameras: Cameras, view: CloudView, water: WaterSurface, index: float, *,
+    gcps: Any = None, reference: Any = None, in_passing: bool = False,
+) -> Diagnosis:  # fmt: skip
+    """Look for signs in a cloud, its cameras with their tie points, and surveys, if given."""
+    evidence = Evidence(
+        cameras, str(inputs.cameras), water, index, view=view, reference=reference,
+        control=None if gcps is None else read_ground_control(gcps, cameras).surveyed,
+        ties=ties_of(inputs, view.crs), in_passing=in_passing,
+    )  # fmt: skip
+    return diagnose(evidence)
 
 
 def _gnss_of(cameras: Cameras, name: str) -> GnssPositions | None:

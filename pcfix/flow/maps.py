@@ -14,7 +14,7 @@ import shapely
 from pcfix.compare.sections import SectionLine, lines_downslope
 from pcfix.errors import GeometryError
 from pcfix.flow.dsm import BLOCK_CELLS, grid_dsm, point_spacing_m
-from pcfix.flow.request import SURFACE, Files, Request, cameras_of, water_of
+from pcfix.flow.request import SURFACE, RunFolder
 from pcfix.flow.runner import Progress
 from pcfix.flow.shore import shoreline_layer
 from pcfix.flow.surfaces import points_of, view_of
@@ -54,15 +54,13 @@ def raster_files(folder: Path, *, errors: bool) -> list[Path]:
     return [*files, *((folder / name).with_suffix(".qml") for name in maps)]
 
 
-def write_rasters(
-    request: Request, files: Files, *, errors: bool, progress: Progress | None = None
-) -> Plain:
+def write_rasters(run: RunFolder, *, errors: bool, progress: Progress | None = None) -> Plain:
     """Write all rasters of a corrected cloud as cloud optimised GeoTIFF, with styles for QGIS.
 
     By default the cells have 2 to 4 points, and are no smaller than a pixel on the ground. Returns
     the facts for ``run.json``.
     """
-    folder, cloud, cameras = files.folder, files.cleaned_cloud, cameras_of(request, files)
+    folder, cloud, cameras = run.folder, run.cleaned_cloud, run.cameras
     gsd_m = None  # a pixel on the ground at nadir, median
     if cameras.lenses:
         with open_cloud(cloud) as source:
@@ -70,7 +68,7 @@ def write_rasters(
         focal = np.array([lens.focal_px for lens in cameras.lenses])
         gsd_m = float(np.median((cameras.centres[:, 2] - middle) / focal))
     spacing_m = point_spacing_m(cloud, folder / SURFACE)
-    cell_m = request.resolution or round_resolution(spacing_m, gsd_m or 0.0)
+    cell_m = run.request.resolution or round_resolution(spacing_m, gsd_m or 0.0)
     plain = DsmOptions(resolution=cell_m, cog=True, style=True, overwrite=True)
     filled = replace(plain, fill=HOLE_CELLS * cell_m)
     asked = {
@@ -141,13 +139,13 @@ def _write_shaded(folder: Path) -> None:
         rasters.copy_as_cog(plain, draft)
 
 
-def write_map(request: Request, files: Files, corrected: Plain, compared: Plain) -> dict[str, int]:
-    """Write all layers of a run; return how many features each has.
+def write_map(path: Path, run: RunFolder, corrected: Plain, compared: Plain) -> dict[str, int]:
+    """Write all layers of a run to a file; return how many features each has.
 
     `corrected` and `compared` are the results of these steps. The height of the water has one
     standard error for all places.
     """
-    folder, cloud = files.folder, files.cleaned_cloud
+    folder, cloud, request = run.folder, run.cleaned_cloud, run.request
     shapes = rasters.outlines(folder / DEPTH, MOST_CELLS)
     area = shapely.area(np.array(shapes, object)) if shapes else np.zeros(0)
     style = vector_style({"area": Symbol("fill", DARK, 0.5)})
@@ -158,12 +156,12 @@ def write_map(request: Request, files: Files, corrected: Plain, compared: Plain)
     layers = [
         Layer("corrected_area", "Polygon", shapes, {"area_m2": area}, style),
         contours_layer(folder),
-        _waterline(cloud, water_of(request, files), sigma_m),
+        _waterline(cloud, run.water, sigma_m),
         _sections(compared.get("figures", {}).get("sections", []), folder),
-        _cameras(cameras_of(request, files), corrected["cameras_unused"]),
+        _cameras(run.cameras, corrected["cameras_unused"]),
         *_checks(folder, points, request.check_depths),
     ]
-    write_layers(files.map, layers, view_of(cloud).crs, overwrite=True)
+    write_layers(path, layers, view_of(cloud).crs, overwrite=True)
     return {one.name: len(one.geometries) for one in layers}
 
 

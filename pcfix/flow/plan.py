@@ -23,7 +23,7 @@ from pcfix.adjust.solve import solve
 from pcfix.errors import PcfixWarning, SettingError
 from pcfix.flow.cameras import draw_footprints
 from pcfix.flow.correct import correct_points
-from pcfix.flow.pose_errors import Sample, pose_errors
+from pcfix.flow.pose_errors import pose_errors
 from pcfix.flow.runner import check_summary, write_summary
 from pcfix.flow.surfaces import Points
 from pcfix.model import Cameras, Correction, FloatArray, TiePoints, Views, WaterPlane
@@ -218,7 +218,7 @@ def _of_adjusted_poses(given: PlanOptions, bed: _Bed) -> float:
         return float("nan")
     survey = Survey(WaterPlane(0.0), bed.cameras, _refraction(given).part(ScienceOptions))
     classes = np.zeros(len(bed.truth), np.uint8)
-    sample = Sample(Points(bed.apparent, None, classes), bed.views)
+    sample = Points(bed.apparent, None, classes, views=bed.views)
     found = pose_errors(sample, survey, members, None)
     return float("nan") if found is None else found.middle_m
 

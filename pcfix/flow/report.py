@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 
 from pcfix.errors import bad_file
+from pcfix.flow.adjust import SUMMARY
 from pcfix.flow.next_steps import FOLDER
-from pcfix.flow.request import Files, Request, cameras_of, inputs_of_run, water_of
-from pcfix.flow.run_adjust import figures_of
+from pcfix.flow.request import RunFolder
 from pcfix.flow.surfaces import view_of
 from pcfix.flow.water import found_picture
 from pcfix.grid.maps import MOST_CELLS, MapsBuilder
 from pcfix.io.crs import crs_words
-from pcfix.io.files import sha256, write_bytes, write_text
+from pcfix.io.files import read_json, sha256, write_bytes, write_text
 from pcfix.io.las.columns import SHIFTS
 from pcfix.io.las.source import coordinates, stated_crs
 from pcfix.io.rasters import preview
@@ -59,33 +59,31 @@ RESULTS = {
 
 
 def report_run(
-    request: Request, files: Files, inputs: list[Path], first: Plain, corrected: Plain,
-    compared: Plain,
-) -> Plain:  # fmt: skip
+    run: RunFolder, inputs: list[Path], first: Plain, corrected: Plain, compared: Plain
+) -> Plain:
     """Write the page of a run, and return what it says in short."""
     pictures, tables, dod, verdict = list[Picture](), list[Table](), None, ""
     if first["adjusted"]:
         verdict = f" The cameras were adjusted first, as {first['why']}."
     elif first["is_said"]:
         verdict = f" The cameras were not adjusted: {first['why']}."
+    request, summary = run.request, Summary(**corrected)
     if compared:
-        dod = preview(files.dod, MOST_CELLS) if request.has_surface else None
+        dod = preview(run.dod, MOST_CELLS) if request.has_surface else None
         pictures, tables = evaluation(compared["figures"], compared["sections"], dod)
         verdict += in_a_sentence(compared["figures"])
     if first["adjusted"]:
-        tables += adjustment_tables(figures_of(files.folder), f"{FOLDER}/report.html")
-    summary, again = Summary(**corrected), inputs_of_run(request)
-    cameras = cameras_of(request, files)
+        figures = read_json(run.folder / FOLDER / SUMMARY)
+        tables += adjustment_tables(figures, f"{FOLDER}/report.html")
     if (summary.water_fit or {}).get("model") == "auto":  # the water was sought in the cloud
-        pictures.append(found_picture(again.surface(view_of(request.source))))
-    run = RunResults(
-        summary, cameras, water_of(request, files),
-        **read_cloud(files.cleaned_cloud, files.resolution_m),
-        project=request.project or "", date=request.date or again.dates(cameras),
+        pictures.append(found_picture(run.inputs.surface(view_of(request.source))))
+    results = RunResults(
+        summary, run.cameras, run.water, **read_cloud(run.cleaned_cloud, run.resolution_m),
+        project=request.project or "", date=request.date or run.inputs.dates(run.cameras),
         pictures=pictures, tables=tables, verdict=verdict, compared=compared.get("figures", {}),
         difference=dod,
     )  # fmt: skip
-    page = write_report(run, inputs, files.folder)
+    page = write_report(results, inputs, run.folder)
     return {
         "in_short": in_short(page.tiles),
         "uncertainty": uncertainty_sentence(summary, compared.get("figures", {}).get("tvu")),

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 from pcfix.errors import SettingError, bad_file
 from pcfix.flow.maps import BED, DEPTH, SHADED, UNCERTAINTY, contours_layer
-from pcfix.flow.request import SURFACE, Files, Request, read_record
+from pcfix.flow.report import PAGE
+from pcfix.flow.request import SURFACE, Request, read_record
 from pcfix.flow.run import RECORD, run_all
 from pcfix.flow.runner import Bar, no_bar
 from pcfix.io import rasters, vectors
@@ -63,7 +64,7 @@ class RunResults:
     @property
     def report(self) -> Path:
         """The page for clients."""
-        return Files(self.folder).report
+        return self.folder / PAGE
 
     @property
     def summary(self) -> Summary:
@@ -130,7 +131,7 @@ class RunResults:
         """
         if not self.compared:
             return {}
-        files = sorted(Files(self.folder).compare.glob("*.csv"))
+        files = sorted((self.folder / "compare").glob("*.csv"))
         rows = [{"of": name, **figures} for name, _, figures in signed_statistics(self.compared)]
         pandas = analysis_library("pandas")
         statistics = pandas.json_normalize(rows).set_index("of")

@@ -23,6 +23,7 @@ from pcfix.model import (
     Cameras,
     FloatArray,
     IntArray,
+    Views,
     WaterDimension,
     WaterMesh,
     WaterRaster,
@@ -35,6 +36,7 @@ from pcfix.water.surface import FoundSurface, OwnWater, build_fields, surface_ab
 if TYPE_CHECKING:
     from pyproj import CRS
 
+    from pcfix.io.views import ViewMatch
     from pcfix.water.fit import ShoreFit
 
 
@@ -47,11 +49,13 @@ class Points(NamedTuple):
     sources: IntArray | None = None  # (n,), point source IDs
     rgb: npt.NDArray[Any] | None = None  # (n, 3)
     original_xyz: FloatArray | None = None  # (n, 3), before the transfer to adjusted cameras
+    views: Views | None = None
 
     def take(self, rows: IntArray | slice) -> Points:
         """Return some of the points."""
-        some: list[Any] = [None if v is None else np.ascontiguousarray(v[rows]) for v in self]
-        return Points(*some)
+        some: list[Any] = [None if v is None else np.ascontiguousarray(v[rows]) for v in self[:-1]]
+        views = None if self.views is None else self.views.take(np.arange(len(self.xyz))[rows])
+        return Points._make([*some, views])
 
 
 RGB = ("red", "green", "blue")
@@ -123,20 +127,36 @@ def first_points(chunks: Iterable[Points]) -> Points:
 
 
 def joined_points(parts: Iterable[Points]) -> Points:
-    """Return consecutive points as one, with the attributes that all of them have."""
-    columns: list[Any] = [
-        None if any(v is None for v in one) else np.concatenate(one)
-        for one in zip(*parts, strict=True)
+    """Return consecutive points as one, with what all of them have, but no weights of views."""
+    *columns, views = [
+        None if any(v is None for v in one) else one for one in zip(*parts, strict=True)
     ]
-    return Points(*columns)
+    joined: list[Any] = [None if one is None else np.concatenate(one) for one in columns]
+    if views is None:
+        return Points(*joined)
+    start = np.cumsum(np.concatenate([[0], *(np.diff(one.start) for one in views)]))
+    camera = np.concatenate([one.camera for one in views])
+    return Points._make([*joined, Views(start, camera, kind=views[0].kind)])
 
 
-def sample_of(view: CloudView, most: int, water: WaterSurface | None = None) -> Points:
-    """Return about `most` points, evenly spread over a cloud."""
-    step, row, parts = max(1, view.points // most), 0, list[Points]()
+def sample_of(
+    view: CloudView, rows: IntArray | int, water: WaterSurface | None = None,
+    match: ViewMatch | None = None,
+) -> Points:  # fmt: skip
+    """Return some points of a cloud, with their views if there is a view list.
+
+    `rows` are theirs, ascending, or about how many there are, evenly spread.
+    """
+    if isinstance(rows, int):
+        rows = np.arange(0, view.points, max(1, view.points // rows))
+    first, parts = 0, list[Points]()
     for one in view.chunks(water):
-        parts.append(one.take(slice(-row % step, None, step)))
-        row += len(one.xyz)
+        low, high = np.searchsorted(rows, (first, first + len(one.xyz)))
+        if match is not None:
+            match = match if first else match.settled(one.xyz)
+            one = one._replace(views=match.views_of(one.xyz, first)[0])
+        parts.append(one.take(rows[low:high] - first))
+        first += len(one.xyz)
     return joined_points(parts)
 
 
