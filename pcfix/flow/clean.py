@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.blocks import empty, release
-from pcfix.clean.points import CleanSummary, Cloud, Reason, flag_neighbours, flag_weak
+from pcfix.clean.points import Cloud, Reason, flag_neighbours, flag_weak
 from pcfix.errors import bad_file
 from pcfix.flow.runner import Chunk, Command, FileTask, FileWork, Progress, stream
 from pcfix.flow.surfaces import CloudView, Points, find_surface, points_of, view_of
@@ -25,6 +25,7 @@ from pcfix.model import LOW_NOISE, NOISE_CLASSES, BoolArray, FloatArray, WaterSu
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import WaterOptions
 from pcfix.options.steps import CleanOptions, CleanRules
+from pcfix.report.summary import Figures
 from pcfix.version import __version__
 from pcfix.water.checks import check_submerged
 from pcfix.water.surface import is_submerged, surface_above
@@ -39,7 +40,7 @@ def clean_file(
     options: CleanOptions | None = None,
     progress: Progress | None = None,
     **keywords: Any,
-) -> CleanSummary:
+) -> Figures:
     """Flag or drop the noise of a LAS or LAZ cloud; what ``pcfix clean`` runs.
 
     Noise gets class 7 and the withheld flag; nothing else changes. Points that are withheld or of
@@ -59,7 +60,7 @@ def clean_file(
 
     Returns
     -------
-    CleanSummary
+    Figures
 
     Raises
     ------
@@ -68,20 +69,12 @@ def clean_file(
     """
     given = taken(CleanOptions, options, keywords, "clean_file")
     command = Command(
-        "clean",
-        partial(_plan_file, given, progress),
-        partial(stream, _cleaning),
-        lambda plan, task, count: replace(
-            plan.summary, input=str(task.source), output=str(task.target), seconds=task.seconds
-        ),
+        "clean", partial(_plan_file, given, progress), partial(stream, _cleaning), _finish
     )
     last = None
     if progress is not None:  # writing is the last of the passes
         last = lambda done, total: progress(((_PASSES - 1) * total + done) // _PASSES, total)  # noqa: E731
-    result: CleanSummary = run_command(
-        command, input, output, given, reads=[given.water], progress=last
-    )
-    return result
+    return run_command(command, input, output, given, reads=[given.water], progress=last)
 
 
 RAY_DIMENSIONS = ("RayCount", "RayMiss", "Incidence")
@@ -107,7 +100,7 @@ def find_noise(
     progress: Callable[[int], None] | None = None,
     *,
     has_rays: bool = True,
-) -> tuple[BoolArray, CleanSummary]:
+) -> tuple[BoolArray, Figures]:
     """Run the tests on a whole cloud of n points, from a file or a PDAL pipeline.
 
     The cloud has some dimensions by `names`. `view` returns it as a water surface needs it, and
@@ -165,21 +158,21 @@ def find_noise(
     distance_m = flag_neighbours(name, cloud, rules, progress)
     noise = reasons != 0
     count = int(noise.sum())
-    return noise, CleanSummary(
+    return noise, Figures(
         input="",
         output="",
         pcfix=__version__,
         points=n,
-        set_aside=int((~used).sum()),
-        submerged=int(submerged.sum()),
+        set_aside=int((~used).sum()),  # withheld or noise before: not tested, not neighbours
+        submerged=int(submerged.sum()),  # tested against the bed
         noise=count,
         reasons={
             str(reason.name).lower(): int(np.count_nonzero(reasons & np.uint8(reason)))
             for reason in Reason
         },
         dropped=count if options.drop else 0,
-        neighbour_distance_m=distance_m,
-        not_run=not_run,
+        neighbour_distance_m=distance_m,  # mean, sd and limit; see `flag_sparse`
+        not_run=not_run,  # tests that could not be run, and why
         water=None if water is None else str(water),
         settings=asdict(rules),
         seconds=0.0,
@@ -191,7 +184,7 @@ class CleanPlan(NamedTuple):
 
     noise: npt.NDArray[np.uint8]
     drop: bool
-    summary: CleanSummary
+    summary: Figures
 
 
 def _plan_file(options: CleanOptions, progress: Progress | None, task: FileTask) -> CleanPlan:
@@ -234,6 +227,12 @@ def _plan_file(options: CleanOptions, progress: Progress | None, task: FileTask)
         )
         raise bad_file(cloud, "cloud.all_noise", sentence, points=points)
     return CleanPlan(np.packbits(noise), options.drop, summary)
+
+
+def _finish(plan: CleanPlan, task: FileTask, count: int) -> Figures:
+    """Return the summary of a whole cloud."""
+    own = {"input": str(task.source), "output": str(task.target), "seconds": task.seconds}
+    return Figures(**vars(plan.summary) | own)
 
 
 def _cleaning(plan: CleanPlan, source: LasSource) -> FileWork:

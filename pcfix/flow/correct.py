@@ -99,10 +99,7 @@ def correct_file(
     """
     given = taken(CorrectOptions, options, keywords, "correct_file")
     command = Command("correct", partial(_plan_file, given), _correct_cloud, finish)
-    result: Summary = run_command(
-        command, input, output, given, reads=paths_in(given), progress=progress
-    )
-    return result
+    return run_command(command, input, output, given, reads=paths_in(given), progress=progress)
 
 
 def _plan_file(options: CorrectOptions, task: FileTask) -> Plan:

@@ -28,10 +28,11 @@ from pcfix.io.las.source import LasSource, part_report
 from pcfix.io.las.writing import labelling_vlr, noted_header
 from pcfix.io.tiles import Clouds
 from pcfix.label.areas import WaterMask
-from pcfix.label.labelling import LabelCounts, Labelling, LabelSummary, Part
+from pcfix.label.labelling import LabelCounts, Labelling, Part
 from pcfix.model import WaterPlane, WaterSurface
 from pcfix.options.correct import LabelOptions, LabelRules, StageLabelOptions
 from pcfix.options.declare import File, taken
+from pcfix.report.summary import Figures
 from pcfix.version import __version__
 from pcfix.water.checks import as_surface, check_submerged, check_tilt, checked_points
 from pcfix.water.surface import surface_above
@@ -106,7 +107,7 @@ def label_file(
     options: LabelOptions | None = None,
     progress: Progress | None = None,
     **keywords: Any,
-) -> LabelSummary:
+) -> Figures:
     """Set the submerged points of a LAS or LAZ cloud to class 40; what ``pcfix label`` runs.
 
     With a band, points near the surface get class 41; with ``reset``, points of class 40 or 41 that
@@ -125,7 +126,7 @@ def label_file(
 
     Returns
     -------
-    LabelSummary
+    Figures
 
     Raises
     ------
@@ -139,10 +140,7 @@ def label_file(
         partial(stream, _labelling),
         _finish,
     )
-    result: LabelSummary = run_command(
-        command, input, output, given, reads=paths_in(given), progress=progress
-    )
-    return result
+    return run_command(command, input, output, given, reads=paths_in(given), progress=progress)
 
 
 @dataclass(frozen=True)
@@ -200,10 +198,10 @@ def _labelling(plan: LabelPlan, source: LasSource) -> FileWork:
     )
 
 
-def _finish(plan: LabelPlan, task: FileTask, counts: LabelCounts) -> LabelSummary:
+def _finish(plan: LabelPlan, task: FileTask, counts: LabelCounts) -> Figures:
     """Check the counts of a whole cloud, and return the summary."""
     check(plan, counts)
-    return LabelSummary(
+    return Figures(
         input=str(task.source),
         output=str(task.target),
         pcfix=__version__,

@@ -7,7 +7,7 @@ import time
 import warnings
 from collections.abc import Collection, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, cast
@@ -27,6 +27,7 @@ from pcfix.model import Cameras, FloatArray, Lens, WaterDimension
 from pcfix.options.declare import File, taken
 from pcfix.options.photos import PhotosOptions
 from pcfix.photos.mapping import Ground, Photo, Scene, exact, ground_seen, nodes_of, paper, resample
+from pcfix.report.summary import Figures
 from pcfix.running import current, threads
 from pcfix.version import __version__
 from pcfix.water.checks import check_above_water
@@ -43,24 +44,6 @@ LENS_TOLERANCE = 0.005
 CLOUDS = (".las", ".laz")
 
 
-@dataclass(frozen=True)
-class PhotosSummary:
-    """The result of `map_photos`."""
-
-    images: int
-    done_before: int  # images among them that an earlier call wrote
-    megapixels: float
-    seconds: float
-    largest_shift_px: float
-    black_share: float  # of the pixels: without ground, occluded, or outside the original image
-    mapping: str
-    dsm: str
-    water: str
-    refractive_index: float
-    spacing_px: int  # of the nodes of the grid
-    notes: tuple[PcfixWarning, ...]
-
-
 def map_photos(
     images: File,
     out: File,
@@ -68,7 +51,7 @@ def map_photos(
     options: PhotosOptions | None = None,
     progress: Progress | None = None,
     **keywords: Any,
-) -> PhotosSummary:
+) -> Figures:
     """Write every photograph as it would be without water; what ``pcfix photos`` runs.
 
     Parameters
@@ -134,16 +117,22 @@ def map_photos(
         notes.append(PcfixWarning("dsm.too_small", words, photographs=len(poor)))
     warn_all(notes)
     pixels = sum(one[1] for one in found)
-    summary = PhotosSummary(
-        images=len(block.photos), done_before=len(old), megapixels=round(1e-6 * pixels, 1),
+    summary = Figures(
+        images=len(block.photos),
+        done_before=len(old),  # images that an earlier call wrote
+        megapixels=round(1e-6 * pixels, 1),
         seconds=round(time.perf_counter() - started, 3),
         largest_shift_px=round(max((one[3] for one in found), default=0.0), 2),
+        # of the pixels: without ground, occluded, or outside the original image
         black_share=round(sum(one[2] for one in found) / max(pixels, 1), 5),
-        mapping=given.mapping, dsm=str(given.dsm), water=str(block.scene.water),
-        refractive_index=block.scene.refractive_index, spacing_px=block.step_px,
-        notes=tuple(notes),
-    )  # fmt: skip
-    write_summary(given, plain(summary))
+        mapping=given.mapping,
+        dsm=str(given.dsm),
+        water=str(block.scene.water),
+        refractive_index=block.scene.refractive_index,
+        spacing_px=block.step_px,
+        notes=notes,
+    )
+    write_summary(given, summary.as_dict())
     return summary
 
 
@@ -180,11 +169,6 @@ def warn_all(notes: Iterable[PcfixWarning]) -> None:
     """Show notes as warnings of the function that the user called."""
     for note in notes:
         warnings.warn(note, stacklevel=3)
-
-
-def plain(summary: Any) -> dict[str, Any]:
-    """Return a summary of a step over photographs as plain values, ready for JSON."""
-    return asdict(summary) | {"notes": [note.as_dict() for note in summary.notes]}
 
 
 @dataclass(frozen=True, eq=False)

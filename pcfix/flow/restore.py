@@ -55,8 +55,7 @@ def restore_file(
     command = Command(
         "restore", lambda task: None, partial(stream, _restoring), lambda plan, task, points: points
     )
-    points: int = run_command(command, input, output, given, progress=progress)
-    return points
+    return run_command(command, input, output, given, progress=progress)
 
 
 def _restoring(plan: None, source: LasSource) -> FileWork:

@@ -15,7 +15,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeAlias, TypeVar
 
 from pcfix.io.files import check_input, check_output, write_bytes, write_text
 from pcfix.io.las.source import LasSource
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     import laspy
     from matplotlib.figure import Figure
 
+Result = TypeVar("Result")
 Chunk: TypeAlias = "laspy.ScaleAwarePointRecord"
 Progress: TypeAlias = Callable[[int, int], None]
 Bar: TypeAlias = Callable[[str], AbstractContextManager[Progress | None]]
@@ -73,7 +74,7 @@ class FileTask:
 
 
 @dataclass(frozen=True)
-class Command:
+class Command(Generic[Result]):
     """A command that rewrites clouds, as functions.
 
     `plan` takes a task for the whole cloud, and returns all that its points have in common, which
@@ -85,7 +86,7 @@ class Command:
     name: str
     plan: Callable[[FileTask], Any]
     process: Callable[[Any, FileTask, int, Finish], tuple[Any, Any]]
-    finish: Callable[[Any, FileTask, Any], Any]
+    finish: Callable[[Any, FileTask, Any], Result]
 
 
 def stream(

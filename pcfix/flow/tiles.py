@@ -32,6 +32,7 @@ from pcfix.flow.runner import (
     Command,
     FileTask,
     Progress,
+    Result,
     check_cloud,
     check_summary,
     file_task,
@@ -111,14 +112,14 @@ def do_tile(pickled: bytes, tile: Tile, jobs: int | None = None) -> str:
 
 
 def run_command(
-    command: Command,
+    command: Command[Result],
     input: Clouds,
     output: File,
     options: Any,
     *,
     reads: Iterable[Any] = (),
     progress: Progress | None = None,
-) -> Any:
+) -> Result:
     """Run a command over one file or many; `reads` are further inputs. Returns its result.
 
     With many files, `progress` is called with (points done, points in all) after each.
@@ -131,7 +132,7 @@ def run_command(
         plan = command.plan(task)
         _, result = command.process(plan, task, 0, partial(command.finish, plan, task))
         _write_summary(options, result)
-    return result
+    return cast("Result", result)
 
 
 def _write_summary(options: Any, result: Any) -> None:
@@ -141,8 +142,8 @@ def _write_summary(options: Any, result: Any) -> None:
 
 
 def _run_tiles(
-    command: Command, tiles: Tiles, output: File, options: Any, progress: Progress | None
-) -> Any:
+    command: Command[Result], tiles: Tiles, output: File, options: Any, progress: Progress | None
+) -> Result:
     """Run a command over all files that are not finished yet, and return its result."""
     folder = path_of(output)
     task = FileTask(tiles, folder)
@@ -194,7 +195,7 @@ def _run_tiles(
             " if files have changed, add --overwrite.\n" + "\n".join(f"  {one}" for one in failed),
             failed=failed,
         )
-    return result
+    return cast("Result", result)
 
 
 def check_folder(folder: Path, tiles: Tiles) -> None:
@@ -240,7 +241,7 @@ def _plain(value: Any) -> Any:
     return sha256(pickle.dumps(value)).hexdigest()
 
 
-def _planned(command: Command, tiles: Tiles, folder: Path) -> tuple[Any, Tiles]:
+def _planned(command: Command[Any], tiles: Tiles, folder: Path) -> tuple[Any, Tiles]:
     """Return the plan, and the tiles that could be read for it."""
     while True:
         try:
