@@ -33,6 +33,7 @@ from pcfix.adjust.result import Adjusted
 from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError, bad_file
 from pcfix.flow.inputs import Inputs, mask_of, paths_in
 from pcfix.flow.next_steps import WATER as WATER_FILE
+from pcfix.flow.runner import check_folder
 from pcfix.flow.surfaces import sample_of, view_of
 from pcfix.io.atomic import temporary_folder
 from pcfix.io.cameras.colmap import write_colmap
@@ -128,7 +129,8 @@ def adjust_into(
     # 1. The block, its water, and what was surveyed
     water_unknowns = unknowns_of(given, ())
     if folder is not None:
-        _check_folder(folder, given.overwrite, paths_in(inputs))
+        known = [*paths_in(inputs), *paths_in(given)]
+        check_folder(folder, known, mark=SUMMARY, overwrite=given.overwrite)
     view = None if cloud is None else view_of(cloud_of(cloud))
     name = str(inputs.cameras) if isinstance(inputs.cameras, str | Path) else "cameras"
     read = inputs.read()
@@ -270,24 +272,6 @@ def _calibration(path: File, cameras: Cameras) -> Lens:
 
 
 # Writing
-
-
-def _check_folder(folder: Path, overwrite: bool, inputs: list[Any]) -> None:
-    """Refuse a folder that is an input, or holds anything but an earlier adjustment."""
-    code, wrong = "output.exists", ""
-    if any(folder.exists() and Path(one).exists() and folder.samefile(one) for one in inputs):
-        code, wrong = "output.is_input", "is an input. Give another folder"
-    elif folder.exists() and not folder.is_dir():
-        wrong = "is a file. Give a folder"
-    elif folder.is_dir() and any(folder.iterdir()):
-        if not overwrite:
-            wrong = "exists. Add --overwrite to replace it"
-        elif not (folder / SUMMARY).is_file():
-            wrong = "holds other files than an adjustment. Give an empty or new folder"
-    elif not folder.resolve().parent.is_dir():
-        code, wrong = "output.no_folder", f"its folder {folder.parent} does not exist. Create it"
-    if wrong:
-        raise SettingError(code, f"{folder}: {wrong}.", path=folder)
 
 
 def _write(folder: Path, found: Adjusted, model: str) -> None:

@@ -166,13 +166,13 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
     Warns of what is uncertain, and writes the shoreline and the line of a regression if asked.
     """
     water_notes = _check_counts(plan, tally)
-    tested, poses, shoreline, options = None, None, None, plan.options
+    tested, poses, absorbed, shoreline, options = None, None, None, None, plan.options
     if plan.inputs.port is None:
         from pcfix.flow.diagnosis import diagnose_in_passing, quick_ties
 
         ties = quick_ties(plan.inputs, plan.view.crs) if len(plan.cameras) else None
         tested = check_fit(plan, tally, ties)
-        poses = diagnose_in_passing(plan, ties)
+        poses, absorbed = diagnose_in_passing(plan, ties)
         if tally.shore is not None and options.shoreline is not None:
             from pcfix.flow.shore import write_shoreline
 
@@ -203,7 +203,6 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
     if moved is not None:
         times = f"{moved.min():+.3f} to {moved.max():+.3f} m at the times of the images"
         water = f"{water}, {times}"
-    of_poses = [None if poses is None else poses.warning, plan.no_poses]
     notes = [
         *plan.cameras.notes,
         *([] if report is None else report.warnings()),
@@ -213,7 +212,7 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
         *coded("water.surface", plan.found.notes),
         *coded("water.images", plan.own_notes),
         *coded("water.extent", water_notes),
-        *coded("cameras.poses", filter(None, of_poses)),
+        *coded("cameras.poses", filter(None, [absorbed, plan.no_poses])),
     ]
     return Summary(
         input=str(task.source),
@@ -236,7 +235,7 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
         carried=transfer.as_dict(tally.transfer) if transfer and tally.transfer else None,
         made=made,
         told=[one for one in map(str, detected) if made is None or one not in made["because"]],
-        poses=None if poses is None else poses.as_dict(),
+        poses=poses,
         shoreline=shoreline,
         fit=None if tested is None else tested.as_dict(),
     )

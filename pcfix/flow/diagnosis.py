@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -62,55 +62,43 @@ def _gnss_of(cameras: Cameras, name: str) -> GnssPositions | None:
         return None
 
 
-class Poses(NamedTuple):
-    """What is known of the poses of a correction.
-
-    absorbed : whether they absorbed the refraction, None if unknown; words : that as a line of a
-    summary; signs : each in plain values.
-    """
-
-    absorbed: bool | None
-    words: str
-    warning: PcfixWarning | None = None
-    signs: tuple[dict[str, Any], ...] = ()
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values, ready for JSON."""
-        return {"absorbed": self.absorbed, "words": self.words, "signs": list(self.signs)}
-
-
-ADJUSTED = Poses(False, "adjusted with refraction (--adjusted-from)")
-
-
-def diagnose_in_passing(plan: Plan, ties: TiePoints | None) -> Poses:
+def diagnose_in_passing(
+    plan: Plan, ties: TiePoints | None
+) -> tuple[dict[str, Any], PcfixWarning | None]:
     """Check the poses with what a correction has read anyway; warn if they absorbed refraction.
 
-    The ties are `quick_ties`.
+    The ties are `quick_ties`. Returns for the summary whether the poses absorbed it (None if
+    unknown), that as a line, and the signs; and the warning.
     """
     inputs, cameras = plan.inputs, plan.cameras
+    found: dict[str, Any] = {"absorbed": None, "words": "", "signs": []}
     if not len(cameras):
-        return Poses(None, "not applicable: no cameras were given")
+        return found | {"words": "not applicable: no cameras were given"}, None
     if inputs.adjusted_from is not None:
-        return ADJUSTED
+        words = "adjusted with refraction (--adjusted-from)"
+        return found | {"absorbed": False, "words": words}, None
     path = None if isinstance(inputs.cameras, Cameras) else inputs.cameras
-    found = [(one.straight, one.is_fused) for one in plan.verdicts if one.straight is not None]
+    seen = [(one.straight, one.is_fused) for one in plan.verdicts if one.straight is not None]
     n = plan.options.refractive_index
     evidence = Evidence(
         cameras, "cameras" if path is None else str(path), plan.found.surface, n, ties=ties,
         view=plan.view, in_passing=True,
-        neighbours=neighbours_sign(*found[-1][0], is_fused=found[-1][1]) if found else None,
+        neighbours=neighbours_sign(*seen[-1][0], is_fused=seen[-1][1]) if seen else None,
     )  # fmt: skip
     try:
         is_large = path is not None and _size_of(Path(path)) > QUICK_BYTES
         diagnosis = diagnose(evidence)
     except (PcfixError, OSError) as error:  # this check stops no correction
-        return Poses(None, f"not checked for absorbed refraction: {error}")
+        return found | {"words": f"not checked for absorbed refraction: {error}"}, None
     command, because = adjust_words(
         inputs, plan.view.name, has_datum=has_datum(evidence.cameras, evidence.name),
         index=None if n == DEFAULT_REFRACTIVE_INDEX else n,
     )  # fmt: skip
-    sentence = diagnosis.sentence(command, because)
-    decided = diagnosis.decided_by
+    sentence, decided, warning = diagnosis.sentence(command, because), diagnosis.decided_by, None
+    if sentence:
+        values = {} if diagnosis.size is None else {"likely_error_m": diagnosis.size[0]}
+        warning = PcfixWarning("poses.absorbed", sentence, command=command, **values)
+        warnings.warn(warning, stacklevel=3)
     if decided is not None:
         did = "absorbed" if diagnosis.absorbed else "did not absorb"
         words = f"{did} the refraction, by {decided.name}{'; see the warning' * bool(sentence)}"
@@ -122,12 +110,8 @@ def diagnose_in_passing(plan: Plan, ties: TiePoints | None) -> Poses:
         elif silent:
             why = f"{' and '.join(silent)} of the file tell too little (see 'pcfix cameras')"
         words = f"not checked for absorbed refraction: {why}"
-    warning = None
-    if sentence:
-        values = {} if diagnosis.size is None else {"likely_error_m": diagnosis.size[0]}
-        warning = PcfixWarning("poses.absorbed", sentence, command=command, **values)
-        warnings.warn(warning, stacklevel=3)
-    return Poses(diagnosis.absorbed, words, warning, tuple(diagnosis.as_dict()["signs"]))
+    signs = diagnosis.as_dict()["signs"]
+    return {"absorbed": diagnosis.absorbed, "words": words, "signs": signs}, warning
 
 
 def quick_ties(inputs: Inputs, crs: Any) -> TiePoints | None:

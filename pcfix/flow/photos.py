@@ -17,7 +17,7 @@ import numpy as np
 from pcfix.errors import GeometryError, PcfixWarning, SettingError, bad_file
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.inputs import Inputs
-from pcfix.flow.runner import Progress, check_summary, json_text, write_summary
+from pcfix.flow.runner import Progress, check_folder, check_summary, json_text, write_summary
 from pcfix.io.files import file_state, read_json, write_text
 from pcfix.io.labels import match_labels
 from pcfix.io.photographs import photographs_in, read_photograph, size_of, write_photograph
@@ -74,11 +74,9 @@ def map_photos(
     started = time.perf_counter()
     given = taken(PhotosOptions, options, keywords, "map_photos")
     folder, target = Path(images), Path(out)
-    if target.resolve() == folder.resolve():
-        sentence = f"{target}: is the folder of the photographs. Give another one."
-        raise SettingError("output.is_input", sentence, path=target)
     check_summary(given)
     paths = photographs_in(folder)
+    check_folder(target, paths)
     mapped = exact if given.mapping == "exact" else paper
     with threads(given.jobs), TemporaryDirectory() as scratch:
         block = block_of(given, paths, Path(scratch))

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.errors import GeometryError, InputError, PcfixError, PcfixWarning, SettingError
+from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError
 from pcfix.flow.compare import compare_clouds
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.photos import CLOUDS, PhotoBlock, block_of, map_photos, open_record
@@ -96,6 +96,13 @@ def rebuild_rounds(
         shutil.rmtree(folders.pop())
     record = open_record(target / RECORD, given, COMMAND_ONLY, folders)
     record.setdefault("rounds", [])
+
+    def note(number: int, noted: dict[str, Any]) -> dict[str, Any]:
+        """Record a round, for a later call to resume."""
+        record["rounds"][number - 1 :] = [noted]
+        write_text(target / RECORD, json_text(record), overwrite=True)
+        return noted
+
     start = str(given.dsm) if Path(given.dsm).suffix.lower() in CLOUDS else None
     if start is not None:  # a cloud is gridded to the folder
         raster = target / "dsm.tif"
@@ -115,26 +122,23 @@ def rebuild_rounds(
         cloud, dsm = folder / "cloud.laz", folder / "dsm.tif"
         noted = record["rounds"][number - 1] if number <= len(record["rounds"]) else {}
         has_cloud = cloud.exists() and noted.get("state") == file_state(cloud)
-        if has_cloud and "mean_m" in noted and dsm.exists():
-            one = Figures(**{name: noted[name] for name in ROUND})
-            done_before += 1
-        else:
+        is_done = has_cloud and "mean_m" in noted and dsm.exists()
+        done_before += is_done
+        if not has_cloud:
+            how = replace(
+                given, dsm=before, resolution=None, summary=None, **RebuildOptions().as_dict()
+            )
             with warnings.catch_warnings():
                 if number > 1:  # the DSM is pcfix's own
                     warnings.filterwarnings("ignore", ".*does not state whether", PcfixWarning)
-                if not has_cloud:
-                    how = replace(
-                        given, dsm=before, resolution=None, summary=None,
-                        **RebuildOptions().as_dict(),
-                    )  # fmt: skip
-                    map_photos(images, folder / "images", options=how, progress=progress)
-                    with threads(given.jobs):
-                        _reconstruct(given, block, number, folder / "images", cloud, progress)
-                    noted = {"command": given.rebuild, "state": file_state(cloud)}
-                    _note(target, record, number, noted)
-                grid_dsm(cloud, dsm, resolution=block.scene.ground.cell_m, overwrite=True)
-            one = _difference(block, cloud, dsm, before)
-            _note(target, record, number, noted | vars(one))
+                map_photos(images, folder / "images", options=how, progress=progress)
+            with threads(given.jobs):
+                _reconstruct(given, block, number, folder / "images", cloud, progress)
+            noted = note(number, {"command": given.rebuild, "state": file_state(cloud)})
+        if not is_done:
+            grid_dsm(cloud, dsm, resolution=block.scene.ground.cell_m, overwrite=True)
+            noted = note(number, noted | _difference(block, cloud, dsm, before))
+        one = Figures(**{name: noted[name] for name in ROUND})
         rounds.append(one)
         if say is not None:
             say(
@@ -150,6 +154,16 @@ def rebuild_rounds(
             )
             notes.append(PcfixWarning("photos.paper_limit", words, excess=excess))
             warnings.warn(notes[-1], stacklevel=2)
+    compared = None
+    if given.reference is not None:
+        # Figs 16, 18 and 20 of the paper; with the first cloud also 15 and 17
+        also = {} if start is None else {"round0": start}
+        also |= {f"round{k}": one.cloud for k, one in enumerate(rounds[:-1], start=1)}
+        compared = str(target / "compare")
+        compare_clouds(
+            rounds[-1].cloud, given.reference, water=given.water, submerged=True, out_dir=compared,
+            also=also, overwrite=True,
+        )  # fmt: skip
     summary = Figures(
         rounds=rounds,
         done_before=done_before,  # rounds that an earlier call finished
@@ -159,17 +173,11 @@ def rebuild_rounds(
         seconds=round(time.perf_counter() - started, 3),
         mapping=given.mapping,
         rebuild=str(given.rebuild),
-        compared=_compared(rounds, start, given, target),  # folder, where a reference was given
+        compared=compared,  # folder, where a reference was given
         notes=notes,
     )
     write_summary(given, summary.as_dict())
     return summary
-
-
-def _note(target: Path, record: dict[str, Any], number: int, noted: dict[str, Any]) -> None:
-    """Record a round, for a later call to resume."""
-    record["rounds"][number - 1 :] = [noted]
-    write_text(target / RECORD, json_text(record), overwrite=True)
 
 
 def _reconstruct(
@@ -211,7 +219,7 @@ def _reconstruct(
         )  # fmt: skip
 
 
-def _difference(block: PhotoBlock, cloud: Path, dsm: Path, before: Path) -> Figures:
+def _difference(block: PhotoBlock, cloud: Path, dsm: Path, before: Path) -> dict[str, Any]:
     """Return by how much the DSM of a round differs from that before, under water."""
     raster = dsm.with_name("difference.tif")
     write_dod(dsm, before, raster, overwrite=True)
@@ -227,29 +235,4 @@ def _difference(block: PhotoBlock, cloud: Path, dsm: Path, before: Path) -> Figu
     moved = moved[wet] if wet.any() else moved
     within = float((np.abs(moved) <= block.gsd_m).mean())  # moved by at most a ground pixel
     sizes = round(float(moved.mean()), 5), round(float(moved.std()), 5), round(within, 5)
-    found = str(cloud), str(dsm), len(moved), *sizes
-    return Figures(**dict(zip(ROUND, found, strict=True)))
-
-
-def _compared(
-    rounds: list[Figures], start: str | None, given: PhotosOptions, target: Path
-) -> str | None:
-    """Compare the clouds with a reference, if one was given; a failure loses no round.
-
-    This gives Figs 16, 18 and 20 of the paper; with the first cloud also 15 and 17.
-    """
-    if given.reference is None:
-        return None
-    also = {} if start is None else {"round0": start}
-    also |= {f"round{k}": one.cloud for k, one in enumerate(rounds[:-1], start=1)}
-    folder = target / "compare"
-    try:
-        compare_clouds(
-            rounds[-1].cloud, given.reference, water=given.water, submerged=True, out_dir=folder,
-            also=also, overwrite=True,
-        )  # fmt: skip
-    except PcfixError as error:
-        words = f"The rounds are finished, but not compared: {error}"
-        warnings.warn(PcfixWarning("rebuild.not_compared", words, cause=error.code), stacklevel=3)
-        return None
-    return str(folder)
+    return dict(zip(ROUND, (str(cloud), str(dsm), len(moved), *sizes), strict=True))

@@ -24,10 +24,9 @@ from pcfix.flow.maps import SECTIONS, raster_files, resolution_sentence, write_m
 from pcfix.flow.next_steps import FOLDER, MODELS
 from pcfix.flow.report import PAGE, report_run
 from pcfix.flow.request import SURFACE, Record, Request, RunFolder
-from pcfix.flow.runner import Bar, Progress, no_bar
+from pcfix.flow.runner import Bar, Progress, check_folder, no_bar
 from pcfix.flow.shore import check_shoreline
 from pcfix.flow.surfaces import view_of
-from pcfix.flow.tiles import check_folder
 from pcfix.io.clouds import is_cloud
 from pcfix.io.files import read_json
 from pcfix.io.gnss_positions import read_gnss
@@ -73,7 +72,7 @@ def run_all(
         load_py4dgeo()
     check_one_file(request.source, request)
     if isinstance(request.source, Tiles):
-        check_folder(run.corrected, request.source)
+        check_folder(run.corrected, request.source.paths)
     record = _opened(request, out_dir)
     check_shoreline(request.shoreline, overwrite=asked.overwrite or record.resumes, inputs=inputs)
 
@@ -247,13 +246,7 @@ def _decide(request: Request) -> Plain:
 
 def _adjust(request: Request, target: Path, files: list[Path]) -> str:
     """Adjust, and return which of `MODELS` has the cameras."""
-    inside = next((path for path in files if target.resolve() in path.resolve().parents), None)
-    if inside is not None:
-        raise SettingError(
-            "output.is_input",
-            f"{inside}: is in {target}, which the adjustment replaces. Give another OUT_DIR.",
-            path=inside,
-        )
+    check_folder(target, files, mark=SUMMARY)  # the adjustment replaces it
     given = AdjustOptions(
         gcps=request.gcps, gnss=request.gnss, lens=request.lens,
         index=with_index(request).refractive_index, overwrite=True,

@@ -17,6 +17,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeAlias, TypeVar
 
+from pcfix.errors import SettingError
 from pcfix.io.files import check_input, check_output, write_bytes, write_text
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import check_suffix, corrected_identity, las_writer
@@ -170,6 +171,33 @@ def check_cloud(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) -> 
     target = check_output(path, overwrite=overwrite, inputs=inputs)
     check_suffix(target)
     return target
+
+
+def check_folder(
+    folder: Path, inputs: Iterable[Any] = (), *, mark: str = "", overwrite: bool = True
+) -> None:
+    """Refuse a folder for outputs that is the folder of an input.
+
+    One that replaces the folder of an earlier call, which has a file `mark`, must not have inputs
+    at any depth, or anything else. Values of `inputs` that are no paths do not count.
+    """
+    place, code, wrong = folder.resolve(), "output.is_input", ""
+    paths = [Path(one).resolve() for one in inputs if isinstance(one, str | PathLike)]
+    inside = [one for one in paths if place in (one, *(one.parents if mark else one.parents[:1]))]
+    if inside:
+        wrong = f"is the folder of the input {inside[0].name}. Give another one"
+    elif folder.exists() and not folder.is_dir():
+        code, wrong = "output.exists" if mark else "output.folder", "is a file. Give a folder"
+    elif mark and not place.parent.is_dir():
+        code, wrong = "output.no_folder", f"its folder {folder.parent} does not exist. Create it"
+    elif mark and folder.is_dir() and any(folder.iterdir()):
+        code = "output.exists"
+        if not overwrite:
+            wrong = "exists. Add --overwrite to replace it"
+        elif not (folder / mark).is_file():
+            wrong = f"holds other files, and no {mark}. Give an empty or new folder"
+    if wrong:
+        raise SettingError(code, f"{folder}: {wrong}.", path=folder)
 
 
 def file_task(

@@ -247,43 +247,43 @@ def own_water_of(
             " level, a plane or a raster.",
             options=["water_per_image", "water"],
         )
-    low, high = view.low, view.high
+    low, high, k = view.low, view.high, len(cameras)
     paths, notes = rasters_of_images(folder, cameras.labels)
-    errors = {row: path.parent / "sigma" / path.name for row, path in paths.items()}
+    offset = np.zeros(k) if level_offset_m is None else level_offset_m
     heights, sigma = dict[int, WaterRaster](), dict[int, WaterRaster]()
-    for files, read in ((paths, heights), (errors, sigma)):
-        with warnings.catch_warnings():  # those of the first raster are enough
-            for row, path in files.items():
-                if files is paths or path.is_file():
-                    read[row] = read_water_raster(path, view.crs)
-                    warnings.simplefilter("ignore", PcfixWarning)
+    places, apart = [], []
+    with warnings.catch_warnings():  # those of the first raster are enough
+        for image, path in paths.items():
+            heights[image] = raster = read_water_raster(path, view.crs)
+            warnings.simplefilter("ignore", PcfixWarning)
+            error = path.parent / "sigma" / path.name
+            if error.is_file():
+                sigma[image] = read_water_raster(error, view.crs)
+            # the rasters must overlap the cloud, and have the vertical datum of the common water
+            rows, columns = np.nonzero(np.isfinite(raster.height_m))
+            x = raster.left_m + (columns + 0.5) * raster.cell_m[0]
+            y = raster.top_m - (rows + 0.5) * raster.cell_m[1]
+            places.append(((x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1])).any())
+            if not isinstance(water, WaterDimension):
+                common = surface_above(water, np.column_stack([x, y, x])).height_m + offset[image]
+                off = np.append(raster.height_m[rows, columns] - common, np.nan)
+                apart.append(np.nanmedian(off))
     if len(sigma) < len(heights):
         lost = len(heights) - len(sigma)
         notes += (f"{folder}: {lost} rasters have no standard errors in the folder sigma.",)
-    offset = np.zeros(len(cameras)) if level_offset_m is None else level_offset_m
-    # The rasters must overlap the cloud, and have the vertical datum of the common water.
-    places, apart = [], []
-    for image, raster in heights.items():
-        rows, columns = np.nonzero(np.isfinite(raster.height_m))
-        x = raster.left_m + (columns + 0.5) * raster.cell_m[0]
-        y = raster.top_m - (rows + 0.5) * raster.cell_m[1]
-        places.append(((x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1])).any())
-        if not isinstance(water, WaterDimension):
-            level = surface_above(water, np.column_stack([x, y, x])).height_m + offset[image]
-            apart.append(np.nanmedian(np.append(raster.height_m[rows, columns] - level, np.nan)))
     if np.isfinite(low).all() and not any(places):
         text = f"{folder}: none of its rasters overlaps the cloud. Check their CRS."
         raise InputError("water.no_overlap", text, path=folder)
-    off = float(np.nanmedian(apart)) if np.isfinite(apart).any() else 0.0
-    if abs(off) > APART_M:
+    differs = float(np.nanmedian(apart)) if np.isfinite(apart).any() else 0.0
+    if abs(differs) > APART_M:
         raise InputError(
             "water.datum",
-            f"{folder}: its water differs by {off:+.2f} m from --water ({water}). Give both the"
+            f"{folder}: its water differs by {differs:+.2f} m from --water ({water}). Give both the"
             " same vertical datum, and 'pcfix calm' the --level of the calm water.",
-            path=folder, difference_m=off,
+            path=folder, difference_m=differs,
         )  # fmt: skip
-    k, common = len(cameras), water if isinstance(water, WaterRaster) else None
-    return OwnWater(build_fields(heights, k, common), build_fields(sigma, k)), notes
+    rest = water if isinstance(water, WaterRaster) else None
+    return OwnWater(build_fields(heights, k, rest), build_fields(sigma, k)), notes
 
 
 def _bounds(low: FloatArray, high: FloatArray) -> tuple[float, float, float, float]:

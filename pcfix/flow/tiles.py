@@ -34,6 +34,7 @@ from pcfix.flow.runner import (
     Progress,
     Result,
     check_cloud,
+    check_folder,
     check_summary,
     file_task,
     write_summary,
@@ -148,7 +149,11 @@ def _run_tiles(
     folder = path_of(output)
     task = FileTask(tiles, folder)
     check_one_file(tiles, options)
-    check_folder(folder, tiles)
+    check_folder(folder, tiles.paths)
+    named = Path(tiles.name)
+    if named.is_dir() and folder.resolve().is_relative_to(named.resolve()):
+        sentence = f"{folder}: is inside the folder of the inputs. Give one outside of it."
+        raise SettingError("output.is_input", sentence, path=folder)
     check_summary(options, tiles.paths)
     work = _work(command.name, tiles, folder, options)
     # A tile is finished if its output exists with the key of these options and inputs.
@@ -196,21 +201,6 @@ def _run_tiles(
             failed=failed,
         )
     return cast("Result", result)
-
-
-def check_folder(folder: Path, tiles: Tiles) -> None:
-    """Refuse a folder for outputs that has inputs, or is inside theirs."""
-    resolved, named = folder.resolve(), Path(tiles.name)
-    code, wrong = "output.is_input", ""
-    inside = next((one for one in tiles.paths if one.parent.resolve() == resolved), None)
-    if inside is not None:
-        wrong = f"is the folder of the input {inside.name}. Give another one"
-    elif named.is_dir() and resolved.is_relative_to(named.resolve()):
-        wrong = "is inside the folder of the inputs. Give one outside of it"
-    elif folder.exists() and not folder.is_dir():
-        code, wrong = "output.folder", "is a file. Give a folder for the outputs"
-    if wrong:
-        raise SettingError(code, f"{folder}: {wrong}.", path=folder)
 
 
 def _work(name: str, tiles: Tiles, folder: Path, options: Any) -> dict[Path, Tile]:
