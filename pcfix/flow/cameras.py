@@ -27,7 +27,7 @@ from pcfix.model import Cameras, FloatArray, Lens, TiePoints, WaterDimension
 from pcfix.options.declare import File, taken
 from pcfix.options.survey import CamerasCheckOptions
 from pcfix.report.page import AFTER, WATER, draw_cloud, label_plan, label_side, new_figure
-from pcfix.report.text import Plain, Rows, RowTable, aligned, filled
+from pcfix.report.text import Plain, Rows, aligned
 from pcfix.water.index import index_of
 from pcfix.water.surface import surface_above
 
@@ -264,63 +264,55 @@ def _fit(
     }
 
 
-_SENSOR: RowTable = (
-    ("Sensor", "{title}: {images:,} images{different}, {frame}, focal length {focals}"
-     " {unit}{pixel}, {projection}{is_distorted}{gsd}", "images"),
-    ("", "the distortion folds within the frame: {percent:.2g} % of it is not used; check the"
-     " radial coefficients", "folded"),
-)  # fmt: skip
-_BLOCK: RowTable = (
-    ("Sensor", "none: the frames are not known", "no_sensor"),
-    ("Angles", "none: every camera counts as visible from every point", "no_angles"),
-    ("CRS", "{crs}", "crs"),
-    ("CRS of cloud", "{crs_of_cloud}", "crs_of_cloud"),
-    ("Problem", "{problem}", "problem"),
-    ("Heights", "{z[0]:.2f} to {z[1]:.2f} m, mean {z[2]:.2f} m", "z"),
-    ("Above water", "{height_above_water_m[0]:.1f} to {height_above_water_m[2]:.1f} m, mean"
-     " {height_above_water_m[1]:.1f} m", "height_above_water_m"),
-    ("Tilt", "median {tilt_deg[0]:.1f} deg, largest {tilt_deg[1]:.1f} deg", "tilt_deg"),
-    ("GNSS", "{gnss[images]:,} images; adjusted minus GNSS east, north, up: mean"
-     " {gnss[mean_m]:+.3f} m, sd {gnss[sd_m]:.3f} m; largest {gnss[largest_m]:.3f} m"
-     " ({gnss[largest_image]})", "some_gnss"),
-    ("{gnss_label}", "{gnss[reason]}", "gnss_reason"),
-    ("Cloud", "{fit[cloud]} ({fit[points_sampled]:,} points sampled)", "fit"),
-    ("Visible", "share of points by number of cameras: {seen}", "fit"),
-    ("Check", "{check}", "fit"),
-)  # fmt: skip
-
-
 def cameras_text(report: CamerasReport) -> str:
     """Return the summary of a camera file."""
     r, cameras, z = report.figures, report.cameras, report.cameras.centres[:, 2]
-    missing, fit, gnss = cameras.unposed, r["fit"] or {}, r["gnss"] or {}
+    missing, fit, gnss, found = cameras.unposed, r["fit"], r["gnss"], report.diagnosis
     images = f"{len(cameras):,} with a pose"
     if missing:
         more = ", ..." if len(missing) > SHOWN_NAMES else ""
         images += f", {len(missing):,} without: {', '.join(missing[:SHOWN_NAMES])}{more}"
-    seen = [f"{name}: {100.0 * part:.1f} %" for name, part in fit.get("seen_by", {}).items()]
-    values = r | {
-        "no_sensor": not r["sensors"],
-        "no_angles": cameras.rotations is None,
-        "crs": _short(r["crs_read"]) or "not stated",
-        "crs_of_cloud": (_short(r["crs"]) or "not stated") if r["crs"] != r["crs_read"] else "",
-        "z": () if r["problem"] else (z.min(), z.max(), z.mean()),
-        "some_gnss": gnss.get("images"),
-        "gnss_reason": gnss.get("reason"),
-        "gnss_label": "" if gnss.get("images") else "GNSS",
-        "seen": ", ".join(seen),
-        "check": fit.get("verdict") or fit.get("tested"),
-    }
     rows = [("Images", images), *(row for one in r["sensors"] for row in _sensor_rows(one))]
-    rows += filled(_BLOCK, values)
-    if (found := report.diagnosis) is not None:
+    if not r["sensors"]:
+        rows.append(("Sensor", "none: the frames are not known"))
+    if cameras.rotations is None:
+        rows.append(("Angles", "none: every camera counts as visible from every point"))
+    rows.append(("CRS", _short(r["crs_read"])))
+    if r["crs"] != r["crs_read"]:
+        rows.append(("CRS of cloud", _short(r["crs"])))
+    heights = f"{z.min():.2f} to {z.max():.2f} m, mean {z.mean():.2f} m"
+    rows.append(("Problem", r["problem"]) if r["problem"] else ("Heights", heights))
+    if r["height_above_water_m"] is not None:
+        low, mean, high = r["height_above_water_m"]
+        rows.append(("Above water", f"{low:.1f} to {high:.1f} m, mean {mean:.1f} m"))
+    if r["tilt_deg"] is not None:
+        median, largest = r["tilt_deg"]
+        rows.append(("Tilt", f"median {median:.1f} deg, largest {largest:.1f} deg"))
+    if gnss is not None:
+        mean, sd = (
+            ", ".join("-" if one is None else f"{one:{form}}" for one in gnss[name])
+            for name, form in (("mean_m", "+.3f"), ("sd_m", ".3f"))
+        )
+        if gnss["images"]:
+            rows.append(("GNSS", f"{gnss['images']:,} images; adjusted minus GNSS east, north, up:"
+                         f" mean {mean} m, sd {sd} m; largest {gnss['largest_m']:.3f} m"
+                         f" ({gnss['largest_image']})"))  # fmt: skip
+        if gnss["reason"]:
+            rows.append(("" if gnss["images"] else "GNSS", gnss["reason"]))
+    if fit is not None:
+        seen = (f"{name}: {100.0 * part:.1f} %" for name, part in fit["seen_by"].items())
+        rows += [
+            ("Cloud", f"{fit['cloud']} ({fit['points_sampled']:,} points sampled)"),
+            ("Visible", f"share of points by number of cameras: {', '.join(seen)}"),
+            ("Check", fit["verdict"] or fit["tested"]),
+        ]
+    if found is not None:
         says = {True: "absorbed", False: "not absorbed", None: "open"}
+        verdict = f"not known; give control points (--gcps), or {export_of(cameras)}"
         if found.absorbed:
             verdict = found.sentence(*report.remedy)
         elif found.absorbed is False and found.decided_by is not None:
             verdict = f"the poses have not absorbed the refraction, by {found.decided_by.name}"
-        else:
-            verdict = f"not known; give control points (--gcps), or {export_of(cameras)}"
         rows.append(("Refraction", verdict))
         rows += [("", f"{s.name}: {says[s.speaks]}. {s.words}") for s in found.signs]
     return aligned(f"{r['path']}: {cameras.source or 'cameras'}", rows, cameras.notes)
@@ -329,28 +321,30 @@ def cameras_text(report: CamerasReport) -> str:
 def _sensor_rows(s: Plain) -> Rows:
     """Return frame, focal length and pixel size of a sensor, and what is wrong with its lens."""
     low, high = f"{s['focal']:.6g}", f"{s['focal_most']:.6g}"
-    frame, pixel = f"{s['width']:g} x {s['height']:g} {s['unit']}", ""
+    frame = f"{s['width']:g} x {s['height']:g} {s['unit']}"
+    words = [
+        f"{s['name'] or 'unnamed'}: {s['images']:,} images",
+        f" with {s['lenses']:,} different lenses" if s["lenses"] > 1 else "",
+        f", {s['frames']} sizes as {frame}" if s["frames"] > 1 else f", {frame}",
+        f", focal length {low if low == high else f'{low} to {high}'} {s['unit']}",
+    ]
     if s["pixel_size_um"] is not None:
-        pixel = "" if s["lenses"] > 1 else f" = {s['focal_mm']:.3f} mm"
-        pixel += f", pixel {s['pixel_size_um']:.2f} um"
-    gsd = "" if s["gsd_m"] is None else f", GSD {100.0 * s['gsd_m']:.2f} cm at the water"
-    values = s | {
-        "title": s["name"] or "unnamed",
-        "different": f" with {s['lenses']:,} different lenses" if s["lenses"] > 1 else "",
-        "frame": f"{s['frames']} sizes as {frame}" if s["frames"] > 1 else frame,
-        "focals": low if low == high else f"{low} to {high}",
-        "pixel": pixel,
-        "is_distorted": ", distorted" if s["distorted"] else "",
-        "gsd": gsd,
-        "percent": 100.0 * s["folded"],
-    }
-    return filled(_SENSOR, values)
+        words.append("" if s["lenses"] > 1 else f" = {s['focal_mm']:.3f} mm")
+        words.append(f", pixel {s['pixel_size_um']:.2f} um")
+    words.append(f", {s['projection']}{', distorted' * s['distorted']}")
+    if s["gsd_m"] is not None:
+        words.append(f", GSD {100.0 * s['gsd_m']:.2f} cm at the water")
+    rows = [("Sensor", "".join(words))]
+    if s["folded"]:
+        rows.append(("", f"the distortion folds within the frame: {100.0 * s['folded']:.2g} % of it"
+                     " is not used; check the radial coefficients"))  # fmt: skip
+    return rows
 
 
 def _short(crs: str | None) -> str:
     """Return the name of a CRS, whose text may be pages long."""
-    if crs is None or len(crs) < SHORT_CRS:
-        return crs or ""
+    if not crs or len(crs) < SHORT_CRS:
+        return crs or "not stated"
     return crs.split('"')[1] if '"' in crs else crs[:SHORT_CRS] + " ..."
 
 
