@@ -13,9 +13,8 @@ import numpy.typing as npt
 from pcfix.blocks import empty, release
 from pcfix.clean.points import Cloud, Reason, flag_neighbours, flag_weak
 from pcfix.errors import bad_file
-from pcfix.flow.runner import Chunk, Command, FileTask, FileWork, Progress, stream
+from pcfix.flow.runner import Chunk, Command, FileTask, FileWork, Progress, run_command, stream
 from pcfix.flow.surfaces import CloudView, Points, find_surface, points_of, view_of
-from pcfix.flow.tiles import run_command
 from pcfix.io.files import scratch_arrays
 from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource

@@ -21,9 +21,17 @@ from pcfix.flow.correction import CloudTally, Plan, correct_chunk
 from pcfix.flow.inputs import CameraInputs, Inputs, paths_in, transfer_between
 from pcfix.flow.planning import plan_correction, plan_of, read_inputs
 from pcfix.flow.plausibility import CloudSample, Plausible, plausible
-from pcfix.flow.runner import Chunk, Command, FileTask, FileWork, Finish, Progress, stream
+from pcfix.flow.runner import (
+    Chunk,
+    Command,
+    FileTask,
+    FileWork,
+    Finish,
+    Progress,
+    run_command,
+    stream,
+)
 from pcfix.flow.surfaces import CloudView, Points, corners, points_of, view_of
-from pcfix.flow.tiles import run_command
 from pcfix.io.las import columns
 from pcfix.io.las.source import LasSource, centring_steps, part_report
 from pcfix.io.las.writing import corrected_header

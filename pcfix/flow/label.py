@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from pcfix.errors import SettingError
 from pcfix.flow.inputs import labelling_of, mask_of, paths_in
-from pcfix.flow.runner import Chunk, Command, FileTask, FileWork, Progress, stream
+from pcfix.flow.runner import Chunk, Command, FileTask, FileWork, Progress, run_command, stream
 from pcfix.flow.surfaces import (
     CloudView,
     Points,
@@ -22,7 +22,6 @@ from pcfix.flow.surfaces import (
     points_of,
     view_of,
 )
-from pcfix.flow.tiles import run_command
 from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource, part_report
 from pcfix.io.las.writing import labelling_vlr, noted_header

@@ -15,9 +15,8 @@ from typing import Any
 from pcfix.errors import InputError, PcfixWarning, SettingError, bad_file
 from pcfix.flow.inputs import Inputs, paths_in, read_blocks
 from pcfix.flow.next_steps import FOLDER
-from pcfix.flow.runner import json_text
+from pcfix.flow.runner import HOW, json_text
 from pcfix.flow.surfaces import view_of
-from pcfix.flow.tiles import HOW
 from pcfix.io.clouds import is_cloud, own_water, reference_of
 from pcfix.io.files import belonging, file_state, files_in, read_json, write_text
 from pcfix.io.rasters import open_raster

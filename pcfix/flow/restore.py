@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from pcfix.errors import bad_file
-from pcfix.flow.runner import Chunk, Command, FileWork, stream
-from pcfix.flow.tiles import run_command
+from pcfix.flow.runner import Chunk, Command, FileWork, run_command, stream
 from pcfix.io.las.columns import SHIFTS, UNSURE, columns_for, convert, move
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import read_settings, record_errors, restored_header
