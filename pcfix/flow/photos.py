@@ -17,8 +17,15 @@ import numpy as np
 from pcfix.errors import GeometryError, PcfixWarning, SettingError, bad_file
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.inputs import Inputs
-from pcfix.flow.runner import Progress, check_folder, check_summary, json_text, write_summary
-from pcfix.io.files import file_state, read_json, write_text
+from pcfix.flow.runner import (
+    Progress,
+    check_folder,
+    check_summary,
+    json_text,
+    key_of,
+    write_summary,
+)
+from pcfix.io.files import read_json, write_text
 from pcfix.io.labels import match_labels
 from pcfix.io.photographs import photographs_in, read_photograph, size_of, write_photograph
 from pcfix.io.rasters import filled_heights, open_raster
@@ -29,7 +36,6 @@ from pcfix.options.photos import PhotosOptions
 from pcfix.photos.mapping import Ground, Photo, Scene, exact, ground_seen, nodes_of, paper, resample
 from pcfix.report.summary import Figures
 from pcfix.running import current, threads
-from pcfix.version import __version__
 from pcfix.water.checks import check_above_water
 from pcfix.water.index import index_of
 
@@ -83,8 +89,7 @@ def map_photos(
         target.mkdir(parents=True, exist_ok=True)
         results = () if given.overwrite else (target / path.name for path in block.paths)
         old = {path.name: path for path in results if path.exists()}
-        ignored, waters = ("overwrite", "jobs", "summary"), block.waters.values()
-        open_record(target / RECORD, given, ignored, old.values(), waters)
+        open_record(target / RECORD, key_of("photos", given), old.values())
         both = zip(block.paths, block.photos, strict=True)
         todo = {path: photo for path, photo in both if path.name not in old}
 
@@ -134,33 +139,24 @@ def map_photos(
     return summary
 
 
-def open_record(
-    place: Path, given: PhotosOptions, ignored: Collection[str], written: Collection[Path],
-    more: Iterable[Path] = (),
-) -> dict[str, Any]:  # fmt: skip
-    """Return the record of an equal call that wrote to a folder; without results, write it.
+def open_record(place: Path, key: str, written: Collection[Path]) -> dict[str, Any]:
+    """Return the record of an equal call that wrote to a folder; without results, a new one.
 
-    A record has the options that are not `ignored`, and size and time of the input files and of
-    `more`. `written` are the results in the folder, which another call must not mix with its own.
+    `key` is that of `key_of`. `written` are the results in the folder, which another call must not
+    mix with its own.
     """
-    asked = {name: value for name, value in given.as_dict().items() if name not in ignored}
-    files = [given.cameras, given.dsm, given.sensor, given.water]
-    paths = [Path(one) for one in files if one is not None and Path(str(one)).exists()]
-    states = [file_state(path) for path in (*paths, *more)]
-    # as a JSON file has it, with lists for tuples
-    record = json.loads(json.dumps({"pcfix": __version__, "asked": asked, "files": states}))
-    if written:
-        old: dict[str, Any] = read_json(place) if place.exists() else {}
-        if {name: old.get(name) for name in record} != record:
-            raise SettingError(
-                "output.exists",
-                f"{min(written)}: exists, and was not written by an equal call. Add"
-                " --overwrite to replace it, or give another folder.",
-                path=min(written),
-            )
-        return old
-    write_text(place, json_text(record), overwrite=True)
-    return dict(record)
+    record: dict[str, Any] = read_json(place) if place.exists() else {}
+    if not written:
+        record = {"key": key}
+        write_text(place, json_text(record), overwrite=True)
+    elif record.get("key") != key:
+        raise SettingError(
+            "output.exists",
+            f"{min(written)}: exists, and was not written by an equal call. Add --overwrite to"
+            " replace it, or give another folder.",
+            path=min(written),
+        )
+    return record
 
 
 def warn_all(notes: Iterable[PcfixWarning]) -> None:

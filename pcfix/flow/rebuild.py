@@ -25,7 +25,7 @@ from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError
 from pcfix.flow.compare import compare_clouds
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.photos import CLOUDS, PhotoBlock, block_of, map_photos, open_record
-from pcfix.flow.runner import Progress, check_summary, json_text, write_summary
+from pcfix.flow.runner import Progress, check_summary, json_text, key_of, write_summary
 from pcfix.io.files import check_input, file_state, run_logged, write_text
 from pcfix.io.las.writing import write_points
 from pcfix.io.photographs import photographs_in, read_colours
@@ -94,7 +94,7 @@ def rebuild_rounds(
     folders = list(target.glob("round[0-9]*"))
     while given.overwrite and folders:
         shutil.rmtree(folders.pop())
-    record = open_record(target / RECORD, given, COMMAND_ONLY, folders)
+    record = open_record(target / RECORD, key_of("rebuild", given, ignored=COMMAND_ONLY), folders)
     record.setdefault("rounds", [])
 
     def note(number: int, noted: dict[str, Any]) -> dict[str, Any]:

@@ -16,7 +16,7 @@ import signal
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import (
     Executor,
     Future,
@@ -283,20 +283,26 @@ def _run_tiles(
 
 def _work(name: str, tiles: Tiles, folder: Path, options: Any) -> dict[Path, Tile]:
     """Return a tile for each file, in their order."""
-    asked = {
-        one.name: _plain(getattr(options, one.name))
-        for one in options_of(type(options))
-        if one.name not in HOW
-    }
-    states = [file_state(path) for path in (*tiles.paths, *tiles.broken)]
-    depends = [version.__version__, name, asked, states]
-    key = sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()
+    key = key_of(name, options, (*tiles.paths, *tiles.broken))
     work, row = {}, 0
     for path, points in zip(tiles.paths, tiles.points, strict=True):
         target = folder.resolve() / path.name
         work[path] = Tile(path.resolve(), target, points, row, key, version.__version__)
         row += points
     return work
+
+
+def key_of(
+    name: str, options: Any, inputs: Iterable[Path] = (), ignored: Collection[str] = HOW
+) -> str:
+    """Return a checksum of all that the outputs of a command depend on."""
+    asked = {
+        one.name: _plain(getattr(options, one.name))
+        for one in options_of(type(options))
+        if one.name not in ignored
+    }
+    depends = [version.__version__, name, asked, [file_state(path) for path in inputs]]
+    return sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()
 
 
 def _plain(value: Any) -> Any:
