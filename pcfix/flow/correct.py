@@ -115,8 +115,8 @@ def _plan_file(options: CorrectOptions, task: FileTask) -> Plan:
     return plan_correction(read_inputs(options, view_of(task.source, options.jobs, task.kept)))
 
 
-def _correct_cloud(plan: Plan, task: FileTask, row: int, finish: Finish) -> tuple[Any, Any]:
-    """Correct a file that begins at a row of the cloud; see `stream`.
+def _correct_cloud(plan: Plan, task: FileTask, finish: Finish) -> Any:
+    """Correct a file; see `stream`.
 
     It is written with the offsets of the input, and again if a coordinate does not fit: with
     offsets in the middle of the cloud.
@@ -124,7 +124,7 @@ def _correct_cloud(plan: Plan, task: FileTask, row: int, finish: Finish) -> tupl
     steps = tuple[int, ...]((0, 0, 0))
     while True:
         try:
-            return stream(partial(_correcting, steps=steps), plan, task, row, finish)
+            return stream(partial(_correcting, steps=steps), plan, task, finish)
         except columns.OutOfRangeError as axis:
             old = steps
             with open_cloud(task.source, task.jobs) as source:

@@ -26,7 +26,7 @@ from concurrent.futures import (
 )
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial, reduce
 from hashlib import sha256
 from operator import add
@@ -107,7 +107,7 @@ class FileWork(NamedTuple):
     identity: bytes = b""  # of the software in the header; by default that of pcfix
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FileTask:
     """A cloud to read, a cloud to write, and how."""
 
@@ -117,11 +117,35 @@ class FileTask:
     progress: Progress | None = None  # called with (points done, points in all)
     started: float = field(default_factory=time.perf_counter)
     kept: list[Chunk] = field(default_factory=list)  # of a small cloud that is read several times
+    # of one of many files: its points, the first as a row of the whole cloud, a checksum of all
+    # that the output depends on, and the version that must process it
+    points: int = 0
+    row: int = 0
+    key: str = ""
+    pcfix: str = version.__version__
+
+    def __str__(self) -> str:
+        return str(self.source)
 
     @property
     def seconds(self) -> float:
         """Time since the start."""
         return round(time.perf_counter() - self.started, 3)
+
+    @property
+    def record(self) -> Path:
+        """The file with its statistics, written just before its output appears."""
+        return self.target.parent / RECORDS / f"{self.target.name}.tally"
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the output exists, with the same key."""
+        return self.target.is_file() and read_tally(self.record)[0] == self.key
+
+    def keep(self, tally: Any) -> None:
+        """Write the statistics; an older output must not be taken for the one that follows."""
+        self.target.unlink(missing_ok=True)
+        write_tally(self.record, self.key, tally)
 
 
 @dataclass(frozen=True)
@@ -129,14 +153,14 @@ class Command(Generic[Result]):
     """A command that rewrites clouds, as functions.
 
     `plan` takes a task for the whole cloud, and returns all that its points have in common, which
-    can be pickled. `process` takes one file through a plan, and returns statistics and result; see
-    `stream`. `finish` takes the plan, the task and the statistics of the whole cloud; it refuses
-    what cannot be right, and returns the result of the command.
+    can be pickled. `process` takes one file through a plan; see `stream`. `finish` takes the plan,
+    the task and the statistics of the whole cloud; it refuses what cannot be right, and returns the
+    result of the command.
     """
 
     name: str
     plan: Callable[[FileTask], Any]
-    process: Callable[[Any, FileTask, int, Finish], tuple[Any, Any]]
+    process: Callable[[Any, FileTask, Finish], Any]
     finish: Callable[[Any, FileTask, Any], Result]
 
 
@@ -159,9 +183,9 @@ def run_command(
     task = file_task(cast("File", input), output, options, reads=reads, progress=progress)
     with threads(task.jobs), all_or_none():
         plan = command.plan(task)
-        _, result = command.process(plan, task, 0, partial(command.finish, plan, task))
+        result: Result = command.process(plan, task, partial(command.finish, plan, task))
         _write_summary(options, result)
-    return cast("Result", result)
+    return result
 
 
 def _write_summary(options: Any, result: Any) -> None:
@@ -171,12 +195,12 @@ def _write_summary(options: Any, result: Any) -> None:
 
 
 def stream(
-    work: Callable[[Any, LasSource], FileWork], plan: Any, task: FileTask, row: int, finish: Finish
-) -> tuple[Any, Any]:
+    work: Callable[[Any, LasSource], FileWork], plan: Any, task: FileTask, finish: Finish
+) -> Any:
     """Take every chunk of a file through a command; the target appears when all went well.
 
-    `work` returns what is done to the opened file by the plan; the file begins at a row of the
-    whole cloud. Returns the statistics, and what `finish` makes of them.
+    `work` returns what is done to the opened file by the plan. Returns what `finish` makes of the
+    statistics.
     """
     with open_cloud(task.source, task.jobs, kept=task.kept or None) as source:
         own, total = work(plan, source), len(source)
@@ -199,7 +223,7 @@ def stream(
             for points in read_ahead(source.chunks()):
                 end = done + len(points)
                 with running(report=report):
-                    result, one = own.compute(points, row + done)
+                    result, one = own.compute(points, task.row + done)
                 if written is not None:
                     written.result()  # at most one chunk waits, which bounds the memory
                 written = writer.submit(write, points, result)
@@ -208,7 +232,7 @@ def stream(
                 report(len(points))
             if written is not None:
                 written.result()
-            return tally, finish(tally)  # before the temporary file is renamed
+            return finish(tally)  # before the temporary file is renamed
 
 
 def read_ahead(chunks: Iterator[Any]) -> Iterator[Any]:
@@ -233,7 +257,7 @@ def _run_tiles(
         sentence = f"{folder}: is inside the folder of the inputs. Give one outside of it."
         raise SettingError("output.is_input", sentence, path=folder)
     check_summary(options, tiles.paths)
-    work = _work(command.name, tiles, folder, options)
+    work = _tasks(command.name, tiles, folder, options)
     # A tile is finished if its output exists with the key of these options and inputs.
     done = {tile for tile in work.values() if tile.is_finished}
     todo = [tile for tile in work.values() if tile not in done]
@@ -250,7 +274,7 @@ def _run_tiles(
             ) from error
         todo = [work[path] for path in readable.paths if work[path] not in done]
         failed = list(readable.broken.values())
-        for tile, why in run(do_tile, pickle.dumps((command.process, plan)), todo):
+        for tile, why in run(do_task, pickle.dumps((command.process, plan)), todo):
             if why:
                 failed.append(why)
             else:
@@ -281,13 +305,13 @@ def _run_tiles(
     return cast("Result", result)
 
 
-def _work(name: str, tiles: Tiles, folder: Path, options: Any) -> dict[Path, Tile]:
-    """Return a tile for each file, in their order."""
+def _tasks(name: str, tiles: Tiles, folder: Path, options: Any) -> dict[Path, FileTask]:
+    """Return a task for each file, in their order."""
     key = key_of(name, options, (*tiles.paths, *tiles.broken))
     work, row = {}, 0
     for path, points in zip(tiles.paths, tiles.points, strict=True):
         target = folder.resolve() / path.name
-        work[path] = Tile(path.resolve(), target, points, row, key, version.__version__)
+        work[path] = FileTask(path.resolve(), target, points=points, row=row, key=key)
         row += points
     return work
 
@@ -327,55 +351,21 @@ def _planned(command: Command[Any], tiles: Tiles, folder: Path) -> tuple[Any, Ti
 # Many files, on processes or a cluster
 
 
-@dataclass(frozen=True)
-class Tile:
-    """A file to process, and its output.
-
-    `row` is its first of the whole cloud, `key` a checksum of everything that the output depends
-    on, and `pcfix` the version that must process it.
-    """
-
-    source: Path
-    target: Path
-    points: int
-    row: int
-    key: str
-    pcfix: str
-
-    def __str__(self) -> str:
-        return str(self.source)
-
-    @property
-    def record(self) -> Path:
-        """The file with its statistics, written just before its output appears."""
-        return self.target.parent / RECORDS / f"{self.target.name}.tally"
-
-    @property
-    def is_finished(self) -> bool:
-        """Whether the output exists, with the same key."""
-        return self.target.is_file() and read_tally(self.record)[0] == self.key
-
-    def keep(self, tally: Any) -> None:
-        """Write the statistics; an older output must not be taken for the one that follows."""
-        self.target.unlink(missing_ok=True)
-        write_tally(self.record, self.key, tally)
-
-
-def do_tile(pickled: bytes, tile: Tile, jobs: int | None = None) -> str:
+def do_task(pickled: bytes, task: FileTask, jobs: int | None = None) -> str:
     """Process one file, here or on a worker; return the error, if there was one."""
     try:
-        if tile.pcfix != version.__version__:
+        if task.pcfix != version.__version__:
             raise InputError(
                 "cluster.version",
-                f"{tile.source}: this worker has pcfix {version.__version__}, not {tile.pcfix}."
+                f"{task}: this worker has pcfix {version.__version__}, not {task.pcfix}."
                 " Install that there.",
             )
-        if tile.is_finished:  # by a worker that was lost before it could say so
+        if task.is_finished:  # by a worker that was lost before it could say so
             return ""
         process, plan = pickle.loads(pickled)
         with threads(jobs), warnings.catch_warnings():
             warnings.simplefilter("ignore", PcfixWarning)  # shown when the plan was made
-            process(plan, FileTask(tile.source, tile.target, jobs), tile.row, tile.keep)
+            process(plan, replace(task, jobs=jobs), task.keep)
     except PcfixError as error:
         return str(error)
     return ""
