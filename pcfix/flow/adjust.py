@@ -295,7 +295,14 @@ def _write(folder: Path, found: Adjusted, model: str) -> None:
 
 def _write_models(folder: Path, found: Adjusted) -> None:
     """Write the model in each format that holds its lenses exactly."""
-    ties, cameras, opensfm = _adjusted_ties(found), found.cameras, folder / "opensfm"
+    ties, cameras, opensfm = None, found.cameras, folder / "opensfm"
+    if found.source != "cloud":  # the adjusted tie points without outliers
+        block, m = found.block, found.block.tie_points
+        used = found.used & (block.owner < m)
+        counts = np.bincount(block.owner[used], minlength=m)[:m]
+        start = np.concatenate([[0], np.cumsum(counts)])
+        ties = TiePoints(found.xyz[:m], Views(start, block.camera[used]), block.image_xy[used])
+        ties = taken_ties(ties, np.flatnonzero(counts >= LEAST_VIEWS))
     writers = {
         "colmap": partial(write_colmap, folder / "colmap", cameras, ties, crs=cameras.crs),
         "opensfm": partial(write_opensfm, opensfm / "reconstruction.json", cameras, ties),
@@ -317,15 +324,3 @@ def _write_models(folder: Path, found: Adjusted) -> None:
         raise InputError(
             "output.format", "No camera format can hold these lenses: " + " ".join(failed)
         )
-
-
-def _adjusted_ties(found: Adjusted) -> TiePoints | None:
-    """Return the adjusted tie points without outliers; None if the cloud replaced them."""
-    if found.source == "cloud":
-        return None
-    block, m = found.block, found.block.tie_points
-    kept = found.used & (block.owner < m)
-    counts = np.bincount(block.owner[kept], minlength=m)[:m]
-    start = np.concatenate([[0], np.cumsum(counts)])
-    ties = TiePoints(found.xyz[:m], Views(start, block.camera[kept]), block.image_xy[kept])
-    return taken_ties(ties, np.flatnonzero(counts >= LEAST_VIEWS))

@@ -106,13 +106,13 @@ def correct_file(
         With one sentence on what to change. No output is left behind.
     """
     given = taken(CorrectOptions, options, keywords, "correct_file")
-    command = Command("correct", partial(_plan_file, given), _correct_cloud, finish)
+
+    def plan(task: FileTask) -> Plan:
+        """Return the plan for a file, or for many as one cloud."""
+        return plan_correction(read_inputs(given, view_of(task.source, given.jobs, task.kept)))
+
+    command = Command("correct", plan, _correct_cloud, finish)
     return run_command(command, input, output, given, reads=paths_in(given), progress=progress)
-
-
-def _plan_file(options: CorrectOptions, task: FileTask) -> Plan:
-    """Return the plan for a file, or for many as one cloud."""
-    return plan_correction(read_inputs(options, view_of(task.source, options.jobs, task.kept)))
 
 
 def _correct_cloud(plan: Plan, task: FileTask, finish: Finish) -> Any:

@@ -201,7 +201,12 @@ def correct_chunk(
     xyz, above = points.xyz, batch.surface
     submerged, labels = plan.labelling.submerged(xyz, above, points.classes)
     if plan.inputs.port is not None:
-        correction = _through_port(plan, batch, np.flatnonzero(submerged))
+        from pcfix.port.methods import correct_through_port
+
+        rows, settings = np.flatnonzero(submerged), plan.survey.settings
+        wet, n = batch.take(rows), len(batch)
+        found = correct_through_port(wet.xyz, plan.cameras, plan.inputs.port, settings, wet.views)
+        correction = _spread(batch, rows, found, np.zeros(n), np.ones(n, np.bool_))
         figures = Tally.of(correction)
         miss_m = float(correction.ray_miss_m[submerged].sum())
         return correction, CloudTally(figures, labels, counts, port_miss_m=miss_m)
@@ -264,15 +269,6 @@ def _through_water(plan: Plan, batch: Batch, rows: IntArray, *, covariances: boo
     land = np.flatnonzero(is_land)
     shift[land] += shift_of_land(batch.take(land))
     return replace(correction, shift_m=shift)
-
-
-def _through_port(plan: Plan, batch: Batch, rows: IntArray) -> Correction:
-    """Correct the points of a cloud that was taken under water."""
-    from pcfix.port.methods import correct_through_port
-
-    wet, settings = batch.take(rows), plan.survey.settings
-    found = correct_through_port(wet.xyz, plan.cameras, plan.inputs.port, settings, wet.views)
-    return _spread(batch, rows, found, np.zeros(len(batch)), np.ones(len(batch), np.bool_))
 
 
 _PER_POINT = {one.name for one in fields(Correction)} & {*Intersection._fields} - {"camera_used"}

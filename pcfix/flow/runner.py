@@ -265,7 +265,13 @@ def _run_tiles(
         check_cloud(tile.target, overwrite=options.overwrite, inputs=tiles.paths)
     result, points = None, sum(one.points for one in todo)
     with threads(options.jobs), machines(options.scheduler, options.jobs, points) as run:
-        plan, readable = _planned(command, tiles, folder)
+        readable = tiles
+        while True:
+            try:
+                plan = command.plan(FileTask(readable, folder))
+                break
+            except BrokenTileError as error:
+                readable = readable.without(error.path, str(error))
         try:
             (folder / RECORDS).mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -337,15 +343,6 @@ def _plain(value: Any) -> Any:
     if value is None or isinstance(value, int | float | tuple):
         return value
     return sha256(pickle.dumps(value)).hexdigest()
-
-
-def _planned(command: Command[Any], tiles: Tiles, folder: Path) -> tuple[Any, Tiles]:
-    """Return the plan, and the tiles that could be read for it."""
-    while True:
-        try:
-            return command.plan(FileTask(tiles, folder)), tiles
-        except BrokenTileError as error:
-            tiles = tiles.without(error.path, str(error))
 
 
 # Many files, on processes or a cluster
@@ -459,18 +456,14 @@ def on_cluster(
 
 
 @contextmanager
-def machines(scheduler: str | None, jobs: int | None, points: int) -> Iterator[Run]:
-    """Give the function that runs a task for each file, with this number of points in all."""
-    if scheduler is None:
+def machines(address: str | None, jobs: int | None, points: int) -> Iterator[Run]:
+    """Give the function that runs a task for each file, with this number of points in all.
+
+    It uses processes of this machine, or the workers of the scheduler at an address.
+    """
+    if address is None:
         yield partial(in_processes, most=jobs or 1 + points // POINTS_A_PROCESS, jobs=jobs)
         return
-    with _client_of(scheduler) as client:
-        yield partial(on_cluster, client)
-
-
-@contextmanager
-def _client_of(address: str) -> Iterator[Any]:
-    """Connect to a scheduler that has workers."""
     distributed = optional_library("distributed", "cluster", f"--scheduler {address}")
     try:
         client = distributed.Client(address, timeout=WAIT_S, set_as_default=False)
@@ -490,7 +483,7 @@ def _client_of(address: str) -> Iterator[Any]:
                 f"scheduler {address}: has no workers. Start some with 'dask worker {address}'.",
                 address=address,
             ) from error
-        yield client
+        yield partial(on_cluster, client)
 
 
 # Files that a command reads and writes
