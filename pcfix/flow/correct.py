@@ -230,20 +230,21 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
         dropped=not_moved if options.uncorrected == "drop" else 0,
         cameras=len(plan.cameras),
         cameras_used=len(plan.cameras) - len(unused),
-        cameras_unused=unused,
+        cameras_unused=unused,  # labels of those without corrected points
         seconds=task.seconds,
         views=None if report is None else report.as_dict(),
         warnings=[one.as_dict() for one in notes],
         labelling=plan.labelling.report(tally.labels),
         settings={**options.part(ScienceOptions).as_dict(), **plan.settings},
-        part=part_report(task.source),
+        part=part_report(task.source),  # what was read, if not all points were
         water=water,
         water_fit=plan.found.as_dict(),
         uncertainty=uncertainty,
         carried=transfer.as_dict(tally.transfer) if transfer and tally.transfer else None,
-        made=made,
+        made=made,  # the reconstruction type, and why
+        # other notes on the cloud, also in `warnings`
         told=[one for one in map(str, detected) if made is None or one not in made["because"]],
-        poses=poses,
+        poses=poses,  # whether they have absorbed the refraction
         shoreline=shoreline,
         fit=None if tested is None else tested.as_dict(),
     )
