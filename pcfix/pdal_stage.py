@@ -162,7 +162,7 @@ def _clean(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
 
     def chunks(water: WaterSurface | None) -> Iterator[Tested]:
         for rows, points in _chunks(cloud, water):
-            yield Tested(points, cloud.withheld[rows], {name: rays[name][rows] for name in rays})
+            yield points, cloud.withheld[rows], {name: rays[name][rows] for name in rays}
 
     with threads(options.jobs):
         noise, found = find_noise(NAME, options, lambda: _view(cloud), ins, chunks, len(cloud))

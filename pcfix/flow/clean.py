@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import asdict, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -81,12 +81,8 @@ RAY_DIMENSIONS = ("RayCount", "RayMiss", "Incidence")
 _NEEDS = {"few rays": "min_rays", "ray miss": "max_ray_miss", "incidence": "max_incidence"}
 
 
-class Tested(NamedTuple):
-    """Some points, and by name those of `RAY_DIMENSIONS` that the cloud has, shape (n,)."""
-
-    points: Points
-    withheld: BoolArray
-    rays: dict[str, FloatArray]
+Tested: TypeAlias = tuple[Points, BoolArray, dict[str, FloatArray]]
+"""Some points, which of them are withheld, and by name those of `RAY_DIMENSIONS` there are."""
 
 
 def find_noise(
@@ -125,13 +121,13 @@ def find_noise(
     used, submerged, reasons = (np.zeros(n, kind) for kind in (bool, bool, np.uint8))
     cloud = Cloud(empty((n, 3)), used, submerged, reasons)
     first = 0
-    for one in chunks(water):
-        count = len(one.withheld)
+    for points, withheld, known in chunks(water):
+        count = len(withheld)
         rows = slice(first, first + count)
-        xyz, heights, classes, *_ = one.points
+        xyz, heights, classes, *_ = points
         cloud.xyz[rows] = xyz
-        used[rows] = ~(one.withheld | np.isin(classes, NOISE_CLASSES))
-        rays, miss, incidence = (one.rays.get(dimension) for dimension in RAY_DIMENSIONS)
+        used[rows] = ~(withheld | np.isin(classes, NOISE_CLASSES))
+        rays, miss, incidence = (known.get(dimension) for dimension in RAY_DIMENSIONS)
         if rays is not None:
             flag_weak(rules, reasons[rows], rays, miss, incidence)
             reasons[rows][~used[rows]] = 0
@@ -210,7 +206,7 @@ def _plan_file(options: CleanOptions, progress: Progress | None, task: FileTask)
             for chunk in source.chunks():
                 rays = {name: source.dimension(chunk, name) for name in shown}
                 withheld = np.asarray(chunk["withheld"]).astype(np.bool_)
-                yield Tested(points_of(chunk, source, water), withheld, rays)
+                yield points_of(chunk, source, water), withheld, rays
 
     beside = task.target.absolute()
     if not beside.parent.is_dir():  # the folder of many files is made later

@@ -460,11 +460,8 @@ def correct_points(
     if level_offset_m is not None:
         offset = np.ascontiguousarray(level_offset_m, dtype=np.float64)
         if offset.shape != (len(cameras),) or not np.isfinite(offset).all():
-            raise SettingError(
-                "array.shape",
-                f"level_offset_m must be {len(cameras)} finite numbers, one per camera, not of"
-                f" shape {offset.shape}.",
-            )
+            sentence = f"level_offset_m must be {len(cameras)} finite numbers, one per camera."
+            raise SettingError("array.shape", sentence, shape=offset.shape)
     original = cameras if adjusted_from is None else adjusted_from
     if views is not None:
         _check_views(views, xyz, original)
@@ -472,11 +469,8 @@ def correct_points(
     if may_be_submerged is not None:
         allowed = np.asarray(may_be_submerged)
         if allowed.shape != classes.shape or allowed.dtype != np.bool_:
-            raise SettingError(
-                "array.shape",
-                f"may_be_submerged must be {len(xyz)} booleans, not {allowed.dtype} of shape"
-                f" {allowed.shape}.",
-            )
+            sentence = f"may_be_submerged must be {len(xyz)} booleans, not {allowed.dtype}."
+            raise SettingError("array.shape", sentence, shape=allowed.shape)
         classes[~allowed] = NOT_SUBMERGED
     points = Points(xyz, heights, classes)
     view = CloudView(
