@@ -37,8 +37,8 @@ from pcfix.photos.waves import (
     slopes_of,
     still,
 )
-from pcfix.report.summary import Figures
 from pcfix.running import threads
+from pcfix.sums import Figures
 from pcfix.water.index import index_of
 from pcfix.water.surface import surface_above
 

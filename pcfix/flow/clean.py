@@ -24,7 +24,7 @@ from pcfix.model import LOW_NOISE, NOISE_CLASSES, BoolArray, FloatArray, WaterSu
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import WaterOptions
 from pcfix.options.steps import CleanOptions, CleanRules
-from pcfix.report.summary import Figures
+from pcfix.sums import Figures
 from pcfix.version import __version__
 from pcfix.water.checks import check_submerged
 from pcfix.water.surface import is_submerged, surface_above

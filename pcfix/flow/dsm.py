@@ -38,7 +38,7 @@ from pcfix.io.tiles import CloudFiles, Clouds, cloud_of, inputs_of, open_cloud
 from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES, FloatArray
 from pcfix.options.declare import File, taken
 from pcfix.options.steps import MIN_RESOLUTION_M, DsmOptions, DsmRules
-from pcfix.report.summary import Figures
+from pcfix.sums import Figures
 from pcfix.version import __version__
 
 WINDOW_POINTS = 400_000

@@ -31,7 +31,7 @@ from pcfix.label.labelling import LabelCounts, Labelling, Part
 from pcfix.model import WaterPlane, WaterSurface
 from pcfix.options.correct import LabelOptions, LabelRules, StageLabelOptions
 from pcfix.options.declare import File, taken
-from pcfix.report.summary import Figures
+from pcfix.sums import Figures
 from pcfix.version import __version__
 from pcfix.water.checks import as_surface, check_submerged, check_tilt, checked_points
 from pcfix.water.surface import surface_above

@@ -22,8 +22,8 @@ from pcfix.model import WaterPlane
 from pcfix.options.declare import File, taken
 from pcfix.options.photos import OrthoOptions, PhotosOptions
 from pcfix.photos.ortho import Picture, mosaic, picture_of
-from pcfix.report.summary import Figures
 from pcfix.running import threads
+from pcfix.sums import Figures
 
 TILE_CELLS = 512
 CACHE_BYTES = 400_000_000

@@ -34,8 +34,8 @@ from pcfix.model import Cameras, FloatArray, Lens, WaterDimension
 from pcfix.options.declare import File, taken
 from pcfix.options.photos import PhotosOptions
 from pcfix.photos.mapping import Ground, Photo, Scene, exact, ground_seen, nodes_of, paper, resample
-from pcfix.report.summary import Figures
 from pcfix.running import current, threads
+from pcfix.sums import Figures
 from pcfix.water.checks import check_above_water
 from pcfix.water.index import index_of
 

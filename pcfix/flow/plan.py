@@ -33,12 +33,12 @@ from pcfix.options.scenes import PlanOptions
 from pcfix.refract.batch import Survey
 from pcfix.refract.tally import COVERAGE_95, ORDERS, largest_tvu_m
 from pcfix.report.page import AFTER, BEFORE, REFERENCE, WATER, Table, label_plan, new_figure
-from pcfix.report.summary import Figures
 from pcfix.report.text import aligned
 from pcfix.running import threads
 from pcfix.simulate.scene import lay_out, points_on
 from pcfix.simulate.settings import SceneSettings
 from pcfix.simulate.sight import see
+from pcfix.sums import Figures
 from pcfix.water.index import index_of
 
 if TYPE_CHECKING:

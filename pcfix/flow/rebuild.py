@@ -34,8 +34,8 @@ from pcfix.options.declare import File, taken
 from pcfix.options.photos import PhotosOptions, RebuildOptions
 from pcfix.photos.ortho import Picture, blank_in
 from pcfix.photos.stereo import stereo_cloud
-from pcfix.report.summary import Figures
 from pcfix.running import threads
+from pcfix.sums import Figures
 from pcfix.water.surface import surface_above
 
 RECORD = "pcfix-rebuild.json"

@@ -2,18 +2,9 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any
 
-from pcfix.errors import plain
-
-
-class Figures(SimpleNamespace):
-    """The results of a command by name, as its text and the JSON file of its summary have them."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values, ready for JSON."""
-        return dict(plain(self))
+from pcfix.sums import Figures
 
 
 class Summary(Figures):

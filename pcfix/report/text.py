@@ -19,7 +19,7 @@ from pcfix.refract.tally import ORDERS
 from pcfix.report.summary import Summary
 
 if TYPE_CHECKING:
-    from pcfix.report.summary import Figures
+    from pcfix.sums import Figures
 
 Plain = dict[str, Any]
 Rows = list[tuple[str, str]]
