@@ -22,7 +22,6 @@ from pcfix.io.files import belonging, file_state, files_in, read_json, write_tex
 from pcfix.io.rasters import open_raster
 from pcfix.io.tiles import Tiles, cloud_of, inputs_of, open_cloud, tiles_from, tiles_of
 from pcfix.model import Cameras, WaterSurface
-from pcfix.options.correct import CorrectOptions
 from pcfix.options.declare import named, options_of
 from pcfix.options.steps import DistanceOptions
 from pcfix.options.survey import RunOptions
@@ -128,11 +127,11 @@ def _files_of(cloud: Path | Tiles) -> list[Path]:
     return inputs_of(cloud) if isinstance(cloud, Tiles) else files_in(cloud)
 
 
-_CORRECTION = {one.name for one in options_of(CorrectOptions)}.difference(
-    ("input", "adjust", "index", "index_formula"),
-    Water._fields,
-    (one.name for one in options_of(Inputs)),
-)
+_FIRST = {
+    *("input", "adjust", "gcps", "gnss", "lens", "index", "index_formula", VERSION),
+    *(one.name for one in options_of(Inputs)),
+    *Water._fields,
+}
 _LATER = {
     **{one.name: "compare" for one in options_of(DistanceOptions)},
     "reference": "compare", "resolution": "dsm", "project": "report", "date": "report",
@@ -141,7 +140,7 @@ _LATER = {
 
 def since(name: str) -> str:
     """Return the first step that an option of a request matters to."""
-    return "correct" if name in _CORRECTION else _LATER.get(name, "adjust")
+    return "adjust" if name in _FIRST else _LATER.get(name, "correct")
 
 
 class Record:
