@@ -208,10 +208,10 @@ def _plan_file(options: CleanOptions, progress: Progress | None, task: FileTask)
                 withheld = np.asarray(chunk["withheld"]).astype(np.bool_)
                 yield points_of(chunk, source, water), withheld, rays
 
-    beside = task.target.absolute()
-    if not beside.parent.is_dir():  # the folder of many files is made later
-        beside = next(one for one in beside.parents if one.is_dir()) / beside.name
-    with scratch_arrays(beside):
+    near = task.target.absolute()
+    if not near.parent.is_dir():  # the folder of many files is made later
+        near = next(one for one in near.parents if one.is_dir()) / near.name
+    with scratch_arrays(near):
         noise, summary = find_noise(
             str(cloud), options, lambda: view_of(cloud), names, chunks, points,
             count, has_rays=has_rays,
@@ -225,7 +225,7 @@ def _plan_file(options: CleanOptions, progress: Progress | None, task: FileTask)
 
 
 def _finish(plan: CleanPlan, task: FileTask, count: int) -> Figures:
-    """Return the summary of a whole cloud."""
+    """Return the summary of a cloud."""
     own = {"input": str(task.source), "output": str(task.target), "seconds": task.seconds}
     return Figures(**vars(plan.summary) | own)
 

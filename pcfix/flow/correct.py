@@ -109,7 +109,7 @@ def correct_file(
 
     def plan(task: FileTask) -> Plan:
         """Return the plan for a file, or for many as one cloud."""
-        return plan_correction(read_inputs(given, view_of(task.source, given.jobs, task.kept)))
+        return plan_correction(read_inputs(given, view_of(task.source, given.jobs, task.cached)))
 
     command = Command("correct", plan, _correct_cloud, finish)
     return run_command(command, input, output, given, reads=paths_in(given), progress=progress)
@@ -326,7 +326,7 @@ def _out_of_sight(plan: Plan, figures: Tally, flat: int) -> str:
 
 
 def check_fit(plan: Plan, tally: CloudTally, ties: TiePoints | None = None) -> Plausible:
-    """Test cameras, cloud and water against each other; warn of every doubt."""
+    """Test cameras, cloud and water against each other; warn of what does not fit."""
     sample, given = tally.sample or CloudSample(), plan.inputs.cameras
     sought = (plan.found.as_dict() or {}).get("model") == "auto"
     tested = plausible(
@@ -335,8 +335,8 @@ def check_fit(plan: Plan, tally: CloudTally, ties: TiePoints | None = None) -> P
         listed=plan.views is not None, every=sample.every,
     )  # fmt: skip
     tested = tested._replace(noted=CAUSES in map(str, _detected(plan, tally)))
-    for doubt in tested.doubts:
-        warnings.warn(doubt, stacklevel=3)
+    for warning in tested.doubts:
+        warnings.warn(warning, stacklevel=3)
     return tested
 
 

@@ -198,7 +198,7 @@ def _labelling(plan: LabelPlan, source: LasSource) -> FileWork:
 
 
 def _finish(plan: LabelPlan, task: FileTask, counts: LabelCounts) -> Figures:
-    """Check the counts of a whole cloud, and return the summary."""
+    """Check the counts of a cloud, and return the summary."""
     check(plan, counts)
     return Figures(
         input=str(task.source),

@@ -150,7 +150,7 @@ def plan_flight(
 def _predicted(given: PlanOptions, depth_m: float) -> Figures:
     """Return the prediction for a flat bed of one depth."""
     bed = _bed(given, depth_m)
-    whole, sigma_m, adjusted_m = _sigma(given, bed)
+    corrected, sigma_m, adjusted_m = _sigma(given, bed)
     parts_m = {part: _rms(_budget(given, bed, part).sigma_z_m) for part in PARTS}
     parts_m["poses"] = float(np.hypot(parts_m["poses"], adjusted_m))
     share, left_m = _absorbed(given, bed)
@@ -158,7 +158,7 @@ def _predicted(given: PlanOptions, depth_m: float) -> Figures:
     return Figures(
         depth_m=depth_m,
         apparent_m=float(-bed.apparent[:, 2].mean()),  # as reconstructed with straight rays
-        rays=float(whole.ray_count.mean()),  # per point
+        rays=float(corrected.ray_count.mean()),  # per point
         sigma_m=sigma_m,  # standard error of the corrected heights, rms over the bed
         parts_m=parts_m,  # of it; their squares add up
         absorbed=share,  # of the misfit, by poses and focal length of an ordinary adjustment

@@ -65,7 +65,7 @@ def report_run(
     pictures, tables, dod, verdict = list[Picture](), list[Table](), None, ""
     if first["adjusted"]:
         verdict = f" The cameras were adjusted first, as {first['why']}."
-    elif first["is_said"]:
+    elif first["is_shown"]:
         verdict = f" The cameras were not adjusted: {first['why']}."
     request, summary = run.request, Summary(**corrected)
     if compared:

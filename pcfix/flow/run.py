@@ -183,7 +183,7 @@ def run_all(
         say(f"{done}{outputs[0]}")
         for words in (adjustment_sentence(figures), *all_notes(figures)):
             say(f"{'':<9} {words}")
-    elif first["is_said"]:
+    elif first["is_shown"]:
         say(f"{'adjust':<9} not done: {first['why']}")
     request = request.with_adjusted(out_dir, first)
     run = RunFolder(out_dir, request)
@@ -197,8 +197,8 @@ def run_all(
         # the first step has surveys that the correction has not
         words = "did not absorb the refraction, as the first step found"
         corrected = {**corrected, "poses": {**poses, "absorbed": False, "words": words}}
-    if not first["is_said"] and first["why"] and (poses or {}).get("absorbed"):
-        first = {**first, "is_said": True}
+    if not first["is_shown"] and first["why"] and (poses or {}).get("absorbed"):
+        first = {**first, "is_shown": True}
         say(f"{'adjust':<9} not done: {first['why']}")
     say(f"{done}{run.corrected}")
 
@@ -277,10 +277,10 @@ def adjust_first(request: Request, folder: Path, files: list[Path]) -> Plain:
     -------
     dict
         `adjusted`, a bool; `model`, the file or folder with the cameras in that of the adjustment;
-        `why`; `is_said`, whether that is worth a line; `is_fine`, whether the poses are known to be
-        right.
+        `why`; `is_shown`, whether that is worth a line; `is_fine`, whether the poses are known to
+        be right.
     """
-    found = {"adjusted": False, "model": None, "why": "", "is_said": False, "is_fine": False}
+    found = {"adjusted": False, "model": None, "why": "", "is_shown": False, "is_fine": False}
     try:
         found |= _decide(request)
         if found["adjusted"]:
@@ -289,7 +289,7 @@ def adjust_first(request: Request, folder: Path, files: list[Path]) -> Plain:
         if request.adjust == "yes" or request.only_to_adjust:
             raise
         # a file that cannot be read will stop the correction, with the same message
-        found |= {"adjusted": False, "why": str(error), "is_said": found["adjusted"]}
+        found |= {"adjusted": False, "why": str(error), "is_shown": found["adjusted"]}
     return found
 
 
@@ -300,12 +300,12 @@ def _decide(request: Request) -> Plain:
     cloud must not depend on it.
     """
     if request.adjust == "yes":
-        return {"adjusted": True, "why": "that was asked for", "is_said": True}
+        return {"adjusted": True, "why": "that was asked for", "is_shown": True}
     if request.adjust == "no":
         return {}
-    inputs, is_said = request.part(Inputs), bool(request.only_to_adjust)
+    inputs, is_shown = request.part(Inputs), bool(request.only_to_adjust)
     if request.why_not_adjust:
-        return {"why": request.why_not_adjust, "is_said": is_said}
+        return {"why": request.why_not_adjust, "is_shown": is_shown}
     view = view_of(request.source)
     # the correction shows the warnings
     with warnings.catch_warnings(action="ignore", category=PcfixWarning):
@@ -317,21 +317,21 @@ def _decide(request: Request) -> Plain:
                 "there is no datum: no --gcps, no --gnss, and no GNSS positions better than"
                 f" {MOST_STATED_M:g} m in the camera file"
             )
-            return {"why": why, "is_said": is_said}
+            return {"why": why, "is_shown": is_shown}
         water = inputs.surface(view).surface
         if isinstance(water, WaterDimension):
             why = f"the water {water} is known at points of the cloud only"
-            return {"why": why, "is_said": True}
+            return {"why": why, "is_shown": True}
         index = with_index(request).refractive_index
         sign = diagnose_inputs(
-            inputs, cameras, view, water, index, gcps=request.gcps, in_passing=not is_said
+            inputs, cameras, view, water, index, gcps=request.gcps, in_passing=not is_shown
         ).decided_by
     if sign is None:
         why = "nothing shows whether the poses absorbed the refraction; --adjust yes adjusts anyway"
-        return {"why": why, "is_said": True}
+        return {"why": why, "is_shown": True}
     did = "absorbed" if sign.speaks else "did not absorb"
     why = f"the poses {did} the refraction: {sign.words}"
-    return {"adjusted": sign.speaks, "why": why, "is_said": True, "is_fine": not sign.speaks}
+    return {"adjusted": sign.speaks, "why": why, "is_shown": True, "is_fine": not sign.speaks}
 
 
 def _adjust(request: Request, target: Path, files: list[Path]) -> str:

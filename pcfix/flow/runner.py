@@ -1,9 +1,9 @@
 """How a command goes over a cloud: in one file, or in many on several processes or a cluster.
 
-A `Command` plans once for a whole cloud; then each file goes through `stream`, chunk by chunk, with
-the next chunk being read and the last one written meanwhile. Of many files each is a task that
-writes its output, and its statistics beside it, in the folder `RECORDS`. A file whose output exists
-with the same key (a hash of options and input files) is skipped.
+A `Command` plans once for a cloud; then each file goes through `stream`, chunk by chunk, with
+the next chunk being read and the last one written meanwhile. Each of many files is a task that
+writes its output, and its statistics in the folder `RECORDS`. A file whose output exists with the
+same key (a hash of options and input files) is skipped.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ Progress: TypeAlias = Callable[[int, int], None]
 Bar: TypeAlias = Callable[[str], AbstractContextManager[Progress | None]]
 """Shows the progress of a step, given its title."""
 Finish: TypeAlias = Callable[[Any], Any]
-"""Takes the statistics of a whole cloud; refuses what cannot be right, else returns the result."""
+"""Takes the statistics of all points; refuses what cannot be right, else returns the result."""
 RECORDS = ".pcfix"
 HOW = ("overwrite", "jobs", "scheduler", "summary")
 """Options on which no output depends."""
@@ -116,8 +116,8 @@ class FileTask:
     jobs: int | None = None
     progress: Progress | None = None  # called with (points done, points in all)
     started: float = field(default_factory=time.perf_counter)
-    kept: list[Chunk] = field(default_factory=list)  # of a small cloud that is read several times
-    # of one of many files: its points, the first as a row of the whole cloud, a checksum of all
+    cached: list[Chunk] = field(default_factory=list)  # of a small cloud that is read several times
+    # of one of many files: its points, the first as a row of all files, a checksum of all
     # that the output depends on, and the version that must process it
     points: int = 0
     row: int = 0
@@ -152,9 +152,9 @@ class FileTask:
 class Command(Generic[Result]):
     """A command that rewrites clouds, as functions.
 
-    `plan` takes a task for the whole cloud, and returns all that its points have in common, which
+    `plan` takes a task for all files, and returns all that its points have in common, which
     can be pickled. `process` takes one file through a plan; see `stream`. `finish` takes the plan,
-    the task and the statistics of the whole cloud; it refuses what cannot be right, and returns the
+    the task and the statistics of all points; it refuses what cannot be right, and returns the
     result of the command.
     """
 
@@ -202,7 +202,7 @@ def stream(
     `work` returns what is done to the opened file by the plan. Returns what `finish` makes of the
     statistics.
     """
-    with open_cloud(task.source, task.jobs, kept=task.kept or None) as source:
+    with open_cloud(task.source, task.jobs, kept=task.cached or None) as source:
         own, total = work(plan, source), len(source)
         tally, done, end, reached = None, 0, 0, 0.0  # points before and after, and those reported
         # the index of a COPC file would be wrong
@@ -291,7 +291,7 @@ def _run_tiles(
             # in the order of the files, so that no sum depends on which was first
             tallies = [read_tally(tile.record)[1] for tile in work.values() if tile in done]
             tally = reduce(add, tallies) if tallies[0] is not None else None
-            # Only the statistics of the whole cloud show whether cameras and water fit.
+            # Only the statistics of all points show whether cameras and water fit.
             try:
                 result = command.finish(plan, task, tally)
             except PcfixError:

@@ -251,7 +251,7 @@ def own_water_of(
     paths, notes = rasters_of_images(folder, cameras.labels)
     offset = np.zeros(k) if level_offset_m is None else level_offset_m
     heights, sigma = dict[int, WaterRaster](), dict[int, WaterRaster]()
-    places, apart = [], []
+    places, differences = [], []
     with warnings.catch_warnings():  # those of the first raster are enough
         for image, path in paths.items():
             heights[image] = raster = read_water_raster(path, view.crs)
@@ -267,14 +267,15 @@ def own_water_of(
             if not isinstance(water, WaterDimension):
                 common = surface_above(water, np.column_stack([x, y, x])).height_m + offset[image]
                 off = np.append(raster.height_m[rows, columns] - common, np.nan)
-                apart.append(np.nanmedian(off))
+                differences.append(np.nanmedian(off))
     if len(sigma) < len(heights):
         lost = len(heights) - len(sigma)
         notes += (f"{folder}: {lost} rasters have no standard errors in the folder sigma.",)
     if np.isfinite(low).all() and not any(places):
         text = f"{folder}: none of its rasters overlaps the cloud. Check their CRS."
         raise InputError("water.no_overlap", text, path=folder)
-    differs = float(np.nanmedian(apart)) if np.isfinite(apart).any() else 0.0
+    known = np.isfinite(differences).any()
+    differs = float(np.nanmedian(differences)) if known else 0.0
     if abs(differs) > APART_M:
         raise InputError(
             "water.datum",

@@ -159,8 +159,8 @@ def _read(path: Path, most: int) -> tuple[list[_Layer], Any]:
             row += len(points)
     if not parts:
         raise InputError("cloud.empty", f"{path}: has no points to show.", path=path)
-    whole = np.vstack(parts)
-    after = _Layer(path.name, whole[:, :3], dict(zip(names, whole.T[3:], strict=True)))
+    rows = np.vstack(parts)
+    after = _Layer(path.name, rows[:, :3], dict(zip(names, rows.T[3:], strict=True)))
     if not {*SHIFTS, "WaterDepth"} <= after.known.keys():
         return [after], crs
     shift = np.column_stack([after.known[name] for name in SHIFTS])
