@@ -33,7 +33,6 @@ from pcfix.flow.maps import (
     UNCERTAINTY,
     contours_layer,
     raster_files,
-    resolution_sentence,
     write_map,
     write_rasters,
 )
@@ -214,12 +213,11 @@ def run_all(
 
     errors = corrected["uncertainty"] is not None
     outputs = raster_files(out_dir, errors=errors)
-    made, done = step(
+    gridded, done = step(
         "dsm", "Gridding", outputs,
         lambda progress: write_rasters(run, errors=errors, progress=progress),
     )  # fmt: skip
-    given = request.resolution is not None
-    say(f"{done}{outputs[0]}{resolution_sentence(made, given=given)}")
+    say(f"{done}{outputs[0]}, cells of {gridded['resolution_m']:g} m")
 
     compared: Plain = {}
     if request.reference is not None:
