@@ -36,7 +36,6 @@ SIGMA_Z = "SigmaZ"
 SAMPLE_POINTS = 200_000
 """Points in histogram and uncertainty figure, evenly spread over the file."""
 PAGE = "report.html"
-ENDINGS = (".laz", ".las", ".tif", ".gpkg", ".csv", ".html", ".json")
 RESULTS = {
     "corrected.laz": "all points, the bed corrected",
     "cleaned.laz": "the same, with outliers flagged as noise",
@@ -100,7 +99,7 @@ def write_report(run: RunResults, inputs: Sequence[Path], out_dir: Path) -> Repo
     """
     rows = [[path.name, f"{path.stat().st_size:,}", sha256(path)] for path in inputs]
     table = Table("Input files", ["file", "bytes", "SHA-256"], rows)
-    report = run_report(run, table, _beside(out_dir))
+    report = run_report(run, table, _results_in(out_dir))
     figures = out_dir / "figures"
     figures.mkdir(exist_ok=True)
     for picture in report.pictures:
@@ -109,17 +108,17 @@ def write_report(run: RunResults, inputs: Sequence[Path], out_dir: Path) -> Repo
     return report
 
 
-def _beside(folder: Path) -> list[tuple[str, str]]:
-    """Return the files beside the page, and their contents."""
-    found = [path for pattern in ("*", "*/*") for path in sorted(folder.glob(pattern))]
-    names = [path.relative_to(folder).as_posix() for path in found if path.is_file()]
-    tiled = {f"{name[:-4]}/": words for name, words in RESULTS.items() if name.endswith(".laz")}
-    names = [name for name in names if not name.startswith(tuple(tiled))]
-    return [(name, words) for name, words in tiled.items() if (folder / name).is_dir()] + [
-        (name, RESULTS.get(name, "a cross-section" if "/section_" in name else ""))
-        for name in names
-        if name.endswith(ENDINGS) and not name.startswith((".", "figures/", PAGE))
-    ]
+def _results_in(folder: Path) -> list[tuple[str, str]]:
+    """Return the files of a run, or the folders of tiles, and their contents."""
+    found = []
+    for name, words in RESULTS.items():
+        tiles = folder / name.removesuffix(".laz")
+        if (folder / name).is_file():
+            found.append((name, words))
+        elif tiles.is_dir():
+            found.append((f"{tiles.name}/", words))
+    sections = sorted(folder.glob("compare/section_*.csv"))
+    return [*found, *((f"compare/{one.name}", "a cross-section") for one in sections)]
 
 
 def read_cloud(path: Path | Tiles, resolution_m: float | None = None) -> Plain:
