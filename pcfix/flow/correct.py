@@ -310,17 +310,14 @@ def _out_of_sight(plan: Plan, figures: Tally, flat: int) -> str:
         )
     from pcfix.io.cameras.mistakes import likely_mistake
 
-    sentence = "no camera has a point in sight. Check that cameras and cloud have the same CRS."
-    if plan.inputs.port is None:
-        middle = (figures.low + figures.high) / 2.0
-        distance = float(np.hypot(*(plan.cameras.centres - middle)[:, :2].T).min())
-        away = f"{distance / 1000.0:,.1f} km" if distance >= 10_000.0 else f"{distance:,.1f} m"
-        within = f" within {limit:g} degrees" if limit else ""
-        sentence = (
-            f"no camera has a submerged point in sight{within}; the nearest is {away} in plan from"
-            f" the middle of the {figures.submerged:,} submerged points. Check that cameras and"
-            " cloud have the same CRS, and that pitch 0 is straight down."
-        )
+    middle = (figures.low + figures.high) / 2.0
+    distance = float(np.hypot(*(plan.cameras.centres - middle)[:, :2].T).min())
+    within = f" within {limit:g} degrees" if limit else ""
+    sentence = (
+        f"no camera has a submerged point in sight{within}; the nearest is {distance:,.1f} m in"
+        f" plan from the middle of the {figures.submerged:,} submerged points. Check that cameras"
+        " and cloud have the same CRS, and that pitch 0 is straight down."
+    )
     mistake = likely_mistake(plan.cameras.centres, figures.low, figures.high, plan.view.crs)
     return f"{sentence} {mistake or ''}".strip()
 
@@ -349,22 +346,12 @@ def _detected(plan: Plan, tally: CloudTally) -> list[PcfixWarning]:
 
         least = LEAST_BEYOND if plan.inputs.regression is None else 0.0
         beyond = tally.beyond.notes(line, least)
-    corrected, rays = tally.figures.corrected, list[PcfixWarning]()
-    if plan.inputs.port is not None and plan.survey.settings.method == "snell" and corrected:
-        mean = tally.port_miss_m / corrected
-        sentence = (
-            "The refracted rays of the apparent points miss each other behind the port by"
-            f" {mean:.3f} m on average. --method consistent takes this into account, best with"
-            " --views."
-        )
-        rays.append(PcfixWarning("port.ray_distance", sentence, mean_m=mean))
     unlisted = []
     if UNLISTED in plan.survey.parts:
         so = " ".join(map(str, plan.of_unlisted))
         unlisted = [f"Points in no view list are corrected as without a list. {so}"]
     return [
         *plan.notes,
-        *rays,
         *coded("regression.range", beyond),
         *coded("cloud.reconstruction", verdicts.values()),
         *coded("views.unlisted", unlisted),
