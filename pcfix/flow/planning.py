@@ -23,7 +23,8 @@ from pcfix.flow.inputs import (
     paths_in,
     read_blocks,
 )
-from pcfix.flow.surfaces import CloudView, Points, first_points, own_water_of, parts_of, sample_of
+from pcfix.flow.surfaces import CloudView, Points, own_water_of, parts_of, sample_of
+from pcfix.io.las.source import CHUNK_POINTS
 from pcfix.model import NOISE_CLASSES, FloatArray, Views, WaterPlane
 from pcfix.options.correct import CorrectOptions
 from pcfix.refract.batch import FLAT_DEG, UNLISTED, Batch, Learned, Survey, stacked
@@ -168,7 +169,7 @@ def plan_correction(plan: Plan) -> Plan:
     water, first = plan.found.surface, None
     if plan.views is not None or transfer is not None:
         # the first points show whether the list is in the order of the cloud, or has coordinates
-        first = first_points(view.chunks(water))
+        first = sample_of(view, np.arange(min(CHUNK_POINTS, view.points)), water)
         if match is not None:
             match = match.settled(first.xyz)
             plan = replace(plan, views=match)

@@ -14,7 +14,6 @@ import numpy.typing as npt
 
 from pcfix.errors import InputError, PcfixWarning, SettingError, coded
 from pcfix.flow.runner import Chunk, read_ahead
-from pcfix.io.las import source as las
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.tiles import CloudFiles, open_cloud
 from pcfix.label.labelling import Part
@@ -115,17 +114,6 @@ def file_points(
         yield from read_ahead(points_of(one, source, water) for one in source.chunks())
 
 
-def first_points(chunks: Iterable[Points]) -> Points:
-    """Return the first points of a cloud, as many as a chunk has."""
-    parts, count = list[Points](), 0
-    for one in chunks:
-        parts.append(one.take(slice(0, las.CHUNK_POINTS - count)))
-        count += len(parts[-1].xyz)
-        if count >= las.CHUNK_POINTS:
-            break
-    return joined_points(parts)
-
-
 def joined_points(parts: Iterable[Points]) -> Points:
     """Return consecutive points as one, with what all of them have, but no weights of views."""
     *columns, views = [
@@ -157,6 +145,8 @@ def sample_of(
             one = one._replace(views=match.views_of(one.xyz, first)[0])
         parts.append(one.take(rows[low:high] - first))
         first += len(one.xyz)
+        if high == len(rows):
+            break
     return joined_points(parts)
 
 
