@@ -346,12 +346,22 @@ def _detected(plan: Plan, tally: CloudTally) -> list[PcfixWarning]:
 
         least = LEAST_BEYOND if plan.inputs.regression is None else 0.0
         beyond = tally.beyond.notes(line, least)
+    corrected, rays = tally.figures.corrected, list[PcfixWarning]()
+    if plan.inputs.port is not None and plan.survey.settings.method == "snell" and corrected:
+        mean = tally.port_miss_m / corrected
+        sentence = (
+            "The refracted rays of the apparent points miss each other behind the port by"
+            f" {mean:.3f} m on average. --method consistent takes this into account, best with"
+            " --views."
+        )
+        rays.append(PcfixWarning("port.ray_distance", sentence, mean_m=mean))
     unlisted = []
     if UNLISTED in plan.survey.parts:
         so = " ".join(map(str, plan.of_unlisted))
         unlisted = [f"Points in no view list are corrected as without a list. {so}"]
     return [
         *plan.notes,
+        *rays,
         *coded("regression.range", beyond),
         *coded("cloud.reconstruction", verdicts.values()),
         *coded("views.unlisted", unlisted),

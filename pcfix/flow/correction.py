@@ -149,6 +149,7 @@ class CloudTally(Sums):
     beyond: BeyondRange | None = None
     shore: NearWater | None = None
     transfer: TransferCounts | None = None
+    port_miss_m: float = 0.0
 
 
 def kind_of(views: ViewMatch | Views | None) -> ViewKind | None:
@@ -206,7 +207,8 @@ def correct_chunk(
         wet, n = batch.take(rows), len(batch)
         found = correct_through_port(wet.xyz, plan.cameras, plan.inputs.port, settings, wet.views)
         correction = _spread(batch, rows, found, np.zeros(n), np.ones(n, np.bool_))
-        return correction, CloudTally(Tally.of(correction), labels, counts)
+        miss_m = float(correction.ray_miss_m[submerged].sum())
+        return correction, CloudTally(Tally.of(correction), labels, counts, port_miss_m=miss_m)
     if step is not None:
         submerged &= step.moved  # a point without a place in the adjusted block is left where it is
     correction = _through_water(plan, batch, np.flatnonzero(submerged), covariances=covariances)
