@@ -99,9 +99,8 @@ def test_measured_replaces_predicted(summary):
     mean = summary.uncertainty["tvu_95_m"]["mean"]
     assert f"predicted {mean:.3f} m on average, measured 0.300 m at 100 points" in found
     assert "order 1a/1b" in found and "Exclusive" not in found
-    assert "predicted" not in uncertainty_sentence(
-        Summary(**vars(summary) | {"uncertainty": None}), far
-    )
+    unknown = Summary(**vars(summary) | {"uncertainty": None})
+    assert "predicted" not in uncertainty_sentence(unknown, far)
     few = asdict(tvu_of(np.full(FEWEST - 1, 0.01), np.full(FEWEST - 1, 2.0)))
     assert f"fewer than {FEWEST} points claim no order" in uncertainty_sentence(summary, few)
 
