@@ -20,9 +20,9 @@ from pcfix.flow.photos import map_photos as map_photos
 from pcfix.flow.plan import plan_flight as plan_flight
 from pcfix.flow.rebuild import rebuild_rounds as rebuild_rounds
 from pcfix.flow.restore import restore_file as restore_file
-from pcfix.flow.results import RunResults as RunResults
-from pcfix.flow.results import open_run as open_run
-from pcfix.flow.results import run as run
+from pcfix.flow.run import RunResults as RunResults
+from pcfix.flow.run import open_run as open_run
+from pcfix.flow.run import run as run
 from pcfix.flow.view import view_clouds as view_clouds
 from pcfix.io.cameras import read_cameras as read_cameras
 from pcfix.io.water import read_water as read_water

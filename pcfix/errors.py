@@ -11,6 +11,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, is_dataclass
+from types import SimpleNamespace
 from typing import Any, TypeVar
 
 _Found = TypeVar("_Found")
@@ -81,6 +82,8 @@ def plain(value: Any) -> Any:
         return value.as_dict()
     if is_dataclass(value) and not isinstance(value, type):
         value = asdict(value)
+    if isinstance(value, SimpleNamespace):
+        value = vars(value)
     if isinstance(value, dict):
         return {str(key): plain(one) for key, one in value.items()}
     if hasattr(value, "tolist"):  # of numpy

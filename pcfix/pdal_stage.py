@@ -26,6 +26,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import numpy as np
@@ -93,16 +94,16 @@ def _run(work: Work, namespace: dict[str, Any], ins: Dimensions, outs: Dimension
 
 
 def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
+    from pcfix.flow.correct import finish
     from pcfix.flow.correction import correct_chunk
     from pcfix.flow.inputs import paths_in
-    from pcfix.flow.outcome import check, summarize
     from pcfix.flow.planning import plan_correction, read_inputs
-    from pcfix.flow.runner import Ends, check_summary, write_summary
+    from pcfix.flow.runner import FileTask, check_summary, write_summary
     from pcfix.io.las.columns import columns_for
     from pcfix.options.correct import CorrectOptions
     from pcfix.running import threads
 
-    started = time.perf_counter()
+    task = FileTask(NAME, Path(NAME))
     options = _options(namespace, CorrectOptions)
     if options.uncorrected == "drop":
         sentence = (
@@ -121,9 +122,8 @@ def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> No
             correction, one = correct_chunk(plan, points, rows.start)
             results.add(rows, correction, options.uncorrected == "withhold")
             tally = one if tally is None else tally + one
-    findings = check(plan, tally)
+    summary = finish(plan, task, tally)
     outs.update(results.dimensions)
-    summary = summarize(plan, tally, findings, Ends(NAME, NAME, time.perf_counter() - started))
     write_summary(options, summary.as_dict())
     namespace["out_metadata"] = metadata_of(summary.as_dict(), unpacked=cloud.unpacked)
 
@@ -162,7 +162,7 @@ def _clean(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
 
     def chunks(water: WaterSurface | None) -> Iterator[Tested]:
         for rows, points in _chunks(cloud, water):
-            yield Tested(points, cloud.withheld[rows], {name: rays[name][rows] for name in rays})
+            yield points, cloud.withheld[rows], {name: rays[name][rows] for name in rays}
 
     with threads(options.jobs):
         noise, found = find_noise(NAME, options, lambda: _view(cloud), ins, chunks, len(cloud))

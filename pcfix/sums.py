@@ -1,12 +1,15 @@
-"""Statistics that are added up with ``+``, over chunks and files, and steps of their bins."""
+"""Statistics that are added up with ``+``, over chunks and files, and the results of commands."""
 
 from __future__ import annotations
 
 import operator
 from dataclasses import fields, replace
-from typing import Self
+from types import SimpleNamespace
+from typing import Any, Self
 
 import numpy as np
+
+from pcfix.errors import plain
 
 LEAST = {"join": np.minimum}
 MOST = {"join": np.maximum}
@@ -38,3 +41,11 @@ def nice_step(least: float) -> float:
         return 1.0
     power = 10.0 ** np.floor(np.log10(least))
     return float(next(f * power for f in (1, 2, 5, 10) if f * power >= least * (1.0 - 1e-9)))
+
+
+class Figures(SimpleNamespace):
+    """The results of a command by name, as its text and the JSON file of its summary have them."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        return dict(plain(self))

@@ -6,9 +6,8 @@ They are independent of each other: each looks at all used points, whatever anot
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from enum import IntFlag
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -237,27 +236,3 @@ def clean_points(
         cloud = Cloud(points, mask, mask & submerged, reasons)
         flag_neighbours("xyz", cloud, settings)
     return reasons
-
-
-@dataclass(frozen=True)
-class CleanSummary:
-    """The numbers of a cleaning; `as_dict` is what ``--summary`` writes."""
-
-    input: str  # files
-    output: str
-    pcfix: str  # version
-    points: int  # read
-    set_aside: int  # withheld or noise (class 7 or 18) in the input: not tested, not neighbours
-    submerged: int  # tested against the bed
-    noise: int  # flagged
-    reasons: dict[str, int]  # points of each `Reason`; a point may have several
-    dropped: int  # not written to the output
-    neighbour_distance_m: dict[str, float]  # mean, sd and limit; see `flag_sparse`
-    not_run: list[str]  # tests that could not be run, and why
-    water: str | None
-    settings: dict[str, Any]
-    seconds: float
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values, ready for JSON."""
-        return dict(vars(self))

@@ -238,15 +238,11 @@ def pipeline(
     input: Path, output: Path | None = None, /, *, options: CorrectOptions, stage: bool = False
 ) -> None:
     """Print the PDAL pipeline of the same 'pcfix correct', as JSON."""
-    from pcfix.flow.pipeline import pipeline_for, stage_for
+    from pcfix.flow.pipeline import pipeline_for
 
-    if stage:
-        content = stage_for(input, options)
-    elif output is None:
+    if output is None and not stage:
         raise UsageError("Give OUTPUT, or --stage to print only the stage")
-    else:
-        content = pipeline_for(input, output, options)
-    say(json.dumps(content, indent=2))
+    say(json.dumps(pipeline_for(input, None if stage else output, options), indent=2))
 
 
 @command("pcfix plan --height 60 --overlap 0.8 --sidelap 0.7 --depth 5 --plot plan.png")

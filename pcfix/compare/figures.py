@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
-from typing import Any, Generic, Literal, NamedTuple, TypeAlias, TypeVar
+from typing import Any, Generic, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -19,10 +19,7 @@ from pcfix.compare.sections import Section, SectionLine, lines_downslope, sectio
 from pcfix.compare.statistics import (
     Bin,
     Distribution,
-    Line,
-    Own,
     Statistics,
-    Tvu,
     binned,
     distances_of,
     distribution_of,
@@ -33,7 +30,7 @@ from pcfix.compare.statistics import (
 )
 from pcfix.errors import GeometryError, PcfixWarning, plain
 from pcfix.model import BoolArray, FloatArray
-from pcfix.options.steps import CompareRules
+from pcfix.sums import Figures
 
 Given = TypeVar("Given")
 Figure = TypeVar("Figure")
@@ -56,62 +53,13 @@ class Pairs(NamedTuple):
     by_nearest: BoolArray  # (n,), one of the two heights is that of a single point
 
 
-@dataclass(frozen=True, slots=True)
-class Counts:
-    """Points of the cloud, of the reference, and those that were compared."""
-
-    cloud: int
-    cloud_left_out: int
-    reference: int
-    reference_left_out: int
-    outside_overlap: int
-    not_submerged: int
-    compared: int
-    by_nearest: int
-    reference_compared: int  # with C2C from the reference
-
-
-@dataclass(frozen=True, slots=True)
-class Further:
-    """C2C of a further cloud, as it is."""
-
-    name: str
-    cloud: str
-    c2c: Distribution | None
-    c2c_from_reference: Distribution | None
-
-
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Comparison:
+class Comparison(Figures):
     """A cloud against a reference; all errors are cloud minus reference, metres."""
-
-    cloud: str
-    reference: str
-    measured_at: Literal["cloud", "reference"]  # each point of the cloud, or each check point
-    counts: Counts
-    # unsigned distances, to the reference (from check points: to the cloud) and from it
-    c2c: AfterBefore[Distribution] | None
-    c2c_from_reference: AfterBefore[Distribution] | None
-    also: tuple[Further, ...]  # further clouds
-    vertical: AfterBefore[Distribution] | None  # signed, along the vertical
-    bed: AfterBefore[Statistics] | None = None  # the same of submerged places and of the others
-    land: AfterBefore[Statistics] | None = None
-    own: Own | None  # of the bed, or of all, without the noise of the reference
-    depth: AfterBefore[Line | None] | None = None  # against reference depth, if water is known
-    depth_bins: tuple[Bin, ...] = ()  # submerged places by reference depth
-    shore_bins: tuple[Bin, ...] = ()  # and by distance in plan from the nearest dry point
-    tvu: Tvu | None = None  # of all submerged places
-    m3c2: AfterBefore[M3c2] | None
-    sections: tuple[Section, ...]
-    settings: CompareRules
-    notes: tuple[PcfixWarning, ...]
-    seconds: float
-    check_points: FloatArray | None = None  # (p, 4): x, y, z of check points, and the error
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON; a section by its line, its heights are CSV."""
-        names = [name for name in self.__slots__ if name not in ("sections", "check_points")]
-        found = {name: plain(getattr(self, name)) for name in names}
+        names = vars(self).keys() - {"sections", "check_points"}
+        found = {name: plain(value) for name, value in vars(self).items() if name in names}
         found["sections"] = [
             {**asdict(s.line), "half_width_m": s.half_width_m, "stations": len(s.distance_m)}
             for s in self.sections
@@ -178,10 +126,17 @@ def figures_of(
         errors = vertical.after.statistics if bed is None else bed.after
         own = own_of(errors, "all" if bed is None else "bed", stated, reference.kind)
     also = [
-        Further(name, other.whole.name, *(w if w is None else w.after for w in c2c_of(other)))
+        Figures(
+            name=name,
+            cloud=other.whole.name,
+            **{
+                way: None if found is None else found.after
+                for way, found in zip(("c2c", "c2c_from_reference"), c2c_of(other), strict=True)
+            },
+        )
         for name, other in others.items()
     ]
-    counts = Counts(
+    counts = Figures(
         cloud=len(whole) + whole.left_out,
         cloud_left_out=whole.left_out,
         reference=len(reference.xyz) + reference.left_out,
@@ -190,26 +145,35 @@ def figures_of(
         not_submerged=match.not_submerged,
         compared=len(match.places) if reference.sparse else len(match.cloud),
         by_nearest=0 if pairs is None else int(pairs.after.by_nearest.sum()),
+        # with C2C from the reference
         reference_compared=len(match.places) if match.settings.from_reference else 0,
     )
     return Comparison(
         cloud=whole.name,
         reference=reference.name,
+        # each point of the cloud, or each check point
         measured_at="reference" if reference.sparse else "cloud",
         counts=counts,
+        # unsigned distances, to the reference (from check points: to the cloud) and from it
         c2c=c2c,
         c2c_from_reference=c2c_from_reference,
-        also=tuple(also),
-        vertical=vertical,
-        own=own,
-        **by_depth,
+        also=also,  # further clouds
+        vertical=vertical,  # signed, along the vertical
+        own=own,  # of the bed, or of all, without the noise of the reference
+        **{
+            "bed": None, "land": None,  # the same of submerged places and of the others
+            "depth": None,  # against reference depth, if water is known
+            "depth_bins": (), "shore_bins": (),  # by depth, and by distance from the shore
+            "tvu": None,  # of all submerged places
+            **by_depth,
+        },
         m3c2=_m3c2(match, pairs) if match.settings.m3c2 else None,
         sections=_sections(match, lines, others),
         settings=match.settings,
-        notes=tuple(notes),
+        notes=notes,
         seconds=round(time.perf_counter() - started, 3),
-        check_points=residuals,
-    )
+        check_points=residuals,  # (p, 4): x, y, z of check points, and the error
+    )  # fmt: skip
 
 
 def both(

@@ -32,7 +32,8 @@ from pcfix.adjust.result import Adjusted
 from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError, bad_file
 from pcfix.flow.inputs import Inputs, mask_of, paths_in
 from pcfix.flow.next_steps import WATER as WATER_FILE
-from pcfix.flow.surfaces import CloudView, view_of
+from pcfix.flow.runner import check_folder
+from pcfix.flow.surfaces import sample_of, view_of
 from pcfix.io.atomic import temporary_folder
 from pcfix.io.cameras.colmap import write_colmap
 from pcfix.io.cameras.opensfm import write_opensfm
@@ -46,7 +47,6 @@ from pcfix.io.tiles import Clouds, cloud_of
 from pcfix.io.water import write_water_raster
 from pcfix.model import (
     Cameras,
-    FloatArray,
     GnssPositions,
     GroundControl,
     Lens,
@@ -127,7 +127,8 @@ def adjust_into(
     # 1. The block, its water, and what was surveyed
     water_unknowns = unknowns_of(given, ())
     if folder is not None:
-        _check_folder(folder, given.overwrite, paths_in(inputs))
+        known = [*paths_in(inputs), *paths_in(given)]
+        check_folder(folder, known, mark=SUMMARY, overwrite=given.overwrite)
     view = None if cloud is None else view_of(cloud_of(cloud))
     name = str(inputs.cameras) if isinstance(inputs.cameras, str | Path) else "cameras"
     read = inputs.read()
@@ -181,7 +182,10 @@ def adjust_into(
         )
         raise InputError("cameras.no_ties", words, path=name, ties=count, least=LEAST_TIES)
     else:
-        found = adjust_block(material, given, cloud_xyz=_sample(view), progress=progress)
+        count = min(CLOUD_POINTS, view.points)  # random points of the cloud
+        rows = np.sort(np.random.default_rng(0).choice(view.points, count, replace=False))
+        xyz = sample_of(view, rows).xyz
+        found = adjust_block(material, given, cloud_xyz=xyz, progress=progress)
 
     # 3. The result
     if control is not None:
@@ -264,37 +268,7 @@ def _calibration(path: File, cameras: Cameras) -> Lens:
     return one
 
 
-def _sample(view: CloudView) -> FloatArray:
-    """Return random points of the cloud."""
-    count = min(CLOUD_POINTS, view.points)
-    rows = np.sort(np.random.default_rng(0).choice(view.points, count, replace=False))
-    xyz, first = [], 0
-    for seen in view.chunks():
-        inside = rows[(rows >= first) & (rows < first + len(seen.xyz))] - first
-        xyz.append(seen.xyz[inside])
-        first += len(seen.xyz)
-    return np.vstack(xyz)
-
-
 # Writing
-
-
-def _check_folder(folder: Path, overwrite: bool, inputs: list[Any]) -> None:
-    """Refuse a folder that is an input, or holds anything but an earlier adjustment."""
-    code, wrong = "output.exists", ""
-    if any(folder.exists() and Path(one).exists() and folder.samefile(one) for one in inputs):
-        code, wrong = "output.is_input", "is an input. Give another folder"
-    elif folder.exists() and not folder.is_dir():
-        wrong = "is a file. Give a folder"
-    elif folder.is_dir() and any(folder.iterdir()):
-        if not overwrite:
-            wrong = "exists. Add --overwrite to replace it"
-        elif not (folder / SUMMARY).is_file():
-            wrong = "holds other files than an adjustment. Give an empty or new folder"
-    elif not folder.resolve().parent.is_dir():
-        code, wrong = "output.no_folder", f"its folder {folder.parent} does not exist. Create it"
-    if wrong:
-        raise SettingError(code, f"{folder}: {wrong}.", path=folder)
 
 
 def _write(folder: Path, found: Adjusted, model: str) -> None:
@@ -319,7 +293,14 @@ def _write(folder: Path, found: Adjusted, model: str) -> None:
 
 def _write_models(folder: Path, found: Adjusted) -> None:
     """Write the model in each format that holds its lenses exactly."""
-    ties, cameras, opensfm = _adjusted_ties(found), found.cameras, folder / "opensfm"
+    ties, cameras, opensfm = None, found.cameras, folder / "opensfm"
+    if found.source != "cloud":  # the adjusted tie points without outliers
+        block, m = found.block, found.block.tie_points
+        used = found.used & (block.owner < m)
+        counts = np.bincount(block.owner[used], minlength=m)[:m]
+        start = np.concatenate([[0], np.cumsum(counts)])
+        ties = TiePoints(found.xyz[:m], Views(start, block.camera[used]), block.image_xy[used])
+        ties = taken_ties(ties, np.flatnonzero(counts >= LEAST_VIEWS))
     writers = {
         "colmap": partial(write_colmap, folder / "colmap", cameras, ties, crs=cameras.crs),
         "opensfm": partial(write_opensfm, opensfm / "reconstruction.json", cameras, ties),
@@ -341,15 +322,3 @@ def _write_models(folder: Path, found: Adjusted) -> None:
         raise InputError(
             "output.format", "No camera format can hold these lenses: " + " ".join(failed)
         )
-
-
-def _adjusted_ties(found: Adjusted) -> TiePoints | None:
-    """Return the adjusted tie points without outliers; None if the cloud replaced them."""
-    if found.source == "cloud":
-        return None
-    block, m = found.block, found.block.tie_points
-    kept = found.used & (block.owner < m)
-    counts = np.bincount(block.owner[kept], minlength=m)[:m]
-    start = np.concatenate([[0], np.cumsum(counts)])
-    ties = TiePoints(found.xyz[:m], Views(start, block.camera[kept]), block.image_xy[kept])
-    return taken_ties(ties, np.flatnonzero(counts >= LEAST_VIEWS))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ import numpy.typing as npt
 from pcfix.blocks import release
 from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError, bad_file
 from pcfix.flow.inputs import Inputs
-from pcfix.flow.photos import photo_of, plain, read_heights, warn_all
+from pcfix.flow.photos import photo_of, read_heights, warn_all
 from pcfix.flow.runner import Progress, check_summary, write_summary
 from pcfix.grid.lattice import Lattice
 from pcfix.io.atomic import temporary_folder
@@ -39,6 +38,7 @@ from pcfix.photos.waves import (
     still,
 )
 from pcfix.running import threads
+from pcfix.sums import Figures
 from pcfix.water.index import index_of
 from pcfix.water.surface import surface_above
 
@@ -53,37 +53,6 @@ LEAST_EXPLAINED = 0.5
 """Share of the slopes; if waves explain less, there is a warning."""
 
 
-@dataclass(frozen=True)
-class WaterFound:
-    """The water of a sequence: number of waves, rms values, share of the slopes explained."""
-
-    folder: str
-    waves: int
-    slope_deg: float
-    height_m: float
-    sigma_m: float
-    explained: float
-
-
-@dataclass(frozen=True)
-class CalmSummary:
-    """The result of `calm_frames`."""
-
-    input: str
-    output: str
-    spread_file: str
-    frames: int
-    columns: int
-    rows: int
-    corners: int  # by which the frames were registered
-    scatter_px: float  # of a corner along an axis, median
-    moved_px: float  # largest movement of the frame's centre
-    spread: float  # of the frames, median over the image, grey values
-    seconds: float
-    water: WaterFound | None
-    notes: tuple[PcfixWarning, ...] = ()
-
-
 def calm_frames(
     frames: File,
     out: File,
@@ -91,7 +60,7 @@ def calm_frames(
     options: CalmOptions | None = None,
     progress: Progress | None = None,
     **keywords: Any,
-) -> CalmSummary:
+) -> Figures:
     """Write the median of frames taken through waves; what ``pcfix calm`` runs.
 
     Parameters
@@ -156,15 +125,24 @@ def calm_frames(
     middle = np.array([0.5 * found.columns, 0.5 * found.rows, 1.0])
     moved = homographies @ middle
     warn_all(notes)
-    summary = CalmSummary(
-        input=str(frames), output=str(out), spread_file=str(beside), frames=len(found.names),
-        columns=found.columns, rows=found.rows, corners=len(scatter),
+    summary = Figures(
+        input=str(frames),
+        output=str(out),
+        spread_file=str(beside),
+        frames=len(found.names),
+        columns=found.columns,
+        rows=found.rows,
+        corners=len(scatter),  # by which the frames were registered
+        # of a corner along an axis, median
         scatter_px=round(float(np.median(scatter)) if len(scatter) else 0.0, 3),
+        # largest movement of the frame's centre
         moved_px=round(float(np.hypot(*(moved[:, :2] / moved[:, 2:] - middle[:2]).T).max()), 2),
-        spread=round(float(np.nanmedian(spread)), 2),
-        seconds=round(time.perf_counter() - started, 3), water=water, notes=tuple(notes),
-    )  # fmt: skip
-    write_summary(given, plain(summary))
+        spread=round(float(np.nanmedian(spread)), 2),  # of the frames, median, grey values
+        seconds=round(time.perf_counter() - started, 3),
+        water=water,
+        notes=notes,
+    )
+    write_summary(given, summary.as_dict())
     return summary
 
 
@@ -269,7 +247,7 @@ def _bed(given: CalmOptions) -> tuple[Callable[[FloatArray], FloatArray], str | 
 def _water(
     view: View, nodes: Nodes, shifts: FloatArray, weights: FloatArray, interval: float | None,
     folder: str,
-) -> tuple[list[tuple[FloatArray, FloatArray]], WaterFound]:  # fmt: skip
+) -> tuple[list[tuple[FloatArray, FloatArray]], Figures]:  # fmt: skip
     """Fit the water of each frame; return heights and standard errors, and a summary."""
     times = np.arange(len(shifts), dtype=np.float64) * (interval or 0.0)
     middle, seen = nodes.xy.mean(axis=0), nodes.seen
@@ -302,7 +280,7 @@ def _water(
         heights = view.level_m + np.stack([height for height, _ in found])
     weight = data.weight[..., None]
     energy = float((weight * data.slope**2).sum() / (2.0 * weight.sum()))
-    summary = WaterFound(
+    summary = Figures(
         folder=folder, waves=max(len(one.number) for one in waves),
         slope_deg=round(float(np.degrees(np.sqrt(energy))), 3),
         height_m=round(float(np.std([one[0][seen] for one in found])), 4),

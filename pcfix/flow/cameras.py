@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.adjust.diagnosis import EXPORT, Diagnosis, Evidence
-from pcfix.errors import InputError, SettingError, shown_once
-from pcfix.flow.diagnosis import diagnose, has_datum, quick_ties
-from pcfix.flow.inputs import Inputs, paths_in, ties_of
+from pcfix.adjust.diagnosis import EXPORT, Diagnosis
+from pcfix.errors import InputError, SettingError, plain, shown_once
+from pcfix.flow.diagnosis import diagnose_inputs, has_datum, quick_ties
+from pcfix.flow.inputs import Inputs, paths_in
 from pcfix.flow.next_steps import adjust_words
 from pcfix.flow.plausibility import plausible
 from pcfix.flow.runner import check_summary, write_summary
@@ -21,14 +21,13 @@ from pcfix.io.cameras.mistakes import UNDULATION_M, likely_mistake
 from pcfix.io.clouds import check_same_crs, read_reference
 from pcfix.io.files import check_input
 from pcfix.io.gnss_positions import read_gnss
-from pcfix.io.ground_control import read_ground_control
 from pcfix.lens.frames import cameras_in_sight, footprint
 from pcfix.lens.imaging import unproject
-from pcfix.model import Cameras, FloatArray, Lens, TiePoints, WaterDimension, WaterSurface
+from pcfix.model import Cameras, FloatArray, Lens, TiePoints, WaterDimension
 from pcfix.options.declare import File, taken
 from pcfix.options.survey import CamerasCheckOptions
 from pcfix.report.page import AFTER, WATER, draw_cloud, label_plan, label_side, new_figure
-from pcfix.report.text import Plain, Rows, RowTable, aligned, filled
+from pcfix.report.text import Plain, Rows, aligned
 from pcfix.water.index import index_of
 from pcfix.water.surface import surface_above
 
@@ -84,41 +83,46 @@ def check_cameras(
         cameras = read_gnss(given.gnss, cameras)
     diagnosis, remedy = None, ("", "")
     if view is not None and surface is not None:
-        diagnosis = _diagnosed(given, inputs, cameras, view, surface)
+        reference = None if given.reference is None else read_reference(given.reference)
+        if reference is not None:
+            crs = None if isinstance(view.crs, str) else view.crs
+            check_same_crs(view.name, crs, reference.name, reference.crs)
+        index = index_of(given.index, given.index_formula)[0]
+        diagnosis = diagnose_inputs(
+            inputs, cameras, view, surface, index, gcps=given.gcps, reference=reference
+        )
         surveys = {name: getattr(given, name) for name in ("gnss", "gcps", "lens", "index")}
         remedy = adjust_words(inputs, view.name, has_datum=has_datum(cameras, str(path)), **surveys)
-    level = above = range_m = tilt_deg = fit = None
+    level = above = tilt = fit = None
     if surface is not None and not (isinstance(surface, WaterDimension) and heights is None):
         at = cameras.centres if heights is None else xyz
         known_m = surface_above(surface, at, heights).height_m
         level = float(np.nanmean(known_m)) if np.isfinite(known_m).any() else None
     if level is not None and not problem:  # geocentric cameras have no heights
         above = cameras.centres[:, 2] - level
-        range_m = [float(above.min()), float(above.mean()), float(above.max())]
     if cameras.rotations is not None and not problem:
         tilt = np.degrees(np.arccos(np.clip(-cameras.rotations[:, 2, 2], -1.0, 1.0)))
-        tilt_deg = [float(np.median(tilt)), float(tilt.max())]
     gnss = _gnss(cameras, str(path))
     if view is not None:
-        up = 0.0 if gnss is None or inputs.cameras_crs is None else gnss["mean_m"][2] or 0.0
+        up = 0.0 if gnss is None or inputs.cameras_crs is None else np.nan_to_num(gnss["mean_m"][2])
         flight = {"file": path, "water_m": level, "every": view.points / max(len(xyz), 1)}
         fit = _fit(cameras, view, xyz, quick_ties(inputs, view.crs), up, flight)
-    figures = {
-        "path": str(path),
+    figures = plain({
+        "path": path,
         "crs_read": read.crs,
         "sensors": sensors_of(cameras, above),
-        "height_above_water_m": range_m,  # least, mean, largest
-        "tilt_deg": tilt_deg,  # of the optical axes from nadir: median, largest
+        "height_above_water_m": None if above is None else (above.min(), above.mean(), above.max()),
+        "tilt_deg": None if tilt is None else (np.median(tilt), tilt.max()),  # axes from nadir
         "gnss": gnss,
         "problem": problem,  # why the cameras are not in a map and have no heights
         "source": cameras.source,
         "images_posed": len(cameras),
-        "images_unposed": list(cameras.unposed),
+        "images_unposed": cameras.unposed,
         "crs": cameras.crs,
         "fit": fit,
         "refraction": diagnosis and diagnosis.as_dict(),
-        "notes": [str(note) for note in cameras.notes],
-    }
+        "notes": list(map(str, cameras.notes)),
+    })  # fmt: skip
     report = CamerasReport(figures, cameras, xyz, level, diagnosis, remedy)
     write_summary(given, figures, lambda: block_figure(report))
     return report
@@ -134,25 +138,6 @@ class CamerasReport:
     level_m: float | None  # mean height of the water
     diagnosis: Diagnosis | None  # whether the poses have absorbed the refraction
     remedy: tuple[str, str]  # the command that corrects the poses, and a remark
-
-
-def _diagnosed(
-    given: CamerasCheckOptions, inputs: Inputs, cameras: Cameras, view: CloudView,
-    surface: WaterSurface,
-) -> Diagnosis:  # fmt: skip
-    """Test whether the poses have absorbed refraction."""
-    path = str(inputs.cameras)
-    reference = None if given.reference is None else read_reference(given.reference)
-    if reference is not None:
-        crs = None if isinstance(view.crs, str) else view.crs
-        check_same_crs(view.name, crs, reference.name, reference.crs)
-    evidence = Evidence(
-        cameras, path, surface, index_of(given.index, given.index_formula)[0], view=view,
-        reference=reference,
-        control=None if given.gcps is None else read_ground_control(given.gcps, cameras).surveyed,
-        ties=ties_of(inputs, view.crs),
-    )  # fmt: skip
-    return diagnose(evidence)
 
 
 def sensors_of(cameras: Cameras, above_m: FloatArray | None) -> list[Plain]:
@@ -171,10 +156,9 @@ def sensors_of(cameras: Cameras, above_m: FloatArray | None) -> list[Plain]:
         # separately only if most lenses have several images
         if len(groups) <= MOST_SENSORS and (key is not keys[0] or len(groups) <= len(lenses) // 2):
             break
-    calibrated = any(map(_is_distorted, lenses))
     above = np.full(len(lenses), np.nan) if above_m is None else above_m
     return [
-        _sensor([lenses[row] for row in rows], float(np.mean(above[rows])), calibrated)
+        _sensor([lenses[row] for row in rows], float(np.mean(above[rows])))
         for rows in groups.values()
     ]
 
@@ -183,17 +167,15 @@ def _is_distorted(lens: Lens) -> bool:
     return any((*lens.radial, *lens.denominator, *lens.tangential, *lens.thin_prism))
 
 
-def _sensor(lenses: list[Lens], above_m: float, calibrated: bool) -> Plain:
+def _sensor(lenses: list[Lens], above_m: float) -> Plain:
     """Return a sensor from the lenses of its images, `above_m` the water on average.
 
-    Values are None where not stated. ``lenses`` and ``frames`` count those that differ, ``folded``
-    is the share of the frame beyond the fold of the distortion, and ``nominal`` means not
-    calibrated, though others of the block are.
+    Values are None where not stated. ``lenses`` and ``frames`` count those that differ, and
+    ``folded`` is the share of the frame beyond the fold of the distortion.
     """
     lens, alike = lenses[0], list(dict.fromkeys(lenses))
-    pixel, distorted = lens.pixel_size_mm, _is_distorted(lens)
+    pixel = lens.pixel_size_mm
     focal_px = lens.focal if lens.unit == "px" else None if pixel is None else lens.focal / pixel
-    middle = (lens.principal_x, lens.principal_y) == (lens.width / 2.0, lens.height / 2.0)
     return {
         "name": lens.sensor if all(one.sensor == lens.sensor for one in alike) else "several",
         "images": len(lenses),
@@ -205,12 +187,11 @@ def _sensor(lenses: list[Lens], above_m: float, calibrated: bool) -> Plain:
         "focal_mm": lens.focal if lens.unit == "mm" else pixel and lens.focal * pixel,
         "pixel_size_um": pixel and 1000.0 * pixel,
         "projection": lens.projection,
-        "distorted": distorted,
+        "distorted": _is_distorted(lens),
         "gsd_m": above_m / focal_px if above_m > 0.0 and focal_px else None,
         "lenses": len(alike),
         "frames": len({(one.width, one.height) for one in alike}),
         "folded": max(_folded(one) for one in alike[:: 1 + len(alike) // 20]),
-        "nominal": calibrated and middle and not distorted,
     }
 
 
@@ -231,15 +212,11 @@ def _gnss(cameras: Cameras, name: str) -> Plain | None:
     rows = np.flatnonzero(np.isfinite(enu_m[:, 0]))
     enu = enu_m[rows] if len(rows) else np.full((1, 3), np.nan)
     length = np.sqrt(np.nansum(enu * enu, axis=1))
-    mean, sd = (
-        [float(one) if np.isfinite(one) else None for one in values]
-        for values in (enu.mean(axis=0), enu.std(axis=0))
-    )
     return {
         "images": len(rows),
-        "mean_m": mean,
-        "sd_m": sd,
-        "largest_m": float(length.max()),
+        "mean_m": enu.mean(axis=0),
+        "sd_m": enu.std(axis=0),
+        "largest_m": length.max(),
         "largest_image": cameras.labels[rows[int(np.argmax(length))]] if len(rows) else "",
         "reason": reason,
     }
@@ -251,17 +228,14 @@ def _fit(
 ) -> Plain:  # fmt: skip
     """Test cameras against a sample of the cloud; `up_m` are they above their GNSS positions.
 
-    ``seen_by`` are the shares of the points that 0, 1, 2, 3 or more frames hold, ``distance_m`` is
-    between the boxes around block and cloud in plan, ``below_ground`` counts cameras lower than the
-    nearest point in plan. The verdict is what is likely wrong, empty where cameras and cloud match.
+    ``seen_by`` are the shares of the points that 0, 1, 2, 3 or more frames hold. The verdict is
+    what is likely wrong, empty where cameras and cloud match.
     """
     from scipy.spatial import cKDTree
 
-    visible = cameras_in_sight(xyz, cameras)
-    shares = {str(k): float(np.mean(visible == k)) for k in (0, 1, 2)}
-    shares["3 or more"] = float(np.mean(visible >= 3))
+    visible = np.minimum(cameras_in_sight(xyz, cameras), 3)
+    shares = np.bincount(visible, minlength=4) / len(xyz)
     low, high, centres = xyz.min(axis=0), xyz.max(axis=0), cameras.centres
-    apart = np.maximum(np.maximum(low - centres.max(axis=0), centres.min(axis=0) - high), 0.0)[:2]
     reach = float(np.hypot(*np.ptp(xyz[:, :2], axis=0))) * 0.1 + 1.0
     distance, row = (np.asarray(one) for one in cKDTree(xyz[:, :2]).query(centres[:, :2]))
     below = int(np.count_nonzero((distance < reach) & (centres[:, 2] <= xyz[row, 2])))
@@ -283,78 +257,62 @@ def _fit(
     return {
         "cloud": view.name,
         "points_sampled": len(xyz),
-        "seen_by": shares,
-        "distance_m": float(np.hypot(*apart)),
-        "below_ground": below,
+        "seen_by": dict(zip(("0", "1", "2", "3 or more"), shares, strict=True)),
         "verdict": verdict,
         "tested": str(found),
         "fits": not verdict,
     }
 
 
-_SENSOR: RowTable = (
-    ("Sensor", "{title}: {images:,} images{different}, {frame}, focal length {focals}"
-     " {unit}{pixel}, {projection}{is_distorted}{gsd}", "images"),
-    ("", "the distortion folds within the frame: {percent:.2g} % of it is not used; check the"
-     " radial coefficients", "folded"),
-    ("", "not calibrated, unlike the others; its images likely had no tie points, so do not trust"
-     " their poses", "nominal"),
-)  # fmt: skip
-_BLOCK: RowTable = (
-    ("Sensor", "none: the frames are not known", "no_sensor"),
-    ("Angles", "none: every camera counts as visible from every point", "no_angles"),
-    ("CRS", "{crs}", "crs"),
-    ("CRS of cloud", "{crs_of_cloud}", "crs_of_cloud"),
-    ("Problem", "{problem}", "problem"),
-    ("Heights", "{z[0]:.2f} to {z[1]:.2f} m, mean {z[2]:.2f} m", "z"),
-    ("Above water", "{height_above_water_m[0]:.1f} to {height_above_water_m[2]:.1f} m, mean"
-     " {height_above_water_m[1]:.1f} m", "height_above_water_m"),
-    ("Tilt", "median {tilt_deg[0]:.1f} deg, largest {tilt_deg[1]:.1f} deg", "tilt_deg"),
-    ("GNSS", "{gnss[images]:,} images; adjusted minus GNSS east, north, up: mean"
-     " {gnss[mean_m]:+.3f} m, sd {gnss[sd_m]:.3f} m; largest {gnss[largest_m]:.3f} m"
-     " ({gnss[largest_image]})", "some_gnss"),
-    ("{gnss_label}", "{gnss[reason]}", "gnss_reason"),
-    ("Cloud", "{fit[cloud]} ({fit[points_sampled]:,} points sampled)", "fit"),
-    ("Visible", "share of points by number of cameras: {seen}", "fit"),
-    ("Distance", "{fit[distance_m]:,.1f} m in plan between block and cloud", "distance"),
-    ("Below ground", "{fit[below_ground]} cameras", "below_ground"),
-    ("Check", "{check}", "fit"),
-)  # fmt: skip
-
-
 def cameras_text(report: CamerasReport) -> str:
     """Return the summary of a camera file."""
     r, cameras, z = report.figures, report.cameras, report.cameras.centres[:, 2]
-    missing, fit, gnss = cameras.unposed, r["fit"] or {}, r["gnss"] or {}
+    missing, fit, gnss, found = cameras.unposed, r["fit"], r["gnss"], report.diagnosis
     images = f"{len(cameras):,} with a pose"
     if missing:
         more = ", ..." if len(missing) > SHOWN_NAMES else ""
         images += f", {len(missing):,} without: {', '.join(missing[:SHOWN_NAMES])}{more}"
-    seen = [f"{name}: {100.0 * part:.1f} %" for name, part in fit.get("seen_by", {}).items()]
-    values = r | {
-        "no_sensor": not r["sensors"],
-        "no_angles": cameras.rotations is None,
-        "crs": _short(r["crs_read"]) or "not stated",
-        "crs_of_cloud": (_short(r["crs"]) or "not stated") if r["crs"] != r["crs_read"] else "",
-        "z": () if r["problem"] else (z.min(), z.max(), z.mean()),
-        "some_gnss": gnss.get("images"),
-        "gnss_reason": gnss.get("reason"),
-        "gnss_label": "" if gnss.get("images") else "GNSS",
-        "seen": ", ".join(seen),
-        "distance": fit.get("distance_m"),
-        "below_ground": fit.get("below_ground"),
-        "check": fit.get("verdict") or fit.get("tested"),
-    }
     rows = [("Images", images), *(row for one in r["sensors"] for row in _sensor_rows(one))]
-    rows += filled(_BLOCK, values)
-    if (found := report.diagnosis) is not None:
+    if not r["sensors"]:
+        rows.append(("Sensor", "none: the frames are not known"))
+    if cameras.rotations is None:
+        rows.append(("Angles", "none: every camera counts as visible from every point"))
+    rows.append(("CRS", _short(r["crs_read"])))
+    if r["crs"] != r["crs_read"]:
+        rows.append(("CRS of cloud", _short(r["crs"])))
+    heights = f"{z.min():.2f} to {z.max():.2f} m, mean {z.mean():.2f} m"
+    rows.append(("Problem", r["problem"]) if r["problem"] else ("Heights", heights))
+    if r["height_above_water_m"] is not None:
+        low, mean, high = r["height_above_water_m"]
+        rows.append(("Above water", f"{low:.1f} to {high:.1f} m, mean {mean:.1f} m"))
+    if r["tilt_deg"] is not None:
+        median, largest = r["tilt_deg"]
+        rows.append(("Tilt", f"median {median:.1f} deg, largest {largest:.1f} deg"))
+    if gnss is not None:
+        mean, sd = (
+            ", ".join("-" if one is None else f"{one:{form}}" for one in gnss[name])
+            for name, form in (("mean_m", "+.3f"), ("sd_m", ".3f"))
+        )
+        if gnss["images"]:
+            rows.append(("GNSS", f"{gnss['images']:,} images; adjusted minus GNSS east, north, up:"
+                         f" mean {mean} m, sd {sd} m; largest {gnss['largest_m']:.3f} m"
+                         f" ({gnss['largest_image']})"))  # fmt: skip
+        if gnss["reason"]:
+            rows.append(("" if gnss["images"] else "GNSS", gnss["reason"]))
+    if fit is not None:
+        seen = (f"{name}: {100.0 * part:.1f} %" for name, part in fit["seen_by"].items())
+        rows += [
+            ("Cloud", f"{fit['cloud']} ({fit['points_sampled']:,} points sampled)"),
+            ("Visible", f"share of points by number of cameras: {', '.join(seen)}"),
+            ("Check", fit["verdict"] or fit["tested"]),
+        ]
+    if found is not None:
         says = {True: "absorbed", False: "not absorbed", None: "open"}
+        verdict = f"not known; give control points (--gcps), or {EXPORT}"
         if found.absorbed:
             verdict = found.sentence(*report.remedy)
         elif found.absorbed is False and found.decided_by is not None:
             verdict = f"the poses have not absorbed the refraction, by {found.decided_by.name}"
-        else:
-            verdict = f"not known; give control points (--gcps), or {EXPORT}"
         rows.append(("Refraction", verdict))
         rows += [("", f"{s.name}: {says[s.speaks]}. {s.words}") for s in found.signs]
     return aligned(f"{r['path']}: {cameras.source or 'cameras'}", rows, cameras.notes)
@@ -363,28 +321,30 @@ def cameras_text(report: CamerasReport) -> str:
 def _sensor_rows(s: Plain) -> Rows:
     """Return frame, focal length and pixel size of a sensor, and what is wrong with its lens."""
     low, high = f"{s['focal']:.6g}", f"{s['focal_most']:.6g}"
-    frame, pixel = f"{s['width']:g} x {s['height']:g} {s['unit']}", ""
+    frame = f"{s['width']:g} x {s['height']:g} {s['unit']}"
+    words = [
+        f"{s['name'] or 'unnamed'}: {s['images']:,} images",
+        f" with {s['lenses']:,} different lenses" if s["lenses"] > 1 else "",
+        f", {s['frames']} sizes as {frame}" if s["frames"] > 1 else f", {frame}",
+        f", focal length {low if low == high else f'{low} to {high}'} {s['unit']}",
+    ]
     if s["pixel_size_um"] is not None:
-        pixel = "" if s["lenses"] > 1 else f" = {s['focal_mm']:.3f} mm"
-        pixel += f", pixel {s['pixel_size_um']:.2f} um"
-    gsd = "" if s["gsd_m"] is None else f", GSD {100.0 * s['gsd_m']:.2f} cm at the water"
-    values = s | {
-        "title": s["name"] or "unnamed",
-        "different": f" with {s['lenses']:,} different lenses" if s["lenses"] > 1 else "",
-        "frame": f"{s['frames']} sizes as {frame}" if s["frames"] > 1 else frame,
-        "focals": low if low == high else f"{low} to {high}",
-        "pixel": pixel,
-        "is_distorted": ", distorted" if s["distorted"] else "",
-        "gsd": gsd,
-        "percent": 100.0 * s["folded"],
-    }
-    return filled(_SENSOR, values)
+        words.append("" if s["lenses"] > 1 else f" = {s['focal_mm']:.3f} mm")
+        words.append(f", pixel {s['pixel_size_um']:.2f} um")
+    words.append(f", {s['projection']}{', distorted' * s['distorted']}")
+    if s["gsd_m"] is not None:
+        words.append(f", GSD {100.0 * s['gsd_m']:.2f} cm at the water")
+    rows = [("Sensor", "".join(words))]
+    if s["folded"]:
+        rows.append(("", f"the distortion folds within the frame: {100.0 * s['folded']:.2g} % of it"
+                     " is not used; check the radial coefficients"))  # fmt: skip
+    return rows
 
 
 def _short(crs: str | None) -> str:
     """Return the name of a CRS, whose text may be pages long."""
-    if crs is None or len(crs) < SHORT_CRS:
-        return crs or ""
+    if not crs or len(crs) < SHORT_CRS:
+        return crs or "not stated"
     return crs.split('"')[1] if '"' in crs else crs[:SHORT_CRS] + " ..."
 
 

@@ -5,27 +5,26 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import asdict, replace
 from functools import partial
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from pcfix.blocks import empty, release
-from pcfix.clean.points import CleanSummary, Cloud, Reason, flag_neighbours, flag_weak
+from pcfix.clean.points import Cloud, Reason, flag_neighbours, flag_weak
 from pcfix.errors import bad_file
-from pcfix.flow.runner import Chunk, Command, Progress, stream
+from pcfix.flow.runner import Chunk, Command, FileTask, FileWork, Progress, run_command, stream
 from pcfix.flow.surfaces import CloudView, Points, find_surface, points_of, view_of
-from pcfix.flow.tiles import run_command
 from pcfix.io.files import scratch_arrays
 from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource
-from pcfix.io.las.writing import cleaning_vlr, corrected_identity, noted_header, own_settings
-from pcfix.io.tiles import CloudFiles, Clouds, open_cloud
+from pcfix.io.las.writing import cleaning_vlr, noted_header, own_settings
+from pcfix.io.tiles import Clouds, open_cloud
 from pcfix.model import LOW_NOISE, NOISE_CLASSES, BoolArray, FloatArray, WaterSurface
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import WaterOptions
 from pcfix.options.steps import CleanOptions, CleanRules
+from pcfix.sums import Figures
 from pcfix.version import __version__
 from pcfix.water.checks import check_submerged
 from pcfix.water.surface import is_submerged, surface_above
@@ -40,7 +39,7 @@ def clean_file(
     options: CleanOptions | None = None,
     progress: Progress | None = None,
     **keywords: Any,
-) -> CleanSummary:
+) -> Figures:
     """Flag or drop the noise of a LAS or LAZ cloud; what ``pcfix clean`` runs.
 
     Noise gets class 7 and the withheld flag; nothing else changes. Points that are withheld or of
@@ -60,7 +59,7 @@ def clean_file(
 
     Returns
     -------
-    CleanSummary
+    Figures
 
     Raises
     ------
@@ -69,21 +68,12 @@ def clean_file(
     """
     given = taken(CleanOptions, options, keywords, "clean_file")
     command = Command(
-        "clean",
-        plan=partial(_plan_file, given, progress),
-        process=partial(stream, _Cleaning),
-        check=lambda plan, tally: None,
-        summarize=lambda plan, tally, findings, ends: replace(
-            plan.summary, input=ends.input, output=ends.output, seconds=round(ends.seconds, 3)
-        ),
+        "clean", partial(_plan_file, given, progress), partial(stream, _cleaning), _finish
     )
     last = None
     if progress is not None:  # writing is the last of the passes
         last = lambda done, total: progress(((_PASSES - 1) * total + done) // _PASSES, total)  # noqa: E731
-    result: CleanSummary = run_command(
-        command, input, output, given, reads=[given.water], progress=last
-    )
-    return result
+    return run_command(command, input, output, given, reads=[given.water], progress=last)
 
 
 RAY_DIMENSIONS = ("RayCount", "RayMiss", "Incidence")
@@ -91,12 +81,8 @@ RAY_DIMENSIONS = ("RayCount", "RayMiss", "Incidence")
 _NEEDS = {"few rays": "min_rays", "ray miss": "max_ray_miss", "incidence": "max_incidence"}
 
 
-class Tested(NamedTuple):
-    """Some points, and by name those of `RAY_DIMENSIONS` that the cloud has, shape (n,)."""
-
-    points: Points
-    withheld: BoolArray
-    rays: dict[str, FloatArray]
+Tested: TypeAlias = tuple[Points, BoolArray, dict[str, FloatArray]]
+"""Some points, which of them are withheld, and by name those of `RAY_DIMENSIONS` there are."""
 
 
 def find_noise(
@@ -109,7 +95,7 @@ def find_noise(
     progress: Callable[[int], None] | None = None,
     *,
     has_rays: bool = True,
-) -> tuple[BoolArray, CleanSummary]:
+) -> tuple[BoolArray, Figures]:
     """Run the tests on a whole cloud of n points, from a file or a PDAL pipeline.
 
     The cloud has some dimensions by `names`. `view` returns it as a water surface needs it, and
@@ -135,13 +121,13 @@ def find_noise(
     used, submerged, reasons = (np.zeros(n, kind) for kind in (bool, bool, np.uint8))
     cloud = Cloud(empty((n, 3)), used, submerged, reasons)
     first = 0
-    for one in chunks(water):
-        count = len(one.withheld)
+    for points, withheld, known in chunks(water):
+        count = len(withheld)
         rows = slice(first, first + count)
-        xyz, heights, classes, *_ = one.points
+        xyz, heights, classes, *_ = points
         cloud.xyz[rows] = xyz
-        used[rows] = ~(one.withheld | np.isin(classes, NOISE_CLASSES))
-        rays, miss, incidence = (one.rays.get(dimension) for dimension in RAY_DIMENSIONS)
+        used[rows] = ~(withheld | np.isin(classes, NOISE_CLASSES))
+        rays, miss, incidence = (known.get(dimension) for dimension in RAY_DIMENSIONS)
         if rays is not None:
             flag_weak(rules, reasons[rows], rays, miss, incidence)
             reasons[rows][~used[rows]] = 0
@@ -167,21 +153,21 @@ def find_noise(
     distance_m = flag_neighbours(name, cloud, rules, progress)
     noise = reasons != 0
     count = int(noise.sum())
-    return noise, CleanSummary(
+    return noise, Figures(
         input="",
         output="",
         pcfix=__version__,
         points=n,
-        set_aside=int((~used).sum()),
-        submerged=int(submerged.sum()),
+        set_aside=int((~used).sum()),  # withheld or noise before: not tested, not neighbours
+        submerged=int(submerged.sum()),  # tested against the bed
         noise=count,
         reasons={
             str(reason.name).lower(): int(np.count_nonzero(reasons & np.uint8(reason)))
             for reason in Reason
         },
         dropped=count if options.drop else 0,
-        neighbour_distance_m=distance_m,
-        not_run=not_run,
+        neighbour_distance_m=distance_m,  # mean, sd and limit; see `flag_sparse`
+        not_run=not_run,  # tests that could not be run, and why
         water=None if water is None else str(water),
         settings=asdict(rules),
         seconds=0.0,
@@ -193,14 +179,12 @@ class CleanPlan(NamedTuple):
 
     noise: npt.NDArray[np.uint8]
     drop: bool
-    summary: CleanSummary
+    summary: Figures
 
 
-def _plan_file(
-    options: CleanOptions, progress: Progress | None,
-    cloud: CloudFiles, target: Path, kept: list[Chunk] | None = None,
-) -> CleanPlan:  # fmt: skip
+def _plan_file(options: CleanOptions, progress: Progress | None, task: FileTask) -> CleanPlan:
     """Find the noise of a whole cloud; large arrays are on the disk of the target."""
+    cloud = task.source
     with open_cloud(cloud) as source:
         names, points = set(source.header.point_format.dimension_names), len(source)
         try:
@@ -222,12 +206,12 @@ def _plan_file(
             for chunk in source.chunks():
                 rays = {name: source.dimension(chunk, name) for name in shown}
                 withheld = np.asarray(chunk["withheld"]).astype(np.bool_)
-                yield Tested(points_of(chunk, source, water), withheld, rays)
+                yield points_of(chunk, source, water), withheld, rays
 
-    beside = target.absolute()
-    if not beside.parent.is_dir():  # the folder of many files is made later
-        beside = next(one for one in beside.parents if one.is_dir()) / target.name
-    with scratch_arrays(beside):
+    near = task.target.absolute()
+    if not near.parent.is_dir():  # the folder of many files is made later
+        near = next(one for one in near.parents if one.is_dir()) / near.name
+    with scratch_arrays(near):
         noise, summary = find_noise(
             str(cloud), options, lambda: view_of(cloud), names, chunks, points,
             count, has_rays=has_rays,
@@ -240,27 +224,31 @@ def _plan_file(
     return CleanPlan(np.packbits(noise), options.drop, summary)
 
 
-class _Cleaning:
-    """The cleaning of one file: its header with a record of it, and each chunk."""
+def _finish(plan: CleanPlan, task: FileTask, count: int) -> Figures:
+    """Return the summary of a cloud."""
+    own = {"input": str(task.source), "output": str(task.target), "seconds": task.seconds}
+    return Figures(**vars(plan.summary) | own)
 
-    def __init__(self, plan: CleanPlan, source: LasSource) -> None:
-        self._plan = plan
-        found = plan.summary.as_dict()
-        content = {name: found[name] for name in ("pcfix", "settings", "water", "reasons")}
-        self.header = noted_header(source, cleaning_vlr({**content, "drop": plan.drop}))
-        self.identity = corrected_identity(source)
 
-    def compute(self, points: Chunk, row: int) -> tuple[BoolArray, int]:
+def _cleaning(plan: CleanPlan, source: LasSource) -> FileWork:
+    """Return the cleaning of one file: its header with a record of it, and each chunk."""
+    found = plan.summary.as_dict()
+    content = {name: found[name] for name in ("pcfix", "settings", "water", "reasons")}
+    header = noted_header(source, cleaning_vlr({**content, "drop": plan.drop}))
+
+    def compute(points: Chunk, row: int) -> tuple[BoolArray, int]:
         """Return which points of a chunk are noise, and their number."""
         end, byte = row + len(points), row // 8
-        bits = np.unpackbits(self._plan.noise[byte : (end + 7) // 8])
+        bits = np.unpackbits(plan.noise[byte : (end + 7) // 8])
         return bits[row - 8 * byte : end - 8 * byte].astype(np.bool_), len(points)
 
-    def apply(self, points: Chunk, noise: BoolArray) -> Chunk:
+    def apply(points: Chunk, noise: BoolArray) -> Chunk:
         """Flag or drop the noise."""
-        new = convert(points, self.header.point_format)
-        if self._plan.drop:
+        new = convert(points, header.point_format)
+        if plan.drop:
             return new[~noise]
         new.array["classification"][noise] = LOW_NOISE
         new["withheld"][:] = np.asarray(new["withheld"]) | noise
         return new
+
+    return FileWork(header, compute, apply)

@@ -1,33 +1,41 @@
 """Correct a LAS or LAZ cloud, or arrays, for refraction: two doors to one calculation.
 
 A plan is made for the whole cloud (`pcfix.flow.planning`), each chunk is corrected by it
-(`pcfix.flow.correction`), and the statistics are checked and summarized (`pcfix.flow.outcome`).
+(`pcfix.flow.correction`), and the statistics are checked and summarized.
 """
 
 from __future__ import annotations
 
 import warnings
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
+from itertools import compress
 from os import PathLike
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import InputError, PcfixWarning, SettingError
+from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError, coded
 from pcfix.flow.correction import CloudTally, Plan, correct_chunk
 from pcfix.flow.inputs import CameraInputs, Inputs, paths_in, transfer_between
-from pcfix.flow.outcome import check, check_fit, summarize
 from pcfix.flow.planning import plan_correction, plan_of, read_inputs
-from pcfix.flow.runner import Check, Chunk, Command, FileTask, Progress, stream
+from pcfix.flow.plausibility import CloudSample, Plausible, plausible
+from pcfix.flow.runner import (
+    Chunk,
+    Command,
+    FileTask,
+    FileWork,
+    Finish,
+    Progress,
+    run_command,
+    stream,
+)
 from pcfix.flow.surfaces import CloudView, Points, corners, points_of, view_of
-from pcfix.flow.tiles import run_command
 from pcfix.io.las import columns
-from pcfix.io.las.source import LasSource, centring_steps
-from pcfix.io.las.writing import corrected_header, corrected_identity
-from pcfix.io.tiles import CloudFiles, Clouds, open_cloud
+from pcfix.io.las.source import LasSource, centring_steps, part_report
+from pcfix.io.las.writing import corrected_header
+from pcfix.io.tiles import Clouds, open_cloud
 from pcfix.label.labelling import Labelling
 from pcfix.model import (
     BATHYMETRIC_POINT,
@@ -35,17 +43,31 @@ from pcfix.model import (
     Cameras,
     Correction,
     FloatArray,
+    Outcome,
+    TiePoints,
     Views,
+    WaterDimension,
     WaterSurface,
 )
-from pcfix.options.correct import CorrectOptions, LabelRules, PointsOptions, RefractionOptions
+from pcfix.options.correct import (
+    CorrectOptions,
+    LabelRules,
+    PointsOptions,
+    RefractionOptions,
+    ScienceOptions,
+)
 from pcfix.options.declare import File, taken
+from pcfix.refract.batch import UNLISTED
+from pcfix.refract.reconstructions import CAUSES
+from pcfix.refract.tally import Tally
 from pcfix.report.summary import Summary
-from pcfix.water.checks import as_surface, checked_points
+from pcfix.version import __version__
+from pcfix.water.checks import as_surface, check_submerged, checked_points, refuse_under_water
 from pcfix.water.index import with_index
 from pcfix.water.surface import FoundSurface
 
 if TYPE_CHECKING:
+    from pcfix.io.views import ViewReport
     from pcfix.refract.regression import DepthRegression
 
 
@@ -84,24 +106,17 @@ def correct_file(
         With one sentence on what to change. No output is left behind.
     """
     given = taken(CorrectOptions, options, keywords, "correct_file")
-    command = Command("correct", partial(plan_file, given), correct_cloud, check, summarize)
-    result: Summary = run_command(
-        command, input, output, given, reads=paths_in(given), progress=progress
-    )
-    return result
+
+    def plan(task: FileTask) -> Plan:
+        """Return the plan for a file, or for many as one cloud."""
+        return plan_correction(read_inputs(given, view_of(task.source, given.jobs, task.cached)))
+
+    command = Command("correct", plan, _correct_cloud, finish)
+    return run_command(command, input, output, given, reads=paths_in(given), progress=progress)
 
 
-def plan_file(
-    options: CorrectOptions, cloud: CloudFiles, target: Path, kept: list[Chunk] | None = None
-) -> Plan:
-    """Return the plan for a file, or for many as one cloud."""
-    return plan_correction(read_inputs(options, view_of(cloud, options.jobs, kept)))
-
-
-def correct_cloud(
-    plan: Plan, task: FileTask, row: int = 0, check: Check | None = None
-) -> tuple[Any, Any]:
-    """Correct a file from a row of the cloud on; return statistics, and what a check finds.
+def _correct_cloud(plan: Plan, task: FileTask, finish: Finish) -> Any:
+    """Correct a file; see `stream`.
 
     It is written with the offsets of the input, and again if a coordinate does not fit: with
     offsets in the middle of the cloud.
@@ -109,7 +124,7 @@ def correct_cloud(
     steps = tuple[int, ...]((0, 0, 0))
     while True:
         try:
-            return stream(partial(Correcting, steps=steps), plan, task, row, check)
+            return stream(partial(_correcting, steps=steps), plan, task, finish)
         except columns.OutOfRangeError as axis:
             old = steps
             with open_cloud(task.source, task.jobs) as source:
@@ -123,40 +138,234 @@ def correct_cloud(
                 ) from axis
 
 
-class Correcting:
-    """The correction of one file: its header, and each chunk."""
+def _correcting(plan: Plan, source: LasSource, steps: tuple[int, ...]) -> FileWork:
+    """Return the correction of one file: its header, and each chunk."""
+    written = columns.columns_for(plan.options.dimensions, plan.options.unsure)
+    header = corrected_header(source, written, plan.provenance(), steps)
+    uncorrected = plan.options.uncorrected
 
-    def __init__(self, plan: Plan, source: LasSource, steps: tuple[int, ...]) -> None:
-        self._plan, self._source, self._steps = plan, source, np.array(steps)
-        self._columns = columns.columns_for(plan.options.dimensions, plan.options.unsure)
-        record = plan.provenance()
-        self.header = corrected_header(source, self._columns, record, steps)
-        self.identity = corrected_identity(source)
+    def compute(points: Chunk, row: int) -> tuple[Correction, CloudTally]:
+        return correct_chunk(plan, points_of(points, source, plan.found.surface), row)
 
-    def compute(self, points: Chunk, row: int) -> tuple[Correction, CloudTally]:
-        """Correct the points of a chunk."""
-        some = points_of(points, self._source, self._plan.found.surface)
-        return correct_chunk(self._plan, some, row)
-
-    def apply(self, points: Chunk, correction: Correction) -> Chunk:
+    def apply(points: Chunk, correction: Correction) -> Chunk:
         """Move points, and write their new dimensions, classes and flags."""
-        new = columns.convert(points, self.header.point_format)
-        new.offsets = self.header.offsets
-        withhold = self._plan.options.uncorrected == "withhold"
+        new = columns.convert(points, header.point_format)
+        new.offsets = header.offsets
         for rows, part in correction.parts():
             some = new[rows]
             # whole steps of the file's own scale, so that 'pcfix restore' gets back every bit
             classes = np.array(some["classification"])
             withheld = np.asarray(some["withheld"]).astype(bool)
             changes = columns.changes_of(
-                self._columns, part, classes, withheld, some.scales, withhold=withhold
+                written, part, classes, withheld, some.scales, withhold=uncorrected == "withhold"
             )
-            columns.move(some, changes.steps + self._steps)
+            columns.move(some, changes.steps + np.array(steps))
             columns.fill(some, changes)
             some.array["classification"][part.corrected] = BATHYMETRIC_POINT
             some["withheld"][:] = (withheld | changes.flagged).astype(np.uint8)
-        drops = self._plan.options.uncorrected == "drop"
-        return new[~correction.uncorrected] if drops else new
+        return new[~correction.uncorrected] if uncorrected == "drop" else new
+
+    return FileWork(header, compute, apply)
+
+
+def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
+    """Refuse a result in which cloud, water and cameras do not fit, else summarize it.
+
+    Warns of what is uncertain, and writes the shoreline and the line of a regression if asked.
+    """
+    water_notes = _check_counts(plan, tally)
+    tested, poses, absorbed, shoreline, options = None, None, None, None, plan.options
+    if plan.inputs.port is None:
+        from pcfix.flow.diagnosis import diagnose_in_passing, quick_ties
+
+        ties = quick_ties(plan.inputs, plan.view.crs) if len(plan.cameras) else None
+        tested = check_fit(plan, tally, ties)
+        poses, absorbed = diagnose_in_passing(plan, ties)
+        if tally.shore is not None and options.shoreline is not None:
+            from pcfix.flow.shore import write_shoreline
+
+            shoreline = write_shoreline(
+                options.shoreline, tally.shore, plan.found, plan.view.crs,
+                overwrite=options.overwrite, sigma_level_m=options.sigma_level,
+            )  # fmt: skip
+    path, line = options.save_regression, plan.regression
+    if path is not None and line is not None:
+        from pcfix.io.regressions import write_regression
+
+        write_regression(path, line, overwrite=options.overwrite)
+    figures, report = tally.figures, _view_report(plan, tally)
+    unused = list(compress(plan.cameras.labels, np.logical_not(figures.camera_used)))
+    counts = figures.as_dict()
+    if options.unsure != "withhold":
+        counts["unsure"] = None
+    not_moved = sum(counts["uncorrected"].values()) + int(figures.outcomes[Outcome.NOT_CARRIED])
+    transfer, moved = plan.transfer, plan.survey.level_offset_m
+    made, detected, water = plan.made, _detected(plan, tally), str(plan.found.surface)
+    uncertainty = figures.uncertainty(made)
+    by_poses = plan.survey.learned.poses
+    if plan.inputs.port is not None:  # no depths, and no orders by depth
+        counts["depth_m"], uncertainty = {}, None
+        water = f"all around, seen through a {plan.inputs.port}"
+    if uncertainty is not None and by_poses is not None:
+        uncertainty["poses_m"] = round(by_poses.middle_m, 4)
+    if moved is not None:
+        times = f"{moved.min():+.3f} to {moved.max():+.3f} m at the times of the images"
+        water = f"{water}, {times}"
+    notes = [
+        *plan.cameras.notes,
+        *([] if report is None else report.warnings()),
+        *coded("cloud.labels", plan.labelling.notes),
+        *(() if tested is None else tested.doubts),
+        *detected,
+        *coded("water.surface", plan.found.notes),
+        *coded("water.images", plan.own_notes),
+        *coded("water.extent", water_notes),
+        *coded("cameras.poses", filter(None, [absorbed, plan.no_poses])),
+    ]
+    return Summary(
+        input=str(task.source),
+        output=str(task.target),
+        pcfix=__version__,
+        **counts,
+        dropped=not_moved if options.uncorrected == "drop" else 0,
+        cameras=len(plan.cameras),
+        cameras_used=len(plan.cameras) - len(unused),
+        cameras_unused=unused,  # labels of those without corrected points
+        seconds=task.seconds,
+        views=None if report is None else report.as_dict(),
+        warnings=[one.as_dict() for one in notes],
+        labelling=plan.labelling.report(tally.labels),
+        settings={**options.part(ScienceOptions).as_dict(), **plan.settings},
+        part=part_report(task.source),  # what was read, if not all points were
+        water=water,
+        water_fit=plan.found.as_dict(),
+        uncertainty=uncertainty,
+        carried=transfer.as_dict(tally.transfer) if transfer and tally.transfer else None,
+        made=made,  # the reconstruction type, and why
+        # other notes on the cloud, also in `warnings`
+        told=[one for one in map(str, detected) if made is None or one not in made["because"]],
+        poses=poses,  # whether they have absorbed the refraction
+        shoreline=shoreline,
+        fit=None if tested is None else tested.as_dict(),
+    )
+
+
+def _check_counts(plan: Plan, tally: CloudTally) -> tuple[str, ...]:
+    """Refuse a cloud of which nothing can be corrected; return notes on the extent of the water."""
+    # From the general to the particular: a view list of another cloud, or a mask elsewhere, would
+    # also leave points without cameras.
+    name, figures = plan.view.name, tally.figures
+    report = _view_report(plan, tally)
+    if report is not None:
+        report.check()
+        for note in report.warnings():
+            warnings.warn(note, stacklevel=2)
+    if plan.transfer is not None and tally.transfer is not None:
+        plan.transfer.check(name, tally.transfer)
+    plan.labelling.check(name, tally.labels)
+    water_notes, water = list[str](), plan.found.surface
+    if tally.water is not None:
+        check_submerged(tally.water.submerged, name, water, tally.water.heights())
+        if isinstance(water, WaterDimension):
+            refuse_under_water(plan.cameras, figures.lowest_water_m, str(water))
+        water_notes = tally.water.check_reach(name, water, deep=plan.options.deep)
+    elif figures.submerged == 0:
+        raise GeometryError(
+            "cloud.none_submerged", f"{name}: no point is left to correct. Check the mask."
+        )
+    flat = int(figures.outcomes[Outcome.FLAT_RAYS])
+    if figures.outcomes[Outcome.NO_CAMERA] + flat == figures.submerged:
+        raise GeometryError(
+            "cameras.max_angle" if flat else "cameras.no_overlap",
+            f"{name}: {_out_of_sight(plan, figures, flat)}",
+            submerged=figures.submerged,
+            flat=flat,
+        )
+    if not figures.corrected and figures.submerged:
+        reasons = {why: n for why, n in figures.uncorrected().items() if n}
+        listed = "; ".join(f"{n:,}: {why}" for why, n in reasons.items())
+        raise GeometryError(
+            "cameras.none_corrected",
+            f"{name}: none of {figures.submerged:,} submerged points can be corrected ({listed})."
+            " Check that cameras and cloud belong together.",
+            reasons=reasons,
+        )
+    return tuple(water_notes)
+
+
+def _view_report(plan: Plan, tally: CloudTally) -> ViewReport | None:
+    """Return how the view list fitted, with the notes of reading it."""
+    if tally.views is None or plan.match is None:
+        return None
+    return replace(tally.views, notes=plan.match.notes)
+
+
+def _out_of_sight(plan: Plan, figures: Tally, flat: int) -> str:
+    """Return the sentence for a cloud of which no camera sees a submerged point."""
+    limit = plan.survey.limit_deg
+    if flat:
+        return (
+            f"no submerged point has two rays within {limit or 90.0:g} deg of the surface"
+            f" normal; {flat:,} points have rays at larger angles. Increase --max-angle."
+        )
+    from pcfix.io.cameras.mistakes import likely_mistake
+
+    middle = (figures.low + figures.high) / 2.0
+    distance = float(np.hypot(*(plan.cameras.centres - middle)[:, :2].T).min())
+    within = f" within {limit:g} degrees" if limit else ""
+    sentence = (
+        f"no camera has a submerged point in sight{within}; the nearest is {distance:,.1f} m in"
+        f" plan from the middle of the {figures.submerged:,} submerged points. Check that cameras"
+        " and cloud have the same CRS, and that pitch 0 is straight down."
+    )
+    mistake = likely_mistake(plan.cameras.centres, figures.low, figures.high, plan.view.crs)
+    return f"{sentence} {mistake or ''}".strip()
+
+
+def check_fit(plan: Plan, tally: CloudTally, ties: TiePoints | None = None) -> Plausible:
+    """Test cameras, cloud and water against each other; warn of what does not fit."""
+    sample, given = tally.sample or CloudSample(), plan.inputs.cameras
+    sought = (plan.found.as_dict() or {}).get("model") == "auto"
+    tested = plausible(
+        plan.cameras, sample.xyz, ties, () if sought else sample.level_doubts(),
+        file="" if isinstance(given, Cameras) else given or "", water_m=sample.water_m,
+        listed=plan.views is not None, every=sample.every,
+    )  # fmt: skip
+    tested = tested._replace(noted=CAUSES in map(str, _detected(plan, tally)))
+    for warning in tested.doubts:
+        warnings.warn(warning, stacklevel=3)
+    return tested
+
+
+def _detected(plan: Plan, tally: CloudTally) -> list[PcfixWarning]:
+    """Return the notes on what was detected from the cloud."""
+    verdicts = {str(note): note for one in plan.verdicts for note in one.warnings()}
+    beyond, line = list[str](), plan.regression
+    if tally.beyond is not None and line is not None:
+        from pcfix.refract.regression import LEAST_BEYOND
+
+        least = LEAST_BEYOND if plan.inputs.regression is None else 0.0
+        beyond = tally.beyond.notes(line, least)
+    corrected, rays = tally.figures.corrected, list[PcfixWarning]()
+    if plan.inputs.port is not None and plan.survey.settings.method == "snell" and corrected:
+        mean = tally.port_miss_m / corrected
+        sentence = (
+            "The refracted rays of the apparent points miss each other behind the port by"
+            f" {mean:.3f} m on average. --method consistent takes this into account, best with"
+            " --views."
+        )
+        rays.append(PcfixWarning("port.ray_distance", sentence, mean_m=mean))
+    unlisted = []
+    if UNLISTED in plan.survey.parts:
+        so = " ".join(map(str, plan.of_unlisted))
+        unlisted = [f"Points in no view list are corrected as without a list. {so}"]
+    return [
+        *plan.notes,
+        *rays,
+        *coded("regression.range", beyond),
+        *coded("cloud.reconstruction", verdicts.values()),
+        *coded("views.unlisted", unlisted),
+    ]
 
 
 def correct_points(
@@ -248,11 +457,8 @@ def correct_points(
     if level_offset_m is not None:
         offset = np.ascontiguousarray(level_offset_m, dtype=np.float64)
         if offset.shape != (len(cameras),) or not np.isfinite(offset).all():
-            raise SettingError(
-                "array.shape",
-                f"level_offset_m must be {len(cameras)} finite numbers, one per camera, not of"
-                f" shape {offset.shape}.",
-            )
+            sentence = f"level_offset_m must be {len(cameras)} finite numbers, one per camera."
+            raise SettingError("array.shape", sentence, shape=offset.shape)
     original = cameras if adjusted_from is None else adjusted_from
     if views is not None:
         _check_views(views, xyz, original)
@@ -260,11 +466,8 @@ def correct_points(
     if may_be_submerged is not None:
         allowed = np.asarray(may_be_submerged)
         if allowed.shape != classes.shape or allowed.dtype != np.bool_:
-            raise SettingError(
-                "array.shape",
-                f"may_be_submerged must be {len(xyz)} booleans, not {allowed.dtype} of shape"
-                f" {allowed.shape}.",
-            )
+            sentence = f"may_be_submerged must be {len(xyz)} booleans, not {allowed.dtype}."
+            raise SettingError("array.shape", sentence, shape=allowed.shape)
         classes[~allowed] = NOT_SUBMERGED
     points = Points(xyz, heights, classes)
     view = CloudView(

@@ -2,8 +2,8 @@
 
 A `Plan` holds what all points of a cloud have in common; `pcfix.flow.planning` makes it.
 `correct_chunk` depends on nothing else, and returns statistics (`CloudTally`) with the points.
-These are added up, and go through `pcfix.flow.outcome`. A housing port is a medium like a water
-surface: all points are below it, whatever their height, and have no depth.
+These are added up, and `pcfix.flow.correct.finish` summarizes them. A housing port is a medium like
+a water surface: all points are below it, whatever their height, and have no depth.
 """
 
 from __future__ import annotations
@@ -201,10 +201,14 @@ def correct_chunk(
     xyz, above = points.xyz, batch.surface
     submerged, labels = plan.labelling.submerged(xyz, above, points.classes)
     if plan.inputs.port is not None:
-        correction = _through_port(plan, batch, np.flatnonzero(submerged))
-        figures = Tally.of(correction)
+        from pcfix.port.methods import correct_through_port
+
+        rows, settings = np.flatnonzero(submerged), plan.survey.settings
+        wet, n = batch.take(rows), len(batch)
+        found = correct_through_port(wet.xyz, plan.cameras, plan.inputs.port, settings, wet.views)
+        correction = _spread(batch, rows, found, np.zeros(n), np.ones(n, np.bool_))
         miss_m = float(correction.ray_miss_m[submerged].sum())
-        return correction, CloudTally(figures, labels, counts, port_miss_m=miss_m)
+        return correction, CloudTally(Tally.of(correction), labels, counts, port_miss_m=miss_m)
     if step is not None:
         submerged &= step.moved  # a point without a place in the adjusted block is left where it is
     correction = _through_water(plan, batch, np.flatnonzero(submerged), covariances=covariances)
@@ -264,15 +268,6 @@ def _through_water(plan: Plan, batch: Batch, rows: IntArray, *, covariances: boo
     land = np.flatnonzero(is_land)
     shift[land] += shift_of_land(batch.take(land))
     return replace(correction, shift_m=shift)
-
-
-def _through_port(plan: Plan, batch: Batch, rows: IntArray) -> Correction:
-    """Correct the points of a cloud that was taken under water."""
-    from pcfix.port.methods import correct_through_port
-
-    wet, settings = batch.take(rows), plan.survey.settings
-    found = correct_through_port(wet.xyz, plan.cameras, plan.inputs.port, settings, wet.views)
-    return _spread(batch, rows, found, np.zeros(len(batch)), np.ones(len(batch), np.bool_))
 
 
 _PER_POINT = {one.name for one in fields(Correction)} & {*Intersection._fields} - {"camera_used"}

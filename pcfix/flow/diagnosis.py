@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,8 +20,10 @@ from pcfix.adjust.diagnosis import (
 from pcfix.errors import InputError, PcfixError, PcfixWarning
 from pcfix.flow.inputs import Inputs, ties_of
 from pcfix.flow.next_steps import adjust_words
+from pcfix.flow.surfaces import CloudView
 from pcfix.io.gnss_positions import gnss_in_frame_of
-from pcfix.model import Cameras, GnssPositions, TiePoints
+from pcfix.io.ground_control import read_ground_control
+from pcfix.model import Cameras, GnssPositions, TiePoints, WaterSurface
 from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
 
 if TYPE_CHECKING:
@@ -39,6 +41,19 @@ def diagnose(evidence: Evidence) -> Diagnosis:
     return diagnosed(replace(evidence, gnss=_gnss_of(evidence.cameras, evidence.name)))
 
 
+def diagnose_inputs(
+    inputs: Inputs, cameras: Cameras, view: CloudView, water: WaterSurface, index: float, *,
+    gcps: Any = None, reference: Any = None, in_passing: bool = False,
+) -> Diagnosis:  # fmt: skip
+    """Look for signs in a cloud, its cameras with their tie points, and surveys, if given."""
+    evidence = Evidence(
+        cameras, str(inputs.cameras), water, index, view=view, reference=reference,
+        control=None if gcps is None else read_ground_control(gcps, cameras).surveyed,
+        ties=ties_of(inputs, view.crs), in_passing=in_passing,
+    )  # fmt: skip
+    return diagnose(evidence)
+
+
 def _gnss_of(cameras: Cameras, name: str) -> GnssPositions | None:
     """Return the GNSS positions in the frame of the cameras; None if they cannot be compared."""
     try:
@@ -47,55 +62,43 @@ def _gnss_of(cameras: Cameras, name: str) -> GnssPositions | None:
         return None
 
 
-class Poses(NamedTuple):
-    """What is known of the poses of a correction.
-
-    absorbed : whether they absorbed the refraction, None if unknown; words : that as a line of a
-    summary; signs : each in plain values.
-    """
-
-    absorbed: bool | None
-    words: str
-    warning: PcfixWarning | None = None
-    signs: tuple[dict[str, Any], ...] = ()
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values, ready for JSON."""
-        return {"absorbed": self.absorbed, "words": self.words, "signs": list(self.signs)}
-
-
-ADJUSTED = Poses(False, "adjusted with refraction (--adjusted-from)")
-
-
-def diagnose_in_passing(plan: Plan, ties: TiePoints | None) -> Poses:
+def diagnose_in_passing(
+    plan: Plan, ties: TiePoints | None
+) -> tuple[dict[str, Any], PcfixWarning | None]:
     """Check the poses with what a correction has read anyway; warn if they absorbed refraction.
 
-    The ties are `quick_ties`.
+    The ties are `quick_ties`. Returns for the summary whether the poses absorbed it (None if
+    unknown), that as a line, and the signs; and the warning.
     """
     inputs, cameras = plan.inputs, plan.cameras
+    found: dict[str, Any] = {"absorbed": None, "words": "", "signs": []}
     if not len(cameras):
-        return Poses(None, "not applicable: no cameras were given")
+        return found | {"words": "not applicable: no cameras were given"}, None
     if inputs.adjusted_from is not None:
-        return ADJUSTED
+        words = "adjusted with refraction (--adjusted-from)"
+        return found | {"absorbed": False, "words": words}, None
     path = None if isinstance(inputs.cameras, Cameras) else inputs.cameras
-    found = [(one.straight, one.is_fused) for one in plan.verdicts if one.straight is not None]
+    seen = [(one.straight, one.is_fused) for one in plan.verdicts if one.straight is not None]
     n = plan.options.refractive_index
     evidence = Evidence(
         cameras, "cameras" if path is None else str(path), plan.found.surface, n, ties=ties,
         view=plan.view, in_passing=True,
-        neighbours=neighbours_sign(*found[-1][0], is_fused=found[-1][1]) if found else None,
+        neighbours=neighbours_sign(*seen[-1][0], is_fused=seen[-1][1]) if seen else None,
     )  # fmt: skip
     try:
         is_large = path is not None and _size_of(Path(path)) > QUICK_BYTES
         diagnosis = diagnose(evidence)
     except (PcfixError, OSError) as error:  # this check stops no correction
-        return Poses(None, f"not checked for absorbed refraction: {error}")
+        return found | {"words": f"not checked for absorbed refraction: {error}"}, None
     command, because = adjust_words(
         inputs, plan.view.name, has_datum=has_datum(evidence.cameras, evidence.name),
         index=None if n == DEFAULT_REFRACTIVE_INDEX else n,
     )  # fmt: skip
-    sentence = diagnosis.sentence(command, because)
-    decided = diagnosis.decided_by
+    sentence, decided, warning = diagnosis.sentence(command, because), diagnosis.decided_by, None
+    if sentence:
+        values = {} if diagnosis.size is None else {"likely_error_m": diagnosis.size[0]}
+        warning = PcfixWarning("poses.absorbed", sentence, command=command, **values)
+        warnings.warn(warning, stacklevel=3)
     if decided is not None:
         did = "absorbed" if diagnosis.absorbed else "did not absorb"
         words = f"{did} the refraction, by {decided.name}{'; see the warning' * bool(sentence)}"
@@ -107,12 +110,8 @@ def diagnose_in_passing(plan: Plan, ties: TiePoints | None) -> Poses:
         elif silent:
             why = f"{' and '.join(silent)} of the file tell too little (see 'pcfix cameras')"
         words = f"not checked for absorbed refraction: {why}"
-    warning = None
-    if sentence:
-        values = {} if diagnosis.size is None else {"likely_error_m": diagnosis.size[0]}
-        warning = PcfixWarning("poses.absorbed", sentence, command=command, **values)
-        warnings.warn(warning, stacklevel=3)
-    return Poses(diagnosis.absorbed, words, warning, tuple(diagnosis.as_dict()["signs"]))
+    signs = diagnosis.as_dict()["signs"]
+    return {"absorbed": diagnosis.absorbed, "words": words, "signs": signs}, warning
 
 
 def quick_ties(inputs: Inputs, crs: Any) -> TiePoints | None:

@@ -11,10 +11,10 @@ import json
 import warnings
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -34,10 +34,11 @@ from pcfix.io.files import check_output, scratch_arrays, write_text
 from pcfix.io.las.source import LasSource, coordinates, metric_crs, part_report
 from pcfix.io.las.writing import is_ours
 from pcfix.io.styles import raster_style
-from pcfix.io.tiles import CloudFiles, Clouds, Tiles, cloud_of, inputs_of, open_cloud
+from pcfix.io.tiles import CloudFiles, Clouds, cloud_of, inputs_of, open_cloud
 from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES, FloatArray
 from pcfix.options.declare import File, taken
 from pcfix.options.steps import MIN_RESOLUTION_M, DsmOptions, DsmRules
+from pcfix.sums import Figures
 from pcfix.version import __version__
 
 WINDOW_POINTS = 400_000
@@ -63,41 +64,6 @@ SPARSE = 20.0
 BULK_SAMPLE, BEYOND_BULK = 1_000_000, 1e-3
 
 
-@dataclass(frozen=True, slots=True)
-class DsmSummary:
-    """The numbers of a DSM; the keys of ``pcfix dsm --summary`` are these names."""
-
-    input: str
-    output: str
-    hillshade: str | None
-    counts: str | None
-    what: str  # the quantity in the cells; see `DsmRules`
-    pcfix: str  # version
-    crs: str | None  # coordinate system of the cloud, and its vertical part
-    heights: str | None
-    width: int  # columns and rows
-    height: int
-    bounds_m: tuple[float, float, float, float]  # left, bottom, right, top
-    points: int  # in the cloud
-    points_used: int  # in the raster: of the surface asked for, neither noise nor withheld
-    cells: int  # with points
-    filled: int  # with a height but no points
-    empty: int  # without a height
-    points_per_cell: float  # mean over the cells with points
-    spacing_m: float  # of the points used, within the area that they fill
-    hole_m: float | None  # width of the widest hole that was bridged
-    settings: dict[str, Any]
-    seconds: float
-    values: dict[str, float]  # least, mean and largest of the cells, before holes are filled
-    resolution_is: Literal["given", "chosen"] = "given"
-    part: dict[str, Any] | None = None  # points read, of how many, and by which bounds
-    stray: int = 0  # points ignored because they lie far from all others
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values, for JSON."""
-        return asdict(self)
-
-
 def grid_dsm(
     input: Clouds,
     output: File,
@@ -105,7 +71,7 @@ def grid_dsm(
     options: DsmOptions | None = None,
     progress: Progress | None = None,
     **keywords: Any,
-) -> DsmSummary:
+) -> Figures:
     """Grid a cloud to a GeoTIFF of heights or another quantity; what ``pcfix dsm`` runs.
 
     The file has one band of float32, -9999 (nodata) if a cell has no value. Heights keep the
@@ -152,7 +118,6 @@ def grid_dsm(
         files, output, given,
         more=more.values(), check=rasters.check_tif, progress=progress,
     )  # fmt: skip
-    cloud: CloudFiles = files if isinstance(files, Tiles) else task.source
     style = task.target.with_suffix(".qml")
     if given.style:
         check_output(style, overwrite=given.overwrite, inputs=inputs_of(files))
@@ -168,7 +133,7 @@ def grid_dsm(
         }
         folder = stack.enter_context(scratch_folder(task.target))
         stack.enter_context(scratch_arrays(task.target))
-        with open_cloud(cloud) as source:
+        with open_cloud(task.source) as source:
             crs, count = metric_crs(source), len(source)
             corrected = any(is_ours(vlr) for vlr in source.vlrs)
             read = _points_of(source, rules, report)
@@ -201,7 +166,7 @@ def grid_dsm(
                 rasters.add_overviews(path)
     if given.style:
         write_text(style, raster_style(task.target, rules.what), overwrite=given.overwrite)
-    result = DsmSummary(
+    result = Figures(
         input=str(task.source),
         output=str(task.target),
         hillshade=None if given.hillshade is None else str(given.hillshade),
@@ -212,20 +177,20 @@ def grid_dsm(
         heights=crs_words(crs)[1] or None,
         width=lattice.width,
         height=lattice.height,
-        bounds_m=lattice.bounds_m,
+        bounds_m=lattice.bounds_m,  # left, bottom, right, top
         points=count,
-        points_used=len(used),
+        points_used=len(used),  # of the surface asked for, neither noise nor withheld
         **counted,
-        points_per_cell=len(used) / counted["cells"],
-        spacing_m=apart_m,
-        hole_m=reach_m if rules.method == "tin" else rules.fill,
+        points_per_cell=len(used) / counted["cells"],  # mean over the cells with points
+        spacing_m=apart_m,  # of the points used, within the area that they fill
+        hole_m=reach_m if rules.method == "tin" else rules.fill,  # widest hole that was bridged
         settings=asdict(rules),
-        seconds=round(task.seconds, 3),
+        seconds=task.seconds,
         resolution_is="given" if given.resolution else "chosen",
         part=part_report(task.source),
-        stray=len(read) - len(used),
+        stray=len(read) - len(used),  # points ignored because they lie far from all others
     )
-    write_summary(task, result.as_dict())
+    write_summary(given, result.as_dict())
     return result
 
 
@@ -240,7 +205,7 @@ def _write_rasters(
 ) -> dict[str, Any]:
     """Write the raster, and hillshade and counts where they have a path.
 
-    Returns the numbers of cells and the statistics of their values, by the names of `DsmSummary`.
+    Returns the numbers of cells and the statistics of their values, by their names in the summary.
     """
     lattice, size_m = how.lattice, rules.cell_m
     plan = None if crs is None else parts(crs)[0]
@@ -292,9 +257,10 @@ def _write_rasters(
                 rasters.write_part(out, light, window, 1)
     found = {"min": low, "mean": total / count, "max": high} if count else {}
     return {
-        "cells": cells,
-        "filled": filled,
-        "empty": lattice.width * lattice.height - known,
+        "cells": cells,  # with points
+        "filled": filled,  # with a height but no points
+        "empty": lattice.width * lattice.height - known,  # without a height
+        # of the cells, before holes are filled
         "values": {name: round(float(value), 4) for name, value in found.items()},
     }
 

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from pcfix.errors import SettingError
 from pcfix.flow.inputs import labelling_of, mask_of, paths_in
-from pcfix.flow.runner import Chunk, Command, Ends, Progress, stream
+from pcfix.flow.runner import Chunk, Command, FileTask, FileWork, Progress, run_command, stream
 from pcfix.flow.surfaces import (
     CloudView,
     Points,
@@ -22,16 +22,16 @@ from pcfix.flow.surfaces import (
     points_of,
     view_of,
 )
-from pcfix.flow.tiles import run_command
 from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource, part_report
-from pcfix.io.las.writing import corrected_identity, labelling_vlr, noted_header
+from pcfix.io.las.writing import labelling_vlr, noted_header
 from pcfix.io.tiles import Clouds
 from pcfix.label.areas import WaterMask
-from pcfix.label.labelling import LabelCounts, Labelling, LabelSummary, Part
+from pcfix.label.labelling import LabelCounts, Labelling, Part
 from pcfix.model import WaterPlane, WaterSurface
 from pcfix.options.correct import LabelOptions, LabelRules, StageLabelOptions
 from pcfix.options.declare import File, taken
+from pcfix.sums import Figures
 from pcfix.version import __version__
 from pcfix.water.checks import as_surface, check_submerged, check_tilt, checked_points
 from pcfix.water.surface import surface_above
@@ -106,7 +106,7 @@ def label_file(
     options: LabelOptions | None = None,
     progress: Progress | None = None,
     **keywords: Any,
-) -> LabelSummary:
+) -> Figures:
     """Set the submerged points of a LAS or LAZ cloud to class 40; what ``pcfix label`` runs.
 
     With a band, points near the surface get class 41; with ``reset``, points of class 40 or 41 that
@@ -125,7 +125,7 @@ def label_file(
 
     Returns
     -------
-    LabelSummary
+    Figures
 
     Raises
     ------
@@ -135,15 +135,11 @@ def label_file(
     given = taken(LabelOptions, options, keywords, "label_file")
     command = Command(
         "label",
-        lambda cloud, target, kept: plan_labelling(given, view_of(cloud, given.jobs)),
-        partial(stream, _Labelling),
-        check,
-        _summarize,
+        lambda task: plan_labelling(given, view_of(task.source, given.jobs)),
+        partial(stream, _labelling),
+        _finish,
     )
-    result: LabelSummary = run_command(
-        command, input, output, given, reads=paths_in(given), progress=progress
-    )
-    return result
+    return run_command(command, input, output, given, reads=paths_in(given), progress=progress)
 
 
 @dataclass(frozen=True)
@@ -178,44 +174,41 @@ def check(plan: LabelPlan, counts: LabelCounts) -> None:
     check_submerged(below, plan.name, plan.water)
 
 
-class _Labelling:
-    """The labelling of one file: its header with a record of it, and each chunk."""
+def _labelling(plan: LabelPlan, source: LasSource) -> FileWork:
+    """Return the labelling of one file: its header with a record of it, and each chunk."""
+    water, mask, part = plan.water, plan.labelling.mask, part_report(source.part)
+    content = {
+        "pcfix": __version__,
+        "settings": plan.labelling.settings.as_dict(),
+        "water": str(water),
+        "water_plane": list(astuple(water)) if isinstance(water, WaterPlane) else None,
+        "water_mask": None if mask is None else mask.name,
+        **({} if part is None else {"part": part}),
+    }
+    header = noted_header(source, labelling_vlr(content))
 
-    def __init__(self, plan: LabelPlan, source: LasSource) -> None:
-        self._plan, self._source = plan, source
-        water, mask, part = plan.water, plan.labelling.mask, part_report(source.part)
-        content = {
-            "pcfix": __version__,
-            "settings": plan.labelling.settings.as_dict(),
-            "water": str(water),
-            "water_plane": list(astuple(water)) if isinstance(water, WaterPlane) else None,
-            "water_mask": None if mask is None else mask.name,
-            **({} if part is None else {"part": part}),
-        }
-        self.header = noted_header(source, labelling_vlr(content))
-        self.identity = corrected_identity(source)
-
-    def compute(self, points: Chunk, row: int) -> tuple[Classes, LabelCounts]:
-        """Return the classes of the points of a chunk."""
-        return label_chunk(self._plan, points_of(points, self._source, self._plan.water))
-
-    def apply(self, points: Chunk, classes: Classes) -> Chunk:
-        """Write the classes."""
-        new = convert(points, self.header.point_format)
+    def apply(points: Chunk, classes: Classes) -> Chunk:
+        new = convert(points, header.point_format)
         new.array["classification"] = classes
         return new
 
+    return FileWork(
+        header, lambda points, row: label_chunk(plan, points_of(points, source, water)), apply
+    )
 
-def _summarize(plan: LabelPlan, counts: LabelCounts, findings: None, ends: Ends) -> LabelSummary:
-    return LabelSummary(
-        input=ends.input,
-        output=ends.output,
+
+def _finish(plan: LabelPlan, task: FileTask, counts: LabelCounts) -> Figures:
+    """Check the counts of a cloud, and return the summary."""
+    check(plan, counts)
+    return Figures(
+        input=str(task.source),
+        output=str(task.target),
         pcfix=__version__,
         **counts.of_classes(),
         water=str(plan.water),
         settings=plan.labelling.settings.as_dict(),
         labelling=plan.labelling.report(counts),
-        seconds=round(ends.seconds, 3),
+        seconds=task.seconds,
         warnings=list(plan.labelling.notes),
-        part=ends.part,
+        part=part_report(task.source),
     )

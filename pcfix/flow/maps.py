@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 import shapely
 
-from pcfix.compare.sections import SectionLine, lines_downslope
-from pcfix.errors import GeometryError
+from pcfix.compare.sections import SectionLine
 from pcfix.flow.dsm import BLOCK_CELLS, grid_dsm, point_spacing_m
-from pcfix.flow.request import SURFACE, Files, Request, cameras_of, water_of
+from pcfix.flow.request import SURFACE, RunFolder
 from pcfix.flow.runner import Progress
 from pcfix.flow.shore import shoreline_layer
 from pcfix.flow.surfaces import points_of, view_of
@@ -54,23 +53,22 @@ def raster_files(folder: Path, *, errors: bool) -> list[Path]:
     return [*files, *((folder / name).with_suffix(".qml") for name in maps)]
 
 
-def write_rasters(
-    request: Request, files: Files, *, errors: bool, progress: Progress | None = None
-) -> Plain:
+def write_rasters(run: RunFolder, *, errors: bool, progress: Progress | None = None) -> Plain:
     """Write all rasters of a corrected cloud as cloud optimised GeoTIFF, with styles for QGIS.
 
     By default the cells have 2 to 4 points, and are no smaller than a pixel on the ground. Returns
-    the facts for ``run.json``.
+    their side for ``run.json``.
     """
-    folder, cloud, cameras = files.folder, files.cleaned_cloud, cameras_of(request, files)
-    gsd_m = None  # a pixel on the ground at nadir, median
+    folder, cloud, cameras = run.folder, run.cleaned_cloud, run.cameras
+    gsd_m = 0.0  # a pixel on the ground at nadir, median
     if cameras.lenses:
         with open_cloud(cloud) as source:
             middle = float(source.header.mins[2] + source.header.maxs[2]) / 2.0
         focal = np.array([lens.focal_px for lens in cameras.lenses])
         gsd_m = float(np.median((cameras.centres[:, 2] - middle) / focal))
-    spacing_m = point_spacing_m(cloud, folder / SURFACE)
-    cell_m = request.resolution or round_resolution(spacing_m, gsd_m or 0.0)
+    cell_m = run.request.resolution
+    if cell_m is None:
+        cell_m = round_resolution(point_spacing_m(cloud, folder / SURFACE), gsd_m)
     plain = DsmOptions(resolution=cell_m, cog=True, style=True, overwrite=True)
     filled = replace(plain, fill=HOLE_CELLS * cell_m)
     asked = {
@@ -79,31 +77,15 @@ def write_rasters(
         DEPTH: replace(filled, what="depth"),
         **({UNCERTAINTY: replace(plain, what="uncertainty")} if errors else {}),
     }
-    summaries = {}
     for number, (name, options) in enumerate(asked.items()):
 
         def report(done: int, total: int, number: int = number) -> None:
             if progress is not None:
                 progress(number * total + done, len(asked) * total)
 
-        summaries[name] = grid_dsm(cloud, folder / name, options=options, progress=report)
+        grid_dsm(cloud, folder / name, options=options, progress=report)
     _write_shaded(folder)
-    density = (cell_m / spacing_m) ** 2 if spacing_m else None
-    return {
-        "resolution_m": cell_m,
-        "points_per_cell": density,
-        "gsd_m": gsd_m,
-        **{Path(name).stem: summary.as_dict() for name, summary in summaries.items()},
-    }
-
-
-def resolution_sentence(facts: Plain, *, given: bool) -> str:
-    """Return the size of the cells of the rasters, and its reason."""
-    density, gsd_m = facts["points_per_cell"], facts["gsd_m"]
-    parts = [] if density is None else [f"{density:.1f} points each"]
-    parts += [] if gsd_m is None else [f"GSD {gsd_m:.2g} m"]
-    more = f" ({', '.join(parts)})" if parts else ""
-    return f", cells of {facts['resolution_m']:g} m{', as given' if given else ''}{more}"
+    return {"resolution_m": cell_m}
 
 
 def _write_shaded(folder: Path) -> None:
@@ -141,13 +123,13 @@ def _write_shaded(folder: Path) -> None:
         rasters.copy_as_cog(plain, draft)
 
 
-def write_map(request: Request, files: Files, corrected: Plain, compared: Plain) -> dict[str, int]:
-    """Write all layers of a run; return how many features each has.
+def write_map(path: Path, run: RunFolder, corrected: Plain, compared: Plain) -> None:
+    """Write all layers of a run to a file.
 
     `corrected` and `compared` are the results of these steps. The height of the water has one
     standard error for all places.
     """
-    folder, cloud = files.folder, files.cleaned_cloud
+    folder, cloud, request = run.folder, run.cleaned_cloud, run.request
     shapes = rasters.outlines(folder / DEPTH, MOST_CELLS)
     area = shapely.area(np.array(shapes, object)) if shapes else np.zeros(0)
     style = vector_style({"area": Symbol("fill", DARK, 0.5)})
@@ -155,16 +137,16 @@ def write_map(request: Request, files: Files, corrected: Plain, compared: Plain)
     sigma_m = next(one for one in known if one is not None)
     # x, y, reference height, and cloud minus reference
     points = np.array(compared.get("check_points", [])).reshape(-1, 4)
+    sections = compared.get("figures", {}).get("sections", [])
     layers = [
         Layer("corrected_area", "Polygon", shapes, {"area_m2": area}, style),
         contours_layer(folder),
-        _waterline(cloud, water_of(request, files), sigma_m),
-        _sections(compared.get("figures", {}).get("sections", []), folder),
-        _cameras(cameras_of(request, files), corrected["cameras_unused"]),
+        _waterline(cloud, run.water, sigma_m),
+        *([_sections(sections)] if sections else []),
+        _cameras(run.cameras, corrected["cameras_unused"]),
         *_checks(folder, points, request.check_depths),
     ]
-    write_layers(files.map, layers, view_of(cloud).crs, overwrite=True)
-    return {one.name: len(one.geometries) for one in layers}
+    write_layers(path, layers, view_of(cloud).crs, overwrite=True)
 
 
 def contours_layer(folder: Path, interval: float | None = None) -> Layer:
@@ -198,17 +180,9 @@ def _waterline(cloud: Path | Tiles, water: WaterSurface, sigma_m: float) -> Laye
     return shoreline_layer("waterline", lines, style)
 
 
-def _sections(sections: Sequence[Mapping[str, float]], folder: Path) -> Layer:
-    """Return the cross-sections of the comparison, else lines down the slope of the bed."""
+def _sections(sections: Sequence[Mapping[str, float]]) -> Layer:
+    """Return the cross-sections of the comparison."""
     lines = [SectionLine(s["x1"], s["y1"], s["x2"], s["y2"]) for s in sections]
-    if not lines:
-        bed, bounds = rasters.preview(folder / BED)
-        row, column = np.nonzero(np.isfinite(bed))
-        xy = rasters.centres(np.column_stack([column, row]), bed, bounds)
-        try:
-            lines = list(lines_downslope(np.column_stack([xy, bed[row, column]]), SECTIONS))
-        except GeometryError:  # the bed is a line in plan
-            lines = []
     names = np.array([f"Cross-section {n}" for n, _ in enumerate(lines, start=1)], object)
     values = {"name": names, "length_m": np.array([one.length_m for one in lines])}
     ends = [shapely.linestrings([(one.x1, one.y1), (one.x2, one.y2)]) for one in lines]

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pcfix.errors import GeometryError, PcfixWarning, bad_file
+from pcfix.errors import GeometryError, bad_file
 from pcfix.flow.inputs import paths_in
-from pcfix.flow.photos import CLOUDS, PhotoBlock, block_of, plain, warn_all
+from pcfix.flow.photos import CLOUDS, PhotoBlock, block_of, warn_all
 from pcfix.flow.runner import Progress, check_summary, write_summary
 from pcfix.grid.lattice import Lattice, lattice_over
 from pcfix.io import rasters
@@ -23,6 +23,7 @@ from pcfix.options.declare import File, taken
 from pcfix.options.photos import OrthoOptions, PhotosOptions
 from pcfix.photos.ortho import Picture, mosaic, picture_of
 from pcfix.running import threads
+from pcfix.sums import Figures
 
 TILE_CELLS = 512
 CACHE_BYTES = 400_000_000
@@ -32,23 +33,6 @@ NO_WATER = WaterPlane(-100_000.0)
 COLOURS = {1: ("gray",), 3: ("red", "green", "blue")}
 
 
-@dataclass(frozen=True)
-class OrthoSummary:
-    """The result of `pcfix.ortho_photo`; `covered_share` is that of the cells over the DSM."""
-
-    output: str
-    images: int
-    width: int
-    height: int
-    resolution_m: float
-    bounds_m: tuple[float, float, float, float]
-    covered_share: float
-    seconds: float
-    dsm: str
-    water: str | None
-    notes: tuple[PcfixWarning, ...]
-
-
 def ortho_photo(
     images: File,
     output: File,
@@ -56,7 +40,7 @@ def ortho_photo(
     options: OrthoOptions | None = None,
     progress: Progress | None = None,
     **keywords: Any,
-) -> OrthoSummary:
+) -> Figures:
     """Write an orthophoto of land and bed on a DSM; what ``pcfix ortho`` runs.
 
     The file is a cloud optimised GeoTIFF in the CRS of the DSM, with the bands of the photographs
@@ -102,12 +86,20 @@ def ortho_photo(
                 path=given.dsm,
             )
         rasters.copy_as_cog(folder / "plain.tif", draft)
-    summary = OrthoSummary(
-        str(target), len(block.photos), lattice.width, lattice.height, lattice.resolution_m,
-        lattice.bounds_m, round(covered / ground, 5), round(time.perf_counter() - started, 3),
-        str(given.dsm), None if given.water is None else str(given.water), block.notes,
-    )  # fmt: skip
-    write_summary(given, plain(summary))
+    summary = Figures(
+        output=str(target),
+        images=len(block.photos),
+        width=lattice.width,
+        height=lattice.height,
+        resolution_m=lattice.resolution_m,
+        bounds_m=lattice.bounds_m,
+        covered_share=round(covered / ground, 5),  # of the cells over the DSM
+        seconds=round(time.perf_counter() - started, 3),
+        dsm=str(given.dsm),
+        water=None if given.water is None else str(given.water),
+        notes=block.notes,
+    )
+    write_summary(given, summary.as_dict())
     return summary
 
 

@@ -7,7 +7,7 @@ import time
 import warnings
 from collections.abc import Collection, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, cast
@@ -17,8 +17,15 @@ import numpy as np
 from pcfix.errors import GeometryError, PcfixWarning, SettingError, bad_file
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.inputs import Inputs
-from pcfix.flow.runner import Progress, check_summary, json_text, write_summary
-from pcfix.io.files import file_state, read_json, write_text
+from pcfix.flow.runner import (
+    Progress,
+    check_folder,
+    check_summary,
+    json_text,
+    key_of,
+    write_summary,
+)
+from pcfix.io.files import read_json, write_text
 from pcfix.io.labels import match_labels
 from pcfix.io.photographs import photographs_in, read_photograph, size_of, write_photograph
 from pcfix.io.rasters import filled_heights, open_raster
@@ -28,7 +35,7 @@ from pcfix.options.declare import File, taken
 from pcfix.options.photos import PhotosOptions
 from pcfix.photos.mapping import Ground, Photo, Scene, exact, ground_seen, nodes_of, paper, resample
 from pcfix.running import current, threads
-from pcfix.version import __version__
+from pcfix.sums import Figures
 from pcfix.water.checks import check_above_water
 from pcfix.water.index import index_of
 
@@ -43,24 +50,6 @@ LENS_TOLERANCE = 0.005
 CLOUDS = (".las", ".laz")
 
 
-@dataclass(frozen=True)
-class PhotosSummary:
-    """The result of `map_photos`."""
-
-    images: int
-    done_before: int  # images among them that an earlier call wrote
-    megapixels: float
-    seconds: float
-    largest_shift_px: float
-    black_share: float  # of the pixels: without ground, occluded, or outside the original image
-    mapping: str
-    dsm: str
-    water: str
-    refractive_index: float
-    spacing_px: int  # of the nodes of the grid
-    notes: tuple[PcfixWarning, ...]
-
-
 def map_photos(
     images: File,
     out: File,
@@ -68,7 +57,7 @@ def map_photos(
     options: PhotosOptions | None = None,
     progress: Progress | None = None,
     **keywords: Any,
-) -> PhotosSummary:
+) -> Figures:
     """Write every photograph as it would be without water; what ``pcfix photos`` runs.
 
     Parameters
@@ -91,19 +80,16 @@ def map_photos(
     started = time.perf_counter()
     given = taken(PhotosOptions, options, keywords, "map_photos")
     folder, target = Path(images), Path(out)
-    if target.resolve() == folder.resolve():
-        sentence = f"{target}: is the folder of the photographs. Give another one."
-        raise SettingError("output.is_input", sentence, path=target)
     check_summary(given)
     paths = photographs_in(folder)
+    check_folder(target, paths)
     mapped = exact if given.mapping == "exact" else paper
     with threads(given.jobs), TemporaryDirectory() as scratch:
         block = block_of(given, paths, Path(scratch))
         target.mkdir(parents=True, exist_ok=True)
         results = () if given.overwrite else (target / path.name for path in block.paths)
         old = {path.name: path for path in results if path.exists()}
-        ignored, waters = ("overwrite", "jobs", "summary"), block.waters.values()
-        open_record(target / RECORD, given, ignored, old.values(), waters)
+        open_record(target / RECORD, key_of("photos", given), old.values())
         both = zip(block.paths, block.photos, strict=True)
         todo = {path: photo for path, photo in both if path.name not in old}
 
@@ -134,57 +120,49 @@ def map_photos(
         notes.append(PcfixWarning("dsm.too_small", words, photographs=len(poor)))
     warn_all(notes)
     pixels = sum(one[1] for one in found)
-    summary = PhotosSummary(
-        images=len(block.photos), done_before=len(old), megapixels=round(1e-6 * pixels, 1),
+    summary = Figures(
+        images=len(block.photos),
+        done_before=len(old),  # images that an earlier call wrote
+        megapixels=round(1e-6 * pixels, 1),
         seconds=round(time.perf_counter() - started, 3),
         largest_shift_px=round(max((one[3] for one in found), default=0.0), 2),
+        # of the pixels: without ground, occluded, or outside the original image
         black_share=round(sum(one[2] for one in found) / max(pixels, 1), 5),
-        mapping=given.mapping, dsm=str(given.dsm), water=str(block.scene.water),
-        refractive_index=block.scene.refractive_index, spacing_px=block.step_px,
-        notes=tuple(notes),
-    )  # fmt: skip
-    write_summary(given, plain(summary))
+        mapping=given.mapping,
+        dsm=str(given.dsm),
+        water=str(block.scene.water),
+        refractive_index=block.scene.refractive_index,
+        spacing_px=block.step_px,
+        notes=notes,
+    )
+    write_summary(given, summary.as_dict())
     return summary
 
 
-def open_record(
-    place: Path, given: PhotosOptions, ignored: Collection[str], written: Collection[Path],
-    more: Iterable[Path] = (),
-) -> dict[str, Any]:  # fmt: skip
-    """Return the record of an equal call that wrote to a folder; without results, write it.
+def open_record(place: Path, key: str, written: Collection[Path]) -> dict[str, Any]:
+    """Return the record of an equal call that wrote to a folder; without results, a new one.
 
-    A record has the options that are not `ignored`, and size and time of the input files and of
-    `more`. `written` are the results in the folder, which another call must not mix with its own.
+    `key` is that of `key_of`. `written` are the results in the folder, which another call must not
+    mix with its own.
     """
-    asked = {name: value for name, value in given.as_dict().items() if name not in ignored}
-    files = [given.cameras, given.dsm, given.sensor, given.water]
-    paths = [Path(one) for one in files if one is not None and Path(str(one)).exists()]
-    states = [file_state(path) for path in (*paths, *more)]
-    # as a JSON file has it, with lists for tuples
-    record = json.loads(json.dumps({"pcfix": __version__, "asked": asked, "files": states}))
-    if written:
-        old: dict[str, Any] = read_json(place) if place.exists() else {}
-        if {name: old.get(name) for name in record} != record:
-            raise SettingError(
-                "output.exists",
-                f"{min(written)}: exists, and was not written by an equal call. Add"
-                " --overwrite to replace it, or give another folder.",
-                path=min(written),
-            )
-        return old
-    write_text(place, json_text(record), overwrite=True)
-    return dict(record)
+    record: dict[str, Any] = read_json(place) if place.exists() else {}
+    if not written:
+        record = {"key": key}
+        write_text(place, json_text(record), overwrite=True)
+    elif record.get("key") != key:
+        raise SettingError(
+            "output.exists",
+            f"{min(written)}: exists, and was not written by an equal call. Add --overwrite to"
+            " replace it, or give another folder.",
+            path=min(written),
+        )
+    return record
 
 
 def warn_all(notes: Iterable[PcfixWarning]) -> None:
     """Show notes as warnings of the function that the user called."""
     for note in notes:
         warnings.warn(note, stacklevel=3)
-
-
-def plain(summary: Any) -> dict[str, Any]:
-    """Return a summary of a step over photographs as plain values, ready for JSON."""
-    return asdict(summary) | {"notes": [note.as_dict() for note in summary.notes]}
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,50 +18,12 @@ if TYPE_CHECKING:
     import laspy
 
 
-def stage_for(input: Path, options: CorrectOptions) -> dict[str, Any]:
-    """Return the pipeline's stage that corrects, ready for JSON; see `pipeline_for`."""
-    if options.uncorrected == "drop":
-        raise SettingError(
-            "pipeline.drop",
-            "--uncorrected drop needs a stage that drops points. Print the whole pipeline.",
-        )
-    read_inputs(options, view_of(input))
-    return _stage(options)
-
-
-def pipeline_for(input: Path, output: Path, options: CorrectOptions) -> dict[str, Any]:
-    """Return the pipeline, ready for JSON.
+def pipeline_for(input: Path, output: Path | None, options: CorrectOptions) -> dict[str, Any]:
+    """Return the pipeline, ready for JSON; without an output only the stage that corrects.
 
     Options that differ from their defaults become those of the stage. PDAL replaces an output that
     exists. What `pcfix.correct_file` refuses at its start is refused here too.
     """
-    check_suffix(output)
-    read_inputs(options, view_of(input))
-    with LasSource(input) as source:
-        point_format = source.header.point_format
-    if UPGRADE[point_format.id] in (9, 10):
-        sentence = (
-            f"has waveforms (point format {point_format.id}), which PDAL does not write. Use 'pcfix"
-            " correct'."
-        )
-        raise bad_file(input, "cloud.waveforms", sentence, point_format=point_format.id)
-    drop = options.uncorrected == "drop"
-    dropping = {"type": "filters.range", "limits": f"{OUTCOME}[0:1]"}
-    writer = {
-        "type": "writers.las",
-        "filename": str(output),
-        "forward": "all",
-        "minor_version": 4,
-        "dataformat_id": UPGRADE[point_format.id],
-    }
-    extra = _extra_dims(point_format, columns_for(options.dimensions, options.unsure))
-    if extra:
-        writer["extra_dims"] = extra
-    reader = {"type": "readers.las", "filename": str(input)}
-    return {"pipeline": [reader, _stage(options), *([dropping] if drop else []), writer]}
-
-
-def _stage(options: CorrectOptions) -> dict[str, Any]:
     for name in ("bounds", "read_resolution", "port"):
         if getattr(options, name) is not None:
             raise SettingError(
@@ -71,10 +33,18 @@ def _stage(options: CorrectOptions) -> dict[str, Any]:
                 option=name,
             )
     drop, plain = options.uncorrected == "drop", options.plain()
+    if drop and output is None:
+        raise SettingError(
+            "pipeline.drop",
+            "--uncorrected drop needs a stage that drops points. Print the whole pipeline.",
+        )
+    if output is not None:
+        check_suffix(output)
+    read_inputs(options, view_of(input))
     columns = columns_for(options.dimensions, options.unsure)
     first = {name: plain[name] for name in ("cameras", "water") if name in plain}
     added = [add_dimension(columns), CLASS_FLAGS, f"{OUTCOME}=uint8" if drop else ""]
-    return {
+    stage: dict[str, Any] = {
         "type": "filters.python",
         "source": STAGE_SOURCE.format("correct"),
         "module": "pcfix_stage",
@@ -87,6 +57,28 @@ def _stage(options: CorrectOptions) -> dict[str, Any]:
             "dimensions": options.dimensions,
         },
     }
+    if output is None:
+        return stage
+    with LasSource(input) as source:
+        point_format = source.header.point_format
+    if UPGRADE[point_format.id] in (9, 10):
+        sentence = (
+            f"has waveforms (point format {point_format.id}), which PDAL does not write. Use 'pcfix"
+            " correct'."
+        )
+        raise bad_file(input, "cloud.waveforms", sentence, point_format=point_format.id)
+    reader = {"type": "readers.las", "filename": str(input)}
+    dropping = {"type": "filters.range", "limits": f"{OUTCOME}[0:1]"}
+    writer = {
+        "type": "writers.las",
+        "filename": str(output),
+        "forward": "all",
+        "minor_version": 4,
+        "dataformat_id": UPGRADE[point_format.id],
+    }
+    if extra := _extra_dims(point_format, columns):
+        writer["extra_dims"] = extra
+    return {"pipeline": [reader, stage, *([dropping] if drop else []), writer]}
 
 
 def _extra_dims(point_format: laspy.PointFormat, columns: tuple[Column, ...]) -> str:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -23,7 +23,7 @@ from pcfix.adjust.solve import solve
 from pcfix.errors import PcfixWarning, SettingError
 from pcfix.flow.cameras import draw_footprints
 from pcfix.flow.correct import correct_points
-from pcfix.flow.pose_errors import Sample, pose_errors
+from pcfix.flow.pose_errors import pose_errors
 from pcfix.flow.runner import check_summary, write_summary
 from pcfix.flow.surfaces import Points
 from pcfix.model import Cameras, Correction, FloatArray, TiePoints, Views, WaterPlane
@@ -33,11 +33,12 @@ from pcfix.options.scenes import PlanOptions
 from pcfix.refract.batch import Survey
 from pcfix.refract.tally import COVERAGE_95, ORDERS, largest_tvu_m
 from pcfix.report.page import AFTER, BEFORE, REFERENCE, WATER, Table, label_plan, new_figure
-from pcfix.report.text import RowTable, aligned, filled
+from pcfix.report.text import aligned
 from pcfix.running import threads
 from pcfix.simulate.scene import lay_out, points_on
 from pcfix.simulate.settings import SceneSettings
 from pcfix.simulate.sight import see
+from pcfix.sums import Figures
 from pcfix.water.index import index_of
 
 if TYPE_CHECKING:
@@ -80,7 +81,7 @@ def plan_flight(
     options: PlanOptions | None = None,
     progress: Callable[[int, int], None] | None = None,
     **keywords: Any,
-) -> Plan:
+) -> Figures:
     """Predict the accuracy of a planned flight, and what would improve it.
 
     Parameters
@@ -101,47 +102,70 @@ def plan_flight(
     given = taken(PlanOptions, options, keywords, "plan_flight")
     given = replace(given, index=index_of(given.index, given.index_formula)[0])
     check_summary(given)
-    deepest = max(given.depth)
+    deepest_m = max(given.depth)
     # other flights, each with its changed option
     overlap, height = 0.5 + 0.5 * given.overlap, round(0.7 * given.height, 1)
-    others = [(f"--height {height:g}", replace(given, height=height))]
-    if overlap <= 0.95:
-        others.append((f"--overlap {overlap:g}", replace(given, overlap=overlap)))
-    if given.obliques is None:
-        others.append(("--obliques 20", replace(given, obliques=20.0)))
-    if given.sigma_level is None or given.sigma_level > 0.01:
-        others.append(("--sigma-level 0.01", replace(given, sigma_level=0.01)))
-    beds: list[DepthPlan] = []
-    tried: list[Alternative] = []
+    changes: list[dict[str, Any]] = [{"height": height}]
+    changes += [{"overlap": overlap}] if overlap <= 0.95 else []
+    changes += [{"obliques": 20.0}] if given.obliques is None else []
+    exact = given.sigma_level is not None and given.sigma_level <= 0.01
+    changes += [] if exact else [{"sigma_level": 0.01}]
+    beds, tried = list[Figures](), list[Figures]()
 
     def step() -> None:
         if progress is not None:
-            progress(len(beds) + len(tried), len(given.depth) + len(others))
+            progress(len(beds) + len(tried), len(given.depth) + len(changes))
 
     with threads(1):  # for so few points, threads do not pay
         for depth_m in given.depth:
-            bed = _bed(given, depth_m)
-            whole, sigma_m, adjusted_m = _sigma(given, bed)
-            parts_m = {part: _rms(_budget(given, bed, part).sigma_z_m) for part in PARTS}
-            parts_m["poses"] = float(np.hypot(parts_m["poses"], adjusted_m))
-            apparent_m, rays = float(-bed.apparent[:, 2].mean()), float(whole.ray_count.mean())
-            absorbed = _absorbed(given, bed)
-            beds.append(DepthPlan(depth_m, apparent_m, rays, sigma_m, parts_m, *absorbed))
+            beds.append(_predicted(given, depth_m))
             step()
-        for words, other in others:
-            sigma_m = _sigma(other, _bed(other, deepest))[1]
-            images = len(lay_out(_scene(other, deepest)).true)
-            tried.append(Alternative(words, images, sigma_m))
+        for change in changes:
+            other = replace(given, **change)
+            images = len(lay_out(_scene(other, deepest_m)).true)
+            words = " ".join(f"--{name.replace('_', '-')} {v:g}" for name, v in change.items())
+            sigma_m = _sigma(other, _bed(other, deepest_m))[1]
+            tried.append(Figures(change=words, images=images, sigma_m=sigma_m))
             step()
-    scene = _scene(given, deepest)
+    scene = _scene(given, deepest_m)
+    cameras = lay_out(scene).true  # as a drone would fly them, in strips along x from the origin
     base_m, spacing_m = scene.base_and_spacing_m
     off_nadir = float(np.degrees(np.arctan(scene.optics.reach))) + (given.obliques or 0.0)
-    plan = Plan(
-        given, lay_out(scene).true, scene.gsd_m, base_m, spacing_m, off_nadir, tuple(beds),
-        tuple(tried),
-    )  # fmt: skip
-    write_summary(given, plan.as_dict(), lambda: plan_figure(plan))
+    deepest = beds[given.depth.index(deepest_m)]
+    plan = Figures(
+        options=given.as_dict(),
+        gsd_m=scene.gsd_m,  # at the water
+        base_m=base_m,  # between images
+        spacing_m=spacing_m,  # between strips
+        flattest_deg=off_nadir,  # largest incidence angle of the rays in the corners of the frames
+        depths=beds,
+        alternatives=tried,  # standard errors of the deepest bed
+        images=len(cameras),
+        advice=_advice(given, deepest, 90.0 - off_nadir),
+    )
+    write_summary(given, plan.as_dict(), lambda: plan_figure(plan, given, cameras))
     return plan
+
+
+def _predicted(given: PlanOptions, depth_m: float) -> Figures:
+    """Return the prediction for a flat bed of one depth."""
+    bed = _bed(given, depth_m)
+    corrected, sigma_m, adjusted_m = _sigma(given, bed)
+    parts_m = {part: _rms(_budget(given, bed, part).sigma_z_m) for part in PARTS}
+    parts_m["poses"] = float(np.hypot(parts_m["poses"], adjusted_m))
+    share, left_m = _absorbed(given, bed)
+    depth, tvu = np.array([depth_m]), COVERAGE_95 * sigma_m
+    return Figures(
+        depth_m=depth_m,
+        apparent_m=float(-bed.apparent[:, 2].mean()),  # as reconstructed with straight rays
+        rays=float(corrected.ray_count.mean()),  # per point
+        sigma_m=sigma_m,  # standard error of the corrected heights, rms over the bed
+        parts_m=parts_m,  # of it; their squares add up
+        absorbed=share,  # of the misfit, by poses and focal length of an ordinary adjustment
+        left_m=left_m,  # true minus corrected height with such poses, mean
+        # the strictest order that the uncertainty at 95 % would keep
+        s44=next((one.name for one in ORDERS if tvu <= largest_tvu_m(one, depth)[0]), "-"),
+    )
 
 
 def _scene(given: PlanOptions, depth_m: float) -> SceneSettings:
@@ -218,7 +242,7 @@ def _of_adjusted_poses(given: PlanOptions, bed: _Bed) -> float:
         return float("nan")
     survey = Survey(WaterPlane(0.0), bed.cameras, _refraction(given).part(ScienceOptions))
     classes = np.zeros(len(bed.truth), np.uint8)
-    sample = Sample(Points(bed.apparent, None, classes), bed.views)
+    sample = Points(bed.apparent, None, classes, views=bed.views)
     found = pose_errors(sample, survey, members, None)
     return float("nan") if found is None else found.middle_m
 
@@ -256,86 +280,34 @@ def _prepared(given: PlanOptions, bed: _Bed, *, through_water: bool) -> Any:
     return prepare(block, Unknowns(lens=() if through_water else ("f",)))
 
 
-@dataclass(frozen=True)
-class DepthPlan:
-    """The prediction for a flat bed of one depth."""
-
-    depth_m: float
-    apparent_m: float  # depth as reconstructed with straight rays
-    rays: float  # per point, on average
-    sigma_m: float  # standard error of the corrected heights, rms over the bed
-    parts_m: dict[str, float]  # of image, level, waves, index and poses; their squares add up
-    absorbed: float  # share of the misfit that poses and focal length of an ordinary block absorb
-    left_m: float  # true minus corrected height with such poses, mean
-
-    @property
-    def order(self) -> str:
-        """The strictest order of S-44 that the uncertainty at 95 % would keep, or a dash."""
-        depth, tvu = np.array([self.depth_m]), COVERAGE_95 * self.sigma_m
-        return next((one.name for one in ORDERS if tvu <= largest_tvu_m(one, depth)[0]), "-")
-
-
-@dataclass(frozen=True)
-class Alternative:
-    """Another flight: the changed option, its images, and its standard error of the deepest bed."""
-
-    change: str
-    images: int
-    sigma_m: float
-
-
-@dataclass(frozen=True, eq=False)
-class Plan:
-    """A planned flight and its prediction."""
-
-    options: PlanOptions
-    cameras: Cameras  # as a drone would fly them: strips along x from the origin, water at 0
-    gsd_m: float  # at the water
-    base_m: float  # between images
-    spacing_m: float  # between strips
-    flattest_deg: float  # largest incidence angle of the rays in the corners of the frames
-    depths: tuple[DepthPlan, ...]
-    alternatives: tuple[Alternative, ...]
-
-    @property
-    def deepest(self) -> DepthPlan:
-        """The greatest depth."""
-        return max(self.depths, key=lambda one: one.depth_m)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values, ready for JSON."""
-        plain = {name: value for name, value in vars(self).items() if name != "cameras"}
-        plain["options"] = self.options.as_dict()
-        plain["alternatives"] = [vars(one) for one in self.alternatives]
-        plain["depths"] = [vars(one) | {"s44": one.order} for one in self.depths]
-        return {**plain, "images": len(self.cameras), "advice": advice_of(self)}
-
-
-def plan_text(plan: Plan) -> str:
+def plan_text(plan: Figures) -> str:
     """Return the plan as the terminal shows it."""
-    given, deepest = plan.options, plan.deepest
-    obliques = "" if given.obliques is None else f", with obliques of {given.obliques:g} deg"
+    given, deepest = plan.options, max(plan.depths, key=lambda one: float(one.depth_m))
+    obliques = given["obliques"]
+    tilted = "" if obliques is None else f", with obliques of {obliques:g} deg"
     flight = [
-        ("Images", f"{len(plan.cameras):,}, every {plan.base_m:.1f} m in strips"
-         f" {plan.spacing_m:.1f} m apart{obliques}"),
+        ("Images", f"{plan.images:,}, every {plan.base_m:.1f} m in strips {plan.spacing_m:.1f} m"
+         f" apart{tilted}"),
         ("GSD", f"{100.0 * plan.gsd_m:.2f} cm at the water"),
     ]  # fmt: skip
-    head = "Planned {:g} m above the water over {:g} x {:g} m".format(given.height, *given.area)
+    head = "Planned {:g} m above the water over {:g} x {:g} m".format(
+        given["height"], *given["area"]
+    )
     header = ["depth", "apparent", "rays", *deepest.parts_m, "total", "95 %", "S-44 order",
               "absorbed", "bias"]  # fmt: skip
     errors = [
         [
             f"{one.depth_m:.4g} m", f"{one.apparent_m:.2f} m", f"{one.rays:.1f}",
             *(f"{100.0 * part:.2f}" for part in one.parts_m.values()),
-            f"{100.0 * one.sigma_m:.2f}", f"{100.0 * COVERAGE_95 * one.sigma_m:.2f}", one.order,
+            f"{100.0 * one.sigma_m:.2f}", f"{100.0 * COVERAGE_95 * one.sigma_m:.2f}", one.s44,
             f"{one.absorbed:.0%}", f"{100.0 * one.left_m:+.1f}",
         ]
         for one in plan.depths
     ]  # fmt: skip
-    title = f"Standard errors of the corrected bed in cm (refractive index {given.index:g}):"
+    title = f"Standard errors of the corrected bed in cm (refractive index {given['index']:g}):"
     table = ["", title, *Table(title, header, errors).lines()]
     rows = [
-        ("poses", f"after 'pcfix adjust' with GNSS of {given.gnss_sigma:g} m and a calibrated"
+        ("poses", f"after 'pcfix adjust' with GNSS of {given['gnss_sigma']:g} m and a calibrated"
          " lens, unless --sigma-centre or --sigma-attitude are given"),
         ("absorbed", "the share of the refraction that an ordinary bundle adjustment absorbs, at"
          " worst: no land, no control points"),
@@ -345,56 +317,52 @@ def plan_text(plan: Plan) -> str:
           for one in plan.alternatives),
     ]  # fmt: skip
     notes = [f"  {label:<18} {text}" for label, text in rows]
-    return "\n".join([aligned(head, flight), *table, *notes, "", *advice_of(plan)])
+    return "\n".join([aligned(head, flight), *table, *notes, "", *plan.advice])
 
 
-_ADVICE: RowTable = (
-    ("", f"Overlap: fly {USUAL_OVERLAP:.0%} along and {USUAL_SIDELAP:.0%} across or more. Only"
-     " {rays:.0f} images see a point of the bed.", "is_sparse"),
-    ("", "Most of the error at {depth_m:g} m is {remedy}.", "is_one_part"),
-    ("", "Poses: keep land and control points in the block, and run 'pcfix adjust'. Without them an"
-     " ordinary bundle adjustment absorbs {absorbed:.0%} of the refraction, and the bed is"
-     " {off_m:.2f} m off.", "depth_m"),
-    ("", "Sun: fly under an overcast sky, or within 60 minutes of dawn or dusk (90 in winter)."
-     " {mirror}", "depth_m"),
-    ("", "Wind: wait for a calm day; {wind}. The water must be clear, the bed textured.",
-     "depth_m"),
-)  # fmt: skip
-"""Skarlatos & Agrafiotis 2018, section 3.3, for sun, wind, water and bed; overlaps after Mulsow."""
+def _advice(given: PlanOptions, deepest: Figures, sun_deg: float) -> list[str]:
+    """Return advice on the flight and the day, a sentence or two each.
 
-
-def advice_of(plan: Plan) -> list[str]:
-    """Return advice on the flight and the day, a sentence or two each."""
-    given, deepest, sun = plan.options, plan.deepest, 90.0 - plan.flattest_deg
-    most = max(deepest.parts_m, key=lambda part: deepest.parts_m[part])
+    Skarlatos & Agrafiotis 2018, section 3.3, for sun, wind, water and bed; overlaps after Mulsow.
+    """
+    advice = []
+    if given.overlap < USUAL_OVERLAP or given.sidelap < USUAL_SIDELAP:
+        advice.append(
+            f"Overlap: fly {USUAL_OVERLAP:.0%} along and {USUAL_SIDELAP:.0%} across or more. Only"
+            f" {deepest.rays:.0f} images see a point of the bed."
+        )
+    part, most_m = max(deepest.parts_m.items(), key=lambda one: one[1])
+    if most_m**2 > LARGE_SHARE * deepest.sigma_m**2:
+        advice.append(f"Most of the error at {deepest.depth_m:g} m is {PARTS[part][2]}.")
     mirror = "Frames can show its reflection at any height of the sun."
-    if sun > 0.0:
-        mirror = f"Below {sun:.0f} deg, no frame shows its reflection in calm water."
-    waves = "'pcfix calm' combines frames taken through waves"
-    values = vars(deepest) | {
-        "is_sparse": given.overlap < USUAL_OVERLAP or given.sidelap < USUAL_SIDELAP,
-        "is_one_part": deepest.parts_m[most] ** 2 > LARGE_SHARE * deepest.sigma_m**2,
-        "remedy": PARTS[most][2],
-        "off_m": abs(deepest.left_m),
-        "mirror": mirror,
-        "wind": waves if given.sigma_waves else "see what --sigma-waves 1 adds",
-    }
-    return [text for _, text in filled(_ADVICE, values)]
+    if sun_deg > 0.0:
+        mirror = f"Below {sun_deg:.0f} deg, no frame shows its reflection in calm water."
+    wind = "see what --sigma-waves 1 adds"
+    if given.sigma_waves:
+        wind = "'pcfix calm' combines frames taken through waves"
+    return [
+        *advice,
+        "Poses: keep land and control points in the block, and run 'pcfix adjust'. Without them an"
+        f" ordinary bundle adjustment absorbs {deepest.absorbed:.0%} of the refraction, and the bed"
+        f" is {abs(deepest.left_m):.2f} m off.",
+        "Sun: fly under an overcast sky, or within 60 minutes of dawn or dusk (90 in winter)."
+        f" {mirror}",
+        f"Wind: wait for a calm day; {wind}. The water must be clear, the bed textured.",
+    ]
 
 
-def plan_figure(plan: Plan) -> Figure:
+def plan_figure(plan: Figures, given: PlanOptions, cameras: Cameras) -> Figure:
     """Draw the block in plan, and the standard errors over the depth."""
     figure, (block, errors) = new_figure(10.0, 4.6, ncols=2)
-    cameras = plan.cameras
     draw_footprints(block, cameras, 0.0, linewidth=0.5, alpha=0.5)
     block.plot(*cameras.centres[:, :2].T, "^", color=AFTER, markersize=4, label="images")
-    x, y = plan.options.area
+    x, y = given.area
     block.plot([0, x, x, 0, 0], [0, 0, y, y, 0], color=REFERENCE, label="area")
     block.plot([], [], color=WATER, label="footprints at the water")
     label_plan(block)
     block.legend(loc="upper right")
     block.set_title(f"{len(cameras):,} images, GSD {100.0 * plan.gsd_m:.2f} cm")
-    beds = sorted(plan.depths, key=lambda one: one.depth_m)
+    beds = sorted(plan.depths, key=lambda one: float(one.depth_m))
     depth = [one.depth_m for one in beds]
     for part, (_, colour, _) in PARTS.items():
         values = [100.0 * one.parts_m[part] for one in beds]

@@ -23,7 +23,8 @@ from pcfix.flow.inputs import (
     paths_in,
     read_blocks,
 )
-from pcfix.flow.surfaces import CloudView, Points, first_points, own_water_of, parts_of
+from pcfix.flow.surfaces import CloudView, Points, own_water_of, parts_of, sample_of
+from pcfix.io.las.source import CHUNK_POINTS
 from pcfix.model import NOISE_CLASSES, FloatArray, Views, WaterPlane
 from pcfix.options.correct import CorrectOptions
 from pcfix.refract.batch import (
@@ -170,7 +171,7 @@ def plan_correction(plan: Plan) -> Plan:
     water, first = plan.found.surface, None
     if plan.views is not None or transfer is not None:
         # the first points show whether the list is in the order of the cloud, or has coordinates
-        first = first_points(view.chunks(water))
+        first = sample_of(view, np.arange(min(CHUNK_POINTS, view.points)), water)
         if match is not None:
             match = match.settled(first.xyz)
             plan = replace(plan, views=match)
@@ -194,9 +195,10 @@ def plan_correction(plan: Plan) -> Plan:
         found["max_angle"] = survey.limit_deg
     plan = replace(plan, settings={**plan.settings, **found})
     if plan.members is not None:
-        from pcfix.flow.pose_errors import SAMPLE_POINTS, pose_errors, sample_of, with_poses
+        from pcfix.flow.pose_errors import SAMPLE_POINTS, pose_errors, with_poses
 
-        sample = sample_of(view.chunks(water), match, 1 + view.points // SAMPLE_POINTS)
+        rows = np.arange(0, view.points, 1 + view.points // SAMPLE_POINTS)
+        sample = sample_of(view, rows, water, match)
         errors = pose_errors(sample, plan.survey, plan.members, transfer)
         plan = replace(plan, survey=with_poses(plan.survey, errors))
     return plan if first is None or plan.views is None else _with_type_of_list(plan, first)

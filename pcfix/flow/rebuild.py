@@ -13,7 +13,7 @@ import shutil
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,11 +21,11 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.errors import GeometryError, InputError, PcfixError, PcfixWarning, SettingError
+from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError
 from pcfix.flow.compare import compare_clouds
 from pcfix.flow.dsm import grid_dsm
-from pcfix.flow.photos import CLOUDS, PhotoBlock, block_of, map_photos, open_record, plain
-from pcfix.flow.runner import Progress, check_summary, json_text, write_summary
+from pcfix.flow.photos import CLOUDS, PhotoBlock, block_of, map_photos, open_record
+from pcfix.flow.runner import Progress, check_summary, json_text, key_of, write_summary
 from pcfix.io.files import check_input, file_state, run_logged, write_text
 from pcfix.io.las.writing import write_points
 from pcfix.io.photographs import photographs_in, read_colours
@@ -35,9 +35,12 @@ from pcfix.options.photos import PhotosOptions, RebuildOptions
 from pcfix.photos.ortho import Picture, blank_in
 from pcfix.photos.stereo import stereo_cloud
 from pcfix.running import threads
+from pcfix.sums import Figures
 from pcfix.water.surface import surface_above
 
 RECORD = "pcfix-rebuild.json"
+ROUND = ("cloud", "dsm", "cells", "mean_m", "sd_m", "within_gsd")
+"""What is recorded of a round: its DSM minus the one before, over submerged cells."""
 PAPER_ROUNDS = 3
 """Rounds after which the mapping by eq 12 is close to its fixed point, which is not the bed."""
 STEREO_CELL_PIXELS = 2.0
@@ -45,34 +48,6 @@ STEREO_STEP_M = 0.001
 CACHED_PHOTOGRAPHS = 16
 COMMAND_ONLY = ("overwrite", "jobs", "summary", "rebuild", "until_gsd", "most_rounds", "reference")
 """Options that a later call may change and still resume."""
-
-
-@dataclass(frozen=True)
-class Round:
-    """The change in a round: DSM minus the one before, over submerged cells (all if none are)."""
-
-    cloud: str
-    dsm: str
-    cells: int
-    mean_m: float
-    sd_m: float
-    within_gsd: float  # share of the cells that moved by at most a ground pixel
-
-
-@dataclass(frozen=True)
-class RebuildSummary:
-    """The result of `pcfix.rebuild_rounds`."""
-
-    rounds: tuple[Round, ...]
-    done_before: int  # rounds that an earlier call finished
-    settled: bool  # whether the last round moved the bed by less than the threshold
-    gsd_m: float
-    threshold_m: float
-    seconds: float
-    mapping: str
-    rebuild: str
-    compared: str | None  # folder of the comparison, where a reference was given
-    notes: tuple[PcfixWarning, ...]
 
 
 def rebuild_rounds(
@@ -83,7 +58,7 @@ def rebuild_rounds(
     progress: Progress | None = None,
     say: Callable[[str], None] | None = None,
     **keywords: Any,
-) -> RebuildSummary:
+) -> Figures:
     """Rebuild the cloud in rounds; what ``pcfix photos --rebuild`` runs.
 
     Parameters
@@ -119,8 +94,15 @@ def rebuild_rounds(
     folders = list(target.glob("round[0-9]*"))
     while given.overwrite and folders:
         shutil.rmtree(folders.pop())
-    record = open_record(target / RECORD, given, COMMAND_ONLY, folders)
+    record = open_record(target / RECORD, key_of("rebuild", given, ignored=COMMAND_ONLY), folders)
     record.setdefault("rounds", [])
+
+    def note(number: int, noted: dict[str, Any]) -> dict[str, Any]:
+        """Record a round, for a later call to resume."""
+        record["rounds"][number - 1 :] = [noted]
+        write_text(target / RECORD, json_text(record), overwrite=True)
+        return noted
+
     start = str(given.dsm) if Path(given.dsm).suffix.lower() in CLOUDS else None
     if start is not None:  # a cloud is gridded to the folder
         raster = target / "dsm.tif"
@@ -131,7 +113,7 @@ def rebuild_rounds(
     with threads(given.jobs), TemporaryDirectory() as scratch:
         block = block_of(given, paths, Path(scratch))
     threshold_m = round(given.until_gsd * block.gsd_m, 5)
-    rounds, done_before = list[Round](), 0
+    rounds, done_before = list[Figures](), 0
     notes: list[PcfixWarning] = []
     while len(rounds) < given.most_rounds and not (rounds and abs(rounds[-1].mean_m) < threshold_m):
         number = len(rounds) + 1
@@ -140,26 +122,23 @@ def rebuild_rounds(
         cloud, dsm = folder / "cloud.laz", folder / "dsm.tif"
         noted = record["rounds"][number - 1] if number <= len(record["rounds"]) else {}
         has_cloud = cloud.exists() and noted.get("state") == file_state(cloud)
-        if has_cloud and "mean_m" in noted and dsm.exists():
-            one = Round(**{name: noted[name] for name in Round.__dataclass_fields__})
-            done_before += 1
-        else:
+        is_done = has_cloud and "mean_m" in noted and dsm.exists()
+        done_before += is_done
+        if not has_cloud:
+            how = replace(
+                given, dsm=before, resolution=None, summary=None, **RebuildOptions().as_dict()
+            )
             with warnings.catch_warnings():
                 if number > 1:  # the DSM is pcfix's own
                     warnings.filterwarnings("ignore", ".*does not state whether", PcfixWarning)
-                if not has_cloud:
-                    how = replace(
-                        given, dsm=before, resolution=None, summary=None,
-                        **RebuildOptions().as_dict(),
-                    )  # fmt: skip
-                    map_photos(images, folder / "images", options=how, progress=progress)
-                    with threads(given.jobs):
-                        _reconstruct(given, block, number, folder / "images", cloud, progress)
-                    noted = {"command": given.rebuild, "state": file_state(cloud)}
-                    _note(target, record, number, noted)
-                grid_dsm(cloud, dsm, resolution=block.scene.ground.cell_m, overwrite=True)
-            one = _difference(block, cloud, dsm, before)
-            _note(target, record, number, noted | asdict(one))
+                map_photos(images, folder / "images", options=how, progress=progress)
+            with threads(given.jobs):
+                _reconstruct(given, block, number, folder / "images", cloud, progress)
+            noted = note(number, {"command": given.rebuild, "state": file_state(cloud)})
+        if not is_done:
+            grid_dsm(cloud, dsm, resolution=block.scene.ground.cell_m, overwrite=True)
+            noted = note(number, noted | _difference(block, cloud, dsm, before))
+        one = Figures(**{name: noted[name] for name in ROUND})
         rounds.append(one)
         if say is not None:
             say(
@@ -175,21 +154,30 @@ def rebuild_rounds(
             )
             notes.append(PcfixWarning("photos.paper_limit", words, excess=excess))
             warnings.warn(notes[-1], stacklevel=2)
-    summary = RebuildSummary(
-        rounds=tuple(rounds), done_before=done_before,
-        settled=abs(rounds[-1].mean_m) < threshold_m, gsd_m=round(block.gsd_m, 5),
-        threshold_m=threshold_m, seconds=round(time.perf_counter() - started, 3),
-        mapping=given.mapping, rebuild=str(given.rebuild),
-        compared=_compared(rounds, start, given, target), notes=tuple(notes),
-    )  # fmt: skip
-    write_summary(given, plain(summary))
+    compared = None
+    if given.reference is not None:
+        # Figs 16, 18 and 20 of the paper; with the first cloud also 15 and 17
+        also = {} if start is None else {"round0": start}
+        also |= {f"round{k}": one.cloud for k, one in enumerate(rounds[:-1], start=1)}
+        compared = str(target / "compare")
+        compare_clouds(
+            rounds[-1].cloud, given.reference, water=given.water, submerged=True, out_dir=compared,
+            also=also, overwrite=True,
+        )  # fmt: skip
+    summary = Figures(
+        rounds=rounds,
+        done_before=done_before,  # rounds that an earlier call finished
+        settled=abs(rounds[-1].mean_m) < threshold_m,
+        gsd_m=round(block.gsd_m, 5),
+        threshold_m=threshold_m,
+        seconds=round(time.perf_counter() - started, 3),
+        mapping=given.mapping,
+        rebuild=str(given.rebuild),
+        compared=compared,  # folder, where a reference was given
+        notes=notes,
+    )
+    write_summary(given, summary.as_dict())
     return summary
-
-
-def _note(target: Path, record: dict[str, Any], number: int, noted: dict[str, Any]) -> None:
-    """Record a round, for a later call to resume."""
-    record["rounds"][number - 1 :] = [noted]
-    write_text(target / RECORD, json_text(record), overwrite=True)
 
 
 def _reconstruct(
@@ -231,7 +219,7 @@ def _reconstruct(
         )  # fmt: skip
 
 
-def _difference(block: PhotoBlock, cloud: Path, dsm: Path, before: Path) -> Round:
+def _difference(block: PhotoBlock, cloud: Path, dsm: Path, before: Path) -> dict[str, Any]:
     """Return by how much the DSM of a round differs from that before, under water."""
     raster = dsm.with_name("difference.tif")
     write_dod(dsm, before, raster, overwrite=True)
@@ -245,31 +233,6 @@ def _difference(block: PhotoBlock, cloud: Path, dsm: Path, before: Path) -> Roun
     x, y = place_of(transform, column + 0.5, row + 0.5)
     wet = surface_above(block.scene.water, np.column_stack([x, y, z])).height_m > z
     moved = moved[wet] if wet.any() else moved
-    return Round(
-        str(cloud), str(dsm), len(moved), round(float(moved.mean()), 5),
-        round(float(moved.std()), 5), round(float((np.abs(moved) <= block.gsd_m).mean()), 5),
-    )  # fmt: skip
-
-
-def _compared(
-    rounds: list[Round], start: str | None, given: PhotosOptions, target: Path
-) -> str | None:
-    """Compare the clouds with a reference, if one was given; a failure loses no round.
-
-    This gives Figs 16, 18 and 20 of the paper; with the first cloud also 15 and 17.
-    """
-    if given.reference is None:
-        return None
-    also = {} if start is None else {"round0": start}
-    also |= {f"round{k}": one.cloud for k, one in enumerate(rounds[:-1], start=1)}
-    folder = target / "compare"
-    try:
-        compare_clouds(
-            rounds[-1].cloud, given.reference, water=given.water, submerged=True, out_dir=folder,
-            also=also, overwrite=True,
-        )  # fmt: skip
-    except PcfixError as error:
-        words = f"The rounds are finished, but not compared: {error}"
-        warnings.warn(PcfixWarning("rebuild.not_compared", words, cause=error.code), stacklevel=3)
-        return None
-    return str(folder)
+    within = float((np.abs(moved) <= block.gsd_m).mean())  # moved by at most a ground pixel
+    sizes = round(float(moved.mean()), 5), round(float(moved.std()), 5), round(within, 5)
+    return dict(zip(ROUND, (str(cloud), str(dsm), len(moved), *sizes), strict=True))

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 
 from pcfix.errors import bad_file
+from pcfix.flow.adjust import SUMMARY
 from pcfix.flow.next_steps import FOLDER
-from pcfix.flow.request import Files, Request, cameras_of, inputs_of_run
-from pcfix.flow.run_adjust import figures_of
+from pcfix.flow.request import RunFolder
 from pcfix.flow.surfaces import view_of
 from pcfix.flow.water import found_picture
 from pcfix.grid.maps import MOST_CELLS, MapsBuilder
 from pcfix.io.crs import crs_words
-from pcfix.io.files import sha256, write_bytes, write_text
+from pcfix.io.files import read_json, sha256, write_bytes, write_text
 from pcfix.io.las.columns import SHIFTS
 from pcfix.io.las.source import coordinates, stated_crs
 from pcfix.io.rasters import preview
@@ -35,7 +35,6 @@ SIGMA_Z = "SigmaZ"
 SAMPLE_POINTS = 200_000
 """Points in histogram and uncertainty figure, evenly spread over the file."""
 PAGE = "report.html"
-ENDINGS = (".laz", ".las", ".tif", ".gpkg", ".csv", ".html", ".json")
 RESULTS = {
     "corrected.laz": "all points, the bed corrected",
     "cleaned.laz": "the same, with outliers flagged as noise",
@@ -58,32 +57,31 @@ RESULTS = {
 
 
 def report_run(
-    request: Request, files: Files, inputs: list[Path], first: Plain, corrected: Plain,
-    compared: Plain,
-) -> Plain:  # fmt: skip
+    run: RunFolder, inputs: list[Path], first: Plain, corrected: Plain, compared: Plain
+) -> Plain:
     """Write the page of a run, and return what it says in short."""
     pictures, tables, dod, verdict = list[Picture](), list[Table](), None, ""
     if first["adjusted"]:
         verdict = f" The cameras were adjusted first, as {first['why']}."
-    elif first["is_said"]:
+    elif first["is_shown"]:
         verdict = f" The cameras were not adjusted: {first['why']}."
+    request, summary = run.request, Summary(**corrected)
     if compared:
-        dod = preview(files.dod, MOST_CELLS) if request.has_surface else None
+        dod = preview(run.dod, MOST_CELLS) if request.has_surface else None
         pictures, tables = evaluation(compared["figures"], compared["sections"], dod)
         verdict += in_a_sentence(compared["figures"])
     if first["adjusted"]:
-        tables += adjustment_tables(figures_of(files.folder), f"{FOLDER}/report.html")
-    summary, again = Summary(**corrected), inputs_of_run(request)
-    cameras = cameras_of(request, files)
+        figures = read_json(run.folder / FOLDER / SUMMARY)
+        tables += adjustment_tables(figures, f"{FOLDER}/report.html")
     if (summary.water_fit or {}).get("model") == "auto":  # the water was sought in the cloud
-        pictures.append(found_picture(again.surface(view_of(request.source))))
-    run = RunResults(
-        summary, cameras, **read_cloud(files.cleaned_cloud, files.resolution_m),
-        project=request.project or "", date=request.date or again.dates(cameras),
+        pictures.append(found_picture(run.inputs.surface(view_of(request.source))))
+    results = RunResults(
+        summary, run.cameras, **read_cloud(run.cleaned_cloud, run.resolution_m),
+        project=request.project or "", date=request.date or run.inputs.dates(run.cameras),
         pictures=pictures, tables=tables, verdict=verdict, compared=compared.get("figures", {}),
         difference=dod,
     )  # fmt: skip
-    page = write_report(run, inputs, files.folder)
+    page = write_report(results, inputs, run.folder)
     return {
         "in_short": in_short(page.tiles),
         "uncertainty": uncertainty_sentence(summary, compared.get("figures", {}).get("tvu")),
@@ -97,7 +95,7 @@ def write_report(run: RunResults, inputs: Sequence[Path], out_dir: Path) -> Repo
     """
     rows = [[path.name, f"{path.stat().st_size:,}", sha256(path)] for path in inputs]
     table = Table("Input files", ["file", "bytes", "SHA-256"], rows)
-    report = run_report(run, table, _beside(out_dir))
+    report = run_report(run, table, _results_in(out_dir))
     figures = out_dir / "figures"
     figures.mkdir(exist_ok=True)
     for picture in report.pictures:
@@ -106,17 +104,17 @@ def write_report(run: RunResults, inputs: Sequence[Path], out_dir: Path) -> Repo
     return report
 
 
-def _beside(folder: Path) -> list[tuple[str, str]]:
-    """Return the files beside the page, and their contents."""
-    found = [path for pattern in ("*", "*/*") for path in sorted(folder.glob(pattern))]
-    names = [path.relative_to(folder).as_posix() for path in found if path.is_file()]
-    tiled = {f"{name[:-4]}/": words for name, words in RESULTS.items() if name.endswith(".laz")}
-    names = [name for name in names if not name.startswith(tuple(tiled))]
-    return [(name, words) for name, words in tiled.items() if (folder / name).is_dir()] + [
-        (name, RESULTS.get(name, "a cross-section" if "/section_" in name else ""))
-        for name in names
-        if name.endswith(ENDINGS) and not name.startswith((".", "figures/", PAGE))
-    ]
+def _results_in(folder: Path) -> list[tuple[str, str]]:
+    """Return the files of a run, or the folders of tiles, and their contents."""
+    found = []
+    for name, words in RESULTS.items():
+        tiles = folder / name.removesuffix(".laz")
+        if (folder / name).is_file():
+            found.append((name, words))
+        elif tiles.is_dir():
+            found.append((f"{tiles.name}/", words))
+    sections = sorted(folder.glob("compare/section_*.csv"))
+    return [*found, *((f"compare/{one.name}", "a cross-section") for one in sections)]
 
 
 def read_cloud(path: Path | Tiles, resolution_m: float | None = None) -> Plain:

@@ -5,24 +5,23 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from pcfix.errors import InputError, PcfixWarning, SettingError
+from pcfix.errors import InputError, PcfixWarning, SettingError, bad_file
 from pcfix.flow.inputs import Inputs, paths_in, read_blocks
 from pcfix.flow.next_steps import FOLDER
-from pcfix.flow.runner import json_text
+from pcfix.flow.runner import HOW, json_text
 from pcfix.flow.surfaces import view_of
-from pcfix.flow.tiles import HOW, RECORDS
 from pcfix.io.clouds import is_cloud, own_water, reference_of
 from pcfix.io.files import belonging, file_state, files_in, read_json, write_text
 from pcfix.io.rasters import open_raster
 from pcfix.io.tiles import Tiles, cloud_of, inputs_of, open_cloud, tiles_from, tiles_of
 from pcfix.model import Cameras, WaterSurface
-from pcfix.options.correct import CorrectOptions
 from pcfix.options.declare import named, options_of
 from pcfix.options.steps import DistanceOptions
 from pcfix.options.survey import RunOptions
@@ -128,11 +127,11 @@ def _files_of(cloud: Path | Tiles) -> list[Path]:
     return inputs_of(cloud) if isinstance(cloud, Tiles) else files_in(cloud)
 
 
-_CORRECTION = {one.name for one in options_of(CorrectOptions)}.difference(
-    ("input", "adjust", "index", "index_formula"),
-    Water._fields,
-    (one.name for one in options_of(Inputs)),
-)
+_FIRST = {
+    *("input", "adjust", "gcps", "gnss", "lens", "index", "index_formula", VERSION),
+    *(one.name for one in options_of(Inputs)),
+    *Water._fields,
+}
 _LATER = {
     **{one.name: "compare" for one in options_of(DistanceOptions)},
     "reference": "compare", "resolution": "dsm", "project": "report", "date": "report",
@@ -141,7 +140,7 @@ _LATER = {
 
 def since(name: str) -> str:
     """Return the first step that an option of a request matters to."""
-    return "correct" if name in _CORRECTION else _LATER.get(name, "adjust")
+    return "adjust" if name in _FIRST else _LATER.get(name, "correct")
 
 
 class Record:
@@ -212,18 +211,18 @@ def read_record(path: Path) -> dict[str, Any]:
         content: dict[str, Any] = read_json(path)
         _ = content["request"], content["inputs"], content["steps"]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            "run.record",
-            f"{path}: is not the record of a run ({error}). Give the run.json of an earlier run, or"
-            " remove it.",
-            path=path,
-        ) from error
+        raise _bad_record(path, error) from error
     return content
+
+
+def _bad_record(path: Path, error: Exception) -> InputError:
+    sentence = f"is not the record of a run ({error}). Give the run.json of an earlier run, or"
+    return bad_file(path, "run.record", f"{sentence} remove it.")
 
 
 def request_of(record: Path) -> Request:
     """Return what an earlier run was asked for, from its ``run.json``."""
-    asked = dict(read_record(record)["request"])
+    asked = {**read_record(record)["request"]}
     input = asked.pop("input", "")
     for name in ("index_from", VERSION):
         asked.pop(name, None)
@@ -231,32 +230,24 @@ def request_of(record: Path) -> Request:
         values = named(asked, options_of(RunOptions), str(record))
         return Request(input=tuple(input) if isinstance(input, list) else input, **values)
     except (SettingError, TypeError) as error:
-        raise InputError(
-            "run.record", f"{record}: is not the record of a run ({error}).", path=record
-        ) from error
+        raise _bad_record(record, error) from error
 
 
-class Files:
-    """The files that a run writes; of a cloud of many files a folder."""
+class RunFolder:
+    """The folder of a run: what was asked for, and the files that it writes."""
 
-    def __init__(self, folder: Path, source: Path | Tiles | None = None) -> None:
-        self.folder = folder
-        self._many = source.paths if isinstance(source, Tiles) else None
-        ending = ".laz" if self._many is None else ""
+    def __init__(self, folder: Path, request: Request) -> None:
+        self.folder, self.request = folder, request
+        tiles = request.source
+        self._tiles = [one.name for one in tiles.paths] if isinstance(tiles, Tiles) else None
+        ending = ".laz" if self._tiles is None else ""
         self.corrected, self.cleaned = folder / f"corrected{ending}", folder / f"cleaned{ending}"
-        self.surface, self.map = folder / SURFACE, folder / "map.gpkg"
-        self.compare, self.report = folder / "compare", folder / "report.html"
+        self.compare = folder / "compare"
         self.regression, self.dod = folder / "regression.json", self.compare / "dod.tif"
 
-    def parts(self, target: Path) -> list[Path]:
-        """Return the files of a cloud."""
-        return [target] if self._many is None else [target / one.name for one in self._many]
-
-    @property
-    def resolution_m(self) -> float:
-        """Side of the cells of the rasters, once they are there."""
-        with open_raster(self.surface) as dsm:
-            return float(dsm.res[0])
+    def files_of(self, cloud: Path) -> list[Path]:
+        """Return the files of a cloud in the folder: itself, or as many as the input has."""
+        return [cloud] if self._tiles is None else [cloud / name for name in self._tiles]
 
     @cached_property
     def corrected_cloud(self) -> Path | Tiles:
@@ -268,36 +259,36 @@ class Files:
         """The cleaned cloud, once it is there."""
         return self._cloud(self.cleaned)
 
-    def _cloud(self, target: Path) -> Path | Tiles:
-        with warnings.catch_warnings(action="ignore", category=PcfixWarning):  # shown for inputs
-            return target if self._many is None else tiles_from(str(target), self.parts(target))
+    def _cloud(self, path: Path) -> Path | Tiles:
+        with _shown_before():
+            return path if self._tiles is None else tiles_from(str(path), self.files_of(path))
 
-    def remove_others(self) -> None:
-        """Remove the clouds that an earlier run made of other files."""
-        current = {*self.parts(self.corrected), *self.parts(self.cleaned)}
-        for name in ("corrected", "cleaned"):
-            cloud = self.folder / name
-            records = {cloud / one.stem: one for one in (cloud / RECORDS).glob("*.la[sz].tally")}
-            for path in {cloud.with_suffix(".laz"), *records} - current:
-                path.unlink(missing_ok=True)
-                records.get(path, path).unlink(missing_ok=True)
+    @property
+    def resolution_m(self) -> float:
+        """Side of the cells of the rasters, once they are there."""
+        with open_raster(self.folder / SURFACE) as dsm:
+            return float(dsm.res[0])
+
+    @property
+    def inputs(self) -> Inputs:
+        """The inputs of the correction, without the view list."""
+        return replace(self.request, views=None).part(Inputs)
+
+    @cached_property
+    def cameras(self) -> Cameras:
+        """The cameras in the CRS of the cloud."""
+        with _shown_before():
+            return read_blocks(self.inputs, view_of(self.corrected_cloud).crs).cameras
+
+    @cached_property
+    def water(self) -> WaterSurface:
+        """The surface as the corrected cloud states it, else as it was asked for."""
+        with _shown_before():
+            with open_cloud(self.corrected_cloud) as source:
+                stated = own_water(source)
+            return stated or self.inputs.surface(view_of(self.corrected_cloud)).surface
 
 
-def inputs_of_run(request: Request) -> Inputs:
-    """Return the inputs of the correction, without the view list."""
-    return replace(request, views=None).part(Inputs)
-
-
-def cameras_of(request: Request, files: Files) -> Cameras:
-    """Return the cameras in the CRS of the cloud; notes were shown when it was corrected."""
-    with warnings.catch_warnings(action="ignore", category=PcfixWarning):
-        return read_blocks(inputs_of_run(request), view_of(files.corrected_cloud).crs).cameras
-
-
-def water_of(request: Request, files: Files) -> WaterSurface:
-    """Return the surface as the corrected cloud states it, else as it was asked for."""
-    cloud = files.corrected_cloud
-    with warnings.catch_warnings(action="ignore", category=PcfixWarning):  # shown at correction
-        with open_cloud(cloud) as source:
-            stated = own_water(source)
-        return stated or inputs_of_run(request).surface(view_of(cloud)).surface
+def _shown_before() -> AbstractContextManager[Any]:
+    """Ignore warnings that were shown when the cloud was corrected."""
+    return warnings.catch_warnings(action="ignore", category=PcfixWarning)

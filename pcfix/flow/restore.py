@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from pcfix.errors import bad_file
-from pcfix.flow.runner import Chunk, Command, stream
-from pcfix.flow.tiles import run_command
+from pcfix.flow.runner import Chunk, Command, FileWork, run_command, stream
 from pcfix.io.las.columns import SHIFTS, UNSURE, columns_for, convert, move
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import read_settings, record_errors, restored_header
@@ -53,46 +52,36 @@ def restore_file(
     """
     given = taken(TileOptions, options, keywords, "restore_file")
     command = Command(
-        "restore",
-        plan=lambda cloud, target, kept: None,
-        process=partial(stream, _Restoring),
-        check=lambda plan, points: None,
-        summarize=lambda plan, points, findings, ends: points,
+        "restore", lambda task: None, partial(stream, _restoring), lambda plan, task, points: points
     )
-    points: int = run_command(command, input, output, given, progress=progress)
-    return points
+    return run_command(command, input, output, given, progress=progress)
 
 
-class _Restoring:
-    """The restoring of one file: its header of before, and each chunk."""
+def _restoring(plan: None, source: LasSource) -> FileWork:
+    """Return the restoring of one file: its header of before, and each chunk."""
+    content = read_settings(source.vlrs, source.path)
+    with record_errors(source.path):
+        names, before = _ours(source, content["settings"]), content["before"]
+        identity = before["identity"].encode("latin-1")
+        offset = np.array(before["steps"], np.int64).reshape(3)
+        header = restored_header(source, before, names)
 
-    def __init__(self, plan: None, source: LasSource) -> None:
-        content = read_settings(source.vlrs, source.path)
-        with record_errors(source.path):
-            names = _ours(source, content["settings"])
-            self._has_unsure = UNSURE.name in names
-            self.identity = content["before"]["identity"].encode("latin-1")
-            self._offset = np.array(content["before"]["steps"], np.int64).reshape(3)
-            self.header = restored_header(source, content["before"], names)
-
-    def compute(self, points: Chunk, row: int) -> tuple[None, int]:
-        """Count the points."""
-        return None, len(points)
-
-    def apply(self, points: Chunk, result: None) -> Chunk:
+    def apply(points: Chunk, result: None) -> Chunk:
         """Give points their original coordinates, classes and flags."""
         moved = np.asarray(points.array["RayCount"] > 0)
         points.array["classification"][moved] = points.array["SourceClass"][moved]
         ours = np.asarray(~moved & (points.array["WaterDepth"] > 0))  # and could not be corrected
-        if self._has_unsure:
+        if UNSURE.name in names:
             ours |= points.array[UNSURE.name] > 0
         withheld = np.asarray(points["withheld"]).astype(bool)
         points["withheld"][:] = (withheld & ~ours).astype(np.uint8)
         shift = np.column_stack([points.array[name] for name in SHIFTS]).astype(np.int64)
-        old = convert(points, self.header.point_format)
-        old.offsets = self.header.offsets
-        move(old, -shift - self._offset)
+        old = convert(points, header.point_format)
+        old.offsets = header.offsets
+        move(old, -shift - offset)
         return old
+
+    return FileWork(header, lambda points, row: (None, len(points)), apply, identity)
 
 
 def _ours(source: LasSource, settings: dict[str, Any]) -> set[str]:

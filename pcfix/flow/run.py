@@ -1,42 +1,141 @@
-"""All steps in one call: adjust, correct, clean, grid, compare, draw the map, report."""
+"""All steps in one call: adjust, correct, clean, grid, compare, draw the map, report.
+
+The results are opened as rasters, lines and tables (`RunResults`).
+"""
 
 from __future__ import annotations
 
 import math
+import os
 import warnings
-from collections.abc import Callable
-from dataclasses import replace
-from functools import partial
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from numbers import Real
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from pcfix.adjust.diagnosis import MOST_STATED_M
 from pcfix.compare.m3c2 import load_py4dgeo
-from pcfix.errors import PcfixWarning, SettingError
+from pcfix.errors import PcfixError, PcfixWarning, SettingError, bad_file
+from pcfix.flow.adjust import SUMMARY, adjust_into
 from pcfix.flow.clean import clean_file
 from pcfix.flow.compare import compare_clouds
 from pcfix.flow.correct import correct_file
+from pcfix.flow.diagnosis import diagnose_inputs, has_datum
 from pcfix.flow.dsm import grid_dsm
-from pcfix.flow.maps import SECTIONS, raster_files, resolution_sentence, write_map, write_rasters
-from pcfix.flow.report import report_run
-from pcfix.flow.request import Files, Record, Request
-from pcfix.flow.run_adjust import adjust_first, figures_of, outputs_of
-from pcfix.flow.runner import Bar, Progress, no_bar
+from pcfix.flow.inputs import Inputs
+from pcfix.flow.maps import (
+    BED,
+    DEPTH,
+    SECTIONS,
+    UNCERTAINTY,
+    contours_layer,
+    raster_files,
+    write_map,
+    write_rasters,
+)
+from pcfix.flow.next_steps import FOLDER, MODELS
+from pcfix.flow.report import PAGE, report_run
+from pcfix.flow.request import SURFACE, Record, Request, RunFolder, read_record
+from pcfix.flow.runner import Bar, Progress, check_folder, no_bar
 from pcfix.flow.shore import check_shoreline
-from pcfix.flow.tiles import check_folder
+from pcfix.flow.surfaces import view_of
+from pcfix.io import rasters, vectors
 from pcfix.io.clouds import is_cloud
-from pcfix.io.rasters import write_dod
+from pcfix.io.files import read_json
+from pcfix.io.gnss_positions import read_gnss
+from pcfix.io.members import FILE as MEMBERS
 from pcfix.io.tiles import Tiles, check_one_file
-from pcfix.io.vectors import check_layers
+from pcfix.libraries import analysis_library
+from pcfix.model import WaterDimension
 from pcfix.options.correct import CorrectOptions
-from pcfix.options.declare import options_of
+from pcfix.options.declare import File, options_of, taken
 from pcfix.options.steps import CleanOptions, DistanceOptions
+from pcfix.options.survey import AdjustOptions, RunOptions
 from pcfix.report.adjustment import adjustment_sentence, all_notes
+from pcfix.report.comparison import signed_statistics
+from pcfix.report.summary import Summary
+from pcfix.running import threads
+from pcfix.water.index import with_index
+
+if TYPE_CHECKING:
+    from geopandas import GeoDataFrame
+    from pandas import DataFrame
+    from xarray import DataArray
 
 Plain = dict[str, Any]
 
 RECORD = "run.json"
-
 REFERENCE_DSM = "reference_dsm.tif"
+COLMAP = ("cameras.bin", "images.bin", "points3D.bin", "georeference.json")
+ADJUSTED = ("report.html", SUMMARY, MEMBERS, *(f"colmap/{name}" for name in COLMAP), *MODELS[1:])
+"""The files that an adjustment may leave, its report first."""
+
+_WHY = {
+    UNCERTAINTY: "the points have no standard errors",
+    "map.gpkg": "lines need pyogrio; run: pip install 'pcfix[analysis]', then run again",
+}
+
+
+def run(
+    input: File | Iterable[File],
+    out_dir: File,
+    *,
+    options: RunOptions | None = None,
+    say: Callable[[str], None] = lambda text: None,
+    bar: Bar = no_bar,
+    **keywords: Any,
+) -> RunResults:
+    """Adjust, correct, clean, grid, compare and report; what ``pcfix run`` runs.
+
+    Parameters
+    ----------
+    input : path, or list of paths
+        LAS or LAZ cloud, of one file or many; see `pcfix.correct_file`.
+    out_dir : path
+        Folder for all results, made where its parent exists. Called again with the same options it
+        resumes, and a finished run is opened at once.
+    options : RunOptions, optional
+        Or its attributes as keywords, as of ``pcfix run``: cameras, water, reference, resolution,
+        overwrite and so on. Cameras and water are files or text, as ``run.json`` keeps them.
+    say : callable, optional
+        Called with a line on each step, as ``print``.
+    bar : callable, optional
+        Shows the progress of a step; see `pcfix.flow.runner.Bar`.
+
+    Returns
+    -------
+    RunResults
+
+    Raises
+    ------
+    PcfixError
+        With one sentence on what to do; the steps before it stay done.
+
+    Examples
+    --------
+    >>> import pcfix
+    >>> result = pcfix.run("cloud.laz", "out", cameras="cameras.csv", water=0.37)  # doctest: +SKIP
+    >>> float(result.depth.max())  # doctest: +SKIP
+    12.25
+    """
+    given, values = taken(RunOptions, options, keywords, "run"), {}
+    for one in options_of(RunOptions):
+        value = getattr(given, one.name)
+        if one.type is Any and value is not None:
+            if not isinstance(value, str | os.PathLike | Real):
+                raise SettingError(
+                    "option.type",
+                    f"run: {one.name} is a {type(value).__name__}. Give a file or text, which"
+                    " run.json can keep, or use correct_file.",
+                    option=one.name,
+                )
+            value = str(value)
+        values[one.name] = value
+    cloud = str(input) if isinstance(input, str | os.PathLike) else tuple(map(str, input))
+    run_all(Request(input=cloud, **values), Path(out_dir), say=say, bar=bar)
+    return RunResults(Path(out_dir))
 
 
 def run_all(
@@ -54,12 +153,12 @@ def run_all(
     `bar` shows its progress.
     """
     inputs = [path for some in request.files().values() for path in some]
-    files, asked = Files(out_dir, request.source), request
+    run, asked = RunFolder(out_dir, request), request
     if request.m3c2:
         load_py4dgeo()
     check_one_file(request.source, request)
     if isinstance(request.source, Tiles):
-        check_folder(files.corrected, request.source)
+        check_folder(run.corrected, request.source.paths)
     record = _opened(request, out_dir)
     check_shoreline(request.shoreline, overwrite=asked.overwrite or record.resumes, inputs=inputs)
 
@@ -71,75 +170,75 @@ def run_all(
             result, was_done = record.step(name, outputs, partial(work, progress))
         return result, f"{name:<9} {'done before' if was_done else 'done'}: "
 
-    outputs = outputs_of(out_dir)
+    outputs = [out_dir / FOLDER / name for name in ADJUSTED]
     first, done = step(
         "adjust", "Adjusting", outputs, lambda _: adjust_first(asked, out_dir, inputs)
     )
     if first["adjusted"]:
-        figures = figures_of(out_dir)
+        figures = read_json(out_dir / FOLDER / SUMMARY)
         say(f"{done}{outputs[0]}")
         for words in (adjustment_sentence(figures), *all_notes(figures)):
             say(f"{'':<9} {words}")
-    elif first["is_said"]:
+    elif first["is_shown"]:
         say(f"{'adjust':<9} not done: {first['why']}")
     request = request.with_adjusted(out_dir, first)
+    run = RunFolder(out_dir, request)
 
-    outputs = files.parts(files.corrected)
-    outputs += [] if request.check_depths is None else [files.regression]
+    outputs = run.files_of(run.corrected)
+    outputs += [] if request.check_depths is None else [run.regression]
     outputs += [] if request.shoreline is None else [Path(request.shoreline)]
-    corrected, done = step("correct", "Correcting", outputs, partial(_correct, request, files))
+    corrected, done = step("correct", "Correcting", outputs, partial(_correct, run))
     poses = corrected["poses"]
     if first["is_fine"] and poses is not None and poses["absorbed"] is None:
         # the first step has surveys that the correction has not
         words = "did not absorb the refraction, as the first step found"
         corrected = {**corrected, "poses": {**poses, "absorbed": False, "words": words}}
-    if not first["is_said"] and first["why"] and (poses or {}).get("absorbed"):
-        first = {**first, "is_said": True}
+    if not first["is_shown"] and first["why"] and (poses or {}).get("absorbed"):
+        first = {**first, "is_shown": True}
         say(f"{'adjust':<9} not done: {first['why']}")
-    say(f"{done}{files.corrected}")
+    say(f"{done}{run.corrected}")
 
     # the corrected cloud marks which points are below the water
     how = CleanOptions(overwrite=True, jobs=asked.jobs, scheduler=asked.scheduler)
     _, done = step(
-        "clean", "Cleaning", files.parts(files.cleaned),
+        "clean", "Cleaning", run.files_of(run.cleaned),
         lambda progress: clean_file(
-            files.corrected_cloud, files.cleaned, options=how, progress=progress
+            run.corrected_cloud, run.cleaned, options=how, progress=progress
         ).as_dict(),
     )  # fmt: skip
-    say(f"{done}{files.cleaned}")
+    say(f"{done}{run.cleaned}")
 
     errors = corrected["uncertainty"] is not None
     outputs = raster_files(out_dir, errors=errors)
-    made, done = step(
+    gridded, done = step(
         "dsm", "Gridding", outputs,
-        lambda progress: write_rasters(request, files, errors=errors, progress=progress),
+        lambda progress: write_rasters(run, errors=errors, progress=progress),
     )  # fmt: skip
-    given = request.resolution is not None
-    say(f"{done}{outputs[0]}{resolution_sentence(made, given=given)}")
+    say(f"{done}{outputs[0]}, cells of {gridded['resolution_m']:g} m")
 
     compared: Plain = {}
     if request.reference is not None:
-        outputs = [files.compare / "compare.json"]
-        compared, done = step("compare", "Comparing", outputs, lambda _: _compare(request, files))
+        outputs = [run.compare / "compare.json"]
+        compared, done = step("compare", "Comparing", outputs, lambda _: _compare(run))
         say(f"{done}{outputs[0]}")
 
+    layers = out_dir / "map.gpkg"
     try:
-        check_layers(files.map)
+        vectors.check_layers(layers)
     except SettingError as error:
         say(f"{'map':<9} not written: {error}")
     else:
-        _, done = step(
-            "map", "Drawing the map", [files.map],
-            lambda _: write_map(request, files, corrected, compared),
-        )  # fmt: skip
-        say(f"{done}{files.map}")
+        draw = partial(write_map, layers, run, corrected, compared)
+        _, done = step("map", "Drawing the map", [layers], lambda _: draw())
+        say(f"{done}{layers}")
 
+    path = out_dir / PAGE
     page, done = step(
-        "report", "Writing the report", [files.report],
-        lambda _: report_run(request, files, inputs, first, corrected, compared),
+        "report", "Writing the report", [path],
+        lambda _: report_run(run, inputs, first, corrected, compared),
     )  # fmt: skip
-    say(f"{done}{files.report}: {page['in_short']}")
-    return files.report
+    say(f"{done}{path}: {page['in_short']}")
+    return path
 
 
 def _opened(request: Request, out_dir: Path) -> Record:
@@ -164,30 +263,109 @@ def _opened(request: Request, out_dir: Path) -> Record:
     return record
 
 
-def _correct(request: Request, files: Files, progress: Progress | None) -> Plain:
+def adjust_first(request: Request, folder: Path, files: list[Path]) -> Plain:
+    """Adjust the cameras of a run into its folder if asked, or if they need it.
+
+    The files are inputs of the run, which the adjustment must not replace.
+
+    Returns
+    -------
+    dict
+        `adjusted`, a bool; `model`, the file or folder with the cameras in that of the adjustment;
+        `why`; `is_shown`, whether that is worth a line; `is_fine`, whether the poses are known to
+        be right.
+    """
+    found = {"adjusted": False, "model": None, "why": "", "is_shown": False, "is_fine": False}
+    try:
+        found |= _decide(request)
+        if found["adjusted"]:
+            found["model"] = _adjust(request, folder / FOLDER, files)
+    except PcfixError as error:
+        if request.adjust == "yes" or request.only_to_adjust:
+            raise
+        # a file that cannot be read will stop the correction, with the same message
+        found |= {"adjusted": False, "why": str(error), "is_shown": found["adjusted"]}
+    return found
+
+
+def _decide(request: Request) -> Plain:
+    """Return whether to adjust: if asked, or if the poses absorbed refraction and there is a datum.
+
+    Signs of absorbed refraction do not include the survey with which the result is compared: the
+    cloud must not depend on it.
+    """
+    if request.adjust == "yes":
+        return {"adjusted": True, "why": "that was asked for", "is_shown": True}
+    if request.adjust == "no":
+        return {}
+    inputs, is_shown = request.part(Inputs), bool(request.only_to_adjust)
+    if request.why_not_adjust:
+        return {"why": request.why_not_adjust, "is_shown": is_shown}
+    view = view_of(request.source)
+    # the correction shows the warnings
+    with warnings.catch_warnings(action="ignore", category=PcfixWarning):
+        cameras = inputs.block(view.crs)[0]
+        if request.gnss is not None:
+            cameras = read_gnss(request.gnss, cameras)
+        elif request.gcps is None and not has_datum(cameras, str(request.cameras)):
+            why = (
+                "there is no datum: no --gcps, no --gnss, and no GNSS positions better than"
+                f" {MOST_STATED_M:g} m in the camera file"
+            )
+            return {"why": why, "is_shown": is_shown}
+        water = inputs.surface(view).surface
+        if isinstance(water, WaterDimension):
+            why = f"the water {water} is known at points of the cloud only"
+            return {"why": why, "is_shown": True}
+        index = with_index(request).refractive_index
+        sign = diagnose_inputs(
+            inputs, cameras, view, water, index, gcps=request.gcps, in_passing=not is_shown
+        ).decided_by
+    if sign is None:
+        why = "nothing shows whether the poses absorbed the refraction; --adjust yes adjusts anyway"
+        return {"why": why, "is_shown": True}
+    did = "absorbed" if sign.speaks else "did not absorb"
+    why = f"the poses {did} the refraction: {sign.words}"
+    return {"adjusted": sign.speaks, "why": why, "is_shown": True, "is_fine": not sign.speaks}
+
+
+def _adjust(request: Request, target: Path, files: list[Path]) -> str:
+    """Adjust, and return which of `MODELS` has the cameras."""
+    check_folder(target, files, mark=SUMMARY)  # the adjustment replaces it
+    given = AdjustOptions(
+        gcps=request.gcps, gnss=request.gnss, lens=request.lens,
+        index=with_index(request).refractive_index, overwrite=True,
+    )  # fmt: skip
+    with threads(request.jobs):
+        adjust_into(target, request.part(Inputs), given, request.source)
+    return next(name for name in MODELS if (target / name).exists())
+
+
+def _correct(run: RunFolder, progress: Progress | None) -> Plain:
     """Correct the cloud."""
-    options = replace(request, overwrite=True).part(CorrectOptions)
-    if request.check_depths is not None:
-        options = replace(options, save_regression=files.regression)
-    files.remove_others()
-    return vars(correct_file(request.source, files.corrected, options=options, progress=progress))
+    options = replace(run.request, overwrite=True).part(CorrectOptions)
+    if options.check_depths is not None:
+        options = replace(options, save_regression=run.regression)
+    source = run.request.source
+    return vars(correct_file(source, run.corrected, options=options, progress=progress))
 
 
-def _compare(request: Request, files: Files) -> Plain:
+def _compare(run: RunFolder) -> Plain:
     """Compare the cleaned cloud with the reference, and write a raster of differences."""
+    request = run.request
     reference = request.surveyed
     result = compare_clouds(
-        files.cleaned_cloud, reference, out_dir=files.compare, sections=SECTIONS, overwrite=True,
+        run.cleaned_cloud, reference, out_dir=run.compare, sections=SECTIONS, overwrite=True,
         **{one.name: getattr(request, one.name) for one in options_of(DistanceOptions)},
     )  # fmt: skip
     if request.has_surface:
         heights = Path(str(reference))
         if is_cloud(reference):
-            heights = files.compare / REFERENCE_DSM
+            heights = run.compare / REFERENCE_DSM
             # the cells are those of the cloud, whatever a warning says
             with warnings.catch_warnings(action="ignore", category=PcfixWarning):
-                grid_dsm(reference, heights, resolution=files.resolution_m, overwrite=True)
-        write_dod(files.surface, heights, files.dod, overwrite=True)
+                grid_dsm(reference, heights, resolution=run.resolution_m, overwrite=True)
+        rasters.write_dod(run.folder / SURFACE, heights, run.dod, overwrite=True)
     sections = [
         {
             "distance_m": section.distance_m.tolist(),
@@ -200,3 +378,132 @@ def _compare(request: Request, files: Files) -> Plain:
     ]
     points = [] if result.check_points is None else result.check_points.tolist()
     return {"figures": result.as_dict(), "sections": sections, "check_points": points}
+
+
+@dataclass(frozen=True)
+class RunResults:
+    """The results of a run in its folder.
+
+    Rasters and lines are in the CRS of the cloud, metres. They need the extra ``analysis``, and are
+    read from the files each time they are asked for.
+
+    Attributes
+    ----------
+    folder : Path
+    """
+
+    folder: Path
+
+    @cached_property
+    def _steps(self) -> dict[str, Plain]:
+        """The result of each step, from ``run.json``."""
+        steps = read_record(self._file(RECORD))["steps"]
+        if "report" not in steps:
+            sentence = "the run did not finish. Run it again; it resumes."
+            raise bad_file(self.folder, "run.unfinished", sentence)
+        return {name: step["result"] for name, step in steps.items()}
+
+    @property
+    def report(self) -> Path:
+        """The page for clients."""
+        return self.folder / PAGE
+
+    @property
+    def summary(self) -> Summary:
+        """The figures of the correction."""
+        return Summary(**self._steps["correct"])
+
+    @property
+    def compared(self) -> Plain:
+        """All figures of the comparison with the reference; empty where there was none."""
+        return dict(self._steps.get("compare", {}).get("figures", {}))
+
+    @property
+    def depth(self) -> DataArray:
+        """Depth of the bed, shape (y, x), metres below the water, positive down; NaN on land."""
+        return rasters.open_array(self._file(DEPTH))
+
+    @property
+    def bed(self) -> DataArray:
+        """Heights of the bed, shape (y, x), metres; NaN on land."""
+        return rasters.open_array(self._file(BED))
+
+    @property
+    def surface(self) -> DataArray:
+        """Heights of land and bed, shape (y, x), metres."""
+        return rasters.open_array(self._file(SURFACE))
+
+    @property
+    def uncertainty(self) -> DataArray:
+        """Vertical uncertainty of the bed at 95 %, shape (y, x), metres, predicted."""
+        return rasters.open_array(self._file(UNCERTAINTY))
+
+    def contours(self, interval: float | None = None) -> GeoDataFrame:
+        """Return lines of equal depth, ``depth_m``.
+
+        Parameters
+        ----------
+        interval : float, optional
+            Metres. Default that of ``map.gpkg``, no finer than the depth is known.
+        """
+        if interval is None:
+            return self.layer("depth_contours")
+        if not interval > 0.0:
+            raise SettingError(
+                "option.range", f"interval {interval:g} must be above 0.",
+                option="interval", value=interval, above=0,
+            )  # fmt: skip
+        return vectors.frame_of(contours_layer(self.folder, interval), self.depth.rio.crs)
+
+    @property
+    def waterline(self) -> GeoDataFrame:
+        """Where the water meets the corrected cloud, with its standard error in plan, metres."""
+        return self.layer("waterline")
+
+    def layer(self, name: str) -> GeoDataFrame:
+        """Return a layer of ``map.gpkg``: waterline, corrected_area, cross_sections, cameras ..."""
+        return vectors.read_frame(self._file("map.gpkg"), name)
+
+    @property
+    def tables(self) -> dict[str, DataFrame]:
+        """Tables of the comparison by name, metres; empty where there was no reference.
+
+        ``statistics`` of the errors before and after; ``depth_bins`` and ``shore_bins``, errors by
+        depth and by distance from the shore; ``section_01`` and so on, heights along a line.
+        """
+        if not self.compared:
+            return {}
+        files = sorted((self.folder / "compare").glob("*.csv"))
+        rows = [{"of": name, **figures} for name, _, figures in signed_statistics(self.compared)]
+        pandas = analysis_library("pandas")
+        statistics = pandas.json_normalize(rows).set_index("of")
+        return {"statistics": statistics, **{one.stem: pandas.read_csv(one) for one in files}}
+
+    def _file(self, name: str) -> Path:
+        path = self.folder / name
+        if not path.is_file():
+            why = f": {_WHY[name]}" if name in _WHY else ""
+            raise bad_file(path, "run.no_file", f"the run has not written it{why}.")
+        return path
+
+
+def open_run(folder: File) -> RunResults:
+    """Open the results of a finished run.
+
+    Parameters
+    ----------
+    folder : path
+        The OUT_DIR of ``pcfix run``.
+
+    Returns
+    -------
+    RunResults
+
+    Raises
+    ------
+    InputError
+        If the folder holds no run, or an unfinished one.
+    """
+    found = RunResults(Path(folder))
+    _ = found.summary
+    return found

@@ -1,40 +1,91 @@
-"""The loop of every command that rewrites a cloud: read a chunk, compute, write, add up.
+"""How a command goes over a cloud: in one file, or in many on several processes or a cluster.
 
-A `Command` plans once for a whole cloud; then each file goes through `stream`, chunk by chunk, with
-the next chunk being read and the last one written meanwhile. `run_command` does that for one file,
-`pcfix.flow.tiles` for many.
+A `Command` plans once for a cloud; then each file goes through `stream`, chunk by chunk, with
+the next chunk being read and the last one written meanwhile. Each of many files is a task that
+writes its output, and its statistics in the folder `RECORDS`. A file whose output exists with the
+same key (a hash of options and input files) is skipped.
 """
 
 from __future__ import annotations
 
 import json
+import multiprocessing
+import os
+import pickle
+import signal
+import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field
+import warnings
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from concurrent.futures import (
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    as_completed,
+)
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass, field, replace
+from functools import partial, reduce
+from hashlib import sha256
+from operator import add
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeAlias, TypeVar, cast
 
-from pcfix.io.files import check_input, check_output, write_bytes, write_text
-from pcfix.io.las.source import CloudPart, LasSource
-from pcfix.io.las.writing import check_suffix, las_writer
-from pcfix.io.tiles import Tiles, check_one_file, inputs_of, open_cloud, part_of
-from pcfix.options.declare import File
-from pcfix.running import running
+from pcfix import version
+from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError
+from pcfix.io.atomic import all_or_none
+from pcfix.io.files import (
+    belonging,
+    check_input,
+    check_output,
+    file_state,
+    path_of,
+    read_tally,
+    write_bytes,
+    write_tally,
+    write_text,
+)
+from pcfix.io.las.source import LasSource
+from pcfix.io.las.writing import check_suffix, corrected_identity, las_writer
+from pcfix.io.tiles import (
+    BrokenTileError,
+    Clouds,
+    Tiles,
+    check_one_file,
+    inputs_of,
+    open_cloud,
+    part_of,
+    tiles_of,
+)
+from pcfix.io.vectors import LAYER_MARK
+from pcfix.libraries import optional_library
+from pcfix.options.declare import File, options_of
+from pcfix.running import current, running, threads
 
 if TYPE_CHECKING:
     import laspy
     from matplotlib.figure import Figure
 
+Result = TypeVar("Result")
 Chunk: TypeAlias = "laspy.ScaleAwarePointRecord"
-Header: TypeAlias = "laspy.LasHeader"
 Progress: TypeAlias = Callable[[int, int], None]
 Bar: TypeAlias = Callable[[str], AbstractContextManager[Progress | None]]
 """Shows the progress of a step, given its title."""
-Check: TypeAlias = Callable[[Any], Any]
-"""Refuses the statistics of a whole cloud that cannot be right, else returns its findings."""
+Finish: TypeAlias = Callable[[Any], Any]
+"""Takes the statistics of all points; refuses what cannot be right, else returns the result."""
+RECORDS = ".pcfix"
+HOW = ("overwrite", "jobs", "scheduler", "summary")
+"""Options on which no output depends."""
+WAIT_S = 10
+"""For a scheduler to answer, and for its first worker."""
+Work = Callable[..., str]
+Run = Callable[[Work, bytes, Sequence[Any]], Iterator[tuple[Any, str]]]
+POINTS_A_PROCESS = 500_000
+"""These take about as long as another process takes to start."""
 
 
 def no_bar(title: str) -> AbstractContextManager[None]:
@@ -42,88 +93,122 @@ def no_bar(title: str) -> AbstractContextManager[None]:
     return nullcontext()
 
 
-class FileWork(Protocol):
-    """What a command does to one file."""
+class FileWork(NamedTuple):
+    """What a command does to one file.
 
-    header: Header
-    identity: bytes
-    """The bytes of the header that name the software of the output."""
-
-    def compute(self, points: Chunk, row: int) -> tuple[Any, Any]:
-        """Return the result for a chunk that begins at a row of the cloud, and its statistics."""
-
-    def apply(self, points: Chunk, result: Any) -> Chunk:
-        """Return the points of the output; runs while the next chunk is computed."""
-
-
-@dataclass(frozen=True)
-class Command:
-    """A command that rewrites clouds, as functions.
-
-    `plan` takes a cloud, the path of the output, and chunks to keep in memory (`FileTask.kept`),
-    and returns all that the points have in common, which can be pickled. `process` takes one file
-    through a plan (plan, task, first row of the cloud, check or None), and returns the statistics
-    and the findings of the check; see `stream`. `check` refuses, by plan and statistics of the
-    whole cloud, what cannot be right. `summarize` makes the result of plan, statistics, findings
-    and `Ends`.
+    `compute` takes a chunk and the row of the cloud at which it begins, and returns a result and
+    statistics. `apply` takes the chunk and the result, and returns the points of the output; it
+    runs while the next chunk is computed.
     """
 
-    name: str
-    plan: Callable[[Any, Path, list[Chunk] | None], Any]
-    process: Callable[[Any, FileTask, int, Check | None], tuple[Any, Any]]
-    check: Callable[[Any, Any], Any]
-    summarize: Callable[[Any, Any, Any, Ends], Any]
+    header: laspy.LasHeader
+    compute: Callable[[Chunk, int], tuple[Any, Any]]
+    apply: Callable[[Chunk, Any], Chunk]
+    identity: bytes = b""  # of the software in the header; by default that of pcfix
 
 
-@dataclass(frozen=True)
-class Ends:
-    """The names of input and output for a summary, the part that was read, and the time so far."""
-
-    input: str
-    output: str
-    seconds: float
-    part: dict[str, Any] | None = None
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FileTask:
     """A cloud to read, a cloud to write, and how."""
 
-    source: Path | CloudPart
+    source: Any  # path, part, or many files; a name in a pipeline of PDAL
     target: Path
-    summary: File | None = None  # JSON file
-    overwrite: bool = False
     jobs: int | None = None
     progress: Progress | None = None  # called with (points done, points in all)
     started: float = field(default_factory=time.perf_counter)
-    kept: list[Chunk] = field(default_factory=list)  # of a small cloud that is read several times
+    cached: list[Chunk] = field(default_factory=list)  # of a small cloud that is read several times
+    # of one of many files: its points, the first as a row of all files, a checksum of all
+    # that the output depends on, and the version that must process it
+    points: int = 0
+    row: int = 0
+    key: str = ""
+    pcfix: str = version.__version__
+
+    def __str__(self) -> str:
+        return str(self.source)
 
     @property
     def seconds(self) -> float:
         """Time since the start."""
-        return time.perf_counter() - self.started
+        return round(time.perf_counter() - self.started, 3)
+
+    @property
+    def record(self) -> Path:
+        """The file with its statistics, written just before its output appears."""
+        return self.target.parent / RECORDS / f"{self.target.name}.tally"
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the output exists, with the same key."""
+        return self.target.is_file() and read_tally(self.record)[0] == self.key
+
+    def keep(self, tally: Any) -> None:
+        """Write the statistics; an older output must not be taken for the one that follows."""
+        self.target.unlink(missing_ok=True)
+        write_tally(self.record, self.key, tally)
+
+
+@dataclass(frozen=True)
+class Command(Generic[Result]):
+    """A command that rewrites clouds, as functions.
+
+    `plan` takes a task for all files, and returns all that its points have in common, which
+    can be pickled. `process` takes one file through a plan; see `stream`. `finish` takes the plan,
+    the task and the statistics of all points; it refuses what cannot be right, and returns the
+    result of the command.
+    """
+
+    name: str
+    plan: Callable[[FileTask], Any]
+    process: Callable[[Any, FileTask, Finish], Any]
+    finish: Callable[[Any, FileTask, Any], Result]
+
+
+def run_command(
+    command: Command[Result],
+    input: Clouds,
+    output: File,
+    options: Any,
+    *,
+    reads: Iterable[Any] = (),
+    progress: Progress | None = None,
+) -> Result:
+    """Run a command over one file or many; `reads` are further inputs. Returns its result.
+
+    With many files, `progress` is called with (points done, points in all) after each.
+    """
+    tiles = tiles_of(input)
+    if tiles is not None:
+        return _run_tiles(command, tiles, output, options, progress)
+    task = file_task(cast("File", input), output, options, reads=reads, progress=progress)
+    with threads(task.jobs), all_or_none():
+        plan = command.plan(task)
+        result: Result = command.process(plan, task, partial(command.finish, plan, task))
+        _write_summary(options, result)
+    return result
+
+
+def _write_summary(options: Any, result: Any) -> None:
+    """Write the summary of a command, if it has one and its options name a file."""
+    if getattr(options, "summary", None) is not None:
+        write_summary(options, result.as_dict())
 
 
 def stream(
-    work: Callable[[Any, LasSource], FileWork],
-    plan: Any,
-    task: FileTask,
-    row: int = 0,
-    check: Check | None = None,
-) -> tuple[Any, Any]:
+    work: Callable[[Any, LasSource], FileWork], plan: Any, task: FileTask, finish: Finish
+) -> Any:
     """Take every chunk of a file through a command; the target appears when all went well.
 
-    `work` returns what is done to the opened file by the plan; the file begins at a row of the
-    whole cloud. Returns the statistics, and the findings of the check.
+    `work` returns what is done to the opened file by the plan. Returns what `finish` makes of the
+    statistics.
     """
-    with open_cloud(task.source, task.jobs, kept=task.kept or None) as source:
+    with open_cloud(task.source, task.jobs, kept=task.cached or None) as source:
         own, total = work(plan, source), len(source)
-        tally, findings = None, None
-        done, end, reached = 0, 0, 0.0  # points before and after the chunk, and those reported
+        tally, done, end, reached = None, 0, 0, 0.0  # points before and after, and those reported
         # the index of a COPC file would be wrong
         evlrs = [one for one in source.evlrs if one.user_id != "copc"]
-        last = evlrs, own.identity, task.jobs
-        with las_writer(task.target, own.header, *last) as append, _thread(task.jobs) as writer:
+        last = evlrs, own.identity or corrected_identity(source), task.jobs
+        with las_writer(task.target, own.header, *last) as append, ThreadPoolExecutor(1) as writer:
 
             def write(points: Chunk, result: Any) -> None:
                 append(own.apply(points, result))
@@ -135,10 +220,10 @@ def stream(
                     task.progress(round(reached), total)
 
             written: Future[None] | None = None
-            for points in read_ahead(source.chunks(), task.jobs):
+            for points in read_ahead(source.chunks()):
                 end = done + len(points)
                 with running(report=report):
-                    result, one = own.compute(points, row + done)
+                    result, one = own.compute(points, task.row + done)
                 if written is not None:
                     written.result()  # at most one chunk waits, which bounds the memory
                 written = writer.submit(write, points, result)
@@ -147,33 +232,261 @@ def stream(
                 report(len(points))
             if written is not None:
                 written.result()
-            if check is not None:  # before the temporary file is renamed
-                findings = check(tally)
-    return tally, findings
+            return finish(tally)  # before the temporary file is renamed
 
 
-def read_ahead(chunks: Iterator[Any], jobs: int | None) -> Iterator[Any]:
-    """Yield chunks while the next one is read; with one job without a thread."""
-    with _thread(jobs) as reader:
+def read_ahead(chunks: Iterator[Any]) -> Iterator[Any]:
+    """Yield chunks while the next one is read."""
+    with ThreadPoolExecutor(1) as reader:
         following = reader.submit(next, chunks, None)
         while (one := following.result()) is not None:
             following = reader.submit(next, chunks, None)
             yield one
 
 
-def _thread(jobs: int | None) -> Executor:
-    """Return another thread, or this one for a single job."""
-    return _ThisThread() if jobs == 1 else ThreadPoolExecutor(1)
+def _run_tiles(
+    command: Command[Result], tiles: Tiles, output: File, options: Any, progress: Progress | None
+) -> Result:
+    """Run a command over all files that are not finished yet, and return its result."""
+    folder = path_of(output)
+    task = FileTask(tiles, folder)
+    check_one_file(tiles, options)
+    check_folder(folder, tiles.paths)
+    named = Path(tiles.name)
+    if named.is_dir() and folder.resolve().is_relative_to(named.resolve()):
+        sentence = f"{folder}: is inside the folder of the inputs. Give one outside of it."
+        raise SettingError("output.is_input", sentence, path=folder)
+    check_summary(options, tiles.paths)
+    work = _tasks(command.name, tiles, folder, options)
+    # A tile is finished if its output exists with the key of these options and inputs.
+    done = {tile for tile in work.values() if tile.is_finished}
+    todo = [tile for tile in work.values() if tile not in done]
+    for tile in todo if folder.exists() else ():
+        check_cloud(tile.target, overwrite=options.overwrite, inputs=tiles.paths)
+    result, points = None, sum(one.points for one in todo)
+    with threads(options.jobs), machines(options.scheduler, options.jobs, points) as run:
+        readable = tiles
+        while True:
+            try:
+                plan = command.plan(FileTask(readable, folder))
+                break
+            except BrokenTileError as error:
+                readable = readable.without(error.path, str(error))
+        try:
+            (folder / RECORDS).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(
+                "output.folder", f"{folder}: cannot be made ({error.strerror})."
+            ) from error
+        todo = [work[path] for path in readable.paths if work[path] not in done]
+        failed = list(readable.broken.values())
+        for tile, why in run(do_task, pickle.dumps((command.process, plan)), todo):
+            if why:
+                failed.append(why)
+            else:
+                done.add(tile)
+            if progress is not None:
+                progress(sum(one.points for one in done), sum(tiles.points))
+        if done:
+            # in the order of the files, so that no sum depends on which was first
+            tallies = [read_tally(tile.record)[1] for tile in work.values() if tile in done]
+            tally = reduce(add, tallies) if tallies[0] is not None else None
+            # Only the statistics of all points show whether cameras and water fit.
+            try:
+                result = command.finish(plan, task, tally)
+            except PcfixError:
+                for tile in todo:
+                    tile.record.unlink(missing_ok=True)
+                    tile.target.unlink(missing_ok=True)
+                raise
+            _write_summary(options, result)
+    if failed:
+        count = len(work) + len(readable.broken)
+        raise InputError(
+            "tiles.failed",
+            f"{tiles}: {len(failed)} of {count} files failed. The same command continues with them;"
+            " if files have changed, add --overwrite.\n" + "\n".join(f"  {one}" for one in failed),
+            failed=failed,
+        )
+    return cast("Result", result)
 
 
-class _ThisThread(Executor):
-    """Runs each call at once, so that Ctrl-C ends a process of many without other threads."""
+def _tasks(name: str, tiles: Tiles, folder: Path, options: Any) -> dict[Path, FileTask]:
+    """Return a task for each file, in their order."""
+    key = key_of(name, options, (*tiles.paths, *tiles.broken))
+    work, row = {}, 0
+    for path, points in zip(tiles.paths, tiles.points, strict=True):
+        target = folder.resolve() / path.name
+        work[path] = FileTask(path.resolve(), target, points=points, row=row, key=key)
+        row += points
+    return work
 
-    def submit(self, call: Any, /, *given: Any, **keywords: Any) -> Future[Any]:
-        """Return what a call gave."""
-        future: Future[Any] = Future()
-        future.set_result(call(*given, **keywords))
-        return future
+
+def key_of(
+    name: str, options: Any, inputs: Iterable[Path] = (), ignored: Collection[str] = HOW
+) -> str:
+    """Return a checksum of all that the outputs of a command depend on."""
+    asked = {
+        one.name: _plain(getattr(options, one.name))
+        for one in options_of(type(options))
+        if one.name not in ignored
+    }
+    depends = [version.__version__, name, asked, [file_state(path) for path in inputs]]
+    return sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()
+
+
+def _plain(value: Any) -> Any:
+    """Return an option as JSON holds it; of files their size and time."""
+    if isinstance(value, str) or hasattr(value, "joinpath"):
+        path = Path(str(value).partition(LAYER_MARK)[0])
+        return [file_state(one) for one in belonging(path)] if path.exists() else str(value)
+    if value is None or isinstance(value, int | float | tuple):
+        return value
+    return sha256(pickle.dumps(value)).hexdigest()
+
+
+# Many files, on processes or a cluster
+
+
+def do_task(pickled: bytes, task: FileTask, jobs: int | None = None) -> str:
+    """Process one file, here or on a worker; return the error, if there was one."""
+    try:
+        if task.pcfix != version.__version__:
+            raise InputError(
+                "cluster.version",
+                f"{task}: this worker has pcfix {version.__version__}, not {task.pcfix}."
+                " Install that there.",
+            )
+        if task.is_finished:  # by a worker that was lost before it could say so
+            return ""
+        process, plan = pickle.loads(pickled)
+        with threads(jobs), warnings.catch_warnings():
+            warnings.simplefilter("ignore", PcfixWarning)  # shown when the plan was made
+            process(plan, replace(task, jobs=jobs), task.keep)
+    except PcfixError as error:
+        return str(error)
+    return ""
+
+
+def in_processes(
+    work: Work, shared: bytes, tasks: Sequence[Any], most: int, jobs: int | None
+) -> Iterator[tuple[Any, str]]:
+    """Yield tasks with their errors as they are done, with the same `shared` for all.
+
+    At most `most` processes share `jobs` threads, all cores by default. A single one is this
+    process. If a process dies, the tasks that are not done continue one at a time, each in its own
+    process: so only those whose process dies again have an error.
+    """
+    jobs = jobs or current().threads
+    most = min(most, jobs, len(tasks))
+    if most <= 1:
+        for task in tasks:
+            yield task, work(shared, task, jobs)
+        return
+    groups = [list(tasks)]
+    for group in groups:
+        count = min(most, len(group))
+        with _processes(count) as pool:
+            given = work, shared, max(1, jobs // count)
+            futures = {pool.submit(_interruptible, *given, task): task for task in group}
+            for future in as_completed(futures):
+                task = futures[future]
+                try:
+                    yield task, future.result()
+                except BrokenProcessPool:
+                    if len(group) > 1:
+                        groups.append([task])
+                    else:
+                        words = "its process ended suddenly, probably for lack of memory."
+                        yield task, f"{task}: {words}"
+
+
+@contextmanager
+def _processes(count: int) -> Iterator[Executor]:
+    """Give an executor of new processes, which Ctrl-C interrupts in their tasks."""
+    context, main = multiprocessing.get_context("spawn"), sys.modules["__main__"]
+    with ProcessPoolExecutor(count, context, initializer=_ignore_interrupts) as pool:
+        # without the user's script, which each process would run again
+        sys.modules["__main__"] = ModuleType("__main__")
+        try:
+            pool.submit(int)  # starts all processes
+        finally:
+            sys.modules["__main__"] = main
+        try:
+            yield pool
+        except BaseException:
+            for process in multiprocessing.active_children():
+                if process.pid is not None:  # it is not started yet
+                    os.kill(process.pid, signal.SIGINT)
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+def _ignore_interrupts() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _interruptible(work: Work, shared: bytes, jobs: int, task: Any) -> str:
+    """Do a task that Ctrl-C ends; between tasks a process waits for its parent to end it."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        return work(shared, task, jobs)
+    finally:
+        _ignore_interrupts()
+
+
+def on_cluster(
+    client: Any, work: Work, shared: bytes, tasks: Sequence[Any]
+) -> Iterator[tuple[Any, str]]:
+    """Yield tasks with their errors as they are done on the workers of a cluster."""
+    everywhere = client.scatter(shared, broadcast=True)  # a lost worker loses its own copy only
+    executor: Executor = client.get_executor(pure=False)
+    futures: dict[Future[str], Any] = {
+        executor.submit(work, everywhere, task, 1): task for task in tasks
+    }
+    try:
+        for future in as_completed(futures):
+            task = futures[future]
+            try:
+                yield task, future.result()
+            except Exception as error:  # of the cluster; those of pcfix are results
+                yield task, f"{task}: the cluster gave up ({error})."
+    finally:
+        executor.shutdown(wait=False)
+
+
+@contextmanager
+def machines(address: str | None, jobs: int | None, points: int) -> Iterator[Run]:
+    """Give the function that runs a task for each file, with this number of points in all.
+
+    It uses processes of this machine, or the workers of the scheduler at an address.
+    """
+    if address is None:
+        yield partial(in_processes, most=jobs or 1 + points // POINTS_A_PROCESS, jobs=jobs)
+        return
+    distributed = optional_library("distributed", "cluster", f"--scheduler {address}")
+    try:
+        client = distributed.Client(address, timeout=WAIT_S, set_as_default=False)
+    except (OSError, ValueError) as error:  # TimeoutError is an OSError
+        raise InputError(
+            "cluster.no_answer",
+            f"scheduler {address}: does not answer within {WAIT_S} s ({error}). Check the address,"
+            " and that 'dask scheduler' runs there.",
+            address=address,
+        ) from error
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=WAIT_S)
+        except TimeoutError as error:
+            raise InputError(
+                "cluster.no_workers",
+                f"scheduler {address}: has no workers. Start some with 'dask worker {address}'.",
+                address=address,
+            ) from error
+        yield partial(on_cluster, client)
+
+
+# Files that a command reads and writes
 
 
 def json_text(content: dict[str, Any]) -> str:
@@ -209,6 +522,33 @@ def check_cloud(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) -> 
     return target
 
 
+def check_folder(
+    folder: Path, inputs: Iterable[Any] = (), *, mark: str = "", overwrite: bool = True
+) -> None:
+    """Refuse a folder for outputs that is the folder of an input.
+
+    One that replaces the folder of an earlier call, which has a file `mark`, must not have inputs
+    at any depth, or anything else. Values of `inputs` that are no paths do not count.
+    """
+    place, code, wrong = folder.resolve(), "output.is_input", ""
+    paths = [Path(one).resolve() for one in inputs if isinstance(one, str | PathLike)]
+    inside = [one for one in paths if place in (one, *(one.parents if mark else one.parents[:1]))]
+    if inside:
+        wrong = f"is the folder of the input {inside[0].name}. Give another one"
+    elif folder.exists() and not folder.is_dir():
+        code, wrong = "output.exists" if mark else "output.folder", "is a file. Give a folder"
+    elif mark and not place.parent.is_dir():
+        code, wrong = "output.no_folder", f"its folder {folder.parent} does not exist. Create it"
+    elif mark and folder.is_dir() and any(folder.iterdir()):
+        code = "output.exists"
+        if not overwrite:
+            wrong = "exists. Add --overwrite to replace it"
+        elif not (folder / mark).is_file():
+            wrong = f"holds other files, and no {mark}. Give an empty or new folder"
+    if wrong:
+        raise SettingError(code, f"{folder}: {wrong}.", path=folder)
+
+
 def file_task(
     input: File | Tiles,
     output: File,
@@ -227,11 +567,12 @@ def file_task(
     """
     started = time.perf_counter()
     check_one_file(input, options)
-    source = Path(str(input)) if isinstance(input, Tiles) else check_input(input)
+    source: Any = input if isinstance(input, Tiles) else check_input(input)
     known = [one for one in (*inputs_of(input), *reads) if isinstance(one, str | PathLike)]
     for path in (output, *more):
         known.append(check(path, overwrite=options.overwrite, inputs=known))
     check_summary(options, known)
-    summary, jobs = (getattr(options, name, None) for name in ("summary", "jobs"))
-    cloud, target = part_of(source, options), Path(output)
-    return FileTask(cloud, target, summary, options.overwrite, jobs, progress, started=started)
+    if not isinstance(source, Tiles):
+        source = part_of(source, options)
+    jobs = getattr(options, "jobs", None)
+    return FileTask(source, Path(output), jobs, progress, started)

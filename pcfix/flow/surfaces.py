@@ -14,7 +14,6 @@ import numpy.typing as npt
 
 from pcfix.errors import InputError, PcfixWarning, SettingError, coded
 from pcfix.flow.runner import Chunk, read_ahead
-from pcfix.io.las import source as las
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.tiles import CloudFiles, open_cloud
 from pcfix.label.labelling import Part
@@ -23,6 +22,7 @@ from pcfix.model import (
     Cameras,
     FloatArray,
     IntArray,
+    Views,
     WaterDimension,
     WaterMesh,
     WaterRaster,
@@ -35,6 +35,7 @@ from pcfix.water.surface import FoundSurface, OwnWater, build_fields, surface_ab
 if TYPE_CHECKING:
     from pyproj import CRS
 
+    from pcfix.io.views import ViewMatch
     from pcfix.water.fit import ShoreFit
 
 
@@ -47,11 +48,13 @@ class Points(NamedTuple):
     sources: IntArray | None = None  # (n,), point source IDs
     rgb: npt.NDArray[Any] | None = None  # (n, 3)
     original_xyz: FloatArray | None = None  # (n, 3), before the transfer to adjusted cameras
+    views: Views | None = None
 
     def take(self, rows: IntArray | slice) -> Points:
         """Return some of the points."""
-        some: list[Any] = [None if v is None else np.ascontiguousarray(v[rows]) for v in self]
-        return Points(*some)
+        some: list[Any] = [None if v is None else np.ascontiguousarray(v[rows]) for v in self[:-1]]
+        views = None if self.views is None else self.views.take(np.arange(len(self.xyz))[rows])
+        return Points._make([*some, views])
 
 
 RGB = ("red", "green", "blue")
@@ -108,35 +111,42 @@ def file_points(
 ) -> Iterator[Points]:
     """Yield all points of a LAS or LAZ file, or of many, chunk by chunk; see `LasSource`."""
     with open_cloud(cloud, jobs, kept=kept) as source:
-        yield from read_ahead((points_of(one, source, water) for one in source.chunks()), jobs)
-
-
-def first_points(chunks: Iterable[Points]) -> Points:
-    """Return the first points of a cloud, as many as a chunk has."""
-    parts, count = list[Points](), 0
-    for one in chunks:
-        parts.append(one.take(slice(0, las.CHUNK_POINTS - count)))
-        count += len(parts[-1].xyz)
-        if count >= las.CHUNK_POINTS:
-            break
-    return joined_points(parts)
+        yield from read_ahead(points_of(one, source, water) for one in source.chunks())
 
 
 def joined_points(parts: Iterable[Points]) -> Points:
-    """Return consecutive points as one, with the attributes that all of them have."""
-    columns: list[Any] = [
-        None if any(v is None for v in one) else np.concatenate(one)
-        for one in zip(*parts, strict=True)
+    """Return consecutive points as one, with what all of them have, but no weights of views."""
+    *columns, views = [
+        None if any(v is None for v in one) else one for one in zip(*parts, strict=True)
     ]
-    return Points(*columns)
+    joined: list[Any] = [None if one is None else np.concatenate(one) for one in columns]
+    if views is None:
+        return Points(*joined)
+    start = np.cumsum(np.concatenate([[0], *(np.diff(one.start) for one in views)]))
+    camera = np.concatenate([one.camera for one in views])
+    return Points._make([*joined, Views(start, camera, kind=views[0].kind)])
 
 
-def sample_of(view: CloudView, most: int, water: WaterSurface | None = None) -> Points:
-    """Return about `most` points, evenly spread over a cloud."""
-    step, row, parts = max(1, view.points // most), 0, list[Points]()
+def sample_of(
+    view: CloudView, rows: IntArray | int, water: WaterSurface | None = None,
+    match: ViewMatch | None = None,
+) -> Points:  # fmt: skip
+    """Return some points of a cloud, with their views if there is a view list.
+
+    `rows` are theirs, ascending, or about how many there are, evenly spread.
+    """
+    if isinstance(rows, int):
+        rows = np.arange(0, view.points, max(1, view.points // rows))
+    first, parts = 0, list[Points]()
     for one in view.chunks(water):
-        parts.append(one.take(slice(-row % step, None, step)))
-        row += len(one.xyz)
+        low, high = np.searchsorted(rows, (first, first + len(one.xyz)))
+        if match is not None:
+            match = match if first else match.settled(one.xyz)
+            one = one._replace(views=match.views_of(one.xyz, first)[0])
+        parts.append(one.take(rows[low:high] - first))
+        first += len(one.xyz)
+        if high == len(rows):
+            break
     return joined_points(parts)
 
 
@@ -227,43 +237,44 @@ def own_water_of(
             " level, a plane or a raster.",
             options=["water_per_image", "water"],
         )
-    low, high = view.low, view.high
+    low, high, k = view.low, view.high, len(cameras)
     paths, notes = rasters_of_images(folder, cameras.labels)
-    errors = {row: path.parent / "sigma" / path.name for row, path in paths.items()}
+    offset = np.zeros(k) if level_offset_m is None else level_offset_m
     heights, sigma = dict[int, WaterRaster](), dict[int, WaterRaster]()
-    for files, read in ((paths, heights), (errors, sigma)):
-        with warnings.catch_warnings():  # those of the first raster are enough
-            for row, path in files.items():
-                if files is paths or path.is_file():
-                    read[row] = read_water_raster(path, view.crs)
-                    warnings.simplefilter("ignore", PcfixWarning)
+    places, differences = [], []
+    with warnings.catch_warnings():  # those of the first raster are enough
+        for image, path in paths.items():
+            heights[image] = raster = read_water_raster(path, view.crs)
+            warnings.simplefilter("ignore", PcfixWarning)
+            error = path.parent / "sigma" / path.name
+            if error.is_file():
+                sigma[image] = read_water_raster(error, view.crs)
+            # the rasters must overlap the cloud, and have the vertical datum of the common water
+            rows, columns = np.nonzero(np.isfinite(raster.height_m))
+            x = raster.left_m + (columns + 0.5) * raster.cell_m[0]
+            y = raster.top_m - (rows + 0.5) * raster.cell_m[1]
+            places.append(((x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1])).any())
+            if not isinstance(water, WaterDimension):
+                common = surface_above(water, np.column_stack([x, y, x])).height_m + offset[image]
+                off = np.append(raster.height_m[rows, columns] - common, np.nan)
+                differences.append(np.nanmedian(off))
     if len(sigma) < len(heights):
         lost = len(heights) - len(sigma)
         notes += (f"{folder}: {lost} rasters have no standard errors in the folder sigma.",)
-    offset = np.zeros(len(cameras)) if level_offset_m is None else level_offset_m
-    # The rasters must overlap the cloud, and have the vertical datum of the common water.
-    places, apart = [], []
-    for image, raster in heights.items():
-        rows, columns = np.nonzero(np.isfinite(raster.height_m))
-        x = raster.left_m + (columns + 0.5) * raster.cell_m[0]
-        y = raster.top_m - (rows + 0.5) * raster.cell_m[1]
-        places.append(((x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1])).any())
-        if not isinstance(water, WaterDimension):
-            level = surface_above(water, np.column_stack([x, y, x])).height_m + offset[image]
-            apart.append(np.nanmedian(np.append(raster.height_m[rows, columns] - level, np.nan)))
     if np.isfinite(low).all() and not any(places):
         text = f"{folder}: none of its rasters overlaps the cloud. Check their CRS."
         raise InputError("water.no_overlap", text, path=folder)
-    off = float(np.nanmedian(apart)) if np.isfinite(apart).any() else 0.0
-    if abs(off) > APART_M:
+    known = np.isfinite(differences).any()
+    differs = float(np.nanmedian(differences)) if known else 0.0
+    if abs(differs) > APART_M:
         raise InputError(
             "water.datum",
-            f"{folder}: its water differs by {off:+.2f} m from --water ({water}). Give both the"
+            f"{folder}: its water differs by {differs:+.2f} m from --water ({water}). Give both the"
             " same vertical datum, and 'pcfix calm' the --level of the calm water.",
-            path=folder, difference_m=off,
+            path=folder, difference_m=differs,
         )  # fmt: skip
-    k, common = len(cameras), water if isinstance(water, WaterRaster) else None
-    return OwnWater(build_fields(heights, k, common), build_fields(sigma, k)), notes
+    rest = water if isinstance(water, WaterRaster) else None
+    return OwnWater(build_fields(heights, k, rest), build_fields(sigma, k)), notes
 
 
 def _bounds(low: FloatArray, high: FloatArray) -> tuple[float, float, float, float]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -67,6 +67,19 @@ class _Layer(NamedTuple):
     known: dict[str, FloatArray]
 
 
+class Scene3d(NamedTuple):
+    """Named clouds with their colours, frusta of cameras, and the water, metres from an origin.
+
+    `lines` has the shape (k, 2, 3), and the triangles of `water` (m, 3, 3).
+    """
+
+    names: list[str]
+    xyz: list[FloatArray]
+    rgb: list[FloatArray]
+    lines: FloatArray
+    water: FloatArray
+
+
 def view_clouds(
     clouds: Sequence[File], *, options: ViewerOptions | None = None, **keywords: Any
 ) -> str:
@@ -106,12 +119,15 @@ def view_clouds(
         check_same_crs(str(paths[0]), crs, target.name, target.crs)
         step = 1 + len(target.xyz) // given.points
         layers.append(_Layer(f"reference {Path(target.name).name}", target.xyz[::step], {}))
-    values = _values(given.colour, layers, surface)
+    xyz = [one.xyz for one in layers]
+    values = [_values(given.colour, one, surface, xyz[-1]) for one in layers]
+    if not any(np.isfinite(one).any() for one in values):
+        sentence = f"No cloud has values for --colour {given.colour}. {COLOURS[given.colour][2]}"
+        raise SettingError("view.no_values", sentence, colour=given.colour)
     scale = scale_of(given.colour, np.concatenate(values))
     rgb = [scale.to_rgba(np.ma.masked_invalid(one))[:, :3] for one in values]
     # all about their common centre
-    low = np.min([one.xyz.min(axis=0) for one in layers], axis=0)
-    high = np.max([one.xyz.max(axis=0) for one in layers], axis=0)
+    low, high = (end([end(one, axis=0) for one in xyz], axis=0) for end in (np.min, np.max))
     lines = np.zeros((0, 2, 3))
     if given.cameras is not None:
         inputs = replace(given, water=0.0 if given.water is None else given.water).part(Inputs)
@@ -119,7 +135,7 @@ def view_clouds(
     ends = np.vstack([low, high, lines.reshape(-1, 3)])
     origin = (ends.min(axis=0) + ends.max(axis=0)) / 2.0
     scene = Scene3d(
-        [one.name for one in layers], [one.xyz - origin for one in layers], rgb,
+        [one.name for one in layers], [one - origin for one in xyz], rgb,
         lines - origin, _sheet(surface, low, high) - origin,
     )  # fmt: skip
     if given.image is None:
@@ -132,71 +148,64 @@ def view_clouds(
 
 def _read(path: Path, most: int) -> tuple[list[_Layer], Any]:
     """Return a cloud, if known also as it was before its correction, and its CRS."""
-    xyz, known = [], dict[str, list[FloatArray]]()
     with LasSource(path) as source:
         crs = metric_crs(source)
         names = [n for n in SHOWN if n in source.header.point_format.extra_dimension_names]
-        step, row = 1 + (len(source) - 1) // most, 0
+        step, row, parts = 1 + (len(source) - 1) // most, 0, list[FloatArray]()
         for points in source.chunks():
-            rows = np.arange(-row % step, len(points), step)
-            xyz.append(coordinates(points)[rows])
-            for name in names:
-                known.setdefault(name, []).append(source.dimension(points, name)[rows])
+            some = points[np.arange(-row % step, len(points), step)]
+            columns = [source.dimension(some, name) for name in names]
+            parts.append(np.column_stack([coordinates(some), *columns]))
             row += len(points)
-    if not xyz:
+    if not parts:
         raise InputError("cloud.empty", f"{path}: has no points to show.", path=path)
-    after = _Layer(path.name, np.vstack(xyz), {n: np.concatenate(v) for n, v in known.items()})
-    if not known.keys() >= {*SHIFTS, "WaterDepth"}:
+    rows = np.vstack(parts)
+    after = _Layer(path.name, rows[:, :3], dict(zip(names, rows.T[3:], strict=True)))
+    if not {*SHIFTS, "WaterDepth"} <= after.known.keys():
         return [after], crs
     shift = np.column_stack([after.known[name] for name in SHIFTS])
     depth = after.known["WaterDepth"]
     apparent = np.where(depth > 0.0, depth + shift[:, 2], 0.0)
-    before = _Layer(f"{path.name} before", after.xyz - shift, {"WaterDepth": apparent})
-    return [before, after], crs
+    return [_Layer(f"{path.name} before", after.xyz - shift, {"WaterDepth": apparent}), after], crs
 
 
-def _values(colour: str, layers: list[_Layer], surface: WaterSurface | None) -> list[FloatArray]:
-    """Return the values for the colours of each layer, NaN where unknown."""
-    values = []
-    for one in layers:
-        found = np.full(len(one.xyz), np.nan)
-        if colour == "height":
-            found = one.xyz[:, 2]
-        elif colour == "error" and one is not layers[-1]:
-            target = layers[-1].xyz
-            near = near_in_plan(one.xyz, target, gap_m(target))
-            if near.any():
-                k = min(CompareRules().neighbours, len(target))
-                found[near] = one.xyz[near, 2] - heights_at(one.xyz[near], target, k)[0]
-        elif colour == "depth":
-            if "WaterDepth" in one.known:
-                found = one.known["WaterDepth"]
-            elif surface is not None and not isinstance(surface, WaterDimension):
-                found = surface_above(surface, one.xyz).height_m - one.xyz[:, 2]
-            found = np.where(found > 0.0, found, np.nan)
-        elif colour == "shift" and "ShiftZ" in one.known:
-            found = np.where(one.known["ShiftZ"] != 0.0, -one.known["ShiftZ"], np.nan)
-        elif colour == "uncertainty" and "SigmaZ" in one.known:
-            found = np.where(one.known["SigmaZ"] > 0.0, COVERAGE_95 * one.known["SigmaZ"], np.nan)
-        values.append(found)
-    if not any(np.isfinite(one).any() for one in values):
-        sentence = f"No cloud has values for --colour {colour}. {COLOURS[colour][2]}"
-        raise SettingError("view.no_values", sentence, colour=colour)
-    return values
+def _values(
+    colour: str, layer: _Layer, surface: WaterSurface | None, reference: FloatArray
+) -> FloatArray:
+    """Return the values for the colours of a layer, NaN where unknown."""
+    xyz, known = layer.xyz, layer.known
+    if colour == "height":
+        return xyz[:, 2]
+    found = np.full(len(xyz), np.nan)
+    if colour == "error":
+        near = near_in_plan(xyz, reference, gap_m(reference))
+        if xyz is not reference and near.any():
+            k = min(CompareRules().neighbours, len(reference))
+            found[near] = xyz[near, 2] - heights_at(xyz[near], reference, k)[0]
+        return found
+    name, factor = {
+        "depth": ("WaterDepth", 1.0),
+        "shift": ("ShiftZ", -1.0),
+        "uncertainty": ("SigmaZ", COVERAGE_95),
+    }[colour]
+    if name in known:
+        return np.where(known[name] != 0.0, factor * known[name], np.nan)
+    if colour == "depth" and surface is not None and not isinstance(surface, WaterDimension):
+        found = surface_above(surface, xyz).height_m - xyz[:, 2]
+    return np.where(found > 0.0, found, np.nan)
 
 
 def _frusta(cameras: Cameras, ground_m: float) -> FloatArray:
     """Return the edges of each camera's frustum, or a line down where it has no frame."""
     length = FRUSTUM_SHARE * max(float(np.median(cameras.centres[:, 2])) - ground_m, 1.0)
+    if cameras.rotations is None or cameras.lenses is None:
+        return np.stack([cameras.centres, cameras.centres - [0.0, 0.0, length]], axis=1)
     lines = []
-    for row, centre in enumerate(cameras.centres):
-        if cameras.rotations is None or cameras.lenses is None:
-            lines.append([centre, centre - [0.0, 0.0, length]])
-            continue
-        lens = cameras.lenses[row]
+    for centre, rotation, lens in zip(
+        cameras.centres, cameras.rotations, cameras.lenses, strict=True
+    ):
         frame = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * [lens.width, lens.height]
-        rays = unproject(lens, frame) @ cameras.rotations[row]
-        corner = centre + length * rays
+        corner = centre + length * (unproject(lens, frame) @ rotation)
         lines += [[centre, one] for one in corner]
         lines += [[corner[i], corner[(i + 1) % 4]] for i in range(4)]
     found = np.array(lines)
@@ -216,20 +225,6 @@ def _sheet(surface: WaterSurface | None, low: FloatArray, high: FloatArray) -> F
     a, b, c, d = xyz[:-1, :-1], xyz[:-1, 1:], xyz[1:, 1:], xyz[1:, :-1]
     triangles = np.moveaxis(np.stack([[a, b, c], [a, c, d]]), 1, 3).reshape(-1, 3, 3)
     return np.asarray(triangles[np.isfinite(triangles).all(axis=(1, 2))])
-
-
-@dataclass(frozen=True, eq=False)
-class Scene3d:
-    """Named clouds with their colours, frusta of cameras, and the water, metres from an origin.
-
-    `lines` has the shape (k, 2, 3), and the triangles of `water` (m, 3, 3).
-    """
-
-    names: list[str]
-    xyz: list[FloatArray]
-    rgb: list[FloatArray]
-    lines: FloatArray
-    water: FloatArray
 
 
 def scale_of(what: str, values: FloatArray) -> ScalarMappable:

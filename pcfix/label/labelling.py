@@ -60,7 +60,7 @@ class LabelCounts(Sums):
     in_pool: IntArray | None = None  # points of each separate pool
 
     def of_classes(self) -> dict[str, int]:
-        """Return the counts by new classes, by the names of `LabelSummary`."""
+        """Return the counts by new classes, by their names in a summary."""
         names = ("submerged", "water_surface", "stale", "water_unknown", "points")
         return {name: getattr(self, name) for name in names}
 
@@ -240,27 +240,3 @@ class Labelling:
 
 def _within(height: FloatArray, reach_m: float) -> BoolArray:
     return np.asarray(np.abs(height) <= reach_m) if reach_m else np.zeros(len(height), np.bool_)
-
-
-@dataclass(frozen=True)
-class LabelSummary:
-    """The numbers of a labelling; `as_dict` is what ``--summary`` writes."""
-
-    input: str
-    output: str
-    pcfix: str
-    points: int
-    submerged: int  # this and the next three: see `LabelCounts`
-    water_surface: int
-    stale: int
-    water_unknown: int
-    water: str
-    settings: dict[str, Any]
-    labelling: dict[str, Any] | None  # excluded points, by rule
-    seconds: float
-    warnings: list[str] = field(default_factory=list)
-    part: dict[str, Any] | None = None  # points read, of how many, and by which bounds
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values, ready for JSON."""
-        return vars(self).copy()

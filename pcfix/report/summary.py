@@ -2,46 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import Any
 
+from pcfix.sums import Figures
 
-@dataclass(frozen=True)
-class Summary:
-    """What a run over a file did, in numbers; `as_dict` is what ``--summary`` writes."""
 
-    input: str
-    output: str
-    pcfix: str
-    points: int
-    submerged: int
-    corrected: int
-    uncorrected: dict[str, int]
-    dropped: int
-    water_unknown: int
-    depth_m: dict[str, float]
-    shift_z_m: dict[str, float]
-    rays: int
-    incidence_deg: float  # the largest of the rays used, in air
-    cameras: int
-    cameras_used: int
-    cameras_unused: list[str]  # labels of those without corrected points
-    water: str
-    settings: dict[str, Any]
-    seconds: float
-    views: dict[str, Any] | None = None
-    water_fit: dict[str, Any] | None = None
-    warnings: list[dict[str, Any]] = field(default_factory=list)
-    labelling: dict[str, Any] | None = None
-    uncertainty: dict[str, Any] | None = None
-    carried: dict[str, Any] | None = None
-    made: dict[str, Any] | None = None  # the reconstruction type, and why
-    told: list[str] = field(default_factory=list)  # other notes on the cloud, also in `warnings`
-    poses: dict[str, Any] | None = None  # whether they have absorbed the refraction
-    unsure: int | None = None  # corrected points that only obliques see; None if not withheld
-    shoreline: dict[str, Any] | None = None
-    fit: dict[str, Any] | None = None  # see `pcfix.flow.plausibility`
-    part: dict[str, Any] | None = None  # what was read, if not all points were
+class Summary(Figures):
+    """The results of a correction by name; `as_dict` is what ``--summary`` writes."""
 
     @property
     def absorbed(self) -> bool | None:

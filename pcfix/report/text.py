@@ -19,8 +19,7 @@ from pcfix.refract.tally import ORDERS
 from pcfix.report.summary import Summary
 
 if TYPE_CHECKING:
-    from pcfix.clean.points import CleanSummary
-    from pcfix.label.labelling import LabelSummary
+    from pcfix.sums import Figures
 
 Plain = dict[str, Any]
 Rows = list[tuple[str, str]]
@@ -334,7 +333,7 @@ def uncertainty_sentence(s: Summary, measured: Plain | None = None) -> str:
     )
 
 
-def labelling_text(s: LabelSummary) -> str:
+def labelling_text(s: Figures) -> str:
     """Return the summary of a labelling."""
     values = vars(s) | {
         "part_words": _part_words(s.part),
@@ -346,7 +345,7 @@ def labelling_text(s: LabelSummary) -> str:
     return aligned(_head("Labelled", s), rows)
 
 
-def cleaning_text(s: CleanSummary) -> str:
+def cleaning_text(s: Figures) -> str:
     """Return the summary of a cleaning."""
     values = vars(s) | {
         "noise_share": share(s.noise, s.points),
@@ -358,7 +357,7 @@ def cleaning_text(s: CleanSummary) -> str:
     return aligned(_head("Cleaned", s), filled(_CLEANED, values))
 
 
-def dsm_text(s: Any) -> str:
+def dsm_text(s: Figures) -> str:
     """Return the summary of a DSM."""
     total = s.width * s.height
     low, mean, high = (s.values.get(name, np.nan) for name in ("min", "mean", "max"))
@@ -378,7 +377,7 @@ def dsm_text(s: Any) -> str:
     return aligned(_head("Gridded", s, points), filled(_GRIDDED, values))
 
 
-def calm_text(s: Any) -> str:
+def calm_text(s: Figures) -> str:
     """Return the summary of an image through calm water."""
     values = vars(s) | {"is_still": not s.corners, "found": s.water}
     if s.water is not None:
@@ -391,7 +390,7 @@ def calm_text(s: Any) -> str:
     return aligned(head, filled(_CALMED, values))
 
 
-def photos_text(s: Any) -> str:
+def photos_text(s: Figures) -> str:
     """Return the summary of photographs without water."""
     head = f"Mapped {s.images - s.done_before:,} images in {s.seconds:.1f} s"
     if s.seconds and s.images > s.done_before:
@@ -399,7 +398,7 @@ def photos_text(s: Any) -> str:
     return aligned(head, filled(_MAPPED, vars(s) | {"black_percent": 100.0 * s.black_share}))
 
 
-def rounds_text(s: Any) -> str:
+def rounds_text(s: Figures) -> str:
     """Return why the rounds ended, and where their clouds and the comparison are."""
     values = vars(s) | {
         "verdict": "settled" if s.settled else "not settled",
@@ -409,7 +408,7 @@ def rounds_text(s: Any) -> str:
     return aligned(f"Rebuilt in {len(s.rounds)} rounds", filled(_REBUILT, values))
 
 
-def ortho_text(s: Any) -> str:
+def ortho_text(s: Figures) -> str:
     """Return the summary of an orthophoto."""
     traced = "without refraction" if s.water is None else f"traced through water {s.water}"
     values = vars(s) | {"covered": 100 * s.covered_share, "traced": traced}

@@ -154,7 +154,7 @@ def test_no_cloud_without_its_summary(name, inputs, tmp_path, monkeypatch):
         given |= {"cameras": inputs / "cameras.csv", "sensor": inputs / "sensor.csv"}
     if name != "clean_file":
         given |= {"water": 0.37}
-    monkeypatch.setattr("pcfix.flow.tiles.write_summary", full)
+    monkeypatch.setattr("pcfix.flow.runner.write_summary", full)
     with refused("output.disk_full"):
         getattr(pcfix, name)(inputs / "cloud.laz", tmp_path / "out.laz", **given)
     assert list(tmp_path.iterdir()) == []

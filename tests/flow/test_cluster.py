@@ -54,7 +54,7 @@ def cloud(tmp_path_factory):
 
 
 def test_refused(scheduler, cloud, tmp_path, monkeypatch):
-    monkeypatch.setattr("pcfix.flow.tiles.WAIT_S", 1)
+    monkeypatch.setattr("pcfix.flow.runner.WAIT_S", 1)
     folder, address = scheduler
     words = ("label", cloud[0], tmp_path / "out", "--water", "0.37", "--scheduler")
     with socket.socket() as deaf:
@@ -125,7 +125,7 @@ def test_other_commands(scheduler, cloud, tmp_path, monkeypatch):
     pcfix.label_file(cloud[1], merged / "labelled.las", water=0.37, band=0.05)
     pcfix.clean_file(cloud[1], merged / "clean.las")
     pcfix.run(cloud[1], merged / "run", **GIVEN)
-    monkeypatch.setattr("pcfix.flow.tiles.in_processes", None)  # nothing is done on this machine
+    monkeypatch.setattr("pcfix.flow.runner.in_processes", None)  # nothing is done on this machine
     for found in on_cluster(cloud[0], tmp_path, scheduler):
         one = merged / found.relative_to(tmp_path)
         suffix = ".laz" if "run" in one.parts else ".las"

@@ -13,7 +13,7 @@ from pcfix.adjust.block import Unknowns
 from pcfix.adjust.precision import Members, precision_of
 from pcfix.adjust.problem import solved_cameras
 from pcfix.adjust.transfer import CloudTransfer
-from pcfix.flow.pose_errors import Sample, pose_errors, variances, with_poses
+from pcfix.flow.pose_errors import pose_errors, variances, with_poses
 from pcfix.flow.surfaces import Points
 from pcfix.io.members import FILE, write_members
 from pcfix.model import Cameras, Lens, Views, WaterPlane
@@ -126,7 +126,7 @@ def test_same_as_twin(moved):
 
     members = members_with(covariance, new)
     views = Views(np.arange(0, 13, 3), np.arange(12) % 3)
-    sample = Sample(Points(xyz, None, np.zeros(4, np.uint8)), views)
+    sample = Points(xyz, None, np.zeros(4, np.uint8), views=views)
     survey = Survey(WaterPlane(LEVEL_M), new, replace(EXACT, index=N))
     found = variances(sample, survey, members, CloudTransfer(old, new, np.arange(3), ()))
     assert np.sqrt(wanted).min() > 0.05
@@ -155,7 +155,7 @@ def test_coverage():
         survey = Survey(scene.water, cameras, settings)
         if poses is None:  # the covariance hardly changes
             members = precision_of(problem, found).members
-            sample = Sample(Points(xyz, None, np.zeros(len(xyz), np.uint8)), views)
+            sample = Points(xyz, None, np.zeros(len(xyz), np.uint8), views=views)
             poses = pose_errors(sample, survey, members, None)
         for one, into in ((with_poses(survey, poses), known), (survey, bare)):
             result = correct(Batch(xyz, surface_above(scene.water, xyz), one, views))

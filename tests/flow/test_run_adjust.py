@@ -19,8 +19,7 @@ from pcfix.adjust.problem import intersect_fixed
 from pcfix.flow.correct import correct_file
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.request import Request
-from pcfix.flow.run import run_all
-from pcfix.flow.run_adjust import adjust_first
+from pcfix.flow.run import adjust_first, run_all
 from pcfix.io.cameras.colmap import write_colmap
 from pcfix.model import TiePoints, Views
 from tests.utils.bent_blocks import GNSS_M, LEVEL_M, TrueBlock
@@ -156,7 +155,7 @@ def test_resumed(scene, finished):
 
 
 def test_auto(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr("pcfix.flow.run_adjust._adjust", lambda *_: "colmap")
+    monkeypatch.setattr("pcfix.flow.run._adjust", lambda *_: "colmap")
     step = first_step(scene.request(gnss=scene.gnss), tmp_path)
     assert step["adjusted"]
     assert "tie points under water" in step["why"]
@@ -195,7 +194,7 @@ def test_datum_of_camera_file(scene, tmp_path, monkeypatch, sigma_m, is_datum):
         return replace(cameras, gnss=places), views
 
     monkeypatch.setattr(Inputs, "block", with_gnss)
-    monkeypatch.setattr("pcfix.flow.run_adjust._adjust", lambda *_: "colmap")
+    monkeypatch.setattr("pcfix.flow.run._adjust", lambda *_: "colmap")
     assert first_step(scene.request(), tmp_path)["adjusted"] is is_datum
 
 

@@ -15,7 +15,7 @@ import rasterio
 from pyproj import CRS
 
 import pcfix
-from pcfix.flow.tiles import in_processes
+from pcfix.flow.runner import in_processes
 from tests.io.test_views import write_ply
 from tests.utils.codes import refused
 from tests.utils.matchers import matched_scene

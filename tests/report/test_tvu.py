@@ -15,6 +15,7 @@ import pcfix
 from pcfix.compare.statistics import tvu_of
 from pcfix.options.correct import BudgetOptions
 from pcfix.refract.tally import UncertaintyTally
+from pcfix.report.summary import Summary
 from pcfix.report.text import (
     FEWEST,
     budget_words,
@@ -91,14 +92,15 @@ def summary(tmp_path_factory):
 
 def test_measured_replaces_predicted(summary):
     assert summary.why_no_order in uncertainty_sentence(summary)
-    predicted = uncertainty_sentence(replace(summary, poses={"absorbed": False}))
+    predicted = uncertainty_sentence(Summary(**vars(summary) | {"poses": {"absorbed": False}}))
     assert "predicted" in predicted and "Exclusive Order" in predicted
     far = asdict(tvu_of(np.full(100, 0.3), np.full(100, 2.0)))
     found = uncertainty_sentence(summary, far)
     mean = summary.uncertainty["tvu_95_m"]["mean"]
     assert f"predicted {mean:.3f} m on average, measured 0.300 m at 100 points" in found
     assert "order 1a/1b" in found and "Exclusive" not in found
-    assert "predicted" not in uncertainty_sentence(replace(summary, uncertainty=None), far)
+    unknown = Summary(**vars(summary) | {"uncertainty": None})
+    assert "predicted" not in uncertainty_sentence(unknown, far)
     few = asdict(tvu_of(np.full(FEWEST - 1, 0.01), np.full(FEWEST - 1, 2.0)))
     assert f"fewer than {FEWEST} points claim no order" in uncertainty_sentence(summary, few)
 
@@ -114,4 +116,4 @@ def test_model_uncertainty(summary):
 def test_summary_rows(summary):
     rows = dict(summary_rows(summary))
     assert rows["Submerged"] == "14,736 points (74 %), all corrected"
-    assert "Uncertainty" not in dict(summary_rows(replace(summary, uncertainty=None)))
+    assert "Uncertainty" not in dict(summary_rows(Summary(**vars(summary) | {"uncertainty": None})))
