@@ -23,9 +23,9 @@ from pcfix.refract.patches import SMOOTH_GSD, Patches, scatter_m, shares
 
 SURE = 2.33
 """Standard errors of a significant difference: 99 %."""
-PRIOR_DENSITY, PRIOR_SOFTWARE = (4.0, 1.0), 1.0
+PRIOR_SPARSE, PRIOR_DENSE, PRIOR_SOFTWARE = (4.0, 1.0), (-1.0, -1.0), 1.0
 """What the density of the cloud, against likelihood and discontinuities, and its software count, in
-standard errors: a sparse cloud is one of tracks, a dense one is not."""
+standard errors: a sparse cloud is one of tracks, a dense one hardly ever."""
 SHARE_ERROR = 0.12
 """Standard error of a share from what the models neglect."""
 WEAK = 3.0
@@ -395,8 +395,8 @@ def _with_prior(
     """
     words = [one.words for one in beds.types]
     dense = patches.is_dense(part, sample.place, step * sample.step)
-    tracks = np.array([one == _TRACKS for one in words]) * (-1.0 if dense else 1.0)
-    counts = np.where(_by_likelihood(beds.types), *PRIOR_DENSITY)
+    tracks = np.array([float(one == _TRACKS) for one in words])
+    counts = np.where(_by_likelihood(beds.types), *(PRIOR_DENSE if dense else PRIOR_SPARSE))
     errors = beds.errors + counts * (tracks[:, None] - tracks)
     if dense and hint is not None:
         likely = np.array([PRIOR_SOFTWARE * (one in hint.words) for one in words])

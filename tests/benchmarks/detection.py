@@ -27,13 +27,14 @@ from tests.utils.matchers import matched_scene
 TYPES = dict(
     zip(("tracks", "depth-maps", "pairs", "single-map", "nearest-map"), IN_FRAME, strict=True)
 )
-AREA = {"area_m": (40.0, 30.0), "lidar_per_m2": 0.0}
+COARSE = {"sensor_px": (1824, 1216), "lidar_per_m2": 0.0}
 BLOCKS = {
-    "nadir": AREA,
-    "oblique": {**AREA, "obliques_deg": 25.0},
-    "river": {**AREA, "bed": "river"},
-    "wide": {**AREA, "focal_mm": 6.0},
+    "nadir": COARSE,
+    "oblique": {**COARSE, "obliques_deg": 25.0},
+    "river": {**COARSE, "bed": "river"},
+    "wide": {**COARSE, "focal_mm": 6.0},
 }
+"""Images of large pixels, for which a cloud of few points is as dense as those of matchers."""
 LEAST_DEPTH_M = 0.2
 CONFIDENCES = (0.5, 0.8, 0.95, 0.99)
 
