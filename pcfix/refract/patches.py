@@ -34,9 +34,6 @@ PATCH_WIDTH, WIDEST_PATCH = 0.04, 0.055
 """In flying heights: so wide that image borders cross many patches. In wider ones relief hides the
 discontinuities."""
 
-DENSE_GSD = 8.0
-"""Points of dense matching are nearer to each other than this, those of tracks are not."""
-
 GRID_SHARE = 0.9
 """Share of neighbours whole steps apart from which a cloud is a grid."""
 
@@ -197,14 +194,13 @@ def _rest(smooth: FloatArray, z: FloatArray) -> FloatArray:
     return z - np.einsum("pki,pi->pk", smooth, np.einsum("pki,pk->pi", smooth, z))
 
 
-def is_dense(part: Batch, place: IntArray, step: float) -> bool:
-    """Whether neighbouring points of the cloud are as near to each other as dense matching is.
+def spacing_gsd(part: Batch, place: IntArray, step: float) -> float:
+    """Return the spacing of the points of the cloud, in ground pixels.
 
     `step` says how many points of the cloud there are for each of these.
     """
     extent = np.ptp(part.xyz[place, :2], axis=1).prod(axis=1)
-    spacing_m = math.sqrt(float(np.median(extent)) / place.shape[1] / step)
-    return spacing_m < DENSE_GSD * gsd_m(part)
+    return math.sqrt(float(np.median(extent)) / place.shape[1] / step) / gsd_m(part)
 
 
 def grid_m(xyz: FloatArray) -> float | None:

@@ -23,11 +23,14 @@ from pcfix.refract.patches import SMOOTH_GSD, Patches, scatter_m, shares
 
 SURE = 2.33
 """Standard errors of a significant difference: 99 %."""
-PRIOR_SPARSE, PRIOR_DENSE, PRIOR_SOFTWARE = (4.0, 1.0), (-1.0, -1.0), 1.0
-"""What the density of the cloud, against likelihood and discontinuities, and its software count, in
-standard errors: a sparse cloud is one of tracks, a dense one hardly ever."""
-SHARE_ERROR = 0.12
-"""Standard error of a share from what the models neglect."""
+SPACING_GSD, PRIOR_TRACKS = (3.0, 8.0), (-1.0, 4.0)
+"""What the spacing of the points counts for tracks, in standard errors: dense matching has a point
+for every pixel or few, and tracks are sparser."""
+PRIOR_OF_SHARES, PRIOR_SOFTWARE = 0.25, 1.0
+"""The share of it against discontinuities, which are clearer; what the software counts."""
+SHARE_ERROR, SHARE_WEIGHT = 0.12, 0.4
+"""Standard error of a share from what the models neglect, and what shares count beside likelihoods:
+less, as the maps of a point are chosen by a smooth bed."""
 WEAK = 3.0
 """Divisor of the evidence of clouds that were smoothed."""
 LEAST_PATCHES = 100
@@ -101,8 +104,8 @@ block with obliques, 0.15 to 0.2; on a real river, whose depths it makes plausib
 SOFTWARE: dict[str, tuple[str, ...]] = {
     "openmvs": (_MAPS,), "odm": (_MAPS,), "opendronemap": (_MAPS,), "opensfm": (_MAPS,),
     "colmap": (_MAPS,), "realitycapture": (_MAPS,), "realityscan": (_MAPS,),
-    "metashape": (_MAPS, _SINGLE, _NEAREST), "photoscan": (_MAPS, _SINGLE, _NEAREST),
-    "sure": (_SINGLE, _PAIRS), "micmac": (_PAIRS, _NEAREST),
+    "metashape": (_SINGLE,), "photoscan": (_SINGLE,), "sure": (_SINGLE, _PAIRS),
+    "micmac": (_PAIRS, _NEAREST),
 }  # fmt: skip
 """Types of dense clouds by a word in the name of the software. OpenMVS, which ODM calls, and COLMAP
 fuse depth maps (their sources); Metashape merges the depth maps of single images (its manual); SURE
@@ -357,7 +360,8 @@ def _beds(
         errors = (0.5 - share) / np.hypot(sigma, SHARE_ERROR)
         likely = [_log_likelihood(part, place, one, z[i]) for i, one in enumerate(types)]
         for a, b in zip(*np.nonzero(_by_likelihood(types)), strict=True):
-            errors[a, b] = standard_errors(likely[a], likely[b])
+            errors[a, b] *= SHARE_WEIGHT
+            errors[a, b] += standard_errors(likely[a], likely[b])
     np.fill_diagonal(share, -np.inf)
     np.fill_diagonal(errors, np.inf)
     return _Beds(types, z, place, len(place), share, sigma, errors)
@@ -394,11 +398,12 @@ def _with_prior(
     A sparse cloud is one of tracks; a dense one is what its software makes, and not of tracks.
     """
     words = [one.words for one in beds.types]
-    dense = patches.is_dense(part, sample.place, step * sample.step)
-    tracks = np.array([float(one == _TRACKS) for one in words])
-    counts = np.where(_by_likelihood(beds.types), *(PRIOR_DENSE if dense else PRIOR_SPARSE))
+    spacing = patches.spacing_gsd(part, sample.place, step * sample.step)
+    by_spacing = float(np.interp(np.log(spacing), np.log(SPACING_GSD), PRIOR_TRACKS))
+    tracks = np.array([by_spacing * (one == _TRACKS) for one in words])
+    counts = np.where(_by_likelihood(beds.types), 1.0, PRIOR_OF_SHARES)
     errors = beds.errors + counts * (tracks[:, None] - tracks)
-    if dense and hint is not None:
+    if hint is not None:
         likely = np.array([PRIOR_SOFTWARE * (one in hint.words) for one in words])
         errors += likely[:, None] - likely
     known = beds._replace(errors=errors)
@@ -406,7 +411,7 @@ def _with_prior(
     best = known.rank(among)[0]
     if beds.patches and beds.rank(among)[0] == best:
         return known, ""
-    by_software = hint is not None and words[best] in hint.words and dense
+    by_software = hint is not None and words[best] in hint.words
     return known, f"its software, {hint.source}" if hint and by_software else "its density"
 
 
