@@ -254,7 +254,8 @@ def _estimated_from_cloud(plan: Plan, chunks: Chunks) -> Plan:
             " had been corrected before. Give the cloud as the matcher wrote it."
         )
         notes.append(PcfixWarning("cloud.corrected_before", sentence, ratio=ratio))
-    hint = hint_of((view.software, plan.cameras.source))
+    software = plan.options.software
+    hint = hint_of((software,) if software else (view.software, plan.cameras.source))
     if views is None:
         survey, verdicts = learn_of_sample(sample, view.points, ties, hint, near)
         notes += _note_flat(sample, survey)

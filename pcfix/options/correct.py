@@ -26,6 +26,10 @@ Method = Literal[
     "auto", "snell", "consistent", "shan", "butler", "murase", "dietrich", "factor", "regression"
 ]
 
+Software = Literal[
+    "colmap", "metashape", "micmac", "odm", "openmvs", "opensfm", "realitycapture", "sure", "other"
+]
+
 WITHOUT_CAMERAS = ("factor", "regression")
 """Methods that use the apparent depth only."""
 
@@ -41,9 +45,16 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
     camera_set: Literal["auto", "mvs", "all"] = option("auto", with_cameras=True)
     """Cameras used when there is no view list: every visible camera (all), or those that a dense
     matcher would use (mvs); auto: mvs with --method consistent, else all."""
-    matcher: Literal["depth-maps", "pairs"] = option("depth-maps", with_cameras=True)
-    """Dense matcher of --camera-set mvs: fused depth maps (OpenMVS, COLMAP), or the median of
-    stereo pairs (MicMac, SURE)."""
+    matcher: Literal["depth-maps", "single-map", "nearest-map", "pairs"] = option(
+        "depth-maps", with_cameras=True
+    )
+    """Dense matcher of --camera-set mvs: fused depth maps (OpenMVS, COLMAP), the depth map of a
+    single image at each place (single-map, SURE), that of the image nearest in plan (nearest-map),
+    or the median of stereo pairs (MicMac)."""
+    software: Software | None = option(None, with_cameras=True)
+    """Software that reconstructed the cloud: its usual reconstruction types are more likely, if the
+    cloud does not show clearly which it is. [default: as named in the header of the cloud or the
+    camera file]"""
     max_angle: float | str | None = option(
         "auto",
         with_cameras=True,
@@ -117,6 +128,11 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
         """Whether a model of dense matching replaces a view list."""
         automatic = self.camera_set == "auto" and self.method in ("auto", "consistent")
         return automatic or self.camera_set == "mvs"
+
+    @property
+    def chooses_maps(self) -> bool:
+        """Whether the images that made a point are chosen among several by the bed around it."""
+        return self.method == "consistent" and self.matcher in ("depth-maps", "single-map")
 
 
 class BudgetOptions(OptionSet, panel=Panel.BUDGET):

@@ -62,7 +62,8 @@ from pcfix.refract.batch import (
     to_adjusted,
     to_original,
 )
-from pcfix.refract.matcher import Matcher
+from pcfix.refract.likelihood import Candidates
+from pcfix.refract.matcher import LEAST_NEAR, Matcher
 from pcfix.refract.rays import light_near, refracted
 from pcfix.refract.tiling import TILE, are_same, put, slots, three
 
@@ -76,14 +77,14 @@ LIKELY, LEAST_DEPTH_M = 1.1, 0.005
 LEAST_CHANGE, MOST_CHANGE = 0.35, 1.5
 """Range of the change of the apparent depth with that of the bed along a ray."""
 
-WIDTH_M = 0.2
-"""Standard deviation of the beds of groups that may have made a point."""
-
 NOTHING = 14.0
 """exp(-NOTHING), a millionth, is neglected."""
 
 AVERAGED_WITHIN = 0.012
 """Depths of neighbouring maps that differ by less, relative, are averaged before the fusion."""
+
+BASE_RAY_DEG, LEAST_PRIOR = 27.0, 1e-4
+"""Angle of the ray of a base image from the vertical at which it is e times less frequent."""
 
 AGREE = 0.01
 """Depths that differ by less, relative, are fused."""
@@ -94,6 +95,9 @@ SHALLOW, DEEP = 0.3, 3.5
 _ROUNDS, _BEDS = 4, 3
 FAR = 0.1
 """Of the way to the bed: farther off, it is decided anew which depths were averaged."""
+
+SINGLE = ("single-map", "nearest-map")
+"""Names of `pcfix.options` for software that keeps one map at each place."""
 
 ABSENT, _OUTSIDE = -1, -2
 
@@ -171,6 +175,13 @@ def invert_depth_maps(batch: Batch) -> Intersection:
         given = np.full(len(batch), np.nan) if bed is None else bed.height_at(batch.xyz[:, :2])
     result = np.zeros((len(batch), COLUMNS))
     _invert_all(batch, listed, given, result, np.zeros((0, 0), np.float32))
+    few = np.flatnonzero(result[:, OUTCOME] == ONE_CAMERA)
+    if batch.survey.settings.matcher in SINGLE and len(few):
+        # no image shows the point with `LEAST_NEAR` others: at the edge of the block
+        again = np.zeros((len(few), COLUMNS))
+        given = given if listed else given[few]
+        _invert_all(batch.take(few), listed, given, again, np.zeros((0, 0), np.float32), least=1)
+        result[few] = again
     outcome = result[:, OUTCOME].astype(np.uint8)
     found = batch.result(result[:, :3], outcome=outcome, ray_miss_m=result[:, _DISTANCE])
     moved = outcome == CORRECTED
@@ -190,12 +201,33 @@ def likely_beds(batch: Batch) -> FloatArray:
     return likely
 
 
+def candidates_of(batch: Batch) -> Candidates:
+    """Return the `likely_beds` in the world frame, with their probabilities.
+
+    Of single maps those of oblique rays are less likely: on two blocks matched by semi-global
+    matching the frequency of base images fell with the fourth power of the angle in the exponent.
+    """
+    likely = batch.xyz[:, 2:] + likely_beds(batch)
+    prior = np.ones(likely.shape)
+    if batch.survey.settings.matcher == "single-map":
+        views = batch.rays
+        owner = np.repeat(np.arange(len(batch)), batch.counts)
+        up = batch.survey.cameras.centres[views.camera] - batch.xyz[owner]
+        angle = np.degrees(np.arccos(up[:, 2] / np.linalg.norm(up, axis=1)))
+        place = np.arange(len(owner)) - np.asarray(views.start)[owner]
+        prior[owner, place] = np.exp(-((angle / BASE_RAY_DEG) ** 4)) + LEAST_PRIOR
+    return Candidates(likely, prior)
+
+
 def _invert_all(
-    batch: Batch, listed: bool, given: FloatArray, result: FloatArray, likely: FloatArray
-) -> None:
-    matcher = batch.survey.learned.matcher
+    batch: Batch, listed: bool, given: FloatArray, result: FloatArray, likely: FloatArray,
+    least: int = LEAST_NEAR,
+) -> None:  # fmt: skip
+    matcher, given_matcher = batch.survey.learned.matcher, batch.survey.settings.matcher
     if matcher is None:
         raise ValueError("a model of the matcher is needed")
+    if given_matcher in SINGLE:
+        matcher = matcher.of_single_maps(least, nearest=given_matcher == "nearest-map")
     images = images_of(batch.original_model, batch.survey.cameras)
     points = batch.chosen()
     block = Block(points, images, matcher, float(points.offset.mean()))
@@ -324,7 +356,8 @@ def _look(out: FloatArray, c: int, count: int, tile: Tile, block: Block) -> None
         change = min(max(change, LEAST_CHANGE * per_depth), MOST_CHANGE * per_depth)
         per_length = 1.0 / room[_LENGTH * TILE + j]
         out[DEPTH * TILE + j] = t * per_length
-        out[BY_HEIGHT * TILE + j] = -change * per_length if t == t else np.nan
+        found = t == t and room[_SEEN * TILE + j] >= block.matcher.least
+        out[BY_HEIGHT * TILE + j] = -change * per_length if found else np.nan
 
 
 @device
@@ -579,8 +612,14 @@ def _weigh_groups(
                 if depths.slope[seed] == depths.slope[seed]:
                     likely[i, seed] = bed + groups.rise[seed]
             continue
-        wanted = around[i] - tile.points[2 * TILE + j] - bed
-        seed, rise, result[i, AMBIGUITY] = _best_seed(groups, depths, wanted)
+        if block.matcher.is_nearest:
+            seed, result[i, AMBIGUITY] = _nearest(cameras, depths, j, tile, block), 0.0
+            rise = groups.rise[seed]
+        else:
+            wanted = around[i] - tile.points[2 * TILE + j] - bed
+            seed, rise, result[i, AMBIGUITY] = _best_seed(
+                groups, depths, wanted, block.matcher.width_m
+            )
         groups.weight[: cameras.size] = 0.0
         if seed >= 0:
             # a map that agrees shares its weight with the maps it was averaged with
@@ -645,7 +684,20 @@ def _share(q: int, share: float, groups: Groups) -> None:
 
 
 @device
-def _best_seed(groups: Groups, depths: Lines, wanted: float) -> tuple[int, float, float]:
+def _nearest(cameras: IntArray, depths: Lines, j: int, tile: Tile, block: Block) -> int:
+    """Return the place of the image that is nearest in plan and has a depth, -1 for none."""
+    nearest, least, p = -1, np.inf, three(tile.points, _ORIGINAL * TILE + j)
+    for q in range(cameras.size):
+        x, y, _ = minus(row_of(block.images.centres, cameras[q]), p)
+        if depths.slope[q] == depths.slope[q] and x * x + y * y < least:
+            nearest, least = q, x * x + y * y
+    return nearest
+
+
+@device
+def _best_seed(
+    groups: Groups, depths: Lines, wanted: float, width_m: float
+) -> tuple[int, float, float]:
     """Return the seed of the group that made the point, its rise, and the ambiguity.
 
     That is the group whose bed is nearest to the wanted height or, where this is NaN, the largest.
@@ -662,7 +714,7 @@ def _best_seed(groups: Groups, depths: Lines, wanted: float) -> tuple[int, float
         misfit = abs(rise - wanted) if known else -groups.size[seed]
         if misfit < least:
             best, at_best, least = seed, rise, misfit
-        likely = np.exp(-0.5 * (misfit / WIDTH_M) ** 2) if known else 1.0
+        likely = np.exp(-0.5 * (misfit / width_m) ** 2) if known else 1.0
         total += likely
         first, second = first + likely * rise, second + likely * rise * rise
     # all groups are far from the wanted bed

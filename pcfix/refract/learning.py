@@ -170,7 +170,11 @@ def learn_of_sample(
         learned = learned._replace(land=land)
     if not settings.models_matcher:
         learned = learned._replace(matcher=None)
-    elif settings.method == "consistent" and settings.matcher == "depth-maps" and len(sample):
+    elif (
+        settings.method == "consistent"
+        and settings.matcher in ("depth-maps", "single-map")
+        and len(sample)
+    ):
         learned = learned._replace(bed=_learn_bed(replace(sample, survey=survey)))
     return replace(survey, learned=learned), verdicts
 
@@ -272,7 +276,9 @@ def _learn_bed(batch: Batch) -> Bed | None:
     from pcfix.refract.depth_maps import likely_beds
     from pcfix.refract.matcher import bed_of
 
-    batch = batch.take(np.arange(0, len(batch), 2 if len(batch) > BED_POINTS else 1))
+    # of single maps each point shows the bed less clearly: all of them are needed
+    many = len(batch) > BED_POINTS and batch.survey.settings.matcher == "depth-maps"
+    batch = batch.take(np.arange(0, len(batch), 2 if many else 1))
     order = spatial_order(batch.xyz)
     likely = [likely_beds(with_rays(batch.take(rows))) for rows in batches(order)]
     table = np.full((len(batch), max(part.shape[1] for part in likely)), np.nan, np.float32)

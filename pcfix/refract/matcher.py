@@ -22,6 +22,9 @@ from pcfix.lens.imaging import project
 from pcfix.model import Cameras, FloatArray, IntArray, TiePoints, Views
 
 MATCHED, AVERAGED, NEIGHBOURS = 5, 8, 12
+NEAR, BASE_TO_HEIGHT, AXES_WITHIN_DEG, LEAST_NEAR = 12, (0.1, 0.5), 30.0, 3
+"""Of software that does not average maps: the stereo models of a base image, and how many of them
+must show a place."""
 BEST_ANGLE_DEG, NARROW_DEG, WIDE_DEG = 12.0, 4.56, 8.4
 LEAST_ANGLE_DEG, LARGEST_ANGLE_DEG = 3.0, 65.0
 LEAST_ANGLE_WEIGHT = 0.1
@@ -31,6 +34,7 @@ REPEATED_DEG = 45.0
 TOLERANCE_PX2 = 0.1
 CELLS = 16
 LEAST_PLACES, PLACES_AN_IMAGE = 4000, 10
+WIDTH_M, NEAR_WIDTH_M = 0.2, 0.06
 LEAST_AREA = 0.05
 LEAST_COMMON = 3
 SCALE_RANGE = (0.2, 3.2)
@@ -46,7 +50,19 @@ class Matcher(NamedTuple):
     fused: IntArray  # (k, 12), the images whose depth maps may be fused with its own
     focal_px: FloatArray  # (k,), pixels per radian
     inner: Frames  # the frames without a border, in which patches do not fit
+    near: IntArray  # (k, 12), the stereo models of software that does not average maps
     tolerance_px2: float = TOLERANCE_PX2  # squared residuals of a pair: e times less likely
+    width_m: float = WIDTH_M  # standard deviation of the beds of maps that may have made a point
+    least: int = 1  # images of `matched` that must show a place
+    is_nearest: bool = False  # whether each point has the map of the image nearest in plan
+
+    def of_single_maps(self, least: int, *, nearest: bool) -> Matcher:
+        """Return the matcher of software that keeps one map at each place, and averages none."""
+        none = np.zeros((len(self.near), 0), np.int64)
+        return self._replace(
+            matched=self.near, averaged=none, fused=none, tolerance_px2=np.inf,
+            width_m=NEAR_WIDTH_M, least=least, is_nearest=nearest,
+        )  # fmt: skip
 
 
 class _Seen(NamedTuple):
@@ -98,7 +114,22 @@ def _matcher(cameras: Cameras, places: FloatArray, seen: _Seen, *, tracked: bool
         fused=table,
         focal_px=np.array([lens.focal_px for lens in cameras.lenses or ()]),
         inner=frames_of(without_border(cameras)),
+        near=_near_images(cameras, float(np.median(places[:, 2]))),
     )
+
+
+def _near_images(cameras: Cameras, ground_m: float) -> IntArray:
+    """Return the images of similar attitude in a range of base to height, nearest first."""
+    axes = np.asarray(cameras.rotations)[:, 2]
+    table = np.full((len(cameras), NEAR), -1)
+    for i, centre in enumerate(cameras.centres):
+        base = np.linalg.norm(cameras.centres - centre, axis=1) / (centre[2] - ground_m)
+        alike = axes @ axes[i] >= np.cos(np.radians(AXES_WITHIN_DEG))
+        order = np.argsort(base, kind="stable")
+        low, high = BASE_TO_HEIGHT
+        near = order[(alike & (base >= low) & (base <= high))[order]][:NEAR]
+        table[i, : len(near)] = near
+    return table
 
 
 BORDER_PX = 8.0

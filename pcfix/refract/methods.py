@@ -148,7 +148,7 @@ def _method(batch: Batch) -> str:
         return METHODS[settings.method]
     modelled = "tracks" if batch.survey.learned.matcher is None else settings.matcher
     kind = modelled if views is None else views.kind
-    if kind == "depth-maps":
+    if kind in ("depth-maps", "single-map", "nearest-map"):
         return _MAPS
     return _PAIRS if kind in ("pairs", "pair-images") else METHODS["consistent"]
 

@@ -24,16 +24,15 @@ import numpy as np
 from pcfix.model import FloatArray, IntArray
 from pcfix.refract.batch import Batch, stacked
 
-PATCHES, PATCH_POINTS, FEWEST_POINTS = 500, 16, 400
+PATCHES, FEWEST_POINTS = 750, 400
+PATCH_POINTS = (32, 16)
+"""Of a patch, or of sparse clouds."""
 FEWEST_WITHOUT_LIST = 2000
 """Fewer are tie points, and their patches overlap."""
 
 PATCH_WIDTH, WIDEST_PATCH = 0.04, 0.055
 """In flying heights: so wide that image borders cross many patches. In wider ones relief hides the
 discontinuities."""
-
-DENSE_GSD = 8.0
-"""Points of dense matching are nearer to each other than this, those of tracks are not."""
 
 GRID_SHARE = 0.9
 """Share of neighbours whole steps apart from which a cloud is a grid."""
@@ -54,12 +53,18 @@ class Patches(NamedTuple):
     """Groups of neighbours among points of a cloud."""
 
     rows: IntArray  # (m,), the rows of a batch that are in a patch
-    place: IntArray  # (p, 16), rows of `rows`, patch by patch
+    place: IntArray  # (p, 32) or (p, 16), rows of `rows`, patch by patch
     step: int  # one in so many points of the batch was taken
 
 
 def patches_of(batch: Batch) -> Patches | None:
     """Return patches of neighbours; None where there are too few points, or too sparse ones."""
+    sizes = PATCH_POINTS if batch.views is None else PATCH_POINTS[-1:]
+    found = (_patches_of(batch, points) for points in sizes)
+    return next(filter(None, found), None)
+
+
+def _patches_of(batch: Batch, points: int) -> Patches | None:
     from scipy.spatial import cKDTree
 
     usable, fewest = np.arange(len(batch)), FEWEST_WITHOUT_LIST
@@ -74,12 +79,12 @@ def patches_of(batch: Batch) -> Patches | None:
     x, y = np.floor((xy - xy.min(axis=0)).T / width_m).astype(np.int64)
     squares = len(np.unique(x * (int(y.max()) + 1) + y))
     covered = min(float(extent.prod()) / width_m**2, squares)
-    step = max(1, int(len(usable) / max(FEWEST_POINTS, PATCH_POINTS * covered)))
+    step = max(1, int(len(usable) / max(FEWEST_POINTS, points * covered)))
     usable = usable[::step]
     xy = batch.xyz[usable, :2]
     seeds = np.unique(np.linspace(0, len(xy) - 1, PATCHES).astype(int))
     tree = cKDTree(xy, balanced_tree=False, compact_nodes=False)
-    patch = usable[tree.query(xy[seeds], k=PATCH_POINTS)[1]]
+    patch = usable[tree.query(xy[seeds], k=points)[1]]
     across = np.ptp(batch.xyz[patch, :2], axis=1).prod(axis=1)
     is_wide = math.sqrt(np.median(across)) * PATCH_WIDTH > WIDEST_PATCH * width_m
     if batch.views is None and is_wide:
@@ -125,10 +130,10 @@ def others_around(batch: Batch, rows: IntArray) -> Batch:
     from scipy.spatial import cKDTree
 
     others = np.setdiff1d(np.arange(len(batch)), rows, assume_unique=True)
-    if batch.views is not None or len(others) < PATCH_POINTS:
+    if batch.views is not None or len(others) < PATCH_POINTS[-1]:
         return batch.take(rows)
     tree = cKDTree(batch.xyz[others, :2], balanced_tree=False, compact_nodes=False)
-    near = tree.query(batch.xyz[rows[::4], :2], k=PATCH_POINTS)[1]
+    near = tree.query(batch.xyz[rows[::4], :2], k=PATCH_POINTS[-1])[1]
     return batch.take(others[np.unique(near)])
 
 
@@ -150,7 +155,7 @@ def shares(part: Batch, place: IntArray, z: FloatArray) -> tuple[FloatArray, Flo
     """
     h = len(z)
     beta, sigma = np.full((2, h, h), np.nan)
-    smooth = _smooth(part.xyz[place])
+    smooth = smooth_surfaces(part.xyz[place])
     level, apparent = part.surface.height_m[place], part.xyz[place, 2]
     noise = _rest(smooth, apparent)
     spread = np.sqrt((noise**2).mean(axis=1))
@@ -172,11 +177,11 @@ def shares(part: Batch, place: IntArray, z: FloatArray) -> tuple[FloatArray, Flo
 
 def scatter_m(part: Batch, place: IntArray, z: FloatArray) -> float:
     """Return the scatter of neighbours about a smooth surface, standard deviation, metres."""
-    rest = _rest(_smooth(part.xyz[place]), z[place])
-    return math.sqrt(float(np.nanmedian((rest**2).sum(axis=1) / (PATCH_POINTS - _TERMS))))
+    rest = _rest(smooth_surfaces(part.xyz[place]), z[place])
+    return math.sqrt(float(np.nanmedian((rest**2).sum(axis=1) / (place.shape[1] - _TERMS))))
 
 
-def _smooth(patch: FloatArray) -> FloatArray:
+def smooth_surfaces(patch: FloatArray) -> FloatArray:
     """Return an orthonormal basis of quadratic surfaces over patches, (p, k, 3), as (p, k, 6)."""
     across = patch[..., :2] - patch[..., :2].mean(axis=1, keepdims=True)
     x, y = np.moveaxis(across / (np.abs(across).max(axis=(1, 2), keepdims=True) + 1e-9), -1, 0)
@@ -189,14 +194,13 @@ def _rest(smooth: FloatArray, z: FloatArray) -> FloatArray:
     return z - np.einsum("pki,pi->pk", smooth, np.einsum("pki,pk->pi", smooth, z))
 
 
-def is_dense(part: Batch, place: IntArray, step: float) -> bool:
-    """Whether neighbouring points of the cloud are as near to each other as dense matching is.
+def spacing_gsd(part: Batch, place: IntArray, step: float) -> float:
+    """Return the spacing of the points of the cloud, in ground pixels.
 
     `step` says how many points of the cloud there are for each of these.
     """
     extent = np.ptp(part.xyz[place, :2], axis=1).prod(axis=1)
-    spacing_m = math.sqrt(float(np.median(extent)) / PATCH_POINTS / step)
-    return spacing_m < DENSE_GSD * gsd_m(part)
+    return math.sqrt(float(np.median(extent)) / place.shape[1] / step) / gsd_m(part)
 
 
 def grid_m(xyz: FloatArray) -> float | None:

@@ -13,17 +13,31 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.model import FloatArray, IntArray, Outcome, ViewKind
+from pcfix.model import BoolArray, FloatArray, IntArray, Outcome, ViewKind
 from pcfix.options.correct import Dimensions, ScienceOptions
 from pcfix.refract import patches
 from pcfix.refract.batch import FLAT_DEG, Batch, ModelUncertainty
+from pcfix.refract.likelihood import Candidates, log_likelihood, standard_errors
 from pcfix.refract.methods import correct, with_rays
 from pcfix.refract.patches import SMOOTH_GSD, Patches, scatter_m, shares
 
-SURE = 3.0
-"""Standard errors by which a share must differ from one half to be significant."""
+SURE = 2.33
+"""Standard errors of a significant difference: 99 %."""
+SPACING_GSD, PRIOR_TRACKS = (3.0, 8.0), (-1.0, 4.0)
+"""What the spacing of the points counts for tracks, in standard errors: dense matching has a point
+for every pixel or few, and tracks are sparser."""
+PRIOR_OF_SHARES, PRIOR_SOFTWARE = 0.25, 1.0
+"""The share of it against discontinuities, which are clearer; what the software counts."""
+SHARE_ERROR, SHARE_WEIGHT = 0.12, 0.4
+"""Standard error of a share from what the models neglect, and what shares count beside likelihoods:
+less, as the maps of a point are chosen by a smooth bed."""
+WEAK = 3.0
+"""Divisor of the evidence of clouds that were smoothed."""
 LEAST_PATCHES = 100
 """With all their points corrected for each type; with fewer nothing is decided."""
+OPEN_ODDS = (20.0, 100.0)
+"""Odds against another type up to which its whole difference counts as uncertainty, and from which
+it counts no more."""
 COVERED = 0.95
 """Least share of the points that must be corrected, of those that are for most types."""
 LEAST_DEPTH_M = 0.1
@@ -57,10 +71,14 @@ class Reconstruction(NamedTuple):
 
 
 _TRACKS, _MAPS, _PAIRS = "tracks", "depth maps", "stereo pairs"
+_SINGLE, _NEAREST = "single depth maps", "single depth maps of the nearest images"
+_MVS = {"method": "consistent", "camera_set": "mvs"}
 IN_FRAME = (
     Reconstruction(_TRACKS, {"method": "consistent", "camera_set": "all"}),
-    Reconstruction(_MAPS, {"method": "consistent", "camera_set": "mvs", "matcher": "depth-maps"}),
-    Reconstruction(_PAIRS, {"method": "consistent", "camera_set": "mvs", "matcher": "pairs"}),
+    Reconstruction(_MAPS, {**_MVS, "matcher": "depth-maps"}),
+    Reconstruction(_PAIRS, {**_MVS, "matcher": "pairs"}),
+    Reconstruction(_SINGLE, {**_MVS, "matcher": "single-map"}),
+    Reconstruction(_NEAREST, {**_MVS, "matcher": "nearest-map"}),
 )
 LISTED = (
     Reconstruction(_TRACKS, {"method": "consistent"}, "tracks"),
@@ -83,23 +101,27 @@ STRONG = 0.25
 where a limit doubles the errors, it leaves 0.28; where it more than halves them, on a rendered
 block with obliques, 0.15 to 0.2; on a real river, whose depths it makes plausible, 0.02 to 0.12."""
 
-SOFTWARE = {
-    "metashape": _MAPS, "photoscan": _MAPS, "openmvs": _MAPS, "colmap": _MAPS, "odm": _MAPS,
-    "opendronemap": _MAPS, "opensfm": _MAPS, "realitycapture": _MAPS, "realityscan": _MAPS,
-    "micmac": _PAIRS, "sure": _PAIRS,
+SOFTWARE: dict[str, tuple[str, ...]] = {
+    "openmvs": (_MAPS,), "odm": (_MAPS,), "opendronemap": (_MAPS,), "opensfm": (_MAPS,),
+    "colmap": (_MAPS,), "realitycapture": (_MAPS,), "realityscan": (_MAPS,),
+    "metashape": (_SINGLE,), "photoscan": (_SINGLE,), "sure": (_SINGLE, _PAIRS),
+    "micmac": (_PAIRS, _NEAREST),
 }  # fmt: skip
-"""Types of dense clouds by a word in the name of the software; that of Pix4D is unknown."""
+"""Types of dense clouds by a word in the name of the software. OpenMVS, which ODM calls, and COLMAP
+fuse depth maps (their sources); Metashape merges the depth maps of single images (its manual); SURE
+triangulates a base image with several others (Rothermel et al. 2012); MicMac fuses stereo models
+or keeps the best image (its manual). Those of Pix4D and DJI Terra are unknown."""
 
 
 class Hint(NamedTuple):
-    """The type of a dense cloud, and the name of the software by which it is known."""
+    """Likely types of a dense cloud, and the name of the software by which they are known."""
 
-    words: str
+    words: tuple[str, ...]
     source: str
 
 
 def hint_of(names: tuple[str, ...]) -> Hint | None:
-    """Return the type that software is known for, by the first name that is known."""
+    """Return the types that software is known for, by the first name that is known."""
     for name in names:
         for word in re.findall(r"[a-z]+", name.lower()):
             if word in SOFTWARE:
@@ -118,6 +140,7 @@ class Verdict(NamedTuple):
 
     chosen: Reconstruction
     runner_up: Reconstruction  # the next best; if the user set the type, the best of all others
+    errors: float  # standard errors by which the evidence is for the chosen type
     share: float
     runner_up_share: float
     sigma: float  # standard error of both
@@ -133,11 +156,8 @@ class Verdict(NamedTuple):
 
     @property
     def confidence(self) -> float:
-        """Probability, 0 to 1, that the bed has fewer discontinuities than with the runner-up."""
-        if not self.patches:
-            return 0.5
-        errors = (0.5 - self.share) / max(self.sigma, 1e-9)
-        return 0.5 * (1.0 + math.erf(errors / math.sqrt(2.0)))
+        """Probability, 0 to 1, that the chosen type is right and not the runner-up."""
+        return 0.5 * (1.0 + math.erf(self.errors / math.sqrt(2.0)))
 
     @property
     def is_fused(self) -> bool:
@@ -146,8 +166,8 @@ class Verdict(NamedTuple):
 
     @property
     def is_sure(self) -> bool:
-        """Whether the discontinuities are significantly fewer than with the other type."""
-        return self.patches > 0 and 0.5 - self.share > SURE * self.sigma
+        """Whether the chosen type is significantly better than the other."""
+        return self.errors > SURE
 
     @property
     def is_strong(self) -> bool:
@@ -157,7 +177,7 @@ class Verdict(NamedTuple):
     @property
     def is_against(self) -> bool:
         """Whether the other type fits significantly better."""
-        return self.patches > 0 and self.share - 0.5 > SURE * self.sigma
+        return self.errors < -SURE
 
     def warnings(self) -> tuple[str, ...]:
         """Return what the user must know, a sentence each."""
@@ -191,8 +211,8 @@ class Verdict(NamedTuple):
         points = self.of[:1].upper() + self.of[1:] or "Cloud"
         how = "set by the user"
         if not self.is_given:
-            by = self.by or ("" if self.patches else "its density")
-            how = f"detected{f' by {by}' if by else ''}{'' if self.is_sure else ', not certain'}"
+            by = f" by {self.by}" if self.by else ""
+            how = f"detected{by}, confidence {100.0 * self.confidence:.0f} %"
         fit = ", which fits better" if self.is_given and self.is_against else ""
         text = (
             f"{points}: {self.chosen.words} ({how}). Next best: {self.runner_up.words}{fit}; the"
@@ -245,12 +265,15 @@ class _Beds(NamedTuple):
     patches: int
     share: FloatArray
     sigma: FloatArray
+    errors: (
+        FloatArray  # (h, h), standard errors by which one is better than another; inf for itself
+    )
 
     def rank(self, among: list[int]) -> tuple[int, int]:
         """Return the best of some types, and the runner-up."""
-        share = self.share[np.ix_(among, among)]
-        best = int(np.argmin(share.max(axis=1)))
-        return among[best], among[int(np.argmax(share[best]))]
+        errors = self.errors[np.ix_(among, among)]
+        best = int(np.argmax(errors.min(axis=1)))
+        return among[best], among[int(np.argmin(errors[best]))]
 
 
 def weigh(
@@ -279,11 +302,15 @@ def weigh(
     beds = _beds(part, replace(batch, survey=part.survey), sample, types)
     if beds is None or (given is not None and given not in beds.types):
         return None
-    remarks, among = _remarks(part, sample.place), list(range(len(beds.types)))
+    remarks, among, by = _remarks(part, sample.place), list(range(len(beds.types))), ""
+    if remarks:
+        beds = beds._replace(errors=beds.errors / WEAK)
     if given is None:
-        best, other, by = _decided(part, beds, sample, step, hint, weak=bool(remarks))
+        if part.views is None and reconstructions is not LIMITS:
+            beds, by = _with_prior(part, beds, sample, step, hint)
+        best, other = beds.rank(among)
     else:
-        best, by = beds.types.index(given), ""
+        best = beds.types.index(given)
         among = [i for i in among if beds.types[i] in reconstructions]
         first, second = beds.rank(among)
         other = second if first == best else first
@@ -295,6 +322,7 @@ def weigh(
     return Verdict(
         chosen=beds.types[best],
         runner_up=beds.types[other],
+        errors=float(beds.errors[best, other]) if beds.patches else 0.0,
         share=float(beds.share[best, other]),
         runner_up_share=float(beds.share[other, best]),
         sigma=float(beds.sigma[best, other]),
@@ -321,38 +349,70 @@ def _beds(
     kept = np.flatnonzero(covered >= COVERED * covered.max())
     if len(kept) < 2 or not covered.max():
         return None
-    z = z[kept]
+    z, types = z[kept], tuple(types[i] for i in kept)
     place = sample.place[np.isfinite(z[:, sample.place]).all(axis=(0, 2))]
-    if len(place) >= LEAST_PATCHES:
-        share, sigma = shares(part, place, z)
-        tested = len(place)
-    else:
-        share, sigma = np.full((2, len(z), len(z)), 0.5)
-        place, tested = sample.place, 0
+    if len(place) < LEAST_PATCHES:
+        half, none = np.full((len(z), len(z)), 0.5), np.zeros((len(z), len(z)))
+        return _Beds(types, z, sample.place, 0, half, half, none)
+    share, sigma = shares(part, place, z)
+    errors = (0.5 - share) / np.maximum(sigma, 1e-9)
+    if part.views is None and LIMITS[0] not in types:
+        errors = (0.5 - share) / np.hypot(sigma, SHARE_ERROR)
+        likely = [_log_likelihood(part, place, one, z[i]) for i, one in enumerate(types)]
+        for a, b in zip(*np.nonzero(_by_likelihood(types)), strict=True):
+            errors[a, b] *= SHARE_WEIGHT
+            errors[a, b] += standard_errors(likely[a], likely[b])
     np.fill_diagonal(share, -np.inf)
-    return _Beds(tuple(types[i] for i in kept), z, place, tested, share, sigma)
+    np.fill_diagonal(errors, np.inf)
+    return _Beds(types, z, place, len(place), share, sigma, errors)
 
 
-def _decided(
-    part: Batch, beds: _Beds, sample: Patches, step: float, hint: Hint | None, *, weak: bool
-) -> tuple[int, int, str]:
-    """Return the chosen type, the runner-up, and other evidence that decided.
+def _by_likelihood(types: tuple[Reconstruction, ...]) -> BoolArray:
+    """Return which pairs of types are compared by the likelihood: those with a single map.
 
-    If the discontinuities are not significant, a dense cloud is what its software makes, and not
-    tracks; a sparse one is tracks.
+    They predict little but the scatter of neighbours, or discontinuities at few places; the others
+    are told from each other by the discontinuities, which do not depend on the noise.
     """
-    best, other = beds.rank(list(range(len(beds.types))))
-    errors = SURE if weak else 1.0
-    if 0.5 - beds.share[best, other] > errors * beds.sigma[best, other] or part.views is not None:
-        return best, other, ""
+    single = np.array([one.words in (_SINGLE, _NEAREST) for one in types])
+    return np.asarray(single[:, None] | single)
+
+
+def _log_likelihood(part: Batch, place: IntArray, one: Reconstruction, z: FloatArray) -> FloatArray:
+    """Return the log likelihood of each patch for a type, per point."""
+    candidates = Candidates(z[:, None], np.ones((len(z), 1)))
+    if one.words in (_MAPS, _SINGLE):  # which of several images made a point is unknown
+        from pcfix.refract.depth_maps import candidates_of
+
+        candidates = candidates_of(with_rays(_as(part, one)))
+    each = Candidates(*(values[place] for values in candidates))
+    terms = patches.smooth_surfaces(part.xyz[place])
+    level = part.surface.height_m[place]
+    return log_likelihood(terms, part.xyz[place, 2], level, each, patches.gsd_m(part))
+
+
+def _with_prior(
+    part: Batch, beds: _Beds, sample: Patches, step: float, hint: Hint | None
+) -> tuple[_Beds, str]:
+    """Add what is known of the types by density and software; return what decided, if these did.
+
+    A sparse cloud is one of tracks; a dense one is what its software makes, and not of tracks.
+    """
     words = [one.words for one in beds.types]
-    dense = patches.is_dense(part, sample.place, step * sample.step)
-    if dense and hint is not None and hint.words in words:
-        known = words.index(hint.words)
-        return known, other if known == best else best, f"its software, {hint.source}"
-    if words[best if dense else other] == _TRACKS:
-        return other, best, "its density"
-    return best, other, ""
+    spacing = patches.spacing_gsd(part, sample.place, step * sample.step)
+    by_spacing = float(np.interp(np.log(spacing), np.log(SPACING_GSD), PRIOR_TRACKS))
+    tracks = np.array([by_spacing * (one == _TRACKS) for one in words])
+    counts = np.where(_by_likelihood(beds.types), 1.0, PRIOR_OF_SHARES)
+    errors = beds.errors + counts * (tracks[:, None] - tracks)
+    if hint is not None:
+        likely = np.array([PRIOR_SOFTWARE * (one in hint.words) for one in words])
+        errors += likely[:, None] - likely
+    known = beds._replace(errors=errors)
+    among = list(range(len(words)))
+    best = known.rank(among)[0]
+    if beds.patches and beds.rank(among)[0] == best:
+        return known, ""
+    by_software = hint is not None and words[best] in hint.words
+    return known, f"its software, {hint.source}" if hint and by_software else "its density"
 
 
 def _remarks(part: Batch, place: IntArray) -> tuple[str, ...]:
@@ -384,10 +444,15 @@ def _model_uncertainty(part: Batch, beds: _Beds, at: int, among: list[int]) -> M
     """
     depth = np.maximum(part.surface.height_m - beds.z[at], 1e-3)[beds.place]
     deep = depth > LEAST_DEPTH_M
+    is_likelihood = _by_likelihood(beds.types)
 
     def left(a: int, b: int, most: float) -> float:
         apart = np.abs((beds.z[a] - beds.z[b])[beds.place]) / depth
-        share = min(max(float(beds.share[a, b]), 0.0) + float(beds.sigma[a, b]), 1.0)
+        share = _open_share(float(beds.errors[a, b]))
+        if not is_likelihood[a, b]:
+            share = max(
+                share, min(max(float(beds.share[a, b]), 0.0) + float(beds.sigma[a, b]), 1.0)
+            )
         if not np.isfinite(apart[deep]).any():
             return 0.0
         # its 95 % interval covers 95 % of the differences
@@ -403,6 +468,16 @@ def _model_uncertainty(part: Batch, beds: _Beds, at: int, among: list[int]) -> M
     budget = correct(_as(part, beds.types[at], "all"))
     formal = float(np.median(budget.sigma_z_m))
     return ModelUncertainty(math.sqrt(max(scatter**2 - formal**2, 0.0)), open_m, formal)
+
+
+def _open_share(errors: float) -> float:
+    """Return how much of the difference to another type counts: all of it up to odds of 20 : 1.
+
+    Less beyond, and nothing from 100 : 1.
+    """
+    wrong = 0.5 * math.erfc(errors / math.sqrt(2.0))
+    odds = (1.0 - wrong) / max(wrong, 1e-12)
+    return float(np.interp(math.log(max(odds, 1e-12)), np.log(OPEN_ODDS), (1.0, 0.0)))
 
 
 def _as(part: Batch, one: Reconstruction, dimensions: Dimensions = "none") -> Batch:
@@ -421,8 +496,7 @@ def _heights(part: Batch, around: Batch, one: Reconstruction) -> FloatArray:
     """Return the heights corrected for a type, NaN where a point is not corrected."""
     part = _as(part, one)
     settings, learned = part.survey.settings, part.survey.learned
-    fuses = settings.method == "consistent" and settings.matcher == "depth-maps"
-    if part.views is None and fuses and learned.matcher is not None:
+    if part.views is None and settings.chooses_maps and learned.matcher is not None:
         from pcfix.refract.depth_maps import likely_beds
         from pcfix.refract.matcher import bed_of
 

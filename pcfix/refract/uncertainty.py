@@ -85,6 +85,9 @@ MODEL_GSD = 0.8
 """Standard error of the model of depth maps, common to a block: the bias of blocks with known truth
 was -0.6 to +1.4 ground pixels, largest with much image noise."""
 
+MODEL_SINGLE_GSD = 0.4
+"""The same of single depth maps: the bias of four semi-global matches was -0.2 to +0.1."""
+
 _XZ, _YZ, _ZZ = 2, 4, 5
 
 
@@ -150,7 +153,9 @@ def with_uncertainty(found: Intersection, batch: Batch) -> Intersection:
         cameras = survey.cameras
         focal_px = float(np.median([lens.focal_px for lens in cameras.lenses or ()]))
         gsd_m = (np.median(cameras.centres[:, 2]) - surface.height_m[moved]) / focal_px
-        variance += ambiguity[moved] ** 2 + (MODEL_GSD * gsd_m) ** 2
+        is_single = survey.settings.matcher != "depth-maps"
+        model_gsd = MODEL_SINGLE_GSD if is_single else MODEL_GSD
+        variance += ambiguity[moved] ** 2 + (model_gsd * gsd_m) ** 2
     if learned.model_uncertainty is not None:
         model, z = learned.model_uncertainty, batch.xyz[:, 2] + found.shift_m[:, 2]
         depth = (surface.height_m - z)[moved]

@@ -59,7 +59,7 @@ def matcher(cameras=CAMERAS, matched=MATCHED, averaged=None, fused=None, toleran
     return Matcher(
         matched, none if averaged is None else averaged,
         np.full((k, 12), -1) if fused is None else fused,
-        np.full(k, LENS.focal), frames_of(cameras), tolerance,
+        np.full(k, LENS.focal), frames_of(cameras), np.full((k, 12), -1), tolerance,
     )  # fmt: skip
 
 

@@ -11,7 +11,7 @@ from pcfix.options.correct import ScienceOptions
 from pcfix.refract import patches
 from pcfix.refract.batch import Batch, Survey
 from pcfix.refract.learning import learn_of_sample
-from pcfix.refract.reconstructions import IN_FRAME, reconstructions_of
+from pcfix.refract.reconstructions import IN_FRAME, hint_of, reconstructions_of
 from pcfix.water.surface import surface_above
 from tests.utils.matchers import simulated
 from tests.utils.nightly import mostly_nightly
@@ -34,6 +34,8 @@ CLOUDS = {
     "river of tracks": {"cloud": "tracks", "bed": "river"},
     "pairs": {"cloud": "pairs"},
 }
+COARSE = {"points": 40_000, "seed": 1, "lidar_per_m2": 0.0, "sensor_px": (1824, 1216)}
+"""A cloud as dense as those of matchers, about 5 pixels from point to point."""
 
 
 @pytest.mark.parametrize("name", mostly_nightly(CLOUDS, "tracks", "depth-maps"))
@@ -45,10 +47,34 @@ def test_simulated_cloud(name):
     assert verdict.chosen is IN_FRAME[place]
     assert settings.method == "consistent"
     assert verdict.share < verdict.runner_up_share
-    assert verdict.is_sure or name == "pairs"
+    # the single maps of images predict nearly the scatter of simulated fused maps
+    assert verdict.is_sure or name in ("pairs", "depth-maps")
     assert (verdict.confidence > 0.99) == verdict.is_sure
     assert {one.words for one in IN_FRAME} == {verdict.chosen.words, *dict(verdict.candidates)}
     assert verdict.runner_up.words in str(verdict)
+
+
+@pytest.mark.parametrize("kind", mostly_nightly(["single-map", "nearest-map"], "single-map"))
+def test_single_maps(kind):
+    scene = simulated(cloud=kind, **COARSE)
+    rows = np.diff(scene.views.start) > 0
+    settings, verdict = told(scene.xyz[rows], scene.cameras, scene.water)
+    assert verdict.chosen is IN_FRAME[["single-map", "nearest-map"].index(kind) + 3]
+    assert (settings.camera_set, settings.matcher) == ("mvs", kind)
+    assert verdict.confidence > 0.8
+
+
+def test_software_is_a_prior():
+    """It decides where the cloud does not, and not against it."""
+    scene = simulated(cloud="single-map", **COARSE)
+    rows = np.diff(scene.views.start) > 0
+    xyz, water = scene.xyz[rows], scene.water
+    batch = Batch(xyz, surface_above(water, xyz), Survey(water, scene.cameras, AUTO))
+    _, (free,) = learn_of_sample(batch, len(xyz))
+    _, (against,) = learn_of_sample(batch, len(xyz), hint=hint_of(("micmac",)))
+    _, (agreeing,) = learn_of_sample(batch, len(xyz), hint=hint_of(("SURE 5.0",)))
+    assert free.chosen is against.chosen is agreeing.chosen is IN_FRAME[3]
+    assert against.errors < free.errors < agreeing.errors + 1e-9
 
 
 def test_no_limit_of_snell():

@@ -12,10 +12,10 @@ from pcfix.simulate.scene import Scene, lay_out, points_on, scene_of, simulate_s
 from pcfix.simulate.settings import SceneSettings
 from pcfix.simulate.sight import see, starts
 from pcfix.simulate.terrain import Terrain
-from tests.utils.matchers.depth_maps import fuse_depth_maps
+from tests.utils.matchers.depth_maps import fuse_depth_maps, keep_single_maps, stereo_models
 from tests.utils.matchers.pairs import SAMPLE, TIES, match_pairs, neighbour_table, openmvs_partners
 
-NEIGHBOURS = {"pairs": 4, "depth-maps": 5}
+NEIGHBOURS = {"pairs": 4, "depth-maps": 5, "single-map": 6, "nearest-map": 6}
 """Images with which each is matched."""
 PAIRS_AT_ONCE = 50_000
 
@@ -33,7 +33,7 @@ class MatchedScene(Scene):
 
 
 def matched_scene(points: int, *, cloud: str = "tracks", **keywords) -> Scene:
-    """Simulate a scene as `pcfix.simulate_scene`, with a cloud of tracks, pairs or depth-maps."""
+    """Simulate a scene as `pcfix.simulate_scene`, with a cloud of tracks or of `NEIGHBOURS`."""
     if cloud == "tracks":
         return MatchedScene(**vars(simulate_scene(points, **keywords)))
     chosen = SceneSettings(points=points, **keywords)
@@ -44,6 +44,9 @@ def matched_scene(points: int, *, cloud: str = "tracks", **keywords) -> Scene:
     if cloud == "pairs":
         sample = truth[:: max(1, len(truth) // SAMPLE)][:SAMPLE]
         table = neighbour_table(see(sample, sure, rng), count)
+    elif cloud in ("single-map", "nearest-map"):
+        partners = stereo_models(site.given, float(np.median(truth[:, 2])), count)
+        table = partners.matched
     else:
         sample = points_on(site.terrain, max(TIES, 10 * len(site.true)), rng)
         every = see(sample, sure, rng)
@@ -56,13 +59,16 @@ def matched_scene(points: int, *, cloud: str = "tracks", **keywords) -> Scene:
         if cloud == "depth-maps":
             normals = normals_of(site.terrain, *some[:, :2].T)
             parts.append(fuse_depth_maps(sight, normals, partners, matching))
+        elif cloud in ("single-map", "nearest-map"):
+            normals, nearest = normals_of(site.terrain, *some[:, :2].T), cloud == "nearest-map"
+            parts.append(keep_single_maps(sight, normals, partners, matching, nearest=nearest))
         else:
             part, *of_part = match_pairs(sight, table, matching)
             parts.append(part)
             pairs.append(of_part)
     xyz, true, camera, counts, *weight = map(np.concatenate, zip(*parts, strict=True))
     scene = vars(scene_of(chosen, site, xyz, true, Views(starts(counts), camera, *weight)))
-    if cloud == "depth-maps":
+    if cloud != "pairs":
         return MatchedScene(**scene, neighbours=table)
     pairs, counts = map(np.concatenate, zip(*pairs, strict=True))
     return MatchedScene(**scene, neighbours=table, pairs=pairs, pairs_start=starts(counts))

@@ -111,6 +111,53 @@ def fuse_depth_maps(
     return fused, true, sight.camera[rows], count, weight.astype(np.float32)
 
 
+BASE_TO_HEIGHT, BEST_BASE, AXES_WITHIN_DEG, LEAST_MODELS = (0.1, 0.5), 0.25, 30.0, 3
+
+
+def stereo_models(cameras: Cameras, ground_m: float, count: int) -> Partners:
+    """Return the images that software without averaging compares with each base image.
+
+    Those of a similar attitude whose base is nearest to a quarter of the height.
+    """
+    base = np.linalg.norm(cameras.centres[:, None] - cameras.centres, axis=2)
+    base /= (cameras.centres[:, 2] - ground_m)[:, None]
+    axes, (low, high) = rotations_of(cameras)[:, 2], BASE_TO_HEIGHT
+    usable = (base >= low) & (base <= high) & (axes @ axes.T > np.cos(np.radians(AXES_WITHIN_DEG)))
+    off = np.where(usable, np.abs(base - BEST_BASE), np.inf)
+    best = np.argsort(off, axis=1, kind="stable")[:, :count]
+    matched = np.where(np.isfinite(np.take_along_axis(off, best, axis=1)), best, -1)
+    none = np.zeros((len(base), 0), int)
+    return Partners(matched, none, none, (matched >= 0).sum(axis=1))
+
+
+def keep_single_maps(
+    sight: Sight, normals: FloatArray, partners: Partners, rng: np.random.Generator, *,
+    nearest: bool,
+) -> tuple[np.ndarray, ...]:  # fmt: skip
+    """Return a point of each place along the ray of one base image; see `fuse_depth_maps`.
+
+    Its depth has the least squared residuals in all images that show the place, of those that the
+    base image was compared with, three or more. The base image is the nearest in plan or drawn by
+    lot. A place without one is not moved and has no cameras.
+    """
+    matching = _Matching(sight, normals, partners, rng)
+    place = sight.intersected(sight.ideal)
+    maps = matching.maps(place, best_pair=False)
+    possible = (matching.partner >= 0).sum(axis=1) >= LEAST_MODELS
+    rows = np.flatnonzero(possible & np.isfinite(maps.depth))
+    centres = sight.site.given.centres[sight.camera[rows], :2]
+    distance = np.linalg.norm(centres - place[sight.point[rows], :2], axis=1)
+    order = np.lexsort((distance if nearest else rng.uniform(size=len(rows)), sight.point[rows]))
+    point, first = np.unique(sight.point[rows[order]], return_index=True)
+    base = rows[order[first]]
+    true = sight.truth.copy()
+    place[point], true[point] = maps.points(base, maps.depth[base]), maps.seen[base]
+    place[~np.isin(np.arange(len(place)), point)] = true[~np.isin(np.arange(len(place)), point)]
+    count = np.zeros(len(place), int)
+    count[point] = 1
+    return place, true, sight.camera[base], count
+
+
 class _Matching:
     """What the depths of all m references, the rows of `sight`, are found with.
 
@@ -139,7 +186,7 @@ class _Matching:
         self.noise_px = rng.normal(0.0, site.image_noise_px, (*shape, 2))
         self.cost_px2 = rng.gumbel(0.0, COST_NOISE * site.image_noise_px**2, shape)
 
-    def maps(self, place: FloatArray) -> Maps:
+    def maps(self, place: FloatArray, *, best_pair: bool = True) -> Maps:
         """Return the depths of all references along their rays through a place of each point."""
         sight, site = self.sight, self.sight.site
         point, camera, lens = sight.point, sight.camera, site.optics.lens
@@ -152,15 +199,18 @@ class _Matching:
             site.water.refractive_index,
         )
         origin, ray = site.given.centres[camera], _rays(pixels, site.given, camera, lens)
-        depth = self._depths((origin, ray, depth), seen)
+        depth = self._depths((origin, ray, depth), seen, best_pair=best_pair)
         maps = Maps(origin, ray, depth, depth, seen, seen)
         averaged, shown = self._averaged(maps)
         return maps._replace(averaged=averaged, shown=shown)
 
     def _depths(
-        self, rays: tuple[FloatArray, FloatArray, FloatArray], seen: FloatArray
+        self, rays: tuple[FloatArray, FloatArray, FloatArray], seen: FloatArray, *, best_pair: bool
     ) -> FloatArray:
-        """Return the depth of the best pair of partners along each ray, from a first depth."""
+        """Return the depth of the best pair of partners, or of all, along each ray.
+
+        From a first depth.
+        """
         site, (reference, slot) = self.sight.site, np.nonzero(self.partner >= 0)
         row = self.partner[reference, slot]
         measured = self._measured(row, seen[reference], self.noise_px[reference, slot])
@@ -175,6 +225,8 @@ class _Matching:
         )
         depth = _least_squares(first, sightings, lens)
         depth[~(np.abs(depth - first) < MOST_OFF * first)] = np.nan  # the images agree nowhere
+        if not best_pair:
+            return depth
         residual, slope = _residuals(depth, sightings, lens)
         shape = self.partner.shape
         squares, right, curved = np.full(shape, np.inf), np.zeros(shape), np.ones(shape)
